@@ -1,0 +1,136 @@
+//! What the CPU kernels, the GPU kernels and the custom ops agree on: lane
+//! numbers of packed rows, the constants of both rasterizer conventions, and the
+//! options of one rasterizer call. Imports nothing of the crate.
+//!
+//! A constant that appears in a kernel appears here first; nothing else may
+//! restate it.
+
+use serde::{Deserialize, Serialize};
+
+/// Floats of one packed splat row: mean 3, quaternion 4, scale 3, opacity 1.
+pub const SPLAT_LANES: usize = 11;
+/// First lane of the mean, world units.
+pub const LANE_MEAN: usize = 0;
+/// First lane of the quaternion, (w, x, y, z), world frame, need not be unit.
+pub const LANE_QUAT: usize = 3;
+/// First lane of the scales: σ along the three axes of the quaternion's frame,
+/// world units, not logarithms.
+pub const LANE_SCALE: usize = 7;
+/// Lane of the opacity, after the sigmoid, in [0, 1].
+pub const LANE_OPACITY: usize = 10;
+
+/// A contribution below this alpha is skipped (8-bit quantisation; 3DGS).
+pub const ALPHA_MIN: f32 = 1.0 / 255.0;
+/// Compositing stops where the transmittance would fall to this (3DGS).
+pub const TRANSMITTANCE_MIN: f32 = 1e-4;
+/// Largest alpha of one splat at one pixel, `standard` (gsplat).
+pub const ALPHA_MAX_STANDARD: f32 = 0.999;
+/// Largest alpha of one splat at one pixel, `mvsplat` (INRIA, August 2023).
+pub const ALPHA_MAX_MVSPLAT: f32 = 0.99;
+/// Nearest camera z that is drawn, `standard`, world units.
+pub const NEAR_STANDARD: f32 = 0.01;
+/// Nearest camera z that is drawn, `mvsplat`, in units of the camera's near plane.
+pub const NEAR_MVSPLAT: f32 = 0.2;
+/// Low-pass added to both diagonal entries of the 2-D covariance, px² (3DGS).
+pub const LOWPASS: f32 = 0.3;
+/// Side of the tiles whose edges the `mvsplat` convention makes visible, px.
+pub const TILE_MVSPLAT: usize = 16;
+
+/// Number of SH coefficients per colour channel at `degree`.
+pub const fn sh_coefficients(degree: usize) -> usize {
+    (degree + 1) * (degree + 1)
+}
+
+/// Highest SH degree that any part of the crate evaluates.
+pub const SH_DEGREE_MAX: usize = 4;
+/// Coefficients per channel at [`SH_DEGREE_MAX`]: 25.
+pub const SH_COEFFICIENTS_MAX: usize = sh_coefficients(SH_DEGREE_MAX);
+
+/// Which rasterizer's rules a render follows.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Convention {
+    /// 3DGS and gsplat: principal point honoured, support exactly where
+    /// alpha ≥ 1/255, alpha capped at 0.999.
+    #[default]
+    Standard,
+    /// The rasterizer that MVSplat's public weights were trained with:
+    /// symmetric frustum, visible 16×16 tile cut, alpha capped at 0.99,
+    /// lengths in units of the near plane.
+    Mvsplat,
+}
+
+/// Which functions the SH coefficients multiply.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ShBasis {
+    /// 3DGS: real SH with the Condon-Shortley sign (l = 1 is −y, z, −x), index
+    /// l² + l + m, degrees 0 to 4.
+    #[default]
+    Standard,
+    /// The kernel that MVSplat's public weights were trained with: the standard
+    /// functions at (z, x, y), function 14 replaced by z(z² − x²), degree ≤ 3
+    /// (coefficients 16 and up are ignored).
+    Mvsplat,
+}
+
+/// From where the direction of view-dependent colour is taken.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ShDirection {
+    /// Each child's own mean: exact, one SH evaluation per child.
+    #[default]
+    Child,
+    /// The parent's direction, taken as the mean of its children's means: one
+    /// SH evaluation per parent and camera.
+    Parent,
+}
+
+/// Everything of one rasterizer call that is not a splat or a camera.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RasterOptions {
+    /// Rules of projection, extent and blending.
+    pub convention: Convention,
+    /// Functions that the SH coefficients multiply.
+    pub sh_basis: ShBasis,
+    /// Degrees above this are not evaluated, however many coefficients a splat has.
+    pub sh_degree: usize,
+    /// Direction of the SH evaluation.
+    pub sh_direction: ShDirection,
+    /// Added to the diagonal of the 2-D covariance, px² of the rendered picture.
+    pub lowpass: f32,
+    /// Scale each opacity by √(det Σ / det(Σ + low-pass)), so that a splat
+    /// smaller than a pixel keeps its integral (`standard` only).
+    pub antialiased: bool,
+    /// `standard`: nearest camera z drawn, world units. `mvsplat`: the camera's
+    /// near plane, whose 0.2-fold is the nearest z drawn.
+    pub near: f32,
+    /// Colour behind everything, linear blend with the final transmittance.
+    pub background: [f32; 3],
+}
+
+impl RasterOptions {
+    /// The defaults of `convention`: SH degree as far as it evaluates, low-pass
+    /// 0.3 px², black background.
+    pub fn new(convention: Convention) -> Self {
+        Self {
+            convention,
+            sh_basis: ShBasis::Standard,
+            sh_degree: SH_DEGREE_MAX,
+            sh_direction: ShDirection::Child,
+            lowpass: LOWPASS,
+            antialiased: false,
+            near: match convention {
+                Convention::Standard => NEAR_STANDARD,
+                Convention::Mvsplat => 1.0,
+            },
+            background: [0.0; 3],
+        }
+    }
+}
+
+impl Default for RasterOptions {
+    fn default() -> Self {
+        Self::new(Convention::Standard)
+    }
+}
