@@ -1,0 +1,121 @@
+//! Files of every kind, in and out. Foreign layouts end here: what leaves this
+//! room follows `camera.rs`'s conventions, whatever the file's were.
+//!
+//! Writers write beside the final name and rename at the end ([`write_atomic`]):
+//! a reader never sees half a file. Readers trust no declared size: they check it
+//! against the bytes that are there before they allocate.
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+use thiserror::Error;
+
+/// Why a file was refused, or could not be written.
+#[derive(Debug, Error)]
+pub enum Error {
+    /// The operating system's answer: missing, no permission, disk full.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The content is not what it claims to be.
+    #[error("{}{at}: expected {expected}, got {got}", path.display())]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// `:12` (a line), ` at byte 96`, ` frame 3`, or empty.
+        at: String,
+        /// What would have been accepted.
+        expected: String,
+        /// What came.
+        got: String,
+    },
+}
+
+/// Result of everything in this room.
+pub type Result<T> = std::result::Result<T, Error>;
+
+impl Error {
+    /// [`Error::Io`] for `path`.
+    pub fn io(path: impl Into<PathBuf>, source: std::io::Error) -> Self {
+        Self::Io { path: path.into(), source }
+    }
+
+    /// [`Error::Format`] for the whole of `path`.
+    pub fn format(
+        path: impl Into<PathBuf>,
+        expected: impl Into<String>,
+        got: impl Into<String>,
+    ) -> Self {
+        let (expected, got) = (expected.into(), got.into());
+        Self::Format { path: path.into(), at: String::new(), expected, got }
+    }
+
+    /// The same error at a place in the file: `:12`, ` at byte 96`, ` frame 3`.
+    #[must_use]
+    pub fn at(mut self, place: impl Into<String>) -> Self {
+        if let Self::Format { at, .. } = &mut self {
+            *at = place.into();
+        }
+        self
+    }
+}
+
+/// Whole file, or [`Error::Io`] that names it.
+///
+/// # Errors
+/// Missing, unreadable, a directory.
+pub fn read(path: &Path) -> Result<Vec<u8>> {
+    std::fs::read(path).map_err(|e| Error::io(path, e))
+}
+
+/// Writes `path` through `body`: into a temporary file of the same folder, flushed
+/// to the disk, then renamed. On any error the temporary file is removed and
+/// whatever stood under the final name still stands there.
+///
+/// # Errors
+/// No such folder, no permission, disk full; or the error that `body` gives.
+pub fn write_atomic(
+    path: &Path,
+    body: impl FnOnce(&mut BufWriter<File>) -> std::io::Result<()>,
+) -> Result<()> {
+    let name = path.file_name().ok_or_else(|| Error::format(path, "a file name", "a folder"))?;
+    let mut temporary = name.to_owned();
+    temporary.push(format!(".{}.part", std::process::id()));
+    let temporary = path.with_file_name(temporary);
+    let attempt = || -> std::io::Result<()> {
+        let mut file = BufWriter::new(File::create(&temporary)?);
+        body(&mut file)?;
+        file.flush()?;
+        file.get_ref().sync_all()?;
+        drop(file);
+        std::fs::rename(&temporary, path)
+    };
+    attempt().map_err(|e| {
+        // Best effort: the first error is the one worth telling.
+        let _ = std::fs::remove_file(&temporary);
+        Error::io(path, e)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_failed_write_leaves_the_old_file_and_no_other() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.bin");
+        write_atomic(&path, |f| f.write_all(b"old")).unwrap();
+        let failed = write_atomic(&path, |f| {
+            f.write_all(b"half")?;
+            Err(std::io::Error::other("disk full"))
+        });
+        assert!(failed.unwrap_err().to_string().contains("disk full"));
+        assert_eq!(read(&path).unwrap(), b"old");
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+}
