@@ -2,6 +2,9 @@
 //!
 //! Parameter names are PyTorch's, so that a converted checkpoint loads as it is.
 
+pub mod layers;
+pub mod weights;
+
 use crate::camera::Camera;
 use crate::config::FeatureLevel;
 use candle_core::{Result, Tensor, bail};

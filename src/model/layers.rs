@@ -1,0 +1,403 @@
+//! Layers that both backbones and the SPGR heads use, under PyTorch's parameter
+//! names and with its initialisation. All have gradients.
+
+use crate::ops::conv2d::conv2d;
+use candle_core::{D, Result, Tensor, bail};
+use candle_nn::{Init, VarBuilder};
+
+/// ε of every normalisation (PyTorch's default).
+pub const NORM_EPS: f64 = 1e-5;
+
+/// PyTorch's default for weights and biases of Linear and Conv: U(±1/√fan_in).
+pub fn default_init(fan_in: usize) -> Init {
+    let bound = 1.0 / (fan_in.max(1) as f64).sqrt();
+    Init::Uniform { lo: -bound, up: bound }
+}
+
+/// Kernel, stride and padding of a [`Conv2d`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ConvShape {
+    /// Side of the kernel.
+    pub kernel: usize,
+    /// Step, both axes.
+    pub stride: usize,
+    /// Zeros on every side.
+    pub padding: usize,
+}
+
+impl ConvShape {
+    /// 3×3, stride 1, same size.
+    pub const K3: Self = Self { kernel: 3, stride: 1, padding: 1 };
+    /// 3×3, stride 2, half the size.
+    pub const K3S2: Self = Self { kernel: 3, stride: 2, padding: 1 };
+    /// 1×1.
+    pub const K1: Self = Self { kernel: 1, stride: 1, padding: 0 };
+    /// 7×7, stride 2, half the size.
+    pub const K7S2: Self = Self { kernel: 7, stride: 2, padding: 3 };
+
+    /// The same with another stride.
+    #[must_use]
+    pub const fn stride(self, stride: usize) -> Self {
+        Self { stride, ..self }
+    }
+}
+
+/// `weight` `[O, C, k, k]`, `bias` `[O]`; `[B, C, H, W]` to `[B, O, H', W']`.
+#[derive(Clone, Debug)]
+pub struct Conv2d {
+    weight: Tensor,
+    bias: Option<Tensor>,
+    shape: ConvShape,
+}
+
+impl Conv2d {
+    /// With bias, PyTorch's default initialisation.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
+    pub fn new(c_in: usize, c_out: usize, shape: ConvShape, vb: VarBuilder) -> Result<Self> {
+        let init = default_init(c_in * shape.kernel * shape.kernel);
+        Self::with(c_in, c_out, shape, (init, Some(init)), vb)
+    }
+
+    /// Without bias, Kaiming-normal over fan-out (for ReLU), as in ResNets.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
+    pub fn new_no_bias(c_in: usize, c_out: usize, s: ConvShape, vb: VarBuilder) -> Result<Self> {
+        let stdev = (2.0 / (c_out * s.kernel * s.kernel) as f64).sqrt();
+        Self::with(c_in, c_out, s, (Init::Randn { mean: 0.0, stdev }, None), vb)
+    }
+
+    /// With the given initialisation of weight and, if there is one, bias.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
+    pub fn with(
+        c_in: usize,
+        c_out: usize,
+        shape: ConvShape,
+        init: (Init, Option<Init>),
+        vb: VarBuilder,
+    ) -> Result<Self> {
+        let k = shape.kernel;
+        let weight = vb.get_with_hints((c_out, c_in, k, k), "weight", init.0)?;
+        let bias = match init.1 {
+            Some(init) => Some(vb.get_with_hints(c_out, "bias", init)?),
+            None => None,
+        };
+        Ok(Self { weight, bias, shape })
+    }
+
+    /// `[B, C, H, W]` to `[B, O, H', W']`.
+    ///
+    /// # Errors
+    /// Another rank or number of channels.
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        conv2d(x, &self.weight, self.bias.as_ref(), self.shape.stride, self.shape.padding)
+    }
+}
+
+/// `weight` `[O, C]`, `bias` `[O]`; `[…, C]` to `[…, O]`.
+#[derive(Clone, Debug)]
+pub struct Linear {
+    weight: Tensor,
+    bias: Option<Tensor>,
+}
+
+impl Linear {
+    /// With bias, PyTorch's default initialisation.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
+    pub fn new(c_in: usize, c_out: usize, vb: VarBuilder) -> Result<Self> {
+        let init = default_init(c_in);
+        Self::with(c_in, c_out, (init, Some(init)), vb)
+    }
+
+    /// Without bias, Xavier-uniform, as in transformers.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
+    pub fn new_no_bias(c_in: usize, c_out: usize, vb: VarBuilder) -> Result<Self> {
+        let bound = (6.0 / (c_in + c_out) as f64).sqrt();
+        Self::with(c_in, c_out, (Init::Uniform { lo: -bound, up: bound }, None), vb)
+    }
+
+    /// With the given initialisation of weight and, if there is one, bias.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
+    pub fn with(
+        c_in: usize,
+        c_out: usize,
+        init: (Init, Option<Init>),
+        vb: VarBuilder,
+    ) -> Result<Self> {
+        let weight = vb.get_with_hints((c_out, c_in), "weight", init.0)?;
+        let bias = match init.1 {
+            Some(init) => Some(vb.get_with_hints(c_out, "bias", init)?),
+            None => None,
+        };
+        Ok(Self { weight, bias })
+    }
+
+    /// `[…, C]` to `[…, O]`.
+    ///
+    /// # Errors
+    /// Another last dimension.
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        let (o, c) = self.weight.dims2()?;
+        let mut dims = x.dims().to_vec();
+        if dims.last() != Some(&c) {
+            bail!("linear: expected x [.., {c}], got {:?}", x.dims());
+        }
+        let y = x.contiguous()?.reshape(((), c))?.matmul(&self.weight.t()?)?;
+        let y = match &self.bias {
+            Some(bias) => y.broadcast_add(bias)?,
+            None => y,
+        };
+        if let Some(last) = dims.last_mut() {
+            *last = o;
+        }
+        y.reshape(dims)
+    }
+}
+
+/// Normalises groups of channels over their channels and pixels, then scales and
+/// shifts each channel: `weight`, `bias` `[C]`; `[B, C, H, W]`.
+#[derive(Clone, Debug)]
+pub struct GroupNorm {
+    weight: Tensor,
+    bias: Tensor,
+    groups: usize,
+}
+
+impl GroupNorm {
+    /// Initialised to scale 1, shift 0.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape; `groups` does not divide `channels`.
+    pub fn new(groups: usize, channels: usize, vb: VarBuilder) -> Result<Self> {
+        Self::with(groups, channels, Init::Const(1.0), vb)
+    }
+
+    /// Initialised to scale 0, shift 0: a residual branch that starts closed.
+    ///
+    /// # Errors
+    /// As [`GroupNorm::new`].
+    pub fn new_zero(groups: usize, channels: usize, vb: VarBuilder) -> Result<Self> {
+        Self::with(groups, channels, Init::Const(0.0), vb)
+    }
+
+    fn with(groups: usize, channels: usize, weight: Init, vb: VarBuilder) -> Result<Self> {
+        if groups == 0 || channels % groups != 0 {
+            bail!("group norm: expected groups that divide {channels} channels, got {groups}");
+        }
+        Ok(Self {
+            weight: vb.get_with_hints(channels, "weight", weight)?,
+            bias: vb.get_with_hints(channels, "bias", Init::Const(0.0))?,
+            groups,
+        })
+    }
+
+    /// `[B, C, …]` to the same shape.
+    ///
+    /// # Errors
+    /// Another number of channels.
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        let dims = x.dims().to_vec();
+        let c = self.weight.elem_count();
+        if dims.len() < 3 || dims[1] != c {
+            bail!("group norm: expected [B, {c}, ..], got {dims:?}");
+        }
+        let rows = normalise_rows(&x.contiguous()?.reshape((dims[0] * self.groups, ()))?)?;
+        let y = rows.reshape((dims[0], c, ()))?;
+        let y = y.broadcast_mul(&self.weight.reshape((1, c, 1))?)?;
+        y.broadcast_add(&self.bias.reshape((1, c, 1))?)?.reshape(dims)
+    }
+}
+
+/// Each channel of each picture to zero mean and unit variance over its pixels, no
+/// parameters; `[B, C, H, W]`.
+///
+/// # Errors
+/// Another rank.
+pub fn instance_norm(x: &Tensor) -> Result<Tensor> {
+    let (b, c, _, _) = x.dims4()?;
+    normalise_rows(&x.contiguous()?.reshape((b * c, ()))?)?.reshape(x.shape())
+}
+
+/// Normalises the last dimension, then scales and shifts: `weight`, `bias` `[C]`.
+#[derive(Clone, Debug)]
+pub struct LayerNorm {
+    weight: Tensor,
+    bias: Tensor,
+}
+
+impl LayerNorm {
+    /// Initialised to scale 1, shift 0.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
+    pub fn new(width: usize, vb: VarBuilder) -> Result<Self> {
+        Ok(Self {
+            weight: vb.get_with_hints(width, "weight", Init::Const(1.0))?,
+            bias: vb.get_with_hints(width, "bias", Init::Const(0.0))?,
+        })
+    }
+
+    /// `[…, C]` to the same shape.
+    ///
+    /// # Errors
+    /// Another last dimension.
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        let c = self.weight.elem_count();
+        if x.dims().last() != Some(&c) {
+            bail!("layer norm: expected x [.., {c}], got {:?}", x.dims());
+        }
+        let y = normalise_rows(&x.contiguous()?.reshape(((), c))?)?;
+        y.broadcast_mul(&self.weight)?.broadcast_add(&self.bias)?.reshape(x.shape())
+    }
+}
+
+/// `[R, n]`: each row to zero mean and unit (biased) variance.
+fn normalise_rows(x: &Tensor) -> Result<Tensor> {
+    let centred = x.broadcast_sub(&x.mean_keepdim(1)?)?;
+    let variance = centred.sqr()?.mean_keepdim(1)?;
+    centred.broadcast_div(&(variance + NORM_EPS)?.sqrt()?)
+}
+
+/// x·sigmoid(x).
+///
+/// # Errors
+/// Not a float tensor.
+pub fn silu(x: &Tensor) -> Result<Tensor> {
+    x.silu()
+}
+
+/// x·Φ(x), the exact (erf) form.
+///
+/// # Errors
+/// Not a float tensor.
+pub fn gelu(x: &Tensor) -> Result<Tensor> {
+    x.gelu_erf()
+}
+
+/// 1/(1 + e⁻ˣ), stable at both ends.
+///
+/// # Errors
+/// Not a float tensor.
+pub fn sigmoid(x: &Tensor) -> Result<Tensor> {
+    // ½(1 + tanh(x/2)): candle's own op form has no gradient.
+    (x * 0.5)?.tanh()?.affine(0.5, 0.5)
+}
+
+/// Softmax over the last dimension.
+///
+/// # Errors
+/// A scalar.
+pub fn softmax(x: &Tensor) -> Result<Tensor> {
+    // The maximum only guards the exponent; no gradient passes through it.
+    let e = x.broadcast_sub(&x.detach().max_keepdim(D::Minus1)?)?.exp()?;
+    e.broadcast_div(&e.sum_keepdim(D::Minus1)?)
+}
+
+/// Bilinear resize of `[B, C, h, w]` to `[B, C, H, W]`, corner pixels on corner
+/// pixels (`align_corners = true`).
+///
+/// # Errors
+/// Another rank, an empty size.
+pub fn resize_bilinear(x: &Tensor, height: usize, width: usize) -> Result<Tensor> {
+    let (b, c, h, w) = x.dims4()?;
+    if h == 0 || w == 0 || height == 0 || width == 0 {
+        bail!("bilinear resize: expected sizes of at least 1, got {h}x{w} to {height}x{width}");
+    }
+    let rows = interpolation(h, height, x)?;
+    let cols = interpolation(w, width, x)?;
+    let y = x.contiguous()?.reshape((b * c * h, w))?.matmul(&cols.t()?)?;
+    let y = y.reshape((b * c, h, width))?;
+    let rows = rows.unsqueeze(0)?.broadcast_as((b * c, height, h))?.contiguous()?;
+    rows.matmul(&y)?.reshape((b, c, height, width))
+}
+
+/// `[to, from]`: the weights of linear interpolation, corners aligned.
+fn interpolation(from: usize, to: usize, like: &Tensor) -> Result<Tensor> {
+    let mut m = vec![0f32; from * to];
+    for i in 0..to {
+        let at = if to > 1 { (i * (from - 1)) as f64 / (to - 1) as f64 } else { 0.0 };
+        let k = (at.floor() as usize).min(from - 1);
+        let f = (at - k as f64) as f32;
+        m[i * from + k] += 1.0 - f;
+        if k + 1 < from {
+            m[i * from + k + 1] += f;
+        }
+    }
+    Tensor::from_vec(m, (to, from), like.device())
+}
+
+/// `[B, C, h, w]` to `[B, C, s·h, s·w]`, each pixel repeated s × s times.
+///
+/// # Errors
+/// Another rank.
+pub fn upsample_nearest(x: &Tensor, s: usize) -> Result<Tensor> {
+    // Not candle's `upsample_nearest2d`: its gradient overwrites instead of adding.
+    let (b, c, h, w) = x.dims4()?;
+    let x = x.reshape((b, c, h, 1, w, 1))?.broadcast_as((b, c, h, s, w, s))?;
+    x.contiguous()?.reshape((b, c, h * s, w * s))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::weights::Weights;
+    use candle_core::{Device, Var};
+
+    /// Compares the gradient of Σ f(x)·r with central differences.
+    fn check_grad(x: Tensor, f: impl Fn(&Tensor) -> Result<Tensor>) -> Result<()> {
+        let var = Var::from_tensor(&x)?;
+        let r = f(&x)?.randn_like(0.0, 1.0)?;
+        let loss = |t: &Tensor| (f(t)? * &r)?.sum_all();
+        let grad = loss(var.as_tensor())?.backward()?;
+        let grad = grad.get(&var).unwrap().flatten_all()?.to_vec1::<f32>()?;
+        let at = x.flatten_all()?.to_vec1::<f32>()?;
+        for i in (0..at.len()).step_by(1 + at.len() / 23) {
+            let eval = |h: f32| -> Result<f64> {
+                let mut v = at.clone();
+                v[i] += h;
+                let y = f(&Tensor::from_vec(v, x.shape(), x.device())?)?;
+                let terms = (y * &r)?.flatten_all()?.to_vec1::<f32>()?;
+                Ok(terms.iter().map(|v| f64::from(*v)).sum())
+            };
+            let numeric = (eval(1e-2)? - eval(-1e-2)?) / 2e-2;
+            let g = f64::from(grad[i]);
+            assert!((numeric - g).abs() < 4e-3 * (1.0 + g.abs()), "[{i}] {numeric} {g}");
+        }
+        Ok(())
+    }
+
+    fn noise(shape: &[usize]) -> Result<Tensor> {
+        Tensor::randn(0.3f32, 1.2, shape, &Device::Cpu)
+    }
+
+    #[test]
+    fn every_layer_has_its_gradient() -> Result<()> {
+        let vb = Weights::seeded(1).builder();
+        let x = noise(&[2, 8, 5, 6])?;
+        let conv = Conv2d::new(8, 4, ConvShape::K3S2, vb.pp("conv"))?;
+        check_grad(x.clone(), |x| conv.forward(x))?;
+        let norm = GroupNorm::new(4, 8, vb.pp("gn"))?;
+        check_grad(x.clone(), |x| norm.forward(x))?;
+        check_grad(x.clone(), instance_norm)?;
+        check_grad(x.clone(), silu)?;
+        check_grad(x.clone(), gelu)?;
+        check_grad(x.clone(), sigmoid)?;
+        check_grad(x.clone(), softmax)?;
+        check_grad(x.clone(), |x| resize_bilinear(x, 9, 11))?;
+        check_grad(x.clone(), |x| upsample_nearest(x, 2))?;
+        let linear = Linear::new(6, 7, vb.pp("linear"))?;
+        check_grad(x.clone(), |x| linear.forward(x))?;
+        let norm = LayerNorm::new(6, vb.pp("ln"))?;
+        check_grad(x, |x| norm.forward(x))
+    }
+}

@@ -1,0 +1,30 @@
+//! Custom candle ops over the kernels of [`crate::cpu`]: shape, dtype and layout
+//! checks live here, the arithmetic there. Every op either has a gradient or says
+//! plainly that it has none; none drops it silently.
+
+pub mod conv2d;
+
+use candle_core::{CpuStorage, Layout, Result, Shape, bail};
+
+/// The elements of an op's argument, which must be contiguous `f32`.
+pub(crate) fn f32_slice<'a>(
+    op: &str,
+    what: &str,
+    storage: &'a CpuStorage,
+    layout: &Layout,
+) -> Result<&'a [f32]> {
+    let CpuStorage::F32(data) = storage else {
+        bail!("{op} {what}: expected f32, got another dtype")
+    };
+    match layout.contiguous_offsets() {
+        Some((start, end)) => Ok(&data[start..end]),
+        None => {
+            bail!("{op} {what}: expected a contiguous tensor, got strides {:?}", layout.stride())
+        }
+    }
+}
+
+/// An op's result.
+pub(crate) fn output(data: Vec<f32>, shape: impl Into<Shape>) -> Result<(CpuStorage, Shape)> {
+    Ok((CpuStorage::F32(data), shape.into()))
+}
