@@ -191,7 +191,7 @@ impl GroupNorm {
     }
 
     fn with(groups: usize, channels: usize, weight: Init, vb: VarBuilder) -> Result<Self> {
-        if groups == 0 || channels % groups != 0 {
+        if groups == 0 || !channels.is_multiple_of(groups) {
             bail!("group norm: expected groups that divide {channels} channels, got {groups}");
         }
         Ok(Self {

@@ -2,12 +2,19 @@
 //!
 //! Parameter names are PyTorch's, so that a converted checkpoint loads as it is.
 
+pub mod backbone;
 pub mod layers;
 pub mod weights;
 
 use crate::camera::Camera;
 use crate::config::FeatureLevel;
 use candle_core::{Result, Tensor, bail};
+
+/// Gives a seeded tensor the start that an initialisation hint cannot say (an
+/// identity, a kernel that averages); `values` come as drawn from the hint.
+pub(crate) fn start_value(name: &str, shape: &[usize], values: &mut [f32]) {
+    backbone::small_start(name, shape, values);
+}
 
 /// B scenes of V posed pictures each, as the network takes them.
 #[derive(Clone, Debug)]

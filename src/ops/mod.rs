@@ -3,6 +3,7 @@
 //! plainly that it has none; none drops it silently.
 
 pub mod conv2d;
+pub mod matching;
 
 use candle_core::{CpuStorage, Layout, Result, Shape, bail};
 
