@@ -5,7 +5,12 @@
 pub mod abi;
 pub mod camera;
 pub mod config;
+pub mod cpu;
 pub mod io;
 pub mod model;
+pub mod ops;
+pub mod render;
 pub mod sh;
 pub mod splats;
+
+pub use render::{Picture, render};
