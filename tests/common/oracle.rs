@@ -55,9 +55,7 @@ struct Flat {
 type M3 = [[f64; 3]; 3];
 
 fn mul(a: &M3, b: &M3) -> M3 {
-    std::array::from_fn(|i| {
-        std::array::from_fn(|j| (0..3).map(|k| a[i][k] * b[k][j]).sum::<f64>())
-    })
+    std::array::from_fn(|i| std::array::from_fn(|j| (0..3).map(|k| a[i][k] * b[k][j]).sum::<f64>()))
 }
 
 fn transpose(a: &M3) -> M3 {
@@ -139,9 +137,8 @@ fn colour(splat: &Splat, eye: [f64; 3], options: &RasterOptions) -> [f64; 3] {
         ShBasis::Standard => (spherical_harmonics(d), 25),
         ShBasis::Mvsplat => {
             let mut y = spherical_harmonics([d[2], d[0], d[1]]);
-            y[14] = (105.0 / (16.0 * std::f64::consts::PI)).sqrt()
-                * d[2]
-                * (d[2] * d[2] - d[0] * d[0]);
+            y[14] =
+                (105.0 / (16.0 * std::f64::consts::PI)).sqrt() * d[2] * (d[2] * d[2] - d[0] * d[0]);
             (y, 16)
         }
     };
@@ -211,22 +208,28 @@ fn flatten(splat: &Splat, camera: &Camera, options: &RasterOptions) -> Option<Fl
     })
 }
 
-/// The 16×16 tiles of a splat in pixels, and whether one of them hangs on rounding.
+/// The 16×16 tiles of a splat in pixels, and whether they hang on rounding.
 fn cut(uv: [f64; 2], size: [f64; 2], xx: f64, yy: f64, det: f64) -> (Option<[i64; 4]>, bool) {
     let mid = (xx + yy) / 2.0;
     let exact = 3.0 * (mid + (mid * mid - det).max(0.1).sqrt()).sqrt();
-    let r = exact.ceil();
-    let mut shaky = (exact - exact.round()).abs() < 1e-4 * exact;
-    let mut side = |axis: usize| {
-        let tiles = (size[axis] / 16.0).ceil();
-        let mut to_px = |v: f64| {
-            shaky |= (v - v.round()).abs() < 1e-5 * (1.0 + v.abs());
-            (v.trunc().clamp(0.0, tiles) * 16.0) as i64
+    let tiles = |radius: f64, nudge: f64| -> [i64; 4] {
+        let r = radius.ceil();
+        let to_px = |axis: usize, v: f64| {
+            let v = v + nudge * (1.0 + v.abs());
+            ((v / 16.0).trunc().clamp(0.0, (size[axis] / 16.0).ceil()) * 16.0) as i64
         };
-        (to_px((uv[axis] - r) / 16.0), to_px((uv[axis] + r + 15.0) / 16.0))
+        [
+            to_px(0, uv[0] - r),
+            to_px(1, uv[1] - r),
+            to_px(0, uv[0] + r + 15.0),
+            to_px(1, uv[1] + r + 15.0),
+        ]
     };
-    let ((x0, x1), (y0, y1)) = (side(0), side(1));
-    (Some([x0, y0, x1, y1]), shaky)
+    let rect = tiles(exact, 0.0);
+    let shaky = [-1e-5, 1e-5]
+        .into_iter()
+        .any(|e| tiles(exact * (1.0 + e), 0.0) != rect || tiles(exact, e) != rect);
+    (Some(rect), shaky)
 }
 
 /// Renders `splats`, all of them finite.
@@ -253,7 +256,8 @@ pub fn render(splats: &[Splat], camera: &Camera, options: &RasterOptions) -> Pic
             let raw = f.opacity * (-sigma).exp();
             let near_rim = (raw * 255.0 - 1.0).abs() < BAND;
             out.boundary[pixel] |= near_rim || (f.shaky && raw * 255.0 > 1.0 - BAND);
-            let inside = f.tiles.is_none_or(|[x0, y0, x1, y1]| x0 <= x && x < x1 && y0 <= y && y < y1);
+            let inside =
+                f.tiles.is_none_or(|[x0, y0, x1, y1]| x0 <= x && x < x1 && y0 <= y && y < y1);
             if raw < 1.0 / 255.0 || !inside {
                 continue;
             }
