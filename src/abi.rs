@@ -21,6 +21,8 @@ pub const LANE_OPACITY: usize = 10;
 
 /// A contribution below this alpha is skipped (8-bit quantisation; 3DGS).
 pub const ALPHA_MIN: f32 = 1.0 / 255.0;
+/// log₂ of [`ALPHA_MIN`].
+pub const ALPHA_MIN_LOG2: f32 = -7.994_353_3;
 /// Compositing stops where the transmittance would fall to this (3DGS).
 pub const TRANSMITTANCE_MIN: f32 = 1e-4;
 /// Largest alpha of one splat at one pixel, `standard` (gsplat).
@@ -35,6 +37,27 @@ pub const NEAR_MVSPLAT: f32 = 0.2;
 pub const LOWPASS: f32 = 0.3;
 /// Side of the tiles whose edges the `mvsplat` convention makes visible, px.
 pub const TILE_MVSPLAT: usize = 16;
+
+/// How far beyond the picture's edge x/z and y/z still move the Jacobian,
+/// `standard`: in units of tan(fov/2) beyond each edge (gsplat).
+pub const JACOBIAN_MARGIN_STANDARD: f32 = 0.3;
+/// Largest |x/z|, |y/z| that moves the Jacobian, `mvsplat`: in units of
+/// tan(fov/2) from the axis (INRIA).
+pub const JACOBIAN_LIMIT_MVSPLAT: f32 = 1.3;
+/// Added to camera z where a mean is projected, `mvsplat`, in units of the
+/// camera's near plane (INRIA).
+pub const Z_EPSILON_MVSPLAT: f32 = 1e-7;
+/// Smallest discriminant under the root of λ_max, `mvsplat`, px⁴ (INRIA).
+pub const DISCRIMINANT_MIN_MVSPLAT: f32 = 0.1;
+/// Radius of a splat in σ of its longer axis, `mvsplat` (INRIA).
+pub const RADIUS_SIGMAS_MVSPLAT: f32 = 3.0;
+/// Smallest divisor of Σ w z where depth is divided by the accumulated alpha.
+pub const DEPTH_ALPHA_MIN: f32 = 1e-10;
+
+/// Side of the tiles that the kernels work in, px. Invisible in the picture.
+pub const TILE: usize = 32;
+/// Side of the pixel blocks inside a tile, px: 4 × 4 = one 16-lane register.
+pub const BLOCK: usize = 4;
 
 /// Number of SH coefficients per colour channel at `degree`.
 pub const fn sh_coefficients(degree: usize) -> usize {

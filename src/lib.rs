@@ -9,5 +9,8 @@ pub mod cpu;
 pub mod io;
 pub mod model;
 pub mod ops;
+pub mod render;
 pub mod sh;
 pub mod splats;
+
+pub use render::{Picture, render};

@@ -1,8 +1,22 @@
 //! CPU kernels: plain `f32` slices in and out, rayon for threads, no tensors.
 //!
-//! Kernels trust their callers (`ops` checks shapes and dtypes) and do not fail.
-//! This is the only room where `unsafe` may appear.
+//! Kernels trust their callers ([`crate::ops`] checks shapes and dtypes) and do not
+//! fail. This is the only room where `unsafe` may appear.
+//!
+//! The rasterizer's stages, one file each: [`ewa`] (one splat), `project` (all
+//! splats), `sort` (depth order), `tiles` (lists), `blend` (one tile), `rasterize`
+//! (the frame).
 
+mod blend;
 pub mod conv2d;
+pub mod ewa;
 pub mod gemm;
 pub mod matching;
+mod project;
+mod rasterize;
+pub mod sh;
+mod sort;
+mod tiles;
+
+pub use project::{Geometry, SplatSlices};
+pub use rasterize::{Rasterizer, Rendered, Stats};

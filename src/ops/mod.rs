@@ -4,6 +4,9 @@
 
 pub mod conv2d;
 pub mod matching;
+mod rasterize;
+
+pub use rasterize::rasterize;
 
 use candle_core::{CpuStorage, Layout, Result, Shape, bail};
 
