@@ -19,6 +19,16 @@ pub mod spz;
 pub use splats::{
     SaveOptions, SaveReport, SplatFormat, SplatInfo, Up, load_splats, save_splats, splat_info,
 };
+pub mod cameras_json;
+pub mod colmap;
+pub mod image;
+pub mod matrices;
+pub mod protocol;
+pub mod re10k;
+pub mod resize;
+pub mod scene;
+pub mod transforms;
+pub mod undistort;
 
 use std::fs::File;
 use std::io::{BufWriter, Write};

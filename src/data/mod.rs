@@ -1,0 +1,5 @@
+//! From a scene to what the network takes: crops, depth ranges, context pairs.
+
+pub mod crop;
+pub mod depth;
+pub mod pair;
