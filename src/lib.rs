@@ -7,6 +7,7 @@ pub mod camera;
 pub mod config;
 pub mod cpu;
 pub mod io;
+pub mod metrics;
 pub mod model;
 pub mod ops;
 pub mod render;
