@@ -6,6 +6,7 @@ pub mod abi;
 pub mod camera;
 pub mod config;
 pub mod cpu;
+pub mod data;
 pub mod io;
 pub mod metrics;
 pub mod model;
