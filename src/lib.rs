@@ -4,7 +4,9 @@
 
 pub mod abi;
 pub mod camera;
+pub mod check;
 pub mod config;
+pub mod cpu;
 pub mod io;
 pub mod model;
 pub mod sh;
