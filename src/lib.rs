@@ -4,6 +4,7 @@
 
 pub mod abi;
 pub mod camera;
+pub mod check;
 pub mod config;
 pub mod cpu;
 pub mod data;

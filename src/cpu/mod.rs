@@ -9,6 +9,7 @@
 
 mod blend;
 pub mod conv2d;
+pub mod detail;
 pub mod ewa;
 pub mod gemm;
 pub mod matching;

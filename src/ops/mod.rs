@@ -8,7 +8,7 @@ mod rasterize;
 
 pub use rasterize::rasterize;
 
-use candle_core::{CpuStorage, Layout, Result, Shape, bail};
+use candle_core::{CpuStorage, Layout, Result, Shape, Tensor, bail};
 
 /// The elements of an op's argument, which must be contiguous `f32`.
 pub(crate) fn f32_slice<'a>(
@@ -31,4 +31,14 @@ pub(crate) fn f32_slice<'a>(
 /// An op's result.
 pub(crate) fn output(data: Vec<f32>, shape: impl Into<Shape>) -> Result<(CpuStorage, Shape)> {
     Ok((CpuStorage::F32(data), shape.into()))
+}
+
+/// A tensor's elements in order, copied.
+pub(crate) fn values(t: &Tensor) -> Result<Vec<f32>> {
+    t.flatten_all()?.to_vec1()
+}
+
+/// A tensor of `like`'s shape and device.
+pub(crate) fn tensor_like(data: Vec<f32>, like: &Tensor) -> Result<Tensor> {
+    Tensor::from_vec(data, like.shape(), like.device())
 }
