@@ -5,6 +5,7 @@
 //! a reader never sees half a file. Readers trust no declared size: they check it
 //! against the bytes that are there before they allocate.
 
+mod assemble;
 pub mod cameras_json;
 pub mod colmap;
 pub mod image;
