@@ -15,7 +15,8 @@
 //! 3DGS's list has `img_name, width, height, fx, fy, rotation` (camera to world),
 //! `position` (the eye): same axes, principal point in the middle.
 
-use super::scene::{Draft, Frame, Lens, Scene, SceneFormat, Units, assemble, find_image};
+use super::assemble::{Draft, Lens, assemble, find_image};
+use super::scene::{Frame, Scene, SceneFormat, Units};
 use super::{Error, Result, read, write_atomic};
 use crate::camera::{Camera, Intrinsics};
 use glam::{DMat4, DVec4};
@@ -49,6 +50,7 @@ pub struct CameraFile {
 }
 
 #[derive(Deserialize)]
+#[serde(expecting = "an object with frames")]
 struct InFile {
     units: Option<String>,
     #[serde(default)]
@@ -57,6 +59,7 @@ struct InFile {
 }
 
 #[derive(Deserialize)]
+#[serde(expecting = "a frame: file, width, height, fx, fy, cx, cy, c2w")]
 struct InFrame {
     file: String,
     width: f64,
@@ -72,6 +75,7 @@ struct InFrame {
 }
 
 #[derive(Deserialize)]
+#[serde(expecting = "a camera: img_name, width, height, fx, fy, rotation, position")]
 struct SplatFrame {
     img_name: String,
     width: f64,

@@ -7,7 +7,8 @@
 
 use super::{Error, Result, read, write_atomic};
 use image::{ImageDecoder, ImageReader, Limits};
-use std::io::Write;
+use std::fs::File;
+use std::io::{BufReader, Write};
 use std::path::Path;
 
 /// A picture with more pixels than this is refused before anything is allocated.
@@ -94,23 +95,22 @@ fn refused(path: &Path, error: image::ImageError) -> Error {
     }
 }
 
-/// Opens the decoder of `path`, with the size already checked.
+/// Opens the decoder of `path`, with the size already checked. The content decides
+/// which decoder, whatever the name's extension.
 fn decoder(path: &Path) -> Result<impl ImageDecoder> {
-    let mut reader = ImageReader::open(path).map_err(|e| Error::io(path, e))?;
+    let file = File::open(path).map_err(|e| Error::io(path, e))?;
+    let mut reader = ImageReader::new(BufReader::new(file));
     let mut limits = Limits::default();
     // Sixteen-bit RGBA of the largest size, and as much again for the decoder.
     limits.max_alloc = Some(MAX_PIXELS * 16);
     reader.limits(limits);
     let reader = reader.with_guessed_format().map_err(|e| Error::io(path, e))?;
     if reader.format().is_none() {
-        return Err(Error::format(
-            path,
-            "a PNG, JPEG, WebP, TIFF or BMP picture",
-            match std::fs::metadata(path) {
-                Ok(m) if m.len() == 0 => "an empty file",
-                _ => "bytes of no known picture format",
-            },
-        ));
+        let got = match std::fs::metadata(path) {
+            Ok(m) if m.len() == 0 => "an empty file",
+            _ => "bytes of no known picture format",
+        };
+        return Err(Error::format(path, "a PNG, JPEG, WebP, TIFF or BMP picture", got));
     }
     let decoder = reader.into_decoder().map_err(|e| refused(path, e))?;
     let (w, h) = decoder.dimensions();

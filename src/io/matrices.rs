@@ -4,7 +4,8 @@
 //!
 //! Numbers may be separated by white space, commas or brackets; `#` begins a comment.
 
-use super::scene::{Draft, Lens, Scene, SceneFormat, assemble, list_images};
+use super::assemble::{Draft, Lens, assemble, list_images};
+use super::scene::{Scene, SceneFormat};
 use super::transforms::opengl_to_opencv;
 use super::{Error, Result, read};
 use glam::{DMat4, DVec4};

@@ -19,6 +19,7 @@ pub mod spz;
 pub use splats::{
     SaveOptions, SaveReport, SplatFormat, SplatInfo, Up, load_splats, save_splats, splat_info,
 };
+mod assemble;
 pub mod cameras_json;
 pub mod colmap;
 pub mod image;

@@ -14,6 +14,7 @@ use std::path::Path;
 
 /// Frames of one test, as indices into the scene's frames.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(expecting = "context and target")]
 pub struct Views {
     /// Inputs, at least one.
     pub context: Vec<usize>,
@@ -38,6 +39,7 @@ impl Views {
 
 /// Intrinsics in pixels of the protocol's resolution.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[serde(expecting = "fx, fy, cx, cy")]
 pub struct ProtocolIntrinsics {
     /// Horizontal focal length, px.
     pub fx: f64,
@@ -51,6 +53,7 @@ pub struct ProtocolIntrinsics {
 
 /// Content of a `protocol.json`.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(expecting = "an object with tests")]
 pub struct Protocol {
     /// Width and height of input and target, px.
     pub resolution: Option<[usize; 2]>,

@@ -7,14 +7,16 @@
 //! fy_norm · H, so a squeezed copy has fx ≠ fy.
 //!
 //! Frames are looked for in `images/`, `frames/`, a folder with the txt's name, and
-//! beside the txt. They are matched by time stamp where their names are the time
-//! stamps (as downloaders write), else in order where there are as many as lines,
-//! else by number where every name is the index of a line.
+//! beside the txt. They are matched by time stamp where all names are time stamps of
+//! the file (as downloaders write), else in order where there are as many as lines,
+//! else by time stamp where some are, else by number where every name is the index of
+//! a line, from 0.
 
-use super::scene::{Draft, Lens, Scene, SceneFormat, Units, assemble, list_images};
+use super::assemble::{Draft, Lens, assemble, list_images};
+use super::scene::{Scene, SceneFormat, Units};
 use super::{Error, Result, read};
 use glam::{DMat4, DVec4};
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 const COLUMNS: usize = 19;
@@ -136,7 +138,7 @@ pub(super) fn load(path: &Path) -> Result<Scene> {
     Ok(scene)
 }
 
-/// The picture of each camera, by the module's three rules.
+/// The picture of each camera, by the module's rules.
 fn matched(
     path: &Path,
     cameras: &[Re10kCamera],
@@ -153,10 +155,14 @@ fn matched(
 
     let by_time = by(&|i| cameras[i].timestamp);
     let by_index = by(&|i| i as i64);
-    let (list, rule) = if found(&by_time) > 0 {
+    let stamps: HashSet<i64> = cameras.iter().map(|c| c.timestamp).collect();
+    let all_stamped = images.iter().all(|p| number(p).is_some_and(|n| stamps.contains(&n)));
+    let (list, rule) = if all_stamped {
         (by_time, "time stamp")
     } else if images.len() == cameras.len() {
         return Ok(images.iter().cloned().map(Some).collect());
+    } else if found(&by_time) > 0 {
+        (by_time, "time stamp")
     } else if numbered.len() == images.len() && found(&by_index) == images.len() {
         (by_index, "number")
     } else {

@@ -7,7 +7,7 @@
 //! rounded to 22 fractional bits, one horizontal pass rounded to 8 bits, then one
 //! vertical pass.
 //!
-//! Golden values: tests/scenes.rs, made by tools/make_resize_golden.py.
+//! Golden values: tests/resize.rs, made by tools/make_resize_golden.py.
 
 use super::image::Rgb;
 use rayon::prelude::*;

@@ -8,8 +8,9 @@
 //! FULL_OPENCV, OPENCV_FISHEYE. Everything else in the file (`aabb_scale`,
 //! `sharpness`, …) is ignored, `ply_file_path` too.
 
+use super::assemble::{Draft, Lens, assemble, find_image};
 use super::cameras_json::{json_error, matrix, side};
-use super::scene::{Draft, Lens, Scene, SceneFormat, assemble, find_image};
+use super::scene::{Scene, SceneFormat};
 use super::undistort::Distortion;
 use super::{Error, Result, read};
 use glam::{DMat4, DVec4};
@@ -18,6 +19,7 @@ use std::path::Path;
 
 /// Keys that stand at the top, in a frame, or in both (the frame's wins).
 #[derive(Deserialize, Default, Clone)]
+#[serde(expecting = "an object")]
 struct Optics {
     camera_model: Option<String>,
     is_fisheye: Option<bool>,
@@ -87,6 +89,7 @@ impl Optics {
 }
 
 #[derive(Deserialize)]
+#[serde(expecting = "an object with frames")]
 struct File {
     #[serde(flatten)]
     optics: Optics,
@@ -94,6 +97,7 @@ struct File {
 }
 
 #[derive(Deserialize)]
+#[serde(expecting = "a frame: file_path, transform_matrix")]
 struct FileFrame {
     file_path: String,
     transform_matrix: Vec<Vec<f64>>,

@@ -14,7 +14,8 @@
 mod binary;
 mod text;
 
-use super::scene::{Draft, Lens, Scene, SceneFormat, assemble, find_image};
+use super::assemble::{Draft, Lens, assemble, find_image};
+use super::scene::{Scene, SceneFormat};
 use super::undistort::Distortion;
 use super::{Error, Result, read};
 use glam::{DMat4, DQuat, DVec3, Vec3};
