@@ -5,6 +5,7 @@
 pub mod abi;
 pub mod camera;
 pub mod config;
+pub mod data;
 pub mod io;
 pub mod metrics;
 pub mod model;
