@@ -3,3 +3,5 @@
 pub mod crop;
 pub mod depth;
 pub mod pair;
+//! Where examples come from.
+pub mod procedural;
