@@ -2,9 +2,14 @@
 //! checks live here, the arithmetic there. Every op either has a gradient or says
 //! plainly that it has none; none drops it silently.
 
+pub mod activation;
+pub mod attention;
 pub mod conv2d;
+pub mod norm;
+pub mod plane_sweep;
+pub mod resize;
 
-use candle_core::{CpuStorage, Layout, Result, Shape, bail};
+use candle_core::{CpuStorage, Layout, Result, Shape, Tensor, bail};
 
 /// The elements of an op's argument, which must be contiguous `f32`.
 pub(crate) fn f32_slice<'a>(
@@ -27,4 +32,14 @@ pub(crate) fn f32_slice<'a>(
 /// An op's result.
 pub(crate) fn output(data: Vec<f32>, shape: impl Into<Shape>) -> Result<(CpuStorage, Shape)> {
     Ok((CpuStorage::F32(data), shape.into()))
+}
+
+/// A tensor's elements in order, copied.
+pub(crate) fn values(t: &Tensor) -> Result<Vec<f32>> {
+    t.flatten_all()?.to_vec1()
+}
+
+/// A tensor of `like`'s shape and device.
+pub(crate) fn tensor_like(data: Vec<f32>, like: &Tensor) -> Result<Tensor> {
+    Tensor::from_vec(data, like.shape(), like.device())
 }
