@@ -7,14 +7,20 @@
 //! splats), `sort` (depth order), `tiles` (lists), `blend` (one tile), `rasterize`
 //! (the frame).
 
+pub mod activation;
+pub mod attention;
 mod blend;
 pub mod conv2d;
 pub mod detail;
 pub mod ewa;
 pub mod gemm;
 pub mod matching;
+pub mod math;
+pub mod norm;
+pub mod plane_sweep;
 mod project;
 mod rasterize;
+pub mod resize;
 pub mod sh;
 mod sort;
 mod tiles;

@@ -1,12 +1,11 @@
 //! Layers that both backbones and the SPGR heads use, under PyTorch's parameter
 //! names and with its initialisation. All have gradients.
 
+use crate::ops::activation::{Activation, activation};
 use crate::ops::conv2d::conv2d;
-use candle_core::{D, Result, Tensor, bail};
+use crate::ops::norm;
+use candle_core::{Result, Tensor, bail};
 use candle_nn::{Init, VarBuilder};
-
-/// ε of every normalisation (PyTorch's default).
-pub const NORM_EPS: f64 = 1e-5;
 
 /// PyTorch's default for weights and biases of Linear and Conv: U(±1/√fan_in).
 pub fn default_init(fan_in: usize) -> Init {
@@ -206,15 +205,7 @@ impl GroupNorm {
     /// # Errors
     /// Another number of channels.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        let dims = x.dims().to_vec();
-        let c = self.weight.elem_count();
-        if dims.len() < 3 || dims[1] != c {
-            bail!("group norm: expected [B, {c}, ..], got {dims:?}");
-        }
-        let rows = normalise_rows(&x.contiguous()?.reshape((dims[0] * self.groups, ()))?)?;
-        let y = rows.reshape((dims[0], c, ()))?;
-        let y = y.broadcast_mul(&self.weight.reshape((1, c, 1))?)?;
-        y.broadcast_add(&self.bias.reshape((1, c, 1))?)?.reshape(dims)
+        norm::group_norm(x, self.groups, &self.weight, &self.bias)
     }
 }
 
@@ -224,8 +215,7 @@ impl GroupNorm {
 /// # Errors
 /// Another rank.
 pub fn instance_norm(x: &Tensor) -> Result<Tensor> {
-    let (b, c, _, _) = x.dims4()?;
-    normalise_rows(&x.contiguous()?.reshape((b * c, ()))?)?.reshape(x.shape())
+    norm::instance_norm(x)
 }
 
 /// Normalises the last dimension, then scales and shifts: `weight`, `bias` `[C]`.
@@ -252,100 +242,44 @@ impl LayerNorm {
     /// # Errors
     /// Another last dimension.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        let c = self.weight.elem_count();
-        if x.dims().last() != Some(&c) {
-            bail!("layer norm: expected x [.., {c}], got {:?}", x.dims());
-        }
-        let y = normalise_rows(&x.contiguous()?.reshape(((), c))?)?;
-        y.broadcast_mul(&self.weight)?.broadcast_add(&self.bias)?.reshape(x.shape())
+        norm::layer_norm(x, &self.weight, &self.bias)
     }
 }
 
-/// `[R, n]`: each row to zero mean and unit (biased) variance.
-fn normalise_rows(x: &Tensor) -> Result<Tensor> {
-    let centred = x.broadcast_sub(&x.mean_keepdim(1)?)?;
-    let variance = centred.sqr()?.mean_keepdim(1)?;
-    centred.broadcast_div(&(variance + NORM_EPS)?.sqrt()?)
+/// max(0, x).
+///
+/// # Errors
+/// Not an f32 tensor.
+pub fn relu(x: &Tensor) -> Result<Tensor> {
+    activation(x, Activation::Relu)
 }
 
 /// x·sigmoid(x).
 ///
 /// # Errors
-/// Not a float tensor.
+/// Not an f32 tensor.
 pub fn silu(x: &Tensor) -> Result<Tensor> {
-    x.silu()
+    activation(x, Activation::Silu)
 }
 
 /// x·Φ(x), the exact (erf) form.
 ///
 /// # Errors
-/// Not a float tensor.
+/// Not an f32 tensor.
 pub fn gelu(x: &Tensor) -> Result<Tensor> {
-    x.gelu_erf()
+    activation(x, Activation::Gelu)
 }
 
-/// 1/(1 + e⁻ˣ), stable at both ends.
+/// 1/(1 + e⁻ˣ).
 ///
 /// # Errors
-/// Not a float tensor.
+/// Not an f32 tensor.
 pub fn sigmoid(x: &Tensor) -> Result<Tensor> {
-    // ½(1 + tanh(x/2)): candle's own op form has no gradient.
-    (x * 0.5)?.tanh()?.affine(0.5, 0.5)
+    activation(x, Activation::Sigmoid)
 }
 
-/// Softmax over the last dimension.
-///
-/// # Errors
-/// A scalar.
-pub fn softmax(x: &Tensor) -> Result<Tensor> {
-    // The maximum only guards the exponent; no gradient passes through it.
-    let e = x.broadcast_sub(&x.detach().max_keepdim(D::Minus1)?)?.exp()?;
-    e.broadcast_div(&e.sum_keepdim(D::Minus1)?)
-}
-
-/// Bilinear resize of `[B, C, h, w]` to `[B, C, H, W]`, corner pixels on corner
-/// pixels (`align_corners = true`).
-///
-/// # Errors
-/// Another rank, an empty size.
-pub fn resize_bilinear(x: &Tensor, height: usize, width: usize) -> Result<Tensor> {
-    let (b, c, h, w) = x.dims4()?;
-    if h == 0 || w == 0 || height == 0 || width == 0 {
-        bail!("bilinear resize: expected sizes of at least 1, got {h}x{w} to {height}x{width}");
-    }
-    let rows = interpolation(h, height, x)?;
-    let cols = interpolation(w, width, x)?;
-    let y = x.contiguous()?.reshape((b * c * h, w))?.matmul(&cols.t()?)?;
-    let y = y.reshape((b * c, h, width))?;
-    let rows = rows.unsqueeze(0)?.broadcast_as((b * c, height, h))?.contiguous()?;
-    rows.matmul(&y)?.reshape((b, c, height, width))
-}
-
-/// `[to, from]`: the weights of linear interpolation, corners aligned.
-fn interpolation(from: usize, to: usize, like: &Tensor) -> Result<Tensor> {
-    let mut m = vec![0f32; from * to];
-    for i in 0..to {
-        let at = if to > 1 { (i * (from - 1)) as f64 / (to - 1) as f64 } else { 0.0 };
-        let k = (at.floor() as usize).min(from - 1);
-        let f = (at - k as f64) as f32;
-        m[i * from + k] += 1.0 - f;
-        if k + 1 < from {
-            m[i * from + k + 1] += f;
-        }
-    }
-    Tensor::from_vec(m, (to, from), like.device())
-}
-
-/// `[B, C, h, w]` to `[B, C, s·h, s·w]`, each pixel repeated s × s times.
-///
-/// # Errors
-/// Another rank.
-pub fn upsample_nearest(x: &Tensor, s: usize) -> Result<Tensor> {
-    // Not candle's `upsample_nearest2d`: its gradient overwrites instead of adding.
-    let (b, c, h, w) = x.dims4()?;
-    let x = x.reshape((b, c, h, 1, w, 1))?.broadcast_as((b, c, h, s, w, s))?;
-    x.contiguous()?.reshape((b, c, h * s, w * s))
-}
+pub use crate::ops::activation::softmax;
+pub use crate::ops::resize::{resize_bilinear, upsample_nearest};
 
 #[cfg(test)]
 mod tests {

@@ -2,9 +2,14 @@
 //! checks live here, the arithmetic there. Every op either has a gradient or says
 //! plainly that it has none; none drops it silently.
 
+pub mod activation;
+pub mod attention;
 pub mod conv2d;
 pub mod matching;
+pub mod norm;
+pub mod plane_sweep;
 mod rasterize;
+pub mod resize;
 
 pub use rasterize::rasterize;
 
