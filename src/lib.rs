@@ -5,7 +5,9 @@
 pub mod abi;
 pub mod camera;
 pub mod config;
+pub mod cpu;
 pub mod io;
 pub mod model;
+pub mod ops;
 pub mod sh;
 pub mod splats;

@@ -2,6 +2,14 @@
 //!
 //! Parameter names are PyTorch's, so that a converted checkpoint loads as it is.
 
+pub mod aggregation;
+pub mod embed;
+pub mod geometry;
+pub mod mlp;
+pub mod spgr;
+pub mod spgr_ref;
+pub mod trunk;
+
 use crate::camera::Camera;
 use crate::config::FeatureLevel;
 use candle_core::{Result, Tensor, bail};
