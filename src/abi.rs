@@ -157,3 +157,39 @@ impl Default for RasterOptions {
         Self::new(Convention::Standard)
     }
 }
+
+/// Floats of one child in the heads' record: Δu, Δv, Δz, Δlog s (3), Δr (3), ℓ, γ̃
+/// (SubSplat, g_θ and h_φ).
+pub const HEAD_LANES: usize = 11;
+/// First lane of the learned offset (û, v̂), sub-pixels before any bound.
+pub const HEAD_OFFSET: usize = 0;
+/// Lane of the depth residual before its tanh.
+pub const HEAD_DEPTH: usize = 2;
+/// First lane of Δlog s.
+pub const HEAD_LOG_SCALE: usize = 3;
+/// First lane of Δr, a rotation vector in the parent's own axes, radians.
+pub const HEAD_ROTATION: usize = 6;
+/// Lane of the opacity logit ℓ.
+pub const HEAD_LOGIT: usize = 9;
+/// Lane of the colour gain γ̃ before its tanh.
+pub const HEAD_GAIN: usize = 10;
+/// Lanes that the geometry head g_θ gives; the appearance head h_φ gives the rest.
+pub const HEAD_GEOMETRY_LANES: usize = 9;
+
+/// ε of w̃ = w / (A + ε), px² (supp. A.3).
+pub const AREA_EPS: f64 = 1e-8;
+/// Largest parent opacity of which a logarithm is taken (spec 2.11).
+pub const OPACITY_CEILING: f64 = 0.9999;
+/// Largest child opacity under the `area` rule.
+pub const AREA_RULE_OPACITY_MAX: f64 = 0.99;
+/// Most that the minimum-footprint rule multiplies a σ by (spec 2.6).
+pub const GROWTH_MAX: f64 = 50.0;
+/// Added to the squared area, so that its root has a gradient at zero, px⁴.
+pub const AREA_SQ_EPS: f64 = 1e-24;
+/// A child lies at least this fraction of its parent's depth away (spec 2.4).
+pub const DEPTH_FRACTION_MIN: f64 = 0.1;
+/// How far beyond each picture edge, in tan(fov/2), the Jacobian's x/z and y/z may
+/// reach (3DGS: 1.3·tan(fov/2) in all).
+pub const FRUSTUM_MARGIN: f64 = 0.3;
+/// Least camera z at which a point is projected for sampling (GaussianFormer).
+pub const VISIBLE_Z_MIN: f64 = 1e-5;

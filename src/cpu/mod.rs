@@ -9,6 +9,7 @@
 
 pub mod activation;
 pub mod attention;
+pub mod attention_gather;
 mod blend;
 pub mod conv2d;
 pub mod detail;
@@ -20,9 +21,12 @@ pub mod norm;
 pub mod plane_sweep;
 mod project;
 mod rasterize;
+pub mod real;
+pub mod redistribute;
 pub mod resize;
 pub mod sh;
 mod sort;
+pub mod spgr;
 mod tiles;
 
 pub use project::{Geometry, SplatSlices};

@@ -5,6 +5,13 @@
 pub mod backbone;
 pub mod layers;
 pub mod weights;
+pub mod aggregation;
+pub mod embed;
+pub mod geometry;
+pub mod mlp;
+pub mod spgr;
+pub mod spgr_ref;
+pub mod trunk;
 
 use crate::camera::Camera;
 use crate::config::FeatureLevel;

@@ -4,12 +4,15 @@
 
 pub mod activation;
 pub mod attention;
+pub mod attention_gather;
 pub mod conv2d;
 pub mod matching;
 pub mod norm;
 pub mod plane_sweep;
 mod rasterize;
+pub mod redistribute;
 pub mod resize;
+pub mod spgr;
 
 pub use rasterize::rasterize;
 
