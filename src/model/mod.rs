@@ -2,16 +2,16 @@
 //!
 //! Parameter names are PyTorch's, so that a converted checkpoint loads as it is.
 
-pub mod backbone;
-pub mod layers;
-pub mod weights;
 pub mod aggregation;
+pub mod backbone;
 pub mod embed;
 pub mod geometry;
+pub mod layers;
 pub mod mlp;
 pub mod spgr;
 pub mod spgr_ref;
 pub mod trunk;
+pub mod weights;
 
 use crate::camera::Camera;
 use crate::config::FeatureLevel;

@@ -87,7 +87,14 @@ impl Layout {
         self.materials.len() - 1
     }
 
-    pub(super) fn add(&mut self, form: Form, centre: Vec3, axes: Mat3, half: Vec3, material: usize) {
+    pub(super) fn add(
+        &mut self,
+        form: Form,
+        centre: Vec3,
+        axes: Mat3,
+        half: Vec3,
+        material: usize,
+    ) {
         let mut primitive = Primitive::new(form, centre, axes, half);
         primitive.material = material;
         self.primitives.push(primitive);

@@ -1,8 +1,8 @@
 //! Light: two lamps, an ambient gradient, corners that darken, highlights and mirrors.
 
 use super::rng::Rng;
-use super::{Room, Surface};
 use super::shape::{Primitive, Ray};
+use super::{Room, Surface};
 use glam::Vec3;
 
 /// A lamp without extent, or a small ball of it where shadows are soft.
@@ -75,12 +75,19 @@ impl Room {
     }
 
     /// Radiance without the mirror's part; that part's weight and ray beside it.
-    fn shaded(&self, solid: &Primitive, ray: &Ray, t: f32, look: &Look) -> (Vec3, Option<(f32, Ray)>) {
+    fn shaded(
+        &self,
+        solid: &Primitive,
+        ray: &Ray,
+        t: f32,
+        look: &Look,
+    ) -> (Vec3, Option<(f32, Ray)>) {
         let point = ray.at(t);
         let surface = solid.surface(point);
         let toward_eye = -ray.direction.normalize_or(Vec3::Z);
         let facing = surface.normal.dot(toward_eye).max(0.05);
-        let material = &self.materials[solid.material + if solid.is_shell() { surface.face } else { 0 }];
+        let material =
+            &self.materials[solid.material + if solid.is_shell() { surface.face } else { 0 }];
         // A slanted surface stretches the footprint one way only: the geometric mean.
         let footprint = t * look.spread / facing.sqrt();
         let colour = material.colour(&self.bank, surface.uv, footprint);
@@ -94,7 +101,9 @@ impl Room {
             let distance2 = path.length_squared();
             let direction = path / distance2.sqrt().max(1e-6);
             let slope = surface.normal.dot(direction);
-            if slope <= 0.0 || (lamp.casts_shadow && self.shadowed(point + surface.normal * 1e-3, place)) {
+            if slope <= 0.0
+                || (lamp.casts_shadow && self.shadowed(point + surface.normal * 1e-3, place))
+            {
                 continue;
             }
             // 0.3 m² keep a wall beside a lamp from burning out.

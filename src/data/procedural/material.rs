@@ -149,8 +149,11 @@ impl Material {
             _ if straight || rng.chance(0.5) => quarter * rng.count(0, 1) as f32,
             _ => rng.range(0.0, 4.0 * quarter),
         };
-        let (specular, gloss) =
-            if rng.chance(0.2) { (rng.range(0.05, 0.5), rng.log_range(8.0, 150.0)) } else { (0.0, 1.0) };
+        let (specular, gloss) = if rng.chance(0.2) {
+            (rng.range(0.05, 0.5), rng.log_range(8.0, 150.0))
+        } else {
+            (0.0, 1.0)
+        };
         Self {
             texture,
             base,

@@ -276,14 +276,15 @@ fn blurred(rgb: &[f32], width: usize, sigma: f32) -> Vec<f32> {
     let height = rgb.len() / (3 * width.max(1));
     // Position `at` moved by tap k, within 0..n.
     let clamped = |at: usize, k: usize, n: usize| (at + k).saturating_sub(radius).min(n - 1);
-    let pass = |source: &[f32], index: &(dyn Fn(usize, usize, usize) -> usize + Sync)| -> Vec<f32> {
-        let value = |i: usize| {
-            let (pixel, c) = (i / 3, i % 3);
-            let (x, y) = (pixel % width, pixel / width);
-            taps.iter().enumerate().map(|(k, t)| t * source[index(x, y, k) * 3 + c]).sum()
+    let pass =
+        |source: &[f32], index: &(dyn Fn(usize, usize, usize) -> usize + Sync)| -> Vec<f32> {
+            let value = |i: usize| {
+                let (pixel, c) = (i / 3, i % 3);
+                let (x, y) = (pixel % width, pixel / width);
+                taps.iter().enumerate().map(|(k, t)| t * source[index(x, y, k) * 3 + c]).sum()
+            };
+            (0..source.len()).into_par_iter().map(value).collect()
         };
-        (0..source.len()).into_par_iter().map(value).collect()
-    };
     let across = pass(rgb, &|x, y, k| y * width + clamped(x, k, width));
     pass(&across, &|x, y, k| clamped(y, k, height) * width + x)
 }

@@ -326,7 +326,8 @@ mod tests {
                 let p = placed(form, &mut rng);
                 let ray = Ray {
                     origin: p.centre + if form == Form::Shell { 0.0 } else { 3.0 } * Vec3::Y,
-                    direction: vector(&mut rng, 1.0) - if form == Form::Shell { 0.0 } else { 3.0 } * Vec3::Y,
+                    direction: vector(&mut rng, 1.0)
+                        - if form == Form::Shell { 0.0 } else { 3.0 } * Vec3::Y,
                 };
                 let Some(t) = p.intersect(&ray, 1e9) else { continue };
                 let (point, h) = (ray.at(t), 2e-3);

@@ -169,10 +169,7 @@ fn leaves(size: usize, rng: &mut Rng) -> Fields {
             } else {
                 ((x / half[0]).hypot(y / half[1]) - 1.0) * half[1]
             };
-            Dab {
-                cover: (0.5 - distance).clamp(0.0, 1.0),
-                value: [value[0] + slope * x, value[1]],
-            }
+            Dab { cover: (0.5 - distance).clamp(0.0, 1.0), value: [value[0] + slope * x, value[1]] }
         });
         area -= std::f32::consts::PI * half[0] * half[1];
     }
@@ -202,9 +199,7 @@ fn stripes(size: usize, rng: &mut Rng) -> Fields {
         .collect();
     let wear = scale_free(size, 1.2, 0, rng);
     let amount = rng.range(0.0, 0.05);
-    Fields::from_fn(size, |x, y| {
-        [column[x][0] + amount * wear[y * size + x], column[x][1]]
-    })
+    Fields::from_fn(size, |x, y| [column[x][0] + amount * wear[y * size + x], column[x][1]])
 }
 
 fn text(size: usize, rng: &mut Rng) -> Fields {
