@@ -21,6 +21,9 @@ use candle_core::{Result, Tensor, bail};
 /// identity, a kernel that averages); `values` come as drawn from the hint.
 pub(crate) fn start_value(name: &str, shape: &[usize], values: &mut [f32]) {
     backbone::small_start(name, shape, values);
+    if let Some(start) = trunk::initial_value(name, shape) {
+        values.copy_from_slice(&start);
+    }
 }
 
 /// B scenes of V posed pictures each, as the network takes them.

@@ -20,6 +20,7 @@ use crate::config::{FeatureLevel, Small};
 use crate::model::layers::{Conv2d, ConvShape, GroupNorm, gelu, resize_bilinear, sigmoid, softmax};
 use crate::model::{BackboneOutput, Views};
 use crate::ops::matching::raw_matching;
+use crate::ops::plane_sweep::{Pair, Projection, Sweep, pair, plane_sweep};
 use crate::sh::C0;
 use candle_core::{D, Result, Tensor, bail};
 use candle_nn::{Init, VarBuilder};
@@ -201,18 +202,30 @@ impl SmallBackbone {
 
     /// Volume of matching scores, through the stem.
     fn sweep(&self, views: &Views, feat4: &Tensor) -> Result<Swept> {
-        let (b, v) = (views.scenes(), views.views());
         let unit = self.matching.forward(feat4)?;
         let norm = (unit.sqr()?.transpose(1, 3)?.contiguous()?.sum_keepdim(D::Minus1)? + 1e-8)?;
         let unit = unit.broadcast_div(&norm.sqrt()?.transpose(1, 3)?.contiguous()?)?;
-        let (_, c, h, w) = unit.dims4()?;
-        let unit = unit.reshape((b, v, c, h, w))?;
+        let (_, channels, h, w) = unit.dims4()?;
         let d = self.config.depth_candidates;
+        let disparities = candidates(views, d);
+        let sweep = Sweep {
+            pairs: pairs(views, h, w)?,
+            depths: disparities
+                .iter()
+                .flatten()
+                .map(|list| list.iter().map(|d| 1.0 / d).collect())
+                .collect(),
+            centre: 0.5,
+            min_z: 1e-3,
+            scale: 1.0,
+            channels,
+            size: [h, w],
+        };
         // [B·V, 1, D, h, w]
-        let learned = Tensor::zeros((b * v, 1, d, h, w), unit.dtype(), unit.device())?;
+        let learned = plane_sweep(&unit, &unit, sweep)?.unsqueeze(1)?;
         let volume = match self.config.raw_matching {
             true => {
-                let raw = raw_matching(&views.images, &views.cameras, &candidates(views, d))?;
+                let raw = raw_matching(&views.images, &views.cameras, &disparities)?;
                 Tensor::cat(&[&learned, &raw], 1)?
             }
             false => learned,
@@ -346,6 +359,21 @@ fn conv_norm(c: usize, o: usize, s: ConvShape, vb: VarBuilder) -> Result<(Conv2d
 fn split_views(t: &Tensor, b: usize, v: usize) -> Result<Tensor> {
     let (_, c, h, w) = t.dims4()?;
     t.reshape((b, v, c, h, w))
+}
+
+/// For each view, all others of its scene, at feature resolution h × w.
+fn pairs(views: &Views, h: usize, w: usize) -> Result<Vec<Vec<Pair>>> {
+    let v = views.views();
+    let mut all = Vec::new();
+    for (b, scene) in views.cameras.iter().enumerate() {
+        let cameras: Vec<Camera> = scene.iter().map(|c| c.resized(w, h)).collect();
+        for i in 0..v {
+            let others = (0..v).filter(|&j| j != i);
+            let row = |j: usize| pair(&cameras[i], &cameras[j], Projection::Source, b * v + j);
+            all.push(others.map(row).collect::<Result<_>>()?);
+        }
+    }
+    Ok(all)
 }
 
 /// `[B][V]` lists of D disparities (1 / camera z), index 0 = far.
