@@ -2,7 +2,12 @@
 //!
 //! Parameter names are PyTorch's, so that a converted checkpoint loads as it is.
 
+pub mod backbone;
+pub mod compare;
+mod floors;
 pub mod layers;
+pub mod primaries;
+pub mod trace;
 pub mod weights;
 
 use crate::camera::Camera;
