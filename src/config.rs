@@ -888,13 +888,24 @@ impl Config {
     /// Side lengths of the input must be multiples of this, px.
     pub fn stride(&self) -> usize {
         match &self.backbone {
-            // Patch size 4 × downscale 4 (MVS patch shim); the refinement U-Net
-            // halves four times, the windows split the 1/4 map in two.
-            Backbone::Mvsplat(b) => {
-                16usize.max(1 << (b.refine_levels - 1)).max(4 * b.window_splits)
-            }
+            Backbone::Mvsplat(b) => Self::stride_of(b),
             Backbone::Small(b) => 4 << (b.unet_channels.len() - 1),
         }
+    }
+
+    /// [`Config::stride`] of MVSplat: patch size 4 × downscale 4 (MVS patch shim); the
+    /// refinement U-Net halves, the windows split and the cost volume's U-Net halves
+    /// the 1/4 map.
+    pub fn stride_of(b: &Mvsplat) -> usize {
+        let common = |a: usize, b: usize| {
+            let (mut x, mut y) = (a, b);
+            while y > 0 {
+                (x, y) = (y, x % y);
+            }
+            a / x.max(1) * b
+        };
+        let halvings = 16usize.max(1 << (b.refine_levels - 1)).max(4 << (b.costvolume_levels - 1));
+        common(halvings, 4 * b.window_splits)
     }
 
     /// JSON for the metadata of a weight file.

@@ -11,6 +11,10 @@ pub mod mlp;
 pub mod spgr;
 pub mod spgr_ref;
 pub mod trunk;
+pub mod compare;
+mod floors;
+pub mod primaries;
+pub mod trace;
 pub mod weights;
 
 use crate::camera::Camera;

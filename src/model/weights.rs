@@ -65,22 +65,13 @@ impl Weights {
     /// Not a safetensors file, a dtype other than f32, f16 and bf16, numbers that are
     /// not finite, a configuration that does not parse.
     pub fn load(path: &Path) -> io::Result<Self> {
-        let bytes = io::read(path)?;
-        let bad = |e: safetensors::SafeTensorError| {
-            io::Error::format(path, "a safetensors file", e.to_string())
-        };
-        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(bad)?;
-        let config = match header.metadata().as_ref().and_then(|m| m.get(Config::METADATA_KEY)) {
+        let (tensors, metadata) = read_tensors(path)?;
+        let config = match metadata.get(Config::METADATA_KEY) {
             Some(json) => Some(Config::from_json(json).map_err(|e| {
                 io::Error::format(path, "a configuration in the metadata", e.to_string())
             })?),
             None => None,
         };
-        let mut tensors = BTreeMap::new();
-        for (name, view) in SafeTensors::deserialize(&bytes).map_err(bad)?.tensors() {
-            let tensor = widen(path, &name, &view)?;
-            tensors.insert(name, tensor);
-        }
         Ok(Self { config, ..Self::from_tensors(tensors) })
     }
 
@@ -221,6 +212,28 @@ impl SimpleBackend for Weights {
     fn contains_tensor(&self, name: &str) -> bool {
         self.find(name).is_some()
     }
+}
+
+/// All tensors of a safetensors file as f32, and its metadata.
+///
+/// # Errors
+/// Not a safetensors file, a dtype other than f32, f16 and bf16, numbers that are not
+/// finite.
+pub fn read_tensors(
+    path: &Path,
+) -> io::Result<(BTreeMap<String, Tensor>, HashMap<String, String>)> {
+    let bytes = io::read(path)?;
+    let bad = |e: safetensors::SafeTensorError| {
+        io::Error::format(path, "a safetensors file", e.to_string())
+    };
+    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(bad)?;
+    let metadata = header.metadata().clone().unwrap_or_default();
+    let mut tensors = BTreeMap::new();
+    for (name, view) in SafeTensors::deserialize(&bytes).map_err(bad)?.tensors() {
+        let tensor = widen(path, &name, &view)?;
+        tensors.insert(name, tensor);
+    }
+    Ok((tensors, metadata))
 }
 
 /// One tensor of the file as f32, checked to be finite.
