@@ -91,13 +91,15 @@ impl Tile {
         let mut masks = [0u64; BLOCKS * BLOCKS];
         let mut batch = [Footprint::default(); BATCH];
         for entries in list.chunks(BATCH) {
-            for (s, (entry, slot)) in entries.iter().zip(&mut batch).enumerate() {
+            // All loads first: they miss the cache, and side by side they overlap.
+            for (entry, slot) in entries.iter().zip(&mut batch) {
                 *slot = footprints[entry.load(Relaxed) as usize];
-                // Tile coordinates from here on: small numbers, the same text for
-                // every tile.
-                slot.u -= left as f32;
-                slot.v -= top as f32;
-                mark(slot, [left, top], 1 << s, &mut masks);
+            }
+            for (s, f) in batch[..entries.len()].iter_mut().enumerate() {
+                // Tile coordinates from here on: small numbers keep their digits.
+                f.u -= left as f32;
+                f.v -= top as f32;
+                mark(f, [left, top], 1 << s, &mut masks);
             }
             for b in bits(live) {
                 let block = &mut self.blocks[b];
@@ -167,27 +169,23 @@ impl Block {
     fn blend(&mut self, f: &Footprint, x: f32, y: f32, rules: Rules) -> bool {
         let mut alpha = power(f, x, y);
         alpha_of(&mut alpha, rules.alpha_max);
-        let mut weight = [0.0; LANES];
-        let mut next = [0.0; LANES];
+        let [red, green, blue] = f.rgb;
+        let [r, g, b] = &mut self.rgb;
+        // One loop over whole arrays, by index: the form that becomes vectors.
         for l in 0..LANES {
             let t = self.t[l];
             // Where blending has stopped, t < 0 and nothing more is added.
             let w = alpha[l] * if t > 0.0 { t } else { 0.0 };
             let rest = t - w;
             let stop = rest <= rules.stop;
-            weight[l] = if stop { 0.0 } else { w };
-            next[l] = if stop { -t.abs() } else { rest };
+            let w = if stop { 0.0 } else { w };
+            self.t[l] = if stop { -t.abs() } else { rest };
+            r[l] += w * red;
+            g[l] += w * green;
+            b[l] += w * blue;
+            self.z[l] += w * f.z;
         }
-        self.t = next;
-        for (sums, c) in self.rgb.iter_mut().zip(f.rgb) {
-            for (sum, w) in sums.iter_mut().zip(&weight) {
-                *sum += w * c;
-            }
-        }
-        for (sum, w) in self.z.iter_mut().zip(&weight) {
-            *sum += w * f.z;
-        }
-        any_positive(&next)
+        any_positive(&self.t)
     }
 }
 

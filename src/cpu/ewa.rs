@@ -29,7 +29,7 @@ const SUPPORT_SLACK: f32 = 1e-4;
 /// Widening of a row's interval, px, for the rounding of pixel positions.
 const SPAN_SLACK_PX: f32 = 1e-3;
 
-const _: () = assert!(TILE_MVSPLAT % BLOCK == 0, "the tile cut falls on block edges");
+const _: () = assert!(TILE_MVSPLAT.is_multiple_of(BLOCK), "the tile cut falls on block edges");
 
 /// A projected splat, one cache line.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

@@ -85,7 +85,7 @@ impl SplatSlices<'_> {
         };
         let p = self.parents();
         let sh = self.sh.len() == p * 3 * sh_coefficients(self.sh_degree);
-        let children = if p == 0 { n == 0 } else { n % p == 0 };
+        let children = if p == 0 { n == 0 } else { n.is_multiple_of(p) };
         let gain = self.gain.is_empty() || self.gain.len() == n || self.gain.len() == 4 * n;
         geometry && sh && children && gain
     }

@@ -132,7 +132,7 @@ mod tests {
                 state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
                 // Few distinct depths over many magnitudes: ties and all digits.
                 let z =
-                    ((state >> 20) as f32).exp2().min(1e30).max(1e-30) / 7.0 + (state >> 28) as f32;
+                    ((state >> 20) as f32).exp2().clamp(1e-30, 1e30) / 7.0 + (state >> 28) as f32;
                 Footprint { z, x1: u32::from(state & 0x300 != 0), ..Footprint::default() }
             })
             .collect();

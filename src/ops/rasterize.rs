@@ -53,7 +53,7 @@ fn check_shapes(splats: &Tensor, sh: &Tensor, gain: &Tensor) -> Result<()> {
     if degree_of(d).is_none() {
         bail!("rasterize: expected sh [P, D, 3] with D = 1, 4, 9, 16 or 25, got {:?}", sh.dims());
     }
-    if (n == 0) != (p == 0) || (p > 0 && n % p != 0) {
+    if (n == 0) != (p == 0) || (p > 0 && !n.is_multiple_of(p)) {
         bail!("rasterize: expected sh [P, D, 3] with P dividing N = {n}, got {:?}", sh.dims());
     }
     if gain.dims() != [n] && gain.dims() != [n, 4] {

@@ -277,8 +277,8 @@ pub fn render(splats: &[Splat], camera: &Camera, options: &RasterOptions) -> Pic
             depth += t * alpha * f.z;
             t = rest;
         }
-        for c in 0..3 {
-            out.rgb[3 * pixel + c] = rgb[c] + t * f64::from(options.background[c]);
+        for (c, sum) in rgb.into_iter().enumerate() {
+            out.rgb[3 * pixel + c] = sum + t * f64::from(options.background[c]);
         }
         out.alpha[pixel] = 1.0 - t;
         out.depth_sum[pixel] = depth;
