@@ -6,10 +6,8 @@ use std::path::PathBuf;
 /// they are absent. `SUBSPLAT_SHARED=require` (CI) turns absence into failure.
 #[allow(dead_code, reason = "not every test binary uses every helper")]
 pub fn shared(relative: &str) -> Option<PathBuf> {
-    let folder = std::env::var_os("SUBSPLAT_SHARED_DIR").map_or_else(
-        || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared"),
-        PathBuf::from,
-    );
+    let folder = std::env::var_os("SUBSPLAT_SHARED_DIR")
+        .map_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared"), PathBuf::from);
     let path = folder.join(relative);
     if path.exists() {
         return Some(path);
