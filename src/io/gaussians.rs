@@ -102,7 +102,7 @@ impl<'a> Outgoing<'a> {
                     Error::format(path, "an opacity in [0, 1]", got).at(format!(" splat {i}"))
                 );
             }
-            if opacity < self.min_opacity {
+            if !self.keeps(i) {
                 self.pruned += 1;
                 continue;
             }
@@ -119,7 +119,12 @@ impl<'a> Outgoing<'a> {
 
     /// Indices of the Gaussians that are written, in order.
     pub fn kept(&self) -> impl Iterator<Item = usize> {
-        (0..self.splats.len()).filter(|&i| self.splats.opacity(i) >= self.min_opacity)
+        (0..self.splats.len()).filter(|&i| self.keeps(i))
+    }
+
+    fn keeps(&self, i: usize) -> bool {
+        // A hair below zero is zero.
+        self.splats.opacity(i).max(0.0) >= self.min_opacity
     }
 
     fn mean(&self, i: usize) -> [f32; 3] {
@@ -353,11 +358,6 @@ impl Incoming {
     pub fn sh_mut(&mut self, i: usize) -> Option<&mut [f32]> {
         let set = 3 * sh_coefficients(self.sh_degree);
         self.sh.get_mut(i * set..(i + 1) * set)
-    }
-
-    /// Number of Gaussians so far.
-    pub fn len(&self) -> usize {
-        self.rows.len() / SPLAT_LANES
     }
 
     /// All of them as one set.

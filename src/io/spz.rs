@@ -6,7 +6,7 @@
 //! Gaussians, mean 3×24-bit fixed point (1: 3×f16), opacity u8, RGB of degree 0 u8 as
 //! 0.15·h + ½, ln σ u8 as 16·(ln σ + 10), rotation (1, 2: x y z as u8, w ≥ 0; 3, 4: the
 //! three smallest of xyzw, 9 bits and a sign each, under 2 bits of index), SH u8 as
-//! 128·h + 128, RGB innermost. Versions 1 to 3 are one gzip stream (a bare one is read
+//! 128·h + 128, RGB innermost (|h| beyond 1 is clamped). Versions 1 to 3 are one gzip stream (a bare one is read
 //! too); 4 has a 32-byte header with the offset of a table of (compressed,
 //! uncompressed) u64 pairs, one zstd stream for each attribute.
 //!
