@@ -606,6 +606,7 @@ fn mutated_scenes_answer_or_refuse() {
         ("cameras.bin", files[0].clone()),
     ];
     for (name, bytes) in sources {
+        let begun = std::time::Instant::now();
         let path = folder.path().join(name);
         let (mut refused, mut accepted) = (0, 0);
         for _ in 0..400 {
@@ -626,7 +627,7 @@ fn mutated_scenes_answer_or_refuse() {
             }
         }
         std::fs::write(&path, &bytes).unwrap();
-        eprintln!("{name}: {accepted} accepted, {refused} refused");
+        eprintln!("{name}: {accepted} accepted, {refused} refused, {:?}", begun.elapsed());
         assert!(refused > 20, "{name}");
     }
     for bytes in [&b"{\"tests\": [{\"context\": [0, 1], \"target\": [2]}]}"[..]] {

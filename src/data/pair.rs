@@ -125,7 +125,7 @@ pub fn choose_pair(scene: &Scene) -> Option<Pair> {
 /// * rotation costs little up to 25 degrees and much beyond: surfaces turn away.
 fn score(g: &ViewGeometry, depth: f32) -> Option<f32> {
     let parallax = g.baseline / depth;
-    if !(parallax > 1e-4) {
+    if parallax.is_nan() || parallax <= 1e-4 {
         return None;
     }
     let too_little = (OVERLAP[0] - g.overlap).max(0.0);

@@ -5,7 +5,7 @@ use super::image::{Probe, probe};
 use super::scene::{Frame, Scene, SceneFormat, Units};
 use super::undistort::Distortion;
 use super::{Error, Result};
-use crate::camera::{Camera, Intrinsics};
+use crate::camera::{Camera, CameraError, Intrinsics};
 use glam::{DMat3, DMat4};
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
@@ -160,6 +160,19 @@ fn stored_intrinsics(
     Ok((Intrinsics { fx, fy, cx, cy, width: stored.width, height: stored.height }, rescaled))
 }
 
+/// A refused camera, at its place in a file.
+pub(super) fn camera_error(path: &Path, place: &str, error: &CameraError) -> Error {
+    // "part: expected this, got that", the form of all errors.
+    let text = error.to_string();
+    let parts = || {
+        let (part, rest) = text.split_once(": expected ")?;
+        let (expected, got) = rest.split_once(", got ")?;
+        Some((format!("a {part} with {expected}"), got.to_owned()))
+    };
+    let (expected, got) = parts().unwrap_or(("a camera".to_owned(), text.clone()));
+    Error::format(path, expected, got).at(place)
+}
+
 /// Makes frames of drafts: looks at every picture's header, checks every camera,
 /// and leaves out, with a warning, frames whose picture is missing.
 pub(super) fn assemble(path: &Path, source: SceneFormat, drafts: Vec<Draft>) -> Result<Scene> {
@@ -222,7 +235,7 @@ fn frame(
     }
     let camera = match Camera::new(intrinsics, pose.as_mat4()) {
         Ok(camera) => camera,
-        Err(e) => return bad("a usable camera".to_owned(), e.to_string()),
+        Err(e) => return Err(camera_error(path, &draft.place, &e)),
     };
     if let Err(e) = draft.distortion.check() {
         return bad("finite distortion coefficients".to_owned(), e);

@@ -15,7 +15,7 @@
 //! 3DGS's list has `img_name, width, height, fx, fy, rotation` (camera to world),
 //! `position` (the eye): same axes, principal point in the middle.
 
-use super::assemble::{Draft, Lens, assemble, find_image};
+use super::assemble::{Draft, Lens, assemble, camera_error, find_image};
 use super::scene::{Frame, Scene, SceneFormat, Units};
 use super::{Error, Result, read, write_atomic};
 use crate::camera::{Camera, Intrinsics};
@@ -110,12 +110,13 @@ struct OutFrame<'a> {
     c2w: [[f32; 4]; 4],
 }
 
-/// A JSON error with its line; what serde expected and got stands in its message.
+/// A JSON error with its line and column; what serde expected and got stands in its message.
 pub(super) fn json_error(path: &Path, expected: &str, error: &serde_json::Error) -> Error {
     let text = error.to_string();
     // serde_json appends the place that `at` already says.
     let got = text.split(" at line ").next().unwrap_or(&text).to_owned();
-    let at = if error.line() > 0 { format!(":{}", error.line()) } else { String::new() };
+    let place = format!(":{}:{}", error.line(), error.column());
+    let at = if error.line() > 0 { place } else { String::new() };
     Error::format(path, expected, got).at(at)
 }
 
@@ -223,7 +224,7 @@ pub fn load_cameras_json(path: &Path) -> Result<CameraFile> {
         let [fx, fy, cx, cy] = k.map(|v| v as f32);
         let intrinsics = Intrinsics { fx, fy, cx, cy, width, height };
         let camera = Camera::new(intrinsics, d.world_from_camera.as_mat4())
-            .map_err(|e| Error::format(path, "a usable camera", e.to_string()).at(&d.place))?;
+            .map_err(|e| camera_error(path, &d.place, &e))?;
         let depth = d
             .depth
             .as_deref()

@@ -92,7 +92,7 @@ pub(super) fn find(folder: &Path) -> Result<Option<PathBuf>> {
     let mut files: Vec<PathBuf> = entries.filter_map(|e| Some(e.ok()?.path())).collect();
     files.sort();
     let like = |p: &PathBuf| {
-        if !p.extension().is_some_and(|e| e == "txt") {
+        if p.extension().is_none_or(|e| e != "txt") {
             return false;
         }
         let Ok(bytes) = read(p) else { return false };

@@ -199,7 +199,7 @@ mod tests {
         for y in 0..8 {
             for x in 0..4 {
                 let at = |x: usize| u32::from(p.data[3 * (y * 8 + x)]);
-                let mean = (at(2 * x) + at(2 * x + 1) + 1) / 2;
+                let mean = (at(2 * x) + at(2 * x + 1)).div_ceil(2);
                 assert_eq!(u32::from(half.data[3 * (y * 4 + x)]), mean);
             }
         }

@@ -111,7 +111,7 @@ impl Distortion {
         for i in 1..=STEPS {
             let r = limit * i as f64 / STEPS as f64;
             let bent = r * self.radial(r * r);
-            if !(bent > last) {
+            if bent.is_nan() || bent <= last {
                 return limit * (i - 1) as f64 / STEPS as f64;
             }
             last = bent;
@@ -227,8 +227,8 @@ fn sample(photo: &Rgb, u: f32, v: f32) -> [u8; 3] {
         let row = at(y0 + j as f32 - 1.0, photo.height) * photo.width;
         for (i, wx) in wx.into_iter().enumerate() {
             let p = 3 * (row + at(x0 + i as f32 - 1.0, photo.width));
-            for c in 0..3 {
-                sum[c] += wx * wy * f32::from(photo.data[p + c]);
+            for (s, v) in sum.iter_mut().zip(&photo.data[p..p + 3]) {
+                *s += wx * wy * f32::from(*v);
             }
         }
     }

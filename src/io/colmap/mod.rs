@@ -5,7 +5,8 @@
 //! ignored: `images.*` still holds every pose. Distortion is removed when a frame is
 //! loaded ([`super::undistort`]). Camera models read: SIMPLE_PINHOLE, PINHOLE,
 //! SIMPLE_RADIAL, RADIAL, OPENCV, OPENCV_FISHEYE, FULL_OPENCV,
-//! SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE; others are refused by name.
+//! SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, SIMPLE_FISHEYE, FISHEYE; others are refused
+//! by name.
 //!
 //! Frames are sorted by picture name, as COLMAP's image ids follow no order.
 //! Layout: COLMAP, `src/colmap/scene/reconstruction_io_{binary,text}` and the
@@ -94,7 +95,7 @@ const MODELS: [(&str, usize); 16] = [
 /// For messages.
 const MODELS_READ: &str = "a camera model among SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, \
                            OPENCV, OPENCV_FISHEYE, FULL_OPENCV, SIMPLE_RADIAL_FISHEYE, \
-                           RADIAL_FISHEYE";
+                           RADIAL_FISHEYE, SIMPLE_FISHEYE, FISHEYE";
 
 /// Focal lengths, principal point and distortion of `model` with its parameters,
 /// which must be as many as [`MODELS`] says.

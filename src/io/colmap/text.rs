@@ -162,8 +162,13 @@ fn image(line: Line<'_>) -> Result<ColmapImage> {
     let q = line.numbers::<4>(&mut words, "a quaternion QW QX QY QZ")?;
     let t = DVec3::from_array(line.numbers::<3>(&mut words, "a translation TX TY TZ")?);
     let camera = line.number(words.next(), "a camera id")?;
-    // A name may have spaces.
-    let name = words.collect::<Vec<_>>().join(" ");
+    // A name may have spaces, also several in a row.
+    let mut rest = line.text;
+    for _ in 0..9 {
+        rest = rest.trim_start();
+        rest = &rest[rest.find(char::is_whitespace).unwrap_or(rest.len())..];
+    }
+    let name = rest.trim_start().to_owned();
     if name.is_empty() {
         return Err(line.error("a picture name", "the end of the line"));
     }
