@@ -12,6 +12,7 @@ pub mod io;
 pub mod metrics;
 pub mod model;
 pub mod ops;
+pub mod pipeline;
 pub mod render;
 pub mod sh;
 pub mod splats;

@@ -4,17 +4,18 @@
 
 pub mod aggregation;
 pub mod backbone;
+pub mod compare;
 pub mod embed;
+mod floors;
 pub mod geometry;
 pub mod layers;
 pub mod mlp;
+pub mod primaries;
 pub mod spgr;
 pub mod spgr_ref;
-pub mod trunk;
-pub mod compare;
-mod floors;
-pub mod primaries;
+pub mod subsplat;
 pub mod trace;
+pub mod trunk;
 pub mod weights;
 
 use crate::camera::Camera;

@@ -1,25 +1,26 @@
-//! Networks that give depth, density and raw Gaussian parameters.
-
-pub mod small;
-mod small_parts;
-
-pub use small::SmallBackbone;
-pub(crate) use small_parts::small_start;
 //! MVSplat's encoder (arXiv 2403.14627), parameter for parameter: posed pictures to
 //! depth, opacity and raw Gaussian parameters.
 //!
 //! Two orders of rows coexist, as in the original: the CNN works on (b v), scene-major;
 //! transformer and depth predictor on (v b), row = v·B + b.
+
 pub mod cnn;
 pub mod cost_volume;
 pub mod depth;
+pub mod small;
+mod small_parts;
 pub mod transformer;
 pub mod unet;
+
+pub use small::SmallBackbone;
+pub(crate) use small_parts::small_start;
+
 use super::trace::Trace;
 use super::{BackboneOutput, Views};
 use crate::config::{Config, FeatureLevel, Mvsplat as Settings};
 use candle_core::{Result, Tensor, bail};
 use candle_nn::VarBuilder;
+
 /// The whole encoder.
 #[derive(Clone, Debug)]
 pub struct Mvsplat {
@@ -28,6 +29,7 @@ pub struct Mvsplat {
     depth: depth::DepthPredictor,
     settings: Settings,
 }
+
 impl Mvsplat {
     /// `vb` at the root of the encoder (`backbone.…`, `depth_predictor.…`).
     ///
@@ -42,6 +44,7 @@ impl Mvsplat {
             settings: settings.clone(),
         })
     }
+
     /// Any number of scenes and of views ≥ 2; H and W multiples of
     /// [`Config::stride`]. Stages go to `trace` under the names of the reference
     /// outputs (`cnn.conv1`, …, `depth.to_disparity_vb`).
@@ -87,10 +90,12 @@ impl Mvsplat {
         })
     }
 }
+
 /// `[B, V, …]` to `[V·B, …]`, view-major.
 pub fn vb_rows(x: &Tensor) -> Result<Tensor> {
     x.transpose(0, 1)?.contiguous()?.flatten(0, 1)
 }
+
 /// `[V·B, …]` to `[B, V, …]`.
 pub fn bv_rows(x: &Tensor, views: usize) -> Result<Tensor> {
     let mut dims = vec![views, x.dim(0)? / views.max(1)];
