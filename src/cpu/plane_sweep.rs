@@ -9,16 +9,21 @@
 use super::math::{dot, vectorised};
 use rayon::prelude::*;
 
-/// Reference pixel and depth to source pixel: p = a·(x, y, 1)·depth + b,
-/// (u, v) = (p.x, p.y)/max(p.z, min_z).
+/// Reference pixel and depth to source pixel: X = R·(K_r⁻¹·(x, y, 1))·depth + t in
+/// source camera coordinates, (u, v) = (fx·X + cx·Z, fy·Y + cy·Z)/max(Z, min_z), in
+/// this order: what rounding does then stays closest to the original.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pair {
     /// Row of the source features.
     pub source: usize,
-    /// K_s·R·K_r⁻¹, row-major.
-    pub a: [f32; 9],
-    /// K_s·t.
-    pub b: [f32; 3],
+    /// K_r⁻¹ as (1/fx, 1/fy, −cx/fx, −cy/fy), feature pixels.
+    pub inverse: [f32; 4],
+    /// R, row-major: reference camera to source camera.
+    pub rotation: [f32; 9],
+    /// The reference camera's centre in the source camera's frame, world units.
+    pub t: [f32; 3],
+    /// fx, fy, cx, cy of the projection, feature pixels.
+    pub k: [f32; 4],
 }
 
 /// Sizes and rules of one sweep.
@@ -57,12 +62,14 @@ impl Sweep {
     #[inline(always)]
     fn place(&self, p: &Pair, x: usize, y: usize, depth: f32) -> (f32, f32, f32) {
         let (x, y) = (x as f32 + self.centre, y as f32 + self.centre);
-        let a = &p.a;
-        let px = (a[0] * x + a[1] * y + a[2]) * depth + p.b[0];
-        let py = (a[3] * x + a[4] * y + a[5]) * depth + p.b[1];
-        let pz = (a[6] * x + a[7] * y + a[8]) * depth + p.b[2];
+        let (x, y) = (p.inverse[0] * x + p.inverse[2], p.inverse[1] * y + p.inverse[3]);
+        let r = &p.rotation;
+        let px = (r[0] * x + r[1] * y + r[2]) * depth + p.t[0];
+        let py = (r[3] * x + r[4] * y + r[5]) * depth + p.t[1];
+        let pz = (r[6] * x + r[7] * y + r[8]) * depth + p.t[2];
         let z = if pz > self.min_z { pz } else { self.min_z };
-        (px / z - self.centre, py / z - self.centre, pz)
+        let [fx, fy, cx, cy] = p.k;
+        ((fx * px + cx * pz) / z - self.centre, (fy * py + cy * pz) / z - self.centre, pz)
     }
 
     /// Bilinear taps at (u, v), or `None` where all four lie outside.

@@ -3,54 +3,44 @@
 //! MVSplat; the features' gradient is not written yet, and backward says so.
 
 use super::{f32_slice, output, values};
-use crate::camera::Camera;
+use crate::camera::{Camera, Intrinsics};
 use crate::cpu::plane_sweep as cpu;
 pub use crate::cpu::plane_sweep::{Pair, Sweep};
 use candle_core::{CpuStorage, CustomOp2, Error, Layout, Result, Shape, Tensor, bail};
-use glam::{DMat3, DMat4};
+use glam::{Mat3, Mat4};
 
-/// Whose intrinsics project into the source view.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Projection {
-    /// The source view's own: right for any pair of cameras.
-    Source,
-    /// The reference view's, as MVSplat does.
-    Reference,
-}
-
-/// The map from reference pixels and depths to pixels of `source`, whose features
-/// are row `row` of the op's second tensor. Both cameras have the intrinsics of the
-/// feature maps ([`Camera::resized`]). f64 until the end.
+/// The map from pixels and depths of a reference view to pixels of a source view,
+/// whose features are row `row` of the op's second tensor. `relative` maps reference
+/// camera coordinates to source camera coordinates; `projection` are the intrinsics
+/// of the source (MVSplat takes the reference's). Intrinsics are those of the feature
+/// maps ([`Intrinsics::resized`]).
 ///
 /// # Errors
-/// An intrinsic matrix or pose that cannot be inverted.
+/// Intrinsics or a pose with numbers that are not finite, or without inverse.
 pub fn pair(
-    reference: &Camera,
-    source: &Camera,
-    projection: Projection,
+    reference: &Intrinsics,
+    projection: &Intrinsics,
+    relative: Mat4,
     row: usize,
 ) -> Result<Pair> {
-    let k_r: DMat3 = reference.intrinsics.matrix().as_dmat3();
-    let k_s = match projection {
-        Projection::Source => source.intrinsics.matrix().as_dmat3(),
-        Projection::Reference => k_r,
-    };
-    let relative = relative_pose(reference, source);
-    let a = k_s * DMat3::from_mat4(relative) * k_r.inverse();
-    let b = k_s * relative.w_axis.truncate();
-    if !a.is_finite() || !b.is_finite() {
-        bail!("plane sweep cameras: expected invertible intrinsics and poses, got {reference:?}");
+    let (r, k) = (reference, projection);
+    let inverse = [1.0 / r.fx, 1.0 / r.fy, -r.cx / r.fx, -r.cy / r.fy];
+    let k = [k.fx, k.fy, k.cx, k.cy];
+    if !relative.is_finite() || inverse.iter().chain(&k).any(|v| !v.is_finite()) {
+        bail!(
+            "plane sweep cameras: expected finite, invertible intrinsics and pose, got \
+             {reference:?}, {projection:?}, {relative:?}"
+        );
     }
-    Ok(Pair {
-        source: row,
-        a: a.transpose().to_cols_array().map(|v| v as f32),
-        b: b.as_vec3().to_array(),
-    })
+    let t = relative.w_axis.truncate().to_array();
+    let rotation = Mat3::from_mat4(relative).transpose().to_cols_array();
+    Ok(Pair { source: row, inverse, rotation, t, k })
 }
 
-/// source_camera_from_reference_camera = inv(E_s)·E_r, f64.
-pub fn relative_pose(reference: &Camera, source: &Camera) -> DMat4 {
-    source.world_from_camera.as_dmat4().inverse() * reference.world_from_camera.as_dmat4()
+/// source_camera_from_reference_camera: inv(E_s)·E_r, in f64.
+pub fn relative_pose(reference: &Camera, source: &Camera) -> Mat4 {
+    let inverse = source.world_from_camera.as_dmat4().inverse();
+    (inverse * reference.world_from_camera.as_dmat4()).as_mat4()
 }
 
 /// Correlation `[R, D, h, w]` of `reference` `[R, C, h, w]` with `source`

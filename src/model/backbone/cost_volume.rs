@@ -1,13 +1,15 @@
 //! MVSplat's cost volume (spec 3) and its refinement (spec 4). Rows (v b).
 
 use super::unet::UNet;
+use crate::camera::Camera;
 use crate::config::Mvsplat as Settings;
 use crate::model::Views;
 use crate::model::layers::{Conv2d, ConvShape, GroupNorm, gelu};
 use crate::model::trace::Trace;
-use crate::ops::plane_sweep::{Pair, Projection, Sweep, pair, plane_sweep, relative_pose, warped};
+use crate::ops::plane_sweep::{Pair, Sweep, pair, plane_sweep, warped};
 use candle_core::{Device, Result, Tensor};
 use candle_nn::VarBuilder;
+use glam::Mat4;
 
 /// Least camera z that the projection divides by.
 const MIN_Z: f32 = 1e-3;
@@ -23,18 +25,32 @@ pub fn disparities(views: &Views, candidates: usize) -> Vec<Vec<f32>> {
     (0..v * b).map(|r| row(views.near_far[r % b][r / b])).collect()
 }
 
+/// Pose of view i in the frame of view j, of one scene, with the original's roundings:
+/// inv(E_j) to f32, a product in f32; with two views the second is the first's inverse.
+fn relative_pose(cameras: &[Camera], i: usize, j: usize) -> Mat4 {
+    let pose = |i: usize, j: usize| {
+        cameras[j].world_from_camera.as_dmat4().inverse().as_mat4() * cameras[i].world_from_camera
+    };
+    match (cameras.len(), i) {
+        (2, 1) => pose(j, i).as_dmat4().inverse().as_mat4(),
+        _ => pose(i, j),
+    }
+}
+
 /// What to compare with what: reference view i with views i + 1, i + 2, … modulo V,
 /// at the resolution h × w of the features, under MVSplat's conventions.
 pub fn sweep(views: &Views, disparities: &[Vec<f32>], features: &Tensor) -> Result<Sweep> {
     let (_, channels, h, w) = features.dims4()?;
     let (b, v) = (views.scenes(), views.views());
-    let camera = |view: usize, scene: usize| views.cameras[scene][view].resized(w, h);
     let mut pairs: Vec<Vec<Pair>> = Vec::with_capacity(v * b);
     for row in 0..v * b {
         let (i, scene) = (row / b, row % b);
         let own = (1..v).map(|offset| {
             let j = (i + offset) % v;
-            pair(&camera(i, scene), &camera(j, scene), Projection::Reference, j * b + scene)
+            let cameras = &views.cameras[scene];
+            // The reference's intrinsics on both sides, as in the original.
+            let k = cameras[i].intrinsics.resized(w, h);
+            pair(&k, &k, relative_pose(cameras, i, j), j * b + scene)
         });
         pairs.push(own.collect::<Result<_>>()?);
     }
@@ -86,8 +102,8 @@ fn trace_geometry(
             let cameras = &views.cameras[scene];
             let own = cameras[i].resized(w, h).intrinsics.matrix().transpose();
             k.extend_from_slice(&own.to_cols_array());
-            let pose = relative_pose(&cameras[i], &cameras[(i + offset) % v]).transpose();
-            poses.extend(pose.to_cols_array().map(|v| v as f32));
+            let pose = relative_pose(cameras, i, (i + offset) % v).transpose();
+            poses.extend(pose.to_cols_array());
         }
         let at = offset - 1;
         trace.put(&format!("cv.K_px.{at}"), &Tensor::from_vec(k, (v * b, 3, 3), dev)?)?;
