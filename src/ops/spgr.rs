@@ -107,7 +107,8 @@ pub fn spgr_into(
     finite(call, head, parents, rows, gains)
 }
 
-/// Refuses a result that is not finite, naming the parent and what was wrong with it.
+/// Refuses numbers that are not finite, on the way in (an infinite opacity would be
+/// capped, an infinite gain squashed: wrong answers in silence) and on the way out.
 fn finite<T: Number>(
     call: &Spgr,
     head: &[T],
@@ -115,24 +116,32 @@ fn finite<T: Number>(
     rows: &[T],
     gains: &[T],
 ) -> Result<()> {
-    let bad = |data: &[T]| data.iter().position(|v| !num_is_finite(*v));
+    let bad =
+        |data: &[T], width: usize| data.iter().position(|v| !finite_number(*v)).map(|i| i / width);
     let k = call.rules.children();
-    let child = bad(rows)
-        .map(|i| i / SPLAT_LANES)
-        .or_else(|| bad(gains).map(|i| i / call.rules.gain_lanes()));
-    let Some(child) = child else { return Ok(()) };
-    let n = child / k;
-    let parent = &parents[n * SPLAT_LANES..(n + 1) * SPLAT_LANES];
-    let record = &head[child * HEAD_LANES..(child + 1) * HEAD_LANES];
+    if let Some(n) = bad(parents, SPLAT_LANES) {
+        let row = &parents[n * SPLAT_LANES..(n + 1) * SPLAT_LANES];
+        bail!("{NAME}: expected finite parents, got parent {} = {row:?}", call.first + n);
+    }
+    let (record, child) = (bad(head, HEAD_LANES), bad(rows, SPLAT_LANES));
+    let child = child.or(bad(gains, call.rules.gain_lanes()));
+    let (what, at) = match (record, child) {
+        (Some(i), _) => ("head records", i),
+        (None, Some(i)) => ("children", i),
+        (None, None) => return Ok(()),
+    };
+    let n = at / k;
     bail!(
-        "{NAME}: expected finite children, got child {} of parent {} = {:?} from parent {parent:?} and head record {record:?}",
-        child % k,
+        "{NAME}: expected finite {what}, got child {} of parent {} = {:?} from parent {:?} and head record {:?}",
+        at % k,
         call.first + n,
-        &rows[child * SPLAT_LANES..(child + 1) * SPLAT_LANES]
+        &rows[at * SPLAT_LANES..(at + 1) * SPLAT_LANES],
+        &parents[n * SPLAT_LANES..(n + 1) * SPLAT_LANES],
+        &head[at * HEAD_LANES..(at + 1) * HEAD_LANES]
     )
 }
 
-fn num_is_finite<T: Number>(v: T) -> bool {
+fn finite_number<T: Number>(v: T) -> bool {
     crate::cpu::real::Real::is_finite(v)
 }
 

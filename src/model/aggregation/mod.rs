@@ -86,7 +86,9 @@ impl Aggregation {
             let w = vb.pp(format!("in.{l}")).get_with_hints((dim, c), "weight", xavier(c, dim))?;
             Ok(Some(Linear::new(w, None)))
         });
-        let input = input.collect::<Result<_>>()?;
+        let input: Vec<Option<Linear>> = input.collect::<Result<_>>()?;
+        let widths: Vec<usize> =
+            widths.iter().zip(&input).map(|(&c, i)| if i.is_some() { dim } else { c }).collect();
         let stage = |name: String| Stage::new(&keys, dim, &widths, vb.pp(name));
         let mut geometry: Vec<Stage> = Vec::with_capacity(keys.stages_geo);
         for t in 0..keys.stages_geo {
