@@ -230,11 +230,31 @@ impl File<'_> {
                 let expected = format!("a tree of nodes, at most {DEPTH_MAX} deep");
                 return Err(self.bad(expected, format!("node {n} again, or deeper")));
             }
-            let world = parent * local(node);
+            let world = parent * self.local(node)?;
             found.extend(node.mesh.map(|m| (m, world)));
             open.extend(node.children.iter().rev().map(|&c| (c, world, depth + 1)));
         }
         Ok(found)
+    }
+
+    fn local(&self, node: &Node) -> Result<DMat4> {
+        if let Some(matrix) = &node.matrix {
+            return Ok(DMat4::from_cols_array(matrix));
+        }
+        let [x, y, z, w] = node.rotation.as_deref().copied().unwrap_or([0.0, 0.0, 0.0, 1.0]);
+        let rotation = DQuat::from_xyzw(x, y, z, w);
+        if !((rotation.length() - 1.0).abs() < 1e-2) {
+            let got = format!("{x} {y} {z} {w}");
+            return Err(self.bad("nodes rotated by a unit quaternion", got));
+        }
+        let vector = |v: &Option<Box<[f64; 3]>>, default: DVec3| {
+            v.as_deref().map_or(default, |v| DVec3::from(*v))
+        };
+        Ok(DMat4::from_scale_rotation_translation(
+            vector(&node.scale, DVec3::ONE),
+            rotation.normalize(),
+            vector(&node.translation, DVec3::ZERO),
+        ))
     }
 
     /// A node's matrix followed by the turn into our axes.
@@ -352,7 +372,11 @@ impl File<'_> {
         if view.buffer != 0 || buffer.uri.is_some() {
             return Err(at(self.bad("data in the file's own BIN chunk", "another buffer")));
         }
-        let have = buffer.byte_length.min(self.binary.len() as u64);
+        let have = buffer.byte_length;
+        if have > self.binary.len() as u64 {
+            let got = self.binary.len().to_string();
+            return Err(at(self.bad(format!("{have} bytes in the BIN chunk"), got)));
+        }
         let element = (component.size() * lanes) as u64;
         let stride = view.byte_stride.unwrap_or(element);
         let start = u128::from(view.byte_offset) + u128::from(a.byte_offset);
@@ -372,21 +396,6 @@ impl File<'_> {
             component,
         })
     }
-}
-
-fn local(node: &Node) -> DMat4 {
-    if let Some(matrix) = &node.matrix {
-        return DMat4::from_cols_array(matrix);
-    }
-    let [x, y, z, w] = node.rotation.as_deref().copied().unwrap_or([0.0, 0.0, 0.0, 1.0]);
-    let vector = |v: &Option<Box<[f64; 3]>>, default: DVec3| {
-        v.as_deref().map_or(default, |v| DVec3::from(*v))
-    };
-    DMat4::from_scale_rotation_translation(
-        vector(&node.scale, DVec3::ONE),
-        DQuat::from_xyzw(x, y, z, w),
-        vector(&node.translation, DVec3::ZERO),
-    )
 }
 
 /// How a number is stored.
