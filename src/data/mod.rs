@@ -1,5 +1,7 @@
-//! From a scene to what the network takes: crops, depth ranges, context pairs.
+//! From scenes to what the network takes: crops, depth ranges, context pairs, and
+//! procedural rooms.
 
 pub mod crop;
 pub mod depth;
 pub mod pair;
+pub mod procedural;

@@ -1,20 +1,19 @@
-//! Helpers that the integration tests share.
+//! What several integration tests share.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-/// A file or folder of the fixtures that live beside the checkout (`../shared`, or
-/// `SUBSPLAT_SHARED_DIR`). `None`, with a loud line, where they are absent; a panic
-/// where `SUBSPLAT_SHARED=require` says that they must be there.
-#[allow(dead_code, reason = "not every test binary uses fixtures")]
-pub fn shared(rel: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("SUBSPLAT_SHARED_DIR")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"), PathBuf::from);
-    let path = root.join(rel);
+/// A file or folder of the references beside the project, or `None`, loudly, where
+/// they are absent. `SUBSPLAT_SHARED=require` (CI) turns absence into failure.
+#[allow(dead_code, reason = "not every test binary uses every helper")]
+pub fn shared(relative: &str) -> Option<PathBuf> {
+    let folder = std::env::var_os("SUBSPLAT_SHARED_DIR")
+        .map_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared"), PathBuf::from);
+    let path = folder.join(relative);
     if path.exists() {
         return Some(path);
     }
     let required = std::env::var("SUBSPLAT_SHARED").is_ok_and(|v| v == "require");
-    assert!(!required, "SUBSPLAT_SHARED=require, but {} is absent", path.display());
-    eprintln!("SKIP: {} is absent", path.display());
+    assert!(!required, "reference {relative} is required and absent");
+    eprintln!("SKIP: reference {relative} is absent; this test checked nothing");
     None
 }

@@ -1,0 +1,131 @@
+//! Pointwise functions and softmax over rows, with gradients.
+
+use super::math::{erf, exp, sum_of, vectorised};
+use rayon::prelude::*;
+
+/// Elements per task: long enough to hide the scheduling, short enough to balance.
+const CHUNK: usize = 16_384;
+
+/// A function of one number.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Activation {
+    /// max(0, x).
+    Relu,
+    /// x·σ(x).
+    Silu,
+    /// x·Φ(x), exact form.
+    Gelu,
+    /// σ(x) = 1/(1 + e⁻ˣ).
+    Sigmoid,
+}
+
+#[inline(always)]
+fn sigmoid(x: f32) -> f32 {
+    1.0 / (1.0 + exp(-x))
+}
+
+#[inline(always)]
+fn normal_cdf(x: f32) -> f32 {
+    0.5 * (1.0 + erf(x * std::f32::consts::FRAC_1_SQRT_2))
+}
+
+/// y = f(x).
+pub fn forward(kind: Activation, x: &[f32], y: &mut [f32]) {
+    x.par_chunks(CHUNK).zip(y.par_chunks_mut(CHUNK)).for_each(|(x, y)| {
+        vectorised(
+            #[inline(always)]
+            || match kind {
+                // Written so that NaN stays NaN.
+                Activation::Relu => map(x, y, |x| if x < 0.0 { 0.0 } else { x }),
+                Activation::Silu => map(x, y, |x| x * sigmoid(x)),
+                Activation::Gelu => map(x, y, |x| x * normal_cdf(x)),
+                Activation::Sigmoid => map(x, y, sigmoid),
+            },
+        );
+    });
+}
+
+#[inline(always)]
+fn map(x: &[f32], y: &mut [f32], f: impl Fn(f32) -> f32) {
+    for (y, x) in y.iter_mut().zip(x) {
+        *y = f(*x);
+    }
+}
+
+/// dx = dy·f′(x).
+pub fn backward(kind: Activation, x: &[f32], dy: &[f32], dx: &mut [f32]) {
+    let chunks = x.par_chunks(CHUNK).zip(dy.par_chunks(CHUNK));
+    chunks.zip(dx.par_chunks_mut(CHUNK)).for_each(|((x, dy), dx)| {
+        vectorised(
+            #[inline(always)]
+            || match kind {
+                Activation::Relu => scale(x, dy, dx, |x| if x > 0.0 { 1.0 } else { 0.0 }),
+                Activation::Silu => scale(x, dy, dx, |x| {
+                    let s = sigmoid(x);
+                    s * (1.0 + x * (1.0 - s))
+                }),
+                Activation::Gelu => scale(x, dy, dx, |x| {
+                    // Φ(x) + x·φ(x), φ the normal density.
+                    normal_cdf(x) + x * 0.398_942_3 * exp(-0.5 * x * x)
+                }),
+                Activation::Sigmoid => scale(x, dy, dx, |x| {
+                    let s = sigmoid(x);
+                    s * (1.0 - s)
+                }),
+            },
+        );
+    });
+}
+
+#[inline(always)]
+fn scale(x: &[f32], dy: &[f32], dx: &mut [f32], f: impl Fn(f32) -> f32) {
+    for ((dx, dy), x) in dx.iter_mut().zip(dy).zip(x) {
+        *dx = dy * f(*x);
+    }
+}
+
+/// One row to e^{x − max}; returns the sum. To be called inside `vectorised`.
+#[inline(always)]
+pub(super) fn exp_row(row: &mut [f32]) -> f32 {
+    let mut lanes = [f32::NEG_INFINITY; 16];
+    let chunks = row.chunks_exact(16);
+    let tail = chunks.remainder().iter().fold(f32::NEG_INFINITY, |m, &v| m.max(v));
+    for c in chunks {
+        for i in 0..16 {
+            lanes[i] = if c[i] > lanes[i] { c[i] } else { lanes[i] };
+        }
+    }
+    let max = lanes.iter().fold(tail, |m, &v| m.max(v));
+    for v in row.iter_mut() {
+        *v = exp(*v - max);
+    }
+    sum_of(row, |v| v) as f32
+}
+
+/// Softmax of every row of `x` `[rows, n]`.
+pub fn softmax(n: usize, x: &[f32], y: &mut [f32]) {
+    let rows = CHUNK.div_ceil(n.max(1));
+    x.par_chunks(rows * n.max(1)).zip(y.par_chunks_mut(rows * n.max(1))).for_each(|(x, y)| {
+        y.copy_from_slice(x);
+        vectorised(
+            #[inline(always)]
+            || {
+                for row in y.chunks_exact_mut(n) {
+                    let inverse = 1.0 / exp_row(row);
+                    row.iter_mut().for_each(|v| *v *= inverse);
+                }
+            },
+        );
+    });
+}
+
+/// dx = y·(dy − Σ y·dy) row by row, y the softmax.
+pub fn softmax_backward(n: usize, y: &[f32], dy: &[f32], dx: &mut [f32]) {
+    let rows = y.par_chunks(n.max(1)).zip(dy.par_chunks(n.max(1)));
+    rows.zip(dx.par_chunks_mut(n.max(1))).for_each(|((y, dy), dx)| {
+        let mean = super::math::dot(y, dy);
+        for ((dx, y), dy) in dx.iter_mut().zip(y).zip(dy) {
+            *dx = y * (dy - mean);
+        }
+    });
+}

@@ -1,0 +1,110 @@
+//! MVSplat's CNN (spec 1): a ResNet to 1/4 resolution, InstanceNorm without
+//! parameters. `[N, 3, H, W]` RGB in [0, 1], rows in any order.
+
+use crate::model::layers::{Conv2d, ConvShape, default_init, instance_norm, relu};
+use crate::model::trace::Trace;
+use candle_core::{Result, Tensor};
+use candle_nn::{Init, VarBuilder};
+
+/// ImageNet's statistics: only the CNN sees normalised colours.
+const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
+const STD: [f32; 3] = [0.229, 0.224, 0.225];
+
+/// Feature maps of the CNN.
+#[derive(Clone, Debug)]
+pub struct CnnOutput {
+    /// First stage, `[N, C₁, H/2, W/2]`.
+    pub half: Tensor,
+    /// Result, `[N, C₃, H/4, W/4]`.
+    pub quarter: Tensor,
+}
+
+/// The network.
+#[derive(Clone, Debug)]
+pub struct Cnn {
+    conv1: Conv2d,
+    stages: Vec<[Residual; 2]>,
+    conv2: Conv2d,
+}
+
+impl Cnn {
+    /// Channels of the three stages.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
+    pub fn new(channels: [usize; 3], vb: VarBuilder) -> Result<Self> {
+        let mut c_in = channels[0];
+        let mut stages = Vec::new();
+        // The third stage keeps 1/4 resolution: UniMatch's `num_output_scales = 0`.
+        for (i, (c, stride)) in channels.into_iter().zip([1, 2, 1]).enumerate() {
+            let vb = vb.pp(format!("layer{}", i + 1));
+            let first = Residual::new(c_in, c, stride, vb.pp("0"))?;
+            stages.push([first, Residual::new(c, c, 1, vb.pp("1"))?]);
+            c_in = c;
+        }
+        Ok(Self {
+            conv1: Conv2d::new_no_bias(3, channels[0], ConvShape::K7S2, vb.pp("conv1"))?,
+            stages,
+            conv2: Conv2d::new(c_in, c_in, ConvShape::K1, vb.pp("conv2"))?,
+        })
+    }
+
+    /// `[N, 3, H, W]` to both maps.
+    ///
+    /// # Errors
+    /// Whatever candle says.
+    pub fn forward(&self, images: &Tensor, trace: &mut Trace<'_>) -> Result<CnnOutput> {
+        let row = |v: [f32; 3]| Tensor::new(&v, images.device())?.reshape((1, 3, 1, 1));
+        let x = images.broadcast_sub(&row(MEAN)?)?.broadcast_div(&row(STD)?)?;
+        trace.put("cnn.normalized_image", &x)?;
+        let x = self.conv1.forward(&x)?;
+        trace.put("cnn.conv1", &x)?;
+        let mut x = relu(&instance_norm(&x)?)?;
+        let mut half = None;
+        for (i, stage) in self.stages.iter().enumerate() {
+            x = stage[1].forward(&stage[0].forward(&x)?)?;
+            trace.put(&format!("cnn.layer{}", i + 1), &x)?;
+            half.get_or_insert_with(|| x.clone());
+        }
+        let quarter = self.conv2.forward(&x)?;
+        trace.put("cnn.out_bv", &quarter)?;
+        Ok(CnnOutput { half: half.unwrap_or(x), quarter })
+    }
+}
+
+/// ReLU(skip(x) + branch(x)); the branch ends in a ReLU of its own.
+#[derive(Clone, Debug)]
+struct Residual {
+    conv1: Conv2d,
+    conv2: Conv2d,
+    downsample: Option<Conv2d>,
+}
+
+impl Residual {
+    fn new(c_in: usize, c: usize, stride: usize, vb: VarBuilder) -> Result<Self> {
+        let downsample = if stride == 1 && c_in == c {
+            None
+        } else {
+            // Its bias is cancelled by the InstanceNorm after it, but checkpoints hold it.
+            let stdev = (2.0 / c as f64).sqrt();
+            let init = (Init::Randn { mean: 0.0, stdev }, Some(default_init(c_in)));
+            let shape = ConvShape::K1.stride(stride);
+            Some(Conv2d::with(c_in, c, shape, init, vb.pp("downsample.0"))?)
+        };
+        Ok(Self {
+            conv1: Conv2d::new_no_bias(c_in, c, ConvShape::K3.stride(stride), vb.pp("conv1"))?,
+            conv2: Conv2d::new_no_bias(c, c, ConvShape::K3, vb.pp("conv2"))?,
+            downsample,
+        })
+    }
+
+    fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        let y = relu(&instance_norm(&self.conv1.forward(x)?)?)?;
+        let y = relu(&instance_norm(&self.conv2.forward(&y)?)?)?;
+        let skip = match &self.downsample {
+            Some(conv) => instance_norm(&conv.forward(x)?)?,
+            None => x.clone(),
+        };
+        relu(&(skip + y)?)
+    }
+}

@@ -1,0 +1,160 @@
+//! MVSplat's cost volume (spec 3) and its refinement (spec 4). Rows (v b).
+
+use super::unet::UNet;
+use crate::config::Mvsplat as Settings;
+use crate::model::Views;
+use crate::model::layers::{Conv2d, ConvShape, GroupNorm, gelu};
+use crate::model::trace::Trace;
+use crate::ops::plane_sweep::{Pair, Projection, Sweep, pair, plane_sweep, relative_pose, warped};
+use candle_core::{Device, Result, Tensor};
+use candle_nn::VarBuilder;
+
+/// Least camera z that the projection divides by.
+const MIN_Z: f32 = 1e-3;
+
+/// `[V·B][D]`: disparity candidates, uniform from 1/far (index 0) to 1/near.
+pub fn disparities(views: &Views, candidates: usize) -> Vec<Vec<f32>> {
+    let (b, v) = (views.scenes(), views.views());
+    let row = |(near, far): (f32, f32)| {
+        let (low, high) = (1.0 / f64::from(far), 1.0 / f64::from(near));
+        let step = (high - low) / (candidates - 1) as f64;
+        (0..candidates).map(|k| (low + k as f64 * step) as f32).collect()
+    };
+    (0..v * b).map(|r| row(views.near_far[r % b][r / b])).collect()
+}
+
+/// What to compare with what: reference view i with views i + 1, i + 2, … modulo V,
+/// at the resolution h × w of the features, under MVSplat's conventions.
+pub fn sweep(views: &Views, disparities: &[Vec<f32>], features: &Tensor) -> Result<Sweep> {
+    let (_, channels, h, w) = features.dims4()?;
+    let (b, v) = (views.scenes(), views.views());
+    let camera = |view: usize, scene: usize| views.cameras[scene][view].resized(w, h);
+    let mut pairs: Vec<Vec<Pair>> = Vec::with_capacity(v * b);
+    for row in 0..v * b {
+        let (i, scene) = (row / b, row % b);
+        let own = (1..v).map(|offset| {
+            let j = (i + offset) % v;
+            pair(&camera(i, scene), &camera(j, scene), Projection::Reference, j * b + scene)
+        });
+        pairs.push(own.collect::<Result<_>>()?);
+    }
+    Ok(Sweep {
+        pairs,
+        depths: disparities.iter().map(|d| d.iter().map(|d| 1.0 / d).collect()).collect(),
+        centre: 0.0,
+        min_z: MIN_Z,
+        scale: 1.0 / (channels as f32).sqrt(),
+        channels,
+        size: [h, w],
+    })
+}
+
+/// Correlation `[V·B, D, h, w]` of transformer features `[V·B, C, h, w]`.
+///
+/// # Errors
+/// Cameras that cannot be inverted.
+pub fn correlation(
+    views: &Views,
+    disparities: &[Vec<f32>],
+    features: &Tensor,
+    trace: &mut Trace<'_>,
+) -> Result<Tensor> {
+    let sweep = sweep(views, disparities, features)?;
+    if trace.is_on() {
+        trace_geometry(views, &sweep, features, trace)?;
+    }
+    let volume = plane_sweep(features, features, sweep)?;
+    trace.put("cv.raw_correlation_vb", &volume)?;
+    Ok(volume)
+}
+
+fn trace_geometry(
+    views: &Views,
+    sweep: &Sweep,
+    features: &Tensor,
+    trace: &mut Trace<'_>,
+) -> Result<()> {
+    let (b, v, [h, w]) = (views.scenes(), views.views(), sweep.size);
+    let d = sweep.candidates();
+    let dev = &Device::Cpu;
+    let candidates: Vec<f32> = sweep.depths.iter().flatten().map(|z| 1.0 / z).collect();
+    trace.put("cv.disp_candidates_vb", &Tensor::from_vec(candidates, (v * b, d), dev)?)?;
+    for offset in 1..v {
+        let (mut k, mut poses) = (Vec::new(), Vec::new());
+        for row in 0..v * b {
+            let (i, scene) = (row / b, row % b);
+            let cameras = &views.cameras[scene];
+            let own = cameras[i].resized(w, h).intrinsics.matrix().transpose();
+            k.extend_from_slice(&own.to_cols_array());
+            let pose = relative_pose(&cameras[i], &cameras[(i + offset) % v]).transpose();
+            poses.extend(pose.to_cols_array().map(|v| v as f32));
+        }
+        let at = offset - 1;
+        trace.put(&format!("cv.K_px.{at}"), &Tensor::from_vec(k, (v * b, 3, 3), dev)?)?;
+        trace.put(&format!("cv.pose.{at}"), &Tensor::from_vec(poses, (v * b, 4, 4), dev)?)?;
+        let some = [0, d / 2, d - 1];
+        let name = format!("cv.warped_d{}_d{}_d{}.{at}", some[0], some[1], some[2]);
+        trace.put_with(&name, || warped(features, sweep, at, &some))?;
+    }
+    Ok(())
+}
+
+/// Stem, U-Net and last convolution over [correlation ; features], plus a pointwise
+/// skip of the same input.
+#[derive(Clone, Debug)]
+pub struct Refinement {
+    stem: (Conv2d, GroupNorm),
+    unet: UNet,
+    last: Conv2d,
+    residual: Conv2d,
+}
+
+impl Refinement {
+    /// `vb` at the depth predictor.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
+    pub fn new(s: &Settings, vb: VarBuilder) -> Result<Self> {
+        let (d, c) = (s.depth_candidates, s.costvolume_channels);
+        let c_in = d + s.cnn_channels[2];
+        let net = vb.pp("corr_refine_net");
+        Ok(Self {
+            stem: (
+                Conv2d::new(c_in, c, ConvShape::K3, net.pp("0"))?,
+                GroupNorm::new(8, c, net.pp("1"))?,
+            ),
+            unet: UNet::new(c, s.costvolume_levels, net.pp("3"))?,
+            last: Conv2d::new(c, d, ConvShape::K3, net.pp("4"))?,
+            residual: Conv2d::new(c_in, d, ConvShape::K1, vb.pp("regressor_residual"))?,
+        })
+    }
+
+    /// `[V·B, D, h, w]` and `[V·B, C, h, w]` to the refined volume `[V·B, D, h, w]`.
+    ///
+    /// # Errors
+    /// Whatever candle says.
+    pub fn forward(
+        &self,
+        volume: &Tensor,
+        features: &Tensor,
+        views: usize,
+        trace: &mut Trace<'_>,
+    ) -> Result<Tensor> {
+        let name = "cv.corr_refine_net";
+        let input = Tensor::cat(&[volume, features], 1)?;
+        let x = self.stem.0.forward(&input)?;
+        trace.put(&format!("{name}.0"), &x)?;
+        let x = self.stem.1.forward(&x)?;
+        trace.put(&format!("{name}.1"), &x)?;
+        let x = gelu(&x)?;
+        trace.put(&format!("{name}.2"), &x)?;
+        let x = self.unet.forward(&x, views, trace, &format!("{name}.3"))?;
+        let x = self.last.forward(&x)?;
+        trace.put(&format!("{name}.out_vb"), &x)?;
+        let residual = self.residual.forward(&input)?;
+        trace.put("cv.regressor_residual_vb", &residual)?;
+        let x = (x + residual)?;
+        trace.put("cv.refined_correlation_vb", &x)?;
+        Ok(x)
+    }
+}

@@ -1,0 +1,255 @@
+//! MVSplat's depth predictor (spec 4 and 5): coarse disparity from the cost volume,
+//! refinement at full resolution, and the heads. Rows (v b).
+//!
+//! Full-resolution tensors arise one row at a time where the arithmetic allows, which
+//! is everywhere but in the refinement U-Net (its attention joins the views).
+
+use super::cost_volume::{Refinement, correlation, disparities};
+use super::unet::UNet;
+use crate::abi::sh_coefficients;
+use crate::config::Mvsplat as Settings;
+use crate::model::Views;
+use crate::model::layers::{
+    Conv2d, ConvShape, GroupNorm, gelu, resize_bilinear, sigmoid, softmax, upsample_nearest,
+};
+use crate::model::trace::Trace;
+use candle_core::{Device, Result, Tensor};
+use candle_nn::VarBuilder;
+
+/// Factor between feature maps and pictures.
+const DOWNSCALE: usize = 4;
+
+/// What the predictor reads, all (v b).
+pub struct Input<'a> {
+    /// Cameras and depth ranges.
+    pub views: &'a Views,
+    /// `[V·B, 3, H, W]`, RGB in [0, 1].
+    pub images: Tensor,
+    /// `[V·B, C, h, w]`, without position encoding.
+    pub cnn: Tensor,
+    /// `[V·B, C, h, w]`.
+    pub trans: Tensor,
+}
+
+/// What the predictor gives, all (v b).
+pub struct Output {
+    /// `[V·B, H·W, 2 + 7 + 3·D]`.
+    pub raw: Tensor,
+    /// `[V·B, H·W, G]`, distance along the unit ray.
+    pub depths: Tensor,
+    /// `[V·B, H·W, G]`, in (0, 1).
+    pub densities: Tensor,
+    /// `[V·B, C_r, H, W]`: the refinement U-Net's output.
+    pub refined: Tensor,
+}
+
+/// Coarse and full-resolution disparity.
+struct Disparity {
+    /// `[V·B, 1, H, W]`.
+    full: Tensor,
+    /// `[V·B, 1, H, W]`: largest probability of any candidate.
+    pdf_max: Tensor,
+}
+
+/// Two convolutions with a GELU between.
+#[derive(Clone, Debug)]
+struct Head(Conv2d, Conv2d);
+
+impl Head {
+    fn new(c_in: usize, hidden: usize, c_out: usize, vb: VarBuilder) -> Result<Self> {
+        Ok(Self(
+            Conv2d::new(c_in, hidden, ConvShape::K3, vb.pp("0"))?,
+            Conv2d::new(hidden, c_out, ConvShape::K3, vb.pp("2"))?,
+        ))
+    }
+
+    fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        self.1.forward(&gelu(&self.0.forward(x)?)?)
+    }
+}
+
+/// The network.
+#[derive(Clone, Debug)]
+pub struct DepthPredictor {
+    refinement: Refinement,
+    depth_head_lowres: Head,
+    upsampler: Conv2d,
+    proj_feature: Conv2d,
+    refine_stem: (Conv2d, GroupNorm),
+    refine_unet: UNet,
+    to_gaussians: Head,
+    to_disparity: Head,
+    candidates: usize,
+    per_pixel: usize,
+}
+
+impl DepthPredictor {
+    /// `vb` at `depth_predictor`.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
+    pub fn new(s: &Settings, vb: VarBuilder) -> Result<Self> {
+        let (c, d, r) = (s.cnn_channels[2], s.depth_candidates, s.refine_channels);
+        let g = s.gaussians_per_pixel;
+        let raw = 2 + 7 + 3 * sh_coefficients(s.primaries.sh_degree);
+        let refine = vb.pp("refine_unet");
+        Ok(Self {
+            refinement: Refinement::new(s, vb.clone())?,
+            depth_head_lowres: Head::new(d, 2 * d, d, vb.pp("depth_head_lowres"))?,
+            upsampler: Conv2d::new(2 * c, c, ConvShape::K3, vb.pp("upsampler.0"))?,
+            proj_feature: Conv2d::new(c, r, ConvShape::K3, vb.pp("proj_feature"))?,
+            refine_stem: (
+                Conv2d::new(3 + r + 2, r, ConvShape::K3, refine.pp("0"))?,
+                // Four groups here, eight everywhere else.
+                GroupNorm::new(4, r, refine.pp("1"))?,
+            ),
+            refine_unet: UNet::new(r, s.refine_levels, refine.pp("3"))?,
+            to_gaussians: Head::new(r + 3 + c, 2 * raw, raw, vb.pp("to_gaussians"))?,
+            to_disparity: Head::new(r, 2 * r, 2 * g, vb.pp("to_disparity"))?,
+            candidates: d,
+            per_pixel: g,
+        })
+    }
+
+    /// Cost volume to heads.
+    ///
+    /// # Errors
+    /// Cameras that cannot be inverted; whatever candle says.
+    pub fn forward(&self, input: Input<'_>, trace: &mut Trace<'_>) -> Result<Output> {
+        let Input { views, images, cnn, trans } = input;
+        let disparity = self.coarse(views, &trans, trace)?;
+        let low = self.upsampler.forward(&Tensor::cat(&[trans, cnn], 1)?)?;
+        trace.put("depth.upsampler.0", &low)?;
+        let up = Upsampled::new(low, trace)?;
+        let refined = self.refine(&images, &up, &disparity, views.views(), trace)?;
+        let raw = self.gaussians(&images, &up, &refined, trace)?;
+        let (depths, densities) = self.disparity(views, &refined, &disparity, trace)?;
+        Ok(Output { raw, depths, densities, refined })
+    }
+
+    fn coarse(&self, views: &Views, trans: &Tensor, trace: &mut Trace<'_>) -> Result<Disparity> {
+        let candidates = disparities(views, self.candidates);
+        let volume = correlation(views, &candidates, trans, trace)?;
+        let volume = self.refinement.forward(&volume, trans, views.views(), trace)?;
+        let logits = self.depth_head_lowres.forward(&volume)?;
+        trace.put("depth.logits_vb", &logits)?;
+        let (rows, d, h, w) = logits.dims4()?;
+        // Candidates last: a strided softmax or sum is many times slower.
+        let pdf = softmax(&logits.flatten_from(2)?.transpose(1, 2)?.contiguous()?)?;
+        trace.put_with("depth.pdf_vb", || {
+            pdf.transpose(1, 2)?.contiguous()?.reshape((rows, d, h, w))
+        })?;
+        let candidates = Tensor::new(candidates, &Device::Cpu)?.reshape((rows, d, 1))?;
+        let map = |x: Tensor| x.reshape((rows, 1, h, w));
+        let disparity = map(pdf.matmul(&candidates)?)?;
+        trace.put("depth.coarse_disp_vb", &disparity)?;
+        let pdf_max = map(pdf.max_keepdim(2)?)?;
+        trace.put("depth.pdf_max_vb", &pdf_max)?;
+        let full = resize_bilinear(&disparity, DOWNSCALE * h, DOWNSCALE * w)?;
+        trace.put("depth.fullres_disp_vb", &full)?;
+        let pdf_max = upsample_nearest(&pdf_max, DOWNSCALE)?;
+        trace.put("depth.pdf_max_fullres_vb", &pdf_max)?;
+        Ok(Disparity { full, pdf_max })
+    }
+
+    fn refine(
+        &self,
+        images: &Tensor,
+        up: &Upsampled,
+        disparity: &Disparity,
+        views: usize,
+        trace: &mut Trace<'_>,
+    ) -> Result<Tensor> {
+        let name = "depth.refine_unet";
+        let projected = each_row(images, |r| self.proj_feature.forward(&up.row(r)?))?;
+        trace.put("depth.proj_feature_vb", &projected)?;
+        let x = Tensor::cat(&[images, &projected, &disparity.full, &disparity.pdf_max], 1)?;
+        drop(projected);
+        trace.put(&format!("{name}.in_vb"), &x)?;
+        let x = self.refine_stem.0.forward(&x)?;
+        trace.put(&format!("{name}.0"), &x)?;
+        let x = self.refine_stem.1.forward(&x)?;
+        trace.put(&format!("{name}.1"), &x)?;
+        let x = gelu(&x)?;
+        trace.put(&format!("{name}.2"), &x)?;
+        self.refine_unet.forward(&x, views, trace, &format!("{name}.3"))
+    }
+
+    fn gaussians(
+        &self,
+        images: &Tensor,
+        up: &Upsampled,
+        refined: &Tensor,
+        trace: &mut Trace<'_>,
+    ) -> Result<Tensor> {
+        let raw = each_row(images, |r| {
+            let row = |x: &Tensor| x.narrow(0, r, 1);
+            let x = Tensor::cat(&[row(refined)?, row(images)?, up.row(r)?], 1)?;
+            let y = self.to_gaussians.forward(&x)?;
+            y.flatten_from(2)?.transpose(1, 2)?.contiguous()
+        })?;
+        trace.put_with("depth.to_gaussians_vb", || {
+            let (rows, _, h, w) = images.dims4()?;
+            raw.transpose(1, 2)?.contiguous()?.reshape((rows, (), h, w))
+        })?;
+        Ok(raw)
+    }
+
+    /// Depths and densities, `[V·B, H·W, G]`.
+    fn disparity(
+        &self,
+        views: &Views,
+        refined: &Tensor,
+        disparity: &Disparity,
+        trace: &mut Trace<'_>,
+    ) -> Result<(Tensor, Tensor)> {
+        let (b, g) = (views.scenes(), self.per_pixel);
+        let out = self.to_disparity.forward(refined)?;
+        trace.put("depth.to_disparity_vb", &out)?;
+        let last = |x: Tensor| x.flatten_from(2)?.transpose(1, 2)?.contiguous();
+        let full = last(disparity.full.broadcast_add(&out.narrow(1, 0, g)?)?)?;
+        let depths = each_row(&full, |r| {
+            let (near, far) = views.near_far[r % b][r / b];
+            full.narrow(0, r, 1)?.clamp(1.0 / far, 1.0 / near)?.recip()
+        })?;
+        Ok((depths, sigmoid(&last(out.narrow(1, g, g)?)?)?))
+    }
+}
+
+/// u = GELU(bilinear ×4): 32 MiB per 256² view. Made again for each use, unless a
+/// gradient must pass through it.
+struct Upsampled {
+    low: Tensor,
+    kept: Option<Tensor>,
+}
+
+impl Upsampled {
+    fn new(low: Tensor, trace: &mut Trace<'_>) -> Result<Self> {
+        let kept = match low.track_op() || trace.is_on() {
+            true => Some(Self::make(&low)?),
+            false => None,
+        };
+        if let Some(up) = &kept {
+            trace.put("depth.upsampler_vb", up)?;
+        }
+        Ok(Self { low, kept })
+    }
+
+    fn make(low: &Tensor) -> Result<Tensor> {
+        let (_, _, h, w) = low.dims4()?;
+        gelu(&resize_bilinear(low, DOWNSCALE * h, DOWNSCALE * w)?)
+    }
+
+    /// Row `r`, `[1, C, H, W]`.
+    fn row(&self, r: usize) -> Result<Tensor> {
+        match &self.kept {
+            Some(up) => up.narrow(0, r, 1),
+            None => Self::make(&self.low.narrow(0, r, 1)?),
+        }
+    }
+}
+
+/// `f` of every row index of `like`, joined along the first dimension.
+fn each_row(like: &Tensor, f: impl Fn(usize) -> Result<Tensor>) -> Result<Tensor> {
+    Tensor::cat(&(0..like.dim(0)?).map(f).collect::<Result<Vec<_>>>()?, 0)
+}

@@ -1,0 +1,263 @@
+//! MVSplat's multi-view transformer (spec 2): windowed self- and cross-attention on
+//! 1/4 features, after UniMatch. Rows are (v b) throughout; tokens of a layer are
+//! kept in window order between the projections, so that windows are plain rows.
+
+use super::{bv_rows, vb_rows};
+use crate::config::Mvsplat as Settings;
+use crate::model::layers::{LayerNorm, Linear, gelu};
+use crate::model::trace::Trace;
+use crate::ops::attention::{Labels, attention};
+use candle_core::{Result, Tensor, bail};
+use candle_nn::VarBuilder;
+
+/// Tokens that pass the feed-forward block at once: its hidden layer is 8 × as wide
+/// as the tokens, 16 MiB per block of this many.
+const FFN_ROWS: usize = 4096;
+
+/// The network.
+#[derive(Clone, Debug)]
+pub struct Transformer {
+    layers: Vec<Layer>,
+    splits: usize,
+}
+
+#[derive(Clone, Debug)]
+struct Layer {
+    self_attn: SubLayer,
+    cross_attn: SubLayer,
+}
+
+impl Transformer {
+    /// Layers of self- then cross-attention.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
+    pub fn new(s: &Settings, vb: VarBuilder) -> Result<Self> {
+        let width = s.cnn_channels[2];
+        let layers = (0..s.transformer_layers).map(|i| {
+            let vb = vb.pp(format!("layers.{i}"));
+            Ok(Layer {
+                self_attn: SubLayer::new(width, None, vb.pp("self_attn"))?,
+                cross_attn: SubLayer::new(
+                    width,
+                    Some(2 * width * s.ffn_expansion),
+                    vb.pp("cross_attn_ffn"),
+                )?,
+            })
+        });
+        Ok(Self { layers: layers.collect::<Result<_>>()?, splits: s.window_splits })
+    }
+
+    /// `[B, V, C, h, w]` to the same shape.
+    ///
+    /// # Errors
+    /// h or w not a multiple of the window splits.
+    pub fn forward(&self, cnn: &Tensor, trace: &mut Trace<'_>) -> Result<Tensor> {
+        let (_, v, c, h, w) = cnn.dims5()?;
+        let s = self.splits;
+        if h % s != 0 || w % s != 0 {
+            bail!("transformer: expected a map that splits into {s}x{s} windows, got {h}x{w}");
+        }
+        let x = cnn.broadcast_add(&position_encoding(c, [h, w], s, cnn)?)?;
+        trace.put("transformer.pos_added", &x)?;
+        let mut x = vb_rows(&x)?.flatten_from(2)?.transpose(1, 2)?.contiguous()?;
+        for (i, layer) in self.layers.iter().enumerate() {
+            // A single window has no seams to shift.
+            let shifted = i % 2 == 1 && s > 1;
+            let windows = Windows::new([h, w], s, shifted);
+            let order = windows.order(x.device())?;
+            let input = x.index_select(&order, 1)?;
+            let updated = layer.self_attn.forward(&input, &[&input], &windows)?;
+            let back = windows.inverse(x.device())?;
+            trace.put_with(&format!("transformer.layer{i}.self_attn_vb"), || {
+                updated.index_select(&back, 1)
+            })?;
+            x = layer.cross(&updated, &input, v, &windows)?.index_select(&back, 1)?;
+            trace.put(&format!("transformer.layer{i}.out_vb"), &x)?;
+        }
+        let rows = x.dim(0)?;
+        let x = bv_rows(&x.transpose(1, 2)?.contiguous()?.reshape((rows, c, h, w))?, v)?;
+        trace.put("transformer.features", &x)?;
+        Ok(x)
+    }
+}
+
+impl Layer {
+    /// Cross-attention of every view to all others as they were at the layer's input
+    /// (`input`), all views at once.
+    fn cross(&self, x: &Tensor, input: &Tensor, views: usize, w: &Windows) -> Result<Tensor> {
+        let scenes = input.dim(0)? / views;
+        let of_view = |v: usize| input.narrow(0, v * scenes, scenes);
+        // Others in ascending order: target t of view v is view t, or t + 1 from v on.
+        let targets = (0..views - 1).map(|t| {
+            let rows = (0..views).map(|v| of_view(if t < v { t } else { t + 1 }));
+            Tensor::cat(&rows.collect::<Result<Vec<_>>>()?, 0)
+        });
+        let targets = targets.collect::<Result<Vec<_>>>()?;
+        self.cross_attn.forward(x, &targets.iter().collect::<Vec<_>>(), w)
+    }
+}
+
+/// x + norm1(merge(attention)), or with a feed-forward block
+/// x + norm2(mlp([x ; norm1(merge(attention))])).
+#[derive(Clone, Debug)]
+struct SubLayer {
+    q_proj: Linear,
+    k_proj: Linear,
+    v_proj: Linear,
+    merge: Linear,
+    norm1: LayerNorm,
+    ffn: Option<(Linear, Linear, LayerNorm)>,
+}
+
+impl SubLayer {
+    fn new(width: usize, hidden: Option<usize>, vb: VarBuilder) -> Result<Self> {
+        let square = |name: &str| Linear::new_no_bias(width, width, vb.pp(name));
+        let ffn = match hidden {
+            Some(hidden) => Some((
+                Linear::new_no_bias(2 * width, hidden, vb.pp("mlp.0"))?,
+                Linear::new_no_bias(hidden, width, vb.pp("mlp.2"))?,
+                LayerNorm::new(width, vb.pp("norm2"))?,
+            )),
+            None => None,
+        };
+        Ok(Self {
+            q_proj: square("q_proj")?,
+            k_proj: square("k_proj")?,
+            v_proj: square("v_proj")?,
+            merge: square("merge")?,
+            norm1: LayerNorm::new(width, vb.pp("norm1"))?,
+            ffn,
+        })
+    }
+
+    /// `x` and each of `targets` `[V·B, tokens, C]` in window order.
+    fn forward(&self, x: &Tensor, targets: &[&Tensor], windows: &Windows) -> Result<Tensor> {
+        let (rows, tokens, c) = x.dims3()?;
+        let (n, m) = (windows.count(), targets.len());
+        let len = tokens / n;
+        // Keys of a window: position-major, target-minor.
+        let gather = |proj: &Linear| -> Result<Tensor> {
+            let all = targets.iter().map(|t| proj.forward(t)?.reshape((rows * n, len, c)));
+            let all = all.collect::<Result<Vec<_>>>()?;
+            Tensor::stack(&all, 2)?.reshape((rows * n, len * m, c))
+        };
+        let q = self.q_proj.forward(x)?.reshape((rows * n, len, c))?;
+        let (k, v) = (gather(&self.k_proj)?, gather(&self.v_proj)?);
+        let scale = 1.0 / (c as f32).sqrt();
+        let message = attention(&q, &k, &v, scale, windows.labels(m))?;
+        let message = self.norm1.forward(&self.merge.forward(&message)?)?;
+        let message = message.reshape((rows, tokens, c))?;
+        match &self.ffn {
+            None => x + message,
+            Some(ffn) => {
+                let x = x.reshape((rows * tokens, c))?;
+                let message = message.reshape((rows * tokens, c))?;
+                feed_forward(ffn, &x, &message)?.reshape((rows, tokens, c))
+            }
+        }
+    }
+}
+
+fn feed_forward(
+    (up, down, norm): &(Linear, Linear, LayerNorm),
+    x: &Tensor,
+    message: &Tensor,
+) -> Result<Tensor> {
+    let rows = x.dim(0)?;
+    let blocks = (0..rows).step_by(FFN_ROWS).map(|start| {
+        let n = FFN_ROWS.min(rows - start);
+        let (x, message) = (x.narrow(0, start, n)?, message.narrow(0, start, n)?);
+        let hidden = gelu(&up.forward(&Tensor::cat(&[&x, &message], 1)?)?)?;
+        x + norm.forward(&down.forward(&hidden)?)?
+    });
+    Tensor::cat(&blocks.collect::<Result<Vec<_>>>()?, 0)
+}
+
+/// splits × splits windows of an h × w map, rolled by half a window if `shifted`.
+struct Windows {
+    size: [usize; 2],
+    splits: usize,
+    shift: [usize; 2],
+}
+
+impl Windows {
+    fn new(size: [usize; 2], splits: usize, shifted: bool) -> Self {
+        let shift = size.map(|n| if shifted { n / splits / 2 } else { 0 });
+        Self { size, splits, shift }
+    }
+
+    fn count(&self) -> usize {
+        self.splits * self.splits
+    }
+
+    /// Rolled coordinates (row, column) in window order: window index row·splits + column,
+    /// row-major inside.
+    fn rolled(&self) -> impl Iterator<Item = [usize; 2]> + use<> {
+        let (s, [wh, ww]) = (self.splits, self.size.map(|n| n / self.splits));
+        (0..s * s).flat_map(move |win| {
+            (0..wh * ww).map(move |i| [win / s * wh + i / ww, win % s * ww + i % ww])
+        })
+    }
+
+    /// Raster index of the token that stands at each place of the window order.
+    fn raster(&self) -> Vec<u32> {
+        let ([h, w], [sh, sw]) = (self.size, self.shift);
+        self.rolled().map(|[y, x]| ((y + sh) % h * w + (x + sw) % w) as u32).collect()
+    }
+
+    fn order(&self, device: &candle_core::Device) -> Result<Tensor> {
+        Tensor::new(self.raster(), device)
+    }
+
+    fn inverse(&self, device: &candle_core::Device) -> Result<Tensor> {
+        let mut inverse = vec![0u32; self.size[0] * self.size[1]];
+        for (place, &token) in self.raster().iter().enumerate() {
+            inverse[token as usize] = place as u32;
+        }
+        Tensor::new(inverse, device)
+    }
+
+    /// Regions that were not neighbours before the roll must not see each other. With
+    /// `m` targets the key labels are tiled, target-major, although the keys are
+    /// target-minor: the original's mask is misaligned for three views and more, and
+    /// its weights were never trained otherwise.
+    fn labels(&self, m: usize) -> Option<Labels> {
+        if self.shift == [0, 0] {
+            return None;
+        }
+        let region = |axis: usize, i: usize| -> u8 {
+            let n = self.size[axis];
+            u8::from(i >= n - n / self.splits) + u8::from(i >= n - self.shift[axis])
+        };
+        let queries: Vec<u8> =
+            self.rolled().map(|[y, x]| 3 * region(0, y) + region(1, x)).collect();
+        let len = queries.len() / self.count();
+        let keys = queries.chunks_exact(len).flat_map(|window| window.repeat(m)).collect();
+        Some(Labels { windows: self.count(), queries, keys })
+    }
+}
+
+/// `[C, h, w]`: sine and cosine of the position inside each window (1 to n, scaled to
+/// 2π), half of the channels from y, half from x.
+fn position_encoding(c: usize, size: [usize; 2], splits: usize, like: &Tensor) -> Result<Tensor> {
+    let [h, w] = size;
+    let half = c / 2;
+    let value = |k: usize, i: usize, n: usize| -> f32 {
+        let position = (i % n + 1) as f64 / (n as f64 + 1e-6) * std::f64::consts::TAU;
+        let angle = position / 10_000f64.powf((2 * (k / 2)) as f64 / half as f64);
+        (if k % 2 == 0 { angle.sin() } else { angle.cos() }) as f32
+    };
+    let mut out = Vec::with_capacity(c * h * w);
+    for k in 0..c {
+        for y in 0..h {
+            for x in 0..w {
+                out.push(match k < half {
+                    true => value(k, y, h / splits),
+                    false => value(k - half, x, w / splits),
+                });
+            }
+        }
+    }
+    Tensor::from_vec(out, (c, h, w), like.device())
+}

@@ -1,0 +1,167 @@
+//! Whether this encoder, with the weights given, computes what a reference computed:
+//! the engine of `subsplat compare`.
+//!
+//! The reference file holds inputs (`in.image` `[B, V, 3, H, W]`, `in.extrinsics`
+//! `[B, V, 4, 4]` camera to world, `in.intrinsics` `[B, V, 3, 3]` over the picture's
+//! size, `in.near`, `in.far` `[B, V]`) and any stages and outputs under the names that
+//! the encoder traces (`cnn.conv1` … `out.opacities`).
+
+use super::backbone::Mvsplat;
+use super::floors::{ALLOWANCE, floor};
+use super::primaries::primaries;
+use super::trace::Trace;
+use super::weights::{Weights, read_tensors};
+use super::{Primaries, Views};
+use crate::camera::{Camera, Intrinsics};
+use crate::config::{Backbone, Mvsplat as Settings};
+use candle_core::{Error, Result, Tensor, bail};
+use glam::Mat4;
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// One tensor of the reference file.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Row {
+    /// Its name; `1/name` where disparity is compared.
+    pub tensor: String,
+    /// Largest |ours − reference|.
+    pub max_abs: f32,
+    /// The same over the largest |reference|.
+    pub relative: f32,
+    /// Largest `relative` that passes: ten times the noise floor.
+    pub allowed: f32,
+    /// Whether it passes.
+    pub ok: bool,
+    /// Why not, where numbers do not say it (another shape).
+    pub note: Option<String>,
+}
+
+/// The whole comparison.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Report {
+    /// Tensors compared, in the order of computation.
+    pub rows: Vec<Row>,
+    /// Tensors of the file that the encoder does not produce.
+    pub not_produced: Vec<String>,
+    /// Tensors of the weight file that the encoder does not read.
+    pub unexpected_weights: Vec<String>,
+}
+
+impl Report {
+    /// Whether something was compared and every row passes.
+    pub fn ok(&self) -> bool {
+        !self.rows.is_empty() && self.rows.iter().all(|r| r.ok)
+    }
+}
+
+/// Runs the encoder on the file's inputs and compares every tensor that both have.
+///
+/// # Errors
+/// A file that cannot be read, inputs missing or malformed, weights that do not fit.
+pub fn compare(weights: &Weights, reference: &Path) -> Result<Report> {
+    let (tensors, _) = read_tensors(reference).map_err(Error::wrap)?;
+    let settings = match weights.config().map(|c| &c.backbone) {
+        None => Settings::re10k(),
+        Some(Backbone::Mvsplat(settings)) => settings.clone(),
+        Some(Backbone::Small(_)) => {
+            bail!("compare: expected weights of an MVSplat backbone, got the small one")
+        }
+    };
+    let encoder = Mvsplat::new(&settings, weights.builder())?;
+    let mut report = compare_encoder(&encoder, &settings, &tensors)?;
+    report.unexpected_weights = weights.unexpected();
+    Ok(report)
+}
+
+/// [`compare`] with a model and tensors in memory.
+///
+/// # Errors
+/// Inputs missing or malformed.
+pub fn compare_encoder(
+    encoder: &Mvsplat,
+    settings: &Settings,
+    reference: &BTreeMap<String, Tensor>,
+) -> Result<Report> {
+    let views = views(reference)?;
+    let mut rows = Vec::new();
+    let mut seen = Vec::new();
+    let mut look = |name: &str, ours: &Tensor| -> Result<()> {
+        if let Some(theirs) = reference.get(name) {
+            rows.push(row(name, ours, theirs)?);
+            if name == "gauss.depths" {
+                rows.push(row("1/gauss.depths", &ours.recip()?, &theirs.recip()?)?);
+            }
+            seen.push(name.to_owned());
+        }
+        Ok(())
+    };
+    let mut trace = Trace::to(&mut look);
+    let out = encoder.forward(&views, &mut trace)?;
+    let p = primaries(&out, &views, &settings.primaries, &mut trace)?;
+    trace_outputs(&p, &mut trace)?;
+    let not_produced =
+        reference.keys().filter(|n| !n.starts_with("in.") && !seen.contains(n)).cloned().collect();
+    Ok(Report { rows, not_produced, unexpected_weights: Vec::new() })
+}
+
+fn trace_outputs(p: &Primaries, trace: &mut Trace<'_>) -> Result<()> {
+    trace.put("out.means", &p.means)?;
+    trace.put_with("out.covariances", || p.covariances())?;
+    trace.put("out.harmonics", &p.sh)?;
+    trace.put("out.opacities", &p.opacities)
+}
+
+fn row(name: &str, ours: &Tensor, theirs: &Tensor) -> Result<Row> {
+    let allowed = ALLOWANCE * floor(name);
+    let tensor = name.to_owned();
+    if ours.dims() != theirs.dims() {
+        let note = format!("expected shape {:?}, got {:?}", theirs.dims(), ours.dims());
+        let inf = f32::INFINITY;
+        let row = Row { tensor, max_abs: inf, relative: inf, allowed, ok: false, note: Some(note) };
+        return Ok(row);
+    }
+    let (a, b) = (ours.flatten_all()?.to_vec1::<f32>()?, theirs.flatten_all()?.to_vec1::<f32>()?);
+    // `max` would drop a NaN; `fold` with this keeps it.
+    let worst = |m: f32, v: f32| if v > m || v.is_nan() { v } else { m };
+    let max_abs = a.iter().zip(&b).map(|(a, b)| (a - b).abs()).fold(0.0, worst);
+    let size = b.iter().map(|b| b.abs()).fold(0.0, worst);
+    let relative = if max_abs == 0.0 { 0.0 } else { max_abs / size };
+    Ok(Row { tensor, max_abs, relative, allowed, ok: relative <= allowed, note: None })
+}
+
+/// The inputs of a reference file.
+///
+/// # Errors
+/// A tensor is missing or has another shape; a camera is refused.
+pub fn views(tensors: &BTreeMap<String, Tensor>) -> Result<Views> {
+    let input = |name: &str| match tensors.get(name) {
+        Some(t) => Ok(t),
+        None => bail!("reference file: expected a tensor `{name}`, got none"),
+    };
+    let images = input("in.image")?;
+    let (b, v, _, h, w) = images.dims5()?;
+    let numbers = |name: &str, rest: &[usize]| -> Result<Vec<f32>> {
+        let (t, expected) = (input(name)?, [&[b, v], rest].concat());
+        if t.dims() != expected {
+            bail!("reference file `{name}`: expected shape {expected:?}, got {:?}", t.dims());
+        }
+        t.flatten_all()?.to_vec1()
+    };
+    let (poses, k) = (numbers("in.extrinsics", &[4, 4])?, numbers("in.intrinsics", &[3, 3])?);
+    let (near, far) = (numbers("in.near", &[])?, numbers("in.far", &[])?);
+    let (mut cameras, mut near_far) = (Vec::new(), Vec::new());
+    for (pose, k) in poses.chunks_exact(16).zip(k.chunks_exact(9)) {
+        let intrinsics = Intrinsics::from_normalised([k[0], k[4], k[2], k[5]], w, h);
+        let mut m = [0f32; 16];
+        m.copy_from_slice(pose);
+        let pose = Mat4::from_cols_array(&m).transpose();
+        cameras.push(Camera::new(intrinsics, pose).map_err(Error::wrap)?);
+    }
+    near_far.extend(near.into_iter().zip(far));
+    Views::new(
+        images.clone(),
+        cameras.chunks(v).map(<[_]>::to_vec).collect(),
+        near_far.chunks(v).map(<[_]>::to_vec).collect(),
+    )
+}

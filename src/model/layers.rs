@@ -1,0 +1,337 @@
+//! Layers that both backbones and the SPGR heads use, under PyTorch's parameter
+//! names and with its initialisation. All have gradients.
+
+use crate::ops::activation::{Activation, activation};
+use crate::ops::conv2d::conv2d;
+use crate::ops::norm;
+use candle_core::{Result, Tensor, bail};
+use candle_nn::{Init, VarBuilder};
+
+/// PyTorch's default for weights and biases of Linear and Conv: U(±1/√fan_in).
+pub fn default_init(fan_in: usize) -> Init {
+    let bound = 1.0 / (fan_in.max(1) as f64).sqrt();
+    Init::Uniform { lo: -bound, up: bound }
+}
+
+/// Kernel, stride and padding of a [`Conv2d`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ConvShape {
+    /// Side of the kernel.
+    pub kernel: usize,
+    /// Step, both axes.
+    pub stride: usize,
+    /// Zeros on every side.
+    pub padding: usize,
+}
+
+impl ConvShape {
+    /// 3×3, stride 1, same size.
+    pub const K3: Self = Self { kernel: 3, stride: 1, padding: 1 };
+    /// 3×3, stride 2, half the size.
+    pub const K3S2: Self = Self { kernel: 3, stride: 2, padding: 1 };
+    /// 1×1.
+    pub const K1: Self = Self { kernel: 1, stride: 1, padding: 0 };
+    /// 7×7, stride 2, half the size.
+    pub const K7S2: Self = Self { kernel: 7, stride: 2, padding: 3 };
+
+    /// The same with another stride.
+    #[must_use]
+    pub const fn stride(self, stride: usize) -> Self {
+        Self { stride, ..self }
+    }
+}
+
+/// `weight` `[O, C, k, k]`, `bias` `[O]`; `[B, C, H, W]` to `[B, O, H', W']`.
+#[derive(Clone, Debug)]
+pub struct Conv2d {
+    weight: Tensor,
+    bias: Option<Tensor>,
+    shape: ConvShape,
+}
+
+impl Conv2d {
+    /// With bias, PyTorch's default initialisation.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
+    pub fn new(c_in: usize, c_out: usize, shape: ConvShape, vb: VarBuilder) -> Result<Self> {
+        let init = default_init(c_in * shape.kernel * shape.kernel);
+        Self::with(c_in, c_out, shape, (init, Some(init)), vb)
+    }
+
+    /// Without bias, Kaiming-normal over fan-out (for ReLU), as in ResNets.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
+    pub fn new_no_bias(c_in: usize, c_out: usize, s: ConvShape, vb: VarBuilder) -> Result<Self> {
+        let stdev = (2.0 / (c_out * s.kernel * s.kernel) as f64).sqrt();
+        Self::with(c_in, c_out, s, (Init::Randn { mean: 0.0, stdev }, None), vb)
+    }
+
+    /// With the given initialisation of weight and, if there is one, bias.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
+    pub fn with(
+        c_in: usize,
+        c_out: usize,
+        shape: ConvShape,
+        init: (Init, Option<Init>),
+        vb: VarBuilder,
+    ) -> Result<Self> {
+        let k = shape.kernel;
+        let weight = vb.get_with_hints((c_out, c_in, k, k), "weight", init.0)?;
+        let bias = match init.1 {
+            Some(init) => Some(vb.get_with_hints(c_out, "bias", init)?),
+            None => None,
+        };
+        Ok(Self { weight, bias, shape })
+    }
+
+    /// `[B, C, H, W]` to `[B, O, H', W']`.
+    ///
+    /// # Errors
+    /// Another rank or number of channels.
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        conv2d(x, &self.weight, self.bias.as_ref(), self.shape.stride, self.shape.padding)
+    }
+}
+
+/// `weight` `[O, C]`, `bias` `[O]`; `[…, C]` to `[…, O]`.
+#[derive(Clone, Debug)]
+pub struct Linear {
+    weight: Tensor,
+    bias: Option<Tensor>,
+}
+
+impl Linear {
+    /// With bias, PyTorch's default initialisation.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
+    pub fn new(c_in: usize, c_out: usize, vb: VarBuilder) -> Result<Self> {
+        let init = default_init(c_in);
+        Self::with(c_in, c_out, (init, Some(init)), vb)
+    }
+
+    /// Without bias, Xavier-uniform, as in transformers.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
+    pub fn new_no_bias(c_in: usize, c_out: usize, vb: VarBuilder) -> Result<Self> {
+        let bound = (6.0 / (c_in + c_out) as f64).sqrt();
+        Self::with(c_in, c_out, (Init::Uniform { lo: -bound, up: bound }, None), vb)
+    }
+
+    /// With the given initialisation of weight and, if there is one, bias.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
+    pub fn with(
+        c_in: usize,
+        c_out: usize,
+        init: (Init, Option<Init>),
+        vb: VarBuilder,
+    ) -> Result<Self> {
+        let weight = vb.get_with_hints((c_out, c_in), "weight", init.0)?;
+        let bias = match init.1 {
+            Some(init) => Some(vb.get_with_hints(c_out, "bias", init)?),
+            None => None,
+        };
+        Ok(Self { weight, bias })
+    }
+
+    /// `[…, C]` to `[…, O]`.
+    ///
+    /// # Errors
+    /// Another last dimension.
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        let (o, c) = self.weight.dims2()?;
+        let mut dims = x.dims().to_vec();
+        if dims.last() != Some(&c) {
+            bail!("linear: expected x [.., {c}], got {:?}", x.dims());
+        }
+        let y = x.contiguous()?.reshape(((), c))?.matmul(&self.weight.t()?)?;
+        let y = match &self.bias {
+            Some(bias) => y.broadcast_add(bias)?,
+            None => y,
+        };
+        if let Some(last) = dims.last_mut() {
+            *last = o;
+        }
+        y.reshape(dims)
+    }
+}
+
+/// Normalises groups of channels over their channels and pixels, then scales and
+/// shifts each channel: `weight`, `bias` `[C]`; `[B, C, H, W]`.
+#[derive(Clone, Debug)]
+pub struct GroupNorm {
+    weight: Tensor,
+    bias: Tensor,
+    groups: usize,
+}
+
+impl GroupNorm {
+    /// Initialised to scale 1, shift 0.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape; `groups` does not divide `channels`.
+    pub fn new(groups: usize, channels: usize, vb: VarBuilder) -> Result<Self> {
+        Self::with(groups, channels, Init::Const(1.0), vb)
+    }
+
+    /// Initialised to scale 0, shift 0: a residual branch that starts closed.
+    ///
+    /// # Errors
+    /// As [`GroupNorm::new`].
+    pub fn new_zero(groups: usize, channels: usize, vb: VarBuilder) -> Result<Self> {
+        Self::with(groups, channels, Init::Const(0.0), vb)
+    }
+
+    fn with(groups: usize, channels: usize, weight: Init, vb: VarBuilder) -> Result<Self> {
+        if groups == 0 || !channels.is_multiple_of(groups) {
+            bail!("group norm: expected groups that divide {channels} channels, got {groups}");
+        }
+        Ok(Self {
+            weight: vb.get_with_hints(channels, "weight", weight)?,
+            bias: vb.get_with_hints(channels, "bias", Init::Const(0.0))?,
+            groups,
+        })
+    }
+
+    /// `[B, C, …]` to the same shape.
+    ///
+    /// # Errors
+    /// Another number of channels.
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        norm::group_norm(x, self.groups, &self.weight, &self.bias)
+    }
+}
+
+/// Each channel of each picture to zero mean and unit variance over its pixels, no
+/// parameters; `[B, C, H, W]`.
+///
+/// # Errors
+/// Another rank.
+pub fn instance_norm(x: &Tensor) -> Result<Tensor> {
+    norm::instance_norm(x)
+}
+
+/// Normalises the last dimension, then scales and shifts: `weight`, `bias` `[C]`.
+#[derive(Clone, Debug)]
+pub struct LayerNorm {
+    weight: Tensor,
+    bias: Tensor,
+}
+
+impl LayerNorm {
+    /// Initialised to scale 1, shift 0.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
+    pub fn new(width: usize, vb: VarBuilder) -> Result<Self> {
+        Ok(Self {
+            weight: vb.get_with_hints(width, "weight", Init::Const(1.0))?,
+            bias: vb.get_with_hints(width, "bias", Init::Const(0.0))?,
+        })
+    }
+
+    /// `[…, C]` to the same shape.
+    ///
+    /// # Errors
+    /// Another last dimension.
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        norm::layer_norm(x, &self.weight, &self.bias)
+    }
+}
+
+/// max(0, x).
+///
+/// # Errors
+/// Not an f32 tensor.
+pub fn relu(x: &Tensor) -> Result<Tensor> {
+    activation(x, Activation::Relu)
+}
+
+/// x·sigmoid(x).
+///
+/// # Errors
+/// Not an f32 tensor.
+pub fn silu(x: &Tensor) -> Result<Tensor> {
+    activation(x, Activation::Silu)
+}
+
+/// x·Φ(x), the exact (erf) form.
+///
+/// # Errors
+/// Not an f32 tensor.
+pub fn gelu(x: &Tensor) -> Result<Tensor> {
+    activation(x, Activation::Gelu)
+}
+
+/// 1/(1 + e⁻ˣ).
+///
+/// # Errors
+/// Not an f32 tensor.
+pub fn sigmoid(x: &Tensor) -> Result<Tensor> {
+    activation(x, Activation::Sigmoid)
+}
+
+pub use crate::ops::activation::softmax;
+pub use crate::ops::resize::{resize_bilinear, upsample_nearest};
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::weights::Weights;
+    use candle_core::{Device, Var};
+
+    /// Compares the gradient of Σ f(x)·r with central differences.
+    fn check_grad(x: Tensor, f: impl Fn(&Tensor) -> Result<Tensor>) -> Result<()> {
+        let var = Var::from_tensor(&x)?;
+        let r = f(&x)?.randn_like(0.0, 1.0)?;
+        let loss = |t: &Tensor| (f(t)? * &r)?.sum_all();
+        let grad = loss(var.as_tensor())?.backward()?;
+        let grad = grad.get(&var).unwrap().flatten_all()?.to_vec1::<f32>()?;
+        let at = x.flatten_all()?.to_vec1::<f32>()?;
+        for i in (0..at.len()).step_by(1 + at.len() / 23) {
+            let eval = |h: f32| -> Result<f64> {
+                let mut v = at.clone();
+                v[i] += h;
+                let y = f(&Tensor::from_vec(v, x.shape(), x.device())?)?;
+                let terms = (y * &r)?.flatten_all()?.to_vec1::<f32>()?;
+                Ok(terms.iter().map(|v| f64::from(*v)).sum())
+            };
+            let numeric = (eval(1e-2)? - eval(-1e-2)?) / 2e-2;
+            let g = f64::from(grad[i]);
+            assert!((numeric - g).abs() < 4e-3 * (1.0 + g.abs()), "[{i}] {numeric} {g}");
+        }
+        Ok(())
+    }
+
+    fn noise(shape: &[usize]) -> Result<Tensor> {
+        Tensor::randn(0.3f32, 1.2, shape, &Device::Cpu)
+    }
+
+    #[test]
+    fn every_layer_has_its_gradient() -> Result<()> {
+        let vb = Weights::seeded(1).builder();
+        let x = noise(&[2, 8, 5, 6])?;
+        let conv = Conv2d::new(8, 4, ConvShape::K3S2, vb.pp("conv"))?;
+        check_grad(x.clone(), |x| conv.forward(x))?;
+        let norm = GroupNorm::new(4, 8, vb.pp("gn"))?;
+        check_grad(x.clone(), |x| norm.forward(x))?;
+        check_grad(x.clone(), instance_norm)?;
+        check_grad(x.clone(), silu)?;
+        check_grad(x.clone(), gelu)?;
+        check_grad(x.clone(), sigmoid)?;
+        check_grad(x.clone(), softmax)?;
+        check_grad(x.clone(), |x| resize_bilinear(x, 9, 11))?;
+        check_grad(x.clone(), |x| upsample_nearest(x, 2))?;
+        let linear = Linear::new(6, 7, vb.pp("linear"))?;
+        check_grad(x.clone(), |x| linear.forward(x))?;
+        let norm = LayerNorm::new(6, vb.pp("ln"))?;
+        check_grad(x, |x| norm.forward(x))
+    }
+}

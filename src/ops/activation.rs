@@ -1,0 +1,71 @@
+//! Pointwise functions and softmax over the last dimension as candle ops with
+//! gradients. Kernels: [`crate::cpu::activation`]. Tests: `model::layers`.
+
+use super::{f32_slice, output, tensor_like, values};
+use crate::cpu::activation as cpu;
+pub use crate::cpu::activation::Activation;
+use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
+
+/// y = f(x), any shape.
+///
+/// # Errors
+/// A dtype other than f32.
+pub fn activation(x: &Tensor, kind: Activation) -> Result<Tensor> {
+    x.contiguous()?.apply_op1(Pointwise(kind))
+}
+
+struct Pointwise(Activation);
+
+impl CustomOp1 for Pointwise {
+    fn name(&self) -> &'static str {
+        "activation"
+    }
+
+    fn cpu_fwd(&self, s: &CpuStorage, l: &Layout) -> Result<(CpuStorage, Shape)> {
+        let x = f32_slice("activation", "x", s, l)?;
+        let mut y = vec![0.0; x.len()];
+        cpu::forward(self.0, x, &mut y);
+        output(y, l.shape().clone())
+    }
+
+    fn bwd(&self, x: &Tensor, _y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
+        let (x_values, dy) = (values(x)?, values(dy)?);
+        let mut dx = vec![0.0; dy.len()];
+        cpu::backward(self.0, &x_values, &dy, &mut dx);
+        tensor_like(dx, x).map(Some)
+    }
+}
+
+/// Softmax over the last dimension.
+///
+/// # Errors
+/// A scalar; a dtype other than f32.
+pub fn softmax(x: &Tensor) -> Result<Tensor> {
+    match x.dims().last() {
+        Some(&n) if n > 0 => x.contiguous()?.apply_op1(Softmax(n)),
+        _ => bail!("softmax: expected a last dimension of at least 1, got {:?}", x.dims()),
+    }
+}
+
+/// Over rows of this many elements.
+struct Softmax(usize);
+
+impl CustomOp1 for Softmax {
+    fn name(&self) -> &'static str {
+        "softmax"
+    }
+
+    fn cpu_fwd(&self, s: &CpuStorage, l: &Layout) -> Result<(CpuStorage, Shape)> {
+        let x = f32_slice("softmax", "x", s, l)?;
+        let mut y = vec![0.0; x.len()];
+        cpu::softmax(self.0, x, &mut y);
+        output(y, l.shape().clone())
+    }
+
+    fn bwd(&self, x: &Tensor, y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
+        let (y, dy) = (values(y)?, values(dy)?);
+        let mut dx = vec![0.0; dy.len()];
+        cpu::softmax_backward(self.0, &y, &dy, &mut dx);
+        tensor_like(dx, x).map(Some)
+    }
+}

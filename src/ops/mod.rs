@@ -1,0 +1,86 @@
+//! Custom candle ops over the kernels of [`crate::cpu`]: shape, dtype and layout
+//! checks live here, the arithmetic there. Every op either has a gradient or says
+//! plainly that it has none; none drops it silently.
+
+pub mod activation;
+pub mod attention;
+pub mod attention_gather;
+pub mod conv2d;
+pub mod matching;
+pub mod norm;
+pub mod plane_sweep;
+mod rasterize;
+pub mod redistribute;
+pub mod resize;
+pub mod spgr;
+
+pub use rasterize::rasterize;
+
+use crate::cpu::real::Real;
+use candle_core::{CpuStorage, Layout, Result, Shape, Tensor, WithDType, bail};
+
+/// A number that both candle and the kernels know: `f32` or `f64`.
+pub(crate) trait Number: Real + WithDType {}
+impl Number for f32 {}
+impl Number for f64 {}
+
+/// The elements of an op's argument, which must be contiguous and of type `T`.
+pub(crate) fn slice<'a, T: Number>(
+    op: &str,
+    what: &str,
+    storage: &'a CpuStorage,
+    layout: &Layout,
+) -> Result<&'a [T]> {
+    let Ok(data) = storage.as_slice::<T>() else {
+        let got = candle_core::backend::BackendStorage::dtype(storage);
+        bail!("{op} {what}: expected {:?} like the first argument, got {got:?}", T::DTYPE)
+    };
+    match layout.contiguous_offsets() {
+        Some((start, end)) => Ok(&data[start..end]),
+        None => {
+            bail!("{op} {what}: expected a contiguous tensor, got strides {:?}", layout.stride())
+        }
+    }
+}
+
+/// All elements in row-major order, for a kernel of a backward pass.
+pub(crate) fn elements<T: Number>(tensor: &Tensor) -> Result<Vec<T>> {
+    tensor.flatten_all()?.to_vec1::<T>()
+}
+
+/// [`slice`] of `f32`.
+pub(crate) fn f32_slice<'a>(
+    op: &str,
+    what: &str,
+    storage: &'a CpuStorage,
+    layout: &Layout,
+) -> Result<&'a [f32]> {
+    slice(op, what, storage, layout)
+}
+
+/// An op's result.
+pub(crate) fn output(data: Vec<f32>, shape: impl Into<Shape>) -> Result<(CpuStorage, Shape)> {
+    Ok((CpuStorage::F32(data), shape.into()))
+}
+
+/// [`elements`] of `f32`.
+pub(crate) fn values(t: &Tensor) -> Result<Vec<f32>> {
+    elements(t)
+}
+
+/// A tensor of `like`'s shape and device.
+pub(crate) fn tensor_like(data: Vec<f32>, like: &Tensor) -> Result<Tensor> {
+    Tensor::from_vec(data, like.shape(), like.device())
+}
+
+/// Runs `$run::<T>($($arg),*)` for the `f32` or `f64` that `$dtype` says.
+macro_rules! by_dtype {
+    ($op:expr, $dtype:expr, $run:ident ( $($arg:expr),* )) => {
+        match $dtype {
+            candle_core::DType::F32 => $run::<f32>($($arg),*),
+            candle_core::DType::F64 => $run::<f64>($($arg),*),
+            other => candle_core::bail!("{}: expected f32 or f64, got {other:?}", $op),
+        }
+    };
+}
+pub(crate) use by_dtype;

@@ -1,0 +1,121 @@
+//! GroupNorm, InstanceNorm and LayerNorm as one candle op with gradients. Kernel:
+//! [`crate::cpu::norm`]. Tests: `model::layers`.
+
+use super::{f32_slice, output, tensor_like, values};
+use crate::cpu::norm::{self as cpu, Rows};
+use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Tensor, bail};
+
+/// ε of every normalisation (PyTorch's default).
+const EPS: f32 = 1e-5;
+
+/// Over the channels of each of `groups` groups and all pixels: `x` `[B, C, …]`,
+/// `weight` and `bias` `[C]`.
+///
+/// # Errors
+/// Shapes that do not fit; a dtype other than f32.
+pub fn group_norm(x: &Tensor, groups: usize, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
+    let dims = x.dims();
+    let c = weight.elem_count();
+    if dims.len() < 3 || dims[1] != c || groups == 0 || !c.is_multiple_of(groups) {
+        bail!(
+            "group norm: expected x [B, {c}, ..] and groups dividing {c}, got {dims:?}, {groups}"
+        );
+    }
+    let run = dims[2..].iter().product();
+    normalise(x, Rows { len: c / groups * run, run, groups, eps: EPS }, Some((weight, bias)))
+}
+
+/// Over the pixels of each channel of each picture, no parameters: `[B, C, H, W]`.
+///
+/// # Errors
+/// Another rank; a dtype other than f32.
+pub fn instance_norm(x: &Tensor) -> Result<Tensor> {
+    let (_, _, h, w) = x.dims4()?;
+    normalise(x, Rows { len: h * w, run: h * w, groups: 1, eps: EPS }, None)
+}
+
+/// Over the last dimension: `x` `[…, C]`, `weight` and `bias` `[C]`.
+///
+/// # Errors
+/// Shapes that do not fit; a dtype other than f32.
+pub fn layer_norm(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
+    let c = weight.elem_count();
+    if x.dims().last() != Some(&c) {
+        bail!("layer norm: expected x [.., {c}], got {:?}", x.dims());
+    }
+    normalise(x, Rows { len: c, run: 1, groups: 1, eps: EPS }, Some((weight, bias)))
+}
+
+fn normalise(x: &Tensor, rows: Rows, affine: Option<(&Tensor, &Tensor)>) -> Result<Tensor> {
+    if rows.len == 0 {
+        bail!("normalisation: expected at least one element to average, got {:?}", x.dims());
+    }
+    let x = x.contiguous()?;
+    match affine {
+        Some((w, b)) if w.dims() == b.dims() => {
+            x.apply_op3(&w.contiguous()?, &b.contiguous()?, Normalise(rows))
+        }
+        Some((w, b)) => {
+            bail!("normalisation bias: expected {:?} like weight, got {:?}", w.dims(), b.dims())
+        }
+        None => x.apply_op1(Normalise(rows)),
+    }
+}
+
+struct Normalise(Rows);
+
+impl Normalise {
+    fn run(&self, x: &[f32], w: &[f32], b: &[f32], shape: &Shape) -> Result<(CpuStorage, Shape)> {
+        let mut y = vec![0.0; x.len()];
+        cpu::forward(&self.0, x, w, b, &mut y);
+        output(y, shape.clone())
+    }
+}
+
+impl CustomOp1 for Normalise {
+    fn name(&self) -> &'static str {
+        "normalise"
+    }
+
+    fn cpu_fwd(&self, s: &CpuStorage, l: &Layout) -> Result<(CpuStorage, Shape)> {
+        self.run(f32_slice("normalise", "x", s, l)?, &[], &[], l.shape())
+    }
+
+    fn bwd(&self, x: &Tensor, _y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
+        let (dx, _, _) = cpu::backward(&self.0, &values(x)?, &[], &values(dy)?);
+        tensor_like(dx, x).map(Some)
+    }
+}
+
+impl CustomOp3 for Normalise {
+    fn name(&self) -> &'static str {
+        "normalise"
+    }
+
+    fn cpu_fwd(
+        &self,
+        s1: &CpuStorage,
+        l1: &Layout,
+        s2: &CpuStorage,
+        l2: &Layout,
+        s3: &CpuStorage,
+        l3: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        let x = f32_slice("normalise", "x", s1, l1)?;
+        let w = f32_slice("normalise", "weight", s2, l2)?;
+        let b = f32_slice("normalise", "bias", s3, l3)?;
+        self.run(x, w, b, l1.shape())
+    }
+
+    fn bwd(
+        &self,
+        x: &Tensor,
+        w: &Tensor,
+        b: &Tensor,
+        _y: &Tensor,
+        dy: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        let (dx, dw, db) = cpu::backward(&self.0, &values(x)?, &values(w)?, &values(dy)?);
+        Ok((Some(tensor_like(dx, x)?), Some(tensor_like(dw, w)?), Some(tensor_like(db, b)?)))
+    }
+}

@@ -1,0 +1,154 @@
+//! Plane sweep (fused warp and correlation) as a candle op. Kernel:
+//! [`crate::cpu::plane_sweep`]. The sampling grid carries no gradient, as in
+//! MVSplat; the features' gradient is not written yet, and backward says so.
+
+use super::{f32_slice, output, values};
+use crate::camera::Camera;
+use crate::cpu::plane_sweep as cpu;
+pub use crate::cpu::plane_sweep::{Pair, Sweep};
+use candle_core::{CpuStorage, CustomOp2, Error, Layout, Result, Shape, Tensor, bail};
+use glam::{DMat3, DMat4};
+
+/// Whose intrinsics project into the source view.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Projection {
+    /// The source view's own: right for any pair of cameras.
+    Source,
+    /// The reference view's, as MVSplat does.
+    Reference,
+}
+
+/// The map from reference pixels and depths to pixels of `source`, whose features
+/// are row `row` of the op's second tensor. Both cameras have the intrinsics of the
+/// feature maps ([`Camera::resized`]). f64 until the end.
+///
+/// # Errors
+/// An intrinsic matrix or pose that cannot be inverted.
+pub fn pair(
+    reference: &Camera,
+    source: &Camera,
+    projection: Projection,
+    row: usize,
+) -> Result<Pair> {
+    let k_r: DMat3 = reference.intrinsics.matrix().as_dmat3();
+    let k_s = match projection {
+        Projection::Source => source.intrinsics.matrix().as_dmat3(),
+        Projection::Reference => k_r,
+    };
+    let relative = relative_pose(reference, source);
+    let a = k_s * DMat3::from_mat4(relative) * k_r.inverse();
+    let b = k_s * relative.w_axis.truncate();
+    if !a.is_finite() || !b.is_finite() {
+        bail!("plane sweep cameras: expected invertible intrinsics and poses, got {reference:?}");
+    }
+    Ok(Pair {
+        source: row,
+        a: a.transpose().to_cols_array().map(|v| v as f32),
+        b: b.as_vec3().to_array(),
+    })
+}
+
+/// source_camera_from_reference_camera = inv(E_s)·E_r, f64.
+pub fn relative_pose(reference: &Camera, source: &Camera) -> DMat4 {
+    source.world_from_camera.as_dmat4().inverse() * reference.world_from_camera.as_dmat4()
+}
+
+/// Correlation `[R, D, h, w]` of `reference` `[R, C, h, w]` with `source`
+/// `[S, C, h, w]`.
+///
+/// # Errors
+/// Shapes, pairs or depths that do not fit one another; a dtype other than f32.
+pub fn plane_sweep(reference: &Tensor, source: &Tensor, sweep: Sweep) -> Result<Tensor> {
+    let ((r, c, h, w), (s, ..)) = (reference.dims4()?, source.dims4()?);
+    if source.dims()[1..] != [c, h, w] || sweep.channels != c || sweep.size != [h, w] {
+        bail!(
+            "plane sweep: expected reference and source [.., {}, {}, {}], got {:?} and {:?}",
+            sweep.channels,
+            sweep.size[0],
+            sweep.size[1],
+            reference.dims(),
+            source.dims()
+        );
+    }
+    let d = sweep.candidates();
+    if sweep.depths.len() != r
+        || sweep.pairs.len() != r
+        || sweep.depths.iter().any(|x| x.len() != d)
+    {
+        bail!(
+            "plane sweep: expected pairs and {d} depths for each of {r} rows, got {} and {}",
+            sweep.pairs.len(),
+            sweep.depths.len()
+        );
+    }
+    if let Some(p) = sweep.pairs.iter().flatten().find(|p| p.source >= s) {
+        bail!("plane sweep pair: expected a source row below {s}, got {}", p.source);
+    }
+    reference.contiguous()?.apply_op2(&source.contiguous()?, Op(sweep))
+}
+
+/// Share of the pairs of each reference pixel and candidate that fall inside their
+/// source picture, `[R, D, h, w]`. Constant: no gradient flows to cameras.
+///
+/// # Errors
+/// Whatever candle says of the allocation.
+pub fn validity(sweep: &Sweep) -> Result<Tensor> {
+    let ([h, w], r, d) = (sweep.size, sweep.pairs.len(), sweep.candidates());
+    let mut out = vec![0.0; r * d * h * w];
+    cpu::validity(sweep, &mut out);
+    Tensor::from_vec(out, (r, d, h, w), &candle_core::Device::Cpu)
+}
+
+/// The warped source features of some candidates, `[R, C, candidates, h, w]`: for
+/// looking at, the sweep itself never makes them.
+///
+/// # Errors
+/// A candidate or pair out of range.
+pub fn warped(source: &Tensor, sweep: &Sweep, pair: usize, candidates: &[usize]) -> Result<Tensor> {
+    let ([h, w], c, r) = (sweep.size, sweep.channels, sweep.pairs.len());
+    if candidates.iter().any(|&k| k >= sweep.candidates()) {
+        bail!("plane sweep: expected candidates below {}, got {candidates:?}", sweep.candidates());
+    }
+    let source = values(source)?;
+    let mut planes = Vec::new();
+    for row in 0..r {
+        for &k in candidates {
+            let plane = cpu::warp(sweep, row, pair, k, &source);
+            planes.push(Tensor::from_vec(plane, (c, h, w), &candle_core::Device::Cpu)?);
+        }
+    }
+    Tensor::stack(&planes, 0)?.reshape((r, candidates.len(), c, h, w))?.transpose(1, 2)
+}
+
+struct Op(Sweep);
+
+impl CustomOp2 for Op {
+    fn name(&self) -> &'static str {
+        "plane-sweep"
+    }
+
+    fn cpu_fwd(
+        &self,
+        s1: &CpuStorage,
+        l1: &Layout,
+        s2: &CpuStorage,
+        l2: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        let reference = f32_slice("plane-sweep", "reference", s1, l1)?;
+        let source = f32_slice("plane-sweep", "source", s2, l2)?;
+        let ([h, w], r, d) = (self.0.size, l1.dims()[0], self.0.candidates());
+        let mut out = vec![0.0; r * d * h * w];
+        cpu::correlation(&self.0, reference, source, &mut out);
+        output(out, (r, d, h, w))
+    }
+
+    fn bwd(
+        &self,
+        _reference: &Tensor,
+        _source: &Tensor,
+        _res: &Tensor,
+        _grad: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
+        Err(Error::BackwardNotSupported { op: "plane-sweep" })
+    }
+}

@@ -1,0 +1,67 @@
+//! Bilinear resize (corners aligned) and nearest upsampling as candle ops with
+//! gradients: candle's bilinear has none, and its nearest overwrites instead of
+//! adding. Kernels: [`crate::cpu::resize`]. Tests: `model::layers`.
+
+use super::{f32_slice, output, values};
+use crate::cpu::resize::{self as cpu, Resize};
+use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
+
+/// `[B, C, h, w]` to `[B, C, H, W]`, corner pixels on corner pixels
+/// (`align_corners = true`).
+///
+/// # Errors
+/// Another rank, an empty size, a dtype other than f32.
+pub fn resize_bilinear(x: &Tensor, height: usize, width: usize) -> Result<Tensor> {
+    run(x, [height, width], None)
+}
+
+/// `[B, C, h, w]` to `[B, C, s·h, s·w]`, each pixel repeated s × s times.
+///
+/// # Errors
+/// Another rank, an empty size, a dtype other than f32.
+pub fn upsample_nearest(x: &Tensor, s: usize) -> Result<Tensor> {
+    let (_, _, h, w) = x.dims4()?;
+    run(x, [s * h, s * w], Some(s))
+}
+
+fn run(x: &Tensor, to: [usize; 2], nearest: Option<usize>) -> Result<Tensor> {
+    let (_, _, h, w) = x.dims4()?;
+    if h * w == 0 || to[0] * to[1] == 0 {
+        bail!("resize: expected sizes of at least 1, got {h}x{w} to {}x{}", to[0], to[1]);
+    }
+    x.contiguous()?.apply_op1(Op { sizes: Resize { from: [h, w], to }, nearest })
+}
+
+struct Op {
+    sizes: Resize,
+    /// Whole factor of nearest upsampling; bilinear if none.
+    nearest: Option<usize>,
+}
+
+impl CustomOp1 for Op {
+    fn name(&self) -> &'static str {
+        "resize"
+    }
+
+    fn cpu_fwd(&self, s: &CpuStorage, l: &Layout) -> Result<(CpuStorage, Shape)> {
+        let x = f32_slice("resize", "x", s, l)?;
+        let (b, c, _, _) = l.shape().dims4()?;
+        let [h, w] = self.sizes.to;
+        let mut y = vec![0.0; b * c * h * w];
+        match self.nearest {
+            Some(s) => cpu::nearest(&self.sizes, s, x, &mut y),
+            None => cpu::bilinear(&self.sizes, x, &mut y),
+        }
+        output(y, (b, c, h, w))
+    }
+
+    fn bwd(&self, x: &Tensor, _y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
+        let dy = values(dy)?;
+        let mut dx = vec![0.0; x.elem_count()];
+        match self.nearest {
+            Some(s) => cpu::nearest_transposed(&self.sizes, s, &dy, &mut dx),
+            None => cpu::bilinear_transposed(&self.sizes, &dy, &mut dx),
+        }
+        super::tensor_like(dx, x).map(Some)
+    }
+}
