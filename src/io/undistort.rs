@@ -251,6 +251,60 @@ mod tests {
         ]
     }
 
+    /// Values by tools/make_distortion_golden.py (OpenCV 5.0.0).
+    #[test]
+    fn distort_is_opencvs() {
+        let rays = [(0.3, -0.2), (-0.5, 0.4), (0.7, 0.1)];
+        let table = [
+            (
+                Distortion::brown(
+                    [0.0578421, -0.0805099, 0.0, 0.0, 0.0, 0.0],
+                    [-0.000980296, 0.00015575],
+                ),
+                [
+                    (0.302013575, -0.201456323),
+                    (-0.504556923, 0.403294703),
+                    (0.706248771, 0.100391409),
+                ],
+            ),
+            (
+                Distortion::brown([-0.2, 0.05, 0.03, 0.0, 0.0, 0.0], [0.01, -0.02]),
+                [(0.285073273, -0.190482182), (-0.486436315, 0.386689052), (0.613175, 0.094025)],
+            ),
+            (
+                Distortion::brown([0.3, 0.1, -0.02, 0.5, 0.05, 0.01], [0.003, 0.004]),
+                [
+                    (0.293781297, -0.195117531),
+                    (-0.466399885, 0.375661908),
+                    (0.655795984, 0.094899426),
+                ],
+            ),
+            (
+                Distortion::fisheye([0.0; 4]),
+                [
+                    (0.287928451, -0.1919523),
+                    (-0.444731961, 0.355785569),
+                    (0.609293826, 0.087041975),
+                ],
+            ),
+            (
+                Distortion::fisheye([0.02, -0.01, 0.005, -0.002]),
+                [
+                    (0.288579096, -0.192386064),
+                    (-0.44721523, 0.357772184),
+                    (0.613176193, 0.087596599),
+                ],
+            ),
+        ];
+        for (lens, seen) in table {
+            for (ray, want) in rays.into_iter().zip(seen) {
+                let got = lens.distort_f64(ray.into());
+                assert!((got - DVec2::from(want)).length() < 1e-8, "{lens:?} {ray:?}: {got}");
+            }
+            assert_eq!(lens.distort(Vec2::ZERO).x, lens.distort_f64(DVec2::ZERO).x as f32);
+        }
+    }
+
     #[test]
     fn the_new_pinhole_touches_the_border_and_stays_inside() {
         for lens in lenses() {
