@@ -1,7 +1,8 @@
 //! Which feature of one photograph is which of the other: nearest descriptors that
 //! choose each other and are clearly nearer than the runner-up. Uses no pose.
 
-use super::features::{DESCRIPTOR, Features};
+use super::descriptors::DESCRIPTOR;
+use super::features::Features;
 use rayon::prelude::*;
 
 /// Largest ratio of the nearest descriptor's distance to the next one's (Lowe,
