@@ -255,22 +255,34 @@ fn the_epipolar_picture_shows_lines_through_their_points() {
     let Some(folder) = common::shared("photos/re10k_0f68374b76390082") else { return };
     let f = frames(&folder, &[2, 12]);
     let report = check(&f[0], &f[0].camera, &f[1], &f[1].camera);
-    let photograph = |f: &'static Frame| RgbPicture {
-        width: f.rgb.width() as usize,
-        height: f.rgb.height() as usize,
-        pixels: f.rgb.as_raw(),
-    };
-    let f: &'static [Frame] = f.leak();
-    let photographs = [photograph(&f[0]), photograph(&f[1])];
+    let photographs = [0, 1].map(|i| RgbPicture {
+        width: f[i].rgb.width() as usize,
+        height: f[i].rgb.height() as usize,
+        pixels: f[i].rgb.as_raw(),
+    });
     let cameras = [&f[0].camera, &f[1].camera];
     let (w, h, rgb) = epipolar_picture(photographs, cameras, &report.points).unwrap();
     assert_eq!(rgb.len(), 3 * w * h);
     assert_eq!((w, h), (2 * 864 + 8, 480));
-    // Undimmed, saturated colours are the drawing's alone: a line across either half.
-    let red = |x: usize, y: usize| rgb[3 * (y * w + x)..][..3] == [255, 64, 64];
-    for columns in [0..864, 872..w] {
-        let count = columns.map(|x| (0..h).filter(|&y| red(x, y)).count()).sum::<usize>();
-        assert!(count > 200, "{count}");
+    // Undimmed, saturated colours are the drawing's alone. The surest match is drawn
+    // in the first colour: around its point, in either half, the line must pass.
+    let passes = |rgb: &[u8], centre: [f32; 2]| {
+        let near = |i: usize| {
+            let (x, y) = ((i % w) as f32 + 0.5, (i / w) as f32 + 0.5);
+            (9.0..12.0).contains(&(x - centre[0]).hypot(y - centre[1]))
+        };
+        (0..w * h).filter(|&i| near(i) && rgb[3 * i..3 * i + 3] == [255, 64, 64]).count()
+    };
+    let surest = report.points.iter().find(|p| p.consistent).unwrap();
+    let places = [surest.a.map(|v| 1.5 * v), [1.5 * surest.b[0] + 872.0, 1.5 * surest.b[1]]];
+    for place in places {
+        assert!(passes(&rgb, place) >= 6, "{place:?} {}", passes(&rgb, place));
+    }
+    let turned = f[1].camera.world_from_camera * Mat4::from_rotation_x(0.2);
+    let wrong = [&f[0].camera, &with_pose(&f[1].camera, turned)];
+    let missed = epipolar_picture(photographs, wrong, &report.points).unwrap().2;
+    for place in places {
+        assert_eq!(passes(&missed, place), 0, "{place:?}");
     }
     let plain = epipolar_picture(photographs, cameras, &[]).unwrap();
     assert!(plain.2 != rgb);
