@@ -276,7 +276,7 @@ fn the_epipolar_picture_shows_lines_through_their_points() {
     let surest = report.points.iter().find(|p| p.consistent).unwrap();
     let places = [surest.a.map(|v| 1.5 * v), [1.5 * surest.b[0] + 872.0, 1.5 * surest.b[1]]];
     for place in places {
-        assert!(passes(&rgb, place) >= 6, "{place:?} {}", passes(&rgb, place));
+        assert!(passes(&rgb, place) >= 3, "{place:?} {}", passes(&rgb, place));
     }
     let turned = f[1].camera.world_from_camera * Mat4::from_rotation_x(0.2);
     let wrong = [&f[0].camera, &with_pose(&f[1].camera, turned)];
