@@ -86,7 +86,7 @@ impl TwoViews {
 
     /// Point of depth `z` at pixel `a` of the first picture, in the second
     /// camera's axes.
-    pub(super) fn to_second(&self, a: DVec2, z: f64) -> DVec3 {
+    pub(super) fn in_second(&self, a: DVec2, z: f64) -> DVec3 {
         self.rotation * (self.k_a.inverse() * a.extend(1.0) * z) + self.translation
     }
 
@@ -176,7 +176,7 @@ mod tests {
             let t = views.triangulate(&m);
             assert!((t.z_a - f64::from(a.to_camera(p).z)).abs() < 1e-3);
             assert!((t.z_b - f64::from(b.to_camera(p).z)).abs() < 1e-3);
-            let back = views.to_second(m.0, t.z_a);
+            let back = views.in_second(m.0, t.z_a);
             assert!((back - b.to_camera(p).as_dvec3()).length() < 1e-3);
             let shifted = (m.0, m.1 + DVec2::new(0.0, 4.0));
             assert!(distance(&f, &shifted) > 1.0);

@@ -262,8 +262,8 @@ fn rotate<const N: usize>(m: &mut [[f64; N]; N], vectors: &mut [[f64; N]; N], p:
         let (a, b) = (row[p], row[q]);
         (row[p], row[q]) = (c * a - s * b, s * a + c * b);
     }
-    for k in 0..N {
-        let (a, b) = (m[p][k], m[q][k]);
+    let (row_p, row_q) = (m[p], m[q]);
+    for ((k, a), b) in row_p.into_iter().enumerate().zip(row_q) {
         (m[p][k], m[q][k]) = (c * a - s * b, s * a + c * b);
     }
     for row in vectors.iter_mut() {
@@ -297,5 +297,87 @@ impl SplitMix {
             }
         }
         out
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn random(seed: u64) -> impl FnMut() -> f64 {
+        let mut state = SplitMix(seed);
+        move || (state.next() >> 11) as f64 / (1u64 << 53) as f64
+    }
+
+    /// `n` matches of points in front of two cameras 1 unit and 0.2 rad apart.
+    fn scene(n: usize, noise: f64) -> Vec<Match> {
+        let k = DMat3::from_cols_array(&[500.0, 0.0, 0.0, 0.0, 510.0, 0.0, 320.0, 240.0, 1.0]);
+        let turn = DMat3::from_rotation_y(0.2);
+        let mut next = random(7);
+        (0..n)
+            .map(|_| {
+                let p = DVec3::new(4.0 * next() - 2.0, 3.0 * next() - 1.5, 3.0 + 4.0 * next());
+                let mut project = |p: DVec3| {
+                    let q = k * p;
+                    let error = DVec2::new(next() - 0.5, next() - 0.5) * noise;
+                    q.truncate() / q.z + error
+                };
+                (project(p), project(turn * p + DVec3::new(1.0, 0.1, 0.2)))
+            })
+            .collect()
+    }
+
+    #[test]
+    fn eight_points_give_their_geometry() {
+        let f = eight_point(&scene(12, 0.0)).unwrap();
+        assert!(scene(40, 0.0).iter().all(|m| distance(&f, m) < 1e-6));
+        assert!(f.determinant().abs() < 1e-12);
+        assert!(eight_point(&scene(7, 0.0)).is_none());
+    }
+
+    #[test]
+    fn seven_points_give_it_too() {
+        let all = scene(40, 0.0);
+        let sample: [Match; 7] = std::array::from_fn(|i| all[i]);
+        let found = seven_point(&sample);
+        assert!(!found.is_empty() && found.len() <= 3);
+        for f in &found {
+            assert!(sample.iter().all(|m| distance(f, m) < 1e-5));
+        }
+        assert!(found.iter().any(|f| all.iter().all(|m| distance(f, m) < 1e-5)));
+    }
+
+    #[test]
+    fn wrong_matches_are_left_out() {
+        let mut matches = scene(120, 0.6);
+        let mut next = random(3);
+        for m in matches.iter_mut().step_by(2) {
+            m.1 = DVec2::new(640.0 * next(), 480.0 * next());
+        }
+        let estimate = fundamental(&matches, 1.5, 1).unwrap();
+        let right = estimate.inliers.iter().filter(|&&i| i % 2 == 1).count();
+        assert!(right >= 58, "{right}");
+        assert!(estimate.inliers.len() - right <= 4);
+        let again = fundamental(&matches, 1.5, 1).unwrap();
+        assert_eq!(estimate.inliers, again.inliers);
+        assert!(fundamental(&matches[..7], 1.5, 1).is_none());
+    }
+
+    #[test]
+    fn repeated_matches_give_no_geometry_and_no_panic() {
+        let one = scene(1, 0.0)[0];
+        let estimate = fundamental(&[one; 20], 1.5, 1);
+        assert!(estimate.is_none_or(|e| e.fundamental.is_finite()));
+    }
+
+    #[test]
+    fn cubics_have_their_roots() {
+        let mut three = cubic_roots(2.0, -12.0, 22.0, -12.0);
+        three.sort_by(f64::total_cmp);
+        for (root, expected) in three.iter().zip([1.0, 2.0, 3.0]) {
+            assert!((root - expected).abs() < 1e-9);
+        }
+        let one = cubic_roots(1.0, 0.0, 1.0, -10.0);
+        assert!(one.len() == 1 && (one[0] - 2.0).abs() < 1e-9);
     }
 }

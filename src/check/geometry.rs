@@ -125,7 +125,7 @@ fn seen(views: &TwoViews, sizes: [&Intrinsics; 2], depth: impl Fn(DVec2) -> f64)
     let (wb, hb) = (sizes[1].width as f64, sizes[1].height as f64);
     let step = |i: usize| (i as f64 + 0.5) / OVERLAP_GRID as f64;
     let inside = |p: DVec2| {
-        let q = views.k_b * views.to_second(p, depth(p));
+        let q = views.k_b * views.in_second(p, depth(p));
         let px = q.truncate() / q.z;
         q.z > 0.0 && px.x >= 0.0 && px.y >= 0.0 && px.x <= wb && px.y <= hb
     };

@@ -28,14 +28,14 @@ impl GrayImage {
         let grey = rgb
             .chunks_exact(3)
             .map(|p| (0..3).map(|c| LUMA[c] * f32::from(p[c])).sum::<f32>() / 255.0);
-        (rgb.len() % 3 == 0).then(|| Self::new(width, height, grey.collect()))?
+        rgb.len().is_multiple_of(3).then(|| Self::new(width, height, grey.collect()))?
     }
 
     /// Luma of interleaved RGB floats in [0, 1], or `None` where the length is not
     /// 3·W·H or a value is not finite.
     pub fn from_rgb(width: usize, height: usize, rgb: &[f32]) -> Option<Self> {
         let grey = rgb.chunks_exact(3).map(|p| (0..3).map(|c| LUMA[c] * p[c]).sum::<f32>());
-        (rgb.len() % 3 == 0).then(|| Self::new(width, height, grey.collect()))?
+        rgb.len().is_multiple_of(3).then(|| Self::new(width, height, grey.collect()))?
     }
 
     /// Width, px.

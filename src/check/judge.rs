@@ -1,12 +1,11 @@
 //! From numbers to a verdict. Every threshold is a constant here, with its reason.
 
+use super::Work;
 use super::epipolar::{Match, TwoViews, distance, median};
 use super::estimate;
 use super::geometry;
 use super::mistakes::{Fit, Reading, fit, in_front, readings};
 use super::report::{EpipolarReport, MatchedPoint, PairReport, ReadingReport, Verdict};
-use super::{GrayImage, Work};
-use crate::camera::Camera;
 
 /// A match agrees with an epipolar geometry within this many px at 640: three
 /// times what good poses of real photographs reach (0.3 to 0.6 measured).
@@ -47,83 +46,10 @@ const SMALL_PARALLAX: f32 = 4.0;
 const LARGE_BASELINE: f32 = 1.2;
 /// Difference of mean brightness (0 to 1) above which one exposure was changed.
 const BRIGHTNESS: f32 = 0.12;
-/// Largest mean difference of two photographs that are one and the same, 0 to 1:
-/// below what recompression leaves.
-const SAME_PHOTOGRAPH: f32 = 0.004;
-/// Fields of view that hand-held pinhole cameras have, degrees.
-const PLAUSIBLE_FOV: std::ops::RangeInclusive<f32> = 8.0..=140.0;
-/// Ratios fx / fy of pixels that video has; beyond them something was divided by
-/// the wrong side.
-const PLAUSIBLE_PIXELS: std::ops::RangeInclusive<f32> = 0.7..=1.43;
-/// Largest relative difference of aspect between a photograph and its intrinsics.
-const ASPECT: f32 = 0.02;
-
-/// Intrinsics against the photographs' sizes, without a look at the content.
-pub(super) fn cameras(report: &mut PairReport, views: [(&GrayImage, &Camera); 2]) {
-    for (name, (image, camera)) in ["first", "second"].into_iter().zip(views) {
-        let (w, h) = (image.width(), image.height());
-        let k = &camera.intrinsics;
-        if (k.width, k.height) != (w, h) {
-            let aspect = (w * k.height) as f32 / (h * k.width).max(1) as f32;
-            let turned = (k.width, k.height) == (h, w);
-            let (severity, note) = if turned {
-                (Verdict::Bad, "the photograph is turned (EXIF orientation?)")
-            } else if (aspect - 1.0).abs() > ASPECT {
-                (Verdict::Bad, "another aspect: it was cropped, or they belong to another camera")
-            } else {
-                (Verdict::Warning, "they are scaled to fit")
-            };
-            let sentence = format!(
-                "the {name} photograph has {w}x{h} pixels, its intrinsics are for {}x{}: {note}",
-                k.width, k.height
-            );
-            report.find(severity, "size_differs", sentence);
-        }
-        let fov = [k.fov_x().to_degrees(), k.fov_y().to_degrees()];
-        if fov.iter().any(|v| !PLAUSIBLE_FOV.contains(v)) {
-            let sentence = format!(
-                "the {name} camera's field of view is {:.0}° x {:.0}°: are its intrinsics in \
-                 pixels of this photograph?",
-                fov[0], fov[1]
-            );
-            report.find(Verdict::Bad, "field_of_view", sentence);
-        } else if !PLAUSIBLE_PIXELS.contains(&(k.fx / k.fy)) {
-            let sentence = format!(
-                "the {name} camera has fx = {:.0} px and fy = {:.0} px: pixels are hardly that far \
-                 from square; was a focal length divided by the wrong side?",
-                k.fx, k.fy
-            );
-            report.find(Verdict::Warning, "pixels_not_square", sentence);
-        }
-    }
-    let [a, b] = views.map(|v| v.1.world_from_camera);
-    if a.abs_diff_eq(b, 1e-6) {
-        let sentence =
-            "both photographs have the same camera: there is no baseline to see depth by";
-        report.find(Verdict::Bad, "same_camera", sentence);
-    }
-}
-
-/// Whether both photographs are one and the same, and says so.
-pub(super) fn same_photograph(report: &mut PairReport, a: &GrayImage, b: &GrayImage) -> bool {
-    if (a.width(), a.height()) != (b.width(), b.height()) {
-        return false;
-    }
-    let sum: f64 = a.pixels().iter().zip(b.pixels()).map(|(x, y)| f64::from((x - y).abs())).sum();
-    let same = sum / (a.pixels().len() as f64) < f64::from(SAME_PHOTOGRAPH);
-    if same {
-        let sentence =
-            "both photographs show the same picture: there is no parallax to see depth by";
-        report.find(Verdict::Bad, "same_photograph", sentence);
-    }
-    same
-}
 
 /// Everything that matched points tell.
-pub(super) fn matches(report: &mut PairReport, work: &Work, all: &[Match], seed: u64) {
-    let limit = (LIMIT_PX * work.unit).max(LIMIT_WORKING_PX);
+pub(super) fn matches(report: &mut PairReport, work: &Work, all: &[Match], evidence: &Evidence) {
     let views = TwoViews::new(&work.cameras[0], &work.cameras[1]);
-    let evidence = Evidence::gather(&views, all, limit, seed);
     report.points = points(work, all, &evidence.consistent);
     report.consistent_matches = evidence.consistent.len();
     let k = work.cameras.map(|c| c.intrinsics);
@@ -134,7 +60,7 @@ pub(super) fn matches(report: &mut PairReport, work: &Work, all: &[Match], seed:
     if evidence.is_thin(all.len()) {
         too_few(report, work, &views);
     } else {
-        agreement(report, work, &views, all, &evidence, limit);
+        agreement(report, work, &views, all, evidence);
     }
     brightness(report, work, all, &evidence.consistent);
 }
@@ -146,8 +72,8 @@ fn agreement(
     views: &TwoViews,
     all: &[Match],
     evidence: &Evidence,
-    limit: f64,
 ) {
+    let limit = limit(work);
     let chosen: Vec<Match> = evidence.consistent.iter().map(|&i| all[i]).collect();
     let given = fit(views, &chosen, limit);
     report.epipolar = Some(epipolar_report(evidence, all.len(), &given, work.unit));
@@ -161,7 +87,7 @@ fn agreement(
 }
 
 /// Which matches agree with one another.
-struct Evidence {
+pub(super) struct Evidence {
     /// Indices of the matches that support one geometry.
     consistent: Vec<usize>,
     /// How many support the given cameras.
@@ -171,11 +97,13 @@ struct Evidence {
 }
 
 impl Evidence {
-    fn gather(views: &TwoViews, all: &[Match], limit: f64, seed: u64) -> Self {
+    /// Which of `all` agree, with the given cameras or with another geometry.
+    pub(super) fn gather(work: &Work, all: &[Match], seed: u64) -> Self {
+        let (limit, views) = (limit(work), TwoViews::new(&work.cameras[0], &work.cameras[1]));
         let f = views.fundamental();
         let given: Vec<usize> = estimate::support(&f, all, limit)
             .into_iter()
-            .filter(|&i| in_front(views, &all[i], limit))
+            .filter(|&i| in_front(&views, &all[i], limit))
             .collect();
         let own = estimate::fundamental(all, limit, seed);
         let Some(own) = own else {
@@ -190,10 +118,21 @@ impl Evidence {
         Self { consistent, given: count, own: own_fit }
     }
 
-    fn is_thin(&self, matches: usize) -> bool {
+    /// How many agree.
+    pub(super) fn strength(&self) -> usize {
+        self.consistent.len()
+    }
+
+    /// Whether too few agree to say anything.
+    pub(super) fn is_thin(&self, matches: usize) -> bool {
         let n = self.consistent.len();
         n < EVIDENCE || (n as f64) < EVIDENCE_SHARE * matches as f64
     }
+}
+
+/// Distance within which a match agrees, working px.
+fn limit(work: &Work) -> f64 {
+    (LIMIT_PX * work.unit).max(LIMIT_WORKING_PX)
 }
 
 fn points(work: &Work, all: &[Match], consistent: &[usize]) -> Vec<MatchedPoint> {

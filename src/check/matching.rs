@@ -1,11 +1,13 @@
 //! Which feature of one photograph is which of the other: nearest descriptors that
 //! choose each other and are clearly nearer than the runner-up. Uses no pose.
 
-use super::features::{DESCRIPTOR, Features};
+use super::descriptors::DESCRIPTOR;
+use super::features::Features;
 use rayon::prelude::*;
 
-/// Largest ratio of the nearest descriptor's distance to the next one's (Lowe,
-/// section 7.1, takes 0.8).
+/// Largest ratio of the nearest descriptor's distance to the next one's. Lowe
+/// (section 7.1) takes 0.8; demanded both ways, 0.85 keeps as few wrong ones and
+/// gives a tenth more right matches on wide pairs.
 const RATIO: f32 = 0.85;
 /// A runner-up this near to the best, px, is the same place found twice.
 const SAME_PLACE: f32 = 3.0;

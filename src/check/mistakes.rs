@@ -242,7 +242,7 @@ fn intrinsics_readings(given: &[Camera; 2]) -> Vec<Reading> {
 
 /// A focal length below this many px is one divided by the picture's width: a
 /// field of view of 170° in 100 px has 4.4 px, a long lens normalised has 8.
-const NORMALISED_FOCAL: f32 = 10.0;
+pub(super) const NORMALISED_FOCAL: f32 = 10.0;
 
 /// Focal lengths scaled by steps of 5 %, both axes together or x alone.
 fn focal_readings(given: &[Camera; 2]) -> Vec<Reading> {
@@ -315,4 +315,63 @@ fn direction(v: Vec3) -> &'static str {
         2
     };
     if v[axis] > 0.0 { names[axis].0 } else { names[axis].1 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Quat;
+
+    fn cameras() -> [Camera; 2] {
+        let k = Intrinsics { fx: 300.0, fy: 310.0, cx: 130.0, cy: 120.0, width: 256, height: 240 };
+        [0.2, -0.3].map(|t: f32| {
+            let turn = Quat::from_euler(glam::EulerRot::XYZ, t, 0.4 - t, 0.1);
+            let eye = Vec3::new(t, 2.0, 1.0 - t);
+            Camera::new(k, Mat4::from_rotation_translation(turn, eye)).unwrap()
+        })
+    }
+
+    #[test]
+    fn every_order_of_axes_is_undone() {
+        let truth = cameras();
+        let vector = |name: &str| match name {
+            "right" => Vec3::X,
+            "left" => Vec3::NEG_X,
+            "down" => Vec3::Y,
+            "up" => Vec3::NEG_Y,
+            "forward" => Vec3::Z,
+            _ => Vec3::NEG_Z,
+        };
+        let readings = axes_readings(&truth);
+        // 24 right-handed orders less OpenCV's and OpenGL's, in either direction.
+        assert_eq!(readings.len(), 44);
+        for r in &readings {
+            let inverted = r.name.starts_with("world_to_camera_");
+            let words: Vec<&str> = r.name.rsplit('_').take(3).collect();
+            // Columns of camera_from_file are the file's axes.
+            let axes = Mat3::from_cols(vector(words[2]), vector(words[1]), vector(words[0]));
+            assert!((axes.determinant() - 1.0).abs() < 1e-6);
+            let as_filed = truth.map(|c| {
+                let pose = c.world_from_camera * Mat4::from_mat3(axes);
+                posed(&c, if inverted { pose.inverse() } else { pose })
+            });
+            let read = axes_readings(&as_filed).into_iter().find(|o| o.name == r.name).unwrap();
+            for (c, t) in read.cameras.iter().zip(&truth) {
+                assert!(c.world_from_camera.abs_diff_eq(t.world_from_camera, 1e-4), "{}", r.name);
+            }
+        }
+    }
+
+    #[test]
+    fn turning_the_photograph_turns_its_points() {
+        let camera = cameras()[0];
+        let turned = turned_clockwise(&camera);
+        let p = camera.world_from_camera.transform_point3(Vec3::new(0.3, -0.2, 2.0));
+        let (old, new) = (camera.project(p).unwrap(), turned.project(p).unwrap());
+        assert!((new.x - (240.0 - old.y)).abs() < 1e-3 && (new.y - old.x).abs() < 1e-3);
+        let mut round = camera;
+        (0..4).for_each(|_| round = turned_clockwise(&round));
+        assert!(round.world_from_camera.abs_diff_eq(camera.world_from_camera, 1e-5));
+        assert_eq!(round.intrinsics, camera.intrinsics);
+    }
 }

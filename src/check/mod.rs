@@ -7,6 +7,7 @@
 //! In: grey photographs and cameras. Out: [`PairReport`]. The room knows no files
 //! and prints nothing. The same input gives the same report.
 
+mod descriptors;
 mod epipolar;
 mod estimate;
 mod features;
@@ -16,6 +17,7 @@ mod judge;
 mod matching;
 mod mistakes;
 mod picture;
+mod plausible;
 mod report;
 
 pub use image::GrayImage;
@@ -27,6 +29,7 @@ pub use report::{
 use crate::camera::Camera;
 use epipolar::Match;
 use glam::DVec2;
+use judge::Evidence;
 
 /// What may be chosen about a check.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -59,25 +62,46 @@ pub fn check_pair(
     options: &CheckOptions,
 ) -> PairReport {
     let mut report = PairReport::default();
-    judge::cameras(&mut report, [(a, camera_a), (b, camera_b)]);
+    plausible::cameras(&mut report, [(a, camera_a), (b, camera_b)]);
     let given = [fitted(camera_a, a), fitted(camera_b, b)];
     geometry::describe(&mut report, &given);
-    if judge::same_photograph(&mut report, a, b) {
+    if plausible::same_photograph(&mut report, a, b) {
         return report;
     }
     let work = Work::new([a, b], given, options);
-    let found = [&work.images[0], &work.images[1]]
-        .map(|image| features::detect(image, options.features, true));
-    let pairs = matching::pairs(&found[0], &found[1]);
-    let place = |f: &features::Feature| DVec2::new(f64::from(f.x), f64::from(f.y));
-    let matches: Vec<Match> = pairs
-        .iter()
-        .map(|p| (place(&found[0].points[p.a]), place(&found[1].points[p.b])))
-        .collect();
-    report.features = [found[0].points.len(), found[1].points.len()];
-    report.matches = matches.len();
-    judge::matches(&mut report, &work, &matches, options.seed);
+    let upright = Found::new(&work, options, true);
+    // Photographs that roll against each other need descriptors that turn along.
+    let found = if upright.evidence.is_thin(upright.matches.len()) {
+        let turned = Found::new(&work, options, false);
+        if turned.evidence.strength() > upright.evidence.strength() { turned } else { upright }
+    } else {
+        upright
+    };
+    report.features = found.features;
+    report.matches = found.matches.len();
+    judge::matches(&mut report, &work, &found.matches, &found.evidence);
     report
+}
+
+/// Points matched between the photographs.
+struct Found {
+    features: [usize; 2],
+    matches: Vec<Match>,
+    evidence: Evidence,
+}
+
+impl Found {
+    fn new(work: &Work, options: &CheckOptions, upright: bool) -> Self {
+        let [a, b] = [&work.images[0], &work.images[1]]
+            .map(|image| features::detect(image, options.features, upright));
+        let place = |f: &features::Feature| DVec2::new(f64::from(f.x), f64::from(f.y));
+        let matches: Vec<Match> = matching::pairs(&a, &b)
+            .iter()
+            .map(|p| (place(&a.points[p.a]), place(&b.points[p.b])))
+            .collect();
+        let evidence = Evidence::gather(work, &matches, options.seed);
+        Self { features: [a.points.len(), b.points.len()], matches, evidence }
+    }
 }
 
 /// The camera for the photograph's real size.

@@ -306,10 +306,10 @@ mod tests {
 
     #[test]
     fn a_larger_photograph_is_averaged_to_the_childrens_scale() {
-        // Four times the input under children of ratio 2: stripes of one pixel
-        // average to grey and must not alias.
-        let stripes: Vec<f32> = (0..3 * 16 * W * H).map(|i| (i / 3 % 2) as f32).collect();
-        let views = [view(0.0, &stripes, 4 * W, 4 * H)];
+        // Six times the input under children of ratio 2: stripes of three columns
+        // average to grey, and the column under a child's centre must not stand out.
+        let stripes: Vec<f32> = (0..3 * 36 * W * H).map(|i| [1.0, 0.0, 0.5][i / 3 % 3]).collect();
+        let views = [view(0.0, &stripes, 6 * W, 6 * H)];
         let means = children(&views[0].camera, 2);
         let delta = residuals(&views, &means, W * H, 4, 2);
         assert!(delta.iter().all(|d| d.abs() < 1e-5));
