@@ -20,7 +20,7 @@ use crate::config::{FeatureLevel, Small};
 use crate::model::layers::{Conv2d, ConvShape, GroupNorm, gelu, resize_bilinear, sigmoid, softmax};
 use crate::model::{BackboneOutput, Views};
 use crate::ops::matching::raw_matching;
-use crate::ops::plane_sweep::{Pair, Projection, Sweep, pair, plane_sweep};
+use crate::ops::plane_sweep::{Pair, Sweep, pair, plane_sweep, relative_pose};
 use crate::sh::C0;
 use candle_core::{D, Result, Tensor, bail};
 use candle_nn::{Init, VarBuilder};
@@ -369,7 +369,10 @@ fn pairs(views: &Views, h: usize, w: usize) -> Result<Vec<Vec<Pair>>> {
         let cameras: Vec<Camera> = scene.iter().map(|c| c.resized(w, h)).collect();
         for i in 0..v {
             let others = (0..v).filter(|&j| j != i);
-            let row = |j: usize| pair(&cameras[i], &cameras[j], Projection::Source, b * v + j);
+            let row = |j: usize| {
+                let (r, s) = (&cameras[i], &cameras[j]);
+                pair(&r.intrinsics, &s.intrinsics, relative_pose(r, s), b * v + j)
+            };
             all.push(others.map(row).collect::<Result<_>>()?);
         }
     }
