@@ -430,6 +430,59 @@ fn an_empty_scene_is_background() {
     }
 }
 
+/// A camera that [`Camera::new`] would refuse draws nothing, but does not panic.
+#[test]
+fn impossible_cameras_see_background() {
+    let scene = scene(Kind::Plain, 5, (64, 48), 1);
+    for convention in [Convention::Standard, Convention::Mvsplat] {
+        let o = options(convention);
+        for bad in [f32::NAN, f32::INFINITY] {
+            let mut camera = scene.camera;
+            camera.intrinsics.fx = bad;
+            camera.world_from_camera.w_axis.y = bad;
+            let picture = Rasterizer::new().render(&slices(&scene.splats), &camera, &o);
+            assert!(picture.rgb.chunks_exact(3).all(|c| c == o.background));
+        }
+        for (width, height) in [(0, 48), (64, 0), (0, 0)] {
+            let mut camera = scene.camera;
+            (camera.intrinsics.width, camera.intrinsics.height) = (width, height);
+            let picture = Rasterizer::new().render(&slices(&scene.splats), &camera, &o);
+            assert!(picture.rgb.is_empty() && picture.alpha.is_empty());
+            let mut planes = vec![1.0];
+            let mut rasterizer = Rasterizer::new();
+            rasterizer.render_planes(&slices(&scene.splats), &camera, &o, &mut planes);
+            assert!(planes.is_empty());
+        }
+    }
+}
+
+/// Behind two opaque layers no work is done, at the picture's rim either.
+#[test]
+fn opaque_layers_end_the_work() {
+    let k = Intrinsics { fx: 30.0, fy: 30.0, cx: 16.5, cy: 16.5, width: 33, height: 33 };
+    let camera = Camera::new(k, Mat4::IDENTITY).unwrap();
+    let layer = |i: usize| [0.0, 0.0, 2.0 + i as f32, 1.0, 0.0, 0.0, 0.0, 1e3, 1e3, 0.0, 1.0];
+    let rows: Vec<f32> = (0..300).flat_map(layer).collect();
+    let splats = Splats::new(rows, vec![0.5; 900], vec![], 0, ShBasis::Standard).unwrap();
+    let mut rasterizer = Rasterizer::new();
+    let picture = rasterizer.render(&slices(&splats), &camera, &RasterOptions::default());
+    assert!(picture.alpha.iter().all(|&a| a > 0.998));
+    // 9 × 9 blocks have a pixel inside; each takes one layer and stops at the next.
+    let stats = rasterizer.stats();
+    assert_eq!((stats.visible, stats.pairs, stats.items), (300, 4 * 300, 2 * 81));
+
+    // Points over a picture of one pixel: the block's other 15 stay clear for long,
+    // and count for nothing.
+    let k = Intrinsics { cx: 0.5, cy: 0.5, width: 1, height: 1, ..k };
+    let camera = Camera::new(k, Mat4::IDENTITY).unwrap();
+    let mut points = splats.clone();
+    for row in points.rows.chunks_exact_mut(SPLAT_LANES) {
+        row[7..10].fill(0.0);
+    }
+    rasterizer.render(&slices(&points), &camera, &RasterOptions::default());
+    assert_eq!(rasterizer.stats().items, 2);
+}
+
 /// `render` reads the basis from the splats, and divides depth by alpha.
 #[test]
 fn render_uses_the_splats_own_basis() {

@@ -37,9 +37,6 @@ fn check_shapes(splats: &Tensor, sh: &Tensor, gain: &Tensor) -> Result<()> {
         if t.dtype() != DType::F32 {
             bail!("rasterize: expected {name} of dtype F32, got {:?}", t.dtype());
         }
-        if !t.is_contiguous() {
-            bail!("rasterize: expected {name} contiguous, got strides {:?}", t.stride());
-        }
         if !t.device().is_cpu() {
             bail!("rasterize: expected {name} on the CPU, got {:?}", t.device().location());
         }
