@@ -609,7 +609,7 @@ fn mutated_scenes_answer_or_refuse() {
         let begun = std::time::Instant::now();
         let path = folder.path().join(name);
         let (mut refused, mut accepted) = (0, 0);
-        for _ in 0..400 {
+        for _ in 0..200 {
             std::fs::write(&path, random.mutate(&bytes)).unwrap();
             match load_scene(&path) {
                 Ok(scene) => {
@@ -632,7 +632,7 @@ fn mutated_scenes_answer_or_refuse() {
     }
     for bytes in [&b"{\"tests\": [{\"context\": [0, 1], \"target\": [2]}]}"[..]] {
         let path = folder.path().join("p.json");
-        for _ in 0..500 {
+        for _ in 0..200 {
             std::fs::write(&path, random.mutate(bytes)).unwrap();
             let _ = load_protocol(&path);
             let _ = load_index(&path);
@@ -641,7 +641,7 @@ fn mutated_scenes_answer_or_refuse() {
     // Pictures too: the decoders are others' code, but the limits are ours.
     let picture = folder.path().join("images/000.png");
     let bytes = std::fs::read(&picture).unwrap();
-    for _ in 0..500 {
+    for _ in 0..200 {
         std::fs::write(&picture, random.mutate(&bytes)).unwrap();
         let _ = image::load(&picture);
     }
