@@ -10,8 +10,8 @@ use candle_core::{Error, Result, bail};
 use candle_nn::VarBuilder;
 
 enum Encoder {
-    Mvsplat(Mvsplat),
-    Small(SmallBackbone),
+    Mvsplat(Box<Mvsplat>),
+    Small(Box<SmallBackbone>),
 }
 
 /// SubSplat with its backbone, built from one [`Config`].
@@ -46,8 +46,8 @@ impl SubSplat {
     pub fn new(config: &Config, vb: VarBuilder) -> Result<Self> {
         config.check().map_err(Error::wrap)?;
         let encoder = match &config.backbone {
-            Backbone::Mvsplat(c) => Encoder::Mvsplat(Mvsplat::new(c, vb.clone())?),
-            Backbone::Small(c) => Encoder::Small(SmallBackbone::new(c, vb.pp("small"))?),
+            Backbone::Mvsplat(c) => Encoder::Mvsplat(Box::new(Mvsplat::new(c, vb.clone())?)),
+            Backbone::Small(c) => Encoder::Small(Box::new(SmallBackbone::new(c, vb.pp("small"))?)),
         };
         let trunk = Trunk::new(config, &feature_channels(config), vb)?;
         Ok(Self { config: config.clone(), encoder, trunk })
