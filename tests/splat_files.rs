@@ -225,6 +225,25 @@ fn splat_round_trips_sorted_at_degree_zero() {
     }
 }
 
+/// Viewers do not normalise these bytes: a quaternion along an axis keeps its length.
+#[test]
+fn splat_quaternion_bytes_reach_their_ends() {
+    let kind = Kind { parents: 4, children: 1, degree: 0, gain_lanes: 0, basis: ShBasis::Standard };
+    let mut s = scene(16, kind);
+    for i in 0..4 {
+        let row = &mut s.rows[i * SPLAT_LANES..(i + 1) * SPLAT_LANES];
+        row[3..7].fill(0.0);
+        row[3 + i] = if i % 2 == 0 { 3.0 } else { -0.5 };
+        row[7..].fill(1.0 / (1.0 + i as f32));
+    }
+    let (_folder, path) = save("a.splat", &s, &SaveOptions::default());
+    for (i, record) in std::fs::read(path).unwrap().chunks_exact(32).enumerate() {
+        let mut expected = [128; 4];
+        expected[i] = 0;
+        assert_eq!(record[28..], expected);
+    }
+}
+
 #[test]
 fn opacities_and_scales_at_their_ends_stay_finite() {
     let opacities = [0.0, 1e-9, 1e-7, 1e-4, 0.5, 0.999, 1.0 - 1e-6, 1.0, 1.000_01, -0.000_01];
@@ -473,24 +492,26 @@ fn glb_nodes_move_turn_and_scale_splats() {
         Kind { parents: 30, children: 1, degree: 3, gain_lanes: 0, basis: ShBasis::Standard };
     let s = scene(13, kind);
     let (_folder, path) = save("a.glb", &s, &SaveOptions { up: Up::Y, ..Default::default() });
-    // Parent: half a turn about z and a shift; child: doubled. Both in glTF's axes.
+    // Parent: a quarter turn about z and a shift; child: doubled. Both in glTF's axes.
+    let half = std::f64::consts::FRAC_1_SQRT_2;
     edit_glb(&path, |json| {
         json["nodes"] = serde_json::json!([
-            { "translation": [1.0, 2.0, 3.0], "rotation": [0.0, 0.0, 1.0, 0.0], "children": [1] },
+            { "translation": [1.0, 2.0, 3.0], "rotation": [0.0, 0.0, half, half], "children": [1] },
             { "mesh": 0, "scale": [2.0, 2.0, 2.0] }
         ]);
     });
     let after = load_splats(&path).unwrap();
-    let turn = DMat3::from_diagonal(DVec3::new(-1.0, -1.0, 1.0));
+    // In ours: x to −y, y to x.
+    let turn = DMat3::from_cols(DVec3::NEG_Y, DVec3::X, DVec3::Z);
     let mut expected = s.clone();
     for i in 0..s.len() {
         let m = s.mean(i);
-        // glTF (x, −y, −z), doubled, (−x, −y, z), shifted, and back to ours.
+        // glTF (x, −y, −z), doubled, turned to (−y, x, z), shifted, and back to ours.
         let g = [2.0 * m[0], -2.0 * m[1], -2.0 * m[2]];
-        let g = [1.0 - g[0], 2.0 - g[1], 3.0 + g[2]];
+        let g = [1.0 - g[1], 2.0 + g[0], 3.0 + g[2]];
         let row = &mut expected.rows[i * SPLAT_LANES..];
         // `assert_same` turns the mean: give it the one before the turn.
-        row[..3].copy_from_slice(&[-g[0], g[1], -g[2]]);
+        row[..3].copy_from_slice(&[g[1], g[0], -g[2]]);
         row[7..10].iter_mut().for_each(|v| *v *= 2.0);
     }
     let allowed = Tolerance { mean: 4e-6, ..EXACT };
