@@ -376,11 +376,11 @@ fn info_describes_what_is_there() {
     assert_eq!((info.count, info.sh_degree, info.non_finite, info.invisible), (101, 2, 0, 1));
     assert_eq!(info.flavour, "ply binary_little_endian");
     assert!(info.comments.iter().any(|c| c.starts_with("subsplat ")), "{:?}", info.comments);
-    let bounds = info.bounds.unwrap();
-    for axis in 0..3 {
+    let [low, high] = info.bounds.unwrap();
+    for (axis, (low, high)) in low.into_iter().zip(high).enumerate() {
         let column = || (0..101).map(|i| s.mean(i)[axis]);
-        assert_eq!(bounds[0][axis], column().fold(f32::INFINITY, f32::min));
-        assert_eq!(bounds[1][axis], column().fold(f32::NEG_INFINITY, f32::max));
+        assert_eq!(low, column().fold(f32::INFINITY, f32::min));
+        assert_eq!(high, column().fold(f32::NEG_INFINITY, f32::max));
     }
     let expected = [0.0, 0.01, 0.25, 0.5, 0.75, 0.99, 1.0];
     for (got, want) in info.opacity.iter().zip(expected) {
