@@ -6,9 +6,9 @@
 //! the scene as on an orbit; at most 28° of rotation about an axis; either view sees
 //! at least 40 % of the other; no eye within 0.1 m of a surface.
 
+use super::Room;
 use super::rng::Rng;
 use super::shape::Ray;
-use super::Room;
 use crate::camera::{Camera, Intrinsics};
 use glam::{EulerRot, Mat3, Mat4, Quat, Vec2, Vec3};
 
@@ -26,9 +26,9 @@ const TRIES: u64 = 300;
 /// What [`sample_cameras`] is asked for.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CameraSpec {
-    /// Width of every picture, px.
+    /// Width of every picture, px; at least 1.
     pub width: usize,
-    /// Height of every picture, px.
+    /// Height of every picture, px; at least 1.
     pub height: usize,
     /// Cameras between the two context cameras.
     pub targets: usize,
@@ -125,13 +125,12 @@ fn propose(room: &Room, rng: &mut Rng, spec: &CameraSpec) -> Option<Rig> {
 
 /// 40° to 80° along the longer side, of the picture or of the one that it is cut from.
 fn intrinsics(spec: &CameraSpec, cropped: bool, rng: &mut Rng) -> Intrinsics {
-    let (width, height) = (spec.width, spec.height);
+    let (width, height) = (spec.width.max(1), spec.height.max(1));
     let fov = rng.range(40.0, 80.0).to_radians();
     let full = if cropped { 2 } else { 1 };
     let (w, h) = ((width * full) as f32, (height * full) as f32);
     let f = 0.5 * w.max(h) / (0.5 * fov).tan();
-    let (left, top) =
-        if cropped { (rng.count(0, width), rng.count(0, height)) } else { (0, 0) };
+    let (left, top) = if cropped { (rng.count(0, width), rng.count(0, height)) } else { (0, 0) };
     let (cx, cy) = (0.5 * w - left as f32, 0.5 * h - top as f32);
     Intrinsics { fx: f, fy: f, cx, cy, width, height }
 }
@@ -189,7 +188,8 @@ fn second_camera(first: &Camera, median: f32, motion: Motion, rng: &mut Rng) -> 
     }
     let degrees = if orbit { [1.5, 1.5, 1.0] } else { [3.0, 7.0, 1.5] };
     let [pitch, yaw, roll] = degrees.map(|d: f32| d.to_radians() * rng.normal());
-    let (y, x, z) = (turn * Quat::from_euler(EulerRot::YXZ, yaw, pitch, roll)).to_euler(EulerRot::YXZ);
+    let (y, x, z) =
+        (turn * Quat::from_euler(EulerRot::YXZ, yaw, pitch, roll)).to_euler(EulerRot::YXZ);
     let [y, x, z] = [y, x, z].map(|a| a.clamp(-ROTATION, ROTATION));
     let rotation = first.rotation() * Mat3::from_quat(Quat::from_euler(EulerRot::YXZ, y, x, z));
     let eye = first.position() + first.rotation() * step;
@@ -202,8 +202,7 @@ fn between(room: &Room, first: &Camera, second: &Camera, rng: &mut Rng) -> Optio
     let t = rng.range(0.1, 0.9);
     let off = 0.04 * a.distance(b) * Vec3::new(rng.normal(), rng.normal(), rng.normal());
     let eye = a.lerp(b, t) + off;
-    let rotation =
-        Quat::from_mat3(&first.rotation()).slerp(Quat::from_mat3(&second.rotation()), t);
+    let rotation = Quat::from_mat3(&first.rotation()).slerp(Quat::from_mat3(&second.rotation()), t);
     let clear = room.clearance(eye) >= CLEARANCE;
     clear.then(|| posed(first.intrinsics, Mat3::from_quat(rotation), eye))
 }

@@ -1,10 +1,10 @@
 //! One example to learn from: two views of a room, targets between them, depth of all,
 //! in the units and with the near and far planes that data sets use.
 
+use super::Room;
 use super::cameras::{CameraSpec, Rig, sample_cameras};
 use super::render::{Grade, Quality, View};
 use super::rng::Rng;
-use super::Room;
 use crate::camera::Camera;
 
 /// What an example holds.
@@ -81,8 +81,7 @@ impl Example {
         let scene = Grade::of_scene(rng);
         let soft = rng.chance(0.3);
         let render = |camera: &Camera| {
-            let grade =
-                if spec.photographic { scene.of_view(soft, rng) } else { Grade::default() };
+            let grade = if spec.photographic { scene.of_view(soft, rng) } else { Grade::default() };
             let quality = Quality { samples: spec.samples, ..Quality::training(grade) };
             let mut view = room.render(camera, &quality);
             view.depth.iter_mut().for_each(|d| *d *= scale);

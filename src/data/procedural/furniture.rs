@@ -38,10 +38,8 @@ impl Layout {
             return None;
         }
         for _ in 0..12 {
-            let at = Vec2::new(
-                self.rng.range(-reach.x, reach.x),
-                self.rng.range(-reach.y, reach.y),
-            );
+            let at =
+                Vec2::new(self.rng.range(-reach.x, reach.x), self.rng.range(-reach.y, reach.y));
             if self.is_clear(at, radius) {
                 self.taken.push((at, radius));
                 return Some(at);
@@ -98,9 +96,15 @@ impl Layout {
         for i in 0..count {
             let offset = (2 * i + 1) as f32 * share;
             let (place, panel) = if upright {
-                (Vec3::new(offset - half.x, 0.0, half.z), Vec3::new(share - 0.012, half.y - 0.02, 0.008))
+                (
+                    Vec3::new(offset - half.x, 0.0, half.z),
+                    Vec3::new(share - 0.012, half.y - 0.02, 0.008),
+                )
             } else {
-                (Vec3::new(0.0, offset - half.y, half.z), Vec3::new(half.x - 0.02, share - 0.012, 0.008))
+                (
+                    Vec3::new(0.0, offset - half.y, half.z),
+                    Vec3::new(half.x - 0.02, share - 0.012, 0.008),
+                )
             };
             self.add(Form::Block, centre + axes * place, axes, panel, material);
         }
@@ -108,7 +112,11 @@ impl Layout {
 
     /// A plate on four legs.
     fn table(&mut self) {
-        let plate = Vec3::new(self.rng.range(0.3, 0.9), self.rng.range(0.01, 0.03), self.rng.range(0.25, 0.5));
+        let plate = Vec3::new(
+            self.rng.range(0.3, 0.9),
+            self.rng.range(0.01, 0.03),
+            self.rng.range(0.25, 0.5),
+        );
         let height = self.rng.range(0.4, 0.8);
         let Some(at) = self.free_floor(0.8 * plate.x.hypot(plate.z)) else { return };
         let axes = yaw(self.rng.range(0.0, std::f32::consts::TAU));
@@ -187,7 +195,11 @@ impl Layout {
         for _ in 0..self.rng.count(5, 9) {
             let around = yaw(self.rng.range(0.0, std::f32::consts::TAU));
             let axes = around * Mat3::from_rotation_z(self.rng.range(-0.9, 0.3));
-            let leaf = Vec3::new(self.rng.range(0.12, 0.26), self.rng.range(0.01, 0.05), self.rng.range(0.04, 0.1));
+            let leaf = Vec3::new(
+                self.rng.range(0.12, 0.26),
+                self.rng.range(0.01, 0.05),
+                self.rng.range(0.04, 0.1),
+            );
             let up = height + tall * self.rng.range(0.35, 1.05);
             let centre = foot - Vec3::Y * up + axes.x_axis * 0.8 * leaf.x;
             self.add(Form::Ellipsoid, centre, axes, leaf, green);
@@ -207,7 +219,11 @@ impl Layout {
         for _ in 0..self.rng.count(2, 15) {
             let top = if self.tops.is_empty() {
                 let Some(at) = self.free_floor(0.1) else { continue };
-                Top { centre: Vec3::new(at.x, 0.0, at.y), axes: Mat3::IDENTITY, half: Vec2::splat(0.1) }
+                Top {
+                    centre: Vec3::new(at.x, 0.0, at.y),
+                    axes: Mat3::IDENTITY,
+                    half: Vec2::splat(0.1),
+                }
             } else {
                 let i = self.rng.count(0, self.tops.len() - 1);
                 self.tops[i]
@@ -227,7 +243,11 @@ impl Layout {
         let dice = self.rng.unit();
         let material = Material::new(Role::Thing, &self.palette, &mut self.rng);
         let (form, half, turned) = if dice < 0.4 {
-            let half = Vec3::new(self.rng.log_range(0.03, 0.14), self.rng.log_range(0.02, 0.18), self.rng.log_range(0.03, 0.12));
+            let half = Vec3::new(
+                self.rng.log_range(0.03, 0.14),
+                self.rng.log_range(0.02, 0.18),
+                self.rng.log_range(0.03, 0.12),
+            );
             (Form::Block, half, yaw(0.5 * self.rng.normal()))
         } else if dice < 0.7 {
             let r = self.rng.log_range(0.02, 0.09);
