@@ -124,7 +124,7 @@ impl Frames {
     /// views, `means` `[V·H·W·G, 3]`: the nearest of the G at each pixel.
     pub fn depth_maps(&self, means: &Tensor, (height, width): (usize, usize)) -> Result<Tensor> {
         let per_view = means.dim(0)? / self.0.len().max(1);
-        if height * width == 0 || per_view % (height * width) != 0 {
+        if height * width == 0 || !per_view.is_multiple_of(height * width) {
             bail!(
                 "depth maps: expected a multiple of {height}x{width} parents per view, got {per_view}"
             );

@@ -26,20 +26,21 @@ pub fn attention_gather(
     let g = &gather;
     let rows = query.dim(0)?;
     let level_ends = |l: &Level| l.first_cell + g.views * l.height * l.width;
-    if g.groups == 0 || g.dim % g.groups != 0 || g.points == 0 || g.views == 0 {
+    if g.groups == 0 || !g.dim.is_multiple_of(g.groups) || g.points == 0 || g.views == 0 {
         bail!("{NAME}: expected groups that divide E, points and views, got {g:?}");
     }
     let channels = g.dim + g.value.max(g.key.unwrap_or(0));
     let expected = g.levels.iter().map(level_ends).max().unwrap_or(0);
     let (cells, stride) = maps.dims2()?;
-    if stride != g.stride || stride < channels || stride % g.dim != 0 || cells < expected {
+    if stride != g.stride || stride < channels || !stride.is_multiple_of(g.dim) || cells < expected
+    {
         bail!(
             "{NAME} maps: expected [{expected}, {}] with {channels} channels in use, got {:?}",
             g.stride,
             maps.dims()
         );
     }
-    let lane_ok = |start: usize| start % g.dim == 0;
+    let lane_ok = |start: usize| start.is_multiple_of(g.dim);
     if !lane_ok(g.value) || !g.key.is_none_or(lane_ok) {
         bail!("{NAME}: expected keys and values to start at multiples of E = {}", g.dim);
     }

@@ -209,7 +209,7 @@ impl<T: Real> Args<'_, T> {
         let cells = self.maps.len() / g.stride;
         let width = g.dim / g.groups;
         // Channels per task: within one group, at most two cache lines of f32.
-        let lanes = (1..=32.min(width)).rev().find(|b| width % b == 0).unwrap_or(1);
+        let lanes = (1..=32.min(width)).rev().find(|b| width.is_multiple_of(*b)).unwrap_or(1);
         let blocks: Vec<Vec<T>> = (0..g.stride / lanes)
             .into_par_iter()
             .map(|block| {

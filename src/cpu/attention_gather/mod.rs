@@ -367,8 +367,8 @@ const OCCLUSION_TOLERANCE: f32 = 0.02;
 /// where the point is outside the picture or behind the camera, since then there is
 /// nothing to hide it. D is bilinear between pixel centres, held at the edges.
 pub fn occlusion(map: DepthMap, at: [f32; 2], z: f32) -> f32 {
-    let inside = at.iter().all(|&r| r > 0.0 && r < 1.0);
-    if !inside || !(z > 0.0) {
+    let inside = z > 0.0 && at.iter().all(|&r| r > 0.0 && r < 1.0);
+    if !inside {
         return 1.0;
     }
     let axis = |r: f32, n: usize| {

@@ -55,7 +55,7 @@ pub fn ring(len: usize) -> Vec<f32> {
     let golden = std::f32::consts::PI * (3.0 - 5f32.sqrt());
     let number = |i: usize| {
         let angle = golden * (i / 2) as f32;
-        if i % 2 == 0 { angle.cos() } else { angle.sin() }
+        if i.is_multiple_of(2) { angle.cos() } else { angle.sin() }
     };
     (0..len).map(number).collect()
 }
