@@ -1,5 +1,5 @@
 //! Random scenes for the trunk's tests: cameras, views, primaries, feature maps.
-#![allow(dead_code)] // each test file uses a part
+#![allow(dead_code, reason = "each test file uses a part")]
 
 use candle_core::{DType, Device, Result, Tensor};
 use glam::{EulerRot, Mat4, Quat, Vec3};
