@@ -246,7 +246,7 @@ fn position_encoding(c: usize, size: [usize; 2], splits: usize, like: &Tensor) -
     let value = |k: usize, i: usize, n: usize| -> f32 {
         let position = (i % n + 1) as f64 / (n as f64 + 1e-6) * std::f64::consts::TAU;
         let angle = position / 10_000f64.powf((2 * (k / 2)) as f64 / half as f64);
-        (if k % 2 == 0 { angle.sin() } else { angle.cos() }) as f32
+        (if k.is_multiple_of(2) { angle.sin() } else { angle.cos() }) as f32
     };
     let mut out = Vec::with_capacity(c * h * w);
     for k in 0..c {
