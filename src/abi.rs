@@ -21,6 +21,8 @@ pub const LANE_OPACITY: usize = 10;
 
 /// A contribution below this alpha is skipped (8-bit quantisation; 3DGS).
 pub const ALPHA_MIN: f32 = 1.0 / 255.0;
+/// log₂ of [`ALPHA_MIN`].
+pub const ALPHA_MIN_LOG2: f32 = -7.994_353_3;
 /// Compositing stops where the transmittance would fall to this (3DGS).
 pub const TRANSMITTANCE_MIN: f32 = 1e-4;
 /// Largest alpha of one splat at one pixel, `standard` (gsplat).
@@ -35,6 +37,27 @@ pub const NEAR_MVSPLAT: f32 = 0.2;
 pub const LOWPASS: f32 = 0.3;
 /// Side of the tiles whose edges the `mvsplat` convention makes visible, px.
 pub const TILE_MVSPLAT: usize = 16;
+
+/// How far beyond the picture's edge x/z and y/z still move the Jacobian,
+/// `standard`: in units of tan(fov/2) beyond each edge (gsplat).
+pub const JACOBIAN_MARGIN_STANDARD: f32 = 0.3;
+/// Largest |x/z|, |y/z| that moves the Jacobian, `mvsplat`: in units of
+/// tan(fov/2) from the axis (INRIA).
+pub const JACOBIAN_LIMIT_MVSPLAT: f32 = 1.3;
+/// Added to camera z where a mean is projected, `mvsplat`, in units of the
+/// camera's near plane (INRIA).
+pub const Z_EPSILON_MVSPLAT: f32 = 1e-7;
+/// Smallest discriminant under the root of λ_max, `mvsplat`, px⁴ (INRIA).
+pub const DISCRIMINANT_MIN_MVSPLAT: f32 = 0.1;
+/// Radius of a splat in σ of its longer axis, `mvsplat` (INRIA).
+pub const RADIUS_SIGMAS_MVSPLAT: f32 = 3.0;
+/// Smallest divisor of Σ w z where depth is divided by the accumulated alpha.
+pub const DEPTH_ALPHA_MIN: f32 = 1e-10;
+
+/// Side of the tiles that the kernels work in, px. Invisible in the picture.
+pub const TILE: usize = 32;
+/// Side of the pixel blocks inside a tile, px: 4 × 4 = one 16-lane register.
+pub const BLOCK: usize = 4;
 
 /// Number of SH coefficients per colour channel at `degree`.
 pub const fn sh_coefficients(degree: usize) -> usize {
@@ -134,3 +157,39 @@ impl Default for RasterOptions {
         Self::new(Convention::Standard)
     }
 }
+
+/// Floats of one child in the heads' record: Δu, Δv, Δz, Δlog s (3), Δr (3), ℓ, γ̃
+/// (SubSplat, g_θ and h_φ).
+pub const HEAD_LANES: usize = 11;
+/// First lane of the learned offset (û, v̂), sub-pixels before any bound.
+pub const HEAD_OFFSET: usize = 0;
+/// Lane of the depth residual before its tanh.
+pub const HEAD_DEPTH: usize = 2;
+/// First lane of Δlog s.
+pub const HEAD_LOG_SCALE: usize = 3;
+/// First lane of Δr, a rotation vector in the parent's own axes, radians.
+pub const HEAD_ROTATION: usize = 6;
+/// Lane of the opacity logit ℓ.
+pub const HEAD_LOGIT: usize = 9;
+/// Lane of the colour gain γ̃ before its tanh.
+pub const HEAD_GAIN: usize = 10;
+/// Lanes that the geometry head g_θ gives; the appearance head h_φ gives the rest.
+pub const HEAD_GEOMETRY_LANES: usize = 9;
+
+/// ε of w̃ = w / (A + ε), px² (supp. A.3).
+pub const AREA_EPS: f64 = 1e-8;
+/// Largest parent opacity of which a logarithm is taken (spec 2.11).
+pub const OPACITY_CEILING: f64 = 0.9999;
+/// Largest child opacity under the `area` rule.
+pub const AREA_RULE_OPACITY_MAX: f64 = 0.99;
+/// Most that the minimum-footprint rule multiplies a σ by (spec 2.6).
+pub const GROWTH_MAX: f64 = 50.0;
+/// Added to the squared area, so that its root has a gradient at zero, px⁴.
+pub const AREA_SQ_EPS: f64 = 1e-24;
+/// A child lies at least this fraction of its parent's depth away (spec 2.4).
+pub const DEPTH_FRACTION_MIN: f64 = 0.1;
+/// How far beyond each picture edge, in tan(fov/2), the Jacobian's x/z and y/z may
+/// reach (3DGS: 1.3·tan(fov/2) in all).
+pub const FRUSTUM_MARGIN: f64 = 0.3;
+/// Least camera z at which a point is projected for sampling (GaussianFormer).
+pub const VISIBLE_Z_MIN: f64 = 1e-5;

@@ -958,7 +958,7 @@ impl Config {
         let a = self.agg.resolved();
         need(self.embed.dim > 0, "embed.dim", "at least 1", self.embed.dim)?;
         need(
-            a.groups > 0 && self.embed.dim % a.groups == 0,
+            a.groups > 0 && self.embed.dim.is_multiple_of(a.groups),
             "agg.groups",
             "a divisor of embed.dim",
             a.groups,
@@ -996,7 +996,7 @@ type Need<T> = fn(bool, &'static str, &str, T) -> Result<(), ConfigError>;
 fn check_mvsplat(b: &Mvsplat, need: Need<usize>) -> Result<(), ConfigError> {
     let width = b.cnn_channels[2];
     need(
-        width > 0 && width % 4 == 0,
+        width > 0 && width.is_multiple_of(4),
         "backbone.cnn_channels",
         "a last stage that is a multiple of 4",
         width,
@@ -1010,7 +1010,7 @@ fn check_mvsplat(b: &Mvsplat, need: Need<usize>) -> Result<(), ConfigError> {
     need(b.window_splits >= 1, "backbone.window_splits", "at least 1", b.window_splits)?;
     need(b.depth_candidates >= 2, "backbone.depth_candidates", "at least 2", b.depth_candidates)?;
     need(
-        b.costvolume_channels > 0 && b.costvolume_channels % 32 == 0,
+        b.costvolume_channels > 0 && b.costvolume_channels.is_multiple_of(32),
         "backbone.costvolume_channels",
         "a multiple of 32",
         b.costvolume_channels,
@@ -1022,7 +1022,7 @@ fn check_mvsplat(b: &Mvsplat, need: Need<usize>) -> Result<(), ConfigError> {
         b.costvolume_levels,
     )?;
     need(
-        b.refine_channels > 0 && b.refine_channels % 32 == 0,
+        b.refine_channels > 0 && b.refine_channels.is_multiple_of(32),
         "backbone.refine_channels",
         "a multiple of 32",
         b.refine_channels,
@@ -1054,7 +1054,7 @@ fn check_small(b: &Small, need: Need<usize>) -> Result<(), ConfigError> {
     need(b.depth_candidates >= 2, "backbone.depth_candidates", "at least 2", b.depth_candidates)?;
     need(b.match_channels > 0, "backbone.match_channels", "at least 1", b.match_channels)?;
     need(
-        b.head_channels > 0 && b.head_channels % 8 == 0,
+        b.head_channels > 0 && b.head_channels.is_multiple_of(8),
         "backbone.head_channels",
         "a multiple of 8",
         b.head_channels,

@@ -1,1 +1,11 @@
-fn main() {}
+//! The `subsplat` program: arguments in, files and one report out. Everything it
+//! does goes through the library's public API.
+
+mod cli;
+
+use clap::Parser;
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    cli::main(cli::args::Cli::parse())
+}

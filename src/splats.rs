@@ -61,13 +61,14 @@ impl Splats {
         if sh_degree > SH_DEGREE_MAX {
             return shape("SH degree", format!("0 to {SH_DEGREE_MAX}"), sh_degree);
         }
-        if rows.len() % SPLAT_LANES != 0 {
+        if !rows.len().is_multiple_of(SPLAT_LANES) {
             return shape("rows", format!("a multiple of {SPLAT_LANES} floats"), rows.len());
         }
         let n = rows.len() / SPLAT_LANES;
         let set = 3 * (sh_degree + 1) * (sh_degree + 1);
         let p = sh.len() / set;
-        if sh.len() % set != 0 || (n == 0) != (p == 0) || (p > 0 && n % p != 0) {
+        if !sh.len().is_multiple_of(set) || (n == 0) != (p == 0) || (p > 0 && !n.is_multiple_of(p))
+        {
             let expected = format!("{set} floats for each of P parents, P dividing {n} splats");
             return shape("SH coefficients", expected, sh.len());
         }

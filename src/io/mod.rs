@@ -5,6 +5,32 @@
 //! a reader never sees half a file. Readers trust no declared size: they check it
 //! against the bytes that are there before they allocate.
 
+pub mod compressed_ply;
+mod gaussians;
+pub mod glb;
+mod glb_read;
+pub mod ksplat;
+pub mod ply;
+mod ply_container;
+pub mod splat;
+pub mod splats;
+pub mod spz;
+
+pub use splats::{
+    SaveOptions, SaveReport, SplatFormat, SplatInfo, Up, load_splats, save_splats, splat_info,
+};
+mod assemble;
+pub mod cameras_json;
+pub mod colmap;
+pub mod image;
+pub mod matrices;
+pub mod protocol;
+pub mod re10k;
+pub mod resize;
+pub mod scene;
+pub mod transforms;
+pub mod undistort;
+
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};

@@ -2,17 +2,34 @@
 //!
 //! Parameter names are PyTorch's, so that a converted checkpoint loads as it is.
 
+pub mod aggregation;
 pub mod backbone;
 pub mod compare;
+pub mod embed;
 mod floors;
+pub mod geometry;
 pub mod layers;
+pub mod mlp;
 pub mod primaries;
+pub mod spgr;
+pub mod spgr_ref;
+pub mod subsplat;
 pub mod trace;
+pub mod trunk;
 pub mod weights;
 
 use crate::camera::Camera;
 use crate::config::FeatureLevel;
 use candle_core::{Result, Tensor, bail};
+
+/// Gives a seeded tensor the start that an initialisation hint cannot say (an
+/// identity, a kernel that averages); `values` come as drawn from the hint.
+pub(crate) fn start_value(name: &str, shape: &[usize], values: &mut [f32]) {
+    backbone::small_start(name, shape, values);
+    if let Some(start) = trunk::initial_value(name, shape) {
+        values.copy_from_slice(&start);
+    }
+}
 
 /// B scenes of V posed pictures each, as the network takes them.
 #[derive(Clone, Debug)]

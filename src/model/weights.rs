@@ -178,7 +178,9 @@ impl Weights {
 
     fn draw(&self, seed: u64, name: &str, shape: &Shape, init: Init) -> Result<Tensor> {
         self.lock().initialised.insert(name.to_owned());
-        Tensor::from_vec(seeded_values(seed, name, shape, init), shape, &Device::Cpu)
+        let mut values = seeded_values(seed, name, shape, init);
+        super::start_value(name, shape.dims(), &mut values);
+        Tensor::from_vec(values, shape, &Device::Cpu)
     }
 }
 

@@ -4,22 +4,36 @@
 
 pub mod activation;
 pub mod attention;
+pub mod attention_gather;
 pub mod conv2d;
+pub mod matching;
 pub mod norm;
 pub mod plane_sweep;
+mod rasterize;
+pub mod redistribute;
 pub mod resize;
+pub mod spgr;
 
-use candle_core::{CpuStorage, Layout, Result, Shape, Tensor, bail};
+pub use rasterize::rasterize;
 
-/// The elements of an op's argument, which must be contiguous `f32`.
-pub(crate) fn f32_slice<'a>(
+use crate::cpu::real::Real;
+use candle_core::{CpuStorage, Layout, Result, Shape, Tensor, WithDType, bail};
+
+/// A number that both candle and the kernels know: `f32` or `f64`.
+pub(crate) trait Number: Real + WithDType {}
+impl Number for f32 {}
+impl Number for f64 {}
+
+/// The elements of an op's argument, which must be contiguous and of type `T`.
+pub(crate) fn slice<'a, T: Number>(
     op: &str,
     what: &str,
     storage: &'a CpuStorage,
     layout: &Layout,
-) -> Result<&'a [f32]> {
-    let CpuStorage::F32(data) = storage else {
-        bail!("{op} {what}: expected f32, got another dtype")
+) -> Result<&'a [T]> {
+    let Ok(data) = storage.as_slice::<T>() else {
+        let got = candle_core::backend::BackendStorage::dtype(storage);
+        bail!("{op} {what}: expected {:?} like the first argument, got {got:?}", T::DTYPE)
     };
     match layout.contiguous_offsets() {
         Some((start, end)) => Ok(&data[start..end]),
@@ -29,17 +43,44 @@ pub(crate) fn f32_slice<'a>(
     }
 }
 
+/// All elements in row-major order, for a kernel of a backward pass.
+pub(crate) fn elements<T: Number>(tensor: &Tensor) -> Result<Vec<T>> {
+    tensor.flatten_all()?.to_vec1::<T>()
+}
+
+/// [`slice`] of `f32`.
+pub(crate) fn f32_slice<'a>(
+    op: &str,
+    what: &str,
+    storage: &'a CpuStorage,
+    layout: &Layout,
+) -> Result<&'a [f32]> {
+    slice(op, what, storage, layout)
+}
+
 /// An op's result.
 pub(crate) fn output(data: Vec<f32>, shape: impl Into<Shape>) -> Result<(CpuStorage, Shape)> {
     Ok((CpuStorage::F32(data), shape.into()))
 }
 
-/// A tensor's elements in order, copied.
+/// [`elements`] of `f32`.
 pub(crate) fn values(t: &Tensor) -> Result<Vec<f32>> {
-    t.flatten_all()?.to_vec1()
+    elements(t)
 }
 
 /// A tensor of `like`'s shape and device.
 pub(crate) fn tensor_like(data: Vec<f32>, like: &Tensor) -> Result<Tensor> {
     Tensor::from_vec(data, like.shape(), like.device())
 }
+
+/// Runs `$run::<T>($($arg),*)` for the `f32` or `f64` that `$dtype` says.
+macro_rules! by_dtype {
+    ($op:expr, $dtype:expr, $run:ident ( $($arg:expr),* )) => {
+        match $dtype {
+            candle_core::DType::F32 => $run::<f32>($($arg),*),
+            candle_core::DType::F64 => $run::<f64>($($arg),*),
+            other => candle_core::bail!("{}: expected f32 or f64, got {other:?}", $op),
+        }
+    };
+}
+pub(crate) use by_dtype;

@@ -7,8 +7,13 @@
 pub mod cnn;
 pub mod cost_volume;
 pub mod depth;
+pub mod small;
+mod small_parts;
 pub mod transformer;
 pub mod unet;
+
+pub use small::SmallBackbone;
+pub(crate) use small_parts::small_start;
 
 use super::trace::Trace;
 use super::{BackboneOutput, Views};

@@ -1,0 +1,235 @@
+//! Grey pictures as the matcher takes them: linear access, Gaussian blur, area
+//! reduction, central differences. Values in [0, 1], row-major, pixel (i, j) has
+//! its centre at (i + 0.5, j + 0.5) as everywhere (`camera.rs`).
+
+use rayon::prelude::*;
+
+/// A grey picture, `height` rows of `width` values in [0, 1].
+#[derive(Clone, Debug, PartialEq)]
+pub struct GrayImage {
+    width: usize,
+    height: usize,
+    pixels: Vec<f32>,
+}
+
+/// Rec. 709 luma weights, applied to the stored (gamma-encoded) values.
+const LUMA: [f32; 3] = [0.2126, 0.7152, 0.0722];
+
+impl GrayImage {
+    /// From `width × height` values, or `None` where the number of values differs,
+    /// the picture is empty, or a value is not finite.
+    pub fn new(width: usize, height: usize, pixels: Vec<f32>) -> Option<Self> {
+        let fits = width.checked_mul(height) == Some(pixels.len()) && !pixels.is_empty();
+        (fits && pixels.iter().all(|v| v.is_finite())).then_some(Self { width, height, pixels })
+    }
+
+    /// Luma of interleaved 8-bit RGB, or `None` where the length is not 3·W·H.
+    pub fn from_rgb8(width: usize, height: usize, rgb: &[u8]) -> Option<Self> {
+        let grey = rgb
+            .chunks_exact(3)
+            .map(|p| (0..3).map(|c| LUMA[c] * f32::from(p[c])).sum::<f32>() / 255.0);
+        rgb.len().is_multiple_of(3).then(|| Self::new(width, height, grey.collect()))?
+    }
+
+    /// Luma of interleaved RGB floats in [0, 1], or `None` where the length is not
+    /// 3·W·H or a value is not finite.
+    pub fn from_rgb(width: usize, height: usize, rgb: &[f32]) -> Option<Self> {
+        let grey = rgb.chunks_exact(3).map(|p| (0..3).map(|c| LUMA[c] * p[c]).sum::<f32>());
+        rgb.len().is_multiple_of(3).then(|| Self::new(width, height, grey.collect()))?
+    }
+
+    /// Width, px.
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Height, px.
+    pub fn height(&self) -> usize {
+        self.height
+    }
+
+    /// All values, row-major.
+    pub fn pixels(&self) -> &[f32] {
+        &self.pixels
+    }
+
+    /// Row `y`.
+    pub(super) fn row(&self, y: usize) -> &[f32] {
+        &self.pixels[y * self.width..(y + 1) * self.width]
+    }
+
+    /// Value at column `x`, row `y`.
+    pub(super) fn at(&self, x: usize, y: usize) -> f32 {
+        self.pixels[y * self.width + x]
+    }
+
+    /// Mean value.
+    pub(super) fn mean(&self) -> f32 {
+        (self.pixels.iter().map(|&v| f64::from(v)).sum::<f64>() / self.pixels.len() as f64) as f32
+    }
+
+    /// Mean over the square of `2·radius + 1` pixels around (x, y), cut at the border.
+    pub(super) fn mean_around(&self, x: f32, y: f32, radius: usize) -> f32 {
+        let (cx, cy) =
+            ((x.max(0.0) as usize).min(self.width - 1), (y.max(0.0) as usize).min(self.height - 1));
+        let columns = cx.saturating_sub(radius)..(cx + radius + 1).min(self.width);
+        let rows = cy.saturating_sub(radius)..(cy + radius + 1).min(self.height);
+        let count = (columns.len() * rows.len()) as f32;
+        rows.map(|r| self.row(r)[columns.clone()].iter().sum::<f32>()).sum::<f32>() / count
+    }
+
+    /// Gaussian blur of `sigma` px, borders repeated, kernel cut at 3.5σ.
+    pub(super) fn blurred(&self, sigma: f32) -> Self {
+        let radius = (3.5 * sigma).ceil() as usize;
+        let kernel = gaussian(sigma, radius);
+        let (w, h) = (self.width, self.height);
+        let mut across = vec![0.0f32; w * h];
+        across.par_chunks_mut(w).enumerate().for_each_init(
+            || vec![0.0f32; w + 2 * radius],
+            |padded, (y, out)| {
+                let row = self.row(y);
+                padded[..radius].fill(row[0]);
+                padded[radius..radius + w].copy_from_slice(row);
+                padded[radius + w..].fill(row[w - 1]);
+                for (k, &weight) in kernel.iter().enumerate() {
+                    accumulate(out, &padded[k..k + w], weight);
+                }
+            },
+        );
+        let mut pixels = vec![0.0f32; w * h];
+        pixels.par_chunks_mut(w).enumerate().for_each(|(y, out)| {
+            for (k, &weight) in kernel.iter().enumerate() {
+                let from = (y + k).saturating_sub(radius).min(h - 1);
+                accumulate(out, &across[from * w..(from + 1) * w], weight);
+            }
+        });
+        Self { width: w, height: h, pixels }
+    }
+
+    /// Every second pixel of both directions: the next octave of a pyramid whose
+    /// level was blurred already. Pixel (i, j) of the result has its centre where
+    /// pixel (2i, 2j) had it.
+    pub(super) fn decimated(&self) -> Self {
+        let (width, height) = (self.width.div_ceil(2), self.height.div_ceil(2));
+        let pixels = (0..height).flat_map(|y| self.row(2 * y).iter().step_by(2).copied()).collect();
+        Self { width, height, pixels }
+    }
+
+    /// Twice the size, bilinear; pixel (2i, 2j) has its centre where (i, j) had it.
+    pub(super) fn doubled(&self) -> Self {
+        let (w, h) = (self.width, self.height);
+        let (width, height) = (2 * w, 2 * h);
+        let mut pixels = vec![0.0f32; width * height];
+        pixels.par_chunks_mut(width).enumerate().for_each(|(y, out)| {
+            let (top, bottom) = (self.row(y / 2), self.row((y / 2 + y % 2).min(h - 1)));
+            for (x, o) in out.iter_mut().enumerate() {
+                let (l, r) = (x / 2, (x / 2 + x % 2).min(w - 1));
+                *o = 0.25 * (top[l] + top[r] + bottom[l] + bottom[r]);
+            }
+        });
+        Self { width, height, pixels }
+    }
+
+    /// Area average down to `width × height`, each no larger than this picture's.
+    pub(super) fn reduced(&self, width: usize, height: usize) -> Self {
+        let columns = area_weights(self.width, width);
+        let rows = area_weights(self.height, height);
+        let mut across = vec![0.0f32; width * self.height];
+        across.par_chunks_mut(width).enumerate().for_each(|(y, out)| {
+            let row = self.row(y);
+            for (o, (first, weights)) in out.iter_mut().zip(&columns) {
+                *o = weights.iter().zip(&row[*first..]).map(|(w, v)| w * v).sum();
+            }
+        });
+        let mut pixels = vec![0.0f32; width * height];
+        pixels.par_chunks_mut(width).zip(&rows).for_each(|(out, (first, weights))| {
+            for (k, &weight) in weights.iter().enumerate() {
+                let from = first + k;
+                accumulate(out, &across[from * width..(from + 1) * width], weight);
+            }
+        });
+        Self { width, height, pixels }
+    }
+}
+
+/// Samples of a Gaussian at −radius..=radius, normalised to sum 1.
+fn gaussian(sigma: f32, radius: usize) -> Vec<f32> {
+    let mut kernel: Vec<f32> = (0..=2 * radius)
+        .map(|i| {
+            let d = (i as f32 - radius as f32) / sigma;
+            (-0.5 * d * d).exp()
+        })
+        .collect();
+    let sum: f32 = kernel.iter().sum();
+    kernel.iter_mut().for_each(|k| *k /= sum);
+    kernel
+}
+
+/// `out += weight · row`.
+fn accumulate(out: &mut [f32], row: &[f32], weight: f32) {
+    for (o, &v) in out.iter_mut().zip(row) {
+        *o += weight * v;
+    }
+}
+
+/// For every output pixel: the first input pixel that it covers and the share of
+/// each, summing to 1.
+fn area_weights(from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
+    let ratio = from as f64 / to as f64;
+    (0..to)
+        .map(|i| {
+            let (start, end) = (i as f64 * ratio, ((i + 1) as f64 * ratio).min(from as f64));
+            let first = (start.floor() as usize).min(from - 1);
+            let last = (end.ceil() as usize).clamp(first + 1, from);
+            let cover = |p: usize| (end.min((p + 1) as f64) - start.max(p as f64)).max(0.0);
+            let weights: Vec<f64> = (first..last).map(cover).collect();
+            let sum: f64 = weights.iter().sum();
+            (first, weights.iter().map(|w| (w / sum) as f32).collect())
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_and_values_are_checked() {
+        assert!(GrayImage::new(2, 2, vec![0.0; 3]).is_none());
+        assert!(GrayImage::new(0, 0, vec![]).is_none());
+        assert!(GrayImage::new(1, 1, vec![f32::NAN]).is_none());
+        assert!(GrayImage::from_rgb8(1, 1, &[1, 2]).is_none());
+        let white = GrayImage::from_rgb8(1, 1, &[255; 3]).unwrap();
+        assert!((white.at(0, 0) - 1.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn reduction_keeps_the_mean_and_splits_pixels_by_area() {
+        let image = GrayImage::new(3, 1, vec![0.0, 1.0, 0.5]).unwrap();
+        let half = image.reduced(2, 1);
+        assert!((half.at(0, 0) - 1.0 / 3.0).abs() < 1e-6);
+        assert!((half.at(1, 0) - 2.0 / 3.0).abs() < 1e-6);
+        assert!((half.mean() - image.mean()).abs() < 1e-6);
+    }
+
+    #[test]
+    fn blur_keeps_constants_and_centres() {
+        let flat = GrayImage::new(9, 7, vec![0.25; 63]).unwrap().blurred(1.3);
+        assert!(flat.pixels().iter().all(|v| (v - 0.25).abs() < 1e-6));
+        let mut dot = vec![0.0; 21 * 21];
+        dot[10 * 21 + 10] = 1.0;
+        let spread = GrayImage::new(21, 21, dot).unwrap().blurred(2.0);
+        assert!((spread.at(10, 10) - 1.0 / (2.0 * std::f32::consts::PI * 4.0)).abs() < 1e-4);
+        assert_eq!(spread.at(8, 10), spread.at(12, 10));
+        assert!((spread.at(8, 10) - spread.at(10, 8)).abs() < 1e-9);
+    }
+
+    #[test]
+    fn doubling_keeps_every_second_pixel() {
+        let image = GrayImage::new(2, 2, vec![0.0, 1.0, 0.5, 0.25]).unwrap();
+        let large = image.doubled();
+        assert_eq!((large.at(0, 0), large.at(2, 0), large.at(0, 2)), (0.0, 1.0, 0.5));
+        assert_eq!(large.at(1, 0), 0.5);
+        assert_eq!(large.decimated(), image);
+    }
+}

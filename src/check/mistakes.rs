@@ -1,0 +1,377 @@
+//! The usual mistakes in camera files, undone one at a time: whichever reading of
+//! the given numbers fits the matches tells the user what to change.
+//!
+//! Two views fix the relative pose only, and not its length. Mistakes that leave
+//! it alone (OpenGL axes under a sideways move without turning, a wrong scale) are
+//! neither seen nor harmful to a reconstruction from the pair.
+
+use super::epipolar::{Match, TwoViews, distance, median};
+use crate::camera::{Camera, Intrinsics};
+use glam::{Mat3, Mat4, Vec3};
+
+/// How well two cameras explain matches.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Fit {
+    /// Median epipolar distance, px, where a point behind a camera counts as
+    /// infinitely far off.
+    pub error: f64,
+    /// Median epipolar distance alone, px.
+    pub distance: f64,
+    /// Share of matches that triangulate in front of both cameras.
+    pub in_front: f64,
+}
+
+/// Fit of `views` to `matches`; `noise` is the accuracy of a point, px.
+pub(super) fn fit(views: &TwoViews, matches: &[Match], noise: f64) -> Fit {
+    let f = views.fundamental();
+    let distances: Vec<f64> = matches.iter().map(|m| distance(&f, m)).collect();
+    let front: Vec<bool> = matches.iter().map(|m| in_front(views, m, noise)).collect();
+    let counted = distances.iter().zip(&front);
+    let errors = counted.map(|(&d, &ok)| if ok { d } else { f64::INFINITY }).collect();
+    Fit {
+        error: median(errors).unwrap_or(f64::INFINITY),
+        distance: median(distances).unwrap_or(f64::INFINITY),
+        in_front: front.iter().filter(|&&ok| ok).count() as f64 / front.len().max(1) as f64,
+    }
+}
+
+/// Whether a match lies in front of both cameras. Rays that are parallel within
+/// the noise meet anywhere: they count as in front.
+pub(super) fn in_front(views: &TwoViews, m: &Match, noise: f64) -> bool {
+    let t = views.triangulate(m);
+    (t.z_a > 0.0 && t.z_b > 0.0) || t.angle < noise * views.radians_per_px()
+}
+
+/// One other way to read the two cameras.
+#[derive(Clone, Debug)]
+pub(super) struct Reading {
+    /// Short name, for programs.
+    pub name: String,
+    /// Ends "the poses fit if …".
+    pub clause: String,
+    /// 0: a usual mistake; 1: a focal length that was searched for; 2: unusual axes.
+    /// A later rank is named only if no earlier one fits.
+    pub rank: u8,
+    /// Factor of the focal length, where that is what is changed.
+    pub factor: Option<f32>,
+    /// The two cameras as this reading has them.
+    pub cameras: [Camera; 2],
+}
+
+impl Reading {
+    /// The largest rank.
+    pub(super) const LAST_RANK: u8 = 2;
+}
+
+/// Every other reading of cameras `a` and `b` for photographs of `sizes` px.
+pub(super) fn readings(given: &[Camera; 2], sizes: [(usize, usize); 2]) -> Vec<Reading> {
+    let mut all = pose_readings(given);
+    all.extend(turned_readings(given, sizes));
+    all.extend(intrinsics_readings(given));
+    all.extend(focal_readings(given));
+    all.extend(axes_readings(given));
+    all
+}
+
+fn reading(
+    name: impl Into<String>,
+    clause: impl Into<String>,
+    given: &[Camera; 2],
+    change: impl Fn(&Camera) -> Camera,
+) -> Reading {
+    let cameras = [change(&given[0]), change(&given[1])];
+    Reading { name: name.into(), clause: clause.into(), rank: 0, factor: None, cameras }
+}
+
+fn posed(camera: &Camera, world_from_camera: Mat4) -> Camera {
+    Camera { world_from_camera, ..*camera }
+}
+
+fn inverse(camera: &Camera) -> Mat4 {
+    camera.camera_from_world()
+}
+
+/// Diagonal (1, −1, −1): OpenGL's axes to OpenCV's and back.
+fn opengl() -> Mat4 {
+    Mat4::from_scale(Vec3::new(1.0, -1.0, -1.0))
+}
+
+fn pose_readings(given: &[Camera; 2]) -> Vec<Reading> {
+    let with = |rotation: Mat3, eye: Vec3| {
+        Mat4::from_cols(
+            rotation.x_axis.extend(0.0),
+            rotation.y_axis.extend(0.0),
+            rotation.z_axis.extend(0.0),
+            eye.extend(1.0),
+        )
+    };
+    let mut all = vec![
+        reading(
+            "opengl",
+            "their camera axes are read as OpenGL's (x right, y up, z back; nerfstudio, Blender)",
+            given,
+            |c| posed(c, c.world_from_camera * opengl()),
+        ),
+        reading(
+            "world_to_camera",
+            "the matrices are read as world-to-camera (COLMAP, RealEstate10K) and inverted",
+            given,
+            |c| posed(c, inverse(c)),
+        ),
+        reading(
+            "world_to_camera_opengl",
+            "the matrices are read as world-to-camera with OpenGL axes",
+            given,
+            |c| posed(c, inverse(c) * opengl()),
+        ),
+        reading(
+            "rotation_transposed",
+            "the rotations are transposed (world-to-camera rotation beside the camera's position)",
+            given,
+            |c| posed(c, with(c.rotation().transpose(), c.position())),
+        ),
+        reading(
+            "translation_world_to_camera",
+            "the translations are read as world-to-camera (the rotations are right)",
+            given,
+            |c| posed(c, with(c.rotation(), -(c.rotation() * c.position()))),
+        ),
+    ];
+    let exchanged = [
+        posed(&given[0], given[1].world_from_camera),
+        posed(&given[1], given[0].world_from_camera),
+    ];
+    all.push(Reading {
+        name: "exchanged".into(),
+        clause: "the two photographs' cameras are exchanged (file order?)".into(),
+        rank: 0,
+        factor: None,
+        cameras: exchanged,
+    });
+    all
+}
+
+/// Photographs turned against their cameras, as EXIF orientation does.
+fn turned_readings(given: &[Camera; 2], sizes: [(usize, usize); 2]) -> Vec<Reading> {
+    let turns = [
+        (1, "turned_clockwise", "the photographs are turned back by 90° counter-clockwise"),
+        (2, "turned_half", "the photographs are turned by 180°"),
+        (3, "turned_counter_clockwise", "the photographs are turned back by 90° clockwise"),
+    ];
+    let build = |(quarters, name, clause): (usize, &str, &str)| {
+        let turn = |i: usize| {
+            let mut camera = given[i];
+            (0..quarters).for_each(|_| camera = turned_clockwise(&camera));
+            camera.resized(sizes[i].0, sizes[i].1)
+        };
+        let clause = format!("{clause} (EXIF orientation?)");
+        Reading { name: name.into(), clause, rank: 0, factor: None, cameras: [turn(0), turn(1)] }
+    };
+    turns.into_iter().map(build).collect()
+}
+
+/// The camera of the photograph turned clockwise by 90°: new x is old −y, new y is
+/// old x.
+fn turned_clockwise(camera: &Camera) -> Camera {
+    let k = camera.intrinsics;
+    let old_from_new = Mat4::from_mat3(Mat3::from_cols(Vec3::NEG_Y, Vec3::X, Vec3::Z));
+    Camera {
+        intrinsics: Intrinsics {
+            fx: k.fy,
+            fy: k.fx,
+            cx: k.height as f32 - k.cy,
+            cy: k.cx,
+            width: k.height,
+            height: k.width,
+        },
+        world_from_camera: camera.world_from_camera * old_from_new,
+    }
+}
+
+fn intrinsics_readings(given: &[Camera; 2]) -> Vec<Reading> {
+    /// Relative difference from which a change of intrinsics is another reading.
+    const DIFFERS: f32 = 0.02;
+    let change = |name: &str, clause: &str, f: &dyn Fn(Intrinsics) -> Intrinsics| {
+        reading(name, clause, given, |c| Camera { intrinsics: f(c.intrinsics), ..*c })
+    };
+    let size = |k: &Intrinsics| (k.width as f32, k.height as f32);
+    let differs = |a: f32, b: f32| (a / b - 1.0).abs() > DIFFERS;
+    let mut all = Vec::new();
+    if given.iter().any(|c| differs(c.intrinsics.fx, c.intrinsics.fy)) {
+        all.push(change("focal_swapped", "fx and fy are exchanged", &|k| Intrinsics {
+            fx: k.fy,
+            fy: k.fx,
+            ..k
+        }));
+    }
+    let middle = |k: &Intrinsics| {
+        let (w, h) = size(k);
+        !differs(2.0 * k.cx, w) && !differs(2.0 * k.cy, h)
+    };
+    if !given.iter().all(|c| middle(&c.intrinsics)) {
+        all.push(change(
+            "principal_point_mirrored",
+            "the principal point is mirrored (width − cx, height − cy)",
+            &|k| Intrinsics { cx: size(&k).0 - k.cx, cy: size(&k).1 - k.cy, ..k },
+        ));
+        all.push(change(
+            "principal_point_centred",
+            "the principal point is put into the middle of the photograph",
+            &|k| Intrinsics { cx: 0.5 * size(&k).0, cy: 0.5 * size(&k).1, ..k },
+        ));
+        all.push(change(
+            "other_size",
+            "the intrinsics are scaled so that the principal point is in the middle: they belong \
+             to another picture size",
+            &|k| {
+                let ((w, h), positive) = (size(&k), |v: f32| v.max(1e-6));
+                let (sx, sy) = (0.5 * w / positive(k.cx), 0.5 * h / positive(k.cy));
+                Intrinsics { fx: k.fx * sx, fy: k.fy * sy, cx: 0.5 * w, cy: 0.5 * h, ..k }
+            },
+        ));
+    }
+    if given.iter().all(|c| c.intrinsics.fx < NORMALISED_FOCAL) {
+        all.push(change(
+            "normalised",
+            "the intrinsics are multiplied by the picture's size: they are normalised, not pixels",
+            &|k| Intrinsics::from_normalised([k.fx, k.fy, k.cx, k.cy], k.width, k.height),
+        ));
+    }
+    all
+}
+
+/// A focal length below this many px is one divided by the picture's width: a
+/// field of view of 170° in 100 px has 4.4 px, a long lens normalised has 8.
+pub(super) const NORMALISED_FOCAL: f32 = 10.0;
+
+/// Focal lengths scaled by steps of 5 %, both axes together or x alone.
+fn focal_readings(given: &[Camera; 2]) -> Vec<Reading> {
+    /// Steps of 5 % to either side: factors 0.4 to 2.5.
+    const STEPS: i32 = 19;
+    let both = (-STEPS..=STEPS).filter(|s| *s != 0).map(|s| (s, true));
+    let alone = (-STEPS..=STEPS).filter(|s| *s != 0).map(|s| (s, false));
+    both.chain(alone)
+        .map(|(step, both)| {
+            let factor = 1.05f32.powi(step);
+            let (name, what) =
+                if both { ("focal_scaled", "fx and fy are") } else { ("fx_scaled", "fx alone is") };
+            let clause = format!("{what} multiplied by about {factor:.2}");
+            let mut scaled = reading(name, clause, given, |c| {
+                let k = c.intrinsics;
+                let fy = if both { k.fy * factor } else { k.fy };
+                Camera { intrinsics: Intrinsics { fx: k.fx * factor, fy, ..k }, ..*c }
+            });
+            (scaled.rank, scaled.factor) = (1, Some(factor));
+            scaled
+        })
+        .collect()
+}
+
+/// All 24 right-handed orders of camera axes, read as either direction of matrix.
+fn axes_readings(given: &[Camera; 2]) -> Vec<Reading> {
+    let units = [Vec3::X, Vec3::Y, Vec3::Z];
+    let mut all = Vec::new();
+    for (i, signs) in (0..3).flat_map(|i| (0..4).map(move |s| (i, s))) {
+        for swap in [false, true] {
+            let sign = |bit: usize| if signs >> bit & 1 == 0 { 1.0 } else { -1.0 };
+            let (x, y) = (units[i] * sign(0), units[(i + if swap { 2 } else { 1 }) % 3] * sign(1));
+            // Rows: the file's axes in OpenCV's.
+            let file_from_camera = Mat3::from_cols(x, y, x.cross(y)).transpose();
+            if x == Vec3::X && y.y.abs() == 1.0 {
+                continue; // OpenCV's own and OpenGL's, tried above.
+            }
+            let axes = [x, y, x.cross(y)].map(direction).join(", ");
+            let axes_name = axes.replace(", ", "_");
+            let change = Mat4::from_mat3(file_from_camera);
+            let mut forward = reading(
+                format!("axes_{axes_name}"),
+                format!("their camera axes are read as ({axes})"),
+                given,
+                |c| posed(c, c.world_from_camera * change),
+            );
+            // LLFF's poses_bounds.npy stores (down, right, back).
+            forward.rank = if axes_name == "down_right_back" { 0 } else { 2 };
+            let mut backward = reading(
+                format!("world_to_camera_axes_{axes_name}"),
+                format!("the matrices are read as world-to-camera with camera axes ({axes})"),
+                given,
+                |c| posed(c, inverse(c) * change),
+            );
+            backward.rank = 2;
+            all.extend([forward, backward]);
+        }
+    }
+    all
+}
+
+/// OpenCV's direction of a signed unit vector.
+fn direction(v: Vec3) -> &'static str {
+    let names = [("right", "left"), ("down", "up"), ("forward", "back")];
+    let axis = if v.x != 0.0 {
+        0
+    } else if v.y != 0.0 {
+        1
+    } else {
+        2
+    };
+    if v[axis] > 0.0 { names[axis].0 } else { names[axis].1 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Quat;
+
+    fn cameras() -> [Camera; 2] {
+        let k = Intrinsics { fx: 300.0, fy: 310.0, cx: 130.0, cy: 120.0, width: 256, height: 240 };
+        [0.2, -0.3].map(|t: f32| {
+            let turn = Quat::from_euler(glam::EulerRot::XYZ, t, 0.4 - t, 0.1);
+            let eye = Vec3::new(t, 2.0, 1.0 - t);
+            Camera::new(k, Mat4::from_rotation_translation(turn, eye)).unwrap()
+        })
+    }
+
+    #[test]
+    fn every_order_of_axes_is_undone() {
+        let truth = cameras();
+        let vector = |name: &str| match name {
+            "right" => Vec3::X,
+            "left" => Vec3::NEG_X,
+            "down" => Vec3::Y,
+            "up" => Vec3::NEG_Y,
+            "forward" => Vec3::Z,
+            _ => Vec3::NEG_Z,
+        };
+        let readings = axes_readings(&truth);
+        // 24 right-handed orders less OpenCV's and OpenGL's, in either direction.
+        assert_eq!(readings.len(), 44);
+        for r in &readings {
+            let inverted = r.name.starts_with("world_to_camera_");
+            let words: Vec<&str> = r.name.rsplit('_').take(3).collect();
+            // Columns of camera_from_file are the file's axes.
+            let axes = Mat3::from_cols(vector(words[2]), vector(words[1]), vector(words[0]));
+            assert!((axes.determinant() - 1.0).abs() < 1e-6);
+            let as_filed = truth.map(|c| {
+                let pose = c.world_from_camera * Mat4::from_mat3(axes);
+                posed(&c, if inverted { pose.inverse() } else { pose })
+            });
+            let read = axes_readings(&as_filed).into_iter().find(|o| o.name == r.name).unwrap();
+            for (c, t) in read.cameras.iter().zip(&truth) {
+                assert!(c.world_from_camera.abs_diff_eq(t.world_from_camera, 1e-4), "{}", r.name);
+            }
+        }
+    }
+
+    #[test]
+    fn turning_the_photograph_turns_its_points() {
+        let camera = cameras()[0];
+        let turned = turned_clockwise(&camera);
+        let p = camera.world_from_camera.transform_point3(Vec3::new(0.3, -0.2, 2.0));
+        let (old, new) = (camera.project(p).unwrap(), turned.project(p).unwrap());
+        assert!((new.x - (240.0 - old.y)).abs() < 1e-3 && (new.y - old.x).abs() < 1e-3);
+        let mut round = camera;
+        (0..4).for_each(|_| round = turned_clockwise(&round));
+        assert!(round.world_from_camera.abs_diff_eq(camera.world_from_camera, 1e-5));
+        assert_eq!(round.intrinsics, camera.intrinsics);
+    }
+}

@@ -1,0 +1,340 @@
+//! Command-line arguments. The texts here are the program's manual.
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use std::path::PathBuf;
+
+/// Two posed photographs in, 3D Gaussians and sharper new views out.
+///
+/// Conventions everywhere: camera axes are OpenCV's (+x right, +y down, +z
+/// forward), poses are camera-to-world, pixel centres lie at +0.5. Readers convert
+/// from each format's own convention.
+#[derive(Debug, Parser)]
+#[command(name = "subsplat", version, max_term_width = 100)]
+pub struct Cli {
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+    /// Print one JSON object on stdout; everything else goes to stderr.
+    #[arg(long, global = true)]
+    pub json: bool,
+    /// Worker threads (default: RAYON_NUM_THREADS, else one per core).
+    #[arg(long, global = true, value_name = "N")]
+    pub threads: Option<usize>,
+}
+
+/// The program's commands.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Reconstruct a scene from two photographs, render views, write all outputs.
+    Run(Box<RunArgs>),
+    /// Render a finished scene (.ply, .splat, .spz, .ksplat, .glb).
+    Render(RenderArgs),
+    /// Judge poses and intrinsics before anyone wastes an hour on wrong ones.
+    Check(CheckArgs),
+    /// Say what a file or a scene folder holds.
+    Info(InfoArgs),
+    /// Run the encoder on a reference file's inputs and compare every tensor in it.
+    Compare(CompareArgs),
+}
+
+/// Which rasterizer's rules a render follows.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub enum ConventionArg {
+    /// 3DGS and gsplat.
+    Standard,
+    /// The rasterizer that MVSplat's public weights were trained with.
+    Mvsplat,
+}
+
+impl From<ConventionArg> for subsplat::abi::Convention {
+    fn from(arg: ConventionArg) -> Self {
+        match arg {
+            ConventionArg::Standard => Self::Standard,
+            ConventionArg::Mvsplat => Self::Mvsplat,
+        }
+    }
+}
+
+/// What SubSplat adds to the backbone.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub enum PresetArg {
+    /// The paper's equations as written.
+    Paper,
+    /// The same with the corrections listed in ARCHITECTURE.md; the sane choice for
+    /// weights that were never trained together with SubSplat.
+    Tuned,
+}
+
+impl From<PresetArg> for subsplat::config::Preset {
+    fn from(arg: PresetArg) -> Self {
+        match arg {
+            PresetArg::Paper => Self::Paper,
+            PresetArg::Tuned => Self::Tuned,
+        }
+    }
+}
+
+/// Which network gives the primary Gaussians.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum BackboneArg {
+    /// MVSplat (12 M parameters).
+    Re10k,
+    /// Our own light network.
+    Small,
+}
+
+/// Off, or from the photograph.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum DetailArg {
+    /// Colours from the network alone.
+    Off,
+    /// Each child adds what the photograph shows at its place beyond its parent's
+    /// pixel.
+    Photo,
+}
+
+/// Of which picture's pixels the low-pass is measured in.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub enum LowpassArg {
+    /// The rendered picture's (3DGS).
+    Target,
+    /// The network input's.
+    Input,
+}
+
+/// Frames to render besides photographs' own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum PathArg {
+    /// The target frames (of `--target`, protocol.json, or between the contexts).
+    Targets,
+    /// From the first context camera to the last.
+    Interpolate,
+    /// A small circle around the middle of the context cameras.
+    Orbit,
+}
+
+/// Formats of the reconstructed scene.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum SceneFormatArg {
+    /// INRIA's layout, SH degree 3: every viewer opens it.
+    Ply,
+    /// glTF with KHR_gaussian_splatting.
+    Glb,
+    /// 32 bytes a Gaussian, no view-dependent colour.
+    Splat,
+    /// Niantic's compressed format, version 3.
+    Spz,
+}
+
+/// Arguments of `run`.
+#[derive(Debug, Args)]
+pub struct RunArgs {
+    /// A scene (folder or pose file: cameras.json, transforms.json, COLMAP,
+    /// RealEstate10K txt), or two photographs.
+    #[arg(required = true, num_args = 1..=2, value_name = "SCENE | IMG IMG")]
+    pub input: Vec<PathBuf>,
+    /// Folder for everything that is written.
+    #[arg(short, long, default_value = "out", value_name = "DIR")]
+    pub out: PathBuf,
+    /// Context frames: indices into the scene's frames, or file names.
+    #[arg(long, value_delimiter = ',', value_name = "I,J")]
+    pub context: Vec<String>,
+    /// Frames to render and, where photographs exist, to score.
+    #[arg(long, value_delimiter = ',', value_name = "I,J,…")]
+    pub target: Vec<String>,
+    /// Side of the network's input, px: N, or WxH.
+    #[arg(long, default_value = "256", value_name = "N | WxH")]
+    pub input_size: String,
+    /// Target over input, side over side: 2 gives 4 children per pixel, 4 gives 16.
+    /// Default: the weights' own, else 2.
+    #[arg(long, value_name = "R")]
+    pub upscale: Option<usize>,
+    /// Weights (.safetensors). Without: seeded, untrained weights.
+    #[arg(long, value_name = "FILE")]
+    pub weights: Option<PathBuf>,
+    /// Seed of untrained weights.
+    #[arg(long, default_value_t = 0)]
+    pub seed: u64,
+    /// Rendered frames.
+    #[arg(long, value_enum, default_value = "targets")]
+    pub path: PathArg,
+    /// Frames of a path.
+    #[arg(long, default_value_t = 30, value_name = "N")]
+    pub frames: usize,
+    /// Formats of the scene.
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "ply", value_name = "F,…")]
+    pub save: Vec<SceneFormatArg>,
+    /// Leave Gaussians of less opacity out of the scene files.
+    #[arg(long, default_value_t = 0.0, value_name = "ALPHA")]
+    pub min_opacity: f32,
+    /// Nearest depth candidate, world units (default: from the scene).
+    #[arg(long)]
+    pub near: Option<f32>,
+    /// Farthest depth candidate, world units (default: from the scene).
+    #[arg(long)]
+    pub far: Option<f32>,
+    /// Detail from the photograph.
+    #[arg(long, value_enum, default_value = "off")]
+    pub detail: DetailArg,
+    /// What the model is.
+    #[command(flatten)]
+    pub model: ModelArgs,
+    /// How it is rendered.
+    #[command(flatten)]
+    pub look: LookArgs,
+    /// Cameras of two loose photographs.
+    #[command(flatten)]
+    pub pair: PairArgs,
+}
+
+/// The model, where weights do not say it.
+#[derive(Debug, Args)]
+pub struct ModelArgs {
+    /// Network that gives the primary Gaussians. Default: the weights' own, `re10k`
+    /// for a bare MVSplat checkpoint, `small` without weights.
+    #[arg(long, value_enum)]
+    pub backbone: Option<BackboneArg>,
+    /// SubSplat's equations. Default: the weights' own, `tuned` for weights without
+    /// SubSplat.
+    #[arg(long, value_enum)]
+    pub preset: Option<PresetArg>,
+    /// A whole configuration (JSON); overrides the presets.
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+}
+
+/// Rendering options.
+#[derive(Debug, Args)]
+pub struct LookArgs {
+    /// Rasterizer rules. Default: the model's own; `standard` for scene files.
+    #[arg(long, value_enum)]
+    pub convention: Option<ConventionArg>,
+    /// Of which picture's pixels the 0.3 px² low-pass is measured in.
+    #[arg(long, value_enum)]
+    pub lowpass_ref: Option<LowpassArg>,
+    /// Background colour, R,G,B in [0, 1].
+    #[arg(long, value_delimiter = ',', num_args = 3, default_values_t = [0.0, 0.0, 0.0], value_name = "R,G,B")]
+    pub background: Vec<f32>,
+}
+
+/// Cameras of two photographs that come without a pose file. The first camera is
+/// the world unless --pose-a is given.
+#[derive(Debug, Args)]
+pub struct PairArgs {
+    /// Horizontal field of view of both photographs, degrees.
+    #[arg(long, value_name = "DEG", conflicts_with = "intrinsics")]
+    pub fov: Option<f32>,
+    /// Intrinsics of both photographs, px: FX,FY,CX,CY, or 9 numbers of a 3x3 matrix.
+    #[arg(long, value_name = "K")]
+    pub intrinsics: Option<String>,
+    /// Where the second camera stands in the first one's frame (x right, y down,
+    /// z forward), world units.
+    #[arg(
+        long = "move",
+        value_delimiter = ',',
+        num_args = 3,
+        allow_hyphen_values = true,
+        value_name = "X,Y,Z"
+    )]
+    pub translation: Vec<f32>,
+    /// How the second camera is turned in the first one's frame: degrees about x,
+    /// then y, then z.
+    #[arg(
+        long,
+        value_delimiter = ',',
+        num_args = 3,
+        allow_hyphen_values = true,
+        value_name = "RX,RY,RZ"
+    )]
+    pub turn: Vec<f32>,
+    /// Pose of the first photograph: 12 or 16 numbers, row by row.
+    #[arg(long, allow_hyphen_values = true, value_name = "M")]
+    pub pose_a: Option<String>,
+    /// Pose of the second photograph: 12 or 16 numbers, row by row.
+    #[arg(long, allow_hyphen_values = true, value_name = "M", conflicts_with_all = ["translation", "turn"])]
+    pub pose_b: Option<String>,
+    /// What --pose-a and --pose-b are.
+    #[arg(long, value_enum, default_value = "opencv-c2w")]
+    pub pose_convention: PoseConventionArg,
+}
+
+/// Axes and direction of a pose matrix.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum PoseConventionArg {
+    /// Camera-to-world, x right, y down, z forward.
+    OpencvC2w,
+    /// World-to-camera, x right, y down, z forward.
+    OpencvW2c,
+    /// Camera-to-world, x right, y up, z backward (NeRF, Blender).
+    OpenglC2w,
+}
+
+/// Arguments of `render`.
+#[derive(Debug, Args)]
+pub struct RenderArgs {
+    /// The scene: .ply, .compressed.ply, .splat, .spz, .ksplat or .glb.
+    pub scene: PathBuf,
+    /// Folder for the pictures.
+    #[arg(short, long, default_value = "out", value_name = "DIR")]
+    pub out: PathBuf,
+    /// Cameras: any pose file or scene folder. Default: cameras.json beside the
+    /// scene, else a view of the whole.
+    #[arg(long, value_name = "SCENE")]
+    pub cameras: Option<PathBuf>,
+    /// Frames of `--cameras` to render (default: all).
+    #[arg(long, value_delimiter = ',', value_name = "I,J,…")]
+    pub target: Vec<String>,
+    /// Rendered frames.
+    #[arg(long, value_enum, default_value = "targets")]
+    pub path: PathArg,
+    /// Frames of a path.
+    #[arg(long, default_value_t = 30, value_name = "N")]
+    pub frames: usize,
+    /// Picture size, px: N, or WxH (default: the cameras' own).
+    #[arg(long, value_name = "N | WxH")]
+    pub size: Option<String>,
+    /// Highest SH degree evaluated.
+    #[arg(long, default_value_t = 4, value_name = "0…4")]
+    pub sh_degree: usize,
+    /// Write 16-bit depth pictures too.
+    #[arg(long)]
+    pub depth: bool,
+    /// How it is rendered.
+    #[command(flatten)]
+    pub look: LookArgs,
+    /// Near plane of the `mvsplat` convention, whose 0.2-fold is the nearest depth
+    /// drawn; nearest depth itself under `standard`.
+    #[arg(long)]
+    pub near: Option<f32>,
+}
+
+/// Arguments of `check`.
+#[derive(Debug, Args)]
+pub struct CheckArgs {
+    /// A scene folder or pose file.
+    pub scene: PathBuf,
+    /// Frames to judge (default: the protocol's contexts, else neighbours).
+    #[arg(long, value_delimiter = ',', value_name = "I,J")]
+    pub context: Vec<String>,
+    /// Folder for the epipolar picture.
+    #[arg(short, long, default_value = "out", value_name = "DIR")]
+    pub out: PathBuf,
+}
+
+/// Arguments of `info`.
+#[derive(Debug, Args)]
+pub struct InfoArgs {
+    /// A splat file, a weight file, a photograph, or a scene.
+    pub file: PathBuf,
+}
+
+/// Arguments of `compare`.
+#[derive(Debug, Args)]
+pub struct CompareArgs {
+    /// Weights (.safetensors), with or without the `encoder.` prefix.
+    #[arg(long, value_name = "FILE")]
+    pub weights: PathBuf,
+    /// Reference: `in.*` tensors, and any of the stages and `out.*` tensors.
+    #[arg(long, value_name = "FILE")]
+    pub reference: PathBuf,
+}

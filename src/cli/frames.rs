@@ -1,0 +1,193 @@
+//! Which frames and cameras a command means.
+
+use anyhow::{Context, Result, bail, ensure};
+use glam::{Mat4, Quat, Vec3};
+use std::path::Path;
+use subsplat::camera::Camera;
+use subsplat::io::protocol::{Views, load_protocol};
+use subsplat::io::scene::Scene;
+
+/// Width and height of `N` or `WxH`, px.
+pub fn size(text: &str) -> Result<(usize, usize)> {
+    let side = |s: &str| -> Result<usize> {
+        let n: usize =
+            s.trim().parse().ok().filter(|n| (1..=32768).contains(n)).with_context(|| {
+                format!("picture size: expected N or WxH, 1 to 32768 pixels a side, got `{text}`")
+            })?;
+        Ok(n)
+    };
+    match text.split_once(['x', 'X', '×']) {
+        Some((w, h)) => Ok((side(w)?, side(h)?)),
+        None => side(text).map(|n| (n, n)),
+    }
+}
+
+/// Indices of the frames that `names` mean: an index, or a frame's name with or
+/// without folder and extension.
+pub fn indices(scene: &Scene, names: &[String], flag: &str) -> Result<Vec<usize>> {
+    names
+        .iter()
+        .map(|name| {
+            let stem = |s: &str| {
+                let file = Path::new(s).file_stem().unwrap_or_default();
+                file.to_string_lossy().into_owned()
+            };
+            if let Ok(i) = name.parse::<usize>()
+                && i < scene.frames.len()
+                && !name.starts_with("00")
+            {
+                return Ok(i);
+            }
+            let wanted = stem(name);
+            let found = scene
+                .frames
+                .iter()
+                .position(|f| &f.name == name || stem(&f.image.to_string_lossy()) == wanted);
+            found.with_context(|| {
+                format!(
+                    "{flag}: expected an index below {} or a frame's name, got `{name}`",
+                    scene.frames.len()
+                )
+            })
+        })
+        .collect()
+}
+
+/// The scene's protocol.json, if it has one: its tests.
+pub fn protocol(path: &Path, scene: &Scene) -> Result<Vec<Views>> {
+    let folder = if path.is_dir() { path } else { path.parent().unwrap_or(path) };
+    let file = folder.join("protocol.json");
+    if !file.is_file() {
+        return Ok(Vec::new());
+    }
+    let tests = load_protocol(&file)?.tests;
+    for test in &tests {
+        test.check(&file, scene.frames.len())?;
+    }
+    Ok(tests)
+}
+
+/// Cameras from the first to the last of `through`, evenly in time: positions along a
+/// Catmull-Rom curve, rotations by slerp, focal lengths in proportion.
+pub fn interpolate(through: &[Camera], frames: usize) -> Result<Vec<Camera>> {
+    ensure!(through.len() >= 2, "a path needs at least 2 cameras, got {}", through.len());
+    ensure!(frames >= 1, "--frames: expected at least 1, got 0");
+    let last = through.len() - 1;
+    let at = |i: usize| {
+        let t = i as f32 / (frames - 1).max(1) as f32 * last as f32;
+        let k = (t.floor() as usize).min(last - 1);
+        let f = t - k as f32;
+        let p = |i: isize| {
+            // Mirrored beyond the ends: the curve starts along the first chord.
+            let clamped = i.clamp(0, last as isize) as usize;
+            let mirror = 2.0 * through[clamped].position();
+            match i {
+                -1 => mirror - through[1].position(),
+                _ if i as usize > last => mirror - through[last - 1].position(),
+                _ => through[clamped].position(),
+            }
+        };
+        let k_signed = k as isize;
+        let position =
+            catmull_rom([p(k_signed - 1), p(k_signed), p(k_signed + 1), p(k_signed + 2)], f);
+        let turn = |i: usize| Quat::from_mat3(&through[i].rotation());
+        let rotation = turn(k).slerp(turn(k + 1), f);
+        let (a, b) = (through[k].intrinsics, through[k + 1].intrinsics);
+        let mut intrinsics = a;
+        let b = b.resized(a.width, a.height);
+        intrinsics.fx += f * (b.fx - a.fx);
+        intrinsics.fy += f * (b.fy - a.fy);
+        intrinsics.cx += f * (b.cx - a.cx);
+        intrinsics.cy += f * (b.cy - a.cy);
+        Camera {
+            intrinsics,
+            world_from_camera: Mat4::from_rotation_translation(rotation, position),
+        }
+    };
+    Ok((0..frames).map(at).collect())
+}
+
+fn catmull_rom(p: [Vec3; 4], t: f32) -> Vec3 {
+    let (a, b) = (2.0 * p[1], p[2] - p[0]);
+    let c = 2.0 * p[0] - 5.0 * p[1] + 4.0 * p[2] - p[3];
+    let d = 3.0 * (p[1] - p[2]) + p[3] - p[0];
+    0.5 * (a + t * (b + t * (c + t * d)))
+}
+
+/// `frames` cameras on a small circle around the middle of `cameras`, looking at what
+/// lies `depth` in front of it. Radius: half the cameras' spread, or 5 % of `depth`.
+pub fn orbit(cameras: &[Camera], depth: f32, frames: usize) -> Result<Vec<Camera>> {
+    ensure!(frames >= 1, "--frames: expected at least 1, got 0");
+    let Some(first) = cameras.first() else { bail!("an orbit needs at least 1 camera, got none") };
+    let count = cameras.len() as f32;
+    let middle = cameras.iter().map(Camera::position).sum::<Vec3>() / count;
+    let spread = cameras.iter().map(|c| c.position().distance(middle)).fold(0.0f32, f32::max);
+    let radius = if spread > 0.0 { 0.5 * spread } else { 0.05 * depth };
+    let turn = if cameras.len() == 1 {
+        Quat::from_mat3(&first.rotation())
+    } else {
+        let last = cameras[cameras.len() - 1].rotation();
+        Quat::from_mat3(&first.rotation()).slerp(Quat::from_mat3(&last), 0.5)
+    };
+    let aim = middle + turn * (Vec3::Z * depth);
+    let at = |i: usize| {
+        let angle = std::f32::consts::TAU * i as f32 / frames as f32;
+        let eye = middle + turn * (radius * Vec3::new(angle.cos(), angle.sin(), 0.0));
+        let forward = (aim - eye).normalize_or(turn * Vec3::Z);
+        let right = (turn * Vec3::Y).cross(forward).normalize_or(turn * Vec3::X);
+        let down = forward.cross(right);
+        let pose = Mat4::from_cols(
+            right.extend(0.0),
+            down.extend(0.0),
+            forward.extend(0.0),
+            eye.extend(1.0),
+        );
+        Camera { intrinsics: first.intrinsics, world_from_camera: pose }
+    };
+    Ok((0..frames).map(at).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use subsplat::camera::Intrinsics;
+
+    fn camera(x: f32, turn: f32) -> Camera {
+        let k = Intrinsics::from_fov_x(1.0, 64, 48);
+        let pose = Mat4::from_rotation_translation(
+            Quat::from_rotation_y(turn),
+            Vec3::new(x, 0.2 * x, 0.0),
+        );
+        Camera::new(k, pose).unwrap()
+    }
+
+    #[test]
+    fn a_path_goes_through_its_cameras() {
+        let through = [camera(0.0, 0.0), camera(1.0, 0.3), camera(3.0, 0.1)];
+        let path = interpolate(&through, 5).unwrap();
+        for (i, expected) in [(0, &through[0]), (2, &through[1]), (4, &through[2])] {
+            assert!(path[i].position().distance(expected.position()) < 1e-5);
+            assert!(Camera::new(path[i].intrinsics, path[i].world_from_camera).is_ok());
+        }
+        assert!(interpolate(&through[..1], 5).is_err());
+    }
+
+    #[test]
+    fn an_orbit_looks_at_its_aim() {
+        let cameras = [camera(-1.0, 0.0), camera(1.0, 0.0)];
+        for c in orbit(&cameras, 4.0, 8).unwrap() {
+            let px = c.project(Vec3::new(0.0, 0.0, 4.0)).unwrap();
+            assert!((px.x - 32.0).abs() < 1e-3 && (px.y - 24.0).abs() < 1e-3, "{px}");
+            assert!(Camera::new(c.intrinsics, c.world_from_camera).is_ok());
+        }
+    }
+
+    #[test]
+    fn sizes() {
+        assert_eq!(size("256").unwrap(), (256, 256));
+        assert_eq!(size("320x192").unwrap(), (320, 192));
+        for bad in ["", "0", "12x", "-3", "1e9", "99999999999999999999"] {
+            assert!(size(bad).unwrap_err().to_string().contains("picture size"), "{bad}");
+        }
+    }
+}

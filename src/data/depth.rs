@@ -1,0 +1,96 @@
+//! near and far of a reconstruction, in this order of trust: given by the user;
+//! RealEstate10K's 1 and 100 (the habit of pixelSplat and MVSplat, whose weights know
+//! no other); the scene's sparse points; the baseline of the context views.
+//!
+//! Depth candidates are uniform in 1/depth between the two, so a far that is too far
+//! costs little, and a near that is too near costs resolution everywhere.
+
+use super::pair::{points_in_view, quantile};
+use crate::io::scene::{Scene, Units};
+use crate::io::{Error, Result};
+
+/// A depth range with its origin.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DepthRange {
+    /// Nearest depth, world units of camera z.
+    pub near: f32,
+    /// Farthest depth.
+    pub far: f32,
+    /// Where the numbers come from, for the user.
+    pub reason: String,
+}
+
+/// Fewer sparse points than this in the context views say nothing.
+const POINTS_MIN: usize = 20;
+
+/// near and far for the context frames `context` of `scene`; `given` are the user's.
+///
+/// # Errors
+/// A given value that is not above 0, or near not below far; a frame that the scene
+/// does not have; nothing to derive them from (all eyes at one place).
+pub fn depth_range(
+    scene: &Scene,
+    context: &[usize],
+    given: (Option<f32>, Option<f32>),
+) -> Result<DepthRange> {
+    let derived = match given {
+        (Some(near), Some(far)) => DepthRange { near, far, reason: "as given".to_owned() },
+        _ => {
+            let d = derive(scene, context)?;
+            let (near, far) = (given.0.unwrap_or(d.near), given.1.unwrap_or(d.far));
+            let reason = match given {
+                (Some(_), _) => format!("near as given, far {}", d.reason),
+                (_, Some(_)) => format!("far as given, near {}", d.reason),
+                _ => d.reason,
+            };
+            DepthRange { near, far, reason }
+        }
+    };
+    let DepthRange { near, far, .. } = derived;
+    if !(near > 0.0 && far > near && far.is_finite()) {
+        let got = format!("near {near}, far {far} ({})", derived.reason);
+        return Err(Error::format(&scene.name, "0 < near < far", got));
+    }
+    Ok(derived)
+}
+
+fn derive(scene: &Scene, context: &[usize]) -> Result<DepthRange> {
+    if scene.units == Units::RealEstate10k {
+        let reason = "RealEstate10K's habit".to_owned();
+        return Ok(DepthRange { near: 1.0, far: 100.0, reason });
+    }
+    let mut cameras = Vec::with_capacity(context.len());
+    for &i in context {
+        let frame = scene.frames.get(i).ok_or_else(|| {
+            let expected = format!("frame indices below {}", scene.frames.len());
+            Error::format(&scene.name, expected, i.to_string())
+        })?;
+        cameras.push(&frame.camera);
+    }
+    if let Some(points) = &scene.points {
+        let mut depths: Vec<f32> = cameras.iter().flat_map(|c| points_in_view(c, points)).collect();
+        if depths.len() >= POINTS_MIN {
+            // A margin for what has no point: a third nearer than the 2 % quantile,
+            // twice as far as the 98 % one. Stray points lie outside the quantiles.
+            let near = quantile(&mut depths, 0.02) / 1.5;
+            let far = quantile(&mut depths, 0.98) * 2.0;
+            let reason = format!("from {} depths of sparse points", depths.len());
+            return Ok(DepthRange { near, far, reason });
+        }
+    }
+    let mut baseline = 0.0f32;
+    for (i, a) in cameras.iter().enumerate() {
+        for b in &cameras[i + 1..] {
+            baseline = baseline.max(a.position().distance(b.position()));
+        }
+    }
+    if !(baseline > 0.0 && baseline.is_finite()) {
+        return Err(Error::format(
+            &scene.name,
+            "context views at different places, or near and far given",
+            format!("a baseline of {baseline}"),
+        ));
+    }
+    let reason = format!("half and 30 times the baseline of {baseline:.4}");
+    Ok(DepthRange { near: 0.5 * baseline, far: 30.0 * baseline, reason })
+}

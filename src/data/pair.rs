@@ -1,0 +1,289 @@
+//! How two cameras lie to each other, and which two of many to reconstruct from.
+//!
+//! Feed-forward reconstruction wants two views that share 40 to 60 % of what they see
+//! (the advice that MVSplat's users are given) and yet lie apart, as depth comes from
+//! parallax alone.
+
+use crate::camera::Camera;
+use crate::io::scene::{Scene, Units};
+use glam::{Mat3, Vec2, Vec3};
+use rayon::prelude::*;
+
+/// Two cameras, compared.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ViewGeometry {
+    /// Distance of the eyes, world units.
+    pub baseline: f32,
+    /// Angle of the rotation from one to the other, degrees.
+    pub rotation_deg: f32,
+    /// Share of each picture that the other sees too, mean of both, in [0, 1], by
+    /// geometry alone: nothing is known of what hides what.
+    pub overlap: f32,
+}
+
+/// Depths tried, spread evenly in their logarithm.
+const DEPTHS: usize = 8;
+/// Pixels tried along each side.
+const GRID: usize = 12;
+
+/// Compares two cameras for a scene that lies between `near` and `far` (world units
+/// of camera z; taken as evenly spread in the logarithm).
+pub fn view_geometry(a: &Camera, b: &Camera, near: f32, far: f32) -> ViewGeometry {
+    let between = a.rotation().transpose() * b.rotation();
+    ViewGeometry {
+        baseline: a.position().distance(b.position()),
+        rotation_deg: angle(&between).to_degrees(),
+        overlap: 0.5 * (seen_by(a, b, near, far) + seen_by(b, a, near, far)),
+    }
+}
+
+/// Angle of a rotation matrix, radians. From its sine as well as its cosine: acos alone
+/// loses everything below a thousandth of a degree.
+fn angle(r: &Mat3) -> f32 {
+    let axis = Vec3::new(r.y_axis.z - r.z_axis.y, r.z_axis.x - r.x_axis.z, r.x_axis.y - r.y_axis.x);
+    let trace = r.x_axis.x + r.y_axis.y + r.z_axis.z;
+    axis.length().atan2(trace - 1.0)
+}
+
+/// Share of `a`'s picture that lies inside `b`'s.
+fn seen_by(a: &Camera, b: &Camera, near: f32, far: f32) -> f32 {
+    let (from, to) = (&a.intrinsics, &b.intrinsics);
+    let size = Vec2::new(from.width as f32, from.height as f32);
+    let mut seen = 0;
+    for d in 0..DEPTHS {
+        let depth = near * (far / near).powf((d as f32 + 0.5) / DEPTHS as f32);
+        for i in 0..GRID * GRID {
+            let at = Vec2::new((i % GRID) as f32 + 0.5, (i / GRID) as f32 + 0.5) / GRID as f32;
+            let point = a.world_from_camera.transform_point3(from.unproject(at * size) * depth);
+            let inside = b.project(point).is_some_and(|p| {
+                p.x >= 0.0 && p.y >= 0.0 && p.x <= to.width as f32 && p.y <= to.height as f32
+            });
+            seen += usize::from(inside);
+        }
+    }
+    seen as f32 / (DEPTHS * GRID * GRID) as f32
+}
+
+/// A chosen pair.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Pair {
+    /// Indices of the frames, the smaller first.
+    pub frames: [usize; 2],
+    /// The two cameras, compared.
+    pub geometry: ViewGeometry,
+    /// Depth range that the overlap was taken for, world units.
+    pub depths: [f32; 2],
+    /// One sentence for the user.
+    pub reason: String,
+}
+
+/// Overlap that is wanted.
+const OVERLAP: [f32; 2] = [0.4, 0.6];
+/// More frames than this are thinned evenly before all pairs are compared.
+const FRAMES_MAX: usize = 128;
+
+/// The pair of frames to reconstruct from: of all pairs, the one with the best balance
+/// of parallax, an overlap of 40 to 60 %, and little rotation (weights in the source).
+/// `None` if the scene has no two frames at different places.
+pub fn choose_pair(scene: &Scene) -> Option<Pair> {
+    let step = scene.frames.len().div_ceil(FRAMES_MAX).max(1);
+    let candidates: Vec<usize> = (0..scene.frames.len()).step_by(step).collect();
+    let (depth, why) = typical_depth(scene)?;
+    let depths = [0.5 * depth, 2.0 * depth];
+    let pairs: Vec<(usize, usize)> = candidates
+        .iter()
+        .enumerate()
+        .flat_map(|(n, &i)| candidates[n + 1..].iter().map(move |&j| (i, j)))
+        .collect();
+    let camera = |i: usize| &scene.frames[i].camera;
+    let scored: Vec<(f32, Pair)> = pairs
+        .into_par_iter()
+        .filter_map(|(i, j)| {
+            let geometry = view_geometry(camera(i), camera(j), depths[0], depths[1]);
+            let score = score(&geometry, depth)?;
+            let reason = format!(
+                "frames {i} and {j}: about {:.0} % overlap, {:.1} degrees apart, baseline {:.3} \
+                 (depth taken as {depth:.3}, {why})",
+                100.0 * geometry.overlap,
+                geometry.rotation_deg,
+                geometry.baseline,
+            );
+            Some((score, Pair { frames: [i, j], geometry, depths, reason }))
+        })
+        .collect();
+    // The first of equals, so that the choice does not hang on threads.
+    scored.into_iter().reduce(|a, b| if b.0 > a.0 { b } else { a }).map(|(_, pair)| pair)
+}
+
+/// Higher is better; `None` for no baseline at all. In units of parallax (baseline over
+/// depth):
+///
+/// * parallax counts up to 0.4 and against the pair beyond: matching gets harder, and
+///   the backbones were trained at 0.05 to 0.38;
+/// * an overlap below 40 % costs 5 per unit; one above 60 % only 0.5, as pairs around an
+///   object stay above it whatever their distance (geometry does not see the far side);
+/// * rotation costs little up to 25 degrees and much beyond: surfaces turn away.
+fn score(g: &ViewGeometry, depth: f32) -> Option<f32> {
+    let parallax = g.baseline / depth;
+    if parallax.is_nan() || parallax <= 1e-4 {
+        return None;
+    }
+    let too_little = (OVERLAP[0] - g.overlap).max(0.0);
+    let too_much = (g.overlap - OVERLAP[1]).max(0.0);
+    let too_far = (parallax - 0.4).max(0.0);
+    let turned = 0.002 * g.rotation_deg + 0.02 * (g.rotation_deg - 25.0).max(0.0);
+    Some(parallax.min(0.4) - too_far - 5.0 * too_little - 0.5 * too_much - turned)
+}
+
+/// A depth at which the scene may be thought to lie, and where it comes from.
+fn typical_depth(scene: &Scene) -> Option<(f32, &'static str)> {
+    let cameras: Vec<&Camera> = scene.frames.iter().map(|f| &f.camera).collect();
+    if let Some(points) = &scene.points {
+        let mut depths: Vec<f32> = Vec::new();
+        for camera in &cameras {
+            depths.extend(points_in_view(camera, points));
+        }
+        if depths.len() >= 20 {
+            return Some((quantile(&mut depths, 0.5), "the median of the sparse points"));
+        }
+    }
+    if scene.units == Units::RealEstate10k {
+        // Rooms are a few units deep where near is 1.
+        return Some((3.0, "RealEstate10K's scale"));
+    }
+    if let Some(depth) = look_at_depth(&cameras) {
+        return Some((depth, "where the optical axes meet"));
+    }
+    let eyes = || cameras.iter().map(|c| c.position());
+    let low = eyes().fold(Vec3::INFINITY, Vec3::min);
+    let high = eyes().fold(Vec3::NEG_INFINITY, Vec3::max);
+    let extent = low.distance(high);
+    (extent > 0.0 && extent.is_finite()).then_some((1.5 * extent, "1.5 times the cameras' extent"))
+}
+
+/// Distance of the eyes to the point closest to all optical axes, if those axes do turn
+/// around a point in front of the cameras.
+fn look_at_depth(cameras: &[&Camera]) -> Option<f32> {
+    // Least squares: Σ(I − d dᵀ)·x = Σ(I − d dᵀ)·p.
+    let (mut a, mut b) = (Mat3::ZERO, Vec3::ZERO);
+    for c in cameras {
+        let d = c.rotation().z_axis;
+        let across = Mat3::IDENTITY - Mat3::from_cols(d * d.x, d * d.y, d * d.z);
+        a += across;
+        b += across * c.position();
+    }
+    let n = cameras.len() as f32;
+    // The determinant of the mean projector is 0 for parallel axes; 0.01 is an average
+    // spread of some six degrees.
+    if (a * (1.0 / n)).determinant() < 0.01 {
+        return None;
+    }
+    let point = a.inverse() * b;
+    let mut depths: Vec<f32> = cameras.iter().map(|c| c.to_camera(point).z).collect();
+    let in_front = depths.iter().filter(|d| **d > 0.0).count();
+    let depth = quantile(&mut depths, 0.5);
+    (in_front * 10 >= cameras.len() * 9 && depth.is_finite()).then_some(depth)
+}
+
+/// Camera z of the points that project into the picture.
+pub(super) fn points_in_view(camera: &Camera, points: &[Vec3]) -> Vec<f32> {
+    let k = &camera.intrinsics;
+    let depth = |p: &Vec3| {
+        let p = camera.to_camera(*p);
+        let px = k.project(p);
+        let inside =
+            (0.0..=k.width as f32).contains(&px.x) && (0.0..=k.height as f32).contains(&px.y);
+        (p.z > 0.0 && inside).then_some(p.z)
+    };
+    points.iter().filter_map(depth).collect()
+}
+
+/// The `q` quantile of values that are not empty (nearest rank).
+pub(super) fn quantile(values: &mut [f32], q: f32) -> f32 {
+    values.sort_by(f32::total_cmp);
+    let rank = (q * (values.len().max(1) - 1) as f32).round() as usize;
+    values.get(rank).copied().unwrap_or(f32::NAN)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::Intrinsics;
+    use crate::io::scene::{Frame, SceneFormat};
+    use crate::io::undistort::Distortion;
+    use glam::{Mat4, Quat};
+
+    fn camera(angle: f32, position: Vec3) -> Camera {
+        let k = Intrinsics::from_fov_x(std::f32::consts::FRAC_PI_2, 200, 200);
+        let pose = Mat4::from_rotation_translation(Quat::from_rotation_y(angle), position);
+        Camera::new(k, pose).unwrap()
+    }
+
+    fn scene(cameras: Vec<Camera>) -> Scene {
+        let frame = |camera| Frame {
+            name: String::new(),
+            image: "".into(),
+            camera,
+            distortion: Distortion::None,
+            timestamp: None,
+            depth: None,
+            visible: Vec::new(),
+        };
+        Scene {
+            name: String::new(),
+            frames: cameras.into_iter().map(frame).collect(),
+            points: None,
+            source: SceneFormat::Pair,
+            units: Units::Unknown,
+            warnings: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn known_geometry() {
+        let a = camera(0.0, Vec3::ZERO);
+        let same = view_geometry(&a, &a, 1.0, 10.0);
+        assert_eq!((same.baseline, same.overlap), (0.0, 1.0));
+        assert!(same.rotation_deg < 1e-3);
+        // At depth 1 a picture of 90 degrees is 2 wide: a shift of 1 leaves a half.
+        let g = view_geometry(&a, &camera(0.0, Vec3::X), 0.999, 1.001);
+        assert!((g.overlap - 0.5).abs() < 1e-6, "{g:?}");
+        assert!((g.baseline - 1.0).abs() < 1e-6);
+        let g = view_geometry(&a, &camera(0.4, Vec3::ZERO), 1.0, 2.0);
+        assert!((g.rotation_deg - 0.4f32.to_degrees()).abs() < 1e-3, "{g:?}");
+        let back = view_geometry(&a, &camera(std::f32::consts::PI, Vec3::ZERO), 1.0, 2.0);
+        assert_eq!(back.overlap, 0.0);
+        assert!((back.rotation_deg - 180.0).abs() < 0.1);
+    }
+
+    #[test]
+    fn the_pair_of_an_orbit_is_apart_and_overlaps() {
+        // Eyes on a circle of radius 4 around the origin, 5 degrees apart, looking in.
+        let orbit = |i: usize| {
+            let a = (5.0 * i as f32).to_radians();
+            camera(a, Quat::from_rotation_y(a) * Vec3::new(0.0, 0.0, -4.0))
+        };
+        let pair = choose_pair(&scene((0..24).map(orbit).collect())).unwrap();
+        let g = pair.geometry;
+        assert!(g.overlap > 0.4, "{pair:?}");
+        assert!((15.0..30.0).contains(&g.rotation_deg), "{pair:?}");
+        assert!((1.0..2.0).contains(&g.baseline), "{pair:?}");
+        assert!(pair.reason.contains("optical axes meet"), "{pair:?}");
+    }
+
+    #[test]
+    fn the_pair_of_a_walk_overlaps_by_half() {
+        // Sideways in steps of 0.1 at RealEstate10K's scale: depth is taken as 3.
+        let mut walk = scene((0..40).map(|i| camera(0.0, Vec3::X * 0.1 * i as f32)).collect());
+        walk.units = Units::RealEstate10k;
+        let g = choose_pair(&walk).unwrap().geometry;
+        assert!((0.4..0.85).contains(&g.overlap) && (1.0..1.5).contains(&g.baseline), "{g:?}");
+    }
+
+    #[test]
+    fn turning_on_the_spot_gives_no_pair() {
+        let cameras = (0..5).map(|i| camera(0.1 * i as f32, Vec3::ONE)).collect();
+        assert!(choose_pair(&scene(cameras)).is_none());
+        assert!(choose_pair(&scene(vec![camera(0.0, Vec3::ZERO)])).is_none());
+    }
+}

@@ -1,0 +1,298 @@
+//! From a camera to a picture and its depth.
+//!
+//! Samples lie on a lattice of `samples`² cells per pixel, one jittered ray in each.
+//! Jitter belongs to the cell, and the tone curve is applied to each sample before the
+//! pixel's mean, so that a picture of W×H with 4n samples a side is the 4×4 box mean of
+//! the picture of 4W×4H with n: views of one scene at ×1, ×2 and ×4 agree exactly, as
+//! a photograph and its reduction do.
+
+use super::light::Look;
+use super::rng::{hash, normal, unit_pair};
+use super::shape::{Primitive, Ray};
+use super::{Form, Rng, Room};
+use crate::camera::Camera;
+use glam::{Mat3, Vec2, Vec3};
+use rayon::prelude::*;
+
+/// Side of the squares of pixels that share a list of visible solids, px.
+const TILE: usize = 16;
+
+/// A rendered picture.
+#[derive(Clone, Debug, PartialEq)]
+pub struct View {
+    /// Width, px.
+    pub width: usize,
+    /// Height, px.
+    pub height: usize,
+    /// `[H, W, 3]` display values in [0, 1].
+    pub rgb: Vec<f32>,
+    /// `[H, W]` camera z of what the ray through the pixel's centre meets.
+    pub depth: Vec<f32>,
+}
+
+/// How light becomes display values, and what a sensor adds. [`Grade::default`] is the
+/// clean one.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Grade {
+    /// Linear gain per channel: scene gain, exposure and white balance together.
+    pub gain: [f32; 3],
+    /// Exponent of the display curve.
+    pub gamma: f32,
+    /// σ of a Gaussian blur of the finished picture, px; 0 for none.
+    pub softness: f32,
+    /// σ of additive noise, display values; 0 for none.
+    pub noise: f32,
+    /// Seed of that noise.
+    pub seed: u64,
+}
+
+impl Default for Grade {
+    fn default() -> Self {
+        Self { gain: [1.0; 3], gamma: 2.2, softness: 0.0, noise: 0.0, seed: 0 }
+    }
+}
+
+impl Grade {
+    /// What all views of a scene share: gain and gamma.
+    pub(super) fn of_scene(rng: &mut Rng) -> Self {
+        let gain = rng.log_range(0.7, 1.6);
+        Self { gain: [gain; 3], gamma: rng.range(1.8, 2.5), ..Self::default() }
+    }
+
+    /// This grade as one view has it: exposure σ 5 %, white balance σ 1.2 %, video
+    /// softness in 30 % of scenes (`soft`), noise σ up to 0.02.
+    pub(super) fn of_view(mut self, soft: bool, rng: &mut Rng) -> Self {
+        let exposure = 1.0 + 0.05 * rng.normal();
+        self.gain = self.gain.map(|g| g * exposure * (1.0 + 0.012 * rng.normal()));
+        self.softness = if soft { rng.range(0.35, 0.9) } else { 0.0 };
+        self.noise = rng.range(0.0, 0.02);
+        self.seed = rng.bits();
+        self
+    }
+}
+
+/// How a picture is made.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Quality {
+    /// Samples along each side of a pixel; their number is the square. At least 1.
+    pub samples: usize,
+    /// Lamps with extent: soft shadows, grainy below some 16 samples a pixel.
+    pub soft_shadows: bool,
+    /// Highlights and mirrors.
+    pub view_dependent: bool,
+    /// Display curve and sensor.
+    pub grade: Grade,
+}
+
+impl Quality {
+    /// Nothing between the scene and the picture: soft shadows, the same exposure for
+    /// every view, no blur and no noise.
+    pub fn clean(samples: usize) -> Self {
+        Self { samples, soft_shadows: true, view_dependent: true, grade: Grade::default() }
+    }
+
+    /// Quick pictures for training: hard shadows, 4 samples a pixel.
+    pub fn training(grade: Grade) -> Self {
+        Self { samples: 2, soft_shadows: false, view_dependent: true, grade }
+    }
+}
+
+/// A solid that a tile may see.
+struct Candidate<'a> {
+    solid: &'a Primitive,
+    /// No hit lies nearer than this, camera z.
+    least: f32,
+}
+
+/// Rays of one camera.
+struct Eye {
+    origin: Vec3,
+    rotation: Mat3,
+    focal: Vec2,
+    middle: Vec2,
+}
+
+impl Eye {
+    fn new(camera: &Camera) -> Self {
+        let k = &camera.intrinsics;
+        Self {
+            origin: camera.position(),
+            rotation: camera.rotation(),
+            focal: Vec2::new(k.fx, k.fy),
+            middle: Vec2::new(k.cx, k.cy),
+        }
+    }
+
+    /// The ray through a pixel position; its parameter is camera z.
+    fn ray(&self, px: Vec2) -> Ray {
+        let direction = self.rotation * ((px - self.middle) / self.focal).extend(1.0);
+        Ray { origin: self.origin, direction }
+    }
+
+    /// The solids whose bounding spheres reach into the pixels from `low` to `high`,
+    /// nearest first.
+    fn candidates<'a>(&self, solids: &'a [Primitive], low: Vec2, high: Vec2) -> Vec<Candidate<'a>> {
+        let unit = |x: f32, y: f32| self.ray(Vec2::new(x, y)).direction.normalize_or(Vec3::Z);
+        let corners =
+            [unit(low.x, low.y), unit(high.x, low.y), unit(low.x, high.y), unit(high.x, high.y)];
+        let axis = corners.iter().sum::<Vec3>().normalize_or(Vec3::Z);
+        // The widest of the corners bounds the tile: its outline is convex around the axis.
+        let angle = |v: Vec3| axis.dot(v).clamp(-1.0, 1.0).acos();
+        let half = corners.iter().map(|c| angle(*c)).fold(0.0, f32::max);
+        let forward = self.rotation.z_axis;
+        let visible = solids.iter().filter_map(|solid| {
+            let offset = solid.centre - self.origin;
+            let distance = offset.length();
+            if solid.form == Form::Shell || distance <= solid.radius {
+                return Some(Candidate { solid, least: 0.0 });
+            }
+            let reach = half + (solid.radius / distance).asin() + 1e-4;
+            let seen = angle(offset / distance) <= reach;
+            let least = (forward.dot(offset) - solid.radius).max(0.0);
+            seen.then_some(Candidate { solid, least })
+        });
+        let mut list: Vec<Candidate> = visible.collect();
+        list.sort_by(|a, b| a.least.total_cmp(&b.least));
+        list
+    }
+}
+
+fn first<'a>(list: &[Candidate<'a>], ray: &Ray) -> Option<(&'a Primitive, f32)> {
+    let mut best: Option<(&Primitive, f32)> = None;
+    let mut limit = f32::INFINITY;
+    for candidate in list {
+        if candidate.least > limit {
+            break;
+        }
+        if let Some(t) = candidate.solid.intersect(ray, limit) {
+            (best, limit) = (Some((candidate.solid, t)), t);
+        }
+    }
+    best
+}
+
+/// Linear light to display values: a shoulder that reaches white at four times the
+/// value that would clip, then the gamma.
+fn display(linear: Vec3, grade: &Grade) -> Vec3 {
+    const WHITE: f32 = 4.0;
+    let x = (linear * Vec3::from(grade.gain)).max(Vec3::ZERO);
+    let shouldered = x * (Vec3::ONE + x / (WHITE * WHITE)) / (Vec3::ONE + x);
+    shouldered.min(Vec3::ONE).powf(1.0 / grade.gamma)
+}
+
+impl Room {
+    /// The picture and the depth that `camera` sees. The camera is one that
+    /// [`Camera::new`] accepts; from inside a solid the solid itself is not seen.
+    pub fn render(&self, camera: &Camera, quality: &Quality) -> View {
+        let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
+        let mut rgb = vec![0.0; width * height * 3];
+        let mut depth = vec![0.0; width * height];
+        let eye = Eye::new(camera);
+        rgb.par_chunks_mut((width * 3 * TILE).max(1))
+            .zip(depth.par_chunks_mut((width * TILE).max(1)))
+            .enumerate()
+            .for_each(|(band, (rgb, depth))| {
+                for left in (0..width).step_by(TILE) {
+                    self.render_tile(&eye, quality, [left, band * TILE], width, rgb, depth);
+                }
+            });
+        if quality.grade.softness > 0.0 {
+            rgb = blurred(&rgb, width, quality.grade.softness);
+        }
+        add_noise(&mut rgb, &quality.grade);
+        View { width, height, rgb, depth }
+    }
+
+    /// One tile of a band of `rgb` and `depth` whose first row is `top`.
+    fn render_tile(
+        &self,
+        eye: &Eye,
+        quality: &Quality,
+        [left, top]: [usize; 2],
+        width: usize,
+        rgb: &mut [f32],
+        depth: &mut [f32],
+    ) {
+        let (right, rows) = ((left + TILE).min(width), depth.len() / width);
+        let low = Vec2::new(left as f32, top as f32);
+        let high = Vec2::new(right as f32, (top + rows) as f32);
+        let list = eye.candidates(&self.primitives, low, high);
+        for row in 0..rows {
+            for x in left..right {
+                let y = top + row;
+                let centre = eye.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5));
+                let i = row * width + x;
+                depth[i] = first(&list, &centre).map_or(0.0, |hit| hit.1);
+                let colour = self.pixel(eye, quality, &list, [x, y]);
+                rgb[i * 3..i * 3 + 3].copy_from_slice(&colour.to_array());
+            }
+        }
+    }
+
+    /// Mean display value over the samples of one pixel.
+    fn pixel(&self, eye: &Eye, quality: &Quality, list: &[Candidate], [x, y]: [usize; 2]) -> Vec3 {
+        let n = quality.samples.max(1);
+        let cell = 1.0 / n as f32;
+        let mut look = Look {
+            spread: cell / (eye.focal.x * eye.focal.y).sqrt(),
+            view_dependent: quality.view_dependent,
+            lamp_shift: Vec3::ZERO,
+        };
+        let mut sum = Vec3::ZERO;
+        for j in 0..n {
+            for i in 0..n {
+                let (cx, cy) = (x * n + i, y * n + j);
+                let bits = hash(0, cx as u64, cy as u64);
+                let (u, v) = unit_pair(bits);
+                let ray = eye.ray(Vec2::new(cx as f32 + u, cy as f32 + v) * cell);
+                let Some((solid, t)) = first(list, &ray) else { continue };
+                if quality.soft_shadows {
+                    let (a, b) = unit_pair(hash(1, cx as u64, cy as u64));
+                    look.lamp_shift = ball(a, b);
+                }
+                let light = self.radiance(solid, &ray, t, &look) * self.exposure;
+                sum += display(light, &quality.grade);
+            }
+        }
+        sum * (cell * cell)
+    }
+}
+
+/// A point on the unit sphere from two numbers in [0, 1).
+fn ball(a: f32, b: f32) -> Vec3 {
+    let y = 2.0 * a - 1.0;
+    let r = (1.0 - y * y).max(0.0).sqrt();
+    let (sin, cos) = (std::f32::consts::TAU * b).sin_cos();
+    Vec3::new(r * cos, y, r * sin)
+}
+
+/// Gaussian blur, 3σ wide, the border repeated.
+fn blurred(rgb: &[f32], width: usize, sigma: f32) -> Vec<f32> {
+    let radius = (3.0 * sigma).ceil() as usize;
+    let tap = |i: usize| (-0.5 * ((i as f32 - radius as f32) / sigma).powi(2)).exp();
+    let mut taps: Vec<f32> = (0..=2 * radius).map(tap).collect();
+    let sum: f32 = taps.iter().sum();
+    taps.iter_mut().for_each(|t| *t /= sum);
+    let height = rgb.len() / (3 * width.max(1));
+    // Position `at` moved by tap k, within 0..n.
+    let clamped = |at: usize, k: usize, n: usize| (at + k).saturating_sub(radius).min(n - 1);
+    let pass =
+        |source: &[f32], index: &(dyn Fn(usize, usize, usize) -> usize + Sync)| -> Vec<f32> {
+            let value = |i: usize| {
+                let (pixel, c) = (i / 3, i % 3);
+                let (x, y) = (pixel % width, pixel / width);
+                taps.iter().enumerate().map(|(k, t)| t * source[index(x, y, k) * 3 + c]).sum()
+            };
+            (0..source.len()).into_par_iter().map(value).collect()
+        };
+    let across = pass(rgb, &|x, y, k| y * width + clamped(x, k, width));
+    pass(&across, &|x, y, k| clamped(y, k, height) * width + x)
+}
+
+fn add_noise(rgb: &mut [f32], grade: &Grade) {
+    if grade.noise > 0.0 {
+        rgb.par_iter_mut().enumerate().for_each(|(i, v)| {
+            *v = (*v + grade.noise * normal(hash(grade.seed, i as u64, 2))).clamp(0.0, 1.0);
+        });
+    }
+}

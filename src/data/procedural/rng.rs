@@ -1,0 +1,139 @@
+//! Random numbers that are the same on every platform and for any number of
+//! threads: SplitMix64 (Steele, Lea and Flood, OOPSLA 2014) as a counter. A stream
+//! is a 64-bit state; [`Rng::fork`] opens an independent one, so that drawing one
+//! more number here moves nothing there.
+
+/// Weyl increment of SplitMix64: 2⁶⁴ over the golden ratio, odd.
+const GOLDEN: u64 = 0x9E37_79B9_7F4A_7C15;
+
+/// SplitMix64's finaliser: every input bit reaches every output bit.
+fn mix(mut z: u64) -> u64 {
+    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+    z ^ (z >> 31)
+}
+
+/// 64 random bits that belong to a place, for jitter and noise that must not depend
+/// on the order of drawing.
+pub(super) fn hash(seed: u64, x: u64, y: u64) -> u64 {
+    let row = mix(seed.wrapping_add(GOLDEN.wrapping_mul(y.wrapping_add(1))));
+    mix(row.wrapping_add(GOLDEN.wrapping_mul(x.wrapping_add(1))))
+}
+
+/// The upper 24 of `bits` as a number in [0, 1): exact in f32.
+pub(super) fn unit(bits: u64) -> f32 {
+    (bits >> 40) as f32 * (1.0 / (1 << 24) as f32)
+}
+
+/// Two numbers in [0, 1) from one hash.
+pub(super) fn unit_pair(bits: u64) -> (f32, f32) {
+    (unit(bits), unit(bits << 24))
+}
+
+/// A nearly normal number, mean 0, variance 1, from the four 16-bit quarters of
+/// `bits` (Irwin-Hall of order 4: tails end at ±3.46): no logarithm, so the same
+/// digits everywhere.
+pub(super) fn normal(bits: u64) -> f32 {
+    let sum = (0..4).map(|i| (bits >> (16 * i)) & 0xFFFF).sum::<u64>();
+    // Four quarters of mean 32767.5 and variance (2³² − 1)/12.
+    (sum as f32 - 131_070.0) * (1.732_050_8 / 65_536.0)
+}
+
+/// A stream of random numbers.
+#[derive(Clone, Debug)]
+pub(super) struct Rng {
+    state: u64,
+}
+
+impl Rng {
+    pub(super) fn new(seed: u64) -> Self {
+        Self { state: mix(seed ^ 0x5355_4253_504C_4154) }
+    }
+
+    /// An independent stream for `key`; this one does not move.
+    pub(super) fn fork(&self, key: u64) -> Self {
+        Self { state: hash(self.state, key, 0x0F0F) }
+    }
+
+    pub(super) fn bits(&mut self) -> u64 {
+        self.state = self.state.wrapping_add(GOLDEN);
+        mix(self.state)
+    }
+
+    /// In [0, 1).
+    pub(super) fn unit(&mut self) -> f32 {
+        unit(self.bits())
+    }
+
+    /// In [low, high).
+    pub(super) fn range(&mut self, low: f32, high: f32) -> f32 {
+        low + (high - low) * self.unit()
+    }
+
+    /// In [low, high), uniform in the logarithm. Both positive.
+    pub(super) fn log_range(&mut self, low: f32, high: f32) -> f32 {
+        low * (high / low).powf(self.unit())
+    }
+
+    /// low, low + 1, …, high, each alike.
+    pub(super) fn count(&mut self, low: usize, high: usize) -> usize {
+        low + (self.bits() >> 32) as usize % (high - low + 1)
+    }
+
+    /// True with probability `p`.
+    pub(super) fn chance(&mut self, p: f32) -> bool {
+        self.unit() < p
+    }
+
+    /// Mean 0, variance 1, within ±3.46.
+    pub(super) fn normal(&mut self) -> f32 {
+        normal(self.bits())
+    }
+
+    /// −1 or 1.
+    pub(super) fn sign(&mut self) -> f32 {
+        if self.chance(0.5) { 1.0 } else { -1.0 }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_stream_is_splitmix64() {
+        // First outputs for state 0, as Vigna's reference C program prints them.
+        let mut rng = Rng { state: 0 };
+        assert_eq!(rng.bits(), 0xE220_A839_7B1D_CDAF);
+        assert_eq!(rng.bits(), 0x6E78_9E6A_A1B9_65F4);
+    }
+
+    #[test]
+    fn moments() {
+        let mut rng = Rng::new(1);
+        let n = 100_000;
+        let (mut unit, mut mean, mut square) = (0.0f64, 0.0f64, 0.0f64);
+        let mut counts = [0; 3];
+        for _ in 0..n {
+            unit += f64::from(rng.unit());
+            let v = f64::from(rng.normal());
+            mean += v;
+            square += v * v;
+            counts[rng.count(2, 4) - 2] += 1;
+        }
+        let n = f64::from(n);
+        assert!((unit / n - 0.5).abs() < 0.005);
+        assert!((mean / n).abs() < 0.015 && (square / n - 1.0).abs() < 0.02);
+        assert!(counts.iter().all(|c| (f64::from(*c) / n - 1.0 / 3.0).abs() < 0.01));
+    }
+
+    #[test]
+    fn forks_differ_and_leave_the_parent_alone() {
+        let mut a = Rng::new(7);
+        let mut b = a.clone();
+        let (mut c, mut d) = (a.fork(0), a.fork(1));
+        assert_ne!(c.bits(), d.bits());
+        assert_eq!(a.bits(), b.bits());
+        assert_eq!(unit_pair(u64::MAX), (1.0 - f32::EPSILON / 2.0, 1.0 - f32::EPSILON / 2.0));
+    }
+}

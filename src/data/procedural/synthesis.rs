@@ -1,0 +1,326 @@
+//! Periodic fields with the statistics of natural pictures: scale-free noise, dead
+//! leaves, stripes, strokes, tiles, grain and level sets.
+//!
+//! Spectra: the amplitude of pictures falls about as 1/f (Field 1987; Ruderman 1994),
+//! and opaque shapes whose radii follow an inverse cube law give the same slope with
+//! real edges (dead leaves: Lee, Mumford and Huang 2001). Everything wraps around.
+
+use super::rng::Rng;
+use super::texture::Kind;
+
+/// Two square fields, row-major, values meant for [0, 1].
+#[derive(Clone)]
+pub(super) struct Fields {
+    /// Side, px; a power of two.
+    pub(super) size: usize,
+    pub(super) a: Vec<f32>,
+    pub(super) b: Vec<f32>,
+}
+
+impl Fields {
+    pub(super) fn filled(size: usize, a: f32, b: f32) -> Self {
+        Self { size, a: vec![a; size * size], b: vec![b; size * size] }
+    }
+
+    fn from_fn(size: usize, f: impl Fn(usize, usize) -> [f32; 2]) -> Self {
+        let mut fields = Self::filled(size, 0.0, 0.0);
+        for y in 0..size {
+            for x in 0..size {
+                let [a, b] = f(x, y);
+                fields.a[y * size + x] = a;
+                fields.b[y * size + x] = b;
+            }
+        }
+        fields
+    }
+
+    /// Blends a shape over what is there, wrapped around. `shape` gets the offset of
+    /// a texel centre from (`cx`, `cy`), px, at most `reach` away, and gives coverage
+    /// and value.
+    fn stamp(&mut self, [cx, cy]: [f32; 2], reach: f32, shape: impl Fn(f32, f32) -> Dab) {
+        let n = self.size as i64;
+        let rows = (cy - reach).floor() as i64..=(cy + reach).ceil() as i64;
+        for y in rows {
+            let row = (y.rem_euclid(n) * n) as usize;
+            for x in (cx - reach).floor() as i64..=(cx + reach).ceil() as i64 {
+                let dab = shape(x as f32 + 0.5 - cx, y as f32 + 0.5 - cy);
+                if dab.cover > 0.0 {
+                    let i = row + x.rem_euclid(n) as usize;
+                    self.a[i] += dab.cover * (dab.value[0] - self.a[i]);
+                    self.b[i] += dab.cover * (dab.value[1] - self.b[i]);
+                }
+            }
+        }
+    }
+}
+
+/// What a stamped shape does to one texel.
+struct Dab {
+    cover: f32,
+    value: [f32; 2],
+}
+
+/// The fields of one texture of `kind`.
+pub(super) fn fields(kind: Kind, size: usize, rng: &mut Rng) -> Fields {
+    match kind {
+        Kind::Noise => noise(size, rng),
+        Kind::Leaves => leaves(size, rng),
+        Kind::Stripes => stripes(size, rng),
+        Kind::Text => text(size, rng),
+        Kind::Tiles => tiles(size, rng),
+        Kind::Grain if rng.chance(0.5) => planks(size, rng),
+        Kind::Grain => weave(size, rng),
+        Kind::Blobs => blobs(size, rng),
+    }
+}
+
+/// Twice the size along the inner axis, periodic; two passes of it and further octaves
+/// interpolate by a quadratic B-spline.
+fn doubled(row: &[f32], out: &mut Vec<f32>) {
+    let n = row.len();
+    for i in 0..n {
+        let (before, after) = (row[(i + n - 1) % n], row[(i + 1) % n]);
+        out.push(0.75 * row[i] + 0.25 * before);
+        out.push(0.75 * row[i] + 0.25 * after);
+    }
+}
+
+fn doubled_rows(field: &[f32], width: usize) -> Vec<f32> {
+    let height = field.len() / width;
+    let mut out = Vec::with_capacity(2 * field.len());
+    for y in 0..height {
+        let row = &field[y * width..][..width];
+        for side in [height - 1, 1] {
+            let other = &field[(y + side) % height * width..][..width];
+            out.extend(row.iter().zip(other).map(|(r, o)| 0.75 * r + 0.25 * o));
+        }
+    }
+    out
+}
+
+/// Noise of mean 0 and variance 1 whose amplitude spectrum falls as 1/f^`exponent`:
+/// white noise on every octave's lattice, each with 2^(1 − exponent) times the
+/// amplitude of the coarser one (an octave of twice the frequency has four times the
+/// area to spread its power over). `stretch` octaves longer along x than along y.
+pub(super) fn scale_free(size: usize, exponent: f32, stretch: usize, rng: &mut Rng) -> Vec<f32> {
+    let (mut width, mut height) = (2, (2 << stretch).min(size));
+    let mut field: Vec<f32> = (0..width * height).map(|_| rng.normal()).collect();
+    let mut amplitude = 1.0;
+    while width < size || height < size {
+        let fresh = height < size;
+        if height < size {
+            field = doubled_rows(&field, width);
+            height *= 2;
+        }
+        if width < size {
+            let mut out = Vec::with_capacity(2 * field.len());
+            field.chunks(width).for_each(|row| doubled(row, &mut out));
+            field = out;
+            width *= 2;
+        }
+        if fresh {
+            amplitude *= (1.0 - exponent).exp2();
+            field.iter_mut().for_each(|v| *v += amplitude * rng.normal());
+        }
+    }
+    let n = field.len() as f64;
+    let mean = field.iter().map(|v| f64::from(*v)).sum::<f64>() / n;
+    let square = field.iter().map(|v| (f64::from(*v) - mean).powi(2)).sum::<f64>() / n;
+    let scale = 1.0 / square.sqrt().max(1e-9);
+    field.iter().map(|v| ((f64::from(*v) - mean) * scale) as f32).collect()
+}
+
+/// Standard deviation of noise around ½ in a field: 2.8σ fit before the clip.
+const SIGMA: f32 = 0.18;
+
+fn noise(size: usize, rng: &mut Rng) -> Fields {
+    let exponent = rng.range(0.8, 1.7);
+    let field = |rng: &mut Rng| -> Vec<f32> {
+        scale_free(size, exponent, 0, rng).iter().map(|v| 0.5 + SIGMA * v).collect()
+    };
+    Fields { size, a: field(rng), b: field(rng) }
+}
+
+/// Radius, px, with density ∝ r⁻³ from `low` to `high`.
+fn leaf_radius(low: f32, high: f32, rng: &mut Rng) -> f32 {
+    let (a, b) = (1.0 / (low * low), 1.0 / (high * high));
+    1.0 / (a + (b - a) * rng.unit()).sqrt()
+}
+
+fn leaves(size: usize, rng: &mut Rng) -> Fields {
+    let mut fields = Fields::filled(size, rng.unit(), rng.unit());
+    let grain = scale_free(size, 1.1, 0, rng);
+    let grain_amplitude = rng.range(0.0, 0.08);
+    let boxes = rng.unit();
+    let (low, high) = (rng.log_range(1.5, 5.0), size as f32 * rng.range(0.08, 0.25));
+    // Shapes of three times the area in all leave 5 % of the ground bare.
+    let mut area = 3.0 * (size * size) as f32;
+    while area > 0.0 {
+        let r = leaf_radius(low, high, rng);
+        let half = [r, r * rng.range(0.35, 1.0)];
+        let (sin, cos) = rng.range(0.0, std::f32::consts::PI).sin_cos();
+        let (value, slope) = ([rng.unit(), rng.unit()], 0.12 * rng.normal() / r);
+        let rectangle = rng.chance(boxes);
+        let centre = [rng.unit() * size as f32, rng.unit() * size as f32];
+        fields.stamp(centre, r * if rectangle { 1.5 } else { 1.1 } + 1.0, |dx, dy| {
+            let (x, y) = (cos * dx + sin * dy, cos * dy - sin * dx);
+            let distance = if rectangle {
+                (x.abs() - half[0]).max(y.abs() - half[1])
+            } else {
+                ((x / half[0]).hypot(y / half[1]) - 1.0) * half[1]
+            };
+            Dab { cover: (0.5 - distance).clamp(0.0, 1.0), value: [value[0] + slope * x, value[1]] }
+        });
+        area -= std::f32::consts::PI * half[0] * half[1];
+    }
+    for (a, g) in fields.a.iter_mut().zip(&grain) {
+        *a += grain_amplitude * g;
+    }
+    fields
+}
+
+fn stripes(size: usize, rng: &mut Rng) -> Fields {
+    // Widths at four times the resolution, then averaged: soft edges of one texel.
+    const FINE: usize = 4;
+    let colours: Vec<[f32; 2]> = (0..rng.count(2, 5)).map(|_| [rng.unit(), rng.unit()]).collect();
+    let mean_width = rng.log_range(0.012, 0.12) * (size * FINE) as f32;
+    let uneven = rng.range(0.0, 0.8);
+    let mut profile: Vec<[f32; 2]> = Vec::with_capacity(size * FINE);
+    let mut stripe = 0;
+    while profile.len() < size * FINE {
+        let width = (mean_width * (1.0 + uneven * rng.range(-1.0, 1.0))).max(1.0) as usize;
+        let colour = colours[stripe % colours.len()];
+        profile.extend(std::iter::repeat_n(colour, width));
+        stripe += 1;
+    }
+    let column: Vec<[f32; 2]> = profile[..size * FINE]
+        .chunks(FINE)
+        .map(|c| [0, 1].map(|k| c.iter().map(|v| v[k]).sum::<f32>() / FINE as f32))
+        .collect();
+    let wear = scale_free(size, 1.2, 0, rng);
+    let amount = rng.range(0.0, 0.05);
+    Fields::from_fn(size, |x, y| [column[x][0] + amount * wear[y * size + x], column[x][1]])
+}
+
+fn text(size: usize, rng: &mut Rng) -> Fields {
+    let mut fields = Fields::filled(size, 0.0, 0.0);
+    let side = size as f32;
+    let mut y = 0.0;
+    while y < side {
+        let line = rng.log_range(0.035, 0.14) * side;
+        let lines = rng.count(1, if line < 0.06 * side { 5 } else { 2 });
+        let tint = rng.unit();
+        for _ in 0..lines {
+            let mut x = rng.range(0.0, 0.1) * side;
+            let end = side * rng.range(0.6, 0.98);
+            while x < end && y + line < side {
+                if rng.chance(0.82) {
+                    glyph(&mut fields, [x, y], line, tint, rng);
+                }
+                x += 0.62 * line;
+            }
+            y += 1.25 * line;
+        }
+        y += 0.6 * line;
+    }
+    let paper = scale_free(size, 1.2, 0, rng);
+    for (a, p) in fields.a.iter_mut().zip(&paper) {
+        *a += 0.015 * p;
+    }
+    fields
+}
+
+/// Two to four strokes between the points of a 3×4 grid in a cell of the line's height.
+fn glyph(fields: &mut Fields, [left, top]: [f32; 2], line: f32, tint: f32, rng: &mut Rng) {
+    let thickness = line * rng.range(0.07, 0.12);
+    let point = |rng: &mut Rng| {
+        let (column, row) = (rng.count(0, 2) as f32, rng.count(0, 3) as f32);
+        [left + line * (0.08 + 0.2 * column), top + line * (0.1 + 0.24 * row)]
+    };
+    let mut from = point(rng);
+    for _ in 0..rng.count(2, 4) {
+        let to = point(rng);
+        let (ex, ey) = (0.5 * (to[0] - from[0]), 0.5 * (to[1] - from[1]));
+        let square = (ex * ex + ey * ey).max(1e-6);
+        let centre = [0.5 * (from[0] + to[0]), 0.5 * (from[1] + to[1])];
+        fields.stamp(centre, square.sqrt() + thickness + 1.0, |dx, dy| {
+            let t = ((dx * ex + dy * ey) / square).clamp(-1.0, 1.0);
+            let distance = (dx - t * ex).hypot(dy - t * ey) - 0.5 * thickness;
+            Dab { cover: (0.5 - distance).clamp(0.0, 1.0), value: [1.0, tint] }
+        });
+        from = to;
+    }
+}
+
+fn tiles(size: usize, rng: &mut Rng) -> Fields {
+    let bond = rng.chance(0.5);
+    let rows = [2, 4, 6, 8, 10][rng.count(0, 4)];
+    let columns = if bond { (rows / 2).max(1) } else { rows };
+    let (width, height) = (size as f32 / columns as f32, size as f32 / rows as f32);
+    let grout = rng.log_range(0.02, 0.08) * height;
+    let (grain, coarse) = (scale_free(size, 1.1, 0, rng), scale_free(size, 1.5, 0, rng));
+    let (amount, spread, joint) = (rng.range(0.01, 0.12), rng.range(0.02, 0.3), rng.unit());
+    let values: Vec<[f32; 2]> = (0..rows * columns).map(|_| [rng.normal(), rng.normal()]).collect();
+    Fields::from_fn(size, |x, y| {
+        let row = y * rows / size;
+        let shift = if bond && row % 2 == 1 { 0.5 * width } else { 0.0 };
+        let along = (x as f32 + 0.5 + shift).rem_euclid(size as f32);
+        let column = ((along / width) as usize).min(columns - 1);
+        let across = y as f32 + 0.5 - row as f32 * height;
+        let inner = along - column as f32 * width;
+        let edge = inner.min(width - inner).min(across).min(height - across);
+        let tile = (edge - 0.5 * grout + 0.5).clamp(0.0, 1.0);
+        let i = y * size + x;
+        let [a, b] = values[row * columns + column];
+        let surface = 0.6 + 0.3 * spread * a + amount * grain[i] + 0.04 * coarse[i];
+        [joint + tile * (surface - joint), tile * (0.5 + 0.3 * spread * b)]
+    })
+}
+
+fn planks(size: usize, rng: &mut Rng) -> Fields {
+    let rows = [1, 2, 4, 8][rng.count(0, 3)];
+    let (fine, rings) =
+        (scale_free(size, rng.range(0.8, 1.2), 5, rng), scale_free(size, 1.6, 3, rng));
+    let (amount, frequency) = (rng.range(0.06, 0.14), rng.range(1.0, 4.0));
+    let boards: Vec<[f32; 3]> =
+        (0..rows).map(|_| [rng.normal(), rng.normal(), rng.unit()]).collect();
+    let height = size / rows;
+    Fields::from_fn(size, |x, y| {
+        let [light, tint, shift] = boards[y / height];
+        let shifted = (x + (shift * size as f32) as usize) % size;
+        let i = y * size + shifted;
+        let ring = (frequency * rings[i] * std::f32::consts::PI).sin();
+        let gap = if rows > 1 && y % height == 0 { 0.35 } else { 0.0 };
+        let a = 0.55 + amount * fine[i] + 0.08 * ring + 0.07 * light - gap;
+        [a, 0.5 + 0.15 * tint + 0.08 * rings[i]]
+    })
+}
+
+fn weave(size: usize, rng: &mut Rng) -> Fields {
+    // Whole threads around the period; at least eight texels each.
+    let threads = rng.count(size / 64, size / 8) as f32;
+    let (along, across) = (scale_free(size, 1.0, 4, rng), scale_free(size, 1.0, 4, rng));
+    let soft = scale_free(size, 1.5, 0, rng);
+    let (relief, amount) = (rng.range(0.05, 0.2), rng.range(0.05, 0.12));
+    let k = std::f32::consts::TAU * threads / size as f32;
+    Fields::from_fn(size, |x, y| {
+        let over = (k * x as f32).sin() * (k * y as f32).sin();
+        let weft = 0.5 + 0.5 * over;
+        let thread = weft * along[y * size + x] + (1.0 - weft) * across[x * size + y];
+        [0.5 + relief * over + amount * thread, 0.5 + SIGMA * soft[y * size + x]]
+    })
+}
+
+fn blobs(size: usize, rng: &mut Rng) -> Fields {
+    let exponent = rng.range(1.0, 1.8);
+    let (noise, other) = (scale_free(size, exponent, 0, rng), scale_free(size, exponent, 0, rng));
+    let (t0, t1, softness) = (0.5 * rng.normal(), 0.7 * rng.normal(), rng.log_range(0.03, 0.3));
+    let step = |v: f32| {
+        let t = (v / softness + 0.5).clamp(0.0, 1.0);
+        t * t * (3.0 - 2.0 * t)
+    };
+    Fields::from_fn(size, |x, y| {
+        let i = y * size + x;
+        [step(noise[i] - t0), step(other[i] - t1)]
+    })
+}

@@ -1,0 +1,226 @@
+//! Periodic textures with mipmaps, and the bank of 144 that every room draws from.
+//!
+//! A texture is two fields in [0, 1], never a colour: a material maps them to colour
+//! linearly, which commutes with the box filter of the mip levels, so one texture
+//! serves any palette without aliasing. `synthesis.rs` makes the fields.
+
+use super::rng::Rng;
+use super::synthesis::{self, Fields};
+use std::sync::{Arc, LazyLock, OnceLock};
+
+/// Number of textures in a bank, in the proportions of [`Kind::of`].
+pub(super) const BANK: usize = 144;
+
+/// What a texture shows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Kind {
+    /// Isotropic noise with amplitude spectrum 1/f^0.8 to 1/f^1.7.
+    Noise,
+    /// Opaque shapes that occlude one another, radii by an inverse cube law.
+    Leaves,
+    /// Parallel bands.
+    Stripes,
+    /// Lines of strokes that look like writing.
+    Text,
+    /// Tiles and bricks with grout.
+    Tiles,
+    /// Wood and cloth: noise far longer along than across.
+    Grain,
+    /// Level sets of noise.
+    Blobs,
+}
+
+/// Kinds and how many of the bank are of each: 22, 26, 8, 8, 10, 14, 12 %.
+const SHARES: [(Kind, usize); 7] = [
+    (Kind::Noise, 32),
+    (Kind::Leaves, 37),
+    (Kind::Stripes, 12),
+    (Kind::Text, 12),
+    (Kind::Tiles, 14),
+    (Kind::Grain, 20),
+    (Kind::Blobs, 17),
+];
+
+impl Kind {
+    /// The kind of the bank's texture `index`.
+    pub(super) fn of(index: usize) -> Self {
+        let mut first = 0;
+        for (kind, count) in SHARES {
+            if index < first + count {
+                return kind;
+            }
+            first += count;
+        }
+        Self::Noise
+    }
+
+    /// The bank's indices of this kind.
+    pub(super) fn indices(self) -> std::ops::Range<usize> {
+        let mut first = 0;
+        for (kind, count) in SHARES {
+            if kind == self {
+                return first..first + count;
+            }
+            first += count;
+        }
+        0..0
+    }
+}
+
+/// A square periodic texture of two fields and its mip levels, down to 1×1.
+pub(super) struct Texture {
+    /// Level l: `[size >> l]²` texels, both fields, 65535 is 1.
+    levels: Vec<Vec<[u16; 2]>>,
+    size: usize,
+}
+
+impl Texture {
+    /// `fields` has a power of two as its side. Values are clipped to [0, 1].
+    pub(super) fn new(fields: &Fields) -> Self {
+        let size = fields.size;
+        let quantised = |v: f32| (v.clamp(0.0, 1.0) * 65_535.0 + 0.5) as u16;
+        let first = fields.a.iter().zip(&fields.b).map(|(a, b)| [quantised(*a), quantised(*b)]);
+        let mut levels = vec![first.collect::<Vec<_>>()];
+        let mut side = size;
+        while side > 1 {
+            let fine = &levels[levels.len() - 1];
+            let half = side / 2;
+            let mut coarse = Vec::with_capacity(half * half);
+            for y in 0..half {
+                for x in 0..half {
+                    let i = 2 * y * side + 2 * x;
+                    let four = [fine[i], fine[i + 1], fine[i + side], fine[i + side + 1]];
+                    let mean = |k: usize| {
+                        ((four.iter().map(|t| u32::from(t[k])).sum::<u32>() + 2) / 4) as u16
+                    };
+                    coarse.push([mean(0), mean(1)]);
+                }
+            }
+            levels.push(coarse);
+            side = half;
+        }
+        Self { levels, size }
+    }
+
+    /// Bilinear value at (u, v), in periods, on one level.
+    fn bilinear(&self, level: usize, u: f32, v: f32) -> [f32; 2] {
+        let side = self.size >> level;
+        let mask = side - 1;
+        let (x, y) = (u * side as f32 - 0.5, v * side as f32 - 0.5);
+        let (x0, y0) = (x.floor(), y.floor());
+        let (fx, fy) = (x - x0, y - y0);
+        // Negative positions wrap as two's complement does, since the side is a power of two.
+        let (x0, y0) = (x0 as i64 as usize, y0 as i64 as usize);
+        let (left, right) = (x0 & mask, x0.wrapping_add(1) & mask);
+        let (top, bottom) = ((y0 & mask) * side, (y0.wrapping_add(1) & mask) * side);
+        let t = &self.levels[level];
+        let [a, b, c, d] = [t[top + left], t[top + right], t[bottom + left], t[bottom + right]];
+        let blend = |k: usize| {
+            let up = f32::from(a[k]) + fx * (f32::from(b[k]) - f32::from(a[k]));
+            let down = f32::from(c[k]) + fx * (f32::from(d[k]) - f32::from(c[k]));
+            (up + fy * (down - up)) * (1.0 / 65_535.0)
+        };
+        [blend(0), blend(1)]
+    }
+
+    /// Both fields at (u, v), in periods, averaged over about `footprint` periods:
+    /// linear between the two mip levels whose texels are nearest to it in size.
+    pub(super) fn sample(&self, u: f32, v: f32, footprint: f32) -> [f32; 2] {
+        let last = self.levels.len() - 1;
+        let lod = (footprint * self.size as f32).max(1.0).log2().min(last as f32);
+        let level = (lod as usize).min(last);
+        let near = self.bilinear(level, u, v);
+        let t = lod - level as f32;
+        if t < 1e-3 || level == last {
+            return near;
+        }
+        let far = self.bilinear(level + 1, u, v);
+        [near[0] + t * (far[0] - near[0]), near[1] + t * (far[1] - near[1])]
+    }
+}
+
+/// The textures of one seed and size, each made when first asked for.
+pub struct TextureBank {
+    seed: u64,
+    size: usize,
+    slots: Vec<OnceLock<Texture>>,
+}
+
+impl std::fmt::Debug for TextureBank {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let made = self.slots.iter().filter(|s| s.get().is_some()).count();
+        write!(f, "TextureBank(seed {}, {}², {made} of {BANK} made)", self.seed, self.size)
+    }
+}
+
+/// Side of the shared bank's textures, px.
+const SHARED_SIZE: usize = 256;
+/// Seed of the shared bank: rooms of the same seed look alike in every process.
+const SHARED_SEED: u64 = 0;
+
+static SHARED: LazyLock<Arc<TextureBank>> =
+    LazyLock::new(|| Arc::new(TextureBank::new(SHARED_SEED, SHARED_SIZE)));
+
+impl TextureBank {
+    /// A bank of 144 textures, none made yet. `size` (px) is rounded up to a power of
+    /// two from 64 to 2048; 4 bytes × 4/3 × size² each once made.
+    pub fn new(seed: u64, size: usize) -> Self {
+        let size = size.clamp(64, 2048).next_power_of_two();
+        Self { seed, size, slots: (0..BANK).map(|_| OnceLock::new()).collect() }
+    }
+
+    /// The bank of 256² textures that [`super::Room::new`] uses: 50 MB when all are made.
+    pub fn shared() -> Arc<Self> {
+        Arc::clone(&SHARED)
+    }
+
+    /// Texture `index`, modulo the bank's size.
+    pub(super) fn get(&self, index: usize) -> &Texture {
+        let index = index % BANK;
+        self.slots[index].get_or_init(|| {
+            let mut rng = Rng::new(self.seed).fork(index as u64);
+            Texture::new(&synthesis::fields(Kind::of(index), self.size, &mut rng))
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn ramp() -> Texture {
+        let mut f = Fields::filled(8, 0.0, 0.25);
+        for (i, a) in f.a.iter_mut().enumerate() {
+            *a = (i % 8) as f32 / 7.0;
+        }
+        Texture::new(&f)
+    }
+
+    #[test]
+    fn texels_interpolate_and_wrap() {
+        let t = ramp();
+        let at = |x: f32| t.sample(x / 8.0, 0.3, 0.0)[0];
+        assert!((at(3.5) - 3.0 / 7.0).abs() < 1e-4);
+        assert!((at(4.0) - 3.5 / 7.0).abs() < 1e-4);
+        assert!((at(0.0) - 0.5).abs() < 1e-4, "between the last column and the first");
+        assert!((at(-4.5) - at(3.5)).abs() < 1e-4);
+        assert!((at(163.5) - at(3.5)).abs() < 1e-4);
+    }
+
+    #[test]
+    fn a_large_footprint_gives_the_mean() {
+        let t = ramp();
+        let [a, b] = t.sample(0.1, 0.9, 1.0);
+        assert!((a - 0.5).abs() < 1e-4 && (b - 0.25).abs() < 1e-4, "{a} {b}");
+        assert_eq!(t.sample(0.1, 0.9, 1e9), [a, b]);
+    }
+
+    #[test]
+    fn shares_fill_the_bank() {
+        assert_eq!(SHARES.iter().map(|s| s.1).sum::<usize>(), BANK);
+        for (kind, count) in SHARES {
+            assert_eq!(kind.indices().len(), count);
+            assert!(kind.indices().all(|i| Kind::of(i) == kind));
+        }
+    }
+}

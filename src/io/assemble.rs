@@ -1,0 +1,297 @@
+//! What all pose readers have in common: finding pictures, looking at their headers,
+//! and making checked [`Frame`]s of what a file says.
+
+use super::image::{Probe, probe};
+use super::scene::{Frame, Scene, SceneFormat, Units};
+use super::undistort::Distortion;
+use super::{Error, Result};
+use crate::camera::{Camera, CameraError, Intrinsics};
+use glam::{DMat3, DMat4};
+use rayon::prelude::*;
+use std::path::{Path, PathBuf};
+
+/// Intrinsics as a pose file gives them.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Lens {
+    /// fx, fy, cx, cy in pixels of the pose file's size.
+    Pixels([f64; 4]),
+    /// The same, divided by width and height of the stored picture.
+    Normalised([f64; 4]),
+}
+
+/// A frame before its picture was looked at.
+#[derive(Clone, Debug)]
+pub(super) struct Draft {
+    /// Where in the pose file, in [`Error::at`]'s form.
+    pub place: String,
+    /// The picture's path as the pose file has it.
+    pub file: String,
+    /// The picture on disk, `None` if there is none.
+    pub image: Option<PathBuf>,
+    /// Intrinsics.
+    pub lens: Lens,
+    /// Picture size that the intrinsics belong to, if the file says so.
+    pub size: Option<(usize, usize)>,
+    /// OpenCV pose.
+    pub world_from_camera: DMat4,
+    /// See [`Frame`].
+    pub distortion: Distortion,
+    /// See [`Frame`].
+    pub timestamp: Option<i64>,
+    /// See [`Frame`].
+    pub depth: Option<PathBuf>,
+    /// See [`Frame`].
+    pub visible: Vec<u32>,
+}
+
+impl Draft {
+    pub fn new(place: String, file: String, lens: Lens, world_from_camera: DMat4) -> Self {
+        Self {
+            place,
+            file,
+            image: None,
+            lens,
+            size: None,
+            world_from_camera,
+            distortion: Distortion::None,
+            timestamp: None,
+            depth: None,
+            visible: Vec::new(),
+        }
+    }
+}
+
+/// Extensions tried where a pose file names a picture without one (NeRF's blender
+/// scenes, some nerfstudio exports).
+pub(super) const EXTENSIONS: [&str; 12] =
+    ["png", "jpg", "jpeg", "PNG", "JPG", "JPEG", "webp", "tif", "tiff", "TIF", "bmp", "BMP"];
+
+/// Looks for a picture below `roots`, with and without `images/` between.
+pub(super) fn find_image(roots: &[&Path], name: &str) -> Option<PathBuf> {
+    let name = name.replace('\\', "/");
+    let name = name.trim_start_matches("./");
+    if name.is_empty() {
+        return None;
+    }
+    let places: Vec<PathBuf> =
+        roots.iter().flat_map(|r| [r.join(name), r.join("images").join(name)]).collect();
+    // `exists` last and not `is_file`: a folder under the picture's name is an error
+    // that the probe names, not a missing picture.
+    let mut candidates = places.iter().filter(|p| p.is_file()).cloned();
+    candidates
+        .next()
+        .or_else(|| places.iter().flat_map(|p| with_extensions(p)).find(|p| p.is_file()))
+        .or_else(|| places.iter().find(|p| p.exists()).cloned())
+}
+
+fn with_extensions(place: &Path) -> impl Iterator<Item = PathBuf> + '_ {
+    EXTENSIONS.iter().map(move |e| {
+        let mut path = place.as_os_str().to_owned();
+        path.push(".");
+        path.push(e);
+        PathBuf::from(path)
+    })
+}
+
+/// Pictures of a folder, sorted by name; empty if there is no such folder.
+pub(super) fn list_images(folder: &Path) -> Vec<PathBuf> {
+    let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
+    let is_picture = |p: &PathBuf| {
+        let extension = p.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+        EXTENSIONS.contains(&extension.as_str())
+    };
+    let mut images: Vec<PathBuf> =
+        entries.filter_map(|e| Some(e.ok()?.path())).filter(is_picture).collect();
+    images.sort();
+    images
+}
+
+/// Nearest rotation, where the file's few digits or an exporter's float noise left
+/// something to correct; what [`Camera::new`] would refuse stays as it is, and so
+/// does what f32 cannot express better. Second value: how far off it was.
+fn orthonormal(pose: DMat4) -> (DMat4, f64) {
+    let error = |r: DMat3| {
+        let gram = r.transpose() * r - DMat3::IDENTITY;
+        gram.to_cols_array().into_iter().fold(0.0f64, |m, v| m.max(v.abs()))
+    };
+    let mut rotation = DMat3::from_mat4(pose);
+    let off = error(rotation);
+    if !(2e-6..=f64::from(Camera::RIGID_TOLERANCE)).contains(&off) {
+        return (pose, off);
+    }
+    // Newton's iteration for the polar decomposition: quadratic, and the start is
+    // within 1 %.
+    for _ in 0..6 {
+        rotation = (rotation + rotation.inverse().transpose()) * 0.5;
+    }
+    let column = |v: glam::DVec3| v.extend(0.0);
+    let pose = DMat4::from_cols(
+        column(rotation.x_axis),
+        column(rotation.y_axis),
+        column(rotation.z_axis),
+        pose.w_axis,
+    );
+    (pose, off)
+}
+
+/// Intrinsics of the stored picture; the second value says that they were rescaled.
+fn stored_intrinsics(
+    draft: &Draft,
+    stored: &Probe,
+) -> std::result::Result<(Intrinsics, bool), String> {
+    let (w, h) = (stored.width as f64, stored.height as f64);
+    let (k, rescaled) = match draft.lens {
+        Lens::Normalised(k) => ([k[0] * w, k[1] * h, k[2] * w, k[3] * h], false),
+        Lens::Pixels(k) => {
+            let (given_w, given_h) = draft.size.unwrap_or((stored.width, stored.height));
+            let (sx, sy) = (w / given_w as f64, h / given_h as f64);
+            // A reduced copy (images_2, images_4) has sides rounded to whole pixels.
+            if (sx / sy - 1.0).abs() > 0.02 {
+                let turned = match stored.orientation {
+                    Some(o) => format!(" (EXIF orientation {o} is not applied)"),
+                    None => String::new(),
+                };
+                return Err(format!("{}x{}{turned}", stored.width, stored.height));
+            }
+            ([k[0] * sx, k[1] * sy, k[2] * sx, k[3] * sy], (sx, sy) != (1.0, 1.0))
+        }
+    };
+    let [fx, fy, cx, cy] = k.map(|v| v as f32);
+    Ok((Intrinsics { fx, fy, cx, cy, width: stored.width, height: stored.height }, rescaled))
+}
+
+/// A refused camera, at its place in a file.
+pub(super) fn camera_error(path: &Path, place: &str, error: &CameraError) -> Error {
+    // "part: expected this, got that", the form of all errors.
+    let text = error.to_string();
+    let parts = || {
+        let (part, rest) = text.split_once(": expected ")?;
+        let (expected, got) = rest.split_once(", got ")?;
+        Some((format!("a {part} with {expected}"), got.to_owned()))
+    };
+    let (expected, got) = parts().unwrap_or(("a camera".to_owned(), text.clone()));
+    Error::format(path, expected, got).at(place)
+}
+
+/// Makes frames of drafts: looks at every picture's header, checks every camera,
+/// and leaves out, with a warning, frames whose picture is missing.
+pub(super) fn assemble(path: &Path, source: SceneFormat, drafts: Vec<Draft>) -> Result<Scene> {
+    if drafts.is_empty() {
+        return Err(Error::format(path, "at least one frame", "none"));
+    }
+    let probes: Vec<Option<Result<Probe>>> =
+        drafts.par_iter().map(|d| d.image.as_deref().map(probe)).collect();
+    let count = drafts.len();
+    let mut notes = Notes::default();
+    let mut frames = Vec::with_capacity(count);
+    for (draft, stored) in drafts.into_iter().zip(probes) {
+        let (Some(image), Some(stored)) = (draft.image.clone(), stored) else {
+            notes.missing.push(draft.file);
+            continue;
+        };
+        frames.push(frame(path, draft, image, &stored?, &mut notes)?);
+    }
+    if frames.is_empty() {
+        let first = notes.missing.first().cloned().unwrap_or_default();
+        let got = format!("none of {count} (the first is `{first}`)");
+        return Err(Error::format(path, "pictures on disk", got));
+    }
+    Ok(Scene {
+        name: scene_name(path),
+        frames,
+        points: None,
+        source,
+        units: Units::Unknown,
+        warnings: notes.lines(count),
+    })
+}
+
+fn frame(
+    path: &Path,
+    draft: Draft,
+    image: PathBuf,
+    stored: &Probe,
+    notes: &mut Notes,
+) -> Result<Frame> {
+    let bad = |expected: String, got: String| {
+        Err(Error::format(path, expected, got).at(draft.place.clone()))
+    };
+    if stored.orientation.is_some() {
+        notes.turned.push(draft.file.clone());
+    }
+    let (intrinsics, rescaled) = match stored_intrinsics(&draft, stored) {
+        Ok(k) => k,
+        Err(got) => {
+            let (w, h) = draft.size.unwrap_or_default();
+            return bad(format!("{} of {w}x{h}, or of the same shape", image.display()), got);
+        }
+    };
+    if rescaled {
+        notes.rescaled.push(draft.file.clone());
+    }
+    let (pose, off) = orthonormal(draft.world_from_camera);
+    if off > 1e-3 && off <= f64::from(Camera::RIGID_TOLERANCE) {
+        notes.skewed.push(draft.file.clone());
+    }
+    let camera = match Camera::new(intrinsics, pose.as_mat4()) {
+        Ok(camera) => camera,
+        Err(e) => return Err(camera_error(path, &draft.place, &e)),
+    };
+    if let Err(e) = draft.distortion.check() {
+        return bad("finite distortion coefficients".to_owned(), e);
+    }
+    let name = draft.file.replace('\\', "/");
+    let name = name.trim_start_matches("./").trim_start_matches("images/");
+    Ok(Frame {
+        name: Path::new(name).with_extension("").to_string_lossy().into_owned(),
+        image,
+        camera,
+        distortion: draft.distortion,
+        timestamp: draft.timestamp,
+        depth: draft.depth,
+        visible: draft.visible,
+    })
+}
+
+/// Files to warn of, gathered so that each kind is one line.
+#[derive(Default)]
+struct Notes {
+    missing: Vec<String>,
+    turned: Vec<String>,
+    rescaled: Vec<String>,
+    skewed: Vec<String>,
+}
+
+impl Notes {
+    fn lines(&self, count: usize) -> Vec<String> {
+        let kinds = [
+            (&self.missing, "have no picture on disk and are left out"),
+            (&self.turned, "have an EXIF orientation: ignored, pose files speak of stored pixels"),
+            (&self.rescaled, "are stored at another size than the pose file's: intrinsics scaled"),
+            (&self.skewed, "have a rotation that is not orthonormal (0.1 % to 1 %): corrected"),
+        ];
+        let line = |(files, what): (&Vec<String>, &str)| {
+            let few: Vec<&str> = files.iter().take(3).map(String::as_str).collect();
+            let more = if files.len() > 3 { ", …" } else { "" };
+            format!("{} of {count} frames {what}: {}{more}", files.len(), few.join(", "))
+        };
+        kinds.into_iter().filter(|(files, _)| !files.is_empty()).map(line).collect()
+    }
+}
+
+/// Name of the folder that a person would call the scene.
+fn scene_name(pose_file: &Path) -> String {
+    let absolute = std::fs::canonicalize(pose_file).unwrap_or_else(|_| pose_file.to_owned());
+    let mut folder = if absolute.is_dir() { Some(absolute.as_path()) } else { absolute.parent() };
+    while let Some(f) = folder {
+        let name = f.file_name().unwrap_or_default().to_string_lossy();
+        let inner = ["sparse", "colmap", "images"].contains(&name.as_ref())
+            || name.chars().all(|c| c.is_ascii_digit())
+                && f.parent().is_some_and(|p| p.ends_with("sparse"));
+        if !inner && !name.is_empty() {
+            return name.into_owned();
+        }
+        folder = f.parent();
+    }
+    "scene".to_owned()
+}

@@ -1,0 +1,268 @@
+//! `cameras.json`: the layout of this project (and of `run`'s output), and the list
+//! that 3DGS training writes under the same name.
+//!
+//! ```json
+//! {"convention": "...", "units": "metres",
+//!  "frames": [{"file": "images/0.png", "width": 512, "height": 512,
+//!              "fx": 1.0, "fy": 1.0, "cx": 1.0, "cy": 1.0,
+//!              "c2w": [[…], […], […], [0, 0, 0, 1]]}]}
+//! ```
+//!
+//! `c2w` is OpenCV camera-to-world, intrinsics are pixels of the stored picture,
+//! which is a pinhole's. Optional: `timestamp_us`, `depth` of a frame; `units`
+//! (`metres`, `re10k`), or `metric: true`, of the file. Unknown keys are ignored.
+//!
+//! 3DGS's list has `img_name, width, height, fx, fy, rotation` (camera to world),
+//! `position` (the eye): same axes, principal point in the middle.
+
+use super::assemble::{Draft, Lens, assemble, camera_error, find_image};
+use super::scene::{Frame, Scene, SceneFormat, Units};
+use super::{Error, Result, read, write_atomic};
+use crate::camera::{Camera, Intrinsics};
+use glam::{DMat4, DVec4};
+use serde::{Deserialize, Serialize};
+use std::io::Write;
+use std::path::Path;
+
+const CONVENTION: &str = "OpenCV camera-to-world (x right, y down, z forward); pixel intrinsics at \
+                          the stored resolution; pinhole";
+
+/// A camera with the name of its picture, which need not exist.
+#[derive(Clone, Debug, PartialEq)]
+pub struct NamedCamera {
+    /// The picture, relative to the folder of the file.
+    pub file: String,
+    /// The camera.
+    pub camera: Camera,
+    /// Time stamp, microseconds.
+    pub timestamp: Option<i64>,
+    /// Depth map, relative to the folder of the file.
+    pub depth: Option<String>,
+}
+
+/// Content of a `cameras.json`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CameraFile {
+    /// In the file's order.
+    pub cameras: Vec<NamedCamera>,
+    /// Unit of length.
+    pub units: Units,
+}
+
+#[derive(Deserialize)]
+#[serde(expecting = "an object with frames")]
+struct InFile {
+    units: Option<String>,
+    #[serde(default)]
+    metric: bool,
+    frames: Vec<InFrame>,
+}
+
+#[derive(Deserialize)]
+#[serde(expecting = "a frame: file, width, height, fx, fy, cx, cy, c2w")]
+struct InFrame {
+    file: String,
+    width: f64,
+    height: f64,
+    fx: f64,
+    fy: f64,
+    cx: f64,
+    cy: f64,
+    c2w: Vec<Vec<f64>>,
+    timestamp_us: Option<i64>,
+    re10k_frame: Option<i64>,
+    depth: Option<String>,
+}
+
+#[derive(Deserialize)]
+#[serde(expecting = "a camera: img_name, width, height, fx, fy, rotation, position")]
+struct SplatFrame {
+    img_name: String,
+    width: f64,
+    height: f64,
+    fx: f64,
+    fy: f64,
+    rotation: [[f64; 3]; 3],
+    position: [f64; 3],
+}
+
+#[derive(Serialize)]
+struct OutFile<'a> {
+    convention: &'a str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    units: Option<&'a str>,
+    frames: Vec<OutFrame<'a>>,
+}
+
+#[derive(Serialize)]
+struct OutFrame<'a> {
+    file: &'a str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    depth: Option<&'a str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    timestamp_us: Option<i64>,
+    width: usize,
+    height: usize,
+    fx: f32,
+    fy: f32,
+    cx: f32,
+    cy: f32,
+    c2w: [[f32; 4]; 4],
+}
+
+/// A JSON error with its line and column; what serde expected and got stands in its message.
+pub(super) fn json_error(path: &Path, expected: &str, error: &serde_json::Error) -> Error {
+    let text = error.to_string();
+    // serde_json appends the place that `at` already says.
+    let got = text.split(" at line ").next().unwrap_or(&text).to_owned();
+    let place = format!(":{}:{}", error.line(), error.column());
+    let at = if error.line() > 0 { place } else { String::new() };
+    Error::format(path, expected, got).at(at)
+}
+
+/// A picture side that a JSON file wrote as a number of any kind.
+pub(super) fn side(value: f64) -> Option<usize> {
+    (value >= 1.0 && value <= f64::from(1 << 20) && value.fract() == 0.0).then_some(value as usize)
+}
+
+/// A 3×4 or 4×4 matrix given as rows.
+pub(super) fn matrix(rows: &[Vec<f64>]) -> std::result::Result<DMat4, String> {
+    let shape_ok = (3..=4).contains(&rows.len()) && rows.iter().all(|r| r.len() == 4);
+    if !shape_ok {
+        let lengths: Vec<usize> = rows.iter().map(Vec::len).collect();
+        return Err(format!("rows of {lengths:?} numbers"));
+    }
+    let row = |i: usize| rows.get(i).map_or(DVec4::W, |r| DVec4::new(r[0], r[1], r[2], r[3]));
+    Ok(DMat4::from_cols(row(0), row(1), row(2), row(3)).transpose())
+}
+
+/// Whether a JSON file has this layout, rather than `transforms.json`'s.
+pub(super) fn is_cameras_json(path: &Path) -> Result<bool> {
+    let value: serde_json::Value = serde_json::from_slice(&read(path)?)
+        .map_err(|e| json_error(path, "a JSON file with cameras", &e))?;
+    Ok(value.is_array() || value["frames"][0].get("c2w").is_some())
+}
+
+fn drafts(path: &Path) -> Result<(Vec<Draft>, Units)> {
+    let bytes = read(path)?;
+    let list = bytes.iter().find(|b| !b.is_ascii_whitespace()) == Some(&b'[');
+    if list {
+        let frames: Vec<SplatFrame> = serde_json::from_slice(&bytes)
+            .map_err(|e| json_error(path, "a list of 3DGS cameras (img_name, rotation, …)", &e))?;
+        let drafts = frames.into_iter().enumerate().map(|(i, f)| splat_draft(path, i, f));
+        return Ok((drafts.collect::<Result<_>>()?, Units::Unknown));
+    }
+    let file: InFile = serde_json::from_slice(&bytes)
+        .map_err(|e| json_error(path, "cameras.json (frames with file, fx, …, c2w)", &e))?;
+    let re10k = |f: &InFrame| f.timestamp_us.is_some() || f.re10k_frame.is_some();
+    let units = match file.units.as_deref() {
+        Some("metres" | "meters" | "m") => Units::Metres,
+        Some("re10k") => Units::RealEstate10k,
+        None if file.metric => Units::Metres,
+        None if !file.frames.is_empty() && file.frames.iter().all(re10k) => Units::RealEstate10k,
+        _ => Units::Unknown,
+    };
+    let drafts = file.frames.into_iter().enumerate().map(|(i, f)| draft(path, i, f));
+    Ok((drafts.collect::<Result<_>>()?, units))
+}
+
+fn size(path: &Path, place: &str, width: f64, height: f64) -> Result<Option<(usize, usize)>> {
+    match (side(width), side(height)) {
+        (Some(w), Some(h)) => Ok(Some((w, h))),
+        _ => {
+            let got = format!("{width}x{height}");
+            Err(Error::format(path, "a picture size in whole pixels", got).at(place))
+        }
+    }
+}
+
+fn draft(path: &Path, index: usize, f: InFrame) -> Result<Draft> {
+    let place = format!(" frame {index}");
+    let pose =
+        matrix(&f.c2w).map_err(|got| Error::format(path, "c2w of 4x4 numbers", got).at(&place))?;
+    let size = size(path, &place, f.width, f.height)?;
+    let lens = Lens::Pixels([f.fx, f.fy, f.cx, f.cy]);
+    let depth = f.depth.map(|d| folder(path).join(d));
+    Ok(Draft { size, timestamp: f.timestamp_us, depth, ..Draft::new(place, f.file, lens, pose) })
+}
+
+fn splat_draft(path: &Path, index: usize, f: SplatFrame) -> Result<Draft> {
+    let place = format!(" frame {index}");
+    let rows: Vec<Vec<f64>> =
+        (0..3).map(|i| [&f.rotation[i][..], &[f.position[i]]].concat()).collect();
+    let pose = matrix(&rows)
+        .map_err(|got| Error::format(path, "rotation of 3x3 numbers", got).at(&place))?;
+    let size = size(path, &place, f.width, f.height)?;
+    let lens = Lens::Pixels([f.fx, f.fy, 0.5 * f.width, 0.5 * f.height]);
+    Ok(Draft { size, ..Draft::new(place, f.img_name, lens, pose) })
+}
+
+fn folder(path: &Path) -> &Path {
+    path.parent().unwrap_or(Path::new(""))
+}
+
+/// Reads a scene; frames without a picture are left out with a warning.
+pub(super) fn load(path: &Path) -> Result<Scene> {
+    let (mut drafts, units) = drafts(path)?;
+    for d in &mut drafts {
+        d.image = find_image(&[folder(path)], &d.file);
+    }
+    let mut scene = assemble(path, SceneFormat::CamerasJson, drafts)?;
+    scene.units = units;
+    Ok(scene)
+}
+
+/// Reads the cameras alone: their pictures need not exist.
+///
+/// # Errors
+/// Not this layout; a camera that is not usable (its frame is named).
+pub fn load_cameras_json(path: &Path) -> Result<CameraFile> {
+    let (drafts, units) = drafts(path)?;
+    let mut cameras = Vec::with_capacity(drafts.len());
+    for d in drafts {
+        let (Some((width, height)), Lens::Pixels(k)) = (d.size, d.lens) else { continue };
+        let [fx, fy, cx, cy] = k.map(|v| v as f32);
+        let intrinsics = Intrinsics { fx, fy, cx, cy, width, height };
+        let camera = Camera::new(intrinsics, d.world_from_camera.as_mat4())
+            .map_err(|e| camera_error(path, &d.place, &e))?;
+        let depth = d
+            .depth
+            .as_deref()
+            .map(|p| p.strip_prefix(folder(path)).unwrap_or(p).to_string_lossy().into_owned());
+        cameras.push(NamedCamera { file: d.file, camera, timestamp: d.timestamp, depth });
+    }
+    Ok(CameraFile { cameras, units })
+}
+
+/// Writes this layout. Floats are written so that they read back the same.
+///
+/// # Errors
+/// Everything of [`write_atomic`].
+pub fn save_cameras_json(path: &Path, content: &CameraFile) -> Result<()> {
+    let frame = |c: &'_ NamedCamera| {
+        let Intrinsics { fx, fy, cx, cy, width, height } = c.camera.intrinsics;
+        let c2w = c.camera.world_from_camera.transpose().to_cols_array_2d();
+        (fx, fy, cx, cy, width, height, c2w)
+    };
+    let frames = content.cameras.iter().map(|c| {
+        let (fx, fy, cx, cy, width, height, c2w) = frame(c);
+        let (file, depth) = (c.file.as_str(), c.depth.as_deref());
+        OutFrame { file, depth, timestamp_us: c.timestamp, width, height, fx, fy, cx, cy, c2w }
+    });
+    let units = match content.units {
+        Units::Unknown => None,
+        Units::Metres => Some("metres"),
+        Units::RealEstate10k => Some("re10k"),
+    };
+    let out = OutFile { convention: CONVENTION, units, frames: frames.collect() };
+    let text = serde_json::to_string_pretty(&out)
+        .map_err(|e| Error::io(path, std::io::Error::other(e)))?;
+    write_atomic(path, |f| writeln!(f, "{text}"))
+}
+
+impl NamedCamera {
+    /// A frame's camera, with `file` as the picture's new name.
+    pub fn of_frame(frame: &Frame, file: impl Into<String>) -> Self {
+        Self { file: file.into(), camera: frame.camera, timestamp: frame.timestamp, depth: None }
+    }
+}

@@ -1,0 +1,485 @@
+//! The reader of `.glb` files with `KHR_gaussian_splatting`; layout in `glb.rs`.
+//!
+//! Every splat primitive of the scene is read, each under its node's transform
+//! (rotation, translation, uniform scale), then turned from glTF's axes (y up, z back)
+//! into ours. Quantised attributes as the extension allows them. Counts, offsets,
+//! strides and chunk lengths are checked against the bytes before anything is kept.
+
+use super::gaussians::{
+    Decoded, HALF_TURN_X, Incoming, Similarity, check_finite, transform, truncated, u32_at,
+};
+use super::glb::{
+    CHUNK_BIN, CHUNK_JSON, EXTENSION, FLOAT, MAGIC, POINTS, SH_DEGREE_MAX, UNSIGNED_SHORT,
+};
+use super::{Error, Result};
+use crate::splats::Splats;
+use glam::{DMat3, DMat4, DQuat, DVec3};
+use serde::Deserialize;
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Deepest node hierarchy that is followed.
+const DEPTH_MAX: usize = 256;
+
+/// Longest JSON chunk, bytes; parsed, a document may take thirty times as much.
+const JSON_MAX: usize = 16 << 20;
+
+/// Reads a `.glb` from memory. `name` is for errors.
+///
+/// # Errors
+/// Not glTF 2 binary, chunks that lie, no splats in it, an accessor beyond its buffer,
+/// a compressed or sparse one, a mirrored or sheared node, numbers that are not finite.
+pub fn parse_glb(bytes: &[u8], name: &Path) -> Result<Splats> {
+    let decoded = decode(bytes, name)?;
+    check_finite(&decoded.splats, name)?;
+    Ok(decoded.splats)
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Document {
+    asset: Asset,
+    scene: Option<usize>,
+    #[serde(default)]
+    scenes: Vec<Scene>,
+    #[serde(default)]
+    nodes: Vec<Node>,
+    #[serde(default)]
+    meshes: Vec<Mesh>,
+    #[serde(default)]
+    accessors: Vec<Accessor>,
+    #[serde(default)]
+    buffer_views: Vec<BufferView>,
+    #[serde(default)]
+    buffers: Vec<Buffer>,
+}
+
+#[derive(Deserialize)]
+struct Asset {
+    version: String,
+    generator: Option<String>,
+}
+
+#[derive(Deserialize)]
+struct Scene {
+    #[serde(default)]
+    nodes: Vec<usize>,
+}
+
+#[derive(Deserialize)]
+// Boxed: a hostile document has millions of empty nodes.
+struct Node {
+    mesh: Option<usize>,
+    #[serde(default)]
+    children: Vec<usize>,
+    matrix: Option<Box<[f64; 16]>>,
+    rotation: Option<Box<[f64; 4]>>,
+    translation: Option<Box<[f64; 3]>>,
+    scale: Option<Box<[f64; 3]>>,
+}
+
+#[derive(Deserialize)]
+struct Mesh {
+    primitives: Vec<Primitive>,
+}
+
+#[derive(Deserialize)]
+struct Primitive {
+    attributes: BTreeMap<String, usize>,
+    mode: Option<u64>,
+    #[serde(default)]
+    extensions: BTreeMap<String, Extension>,
+}
+
+/// Only what decides whether the attributes can be read as they stand.
+#[derive(Deserialize)]
+struct Extension {
+    #[serde(default)]
+    extensions: BTreeMap<String, serde_json::Value>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Accessor {
+    buffer_view: Option<usize>,
+    #[serde(default)]
+    byte_offset: u64,
+    component_type: u64,
+    #[serde(default)]
+    normalized: bool,
+    count: u64,
+    #[serde(rename = "type")]
+    kind: String,
+    sparse: Option<serde_json::Value>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct BufferView {
+    buffer: usize,
+    #[serde(default)]
+    byte_offset: u64,
+    byte_length: u64,
+    byte_stride: Option<u64>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Buffer {
+    uri: Option<String>,
+    byte_length: u64,
+}
+
+struct File<'a> {
+    path: &'a Path,
+    document: Document,
+    binary: &'a [u8],
+}
+
+pub(super) fn decode(bytes: &[u8], path: &Path) -> Result<Decoded> {
+    let (json, binary) = chunks(bytes, path)?;
+    let document: Document = serde_json::from_slice(json)
+        .map_err(|e| Error::format(path, "a glTF 2.0 document in the JSON chunk", e.to_string()))?;
+    let version = &document.asset.version;
+    if version.split('.').next() != Some("2") {
+        return Err(Error::format(path, "glTF version 2.x", format!("{version:?}")));
+    }
+    let comments = document.asset.generator.iter().map(|g| format!("generator: {g}")).collect();
+    let file = File { path, document, binary };
+    let mut parts = Vec::new();
+    // A Gaussian takes at least 14 bytes: more than one for each byte are instances without end.
+    let mut budget = bytes.len();
+    for (mesh, world) in file.instances()? {
+        for part in file.mesh(mesh, &mut budget)? {
+            let mut splats = part;
+            transform(&mut splats, &file.similarity(world)?);
+            parts.push(splats);
+        }
+    }
+    let splats = join(parts, path)?;
+    Ok(Decoded { splats, flavour: format!("glb {EXTENSION}"), comments })
+}
+
+/// The JSON chunk and the binary one (empty where there is none).
+fn chunks<'a>(bytes: &'a [u8], path: &Path) -> Result<(&'a [u8], &'a [u8])> {
+    if !bytes.starts_with(&MAGIC) {
+        let got = format!("{:02x?}", &bytes[..bytes.len().min(4)]);
+        return Err(Error::format(path, "the magic glTF (.glb)", got));
+    }
+    let (version, length) = (u32_at(bytes, 4, path)?, u32_at(bytes, 8, path)? as usize);
+    if version != 2 {
+        return Err(Error::format(path, "glTF binary version 2", version.to_string()));
+    }
+    if length > bytes.len() {
+        return Err(truncated(path, length as u64, bytes.len() as u64));
+    }
+    let chunk = |at: usize, kind: u32, name: &str| -> Result<(&'a [u8], usize)> {
+        let (size, got) = (u32_at(bytes, at, path)? as usize, u32_at(bytes, at + 4, path)?);
+        if got != kind {
+            let expected = format!("a {name} chunk");
+            let place = format!(" at byte {at}");
+            return Err(Error::format(path, expected, format!("type {got:#010x}")).at(place));
+        }
+        let start = at + 8;
+        let body = bytes
+            .get(start..start.saturating_add(size))
+            .ok_or_else(|| truncated(path, start as u64 + size as u64, bytes.len() as u64))?;
+        Ok((body, start + size))
+    };
+    let (json, end) = chunk(12, CHUNK_JSON, "JSON")?;
+    if json.len() > JSON_MAX {
+        let got = json.len().to_string();
+        return Err(Error::format(path, format!("at most {JSON_MAX} bytes of JSON"), got));
+    }
+    if end + 8 > length {
+        return Ok((json, &[]));
+    }
+    Ok((json, chunk(end, CHUNK_BIN, "BIN")?.0))
+}
+
+impl File<'_> {
+    fn bad(&self, expected: impl Into<String>, got: impl Into<String>) -> Error {
+        Error::format(self.path, expected, got)
+    }
+
+    fn item<'b, T>(&self, all: &'b [T], i: usize, what: &str) -> Result<&'b T> {
+        all.get(i).ok_or_else(|| self.bad(format!("{what} 0 to {}", all.len()), i.to_string()))
+    }
+
+    /// Meshes of the default scene with their world matrices.
+    fn instances(&self) -> Result<Vec<(usize, DMat4)>> {
+        let d = &self.document;
+        let roots = if d.scenes.is_empty() {
+            let mut root = vec![true; d.nodes.len()];
+            for &child in d.nodes.iter().flat_map(|n| &n.children) {
+                if let Some(r) = root.get_mut(child) {
+                    *r = false;
+                }
+            }
+            (0..d.nodes.len()).filter(|&n| root[n]).collect()
+        } else {
+            self.item(&d.scenes, d.scene.unwrap_or(0), "scene")?.nodes.clone()
+        };
+        let mut seen = vec![false; d.nodes.len()];
+        let mut open: Vec<(usize, DMat4, usize)> =
+            roots.into_iter().rev().map(|n| (n, DMat4::IDENTITY, 0)).collect();
+        let mut found = Vec::new();
+        while let Some((n, parent, depth)) = open.pop() {
+            let node = self.item(&d.nodes, n, "node")?;
+            if std::mem::replace(&mut seen[n], true) || depth > DEPTH_MAX {
+                let expected = format!("a tree of nodes, at most {DEPTH_MAX} deep");
+                return Err(self.bad(expected, format!("node {n} again, or deeper")));
+            }
+            let world = parent * self.local(node)?;
+            found.extend(node.mesh.map(|m| (m, world)));
+            open.extend(node.children.iter().rev().map(|&c| (c, world, depth + 1)));
+        }
+        Ok(found)
+    }
+
+    fn local(&self, node: &Node) -> Result<DMat4> {
+        if let Some(matrix) = &node.matrix {
+            return Ok(DMat4::from_cols_array(matrix));
+        }
+        let [x, y, z, w] = node.rotation.as_deref().copied().unwrap_or([0.0, 0.0, 0.0, 1.0]);
+        let rotation = DQuat::from_xyzw(x, y, z, w);
+        if !((rotation.length() - 1.0).abs() < 1e-2) {
+            let got = format!("{x} {y} {z} {w}");
+            return Err(self.bad("nodes rotated by a unit quaternion", got));
+        }
+        let vector = |v: &Option<Box<[f64; 3]>>, default: DVec3| {
+            v.as_deref().map_or(default, |v| DVec3::from(*v))
+        };
+        Ok(DMat4::from_scale_rotation_translation(
+            vector(&node.scale, DVec3::ONE),
+            rotation.normalize(),
+            vector(&node.translation, DVec3::ZERO),
+        ))
+    }
+
+    /// A node's matrix followed by the turn into our axes.
+    fn similarity(&self, world: DMat4) -> Result<Similarity> {
+        let linear = DMat3::from_mat4(world);
+        let scale = linear.determinant().cbrt();
+        let rotation = linear * scale.recip();
+        let gram = rotation.transpose() * rotation - DMat3::IDENTITY;
+        let error = gram.to_cols_array().iter().fold(0.0f64, |m, v| m.max(v.abs()));
+        let translation = world.w_axis.truncate();
+        if !(scale > 0.0 && error < 1e-4 && scale.is_finite() && translation.is_finite()) {
+            let got = format!("scale {scale}, distance from a rotation {error:.1e}");
+            return Err(self.bad("nodes that rotate, move and scale uniformly", got));
+        }
+        // Orthonormal to rounding, or the SH rotation would not be one.
+        let rotation = DMat3::from_quat(DQuat::from_mat3(&rotation).normalize());
+        Ok(Similarity {
+            // A unit scale came through a cube root.
+            scale: if (scale - 1.0).abs() < 1e-9 { 1.0 } else { scale },
+            rotation: HALF_TURN_X * rotation,
+            translation: HALF_TURN_X * translation,
+        })
+    }
+
+    fn mesh(&self, mesh: usize, budget: &mut usize) -> Result<Vec<Splats>> {
+        let mesh = self.item(&self.document.meshes, mesh, "mesh")?;
+        let mut parts = Vec::new();
+        for primitive in &mesh.primitives {
+            let Some(extension) = primitive.extensions.get(EXTENSION) else { continue };
+            if let Some(nested) = extension.extensions.keys().next() {
+                return Err(self.bad("attributes without compression", nested.clone()));
+            }
+            if primitive.mode != Some(POINTS) {
+                let got = format!("mode {:?}", primitive.mode);
+                return Err(self.bad("splats in a primitive of points", got));
+            }
+            parts.push(self.primitive(primitive, budget)?);
+        }
+        Ok(parts)
+    }
+
+    fn primitive(&self, primitive: &Primitive, budget: &mut usize) -> Result<Splats> {
+        let find = |name: &str, lanes: usize| -> Result<Column> {
+            let i = primitive.attributes.get(name).copied();
+            let i = i.ok_or_else(|| self.bad(format!("attribute {name}"), "none"))?;
+            self.column(i, name, lanes)
+        };
+        let own = |n: &str| format!("{EXTENSION}:{n}");
+        let position = find("POSITION", 3)?;
+        let quat = find(&own("ROTATION"), 4)?;
+        let scale = find(&own("SCALE"), 3)?;
+        let opacity = find(&own("OPACITY"), 1)?;
+        let has = |l: usize| {
+            (0..=2 * l).any(|n| {
+                primitive.attributes.contains_key(&own(&format!("SH_DEGREE_{l}_COEF_{n}")))
+            })
+        };
+        let sh_degree = (0..=SH_DEGREE_MAX).rev().find(|&l| has(l)).unwrap_or(0);
+        let mut sh = Vec::new();
+        for l in 0..=sh_degree {
+            for n in 0..=2 * l {
+                sh.push(find(&own(&format!("SH_DEGREE_{l}_COEF_{n}")), 3)?);
+            }
+        }
+        let count = position.count;
+        for column in [&quat, &scale, &opacity].into_iter().chain(&sh) {
+            if column.count != count {
+                let got = column.count.to_string();
+                return Err(self.bad(format!("{count} elements in each attribute"), got));
+            }
+        }
+        *budget = budget
+            .checked_sub(count)
+            .ok_or_else(|| self.bad("fewer Gaussians than bytes", "instances of instances"))?;
+        let mut incoming = Incoming::with_capacity(count, sh_degree);
+        for i in 0..count {
+            let [x, y, z, w] = quat.get(i);
+            let [px, py, pz, _] = position.get(i);
+            let [a, b, c, _] = scale.get(i);
+            let [alpha, ..] = opacity.get(i);
+            if !(0.0..=1.0).contains(&alpha) && alpha.is_finite() {
+                let place = format!(" splat {i}");
+                return Err(self.bad("an opacity in [0, 1]", alpha.to_string()).at(place));
+            }
+            if [a, b, c].iter().any(|s| *s < 0.0) {
+                let got = format!("{a} {b} {c}: logarithms, as early drafts had?");
+                let place = format!(" splat {i}");
+                return Err(self.bad("scales of 0 or more, linear", got).at(place));
+            }
+            let set = incoming.push([px, py, pz], [w, x, y, z], [a, b, c], alpha);
+            for (h, column) in set.chunks_exact_mut(3).zip(&sh) {
+                h.copy_from_slice(&column.get(i)[..3]);
+            }
+        }
+        incoming.into_splats(self.path)
+    }
+
+    /// An accessor whose every element lies within the binary chunk.
+    fn column(&self, accessor: usize, name: &str, lanes: usize) -> Result<Column<'_>> {
+        let d = &self.document;
+        let a = self.item(&d.accessors, accessor, "accessor")?;
+        let at = |e: Error| e.at(format!(" attribute {name}"));
+        let kind = ["SCALAR", "VEC2", "VEC3", "VEC4"].get(lanes - 1).copied().unwrap_or("");
+        if a.kind != kind || a.sparse.is_some() {
+            let got = if a.sparse.is_some() { "a sparse one" } else { a.kind.as_str() };
+            return Err(at(self.bad(format!("a plain accessor of {kind}"), got)));
+        }
+        let component = Component::of(a).ok_or_else(|| {
+            at(self
+                .bad("floats, or bytes and shorts of 8 or 16 bits", a.component_type.to_string()))
+        })?;
+        let view = a.buffer_view.ok_or_else(|| at(self.bad("a bufferView", "none")))?;
+        let view = self.item(&d.buffer_views, view, "bufferView").map_err(at)?;
+        let buffer = self.item(&d.buffers, view.buffer, "buffer").map_err(at)?;
+        if view.buffer != 0 || buffer.uri.is_some() {
+            return Err(at(self.bad("data in the file's own BIN chunk", "another buffer")));
+        }
+        let have = buffer.byte_length;
+        if have > self.binary.len() as u64 {
+            let got = self.binary.len().to_string();
+            return Err(at(self.bad(format!("{have} bytes in the BIN chunk"), got)));
+        }
+        let element = (component.size() * lanes) as u64;
+        let stride = view.byte_stride.unwrap_or(element);
+        let start = u128::from(view.byte_offset) + u128::from(a.byte_offset);
+        let last = u128::from(stride) * u128::from(a.count.saturating_sub(1));
+        let end = start + last + u128::from(element);
+        let view_end = u128::from(view.byte_offset) + u128::from(view.byte_length);
+        if stride < element || a.count == 0 || end > view_end || view_end > u128::from(have) {
+            let expected = format!("1 or more elements of {element} bytes within {have}");
+            let got = format!("{} with stride {stride} up to byte {end}", a.count);
+            return Err(at(self.bad(expected, got)));
+        }
+        Ok(Column {
+            bytes: &self.binary[start as usize..],
+            stride: stride as usize,
+            count: a.count as usize,
+            lanes,
+            component,
+        })
+    }
+}
+
+/// How a number is stored.
+#[derive(Clone, Copy)]
+enum Component {
+    Float,
+    Byte(bool),
+    UnsignedByte(bool),
+    Short(bool),
+    UnsignedShort(bool),
+}
+
+impl Component {
+    fn of(a: &Accessor) -> Option<Self> {
+        Some(match a.component_type {
+            FLOAT => Self::Float,
+            5120 => Self::Byte(a.normalized),
+            5121 => Self::UnsignedByte(a.normalized),
+            5122 => Self::Short(a.normalized),
+            UNSIGNED_SHORT => Self::UnsignedShort(a.normalized),
+            _ => return None,
+        })
+    }
+
+    fn size(self) -> usize {
+        match self {
+            Self::Float => 4,
+            Self::Byte(_) | Self::UnsignedByte(_) => 1,
+            Self::Short(_) | Self::UnsignedShort(_) => 2,
+        }
+    }
+
+    /// glTF 2.0, section 3.11: signed normalised numbers reach −1 twice.
+    fn value(self, b: &[u8]) -> f32 {
+        let scaled = |v: f32, top: f32, on: bool| if on { (v / top).max(-1.0) } else { v };
+        match self {
+            Self::Float => f32::from_le_bytes([b[0], b[1], b[2], b[3]]),
+            Self::Byte(n) => scaled(f32::from(b[0] as i8), 127.0, n),
+            Self::UnsignedByte(n) => scaled(f32::from(b[0]), 255.0, n),
+            Self::Short(n) => scaled(f32::from(i16::from_le_bytes([b[0], b[1]])), 32767.0, n),
+            Self::UnsignedShort(n) => {
+                scaled(f32::from(u16::from_le_bytes([b[0], b[1]])), 65535.0, n)
+            }
+        }
+    }
+}
+
+struct Column<'a> {
+    bytes: &'a [u8],
+    stride: usize,
+    count: usize,
+    lanes: usize,
+    component: Component,
+}
+
+impl Column<'_> {
+    /// Element `i`, zero beyond its lanes.
+    fn get(&self, i: usize) -> [f32; 4] {
+        let mut out = [0.0; 4];
+        let at = i * self.stride;
+        for (l, v) in out.iter_mut().enumerate().take(self.lanes) {
+            *v = self.component.value(&self.bytes[at + l * self.component.size()..]);
+        }
+        out
+    }
+}
+
+/// All parts as one set, at the highest degree among them.
+fn join(mut parts: Vec<Splats>, path: &Path) -> Result<Splats> {
+    if parts.len() == 1 {
+        return Ok(parts.remove(0));
+    }
+    let Some(sh_degree) = parts.iter().map(|p| p.sh_degree).max() else {
+        let expected = format!("a primitive with {EXTENSION} in the scene");
+        return Err(Error::format(path, expected, "none"));
+    };
+    let mut incoming = Incoming::with_capacity(parts.iter().map(Splats::len).sum(), sh_degree);
+    for part in &parts {
+        for i in 0..part.len() {
+            let set =
+                incoming.push(part.mean(i), part.quat_wxyz(i), part.scale(i), part.opacity(i));
+            let own = part.sh_of(i);
+            set[..own.len()].copy_from_slice(own);
+        }
+    }
+    incoming.into_splats(path)
+}

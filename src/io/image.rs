@@ -1,0 +1,344 @@
+//! Pictures in (PNG, JPEG, WebP, TIFF, BMP) and out (8-bit PNG, 16-bit depth PNG).
+//!
+//! In memory a picture is 8-bit RGB, rows from the top, as the evaluation protocol
+//! resizes it (MVSplat resizes uint8 with PIL); the network takes `[3, H, W]` floats
+//! in [0, 1]. No colour management: stored values are used as they are. EXIF
+//! orientation is reported, never applied: pose files speak of the stored pixels.
+
+use super::{Error, Result, read, write_atomic};
+use image::{ImageDecoder, ImageReader, Limits};
+use std::fs::File;
+use std::io::{BufReader, Write};
+use std::path::Path;
+
+/// A picture with more pixels than this is refused before anything is allocated.
+pub const MAX_PIXELS: u64 = 100_000_000;
+
+/// An 8-bit RGB picture.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Rgb {
+    /// Width, px.
+    pub width: usize,
+    /// Height, px.
+    pub height: usize,
+    /// `[H, W, 3]`, rows from the top.
+    pub data: Vec<u8>,
+}
+
+impl Rgb {
+    /// A black picture.
+    pub fn black(width: usize, height: usize) -> Self {
+        Self { width, height, data: vec![0; width * height * 3] }
+    }
+
+    /// `[3, H, W]` floats, value / 255.
+    pub fn to_planes(&self) -> Vec<f32> {
+        let mut planes = Vec::with_capacity(self.data.len());
+        for c in 0..3 {
+            planes.extend(self.data[c..].iter().step_by(3).map(|&v| f32::from(v) / 255.0));
+        }
+        planes
+    }
+
+    /// From `[3, H, W]` floats: clamped to [0, 1] (NaN is 0), times 255, rounded to
+    /// nearest. MVSplat truncates when it saves; rounding halves the error. Metrics
+    /// are taken from the floats, never from a saved picture.
+    ///
+    /// `None` if `planes` is not 3·W·H long.
+    pub fn from_planes(planes: &[f32], width: usize, height: usize) -> Option<Self> {
+        let area = width.checked_mul(height)?;
+        if planes.len() != area.checked_mul(3)? {
+            return None;
+        }
+        let mut data = Vec::with_capacity(planes.len());
+        for i in 0..area {
+            data.extend((0..3).map(|c| quantise(planes[c * area + i])));
+        }
+        Some(Self { width, height, data })
+    }
+
+    /// The window of `width` × `height` pixels at (`left`, `top`); `None` where it
+    /// does not lie inside.
+    pub fn window(&self, left: usize, top: usize, width: usize, height: usize) -> Option<Self> {
+        if left.checked_add(width)? > self.width || top.checked_add(height)? > self.height {
+            return None;
+        }
+        let mut data = Vec::with_capacity(3 * width * height);
+        for y in top..top + height {
+            let start = 3 * (y * self.width + left);
+            data.extend_from_slice(&self.data[start..start + 3 * width]);
+        }
+        Some(Self { width, height, data })
+    }
+}
+
+fn quantise(v: f32) -> u8 {
+    // `as` saturates, and NaN becomes 0.
+    (v * 255.0 + 0.5) as u8
+}
+
+/// What the header of a picture says.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Probe {
+    /// Stored width, px.
+    pub width: usize,
+    /// Stored height, px.
+    pub height: usize,
+    /// EXIF orientation 2 to 8, if one other than "as stored" is set.
+    pub orientation: Option<u8>,
+}
+
+fn refused(path: &Path, error: image::ImageError) -> Error {
+    match error {
+        image::ImageError::IoError(e) if e.raw_os_error().is_some() => Error::io(path, e),
+        e => Error::format(path, "a PNG, JPEG, WebP, TIFF or BMP picture", e.to_string()),
+    }
+}
+
+/// Opens the decoder of `path`, with the size already checked. The content decides
+/// which decoder, whatever the name's extension.
+fn decoder(path: &Path) -> Result<impl ImageDecoder> {
+    let file = File::open(path).map_err(|e| Error::io(path, e))?;
+    let mut reader = ImageReader::new(BufReader::new(file));
+    let mut limits = Limits::default();
+    // Sixteen-bit RGBA of the largest size, and as much again for the decoder.
+    limits.max_alloc = Some(MAX_PIXELS * 16);
+    reader.limits(limits);
+    let reader = reader.with_guessed_format().map_err(|e| Error::io(path, e))?;
+    if reader.format().is_none() {
+        let got = match std::fs::metadata(path) {
+            Ok(m) if m.len() == 0 => "an empty file",
+            _ => "bytes of no known picture format",
+        };
+        return Err(Error::format(path, "a PNG, JPEG, WebP, TIFF or BMP picture", got));
+    }
+    let decoder = reader.into_decoder().map_err(|e| refused(path, e))?;
+    let (w, h) = decoder.dimensions();
+    if w == 0 || h == 0 || u64::from(w) * u64::from(h) > MAX_PIXELS {
+        let expected = format!("1 to {} megapixels", MAX_PIXELS / 1_000_000);
+        return Err(Error::format(path, expected, format!("{w}x{h} pixels")));
+    }
+    Ok(decoder)
+}
+
+/// Size and orientation, from the header.
+///
+/// # Errors
+/// Missing, not a picture, more than [`MAX_PIXELS`].
+pub fn probe(path: &Path) -> Result<Probe> {
+    let mut decoder = decoder(path)?;
+    let (w, h) = decoder.dimensions();
+    // A broken EXIF block is no reason to refuse a picture that decodes.
+    let orientation = decoder.orientation().map_or(1, image::metadata::Orientation::to_exif);
+    Ok(Probe {
+        width: w as usize,
+        height: h as usize,
+        orientation: (orientation > 1).then_some(orientation),
+    })
+}
+
+/// Decodes a picture. Grey becomes three equal channels, 16 bits are rounded to 8,
+/// transparency is laid over black (the renderer's background).
+///
+/// # Errors
+/// Missing, truncated, not a picture, more than [`MAX_PIXELS`].
+pub fn load(path: &Path) -> Result<Rgb> {
+    let decoded =
+        image::DynamicImage::from_decoder(decoder(path)?).map_err(|e| refused(path, e))?;
+    let (width, height) = (decoded.width() as usize, decoded.height() as usize);
+    let data = if decoded.color().has_alpha() {
+        let rgba = decoded.into_rgba8().into_raw();
+        let over_black = |v: u8, a: u8| ((u32::from(v) * u32::from(a) + 127) / 255) as u8;
+        rgba.chunks_exact(4)
+            .flat_map(|p| [over_black(p[0], p[3]), over_black(p[1], p[3]), over_black(p[2], p[3])])
+            .collect()
+    } else {
+        decoded.into_rgb8().into_raw()
+    };
+    Ok(Rgb { width, height, data })
+}
+
+fn encode(
+    path: &Path,
+    data: &[u8],
+    w: usize,
+    h: usize,
+    kind: image::ExtendedColorType,
+) -> Result<Vec<u8>> {
+    use image::ImageEncoder;
+    let size = |v: usize| {
+        u32::try_from(v).map_err(|_| Error::format(path, "a side below 2^32", v.to_string()))
+    };
+    let mut bytes = Vec::new();
+    image::codecs::png::PngEncoder::new(&mut bytes)
+        .write_image(data, size(w)?, size(h)?, kind)
+        .map_err(|e| Error::io(path, std::io::Error::other(e)))?;
+    Ok(bytes)
+}
+
+/// Writes an 8-bit RGB PNG.
+///
+/// # Errors
+/// A buffer that does not fit the size; everything of [`write_atomic`].
+pub fn save_png(path: &Path, picture: &Rgb) -> Result<()> {
+    let expected = 3 * picture.width * picture.height;
+    if picture.data.len() != expected || expected == 0 {
+        let got = format!("{} for {}x{}", picture.data.len(), picture.width, picture.height);
+        return Err(Error::format(path, format!("{expected} bytes of pixels"), got));
+    }
+    let kind = image::ExtendedColorType::Rgb8;
+    let bytes = encode(path, &picture.data, picture.width, picture.height, kind)?;
+    write_atomic(path, |f| f.write_all(&bytes))
+}
+
+/// A depth map: camera z of each pixel centre, world units; 0 where there is none.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Depth {
+    /// Width, px.
+    pub width: usize,
+    /// Height, px.
+    pub height: usize,
+    /// `[H, W]`, world units.
+    pub data: Vec<f32>,
+}
+
+/// Key of the PNG text chunk that holds [`save_depth_png`]'s unit.
+const DEPTH_UNIT_KEY: &[u8] = b"depth_unit";
+
+/// Writes depth as 16-bit grey PNG and returns the unit: world units of one step.
+/// The unit is the smallest power of ten with which the greatest depth fits 65535,
+/// so metres up to 65 become millimetres; it also stands in the file as tEXt chunk
+/// `depth_unit`. 0 means no depth: for values not finite, or not above half a unit.
+///
+/// # Errors
+/// A buffer that does not fit the size; everything of [`write_atomic`].
+pub fn save_depth_png(path: &Path, depth: &Depth) -> Result<f32> {
+    let area = depth.width * depth.height;
+    if depth.data.len() != area || area == 0 {
+        let got = format!("{} for {}x{}", depth.data.len(), depth.width, depth.height);
+        return Err(Error::format(path, format!("{area} depths"), got));
+    }
+    let greatest = depth.data.iter().copied().filter(|d| d.is_finite()).fold(0.0f32, f32::max);
+    let exponent =
+        if greatest > 0.0 { (f64::from(greatest) / 65535.0).log10().ceil() } else { -3.0 };
+    let unit = 10f64.powi(exponent as i32);
+    let steps = |d: f32| if d.is_finite() { (f64::from(d) / unit).round() as u16 } else { 0 };
+    // The encoder takes native-endian samples and swaps them itself.
+    let samples: Vec<u8> = depth.data.iter().flat_map(|&d| steps(d).to_ne_bytes()).collect();
+    let kind = image::ExtendedColorType::L16;
+    let png = encode(path, &samples, depth.width, depth.height, kind)?;
+    let unit = unit as f32;
+    let mut text = DEPTH_UNIT_KEY.to_vec();
+    text.push(0);
+    text.extend(unit.to_string().bytes());
+    // Signature 8 bytes, then IHDR: 4 length, 4 name, 13 data, 4 checksum.
+    let (head, rest) = png.split_at(33);
+    write_atomic(path, |f| {
+        f.write_all(head)?;
+        f.write_all(&png_chunk(*b"tEXt", &text))?;
+        f.write_all(rest)
+    })?;
+    Ok(unit)
+}
+
+fn png_chunk(name: [u8; 4], data: &[u8]) -> Vec<u8> {
+    let mut chunk = (data.len() as u32).to_be_bytes().to_vec();
+    chunk.extend(name);
+    chunk.extend(data);
+    let mut crc = flate2::Crc::new();
+    crc.update(&chunk[4..]);
+    chunk.extend(crc.sum().to_be_bytes());
+    chunk
+}
+
+/// The `depth_unit` text of a PNG, if it has one.
+fn depth_unit(png: &[u8]) -> Option<f32> {
+    let mut rest = png.get(8..)?;
+    loop {
+        let length = u32::from_be_bytes(rest.get(..4)?.try_into().ok()?) as usize;
+        let data = rest.get(8..length.checked_add(8)?)?;
+        if rest.get(4..8)? == b"tEXt"
+            && let Some(value) =
+                data.strip_prefix(DEPTH_UNIT_KEY).and_then(|d| d.strip_prefix(&[0]))
+        {
+            return std::str::from_utf8(value).ok()?.parse().ok();
+        }
+        rest = rest.get(length.checked_add(12)?..)?;
+    }
+}
+
+/// Reads a 16-bit grey depth PNG. The unit is the file's own `depth_unit`, or else
+/// `unit` (0.001 for the usual millimetres).
+///
+/// # Errors
+/// Missing, truncated, not 16-bit grey, a unit that is not above zero.
+pub fn load_depth_png(path: &Path, unit: f32) -> Result<Depth> {
+    let decoded =
+        image::DynamicImage::from_decoder(decoder(path)?).map_err(|e| refused(path, e))?;
+    let image::DynamicImage::ImageLuma16(grey) = decoded else {
+        let got = format!("{:?}", decoded.color());
+        return Err(Error::format(path, "16-bit grey depth", got));
+    };
+    let unit = depth_unit(&read(path)?).unwrap_or(unit);
+    if !(unit > 0.0 && unit.is_finite()) {
+        return Err(Error::format(path, "a depth unit above 0", unit.to_string()));
+    }
+    let (width, height) = (grey.width() as usize, grey.height() as usize);
+    let data = grey.into_raw().into_iter().map(|v| f32::from(v) * unit).collect();
+    Ok(Depth { width, height, data })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn png_survives_and_floats_round() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.png");
+        let data: Vec<u8> = (0..5 * 4 * 3).map(|i| (i * 41 % 256) as u8).collect();
+        let picture = Rgb { width: 5, height: 4, data };
+        save_png(&path, &picture).unwrap();
+        assert_eq!(load(&path).unwrap(), picture);
+        assert_eq!(Rgb::from_planes(&picture.to_planes(), 5, 4).unwrap(), picture);
+        let odd = Rgb::from_planes(&[0.5001 / 255.0, f32::NAN, 7.0], 1, 1).unwrap();
+        assert_eq!(odd.data, [1, 0, 255]);
+        assert!(Rgb::from_planes(&[0.0; 4], 1, 1).is_none());
+        assert_eq!(picture.window(1, 2, 3, 2).unwrap().data[..3], picture.data[3 * 11..3 * 12]);
+        assert!(picture.window(3, 2, 3, 2).is_none());
+    }
+
+    #[test]
+    fn depth_survives_with_its_unit() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("d.png");
+        let data = vec![0.0, 1.25, f32::NAN, 60.0, f32::INFINITY, 12.3456];
+        let depth = Depth { width: 3, height: 2, data };
+        let unit = save_depth_png(&path, &depth).unwrap();
+        assert_eq!(unit, 0.001);
+        // The file's own unit wins over the caller's.
+        let back = load_depth_png(&path, 7.0).unwrap();
+        for (b, d) in back.data.iter().zip([0.0, 1.25, 0.0, 60.0, 0.0, 12.346]) {
+            assert!((b - d).abs() < 1e-5, "{b} {d}");
+        }
+        let far = Depth { width: 1, height: 1, data: vec![4000.0] };
+        assert_eq!(save_depth_png(&path, &far).unwrap(), 0.1);
+        assert_eq!(load_depth_png(&path, 7.0).unwrap().data[0], 4000.0);
+        let empty = Depth { width: 1, height: 1, data: vec![0.0] };
+        assert_eq!(save_depth_png(&path, &empty).unwrap(), 0.001);
+    }
+
+    #[test]
+    fn grey_alpha_and_sixteen_bits_are_taken() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.png");
+        image::GrayImage::from_raw(1, 1, vec![77]).unwrap().save(&path).unwrap();
+        assert_eq!(load(&path).unwrap().data, [77; 3]);
+        image::RgbaImage::from_raw(1, 1, vec![200, 100, 255, 128]).unwrap().save(&path).unwrap();
+        assert_eq!(load(&path).unwrap().data, [100, 50, 128]);
+        let deep: image::ImageBuffer<image::Rgb<u16>, _> =
+            image::ImageBuffer::from_raw(1, 1, vec![257u16 * 9, 257 * 9 + 200, 65535]).unwrap();
+        image::DynamicImage::ImageRgb16(deep).save(&path).unwrap();
+        assert_eq!(load(&path).unwrap().data, [9, 10, 255]);
+    }
+}

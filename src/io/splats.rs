@@ -1,0 +1,318 @@
+//! Splat files by name: which format, load, save, and what `subsplat info` tells.
+//!
+//! | format | in | out | SH written | axes of the file |
+//! |---|---|---|---|---|
+//! | `.ply` (INRIA 3DGS) | yes | yes | 3 (4 on demand) | ours, or as `up` says |
+//! | `.compressed.ply` (PlayCanvas) | yes | no | | |
+//! | `.glb` (KHR_gaussian_splatting) | yes | yes | 3 | y-up by a node's rotation |
+//! | `.spz` (Niantic, 1 to 4) | yes | version 3 | 3 | y-up by definition |
+//! | `.splat` (antimatter15) | yes | yes | 0 | ours, or as `up` says |
+//! | `.ksplat` (mkkellogg) | yes | no | | |
+//!
+//! Ours: OpenCV axes, y down, which viewers of `.ply` and `.splat` turn upright
+//! themselves. SH of degree 4 are dropped by default: viewers know 3.
+
+use super::gaussians::{Decoded, HALF_TURN_X, Outgoing, check_finite};
+use super::{Error, Result, glb, glb_read, ksplat, ply, read, splat, spz, write_atomic};
+use crate::abi::ALPHA_MIN;
+use crate::splats::Splats;
+use glam::{DMat3, DVec3};
+use serde::{Deserialize, Serialize};
+use std::fs::File;
+use std::io::{BufReader, Read};
+use std::path::Path;
+use std::str::FromStr;
+
+/// A kind of splat file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SplatFormat {
+    /// INRIA's `.ply`, or PlayCanvas' packed one.
+    Ply,
+    /// Binary glTF with KHR_gaussian_splatting.
+    Glb,
+    /// Niantic's `.spz`.
+    Spz,
+    /// antimatter15's `.splat`.
+    Splat,
+    /// mkkellogg's `.ksplat`.
+    Ksplat,
+}
+
+/// What [`load_splats`] accepts, for errors.
+const KNOWN: &str = "a .ply, .glb, .spz, .splat or .ksplat file";
+
+impl SplatFormat {
+    /// By the file name's ending, whatever its case.
+    pub fn from_name(path: &Path) -> Option<Self> {
+        let extension = path.extension()?.to_string_lossy().to_ascii_lowercase();
+        Some(match extension.as_str() {
+            "ply" => Self::Ply,
+            "glb" => Self::Glb,
+            "spz" => Self::Spz,
+            "splat" => Self::Splat,
+            "ksplat" => Self::Ksplat,
+            _ => return None,
+        })
+    }
+
+    /// By the first bytes, where the format has a magic.
+    pub fn from_magic(head: &[u8]) -> Option<Self> {
+        if head.starts_with(b"ply\n") || head.starts_with(b"ply\r") {
+            Some(Self::Ply)
+        } else if head.starts_with(&glb::MAGIC) {
+            Some(Self::Glb)
+        } else if head.starts_with(&spz::MAGIC) || head.starts_with(&[0x1f, 0x8b]) {
+            Some(Self::Spz)
+        } else {
+            None
+        }
+    }
+}
+
+/// Direction that is up in a written file.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Up {
+    /// Our world as it is: OpenCV axes, up is −y.
+    #[default]
+    Keep,
+    /// Half a turn about x: up is +y, −z forward (OpenGL).
+    Y,
+    /// A quarter turn about x: up is +z, +y forward (Blender).
+    Z,
+}
+
+impl Up {
+    /// From our axes to the file's.
+    fn turn(self) -> Option<DMat3> {
+        match self {
+            Self::Keep => None,
+            Self::Y => Some(HALF_TURN_X),
+            Self::Z => Some(DMat3::from_cols(DVec3::X, DVec3::NEG_Z, DVec3::Y)),
+        }
+    }
+}
+
+impl FromStr for Up {
+    type Err = String;
+
+    fn from_str(s: &str) -> std::result::Result<Self, String> {
+        match s {
+            "keep" => Ok(Self::Keep),
+            "y" => Ok(Self::Y),
+            "z" => Ok(Self::Z),
+            _ => Err(format!("up axis: expected keep, y or z, got {s:?}")),
+        }
+    }
+}
+
+/// How to write splats.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct SaveOptions {
+    /// Highest SH degree written; `None` is 3. Never more than is stored, nor than the
+    /// format holds (`.ply` 4, `.glb` and `.spz` 3, `.splat` 0).
+    pub sh_degree: Option<usize>,
+    /// Gaussians of a lower opacity are left out; 0 keeps all.
+    pub min_opacity: f32,
+    /// Rotation of means, quaternions and SH. `.glb` takes each (its node turns back);
+    /// `.spz` is y-up by definition and refuses `z`.
+    pub up: Up,
+    /// Lines for the header of a `.ply`, or the `asset` of a `.glb`.
+    pub comments: Vec<String>,
+}
+
+/// What was written.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct SaveReport {
+    /// Format.
+    pub format: SplatFormat,
+    /// Gaussians written.
+    pub count: usize,
+    /// Gaussians under the least opacity.
+    pub pruned: usize,
+    /// SH degree written.
+    pub sh_degree: usize,
+    /// SH degree that the splats had.
+    pub stored_sh_degree: usize,
+    /// Gaussians of which a σ was zero or less, and was raised to 1e-12.
+    pub clamped_scales: usize,
+    /// Size of the file.
+    pub bytes: u64,
+}
+
+/// Reads a splat file. Its first bytes decide where they are a magic, else its name.
+/// The result: standard SH basis, K = 1, unit world quaternions, no gain.
+///
+/// # Errors
+/// Unknown kind; whatever the format's reader says, with the file's name.
+pub fn load_splats(path: &Path) -> Result<Splats> {
+    let decoded = decode(path)?.1;
+    check_finite(&decoded.splats, path)?;
+    Ok(decoded.splats)
+}
+
+fn decode(path: &Path) -> Result<(SplatFormat, Decoded, u64)> {
+    let io = |e| Error::io(path, e);
+    let mut file = File::open(path).map_err(io)?;
+    let metadata = file.metadata().map_err(io)?;
+    let mut head = Vec::new();
+    Read::take(&mut file, 4).read_to_end(&mut head).map_err(io)?;
+    if head.starts_with(b"PK\x03\x04") {
+        let got = "a zip archive (.sog?): `npx @playcanvas/splat-transform` converts it to .ply";
+        return Err(Error::format(path, KNOWN, got));
+    }
+    let format = SplatFormat::from_magic(&head)
+        .or_else(|| SplatFormat::from_name(path))
+        .ok_or_else(|| Error::format(path, KNOWN, format!("first bytes {head:02x?}")))?;
+    // The largest files are .ply: streamed, where the size is known beforehand.
+    if format == SplatFormat::Ply && metadata.is_file() {
+        let mut reader = BufReader::with_capacity(1 << 16, File::open(path).map_err(io)?);
+        let decoded = ply::decode(&mut reader, metadata.len(), path)?;
+        return Ok((format, decoded, metadata.len()));
+    }
+    let mut bytes = head;
+    if metadata.is_file() {
+        bytes = read(path)?;
+    } else {
+        file.read_to_end(&mut bytes).map_err(io)?;
+    }
+    let decoded = match format {
+        SplatFormat::Ply => ply::decode(&mut bytes.as_slice(), bytes.len() as u64, path),
+        SplatFormat::Glb => glb_read::decode(&bytes, path),
+        SplatFormat::Spz => spz::decode(&bytes, path),
+        SplatFormat::Splat => splat::decode(&bytes, path),
+        SplatFormat::Ksplat => ksplat::decode(&bytes, path),
+    }?;
+    Ok((format, decoded, bytes.len() as u64))
+}
+
+/// Writes a splat file in the format of its name, whole or not at all.
+///
+/// Lossless in `.ply` and `.glb` (float) but for SH beyond the degree written; `.spz`
+/// and `.splat` quantise (their modules say how).
+///
+/// # Errors
+/// A name of no writable format, numbers that are not finite (the first Gaussian is
+/// named), an opacity out of [0, 1], nothing left to write, the operating system's.
+pub fn save_splats(path: &Path, splats: &Splats, options: &SaveOptions) -> Result<SaveReport> {
+    let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+    let format = SplatFormat::from_name(path)
+        .filter(|f| *f != SplatFormat::Ksplat && !name.ends_with(".compressed.ply"))
+        .ok_or_else(|| {
+            Error::format(path, "a name that ends in .ply, .glb, .spz or .splat", name.clone())
+        })?;
+    let survey = |turn, limit| Outgoing::new(splats, options, turn, limit, path);
+    let turn = options.up.turn();
+    let out = match format {
+        SplatFormat::Ply => survey(turn, 4)?,
+        SplatFormat::Glb => survey(turn, glb::SH_DEGREE_MAX)?,
+        SplatFormat::Splat => survey(turn, 0)?,
+        SplatFormat::Spz | SplatFormat::Ksplat if options.up == Up::Z => {
+            return Err(Error::format(path, "up keep or y (.spz is y-up by definition)", "z"));
+        }
+        SplatFormat::Spz | SplatFormat::Ksplat => survey(Some(HALF_TURN_X), 3)?,
+    };
+    match format {
+        SplatFormat::Ply => write_atomic(path, |f| ply::write(f, &out, options))?,
+        SplatFormat::Glb => {
+            let plan = glb::Plan::new(&out, options.up, &options.comments, path)?;
+            write_atomic(path, |f| plan.write(f, &out))?;
+        }
+        SplatFormat::Splat => write_atomic(path, |f| splat::write(f, &out))?,
+        SplatFormat::Spz | SplatFormat::Ksplat => {
+            let bits = spz::fraction_bits(&out, path)?;
+            write_atomic(path, |f| spz::write(f, &out, bits))?;
+        }
+    }
+    let bytes = std::fs::metadata(path).map_err(|e| Error::io(path, e))?.len();
+    Ok(SaveReport {
+        format,
+        count: out.count,
+        pruned: out.pruned,
+        sh_degree: out.sh_degree,
+        stored_sh_degree: splats.sh_degree,
+        clamped_scales: out.clamped_scales,
+        bytes,
+    })
+}
+
+/// What a splat file holds.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct SplatInfo {
+    /// Format.
+    pub format: SplatFormat,
+    /// Format with its version or encoding: `ply binary_little_endian`, `spz 3`.
+    pub flavour: String,
+    /// Size of the file.
+    pub bytes: u64,
+    /// Number of Gaussians.
+    pub count: usize,
+    /// SH degree.
+    pub sh_degree: usize,
+    /// Gaussians with a number that is NaN or infinite; left out of what follows.
+    pub non_finite: usize,
+    /// Gaussians too faint to be drawn anywhere (opacity below 1/255).
+    pub invisible: usize,
+    /// Least and largest mean, our axes; `None` without a finite Gaussian.
+    pub bounds: Option<[[f32; 3]; 2]>,
+    /// [`SplatInfo::QUANTILES`] of the opacity.
+    pub opacity: Vec<f32>,
+    /// [`SplatInfo::QUANTILES`] of σ, all three axes together, world units.
+    pub scale: Vec<f32>,
+    /// Comments of the file.
+    pub comments: Vec<String>,
+}
+
+impl SplatInfo {
+    /// Which quantiles are given: least, 1 %, quartiles, 99 %, largest.
+    pub const QUANTILES: [f64; 7] = [0.0, 0.01, 0.25, 0.5, 0.75, 0.99, 1.0];
+
+    fn of(format: SplatFormat, decoded: Decoded, bytes: u64) -> Self {
+        let s = &decoded.splats;
+        let set = 3 * s.sh_coefficients();
+        let finite = |i: usize| {
+            let sh = &s.sh[i * set..(i + 1) * set];
+            s.row(i).iter().chain(sh).all(|v| v.is_finite())
+        };
+        let mut bounds = [[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]];
+        let (mut opacity, mut scale) = (Vec::new(), Vec::new());
+        for i in (0..s.len()).filter(|&i| finite(i)) {
+            for (axis, m) in s.mean(i).into_iter().enumerate() {
+                bounds[0][axis] = bounds[0][axis].min(m);
+                bounds[1][axis] = bounds[1][axis].max(m);
+            }
+            opacity.push(s.opacity(i));
+            scale.extend(s.scale(i));
+        }
+        Self {
+            format,
+            flavour: decoded.flavour,
+            bytes,
+            count: s.len(),
+            sh_degree: s.sh_degree,
+            non_finite: s.len() - opacity.len(),
+            invisible: opacity.iter().filter(|o| **o < ALPHA_MIN).count(),
+            bounds: (!opacity.is_empty()).then_some(bounds),
+            opacity: quantiles(opacity),
+            scale: quantiles(scale),
+            comments: decoded.comments,
+        }
+    }
+}
+
+/// The value at the nearest rank of each quantile; nothing of nothing.
+fn quantiles(mut values: Vec<f32>) -> Vec<f32> {
+    values.sort_by(f32::total_cmp);
+    let rank = |q: f64| (q * (values.len() as f64 - 1.0)).round() as usize;
+    SplatInfo::QUANTILES.iter().filter_map(|q| values.get(rank(*q)).copied()).collect()
+}
+
+/// Reads a splat file and describes it, numbers that are not finite included.
+///
+/// # Errors
+/// As [`load_splats`], but for numbers that are not finite: those are counted.
+pub fn splat_info(path: &Path) -> Result<SplatInfo> {
+    let (format, decoded, bytes) = decode(path)?;
+    Ok(SplatInfo::of(format, decoded, bytes))
+}

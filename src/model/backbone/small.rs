@@ -1,0 +1,399 @@
+//! The small backbone: a plane sweep that a CPU trains and runs in seconds.
+//!
+//! In: [`Views`]. Out: [`BackboneOutput`], the same hand-over as MVSplat's, and the
+//! [`DepthMaps`] that depth supervision reads. Every part is a key of
+//! [`crate::config::Small`]; which of them matter, and by how much, was measured
+//! (ARCHITECTURE.md, "The small backbone").
+//!
+//! CNN to 1/4 → correlation of unit-length channels beside raw matching channels →
+//! 3-D stem shared over disparity → 2-D U-Net → logits over D candidates uniform in
+//! disparity → convex ×4 upsampling → heads at full resolution.
+//!
+//! Untrained it is already a working plane sweep: the stem begins as an aggregation
+//! of the raw scores, every learned correction at zero, the colour at the pixel's
+//! own. Parameters stand under `small.*`.
+
+use super::small_parts::{ConvexUpsampling, Stem, Unet, conv_norm_gelu, local_mean};
+use crate::abi::sh_coefficients;
+use crate::camera::Camera;
+use crate::config::{FeatureLevel, Small};
+use crate::model::layers::{Conv2d, ConvShape, GroupNorm, gelu, resize_bilinear, sigmoid, softmax};
+use crate::model::{BackboneOutput, Views};
+use crate::ops::matching::raw_matching;
+use crate::ops::plane_sweep::{Pair, Sweep, pair, plane_sweep, relative_pose};
+use crate::sh::C0;
+use candle_core::{D, Result, Tensor, bail};
+use candle_nn::{Init, VarBuilder};
+
+/// Kernel 5×5, stride 2, half the size.
+const K5S2: ConvShape = ConvShape { kernel: 5, stride: 2, padding: 2 };
+/// The raw head starts at σ = 0.6 input px: 0.5 + 14.5·sigmoid(x) = 3 fifths of a
+/// pixel ([`crate::config::Primaries`]).
+const SCALE_BIAS: f32 = -1.57;
+/// Untrained confidence: logit = 6·(mass around the mode) − 1.5, so that a sure
+/// pixel is opaque and a flat distribution faint.
+const CONFIDENCE_SLOPE: f64 = 6.0;
+const CONFIDENCE_SHIFT: f64 = -1.5;
+
+/// What depth supervision and inspection read; all at 1/4 but the last two.
+#[derive(Clone, Debug)]
+pub struct DepthMaps {
+    /// `[B·V, D, h, w]`: logits over candidates, index 0 = far.
+    pub logits: Tensor,
+    /// `[B·V, 1, H, W]`: disparity (1 / camera z) in candidate indices, 0 to D − 1.
+    pub index: Tensor,
+    /// `[B·V, 1, H, W]`: confidence in (0, 1).
+    pub confidence: Tensor,
+}
+
+/// A residual block at 1/4: x + GN(conv(GELU(GN(conv x)))), then GELU.
+#[derive(Clone, Debug)]
+struct Residual {
+    conv1: Conv2d,
+    norm1: GroupNorm,
+    conv2: Conv2d,
+    norm2: GroupNorm,
+}
+
+impl Residual {
+    fn new(c: usize, vb: VarBuilder) -> Result<Self> {
+        Ok(Self {
+            conv1: Conv2d::new(c, c, ConvShape::K3, vb.pp("conv1"))?,
+            norm1: GroupNorm::new(8, c, vb.pp("norm1"))?,
+            conv2: Conv2d::new(c, c, ConvShape::K3, vb.pp("conv2"))?,
+            norm2: GroupNorm::new(8, c, vb.pp("norm2"))?,
+        })
+    }
+
+    fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        let y = gelu(&self.norm1.forward(&self.conv1.forward(x)?)?)?;
+        gelu(&(x + self.norm2.forward(&self.conv2.forward(&y)?)?)?)
+    }
+}
+
+/// The network. Learned tensors under `small.*`.
+#[derive(Clone, Debug)]
+pub struct SmallBackbone {
+    config: Small,
+    down2: (Conv2d, GroupNorm),
+    down4: (Conv2d, GroupNorm),
+    blocks: Vec<Residual>,
+    matching: Conv2d,
+    stem: Option<Stem>,
+    stem_factor: Tensor,
+    unet: Unet,
+    logits: Conv2d,
+    confidence: (Conv2d, Conv2d),
+    upsampling: Option<ConvexUpsampling>,
+    project: Conv2d,
+    head1: Conv2d,
+    head2: Conv2d,
+}
+
+impl SmallBackbone {
+    /// Reads or initialises every tensor under `vb`'s prefix (`small`).
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape; the message names it.
+    pub fn new(config: &Small, vb: VarBuilder) -> Result<Self> {
+        let [c2, c4] = config.cnn_channels;
+        let zero = Init::Const(0.0);
+        let volume = if config.raw_matching { 1 + crate::ops::matching::CHANNELS } else { 1 };
+        let d = config.depth_candidates;
+        let swept = if config.stem_channels > 0 { d } else { d * volume };
+        let stem = match config.stem_channels {
+            0 => None,
+            s => Some(Stem::new(volume, s, vb.pp("stem"))?),
+        };
+        let unet = Unet::new(swept + c4, &config.unet_channels, vb.pp("unet"))?;
+        let top = config.unet_channels[0];
+        let upsampling = match config.convex_upsampling {
+            true => Some(ConvexUpsampling::new(top, vb.pp("upsampling"))?),
+            false => None,
+        };
+        let hidden = config.head_channels;
+        let outputs = 9 + 3 * sh_coefficients(config.primaries.sh_degree) + 1;
+        Ok(Self {
+            down2: conv_norm(3, c2, K5S2, vb.pp("down2"))?,
+            down4: conv_norm(c2, c4, ConvShape::K3S2, vb.pp("down4"))?,
+            blocks: (0..config.cnn_blocks)
+                .map(|i| Residual::new(c4, vb.pp("blocks").pp(i)))
+                .collect::<Result<_>>()?,
+            matching: Conv2d::new(c4, config.match_channels, ConvShape::K1, vb.pp("matching"))?,
+            stem,
+            stem_factor: vb.get_with_hints(1, "stem_factor", Init::Const(1.0))?,
+            unet,
+            logits: Conv2d::with(top, d, ConvShape::K3, (zero, Some(zero)), vb.pp("logits"))?,
+            confidence: (
+                Conv2d::new(top + 2, 32, ConvShape::K3, vb.pp("confidence.0"))?,
+                Conv2d::with(32, 1, ConvShape::K1, (zero, Some(zero)), vb.pp("confidence.1"))?,
+            ),
+            upsampling,
+            project: Conv2d::new(top, hidden, ConvShape::K1, vb.pp("project"))?,
+            head1: Conv2d::new(hidden + 5, hidden, ConvShape::K3, vb.pp("head.0"))?,
+            head2: Conv2d::with(
+                hidden,
+                outputs,
+                ConvShape::K3,
+                (zero, Some(zero)),
+                vb.pp("head.1"),
+            )?,
+            config: config.clone(),
+        })
+    }
+
+    /// Runs the network. `training` averages disparity over all candidates; else over
+    /// the window around the mode.
+    ///
+    /// # Errors
+    /// A picture whose sides are no multiples of the configuration's stride.
+    pub fn forward(&self, views: &Views, training: bool) -> Result<(BackboneOutput, DepthMaps)> {
+        let (b, v, _, h, w) = views.images.dims5()?;
+        let stride = 4 << (self.config.unet_channels.len() - 1);
+        if h % stride != 0 || w % stride != 0 {
+            bail!("small backbone: expected sides that are multiples of {stride}, got {h}x{w}");
+        }
+        let rgb = views.images.reshape((b * v, 3, h, w))?;
+        let feat2 = conv_norm_gelu(&(&rgb - 0.5)?, &self.down2)?;
+        let mut feat4 = conv_norm_gelu(&feat2, &self.down4)?;
+        for block in &self.blocks {
+            feat4 = block.forward(&feat4)?;
+        }
+        let stem = self.sweep(views, &feat4)?;
+        let deep = self.unet.forward(&Tensor::cat(&[&stem.input, &feat4], 1)?)?;
+        let mut logits = self.logits.forward(&deep)?;
+        if let Some(scores) = &stem.scores
+            && self.config.stem_skip
+        {
+            logits = (logits + (scores * 4.0)?.broadcast_mul(&self.stem_factor)?)?;
+        }
+        let (index, mass) = self.expected_index(&logits, training)?;
+        let rough = (&index - local_mean(&index)?)?.abs()?;
+        let hidden = Tensor::cat(&[&deep, &mass, &(rough / 4.0)?], 1)?;
+        let hidden = gelu(&self.confidence.0.forward(&hidden)?)?;
+        let confidence = (self.confidence.1.forward(&hidden)?
+            + mass.affine(CONFIDENCE_SLOPE, CONFIDENCE_SHIFT)?)?;
+        let (index, confidence) = match &self.upsampling {
+            Some(convex) => {
+                let mask = convex.mask(&deep, &rgb)?;
+                (convex.apply(&mask, &index)?, convex.apply(&mask, &confidence)?)
+            }
+            None => (resize_bilinear(&index, h, w)?, resize_bilinear(&confidence, h, w)?),
+        };
+        let heads = self.heads(&rgb, &deep, &index, &confidence)?;
+        let depths = self.ray_distance(views, &index)?;
+        let pool = |s: usize| -> Result<Tensor> { split_views(&deep.avg_pool2d(s)?, b, v) };
+        let features = vec![
+            (FeatureLevel::Trans4, split_views(&deep, b, v)?),
+            (FeatureLevel::Trans8, pool(2)?),
+            (FeatureLevel::Trans16, pool(4)?),
+            (FeatureLevel::Cnn4, split_views(&feat4, b, v)?),
+            (FeatureLevel::Cnn2, split_views(&feat2, b, v)?),
+            (FeatureLevel::Refine1, split_views(&heads.hidden, b, v)?),
+        ];
+        let output = BackboneOutput {
+            raw: heads.raw.reshape((b, v, h * w, ()))?,
+            depths,
+            densities: heads.density.reshape((b, v, h * w, 1))?,
+            features,
+        };
+        Ok((output, DepthMaps { logits, index, confidence: sigmoid(&confidence)? }))
+    }
+
+    /// Volume of matching scores, through the stem.
+    fn sweep(&self, views: &Views, feat4: &Tensor) -> Result<Swept> {
+        let unit = self.matching.forward(feat4)?;
+        let norm = (unit.sqr()?.transpose(1, 3)?.contiguous()?.sum_keepdim(D::Minus1)? + 1e-8)?;
+        let unit = unit.broadcast_div(&norm.sqrt()?.transpose(1, 3)?.contiguous()?)?;
+        let (_, channels, h, w) = unit.dims4()?;
+        let d = self.config.depth_candidates;
+        let disparities = candidates(views, d);
+        let sweep = Sweep {
+            pairs: pairs(views, h, w)?,
+            depths: disparities
+                .iter()
+                .flatten()
+                .map(|list| list.iter().map(|d| 1.0 / d).collect())
+                .collect(),
+            centre: 0.5,
+            min_z: 1e-3,
+            scale: 1.0,
+            channels,
+            size: [h, w],
+        };
+        // [B·V, 1, D, h, w]
+        let learned = plane_sweep(&unit, &unit, sweep)?.unsqueeze(1)?;
+        let volume = match self.config.raw_matching {
+            true => {
+                let raw = raw_matching(&views.images, &views.cameras, &disparities)?;
+                Tensor::cat(&[&learned, &raw], 1)?
+            }
+            false => learned,
+        };
+        match &self.stem {
+            Some(stem) => {
+                let scores = stem.forward(&volume)?;
+                Ok(Swept { input: scores.clone(), scores: Some(scores) })
+            }
+            None => Ok(Swept { input: volume.flatten(1, 2)?, scores: None }),
+        }
+    }
+
+    /// Expected candidate index `[B·V, 1, h, w]`, and the probability within the
+    /// window around the mode.
+    fn expected_index(&self, logits: &Tensor, training: bool) -> Result<(Tensor, Tensor)> {
+        let d = self.config.depth_candidates;
+        let pdf = softmax(&logits.permute((0, 2, 3, 1))?.contiguous()?)?;
+        let index = Tensor::arange(0f32, d as f32, pdf.device())?;
+        let mode = pdf.argmax_keepdim(D::Minus1)?.to_dtype(pdf.dtype())?;
+        let away = index.reshape((1, 1, 1, d))?.broadcast_sub(&mode)?.abs()?;
+        let window = away.le(self.config.mode_window.max(1) as f64 + 0.5)?.to_dtype(pdf.dtype())?;
+        let near = (&pdf * window)?;
+        let mass = near.sum_keepdim(D::Minus1)?;
+        let mean = if training || self.config.mode_window == 0 {
+            pdf.broadcast_mul(&index)?.sum_keepdim(D::Minus1)?
+        } else {
+            near.broadcast_mul(&index)?.sum_keepdim(D::Minus1)?.broadcast_div(&mass)?
+        };
+        let first = |t: Tensor| t.permute((0, 3, 1, 2))?.contiguous();
+        Ok((first(mean)?, first(mass)?))
+    }
+
+    fn heads(
+        &self,
+        rgb: &Tensor,
+        deep: &Tensor,
+        index: &Tensor,
+        confidence: &Tensor,
+    ) -> Result<Heads> {
+        let (views, _, h, w) = rgb.dims4()?;
+        let d = sh_coefficients(self.config.primaries.sh_degree);
+        let d_max = (self.config.depth_candidates - 1) as f64;
+        let projected = self.project.forward(deep)?;
+        // One view at a time: these are the largest tensors of the network.
+        let (mut raws, mut densities, mut hiddens) = (Vec::new(), Vec::new(), Vec::new());
+        for i in 0..views {
+            let one = |t: &Tensor| t.narrow(0, i, 1);
+            let (rgb, confidence) = (one(rgb)?, one(confidence)?);
+            let input = Tensor::cat(
+                &[
+                    &resize_bilinear(&one(&projected)?, h, w)?,
+                    &rgb,
+                    &(one(index)? / d_max)?,
+                    &sigmoid(&confidence)?,
+                ],
+                1,
+            )?;
+            let hidden = gelu(&self.head1.forward(&input)?)?;
+            let out = self.head2.forward(&hidden)?;
+            let raw = out.narrow(1, 0, 9 + 3 * d)?.flatten_from(2)?.transpose(1, 2)?;
+            raws.push((raw.contiguous()?.broadcast_add(&self.raw_start(&rgb)?))?);
+            let residual = out.narrow(1, 9 + 3 * d, 1)?;
+            densities.push(match self.config.confidence_opacity {
+                true => sigmoid(&(confidence + residual)?)?.sqr()?,
+                false => sigmoid(&(residual + 2.0)?)?,
+            });
+            hiddens.push(hidden);
+        }
+        Ok(Heads {
+            raw: Tensor::cat(&raws, 0)?,
+            density: Tensor::cat(&densities, 0)?,
+            hidden: Tensor::cat(&hiddens, 0)?,
+        })
+    }
+
+    /// `[1, H·W, 9 + 3·D]`: what the raw head corrects. Offset 0, σ of 0.6 px, no
+    /// rotation, the pixel's own colour (or mid-grey).
+    fn raw_start(&self, rgb: &Tensor) -> Result<Tensor> {
+        let (_, _, h, w) = rgb.dims4()?;
+        let d = sh_coefficients(self.config.primaries.sh_degree);
+        let shape = [0.0, 0.0, SCALE_BIAS, SCALE_BIAS, SCALE_BIAS, 0.0, 0.0, 0.0, 1.0];
+        let shape = Tensor::new(&shape, rgb.device())?.reshape((1, 1, 9))?;
+        let mut parts = vec![shape.broadcast_as((1, h * w, 9))?.contiguous()?];
+        let colour = match self.config.pixel_colour {
+            true => ((rgb - 0.5)? / C0)?,
+            false => rgb.zeros_like()?,
+        };
+        let rest = Tensor::zeros((1, h * w, d - 1), rgb.dtype(), rgb.device())?;
+        for c in 0..3 {
+            parts.push(colour.narrow(1, c, 1)?.reshape((1, h * w, 1))?);
+            if d > 1 {
+                parts.push(rest.clone());
+            }
+        }
+        Tensor::cat(&parts, 2)
+    }
+
+    /// Candidate index to distance along the unit ray, `[B, V, H·W, 1]`.
+    fn ray_distance(&self, views: &Views, index: &Tensor) -> Result<Tensor> {
+        let (b, v, _, h, w) = views.images.dims5()?;
+        let steps = (self.config.depth_candidates - 1) as f64;
+        let mut out = Vec::with_capacity(b * v);
+        for (i, (camera, &(near, far))) in
+            views.cameras.iter().flatten().zip(views.near_far.iter().flatten()).enumerate()
+        {
+            let (lo, hi) = (1.0 / f64::from(far), 1.0 / f64::from(near));
+            let disparity = index.narrow(0, i, 1)?.affine((hi - lo) / steps, lo)?;
+            let lengths = Tensor::from_vec(ray_lengths(camera), (1, 1, h, w), index.device())?;
+            out.push((lengths / disparity)?.reshape((1, h * w, 1))?);
+        }
+        Tensor::cat(&out, 0)?.reshape((b, v, h * w, 1))
+    }
+}
+
+struct Swept {
+    input: Tensor,
+    scores: Option<Tensor>,
+}
+
+struct Heads {
+    raw: Tensor,
+    density: Tensor,
+    hidden: Tensor,
+}
+
+fn conv_norm(c: usize, o: usize, s: ConvShape, vb: VarBuilder) -> Result<(Conv2d, GroupNorm)> {
+    Ok((Conv2d::new(c, o, s, vb.pp("conv"))?, GroupNorm::new(8, o, vb.pp("norm"))?))
+}
+
+fn split_views(t: &Tensor, b: usize, v: usize) -> Result<Tensor> {
+    let (_, c, h, w) = t.dims4()?;
+    t.reshape((b, v, c, h, w))
+}
+
+/// For each view, all others of its scene, at feature resolution h × w.
+fn pairs(views: &Views, h: usize, w: usize) -> Result<Vec<Vec<Pair>>> {
+    let v = views.views();
+    let mut all = Vec::new();
+    for (b, scene) in views.cameras.iter().enumerate() {
+        let cameras: Vec<Camera> = scene.iter().map(|c| c.resized(w, h)).collect();
+        for i in 0..v {
+            let others = (0..v).filter(|&j| j != i);
+            let row = |j: usize| {
+                let (r, s) = (&cameras[i], &cameras[j]);
+                pair(&r.intrinsics, &s.intrinsics, relative_pose(r, s), b * v + j)
+            };
+            all.push(others.map(row).collect::<Result<_>>()?);
+        }
+    }
+    Ok(all)
+}
+
+/// `[B][V]` lists of D disparities (1 / camera z), index 0 = far.
+fn candidates(views: &Views, d: usize) -> Vec<Vec<Vec<f32>>> {
+    let list = |&(near, far): &(f32, f32)| {
+        let (lo, hi) = (1.0 / far, 1.0 / near);
+        (0..d).map(|k| lo + (hi - lo) * k as f32 / (d - 1) as f32).collect()
+    };
+    views.near_far.iter().map(|scene| scene.iter().map(list).collect()).collect()
+}
+
+/// Length of K⁻¹(u, v, 1) at each pixel centre: distance along the ray over camera z.
+fn ray_lengths(camera: &Camera) -> Vec<f32> {
+    let k = camera.intrinsics;
+    let at = |i: usize| {
+        let (x, y) = ((i % k.width) as f32 + 0.5, (i / k.width) as f32 + 0.5);
+        k.unproject(glam::Vec2::new(x, y)).length()
+    };
+    (0..k.width * k.height).map(at).collect()
+}

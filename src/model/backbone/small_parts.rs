@@ -1,0 +1,207 @@
+//! Parts of the small backbone: 3-D stem, U-Net, convex upsampling.
+
+use crate::model::layers::{
+    Conv2d, ConvShape, GroupNorm, default_init, gelu, softmax, upsample_nearest,
+};
+use crate::ops::conv2d::conv2d;
+use candle_core::{D, Result, Tensor};
+use candle_nn::{Init, VarBuilder};
+
+/// GELU(GroupNorm(conv x)).
+pub(super) fn conv_norm_gelu(x: &Tensor, layer: &(Conv2d, GroupNorm)) -> Result<Tensor> {
+    gelu(&layer.1.forward(&layer.0.forward(x)?)?)
+}
+
+/// Edge pixels repeated once on every side of `[B, C, h, w]`.
+fn pad_edge(x: &Tensor) -> Result<Tensor> {
+    x.pad_with_same(2, 1, 1)?.pad_with_same(3, 1, 1)
+}
+
+/// Mean over 3×3 pixels of `[B, 1, h, w]`, edges repeated.
+pub(super) fn local_mean(x: &Tensor) -> Result<Tensor> {
+    let box3 = Tensor::full(1f32 / 9.0, (1, 1, 3, 3), x.device())?;
+    conv2d(&pad_edge(x)?, &box3, None, 1, 0)
+}
+
+/// Two 3×3×3 convolutions over (disparity, y, x), shared over all of them:
+/// `[B, C, D, h, w]` to scores `[B, D, h, w]`. PyTorch's Conv3d layout,
+/// `0.weight` `[S, C, 3, 3, 3]`, `1.weight` `[1, S, 3, 3, 3]`.
+///
+/// Run as 2-D convolutions over three neighbouring candidates' channels.
+#[derive(Clone, Debug)]
+pub(super) struct Stem {
+    weights: [Tensor; 2],
+    biases: [Tensor; 2],
+}
+
+/// Untrained stem, hidden channel 0: the raw scores times these (−|ΔRGB| counts
+/// fourfold, its range being a quarter; validity does not count), averaged over 3×3
+/// pixels, lifted by 4 into GELU's linear part.
+const STEM_SCORES: [f32; 4] = [1.0, 4.0, 1.0, 0.0];
+const STEM_LIFT: f32 = 4.0;
+/// Untrained gain of the second convolution, per score: with the skip's factor 4 a
+/// clear match stands about e⁶ above its rivals.
+const STEM_GAIN: f32 = 1.5;
+
+impl Stem {
+    pub(super) fn new(c: usize, s: usize, vb: VarBuilder) -> Result<Self> {
+        let random = |fan| default_init(fan);
+        let w0 = vb.get_with_hints((s, c, 3, 3, 3), "0.weight", random(c * 27))?;
+        let w1 = vb.get_with_hints((1, s, 3, 3, 3), "1.weight", Init::Const(0.0))?;
+        let b0 = vb.get_with_hints(s, "0.bias", Init::Const(0.0))?;
+        let b1 = vb.get_with_hints(1, "1.bias", Init::Const(0.0))?;
+        Ok(Self { weights: [w0, w1], biases: [b0, b1] })
+    }
+
+    pub(super) fn forward(&self, volume: &Tensor) -> Result<Tensor> {
+        let (b, _, d, h, w) = volume.dims5()?;
+        let x = volume.transpose(1, 2)?.contiguous()?; // [B, D, C, h, w]
+        let x = gelu(&conv3(&x, &self.weights[0], &self.biases[0])?)?;
+        conv3(&x, &self.weights[1], &self.biases[1])?.reshape((b, d, h, w))
+    }
+}
+
+/// 3×3×3 convolution of `[B, D, C, h, w]` (channels inside candidates), zero padding.
+fn conv3(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
+    let (b, d, c, h, w) = x.dims5()?;
+    let o = weight.dim(0)?;
+    let x = x.pad_with_zeros(1, 1, 1)?;
+    let neighbours = (0..3).map(|k| x.narrow(1, k, d)).collect::<Result<Vec<_>>>()?;
+    let x = Tensor::cat(&neighbours, 2)?.reshape((b * d, 3 * c, h, w))?;
+    let weight = weight.transpose(1, 2)?.contiguous()?.reshape((o, 3 * c, 3, 3))?;
+    conv2d(&x, &weight, Some(bias), 1, 1)?.reshape((b, d, o, h, w))
+}
+
+/// Starts of the stem's tensors that a hint cannot say.
+pub(crate) fn small_start(name: &str, shape: &[usize], values: &mut [f32]) {
+    match (name, shape) {
+        ("small.stem.0.weight", &[_, c, 3, 3, 3]) if c == STEM_SCORES.len() + 1 => {
+            values[..c * 27].fill(0.0);
+            for (k, factor) in STEM_SCORES.iter().enumerate() {
+                // Middle candidate, all nine pixels.
+                values[(k + 1) * 27 + 9..][..9].fill(factor / 9.0);
+            }
+        }
+        ("small.stem.0.bias", &[_]) => values[0] = STEM_LIFT,
+        ("small.stem.1.weight", &[1, _, 3, 3, 3]) => values[9..18].fill(STEM_GAIN / 9.0),
+        _ => {}
+    }
+}
+
+/// conv, GroupNorm, GELU, twice.
+#[derive(Clone, Debug)]
+struct Block([(Conv2d, GroupNorm); 2]);
+
+impl Block {
+    fn new(c: usize, o: usize, vb: VarBuilder) -> Result<Self> {
+        let layer = |i: usize, c: usize| -> Result<(Conv2d, GroupNorm)> {
+            let vb = vb.pp(i);
+            let conv = Conv2d::new(c, o, ConvShape::K3, vb.pp("conv"))?;
+            Ok((conv, GroupNorm::new(8, o, vb.pp("norm"))?))
+        };
+        Ok(Self([layer(0, c)?, layer(1, o)?]))
+    }
+
+    fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        conv_norm_gelu(&conv_norm_gelu(x, &self.0[0])?, &self.0[1])
+    }
+}
+
+/// U-Net from 1/4 downwards, one block a level on either side.
+#[derive(Clone, Debug)]
+pub(super) struct Unet {
+    down: Vec<Block>,
+    shrink: Vec<Conv2d>,
+    up: Vec<Block>,
+}
+
+impl Unet {
+    pub(super) fn new(c_in: usize, channels: &[usize], vb: VarBuilder) -> Result<Self> {
+        let (mut down, mut shrink, mut up) = (Vec::new(), Vec::new(), Vec::new());
+        for (l, &c) in channels.iter().enumerate() {
+            let from = if l == 0 { c_in } else { c };
+            down.push(Block::new(from, c, vb.pp("down").pp(l))?);
+            if let Some(&next) = channels.get(l + 1) {
+                shrink.push(Conv2d::new(c, next, ConvShape::K3S2, vb.pp("shrink").pp(l))?);
+                up.push(Block::new(c + next, c, vb.pp("up").pp(l))?);
+            }
+        }
+        Ok(Self { down, shrink, up })
+    }
+
+    /// `[B, c_in, h, w]` to `[B, channels[0], h, w]`.
+    pub(super) fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        let mut skips = Vec::new();
+        let mut x = self.down[0].forward(x)?;
+        for (shrink, block) in self.shrink.iter().zip(&self.down[1..]) {
+            let next = block.forward(&shrink.forward(&x)?)?;
+            skips.push(std::mem::replace(&mut x, next));
+        }
+        for (block, skip) in self.up.iter().zip(&skips).rev() {
+            x = block.forward(&Tensor::cat(&[skip, &upsample_nearest(&x, 2)?], 1)?)?;
+        }
+        Ok(x)
+    }
+}
+
+/// ×4 upsampling in which each fine pixel is a learned convex combination of the 3×3
+/// coarse pixels around it (RAFT, 3.3). Untrained: bilinear.
+#[derive(Clone, Debug)]
+pub(super) struct ConvexUpsampling {
+    hidden: Conv2d,
+    mask: Conv2d,
+}
+
+/// Log of the least share that an untrained mask gives a neighbour.
+const LEAST_SHARE: f32 = 1e-3;
+
+impl ConvexUpsampling {
+    pub(super) fn new(c: usize, vb: VarBuilder) -> Result<Self> {
+        let zero = Init::Const(0.0);
+        Ok(Self {
+            hidden: Conv2d::new(c + 48, 64, ConvShape::K3, vb.pp("0"))?,
+            mask: Conv2d::with(64, 144, ConvShape::K1, (zero, Some(zero)), vb.pp("1"))?,
+        })
+    }
+
+    /// `[B, h, w, 16, 9]`: shares of the nine coarse pixels for each fine one.
+    pub(super) fn mask(&self, deep: &Tensor, rgb: &Tensor) -> Result<Tensor> {
+        let (b, _, h, w) = deep.dims4()?;
+        // The picture's 4×4 blocks as channels.
+        let blocks = rgb.reshape(&[b, 3, h, 4, w, 4][..])?.permute([0, 1, 3, 5, 2, 4])?;
+        let blocks = (blocks.contiguous()?.reshape((b, 48, h, w))? - 0.5)?;
+        let hidden = gelu(&self.hidden.forward(&Tensor::cat(&[deep, &blocks], 1)?)?)?;
+        let logits = self.mask.forward(&hidden)?.reshape((b, 16, 9, h * w))?;
+        let logits = logits.permute((0, 3, 1, 2))?.contiguous()?;
+        let start = Tensor::from_vec(bilinear_shares(), (1, 1, 16, 9), deep.device())?;
+        softmax(&logits.broadcast_add(&start.log()?)?)?.reshape((b, h, w, 16, 9))
+    }
+
+    /// `[B, 1, h, w]` to `[B, 1, 4h, 4w]` under a mask.
+    pub(super) fn apply(&self, mask: &Tensor, x: &Tensor) -> Result<Tensor> {
+        let (b, _, h, w) = x.dims4()?;
+        let padded = pad_edge(x)?;
+        let mut around = Vec::with_capacity(9);
+        for k in 0..9 {
+            around.push(padded.narrow(2, k / 3, h)?.narrow(3, k % 3, w)?.reshape((b, h, w, 1, 1))?);
+        }
+        let fine = mask.broadcast_mul(&Tensor::cat(&around, 4)?)?.sum(D::Minus1)?;
+        let fine = fine.reshape(&[b, h, w, 4, 4][..])?.permute([0, 1, 3, 2, 4])?;
+        fine.contiguous()?.reshape((b, 1, 4 * h, 4 * w))
+    }
+}
+
+/// `[16, 9]`: shares of the 3×3 coarse pixels in bilinear ×4 upsampling, at least
+/// [`LEAST_SHARE`].
+fn bilinear_shares() -> Vec<f32> {
+    let axis = |i: usize| {
+        let o = (i as f32 + 0.5) / 4.0 - 0.5;
+        [(-o).max(0.0), 1.0 - o.abs(), o.max(0.0)]
+    };
+    let mut shares = Vec::with_capacity(144);
+    for i in 0..16 {
+        let (wy, wx) = (axis(i / 4), axis(i % 4));
+        shares.extend((0..9).map(|k| (wy[k / 3] * wx[k % 3]).max(LEAST_SHARE)));
+    }
+    shares
+}

@@ -1,0 +1,98 @@
+//! Linear layers with chosen initial values, and a LayerNorm that keeps its
+//! gradient where one is wanted.
+
+use candle_core::{D, Result, Tensor};
+use candle_nn::{Init, Linear, Module, VarBuilder};
+
+/// Whether a forward pass serves a picture or a gradient.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Mode {
+    /// Fused kernels without gradient, nothing random.
+    Infer,
+    /// Everything differentiable; `seed` decides what is dropped.
+    Train {
+        /// Of this step.
+        seed: u64,
+    },
+}
+
+/// Uniform in ±√(6/(in + out)) (Xavier, Glorot).
+pub(crate) fn xavier(inputs: usize, outputs: usize) -> Init {
+    let bound = (6.0 / (inputs + outputs) as f64).sqrt();
+    Init::Uniform { lo: -bound, up: bound }
+}
+
+/// y = x·Wᵀ + b with `weight` initialised as said and `bias` at zero.
+pub(crate) fn linear(
+    inputs: usize,
+    outputs: usize,
+    weight: Init,
+    vb: VarBuilder,
+) -> Result<Linear> {
+    let w = vb.get_with_hints((outputs, inputs), "weight", weight)?;
+    let b = vb.get_with_hints(outputs, "bias", Init::Const(0.0))?;
+    Ok(Linear::new(w, Some(b)))
+}
+
+/// ε of every LayerNorm (PyTorch's default).
+const NORM_EPS: f64 = 1e-5;
+
+/// (x − mean)/√(variance + ε)·weight + bias over the last axis.
+#[derive(Clone, Debug)]
+pub struct LayerNorm {
+    weight: Tensor,
+    bias: Tensor,
+}
+
+impl LayerNorm {
+    /// Parameters `weight` and `bias` of `dim` numbers.
+    pub fn new(dim: usize, vb: VarBuilder) -> Result<Self> {
+        Ok(Self {
+            weight: vb.get_with_hints(dim, "weight", Init::Const(1.0))?,
+            bias: vb.get_with_hints(dim, "bias", Init::Const(0.0))?,
+        })
+    }
+
+    /// `x` `[.., dim]`. Candle's fused kernel has no gradient, so it serves
+    /// [`Mode::Infer`] only.
+    pub fn forward(&self, x: &Tensor, mode: Mode) -> Result<Tensor> {
+        if mode == Mode::Infer {
+            let x = x.contiguous()?;
+            return candle_nn::ops::layer_norm(&x, &self.weight, &self.bias, NORM_EPS as f32);
+        }
+        let x = x.broadcast_sub(&x.mean_keepdim(D::Minus1)?)?;
+        let variance = x.sqr()?.mean_keepdim(D::Minus1)?;
+        x.broadcast_div(&(variance + NORM_EPS)?.sqrt()?)?
+            .broadcast_mul(&self.weight)?
+            .broadcast_add(&self.bias)
+    }
+}
+
+/// (Linear, ReLU, LayerNorm) twice: an attribute MLP of PixelGaussian and
+/// GaussianFormer. Parameters `lin0`, `ln0`, `lin1`, `ln1`.
+#[derive(Clone, Debug)]
+pub(crate) struct Block2 {
+    lin: [Linear; 2],
+    ln: [LayerNorm; 2],
+}
+
+impl Block2 {
+    pub(crate) fn new(inputs: usize, dim: usize, vb: VarBuilder) -> Result<Self> {
+        let relu = candle_nn::init::DEFAULT_KAIMING_UNIFORM;
+        Ok(Self {
+            lin: [
+                linear(inputs, dim, relu, vb.pp("lin0"))?,
+                linear(dim, dim, relu, vb.pp("lin1"))?,
+            ],
+            ln: [LayerNorm::new(dim, vb.pp("ln0"))?, LayerNorm::new(dim, vb.pp("ln1"))?],
+        })
+    }
+
+    pub(crate) fn forward(&self, x: &Tensor, mode: Mode) -> Result<Tensor> {
+        let mut x = x.clone();
+        for (lin, ln) in self.lin.iter().zip(&self.ln) {
+            x = ln.forward(&lin.forward(&x)?.relu()?, mode)?;
+        }
+        Ok(x)
+    }
+}

@@ -1,0 +1,130 @@
+//! The whole model: posed pictures to children.
+
+use super::backbone::{Mvsplat, SmallBackbone};
+use super::primaries::primaries;
+use super::trace::Trace;
+use super::trunk::{Children, Trunk};
+use super::{BackboneOutput, Primaries, Views};
+use crate::config::{Backbone, Config, FeatureLevel};
+use candle_core::{Error, Result, bail};
+use candle_nn::VarBuilder;
+
+enum Encoder {
+    Mvsplat(Box<Mvsplat>),
+    Small(Box<SmallBackbone>),
+}
+
+/// SubSplat with its backbone, built from one [`Config`].
+///
+/// Parameter names: MVSplat's own at the root (a converted checkpoint loads as it
+/// is, with or without its `encoder.` prefix), the small backbone under `small.`,
+/// everything that SubSplat adds under `subsplat.`.
+pub struct SubSplat {
+    config: Config,
+    encoder: Encoder,
+    trunk: Trunk,
+}
+
+/// One scene out of [`SubSplat::forward`].
+pub struct SceneOutput {
+    /// The Gaussians that are rendered.
+    pub children: Children,
+    /// Distance along the unit ray of each input pixel (its first Gaussian's),
+    /// `[V, H·W]`, world units.
+    pub depths: Vec<Vec<f32>>,
+}
+
+/// The stages that [`SubSplat::forward`] announces, in order.
+pub const STAGES: [&str; 3] = ["backbone", "primaries", "subsplat"];
+
+impl SubSplat {
+    /// Builds the model; `vb` is at the root of the names.
+    ///
+    /// # Errors
+    /// A configuration out of range; a tensor that is missing or has another shape,
+    /// named with both shapes.
+    pub fn new(config: &Config, vb: VarBuilder) -> Result<Self> {
+        config.check().map_err(Error::wrap)?;
+        let encoder = match &config.backbone {
+            Backbone::Mvsplat(c) => Encoder::Mvsplat(Box::new(Mvsplat::new(c, vb.clone())?)),
+            Backbone::Small(c) => Encoder::Small(Box::new(SmallBackbone::new(c, vb.pp("small"))?)),
+        };
+        let trunk = Trunk::new(config, &feature_channels(config), vb)?;
+        Ok(Self { config: config.clone(), encoder, trunk })
+    }
+
+    /// The configuration that the model was built from.
+    pub fn config(&self) -> &Config {
+        &self.config
+    }
+
+    /// The backbone alone, at inference.
+    ///
+    /// # Errors
+    /// Sides that are no multiples of [`Config::stride`].
+    pub fn encode(&self, views: &Views) -> Result<BackboneOutput> {
+        let (h, w) = views.size()?;
+        let stride = self.config.stride();
+        if h % stride != 0 || w % stride != 0 {
+            bail!("input images: expected sides that are multiples of {stride}, got {w}x{h}");
+        }
+        match &self.encoder {
+            Encoder::Mvsplat(encoder) => encoder.forward(views, &mut Trace::off()),
+            Encoder::Small(encoder) => Ok(encoder.forward(views, false)?.0),
+        }
+    }
+
+    /// World-frame primaries of what the backbone gave.
+    ///
+    /// # Errors
+    /// Shapes that do not fit `views`.
+    pub fn primaries(&self, views: &Views, output: &BackboneOutput) -> Result<Primaries> {
+        primaries(output, views, self.config.primaries(), &mut Trace::off())
+    }
+
+    /// Pictures to children, one [`SceneOutput`] a scene. `stage` hears the name of
+    /// each stage ([`STAGES`]) as it begins.
+    ///
+    /// # Errors
+    /// Whatever a stage finds wrong with its input; a result that is not finite.
+    pub fn forward(
+        &self,
+        views: &Views,
+        stage: &mut dyn FnMut(&'static str),
+    ) -> Result<Vec<SceneOutput>> {
+        let mut scenes = Vec::with_capacity(views.scenes());
+        for b in 0..views.scenes() {
+            // Scenes do not see one another; one at a time bounds the memory.
+            let views = views.scene(b)?;
+            stage(STAGES[0]);
+            let output = self.encode(&views)?;
+            stage(STAGES[1]);
+            let parents = self.primaries(&views, &output)?;
+            stage(STAGES[2]);
+            let children = self.trunk.forward(&views, &output, &parents)?;
+            let depths = output.depths.narrow(3, 0, 1)?.squeeze(3)?.squeeze(0)?.to_vec2()?;
+            scenes.push(SceneOutput { children, depths });
+        }
+        Ok(scenes)
+    }
+}
+
+/// Channels of every feature level that the configuration's backbone has.
+pub fn feature_channels(config: &Config) -> Vec<(FeatureLevel, usize)> {
+    let [quarter, cnn4, cnn2, full] = match &config.backbone {
+        Backbone::Mvsplat(c) => {
+            [c.cnn_channels[2], c.cnn_channels[2], c.cnn_channels[0], c.refine_channels]
+        }
+        Backbone::Small(c) => {
+            [c.unet_channels[0], c.cnn_channels[1], c.cnn_channels[0], c.head_channels]
+        }
+    };
+    vec![
+        (FeatureLevel::Trans4, quarter),
+        (FeatureLevel::Trans8, quarter),
+        (FeatureLevel::Trans16, quarter),
+        (FeatureLevel::Cnn4, cnn4),
+        (FeatureLevel::Cnn2, cnn2),
+        (FeatureLevel::Refine1, full),
+    ]
+}

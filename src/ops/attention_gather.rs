@@ -1,0 +1,147 @@
+//! Fused attention over bilinear samples of feature maps as one candle op, with
+//! gradients for maps, query and points (SubSplat A.2; spec 1.6). Formulas and
+//! layouts: [`crate::cpu::attention_gather`]. Tests: tests/aggregation.rs.
+
+use super::{Number, by_dtype, elements, slice};
+use crate::cpu::attention_gather as cpu;
+use candle_core::backend::BackendStorage;
+use candle_core::{CpuStorage, CustomOp3, DType, Layout, Result, Shape, Tensor, bail};
+
+pub use cpu::{Drop, Gather, Level};
+
+const NAME: &str = "attention_gather";
+
+/// Attention output `[N, E]`. `maps` `[cells, stride]`, `query` `[N, Q]`, `points`
+/// `[N, V, M or L·M, 2]`, all `f32` or all `f64`; layouts at
+/// [`crate::cpu::attention_gather`], sizes by `gather`.
+///
+/// # Errors
+/// Shapes that do not fit `gather` or one another, mixed dtypes.
+pub fn attention_gather(
+    maps: &Tensor,
+    query: &Tensor,
+    points: &Tensor,
+    gather: Gather,
+) -> Result<Tensor> {
+    let g = &gather;
+    let rows = query.dim(0)?;
+    let level_ends = |l: &Level| l.first_cell + g.views * l.height * l.width;
+    if g.groups == 0 || !g.dim.is_multiple_of(g.groups) || g.points == 0 || g.views == 0 {
+        bail!("{NAME}: expected groups that divide E, points and views, got {g:?}");
+    }
+    let channels = g.dim + g.value.max(g.key.unwrap_or(0));
+    let expected = g.levels.iter().map(level_ends).max().unwrap_or(0);
+    let (cells, stride) = maps.dims2()?;
+    if stride != g.stride || stride < channels || stride % g.dim != 0 || cells < expected {
+        bail!(
+            "{NAME} maps: expected [{expected}, {}] with {channels} channels in use, got {:?}",
+            g.stride,
+            maps.dims()
+        );
+    }
+    let lane_ok = |start: usize| start.is_multiple_of(g.dim);
+    if !lane_ok(g.value) || !g.key.is_none_or(lane_ok) {
+        bail!("{NAME}: expected keys and values to start at multiples of E = {}", g.dim);
+    }
+    if query.dims() != [rows, g.query_width()] {
+        bail!("{NAME} query: expected [N, {}], got {:?}", g.query_width(), query.dims());
+    }
+    let expected = [rows, g.views, g.points_width(), 2];
+    if points.dims() != expected {
+        bail!("{NAME} points: expected {expected:?}, got {:?}", points.dims());
+    }
+    let op = AttentionGather(gather);
+    maps.contiguous()?.apply_op3(&query.contiguous()?, &points.contiguous()?, op)
+}
+
+struct AttentionGather(Gather);
+
+impl CustomOp3 for AttentionGather {
+    fn name(&self) -> &'static str {
+        NAME
+    }
+
+    fn cpu_fwd(
+        &self,
+        s1: &CpuStorage,
+        l1: &Layout,
+        s2: &CpuStorage,
+        l2: &Layout,
+        s3: &CpuStorage,
+        l3: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        let args = [(s1, l1), (s2, l2), (s3, l3)];
+        by_dtype!(NAME, s1.dtype(), forward(&self.0, args))
+    }
+
+    fn bwd(
+        &self,
+        maps: &Tensor,
+        query: &Tensor,
+        points: &Tensor,
+        _: &Tensor,
+        grad: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        by_dtype!(NAME, maps.dtype(), backward(&self.0, [maps, query, points, grad]))
+    }
+}
+
+fn forward<T: Number>(
+    g: &Gather,
+    [maps, query, points]: [(&CpuStorage, &Layout); 3],
+) -> Result<(CpuStorage, Shape)> {
+    let rows = query.1.dims()[0];
+    let maps = slice::<T>(NAME, "maps", maps.0, maps.1)?;
+    let query = slice::<T>(NAME, "query", query.0, query.1)?;
+    let points = slice::<T>(NAME, "points", points.0, points.1)?;
+    let mut out = vec![T::default(); rows * g.dim];
+    cpu::forward(g, maps, query, points, &mut out);
+    Ok((T::to_cpu_storage_owned(out), Shape::from((rows, g.dim))))
+}
+
+type Triple = (Option<Tensor>, Option<Tensor>, Option<Tensor>);
+
+fn backward<T: Number>(g: &Gather, [maps, query, points, grad]: [&Tensor; 4]) -> Result<Triple> {
+    let device = maps.device();
+    let (m, q) = (elements::<T>(maps)?, elements::<T>(query)?);
+    let (p, o) = (elements::<T>(points)?, elements::<T>(grad)?);
+    let d = cpu::backward(g, &m, &q, &p, &o);
+    let points = match g.point_gradient {
+        true => Some(Tensor::from_vec(d.points, points.dims(), device)?),
+        false => None,
+    };
+    Ok((
+        Some(Tensor::from_vec(d.maps, maps.dims(), device)?),
+        Some(Tensor::from_vec(d.query, query.dims(), device)?),
+        points,
+    ))
+}
+
+/// Visibility `[N, V]` in [0, 1] of N points in V views by the views' own depth
+/// maps (spec 5.3): `points` `[N, V, 2]` in [0, 1]², their camera z `[N, V]`,
+/// `depths` `[V, H, W]` camera z. A constant of the graph: no gradient passes.
+///
+/// # Errors
+/// Shapes that do not fit one another, a dtype other than `f32`.
+pub fn occlusion_gate(points: &Tensor, z: &Tensor, depths: &Tensor) -> Result<Tensor> {
+    let (n, v, two) = points.dims3()?;
+    let (views, height, width) = depths.dims3()?;
+    if two != 2 || z.dims() != [n, v] || views != v {
+        bail!(
+            "occlusion gate: expected points [N, V, 2], z [N, V] and depths [V, H, W], got {:?}, {:?} and {:?}",
+            points.dims(),
+            z.dims(),
+            depths.dims()
+        );
+    }
+    let dtype = points.dtype();
+    let host = |t: &Tensor| t.to_dtype(DType::F32)?.flatten_all()?.to_vec1::<f32>();
+    let (at, z, maps) = (host(points)?, host(z)?, host(depths)?);
+    let area = height * width;
+    let gate = |i: usize| {
+        let map = cpu::DepthMap { z: &maps[i % v * area..(i % v + 1) * area], height, width };
+        cpu::occlusion(map, [at[2 * i], at[2 * i + 1]], z[i])
+    };
+    let gates: Vec<f32> = (0..n * v).map(gate).collect();
+    Tensor::from_vec(gates, (n, v), points.device())?.to_dtype(dtype)
+}

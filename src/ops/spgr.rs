@@ -1,0 +1,193 @@
+//! Sub-pixel Gaussian reparameterization as a candle op without gradient, and into
+//! buffers of the caller's. Formulas and layouts: [`crate::cpu::spgr`]; the same
+//! with gradients, unfused: `model/spgr_ref.rs`. Tests: tests/spgr.rs.
+
+use super::{Number, by_dtype, slice};
+use crate::abi::{HEAD_LANES, SPLAT_LANES};
+use crate::camera::Camera;
+use crate::cpu::spgr as cpu;
+use candle_core::backend::BackendStorage;
+use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Storage, Tensor, bail};
+
+pub use cpu::{CHILDREN_MAX, Rules};
+
+const NAME: &str = "spgr";
+
+/// One call's constants.
+#[derive(Clone, Debug)]
+pub struct Spgr {
+    /// Rules in numbers.
+    pub rules: Rules,
+    /// V context cameras, pixels of the input pictures.
+    pub cameras: Vec<Camera>,
+    /// Near plane of each view, world units.
+    pub near: Vec<f32>,
+    /// Parents per view.
+    pub per_view: usize,
+    /// Index of parent 0 of this call in the scene.
+    pub first: usize,
+}
+
+impl Spgr {
+    fn check(&self, head: &Tensor, parents: &Tensor) -> Result<usize> {
+        let n = parents.dim(0)?;
+        let k = self.rules.children();
+        if k == 0 || k > CHILDREN_MAX {
+            bail!("{NAME}: expected 1 to {CHILDREN_MAX} children per parent, got {k}");
+        }
+        if parents.dims() != [n, SPLAT_LANES] || head.dims() != [n, k, HEAD_LANES] {
+            bail!(
+                "{NAME}: expected parents [N, {SPLAT_LANES}] and head records [N, {k}, {HEAD_LANES}], got {:?} and {:?}",
+                parents.dims(),
+                head.dims()
+            );
+        }
+        if self.cameras.is_empty() || self.near.len() != self.cameras.len() || self.per_view == 0 {
+            bail!(
+                "{NAME}: expected one near plane per camera and parents in every view, got {} cameras, {} near planes, {} parents per view",
+                self.cameras.len(),
+                self.near.len(),
+                self.per_view
+            );
+        }
+        Ok(n)
+    }
+
+    fn source(&self) -> cpu::Source<'_> {
+        let Self { cameras, near, per_view, first, .. } = self;
+        cpu::Source { cameras, near, per_view: *per_view, first: *first }
+    }
+}
+
+/// Children `[N·K, 11]` and gains `[N·K]` or `[N·K, 4]` of `parents` `[N, 11]` with
+/// head records `head` `[N, K, 11]`; `f32` or `f64`. Without gradient: a backward
+/// pass through it is an error that says so.
+///
+/// # Errors
+/// Shapes that do not fit one another, or an input that gives a number that is not
+/// finite (named by parent and child).
+pub fn spgr(head: &Tensor, parents: &Tensor, call: &Spgr) -> Result<(Tensor, Tensor)> {
+    let n = call.check(head, parents)?;
+    let count = n * call.rules.children();
+    let lanes = call.rules.gain_lanes();
+    let packed = head.contiguous()?.apply_op2(&parents.contiguous()?, Fused(call.clone()))?;
+    let rows = packed.narrow(0, 0, count * SPLAT_LANES)?.reshape((count, SPLAT_LANES))?;
+    let gains = packed.narrow(0, count * SPLAT_LANES, count * lanes)?;
+    let gains = if lanes == 1 { gains } else { gains.reshape((count, lanes))? };
+    Ok((rows, gains))
+}
+
+/// [`spgr`] of `f32` tensors into `rows` (N·K·11 floats) and `gains` (N·K or N·K·4).
+///
+/// # Errors
+/// Those of [`spgr`], and buffers of another length.
+pub fn spgr_into(
+    head: &Tensor,
+    parents: &Tensor,
+    call: &Spgr,
+    rows: &mut [f32],
+    gains: &mut [f32],
+) -> Result<()> {
+    let n = call.check(head, parents)?;
+    let count = n * call.rules.children();
+    let expected = (count * SPLAT_LANES, count * call.rules.gain_lanes());
+    if (rows.len(), gains.len()) != expected {
+        let got = (rows.len(), gains.len());
+        bail!("{NAME}: expected buffers of {expected:?} floats, got {got:?}");
+    }
+    let (head, parents) = (head.contiguous()?, parents.contiguous()?);
+    let (hs, hl) = head.storage_and_layout();
+    let (ps, pl) = parents.storage_and_layout();
+    let (Storage::Cpu(hs), Storage::Cpu(ps)) = (&*hs, &*ps) else {
+        bail!("{NAME}: expected tensors on the CPU")
+    };
+    let head = slice::<f32>(NAME, "head records", hs, hl)?;
+    let parents = slice::<f32>(NAME, "parents", ps, pl)?;
+    cpu::forward(&call.rules, call.source(), head, parents, rows, gains);
+    finite(call, head, parents, rows, gains)
+}
+
+/// Refuses numbers that are not finite, on the way in (an infinite opacity would be
+/// capped, an infinite gain squashed: wrong answers in silence) and on the way out.
+fn finite<T: Number>(
+    call: &Spgr,
+    head: &[T],
+    parents: &[T],
+    rows: &[T],
+    gains: &[T],
+) -> Result<()> {
+    let bad =
+        |data: &[T], width: usize| data.iter().position(|v| !finite_number(*v)).map(|i| i / width);
+    let k = call.rules.children();
+    if let Some(n) = bad(parents, SPLAT_LANES) {
+        let row = &parents[n * SPLAT_LANES..(n + 1) * SPLAT_LANES];
+        bail!("{NAME}: expected finite parents, got parent {} = {row:?}", call.first + n);
+    }
+    let (record, child) = (bad(head, HEAD_LANES), bad(rows, SPLAT_LANES));
+    let child = child.or(bad(gains, call.rules.gain_lanes()));
+    let (what, at) = match (record, child) {
+        (Some(i), _) => ("head records", i),
+        (None, Some(i)) => ("children", i),
+        (None, None) => return Ok(()),
+    };
+    let n = at / k;
+    bail!(
+        "{NAME}: expected finite {what}, got child {} of parent {} = {:?} from parent {:?} and head record {:?}",
+        at % k,
+        call.first + n,
+        &rows[at * SPLAT_LANES..(at + 1) * SPLAT_LANES],
+        &parents[n * SPLAT_LANES..(n + 1) * SPLAT_LANES],
+        &head[at * HEAD_LANES..(at + 1) * HEAD_LANES]
+    )
+}
+
+fn finite_number<T: Number>(v: T) -> bool {
+    crate::cpu::real::Real::is_finite(v)
+}
+
+struct Fused(Spgr);
+
+impl CustomOp2 for Fused {
+    fn name(&self) -> &'static str {
+        NAME
+    }
+
+    fn cpu_fwd(
+        &self,
+        s1: &CpuStorage,
+        l1: &Layout,
+        s2: &CpuStorage,
+        l2: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        by_dtype!(NAME, s1.dtype(), forward(&self.0, (s1, l1), (s2, l2)))
+    }
+
+    fn bwd(
+        &self,
+        _: &Tensor,
+        _: &Tensor,
+        _: &Tensor,
+        _: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
+        bail!(
+            "{NAME}: the fused op has no backward pass; training goes through the unfused graph (model::spgr_ref)"
+        )
+    }
+}
+
+fn forward<T: Number>(
+    call: &Spgr,
+    (s1, l1): (&CpuStorage, &Layout),
+    (s2, l2): (&CpuStorage, &Layout),
+) -> Result<(CpuStorage, Shape)> {
+    let head = slice::<T>(NAME, "head records", s1, l1)?;
+    let parents = slice::<T>(NAME, "parents", s2, l2)?;
+    let count = l2.dims()[0] * call.rules.children();
+    let rows = count * SPLAT_LANES;
+    let mut out = vec![T::default(); rows + count * call.rules.gain_lanes()];
+    let (children, gains) = out.split_at_mut(rows);
+    cpu::forward(&call.rules, call.source(), head, parents, children, gains);
+    finite(call, head, parents, children, gains)?;
+    let len = out.len();
+    Ok((T::to_cpu_storage_owned(out), Shape::from(len)))
+}

@@ -1,0 +1,340 @@
+//! Photographs to a scene in one call: what an application uses.
+//!
+//! ```no_run
+//! use subsplat::pipeline::{Photo, Reconstructor, Request};
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let scene = subsplat::io::scene::load_scene("scene".as_ref())?;
+//! let photos = [Photo::from_frame(&scene.frames[0])?, Photo::from_frame(&scene.frames[1])?];
+//! let model = Reconstructor::load("weights.safetensors".as_ref(), None)?;
+//! let result = model.reconstruct(&photos, &Request::default())?;
+//! subsplat::io::save_splats("scene.ply".as_ref(), &result.splats, &Default::default())?;
+//! # Ok(())
+//! # }
+//! ```
+
+use crate::abi::RasterOptions;
+use crate::camera::Camera;
+use crate::config::{Backbone, Config, ConfigError, Preset};
+use crate::cpu::detail::{Photograph, SourceView, residuals, with_residuals};
+use crate::data::crop::{CropOptions, Cropped, crop};
+use crate::io;
+use crate::io::image::{Depth, Rgb};
+use crate::io::scene::Frame;
+use crate::model::Views;
+use crate::model::subsplat::{SceneOutput, SubSplat};
+use crate::model::weights::{SUBSPLAT_PREFIX, Weights};
+use crate::splats::Splats;
+use candle_core::{Device, Tensor};
+use std::path::Path;
+use std::time::Instant;
+use thiserror::Error;
+
+/// Why a reconstruction could not be made.
+#[derive(Debug, Error)]
+pub enum Error {
+    /// A file or a picture.
+    #[error(transparent)]
+    Io(#[from] io::Error),
+    /// The network: shapes, weights, numbers.
+    #[error(transparent)]
+    Model(#[from] candle_core::Error),
+    /// A configuration.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// What the caller asked for.
+    #[error("{what}: expected {expected}, got {got}")]
+    Request {
+        /// Which part of it.
+        what: &'static str,
+        /// What would be accepted.
+        expected: String,
+        /// What came.
+        got: String,
+    },
+}
+
+/// Result of everything in this room.
+pub type Result<T> = std::result::Result<T, Error>;
+
+/// A photograph without lens distortion, and its camera.
+#[derive(Clone, Debug)]
+pub struct Photo {
+    /// The pixels.
+    pub image: Rgb,
+    /// Pinhole camera of these pixels.
+    pub camera: Camera,
+}
+
+impl Photo {
+    /// Decodes a frame's picture and removes its lens distortion.
+    ///
+    /// # Errors
+    /// Everything of [`Frame::load`].
+    pub fn from_frame(frame: &Frame) -> Result<Self> {
+        let (image, camera) = frame.load()?;
+        Ok(Self { image, camera })
+    }
+
+    /// The parts that the network and the scores need.
+    ///
+    /// # Errors
+    /// Everything of [`crop`].
+    pub fn crop(&self, options: &CropOptions) -> Result<Cropped> {
+        Ok(crop(&self.image, &self.camera, options)?)
+    }
+}
+
+/// What a reconstruction is asked for.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Request {
+    /// Width and height of the network's input, px; cut to the model's stride.
+    pub input_size: (usize, usize),
+    /// Nearest and farthest depth candidate, world units.
+    pub near_far: (f32, f32),
+    /// Add to each child what the photograph shows at its place beyond its parent's
+    /// pixel ([`crate::cpu::detail`]).
+    pub detail: bool,
+}
+
+impl Default for Request {
+    /// 256×256, depth 1 to 100, no detail: RealEstate10K's habit.
+    fn default() -> Self {
+        Self { input_size: (256, 256), near_far: (1.0, 100.0), detail: false }
+    }
+}
+
+/// A reconstructed scene.
+#[derive(Clone, Debug)]
+pub struct Reconstruction {
+    /// The Gaussians.
+    pub splats: Splats,
+    /// The photographs as the network saw them, and at target resolution.
+    pub inputs: Vec<Cropped>,
+    /// Predicted depth of each input, camera z, world units.
+    pub depths: Vec<Depth>,
+    /// Harmless oddities, one line each, for the user.
+    pub warnings: Vec<String>,
+    /// Seconds by stage, in order.
+    pub seconds: Vec<(&'static str, f64)>,
+}
+
+/// A model that is ready to reconstruct.
+pub struct Reconstructor {
+    model: SubSplat,
+    weights: Weights,
+}
+
+impl Reconstructor {
+    /// A model with seeded, untrained weights. The small backbone is then a plain
+    /// plane sweep and gives a usable scene; MVSplat's gives noise.
+    ///
+    /// # Errors
+    /// A configuration out of range.
+    pub fn untrained(config: &Config, seed: u64) -> Result<Self> {
+        Self::build(config, Weights::seeded(seed))
+    }
+
+    /// A model from a weight file. Its own configuration is used unless `config` is
+    /// given; a file without one must fit `config`, which is then by default MVSplat
+    /// with the `tuned` preset and ×2. SubSplat's tensors may be missing (a converted
+    /// MVSplat checkpoint): they start untrained, and
+    /// [`Reconstructor::untrained_tensors`] lists them.
+    ///
+    /// # Errors
+    /// A file that is no weight file; a tensor that is missing or has another shape,
+    /// named with both shapes; a configuration out of range.
+    pub fn load(path: &Path, config: Option<&Config>) -> Result<Self> {
+        let weights = Weights::load(path)?.allow_missing(SUBSPLAT_PREFIX, 0);
+        let config = match (config, weights.config()) {
+            (Some(config), _) | (None, Some(config)) => config.clone(),
+            (None, None) => Config::re10k(Preset::Tuned, 2),
+        };
+        Self::build(&config, weights)
+    }
+
+    fn build(config: &Config, weights: Weights) -> Result<Self> {
+        let model = SubSplat::new(config, weights.builder())?;
+        Ok(Self { model, weights })
+    }
+
+    /// The model's configuration.
+    pub fn config(&self) -> &Config {
+        self.model.config()
+    }
+
+    /// The model itself.
+    pub fn model(&self) -> &SubSplat {
+        &self.model
+    }
+
+    /// Names of the tensors that no file gave.
+    pub fn untrained_tensors(&self) -> Vec<String> {
+        self.weights.initialised()
+    }
+
+    /// Names in the weight file that the model did not ask for.
+    pub fn unexpected_tensors(&self) -> Vec<String> {
+        self.weights.unexpected()
+    }
+
+    /// How this model crops a photograph for inputs of `input_size`.
+    pub fn crop_options(&self, input_size: (usize, usize)) -> CropOptions {
+        let config = self.config();
+        CropOptions { input_size, ..CropOptions::square(0, config.upscale, config.stride()) }
+    }
+
+    /// How this model's Gaussians are rendered at target resolution.
+    pub fn raster_options(&self, near: f32) -> RasterOptions {
+        raster_options(self.config(), near)
+    }
+
+    /// Photographs to Gaussians.
+    ///
+    /// # Errors
+    /// Fewer than two photographs, a bad request, whatever the network finds wrong.
+    pub fn reconstruct(&self, photos: &[Photo], request: &Request) -> Result<Reconstruction> {
+        self.reconstruct_with(photos, request, &mut |_| {})
+    }
+
+    /// [`Reconstructor::reconstruct`], telling `stage` the name of each stage as it
+    /// begins.
+    ///
+    /// # Errors
+    /// As [`Reconstructor::reconstruct`].
+    pub fn reconstruct_with(
+        &self,
+        photos: &[Photo],
+        request: &Request,
+        stage: &mut dyn FnMut(&'static str),
+    ) -> Result<Reconstruction> {
+        if photos.len() < 2 {
+            let (expected, got) = ("at least 2".to_owned(), photos.len().to_string());
+            return Err(Error::Request { what: "photographs", expected, got });
+        }
+        let mut clock = Clock::new(stage);
+        clock.begin("crop");
+        let options = self.crop_options(request.input_size);
+        let inputs = photos.iter().map(|p| p.crop(&options)).collect::<Result<Vec<_>>>()?;
+        let views = views_of(&inputs, request.near_far)?;
+        let mut scenes = self.model.forward(&views, &mut |name| clock.begin(name))?;
+        let Some(SceneOutput { children, depths }) = scenes.pop() else {
+            let (expected, got) = ("one scene".to_owned(), "none".to_owned());
+            return Err(Error::Request { what: "reconstruction", expected, got });
+        };
+        let mut splats = children.to_splats()?;
+        drop(children);
+        let mut warnings: Vec<String> = inputs.iter().flat_map(|c| c.warnings.clone()).collect();
+        warnings.sort();
+        warnings.dedup();
+        if request.detail {
+            clock.begin("detail");
+            self.add_detail(&mut splats, &inputs)?;
+        }
+        let depths =
+            inputs.iter().zip(depths).map(|(c, d)| camera_depth(&c.input_camera, d)).collect();
+        let seconds = clock.end();
+        Ok(Reconstruction { splats, inputs, depths, warnings, seconds })
+    }
+
+    fn add_detail(&self, splats: &mut Splats, inputs: &[Cropped]) -> Result<()> {
+        let ratio = self.config().upscale;
+        let pixels: Vec<Vec<f32>> = inputs
+            .iter()
+            .map(|c| c.target.data.iter().map(|&v| f32::from(v) / 255.0).collect())
+            .collect();
+        let mut sources = Vec::with_capacity(inputs.len());
+        for (c, pixels) in inputs.iter().zip(&pixels) {
+            let (w, h) = (c.target.width, c.target.height);
+            // Photograph pixels per input pixel: at most 1 holds nothing to add.
+            let photograph = match (c.window.scale * ratio as f32).min_element() > 1.0 {
+                true => Some(Photograph::new(pixels, w, h).ok_or_else(|| Error::Request {
+                    what: "photograph",
+                    expected: format!("{w}x{h} pixels"),
+                    got: pixels.len().to_string(),
+                })?),
+                false => None,
+            };
+            sources.push(SourceView { photograph, camera: c.input_camera });
+        }
+        let means: Vec<f32> = (0..splats.len()).flat_map(|i| splats.mean(i)).collect();
+        let per_view = splats.parents() / inputs.len();
+        let children = splats.children_per_parent();
+        let delta = residuals(&sources, &means, per_view, children, ratio);
+        splats.gain = with_residuals(&splats.gain, &delta);
+        Ok(())
+    }
+}
+
+/// How Gaussians of a model with `config` are rendered at target resolution; `near`
+/// is the near plane that the reconstruction was made with.
+pub fn raster_options(config: &Config, near: f32) -> RasterOptions {
+    let render = &config.render;
+    let mut options = RasterOptions::new(render.convention);
+    options.sh_degree = render.sh_degree;
+    options.sh_direction = render.sh_dir;
+    options.lowpass = render.lowpass_px2(config.upscale as f32);
+    if render.convention == crate::abi::Convention::Mvsplat {
+        options.near = near;
+    }
+    options
+}
+
+/// The preset configuration for a backbone by name.
+pub fn preset(mvsplat: bool, preset: Preset, upscale: usize) -> Config {
+    if mvsplat { Config::re10k(preset, upscale) } else { Config::small(preset, upscale) }
+}
+
+/// Whether a configuration's backbone is MVSplat.
+pub fn is_mvsplat(config: &Config) -> bool {
+    matches!(config.backbone, Backbone::Mvsplat(_))
+}
+
+/// Cropped photographs as the network takes them, one scene.
+fn views_of(inputs: &[Cropped], near_far: (f32, f32)) -> Result<Views> {
+    let (w, h) = (inputs[0].input.width, inputs[0].input.height);
+    let pixels: Vec<f32> = inputs.iter().flat_map(|c| c.input.to_planes()).collect();
+    let images = Tensor::from_vec(pixels, (1, inputs.len(), 3, h, w), &Device::Cpu)?;
+    let cameras = inputs.iter().map(|c| c.input_camera).collect();
+    Ok(Views::new(images, vec![cameras], vec![vec![near_far; inputs.len()]])?)
+}
+
+/// Distance along the unit ray to camera z.
+fn camera_depth(camera: &Camera, distance: Vec<f32>) -> Depth {
+    let k = camera.intrinsics;
+    let mut data = distance;
+    for (i, d) in data.iter_mut().enumerate() {
+        let at = glam::Vec2::new((i % k.width) as f32 + 0.5, (i / k.width) as f32 + 0.5);
+        *d /= k.unproject(at).length();
+    }
+    Depth { width: k.width, height: k.height, data }
+}
+
+/// Books the time between announcements.
+struct Clock<'a> {
+    stage: &'a mut dyn FnMut(&'static str),
+    current: Option<(&'static str, Instant)>,
+    seconds: Vec<(&'static str, f64)>,
+}
+
+impl<'a> Clock<'a> {
+    fn new(stage: &'a mut dyn FnMut(&'static str)) -> Self {
+        Self { stage, current: None, seconds: Vec::new() }
+    }
+
+    fn close(&mut self) {
+        if let Some((name, start)) = self.current.take() {
+            self.seconds.push((name, start.elapsed().as_secs_f64()));
+        }
+    }
+
+    fn begin(&mut self, name: &'static str) {
+        self.close();
+        (self.stage)(name);
+        self.current = Some((name, Instant::now()));
+    }
+
+    fn end(mut self) -> Vec<(&'static str, f64)> {
+        self.close();
+        self.seconds
+    }
+}

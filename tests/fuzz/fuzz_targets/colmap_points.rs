@@ -1,0 +1,10 @@
+//! Any bytes as COLMAP's binary points file: an answer or an error, never a panic, never
+//! more memory than a few times the input.
+#![no_main]
+
+use libfuzzer_sys::fuzz_target;
+use std::path::Path;
+
+fuzz_target!(|bytes: &[u8]| {
+    let _ = subsplat::io::colmap::parse_points_bin(Path::new("fuzz"), bytes);
+});
