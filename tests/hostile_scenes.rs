@@ -57,7 +57,8 @@ fn transforms(change: impl Fn(&mut Value)) -> Vec<u8> {
 fn cameras_json(change: impl Fn(&mut Value)) -> Vec<u8> {
     let (folder, cameras) = made_up(3);
     let path = folder.path().join("cameras.json");
-    save_cameras_json(&path, &CameraFile { cameras, units: Units::Unknown }).unwrap();
+    save_cameras_json(&path, &CameraFile { cameras, units: Units::Unknown, near_far: None })
+        .unwrap();
     let mut value = serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap();
     change(&mut value);
     value.to_string().into_bytes()
@@ -324,7 +325,8 @@ fn bad_matrices() {
 fn bad_pictures() {
     let (folder, cameras) = made_up(3);
     let path = folder.path().join("cameras.json");
-    save_cameras_json(&path, &CameraFile { cameras, units: Units::Unknown }).unwrap();
+    save_cameras_json(&path, &CameraFile { cameras, units: Units::Unknown, near_far: None })
+        .unwrap();
     let picture = folder.path().join("images/001.png");
     let good = std::fs::read(&picture).unwrap();
 

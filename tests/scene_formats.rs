@@ -25,7 +25,7 @@ fn cameras_json_reads_back_what_was_written() {
     cameras[3].depth = Some("depth/003.png".to_owned());
     for units in [Units::Unknown, Units::Metres, Units::RealEstate10k] {
         let path = folder.path().join("cameras.json");
-        let content = CameraFile { cameras: cameras.clone(), units };
+        let content = CameraFile { cameras: cameras.clone(), units, near_far: Some((0.5, 8.0)) };
         save_cameras_json(&path, &content).unwrap();
         assert_eq!(load_cameras_json(&path).unwrap(), content);
         let scene = load_scene(folder.path()).unwrap();
@@ -244,7 +244,7 @@ fn precedence_of_pose_files() {
     assert_eq!(source(), SceneFormat::Transforms);
     save_cameras_json(
         &at("cameras.json"),
-        &CameraFile { cameras: cameras.clone(), units: Units::Unknown },
+        &CameraFile { cameras: cameras.clone(), units: Units::Unknown, near_far: None },
     )
     .unwrap();
     assert_eq!(source(), SceneFormat::CamerasJson);

@@ -338,7 +338,7 @@ fn write_scene(
             depth: Some(format!("depth/{}.png", t.name)),
         })
         .collect();
-    let content = CameraFile { cameras, units: Default::default() };
+    let content = CameraFile { cameras, units: Default::default(), near_far: None };
     save_cameras_json(&args.out.join("cameras.json"), &content)?;
     let convention = format!("{:?}", model.config().render.convention).to_lowercase();
     let options = SaveOptions {

@@ -55,6 +55,9 @@ pub fn depth_range(
 }
 
 fn derive(scene: &Scene, context: &[usize]) -> Result<DepthRange> {
+    if let Some((near, far)) = scene.near_far {
+        return Ok(DepthRange { near, far, reason: "from the pose file".to_owned() });
+    }
     if scene.units == Units::RealEstate10k {
         let reason = "RealEstate10K's habit".to_owned();
         return Ok(DepthRange { near: 1.0, far: 100.0, reason });

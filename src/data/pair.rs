@@ -235,6 +235,7 @@ mod tests {
             points: None,
             source: SceneFormat::Pair,
             units: Units::Unknown,
+            near_far: None,
             warnings: Vec::new(),
         }
     }

@@ -202,6 +202,7 @@ pub(super) fn assemble(path: &Path, source: SceneFormat, drafts: Vec<Draft>) -> 
         points: None,
         source,
         units: Units::Unknown,
+        near_far: None,
         warnings: notes.lines(count),
     })
 }

@@ -10,7 +10,8 @@
 //!
 //! `c2w` is OpenCV camera-to-world, intrinsics are pixels of the stored picture,
 //! which is a pinhole's. Optional: `timestamp_us`, `depth` of a frame; `units`
-//! (`metres`, `re10k`), or `metric: true`, of the file. Unknown keys are ignored.
+//! (`metres`, `re10k`), or `metric: true`, and `near` and `far` (camera z in world
+//! units, for all frames) of the file. Unknown keys are ignored.
 //!
 //! 3DGS's list has `img_name, width, height, fx, fy, rotation` (camera to world),
 //! `position` (the eye): same axes, principal point in the middle.
@@ -47,6 +48,15 @@ pub struct CameraFile {
     pub cameras: Vec<NamedCamera>,
     /// Unit of length.
     pub units: Units,
+    /// Nearest and farthest depth of the scene, world units of camera z.
+    pub near_far: Option<(f32, f32)>,
+}
+
+/// What the file says of all frames.
+#[derive(Clone, Copy, Default)]
+struct Facts {
+    units: Units,
+    near_far: Option<(f32, f32)>,
 }
 
 #[derive(Deserialize)]
@@ -55,6 +65,8 @@ struct InFile {
     units: Option<String>,
     #[serde(default)]
     metric: bool,
+    near: Option<f32>,
+    far: Option<f32>,
     frames: Vec<InFrame>,
 }
 
@@ -91,6 +103,10 @@ struct OutFile<'a> {
     convention: &'a str,
     #[serde(skip_serializing_if = "Option::is_none")]
     units: Option<&'a str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    near: Option<f32>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    far: Option<f32>,
     frames: Vec<OutFrame<'a>>,
 }
 
@@ -143,14 +159,14 @@ pub(super) fn is_cameras_json(path: &Path) -> Result<bool> {
     Ok(value.is_array() || value["frames"][0].get("c2w").is_some())
 }
 
-fn drafts(path: &Path) -> Result<(Vec<Draft>, Units)> {
+fn drafts(path: &Path) -> Result<(Vec<Draft>, Facts)> {
     let bytes = read(path)?;
     let list = bytes.iter().find(|b| !b.is_ascii_whitespace()) == Some(&b'[');
     if list {
         let frames: Vec<SplatFrame> = serde_json::from_slice(&bytes)
             .map_err(|e| json_error(path, "a list of 3DGS cameras (img_name, rotation, …)", &e))?;
         let drafts = frames.into_iter().enumerate().map(|(i, f)| splat_draft(path, i, f));
-        return Ok((drafts.collect::<Result<_>>()?, Units::Unknown));
+        return Ok((drafts.collect::<Result<_>>()?, Facts::default()));
     }
     let file: InFile = serde_json::from_slice(&bytes)
         .map_err(|e| json_error(path, "cameras.json (frames with file, fx, …, c2w)", &e))?;
@@ -162,8 +178,16 @@ fn drafts(path: &Path) -> Result<(Vec<Draft>, Units)> {
         None if !file.frames.is_empty() && file.frames.iter().all(re10k) => Units::RealEstate10k,
         _ => Units::Unknown,
     };
+    let near_far = match (file.near, file.far) {
+        (Some(near), Some(far)) if near > 0.0 && far > near && far.is_finite() => Some((near, far)),
+        (None, None) => None,
+        (near, far) => {
+            let got = format!("near {near:?}, far {far:?}");
+            return Err(Error::format(path, "both near and far, 0 < near < far", got));
+        }
+    };
     let drafts = file.frames.into_iter().enumerate().map(|(i, f)| draft(path, i, f));
-    Ok((drafts.collect::<Result<_>>()?, units))
+    Ok((drafts.collect::<Result<_>>()?, Facts { units, near_far }))
 }
 
 fn size(path: &Path, place: &str, width: f64, height: f64) -> Result<Option<(usize, usize)>> {
@@ -203,12 +227,13 @@ fn folder(path: &Path) -> &Path {
 
 /// Reads a scene; frames without a picture are left out with a warning.
 pub(super) fn load(path: &Path) -> Result<Scene> {
-    let (mut drafts, units) = drafts(path)?;
+    let (mut drafts, facts) = drafts(path)?;
     for d in &mut drafts {
         d.image = find_image(&[folder(path)], &d.file);
     }
     let mut scene = assemble(path, SceneFormat::CamerasJson, drafts)?;
-    scene.units = units;
+    scene.units = facts.units;
+    scene.near_far = facts.near_far;
     Ok(scene)
 }
 
@@ -217,7 +242,7 @@ pub(super) fn load(path: &Path) -> Result<Scene> {
 /// # Errors
 /// Not this layout; a camera that is not usable (its frame is named).
 pub fn load_cameras_json(path: &Path) -> Result<CameraFile> {
-    let (drafts, units) = drafts(path)?;
+    let (drafts, facts) = drafts(path)?;
     let mut cameras = Vec::with_capacity(drafts.len());
     for d in drafts {
         let (Some((width, height)), Lens::Pixels(k)) = (d.size, d.lens) else { continue };
@@ -231,7 +256,7 @@ pub fn load_cameras_json(path: &Path) -> Result<CameraFile> {
             .map(|p| p.strip_prefix(folder(path)).unwrap_or(p).to_string_lossy().into_owned());
         cameras.push(NamedCamera { file: d.file, camera, timestamp: d.timestamp, depth });
     }
-    Ok(CameraFile { cameras, units })
+    Ok(CameraFile { cameras, units: facts.units, near_far: facts.near_far })
 }
 
 /// Writes this layout. Floats are written so that they read back the same.
@@ -254,7 +279,8 @@ pub fn save_cameras_json(path: &Path, content: &CameraFile) -> Result<()> {
         Units::Metres => Some("metres"),
         Units::RealEstate10k => Some("re10k"),
     };
-    let out = OutFile { convention: CONVENTION, units, frames: frames.collect() };
+    let (near, far) = content.near_far.unzip();
+    let out = OutFile { convention: CONVENTION, units, near, far, frames: frames.collect() };
     let text = serde_json::to_string_pretty(&out)
         .map_err(|e| Error::io(path, std::io::Error::other(e)))?;
     write_atomic(path, |f| writeln!(f, "{text}"))

@@ -123,6 +123,8 @@ pub struct Scene {
     pub source: SceneFormat,
     /// Unit of length.
     pub units: Units,
+    /// Nearest and farthest depth that the pose file gives, world units of camera z.
+    pub near_far: Option<(f32, f32)>,
     /// Harmless oddities, one line each, for the user.
     pub warnings: Vec<String>,
 }
