@@ -1,7 +1,7 @@
 //! What `run` writes: pictures, depth, cameras, the scene in any format.
 //!
 //! `images/` holds the rendered views, `depth/` their depth, `inputs/` what the network
-//! saw and its depth of it. With `cameras.json` the folder is a scene that every
+//! saw and its depth of it, `config.json` the model. With `cameras.json` the folder is a scene that every
 //! command reads.
 
 use super::args::SceneFormatArg;
@@ -12,6 +12,7 @@ use serde_json::{Value, json};
 use std::path::Path;
 use subsplat::abi::{Convention, RasterOptions};
 use subsplat::camera::Camera;
+use subsplat::config::Config;
 use subsplat::cpu::Rasterizer;
 use subsplat::data::crop::CropOptions;
 use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
@@ -195,6 +196,14 @@ pub fn write_cameras(
     let cameras = views.iter().map(camera).collect();
     let content = CameraFile { cameras, units, near_far: Some(near_far) };
     Ok(save_cameras_json(&out.join("cameras.json"), &content)?)
+}
+
+/// `config.json`, which `--config` takes.
+pub fn write_config(out: &Path, config: &Config) -> Result<()> {
+    let text = serde_json::to_string_pretty(config)?;
+    let write =
+        |f: &mut std::io::BufWriter<std::fs::File>| std::io::Write::write_all(f, text.as_bytes());
+    Ok(subsplat::io::write_atomic(&out.join("config.json"), write)?)
 }
 
 /// The scene in each of `formats`; one report each.
