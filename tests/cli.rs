@@ -111,8 +111,10 @@ fn a_scene_file_renders_as_it_was_run_under_either_convention() {
     let place = workplace();
     let run = "run scene --context 0,2 --input-size 64 --no-check --near 0.7 --far 60";
     let mut pictures = Vec::new();
-    for convention in ["standard", "mvsplat"] {
-        let command = format!("{run} -o {convention} --convention {convention} --save ply,glb");
+    for (convention, lowpass) in [("standard", "input"), ("mvsplat", "target")] {
+        let command = format!(
+            "{run} -o {convention} --convention {convention} --lowpass-ref {lowpass} --save ply,glb"
+        );
         assert_eq!(call_in(place.path(), &command).code, 0);
         let direct = place.path().join(convention).join("images/view1.png");
         for format in ["ply", "glb"] {
@@ -120,29 +122,31 @@ fn a_scene_file_renders_as_it_was_run_under_either_convention() {
             assert_eq!(done(&call_in(place.path(), &command))["convention"], convention);
             let again = place.path().join(format).join("view1.png");
             let likeness = likeness(&again, &direct);
-            assert!(likeness >= 50.0, "{convention} {format}: {likeness}");
+            // The field asks for 50 dB. Ours are the same pictures; 88 dB are five
+            // differences of one level, for another platform's `ln`.
+            assert!(likeness >= 88.0, "{convention} {format}: {likeness}");
         }
         pictures.push(direct);
     }
-    // Otherwise this test would show nothing.
-    assert!(likeness(&pictures[0], &pictures[1]) < 50.0);
+    // The wrong convention would not pass above (82.7 dB here: they differ little).
+    assert!(likeness(&pictures[0], &pictures[1]) < 86.0);
 }
 
 #[test]
 fn the_same_call_gives_the_same_bytes() {
     let place = workplace();
     let quick = "run scene --context 0,2 --input-size 64 --no-check --backbone re10k";
-    let calls: [(&str, &str, &[(&str, &str)]); 5] = [
-        ("first", "--seed 7", &[]),
-        ("second", "--seed 7", &[]),
-        ("one", "--seed 7 --threads 1", &[]),
-        ("three", "--seed 7", &[("RAYON_NUM_THREADS", "3")]),
-        ("other", "--seed 8", &[]),
+    let calls = [
+        ("first", "--seed 7", None),
+        ("second", "--seed 7", None),
+        ("one", "--seed 7 --threads 1", None),
+        ("three", "--seed 7", Some(("RAYON_NUM_THREADS", "3"))),
+        ("other", "--seed 8", None),
     ];
-    let bytes = calls.map(|(out, more, environment)| {
+    let bytes = calls.map(|(out, more, variable)| {
         let command = format!("{quick} {more} -o {out}");
         let arguments: Vec<&str> = command.split_whitespace().collect();
-        let called = call_with(place.path(), &arguments, environment);
+        let called = call_with(place.path(), &arguments, variable.as_slice());
         assert_eq!(called.code, 0, "{}", called.stderr);
         assert!(called.stderr.contains("random weights"), "{}", called.stderr);
         std::fs::read(place.path().join(out).join("scene.ply")).unwrap()
