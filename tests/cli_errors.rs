@@ -20,6 +20,7 @@ fn refused(folder: &Path, rows: &[Row]) {
         let error = called.error();
         assert!(error.contains(named), "{arguments}: expected `{named}` in: {error}");
         assert_eq!(format!("error: {}", called.json()["error"].as_str().unwrap()), error);
+        assert!(error.matches("os error").count() <= 1, "told twice: {error}");
         assert!(!called.stderr.contains("panicked"), "{arguments}: {}", called.stderr);
     }
     let after = files(folder);
@@ -164,4 +165,6 @@ fn backtraces_stay_out_of_errors() {
     assert_eq!(called.code, 1);
     let (last, error) = (called.stderr.lines().last().unwrap(), called.error());
     assert!(last == error && error.contains("w.safetensors"), "{}", called.stderr);
+    // It ends with the shape that is missing.
+    assert!(error.ends_with("got no such tensor"), "{error}");
 }

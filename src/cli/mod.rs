@@ -43,7 +43,7 @@ pub fn main() -> ExitCode {
         Ok(true) => ExitCode::SUCCESS,
         Ok(false) => ExitCode::from(ANSWER_NO),
         Err(error) => {
-            let line = one_line(&format!("{error:#}"));
+            let line = told(&error);
             report::say(format!("error: {line}"));
             // The exit code tells of the error; a closed pipe here adds nothing to it.
             let _ = answer.finish(&json!({ "error": line }));
@@ -66,6 +66,18 @@ fn refuse(error: &clap::Error) -> ExitCode {
     let json = std::env::args_os().any(|a| a == "--json");
     let _ = Answer::new(json).finish(&json!({ "error": line }));
     ExitCode::from(USAGE)
+}
+
+/// The error and its causes in one line. A cause that the error's own words repeat is
+/// left out.
+fn told(error: &anyhow::Error) -> String {
+    error.chain().map(|cause| one_line(&cause.to_string())).fold(String::new(), |all, cause| {
+        match all.as_str() {
+            "" => cause,
+            _ if all.contains(&cause) => all,
+            _ => format!("{all}: {cause}"),
+        }
+    })
 }
 
 /// `text` without line breaks, and without the backtrace that candle appends to its
