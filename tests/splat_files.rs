@@ -1,9 +1,7 @@
 //! Splat files written by us and by others: every round trip, every fixture.
 
-mod common;
 mod splat_scene;
 
-use common::shared;
 use glam::{DMat3, DVec3};
 use splat_scene::*;
 use std::path::{Path, PathBuf};
@@ -227,6 +225,25 @@ fn splat_round_trips_sorted_at_degree_zero() {
     }
 }
 
+/// Viewers do not normalise these bytes: a quaternion along an axis keeps its length.
+#[test]
+fn splat_quaternion_bytes_reach_their_ends() {
+    let kind = Kind { parents: 4, children: 1, degree: 0, gain_lanes: 0, basis: ShBasis::Standard };
+    let mut s = scene(16, kind);
+    for i in 0..4 {
+        let row = &mut s.rows[i * SPLAT_LANES..(i + 1) * SPLAT_LANES];
+        row[3..7].fill(0.0);
+        row[3 + i] = if i % 2 == 0 { 3.0 } else { -0.5 };
+        row[7..].fill(1.0 / (1.0 + i as f32));
+    }
+    let (_folder, path) = save("a.splat", &s, &SaveOptions::default());
+    for (i, record) in std::fs::read(path).unwrap().chunks_exact(32).enumerate() {
+        let mut expected = [128; 4];
+        expected[i] = 0;
+        assert_eq!(record[28..], expected);
+    }
+}
+
 #[test]
 fn opacities_and_scales_at_their_ends_stay_finite() {
     let opacities = [0.0, 1e-9, 1e-7, 1e-4, 0.5, 0.999, 1.0 - 1e-6, 1.0, 1.000_01, -0.000_01];
@@ -359,11 +376,11 @@ fn info_describes_what_is_there() {
     assert_eq!((info.count, info.sh_degree, info.non_finite, info.invisible), (101, 2, 0, 1));
     assert_eq!(info.flavour, "ply binary_little_endian");
     assert!(info.comments.iter().any(|c| c.starts_with("subsplat ")), "{:?}", info.comments);
-    let bounds = info.bounds.unwrap();
-    for axis in 0..3 {
+    let [low, high] = info.bounds.unwrap();
+    for (axis, (low, high)) in low.into_iter().zip(high).enumerate() {
         let column = || (0..101).map(|i| s.mean(i)[axis]);
-        assert_eq!(bounds[0][axis], column().fold(f32::INFINITY, f32::min));
-        assert_eq!(bounds[1][axis], column().fold(f32::NEG_INFINITY, f32::max));
+        assert_eq!(low, column().fold(f32::INFINITY, f32::min));
+        assert_eq!(high, column().fold(f32::NEG_INFINITY, f32::max));
     }
     let expected = [0.0, 0.01, 0.25, 0.5, 0.75, 0.99, 1.0];
     for (got, want) in info.opacity.iter().zip(expected) {
@@ -475,24 +492,26 @@ fn glb_nodes_move_turn_and_scale_splats() {
         Kind { parents: 30, children: 1, degree: 3, gain_lanes: 0, basis: ShBasis::Standard };
     let s = scene(13, kind);
     let (_folder, path) = save("a.glb", &s, &SaveOptions { up: Up::Y, ..Default::default() });
-    // Parent: half a turn about z and a shift; child: doubled. Both in glTF's axes.
+    // Parent: a quarter turn about z and a shift; child: doubled. Both in glTF's axes.
+    let half = std::f64::consts::FRAC_1_SQRT_2;
     edit_glb(&path, |json| {
         json["nodes"] = serde_json::json!([
-            { "translation": [1.0, 2.0, 3.0], "rotation": [0.0, 0.0, 1.0, 0.0], "children": [1] },
+            { "translation": [1.0, 2.0, 3.0], "rotation": [0.0, 0.0, half, half], "children": [1] },
             { "mesh": 0, "scale": [2.0, 2.0, 2.0] }
         ]);
     });
     let after = load_splats(&path).unwrap();
-    let turn = DMat3::from_diagonal(DVec3::new(-1.0, -1.0, 1.0));
+    // In ours: x to −y, y to x.
+    let turn = DMat3::from_cols(DVec3::NEG_Y, DVec3::X, DVec3::Z);
     let mut expected = s.clone();
     for i in 0..s.len() {
         let m = s.mean(i);
-        // glTF (x, −y, −z), doubled, (−x, −y, z), shifted, and back to ours.
+        // glTF (x, −y, −z), doubled, turned to (−y, x, z), shifted, and back to ours.
         let g = [2.0 * m[0], -2.0 * m[1], -2.0 * m[2]];
-        let g = [1.0 - g[0], 2.0 - g[1], 3.0 + g[2]];
+        let g = [1.0 - g[1], 2.0 + g[0], 3.0 + g[2]];
         let row = &mut expected.rows[i * SPLAT_LANES..];
         // `assert_same` turns the mean: give it the one before the turn.
-        row[..3].copy_from_slice(&[-g[0], g[1], -g[2]]);
+        row[..3].copy_from_slice(&[g[1], g[0], -g[2]]);
         row[7..10].iter_mut().for_each(|v| *v *= 2.0);
     }
     let allowed = Tolerance { mean: 4e-6, ..EXACT };
@@ -531,4 +550,49 @@ fn glb_quantised_attributes_are_read() {
     let after = load_splats(&path).unwrap();
     let allowed = Tolerance { opacity: 0.6 / 65535.0, ..EXACT };
     assert_same(&s, &after, &in_order(&s), DMat3::IDENTITY, 0, allowed);
+}
+
+/// The Khronos validator over files of every degree. It comes from the npm registry,
+/// so it runs where `SUBSPLAT_GLB_CHECK=require` asks for it (CI).
+#[test]
+fn khronos_validator_accepts_our_glbs() {
+    if std::env::var("SUBSPLAT_GLB_CHECK").is_ok_and(|v| v == "require") {
+        let folder = tempfile::tempdir().unwrap();
+        let mut files = Vec::new();
+        for (k, up) in [Up::Keep, Up::Y, Up::Z, Up::Keep].into_iter().enumerate() {
+            let basis = ShBasis::Mvsplat;
+            let kind = Kind { parents: 30, children: 4, degree: k, gain_lanes: 4, basis };
+            let path = folder.path().join(format!("degree{k}.glb"));
+            let comments = vec!["a comment".to_owned()];
+            let options = SaveOptions { up, comments, ..Default::default() };
+            save_splats(&path, &scene(15, kind), &options).unwrap();
+            files.push(path);
+        }
+        let run = |files: &[PathBuf]| {
+            let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tools/check_glb.mjs");
+            std::process::Command::new("node").arg(script).args(files).output().unwrap()
+        };
+        let good = run(&files);
+        let text = |o: &std::process::Output| {
+            String::from_utf8_lossy(&[&o.stdout[..], &o.stderr[..]].concat()).into_owned()
+        };
+        assert_eq!(good.status.code(), Some(0), "{}", text(&good));
+        assert!(text(&good).contains("120 splats of degree 3"), "{}", text(&good));
+        // It must be able to say no: to the container's mistakes and to the extension's.
+        let edits: [fn(&mut serde_json::Value); 4] = [
+            |j| j["accessors"][0]["max"][0] = 99.0.into(),
+            |j| j["bufferViews"][0]["byteOffset"] = 2.into(),
+            |j| j["meshes"][0]["primitives"][0]["mode"] = 4.into(),
+            |j| j["accessors"][2]["type"] = "VEC4".into(),
+        ];
+        for (k, edit) in edits.into_iter().enumerate() {
+            let path = folder.path().join(format!("bad{k}.glb"));
+            std::fs::copy(&files[0], &path).unwrap();
+            edit_glb(&path, edit);
+            let bad = run(&[path]);
+            assert_eq!(bad.status.code(), Some(1), "edit {k}: {}", text(&bad));
+        }
+    } else {
+        eprintln!("SKIP: SUBSPLAT_GLB_CHECK=require is not set; the validator was not run");
+    }
 }

@@ -145,8 +145,8 @@ fn minimal_files_agree() {
             near("x", f64::from(s.mean(i)[0]), xz[i][0], 1e-6);
             near("y", f64::from(s.mean(i)[1]), 0.0, 1e-6);
             near("z", f64::from(s.mean(i)[2]), z, 1e-6);
-            for c in 0..2 {
-                let v = f64::from(bytes[i][c]) / 255.0 - 0.5;
+            for (c, byte) in bytes[i].into_iter().enumerate() {
+                let v = f64::from(byte) / 255.0 - 0.5;
                 let dc = if old { v / 0.15 } else { v / C0 };
                 near(ending, f64::from(s.sh_of(i)[c]), dc, 0.51 / 255.0 / 0.15);
             }

@@ -74,8 +74,10 @@ impl Scene {
     }
 }
 
+type Change = fn(&mut Config);
+
 /// Every value of every switch, one at a time, on top of both presets.
-fn switches() -> Vec<(&'static str, fn(&mut Config))> {
+fn switches() -> Vec<(&'static str, Change)> {
     use FeatureLevel::*;
     vec![
         ("as is", |_| {}),

@@ -1,6 +1,6 @@
 //! How a parent's opacity is shared among its children, and the gradient.
 //!
-//! In: logits ℓ [P,K]; areas [P,K]; opacities α [P].   Out: [P,K].
+//! In: logits ℓ `[P,K]`; areas `[P,K]`; opacities α `[P]`.   Out: `[P,K]`.
 //! With w = softmax(ℓ):
 //!
 //! | rule | α_k | areas |

@@ -245,7 +245,8 @@ impl<T: Real> Footprint<T> {
     /// Factors of the three σ that raise the area to `a_min` where it is below.
     fn growth(&self, area: T, a_min: T, two_axis: bool) -> V3<T> {
         let (one, most) = (T::of(1.0), T::of(GROWTH_MAX));
-        if !(area < a_min) {
+        let small = area < a_min;
+        if !small {
             return [one; 3];
         }
         if !two_axis {
@@ -333,7 +334,8 @@ impl<'a, T: Real> Parent<'a, T> {
         ];
         let m = Footprint::new(j, &g);
         let det = m.area() * m.area();
-        if !(det > T::of(1e-20)) {
+        let solid = det > T::of(1e-20);
+        if !solid {
             return None;
         }
         let [a, b] = m.0;

@@ -193,18 +193,16 @@ impl Plan {
     }
 }
 
-fn document(
+/// Buffer views, accessors, and the attributes' indices.
+fn layout(
     attributes: &[Attribute],
     offsets: &[u64],
-    binary: u64,
     out: &Outgoing,
-    up: Up,
-    comments: &[String],
-) -> Value {
+) -> (Vec<Value>, Vec<Value>, serde_json::Map<String, Value>) {
+    const ARRAY_BUFFER: u32 = 34962;
     let (mut views, mut accessors) = (Vec::new(), Vec::new());
     let mut named = serde_json::Map::new();
     for (i, (a, offset)) in attributes.iter().zip(offsets).enumerate() {
-        const ARRAY_BUFFER: u32 = 34962;
         let length = a.bytes as u64 * out.count as u64;
         views.push(json!({
             "buffer": 0, "byteOffset": offset, "byteLength": length, "target": ARRAY_BUFFER
@@ -224,6 +222,18 @@ fn document(
         accessors.push(accessor);
         named.insert(a.name.clone(), json!(i));
     }
+    (views, accessors, named)
+}
+
+fn document(
+    attributes: &[Attribute],
+    offsets: &[u64],
+    binary: u64,
+    out: &Outgoing,
+    up: Up,
+    comments: &[String],
+) -> Value {
+    let (views, accessors, named) = layout(attributes, offsets, out);
     let mut node = json!({ "mesh": 0, "name": "splats" });
     if let Some(rotation) = node_rotation(up) {
         node["rotation"] = json!(rotation);

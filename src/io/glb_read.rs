@@ -243,7 +243,7 @@ impl File<'_> {
         }
         let [x, y, z, w] = node.rotation.as_deref().copied().unwrap_or([0.0, 0.0, 0.0, 1.0]);
         let rotation = DQuat::from_xyzw(x, y, z, w);
-        if !((rotation.length() - 1.0).abs() < 1e-2) {
+        if !(0.99..=1.01).contains(&rotation.length()) {
             let got = format!("{x} {y} {z} {w}");
             return Err(self.bad("nodes rotated by a unit quaternion", got));
         }

@@ -25,7 +25,7 @@ use flate2::read::GzDecoder;
 use flate2::write::GzEncoder;
 use glam::DVec3;
 use half::f16;
-use std::io::{Read, Write};
+use std::io::{BufWriter, Read, Write};
 use std::path::Path;
 
 /// `NGSP`.
@@ -328,7 +328,9 @@ pub(super) fn fraction_bits(out: &Outgoing, path: &Path) -> Result<u32> {
 ///
 /// SH keep all 8 bits; the reference encoder rounds to 5 and 4 for size.
 pub(super) fn write(file: &mut dyn Write, out: &Outgoing, bits: u32) -> std::io::Result<()> {
-    let mut gzip = GzEncoder::new(file, flate2::Compression::default());
+    // Single bytes straight into the encoder would cost more than compressing them.
+    let encoder = GzEncoder::new(file, flate2::Compression::default());
+    let mut gzip = BufWriter::with_capacity(1 << 16, encoder);
     let mut head = MAGIC.to_vec();
     head.extend(3u32.to_le_bytes());
     // `fraction_bits` has checked that it fits.
@@ -363,5 +365,5 @@ pub(super) fn write(file: &mut dyn Write, out: &Outgoing, bits: u32) -> std::io:
             }
         }
     }
-    gzip.finish().map(drop)
+    gzip.into_inner()?.finish().map(drop)
 }

@@ -419,12 +419,12 @@ pub fn spgr(head: &Tensor, parents: &Tensor, call: &Spgr) -> Result<(Tensor, Ten
     let opacities = parents.narrow(1, LANE_OPACITY, 1)?.squeeze(1)?;
     let alpha = redistribute(rules.opacity, &lane(HEAD_LOGIT)?, &areas, &opacities, own.as_ref())?;
     let mut lanes = Vec::with_capacity(11);
-    for i in 0..3 {
-        lanes.push(add(&in_world[i], &p.mean[i])?);
+    for (step, mean) in in_world.iter().zip(&p.mean) {
+        lanes.push(add(step, mean)?);
     }
     lanes.extend(quat);
-    for i in 0..3 {
-        lanes.push(mul(&scale[i], &growth[i])?);
+    for (scale, growth) in scale.iter().zip(&growth) {
+        lanes.push(mul(scale, growth)?);
     }
     lanes.push(alpha);
     let rows = Tensor::stack(&lanes, 2)?.reshape((n * k, lanes.len()))?;

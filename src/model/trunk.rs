@@ -18,8 +18,10 @@ use candle_core::{DType, Result, Tensor, bail};
 use candle_nn::{VarBuilder, VarMap};
 use rayon::prelude::*;
 
-/// Parents per chunk at inference: activations of 1 MB, inside a core's L2.
-pub const CHUNK: usize = 2048;
+/// Parents per chunk at inference. A `[256, 128]` activation stays in a core's L2, and
+/// below the 65,536 elements from which candle spreads one elementwise operation over
+/// a spinning thread pool of its own, whose lock the chunks would fight for.
+pub const CHUNK: usize = 256;
 
 /// Gaussians of one scene that share SH by parent.
 #[derive(Clone, Debug)]

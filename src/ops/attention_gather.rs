@@ -1,6 +1,6 @@
 //! Fused attention over bilinear samples of feature maps as one candle op, with
 //! gradients for maps, query and points (SubSplat A.2; spec 1.6). Formulas and
-//! layouts: [`crate::cpu::attention_gather`]. Tests: tests/aggregation.rs.
+//! layouts: [`crate::cpu::attention_gather`]. Tests: tests/attention_gather.rs.
 
 use super::{Number, by_dtype, elements, slice};
 use crate::cpu::attention_gather as cpu;
@@ -32,7 +32,8 @@ pub fn attention_gather(
     let channels = g.dim + g.value.max(g.key.unwrap_or(0));
     let expected = g.levels.iter().map(level_ends).max().unwrap_or(0);
     let (cells, stride) = maps.dims2()?;
-    if stride != g.stride || stride < channels || stride % g.dim != 0 || cells < expected {
+    if stride != g.stride || stride < channels || !stride.is_multiple_of(g.dim) || cells < expected
+    {
         bail!(
             "{NAME} maps: expected [{expected}, {}] with {channels} channels in use, got {:?}",
             g.stride,

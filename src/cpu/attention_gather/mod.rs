@@ -15,7 +15,7 @@
 //! after level, view after view within a level, row-major; query
 //! `[N, Q]` = (q `[E]` where keys are used, bias `[V,L,M,G]`, gate `[V]`); points
 //! `[N, V, M or L·M, 2]` in [0, 1]² of the picture.   Out: `[N, E]`.
-//! Twin: ops/attention_gather.rs. Tests: tests/aggregation.rs.
+//! Twin: ops/attention_gather.rs. Tests: tests/attention_gather.rs.
 
 mod backward;
 
@@ -367,8 +367,8 @@ const OCCLUSION_TOLERANCE: f32 = 0.02;
 /// where the point is outside the picture or behind the camera, since then there is
 /// nothing to hide it. D is bilinear between pixel centres, held at the edges.
 pub fn occlusion(map: DepthMap, at: [f32; 2], z: f32) -> f32 {
-    let inside = at.iter().all(|&r| r > 0.0 && r < 1.0);
-    if !inside || !(z > 0.0) {
+    let inside = z > 0.0 && at.iter().all(|&r| r > 0.0 && r < 1.0);
+    if !inside {
         return 1.0;
     }
     let axis = |r: f32, n: usize| {

@@ -26,9 +26,9 @@ const TRIES: u64 = 300;
 /// What [`sample_cameras`] is asked for.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CameraSpec {
-    /// Width of every picture, px.
+    /// Width of every picture, px; at least 1.
     pub width: usize,
-    /// Height of every picture, px.
+    /// Height of every picture, px; at least 1.
     pub height: usize,
     /// Cameras between the two context cameras.
     pub targets: usize,
@@ -125,7 +125,7 @@ fn propose(room: &Room, rng: &mut Rng, spec: &CameraSpec) -> Option<Rig> {
 
 /// 40° to 80° along the longer side, of the picture or of the one that it is cut from.
 fn intrinsics(spec: &CameraSpec, cropped: bool, rng: &mut Rng) -> Intrinsics {
-    let (width, height) = (spec.width, spec.height);
+    let (width, height) = (spec.width.max(1), spec.height.max(1));
     let fov = rng.range(40.0, 80.0).to_radians();
     let full = if cropped { 2 } else { 1 };
     let (w, h) = ((width * full) as f32, (height * full) as f32);

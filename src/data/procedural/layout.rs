@@ -282,6 +282,24 @@ impl Layout {
         self.tops.push(Top { centre, axes: wall.axes, half: Vec2::new(half.x, half.z) });
     }
 
+    /// A glowing globe on a cord around the lamp at `place`, in half of the rooms.
+    pub(super) fn hang_lamp(&mut self, place: Vec3) {
+        let mut rng = self.rng.fork(3);
+        let (shown, radius) = (rng.chance(0.5), rng.range(0.07, 0.13));
+        if !shown || self.primitives.iter().any(|p| p.distance(place) < radius) {
+            return;
+        }
+        let globe = Material::new(Role::Ceiling, &self.palette, &mut rng).into_glowing(4.0);
+        let (globe, cord) = (self.keep(globe), self.material(Role::Furniture));
+        let half = Vec3::new(0.006, 0.5 * (self.size.y + place.y), 0.006);
+        let middle = place - Vec3::Y * half.y;
+        self.add(Form::Ellipsoid, place, Mat3::IDENTITY, Vec3::splat(radius), globe);
+        self.add(Form::Cylinder, middle, Mat3::IDENTITY, half, cord);
+        for part in self.primitives.iter_mut().rev().take(2) {
+            part.casts_shadow = false;
+        }
+    }
+
     /// A niche: a dark back within four boards that stand out from the wall.
     fn inset(&mut self) {
         let half = Vec2::new(self.rng.range(0.15, 0.5), self.rng.range(0.15, 0.5));

@@ -24,7 +24,7 @@ pub(super) struct Lighting {
 }
 
 /// Radius of a lamp where shadows are soft, m.
-const LAMP_RADIUS: f32 = 0.12;
+const LAMP_RADIUS: f32 = 0.08;
 /// Reach of the darkening in corners, m, and its strength.
 const CORNER_REACH: f32 = 0.22;
 const CORNER_DEPTH: f32 = 0.38;
@@ -46,9 +46,14 @@ impl Lighting {
         let (first, second) = (lamp(true, 1.0), lamp(false, 0.6));
         let casts_shadow = rng.chance(0.5);
         let sky = 0.06 * rng.normal();
-        let above = Vec3::new(1.0 - sky, 1.0, 1.0 + sky) * rng.range(0.25, 0.6);
+        let above = Vec3::new(1.0 - sky, 1.0, 1.0 + sky) * rng.range(0.2, 0.5);
         let below = above * rng.range(0.35, 0.9);
         Self { lamps: [Lamp { casts_shadow, ..first }, second], above, below }
+    }
+
+    /// Where the lamp that may cast shadows hangs.
+    pub(super) fn main_lamp(&self) -> Vec3 {
+        self.lamps[0].place
     }
 }
 
@@ -59,8 +64,9 @@ pub(super) struct Look {
     pub(super) spread: f32,
     /// Highlights and mirrors.
     pub(super) view_dependent: bool,
-    /// Shift of the lamps, radii: zero for hard shadows.
-    pub(super) lamp_shift: Vec3,
+    /// Where in its ball each lamp stands, radii, when all lamps cast soft shadows;
+    /// `None` for the room's own choice of hard ones.
+    pub(super) lamp_shift: Option<Vec3>,
 }
 
 impl Room {
@@ -96,14 +102,15 @@ impl Room {
         }
         let (mut light, mut highlight) = (self.ambient(point, &surface), Vec3::ZERO);
         for lamp in &self.lighting.lamps {
-            let place = lamp.place + look.lamp_shift * LAMP_RADIUS;
-            let path = place - point;
+            let path = lamp.place - point;
             let distance2 = path.length_squared();
             let direction = path / distance2.sqrt().max(1e-6);
             let slope = surface.normal.dot(direction);
-            if slope <= 0.0
-                || (lamp.casts_shadow && self.shadowed(point + surface.normal * 1e-3, place))
-            {
+            // Only the shadow knows that a lamp has extent: no grain elsewhere.
+            let place = lamp.place + look.lamp_shift.unwrap_or(Vec3::ZERO) * LAMP_RADIUS;
+            let casts_shadow = lamp.casts_shadow || look.lamp_shift.is_some();
+            let from = point + surface.normal * 1e-3;
+            if slope <= 0.0 || (casts_shadow && self.shadowed(from, place)) {
                 continue;
             }
             // 0.3 m² keep a wall beside a lamp from burning out.

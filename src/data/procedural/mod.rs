@@ -54,7 +54,7 @@ pub struct Room {
 
 /// Linear value that the mean radiance of a room is exposed to: with the shoulder and
 /// a gamma of 2.2 this is displayed a little under ½.
-const MIDDLE_GREY: f32 = 0.24;
+const MIDDLE_GREY: f32 = 0.2;
 
 impl Room {
     /// The room of `seed`, with the shared bank of 256² textures.
@@ -64,8 +64,9 @@ impl Room {
 
     /// The same room with the textures of `bank`, for instance larger ones.
     pub fn with_bank(seed: u64, bank: Arc<TextureBank>) -> Self {
-        let layout = Layout::furnished(seed);
+        let mut layout = Layout::furnished(seed);
         let lighting = Lighting::new(layout.size, &mut layout.rng.fork(1));
+        layout.hang_lamp(lighting.main_lamp());
         let mut room = Self {
             size: layout.size,
             primitives: layout.primitives,
@@ -98,7 +99,7 @@ impl Room {
     /// Geometric mean luminance over rays from the room's middle.
     fn mean_radiance(&self, rng: &mut Rng) -> f32 {
         const RAYS: usize = 96;
-        let look = Look { spread: 0.1, view_dependent: false, lamp_shift: Vec3::ZERO };
+        let look = Look { spread: 0.1, view_dependent: false, lamp_shift: None };
         let mut sum = 0.0;
         for _ in 0..RAYS {
             let origin = Vec3::new(

@@ -76,7 +76,8 @@ impl Grade {
 pub struct Quality {
     /// Samples along each side of a pixel; their number is the square. At least 1.
     pub samples: usize,
-    /// Lamps with extent: soft shadows, grainy below some 16 samples a pixel.
+    /// All lamps cast shadows, and have extent: grainy below some 16 samples a pixel.
+    /// Off: hard shadows of one lamp, in half of the rooms.
     pub soft_shadows: bool,
     /// Highlights and mirrors.
     pub view_dependent: bool,
@@ -171,10 +172,10 @@ fn first<'a>(list: &[Candidate<'a>], ray: &Ray) -> Option<(&'a Primitive, f32)> 
     best
 }
 
-/// Linear light to display values: a shoulder that reaches white at four times the
-/// value that would clip, then the gamma.
+/// Linear light to display values: a shoulder (Reinhard et al. 2002, eq. 4) that
+/// reaches white at 1.6, then the gamma.
 fn display(linear: Vec3, grade: &Grade) -> Vec3 {
-    const WHITE: f32 = 4.0;
+    const WHITE: f32 = 1.6;
     let x = (linear * Vec3::from(grade.gain)).max(Vec3::ZERO);
     let shouldered = x * (Vec3::ONE + x / (WHITE * WHITE)) / (Vec3::ONE + x);
     shouldered.min(Vec3::ONE).powf(1.0 / grade.gamma)
@@ -236,7 +237,7 @@ impl Room {
         let mut look = Look {
             spread: cell / (eye.focal.x * eye.focal.y).sqrt(),
             view_dependent: quality.view_dependent,
-            lamp_shift: Vec3::ZERO,
+            lamp_shift: None,
         };
         let mut sum = Vec3::ZERO;
         for j in 0..n {
@@ -247,8 +248,7 @@ impl Room {
                 let ray = eye.ray(Vec2::new(cx as f32 + u, cy as f32 + v) * cell);
                 let Some((solid, t)) = first(list, &ray) else { continue };
                 if quality.soft_shadows {
-                    let (a, b) = unit_pair(hash(1, cx as u64, cy as u64));
-                    look.lamp_shift = ball(a, b);
+                    look.lamp_shift = Some(lamp_shift(cx, cy));
                 }
                 let light = self.radiance(solid, &ray, t, &look) * self.exposure;
                 sum += display(light, &quality.grade);
@@ -258,8 +258,20 @@ impl Room {
     }
 }
 
-/// A point on the unit sphere from two numbers in [0, 1).
-fn ball(a: f32, b: f32) -> Vec3 {
+/// The point of the unit sphere that a sample takes for a lamp. The two coordinates
+/// come from an additive recurrence over the lattice (multiples of irrational numbers,
+/// modulo 1), so that neighbouring samples see different parts of a lamp and a pixel's
+/// mean has far less grain than with independent draws.
+fn lamp_shift(cx: usize, cy: usize) -> Vec3 {
+    // Powers of the inverse of the root of x⁵ = x + 1 (Roberts' R4 sequence).
+    const STEP: [f64; 4] = [
+        0.856_674_883_854_502_8,
+        0.733_891_856_627_126,
+        0.628_706_721_037_808_4,
+        0.538_597_257_223_612_4,
+    ];
+    let along = |i: usize| (cx as f64 * STEP[i] + cy as f64 * STEP[i + 1]).fract() as f32;
+    let (a, b) = (along(0), along(2));
     let y = 2.0 * a - 1.0;
     let r = (1.0 - y * y).max(0.0).sqrt();
     let (sin, cos) = (std::f32::consts::TAU * b).sin_cos();

@@ -161,18 +161,29 @@ impl Primitive {
             Form::Shell => (self.half - p.abs()).min_element(),
             Form::Block => box_distance(p.abs() - self.half),
             Form::Ellipsoid => {
-                let (unit, slope) = (p / self.half, p / (self.half * self.half));
-                let k = unit.length();
-                if k < 1e-3 { -self.half.min_element() } else { k * (k - 1.0) / slope.length() }
+                let unit = p / self.half;
+                implicit_distance(
+                    unit.length(),
+                    (unit / self.half).length(),
+                    self.half.min_element(),
+                )
             }
             Form::Cylinder => {
-                let out = (Vec2::new(p.x / self.half.x, p.z / self.half.z).length() - 1.0)
-                    * self.half.x.min(self.half.z);
+                let half = Vec2::new(self.half.x, self.half.z);
+                let unit = Vec2::new(p.x, p.z) / half;
+                let out =
+                    implicit_distance(unit.length(), (unit / half).length(), half.min_element());
                 let up = p.y.abs() - self.half.y;
                 out.max(up).min(0.0) + Vec2::new(out, up).max(Vec2::ZERO).length()
             }
         }
     }
+}
+
+/// First-order distance to an ellipse or ellipsoid from `k` = |p/h| and `slope` =
+/// |p/h²|: (k − 1) over the length of its gradient.
+fn implicit_distance(k: f32, slope: f32, least: f32) -> f32 {
+    if k < 1e-3 { -least } else { k * (k - 1.0) / slope }
 }
 
 fn box_distance(out: Vec3) -> f32 {

@@ -68,10 +68,26 @@ pub(super) fn fields(kind: Kind, size: usize, rng: &mut Rng) -> Fields {
         Kind::Stripes => stripes(size, rng),
         Kind::Text => text(size, rng),
         Kind::Tiles => tiles(size, rng),
-        Kind::Grain if rng.chance(0.5) => planks(size, rng),
-        Kind::Grain => weave(size, rng),
+        Kind::Grain if rng.chance(0.5) => levelled(planks(size, rng)),
+        Kind::Grain => levelled(weave(size, rng)),
         Kind::Blobs => blobs(size, rng),
     }
+}
+
+/// The first field brought to mean ½ and deviation [`SIGMA`].
+fn levelled(mut fields: Fields) -> Fields {
+    standardised(&mut fields.a);
+    fields.a.iter_mut().for_each(|v| *v = 0.5 + SIGMA * *v);
+    fields
+}
+
+/// To mean 0 and variance 1.
+fn standardised(field: &mut [f32]) {
+    let n = field.len().max(1) as f64;
+    let mean = field.iter().map(|v| f64::from(*v)).sum::<f64>() / n;
+    let square = field.iter().map(|v| (f64::from(*v) - mean).powi(2)).sum::<f64>() / n;
+    let scale = 1.0 / square.sqrt().max(1e-9);
+    field.iter_mut().for_each(|v| *v = ((f64::from(*v) - mean) * scale) as f32);
 }
 
 /// Twice the size along the inner axis, periodic; two passes of it and further octaves
@@ -123,11 +139,8 @@ pub(super) fn scale_free(size: usize, exponent: f32, stretch: usize, rng: &mut R
             field.iter_mut().for_each(|v| *v += amplitude * rng.normal());
         }
     }
-    let n = field.len() as f64;
-    let mean = field.iter().map(|v| f64::from(*v)).sum::<f64>() / n;
-    let square = field.iter().map(|v| (f64::from(*v) - mean).powi(2)).sum::<f64>() / n;
-    let scale = 1.0 / square.sqrt().max(1e-9);
-    field.iter().map(|v| ((f64::from(*v) - mean) * scale) as f32).collect()
+    standardised(&mut field);
+    field
 }
 
 /// Standard deviation of noise around ½ in a field: 2.8σ fit before the clip.
@@ -225,7 +238,8 @@ fn text(size: usize, rng: &mut Rng) -> Fields {
     }
     let paper = scale_free(size, 1.2, 0, rng);
     for (a, p) in fields.a.iter_mut().zip(&paper) {
-        *a += 0.015 * p;
+        // Paper at 0.05, so that its grain does not clip.
+        *a = 0.05 + 0.9 * *a + 0.015 * p;
     }
     fields
 }
@@ -323,4 +337,130 @@ fn blobs(size: usize, rng: &mut Rng) -> Fields {
         let i = y * size + x;
         [step(noise[i] - t0), step(other[i] - t1)]
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::texture::BANK;
+    use super::*;
+
+    /// Power |F(u, v)|² of a square field by the definition, rows then columns.
+    fn power(field: &[f32], n: usize) -> Vec<f64> {
+        let wave: Vec<(f64, f64)> =
+            (0..n).map(|k| (std::f64::consts::TAU * k as f64 / n as f64).sin_cos()).collect();
+        let pass = |input: &[(f64, f64)]| -> Vec<(f64, f64)> {
+            // Transform along the inner axis, and transpose.
+            let mut out = vec![(0.0, 0.0); n * n];
+            for y in 0..n {
+                for u in 0..n {
+                    let mut sum = (0.0, 0.0);
+                    for x in 0..n {
+                        let ((sin, cos), (re, im)) = (wave[u * x % n], input[y * n + x]);
+                        sum.0 += re * cos + im * sin;
+                        sum.1 += im * cos - re * sin;
+                    }
+                    out[u * n + y] = sum;
+                }
+            }
+            out
+        };
+        let mean = field.iter().map(|v| f64::from(*v)).sum::<f64>() / field.len() as f64;
+        let start: Vec<(f64, f64)> = field.iter().map(|v| (f64::from(*v) - mean, 0.0)).collect();
+        pass(&pass(&start)).iter().map(|(re, im)| re * re + im * im).collect()
+    }
+
+    /// Slope of log power over log frequency, from 3 cycles to a quarter of the side.
+    fn slope(field: &[f32], n: usize) -> f64 {
+        let power = power(field, n);
+        let mut rings = vec![(0.0, 0u32); n];
+        for v in 0..n {
+            for u in 0..n {
+                let fold = |k: usize| k.min(n - k) as f64;
+                let f = fold(u).hypot(fold(v));
+                let ring = &mut rings[f.round() as usize];
+                *ring = (ring.0 + power[v * n + u], ring.1 + 1);
+            }
+        }
+        let points: Vec<(f64, f64)> = (3..=n / 4)
+            .map(|f| ((f as f64).ln(), (rings[f].0 / f64::from(rings[f].1)).ln()))
+            // As many points per octave low and high: weight by thinning.
+            .enumerate()
+            .filter(|(i, _)| (*i).is_power_of_two() || *i % 5 == 0)
+            .map(|(_, p)| p)
+            .collect();
+        let count = points.len() as f64;
+        let (mx, my) =
+            points.iter().fold((0.0, 0.0), |m, p| (m.0 + p.0 / count, m.1 + p.1 / count));
+        let (xy, xx) = points
+            .iter()
+            .fold((0.0, 0.0), |s, (x, y)| (s.0 + (x - mx) * (y - my), s.1 + (x - mx) * (x - mx)));
+        xy / xx
+    }
+
+    const N: usize = 128;
+
+    #[test]
+    fn noise_has_the_spectrum_that_it_was_asked_for() {
+        let mut rng = Rng::new(1);
+        for exponent in [0.8, 1.2, 1.7] {
+            let slopes = (0..4).map(|_| slope(&scale_free(N, exponent, 0, &mut rng), N));
+            let mean = slopes.sum::<f64>() / 4.0;
+            // Power is the square of amplitude.
+            let want = -2.0 * f64::from(exponent);
+            assert!((mean - want).abs() < 0.3, "exponent {exponent}: power slope {mean}");
+        }
+    }
+
+    #[test]
+    fn dead_leaves_fall_as_pictures_do() {
+        let mut rng = Rng::new(2);
+        let slopes = (0..6).map(|_| slope(&fields(Kind::Leaves, N, &mut rng).b, N));
+        let mean = slopes.sum::<f64>() / 6.0;
+        // Photographs: −2 ± 0.4 in power; leaves of a finite range of radii bend to −3.
+        assert!((-3.1..-1.7).contains(&mean), "{mean}");
+    }
+
+    #[test]
+    fn grain_is_longer_than_wide() {
+        let mut rng = Rng::new(3);
+        let field = scale_free(N, 1.0, 4, &mut rng);
+        let step = |dx: usize, dy: usize| -> f64 {
+            let moved = |i: usize| (i / N + dy) % N * N + (i % N + dx) % N;
+            (0..N * N).map(|i| f64::from(field[i] - field[moved(i)]).powi(2)).sum()
+        };
+        assert!(step(0, 1) > 8.0 * step(1, 0), "{} {}", step(0, 1), step(1, 0));
+    }
+
+    #[test]
+    fn all_textures_of_the_bank_show_something_and_wrap() {
+        for index in 0..BANK {
+            let mut rng = Rng::new(0).fork(index as u64);
+            let f = fields(Kind::of(index), 64, &mut rng);
+            let all = f.a.iter().chain(&f.b);
+            assert!(all.clone().all(|v| v.is_finite()), "texture {index}");
+            let clipped = all.filter(|v| !(-0.001..=1.001).contains(*v)).count();
+            assert!(clipped * 8 < f.a.len(), "texture {index}: {clipped} values clip");
+            let mean = f.a.iter().sum::<f32>() / f.a.len() as f32;
+            let deviation =
+                (f.a.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / f.a.len() as f32).sqrt();
+            assert!(deviation > 0.02, "texture {index} {:?}: {deviation}", Kind::of(index));
+        }
+        // The step over the seam is like the steps within.
+        let mut rng = Rng::new(9);
+        for kind in [Kind::Noise, Kind::Leaves, Kind::Blobs, Kind::Text] {
+            let (mut seam, mut within) = (0.0, 0.0);
+            for _ in 0..8 {
+                let f = fields(kind, 64, &mut rng);
+                for y in 0..64 {
+                    seam += (f.a[y * 64] - f.a[y * 64 + 63]).abs();
+                    within += (f.a[y * 64 + 20] - f.a[y * 64 + 19]).abs()
+                        + (f.a[y * 64 + 43] - f.a[y * 64 + 42]).abs();
+                }
+            }
+            assert!(
+                seam < 1.6 * within,
+                "{kind:?}: {seam} over the seam, {within} within two columns"
+            );
+        }
+    }
 }

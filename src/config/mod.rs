@@ -1,0 +1,278 @@
+//! Every hyper-parameter of the method: symbol, source, default. One value of
+//! [`Config`] is one model; every ablation of the paper is a value of it.
+//!
+//! Sources: "paper" and "supp." are SubSplat's main text and supplement, "MVS" is
+//! MVSplat (arXiv 2403.14627) with its released `re10k` configuration.
+//!
+//! A configuration serialises to JSON and travels in the metadata of a weight
+//! file (key [`Config::METADATA_KEY`]). Unknown keys are refused by name.
+
+mod aggregation;
+mod backbone;
+mod check;
+mod spgr;
+
+pub use aggregation::*;
+pub use backbone::*;
+pub use spgr::*;
+
+use crate::abi::{Convention, LOWPASS, ShDirection};
+use serde::{Deserialize, Serialize};
+use std::str::FromStr;
+use thiserror::Error;
+
+/// Why a configuration was refused.
+#[derive(Debug, Error)]
+pub enum ConfigError {
+    /// Not JSON, an unknown key, or a value of the wrong type.
+    #[error("configuration: {0}")]
+    Parse(#[from] serde_json::Error),
+    /// A value outside its range, or two that do not fit each other.
+    #[error("configuration key `{key}`: expected {expected}, got {got}")]
+    Value {
+        /// Dotted path of the key.
+        key: &'static str,
+        /// What would be accepted.
+        expected: String,
+        /// What came.
+        got: String,
+    },
+    /// A preset nobody defined.
+    #[error("preset: expected {expected}, got `{got}`")]
+    Preset {
+        /// The known names.
+        expected: &'static str,
+        /// What came.
+        got: String,
+    },
+}
+
+/// The whole model.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// r: side of the target picture over side of the input; K = r² children per
+    /// primary (paper: 2 and 4).
+    pub upscale: usize,
+    /// Images and cameras to depth, opacity and raw Gaussian parameters.
+    pub backbone: Backbone,
+    /// Attribute embeddings of the primaries (paper A.2).
+    pub embed: Embed,
+    /// Deformable attention over the views' features (paper A.2).
+    pub agg: Aggregation,
+    /// Sub-pixel Gaussian reparameterization (paper 3, supp. A.3).
+    pub spgr: Spgr,
+    /// How the result is meant to be rendered.
+    pub render: Render,
+}
+
+/// How the result is meant to be rendered.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Render {
+    /// Rules of the rasterizer.
+    pub convention: Convention,
+    /// Low-pass, px² (3DGS: 0.3).
+    pub lowpass: f32,
+    /// Of which picture's pixels.
+    pub lowpass_ref: LowpassRef,
+    /// Highest SH degree evaluated (3DGS: 3).
+    pub sh_degree: usize,
+    /// Direction of view-dependent colour.
+    pub sh_dir: ShDirection,
+}
+
+impl Render {
+    /// The low-pass in px² of a picture `ratio` times as large (side over side)
+    /// as the network's input.
+    pub fn lowpass_px2(&self, ratio: f32) -> f32 {
+        match self.lowpass_ref {
+            LowpassRef::Target => self.lowpass,
+            LowpassRef::Input => self.lowpass * ratio * ratio,
+        }
+    }
+}
+
+/// Of which picture's pixels the low-pass is measured in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LowpassRef {
+    /// The rendered picture's (3DGS).
+    Target,
+    /// The input's: r² times as much, so that coverage is that of a native render.
+    Input,
+}
+
+/// What SubSplat adds to the backbone: as written, or as recommended.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Preset {
+    /// The paper's equations, for its tables and for weights trained with them.
+    #[default]
+    Paper,
+    /// `paper` with the corrections of ARCHITECTURE.md, "Where the paper is silent".
+    Tuned,
+}
+
+impl FromStr for Preset {
+    type Err = ConfigError;
+
+    fn from_str(s: &str) -> Result<Self, ConfigError> {
+        match s {
+            "paper" => Ok(Preset::Paper),
+            "tuned" => Ok(Preset::Tuned),
+            _ => Err(ConfigError::Preset { expected: "`paper` or `tuned`", got: s.to_owned() }),
+        }
+    }
+}
+
+impl Config {
+    /// Key of the JSON form in the metadata of a safetensors file.
+    pub const METADATA_KEY: &'static str = "subsplat.config";
+
+    fn preset(backbone: Backbone, preset: Preset, upscale: usize) -> Self {
+        let convention = match &backbone {
+            Backbone::Mvsplat(_) => Convention::Mvsplat,
+            Backbone::Small(_) => Convention::Standard,
+        };
+        Self {
+            upscale,
+            backbone,
+            embed: Embed::preset(preset),
+            agg: Aggregation::preset(preset),
+            spgr: Spgr::preset(preset),
+            render: Render {
+                convention,
+                lowpass: LOWPASS,
+                lowpass_ref: LowpassRef::Target,
+                sh_degree: 3,
+                sh_dir: ShDirection::Child,
+            },
+        }
+    }
+
+    /// MVSplat's `re10k` backbone with SubSplat's additions. `tuned` also turns
+    /// the colour coefficients exactly ([`ShFrame::MvsplatExact`]).
+    pub fn re10k(preset: Preset, upscale: usize) -> Self {
+        let mut backbone = Mvsplat::re10k();
+        if preset == Preset::Tuned {
+            backbone.primaries.sh_frame = ShFrame::MvsplatExact;
+        }
+        Self::preset(Backbone::Mvsplat(backbone), preset, upscale)
+    }
+
+    /// The light backbone with SubSplat's additions.
+    pub fn small(preset: Preset, upscale: usize) -> Self {
+        Self::preset(Backbone::Small(Small::standard()), preset, upscale)
+    }
+
+    /// The paper's ×2 model: 256 → 512, K = 4.
+    pub fn x2() -> Self {
+        Self::re10k(Preset::Paper, 2)
+    }
+
+    /// The paper's ×4 model: 256 → 1024, K = 16.
+    pub fn x4() -> Self {
+        Self::re10k(Preset::Paper, 4)
+    }
+
+    /// K: children per primary, r².
+    pub fn children(&self) -> usize {
+        self.upscale * self.upscale
+    }
+
+    /// Shape, colour and frame of the backbone's primaries.
+    pub fn primaries(&self) -> &Primaries {
+        match &self.backbone {
+            Backbone::Mvsplat(b) => &b.primaries,
+            Backbone::Small(b) => &b.primaries,
+        }
+    }
+
+    /// Side lengths of the input must be multiples of this, px.
+    pub fn stride(&self) -> usize {
+        match &self.backbone {
+            Backbone::Mvsplat(b) => Self::stride_of(b),
+            Backbone::Small(b) => 4 << (b.unet_channels.len() - 1),
+        }
+    }
+
+    /// [`Config::stride`] of MVSplat: patch size 4 × downscale 4 (MVS patch shim); the
+    /// refinement U-Net halves, the windows split and the cost volume's U-Net halves
+    /// the 1/4 map.
+    pub fn stride_of(b: &Mvsplat) -> usize {
+        let common = |a: usize, b: usize| {
+            let (mut x, mut y) = (a, b);
+            while y > 0 {
+                (x, y) = (y, x % y);
+            }
+            a / x.max(1) * b
+        };
+        let halvings = 16usize.max(1 << (b.refine_levels - 1)).max(4 << (b.costvolume_levels - 1));
+        common(halvings, 4 * b.window_splits)
+    }
+
+    /// JSON for the metadata of a weight file.
+    ///
+    /// # Errors
+    /// None in practice; kept because serialisation is fallible.
+    pub fn to_json(&self) -> Result<String, ConfigError> {
+        Ok(serde_json::to_string(self)?)
+    }
+
+    /// Reads [`Config::to_json`]'s form and checks it.
+    ///
+    /// # Errors
+    /// Unknown or missing keys, values of the wrong type or range.
+    pub fn from_json(json: &str) -> Result<Self, ConfigError> {
+        let config: Self = serde_json::from_str(json)?;
+        config.check()?;
+        Ok(config)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn all() -> Vec<Config> {
+        let mut all = Vec::new();
+        for preset in [Preset::Paper, Preset::Tuned] {
+            for upscale in [1, 2, 3, 4] {
+                all.push(Config::re10k(preset, upscale));
+                all.push(Config::small(preset, upscale));
+            }
+        }
+        all
+    }
+
+    #[test]
+    fn presets_are_valid_and_survive_json() {
+        for config in all() {
+            config.check().unwrap();
+            let back = Config::from_json(&config.to_json().unwrap()).unwrap();
+            assert_eq!(config, back);
+        }
+    }
+
+    #[test]
+    fn bad_values_are_refused_by_key() {
+        let mut c = Config::x2();
+        c.spgr.delta = 1.5;
+        assert!(c.check().unwrap_err().to_string().contains("spgr.delta"));
+        let mut c = Config::x2();
+        c.upscale = 0;
+        assert!(c.check().unwrap_err().to_string().contains("upscale"));
+        let json = Config::x2().to_json().unwrap().replace("\"beta_z\"", "\"betaz\"");
+        assert!(Config::from_json(&json).unwrap_err().to_string().contains("betaz"));
+    }
+
+    #[test]
+    fn paper_values() {
+        let c = Config::x4();
+        assert_eq!(c.children(), 16);
+        assert_eq!(c.spgr.lambda_s.value(16), 0.60);
+        assert_eq!(Config::re10k(Preset::Tuned, 4).spgr.lambda_s.value(16), 0.25);
+        assert_eq!(c.stride(), 16);
+    }
+}
