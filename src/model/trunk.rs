@@ -18,8 +18,10 @@ use candle_core::{DType, Result, Tensor, bail};
 use candle_nn::{VarBuilder, VarMap};
 use rayon::prelude::*;
 
-/// Parents per chunk at inference: activations of 1 MB, inside a core's L2.
-pub const CHUNK: usize = 2048;
+/// Parents per chunk at inference: activations of 128 KiB, so that those of one chunk
+/// stay inside a core's L2, and below the 2¹⁶ elements from which on candle shares one
+/// elementwise operation among threads of its own, where chunks would queue.
+pub const CHUNK: usize = 256;
 
 /// Gaussians of one scene that share SH by parent.
 #[derive(Clone, Debug)]
