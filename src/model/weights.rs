@@ -416,7 +416,7 @@ mod tests {
                 let at = word as usize % bytes.len();
                 bytes[at] = (word >> 40) as u8;
             }
-            if mix(i ^ 99) % 4 == 0 {
+            if mix(i ^ 99).is_multiple_of(4) {
                 bytes.truncate(mix(i) as usize % good.len());
             }
             refused += u32::from(parse_tensors(&bytes, &path).is_err());
