@@ -144,7 +144,15 @@ impl Reconstructor {
     /// A file that is no weight file; a tensor that is missing or has another shape,
     /// named with both shapes; a configuration out of range.
     pub fn load(path: &Path, config: Option<&Config>) -> Result<Self> {
-        let weights = Weights::load(path)?.allow_missing(SUBSPLAT_PREFIX, 0);
+        Self::from_weights(Weights::load(path)?, config)
+    }
+
+    /// [`Reconstructor::load`] from weights that were read already.
+    ///
+    /// # Errors
+    /// As [`Reconstructor::load`].
+    pub fn from_weights(weights: Weights, config: Option<&Config>) -> Result<Self> {
+        let weights = weights.allow_missing(SUBSPLAT_PREFIX, 0);
         let config = match (config, weights.config()) {
             (Some(config), _) | (None, Some(config)) => config.clone(),
             (None, None) => Config::re10k(Preset::Tuned, 2),

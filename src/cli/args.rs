@@ -3,13 +3,33 @@
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
+/// What scripts may rely on; `super` keeps to it.
+const EXIT_CODES: &str = "\
+Exit codes: 0 done; 1 an error, told on stderr in one line; 2 wrong usage; 3 done, and the answer
+is no (check: bad poses; compare: a tensor out of tolerance).
+
+--json: one object on stdout, nothing else there; {\"error\": ...} with exit codes 1 and 2.";
+
+/// Three numbers, separated by commas or white space.
+fn triple(text: &str) -> Result<[f32; 3], String> {
+    let numbers: Result<Vec<f32>, _> = text
+        .split(|c: char| c == ',' || c.is_whitespace())
+        .filter(|w| !w.is_empty())
+        .map(str::parse)
+        .collect();
+    numbers
+        .ok()
+        .and_then(|v| v.try_into().ok())
+        .ok_or_else(|| "expected three numbers with commas between them".to_owned())
+}
+
 /// Two posed photographs in, 3D Gaussians and sharper new views out.
 ///
 /// Conventions everywhere: camera axes are OpenCV's (+x right, +y down, +z
 /// forward), poses are camera-to-world, pixel centres lie at +0.5. Readers convert
 /// from each format's own convention.
 #[derive(Debug, Parser)]
-#[command(name = "subsplat", version, max_term_width = 100)]
+#[command(name = "subsplat", version, max_term_width = 100, after_help = EXIT_CODES)]
 pub struct Cli {
     /// What to do.
     #[command(subcommand)]
@@ -17,7 +37,8 @@ pub struct Cli {
     /// Print one JSON object on stdout; everything else goes to stderr.
     #[arg(long, global = true)]
     pub json: bool,
-    /// Worker threads (default: RAYON_NUM_THREADS, else one per core).
+    /// Worker threads (default: RAYON_NUM_THREADS, else one per core). The result does not
+    /// depend on it.
     #[arg(long, global = true, value_name = "N")]
     pub threads: Option<usize>,
 }
@@ -139,7 +160,8 @@ pub struct RunArgs {
     /// Context frames: indices into the scene's frames, or file names.
     #[arg(long, value_delimiter = ',', value_name = "I,J")]
     pub context: Vec<String>,
-    /// Frames to render and, where photographs exist, to score.
+    /// Frames to render and to score against their photographs (default: protocol.json's,
+    /// else those between the contexts, else a path).
     #[arg(long, value_delimiter = ',', value_name = "I,J,…")]
     pub target: Vec<String>,
     /// Side of the network's input, px: N, or WxH.
@@ -158,21 +180,25 @@ pub struct RunArgs {
     /// Rendered frames.
     #[arg(long, value_enum, default_value = "targets")]
     pub path: PathArg,
-    /// Frames of a path.
+    /// Number of views of `--path interpolate` and `orbit`.
     #[arg(long, default_value_t = 30, value_name = "N")]
     pub frames: usize,
-    /// Formats of the scene.
+    /// Formats of the scene, written as scene.ply and so on.
     #[arg(long, value_enum, value_delimiter = ',', default_value = "ply", value_name = "F,…")]
     pub save: Vec<SceneFormatArg>,
     /// Leave Gaussians of less opacity out of the scene files.
     #[arg(long, default_value_t = 0.0, value_name = "ALPHA")]
     pub min_opacity: f32,
-    /// Nearest depth candidate, world units (default: from the scene).
+    /// Nearest depth candidate, world units (default: the pose file's, RealEstate10K's 1,
+    /// or from sparse points, matched points or the baseline).
     #[arg(long)]
     pub near: Option<f32>,
-    /// Farthest depth candidate, world units (default: from the scene).
+    /// Farthest depth candidate, world units (default: likewise; RealEstate10K's 100).
     #[arg(long)]
     pub far: Option<f32>,
+    /// Do not match points between the context photographs to check their poses first.
+    #[arg(long)]
+    pub no_check: bool,
     /// Detail from the photograph.
     #[arg(long, value_enum, default_value = "off")]
     pub detail: DetailArg,
@@ -198,23 +224,24 @@ pub struct ModelArgs {
     /// SubSplat.
     #[arg(long, value_enum)]
     pub preset: Option<PresetArg>,
-    /// A whole configuration (JSON); overrides the presets.
-    #[arg(long, value_name = "FILE")]
+    /// A whole configuration (JSON) instead of the two above.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["backbone", "preset"])]
     pub config: Option<PathBuf>,
 }
 
 /// Rendering options.
 #[derive(Debug, Args)]
 pub struct LookArgs {
-    /// Rasterizer rules. Default: the model's own; `standard` for scene files.
+    /// Rasterizer rules. Default: the model's own; for scene files what `run` noted in
+    /// them (.ply, .glb), else `standard`.
     #[arg(long, value_enum)]
     pub convention: Option<ConventionArg>,
     /// Of which picture's pixels the 0.3 px² low-pass is measured in.
     #[arg(long, value_enum)]
     pub lowpass_ref: Option<LowpassArg>,
     /// Background colour, R,G,B in [0, 1].
-    #[arg(long, value_delimiter = ',', num_args = 3, default_values_t = [0.0, 0.0, 0.0], value_name = "R,G,B")]
-    pub background: Vec<f32>,
+    #[arg(long, value_parser = triple, default_value = "0,0,0", value_name = "R,G,B")]
+    pub background: [f32; 3],
 }
 
 /// Cameras of two photographs that come without a pose file. The first camera is
@@ -229,24 +256,12 @@ pub struct PairArgs {
     pub intrinsics: Option<String>,
     /// Where the second camera stands in the first one's frame (x right, y down,
     /// z forward), world units.
-    #[arg(
-        long = "move",
-        value_delimiter = ',',
-        num_args = 3,
-        allow_hyphen_values = true,
-        value_name = "X,Y,Z"
-    )]
-    pub translation: Vec<f32>,
+    #[arg(long = "move", value_parser = triple, allow_hyphen_values = true, value_name = "X,Y,Z")]
+    pub translation: Option<[f32; 3]>,
     /// How the second camera is turned in the first one's frame: degrees about x,
     /// then y, then z.
-    #[arg(
-        long,
-        value_delimiter = ',',
-        num_args = 3,
-        allow_hyphen_values = true,
-        value_name = "RX,RY,RZ"
-    )]
-    pub turn: Vec<f32>,
+    #[arg(long, value_parser = triple, allow_hyphen_values = true, value_name = "RX,RY,RZ")]
+    pub turn: Option<[f32; 3]>,
     /// Pose of the first photograph: 12 or 16 numbers, row by row.
     #[arg(long, allow_hyphen_values = true, value_name = "M")]
     pub pose_a: Option<String>,
@@ -287,7 +302,7 @@ pub struct RenderArgs {
     /// Rendered frames.
     #[arg(long, value_enum, default_value = "targets")]
     pub path: PathArg,
-    /// Frames of a path.
+    /// Number of views of `--path interpolate` and `orbit`.
     #[arg(long, default_value_t = 30, value_name = "N")]
     pub frames: usize,
     /// Picture size, px: N, or WxH (default: the cameras' own).
@@ -311,14 +326,19 @@ pub struct RenderArgs {
 /// Arguments of `check`.
 #[derive(Debug, Args)]
 pub struct CheckArgs {
-    /// A scene folder or pose file.
-    pub scene: PathBuf,
-    /// Frames to judge (default: the protocol's contexts, else neighbours).
+    /// A scene folder or pose file, or two photographs.
+    #[arg(required = true, num_args = 1..=2, value_name = "SCENE | IMG IMG")]
+    pub input: Vec<PathBuf>,
+    /// Frames to judge, each with the next (default: protocol.json's contexts, else the
+    /// pair that `run` would choose).
     #[arg(long, value_delimiter = ',', value_name = "I,J")]
     pub context: Vec<String>,
-    /// Folder for the epipolar picture.
+    /// Folder for the epipolar pictures.
     #[arg(short, long, default_value = "out", value_name = "DIR")]
     pub out: PathBuf,
+    /// Cameras of two loose photographs.
+    #[command(flatten)]
+    pub pair: PairArgs,
 }
 
 /// Arguments of `info`.

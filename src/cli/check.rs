@@ -1,20 +1,22 @@
 //! `subsplat check`: are these poses right?
 
 use super::args::CheckArgs;
-use super::frames;
-use super::report::{Progress, finish, say, warn};
+use super::range::grey;
+use super::report::{Answer, Progress, peak_memory_bytes, say, warn};
+use super::{frames, pair};
 use anyhow::{Context, Result, ensure};
 use serde_json::json;
 use subsplat::check::{
-    CheckOptions, GrayImage, PairReport, RgbPicture, Verdict, check_pair, epipolar_picture,
+    CheckOptions, PairReport, RgbPicture, Verdict, check_pair, epipolar_picture,
 };
+use subsplat::data::pair::choose_pair;
 use subsplat::io::image::{Rgb, save_png};
-use subsplat::io::scene::{Scene, load_scene};
+use subsplat::io::scene::Scene;
 
 /// Runs the command; `false` where the poses are judged bad.
-pub fn check(args: &CheckArgs, as_json: bool) -> Result<bool> {
+pub fn check(args: &CheckArgs, answer: Answer) -> Result<bool> {
     let mut progress = Progress::new();
-    let scene = progress.stage("reading the scene", |_| load_scene(&args.scene))?;
+    let scene = progress.stage("scene", |_| pair::load(&args.input, &args.pair))?;
     scene.warnings.iter().for_each(warn);
     let pairs = pairs(args, &scene)?;
     say(format!(
@@ -33,43 +35,42 @@ pub fn check(args: &CheckArgs, as_json: bool) -> Result<bool> {
             let (report, picture) = judge(&scene, i, j)?;
             good &= report.verdict != Verdict::Bad;
             let file = args.out.join(format!("epipolar_{i}_{j}.png"));
-            if let Some(picture) = picture {
-                save_png(&file, &picture)?;
+            if let Some(picture) = &picture {
+                save_png(&file, picture)?;
             }
-            bar.suspend(|| tell(&scene, [i, j], &report));
-            let names = [&scene.frames[i].name, &scene.frames[j].name];
+            bar.suspend(|| tell(answer, &scene, [i, j], &report));
+            // Without the hundreds of matched points: the picture shows them.
             let mut value = serde_json::to_value(&report)?;
-            if let Some(map) = value.as_object_mut() {
-                // Hundreds of coordinates; the picture shows them.
-                map.remove("points");
-                map.insert("frames".to_owned(), json!(names));
-                map.insert("epipolar_picture".to_owned(), json!(file));
-            }
+            value["frames"] = json!([scene.frames[i].name, scene.frames[j].name]);
+            value["epipolar_picture"] = json!(picture.map(|_| file.display().to_string()));
             reports.push(value);
             bar.inc(1);
         }
         anyhow::Ok(())
     })?;
     say(format!("epipolar pictures in {}", args.out.display()));
-    let report = json!({
+    answer.finish(&json!({
         "scene": scene.name,
         "ok": good,
         "pairs": reports,
         "seconds": progress.seconds(),
-    });
-    finish(as_json, &report)?;
+        "peak_memory_bytes": peak_memory_bytes(),
+    }))?;
     Ok(good)
 }
 
 fn pairs(args: &CheckArgs, scene: &Scene) -> Result<Vec<[usize; 2]>> {
     let n = scene.frames.len();
-    ensure!(n >= 2, "{}: expected at least 2 frames, got {n}", args.scene.display());
+    ensure!(n >= 2, "{}: expected at least 2 frames, got {n}", args.input[0].display());
     if !args.context.is_empty() {
         let chosen = frames::indices(scene, &args.context, "--context")?;
         ensure!(chosen.len() >= 2, "--context: expected at least 2 frames, got {}", chosen.len());
         return Ok(chosen.windows(2).map(|w| [w[0], w[1]]).collect());
     }
-    let tests = frames::protocol(&args.scene, scene)?;
+    if n == 2 {
+        return Ok(vec![[0, 1]]);
+    }
+    let tests = frames::protocol(&args.input[0], scene)?;
     let pairs: Vec<[usize; 2]> = tests
         .iter()
         .filter(|t| t.context.len() >= 2)
@@ -78,20 +79,14 @@ fn pairs(args: &CheckArgs, scene: &Scene) -> Result<Vec<[usize; 2]>> {
     if !pairs.is_empty() {
         return Ok(pairs);
     }
-    if let Some(pair) = subsplat::data::pair::choose_pair(scene) {
-        return Ok(vec![pair.frames]);
-    }
-    Ok(vec![[0, n - 1]])
+    Ok(choose_pair(scene).map_or(vec![[0, n - 1]], |pair| vec![pair.frames]))
 }
 
 fn judge(scene: &Scene, i: usize, j: usize) -> Result<(PairReport, Option<Rgb>)> {
     let (a, camera_a) = scene.frames[i].load()?;
     let (b, camera_b) = scene.frames[j].load()?;
-    let grey = |p: &Rgb| {
-        GrayImage::from_rgb8(p.width, p.height, &p.data)
-            .with_context(|| format!("picture of {}x{} pixels", p.width, p.height))
-    };
-    let report = check_pair(&grey(&a)?, &camera_a, &grey(&b)?, &camera_b, &CheckOptions::default());
+    let options = CheckOptions::default();
+    let report = check_pair(&grey(&a)?, &camera_a, &grey(&b)?, &camera_b, &options);
     fn picture(p: &Rgb) -> RgbPicture<'_> {
         RgbPicture { width: p.width, height: p.height, pixels: &p.data }
     }
@@ -101,11 +96,24 @@ fn judge(scene: &Scene, i: usize, j: usize) -> Result<(PairReport, Option<Rgb>)>
     Ok((report, drawn))
 }
 
-fn tell(scene: &Scene, [i, j]: [usize; 2], report: &PairReport) {
+fn word(verdict: Verdict) -> &'static str {
+    match verdict {
+        Verdict::Ok => "ok",
+        Verdict::Warning => "warning",
+        Verdict::Bad => "bad",
+    }
+}
+
+fn tell(answer: Answer, scene: &Scene, [i, j]: [usize; 2], report: &PairReport) {
     let names = [&scene.frames[i].name, &scene.frames[j].name];
-    say(format!("frames {i} ({}) and {j} ({}): {:?}", names[0], names[1], report.verdict));
+    answer.line(format!(
+        "frames {i} ({}) and {j} ({}): {}",
+        names[0],
+        names[1],
+        word(report.verdict)
+    ));
     let median = report.epipolar.as_ref().and_then(|e| e.median_px);
-    say(format!(
+    answer.line(format!(
         "  {} matches; median epipolar error {}; baseline {:.4}, rotation {:.1}°, field of view {:.1}°×{:.1}°{}",
         report.matches,
         median.map_or("unknown".to_owned(), |m| format!("{m:.2} px at 640 px wide")),
@@ -118,6 +126,6 @@ fn tell(scene: &Scene, [i, j]: [usize; 2], report: &PairReport) {
             .map_or(String::new(), |o| format!(", overlap {:.0} %", 100.0 * o[0].min(o[1])))
     ));
     for finding in &report.findings {
-        say(format!("  {:?}: {}", finding.severity, finding.sentence));
+        answer.line(format!("  {}: {}", word(finding.severity), finding.sentence));
     }
 }

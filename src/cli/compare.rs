@@ -1,21 +1,23 @@
 //! `subsplat compare`: the encoder against a reference file.
 
 use super::args::CompareArgs;
-use super::report::{Progress, finish, say, warn};
-use anyhow::Result;
+use super::report::{Answer, Progress, peak_memory_bytes, warn};
+use anyhow::{Context, Result};
 use serde_json::{Value, json};
 use subsplat::model::compare;
 use subsplat::model::weights::Weights;
 
 /// Runs the command; `false` where a tensor is out of tolerance.
-pub fn compare(args: &CompareArgs, as_json: bool) -> Result<bool> {
+pub fn compare(args: &CompareArgs, answer: Answer) -> Result<bool> {
     let mut progress = Progress::new();
     let report = progress.stage("encoder", |_| -> Result<_> {
-        Ok(compare::compare(&Weights::load(&args.weights)?, &args.reference)?)
+        let weights = Weights::load(&args.weights)?;
+        compare::compare(&weights, &args.reference)
+            .with_context(|| args.reference.display().to_string())
     })?;
-    say(format!("{:<44} {:>10} {:>10} {:>10}", "tensor", "max abs", "relative", "allowed"));
+    answer.line(format!("{:<44} {:>10} {:>10} {:>10}", "tensor", "max abs", "relative", "allowed"));
     for row in &report.rows {
-        say(format!(
+        answer.line(format!(
             "{:<44} {:>10.2e} {:>10.2e} {:>10.2e}{}",
             row.tensor,
             row.max_abs,
@@ -28,7 +30,7 @@ pub fn compare(args: &CompareArgs, as_json: bool) -> Result<bool> {
         warn(format!("the reference holds `{name}`, which the encoder does not produce"));
     }
     let out = report.rows.iter().filter(|r| !r.ok).count();
-    say(format!("{} tensors compared, {out} out of tolerance", report.rows.len()));
+    answer.line(format!("{} tensors compared, {out} out of tolerance", report.rows.len()));
     let rows: Vec<Value> = report
         .rows
         .iter()
@@ -43,14 +45,12 @@ pub fn compare(args: &CompareArgs, as_json: bool) -> Result<bool> {
         })
         .collect();
     let ok = report.ok();
-    finish(
-        as_json,
-        &json!({
-            "ok": ok,
-            "tensors": rows,
-            "not_produced": report.not_produced,
-            "seconds": progress.seconds(),
-        }),
-    )?;
+    answer.finish(&json!({
+        "ok": ok,
+        "tensors": rows,
+        "not_produced": report.not_produced,
+        "seconds": progress.seconds(),
+        "peak_memory_bytes": peak_memory_bytes(),
+    }))?;
     Ok(ok)
 }

@@ -22,35 +22,69 @@ pub fn size(text: &str) -> Result<(usize, usize)> {
     }
 }
 
-/// Indices of the frames that `names` mean: an index, or a frame's name with or
-/// without folder and extension.
-pub fn indices(scene: &Scene, names: &[String], flag: &str) -> Result<Vec<usize>> {
-    names
-        .iter()
-        .map(|name| {
-            let stem = |s: &str| {
-                let file = Path::new(s).file_stem().unwrap_or_default();
-                file.to_string_lossy().into_owned()
-            };
-            if let Ok(i) = name.parse::<usize>()
-                && i < scene.frames.len()
-                && !name.starts_with("00")
-            {
-                return Ok(i);
-            }
-            let wanted = stem(name);
-            let found = scene
-                .frames
-                .iter()
-                .position(|f| &f.name == name || stem(&f.image.to_string_lossy()) == wanted);
-            found.with_context(|| {
-                format!(
-                    "{flag}: expected an index below {} or a frame's name, got `{name}`",
-                    scene.frames.len()
-                )
-            })
-        })
-        .collect()
+/// Most views of a path.
+const PATH_MAX: usize = 100_000;
+
+/// `--frames`, checked.
+pub fn count(frames: usize) -> Result<usize> {
+    ensure!((1..=PATH_MAX).contains(&frames), "--frames: expected 1 to {PATH_MAX}, got {frames}");
+    Ok(frames)
+}
+
+fn stem(file: &str) -> String {
+    Path::new(file).file_stem().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// Which of `frames` the words of `flag` mean: an index, or a frame's name with or
+/// without folder and extension. Digits with leading zeros are a name.
+pub fn pick(frames: &[&str], wanted: &[String], flag: &str) -> Result<Vec<usize>> {
+    let one = |word: &String| -> Result<usize> {
+        if let Ok(i) = word.parse::<usize>()
+            && i < frames.len()
+            && i.to_string() == *word
+        {
+            return Ok(i);
+        }
+        if let Some(i) = frames.iter().position(|f| f == word) {
+            return Ok(i);
+        }
+        let mut same = (0..frames.len()).filter(|&i| stem(frames[i]) == stem(word));
+        let found = same.next().with_context(|| {
+            format!(
+                "{flag}: expected an index below {} or a frame's name, got `{word}`",
+                frames.len()
+            )
+        })?;
+        if let Some(other) = same.next() {
+            bail!(
+                "{flag}: `{word}` may be frame {found} ({}) or {other} ({}): give the index",
+                frames[found],
+                frames[other]
+            );
+        }
+        Ok(found)
+    };
+    wanted.iter().map(one).collect()
+}
+
+/// [`pick`] among a scene's frames.
+pub fn indices(scene: &Scene, wanted: &[String], flag: &str) -> Result<Vec<usize>> {
+    let names: Vec<&str> = scene.frames.iter().map(|f| f.name.as_str()).collect();
+    pick(&names, wanted, flag)
+}
+
+/// File stems for pictures of `names`, no two alike.
+pub fn file_stems(names: &[String]) -> Vec<String> {
+    let plain = |n: &String| n.replace(['/', '\\', ':'], "_");
+    let mut taken = std::collections::BTreeSet::new();
+    let unique = |(i, name): (usize, &String)| {
+        let mut stem = plain(name);
+        while !taken.insert(stem.clone()) {
+            stem = format!("{stem}_{i}");
+        }
+        stem
+    };
+    names.iter().enumerate().map(unique).collect()
 }
 
 /// The scene's protocol.json, if it has one: its tests.
@@ -71,7 +105,7 @@ pub fn protocol(path: &Path, scene: &Scene) -> Result<Vec<Views>> {
 /// Catmull-Rom curve, rotations by slerp, focal lengths in proportion.
 pub fn interpolate(through: &[Camera], frames: usize) -> Result<Vec<Camera>> {
     ensure!(through.len() >= 2, "a path needs at least 2 cameras, got {}", through.len());
-    ensure!(frames >= 1, "--frames: expected at least 1, got 0");
+    let frames = count(frames)?;
     let last = through.len() - 1;
     let at = |i: usize| {
         let t = i as f32 / (frames - 1).max(1) as f32 * last as f32;
@@ -117,7 +151,7 @@ fn catmull_rom(p: [Vec3; 4], t: f32) -> Vec3 {
 /// `frames` cameras on a small circle around the middle of `cameras`, looking at what
 /// lies `depth` in front of it. Radius: half the cameras' spread, or 5 % of `depth`.
 pub fn orbit(cameras: &[Camera], depth: f32, frames: usize) -> Result<Vec<Camera>> {
-    ensure!(frames >= 1, "--frames: expected at least 1, got 0");
+    let frames = count(frames)?;
     let Some(first) = cameras.first() else { bail!("an orbit needs at least 1 camera, got none") };
     let count = cameras.len() as f32;
     let middle = cameras.iter().map(Camera::position).sum::<Vec3>() / count;
@@ -180,6 +214,38 @@ mod tests {
             assert!((px.x - 32.0).abs() < 1e-3 && (px.y - 24.0).abs() < 1e-3, "{px}");
             assert!(Camera::new(c.intrinsics, c.world_from_camera).is_ok());
         }
+    }
+
+    #[test]
+    fn frames_by_index_and_by_name() {
+        let frames = ["0001", "0012", "left/2", "right/2", "1"];
+        let pick = |word: &str| super::pick(&frames, &[word.to_owned()], "--target");
+        for (word, expected) in [
+            ("0", 0),
+            ("1", 1),
+            ("0001", 0),
+            ("0012.jpg", 1),
+            ("images/0001.png", 0),
+            ("left/2", 2),
+        ] {
+            assert_eq!(pick(word).unwrap(), [expected], "{word}");
+        }
+        // `2` is an index; `2.png` is a name that two frames have.
+        assert_eq!(pick("2").unwrap(), [2]);
+        for (word, hint) in [("2.png", "give the index"), ("9", "below 5"), ("", "below 5")] {
+            let error = pick(word).unwrap_err().to_string();
+            assert!(error.contains(hint) && error.contains("--target"), "{error}");
+        }
+    }
+
+    #[test]
+    fn pictures_do_not_overwrite_one_another() {
+        let names = ["a/1", "a_1", "b:1", "a/1"].map(str::to_owned);
+        let mut stems = file_stems(&names);
+        assert_eq!(stems[..3], ["a_1", "a_1_1", "b_1"]);
+        stems.sort();
+        stems.dedup();
+        assert_eq!(stems.len(), 4);
     }
 
     #[test]

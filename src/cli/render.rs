@@ -2,8 +2,9 @@
 
 use super::args::{LookArgs, LowpassArg, PathArg, RenderArgs};
 use super::frames;
-use super::report::{Progress, finish, mebibytes, peak_memory_bytes, say, warn};
-use super::run::to_rgb8;
+use super::memory;
+use super::output::{self, to_rgb8};
+use super::report::{Answer, Progress, mebibytes, peak_memory_bytes, say, warn};
 use anyhow::{Context, Result, ensure};
 use glam::{Mat4, Vec3};
 use serde_json::json;
@@ -13,7 +14,7 @@ use subsplat::camera::{Camera, Intrinsics};
 use subsplat::cpu::Rasterizer;
 use subsplat::io::cameras_json::load_cameras_json;
 use subsplat::io::image::{Depth, save_depth_png, save_png};
-use subsplat::io::load_splats;
+use subsplat::io::load_with_comments;
 use subsplat::io::scene::load_scene;
 use subsplat::render::render_with;
 use subsplat::splats::Splats;
@@ -25,28 +26,19 @@ const DEFAULT_FOV_X: f32 = 0.9;
 
 /// The background colour, checked.
 pub fn background(look: &LookArgs) -> Result<[f32; 3]> {
-    let ok = look.background.len() == 3 && look.background.iter().all(|v| (0.0..=1.0).contains(v));
-    ensure!(ok, "--background: expected three numbers in [0, 1], got {:?}", look.background);
-    Ok([look.background[0], look.background[1], look.background[2]])
+    let [r, g, b] = look.background;
+    let ok = look.background.iter().all(|v| (0.0..=1.0).contains(v));
+    ensure!(ok, "--background: expected three numbers in [0, 1], got {r},{g},{b}");
+    Ok(look.background)
 }
 
 /// Runs the command.
-pub fn render(args: &RenderArgs, as_json: bool) -> Result<()> {
+pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
-    let splats = progress.stage("reading the scene", |_| load_splats(&args.scene))?;
+    check(args)?;
+    let (splats, comments) = progress.stage("scene", |_| load_with_comments(&args.scene))?;
     let cameras = cameras(args, &splats)?;
-    let mut options =
-        RasterOptions::new(args.look.convention.map_or(Convention::Standard, Convention::from));
-    ensure!(args.sh_degree <= 4, "--sh-degree: expected 0 to 4, got {}", args.sh_degree);
-    options.sh_degree = args.sh_degree;
-    options.background = background(&args.look)?;
-    if let Some(near) = args.near {
-        ensure!(near > 0.0 && near.is_finite(), "--near: expected above 0, got {near}");
-        options.near = near;
-    }
-    if matches!(args.look.lowpass_ref, Some(LowpassArg::Input)) {
-        warn("--lowpass-ref input: a scene file does not know its input's size; ignored");
-    }
+    let options = options(args, &comments)?;
     std::fs::create_dir_all(&args.out)
         .with_context(|| format!("output folder {}", args.out.display()))?;
     let mut views = Vec::new();
@@ -57,11 +49,12 @@ pub fn render(args: &RenderArgs, as_json: bool) -> Result<()> {
             let (width, height) = (picture.width, picture.height);
             let file = args.out.join(format!("{name}.png"));
             save_png(&file, &to_rgb8(&picture.rgb, width, height))?;
+            let file = file.display().to_string();
             let mut view = json!({ "file": file, "width": width, "height": height });
             if args.depth {
                 let file = args.out.join(format!("{name}_depth.png"));
                 let unit = save_depth_png(&file, &Depth { width, height, data: picture.depth })?;
-                view["depth_file"] = json!(file);
+                view["depth_file"] = json!(file.display().to_string());
                 view["depth_unit"] = json!(unit);
             }
             views.push(view);
@@ -69,22 +62,59 @@ pub fn render(args: &RenderArgs, as_json: bool) -> Result<()> {
         }
         anyhow::Ok(())
     })?;
+    let seconds = progress.seconds();
     let peak = peak_memory_bytes();
-    say(format!(
-        "{} Gaussians, {} views in {}{}",
+    answer.line(format!(
+        "{} Gaussians, {} views in {}; {:.1} s{}",
         splats.len(),
         views.len(),
         args.out.display(),
-        peak.map_or(String::new(), |p| format!("; peak memory {}", mebibytes(p)))
+        seconds["total"].as_f64().unwrap_or(0.0),
+        peak.map_or(String::new(), |p| format!(", peak memory {}", mebibytes(p)))
     ));
-    let report = json!({
-        "scene": args.scene,
+    let mvsplat_rules = options.convention == Convention::Mvsplat;
+    answer.finish(&json!({
+        "scene": args.scene.display().to_string(),
         "gaussians": splats.len(),
+        "convention": if mvsplat_rules { "mvsplat" } else { "standard" },
         "views": views,
-        "seconds": progress.seconds(),
+        "seconds": seconds,
         "peak_memory_bytes": peak,
-    });
-    finish(as_json, &report)
+    }))
+}
+
+/// What is wrong with the arguments themselves, before a large file is read.
+fn check(args: &RenderArgs) -> Result<()> {
+    background(&args.look)?;
+    ensure!(args.sh_degree <= 4, "--sh-degree: expected 0 to 4, got {}", args.sh_degree);
+    if let Some(near) = args.near {
+        ensure!(near > 0.0 && near.is_finite(), "--near: expected above 0, got {near}");
+    }
+    frames::count(args.frames)?;
+    args.size.as_deref().map_or(Ok(()), |text| memory::check_picture(frames::size(text)?))
+}
+
+/// The arguments', else what `run` noted in the file, else the standard.
+fn options(args: &RenderArgs, comments: &[String]) -> Result<RasterOptions> {
+    let noted = output::rendering(comments);
+    let convention = args.look.convention.map(Convention::from);
+    let mut options = match (convention, noted) {
+        (Some(convention), _) => RasterOptions::new(convention),
+        (None, Some((convention, _))) => RasterOptions::new(convention),
+        (None, None) => RasterOptions::new(Convention::Standard),
+    };
+    if let Some((convention, near)) = noted
+        && convention == options.convention
+    {
+        options.near = near;
+    }
+    options.near = args.near.unwrap_or(options.near);
+    options.sh_degree = args.sh_degree;
+    options.background = background(&args.look)?;
+    if matches!(args.look.lowpass_ref, Some(LowpassArg::Input)) {
+        warn("--lowpass-ref input: a scene file does not know its input's size; ignored");
+    }
+    Ok(options)
 }
 
 /// File stems and cameras.
@@ -123,34 +153,47 @@ fn cameras(args: &RenderArgs, splats: &Splats) -> Result<Vec<(String, Camera)>> 
 
 fn named_cameras(args: &RenderArgs, splats: &Splats) -> Result<Vec<(String, Camera)>> {
     let beside = args.scene.parent().unwrap_or(Path::new("")).join("cameras.json");
-    let stem = |file: &str| {
-        let stem = Path::new(file).file_stem().unwrap_or_default();
-        stem.to_string_lossy().into_owned()
-    };
     let source = match &args.cameras {
         Some(path) => path.clone(),
         None if beside.is_file() => beside,
         None => {
+            ensure!(
+                args.target.is_empty(),
+                "--target: expected --cameras or cameras.json beside the scene"
+            );
             say("no cameras given and no cameras.json beside the scene: a view of the whole");
             return Ok(vec![("view".to_owned(), whole(splats)?)]);
         }
     };
-    // A camera list needs no pictures; any other pose file goes through its reader.
-    if source.is_file()
-        && args.target.is_empty()
-        && let Ok(content) = load_cameras_json(&source)
-    {
-        ensure!(!content.cameras.is_empty(), "{}: expected a camera, got none", source.display());
-        return Ok(content.cameras.iter().map(|c| (stem(&c.file), c.camera)).collect());
-    }
-    let scene = load_scene(&source)?;
-    scene.warnings.iter().for_each(warn);
+    let all = read_cameras(&source)?;
+    ensure!(!all.is_empty(), "{}: expected a camera, got none", source.display());
+    let names: Vec<&str> = all.iter().map(|(n, _)| n.as_str()).collect();
     let chosen = match args.target.is_empty() {
-        true => (0..scene.frames.len()).collect(),
-        false => frames::indices(&scene, &args.target, "--target")?,
+        true => (0..all.len()).collect(),
+        false => frames::pick(&names, &args.target, "--target")?,
     };
-    let named = |i: usize| Ok((stem(&scene.frames[i].name), scene.frames[i].pinhole()?));
-    chosen.into_iter().map(named).collect()
+    let (names, cameras): (Vec<String>, Vec<Camera>) =
+        chosen.into_iter().map(|i| all[i].clone()).unzip();
+    Ok(frames::file_stems(&names).into_iter().zip(cameras).collect())
+}
+
+/// Names and cameras of a pose file or scene folder.
+fn read_cameras(source: &Path) -> Result<Vec<(String, Camera)>> {
+    let inside = source.join("cameras.json");
+    let list = if inside.is_file() { &inside } else { source };
+    // A camera list needs no pictures; any other pose file goes through its reader.
+    if list.is_file()
+        && let Ok(content) = load_cameras_json(list)
+    {
+        let name = |file: &str| {
+            let file = file.strip_prefix("images/").unwrap_or(file);
+            Path::new(file).with_extension("").to_string_lossy().into_owned()
+        };
+        return Ok(content.cameras.iter().map(|c| (name(&c.file), c.camera)).collect());
+    }
+    let scene = load_scene(source)?;
+    scene.warnings.iter().for_each(warn);
+    scene.frames.iter().map(|f| Ok((f.name.clone(), f.pinhole()?))).collect()
 }
 
 fn median_depth(splats: &Splats, camera: &Camera) -> f32 {

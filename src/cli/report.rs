@@ -1,7 +1,9 @@
 //! What the user sees while the program works, and at the end.
 
+use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
+use std::io::Write;
 use std::time::{Duration, Instant};
 
 /// Times stages, shows a bar for the ones that take a while, on stderr only.
@@ -60,8 +62,14 @@ impl Progress {
         result
     }
 
+    /// Replaces the stage booked last by its `parts`.
+    pub fn split_last(&mut self, parts: &[(&'static str, f64)]) {
+        self.stages.pop();
+        parts.iter().for_each(|(name, seconds)| self.book(name, *seconds));
+    }
+
     /// Books `seconds` under `name`.
-    pub fn book(&mut self, name: &str, seconds: f64) {
+    fn book(&mut self, name: &str, seconds: f64) {
         self.stages.push((name.to_owned(), seconds));
     }
 
@@ -92,20 +100,47 @@ pub fn peak_memory_bytes() -> Option<u64> {
 
 /// A line for people, on stderr.
 pub fn say(line: impl AsRef<str>) {
-    eprintln!("{}", line.as_ref());
+    // Nobody listening is no error.
+    let _ = writeln!(std::io::stderr(), "{}", line.as_ref());
 }
 
 /// A warning for people, on stderr.
 pub fn warn(line: impl AsRef<str>) {
-    eprintln!("warning: {}", line.as_ref());
+    say(format!("warning: {}", line.as_ref()));
 }
 
-/// The one JSON object on stdout where `--json` asks for it.
-pub fn finish(json: bool, report: &impl Serialize) -> anyhow::Result<()> {
-    if json {
-        println!("{}", serde_json::to_string(report)?);
+/// Where a command's answer goes: lines for people, or one JSON object, on stdout.
+#[derive(Clone, Copy, Debug)]
+pub struct Answer {
+    json: bool,
+}
+
+impl Answer {
+    /// `json`: the object is asked for, and lines go to stderr.
+    pub fn new(json: bool) -> Self {
+        Self { json }
     }
-    Ok(())
+
+    /// A line of the answer.
+    pub fn line(self, line: impl AsRef<str>) {
+        if self.json {
+            return say(line);
+        }
+        // `subsplat info … | head` closes the pipe early and means it.
+        let _ = writeln!(std::io::stdout(), "{}", line.as_ref());
+    }
+
+    /// The whole answer; the last thing that a command does.
+    ///
+    /// # Errors
+    /// Stdout is closed or full.
+    pub fn finish(self, report: &impl Serialize) -> anyhow::Result<()> {
+        if self.json {
+            let text = serde_json::to_string(report)?;
+            writeln!(std::io::stdout(), "{text}").context("stdout")?;
+        }
+        Ok(())
+    }
 }
 
 /// Bytes as people read them.

@@ -1,68 +1,62 @@
 //! `subsplat run`: photographs to Gaussians, views and files.
 
-use super::args::{
-    BackboneArg, DetailArg, LowpassArg, ModelArgs, PathArg, RunArgs, SceneFormatArg,
-};
-use super::report::{Progress, finish, mebibytes, peak_memory_bytes, say, warn};
-use super::{frames, pair};
-use anyhow::{Context, Result, bail, ensure};
+use super::args::{DetailArg, LowpassArg, PathArg, RunArgs};
+use super::output::{self, Scored, View, Views};
+use super::report::{Answer, Progress, mebibytes, peak_memory_bytes, say, warn};
+use super::{frames, memory, model, pair, range, render};
+use anyhow::{Result, bail, ensure};
 use indicatif::ProgressBar;
 use serde_json::{Value, json};
-use std::path::{Path, PathBuf};
-use subsplat::abi::RasterOptions;
+use std::path::Path;
+use subsplat::abi::{Convention, RasterOptions};
 use subsplat::camera::Camera;
-use subsplat::config::{Config, LowpassRef, Preset};
-use subsplat::cpu::Rasterizer;
+use subsplat::check::PairReport;
+use subsplat::config::LowpassRef;
 use subsplat::data::depth::{DepthRange, depth_range};
 use subsplat::data::pair::choose_pair;
-use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
-use subsplat::io::image::{Depth, Rgb, save_depth_png, save_png};
-use subsplat::io::scene::{Scene, load_scene};
-use subsplat::io::{SaveOptions, save_splats};
-use subsplat::metrics::{psnr, ssim};
-use subsplat::model::weights::Weights;
+use subsplat::io::SaveOptions;
+use subsplat::io::scene::Scene;
 use subsplat::pipeline::{self, Photo, Reconstruction, Reconstructor, Request};
-use subsplat::render::render_with;
 
-/// A view to render.
-struct Target {
-    /// File stem.
-    name: String,
-    camera: Camera,
-    /// What a photograph shows there, and whether it had to be enlarged.
-    truth: Option<(Rgb, bool)>,
+/// Most targets that are chosen without being asked for.
+const DEFAULT_TARGETS: usize = 30;
+
+/// What to do, settled before the first second of work.
+struct Plan {
+    scene: Scene,
+    context: Vec<usize>,
+    /// Frames to render; empty for a path.
+    targets: Vec<usize>,
+    input_size: (usize, usize),
+    background: [f32; 3],
 }
 
 /// Runs the command.
-pub fn run(args: &RunArgs, as_json: bool) -> Result<()> {
+pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
-    let scene = progress.stage("reading the scene", |_| scene(args))?;
-    for line in &scene.warnings {
-        warn(line);
-    }
-    let (context, why) = context(args, &scene)?;
-    let range = depth_range(&scene, &context, (args.near, args.far))?;
-    say(format!(
-        "{}: {} frames ({}); context {}; near {:.4}, far {:.4} ({})",
-        scene.name,
-        scene.frames.len(),
-        scene.source.name(),
-        why,
-        range.near,
-        range.far,
-        range.reason
-    ));
-    let model = progress.stage("loading the model", |_| model(args))?;
-    let mut photos = Vec::new();
-    progress.steps("photographs", context.len(), |bar| {
-        for &i in &context {
-            photos.push(Photo::from_frame(&scene.frames[i])?);
+    let plan = plan(args, &mut progress)?;
+    let given = (args.near, args.far);
+    // Refuses early what was given; its guesses may give way to matched points below.
+    let guess = depth_range(&plan.scene, &plan.context, given)?;
+    let model = progress.stage("model", |_| model::load(args))?;
+    memory::check_run(model.config(), plan.context.len(), plan.input_size)?;
+    output::prepare(&args.out, &plan.scene)?;
+    let photos = progress.steps("photographs", plan.context.len(), |bar| {
+        let photo = |&i: &usize| {
             bar.inc(1);
-        }
-        anyhow::Ok(())
+            Photo::from_frame(&plan.scene.frames[i])
+        };
+        plan.context.iter().map(photo).collect::<Result<Vec<_>, _>>()
     })?;
+    let reports = match args.no_check {
+        true => Vec::new(),
+        false => progress.stage("check", |_| range::check(&photos))?,
+    };
+    range::tell(&reports);
+    let range = range::refine(guess, given, &reports);
+    say(format!("near {:.4}, far {:.4}: {}", range.near, range.far, range.reason));
     let request = Request {
-        input_size: frames::size(&args.input_size)?,
+        input_size: plan.input_size,
         near_far: (range.near, range.far),
         detail: args.detail == DetailArg::Photo,
     };
@@ -70,28 +64,61 @@ pub fn run(args: &RunArgs, as_json: bool) -> Result<()> {
         model.reconstruct_with(&photos, &request, &mut |name| bar.set_message(name))
     })?;
     drop(photos);
-    for (name, seconds) in &result.seconds {
-        progress.book(name, *seconds);
-    }
+    progress.split_last(&result.seconds);
     result.warnings.iter().for_each(warn);
-    let targets = targets(args, &scene, &context, &model, &result)?;
-    let options = raster_options(args, &model, range.near)?;
-    std::fs::create_dir_all(&args.out)
-        .with_context(|| format!("output folder {}", args.out.display()))?;
-    let scored = progress.steps("rendering", targets.len(), |bar| {
-        render_targets(&args.out, &result, &targets, &options, bar)
+    let options = raster_options(args, &plan, &model, range.near);
+    let views = views(args, &plan, &result)?;
+    let job = Views {
+        out: &args.out,
+        scene: &plan.scene,
+        crop: model.crop_options(plan.input_size),
+        options,
+    };
+    let scored =
+        progress.steps("rendering", views.len(), |bar| job.render(&result, &views, bar))?;
+    let files = progress.stage("writing", |_| {
+        let near_far = (range.near, range.far);
+        output::write_cameras(&args.out, &scored, plan.scene.units, near_far)?;
+        let save = SaveOptions {
+            min_opacity: args.min_opacity,
+            comments: vec![output::note(&options)],
+            ..SaveOptions::default()
+        };
+        output::write_scene(&args.out, &result, &args.save, &save)
     })?;
-    let files = progress.stage("writing", |_| write_scene(args, &model, &result, &targets))?;
-    let report = report(args, &scene, &context, &range, &model, &result, &scored, &files);
-    finish_run(args, as_json, report, progress, &scored)
+    let done = Done { range, reports, model, result, options, scored, files };
+    done.finish(args, &plan, progress, answer)
 }
 
-fn scene(args: &RunArgs) -> Result<Scene> {
-    match args.input.as_slice() {
-        [a, b] => pair::scene(a, b, &args.pair),
-        [one] => Ok(load_scene(one)?),
-        _ => bail!("run: expected a scene or two photographs"),
+/// Everything that can be wrong with the arguments and the scene is found here.
+fn plan(args: &RunArgs, progress: &mut Progress) -> Result<Plan> {
+    let input_size = frames::size(&args.input_size)?;
+    let background = render::background(&args.look)?;
+    frames::count(args.frames)?;
+    ensure!(
+        (0.0..=1.0).contains(&args.min_opacity),
+        "--min-opacity: expected 0 to 1, got {}",
+        args.min_opacity
+    );
+    let scene = progress.stage("scene", |_| pair::load(&args.input, &args.pair))?;
+    scene.warnings.iter().for_each(warn);
+    let (context, why) = context(args, &scene)?;
+    let targets = match (args.path, args.target.is_empty()) {
+        (PathArg::Targets, false) => frames::indices(&scene, &args.target, "--target")?,
+        (PathArg::Targets, true) => default_targets(&args.input[0], &scene, &context)?,
+        (_, false) => bail!("--target: only with --path targets"),
+        _ => Vec::new(),
+    };
+    say(format!(
+        "{}: {} frames ({}); context {why}",
+        scene.name,
+        scene.frames.len(),
+        scene.source.name(),
+    ));
+    if args.path == PathArg::Targets && targets.is_empty() {
+        say(format!("no target frames: {} views from the first context to the last", args.frames));
     }
+    Ok(Plan { scene, context, targets, input_size, background })
 }
 
 /// Context frames, and how they were chosen.
@@ -100,10 +127,13 @@ fn context(args: &RunArgs, scene: &Scene) -> Result<(Vec<usize>, String)> {
     if !args.context.is_empty() {
         let chosen = frames::indices(scene, &args.context, "--context")?;
         ensure!(chosen.len() >= 2, "--context: expected at least 2 frames, got {}", chosen.len());
-        let mut distinct = chosen.clone();
-        distinct.sort_unstable();
-        distinct.dedup();
-        ensure!(distinct.len() == chosen.len(), "--context: expected different frames");
+        for (n, i) in chosen.iter().enumerate() {
+            let name = &scene.frames[*i].name;
+            ensure!(
+                !chosen[..n].contains(i),
+                "--context: expected different frames, got {name} twice"
+            );
+        }
         let text = format!("{} as given", list(&chosen));
         return Ok((chosen, text));
     }
@@ -127,123 +157,29 @@ fn context(args: &RunArgs, scene: &Scene) -> Result<(Vec<usize>, String)> {
     Ok((pair.frames.to_vec(), text))
 }
 
-/// The model that the arguments ask for.
-fn model(args: &RunArgs) -> Result<Reconstructor> {
-    let Some(path) = &args.weights else {
-        let config = config(&args.model, None, args.upscale)?;
-        let what = match pipeline::is_mvsplat(&config) {
-            true => "MVSplat's network gives noise with them",
-            false => "the small network is then a plain plane sweep, without anything learned",
-        };
-        warn(format!("no --weights: using seeded random weights (seed {}); {what}", args.seed));
-        return Ok(Reconstructor::untrained(&config, args.seed)?);
-    };
-    let stored = Weights::load(path)?.config().cloned();
-    let config = config(&args.model, Some(stored), args.upscale)?;
-    let model = Reconstructor::load(path, Some(&config))?;
-    let untrained = model.untrained_tensors();
-    if !untrained.is_empty() {
-        say(format!(
-            "{}: holds no SubSplat tensors ({} start untrained, so children follow the plain \
-             split of their parents)",
-            path.display(),
-            untrained.len()
-        ));
-    }
-    let unexpected = model.unexpected_tensors();
-    if !unexpected.is_empty() {
-        warn(format!(
-            "{}: {} tensors are not part of this model, first `{}`",
-            path.display(),
-            unexpected.len(),
-            unexpected[0]
-        ));
-    }
-    Ok(model)
-}
-
-/// `stored` is `None` without weights, `Some(None)` for weights that carry no
-/// configuration.
-fn config(
-    args: &ModelArgs,
-    stored: Option<Option<Config>>,
-    upscale: Option<usize>,
-) -> Result<Config> {
-    if let Some(path) = &args.config {
-        let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
-        let mut config = Config::from_json(&text).with_context(|| path.display().to_string())?;
-        config.upscale = upscale.unwrap_or(config.upscale);
-        config.check()?;
-        return Ok(config);
-    }
-    let bare = stored.is_some();
-    let mvsplat = match (args.backbone, stored.as_ref().and_then(Option::as_ref)) {
-        (Some(backbone), _) => backbone == BackboneArg::Re10k,
-        (None, Some(config)) => pipeline::is_mvsplat(config),
-        (None, None) => bare,
-    };
-    let mut config = match (stored.flatten(), args.preset) {
-        (Some(config), None) if pipeline::is_mvsplat(&config) == mvsplat => config,
-        (_, preset) => {
-            let preset = preset.map_or(Preset::Tuned, Preset::from);
-            pipeline::preset(mvsplat, preset, upscale.unwrap_or(2))
-        }
-    };
-    config.upscale = upscale.unwrap_or(config.upscale);
-    config.check()?;
-    Ok(config)
-}
-
-fn targets(
-    args: &RunArgs,
-    scene: &Scene,
-    context: &[usize],
-    model: &Reconstructor,
-    result: &Reconstruction,
-) -> Result<Vec<Target>> {
-    let inputs: Vec<Camera> = result.inputs.iter().map(|c| c.target_camera).collect();
-    let path = |cameras: Vec<Camera>| {
-        let name = |i| format!("path_{i:04}");
-        let target = |(i, camera)| Target { name: name(i), camera, truth: None };
-        cameras.into_iter().enumerate().map(target).collect::<Vec<_>>()
-    };
-    match args.path {
-        PathArg::Interpolate => return Ok(path(frames::interpolate(&inputs, args.frames)?)),
-        PathArg::Orbit => {
-            let depth = median(&result.depths[0].data);
-            return Ok(path(frames::orbit(&inputs, depth, args.frames)?));
-        }
-        PathArg::Targets => {}
-    }
-    let chosen = match args.target.is_empty() {
-        false => frames::indices(scene, &args.target, "--target")?,
-        true => default_targets(&args.input[0], scene, context)?,
-    };
-    if chosen.is_empty() {
-        return Ok(path(frames::interpolate(&inputs, args.frames)?));
-    }
-    let options = model.crop_options(frames::size(&args.input_size)?);
-    chosen
-        .iter()
-        .map(|&i| {
-            let frame = &scene.frames[i];
-            let cropped = Photo::from_frame(frame)?.crop(&options)?;
-            let name = frame.name.replace(['/', '\\', ':'], "_");
-            let enlarged = !cropped.warnings.is_empty();
-            let truth = Some((cropped.target, enlarged));
-            Ok(Target { name, camera: cropped.target_camera, truth })
-        })
-        .collect()
-}
-
-/// The protocol's targets for these contexts, else the frames between them.
+/// The protocol's targets for these contexts, else frames between them, spread evenly
+/// where they are many.
 fn default_targets(input: &Path, scene: &Scene, context: &[usize]) -> Result<Vec<usize>> {
     if let Some(test) = frames::protocol(input, scene)?.into_iter().find(|t| t.context == context) {
         return Ok(test.target);
     }
     let (first, last) = (context.iter().min(), context.iter().max());
     let (Some(&first), Some(&last)) = (first, last) else { return Ok(Vec::new()) };
-    Ok((first + 1..last).filter(|i| !context.contains(i)).collect())
+    let all: Vec<usize> = (first + 1..last).filter(|i| !context.contains(i)).collect();
+    let count = all.len().min(DEFAULT_TARGETS);
+    Ok((0..count).map(|i| all[i * all.len() / count]).collect())
+}
+
+fn views(args: &RunArgs, plan: &Plan, result: &Reconstruction) -> Result<Vec<View>> {
+    let inputs: Vec<Camera> = result.inputs.iter().map(|c| c.target_camera).collect();
+    let path = match args.path {
+        PathArg::Orbit => frames::orbit(&inputs, median(&result.depths[0].data), args.frames)?,
+        PathArg::Targets if !plan.targets.is_empty() => {
+            return Ok(plan.targets.iter().map(|&i| View::Frame(i)).collect());
+        }
+        PathArg::Targets | PathArg::Interpolate => frames::interpolate(&inputs, args.frames)?,
+    };
+    Ok(path.into_iter().map(View::Path).collect())
 }
 
 fn median(values: &[f32]) -> f32 {
@@ -252,7 +188,7 @@ fn median(values: &[f32]) -> f32 {
     sorted.get(sorted.len() / 2).copied().unwrap_or(1.0)
 }
 
-fn raster_options(args: &RunArgs, model: &Reconstructor, near: f32) -> Result<RasterOptions> {
+fn raster_options(args: &RunArgs, plan: &Plan, model: &Reconstructor, near: f32) -> RasterOptions {
     let mut config = model.config().clone();
     if let Some(convention) = args.look.convention {
         config.render.convention = convention.into();
@@ -264,185 +200,96 @@ fn raster_options(args: &RunArgs, model: &Reconstructor, near: f32) -> Result<Ra
         };
     }
     let mut options = pipeline::raster_options(&config, near);
-    options.background = super::render::background(&args.look)?;
-    Ok(options)
+    options.background = plan.background;
+    options
 }
 
-/// One rendered target with its scores.
-struct Scored {
-    name: String,
-    psnr: Option<f64>,
-    ssim: Option<f64>,
-    /// The photograph was smaller than the target and had to be enlarged.
-    enlarged: bool,
+/// Everything that the report names.
+struct Done {
+    range: DepthRange,
+    reports: Vec<PairReport>,
+    model: Reconstructor,
+    result: Reconstruction,
+    options: RasterOptions,
+    scored: Vec<Scored>,
+    files: Vec<Value>,
 }
 
-fn render_targets(
-    out: &Path,
-    result: &Reconstruction,
-    targets: &[Target],
-    options: &RasterOptions,
-    bar: &ProgressBar,
-) -> Result<Vec<Scored>> {
-    let (images, depths) = (out.join("images"), out.join("depth"));
-    for folder in [&images, &depths, &out.join("inputs")] {
-        std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
-    }
-    for (i, (input, depth)) in result.inputs.iter().zip(&result.depths).enumerate() {
-        save_png(&out.join(format!("inputs/{i}.png")), &input.input)?;
-        save_depth_png(&out.join(format!("inputs/{i}_depth.png")), depth)?;
-    }
-    let mut rasterizer = Rasterizer::new();
-    let mut scored = Vec::with_capacity(targets.len());
-    for target in targets {
-        let picture = render_with(&mut rasterizer, &result.splats, &target.camera, options);
-        let (width, height) = (picture.width, picture.height);
-        save_png(
-            &images.join(format!("{}.png", target.name)),
-            &to_rgb8(&picture.rgb, width, height),
-        )?;
-        let depth = Depth { width, height, data: picture.depth };
-        save_depth_png(&depths.join(format!("{}.png", target.name)), &depth)?;
-        let mut score =
-            Scored { name: target.name.clone(), psnr: None, ssim: None, enlarged: false };
-        if let Some((truth, enlarged)) = &target.truth {
-            let truth: Vec<f32> = truth.data.iter().map(|&v| f32::from(v) / 255.0).collect();
-            score.psnr = Some(psnr(&picture.rgb, &truth, width, height)?);
-            score.ssim = ssim(&picture.rgb, &truth, width, height).ok();
-            score.enlarged = *enlarged;
-        }
-        scored.push(score);
-        bar.inc(1);
-    }
-    Ok(scored)
-}
-
-/// Linear values to 8 bits, rounded.
-pub fn to_rgb8(rgb: &[f32], width: usize, height: usize) -> Rgb {
-    let byte = |v: &f32| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
-    Rgb { width, height, data: rgb.iter().map(byte).collect() }
-}
-
-fn write_scene(
-    args: &RunArgs,
-    model: &Reconstructor,
-    result: &Reconstruction,
-    targets: &[Target],
-) -> Result<Vec<Value>> {
-    let cameras = targets
-        .iter()
-        .map(|t| NamedCamera {
-            file: format!("images/{}.png", t.name),
-            camera: t.camera,
-            timestamp: None,
-            depth: Some(format!("depth/{}.png", t.name)),
-        })
-        .collect();
-    let content = CameraFile { cameras, units: Default::default(), near_far: None };
-    save_cameras_json(&args.out.join("cameras.json"), &content)?;
-    let convention = format!("{:?}", model.config().render.convention).to_lowercase();
-    let options = SaveOptions {
-        min_opacity: args.min_opacity,
-        comments: vec![format!("render convention: {convention}")],
-        ..SaveOptions::default()
-    };
-    let mut formats = args.save.clone();
-    formats.dedup();
-    let mut files = Vec::new();
-    for format in formats {
-        let name = match format {
-            SceneFormatArg::Ply => "scene.ply",
-            SceneFormatArg::Glb => "scene.glb",
-            SceneFormatArg::Splat => "scene.splat",
-            SceneFormatArg::Spz => "scene.spz",
-        };
-        let path: PathBuf = args.out.join(name);
-        let saved = save_splats(&path, &result.splats, &options)?;
-        files.push(json!({ "file": path, "report": saved }));
-    }
-    Ok(files)
-}
-
-#[allow(clippy::too_many_arguments, reason = "one call, everything that the report names")]
-fn report(
-    args: &RunArgs,
-    scene: &Scene,
-    context: &[usize],
-    range: &DepthRange,
-    model: &Reconstructor,
-    result: &Reconstruction,
-    scored: &[Scored],
-    files: &[Value],
-) -> Value {
-    let target = |s: &Scored| {
-        json!({
-            "frame": s.name,
-            "psnr": s.psnr.filter(|v| v.is_finite()),
-            "ssim": s.ssim,
-            "photograph_enlarged": s.enlarged,
-        })
-    };
-    let names = |i: &usize| scene.frames[*i].name.clone();
-    let camera = |c: &Camera| {
-        let k = c.intrinsics;
-        json!({ "width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy })
-    };
-    json!({
-        "scene": scene.name,
-        "context": context.iter().map(names).collect::<Vec<_>>(),
-        "near": range.near,
-        "far": range.far,
-        "input_intrinsics": result.inputs.iter().map(|c| camera(&c.input_camera)).collect::<Vec<_>>(),
-        "upscale": model.config().upscale,
-        "trained": args.weights.is_some(),
-        "detail": args.detail == DetailArg::Photo,
-        "gaussians": result.splats.len(),
-        "targets": scored.iter().map(target).collect::<Vec<_>>(),
-        "files": files,
-    })
-}
-
-fn finish_run(
-    args: &RunArgs,
-    as_json: bool,
-    mut report: Value,
-    progress: Progress,
-    scored: &[Scored],
-) -> Result<()> {
-    let peak = peak_memory_bytes();
-    let seconds = progress.seconds();
-    let mean = |f: fn(&Scored) -> Option<f64>| {
-        let all: Vec<f64> = scored.iter().filter_map(f).filter(|v| v.is_finite()).collect();
+impl Done {
+    /// Mean over the views that have a finite value.
+    fn mean(&self, value: fn(&Scored) -> Option<f64>) -> Option<f64> {
+        let all: Vec<f64> =
+            self.scored.iter().filter_map(value).filter(|v| v.is_finite()).collect();
         (!all.is_empty()).then(|| all.iter().sum::<f64>() / all.len() as f64)
-    };
-    let (psnr, ssim) = (mean(|s| s.psnr), mean(|s| s.ssim));
-    if let Some(map) = report.as_object_mut() {
-        map.insert("psnr".to_owned(), json!(psnr));
-        map.insert("ssim".to_owned(), json!(ssim));
-        map.insert("seconds".to_owned(), json!(seconds));
-        map.insert("peak_memory_bytes".to_owned(), json!(peak));
     }
-    if scored.iter().any(|s| s.psnr.is_some()) {
+
+    fn report(&self, args: &RunArgs, plan: &Plan) -> Value {
+        let camera = |c: &Camera| {
+            let k = c.intrinsics;
+            json!({ "width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy })
+        };
+        let inputs = &self.result.inputs;
+        let name = |i: &usize| plan.scene.frames[*i].name.clone();
+        let config = self.model.config();
+        let mvsplat_rules = self.options.convention == Convention::Mvsplat;
+        json!({
+            "scene": plan.scene.name,
+            "context": plan.context.iter().map(name).collect::<Vec<_>>(),
+            "near": self.range.near,
+            "far": self.range.far,
+            "near_far_from": self.range.reason,
+            "check": range::report(&self.reports),
+            "input_intrinsics": inputs.iter().map(|c| camera(&c.input_camera)).collect::<Vec<_>>(),
+            "backbone": if pipeline::is_mvsplat(config) { "re10k" } else { "small" },
+            "upscale": config.upscale,
+            "convention": if mvsplat_rules { "mvsplat" } else { "standard" },
+            "weights": args.weights.as_ref().map(|p| p.display().to_string()),
+            "seed": args.seed,
+            "untrained_tensors": self.model.untrained_tensors().len(),
+            "detail": args.detail == DetailArg::Photo,
+            "gaussians": self.result.splats.len(),
+            "targets": self.scored.iter().map(Scored::json).collect::<Vec<_>>(),
+            "psnr": self.mean(|s| s.psnr),
+            "ssim": self.mean(|s| s.ssim),
+            "warnings": self.result.warnings,
+            "files": self.files,
+        })
+    }
+
+    fn finish(self, args: &RunArgs, plan: &Plan, progress: Progress, answer: Answer) -> Result<()> {
+        let mut report = self.report(args, plan);
+        let seconds = progress.seconds();
+        let total = seconds["total"].as_f64().unwrap_or(0.0);
+        let peak = peak_memory_bytes();
+        report["seconds"] = Value::Object(seconds);
+        report["peak_memory_bytes"] = json!(peak);
         let path = args.out.join("metrics.json");
         let text = serde_json::to_string_pretty(&report)?;
         subsplat::io::write_atomic(&path, |f| std::io::Write::write_all(f, text.as_bytes()))?;
-        for s in scored {
+        self.scores(answer);
+        answer.line(format!(
+            "{} Gaussians, {} views in {}; {total:.1} s{}",
+            self.result.splats.len(),
+            self.scored.len(),
+            args.out.display(),
+            peak.map_or(String::new(), |p| format!(", peak memory {}", mebibytes(p)))
+        ));
+        answer.finish(&report)
+    }
+
+    fn scores(&self, answer: Answer) {
+        let cell = |v: Option<f64>, digits: usize| {
+            v.map_or_else(|| format!("{:>6}", "-"), |v| format!("{v:6.digits$}"))
+        };
+        let compared: Vec<&Scored> = self.scored.iter().filter(|s| s.psnr.is_some()).collect();
+        for s in &compared {
             let note = if s.enlarged { "  (photograph smaller than the target)" } else { "" };
-            say(format!(
-                "  {:<12} PSNR {:6.2}  SSIM {:.4}{note}",
-                s.name,
-                s.psnr.unwrap_or(f64::NAN),
-                s.ssim.unwrap_or(f64::NAN)
-            ));
+            let (psnr, ssim) = (cell(s.psnr, 2), cell(s.ssim, 4));
+            answer.line(format!("  {:<12} PSNR {psnr}  SSIM {ssim}{note}", s.name));
+        }
+        if compared.len() > 1 {
+            let (psnr, ssim) = (cell(self.mean(|s| s.psnr), 2), cell(self.mean(|s| s.ssim), 4));
+            answer.line(format!("  {:<12} PSNR {psnr}  SSIM {ssim}", "mean"));
         }
     }
-    say(format!(
-        "{} Gaussians, {} views in {}; {:.1} s{}",
-        report["gaussians"],
-        scored.len(),
-        args.out.display(),
-        seconds["total"].as_f64().unwrap_or(0.0),
-        peak.map_or(String::new(), |p| format!(", peak memory {}", mebibytes(p)))
-    ));
-    finish(as_json, &report)
 }

@@ -18,6 +18,8 @@ pub struct DepthRange {
     pub far: f32,
     /// Where the numbers come from, for the user.
     pub reason: String,
+    /// A number comes from nothing but the baseline: matched points know better.
+    pub guessed: bool,
 }
 
 /// Fewer sparse points than this in the context views say nothing.
@@ -34,7 +36,9 @@ pub fn depth_range(
     given: (Option<f32>, Option<f32>),
 ) -> Result<DepthRange> {
     let derived = match given {
-        (Some(near), Some(far)) => DepthRange { near, far, reason: "as given".to_owned() },
+        (Some(near), Some(far)) => {
+            DepthRange { near, far, reason: "as given".to_owned(), guessed: false }
+        }
         _ => {
             let d = derive(scene, context)?;
             let (near, far) = (given.0.unwrap_or(d.near), given.1.unwrap_or(d.far));
@@ -43,7 +47,7 @@ pub fn depth_range(
                 (_, Some(_)) => format!("far as given, near {}", d.reason),
                 _ => d.reason,
             };
-            DepthRange { near, far, reason }
+            DepthRange { near, far, reason, guessed: d.guessed }
         }
     };
     let DepthRange { near, far, .. } = derived;
@@ -56,11 +60,16 @@ pub fn depth_range(
 
 fn derive(scene: &Scene, context: &[usize]) -> Result<DepthRange> {
     if let Some((near, far)) = scene.near_far {
-        return Ok(DepthRange { near, far, reason: "from the pose file".to_owned() });
+        return Ok(DepthRange {
+            near,
+            far,
+            reason: "from the pose file".to_owned(),
+            guessed: false,
+        });
     }
     if scene.units == Units::RealEstate10k {
         let reason = "RealEstate10K's habit".to_owned();
-        return Ok(DepthRange { near: 1.0, far: 100.0, reason });
+        return Ok(DepthRange { near: 1.0, far: 100.0, reason, guessed: false });
     }
     let mut cameras = Vec::with_capacity(context.len());
     for &i in context {
@@ -78,7 +87,7 @@ fn derive(scene: &Scene, context: &[usize]) -> Result<DepthRange> {
             let near = quantile(&mut depths, 0.02) / 1.5;
             let far = quantile(&mut depths, 0.98) * 2.0;
             let reason = format!("from {} depths of sparse points", depths.len());
-            return Ok(DepthRange { near, far, reason });
+            return Ok(DepthRange { near, far, reason, guessed: false });
         }
     }
     let mut baseline = 0.0f32;
@@ -95,5 +104,5 @@ fn derive(scene: &Scene, context: &[usize]) -> Result<DepthRange> {
         ));
     }
     let reason = format!("half and 30 times the baseline of {baseline:.4}");
-    Ok(DepthRange { near: 0.5 * baseline, far: 30.0 * baseline, reason })
+    Ok(DepthRange { near: 0.5 * baseline, far: 30.0 * baseline, reason, guessed: true })
 }

@@ -17,7 +17,8 @@ pub mod splats;
 pub mod spz;
 
 pub use splats::{
-    SaveOptions, SaveReport, SplatFormat, SplatInfo, Up, load_splats, save_splats, splat_info,
+    SaveOptions, SaveReport, SplatFormat, SplatInfo, Up, load_splats, load_with_comments,
+    save_splats, splat_info,
 };
 mod assemble;
 pub mod cameras_json;

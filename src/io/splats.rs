@@ -147,9 +147,17 @@ pub struct SaveReport {
 /// # Errors
 /// Unknown kind; whatever the format's reader says, with the file's name.
 pub fn load_splats(path: &Path) -> Result<Splats> {
+    Ok(load_with_comments(path)?.0)
+}
+
+/// [`load_splats`], and the comments that the file carries ([`SaveOptions::comments`]).
+///
+/// # Errors
+/// As [`load_splats`].
+pub fn load_with_comments(path: &Path) -> Result<(Splats, Vec<String>)> {
     let decoded = decode(path)?.1;
     check_finite(&decoded.splats, path)?;
-    Ok(decoded.splats)
+    Ok((decoded.splats, decoded.comments))
 }
 
 fn decode(path: &Path) -> Result<(SplatFormat, Decoded, u64)> {
