@@ -21,7 +21,7 @@ fn scene(folder: &Path, side: usize) {
     let cameras = shoot.photos.iter().enumerate().map(frame).collect();
     save_cameras_json(
         &folder.join("cameras.json"),
-        &CameraFile { cameras, units: Default::default() },
+        &CameraFile { cameras, units: Default::default(), near_far: None },
     )
     .unwrap();
 }
