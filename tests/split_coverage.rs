@@ -46,10 +46,13 @@ struct Parents {
     primaries: Primaries,
 }
 
+/// Row and colour of the parent at a pixel of a camera.
+type Draw<'a> = dyn FnMut(&Camera, Vec2) -> ([f32; 11], [f32; 3]) + 'a;
+
 impl Parents {
     fn new(
         cameras: &[Camera],
-        parent: &mut dyn FnMut(&Camera, Vec2) -> ([f32; 11], [f32; 3]),
+        parent: &mut Draw<'_>,
     ) -> Self {
         let k = cameras[0].intrinsics;
         let (mut rows, mut sh) = (Vec::new(), Vec::new());
