@@ -223,7 +223,8 @@ fn tuned_children_reduced_are_their_parents_native_render() {
             let (bias, noise, colour) = score(&config(upscale));
             // Pixel by pixel they differ: children tile their parent's moved pixel, where
             // the native render blurs it over its neighbours.
-            assert!(bias.abs() < 0.01 && noise < 0.035, "{bias:+.4} {noise:.4}");
+            let (most, spread) = if upscale == 2 { (0.003, 0.012) } else { (0.008, 0.03) };
+            assert!(bias.abs() < most && noise < spread, "{bias:+.4} {noise:.4}");
             assert!(colour < 0.08, "{colour:.4}");
             // The paper's rules do not keep it: the comparison sees the difference.
             let mut paper = Config::small(Preset::Paper, upscale);
