@@ -50,10 +50,7 @@ struct Parents {
 type Draw<'a> = dyn FnMut(&Camera, Vec2) -> ([f32; 11], [f32; 3]) + 'a;
 
 impl Parents {
-    fn new(
-        cameras: &[Camera],
-        parent: &mut Draw<'_>,
-    ) -> Self {
+    fn new(cameras: &[Camera], parent: &mut Draw<'_>) -> Self {
         let k = cameras[0].intrinsics;
         let (mut rows, mut sh) = (Vec::new(), Vec::new());
         for camera in cameras {
