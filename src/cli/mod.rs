@@ -60,8 +60,9 @@ fn refuse(error: &clap::Error) -> ExitCode {
         return ExitCode::SUCCESS;
     }
     let text = error.to_string();
-    let line = text.lines().next().unwrap_or_default();
-    let line = line.strip_prefix("error: ").unwrap_or(line);
+    // Usage and hints follow after an empty line.
+    let line = one_line(text.split("\n\n").next().unwrap_or_default());
+    let line = line.strip_prefix("error: ").unwrap_or(&line);
     let json = std::env::args_os().any(|a| a == "--json");
     let _ = Answer::new(json).finish(&json!({ "error": line }));
     ExitCode::from(USAGE)

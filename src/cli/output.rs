@@ -1,7 +1,7 @@
 //! What `run` writes: pictures, depth, cameras, the scene in any format.
 //!
 //! `images/` holds the rendered views, `depth/` their depth, `inputs/` what the network
-//! saw and its depth of it. With `cameras.json` the folder is a scene that every
+//! saw and its depth of it, `config.json` the model. With `cameras.json` the folder is a scene that every
 //! command reads.
 
 use super::args::SceneFormatArg;
@@ -12,6 +12,7 @@ use serde_json::{Value, json};
 use std::path::Path;
 use subsplat::abi::{Convention, RasterOptions};
 use subsplat::camera::Camera;
+use subsplat::config::Config;
 use subsplat::cpu::Rasterizer;
 use subsplat::data::crop::CropOptions;
 use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
@@ -197,6 +198,14 @@ pub fn write_cameras(
     Ok(save_cameras_json(&out.join("cameras.json"), &content)?)
 }
 
+/// `config.json`, which `--config` takes.
+pub fn write_config(out: &Path, config: &Config) -> Result<()> {
+    let text = serde_json::to_string_pretty(config)?;
+    let write =
+        |f: &mut std::io::BufWriter<std::fs::File>| std::io::Write::write_all(f, text.as_bytes());
+    Ok(subsplat::io::write_atomic(&out.join("config.json"), write)?)
+}
+
 /// The scene in each of `formats`; one report each.
 pub fn write_scene(
     out: &Path,
@@ -235,20 +244,22 @@ pub fn note(options: &RasterOptions) -> String {
         Convention::Standard => "standard",
         Convention::Mvsplat => "mvsplat",
     };
-    format!("{NOTE} convention={convention} near={}", options.near)
+    format!("{NOTE} convention={convention} near={} lowpass={}", options.near, options.lowpass)
 }
 
-/// The convention and near plane that [`note`] left among a file's comments.
-pub fn rendering(comments: &[String]) -> Option<(Convention, f32)> {
+/// Convention, near plane and low-pass that [`note`] left among a file's comments.
+pub fn rendering(comments: &[String]) -> Option<RasterOptions> {
     let text = comments.iter().find_map(|c| c.trim().strip_prefix(NOTE))?;
     let value = |key: &str| text.split_whitespace().find_map(|w| w.strip_prefix(key));
+    let number = |key: &str| value(key)?.parse::<f32>().ok().filter(|v| v.is_finite());
     let convention = match value("convention=")? {
         "standard" => Convention::Standard,
         "mvsplat" => Convention::Mvsplat,
         _ => return None,
     };
-    let near: f32 = value("near=")?.parse().ok()?;
-    (near > 0.0 && near.is_finite()).then_some((convention, near))
+    let near = number("near=").filter(|v| *v > 0.0)?;
+    let lowpass = number("lowpass=").filter(|v| *v >= 0.0)?;
+    Some(RasterOptions { near, lowpass, ..RasterOptions::new(convention) })
 }
 
 #[cfg(test)]
@@ -257,12 +268,19 @@ mod tests {
 
     #[test]
     fn a_scene_file_remembers_how_it_is_rendered() {
-        for (convention, near) in [(Convention::Standard, 0.01), (Convention::Mvsplat, 1.25)] {
-            let options = RasterOptions { near, ..RasterOptions::new(convention) };
-            let comments = ["up is -y".to_owned(), note(&options)];
-            assert_eq!(rendering(&comments), Some((convention, near)));
+        for (convention, near, lowpass) in
+            [(Convention::Standard, 0.01, 0.3), (Convention::Mvsplat, 1.25, 1.2)]
+        {
+            let options = RasterOptions { near, lowpass, ..RasterOptions::new(convention) };
+            assert_eq!(rendering(&["up is -y".to_owned(), note(&options)]), Some(options));
         }
-        for bad in ["", "convention=gsplat near=1", "convention=standard near=-1", "near=1"] {
+        for bad in [
+            "",
+            "convention=gsplat near=1 lowpass=0.3",
+            "convention=standard near=-1 lowpass=0.3",
+            "convention=standard near=1 lowpass=nan",
+            "near=1 lowpass=0.3",
+        ] {
             assert_eq!(rendering(&[format!("{NOTE} {bad}")]), None, "{bad}");
         }
     }

@@ -97,17 +97,12 @@ fn check(args: &RenderArgs) -> Result<()> {
 /// The arguments', else what `run` noted in the file, else the standard.
 fn options(args: &RenderArgs, comments: &[String]) -> Result<RasterOptions> {
     let noted = output::rendering(comments);
-    let convention = args.look.convention.map(Convention::from);
-    let mut options = match (convention, noted) {
-        (Some(convention), _) => RasterOptions::new(convention),
-        (None, Some((convention, _))) => RasterOptions::new(convention),
-        (None, None) => RasterOptions::new(Convention::Standard),
+    let asked = args.look.convention.map(Convention::from);
+    // What was noted for one convention says nothing about the other.
+    let mut options = match noted.filter(|n| asked.is_none_or(|a| a == n.convention)) {
+        Some(noted) => noted,
+        None => RasterOptions::new(asked.unwrap_or(Convention::Standard)),
     };
-    if let Some((convention, near)) = noted
-        && convention == options.convention
-    {
-        options.near = near;
-    }
     options.near = args.near.unwrap_or(options.near);
     options.sh_degree = args.sh_degree;
     options.background = background(&args.look)?;

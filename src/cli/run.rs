@@ -25,8 +25,6 @@ const DEFAULT_TARGETS: usize = 30;
 struct Plan {
     scene: Scene,
     context: Vec<usize>,
-    /// Frames to render; empty for a path.
-    targets: Vec<usize>,
     input_size: (usize, usize),
     background: [f32; 3],
 }
@@ -39,7 +37,14 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     // Refuses early what was given; its guesses may give way to matched points below.
     let guess = depth_range(&plan.scene, &plan.context, given)?;
     let model = progress.stage("model", |_| model::load(args))?;
-    memory::check_run(model.config(), plan.context.len(), plan.input_size)?;
+    let (stride, (w, h)) = (model.config().stride(), plan.input_size);
+    ensure!(
+        w >= stride && h >= stride,
+        "--input-size: expected at least {stride} pixels a side, got {w}x{h}"
+    );
+    memory::check_run(model.config(), plan.context.len(), (w, h))?;
+    let r = model.config().upscale;
+    let targets = targets(args, &plan, (w * r, h * r))?;
     output::prepare(&args.out, &plan.scene)?;
     let photos = progress.steps("photographs", plan.context.len(), |bar| {
         let photo = |&i: &usize| {
@@ -67,7 +72,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     progress.split_last(&result.seconds);
     result.warnings.iter().for_each(warn);
     let options = raster_options(args, &plan, &model, range.near);
-    let views = views(args, &plan, &result)?;
+    let views = views(args, &targets, &result)?;
     let job = Views {
         out: &args.out,
         scene: &plan.scene,
@@ -78,6 +83,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
         progress.steps("rendering", views.len(), |bar| job.render(&result, &views, bar))?;
     let files = progress.stage("writing", |_| {
         let near_far = (range.near, range.far);
+        output::write_config(&args.out, model.config())?;
         output::write_cameras(&args.out, &scored, plan.scene.units, near_far)?;
         let save = SaveOptions {
             min_opacity: args.min_opacity,
@@ -103,22 +109,17 @@ fn plan(args: &RunArgs, progress: &mut Progress) -> Result<Plan> {
     let scene = progress.stage("scene", |_| pair::load(&args.input, &args.pair))?;
     scene.warnings.iter().for_each(warn);
     let (context, why) = context(args, &scene)?;
-    let targets = match (args.path, args.target.is_empty()) {
-        (PathArg::Targets, false) => frames::indices(&scene, &args.target, "--target")?,
-        (PathArg::Targets, true) => default_targets(&args.input[0], &scene, &context)?,
-        (_, false) => bail!("--target: only with --path targets"),
-        _ => Vec::new(),
-    };
+    ensure!(
+        args.path == PathArg::Targets || args.target.is_empty(),
+        "--target: only with --path targets"
+    );
     say(format!(
         "{}: {} frames ({}); context {why}",
         scene.name,
         scene.frames.len(),
         scene.source.name(),
     ));
-    if args.path == PathArg::Targets && targets.is_empty() {
-        say(format!("no target frames: {} views from the first context to the last", args.frames));
-    }
-    Ok(Plan { scene, context, targets, input_size, background })
+    Ok(Plan { scene, context, input_size, background })
 }
 
 /// Context frames, and how they were chosen.
@@ -157,10 +158,34 @@ fn context(args: &RunArgs, scene: &Scene) -> Result<(Vec<usize>, String)> {
     Ok((pair.frames.to_vec(), text))
 }
 
+/// Frames to render, given the size of the pictures; empty for a path.
+fn targets(args: &RunArgs, plan: &Plan, size: (usize, usize)) -> Result<Vec<usize>> {
+    if args.path != PathArg::Targets {
+        return Ok(Vec::new());
+    }
+    let chosen = match args.target.is_empty() {
+        false => frames::indices(&plan.scene, &args.target, "--target")?,
+        true => default_targets(&args.input[0], plan, size)?,
+    };
+    if chosen.is_empty() {
+        say(format!("no target frames: {} views from the first context to the last", args.frames));
+    }
+    Ok(chosen)
+}
+
 /// The protocol's targets for these contexts, else frames between them, spread evenly
-/// where they are many.
-fn default_targets(input: &Path, scene: &Scene, context: &[usize]) -> Result<Vec<usize>> {
-    if let Some(test) = frames::protocol(input, scene)?.into_iter().find(|t| t.context == context) {
+/// where they are many. A protocol may have targets of several sizes: the
+/// smallest photographs that are no smaller than `size`, else the largest.
+fn default_targets(input: &Path, plan: &Plan, size: (usize, usize)) -> Result<Vec<usize>> {
+    let Plan { scene, context, .. } = plan;
+    let misfit = |targets: &[usize]| {
+        let k = targets.first().map(|&i| scene.frames[i].camera.intrinsics);
+        let area = k.map_or(0, |k| k.width * k.height);
+        let small = k.is_none_or(|k| k.width < size.0 || k.height < size.1);
+        (small, if small { usize::MAX - area } else { area })
+    };
+    let tests = frames::protocol(input, scene)?.into_iter().filter(|t| t.context == *context);
+    if let Some(test) = tests.min_by_key(|t| misfit(&t.target)) {
         return Ok(test.target);
     }
     let (first, last) = (context.iter().min(), context.iter().max());
@@ -170,12 +195,12 @@ fn default_targets(input: &Path, scene: &Scene, context: &[usize]) -> Result<Vec
     Ok((0..count).map(|i| all[i * all.len() / count]).collect())
 }
 
-fn views(args: &RunArgs, plan: &Plan, result: &Reconstruction) -> Result<Vec<View>> {
+fn views(args: &RunArgs, targets: &[usize], result: &Reconstruction) -> Result<Vec<View>> {
     let inputs: Vec<Camera> = result.inputs.iter().map(|c| c.target_camera).collect();
     let path = match args.path {
         PathArg::Orbit => frames::orbit(&inputs, median(&result.depths[0].data), args.frames)?,
-        PathArg::Targets if !plan.targets.is_empty() => {
-            return Ok(plan.targets.iter().map(|&i| View::Frame(i)).collect());
+        PathArg::Targets if !targets.is_empty() => {
+            return Ok(targets.iter().map(|&i| View::Frame(i)).collect());
         }
         PathArg::Targets | PathArg::Interpolate => frames::interpolate(&inputs, args.frames)?,
     };

@@ -58,6 +58,9 @@ struct Document {
 struct Asset {
     version: String,
     generator: Option<String>,
+    /// Anyone's: read only as far as it has the writer's form.
+    #[serde(default)]
+    extras: serde_json::Value,
 }
 
 #[derive(Deserialize)]
@@ -144,7 +147,11 @@ pub(super) fn decode(bytes: &[u8], path: &Path) -> Result<Decoded> {
     if version.split('.').next() != Some("2") {
         return Err(Error::format(path, "glTF version 2.x", format!("{version:?}")));
     }
-    let comments = document.asset.generator.iter().map(|g| format!("generator: {g}")).collect();
+    let asset = &document.asset;
+    let mut comments: Vec<String> =
+        asset.generator.iter().map(|g| format!("generator: {g}")).collect();
+    let extras = asset.extras["comments"].as_array();
+    comments.extend(extras.into_iter().flatten().filter_map(|c| Some(c.as_str()?.to_owned())));
     let file = File { path, document, binary };
     let mut parts = Vec::new();
     // A Gaussian takes at least 14 bytes: more than one for each byte are instances without end.
