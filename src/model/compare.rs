@@ -165,3 +165,24 @@ pub fn views(tensors: &BTreeMap<String, Tensor>) -> Result<Views> {
         near_far.chunks(v).map(<[_]>::to_vec).collect(),
     )
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use candle_core::Device;
+
+    #[test]
+    fn what_is_not_a_number_never_passes() -> Result<()> {
+        let t = |v: [f32; 3]| Tensor::new(&v, &Device::Cpu);
+        let fine = t([1.0, -2.0, 0.5])?;
+        assert!(row("x", &fine, &fine)?.ok);
+        for bad in [[1.0, f32::NAN, 0.5], [f32::NAN, -2.0, 0.5], [1.0, -2.0, f32::INFINITY]] {
+            assert!(!row("x", &t(bad)?, &fine)?.ok, "{bad:?}");
+            assert!(!row("x", &fine, &t(bad)?)?.ok, "{bad:?}");
+        }
+        assert!(!row("x", &fine, &t([0.0; 3])?)?.ok);
+        assert!(row("x", &t([0.0; 3])?, &t([0.0; 3])?)?.ok);
+        assert!(!Report::default().ok());
+        Ok(())
+    }
+}

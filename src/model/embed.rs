@@ -6,10 +6,10 @@
 //! four linear maps), φ_c through 64, a LayerNorm at the end of each.
 
 use super::geometry::{Frames, ParentChunk, canonical};
-use super::mlp::{Block2, LayerNorm, Mode, linear, xavier};
+use super::mlp::{Block2, LayerNorm, Mode, affine, gelu, linear, xavier};
 use crate::config::{AlphaInput, AnchorFrame, Embed, EmbedMlp, MuInput, ScaleInput};
 use candle_core::{Result, Tensor};
-use candle_nn::{Linear, Module, VarBuilder};
+use candle_nn::{Linear, VarBuilder};
 
 /// Hidden width of the `lite` geometry attributes.
 const LITE_HIDDEN: usize = 32;
@@ -137,13 +137,14 @@ impl Embeddings {
                 for (block, x) in geometry.iter().zip(&inputs).skip(1) {
                     sum = sum.add(&block.forward(x, mode)?)?;
                 }
-                Ok((w_g.forward(&sum)?, colour.forward(&parents.sh, mode)?))
+                Ok((affine(w_g, &sum, mode)?, colour.forward(&parents.sh, mode)?))
             }
             Mlps::Lite { geometry, w_g, ln_g, colour, ln_c } => {
-                let hidden = geometry.iter().zip(&inputs).map(|(l, x)| l.forward(x));
-                let hidden = Tensor::cat(&hidden.collect::<Result<Vec<_>>>()?, 1)?.gelu_erf()?;
-                let z_g = ln_g.forward(&w_g.forward(&hidden)?, mode)?;
-                let z_a = colour[1].forward(&colour[0].forward(&parents.sh)?.gelu_erf()?)?;
+                let hidden = geometry.iter().zip(&inputs).map(|(l, x)| affine(l, x, mode));
+                let hidden = Tensor::cat(&hidden.collect::<Result<Vec<_>>>()?, 1)?;
+                let z_g = ln_g.forward(&affine(w_g, &gelu(&hidden, mode)?, mode)?, mode)?;
+                let hidden = gelu(&affine(&colour[0], &parents.sh, mode)?, mode)?;
+                let z_a = affine(&colour[1], &hidden, mode)?;
                 Ok((z_g, ln_c.forward(&z_a, mode)?))
             }
         }

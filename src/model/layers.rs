@@ -314,6 +314,83 @@ mod tests {
         Tensor::randn(0.3f32, 1.2, shape, &Device::Cpu)
     }
 
+    fn far(a: &Tensor, b: &Tensor) -> Result<f32> {
+        (a - b)?.abs()?.flatten_all()?.max(0)?.to_scalar()
+    }
+
+    /// `[R, n]`: each row to zero mean and unit variance, in tensor operations.
+    fn normalised(x: &Tensor) -> Result<Tensor> {
+        let centred = x.broadcast_sub(&x.mean_keepdim(1)?)?;
+        centred.broadcast_div(&(centred.sqr()?.mean_keepdim(1)? + 1e-5)?.sqrt()?)
+    }
+
+    #[test]
+    fn layers_agree_with_their_definitions() -> Result<()> {
+        let x = (noise(&[3, 8, 37, 41])? + 2.0)?;
+        let (w, b) = (noise(&[8])?, noise(&[8])?);
+        let norm = GroupNorm { weight: w.clone(), bias: b.clone(), groups: 2 };
+        let want = normalised(&x.reshape((6, ()))?)?.reshape(x.shape())?;
+        let want = want.broadcast_mul(&w.reshape((1, 8, 1, 1))?)?;
+        let want = want.broadcast_add(&b.reshape((1, 8, 1, 1))?)?;
+        assert!(far(&norm.forward(&x)?, &want)? < 2e-5);
+        let want = normalised(&x.reshape((24, ()))?)?.reshape(x.shape())?;
+        assert!(far(&instance_norm(&x)?, &want)? < 2e-5);
+        let x = (noise(&[5000, 8])? + 2.0)?;
+        let norm = LayerNorm { weight: w.clone(), bias: b.clone() };
+        let want = normalised(&x)?.broadcast_mul(&w)?.broadcast_add(&b)?;
+        assert!(far(&norm.forward(&x)?, &want)? < 2e-5);
+        // Long enough that several chunks take part.
+        let x = noise(&[40_001])?;
+        assert!(far(&gelu(&x)?, &x.gelu_erf()?)? < 1e-6);
+        assert!(far(&silu(&x)?, &x.silu()?)? < 1e-6);
+        assert!(far(&relu(&x)?, &x.relu()?)? == 0.0);
+        assert!(far(&sigmoid(&x)?, &((x.clone() * 0.5)?.tanh()?.affine(0.5, 0.5)?))? < 1e-6);
+        let x = noise(&[301, 67])?;
+        let e = x.exp()?;
+        assert!(far(&softmax(&x)?, &e.broadcast_div(&e.sum_keepdim(1)?)?)? < 1e-6);
+        let spread = Tensor::new(&[-1e30f32, 0.0, 88.0, 1e30], &Device::Cpu)?;
+        assert_eq!(softmax(&spread)?.to_vec1::<f32>()?, [0.0, 0.0, 0.0, 1.0]);
+        Ok(())
+    }
+
+    #[test]
+    fn resizes_agree_with_their_definitions() -> Result<()> {
+        let x = Tensor::arange(0f32, 12.0, &Device::Cpu)?.reshape((1, 2, 2, 3))?;
+        // Linear in both indices, so bilinear interpolation is exact: 3·v + u.
+        let y = resize_bilinear(&x, 5, 9)?;
+        for (i, v) in y.flatten_all()?.to_vec1::<f32>()?.into_iter().enumerate() {
+            let (c, row, col) = (i / 45, i / 9 % 5, i % 9);
+            let want = 6.0 * c as f32 + 3.0 * row as f32 / 4.0 + 2.0 * col as f32 / 8.0;
+            assert!((v - want).abs() < 1e-5, "{i}: {v} {want}");
+        }
+        assert_eq!(resize_bilinear(&x, 2, 3)?.flatten_all()?.to_vec1::<f32>()?, values(&x)?);
+        assert_eq!(resize_bilinear(&x, 1, 1)?.flatten_all()?.to_vec1::<f32>()?, [0.0, 6.0]);
+        let y = upsample_nearest(&x, 3)?;
+        for (i, v) in values(&y)?.into_iter().enumerate() {
+            let (c, row, col) = (i / 54, i / 9 % 6, i % 9);
+            assert_eq!(v, (6 * c + 3 * (row / 3) + col / 3) as f32);
+        }
+        Ok(())
+    }
+
+    fn values(t: &Tensor) -> Result<Vec<f32>> {
+        t.flatten_all()?.to_vec1()
+    }
+
+    #[test]
+    fn misfits_are_named() -> Result<()> {
+        let vb = Weights::seeded(1).builder();
+        let x = noise(&[2, 8, 5, 6])?;
+        let e = GroupNorm::new(3, 8, vb.pp("gn")).unwrap_err().to_string();
+        assert!(e.contains("group norm"), "{e}");
+        let e = LayerNorm::new(8, vb.pp("ln"))?.forward(&x).unwrap_err().to_string();
+        assert!(e.contains("layer norm"), "{e}");
+        let e = Linear::new(8, 2, vb.pp("l"))?.forward(&x).unwrap_err().to_string();
+        assert!(e.contains("linear"), "{e}");
+        assert!(resize_bilinear(&x, 0, 4).is_err());
+        Ok(())
+    }
+
     #[test]
     fn every_layer_has_its_gradient() -> Result<()> {
         let vb = Weights::seeded(1).builder();

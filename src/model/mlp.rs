@@ -1,7 +1,9 @@
 //! Linear layers with chosen initial values, and a LayerNorm that keeps its
 //! gradient where one is wanted.
 
-use candle_core::{D, Result, Tensor};
+use crate::ops;
+use crate::ops::activation::{Activation, activation};
+use candle_core::{D, DType, Result, Tensor};
 use candle_nn::{Init, Linear, Module, VarBuilder};
 
 /// Whether a forward pass serves a picture or a gradient.
@@ -34,6 +36,25 @@ pub(crate) fn linear(
     Ok(Linear::new(w, Some(b)))
 }
 
+/// x·Wᵀ + b of `x` `[n, inputs]`. In [`Mode::Infer`] it stays on the caller's thread
+/// ([`ops::linear`]): chunks of parents are the parallel tasks.
+pub(crate) fn affine(layer: &Linear, x: &Tensor, mode: Mode) -> Result<Tensor> {
+    match (layer.bias(), mode) {
+        (Some(bias), Mode::Infer) if x.dtype() == DType::F32 => {
+            ops::linear::linear(x, layer.weight(), bias)
+        }
+        _ => layer.forward(x),
+    }
+}
+
+/// x·Φ(x), exact form.
+pub(crate) fn gelu(x: &Tensor, mode: Mode) -> Result<Tensor> {
+    match mode {
+        Mode::Infer if x.dtype() == DType::F32 => activation(x, Activation::Gelu),
+        _ => x.gelu_erf(),
+    }
+}
+
 /// ε of every LayerNorm (PyTorch's default).
 const NORM_EPS: f64 = 1e-5;
 
@@ -53,12 +74,10 @@ impl LayerNorm {
         })
     }
 
-    /// `x` `[.., dim]`. Candle's fused kernel has no gradient, so it serves
-    /// [`Mode::Infer`] only.
+    /// `x` `[.., dim]`. The fused kernel knows f32 only, so it serves [`Mode::Infer`].
     pub fn forward(&self, x: &Tensor, mode: Mode) -> Result<Tensor> {
-        if mode == Mode::Infer {
-            let x = x.contiguous()?;
-            return candle_nn::ops::layer_norm(&x, &self.weight, &self.bias, NORM_EPS as f32);
+        if mode == Mode::Infer && x.dtype() == DType::F32 {
+            return ops::norm::layer_norm(x, &self.weight, &self.bias);
         }
         let x = x.broadcast_sub(&x.mean_keepdim(D::Minus1)?)?;
         let variance = x.sqr()?.mean_keepdim(D::Minus1)?;
@@ -91,7 +110,7 @@ impl Block2 {
     pub(crate) fn forward(&self, x: &Tensor, mode: Mode) -> Result<Tensor> {
         let mut x = x.clone();
         for (lin, ln) in self.lin.iter().zip(&self.ln) {
-            x = ln.forward(&lin.forward(&x)?.relu()?, mode)?;
+            x = ln.forward(&affine(lin, &x, mode)?.relu()?, mode)?;
         }
         Ok(x)
     }

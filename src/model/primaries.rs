@@ -218,9 +218,9 @@ fn ray_positions(offsets: &Tensor, width: usize, height: usize) -> Result<Tensor
     centres + offsets.broadcast_mul(&pixel)?
 }
 
-/// `[P, n]` to `[P, 1]`: Euclidean norms.
+/// `[P, n]` to `[P, 1]`: Euclidean norms, with a finite gradient at zero.
 fn norm(x: &Tensor) -> Result<Tensor> {
-    x.sqr()?.sum_keepdim(1)?.sqrt()
+    (x.sqr()?.sum_keepdim(1)? + 1e-30)?.sqrt()
 }
 
 /// For row vectors: x·matrix3(R) is R·x.

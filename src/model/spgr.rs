@@ -10,7 +10,7 @@
 //!   c_k = `pos1`·GELU(`pos0`·posenc(g_k)) of the sub-pixel's place g_k: parameters
 //!   do not depend on K.
 
-use super::mlp::{LayerNorm, Mode, linear};
+use super::mlp::{LayerNorm, Mode, affine, gelu, linear};
 use crate::abi::{HEAD_GEOMETRY_LANES, HEAD_LANES};
 use crate::config::{
     AMin, AMinMode, AreaAt, Config, DepthDir, DepthUnit, GainSpace, OpacityRule, PrimaryView,
@@ -19,7 +19,7 @@ use crate::config::{
 use crate::ops::redistribute::Rule;
 use crate::ops::spgr::Rules;
 use candle_core::{Result, Tensor};
-use candle_nn::{Init, Linear, Module, VarBuilder};
+use candle_nn::{Init, Linear, VarBuilder};
 
 /// Octaves of the positional encoding of a sub-pixel's place.
 const OCTAVES: usize = 4;
@@ -82,23 +82,25 @@ impl Head {
         let (n, k) = (x.dim(0)?, side * side);
         let out = match &self.form {
             Form::Mlp2 { norm, lin0, lin1 } => {
-                lin1.forward(&lin0.forward(&norm.forward(x, mode)?)?.gelu_erf()?)?
+                let hidden = affine(lin0, &norm.forward(x, mode)?, mode)?;
+                affine(lin1, &gelu(&hidden, mode)?, mode)?
             }
             Form::Pg { lin, ln } => {
                 let mut x = x.clone();
                 for (i, ln) in ln.iter().enumerate() {
-                    x = lin[2 * i].forward(&x)?.relu()?;
-                    x = ln.forward(&lin[2 * i + 1].forward(&x)?.relu()?, mode)?;
+                    x = affine(&lin[2 * i], &x, mode)?.relu()?;
+                    x = ln.forward(&affine(&lin[2 * i + 1], &x, mode)?.relu()?, mode)?;
                 }
-                lin[4].forward(&x)?
+                affine(&lin[4], &x, mode)?
             }
             Form::Coord { norm, lin0, lin1, pos } => {
-                let x = lin0.forward(&norm.forward(x, mode)?)?;
-                let places = pos[0].forward(&posenc(side, &x)?)?.gelu_erf()?;
-                let places = pos[1].forward(&places)?;
+                let x = affine(lin0, &norm.forward(x, mode)?, mode)?;
+                let places = gelu(&affine(&pos[0], &posenc(side, &x)?, mode)?, mode)?;
+                let places = affine(&pos[1], &places, mode)?;
                 // One child at a time: [n, K, hidden] never exists.
                 let child = |i: usize| {
-                    lin1.forward(&x.broadcast_add(&places.narrow(0, i, 1)?)?.gelu_erf()?)
+                    let hidden = x.broadcast_add(&places.narrow(0, i, 1)?)?;
+                    affine(lin1, &gelu(&hidden, mode)?, mode)
                 };
                 Tensor::cat(&(0..k).map(child).collect::<Result<Vec<_>>>()?, 1)?
             }

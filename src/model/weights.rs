@@ -222,14 +222,24 @@ impl SimpleBackend for Weights {
 pub fn read_tensors(
     path: &Path,
 ) -> io::Result<(BTreeMap<String, Tensor>, HashMap<String, String>)> {
-    let bytes = io::read(path)?;
+    parse_tensors(&io::read(path)?, path)
+}
+
+/// [`read_tensors`] of bytes in memory; `path` names them in errors.
+///
+/// # Errors
+/// As [`read_tensors`].
+pub fn parse_tensors(
+    bytes: &[u8],
+    path: &Path,
+) -> io::Result<(BTreeMap<String, Tensor>, HashMap<String, String>)> {
     let bad = |e: safetensors::SafeTensorError| {
         io::Error::format(path, "a safetensors file", e.to_string())
     };
-    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(bad)?;
+    let (_, header) = SafeTensors::read_metadata(bytes).map_err(bad)?;
     let metadata = header.metadata().clone().unwrap_or_default();
     let mut tensors = BTreeMap::new();
-    for (name, view) in SafeTensors::deserialize(&bytes).map_err(bad)?.tensors() {
+    for (name, view) in SafeTensors::deserialize(bytes).map_err(bad)?.tensors() {
         let tensor = widen(path, &name, &view)?;
         tensors.insert(name, tensor);
     }
@@ -392,6 +402,26 @@ mod tests {
         std::fs::write(&path, &nan).unwrap();
         let e = Weights::load(&path).unwrap_err().to_string();
         assert!(e.contains("`a`") && e.contains("298"), "{e}");
+    }
+
+    #[test]
+    fn damaged_files_give_an_answer() {
+        let (_keep, path) = file(&[("a", ones(&[30])), ("b.c", ones(&[2, 5]))]);
+        let good = std::fs::read(&path).unwrap();
+        let mut refused = 0;
+        for i in 0..4000u64 {
+            let mut bytes = good.clone();
+            for j in 0..=mix(i) % 3 {
+                let word = mix(i * 7 + j);
+                let at = word as usize % bytes.len();
+                bytes[at] = (word >> 40) as u8;
+            }
+            if mix(i ^ 99).is_multiple_of(4) {
+                bytes.truncate(mix(i) as usize % good.len());
+            }
+            refused += u32::from(parse_tensors(&bytes, &path).is_err());
+        }
+        assert!(refused > 1000, "{refused}");
     }
 
     #[test]

@@ -5,7 +5,7 @@
 use super::{Number, by_dtype, elements, slice};
 use crate::cpu::attention_gather as cpu;
 use candle_core::backend::BackendStorage;
-use candle_core::{CpuStorage, CustomOp3, DType, Layout, Result, Shape, Tensor, bail};
+use candle_core::{CpuStorage, CustomOp3, DType, Layout, Result, Shape, Storage, Tensor, bail};
 
 pub use cpu::{Drop, Gather, Level};
 
@@ -137,7 +137,14 @@ pub fn occlusion_gate(points: &Tensor, z: &Tensor, depths: &Tensor) -> Result<Te
     }
     let dtype = points.dtype();
     let host = |t: &Tensor| t.to_dtype(DType::F32)?.flatten_all()?.to_vec1::<f32>();
-    let (at, z, maps) = (host(points)?, host(z)?, host(depths)?);
+    let (at, z) = (host(points)?, host(z)?);
+    // Borrowed: every chunk of parents reads the same maps.
+    let depths = depths.to_dtype(DType::F32)?.contiguous()?;
+    let (storage, layout) = depths.storage_and_layout();
+    let Storage::Cpu(storage) = &*storage else {
+        bail!("occlusion gate depths: expected a tensor on the CPU")
+    };
+    let maps = slice::<f32>("occlusion gate", "depths", storage, layout)?;
     let area = height * width;
     let gate = |i: usize| {
         let map = cpu::DepthMap { z: &maps[i % v * area..(i % v + 1) * area], height, width };

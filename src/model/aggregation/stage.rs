@@ -6,7 +6,7 @@ use crate::config::{
     Aggregation as Keys, AttentionOp, Gate, LogitScale, MaskMode, Points, Residual,
     SampleConvention, StageNorm,
 };
-use crate::model::mlp::{LayerNorm, Mode, linear, xavier};
+use crate::model::mlp::{LayerNorm, Mode, affine, linear, xavier};
 use crate::ops::attention_gather::{Drop, Gather, attention_gather};
 use candle_core::{Result, Tensor};
 use candle_nn::{Init, Linear, Module, VarBuilder};
@@ -133,12 +133,12 @@ impl Stage {
         let query = self.query(keys, shared, &gather, &q)?;
         let mut o = attention_gather(maps, &query, &points, gather)?;
         if let Some(wo) = &self.wo {
-            o = wo.forward(&o)?;
+            o = affine(wo, &o, shared.mode)?;
         }
         let (joined, next) = match (keys.residual, &self.cat) {
             (Residual::Cat, Some(cat)) => {
                 let joined = Tensor::cat(&[f, &o], 1)?;
-                let next = cat.forward(&joined)?;
+                let next = affine(cat, &joined, shared.mode)?;
                 (joined, next)
             }
             (Residual::None, _) => (o.clone(), o),
@@ -190,7 +190,7 @@ impl Stage {
         let (v, l, m) = (g.views, g.levels.len(), g.points);
         let width = v * l * m * keys.groups;
         let bias = match (&self.weights, &self.level_bias) {
-            (Some(weights), _) => weights.forward(q)?.narrow(1, 0, width)?,
+            (Some(weights), _) => affine(weights, q, shared.mode)?.narrow(1, 0, width)?,
             (None, Some(bias)) => {
                 let bias = bias.reshape((1, 1, l, 1, 1))?;
                 bias.broadcast_as((n, v, l, m, keys.groups))?.reshape((n, width))?
@@ -234,7 +234,7 @@ impl FeedForward {
 
     fn forward(&self, x: &Tensor, mode: Mode) -> Result<Tensor> {
         let x = self.norm.forward(x, mode)?;
-        self.lin1.forward(&self.lin0.forward(&x)?.relu()?)
+        affine(&self.lin1, &affine(&self.lin0, &x, mode)?.relu()?, mode)
     }
 }
 

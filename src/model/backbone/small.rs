@@ -30,10 +30,11 @@ const K5S2: ConvShape = ConvShape { kernel: 5, stride: 2, padding: 2 };
 /// The raw head starts at σ = 0.6 input px: 0.5 + 14.5·sigmoid(x) = 3 fifths of a
 /// pixel ([`crate::config::Primaries`]).
 const SCALE_BIAS: f32 = -1.57;
-/// Untrained confidence: logit = 6·(mass around the mode) − 1.5, so that a sure
-/// pixel is opaque and a flat distribution faint.
+/// Untrained confidence: logit = 6·(mass around the mode) + 1, so that a sure pixel
+/// is opaque; a flat distribution, which lies at the far plane, still covers what
+/// nothing nearer does (on photographs 1 dB better than an intercept of −1.5).
 const CONFIDENCE_SLOPE: f64 = 6.0;
-const CONFIDENCE_SHIFT: f64 = -1.5;
+const CONFIDENCE_SHIFT: f64 = 1.0;
 
 /// What depth supervision and inspection read; all at 1/4 but the last two.
 #[derive(Clone, Debug)]

@@ -1,0 +1,123 @@
+//! Linear layer as a candle op with gradients, bias and product in one pass over
+//! blocks of rows. Kernel: [`crate::cpu::gemm`].
+//!
+//! Candle's own product splits itself over all threads, and its sums wait on a
+//! barrier of their own: called from many tasks at once they wait for one another.
+//! This one stays on the caller's thread for up to one block of rows.
+
+use super::{f32_slice, output};
+use crate::cpu::gemm::{Mat, gemm};
+use candle_core::{CpuStorage, CustomOp3, Layout, Result, Tensor, bail};
+use rayon::prelude::*;
+
+const NAME: &str = "linear";
+
+/// Rows per task: 256 × 128 floats are 128 KiB, a part of a core's L2.
+const BLOCK: usize = 256;
+
+/// y = x·Wᵀ + b: `x` `[N, C]`, `weight` `[O, C]`, `bias` `[O]`, f32.
+///
+/// # Errors
+/// Shapes that do not fit; a dtype other than f32.
+pub fn linear(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
+    let (o, c) = weight.dims2()?;
+    if x.rank() != 2 || x.dims()[1] != c || bias.dims() != [o] {
+        bail!("{NAME}: expected x [N, {c}] and bias [{o}], got {:?}, {:?}", x.dims(), bias.dims());
+    }
+    x.contiguous()?.apply_op3(&weight.contiguous()?, &bias.contiguous()?, Linear)
+}
+
+struct Linear;
+
+impl CustomOp3 for Linear {
+    fn name(&self) -> &'static str {
+        NAME
+    }
+
+    fn cpu_fwd(
+        &self,
+        s1: &CpuStorage,
+        l1: &Layout,
+        s2: &CpuStorage,
+        l2: &Layout,
+        s3: &CpuStorage,
+        l3: &Layout,
+    ) -> Result<(CpuStorage, candle_core::Shape)> {
+        let x = f32_slice(NAME, "x", s1, l1)?;
+        let w = f32_slice(NAME, "weight", s2, l2)?;
+        let b = f32_slice(NAME, "bias", s3, l3)?;
+        let ((n, c), o) = (l1.shape().dims2()?, b.len());
+        let mut y = vec![0.0; n * o];
+        if o > 0 {
+            y.par_chunks_mut(BLOCK * o).enumerate().for_each(|(i, y)| {
+                y.chunks_exact_mut(o).for_each(|row| row.copy_from_slice(b));
+                let rows = y.len() / o;
+                let x = &x[i * BLOCK * c..][..rows * c];
+                gemm(y, o, Mat::new(x, rows, c, c), Mat::new(w, o, c, c).t(), 1.0, true);
+            });
+        }
+        output(y, (n, o))
+    }
+
+    fn bwd(
+        &self,
+        x: &Tensor,
+        w: &Tensor,
+        _b: &Tensor,
+        _y: &Tensor,
+        dy: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        Ok((Some(dy.matmul(w)?), Some(dy.t()?.matmul(x)?), Some(dy.sum(0)?)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use candle_core::{Device, Var};
+
+    /// (y, dx, dw, db) of Σ y·r.
+    fn run(f: impl Fn(&Tensor, &Tensor, &Tensor) -> Result<Tensor>) -> Result<[Vec<f32>; 4]> {
+        let number = |i: usize, k: f32| ((i as f32 + 0.5) * k).sin();
+        let make = |n: usize, k: f32, shape: &[usize]| {
+            let data: Vec<f32> = (0..n).map(|i| number(i, k)).collect();
+            Var::from_tensor(&Tensor::from_vec(data, shape, &Device::Cpu)?)
+        };
+        // More rows than a block, and a block that is not full.
+        let (n, c, o) = (BLOCK + 37, 19, 11);
+        let x = make(n * c, 0.71, &[n, c])?;
+        let (w, b) = (make(o * c, 1.3, &[o, c])?, make(o, 2.1, &[o])?);
+        let y = f(&x, &w, &b)?;
+        let r = make(n * o, 0.37, &[n, o])?;
+        let grads = (&y * r.as_tensor())?.sum_all()?.backward()?;
+        let flat = |t: &Tensor| t.flatten_all()?.to_vec1::<f32>();
+        let grad = |v: &Var| match grads.get(v) {
+            Some(g) => flat(g),
+            None => bail!("no gradient"),
+        };
+        Ok([flat(&y)?, grad(&x)?, grad(&w)?, grad(&b)?])
+    }
+
+    #[test]
+    fn agrees_with_candles_own_and_so_do_its_gradients() -> Result<()> {
+        let ours = run(linear)?;
+        let theirs = run(|x, w, b| x.matmul(&w.t()?)?.broadcast_add(b))?;
+        for (a, b) in ours.iter().zip(&theirs) {
+            assert_eq!(a.len(), b.len());
+            for (a, b) in a.iter().zip(b) {
+                assert!((a - b).abs() < 1e-4, "{a} {b}");
+            }
+        }
+        Ok(())
+    }
+
+    #[test]
+    fn misfits_are_refused() -> Result<()> {
+        let zeros = |shape: &[usize]| Tensor::zeros(shape, candle_core::DType::F32, &Device::Cpu);
+        let (w, b) = (zeros(&[2, 3])?, zeros(&[2])?);
+        assert!(linear(&zeros(&[5, 4])?, &w, &b).is_err());
+        assert!(linear(&zeros(&[5, 3])?, &w, &zeros(&[3])?).is_err());
+        assert_eq!(linear(&zeros(&[0, 3])?, &w, &b)?.dims(), [0, 2]);
+        Ok(())
+    }
+}
