@@ -422,7 +422,7 @@ fn learned_gates_have_a_limit_of_views() {
         (Gate::Off, AttentionOp::Dot, true),
         (Gate::Off, AttentionOp::Linear, false),
     ] {
-        let keys = subsplat::config::Aggregation { gate, op, ..paper() };
+        let keys = subsplat::config::Aggregation { gate, op, gate_views: 2, ..paper() };
         let (agg, _) = build(&keys, 14);
         let got = agg.prepare(&views(&three), &frames, &backbone, &primaries);
         match got {

@@ -385,8 +385,7 @@ fn a_batch_equals_its_scenes() {
 #[test]
 fn any_number_of_views_any_shape_any_depth_range() {
     for mvsplat in [true, false] {
-        let mut config = light(plain(mvsplat, Preset::Tuned, 2));
-        config.agg.gate_views = 3;
+        let config = light(plain(mvsplat, Preset::Tuned, 2));
         let model = lively(&config);
         let size = if mvsplat { (96, 64) } else { (128, 64) };
         for (views, near_far) in [(3, NEAR_FAR), (2, (0.05, 3.0)), (3, (5.0, 400.0))] {

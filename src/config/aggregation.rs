@@ -118,7 +118,8 @@ pub struct Aggregation {
     pub kv_proj: bool,
     /// View gates α_v.
     pub gate: Gate,
-    /// Most views that learned per-view gates can serve.
+    /// Most views that learned per-view gates (and the weights of op `linear`) can
+    /// serve; fewer views use the first of them (8).
     pub gate_views: usize,
     /// How a stage's output joins its input.
     pub residual: Residual,
@@ -279,7 +280,7 @@ impl Aggregation {
             logit_scale: LogitScale::InvSqrt,
             kv_proj: true,
             gate: Gate::SoftmaxV,
-            gate_views: 2,
+            gate_views: 8,
             residual: Residual::Add,
             norm: if tuned { StageNorm::Pre } else { StageNorm::None },
             ffn: false,
