@@ -26,7 +26,7 @@
 //! # }
 //! ```
 //!
-//! Where to look: [`pipeline`] is the whole path in one call; [`render`] draws any
+//! Where to look: [`pipeline`] is the whole path in one call; [`render()`] draws any
 //! [`splats::Splats`]; [`io`] reads and writes files; [`check`] judges poses;
 //! [`model`] is the network, its parts usable one by one, configured by
 //! [`config::Config`]; [`ops`] are the same kernels as candle ops. Every geometric

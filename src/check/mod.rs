@@ -2,7 +2,7 @@
 //! for a reconstruction: points matched between the photographs, without a look at
 //! the poses, are held against the epipolar geometry of the given cameras. Where
 //! they disagree, the usual mistakes of camera files are tried and the one that
-//! fits is named ([`mistakes`]).
+//! fits is named.
 //!
 //! In: grey photographs and cameras. Out: [`PairReport`]. The room knows no files
 //! and prints nothing. The same input gives the same report.
