@@ -40,7 +40,7 @@ pub const TILE_MVSPLAT: usize = 16;
 
 /// How far beyond the picture's edge x/z and y/z still move the Jacobian,
 /// `standard`: in units of tan(fov/2) beyond each edge (gsplat).
-pub const JACOBIAN_MARGIN_STANDARD: f32 = 0.3;
+pub const JACOBIAN_MARGIN_STANDARD: f32 = FRUSTUM_MARGIN as f32;
 /// Largest |x/z|, |y/z| that moves the Jacobian, `mvsplat`: in units of
 /// tan(fov/2) from the axis (INRIA).
 pub const JACOBIAN_LIMIT_MVSPLAT: f32 = 1.3;

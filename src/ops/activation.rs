@@ -1,7 +1,7 @@
 //! Pointwise functions and softmax over the last dimension as candle ops with
 //! gradients. Kernels: [`crate::cpu::activation`]. Tests: `model::layers`.
 
-use super::{f32_slice, output, tensor_like, values};
+use super::{elements, output, slice, tensor_like};
 use crate::cpu::activation as cpu;
 pub use crate::cpu::activation::Activation;
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
@@ -22,14 +22,14 @@ impl CustomOp1 for Pointwise {
     }
 
     fn cpu_fwd(&self, s: &CpuStorage, l: &Layout) -> Result<(CpuStorage, Shape)> {
-        let x = f32_slice("activation", "x", s, l)?;
+        let x = slice::<f32>("activation", "x", s, l)?;
         let mut y = vec![0.0; x.len()];
         cpu::forward(self.0, x, &mut y);
         output(y, l.shape().clone())
     }
 
     fn bwd(&self, x: &Tensor, _y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
-        let (x_values, dy) = (values(x)?, values(dy)?);
+        let (x_values, dy) = (elements::<f32>(x)?, elements::<f32>(dy)?);
         let mut dx = vec![0.0; dy.len()];
         cpu::backward(self.0, &x_values, &dy, &mut dx);
         tensor_like(dx, x).map(Some)
@@ -56,14 +56,14 @@ impl CustomOp1 for Softmax {
     }
 
     fn cpu_fwd(&self, s: &CpuStorage, l: &Layout) -> Result<(CpuStorage, Shape)> {
-        let x = f32_slice("softmax", "x", s, l)?;
+        let x = slice::<f32>("softmax", "x", s, l)?;
         let mut y = vec![0.0; x.len()];
         cpu::softmax(self.0, x, &mut y);
         output(y, l.shape().clone())
     }
 
     fn bwd(&self, x: &Tensor, y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
-        let (y, dy) = (values(y)?, values(dy)?);
+        let (y, dy) = (elements::<f32>(y)?, elements::<f32>(dy)?);
         let mut dx = vec![0.0; dy.len()];
         cpu::softmax_backward(self.0, &y, &dy, &mut dx);
         tensor_like(dx, x).map(Some)

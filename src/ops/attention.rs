@@ -1,7 +1,7 @@
 //! Scaled dot-product attention as one candle op with gradients; the matrix of
 //! logits never exists. Kernel: [`crate::cpu::attention`]. Tests: below.
 
-use super::{f32_slice, output, tensor_like, values};
+use super::{elements, output, slice, tensor_like};
 use crate::cpu::attention::{self as cpu, Attention};
 pub use crate::cpu::attention::{Labels, PENALTY};
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
@@ -59,9 +59,9 @@ impl CustomOp3 for Op {
         s3: &CpuStorage,
         l3: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let q = f32_slice("attention", "q", s1, l1)?;
-        let k = f32_slice("attention", "k", s2, l2)?;
-        let v = f32_slice("attention", "v", s3, l3)?;
+        let q = slice::<f32>("attention", "q", s1, l1)?;
+        let k = slice::<f32>("attention", "k", s2, l2)?;
+        let v = slice::<f32>("attention", "v", s3, l3)?;
         let shape = (l1.dims()[0], self.0.queries, self.0.value_width);
         let mut out = vec![0.0; shape.0 * shape.1 * shape.2];
         cpu::forward(&self.0, q, k, v, &mut out);
@@ -76,8 +76,8 @@ impl CustomOp3 for Op {
         out: &Tensor,
         grad: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let (qs, ks, vs) = (values(q)?, values(k)?, values(v)?);
-        let (out, grad) = (values(out)?, values(grad)?);
+        let (qs, ks, vs) = (elements::<f32>(q)?, elements::<f32>(k)?, elements::<f32>(v)?);
+        let (out, grad) = (elements::<f32>(out)?, elements::<f32>(grad)?);
         let saved = cpu::Saved { q: &qs, k: &ks, v: &vs, out: &out, grad: &grad };
         let (dq, dk, dv) = cpu::backward(&self.0, &saved);
         Ok((Some(tensor_like(dq, q)?), Some(tensor_like(dk, k)?), Some(tensor_like(dv, v)?)))

@@ -2,7 +2,7 @@
 //! bias. Kernel: [`crate::cpu::conv2d`]; candle's own is 6 to 12 times slower.
 //! Tests: below (finite differences), and the kernel's own.
 
-use super::{f32_slice, output};
+use super::{output, slice};
 use crate::cpu::conv2d::{self as cpu, Geometry};
 use candle_core::{
     CpuStorage, CustomOp1, CustomOp2, CustomOp3, Layout, Result, Shape, Tensor, bail,
@@ -88,8 +88,8 @@ impl CustomOp2 for Conv {
         s2: &CpuStorage,
         l2: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let x = f32_slice("conv2d", "x", s1, l1)?;
-        let w = f32_slice("conv2d", "weight", s2, l2)?;
+        let x = slice::<f32>("conv2d", "x", s1, l1)?;
+        let w = slice::<f32>("conv2d", "weight", s2, l2)?;
         self.run(l1.dims()[0], x, w, &[])
     }
 
@@ -118,9 +118,9 @@ impl CustomOp3 for Conv {
         s3: &CpuStorage,
         l3: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let x = f32_slice("conv2d", "x", s1, l1)?;
-        let w = f32_slice("conv2d", "weight", s2, l2)?;
-        let bias = f32_slice("conv2d", "bias", s3, l3)?;
+        let x = slice::<f32>("conv2d", "x", s1, l1)?;
+        let w = slice::<f32>("conv2d", "weight", s2, l2)?;
+        let bias = slice::<f32>("conv2d", "bias", s3, l3)?;
         self.run(l1.dims()[0], x, w, bias)
     }
 
@@ -157,8 +157,8 @@ impl CustomOp2 for InputGrad {
         s2: &CpuStorage,
         l2: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let dy = f32_slice("conv2d", "dy", s1, l1)?;
-        let w = f32_slice("conv2d", "weight", s2, l2)?;
+        let dy = slice::<f32>("conv2d", "dy", s1, l1)?;
+        let w = slice::<f32>("conv2d", "weight", s2, l2)?;
         let ([h, wi], batch) = (self.0.size, l1.dims()[0]);
         let mut dx = vec![0.0; batch * self.0.in_channels * h * wi];
         cpu::input_grad(&self.0, dy, w, &mut dx);
@@ -181,8 +181,8 @@ impl CustomOp2 for WeightGrad {
         s2: &CpuStorage,
         l2: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let x = f32_slice("conv2d", "x", s1, l1)?;
-        let dy = f32_slice("conv2d", "dy", s2, l2)?;
+        let x = slice::<f32>("conv2d", "x", s1, l1)?;
+        let dy = slice::<f32>("conv2d", "dy", s2, l2)?;
         let (c, o, [kh, kw]) = (self.0.in_channels, self.0.out_channels, self.0.kernel);
         let mut dw = vec![0.0; o * c * kh * kw];
         cpu::weight_grad(&self.0, x, dy, &mut dw);
@@ -199,7 +199,7 @@ impl CustomOp1 for BiasGrad {
     }
 
     fn cpu_fwd(&self, s: &CpuStorage, l: &Layout) -> Result<(CpuStorage, Shape)> {
-        let dy = f32_slice("conv2d", "dy", s, l)?;
+        let dy = slice::<f32>("conv2d", "dy", s, l)?;
         let (_, o, h, w) = l.shape().dims4()?;
         let mut db = vec![0.0; o];
         cpu::bias_grad(h * w, dy, &mut db);

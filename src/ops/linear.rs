@@ -5,7 +5,7 @@
 //! barrier of their own: called from many tasks at once they wait for one another.
 //! This one stays on the caller's thread for up to one block of rows.
 
-use super::{f32_slice, output};
+use super::{output, slice};
 use crate::cpu::gemm::{Mat, gemm};
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Tensor, bail};
 use rayon::prelude::*;
@@ -43,9 +43,9 @@ impl CustomOp3 for Linear {
         s3: &CpuStorage,
         l3: &Layout,
     ) -> Result<(CpuStorage, candle_core::Shape)> {
-        let x = f32_slice(NAME, "x", s1, l1)?;
-        let w = f32_slice(NAME, "weight", s2, l2)?;
-        let b = f32_slice(NAME, "bias", s3, l3)?;
+        let x = slice::<f32>(NAME, "x", s1, l1)?;
+        let w = slice::<f32>(NAME, "weight", s2, l2)?;
+        let b = slice::<f32>(NAME, "bias", s3, l3)?;
         let ((n, c), o) = (l1.shape().dims2()?, b.len());
         let mut y = vec![0.0; n * o];
         if o > 0 {

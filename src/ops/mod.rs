@@ -49,24 +49,9 @@ pub(crate) fn elements<T: Number>(tensor: &Tensor) -> Result<Vec<T>> {
     tensor.flatten_all()?.to_vec1::<T>()
 }
 
-/// [`slice`] of `f32`.
-pub(crate) fn f32_slice<'a>(
-    op: &str,
-    what: &str,
-    storage: &'a CpuStorage,
-    layout: &Layout,
-) -> Result<&'a [f32]> {
-    slice(op, what, storage, layout)
-}
-
 /// An op's result.
 pub(crate) fn output(data: Vec<f32>, shape: impl Into<Shape>) -> Result<(CpuStorage, Shape)> {
     Ok((CpuStorage::F32(data), shape.into()))
-}
-
-/// [`elements`] of `f32`.
-pub(crate) fn values(t: &Tensor) -> Result<Vec<f32>> {
-    elements(t)
 }
 
 /// A tensor of `like`'s shape and device.

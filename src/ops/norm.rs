@@ -1,7 +1,7 @@
 //! GroupNorm, InstanceNorm and LayerNorm as one candle op with gradients. Kernel:
 //! [`crate::cpu::norm`]. Tests: `model::layers`.
 
-use super::{f32_slice, output, tensor_like, values};
+use super::{elements, output, slice, tensor_like};
 use crate::cpu::norm::{self as cpu, Rows};
 use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Tensor, bail};
 
@@ -78,11 +78,11 @@ impl CustomOp1 for Normalise {
     }
 
     fn cpu_fwd(&self, s: &CpuStorage, l: &Layout) -> Result<(CpuStorage, Shape)> {
-        self.run(f32_slice("normalise", "x", s, l)?, &[], &[], l.shape())
+        self.run(slice::<f32>("normalise", "x", s, l)?, &[], &[], l.shape())
     }
 
     fn bwd(&self, x: &Tensor, _y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
-        let (dx, _, _) = cpu::backward(&self.0, &values(x)?, &[], &values(dy)?);
+        let (dx, _, _) = cpu::backward(&self.0, &elements::<f32>(x)?, &[], &elements::<f32>(dy)?);
         tensor_like(dx, x).map(Some)
     }
 }
@@ -101,9 +101,9 @@ impl CustomOp3 for Normalise {
         s3: &CpuStorage,
         l3: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let x = f32_slice("normalise", "x", s1, l1)?;
-        let w = f32_slice("normalise", "weight", s2, l2)?;
-        let b = f32_slice("normalise", "bias", s3, l3)?;
+        let x = slice::<f32>("normalise", "x", s1, l1)?;
+        let w = slice::<f32>("normalise", "weight", s2, l2)?;
+        let b = slice::<f32>("normalise", "bias", s3, l3)?;
         self.run(x, w, b, l1.shape())
     }
 
@@ -115,7 +115,12 @@ impl CustomOp3 for Normalise {
         _y: &Tensor,
         dy: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let (dx, dw, db) = cpu::backward(&self.0, &values(x)?, &values(w)?, &values(dy)?);
+        let (dx, dw, db) = cpu::backward(
+            &self.0,
+            &elements::<f32>(x)?,
+            &elements::<f32>(w)?,
+            &elements::<f32>(dy)?,
+        );
         Ok((Some(tensor_like(dx, x)?), Some(tensor_like(dw, w)?), Some(tensor_like(db, b)?)))
     }
 }

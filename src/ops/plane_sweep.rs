@@ -2,7 +2,7 @@
 //! [`crate::cpu::plane_sweep`]. The sampling grid carries no gradient, as in
 //! MVSplat; the features' gradient is not written yet, and backward says so.
 
-use super::{f32_slice, output, values};
+use super::{elements, output, slice};
 use crate::camera::{Camera, Intrinsics};
 use crate::cpu::plane_sweep as cpu;
 pub use crate::cpu::plane_sweep::{Pair, Sweep};
@@ -99,7 +99,7 @@ pub fn warped(source: &Tensor, sweep: &Sweep, pair: usize, candidates: &[usize])
     if candidates.iter().any(|&k| k >= sweep.candidates()) {
         bail!("plane sweep: expected candidates below {}, got {candidates:?}", sweep.candidates());
     }
-    let source = values(source)?;
+    let source = elements::<f32>(source)?;
     let mut planes = Vec::new();
     for row in 0..r {
         for &k in candidates {
@@ -124,8 +124,8 @@ impl CustomOp2 for Op {
         s2: &CpuStorage,
         l2: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let reference = f32_slice("plane-sweep", "reference", s1, l1)?;
-        let source = f32_slice("plane-sweep", "source", s2, l2)?;
+        let reference = slice::<f32>("plane-sweep", "reference", s1, l1)?;
+        let source = slice::<f32>("plane-sweep", "source", s2, l2)?;
         let ([h, w], r, d) = (self.0.size, l1.dims()[0], self.0.candidates());
         let mut out = vec![0.0; r * d * h * w];
         cpu::correlation(&self.0, reference, source, &mut out);

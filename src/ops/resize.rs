@@ -2,7 +2,7 @@
 //! gradients: candle's bilinear has none, and its nearest overwrites instead of
 //! adding. Kernels: [`crate::cpu::resize`]. Tests: `model::layers`.
 
-use super::{f32_slice, output, values};
+use super::{elements, output, slice};
 use crate::cpu::resize::{self as cpu, Resize};
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
 
@@ -44,7 +44,7 @@ impl CustomOp1 for Op {
     }
 
     fn cpu_fwd(&self, s: &CpuStorage, l: &Layout) -> Result<(CpuStorage, Shape)> {
-        let x = f32_slice("resize", "x", s, l)?;
+        let x = slice::<f32>("resize", "x", s, l)?;
         let (b, c, _, _) = l.shape().dims4()?;
         let [h, w] = self.sizes.to;
         let mut y = vec![0.0; b * c * h * w];
@@ -56,7 +56,7 @@ impl CustomOp1 for Op {
     }
 
     fn bwd(&self, x: &Tensor, _y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
-        let dy = values(dy)?;
+        let dy = elements::<f32>(dy)?;
         let mut dx = vec![0.0; x.elem_count()];
         match self.nearest {
             Some(s) => cpu::nearest_transposed(&self.sizes, s, &dy, &mut dx),
