@@ -8,7 +8,7 @@
 use super::{Error, Result, read, write_atomic};
 use image::{ImageDecoder, ImageReader, Limits};
 use std::fs::File;
-use std::io::{BufReader, Write};
+use std::io::{BufRead, BufReader, Seek, Write};
 use std::path::Path;
 
 /// A picture with more pixels than this is refused before anything is allocated.
@@ -97,19 +97,25 @@ fn refused(path: &Path, error: image::ImageError) -> Error {
 
 /// Opens the decoder of `path`, with the size already checked. The content decides
 /// which decoder, whatever the name's extension.
-fn decoder(path: &Path) -> Result<impl ImageDecoder> {
+fn file_decoder(path: &Path) -> Result<impl ImageDecoder> {
     let file = File::open(path).map_err(|e| Error::io(path, e))?;
-    let mut reader = ImageReader::new(BufReader::new(file));
+    let empty = file.metadata().is_ok_and(|m| m.len() == 0);
+    decoder(BufReader::new(file), empty, path)
+}
+
+fn decoder<'a, R: BufRead + Seek + 'a>(
+    input: R,
+    empty: bool,
+    path: &Path,
+) -> Result<Box<dyn ImageDecoder + 'a>> {
+    let mut reader = ImageReader::new(input);
     let mut limits = Limits::default();
     // Sixteen-bit RGBA of the largest size, and as much again for the decoder.
     limits.max_alloc = Some(MAX_PIXELS * 16);
     reader.limits(limits);
     let reader = reader.with_guessed_format().map_err(|e| Error::io(path, e))?;
     if reader.format().is_none() {
-        let got = match std::fs::metadata(path) {
-            Ok(m) if m.len() == 0 => "an empty file",
-            _ => "bytes of no known picture format",
-        };
+        let got = if empty { "an empty file" } else { "bytes of no known picture format" };
         return Err(Error::format(path, "a PNG, JPEG, WebP, TIFF or BMP picture", got));
     }
     let decoder = reader.into_decoder().map_err(|e| refused(path, e))?;
@@ -118,7 +124,7 @@ fn decoder(path: &Path) -> Result<impl ImageDecoder> {
         let expected = format!("1 to {} megapixels", MAX_PIXELS / 1_000_000);
         return Err(Error::format(path, expected, format!("{w}x{h} pixels")));
     }
-    Ok(decoder)
+    Ok(Box::new(decoder))
 }
 
 /// Size and orientation, from the header.
@@ -126,7 +132,7 @@ fn decoder(path: &Path) -> Result<impl ImageDecoder> {
 /// # Errors
 /// Missing, not a picture, more than [`MAX_PIXELS`].
 pub fn probe(path: &Path) -> Result<Probe> {
-    let mut decoder = decoder(path)?;
+    let mut decoder = file_decoder(path)?;
     let (w, h) = decoder.dimensions();
     // A broken EXIF block is no reason to refuse a picture that decodes.
     let orientation = decoder.orientation().map_or(1, image::metadata::Orientation::to_exif);
@@ -143,8 +149,19 @@ pub fn probe(path: &Path) -> Result<Probe> {
 /// # Errors
 /// Missing, truncated, not a picture, more than [`MAX_PIXELS`].
 pub fn load(path: &Path) -> Result<Rgb> {
-    let decoded =
-        image::DynamicImage::from_decoder(decoder(path)?).map_err(|e| refused(path, e))?;
+    decode(file_decoder(path)?, path)
+}
+
+/// [`load`] of bytes in memory; `path` names them in errors.
+///
+/// # Errors
+/// As [`load`].
+pub fn parse_picture(bytes: &[u8], path: &Path) -> Result<Rgb> {
+    decode(decoder(std::io::Cursor::new(bytes), bytes.is_empty(), path)?, path)
+}
+
+fn decode(decoder: impl ImageDecoder, path: &Path) -> Result<Rgb> {
+    let decoded = image::DynamicImage::from_decoder(decoder).map_err(|e| refused(path, e))?;
     let (width, height) = (decoded.width() as usize, decoded.height() as usize);
     let data = if decoded.color().has_alpha() {
         let rgba = decoded.into_rgba8().into_raw();
@@ -273,13 +290,21 @@ fn depth_unit(png: &[u8]) -> Option<f32> {
 /// # Errors
 /// Missing, truncated, not 16-bit grey, a unit that is not above zero.
 pub fn load_depth_png(path: &Path, unit: f32) -> Result<Depth> {
-    let decoded =
-        image::DynamicImage::from_decoder(decoder(path)?).map_err(|e| refused(path, e))?;
+    parse_depth_png(&read(path)?, unit, path)
+}
+
+/// [`load_depth_png`] of bytes in memory; `path` names them in errors.
+///
+/// # Errors
+/// As [`load_depth_png`].
+pub fn parse_depth_png(bytes: &[u8], unit: f32, path: &Path) -> Result<Depth> {
+    let decoder = decoder(std::io::Cursor::new(bytes), bytes.is_empty(), path)?;
+    let decoded = image::DynamicImage::from_decoder(decoder).map_err(|e| refused(path, e))?;
     let image::DynamicImage::ImageLuma16(grey) = decoded else {
         let got = format!("{:?}", decoded.color());
         return Err(Error::format(path, "16-bit grey depth", got));
     };
-    let unit = depth_unit(&read(path)?).unwrap_or(unit);
+    let unit = depth_unit(bytes).unwrap_or(unit);
     if !(unit > 0.0 && unit.is_finite()) {
         return Err(Error::format(path, "a depth unit above 0", unit.to_string()));
     }
