@@ -137,7 +137,7 @@ pub enum PathArg {
 /// Formats of the reconstructed scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum SceneFormatArg {
-    /// INRIA's layout, SH degree 3: every viewer opens it.
+    /// INRIA's layout, SH degree 3: what viewers read.
     Ply,
     /// glTF with KHR_gaussian_splatting.
     Glb,
