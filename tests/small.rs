@@ -1,0 +1,143 @@
+//! The small backbone: what its untrained start sees, and its switches.
+
+use candle_core::{Device, Tensor};
+use subsplat::config::Small;
+use subsplat::data::procedural::{Example, ExampleSpec};
+use subsplat::model::Views;
+use subsplat::model::backbone::SmallBackbone;
+use subsplat::model::weights::Weights;
+
+const SIDE: usize = 128;
+
+fn example(seed: u64) -> Example {
+    let mut spec = ExampleSpec::new(SIDE, SIDE, 0);
+    spec.photographic = false;
+    spec.cameras.crop = 0.0;
+    Example::new(seed, &spec)
+}
+
+fn views(examples: &[Example]) -> Views {
+    let mut pixels = Vec::new();
+    for view in examples.iter().flat_map(|e| &e.views[..2]) {
+        for c in 0..3 {
+            pixels.extend(view.rgb.iter().skip(c).step_by(3).map(|v| v.clamp(0.0, 1.0)));
+        }
+    }
+    let shape = (examples.len(), 2, 3, SIDE, SIDE);
+    let images = Tensor::from_vec(pixels, shape, &Device::Cpu).unwrap();
+    let cameras = examples.iter().map(|e| e.cameras[..2].to_vec()).collect();
+    let planes = examples.iter().map(|e| vec![(e.near, e.far); 2]).collect();
+    Views::new(images, cameras, planes).unwrap()
+}
+
+fn build(config: &Small) -> (SmallBackbone, Weights) {
+    let weights = Weights::seeded(3).trainable();
+    (SmallBackbone::new(config, weights.builder().pp("small")).unwrap(), weights)
+}
+
+fn flat(t: &Tensor) -> Vec<f32> {
+    t.flatten_all().unwrap().to_vec1().unwrap()
+}
+
+/// Share of all pixels whose distance is right within `tolerance`, relative.
+fn right(config: &Small, tolerance: f32) -> f32 {
+    let (net, _) = build(config);
+    let (mut hits, mut all) = (0, 0);
+    for seed in 0..4 {
+        let e = example(seed);
+        let (out, _) = net.forward(&views(std::slice::from_ref(&e)), false).unwrap();
+        let got = flat(&out.depths);
+        for (v, view) in e.views[..2].iter().enumerate() {
+            let k = e.cameras[v].intrinsics;
+            for (i, z) in view.depth.iter().enumerate() {
+                let px = glam::Vec2::new((i % SIDE) as f32 + 0.5, (i / SIDE) as f32 + 0.5);
+                let distance = z * k.unproject(px).length();
+                let error = (got[v * SIDE * SIDE + i] - distance).abs() / distance;
+                hits += usize::from(error < tolerance);
+                all += 1;
+            }
+        }
+    }
+    hits as f32 / all as f32
+}
+
+#[test]
+fn untrained_it_is_a_plane_sweep() {
+    let share = right(&Small::standard(), 0.15);
+    let mut blind = Small::standard();
+    blind.raw_matching = false;
+    let without = right(&blind, 0.15);
+    println!("within 15 %: {share:.3}; without the raw channels {without:.3}");
+    assert!(share > 0.5, "{share}");
+    assert!(without < share - 0.2, "the check does not see geometry: {without} and {share}");
+}
+
+#[test]
+fn half_a_million_to_two_million_parameters() {
+    let (_, weights) = build(&Small::standard());
+    let count: usize = weights.variables().values().map(|v| v.elem_count()).sum();
+    println!("{count} parameters");
+    assert!((500_000..=2_000_000).contains(&count), "{count}");
+}
+
+#[test]
+fn every_part_can_be_switched() {
+    let parts: [fn(&mut Small); 9] = [
+        |_| {},
+        |c| c.raw_matching = false,
+        |c| c.stem_channels = 0,
+        |c| c.stem_skip = false,
+        |c| c.mode_window = 0,
+        |c| c.convex_upsampling = false,
+        |c| c.confidence_opacity = false,
+        |c| c.pixel_colour = false,
+        |c| c.unet_channels = vec![32, 40],
+    ];
+    let v = views(&[example(5)]);
+    let mut seen = Vec::new();
+    for part in parts {
+        let mut config = Small::standard();
+        part(&mut config);
+        let (net, weights) = build(&config);
+        let (out, maps) = net.forward(&v, false).unwrap();
+        assert_eq!(out.depths.dims(), [1, 2, SIDE * SIDE, 1]);
+        assert_eq!(out.raw.dims(), [1, 2, SIDE * SIDE, 9 + 75]);
+        let mut values = flat(&out.depths);
+        assert!(values.iter().all(|d| d.is_finite() && *d > 0.0));
+        assert!(flat(&maps.confidence).iter().all(|c| (0.0..=1.0).contains(c)));
+        assert!(flat(&out.densities).iter().all(|c| (0.0..=1.0).contains(c)));
+        values.extend(flat(&out.densities));
+        values.extend(flat(&out.raw.narrow(3, 9, 1).unwrap()));
+        // The U-Net's corrections start at zero: its width shows in the tensors alone.
+        values.push(weights.variables().values().map(|v| v.elem_count()).sum::<usize>() as f32);
+        assert!(!seen.contains(&values), "a switch that changes nothing");
+        seen.push(values);
+    }
+}
+
+#[test]
+fn a_batch_equals_its_parts() {
+    let (net, _) = build(&Small::standard());
+    let (one, two) = (example(7), example(8));
+    let both = net.forward(&views(&[one.clone(), two.clone()]), false).unwrap().0;
+    for (b, e) in [one, two].into_iter().enumerate() {
+        let alone = net.forward(&views(&[e]), false).unwrap().0;
+        for (x, y) in [(&both.depths, &alone.depths), (&both.raw, &alone.raw)] {
+            let (x, y) = (flat(&x.get(b).unwrap()), flat(&y.get(0).unwrap()));
+            let worst = x.iter().zip(&y).map(|(x, y)| (x - y).abs() / (1.0 + y.abs()));
+            assert!(worst.fold(0.0, f32::max) < 1e-4);
+        }
+    }
+}
+
+#[test]
+fn wrong_sizes_are_refused() {
+    let (net, _) = build(&Small::standard());
+    let e = example(9);
+    let v = views(&[e]);
+    let images = v.images.narrow(3, 0, 96).unwrap().narrow(4, 0, 80).unwrap();
+    let cameras = vec![v.cameras[0].iter().map(|c| c.resized(80, 96)).collect()];
+    let narrow = Views::new(images.contiguous().unwrap(), cameras, v.near_far.clone()).unwrap();
+    let error = net.forward(&narrow, false).unwrap_err().to_string();
+    assert!(error.contains("multiples of 32") && error.contains("96x80"), "{error}");
+}
