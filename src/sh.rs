@@ -164,16 +164,8 @@ pub fn standard_from_mvsplat() -> Vec<f64> {
     m
 }
 
-/// Coefficients `sh[D, 3]` of a function, moved from `basis` to the standard one
-/// (in place; coefficients 16 and up of [`ShBasis::Mvsplat`] become zero).
-pub fn to_standard(sh: &mut [f32], basis: ShBasis) {
-    match basis {
-        ShBasis::Standard => {}
-        ShBasis::Mvsplat => apply_mvsplat_map(sh, &standard_from_mvsplat()),
-    }
-}
-
-/// [`to_standard`] for many sets, `sets[P, D, 3]`, with the matrix made once.
+/// Coefficients of many functions, `sets[P, D, 3]`, moved from `basis` to the standard
+/// one (in place; coefficients 16 and up of [`ShBasis::Mvsplat`] become zero).
 pub fn all_to_standard(sets: &mut [f32], coefficients: usize, basis: ShBasis) {
     if basis == ShBasis::Mvsplat {
         let m = standard_from_mvsplat();

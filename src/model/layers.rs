@@ -1,6 +1,7 @@
 //! Layers that both backbones and the SPGR heads use, under PyTorch's parameter
 //! names and with its initialisation. All have gradients.
 
+use crate::model::mlp::xavier;
 use crate::ops::activation::{Activation, activation};
 use crate::ops::conv2d::conv2d;
 use crate::ops::norm;
@@ -119,8 +120,7 @@ impl Linear {
     /// # Errors
     /// A tensor is missing or has another shape.
     pub fn new_no_bias(c_in: usize, c_out: usize, vb: VarBuilder) -> Result<Self> {
-        let bound = (6.0 / (c_in + c_out) as f64).sqrt();
-        Self::with(c_in, c_out, (Init::Uniform { lo: -bound, up: bound }, None), vb)
+        Self::with(c_in, c_out, (xavier(c_in, c_out), None), vb)
     }
 
     /// With the given initialisation of weight and, if there is one, bias.
