@@ -2,16 +2,16 @@
 //!
 //! A `.ckpt`, `.pt` or `.pth` file is a pickle, a program for a machine that can call any
 //! function by name, and the tensors' bytes. Here the machine is our own
-//! ([`pickle`]) and knows data only: tensors, parameters and plain containers are
+//! (`pickle.rs`) and knows data only: tensors, parameters and plain containers are
 //! understood, every other name gives [`Value::Opaque`] and what it would have been made
 //! from is forgotten. So the callbacks and optimizer states of a Lightning checkpoint do
 //! no harm, and whoever needs a tensor refuses an opaque value in its place by name.
 //!
-//! Two forms, told apart by content: the zip archive of torch 1.6 ([`zip`]; why the
-//! directory reader is our own stands there) and the older one ([`legacy`]). A file is
+//! Two forms, told apart by content: the zip archive of torch 1.6 (`zip.rs`; why the
+//! directory reader is our own stands there) and the older one (`legacy.rs`). A file is
 //! read by ranges: the pickle, then each tensor when it is asked for. A hostile file
-//! costs at most what the limits of the pickle allow ([`pickle::MAX_PICKLE`],
-//! [`pickle::MAX_VALUES`]; some 200 MB), and one error.
+//! costs at most what the limits of a pickle allow (64 MiB, two million values: some
+//! 200 MB), and one error.
 //!
 //! Refused by name: big-endian files, TorchScript archives, the tar form, deflated or
 //! encrypted entries; opaque, so refused where a tensor is wanted: complex, quantized,
