@@ -156,7 +156,7 @@ pub(super) fn run(stream: &mut Stream) -> Result<Pickle> {
 impl Machine<'_, '_> {
     /// An error at the instruction at work.
     pub(super) fn bad(&self, expected: impl Into<String>, got: impl Into<String>) -> Error {
-        let place = format!(" at byte {} of the pickle's file", self.at);
+        let place = format!(" at byte {}", self.at);
         Error::format(self.stream.path, expected, got).at(place)
     }
 
