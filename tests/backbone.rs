@@ -470,32 +470,6 @@ fn several_gaussians_per_pixel_share_all_but_depth_and_opacity() -> Result<()> {
     Ok(())
 }
 
-/// A training step must not lose a gradient silently: the sweep says what it lacks.
-#[test]
-fn backward_through_the_sweep_is_refused_by_name() -> Result<()> {
-    use subsplat::ops::plane_sweep::{Sweep, pair, plane_sweep, relative_pose};
-    let views = posed(2, 32, 48);
-    let cameras: Vec<Camera> = views.cameras[0].iter().map(|c| c.resized(12, 8)).collect();
-    let to = |i: usize, j: usize| {
-        let pose = relative_pose(&cameras[i], &cameras[j]);
-        pair(&cameras[i].intrinsics, &cameras[j].intrinsics, pose, j)
-    };
-    let sweep = Sweep {
-        pairs: vec![vec![to(0, 1)?], vec![to(1, 0)?]],
-        depths: vec![vec![1.0, 2.0]; 2],
-        centre: 0.5,
-        min_z: 1e-3,
-        scale: 1.0,
-        channels: 4,
-        size: [8, 12],
-    };
-    let f = Var::ones((2, 4, 8, 12), candle_core::DType::F32, &Device::Cpu)?;
-    let y = plane_sweep(&f, &f, sweep)?;
-    let e = y.sum_all()?.backward().unwrap_err().to_string();
-    assert!(e.contains("plane-sweep"), "{e}");
-    Ok(())
-}
-
 /// With pixel centres at +½ and the source's own intrinsics, the sweep samples where
 /// `camera.rs` projects: a source map that holds its own coordinates gives them back.
 #[test]

@@ -1,12 +1,12 @@
 //! Plane sweep (fused warp and correlation) as a candle op. Kernel:
-//! [`crate::cpu::plane_sweep`]. The sampling grid carries no gradient, as in
-//! MVSplat; the features' gradient is not written yet, and backward says so.
+//! [`crate::cpu::plane_sweep`]. Gradients reach both feature maps; the sampling grid
+//! carries none, as in MVSplat.
 
 use super::{elements, output, slice};
 use crate::camera::{Camera, Intrinsics};
 use crate::cpu::plane_sweep as cpu;
 pub use crate::cpu::plane_sweep::{Pair, Sweep};
-use candle_core::{CpuStorage, CustomOp2, Error, Layout, Result, Shape, Tensor, bail};
+use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
 use glam::{Mat3, Mat4};
 
 /// The map from pixels and depths of a reference view to pixels of a source view,
@@ -134,11 +134,17 @@ impl CustomOp2 for Op {
 
     fn bwd(
         &self,
-        _reference: &Tensor,
-        _source: &Tensor,
+        reference: &Tensor,
+        source: &Tensor,
         _res: &Tensor,
-        _grad: &Tensor,
+        grad: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>)> {
-        Err(Error::BackwardNotSupported { op: "plane-sweep" })
+        let (f, g) = (elements::<f32>(reference)?, elements::<f32>(source)?);
+        let (d_f, d_g) = cpu::backward(&self.0, &f, &g, &elements::<f32>(grad)?);
+        let device = reference.device();
+        Ok((
+            Some(Tensor::from_vec(d_f, reference.dims(), device)?),
+            Some(Tensor::from_vec(d_g, source.dims(), device)?),
+        ))
     }
 }

@@ -6,6 +6,7 @@
 //! write one float, and the sums' order does not depend on the number of threads.
 
 use super::{BLOCK, Gather, Scratch, State, axpy, dot};
+use crate::cpu::math::vectorised;
 use crate::cpu::real::Real;
 use rayon::prelude::*;
 
@@ -59,9 +60,14 @@ pub fn backward<T: Real>(
         .map_init(Scratch::new, |scratch, (block, (d_query, d_points))| {
             let mut out = Scatter::default();
             let rows = d_query.chunks_exact_mut(q_width).zip(d_points.chunks_exact_mut(p_width));
-            for (i, (d_query, d_points)) in rows.enumerate() {
-                args.parent(scratch, block * BLOCK + i, (d_query, d_points), &mut out);
-            }
+            vectorised(
+                #[inline(always)]
+                || {
+                    for (i, (d_query, d_points)) in rows.enumerate() {
+                        args.parent(scratch, block * BLOCK + i, (d_query, d_points), &mut out);
+                    }
+                },
+            );
             out
         })
         .collect();
@@ -70,6 +76,7 @@ pub fn backward<T: Real>(
 
 impl<T: Real> Args<'_, T> {
     /// Gradients of parent `n` into its rows, and its part of the maps' gradient.
+    #[inline(always)]
     fn parent(
         self,
         scratch: &mut Scratch<T>,
@@ -108,6 +115,7 @@ impl<T: Real> Args<'_, T> {
     }
 
     /// ∂logits and ∂gates.
+    #[inline(always)]
     fn softmax(
         self,
         scratch: &Scratch<T>,
@@ -138,6 +146,7 @@ impl<T: Real> Args<'_, T> {
     }
 
     /// ∂points through the bilinear weights; call after `softmax`.
+    #[inline(always)]
     fn points(
         self,
         scratch: &Scratch<T>,
@@ -180,6 +189,7 @@ impl<T: Real> Args<'_, T> {
     }
 
     /// ∂q, and the factors of q in the gradient of each tap's key row.
+    #[inline(always)]
     fn keys(self, scratch: &Scratch<T>, d_logits: &[T], d_q: &mut [T]) -> Vec<T> {
         let g = self.g;
         let mut factors = vec![T::default(); scratch.taps.len() * g.groups];
@@ -250,11 +260,16 @@ fn add<'a, T: Real>(
     }
     let channel = first - start;
     let group = channel / (g.dim / g.groups);
-    for scatter in scatters {
-        let factors = factors(scatter).chunks_exact(g.groups);
-        for (&(n, cell), factors) in scatter.taps.iter().zip(factors) {
-            let row = &mut sums[cell * lanes..(cell + 1) * lanes];
-            axpy(row, factors[group], &source(n)[channel..channel + lanes]);
-        }
-    }
+    vectorised(
+        #[inline(always)]
+        || {
+            for scatter in scatters {
+                let factors = factors(scatter).chunks_exact(g.groups);
+                for (&(n, cell), factors) in scatter.taps.iter().zip(factors) {
+                    let row = &mut sums[cell * lanes..(cell + 1) * lanes];
+                    axpy(row, factors[group], &source(n)[channel..channel + lanes]);
+                }
+            }
+        },
+    );
 }

@@ -21,6 +21,7 @@ mod backward;
 
 pub use backward::{Gradients, backward};
 
+use super::math::vectorised;
 use super::real::Real;
 use rayon::prelude::*;
 
@@ -106,6 +107,7 @@ impl Gather {
     }
 
     /// Factor of the weight of sample `j`, group `g` of parent `n` after dropping.
+    #[inline(always)]
     fn kept<T: Real>(&self, n: usize, j: usize, g: usize) -> T {
         let Some(drop) = self.drop else { return T::of(1.0) };
         let index = ((drop.first_parent + n) * self.samples() + j) * self.groups + g;
@@ -169,6 +171,7 @@ impl<T: Real> Scratch<T> {
     }
 
     /// Taps and weights of all samples of the parent whose points are `points`.
+    #[inline(always)]
     fn place(&mut self, g: &Gather, points: &[T]) {
         self.samples.clear();
         self.taps.clear();
@@ -188,6 +191,7 @@ impl<T: Real> Scratch<T> {
         }
     }
 
+    #[inline(always)]
     fn sample(
         &mut self,
         g: &Gather,
@@ -221,7 +225,11 @@ impl<T: Real> Scratch<T> {
                 continue;
             }
             let cell = first_cell + cy as usize * level.width + cx as usize;
-            let known = self.taps[first_tap..].iter().position(|&c| c == cell);
+            // The corners of a lone point are distinct.
+            let known = match g.points {
+                1 => None,
+                _ => self.taps[first_tap..].iter().position(|&c| c == cell),
+            };
             let tap = known.map_or(self.taps.len(), |i| first_tap + i);
             if known.is_none() {
                 self.taps.push(cell);
@@ -235,6 +243,7 @@ impl<T: Real> Scratch<T> {
     }
 
     /// Logits and their softmax; false where every sample is masked.
+    #[inline(always)]
     fn attend(&mut self, g: &Gather, maps: &[T], query: &[T]) -> bool {
         let (groups, width) = (g.groups, g.dim / g.groups);
         let (q, rest) = query.split_at(g.query_channels());
@@ -278,6 +287,7 @@ impl<T: Real> Scratch<T> {
     }
 
     /// Factors of the taps' value rows.
+    #[inline(always)]
     fn merge(&mut self, g: &Gather, n: usize, gates: &[T]) {
         let groups = g.groups;
         self.coefficients.clear();
@@ -296,6 +306,7 @@ impl<T: Real> Scratch<T> {
 }
 
 /// Dot product in sixteen partial sums, which a compiler turns into vectors.
+#[inline(always)]
 fn dot<T: Real>(a: &[T], b: &[T]) -> T {
     const LANES: usize = 16;
     let mut sums = [T::default(); LANES];
@@ -310,6 +321,7 @@ fn dot<T: Real>(a: &[T], b: &[T]) -> T {
 }
 
 /// y += c·x.
+#[inline(always)]
 fn axpy<T: Real>(y: &mut [T], c: T, x: &[T]) {
     for (y, &x) in y.iter_mut().zip(x) {
         *y += c * x;
@@ -326,24 +338,29 @@ pub fn forward<T: Real>(g: &Gather, maps: &[T], query: &[T], points: &[T], out: 
     out.par_chunks_mut(BLOCK * g.dim).enumerate().for_each_init(
         Scratch::new,
         |scratch, (block, out)| {
-            for (i, out) in out.chunks_exact_mut(g.dim).enumerate() {
-                let n = block * BLOCK + i;
-                let query = &query[n * q_width..(n + 1) * q_width];
-                out.fill(T::default());
-                scratch.place(g, &points[n * p_width..(n + 1) * p_width]);
-                if !scratch.attend(g, maps, query) {
-                    continue;
-                }
-                scratch.merge(g, n, &query[q_width - g.views..]);
-                let coefficients = scratch.coefficients.chunks_exact(g.groups);
-                for (&cell, coefficients) in scratch.taps.iter().zip(coefficients) {
-                    let row = &maps[cell * g.stride + g.value..][..g.dim];
-                    let groups = out.chunks_exact_mut(width).zip(row.chunks_exact(width));
-                    for ((o, u), &c) in groups.zip(coefficients) {
-                        axpy(o, c, u);
+            vectorised(
+                #[inline(always)]
+                || {
+                    for (i, out) in out.chunks_exact_mut(g.dim).enumerate() {
+                        let n = block * BLOCK + i;
+                        let query = &query[n * q_width..(n + 1) * q_width];
+                        out.fill(T::default());
+                        scratch.place(g, &points[n * p_width..(n + 1) * p_width]);
+                        if !scratch.attend(g, maps, query) {
+                            continue;
+                        }
+                        scratch.merge(g, n, &query[q_width - g.views..]);
+                        let coefficients = scratch.coefficients.chunks_exact(g.groups);
+                        for (&cell, coefficients) in scratch.taps.iter().zip(coefficients) {
+                            let row = &maps[cell * g.stride + g.value..][..g.dim];
+                            let groups = out.chunks_exact_mut(width).zip(row.chunks_exact(width));
+                            for ((o, u), &c) in groups.zip(coefficients) {
+                                axpy(o, c, u);
+                            }
+                        }
                     }
-                }
-            }
+                },
+            );
         },
     );
 }

@@ -4,7 +4,11 @@
 //!
 //! reference `[R, C, h, w]`, source `[S, C, h, w]`, depths `[R, D]`; out
 //! `[R, D, h, w]` = scale · mean over the pairs of Σ_c f·bilinear(g), zero outside
-//! the source (per tap). Source: MVSplat section 3.
+//! the source (per tap). Source: MVSplat section 3. Gradient: [`backward`].
+
+mod backward;
+
+pub use backward::backward;
 
 use super::math::{dot, vectorised};
 use rayon::prelude::*;
@@ -118,36 +122,102 @@ fn channels_last(channels: usize, n: usize, x: &[f32]) -> Vec<f32> {
     out
 }
 
+/// Working memory of one thread: where the candidates of one reference pixel fall,
+/// and the source cells that they touch.
+struct Walk {
+    /// `[D]`: source index coordinates.
+    u: Vec<f32>,
+    v: Vec<f32>,
+    /// `[h·w]`: the last pixel that touched the cell, and what it left there.
+    cells: Vec<Cell>,
+    /// Number of the current pixel; 0 is none.
+    pixel: u32,
+}
+
+/// What the current pixel knows of a source cell.
+#[derive(Clone, Copy, Default)]
+struct Cell {
+    pixel: u32,
+    value: f32,
+}
+
+impl Walk {
+    fn new(s: &Sweep) -> Self {
+        let (d, n) = (s.candidates(), s.size[0] * s.size[1]);
+        Self { u: vec![0.0; d], v: vec![0.0; d], cells: vec![Cell::default(); n], pixel: 0 }
+    }
+
+    /// Begins reference pixel (x, y): forgets the cells, places all candidates.
+    #[inline(always)]
+    fn begin(&mut self, s: &Sweep, pair: &Pair, (x, y): (usize, usize), depths: &[f32]) {
+        self.pixel = self.pixel.wrapping_add(1);
+        if self.pixel == 0 {
+            self.cells.fill(Cell::default());
+            self.pixel = 1;
+        }
+        for ((u, v), &depth) in self.u.iter_mut().zip(&mut self.v).zip(depths) {
+            (*u, *v, _) = s.place(pair, x, y, depth);
+        }
+    }
+
+    /// The cell's value for the current pixel; `first` gives it at the first touch.
+    #[inline(always)]
+    fn value(&mut self, cell: usize, first: impl FnOnce() -> f32) -> &mut f32 {
+        let slot = &mut self.cells[cell];
+        if slot.pixel != self.pixel {
+            *slot = Cell { pixel: self.pixel, value: first() };
+        }
+        &mut slot.value
+    }
+}
+
 /// Correlation `[R, D, h, w]`.
+///
+/// Candidates of one pixel lie on one epipolar line and share most of their taps, so
+/// each distinct source cell is multiplied with the pixel's features once.
 pub fn correlation(s: &Sweep, reference: &[f32], source: &[f32], out: &mut [f32]) {
     let ([h, w], c, d) = (s.size, s.channels, s.candidates());
     if out.is_empty() {
         return;
     }
-    let reference = channels_last(c, h * w, reference);
-    let source = channels_last(c, h * w, source);
-    out.par_chunks_exact_mut(h * w).enumerate().for_each(|(plane, out)| {
-        let (r, k) = (plane / d, plane % d);
-        let own = &reference[r * h * w * c..(r + 1) * h * w * c];
-        let factor = s.scale / s.pairs[r].len().max(1) as f32;
-        out.fill(0.0);
-        for pair in &s.pairs[r] {
-            let other = &source[pair.source * h * w * c..(pair.source + 1) * h * w * c];
-            vectorised(
-                #[inline(always)]
-                || {
-                    for (i, out) in out.iter_mut().enumerate() {
-                        let (u, v, _) = s.place(pair, i % w, i / w, s.depths[r][k]);
-                        let Some(sample) = s.sample(u, v) else { continue };
-                        let f = &own[i * c..(i + 1) * c];
-                        for (tap, weight) in sample.taps.into_iter().zip(sample.weights) {
-                            if weight != 0.0 {
-                                *out += weight * factor * dot(f, &other[tap * c..(tap + 1) * c]);
+    let n = h * w;
+    let reference = channels_last(c, n, reference);
+    let source = channels_last(c, n, source);
+    // `[R, h, D, w]`: what one task makes is contiguous.
+    let mut rows = vec![0f32; out.len()];
+    rows.par_chunks_exact_mut(d * w).enumerate().for_each_init(
+        || Walk::new(s),
+        |walk, (row, out)| {
+            let (r, y) = (row / h, row % h);
+            let factor = s.scale / s.pairs[r].len().max(1) as f32;
+            for pair in &s.pairs[r] {
+                let other = &source[pair.source * n * c..(pair.source + 1) * n * c];
+                let own = &reference[(r * n + y * w) * c..(r * n + (y + 1) * w) * c];
+                vectorised(
+                    #[inline(always)]
+                    || {
+                        for (x, f) in own.chunks_exact(c).enumerate() {
+                            walk.begin(s, pair, (x, y), &s.depths[r]);
+                            for k in 0..d {
+                                let Some(at) = s.sample(walk.u[k], walk.v[k]) else { continue };
+                                for (tap, weight) in at.taps.into_iter().zip(at.weights) {
+                                    if weight != 0.0 {
+                                        let g = &other[tap * c..(tap + 1) * c];
+                                        let dot = *walk.value(tap, || dot(f, g));
+                                        out[k * w + x] += weight * factor * dot;
+                                    }
+                                }
                             }
                         }
-                    }
-                },
-            );
+                    },
+                );
+            }
+        },
+    );
+    out.par_chunks_exact_mut(n).enumerate().for_each(|(plane, out)| {
+        let (r, k) = (plane / d, plane % d);
+        for (y, out) in out.chunks_exact_mut(w).enumerate() {
+            out.copy_from_slice(&rows[((r * h + y) * d + k) * w..][..w]);
         }
     });
 }
