@@ -5,10 +5,14 @@
 mod witness_common;
 
 use candle_core::{DType, Device, Result, Tensor};
+use glam::{DMat3, DQuat, DVec3};
 use std::collections::BTreeMap;
-use subsplat::abi::{LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, ShBasis};
+use subsplat::abi::{
+    Convention, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, RasterOptions, ShBasis,
+};
 use subsplat::camera::Camera;
 use subsplat::config::{self, Config, FeatureLevel, LowpassRef, Preset};
+use subsplat::cpu::{ewa, sh};
 use subsplat::model::aggregation::Aggregation;
 use subsplat::model::embed::Embeddings;
 use subsplat::model::geometry::{Frames, ParentChunk};
@@ -79,17 +83,21 @@ impl Scene {
         Views::new(images, vec![self.cameras.clone()], vec![near_far])
     }
 
-    /// As a backbone hands them over; `sh` `[N, 3·D]` stands in both frames.
-    fn primaries(&self, sh: &Tensor) -> Result<Primaries> {
+    /// As a backbone hands them over; `sh` `[N, 3·D]` stands in `frame`, nothing in the other.
+    fn primaries(&self, sh: &Tensor, frame: config::ShInput) -> Result<Primaries> {
         let n = self.means.dim(0)?;
         let sh = sh.reshape((1, n, 3, ()))?;
+        let (world, camera) = match frame {
+            config::ShInput::World => (sh.clone(), sh.zeros_like()?),
+            config::ShInput::Camera => (sh.zeros_like()?, sh),
+        };
         Ok(Primaries {
             means: self.means.unsqueeze(0)?,
             quats_wxyz: self.quats.unsqueeze(0)?,
             scales: self.scales.unsqueeze(0)?,
             opacities: self.opacities.reshape((1, n))?,
-            sh: sh.clone(),
-            sh_camera: sh,
+            sh: world,
+            sh_camera: camera,
             sh_basis: ShBasis::Standard,
             per_view: self.per_view,
         })
@@ -97,10 +105,7 @@ impl Scene {
 }
 
 /// Two tensors per view, joined over the views.
-fn joined(
-    scene: &Scene,
-    each: impl Fn(usize) -> Result<(Tensor, Tensor)>,
-) -> Result<[Tensor; 2]> {
+fn joined(scene: &Scene, each: impl Fn(usize) -> Result<(Tensor, Tensor)>) -> Result<[Tensor; 2]> {
     let views = 0..scene.cameras.len();
     let (a, b): (Vec<_>, Vec<_>) = views.map(each).collect::<Result<Vec<_>>>()?.into_iter().unzip();
     Ok([Tensor::cat(&a, 0)?, Tensor::cat(&b, 0)?])
@@ -145,11 +150,10 @@ fn embeddings() -> Result<()> {
         let golden = Golden::load(&name);
         let (scene, weights) = (Scene::new(&golden)?, golden.weights());
         let keys: config::Embed = golden.note("embed");
-        let embed =
-            Embeddings::new(&keys, 75, weights.builder().pp("subsplat").pp("embed"))?;
-        let sh = golden.input("sh");
+        let embed = Embeddings::new(&keys, 75, weights.builder().pp("subsplat").pp("embed"))?;
+        let colour = golden.input("sh");
         for mode in MODES {
-            let each = |v| embed.forward(&scene.chunk(v, &sh)?, &scene.frames, mode);
+            let each = |v| embed.forward(&scene.chunk(v, &colour)?, &scene.frames, mode);
             let [z_g, z_a] = joined(&scene, each)?;
             golden.compare("z_g", &z_g);
             golden.compare("z_a", &z_a);
@@ -170,7 +174,7 @@ fn attention() -> Result<()> {
         let vb = weights.builder().pp("subsplat").pp("agg");
         let agg = Aggregation::new(&keys, z[0].dim(1)?, &channels, vb)?;
         let sh = Tensor::zeros((z[0].dim(0)?, 3), DType::F32, &Device::Cpu)?;
-        let primaries = scene.primaries(&sh)?;
+        let primaries = scene.primaries(&sh, config::ShInput::World)?;
         let prepared = agg.prepare(&scene.views()?, &scene.frames, &backbone, &primaries)?;
         for mode in MODES {
             let [f_g, f_a] = joined(&scene, |v| {
@@ -262,7 +266,8 @@ fn trunk() -> Result<()> {
         config.spgr = golden.note("spgr");
         let (backbone, channels) = backbone(&golden, &config.agg.levels)?;
         let trunk = Trunk::new(&config, &channels, weights.builder())?;
-        let (views, primaries) = (scene.views()?, scene.primaries(&golden.input("sh"))?);
+        let (views, primaries) =
+            (scene.views()?, scene.primaries(&golden.input("sh"), config.embed.sh)?);
         let compare = |children: Children| -> Result<()> {
             let mut parts = split(&children.rows, &scene.rows()?)?;
             parts.insert("gain", children.gain);
@@ -274,6 +279,108 @@ fn trunk() -> Result<()> {
         golden.done(&weights);
     }
     Ok(())
+}
+
+/// Colour by direction: both bases, degrees 0 to 4.
+#[test]
+fn harmonics() -> Result<()> {
+    let golden = Golden::load("sub_sh");
+    let directions = golden.input("direction").to_vec2::<f32>()?;
+    let coefficients = golden.input("sh").flatten_from(1)?.to_vec2::<f32>()?;
+    for (name, basis) in [("standard", ShBasis::Standard), ("mvsplat", ShBasis::Mvsplat)] {
+        for degree in 0..=4 {
+            let one = |(d, sh): (&Vec<f32>, &Vec<f32>)| {
+                sh::radiance(basis, degree, sh::direction([d[0], d[1], d[2]]), sh)
+            };
+            let got: Vec<f32> = directions.iter().zip(&coefficients).flat_map(one).collect();
+            let got = Tensor::from_vec(got, (directions.len(), 3), &Device::Cpu)?;
+            golden.compare(&format!("{name}_{degree}"), &got);
+        }
+    }
+    golden.done(&golden.weights());
+    Ok(())
+}
+
+/// Footprints of splats, given as quaternion and σ and as covariance.
+#[test]
+fn projection() -> Result<()> {
+    for name in names("sub_ewa_") {
+        let golden = Golden::load(&name);
+        let scene = Scene::new(&golden)?;
+        let convention: Convention = golden.note("convention");
+        let [width, height] = golden.note("picture");
+        let intrinsics = scene.cameras[0].intrinsics.resized(width, height);
+        let camera = Camera::new(intrinsics, scene.cameras[0].world_from_camera).unwrap();
+        let view = ewa::View::new(
+            &camera,
+            &RasterOptions {
+                lowpass: golden.note("lowpass"),
+                antialiased: golden.note("antialiased"),
+                // World units, or the camera's near plane.
+                near: scene.near[0] * if convention == Convention::Mvsplat { 1.0 } else { 2.0 },
+                ..RasterOptions::new(convention)
+            },
+        );
+        let rows = scene.rows()?.to_vec2::<f32>()?;
+        let mut quads: BTreeMap<&str, [Vec<f32>; 2]> = BTreeMap::new();
+        for row in &rows {
+            let part = |at: usize| [row[at], row[at + 1], row[at + 2]];
+            let (mean, scale) = (part(LANE_MEAN), part(LANE_SCALE).map(|s| 0.25 * s));
+            let quat = [row[LANE_QUAT], row[LANE_QUAT + 1], row[LANE_QUAT + 2], row[LANE_QUAT + 3]];
+            let opacity = row[LANE_OPACITY];
+            let forms = [
+                view.project_quat(mean, quat, scale, opacity),
+                view.project_cov6(mean, covariance(quat, scale), opacity),
+            ];
+            for (form, found) in forms.into_iter().enumerate() {
+                let f = found.unwrap_or_default();
+                let opacity = if found.is_some() { f.opacity() } else { 0.0 };
+                let conic = if found.is_some() { f.conic() } else { [0.0; 3] };
+                let edges = [f.x0, f.y0, f.x1, f.y1].map(|v| v as f32);
+                let mut put = |name, v: &[f32]| quads.entry(name).or_default()[form].extend(v);
+                put("means2d", &[f.u, f.v]);
+                put("conic", &conic);
+                put("depth", &[f.z]);
+                put("half", &[f.half_width, f.half_height]);
+                put("opacity", &[opacity]);
+                put("pixels", &edges);
+                put("wide", &edges);
+            }
+        }
+        for (output, forms) in quads {
+            for got in forms {
+                let got = Tensor::from_vec(
+                    got.clone(),
+                    (rows.len(), got.len() / rows.len()),
+                    &Device::Cpu,
+                )?;
+                if output == "pixels" || output == "wide" {
+                    // No pixel less than the exact support, none farther out than the wide one.
+                    let sign = if output == "wide" { 1.0 } else { -1.0 };
+                    let excess = outward(&got, &golden.output(output))?.affine(sign, 0.0)?;
+                    assert!(excess.max_all()?.to_scalar::<f32>()? <= 0.0, "{name}.{output}");
+                }
+                golden.compare(output, &got);
+            }
+        }
+        golden.done(&golden.weights());
+    }
+    Ok(())
+}
+
+/// How many pixels `a` reaches farther out than `b` at each edge (x0, y0, x1, y1).
+fn outward(a: &Tensor, b: &Tensor) -> Result<Tensor> {
+    let signs = Tensor::new(&[[-1f32, -1.0, 1.0, 1.0]], &Device::Cpu)?;
+    (a - b)?.broadcast_mul(&signs)
+}
+
+/// World covariance (00, 01, 02, 11, 12, 22) of a unit quaternion wxyz and σ.
+fn covariance(quat: [f32; 4], scale: [f32; 3]) -> [f32; 6] {
+    let [w, x, y, z] = quat.map(f64::from);
+    let m = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize())
+        * DMat3::from_diagonal(DVec3::from_array(scale.map(f64::from)));
+    let c = m * m.transpose();
+    [c.x_axis.x, c.x_axis.y, c.x_axis.z, c.y_axis.y, c.y_axis.z, c.z_axis.z].map(|v| v as f32)
 }
 
 /// The witness's presets, typed from the specification, are the crate's.

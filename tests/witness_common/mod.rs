@@ -101,6 +101,12 @@ impl Golden {
         Tensor::from_vec(values, shape.as_slice(), &Device::Cpu).unwrap()
     }
 
+    /// What the golden holds of an output, in the output's shape (of stride 1).
+    pub fn output(&self, name: &str) -> Tensor {
+        let held = &self.about.outputs[name];
+        self.tensors[&format!("out.{name}")].reshape(held.shape.as_slice()).unwrap()
+    }
+
     /// Numbers that stand in the golden for the test alone.
     pub fn aside(&self, name: &str) -> Tensor {
         let found = self.tensors.get(&format!("aside.{name}"));

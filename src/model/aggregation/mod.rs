@@ -18,7 +18,7 @@ mod stage;
 use super::geometry::{Frames, ParentChunk};
 use super::mlp::{Mode, xavier};
 use super::{BackboneOutput, Primaries, Views};
-use crate::config::{Aggregation as Keys, FeatureLevel, Gate, Points};
+use crate::config::{Aggregation as Keys, FeatureLevel, Gate, MaskMode, Points};
 use crate::ops::attention_gather::{Level, occlusion_gate};
 use candle_core::{Result, Tensor, bail};
 use candle_nn::{Linear, Module, VarBuilder};
@@ -189,7 +189,11 @@ impl Aggregation {
         };
         let (centres, z) = frames.project(&parents.means.unsqueeze(1)?, self.keys.mask)?;
         let occlusion = match &prepared.depths {
-            Some(depths) => Some(occlusion_gate(&centres.squeeze(2)?, &z.squeeze(2)?, depths)?),
+            Some(depths) => {
+                // Clamped positions would give a parent beside the picture its edge's depth.
+                let (at, _) = frames.project(&parents.means.unsqueeze(1)?, MaskMode::Renorm)?;
+                Some(occlusion_gate(&at.squeeze(2)?, &z.squeeze(2)?, depths)?)
+            }
             None => None,
         };
         let levels = &prepared.levels;

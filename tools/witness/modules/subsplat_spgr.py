@@ -210,4 +210,7 @@ class Spgr:
             return g.minimum(alpha * own * w / area, 0.99)
         tau = -g.log(1.0 - capped)
         own = geo.blurred(g, self.own(), self.lowpass[1]) * float(self.k)
-        return 1.0 - g.exp(-(tau * w * own / geo.blurred(g, grown, self.lowpass[0])))
+        # A child whose growth meets GROWTH_MAX counts with A_min all the same ("A from 2.6 after the adjustment").
+        blurred, bare = geo.blurred(g, grown, self.lowpass[0]), geo.area(g, grown)
+        blurred = g.sqrt(blurred * blurred + area * area - bare * bare)
+        return 1.0 - g.exp(-(tau * w * own / blurred))
