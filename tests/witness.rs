@@ -4,10 +4,18 @@
 
 mod witness_common;
 
-use candle_core::Result;
-use std::collections::BTreeSet;
+use candle_core::{DType, Device, Result, Tensor};
+use std::collections::{BTreeMap, BTreeSet};
+use subsplat::config::{self, FeatureLevel, Mvsplat as Settings};
+use subsplat::model::backbone::Mvsplat;
 use subsplat::model::backbone::cnn::Cnn;
+use subsplat::model::backbone::cost_volume::{correlation, disparities};
+use subsplat::model::backbone::depth::{DepthPredictor, Input};
+use subsplat::model::backbone::transformer::Transformer;
+use subsplat::model::backbone::unet::UNet;
+use subsplat::model::primaries::primaries;
 use subsplat::model::trace::Trace;
+use subsplat::model::{BackboneOutput, Primaries, Views};
 use witness_common::{Golden, folder, tolerances};
 
 #[test]
@@ -21,6 +29,170 @@ fn cnn() -> Result<()> {
         golden.compare("quarter", &out.quarter);
         golden.done(&weights);
     }
+    Ok(())
+}
+
+/// The widths of `tools/witness/modules/{backbone,depth}.py`; the structure is the
+/// released one.
+fn narrow() -> Settings {
+    Settings {
+        cnn_channels: [8, 12, 16],
+        transformer_layers: 2,
+        depth_candidates: 24,
+        costvolume_channels: 32,
+        ..Settings::re10k()
+    }
+}
+
+/// What `run` traces, by name.
+fn traced(run: impl FnOnce(&mut Trace<'_>) -> Result<()>) -> Result<BTreeMap<String, Tensor>> {
+    let mut seen = BTreeMap::new();
+    let mut look = |name: &str, t: &Tensor| {
+        seen.insert(name.to_owned(), t.clone());
+        Ok(())
+    };
+    run(&mut Trace::to(&mut look))?;
+    Ok(seen)
+}
+
+#[test]
+fn transformer_plain_shifted_and_with_three_views() -> Result<()> {
+    for name in ["transformer", "transformer3"] {
+        let golden = Golden::load(name);
+        let weights = golden.weights();
+        let net = Transformer::new(&narrow(), weights.builder().pp("backbone.transformer"))?;
+        let x = golden.input("features").unsqueeze(0)?;
+        let seen = traced(|trace| {
+            golden.compare("out", &net.forward(&x, trace)?.squeeze(0)?);
+            Ok(())
+        })?;
+        for i in 0..2 {
+            let own = &seen[&format!("transformer.layer{i}.self_attn_vb")];
+            golden.compare(&format!("self{i}"), own);
+            golden.compare(&format!("layer{i}"), &seen[&format!("transformer.layer{i}.out_vb")]);
+        }
+        golden.done(&weights);
+    }
+    Ok(())
+}
+
+#[test]
+fn plane_sweep() -> Result<()> {
+    for (name, height, width) in [("sweep", 48, 64), ("sweep3", 40, 48)] {
+        let golden = Golden::load(name);
+        let features = golden.input("features");
+        let (cameras, near_far) = golden.cameras(width, height);
+        let blank = Tensor::zeros((1, cameras.len(), 3, height, width), DType::F32, &Device::Cpu)?;
+        let views = Views::new(blank, vec![cameras], vec![near_far])?;
+        let candidates = disparities(&views, 24);
+        let volume = correlation(&views, &candidates, &features, &mut Trace::off())?;
+        golden.compare("disparities", &Tensor::new(candidates, &Device::Cpu)?);
+        golden.compare("correlation", &volume);
+        golden.done(&golden.weights());
+    }
+    Ok(())
+}
+
+#[test]
+fn unet_with_attention_across_views() -> Result<()> {
+    let golden = Golden::load("unet");
+    let weights = golden.weights();
+    let net = UNet::new(64, 3, weights.builder().pp("net"))?;
+    golden.compare("out", &net.forward(&golden.input("x"), 2, &mut Trace::off(), "")?);
+    golden.done(&weights);
+    Ok(())
+}
+
+#[test]
+fn depth_predictor_stage_by_stage() -> Result<()> {
+    let golden = Golden::load("depth");
+    let weights = golden.weights();
+    let net = DepthPredictor::new(&narrow(), weights.builder().pp("depth_predictor"))?;
+    let views = golden.views();
+    let seen = traced(|trace| {
+        let input = Input {
+            views: &views,
+            images: golden.input("images"),
+            cnn: golden.input("cnn"),
+            trans: golden.input("trans"),
+        };
+        let out = net.forward(input, trace)?;
+        golden.compare("refine", &out.refined);
+        golden.compare("raw", &out.raw);
+        golden.compare("depths", &out.depths);
+        golden.compare("disparity", &out.depths.recip()?);
+        golden.compare("densities", &out.densities);
+        Ok(())
+    })?;
+    for (output, stage) in [
+        ("correlation", "cv.raw_correlation_vb"),
+        ("refined_volume", "cv.refined_correlation_vb"),
+        ("pdf", "depth.pdf_vb"),
+        ("coarse_disp", "depth.coarse_disp_vb"),
+        ("pdf_max", "depth.pdf_max_vb"),
+        ("fullres_disp", "depth.fullres_disp_vb"),
+        ("upsampled", "depth.upsampler_vb"),
+        ("projected", "depth.proj_feature_vb"),
+        ("delta", "depth.to_disparity_vb"),
+    ] {
+        golden.compare(output, &seen[stage]);
+    }
+    golden.done(&weights);
+    Ok(())
+}
+
+fn compare_primaries(golden: &Golden, p: &Primaries) -> Result<()> {
+    golden.compare("means", &p.means.squeeze(0)?);
+    golden.compare("quats", &p.quats_wxyz.squeeze(0)?);
+    golden.compare("scales", &p.scales.squeeze(0)?);
+    golden.compare("opacities", &p.opacities.squeeze(0)?);
+    golden.compare("sh", &p.sh.squeeze(0)?);
+    golden.compare("sh_camera", &p.sh_camera.squeeze(0)?);
+    Ok(())
+}
+
+#[test]
+fn gaussian_adapter() -> Result<()> {
+    let golden = Golden::load("adapter");
+    let (cameras, near_far) = golden.cameras(20, 12);
+    let blank = Tensor::zeros((1, 2, 3, 12, 20), DType::F32, &Device::Cpu)?;
+    let views = Views::new(blank, vec![cameras], vec![near_far])?;
+    let out = BackboneOutput {
+        raw: golden.input("raw").unsqueeze(0)?,
+        depths: golden.input("depths").unsqueeze(0)?,
+        densities: golden.input("densities").unsqueeze(0)?,
+        features: Vec::new(),
+    };
+    let settings = config::Primaries { opacity_exponent: 0.7, ..narrow().primaries };
+    compare_primaries(&golden, &primaries(&out, &views, &settings, &mut Trace::off())?)?;
+    golden.done(&golden.weights());
+    Ok(())
+}
+
+/// Three non-square views through the whole encoder, pictures to primaries.
+#[test]
+fn whole_backbone() -> Result<()> {
+    let golden = Golden::load("backbone");
+    let weights = golden.weights();
+    let views = golden.views();
+    let net = Mvsplat::new(&narrow(), weights.builder())?;
+    let out = net.forward(&views, &mut Trace::off())?;
+    let levels = [
+        ("cnn2", FeatureLevel::Cnn2),
+        ("cnn4", FeatureLevel::Cnn4),
+        ("trans4", FeatureLevel::Trans4),
+        ("trans8", FeatureLevel::Trans8),
+        ("trans16", FeatureLevel::Trans16),
+        ("refine1", FeatureLevel::Refine1),
+    ];
+    for (output, level) in levels {
+        golden.compare(output, &out.feature(level)?.squeeze(0)?);
+    }
+    golden.compare("raw", &out.raw.squeeze(0)?);
+    golden.compare("disparity", &out.depths.squeeze(0)?.recip()?);
+    golden.compare("densities", &out.densities.squeeze(0)?);
+    compare_primaries(&golden, &primaries(&out, &views, &narrow().primaries, &mut Trace::off())?)?;
+    golden.done(&weights);
     Ok(())
 }
 

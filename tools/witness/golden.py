@@ -65,7 +65,7 @@ class Case:
             poses.append(pose)
             fx, fy = width * (0.9 + 0.1 * u[i, 6]), width * (0.9 + 0.1 * u[i, 7])
             intrinsics.append([fx, fy, width * (0.5 + 0.04 * u[i, 8]), height * (0.5 + 0.04 * u[i, 9])])
-            near_far.append([1.2 + 0.2 * u[i, 10], 20.0 + 5.0 * u[i, 11]])
+            near_far.append([0.6 + 0.1 * u[i, 10], 20.0 + 5.0 * u[i, 11]])
         return (self.aside("poses", poses), self.aside("intrinsics", intrinsics), self.aside("near_far", near_far))
 
     def output(self, name, value, stride=1):
