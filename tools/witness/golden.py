@@ -5,7 +5,7 @@ tensors `in.X` (inputs that no formula makes), `aside.X` (what the Rust test nee
 beside them, such as cameras), `out.X` (every stride-th element of the flattened
 output X), and one metadata entry `witness`, JSON: maker, versions, seed, weights
 [[name, shape]], drawn [[name, shape, low, high]], outputs {name: {shape, stride}},
-graph_sha256. Weights and drawn inputs come from formula.py.
+notes, graph_sha256. Weights and drawn inputs come from formula.py.
 """
 
 import hashlib
@@ -33,6 +33,8 @@ class Case:
     def __init__(self, name, seed=0):
         self.name, self.seed, self.g = name, seed, G(name)
         self.specs, self.stored, self.asides, self.strides = [], {}, {}, {}
+        # JSON for the Rust test: the configuration that the graph stands for.
+        self.notes = {}
 
     def drawn(self, name, shape, low=-1.0, high=1.0):
         """A graph input uniform in (low, high) by formula."""
@@ -99,6 +101,7 @@ class Case:
             "weights": [[n, list(v.shape)] for n, v in self.g.weights.items()],
             "drawn": self.specs,
             "outputs": {n: {"shape": list(a.shape), "stride": self.strides[n]} for n, a in results.items()},
+            "notes": self.notes,
             "graph_sha256": hashlib.sha256(graph).hexdigest(),
         }
         save_file(tensors, folder / f"{self.name}.safetensors", metadata={"witness": json.dumps(about)})

@@ -41,6 +41,8 @@ def check(name):
     for n, shape in about["weights"]:
         if n not in case.g.weights or list(case.g.weights[n].shape) != shape:
             bad.append(f"{name}: weight {n} {shape} is not in the graph")
+    if about.get("notes", {}) != case.notes:
+        bad.append(f"{name}: notes: expected {case.notes}, got {about.get('notes')}")
     # What the golden says it was given, not what the definition would give today.
     feeds = {k[3:]: v for k, v in tensors.items() if k.startswith("in.")}
     feeds |= {n: formula.drawn(about["seed"], n, s, low, high) for n, s, low, high in about["drawn"]}
