@@ -6,7 +6,7 @@ mod witness_common;
 
 use candle_core::{DType, Device, Result, Tensor};
 use std::collections::{BTreeMap, BTreeSet};
-use subsplat::config::{self, FeatureLevel, Mvsplat as Settings};
+use subsplat::config::{self, Backbone, Config, FeatureLevel, Mvsplat as Settings, Preset};
 use subsplat::model::backbone::Mvsplat;
 use subsplat::model::backbone::cnn::Cnn;
 use subsplat::model::backbone::cost_volume::{correlation, disparities};
@@ -14,9 +14,11 @@ use subsplat::model::backbone::depth::{DepthPredictor, Input};
 use subsplat::model::backbone::transformer::Transformer;
 use subsplat::model::backbone::unet::UNet;
 use subsplat::model::primaries::primaries;
+use subsplat::model::subsplat::{SceneOutput, SubSplat};
 use subsplat::model::trace::Trace;
+use subsplat::model::weights::Weights;
 use subsplat::model::{BackboneOutput, Primaries, Views};
-use witness_common::{Golden, folder, tolerances};
+use witness_common::{Golden, folder, skip, tolerances};
 
 #[test]
 fn cnn() -> Result<()> {
@@ -193,6 +195,78 @@ fn whole_backbone() -> Result<()> {
     golden.compare("densities", &out.densities.squeeze(0)?);
     compare_primaries(&golden, &primaries(&out, &views, &narrow().primaries, &mut Trace::off())?)?;
     golden.done(&weights);
+    Ok(())
+}
+
+/// The preset with the backbone of [`narrow`] and the golden's own settings.
+fn configured(golden: &Golden, preset: Preset) -> Config {
+    fn part<T: serde::de::DeserializeOwned>(golden: &Golden, name: &str) -> T {
+        serde_json::from_value(golden.about.notes[name].clone()).unwrap()
+    }
+    Config {
+        backbone: Backbone::Mvsplat(narrow()),
+        embed: part(golden, "embed"),
+        agg: part(golden, "agg"),
+        spgr: part(golden, "spgr"),
+        ..Config::re10k(preset, part(golden, "upscale"))
+    }
+}
+
+/// Pictures to children, through the crate's front door; outputs by name.
+fn whole(
+    golden: &Golden,
+    preset: Preset,
+    weights: &Weights,
+) -> Result<BTreeMap<&'static str, Tensor>> {
+    let model = SubSplat::new(&configured(golden, preset), weights.builder())?;
+    let mut scenes = model.forward(&golden.views(), &mut |_| ())?;
+    let SceneOutput { children, depths } = scenes.remove(0);
+    let rows = |from: usize, len: usize| children.rows.narrow(1, from, len);
+    Ok(BTreeMap::from([
+        ("depths", Tensor::new(depths, &Device::Cpu)?),
+        ("means", rows(0, 3)?),
+        ("quats", rows(3, 4)?),
+        ("scales", rows(7, 3)?),
+        ("opacities", rows(10, 1)?.squeeze(1)?),
+        ("gain", children.gain.clone()),
+        ("sh", children.sh.clone()),
+    ]))
+}
+
+const WHOLE: [(&str, Preset); 2] = [("whole_paper", Preset::Paper), ("whole_tuned", Preset::Tuned)];
+
+#[test]
+fn whole_network() -> Result<()> {
+    for (name, preset) in WHOLE {
+        let golden = Golden::load(name);
+        let weights = golden.weights();
+        for (output, got) in whole(&golden, preset, &weights)? {
+            golden.compare(output, &got);
+        }
+        golden.done(&weights);
+    }
+    Ok(())
+}
+
+/// `tools/witness/verify.py --fresh DIR` draws pictures, cameras and weights anew;
+/// SUBSPLAT_WITNESS names DIR.
+#[test]
+fn fresh_inputs() -> Result<()> {
+    let Some(folder) = std::env::var_os("SUBSPLAT_WITNESS") else {
+        skip("SUBSPLAT_WITNESS is not set; nothing drawn anew was checked");
+        return Ok(());
+    };
+    let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
+    for (name, preset) in WHOLE {
+        let golden = Golden::load_from(&root.join(&folder), name);
+        for (output, got) in whole(&golden, preset, &golden.weights())? {
+            println!(
+                "{name}.{output}: {:.1e}, seed {}",
+                golden.distance(output, &got),
+                golden.about.seed
+            );
+        }
+    }
     Ok(())
 }
 
