@@ -139,6 +139,11 @@ impl Golden {
 
     /// Largest difference over largest magnitude; NaN counts as infinite.
     pub fn distance(&self, output: &str, got: &Tensor) -> f64 {
+        self.distances(output, got).into_iter().fold(0.0, f64::max)
+    }
+
+    /// Differences of all elements kept, over the largest magnitude; NaN counts as infinite.
+    pub fn distances(&self, output: &str, got: &Tensor) -> Vec<f64> {
         let held = (self.about.outputs.get(output))
             .unwrap_or_else(|| panic!("{}: no output {output}", self.name));
         assert_eq!(got.dims(), held.shape, "{}.{output}", self.name);
@@ -151,8 +156,8 @@ impl Golden {
         let got: Vec<f64> = flat(got).into_iter().step_by(held.stride).collect();
         assert_eq!(got.len(), want.len(), "{}.{output}", self.name);
         let size = want.iter().fold(0f64, |m, v| m.max(v.abs()));
-        let differences = got.iter().zip(&want).map(|(a, b)| (a - b).abs());
-        differences.map(|d| if d.is_nan() { f64::INFINITY } else { d }).fold(0f64, f64::max) / size
+        let differences = got.iter().zip(&want).map(|(a, b)| (a - b).abs() / size);
+        differences.map(|d| if d.is_nan() { f64::INFINITY } else { d }).collect()
     }
 
     /// Every output was compared, and the modules asked for every weight.

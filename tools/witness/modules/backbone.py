@@ -11,10 +11,10 @@ from .transformer import transformer
 CHANNELS, LAYERS = (8, 12, 16), 2
 
 
-def encode(c, views, height, width):
+def encode(c, views, height, width, far=20.0):
     """Inputs, then (encoder's stages and feature maps, primaries, frames)."""
     g = c.g
-    geo = geometry(c, views, height, width)
+    geo = geometry(c, views, height, width, far=far)
     images = c.drawn("images", (views, 3, height, width), 0.0, 1.0)
     half, quarter = cnn(g, images, CHANNELS)
     trans = transformer(g, quarter, LAYERS)
