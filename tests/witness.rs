@@ -219,14 +219,19 @@ fn whole(
     weights: &Weights,
 ) -> Result<BTreeMap<&'static str, Tensor>> {
     let model = SubSplat::new(&configured(golden, preset), weights.builder())?;
-    let mut scenes = model.forward(&golden.views(), &mut |_| ())?;
+    let views = golden.views();
+    let parents = model.primaries(&views, &model.encode(&views)?)?.means.squeeze(0)?;
+    let mut scenes = model.forward(&views, &mut |_| ())?;
     let SceneOutput { children, depths } = scenes.remove(0);
     let rows = |from: usize, len: usize| children.rows.narrow(1, from, len);
+    let (means, (n, _)) = (rows(0, 3)?, parents.dims2()?);
+    let steps = means.reshape((n, children.k, 3))?.broadcast_sub(&parents.unsqueeze(1)?)?;
     Ok(BTreeMap::from([
         ("depths", Tensor::new(depths, &Device::Cpu)?),
-        ("means", rows(0, 3)?),
+        ("steps", steps.reshape((n * children.k, 3))?),
+        ("means", means),
         ("quats", rows(3, 4)?),
-        ("scales", rows(7, 3)?),
+        ("log_scales", rows(7, 3)?.log()?),
         ("opacities", rows(10, 1)?.squeeze(1)?),
         ("gain", children.gain.clone()),
         ("sh", children.sh.clone()),

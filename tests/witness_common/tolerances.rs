@@ -53,15 +53,16 @@ const BACKBONE: &[Row] = &[
     ("backbone.means scales", 2e-4, "as depth.depths"),
     ("backbone.quats", 5e-5, "raw quaternions of small norm are divided by it"),
     (
-        "whole_paper.depths means scales opacities",
+        "whole_paper.depths means log_scales opacities",
         6e-5,
         "as backbone.means, with a nearer far plane; then six layers",
     ),
+    ("whole_paper.steps", 3e-4, "differences of f32 means that are thirty times as large"),
     ("whole_paper.quats", 2e-4, "as backbone.quats, turned by a head's output"),
     ("whole_paper.gain sh", 2e-5, "as backbone.raw; then six layers"),
     ("whole_tuned.depths means", 6e-5, "as whole_paper"),
     (
-        "whole_tuned.scales opacities quats gain",
+        "whole_tuned.steps log_scales opacities quats gain",
         1e-3,
         "the occlusion gate takes differences of depth over 2 % of it",
     ),

@@ -23,7 +23,7 @@ def embed_case(keys):
 
 def agg_case(keys):
     def case(c):
-        scene = Scene(c, 2, 6, 4, lost=True)
+        scene = Scene(c, 2, 6, 4, lost=("outside", "behind"))
         c.notes = {"agg": keys}
         n = 2 * scene.per_view
         maps = {level: c.drawn(f"map.{level}", (2, *MAPS[level]), -2.0, 2.0) for level in keys["levels"]}
@@ -47,14 +47,13 @@ def head_case(form, side, lanes):
 
 def spgr_case(keys, side, lowpass=(0.3, 0.3)):
     def case(c):
-        scene = Scene(c, 2, 4, 3 if side == 2 else 2)
+        scene = Scene(c, 2, 4, 3 if side == 2 else 2, lost=("outside",))
         c.notes = {"spgr": keys, "side": side, "lowpass_input": lowpass[0] != lowpass[1]}
         n = 2 * scene.per_view
         record = c.drawn("record", (n, side * side, 11), -1.2, 1.2)
         spgr = Spgr(c.g, keys, side, scene.views, scene.near, scene.parents, scene.per_view, lowpass)
-        rows, gain = spgr.forward(record)
-        c.output("rows", rows)
-        c.output("gain", gain)
+        for name, value in spgr.forward(record).items():
+            c.output(name, value)
     return case
 
 

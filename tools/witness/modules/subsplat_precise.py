@@ -6,7 +6,7 @@ from onnx import TensorProto
 from graph import G, Value
 
 # Operators of opset 18 that onnxruntime's CPU has in f32 alone.
-F32_ONLY = ("AveragePool", "Conv", "Erf", "GridSample", "Resize")
+F32_ONLY = ("AveragePool", "Conv", "ConvTranspose", "Erf", "GridSample", "Resize")
 
 
 class Precise(G):
@@ -33,5 +33,5 @@ class Precise(G):
     def op(self, kind, inputs, shape, dtype="float32", out=None, **attributes):
         if kind not in F32_ONLY:
             return super().op(kind, inputs, shape, dtype, out, **attributes)
-        inputs = [i if i is None or i.dtype != "float32" else self.cast_to(i, TensorProto.FLOAT) for i in inputs]
-        return self.cast_to(super().op(kind, inputs, shape, dtype, out, **attributes), TensorProto.DOUBLE)
+        inputs = [i if i is None or i.dtype == "int64" else self.cast_to(i, TensorProto.FLOAT) for i in inputs]
+        return self.cast_to(super().op(kind, inputs, shape, dtype, **attributes), TensorProto.DOUBLE)

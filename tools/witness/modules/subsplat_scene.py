@@ -31,9 +31,10 @@ SPGR = {"paper": _SPGR, "tuned": _SPGR | {"primary_view": "source", "offset_boun
 class Scene:
     """V views of width x height px, one parent per pixel, built in double precision into the case.
 
-    `lost` puts parent 1 outside every picture and parent 2 behind every camera."""
+    `lost` lists what goes astray: "outside" puts parent 1 outside every picture, "behind" parent 2 behind every
+    camera."""
 
-    def __init__(self, c, views=2, width=6, height=4, lost=False):
+    def __init__(self, c, views=2, width=6, height=4, lost=()):
         c.g = Precise(c.name)
         self.size, self.per_view = (width, height), width * height
         poses, intrinsics, near_far = c.cameras(views, height, width)
@@ -42,7 +43,7 @@ class Scene:
         self.near = c.given("near", near_far[:, 0])
         self.views = [View(c.g, self.poses[i], self.lenses[i], self.size) for i in range(views)]
         numbers = parents(c.seed, poses.astype(np.float64), intrinsics.astype(np.float64), width, height, lost)
-        self.parents = {name: c.given(name, a) for name, a in numbers.items()}
+        self.parents = {name: c.given(f"parent.{name}", a) for name, a in numbers.items()}
 
 
 def quat_of(r):
@@ -67,9 +68,9 @@ def parents(seed, poses, intrinsics, width, height, lost):
         row, column = divmod(pixel, width)
         z = 2.0 + 3.0 * u[i, 2]
         at = np.array([column + 0.1 + 0.8 * u[i, 0], row + 0.1 + 0.8 * u[i, 1]])
-        if lost and i == 1:
+        if "outside" in lost and i == 1:
             at = np.array([-4.0 * width, 0.5 * height])
-        if lost and i == 2:
+        if "behind" in lost and i == 2:
             z = -z
         in_camera = np.array([(at[0] - cx) / fx, (at[1] - cy) / fy, 1.0]) * z
         rotation, eye = poses[v, :3, :3], poses[v, :3, 3]

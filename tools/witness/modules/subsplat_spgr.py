@@ -89,7 +89,7 @@ class Primary:
 
 
 class Spgr:
-    """keys: the `spgr` section; lowpass: (target px^2, input px^2)."""
+    """keys: the `spgr` section; near: [V]; lowpass: (target px^2, input px^2)."""
 
     def __init__(self, g, keys, side, views, near, parents, per_view, lowpass=(0.3, 0.3)):
         self.g, self.keys, self.side, self.k = g, keys, side, side * side
@@ -98,11 +98,11 @@ class Spgr:
         self.z = g.maximum(self.view.in_camera[:, 2:], self.view.z_min)
 
     def forward(self, record):
-        """rows [N K, 11] (mean, quat wxyz, sigma, opacity) and gain [N K] or [N K, 4] from records [N, K, 11]."""
+        """Children of records [N, K, 11], child k of parent n in row n K + k: `steps` [N K, 3] from the parent's mean,
+        `quats` [N K, 4] wxyz, `log_scales` [N K, 3], `opacities` [N K], `gain` [N K] or [N K, 4]."""
         g, keys = self.g, self.keys
         in_camera = self.place(record)
-        step = in_camera - self.view.in_camera[:, None]
-        means = self.parents["means"][:, None] + step @ self.view.w2c()
+        steps = (in_camera - self.view.in_camera[:, None]) @ self.view.w2c()
         clamp = keys["dlog_clamp"]
         growth = g.exp(g.tanh(record[..., 3:6] / clamp) * clamp)
         scales = self.parents["scales"][:, None] * growth * lambda_s(keys, self.side)
@@ -114,14 +114,15 @@ class Spgr:
         scales = scales * factors
         grown = self.footprint(at, quats, scales, self.side)
         alpha = self.opacity(record[..., 9], g.maximum(area, least), grown)
-        rows = g.concat([means, quats, scales, alpha[..., None]], 2).reshape(self.n * self.k, 11)
-        extra = g.tanh(record[..., 10]) * keys["delta"]
-        gain = (extra + 1.0).reshape(-1)
+        flat = lambda x: x.reshape(self.n * self.k, x.shape[-1])
+        extra = g.tanh(record[..., 10:]) * keys["delta"]
+        gain = (extra + 1.0).reshape(self.n * self.k)
         if keys["gain_space"] == "rgb":
             # gamma (1/2 + S) = gamma S + 1/2 + (gamma - 1)/2.
-            rest = g.broadcast((extra * 0.5).reshape(-1, 1), (self.n * self.k, 3))
+            rest = g.broadcast(flat(extra) * 0.5, (self.n * self.k, 3))
             gain = g.concat([gain[:, None], rest], 1)
-        return rows, gain
+        return {"steps": flat(steps), "quats": flat(quats), "log_scales": g.log(flat(scales)),
+                "opacities": alpha.reshape(self.n * self.k), "gain": gain}
 
     def place(self, record):
         """Camera points of the children [N, K, 3] (spec 2.4)."""

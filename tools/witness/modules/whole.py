@@ -1,47 +1,40 @@
 """The whole network in one graph: pictures and cameras of one scene to children. MVSplat's encoder (backbone.py), its
-primaries (adapter.py), then SubSplat's embeddings, attention, heads and reparameterization (subsplat_*.py)."""
+primaries (adapter.py), then what SubSplat adds (trunk.py)."""
 
 import numpy as np
 
 from .backbone import encode
-from .subsplat_attention import Attention
-from .subsplat_embed import embed
 from .subsplat_geometry import View
 from .subsplat_precise import Precise
-from .subsplat_scene import AGG, EMBED, SPGR
-from .subsplat_spgr import Spgr, heads
+from .trunk import preset, trunk
 
 E, SIDE = 32, 2
 # Near enough that f32 noise of disparity (3e-6) stays small in depth, whose differences the occlusion gate of `tuned`
 # multiplies by fifty.
 FAR = 5.0
-STRIDES = {"depths": 5, "sh": 367, "gain": 5, "means": 11, "quats": 17, "scales": 11, "opacities": 5}
+STRIDES = {"depths": 5, "sh": 367, "gain": 5, "means": 11, "steps": 11, "quats": 17, "log_scales": 11, "opacities": 5}
 
 
-def case(preset, views, height, width):
+def case(name, views, height, width):
     def build(c):
         g = c.g = Precise(c.name)
-        c.notes = {"upscale": SIDE, "embed": EMBED[preset] | {"dim": E}, "agg": AGG[preset],
-                   "spgr": SPGR[preset] | {"hidden": E}}
+        config = preset(name, embed={"dim": E}, spgr={"hidden": E})
+        c.notes = {**config, "upscale": SIDE}
         out, primaries, frames = encode(c, views, height, width, far=FAR)
-        n = views * height * width
-        pictures = np.array([width, height] * 2, np.float64)
-        lenses = frames["intrinsics"] / pictures
+        n, k = views * height * width, SIDE * SIDE
+        lenses = frames["intrinsics"] / np.array([width, height] * 2)
         poses = [g.concat([frames["rotation"][v], frames["origin"][v].reshape(3, 1)], 1) for v in range(views)]
         seen_by = [View(g, poses[v], lenses[v], (width, height)) for v in range(views)]
         near = c.given("near", c.asides["near_far"][:, 0])
-        parents = {"means": primaries["means"], "quats": primaries["quats"], "scales": primaries["scales"],
-                   "opacities": primaries["opacities"].reshape(n, 1)}
-        sh = primaries["sh_camera" if EMBED[preset]["sh"] == "camera" else "sh"].reshape(n, 75)
-        z = embed(g, c.notes["embed"], seen_by, parents, sh, height * width)
-        attention = Attention(g, c.notes["agg"], E, out, seen_by, parents, height * width)
-        record = heads(g, c.notes["spgr"], *attention.head_inputs(*z), SIDE)
-        rows, gain = Spgr(g, c.notes["spgr"], SIDE, seen_by, near, parents, height * width).forward(record)
-        found = {"depths": out["depths"].reshape(views, height * width), "sh": primaries["sh"].transpose(0, 2, 1),
-                 "gain": gain, "means": rows[:, 0:3], "quats": rows[:, 3:7], "scales": rows[:, 7:10],
-                 "opacities": rows[:, 10]}
-        for name, value in found.items():
-            c.output(name, value, STRIDES[name])
+        parents = {key: primaries[key] for key in ("means", "quats", "scales")}
+        parents["opacities"] = primaries["opacities"].reshape(n, 1)
+        sh = primaries["sh_camera" if config["embed"]["sh"] == "camera" else "sh"].reshape(n, 75)
+        children = trunk(g, config, SIDE, seen_by, near, parents, sh, out, height * width)
+        owners = g.broadcast(parents["means"].reshape(n, 1, 3), (n, k, 3)).reshape(n * k, 3)
+        children |= {"means": owners + children["steps"], "sh": primaries["sh"].transpose(0, 2, 1),
+                     "depths": out["depths"].reshape(views, height * width)}
+        for key, value in children.items():
+            c.output(key, value, STRIDES[key])
     return build
 
 
