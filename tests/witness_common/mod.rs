@@ -43,6 +43,17 @@ pub struct Golden {
     compared: RefCell<BTreeSet<String>>,
 }
 
+/// Names of the committed goldens that begin with `prefix`, in order; at least one.
+pub fn names(prefix: &str) -> Vec<String> {
+    let files = std::fs::read_dir(folder()).unwrap().map(|e| e.unwrap().path());
+    let stems = files.filter(|p| p.extension().is_some_and(|e| e == "safetensors"));
+    let stems = stems.map(|p| p.file_stem().unwrap().to_string_lossy().into_owned());
+    let mut found: Vec<String> = stems.filter(|n| n.starts_with(prefix)).collect();
+    found.sort();
+    assert!(!found.is_empty(), "no golden {prefix}*");
+    found
+}
+
 /// Where the committed goldens lie.
 pub fn folder() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/goldens/witness")
@@ -114,6 +125,13 @@ impl Golden {
         };
         let near_far = rows(self.aside("near_far")).iter().map(|r| (r[0], r[1])).collect();
         (poses.iter().zip(&k).map(camera).collect(), near_far)
+    }
+
+    /// The part of the notes called `key`.
+    pub fn note<T: serde::de::DeserializeOwned>(&self, key: &str) -> T {
+        let value = self.about.notes.get(key).cloned();
+        let value = value.unwrap_or_else(|| panic!("{}: no note {key}", self.name));
+        serde_json::from_value(value).unwrap_or_else(|e| panic!("{}: {key}: {e}", self.name))
     }
 
     /// One scene: input `images` `[V, 3, H, W]` with the golden's cameras.

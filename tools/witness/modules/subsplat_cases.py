@@ -13,7 +13,7 @@ MAPS = {"trans4": (16, 4, 6), "cnn2": (10, 7, 9), "cnn4": (16, 5, 5)}
 def embed_case(keys):
     def case(c):
         scene = Scene(c, 2, 5, 4)
-        c.notes = {"embed": {**keys, "dim": E}}
+        c.notes["embed"] = {**keys, "dim": E}
         sh = c.drawn("sh", (2 * scene.per_view, 75), -0.6, 0.6)
         z_g, z_a = embed(c.g, c.notes["embed"], scene.views, scene.parents, sh, scene.per_view)
         c.output("z_g", z_g)
@@ -24,7 +24,7 @@ def embed_case(keys):
 def agg_case(keys):
     def case(c):
         scene = Scene(c, 2, 6, 4, lost=("outside", "behind"))
-        c.notes = {"agg": keys}
+        c.notes["agg"] = keys
         n = 2 * scene.per_view
         maps = {level: c.drawn(f"map.{level}", (2, *MAPS[level]), -2.0, 2.0) for level in keys["levels"]}
         z = [c.drawn(name, (n, E), -1.7, 1.7) for name in ("z_g", "z_a")]
@@ -45,10 +45,10 @@ def head_case(form, side, lanes):
     return case
 
 
-def spgr_case(keys, side, lowpass=(0.3, 0.3)):
+def spgr_case(keys, side, lowpass=[0.3, 0.3]):
     def case(c):
         scene = Scene(c, 2, 4, 3 if side == 2 else 2, lost=("outside",))
-        c.notes = {"spgr": keys, "side": side, "lowpass_input": lowpass[0] != lowpass[1]}
+        c.notes |= {"spgr": keys, "side": side, "lowpass": lowpass}
         n = 2 * scene.per_view
         record = c.drawn("record", (n, side * side, 11), -1.2, 1.2)
         spgr = Spgr(c.g, keys, side, scene.views, scene.near, scene.parents, scene.per_view, lowpass)
@@ -107,4 +107,4 @@ CASES |= {f"sub_head_{form}": head_case(form, 2, 9) for form in ("mlp2", "pg", "
 CASES |= {"sub_head_coord_4": head_case("coord", 4, 2), "sub_head_mlp2_3": head_case("mlp2", 3, 2)}
 CASES |= {f"sub_spgr_{name}": spgr_case(keys, 2) for name, keys in SPGRS.items()}
 CASES |= {f"sub_spgr_{name}_16": spgr_case(SPGRS[name], 4) for name in ALSO_16}
-CASES["sub_spgr_depth_lowpass"] = spgr_case(SPGR["tuned"], 2, (1.2, 0.3))
+CASES["sub_spgr_depth_lowpass"] = spgr_case(SPGR["tuned"], 2, [1.2, 0.3])

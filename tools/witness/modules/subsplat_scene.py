@@ -36,6 +36,7 @@ class Scene:
 
     def __init__(self, c, views=2, width=6, height=4, lost=()):
         c.g = Precise(c.name)
+        c.notes["size"] = [width, height]
         self.size, self.per_view = (width, height), width * height
         poses, intrinsics, near_far = c.cameras(views, height, width)
         lenses = intrinsics / np.array([width, height] * 2, np.float32)

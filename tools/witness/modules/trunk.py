@@ -36,7 +36,7 @@ MAPS = {"trans4": (24, 3, 4), "cnn2": (20, 5, 7)}
 def case(config, side):
     def build(c):
         scene = Scene(c, 2, 7, 5)
-        c.notes = {**config, "upscale": side}
+        c.notes |= {**config, "upscale": side}
         sh = c.drawn("sh", (2 * scene.per_view, 75), -0.6, 0.6)
         maps = {level: c.drawn(f"map.{level}", (2, *MAPS[level]), -2.0, 2.0) for level in config["agg"]["levels"]}
         out = trunk(c.g, config, side, scene.views, scene.near, scene.parents, sh, maps, scene.per_view)
