@@ -6,6 +6,7 @@ mod witness_common;
 
 use candle_core::{DType, Device, Result, Tensor};
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 use subsplat::config::{self, Backbone, Config, FeatureLevel, Mvsplat as Settings, Preset};
 use subsplat::model::backbone::Mvsplat;
 use subsplat::model::backbone::cnn::Cnn;
@@ -97,11 +98,13 @@ fn plane_sweep() -> Result<()> {
 
 #[test]
 fn unet_with_attention_across_views() -> Result<()> {
-    let golden = Golden::load("unet");
-    let weights = golden.weights();
-    let net = UNet::new(64, 3, weights.builder().pp("net"))?;
-    golden.compare("out", &net.forward(&golden.input("x"), 2, &mut Trace::off(), "")?);
-    golden.done(&weights);
+    for (name, channels, levels) in [("unet", 64, 3), ("unet_dim", 32, 2)] {
+        let golden = Golden::load(name);
+        let weights = golden.weights();
+        let net = UNet::new(channels, levels, weights.builder().pp("net"))?;
+        golden.compare("out", &net.forward(&golden.input("x"), 2, &mut Trace::off(), "")?);
+        golden.done(&weights);
+    }
     Ok(())
 }
 
@@ -254,25 +257,32 @@ fn whole_network() -> Result<()> {
 }
 
 /// `tools/witness/verify.py --fresh DIR` draws pictures, cameras and weights anew;
-/// SUBSPLAT_WITNESS names DIR.
+/// SUBSPLAT_WITNESS names DIR. One element in 500 may be off: a parent on the edge of
+/// another view's picture, or equally near to two views, may fall on either side.
 #[test]
 fn fresh_inputs() -> Result<()> {
     let Some(folder) = std::env::var_os("SUBSPLAT_WITNESS") else {
         skip("SUBSPLAT_WITNESS is not set; nothing drawn anew was checked");
         return Ok(());
     };
-    let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join(folder);
     for (name, preset) in WHOLE {
-        let golden = Golden::load_from(&root.join(&folder), name);
-        for (output, got) in whole(&golden, preset, &golden.weights())? {
-            let (far, tolerance) = (golden.distances(output, &got), tolerances::of(name, output));
+        let golden = Golden::load_from(&folder, name);
+        let weights = golden.weights();
+        for (output, got) in whole(&golden, preset, &weights)? {
+            let far = golden.distances(output, &got);
+            let tolerance = tolerances::of(name, output);
             let off = far.iter().filter(|&&d| d > tolerance).count();
             let worst = far.iter().copied().fold(0.0, f64::max);
-            println!(
-                "{name}.{output}: {off} of {} beyond {tolerance:.0e}, worst {worst:.1e}",
+            let what = format!(
+                "seed {}, {name}.{output}: {off} of {} beyond {tolerance:.0e}, worst {worst:.1e}",
+                golden.about.seed,
                 far.len()
             );
+            println!("{what}");
+            assert!(off * 500 <= far.len() && worst.is_finite(), "{what}");
         }
+        golden.done(&weights);
     }
     Ok(())
 }

@@ -31,6 +31,7 @@ const BACKBONE: &[Row] = &[
         2e-5,
         "sampling positions carry 1e-6 px of noise, features differ by 4 a pixel",
     ),
+    ("unet_dim.out", 1e-5, "as unet"),
     ("unet.out", 1e-5, "some twenty convolutions with norms, attention"),
     (
         "depth.correlation",
@@ -53,10 +54,11 @@ const BACKBONE: &[Row] = &[
     ("backbone.means scales", 2e-4, "as depth.depths"),
     ("backbone.quats", 5e-5, "raw quaternions of small norm are divided by it"),
     (
-        "whole_paper.depths means log_scales opacities",
+        "whole_paper.depths means log_scales",
         6e-5,
         "as backbone.means, with a nearer far plane; then six layers",
     ),
+    ("whole_paper.opacities", 1.5e-4, "a softmax of logits less the logarithm of areas"),
     ("whole_paper.steps", 3e-4, "differences of f32 means that are thirty times as large"),
     ("whole_paper.quats", 2e-4, "as backbone.quats, turned by a head's output"),
     ("whole_paper.gain sh", 2e-5, "as backbone.raw; then six layers"),

@@ -8,7 +8,7 @@ def geometry(c, views, height, width, scale=4, far=20.0):
     """Cameras as graph inputs. What needs a matrix inverse is computed here in f64:
     relative [V, V-1, 4, 4] (offset o: view i to view (i + o) mod V), k and k_inv
     [V, 3, 3] at 1/scale of the picture."""
-    poses, intrinsics, near_far = (a.astype(np.float64) for a in c.cameras(views, height, width, far))
+    poses, intrinsics, near_far = (a.astype(np.float64) for a in c.cameras(views, height, width, 0.6, far))
     relative = [[np.linalg.inv(poses[(i + o) % views]) @ poses[i] for o in range(1, views)] for i in range(views)]
     if views == 2:
         relative[1][0] = np.linalg.inv(relative[0][0])

@@ -54,8 +54,11 @@ def unet(g, x, name, levels):
     return g.silu(g.group_norm(g.conv(x, f"{name}.out.0", c), f"{name}.out.1", 8))
 
 
-def case(c):
-    c.output("out", unet(c.g, c.drawn("x", (2, 64, 12, 8), -1.5, 1.5), "net", 3), stride=5)
+def case(shape, levels, high, stride):
+    def build(c):
+        c.output("out", unet(c.g, c.drawn("x", shape, -high, high), "net", levels), stride)
+    return build
 
 
-CASES = {"unet": case}
+# In unet_dim the variance within a group of the first norms comes from the biases alone, and eps is seen.
+CASES = {"unet": case((2, 64, 12, 8), 3, 1.5, 5), "unet_dim": case((2, 32, 4, 6), 2, 0.01, 1)}
