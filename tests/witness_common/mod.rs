@@ -24,7 +24,7 @@ pub struct About {
     pub weights: Vec<(String, Vec<usize>)>,
     pub drawn: Vec<(String, Vec<usize>, f64, f64)>,
     pub outputs: BTreeMap<String, Held>,
-    /// What the graph stands for, such as a configuration.
+    /// The configuration that the graph stands for, in the crate's JSON.
     #[serde(default)]
     pub notes: serde_json::Value,
 }
@@ -57,6 +57,12 @@ pub fn names(prefix: &str) -> Vec<String> {
 /// Where the committed goldens lie.
 pub fn folder() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/goldens/witness")
+}
+
+/// Says loudly that a test checked nothing.
+pub fn skip(why: &str) {
+    // Not `eprintln!`, which cargo hides for tests that pass.
+    std::io::Write::write_all(&mut std::io::stderr(), format!("SKIP: {why}\n").as_bytes()).ok();
 }
 
 impl Golden {
@@ -157,6 +163,11 @@ impl Golden {
 
     /// Largest difference over largest magnitude; NaN counts as infinite.
     pub fn distance(&self, output: &str, got: &Tensor) -> f64 {
+        self.distances(output, got).into_iter().fold(0.0, f64::max)
+    }
+
+    /// Differences of all elements kept, over the largest magnitude; NaN counts as infinite.
+    pub fn distances(&self, output: &str, got: &Tensor) -> Vec<f64> {
         let held = (self.about.outputs.get(output))
             .unwrap_or_else(|| panic!("{}: no output {output}", self.name));
         assert_eq!(got.dims(), held.shape, "{}.{output}", self.name);
@@ -169,14 +180,21 @@ impl Golden {
         let got: Vec<f64> = flat(got).into_iter().step_by(held.stride).collect();
         assert_eq!(got.len(), want.len(), "{}.{output}", self.name);
         let size = want.iter().fold(0f64, |m, v| m.max(v.abs()));
-        let differences = got.iter().zip(&want).map(|(a, b)| (a - b).abs());
-        differences.map(|d| if d.is_nan() { f64::INFINITY } else { d }).fold(0f64, f64::max) / size
+        let differences = got.iter().zip(&want).map(|(a, b)| (a - b).abs() / size);
+        differences.map(|d| if d.is_nan() { f64::INFINITY } else { d }).collect()
     }
 
     /// Every output was compared, and the modules asked for every weight.
     pub fn done(&self, weights: &Weights) {
         let all: BTreeSet<String> = self.about.outputs.keys().cloned().collect();
         assert_eq!(*self.compared.borrow(), all, "{}: outputs compared", self.name);
-        assert_eq!(weights.unexpected(), [""; 0], "{}: weights never asked for", self.name);
+        let left = weights.unexpected();
+        assert!(
+            left.is_empty(),
+            "{}: {} weights never asked for, {}",
+            self.name,
+            left.len(),
+            left[0]
+        );
     }
 }

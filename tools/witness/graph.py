@@ -86,7 +86,7 @@ class G:
         return Value(self, self.constants[key][0], a.shape, str(a.dtype))
 
     def output(self, name, value):
-        assert name not in self.outputs, name
+        assert name not in {**self.outputs, **self.inputs, **self.weights}, name
         self.outputs[name] = self.op("Identity", [value], value.shape, value.dtype, out=name)
 
     # --- nodes ----------------------------------------------------------------------

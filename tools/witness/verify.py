@@ -3,11 +3,11 @@ and that the graphs are what the definitions in modules/ say:
 
     python tools/witness/verify.py [NAMES...]
     python tools/witness/verify.py --fresh DIR    random inputs, weights and cameras for
-                                                  the case `whole`; writes DIR/whole.*
+                                                  the cases of FRESH; writes DIR/NAME.*
 
-A difference is named, and the exit status is 1. Equal means: no element is farther off
-than TOLERANCE of the output's largest magnitude, since processors with other vector
-units sum in another order.
+A difference is named, and the exit status is 1. On one machine the numbers are equal to
+the bit; processors with other vector units sum in another order, so no element may be
+farther off than TOLERANCE (LOOSER for some cases) of the output's largest magnitude.
 """
 
 import hashlib
@@ -21,8 +21,11 @@ from golden import FOLDER, Case, read, run, thinned
 import formula
 from modules import CASES
 
-TOLERANCE = 2e-5
-FRESH = "whole"
+TOLERANCE = 1e-5
+# What onnxruntime with and without its graph rewriting differs by, fivefold: 1/disparity far away (2e-5), and the
+# occlusion gate's differences of depth (1.5e-4).
+LOOSER = {"depth": 1e-4, "backbone": 1e-4, "whole_paper": 1e-4, "whole_tuned": 8e-4}
+FRESH = ("whole_paper", "whole_tuned")
 
 
 def check(name):
@@ -52,7 +55,7 @@ def check(name):
         if have != {prefix + n for n in made}:
             bad.append(f"{name}: tensors {prefix}*: expected {sorted(made)}, got {sorted(have)}")
         for n in made:
-            bad += differs(f"{name}: {prefix}{n}", tensors.get(prefix + n), made[n])
+            bad += differs(f"{name}: {prefix}{n}", tensors.get(prefix + n), made[n], TOLERANCE)
     results = run(graph, feeds)
     if set(results) != set(about["outputs"]):
         bad.append(f"{name}: outputs: expected {sorted(results)}, got {sorted(about['outputs'])}")
@@ -60,16 +63,17 @@ def check(name):
         held = about["outputs"].get(n, {"stride": 1})
         if held.get("shape") != list(a.shape) or held["stride"] != case.strides[n]:
             bad.append(f"{name}: output {n}: shape or stride is not the definition's")
-        bad += differs(f"{name}: out.{n}", tensors.get(f"out.{n}"), thinned(a, held["stride"]))
+        tolerance = LOOSER.get(name, TOLERANCE)
+        bad += differs(f"{name}: out.{n}", tensors.get(f"out.{n}"), thinned(a, held["stride"]), tolerance)
     return bad
 
 
-def differs(what, have, want):
+def differs(what, have, want, tolerance):
     if have is None or have.shape != want.shape or have.dtype != want.dtype:
         return [f"{what}: expected {want.dtype} {want.shape}, got {'nothing' if have is None else (have.dtype, have.shape)}"]
     have, want = have.astype(np.float64), want.astype(np.float64)
     far, size = np.abs(have - want), np.abs(want).max(initial=0.0)
-    if want.size and not far.max() <= TOLERANCE * size:
+    if want.size and not far.max() <= tolerance * size:
         at = int(far.argmax())
         return [f"{what}: element {at} is {have.flat[at]:.9g}, onnxruntime says {want.flat[at]:.9g}; largest is {size:.3g}"]
     return []
@@ -77,17 +81,16 @@ def differs(what, have, want):
 
 def fresh(folder):
     folder.mkdir(parents=True, exist_ok=True)
-    seed = int.from_bytes(os.urandom(6))
+    seed = int.from_bytes(os.urandom(6), "big")
     print(f"fresh: seed {seed}")
-    case = Case(FRESH, seed)
-    CASES[FRESH](case)
-    graph = (FOLDER / f"{FRESH}.onnx").read_bytes()
-    if case.g.bytes() != graph:
-        raise SystemExit(f"{FRESH}.onnx: modules/ builds another graph for seed {seed}")
-    results = case.run(graph)
-    (folder / f"{FRESH}.onnx").write_bytes(graph)
-    case.write(folder, results, graph)
-    print(f"fresh: wrote {len(results)} outputs")
+    for name in FRESH:
+        case = Case(name, seed)
+        CASES[name](case)
+        graph = (FOLDER / f"{name}.onnx").read_bytes()
+        if case.g.bytes() != graph:
+            raise SystemExit(f"{name}.onnx: modules/ builds another graph for seed {seed}")
+        case.write(folder, case.run(graph), graph)
+        print(f"fresh: wrote {name}")
 
 
 def main(arguments):
