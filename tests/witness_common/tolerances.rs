@@ -83,7 +83,8 @@ const DISC: &str = "(J Sigma J^T)^-1 of a needle of 1000 to 1 in f32; in f64 the
 const TRUNK: &str = "as attention, heads and children in a row";
 const LITERAL: &str = "as TRUNK; logits of factor 1 in a softmax";
 const SH: &str = "one polynomial and a sum";
-const NEEDLE: &str = "a needle's short axis from its quaternion in f32";
+const NEEDLE: &str =
+    "a needle's short axis from a covariance in f32; the test holds the other form to 1e-6";
 const SUPPORT: &str = "supports are widened by 1e-4 in log2 of alpha";
 const PIXELS: &str = "3 px; the test bounds them on either side to the pixel";
 
@@ -95,6 +96,7 @@ const SUBSPLAT: &[Row] = &[
     ("sub_agg_cat_ffn.f_g f_a", 6e-6, ATTENTION),
     ("sub_agg_clamp.f_g f_a", 6e-6, ATTENTION),
     ("sub_agg_clamp_hidden.f_g f_a", 6e-6, ATTENTION),
+    ("sub_agg_faint.f_g f_a", 6e-6, ATTENTION),
     ("sub_agg_groups.f_g f_a", 6e-6, ATTENTION),
     ("sub_agg_integer.f_g f_a", 6e-6, ATTENTION),
     ("sub_agg_linear.f_g f_a", 6e-6, ATTENTION),
@@ -105,23 +107,32 @@ const SUBSPLAT: &[Row] = &[
     ("sub_agg_offsets.f_g f_a", 6e-6, ATTENTION),
     ("sub_agg_offsets_linear.f_g f_a", 6e-6, ATTENTION),
     ("sub_agg_paper.f_g f_a", 6e-6, ATTENTION),
+    ("sub_agg_three_views.f_g f_a", 6e-6, ATTENTION),
     ("sub_agg_tuned.f_g f_a", 6e-6, ATTENTION),
     ("sub_embed_lite_raw.z_g z_a", 2e-6, EMBED),
     ("sub_embed_paper.z_g z_a", 2e-6, EMBED),
     ("sub_embed_tuned.z_g z_a", 2e-6, EMBED),
     ("sub_embed_view0.z_g z_a", 2e-6, EMBED),
     ("sub_ewa_antialiased.means2d depth", 5e-7, SPLAT),
-    ("sub_ewa_antialiased.conic opacity", 2e-4, NEEDLE),
+    ("sub_ewa_antialiased.conic opacity", 5e-4, NEEDLE),
     ("sub_ewa_antialiased.half", 2e-4, SUPPORT),
     ("sub_ewa_antialiased.pixels wide", 4e-2, PIXELS),
     ("sub_ewa_mvsplat.means2d depth opacity", 5e-7, SPLAT),
-    ("sub_ewa_mvsplat.conic", 2e-4, NEEDLE),
+    ("sub_ewa_mvsplat.conic", 5e-4, NEEDLE),
     ("sub_ewa_mvsplat.half", 2e-4, SUPPORT),
     ("sub_ewa_mvsplat.pixels wide", 4e-2, PIXELS),
+    ("sub_ewa_mvsplat_large.means2d depth opacity", 5e-7, SPLAT),
+    ("sub_ewa_mvsplat_large.conic", 5e-4, NEEDLE),
+    ("sub_ewa_mvsplat_large.half", 2e-4, SUPPORT),
+    ("sub_ewa_mvsplat_large.pixels wide", 4e-2, PIXELS),
     ("sub_ewa_standard.means2d depth opacity", 5e-7, SPLAT),
-    ("sub_ewa_standard.conic", 2e-4, NEEDLE),
+    ("sub_ewa_standard.conic", 5e-4, NEEDLE),
     ("sub_ewa_standard.half", 2e-4, SUPPORT),
     ("sub_ewa_standard.pixels wide", 4e-2, PIXELS),
+    ("sub_ewa_standard_large.means2d depth opacity", 5e-7, SPLAT),
+    ("sub_ewa_standard_large.conic", 5e-4, NEEDLE),
+    ("sub_ewa_standard_large.half", 2e-4, SUPPORT),
+    ("sub_ewa_standard_large.pixels wide", 4e-2, PIXELS),
     ("sub_head_coord.record", 1e-6, HEAD),
     ("sub_head_coord_4.record", 1e-6, HEAD),
     ("sub_head_mlp2.record", 1e-6, HEAD),
