@@ -317,8 +317,8 @@ fn projection() -> Result<()> {
             &RasterOptions {
                 lowpass: golden.note("lowpass"),
                 antialiased: golden.note("antialiased"),
-                // World units, or the camera's near plane.
-                near: scene.near[0] * if convention == Convention::Mvsplat { 1.0 } else { 2.0 },
+                // World units, or a camera's near plane.
+                near: scene.near[0] * if convention == Convention::Mvsplat { 10.0 } else { 2.0 },
                 ..RasterOptions::new(convention)
             },
         );

@@ -137,8 +137,8 @@ def ewa_case(convention, lowpass=0.3, antialiased=False, size=0.25):
         c.notes["scale"] = size
         view = geo.View(c.g, scene.poses[0], scene.lenses[0], (72, 60))
         splats = scene.parents | {"scales": scene.parents["scales"] * size}
-        # Standard: world units; some parents stand nearer.
-        near = scene.near[:1] * (1.0 if convention == "mvsplat" else 2.0)
+        # Some parents stand nearer than 2 near planes (`standard`), or a fifth of 10 (`mvsplat`).
+        near = scene.near[:1] * (10.0 if convention == "mvsplat" else 2.0)
         for name, value in project(c.g, view, near[0], splats, convention, lowpass, antialiased).items():
             c.output(name, value)
     return case
