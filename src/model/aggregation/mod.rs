@@ -190,8 +190,13 @@ impl Aggregation {
         let (centres, z) = frames.project(&parents.means.unsqueeze(1)?, self.keys.mask)?;
         let occlusion = match &prepared.depths {
             Some(depths) => {
-                // Clamped positions would give a parent beside the picture its edge's depth.
-                let (at, _) = frames.project(&parents.means.unsqueeze(1)?, MaskMode::Renorm)?;
+                let at = match self.keys.mask {
+                    MaskMode::Renorm => centres.clone(),
+                    // Clamped, a parent beside the picture would be judged by its edge.
+                    MaskMode::PgClamp => {
+                        frames.project(&parents.means.unsqueeze(1)?, MaskMode::Renorm)?.0
+                    }
+                };
                 Some(occlusion_gate(&at.squeeze(2)?, &z.squeeze(2)?, depths)?)
             }
             None => None,

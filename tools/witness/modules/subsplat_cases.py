@@ -2,6 +2,7 @@
 
 from .subsplat_attention import Attention
 from .subsplat_embed import embed
+from .subsplat_precise import Precise
 from .subsplat_scene import AGG, EMBED, SPGR, Scene
 from .subsplat_spgr import Spgr, head
 
@@ -21,13 +22,13 @@ def embed_case(keys):
     return case
 
 
-def agg_case(keys):
+def agg_case(keys, views=2, contrast=1.7):
     def case(c):
-        scene = Scene(c, 2, 6, 4, lost=("outside", "behind"))
+        scene = Scene(c, views, 6, 4, lost=("outside", "behind"))
         c.notes["agg"] = keys
-        n = 2 * scene.per_view
-        maps = {level: c.drawn(f"map.{level}", (2, *MAPS[level]), -2.0, 2.0) for level in keys["levels"]}
-        z = [c.drawn(name, (n, E), -1.7, 1.7) for name in ("z_g", "z_a")]
+        n = views * scene.per_view
+        maps = {level: c.drawn(f"map.{level}", (views, *MAPS[level]), -2.0, 2.0) for level in keys["levels"]}
+        z = [c.drawn(name, (n, E), -contrast, contrast) for name in ("z_g", "z_a")]
         attention = Attention(c.g, keys, E, maps, scene.views, scene.parents, scene.per_view)
         f_g, f_a = attention.forward(*z)
         c.output("f_g", f_g)
@@ -37,7 +38,6 @@ def agg_case(keys):
 
 def head_case(form, side, lanes):
     def case(c):
-        from .subsplat_precise import Precise
         c.g = Precise(c.name)
         keys = {**SPGR["paper"], "head": form, "hidden": 12}
         c.notes = {"spgr": keys, "side": side, "dim": E, "lanes": lanes}
@@ -103,6 +103,9 @@ CASES = {f"sub_embed_{name}": embed_case(keys) for name, keys in EMBED.items()}
 CASES["sub_embed_view0"] = embed_case({**EMBED["tuned"], "mlp": "pg", "anchor_frame": "view0", "scale": "raw"})
 CASES["sub_embed_lite_raw"] = embed_case({**EMBED["paper"], "mlp": "lite", "scale": "log_px"})
 CASES |= {f"sub_agg_{name}": agg_case(keys) for name, keys in AGGREGATIONS.items()}
+CASES["sub_agg_three_views"] = agg_case(AGG["paper"] | ONE | {"op": "linear", "levels": ["cnn2", "trans4"]}, 3)
+# Queries so faint that the LayerNorm's epsilon counts.
+CASES["sub_agg_faint"] = agg_case(AGG["tuned"] | ONE | {"residual": "none", "occlusion_gate": False}, 2, 0.005)
 CASES |= {f"sub_head_{form}": head_case(form, 2, 9) for form in ("mlp2", "pg", "coord")}
 CASES |= {"sub_head_coord_4": head_case("coord", 4, 2), "sub_head_mlp2_3": head_case("mlp2", 3, 2)}
 CASES |= {f"sub_spgr_{name}": spgr_case(keys, 2) for name, keys in SPGRS.items()}

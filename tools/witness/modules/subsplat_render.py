@@ -129,13 +129,14 @@ def rectangle(g, view, means2d, half, tiles):
     return g.concat([first, past], 1)
 
 
-def ewa_case(convention, lowpass=0.3, antialiased=False):
+def ewa_case(convention, lowpass=0.3, antialiased=False, size=0.25):
     def case(c):
-        # Parents of two views of 6 x 5 px, seen by view 0 as a picture of 72 x 60 px, a quarter of their size.
-        scene = Scene(c, 2, 6, 5, lost=("outside", "behind"))
+        # Parents of two views of 6 x 5 px, seen by view 0 as a picture of 72 x 60 px, `size` times as large.
+        scene = Scene(c, 2, 6, 5, lost=("outside", "behind", "round"))
         c.notes |= {"convention": convention, "lowpass": lowpass, "antialiased": antialiased, "picture": [72, 60]}
+        c.notes["scale"] = size
         view = geo.View(c.g, scene.poses[0], scene.lenses[0], (72, 60))
-        splats = scene.parents | {"scales": scene.parents["scales"] * 0.25}
+        splats = scene.parents | {"scales": scene.parents["scales"] * size}
         # Standard: world units; some parents stand nearer.
         near = scene.near[:1] * (1.0 if convention == "mvsplat" else 2.0)
         for name, value in project(c.g, view, near[0], splats, convention, lowpass, antialiased).items():
@@ -148,4 +149,6 @@ CASES = {
     "sub_ewa_standard": ewa_case("standard"),
     "sub_ewa_antialiased": ewa_case("standard", 1.2, True),
     "sub_ewa_mvsplat": ewa_case("mvsplat"),
+    "sub_ewa_standard_large": ewa_case("standard", size=2.0),
+    "sub_ewa_mvsplat_large": ewa_case("mvsplat", size=2.0),
 }

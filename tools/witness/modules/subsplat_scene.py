@@ -32,7 +32,8 @@ class Scene:
     """V views of width x height px, one parent per pixel, built in double precision into the case.
 
     `lost` lists what goes astray: "outside" puts parent 1 outside every picture, "behind" parent 2 behind every
-    camera."""
+    camera, "round" makes parents 8 to 23 round, opaque and
+    0.24 px wide, and puts 24 to 29 a little outside the picture."""
 
     def __init__(self, c, views=2, width=6, height=4, lost=()):
         c.g = Precise(c.name)
@@ -71,6 +72,9 @@ def parents(seed, poses, intrinsics, width, height, lost):
         at = np.array([column + 0.1 + 0.8 * u[i, 0], row + 0.1 + 0.8 * u[i, 1]])
         if "outside" in lost and i == 1:
             at = np.array([-4.0 * width, 0.5 * height])
+        if "round" in lost and 24 <= i < 30:
+            away = np.array([[-0.8, 2], [6.8, 1], [3, -0.65], [2, 5.65], [-1.5, 4], [7.5, 3]])[i - 24]
+            at = away / np.array([6, 5]) * np.array([width, height])
         if "behind" in lost and i == 2:
             z = -z
         in_camera = np.array([(at[0] - cx) / fx, (at[1] - cy) / fy, 1.0]) * z
@@ -81,6 +85,8 @@ def parents(seed, poses, intrinsics, width, height, lost):
         out["quats"].append(q if q[0] >= 0 else -q)
         px = 0.2 * (2.5 / 0.2) ** u[i, 7:10]
         px = px * {5: 0.002}.get(i, 1.0) * (np.array([20.0, 0.02, 0.02]) if i == 6 else 1.0)
+        if "round" in lost and 8 <= i < 24:
+            px, u[i, 10] = np.full(3, 0.24), 0.98
         out["scales"].append(px * abs(z) / fx)
         out["opacities"].append([{3: 0.99996, 4: 0.0011}.get(i, 0.02 + 0.96 * u[i, 10])])
     return {name: np.array(rows, np.float32) for name, rows in out.items()}
