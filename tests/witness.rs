@@ -81,7 +81,8 @@ fn transformer_plain_shifted_and_with_three_views() -> Result<()> {
 
 #[test]
 fn plane_sweep() -> Result<()> {
-    for (name, height, width) in [("sweep", 48, 64), ("sweep3", 40, 48)] {
+    let cases = [("sweep", 48, 64), ("sweep3", 40, 48), ("sweep_close", 48, 64)];
+    for (name, height, width) in cases {
         let golden = Golden::load(name);
         let features = golden.input("features");
         let (cameras, near_far) = golden.cameras(width, height);

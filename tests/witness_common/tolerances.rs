@@ -31,6 +31,8 @@ const BACKBONE: &[Row] = &[
         2e-5,
         "sampling positions carry 1e-6 px of noise, features differ by 4 a pixel",
     ),
+    ("sweep_close.disparities", 5e-7, "three operations"),
+    ("sweep_close.correlation", 4e-5, "as sweep; a small z magnifies the noise of positions"),
     ("unet_dim.out", 1e-5, "as unet"),
     ("unet.out", 1e-5, "some twenty convolutions with norms, attention"),
     (

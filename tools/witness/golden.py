@@ -51,19 +51,19 @@ class Case:
         self.asides[name] = np.ascontiguousarray(array, dtype=np.float32)
         return self.asides[name]
 
-    def cameras(self, views, height, width, near=1.2, far=20.0):
+    def cameras(self, views, height, width, near=1.2, far=20.0, step=(0.5, 0.0, 0.0)):
         """Poses by formula: `aside.poses` [V, 4, 4] world_from_camera, `aside.intrinsics`
         [V, 4] fx fy cx cy in px, `aside.near_far` [V, 2] (within a sixth of `near`, a quarter
         of `far`). All three differ by view; the world is turned by about half a radian
-        against every camera, the views by about a tenth against one another, with half a
-        unit between neighbours. Gives the three arrays (f32)."""
+        against every camera, the views by about a tenth against one another, with `step` (and a
+        tenth of noise) between neighbours. Gives the three arrays (f32)."""
         u = 2.0 * formula.uniform(self.seed, "cameras", 3 + 16 * views) - 1.0
         world, u = turn(0.5 * np.sign(u[:3]) + 0.2 * u[:3]), u[3:].reshape(views, 16)
         poses, intrinsics, near_far = [], [], []
         for i in range(views):
             pose = np.eye(4)
             pose[:3, :3] = world @ turn(0.1 * u[i, :3])
-            pose[:3, 3] = world @ (np.array([0.5 * i, 0.0, 0.0]) + 0.1 * u[i, 3:6]) + 0.3
+            pose[:3, 3] = world @ (i * np.array(step) + 0.1 * u[i, 3:6]) + 0.3
             poses.append(pose)
             fx, fy = width * (0.9 + 0.1 * u[i, 6]), width * (0.9 + 0.1 * u[i, 7])
             intrinsics.append([fx, fy, width * (0.5 + 0.04 * u[i, 8]), height * (0.5 + 0.04 * u[i, 9])])

@@ -4,11 +4,11 @@
 import numpy as np
 
 
-def geometry(c, views, height, width, scale=4, far=20.0):
+def geometry(c, views, height, width, scale=4, near=0.6, far=20.0, step=(0.5, 0.0, 0.0)):
     """Cameras as graph inputs. What needs a matrix inverse is computed here in f64:
     relative [V, V-1, 4, 4] (offset o: view i to view (i + o) mod V), k and k_inv
     [V, 3, 3] at 1/scale of the picture."""
-    poses, intrinsics, near_far = (a.astype(np.float64) for a in c.cameras(views, height, width, 0.6, far))
+    poses, intrinsics, near_far = (a.astype(np.float64) for a in c.cameras(views, height, width, near, far, step))
     relative = [[np.linalg.inv(poses[(i + o) % views]) @ poses[i] for o in range(1, views)] for i in range(views)]
     if views == 2:
         relative[1][0] = np.linalg.inv(relative[0][0])
@@ -49,14 +49,17 @@ def correlation(g, features, geo, disparities):
     return g.stack(volumes, 0)
 
 
-def case(views, height, width):
+def case(views, height, width, stride=5, **cameras):
     def build(c):
-        geo = geometry(c, views, height, width)
+        geo = geometry(c, views, height, width, **cameras)
         d = candidates(c.g, geo["near_far"], 24)
         features = c.drawn("features", (views, 16, height // 4, width // 4), -2.0, 2.0)
         c.output("disparities", d)
-        c.output("correlation", correlation(c.g, features, geo, d), stride=5)
+        c.output("correlation", correlation(c.g, features, geo, d), stride)
     return build
 
 
-CASES = {"sweep": case(2, 48, 64), "sweep3": case(3, 40, 48)}
+# sweep_close: the second camera stands within the first one's depth range, so that some points lie behind it and some
+# hardly before it.
+CASES = {"sweep": case(2, 48, 64), "sweep3": case(3, 40, 48),
+         "sweep_close": case(2, 48, 64, stride=1, near=0.3, step=(0.02, 0.0, 0.6))}
