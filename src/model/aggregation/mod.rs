@@ -18,7 +18,7 @@ mod stage;
 use super::geometry::{Frames, ParentChunk};
 use super::mlp::{Mode, xavier};
 use super::{BackboneOutput, Primaries, Views};
-use crate::config::{Aggregation as Keys, FeatureLevel, Gate, Points};
+use crate::config::{Aggregation as Keys, FeatureLevel, Gate, MaskMode, Points};
 use crate::ops::attention_gather::{Level, occlusion_gate};
 use candle_core::{Result, Tensor, bail};
 use candle_nn::{Linear, Module, VarBuilder};
@@ -189,7 +189,16 @@ impl Aggregation {
         };
         let (centres, z) = frames.project(&parents.means.unsqueeze(1)?, self.keys.mask)?;
         let occlusion = match &prepared.depths {
-            Some(depths) => Some(occlusion_gate(&centres.squeeze(2)?, &z.squeeze(2)?, depths)?),
+            Some(depths) => {
+                let at = match self.keys.mask {
+                    MaskMode::Renorm => centres.clone(),
+                    // Clamped, a parent beside the picture would be judged by its edge.
+                    MaskMode::PgClamp => {
+                        frames.project(&parents.means.unsqueeze(1)?, MaskMode::Renorm)?.0
+                    }
+                };
+                Some(occlusion_gate(&at.squeeze(2)?, &z.squeeze(2)?, depths)?)
+            }
             None => None,
         };
         let levels = &prepared.levels;

@@ -1,0 +1,11 @@
+"""Cases by name. A file of this folder with a dictionary CASES {name: function(case)}
+is found by itself."""
+
+import importlib
+import pkgutil
+
+CASES = {}
+for _, _name, _ in sorted(pkgutil.iter_modules(__path__), key=lambda m: m.name):
+    _found = getattr(importlib.import_module(f"{__name__}.{_name}"), "CASES", {})
+    assert not set(_found) & set(CASES), _name
+    CASES |= _found

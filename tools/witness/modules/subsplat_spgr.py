@@ -1,0 +1,216 @@
+"""Heads and sub-pixel reparameterization (paper 3.2, supp. A.3; spec 2), every quantity by its definition: positions
+by un-projection, areas as sqrt det(J Sigma J^T), opacities from softmax weights."""
+
+import numpy as np
+from . import subsplat_geometry as geo
+
+GROWTH_MAX = 50.0
+ALPHA_MAX = 0.9999
+
+
+def head(g, keys, x, name, side, lanes):
+    """[N, K, lanes] from [N, E] (spec 2.1)."""
+    n, k, hidden = x.shape[0], side * side, keys["hidden"]
+    if keys["head"] == "mlp2":
+        h = g.gelu(g.linear(g.layer_norm(x, f"{name}.norm"), f"{name}.lin0", hidden))
+        return g.linear(h, f"{name}.lin1", k * lanes).reshape(n, k, lanes)
+    if keys["head"] == "pg":
+        for i in range(2):
+            x = g.relu(g.linear(x, f"{name}.lin{2 * i}", hidden))
+            x = g.layer_norm(g.relu(g.linear(x, f"{name}.lin{2 * i + 1}", hidden)), f"{name}.ln{i}")
+        return g.linear(x, f"{name}.lin4", k * lanes).reshape(n, k, lanes)
+    # coord: hid_k = GELU(W x + c_k), o_k = W' hid_k, c_k = MLP(posenc(g_k)).
+    x = g.linear(g.layer_norm(x, f"{name}.norm"), f"{name}.lin0", hidden)
+    c = g.linear(g.gelu(g.linear(g.const(posenc(side)), f"{name}.pos0", hidden)), f"{name}.pos1", hidden)
+    return g.linear(g.gelu(x[:, None] + c), f"{name}.lin1", lanes)
+
+
+def places(side):
+    """[K, 2]: centres of the sub-pixels in input px from the pixel's centre, row-major (spec 2.2)."""
+    return np.array([[(j + 0.5) / side - 0.5, (i + 0.5) / side - 0.5] for i in range(side) for j in range(side)])
+
+
+def posenc(side):
+    """[K, 18]: x, y, then per octave 2^o pi: sin x, cos x, sin y, cos y."""
+    p = places(side)
+    waves = [f(np.pi * 2.0**o * p[:, i]) for o in range(4) for i in range(2) for f in (np.sin, np.cos)]
+    return np.stack([p[:, 0], p[:, 1]] + waves, 1)
+
+
+def heads(g, keys, geo_in, app_in, side, name="subsplat"):
+    """Records [N, K, 11]: (du, dv, dz, dlog s (3), dr (3), l, gamma~)."""
+    return g.concat([head(g, keys, geo_in, f"{name}.geo", side, 9), head(g, keys, app_in, f"{name}.app", side, 2)], 2)
+
+
+def a_min(keys, side):
+    """Target px^2 (spec 2.6): a number, or one of over_k, off, {target_px: a}, {input_px: a}."""
+    rule, k = keys["a_min"], side * side
+    if rule == "over_k":
+        return 1.0 / k if k > 1 else 0.0
+    if rule == "off":
+        return 0.0
+    (unit, value), = rule.items()
+    return value * (k if unit == "input_px" else 1.0)
+
+
+def lambda_s(keys, side):
+    (rule, value), = keys["lambda_s"].items()
+    return value / side if rule == "over_sqrt_k" else value
+
+
+class Primary:
+    """Every parent's primary view v*, looked up: rotation [N, 3, 3], camera point [N, 3] and so on."""
+
+    def __init__(self, g, keys, views, near, parents, per_view):
+        n, means = parents["means"].shape[0], parents["means"]
+        index = g.const(np.arange(n) // per_view, np.int64)
+        if keys["primary_view"] == "nearest_visible":
+            costs = []
+            for view in views:
+                p = view.to_camera(means)
+                costs.append(g.where(geo.seen(p[:, 2], view.positions(p)), p[:, 2], 1e30))
+            cost = g.stack(costs, 1)
+            best = g.op("ArgMin", [cost], (n,), "int64", axis=1, keepdims=0)
+            index = g.where(cost.min(1) < 1e29, best, index)
+        table = lambda rows: g.gather(g.stack(rows, 0), index)
+        self.rotation = table([v.rotation for v in views])
+        self.focal = table([v.focal for v in views])
+        self.z_min = g.maximum(table([near[i:i + 1] * 0.01 for i in range(len(views))]), 1e-3)
+        eye = table([v.position for v in views])
+        self.in_camera = (self.w2c() @ (means - eye)[..., None])[..., 0]
+        # 0.3 tan(fov/2) beyond each edge, tan(fov/2) as half the picture over f.
+        edge = lambda v, at: (v.size * at - v.centre) / v.focal
+        margin = lambda v: (v.size * 0.15) / v.focal
+        self.low = table([edge(v, 0.0) - margin(v) for v in views])
+        self.high = table([edge(v, 1.0) + margin(v) for v in views])
+
+    def w2c(self):
+        return self.rotation.transpose(0, 2, 1)
+
+
+class Spgr:
+    """keys: the `spgr` section; near: [V]; lowpass: (target px^2, input px^2)."""
+
+    def __init__(self, g, keys, side, views, near, parents, per_view, lowpass=(0.3, 0.3)):
+        self.g, self.keys, self.side, self.k = g, keys, side, side * side
+        self.parents, self.lowpass, self.n = parents, lowpass, parents["means"].shape[0]
+        self.view = Primary(g, keys, views, near, parents, per_view)
+        self.z = g.maximum(self.view.in_camera[:, 2:], self.view.z_min)
+
+    def forward(self, record):
+        """Children of records [N, K, 11], child k of parent n in row n K + k: `steps` [N K, 3] from the parent's mean,
+        `quats` [N K, 4] wxyz, `log_scales` [N K, 3], `opacities` [N K], `gain` [N K] or [N K, 4]."""
+        g, keys = self.g, self.keys
+        in_camera = self.place(record)
+        steps = (in_camera - self.view.in_camera[:, None]) @ self.view.w2c()
+        clamp = keys["dlog_clamp"]
+        growth = g.exp(g.tanh(record[..., 3:6] / clamp) * clamp)
+        scales = self.parents["scales"][:, None] * growth * lambda_s(keys, self.side)
+        quats = geo.unit(g, geo.product(g, self.parents["quats"][:, None], geo.exponential(g, record[..., 6:9])))
+        at = self.view.in_camera[:, None] if keys["area_at"] == "parent" else in_camera
+        m = self.footprint(at, quats, scales, self.side)
+        area, least = geo.area(g, m), a_min(keys, self.side)
+        factors = self.grow(m, area, least)
+        scales = scales * factors
+        grown = self.footprint(at, quats, scales, self.side)
+        alpha = self.opacity(record[..., 9], g.maximum(area, least), grown)
+        flat = lambda x: x.reshape(self.n * self.k, x.shape[-1])
+        extra = g.tanh(record[..., 10:]) * keys["delta"]
+        gain = (extra + 1.0).reshape(self.n * self.k)
+        if keys["gain_space"] == "rgb":
+            # gamma (1/2 + S) = gamma S + 1/2 + (gamma - 1)/2.
+            rest = g.broadcast(flat(extra) * 0.5, (self.n * self.k, 3))
+            gain = g.concat([gain[:, None], rest], 1)
+        return {"steps": flat(steps), "quats": flat(quats), "log_scales": g.log(flat(scales)),
+                "opacities": alpha.reshape(self.n * self.k), "gain": gain}
+
+    def place(self, record):
+        """Camera points of the children [N, K, 3] (spec 2.4)."""
+        g, keys, c, z = self.g, self.keys, self.view.in_camera[:, None], self.z[:, None]
+        learned = record[..., :2]
+        if keys["offset_bound"] is not None:
+            learned = g.tanh(learned) * keys["offset_bound"]
+        delta = learned / self.side + places(self.side)
+        lateral = delta / self.view.focal[:, None] * z
+        flat = g.concat([c[..., :2] + lateral, g.broadcast(c[..., 2:], (self.n, self.k, 1))], 2)
+        moved = self.slid(flat, delta) if keys["slide"] == "disc" else flat
+        depth = g.tanh(record[..., 2:3]) * keys["beta_z"]
+        if keys["depth_unit"] == "relative":
+            depth = depth * z
+        # z + dz >= 0.1 z.
+        target = g.maximum(moved[..., 2:] + depth, moved[..., 2:] * 0.0 + 0.1 * z)
+        if keys["depth_dir"] == "ray":
+            return moved / moved[..., 2:] * target
+        return g.concat([moved[..., :2], target], 2)
+
+    def slid(self, flat, delta):
+        """Along the disc: Sigma J^T (J Sigma J^T)^-1 delta; mixed with the flat step so that z moves at most a tenth."""
+        g, c = self.g, self.view.in_camera
+        rotation = geo.matrix(g, geo.unit(g, self.parents["quats"]))
+        axes = self.view.w2c() @ rotation * self.parents["scales"][:, None]
+        sigma = geo.gram(g, axes)
+        free = np.full((1, 2), 1e9)
+        j = geo.jacobian(g, c, self.view.focal, self.view.z_min, -free, free)
+        s = j @ sigma @ j.transpose(0, 2, 1)
+        a, b, d, det = s[:, 0, 0], s[:, 0, 1], s[:, 1, 1], geo.det2(s)
+        inverse = g.stack([g.stack([d, -b], -1), g.stack([-b, a], -1)], -2) / det[:, None, None]
+        steps = sigma @ j.transpose(0, 2, 1) @ inverse
+        along = delta @ steps.transpose(0, 2, 1) + c[:, None]
+        reach, tenth = g.abs(along[..., 2:] - c[:, None, 2:]), 0.1 * self.z[:, None]
+        share = g.where(reach > tenth, tenth / reach, 1.0)
+        return flat * (1.0 - share) + along * share
+
+    def footprint(self, at, quats, scales, zoom):
+        """M = J R_w2c R(q) S [.., 2, 3] at camera points `at`, px of a picture `zoom` times the input."""
+        g, view = self.g, self.view
+        low, high, z_min = view.low[:, None], view.high[:, None], view.z_min[:, None]
+        j = geo.jacobian(g, at, view.focal[:, None] * float(zoom), z_min, low, high)
+        return j @ view.w2c()[:, None] @ geo.matrix(g, quats) * scales[..., None, :]
+
+    def grow(self, m, area, least):
+        """Factors [N, K, 3] of sigma (spec 2.6)."""
+        g = self.g
+        small = area[..., None] < least
+        if self.keys["a_min_mode"] == "iso":
+            c = g.minimum(g.sqrt(least / area[..., None]), GROWTH_MAX)
+            return g.broadcast(g.where(small, c, 1.0), (self.n, self.k, 3))
+        lengths = (m * m).sum(2)
+        still = g.op("ArgMin", [lengths], (self.n, self.k), "int64", axis=2, keepdims=0)
+        still = g.gather(g.const(np.eye(3)), still)
+        # |m_a x m_b|^2 per pair, named by the axis left out.
+        u, v = m[:, :, 0], m[:, :, 1]
+        pairs = [(1, 2), (2, 0), (0, 1)]
+        squares = g.stack([(u[..., i] * v[..., j] - u[..., j] * v[..., i]) ** 2.0 for i, j in pairs], 2)
+        p = (squares * still).sum(2, keep=True)
+        q = (squares * (1.0 - still)).sum(2, keep=True)
+        # c^4 p + c^2 q = A_min^2.
+        c2 = (g.sqrt(q * q + 4.0 * least**2 * p) - q) / (2.0 * p)
+        c = g.minimum(g.sqrt(c2), GROWTH_MAX)
+        return g.where(small, still + (1.0 - still) * c, 1.0)
+
+    def own(self):
+        """M of the parents, input px: [N, 1, 2, 3]."""
+        quats = geo.unit(self.g, self.parents["quats"])[:, None]
+        return self.footprint(self.view.in_camera[:, None], quats, self.parents["scales"][:, None], 1)
+
+    def opacity(self, logits, area, grown):
+        """[N, K] (spec 2.7, 2.8); area: after the clamp."""
+        g, rule, alpha = self.g, self.keys["opacity"], self.parents["opacities"]
+        w = g.softmax(logits, axis=1)
+        if rule == "none":
+            return g.broadcast(alpha, (self.n, self.k))
+        if rule == "linear":
+            shared = w / (area + 1e-8)
+            return alpha * shared / shared.sum(1, keep=True)
+        capped = g.minimum(alpha, ALPHA_MAX)
+        if rule == "transmittance":
+            return 1.0 - (1.0 - capped) ** w
+        if rule == "area":
+            own = geo.area(g, self.own()) * float(self.k)
+            return g.minimum(alpha * own * w / area, 0.99)
+        tau = -g.log(1.0 - capped)
+        own = geo.blurred(g, self.own(), self.lowpass[1]) * float(self.k)
+        # A child whose growth meets GROWTH_MAX counts with A_min all the same ("A from 2.6 after the adjustment").
+        blurred, bare = geo.blurred(g, grown, self.lowpass[0]), geo.area(g, grown)
+        blurred = g.sqrt(blurred * blurred + area * area - bare * bare)
+        return 1.0 - g.exp(-(tau * w * own / blurred))
