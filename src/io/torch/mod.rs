@@ -1,10 +1,36 @@
 //! PyTorch's files (`torch.save`), read without running anything in them.
+//!
+//! A `.ckpt`, `.pt` or `.pth` file is a pickle, a program for a machine that can call any
+//! function by name, and the tensors' bytes. Here the machine is our own
+//! ([`pickle`]) and knows data only: tensors, parameters and plain containers are
+//! understood, every other name gives [`Value::Opaque`] and what it would have been made
+//! from is forgotten. So the callbacks and optimizer states of a Lightning checkpoint do
+//! no harm, and whoever needs a tensor refuses an opaque value in its place by name.
+//!
+//! Two forms, told apart by content: the zip archive of torch 1.6 ([`zip`]; why the
+//! directory reader is our own stands there) and the older one ([`legacy`]). A file is
+//! read by ranges: the pickle, then each tensor when it is asked for. A hostile file
+//! costs at most the limits of the pickle ([`pickle::MAX_PICKLE`],
+//! [`pickle::MAX_VALUES`]), a few hundred megabytes, and one error.
+//!
+//! Refused by name: big-endian files, TorchScript archives, the tar form, deflated or
+//! encrypted entries; opaque, so refused where a tensor is wanted: complex, quantized,
+//! sparse, meta and 8-bit float tensors, and views with negation or conjugation pending.
 
+mod foreign;
+mod globals;
+mod legacy;
+mod pickle;
+mod read;
+mod source;
+mod tree;
 mod value;
+mod zip;
 
 pub use value::{StorageRef, TensorRef, TorchDtype, Value};
 
 use super::{Error, Result};
+use source::{Source, Stream};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -29,6 +55,7 @@ pub struct TorchFile {
     form: Form,
     root: Value,
     opaque: BTreeSet<String>,
+    source: Source,
 }
 
 impl TorchFile {
@@ -38,7 +65,7 @@ impl TorchFile {
     /// Missing, not a file of `torch.save` (the message says what it is instead),
     /// truncated, a tensor that does not lie in its storage, more values than the limits.
     pub fn open(path: &Path) -> Result<Self> {
-        Err(Error::format(path, "a reader", "none"))
+        Self::from_source(Source::open(path)?, path)
     }
 
     /// [`TorchFile::open`] of bytes in memory; `name` stands in messages.
@@ -46,8 +73,30 @@ impl TorchFile {
     /// # Errors
     /// As [`TorchFile::open`].
     pub fn parse(bytes: impl Into<Arc<[u8]>>, name: &Path) -> Result<Self> {
-        let _: Arc<[u8]> = bytes.into();
-        Err(Error::format(name, "a reader", "none"))
+        Self::from_source(Source::Memory(bytes.into()), name)
+    }
+
+    fn from_source(source: Source, path: &Path) -> Result<Self> {
+        let length = source.len();
+        let head = source.bytes(0, length.min(foreign::HEAD), path)?;
+        let (form, pickle, root) = if head.starts_with(b"PK\x03\x04") {
+            let archive = zip::Archive::open(&source, path)?;
+            let pickle = archived(&archive, &source, path)?;
+            let place = |key: &str| {
+                archive.get(&format!("data/{key}")).map(|e| (e.at, e.bytes, Some(e.crc)))
+            };
+            let root = tree::Builder::new(path, &pickle, &place).root()?;
+            (Form::Zip, pickle, root)
+        } else if legacy::starts(&head) {
+            let (pickle, places) = legacy::open(&source, path)?;
+            let place = |key: &str| places.get(key).copied();
+            let root = tree::Builder::new(path, &pickle, &place).root()?;
+            (Form::Legacy, pickle, root)
+        } else {
+            let got = foreign::name(&head, length);
+            return Err(Error::format(path, "a file of torch.save", got));
+        };
+        Ok(Self { path: path.to_owned(), form, root, opaque: pickle.opaque, source })
     }
 
     /// Name of the file, for messages.
@@ -72,13 +121,39 @@ impl TorchFile {
     }
 
     /// Elements of a tensor of this file, contiguous and little-endian, in the order of
-    /// its shape.
+    /// its shape. Memory: the elements, and for a view with gaps at most four times them
+    /// or 16 MiB, whichever is more.
     ///
     /// # Errors
-    /// The file has become shorter, or unreadable; an expanded tensor (stride 0) of more
-    /// than 64 MiB beyond its storage.
+    /// The file has become shorter, or unreadable; a whole storage that does not have the
+    /// archive's checksum; an expanded tensor (stride 0) of more than 64 MiB beyond its
+    /// storage.
     pub fn read(&self, t: &TensorRef) -> Result<Vec<u8>> {
-        let _ = t;
-        Err(Error::format(&self.path, "a reader", "none"))
+        read::read(&self.source, &self.path, t)
     }
+}
+
+/// The pickle of an archive, which must be little-endian.
+fn archived(archive: &zip::Archive, source: &Source, path: &Path) -> Result<pickle::Pickle> {
+    if let Some(order) = archive.get("byteorder") {
+        let order = source.bytes(order.at, order.bytes.min(16), path)?;
+        if order != b"little" {
+            let got = format!("byte order `{}`", shown(&String::from_utf8_lossy(&order)));
+            return Err(Error::format(path, "little-endian storages", got));
+        }
+    }
+    let Some(entry) = archive.get("data.pkl") else {
+        return Err(Error::format(path, "data.pkl in the archive", "none"));
+    };
+    let end = entry.at + entry.bytes;
+    pickle::run(&mut Stream::new(source, path, entry.at, end, pickle::MAX_PICKLE))
+}
+
+/// A name of the file as messages show it: on one line, and cut where it is long.
+fn shown(text: &str) -> String {
+    let mut shown: String = text.chars().take(120).flat_map(char::escape_debug).collect();
+    if text.chars().nth(120).is_some() {
+        shown.push('…');
+    }
+    shown
 }
