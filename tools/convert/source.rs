@@ -3,6 +3,7 @@
 
 use crate::numbers::Float;
 use anyhow::{Context, Result, bail};
+use safetensors::Dtype;
 use sha2::{Digest, Sha256};
 use std::collections::BTreeSet;
 use std::io::Read;
@@ -102,7 +103,7 @@ impl Source {
         let entry = |TensorSpec { name, dtype, shape }: TensorSpec| {
             let content = match Float::from_dtype(dtype) {
                 Some(dtype) => Content::Floats { dtype, shape, place: Place::Named },
-                None => Content::Integers(format!("a {dtype:?} tensor of shape {shape:?}")),
+                None => not_floats(dtype, &shape),
             };
             Entry { name, content }
         };
@@ -164,6 +165,15 @@ fn entry((key, value): (&Value, &Value)) -> Entry {
     };
     let name = key.as_str().map_or_else(|| format!("({} as key)", key.kind()), str::to_owned);
     Entry { name, content }
+}
+
+fn not_floats(dtype: Dtype, shape: &[usize]) -> Content {
+    let what = format!("a {dtype:?} tensor of shape {shape:?}");
+    match dtype {
+        Dtype::BOOL | Dtype::U8 | Dtype::I8 | Dtype::U16 | Dtype::I16 => Content::Integers(what),
+        Dtype::U32 | Dtype::I32 | Dtype::U64 | Dtype::I64 => Content::Integers(what),
+        _ => Content::Other(what),
+    }
 }
 
 fn float(dtype: TorchDtype) -> Option<Float> {
