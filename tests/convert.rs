@@ -1,12 +1,15 @@
 //! `subsplat-convert` from outside: checkpoints in, weights out, number for number.
 
+#[path = "common/checkpoints.rs"]
+mod checkpoints;
 mod common;
 #[path = "common/program.rs"]
 #[allow(dead_code, reason = "its scene is for the other program")]
 mod program;
-#[path = "common/torch_zip.rs"]
-mod torch_zip;
+#[path = "common/torch_writer.rs"]
+mod torch_writer;
 
+use checkpoints::{Item, floats, saved};
 use common::shared;
 use half::{bf16, f16};
 use program::{Called, called};
@@ -20,7 +23,6 @@ use subsplat::io::tensors::{TensorFile, TensorSpec, write_tensors};
 use subsplat::model::lpips::Lpips;
 use subsplat::model::subsplat::SubSplat;
 use subsplat::model::weights::{Weights, read_tensors, save};
-use torch_zip::{Item, floats, saved};
 
 /// Name to shape and elements.
 type Content = BTreeMap<String, (Vec<usize>, Vec<u8>)>;
@@ -54,7 +56,7 @@ fn items<'a>(
     tensors: impl IntoIterator<Item = (&'a String, &'a (Vec<usize>, Vec<u8>))>,
 ) -> Vec<(String, Item)> {
     let item = |(name, (shape, bytes)): (&String, &(Vec<usize>, Vec<u8>))| {
-        (name.clone(), Item::Tensor("FloatStorage", shape.clone(), bytes.clone()))
+        (name.clone(), Item::Tensor("torch FloatStorage", shape.clone(), bytes.clone()))
     };
     tensors.into_iter().map(item).collect()
 }
@@ -74,7 +76,7 @@ fn lightning(weights: Vec<(String, Item)>, states: usize) -> Item {
         ),
     ]);
     let callback = Item::Dict(vec![
-        ("dirpath".into(), Item::Object("pathlib", "PosixPath")),
+        ("dirpath".into(), Item::Object("pathlib PosixPath")),
         ("best_model_score".into(), Item::None),
     ]);
     Item::Dict(vec![
@@ -362,10 +364,13 @@ fn bad_input_gets_one_clear_error() {
     put("nan.pt", &changed(first, of(f32::NAN)));
     put("big.pt", &changed(first, of(1e5)));
     put("shape.pt", &changed(first, floats(&[64, 1], &[0.5; 64])));
-    put("int.pt", &changed(first, Item::Tensor("LongStorage", vec![1, 64, 1, 1], vec![0; 512])));
-    put("object.pt", &changed(first, Item::Object("os", "system")));
+    put(
+        "int.pt",
+        &changed(first, Item::Tensor("torch LongStorage", vec![1, 64, 1, 1], vec![0; 512])),
+    );
+    put("object.pt", &changed(first, Item::Object("os system")));
     put("extra.pt", &changed("head.weight", floats(&[1], &[0.0])));
-    put("module.pt", &Item::Object("torchvision.models.vgg", "VGG"));
+    put("module.pt", &Item::Object("torchvision.models.vgg VGG"));
     put("other.pt", &changed(first, of(0.0)));
     put("foreign.pt", &Item::StateDict(vec![("fc.weight".into(), floats(&[1], &[0.0]))]));
     put("list.pt", &Item::List(vec![floats(&[1], &[0.0])]));
@@ -436,7 +441,7 @@ fn what_is_left_out_is_told() {
     let place = folder.path();
     let mut tensors = small();
     tensors.push(("head.weight".into(), floats(&[1], &[f32::NAN])));
-    tensors.push(("tracked".into(), Item::Tensor("LongStorage", vec![], vec![0; 8])));
+    tensors.push(("tracked".into(), Item::Tensor("torch LongStorage", vec![], vec![0; 8])));
     tensors.push(("version".into(), Item::Text("3".into())));
     std::fs::write(place.join("extra.pt"), saved(&Item::StateDict(tensors))).unwrap();
     let report = converted(place, "extra.pt w.safetensors --allow-missing");

@@ -120,10 +120,14 @@ impl Lpips {
 }
 
 /// Largest of each 2×2 pixels; an odd row or column at the end is left out, as in
-/// PyTorch. (It is cut off first: candle's pooling has no gradient with it.)
+/// PyTorch. (Candle's own pooling hands back a quarter of the gradient.)
 fn halved(x: &Tensor) -> Result<Tensor> {
-    let (_, _, h, w) = x.dims4()?;
-    x.narrow(2, 0, h / 2 * 2)?.narrow(3, 0, w / 2 * 2)?.contiguous()?.max_pool2d(2)
+    let (n, c, h, w) = x.dims4()?;
+    let (h, w) = (h / 2, w / 2);
+    let larger = |pairs: Tensor| pairs.narrow(2, 0, 1)?.maximum(&pairs.narrow(2, 1, 1)?);
+    let even = x.narrow(2, 0, 2 * h)?.narrow(3, 0, 2 * w)?.contiguous()?;
+    let rows = larger(even.reshape((n * c, h, 2, 2 * w))?)?;
+    larger(rows.reshape((n * c * h, w, 2))?)?.reshape((n, c, h, w))
 }
 
 /// Divided by the length over the channels.
