@@ -34,8 +34,19 @@ const UNDERSTOOD: &[&str] = &[
 
 /// Python's own types, of `builtins` (and `__builtin__`, protocol 2's name for it).
 const BUILTINS: &[&str] = &[
-    "set", "frozenset", "list", "dict", "tuple", "bytearray", "bytes", "int", "long", "float",
-    "bool", "str", "object",
+    "set",
+    "frozenset",
+    "list",
+    "dict",
+    "tuple",
+    "bytearray",
+    "bytes",
+    "int",
+    "long",
+    "float",
+    "bool",
+    "str",
+    "object",
 ];
 
 fn builtin(name: &str) -> Option<&str> {
@@ -181,7 +192,9 @@ pub(super) fn call(machine: &mut Machine, callee: Id, arguments: Id) -> Result<I
 /// `OrderedDict()`, `OrderedDict([[k, v], …])`, `Counter({…})`.
 fn dictionary(machine: &mut Machine, name: &Arc<str>, arguments: &[Id]) -> Result<Id> {
     let pair = |id: &Id| match machine.node(*id) {
-        Node::List(p) | Node::Tuple(p) => p.as_slice().try_into().ok().map(|[k, v]: [Id; 2]| (k, v)),
+        Node::List(p) | Node::Tuple(p) => {
+            p.as_slice().try_into().ok().map(|[k, v]: [Id; 2]| (k, v))
+        }
         _ => None,
     };
     let pairs = match arguments.first().map(|a| machine.node(*a)) {

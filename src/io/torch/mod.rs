@@ -146,6 +146,17 @@ fn archived(archive: &zip::Archive, source: &Source, path: &Path) -> Result<pick
         return Err(Error::format(path, "data.pkl in the archive", "none"));
     };
     let end = entry.at + entry.bytes;
+    let mut sum = flate2::Crc::new();
+    let mut whole = Stream::new(source, path, entry.at, end, pickle::MAX_PICKLE);
+    while whole.left() > 0 {
+        sum.update(whole.take(whole.left().min(1 << 16) as usize)?);
+    }
+    // PyTorch writes 0 where it was told to compute none.
+    if entry.crc != 0 && entry.bytes <= pickle::MAX_PICKLE && sum.sum() != entry.crc {
+        let expected = format!("CRC-32 {:08x} of data.pkl", entry.crc);
+        let got = format!("{:08x} (a damaged file)", sum.sum());
+        return Err(Error::format(path, expected, got));
+    }
     pickle::run(&mut Stream::new(source, path, entry.at, end, pickle::MAX_PICKLE))
 }
 

@@ -353,9 +353,8 @@ impl Machine<'_, '_> {
     /// GLOBAL, STACK_GLOBAL.
     fn global(&mut self, op: u8) -> Result<()> {
         let (module, name) = if op == b'c' {
-            let line = |s: &mut Stream| {
-                s.line(MAX_NAME).map(|l| String::from_utf8_lossy(&l).into_owned())
-            };
+            let line =
+                |s: &mut Stream| s.line(MAX_NAME).map(|l| String::from_utf8_lossy(&l).into_owned());
             (line(self.stream)?, line(self.stream)?)
         } else {
             let (name, module) = (self.pop()?, self.pop()?);

@@ -2,41 +2,49 @@
 
 use super::super::{Error, Result};
 use super::source::Source;
-use super::value::TensorRef;
+use super::value::{TensorRef, extent};
 use std::path::Path;
 
 /// What an expanded tensor (stride 0) may take beyond its storage, bytes.
 const MAX_EXPANDED: u64 = 64 << 20;
 
-/// Least bytes that a gather reads of the file at a time.
+/// A view that spans no more bytes than this, or than four times its elements', is read
+/// in one piece.
 const WINDOW: u64 = 16 << 20;
+
+/// What is read at a time of one that spans more: so little that jumping back and forth
+/// costs no more than the elements' number.
+const PAGE: u64 = 4 << 10;
 
 /// Contiguous, little-endian elements of `t`.
 pub(super) fn read(source: &Source, path: &Path, t: &TensorRef) -> Result<Vec<u8>> {
     let size = t.dtype.size();
-    let count = t.shape.iter().try_fold(size, |n, s| n.checked_mul(*s));
-    let limit = t.storage.bytes.saturating_add(MAX_EXPANDED);
-    let Some(total) = count.filter(|n| *n as u64 <= limit) else {
-        let expected = format!("a tensor of at most {limit} bytes, 64 MiB over its storage's");
-        return Err(Error::format(path, expected, format!("shape {:?}, expanded", t.shape)));
-    };
-    if total == 0 {
+    if t.shape.contains(&0) {
         return Ok(Vec::new());
     }
-    let (outer, run) = runs(t);
-    // Bytes from the first element to behind the last.
-    let span = outer.iter().map(|(s, stride)| (s - 1) * stride).sum::<usize>() + run;
-    let start = t.storage.at + (t.offset * size) as u64;
-    if start.checked_add(span as u64).is_none_or(|end| end > t.storage.at + t.storage.bytes) {
+    let inside = extent(t.dtype, &t.shape, &t.strides, t.offset).filter(|e| *e <= t.storage.bytes);
+    let Some(end) = inside else {
         let got = format!("shape {:?}, strides {:?}, offset {}", t.shape, t.strides, t.offset);
         return Err(Error::format(path, "a tensor inside its storage", got));
+    };
+    // None of these overflow: `extent` took the same products.
+    let total = size * t.shape.iter().product::<usize>();
+    let limit = t.storage.bytes.saturating_add(MAX_EXPANDED);
+    if total as u64 > limit {
+        let expected = format!("a tensor of at most {limit} bytes, 64 MiB over its storage's");
+        return Err(Error::format(path, expected, format!("shape {:?}, expanded", t.shape)));
     }
+    let (outer, run) = runs(t);
+    let start = t.storage.at + (t.offset * size) as u64;
+    let end = t.storage.at + end;
     if outer.is_empty() {
         let bytes = source.bytes(start, total as u64, path)?;
         return checked(bytes, path, t);
     }
-    let window = (span as u64).min(WINDOW.max(4 * total as u64));
-    let mut gather = Gather { source, path, end: start + span as u64, window, at: 0, held: vec![] };
+    let span = end - start;
+    let whole = span <= WINDOW.max(4 * total as u64);
+    let window = if whole { span } else { PAGE };
+    let mut gather = Gather { source, path, end, window, at: 0, held: Vec::new() };
     let mut out = Vec::with_capacity(total);
     let mut index = vec![0; outer.len()];
     let mut at = start;
@@ -67,9 +75,11 @@ fn runs(t: &TensorRef) -> (Vec<(usize, usize)>, usize) {
     let mut run = size;
     let mut outer = Vec::new();
     for (s, stride) in t.shape.iter().zip(&t.strides).rev() {
+        // A dimension of one element has a stride of no meaning, and any value.
+        if *s == 1 {
+            continue;
+        }
         match stride * size {
-            // A dimension of one element has a stride of no meaning.
-            _ if *s == 1 => {}
             stride if outer.is_empty() && stride == run => run *= s,
             stride => outer.push((*s, stride)),
         }

@@ -98,6 +98,11 @@ impl<'a> Stream<'a> {
         self.next - (self.buffer.len() - self.used) as u64
     }
 
+    /// Bytes up to the end.
+    pub(super) fn left(&self) -> u64 {
+        self.end.saturating_sub(self.position())
+    }
+
     /// The next `n` bytes.
     pub(super) fn take(&mut self, n: usize) -> Result<&[u8]> {
         if self.buffer.len() - self.used < n {
@@ -109,8 +114,7 @@ impl<'a> Stream<'a> {
     }
 
     fn fill(&mut self, n: usize) -> Result<()> {
-        let position = self.position();
-        let left = self.end.saturating_sub(position);
+        let left = self.left();
         if (n as u64) > left {
             return Err(self.short(n as u64));
         }
@@ -127,7 +131,7 @@ impl<'a> Stream<'a> {
 
     fn short(&self, n: u64) -> Error {
         let position = self.position();
-        let left = self.end.saturating_sub(position);
+        let left = self.left();
         let got = match self.limited {
             true => format!("{left} up to the limit on the size of a pickle"),
             false => format!("{left} (truncated, or a length that lies)"),

@@ -3,7 +3,7 @@
 
 use super::super::{Error, Result};
 use super::pickle::{Id, Kind, MAX_VALUES, Node, Pickle, Rebuilt, Storage};
-use super::value::{StorageRef, TensorRef, Value};
+use super::value::{StorageRef, TensorRef, Value, extent};
 use super::{MAX_DEPTH, shown};
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
@@ -133,18 +133,11 @@ impl<'a> Builder<'a> {
         let storage = self.storage(&rebuilt.storage)?;
         let Rebuilt { dtype, offset, requires_grad, .. } = *rebuilt;
         let (shape, strides) = (&rebuilt.shape, &rebuilt.strides);
-        let size = dtype.size();
-        let elements = shape.iter().try_fold(size, |n, s| n.checked_mul((*s).max(1)));
-        if elements.is_none_or(|n| isize::try_from(n).is_err()) {
-            let got = format!("shape {}", list(shape));
-            return Err(self.bad("a tensor whose size in bytes fits 63 bits", got));
-        }
-        let last = shape.iter().zip(strides).try_fold(offset, |at, (s, stride)| {
-            at.checked_add(s.saturating_sub(1).checked_mul(*stride)?)
-        });
-        let end = last.and_then(|l| (l as u64).checked_add(1)?.checked_mul(size as u64));
-        let empty = shape.contains(&0);
-        if !empty && end.is_none_or(|end| end > storage.bytes) {
+        let inside = match extent(dtype, shape, strides, offset) {
+            Some(end) => end <= storage.bytes || shape.contains(&0),
+            None => false,
+        };
+        if !inside {
             let expected = format!("a tensor inside its storage of {} bytes", storage.bytes);
             let (shape, strides) = (list(shape), list(strides));
             let got = format!(
@@ -154,8 +147,7 @@ impl<'a> Builder<'a> {
             return Err(self.bad(expected, got));
         }
         let (shape, strides) = (shape.clone(), strides.clone());
-        let tensor =
-            Arc::new(TensorRef { dtype, shape, strides, offset, storage, requires_grad });
+        let tensor = Arc::new(TensorRef { dtype, shape, strides, offset, storage, requires_grad });
         self.tensors.insert(id, tensor.clone());
         Ok(tensor)
     }
@@ -175,7 +167,8 @@ impl<'a> Builder<'a> {
         let bytes = storage.elements.checked_mul(size);
         // A storage of bytes that became one of floats may end in part of a float.
         let Some(bytes) = bytes.filter(|b| *b <= there && there - b < size.max(2)) else {
-            let expected = format!("{} elements of {size} bytes in storage `{key}`", storage.elements);
+            let expected =
+                format!("{} elements of {size} bytes in storage `{key}`", storage.elements);
             return Err(self.bad(expected, format!("{there} bytes")));
         };
         if let Some((first, elements)) = storage.view {

@@ -117,6 +117,24 @@ impl TensorRef {
     }
 }
 
+/// Bytes from a storage's start to behind the last element of a view; the offset's own
+/// where there is none. `None` past 63 bits, or where the strides are not the shape's.
+pub(super) fn extent(
+    dtype: TorchDtype,
+    shape: &[usize],
+    strides: &[usize],
+    offset: usize,
+) -> Option<u64> {
+    let size = dtype.size();
+    let whole = shape.iter().try_fold(size, |n, s| n.checked_mul((*s).max(1)))?;
+    isize::try_from(whole).ok().filter(|_| shape.len() == strides.len())?;
+    let last = shape.iter().zip(strides).try_fold(offset, |at, (s, stride)| {
+        at.checked_add(s.saturating_sub(1).checked_mul(*stride)?)
+    })?;
+    let behind = last.checked_add(usize::from(!shape.contains(&0)))?.checked_mul(size)?;
+    isize::try_from(behind).ok().map(|end| end as u64)
+}
+
 /// A value of the pickle. The tree is at most [`super::MAX_DEPTH`] deep.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Value {

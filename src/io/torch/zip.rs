@@ -97,7 +97,8 @@ fn directory(source: &Source, path: &Path) -> Result<(u64, u64, u64)> {
     if let Some(locator) = locator.filter(|l| l.starts_with(b"PK\x06\x07")) {
         behind = number(locator, 8, 8);
         let record = source.bytes(behind, 56, path)?;
-        if !record.starts_with(b"PK\x06\x06") || behind.saturating_add(12).saturating_add(number(&record, 4, 8)) != end_at - 20
+        if !record.starts_with(b"PK\x06\x06")
+            || behind.saturating_add(12).saturating_add(number(&record, 4, 8)) != end_at - 20
         {
             return refuse(path, "a zip64 end record before its locator", "a locator that lies");
         }
@@ -188,7 +189,11 @@ fn checked_name(bytes: &[u8], path: &Path) -> Result<String> {
     };
     let drive = name.as_bytes().get(1) == Some(&b':');
     let odd = name.chars().any(|c| c == '\\' || c.is_control());
-    if name.is_empty() || name.starts_with('/') || drive || odd || name.split('/').any(|p| p == "..")
+    if name.is_empty()
+        || name.starts_with('/')
+        || drive
+        || odd
+        || name.split('/').any(|p| p == "..")
     {
         let got = format!("`{}`", shown(name));
         return refuse(path, "entry names that stay inside the archive", got);
