@@ -115,8 +115,9 @@ fn a_thinned_checkpoint_of_lightning() {
     assert_eq!(report["missing"].as_array().unwrap().len(), 471 - 137);
     assert_eq!(report["unexpected"].as_array().unwrap().len(), 0);
     assert_eq!(report["inputs"][0]["weights_at"], "state_dict");
-    // step, exp_avg and exp_avg_sq of Adam.
-    assert!(report["inputs"][0]["beside"]["tensors"].as_u64().unwrap() > 100, "{report}");
+    // Counted by PyTorch itself.
+    let beside = serde_json::json!({ "tensors": 16, "bytes": 468_512 });
+    assert_eq!(report["inputs"][0]["beside"], beside);
 }
 
 #[test]
@@ -140,7 +141,7 @@ fn a_whole_checkpoint_is_the_same_model() {
     if let Some(peak) = report["peak_memory_bytes"].as_u64() {
         let bytes = checkpoint.len() as u64;
         eprintln!("peak {peak} bytes for a checkpoint of {bytes}");
-        assert!(peak < 2 * bytes, "{peak} bytes for a checkpoint of {bytes}");
+        assert!(peak < bytes / 2, "{peak} bytes for a checkpoint of {bytes}");
     }
 
     let compared = called(
@@ -494,4 +495,4 @@ fn the_file_says_where_it_comes_from() {
     assert_eq!(out.metadata(Config::METADATA_KEY), None);
 }
 
-const SOURCE_SHA256: &str = "?";
+const SOURCE_SHA256: &str = "5d9131e2e498a1909a5e5196d13fe70ec0db5bb6af9494ea3ddad3a086d79fc1";

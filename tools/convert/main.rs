@@ -136,14 +136,14 @@ fn tell(answer: Answer, args: &Args, plan: &Plan, sources: &[Source], done: &Don
             "{}: {}{inside}, {}, sha256 {}",
             source.path.display(),
             source.format,
-            mebibytes(source.bytes),
+            size(source.bytes),
             source.sha256
         ));
         if source.beside.0 > 0 {
             let (n, bytes) = source.beside;
             answer.line(format!(
                 "  {n} tensors beside the weights ({}; optimizer state) were left out",
-                mebibytes(bytes)
+                size(bytes)
             ));
         }
         if !source.opaque.is_empty() {
@@ -171,8 +171,12 @@ fn tell(answer: Answer, args: &Args, plan: &Plan, sources: &[Source], done: &Don
         done.parameters,
         from.join(" and "),
         Float::from(args.dtype).name(),
-        mebibytes(done.bytes)
+        size(done.bytes)
     ));
+}
+
+fn size(bytes: u64) -> String {
+    if bytes < 1 << 20 { format!("{bytes} bytes") } else { mebibytes(bytes) }
 }
 
 fn report(args: &Args, plan: &Plan, sources: &[Source], done: &Done) -> Value {
