@@ -1,6 +1,7 @@
-//! From scenes to what the network takes: crops, depth ranges, context pairs, and
-//! procedural rooms.
+//! From scenes to what the network takes: crops, depth ranges, context pairs, chunks of
+//! pixelSplat's data sets, and procedural rooms.
 
+pub mod chunks;
 pub mod crop;
 pub mod depth;
 pub mod pair;

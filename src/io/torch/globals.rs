@@ -136,6 +136,17 @@ pub(super) fn storage(machine: &Machine, id: Id) -> Result<Storage> {
     Ok(Storage { key: key.clone(), kind, elements, view })
 }
 
+/// The class in the persistent id `("module", class, file, source)`, with which legacy
+/// files keep the source text of a saved model's classes.
+pub(super) fn module(machine: &Machine, id: Id) -> Option<Id> {
+    let Node::Tuple(parts) = machine.node(id) else { return None };
+    let [tag, class, ..] = parts.as_slice() else { return None };
+    match (machine.node(*tag), machine.node(*class)) {
+        (Node::Str(tag), Node::Global(_)) if &**tag == "module" => Some(*class),
+        _ => None,
+    }
+}
+
 /// What `callee(*arguments)` would be: data, or [`Node::Opaque`].
 pub(super) fn call(machine: &mut Machine, callee: Id, arguments: Id) -> Result<Id> {
     let name = match machine.node(callee) {

@@ -10,8 +10,8 @@
 //! Two forms, told apart by content: the zip archive of torch 1.6 ([`zip`]; why the
 //! directory reader is our own stands there) and the older one ([`legacy`]). A file is
 //! read by ranges: the pickle, then each tensor when it is asked for. A hostile file
-//! costs at most the limits of the pickle ([`pickle::MAX_PICKLE`],
-//! [`pickle::MAX_VALUES`]), a few hundred megabytes, and one error.
+//! costs at most what the limits of the pickle allow ([`pickle::MAX_PICKLE`],
+//! [`pickle::MAX_VALUES`]; some 200 MB), and one error.
 //!
 //! Refused by name: big-endian files, TorchScript archives, the tar form, deflated or
 //! encrypted entries; opaque, so refused where a tensor is wanted: complex, quantized,

@@ -19,7 +19,7 @@ pub(super) const MAX_PICKLE: u64 = 64 << 20;
 
 /// Nodes that a pickle may make, values that they may come to once what is shared is
 /// written out, and entries of the memo and the stack: each at most this.
-pub(super) const MAX_VALUES: usize = 1 << 22;
+pub(super) const MAX_VALUES: usize = 1 << 21;
 
 /// Containers that may be open at once; Python's own pickler stops near 500.
 const MAX_MARKS: usize = 10_000;
@@ -387,6 +387,9 @@ impl Machine<'_, '_> {
         }
         let made = if op == b'Q' {
             let id = self.pop()?;
+            if let Some(class) = globals::module(self, id) {
+                return self.push(class);
+            }
             let storage = Arc::new(globals::storage(self, id)?);
             let known = self.storages.entry(storage.key.clone()).or_insert(storage.clone());
             if (&known.kind, known.elements) != (&storage.kind, storage.elements) {

@@ -1,0 +1,246 @@
+//! pixelSplat's data sets, which MVSplat and its descendants train and measure with:
+//! `{root}/{train,test}/NNNNNN.torch`, each a list of examples, and `index.json` from
+//! keys to files.
+//!
+//! An example is a video: `key`, `url`, `timestamps` int64 `[N]`, `cameras` float32
+//! `[N, 18]` and `images`, N encoded pictures as 1-D uint8 tensors (JPEG; PNG for DTU).
+//! A row of `cameras` is fx, fy, cx, cy over the picture's width and height, two numbers
+//! that pixelSplat ignores, and the 3×4 matrix camera-from-world, row by row, OpenCV
+//! axes. Here it becomes the crate's `world_from_camera`.
+//!
+//! Nothing in a chunk is executed ([`crate::io::torch`]), and pictures are read one at a
+//! time: a chunk of 100 MB costs what its list of frames does.
+
+use crate::camera::{Camera, Intrinsics};
+use crate::io::image::{Rgb, parse_picture};
+use crate::io::torch::{TensorRef, TorchDtype, TorchFile, Value};
+use crate::io::{Error, Result, read};
+use glam::{DMat4, DVec4, Mat4};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// Numbers in a row of `cameras`.
+const COLUMNS: usize = 18;
+
+/// near and far that pixelSplat and MVSplat give every RealEstate10K view, world units.
+pub const NEAR_FAR: (f32, f32) = (1.0, 100.0);
+
+/// A frame's camera, whatever the size of its picture.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ChunkCamera {
+    /// fx, fy, cx, cy over the picture's width and height.
+    pub normalised: [f32; 4],
+    /// Camera to world, rigid: the inverse of the row's matrix.
+    pub world_from_camera: Mat4,
+}
+
+impl ChunkCamera {
+    /// The camera of the frame's picture of `width` × `height` pixels.
+    pub fn camera(&self, width: usize, height: usize) -> Camera {
+        let intrinsics = Intrinsics::from_normalised(self.normalised, width, height);
+        Camera { intrinsics, world_from_camera: self.world_from_camera }
+    }
+
+    /// From a row; `Err` says what is wrong with it.
+    fn from_row(row: &[f32; COLUMNS]) -> std::result::Result<Self, String> {
+        let [fx, fy, cx, cy, _, _, m @ ..] = row.map(f64::from);
+        let [a, b, c, d, e, f, g, h, i, j, k, l] = m;
+        let rows = DMat4::from_cols(
+            DVec4::new(a, b, c, d),
+            DVec4::new(e, f, g, h),
+            DVec4::new(i, j, k, l),
+            DVec4::W,
+        );
+        // NaN and infinity are left for `Camera::new` to name.
+        let pose = rows.transpose().inverse().as_mat4();
+        let normalised = [fx, fy, cx, cy].map(|v| v as f32);
+        let unit = Intrinsics::from_normalised(normalised, 1, 1);
+        let camera = Camera::new(unit, pose).map_err(|e| e.to_string())?;
+        Ok(Self { normalised, world_from_camera: camera.world_from_camera })
+    }
+}
+
+/// A video of a chunk.
+#[derive(Clone, Debug)]
+pub struct Example {
+    /// Its name in the data set.
+    pub key: String,
+    /// The video's address; empty where there is none.
+    pub url: String,
+    /// Microseconds, one a frame.
+    pub timestamps: Vec<i64>,
+    /// One a frame.
+    pub cameras: Vec<ChunkCamera>,
+    images: Vec<Arc<TensorRef>>,
+}
+
+impl Example {
+    /// Number of frames.
+    pub fn frames(&self) -> usize {
+        self.cameras.len()
+    }
+}
+
+/// An open chunk.
+#[derive(Debug)]
+pub struct Chunk {
+    file: TorchFile,
+    examples: Vec<Example>,
+}
+
+impl Chunk {
+    /// Opens `NNNNNN.torch`; reads everything but the pictures.
+    ///
+    /// # Errors
+    /// What [`TorchFile::open`] refuses; an example that lacks a part, or whose parts
+    /// disagree about the number of frames; a camera that is none.
+    pub fn open(path: &Path) -> Result<Self> {
+        Self::from_file(TorchFile::open(path)?)
+    }
+
+    /// [`Chunk::open`] of bytes in memory; `name` stands in messages.
+    ///
+    /// # Errors
+    /// As [`Chunk::open`].
+    pub fn parse(bytes: impl Into<Arc<[u8]>>, name: &Path) -> Result<Self> {
+        Self::from_file(TorchFile::parse(bytes, name)?)
+    }
+
+    fn from_file(file: TorchFile) -> Result<Self> {
+        let Value::List(rows) = file.root() else {
+            let got = file.root().kind();
+            return Err(Error::format(file.path(), "a chunk: a list of examples", got));
+        };
+        let examples = rows.iter().enumerate().map(|(i, row)| example(&file, i, row));
+        let examples = examples.collect::<Result<Vec<_>>>()?;
+        Ok(Self { file, examples })
+    }
+
+    /// The examples, in the file's order.
+    pub fn examples(&self) -> &[Example] {
+        &self.examples
+    }
+
+    /// The example of a key.
+    pub fn find(&self, key: &str) -> Option<&Example> {
+        self.examples.iter().find(|e| e.key == key)
+    }
+
+    /// Encoded picture of a frame of an example of this chunk, as the file has it.
+    ///
+    /// # Errors
+    /// No such frame; the file has changed.
+    pub fn encoded(&self, example: &Example, frame: usize) -> Result<Vec<u8>> {
+        let Some(image) = example.images.get(frame) else {
+            let expected = format!("a frame below {}", example.images.len());
+            let place = format!(" example `{}`", example.key);
+            return Err(Error::format(self.file.path(), expected, frame.to_string()).at(place));
+        };
+        self.file.read(image)
+    }
+
+    /// Decoded picture of a frame with its camera.
+    ///
+    /// # Errors
+    /// As [`Chunk::encoded`]; no picture, or a damaged one.
+    pub fn load(&self, example: &Example, frame: usize) -> Result<(Rgb, Camera)> {
+        let bytes = self.encoded(example, frame)?;
+        let picture = parse_picture(&bytes, self.file.path())
+            .map_err(|e| e.at(format!(" example `{}` frame {frame}", example.key)))?;
+        let Some(camera) = example.cameras.get(frame) else {
+            return Err(Error::format(self.file.path(), "a camera for each picture", "none"));
+        };
+        let camera = camera.camera(picture.width, picture.height);
+        Ok((picture, camera))
+    }
+}
+
+/// Example `i` of the file.
+fn example(file: &TorchFile, i: usize, row: &Value) -> Result<Example> {
+    let key = row.get("key").and_then(Value::as_str);
+    let place = match key {
+        Some(key) => format!(" example `{}`", key.escape_debug()),
+        None => format!(" example {i}"),
+    };
+    let bad =
+        |expected: String, got: String| Error::format(file.path(), expected, got).at(place.clone());
+    let part = |name: &str| {
+        row.get(name).ok_or_else(|| {
+            let expected = "a dictionary of key, url, timestamps, cameras and images".to_owned();
+            bad(expected, format!("{} without `{name}`", row.kind()))
+        })
+    };
+    let Some(key) = part("key")?.as_str() else {
+        return Err(bad("a text as `key`".to_owned(), part("key")?.kind()));
+    };
+    let table = |name: &str, dtype: TorchDtype, columns: Option<usize>| -> Result<Vec<u8>> {
+        let value = part(name)?;
+        let fits = |t: &&TensorRef| match (t.shape.as_slice(), columns) {
+            ([_], None) => t.dtype == dtype,
+            ([_, c], Some(columns)) => t.dtype == dtype && *c == columns,
+            _ => false,
+        };
+        match value.as_tensor().filter(fits) {
+            Some(t) => file.read(t),
+            None => {
+                let columns = columns.map_or(String::new(), |c| format!(", {c}"));
+                let expected = format!("`{name}` as {} [frames{columns}]", dtype.name());
+                Err(bad(expected, value.kind()))
+            }
+        }
+    };
+    let timestamps = table("timestamps", TorchDtype::I64, None)?;
+    let timestamps: Vec<i64> =
+        timestamps.as_chunks::<8>().0.iter().map(|b| i64::from_le_bytes(*b)).collect();
+    let rows = table("cameras", TorchDtype::F32, Some(COLUMNS))?;
+    let numbers: Vec<f32> =
+        rows.as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
+    let cameras = numbers.as_chunks::<COLUMNS>().0.iter().enumerate().map(|(frame, row)| {
+        ChunkCamera::from_row(row).map_err(|e| {
+            let place = format!("{place} frame {frame}");
+            Error::format(file.path(), "a row of `cameras` with a rigid pose", e).at(place)
+        })
+    });
+    let cameras = cameras.collect::<Result<Vec<_>>>()?;
+    let images = pictures(part("images")?).map_err(|got| {
+        bad("`images`, a list of encoded pictures (1-D uint8 tensors)".to_owned(), got)
+    })?;
+    if timestamps.len() != cameras.len() || images.len() != cameras.len() {
+        let got = format!("{}, {} and {}", timestamps.len(), cameras.len(), images.len());
+        return Err(bad("as many timestamps as cameras and images".to_owned(), got));
+    }
+    let url = row.get("url").and_then(Value::as_str).unwrap_or_default().to_owned();
+    Ok(Example { key: key.to_owned(), url, timestamps, cameras, images })
+}
+
+/// The pictures' tensors, or what came instead.
+fn pictures(value: &Value) -> std::result::Result<Vec<Arc<TensorRef>>, String> {
+    let Value::List(items) = value else { return Err(value.kind()) };
+    let picture = |(i, item): (usize, &Value)| match item {
+        Value::Tensor(t) if t.dtype == TorchDtype::U8 && t.shape.len() == 1 => Ok(t.clone()),
+        other => Err(format!("{} as picture {i}", other.kind())),
+    };
+    items.iter().enumerate().map(picture).collect()
+}
+
+/// `index.json` of a folder of chunks: the file of each key.
+///
+/// # Errors
+/// Missing, not an object of texts, a file name that leaves the folder.
+pub fn load_index(folder: &Path) -> Result<BTreeMap<String, PathBuf>> {
+    let path = folder.join("index.json");
+    let names: BTreeMap<String, String> = serde_json::from_slice(&read(&path)?).map_err(|e| {
+        Error::format(&path, "an object from keys to names of chunks", e.to_string())
+    })?;
+    let inside = |(key, name): (String, String)| {
+        let plain = Path::new(&name).file_name().is_some_and(|n| n == name.as_str());
+        if !plain || name.contains('\\') {
+            let got = format!("`{}`", name.escape_debug());
+            return Err(Error::format(&path, "names of files in the index's folder", got));
+        }
+        let file = folder.join(name);
+        Ok((key, file))
+    };
+    names.into_iter().map(inside).collect()
+}
