@@ -32,7 +32,7 @@
 //! [`config::Config`]; [`ops`] are the same kernels as candle ops. Every geometric
 //! convention is said once, in [`camera`].
 //!
-//! Features: `cli` (default) builds the program `subsplat`.
+//! Features: `cli` (default) builds the programs `subsplat` and `subsplat-convert`.
 
 pub mod abi;
 pub mod camera;

@@ -29,6 +29,7 @@ pub mod protocol;
 pub mod re10k;
 pub mod resize;
 pub mod scene;
+pub mod tensors;
 pub mod torch;
 pub mod transforms;
 pub mod undistort;

@@ -13,7 +13,7 @@ use super::trace::Trace;
 use super::weights::{Weights, read_tensors};
 use super::{Primaries, Views};
 use crate::camera::{Camera, Intrinsics};
-use crate::config::{Backbone, Mvsplat as Settings};
+use crate::config::{Backbone, Mvsplat as Settings, Primaries as Ours, ShFrame};
 use candle_core::{Error, Result, Tensor, bail};
 use glam::Mat4;
 use serde::Serialize;
@@ -63,7 +63,11 @@ pub fn compare(weights: &Weights, reference: &Path) -> Result<Report> {
     let (tensors, _) = read_tensors(reference).map_err(Error::wrap)?;
     let settings = match weights.config().map(|c| &c.backbone) {
         None => Settings::re10k(),
-        Some(Backbone::Mvsplat(settings)) => settings.clone(),
+        // The reference is MVSplat's, whatever frame the weights' colours are rendered in.
+        Some(Backbone::Mvsplat(settings)) => {
+            let primaries = Ours { sh_frame: ShFrame::Mvsplat, ..settings.primaries.clone() };
+            Settings { primaries, ..settings.clone() }
+        }
         Some(Backbone::Small(_)) => {
             bail!("compare: expected weights of an MVSplat backbone, got the small one")
         }

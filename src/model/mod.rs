@@ -3,12 +3,14 @@
 //! Parameter names are PyTorch's, so that a converted checkpoint loads as it is.
 
 pub mod aggregation;
+pub mod architecture;
 pub mod backbone;
 pub mod compare;
 pub mod embed;
 mod floors;
 pub mod geometry;
 pub mod layers;
+pub mod lpips;
 pub mod mlp;
 pub mod primaries;
 pub mod spgr;

@@ -48,12 +48,14 @@ pub fn call_in(folder: &Path, arguments: &str) -> Called {
 
 /// Calls the program with these arguments and environment, in `folder`.
 pub fn call_with(folder: &Path, arguments: &[&str], environment: &[(&str, &str)]) -> Called {
-    let output = Command::new(env!("CARGO_BIN_EXE_subsplat"))
-        .args(arguments)
-        .current_dir(folder)
-        .envs(environment.iter().copied())
-        .output()
-        .unwrap();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_subsplat"));
+    command.args(arguments).current_dir(folder).envs(environment.iter().copied());
+    called(&mut command)
+}
+
+/// What `command` left.
+pub fn called(command: &mut Command) -> Called {
+    let output = command.output().unwrap();
     let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
     Called {
         code: output.status.code().unwrap_or(-1),

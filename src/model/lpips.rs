@@ -1,0 +1,137 @@
+//! LPIPS, version 0.1 with VGG16: a perceptual distance of pictures (Zhang et al.,
+//! "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018).
+//!
+//! Pictures in [0, 1] become x ↦ 2x − 1 and then (x − shift)/scale; VGG16's features
+//! after the last ReLU of its five blocks are divided by their length over the
+//! channels; d = Σ_blocks mean_pixels Σ_c w_c (a_c − b_c)². Parameter names are those of
+//! the `lpips` package: `net.slice{1..5}.{n}`, n being torchvision's index of the
+//! convolution, and `lin{0..4}.model.1.weight`. The package's dropout before the linear
+//! weights is inactive outside its own training and absent here. Tests: `tests/lpips.rs`.
+
+use super::layers::{Conv2d, ConvShape};
+use crate::ops::activation::{Activation, activation};
+use candle_core::{Device, Result, Tensor, bail};
+use candle_nn::{Init, VarBuilder};
+
+/// Blocks of VGG16: torchvision's indices of the convolutions, and their channels.
+pub(super) const BLOCKS: [(&[usize], usize); 5] = [
+    (&[0, 2], 64),
+    (&[5, 7], 128),
+    (&[10, 12, 14], 256),
+    (&[17, 19, 21], 512),
+    (&[24, 26, 28], 512),
+];
+/// Means and standard deviations of ImageNet's pictures in [−1, 1], as the package has
+/// them.
+const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
+const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
+/// Added to the length of a feature.
+const EPSILON: f64 = 1e-10;
+/// Least squared length under the root: its slope at 0 is infinite. A feature as short
+/// (10⁻¹⁵) is nothing beside [`EPSILON`].
+const LEAST_SQUARE: f64 = 1e-30;
+/// Least side of a picture, px: four times halved, one pixel is left.
+pub const LEAST_SIDE: usize = 16;
+
+/// The distance, with its weights. Gradients flow into both pictures.
+#[derive(Clone, Debug)]
+pub struct Lpips {
+    blocks: Vec<Vec<Conv2d>>,
+    /// `[1, C]` for each block.
+    linear: Vec<Tensor>,
+    /// `[1, 3, 1, 1]`.
+    shift: Tensor,
+    scale: Tensor,
+}
+
+impl Lpips {
+    /// `vb` is at the root of the names.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
+    pub fn new(vb: VarBuilder) -> Result<Self> {
+        let (mut blocks, mut linear) = (Vec::new(), Vec::new());
+        let mut c_in = 3;
+        for (i, (indices, channels)) in BLOCKS.into_iter().enumerate() {
+            let slice = vb.pp("net").pp(format!("slice{}", i + 1));
+            let mut block = Vec::with_capacity(indices.len());
+            for index in indices {
+                block.push(Conv2d::new(c_in, channels, ConvShape::K3, slice.pp(index))?);
+                c_in = channels;
+            }
+            blocks.push(block);
+            let shape = (1, channels, 1, 1);
+            let lin = vb.pp(format!("lin{i}")).pp("model.1");
+            // Untrained: every channel counts alike.
+            let weight = lin.get_with_hints(shape, "weight", Init::Const(1.0))?;
+            linear.push(weight.reshape((1, channels))?);
+        }
+        let three = |v: [f32; 3]| Tensor::from_slice(&v, (1, 3, 1, 1), &Device::Cpu);
+        Ok(Self { blocks, linear, shift: three(SHIFT)?, scale: three(SCALE)? })
+    }
+
+    /// Distances of the pictures `a` and `b`, `[N, 3, H, W]` in [0, 1] (values outside
+    /// are taken as they are): `[N]`.
+    ///
+    /// # Errors
+    /// Shapes that differ or are no pictures; sides below [`LEAST_SIDE`].
+    pub fn forward(&self, a: &Tensor, b: &Tensor) -> Result<Tensor> {
+        self.layers(a, b)?.sum(1)
+    }
+
+    /// The same before the sum over blocks: `[N, 5]`.
+    ///
+    /// # Errors
+    /// As [`Lpips::forward`].
+    pub fn layers(&self, a: &Tensor, b: &Tensor) -> Result<Tensor> {
+        let (_, c, h, w) = a.dims4()?;
+        if a.dims() != b.dims() || c != 3 {
+            let (a, b) = (a.dims(), b.dims());
+            bail!("lpips: expected two pictures [N, 3, H, W] of one shape, got {a:?} and {b:?}");
+        }
+        if h.min(w) < LEAST_SIDE {
+            bail!("lpips: expected pictures of at least {LEAST_SIDE} pixels a side, got {w}x{h}");
+        }
+        let (a, b) = (self.features(a)?, self.features(b)?);
+        let distance = |((a, b), weight): ((&Tensor, &Tensor), &Tensor)| {
+            let each = (a - b)?.sqr()?.flatten_from(2)?.mean(2)?;
+            each.broadcast_mul(weight)?.sum(1)
+        };
+        let each = a.iter().zip(&b).zip(&self.linear).map(distance).collect::<Result<Vec<_>>>()?;
+        Tensor::stack(&each, 1)
+    }
+
+    /// Features after each block, of unit length over the channels.
+    fn features(&self, picture: &Tensor) -> Result<Vec<Tensor>> {
+        let centred = picture.affine(2.0, -1.0)?.broadcast_sub(&self.shift)?;
+        let mut x = centred.broadcast_div(&self.scale)?;
+        let mut features = Vec::with_capacity(self.blocks.len());
+        for (i, block) in self.blocks.iter().enumerate() {
+            if i > 0 {
+                x = halved(&x)?;
+            }
+            for conv in block {
+                x = activation(&conv.forward(&x)?, Activation::Relu)?;
+            }
+            features.push(unit(&x)?);
+        }
+        Ok(features)
+    }
+}
+
+/// Largest of each 2×2 pixels; an odd row or column at the end is left out, as in
+/// PyTorch. (Candle's own pooling hands back a quarter of the gradient.)
+fn halved(x: &Tensor) -> Result<Tensor> {
+    let (n, c, h, w) = x.dims4()?;
+    let (h, w) = (h / 2, w / 2);
+    let larger = |pairs: Tensor| pairs.narrow(2, 0, 1)?.maximum(&pairs.narrow(2, 1, 1)?);
+    let even = x.narrow(2, 0, 2 * h)?.narrow(3, 0, 2 * w)?.contiguous()?;
+    let rows = larger(even.reshape((n * c, h, 2, 2 * w))?)?;
+    larger(rows.reshape((n * c * h, w, 2))?)?.reshape((n, c, h, w))
+}
+
+/// Divided by the length over the channels.
+fn unit(x: &Tensor) -> Result<Tensor> {
+    let length = x.sqr()?.sum_keepdim(1)?.maximum(LEAST_SQUARE)?.sqrt()?;
+    x.broadcast_div(&(length + EPSILON)?)
+}
