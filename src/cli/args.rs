@@ -54,7 +54,8 @@ pub enum Command {
     Check(CheckArgs),
     /// Say what a file or a scene folder holds.
     Info(InfoArgs),
-    /// Run the encoder on a reference file's inputs and compare every tensor in it.
+    /// Run the encoder, or the rasterizer, on a reference file's inputs and compare every
+    /// tensor in it.
     Compare(CompareArgs),
 }
 
@@ -351,10 +352,13 @@ pub struct InfoArgs {
 /// Arguments of `compare`.
 #[derive(Debug, Args)]
 pub struct CompareArgs {
-    /// Weights (.safetensors), with or without the `encoder.` prefix.
+    /// Weights (.safetensors) of the encoder, with or without the `encoder.` prefix. A
+    /// rasterizer case needs none.
     #[arg(long, value_name = "FILE")]
-    pub weights: PathBuf,
-    /// Reference: `in.*` tensors, and any of the stages and `out.*` tensors.
+    pub weights: Option<PathBuf>,
+    /// Reference: `in.*` tensors, and any of the stages and `out.*` tensors; or, without
+    /// --weights, a rasterizer case: splats, a camera, and the picture and gradients that
+    /// another rasterizer made of them.
     #[arg(long, value_name = "FILE")]
     pub reference: PathBuf,
 }
