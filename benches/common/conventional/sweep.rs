@@ -32,6 +32,63 @@ pub fn correlation(s: &Sweep, reference: &[f32], source: &[f32]) -> Vec<f32> {
     out
 }
 
+/// Gradients by reference and source for `grad` `[R, D, h, w]`. The volume is warped
+/// again, then its own gradient takes its place and is scattered back.
+pub fn backward(
+    s: &Sweep,
+    reference: &[f32],
+    source: &[f32],
+    grad: &[f32],
+) -> (Vec<f32>, Vec<f32>) {
+    let ([h, w], c, d) = (s.size, s.channels, s.depths[0].len());
+    let n = h * w;
+    let (mut by_reference, mut by_source) = (vec![0.0; reference.len()], vec![0.0; source.len()]);
+    let mut volume = vec![0.0; c * d * n];
+    for (r, grad) in grad.chunks_exact(d * n).enumerate() {
+        let factor = s.scale / s.pairs[r].len() as f32;
+        let own = &reference[r * c * n..(r + 1) * c * n];
+        let by_own = &mut by_reference[r * c * n..(r + 1) * c * n];
+        for pair in &s.pairs[r] {
+            let grid = grid(s, pair, &s.depths[r]);
+            let at = pair.source * c * n..(pair.source + 1) * c * n;
+            warp([h, w], &source[at.clone()], &grid, &mut volume);
+            let channels = volume.par_chunks_exact_mut(d * n);
+            let channels = channels.zip(own.par_chunks_exact(n));
+            let channels = channels.zip(by_own.par_chunks_exact_mut(n));
+            let channels = channels.zip(by_source[at].par_chunks_exact_mut(n));
+            channels.for_each(|(((warped, own), by_own), by_plane)| {
+                for (warped, grad) in warped.chunks_exact_mut(n).zip(grad.chunks_exact(n)) {
+                    for i in 0..n {
+                        by_own[i] += factor * grad[i] * warped[i];
+                        warped[i] = factor * grad[i] * own[i];
+                    }
+                }
+                scatter([h, w], warped, &grid, by_plane);
+            });
+        }
+    }
+    (by_reference, by_source)
+}
+
+/// Adds `warped` `[D, h, w]` to the taps that it came from.
+fn scatter([h, w]: [usize; 2], warped: &[f32], grid: &[[f32; 2]], plane: &mut [f32]) {
+    for (g, &[u, v]) in warped.iter().zip(grid) {
+        let (left, top) = (u.floor(), v.floor());
+        let (fx, fy) = (u - left, v - top);
+        let (x, y) = (left as i32, top as i32);
+        let mut add = |x: i32, y: i32, weight: f32| {
+            if x >= 0 && y >= 0 && x < w as i32 && y < h as i32 {
+                plane[y as usize * w + x as usize] += g * weight;
+            }
+        };
+        let (right, below) = (x.wrapping_add(1), y.wrapping_add(1));
+        add(x, y, (1.0 - fx) * (1.0 - fy));
+        add(right, y, fx * (1.0 - fy));
+        add(x, below, (1.0 - fx) * fy);
+        add(right, below, fx * fy);
+    }
+}
+
 /// Source columns and rows (0 = centre of the first pixel) `[D, h, w]`.
 fn grid(s: &Sweep, p: &Pair, depths: &[f32]) -> Vec<[f32; 2]> {
     let [h, w] = s.size;
