@@ -12,7 +12,7 @@ mod common;
 mod oracle;
 
 use anyhow::Result;
-use common::conventional::project::{Gradients, Options, Splats as Plain};
+use common::conventional::project::{Gradients as PlainGradients, Options, Splats as Plain};
 use common::conventional::raster::Rasterizer as Conventional;
 use common::scene::{self, SCENES, Spec};
 use common::{Bench, Contender, Threads, Work, agree};
@@ -22,7 +22,7 @@ use std::collections::HashMap;
 use std::path::Path;
 use subsplat::abi::RasterOptions;
 use subsplat::camera::Camera;
-use subsplat::cpu::{Rasterizer, Rendered, Stats};
+use subsplat::cpu::{Gradients, Rasterizer, Rendered, Stats};
 use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
 use subsplat::io::scene::Units;
 use subsplat::io::{save_splats, write_atomic};
@@ -43,6 +43,8 @@ const FLOPS_PER_SPLAT: f64 = 150.0;
 /// Differences of pictures: all but a thousandth of the numbers within 5e-5; decisions
 /// that hang on rounding may flip elsewhere.
 const PICTURE: [f32; 3] = [5e-5, 0.2, 1e-3];
+/// The same of gradients, of which f32 sums over many pixels cancel.
+const GRADIENT: [f32; 3] = [2e-4, 0.2, 1e-3];
 /// Picture for which the naive oracle takes seconds rather than minutes.
 const NAIVE_SIDE: usize = 128;
 
@@ -198,16 +200,92 @@ fn forward(bench: &mut Bench, name: &str, case: &Case, stats: Stats) -> Result<(
 }
 
 fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
-    let (v_rgb, v_alpha) = case.seeds();
+    let seeds = case.seeds();
+    check_gradients(bench, case, &seeds)?;
+    let (v_rgb, v_alpha) = &seeds;
     let mut plain = Conventional::default();
+    let mut plain_both = Conventional::default();
     plain.forward(&case.plain(), &case.camera, case.plain_options(BOX));
-    let mut kept = Gradients::default();
-    let contenders = vec![Contender::new("conventional, scalar", Threads::One, || {
-        let options = case.plain_options(BOX);
-        kept = plain.backward(&case.plain(), &case.camera, options, &v_rgb, &v_alpha);
-        Ok(())
-    })];
-    bench.group(name, contenders, "after a forward pass, not counted")
+    let options = case.plain_options(BOX);
+    let mut contenders = vec![
+        Contender::new("conventional, backward alone", Threads::One, || {
+            let g = plain.backward(&case.plain(), &case.camera, options, v_rgb, v_alpha);
+            std::hint::black_box(g);
+            Ok(())
+        }),
+        Contender::new("conventional, both passes", Threads::One, move || {
+            plain_both.forward(&case.plain(), &case.camera, options);
+            let g = plain_both.backward(&case.plain(), &case.camera, options, v_rgb, v_alpha);
+            std::hint::black_box(g);
+            Ok(())
+        }),
+    ];
+    let planes = &planes(&seeds);
+    let mut kept: [(Frames, Vec<f32>); 2] = Default::default();
+    for ((frames, picture), threads) in kept.iter_mut().zip([Threads::One, Threads::All]) {
+        let slices = slices(&case.splats);
+        let mut frame = frames.rasterizer.frame(slices, &case.camera, &case.options, picture);
+        let gradients = &mut frames.gradients;
+        contenders.push(Contender::new("subsplat, backward alone", threads, move || {
+            frame.backward(planes, gradients);
+            Ok(())
+        }));
+    }
+    let (mut one, mut all) = (Frames::default(), Frames::default());
+    for (threads, frames) in [(Threads::One, &mut one), (Threads::All, &mut all)] {
+        contenders.push(Contender::new("subsplat, both passes", threads, move || {
+            let slices = slices(&case.splats);
+            let (camera, options) = (&case.camera, &case.options);
+            frames.rasterizer.backward(&slices, camera, options, planes, &mut frames.gradients);
+            Ok(())
+        }));
+    }
+    bench.group(name, contenders, "gradients of everything; compare like with like")
+}
+
+/// Our rasterizer with its results' buffers.
+#[derive(Default)]
+struct Frames {
+    rasterizer: Rasterizer,
+    gradients: Gradients,
+}
+
+/// `[5, H, W]` of the gradients of RGB `[H, W, 3]` and alpha `[H, W]`.
+fn planes((v_rgb, v_alpha): &(Vec<f32>, Vec<f32>)) -> Vec<f32> {
+    let mut planes: Vec<f32> = Vec::with_capacity(5 * v_alpha.len());
+    for c in 0..3 {
+        planes.extend(v_rgb.iter().skip(c).step_by(3));
+    }
+    planes.extend(v_alpha);
+    planes.resize(5 * v_alpha.len(), 0.0);
+    planes
+}
+
+/// Our gradients against the baseline's, each lane for itself.
+fn check_gradients(bench: &Bench, case: &Case, seeds: &(Vec<f32>, Vec<f32>)) -> Result<()> {
+    let mut plain = Conventional::default();
+    let options = case.plain_options(EXACT_BOX);
+    plain.forward(&case.plain(), &case.camera, options);
+    let expected: PlainGradients =
+        plain.backward(&case.plain(), &case.camera, options, &seeds.0, &seeds.1);
+    let mut ours = Frames::default();
+    bench.on_all(|| {
+        let (slices, planes) = (slices(&case.splats), planes(seeds));
+        let out = &mut ours.gradients;
+        ours.rasterizer.backward(&slices, &case.camera, &case.options, &planes, out);
+    });
+    let got = &ours.gradients;
+    for lane in 0..11 {
+        let column = |rows: &[f32]| rows.iter().skip(lane).step_by(11).copied().collect::<Vec<_>>();
+        let what = format!("gradient of lane {lane}");
+        agree(&what, &column(&got.rows), &column(&expected.rows), GRADIENT)?;
+    }
+    agree("gradient of sh", &got.sh, &expected.sh, GRADIENT)?;
+    agree("gradient of the background", &got.background, &expected.background, GRADIENT)?;
+    if !expected.gain.is_empty() {
+        agree("gradient of gain", &got.gain, &expected.gain, GRADIENT)?;
+    }
+    Ok(())
 }
 
 fn write(folder: &Path, bench: &Bench) -> Result<()> {

@@ -42,6 +42,7 @@ fn every_case_passes() {
             let tensors = report["tensors"].as_array().unwrap();
             let names: Vec<_> = tensors.iter().map(|t| t["tensor"].as_str().unwrap()).collect();
             assert!(names.starts_with(&["rgb", "alpha", "depth_sum", "depth"]), "{names:?}");
+            assert!(names.contains(&"grad.sh") && names.len() >= 9, "{names:?}");
         }
     }
 }
@@ -80,6 +81,14 @@ impl Copy {
         at.copy_from_slice(&value.to_le_bytes());
     }
 
+    /// Multiplies a tensor.
+    fn scale(&mut self, name: &str, by: f32) {
+        for at in self.tensors.get_mut(name).unwrap().2.chunks_exact_mut(4) {
+            let value = by * f32::from_le_bytes((&*at).try_into().unwrap());
+            at.copy_from_slice(&value.to_le_bytes());
+        }
+    }
+
     /// Index of a pixel that is no boundary.
     fn inner(&self) -> usize {
         let boundary = &self.tensors["boundary"].2;
@@ -95,12 +104,16 @@ fn a_case_that_is_a_little_off_fails() {
     let case = Copy::read(&path);
     let pixel = case.inner();
     type Change = fn(&mut Copy, usize);
-    let changes: [(&str, Change); 5] = [
+    let changes: [(&str, Change); 9] = [
         ("rgb", |c, pixel| c.shift("rgb", 3 * pixel + 1, 6e-5)),
         ("alpha", |c, pixel| c.shift("alpha", pixel, -6e-5)),
         ("depth", |c, pixel| c.shift("depth", pixel, 5e-3)),
         ("depth_sum", |c, pixel| c.shift("depth_sum", pixel, f32::NAN)),
         ("rgb", |c, _| c.shift("background", 2, 1e-3)),
+        ("grad.scales", |c, _| c.scale("grad.scales", 1.002)),
+        ("grad.gain", |c, _| c.scale("grad.gain", 0.998)),
+        ("grad.background", |c, _| c.scale("grad.background", 1.002)),
+        ("grad.sh", |c, pixel| c.shift("v_rgb", 3 * pixel, 1.0)),
     ];
     for (tensor, change) in changes {
         let mut off = Copy { metadata: case.metadata.clone(), tensors: case.tensors.clone() };

@@ -120,6 +120,11 @@ impl Case {
         array(&self.tensors, name, shape)
     }
 
+    /// Whether the file has the tensor.
+    pub fn has(&self, name: &str) -> bool {
+        self.tensors.contains_key(name)
+    }
+
     fn values(&self, name: &str) -> &[f32] {
         self.tensors.get(name).map_or(&[], |(_, values)| values)
     }
