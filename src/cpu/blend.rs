@@ -58,9 +58,9 @@ impl Default for Tile {
 /// The two numbers in which the conventions blend differently.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Rules {
-    alpha_max: f32,
+    pub(crate) alpha_max: f32,
     /// Blending stops where T would become this or less.
-    stop: f32,
+    pub(crate) stop: f32,
 }
 
 impl Rules {
@@ -235,8 +235,8 @@ fn alpha_of(p: &mut Lanes, cap: f32) {
     }
 }
 
-#[inline]
-fn any_positive(v: &Lanes) -> bool {
+#[inline(always)]
+pub(crate) fn any_positive(v: &Lanes) -> bool {
     let mut most = [f32::MIN; BLOCK];
     for row in v.chunks_exact(BLOCK) {
         for (m, x) in most.iter_mut().zip(row) {
@@ -247,7 +247,7 @@ fn any_positive(v: &Lanes) -> bool {
 }
 
 /// Positions of the set bits, lowest first.
-fn bits(mut mask: u64) -> impl Iterator<Item = usize> {
+pub(crate) fn bits(mut mask: u64) -> impl Iterator<Item = usize> {
     std::iter::from_fn(move || {
         (mask != 0).then(|| {
             let b = mask.trailing_zeros() as usize;

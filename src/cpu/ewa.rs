@@ -85,6 +85,7 @@ impl Footprint {
 
     /// Pixel columns, as a real interval, in which rows `y0..=y1` (pixel centres)
     /// can meet the support; `None` where they cannot.
+    #[inline]
     pub fn span(&self, y0: f32, y1: f32) -> Option<(f32, f32)> {
         let low = (y0 - self.v).max(-self.half_height);
         let high = (y1 - self.v).min(self.half_height);
@@ -123,18 +124,18 @@ fn support(power: f32) -> f32 {
 #[derive(Clone, Debug)]
 pub struct View {
     /// Rows of the rotation from world to camera.
-    rows: [[f32; 3]; 3],
+    pub(crate) rows: [[f32; 3]; 3],
     /// The eye, world.
     pub(crate) eye: [f32; 3],
-    focal: [f32; 2],
+    pub(crate) focal: [f32; 2],
     /// Pixel position of the axis, centres at integers.
     centre: [f32; 2],
     /// Intervals to which x/z and y/z are clamped inside J.
-    limit: [(f32, f32); 2],
+    pub(crate) limit: [(f32, f32); 2],
     near: f32,
-    z_epsilon: f32,
+    pub(crate) z_epsilon: f32,
     lowpass: f32,
-    antialiased: bool,
+    pub(crate) antialiased: bool,
     tile_cut: bool,
     size: [usize; 2],
 }
@@ -180,7 +181,8 @@ impl View {
     }
 
     /// World to camera, as Rᵀ(p − t).
-    fn to_camera(&self, p: [f32; 3]) -> [f32; 3] {
+    #[inline(always)]
+    pub(crate) fn to_camera(&self, p: [f32; 3]) -> [f32; 3] {
         let d = [p[0] - self.eye[0], p[1] - self.eye[1], p[2] - self.eye[2]];
         self.rows.map(|r| dot(r, d))
     }
@@ -355,6 +357,7 @@ fn rotation(q: [f32; 4]) -> Option<[[f32; 3]; 3]> {
     ])
 }
 
+#[inline(always)]
 fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }

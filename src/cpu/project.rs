@@ -90,19 +90,19 @@ impl SplatSlices<'_> {
         geometry && sh && children && gain
     }
 
-    fn mean(&self, i: usize) -> [f32; 3] {
+    pub(crate) fn mean(&self, i: usize) -> [f32; 3] {
         match self.geometry {
             Geometry::Packed(rows) => lanes(rows, i * SPLAT_LANES + LANE_MEAN),
             Geometry::Cov6 { means, .. } => lanes(means, 3 * i),
         }
     }
 
-    fn sh_of_parent(&self, p: usize) -> &[f32] {
+    pub(crate) fn sh_of_parent(&self, p: usize) -> &[f32] {
         let set = 3 * sh_coefficients(self.sh_degree);
         self.sh.get(p * set..(p + 1) * set).unwrap_or(&[])
     }
 
-    fn gain_of(&self, i: usize) -> (f32, [f32; 3]) {
+    pub(crate) fn gain_of(&self, i: usize) -> (f32, [f32; 3]) {
         if self.gain.len() == 4 * self.len() && !self.gain.is_empty() {
             let [gain, residual @ ..]: [f32; 4] = lanes(self.gain, 4 * i);
             (gain, residual)
@@ -126,7 +126,7 @@ impl SplatSlices<'_> {
 }
 
 /// `L` floats from `at` on; zeros where the slice ends before.
-fn lanes<const L: usize>(from: &[f32], at: usize) -> [f32; L] {
+pub(crate) fn lanes<const L: usize>(from: &[f32], at: usize) -> [f32; L] {
     from.get(at..at + L).and_then(|s| s.try_into().ok()).unwrap_or([0.0; L])
 }
 
@@ -147,6 +147,11 @@ impl Projection {
         self.footprints.capacity() * size_of::<Footprint>()
             + self.visible.capacity() * size_of::<usize>()
             + self.parents.capacity() * size_of::<[f32; 3]>()
+    }
+
+    /// Σ sh·Y of each parent; stale unless directions are the parents'.
+    pub(crate) fn parents(&self) -> &[[f32; 3]] {
+        &self.parents
     }
 
     /// Projects all splats.
@@ -208,6 +213,6 @@ impl Projection {
     }
 }
 
-fn minus(a: [f32; 3], b: [f32; 3]) -> [f32; 3] {
+pub(crate) fn minus(a: [f32; 3], b: [f32; 3]) -> [f32; 3] {
     [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
 }

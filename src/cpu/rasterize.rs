@@ -10,6 +10,7 @@ use crate::camera::Camera;
 use crate::cpu::blend::{BLOCKS, Block, Rules, Tile};
 use crate::cpu::ewa::{Footprint, View};
 use crate::cpu::project::{Projection, SplatSlices};
+use crate::cpu::raster_bwd::Buffers;
 use crate::cpu::sort::DepthSort;
 use crate::cpu::tiles::{Grid, TileLists};
 use rayon::prelude::*;
@@ -55,16 +56,17 @@ pub struct Stats {
 /// next to nothing.
 #[derive(Debug, Default)]
 pub struct Rasterizer {
-    projection: Projection,
-    order: DepthSort,
-    lists: TileLists,
-    grid: Grid,
+    pub(crate) projection: Projection,
+    pub(crate) order: DepthSort,
+    pub(crate) lists: TileLists,
+    pub(crate) grid: Grid,
     /// Accumulators, in order of work: slot s holds tile `tile_of_slot[s]`.
-    slots: Vec<Tile>,
+    pub(crate) slots: Vec<Tile>,
     tile_of_slot: Vec<usize>,
-    slot_of_tile: Vec<usize>,
+    pub(crate) slot_of_tile: Vec<usize>,
     background: [f32; 3],
     stats: Stats,
+    pub(crate) back: Buffers,
 }
 
 impl Rasterizer {
@@ -146,7 +148,7 @@ impl Rasterizer {
     }
 
     /// Everything but the picture: leaves the accumulators of all tiles in `slots`.
-    fn composite(&mut self, splats: &SplatSlices, camera: &Camera, options: &RasterOptions) {
+    pub(crate) fn composite(&mut self, splats: &SplatSlices, camera: &Camera, options: &RasterOptions) {
         debug_assert!(splats.is_consistent(), "splat buffers do not fit one another");
         let view = View::new(camera, options);
         self.grid = Grid::new(camera.intrinsics.width, camera.intrinsics.height);
@@ -211,6 +213,7 @@ impl Rasterizer {
         self.projection.bytes()
             + self.order.bytes()
             + self.lists.bytes()
+            + self.back.bytes()
             + self.slots.capacity() * size_of::<Tile>()
             + 8 * (self.tile_of_slot.capacity() + self.slot_of_tile.capacity())
     }

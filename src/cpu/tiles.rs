@@ -79,12 +79,15 @@ pub(crate) struct TileLists {
     /// Splats, in depth order, per chunk.
     chunk: usize,
     pairs_per_group: Option<usize>,
+    /// The group whose lists `entries` holds; empty after a count.
+    filled: Range<usize>,
 }
 
 impl TileLists {
     /// Counts the entries of every tile.
     pub(crate) fn count(&mut self, grid: Grid, order: &DepthSort, footprints: &[Footprint]) {
         self.grid = grid;
+        self.filled = 0..0;
         let tiles = grid.len();
         let chunk = chunk_len(order.len());
         self.chunk = chunk;
@@ -132,7 +135,12 @@ impl TileLists {
 
     /// The largest range of tiles from `first` on that makes one group.
     pub(crate) fn group(&self, first: usize) -> Range<usize> {
-        let limit = self.pairs_per_group.unwrap_or(PAIRS_PER_GROUP);
+        self.group_within(first, PAIRS_PER_GROUP)
+    }
+
+    /// The same with at most `limit` pairs.
+    pub(crate) fn group_within(&self, first: usize, limit: usize) -> Range<usize> {
+        let limit = self.pairs_per_group.map_or(limit, |own| own.min(limit));
         let mut pairs = 0;
         let mut past = first;
         while past < self.counts.len() {
@@ -153,6 +161,7 @@ impl TileLists {
         footprints: &[Footprint],
     ) {
         let tiles = self.grid.len();
+        self.filled = group.clone();
         let mut next = 0;
         for t in group.clone() {
             self.starts[t] = next;
@@ -175,6 +184,48 @@ impl TileLists {
                         entries[slots[t] as usize].store(splat, Relaxed);
                         slots[t] += 1;
                     }
+                });
+            }
+        });
+    }
+
+    /// The group last filled.
+    pub(crate) fn filled(&self) -> Range<usize> {
+        self.filled.clone()
+    }
+
+    /// Calls `each` for every splat with a function that walks its entries in the lists
+    /// of `group`, the one last filled: (tile, place in the tile's list, place among
+    /// all entries), tiles ascending.
+    pub(crate) fn visit(
+        &self,
+        group: &Range<usize>,
+        order: &DepthSort,
+        footprints: &[Footprint],
+        each: impl Fn(u32, &mut dyn FnMut(&mut dyn FnMut(usize, usize, usize))) + Sync,
+    ) {
+        let (tiles, chunk) = (self.grid.len(), self.chunk);
+        if tiles == 0 {
+            return;
+        }
+        let rows = group.start / self.grid.columns..group.end.div_ceil(self.grid.columns);
+        let chunks = self.slots.len() / tiles;
+        (0..chunks).into_par_iter().for_each(|c| {
+            // After a fill, a chunk's slots are where the next one's entries begin.
+            let begin = |t: usize| match c {
+                0 => self.starts[t],
+                _ => self.slots[(c - 1) * tiles + t] as usize,
+            };
+            let mut cursor: Vec<usize> = group.clone().map(begin).collect();
+            for rank in c * chunk..((c + 1) * chunk).min(order.len()) {
+                let splat = order.splat(rank);
+                each(splat, &mut |entry| {
+                    self.grid.touched(&footprints[splat as usize], rows.clone(), |t| {
+                        if let Some(slot) = t.checked_sub(group.start).and_then(|i| cursor.get_mut(i)) {
+                            entry(t, *slot - self.starts[t], *slot);
+                            *slot += 1;
+                        }
+                    });
                 });
             }
         });
