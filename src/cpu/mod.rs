@@ -25,6 +25,7 @@ pub mod real;
 pub mod redistribute;
 pub mod resize;
 pub mod sh;
+pub mod simd;
 mod sort;
 pub mod spgr;
 mod tiles;
