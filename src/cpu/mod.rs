@@ -30,6 +30,7 @@ pub mod redistribute;
 pub mod resize;
 pub mod sh;
 mod sh_bwd;
+pub mod simd;
 mod sort;
 pub mod spgr;
 mod tiles;
