@@ -190,4 +190,9 @@ fn malformed_cases_are_refused_by_name() {
     let mut case = copy();
     case.metadata.clear();
     refused(&case, &["convention", "--weights"]);
+    std::fs::write(&file, "text").unwrap();
+    let called = compare(&file, &[]);
+    assert_eq!(called.code, 1);
+    assert!(called.error().contains("bad.safetensors: expected a safetensors file"));
+    assert!(compare(&place.path().join("none"), &[]).error().contains("none"));
 }

@@ -215,7 +215,7 @@ impl Bench {
             "median ms",
             "least ms",
             "cpu ms",
-            "times as",
+            "speed",
             "GB/s",
             "of",
             "GFLOP/s",
@@ -253,7 +253,7 @@ impl Bench {
                 "least_ms": 1e3 * least,
                 "cpu_ms": cpu,
                 "turns": times.wall.len(),
-                "times_as_fast_as_first": base / median,
+                "speed_to_first": base / median,
                 "gb_s": rate.map(|r| r[0]),
                 "gflop_s": rate.map(|r| r[1]),
             }));
