@@ -207,6 +207,9 @@ fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
     let mut plain_both = Conventional::default();
     plain.forward(&case.plain(), &case.camera, case.plain_options(BOX));
     let options = case.plain_options(BOX);
+    let planes = &planes(&seeds);
+    let mut kept: [(Frames, Vec<f32>); 2] = Default::default();
+    let (mut one, mut all) = (Frames::default(), Frames::default());
     let mut contenders = vec![
         Contender::new("conventional, backward alone", Threads::One, || {
             let g = plain.backward(&case.plain(), &case.camera, options, v_rgb, v_alpha);
@@ -220,8 +223,6 @@ fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
             Ok(())
         }),
     ];
-    let planes = &planes(&seeds);
-    let mut kept: [(Frames, Vec<f32>); 2] = Default::default();
     for ((frames, picture), threads) in kept.iter_mut().zip([Threads::One, Threads::All]) {
         let slices = slices(&case.splats);
         let mut frame = frames.rasterizer.frame(slices, &case.camera, &case.options, picture);
@@ -231,7 +232,6 @@ fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
             Ok(())
         }));
     }
-    let (mut one, mut all) = (Frames::default(), Frames::default());
     for (threads, frames) in [(Threads::One, &mut one), (Threads::All, &mut all)] {
         contenders.push(Contender::new("subsplat, both passes", threads, move || {
             let slices = slices(&case.splats);
