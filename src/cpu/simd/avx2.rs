@@ -146,6 +146,15 @@ impl Simd for Token {
         unsafe { F(_mm256_sqrt_ps(v.0), _mm256_sqrt_ps(v.1)) }
     }
     #[inline(always)]
+    fn rough_sqrt(self, v: F) -> F {
+        unsafe {
+            F(
+                _mm256_mul_ps(v.0, _mm256_rsqrt_ps(v.0)),
+                _mm256_mul_ps(v.1, _mm256_rsqrt_ps(v.1)),
+            )
+        }
+    }
+    #[inline(always)]
     fn abs(self, v: F) -> F {
         unsafe {
             let sign = _mm256_set1_ps(-0.0);
@@ -246,6 +255,10 @@ impl Simd for Token {
         }
     }
     #[inline(always)]
+    fn shift(self, v: I, by: I) -> I {
+        unsafe { I(_mm256_sllv_epi32(v.0, by.0), _mm256_sllv_epi32(v.1, by.1)) }
+    }
+    #[inline(always)]
     fn shr<const N: u32>(self, v: I) -> I {
         let n = N as i32;
         unsafe {
@@ -255,16 +268,20 @@ impl Simd for Token {
     }
 
     #[inline(always)]
+    fn prefetch<T>(self, v: &T) {
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(v).cast()) }
+    }
+    #[inline(always)]
     fn sum(self, v: F) -> f32 {
         unsafe { sum8(_mm256_add_ps(v.0, v.1)) }
     }
     #[inline(always)]
-    fn load4(self, from: &[f32], at: &[usize; LANES]) -> [F; 4] {
-        if !all_inside(from.len(), at) {
+    fn load4(self, from: &[f32], at: &[usize; LANES], offset: usize) -> [F; 4] {
+        if !all_inside(from.len(), at, offset) {
             return [self.splat(0.0); 4];
         }
         unsafe {
-            let quad = |i: usize| _mm_loadu_ps(from.as_ptr().add(at[i]));
+            let quad = |i: usize| _mm_loadu_ps(from.as_ptr().add(at[i] + offset));
             let join = |i: usize| _mm256_set_m128(quad(i + 4), quad(i));
             let low = transpose4([join(0), join(1), join(2), join(3)]);
             let high = transpose4([join(8), join(9), join(10), join(11)]);

@@ -130,6 +130,10 @@ impl Simd for Token {
         F(unsafe { _mm512_sqrt_ps(v.0) })
     }
     #[inline(always)]
+    fn rough_sqrt(self, v: F) -> F {
+        F(unsafe { _mm512_mul_ps(v.0, _mm512_rsqrt14_ps(v.0)) })
+    }
+    #[inline(always)]
     fn abs(self, v: F) -> F {
         F(unsafe { _mm512_abs_ps(v.0) })
     }
@@ -212,10 +216,18 @@ impl Simd for Token {
         I(unsafe { _mm512_slli_epi32::<N>(v.0) })
     }
     #[inline(always)]
+    fn shift(self, v: I, by: I) -> I {
+        I(unsafe { _mm512_sllv_epi32(v.0, by.0) })
+    }
+    #[inline(always)]
     fn shr<const N: u32>(self, v: I) -> I {
         I(unsafe { _mm512_srai_epi32::<N>(v.0) })
     }
 
+    #[inline(always)]
+    fn prefetch<T>(self, v: &T) {
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(v).cast()) }
+    }
     #[inline(always)]
     fn sum(self, v: F) -> f32 {
         unsafe {
@@ -224,12 +236,12 @@ impl Simd for Token {
         }
     }
     #[inline(always)]
-    fn load4(self, from: &[f32], at: &[usize; LANES]) -> [F; 4] {
-        if !all_inside(from.len(), at) {
+    fn load4(self, from: &[f32], at: &[usize; LANES], offset: usize) -> [F; 4] {
+        if !all_inside(from.len(), at, offset) {
             return [self.splat(0.0); 4];
         }
         unsafe {
-            let quad = |i: usize| _mm_loadu_ps(from.as_ptr().add(at[i]));
+            let quad = |i: usize| _mm_loadu_ps(from.as_ptr().add(at[i] + offset));
             // Rows i, i + 4, i + 8, i + 12 side by side: the 4×4 transposes inside
             // 128-bit parts then leave rows in order.
             let join = |i: usize| {
