@@ -131,7 +131,8 @@ impl Kernel for RenderTile<'_> {
             while blocks != 0 {
                 let b = blocks.trailing_zeros() as usize;
                 blocks &= blocks - 1;
-                let (count, goes_on) = batch.blend(s, &mut self.tile.blocks[b], b, corner, self.rules);
+                let (count, goes_on) =
+                    batch.blend(s, &mut self.tile.blocks[b], b, corner, self.rules);
                 items += count;
                 live &= !(u64::from(!goes_on) << b);
             }
@@ -258,4 +259,3 @@ impl Batch {
         (count, goes_on)
     }
 }
-

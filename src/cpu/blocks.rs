@@ -22,49 +22,66 @@ pub(crate) fn met<S: Simd>(
     /// Columns and rows are counted in blocks from the tile's corner.
     const PER_BLOCK: f32 = 1.0 / BLOCK as f32;
     let [u, v, sx, shear, sy, power, _, _, _, _, half_width, half_height, x0, y0, x1, y1] = fields;
-    let whole = |v: S::F| s.of_int(s.to_bits(v));
     let (zero, one, quarter) = (s.splat(0.0), s.splat(1.0), s.splat(PER_BLOCK));
     let (left, top) = (s.splat(corner[0]), s.splat(corner[1]));
     let reach = support_lanes(s, power);
     let sy2 = sy * sy;
     let tip = -(shear * half_height * half_height / half_width);
-    let (tip_left, tip_right) = (-tip, tip);
-    let lowest = s.max(-half_height, whole(y0) - v);
-    let highest = s.min(half_height, whole(y1) - one - v);
+    let lowest = s.max(-half_height, whole(s, y0) - v);
+    let highest = s.min(half_height, whole(s, y1) - one - v);
     // Edges in blocks, the roughness of the root made up for.
     let width = s.splat(PER_BLOCK * (1.0 + 2.0 * ROUGH)) / sx;
     let slack = s.splat(SPAN_SLACK_PX * PER_BLOCK);
     let middle = (u - left) * quarter;
     let (middle_left, middle_right) = (middle - slack, middle + slack);
     let slant = shear * quarter;
-    let first = s.max((whole(x0) - left) * quarter, zero);
-    let last = s.min((whole(x1) - one - left) * quarter, s.splat(BLOCKS as f32 - PER_BLOCK));
-    let one_int = s.splat_int(1);
-    // Bits of columns 0 to `past` − 1.
-    let below = |past: S::F| s.shift(one_int, s.to_int(past));
-    let tiny = s.splat(f32::MIN_POSITIVE);
-    let edge = |dy: S::F| s.rough_sqrt(s.max(s.fnma(dy * dy, sy2, reach), tiny));
-    let row = |r: usize| {
-        let y = top + s.splat((r * BLOCK) as f32) - v;
-        let low = s.max(y, lowest);
-        let high = s.min(y + s.splat(BLOCK as f32 - 1.0), highest);
-        let right = s.min(s.max(tip_right, low), high);
-        let left = s.min(s.max(tip_left, low), high);
-        let from = s.fnma(edge(left), width, s.fnma(slant, left, middle_left));
-        let to = s.fma(edge(right), width, s.fnma(slant, right, middle_right));
-        let from = s.max(from, first);
-        let to = s.keep(s.le(low, high), s.min(to, last) + one);
-        // Truncation: both are positive where anything is met.
-        below(s.max(to, from)) - below(from)
-    };
-    let upper = row(0) | s.shl::<8>(row(1)) | s.shl::<16>(row(2)) | s.shl::<24>(row(3));
-    let lower = row(4) | s.shl::<8>(row(5)) | s.shl::<16>(row(6)) | s.shl::<24>(row(7));
+    let first = s.max((whole(s, x0) - left) * quarter, zero);
+    let last = s.splat(BLOCKS as f32 - PER_BLOCK);
+    let last = s.min((whole(s, x1) - one - left) * quarter, last);
+    let mut halves = [s.splat_int(0); 2];
+    for (half, bits) in halves.iter_mut().enumerate() {
+        for r in 0..4 {
+            let y = top + s.splat(((4 * half + r) * BLOCK) as f32) - v;
+            let low = s.max(y, lowest);
+            let high = s.min(y + s.splat(BLOCK as f32 - 1.0), highest);
+            let right = s.min(s.max(tip, low), high);
+            let left = s.min(s.max(-tip, low), high);
+            let reach_left = edge(s, left, sy2, reach);
+            let reach_right = edge(s, right, sy2, reach);
+            let from = s.fnma(reach_left, width, s.fnma(slant, left, middle_left));
+            let to = s.fma(reach_right, width, s.fnma(slant, right, middle_right));
+            let from = s.max(from, first);
+            let to = s.keep(s.le(low, high), s.min(to, last) + one);
+            // Truncation floors: both are positive where anything is met.
+            let row = below(s, s.max(to, from)) - below(s, from);
+            *bits = *bits | s.shift(row, s.splat_int(8 * r as i32));
+        }
+    }
     let (mut a, mut b) = ([0; LANES], [0; LANES]);
-    s.store_int(upper, &mut a);
-    s.store_int(lower, &mut b);
+    s.store_int(halves[0], &mut a);
+    s.store_int(halves[1], &mut b);
     for ((mask, a), b) in masks.iter_mut().zip(a).zip(b) {
         *mask = u64::from(a as u32) | u64::from(b as u32) << 32;
     }
+}
+
+/// The whole number whose bits a lane holds.
+#[inline(always)]
+fn whole<S: Simd>(s: S, v: S::F) -> S::F {
+    s.of_int(s.to_bits(v))
+}
+
+/// Distance along x of the ellipse's edge from its middle, `dy` off the mean, before
+/// the division by sx.
+#[inline(always)]
+fn edge<S: Simd>(s: S, dy: S::F, sy2: S::F, reach: S::F) -> S::F {
+    s.rough_sqrt(s.max(s.fnma(dy * dy, sy2, reach), s.splat(f32::MIN_POSITIVE)))
+}
+
+/// Bits of columns 0 to `past` − 1.
+#[inline(always)]
+fn below<S: Simd>(s: S, past: S::F) -> S::I {
+    s.shift(s.splat_int(1), s.to_int(past))
 }
 
 /// Exchanges rows and columns of a 64×64 matrix of bits: bit c of word r becomes bit r
@@ -153,8 +170,18 @@ mod tests {
                 let cut = if l % 4 == 0 { 80 } else { 1000 };
                 let (u, v) = (next(50.0, 110.0), next(20.0, 80.0));
                 Footprint {
-                    u, v, sx, shear, sy, power, half_width, half_height,
-                    x1: cut, y0: 36, y1: 2000, ..Footprint::default()
+                    u,
+                    v,
+                    sx,
+                    shear,
+                    sy,
+                    power,
+                    half_width,
+                    half_height,
+                    x1: cut,
+                    y0: 36,
+                    y1: 2000,
+                    ..Footprint::default()
                 }
             });
             let exact = splats.map(|f| {
@@ -174,7 +201,9 @@ mod tests {
             });
             needed += exact.iter().map(|m| m.count_ones()).sum::<u32>();
             for (i, &tier) in Tier::available().iter().enumerate() {
-                for (l, (got, exact)) in tier.run(Met(&splats, corner)).into_iter().zip(exact).enumerate() {
+                for (l, (got, exact)) in
+                    tier.run(Met(&splats, corner)).into_iter().zip(exact).enumerate()
+                {
                     assert_eq!(exact & !got, 0, "{tier:?} {:?}", splats[l]);
                     let columns = if splats[l].x1 == 80 { 0x0f0f_0f0f_0f0f_0f0f } else { u64::MAX };
                     assert_eq!(got & !(columns << 8 & !0xff), got & 0, "{tier:?} outside");

@@ -216,15 +216,16 @@ impl View {
     fn jacobian_in_world<S: Simd>(&self, s: S, slopes: [S::F; 2], z: S::F) -> [[S::F; 3]; 2] {
         let inverse = s.splat(1.0) / z;
         let away = self.rows[2];
-        let row = |i: usize| {
+        let mut j = [[z; 3]; 2];
+        for i in 0..2 {
             let (low, high) = self.limit[i];
             let slope = s.min(s.max(slopes[i], s.splat(low)), s.splat(high));
             let f = s.splat(self.focal[i]) * inverse;
-            let axis = self.rows[i];
-            let entry = |c: usize| f * s.fnma(slope, s.splat(away[c]), s.splat(axis[c]));
-            [entry(0), entry(1), entry(2)]
-        };
-        [row(0), row(1)]
+            for c in 0..3 {
+                j[i][c] = f * s.fnma(slope, s.splat(away[c]), s.splat(self.rows[i][c]));
+            }
+        }
+        j
     }
 
     /// Sixteen footprints, colours 0: vector k holds field k of [`Footprint`], zeros
@@ -291,12 +292,30 @@ impl View {
         let (x0, x1) = self.extent(s, 0, u, half_width, radius);
         let (y0, y1) = self.extent(s, 1, v, half_height, radius);
         kept = kept & s.lt(x0, x1) & s.lt(y0, y1);
-        let int = |v: S::F| s.keep(kept, s.of_bits(s.to_int(v)));
-        let k = |v: S::F| s.keep(kept, v);
-        let fields = [
-            k(u), k(v), k(sx), k(shear), k(sy), k(power), zero, zero, zero,
-            k(p[2]), k(half_width), k(half_height), int(x0), int(y0), int(x1), int(y1),
+        let mut fields = [
+            u,
+            v,
+            sx,
+            shear,
+            sy,
+            power,
+            zero,
+            zero,
+            zero,
+            p[2],
+            half_width,
+            half_height,
+            x0,
+            y0,
+            x1,
+            y1,
         ];
+        for field in &mut fields[FIELDS - 4..] {
+            *field = s.of_bits(s.to_int(*field));
+        }
+        for field in &mut fields {
+            *field = s.keep(kept, *field);
+        }
         (fields, kept)
     }
 
@@ -365,11 +384,13 @@ fn covariance_quat<S: Simd>(
         [xy - wz, one - (xx + zz), yz + wx],
         [xz + wy, yz - wx, one - (xx + yy)],
     ];
-    let row = |i: usize| {
-        let entry = |k: usize| dot(s, j[i], axes[k]) * scale[k];
-        [entry(0), entry(1), entry(2)]
-    };
-    let (a, b) = (row(0), row(1));
+    let mut m = j;
+    for i in 0..2 {
+        for k in 0..3 {
+            m[i][k] = dot(s, j[i], axes[k]) * scale[k];
+        }
+    }
+    let [a, b] = m;
     let n = [
         s.fnma(a[2], b[1], a[1] * b[2]),
         s.fnma(a[0], b[2], a[2] * b[0]),
@@ -382,11 +403,7 @@ fn covariance_quat<S: Simd>(
 
 /// J·Σ·Jᵀ of given covariances, in `f64`: its determinant cancels in needles.
 #[inline(always)]
-fn covariance_cov6<S: Simd>(
-    s: S,
-    j: [[S::F; 3]; 2],
-    cov6: &[[f32; 6]; LANES],
-) -> Covariance2d<S> {
+fn covariance_cov6<S: Simd>(s: S, j: [[S::F; 3]; 2], cov6: &[[f32; 6]; LANES]) -> Covariance2d<S> {
     let mut rows = [[[0.0; LANES]; 3]; 2];
     for (to, from) in rows.iter_mut().zip(j) {
         for (to, from) in to.iter_mut().zip(from) {

@@ -361,14 +361,14 @@ impl Chunk<'_> {
             radiance_lanes(s, self.basis, d, splats.sh, &at.map(|p| p * set))
         };
         let (gain, residual) = self.gain(s, &index);
-        let (half, zero) = (s.splat(0.5), s.splat(0.0));
-        let channel = |c: usize| s.fma(gain, sum[c], half) + residual[c];
-        let rgb = [channel(0), channel(1), channel(2)];
-        let finite = |v: S::F| s.lt(s.abs(v), s.splat(f32::INFINITY));
-        let good = s.bits(finite(rgb[0]) & finite(rgb[1]) & finite(rgb[2]));
-        for (lanes, v) in lanes.iter_mut().zip(rgb) {
-            s.store(s.max(v, zero), lanes);
+        let (half, infinity) = (s.splat(0.5), s.splat(f32::INFINITY));
+        let mut good = s.lt(half, infinity);
+        for c in 0..3 {
+            let v = s.fma(gain, sum[c], half) + residual[c];
+            good = good & s.lt(s.abs(v), infinity);
+            s.store(s.max(v, s.splat(0.0)), &mut lanes[c]);
         }
+        let good = s.bits(good);
         for (l, &i) in group[..count].iter().enumerate() {
             let f = &mut self.footprints[i as usize];
             if good & (1 << l) != 0 {

@@ -18,25 +18,25 @@ pub fn degree_max(basis: ShBasis) -> usize {
 
 /// Basis functions of `basis` up to `degree` at the unit vector `d`; the rest is 0.
 pub fn basis(basis: ShBasis, degree: usize, d: [f32; 3]) -> [f32; SH_COEFFICIENTS_MAX] {
-    functions(basis, degree, d, |v| v)
+    functions(One, basis, degree, d)
 }
 
-/// One text for one direction and for lanes of them; `k` makes a constant.
+/// One text for one direction and for lanes of them.
 #[inline(always)]
-fn functions<T: Number>(
+fn functions<T: Number, K: Constants<T>>(
+    k: K,
     basis: ShBasis,
     degree: usize,
     d: [T; 3],
-    k: impl Fn(f32) -> T + Copy,
 ) -> [T; SH_COEFFICIENTS_MAX] {
     let [x, y, z] = d;
     match basis {
-        ShBasis::Standard => standard(degree, d, k),
+        ShBasis::Standard => standard(k, degree, d),
         ShBasis::Mvsplat => {
             let degree = degree.min(degree_max(ShBasis::Mvsplat));
-            let mut out = standard(degree, [z, x, y], k);
+            let mut out = standard(k, degree, [z, x, y]);
             if degree == 3 {
-                out[14] = k(1.445_305_7) * z * (z * z - x * x);
+                out[14] = k.of(1.445_305_7) * z * (z * z - x * x);
             }
             out
         }
@@ -47,52 +47,77 @@ fn functions<T: Number>(
 trait Number: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> {}
 impl<T: Copy + Add<Output = T> + Sub<Output = T> + Mul<Output = T>> Number for T {}
 
+/// What makes constants among them.
+trait Constants<T>: Copy {
+    fn of(self, v: f32) -> T;
+}
+
+#[derive(Clone, Copy)]
+struct One;
+
+impl Constants<f32> for One {
+    #[inline(always)]
+    fn of(self, v: f32) -> f32 {
+        v
+    }
+}
+
+#[derive(Clone, Copy)]
+struct Sixteen<S>(S);
+
+impl<S: Simd> Constants<S::F> for Sixteen<S> {
+    #[inline(always)]
+    fn of(self, v: f32) -> S::F {
+        self.0.splat(v)
+    }
+}
+
 #[inline(always)]
-fn standard<T: Number>(
+fn standard<T: Number, K: Constants<T>>(
+    k: K,
     degree: usize,
     [x, y, z]: [T; 3],
-    k: impl Fn(f32) -> T + Copy,
 ) -> [T; SH_COEFFICIENTS_MAX] {
-    let mut b = [k(0.0); SH_COEFFICIENTS_MAX];
-    b[0] = k(0.282_094_8);
+    let mut b = [k.of(0.0); SH_COEFFICIENTS_MAX];
+    b[0] = k.of(0.282_094_8);
     if degree == 0 {
         return b;
     }
-    b[1] = k(-0.488_602_52) * y;
-    b[2] = k(0.488_602_52) * z;
-    b[3] = k(-0.488_602_52) * x;
+    b[1] = k.of(-0.488_602_52) * y;
+    b[2] = k.of(0.488_602_52) * z;
+    b[3] = k.of(-0.488_602_52) * x;
     if degree == 1 {
         return b;
     }
     let (xx, yy, zz) = (x * x, y * y, z * z);
     let (xy, yz, xz) = (x * y, y * z, x * z);
-    b[4] = k(1.092_548_5) * xy;
-    b[5] = k(-1.092_548_5) * yz;
-    b[6] = k(0.315_391_57) * (k(2.0) * zz - xx - yy);
-    b[7] = k(-1.092_548_5) * xz;
-    b[8] = k(0.546_274_24) * (xx - yy);
+    b[4] = k.of(1.092_548_5) * xy;
+    b[5] = k.of(-1.092_548_5) * yz;
+    b[6] = k.of(0.315_391_57) * (k.of(2.0) * zz - xx - yy);
+    b[7] = k.of(-1.092_548_5) * xz;
+    b[8] = k.of(0.546_274_24) * (xx - yy);
     if degree == 2 {
         return b;
     }
-    b[9] = k(-0.590_043_6) * y * (k(3.0) * xx - yy);
-    b[10] = k(2.890_611_4) * xy * z;
-    b[11] = k(-0.457_045_8) * y * (k(4.0) * zz - xx - yy);
-    b[12] = k(0.373_176_34) * z * (k(2.0) * zz - k(3.0) * xx - k(3.0) * yy);
-    b[13] = k(-0.457_045_8) * x * (k(4.0) * zz - xx - yy);
-    b[14] = k(1.445_305_7) * z * (xx - yy);
-    b[15] = k(-0.590_043_6) * x * (xx - k(3.0) * yy);
+    b[9] = k.of(-0.590_043_6) * y * (k.of(3.0) * xx - yy);
+    b[10] = k.of(2.890_611_4) * xy * z;
+    b[11] = k.of(-0.457_045_8) * y * (k.of(4.0) * zz - xx - yy);
+    b[12] = k.of(0.373_176_34) * z * (k.of(2.0) * zz - k.of(3.0) * xx - k.of(3.0) * yy);
+    b[13] = k.of(-0.457_045_8) * x * (k.of(4.0) * zz - xx - yy);
+    b[14] = k.of(1.445_305_7) * z * (xx - yy);
+    b[15] = k.of(-0.590_043_6) * x * (xx - k.of(3.0) * yy);
     if degree == 3 {
         return b;
     }
-    b[16] = k(2.503_343) * xy * (xx - yy);
-    b[17] = k(-1.770_130_8) * yz * (k(3.0) * xx - yy);
-    b[18] = k(0.946_174_7) * xy * (k(7.0) * zz - k(1.0));
-    b[19] = k(-0.669_046_5) * yz * (k(7.0) * zz - k(3.0));
-    b[20] = k(0.105_785_55) * (zz * (k(35.0) * zz - k(30.0)) + k(3.0));
-    b[21] = k(-0.669_046_5) * xz * (k(7.0) * zz - k(3.0));
-    b[22] = k(0.473_087_34) * (xx - yy) * (k(7.0) * zz - k(1.0));
-    b[23] = k(-1.770_130_8) * xz * (xx - k(3.0) * yy);
-    b[24] = k(0.625_835_7) * (xx * (xx - k(3.0) * yy) - yy * (k(3.0) * xx - yy));
+    b[16] = k.of(2.503_343) * xy * (xx - yy);
+    b[17] = k.of(-1.770_130_8) * yz * (k.of(3.0) * xx - yy);
+    b[18] = k.of(0.946_174_7) * xy * (k.of(7.0) * zz - k.of(1.0));
+    b[19] = k.of(-0.669_046_5) * yz * (k.of(7.0) * zz - k.of(3.0));
+    b[20] = k.of(0.105_785_55) * (zz * (k.of(35.0) * zz - k.of(30.0)) + k.of(3.0));
+    b[21] = k.of(-0.669_046_5) * xz * (k.of(7.0) * zz - k.of(3.0));
+    b[22] = k.of(0.473_087_34) * (xx - yy) * (k.of(7.0) * zz - k.of(1.0));
+    b[23] = k.of(-1.770_130_8) * xz * (xx - k.of(3.0) * yy);
+    b[24] = k.of(0.625_835_7) * (xx * (xx - k.of(3.0) * yy) - yy * (k.of(3.0) * xx - yy));
     b
 }
 
@@ -122,7 +147,7 @@ pub(crate) fn radiance_lanes<S: Simd>(
 ) -> [S::F; 3] {
     let degree = degree.min(degree_max(kind));
     let used = sh_coefficients(degree);
-    let b = functions(kind, degree, d, |v| s.splat(v));
+    let b = functions(Sixteen(s), kind, degree, d);
     let mut rgb = [s.splat(0.0); 3];
     // Four coefficients are twelve floats, three transposed quads.
     let mut c = 0;
@@ -158,8 +183,7 @@ pub(crate) fn direction_lanes<S: Simd>(s: S, v: [S::F; 3]) -> [S::F; 3] {
     let norm = s.sqrt(s.fma(v[0], v[0], s.fma(v[1], v[1], v[2] * v[2])));
     let good = s.lt(s.splat(0.0), norm) & s.lt(norm, s.splat(f32::INFINITY));
     let inverse = s.keep(good, s.splat(1.0) / norm);
-    let along = |v: S::F| s.keep(good, v * inverse);
-    [along(v[0]), along(v[1]), along(v[2])]
+    [s.keep(good, v[0] * inverse), s.keep(good, v[1] * inverse), s.keep(good, v[2] * inverse)]
 }
 
 /// `v` / ‖v‖, or the zero vector where that has no direction.

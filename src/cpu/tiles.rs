@@ -316,8 +316,7 @@ impl TileLists {
             self.splats.resize(total, 0);
             self.order.resize(total, 0);
         }
-        let (entries, splats) =
-            (Disjoint::new(&mut self.entries), Disjoint::new(&mut self.splats));
+        let (entries, splats) = (Disjoint::new(&mut self.entries), Disjoint::new(&mut self.splats));
         let (grid, starts) = (self.grid, &self.starts);
         let rows = group.start / grid.columns..group.end.div_ceil(grid.columns);
         let chunks = self.covers.par_chunks(CHUNK).zip(&self.lens);

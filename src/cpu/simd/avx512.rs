@@ -241,27 +241,30 @@ impl Simd for Token {
             return [self.splat(0.0); 4];
         }
         unsafe {
-            let quad = |i: usize| _mm_loadu_ps(from.as_ptr().add(at[i] + offset));
+            let p = from.as_ptr().add(offset);
+            let mut joined = [_mm512_setzero_ps(); 4];
             // Rows i, i + 4, i + 8, i + 12 side by side: the 4×4 transposes inside
             // 128-bit parts then leave rows in order.
-            let join = |i: usize| {
-                let v = _mm512_castps128_ps512(quad(i));
-                let v = _mm512_insertf32x4::<1>(v, quad(i + 4));
-                let v = _mm512_insertf32x4::<2>(v, quad(i + 8));
-                _mm512_insertf32x4::<3>(v, quad(i + 12))
-            };
-            transpose4([join(0), join(1), join(2), join(3)]).map(F)
+            for i in 0..4 {
+                let v = _mm512_castps128_ps512(_mm_loadu_ps(p.add(at[i])));
+                let v = _mm512_insertf32x4::<1>(v, _mm_loadu_ps(p.add(at[i + 4])));
+                let v = _mm512_insertf32x4::<2>(v, _mm_loadu_ps(p.add(at[i + 8])));
+                joined[i] = _mm512_insertf32x4::<3>(v, _mm_loadu_ps(p.add(at[i + 12])));
+            }
+            let [a, b, c, d] = transpose4(joined);
+            [F(a), F(b), F(c), F(d)]
         }
     }
     #[inline(always)]
     fn transpose(self, v: [F; LANES]) -> [F; LANES] {
         unsafe {
-            let quad = |i: usize| transpose4([v[i].0, v[i + 1].0, v[i + 2].0, v[i + 3].0]);
             // q[a][c]: part b holds rows 4a..4a + 4 of column 4b + c.
-            let q = [quad(0), quad(4), quad(8), quad(12)];
+            let mut q = [[_mm512_setzero_ps(); 4]; 4];
+            for a in 0..4 {
+                q[a] = transpose4([v[4 * a].0, v[4 * a + 1].0, v[4 * a + 2].0, v[4 * a + 3].0]);
+            }
             let mut out = [F(_mm512_setzero_ps()); LANES];
-            let mut c = 0;
-            while c < 4 {
+            for c in 0..4 {
                 let low = _mm512_shuffle_f32x4::<0x88>(q[0][c], q[1][c]);
                 let high = _mm512_shuffle_f32x4::<0x88>(q[2][c], q[3][c]);
                 out[c] = F(_mm512_shuffle_f32x4::<0x88>(low, high));
@@ -270,7 +273,6 @@ impl Simd for Token {
                 let high = _mm512_shuffle_f32x4::<0xdd>(q[2][c], q[3][c]);
                 out[4 + c] = F(_mm512_shuffle_f32x4::<0x88>(low, high));
                 out[12 + c] = F(_mm512_shuffle_f32x4::<0xdd>(low, high));
-                c += 1;
             }
             out
         }

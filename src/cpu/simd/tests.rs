@@ -65,8 +65,14 @@ impl Kernel for Everything<'_> {
             put(&mut exact, s.scale(s.splat(1.25), e));
             let i = s.to_int(small) + s.splat_int(7);
             let by = i & s.splat_int(31);
-            for v in [s.shift(i, by), i, s.shl::<3>(i), s.shr::<5>(i), i & s.to_bits(b), i | (i - s.to_int(small))]
-            {
+            for v in [
+                s.shift(i, by),
+                i,
+                s.shl::<3>(i),
+                s.shr::<5>(i),
+                i & s.to_bits(b),
+                i | (i - s.to_int(small)),
+            ] {
                 s.store_int(v, &mut integers);
                 exact.extend(integers.map(|v| v as u32));
             }
