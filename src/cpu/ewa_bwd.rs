@@ -65,7 +65,8 @@ struct Jacobian {
 impl Jacobian {
     #[inline(always)]
     fn new(view: &View, mean: [f32; 3]) -> Self {
-        let p = view.to_camera(mean);
+        let d = [mean[0] - view.eye[0], mean[1] - view.eye[1], mean[2] - view.eye[2]];
+        let p = [dot(view.rows[0], d), dot(view.rows[1], d), dot(view.rows[2], d)];
         let at = |i: usize| {
             let (low, high) = view.limit[i];
             let ratio = p[i] / p[2];
@@ -134,7 +135,7 @@ pub(crate) struct QuatGradient {
     pub(crate) scale: [f32; 3],
 }
 
-/// Backward of [`View::project_quat`], the opacity's own share (Σ v / o) left out.
+/// Backward of [`View::project`] from quaternions, the opacity's own share (Σ v / o) left out.
 #[inline(always)]
 pub(crate) fn quat_gradient(
     view: &View,
@@ -204,7 +205,7 @@ pub(crate) struct Cov6Gradient {
     pub(crate) cov6: [f32; 6],
 }
 
-/// Backward of [`View::project_cov6`]; each off-diagonal number stands for two entries.
+/// Backward of [`View::project`] from covariances; each off-diagonal number stands for two entries.
 #[inline(always)]
 pub(crate) fn cov6_gradient(
     view: &View,

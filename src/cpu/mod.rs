@@ -4,15 +4,17 @@
 //! fail. This is the only room where `unsafe` may appear.
 //!
 //! The rasterizer's stages, one file each: [`ewa`] (one splat), `project` (all
-//! splats), `sort` (depth order), `tiles` (lists), `blend` (one tile), `rasterize`
-//! (the frame).
+//! splats), `tiles` (lists), `sort` (depth order in a tile), `blocks` and `blend` (one
+//! tile), `rasterize` (the frame).
 
 pub mod activation;
 pub mod attention;
 pub mod attention_gather;
 mod blend;
+mod blocks;
 pub mod conv2d;
 pub mod detail;
+mod disjoint;
 pub mod ewa;
 mod ewa_bwd;
 pub mod gemm;
@@ -37,5 +39,6 @@ mod tiles;
 
 pub use project::{Geometry, SplatSlices};
 pub use project_bwd::Gradients;
-pub use raster_bwd::Frame;
-pub use rasterize::{Rasterizer, Rendered, Stats};
+pub use raster_bwd::{BackwardTimes, Frame};
+pub use rasterize::{Rasterizer, Rendered, StageTimes, Stats};
+pub use simd::Tier;

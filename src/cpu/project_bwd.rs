@@ -12,12 +12,11 @@ use crate::abi::{
 };
 use crate::cpu::ewa::{Footprint, View};
 use crate::cpu::ewa_bwd::{Moments, Whitening, cov6_gradient, quat_gradient};
-use crate::cpu::math::vectorised;
-use crate::cpu::project::{Geometry, SplatSlices, lanes, minus};
-use crate::cpu::raster_bwd_tile::SUMS;
+use crate::cpu::project::{Geometry, SplatSlices, lanes_at};
+use crate::cpu::raster_bwd_tile::{PairSums, SUMS};
 use crate::cpu::sh_bwd::{used_coefficients, values_and_slope};
+use crate::cpu::simd::{Kernel, Simd, Tier};
 use rayon::prelude::*;
-use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 /// Splats side by side.
 const GROUP: usize = 16;
@@ -25,9 +24,6 @@ const GROUP: usize = 16;
 const PART: usize = 2048;
 
 type L = [f32; GROUP];
-
-/// Sums of one splat over all tiles, as bits.
-pub(crate) type SplatSums = [AtomicU32; SUMS];
 
 /// Gradients of a scalar loss with respect to what [`SplatSlices`] holds, in its
 /// layouts; buffers are reused from call to call. Splats that were dropped, and all that
@@ -82,7 +78,7 @@ pub(crate) struct Pass<'a> {
     /// `[N]`.
     pub(crate) footprints: &'a [Footprint],
     /// `[N]`; read where the footprint is visible.
-    pub(crate) sums: &'a [SplatSums],
+    pub(crate) sums: &'a [PairSums],
     /// `[P]`: Σ sh·Y of each parent ([`ShDirection::Parent`] only).
     pub(crate) radiance: &'a [[f32; 3]],
 }
@@ -133,9 +129,21 @@ struct Directions {
     slope: [L; 3],
 }
 
+/// One part of a pass, compiled for a tier.
+struct PartOf<'a, 'b>(&'a Pass<'b>, Part<'a>);
+
+impl Kernel for PartOf<'_, '_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        self.0.part(self.1);
+    }
+}
+
 impl Pass<'_> {
     /// Fills `out`, the background's gradient apart.
-    pub(crate) fn run(&self, out: &mut Gradients) {
+    pub(crate) fn run(&self, tier: Tier, out: &mut Gradients) {
         let n = self.splats.len();
         out.fit(self.splats);
         let children = self.splats.children_per_parent();
@@ -162,7 +170,7 @@ impl Pass<'_> {
                 gain: gain.next().unwrap_or_default(),
             })
             .collect();
-        parts.into_par_iter().for_each(|part| vectorised(|| self.part(part)));
+        parts.into_par_iter().for_each(|part| tier.run(PartOf(self, part)));
     }
 
     #[inline(always)]
@@ -207,13 +215,13 @@ impl Pass<'_> {
                     put(&mut group.mean, l, self.splats.mean(i));
                     match self.splats.geometry {
                         Geometry::Packed(rows) => {
-                            let row: [f32; SPLAT_LANES] = lanes(rows, i * SPLAT_LANES);
-                            put::<4>(&mut group.quat, l, lanes(&row, LANE_QUAT));
-                            put::<3>(&mut group.scale, l, lanes(&row, LANE_SCALE));
+                            let row: [f32; SPLAT_LANES] = lanes_at(rows, i * SPLAT_LANES);
+                            put::<4>(&mut group.quat, l, lanes_at(&row, LANE_QUAT));
+                            put::<3>(&mut group.scale, l, lanes_at(&row, LANE_SCALE));
                             group.opacity[l] = row[LANE_OPACITY];
                         }
                         Geometry::Cov6 { cov6, opacities, .. } => {
-                            put::<6>(&mut group.cov6, l, lanes(cov6, 6 * i));
+                            put::<6>(&mut group.cov6, l, lanes_at(cov6, 6 * i));
                             group.opacity[l] = opacities[i];
                         }
                     }
@@ -237,8 +245,7 @@ impl Pass<'_> {
     /// The sums of visible splat `i`, those of a clamped colour channel as 0.
     #[inline(always)]
     fn sums_of(&self, i: usize) -> [f32; SUMS] {
-        let mut sums: [f32; SUMS] =
-            std::array::from_fn(|k| f32::from_bits(self.sums[i][k].load(Relaxed)));
+        let mut sums = self.sums[i];
         for (v, colour) in sums[6..9].iter_mut().zip(self.footprints[i].rgb) {
             *v = if colour > 0.0 { *v } else { 0.0 };
         }
@@ -285,14 +292,14 @@ impl Pass<'_> {
             put(&mut seen.towards, l, towards);
         }
         for l in lanes_of(alive) {
-            let sh = self.splats.sh_of_parent((part.first + at + l) / children);
+            let sh = sh_of_parent(self.splats, (part.first + at + l) / children);
             seen.weigh(l, used, sh, get(&group.sums, l)[6..9].try_into().unwrap_or_default());
         }
         seen.evaluate(used, self.options.sh_basis);
         let set = 3 * sh_coefficients(self.splats.sh_degree);
         for l in lanes_of(alive) {
             let i = part.first + at + l;
-            let (gain, _) = self.splats.gain_of(i);
+            let gain = gain_of(self.splats, i);
             let rgb = [group.sums[6][l], group.sums[7][l], group.sums[8][l]];
             for c in 0..3 {
                 group.d_mean[c][l] += gain * seen.slope[c][l];
@@ -343,7 +350,7 @@ impl Pass<'_> {
                     if !self.footprints[i].visible() {
                         continue;
                     }
-                    let (gain, sums) = (self.splats.gain_of(i).0, self.sums_of(i));
+                    let (gain, sums) = (gain_of(self.splats, i), self.sums_of(i));
                     for c in 0..3 {
                         weighted[l][c] += gain * sums[6 + c];
                     }
@@ -353,7 +360,7 @@ impl Pass<'_> {
             }
             for l in lanes_of(alive) {
                 let p = part.first / children + first + l;
-                seen.weigh(l, used, self.splats.sh_of_parent(p), weighted[l]);
+                seen.weigh(l, used, sh_of_parent(self.splats, p), weighted[l]);
             }
             seen.evaluate(used, self.options.sh_basis);
             for l in lanes_of(alive) {
@@ -511,6 +518,24 @@ fn set<const N: usize>(to: &mut [f32], at: usize, values: [f32; N]) {
     if let Some(to) = to.get_mut(at..at + N) {
         to.copy_from_slice(&values);
     }
+}
+
+#[inline(always)]
+fn minus(a: [f32; 3], b: [f32; 3]) -> [f32; 3] {
+    [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
+}
+
+#[inline(always)]
+fn sh_of_parent<'a>(splats: &SplatSlices<'a>, p: usize) -> &'a [f32] {
+    let set = 3 * sh_coefficients(splats.sh_degree);
+    splats.sh.get(p * set..(p + 1) * set).unwrap_or(&[])
+}
+
+/// γ of splat `i`.
+#[inline(always)]
+fn gain_of(splats: &SplatSlices, i: usize) -> f32 {
+    let lanes = splats.gain.len() / splats.len().max(1);
+    splats.gain.get(i * lanes).copied().filter(|_| lanes > 0).unwrap_or(1.0)
 }
 
 /// Positions of the set bits.

@@ -1,12 +1,12 @@
 //! The whole backward pass: tiles, then a gather over each splat's tiles, then one pass
 //! over all splats.
 //!
-//! In: the gradient of a scalar loss with respect to the five planes that
-//! [`Rasterizer::render_planes`] gives. Out: [`Gradients`], exact for the piecewise
+//! In: the five planes that [`Rasterizer::render_planes`] gave, and the gradient of a
+//! scalar loss with respect to them. Out: [`Gradients`], exact for the piecewise
 //! function that the forward is: nothing passes a capped alpha, a clamped colour or a
-//! cull; directions of SH are not detached. No atomic sum anywhere: each
-//! (splat, tile) pair has its own row, rows are added in the order of tiles, so the
-//! same bytes come out for any number of threads.
+//! cull; directions of SH are not detached. No atomic sum anywhere: each (splat, tile)
+//! pair has its own row, rows are added in the order of tiles, so the same bytes come
+//! out for any number of threads.
 //!
 //! Memory beyond the forward's: 40 bytes a pair, at most [`PAIRS_PER_GROUP`] at a time
 //! (or one tile's), and 40 bytes a splat.
@@ -14,36 +14,51 @@
 use crate::abi::RasterOptions;
 use crate::camera::Camera;
 use crate::cpu::blend::Rules;
+use crate::cpu::disjoint::Disjoint;
 use crate::cpu::ewa::View;
-use crate::cpu::math::vectorised;
 use crate::cpu::project::SplatSlices;
-use crate::cpu::project_bwd::{Gradients, Pass, SplatSums};
-use crate::cpu::raster_bwd_tile::{PairSums, Report, SUMS, Upstream, backward};
-use crate::cpu::rasterize::Rasterizer;
+use crate::cpu::project_bwd::{Gradients, Pass};
+use crate::cpu::raster_bwd_tile::{PairSums, Pixels, SUMS, WalkTile};
+use crate::cpu::rasterize::{Rasterizer, since};
+use crate::cpu::sort::depth_order;
 use rayon::prelude::*;
 use std::ops::Range;
-use std::sync::atomic::Ordering::Relaxed;
+use std::time::Duration;
 
 /// Most (splat, tile) pairs whose sums are held at a time: 160 MiB.
 const PAIRS_PER_GROUP: usize = 1 << 22;
+
+/// Where the last backward's time went; zeros unless asked for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct BackwardTimes {
+    /// Walking the tiles (and listing them again, where they did not fit one group).
+    pub tiles: Duration,
+    /// Adding up each splat's tiles.
+    pub gather: Duration,
+    /// From sums to gradients.
+    pub splats: Duration,
+}
 
 /// Buffers of the backward pass, reused from call to call.
 #[derive(Debug, Default)]
 pub(crate) struct Buffers {
     /// A row per pair of the group at hand, in the order of its lists.
     pairs: Vec<PairSums>,
-    /// `[tiles]`.
-    reports: Vec<Report>,
-    /// `[N]`.
-    sums: Vec<SplatSums>,
+    /// `[N]`; only those of visible splats are meant.
+    sums: Vec<PairSums>,
+    /// `[tiles]`: gradients of the background.
+    background: Vec<[f64; 3]>,
+    /// The picture, where the caller did not keep it.
+    planes: Vec<f32>,
+    times: BackwardTimes,
 }
 
 impl Buffers {
     /// Bytes held.
     pub(crate) fn bytes(&self) -> usize {
-        self.pairs.capacity() * size_of::<PairSums>()
-            + self.reports.capacity() * size_of::<Report>()
-            + self.sums.capacity() * size_of::<SplatSums>()
+        (self.pairs.capacity() + self.sums.capacity()) * size_of::<PairSums>()
+            + self.background.capacity() * size_of::<[f64; 3]>()
+            + 4 * self.planes.capacity()
     }
 }
 
@@ -55,13 +70,21 @@ pub struct Frame<'r, 's> {
     splats: SplatSlices<'s>,
     camera: Camera,
     options: RasterOptions,
+    planes: &'r [f32],
 }
 
 impl Frame<'_, '_> {
+    /// `[5, H, W]`: R, G, B, alpha, Σ w·z.
+    pub fn planes(&self) -> &[f32] {
+        self.planes
+    }
+
     /// Gradients of a loss whose gradient with respect to the frame's planes
-    /// `[5, H, W]` (R, G, B, alpha, Σ w·z) is `planes`.
-    pub fn backward(&mut self, planes: &[f32], out: &mut Gradients) {
-        self.rasterizer.backward_of_last(&self.splats, &self.camera, &self.options, planes, out);
+    /// `[5, H, W]` (R, G, B, alpha, Σ w·z) is `gradients`; zeros where that has another
+    /// size.
+    pub fn backward(&mut self, gradients: &[f32], out: &mut Gradients) {
+        let pixels = Pixels { planes: self.planes, gradients };
+        self.rasterizer.backward_of_last(&self.splats, &self.camera, &self.options, pixels, out);
     }
 }
 
@@ -73,124 +96,132 @@ impl Rasterizer {
         splats: SplatSlices<'s>,
         camera: &Camera,
         options: &RasterOptions,
-        planes: &mut Vec<f32>,
+        planes: &'r mut Vec<f32>,
     ) -> Frame<'r, 's> {
         self.render_planes(&splats, camera, options, planes);
-        Frame { rasterizer: self, splats, camera: *camera, options: *options }
+        Frame { rasterizer: self, splats, camera: *camera, options: *options, planes }
     }
 
     /// Forward and backward: gradients of a loss whose gradient with respect to the
-    /// planes `[5, H, W]` of this view (R, G, B, alpha, Σ w·z) is `planes`.
+    /// planes `[5, H, W]` of this view (R, G, B, alpha, Σ w·z) is `gradients`; zeros
+    /// where that has another size.
     pub fn backward(
         &mut self,
         splats: &SplatSlices,
         camera: &Camera,
         options: &RasterOptions,
-        planes: &[f32],
+        gradients: &[f32],
         out: &mut Gradients,
     ) {
-        self.composite(splats, camera, options);
-        self.backward_of_last(splats, camera, options, planes, out);
+        let mut planes = std::mem::take(&mut self.back.planes);
+        self.render_planes(splats, camera, options, &mut planes);
+        let pixels = Pixels { planes: &planes, gradients };
+        self.backward_of_last(splats, camera, options, pixels, out);
+        self.back.planes = planes;
     }
 
-    /// The backward pass of the last frame, whose splats, camera and options these must
-    /// be. Planes of another size count as zeros.
+    /// Where the last backward's time went; zeros without
+    /// [`Rasterizer::with_stage_times`].
+    pub fn backward_times(&self) -> BackwardTimes {
+        self.back.times
+    }
+
+    /// The backward pass of the last frame, whose splats, camera, options and planes
+    /// these must be.
     pub(crate) fn backward_of_last(
         &mut self,
         splats: &SplatSlices,
         camera: &Camera,
         options: &RasterOptions,
-        planes: &[f32],
+        pixels: Pixels,
         out: &mut Gradients,
     ) {
-        let tiles = self.grid.len();
-        let fits = planes.len() == 5 * self.grid.width * self.grid.height
-            && self.projection.footprints.len() == splats.len();
-        debug_assert!(fits, "gradient planes or splats that do not fit the last frame");
-        if !fits {
+        let (tiles, numbers) = (self.grid.len(), 5 * self.grid.width * self.grid.height);
+        let fits = pixels.planes.len() == numbers && pixels.gradients.len() == numbers;
+        if !fits || self.projection.footprints.len() != splats.len() {
             return out.clear(splats);
         }
-        let upstream = Upstream { planes, background: options.background };
-        let buffers = &mut self.back;
-        buffers.reports.clear();
-        buffers.reports.resize(tiles, Report::default());
-        buffers.sums.resize_with(splats.len(), Default::default);
+        let mut times = BackwardTimes::default();
+        self.back.background.clear();
+        self.back.background.resize(tiles, [0.0; 3]);
+        self.back.sums.resize(splats.len(), [0.0; SUMS]);
         let mut first = 0;
         while first < tiles {
+            let start = self.now();
             let group = self.lists.group_within(first, PAIRS_PER_GROUP);
-            if group != self.lists.filled() {
-                if first == 0 {
-                    self.lists.count(self.grid, &self.order, &self.projection.footprints);
-                }
-                self.lists.fill(&group, &self.order, &self.projection.footprints);
+            let listed = group == self.lists.filled();
+            if !listed {
+                self.lists.fill_again(&group, &self.projection.footprints);
             }
-            self.walk_group(group.clone(), Rules::new(options.convention), upstream);
+            self.walk_group(group.clone(), listed, Rules::new(options.convention), pixels);
+            times.tiles += since(start);
+            let start = self.now();
             self.gather_group(&group);
+            times.gather += since(start);
             first = group.end;
         }
-        let mut background = [0.0f64; 3];
-        for report in &self.back.reports {
-            for (sum, v) in background.iter_mut().zip(report.background) {
-                *sum += v;
-            }
-        }
+        let start = self.now();
         let pass = Pass {
             splats,
             view: &View::new(camera, options),
             options,
             footprints: &self.projection.footprints,
             sums: &self.back.sums,
-            radiance: self.projection.parents(),
+            radiance: &self.projection.parents,
         };
-        pass.run(out);
+        pass.run(self.tier, out);
+        let mut background = [0.0f64; 3];
+        for tile in &self.back.background {
+            for (sum, v) in background.iter_mut().zip(tile) {
+                *sum += v;
+            }
+        }
         out.background = background.map(|v| v as f32);
+        times.splats = since(start);
+        self.back.times = times;
     }
 
-    /// The backward of one group of tiles, those with the longest lists first.
-    fn walk_group(&mut self, group: Range<usize>, rules: Rules, upstream: Upstream) {
-        let Buffers { pairs, reports, .. } = &mut self.back;
-        let (lists, grid, slots) = (&self.lists, &self.grid, &self.slots);
-        let footprints = &self.projection.footprints;
-        let total: usize = group.clone().map(|t| lists.tile_len(t)).sum();
+    /// The backward of one group of tiles, those with the longest lists first; sorts
+    /// their lists unless the forward did.
+    fn walk_group(&mut self, group: Range<usize>, listed: bool, rules: Rules, pixels: Pixels) {
+        let Buffers { pairs, background, .. } = &mut self.back;
+        let total: usize = group.clone().map(|t| self.lists.tile_len(t)).sum();
         if pairs.len() < total {
             pairs.resize(total, [0.0; SUMS]);
         }
-        let mut rest = &mut pairs[..total];
-        let mut work = Vec::with_capacity(group.len());
-        for (t, report) in group.clone().zip(&mut reports[group]) {
-            let (rows, tail) = rest.split_at_mut(lists.tile_len(t));
-            rest = tail;
-            work.push((t, rows, report));
-        }
-        work.sort_unstable_by_key(|(t, rows, _)| (std::cmp::Reverse(rows.len()), *t));
-        let slot_of_tile = &self.slot_of_tile;
-        work.into_par_iter().with_max_len(1).for_each(|(t, rows, report)| {
-            let done = (&slots[slot_of_tile[t]], rules);
-            let list = lists.list(t);
-            *report = vectorised(|| backward((t, grid), list, footprints, done, upstream, rows));
+        let mut queue: Vec<usize> = group.collect();
+        queue.sort_unstable_by_key(|&t| (std::cmp::Reverse(self.lists.tile_len(t)), t));
+        let (grid, tier) = (self.grid, self.tier);
+        let footprints = &self.projection.footprints;
+        let (pairs, background) = (Disjoint::new(pairs), Disjoint::new(background));
+        let lists = self.lists.lists();
+        queue.into_par_iter().with_max_len(1).for_each(|t| {
+            // SAFETY: the queue names each tile once, and no two tiles share a place.
+            let (list, rows) = unsafe { (lists.take(t), pairs.part(lists.places(t))) };
+            if !listed {
+                depth_order(list.entries, list.spare, list.order);
+            }
+            let (order, splats) = (&*list.order, list.splats);
+            let work = WalkTile { t, grid, order, splats, footprints, rules, pixels, rows };
+            let seen = tier.run(work);
+            // SAFETY: as above.
+            unsafe { background.write(t, seen) };
         });
     }
 
     /// Adds the rows of `group` to the sums of their splats, tile by tile.
     fn gather_group(&mut self, group: &Range<usize>) {
-        let Buffers { pairs, reports, sums } = &self.back;
-        let (lists, first_group) = (&self.lists, group.start == 0);
-        lists.visit(group, &self.order, &self.projection.footprints, |splat, slots| {
-            let target = &sums[splat as usize];
-            let mut sum: PairSums = if first_group {
-                [0.0; SUMS]
-            } else {
-                std::array::from_fn(|k| f32::from_bits(target[k].load(Relaxed)))
-            };
-            slots(&mut |t, position, slot| {
-                if position < reports[t].reached {
-                    for (s, v) in sum.iter_mut().zip(pairs[slot]) {
-                        *s += v;
-                    }
+        let Buffers { pairs, sums, .. } = &mut self.back;
+        let fresh = group.start == 0;
+        let pairs = &*pairs;
+        self.lists.gather(group, &self.projection.footprints, sums, |sum, slots| {
+            if fresh {
+                *sum = [0.0; SUMS];
+            }
+            for &slot in slots {
+                for (s, v) in sum.iter_mut().zip(pairs[slot as usize]) {
+                    *s += v;
                 }
-            });
-            for (to, s) in target.iter().zip(sum) {
-                to.store(s.to_bits(), Relaxed);
             }
         });
     }

@@ -22,6 +22,9 @@ use std::sync::OnceLock;
 /// Lanes of a vector, in every tier.
 pub const LANES: usize = 16;
 
+/// Relative error of [`Simd::rough_sqrt`]: AVX2's reciprocal root has 11.4 bits.
+pub(crate) const ROUGH: f32 = 4e-4;
+
 /// An instruction set that kernels are compiled for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Tier {
@@ -171,6 +174,9 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     /// a > b ? a : b.
     fn max(self, a: Self::F, b: Self::F) -> Self::F;
     fn sqrt(self, v: Self::F) -> Self::F;
+    /// √v to a relative [`ROUGH`] for v ≥ [`f32::MIN_POSITIVE`]: the one operation in
+    /// which tiers differ, for tests that leave a margin.
+    fn rough_sqrt(self, v: Self::F) -> Self::F;
     fn abs(self, v: Self::F) -> Self::F;
     fn floor(self, v: Self::F) -> Self::F;
     fn ceil(self, v: Self::F) -> Self::F;
@@ -206,23 +212,29 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     fn of_int(self, v: Self::I) -> Self::F;
     /// v << N.
     fn shl<const N: u32>(self, v: Self::I) -> Self::I;
+    /// v << by, 0 ≤ by < 32.
+    fn shift(self, v: Self::I, by: Self::I) -> Self::I;
     /// v >> N, the sign kept.
     fn shr<const N: u32>(self, v: Self::I) -> Self::I;
 
+    /// Asks for the cache line at `v`.
+    fn prefetch<T>(self, v: &T);
     /// Sum of the lanes: lane i + lane (i + 8), then + 4, + 2, + 1.
     fn sum(self, v: Self::F) -> f32;
     /// Four floats at each of 16 places of `from`, as four vectors: lane i of
-    /// vector c is `from[at[i] + c]`. Zeros if any of them lies outside.
-    fn load4(self, from: &[f32], at: &[usize; LANES]) -> [Self::F; 4];
+    /// vector c is `from[at[i] + offset + c]`. Zeros if any of them lies outside.
+    fn load4(self, from: &[f32], at: &[usize; LANES], offset: usize) -> [Self::F; 4];
     /// Rows and columns exchanged: lane j of vector i goes to lane i of vector j.
     fn transpose(self, v: [Self::F; LANES]) -> [Self::F; LANES];
 }
 
-/// Whether four floats at each place of `at` lie inside `len`.
+/// Whether four floats from `offset` past each place of `at` lie inside `len`.
 #[inline(always)]
-fn all_inside(len: usize, at: &[usize; LANES]) -> bool {
+fn all_inside(len: usize, at: &[usize; LANES], offset: usize) -> bool {
     let most = at.iter().fold(0, |m, &a| if a > m { a } else { m });
-    len >= 4 && most <= len - 4
+    // No sum can wrap: slices are shorter than half of what a usize counts.
+    let room = len.wrapping_sub(offset).wrapping_sub(4);
+    len >= 4 && offset <= len - 4 && most <= room
 }
 
 /// 2^p to 2 ulp for −125 ≤ p ≤ 126, any number elsewhere: the nearest whole number by

@@ -161,6 +161,10 @@ macro_rules! tier {
                 F(map(v.0, f32::sqrt))
             }
             #[inline(always)]
+            fn rough_sqrt(self, v: F) -> F {
+                self.sqrt(v)
+            }
+            #[inline(always)]
             fn abs(self, v: F) -> F {
                 F(map(v.0, f32::abs))
             }
@@ -255,9 +259,15 @@ macro_rules! tier {
                 I(map(v.0, |v| v << N))
             }
             #[inline(always)]
+            fn shift(self, v: I, by: I) -> I {
+                I(zip(v.0, by.0, |v, by| v << (by & 31)))
+            }
+            #[inline(always)]
             fn shr<const N: u32>(self, v: I) -> I {
                 I(map(v.0, |v| v >> N))
             }
+            #[inline(always)]
+            fn prefetch<T>(self, _: &T) {}
             #[inline(always)]
             fn sum(self, v: F) -> f32 {
                 let mut v = v.0;
@@ -269,11 +279,11 @@ macro_rules! tier {
                 v[0]
             }
             #[inline(always)]
-            fn load4(self, from: &[f32], at: &[usize; LANES]) -> [F; 4] {
+            fn load4(self, from: &[f32], at: &[usize; LANES], offset: usize) -> [F; 4] {
                 let mut out = [[0.0; LANES]; 4];
-                if all_inside(from.len(), at) {
+                if all_inside(from.len(), at, offset) {
                     for i in 0..LANES {
-                        for (c, v) in from[at[i]..at[i] + 4].iter().enumerate() {
+                        for (c, v) in from[at[i] + offset..at[i] + offset + 4].iter().enumerate() {
                             out[c][i] = *v;
                         }
                     }

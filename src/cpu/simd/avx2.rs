@@ -146,6 +146,12 @@ impl Simd for Token {
         unsafe { F(_mm256_sqrt_ps(v.0), _mm256_sqrt_ps(v.1)) }
     }
     #[inline(always)]
+    fn rough_sqrt(self, v: F) -> F {
+        unsafe {
+            F(_mm256_mul_ps(v.0, _mm256_rsqrt_ps(v.0)), _mm256_mul_ps(v.1, _mm256_rsqrt_ps(v.1)))
+        }
+    }
+    #[inline(always)]
     fn abs(self, v: F) -> F {
         unsafe {
             let sign = _mm256_set1_ps(-0.0);
@@ -246,6 +252,10 @@ impl Simd for Token {
         }
     }
     #[inline(always)]
+    fn shift(self, v: I, by: I) -> I {
+        unsafe { I(_mm256_sllv_epi32(v.0, by.0), _mm256_sllv_epi32(v.1, by.1)) }
+    }
+    #[inline(always)]
     fn shr<const N: u32>(self, v: I) -> I {
         let n = N as i32;
         unsafe {
@@ -255,19 +265,30 @@ impl Simd for Token {
     }
 
     #[inline(always)]
+    fn prefetch<T>(self, v: &T) {
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(v).cast()) }
+    }
+    #[inline(always)]
     fn sum(self, v: F) -> f32 {
         unsafe { sum8(_mm256_add_ps(v.0, v.1)) }
     }
     #[inline(always)]
-    fn load4(self, from: &[f32], at: &[usize; LANES]) -> [F; 4] {
-        if !all_inside(from.len(), at) {
+    fn load4(self, from: &[f32], at: &[usize; LANES], offset: usize) -> [F; 4] {
+        if !all_inside(from.len(), at, offset) {
             return [self.splat(0.0); 4];
         }
         unsafe {
-            let quad = |i: usize| _mm_loadu_ps(from.as_ptr().add(at[i]));
-            let join = |i: usize| _mm256_set_m128(quad(i + 4), quad(i));
-            let low = transpose4([join(0), join(1), join(2), join(3)]);
-            let high = transpose4([join(8), join(9), join(10), join(11)]);
+            let p = from.as_ptr().add(offset);
+            let mut halves = [[_mm256_setzero_ps(); 4]; 2];
+            for (h, half) in halves.iter_mut().enumerate() {
+                for i in 0..4 {
+                    let low = _mm_loadu_ps(p.add(at[8 * h + i]));
+                    let high = _mm_loadu_ps(p.add(at[8 * h + i + 4]));
+                    half[i] = _mm256_set_m128(high, low);
+                }
+                *half = transpose4(*half);
+            }
+            let [low, high] = halves;
             [F(low[0], high[0]), F(low[1], high[1]), F(low[2], high[2]), F(low[3], high[3])]
         }
     }
@@ -275,25 +296,22 @@ impl Simd for Token {
     fn transpose(self, v: [F; LANES]) -> [F; LANES] {
         unsafe {
             let mut out = v;
-            let mut half = 0;
-            while half < 2 {
-                let base = 8 * half;
-                let left = |i: usize| v[base + i].0;
-                let right = |i: usize| v[base + i].1;
-                let l = transpose8([0, 1, 2, 3, 4, 5, 6, 7].map(left));
-                let r = transpose8([0, 1, 2, 3, 4, 5, 6, 7].map(right));
-                let mut i = 0;
-                while i < 8 {
-                    if half == 0 {
-                        out[i].0 = l[i];
-                        out[8 + i].0 = r[i];
-                    } else {
-                        out[i].1 = l[i];
-                        out[8 + i].1 = r[i];
-                    }
-                    i += 1;
+            for h in 0..2 {
+                let (mut left, mut right) = ([v[0].0; 8], [v[0].0; 8]);
+                for i in 0..8 {
+                    left[i] = v[8 * h + i].0;
+                    right[i] = v[8 * h + i].1;
                 }
-                half += 1;
+                let (left, right) = (transpose8(left), transpose8(right));
+                for i in 0..8 {
+                    if h == 0 {
+                        out[i].0 = left[i];
+                        out[8 + i].0 = right[i];
+                    } else {
+                        out[i].1 = left[i];
+                        out[8 + i].1 = right[i];
+                    }
+                }
             }
             out
         }
@@ -321,11 +339,9 @@ unsafe fn transpose8(v: [__m256; 8]) -> [__m256; 8] {
         let low = transpose4([v[0], v[1], v[2], v[3]]);
         let high = transpose4([v[4], v[5], v[6], v[7]]);
         let (mut out, mut upper) = (low, high);
-        let mut i = 0;
-        while i < 4 {
+        for i in 0..4 {
             out[i] = _mm256_permute2f128_ps::<0x20>(low[i], high[i]);
             upper[i] = _mm256_permute2f128_ps::<0x31>(low[i], high[i]);
-            i += 1;
         }
         [out[0], out[1], out[2], out[3], upper[0], upper[1], upper[2], upper[3]]
     }

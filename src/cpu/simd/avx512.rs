@@ -130,6 +130,10 @@ impl Simd for Token {
         F(unsafe { _mm512_sqrt_ps(v.0) })
     }
     #[inline(always)]
+    fn rough_sqrt(self, v: F) -> F {
+        F(unsafe { _mm512_mul_ps(v.0, _mm512_rsqrt14_ps(v.0)) })
+    }
+    #[inline(always)]
     fn abs(self, v: F) -> F {
         F(unsafe { _mm512_abs_ps(v.0) })
     }
@@ -212,10 +216,18 @@ impl Simd for Token {
         I(unsafe { _mm512_slli_epi32::<N>(v.0) })
     }
     #[inline(always)]
+    fn shift(self, v: I, by: I) -> I {
+        I(unsafe { _mm512_sllv_epi32(v.0, by.0) })
+    }
+    #[inline(always)]
     fn shr<const N: u32>(self, v: I) -> I {
         I(unsafe { _mm512_srai_epi32::<N>(v.0) })
     }
 
+    #[inline(always)]
+    fn prefetch<T>(self, v: &T) {
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(v).cast()) }
+    }
     #[inline(always)]
     fn sum(self, v: F) -> f32 {
         unsafe {
@@ -224,32 +236,35 @@ impl Simd for Token {
         }
     }
     #[inline(always)]
-    fn load4(self, from: &[f32], at: &[usize; LANES]) -> [F; 4] {
-        if !all_inside(from.len(), at) {
+    fn load4(self, from: &[f32], at: &[usize; LANES], offset: usize) -> [F; 4] {
+        if !all_inside(from.len(), at, offset) {
             return [self.splat(0.0); 4];
         }
         unsafe {
-            let quad = |i: usize| _mm_loadu_ps(from.as_ptr().add(at[i]));
+            let p = from.as_ptr().add(offset);
+            let mut joined = [_mm512_setzero_ps(); 4];
             // Rows i, i + 4, i + 8, i + 12 side by side: the 4×4 transposes inside
             // 128-bit parts then leave rows in order.
-            let join = |i: usize| {
-                let v = _mm512_castps128_ps512(quad(i));
-                let v = _mm512_insertf32x4::<1>(v, quad(i + 4));
-                let v = _mm512_insertf32x4::<2>(v, quad(i + 8));
-                _mm512_insertf32x4::<3>(v, quad(i + 12))
-            };
-            transpose4([join(0), join(1), join(2), join(3)]).map(F)
+            for i in 0..4 {
+                let v = _mm512_castps128_ps512(_mm_loadu_ps(p.add(at[i])));
+                let v = _mm512_insertf32x4::<1>(v, _mm_loadu_ps(p.add(at[i + 4])));
+                let v = _mm512_insertf32x4::<2>(v, _mm_loadu_ps(p.add(at[i + 8])));
+                joined[i] = _mm512_insertf32x4::<3>(v, _mm_loadu_ps(p.add(at[i + 12])));
+            }
+            let [a, b, c, d] = transpose4(joined);
+            [F(a), F(b), F(c), F(d)]
         }
     }
     #[inline(always)]
     fn transpose(self, v: [F; LANES]) -> [F; LANES] {
         unsafe {
-            let quad = |i: usize| transpose4([v[i].0, v[i + 1].0, v[i + 2].0, v[i + 3].0]);
             // q[a][c]: part b holds rows 4a..4a + 4 of column 4b + c.
-            let q = [quad(0), quad(4), quad(8), quad(12)];
+            let mut q = [[_mm512_setzero_ps(); 4]; 4];
+            for a in 0..4 {
+                q[a] = transpose4([v[4 * a].0, v[4 * a + 1].0, v[4 * a + 2].0, v[4 * a + 3].0]);
+            }
             let mut out = [F(_mm512_setzero_ps()); LANES];
-            let mut c = 0;
-            while c < 4 {
+            for c in 0..4 {
                 let low = _mm512_shuffle_f32x4::<0x88>(q[0][c], q[1][c]);
                 let high = _mm512_shuffle_f32x4::<0x88>(q[2][c], q[3][c]);
                 out[c] = F(_mm512_shuffle_f32x4::<0x88>(low, high));
@@ -258,7 +273,6 @@ impl Simd for Token {
                 let high = _mm512_shuffle_f32x4::<0xdd>(q[2][c], q[3][c]);
                 out[4 + c] = F(_mm512_shuffle_f32x4::<0x88>(low, high));
                 out[12 + c] = F(_mm512_shuffle_f32x4::<0xdd>(low, high));
-                c += 1;
             }
             out
         }

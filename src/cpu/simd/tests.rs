@@ -64,16 +64,26 @@ impl Kernel for Everything<'_> {
             let e = s.min(s.max(s.floor(a), s.splat(-120.0)), s.splat(120.0));
             put(&mut exact, s.scale(s.splat(1.25), e));
             let i = s.to_int(small) + s.splat_int(7);
-            for v in [i, s.shl::<3>(i), s.shr::<5>(i), i & s.to_bits(b), i | (i - s.to_int(small))]
-            {
+            let by = i & s.splat_int(31);
+            for v in [
+                s.shift(i, by),
+                i,
+                s.shl::<3>(i),
+                s.shr::<5>(i),
+                i & s.to_bits(b),
+                i | (i - s.to_int(small)),
+            ] {
                 s.store_int(v, &mut integers);
                 exact.extend(integers.map(|v| v as u32));
             }
             put(&mut exact, s.of_int(i));
             exact.push(s.sum(s.of_int(i)).to_bits());
-            let places = std::array::from_fn(|l| (at + 29 * l) % (self.1.len() - 3));
-            s.load4(self.1, &places).map(|v| put(&mut exact, v));
-            put(&mut exact, s.load4(self.1, &[self.1.len() - 3; LANES])[0]);
+            let places = std::array::from_fn(|l| (at + 29 * l) % (self.1.len() - 8));
+            s.load4(self.1, &places, 5).map(|v| put(&mut exact, v));
+            for (at, offset) in [(self.1.len() - 3, 0), (0, self.1.len() - 3), (9, usize::MAX)] {
+                put(&mut exact, s.load4(self.1, &[at; LANES], offset)[0]);
+            }
+            put(&mut exact, s.load4(&self.1[..3], &[0; LANES], 0)[0]);
             let rows = [a, b, c, a, b, c, -a, a, b, c, a, b, -c, a, b, c];
             s.transpose(rows).map(|v| put(&mut exact, v));
 
@@ -152,6 +162,35 @@ fn exponential_and_logarithm() {
             worst_log = worst_log.max((f64::from(log) - exact).abs() / exact.abs().max(1.0));
         }
         assert!(worst_exp < 2.4e-7 && worst_log < 1.5e-7, "{tier:?} {worst_exp:e} {worst_log:e}");
+    }
+}
+
+struct Roots<'a>(&'a [f32]);
+
+impl Kernel for Roots<'_> {
+    type Output = f64;
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) -> f64 {
+        let mut out = [0.0; LANES];
+        let mut worst = 0.0f64;
+        for v in self.0.chunks_exact(LANES) {
+            s.store(s.rough_sqrt(s.load(v.try_into().unwrap())), &mut out);
+            for (v, root) in v.iter().zip(out) {
+                worst = worst.max((f64::from(root) / f64::from(*v).sqrt() - 1.0).abs());
+            }
+        }
+        worst
+    }
+}
+
+#[test]
+fn rough_roots_are_as_good_as_they_say() {
+    let mut x: Vec<f32> = (0..1 << 16).map(|i| (i as f32 / 300.0 - 100.0).exp2()).collect();
+    x.extend([f32::MIN_POSITIVE; LANES]);
+    for &tier in Tier::available() {
+        let worst = tier.run(Roots(&x));
+        assert!(worst < f64::from(ROUGH), "{tier:?} {worst:e}");
     }
 }
 
