@@ -22,7 +22,7 @@ use std::collections::HashMap;
 use std::path::Path;
 use subsplat::abi::RasterOptions;
 use subsplat::camera::Camera;
-use subsplat::cpu::{Gradients, Rasterizer, Rendered, Stats};
+use subsplat::cpu::{Gradients, Rasterizer, Rendered, Stats, Tier};
 use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
 use subsplat::io::scene::Units;
 use subsplat::io::{save_splats, write_atomic};
@@ -173,13 +173,15 @@ fn forward(bench: &mut Bench, name: &str, case: &Case, stats: Stats) -> Result<(
         plain.forward(&case.plain(), &case.camera, case.plain_options(BOX));
         Ok(())
     })];
-    for threads in [Threads::One, Threads::All] {
-        let (mut ours, mut out) = (Rasterizer::new(), Rendered::default());
+    let one = Tier::available().iter().map(|&tier| (Threads::One, tier));
+    for (threads, tier) in one.chain([(Threads::All, Tier::best())]) {
+        let (mut ours, mut out) = (Rasterizer::new().with_tier(tier), Rendered::default());
         let run = move || {
             ours.render_into(&slices(&case.splats), &case.camera, &case.options, &mut out);
             Ok(())
         };
-        let contender = Contender::new("subsplat", threads, run);
+        let name = format!("subsplat, {}", tier.name());
+        let contender = Contender::new(name, threads, run);
         contenders.push(contender.with_work(case.work(stats)));
     }
     if case.naive && !bench.args.quick {

@@ -12,6 +12,7 @@ use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
+use subsplat::cpu::Tier;
 
 /// Not ours: it holds no camera and no metadata (tests/raster.rs has its test).
 const FOREIGN: &str = "brush_tiny";
@@ -34,8 +35,8 @@ fn compare(reference: &Path, more: &[&str]) -> Called {
 #[test]
 fn every_case_passes() {
     for path in cases().iter().filter(|p| p.file_stem().unwrap() != FOREIGN) {
-        for threads in ["1", "3"] {
-            let called = compare(path, &["--threads", threads]);
+        for (tier, threads) in Tier::available().iter().zip(["1", "2", "3", "4"]) {
+            let called = compare(path, &["--threads", threads, "--simd", tier.name()]);
             assert_eq!(called.code, 0, "{}: {} {}", path.display(), called.stdout, called.stderr);
             let report = called.json();
             assert_eq!(report["ok"], true);
@@ -195,4 +196,17 @@ fn malformed_cases_are_refused_by_name() {
     assert_eq!(called.code, 1);
     assert!(called.error().contains("bad.safetensors: expected a safetensors file"));
     assert!(compare(&place.path().join("none"), &[]).error().contains("none"));
+}
+
+#[test]
+fn an_instruction_set_that_is_not_here_is_refused() {
+    let Some(path) = shared("fixtures/raster/sh1.safetensors") else { return };
+    let all = [Tier::Scalar, Tier::Avx2, Tier::Avx512, Tier::Neon];
+    let absent: Vec<_> = all.into_iter().filter(|t| !t.is_available()).collect();
+    assert!(!absent.is_empty());
+    for tier in absent {
+        let called = compare(&path, &["--simd", tier.name()]);
+        assert_eq!(called.code, 1);
+        assert!(called.error().contains("--simd") && called.error().contains(tier.name()));
+    }
 }

@@ -349,6 +349,30 @@ pub struct InfoArgs {
     pub file: PathBuf,
 }
 
+/// An instruction set that kernels are compiled for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum SimdArg {
+    /// What every processor of the kind has; products and sums round separately.
+    Scalar,
+    /// x86-64-v3.
+    Avx2,
+    /// x86-64-v4.
+    Avx512,
+    /// AArch64.
+    Neon,
+}
+
+impl From<SimdArg> for subsplat::cpu::Tier {
+    fn from(arg: SimdArg) -> Self {
+        match arg {
+            SimdArg::Scalar => Self::Scalar,
+            SimdArg::Avx2 => Self::Avx2,
+            SimdArg::Avx512 => Self::Avx512,
+            SimdArg::Neon => Self::Neon,
+        }
+    }
+}
+
 /// Arguments of `compare`.
 #[derive(Debug, Args)]
 pub struct CompareArgs {
@@ -361,4 +385,7 @@ pub struct CompareArgs {
     /// another rasterizer made of them.
     #[arg(long, value_name = "FILE")]
     pub reference: PathBuf,
+    /// Instruction set of the rasterizer (default: SUBSPLAT_SIMD, else the widest here).
+    #[arg(long, value_enum, conflicts_with = "weights")]
+    pub simd: Option<SimdArg>,
 }

@@ -1,12 +1,13 @@
 //! `subsplat compare`: the encoder, or the rasterizer, against a reference file.
 
-use super::args::CompareArgs;
+use super::args::{CompareArgs, SimdArg};
 use super::compare_raster;
 use super::raster_case::Case;
 use super::report::{Answer, Progress, peak_memory_bytes, warn};
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, bail, ensure};
 use serde_json::{Value, json};
 use std::path::Path;
+use subsplat::cpu::Tier;
 use subsplat::model::compare::{self, Row};
 use subsplat::model::weights::Weights;
 
@@ -14,7 +15,7 @@ use subsplat::model::weights::Weights;
 pub fn compare(args: &CompareArgs, answer: Answer) -> Result<bool> {
     match &args.weights {
         Some(weights) => encoder(weights, &args.reference, answer),
-        None => rasterizer(&args.reference, answer),
+        None => rasterizer(&args.reference, tier(args.simd)?, answer),
     }
 }
 
@@ -32,7 +33,20 @@ fn encoder(weights: &Path, reference: &Path, answer: Answer) -> Result<bool> {
     finish(&report.rows, ok, &report.not_produced, &progress, answer)
 }
 
-fn rasterizer(reference: &Path, answer: Answer) -> Result<bool> {
+/// The instruction set that is asked for, or the best one.
+fn tier(asked: Option<SimdArg>) -> Result<Tier> {
+    let tier = asked.map_or_else(Tier::best, Tier::from);
+    let here: Vec<&str> = Tier::available().iter().map(|t| t.name()).collect();
+    ensure!(
+        tier.is_available(),
+        "--simd: expected one that this processor runs ({}), got {}",
+        here.join(", "),
+        tier.name()
+    );
+    Ok(tier)
+}
+
+fn rasterizer(reference: &Path, tier: Tier, answer: Answer) -> Result<bool> {
     let mut progress = Progress::new();
     let rows = progress.stage("rasterizer", |_| -> Result<_> {
         let Some(case) = Case::read(reference)? else {
@@ -42,9 +56,10 @@ fn rasterizer(reference: &Path, answer: Answer) -> Result<bool> {
                 reference.display()
             )
         };
-        let rows = compare_raster::compare(&case);
+        let rows = compare_raster::compare(&case, tier);
         rows.with_context(|| format!("{} {}", reference.display(), case.name))
     })?;
+    answer.line(format!("instruction set: {}", tier.name()));
     table(&rows, answer);
     let ok = rows.iter().all(|r| r.ok);
     finish(&rows, ok, &[], &progress, answer)

@@ -7,7 +7,7 @@
 use super::raster_case::Case;
 use anyhow::{Result, ensure};
 use subsplat::abi::{Convention, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES};
-use subsplat::cpu::{Gradients, Rasterizer};
+use subsplat::cpu::{Gradients, Rasterizer, Tier};
 use subsplat::model::compare::Row;
 
 /// Largest |difference| of RGB and alpha, `standard`: ten times the f32 floor.
@@ -29,17 +29,18 @@ const GRADIENT_NEEDLES: f32 = 2e-3;
 /// The case that holds such splats.
 const NEEDLES: &str = "needles";
 
-/// Renders the case and compares every output that the file holds. `relative` of a row
+/// Renders the case with the instructions of `tier` and compares every output that the file holds. `relative` of a row
 /// is the difference in the tensor's own measure: absolute for colours and alpha.
 ///
 /// # Errors
 /// A tensor is missing or has another shape; every pixel is marked as boundary.
-pub fn compare(case: &Case) -> Result<Vec<Row>> {
+pub fn compare(case: &Case, tier: Tier) -> Result<Vec<Row>> {
     let k = case.camera.intrinsics;
     let pixels = [k.height, k.width];
     let boundary = case.array("boundary", &pixels)?;
     ensure!(boundary.contains(&0.0), "tensor `boundary`: expected a pixel to compare, got none");
-    let got = Rasterizer::new().render(&case.splats(), &case.camera, &case.options);
+    let mut rasterizer = Rasterizer::new().with_tier(tier);
+    let got = rasterizer.render(&case.splats(), &case.camera, &case.options);
     let colour = match case.options.convention {
         Convention::Standard => COLOUR_STANDARD,
         Convention::Mvsplat => COLOUR_MVSPLAT,
@@ -67,13 +68,13 @@ pub fn compare(case: &Case) -> Result<Vec<Row>> {
         rows.push(row(name, max_abs, relative, allowed));
     }
     if case.has("v_rgb") {
-        gradients(case, &mut rows)?;
+        gradients(case, &mut rasterizer, &mut rows)?;
     }
     Ok(rows)
 }
 
 /// Compares the gradients of Σ rgb·v_rgb + Σ alpha·v_alpha.
-fn gradients(case: &Case, rows: &mut Vec<Row>) -> Result<()> {
+fn gradients(case: &Case, rasterizer: &mut Rasterizer, rows: &mut Vec<Row>) -> Result<()> {
     let k = case.camera.intrinsics;
     let v_rgb = case.array("v_rgb", &[k.height, k.width, 3])?;
     let v_alpha = case.array("v_alpha", &[k.height, k.width])?;
@@ -85,7 +86,7 @@ fn gradients(case: &Case, rows: &mut Vec<Row>) -> Result<()> {
     planes.resize(5 * v_alpha.len(), 0.0);
     let splats = case.splats();
     let mut got = Gradients::default();
-    Rasterizer::new().backward(&splats, &case.camera, &case.options, &planes, &mut got);
+    rasterizer.backward(&splats, &case.camera, &case.options, &planes, &mut got);
 
     let allowed = if case.name == NEEDLES { GRADIENT_NEEDLES } else { GRADIENT };
     let lanes = |from: usize, count: usize| -> Vec<f32> {

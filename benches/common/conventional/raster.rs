@@ -1,7 +1,7 @@
 //! A rasterizer as most of them are written (3DGS' algorithm on one CPU thread):
 //! 16×16 tiles, a square box of some σ around each splat, one sort of (tile, depth)
-//! pairs, each pixel walks its tile's list front to back; backward walks it back to
-//! front from a stored last index and recovers T by division.
+//! pairs, each pixel walks its tile's list front to back and keeps the splats that it
+//! blended; backward walks those back to front and recovers T by division.
 
 use super::project::{Gradients, Options, Projected, ProjectedGrad, Splats, View};
 use subsplat::camera::Camera;
@@ -22,8 +22,10 @@ pub struct Frame {
     pub depth_sum: Vec<f32>,
     /// `[H, W]`: T behind the last splat.
     transmittance: Vec<f32>,
-    /// `[H, W]`: one past the last splat blended, an index into the pairs.
-    last: Vec<u32>,
+    /// Splats that pixels blended, front to back, one pixel after the other.
+    blended: Vec<u32>,
+    /// `[H, W]`: first and one past the last of a pixel's in `blended`.
+    spans: Vec<(usize, usize)>,
 }
 
 /// The rasterizer with its buffers.
@@ -63,7 +65,8 @@ impl Rasterizer {
         for plane in [&mut f.alpha, &mut f.depth_sum, &mut f.transmittance] {
             plane.resize(width * height, 0.0);
         }
-        f.last.resize(width * height, 0);
+        f.spans.resize(width * height, (0, 0));
+        f.blended.clear();
         let columns = width.div_ceil(TILE);
         for tile in 0..self.ranges.len() {
             let (x0, y0) = (tile % columns * TILE, tile / columns * TILE);
@@ -108,9 +111,10 @@ impl Rasterizer {
     fn pixel(&mut self, tile: usize, x: usize, y: usize, width: usize, background: [f32; 3]) {
         let (px, py) = (x as f32 + 0.5, y as f32 + 0.5);
         let (from, to) = self.ranges[tile];
-        let (mut t, mut rgb, mut depth, mut last) = (1.0f32, [0.0f32; 3], 0.0f32, from);
-        for k in from..to {
-            let s = &self.projected[self.pairs[k as usize].1 as usize];
+        let (mut t, mut rgb, mut depth) = (1.0f32, [0.0f32; 3], 0.0f32);
+        let first = self.frame.blended.len();
+        for &(_, i) in &self.pairs[from as usize..to as usize] {
+            let s = &self.projected[i as usize];
             let Some((alpha, _)) = alpha_at(s, px - s.uv[0], py - s.uv[1]) else { continue };
             let alpha = alpha.min(ALPHA_MAX);
             let rest = t * (1.0 - alpha);
@@ -123,7 +127,7 @@ impl Rasterizer {
             }
             depth += weight * s.z;
             t = rest;
-            last = k + 1;
+            self.frame.blended.push(i);
         }
         let at = y * width + x;
         for c in 0..3 {
@@ -132,7 +136,7 @@ impl Rasterizer {
         self.frame.alpha[at] = 1.0 - t;
         self.frame.depth_sum[at] = depth;
         self.frame.transmittance[at] = t;
-        self.frame.last[at] = last;
+        self.frame.spans[at] = (first, self.frame.blended.len());
     }
 
     /// Gradients of Σ rgb·v_rgb + Σ alpha·v_alpha of the last [`Rasterizer::forward`],
@@ -164,11 +168,10 @@ impl Rasterizer {
                     for c in 0..3 {
                         out.background[c] += self.frame.transmittance[at] * v[c];
                     }
-                    let from = self.ranges[tile].0;
                     let b = view.background();
                     // d loss / d T_final.
                     let v_t = v[0] * b[0] + v[1] * b[1] + v[2] * b[2] - v_alpha[at];
-                    self.pixel_backward([x, y], from, at, v, v_t, &mut flat);
+                    self.pixel_backward([x, y], at, v, v_t, &mut flat);
                 }
             }
         }
@@ -183,7 +186,6 @@ impl Rasterizer {
     fn pixel_backward(
         &self,
         [x, y]: [usize; 2],
-        from: u32,
         at: usize,
         v: [f32; 3],
         v_t: f32,
@@ -194,8 +196,9 @@ impl Rasterizer {
         let mut t = last;
         // Σ over the splats behind of w·(c·v).
         let mut behind = 0.0;
-        for k in (from..self.frame.last[at]).rev() {
-            let i = self.pairs[k as usize].1 as usize;
+        let (first, past) = self.frame.spans[at];
+        for &i in self.frame.blended[first..past].iter().rev() {
+            let i = i as usize;
             let s = &self.projected[i];
             let (dx, dy) = (px - s.uv[0], py - s.uv[1]);
             let Some((raw, falloff)) = alpha_at(s, dx, dy) else { continue };
