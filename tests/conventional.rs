@@ -142,7 +142,7 @@ fn check_case(name: &str) {
     let g = rasterizer.backward(&splats, &camera, options, v_rgb, v_alpha);
     let expected = case.rows("grad.");
     let allowed = if name == "needles" { 2e-3 } else { 5e-4 };
-    let mut check = |what: &str, got: &[f32], expected: &[f32], lanes: usize| {
+    let check = |what: &str, got: &[f32], expected: &[f32], lanes: usize| {
         let error = gradient_error(got, expected, lanes);
         assert!(error < allowed, "{name} gradient of {what}: {error}");
     };
