@@ -54,7 +54,8 @@ pub enum Command {
     Check(CheckArgs),
     /// Say what a file or a scene folder holds.
     Info(InfoArgs),
-    /// Run the encoder on a reference file's inputs and compare every tensor in it.
+    /// Run the encoder, or the rasterizer, on a reference file's inputs and compare every
+    /// tensor in it.
     Compare(CompareArgs),
 }
 
@@ -348,13 +349,43 @@ pub struct InfoArgs {
     pub file: PathBuf,
 }
 
+/// An instruction set that kernels are compiled for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum SimdArg {
+    /// What every processor of the kind has; products and sums round separately.
+    Scalar,
+    /// x86-64-v3.
+    Avx2,
+    /// x86-64-v4.
+    Avx512,
+    /// AArch64.
+    Neon,
+}
+
+impl From<SimdArg> for subsplat::cpu::Tier {
+    fn from(arg: SimdArg) -> Self {
+        match arg {
+            SimdArg::Scalar => Self::Scalar,
+            SimdArg::Avx2 => Self::Avx2,
+            SimdArg::Avx512 => Self::Avx512,
+            SimdArg::Neon => Self::Neon,
+        }
+    }
+}
+
 /// Arguments of `compare`.
 #[derive(Debug, Args)]
 pub struct CompareArgs {
-    /// Weights (.safetensors), with or without the `encoder.` prefix.
+    /// Weights (.safetensors) of the encoder, with or without the `encoder.` prefix. A
+    /// rasterizer case needs none.
     #[arg(long, value_name = "FILE")]
-    pub weights: PathBuf,
-    /// Reference: `in.*` tensors, and any of the stages and `out.*` tensors.
+    pub weights: Option<PathBuf>,
+    /// Reference: `in.*` tensors, and any of the stages and `out.*` tensors; or, without
+    /// --weights, a rasterizer case: splats, a camera, and the picture and gradients that
+    /// another rasterizer made of them.
     #[arg(long, value_name = "FILE")]
     pub reference: PathBuf,
+    /// Instruction set of the rasterizer (default: SUBSPLAT_SIMD, else the widest here).
+    #[arg(long, value_enum, conflicts_with = "weights")]
+    pub simd: Option<SimdArg>,
 }

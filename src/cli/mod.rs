@@ -7,6 +7,7 @@
 pub mod args;
 mod check;
 mod compare;
+mod compare_raster;
 mod failure;
 mod frames;
 mod info;
@@ -15,6 +16,7 @@ mod model;
 mod output;
 mod pair;
 mod range;
+mod raster_case;
 mod render;
 mod report;
 mod run;

@@ -21,14 +21,21 @@ use crate::abi::{
     Z_EPSILON_MVSPLAT,
 };
 use crate::camera::{Camera, Intrinsics};
+use crate::cpu::simd::{LANES, Simd, log2};
 use std::f32::consts::{LN_2, LOG2_E};
 
 /// Relative and absolute widening of a support, in log₂ of alpha: pixels on its
 /// rim are found whatever the rounding, and the per-pixel test decides.
 const SUPPORT_SLACK: f32 = 1e-4;
 /// Widening of a row's interval, px, for the rounding of pixel positions.
-const SPAN_SLACK_PX: f32 = 1e-3;
+pub(crate) const SPAN_SLACK_PX: f32 = 1e-3;
+/// Larger opacities act as this one, far beyond any alpha cap, so that their
+/// logarithm stays within what an exponent can hold.
+const OPACITY_MAX: f32 = 1e36;
+/// Four-byte fields of a [`Footprint`].
+pub(crate) const FIELDS: usize = 16;
 
+const _: () = assert!(size_of::<Footprint>() == 4 * FIELDS && FIELDS == LANES);
 const _: () = assert!(TILE_MVSPLAT.is_multiple_of(BLOCK), "the tile cut falls on block edges");
 
 /// A projected splat, one cache line.
@@ -66,6 +73,21 @@ pub struct Footprint {
 }
 
 impl Footprint {
+    /// Its fields in order, the last four as the bits of whole numbers.
+    #[inline(always)]
+    pub(crate) fn fields(&self) -> &[f32; FIELDS] {
+        // SAFETY: sixteen fields of four bytes without padding (`repr(C)` and the
+        // assertion above), and every pattern of 32 bits is an f32.
+        unsafe { &*std::ptr::from_ref(self).cast() }
+    }
+
+    /// The same to be written.
+    #[inline(always)]
+    pub(crate) fn fields_mut(&mut self) -> &mut [f32; FIELDS] {
+        // SAFETY: as above; every pattern of 32 bits is a u32 as well.
+        unsafe { &mut *std::ptr::from_mut(self).cast() }
+    }
+
     /// Whether the splat was kept.
     pub fn visible(&self) -> bool {
         self.x1 > self.x0
@@ -103,13 +125,6 @@ impl Footprint {
             self.u - self.shear * right + edge(right) + SPAN_SLACK_PX,
         ))
     }
-
-    fn is_finite(&self) -> bool {
-        // A sum is finite only if no term is NaN or infinite, bar overflow of huge
-        // finite terms, which is dropped alike.
-        (self.u + self.v + self.sx + self.shear + self.sy + self.power + self.z).is_finite()
-            && (self.half_width + self.half_height).is_finite()
-    }
 }
 
 /// log₂(255·opacity) from `power` = log₂ opacity, with slack: where the exponent of
@@ -119,22 +134,29 @@ fn support(power: f32) -> f32 {
     reach + SUPPORT_SLACK * (1.0 + reach)
 }
 
+/// [`support`] of sixteen splats.
+#[inline(always)]
+pub(crate) fn support_lanes<S: Simd>(s: S, power: S::F) -> S::F {
+    let reach = power - s.splat(ALPHA_MIN_LOG2);
+    s.fma(s.splat(SUPPORT_SLACK), s.splat(1.0) + reach, reach)
+}
+
 /// A camera and the options of a call, as projection needs them.
 #[derive(Clone, Debug)]
 pub struct View {
     /// Rows of the rotation from world to camera.
-    rows: [[f32; 3]; 3],
+    pub(crate) rows: [[f32; 3]; 3],
     /// The eye, world.
     pub(crate) eye: [f32; 3],
-    focal: [f32; 2],
+    pub(crate) focal: [f32; 2],
     /// Pixel position of the axis, centres at integers.
     centre: [f32; 2],
     /// Intervals to which x/z and y/z are clamped inside J.
-    limit: [(f32, f32); 2],
+    pub(crate) limit: [(f32, f32); 2],
     near: f32,
-    z_epsilon: f32,
-    lowpass: f32,
-    antialiased: bool,
+    pub(crate) z_epsilon: f32,
+    pub(crate) lowpass: f32,
+    pub(crate) antialiased: bool,
     tile_cut: bool,
     size: [usize; 2],
 }
@@ -180,53 +202,217 @@ impl View {
     }
 
     /// World to camera, as Rᵀ(p − t).
-    fn to_camera(&self, p: [f32; 3]) -> [f32; 3] {
-        let d = [p[0] - self.eye[0], p[1] - self.eye[1], p[2] - self.eye[2]];
-        self.rows.map(|r| dot(r, d))
+    #[inline(always)]
+    fn to_camera<S: Simd>(&self, s: S, p: [S::F; 3]) -> [S::F; 3] {
+        let e = self.eye;
+        let d = [p[0] - s.splat(e[0]), p[1] - s.splat(e[1]), p[2] - s.splat(e[2])];
+        let [a, b, c] = self.rows;
+        [dot_const(s, a, d), dot_const(s, b, d), dot_const(s, c, d)]
     }
 
-    /// Rows of J·W at a point in camera coordinates, px per world unit.
-    fn jacobian_in_world(&self, p: [f32; 3]) -> [[f32; 3]; 2] {
-        let [x, y, z] = self.rows;
-        std::array::from_fn(|i| {
+    /// Rows of J·W at points in camera coordinates, px per world unit; `slopes` are
+    /// x/z and y/z.
+    #[inline(always)]
+    fn jacobian_in_world<S: Simd>(&self, s: S, slopes: [S::F; 2], z: S::F) -> [[S::F; 3]; 2] {
+        let inverse = s.splat(1.0) / z;
+        let away = self.rows[2];
+        let mut j = [[z; 3]; 2];
+        for i in 0..2 {
             let (low, high) = self.limit[i];
-            let slope = (p[i] / p[2]).max(low).min(high);
-            let f = self.focal[i] / p[2];
-            let axis = if i == 0 { x } else { y };
-            std::array::from_fn(|c| f * (axis[c] - slope * z[c]))
-        })
+            let slope = s.min(s.max(slopes[i], s.splat(low)), s.splat(high));
+            let f = s.splat(self.focal[i]) * inverse;
+            for c in 0..3 {
+                j[i][c] = f * s.fnma(slope, s.splat(away[c]), s.splat(self.rows[i][c]));
+            }
+        }
+        j
     }
 
-    /// The footprint of a splat given by quaternion (wxyz, any length) and σ; its
-    /// colour stays 0. `None` where the splat is dropped.
-    pub fn project_quat(
+    /// Sixteen footprints, colours 0: vector k holds field k of [`Footprint`], zeros
+    /// in the lanes of dropped splats; and which lanes were kept.
+    #[inline(always)]
+    pub(crate) fn project<S: Simd>(
         &self,
-        mean: [f32; 3],
-        quat: [f32; 4],
-        scale: [f32; 3],
-        opacity: f32,
-    ) -> Option<Footprint> {
-        let p = self.in_front(mean)?;
-        let r = rotation(quat)?;
-        let j = self.jacobian_in_world(p);
-        // M = J·W·R·S: row i, column k.
-        let m: [[f32; 3]; 2] = std::array::from_fn(|i| {
-            std::array::from_fn(|k| dot(j[i], [r[0][k], r[1][k], r[2][k]]) * scale[k])
-        });
-        let n = cross(m[0], m[1]);
-        let covariance = Covariance2d {
-            xx: dot(m[0], m[0]),
-            xy: dot(m[0], m[1]),
-            yy: dot(m[1], m[1]),
-            det: dot(n, n),
+        s: S,
+        mean: [S::F; 3],
+        shape: Shape<S>,
+        opacity: S::F,
+    ) -> ([S::F; FIELDS], S::M) {
+        let p = self.to_camera(s, mean);
+        let front = s.lt(s.splat(self.near), p[2]);
+        let slopes = [p[0] / p[2], p[1] / p[2]];
+        let j = self.jacobian_in_world(s, slopes, p[2]);
+        let (covariance, shaped) = match shape {
+            Shape::Quat(quat, scale) => covariance_quat(s, j, quat, scale),
+            Shape::Cov6(cov6) => (covariance_cov6(s, j, cov6), front),
         };
-        self.footprint(p, covariance, opacity)
+        self.footprint(s, p, slopes, covariance, opacity, front & shaped)
     }
 
-    /// The same from a world covariance `cov6` = (00, 01, 02, 11, 12, 22).
-    pub fn project_cov6(&self, mean: [f32; 3], cov6: [f32; 6], opacity: f32) -> Option<Footprint> {
-        let p = self.in_front(mean)?;
-        let j = self.jacobian_in_world(p).map(|r| r.map(f64::from));
+    #[inline(always)]
+    fn footprint<S: Simd>(
+        &self,
+        s: S,
+        p: [S::F; 3],
+        slopes: [S::F; 2],
+        c: Covariance2d<S>,
+        opacity: S::F,
+        kept: S::M,
+    ) -> ([S::F; FIELDS], S::M) {
+        let (zero, lowpass) = (s.splat(0.0), s.splat(self.lowpass));
+        let (xx, yy) = (c.xx + lowpass, c.yy + lowpass);
+        let det = s.fma(lowpass, c.xx + c.yy + lowpass, c.det);
+        let mut opacity = opacity;
+        if self.antialiased {
+            opacity = opacity * s.sqrt(s.max(c.det / det, zero));
+        }
+        let infinity = s.splat(f32::INFINITY);
+        // Comparisons are false for NaN.
+        let mut kept = kept & s.le(s.splat(ALPHA_MIN), opacity) & s.lt(opacity, infinity);
+        kept = kept & s.lt(zero, det) & s.lt(det, infinity) & s.lt(zero, xx) & s.lt(zero, yy);
+        let power = log2(s, s.min(opacity, s.splat(OPACITY_MAX)));
+        let reach = s.splat(2.0 * LN_2) * support_lanes(s, power);
+        let [mut u, mut v] = slopes;
+        if self.z_epsilon != 0.0 {
+            let z = p[2] + s.splat(self.z_epsilon);
+            (u, v) = (p[0] / z, p[1] / z);
+        }
+        u = s.fma(s.splat(self.focal[0]), u, s.splat(self.centre[0]));
+        v = s.fma(s.splat(self.focal[1]), v, s.splat(self.centre[1]));
+        let inverse = s.splat(1.0) / yy;
+        let sx = s.sqrt(s.splat(0.5 * LOG2_E) * (yy / det));
+        let shear = -c.xy * inverse;
+        let sy = s.sqrt(s.splat(0.5 * LOG2_E) * inverse);
+        let (half_width, half_height) = (s.sqrt(reach * xx), s.sqrt(reach * yy));
+        // A sum is finite only if no term is NaN or infinite, bar overflow of huge
+        // finite terms, which is dropped alike.
+        let sum = u + v + sx + shear + sy + p[2] + half_width + half_height;
+        kept = kept & s.lt(s.abs(sum), infinity);
+        let radius = if self.tile_cut { Some(radius_mvsplat(s, xx, yy, det)) } else { None };
+        let (x0, x1) = self.extent(s, 0, u, half_width, radius);
+        let (y0, y1) = self.extent(s, 1, v, half_height, radius);
+        kept = kept & s.lt(x0, x1) & s.lt(y0, y1);
+        let mut fields = [
+            u,
+            v,
+            sx,
+            shear,
+            sy,
+            power,
+            zero,
+            zero,
+            zero,
+            p[2],
+            half_width,
+            half_height,
+            x0,
+            y0,
+            x1,
+            y1,
+        ];
+        for field in &mut fields[FIELDS - 4..] {
+            *field = s.of_bits(s.to_int(*field));
+        }
+        for field in &mut fields {
+            *field = s.keep(kept, *field);
+        }
+        (fields, kept)
+    }
+
+    /// Pixels [first, past the last) along one axis that the support meets and,
+    /// with a radius, that the tile cut leaves: whole numbers from 0 to the side.
+    #[inline(always)]
+    fn extent<S: Simd>(
+        &self,
+        s: S,
+        axis: usize,
+        mean: S::F,
+        half: S::F,
+        radius: Option<S::F>,
+    ) -> (S::F, S::F) {
+        let (zero, side) = (s.splat(0.0), s.splat(self.size[axis] as f32));
+        let half = half + s.splat(SPAN_SLACK_PX);
+        let mut first = s.max(s.ceil(mean - half), zero);
+        let mut past = s.min(s.floor(mean + half) + s.splat(1.0), side);
+        if let Some(r) = radius {
+            const TILE_PX: f32 = TILE_MVSPLAT as f32;
+            // The original truncates towards zero; what is below 0 ends at 0 anyway.
+            let tile = s.splat(1.0 / TILE_PX);
+            let from = s.floor((mean - r) * tile);
+            let to = s.floor((mean + r + s.splat(TILE_PX - 1.0)) * tile);
+            first = s.max(from * s.splat(TILE_PX), first);
+            past = s.min(to * s.splat(TILE_PX), past);
+        }
+        (s.min(first, side), s.max(past, zero))
+    }
+}
+
+/// Sixteen splats' shapes.
+pub(crate) enum Shape<'a, S: Simd> {
+    /// Quaternion wxyz of any length, σ.
+    Quat([S::F; 4], [S::F; 3]),
+    /// World covariances 00, 01, 02, 11, 12, 22.
+    Cov6(&'a [[f32; 6]; LANES]),
+}
+
+/// J·Σ·Jᵀ before the low-pass, px² (det: px⁴).
+struct Covariance2d<S: Simd> {
+    xx: S::F,
+    xy: S::F,
+    yy: S::F,
+    det: S::F,
+}
+
+/// M·Mᵀ with M = J·W·R·S, and in which lanes the quaternion has a direction.
+#[inline(always)]
+fn covariance_quat<S: Simd>(
+    s: S,
+    j: [[S::F; 3]; 2],
+    [w, x, y, z]: [S::F; 4],
+    scale: [S::F; 3],
+) -> (Covariance2d<S>, S::M) {
+    let norm2 = s.fma(w, w, s.fma(x, x, s.fma(y, y, z * z)));
+    let whole = s.le(s.splat(f32::MIN_POSITIVE), norm2) & s.lt(norm2, s.splat(f32::INFINITY));
+    let t = s.splat(2.0) / norm2;
+    let (one, wt, xt, yt) = (s.splat(1.0), w * t, x * t, y * t);
+    let (xx, yy, zz) = (xt * x, yt * y, z * z * t);
+    let (xy, xz, yz) = (xt * y, xt * z, yt * z);
+    let (wx, wy, wz) = (wt * x, wt * y, wt * z);
+    // Columns of R, each times its σ.
+    let axes = [
+        [one - (yy + zz), xy + wz, xz - wy],
+        [xy - wz, one - (xx + zz), yz + wx],
+        [xz + wy, yz - wx, one - (xx + yy)],
+    ];
+    let mut m = j;
+    for i in 0..2 {
+        for k in 0..3 {
+            m[i][k] = dot(s, j[i], axes[k]) * scale[k];
+        }
+    }
+    let [a, b] = m;
+    let n = [
+        s.fnma(a[2], b[1], a[1] * b[2]),
+        s.fnma(a[0], b[2], a[2] * b[0]),
+        s.fnma(a[1], b[0], a[0] * b[1]),
+    ];
+    let c =
+        Covariance2d { xx: dot(s, a, a), xy: dot(s, a, b), yy: dot(s, b, b), det: dot(s, n, n) };
+    (c, whole)
+}
+
+/// J·Σ·Jᵀ of given covariances, in `f64`: its determinant cancels in needles.
+#[inline(always)]
+fn covariance_cov6<S: Simd>(s: S, j: [[S::F; 3]; 2], cov6: &[[f32; 6]; LANES]) -> Covariance2d<S> {
+    let mut rows = [[[0.0; LANES]; 3]; 2];
+    for (to, from) in rows.iter_mut().zip(j) {
+        for (to, from) in to.iter_mut().zip(from) {
+            s.store(from, to);
+        }
+    }
+    let mut out = [[0.0; LANES]; 4];
+    for (l, cov6) in cov6.iter().enumerate() {
+        let j = rows.map(|r| r.map(|lanes| f64::from(lanes[l])));
         let [a, b, c, d, e, f] = cov6.map(f64::from);
         let apply = |v: [f64; 3]| {
             [
@@ -238,90 +424,24 @@ impl View {
         let inner = |u: [f64; 3], v: [f64; 3]| u[0] * v[0] + u[1] * v[1] + u[2] * v[2];
         let (sx, sy) = (apply(j[0]), apply(j[1]));
         let (xx, xy, yy) = (inner(j[0], sx), inner(j[0], sy), inner(j[1], sy));
-        let covariance = Covariance2d {
-            xx: xx as f32,
-            xy: xy as f32,
-            yy: yy as f32,
-            det: (xx * yy - xy * xy) as f32,
-        };
-        self.footprint(p, covariance, opacity)
-    }
-
-    fn in_front(&self, mean: [f32; 3]) -> Option<[f32; 3]> {
-        let p = self.to_camera(mean);
-        (p[2] > self.near).then_some(p)
-    }
-
-    fn footprint(&self, p: [f32; 3], c: Covariance2d, opacity: f32) -> Option<Footprint> {
-        let xx = c.xx + self.lowpass;
-        let yy = c.yy + self.lowpass;
-        let det = c.det + self.lowpass * (c.xx + c.yy) + self.lowpass * self.lowpass;
-        let mut opacity = opacity;
-        if self.antialiased {
-            opacity *= (c.det / det).max(0.0).sqrt();
+        for (lanes, v) in out.iter_mut().zip([xx, xy, yy, xx * yy - xy * xy]) {
+            lanes[l] = v as f32;
         }
-        // Written so that NaN fails each test.
-        if !(opacity >= ALPHA_MIN && det > 0.0 && det.is_finite() && xx > 0.0 && yy > 0.0) {
-            return None;
-        }
-        let power = opacity.log2();
-        let reach = 2.0 * LN_2 * support(power);
-        let z = p[2] + self.z_epsilon;
-        let mut f = Footprint {
-            u: self.focal[0] * p[0] / z + self.centre[0],
-            v: self.focal[1] * p[1] / z + self.centre[1],
-            sx: (0.5 * LOG2_E * (yy / det)).sqrt(),
-            shear: -c.xy / yy,
-            sy: (0.5 * LOG2_E / yy).sqrt(),
-            power,
-            z: p[2],
-            half_width: (reach * xx).sqrt(),
-            half_height: (reach * yy).sqrt(),
-            ..Footprint::default()
-        };
-        let radius = self.tile_cut.then(|| radius_mvsplat(xx, yy, det));
-        let (x0, x1) = self.extent(0, f.u, f.half_width, radius);
-        let (y0, y1) = self.extent(1, f.v, f.half_height, radius);
-        if !f.is_finite() || x0 >= x1 || y0 >= y1 {
-            return None;
-        }
-        (f.x0, f.x1, f.y0, f.y1) = (x0, x1, y0, y1);
-        Some(f)
     }
-
-    /// Pixels [first, past the last) along one axis that the support meets and,
-    /// with a radius, that the tile cut leaves.
-    fn extent(&self, axis: usize, mean: f32, half: f32, radius: Option<f32>) -> (u32, u32) {
-        let side = self.size[axis];
-        let half = half + SPAN_SLACK_PX;
-        let first = (mean - half).ceil().max(0.0) as usize;
-        let past = ((mean + half).floor() + 1.0).max(0.0) as usize;
-        let (mut first, mut past) = (first, past.min(side));
-        if let Some(r) = radius {
-            const TILE_PX: f32 = TILE_MVSPLAT as f32;
-            // `as` truncates towards zero as the original's cast does; below 0 is 0.
-            let from = ((mean - r) / TILE_PX) as usize;
-            let to = ((mean + r + (TILE_PX - 1.0)) / TILE_PX) as usize;
-            first = first.max(from.saturating_mul(TILE_MVSPLAT));
-            past = past.min(to.saturating_mul(TILE_MVSPLAT));
-        }
-        (first.min(side) as u32, past as u32)
+    Covariance2d {
+        xx: s.load(&out[0]),
+        xy: s.load(&out[1]),
+        yy: s.load(&out[2]),
+        det: s.load(&out[3]),
     }
-}
-
-/// J·Σ·Jᵀ before the low-pass, px² (det: px⁴).
-struct Covariance2d {
-    xx: f32,
-    xy: f32,
-    yy: f32,
-    det: f32,
 }
 
 /// ⌈3·√λ_max⌉ of the covariance with low-pass, px (INRIA).
-fn radius_mvsplat(xx: f32, yy: f32, det: f32) -> f32 {
-    let mid = 0.5 * (xx + yy);
-    let largest = mid + (mid * mid - det).max(DISCRIMINANT_MIN_MVSPLAT).sqrt();
-    (RADIUS_SIGMAS_MVSPLAT * largest.sqrt()).ceil()
+#[inline(always)]
+fn radius_mvsplat<S: Simd>(s: S, xx: S::F, yy: S::F, det: S::F) -> S::F {
+    let mid = s.splat(0.5) * (xx + yy);
+    let discriminant = s.max(s.fma(mid, mid, -det), s.splat(DISCRIMINANT_MIN_MVSPLAT));
+    s.ceil(s.splat(RADIUS_SIGMAS_MVSPLAT) * s.sqrt(mid + s.sqrt(discriminant)))
 }
 
 /// tan of half the angle between the rays through the middles of opposite picture
@@ -340,25 +460,12 @@ fn tan_half_fov(k: &Intrinsics) -> [f32; 2] {
     [half(ray(0.0, 0.5 * h), ray(w, 0.5 * h)), half(ray(0.5 * w, 0.0), ray(0.5 * w, h))]
 }
 
-/// Rotation matrix, row-major, of a quaternion wxyz of any length above 1e-19.
-fn rotation(q: [f32; 4]) -> Option<[[f32; 3]; 3]> {
-    let norm2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
-    if !(norm2 >= f32::MIN_POSITIVE && norm2.is_finite()) {
-        return None;
-    }
-    let s = 2.0 / norm2;
-    let [w, x, y, z] = q;
-    Some([
-        [1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)],
-        [s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x)],
-        [s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y)],
-    ])
+#[inline(always)]
+fn dot<S: Simd>(s: S, a: [S::F; 3], b: [S::F; 3]) -> S::F {
+    s.fma(a[0], b[0], s.fma(a[1], b[1], a[2] * b[2]))
 }
 
-fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
-fn cross(a: [f32; 3], b: [f32; 3]) -> [f32; 3] {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+#[inline(always)]
+fn dot_const<S: Simd>(s: S, a: [f32; 3], b: [S::F; 3]) -> S::F {
+    dot(s, [s.splat(a[0]), s.splat(a[1]), s.splat(a[2])], b)
 }

@@ -4,30 +4,41 @@
 //! fail. This is the only room where `unsafe` may appear.
 //!
 //! The rasterizer's stages, one file each: [`ewa`] (one splat), `project` (all
-//! splats), `sort` (depth order), `tiles` (lists), `blend` (one tile), `rasterize`
-//! (the frame).
+//! splats), `tiles` (lists), `sort` (depth order in a tile), `blocks` and `blend` (one
+//! tile), `rasterize` (the frame).
 
 pub mod activation;
 pub mod attention;
 pub mod attention_gather;
 mod blend;
+mod blocks;
 pub mod conv2d;
 pub mod detail;
+mod disjoint;
 pub mod ewa;
+mod ewa_bwd;
 pub mod gemm;
 pub mod matching;
 pub mod math;
 pub mod norm;
 pub mod plane_sweep;
 mod project;
+mod project_bwd;
+mod raster_bwd;
+mod raster_bwd_tile;
 mod rasterize;
 pub mod real;
 pub mod redistribute;
 pub mod resize;
 pub mod sh;
+mod sh_bwd;
+pub mod simd;
 mod sort;
 pub mod spgr;
 mod tiles;
 
 pub use project::{Geometry, SplatSlices};
-pub use rasterize::{Rasterizer, Rendered, Stats};
+pub use project_bwd::Gradients;
+pub use raster_bwd::{BackwardTimes, Frame};
+pub use rasterize::{Rasterizer, Rendered, StageTimes, Stats};
+pub use simd::Tier;

@@ -2,21 +2,27 @@
 //! chunks of splats.
 //!
 //! In: [`SplatSlices`] in world frame. Out: one [`Footprint`] per splat (empty where
-//! dropped, see [`crate::cpu::ewa`]) and the number of visible ones per chunk.
+//! dropped, see [`crate::cpu::ewa`]), and what [`crate::cpu::tiles`] needs to list
+//! them. Sixteen splats go side by side: first the geometry of all, then the SH of those
+//! that were kept, whose coefficients alone are read.
 //! Colour of child i of parent p: max(0, ½ + γ_i·Σ_k sh_{p,k} Y_k(d) + δ_i)
 //! (SubSplat, colour gain; 3DGS for γ = 1, δ = 0).
 
 use crate::abi::{
-    LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, RasterOptions, SPLAT_LANES, ShDirection,
-    sh_coefficients,
+    LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, RasterOptions, SPLAT_LANES, ShBasis,
+    ShDirection, sh_coefficients,
 };
-use crate::cpu::ewa::{Footprint, View};
-use crate::cpu::sh::{direction, radiance};
+use crate::cpu::ewa::{FIELDS, Footprint, Shape, View};
+use crate::cpu::sh::{direction_lanes, radiance_lanes};
+use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
+use crate::cpu::tiles::{ChunkCover, TileLists};
 use rayon::prelude::*;
 
 /// Splats per unit of parallel work. A constant, so that no result can depend on
 /// the number of threads.
 pub(crate) const CHUNK: usize = 4096;
+
+const _: () = assert!(LANE_OPACITY == LANE_SCALE + 3 && LANE_QUAT == LANE_MEAN + 3);
 
 /// Where N splats' positions, shapes and opacities lie.
 #[derive(Clone, Copy, Debug)]
@@ -90,43 +96,16 @@ impl SplatSlices<'_> {
         geometry && sh && children && gain
     }
 
-    fn mean(&self, i: usize) -> [f32; 3] {
+    pub(crate) fn mean(&self, i: usize) -> [f32; 3] {
         match self.geometry {
-            Geometry::Packed(rows) => lanes(rows, i * SPLAT_LANES + LANE_MEAN),
-            Geometry::Cov6 { means, .. } => lanes(means, 3 * i),
-        }
-    }
-
-    fn sh_of_parent(&self, p: usize) -> &[f32] {
-        let set = 3 * sh_coefficients(self.sh_degree);
-        self.sh.get(p * set..(p + 1) * set).unwrap_or(&[])
-    }
-
-    fn gain_of(&self, i: usize) -> (f32, [f32; 3]) {
-        if self.gain.len() == 4 * self.len() && !self.gain.is_empty() {
-            let [gain, residual @ ..]: [f32; 4] = lanes(self.gain, 4 * i);
-            (gain, residual)
-        } else {
-            (self.gain.get(i).copied().unwrap_or(1.0), [0.0; 3])
-        }
-    }
-
-    fn footprint(&self, view: &View, i: usize) -> Option<Footprint> {
-        match self.geometry {
-            Geometry::Packed(rows) => {
-                let row = &rows[i * SPLAT_LANES..(i + 1) * SPLAT_LANES];
-                let (quat, scale) = (lanes(row, LANE_QUAT), lanes(row, LANE_SCALE));
-                view.project_quat(self.mean(i), quat, scale, row[LANE_OPACITY])
-            }
-            Geometry::Cov6 { cov6, opacities, .. } => {
-                view.project_cov6(self.mean(i), lanes(cov6, 6 * i), opacities[i])
-            }
+            Geometry::Packed(rows) => lanes_at(rows, i * SPLAT_LANES + LANE_MEAN),
+            Geometry::Cov6 { means, .. } => lanes_at(means, 3 * i),
         }
     }
 }
 
 /// `L` floats from `at` on; zeros where the slice ends before.
-fn lanes<const L: usize>(from: &[f32], at: usize) -> [f32; L] {
+pub(crate) fn lanes_at<const L: usize>(from: &[f32], at: usize) -> [f32; L] {
     from.get(at..at + L).and_then(|s| s.try_into().ok()).unwrap_or([0.0; L])
 }
 
@@ -135,79 +114,284 @@ fn lanes<const L: usize>(from: &[f32], at: usize) -> [f32; L] {
 pub(crate) struct Projection {
     /// `[N]`.
     pub(crate) footprints: Vec<Footprint>,
-    /// Visible splats of each [`CHUNK`].
-    pub(crate) visible: Vec<usize>,
     /// `[P]`: Σ sh·Y at each parent's direction ([`ShDirection::Parent`] only).
-    parents: Vec<[f32; 3]>,
+    pub(crate) parents: Vec<[f32; 3]>,
 }
 
 impl Projection {
     /// Bytes held.
     pub(crate) fn bytes(&self) -> usize {
         self.footprints.capacity() * size_of::<Footprint>()
-            + self.visible.capacity() * size_of::<usize>()
             + self.parents.capacity() * size_of::<[f32; 3]>()
     }
 
-    /// Projects all splats.
-    pub(crate) fn run(&mut self, splats: &SplatSlices, view: &View, options: &RasterOptions) {
-        let degree = options.sh_degree.min(splats.sh_degree);
+    /// Projects all splats and counts their entries in the lists of `lists`' tiles.
+    pub(crate) fn run(
+        &mut self,
+        tier: Tier,
+        splats: &SplatSlices,
+        view: &View,
+        options: &RasterOptions,
+        lists: &mut TileLists,
+    ) {
+        let basis = (options.sh_basis, options.sh_degree.min(splats.sh_degree));
         let shared = options.sh_direction == ShDirection::Parent;
+        self.parents.clear();
         if shared {
-            self.parent_radiance(splats, view, options);
+            let children = splats.children_per_parent();
+            let parents = splats.parents().max(splats.len().div_ceil(children));
+            self.parents.resize(parents, [0.0; 3]);
+            self.parents.par_chunks_mut(CHUNK / 16).enumerate().for_each(|(c, out)| {
+                tier.run(Parents { splats, view, basis, first: c * (CHUNK / 16), out });
+            });
         }
-        let children = splats.children_per_parent();
         self.footprints.resize(splats.len(), Footprint::default());
-        self.visible.resize(splats.len().div_ceil(CHUNK), 0);
-        let parents = &self.parents;
-        let one = |i: usize| -> Footprint {
-            let Some(mut f) = splats.footprint(view, i) else { return Footprint::default() };
-            let p = i / children;
-            let sum = if shared {
-                parents[p]
-            } else {
-                let d = direction(minus(splats.mean(i), view.eye));
-                radiance(options.sh_basis, degree, d, splats.sh_of_parent(p))
-            };
-            let (gain, residual) = splats.gain_of(i);
-            let rgb: [f32; 3] = std::array::from_fn(|c| 0.5 + gain * sum[c] + residual[c]);
-            if !rgb.iter().all(|v| v.is_finite()) {
-                return Footprint::default();
-            }
-            f.rgb = rgb.map(|v| v.max(0.0));
-            f
-        };
-        let chunks = self.footprints.par_chunks_mut(CHUNK).zip(&mut self.visible);
-        chunks.enumerate().for_each(|(c, (chunk, visible))| {
-            *visible = 0;
-            for (j, f) in chunk.iter_mut().enumerate() {
-                *f = one(c * CHUNK + j);
-                *visible += usize::from(f.visible());
-            }
-        });
-    }
-
-    /// Σ sh·Y of every parent, seen along the mean of its children's means (those
-    /// that are finite).
-    fn parent_radiance(&mut self, splats: &SplatSlices, view: &View, options: &RasterOptions) {
-        let degree = options.sh_degree.min(splats.sh_degree);
-        let (children, n) = (splats.children_per_parent(), splats.len());
-        self.parents.resize(splats.parents().max(n.div_ceil(children)), [0.0; 3]);
-        self.parents.par_iter_mut().with_min_len(CHUNK / 16).enumerate().for_each(|(p, out)| {
-            let (mut sum, mut count) = ([0.0f32; 3], 0.0f32);
-            for i in p * children..((p + 1) * children).min(n) {
-                let d = minus(splats.mean(i), view.eye);
-                if d.iter().all(|v| v.is_finite()) {
-                    sum = [sum[0] + d[0], sum[1] + d[1], sum[2] + d[2]];
-                    count += 1.0;
-                }
-            }
-            let d = direction(sum.map(|v| v / count.max(1.0)));
-            *out = radiance(options.sh_basis, degree, d, splats.sh_of_parent(p));
+        let parents = shared.then_some(&self.parents[..]);
+        let chunks = self.footprints.par_chunks_mut(CHUNK).zip(lists.chunks(splats.len()));
+        chunks.enumerate().for_each(|(c, (footprints, cover))| {
+            tier.run(Chunk { splats, view, basis, parents, first: c * CHUNK, footprints, cover });
         });
     }
 }
 
-fn minus(a: [f32; 3], b: [f32; 3]) -> [f32; 3] {
-    [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
+/// Σ sh·Y of some parents, seen along the mean of their children's means (those that
+/// are finite).
+struct Parents<'a> {
+    splats: &'a SplatSlices<'a>,
+    view: &'a View,
+    basis: (ShBasis, usize),
+    /// First parent.
+    first: usize,
+    out: &'a mut [[f32; 3]],
+}
+
+impl Kernel for Parents<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        let (splats, eye) = (self.splats, self.view.eye);
+        let (children, n) = (splats.children_per_parent(), splats.len());
+        let set = 3 * sh_coefficients(splats.sh_degree);
+        let mut buffer = [[0.0; LANES]; 3];
+        for (g, out) in self.out.chunks_mut(LANES).enumerate() {
+            let mut at = [0; LANES];
+            for l in 0..out.len() {
+                let p = self.first + g * LANES + l;
+                at[l] = p * set;
+                let (mut sum, mut count) = ([0.0f32; 3], 0.0f32);
+                for i in p * children..((p + 1) * children).min(n) {
+                    let m = splats.mean(i);
+                    let d = [m[0] - eye[0], m[1] - eye[1], m[2] - eye[2]];
+                    if d.iter().all(|v| v.is_finite()) {
+                        sum = [sum[0] + d[0], sum[1] + d[1], sum[2] + d[2]];
+                        count += 1.0;
+                    }
+                }
+                for (lanes, v) in buffer.iter_mut().zip(sum) {
+                    lanes[l] = v / count.max(1.0);
+                }
+            }
+            let d = [s.load(&buffer[0]), s.load(&buffer[1]), s.load(&buffer[2])];
+            let d = direction_lanes(s, d);
+            let rgb = radiance_lanes(s, self.basis, d, splats.sh, &at);
+            for (lanes, v) in buffer.iter_mut().zip(rgb) {
+                s.store(v, lanes);
+            }
+            for (l, out) in out.iter_mut().enumerate() {
+                *out = [buffer[0][l], buffer[1][l], buffer[2][l]];
+            }
+        }
+    }
+}
+
+/// Splats that are projected before any of them is coloured: their footprints stay in
+/// the first cache.
+const STRIP: usize = 256;
+
+/// One chunk of splats on its way to footprints.
+struct Chunk<'a> {
+    splats: &'a SplatSlices<'a>,
+    view: &'a View,
+    basis: (ShBasis, usize),
+    parents: Option<&'a [[f32; 3]]>,
+    /// First splat.
+    first: usize,
+    footprints: &'a mut [Footprint],
+    cover: ChunkCover<'a>,
+}
+
+impl Kernel for Chunk<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(mut self, s: S) {
+        self.cover.clear();
+        let mut kept = [0u32; STRIP + LANES];
+        let mut start = 0;
+        while start < self.footprints.len() {
+            let past = (start + STRIP).min(self.footprints.len());
+            let count = self.geometry(s, start, past, &mut kept);
+            // The last group is filled up with a splat that is there.
+            let last = kept[count.saturating_sub(1)];
+            kept[count..count + LANES].fill(last);
+            let mut g = 0;
+            while g < count {
+                let (group, _) = kept[g..].split_at(LANES);
+                self.colour(s, group, (count - g).min(LANES));
+                g += LANES;
+            }
+            for &i in &kept[..count] {
+                let f = &self.footprints[i as usize];
+                if f.visible() {
+                    self.cover.add(f, self.first as u32 + i);
+                }
+            }
+            start = past;
+        }
+    }
+}
+
+impl Chunk<'_> {
+    /// Footprints without colour of the chunk's splats `start..past`; writes the
+    /// places of the kept ones to `kept` and returns how many they are.
+    #[inline(always)]
+    fn geometry<S: Simd>(
+        &mut self,
+        s: S,
+        start: usize,
+        past: usize,
+        kept: &mut [u32; STRIP + LANES],
+    ) -> usize {
+        let (mut count, mut g) = (0, start);
+        while g < past {
+            let lanes = (past - g).min(LANES);
+            let (fields, mask) = self.group(s, self.first + g, lanes);
+            let bits = s.bits(mask) & (u32::MAX >> (32 - lanes));
+            if bits == 0 {
+                self.footprints[g..g + lanes].fill(Footprint::default());
+            } else {
+                let rows = s.transpose(fields);
+                for (l, f) in self.footprints[g..g + lanes].iter_mut().enumerate() {
+                    s.store(rows[l], f.fields_mut());
+                }
+                let mut rest = bits;
+                while rest != 0 {
+                    kept[count] = g as u32 + rest.trailing_zeros();
+                    count += 1;
+                    rest &= rest - 1;
+                }
+            }
+            g += LANES;
+        }
+        count
+    }
+
+    /// Projects splats `first..first + lanes`.
+    #[inline(always)]
+    fn group<S: Simd>(&self, s: S, first: usize, lanes: usize) -> ([S::F; FIELDS], S::M) {
+        let mut index = [first; LANES];
+        for (l, i) in index.iter_mut().enumerate() {
+            *i += l.min(lanes - 1);
+        }
+        match self.splats.geometry {
+            Geometry::Packed(rows) => {
+                let at = index.map(|i| i * SPLAT_LANES);
+                let [x, y, z, qw] = s.load4(rows, &at, LANE_MEAN);
+                let [qx, qy, qz, _] = s.load4(rows, &at, LANE_QUAT + 1);
+                // The row's last four.
+                let [sx, sy, sz, opacity] = s.load4(rows, &at, LANE_SCALE);
+                let shape = Shape::Quat([qw, qx, qy, qz], [sx, sy, sz]);
+                self.view.project(s, [x, y, z], shape, opacity)
+            }
+            Geometry::Cov6 { cov6, opacities, .. } => {
+                let mut columns = [[0.0; LANES]; 4];
+                let mut shapes = [[0.0; 6]; LANES];
+                for (l, &i) in index.iter().enumerate() {
+                    let [x, y, z] = self.splats.mean(i);
+                    for (column, v) in columns.iter_mut().zip([x, y, z, opacities[i]]) {
+                        column[l] = v;
+                    }
+                    shapes[l] = lanes_at(cov6, 6 * i);
+                }
+                let [x, y, z, opacity] = columns;
+                let mean = [s.load(&x), s.load(&y), s.load(&z)];
+                self.view.project(s, mean, Shape::Cov6(&shapes), s.load(&opacity))
+            }
+        }
+    }
+
+    /// Colours the splats at `group`, of which the first `count` are meant; drops
+    /// those whose colour is no number.
+    #[inline(always)]
+    fn colour<S: Simd>(&mut self, s: S, group: &[u32], count: usize) {
+        let splats = self.splats;
+        let children = splats.children_per_parent();
+        let mut index = [self.first; LANES];
+        for (i, g) in index.iter_mut().zip(group) {
+            *i += *g as usize;
+        }
+        let mut lanes = [[0.0; LANES]; 4];
+        let sum = if let Some(parents) = self.parents {
+            for (l, i) in index.iter().enumerate() {
+                let rgb = parents.get(i / children).copied().unwrap_or([0.0; 3]);
+                (lanes[0][l], lanes[1][l], lanes[2][l]) = (rgb[0], rgb[1], rgb[2]);
+            }
+            [s.load(&lanes[0]), s.load(&lanes[1]), s.load(&lanes[2])]
+        } else {
+            let set = 3 * sh_coefficients(splats.sh_degree);
+            let mean = match splats.geometry {
+                Geometry::Packed(rows) => {
+                    let [x, y, z, _] = s.load4(rows, &index.map(|i| i * SPLAT_LANES), LANE_MEAN);
+                    [x, y, z]
+                }
+                Geometry::Cov6 { .. } => {
+                    for (l, &i) in index.iter().enumerate() {
+                        let m = splats.mean(i);
+                        (lanes[0][l], lanes[1][l], lanes[2][l]) = (m[0], m[1], m[2]);
+                    }
+                    [s.load(&lanes[0]), s.load(&lanes[1]), s.load(&lanes[2])]
+                }
+            };
+            let eye = self.view.eye;
+            let away =
+                [mean[0] - s.splat(eye[0]), mean[1] - s.splat(eye[1]), mean[2] - s.splat(eye[2])];
+            let d = direction_lanes(s, away);
+            let at = if children == 1 { index } else { index.map(|i| i / children) };
+            radiance_lanes(s, self.basis, d, splats.sh, &at.map(|p| p * set))
+        };
+        let (gain, residual) = self.gain(s, &index);
+        let (half, infinity) = (s.splat(0.5), s.splat(f32::INFINITY));
+        let mut good = s.lt(half, infinity);
+        for c in 0..3 {
+            let v = s.fma(gain, sum[c], half) + residual[c];
+            good = good & s.lt(s.abs(v), infinity);
+            s.store(s.max(v, s.splat(0.0)), &mut lanes[c]);
+        }
+        let good = s.bits(good);
+        for (l, &i) in group[..count].iter().enumerate() {
+            let f = &mut self.footprints[i as usize];
+            if good & (1 << l) != 0 {
+                f.rgb = [lanes[0][l], lanes[1][l], lanes[2][l]];
+            } else {
+                *f = Footprint::default();
+            }
+        }
+    }
+
+    /// γ and δ.
+    #[inline(always)]
+    fn gain<S: Simd>(&self, s: S, index: &[usize; LANES]) -> (S::F, [S::F; 3]) {
+        let (gain, n) = (self.splats.gain, self.splats.len());
+        let none = [s.splat(0.0); 3];
+        if gain.is_empty() {
+            (s.splat(1.0), none)
+        } else if gain.len() == 4 * n {
+            let [gain, r, g, b] = s.load4(gain, &index.map(|i| 4 * i), 0);
+            (gain, [r, g, b])
+        } else {
+            let one = index.map(|i| gain.get(i).copied().unwrap_or(1.0));
+            (s.load(&one), none)
+        }
+    }
 }

@@ -1,19 +1,26 @@
-//! The whole forward pass: project, sort by depth, list per tile, composite.
+//! The whole forward pass: project, list per tile; then for each tile sort by depth,
+//! composite, write.
 //!
 //! In: [`SplatSlices`], a camera, [`RasterOptions`]. Out, H × W pixels row-major:
 //! RGB over the background, accumulated alpha 1 − T, and Σ w·z with z the camera z
 //! of the means in world units (in either convention). Work is spread over rayon's
-//! current pool; the same bytes come out whatever its size.
+//! current pool; the same bytes come out whatever its size. Of the tiers only
+//! [`Tier::Scalar`] gives other bytes than the rest, since it rounds products.
 
 use crate::abi::{BLOCK, DEPTH_ALPHA_MIN, RasterOptions, TILE};
 use crate::camera::Camera;
-use crate::cpu::blend::{BLOCKS, Block, Rules, Tile};
+use crate::cpu::blend::{BLOCKS, RenderTile, Rules, Tile};
+use crate::cpu::disjoint::Disjoint;
 use crate::cpu::ewa::{Footprint, View};
 use crate::cpu::project::{Projection, SplatSlices};
-use crate::cpu::sort::DepthSort;
+use crate::cpu::raster_bwd::Buffers;
+use crate::cpu::simd::Tier;
+use crate::cpu::sort::depth_order;
 use crate::cpu::tiles::{Grid, TileLists};
 use rayon::prelude::*;
 use std::ops::Range;
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering::Relaxed};
+use std::time::{Duration, Instant};
 
 /// A rendered picture, row-major.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -51,20 +58,56 @@ pub struct Stats {
     pub bytes: usize,
 }
 
+/// Where the last frame's time went.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct StageTimes {
+    /// Geometry, colour and counting, from start to end.
+    pub project: Duration,
+    /// Prefix sums and the writing of lists, from start to end.
+    pub list: Duration,
+    /// Sorting, compositing and writing of tiles, from start to end.
+    pub tiles: Duration,
+    /// Sorting by depth, summed over threads.
+    pub sort: Duration,
+    /// Compositing, summed over threads.
+    pub blend: Duration,
+    /// Writing pixels, summed over threads.
+    pub write: Duration,
+}
+
+/// Nanoseconds that tiles took, added up by all threads.
+#[derive(Debug, Default)]
+struct Clocks {
+    sort: AtomicU64,
+    blend: AtomicU64,
+    write: AtomicU64,
+}
+
 /// The rasterizer with its buffers: a frame no larger than the last allocates
-/// next to nothing.
+/// nothing.
 #[derive(Debug, Default)]
 pub struct Rasterizer {
-    projection: Projection,
-    order: DepthSort,
-    lists: TileLists,
-    grid: Grid,
-    /// Accumulators, in order of work: slot s holds tile `tile_of_slot[s]`.
-    slots: Vec<Tile>,
-    tile_of_slot: Vec<usize>,
-    slot_of_tile: Vec<usize>,
-    background: [f32; 3],
+    pub(crate) tier: Tier,
+    pub(crate) timed: bool,
+    pub(crate) projection: Projection,
+    pub(crate) lists: TileLists,
+    pub(crate) grid: Grid,
+    /// Tiles in the order of work.
+    queue: Vec<u32>,
     stats: Stats,
+    times: StageTimes,
+    pub(crate) back: Buffers,
+}
+
+/// A picture being written, tile by tile: pixel p's channel c stands at
+/// `rgb[p·step + c·channel]`.
+struct Target<'a> {
+    rgb: Disjoint<'a, f32>,
+    step: usize,
+    channel: usize,
+    alpha: Disjoint<'a, f32>,
+    depth_sum: Disjoint<'a, f32>,
+    background: [f32; 3],
 }
 
 impl Rasterizer {
@@ -73,10 +116,25 @@ impl Rasterizer {
         Self::default()
     }
 
-    /// Limits the memory of the per-tile lists to about `pairs` × 4 bytes (default
-    /// 2²⁶ pairs). The picture does not depend on it.
+    /// Limits the memory of the per-tile lists to about `pairs` × 24 bytes (default
+    /// 2²⁴ pairs). The picture does not depend on it.
     pub fn with_pairs_per_group(mut self, pairs: usize) -> Self {
         self.lists.set_pairs_per_group(pairs);
+        self
+    }
+
+    /// Uses the instructions of `tier` (default [`Tier::best`]; the scalar ones where
+    /// the processor lacks them). Tiers that fuse multiply and add give the same
+    /// bytes; the scalar one differs in last bits (about 1e-6 of a colour, and
+    /// a splat's contribution of 1/255 where that decides whether it is skipped).
+    pub fn with_tier(mut self, tier: Tier) -> Self {
+        self.tier = tier;
+        self
+    }
+
+    /// Measures what [`Rasterizer::stage_times`] tells.
+    pub fn with_stage_times(mut self) -> Self {
+        self.timed = true;
         self
     }
 
@@ -100,22 +158,20 @@ impl Rasterizer {
         options: &RasterOptions,
         out: &mut Rendered,
     ) {
-        self.composite(splats, camera, options);
-        let Grid { width, height, .. } = self.grid;
+        let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
         (out.width, out.height) = (width, height);
         out.rgb.resize(3 * width * height, 0.0);
         out.alpha.resize(width * height, 0.0);
         out.depth_sum.resize(width * height, 0.0);
-        let w = width.max(1);
-        let rows = out.rgb.par_chunks_mut(3 * w).zip(out.alpha.par_chunks_mut(w));
-        let rows = rows.zip(out.depth_sum.par_chunks_mut(w));
-        rows.enumerate().for_each(|(y, ((rgb, alpha), depth_sum))| {
-            self.row(y, |x, pixel| {
-                rgb[3 * x..3 * x + 3].copy_from_slice(&pixel[..3]);
-                alpha[x] = pixel[3];
-                depth_sum[x] = pixel[4];
-            });
-        });
+        let target = Target {
+            rgb: Disjoint::new(&mut out.rgb),
+            step: 3,
+            channel: 1,
+            alpha: Disjoint::new(&mut out.alpha),
+            depth_sum: Disjoint::new(&mut out.depth_sum),
+            background: options.background,
+        };
+        self.composite(splats, camera, options, &target);
     }
 
     /// Renders into planes `[5, H, W]`: R, G, B, alpha, Σ w·z.
@@ -126,13 +182,19 @@ impl Rasterizer {
         options: &RasterOptions,
         out: &mut Vec<f32>,
     ) {
-        self.composite(splats, camera, options);
-        let Grid { width, height, .. } = self.grid;
-        out.resize(5 * width * height, 0.0);
-        out.par_chunks_mut(width.max(1)).enumerate().for_each(|(row, values)| {
-            let (plane, y) = (row / height, row % height);
-            self.row(y, |x, pixel| values[x] = pixel[plane]);
-        });
+        let plane = camera.intrinsics.width * camera.intrinsics.height;
+        out.resize(5 * plane, 0.0);
+        let (rgb, rest) = out.split_at_mut(3 * plane);
+        let (alpha, depth_sum) = rest.split_at_mut(plane);
+        let target = Target {
+            rgb: Disjoint::new(rgb),
+            step: 1,
+            channel: plane,
+            alpha: Disjoint::new(alpha),
+            depth_sum: Disjoint::new(depth_sum),
+            background: options.background,
+        };
+        self.composite(splats, camera, options, &target);
     }
 
     /// `[N]`: the last frame's footprints, in the splats' order.
@@ -145,73 +207,165 @@ impl Rasterizer {
         self.stats
     }
 
-    /// Everything but the picture: leaves the accumulators of all tiles in `slots`.
-    fn composite(&mut self, splats: &SplatSlices, camera: &Camera, options: &RasterOptions) {
+    /// Where the last frame's time went; zeros without
+    /// [`Rasterizer::with_stage_times`].
+    pub fn stage_times(&self) -> StageTimes {
+        self.times
+    }
+
+    /// The whole frame, written to `target`.
+    fn composite(
+        &mut self,
+        splats: &SplatSlices,
+        camera: &Camera,
+        options: &RasterOptions,
+        target: &Target,
+    ) {
         debug_assert!(splats.is_consistent(), "splat buffers do not fit one another");
+        let start = self.now();
         let view = View::new(camera, options);
         self.grid = Grid::new(camera.intrinsics.width, camera.intrinsics.height);
-        self.background = options.background;
-        self.projection.run(splats, &view, options);
-        let footprints = &self.projection.footprints;
-        self.order.run(footprints, &self.projection.visible);
-        self.lists.count(self.grid, &self.order, footprints);
+        self.lists.begin(self.grid, splats.len());
+        self.projection.run(self.tier, splats, &view, options, &mut self.lists);
+        self.times = StageTimes { project: since(start), ..StageTimes::default() };
 
+        let clocks = Clocks::default();
+        self.lists.count();
         let tiles = self.grid.len();
-        self.slots.resize(tiles, Tile::default());
-        self.tile_of_slot.clear();
-        self.tile_of_slot.extend(0..tiles);
-        self.slot_of_tile.resize(tiles, 0);
         let (mut first, mut items) = (0, 0);
         while first < tiles {
+            let start = self.now();
             let group = self.lists.group(first);
             first = group.end;
-            items += self.composite_group(group, Rules::new(options.convention));
+            self.lists.fill(&group, &self.projection.footprints);
+            self.times.list += since(start);
+            let start = self.now();
+            items += self.tiles(group, Rules::new(options.convention), target, &clocks);
+            self.times.tiles += since(start);
         }
+        let spent = |clock: &AtomicU64| Duration::from_nanos(clock.load(Relaxed));
+        self.times.sort = spent(&clocks.sort);
+        self.times.blend = spent(&clocks.blend);
+        self.times.write = spent(&clocks.write);
         self.stats = Stats {
-            visible: self.order.len(),
+            visible: self.lists.visible(),
             pairs: self.lists.pairs(),
             items,
-            bytes: self.bytes(),
+            bytes: self.projection.bytes()
+                + self.lists.bytes()
+                + self.back.bytes()
+                + 4 * self.queue.capacity(),
         };
     }
 
-    /// Composites one group of tiles, those with the longest lists first.
-    fn composite_group(&mut self, group: Range<usize>, rules: Rules) -> usize {
+    /// Sorts, composites and writes one group of tiles, those with the longest lists
+    /// first: threads take them from one queue.
+    fn tiles(
+        &mut self,
+        group: Range<usize>,
+        rules: Rules,
+        target: &Target,
+        clocks: &Clocks,
+    ) -> usize {
+        let (lists, timed) = (&self.lists, self.timed);
+        self.queue.clear();
+        self.queue.extend(group.map(|t| t as u32));
+        self.queue.sort_unstable_by_key(|&t| (std::cmp::Reverse(lists.tile_len(t as usize)), t));
+        let (grid, tier, queue) = (self.grid, self.tier, &self.queue);
         let footprints = &self.projection.footprints;
-        self.lists.fill(&group, &self.order, footprints);
-        let (lists, grid) = (&self.lists, &self.grid);
-        let tiles = &mut self.tile_of_slot[group.clone()];
-        tiles.sort_unstable_by_key(|&t| (std::cmp::Reverse(lists.tile_len(t)), t));
-        for (s, &t) in tiles.iter().enumerate() {
-            self.slot_of_tile[t] = group.start + s;
-        }
-        let slots = self.slots[group].par_iter_mut().with_max_len(1);
-        let work = slots.zip(&*tiles);
-        work.map(|(slot, &t)| slot.render(t, grid, lists.list(t), footprints, rules)).sum()
+        let lists = self.lists.lists();
+        let (next, items) = (AtomicUsize::new(0), AtomicUsize::new(0));
+        let work = |_| {
+            let mut tile = Tile::default();
+            while let Some(&t) = queue.get(next.fetch_add(1, Relaxed)) {
+                let t = t as usize;
+                let start = timed.then(Instant::now);
+                // SAFETY: the queue names each tile once, and its counter gives each
+                // place to one thread.
+                let list = unsafe { lists.take(t) };
+                depth_order(list.entries, list.spare, list.order);
+                let (order, splats) = (&*list.order, list.splats);
+                let sorted = timed.then(Instant::now);
+                let work =
+                    RenderTile { tile: &mut tile, t, grid, order, splats, footprints, rules };
+                items.fetch_add(tier.run(work), Relaxed);
+                let blended = timed.then(Instant::now);
+                // SAFETY: as above; no other tile has these pixels.
+                unsafe { target.write(&tile, t, &grid) };
+                if let (Some(start), Some(sorted), Some(blended)) = (start, sorted, blended) {
+                    let add = |clock: &AtomicU64, from: Instant, to: Instant| {
+                        clock.fetch_add((to - from).as_nanos() as u64, Relaxed);
+                    };
+                    add(&clocks.sort, start, sorted);
+                    add(&clocks.blend, sorted, blended);
+                    add(&clocks.write, blended, Instant::now());
+                }
+            }
+        };
+        let threads = rayon::current_num_threads().min(queue.len());
+        (0..threads).into_par_iter().with_max_len(1).for_each(work);
+        items.into_inner()
     }
 
-    /// Calls `write` with every x of row `y` and its (R, G, B, alpha, Σ w·z).
-    fn row(&self, y: usize, mut write: impl FnMut(usize, [f32; 5])) {
-        let first_tile = y / TILE * self.grid.columns;
-        let (block_row, lane_row) = (y % TILE / BLOCK, y % BLOCK);
-        for x in (0..self.grid.width).step_by(BLOCK) {
-            let tile = &self.slots[self.slot_of_tile[first_tile + x / TILE]];
-            let block: &Block = &tile.blocks[block_row * BLOCKS + x % TILE / BLOCK];
-            for i in 0..BLOCK.min(self.grid.width - x) {
-                let l = lane_row * BLOCK + i;
-                let t = block.t[l].abs();
-                let [r, g, b]: [f32; 3] =
-                    std::array::from_fn(|c| block.rgb[c][l] + t * self.background[c]);
-                write(x + i, [r, g, b, 1.0 - t, block.z[l]]);
+    pub(crate) fn now(&self) -> Option<Instant> {
+        self.timed.then(Instant::now)
+    }
+}
+
+pub(crate) fn since(start: Option<Instant>) -> Duration {
+    start.map_or(Duration::ZERO, |s| s.elapsed())
+}
+
+impl Target<'_> {
+    /// Writes the pixels of tile `t` of `grid`.
+    ///
+    /// # Safety
+    /// No other thread writes the same tile.
+    unsafe fn write(&self, tile: &Tile, t: usize, grid: &Grid) {
+        let (left, top) = (t % grid.columns * TILE, t / grid.columns * TILE);
+        let width = TILE.min(grid.width - left);
+        let [red, green, blue] = self.background;
+        for y in 0..TILE.min(grid.height - top) {
+            // One row of pixels, unfolded from its blocks.
+            let mut row = [[0.0f32; TILE]; 5];
+            let blocks = &tile.blocks[y / BLOCK * BLOCKS..][..BLOCKS];
+            for (b, block) in blocks.iter().enumerate() {
+                let lane = y % BLOCK * BLOCK;
+                for (to, from) in row.iter_mut().zip([
+                    &block.rgb[0],
+                    &block.rgb[1],
+                    &block.rgb[2],
+                    &block.t,
+                    &block.z,
+                ]) {
+                    to[b * BLOCK..][..BLOCK].copy_from_slice(&from[lane..lane + BLOCK]);
+                }
+            }
+            let [r, g, b, t, z] = &mut row;
+            for x in 0..TILE {
+                let rest = t[x].abs();
+                r[x] += rest * red;
+                g[x] += rest * green;
+                b[x] += rest * blue;
+                t[x] = 1.0 - rest;
+            }
+            let first = (top + y) * grid.width + left;
+            // SAFETY: these pixels are the tile's (the caller's promise).
+            unsafe {
+                self.alpha.part(first..first + width).copy_from_slice(&t[..width]);
+                self.depth_sum.part(first..first + width).copy_from_slice(&z[..width]);
+                if self.step == 1 {
+                    for (c, plane) in [&*r, &*g, &*b].into_iter().enumerate() {
+                        let first = c * self.channel + first;
+                        self.rgb.part(first..first + width).copy_from_slice(&plane[..width]);
+                    }
+                } else {
+                    let pixels = self.rgb.part(3 * first..3 * (first + width));
+                    for (x, pixel) in pixels.chunks_exact_mut(3).enumerate() {
+                        pixel.copy_from_slice(&[r[x], g[x], b[x]]);
+                    }
+                }
             }
         }
-    }
-
-    fn bytes(&self) -> usize {
-        self.projection.bytes()
-            + self.order.bytes()
-            + self.lists.bytes()
-            + self.slots.capacity() * size_of::<Tile>()
-            + 8 * (self.tile_of_slot.capacity() + self.slot_of_tile.capacity())
     }
 }

@@ -5,6 +5,8 @@
 //! coefficients `[D, 3]`, RGB innermost. Out: RGB before gain, offset and clamp.
 
 use crate::abi::{SH_COEFFICIENTS_MAX, ShBasis, sh_coefficients};
+use crate::cpu::simd::{LANES, Simd};
+use std::ops::{Add, Mul, Sub};
 
 /// Highest degree that `basis` evaluates.
 pub fn degree_max(basis: ShBasis) -> usize {
@@ -16,61 +18,106 @@ pub fn degree_max(basis: ShBasis) -> usize {
 
 /// Basis functions of `basis` up to `degree` at the unit vector `d`; the rest is 0.
 pub fn basis(basis: ShBasis, degree: usize, d: [f32; 3]) -> [f32; SH_COEFFICIENTS_MAX] {
+    functions(One, basis, degree, d)
+}
+
+/// One text for one direction and for lanes of them.
+#[inline(always)]
+fn functions<T: Number, K: Constants<T>>(
+    k: K,
+    basis: ShBasis,
+    degree: usize,
+    d: [T; 3],
+) -> [T; SH_COEFFICIENTS_MAX] {
+    let [x, y, z] = d;
     match basis {
-        ShBasis::Standard => standard(degree, d),
+        ShBasis::Standard => standard(k, degree, d),
         ShBasis::Mvsplat => {
-            let [x, y, z] = d;
             let degree = degree.min(degree_max(ShBasis::Mvsplat));
-            let mut out = standard(degree, [z, x, y]);
+            let mut out = standard(k, degree, [z, x, y]);
             if degree == 3 {
-                out[14] = 1.445_305_7 * z * (z * z - x * x);
+                out[14] = k.of(1.445_305_7) * z * (z * z - x * x);
             }
             out
         }
     }
 }
 
-fn standard(degree: usize, [x, y, z]: [f32; 3]) -> [f32; SH_COEFFICIENTS_MAX] {
-    let mut b = [0.0; SH_COEFFICIENTS_MAX];
-    b[0] = 0.282_094_8;
+/// What [`functions`] needs of its numbers.
+trait Number: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> {}
+impl<T: Copy + Add<Output = T> + Sub<Output = T> + Mul<Output = T>> Number for T {}
+
+/// What makes constants among them.
+trait Constants<T>: Copy {
+    fn of(self, v: f32) -> T;
+}
+
+#[derive(Clone, Copy)]
+struct One;
+
+impl Constants<f32> for One {
+    #[inline(always)]
+    fn of(self, v: f32) -> f32 {
+        v
+    }
+}
+
+#[derive(Clone, Copy)]
+struct Sixteen<S>(S);
+
+impl<S: Simd> Constants<S::F> for Sixteen<S> {
+    #[inline(always)]
+    fn of(self, v: f32) -> S::F {
+        self.0.splat(v)
+    }
+}
+
+#[inline(always)]
+fn standard<T: Number, K: Constants<T>>(
+    k: K,
+    degree: usize,
+    [x, y, z]: [T; 3],
+) -> [T; SH_COEFFICIENTS_MAX] {
+    let mut b = [k.of(0.0); SH_COEFFICIENTS_MAX];
+    b[0] = k.of(0.282_094_8);
     if degree == 0 {
         return b;
     }
-    b[1] = -0.488_602_52 * y;
-    b[2] = 0.488_602_52 * z;
-    b[3] = -0.488_602_52 * x;
+    b[1] = k.of(-0.488_602_52) * y;
+    b[2] = k.of(0.488_602_52) * z;
+    b[3] = k.of(-0.488_602_52) * x;
     if degree == 1 {
         return b;
     }
     let (xx, yy, zz) = (x * x, y * y, z * z);
     let (xy, yz, xz) = (x * y, y * z, x * z);
-    b[4] = 1.092_548_5 * xy;
-    b[5] = -1.092_548_5 * yz;
-    b[6] = 0.315_391_57 * (2.0 * zz - xx - yy);
-    b[7] = -1.092_548_5 * xz;
-    b[8] = 0.546_274_24 * (xx - yy);
+    b[4] = k.of(1.092_548_5) * xy;
+    b[5] = k.of(-1.092_548_5) * yz;
+    b[6] = k.of(0.315_391_57) * (k.of(2.0) * zz - xx - yy);
+    b[7] = k.of(-1.092_548_5) * xz;
+    b[8] = k.of(0.546_274_24) * (xx - yy);
     if degree == 2 {
         return b;
     }
-    b[9] = -0.590_043_6 * y * (3.0 * xx - yy);
-    b[10] = 2.890_611_4 * xy * z;
-    b[11] = -0.457_045_8 * y * (4.0 * zz - xx - yy);
-    b[12] = 0.373_176_34 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy);
-    b[13] = -0.457_045_8 * x * (4.0 * zz - xx - yy);
-    b[14] = 1.445_305_7 * z * (xx - yy);
-    b[15] = -0.590_043_6 * x * (xx - 3.0 * yy);
+    b[9] = k.of(-0.590_043_6) * y * (k.of(3.0) * xx - yy);
+    b[10] = k.of(2.890_611_4) * xy * z;
+    b[11] = k.of(-0.457_045_8) * y * (k.of(4.0) * zz - xx - yy);
+    b[12] = k.of(0.373_176_34) * z * (k.of(2.0) * zz - k.of(3.0) * xx - k.of(3.0) * yy);
+    b[13] = k.of(-0.457_045_8) * x * (k.of(4.0) * zz - xx - yy);
+    b[14] = k.of(1.445_305_7) * z * (xx - yy);
+    b[15] = k.of(-0.590_043_6) * x * (xx - k.of(3.0) * yy);
     if degree == 3 {
         return b;
     }
-    b[16] = 2.503_343 * xy * (xx - yy);
-    b[17] = -1.770_130_8 * yz * (3.0 * xx - yy);
-    b[18] = 0.946_174_7 * xy * (7.0 * zz - 1.0);
-    b[19] = -0.669_046_5 * yz * (7.0 * zz - 3.0);
-    b[20] = 0.105_785_55 * (zz * (35.0 * zz - 30.0) + 3.0);
-    b[21] = -0.669_046_5 * xz * (7.0 * zz - 3.0);
-    b[22] = 0.473_087_34 * (xx - yy) * (7.0 * zz - 1.0);
-    b[23] = -1.770_130_8 * xz * (xx - 3.0 * yy);
-    b[24] = 0.625_835_7 * (xx * (xx - 3.0 * yy) - yy * (3.0 * xx - yy));
+    b[16] = k.of(2.503_343) * xy * (xx - yy);
+    b[17] = k.of(-1.770_130_8) * yz * (k.of(3.0) * xx - yy);
+    b[18] = k.of(0.946_174_7) * xy * (k.of(7.0) * zz - k.of(1.0));
+    b[19] = k.of(-0.669_046_5) * yz * (k.of(7.0) * zz - k.of(3.0));
+    b[20] = k.of(0.105_785_55) * (zz * (k.of(35.0) * zz - k.of(30.0)) + k.of(3.0));
+    b[21] = k.of(-0.669_046_5) * xz * (k.of(7.0) * zz - k.of(3.0));
+    b[22] = k.of(0.473_087_34) * (xx - yy) * (k.of(7.0) * zz - k.of(1.0));
+    b[23] = k.of(-1.770_130_8) * xz * (xx - k.of(3.0) * yy);
+    b[24] = k.of(0.625_835_7) * (xx * (xx - k.of(3.0) * yy) - yy * (k.of(3.0) * xx - yy));
     b
 }
 
@@ -86,6 +133,57 @@ pub fn radiance(kind: ShBasis, degree: usize, d: [f32; 3], sh: &[f32]) -> [f32; 
         }
     }
     rgb
+}
+
+/// [`radiance`] of sixteen sets along sixteen unit vectors: set l starts at `at[l]`
+/// of `sh`, and holds at least the coefficients of `degree`.
+#[inline(always)]
+pub(crate) fn radiance_lanes<S: Simd>(
+    s: S,
+    (kind, degree): (ShBasis, usize),
+    d: [S::F; 3],
+    sh: &[f32],
+    at: &[usize; LANES],
+) -> [S::F; 3] {
+    let degree = degree.min(degree_max(kind));
+    let used = sh_coefficients(degree);
+    let b = functions(Sixteen(s), kind, degree, d);
+    let mut rgb = [s.splat(0.0); 3];
+    // Four coefficients are twelve floats, three transposed quads.
+    let mut c = 0;
+    while c + 4 <= used {
+        let [r0, g0, b0, r1] = s.load4(sh, at, 3 * c);
+        let [g1, b1, r2, g2] = s.load4(sh, at, 3 * c + 4);
+        let [b2, r3, g3, b3] = s.load4(sh, at, 3 * c + 8);
+        let (y0, y1, y2, y3) = (b[c], b[c + 1], b[c + 2], b[c + 3]);
+        rgb[0] = s.fma(r3, y3, s.fma(r2, y2, s.fma(r1, y1, s.fma(r0, y0, rgb[0]))));
+        rgb[1] = s.fma(g3, y3, s.fma(g2, y2, s.fma(g1, y1, s.fma(g0, y0, rgb[1]))));
+        rgb[2] = s.fma(b3, y3, s.fma(b2, y2, s.fma(b1, y1, s.fma(b0, y0, rgb[2]))));
+        c += 4;
+    }
+    // (degree + 1)² leaves one or none.
+    if c < used {
+        let mut last = [[0.0; LANES]; 3];
+        for (l, &at) in at.iter().enumerate() {
+            let set = sh.get(at + 3 * c..at + 3 * c + 3).unwrap_or(&[0.0; 3]);
+            for (lanes, v) in last.iter_mut().zip(set) {
+                lanes[l] = *v;
+            }
+        }
+        rgb[0] = s.fma(s.load(&last[0]), b[c], rgb[0]);
+        rgb[1] = s.fma(s.load(&last[1]), b[c], rgb[1]);
+        rgb[2] = s.fma(s.load(&last[2]), b[c], rgb[2]);
+    }
+    rgb
+}
+
+/// [`direction`] of sixteen vectors.
+#[inline(always)]
+pub(crate) fn direction_lanes<S: Simd>(s: S, v: [S::F; 3]) -> [S::F; 3] {
+    let norm = s.sqrt(s.fma(v[0], v[0], s.fma(v[1], v[1], v[2] * v[2])));
+    let good = s.lt(s.splat(0.0), norm) & s.lt(norm, s.splat(f32::INFINITY));
+    let inverse = s.keep(good, s.splat(1.0) / norm);
+    [s.keep(good, v[0] * inverse), s.keep(good, v[1] * inverse), s.keep(good, v[2] * inverse)]
 }
 
 /// `v` / ‖v‖, or the zero vector where that has no direction.

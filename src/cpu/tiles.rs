@@ -1,22 +1,24 @@
-//! Which splats touch which tile: per-tile lists in depth order.
+//! Which splats touch which tile: per-tile lists.
 //!
-//! Splats in depth order are cut into chunks; each chunk counts its entries per
-//! tile, a prefix sum over (tile, chunk) gives every chunk its slots, and each
-//! chunk writes. Lists come out depth-sorted with no sort of (tile, depth) pairs,
-//! the same for any number of threads.
+//! Projection leaves, chunk by chunk of splats, the tiles that each visible splat can
+//! touch and how many entries every tile gets; a prefix sum over (tile, chunk) gives
+//! every chunk its slots, and each chunk writes, reading nothing but what projection
+//! left. Lists come out in the splats' order, the same for any number of threads; each
+//! is sorted by depth where it is used.
 //!
 //! Memory is bounded: tiles are taken in groups whose lists together stay within
 //! [`PAIRS_PER_GROUP`] entries (or one tile's), however many tiles the splats cover.
 
 use crate::abi::TILE;
+use crate::cpu::disjoint::Disjoint;
 use crate::cpu::ewa::Footprint;
-use crate::cpu::sort::{DepthSort, chunk_len};
+use crate::cpu::project::CHUNK;
+use crate::cpu::sort::entry;
 use rayon::prelude::*;
 use std::ops::Range;
-use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
-/// Most (splat, tile) pairs listed at a time: 256 MiB.
-pub(crate) const PAIRS_PER_GROUP: usize = 1 << 26;
+/// Most (splat, tile) pairs listed at a time, 24 bytes each: 384 MiB.
+pub(crate) const PAIRS_PER_GROUP: usize = 1 << 24;
 
 /// The tiles of a picture, row-major.
 #[derive(Clone, Copy, Debug, Default)]
@@ -36,31 +38,88 @@ impl Grid {
         self.columns * self.rows
     }
 
-    /// Calls `each` with every tile of rows `rows` that `f` can touch.
+    /// Tiles of the pixel rectangle of `f`: columns, rows.
+    #[inline(always)]
+    fn rectangle(f: &Footprint) -> [Range<usize>; 2] {
+        [
+            f.x0 as usize / TILE..(f.x1 as usize).div_ceil(TILE),
+            f.y0 as usize / TILE..(f.y1 as usize).div_ceil(TILE),
+        ]
+    }
+
+    /// Calls `each` with every tile of rows `rows` that `f` can touch, by its ellipse.
     fn touched(&self, f: &Footprint, rows: Range<usize>, mut each: impl FnMut(usize)) {
-        let first = (f.y0 as usize / TILE).max(rows.start);
-        let past = (f.y1 as usize).div_ceil(TILE).min(rows.end);
-        let all = (f.x0 as usize / TILE, (f.x1 as usize).div_ceil(TILE));
-        // For splats smaller than a tile the rectangle is nearly as good as the
-        // ellipse, and cheaper.
-        let side = TILE as u32;
-        let small = f.x1 - f.x0 <= side && f.y1 - f.y0 <= side;
-        for row in first..past {
-            let (mut from, mut to) = all;
-            if !small {
-                let top = (row * TILE) as f32;
-                match f.span(top, top + (TILE - 1) as f32) {
-                    // `as` takes what lies left of the picture to column 0.
-                    Some((left, right)) if right >= 0.0 => {
-                        from = from.max(left as usize / TILE);
-                        to = to.min(right as usize / TILE + 1);
-                    }
-                    _ => continue,
-                }
+        let [columns, own] = Self::rectangle(f);
+        for row in own.start.max(rows.start)..own.end.min(rows.end) {
+            let top = (row * TILE) as f32;
+            let Some((left, right)) = f.span(top, top + (TILE - 1) as f32) else { continue };
+            if right < 0.0 {
+                continue;
             }
+            // `as` takes what lies left of the picture to column 0.
+            let from = columns.start.max(left as usize / TILE);
+            let to = columns.end.min(right as usize / TILE + 1);
             for column in from..to {
                 each(row * self.columns + column);
             }
+        }
+    }
+}
+
+/// Where one visible splat goes.
+#[derive(Clone, Copy, Debug, Default)]
+struct Cover {
+    /// Bits of the camera z.
+    z: u32,
+    splat: u32,
+    /// Tile columns [from, to); to = 0: ask the footprint.
+    columns: [u16; 2],
+    /// Tile rows.
+    rows: [u16; 2],
+}
+
+/// What projection leaves of one chunk of splats.
+pub(crate) struct ChunkCover<'a> {
+    grid: Grid,
+    covers: &'a mut [Cover],
+    len: &'a mut u32,
+    /// Entries of every tile.
+    counts: &'a mut [u32],
+}
+
+impl ChunkCover<'_> {
+    /// Forgets the last frame.
+    pub(crate) fn clear(&mut self) {
+        *self.len = 0;
+        self.counts.fill(0);
+    }
+
+    /// Adds a visible splat; call it in the splats' order.
+    #[inline(always)]
+    pub(crate) fn add(&mut self, f: &Footprint, splat: u32) {
+        let [columns, rows] = Grid::rectangle(f);
+        // For splats that meet four tiles at most the rectangle is nearly as good as
+        // the ellipse, and cheaper.
+        let small = columns.len() <= 2 && rows.len() <= 2;
+        let fits = columns.end <= usize::from(u16::MAX) && rows.end <= usize::from(u16::MAX);
+        let mut cover = Cover { z: f.z.to_bits(), splat, ..Cover::default() };
+        let (grid, counts) = (self.grid, &mut *self.counts);
+        if small && fits {
+            cover.columns = [columns.start as u16, columns.end as u16];
+            cover.rows = [rows.start as u16, rows.end as u16];
+            for row in rows {
+                for c in columns.clone() {
+                    if let Some(count) = counts.get_mut(row * grid.columns + c) {
+                        *count += 1;
+                    }
+                }
+            }
+        } else {
+            grid.touched(f, 0..grid.rows, |t| counts[t] += 1);
+        }
+        if let Some(slot) = self.covers.get_mut(*self.len as usize) {
+            *slot = cover;
+            *self.len += 1;
         }
     }
 }
@@ -69,35 +128,109 @@ impl Grid {
 #[derive(Debug, Default)]
 pub(crate) struct TileLists {
     grid: Grid,
+    /// `[chunks, CHUNK]`: each chunk's first `lens` are meant.
+    covers: Vec<Cover>,
+    /// `[chunks]`: visible splats.
+    lens: Vec<u32>,
     /// `[chunks, tiles]`: counts, then where each chunk's next entry goes.
     slots: Vec<u32>,
     /// `[tiles]`: entries of each tile.
     counts: Vec<u32>,
     /// `[tiles]`: first entry of each tile within its group.
-    starts: Vec<usize>,
-    entries: Vec<AtomicU32>,
-    /// Splats, in depth order, per chunk.
-    chunk: usize,
+    starts: Vec<u32>,
+    /// Depth and place of every entry, tile by tile.
+    entries: Vec<u64>,
+    spare: Vec<u64>,
+    /// Splat of every entry, ascending within a tile.
+    splats: Vec<u32>,
+    /// Places within the tile, nearest first.
+    order: Vec<u32>,
     pairs_per_group: Option<usize>,
+    /// The group that the lists hold; empty before a fill.
+    filled: Range<usize>,
+}
+
+/// One tile's lists.
+pub(crate) struct TileList<'a> {
+    /// Depth and place; as long as the list.
+    pub(crate) entries: &'a mut [u64],
+    /// Room for the sort.
+    pub(crate) spare: &'a mut [u64],
+    /// Places, nearest first, once sorted.
+    pub(crate) order: &'a mut [u32],
+    /// Splat at each place.
+    pub(crate) splats: &'a [u32],
+}
+
+/// The lists of one group of tiles, given out tile by tile to several threads.
+pub(crate) struct GroupLists<'a> {
+    counts: &'a [u32],
+    starts: &'a [u32],
+    entries: Disjoint<'a, u64>,
+    spare: Disjoint<'a, u64>,
+    order: Disjoint<'a, u32>,
+    splats: &'a [u32],
+}
+
+impl GroupLists<'_> {
+    /// Places of the entries of tile `t` among those of the group.
+    pub(crate) fn places(&self, t: usize) -> Range<usize> {
+        let start = self.starts[t] as usize;
+        start..start + self.counts[t] as usize
+    }
+
+    /// The lists of tile `t`.
+    ///
+    /// # Safety
+    /// Every tile is asked for once.
+    pub(crate) unsafe fn take(&self, t: usize) -> TileList<'_> {
+        let start = self.starts[t] as usize;
+        let range = start..start + self.counts[t] as usize;
+        // SAFETY: ranges of different tiles do not overlap, being made by a prefix sum,
+        // and each is taken once (the caller's promise).
+        unsafe {
+            TileList {
+                entries: self.entries.part(range.clone()),
+                spare: self.spare.part(range.clone()),
+                order: self.order.part(range.clone()),
+                splats: &self.splats[range],
+            }
+        }
+    }
 }
 
 impl TileLists {
-    /// Counts the entries of every tile.
-    pub(crate) fn count(&mut self, grid: Grid, order: &DepthSort, footprints: &[Footprint]) {
+    /// Makes room for a frame of `n` splats.
+    pub(crate) fn begin(&mut self, grid: Grid, n: usize) {
         self.grid = grid;
-        let tiles = grid.len();
-        let chunk = chunk_len(order.len());
-        self.chunk = chunk;
-        self.slots.clear();
-        self.slots.resize(order.len().div_ceil(chunk) * tiles, 0);
-        if tiles > 0 {
-            self.slots.par_chunks_mut(tiles).enumerate().for_each(|(c, counts)| {
-                for rank in c * chunk..((c + 1) * chunk).min(order.len()) {
-                    let f = &footprints[order.splat(rank) as usize];
-                    grid.touched(f, 0..grid.rows, |t| counts[t] += 1);
-                }
-            });
+        self.filled = 0..0;
+        let chunks = n.div_ceil(CHUNK);
+        if self.covers.len() < n {
+            self.covers.resize(n, Cover::default());
         }
+        self.lens.resize(chunks, 0);
+        self.slots.resize(chunks * grid.len().max(1), 0);
+    }
+
+    /// What each chunk of `n` splats has to fill in.
+    pub(crate) fn chunks(
+        &mut self,
+        n: usize,
+    ) -> impl IndexedParallelIterator<Item = ChunkCover<'_>> {
+        let grid = self.grid;
+        let covers = self.covers[..n].par_chunks_mut(CHUNK).zip(&mut self.lens);
+        let counts = self.slots.par_chunks_mut(grid.len().max(1));
+        covers.zip(counts).map(move |((covers, len), counts)| ChunkCover {
+            grid,
+            covers,
+            len,
+            counts,
+        })
+    }
+
+    /// Counts the entries of every tile, all chunks being done.
+    pub(crate) fn count(&mut self) {
+        let tiles = self.grid.len();
         self.counts.clear();
         self.counts.resize(tiles, 0);
         self.starts.clear();
@@ -114,6 +247,11 @@ impl TileLists {
         self.pairs_per_group = Some(pairs);
     }
 
+    /// Splats that can touch the picture.
+    pub(crate) fn visible(&self) -> usize {
+        self.lens.iter().map(|&n| n as usize).sum()
+    }
+
     /// All (splat, tile) pairs of the frame.
     pub(crate) fn pairs(&self) -> usize {
         self.counts.iter().map(|&c| c as usize).sum()
@@ -126,13 +264,20 @@ impl TileLists {
 
     /// Bytes held.
     pub(crate) fn bytes(&self) -> usize {
-        4 * (self.slots.capacity() + self.counts.capacity() + self.entries.capacity())
-            + 8 * self.starts.capacity()
+        size_of::<Cover>() * self.covers.capacity()
+            + 8 * (self.entries.capacity() + self.spare.capacity())
+            + 4 * (self.lens.capacity() + self.slots.capacity() + self.counts.capacity())
+            + 4 * (self.starts.capacity() + self.splats.capacity() + self.order.capacity())
     }
 
     /// The largest range of tiles from `first` on that makes one group.
     pub(crate) fn group(&self, first: usize) -> Range<usize> {
-        let limit = self.pairs_per_group.unwrap_or(PAIRS_PER_GROUP);
+        self.group_within(first, PAIRS_PER_GROUP)
+    }
+
+    /// The same with `limit` entries unless a lower limit was set.
+    pub(crate) fn group_within(&self, first: usize, limit: usize) -> Range<usize> {
+        let limit = self.pairs_per_group.map_or(limit, |own| own.min(limit));
         let mut pairs = 0;
         let mut past = first;
         while past < self.counts.len() {
@@ -145,43 +290,140 @@ impl TileLists {
         first..past
     }
 
-    /// Writes the lists of the tiles of `group`.
-    pub(crate) fn fill(
-        &mut self,
-        group: &Range<usize>,
-        order: &DepthSort,
-        footprints: &[Footprint],
-    ) {
+    /// Writes the lists of the tiles of `group`, unsorted.
+    pub(crate) fn fill(&mut self, group: &Range<usize>, footprints: &[Footprint]) {
         let tiles = self.grid.len();
+        self.filled = group.clone();
         let mut next = 0;
         for t in group.clone() {
             self.starts[t] = next;
-            let mut slot = next as u32;
-            next += self.counts[t] as usize;
-            for counts in self.slots.chunks_mut(tiles) {
-                slot += std::mem::replace(&mut counts[t], slot);
+            next += self.counts[t];
+        }
+        let total = next as usize;
+        // Where the next chunk's entries of each tile begin; `starts` in the end again.
+        let cursor = &mut self.starts[group.clone()];
+        for counts in self.slots.chunks_mut(tiles) {
+            for (slot, c) in counts[group.clone()].iter_mut().zip(&mut *cursor) {
+                *c += std::mem::replace(slot, *c);
             }
         }
-        if self.entries.len() < next {
-            self.entries.resize_with(next, AtomicU32::default);
+        for (c, n) in cursor.iter_mut().zip(&self.counts[group.clone()]) {
+            *c -= n;
         }
-        let (grid, entries, chunk) = (self.grid, &self.entries, self.chunk);
+        if self.entries.len() < total {
+            self.entries.resize(total, 0);
+            self.spare.resize(total, 0);
+            self.splats.resize(total, 0);
+            self.order.resize(total, 0);
+        }
+        let (entries, splats) = (Disjoint::new(&mut self.entries), Disjoint::new(&mut self.splats));
+        let (grid, starts) = (self.grid, &self.starts);
         let rows = group.start / grid.columns..group.end.div_ceil(grid.columns);
-        self.slots.par_chunks_mut(tiles).enumerate().for_each(|(c, slots)| {
-            for rank in c * chunk..((c + 1) * chunk).min(order.len()) {
-                let splat = order.splat(rank);
-                grid.touched(&footprints[splat as usize], rows.clone(), |t| {
-                    if group.contains(&t) {
-                        entries[slots[t] as usize].store(splat, Relaxed);
-                        slots[t] += 1;
+        let chunks = self.covers.par_chunks(CHUNK).zip(&self.lens);
+        chunks.zip(self.slots.par_chunks_mut(tiles)).for_each(|((covers, len), slots)| {
+            for cover in &covers[..*len as usize] {
+                let mut put = |t: usize| {
+                    if !group.contains(&t) {
+                        return;
                     }
-                });
+                    let slot = slots[t];
+                    slots[t] = slot + 1;
+                    // SAFETY: the prefix sum gave every entry of every chunk a slot of
+                    // its own.
+                    unsafe {
+                        entries.write(slot as usize, entry(cover.z, slot - starts[t]));
+                        splats.write(slot as usize, cover.splat);
+                    }
+                };
+                if cover.columns[1] == 0 {
+                    grid.touched(&footprints[cover.splat as usize], rows.clone(), put);
+                    continue;
+                }
+                for row in cover.rows[0]..cover.rows[1] {
+                    for column in cover.columns[0]..cover.columns[1] {
+                        put(usize::from(row) * grid.columns + usize::from(column));
+                    }
+                }
             }
         });
     }
 
-    /// Splats of tile `t` of the group last filled, nearest first.
-    pub(crate) fn list(&self, t: usize) -> &[AtomicU32] {
-        &self.entries[self.starts[t]..self.starts[t] + self.counts[t] as usize]
+    /// The group last filled.
+    pub(crate) fn filled(&self) -> Range<usize> {
+        self.filled.clone()
+    }
+
+    /// [`TileLists::fill`] for tiles that were filled before, in the same groups or in
+    /// others.
+    pub(crate) fn fill_again(&mut self, group: &Range<usize>, footprints: &[Footprint]) {
+        let tiles = self.grid.len().max(1);
+        // After a fill, a chunk's slot is where the next chunk's entries begin.
+        for c in (0..self.slots.len() / tiles).rev() {
+            for t in group.clone() {
+                let begin = match c {
+                    0 => self.starts[t],
+                    _ => self.slots[(c - 1) * tiles + t],
+                };
+                self.slots[c * tiles + t] -= begin;
+            }
+        }
+        self.fill(group, footprints);
+    }
+
+    /// Calls `each` for every visible splat with its element of `targets` (`[N]`) and
+    /// its entries in the lists of `group`, the one last filled, tiles ascending.
+    pub(crate) fn gather<T: Send>(
+        &self,
+        group: &Range<usize>,
+        footprints: &[Footprint],
+        targets: &mut [T],
+        each: impl Fn(&mut T, &[u32]) + Sync,
+    ) {
+        let (grid, tiles) = (self.grid, self.grid.len().max(1));
+        let rows = group.start / grid.columns.max(1)..group.end.div_ceil(grid.columns.max(1));
+        let chunks = self.covers.par_chunks(CHUNK).zip(&self.lens);
+        chunks.zip(targets.par_chunks_mut(CHUNK)).enumerate().for_each(
+            |(c, ((covers, len), targets))| {
+                let mut cursor = match c {
+                    0 => self.starts[group.clone()].to_vec(),
+                    _ => self.slots[(c - 1) * tiles..][group.clone()].to_vec(),
+                };
+                let mut found = Vec::new();
+                for cover in &covers[..*len as usize] {
+                    found.clear();
+                    let mut take = |t: usize| {
+                        let slot = t.checked_sub(group.start).and_then(|i| cursor.get_mut(i));
+                        if let Some(slot) = slot {
+                            found.push(*slot);
+                            *slot += 1;
+                        }
+                    };
+                    if cover.columns[1] == 0 {
+                        grid.touched(&footprints[cover.splat as usize], rows.clone(), take);
+                    } else {
+                        for row in cover.rows[0]..cover.rows[1] {
+                            for column in cover.columns[0]..cover.columns[1] {
+                                take(usize::from(row) * grid.columns + usize::from(column));
+                            }
+                        }
+                    }
+                    if let Some(target) = targets.get_mut(cover.splat as usize - c * CHUNK) {
+                        each(target, &found);
+                    }
+                }
+            },
+        );
+    }
+
+    /// The lists of the group last filled, to be taken tile by tile.
+    pub(crate) fn lists(&mut self) -> GroupLists<'_> {
+        GroupLists {
+            counts: &self.counts,
+            starts: &self.starts,
+            entries: Disjoint::new(&mut self.entries),
+            spare: Disjoint::new(&mut self.spare),
+            order: Disjoint::new(&mut self.order),
+            splats: &self.splats,
+        }
     }
 }

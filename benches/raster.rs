@@ -1,0 +1,362 @@
+//! The rasterizer beside a conventional one (`common/conventional/raster.rs`) on scenes
+//! of a pixel-aligned network (`common/scene.rs`): forward, and the full backward pass.
+//!
+//! `-- --write DIR` writes the scenes for other programs instead: `NAME.ply`,
+//! `NAME.cameras.json`, and `NAME.safetensors` (one SH set a splat) and
+//! `NAME.shared.safetensors` (one a parent of four) with the camera in tensors and
+//! metadata.
+
+mod common;
+#[path = "../tests/common/oracle.rs"]
+#[allow(dead_code, reason = "the scenes have no covariances")]
+mod oracle;
+
+use anyhow::Result;
+use common::conventional::project::{Gradients as PlainGradients, Options, Splats as Plain};
+use common::conventional::raster::Rasterizer as Conventional;
+use common::scene::{self, SCENES, Spec};
+use common::{Bench, Contender, Threads, Work, agree};
+use safetensors::Dtype;
+use safetensors::tensor::TensorView;
+use std::collections::HashMap;
+use std::path::Path;
+use subsplat::abi::RasterOptions;
+use subsplat::camera::Camera;
+use subsplat::cpu::{Gradients, Rasterizer, Rendered, Stats, Tier};
+use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
+use subsplat::io::scene::Units;
+use subsplat::io::{save_splats, write_atomic};
+use subsplat::render::slices;
+use subsplat::splats::Splats;
+
+/// Side of a splat's box in σ: what most programs take, and what the baseline is timed
+/// with.
+const BOX: f32 = 3.0;
+/// A box that cuts no pixel of alpha ≥ 1/255: what the baseline is checked with.
+const EXACT_BOX: f32 = 3.34;
+/// Least multiplications and additions of one splat at one pixel: exponent 9, 2^x 13,
+/// alpha and transmittance 4, four sums 9.
+const FLOPS_PER_PIXEL: f64 = 35.0;
+/// The same of one projection: camera 15, J·W 12, rotation 30, M 36, covariance 15,
+/// conic and extent 40.
+const FLOPS_PER_SPLAT: f64 = 150.0;
+/// Differences of pictures: all but a thousandth of the numbers within 5e-5; decisions
+/// that hang on rounding may flip elsewhere.
+const PICTURE: [f32; 3] = [5e-5, 0.2, 1e-3];
+/// The same of gradients, of which f32 sums over many pixels cancel.
+const GRADIENT: [f32; 3] = [2e-4, 0.2, 1e-3];
+/// Picture for which the naive oracle takes seconds rather than minutes.
+const NAIVE_SIDE: usize = 128;
+
+fn main() -> Result<()> {
+    let mut bench = Bench::new("raster")?;
+    if let Some(folder) = bench.args.write.clone() {
+        return write(&folder, &bench);
+    }
+    for spec in &SCENES {
+        if bench.args.quick && !["8k-128", "131k-512"].contains(&spec.name) {
+            continue;
+        }
+        let shared = || scene::shared(spec);
+        let forms: [(&str, &dyn Fn() -> Splats); 2] =
+            [("shared", &shared), ("own", &|| scene::unshared(&shared()))];
+        for (form, splats) in forms {
+            let names = ["forward", "backward"].map(|p| format!("{p} {} {form}", spec.name));
+            // One SH set a splat says more about memory than about rasterizing.
+            let extra = form == "own" && spec.name != "131k-512" && spec.name != "524k-512";
+            if extra || !names.iter().any(|n| bench.wants(n)) {
+                continue;
+            }
+            let case = Case::new(spec, splats());
+            let stats = case.check(&bench)?;
+            if bench.wants(&names[0]) {
+                forward(&mut bench, &names[0], &case, stats)?;
+            }
+            if bench.wants(&names[1]) {
+                backward(&mut bench, &names[1], &case)?;
+            }
+        }
+    }
+    bench.finish()
+}
+
+/// A scene with its camera.
+struct Case {
+    splats: Splats,
+    camera: Camera,
+    options: RasterOptions,
+    naive: bool,
+}
+
+impl Case {
+    fn new(spec: &Spec, splats: Splats) -> Self {
+        let options = RasterOptions { background: [0.2, 0.1, 0.3], ..RasterOptions::default() };
+        let naive = spec.side <= NAIVE_SIDE;
+        Self { splats, camera: scene::camera(spec.side), options, naive }
+    }
+
+    fn plain(&self) -> Plain<'_> {
+        let s = &self.splats;
+        Plain { rows: &s.rows, sh: &s.sh, gain: &s.gain, sh_degree: s.sh_degree }
+    }
+
+    fn plain_options(&self, box_sigmas: f32) -> Options {
+        Options {
+            near: self.options.near,
+            lowpass: self.options.lowpass,
+            antialiased: false,
+            background: self.options.background,
+            box_sigmas,
+        }
+    }
+
+    /// Gradient of the picture that backward passes start from.
+    fn seeds(&self) -> (Vec<f32>, Vec<f32>) {
+        let pixels = (self.camera.intrinsics.width * self.camera.intrinsics.height) as u64;
+        let seeds = |stream: u64, n: u64| (0..n).map(|i| scene::normal(stream, i)).collect();
+        (seeds(50, 3 * pixels), seeds(51, pixels))
+    }
+
+    /// Our picture against the baseline's, and in small against the naive oracle's.
+    fn check(&self, bench: &Bench) -> Result<Stats> {
+        let mut ours = Rasterizer::new();
+        let got = bench.on_all(|| ours.render(&slices(&self.splats), &self.camera, &self.options));
+        let mut plain = Conventional::default();
+        plain.forward(&self.plain(), &self.camera, self.plain_options(EXACT_BOX));
+        agree("rgb", &got.rgb, &plain.frame.rgb, PICTURE)?;
+        agree("alpha", &got.alpha, &plain.frame.alpha, PICTURE)?;
+        agree("depth_sum", &got.depth_sum, &plain.frame.depth_sum, PICTURE)?;
+        if self.naive {
+            let naive = self.naive();
+            let rgb: Vec<f32> = naive.rgb.iter().map(|&v| v as f32).collect();
+            agree("rgb of the oracle", &got.rgb, &rgb, PICTURE)?;
+        }
+        Ok(ours.stats())
+    }
+
+    fn naive(&self) -> oracle::Picture {
+        let s = &self.splats;
+        let one = |i: usize| {
+            let (gain, residual) = s.gain_of(i);
+            oracle::Splat {
+                mean: s.mean(i),
+                shape: oracle::Shape::Quat(s.quat_wxyz(i), s.scale(i)),
+                opacity: s.opacity(i),
+                sh: s.sh_of(i).chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect(),
+                gain,
+                residual,
+                parent_mean: [0.0; 3],
+            }
+        };
+        let splats: Vec<oracle::Splat> = (0..s.len()).map(one).collect();
+        oracle::render(&splats, &self.camera, &self.options)
+    }
+
+    /// What a forward pass must move and compute by the rasterizer's own counts.
+    fn work(&self, stats: Stats) -> Work {
+        let s = &self.splats;
+        let (n, pairs) = (s.len() as f64, stats.pairs as f64);
+        let pixels = (self.camera.intrinsics.width * self.camera.intrinsics.height) as f64;
+        let input = 4.0 * (s.rows.len() + s.sh.len() + s.gain.len()) as f64;
+        // A 64-byte record a splat, written and read per tile; sort keys and values,
+        // written and read thrice; lists, written and read; RGB, alpha, depth.
+        let bytes = input + 64.0 * (n + pairs) + 48.0 * n + 8.0 * pairs + 20.0 * pixels;
+        let sh = 2.0 * s.sh.len() as f64 + 40.0 * s.parents() as f64;
+        let flops = 16.0 * FLOPS_PER_PIXEL * stats.items as f64 + FLOPS_PER_SPLAT * n + sh;
+        Work { bytes, flops }
+    }
+}
+
+fn forward(bench: &mut Bench, name: &str, case: &Case, stats: Stats) -> Result<()> {
+    let mut plain = Conventional::default();
+    let mut contenders = vec![Contender::new("conventional, scalar", Threads::One, move || {
+        plain.forward(&case.plain(), &case.camera, case.plain_options(BOX));
+        Ok(())
+    })];
+    let one = Tier::available().iter().map(|&tier| (Threads::One, tier));
+    for (threads, tier) in one.chain([(Threads::All, Tier::best())]) {
+        let (mut ours, mut out) = (Rasterizer::new().with_tier(tier), Rendered::default());
+        let run = move || {
+            ours.render_into(&slices(&case.splats), &case.camera, &case.options, &mut out);
+            Ok(())
+        };
+        let name = format!("subsplat, {}", tier.name());
+        let contender = Contender::new(name, threads, run);
+        contenders.push(contender.with_work(case.work(stats)));
+    }
+    if case.naive && !bench.args.quick {
+        contenders.push(Contender::new("naive oracle, f64", Threads::One, || {
+            std::hint::black_box(case.naive());
+            Ok(())
+        }));
+    }
+    let note = format!(
+        "{} of {} splats visible, {} (splat, tile) pairs, {} block items, {:.0} MiB held",
+        stats.visible,
+        case.splats.len(),
+        stats.pairs,
+        stats.items,
+        stats.bytes as f64 / f64::from(1 << 20)
+    );
+    bench.group(name, contenders, &note)
+}
+
+fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
+    let seeds = case.seeds();
+    check_gradients(bench, case, &seeds)?;
+    let (v_rgb, v_alpha) = &seeds;
+    let mut plain = Conventional::default();
+    let mut plain_both = Conventional::default();
+    plain.forward(&case.plain(), &case.camera, case.plain_options(BOX));
+    let options = case.plain_options(BOX);
+    let planes = &planes(&seeds);
+    let mut kept: [(Frames, Vec<f32>); 2] = Default::default();
+    let (mut one, mut all) = (Frames::default(), Frames::default());
+    let mut contenders = vec![
+        Contender::new("conventional, backward alone", Threads::One, || {
+            let g = plain.backward(&case.plain(), &case.camera, options, v_rgb, v_alpha);
+            std::hint::black_box(g);
+            Ok(())
+        }),
+        Contender::new("conventional, both passes", Threads::One, move || {
+            plain_both.forward(&case.plain(), &case.camera, options);
+            let g = plain_both.backward(&case.plain(), &case.camera, options, v_rgb, v_alpha);
+            std::hint::black_box(g);
+            Ok(())
+        }),
+    ];
+    for ((frames, picture), threads) in kept.iter_mut().zip([Threads::One, Threads::All]) {
+        let slices = slices(&case.splats);
+        let mut frame = frames.rasterizer.frame(slices, &case.camera, &case.options, picture);
+        let gradients = &mut frames.gradients;
+        contenders.push(Contender::new("subsplat, backward alone", threads, move || {
+            frame.backward(planes, gradients);
+            Ok(())
+        }));
+    }
+    for (threads, frames) in [(Threads::One, &mut one), (Threads::All, &mut all)] {
+        contenders.push(Contender::new("subsplat, both passes", threads, move || {
+            let slices = slices(&case.splats);
+            let (camera, options) = (&case.camera, &case.options);
+            frames.rasterizer.backward(&slices, camera, options, planes, &mut frames.gradients);
+            Ok(())
+        }));
+    }
+    bench.group(name, contenders, "gradients of everything; compare like with like")
+}
+
+/// Our rasterizer with its results' buffers.
+#[derive(Default)]
+struct Frames {
+    rasterizer: Rasterizer,
+    gradients: Gradients,
+}
+
+/// `[5, H, W]` of the gradients of RGB `[H, W, 3]` and alpha `[H, W]`.
+fn planes((v_rgb, v_alpha): &(Vec<f32>, Vec<f32>)) -> Vec<f32> {
+    let mut planes: Vec<f32> = Vec::with_capacity(5 * v_alpha.len());
+    for c in 0..3 {
+        planes.extend(v_rgb.iter().skip(c).step_by(3));
+    }
+    planes.extend(v_alpha);
+    planes.resize(5 * v_alpha.len(), 0.0);
+    planes
+}
+
+/// Our gradients against the baseline's, each lane for itself.
+fn check_gradients(bench: &Bench, case: &Case, seeds: &(Vec<f32>, Vec<f32>)) -> Result<()> {
+    let mut plain = Conventional::default();
+    let options = case.plain_options(EXACT_BOX);
+    plain.forward(&case.plain(), &case.camera, options);
+    let expected: PlainGradients =
+        plain.backward(&case.plain(), &case.camera, options, &seeds.0, &seeds.1);
+    let mut ours = Frames::default();
+    bench.on_all(|| {
+        let (slices, planes) = (slices(&case.splats), planes(seeds));
+        let out = &mut ours.gradients;
+        ours.rasterizer.backward(&slices, &case.camera, &case.options, &planes, out);
+    });
+    let got = &ours.gradients;
+    for lane in 0..11 {
+        let column = |rows: &[f32]| rows.iter().skip(lane).step_by(11).copied().collect::<Vec<_>>();
+        let what = format!("gradient of lane {lane}");
+        agree(&what, &column(&got.rows), &column(&expected.rows), GRADIENT)?;
+    }
+    agree("gradient of sh", &got.sh, &expected.sh, GRADIENT)?;
+    agree("gradient of the background", &got.background, &expected.background, GRADIENT)?;
+    if !expected.gain.is_empty() {
+        agree("gradient of gain", &got.gain, &expected.gain, GRADIENT)?;
+    }
+    Ok(())
+}
+
+fn write(folder: &Path, bench: &Bench) -> Result<()> {
+    std::fs::create_dir_all(folder)?;
+    let mut written = Vec::new();
+    for spec in SCENES.iter().filter(|s| bench.wants(s.name)) {
+        let at = |ending: &str| folder.join(format!("{}.{ending}", spec.name));
+        let (splats, camera) = (scene::shared(spec), scene::camera(spec.side));
+        save_splats(&at("ply"), &splats, &Default::default())?;
+        let file = format!("{}.png", spec.name);
+        let camera_only = NamedCamera { file, camera, timestamp: None, depth: None };
+        let cameras =
+            CameraFile { cameras: vec![camera_only], units: Units::Unknown, near_far: None };
+        save_cameras_json(&at("cameras.json"), &cameras)?;
+        write_tensors(&at("shared.safetensors"), &splats, &camera)?;
+        write_tensors(&at("safetensors"), &scene::unshared(&splats), &camera)?;
+        written.push(spec.name);
+    }
+    println!("{}: {}", folder.display(), written.join(", "));
+    Ok(())
+}
+
+/// Tensors and metadata under the names of the conformance cases.
+fn write_tensors(path: &Path, splats: &Splats, camera: &Camera) -> Result<()> {
+    let (n, p, d) = (splats.len(), splats.parents(), splats.sh_coefficients());
+    let column = |from: usize, lanes: usize| -> Vec<f32> {
+        splats.rows.chunks_exact(11).flat_map(|r| r[from..from + lanes].iter().copied()).collect()
+    };
+    let k = camera.intrinsics;
+    let pose = camera.world_from_camera.transpose().to_cols_array().to_vec();
+    let mut tensors = vec![
+        ("means", vec![n, 3], column(0, 3)),
+        ("quats", vec![n, 4], column(3, 4)),
+        ("scales", vec![n, 3], column(7, 3)),
+        ("opacities", vec![n], column(10, 1)),
+        ("sh", vec![p, d, 3], splats.sh.clone()),
+        ("intrinsics", vec![4], vec![k.fx, k.fy, k.cx, k.cy]),
+        ("world_from_camera", vec![4, 4], pose.clone()),
+        ("background", vec![3], vec![0.0; 3]),
+    ];
+    if !splats.gain.is_empty() {
+        tensors.push(("gain", vec![n], splats.gain.clone()));
+    }
+    let list = |v: &[f32]| v.iter().map(f32::to_string).collect::<Vec<_>>().join(",");
+    let metadata = [
+        ("width", k.width.to_string()),
+        ("height", k.height.to_string()),
+        ("intrinsics", list(&[k.fx, k.fy, k.cx, k.cy])),
+        ("world_from_camera", list(&pose)),
+        ("children", (n / p).to_string()),
+        ("sh_degree", splats.sh_degree.to_string()),
+        ("near", "0.01".to_owned()),
+        ("lowpass", "0.3".to_owned()),
+        ("axes", "OpenCV: x right, y down, z forward; quaternions wxyz; sigma".to_owned()),
+        ("maker", "cargo bench --bench raster -- --write".to_owned()),
+    ];
+    let metadata: HashMap<String, String> =
+        metadata.into_iter().map(|(k, v)| (k.to_owned(), v)).collect();
+    let bytes: Vec<(&str, Vec<usize>, Vec<u8>)> = tensors
+        .into_iter()
+        .map(|(name, shape, data)| {
+            (name, shape, data.iter().flat_map(|v| v.to_le_bytes()).collect())
+        })
+        .collect();
+    let views: Result<Vec<_>, _> = bytes
+        .iter()
+        .map(|(name, shape, data)| Ok((*name, TensorView::new(Dtype::F32, shape.clone(), data)?)))
+        .collect::<Result<_, safetensors::SafeTensorError>>();
+    let file = safetensors::serialize(views?, Some(metadata))?;
+    write_atomic(path, |f| std::io::Write::write_all(f, &file))?;
+    Ok(())
+}

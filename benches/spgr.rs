@@ -1,0 +1,229 @@
+//! Sub-pixel reparameterization and opacity redistribution, fused, beside the same as a
+//! graph of candle tensor operations.
+
+mod common;
+
+use anyhow::Result;
+use candle_core::{Tensor, Var};
+use common::conventional::redistribute as plain;
+use common::scene::{self, Spec};
+use common::{Bench, Contender, Threads, Work, agree, inputs};
+use subsplat::abi::{HEAD_LANES, SPLAT_LANES};
+use subsplat::config::{Config, Preset};
+use subsplat::model::spgr::rules;
+use subsplat::model::spgr_ref;
+use subsplat::ops::redistribute::{Rule, redistribute};
+use subsplat::ops::spgr::{Spgr, spgr, spgr_into};
+
+/// Side of the two input pictures, px: 131,072 parents, as MVSplat's 256² gives them.
+const SIDE: usize = 256;
+/// The same with `--quick`.
+const SIDE_QUICK: usize = 64;
+/// Multiplications and additions of one child, an elementary function counted as 18:
+/// eleven of them, quaternions 40, rotation 30, M 48, area and growth 35, opacity 20.
+const FLOPS_PER_CHILD: f64 = 370.0;
+/// The same of redistribution alone: three elementary functions and a softmax.
+const FLOPS_PER_SHARE: f64 = 65.0;
+/// f32 rounding through two chains of some 40 operations.
+const TIGHT: [f32; 3] = [1e-4, 1e-2, 1e-4];
+
+fn main() -> Result<()> {
+    let mut bench = Bench::new("spgr")?;
+    let side = if bench.args.quick { SIDE_QUICK } else { SIDE };
+    for (preset, name) in [(Preset::Tuned, "tuned"), (Preset::Paper, "paper")] {
+        for upscale in [2, 4] {
+            let names = ["forward", "backward"].map(|p| format!("spgr {p} {name} x{upscale}"));
+            if !names.iter().any(|n| bench.wants(n)) {
+                continue;
+            }
+            let case = Case::new(side, preset, upscale)?;
+            if bench.wants(&names[0]) {
+                forward(&mut bench, &names[0], &case)?;
+            }
+            if bench.wants(&names[1]) {
+                backward(&mut bench, &names[1], &case)?;
+            }
+        }
+    }
+    for (rule, name) in [(Rule::Linear, "linear"), (Rule::OpticalDepth, "optical-depth")] {
+        for children in [4, 16] {
+            for (pass, pass_name) in [(Pass::Forward, "forward"), (Pass::Both, "backward")] {
+                let name = format!("redistribute {pass_name} {name} K={children}");
+                if bench.wants(&name) {
+                    redistribution(&mut bench, &name, rule, (2 * side * side, children), pass)?;
+                }
+            }
+        }
+    }
+    bench.finish()
+}
+
+fn host(t: &Tensor) -> Result<Vec<f32>> {
+    Ok(t.flatten_all()?.to_vec1()?)
+}
+
+/// Parents of two views and their head records.
+struct Case {
+    call: Spgr,
+    head: Tensor,
+    parents: Tensor,
+    /// Weights of the loss that backward passes start from.
+    weights: [Tensor; 2],
+}
+
+type Op = fn(&Tensor, &Tensor, &Spgr) -> candle_core::Result<(Tensor, Tensor)>;
+const GRAPH: Op = spgr_ref::spgr;
+const FUSED: Op = spgr;
+
+impl Case {
+    fn new(side: usize, preset: Preset, upscale: usize) -> Result<Self> {
+        let call = Spgr {
+            rules: rules(&Config::re10k(preset, upscale), upscale),
+            cameras: scene::views(side).to_vec(),
+            near: vec![1.0; 2],
+            per_view: side * side,
+            first: 0,
+        };
+        let spec = Spec { name: "", grid: side, sigma_at: side, sigma_px: 1.0, side };
+        let n = 2 * side * side;
+        let rows = scene::shared(&spec).rows;
+        let parents = Tensor::from_vec(rows, (n, SPLAT_LANES), &candle_core::Device::Cpu)?;
+        let (k, lanes) = (call.rules.children(), call.rules.gain_lanes());
+        let gains = if lanes == 1 { vec![n * k] } else { vec![n * k, lanes] };
+        Ok(Self {
+            head: inputs::tensor(&[n, k, HEAD_LANES], 0.3, 60)?,
+            parents,
+            weights: [
+                inputs::tensor(&[n * k, SPLAT_LANES], 1.0, 61)?,
+                inputs::tensor(&gains, 1.0, 62)?,
+            ],
+            call,
+        })
+    }
+
+    fn children(&self) -> usize {
+        self.call.per_view * 2 * self.call.rules.children()
+    }
+
+    /// Gradients by head records and parents.
+    fn gradients(&self, op: Op) -> Result<[Tensor; 2]> {
+        let (head, parents) = (Var::from_tensor(&self.head)?, Var::from_tensor(&self.parents)?);
+        let (rows, gains) = op(&head, &parents, &self.call)?;
+        let loss = rows.mul(&self.weights[0])?.sum_all()?;
+        let grads = loss.add(&gains.mul(&self.weights[1])?.sum_all()?)?.backward()?;
+        let get = |v: &Var| grads.get(v).cloned().ok_or_else(|| anyhow::anyhow!("no gradient"));
+        Ok([get(&head)?, get(&parents)?])
+    }
+
+    fn work(&self) -> Work {
+        let n = self.children() as f64;
+        let out = SPLAT_LANES + self.call.rules.gain_lanes();
+        let parent = SPLAT_LANES as f64 / self.call.rules.children() as f64;
+        Work {
+            bytes: 4.0 * n * (HEAD_LANES as f64 + parent + out as f64),
+            flops: FLOPS_PER_CHILD * n,
+        }
+    }
+}
+
+fn forward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
+    let (graph, fused) = (
+        GRAPH(&case.head, &case.parents, &case.call)?,
+        FUSED(&case.head, &case.parents, &case.call)?,
+    );
+    agree("children", &host(&fused.0)?, &host(&graph.0)?, TIGHT)?;
+    agree("gains", &host(&fused.1)?, &host(&graph.1)?, TIGHT)?;
+    let mut contenders = Vec::new();
+    for threads in [Threads::One, Threads::All] {
+        contenders.push(Contender::new("candle graph", threads, || {
+            GRAPH(&case.head, &case.parents, &case.call)?;
+            Ok(())
+        }));
+    }
+    for threads in [Threads::One, Threads::All] {
+        let mut rows = vec![0.0; case.children() * SPLAT_LANES];
+        let mut gains = vec![0.0; case.children() * case.call.rules.gain_lanes()];
+        let run = move || {
+            spgr_into(&case.head, &case.parents, &case.call, &mut rows, &mut gains)?;
+            Ok(())
+        };
+        contenders.push(Contender::new("fused", threads, run).with_work(case.work()));
+    }
+    bench.group(name, contenders, "")
+}
+
+fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
+    let graph = case.gradients(GRAPH)?;
+    let (ops, note): (&[(&str, Op)], String) = match case.gradients(FUSED) {
+        Ok(fused) => {
+            for (what, i) in [("by head records", 0), ("by parents", 1)] {
+                agree(what, &host(&fused[i])?, &host(&graph[i])?, TIGHT)?;
+            }
+            (&[("candle graph", GRAPH), ("fused", FUSED)], "forward and backward".to_owned())
+        }
+        Err(e) => (&[("candle graph", GRAPH)], format!("forward and backward; {e}")),
+    };
+    drop(graph);
+    let mut contenders = Vec::new();
+    for (what, op) in ops {
+        for threads in [Threads::One, Threads::All] {
+            contenders.push(Contender::new(*what, threads, || case.gradients(*op).map(drop)));
+        }
+    }
+    bench.group(name, contenders, &note)
+}
+
+#[derive(Clone, Copy, PartialEq)]
+enum Pass {
+    Forward,
+    Both,
+}
+
+fn redistribution(
+    bench: &mut Bench,
+    name: &str,
+    rule: Rule,
+    (parents, children): (usize, usize),
+    pass: Pass,
+) -> Result<()> {
+    let logits = Var::from_tensor(&inputs::tensor(&[parents, children], 1.0, 70)?)?;
+    let areas = Var::from_tensor(&inputs::tensor(&[parents, children], 0.5, 71)?.exp()?)?;
+    let own = inputs::tensor(&[parents], 0.3, 72)?.exp()?;
+    let alpha: Vec<f32> = (0..parents as u64).map(|i| scene::unit(73, i)).collect();
+    let alpha = Var::from_vec(alpha, parents, &candle_core::Device::Cpu)?;
+    let weights = inputs::tensor(&[parents, children], 1.0, 74)?;
+    // Leaves without gradients do not keep the graph's parts.
+    let leaf = |v: &Var| if pass == Pass::Both { v.as_tensor().clone() } else { v.detach() };
+    let (l, a, o) = (leaf(&logits), leaf(&areas), leaf(&alpha));
+    let run = |fused: bool| -> Result<Vec<Tensor>> {
+        let y = match (fused, rule) {
+            (true, _) => redistribute(rule, &l, &a, &o, Some(&own))?,
+            (false, Rule::Linear) => plain::linear(&l, &a, &o)?,
+            (false, _) => plain::optical_depth(&l, &a, &o, &own)?,
+        };
+        if pass == Pass::Forward {
+            return Ok(vec![y]);
+        }
+        let grads = y.mul(&weights)?.sum_all()?.backward()?;
+        Ok([&logits, &areas, &alpha].into_iter().filter_map(|v| grads.get(v).cloned()).collect())
+    };
+    let (fused, graph) = (run(true)?, run(false)?);
+    anyhow::ensure!(fused.len() == graph.len(), "{} and {} tensors", fused.len(), graph.len());
+    for (got, expected) in fused.iter().zip(&graph) {
+        agree(name, &host(got)?, &host(expected)?, TIGHT)?;
+    }
+    let floats = (parents * (2 * children + 1) + parents * children) as f64;
+    // Backward reads the gradient and the inputs again and writes their gradients.
+    let passes = if pass == Pass::Both { 2.5 } else { 1.0 };
+    let flops = passes * FLOPS_PER_SHARE * (parents * children) as f64;
+    let work = Work { bytes: 4.0 * passes * floats, flops };
+    let mut contenders = Vec::new();
+    for (what, fused) in [("candle graph", false), ("fused", true)] {
+        for threads in [Threads::One, Threads::All] {
+            let contender = Contender::new(what, threads, move || run(fused).map(drop));
+            contenders.push(if fused { contender.with_work(work) } else { contender });
+        }
+    }
+    let note = if pass == Pass::Both { "forward and backward" } else { "" };
+    bench.group(name, contenders, note)
+}

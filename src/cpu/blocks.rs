@@ -1,0 +1,219 @@
+//! Which 4×4 blocks of a tile a splat can meet, for sixteen splats at a time, and the
+//! turn from "blocks of a splat" to "splats of a block".
+
+use crate::abi::BLOCK;
+use crate::cpu::blend::BLOCKS;
+use crate::cpu::ewa::{FIELDS, SPAN_SLACK_PX, support_lanes};
+use crate::cpu::simd::{LANES, ROUGH, Simd};
+
+/// Masks of the blocks that sixteen splats can meet in the tile whose first pixel is at
+/// `corner`: bit 8·row + column. `fields` are their footprints, field by field.
+///
+/// As in [`crate::cpu::ewa::Footprint::span`]: over the four pixel rows of a row of
+/// blocks, the ellipse spans the columns between its left edge at one row and its right
+/// edge at another.
+#[inline(always)]
+pub(crate) fn met<S: Simd>(
+    s: S,
+    fields: [S::F; FIELDS],
+    corner: [f32; 2],
+    masks: &mut [u64; LANES],
+) {
+    /// Columns and rows are counted in blocks from the tile's corner.
+    const PER_BLOCK: f32 = 1.0 / BLOCK as f32;
+    let [u, v, sx, shear, sy, power, _, _, _, _, half_width, half_height, x0, y0, x1, y1] = fields;
+    let (zero, one, quarter) = (s.splat(0.0), s.splat(1.0), s.splat(PER_BLOCK));
+    let (left, top) = (s.splat(corner[0]), s.splat(corner[1]));
+    let reach = support_lanes(s, power);
+    let sy2 = sy * sy;
+    let tip = -(shear * half_height * half_height / half_width);
+    let lowest = s.max(-half_height, whole(s, y0) - v);
+    let highest = s.min(half_height, whole(s, y1) - one - v);
+    // Edges in blocks, the roughness of the root made up for.
+    let width = s.splat(PER_BLOCK * (1.0 + 2.0 * ROUGH)) / sx;
+    let slack = s.splat(SPAN_SLACK_PX * PER_BLOCK);
+    let middle = (u - left) * quarter;
+    let (middle_left, middle_right) = (middle - slack, middle + slack);
+    let slant = shear * quarter;
+    let first = s.max((whole(s, x0) - left) * quarter, zero);
+    let last = s.splat(BLOCKS as f32 - PER_BLOCK);
+    let last = s.min((whole(s, x1) - one - left) * quarter, last);
+    let mut halves = [s.splat_int(0); 2];
+    for (half, bits) in halves.iter_mut().enumerate() {
+        for r in 0..4 {
+            let y = top + s.splat(((4 * half + r) * BLOCK) as f32) - v;
+            let low = s.max(y, lowest);
+            let high = s.min(y + s.splat(BLOCK as f32 - 1.0), highest);
+            let right = s.min(s.max(tip, low), high);
+            let left = s.min(s.max(-tip, low), high);
+            let reach_left = edge(s, left, sy2, reach);
+            let reach_right = edge(s, right, sy2, reach);
+            let from = s.fnma(reach_left, width, s.fnma(slant, left, middle_left));
+            let to = s.fma(reach_right, width, s.fnma(slant, right, middle_right));
+            let from = s.max(from, first);
+            let to = s.keep(s.le(low, high), s.min(to, last) + one);
+            // Truncation floors: both are positive where anything is met.
+            let row = below(s, s.max(to, from)) - below(s, from);
+            *bits = *bits | s.shift(row, s.splat_int(8 * r as i32));
+        }
+    }
+    let (mut a, mut b) = ([0; LANES], [0; LANES]);
+    s.store_int(halves[0], &mut a);
+    s.store_int(halves[1], &mut b);
+    for ((mask, a), b) in masks.iter_mut().zip(a).zip(b) {
+        *mask = u64::from(a as u32) | u64::from(b as u32) << 32;
+    }
+}
+
+/// The whole number whose bits a lane holds.
+#[inline(always)]
+fn whole<S: Simd>(s: S, v: S::F) -> S::F {
+    s.of_int(s.to_bits(v))
+}
+
+/// Distance along x of the ellipse's edge from its middle, `dy` off the mean, before
+/// the division by sx.
+#[inline(always)]
+fn edge<S: Simd>(s: S, dy: S::F, sy2: S::F, reach: S::F) -> S::F {
+    s.rough_sqrt(s.max(s.fnma(dy * dy, sy2, reach), s.splat(f32::MIN_POSITIVE)))
+}
+
+/// Bits of columns 0 to `past` − 1.
+#[inline(always)]
+fn below<S: Simd>(s: S, past: S::F) -> S::I {
+    s.shift(s.splat_int(1), s.to_int(past))
+}
+
+/// Exchanges rows and columns of a 64×64 matrix of bits: bit c of word r becomes bit r
+/// of word c. Halves of ever smaller squares change places (Warren, Hacker's Delight).
+#[inline(always)]
+pub(crate) fn transpose_bits(m: &mut [u64; 64]) {
+    macro_rules! step {
+        ($half:expr, $mask:expr) => {
+            for square in m.chunks_exact_mut(2 * $half) {
+                let (a, b) = square.split_at_mut($half);
+                for (a, b) in a.iter_mut().zip(b) {
+                    let swap = ((*a >> $half) ^ *b) & $mask;
+                    *a ^= swap << $half;
+                    *b ^= swap;
+                }
+            }
+        };
+    }
+    step!(32, 0x0000_0000_ffff_ffff);
+    step!(16, 0x0000_ffff_0000_ffff);
+    step!(8, 0x00ff_00ff_00ff_00ff);
+    step!(4, 0x0f0f_0f0f_0f0f_0f0f);
+    step!(2, 0x3333_3333_3333_3333);
+    step!(1, 0x5555_5555_5555_5555);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::abi::{ALPHA_MIN_LOG2, TILE};
+    use crate::cpu::ewa::Footprint;
+    use crate::cpu::simd::{Kernel, Tier};
+
+    #[test]
+    fn bits_are_transposed() {
+        let mut state = 7u64;
+        let words: [u64; 64] = std::array::from_fn(|_| {
+            state = state.wrapping_mul(0x5851_F42D_4C95_7F2D).wrapping_add(0x1405_7B7E_F767_814F);
+            state ^ state >> 29
+        });
+        let mut turned = words;
+        transpose_bits(&mut turned);
+        for (r, word) in words.iter().enumerate() {
+            for (c, other) in turned.iter().enumerate() {
+                assert_eq!(word >> c & 1, other >> r & 1, "{r} {c}");
+            }
+        }
+    }
+
+    struct Met<'a>(&'a [Footprint; LANES], [f32; 2]);
+
+    impl Kernel for Met<'_> {
+        type Output = [u64; LANES];
+
+        #[inline(always)]
+        fn run<S: Simd>(self, s: S) -> [u64; LANES] {
+            let mut rows = [s.splat(0.0); LANES];
+            for (row, f) in rows.iter_mut().zip(self.0) {
+                *row = s.load(f.fields());
+            }
+            let mut masks = [0; LANES];
+            met(s, s.transpose(rows), self.1, &mut masks);
+            masks
+        }
+    }
+
+    /// No block with a pixel that shows is missed, few without one are named, and none
+    /// outside the splat's rectangle.
+    #[test]
+    fn blocks_are_those_with_pixels_that_show() {
+        let mut state = 3u32;
+        let mut next = |from: f32, to: f32| {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            from + (to - from) * (state >> 8) as f32 / (1 << 24) as f32
+        };
+        let corner = [64.0, 32.0];
+        let (mut needed, mut named) = (0, [0; 4]);
+        for _ in 0..200 {
+            let splats: [Footprint; LANES] = std::array::from_fn(|l| {
+                let (sx, sy) = (next(0.02, 1.5), next(0.02, 1.5));
+                let (shear, power) = (next(-3.0, 3.0), next(-7.9, 0.0));
+                let reach = power - ALPHA_MIN_LOG2;
+                let half_height = reach.sqrt() / sy;
+                let half_width = (reach / (sx * sx) + (shear * half_height).powi(2)).sqrt();
+                // Some cut, as `mvsplat` does.
+                let cut = if l % 4 == 0 { 80 } else { 1000 };
+                let (u, v) = (next(50.0, 110.0), next(20.0, 80.0));
+                Footprint {
+                    u,
+                    v,
+                    sx,
+                    shear,
+                    sy,
+                    power,
+                    half_width,
+                    half_height,
+                    x1: cut,
+                    y0: 36,
+                    y1: 2000,
+                    ..Footprint::default()
+                }
+            });
+            let exact = splats.map(|f| {
+                let mut mask = 0u64;
+                for p in 0..TILE * TILE {
+                    let (x, y) = (p % TILE, p / TILE);
+                    let (px, py) = (corner[0] + x as f32, corner[1] + y as f32);
+                    let (dx, dy) = (f64::from(px - f.u), f64::from(py - f.v));
+                    let a = f64::from(f.sx) * (dx + f64::from(f.shear) * dy);
+                    let b = f64::from(f.sy) * dy;
+                    let shows = f64::from(f.power) - a * a - b * b >= f64::from(ALPHA_MIN_LOG2);
+                    if shows && px < f.x1 as f32 && py >= f.y0 as f32 {
+                        mask |= 1 << (y / BLOCK * BLOCKS + x / BLOCK);
+                    }
+                }
+                mask
+            });
+            needed += exact.iter().map(|m| m.count_ones()).sum::<u32>();
+            for (i, &tier) in Tier::available().iter().enumerate() {
+                for (l, (got, exact)) in
+                    tier.run(Met(&splats, corner)).into_iter().zip(exact).enumerate()
+                {
+                    assert_eq!(exact & !got, 0, "{tier:?} {:?}", splats[l]);
+                    let columns = if splats[l].x1 == 80 { 0x0f0f_0f0f_0f0f_0f0f } else { u64::MAX };
+                    assert_eq!(got & !(columns << 8 & !0xff), got & 0, "{tier:?} outside");
+                    named[i] += got.count_ones();
+                }
+            }
+        }
+        assert!(needed > 20_000, "{needed}");
+        for (named, tier) in named.iter().zip(Tier::available()) {
+            assert!(f64::from(*named) < 1.15 * f64::from(needed), "{tier:?}: {named} of {needed}");
+        }
+    }
+}

@@ -1,0 +1,68 @@
+//! A slice that many threads write at once, each at places of its own.
+
+use std::marker::PhantomData;
+use std::ops::Range;
+
+/// A borrowed slice without the borrow checker's watch over who writes where.
+pub(crate) struct Disjoint<'a, T> {
+    start: *mut T,
+    len: usize,
+    slice: PhantomData<&'a mut [T]>,
+}
+
+// SAFETY: a thread that holds it can do no more than with a part of the `&mut [T]` it
+// was made of; who takes which part is the callers' promise in the methods below.
+unsafe impl<T: Send> Sync for Disjoint<'_, T> {}
+// SAFETY: as above.
+unsafe impl<T: Send> Send for Disjoint<'_, T> {}
+
+impl<'a, T> Disjoint<'a, T> {
+    /// Shares `slice`.
+    pub(crate) fn new(slice: &'a mut [T]) -> Self {
+        Self { start: slice.as_mut_ptr(), len: slice.len(), slice: PhantomData }
+    }
+
+    /// Writes `v` at place `i`; nothing where that lies outside.
+    ///
+    /// # Safety
+    /// No other thread reads or writes place `i` at the same time.
+    #[inline(always)]
+    pub(crate) unsafe fn write(&self, i: usize, v: T) {
+        if i < self.len {
+            // SAFETY: inside the slice, and this thread's alone (the caller's promise).
+            unsafe { self.start.add(i).write(v) }
+        }
+    }
+
+    /// The places of `range` (fewer where it reaches outside).
+    ///
+    /// # Safety
+    /// No other reference to any of these places is used while this one lives.
+    #[inline(always)]
+    #[expect(clippy::mut_from_ref, reason = "that is what this type is for")]
+    pub(crate) unsafe fn part(&self, range: Range<usize>) -> &mut [T] {
+        let past = range.end.min(self.len);
+        let first = range.start.min(past);
+        // SAFETY: inside the slice, and not aliased (the caller's promise).
+        unsafe { std::slice::from_raw_parts_mut(self.start.add(first), past - first) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_are_those_of_the_slice() {
+        let mut v: Vec<u32> = (0..10).collect();
+        let shared = Disjoint::new(&mut v);
+        // SAFETY: one thread, and no two parts alive at once.
+        unsafe {
+            shared.write(3, 30);
+            shared.write(10, 1);
+            shared.part(8..20).fill(7);
+            assert_eq!(shared.part(12..20).len(), 0);
+        }
+        assert_eq!(v, [0, 1, 2, 30, 4, 5, 6, 7, 7, 7]);
+    }
+}

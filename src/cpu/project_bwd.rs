@@ -1,0 +1,544 @@
+//! Backward of [`crate::cpu::project`]: from the pixels' sums to gradients of what the
+//! caller gave, sixteen splats at a time, in parallel over families of children.
+//!
+//! A parent's SH gradient is summed over its children by one thread in their order, so
+//! that no thread count changes a byte. Splats that no pixel saw, dropped ones above
+//! all, are replaced by a harmless one with sums of zero: their gradients come out 0,
+//! whatever numbers they hold.
+
+use crate::abi::{
+    LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, RasterOptions, SH_COEFFICIENTS_MAX,
+    SPLAT_LANES, ShBasis, ShDirection, sh_coefficients,
+};
+use crate::cpu::ewa::{Footprint, View};
+use crate::cpu::ewa_bwd::{Moments, Whitening, cov6_gradient, quat_gradient};
+use crate::cpu::project::{Geometry, SplatSlices, lanes_at};
+use crate::cpu::raster_bwd_tile::{PairSums, SUMS};
+use crate::cpu::sh_bwd::{used_coefficients, values_and_slope};
+use crate::cpu::simd::{Kernel, Simd, Tier};
+use rayon::prelude::*;
+
+/// Splats side by side.
+const GROUP: usize = 16;
+/// Splats per unit of parallel work, about.
+const PART: usize = 2048;
+
+type L = [f32; GROUP];
+
+/// Gradients of a scalar loss with respect to what [`SplatSlices`] holds, in its
+/// layouts; buffers are reused from call to call. Splats that were dropped, and all that
+/// no pixel saw, have zeros.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Gradients {
+    /// `[N, 11]` for [`Geometry::Packed`], lanes as in [`crate::abi`] (the quaternion's
+    /// through its normalisation); else empty.
+    pub rows: Vec<f32>,
+    /// `[N, 3]` for [`Geometry::Cov6`], else empty.
+    pub means: Vec<f32>,
+    /// `[N, 6]` for [`Geometry::Cov6`], else empty; an off-diagonal number stands for
+    /// both entries of the matrix.
+    pub cov6: Vec<f32>,
+    /// `[N]` for [`Geometry::Cov6`], else empty.
+    pub opacities: Vec<f32>,
+    /// `[P, D, 3]`: summed over the children of each parent.
+    pub sh: Vec<f32>,
+    /// As long as [`SplatSlices::gain`].
+    pub gain: Vec<f32>,
+    /// RGB of the background.
+    pub background: [f32; 3],
+}
+
+impl Gradients {
+    /// Gives every buffer the length that `splats` asks for.
+    fn fit(&mut self, splats: &SplatSlices) {
+        let n = splats.len();
+        let packed = matches!(splats.geometry, Geometry::Packed(_));
+        let (packed, cov) = if packed { (n, 0) } else { (0, n) };
+        self.rows.resize(packed * SPLAT_LANES, 0.0);
+        self.means.resize(3 * cov, 0.0);
+        self.cov6.resize(6 * cov, 0.0);
+        self.opacities.resize(cov, 0.0);
+        self.sh.resize(splats.sh.len(), 0.0);
+        self.gain.resize(splats.gain.len(), 0.0);
+    }
+
+    /// Zeros for `splats`.
+    pub(crate) fn clear(&mut self, splats: &SplatSlices) {
+        *self = Self::default();
+        self.fit(splats);
+    }
+}
+
+/// What the pass over all splats reads.
+#[derive(Clone, Copy)]
+pub(crate) struct Pass<'a> {
+    pub(crate) splats: &'a SplatSlices<'a>,
+    pub(crate) view: &'a View,
+    pub(crate) options: &'a RasterOptions,
+    /// `[N]`.
+    pub(crate) footprints: &'a [Footprint],
+    /// `[N]`; read where the footprint is visible.
+    pub(crate) sums: &'a [PairSums],
+    /// `[P]`: Σ sh·Y of each parent ([`ShDirection::Parent`] only).
+    pub(crate) radiance: &'a [[f32; 3]],
+}
+
+/// The gradients of a run of whole families.
+struct Part<'a> {
+    /// First splat.
+    first: usize,
+    len: usize,
+    rows: &'a mut [f32],
+    means: &'a mut [f32],
+    cov6: &'a mut [f32],
+    opacities: &'a mut [f32],
+    sh: &'a mut [f32],
+    gain: &'a mut [f32],
+}
+
+/// Sixteen splats in structure of arrays.
+#[derive(Default)]
+#[repr(C, align(64))]
+struct Group {
+    mean: [L; 3],
+    quat: [L; 4],
+    scale: [L; 3],
+    cov6: [L; 6],
+    opacity: L,
+    whitening: [L; 3],
+    sums: [L; SUMS],
+    d_mean: [L; 3],
+    d_quat: [L; 4],
+    d_scale: [L; 3],
+    d_cov6: [L; 6],
+    d_opacity: L,
+}
+
+/// Directions in which SH are seen, sixteen at a time.
+#[repr(C, align(64))]
+struct Directions {
+    /// From the eye, world.
+    towards: [L; 3],
+    /// Σ_c ∂L/∂rgb_c·sh_{k,c}.
+    s: [L; SH_COEFFICIENTS_MAX],
+    /// Y_k.
+    y: [L; SH_COEFFICIENTS_MAX],
+    /// Σ_k s_k Y_k.
+    value: L,
+    /// ∂/∂towards of that.
+    slope: [L; 3],
+}
+
+/// One part of a pass, compiled for a tier.
+struct PartOf<'a, 'b>(&'a Pass<'b>, Part<'a>);
+
+impl Kernel for PartOf<'_, '_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        self.0.part(self.1);
+    }
+}
+
+impl Pass<'_> {
+    /// Fills `out`, the background's gradient apart.
+    pub(crate) fn run(&self, tier: Tier, out: &mut Gradients) {
+        let n = self.splats.len();
+        out.fit(self.splats);
+        let children = self.splats.children_per_parent();
+        let families = (PART / children).max(1);
+        let len = families * children;
+        let set = 3 * sh_coefficients(self.splats.sh_degree);
+        let gain_lanes = self.splats.gain.len().checked_div(n).unwrap_or(0);
+        let mut rows = out.rows.chunks_mut(len * SPLAT_LANES);
+        let mut means = out.means.chunks_mut(3 * len);
+        let mut cov6 = out.cov6.chunks_mut(6 * len);
+        let mut opacities = out.opacities.chunks_mut(len);
+        let mut sh = out.sh.chunks_mut(families * set);
+        let mut gain = out.gain.chunks_mut((len * gain_lanes).max(1));
+        let parts: Vec<Part> = (0..n)
+            .step_by(len)
+            .map(|first| Part {
+                first,
+                len: len.min(n - first),
+                rows: rows.next().unwrap_or_default(),
+                means: means.next().unwrap_or_default(),
+                cov6: cov6.next().unwrap_or_default(),
+                opacities: opacities.next().unwrap_or_default(),
+                sh: sh.next().unwrap_or_default(),
+                gain: gain.next().unwrap_or_default(),
+            })
+            .collect();
+        parts.into_par_iter().for_each(|part| tier.run(PartOf(self, part)));
+    }
+
+    #[inline(always)]
+    fn part(&self, mut part: Part) {
+        part.sh.fill(0.0);
+        let mut group = Group::default();
+        let mut seen = Directions::default();
+        for at in (0..part.len).step_by(GROUP) {
+            let count = GROUP.min(part.len - at);
+            let alive = self.load(part.first + at, count, &mut group);
+            if alive == 0 {
+                part.clear(at, count);
+                continue;
+            }
+            self.geometry(&mut group);
+            if self.options.sh_direction == ShDirection::Child {
+                self.child_colours(&mut part, at, alive, &mut group, &mut seen);
+            } else {
+                self.parent_gains(&mut part, at, count, &group);
+            }
+            part.store(at, count, &group);
+        }
+        if self.options.sh_direction == ShDirection::Parent {
+            self.parent_colours(&mut part, &mut seen);
+        }
+    }
+
+    /// Fills `group` with splats `first..first + count`; returns the mask of those that
+    /// some pixel may have seen.
+    #[inline(always)]
+    fn load(&self, first: usize, count: usize, group: &mut Group) -> u32 {
+        let mut alive = 0;
+        for l in 0..GROUP {
+            let i = first + l;
+            let sums = (l < count && self.footprints[i].visible()).then(|| self.sums_of(i));
+            match sums.filter(|s| s.iter().any(|&v| v != 0.0)) {
+                Some(sums) => {
+                    alive |= 1 << l;
+                    let f = &self.footprints[i];
+                    put(&mut group.whitening, l, [f.sx, f.sx * f.shear, f.sy]);
+                    put(&mut group.sums, l, sums);
+                    put(&mut group.mean, l, self.splats.mean(i));
+                    match self.splats.geometry {
+                        Geometry::Packed(rows) => {
+                            let row: [f32; SPLAT_LANES] = lanes_at(rows, i * SPLAT_LANES);
+                            put::<4>(&mut group.quat, l, lanes_at(&row, LANE_QUAT));
+                            put::<3>(&mut group.scale, l, lanes_at(&row, LANE_SCALE));
+                            group.opacity[l] = row[LANE_OPACITY];
+                        }
+                        Geometry::Cov6 { cov6, opacities, .. } => {
+                            put::<6>(&mut group.cov6, l, lanes_at(cov6, 6 * i));
+                            group.opacity[l] = opacities[i];
+                        }
+                    }
+                }
+                None => {
+                    // A unit ball one unit in front of the eye.
+                    let ahead = std::array::from_fn(|c| self.view.eye[c] + self.view.rows[2][c]);
+                    put(&mut group.mean, l, ahead);
+                    put(&mut group.quat, l, [1.0, 0.0, 0.0, 0.0]);
+                    put(&mut group.scale, l, [1.0; 3]);
+                    put(&mut group.cov6, l, [1.0, 0.0, 0.0, 1.0, 0.0, 1.0]);
+                    put(&mut group.whitening, l, [1.0, 0.0, 1.0]);
+                    put(&mut group.sums, l, [0.0; SUMS]);
+                    group.opacity[l] = 1.0;
+                }
+            }
+        }
+        alive
+    }
+
+    /// The sums of visible splat `i`, those of a clamped colour channel as 0.
+    #[inline(always)]
+    fn sums_of(&self, i: usize) -> [f32; SUMS] {
+        let mut sums = self.sums[i];
+        for (v, colour) in sums[6..9].iter_mut().zip(self.footprints[i].rgb) {
+            *v = if colour > 0.0 { *v } else { 0.0 };
+        }
+        sums
+    }
+
+    #[inline(always)]
+    fn geometry(&self, group: &mut Group) {
+        let cov = matches!(self.splats.geometry, Geometry::Cov6 { .. });
+        let view = self.view;
+        for l in 0..GROUP {
+            let m = Moments::from(get(&group.sums, l));
+            let [a, b, c] = get(&group.whitening, l);
+            let (w, mean) = (Whitening { a, b, c }, get(&group.mean, l));
+            if cov {
+                let g = cov6_gradient(view, mean, get(&group.cov6, l), w, &m);
+                put(&mut group.d_mean, l, g.mean);
+                put(&mut group.d_cov6, l, g.cov6);
+            } else {
+                let (quat, scale) = (get(&group.quat, l), get(&group.scale, l));
+                let g = quat_gradient(view, mean, quat, scale, w, &m);
+                put(&mut group.d_mean, l, g.mean);
+                put(&mut group.d_quat, l, g.quat);
+                put(&mut group.d_scale, l, g.scale);
+            }
+            group.d_opacity[l] = m.one / group.opacity[l];
+        }
+    }
+
+    /// SH, gain and direction where every child looks along its own mean.
+    #[inline(always)]
+    fn child_colours(
+        &self,
+        part: &mut Part,
+        at: usize,
+        alive: u32,
+        group: &mut Group,
+        seen: &mut Directions,
+    ) {
+        let children = self.splats.children_per_parent();
+        let used = self.used();
+        for l in 0..GROUP {
+            let towards = minus(get(&group.mean, l), self.view.eye);
+            put(&mut seen.towards, l, towards);
+        }
+        for l in lanes_of(alive) {
+            let sh = sh_of_parent(self.splats, (part.first + at + l) / children);
+            seen.weigh(l, used, sh, get(&group.sums, l)[6..9].try_into().unwrap_or_default());
+        }
+        seen.evaluate(used, self.options.sh_basis);
+        let set = 3 * sh_coefficients(self.splats.sh_degree);
+        for l in lanes_of(alive) {
+            let i = part.first + at + l;
+            let gain = gain_of(self.splats, i);
+            let rgb = [group.sums[6][l], group.sums[7][l], group.sums[8][l]];
+            for c in 0..3 {
+                group.d_mean[c][l] += gain * seen.slope[c][l];
+            }
+            let p = (at + l) / children;
+            if let Some(sh) = part.sh.get_mut(p * set..(p + 1) * set) {
+                seen.add_to(sh, l, used, rgb.map(|v| gain * v));
+            }
+        }
+        for l in 0..GROUP.min(part.len - at) {
+            let value = if alive & (1 << l) != 0 { seen.value[l] } else { 0.0 };
+            part.put_gain(at + l, value, [group.sums[6][l], group.sums[7][l], group.sums[8][l]]);
+        }
+    }
+
+    /// Gain where the children of a parent share its direction.
+    #[inline(always)]
+    fn parent_gains(&self, part: &mut Part, at: usize, count: usize, group: &Group) {
+        let children = self.splats.children_per_parent();
+        for l in 0..count {
+            let rgb: [f32; 3] = std::array::from_fn(|c| group.sums[6 + c][l]);
+            let radiance = self.radiance[(part.first + at + l) / children];
+            let alive = rgb.iter().any(|&v| v != 0.0);
+            let value = (0..3).map(|c| rgb[c] * radiance[c]).sum();
+            part.put_gain(at + l, if alive { value } else { 0.0 }, rgb);
+        }
+    }
+
+    /// SH and direction of every parent of `part`, the latter shared by its children.
+    #[inline(always)]
+    fn parent_colours(&self, part: &mut Part, seen: &mut Directions) {
+        let children = self.splats.children_per_parent();
+        let (used, set) = (self.used(), 3 * sh_coefficients(self.splats.sh_degree));
+        let parents = part.len.div_ceil(children);
+        for first in (0..parents).step_by(GROUP) {
+            let mut weighted = [[0.0f32; 3]; GROUP];
+            let mut count = [0.0f32; GROUP];
+            let mut alive = 0;
+            for l in 0..GROUP.min(parents - first) {
+                let family = (first + l) * children..((first + l + 1) * children).min(part.len);
+                let mut sum = [0.0f32; 3];
+                for i in family.map(|j| part.first + j) {
+                    let d = minus(self.splats.mean(i), self.view.eye);
+                    if d.iter().all(|v| v.is_finite()) {
+                        sum = [sum[0] + d[0], sum[1] + d[1], sum[2] + d[2]];
+                        count[l] += 1.0;
+                    }
+                    if !self.footprints[i].visible() {
+                        continue;
+                    }
+                    let (gain, sums) = (gain_of(self.splats, i), self.sums_of(i));
+                    for c in 0..3 {
+                        weighted[l][c] += gain * sums[6 + c];
+                    }
+                }
+                put(&mut seen.towards, l, sum.map(|v| v / count[l].max(1.0)));
+                alive |= u32::from(weighted[l] != [0.0; 3]) << l;
+            }
+            for l in lanes_of(alive) {
+                let p = part.first / children + first + l;
+                seen.weigh(l, used, sh_of_parent(self.splats, p), weighted[l]);
+            }
+            seen.evaluate(used, self.options.sh_basis);
+            for l in lanes_of(alive) {
+                let p = first + l;
+                if let Some(sh) = part.sh.get_mut(p * set..(p + 1) * set) {
+                    seen.add_to(sh, l, used, weighted[l]);
+                }
+                let share = get(&seen.slope, l).map(|v: f32| v / count[l].max(1.0));
+                for j in p * children..((p + 1) * children).min(part.len) {
+                    let mean = self.splats.mean(part.first + j);
+                    if minus(mean, self.view.eye).iter().all(|v| v.is_finite()) {
+                        part.add_mean(j, share);
+                    }
+                }
+            }
+        }
+    }
+
+    fn used(&self) -> usize {
+        used_coefficients(
+            self.options.sh_basis,
+            self.options.sh_degree.min(self.splats.sh_degree),
+        )
+    }
+}
+
+impl Default for Directions {
+    fn default() -> Self {
+        let (s, y) = ([[0.0; GROUP]; SH_COEFFICIENTS_MAX], [[0.0; GROUP]; SH_COEFFICIENTS_MAX]);
+        let towards = [[1.0; GROUP]; 3];
+        Self { towards, s, y, value: [0.0; GROUP], slope: [[0.0; GROUP]; 3] }
+    }
+}
+
+impl Directions {
+    /// s_k of lane `l` from the colour gradient `g` and one SH set.
+    #[inline(always)]
+    fn weigh(&mut self, l: usize, used: usize, sh: &[f32], g: [f32; 3]) {
+        for (s, h) in self.s[..used].iter_mut().zip(sh.chunks_exact(3)) {
+            s[l] = g[0] * h[0] + g[1] * h[1] + g[2] * h[2];
+        }
+    }
+
+    /// Adds Y ⊗ `g` of lane `l` to one SH set.
+    #[inline(always)]
+    fn add_to(&self, sh: &mut [f32], l: usize, used: usize, g: [f32; 3]) {
+        for (h, y) in sh.chunks_exact_mut(3).zip(&self.y[..used]) {
+            h[0] += y[l] * g[0];
+            h[1] += y[l] * g[1];
+            h[2] += y[l] * g[2];
+        }
+    }
+
+    #[inline(always)]
+    fn evaluate(&mut self, used: usize, basis: ShBasis) {
+        let mvsplat = basis == ShBasis::Mvsplat;
+        match used {
+            1 => self.evaluate_first::<1>(mvsplat),
+            4 => self.evaluate_first::<4>(mvsplat),
+            9 => self.evaluate_first::<9>(mvsplat),
+            16 => self.evaluate_first::<16>(mvsplat),
+            _ => self.evaluate_first::<SH_COEFFICIENTS_MAX>(mvsplat),
+        }
+    }
+
+    #[inline(always)]
+    fn evaluate_first<const D: usize>(&mut self, mvsplat: bool) {
+        for l in 0..GROUP {
+            let v: [f32; 3] = get(&self.towards, l);
+            let inverse = 1.0 / (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
+            let d = [v[0] * inverse, v[1] * inverse, v[2] * inverse];
+            let s: [f32; D] = std::array::from_fn(|k| self.s[k][l]);
+            let (y, g) = values_and_slope::<D>(mvsplat, d, &s);
+            let mut value = 0.0;
+            for k in 0..D {
+                self.y[k][l] = y[k];
+                value += s[k] * y[k];
+            }
+            self.value[l] = value;
+            let radial = d[0] * g[0] + d[1] * g[1] + d[2] * g[2];
+            for c in 0..3 {
+                self.slope[c][l] = (g[c] - d[c] * radial) * inverse;
+            }
+        }
+    }
+}
+
+impl Part<'_> {
+    /// Zeros for splats that no pixel saw.
+    fn clear(&mut self, at: usize, count: usize) {
+        let zero = |values: &mut [f32], lanes: usize| {
+            if let Some(v) = values.get_mut(at * lanes..(at + count) * lanes) {
+                v.fill(0.0);
+            }
+        };
+        zero(self.rows, SPLAT_LANES);
+        zero(self.means, 3);
+        zero(self.cov6, 6);
+        zero(self.opacities, 1);
+        let gain_lanes = self.gain.len() / self.len;
+        zero(self.gain, gain_lanes);
+    }
+
+    #[inline(always)]
+    fn store(&mut self, at: usize, count: usize, group: &Group) {
+        for l in 0..count {
+            let j = at + l;
+            if self.rows.is_empty() {
+                set(self.means, 3 * j, get::<3>(&group.d_mean, l));
+                set(self.cov6, 6 * j, get::<6>(&group.d_cov6, l));
+                set(self.opacities, j, [group.d_opacity[l]]);
+            } else {
+                let row = &mut self.rows[j * SPLAT_LANES..(j + 1) * SPLAT_LANES];
+                set(row, LANE_MEAN, get::<3>(&group.d_mean, l));
+                set(row, LANE_QUAT, get::<4>(&group.d_quat, l));
+                set(row, LANE_SCALE, get::<3>(&group.d_scale, l));
+                set(row, LANE_OPACITY, [group.d_opacity[l]]);
+            }
+        }
+    }
+
+    /// Writes ∂L/∂γ and, with four lanes, ∂L/∂δ of splat `j` of the part.
+    #[inline(always)]
+    fn put_gain(&mut self, j: usize, gain: f32, [r, g, b]: [f32; 3]) {
+        match self.gain.len() / self.len {
+            1 => self.gain[j] = gain,
+            4 => set(self.gain, 4 * j, [gain, r, g, b]),
+            _ => {}
+        }
+    }
+
+    fn add_mean(&mut self, j: usize, g: [f32; 3]) {
+        let (values, lanes) =
+            if self.rows.is_empty() { (&mut *self.means, 3) } else { (&mut *self.rows, SPLAT_LANES) };
+        for (v, g) in values[j * lanes..j * lanes + 3].iter_mut().zip(g) {
+            *v += g;
+        }
+    }
+}
+
+#[inline(always)]
+fn get<const N: usize>(from: &[L; N], l: usize) -> [f32; N] {
+    std::array::from_fn(|k| from[k][l])
+}
+
+#[inline(always)]
+fn put<const N: usize>(to: &mut [L; N], l: usize, values: [f32; N]) {
+    for (k, v) in values.into_iter().enumerate() {
+        to[k][l] = v;
+    }
+}
+
+#[inline(always)]
+fn set<const N: usize>(to: &mut [f32], at: usize, values: [f32; N]) {
+    if let Some(to) = to.get_mut(at..at + N) {
+        to.copy_from_slice(&values);
+    }
+}
+
+#[inline(always)]
+fn minus(a: [f32; 3], b: [f32; 3]) -> [f32; 3] {
+    [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
+}
+
+#[inline(always)]
+fn sh_of_parent<'a>(splats: &SplatSlices<'a>, p: usize) -> &'a [f32] {
+    let set = 3 * sh_coefficients(splats.sh_degree);
+    splats.sh.get(p * set..(p + 1) * set).unwrap_or(&[])
+}
+
+/// γ of splat `i`.
+#[inline(always)]
+fn gain_of(splats: &SplatSlices, i: usize) -> f32 {
+    let lanes = splats.gain.len() / splats.len().max(1);
+    splats.gain.get(i * lanes).copied().filter(|_| lanes > 0).unwrap_or(1.0)
+}
+
+/// Positions of the set bits.
+fn lanes_of(mask: u32) -> impl Iterator<Item = usize> {
+    (0..GROUP).filter(move |l| mask & (1 << l) != 0)
+}

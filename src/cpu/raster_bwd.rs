@@ -1,0 +1,228 @@
+//! The whole backward pass: tiles, then a gather over each splat's tiles, then one pass
+//! over all splats.
+//!
+//! In: the five planes that [`Rasterizer::render_planes`] gave, and the gradient of a
+//! scalar loss with respect to them. Out: [`Gradients`], exact for the piecewise
+//! function that the forward is: nothing passes a capped alpha, a clamped colour or a
+//! cull; directions of SH are not detached. No atomic sum anywhere: each (splat, tile)
+//! pair has its own row, rows are added in the order of tiles, so the same bytes come
+//! out for any number of threads.
+//!
+//! Memory beyond the forward's: 40 bytes a pair, at most [`PAIRS_PER_GROUP`] at a time
+//! (or one tile's), and 40 bytes a splat.
+
+use crate::abi::RasterOptions;
+use crate::camera::Camera;
+use crate::cpu::blend::Rules;
+use crate::cpu::disjoint::Disjoint;
+use crate::cpu::ewa::View;
+use crate::cpu::project::SplatSlices;
+use crate::cpu::project_bwd::{Gradients, Pass};
+use crate::cpu::raster_bwd_tile::{PairSums, Pixels, SUMS, WalkTile};
+use crate::cpu::rasterize::{Rasterizer, since};
+use crate::cpu::sort::depth_order;
+use rayon::prelude::*;
+use std::ops::Range;
+use std::time::Duration;
+
+/// Most (splat, tile) pairs whose sums are held at a time: 160 MiB.
+const PAIRS_PER_GROUP: usize = 1 << 22;
+
+/// Where the last backward's time went; zeros unless asked for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct BackwardTimes {
+    /// Walking the tiles (and listing them again, where they did not fit one group).
+    pub tiles: Duration,
+    /// Adding up each splat's tiles.
+    pub gather: Duration,
+    /// From sums to gradients.
+    pub splats: Duration,
+}
+
+/// Buffers of the backward pass, reused from call to call.
+#[derive(Debug, Default)]
+pub(crate) struct Buffers {
+    /// A row per pair of the group at hand, in the order of its lists.
+    pairs: Vec<PairSums>,
+    /// `[N]`; only those of visible splats are meant.
+    sums: Vec<PairSums>,
+    /// `[tiles]`: gradients of the background.
+    background: Vec<[f64; 3]>,
+    /// The picture, where the caller did not keep it.
+    planes: Vec<f32>,
+    times: BackwardTimes,
+}
+
+impl Buffers {
+    /// Bytes held.
+    pub(crate) fn bytes(&self) -> usize {
+        (self.pairs.capacity() + self.sums.capacity()) * size_of::<PairSums>()
+            + self.background.capacity() * size_of::<[f64; 3]>()
+            + 4 * self.planes.capacity()
+    }
+}
+
+/// A rendered frame that still knows its splats, so that its backward pass can use what
+/// the forward left. Made by [`Rasterizer::frame`].
+#[derive(Debug)]
+pub struct Frame<'r, 's> {
+    rasterizer: &'r mut Rasterizer,
+    splats: SplatSlices<'s>,
+    camera: Camera,
+    options: RasterOptions,
+    planes: &'r [f32],
+}
+
+impl Frame<'_, '_> {
+    /// `[5, H, W]`: R, G, B, alpha, Σ w·z.
+    pub fn planes(&self) -> &[f32] {
+        self.planes
+    }
+
+    /// Gradients of a loss whose gradient with respect to the frame's planes
+    /// `[5, H, W]` (R, G, B, alpha, Σ w·z) is `gradients`; zeros where that has another
+    /// size.
+    pub fn backward(&mut self, gradients: &[f32], out: &mut Gradients) {
+        let pixels = Pixels { planes: self.planes, gradients };
+        self.rasterizer.backward_of_last(&self.splats, &self.camera, &self.options, pixels, out);
+    }
+}
+
+impl Rasterizer {
+    /// Renders into planes as [`Rasterizer::render_planes`] does, and keeps hold of the
+    /// splats for [`Frame::backward`].
+    pub fn frame<'r, 's>(
+        &'r mut self,
+        splats: SplatSlices<'s>,
+        camera: &Camera,
+        options: &RasterOptions,
+        planes: &'r mut Vec<f32>,
+    ) -> Frame<'r, 's> {
+        self.render_planes(&splats, camera, options, planes);
+        Frame { rasterizer: self, splats, camera: *camera, options: *options, planes }
+    }
+
+    /// Forward and backward: gradients of a loss whose gradient with respect to the
+    /// planes `[5, H, W]` of this view (R, G, B, alpha, Σ w·z) is `gradients`; zeros
+    /// where that has another size.
+    pub fn backward(
+        &mut self,
+        splats: &SplatSlices,
+        camera: &Camera,
+        options: &RasterOptions,
+        gradients: &[f32],
+        out: &mut Gradients,
+    ) {
+        let mut planes = std::mem::take(&mut self.back.planes);
+        self.render_planes(splats, camera, options, &mut planes);
+        let pixels = Pixels { planes: &planes, gradients };
+        self.backward_of_last(splats, camera, options, pixels, out);
+        self.back.planes = planes;
+    }
+
+    /// Where the last backward's time went; zeros without
+    /// [`Rasterizer::with_stage_times`].
+    pub fn backward_times(&self) -> BackwardTimes {
+        self.back.times
+    }
+
+    /// The backward pass of the last frame, whose splats, camera, options and planes
+    /// these must be.
+    pub(crate) fn backward_of_last(
+        &mut self,
+        splats: &SplatSlices,
+        camera: &Camera,
+        options: &RasterOptions,
+        pixels: Pixels,
+        out: &mut Gradients,
+    ) {
+        let (tiles, numbers) = (self.grid.len(), 5 * self.grid.width * self.grid.height);
+        let fits = pixels.planes.len() == numbers && pixels.gradients.len() == numbers;
+        if !fits || self.projection.footprints.len() != splats.len() {
+            return out.clear(splats);
+        }
+        let mut times = BackwardTimes::default();
+        self.back.background.clear();
+        self.back.background.resize(tiles, [0.0; 3]);
+        self.back.sums.resize(splats.len(), [0.0; SUMS]);
+        let mut first = 0;
+        while first < tiles {
+            let start = self.now();
+            let group = self.lists.group_within(first, PAIRS_PER_GROUP);
+            let listed = group == self.lists.filled();
+            if !listed {
+                self.lists.fill_again(&group, &self.projection.footprints);
+            }
+            self.walk_group(group.clone(), listed, Rules::new(options.convention), pixels);
+            times.tiles += since(start);
+            let start = self.now();
+            self.gather_group(&group);
+            times.gather += since(start);
+            first = group.end;
+        }
+        let start = self.now();
+        let pass = Pass {
+            splats,
+            view: &View::new(camera, options),
+            options,
+            footprints: &self.projection.footprints,
+            sums: &self.back.sums,
+            radiance: &self.projection.parents,
+        };
+        pass.run(self.tier, out);
+        let mut background = [0.0f64; 3];
+        for tile in &self.back.background {
+            for (sum, v) in background.iter_mut().zip(tile) {
+                *sum += v;
+            }
+        }
+        out.background = background.map(|v| v as f32);
+        times.splats = since(start);
+        self.back.times = times;
+    }
+
+    /// The backward of one group of tiles, those with the longest lists first; sorts
+    /// their lists unless the forward did.
+    fn walk_group(&mut self, group: Range<usize>, listed: bool, rules: Rules, pixels: Pixels) {
+        let Buffers { pairs, background, .. } = &mut self.back;
+        let total: usize = group.clone().map(|t| self.lists.tile_len(t)).sum();
+        if pairs.len() < total {
+            pairs.resize(total, [0.0; SUMS]);
+        }
+        let mut queue: Vec<usize> = group.collect();
+        queue.sort_unstable_by_key(|&t| (std::cmp::Reverse(self.lists.tile_len(t)), t));
+        let (grid, tier) = (self.grid, self.tier);
+        let footprints = &self.projection.footprints;
+        let (pairs, background) = (Disjoint::new(pairs), Disjoint::new(background));
+        let lists = self.lists.lists();
+        queue.into_par_iter().with_max_len(1).for_each(|t| {
+            // SAFETY: the queue names each tile once, and no two tiles share a place.
+            let (list, rows) = unsafe { (lists.take(t), pairs.part(lists.places(t))) };
+            if !listed {
+                depth_order(list.entries, list.spare, list.order);
+            }
+            let (order, splats) = (&*list.order, list.splats);
+            let work = WalkTile { t, grid, order, splats, footprints, rules, pixels, rows };
+            let seen = tier.run(work);
+            // SAFETY: as above.
+            unsafe { background.write(t, seen) };
+        });
+    }
+
+    /// Adds the rows of `group` to the sums of their splats, tile by tile.
+    fn gather_group(&mut self, group: &Range<usize>) {
+        let Buffers { pairs, sums, .. } = &mut self.back;
+        let fresh = group.start == 0;
+        let pairs = &*pairs;
+        self.lists.gather(group, &self.projection.footprints, sums, |sum, slots| {
+            if fresh {
+                *sum = [0.0; SUMS];
+            }
+            for &slot in slots {
+                for (s, v) in sum.iter_mut().zip(pairs[slot as usize]) {
+                    *s += v;
+                }
+            }
+        });
+    }
+}

@@ -1,0 +1,348 @@
+//! AVX2 and FMA: sixteen lanes in two registers.
+//!
+//! SAFETY of every block below: the intrinsics need x86-64-v3. A vector comes only
+//! from [`Token`], and a token only from [`run`], whose caller has asked the
+//! processor. Loads and stores go through references to whole arrays, or to places
+//! checked beforehand.
+#![expect(clippy::undocumented_unsafe_blocks, reason = "one reason for all, stated above")]
+
+use super::{Floats, Ints, Kernel, LANES, Mask, Simd, all_inside};
+use std::arch::x86_64::*;
+use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
+
+/// Proof that the processor has x86-64-v3.
+#[derive(Clone, Copy)]
+pub(super) struct Token(());
+
+#[derive(Clone, Copy)]
+pub(super) struct F(__m256, __m256);
+
+/// All bits of a lane, or none.
+#[derive(Clone, Copy)]
+pub(super) struct M(__m256, __m256);
+
+#[derive(Clone, Copy)]
+pub(super) struct I(__m256i, __m256i);
+
+impl Floats for F {}
+impl Mask for M {}
+impl Ints for I {}
+
+/// Whether the processor has what [`run`] needs.
+pub(super) fn detected() -> bool {
+    is_x86_feature_detected!("avx2")
+        && is_x86_feature_detected!("fma")
+        && is_x86_feature_detected!("bmi1")
+        && is_x86_feature_detected!("bmi2")
+        && is_x86_feature_detected!("lzcnt")
+        && is_x86_feature_detected!("popcnt")
+}
+
+/// Runs `kernel` compiled for x86-64-v3.
+///
+/// # Safety
+/// [`detected`] must have said yes.
+#[target_feature(enable = "avx2,fma,bmi1,bmi2,lzcnt,popcnt")]
+pub(super) unsafe fn run<K: Kernel>(kernel: K) -> K::Output {
+    kernel.run(Token(()))
+}
+
+macro_rules! operators {
+    ($($vector:ident $op:ident $method:ident $intrinsic:ident;)*) => { $(
+        impl $op for $vector {
+            type Output = Self;
+            #[inline(always)]
+            fn $method(self, other: Self) -> Self {
+                unsafe { Self($intrinsic(self.0, other.0), $intrinsic(self.1, other.1)) }
+            }
+        }
+    )* };
+}
+
+operators! {
+    F Add add _mm256_add_ps;
+    F Sub sub _mm256_sub_ps;
+    F Mul mul _mm256_mul_ps;
+    F Div div _mm256_div_ps;
+    I Add add _mm256_add_epi32;
+    I Sub sub _mm256_sub_epi32;
+    I BitAnd bitand _mm256_and_si256;
+    I BitOr bitor _mm256_or_si256;
+    M BitAnd bitand _mm256_and_ps;
+    M BitOr bitor _mm256_or_ps;
+}
+
+impl Neg for F {
+    type Output = Self;
+    #[inline(always)]
+    fn neg(self) -> Self {
+        unsafe {
+            let sign = _mm256_set1_ps(-0.0);
+            F(_mm256_xor_ps(self.0, sign), _mm256_xor_ps(self.1, sign))
+        }
+    }
+}
+
+impl Not for M {
+    type Output = Self;
+    #[inline(always)]
+    fn not(self) -> Self {
+        unsafe {
+            let all = _mm256_castsi256_ps(_mm256_set1_epi32(-1));
+            M(_mm256_xor_ps(self.0, all), _mm256_xor_ps(self.1, all))
+        }
+    }
+}
+
+/// Sum of eight lanes: i + (i + 4), then + 2, + 1.
+#[inline(always)]
+pub(super) unsafe fn sum8(v: __m256) -> f32 {
+    unsafe {
+        let v = _mm_add_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps::<1>(v));
+        let v = _mm_add_ps(v, _mm_movehl_ps(v, v));
+        _mm_cvtss_f32(_mm_add_ss(v, _mm_movehdup_ps(v)))
+    }
+}
+
+impl Simd for Token {
+    type F = F;
+    type M = M;
+    type I = I;
+
+    #[inline(always)]
+    fn splat(self, v: f32) -> F {
+        let v = unsafe { _mm256_set1_ps(v) };
+        F(v, v)
+    }
+    #[inline(always)]
+    fn load(self, v: &[f32; LANES]) -> F {
+        unsafe { F(_mm256_loadu_ps(v.as_ptr()), _mm256_loadu_ps(v.as_ptr().add(8))) }
+    }
+    #[inline(always)]
+    fn store(self, v: F, to: &mut [f32; LANES]) {
+        unsafe {
+            _mm256_storeu_ps(to.as_mut_ptr(), v.0);
+            _mm256_storeu_ps(to.as_mut_ptr().add(8), v.1);
+        }
+    }
+    #[inline(always)]
+    fn fma(self, a: F, b: F, c: F) -> F {
+        unsafe { F(_mm256_fmadd_ps(a.0, b.0, c.0), _mm256_fmadd_ps(a.1, b.1, c.1)) }
+    }
+    #[inline(always)]
+    fn fnma(self, a: F, b: F, c: F) -> F {
+        unsafe { F(_mm256_fnmadd_ps(a.0, b.0, c.0), _mm256_fnmadd_ps(a.1, b.1, c.1)) }
+    }
+    #[inline(always)]
+    fn min(self, a: F, b: F) -> F {
+        unsafe { F(_mm256_min_ps(a.0, b.0), _mm256_min_ps(a.1, b.1)) }
+    }
+    #[inline(always)]
+    fn max(self, a: F, b: F) -> F {
+        unsafe { F(_mm256_max_ps(a.0, b.0), _mm256_max_ps(a.1, b.1)) }
+    }
+    #[inline(always)]
+    fn sqrt(self, v: F) -> F {
+        unsafe { F(_mm256_sqrt_ps(v.0), _mm256_sqrt_ps(v.1)) }
+    }
+    #[inline(always)]
+    fn rough_sqrt(self, v: F) -> F {
+        unsafe {
+            F(_mm256_mul_ps(v.0, _mm256_rsqrt_ps(v.0)), _mm256_mul_ps(v.1, _mm256_rsqrt_ps(v.1)))
+        }
+    }
+    #[inline(always)]
+    fn abs(self, v: F) -> F {
+        unsafe {
+            let sign = _mm256_set1_ps(-0.0);
+            F(_mm256_andnot_ps(sign, v.0), _mm256_andnot_ps(sign, v.1))
+        }
+    }
+    #[inline(always)]
+    fn floor(self, v: F) -> F {
+        unsafe { F(_mm256_floor_ps(v.0), _mm256_floor_ps(v.1)) }
+    }
+    #[inline(always)]
+    fn ceil(self, v: F) -> F {
+        unsafe { F(_mm256_ceil_ps(v.0), _mm256_ceil_ps(v.1)) }
+    }
+    #[inline(always)]
+    fn split(self, v: F) -> (F, F) {
+        const NEAREST: i32 = _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
+        let n = unsafe { F(_mm256_round_ps::<NEAREST>(v.0), _mm256_round_ps::<NEAREST>(v.1)) };
+        (n, v - n)
+    }
+    #[inline(always)]
+    fn scale(self, v: F, e: F) -> F {
+        self.of_bits(self.to_bits(v) + self.shl::<23>(self.to_int(e)))
+    }
+
+    #[inline(always)]
+    fn lt(self, a: F, b: F) -> M {
+        unsafe { M(_mm256_cmp_ps::<_CMP_LT_OQ>(a.0, b.0), _mm256_cmp_ps::<_CMP_LT_OQ>(a.1, b.1)) }
+    }
+    #[inline(always)]
+    fn le(self, a: F, b: F) -> M {
+        unsafe { M(_mm256_cmp_ps::<_CMP_LE_OQ>(a.0, b.0), _mm256_cmp_ps::<_CMP_LE_OQ>(a.1, b.1)) }
+    }
+    #[inline(always)]
+    fn select(self, m: M, a: F, b: F) -> F {
+        unsafe { F(_mm256_blendv_ps(b.0, a.0, m.0), _mm256_blendv_ps(b.1, a.1, m.1)) }
+    }
+    #[inline(always)]
+    fn keep(self, m: M, v: F) -> F {
+        unsafe { F(_mm256_and_ps(m.0, v.0), _mm256_and_ps(m.1, v.1)) }
+    }
+    #[inline(always)]
+    fn bits(self, m: M) -> u32 {
+        unsafe { _mm256_movemask_ps(m.0) as u32 | (_mm256_movemask_ps(m.1) as u32) << 8 }
+    }
+    #[inline(always)]
+    fn mask(self, bits: u32) -> M {
+        unsafe {
+            let bits = _mm256_set1_epi32(bits as i32);
+            let low = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
+            let high = _mm256_slli_epi32::<8>(low);
+            M(
+                _mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_and_si256(bits, low), low)),
+                _mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_and_si256(bits, high), high)),
+            )
+        }
+    }
+    #[inline(always)]
+    fn any(self, m: M) -> bool {
+        unsafe { _mm256_movemask_ps(_mm256_or_ps(m.0, m.1)) != 0 }
+    }
+
+    #[inline(always)]
+    fn splat_int(self, v: i32) -> I {
+        let v = unsafe { _mm256_set1_epi32(v) };
+        I(v, v)
+    }
+    #[inline(always)]
+    fn store_int(self, v: I, to: &mut [i32; LANES]) {
+        unsafe {
+            _mm256_storeu_si256(to.as_mut_ptr().cast(), v.0);
+            _mm256_storeu_si256(to.as_mut_ptr().add(8).cast(), v.1);
+        }
+    }
+    #[inline(always)]
+    fn to_bits(self, v: F) -> I {
+        unsafe { I(_mm256_castps_si256(v.0), _mm256_castps_si256(v.1)) }
+    }
+    #[inline(always)]
+    fn of_bits(self, v: I) -> F {
+        unsafe { F(_mm256_castsi256_ps(v.0), _mm256_castsi256_ps(v.1)) }
+    }
+    #[inline(always)]
+    fn to_int(self, v: F) -> I {
+        unsafe { I(_mm256_cvttps_epi32(v.0), _mm256_cvttps_epi32(v.1)) }
+    }
+    #[inline(always)]
+    fn of_int(self, v: I) -> F {
+        unsafe { F(_mm256_cvtepi32_ps(v.0), _mm256_cvtepi32_ps(v.1)) }
+    }
+    #[inline(always)]
+    fn shl<const N: u32>(self, v: I) -> I {
+        // The intrinsic's constant is an i32, which no generic u32 becomes.
+        let n = N as i32;
+        unsafe {
+            let n = _mm_cvtsi32_si128(n);
+            I(_mm256_sll_epi32(v.0, n), _mm256_sll_epi32(v.1, n))
+        }
+    }
+    #[inline(always)]
+    fn shift(self, v: I, by: I) -> I {
+        unsafe { I(_mm256_sllv_epi32(v.0, by.0), _mm256_sllv_epi32(v.1, by.1)) }
+    }
+    #[inline(always)]
+    fn shr<const N: u32>(self, v: I) -> I {
+        let n = N as i32;
+        unsafe {
+            let n = _mm_cvtsi32_si128(n);
+            I(_mm256_sra_epi32(v.0, n), _mm256_sra_epi32(v.1, n))
+        }
+    }
+
+    #[inline(always)]
+    fn prefetch<T>(self, v: &T) {
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(v).cast()) }
+    }
+    #[inline(always)]
+    fn sum(self, v: F) -> f32 {
+        unsafe { sum8(_mm256_add_ps(v.0, v.1)) }
+    }
+    #[inline(always)]
+    fn load4(self, from: &[f32], at: &[usize; LANES], offset: usize) -> [F; 4] {
+        if !all_inside(from.len(), at, offset) {
+            return [self.splat(0.0); 4];
+        }
+        unsafe {
+            let p = from.as_ptr().add(offset);
+            let mut halves = [[_mm256_setzero_ps(); 4]; 2];
+            for (h, half) in halves.iter_mut().enumerate() {
+                for i in 0..4 {
+                    let low = _mm_loadu_ps(p.add(at[8 * h + i]));
+                    let high = _mm_loadu_ps(p.add(at[8 * h + i + 4]));
+                    half[i] = _mm256_set_m128(high, low);
+                }
+                *half = transpose4(*half);
+            }
+            let [low, high] = halves;
+            [F(low[0], high[0]), F(low[1], high[1]), F(low[2], high[2]), F(low[3], high[3])]
+        }
+    }
+    #[inline(always)]
+    fn transpose(self, v: [F; LANES]) -> [F; LANES] {
+        unsafe {
+            let mut out = v;
+            for h in 0..2 {
+                let (mut left, mut right) = ([v[0].0; 8], [v[0].0; 8]);
+                for i in 0..8 {
+                    left[i] = v[8 * h + i].0;
+                    right[i] = v[8 * h + i].1;
+                }
+                let (left, right) = (transpose8(left), transpose8(right));
+                for i in 0..8 {
+                    if h == 0 {
+                        out[i].0 = left[i];
+                        out[8 + i].0 = right[i];
+                    } else {
+                        out[i].1 = left[i];
+                        out[8 + i].1 = right[i];
+                    }
+                }
+            }
+            out
+        }
+    }
+}
+
+/// 4×4 transposes inside each 128-bit part.
+#[inline(always)]
+unsafe fn transpose4(v: [__m256; 4]) -> [__m256; 4] {
+    unsafe {
+        let (a, b) = (_mm256_unpacklo_ps(v[0], v[1]), _mm256_unpackhi_ps(v[0], v[1]));
+        let (c, d) = (_mm256_unpacklo_ps(v[2], v[3]), _mm256_unpackhi_ps(v[2], v[3]));
+        [
+            _mm256_shuffle_ps::<0x44>(a, c),
+            _mm256_shuffle_ps::<0xee>(a, c),
+            _mm256_shuffle_ps::<0x44>(b, d),
+            _mm256_shuffle_ps::<0xee>(b, d),
+        ]
+    }
+}
+
+#[inline(always)]
+unsafe fn transpose8(v: [__m256; 8]) -> [__m256; 8] {
+    unsafe {
+        let low = transpose4([v[0], v[1], v[2], v[3]]);
+        let high = transpose4([v[4], v[5], v[6], v[7]]);
+        let (mut out, mut upper) = (low, high);
+        for i in 0..4 {
+            out[i] = _mm256_permute2f128_ps::<0x20>(low[i], high[i]);
+            upper[i] = _mm256_permute2f128_ps::<0x31>(low[i], high[i]);
+        }
+        [out[0], out[1], out[2], out[3], upper[0], upper[1], upper[2], upper[3]]
+    }
+}

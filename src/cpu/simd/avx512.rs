@@ -1,0 +1,295 @@
+//! AVX-512: sixteen lanes in one register, truths in a mask register.
+//!
+//! SAFETY of every block below: the intrinsics need x86-64-v4. A vector comes only
+//! from [`Token`], and a token only from [`run`], whose caller has asked the
+//! processor. Loads and stores go through references to whole arrays, or to places
+//! checked beforehand.
+#![expect(clippy::undocumented_unsafe_blocks, reason = "one reason for all, stated above")]
+
+use super::{Floats, Ints, Kernel, LANES, Mask, Simd, all_inside};
+use std::arch::x86_64::*;
+use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
+
+/// Proof that the processor has x86-64-v4.
+#[derive(Clone, Copy)]
+pub(super) struct Token(());
+
+#[derive(Clone, Copy)]
+#[repr(transparent)]
+pub(super) struct F(__m512);
+
+#[derive(Clone, Copy)]
+#[repr(transparent)]
+pub(super) struct M(__mmask16);
+
+#[derive(Clone, Copy)]
+#[repr(transparent)]
+pub(super) struct I(__m512i);
+
+impl Floats for F {}
+impl Mask for M {}
+impl Ints for I {}
+
+/// Whether the processor has what [`run`] needs.
+pub(super) fn detected() -> bool {
+    super::avx2::detected()
+        && is_x86_feature_detected!("avx512f")
+        && is_x86_feature_detected!("avx512bw")
+        && is_x86_feature_detected!("avx512cd")
+        && is_x86_feature_detected!("avx512dq")
+        && is_x86_feature_detected!("avx512vl")
+}
+
+/// Runs `kernel` compiled for x86-64-v4.
+///
+/// # Safety
+/// [`detected`] must have said yes.
+#[target_feature(
+    enable = "avx512f,avx512bw,avx512cd,avx512dq,avx512vl,avx2,fma,bmi1,bmi2,lzcnt,popcnt"
+)]
+pub(super) unsafe fn run<K: Kernel>(kernel: K) -> K::Output {
+    kernel.run(Token(()))
+}
+
+macro_rules! operators {
+    ($($vector:ident $op:ident $method:ident $intrinsic:ident;)*) => { $(
+        impl $op for $vector {
+            type Output = Self;
+            #[inline(always)]
+            fn $method(self, other: Self) -> Self {
+                Self(unsafe { $intrinsic(self.0, other.0) })
+            }
+        }
+    )* };
+}
+
+operators! {
+    F Add add _mm512_add_ps;
+    F Sub sub _mm512_sub_ps;
+    F Mul mul _mm512_mul_ps;
+    F Div div _mm512_div_ps;
+    I Add add _mm512_add_epi32;
+    I Sub sub _mm512_sub_epi32;
+    I BitAnd bitand _mm512_and_si512;
+    I BitOr bitor _mm512_or_si512;
+    M BitAnd bitand _kand_mask16;
+    M BitOr bitor _kor_mask16;
+}
+
+impl Neg for F {
+    type Output = Self;
+    #[inline(always)]
+    fn neg(self) -> Self {
+        F(unsafe { _mm512_xor_ps(self.0, _mm512_set1_ps(-0.0)) })
+    }
+}
+
+impl Not for M {
+    type Output = Self;
+    #[inline(always)]
+    fn not(self) -> Self {
+        M(!self.0)
+    }
+}
+
+impl Simd for Token {
+    type F = F;
+    type M = M;
+    type I = I;
+
+    #[inline(always)]
+    fn splat(self, v: f32) -> F {
+        F(unsafe { _mm512_set1_ps(v) })
+    }
+    #[inline(always)]
+    fn load(self, v: &[f32; LANES]) -> F {
+        F(unsafe { _mm512_loadu_ps(v.as_ptr()) })
+    }
+    #[inline(always)]
+    fn store(self, v: F, to: &mut [f32; LANES]) {
+        unsafe { _mm512_storeu_ps(to.as_mut_ptr(), v.0) }
+    }
+    #[inline(always)]
+    fn fma(self, a: F, b: F, c: F) -> F {
+        F(unsafe { _mm512_fmadd_ps(a.0, b.0, c.0) })
+    }
+    #[inline(always)]
+    fn fnma(self, a: F, b: F, c: F) -> F {
+        F(unsafe { _mm512_fnmadd_ps(a.0, b.0, c.0) })
+    }
+    #[inline(always)]
+    fn min(self, a: F, b: F) -> F {
+        F(unsafe { _mm512_min_ps(a.0, b.0) })
+    }
+    #[inline(always)]
+    fn max(self, a: F, b: F) -> F {
+        F(unsafe { _mm512_max_ps(a.0, b.0) })
+    }
+    #[inline(always)]
+    fn sqrt(self, v: F) -> F {
+        F(unsafe { _mm512_sqrt_ps(v.0) })
+    }
+    #[inline(always)]
+    fn rough_sqrt(self, v: F) -> F {
+        F(unsafe { _mm512_mul_ps(v.0, _mm512_rsqrt14_ps(v.0)) })
+    }
+    #[inline(always)]
+    fn abs(self, v: F) -> F {
+        F(unsafe { _mm512_abs_ps(v.0) })
+    }
+    #[inline(always)]
+    fn floor(self, v: F) -> F {
+        const DOWN: i32 = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
+        F(unsafe { _mm512_roundscale_ps::<DOWN>(v.0) })
+    }
+    #[inline(always)]
+    fn ceil(self, v: F) -> F {
+        const UP: i32 = _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC;
+        F(unsafe { _mm512_roundscale_ps::<UP>(v.0) })
+    }
+    #[inline(always)]
+    fn split(self, v: F) -> (F, F) {
+        const NEAREST: i32 = _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
+        let f = F(unsafe { _mm512_reduce_ps::<NEAREST>(v.0) });
+        (v - f, f)
+    }
+    #[inline(always)]
+    fn scale(self, v: F, e: F) -> F {
+        F(unsafe { _mm512_scalef_ps(v.0, e.0) })
+    }
+
+    #[inline(always)]
+    fn lt(self, a: F, b: F) -> M {
+        M(unsafe { _mm512_cmp_ps_mask::<_CMP_LT_OQ>(a.0, b.0) })
+    }
+    #[inline(always)]
+    fn le(self, a: F, b: F) -> M {
+        M(unsafe { _mm512_cmp_ps_mask::<_CMP_LE_OQ>(a.0, b.0) })
+    }
+    #[inline(always)]
+    fn select(self, m: M, a: F, b: F) -> F {
+        F(unsafe { _mm512_mask_blend_ps(m.0, b.0, a.0) })
+    }
+    #[inline(always)]
+    fn keep(self, m: M, v: F) -> F {
+        F(unsafe { _mm512_maskz_mov_ps(m.0, v.0) })
+    }
+    #[inline(always)]
+    fn bits(self, m: M) -> u32 {
+        u32::from(m.0)
+    }
+    #[inline(always)]
+    fn mask(self, bits: u32) -> M {
+        M(bits as u16)
+    }
+    #[inline(always)]
+    fn any(self, m: M) -> bool {
+        m.0 != 0
+    }
+
+    #[inline(always)]
+    fn splat_int(self, v: i32) -> I {
+        I(unsafe { _mm512_set1_epi32(v) })
+    }
+    #[inline(always)]
+    fn store_int(self, v: I, to: &mut [i32; LANES]) {
+        unsafe { _mm512_storeu_si512(to.as_mut_ptr().cast(), v.0) }
+    }
+    #[inline(always)]
+    fn to_bits(self, v: F) -> I {
+        I(unsafe { _mm512_castps_si512(v.0) })
+    }
+    #[inline(always)]
+    fn of_bits(self, v: I) -> F {
+        F(unsafe { _mm512_castsi512_ps(v.0) })
+    }
+    #[inline(always)]
+    fn to_int(self, v: F) -> I {
+        I(unsafe { _mm512_cvttps_epi32(v.0) })
+    }
+    #[inline(always)]
+    fn of_int(self, v: I) -> F {
+        F(unsafe { _mm512_cvtepi32_ps(v.0) })
+    }
+    #[inline(always)]
+    fn shl<const N: u32>(self, v: I) -> I {
+        I(unsafe { _mm512_slli_epi32::<N>(v.0) })
+    }
+    #[inline(always)]
+    fn shift(self, v: I, by: I) -> I {
+        I(unsafe { _mm512_sllv_epi32(v.0, by.0) })
+    }
+    #[inline(always)]
+    fn shr<const N: u32>(self, v: I) -> I {
+        I(unsafe { _mm512_srai_epi32::<N>(v.0) })
+    }
+
+    #[inline(always)]
+    fn prefetch<T>(self, v: &T) {
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(v).cast()) }
+    }
+    #[inline(always)]
+    fn sum(self, v: F) -> f32 {
+        unsafe {
+            let half = _mm256_add_ps(_mm512_castps512_ps256(v.0), _mm512_extractf32x8_ps::<1>(v.0));
+            super::avx2::sum8(half)
+        }
+    }
+    #[inline(always)]
+    fn load4(self, from: &[f32], at: &[usize; LANES], offset: usize) -> [F; 4] {
+        if !all_inside(from.len(), at, offset) {
+            return [self.splat(0.0); 4];
+        }
+        unsafe {
+            let p = from.as_ptr().add(offset);
+            let mut joined = [_mm512_setzero_ps(); 4];
+            // Rows i, i + 4, i + 8, i + 12 side by side: the 4×4 transposes inside
+            // 128-bit parts then leave rows in order.
+            for i in 0..4 {
+                let v = _mm512_castps128_ps512(_mm_loadu_ps(p.add(at[i])));
+                let v = _mm512_insertf32x4::<1>(v, _mm_loadu_ps(p.add(at[i + 4])));
+                let v = _mm512_insertf32x4::<2>(v, _mm_loadu_ps(p.add(at[i + 8])));
+                joined[i] = _mm512_insertf32x4::<3>(v, _mm_loadu_ps(p.add(at[i + 12])));
+            }
+            let [a, b, c, d] = transpose4(joined);
+            [F(a), F(b), F(c), F(d)]
+        }
+    }
+    #[inline(always)]
+    fn transpose(self, v: [F; LANES]) -> [F; LANES] {
+        unsafe {
+            // q[a][c]: part b holds rows 4a..4a + 4 of column 4b + c.
+            let mut q = [[_mm512_setzero_ps(); 4]; 4];
+            for a in 0..4 {
+                q[a] = transpose4([v[4 * a].0, v[4 * a + 1].0, v[4 * a + 2].0, v[4 * a + 3].0]);
+            }
+            let mut out = [F(_mm512_setzero_ps()); LANES];
+            for c in 0..4 {
+                let low = _mm512_shuffle_f32x4::<0x88>(q[0][c], q[1][c]);
+                let high = _mm512_shuffle_f32x4::<0x88>(q[2][c], q[3][c]);
+                out[c] = F(_mm512_shuffle_f32x4::<0x88>(low, high));
+                out[8 + c] = F(_mm512_shuffle_f32x4::<0xdd>(low, high));
+                let low = _mm512_shuffle_f32x4::<0xdd>(q[0][c], q[1][c]);
+                let high = _mm512_shuffle_f32x4::<0xdd>(q[2][c], q[3][c]);
+                out[4 + c] = F(_mm512_shuffle_f32x4::<0x88>(low, high));
+                out[12 + c] = F(_mm512_shuffle_f32x4::<0xdd>(low, high));
+            }
+            out
+        }
+    }
+}
+
+/// 4×4 transposes inside each 128-bit part.
+#[inline(always)]
+unsafe fn transpose4(v: [__m512; 4]) -> [__m512; 4] {
+    unsafe {
+        let (a, b) = (_mm512_unpacklo_ps(v[0], v[1]), _mm512_unpackhi_ps(v[0], v[1]));
+        let (c, d) = (_mm512_unpacklo_ps(v[2], v[3]), _mm512_unpackhi_ps(v[2], v[3]));
+        [
+            _mm512_shuffle_ps::<0x44>(a, c),
+            _mm512_shuffle_ps::<0xee>(a, c),
+            _mm512_shuffle_ps::<0x44>(b, d),
+            _mm512_shuffle_ps::<0xee>(b, d),
+        ]
+    }
+}
