@@ -15,6 +15,7 @@ pub mod conv2d;
 pub mod detail;
 pub mod ewa;
 pub mod gemm;
+pub mod lanes;
 pub mod matching;
 pub mod math;
 pub mod norm;
