@@ -8,11 +8,11 @@ mod spgr_calls;
 use candle_core::{DType, Device, Tensor, Var};
 use glam::{DMat3, DVec3, Quat, Vec2, Vec3};
 use scenes::*;
+use spgr_calls::*;
 use subsplat::abi::HEAD_LANES;
 use subsplat::camera::Camera;
 use subsplat::config::*;
 use subsplat::model::spgr_ref;
-use spgr_calls::*;
 use subsplat::ops::spgr::{Rules, Spgr, spgr, spgr_into};
 
 fn cpu(v: Vec<f64>, shape: &[usize]) -> Tensor {

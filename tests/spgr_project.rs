@@ -173,7 +173,7 @@ fn any_number_of_threads_projects_the_same_bytes() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap();
         pool.install(|| scene.direct(&camera, &options).1)
     };
-    assert_eq!(run(1), run(2));
+    assert!(run(1) == run(2));
 }
 
 #[test]
@@ -185,6 +185,5 @@ fn a_record_that_is_not_a_number_is_reported_and_kept_apart() {
     scene.head[44 * 30 + 5] = f32::INFINITY;
     let (finite, got) = scene.direct(&camera, &options);
     assert!(!finite);
-    assert_eq!(got[..120], clean[..120]);
-    assert_eq!(got[124..], clean[124..]);
+    assert!(got[..120] == clean[..120] && got[124..] == clean[124..]);
 }

@@ -244,14 +244,6 @@ impl<S: Simd> Lanes for Vector<S> {
     #[inline(always)]
     fn sin_cos(self) -> (Self, Self) {
         let s = self.s;
-        let m = Vectors(s);
-        let far = Self::select(self.abs().lt(self.c(REDUCIBLE)), self.c(0.0), self.c(1.0));
-        if s.reduce_max_f32s(far.v) > 0.0 {
-            let mut x = [0.0; WIDTH_MAX];
-            m.store(self, &mut x);
-            let [sin, cos] = Self::sin_cos_far(x);
-            return (m.load(&sin), m.load(&cos));
-        }
         let shifted = self.fma(self.c(std::f32::consts::FRAC_2_PI), self.c(MAGIC));
         let n = shifted - self.c(MAGIC);
         // π/2 in three parts of few bits (Cephes' π/4, doubled).
@@ -271,10 +263,19 @@ impl<S: Simd> Lanes for Vector<S> {
             s.wrapping_dyn_shl_u32s(bit, s.splat_u32s(30))
         };
         let flip = |v: Self, q: S::u32s| v.from_bits(s.xor_u32s(v.bits(), sign(q)));
-        (
+        let near = (
             flip(Self::select(odd, cos, sin), quadrant),
             flip(Self::select(odd, sin, cos), s.add_u32s(quadrant, one)),
-        )
+        );
+        let far = self.c(REDUCIBLE).lt(self.abs());
+        if s.reduce_max_f32s(Self::select(far, self.c(1.0), self.c(0.0)).v) == 0.0 {
+            return near;
+        }
+        let m = Vectors(s);
+        let mut x = [0.0; WIDTH_MAX];
+        m.store(self, &mut x);
+        let [sin, cos] = Self::sin_cos_far(x);
+        (Self::select(far, m.load(&sin), near.0), Self::select(far, m.load(&cos), near.1))
     }
 }
 

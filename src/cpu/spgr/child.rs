@@ -4,7 +4,9 @@
 use super::Rules;
 use super::parent::{Parent, ParentGradient};
 use super::shape::{Footprint, Turn, Unit, conjugate, matrix, matrix_backward, multiply};
-use super::view::{Jacobian, M3, V3, add, axpy, dot, kept, scaled, times, transposed};
+use super::view::{
+    Jacobian, M3, V3, add, add4, axpy, dot, kept, product, scaled, times, transposed,
+};
 use crate::abi::{
     DEPTH_FRACTION_MIN, HEAD_DEPTH, HEAD_LANES, HEAD_LOG_SCALE, HEAD_OFFSET, HEAD_ROTATION,
 };
@@ -36,7 +38,7 @@ impl<V: Lanes> Step<V> {
         let cell = [k % rules.side, k / rules.side];
         let learned = [head[HEAD_OFFSET], head[HEAD_OFFSET + 1]];
         let (bounded, per_px) = match rules.offset_bound {
-            Some(bound) => (learned.map(V::tanh), bound * per_side),
+            Some(bound) => ([learned[0].tanh(), learned[1].tanh()], bound * per_side),
             None => (learned, per_side),
         };
         let grid = |i: usize| of((cell[i] as f64 + 0.5) * per_side - 0.5);
@@ -174,9 +176,12 @@ impl<V: Lanes> Child<V> {
         let mean = add(parent.mean, times(&parent.view.rotation, step.out));
         let c = of(rules.dlog_clamp);
         let per_c = of(1.0 / rules.dlog_clamp);
-        let soft: V3<V> = std::array::from_fn(|i| (head[HEAD_LOG_SCALE + i] * per_c).tanh());
-        let factor = soft.map(|t| of(rules.lambda_s) * (c * t).exp());
-        let small: V3<V> = std::array::from_fn(|i| factor[i] * parent.scale[i]);
+        let l = HEAD_LOG_SCALE;
+        let [x, y, z] = scaled([head[l], head[l + 1], head[l + 2]], per_c);
+        let soft = [x.tanh(), y.tanh(), z.tanh()];
+        let [x, y, z] = scaled(soft, c);
+        let factor = scaled([x.exp(), y.exp(), z.exp()], of(rules.lambda_s));
+        let small = product(factor, parent.scale);
         let r = HEAD_ROTATION;
         let turn = Turn::new([head[r], head[r + 1], head[r + 2]]);
         let unit = Unit::new(multiply(parent.quat, turn.e));
@@ -199,7 +204,7 @@ impl<V: Lanes> Child<V> {
             Rule::OpticalDepth => footprint.blurred(growth, clamped, rules.lowpass_target),
             _ => clamped,
         };
-        let scale = std::array::from_fn(|i| small[i] * growth[i]);
+        let scale = product(small, growth);
         Self {
             step,
             turn,
@@ -263,11 +268,11 @@ impl<V: Lanes> Child<V> {
             d_head[HEAD_LOG_SCALE + i] = d_small * self.small[i] * (c - t * t);
         }
         let by_rotation = matrix_backward(self.unit.q, &d_rotation);
-        let d_unit = self.unit.backward(std::array::from_fn(|i| g.quat[i] + by_rotation[i]));
+        let d_unit = self.unit.backward(add4(g.quat, by_rotation));
         let d_turn = self.turn.backward(multiply(conjugate(parent.quat), d_unit));
         d_head[HEAD_ROTATION..HEAD_ROTATION + 3].copy_from_slice(&d_turn);
         let by_parent = multiply(d_unit, conjugate(self.turn.e));
-        d.quat = std::array::from_fn(|i| d.quat[i] + by_parent[i]);
+        d.quat = add4(d.quat, by_parent);
         d.mean = add(d.mean, g.mean);
         let mut d_step = transposed(&parent.view.rotation, g.mean);
         match &self.jacobian {

@@ -1,7 +1,7 @@
 //! Spherical harmonics on lanes: the functions of [`crate::cpu::sh`] with a vector of
 //! directions, and the parents' coefficients turned into vectors.
 
-use super::view::{V3, dot, kept};
+use super::view::{V3, dot, kept, scaled};
 use crate::abi::{SH_COEFFICIENTS_MAX, ShBasis, sh_coefficients};
 use crate::cpu::lanes::{Lanes, Machine, WIDTH_MAX};
 use crate::cpu::sh::degree_max;
@@ -44,7 +44,7 @@ impl<T: crate::cpu::real::Real> Coefficients<T> {
         let norm = dot(v, v).sqrt();
         let sound = kept(norm.lt(m.of(f64::INFINITY)), norm);
         let inverse = kept(zero.lt(sound), one / norm);
-        let d = v.map(|x| x * inverse);
+        let d = scaled(v, inverse);
         let mut y = [zero; SH_COEFFICIENTS_MAX];
         match self.basis {
             ShBasis::Standard => standard(self.degree, d, &mut y),

@@ -152,7 +152,7 @@ fn records<M: Machine>(
     let mut tile = [[M::Scalar::default(); WIDTH_MAX]; HEAD_LANES];
     let from = &args.head[(first * children + k) * HEAD_LANES..];
     rows_to_lanes(m, from, (children * HEAD_LANES, count), &mut tile);
-    std::array::from_fn(|i| m.load(&tile[i]))
+    view::load(m, &tile)
 }
 
 /// One block of parents forward; `rows` and `gains` are the block's own.

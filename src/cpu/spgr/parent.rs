@@ -3,7 +3,8 @@
 
 use super::shape::{Footprint, Unit, matrix, matrix_backward};
 use super::view::{
-    Jacobian, M3, Table, V3, View, add, axpy, cross, dot, kept, scaled, times, transposed,
+    Jacobian, M3, Table, V3, View, add, add4, axpy, cross, dot, each, indexed, kept, product,
+    scaled, times, transposed,
 };
 use super::{Rules, Source};
 use crate::abi::{LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES};
@@ -185,7 +186,7 @@ impl<V: Lanes> Own<V> {
         d.in_camera = add(d.in_camera, self.jacobian.backward(&d_jw));
         d.scale = add(d.scale, d_scale);
         let d_quat = self.unit.backward(matrix_backward(self.unit.q, &d_rotation));
-        d.quat = std::array::from_fn(|i| d.quat[i] + d_quat[i]);
+        d.quat = add4(d.quat, d_quat);
     }
 }
 
@@ -215,13 +216,15 @@ impl<V: Lanes> Disc<V> {
         let unit = Unit::new(parent.quat);
         let rotation = matrix(unit.q);
         let columns = &parent.view.rotation;
-        let turned: M3<V> = std::array::from_fn(|i| {
-            transposed(&rotation, [columns[0][i], columns[1][i], columns[2][i]])
-        });
-        let g = turned.map(|t| [t[0] * s[0], t[1] * s[1], t[2] * s[2]]);
+        let turned: M3<V> = indexed(
+            [zero; 3],
+            #[inline(always)]
+            |i| transposed(&rotation, [columns[0][i], columns[1][i], columns[2][i]]),
+        );
+        let g = [product(turned[0], s), product(turned[1], s), product(turned[2], s)];
         let f = [parent.view.focal[0] / z, parent.view.focal[1] / z];
         let j = [[f[0], zero, -f[0] * x[0] / z], [zero, f[1], -f[1] * x[1] / z]];
-        let m = j.map(|row| transposed(&g, row));
+        let m = [transposed(&g, j[0]), transposed(&g, j[1])];
         let normal = cross(m[0], m[1]);
         let det = dot(normal, normal) + one.of(crate::abi::AREA_SQ_EPS);
         let solid = one.of(SOLID).lt(det);
@@ -232,17 +235,25 @@ impl<V: Lanes> Disc<V> {
             scaled(axpy(-ab, b, scaled(a, bb)), inverse_det),
             scaled(axpy(-ab, a, scaled(b, aa)), inverse_det),
         ];
-        let steps = weights.map(|t| times(&g, t));
+        let steps = [times(&g, weights[0]), times(&g, weights[1])];
         Self { steps, solid, unit, turned, g, j, m, normal, inverse_det, weights }
     }
 
     #[inline(always)]
     fn backward(&self, parent: &Parent<V>, d: &mut ParentGradient<V>) {
         let [a, b] = self.m;
-        let [du, dv] = d.disc.map(|d| d.map(|v| kept(self.solid, v)));
+        let [du, dv] = each(
+            d.disc,
+            #[inline(always)]
+            |[x, y, z]| [kept(self.solid, x), kept(self.solid, y), kept(self.solid, z)],
+        );
         let [tu, tv] = self.weights;
         // steps = G·t: ∂G = d tᵀ, ∂t = Gᵀ d.
-        let mut d_g: M3<V> = std::array::from_fn(|i| axpy(dv[i], tv, scaled(tu, du[i])));
+        let mut d_g: M3<V> = indexed(
+            tu,
+            #[inline(always)]
+            |i| axpy(dv[i], tv, scaled(tu, du[i])),
+        );
         let (eu, ev) = (
             scaled(transposed(&self.g, du), self.inverse_det),
             scaled(transposed(&self.g, dv), self.inverse_det),
@@ -271,17 +282,15 @@ impl<V: Lanes> Disc<V> {
         }
         // G = R_w2c·R·S.
         let s = parent.scale;
-        let d_scale: V3<V> = std::array::from_fn(|c| {
-            dot(
-                [d_g[0][c], d_g[1][c], d_g[2][c]],
-                [self.turned[0][c], self.turned[1][c], self.turned[2][c]],
-            )
-        });
-        d.scale = add(d.scale, d_scale);
-        let d_turned = d_g.map(|r| [r[0] * s[0], r[1] * s[1], r[2] * s[2]]);
+        let t = &self.turned;
+        for (scale, t) in d_g.iter().zip(t) {
+            d.scale = add(d.scale, product(*scale, *t));
+        }
+        let d_turned = [product(d_g[0], s), product(d_g[1], s), product(d_g[2], s)];
+        let r = &parent.view.rotation;
         let d_rotation: M3<V> =
-            std::array::from_fn(|i| transposed(&d_turned, parent.view.rotation[i]));
+            [transposed(&d_turned, r[0]), transposed(&d_turned, r[1]), transposed(&d_turned, r[2])];
         let d_quat = self.unit.backward(matrix_backward(self.unit.q, &d_rotation));
-        d.quat = std::array::from_fn(|i| d.quat[i] + d_quat[i]);
+        d.quat = add4(d.quat, d_quat);
     }
 }

@@ -9,7 +9,9 @@
 use super::child::Child;
 use super::colour::Coefficients;
 use super::parent::Parent;
-use super::view::{M3, V3, axpy, cross, dot, kept, scaled, times, transposed};
+use super::view::{
+    M3, V3, axpy, cross, dot, each, kept, product, scaled, splat, times, transposed,
+};
 use super::{Args, BLOCK, gain, not_finite, records};
 use crate::abi::{
     ALPHA_MIN, ALPHA_MIN_LOG2, Convention, DISCRIMINANT_MIN_MVSPLAT, HEAD_GAIN, HEAD_LOGIT,
@@ -136,17 +138,17 @@ struct Seen<V> {
 impl<V: Lanes> Seen<V> {
     #[inline(always)]
     fn new<M: Machine<Scalar = f32, V = V>>(m: M, lens: &Lens, d: V3<V>, child: &Child<V>) -> Self {
-        let rows = lens.rows.map(|r| r.map(|v| m.splat(v)));
+        let rows = [splat(m, &lens.rows[0]), splat(m, &lens.rows[1]), splat(m, &lens.rows[2])];
         let p = times(&rows, d);
         let inverse = m.of(1.0) / p[2];
-        let row = |i: usize| -> V3<V> {
+        let mut footprint = [[inverse; 3]; 2];
+        for (i, row) in footprint.iter_mut().enumerate() {
             let (low, high) = lens.limit[i];
             let slope = (p[i] * inverse).max(m.splat(low)).min(m.splat(high));
             let world = scaled(axpy(-slope, rows[2], rows[i]), m.splat(lens.focal[i]) * inverse);
-            let turned = transposed(child.rotation(), world);
-            [turned[0] * child.scale[0], turned[1] * child.scale[1], turned[2] * child.scale[2]]
-        };
-        let (a, b) = (row(0), row(1));
+            *row = product(transposed(child.rotation(), world), child.scale);
+        }
+        let [a, b] = footprint;
         let n = cross(a, b);
         let zero = m.of(0.0);
         Self {
@@ -163,12 +165,7 @@ impl<V: Lanes> Seen<V> {
     /// The footprint's 12 numbers and four extents in the order of [`Footprint`], and
     /// 1 where it is kept.
     #[inline(always)]
-    fn finish<M: Machine<Scalar = f32, V = V>>(
-        &self,
-        m: M,
-        lens: &Lens,
-        alpha: V,
-    ) -> ([V; 16], V) {
+    fn finish<M: Machine<Scalar = f32, V = V>>(&self, m: M, lens: &Lens, alpha: V) -> ([V; 16], V) {
         let (zero, one, lowpass) = (m.of(0.0), m.of(1.0), m.splat(lens.lowpass));
         let (xx, yy) = (self.xx + lowpass, self.yy + lowpass);
         let det = self.det + lowpass * (self.xx + self.yy) + lowpass * lowpass;
@@ -181,9 +178,8 @@ impl<V: Lanes> Seen<V> {
         let reach = reach + m.of(SUPPORT_SLACK) * (one + reach);
         let reach = m.of(2.0 * std::f64::consts::LN_2) * reach;
         let inverse_z = one / (self.p[2] + m.splat(lens.z_epsilon));
-        let place = |i: usize| {
-            (m.splat(lens.focal[i]) * self.p[i]).fma(inverse_z, m.splat(lens.centre[i]))
-        };
+        let place =
+            |i: usize| (m.splat(lens.focal[i]) * self.p[i]).fma(inverse_z, m.splat(lens.centre[i]));
         let (u, v) = (place(0), place(1));
         let half = m.of(0.5 * std::f64::consts::LOG2_E);
         let inverse_yy = one / yy;
@@ -198,10 +194,10 @@ impl<V: Lanes> Seen<V> {
         });
         let (x0, x1) = extent(m, lens.size[0], (u, width), radius);
         let (y0, y1) = extent(m, lens.size[1], (v, height), radius);
-        let rgb: V3<V> = std::array::from_fn(|c| {
-            self.gain[0].fma(self.sum[c], m.of(0.5)) + self.gain[1]
-        });
-        let numbers = [u, v, sx, shear, sy, power, rgb[0], rgb[1], rgb[2], self.p[2], width, height];
+        let grey = m.of(0.5) + self.gain[1];
+        let rgb = axpy(self.gain[0], self.sum, [grey; 3]);
+        let numbers =
+            [u, v, sx, shear, sy, power, rgb[0], rgb[1], rgb[2], self.p[2], width, height];
         // Every test fails for NaN.
         let mut keep = kept(m.splat(lens.near).lt(self.p[2]), one);
         for (low, high) in [(zero, det), (zero, xx), (zero, yy), (x0, x1), (y0, y1)] {
@@ -210,7 +206,7 @@ impl<V: Lanes> Seen<V> {
         keep = V::select(alpha.lt(m.splat(ALPHA_MIN)), zero, keep);
         let sound = not_finite(&numbers, det - det).abs();
         keep = kept(sound.lt(one), keep);
-        let rgb = rgb.map(|v| v.max(zero));
+        let rgb = [rgb[0].max(zero), rgb[1].max(zero), rgb[2].max(zero)];
         (
             [
                 u, v, sx, shear, sy, power, rgb[0], rgb[1], rgb[2], self.p[2], width, height, x0,
@@ -240,9 +236,14 @@ fn extent<M: Machine<Scalar = f32>>(
     if let Some(r) = radius {
         let tile = m.of(TILE_MVSPLAT as f64);
         let per = one / tile;
-        let cell = |at: M::V| (at.max(zero).min(side + tile) * per).floor() * tile;
-        first = first.max(cell(mean - r)).min(side);
-        past = past.min(cell(mean + r + (tile - one)));
+        let ends = [mean - r, mean + r + (tile - one)];
+        let cut = each(
+            ends,
+            #[inline(always)]
+            |at| (at.max(zero).min(side + tile) * per).floor() * tile,
+        );
+        first = first.max(cut[0]).min(side);
+        past = past.min(cut[1]);
     }
     (first, past)
 }
@@ -305,7 +306,7 @@ impl Project<'_> {
         let Args { rules, source, parents, .. } = self.args;
         let parent = Parent::load(m, (rules, self.table, &source), parents, span);
         let mut bad = not_finite(&[parent.alpha, parent.z], m.of(0.0));
-        let eye = self.lens.eye.map(|v| m.splat(v));
+        let eye = splat(m, &self.lens.eye);
         let shared = self.target.options.sh_direction == ShDirection::Parent;
         let mut towards = [m.of(0.0); 3];
         for (k, seen) in seen.iter_mut().enumerate() {
@@ -314,7 +315,7 @@ impl Project<'_> {
             let child = Child::new(rules, &parent, k, &head);
             (areas[k], alphas[k]) = (child.area, head[HEAD_LOGIT]);
             bad = not_finite(&child.mean, not_finite(&child.scale, bad));
-            let d: V3<M::V> = std::array::from_fn(|i| child.mean[i] - eye[i]);
+            let d = axpy(m.of(-1.0), eye, child.mean);
             *seen = Seen::new(m, self.lens, d, &child);
             let [gamma, residual, ..] = gain(m, rules, head[HEAD_GAIN]);
             seen.gain = [gamma, residual];

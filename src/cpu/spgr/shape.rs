@@ -1,7 +1,9 @@
 //! Orientation and footprint of one ellipsoid, with gradients (spec 2.5, 2.6, 2.12).
 
 use super::Rules;
-use super::view::{M3, V3, add, axpy, cross, dot, kept, scaled};
+use super::view::{
+    M3, V3, add, axpy, cross, dot, indexed, kept, product, scaled, times, transposed,
+};
 use crate::abi::{AREA_SQ_EPS, GROWTH_MAX};
 use crate::cpu::lanes::Lanes;
 
@@ -39,7 +41,11 @@ impl<V: Lanes> Unit<V> {
         let squared = (q[0] * q[0] + q[1] * q[1]) + (q[2] * q[2] + q[3] * q[3]);
         let least = squared.of(AREA_SQ_EPS);
         let inverse = squared.of(1.0) / squared.max(least).sqrt();
-        Self { q: q.map(|v| v * inverse), inverse, free: least.lt(squared) }
+        Self {
+            q: [q[0] * inverse, q[1] * inverse, q[2] * inverse, q[3] * inverse],
+            inverse,
+            free: least.lt(squared),
+        }
     }
 
     #[inline(always)]
@@ -47,7 +53,13 @@ impl<V: Lanes> Unit<V> {
         let q = self.q;
         let along = (q[0] * d[0] + q[1] * d[1]) + (q[2] * d[2] + q[3] * d[3]);
         let along = kept(self.free, along);
-        std::array::from_fn(|i| (d[i] - q[i] * along) * self.inverse)
+        let s = self.inverse;
+        [
+            (d[0] - q[0] * along) * s,
+            (d[1] - q[1] * along) * s,
+            (d[2] - q[2] * along) * s,
+            (d[3] - q[3] * along) * s,
+        ]
     }
 }
 
@@ -135,8 +147,8 @@ pub(super) type FootprintGradient<V> = ([V3<V>; 2], M3<V>, V3<V>);
 impl<V: Lanes> Footprint<V> {
     #[inline(always)]
     pub(super) fn new(jw: &[V3<V>; 2], rotation: &M3<V>, scale: V3<V>) -> Self {
-        let turned = jw.map(|row| super::view::transposed(rotation, row));
-        let m = turned.map(|t| [t[0] * scale[0], t[1] * scale[1], t[2] * scale[2]]);
+        let turned = [transposed(rotation, jw[0]), transposed(rotation, jw[1])];
+        let m = [product(turned[0], scale), product(turned[1], scale)];
         let normal = cross(m[0], m[1]);
         let area = (dot(normal, normal) + scale[0].of(AREA_SQ_EPS)).sqrt();
         Self { turned, m, normal, area }
@@ -164,9 +176,8 @@ impl<V: Lanes> Footprint<V> {
     ) -> (V, [V3<V>; 2]) {
         let each = d / value;
         let by = each * each.of(lowpass);
-        let row =
-            |m: V3<V>| -> V3<V> { std::array::from_fn(|i| by * growth[i] * growth[i] * m[i]) };
-        (each * area, [row(self.m[0]), row(self.m[1])])
+        let by = scaled(product(growth, growth), by);
+        (each * area, [product(by, self.m[0]), product(by, self.m[1])])
     }
 
     /// Gradients for those of the area and of M (the latter beside the area's own).
@@ -180,11 +191,14 @@ impl<V: Lanes> Footprint<V> {
         let n = scaled(self.normal, d_area / self.area);
         let d_m = [add(d_m[0], cross(self.m[1], n)), add(d_m[1], cross(n, self.m[0]))];
         let t = &self.turned;
-        let d_scale = std::array::from_fn(|i| d_m[0][i].fma(t[0][i], d_m[1][i] * t[1][i]));
-        let d_turned = d_m.map(|row| [row[0] * scale[0], row[1] * scale[1], row[2] * scale[2]]);
-        let d_rotation =
-            std::array::from_fn(|c| axpy(jw[1][c], d_turned[1], scaled(d_turned[0], jw[0][c])));
-        let d_jw = d_turned.map(|row| super::view::times(rotation, row));
+        let d_scale = add(product(d_m[0], t[0]), product(d_m[1], t[1]));
+        let d_turned = [product(d_m[0], scale), product(d_m[1], scale)];
+        let d_rotation = indexed(
+            d_scale,
+            #[inline(always)]
+            |c| axpy(jw[1][c], d_turned[1], scaled(d_turned[0], jw[0][c])),
+        );
+        let d_jw = [times(rotation, d_turned[0]), times(rotation, d_turned[1])];
         (d_jw, d_rotation, d_scale)
     }
 

@@ -30,6 +30,61 @@ pub(super) fn scaled<V: Lanes>(a: V3<V>, s: V) -> V3<V> {
     [a[0] * s, a[1] * s, a[2] * s]
 }
 
+/// f of each. `array::map` and `from_fn` are not always inlined, and what is not inlined
+/// is compiled without vectors.
+#[inline(always)]
+pub(super) fn each<A: Copy, const N: usize>(mut a: [A; N], f: impl Fn(A) -> A) -> [A; N] {
+    for v in &mut a {
+        *v = f(*v);
+    }
+    a
+}
+
+/// f of each index, `N` times, on top of `start`.
+#[inline(always)]
+pub(super) fn indexed<A: Copy, const N: usize>(start: A, f: impl Fn(usize) -> A) -> [A; N] {
+    let mut out = [start; N];
+    for (i, v) in out.iter_mut().enumerate() {
+        *v = f(i);
+    }
+    out
+}
+
+/// a + b.
+#[inline(always)]
+pub(super) fn add4<V: Lanes>(a: [V; 4], b: [V; 4]) -> [V; 4] {
+    [a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3]]
+}
+
+/// Every row of a table of scalars in every lane.
+#[inline(always)]
+pub(super) fn splat<M: Machine, const N: usize>(m: M, from: &[M::Scalar; N]) -> [M::V; N] {
+    indexed(
+        m.of(0.0),
+        #[inline(always)]
+        |i| m.splat(from[i]),
+    )
+}
+
+/// Every row of a tile as a vector.
+#[inline(always)]
+pub(super) fn load<M: Machine, const N: usize>(
+    m: M,
+    tile: &[[M::Scalar; WIDTH_MAX]; N],
+) -> [M::V; N] {
+    indexed(
+        m.of(0.0),
+        #[inline(always)]
+        |i| m.load(&tile[i]),
+    )
+}
+
+/// a ⊙ b.
+#[inline(always)]
+pub(super) fn product<V: Lanes>(a: V3<V>, b: V3<V>) -> V3<V> {
+    [a[0] * b[0], a[1] * b[1], a[2] * b[2]]
+}
+
 /// s·a + b.
 #[inline(always)]
 pub(super) fn axpy<V: Lanes>(s: V, a: V3<V>, b: V3<V>) -> V3<V> {
@@ -104,7 +159,7 @@ impl<T: Real> Table<T> {
     ) -> View<M::V> {
         let lanes = &index[..M::WIDTH];
         if lanes.iter().all(|&v| v == lanes[0]) {
-            return View::new(self.cameras[lanes[0]].map(|v| m.splat(v)));
+            return View::new(splat(m, &self.cameras[lanes[0]]));
         }
         let mut tile = [[T::default(); WIDTH_MAX]; FIELDS];
         for (lane, &v) in lanes.iter().enumerate() {
@@ -112,7 +167,7 @@ impl<T: Real> Table<T> {
                 tile[lane] = v;
             }
         }
-        View::new(std::array::from_fn(|i| m.load(&tile[i])))
+        View::new(load(m, &tile))
     }
 
     /// v* of every lane (module doc of [`super`]).
@@ -129,7 +184,7 @@ impl<T: Real> Table<T> {
         }
         let (mut nearest, mut best) = (m.of(f64::INFINITY), m.of(-1.0));
         for (v, camera) in self.cameras.iter().enumerate() {
-            let view = View::new(camera.map(|v| m.splat(v)));
+            let view = View::new(splat(m, camera));
             let p = view.to_camera(mean);
             let closer = view.sees(p, p[2].lt(nearest));
             nearest = M::V::select(closer, p[2], nearest);
@@ -225,13 +280,14 @@ impl<V: Lanes> Jacobian<V> {
         let slope =
             [raw[0].max(view.low[0]).min(view.high[0]), raw[1].max(view.low[1]).min(view.high[1])];
         let focal = [zoom * view.focal[0] * inverse_z, zoom * view.focal[1] * inverse_z];
-        let row = |i: usize| -> V3<V> {
+        let mut jw = [axis; 2];
+        for (i, row) in jw.iter_mut().enumerate() {
             let side = [r[0][i], r[1][i], r[2][i]];
-            scaled(axpy(-slope[i], axis, side), focal[i])
-        };
+            *row = scaled(axpy(-slope[i], axis, side), focal[i]);
+        }
         let inside = |i: usize| [view.low[i].lt(raw[i]), raw[i].lt(view.high[i])];
         Self {
-            jw: [row(0), row(1)],
+            jw,
             focal,
             raw,
             inverse_z,
