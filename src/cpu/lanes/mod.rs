@@ -8,6 +8,8 @@
 //! What a kernel calls must be `#[inline(always)]`, so that it is compiled for the
 //! instruction set of the vectors.
 
+#[cfg(target_arch = "x86_64")]
+mod transpose;
 mod vector;
 
 use super::real::Real;
@@ -79,6 +81,26 @@ pub trait Machine: Copy {
     #[inline(always)]
     fn of(self, v: f64) -> Self::V {
         self.splat(Self::Scalar::of(v))
+    }
+    /// Rows of `L` ≤ 16 numbers, `stride` apart, of `count` lanes: number i of every
+    /// lane. Lanes above `count` repeat the last row.
+    #[inline(always)]
+    fn load_rows<const L: usize>(
+        self,
+        rows: &[Self::Scalar],
+        (stride, count): (usize, usize),
+    ) -> [Self::V; L] {
+        load_rows(self, rows, (stride, count))
+    }
+    /// The inverse of [`Machine::load_rows`]: the first `count` lanes into their rows.
+    #[inline(always)]
+    fn store_rows<const L: usize>(
+        self,
+        from: &[Self::V; L],
+        (stride, count): (usize, usize),
+        rows: &mut [Self::Scalar],
+    ) {
+        store_rows(self, from, (stride, count), rows);
     }
 }
 
@@ -206,36 +228,43 @@ impl Lanes for f64 {
     }
 }
 
-/// Rows of `L` numbers, `stride` apart, of `count` lanes into `out` `[L][lane]`;
-/// lanes above `count` repeat the last row. `rows` holds at least one row.
+/// [`Machine::load_rows`] by single moves.
 #[inline(always)]
-pub(super) fn rows_to_lanes<M: Machine, const L: usize>(
-    _: M,
+fn load_rows<M: Machine, const L: usize>(
+    m: M,
     rows: &[M::Scalar],
     (stride, count): (usize, usize),
-    out: &mut [[M::Scalar; WIDTH_MAX]; L],
-) {
+) -> [M::V; L] {
+    let mut tile = [[M::Scalar::default(); WIDTH_MAX]; L];
     for lane in 0..M::WIDTH {
         let at = lane.min(count - 1) * stride;
-        let row = &rows[at..at + L];
-        for (out, &v) in out.iter_mut().zip(row) {
+        for (out, &v) in tile.iter_mut().zip(&rows[at..at + L]) {
             out[lane] = v;
         }
     }
+    let mut out = [m.of(0.0); L];
+    for (out, tile) in out.iter_mut().zip(&tile) {
+        *out = m.load(tile);
+    }
+    out
 }
 
-/// The inverse of [`rows_to_lanes`]: the first `count` lanes into their rows.
+/// [`Machine::store_rows`] by single moves.
 #[inline(always)]
-pub(super) fn lanes_to_rows<T: Real, const L: usize>(
-    from: &[[T; WIDTH_MAX]; L],
+fn store_rows<M: Machine, const L: usize>(
+    m: M,
+    from: &[M::V; L],
     (stride, count): (usize, usize),
-    rows: &mut [T],
+    rows: &mut [M::Scalar],
 ) {
+    let mut tile = [[M::Scalar::default(); WIDTH_MAX]; L];
+    for (&v, tile) in from.iter().zip(&mut tile) {
+        m.store(v, tile);
+    }
     for lane in 0..count {
         let at = lane * stride;
-        let row = &mut rows[at..at + L];
-        for (v, from) in row.iter_mut().zip(from) {
-            *v = from[lane];
+        for (v, tile) in rows[at..at + L].iter_mut().zip(&tile) {
+            *v = tile[lane];
         }
     }
 }

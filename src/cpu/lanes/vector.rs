@@ -1,7 +1,7 @@
 //! Vectors of `f32` and their elementary functions, each good to a few ulp.
 //! Coefficients: Cephes (`expf`, `logf`, `sinf`, `cosf`).
 
-use super::{Lanes, Machine, WIDTH_MAX};
+use super::{Lanes, Machine, WIDTH_MAX, load_rows, store_rows};
 use pulp::Simd;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
@@ -32,6 +32,54 @@ impl<S: Simd> Machine for Vectors<S> {
     fn store(self, v: Vector<S>, to: &mut [f32; WIDTH_MAX]) {
         S::as_mut_simd_f32s(to).0[0] = v.v;
     }
+    #[inline(always)]
+    fn load_rows<const L: usize>(
+        self,
+        rows: &[f32],
+        (stride, count): (usize, usize),
+    ) -> [Vector<S>; L] {
+        #[cfg(target_arch = "x86_64")]
+        if is_avx512::<S>() {
+            // SAFETY: a value of this `S` exists only where AVX-512 does.
+            if let Some(columns) = unsafe { super::transpose::load(rows, L, (stride, count)) } {
+                let mut out = [self.of(0.0); L];
+                for (out, column) in out.iter_mut().zip(&columns) {
+                    // SAFETY: both are 16 `f32` (`is_avx512`).
+                    out.v = unsafe { std::mem::transmute_copy(column) };
+                }
+                return out;
+            }
+        }
+        load_rows(self, rows, (stride, count))
+    }
+    #[inline(always)]
+    fn store_rows<const L: usize>(
+        self,
+        from: &[Vector<S>; L],
+        (stride, count): (usize, usize),
+        rows: &mut [f32],
+    ) {
+        #[cfg(target_arch = "x86_64")]
+        if is_avx512::<S>() {
+            // SAFETY: all zeros is a vector of 16 `f32`.
+            let mut columns: [std::arch::x86_64::__m512; 16] = unsafe { std::mem::zeroed() };
+            for (column, v) in columns.iter_mut().zip(from) {
+                // SAFETY: both are 16 `f32` (`is_avx512`).
+                *column = unsafe { std::mem::transmute_copy(&v.v) };
+            }
+            // SAFETY: a value of this `S` exists only where AVX-512 does.
+            if unsafe { super::transpose::store(columns, L, (stride, count), rows) } {
+                return;
+            }
+        }
+        store_rows(self, from, (stride, count), rows);
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[inline(always)]
+fn is_avx512<S: Simd>() -> bool {
+    std::any::TypeId::of::<S>() == std::any::TypeId::of::<pulp::x86::V4>()
 }
 
 macro_rules! operator {

@@ -9,9 +9,7 @@ use super::{Args, BLOCK, records};
 use crate::abi::{
     HEAD_GAIN, HEAD_LANES, HEAD_LOGIT, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES,
 };
-use crate::cpu::lanes::{
-    Kernel, LaneReal, Lanes, Machine, WIDTH_MAX, lanes_to_rows, rows_to_lanes,
-};
+use crate::cpu::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};
 use crate::cpu::redistribute::share_backward;
 use rayon::prelude::*;
 
@@ -79,18 +77,11 @@ impl<T: LaneReal> Backward<'_, T> {
             d_head[HEAD_GAIN] = self.gain(m, span, k, head[HEAD_GAIN]);
             let g = self.cotangents(m, span, k, s.areas[k]);
             child.backward((rules, &parent), g, &mut d_head, &mut d);
-            let mut tile = [[T::default(); WIDTH_MAX]; HEAD_LANES];
-            for (v, tile) in d_head.into_iter().zip(&mut tile) {
-                m.store(v, tile);
-            }
             let to = &mut self.head[(at * children + k) * HEAD_LANES..];
-            lanes_to_rows(&tile, (children * HEAD_LANES, span.1), to);
+            m.store_rows(&d_head, (children * HEAD_LANES, span.1), to);
         }
-        let mut tile = [[T::default(); WIDTH_MAX]; SPLAT_LANES];
-        for (v, tile) in parent.backward(rules, d).into_iter().zip(&mut tile) {
-            m.store(v, tile);
-        }
-        lanes_to_rows(&tile, (SPLAT_LANES, span.1), &mut self.parents[at * SPLAT_LANES..]);
+        let d_parents = parent.backward(rules, d);
+        m.store_rows(&d_parents, (SPLAT_LANES, span.1), &mut self.parents[at * SPLAT_LANES..]);
     }
 
     /// Gradients of the opacity of child `k`.
@@ -102,10 +93,12 @@ impl<T: LaneReal> Backward<'_, T> {
         k: usize,
     ) -> M::V {
         let children = self.args.rules.children();
-        let mut tile = [[T::default(); WIDTH_MAX]; 1];
         let from = &self.grad.rows[(first * children + k) * SPLAT_LANES + LANE_OPACITY..];
-        rows_to_lanes(m, from, (children * SPLAT_LANES, count), &mut tile);
-        m.load(&tile[0])
+        let mut lanes = [T::default(); WIDTH_MAX];
+        for (lane, out) in lanes[..M::WIDTH].iter_mut().enumerate() {
+            *out = from[lane.min(count - 1) * children * SPLAT_LANES];
+        }
+        m.load(&lanes)
     }
 
     /// Gradients of mean, quaternion and σ of child `k`, and that of its area.
@@ -118,15 +111,13 @@ impl<T: LaneReal> Backward<'_, T> {
         area: M::V,
     ) -> ChildGradient<M::V> {
         let children = self.args.rules.children();
-        let mut tile = [[T::default(); WIDTH_MAX]; LANE_OPACITY];
         let from = &self.grad.rows[(first * children + k) * SPLAT_LANES..];
-        rows_to_lanes(m, from, (children * SPLAT_LANES, count), &mut tile);
-        let lane = |i: usize| m.load(&tile[i]);
-        let vector = |i: usize| [lane(i), lane(i + 1), lane(i + 2)];
+        let g: [M::V; SPLAT_LANES] = m.load_rows(from, (children * SPLAT_LANES, count));
+        let vector = |i: usize| [g[i], g[i + 1], g[i + 2]];
         let q = LANE_QUAT;
         ChildGradient {
             mean: vector(LANE_MEAN),
-            quat: [lane(q), lane(q + 1), lane(q + 2), lane(q + 3)],
+            quat: [g[q], g[q + 1], g[q + 2], g[q + 3]],
             scale: vector(LANE_SCALE),
             area,
         }

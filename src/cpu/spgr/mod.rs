@@ -34,7 +34,7 @@ mod view;
 pub use backward::{Cotangents, backward};
 pub use project::{Target, project};
 
-use super::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX, lanes_to_rows, rows_to_lanes};
+use super::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};
 use super::redistribute::{Rule, share};
 use crate::abi::{
     HEAD_GAIN, HEAD_LANES, HEAD_LOGIT, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES,
@@ -149,10 +149,8 @@ fn records<M: Machine>(
     k: usize,
 ) -> [M::V; HEAD_LANES] {
     let children = args.rules.children();
-    let mut tile = [[M::Scalar::default(); WIDTH_MAX]; HEAD_LANES];
     let from = &args.head[(first * children + k) * HEAD_LANES..];
-    rows_to_lanes(m, from, (children * HEAD_LANES, count), &mut tile);
-    view::load(m, &tile)
+    m.load_rows(from, (children * HEAD_LANES, count))
 }
 
 /// One block of parents forward; `rows` and `gains` are the block's own.
@@ -207,25 +205,21 @@ impl<T: LaneReal> Forward<'_, T> {
         let parent = Parent::load(m, (rules, self.table, &source), parents, (first, count));
         let mut bad = not_finite(&[parent.alpha, parent.z], m.of(0.0));
         let at = first - self.parents.start;
-        let mut tile = [[T::default(); WIDTH_MAX]; SPLAT_LANES];
         for k in 0..children {
             let head = records(m, &self.args, (first, count), k);
             bad = not_finite(&head, bad);
             let child = Child::new(rules, &parent, k, &head);
             (areas[k], alphas[k]) = (child.area, head[HEAD_LOGIT]);
+            let mut row = [m.of(0.0); SPLAT_LANES];
             let shape = [(LANE_MEAN, child.mean), (LANE_SCALE, child.scale)];
             for (lane, v) in shape {
-                for i in 0..3 {
-                    m.store(v[i], &mut tile[lane + i]);
-                }
+                row[lane..lane + 3].copy_from_slice(&v);
                 bad = not_finite(&v, bad);
             }
-            for (i, v) in child.quat().into_iter().enumerate() {
-                m.store(v, &mut tile[LANE_QUAT + i]);
-            }
+            row[LANE_QUAT..LANE_QUAT + 4].copy_from_slice(&child.quat());
             bad = not_finite(&child.quat(), bad);
             let rows = &mut self.rows[(at * children + k) * SPLAT_LANES..];
-            lanes_to_rows(&tile, (children * SPLAT_LANES, count), rows);
+            m.store_rows(&row, (children * SPLAT_LANES, count), rows);
             let gain = gain(m, rules, head[HEAD_GAIN]);
             let mut tile = [[T::default(); WIDTH_MAX]; 4];
             for (gain, tile) in gain.into_iter().zip(&mut tile) {

@@ -8,7 +8,7 @@ use super::view::{
 };
 use super::{Rules, Source};
 use crate::abi::{LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES};
-use crate::cpu::lanes::{Lanes, Machine, WIDTH_MAX, rows_to_lanes};
+use crate::cpu::lanes::{Lanes, Machine, WIDTH_MAX};
 use crate::cpu::redistribute::Rule;
 
 /// Least squared area of a disc that children slide on, px⁴.
@@ -72,20 +72,18 @@ impl<V: Lanes> Parent<V> {
         rows: &[M::Scalar],
         (first, count): (usize, usize),
     ) -> Self {
-        let mut tile = [[M::Scalar::default(); WIDTH_MAX]; SPLAT_LANES];
-        rows_to_lanes(m, &rows[first * SPLAT_LANES..], (SPLAT_LANES, count), &mut tile);
+        let row: [V; SPLAT_LANES] = m.load_rows(&rows[first * SPLAT_LANES..], (SPLAT_LANES, count));
         let mut index = [0; WIDTH_MAX];
         for (lane, index) in index[..M::WIDTH].iter_mut().enumerate() {
             let n = source.first + first + lane.min(count - 1);
             *index = (n / source.per_view).min(table.len() - 1);
         }
-        let lane = |i: usize| m.load(&tile[i]);
-        let vector = |i: usize| [lane(i), lane(i + 1), lane(i + 2)];
+        let vector = |i: usize| [row[i], row[i + 1], row[i + 2]];
         let mean = vector(LANE_MEAN);
         let q = LANE_QUAT;
-        let quat = [lane(q), lane(q + 1), lane(q + 2), lane(q + 3)];
+        let quat = [row[q], row[q + 1], row[q + 2], row[q + 3]];
         let view = table.primary(m, rules, mean, index);
-        Self::new(rules, view, (mean, quat, vector(LANE_SCALE), lane(LANE_OPACITY)))
+        Self::new(rules, view, (mean, quat, vector(LANE_SCALE), row[LANE_OPACITY]))
     }
 
     #[inline(always)]
