@@ -2,14 +2,16 @@
 
 #[path = "common/scenes.rs"]
 mod scenes;
+#[path = "common/spgr_calls.rs"]
+mod spgr_calls;
 
 use candle_core::{DType, Device, Tensor, Var};
 use glam::{DMat3, DVec3, Quat, Vec2, Vec3};
 use scenes::*;
+use spgr_calls::*;
 use subsplat::abi::HEAD_LANES;
 use subsplat::camera::Camera;
 use subsplat::config::*;
-use subsplat::model::spgr::rules;
 use subsplat::model::spgr_ref;
 use subsplat::ops::spgr::{Rules, Spgr, spgr, spgr_into};
 
@@ -19,28 +21,6 @@ fn cpu(v: Vec<f64>, shape: &[usize]) -> Tensor {
 
 fn host(t: &Tensor) -> Vec<f64> {
     t.to_dtype(DType::F64).unwrap().flatten_all().unwrap().to_vec1().unwrap()
-}
-
-/// A call for parents of two views of `size` px, one parent per pixel.
-fn call(config: &Config, size: usize) -> Spgr {
-    Spgr {
-        rules: rules(config, config.upscale),
-        cameras: cameras(2, size, size),
-        near: vec![1.0; 2],
-        per_view: size * size,
-        first: 0,
-    }
-}
-
-/// Parents `[n, 11]` as a backbone gives them, f32.
-fn parents(cameras: &[Camera], r: &mut Random) -> Tensor {
-    let p = LocalPrimaries::random(cameras, 1, r).place(cameras);
-    let alpha = p.opacities.unsqueeze(2).unwrap();
-    Tensor::cat(&[&p.means, &p.quats_wxyz, &p.scales, &alpha], 2).unwrap().squeeze(0).unwrap()
-}
-
-fn head(n: usize, k: usize, scale: f64, dtype: DType, r: &mut Random) -> Tensor {
-    r.tensor(&[n, k, HEAD_LANES], scale, dtype)
 }
 
 fn column(rows: &Tensor, i: usize) -> Vec<f64> {
@@ -91,48 +71,6 @@ fn untrained_tuned_children_have_their_parents_opacity() {
         }
     }
 }
-
-/// Every rule of the configuration, one at a time and in mixture.
-fn variants(side: usize) -> Vec<(String, Config)> {
-    let mut all = Vec::new();
-    for preset in [Preset::Paper, Preset::Tuned] {
-        let base = Config::re10k(preset, side);
-        type Change = (&'static str, fn(&mut Spgr_));
-        let changes: [Change; 22] = [
-            ("as is", |_| {}),
-            ("nearest", |s| s.primary_view = PrimaryView::NearestVisible),
-            ("source", |s| s.primary_view = PrimaryView::Source),
-            ("unbounded", |s| s.offset_bound = None),
-            ("bounded", |s| s.offset_bound = Some(0.5)),
-            ("axis", |s| s.depth_dir = DepthDir::Axis),
-            ("ray", |s| s.depth_dir = DepthDir::Ray),
-            ("world", |s| (s.depth_unit, s.beta_z) = (DepthUnit::World, 9.0)),
-            ("relative", |s| (s.depth_unit, s.beta_z) = (DepthUnit::Relative, 1.0)),
-            ("disc", |s| s.slide = Slide::Disc),
-            ("lambda", |s| s.lambda_s = LambdaS::OverSqrtK(1.2)),
-            ("at parent", |s| s.area_at = AreaAt::Parent),
-            ("a_min px", |s| s.a_min = AMin::TargetPx(2.0)),
-            ("a_min in", |s| s.a_min = AMin::InputPx(0.5)),
-            ("a_min off", |s| s.a_min = AMin::Off),
-            ("two axis", |s| (s.a_min, s.a_min_mode) = (AMin::TargetPx(2.0), AMinMode::TwoAxis)),
-            ("linear", |s| s.opacity = OpacityRule::Linear),
-            ("depth", |s| s.opacity = OpacityRule::OpticalDepth),
-            ("through", |s| s.opacity = OpacityRule::Transmittance),
-            ("area", |s| s.opacity = OpacityRule::Area),
-            ("none", |s| s.opacity = OpacityRule::None),
-            ("rgb", |s| s.gain_space = GainSpace::Rgb),
-        ];
-        for (name, change) in changes {
-            let mut config = base.clone();
-            change(&mut config.spgr);
-            config.check().unwrap();
-            all.push((format!("{preset:?} {name} r={side}"), config));
-        }
-    }
-    all
-}
-
-use subsplat::config::Spgr as Spgr_;
 
 #[test]
 fn fused_equals_unfused() {
@@ -208,17 +146,6 @@ fn gradient_is_finite_at_the_initial_point() {
             assert!(any || (6..9).contains(&lane), "lane {lane} has no gradient");
         }
     }
-}
-
-#[test]
-fn a_backward_pass_through_the_fused_op_is_an_error() {
-    let config = Config::x2();
-    let call = call(&config, 8);
-    let p = parents(&call.cameras, &mut Random(10));
-    let h = Var::zeros((128, 4, HEAD_LANES), DType::F32, &Device::Cpu).unwrap();
-    let (rows, _) = spgr(h.as_tensor(), &p, &call).unwrap();
-    let error = rows.sum_all().unwrap().backward().unwrap_err().to_string();
-    assert!(error.contains("no backward pass") && error.contains("spgr_ref"), "{error}");
 }
 
 /// √det(J Σ Jᵀ) in f64 from the child's own numbers, by the determinant.

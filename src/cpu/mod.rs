@@ -18,6 +18,7 @@ mod disjoint;
 pub mod ewa;
 mod ewa_bwd;
 pub mod gemm;
+pub mod lanes;
 pub mod matching;
 pub mod math;
 pub mod norm;

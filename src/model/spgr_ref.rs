@@ -1,6 +1,6 @@
 //! Sub-pixel Gaussian reparameterization in tensor operations: what
-//! [`crate::cpu::spgr`] does in one pass, with gradients to head records and parents,
-//! for training and as the fused op's reference (spec 2.2 to 2.9, 2.12).
+//! [`crate::cpu::spgr`] does in one pass, with candle's gradients to head records and
+//! parents. The fused op's reference in tests (spec 2.2 to 2.9, 2.12).
 //!
 //! No gradient passes the choice of the primary view, the growth factor c of the
 //! minimum footprint (it would cancel the scale's own) and the share of a disc step.

@@ -9,10 +9,10 @@ use super::embed::Embeddings;
 use super::geometry::{Frames, ParentChunk};
 use super::mlp::Mode;
 use super::spgr::{Heads, rules};
-use super::{BackboneOutput, Primaries, Views, spgr_ref};
+use super::{BackboneOutput, Primaries, Views};
 use crate::abi::{SPLAT_LANES, ShBasis, sh_coefficients};
 use crate::config::{Config, FeatureLevel, HeadInput, ShInput, SpgrHead};
-use crate::ops::spgr::{Rules, Spgr, spgr_into};
+use crate::ops::spgr::{Rules, Spgr, spgr, spgr_into};
 use crate::splats::Splats;
 use candle_core::{DType, Result, Tensor, bail};
 use candle_nn::{VarBuilder, VarMap};
@@ -184,11 +184,11 @@ impl Trunk {
     }
 
     /// Children of the one scene in `views`, differentiable in every parameter and in
-    /// the backbone's outputs: the unfused graph, `chunk` parents at a time. `seed`
-    /// decides what attention drops.
+    /// the backbone's outputs, `chunk` parents at a time. `seed` decides what attention
+    /// drops.
     ///
     /// # Errors
-    /// Inputs that do not fit one another or the configuration.
+    /// Those of [`Trunk::forward`].
     pub fn forward_train(
         &self,
         views: &Views,
@@ -201,7 +201,7 @@ impl Trunk {
         let (mut rows, mut gains) = (Vec::new(), Vec::new());
         for span in chunks(scene.means.dim(0)?, scene.per_view, chunk.max(1)) {
             let (head, parents) = self.records(parts, &scene, span, Mode::Train { seed })?;
-            let (r, g) = spgr_ref::spgr(&head, &parents, &scene.call(span.0))?;
+            let (r, g) = spgr(&head, &parents, &scene.call(span.0))?;
             rows.push(r);
             gains.push(g);
         }

@@ -18,7 +18,7 @@ pub mod spgr;
 pub use rasterize::rasterize;
 
 use crate::cpu::real::Real;
-use candle_core::{CpuStorage, Layout, Result, Shape, Tensor, WithDType, bail};
+use candle_core::{CpuStorage, Layout, Result, Shape, Storage, Tensor, WithDType, bail};
 
 /// A number that both candle and the kernels know: `f32` or `f64`.
 pub(crate) trait Number: Real + WithDType {}
@@ -47,6 +47,21 @@ pub(crate) fn slice<'a, T: Number>(
 /// All elements in row-major order, for a kernel of a backward pass.
 pub(crate) fn elements<T: Number>(tensor: &Tensor) -> Result<Vec<T>> {
     tensor.flatten_all()?.to_vec1::<T>()
+}
+
+/// `f` of the elements of contiguous tensors on the CPU, read where they lie.
+pub(crate) fn borrowed<T: Number, R, const N: usize>(
+    op: &str,
+    tensors: [&Tensor; N],
+    f: impl FnOnce([&[T]; N]) -> R,
+) -> Result<R> {
+    let held = tensors.map(Tensor::storage_and_layout);
+    let mut slices: [&[T]; N] = [&[]; N];
+    for (slice_of, (storage, layout)) in slices.iter_mut().zip(&held) {
+        let Storage::Cpu(storage) = &**storage else { bail!("{op}: expected tensors on the CPU") };
+        *slice_of = slice::<T>(op, "argument", storage, layout)?;
+    }
+    Ok(f(slices))
 }
 
 /// An op's result.

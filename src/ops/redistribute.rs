@@ -2,7 +2,8 @@
 //! allocation"; supp. A.3; spec 2.7 and 2.8). Formulas: [`crate::cpu::redistribute`].
 //! Tests: tests/redistribute.rs (identities, finite differences in `f64`).
 
-use super::{Number, by_dtype, elements, slice};
+use super::{Number, borrowed, by_dtype, slice};
+use crate::cpu::lanes::LaneReal;
 use crate::cpu::redistribute as cpu;
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
@@ -35,18 +36,24 @@ pub fn redistribute(
     if k == 0 {
         bail!("redistribute: expected at least 1 child per parent, got 0");
     }
-    let areas = match (rule.areas_are_relative(), parent_areas) {
-        (false, _) => areas.clone(),
-        (true, Some(own)) if own.dims() == [p] => areas.broadcast_div(&own.unsqueeze(1)?)?,
+    let own = match (rule.areas_are_relative(), parent_areas) {
+        (false, _) => None,
+        (true, Some(own)) if own.dims() == [p] => Some(own),
         (true, Some(own)) => {
             bail!("redistribute: expected parent areas [{p}], got {:?}", own.dims())
         }
         (true, None) => bail!("redistribute: rule {rule:?} expects the parents' areas, got none"),
     };
+    let per_parent = match own {
+        Some(own) => Tensor::stack(&[opacities, own], 0)?,
+        None => opacities.contiguous()?.unsqueeze(0)?,
+    };
     let (logits, areas) = (logits.contiguous()?, areas.contiguous()?);
-    logits.apply_op3(&areas, &opacities.contiguous()?, Redistribute(rule))
+    logits.apply_op3(&areas, &per_parent, Redistribute(rule))
 }
 
+/// On logits `[P, K]`, areas `[P, K]` and, `[1, P]` or `[2, P]`, the parents'
+/// opacities and own areas.
 struct Redistribute(Rule);
 
 const NAME: &str = "redistribute";
@@ -73,42 +80,65 @@ impl CustomOp3 for Redistribute {
         &self,
         logits: &Tensor,
         areas: &Tensor,
-        opacities: &Tensor,
+        per_parent: &Tensor,
         _: &Tensor,
         grad: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        by_dtype!(NAME, logits.dtype(), backward(self.0, [logits, areas, opacities, grad]))
+        by_dtype!(NAME, logits.dtype(), backward(self.0, [logits, areas, per_parent, grad]))
     }
 }
 
-fn forward<T: Number>(
+fn arguments<'a, T: Number + LaneReal>(
     rule: Rule,
-    [logits, areas, alphas]: [(&CpuStorage, &Layout); 3],
+    logits: &Tensor2<'a, T>,
+    areas: &'a [T],
+    per_parent: &'a [T],
+) -> cpu::Args<'a, T> {
+    let (alphas, own) = per_parent.split_at(logits.parents);
+    cpu::Args { rule, k: logits.k, logits: logits.data, areas, alphas, own }
+}
+
+/// Elements of `[parents, k]`.
+struct Tensor2<'a, T> {
+    data: &'a [T],
+    parents: usize,
+    k: usize,
+}
+
+fn forward<T: Number + LaneReal>(
+    rule: Rule,
+    [logits, areas, per_parent]: [(&CpuStorage, &Layout); 3],
 ) -> Result<(CpuStorage, Shape)> {
     let shape = logits.1.shape().clone();
-    let (_, k) = shape.dims2()?;
-    let logits = slice::<T>(NAME, "logits", logits.0, logits.1)?;
+    let (parents, k) = shape.dims2()?;
+    let data = slice::<T>(NAME, "logits", logits.0, logits.1)?;
     let areas = slice::<T>(NAME, "areas", areas.0, areas.1)?;
-    let alphas = slice::<T>(NAME, "opacities", alphas.0, alphas.1)?;
-    let mut out = vec![T::default(); logits.len()];
-    cpu::forward(rule, k, logits, areas, alphas, &mut out);
+    let per_parent = slice::<T>(NAME, "opacities", per_parent.0, per_parent.1)?;
+    let mut out = vec![T::default(); data.len()];
+    cpu::forward(arguments(rule, &Tensor2 { data, parents, k }, areas, per_parent), &mut out);
     Ok((T::to_cpu_storage_owned(out), shape))
 }
 
 type Triple = (Option<Tensor>, Option<Tensor>, Option<Tensor>);
 
-fn backward<T: Number>(
+fn backward<T: Number + LaneReal>(
     rule: Rule,
-    [logits, areas, opacities, grad]: [&Tensor; 4],
+    [logits, areas, per_parent, grad]: [&Tensor; 4],
 ) -> Result<Triple> {
-    let (p, k) = logits.dims2()?;
+    let (parents, k) = logits.dims2()?;
     let device = logits.device();
-    let (l, a) = (elements::<T>(logits)?, elements::<T>(areas)?);
-    let (o, g) = (elements::<T>(opacities)?, elements::<T>(grad)?);
-    let d = cpu::backward(rule, k, &l, &a, &o, &g);
+    let grad = grad.contiguous()?;
+    let d = borrowed::<T, _, 4>(NAME, [logits, areas, per_parent, &grad], |[l, a, p, g]| {
+        let l = Tensor2 { data: l, parents, k };
+        cpu::backward(arguments(rule, &l, a, p), g)
+    })?;
+    let mut per_parent_grad = d.alphas;
+    if per_parent.dim(0)? == 2 {
+        per_parent_grad.extend(d.own);
+    }
     Ok((
-        Some(Tensor::from_vec(d.logits, (p, k), device)?),
-        Some(Tensor::from_vec(d.areas, (p, k), device)?),
-        Some(Tensor::from_vec(d.alphas, p, device)?),
+        Some(Tensor::from_vec(d.logits, (parents, k), device)?),
+        Some(Tensor::from_vec(d.areas, (parents, k), device)?),
+        Some(Tensor::from_vec(per_parent_grad, per_parent.dims(), device)?),
     ))
 }

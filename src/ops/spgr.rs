@@ -1,10 +1,11 @@
-//! Sub-pixel Gaussian reparameterization as a candle op without gradient, and into
+//! Sub-pixel Gaussian reparameterization as a candle op with its gradient, and into
 //! buffers of the caller's. Formulas and layouts: [`crate::cpu::spgr`]; the same
-//! with gradients, unfused: `model/spgr_ref.rs`. Tests: tests/spgr.rs.
+//! unfused: `model/spgr_ref.rs`. Tests: tests/spgr.rs, tests/spgr_backward.rs.
 
-use super::{Number, by_dtype, slice};
+use super::{Number, borrowed, by_dtype, slice};
 use crate::abi::{HEAD_LANES, SPLAT_LANES};
 use crate::camera::Camera;
+use crate::cpu::lanes::LaneReal;
 use crate::cpu::spgr as cpu;
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Storage, Tensor, bail};
@@ -60,8 +61,9 @@ impl Spgr {
 }
 
 /// Children `[N·K, 11]` and gains `[N·K]` or `[N·K, 4]` of `parents` `[N, 11]` with
-/// head records `head` `[N, K, 11]`; `f32` or `f64`. Without gradient: a backward
-/// pass through it is an error that says so.
+/// head records `head` `[N, K, 11]`; `f32` or `f64`. Differentiable in both; no
+/// gradient passes the choice of the primary view, the growth of footprints that are
+/// too small, and the share of a disc step.
 ///
 /// # Errors
 /// Shapes that do not fit one another, or an input that gives a number that is not
@@ -103,8 +105,22 @@ pub fn spgr_into(
     };
     let head = slice::<f32>(NAME, "head records", hs, hl)?;
     let parents = slice::<f32>(NAME, "parents", ps, pl)?;
-    cpu::forward(&call.rules, call.source(), head, parents, rows, gains);
-    finite(call, head, parents, rows, gains)
+    run(call, head, parents, rows, gains)
+}
+
+/// The kernel, and a refusal of numbers that are not finite.
+fn run<T: Number + LaneReal>(
+    call: &Spgr,
+    head: &[T],
+    parents: &[T],
+    rows: &mut [T],
+    gains: &mut [T],
+) -> Result<()> {
+    let args = cpu::Args { rules: &call.rules, source: call.source(), head, parents };
+    match cpu::forward(args, rows, gains) {
+        true => Ok(()),
+        false => finite(call, head, parents, rows, gains),
+    }
 }
 
 /// Refuses numbers that are not finite, on the way in (an infinite opacity would be
@@ -164,18 +180,16 @@ impl CustomOp2 for Fused {
 
     fn bwd(
         &self,
+        head: &Tensor,
+        parents: &Tensor,
         _: &Tensor,
-        _: &Tensor,
-        _: &Tensor,
-        _: &Tensor,
+        grad: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>)> {
-        bail!(
-            "{NAME}: the fused op has no backward pass; training goes through the unfused graph (model::spgr_ref)"
-        )
+        by_dtype!(NAME, head.dtype(), backward(&self.0, head, parents, grad))
     }
 }
 
-fn forward<T: Number>(
+fn forward<T: Number + LaneReal>(
     call: &Spgr,
     (s1, l1): (&CpuStorage, &Layout),
     (s2, l2): (&CpuStorage, &Layout),
@@ -186,8 +200,29 @@ fn forward<T: Number>(
     let rows = count * SPLAT_LANES;
     let mut out = vec![T::default(); rows + count * call.rules.gain_lanes()];
     let (children, gains) = out.split_at_mut(rows);
-    cpu::forward(&call.rules, call.source(), head, parents, children, gains);
-    finite(call, head, parents, children, gains)?;
+    run(call, head, parents, children, gains)?;
     let len = out.len();
     Ok((T::to_cpu_storage_owned(out), Shape::from(len)))
+}
+
+fn backward<T: Number + LaneReal>(
+    call: &Spgr,
+    head: &Tensor,
+    parents: &Tensor,
+    grad: &Tensor,
+) -> Result<(Option<Tensor>, Option<Tensor>)> {
+    let grad = grad.contiguous()?;
+    let rows = head.elem_count() / HEAD_LANES * SPLAT_LANES;
+    let mut d_head = vec![T::default(); head.elem_count()];
+    let mut d_parents = vec![T::default(); parents.elem_count()];
+    borrowed::<T, (), 3>(NAME, [head, parents, &grad], |[head, parents, grad]| {
+        let (rows, gains) = grad.split_at(rows);
+        let args = cpu::Args { rules: &call.rules, source: call.source(), head, parents };
+        cpu::backward(args, cpu::Cotangents { rows, gains }, &mut d_head, &mut d_parents);
+    })?;
+    let device = head.device();
+    Ok((
+        Some(Tensor::from_vec(d_head, head.dims(), device)?),
+        Some(Tensor::from_vec(d_parents, parents.dims(), device)?),
+    ))
 }

@@ -1,0 +1,165 @@
+//! Gradients of the children with respect to head records and parents (spec 2.12),
+//! everything recomputed from the inputs: a first walk over the children for their
+//! areas, which the opacity rule couples, and a second one for the rest.
+
+use super::child::{Child, ChildGradient};
+use super::parent::{Parent, ParentGradient};
+use super::view::Table;
+use super::{Args, BLOCK, records};
+use crate::abi::{
+    HEAD_GAIN, HEAD_LANES, HEAD_LOGIT, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES,
+};
+use crate::cpu::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};
+use crate::cpu::redistribute::share_backward;
+use rayon::prelude::*;
+
+/// Gradients of what [`super::forward`] writes.
+#[derive(Clone, Copy, Debug)]
+pub struct Cotangents<'a, T> {
+    /// `[N·K, 11]`.
+    pub rows: &'a [T],
+    /// `[N·K]` or `[N·K, 4]`.
+    pub gains: &'a [T],
+}
+
+/// One block of parents; the mutable slices are the block's own.
+struct Backward<'a, T> {
+    args: Args<'a, T>,
+    grad: Cotangents<'a, T>,
+    table: &'a Table<T>,
+    range: std::ops::Range<usize>,
+    head: &'a mut [T],
+    parents: &'a mut [T],
+}
+
+/// A vector per child, reused from group to group.
+struct Scratch<V> {
+    areas: Vec<V>,
+    logits: Vec<V>,
+    alphas: Vec<V>,
+}
+
+impl<T: LaneReal> Kernel<T> for Backward<'_, T> {
+    type Output = ();
+    #[inline(always)]
+    fn run<M: Machine<Scalar = T>>(mut self, m: M) {
+        let zeros = vec![m.of(0.0); self.args.rules.children()];
+        let mut scratch = Scratch { areas: zeros.clone(), logits: zeros.clone(), alphas: zeros };
+        for first in self.range.clone().step_by(M::WIDTH) {
+            let count = M::WIDTH.min(self.range.end - first);
+            self.group(m, (first, count), &mut scratch);
+        }
+    }
+}
+
+impl<T: LaneReal> Backward<'_, T> {
+    #[inline(always)]
+    fn group<M: Machine<Scalar = T>>(&mut self, m: M, span: (usize, usize), s: &mut Scratch<M::V>) {
+        let Args { rules, source, parents, .. } = self.args;
+        let children = rules.children();
+        let parent = Parent::load(m, (rules, self.table, &source), parents, span);
+        for k in 0..children {
+            let head = records(m, &self.args, span, k);
+            let child = Child::new(rules, &parent, k, &head);
+            (s.areas[k], s.logits[k]) = (child.area, head[HEAD_LOGIT]);
+            s.alphas[k] = self.opacity(m, span, k);
+        }
+        let mut d = ParentGradient::zero(m.of(0.0));
+        let of_parent = (parent.alpha, parent.own);
+        (d.alpha, d.own) =
+            share_backward(rules.opacity, of_parent, &mut s.alphas, &mut s.logits, &mut s.areas);
+        let at = span.0 - self.range.start;
+        for k in 0..children {
+            let head = records(m, &self.args, span, k);
+            let child = Child::new(rules, &parent, k, &head);
+            let mut d_head = [m.of(0.0); HEAD_LANES];
+            d_head[HEAD_LOGIT] = s.logits[k];
+            d_head[HEAD_GAIN] = self.gain(m, span, k, head[HEAD_GAIN]);
+            let g = self.cotangents(m, span, k, s.areas[k]);
+            child.backward((rules, &parent), g, &mut d_head, &mut d);
+            let to = &mut self.head[(at * children + k) * HEAD_LANES..];
+            m.store_rows(&d_head, (children * HEAD_LANES, span.1), to);
+        }
+        let d_parents = parent.backward(rules, d);
+        m.store_rows(&d_parents, (SPLAT_LANES, span.1), &mut self.parents[at * SPLAT_LANES..]);
+    }
+
+    /// Gradients of the opacity of child `k`.
+    #[inline(always)]
+    fn opacity<M: Machine<Scalar = T>>(
+        &self,
+        m: M,
+        (first, count): (usize, usize),
+        k: usize,
+    ) -> M::V {
+        let children = self.args.rules.children();
+        let from = &self.grad.rows[(first * children + k) * SPLAT_LANES + LANE_OPACITY..];
+        let mut lanes = [T::default(); WIDTH_MAX];
+        for (lane, out) in lanes[..M::WIDTH].iter_mut().enumerate() {
+            *out = from[lane.min(count - 1) * children * SPLAT_LANES];
+        }
+        m.load(&lanes)
+    }
+
+    /// Gradients of mean, quaternion and σ of child `k`, and that of its area.
+    #[inline(always)]
+    fn cotangents<M: Machine<Scalar = T>>(
+        &self,
+        m: M,
+        (first, count): (usize, usize),
+        k: usize,
+        area: M::V,
+    ) -> ChildGradient<M::V> {
+        let children = self.args.rules.children();
+        let from = &self.grad.rows[(first * children + k) * SPLAT_LANES..];
+        let g: [M::V; SPLAT_LANES] = m.load_rows(from, (children * SPLAT_LANES, count));
+        let vector = |i: usize| [g[i], g[i + 1], g[i + 2]];
+        let q = LANE_QUAT;
+        ChildGradient {
+            mean: vector(LANE_MEAN),
+            quat: [g[q], g[q + 1], g[q + 2], g[q + 3]],
+            scale: vector(LANE_SCALE),
+            area,
+        }
+    }
+
+    /// ∂/∂γ̃ of child `k`.
+    #[inline(always)]
+    fn gain<M: Machine<Scalar = T>>(
+        &self,
+        m: M,
+        (first, count): (usize, usize),
+        k: usize,
+        raw: M::V,
+    ) -> M::V {
+        let rules = self.args.rules;
+        let (children, lanes) = (rules.children(), rules.gain_lanes());
+        let mut sums = [T::default(); WIDTH_MAX];
+        for (lane, sum) in sums[..M::WIDTH].iter_mut().enumerate() {
+            let at = ((first + lane.min(count - 1)) * children + k) * lanes;
+            let residual: T = self.grad.gains[at + 1..at + lanes].iter().copied().sum();
+            *sum = self.grad.gains[at] + T::of(0.5) * residual;
+        }
+        let t = raw.tanh();
+        m.load(&sums) * m.of(rules.delta) * (m.of(1.0) - t * t)
+    }
+}
+
+/// Gradients into `head` `[N, K, 11]` and `parents` `[N, 11]` for those of the
+/// children and gains. Each parent is one task's own: any number of threads gives the
+/// same bytes.
+pub fn backward<T: LaneReal>(
+    args: Args<T>,
+    grad: Cotangents<T>,
+    head: &mut [T],
+    parents: &mut [T],
+) {
+    let table = Table::new(&args.source);
+    head.par_chunks_mut(BLOCK * args.rules.children() * HEAD_LANES)
+        .zip(parents.par_chunks_mut(BLOCK * SPLAT_LANES))
+        .enumerate()
+        .for_each(|(block, (head, parents))| {
+            let range = args.block(block);
+            T::dispatch(Backward { args, grad, table: &table, range, head, parents });
+        });
+}

@@ -1,0 +1,288 @@
+//! One vector of children, child k of as many parents: everything but the opacity,
+//! with gradients (spec 2.2 to 2.6, 2.9, 2.12).
+
+use super::Rules;
+use super::parent::{Parent, ParentGradient};
+use super::shape::{Footprint, Turn, Unit, conjugate, matrix, matrix_backward, multiply};
+use super::view::{
+    Jacobian, M3, V3, add, add4, axpy, dot, kept, product, scaled, times, transposed,
+};
+use crate::abi::{
+    DEPTH_FRACTION_MIN, HEAD_DEPTH, HEAD_LANES, HEAD_LOG_SCALE, HEAD_OFFSET, HEAD_ROTATION,
+};
+use crate::cpu::lanes::Lanes;
+use crate::cpu::redistribute::Rule;
+
+/// The camera-frame step of a child, and what its gradient needs.
+struct Step<V: Lanes> {
+    out: V3<V>,
+    /// tanh of the learned offset, where it is bounded.
+    bounded: [V; 2],
+    /// Input px.
+    offset: [V; 2],
+    /// Share of the disc step.
+    along_disc: V,
+    tanh_z: V,
+    free_z: V::Mask,
+    /// Before the residual along the ray.
+    side: [V; 2],
+    ray: Option<(V, V, V::Mask)>,
+}
+
+impl<V: Lanes> Step<V> {
+    #[inline(always)]
+    fn new(rules: &Rules, parent: &Parent<V>, k: usize, head: &[V; HEAD_LANES]) -> Self {
+        let z = parent.z;
+        let of = |v: f64| z.of(v);
+        let per_side = 1.0 / rules.side as f64;
+        let cell = [k % rules.side, k / rules.side];
+        let learned = [head[HEAD_OFFSET], head[HEAD_OFFSET + 1]];
+        let (bounded, per_px) = match rules.offset_bound {
+            Some(bound) => ([learned[0].tanh(), learned[1].tanh()], bound * per_side),
+            None => (learned, per_side),
+        };
+        let grid = |i: usize| of((cell[i] as f64 + 0.5) * per_side - 0.5);
+        let offset = [bounded[0].fma(of(per_px), grid(0)), bounded[1].fma(of(per_px), grid(1))];
+        let f = parent.view.focal;
+        let mut s = [z * offset[0] / f[0], z * offset[1] / f[1], of(0.0)];
+        let mut along_disc = of(0.0);
+        if let Some(disc) = &parent.disc {
+            let [u, v] = disc.steps;
+            let d = axpy(offset[1], v, scaled(u, offset[0]));
+            // Both steps project alike to first order, so a mixture does: an edge-on
+            // disc slides at most a tenth of its depth.
+            let tenth = of(DEPTH_FRACTION_MIN) * z;
+            along_disc = kept(disc.solid, tenth / d[2].abs().max(tenth));
+            s = axpy(along_disc, [d[0] - s[0], d[1] - s[1], d[2] - s[2]], s);
+        }
+        let tanh_z = head[HEAD_DEPTH].tanh();
+        let mut dz = of(rules.beta_z) * tanh_z;
+        if rules.relative_depth {
+            dz = dz * z;
+        }
+        let least = of(DEPTH_FRACTION_MIN - 1.0) * z - s[2];
+        let free_z = least.lt(dz);
+        let dz = dz.max(least);
+        let side = [s[0], s[1]];
+        let mut ray = None;
+        if rules.ray {
+            let ahead = parent.in_camera[2] + s[2];
+            let inverse = of(1.0) / ahead.max(parent.view.z_min);
+            let share = dz * inverse;
+            for (s, x) in s.iter_mut().zip(parent.in_camera).take(2) {
+                *s = share.fma(x + *s, *s);
+            }
+            ray = Some((share, inverse, parent.view.z_min.lt(ahead)));
+        }
+        s[2] = s[2] + dz;
+        Self { out: s, bounded, offset, along_disc, tanh_z, free_z, side, ray }
+    }
+
+    /// Adds to the gradients of head and parent those that come through the step.
+    #[inline(always)]
+    fn backward(
+        &self,
+        (rules, parent): (&Rules, &Parent<V>),
+        mut d_s: V3<V>,
+        d_head: &mut [V; HEAD_LANES],
+        d: &mut ParentGradient<V>,
+    ) {
+        let z = parent.z;
+        let of = |v: f64| z.of(v);
+        let mut d_dz = d_s[2];
+        if let Some((share, inverse, free)) = self.ray {
+            let mut d_share = of(0.0);
+            for i in 0..2 {
+                d_share = d_s[i].fma(parent.in_camera[i] + self.side[i], d_share);
+                d.in_camera[i] = share.fma(d_s[i], d.in_camera[i]);
+                d_s[i] = share.fma(d_s[i], d_s[i]);
+            }
+            let each = d_share * inverse;
+            d_dz = d_dz + each;
+            let d_ahead = kept(free, -each * share);
+            d.in_camera[2] = d.in_camera[2] + d_ahead;
+            d_s[2] = d_s[2] + d_ahead;
+        }
+        let free_dz = kept(self.free_z, d_dz);
+        let bound_dz = d_dz - free_dz;
+        d.z = bound_dz.fma(of(DEPTH_FRACTION_MIN - 1.0), d.z);
+        d_s[2] = d_s[2] - bound_dz;
+        let mut d_tanh = free_dz * of(rules.beta_z);
+        if rules.relative_depth {
+            d.z = d_tanh.fma(self.tanh_z, d.z);
+            d_tanh = d_tanh * z;
+        }
+        d_head[HEAD_DEPTH] = d_tanh * (of(1.0) - self.tanh_z * self.tanh_z);
+        let mut d_offset = [of(0.0); 2];
+        let mut d_flat = d_s;
+        if let Some(disc) = &parent.disc {
+            let d_slid = scaled(d_s, self.along_disc);
+            for i in 0..2 {
+                d.disc[i] = axpy(self.offset[i], d_slid, d.disc[i]);
+                d_offset[i] = dot(disc.steps[i], d_slid);
+                d_flat[i] = d_s[i] - d_slid[i];
+            }
+        }
+        let per_side = 1.0 / rules.side as f64;
+        for i in 0..2 {
+            let per = d_flat[i] / parent.view.focal[i];
+            d_offset[i] = per.fma(z, d_offset[i]);
+            d.z = per.fma(self.offset[i], d.z);
+            let t = self.bounded[i];
+            d_head[HEAD_OFFSET + i] = match rules.offset_bound {
+                Some(bound) => d_offset[i] * of(bound * per_side) * (of(1.0) - t * t),
+                None => d_offset[i] * of(per_side),
+            };
+        }
+    }
+}
+
+pub(super) struct Child<V: Lanes> {
+    step: Step<V>,
+    turn: Turn<V>,
+    unit: Unit<V>,
+    rotation: M3<V>,
+    /// At the child; `None` where footprints take the parent's.
+    jacobian: Option<Jacobian<V>>,
+    footprint: Footprint<V>,
+    /// tanh(Δlog s/c), and λ_s·e^…
+    soft: V3<V>,
+    factor: V3<V>,
+    /// Before the growth to the least footprint.
+    small: V3<V>,
+    growth: V3<V>,
+    clamped: V,
+    /// World.
+    pub(super) mean: V3<V>,
+    /// σ, world units.
+    pub(super) scale: V3<V>,
+    /// What the opacity rule divides by, target px².
+    pub(super) area: V,
+}
+
+/// Gradients of what a child gives.
+pub(super) struct ChildGradient<V> {
+    pub(super) mean: V3<V>,
+    pub(super) quat: [V; 4],
+    pub(super) scale: V3<V>,
+    pub(super) area: V,
+}
+
+impl<V: Lanes> Child<V> {
+    #[inline(always)]
+    pub(super) fn new(rules: &Rules, parent: &Parent<V>, k: usize, head: &[V; HEAD_LANES]) -> Self {
+        let step = Step::new(rules, parent, k, head);
+        let of = |v: f64| parent.z.of(v);
+        let mean = add(parent.mean, times(&parent.view.rotation, step.out));
+        let c = of(rules.dlog_clamp);
+        let per_c = of(1.0 / rules.dlog_clamp);
+        let l = HEAD_LOG_SCALE;
+        let [x, y, z] = scaled([head[l], head[l + 1], head[l + 2]], per_c);
+        let soft = [x.tanh(), y.tanh(), z.tanh()];
+        let [x, y, z] = scaled(soft, c);
+        let factor = scaled([x.exp(), y.exp(), z.exp()], of(rules.lambda_s));
+        let small = product(factor, parent.scale);
+        let r = HEAD_ROTATION;
+        let turn = Turn::new([head[r], head[r + 1], head[r + 2]]);
+        let unit = Unit::new(multiply(parent.quat, turn.e));
+        let rotation = matrix(unit.q);
+        let mut jacobian = None;
+        let jw = match &parent.jacobian {
+            Some(shared) => shared.jw,
+            None => {
+                let at = add(parent.in_camera, step.out);
+                let own = Jacobian::new(&parent.view, at, of(rules.side as f64));
+                let jw = own.jw;
+                jacobian = Some(own);
+                jw
+            }
+        };
+        let footprint = Footprint::new(&jw, &rotation, small);
+        let growth = footprint.growth(rules);
+        let clamped = footprint.area.max(of(rules.a_min));
+        let area = match rules.opacity {
+            Rule::OpticalDepth => footprint.blurred(growth, clamped, rules.lowpass_target),
+            _ => clamped,
+        };
+        let scale = product(small, growth);
+        Self {
+            step,
+            turn,
+            unit,
+            rotation,
+            jacobian,
+            footprint,
+            soft,
+            factor,
+            small,
+            growth,
+            clamped,
+            mean,
+            scale,
+            area,
+        }
+    }
+
+    /// wxyz, unit.
+    #[inline(always)]
+    pub(super) fn quat(&self) -> [V; 4] {
+        self.unit.q
+    }
+
+    /// Rows of R(q).
+    #[inline(always)]
+    pub(super) fn rotation(&self) -> &M3<V> {
+        &self.rotation
+    }
+
+    /// Writes the gradients of the head's geometry lanes and adds to the parent's.
+    #[inline(always)]
+    pub(super) fn backward(
+        &self,
+        (rules, parent): (&Rules, &Parent<V>),
+        g: ChildGradient<V>,
+        d_head: &mut [V; HEAD_LANES],
+        d: &mut ParentGradient<V>,
+    ) {
+        let of = |v: f64| parent.z.of(v);
+        let zero = of(0.0);
+        let f = &self.footprint;
+        let (d_clamped, d_m) = match rules.opacity {
+            Rule::OpticalDepth => {
+                let at = (self.growth, self.clamped, self.area);
+                f.blurred_backward(at, rules.lowpass_target, g.area)
+            }
+            _ => (g.area, [[zero; 3]; 2]),
+        };
+        let d_area = kept(of(rules.a_min).lt(f.area), d_clamped);
+        let jw = match (&parent.jacobian, &self.jacobian) {
+            (Some(j), _) | (None, Some(j)) => &j.jw,
+            (None, None) => return,
+        };
+        let (d_jw, d_rotation, by_area) = f.backward((jw, &self.rotation, self.small), d_area, d_m);
+        let c = of(1.0);
+        for i in 0..3 {
+            let d_small = g.scale[i].fma(self.growth[i], by_area[i]);
+            d.scale[i] = d_small.fma(self.factor[i], d.scale[i]);
+            let t = self.soft[i];
+            d_head[HEAD_LOG_SCALE + i] = d_small * self.small[i] * (c - t * t);
+        }
+        let by_rotation = matrix_backward(self.unit.q, &d_rotation);
+        let d_unit = self.unit.backward(add4(g.quat, by_rotation));
+        let d_turn = self.turn.backward(multiply(conjugate(parent.quat), d_unit));
+        d_head[HEAD_ROTATION..HEAD_ROTATION + 3].copy_from_slice(&d_turn);
+        let by_parent = multiply(d_unit, conjugate(self.turn.e));
+        d.quat = add4(d.quat, by_parent);
+        d.mean = add(d.mean, g.mean);
+        let mut d_step = transposed(&parent.view.rotation, g.mean);
+        match &self.jacobian {
+            Some(j) => {
+                let d_at = j.backward(&d_jw);
+                d.in_camera = add(d.in_camera, d_at);
+                d_step = add(d_step, d_at);
+            }
+            None => d.jw = [add(d.jw[0], d_jw[0]), add(d.jw[1], d_jw[1])],
+        }
+        self.step.backward((rules, parent), d_step, d_head, d);
+    }
+}

@@ -1,0 +1,394 @@
+//! Head records straight to one camera's 2-D splats: no child's mean, quaternion,
+//! covariance or SH is ever in memory (spec 6, first fusion).
+//!
+//! In: what [`super::forward`] takes, the parents' SH `[N, D, 3]`, a target camera.
+//! Out: one [`Footprint`] per child, empty where dropped, by the rules of
+//! [`crate::cpu::ewa`] and of the frame's projection (tests/spgr_project.rs holds them
+//! together). SH is evaluated once per parent under [`ShDirection::Parent`].
+
+use super::child::Child;
+use super::colour::Coefficients;
+use super::parent::Parent;
+use super::view::{
+    M3, V3, axpy, cross, dot, each, kept, product, scaled, splat, times, transposed,
+};
+use super::{Args, BLOCK, gain, not_finite, records};
+use crate::abi::{
+    ALPHA_MIN, ALPHA_MIN_LOG2, Convention, DISCRIMINANT_MIN_MVSPLAT, HEAD_GAIN, HEAD_LOGIT,
+    JACOBIAN_LIMIT_MVSPLAT, JACOBIAN_MARGIN_STANDARD, NEAR_MVSPLAT, RADIUS_SIGMAS_MVSPLAT,
+    RasterOptions, ShDirection, TILE_MVSPLAT, Z_EPSILON_MVSPLAT, sh_coefficients,
+};
+use crate::camera::Camera;
+use crate::cpu::ewa::Footprint;
+use crate::cpu::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};
+use crate::cpu::redistribute::share;
+use crate::cpu::spgr::view::Table;
+use rayon::prelude::*;
+
+/// Relative and absolute widening of a support, in log₂ of alpha (as in `ewa`).
+const SUPPORT_SLACK: f64 = 1e-4;
+/// Widening of an extent, px (as in `ewa`).
+const SPAN_SLACK_PX: f64 = 1e-3;
+/// Adding it to a whole number below 2²³ leaves that number in the mantissa.
+const MANTISSA: f32 = 8_388_608.0;
+
+/// Who looks at the children, and their parents' colour.
+#[derive(Clone, Copy, Debug)]
+pub struct Target<'a> {
+    /// The camera of the picture to be rendered.
+    pub camera: &'a Camera,
+    /// How it is rendered.
+    pub options: &'a RasterOptions,
+    /// `[N, D, 3]`, D = (`sh_degree` + 1)².
+    pub sh: &'a [f32],
+    /// Degree that `sh` stores.
+    pub sh_degree: usize,
+}
+
+/// Numbers of the target camera.
+#[derive(Clone, Copy)]
+struct Lens {
+    /// Rows of the rotation from world to camera.
+    rows: M3<f32>,
+    eye: [f32; 3],
+    focal: [f32; 2],
+    /// Pixel position of the axis, centres at integers.
+    centre: [f32; 2],
+    limit: [(f32, f32); 2],
+    near: f32,
+    z_epsilon: f32,
+    lowpass: f32,
+    antialiased: bool,
+    tile_cut: bool,
+    size: [f32; 2],
+}
+
+impl Lens {
+    fn new(camera: &Camera, options: &RasterOptions) -> Self {
+        let k = &camera.intrinsics;
+        let size = [k.width as f32, k.height as f32];
+        let rotation = camera.rotation();
+        let standard = options.convention == Convention::Standard;
+        let principal = [k.cx, k.cy];
+        let (focal, centre, limit) = if standard {
+            let focal = [k.fx, k.fy];
+            let limit = std::array::from_fn(|i| {
+                let margin = JACOBIAN_MARGIN_STANDARD * 0.5 * size[i] / focal[i];
+                let (low, high) = (principal[i] / focal[i], (size[i] - principal[i]) / focal[i]);
+                (-low - margin, high + margin)
+            });
+            (focal, principal.map(|c| c - 0.5), limit)
+        } else {
+            let tan = half_angles(camera);
+            let focal = std::array::from_fn(|i| 0.5 * size[i] / tan[i]);
+            let limit = tan.map(|t| (-JACOBIAN_LIMIT_MVSPLAT * t, JACOBIAN_LIMIT_MVSPLAT * t));
+            (focal, size.map(|s| 0.5 * s - 0.5), limit)
+        };
+        let near = if standard { options.near } else { NEAR_MVSPLAT * options.near };
+        Self {
+            rows: std::array::from_fn(|i| rotation.col(i).to_array()),
+            eye: camera.position().to_array(),
+            focal,
+            centre,
+            limit,
+            near: near.max(f32::MIN_POSITIVE),
+            z_epsilon: if standard { 0.0 } else { Z_EPSILON_MVSPLAT * options.near },
+            lowpass: options.lowpass,
+            antialiased: standard && options.antialiased,
+            tile_cut: !standard,
+            size,
+        }
+    }
+}
+
+/// tan of half the angle between the rays through the middles of opposite picture
+/// edges, as MVSplat derives its frustum.
+fn half_angles(camera: &Camera) -> [f32; 2] {
+    let k = &camera.intrinsics;
+    let focal = [f64::from(k.fx), f64::from(k.fy)];
+    let centre = [f64::from(k.cx), f64::from(k.cy)];
+    let size = [k.width as f64, k.height as f64];
+    std::array::from_fn(|i| {
+        let ray = |at: f64| {
+            let mut v = glam::DVec3::new(0.0, 0.0, 1.0);
+            v[i] = (at - centre[i]) / focal[i];
+            v[1 - i] = (0.5 * size[1 - i] - centre[1 - i]) / focal[1 - i];
+            v
+        };
+        let (a, b) = (ray(0.0), ray(size[i]));
+        (0.5 * a.cross(b).length().atan2(a.dot(b))).tan() as f32
+    })
+}
+
+/// A child as the target sees it, its opacity still unknown.
+#[derive(Clone, Copy)]
+struct Seen<V> {
+    /// Camera point.
+    p: V3<V>,
+    /// J·Σ·Jᵀ before the low-pass, px², and its determinant, px⁴.
+    xx: V,
+    xy: V,
+    yy: V,
+    det: V,
+    gain: [V; 2],
+    /// Σ sh·Y at the child's own direction.
+    sum: V3<V>,
+}
+
+impl<V: Lanes> Seen<V> {
+    #[inline(always)]
+    fn new<M: Machine<Scalar = f32, V = V>>(m: M, lens: &Lens, d: V3<V>, child: &Child<V>) -> Self {
+        let rows = [splat(m, &lens.rows[0]), splat(m, &lens.rows[1]), splat(m, &lens.rows[2])];
+        let p = times(&rows, d);
+        let inverse = m.of(1.0) / p[2];
+        let mut footprint = [[inverse; 3]; 2];
+        for (i, row) in footprint.iter_mut().enumerate() {
+            let (low, high) = lens.limit[i];
+            let slope = (p[i] * inverse).max(m.splat(low)).min(m.splat(high));
+            let world = scaled(axpy(-slope, rows[2], rows[i]), m.splat(lens.focal[i]) * inverse);
+            *row = product(transposed(child.rotation(), world), child.scale);
+        }
+        let [a, b] = footprint;
+        let n = cross(a, b);
+        let zero = m.of(0.0);
+        Self {
+            p,
+            xx: dot(a, a),
+            xy: dot(a, b),
+            yy: dot(b, b),
+            det: dot(n, n),
+            gain: [zero; 2],
+            sum: [zero; 3],
+        }
+    }
+
+    /// The footprint's 12 numbers and four extents in the order of [`Footprint`], and
+    /// 1 where it is kept.
+    #[inline(always)]
+    fn finish<M: Machine<Scalar = f32, V = V>>(&self, m: M, lens: &Lens, alpha: V) -> ([V; 16], V) {
+        let (zero, one, lowpass) = (m.of(0.0), m.of(1.0), m.splat(lens.lowpass));
+        let (xx, yy) = (self.xx + lowpass, self.yy + lowpass);
+        let det = self.det + lowpass * (self.xx + self.yy) + lowpass * lowpass;
+        let mut alpha = alpha;
+        if lens.antialiased {
+            alpha = alpha * (self.det / det).max(zero).sqrt();
+        }
+        let power = alpha.log2();
+        let reach = power - m.splat(ALPHA_MIN_LOG2);
+        let reach = reach + m.of(SUPPORT_SLACK) * (one + reach);
+        let reach = m.of(2.0 * std::f64::consts::LN_2) * reach;
+        let inverse_z = one / (self.p[2] + m.splat(lens.z_epsilon));
+        let place =
+            |i: usize| (m.splat(lens.focal[i]) * self.p[i]).fma(inverse_z, m.splat(lens.centre[i]));
+        let (u, v) = (place(0), place(1));
+        let half = m.of(0.5 * std::f64::consts::LOG2_E);
+        let inverse_yy = one / yy;
+        let sx = (half * (yy / det)).sqrt();
+        let shear = -self.xy * inverse_yy;
+        let sy = (half * inverse_yy).sqrt();
+        let (width, height) = ((reach * xx).sqrt(), (reach * yy).sqrt());
+        let radius = lens.tile_cut.then(|| {
+            let mid = m.of(0.5) * (xx + yy);
+            let spread = (mid * mid - det).max(m.splat(DISCRIMINANT_MIN_MVSPLAT)).sqrt();
+            -(-(m.splat(RADIUS_SIGMAS_MVSPLAT) * (mid + spread).sqrt())).floor()
+        });
+        let (x0, x1) = extent(m, lens.size[0], (u, width), radius);
+        let (y0, y1) = extent(m, lens.size[1], (v, height), radius);
+        let grey = m.of(0.5) + self.gain[1];
+        let rgb = axpy(self.gain[0], self.sum, [grey; 3]);
+        let numbers =
+            [u, v, sx, shear, sy, power, rgb[0], rgb[1], rgb[2], self.p[2], width, height];
+        // Every test fails for NaN.
+        let mut keep = kept(m.splat(lens.near).lt(self.p[2]), one);
+        for (low, high) in [(zero, det), (zero, xx), (zero, yy), (x0, x1), (y0, y1)] {
+            keep = kept(low.lt(high), keep);
+        }
+        keep = V::select(alpha.lt(m.splat(ALPHA_MIN)), zero, keep);
+        let sound = not_finite(&numbers, det - det).abs();
+        keep = kept(sound.lt(one), keep);
+        let rgb = [rgb[0].max(zero), rgb[1].max(zero), rgb[2].max(zero)];
+        (
+            [
+                u, v, sx, shear, sy, power, rgb[0], rgb[1], rgb[2], self.p[2], width, height, x0,
+                y0, x1, y1,
+            ],
+            keep,
+        )
+    }
+}
+
+/// Pixels [first, past the last) along one axis of `side` pixels that the support
+/// meets and, with a radius, that the tile cut leaves; whole numbers.
+#[inline(always)]
+fn extent<M: Machine<Scalar = f32>>(
+    m: M,
+    side: f32,
+    (mean, half): (M::V, M::V),
+    radius: Option<M::V>,
+) -> (M::V, M::V) {
+    let (zero, one, side) = (m.of(0.0), m.of(1.0), m.splat(side));
+    let half = half + m.of(SPAN_SLACK_PX);
+    // Clamped first, so that a whole number fits the mantissa.
+    let first = (mean - half).max(zero).min(side);
+    let past = (mean + half).max(-one).min(side);
+    let mut first = -(-first).floor();
+    let mut past = (past.floor() + one).min(side);
+    if let Some(r) = radius {
+        let tile = m.of(TILE_MVSPLAT as f64);
+        let per = one / tile;
+        let ends = [mean - r, mean + r + (tile - one)];
+        let cut = each(
+            ends,
+            #[inline(always)]
+            |at| (at.max(zero).min(side + tile) * per).floor() * tile,
+        );
+        first = first.max(cut[0]).min(side);
+        past = past.min(cut[1]);
+    }
+    (first, past)
+}
+
+/// One block of parents; `out` is the block's own.
+struct Project<'a> {
+    args: Args<'a, f32>,
+    target: Target<'a>,
+    lens: &'a Lens,
+    table: &'a Table<f32>,
+    range: std::ops::Range<usize>,
+    out: &'a mut [Footprint],
+}
+
+impl Kernel<f32> for Project<'_> {
+    type Output = bool;
+    #[inline(always)]
+    fn run<M: Machine<Scalar = f32>>(mut self, m: M) -> bool {
+        let children = self.args.rules.children();
+        let options = self.target.options;
+        let degree = options.sh_degree.min(self.target.sh_degree);
+        let mut colour = Coefficients::new(options.sh_basis, degree);
+        let zero = m.of(0.0);
+        let empty = Seen {
+            p: [zero; 3],
+            xx: zero,
+            xy: zero,
+            yy: zero,
+            det: zero,
+            gain: [zero; 2],
+            sum: [zero; 3],
+        };
+        let mut seen = vec![empty; children];
+        let (mut areas, mut alphas) = (vec![zero; children], vec![zero; children]);
+        let mut bad = zero;
+        for first in self.range.clone().step_by(M::WIDTH) {
+            let span = (first, M::WIDTH.min(self.range.end - first));
+            let set = 3 * sh_coefficients(self.target.sh_degree);
+            colour.load(m, self.target.sh, (span.0, span.1, set));
+            let scratch = (&mut seen[..], &mut areas[..], &mut alphas[..]);
+            bad = bad + self.look(m, span, &colour, scratch);
+            self.write(m, span, &seen, &alphas);
+        }
+        let mut lanes = [0.0; WIDTH_MAX];
+        m.store(bad, &mut lanes);
+        lanes[..M::WIDTH].iter().all(|&v| v == 0.0)
+    }
+}
+
+impl Project<'_> {
+    /// The children of one vector of parents; 0 where all is finite, else NaN.
+    #[inline(always)]
+    fn look<M: Machine<Scalar = f32>>(
+        &self,
+        m: M,
+        span: (usize, usize),
+        colour: &Coefficients<f32>,
+        (seen, areas, alphas): (&mut [Seen<M::V>], &mut [M::V], &mut [M::V]),
+    ) -> M::V {
+        let Args { rules, source, parents, .. } = self.args;
+        let parent = Parent::load(m, (rules, self.table, &source), parents, span);
+        let mut bad = not_finite(&[parent.alpha, parent.z], m.of(0.0));
+        let eye = splat(m, &self.lens.eye);
+        let shared = self.target.options.sh_direction == ShDirection::Parent;
+        let mut towards = [m.of(0.0); 3];
+        for (k, seen) in seen.iter_mut().enumerate() {
+            let head = records(m, &self.args, span, k);
+            bad = not_finite(&head, bad);
+            let child = Child::new(rules, &parent, k, &head);
+            (areas[k], alphas[k]) = (child.area, head[HEAD_LOGIT]);
+            bad = not_finite(&child.mean, not_finite(&child.scale, bad));
+            let d = axpy(m.of(-1.0), eye, child.mean);
+            *seen = Seen::new(m, self.lens, d, &child);
+            let [gamma, residual, ..] = gain(m, rules, head[HEAD_GAIN]);
+            seen.gain = [gamma, residual];
+            if shared {
+                towards = axpy(m.of(1.0), d, towards);
+            } else {
+                seen.sum = colour.radiance(m, d);
+            }
+        }
+        if shared {
+            let sum = colour.radiance(m, towards);
+            seen.iter_mut().for_each(|s| s.sum = sum);
+        }
+        share(rules.opacity, areas, parent.alpha, parent.own, alphas);
+        not_finite(alphas, bad)
+    }
+
+    #[inline(always)]
+    fn write<M: Machine<Scalar = f32>>(
+        &mut self,
+        m: M,
+        (first, count): (usize, usize),
+        seen: &[Seen<M::V>],
+        alphas: &[M::V],
+    ) {
+        let children = seen.len();
+        let at = (first - self.range.start) * children;
+        for (k, (seen, &alpha)) in seen.iter().zip(alphas).enumerate() {
+            let (numbers, keep) = seen.finish(m, self.lens, alpha);
+            let mut tile = [[0.0; WIDTH_MAX]; 16];
+            for (i, (v, tile)) in numbers.into_iter().zip(&mut tile).enumerate() {
+                let v = if i < 12 { v } else { v + m.splat(MANTISSA) };
+                m.store(v, tile);
+            }
+            let mut keeps = [0.0; WIDTH_MAX];
+            m.store(keep, &mut keeps);
+            for lane in 0..count {
+                let f = |i: usize| tile[i][lane];
+                let whole = |i: usize| tile[i][lane].to_bits() & 0x007f_ffff;
+                self.out[at + lane * children + k] = match keeps[lane] > 0.0 {
+                    false => Footprint::default(),
+                    true => Footprint {
+                        u: f(0),
+                        v: f(1),
+                        sx: f(2),
+                        shear: f(3),
+                        sy: f(4),
+                        power: f(5),
+                        rgb: [f(6), f(7), f(8)],
+                        z: f(9),
+                        half_width: f(10),
+                        half_height: f(11),
+                        x0: whole(12),
+                        y0: whole(13),
+                        x1: whole(14),
+                        y1: whole(15),
+                    },
+                };
+            }
+        }
+    }
+}
+
+/// Footprints `[N·K]` of the children as `target` sees them (module doc), child k of
+/// parent n at n·K + k. False as in [`super::forward`].
+pub fn project(args: Args<f32>, target: Target, out: &mut [Footprint]) -> bool {
+    let table = Table::new(&args.source);
+    let lens = Lens::new(target.camera, target.options);
+    out.par_chunks_mut(BLOCK * args.rules.children())
+        .enumerate()
+        .map(|(block, out)| {
+            let range = args.block(block);
+            f32::dispatch(Project { args, target, lens: &lens, table: &table, range, out })
+        })
+        .reduce(|| true, |a, b| a && b)
+}
