@@ -83,8 +83,9 @@ impl Frame<'_, '_> {
     /// `[5, H, W]` (R, G, B, alpha, Σ w·z) is `gradients`; zeros where that has another
     /// size.
     pub fn backward(&mut self, gradients: &[f32], out: &mut Gradients) {
-        let pixels = Pixels { planes: self.planes, gradients };
-        self.rasterizer.backward_of_last(&self.splats, &self.camera, &self.options, pixels, out);
+        let (camera, options) = (&self.camera, &self.options);
+        let pixels = (self.planes, gradients);
+        self.rasterizer.backward_of_last(&self.splats, camera, options, pixels, out);
     }
 }
 
@@ -115,8 +116,7 @@ impl Rasterizer {
     ) {
         let mut planes = std::mem::take(&mut self.back.planes);
         self.render_planes(splats, camera, options, &mut planes);
-        let pixels = Pixels { planes: &planes, gradients };
-        self.backward_of_last(splats, camera, options, pixels, out);
+        self.backward_of_last(splats, camera, options, (&planes, gradients), out);
         self.back.planes = planes;
     }
 
@@ -127,15 +127,16 @@ impl Rasterizer {
     }
 
     /// The backward pass of the last frame, whose splats, camera, options and planes
-    /// these must be.
+    /// these must be; `planes` come with their gradient.
     pub(crate) fn backward_of_last(
         &mut self,
         splats: &SplatSlices,
         camera: &Camera,
         options: &RasterOptions,
-        pixels: Pixels,
+        (planes, gradients): (&[f32], &[f32]),
         out: &mut Gradients,
     ) {
+        let pixels = Pixels { planes, gradients };
         let (tiles, numbers) = (self.grid.len(), 5 * self.grid.width * self.grid.height);
         let fits = pixels.planes.len() == numbers && pixels.gradients.len() == numbers;
         if !fits || self.projection.footprints.len() != splats.len() {
