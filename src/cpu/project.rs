@@ -237,6 +237,7 @@ impl Kernel for Chunk<'_> {
             kept[count..count + LANES].fill(last);
             let mut g = 0;
             while g < count {
+                self.prefetch(s, &kept[(g + AHEAD).min(count)..(g + AHEAD + LANES).min(count)]);
                 let (group, _) = kept[g..].split_at(LANES);
                 self.colour(s, group, (count - g).min(LANES));
                 g += LANES;
@@ -252,7 +253,29 @@ impl Kernel for Chunk<'_> {
     }
 }
 
+/// How many splats ahead their coefficients are asked for.
+const AHEAD: usize = 2 * LANES;
+
 impl Chunk<'_> {
+    /// Asks for the SH sets of some splats of the chunk.
+    #[inline(always)]
+    fn prefetch<S: Simd>(&self, s: S, group: &[u32]) {
+        const LINE: usize = 16;
+        if self.parents.is_some() {
+            return;
+        }
+        let set = 3 * sh_coefficients(self.splats.sh_degree);
+        let children = self.splats.children_per_parent();
+        for &i in group {
+            let at = (self.first + i as usize) / children * set;
+            for line in 0..set.div_ceil(LINE) {
+                if let Some(v) = self.splats.sh.get(at + line * LINE) {
+                    s.prefetch(v);
+                }
+            }
+        }
+    }
+
     /// Footprints without colour of the chunk's splats `start..past`; writes the
     /// places of the kept ones to `kept` and returns how many they are.
     #[inline(always)]

@@ -178,6 +178,8 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     /// which tiers differ, for tests that leave a margin.
     fn rough_sqrt(self, v: Self::F) -> Self::F;
     fn abs(self, v: Self::F) -> Self::F;
+    /// −|v|.
+    fn negative(self, v: Self::F) -> Self::F;
     fn floor(self, v: Self::F) -> Self::F;
     fn ceil(self, v: Self::F) -> Self::F;
     /// (n, v − n), n the nearest whole number (ties to even), exact for |v| < 2²²

@@ -159,6 +159,13 @@ impl Simd for Token {
         }
     }
     #[inline(always)]
+    fn negative(self, v: F) -> F {
+        unsafe {
+            let sign = _mm256_set1_ps(-0.0);
+            F(_mm256_or_ps(v.0, sign), _mm256_or_ps(v.1, sign))
+        }
+    }
+    #[inline(always)]
     fn floor(self, v: F) -> F {
         unsafe { F(_mm256_floor_ps(v.0), _mm256_floor_ps(v.1)) }
     }
