@@ -204,7 +204,7 @@ impl CustomOp3 for Rasterize {
         splats: &Tensor,
         sh: &Tensor,
         gain: &Tensor,
-        planes: &Tensor,
+        _planes: &Tensor,
         gradient: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let Some(sh_degree) = degree_of(sh.dim(1)?) else {
@@ -214,11 +214,11 @@ impl CustomOp3 for Rasterize {
             [elements::<f32>(splats)?, elements::<f32>(sh)?, elements::<f32>(gain)?];
         let slices =
             SplatSlices { geometry: Geometry::Packed(&rows), sh: &set, gain: &gains, sh_degree };
-        let (planes, gradient) = (elements::<f32>(planes)?, elements::<f32>(gradient)?);
+        let gradient = elements::<f32>(gradient)?;
         let mut out = Gradients::default();
         let mut rasterizer = self.rasterizer.lock().unwrap_or_else(PoisonError::into_inner);
         let (camera, options) = (&self.camera, &self.options);
-        rasterizer.backward_of_last(&slices, camera, options, (&planes, &gradient), &mut out);
+        rasterizer.backward_of_last(&slices, camera, options, &gradient, &mut out);
         Ok((
             Some(tensor_like(out.rows, splats)?),
             Some(tensor_like(out.sh, sh)?),
