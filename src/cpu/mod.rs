@@ -12,6 +12,7 @@ pub mod attention;
 pub mod attention_gather;
 mod blend;
 mod blocks;
+mod colour_bwd;
 pub mod conv2d;
 pub mod detail;
 mod disjoint;

@@ -148,8 +148,13 @@ impl WalkTile<'_> {
                 while blocks != 0 {
                     let b = blocks.trailing_zeros() as usize;
                     blocks &= blocks - 1;
-                    let (changed, goes_on) =
-                        step_forward(s, &mut walks[b & 63], f, block_corner(corner, b), (i, self.rules));
+                    let (changed, goes_on) = step_forward(
+                        s,
+                        &mut walks[b & 63],
+                        f,
+                        block_corner(corner, b),
+                        (i, self.rules),
+                    );
                     mask &= !(u64::from(!changed) << b);
                     live &= !(u64::from(!goes_on) << b);
                 }
@@ -271,12 +276,7 @@ fn look<S: Simd>(s: S, f: &Footprint, at: [f32; 2]) -> Seen<S> {
     let across = s.fma(s.splat(f.shear), dy, dx) * s.splat(f.sx);
     let down = dy * s.splat(f.sy);
     let power = s.fnma(down, down, s.fnma(across, across, s.splat(f.power)));
-    Seen {
-        across,
-        down,
-        shows: s.le(least, power),
-        raw: simd::exp2(s, s.max(power, least)),
-    }
+    Seen { across, down, shows: s.le(least, power), raw: simd::exp2(s, s.max(power, least)) }
 }
 
 /// Splat `i` of the order at one block: whether it changed a pixel, and whether a pixel
