@@ -26,7 +26,7 @@ use crate::cpu::tiles::Grid;
 /// Sums kept per (splat, tile): the numbers of [`Moments`].
 pub(crate) const SUMS: usize = 10;
 /// Splats whose footprints are asked for ahead of their turn.
-const AHEAD: usize = 2 * LANES;
+const AHEAD: usize = LANES;
 
 /// What one tile says of one splat, in the order of [`Moments`].
 pub(crate) type PairSums = [f32; SUMS];
@@ -216,23 +216,22 @@ fn start(
     let mut live = 0u64;
     for y in 0..height {
         let first = (corner[1] + y) * grid.width + corner[0];
-        let mut g = [[0.0f32; TILE]; 5];
-        for (c, g) in g.iter_mut().enumerate() {
-            let inside = c * pixels + first..c * pixels + first + width;
-            g[..width].copy_from_slice(&planes[inside]);
-        }
-        for x in 0..width {
-            let (b, l) = (y / BLOCK * BLOCKS + x / BLOCK, y % BLOCK * BLOCK + x % BLOCK);
-            let walk = &mut walks[b];
-            live |= 1 << b;
-            walk.t[l] = 1.0;
-            let mut behind = -g[3][x];
-            for c in 0..3 {
-                behind += background[c] * g[c][x];
+        // Pixel by pixel instead of plane by plane.
+        let mut row = [[0.0f32; 5]; TILE];
+        for c in 0..5 {
+            let plane = &planes[c * pixels + first..][..width];
+            for (pixel, v) in row.iter_mut().zip(plane) {
+                pixel[c] = *v;
             }
-            walk.behind[l] = behind;
-            for (to, c) in walk.g.iter_mut().zip([0, 1, 2, 4]) {
-                to[l] = g[c][x];
+        }
+        for (x, &[r, g, b, alpha, z]) in row[..width].iter().enumerate() {
+            let (block, l) = (y / BLOCK * BLOCKS + x / BLOCK, y % BLOCK * BLOCK + x % BLOCK);
+            let walk = &mut walks[block];
+            live |= 1 << block;
+            walk.t[l] = 1.0;
+            walk.behind[l] = background[0] * r + background[1] * g + background[2] * b - alpha;
+            for (to, v) in walk.g.iter_mut().zip([r, g, b, z]) {
+                to[l] = v;
             }
         }
     }
