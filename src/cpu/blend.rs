@@ -222,8 +222,7 @@ impl Batch {
         let mut z = s.load(&block.z);
         let mut count = 0;
         let mut goes_on = true;
-        'batch: for (words, footprints) in self.words.iter().zip(self.footprints.chunks_exact(64))
-        {
+        'batch: for (words, footprints) in self.words.iter().zip(self.footprints.chunks_exact(64)) {
             let mut bits = words[b];
             while bits != 0 {
                 let f = &footprints[bits.trailing_zeros() as usize & 63];

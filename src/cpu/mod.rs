@@ -13,6 +13,7 @@ pub mod attention_gather;
 mod blend;
 mod blocks;
 pub mod conv2d;
+mod covariance;
 pub mod detail;
 mod disjoint;
 pub mod ewa;

@@ -12,13 +12,21 @@
 use crate::abi::TILE;
 use crate::cpu::disjoint::Disjoint;
 use crate::cpu::ewa::Footprint;
-use crate::cpu::project::CHUNK;
 use crate::cpu::sort::entry;
 use rayon::prelude::*;
 use std::ops::Range;
 
 /// Most (splat, tile) pairs listed at a time, 24 bytes each: 384 MiB.
 pub(crate) const PAIRS_PER_GROUP: usize = 1 << 24;
+
+/// Least splats of a chunk.
+const CHUNK_MIN: usize = 1024;
+
+/// Splats per chunk, a unit of parallel work: enough chunks to keep every thread busy,
+/// few enough that a count per chunk and tile stays little. No result depends on it.
+fn chunk_len(n: usize) -> usize {
+    n.div_ceil(8 * rayon::current_num_threads()).next_multiple_of(CHUNK_MIN).max(CHUNK_MIN)
+}
 
 /// The tiles of a picture, row-major.
 #[derive(Clone, Copy, Debug, Default)]
@@ -128,7 +136,9 @@ impl ChunkCover<'_> {
 #[derive(Debug, Default)]
 pub(crate) struct TileLists {
     grid: Grid,
-    /// `[chunks, CHUNK]`: each chunk's first `lens` are meant.
+    /// Splats per chunk.
+    chunk: usize,
+    /// `[chunks, chunk]`: each chunk's first `lens` are meant.
     covers: Vec<Cover>,
     /// `[chunks]`: visible splats.
     lens: Vec<u32>,
@@ -195,12 +205,18 @@ impl TileLists {
     /// Makes room for a frame of `n` splats.
     pub(crate) fn begin(&mut self, grid: Grid, n: usize) {
         self.grid = grid;
-        let chunks = n.div_ceil(CHUNK);
+        self.chunk = chunk_len(n);
+        let chunks = n.div_ceil(self.chunk);
         if self.covers.len() < n {
             self.covers.resize(n, Cover::default());
         }
         self.lens.resize(chunks, 0);
         self.slots.resize(chunks * grid.len().max(1), 0);
+    }
+
+    /// Splats per chunk of this frame.
+    pub(crate) fn chunk(&self) -> usize {
+        self.chunk
     }
 
     /// What each chunk of `n` splats has to fill in.
@@ -209,7 +225,7 @@ impl TileLists {
         n: usize,
     ) -> impl IndexedParallelIterator<Item = ChunkCover<'_>> {
         let grid = self.grid;
-        let covers = self.covers[..n].par_chunks_mut(CHUNK).zip(&mut self.lens);
+        let covers = self.covers[..n].par_chunks_mut(self.chunk).zip(&mut self.lens);
         let counts = self.slots.par_chunks_mut(grid.len().max(1));
         covers.zip(counts).map(move |((covers, len), counts)| ChunkCover {
             grid,
@@ -304,7 +320,7 @@ impl TileLists {
         let (entries, splats) = (Disjoint::new(&mut self.entries), Disjoint::new(&mut self.splats));
         let (grid, starts) = (self.grid, &self.starts);
         let rows = group.start / grid.columns..group.end.div_ceil(grid.columns);
-        let chunks = self.covers.par_chunks(CHUNK).zip(&self.lens);
+        let chunks = self.covers.par_chunks(self.chunk).zip(&self.lens);
         chunks.zip(self.slots.par_chunks_mut(tiles)).for_each(|((covers, len), slots)| {
             for cover in &covers[..*len as usize] {
                 let mut put = |t: usize| {

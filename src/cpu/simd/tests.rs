@@ -48,7 +48,13 @@ impl Kernel for Everything<'_> {
             for v in [a + b, a - b, a * b, a / b, -a, s.min(a, b), s.max(a, b), s.abs(a)] {
                 put(&mut exact, v);
             }
-            for v in [s.negative(a), s.sqrt(s.abs(a)), s.floor(a), s.ceil(a), s.splat(lanes(self.0, at)[3])] {
+            for v in [
+                s.negative(a),
+                s.sqrt(s.abs(a)),
+                s.floor(a),
+                s.ceil(a),
+                s.splat(lanes(self.0, at)[3]),
+            ] {
                 put(&mut exact, v);
             }
             let m = s.lt(a, b);
