@@ -380,7 +380,7 @@ fn tiers_agree() {
             for other in fused.windows(2) {
                 assert!(bytes(&other[0]) == bytes(&other[1]), "{kind:?} {convention:?}");
             }
-            for picture in fused.first() {
+            if let Some(picture) = fused.first() {
                 pixels += picture.alpha.len();
                 for (a, b) in picture.rgb.chunks_exact(3).zip(scalar.rgb.chunks_exact(3)) {
                     let apart = a.iter().zip(b).map(|(a, b)| (a - b).abs() / b.abs().max(1.0));

@@ -115,11 +115,20 @@ impl ChunkCover<'_> {
         if small && fits {
             cover.columns = [columns.start as u16, columns.end as u16];
             cover.rows = [rows.start as u16, rows.end as u16];
-            for row in rows {
-                for c in columns.clone() {
-                    if let Some(count) = counts.get_mut(row * grid.columns + c) {
-                        *count += 1;
-                    }
+            let first = rows.start * grid.columns + columns.start;
+            let mut count = |t: usize| {
+                if let Some(count) = counts.get_mut(t) {
+                    *count += 1;
+                }
+            };
+            count(first);
+            if columns.len() == 2 {
+                count(first + 1);
+            }
+            if rows.len() == 2 {
+                count(first + grid.columns);
+                if columns.len() == 2 {
+                    count(first + grid.columns + 1);
                 }
             }
         } else {
