@@ -240,8 +240,8 @@ impl View {
     ) -> ([S::F; FIELDS], S::M) {
         let p = self.to_camera(s, mean);
         // So far away that the length of its direction overflows, it has no colour.
-        let near = s.lt(dot(s, p, p), s.splat(f32::INFINITY));
-        let front = s.lt(s.splat(self.near), p[2]) & near;
+        let within = s.lt(dot(s, p, p), s.splat(f32::INFINITY));
+        let front = s.lt(s.splat(self.near), p[2]) & within;
         let slopes = [p[0] / p[2], p[1] / p[2]];
         let j = self.jacobian_in_world(s, slopes, p[2]);
         let (covariance, shaped) = match shape {
