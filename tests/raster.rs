@@ -12,7 +12,7 @@ use raster_case::{File, degree_of, rows};
 use std::path::Path;
 use subsplat::abi::{Convention, RasterOptions, ShBasis};
 use subsplat::camera::{Camera, Intrinsics};
-use subsplat::cpu::{Geometry, Rasterizer, SplatSlices};
+use subsplat::cpu::{Geometry, Rasterizer, SplatSlices, Tier};
 use subsplat::splats::Splats;
 
 /// Largest |got − expected| over pixels that are no boundary; `lanes` per pixel.
@@ -32,7 +32,14 @@ fn worst(got: &[f32], expected: &[f32], boundary: &[f32], relative: Option<f32>)
     worst
 }
 
+/// Every case in every tier that the processor has.
 fn check_case(name: &str) {
+    for &tier in Tier::available() {
+        check_case_in(name, tier);
+    }
+}
+
+fn check_case_in(name: &str, tier: Tier) {
     let Some(path) = shared(&format!("fixtures/raster/{name}.safetensors")) else { return };
     let file = File::read(&path);
     let (camera, options) = (file.camera(), file.options());
@@ -54,7 +61,7 @@ fn check_case(name: &str) {
     let sh_degree = degree_of(file.tensors["sh"].0[1]);
     let splats = SplatSlices { geometry, sh: file.get("sh"), gain, sh_degree };
     assert_eq!(splats.children_per_parent(), file.meta::<usize>("children"));
-    let mut rasterizer = Rasterizer::new();
+    let mut rasterizer = Rasterizer::new().with_tier(tier);
     let got = rasterizer.render(&splats, &camera, &options);
 
     let boundary = file.get("boundary");
@@ -67,9 +74,11 @@ fn check_case(name: &str) {
     // Where almost nothing covers a pixel, 1 − T has few digits left.
     let sum = worst(&got.depth_sum, file.get("depth_sum"), boundary, Some(0.1));
     let depth = worst(&got.depth(), file.get("depth"), boundary, Some(1e-3));
-    eprintln!("{name}: rgb {rgb:.1e} alpha {alpha:.1e} depth_sum {sum:.1e} depth {depth:.1e}");
-    assert!(rgb < tolerance && alpha < tolerance, "{name}: rgb {rgb} alpha {alpha}");
-    assert!(sum < 1e-4 && depth < 1e-4, "{name}: depth_sum {sum} depth {depth}");
+    eprintln!(
+        "{name} {tier:?}: rgb {rgb:.1e} alpha {alpha:.1e} depth_sum {sum:.1e} depth {depth:.1e}"
+    );
+    assert!(rgb < tolerance && alpha < tolerance, "{name} {tier:?}: rgb {rgb} alpha {alpha}");
+    assert!(sum < 1e-4 && depth < 1e-4, "{name} {tier:?}: depth_sum {sum} depth {depth}");
     check_intermediates(name, &file, &rasterizer, mvsplat);
     assert_eq!(rasterizer.footprints().len(), n);
 }

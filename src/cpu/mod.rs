@@ -14,6 +14,7 @@ mod blend;
 mod blocks;
 mod colour_bwd;
 pub mod conv2d;
+mod covariance;
 pub mod detail;
 mod disjoint;
 pub mod ewa;

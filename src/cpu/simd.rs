@@ -156,6 +156,7 @@ pub(crate) trait Ints:
 ///
 /// Comparisons are false where an operand is NaN; `min` and `max` then give their
 /// second operand.
+#[allow(dead_code, reason = "a vocabulary, not all of whose words every kernel uses")]
 pub(crate) trait Simd: Copy + Send + Sync + 'static {
     type F: Floats;
     type M: Mask;
