@@ -26,7 +26,7 @@ fn slope(
     step: f32,
     of: impl Fn(&mut Scene) -> &mut f32,
 ) -> f64 {
-    let mut at = |sign: f32| {
+    let at = |sign: f32| {
         let mut s = scene.clone();
         let x = of(&mut s);
         *x += sign * step;
