@@ -27,7 +27,7 @@
 //! ```
 //!
 //! Where to look: [`pipeline`] is the whole path in one call; [`render()`] draws any
-//! [`splats::Splats`]; [`io`] reads and writes files; [`check`] judges poses;
+//! [`splats::Splats`], [`rasterize`] does so with gradients; [`io`] reads and writes files; [`check`] judges poses;
 //! [`model`] is the network, its parts usable one by one, configured by
 //! [`config::Config`]; [`ops`] are the same kernels as candle ops. Every geometric
 //! convention is said once, in [`camera`].
@@ -49,4 +49,5 @@ pub mod render;
 pub mod sh;
 pub mod splats;
 
+pub use ops::rasterize_splats as rasterize;
 pub use render::{Picture, render};

@@ -43,6 +43,48 @@ pub struct Splats {
     pub sh_basis: ShBasis,
 }
 
+/// [`Splats`] as tensors, for optimisation: gradients reach what they were made of.
+#[derive(Clone, Debug)]
+pub struct SplatTensors {
+    /// `[N, 11]`, as [`Splats::rows`].
+    pub rows: Tensor,
+    /// `[P, D, 3]`, as [`Splats::sh`].
+    pub sh: Tensor,
+    /// `[N]` (γ) or `[N, 4]` (γ, δ); none means γ = 1, δ = 0.
+    pub gain: Option<Tensor>,
+    /// Functions that `sh` multiplies.
+    pub sh_basis: ShBasis,
+}
+
+impl SplatTensors {
+    /// Packs means `[N, 3]`, quaternions wxyz `[N, 4]` (of any length), σ `[N, 3]`,
+    /// opacities `[N]` and SH `[P, D, 3]`, P dividing N; no gain.
+    ///
+    /// # Errors
+    /// Tensors that cannot stand side by side.
+    pub fn from_parts(
+        means: &Tensor,
+        quats_wxyz: &Tensor,
+        scales: &Tensor,
+        opacities: &Tensor,
+        sh: &Tensor,
+        sh_basis: ShBasis,
+    ) -> candle_core::Result<Self> {
+        let rows = Tensor::cat(&[means, quats_wxyz, scales, &opacities.unsqueeze(1)?], 1)?;
+        Ok(Self { rows, sh: sh.clone(), gain: None, sh_basis })
+    }
+
+    /// Copies of `splats` on `device`.
+    ///
+    /// # Errors
+    /// Whatever candle says of the allocation.
+    pub fn new(splats: &Splats, device: &Device) -> candle_core::Result<Self> {
+        let (rows, sh, gain) = splats.to_tensors(device)?;
+        let gain = (splats.gain_lanes() > 0).then_some(gain);
+        Ok(Self { rows, sh, gain, sh_basis: splats.sh_basis })
+    }
+}
+
 impl Splats {
     /// Checks that the three buffers fit one another.
     ///

@@ -3,100 +3,17 @@
 //! independent render of a real .ply (`shared/fixtures/ref_render`).
 
 mod common;
+#[path = "common/raster_case.rs"]
+mod raster_case;
 
 use common::shared;
 use glam::{Mat4, Vec3};
-use safetensors::SafeTensors;
-use std::collections::HashMap;
+use raster_case::{File, degree_of, rows};
 use std::path::Path;
-use subsplat::abi::{Convention, RasterOptions, SH_DEGREE_MAX, ShBasis, sh_coefficients};
+use subsplat::abi::{Convention, RasterOptions, ShBasis};
 use subsplat::camera::{Camera, Intrinsics};
-use subsplat::cpu::{Geometry, Rasterizer, SplatSlices};
+use subsplat::cpu::{Geometry, Rasterizer, SplatSlices, Tier};
 use subsplat::splats::Splats;
-
-/// A fixture file, decoded.
-struct File {
-    tensors: HashMap<String, (Vec<usize>, Vec<f32>)>,
-    metadata: HashMap<String, String>,
-}
-
-impl File {
-    fn read(path: &Path) -> Self {
-        let bytes = std::fs::read(path).unwrap();
-        let (_, header) = SafeTensors::read_metadata(&bytes).unwrap();
-        let metadata = header.metadata().clone().unwrap_or_default();
-        let tensors = SafeTensors::deserialize(&bytes).unwrap();
-        let tensors = tensors.tensors().into_iter().map(|(name, t)| {
-            let data = match t.dtype() {
-                safetensors::Dtype::F32 => t
-                    .data()
-                    .chunks_exact(4)
-                    .map(|b| f32::from_le_bytes(b.try_into().unwrap()))
-                    .collect(),
-                safetensors::Dtype::U8 => t.data().iter().map(|&b| f32::from(b)).collect(),
-                other => panic!("{name}: {other:?}"),
-            };
-            (name, (t.shape().to_vec(), data))
-        });
-        Self { tensors: tensors.collect(), metadata }
-    }
-
-    fn get(&self, name: &str) -> &[f32] {
-        &self.tensors.get(name).unwrap_or_else(|| panic!("no tensor {name}")).1
-    }
-
-    fn meta<T: std::str::FromStr<Err: std::fmt::Debug>>(&self, key: &str) -> T {
-        self.metadata[key].parse().unwrap()
-    }
-
-    fn camera(&self) -> Camera {
-        let k = self.get("intrinsics");
-        let k = Intrinsics {
-            fx: k[0],
-            fy: k[1],
-            cx: k[2],
-            cy: k[3],
-            width: self.meta("width"),
-            height: self.meta("height"),
-        };
-        let pose: [f32; 16] = self.get("world_from_camera").try_into().unwrap();
-        Camera::new(k, Mat4::from_cols_array(&pose).transpose()).unwrap()
-    }
-
-    fn options(&self) -> RasterOptions {
-        let near: f32 = self.meta("near");
-        let (convention, sh_basis, near) = match self.metadata["convention"].as_str() {
-            "standard" => (Convention::Standard, ShBasis::Standard, near),
-            "mvsplat" => (Convention::Mvsplat, ShBasis::Mvsplat, near / 0.2),
-            other => panic!("{other}"),
-        };
-        RasterOptions {
-            sh_basis,
-            sh_degree: self.meta("sh_degree"),
-            lowpass: self.meta("lowpass"),
-            antialiased: self.meta("antialiased"),
-            near,
-            background: self.get("background").try_into().unwrap(),
-            ..RasterOptions::new(convention)
-        }
-    }
-}
-
-/// `[N, 11]` rows.
-fn rows(means: &[f32], quats: &[f32], scales: &[f32], opacities: &[f32]) -> Vec<f32> {
-    let mut rows = Vec::new();
-    for (i, o) in opacities.iter().enumerate() {
-        rows.extend_from_slice(&means[3 * i..3 * i + 3]);
-        rows.extend_from_slice(&quats[4 * i..4 * i + 4]);
-        rows.extend_from_slice(&scales[3 * i..3 * i + 3]);
-        rows.push(*o);
-    }
-    rows
-}
-
-fn degree_of(coefficients: usize) -> usize {
-    (0..=SH_DEGREE_MAX).find(|&l| sh_coefficients(l) == coefficients).unwrap()
-}
 
 /// Largest |got − expected| over pixels that are no boundary; `lanes` per pixel.
 /// With `relative`, over max(|expected|, the number given).
@@ -115,7 +32,14 @@ fn worst(got: &[f32], expected: &[f32], boundary: &[f32], relative: Option<f32>)
     worst
 }
 
+/// Every case in every tier that the processor has.
 fn check_case(name: &str) {
+    for &tier in Tier::available() {
+        check_case_in(name, tier);
+    }
+}
+
+fn check_case_in(name: &str, tier: Tier) {
     let Some(path) = shared(&format!("fixtures/raster/{name}.safetensors")) else { return };
     let file = File::read(&path);
     let (camera, options) = (file.camera(), file.options());
@@ -137,7 +61,7 @@ fn check_case(name: &str) {
     let sh_degree = degree_of(file.tensors["sh"].0[1]);
     let splats = SplatSlices { geometry, sh: file.get("sh"), gain, sh_degree };
     assert_eq!(splats.children_per_parent(), file.meta::<usize>("children"));
-    let mut rasterizer = Rasterizer::new();
+    let mut rasterizer = Rasterizer::new().with_tier(tier);
     let got = rasterizer.render(&splats, &camera, &options);
 
     let boundary = file.get("boundary");
@@ -150,9 +74,11 @@ fn check_case(name: &str) {
     // Where almost nothing covers a pixel, 1 − T has few digits left.
     let sum = worst(&got.depth_sum, file.get("depth_sum"), boundary, Some(0.1));
     let depth = worst(&got.depth(), file.get("depth"), boundary, Some(1e-3));
-    eprintln!("{name}: rgb {rgb:.1e} alpha {alpha:.1e} depth_sum {sum:.1e} depth {depth:.1e}");
-    assert!(rgb < tolerance && alpha < tolerance, "{name}: rgb {rgb} alpha {alpha}");
-    assert!(sum < 1e-4 && depth < 1e-4, "{name}: depth_sum {sum} depth {depth}");
+    eprintln!(
+        "{name} {tier:?}: rgb {rgb:.1e} alpha {alpha:.1e} depth_sum {sum:.1e} depth {depth:.1e}"
+    );
+    assert!(rgb < tolerance && alpha < tolerance, "{name} {tier:?}: rgb {rgb} alpha {alpha}");
+    assert!(sum < 1e-4 && depth < 1e-4, "{name} {tier:?}: depth_sum {sum} depth {depth}");
     check_intermediates(name, &file, &rasterizer, mvsplat);
     assert_eq!(rasterizer.footprints().len(), n);
 }

@@ -143,7 +143,8 @@ fn brush_tiny() {
             let y = subsplat::sh::standard(at.normalize());
             (0..16)
                 .map(|k| {
-                    (0..3).map(|c| colour[c] * f64::from(sh[48 * i + 3 * k + c])).sum::<f64>() * y[k]
+                    (0..3).map(|c| colour[c] * f64::from(sh[48 * i + 3 * k + c])).sum::<f64>()
+                        * y[k]
                 })
                 .sum()
         };

@@ -1,12 +1,13 @@
-//! `ops::rasterize`: the kernel's numbers, every refusal by name, and no silent
-//! gradient.
+//! `ops::rasterize`: the kernel's numbers, every refusal by name, and gradients that
+//! reach every input.
 
 use candle_core::{DType, Device, Tensor, Var};
 use glam::{Mat4, Vec3};
 use subsplat::abi::{Convention, RasterOptions, ShBasis};
 use subsplat::camera::{Camera, Intrinsics};
-use subsplat::ops::rasterize;
-use subsplat::splats::Splats;
+use subsplat::cpu::{Gradients, Rasterizer};
+use subsplat::ops::{over_background, rasterize};
+use subsplat::splats::{SplatTensors, Splats};
 
 fn camera() -> Camera {
     let k = Intrinsics { fx: 30.0, fy: 32.0, cx: 14.0, cy: 10.0, width: 29, height: 21 };
@@ -119,16 +120,123 @@ impl First for Tensor {
     }
 }
 
+/// Weights of a loss over the planes, away from anything regular.
+fn weights() -> Tensor {
+    let v: Vec<f32> = (0..5 * 21 * 29).map(|i| (i as f32 * 0.37).sin()).collect();
+    Tensor::from_vec(v, (5, 21, 29), &Device::Cpu).unwrap()
+}
+
 #[test]
-fn backward_is_an_error_and_not_silence() {
-    let (rows, sh, gain) = splats().to_tensors(&Device::Cpu).unwrap();
-    let o = RasterOptions::default();
-    for which in 0..3 {
-        let mut inputs = [rows.clone(), sh.clone(), gain.clone()];
-        let variable = Var::from_tensor(&inputs[which]).unwrap();
-        inputs[which] = variable.as_tensor().clone();
-        let out = rasterize(&inputs[0], &inputs[1], &inputs[2], &camera(), &o).unwrap();
-        let error = out.sum_all().unwrap().backward().unwrap_err().to_string();
-        assert!(error.contains("rasterize"), "{error}");
+fn gradients_are_the_kernels_and_those_of_the_loss() {
+    let (mut s, camera, o) = (splats(), camera(), RasterOptions::default());
+    // So wide and faint that no support ends inside the picture and no pixel stops: a
+    // finite step then meets no jump.
+    for row in s.rows.chunks_exact_mut(11) {
+        row[7..10].iter_mut().for_each(|scale| *scale *= 20.0);
+        row[10] = 0.35;
     }
+    let (rows, sh, gain) = s.to_tensors(&Device::Cpu).unwrap();
+    let variables = [&rows, &sh, &gain].map(|t| Var::from_tensor(t).unwrap());
+    let [a, b, c] = variables.each_ref().map(|v| v.as_tensor().clone());
+    let planes = rasterize(&a, &b, &c, &camera, &o).unwrap();
+    let loss = (&planes * weights()).unwrap().sum_all().unwrap();
+    // Twice: what the forward left serves any number of backward passes.
+    let store = loss.backward().unwrap();
+    let again = loss.backward().unwrap();
+    let mut kernel = Gradients::default();
+    let v: Vec<f32> = weights().flatten_all().unwrap().to_vec1().unwrap();
+    let slices = subsplat::render::slices(&s);
+    Rasterizer::new().backward(&slices, &camera, &o, &v, &mut kernel);
+    for (variable, expected) in variables.iter().zip([&kernel.rows, &kernel.sh, &kernel.gain]) {
+        for store in [&store, &again] {
+            let got = store.get(variable).unwrap();
+            assert_eq!(got.dims(), variable.dims());
+            let got: Vec<f32> = got.flatten_all().unwrap().to_vec1().unwrap();
+            assert!(got == *expected && got.iter().any(|&g| g != 0.0));
+        }
+    }
+
+    // Σ ∂L/∂x·Δ against the loss itself, along a direction in all inputs of a kind.
+    for (which, step) in [(0, 2e-4f32), (1, 1e-3), (2, 1e-3)] {
+        let dims = variables[which].dims();
+        let n: usize = dims.iter().product();
+        let direction: Vec<f32> = (0..n).map(|i| (i as f32 * 1.7).cos()).collect();
+        let direction = Tensor::from_vec(direction, dims, &Device::Cpu).unwrap();
+        let at = |sign: f64| -> f64 {
+            let mut inputs = [rows.clone(), sh.clone(), gain.clone()];
+            let moved = (&direction * (sign * f64::from(step))).unwrap();
+            inputs[which] = (&inputs[which] + moved).unwrap();
+            let [a, b, c] = &inputs;
+            let planes = rasterize(a, b, c, &camera, &o).unwrap();
+            let planes = (planes.to_dtype(DType::F64).unwrap())
+                .mul(&weights().to_dtype(DType::F64).unwrap())
+                .unwrap();
+            planes.sum_all().unwrap().to_scalar::<f64>().unwrap()
+        };
+        let measured = (at(1.0) - at(-1.0)) / (2.0 * f64::from(step));
+        let got = (store.get(&variables[which]).unwrap() * &direction).unwrap();
+        let got = f64::from(got.sum_all().unwrap().to_scalar::<f32>().unwrap());
+        let scale = measured.abs().max(1.0);
+        assert!((got - measured).abs() < 0.02 * scale, "input {which}: {got} {measured}");
+    }
+}
+
+/// The tensors that a user optimises: parts packed by candle, gain or none, a view.
+#[test]
+fn splat_tensors_pass_gradients_to_their_parts() {
+    let (s, camera, o) = (splats(), camera(), RasterOptions::default());
+    let (rows, sh, _) = s.to_tensors(&Device::Cpu).unwrap();
+    let part = |from: usize, n: usize| {
+        let part = rows.narrow(1, from, n).unwrap().contiguous().unwrap();
+        Var::from_tensor(&part).unwrap()
+    };
+    let (means, quats, scales) = (part(0, 3), part(3, 4), part(7, 3));
+    let opacities = Var::from_tensor(&part(10, 1).flatten_all().unwrap()).unwrap();
+    let sh = Var::from_tensor(&sh).unwrap();
+    let tensors =
+        SplatTensors::from_parts(&means, &quats, &scales, &opacities, &sh, s.sh_basis).unwrap();
+    let planes = subsplat::rasterize(&tensors, &camera, &o).unwrap();
+    let mut plain = s.clone();
+    plain.gain = Vec::new();
+    let picture = subsplat::render(&plain, &camera, &o);
+    let got: Vec<f32> = planes.get(3).unwrap().flatten_all().unwrap().to_vec1().unwrap();
+    assert!(got == picture.alpha);
+    let store = (&planes * weights()).unwrap().sum_all().unwrap().backward().unwrap();
+    for v in [&means, &quats, &scales, &opacities, &sh] {
+        let g = store.get(v).unwrap().abs().unwrap().sum_all().unwrap();
+        assert!(g.to_scalar::<f32>().unwrap() > 1e-3);
+    }
+    // With its gain, and with SH that is a view of something else.
+    let mut tensors = SplatTensors::new(&s, &Device::Cpu).unwrap();
+    tensors.sh = tensors.sh.transpose(0, 1).unwrap().contiguous().unwrap().transpose(0, 1).unwrap();
+    let planes = subsplat::rasterize(&tensors, &camera, &o).unwrap();
+    let got: Vec<f32> = planes.get(0).unwrap().flatten_all().unwrap().to_vec1().unwrap();
+    let picture = subsplat::render(&s, &camera, &o);
+    assert!(got.iter().zip(picture.rgb.chunks_exact(3)).all(|(g, p)| *g == p[0]));
+}
+
+#[test]
+fn a_background_tensor_is_the_option_and_has_a_gradient() {
+    let (s, camera) = (splats(), camera());
+    let black = RasterOptions::default();
+    let background = [0.2f32, 0.5, 0.9];
+    let tensors = SplatTensors::new(&s, &Device::Cpu).unwrap();
+    let variable = Var::new(&background, &Device::Cpu).unwrap();
+    let planes = subsplat::rasterize(&tensors, &camera, &black).unwrap();
+    let over = over_background(&planes, &variable).unwrap();
+    let fixed = RasterOptions { background, ..black };
+    let expected = subsplat::rasterize(&tensors, &camera, &fixed).unwrap();
+    let apart = (&over - &expected).unwrap().abs().unwrap().max_all().unwrap();
+    assert!(apart.to_scalar::<f32>().unwrap() < 1e-6);
+    let store = (&over * weights()).unwrap().sum_all().unwrap().backward().unwrap();
+    let got: Vec<f32> = store.get(&variable).unwrap().to_vec1().unwrap();
+    let mut kernel = Gradients::default();
+    let v: Vec<f32> = weights().flatten_all().unwrap().to_vec1().unwrap();
+    let slices = subsplat::render::slices(&s);
+    Rasterizer::new().backward(&slices, &camera, &fixed, &v, &mut kernel);
+    for (g, e) in got.iter().zip(kernel.background) {
+        assert!((g - e).abs() < 1e-4 * e.abs().max(1.0), "{g} {e}");
+    }
+    let error = over_background(&planes.narrow(0, 0, 4).unwrap(), &variable).unwrap_err();
+    assert!(error.to_string().contains("[4, 21, 29]"), "{error}");
 }

@@ -11,7 +11,7 @@ use subsplat::abi::{
     ALPHA_MIN, Convention, LANE_OPACITY, RasterOptions, SPLAT_LANES, ShBasis, ShDirection,
 };
 use subsplat::camera::{Camera, Intrinsics};
-use subsplat::cpu::{Geometry, Rasterizer, Rendered, SplatSlices};
+use subsplat::cpu::{Geometry, Rasterizer, Rendered, SplatSlices, Tier};
 use subsplat::splats::Splats;
 
 /// xorshift64*.
@@ -200,12 +200,15 @@ fn random_scenes_agree() {
                 ];
                 for (v, o) in variants.into_iter().enumerate() {
                     let what = format!("{kind:?} {size:?} {convention:?} variant {v}");
-                    let mut rasterizer = Rasterizer::new();
-                    let got = rasterizer.render(&slices(&scene.splats), &scene.camera, &o);
                     let expected = oracle::render(&splats, &scene.camera, &o);
-                    let (d, b) = compare(&got, &expected, &what, 5e-5);
-                    worst = worst.max(d);
-                    boundary += b;
+                    for &tier in Tier::available() {
+                        let mut rasterizer = Rasterizer::new().with_tier(tier);
+                        let got = rasterizer.render(&slices(&scene.splats), &scene.camera, &o);
+                        let what = format!("{what} {tier:?}");
+                        let (d, b) = compare(&got, &expected, &what, 5e-5);
+                        worst = worst.max(d);
+                        boundary += b;
+                    }
                     pixels += expected.alpha.len();
                     if size == (64, 48) {
                         let covered = expected.alpha.iter().filter(|&&a| a > 0.05).count();
@@ -216,6 +219,7 @@ fn random_scenes_agree() {
         }
     }
     eprintln!("oracle: worst {worst:.1e}, boundary {boundary} of {pixels} pixels");
+    let pixels = pixels * Tier::available().len();
     assert!(boundary * 200 < pixels, "boundary: {boundary} of {pixels} pixels");
 }
 
@@ -315,8 +319,10 @@ fn any_number_of_threads_and_any_memory_gives_the_same_bytes() {
         all.splats.gain.extend_from_slice(&more.splats.gain);
     }
     assert!(all.splats.len() > 10_000);
-    for convention in [Convention::Standard, Convention::Mvsplat] {
+    let tiers = Tier::available().iter().map(|&tier| (Convention::Standard, tier));
+    for (convention, tier) in tiers.chain([(Convention::Mvsplat, Tier::best())]) {
         let o = options(convention);
+        let new = || Rasterizer::new().with_tier(tier);
         let run = |threads: usize, mut rasterizer: Rasterizer| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             pool.install(|| {
@@ -330,16 +336,22 @@ fn any_number_of_threads_and_any_memory_gives_the_same_bytes() {
                 (first, rasterizer.stats())
             })
         };
-        let (one, stats) = run(1, Rasterizer::new());
-        let (three, stats3) = run(3, Rasterizer::new());
-        assert!(bytes(&one) == bytes(&three), "{convention:?}: threads change the picture");
+        let (one, stats) = run(1, new());
+        let (three, stats3) = run(3, new());
+        assert!(
+            bytes(&one) == bytes(&three),
+            "{convention:?} {tier:?}: threads change the picture"
+        );
         assert_eq!((stats.pairs, stats.items), (stats3.pairs, stats3.items));
         for limit in [0, stats.pairs / 7] {
-            let (few, _) = run(2, Rasterizer::new().with_pairs_per_group(limit));
-            assert!(bytes(&one) == bytes(&few), "{convention:?}: the limit changes the picture");
+            let (few, _) = run(2, new().with_pairs_per_group(limit));
+            assert!(
+                bytes(&one) == bytes(&few),
+                "{convention:?} {tier:?}: the limit changes the picture"
+            );
         }
         let mut planes = Vec::new();
-        Rasterizer::new().render_planes(&slices(&all.splats), &camera, &o, &mut planes);
+        new().render_planes(&slices(&all.splats), &camera, &o, &mut planes);
         let pixels = one.alpha.len();
         for p in 0..pixels {
             let got: [f32; 5] = std::array::from_fn(|c| planes[c * pixels + p]);
@@ -347,6 +359,103 @@ fn any_number_of_threads_and_any_memory_gives_the_same_bytes() {
             assert_eq!(got, [rgb[0], rgb[1], rgb[2], one.alpha[p], one.depth_sum[p]]);
         }
     }
+}
+
+/// Tiers with fused products agree to the byte, however wide their registers; the
+/// scalar one, which rounds products as well, to 1e-5 but for pixels where that flips
+/// a decision.
+#[test]
+fn tiers_agree() {
+    let (mut flipped, mut pixels) = (0, 0);
+    for (i, kind) in KINDS.into_iter().enumerate() {
+        let scene = scene(kind, 40 + i as u64, (100, 75), [0, 1, 4][i % 3]);
+        for convention in [Convention::Standard, Convention::Mvsplat] {
+            let o = options(convention);
+            let render = |tier| {
+                Rasterizer::new().with_tier(tier).render(&slices(&scene.splats), &scene.camera, &o)
+            };
+            let scalar = render(Tier::Scalar);
+            let fused = Tier::available().iter().filter(|&&t| t != Tier::Scalar);
+            let fused: Vec<Rendered> = fused.map(|&t| render(t)).collect();
+            for other in fused.windows(2) {
+                assert!(bytes(&other[0]) == bytes(&other[1]), "{kind:?} {convention:?}");
+            }
+            if let Some(picture) = fused.first() {
+                pixels += picture.alpha.len();
+                for (a, b) in picture.rgb.chunks_exact(3).zip(scalar.rgb.chunks_exact(3)) {
+                    let apart = a.iter().zip(b).map(|(a, b)| (a - b).abs() / b.abs().max(1.0));
+                    flipped += usize::from(apart.fold(0.0, f32::max) > 1e-5);
+                }
+            }
+        }
+    }
+    eprintln!("{flipped} of {pixels} pixels differ between scalar and fused tiers");
+    assert!(flipped * 100 <= pixels, "{flipped} of {pixels} pixels");
+}
+
+/// A context that was told no tier takes the best; one that is told a tier which the
+/// processor lacks still draws.
+#[test]
+fn foreign_tiers_draw_as_the_scalar_one() {
+    let scene = scene(Kind::Plain, 11, (64, 48), 0);
+    let o = options(Convention::Standard);
+    let render = |r: Rasterizer| bytes(&{ r }.render(&slices(&scene.splats), &scene.camera, &o));
+    assert!(render(Rasterizer::new()) == render(Rasterizer::new().with_tier(Tier::best())));
+    for tier in [Tier::Avx2, Tier::Avx512, Tier::Neon] {
+        if !tier.is_available() {
+            let scalar = Rasterizer::new().with_tier(Tier::Scalar);
+            assert!(render(Rasterizer::new().with_tier(tier)) == render(scalar));
+        }
+    }
+}
+
+/// A million splats in one tile, and splats far larger than the picture.
+#[test]
+fn crowds_and_giants_are_drawn() {
+    let k = Intrinsics { fx: 60.0, fy: 60.0, cx: 20.0, cy: 20.0, width: 40, height: 40 };
+    let camera = Camera::new(k, Mat4::IDENTITY).unwrap();
+    let mut r = Random(77);
+    let n = 1 << 20;
+    let mut rows = Vec::with_capacity(SPLAT_LANES * n);
+    for i in 0..n {
+        let z = 2.0 + 3.0 * r.unit();
+        let giant = i % 50_000 == 0;
+        let scale = if giant { 1e6 } else { 0.002 };
+        // All within one pixel of (10.5, 10.5).
+        rows.extend([-0.16 * z, -0.16 * z, z, 1.0, 0.0, 0.0, 0.0, scale, scale, scale * 0.5]);
+        rows.push(if giant { 0.05 } else { 0.008 });
+    }
+    let splats = Splats::new(rows, vec![0.3; 3 * n], vec![], 0, ShBasis::Standard).unwrap();
+    let o = options(Convention::Standard);
+    let mut rasterizer = Rasterizer::new();
+    let picture = rasterizer.render(&slices(&splats), &camera, &o);
+    assert!(picture.rgb.iter().all(|v| v.is_finite()));
+    assert!(picture.alpha.iter().all(|&a| a > 0.5), "giants cover the picture");
+    assert!(picture.alpha[10 * 40 + 10] > 0.9995, "the crowd is opaque");
+    assert!(rasterizer.stats().visible == n);
+    // Front to back: with all of one colour, C = c·alpha + T·background.
+    let colour = 0.5 + 0.3 * 0.282_094_8;
+    for p in 0..1600 {
+        for c in 0..3 {
+            let a = picture.alpha[p];
+            let expected = a * colour + (1.0 - a) * o.background[c];
+            assert!((picture.rgb[3 * p + c] - expected).abs() < 2e-5);
+        }
+    }
+}
+
+/// Stage times are zeros unless asked for.
+#[test]
+fn stage_times_are_asked_for() {
+    let scene = scene(Kind::Plain, 2, (64, 48), 0);
+    let o = options(Convention::Standard);
+    let mut plain = Rasterizer::new();
+    plain.render(&slices(&scene.splats), &scene.camera, &o);
+    assert_eq!(plain.stage_times(), Default::default());
+    let mut timed = Rasterizer::new().with_stage_times();
+    timed.render(&slices(&scene.splats), &scene.camera, &o);
+    let t = timed.stage_times();
+    assert!([t.project, t.list, t.tiles, t.sort, t.blend, t.write].iter().all(|d| !d.is_zero()));
 }
 
 fn bytes(picture: &Rendered) -> Vec<u32> {

@@ -97,9 +97,16 @@ impl Tile {
     }
 }
 
-/// Composites one tile.
+/// What a thread composites with.
+#[derive(Default)]
+pub(crate) struct Workplace {
+    pub(crate) tile: Tile,
+    batch: Batch,
+}
+
+/// Composites one tile into `place.tile`.
 pub(crate) struct RenderTile<'a> {
-    pub(crate) tile: &'a mut Tile,
+    pub(crate) place: &'a mut Workplace,
     /// Which tile of `grid`.
     pub(crate) t: usize,
     pub(crate) grid: Grid,
@@ -116,39 +123,34 @@ impl Kernel for RenderTile<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) -> usize {
-        let (left, top) = (self.t % self.grid.columns * TILE, self.t / self.grid.columns * TILE);
-        let mut live = self.tile.reset(self.grid.width - left, self.grid.height - top);
+        let Self { place: Workplace { tile, batch }, t, grid, order, splats, footprints, rules } =
+            self;
+        let (left, top) = (t % grid.columns * TILE, t / grid.columns * TILE);
+        let mut live = tile.reset(grid.width - left, grid.height - top);
         let corner = [left as f32, top as f32];
-        let mut batch = Batch::new();
         let mut items = 0;
-        let mut rest = self.order;
-        self.prefetch(s, rest);
+        let mut rest = order;
         while live != 0 && !rest.is_empty() {
             let (now, later) = rest.split_at(rest.len().min(BATCH));
-            batch.load(s, now, self.splats, self.footprints, corner);
-            self.prefetch(s, later);
+            batch.load(s, now, splats, footprints, corner);
             let mut blocks = live;
+            // The next batch's footprints are asked for a few at a time: the memory
+            // system holds no more requests than that, and would wait.
+            let portion = BATCH.div_ceil(live.count_ones() as usize);
+            let mut wanted = later[..later.len().min(BATCH)].chunks(portion);
             while blocks != 0 {
                 let b = blocks.trailing_zeros() as usize;
                 blocks &= blocks - 1;
-                let (count, goes_on) =
-                    batch.blend(s, &mut self.tile.blocks[b], b, corner, self.rules);
+                for &place in wanted.next().unwrap_or(&[]) {
+                    s.prefetch(&footprints[splats[place as usize] as usize]);
+                }
+                let (count, goes_on) = batch.blend(s, &mut tile.blocks[b], b, corner, rules);
                 items += count;
                 live &= !(u64::from(!goes_on) << b);
             }
             rest = later;
         }
         items
-    }
-}
-
-impl RenderTile<'_> {
-    /// Asks for the footprints of the first batch of `order`.
-    #[inline(always)]
-    fn prefetch<S: Simd>(&self, s: S, order: &[u32]) {
-        for &place in &order[..order.len().min(BATCH)] {
-            s.prefetch(&self.footprints[self.splats[place as usize] as usize]);
-        }
     }
 }
 
@@ -159,12 +161,13 @@ struct Batch {
     words: [[u64; BLOCKS * BLOCKS]; WORDS],
 }
 
-impl Batch {
-    #[inline(always)]
-    fn new() -> Self {
+impl Default for Batch {
+    fn default() -> Self {
         Self { footprints: [Footprint::default(); BATCH], words: [[0; 64]; WORDS] }
     }
+}
 
+impl Batch {
     /// Takes the splats at `places` and finds the blocks that they meet.
     #[inline(always)]
     fn load<S: Simd>(
@@ -217,7 +220,6 @@ impl Batch {
         let [mut red, mut green, mut blue] =
             [s.load(&block.rgb[0]), s.load(&block.rgb[1]), s.load(&block.rgb[2])];
         let mut z = s.load(&block.z);
-        let mut live = s.lt(s.splat(0.0), t);
         let mut count = 0;
         let mut goes_on = true;
         'batch: for (words, footprints) in self.words.iter().zip(self.footprints.chunks_exact(64)) {
@@ -230,27 +232,27 @@ impl Batch {
                 let across = s.fma(s.splat(f.shear), dy, dx) * s.splat(f.sx);
                 let down = dy * s.splat(f.sy);
                 let power = s.fnma(down, down, s.fnma(across, across, s.splat(f.power)));
-                let shows = s.le(least, power) & live;
                 // The clamp keeps denormals away.
                 let alpha = s.min(simd::exp2(s, s.max(power, least)), cap);
+                let alpha = s.keep(s.le(least, power), alpha);
                 let rest = s.fnma(alpha, t, t);
-                let adds = s.lt(stop, rest) & shows;
-                let w = s.keep(adds, alpha * t);
-                t = s.select(adds, rest, t);
-                live = live & (adds | !shows);
+                // Where blending goes on, T > stop, so an alpha of 0 changes nothing;
+                // where it has stopped, T < 0, so it stays there.
+                let goes = s.lt(stop, rest);
+                let w = s.keep(goes, alpha * t);
+                t = s.select(goes, rest, s.negative(t));
                 red = s.fma(w, s.splat(f.rgb[0]), red);
                 green = s.fma(w, s.splat(f.rgb[1]), green);
                 blue = s.fma(w, s.splat(f.rgb[2]), blue);
                 z = s.fma(w, s.splat(f.z), z);
-                if !s.any(live) {
+                if !s.any(goes) {
                     goes_on = false;
                     break 'batch;
                 }
             }
         }
         if count > 0 {
-            // Where blending has stopped, T < 0.
-            s.store(s.select(live, t, -s.abs(t)), &mut block.t);
+            s.store(t, &mut block.t);
             s.store(red, &mut block.rgb[0]);
             s.store(green, &mut block.rgb[1]);
             s.store(blue, &mut block.rgb[2]);

@@ -205,13 +205,14 @@ mod tests {
                     tier.run(Met(&splats, corner)).into_iter().zip(exact).enumerate()
                 {
                     assert_eq!(exact & !got, 0, "{tier:?} {:?}", splats[l]);
-                    let columns = if splats[l].x1 == 80 { 0x0f0f_0f0f_0f0f_0f0f } else { u64::MAX };
-                    assert_eq!(got & !(columns << 8 & !0xff), got & 0, "{tier:?} outside");
+                    let rectangle: u64 =
+                        if splats[l].x1 == 80 { 0x0f0f_0f0f_0f0f_0f00 } else { !0xff };
+                    assert_eq!(got & !rectangle, 0, "{tier:?} {:?}: outside", splats[l]);
                     named[i] += got.count_ones();
                 }
             }
         }
-        assert!(needed > 20_000, "{needed}");
+        assert!(needed > 5000, "{needed}");
         for (named, tier) in named.iter().zip(Tier::available()) {
             assert!(f64::from(*named) < 1.15 * f64::from(needed), "{tier:?}: {named} of {needed}");
         }

@@ -76,7 +76,11 @@ impl Jacobian {
         let ((sx, fx), (sy, fy)) = (at(0), at(1));
         let [x, y, z] = view.rows;
         let row = |f: f32, axis: [f32; 3], slope: f32| {
-            [f * (axis[0] - slope * z[0]), f * (axis[1] - slope * z[1]), f * (axis[2] - slope * z[2])]
+            [
+                f * (axis[0] - slope * z[0]),
+                f * (axis[1] - slope * z[1]),
+                f * (axis[2] - slope * z[2]),
+            ]
         };
         let rows = [row(view.focal[0] / p[2], x, sx), row(view.focal[1] / p[2], y, sy)];
         Self { p, slope: [sx, sy], free: [fx, fy], rows }
@@ -116,7 +120,11 @@ fn pixel_gradient(m: &Moments, w: Whitening) -> [f32; 2] {
 fn covariance_gradient(m: &Moments, Whitening { a, b, c }: Whitening) -> Gradient2d {
     let k = 2.0 * LN_2 * LN_2;
     let skew = b * m.dd + c * m.ds;
-    Gradient2d { xx: k * a * a * m.dd, xy: k * a * skew, yy: k * (b * skew + c * (b * m.ds + c * m.ss)) }
+    Gradient2d {
+        xx: k * a * a * m.dd,
+        xy: k * a * skew,
+        yy: k * (b * skew + c * (b * m.ds + c * m.ss)),
+    }
 }
 
 /// The antialiased opacity is o·√(det Σ₀ / det Σ): its share of ∂L/∂Σ.
@@ -178,7 +186,9 @@ pub(crate) fn quat_gradient(
     let d_scale = |k: usize| g0[k] * reach[0][k] + g1[k] * reach[1][k];
     let row_gradient = |g: [f32; 3]| {
         let at = |c: usize| {
-            g[0] * scale[0] * axes[0][c] + g[1] * scale[1] * axes[1][c] + g[2] * scale[2] * axes[2][c]
+            g[0] * scale[0] * axes[0][c]
+                + g[1] * scale[1] * axes[1][c]
+                + g[2] * scale[2] * axes[2][c]
         };
         [at(0), at(1), at(2)]
     };

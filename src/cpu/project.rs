@@ -12,15 +12,15 @@ use crate::abi::{
     LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, RasterOptions, SPLAT_LANES, ShBasis,
     ShDirection, sh_coefficients,
 };
-use crate::cpu::ewa::{FIELDS, Footprint, Shape, View};
+use crate::cpu::covariance::Shape;
+use crate::cpu::ewa::{FIELDS, Footprint, View};
 use crate::cpu::sh::{direction_lanes, radiance_lanes};
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
 use crate::cpu::tiles::{ChunkCover, TileLists};
 use rayon::prelude::*;
 
-/// Splats per unit of parallel work. A constant, so that no result can depend on
-/// the number of threads.
-pub(crate) const CHUNK: usize = 4096;
+/// Parents per unit of parallel work.
+const PARENTS: usize = 256;
 
 const _: () = assert!(LANE_OPACITY == LANE_SCALE + 3 && LANE_QUAT == LANE_MEAN + 3);
 
@@ -141,15 +141,16 @@ impl Projection {
             let children = splats.children_per_parent();
             let parents = splats.parents().max(splats.len().div_ceil(children));
             self.parents.resize(parents, [0.0; 3]);
-            self.parents.par_chunks_mut(CHUNK / 16).enumerate().for_each(|(c, out)| {
-                tier.run(Parents { splats, view, basis, first: c * (CHUNK / 16), out });
+            self.parents.par_chunks_mut(PARENTS).enumerate().for_each(|(c, out)| {
+                tier.run(Parents { splats, view, basis, first: c * PARENTS, out });
             });
         }
         self.footprints.resize(splats.len(), Footprint::default());
         let parents = shared.then_some(&self.parents[..]);
-        let chunks = self.footprints.par_chunks_mut(CHUNK).zip(lists.chunks(splats.len()));
+        let chunk = lists.chunk();
+        let chunks = self.footprints.par_chunks_mut(chunk).zip(lists.chunks(splats.len()));
         chunks.enumerate().for_each(|(c, (footprints, cover))| {
-            tier.run(Chunk { splats, view, basis, parents, first: c * CHUNK, footprints, cover });
+            tier.run(Chunk { splats, view, basis, parents, first: c * chunk, footprints, cover });
         });
     }
 }
@@ -237,6 +238,7 @@ impl Kernel for Chunk<'_> {
             kept[count..count + LANES].fill(last);
             let mut g = 0;
             while g < count {
+                self.prefetch(s, &kept[(g + AHEAD).min(count)..(g + AHEAD + LANES).min(count)]);
                 let (group, _) = kept[g..].split_at(LANES);
                 self.colour(s, group, (count - g).min(LANES));
                 g += LANES;
@@ -252,7 +254,35 @@ impl Kernel for Chunk<'_> {
     }
 }
 
+/// How many splats ahead their coefficients are asked for.
+const AHEAD: usize = 2 * LANES;
+
 impl Chunk<'_> {
+    /// Asks for the SH sets of some splats of the chunk.
+    #[inline(always)]
+    fn prefetch<S: Simd>(&self, s: S, group: &[u32]) {
+        /// Floats of a cache line.
+        const LINE: usize = 16;
+        if self.parents.is_some() {
+            return;
+        }
+        let set = 3 * sh_coefficients(self.splats.sh_degree);
+        let children = self.splats.children_per_parent();
+        let mut last = usize::MAX;
+        for &i in group {
+            let i = self.first + i as usize;
+            let p = if children == 1 { i } else { i / children };
+            if p != last {
+                for at in (p * set..(p + 1) * set).step_by(LINE) {
+                    if let Some(v) = self.splats.sh.get(at) {
+                        s.prefetch(v);
+                    }
+                }
+                last = p;
+            }
+        }
+    }
+
     /// Footprints without colour of the chunk's splats `start..past`; writes the
     /// places of the kept ones to `kept` and returns how many they are.
     #[inline(always)]

@@ -7,23 +7,23 @@
 //! whatever numbers they hold.
 
 use crate::abi::{
-    LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, RasterOptions, SH_COEFFICIENTS_MAX,
-    SPLAT_LANES, ShBasis, ShDirection, sh_coefficients,
+    LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, RasterOptions, SPLAT_LANES, ShDirection,
+    sh_coefficients,
 };
+use crate::cpu::colour_bwd::Directions;
 use crate::cpu::ewa::{Footprint, View};
 use crate::cpu::ewa_bwd::{Moments, Whitening, cov6_gradient, quat_gradient};
 use crate::cpu::project::{Geometry, SplatSlices, lanes_at};
 use crate::cpu::raster_bwd_tile::{PairSums, SUMS};
-use crate::cpu::sh_bwd::{used_coefficients, values_and_slope};
 use crate::cpu::simd::{Kernel, Simd, Tier};
 use rayon::prelude::*;
 
 /// Splats side by side.
-const GROUP: usize = 16;
+pub(crate) const GROUP: usize = 16;
 /// Splats per unit of parallel work, about.
 const PART: usize = 2048;
 
-type L = [f32; GROUP];
+pub(crate) type L = [f32; GROUP];
 
 /// Gradients of a scalar loss with respect to what [`SplatSlices`] holds, in its
 /// layouts; buffers are reused from call to call. Splats that were dropped, and all that
@@ -84,49 +84,34 @@ pub(crate) struct Pass<'a> {
 }
 
 /// The gradients of a run of whole families.
-struct Part<'a> {
+pub(crate) struct Part<'a> {
     /// First splat.
-    first: usize,
-    len: usize,
+    pub(crate) first: usize,
+    pub(crate) len: usize,
     rows: &'a mut [f32],
     means: &'a mut [f32],
     cov6: &'a mut [f32],
     opacities: &'a mut [f32],
-    sh: &'a mut [f32],
+    pub(crate) sh: &'a mut [f32],
     gain: &'a mut [f32],
 }
 
 /// Sixteen splats in structure of arrays.
 #[derive(Default)]
 #[repr(C, align(64))]
-struct Group {
-    mean: [L; 3],
+pub(crate) struct Group {
+    pub(crate) mean: [L; 3],
     quat: [L; 4],
     scale: [L; 3],
     cov6: [L; 6],
     opacity: L,
     whitening: [L; 3],
-    sums: [L; SUMS],
-    d_mean: [L; 3],
+    pub(crate) sums: [L; SUMS],
+    pub(crate) d_mean: [L; 3],
     d_quat: [L; 4],
     d_scale: [L; 3],
     d_cov6: [L; 6],
     d_opacity: L,
-}
-
-/// Directions in which SH are seen, sixteen at a time.
-#[repr(C, align(64))]
-struct Directions {
-    /// From the eye, world.
-    towards: [L; 3],
-    /// Σ_c ∂L/∂rgb_c·sh_{k,c}.
-    s: [L; SH_COEFFICIENTS_MAX],
-    /// Y_k.
-    y: [L; SH_COEFFICIENTS_MAX],
-    /// Σ_k s_k Y_k.
-    value: L,
-    /// ∂/∂towards of that.
-    slope: [L; 3],
 }
 
 /// One part of a pass, compiled for a tier.
@@ -175,25 +160,30 @@ impl Pass<'_> {
 
     #[inline(always)]
     fn part(&self, mut part: Part) {
-        part.sh.fill(0.0);
+        let shared = self.options.sh_direction == ShDirection::Parent;
+        // Without siblings, every SH set is written once.
+        let single = !shared && self.splats.children_per_parent() == 1;
+        if !single {
+            part.sh.fill(0.0);
+        }
         let mut group = Group::default();
         let mut seen = Directions::default();
         for at in (0..part.len).step_by(GROUP) {
             let count = GROUP.min(part.len - at);
             let alive = self.load(part.first + at, count, &mut group);
             if alive == 0 {
-                part.clear(at, count);
+                part.clear(at, count, single);
                 continue;
             }
             self.geometry(&mut group);
-            if self.options.sh_direction == ShDirection::Child {
-                self.child_colours(&mut part, at, alive, &mut group, &mut seen);
+            if !shared {
+                self.child_colours(&mut part, (at, single), alive, &mut group, &mut seen);
             } else {
                 self.parent_gains(&mut part, at, count, &group);
             }
             part.store(at, count, &group);
         }
-        if self.options.sh_direction == ShDirection::Parent {
+        if shared {
             self.parent_colours(&mut part, &mut seen);
         }
     }
@@ -244,7 +234,7 @@ impl Pass<'_> {
 
     /// The sums of visible splat `i`, those of a clamped colour channel as 0.
     #[inline(always)]
-    fn sums_of(&self, i: usize) -> [f32; SUMS] {
+    pub(crate) fn sums_of(&self, i: usize) -> [f32; SUMS] {
         let mut sums = self.sums[i];
         for (v, colour) in sums[6..9].iter_mut().zip(self.footprints[i].rgb) {
             *v = if colour > 0.0 { *v } else { 0.0 };
@@ -274,183 +264,11 @@ impl Pass<'_> {
             group.d_opacity[l] = m.one / group.opacity[l];
         }
     }
-
-    /// SH, gain and direction where every child looks along its own mean.
-    #[inline(always)]
-    fn child_colours(
-        &self,
-        part: &mut Part,
-        at: usize,
-        alive: u32,
-        group: &mut Group,
-        seen: &mut Directions,
-    ) {
-        let children = self.splats.children_per_parent();
-        let used = self.used();
-        for l in 0..GROUP {
-            let towards = minus(get(&group.mean, l), self.view.eye);
-            put(&mut seen.towards, l, towards);
-        }
-        for l in lanes_of(alive) {
-            let sh = sh_of_parent(self.splats, (part.first + at + l) / children);
-            seen.weigh(l, used, sh, get(&group.sums, l)[6..9].try_into().unwrap_or_default());
-        }
-        seen.evaluate(used, self.options.sh_basis);
-        let set = 3 * sh_coefficients(self.splats.sh_degree);
-        for l in lanes_of(alive) {
-            let i = part.first + at + l;
-            let gain = gain_of(self.splats, i);
-            let rgb = [group.sums[6][l], group.sums[7][l], group.sums[8][l]];
-            for c in 0..3 {
-                group.d_mean[c][l] += gain * seen.slope[c][l];
-            }
-            let p = (at + l) / children;
-            if let Some(sh) = part.sh.get_mut(p * set..(p + 1) * set) {
-                seen.add_to(sh, l, used, rgb.map(|v| gain * v));
-            }
-        }
-        for l in 0..GROUP.min(part.len - at) {
-            let value = if alive & (1 << l) != 0 { seen.value[l] } else { 0.0 };
-            part.put_gain(at + l, value, [group.sums[6][l], group.sums[7][l], group.sums[8][l]]);
-        }
-    }
-
-    /// Gain where the children of a parent share its direction.
-    #[inline(always)]
-    fn parent_gains(&self, part: &mut Part, at: usize, count: usize, group: &Group) {
-        let children = self.splats.children_per_parent();
-        for l in 0..count {
-            let rgb: [f32; 3] = std::array::from_fn(|c| group.sums[6 + c][l]);
-            let radiance = self.radiance[(part.first + at + l) / children];
-            let alive = rgb.iter().any(|&v| v != 0.0);
-            let value = (0..3).map(|c| rgb[c] * radiance[c]).sum();
-            part.put_gain(at + l, if alive { value } else { 0.0 }, rgb);
-        }
-    }
-
-    /// SH and direction of every parent of `part`, the latter shared by its children.
-    #[inline(always)]
-    fn parent_colours(&self, part: &mut Part, seen: &mut Directions) {
-        let children = self.splats.children_per_parent();
-        let (used, set) = (self.used(), 3 * sh_coefficients(self.splats.sh_degree));
-        let parents = part.len.div_ceil(children);
-        for first in (0..parents).step_by(GROUP) {
-            let mut weighted = [[0.0f32; 3]; GROUP];
-            let mut count = [0.0f32; GROUP];
-            let mut alive = 0;
-            for l in 0..GROUP.min(parents - first) {
-                let family = (first + l) * children..((first + l + 1) * children).min(part.len);
-                let mut sum = [0.0f32; 3];
-                for i in family.map(|j| part.first + j) {
-                    let d = minus(self.splats.mean(i), self.view.eye);
-                    if d.iter().all(|v| v.is_finite()) {
-                        sum = [sum[0] + d[0], sum[1] + d[1], sum[2] + d[2]];
-                        count[l] += 1.0;
-                    }
-                    if !self.footprints[i].visible() {
-                        continue;
-                    }
-                    let (gain, sums) = (gain_of(self.splats, i), self.sums_of(i));
-                    for c in 0..3 {
-                        weighted[l][c] += gain * sums[6 + c];
-                    }
-                }
-                put(&mut seen.towards, l, sum.map(|v| v / count[l].max(1.0)));
-                alive |= u32::from(weighted[l] != [0.0; 3]) << l;
-            }
-            for l in lanes_of(alive) {
-                let p = part.first / children + first + l;
-                seen.weigh(l, used, sh_of_parent(self.splats, p), weighted[l]);
-            }
-            seen.evaluate(used, self.options.sh_basis);
-            for l in lanes_of(alive) {
-                let p = first + l;
-                if let Some(sh) = part.sh.get_mut(p * set..(p + 1) * set) {
-                    seen.add_to(sh, l, used, weighted[l]);
-                }
-                let share = get(&seen.slope, l).map(|v: f32| v / count[l].max(1.0));
-                for j in p * children..((p + 1) * children).min(part.len) {
-                    let mean = self.splats.mean(part.first + j);
-                    if minus(mean, self.view.eye).iter().all(|v| v.is_finite()) {
-                        part.add_mean(j, share);
-                    }
-                }
-            }
-        }
-    }
-
-    fn used(&self) -> usize {
-        used_coefficients(
-            self.options.sh_basis,
-            self.options.sh_degree.min(self.splats.sh_degree),
-        )
-    }
-}
-
-impl Default for Directions {
-    fn default() -> Self {
-        let (s, y) = ([[0.0; GROUP]; SH_COEFFICIENTS_MAX], [[0.0; GROUP]; SH_COEFFICIENTS_MAX]);
-        let towards = [[1.0; GROUP]; 3];
-        Self { towards, s, y, value: [0.0; GROUP], slope: [[0.0; GROUP]; 3] }
-    }
-}
-
-impl Directions {
-    /// s_k of lane `l` from the colour gradient `g` and one SH set.
-    #[inline(always)]
-    fn weigh(&mut self, l: usize, used: usize, sh: &[f32], g: [f32; 3]) {
-        for (s, h) in self.s[..used].iter_mut().zip(sh.chunks_exact(3)) {
-            s[l] = g[0] * h[0] + g[1] * h[1] + g[2] * h[2];
-        }
-    }
-
-    /// Adds Y ⊗ `g` of lane `l` to one SH set.
-    #[inline(always)]
-    fn add_to(&self, sh: &mut [f32], l: usize, used: usize, g: [f32; 3]) {
-        for (h, y) in sh.chunks_exact_mut(3).zip(&self.y[..used]) {
-            h[0] += y[l] * g[0];
-            h[1] += y[l] * g[1];
-            h[2] += y[l] * g[2];
-        }
-    }
-
-    #[inline(always)]
-    fn evaluate(&mut self, used: usize, basis: ShBasis) {
-        let mvsplat = basis == ShBasis::Mvsplat;
-        match used {
-            1 => self.evaluate_first::<1>(mvsplat),
-            4 => self.evaluate_first::<4>(mvsplat),
-            9 => self.evaluate_first::<9>(mvsplat),
-            16 => self.evaluate_first::<16>(mvsplat),
-            _ => self.evaluate_first::<SH_COEFFICIENTS_MAX>(mvsplat),
-        }
-    }
-
-    #[inline(always)]
-    fn evaluate_first<const D: usize>(&mut self, mvsplat: bool) {
-        for l in 0..GROUP {
-            let v: [f32; 3] = get(&self.towards, l);
-            let inverse = 1.0 / (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
-            let d = [v[0] * inverse, v[1] * inverse, v[2] * inverse];
-            let s: [f32; D] = std::array::from_fn(|k| self.s[k][l]);
-            let (y, g) = values_and_slope::<D>(mvsplat, d, &s);
-            let mut value = 0.0;
-            for k in 0..D {
-                self.y[k][l] = y[k];
-                value += s[k] * y[k];
-            }
-            self.value[l] = value;
-            let radial = d[0] * g[0] + d[1] * g[1] + d[2] * g[2];
-            for c in 0..3 {
-                self.slope[c][l] = (g[c] - d[c] * radial) * inverse;
-            }
-        }
-    }
 }
 
 impl Part<'_> {
     /// Zeros for splats that no pixel saw.
-    fn clear(&mut self, at: usize, count: usize) {
+    fn clear(&mut self, at: usize, count: usize, single: bool) {
         let zero = |values: &mut [f32], lanes: usize| {
             if let Some(v) = values.get_mut(at * lanes..(at + count) * lanes) {
                 v.fill(0.0);
@@ -462,6 +280,10 @@ impl Part<'_> {
         zero(self.opacities, 1);
         let gain_lanes = self.gain.len() / self.len;
         zero(self.gain, gain_lanes);
+        if single {
+            let set = self.sh.len() / self.len;
+            zero(self.sh, set);
+        }
     }
 
     #[inline(always)]
@@ -484,7 +306,7 @@ impl Part<'_> {
 
     /// Writes ∂L/∂γ and, with four lanes, ∂L/∂δ of splat `j` of the part.
     #[inline(always)]
-    fn put_gain(&mut self, j: usize, gain: f32, [r, g, b]: [f32; 3]) {
+    pub(crate) fn put_gain(&mut self, j: usize, gain: f32, [r, g, b]: [f32; 3]) {
         match self.gain.len() / self.len {
             1 => self.gain[j] = gain,
             4 => set(self.gain, 4 * j, [gain, r, g, b]),
@@ -492,9 +314,12 @@ impl Part<'_> {
         }
     }
 
-    fn add_mean(&mut self, j: usize, g: [f32; 3]) {
-        let (values, lanes) =
-            if self.rows.is_empty() { (&mut *self.means, 3) } else { (&mut *self.rows, SPLAT_LANES) };
+    pub(crate) fn add_mean(&mut self, j: usize, g: [f32; 3]) {
+        let (values, lanes) = if self.rows.is_empty() {
+            (&mut *self.means, 3)
+        } else {
+            (&mut *self.rows, SPLAT_LANES)
+        };
         for (v, g) in values[j * lanes..j * lanes + 3].iter_mut().zip(g) {
             *v += g;
         }
@@ -502,12 +327,12 @@ impl Part<'_> {
 }
 
 #[inline(always)]
-fn get<const N: usize>(from: &[L; N], l: usize) -> [f32; N] {
+pub(crate) fn get<const N: usize>(from: &[L; N], l: usize) -> [f32; N] {
     std::array::from_fn(|k| from[k][l])
 }
 
 #[inline(always)]
-fn put<const N: usize>(to: &mut [L; N], l: usize, values: [f32; N]) {
+pub(crate) fn put<const N: usize>(to: &mut [L; N], l: usize, values: [f32; N]) {
     for (k, v) in values.into_iter().enumerate() {
         to[k][l] = v;
     }
@@ -518,27 +343,4 @@ fn set<const N: usize>(to: &mut [f32], at: usize, values: [f32; N]) {
     if let Some(to) = to.get_mut(at..at + N) {
         to.copy_from_slice(&values);
     }
-}
-
-#[inline(always)]
-fn minus(a: [f32; 3], b: [f32; 3]) -> [f32; 3] {
-    [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
-}
-
-#[inline(always)]
-fn sh_of_parent<'a>(splats: &SplatSlices<'a>, p: usize) -> &'a [f32] {
-    let set = 3 * sh_coefficients(splats.sh_degree);
-    splats.sh.get(p * set..(p + 1) * set).unwrap_or(&[])
-}
-
-/// γ of splat `i`.
-#[inline(always)]
-fn gain_of(splats: &SplatSlices, i: usize) -> f32 {
-    let lanes = splats.gain.len() / splats.len().max(1);
-    splats.gain.get(i * lanes).copied().filter(|_| lanes > 0).unwrap_or(1.0)
-}
-
-/// Positions of the set bits.
-fn lanes_of(mask: u32) -> impl Iterator<Item = usize> {
-    (0..GROUP).filter(move |l| mask & (1 << l) != 0)
 }

@@ -1,14 +1,14 @@
 //! The whole backward pass: tiles, then a gather over each splat's tiles, then one pass
 //! over all splats.
 //!
-//! In: the five planes that [`Rasterizer::render_planes`] gave, and the gradient of a
-//! scalar loss with respect to them. Out: [`Gradients`], exact for the piecewise
+//! In: the gradient of a scalar loss with respect to the five planes that
+//! [`Rasterizer::render_planes`] gives. Out: [`Gradients`], exact for the piecewise
 //! function that the forward is: nothing passes a capped alpha, a clamped colour or a
 //! cull; directions of SH are not detached. No atomic sum anywhere: each (splat, tile)
 //! pair has its own row, rows are added in the order of tiles, so the same bytes come
 //! out for any number of threads.
 //!
-//! Memory beyond the forward's: 40 bytes a pair, at most [`PAIRS_PER_GROUP`] at a time
+//! Memory beyond the forward's: 48 bytes a pair, at most [`PAIRS_PER_GROUP`] at a time
 //! (or one tile's), and 40 bytes a splat.
 
 use crate::abi::RasterOptions;
@@ -18,14 +18,15 @@ use crate::cpu::disjoint::Disjoint;
 use crate::cpu::ewa::View;
 use crate::cpu::project::SplatSlices;
 use crate::cpu::project_bwd::{Gradients, Pass};
-use crate::cpu::raster_bwd_tile::{PairSums, Pixels, SUMS, WalkTile};
+use crate::cpu::raster_bwd_tile::{PairSums, SUMS, Upstream, WalkTile};
 use crate::cpu::rasterize::{Rasterizer, since};
 use crate::cpu::sort::depth_order;
+use crate::cpu::tiles::Grid;
 use rayon::prelude::*;
 use std::ops::Range;
 use std::time::Duration;
 
-/// Most (splat, tile) pairs whose sums are held at a time: 160 MiB.
+/// Most (splat, tile) pairs whose sums are held at a time: 192 MiB.
 const PAIRS_PER_GROUP: usize = 1 << 22;
 
 /// Where the last backward's time went; zeros unless asked for.
@@ -48,8 +49,8 @@ pub(crate) struct Buffers {
     sums: Vec<PairSums>,
     /// `[tiles]`: gradients of the background.
     background: Vec<[f64; 3]>,
-    /// The picture, where the caller did not keep it.
-    planes: Vec<f32>,
+    /// A mask of blocks per pair.
+    masks: Vec<u64>,
     times: BackwardTimes,
 }
 
@@ -58,7 +59,7 @@ impl Buffers {
     pub(crate) fn bytes(&self) -> usize {
         (self.pairs.capacity() + self.sums.capacity()) * size_of::<PairSums>()
             + self.background.capacity() * size_of::<[f64; 3]>()
-            + 4 * self.planes.capacity()
+            + 8 * self.masks.capacity()
     }
 }
 
@@ -70,21 +71,15 @@ pub struct Frame<'r, 's> {
     splats: SplatSlices<'s>,
     camera: Camera,
     options: RasterOptions,
-    planes: &'r [f32],
 }
 
 impl Frame<'_, '_> {
-    /// `[5, H, W]`: R, G, B, alpha, Σ w·z.
-    pub fn planes(&self) -> &[f32] {
-        self.planes
-    }
-
     /// Gradients of a loss whose gradient with respect to the frame's planes
     /// `[5, H, W]` (R, G, B, alpha, Σ w·z) is `gradients`; zeros where that has another
     /// size.
     pub fn backward(&mut self, gradients: &[f32], out: &mut Gradients) {
-        let pixels = Pixels { planes: self.planes, gradients };
-        self.rasterizer.backward_of_last(&self.splats, &self.camera, &self.options, pixels, out);
+        let (camera, options) = (&self.camera, &self.options);
+        self.rasterizer.backward_of_last(&self.splats, camera, options, gradients, out);
     }
 }
 
@@ -96,10 +91,10 @@ impl Rasterizer {
         splats: SplatSlices<'s>,
         camera: &Camera,
         options: &RasterOptions,
-        planes: &'r mut Vec<f32>,
+        planes: &mut Vec<f32>,
     ) -> Frame<'r, 's> {
         self.render_planes(&splats, camera, options, planes);
-        Frame { rasterizer: self, splats, camera: *camera, options: *options, planes }
+        Frame { rasterizer: self, splats, camera: *camera, options: *options }
     }
 
     /// Forward and backward: gradients of a loss whose gradient with respect to the
@@ -113,11 +108,13 @@ impl Rasterizer {
         gradients: &[f32],
         out: &mut Gradients,
     ) {
-        let mut planes = std::mem::take(&mut self.back.planes);
-        self.render_planes(splats, camera, options, &mut planes);
-        let pixels = Pixels { planes: &planes, gradients };
-        self.backward_of_last(splats, camera, options, pixels, out);
-        self.back.planes = planes;
+        debug_assert!(splats.is_consistent(), "splat buffers do not fit one another");
+        let view = View::new(camera, options);
+        self.grid = Grid::new(camera.intrinsics.width, camera.intrinsics.height);
+        self.lists.begin(self.grid, splats.len());
+        self.projection.run(self.tier, splats, &view, options, &mut self.lists);
+        self.lists.count();
+        self.backward_of_last(splats, camera, options, gradients, out);
     }
 
     /// Where the last backward's time went; zeros without
@@ -126,34 +123,37 @@ impl Rasterizer {
         self.back.times
     }
 
-    /// The backward pass of the last frame, whose splats, camera, options and planes
-    /// these must be.
+    /// The backward pass of the last frame, whose splats, camera and options these must
+    /// be.
     pub(crate) fn backward_of_last(
         &mut self,
         splats: &SplatSlices,
         camera: &Camera,
         options: &RasterOptions,
-        pixels: Pixels,
+        gradients: &[f32],
         out: &mut Gradients,
     ) {
+        let upstream = Upstream { planes: gradients, background: options.background };
         let (tiles, numbers) = (self.grid.len(), 5 * self.grid.width * self.grid.height);
-        let fits = pixels.planes.len() == numbers && pixels.gradients.len() == numbers;
-        if !fits || self.projection.footprints.len() != splats.len() {
+        if gradients.len() != numbers || self.projection.footprints.len() != splats.len() {
             return out.clear(splats);
         }
         let mut times = BackwardTimes::default();
         self.back.background.clear();
         self.back.background.resize(tiles, [0.0; 3]);
         self.back.sums.resize(splats.len(), [0.0; SUMS]);
+        let before = !self.lists.filled().is_empty();
         let mut first = 0;
         while first < tiles {
             let start = self.now();
             let group = self.lists.group_within(first, PAIRS_PER_GROUP);
             let listed = group == self.lists.filled();
-            if !listed {
+            if !listed && !before {
+                self.lists.fill(&group, &self.projection.footprints);
+            } else if !listed {
                 self.lists.fill_again(&group, &self.projection.footprints);
             }
-            self.walk_group(group.clone(), listed, Rules::new(options.convention), pixels);
+            self.walk_group(group.clone(), listed, Rules::new(options.convention), upstream);
             times.tiles += since(start);
             let start = self.now();
             self.gather_group(&group);
@@ -183,26 +183,32 @@ impl Rasterizer {
 
     /// The backward of one group of tiles, those with the longest lists first; sorts
     /// their lists unless the forward did.
-    fn walk_group(&mut self, group: Range<usize>, listed: bool, rules: Rules, pixels: Pixels) {
-        let Buffers { pairs, background, .. } = &mut self.back;
+    fn walk_group(&mut self, group: Range<usize>, listed: bool, rules: Rules, upstream: Upstream) {
+        let Buffers { pairs, masks, background, .. } = &mut self.back;
         let total: usize = group.clone().map(|t| self.lists.tile_len(t)).sum();
         if pairs.len() < total {
             pairs.resize(total, [0.0; SUMS]);
+            masks.resize(total, 0);
         }
         let mut queue: Vec<usize> = group.collect();
         queue.sort_unstable_by_key(|&t| (std::cmp::Reverse(self.lists.tile_len(t)), t));
         let (grid, tier) = (self.grid, self.tier);
         let footprints = &self.projection.footprints;
-        let (pairs, background) = (Disjoint::new(pairs), Disjoint::new(background));
+        let (pairs, masks) = (Disjoint::new(pairs), Disjoint::new(masks));
+        let background = Disjoint::new(background);
         let lists = self.lists.lists();
         queue.into_par_iter().with_max_len(1).for_each(|t| {
             // SAFETY: the queue names each tile once, and no two tiles share a place.
-            let (list, rows) = unsafe { (lists.take(t), pairs.part(lists.places(t))) };
+            let (list, rows, masks) = unsafe {
+                let places = lists.places(t);
+                (lists.take(t), pairs.part(places.clone()), masks.part(places))
+            };
             if !listed {
                 depth_order(list.entries, list.spare, list.order);
             }
             let (order, splats) = (&*list.order, list.splats);
-            let work = WalkTile { t, grid, order, splats, footprints, rules, pixels, rows };
+            let work =
+                WalkTile { t, grid, order, splats, footprints, rules, upstream, masks, rows };
             let seen = tier.run(work);
             // SAFETY: as above.
             unsafe { background.write(t, seen) };

@@ -1,4 +1,4 @@
-//! Backward of [`crate::cpu::blend`] for one 32×32 tile, front to back as the forward.
+//! Backward of [`crate::cpu::blend`] for one 32×32 tile: once forward, once back.
 //!
 //! With q_i = c_i·∂L/∂rgb + z_i·∂L/∂depth of splat i at a pixel, b the same of the
 //! background (bg·∂L/∂rgb − ∂L/∂alpha) and w_i = α_i T_i, the loss sees of a pixel
@@ -6,11 +6,14 @@
 //!
 //! ∂L/∂ln α_i = w_i q_i − α_i/(1 − α_i)·(Σ_{j>i} w_j q_j + T b).
 //!
-//! The forward's planes give the whole sum at once, so the sum over what lies behind is
-//! known at the first splat and shrinks by w_i q_i at each: nothing is stored per pixel
-//! and splat, and skip, cap and stop are decided by the forward's own operations.
-//! Splats go one by one, each over the blocks that it can touch, its ten sums in
-//! registers; one reduction and one row per (splat, tile).
+//! The way forward repeats the forward's decisions by the forward's own operations and
+//! leaves, per pixel, T and the last splat blended, and per (splat, tile) the mask of
+//! blocks that it changed. The way back grows the sum over what lies behind from nothing
+//! (subtracting it from the whole, front to back, would lose the digits of what opaque
+//! splats hide) and recovers T by division, exact to rounding since α ≤ 0.999.
+//!
+//! Splats go one by one, each over its blocks, its ten sums in registers; one reduction
+//! and one row per (splat, tile). Nothing is stored per pixel and splat.
 
 use crate::abi::{ALPHA_MIN_LOG2, BLOCK, TILE};
 use crate::cpu::blend::{BLOCKS, Lanes, Rules};
@@ -23,7 +26,7 @@ use crate::cpu::tiles::Grid;
 /// Sums kept per (splat, tile): the numbers of [`Moments`].
 pub(crate) const SUMS: usize = 10;
 /// Splats whose footprints are asked for ahead of their turn.
-const AHEAD: usize = 2 * LANES;
+const AHEAD: usize = LANES;
 
 /// What one tile says of one splat, in the order of [`Moments`].
 pub(crate) type PairSums = [f32; SUMS];
@@ -35,22 +38,23 @@ impl From<PairSums> for Moments {
     }
 }
 
-/// A picture and the gradient that arrives at it.
+/// The gradient that arrives at a picture.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Pixels<'a> {
-    /// `[5, H, W]`: R, G, B over the background, alpha, Σ w·z.
+pub(crate) struct Upstream<'a> {
+    /// `[5, H, W]`: ∂L/∂ R, G, B, alpha, Σ w·z.
     pub(crate) planes: &'a [f32],
-    /// `[5, H, W]`: ∂L/∂ of those.
-    pub(crate) gradients: &'a [f32],
+    pub(crate) background: [f32; 3],
 }
 
-/// One block on its way from front to back.
+/// One block on its way.
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
 struct Walk {
     /// Transmittance; negative where blending has stopped.
     t: Lanes,
-    /// Σ w q of the splats still to come, with T·b of the end.
+    /// [`rank`] of the last splat blended.
+    last: Lanes,
+    /// ∂L/∂T of the background, then with Σ w q of the splats passed on the way back.
     behind: Lanes,
     /// ∂L/∂ R, G, B, Σ w·z.
     g: [Lanes; 4],
@@ -59,6 +63,11 @@ struct Walk {
 /// x and y of a block's pixels.
 const ACROSS: Lanes = [0., 1., 2., 3., 0., 1., 2., 3., 0., 1., 2., 3., 0., 1., 2., 3.];
 const DOWN: Lanes = [0., 0., 0., 0., 1., 1., 1., 1., 2., 2., 2., 2., 3., 3., 3., 3.];
+
+/// Place `i` of an order as a float that compares as it does; above 0.
+fn rank(i: usize) -> f32 {
+    f32::from_bits(f32::MIN_POSITIVE.to_bits().saturating_add(i as u32))
+}
 
 /// The backward of one tile; returns Σ T·∂L/∂rgb over its pixels.
 pub(crate) struct WalkTile<'a> {
@@ -70,7 +79,9 @@ pub(crate) struct WalkTile<'a> {
     pub(crate) splats: &'a [u32],
     pub(crate) footprints: &'a [Footprint],
     pub(crate) rules: Rules,
-    pub(crate) pixels: Pixels<'a>,
+    pub(crate) upstream: Upstream<'a>,
+    /// Room for a mask per splat of the list.
+    pub(crate) masks: &'a mut [u64],
     /// A row for every splat of the list.
     pub(crate) rows: &'a mut [PairSums],
 }
@@ -79,172 +90,254 @@ impl Kernel for WalkTile<'_> {
     type Output = [f64; 3];
 
     #[inline(always)]
-    fn run<S: Simd>(self, s: S) -> [f64; 3] {
+    fn run<S: Simd>(mut self, s: S) -> [f64; 3] {
         let corner = [self.t % self.grid.columns * TILE, self.t / self.grid.columns * TILE];
-        let empty = Walk { t: [-1.0; LANES], behind: [0.0; LANES], g: [[0.0; LANES]; 4] };
-        let mut walks = [empty; BLOCKS * BLOCKS];
-        let (mut live, background) = start(&mut walks, corner, &self.grid, self.pixels);
+        let empty = [0.0; LANES];
+        let walk = Walk { t: [-1.0; LANES], last: empty, behind: empty, g: [empty; 4] };
+        let mut walks = [walk; BLOCKS * BLOCKS];
+        let live = start(&mut walks, corner, &self.grid, self.upstream);
         let corner = corner.map(|c| c as f32);
-        self.prefetch(s, 0);
-        let mut from = 0;
-        while from < self.order.len() && live != 0 {
-            self.prefetch(s, from + AHEAD - LANES);
-            let places = &self.order[from..(from + LANES).min(self.order.len())];
-            let mut masks = [0; LANES];
-            let mut fields = [s.splat(0.0); LANES];
-            for l in 0..LANES {
-                // Spare lanes repeat the last splat and are not walked.
-                let place = places[l.min(places.len() - 1)];
-                fields[l] = s.load(self.footprint(place).fields());
-            }
-            met(s, s.transpose(fields), corner, &mut masks);
-            for (&place, mask) in places.iter().zip(masks) {
-                let f = self.footprint(place);
-                let row = walk(s, f, &mut walks, (mask, &mut live), corner, self.rules);
-                if let Some(to) = self.rows.get_mut(place as usize) {
-                    *to = row;
-                }
-            }
-            from += places.len();
-        }
-        for &place in &self.order[from..] {
-            if let Some(to) = self.rows.get_mut(place as usize) {
-                *to = [0.0; SUMS];
+        let reached = self.forward(s, &mut walks, live, corner);
+        let total = turn(&mut walks);
+        self.back(s, &mut walks, reached, corner);
+        for &place in &self.order[reached..] {
+            if let Some(row) = self.rows.get_mut(place as usize) {
+                *row = [0.0; SUMS];
             }
         }
-        background
+        total
     }
 }
 
 impl WalkTile<'_> {
     #[inline(always)]
-    fn footprint(&self, place: u32) -> &Footprint {
-        &self.footprints[self.splats[place as usize] as usize]
+    fn footprint(&self, i: usize) -> &Footprint {
+        &self.footprints[self.splats[self.order[i] as usize] as usize]
     }
 
-    /// Asks for the footprints of a group from `first` of the order on.
+    /// Takes `walks` from front to back; returns how many splats it took until all
+    /// pixels had stopped. Leaves in `masks`, by place in the order, the blocks changed.
     #[inline(always)]
-    fn prefetch<S: Simd>(&self, s: S, first: usize) {
-        let past = self.order.len().min(first + LANES);
-        for &place in self.order.get(first..past).unwrap_or_default() {
-            s.prefetch(self.footprint(place));
+    fn forward<S: Simd>(
+        &mut self,
+        s: S,
+        walks: &mut [Walk; BLOCKS * BLOCKS],
+        mut live: u64,
+        corner: [f32; 2],
+    ) -> usize {
+        let count = self.order.len();
+        let mut from = 0;
+        while from < count && live != 0 {
+            let past = (from + LANES).min(count);
+            let mut i = past;
+            while i < (past + AHEAD).min(count) {
+                s.prefetch(self.footprint(i));
+                i += 1;
+            }
+            let mut masks = [0; LANES];
+            let mut fields = [s.splat(0.0); LANES];
+            for (l, field) in fields.iter_mut().enumerate() {
+                // Spare lanes repeat the last splat and are not walked.
+                *field = s.load(self.footprint((from + l).min(past - 1)).fields());
+            }
+            met(s, s.transpose(fields), corner, &mut masks);
+            for i in from..past {
+                let f = self.footprint(i);
+                let mut mask = masks[i - from] & live;
+                let mut blocks = mask;
+                while blocks != 0 {
+                    let b = blocks.trailing_zeros() as usize;
+                    blocks &= blocks - 1;
+                    let (changed, goes_on) = step_forward(
+                        s,
+                        &mut walks[b & 63],
+                        f,
+                        block_corner(corner, b),
+                        (i, self.rules),
+                    );
+                    mask &= !(u64::from(!changed) << b);
+                    live &= !(u64::from(!goes_on) << b);
+                }
+                self.masks[i] = mask;
+            }
+            from = past;
+        }
+        from
+    }
+
+    /// Takes `walks` back from splat `reached` and writes the rows of all before it.
+    #[inline(always)]
+    fn back<S: Simd>(
+        &mut self,
+        s: S,
+        walks: &mut [Walk; BLOCKS * BLOCKS],
+        reached: usize,
+        corner: [f32; 2],
+    ) {
+        for i in (0..reached).rev() {
+            s.prefetch(self.footprint(i.saturating_sub(AHEAD)));
+            let f = self.footprint(i);
+            let mut sums = [s.splat(0.0); SUMS];
+            let mut blocks = self.masks[i];
+            let mut row = [0.0; SUMS];
+            if blocks != 0 {
+                while blocks != 0 {
+                    let b = blocks.trailing_zeros() as usize;
+                    blocks &= blocks - 1;
+                    let at = block_corner(corner, b);
+                    sums = step_back(s, &mut walks[b & 63], f, at, (i, self.rules), sums);
+                }
+                for (to, sum) in row.iter_mut().zip(sums) {
+                    *to = s.sum(sum);
+                }
+            }
+            if let Some(to) = self.rows.get_mut(self.order[i] as usize) {
+                *to = row;
+            }
         }
     }
 }
 
-/// Fills `walks`; returns the blocks with a pixel inside and the background's gradient.
+#[inline(always)]
+fn block_corner(corner: [f32; 2], b: usize) -> [f32; 2] {
+    [corner[0] + (b % BLOCKS * BLOCK) as f32, corner[1] + (b / BLOCKS * BLOCK) as f32]
+}
+
+/// Fills `walks`; returns the blocks with a pixel inside.
 fn start(
     walks: &mut [Walk; BLOCKS * BLOCKS],
     corner: [usize; 2],
     grid: &Grid,
-    Pixels { planes, gradients }: Pixels,
-) -> (u64, [f64; 3]) {
+    Upstream { planes, background }: Upstream,
+) -> u64 {
     let (width, height) = (grid.width - corner[0], grid.height - corner[1]);
+    let (width, height) = (width.min(TILE), height.min(TILE));
     let pixels = grid.width * grid.height;
-    let (mut live, mut total) = (0u64, [0.0f64; 3]);
-    for y in 0..TILE.min(height) {
+    let mut live = 0u64;
+    for y in 0..height {
         let first = (corner[1] + y) * grid.width + corner[0];
-        let row = |from: &'_ [f32], c: usize| -> [f32; TILE] {
-            let mut out = [0.0; TILE];
-            let inside = c * pixels + first..c * pixels + first + TILE.min(width);
-            let from = from.get(inside).unwrap_or_default();
-            out[..from.len()].copy_from_slice(from);
-            out
-        };
-        let g: [[f32; TILE]; 5] = std::array::from_fn(|c| row(gradients, c));
-        let p: [[f32; TILE]; 5] = std::array::from_fn(|c| row(planes, c));
-        let mut sums = [0.0f32; 3];
-        for x in 0..TILE.min(width) {
-            let rest = 1.0 - p[3][x];
-            let (b, l) = (y / BLOCK * BLOCKS + x / BLOCK, y % BLOCK * BLOCK + x % BLOCK);
-            let walk = &mut walks[b];
-            live |= 1 << b;
-            walk.t[l] = 1.0;
-            let mut whole = -f64::from(g[3][x]) * f64::from(rest);
-            for c in [0, 1, 2, 4] {
-                whole += f64::from(g[c][x]) * f64::from(p[c][x]);
-            }
-            walk.behind[l] = whole as f32;
-            for (to, c) in walk.g.iter_mut().zip([0, 1, 2, 4]) {
-                to[l] = g[c][x];
-            }
-            for (sum, g) in sums.iter_mut().zip(&g) {
-                *sum += rest * g[x];
+        // Pixel by pixel instead of plane by plane.
+        let mut row = [[0.0f32; 5]; TILE];
+        for c in 0..5 {
+            let plane = &planes[c * pixels + first..][..width];
+            for (pixel, v) in row.iter_mut().zip(plane) {
+                pixel[c] = *v;
             }
         }
-        for (sum, v) in total.iter_mut().zip(sums) {
-            *sum += f64::from(v);
+        for (x, &[r, g, b, alpha, z]) in row[..width].iter().enumerate() {
+            let (block, l) = (y / BLOCK * BLOCKS + x / BLOCK, y % BLOCK * BLOCK + x % BLOCK);
+            let walk = &mut walks[block];
+            live |= 1 << block;
+            walk.t[l] = 1.0;
+            walk.behind[l] = background[0] * r + background[1] * g + background[2] * b - alpha;
+            for (to, v) in walk.g.iter_mut().zip([r, g, b, z]) {
+                to[l] = v;
+            }
         }
     }
-    (live, total)
+    live
 }
 
-/// One splat over the blocks of `mask`: moves them past it, takes those off `live` whose
-/// pixels have all stopped, and returns its sums.
-#[inline(always)]
-fn walk<S: Simd>(
-    s: S,
-    f: &Footprint,
-    walks: &mut [Walk; BLOCKS * BLOCKS],
-    (mask, live): (u64, &mut u64),
-    corner: [f32; 2],
-    rules: Rules,
-) -> PairSums {
-    let zero = s.splat(0.0);
-    let mut sums = [zero; SUMS];
-    let (least, cap) = (s.splat(ALPHA_MIN_LOG2), s.splat(rules.alpha_max));
-    let (stop, one) = (s.splat(rules.stop), s.splat(1.0));
-    let mut blocks = mask & *live;
-    while blocks != 0 {
-        let b = blocks.trailing_zeros() as usize;
-        blocks &= blocks - 1;
-        let block = &mut walks[b & 63];
-        let x = s.load(&ACROSS) + s.splat(corner[0] + (b % BLOCKS * BLOCK) as f32);
-        let y = s.load(&DOWN) + s.splat(corner[1] + (b / BLOCKS * BLOCK) as f32);
-        let t = s.load(&block.t);
-        let (dx, dy) = (x - s.splat(f.u), y - s.splat(f.v));
-        let across = s.fma(s.splat(f.shear), dy, dx) * s.splat(f.sx);
-        let down = dy * s.splat(f.sy);
-        let power = s.fnma(down, down, s.fnma(across, across, s.splat(f.power)));
-        let shows = s.le(least, power) & s.lt(zero, t);
-        let raw = simd::exp2(s, s.max(power, least));
-        let alpha = s.min(raw, cap);
-        let rest = s.fnma(alpha, t, t);
-        let adds = s.lt(stop, rest) & shows;
-        let w = s.keep(adds, alpha * t);
-        let t = s.select(adds, rest, s.select(shows, -t, t));
-        s.store(t, &mut block.t);
-        if !s.any(s.lt(zero, t)) {
-            *live &= !(1 << b);
+/// At the far end: T without its sign, T·b; returns Σ T·∂L/∂rgb.
+fn turn(walks: &mut [Walk; BLOCKS * BLOCKS]) -> [f64; 3] {
+    let mut total = [0.0f64; 3];
+    for walk in walks {
+        for l in 0..LANES {
+            walk.t[l] = walk.t[l].abs();
+            walk.behind[l] *= walk.t[l];
         }
-        let g = [
-            s.load(&block.g[0]),
-            s.load(&block.g[1]),
-            s.load(&block.g[2]),
-            s.load(&block.g[3]),
-        ];
-        let wg = [w * g[0], w * g[1], w * g[2], w * g[3]];
-        let q = s.fma(g[2], s.splat(f.rgb[2]), g[3] * s.splat(f.z));
-        let q = s.fma(g[0], s.splat(f.rgb[0]), s.fma(g[1], s.splat(f.rgb[1]), q));
-        let behind = s.fnma(w, q, s.load(&block.behind));
-        s.store(behind, &mut block.behind);
-        let v = s.fnma(behind, alpha / (one - alpha), w * q);
-        let v = s.keep(adds & s.lt(raw, cap), v);
-        let (va, vd) = (v * across, v * down);
-        sums[0] = sums[0] + v;
-        sums[1] = sums[1] + va;
-        sums[2] = sums[2] + vd;
-        sums[3] = s.fma(va, across, sums[3]);
-        sums[4] = s.fma(va, down, sums[4]);
-        sums[5] = s.fma(vd, down, sums[5]);
-        sums[6] = sums[6] + wg[0];
-        sums[7] = sums[7] + wg[1];
-        sums[8] = sums[8] + wg[2];
-        sums[9] = sums[9] + wg[3];
+        for (sum, g) in total.iter_mut().zip(&walk.g) {
+            let row: f32 = g.iter().zip(&walk.t).map(|(g, t)| g * t).sum();
+            *sum += f64::from(row);
+        }
     }
-    if mask == 0 {
-        return [0.0; SUMS];
-    }
-    let sum = |k: usize| s.sum(sums[k]);
-    [sum(0), sum(1), sum(2), sum(3), sum(4), sum(5), sum(6), sum(7), sum(8), sum(9)]
+    total
+}
+
+/// What a splat is at a block's pixels.
+struct Seen<S: Simd> {
+    /// Whitened distances.
+    across: S::F,
+    down: S::F,
+    /// Not below 1/255.
+    shows: S::M,
+    /// o·e^(−σ).
+    raw: S::F,
+}
+
+/// The forward's own operations.
+#[inline(always)]
+fn look<S: Simd>(s: S, f: &Footprint, at: [f32; 2]) -> Seen<S> {
+    let least = s.splat(ALPHA_MIN_LOG2);
+    let x = s.load(&ACROSS) + s.splat(at[0]);
+    let y = s.load(&DOWN) + s.splat(at[1]);
+    let (dx, dy) = (x - s.splat(f.u), y - s.splat(f.v));
+    let across = s.fma(s.splat(f.shear), dy, dx) * s.splat(f.sx);
+    let down = dy * s.splat(f.sy);
+    let power = s.fnma(down, down, s.fnma(across, across, s.splat(f.power)));
+    Seen { across, down, shows: s.le(least, power), raw: simd::exp2(s, s.max(power, least)) }
+}
+
+/// Splat `i` of the order at one block: whether it changed a pixel, and whether a pixel
+/// still goes on.
+#[inline(always)]
+fn step_forward<S: Simd>(
+    s: S,
+    walk: &mut Walk,
+    f: &Footprint,
+    at: [f32; 2],
+    (i, rules): (usize, Rules),
+) -> (bool, bool) {
+    let zero = s.splat(0.0);
+    let seen = look(s, f, at);
+    let t = s.load(&walk.t);
+    let shows = seen.shows & s.lt(zero, t);
+    let alpha = s.min(seen.raw, s.splat(rules.alpha_max));
+    let rest = s.fnma(alpha, t, t);
+    let adds = s.lt(s.splat(rules.stop), rest) & shows;
+    let t = s.select(adds, rest, s.select(shows, -t, t));
+    s.store(t, &mut walk.t);
+    s.store(s.select(adds, s.splat(rank(i)), s.load(&walk.last)), &mut walk.last);
+    (s.any(adds), s.any(s.lt(zero, t)))
+}
+
+/// The same on the way back; adds to `sums`.
+#[inline(always)]
+fn step_back<S: Simd>(
+    s: S,
+    walk: &mut Walk,
+    f: &Footprint,
+    at: [f32; 2],
+    (i, rules): (usize, Rules),
+    sums: [S::F; SUMS],
+) -> [S::F; SUMS] {
+    let seen = look(s, f, at);
+    let (cap, one) = (s.splat(rules.alpha_max), s.splat(1.0));
+    let alpha = s.min(seen.raw, cap);
+    let adds = seen.shows & s.le(s.splat(rank(i)), s.load(&walk.last));
+    let after = s.load(&walk.t);
+    let inverse = one / (one - alpha);
+    let t = s.select(adds, after * inverse, after);
+    s.store(t, &mut walk.t);
+    let w = s.keep(adds, alpha * t);
+    let g = [s.load(&walk.g[0]), s.load(&walk.g[1]), s.load(&walk.g[2]), s.load(&walk.g[3])];
+    let q = s.fma(g[2], s.splat(f.rgb[2]), g[3] * s.splat(f.z));
+    let q = s.fma(g[0], s.splat(f.rgb[0]), s.fma(g[1], s.splat(f.rgb[1]), q));
+    let behind = s.load(&walk.behind);
+    s.store(s.fma(w, q, behind), &mut walk.behind);
+    let v = s.fnma(behind, alpha * inverse, w * q);
+    let v = s.keep(adds & s.lt(seen.raw, cap), v);
+    let (va, vd) = (v * seen.across, v * seen.down);
+    [
+        sums[0] + v,
+        sums[1] + va,
+        sums[2] + vd,
+        s.fma(va, seen.across, sums[3]),
+        s.fma(va, seen.down, sums[4]),
+        s.fma(vd, seen.down, sums[5]),
+        s.fma(w, g[0], sums[6]),
+        s.fma(w, g[1], sums[7]),
+        s.fma(w, g[2], sums[8]),
+        s.fma(w, g[3], sums[9]),
+    ]
 }

@@ -9,7 +9,7 @@
 
 use crate::abi::{BLOCK, DEPTH_ALPHA_MIN, RasterOptions, TILE};
 use crate::camera::Camera;
-use crate::cpu::blend::{BLOCKS, RenderTile, Rules, Tile};
+use crate::cpu::blend::{BLOCKS, RenderTile, Rules, Tile, Workplace};
 use crate::cpu::disjoint::Disjoint;
 use crate::cpu::ewa::{Footprint, View};
 use crate::cpu::project::{Projection, SplatSlices};
@@ -276,7 +276,7 @@ impl Rasterizer {
         let lists = self.lists.lists();
         let (next, items) = (AtomicUsize::new(0), AtomicUsize::new(0));
         let work = |_| {
-            let mut tile = Tile::default();
+            let mut place = Workplace::default();
             while let Some(&t) = queue.get(next.fetch_add(1, Relaxed)) {
                 let t = t as usize;
                 let start = timed.then(Instant::now);
@@ -287,11 +287,11 @@ impl Rasterizer {
                 let (order, splats) = (&*list.order, list.splats);
                 let sorted = timed.then(Instant::now);
                 let work =
-                    RenderTile { tile: &mut tile, t, grid, order, splats, footprints, rules };
+                    RenderTile { place: &mut place, t, grid, order, splats, footprints, rules };
                 items.fetch_add(tier.run(work), Relaxed);
                 let blended = timed.then(Instant::now);
                 // SAFETY: as above; no other tile has these pixels.
-                unsafe { target.write(&tile, t, &grid) };
+                unsafe { target.write(&place.tile, t, &grid) };
                 if let (Some(start), Some(sorted), Some(blended)) = (start, sorted, blended) {
                     let add = |clock: &AtomicU64, from: Instant, to: Instant| {
                         clock.fetch_add((to - from).as_nanos() as u64, Relaxed);

@@ -195,6 +195,7 @@ pub fn direction(v: [f32; 3]) -> [f32; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cpu::simd::{Kernel, Tier};
     use glam::DVec3;
 
     fn directions() -> impl Iterator<Item = DVec3> {
@@ -241,5 +242,59 @@ mod tests {
             (radiance(ShBasis::Mvsplat, 3, d, &sh), radiance(ShBasis::Mvsplat, 4, d, &sh));
         assert_eq!(three, four);
         assert_ne!(three, radiance(ShBasis::Mvsplat, 2, d, &sh));
+    }
+
+    struct Lanes<'a>(ShBasis, usize, &'a [[f32; 3]; LANES], &'a [f32], &'a [usize; LANES]);
+
+    impl Kernel for Lanes<'_> {
+        type Output = [[f32; LANES]; 3];
+
+        #[inline(always)]
+        fn run<S: Simd>(self, s: S) -> Self::Output {
+            let mut columns = [[0.0; LANES]; 3];
+            for (l, v) in self.2.iter().enumerate() {
+                for c in 0..3 {
+                    columns[c][l] = v[c];
+                }
+            }
+            let d = direction_lanes(s, columns.map(|c| s.load(&c)));
+            for (to, v) in
+                columns.iter_mut().zip(radiance_lanes(s, (self.0, self.1), d, self.3, self.4))
+            {
+                s.store(v, to);
+            }
+            columns
+        }
+    }
+
+    /// Sixteen at a time give what one at a time does, in every tier, for sets of
+    /// any degree stored and evaluated, the last set of the slice included.
+    #[test]
+    fn lanes_are_the_single_one() {
+        let vectors: [[f32; 3]; LANES] = std::array::from_fn(|l| match l {
+            3 => [0.0; 3],
+            5 => [f32::MAX; 3],
+            _ => [(l as f32).sin(), (l as f32 * 2.3).cos(), 3.0 - l as f32 * 0.4],
+        });
+        for stored in 0..=4 {
+            let set = 3 * sh_coefficients(stored);
+            let sh: Vec<f32> = (0..9 * set).map(|i| (i as f32 * 0.7).sin()).collect();
+            let at = std::array::from_fn(|l| (l * 5 % 9) * set);
+            for degree in 0..=stored {
+                for kind in [ShBasis::Standard, ShBasis::Mvsplat] {
+                    for &tier in Tier::available() {
+                        let got = tier.run(Lanes(kind, degree, &vectors, &sh, &at));
+                        for l in 0..LANES {
+                            let set = &sh[at[l]..at[l] + set];
+                            let expected = radiance(kind, degree, direction(vectors[l]), set);
+                            for c in 0..3 {
+                                let (a, b) = (got[c][l], expected[c]);
+                                assert!((a - b).abs() < 2e-6, "{tier:?} {stored} {degree} {a} {b}");
+                            }
+                        }
+                    }
+                }
+            }
+        }
     }
 }

@@ -156,6 +156,7 @@ pub(crate) trait Ints:
 ///
 /// Comparisons are false where an operand is NaN; `min` and `max` then give their
 /// second operand.
+#[allow(dead_code, reason = "a vocabulary, not all of whose words every kernel uses")]
 pub(crate) trait Simd: Copy + Send + Sync + 'static {
     type F: Floats;
     type M: Mask;
@@ -178,6 +179,8 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     /// which tiers differ, for tests that leave a margin.
     fn rough_sqrt(self, v: Self::F) -> Self::F;
     fn abs(self, v: Self::F) -> Self::F;
+    /// −|v|.
+    fn negative(self, v: Self::F) -> Self::F;
     fn floor(self, v: Self::F) -> Self::F;
     fn ceil(self, v: Self::F) -> Self::F;
     /// (n, v − n), n the nearest whole number (ties to even), exact for |v| < 2²²

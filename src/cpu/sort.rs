@@ -9,7 +9,6 @@
 /// Bits of a digit; a pass costs a table of 2⁸ counts.
 const DIGIT_BITS: u32 = 8;
 const DIGITS: usize = 1 << DIGIT_BITS;
-const PASSES: usize = 4;
 /// Lists up to this length are sorted by comparison, quicker than by tables.
 const SHORT: usize = 48;
 
@@ -36,21 +35,56 @@ pub(crate) fn depth_order(entries: &mut [u64], spare: &mut [u64], order: &mut [u
         (least, most) = (least.min(z(e)), most.max(z(e)));
     }
     let bits = u32::BITS - (most - least).leading_zeros();
-    let passes = bits.div_ceil(DIGIT_BITS) as usize;
+    match bits.div_ceil(DIGIT_BITS) {
+        0 | 1 => radix::<1>(least, entries, spare, order),
+        2 => radix::<2>(least, entries, spare, order),
+        3 => radix::<3>(least, entries, spare, order),
+        _ => radix::<4>(least, entries, spare, order),
+    }
+}
+
+/// Sorts by the low `PASSES` digits of depth bits − `least`.
+fn radix<const PASSES: usize>(
+    least: u32,
+    entries: &mut [u64],
+    spare: &mut [u64],
+    order: &mut [u32],
+) {
     let digit = |e: u64, pass: usize| {
-        ((z(e) - least) >> (pass as u32 * DIGIT_BITS)) as usize & (DIGITS - 1)
+        (((e >> 32) as u32 - least) >> (pass as u32 * DIGIT_BITS)) as usize & (DIGITS - 1)
     };
-    let mut slots = [[0u32; DIGITS]; PASSES];
-    for &e in &*entries {
-        for (pass, counts) in slots[..passes].iter_mut().enumerate() {
-            counts[digit(e, pass)] += 1;
+    // Neighbours in a list lie side by side in space and share digits: two tables, so
+    // that a count need not wait for the last one.
+    let mut tables = [[[0u32; DIGITS]; PASSES]; 2];
+    let pairs = entries.chunks_exact(2);
+    for &e in pairs.remainder() {
+        for pass in 0..PASSES {
+            tables[0][pass][digit(e, pass)] += 1;
         }
     }
+    for pair in pairs {
+        for pass in 0..PASSES {
+            tables[0][pass][digit(pair[0], pass)] += 1;
+            tables[1][pass][digit(pair[1], pass)] += 1;
+        }
+    }
+    let [mut slots, other] = tables;
     let (mut from, mut to) = (entries, spare);
-    for (pass, slots) in slots[..passes].iter_mut().enumerate() {
+    for pass in 0..PASSES {
+        let slots = &mut slots[pass];
         let mut next = 0;
-        for slot in slots.iter_mut() {
-            next += std::mem::replace(slot, next);
+        for (slot, more) in slots.iter_mut().zip(&other[pass]) {
+            next += std::mem::replace(slot, next) + more;
+        }
+        if pass + 1 == PASSES {
+            for &e in &*from {
+                let slot = &mut slots[digit(e, pass)];
+                if let Some(to) = order.get_mut(*slot as usize) {
+                    *to = e as u32;
+                }
+                *slot += 1;
+            }
+            return;
         }
         for &e in &*from {
             let slot = &mut slots[digit(e, pass)];
@@ -60,9 +94,6 @@ pub(crate) fn depth_order(entries: &mut [u64], spare: &mut [u64], order: &mut [u
             *slot += 1;
         }
         (from, to) = (to, from);
-    }
-    for (o, e) in order.iter_mut().zip(from) {
-        *o = *e as u32;
     }
 }
 

@@ -12,13 +12,21 @@
 use crate::abi::TILE;
 use crate::cpu::disjoint::Disjoint;
 use crate::cpu::ewa::Footprint;
-use crate::cpu::project::CHUNK;
 use crate::cpu::sort::entry;
 use rayon::prelude::*;
 use std::ops::Range;
 
 /// Most (splat, tile) pairs listed at a time, 24 bytes each: 384 MiB.
 pub(crate) const PAIRS_PER_GROUP: usize = 1 << 24;
+
+/// Least splats of a chunk.
+const CHUNK_MIN: usize = 1024;
+
+/// Splats per chunk, a unit of parallel work: enough chunks to keep every thread busy,
+/// few enough that a count per chunk and tile stays little. No result depends on it.
+fn chunk_len(n: usize) -> usize {
+    n.div_ceil(8 * rayon::current_num_threads()).next_multiple_of(CHUNK_MIN).max(CHUNK_MIN)
+}
 
 /// The tiles of a picture, row-major.
 #[derive(Clone, Copy, Debug, Default)]
@@ -107,11 +115,20 @@ impl ChunkCover<'_> {
         if small && fits {
             cover.columns = [columns.start as u16, columns.end as u16];
             cover.rows = [rows.start as u16, rows.end as u16];
-            for row in rows {
-                for c in columns.clone() {
-                    if let Some(count) = counts.get_mut(row * grid.columns + c) {
-                        *count += 1;
-                    }
+            let first = rows.start * grid.columns + columns.start;
+            let mut count = |t: usize| {
+                if let Some(count) = counts.get_mut(t) {
+                    *count += 1;
+                }
+            };
+            count(first);
+            if columns.len() == 2 {
+                count(first + 1);
+            }
+            if rows.len() == 2 {
+                count(first + grid.columns);
+                if columns.len() == 2 {
+                    count(first + grid.columns + 1);
                 }
             }
         } else {
@@ -128,7 +145,9 @@ impl ChunkCover<'_> {
 #[derive(Debug, Default)]
 pub(crate) struct TileLists {
     grid: Grid,
-    /// `[chunks, CHUNK]`: each chunk's first `lens` are meant.
+    /// Splats per chunk.
+    chunk: usize,
+    /// `[chunks, chunk]`: each chunk's first `lens` are meant.
     covers: Vec<Cover>,
     /// `[chunks]`: visible splats.
     lens: Vec<u32>,
@@ -204,12 +223,18 @@ impl TileLists {
     pub(crate) fn begin(&mut self, grid: Grid, n: usize) {
         self.grid = grid;
         self.filled = 0..0;
-        let chunks = n.div_ceil(CHUNK);
+        self.chunk = chunk_len(n);
+        let chunks = n.div_ceil(self.chunk);
         if self.covers.len() < n {
             self.covers.resize(n, Cover::default());
         }
         self.lens.resize(chunks, 0);
         self.slots.resize(chunks * grid.len().max(1), 0);
+    }
+
+    /// Splats per chunk of this frame.
+    pub(crate) fn chunk(&self) -> usize {
+        self.chunk
     }
 
     /// What each chunk of `n` splats has to fill in.
@@ -218,7 +243,7 @@ impl TileLists {
         n: usize,
     ) -> impl IndexedParallelIterator<Item = ChunkCover<'_>> {
         let grid = self.grid;
-        let covers = self.covers[..n].par_chunks_mut(CHUNK).zip(&mut self.lens);
+        let covers = self.covers[..n].par_chunks_mut(self.chunk).zip(&mut self.lens);
         let counts = self.slots.par_chunks_mut(grid.len().max(1));
         covers.zip(counts).map(move |((covers, len), counts)| ChunkCover {
             grid,
@@ -319,7 +344,7 @@ impl TileLists {
         let (entries, splats) = (Disjoint::new(&mut self.entries), Disjoint::new(&mut self.splats));
         let (grid, starts) = (self.grid, &self.starts);
         let rows = group.start / grid.columns..group.end.div_ceil(grid.columns);
-        let chunks = self.covers.par_chunks(CHUNK).zip(&self.lens);
+        let chunks = self.covers.par_chunks(self.chunk).zip(&self.lens);
         chunks.zip(self.slots.par_chunks_mut(tiles)).for_each(|((covers, len), slots)| {
             for cover in &covers[..*len as usize] {
                 let mut put = |t: usize| {
@@ -381,8 +406,8 @@ impl TileLists {
     ) {
         let (grid, tiles) = (self.grid, self.grid.len().max(1));
         let rows = group.start / grid.columns.max(1)..group.end.div_ceil(grid.columns.max(1));
-        let chunks = self.covers.par_chunks(CHUNK).zip(&self.lens);
-        chunks.zip(targets.par_chunks_mut(CHUNK)).enumerate().for_each(
+        let chunks = self.covers.par_chunks(self.chunk).zip(&self.lens);
+        chunks.zip(targets.par_chunks_mut(self.chunk)).enumerate().for_each(
             |(c, ((covers, len), targets))| {
                 let mut cursor = match c {
                     0 => self.starts[group.clone()].to_vec(),
@@ -407,7 +432,7 @@ impl TileLists {
                             }
                         }
                     }
-                    if let Some(target) = targets.get_mut(cover.splat as usize - c * CHUNK) {
+                    if let Some(target) = targets.get_mut(cover.splat as usize - c * self.chunk) {
                         each(target, &found);
                     }
                 }

@@ -15,7 +15,7 @@ pub mod redistribute;
 pub mod resize;
 pub mod spgr;
 
-pub use rasterize::rasterize;
+pub use rasterize::{over_background, rasterize, rasterize_splats};
 
 use crate::cpu::real::Real;
 use candle_core::{CpuStorage, Layout, Result, Shape, Storage, Tensor, WithDType, bail};

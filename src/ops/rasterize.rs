@@ -3,16 +3,24 @@
 //! In: `splats[N, 11]`, `sh[P, D, 3]` (splat i reads set i / (N/P)), `gain[N]` or
 //! `[N, 4]`, all f32, contiguous, on the CPU. Out: `[5, H, W]`: RGB over the
 //! background, accumulated alpha, Σ w·z. The camera and the options ride in the op.
-//! No gradient: `backward` through the result is an error.
+//! Gradients reach all three inputs, exact for the piecewise function that the forward
+//! is ([`crate::cpu::Gradients`]); the background's goes through [`over_background`].
+//! Until its graph is dropped, an op keeps its lists (about 150 bytes a splat), so that
+//! the backward pass need not make them again.
 
 use crate::abi::{Convention, RasterOptions, SH_DEGREE_MAX, SPLAT_LANES, sh_coefficients};
 use crate::camera::Camera;
-use crate::cpu::{Geometry, Rasterizer, SplatSlices};
+use crate::cpu::{Geometry, Gradients, Rasterizer, SplatSlices};
+use crate::ops::{elements, tensor_like};
+use crate::splats::SplatTensors;
 use candle_core::{CpuStorage, CustomOp3, DType, Layout, Result, Shape, Tensor, bail};
+use std::sync::{Mutex, PoisonError};
 
 struct Rasterize {
     camera: Camera,
     options: RasterOptions,
+    /// What the forward left.
+    rasterizer: Mutex<Rasterizer>,
 }
 
 /// Renders packed splats: `[5, H, W]` planes R, G, B, alpha, Σ w·z.
@@ -29,7 +37,73 @@ pub fn rasterize(
 ) -> Result<Tensor> {
     check_shapes(splats, sh, gain)?;
     check_options(camera, options)?;
-    splats.apply_op3(sh, gain, Rasterize { camera: *camera, options: *options })
+    let rasterizer = Mutex::default();
+    splats.apply_op3(sh, gain, Rasterize { camera: *camera, options: *options, rasterizer })
+}
+
+/// [`rasterize`] of splats with everything that belongs to them: `[5, H, W]` planes R,
+/// G, B, alpha, Σ w·z, with gradients to every tensor of `splats`. The SH basis is the
+/// splats' own; `options.sh_basis` is not read.
+///
+/// # Errors
+/// As [`rasterize`].
+///
+/// ```
+/// use candle_core::{Device, Tensor, Var};
+/// use subsplat::abi::{RasterOptions, ShBasis};
+/// use subsplat::camera::{Camera, Intrinsics};
+/// use subsplat::splats::SplatTensors;
+///
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// let d = &Device::Cpu;
+/// let means = Var::new(&[[0f32, 0.0, 2.0], [0.3, 0.1, 3.0]], d)?;
+/// let quats = Tensor::new(&[[1f32, 0.0, 0.0, 0.0], [0.9, 0.1, 0.0, 0.2]], d)?;
+/// let scales = Tensor::full(0.2f32, (2, 3), d)?;
+/// let opacities = Tensor::full(0.8f32, 2, d)?;
+/// let sh = Var::new(&[[[0.5f32, 0.1, -0.3]], [[-0.2, 0.4, 0.1]]], d)?;
+/// let basis = ShBasis::Standard;
+/// let splats = SplatTensors::from_parts(&means, &quats, &scales, &opacities, &sh, basis)?;
+/// let k = Intrinsics { fx: 30.0, fy: 30.0, cx: 16.0, cy: 12.0, width: 32, height: 24 };
+/// let camera = Camera::new(k, glam::Mat4::IDENTITY)?;
+/// let planes = subsplat::rasterize(&splats, &camera, &RasterOptions::default())?;
+/// let rgb = planes.narrow(0, 0, 3)?;
+/// let gradients = rgb.sqr()?.sum_all()?.backward()?;
+/// assert!(gradients.get(&means).is_some() && gradients.get(&sh).is_some());
+/// # Ok(())
+/// # }
+/// ```
+pub fn rasterize_splats(
+    splats: &SplatTensors,
+    camera: &Camera,
+    options: &RasterOptions,
+) -> Result<Tensor> {
+    let options = RasterOptions { sh_basis: splats.sh_basis, ..*options };
+    let contiguous = |t: &Tensor| t.contiguous();
+    let (rows, sh) = (contiguous(&splats.rows)?, contiguous(&splats.sh)?);
+    let gain = match &splats.gain {
+        Some(gain) => contiguous(gain)?,
+        None => Tensor::ones(rows.dim(0)?, DType::F32, rows.device())?,
+    };
+    rasterize(&rows, &sh, &gain, camera, &options)
+}
+
+/// Puts planes `[5, H, W]` that were rendered over black before a `background` `[3]`:
+/// RGB + (1 − alpha)·background, with gradients to both. For a background that is
+/// learnt or sampled anew; a fixed one rides in [`RasterOptions`].
+///
+/// # Errors
+/// Tensors of other shapes.
+pub fn over_background(planes: &Tensor, background: &Tensor) -> Result<Tensor> {
+    let (&[5, _, _], &[3]) = (planes.dims(), background.dims()) else {
+        bail!(
+            "over_background: expected planes [5, H, W] and a background [3], got {:?} and {:?}",
+            planes.dims(),
+            background.dims()
+        )
+    };
+    let alpha = planes.narrow(0, 3, 1)?;
+    let behind = alpha.affine(-1.0, 1.0)?.broadcast_mul(&background.reshape((3, 1, 1))?)?;
+    Tensor::cat(&[(planes.narrow(0, 0, 3)? + behind)?, planes.narrow(0, 3, 2)?], 0)
 }
 
 fn check_shapes(splats: &Tensor, sh: &Tensor, gain: &Tensor) -> Result<()> {
@@ -119,8 +193,36 @@ impl CustomOp3 for Rasterize {
             sh_degree,
         };
         let mut out = Vec::new();
-        Rasterizer::new().render_planes(&slices, &self.camera, &self.options, &mut out);
+        let mut rasterizer = self.rasterizer.lock().unwrap_or_else(PoisonError::into_inner);
+        rasterizer.render_planes(&slices, &self.camera, &self.options, &mut out);
         let k = self.camera.intrinsics;
         Ok((CpuStorage::F32(out), (5, k.height, k.width).into()))
+    }
+
+    fn bwd(
+        &self,
+        splats: &Tensor,
+        sh: &Tensor,
+        gain: &Tensor,
+        _planes: &Tensor,
+        gradient: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        let Some(sh_degree) = degree_of(sh.dim(1)?) else {
+            bail!("rasterize: expected sh with D = 1, 4, 9, 16 or 25, got {:?}", sh.dims())
+        };
+        let [rows, set, gains] =
+            [elements::<f32>(splats)?, elements::<f32>(sh)?, elements::<f32>(gain)?];
+        let slices =
+            SplatSlices { geometry: Geometry::Packed(&rows), sh: &set, gain: &gains, sh_degree };
+        let gradient = elements::<f32>(gradient)?;
+        let mut out = Gradients::default();
+        let mut rasterizer = self.rasterizer.lock().unwrap_or_else(PoisonError::into_inner);
+        let (camera, options) = (&self.camera, &self.options);
+        rasterizer.backward_of_last(&slices, camera, options, &gradient, &mut out);
+        Ok((
+            Some(tensor_like(out.rows, splats)?),
+            Some(tensor_like(out.sh, sh)?),
+            Some(tensor_like(out.gain, gain)?),
+        ))
     }
 }

@@ -169,6 +169,10 @@ macro_rules! tier {
                 F(map(v.0, f32::abs))
             }
             #[inline(always)]
+            fn negative(self, v: F) -> F {
+                F(map(v.0, |v| -v.abs()))
+            }
+            #[inline(always)]
             fn floor(self, v: F) -> F {
                 F(map(v.0, floor))
             }

@@ -96,6 +96,7 @@ impl Not for M {
 
 /// Sum of eight lanes: i + (i + 4), then + 2, + 1.
 #[inline(always)]
+#[allow(dead_code, reason = "called by `sum`, which not every build uses")]
 pub(super) unsafe fn sum8(v: __m256) -> f32 {
     unsafe {
         let v = _mm_add_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps::<1>(v));
@@ -156,6 +157,13 @@ impl Simd for Token {
         unsafe {
             let sign = _mm256_set1_ps(-0.0);
             F(_mm256_andnot_ps(sign, v.0), _mm256_andnot_ps(sign, v.1))
+        }
+    }
+    #[inline(always)]
+    fn negative(self, v: F) -> F {
+        unsafe {
+            let sign = _mm256_set1_ps(-0.0);
+            F(_mm256_or_ps(v.0, sign), _mm256_or_ps(v.1, sign))
         }
     }
     #[inline(always)]

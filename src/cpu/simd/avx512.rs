@@ -138,6 +138,10 @@ impl Simd for Token {
         F(unsafe { _mm512_abs_ps(v.0) })
     }
     #[inline(always)]
+    fn negative(self, v: F) -> F {
+        F(unsafe { _mm512_or_ps(v.0, _mm512_set1_ps(-0.0)) })
+    }
+    #[inline(always)]
     fn floor(self, v: F) -> F {
         const DOWN: i32 = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
         F(unsafe { _mm512_roundscale_ps::<DOWN>(v.0) })
