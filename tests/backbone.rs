@@ -2,7 +2,7 @@
 //! reach, against naive readings of the specification: three views, non-square
 //! pictures, several Gaussians per pixel.
 
-use candle_core::{Device, Result, Tensor, Var};
+use candle_core::{Device, Result, Tensor};
 use glam::{Mat4, Quat, Vec3};
 use std::collections::BTreeMap;
 use subsplat::camera::{Camera, Intrinsics};

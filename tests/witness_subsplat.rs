@@ -12,7 +12,7 @@ use subsplat::abi::{
 };
 use subsplat::camera::Camera;
 use subsplat::config::{self, Config, FeatureLevel, LowpassRef, Preset};
-use subsplat::cpu::{ewa, sh};
+use subsplat::cpu::{Geometry, Rasterizer, SplatSlices, sh};
 use subsplat::model::aggregation::Aggregation;
 use subsplat::model::embed::Embeddings;
 use subsplat::model::geometry::{Frames, ParentChunk};
@@ -312,31 +312,39 @@ fn projection() -> Result<()> {
         let size: f32 = golden.note("scale");
         let intrinsics = scene.cameras[0].intrinsics.resized(width, height);
         let camera = Camera::new(intrinsics, scene.cameras[0].world_from_camera).unwrap();
-        let view = ewa::View::new(
-            &camera,
-            &RasterOptions {
-                lowpass: golden.note("lowpass"),
-                antialiased: golden.note("antialiased"),
-                // World units, or a camera's near plane.
-                near: scene.near[0] * if convention == Convention::Mvsplat { 10.0 } else { 2.0 },
-                ..RasterOptions::new(convention)
-            },
-        );
-        let rows = scene.rows()?.to_vec2::<f32>()?;
-        let mut quads: BTreeMap<&str, [Vec<f32>; 2]> = BTreeMap::new();
-        for row in &rows {
+        let options = RasterOptions {
+            lowpass: golden.note("lowpass"),
+            antialiased: golden.note("antialiased"),
+            // World units, or a camera's near plane.
+            near: scene.near[0] * if convention == Convention::Mvsplat { 10.0 } else { 2.0 },
+            ..RasterOptions::new(convention)
+        };
+        let mut rows = scene.rows()?.to_vec2::<f32>()?;
+        let (mut means, mut cov6, mut opacities) = (Vec::new(), Vec::new(), Vec::new());
+        for row in &mut rows {
+            row[LANE_SCALE..LANE_SCALE + 3].iter_mut().for_each(|s| *s *= size);
             let part = |at: usize| [row[at], row[at + 1], row[at + 2]];
-            let (mean, scale) = (part(LANE_MEAN), part(LANE_SCALE).map(|s| size * s));
             let quat = [row[LANE_QUAT], row[LANE_QUAT + 1], row[LANE_QUAT + 2], row[LANE_QUAT + 3]];
-            let opacity = row[LANE_OPACITY];
-            let forms = [
-                view.project_quat(mean, quat, scale, opacity),
-                view.project_cov6(mean, covariance(quat, scale), opacity),
-            ];
-            for (form, found) in forms.into_iter().enumerate() {
-                let f = found.unwrap_or_default();
-                let opacity = if found.is_some() { f.opacity() } else { 0.0 };
-                let conic = if found.is_some() { f.conic() } else { [0.0; 3] };
+            means.extend(part(LANE_MEAN));
+            cov6.extend(covariance(quat, part(LANE_SCALE)));
+            opacities.push(row[LANE_OPACITY]);
+        }
+        let packed = rows.concat();
+        let forms = [
+            Geometry::Packed(&packed),
+            Geometry::Cov6 { means: &means, cov6: &cov6, opacities: &opacities },
+        ];
+        let sh = vec![0.0; means.len()];
+        let mut quads: BTreeMap<&str, [Vec<f32>; 2]> = BTreeMap::new();
+        for (form, geometry) in forms.into_iter().enumerate() {
+            let slices = SplatSlices { geometry, sh: &sh, gain: &[], sh_degree: 0 };
+            let mut rasterizer = Rasterizer::new();
+            rasterizer.render(&slices, &camera, &options);
+            for f in rasterizer.footprints() {
+                let (conic, opacity) = match f.visible() {
+                    true => (f.conic(), f.opacity()),
+                    false => ([0.0; 3], 0.0),
+                };
                 let edges = [f.x0, f.y0, f.x1, f.y1].map(|v| v as f32);
                 let mut put = |name, v: &[f32]| quads.entry(name).or_default()[form].extend(v);
                 put("means2d", &[f.u, f.v]);
