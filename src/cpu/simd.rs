@@ -263,7 +263,7 @@ pub(crate) fn exp2<S: Simd>(s: S, p: S::F) -> S::F {
 #[inline(always)]
 pub(crate) fn log2<S: Simd>(s: S, v: S::F) -> S::F {
     const C: [f32; 9] = [
-        1.442_695,
+        std::f32::consts::LOG2_E,
         -0.721_347_35,
         0.480_910_64,
         -0.360_703_68,

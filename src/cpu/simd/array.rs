@@ -31,27 +31,28 @@ impl Mask for M {}
 impl Ints for I {}
 
 macro_rules! lanewise {
-    ($vector:ident, $of:ty, $($op:ident $method:ident $f:expr;)*) => { $(
+    ($($vector:ident $op:ident $method:ident $f:path;)*) => { $(
         impl $op for $vector {
             type Output = Self;
             #[inline(always)]
             fn $method(self, other: Self) -> Self {
-                let mut out = self.0;
-                for i in 0..LANES {
-                    let f: fn($of, $of) -> $of = $f;
-                    out[i] = f(self.0[i], other.0[i]);
-                }
-                Self(out)
+                Self(zip(self.0, other.0, $f))
             }
         }
     )* };
 }
 
-lanewise! { F, f32, Add add |a, b| a + b; Sub sub |a, b| a - b; Mul mul |a, b| a * b; Div div |a, b| a / b; }
-lanewise! { M, u32, BitAnd bitand |a, b| a & b; BitOr bitor |a, b| a | b; }
-lanewise! { I, i32,
-    Add add i32::wrapping_add; Sub sub i32::wrapping_sub;
-    BitAnd bitand |a, b| a & b; BitOr bitor |a, b| a | b;
+lanewise! {
+    F Add add Add::add;
+    F Sub sub Sub::sub;
+    F Mul mul Mul::mul;
+    F Div div Div::div;
+    M BitAnd bitand BitAnd::bitand;
+    M BitOr bitor BitOr::bitor;
+    I Add add i32::wrapping_add;
+    I Sub sub i32::wrapping_sub;
+    I BitAnd bitand BitAnd::bitand;
+    I BitOr bitor BitOr::bitor;
 }
 
 impl Neg for F {
@@ -117,7 +118,7 @@ fn floor(v: f32) -> f32 {
 }
 
 macro_rules! tier {
-    ($token:ident, $fma:expr) => {
+    ($token:ident, $fma:path) => {
         impl Simd for $token {
             type F = F;
             type M = M;
@@ -139,8 +140,7 @@ macro_rules! tier {
             fn fma(self, a: F, b: F, c: F) -> F {
                 let mut out = c.0;
                 for i in 0..LANES {
-                    let f: fn(f32, f32, f32) -> f32 = $fma;
-                    out[i] = f(a.0[i], b.0[i], c.0[i]);
+                    out[i] = $fma(a.0[i], b.0[i], c.0[i]);
                 }
                 F(out)
             }
@@ -308,6 +308,12 @@ macro_rules! tier {
     };
 }
 
-tier!(Separate, |a, b, c| a * b + c);
+/// a·b + c, rounded twice.
+#[inline(always)]
+fn multiply_then_add(a: f32, b: f32, c: f32) -> f32 {
+    a * b + c
+}
+
+tier!(Separate, multiply_then_add);
 #[cfg(any(target_arch = "aarch64", test))]
 tier!(Fused, f32::mul_add);
