@@ -14,7 +14,7 @@ use crate::cpu::disjoint::Disjoint;
 use crate::cpu::ewa::{Footprint, View};
 use crate::cpu::project::{Projection, SplatSlices};
 use crate::cpu::raster_bwd::Buffers;
-use crate::cpu::simd::Tier;
+use crate::cpu::simd::{Kernel, Simd, Tier};
 use crate::cpu::sort::depth_order;
 use crate::cpu::tiles::{Grid, TileLists};
 use rayon::prelude::*;
@@ -290,8 +290,7 @@ impl Rasterizer {
                     RenderTile { place: &mut place, t, grid, order, splats, footprints, rules };
                 items.fetch_add(tier.run(work), Relaxed);
                 let blended = timed.then(Instant::now);
-                // SAFETY: as above; no other tile has these pixels.
-                unsafe { target.write(&place.tile, t, &grid) };
+                tier.run(WriteTile { tile: &place.tile, t, grid: &grid, target });
                 if let (Some(start), Some(sorted), Some(blended)) = (start, sorted, blended) {
                     let add = |clock: &AtomicU64, from: Instant, to: Instant| {
                         clock.fetch_add((to - from).as_nanos() as u64, Relaxed);
@@ -316,56 +315,82 @@ pub(crate) fn since(start: Option<Instant>) -> Duration {
     start.map_or(Duration::ZERO, |s| s.elapsed())
 }
 
-impl Target<'_> {
-    /// Writes the pixels of tile `t` of `grid`.
-    ///
-    /// # Safety
-    /// No other thread writes the same tile.
-    unsafe fn write(&self, tile: &Tile, t: usize, grid: &Grid) {
-        let (left, top) = (t % grid.columns * TILE, t / grid.columns * TILE);
+/// Writes the pixels of tile `t` of `grid`. One thread at a time for each tile.
+struct WriteTile<'a> {
+    tile: &'a Tile,
+    t: usize,
+    grid: &'a Grid,
+    target: &'a Target<'a>,
+}
+
+impl Kernel for WriteTile<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        let (grid, target) = (self.grid, self.target);
+        let (left, top) = (self.t % grid.columns * TILE, self.t / grid.columns * TILE);
         let width = TILE.min(grid.width - left);
-        let [red, green, blue] = self.background;
         for y in 0..TILE.min(grid.height - top) {
-            // One row of pixels, unfolded from its blocks.
-            let mut row = [[0.0f32; TILE]; 5];
-            let blocks = &tile.blocks[y / BLOCK * BLOCKS..][..BLOCKS];
-            for (b, block) in blocks.iter().enumerate() {
-                let lane = y % BLOCK * BLOCK;
-                for (to, from) in row.iter_mut().zip([
-                    &block.rgb[0],
-                    &block.rgb[1],
-                    &block.rgb[2],
-                    &block.t,
-                    &block.z,
-                ]) {
-                    to[b * BLOCK..][..BLOCK].copy_from_slice(&from[lane..lane + BLOCK]);
-                }
-            }
-            let [r, g, b, t, z] = &mut row;
-            for x in 0..TILE {
-                let rest = t[x].abs();
-                r[x] += rest * red;
-                g[x] += rest * green;
-                b[x] += rest * blue;
-                t[x] = 1.0 - rest;
-            }
+            let row = unfold(self.tile, y, target.background);
             let first = (top + y) * grid.width + left;
-            // SAFETY: these pixels are the tile's (the caller's promise).
+            // SAFETY: no other tile has these pixels, and this tile is one thread's.
             unsafe {
-                self.alpha.part(first..first + width).copy_from_slice(&t[..width]);
-                self.depth_sum.part(first..first + width).copy_from_slice(&z[..width]);
-                if self.step == 1 {
-                    for (c, plane) in [&*r, &*g, &*b].into_iter().enumerate() {
-                        let first = c * self.channel + first;
-                        self.rgb.part(first..first + width).copy_from_slice(&plane[..width]);
+                copy(target.alpha.part(first..first + width), &row[3]);
+                copy(target.depth_sum.part(first..first + width), &row[4]);
+                if target.step == 1 {
+                    for (c, plane) in row[..3].iter().enumerate() {
+                        let first = c * target.channel + first;
+                        copy(target.rgb.part(first..first + width), plane);
                     }
                 } else {
-                    let pixels = self.rgb.part(3 * first..3 * (first + width));
-                    for (x, pixel) in pixels.chunks_exact_mut(3).enumerate() {
-                        pixel.copy_from_slice(&[r[x], g[x], b[x]]);
+                    let mut pixels = [0.0; 3 * TILE];
+                    for x in 0..TILE {
+                        pixels[3 * x] = row[0][x];
+                        pixels[3 * x + 1] = row[1][x];
+                        pixels[3 * x + 2] = row[2][x];
                     }
+                    copy(target.rgb.part(3 * first..3 * (first + width)), &pixels);
                 }
             }
+        }
+    }
+}
+
+/// Pixel row `y` of a tile: R, G, B over the background, alpha, Σ w·z.
+#[inline(always)]
+fn unfold(tile: &Tile, y: usize, background: [f32; 3]) -> [[f32; TILE]; 5] {
+    let mut row = [[0.0f32; TILE]; 5];
+    let lane = y % BLOCK * BLOCK;
+    for b in 0..BLOCKS {
+        let block = &tile.blocks[y / BLOCK * BLOCKS + b];
+        for i in 0..BLOCK {
+            let x = b * BLOCK + i;
+            row[0][x] = block.rgb[0][lane + i];
+            row[1][x] = block.rgb[1][lane + i];
+            row[2][x] = block.rgb[2][lane + i];
+            row[3][x] = block.t[lane + i].abs();
+            row[4][x] = block.z[lane + i];
+        }
+    }
+    for x in 0..TILE {
+        let rest = row[3][x];
+        row[0][x] += rest * background[0];
+        row[1][x] += rest * background[1];
+        row[2][x] += rest * background[2];
+        row[3][x] = 1.0 - rest;
+    }
+    row
+}
+
+/// Copies as much of `from` as `to` takes; a whole row without asking how much.
+#[inline(always)]
+fn copy<const L: usize>(to: &mut [f32], from: &[f32; L]) {
+    if let Ok(to) = <&mut [f32; L]>::try_from(&mut *to) {
+        *to = *from;
+    } else {
+        for (to, from) in to.iter_mut().zip(from) {
+            *to = *from;
         }
     }
 }
