@@ -390,6 +390,7 @@ impl Kernel for WriteTile<'_> {
 
 /// Pixel row `y` of a tile: R, G, B over the background, alpha, Σ w·z.
 #[inline(always)]
+#[expect(clippy::needless_range_loop, reason = "one index walks five rows")]
 fn unfold(tile: &Tile, y: usize, background: [f32; 3]) -> [[f32; TILE]; 5] {
     let mut row = [[0.0f32; TILE]; 5];
     let lane = y % BLOCK * BLOCK;
