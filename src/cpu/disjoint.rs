@@ -22,6 +22,12 @@ impl<'a, T> Disjoint<'a, T> {
         Self { start: slice.as_mut_ptr(), len: slice.len(), slice: PhantomData }
     }
 
+    /// Where place `i` is, for a prefetch.
+    #[inline(always)]
+    pub(crate) fn address(&self, i: usize) -> *const T {
+        self.start.wrapping_add(i)
+    }
+
     /// Writes `v` at place `i`; nothing where that lies outside.
     ///
     /// # Safety

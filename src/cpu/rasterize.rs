@@ -283,6 +283,7 @@ impl Rasterizer {
                 // SAFETY: the queue names each tile once, and its counter gives each
                 // place to one thread.
                 let list = unsafe { lists.take(t) };
+                tier.run(AwaitTile { t, grid: &grid, target });
                 depth_order(list.entries, list.spare, list.order);
                 let (order, splats) = (&*list.order, list.splats);
                 let sorted = timed.then(Instant::now);
@@ -313,6 +314,41 @@ impl Rasterizer {
 
 pub(crate) fn since(start: Option<Instant>) -> Duration {
     start.map_or(Duration::ZERO, |s| s.elapsed())
+}
+
+/// Asks for the cache lines of tile `t`'s pixels, which are to be here when it is
+/// written: its rows lie far apart, where no processor foresees them.
+struct AwaitTile<'a> {
+    t: usize,
+    grid: &'a Grid,
+    target: &'a Target<'a>,
+}
+
+impl Kernel for AwaitTile<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        /// Floats of a cache line.
+        const LINE: usize = 16;
+        let (grid, target) = (self.grid, self.target);
+        let (left, top) = (self.t % grid.columns * TILE, self.t / grid.columns * TILE);
+        for y in 0..TILE.min(grid.height - top) {
+            let first = (top + y) * grid.width + left;
+            for x in (0..TILE).step_by(LINE) {
+                s.prefetch(target.alpha.address(first + x));
+                s.prefetch(target.depth_sum.address(first + x));
+                for c in 0..3 {
+                    let at = if target.step == 1 {
+                        first + x + c * target.channel
+                    } else {
+                        3 * (first + x) + c * LINE
+                    };
+                    s.prefetch(target.rgb.address(at));
+                }
+            }
+        }
+    }
 }
 
 /// Writes the pixels of tile `t` of `grid`. One thread at a time for each tile.
@@ -359,6 +395,7 @@ impl Kernel for WriteTile<'_> {
 
 /// Pixel row `y` of a tile: R, G, B over the background, alpha, Σ w·z.
 #[inline(always)]
+#[expect(clippy::needless_range_loop, reason = "one index walks five rows")]
 fn unfold(tile: &Tile, y: usize, background: [f32; 3]) -> [[f32; TILE]; 5] {
     let mut row = [[0.0f32; TILE]; 5];
     let lane = y % BLOCK * BLOCK;

@@ -220,8 +220,8 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     /// v >> N, the sign kept.
     fn shr<const N: u32>(self, v: Self::I) -> Self::I;
 
-    /// Asks for the cache line at `v`.
-    fn prefetch<T>(self, v: &T);
+    /// Asks for the cache line at `v`; any address will do.
+    fn prefetch<T>(self, v: *const T);
     /// Sum of the lanes: lane i + lane (i + 8), then + 4, + 2, + 1.
     fn sum(self, v: Self::F) -> f32;
     /// Four floats at each of 16 places of `from`, as four vectors: lane i of

@@ -271,7 +271,7 @@ macro_rules! tier {
                 I(map(v.0, |v| v >> N))
             }
             #[inline(always)]
-            fn prefetch<T>(self, _: &T) {}
+            fn prefetch<T>(self, _: *const T) {}
             #[inline(always)]
             fn sum(self, v: F) -> f32 {
                 let mut v = v.0;

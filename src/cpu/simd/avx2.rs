@@ -273,8 +273,8 @@ impl Simd for Token {
     }
 
     #[inline(always)]
-    fn prefetch<T>(self, v: &T) {
-        unsafe { _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(v).cast()) }
+    fn prefetch<T>(self, v: *const T) {
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(v.cast()) }
     }
     #[inline(always)]
     fn sum(self, v: F) -> f32 {
