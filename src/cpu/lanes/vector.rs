@@ -388,7 +388,8 @@ mod tests {
                 if x.abs() > 87.2 && i < 2 {
                     continue;
                 }
-                let at = if i == 7 { -(x.abs() / (x.abs() + 0.001)) } else { *x };
+                // ln(1 + x) down to the largest optical depth that occurs, x = -0.9999.
+                let at = if i == 7 { -(x.abs() / (x.abs() + 0.001)).min(0.9999) } else { *x };
                 let want = want[i](f64::from(at));
                 // Next to a zero of sine, cosine or logarithm the error is absolute.
                 let floor = if (3..7).contains(&i) { 0.3 } else { 1e-30 };
