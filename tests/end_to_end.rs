@@ -382,6 +382,45 @@ fn a_batch_equals_its_scenes() {
     }
 }
 
+/// The path without children in memory gives the picture of the path with them, with
+/// SPGR on and off, in both presets' conventions.
+#[test]
+fn straight_to_the_picture_is_the_same_picture() {
+    let shoots = [shoot(1, 2, 64, 64)];
+    for (mvsplat, preset) in [(true, Preset::Paper), (true, Preset::Tuned), (false, Preset::Tuned)]
+    {
+        let config = light(plain(mvsplat, preset, 2));
+        for config in [native(&config), config] {
+            let model = lively(&config);
+            let views = batch(&model, &shoots, SIZE);
+            let options = model.raster_options(NEAR_FAR.0);
+            let camera = views.cameras[0][0].resized(2 * SIZE.0, 2 * SIZE.1);
+            let direct = model.model().render(&views, &camera, &options).unwrap();
+            let scenes = model.model().forward(&views, &mut |_| {}).unwrap();
+            assert_eq!(direct.len(), scenes.len());
+            for (direct, scene) in direct.iter().zip(&scenes) {
+                assert_eq!(direct.dims(), [5, 2 * SIZE.1, 2 * SIZE.0]);
+                let splats = scene.children.to_splats().unwrap();
+                let options = RasterOptions { sh_basis: splats.sh_basis, ..options };
+                let picture = render(&splats, &camera, &options);
+                assert!(mean(&picture.alpha) > 0.1, "{mvsplat} {preset:?} {}", mean(&picture.alpha));
+                let flat = direct.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+                let plane = picture.alpha.len();
+                let rgb = |i: usize| picture.rgb[i % plane * 3 + i / plane];
+                let want = (0..3 * plane).map(rgb).chain(picture.alpha.iter().copied());
+                let (mut worst, mut flips) = (0f32, 0);
+                for (a, b) in flat.iter().zip(want) {
+                    let d = (a - b).abs();
+                    // Rounding decides now and then whether a splat of 1/255 counts.
+                    flips += usize::from(d > 1e-4);
+                    worst = worst.max(d);
+                }
+                assert!(worst < 0.02 && flips * 500 < plane, "{worst} {flips}");
+            }
+        }
+    }
+}
+
 #[test]
 fn any_number_of_views_any_shape_any_depth_range() {
     for mvsplat in [true, false] {

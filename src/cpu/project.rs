@@ -125,6 +125,19 @@ impl Projection {
             + self.parents.capacity() * size_of::<[f32; 3]>()
     }
 
+    /// Counts the entries of footprints that are there already.
+    pub(crate) fn cover(&self, lists: &mut TileLists) {
+        let chunk = lists.chunk();
+        let covers = lists.chunks(self.footprints.len());
+        let chunks = self.footprints.par_chunks(chunk).zip(covers);
+        chunks.enumerate().for_each(|(c, (footprints, mut cover))| {
+            cover.clear();
+            for (i, f) in footprints.iter().enumerate().filter(|(_, f)| f.visible()) {
+                cover.add(f, (c * chunk + i) as u32);
+            }
+        });
+    }
+
     /// Projects all splats and counts their entries in the lists of `lists`' tiles.
     pub(crate) fn run(
         &mut self,

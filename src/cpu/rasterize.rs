@@ -171,7 +171,8 @@ impl Rasterizer {
             depth_sum: Disjoint::new(&mut out.depth_sum),
             background: options.background,
         };
-        self.composite(splats, camera, options, &target);
+        self.project(splats, camera, options);
+        self.composite(options, &target);
     }
 
     /// Renders into planes `[5, H, W]`: R, G, B, alpha, Σ w·z.
@@ -182,19 +183,33 @@ impl Rasterizer {
         options: &RasterOptions,
         out: &mut Vec<f32>,
     ) {
-        let plane = camera.intrinsics.width * camera.intrinsics.height;
-        out.resize(5 * plane, 0.0);
-        let (rgb, rest) = out.split_at_mut(3 * plane);
-        let (alpha, depth_sum) = rest.split_at_mut(plane);
-        let target = Target {
-            rgb: Disjoint::new(rgb),
-            step: 1,
-            channel: plane,
-            alpha: Disjoint::new(alpha),
-            depth_sum: Disjoint::new(depth_sum),
-            background: options.background,
-        };
-        self.composite(splats, camera, options, &target);
+        self.project(splats, camera, options);
+        self.composite(options, &planes(camera, options, out));
+    }
+
+    /// Renders `count` splats that are projected already: `fill` writes their footprints
+    /// for this camera and these options ([`crate::cpu::spgr::project`] makes them from
+    /// head records). Planes `[5, H, W]` as of [`Rasterizer::render_planes`].
+    ///
+    /// # Errors
+    /// What `fill` returns; `out` is then as it was.
+    pub fn render_footprints<E>(
+        &mut self,
+        count: usize,
+        camera: &Camera,
+        options: &RasterOptions,
+        fill: impl FnOnce(&mut [Footprint]) -> Result<(), E>,
+        out: &mut Vec<f32>,
+    ) -> Result<(), E> {
+        let start = self.now();
+        self.projection.footprints.resize(count, Footprint::default());
+        fill(&mut self.projection.footprints)?;
+        self.grid = Grid::new(camera.intrinsics.width, camera.intrinsics.height);
+        self.lists.begin(self.grid, count);
+        self.projection.cover(&mut self.lists);
+        self.times = StageTimes { project: since(start), ..StageTimes::default() };
+        self.composite(options, &planes(camera, options, out));
+        Ok(())
     }
 
     /// `[N]`: the last frame's footprints, in the splats' order.
@@ -213,14 +228,8 @@ impl Rasterizer {
         self.times
     }
 
-    /// The whole frame, written to `target`.
-    fn composite(
-        &mut self,
-        splats: &SplatSlices,
-        camera: &Camera,
-        options: &RasterOptions,
-        target: &Target,
-    ) {
+    /// Footprints, and what each adds to which tile.
+    fn project(&mut self, splats: &SplatSlices, camera: &Camera, options: &RasterOptions) {
         debug_assert!(splats.is_consistent(), "splat buffers do not fit one another");
         let start = self.now();
         let view = View::new(camera, options);
@@ -228,7 +237,10 @@ impl Rasterizer {
         self.lists.begin(self.grid, splats.len());
         self.projection.run(self.tier, splats, &view, options, &mut self.lists);
         self.times = StageTimes { project: since(start), ..StageTimes::default() };
+    }
 
+    /// All that follows projection, written to `target`.
+    fn composite(&mut self, options: &RasterOptions, target: &Target) {
         let clocks = Clocks::default();
         self.lists.count();
         let tiles = self.grid.len();
@@ -309,6 +321,22 @@ impl Rasterizer {
 
     pub(crate) fn now(&self) -> Option<Instant> {
         self.timed.then(Instant::now)
+    }
+}
+
+/// Planes R, G, B, alpha, Σ w·z in `out`, made as long as they are.
+fn planes<'a>(camera: &Camera, options: &RasterOptions, out: &'a mut Vec<f32>) -> Target<'a> {
+    let plane = camera.intrinsics.width * camera.intrinsics.height;
+    out.resize(5 * plane, 0.0);
+    let (rgb, rest) = out.split_at_mut(3 * plane);
+    let (alpha, depth_sum) = rest.split_at_mut(plane);
+    Target {
+        rgb: Disjoint::new(rgb),
+        step: 1,
+        channel: plane,
+        alpha: Disjoint::new(alpha),
+        depth_sum: Disjoint::new(depth_sum),
+        background: options.background,
     }
 }
 

@@ -5,8 +5,10 @@ use super::primaries::primaries;
 use super::trace::Trace;
 use super::trunk::{Children, Trunk};
 use super::{BackboneOutput, Primaries, Views};
+use crate::abi::RasterOptions;
+use crate::camera::Camera;
 use crate::config::{Backbone, Config, FeatureLevel};
-use candle_core::{Error, Result, bail};
+use candle_core::{Error, Result, Tensor, bail};
 use candle_nn::VarBuilder;
 
 enum Encoder {
@@ -106,6 +108,26 @@ impl SubSplat {
             scenes.push(SceneOutput { children, depths });
         }
         Ok(scenes)
+    }
+
+    /// Pictures straight to what `camera` sees of them, `[5, H, W]` a scene (R, G, B,
+    /// alpha, Σ w·z): the children are never in memory ([`Trunk::render`]).
+    ///
+    /// # Errors
+    /// Those of [`SubSplat::forward`] and of the rasterizer.
+    pub fn render(
+        &self,
+        views: &Views,
+        camera: &Camera,
+        options: &RasterOptions,
+    ) -> Result<Vec<Tensor>> {
+        let one = |b: usize| {
+            let views = views.scene(b)?;
+            let output = self.encode(&views)?;
+            let parents = self.primaries(&views, &output)?;
+            self.trunk.render(&views, &output, &parents, camera, options)
+        };
+        (0..views.scenes()).map(one).collect()
     }
 }
 

@@ -10,8 +10,11 @@ use super::geometry::{Frames, ParentChunk};
 use super::mlp::Mode;
 use super::spgr::{Heads, rules};
 use super::{BackboneOutput, Primaries, Views};
-use crate::abi::{SPLAT_LANES, ShBasis, sh_coefficients};
+use crate::abi::{RasterOptions, SPLAT_LANES, ShBasis, sh_coefficients};
+use crate::camera::Camera;
 use crate::config::{Config, FeatureLevel, HeadInput, ShInput, SpgrHead};
+use crate::ops::direct::{Footprint, rasterize_footprints, spgr_footprints};
+use crate::ops::rasterize;
 use crate::ops::spgr::{Rules, Spgr, spgr, spgr_into};
 use crate::splats::Splats;
 use candle_core::{DType, Result, Tensor, bail};
@@ -167,7 +170,45 @@ impl Trunk {
         })
     }
 
-    /// The same for every scene of a batch.
+    /// The picture `[5, H, W]` (R, G, B, alpha, Σ w·z) that `camera` sees of the one
+    /// scene in `views`, without children in memory: head records become footprints
+    /// chunk by chunk. The basis of `options` gives way to the primaries' own.
+    ///
+    /// # Errors
+    /// Those of [`Trunk::forward`] and of the rasterizer.
+    pub fn render(
+        &self,
+        views: &Views,
+        backbone: &BackboneOutput,
+        primaries: &Primaries,
+        camera: &Camera,
+        options: &RasterOptions,
+    ) -> Result<Tensor> {
+        let options = &RasterOptions { sh_basis: primaries.sh_basis, ..*options };
+        let Some(parts) = &self.parts else {
+            let all = self.pass_through(views, primaries)?;
+            return rasterize(&all.rows, &all.sh, &all.gain, camera, options);
+        };
+        let scene = self.scene(parts, views, backbone, primaries)?;
+        let (k, n) = (scene.rules.children(), scene.means.dim(0)?);
+        let sh = primaries.sh.squeeze(0)?;
+        let fill = |mut left: &mut [Footprint]| {
+            let mut jobs = Vec::new();
+            for (first, len) in chunks(n, scene.per_view, CHUNK) {
+                let (own, rest) = left.split_at_mut(len * k);
+                left = rest;
+                jobs.push((first, len, own));
+            }
+            jobs.into_par_iter().try_for_each(|(first, len, own)| {
+                let (head, parents) = self.records(parts, &scene, (first, len), Mode::Infer)?;
+                let sh = sh.narrow(0, first, len)?.transpose(1, 2)?;
+                spgr_footprints((&head, &parents, &sh), &scene.call(first), camera, options, own)
+            })
+        };
+        rasterize_footprints(n * k, camera, options, fill)
+    }
+
+    /// [`Trunk::forward`] for every scene of a batch.
     ///
     /// # Errors
     /// Those of [`Trunk::forward`].

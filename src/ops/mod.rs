@@ -6,6 +6,7 @@ pub mod activation;
 pub mod attention;
 pub mod attention_gather;
 pub mod conv2d;
+pub mod direct;
 pub mod linear;
 pub mod matching;
 pub mod norm;

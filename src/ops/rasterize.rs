@@ -133,7 +133,7 @@ fn check_shapes(splats: &Tensor, sh: &Tensor, gain: &Tensor) -> Result<()> {
     Ok(())
 }
 
-fn check_options(camera: &Camera, options: &RasterOptions) -> Result<()> {
+pub(super) fn check_options(camera: &Camera, options: &RasterOptions) -> Result<()> {
     camera.intrinsics.check().map_err(candle_core::Error::wrap)?;
     if !camera.world_from_camera.is_finite() {
         bail!("rasterize: expected a finite camera pose, got {:?}", camera.world_from_camera);

@@ -30,7 +30,7 @@ pub struct Spgr {
 }
 
 impl Spgr {
-    fn check(&self, head: &Tensor, parents: &Tensor) -> Result<usize> {
+    pub(super) fn check(&self, head: &Tensor, parents: &Tensor) -> Result<usize> {
         let n = parents.dim(0)?;
         let k = self.rules.children();
         if k == 0 || k > CHILDREN_MAX {
@@ -54,7 +54,7 @@ impl Spgr {
         Ok(n)
     }
 
-    fn source(&self) -> cpu::Source<'_> {
+    pub(super) fn source(&self) -> cpu::Source<'_> {
         let Self { cameras, near, per_view, first, .. } = self;
         cpu::Source { cameras, near, per_view: *per_view, first: *first }
     }
