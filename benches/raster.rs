@@ -205,23 +205,31 @@ fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
     let seeds = case.seeds();
     check_gradients(bench, case, &seeds)?;
     let (v_rgb, v_alpha) = &seeds;
-    let mut plain = Conventional::default();
-    let mut plain_both = Conventional::default();
-    plain.forward(&case.plain(), &case.camera, case.plain_options(BOX));
     let options = case.plain_options(BOX);
+    let forward = |plain: &mut Conventional| plain.forward(&case.plain(), &case.camera, options);
+    let backward = |plain: &Conventional| {
+        let g = plain.backward(&case.plain(), &case.camera, options, v_rgb, v_alpha);
+        std::hint::black_box(g);
+    };
+    let mut plain = [false, true].map(|keeps| Conventional { keeps, ..Conventional::default() });
+    plain.iter_mut().for_each(forward);
+    let [walks, keeps] = &plain;
+    let mut both = Conventional::default();
     let planes = &planes(&seeds);
     let mut kept: [(Frames, Vec<f32>); 2] = Default::default();
     let (mut one, mut all) = (Frames::default(), Frames::default());
     let mut contenders = vec![
         Contender::new("conventional, backward alone", Threads::One, || {
-            let g = plain.backward(&case.plain(), &case.camera, options, v_rgb, v_alpha);
-            std::hint::black_box(g);
+            backward(walks);
             Ok(())
         }),
-        Contender::new("conventional, both passes", Threads::One, move || {
-            plain_both.forward(&case.plain(), &case.camera, options);
-            let g = plain_both.backward(&case.plain(), &case.camera, options, v_rgb, v_alpha);
-            std::hint::black_box(g);
+        Contender::new("conventional, keeps what it blended", Threads::One, || {
+            backward(keeps);
+            Ok(())
+        }),
+        Contender::new("conventional, both passes", Threads::One, || {
+            forward(&mut both);
+            backward(&both);
             Ok(())
         }),
     ];

@@ -111,6 +111,13 @@ fn lanes_of(rows: &[f32], lanes: std::ops::Range<usize>) -> Vec<f32> {
 }
 
 fn check_case(name: &str) {
+    for keeps in [false, true] {
+        check_walk(name, keeps);
+    }
+}
+
+/// The baseline, with and without a list of what each pixel blended.
+fn check_walk(name: &str, keeps: bool) {
     let Some(case) = Case::read(name) else { return };
     let rows = case.rows("");
     let children: usize = case.metadata["children"].parse().unwrap();
@@ -122,7 +129,7 @@ fn check_case(name: &str) {
         sh_degree: coefficients.isqrt() - 1,
     };
     let (camera, options) = (case.camera(), case.options());
-    let mut rasterizer = Rasterizer::default();
+    let mut rasterizer = Rasterizer { keeps, ..Rasterizer::default() };
     rasterizer.forward(&splats, &camera, options);
     let boundary = case.get("boundary");
     let outputs = [

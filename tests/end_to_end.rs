@@ -403,7 +403,11 @@ fn straight_to_the_picture_is_the_same_picture() {
                 let splats = scene.children.to_splats().unwrap();
                 let options = RasterOptions { sh_basis: splats.sh_basis, ..options };
                 let picture = render(&splats, &camera, &options);
-                assert!(mean(&picture.alpha) > 0.1, "{mvsplat} {preset:?} {}", mean(&picture.alpha));
+                assert!(
+                    mean(&picture.alpha) > 0.1,
+                    "{mvsplat} {preset:?} {}",
+                    mean(&picture.alpha)
+                );
                 let flat = direct.flatten_all().unwrap().to_vec1::<f32>().unwrap();
                 let plane = picture.alpha.len();
                 let rgb = |i: usize| picture.rgb[i % plane * 3 + i / plane];

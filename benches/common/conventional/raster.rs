@@ -1,7 +1,8 @@
 //! A rasterizer as most of them are written (3DGS' algorithm on one CPU thread):
 //! 16×16 tiles, a square box of some σ around each splat, one sort of (tile, depth)
-//! pairs, each pixel walks its tile's list front to back and keeps the splats that it
-//! blended; backward walks those back to front and recovers T by division.
+//! pairs, each pixel walks its tile's list front to back; backward walks it back to
+//! front from a stored last place and recovers T by division. Some programs keep what
+//! each pixel blended instead (`keeps`): a faster backward for much memory.
 
 use super::project::{Gradients, Options, Projected, ProjectedGrad, Splats, View};
 use subsplat::camera::Camera;
@@ -22,9 +23,10 @@ pub struct Frame {
     pub depth_sum: Vec<f32>,
     /// `[H, W]`: T behind the last splat.
     transmittance: Vec<f32>,
-    /// Splats that pixels blended, front to back, one pixel after the other.
+    /// Splats that pixels blended, front to back, one pixel after the other, if kept.
     blended: Vec<u32>,
-    /// `[H, W]`: first and one past the last of a pixel's in `blended`.
+    /// `[H, W]`: first and one past the last of a pixel's in `blended`, else in the
+    /// pairs.
     spans: Vec<(usize, usize)>,
 }
 
@@ -36,6 +38,8 @@ pub struct Rasterizer {
     pairs: Vec<(u64, u32)>,
     /// First and one past the last pair of each tile.
     ranges: Vec<(u32, u32)>,
+    /// Whether a pixel's splats are kept for backward.
+    pub keeps: bool,
     pub frame: Frame,
 }
 
@@ -112,8 +116,10 @@ impl Rasterizer {
         let (px, py) = (x as f32 + 0.5, y as f32 + 0.5);
         let (from, to) = self.ranges[tile];
         let (mut t, mut rgb, mut depth) = (1.0f32, [0.0f32; 3], 0.0f32);
-        let first = self.frame.blended.len();
-        for &(_, i) in &self.pairs[from as usize..to as usize] {
+        let first = if self.keeps { self.frame.blended.len() } else { from as usize };
+        let mut past = first;
+        for k in from as usize..to as usize {
+            let i = self.pairs[k].1;
             let s = &self.projected[i as usize];
             let Some((alpha, _)) = alpha_at(s, px - s.uv[0], py - s.uv[1]) else { continue };
             let alpha = alpha.min(ALPHA_MAX);
@@ -127,7 +133,11 @@ impl Rasterizer {
             }
             depth += weight * s.z;
             t = rest;
-            self.frame.blended.push(i);
+            past = k + 1;
+            if self.keeps {
+                self.frame.blended.push(i);
+                past = self.frame.blended.len();
+            }
         }
         let at = y * width + x;
         for c in 0..3 {
@@ -136,7 +146,7 @@ impl Rasterizer {
         self.frame.alpha[at] = 1.0 - t;
         self.frame.depth_sum[at] = depth;
         self.frame.transmittance[at] = t;
-        self.frame.spans[at] = (first, self.frame.blended.len());
+        self.frame.spans[at] = (first, past);
     }
 
     /// Gradients of Σ rgb·v_rgb + Σ alpha·v_alpha of the last [`Rasterizer::forward`],
@@ -197,8 +207,8 @@ impl Rasterizer {
         // Σ over the splats behind of w·(c·v).
         let mut behind = 0.0;
         let (first, past) = self.frame.spans[at];
-        for &i in self.frame.blended[first..past].iter().rev() {
-            let i = i as usize;
+        for k in (first..past).rev() {
+            let i = if self.keeps { self.frame.blended[k] } else { self.pairs[k].1 } as usize;
             let s = &self.projected[i];
             let (dx, dy) = (px - s.uv[0], py - s.uv[1]);
             let Some((raw, falloff)) = alpha_at(s, dx, dy) else { continue };

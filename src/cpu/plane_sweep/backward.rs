@@ -59,11 +59,14 @@ impl Sparse {
     }
 }
 
+/// One line of pixels: how many entries each pixel has, and the entries.
+type Line = (Vec<usize>, Vec<(u32, f32)>);
+
 /// c_ij of reference row `r` and one of its pairs, by reference pixel.
 fn coefficients(s: &Sweep, r: usize, pair: &Pair, grad: &[f32]) -> Sparse {
     let ([h, w], d) = (s.size, s.candidates());
     let factor = s.scale / s.pairs[r].len().max(1) as f32;
-    let rows: Vec<(Vec<usize>, Vec<(u32, f32)>)> = (0..h)
+    let rows: Vec<Line> = (0..h)
         .into_par_iter()
         .map_init(
             || Walk::new(s),
