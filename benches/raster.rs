@@ -211,7 +211,7 @@ fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
         let g = plain.backward(&case.plain(), &case.camera, options, v_rgb, v_alpha);
         std::hint::black_box(g);
     };
-    let mut plain = [false, true].map(|keeps| Conventional { keeps, ..Conventional::default() });
+    let mut plain = [false, true].map(Conventional::new);
     plain.iter_mut().for_each(forward);
     let [walks, keeps] = &plain;
     let mut both = Conventional::default();

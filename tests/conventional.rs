@@ -129,7 +129,7 @@ fn check_walk(name: &str, keeps: bool) {
         sh_degree: coefficients.isqrt() - 1,
     };
     let (camera, options) = (case.camera(), case.options());
-    let mut rasterizer = Rasterizer { keeps, ..Rasterizer::default() };
+    let mut rasterizer = Rasterizer::new(keeps);
     rasterizer.forward(&splats, &camera, options);
     let boundary = case.get("boundary");
     let outputs = [

@@ -39,7 +39,7 @@ pub struct Rasterizer {
     /// First and one past the last pair of each tile.
     ranges: Vec<(u32, u32)>,
     /// Whether a pixel's splats are kept for backward.
-    pub keeps: bool,
+    keeps: bool,
     pub frame: Frame,
 }
 
@@ -57,6 +57,11 @@ fn alpha_at(s: &Projected, dx: f32, dy: f32) -> Option<(f32, f32)> {
 }
 
 impl Rasterizer {
+    /// Without buffers. `keeps`: backward reads what each pixel blended.
+    pub fn new(keeps: bool) -> Self {
+        Self { keeps, ..Self::default() }
+    }
+
     /// Renders into `frame`.
     pub fn forward(&mut self, splats: &Splats, camera: &Camera, options: Options) {
         let view = View::new(camera, options);
