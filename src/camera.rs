@@ -35,8 +35,11 @@ pub enum CameraError {
         /// Vertical focal length, px.
         fy: f32,
     },
-    /// The picture has no pixels.
-    #[error("camera picture size: expected at least 1x1, got {width}x{height}")]
+    /// The picture has no pixels, or more than any kernel is made for.
+    #[error(
+        "camera picture size: expected 1 to {} pixels a side, got {width}x{height}",
+        Intrinsics::SIDE_MAX
+    )]
     Size {
         /// Width, px.
         width: usize,
@@ -74,6 +77,9 @@ pub struct Intrinsics {
 }
 
 impl Intrinsics {
+    /// Most pixels along a side of a picture.
+    pub const SIDE_MAX: usize = 32_768;
+
     /// From intrinsics divided by the picture's size, (fx/W, fy/H, cx/W, cy/H).
     pub fn from_normalised(k: [f32; 4], width: usize, height: usize) -> Self {
         let (w, h) = (width as f32, height as f32);
@@ -155,7 +161,8 @@ impl Intrinsics {
         if self.fx <= 0.0 || self.fy <= 0.0 {
             return Err(CameraError::Focal { fx: self.fx, fy: self.fy });
         }
-        if self.width == 0 || self.height == 0 {
+        let side = 1..=Self::SIDE_MAX;
+        if !side.contains(&self.width) || !side.contains(&self.height) {
             return Err(CameraError::Size { width: self.width, height: self.height });
         }
         Ok(())

@@ -107,7 +107,10 @@ fn misfits_are_refused_by_name() {
     refused(with(RasterOptions { background: black_hole, ..o }), &["background", "inf"]);
     let mut empty = camera;
     empty.intrinsics.width = 0;
-    refused(rasterize(&rows, &sh, &gain, &empty, &o), &["at least 1x1", "0x21"]);
+    refused(rasterize(&rows, &sh, &gain, &empty, &o), &["1 to 32768 pixels", "0x21"]);
+    let mut vast = camera;
+    (vast.intrinsics.width, vast.intrinsics.height) = (1_000_000, 1_000_000);
+    refused(rasterize(&rows, &sh, &gain, &vast, &o), &["1 to 32768 pixels", "1000000x1000000"]);
 }
 
 trait First {

@@ -3,15 +3,19 @@
 use anyhow::{Context, Result, bail, ensure};
 use glam::{Mat4, Quat, Vec3};
 use std::path::Path;
-use subsplat::camera::Camera;
+use subsplat::camera::{Camera, Intrinsics};
 use subsplat::io::protocol::{Views, load_protocol};
 use subsplat::io::scene::Scene;
 
 /// Width and height of `N` or `WxH`, px.
 pub fn size(text: &str) -> Result<(usize, usize)> {
     let side = |s: &str| -> Result<usize> {
-        let n: usize =
-            s.trim().parse().ok().filter(|n| (1..=32768).contains(n)).with_context(|| {
+        let n: usize = s
+            .trim()
+            .parse()
+            .ok()
+            .filter(|n| (1..=Intrinsics::SIDE_MAX).contains(n))
+            .with_context(|| {
                 format!("picture size: expected N or WxH, 1 to 32768 pixels a side, got `{text}`")
             })?;
         Ok(n)
