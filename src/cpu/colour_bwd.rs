@@ -222,10 +222,10 @@ impl Pass<'_> {
         seen.evaluate(WIDE, self.options.sh_basis);
         let gains = s.load(&gain);
         let mut weighted = [[0.0; GROUP]; 3];
-        for c in 0..3 {
+        for (c, weighted) in weighted.iter_mut().enumerate() {
             let moved = s.fma(gains, s.load(&seen.slope[c]), s.load(&group.d_mean[c]));
             s.store(moved, &mut group.d_mean[c]);
-            s.store(gains * s.load(&group.sums[6 + c]), &mut weighted[c]);
+            s.store(gains * s.load(&group.sums[6 + c]), weighted);
         }
         let (mut p, mut child) = (at / children, at % children);
         for (l, new) in seen.spread(s, &weighted).iter().enumerate().take(part.len - at) {

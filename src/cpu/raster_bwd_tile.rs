@@ -325,12 +325,12 @@ impl Walks {
             let mut sums = [s.splat(0.0); 3];
             for walk in row {
                 let t = s.abs(s.load(&walk.t));
-                for c in 0..3 {
-                    sums[c] = s.fma(t, s.load(&walk.g[c]), sums[c]);
+                for (sum, g) in sums.iter_mut().zip(&walk.g) {
+                    *sum = s.fma(t, s.load(g), *sum);
                 }
             }
-            for c in 0..3 {
-                total[c] += f64::from(s.sum(sums[c]));
+            for (total, sum) in total.iter_mut().zip(sums) {
+                *total += f64::from(s.sum(sum));
             }
         }
         total
