@@ -5,6 +5,10 @@ use crate::abi::{SH_COEFFICIENTS_MAX, ShBasis, sh_coefficients};
 use crate::cpu::project::SplatSlices;
 use crate::cpu::project_bwd::{GROUP, Group, L, Part, Pass, get, put};
 use crate::cpu::sh_bwd::{used_coefficients, values_and_slope};
+use crate::cpu::simd::Simd;
+
+/// Coefficients per channel of the degree that goes sixteen splats at a time: 3.
+const WIDE: usize = 16;
 
 /// Directions in which SH are seen, sixteen at a time.
 #[repr(C, align(64))]
@@ -58,6 +62,40 @@ impl Directions {
         unused.fill(0.0);
     }
 
+    /// s_k of all lanes, [`WIDE`] of them, from the colour gradients `g` and the SH sets
+    /// that begin at `sets` of `sh`.
+    #[inline(always)]
+    fn weigh_all<S: Simd>(&mut self, lanes: S, sh: &[f32], sets: &[usize; GROUP], g: [&L; 3]) {
+        let [r, g, b] = g.map(|g| lanes.load(g));
+        for q in 0..WIDE / 4 {
+            let [r0, g0, b0, r1] = lanes.load4(sh, sets, 12 * q);
+            let [g1, b1, r2, g2] = lanes.load4(sh, sets, 12 * q + 4);
+            let [b2, r3, g3, b3] = lanes.load4(sh, sets, 12 * q + 8);
+            let sets = [[r0, g0, b0], [r1, g1, b1], [r2, g2, b2], [r3, g3, b3]];
+            for (s, h) in self.s[4 * q..].iter_mut().zip(sets) {
+                lanes.store(lanes.fma(h[0], r, lanes.fma(h[1], g, h[2] * b)), s);
+            }
+        }
+    }
+
+    /// Y ⊗ `g` of every lane, [`WIDE`] coefficients.
+    #[inline(always)]
+    fn spread<S: Simd>(&self, s: S, g: &[L; 3]) -> [[L; 3]; GROUP] {
+        let mut out = [[[0.0; GROUP]; 3]; GROUP];
+        let g = [s.load(&g[0]), s.load(&g[1]), s.load(&g[2])];
+        for v in 0..3 {
+            let mut columns = [s.splat(0.0); GROUP];
+            for (j, column) in columns.iter_mut().enumerate() {
+                let i = GROUP * v + j;
+                *column = s.load(&self.y[i / 3]) * g[i % 3];
+            }
+            for (out, row) in out.iter_mut().zip(s.transpose(columns)) {
+                s.store(row, &mut out[v]);
+            }
+        }
+        out
+    }
+
     #[inline(always)]
     fn evaluate(&mut self, used: usize, basis: ShBasis) {
         let mvsplat = basis == ShBasis::Mvsplat;
@@ -96,14 +134,18 @@ impl Pass<'_> {
     /// SH, gain and direction where every child looks along its own mean; `single`: no
     /// child has siblings, and SH sets hold nothing yet.
     #[inline(always)]
-    pub(crate) fn child_colours(
+    pub(crate) fn child_colours<S: Simd>(
         &self,
+        s: S,
         part: &mut Part,
         (at, single): (usize, bool),
         alive: u32,
         group: &mut Group,
         seen: &mut Directions,
     ) {
+        if self.wide() {
+            return self.child_colours_wide(s, part, at, alive, group, seen);
+        }
         let children = self.splats.children_per_parent();
         let used = self.used();
         for l in 0..GROUP {
@@ -139,6 +181,69 @@ impl Pass<'_> {
             }
         }
         for l in 0..GROUP.min(part.len - at) {
+            let value = if alive & (1 << l) != 0 { seen.value[l] } else { 0.0 };
+            part.put_gain(at + l, value, [group.sums[6][l], group.sums[7][l], group.sums[8][l]]);
+        }
+    }
+
+    /// Whether [`WIDE`] coefficients of each SH set are used.
+    pub(crate) fn wide(&self) -> bool {
+        self.used() == WIDE
+    }
+
+    /// The same with [`WIDE`] coefficients; writes the SH set of a parent with its first
+    /// child and adds the others'.
+    #[inline(always)]
+    fn child_colours_wide<S: Simd>(
+        &self,
+        s: S,
+        part: &mut Part,
+        at: usize,
+        alive: u32,
+        group: &mut Group,
+        seen: &mut Directions,
+    ) {
+        let children = self.splats.children_per_parent();
+        let set = 3 * sh_coefficients(self.splats.sh_degree);
+        // Lanes of zeros read a set that some alive lane has, whose numbers are finite.
+        let spare = alive.trailing_zeros() as usize;
+        let mut sets = [(part.first + at + spare) / children * set; GROUP];
+        let mut gain = [0.0; GROUP];
+        for l in lanes_of(alive) {
+            sets[l] = (part.first + at + l) / children * set;
+            gain[l] = part.gain_of(self.splats, at + l);
+        }
+        let eye = self.view.eye;
+        for ((to, mean), eye) in seen.towards.iter_mut().zip(&group.mean).zip(eye) {
+            s.store(s.load(mean) - s.splat(eye), to);
+        }
+        let [.., r, g, b, _] = &group.sums;
+        seen.weigh_all(s, self.splats.sh, &sets, [r, g, b]);
+        seen.evaluate(WIDE, self.options.sh_basis);
+        let gains = s.load(&gain);
+        let mut weighted = [[0.0; GROUP]; 3];
+        for (c, weighted) in weighted.iter_mut().enumerate() {
+            let moved = s.fma(gains, s.load(&seen.slope[c]), s.load(&group.d_mean[c]));
+            s.store(moved, &mut group.d_mean[c]);
+            s.store(gains * s.load(&group.sums[6 + c]), weighted);
+        }
+        let (mut p, mut child) = (at / children, at % children);
+        for (l, new) in seen.spread(s, &weighted).iter().enumerate().take(part.len - at) {
+            if let Some(sh) = part.sh.get_mut(p * set..(p + 1) * set) {
+                let (used, unused) = sh.split_at_mut(3 * WIDE);
+                if child == 0 {
+                    used.copy_from_slice(new.as_flattened());
+                    unused.fill(0.0);
+                } else if alive & (1 << l) != 0 {
+                    for (to, new) in used.iter_mut().zip(new.as_flattened()) {
+                        *to += new;
+                    }
+                }
+            }
+            child += 1;
+            if child == children {
+                (p, child) = (p + 1, 0);
+            }
             let value = if alive & (1 << l) != 0 { seen.value[l] } else { 0.0 };
             part.put_gain(at + l, value, [group.sums[6][l], group.sums[7][l], group.sums[8][l]]);
         }

@@ -94,6 +94,8 @@ pub(crate) struct Part<'a> {
     opacities: &'a mut [f32],
     pub(crate) sh: &'a mut [f32],
     gain: &'a mut [f32],
+    /// Numbers of [`SplatSlices::gain`] per splat.
+    gain_lanes: usize,
 }
 
 /// Sixteen splats in structure of arrays.
@@ -121,8 +123,8 @@ impl Kernel for PartOf<'_, '_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(self, _: S) {
-        self.0.part(self.1);
+    fn run<S: Simd>(self, s: S) {
+        self.0.part(s, self.1);
     }
 }
 
@@ -153,16 +155,17 @@ impl Pass<'_> {
                 opacities: opacities.next().unwrap_or_default(),
                 sh: sh.next().unwrap_or_default(),
                 gain: gain.next().unwrap_or_default(),
+                gain_lanes,
             })
             .collect();
         parts.into_par_iter().for_each(|part| tier.run(PartOf(self, part)));
     }
 
     #[inline(always)]
-    fn part(&self, mut part: Part) {
+    fn part<S: Simd>(&self, s: S, mut part: Part) {
         let shared = self.options.sh_direction == ShDirection::Parent;
-        // Without siblings, every SH set is written once.
-        let single = !shared && self.splats.children_per_parent() == 1;
+        // Without siblings, every SH set is written once; or first written, then added to.
+        let single = !shared && (self.splats.children_per_parent() == 1 || self.wide());
         if !single {
             part.sh.fill(0.0);
         }
@@ -172,12 +175,13 @@ impl Pass<'_> {
             let count = GROUP.min(part.len - at);
             let alive = self.load(part.first + at, count, &mut group);
             if alive == 0 {
-                part.clear(at, count, single);
+                let children = self.splats.children_per_parent();
+                part.clear(at, count, single.then_some(children));
                 continue;
             }
             self.geometry(&mut group);
             if !shared {
-                self.child_colours(&mut part, (at, single), alive, &mut group, &mut seen);
+                self.child_colours(s, &mut part, (at, single), alive, &mut group, &mut seen);
             } else {
                 self.parent_gains(&mut part, at, count, &group);
             }
@@ -244,31 +248,42 @@ impl Pass<'_> {
 
     #[inline(always)]
     fn geometry(&self, group: &mut Group) {
-        let cov = matches!(self.splats.geometry, Geometry::Cov6 { .. });
         let view = self.view;
-        for l in 0..GROUP {
-            let m = Moments::from(get(&group.sums, l));
-            let [a, b, c] = get(&group.whitening, l);
-            let (w, mean) = (Whitening { a, b, c }, get(&group.mean, l));
-            if cov {
+        // Two loops: in one, every splat would be taken both ways.
+        if matches!(self.splats.geometry, Geometry::Cov6 { .. }) {
+            for l in 0..GROUP {
+                let (m, w, mean) = group.one(l);
                 let g = cov6_gradient(view, mean, get(&group.cov6, l), w, &m);
                 put(&mut group.d_mean, l, g.mean);
                 put(&mut group.d_cov6, l, g.cov6);
-            } else {
+                group.d_opacity[l] = m.one / group.opacity[l];
+            }
+        } else {
+            for l in 0..GROUP {
+                let (m, w, mean) = group.one(l);
                 let (quat, scale) = (get(&group.quat, l), get(&group.scale, l));
                 let g = quat_gradient(view, mean, quat, scale, w, &m);
                 put(&mut group.d_mean, l, g.mean);
                 put(&mut group.d_quat, l, g.quat);
                 put(&mut group.d_scale, l, g.scale);
+                group.d_opacity[l] = m.one / group.opacity[l];
             }
-            group.d_opacity[l] = m.one / group.opacity[l];
         }
     }
 }
 
+impl Group {
+    #[inline(always)]
+    fn one(&self, l: usize) -> (Moments, Whitening, [f32; 3]) {
+        let [a, b, c] = get(&self.whitening, l);
+        (Moments::from(get(&self.sums, l)), Whitening { a, b, c }, get(&self.mean, l))
+    }
+}
+
 impl Part<'_> {
-    /// Zeros for splats that no pixel saw.
-    fn clear(&mut self, at: usize, count: usize, single: bool) {
+    /// Zeros for splats that no pixel saw; with the number of children per parent, for
+    /// the SH sets too of which they are the first.
+    fn clear(&mut self, at: usize, count: usize, children: Option<usize>) {
         let zero = |values: &mut [f32], lanes: usize| {
             if let Some(v) = values.get_mut(at * lanes..(at + count) * lanes) {
                 v.fill(0.0);
@@ -278,11 +293,13 @@ impl Part<'_> {
         zero(self.means, 3);
         zero(self.cov6, 6);
         zero(self.opacities, 1);
-        let gain_lanes = self.gain.len() / self.len;
-        zero(self.gain, gain_lanes);
-        if single {
-            let set = self.sh.len() / self.len;
-            zero(self.sh, set);
+        zero(self.gain, self.gain_lanes);
+        if let Some(children) = children {
+            let set = self.sh.len() / self.len.div_ceil(children);
+            let sets = at.div_ceil(children) * set..(at + count).div_ceil(children) * set;
+            if let Some(sh) = self.sh.get_mut(sets) {
+                sh.fill(0.0);
+            }
         }
     }
 
@@ -304,10 +321,17 @@ impl Part<'_> {
         }
     }
 
+    /// γ of splat `j` of the part.
+    #[inline(always)]
+    pub(crate) fn gain_of(&self, splats: &SplatSlices, j: usize) -> f32 {
+        let at = (self.first + j) * self.gain_lanes;
+        splats.gain.get(at).copied().filter(|_| self.gain_lanes > 0).unwrap_or(1.0)
+    }
+
     /// Writes ∂L/∂γ and, with four lanes, ∂L/∂δ of splat `j` of the part.
     #[inline(always)]
     pub(crate) fn put_gain(&mut self, j: usize, gain: f32, [r, g, b]: [f32; 3]) {
-        match self.gain.len() / self.len {
+        match self.gain_lanes {
             1 => self.gain[j] = gain,
             4 => set(self.gain, 4 * j, [gain, r, g, b]),
             _ => {}

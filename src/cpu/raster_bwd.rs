@@ -9,7 +9,7 @@
 //! out for any number of threads.
 //!
 //! Memory beyond the forward's: 48 bytes a pair, at most [`PAIRS_PER_GROUP`] at a time
-//! (or one tile's), and 40 bytes a splat.
+//! (or one tile's), 40 bytes a splat and a few MiB a thread.
 
 use crate::abi::RasterOptions;
 use crate::camera::Camera;
@@ -18,12 +18,14 @@ use crate::cpu::disjoint::Disjoint;
 use crate::cpu::ewa::View;
 use crate::cpu::project::SplatSlices;
 use crate::cpu::project_bwd::{Gradients, Pass};
-use crate::cpu::raster_bwd_tile::{PairSums, SUMS, Upstream, WalkTile};
+use crate::cpu::raster_bwd_tile::{PairSums, SUMS, Scratch, Upstream, WalkTile};
 use crate::cpu::rasterize::{Rasterizer, since};
 use crate::cpu::sort::depth_order;
 use crate::cpu::tiles::Grid;
 use rayon::prelude::*;
 use std::ops::Range;
+use std::sync::atomic::AtomicUsize;
+use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 
 /// Most (splat, tile) pairs whose sums are held at a time: 192 MiB.
@@ -51,6 +53,8 @@ pub(crate) struct Buffers {
     background: Vec<[f64; 3]>,
     /// A mask of blocks per pair.
     masks: Vec<u64>,
+    /// One per thread.
+    scratch: Vec<Scratch>,
     times: BackwardTimes,
 }
 
@@ -60,6 +64,7 @@ impl Buffers {
         (self.pairs.capacity() + self.sums.capacity()) * size_of::<PairSums>()
             + self.background.capacity() * size_of::<[f64; 3]>()
             + 8 * self.masks.capacity()
+            + self.scratch.iter().map(Scratch::bytes).sum::<usize>()
     }
 }
 
@@ -184,7 +189,7 @@ impl Rasterizer {
     /// The backward of one group of tiles, those with the longest lists first; sorts
     /// their lists unless the forward did.
     fn walk_group(&mut self, group: Range<usize>, listed: bool, rules: Rules, upstream: Upstream) {
-        let Buffers { pairs, masks, background, .. } = &mut self.back;
+        let Buffers { pairs, masks, background, scratch, .. } = &mut self.back;
         let total: usize = group.clone().map(|t| self.lists.tile_len(t)).sum();
         if pairs.len() < total {
             pairs.resize(total, [0.0; SUMS]);
@@ -197,21 +202,38 @@ impl Rasterizer {
         let (pairs, masks) = (Disjoint::new(pairs), Disjoint::new(masks));
         let background = Disjoint::new(background);
         let lists = self.lists.lists();
-        queue.into_par_iter().with_max_len(1).for_each(|t| {
-            // SAFETY: the queue names each tile once, and no two tiles share a place.
-            let (list, rows, masks) = unsafe {
-                let places = lists.places(t);
-                (lists.take(t), pairs.part(places.clone()), masks.part(places))
-            };
-            if !listed {
-                depth_order(list.entries, list.spare, list.order);
+        let threads = rayon::current_num_threads().min(queue.len());
+        if scratch.len() < threads {
+            scratch.resize_with(threads, Scratch::default);
+        }
+        let next = AtomicUsize::new(0);
+        scratch[..threads].par_iter_mut().with_max_len(1).for_each(|scratch| {
+            while let Some(&t) = queue.get(next.fetch_add(1, Relaxed)) {
+                // SAFETY: the queue names each tile once, its counter gives each place
+                // to one thread, and no two tiles share a place.
+                let (list, rows, masks) = unsafe {
+                    let places = lists.places(t);
+                    (lists.take(t), pairs.part(places.clone()), masks.part(places))
+                };
+                if !listed {
+                    depth_order(list.entries, list.spare, list.order);
+                }
+                let (order, splats) = (&*list.order, list.splats);
+                let seen = tier.run(WalkTile {
+                    t,
+                    grid,
+                    order,
+                    splats,
+                    footprints,
+                    rules,
+                    upstream,
+                    masks,
+                    rows,
+                    scratch: &mut *scratch,
+                });
+                // SAFETY: as above.
+                unsafe { background.write(t, seen) };
             }
-            let (order, splats) = (&*list.order, list.splats);
-            let work =
-                WalkTile { t, grid, order, splats, footprints, rules, upstream, masks, rows };
-            let seen = tier.run(work);
-            // SAFETY: as above.
-            unsafe { background.write(t, seen) };
         });
     }
 

@@ -4,16 +4,20 @@
 //! background (bg·∂L/∂rgb − ∂L/∂alpha) and w_i = α_i T_i, the loss sees of a pixel
 //! Σ w_i q_i + T b, whence (3DGS appendix)
 //!
-//! ∂L/∂ln α_i = w_i q_i − α_i/(1 − α_i)·(Σ_{j>i} w_j q_j + T b).
+//! ∂L/∂ln α_i = w_i q_i − α_i/(1 − α_i)·(Σ_{j>i} w_j q_j + T b) = w_i (q_i − B_i),
+//!
+//! B_i = (Σ_{j>i} w_j q_j + T b) / T_{i+1} being what is seen of q behind splat i, were
+//! nothing before it: B_{i−1} = B_i + α_i (q_i − B_i), b behind the last. Neither a
+//! division nor a difference of sums; what opaque splats hide keeps its digits.
 //!
 //! The way forward repeats the forward's decisions by the forward's own operations and
-//! leaves, per pixel, T and the last splat blended, and per (splat, tile) the mask of
-//! blocks that it changed. The way back grows the sum over what lies behind from nothing
-//! (subtracting it from the whole, front to back, would lose the digits of what opaque
-//! splats hide) and recovers T by division, exact to rounding since α ≤ 0.999.
+//! leaves, per (splat, tile), the mask of blocks that it changed, and per (splat, block)
+//! of those an [`Item`]. The way back reads them.
 //!
 //! Splats go one by one, each over its blocks, its ten sums in registers; one reduction
-//! and one row per (splat, tile). Nothing is stored per pixel and splat.
+//! and one row per (splat, tile). Items are held for a stretch of the list at a time,
+//! [`ITEMS`] or little more; the stretches of a longer list, but for the last, are
+//! walked forward again from what was kept of T.
 
 use crate::abi::{ALPHA_MIN_LOG2, BLOCK, TILE};
 use crate::cpu::blend::{BLOCKS, Lanes, Rules};
@@ -25,6 +29,11 @@ use crate::cpu::tiles::Grid;
 
 /// Sums kept per (splat, tile): the numbers of [`Moments`].
 pub(crate) const SUMS: usize = 10;
+/// Items after which a stretch of a list ends: 4 MiB a thread, where the next splats may
+/// add 128 KiB.
+const ITEMS: usize = 1 << 15;
+/// Items that the splats of one step forward can make.
+const STEP: usize = LANES * BLOCKS * BLOCKS;
 /// Splats whose footprints are asked for ahead of their turn.
 const AHEAD: usize = LANES;
 
@@ -46,27 +55,58 @@ pub(crate) struct Upstream<'a> {
     pub(crate) background: [f32; 3],
 }
 
+/// What a splat does to the pixels of a block.
+#[derive(Clone, Copy, Debug)]
+#[repr(C, align(64))]
+struct Item {
+    /// α, 0 where nothing is blended.
+    alpha: Lanes,
+    /// α·T.
+    w: Lanes,
+}
+
+/// Where a stretch of a list begins.
+#[derive(Clone, Debug)]
+struct Stretch {
+    /// Place in the order.
+    from: usize,
+    live: u64,
+    /// T of every block.
+    t: [Lanes; BLOCKS * BLOCKS],
+}
+
+/// What a thread walks with, reused from tile to tile.
+#[derive(Debug, Default)]
+pub(crate) struct Scratch {
+    items: Vec<Item>,
+    stretches: Vec<Stretch>,
+}
+
+impl Scratch {
+    /// Bytes held.
+    pub(crate) fn bytes(&self) -> usize {
+        self.items.capacity() * size_of::<Item>() + self.stretches.capacity() * size_of::<Stretch>()
+    }
+}
+
 /// One block on its way.
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
 struct Walk {
     /// Transmittance; negative where blending has stopped.
     t: Lanes,
-    /// [`rank`] of the last splat blended.
-    last: Lanes,
-    /// ∂L/∂T of the background, then with Σ w q of the splats passed on the way back.
+    /// B of the splats passed on the way back; at first the background's b.
     behind: Lanes,
     /// ∂L/∂ R, G, B, Σ w·z.
     g: [Lanes; 4],
 }
 
-/// x and y of a block's pixels.
-const ACROSS: Lanes = [0., 1., 2., 3., 0., 1., 2., 3., 0., 1., 2., 3., 0., 1., 2., 3.];
-const DOWN: Lanes = [0., 0., 0., 0., 1., 1., 1., 1., 2., 2., 2., 2., 3., 3., 3., 3.];
-
-/// Place `i` of an order as a float that compares as it does; above 0.
-fn rank(i: usize) -> f32 {
-    f32::from_bits(f32::MIN_POSITIVE.to_bits().saturating_add(i as u32))
+/// The blocks of a tile, and x and y of their pixels by column and row.
+#[repr(C, align(64))]
+struct Walks {
+    x: [Lanes; BLOCKS],
+    y: [Lanes; BLOCKS],
+    blocks: [Walk; BLOCKS * BLOCKS],
 }
 
 /// The backward of one tile; returns Σ T·∂L/∂rgb over its pixels.
@@ -84,6 +124,7 @@ pub(crate) struct WalkTile<'a> {
     pub(crate) masks: &'a mut [u64],
     /// A row for every splat of the list.
     pub(crate) rows: &'a mut [PairSums],
+    pub(crate) scratch: &'a mut Scratch,
 }
 
 impl Kernel for WalkTile<'_> {
@@ -92,14 +133,29 @@ impl Kernel for WalkTile<'_> {
     #[inline(always)]
     fn run<S: Simd>(mut self, s: S) -> [f64; 3] {
         let corner = [self.t % self.grid.columns * TILE, self.t / self.grid.columns * TILE];
-        let empty = [0.0; LANES];
-        let walk = Walk { t: [-1.0; LANES], last: empty, behind: empty, g: [empty; 4] };
-        let mut walks = [walk; BLOCKS * BLOCKS];
-        let live = start(&mut walks, corner, &self.grid, self.upstream);
+        let (mut walks, mut live) = Walks::start(s, corner, &self.grid, self.upstream);
         let corner = corner.map(|c| c as f32);
-        let reached = self.forward(s, &mut walks, live, corner);
-        let total = turn(&mut walks);
-        self.back(s, &mut walks, reached, corner);
+        self.scratch.stretches.clear();
+        let count = self.order.len();
+        let (mut reached, mut items) = (0, 0);
+        while reached < count && live != 0 {
+            let stretch = Stretch { from: reached, live, t: walks.transmittances() };
+            self.scratch.stretches.push(stretch);
+            (reached, items) = self.forward(s, &mut walks, &mut live, reached, corner);
+        }
+        let total = walks.background(s);
+        let mut past = reached;
+        while let Some(stretch) = self.scratch.stretches.pop() {
+            if past < reached {
+                let mut live = stretch.live;
+                for (walk, t) in walks.blocks.iter_mut().zip(&stretch.t) {
+                    walk.t = *t;
+                }
+                (_, items) = self.forward(s, &mut walks, &mut live, stretch.from, corner);
+            }
+            self.back(s, &mut walks, stretch.from..past, items);
+            past = stretch.from;
+        }
         for &place in &self.order[reached..] {
             if let Some(row) = self.rows.get_mut(place as usize) {
                 *row = [0.0; SUMS];
@@ -115,24 +171,31 @@ impl WalkTile<'_> {
         &self.footprints[self.splats[self.order[i] as usize] as usize]
     }
 
-    /// Takes `walks` from front to back; returns how many splats it took until all
-    /// pixels had stopped. Leaves in `masks`, by place in the order, the blocks changed.
+    /// Takes `walks` from splat `from` of the order to the end of its stretch: there are
+    /// enough items, or no more splats, or all pixels have stopped. Returns where that
+    /// is and the number of items. Leaves in `masks`, by place in the order, the blocks
+    /// changed.
     #[inline(always)]
     fn forward<S: Simd>(
         &mut self,
         s: S,
-        walks: &mut [Walk; BLOCKS * BLOCKS],
-        mut live: u64,
+        walks: &mut Walks,
+        live: &mut u64,
+        mut from: usize,
         corner: [f32; 2],
-    ) -> usize {
+    ) -> (usize, usize) {
         let count = self.order.len();
-        let mut from = 0;
-        while from < count && live != 0 {
+        let mut items = 0;
+        while from < count && *live != 0 && items < ITEMS {
             let past = (from + LANES).min(count);
             let mut i = past;
             while i < (past + AHEAD).min(count) {
                 s.prefetch(self.footprint(i));
                 i += 1;
+            }
+            if self.scratch.items.len() < items + STEP {
+                let empty = Item { alpha: [0.0; LANES], w: [0.0; LANES] };
+                self.scratch.items.resize((2 * items).max(items + STEP), empty);
             }
             let mut masks = [0; LANES];
             let mut fields = [s.splat(0.0); LANES];
@@ -142,54 +205,53 @@ impl WalkTile<'_> {
             }
             met(s, s.transpose(fields), corner, &mut masks);
             for i in from..past {
-                let f = self.footprint(i);
-                let mut mask = masks[i - from] & live;
+                let f = &self.footprints[self.splats[self.order[i] as usize] as usize];
+                let mut mask = masks[i - from] & *live;
                 let mut blocks = mask;
                 while blocks != 0 {
                     let b = blocks.trailing_zeros() as usize;
                     blocks &= blocks - 1;
-                    let (changed, goes_on) = step_forward(
-                        s,
-                        &mut walks[b & 63],
-                        f,
-                        block_corner(corner, b),
-                        (i, self.rules),
-                    );
+                    let Some(item) = self.scratch.items.get_mut(items) else { break };
+                    let (changed, goes_on) = step_forward(s, walks, b, f, self.rules, item);
+                    items += usize::from(changed);
                     mask &= !(u64::from(!changed) << b);
-                    live &= !(u64::from(!goes_on) << b);
+                    *live &= !(u64::from(!goes_on) << b);
                 }
                 self.masks[i] = mask;
             }
             from = past;
         }
-        from
+        (from, items)
     }
 
-    /// Takes `walks` back from splat `reached` and writes the rows of all before it.
+    /// Takes `walks` back over one stretch, whose items are the first `items`, and
+    /// writes the rows of its splats.
     #[inline(always)]
     fn back<S: Simd>(
         &mut self,
         s: S,
-        walks: &mut [Walk; BLOCKS * BLOCKS],
-        reached: usize,
-        corner: [f32; 2],
+        walks: &mut Walks,
+        stretch: std::ops::Range<usize>,
+        items: usize,
     ) {
-        for i in (0..reached).rev() {
-            s.prefetch(self.footprint(i.saturating_sub(AHEAD)));
+        let first = stretch.start;
+        let mut rest = self.scratch.items.get(..items).unwrap_or(&[]);
+        for i in stretch.rev() {
+            s.prefetch(self.footprint(i.saturating_sub(AHEAD).max(first)));
             let f = self.footprint(i);
-            let mut sums = [s.splat(0.0); SUMS];
             let mut blocks = self.masks[i];
             let mut row = [0.0; SUMS];
             if blocks != 0 {
-                while blocks != 0 {
+                let mut sums = [s.splat(0.0); SUMS];
+                let (before, own) =
+                    rest.split_at(rest.len().saturating_sub(blocks.count_ones() as usize));
+                rest = before;
+                for item in own {
                     let b = blocks.trailing_zeros() as usize;
-                    blocks &= blocks - 1;
-                    let at = block_corner(corner, b);
-                    sums = step_back(s, &mut walks[b & 63], f, at, (i, self.rules), sums);
+                    blocks &= blocks.wrapping_sub(1);
+                    sums = step_back(s, walks, b, f, self.rules, item, sums);
                 }
-                for (to, sum) in row.iter_mut().zip(sums) {
-                    *to = s.sum(sum);
-                }
+                row = s.sums(sums);
             }
             if let Some(to) = self.rows.get_mut(self.order[i] as usize) {
                 *to = row;
@@ -198,143 +260,158 @@ impl WalkTile<'_> {
     }
 }
 
-#[inline(always)]
-fn block_corner(corner: [f32; 2], b: usize) -> [f32; 2] {
-    [corner[0] + (b % BLOCKS * BLOCK) as f32, corner[1] + (b / BLOCKS * BLOCK) as f32]
-}
-
-/// Fills `walks`; returns the blocks with a pixel inside.
-fn start(
-    walks: &mut [Walk; BLOCKS * BLOCKS],
-    corner: [usize; 2],
-    grid: &Grid,
-    Upstream { planes, background }: Upstream,
-) -> u64 {
-    let (width, height) = (grid.width - corner[0], grid.height - corner[1]);
-    let (width, height) = (width.min(TILE), height.min(TILE));
-    let pixels = grid.width * grid.height;
-    let mut live = 0u64;
-    for y in 0..height {
-        let first = (corner[1] + y) * grid.width + corner[0];
-        // Pixel by pixel instead of plane by plane.
-        let mut row = [[0.0f32; 5]; TILE];
-        for c in 0..5 {
-            let plane = &planes[c * pixels + first..][..width];
-            for (pixel, v) in row.iter_mut().zip(plane) {
-                pixel[c] = *v;
+impl Walks {
+    /// The blocks of the tile at `corner`, and the mask of those with a pixel inside.
+    #[inline(always)]
+    fn start<S: Simd>(
+        s: S,
+        corner: [usize; 2],
+        grid: &Grid,
+        Upstream { planes, background }: Upstream,
+    ) -> (Self, u64) {
+        let (width, height) = (grid.width - corner[0], grid.height - corner[1]);
+        let pixels = grid.width * grid.height;
+        let empty = [0.0; LANES];
+        let walk = Walk { t: [-1.0; LANES], behind: empty, g: [empty; 4] };
+        let mut walks =
+            Self { x: [empty; BLOCKS], y: [empty; BLOCKS], blocks: [walk; BLOCKS * BLOCKS] };
+        for k in 0..BLOCKS {
+            for l in 0..LANES {
+                walks.x[k][l] = (corner[0] + k * BLOCK + l % BLOCK) as f32;
+                walks.y[k][l] = (corner[1] + k * BLOCK + l / BLOCK) as f32;
             }
         }
-        for (x, &[r, g, b, alpha, z]) in row[..width].iter().enumerate() {
-            let (block, l) = (y / BLOCK * BLOCKS + x / BLOCK, y % BLOCK * BLOCK + x % BLOCK);
-            let walk = &mut walks[block];
-            live |= 1 << block;
-            walk.t[l] = 1.0;
-            walk.behind[l] = background[0] * r + background[1] * g + background[2] * b - alpha;
-            for (to, v) in walk.g.iter_mut().zip([r, g, b, z]) {
-                to[l] = v;
+        let background = background.map(|v| s.splat(v));
+        let mut live = 0u64;
+        for b in 0..BLOCKS * BLOCKS {
+            let (x, y) = (b % BLOCKS * BLOCK, b / BLOCKS * BLOCK);
+            if x >= width || y >= height {
+                continue;
+            }
+            live |= 1 << b;
+            let walk = &mut walks.blocks[b];
+            let mut alpha = empty;
+            let first = (corner[1] + y) * grid.width + corner[0] + x;
+            for r in 0..BLOCK.min(height - y) {
+                let (lane, n) = (r * BLOCK, BLOCK.min(width - x));
+                let at = first + r * grid.width;
+                walk.t[lane..lane + n].fill(1.0);
+                let [red, green, blue, depth] = &mut walk.g;
+                for (c, to) in [red, green, blue, &mut alpha, depth].into_iter().enumerate() {
+                    copy(&mut to[lane..lane + n], &planes[c * pixels + at..]);
+                }
+            }
+            let (red, green, blue) = (s.load(&walk.g[0]), s.load(&walk.g[1]), s.load(&walk.g[2]));
+            let colour = s.fma(green, background[1], red * background[0]);
+            s.store(s.fma(blue, background[2], colour) - s.load(&alpha), &mut walk.behind);
+        }
+        (walks, live)
+    }
+
+    #[inline(always)]
+    fn transmittances(&self) -> [Lanes; BLOCKS * BLOCKS] {
+        let mut t = [[0.0; LANES]; BLOCKS * BLOCKS];
+        for (t, walk) in t.iter_mut().zip(&self.blocks) {
+            *t = walk.t;
+        }
+        t
+    }
+
+    /// Σ |T|·∂L/∂rgb.
+    #[inline(always)]
+    fn background<S: Simd>(&self, s: S) -> [f64; 3] {
+        let mut total = [0.0f64; 3];
+        for row in self.blocks.chunks_exact(BLOCKS) {
+            let mut sums = [s.splat(0.0); 3];
+            for walk in row {
+                let t = s.abs(s.load(&walk.t));
+                for (sum, g) in sums.iter_mut().zip(&walk.g) {
+                    *sum = s.fma(t, s.load(g), *sum);
+                }
+            }
+            for (total, sum) in total.iter_mut().zip(sums) {
+                *total += f64::from(s.sum(sum));
             }
         }
+        total
     }
-    live
-}
 
-/// At the far end: T without its sign, T·b; returns Σ T·∂L/∂rgb.
-fn turn(walks: &mut [Walk; BLOCKS * BLOCKS]) -> [f64; 3] {
-    let mut total = [0.0f64; 3];
-    for walk in walks {
-        for l in 0..LANES {
-            walk.t[l] = walk.t[l].abs();
-            walk.behind[l] *= walk.t[l];
-        }
-        for (sum, g) in total.iter_mut().zip(&walk.g) {
-            let row: f32 = g.iter().zip(&walk.t).map(|(g, t)| g * t).sum();
-            *sum += f64::from(row);
-        }
+    /// Distances of block `b`'s pixels from the mean of `f`, whitened.
+    #[inline(always)]
+    fn whitened<S: Simd>(&self, s: S, b: usize, f: &Footprint) -> [S::F; 2] {
+        let dx = s.load(&self.x[b % BLOCKS]) - s.splat(f.u);
+        let dy = s.load(&self.y[b / BLOCKS % BLOCKS]) - s.splat(f.v);
+        [s.fma(s.splat(f.shear), dy, dx) * s.splat(f.sx), dy * s.splat(f.sy)]
     }
-    total
 }
 
-/// What a splat is at a block's pixels.
-struct Seen<S: Simd> {
-    /// Whitened distances.
-    across: S::F,
-    down: S::F,
-    /// Not below 1/255.
-    shows: S::M,
-    /// o·e^(−σ).
-    raw: S::F,
-}
-
-/// The forward's own operations.
+/// Copies the first of `from` over `to`; a whole row of a block without asking how many.
 #[inline(always)]
-fn look<S: Simd>(s: S, f: &Footprint, at: [f32; 2]) -> Seen<S> {
-    let least = s.splat(ALPHA_MIN_LOG2);
-    let x = s.load(&ACROSS) + s.splat(at[0]);
-    let y = s.load(&DOWN) + s.splat(at[1]);
-    let (dx, dy) = (x - s.splat(f.u), y - s.splat(f.v));
-    let across = s.fma(s.splat(f.shear), dy, dx) * s.splat(f.sx);
-    let down = dy * s.splat(f.sy);
-    let power = s.fnma(down, down, s.fnma(across, across, s.splat(f.power)));
-    Seen { across, down, shows: s.le(least, power), raw: simd::exp2(s, s.max(power, least)) }
+fn copy(to: &mut [f32], from: &[f32]) {
+    match (<&mut [f32; BLOCK]>::try_from(&mut *to), from.first_chunk::<BLOCK>()) {
+        (Ok(to), Some(from)) => *to = *from,
+        _ => to.iter_mut().zip(from).for_each(|(to, from)| *to = *from),
+    }
 }
 
-/// Splat `i` of the order at one block: whether it changed a pixel, and whether a pixel
-/// still goes on.
+/// A splat at block `b`, by the forward's own operations: whether it changed a pixel,
+/// and whether a pixel still goes on.
 #[inline(always)]
 fn step_forward<S: Simd>(
     s: S,
-    walk: &mut Walk,
+    walks: &mut Walks,
+    b: usize,
     f: &Footprint,
-    at: [f32; 2],
-    (i, rules): (usize, Rules),
+    rules: Rules,
+    item: &mut Item,
 ) -> (bool, bool) {
-    let zero = s.splat(0.0);
-    let seen = look(s, f, at);
+    let (least, zero) = (s.splat(ALPHA_MIN_LOG2), s.splat(0.0));
+    let [across, down] = walks.whitened(s, b, f);
+    let power = s.fnma(down, down, s.fnma(across, across, s.splat(f.power)));
+    let alpha = s.min(simd::exp2(s, s.max(power, least)), s.splat(rules.alpha_max));
+    let walk = &mut walks.blocks[b % (BLOCKS * BLOCKS)];
     let t = s.load(&walk.t);
-    let shows = seen.shows & s.lt(zero, t);
-    let alpha = s.min(seen.raw, s.splat(rules.alpha_max));
-    let rest = s.fnma(alpha, t, t);
-    let adds = s.lt(s.splat(rules.stop), rest) & shows;
-    let t = s.select(adds, rest, s.select(shows, -t, t));
-    s.store(t, &mut walk.t);
-    s.store(s.select(adds, s.splat(rank(i)), s.load(&walk.last)), &mut walk.last);
-    (s.any(adds), s.any(s.lt(zero, t)))
+    let shows = s.le(least, power);
+    let rest = s.fnma(s.keep(shows, alpha), t, t);
+    // Where blending has stopped, T < 0, and so is what is left of it.
+    let goes = s.lt(s.splat(rules.stop), rest);
+    let adds = goes & shows;
+    let alpha = s.keep(adds, alpha);
+    s.store(alpha, &mut item.alpha);
+    s.store(alpha * s.max(t, zero), &mut item.w);
+    s.store(s.select(goes, rest, s.negative(t)), &mut walk.t);
+    (s.any(adds), s.any(goes))
 }
 
 /// The same on the way back; adds to `sums`.
 #[inline(always)]
 fn step_back<S: Simd>(
     s: S,
-    walk: &mut Walk,
+    walks: &mut Walks,
+    b: usize,
     f: &Footprint,
-    at: [f32; 2],
-    (i, rules): (usize, Rules),
+    rules: Rules,
+    item: &Item,
     sums: [S::F; SUMS],
 ) -> [S::F; SUMS] {
-    let seen = look(s, f, at);
-    let (cap, one) = (s.splat(rules.alpha_max), s.splat(1.0));
-    let alpha = s.min(seen.raw, cap);
-    let adds = seen.shows & s.le(s.splat(rank(i)), s.load(&walk.last));
-    let after = s.load(&walk.t);
-    let inverse = one / (one - alpha);
-    let t = s.select(adds, after * inverse, after);
-    s.store(t, &mut walk.t);
-    let w = s.keep(adds, alpha * t);
+    let [across, down] = walks.whitened(s, b, f);
+    let walk = &mut walks.blocks[b % (BLOCKS * BLOCKS)];
+    let (alpha, w) = (s.load(&item.alpha), s.load(&item.w));
     let g = [s.load(&walk.g[0]), s.load(&walk.g[1]), s.load(&walk.g[2]), s.load(&walk.g[3])];
     let q = s.fma(g[2], s.splat(f.rgb[2]), g[3] * s.splat(f.z));
     let q = s.fma(g[0], s.splat(f.rgb[0]), s.fma(g[1], s.splat(f.rgb[1]), q));
     let behind = s.load(&walk.behind);
-    s.store(s.fma(w, q, behind), &mut walk.behind);
-    let v = s.fnma(behind, alpha * inverse, w * q);
-    let v = s.keep(adds & s.lt(seen.raw, cap), v);
-    let (va, vd) = (v * seen.across, v * seen.down);
+    let more = q - behind;
+    s.store(s.fma(alpha, more, behind), &mut walk.behind);
+    let v = s.keep(s.lt(alpha, s.splat(rules.alpha_max)), w * more);
+    let (va, vd) = (v * across, v * down);
     [
         sums[0] + v,
         sums[1] + va,
         sums[2] + vd,
-        s.fma(va, seen.across, sums[3]),
-        s.fma(va, seen.down, sums[4]),
-        s.fma(vd, seen.down, sums[5]),
+        s.fma(va, across, sums[3]),
+        s.fma(va, down, sums[4]),
+        s.fma(vd, down, sums[5]),
         s.fma(w, g[0], sums[6]),
         s.fma(w, g[1], sums[7]),
         s.fma(w, g[2], sums[8]),

@@ -224,6 +224,15 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     fn prefetch<T>(self, v: *const T);
     /// Sum of the lanes: lane i + lane (i + 8), then + 4, + 2, + 1.
     fn sum(self, v: Self::F) -> f32;
+    /// [`Simd::sum`] of each of up to 16 vectors.
+    #[inline(always)]
+    fn sums<const N: usize>(self, v: [Self::F; N]) -> [f32; N] {
+        let mut out = [0.0; N];
+        for (out, v) in out.iter_mut().zip(v) {
+            *out = self.sum(v);
+        }
+        out
+    }
     /// Four floats at each of 16 places of `from`, as four vectors: lane i of
     /// vector c is `from[at[i] + offset + c]`. Zeros if any of them lies outside.
     fn load4(self, from: &[f32], at: &[usize; LANES], offset: usize) -> [Self::F; 4];
@@ -381,6 +390,13 @@ mod tests {
                 }
                 put(&mut exact, s.of_int(i));
                 exact.push(s.sum(s.of_int(i)).to_bits());
+                // Sums of many at once are those of each.
+                let (many, few) = (s.sums([s.floor(small); LANES]), s.sums([a, b, c]));
+                exact.extend([many[0], many[7], many[15]].map(f32::to_bits));
+                for (sum, v) in few.into_iter().zip([a, b, c]) {
+                    let same = sum.to_bits() == s.sum(v).to_bits();
+                    assert!(same || sum.is_nan() && s.sum(v).is_nan());
+                }
                 let places = std::array::from_fn(|l| (at + 29 * l) % (self.1.len() - 8));
                 for v in s.load4(self.1, &places, 5) {
                     put(&mut exact, v);

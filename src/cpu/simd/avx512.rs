@@ -240,6 +240,41 @@ impl Simd for Token {
         }
     }
     #[inline(always)]
+    fn sums<const N: usize>(self, v: [F; N]) -> [f32; N] {
+        const { assert!(N <= LANES) };
+        let mut out = [0.0; LANES];
+        unsafe {
+            let mut a = [_mm512_setzero_ps(); LANES];
+            for (a, v) in a.iter_mut().zip(v) {
+                *a = v.0;
+            }
+            // Two vectors make one of half sums, four times.
+            for i in 0..8 {
+                let (x, y) = (a[2 * i], a[2 * i + 1]);
+                let own = _mm512_mask_blend_ps(0xff00, x, y);
+                a[i] = _mm512_add_ps(own, _mm512_shuffle_f32x4::<0x4e>(x, y));
+            }
+            for i in 0..4 {
+                let (x, y) = (a[2 * i], a[2 * i + 1]);
+                let even = _mm512_shuffle_f32x4::<0x88>(x, y);
+                a[i] = _mm512_add_ps(even, _mm512_shuffle_f32x4::<0xdd>(x, y));
+            }
+            for i in 0..2 {
+                let (x, y) = (a[2 * i], a[2 * i + 1]);
+                let own = _mm512_mask_blend_ps(0xcccc, x, y);
+                a[i] = _mm512_add_ps(own, _mm512_shuffle_ps::<0x4e>(x, y));
+            }
+            let even = _mm512_shuffle_ps::<0x88>(a[0], a[1]);
+            let sums = _mm512_add_ps(even, _mm512_shuffle_ps::<0xdd>(a[0], a[1]));
+            // Lane 4i + j holds the sum of vector i + 4j.
+            let places = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
+            self.store(F(_mm512_permutexvar_ps(places, sums)), &mut out);
+        }
+        let mut first = [0.0; N];
+        first.copy_from_slice(&out[..N]);
+        first
+    }
+    #[inline(always)]
     fn load4(self, from: &[f32], at: &[usize; LANES], offset: usize) -> [F; 4] {
         if !all_inside(from.len(), at, offset) {
             return [self.splat(0.0); 4];
