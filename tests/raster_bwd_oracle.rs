@@ -175,6 +175,36 @@ fn covariances() {
     }
 }
 
+/// 800 faint splats over every block of one tile: more (splat, block) items than the
+/// tile's walk keeps at once (2¹⁵), so that it goes in stretches.
+#[test]
+fn a_list_longer_than_what_is_kept() {
+    let mut scene = Scene::new(Kind::Plain, 9, 200, 0, 0);
+    let mut r = Random(11);
+    let depth = |row: &[f32], camera: &Camera| {
+        let at = Vec3::new(row[0], row[1], row[2]);
+        camera.world_from_camera.inverse().transform_point3(at).z
+    };
+    for row in scene.rows.chunks_mut(SPLAT_LANES) {
+        let px = depth(row, &scene.camera) / SIZE.0 as f32;
+        row[LANE_SCALE..LANE_SCALE + 3]
+            .copy_from_slice(&r.array::<3>(60.0, 80.0).map(|s: f32| s * px));
+        row[LANE_OPACITY] = r.range(0.008, 0.01);
+    }
+    let o = options(Convention::Standard);
+    let v = scene.upstream(&o, 77);
+    assert!(v.iter().filter(|v| **v != 0.0).count() > v.len() / 2);
+    let got = scene.gradients(&o, &v);
+    let opacity = |i: usize| got.rows[i * SPLAT_LANES + LANE_OPACITY];
+    let most = (0..scene.len()).fold(0f32, |m, i| m.max(opacity(i).abs()));
+    for i in (0..scene.len()).step_by(23) {
+        let at = i * SPLAT_LANES + LANE_OPACITY;
+        let want = slope(&scene, (&o, &v), 5e-5 * scene.rows[at], |s| &mut s.rows[at]);
+        let error = (f64::from(opacity(i)) - want).abs() / f64::from(most);
+        assert!(error < 1e-4, "splat {i}: {} for {want}", opacity(i));
+    }
+}
+
 fn bytes(g: &Gradients) -> Vec<u32> {
     let all = [&g.rows[..], &g.means, &g.cov6, &g.opacities, &g.sh, &g.gain, &g.background];
     all.into_iter().flatten().map(|v| v.to_bits()).collect()
