@@ -24,8 +24,8 @@ const SIDE_QUICK: usize = 64;
 /// Multiplications and additions of one child, an elementary function counted as 18:
 /// eleven of them, quaternions 40, rotation 30, M 48, area and growth 35, opacity 20.
 const FLOPS_PER_CHILD: f64 = 370.0;
-/// The same of redistribution alone: three elementary functions and a softmax.
-const FLOPS_PER_SHARE: f64 = 65.0;
+/// The same of redistribution alone: two elementary functions and eight more.
+const FLOPS_PER_SHARE: f64 = 44.0;
 /// f32 rounding through two chains of some 40 operations.
 const TIGHT: [f32; 3] = [1e-4, 1e-2, 1e-4];
 
@@ -279,6 +279,19 @@ enum Pass {
     Both,
 }
 
+/// Least work of redistribution.
+fn share_work(rule: Rule, (parents, children): (usize, usize), pass: Pass) -> Work {
+    // Forward: logits, areas and per-parent numbers in, opacities out. Backward: the same
+    // and the gradient in, gradients of all inputs out.
+    let (pc, per_parent) = ((parents * children) as f64, parents as f64);
+    let singles = if rule.areas_are_relative() { 2.0 } else { 1.0 };
+    let (bytes, flops) = match pass {
+        Pass::Forward => (3.0 * pc + singles * per_parent, FLOPS_PER_SHARE),
+        Pass::Both => (8.0 * pc + 3.0 * singles * per_parent, 2.2 * FLOPS_PER_SHARE),
+    };
+    Work { bytes: 4.0 * bytes, flops: flops * pc }
+}
+
 fn redistribution(
     bench: &mut Bench,
     name: &str,
@@ -313,15 +326,7 @@ fn redistribution(
     for (got, expected) in fused.iter().zip(&graph) {
         agree(name, &host(got)?, &host(expected)?, TIGHT)?;
     }
-    // Forward: logits, areas and per-parent numbers in, opacities out. Backward: the same
-    // and the gradient in, gradients of all inputs out.
-    let (pc, per_parent) = ((parents * children) as f64, parents as f64);
-    let singles = if rule.areas_are_relative() { 2.0 } else { 1.0 };
-    let (bytes, flops) = match pass {
-        Pass::Forward => (3.0 * pc + singles * per_parent, FLOPS_PER_SHARE),
-        Pass::Both => (8.0 * pc + 3.0 * singles * per_parent, 2.2 * FLOPS_PER_SHARE),
-    };
-    let work = Work { bytes: 4.0 * bytes, flops: flops * pc };
+    let work = share_work(rule, (parents, children), pass);
     let [hl, ha, ho, hown, hw] = [host(&l)?, host(&a)?, host(&o)?, host(&own)?, host(&weights)?];
     let args = shares::Args {
         rule,
