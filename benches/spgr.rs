@@ -4,12 +4,14 @@
 mod common;
 
 use anyhow::Result;
-use candle_core::{Tensor, Var};
+use candle_core::{CpuStorage, CustomOp2, Layout, Shape, Storage, Tensor, Var};
 use common::conventional::redistribute as plain;
 use common::scene::{self, Spec};
 use common::{Bench, Contender, Threads, Work, agree, inputs};
+use rayon::prelude::*;
 use subsplat::abi::{HEAD_LANES, SPLAT_LANES};
 use subsplat::config::{Config, Preset};
+use subsplat::cpu::{math, redistribute as shares, spgr as kernel};
 use subsplat::model::spgr::rules;
 use subsplat::model::spgr_ref;
 use subsplat::ops::redistribute::{Rule, redistribute};
@@ -22,8 +24,8 @@ const SIDE_QUICK: usize = 64;
 /// Multiplications and additions of one child, an elementary function counted as 18:
 /// eleven of them, quaternions 40, rotation 30, M 48, area and growth 35, opacity 20.
 const FLOPS_PER_CHILD: f64 = 370.0;
-/// The same of redistribution alone: three elementary functions and a softmax.
-const FLOPS_PER_SHARE: f64 = 65.0;
+/// The same of redistribution alone: two elementary functions and eight more.
+const FLOPS_PER_SHARE: f64 = 44.0;
 /// f32 rounding through two chains of some 40 operations.
 const TIGHT: [f32; 3] = [1e-4, 1e-2, 1e-4];
 
@@ -60,6 +62,49 @@ fn main() -> Result<()> {
 
 fn host(t: &Tensor) -> Result<Vec<f32>> {
     Ok(t.flatten_all()?.to_vec1()?)
+}
+
+/// Σ wᵢxᵢ over two tensors as one op, whose gradients are the weights as they lie: a
+/// loss that costs next to nothing beside what it measures.
+struct Dot([Tensor; 2]);
+
+impl CustomOp2 for Dot {
+    fn name(&self) -> &'static str {
+        "dot"
+    }
+
+    fn cpu_fwd(
+        &self,
+        s1: &CpuStorage,
+        l1: &Layout,
+        s2: &CpuStorage,
+        l2: &Layout,
+    ) -> candle_core::Result<(CpuStorage, Shape)> {
+        let mut sum = 0.0;
+        for ((x, layout), weights) in [(s1, l1), (s2, l2)].into_iter().zip(&self.0) {
+            let (held, _) = weights.storage_and_layout();
+            let (Storage::Cpu(held), Some((start, end))) = (&*held, layout.contiguous_offsets())
+            else {
+                candle_core::bail!("dot: expected contiguous tensors on the CPU, got {layout:?}")
+            };
+            let (x, w) = (&x.as_slice::<f32>()?[start..end], held.as_slice::<f32>()?);
+            let chunks = x.par_chunks(1 << 14).zip(w.par_chunks(1 << 14));
+            sum += chunks.map(|(x, w)| f64::from(math::dot(x, w))).sum::<f64>();
+        }
+        Ok((CpuStorage::F32(vec![sum as f32]), Shape::from(())))
+    }
+
+    fn bwd(
+        &self,
+        _: &Tensor,
+        _: &Tensor,
+        _: &Tensor,
+        _: &Tensor,
+    ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>)> {
+        // The loss is the end of the graph: its own gradient is 1.
+        let [a, b] = &self.0;
+        Ok((Some(a.clone()), Some(b.clone())))
+    }
 }
 
 /// Parents of two views and their head records.
@@ -109,10 +154,22 @@ impl Case {
     fn gradients(&self, op: Op) -> Result<[Tensor; 2]> {
         let (head, parents) = (Var::from_tensor(&self.head)?, Var::from_tensor(&self.parents)?);
         let (rows, gains) = op(&head, &parents, &self.call)?;
-        let loss = rows.mul(&self.weights[0])?.sum_all()?;
-        let grads = loss.add(&gains.mul(&self.weights[1])?.sum_all()?)?.backward()?;
+        let grads = rows
+            .contiguous()?
+            .apply_op2(&gains.contiguous()?, Dot(self.weights.clone()))?
+            .backward()?;
         let get = |v: &Var| grads.get(v).cloned().ok_or_else(|| anyhow::anyhow!("no gradient"));
         Ok([get(&head)?, get(&parents)?])
+    }
+
+    /// Of forward and backward: the inputs are read twice more (each lane of the head
+    /// records, and the cache line of the gain once again), results' gradients are read
+    /// and inputs' gradients written; children are calculated three times, and their
+    /// gradient costs as much as two.
+    fn work_both(&self) -> Work {
+        let Work { bytes, flops } = self.work();
+        let head = 4.0 * self.children() as f64 * HEAD_LANES as f64;
+        Work { bytes: 2.0 * bytes + 3.0 * head, flops: 5.0 * flops }
     }
 
     fn work(&self) -> Work {
@@ -163,20 +220,76 @@ fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
         }
         Err(e) => (&[("candle graph", GRAPH)], format!("forward and backward; {e}")),
     };
-    drop(graph);
+    let mut kernels = Kernels::new(case)?;
+    kernels.run(case)?;
+    for (got, expected) in kernels.inputs.iter().zip(&graph) {
+        agree("without autograd", got, &host(expected)?, TIGHT)?;
+    }
+    drop((graph, kernels));
     let mut contenders = Vec::new();
     for (what, op) in ops {
         for threads in [Threads::One, Threads::All] {
             contenders.push(Contender::new(*what, threads, || case.gradients(*op).map(drop)));
         }
     }
+    for threads in [Threads::One, Threads::All] {
+        let mut kernels = Kernels::new(case)?;
+        let contender = Contender::new("fused, no autograd", threads, move || kernels.run(case));
+        contenders.push(contender.with_work(case.work_both()));
+    }
     bench.group(name, contenders, &note)
+}
+
+/// Both passes of the op on buffers that are there already, without candle's sums of
+/// gradients.
+struct Kernels {
+    head: Vec<f32>,
+    parents: Vec<f32>,
+    grads: [Vec<f32>; 2],
+    results: [Vec<f32>; 2],
+    inputs: [Vec<f32>; 2],
+}
+
+impl Kernels {
+    fn new(case: &Case) -> Result<Self> {
+        let (head, parents) = (host(&case.head)?, host(&case.parents)?);
+        let grads = [host(&case.weights[0])?, host(&case.weights[1])?];
+        let zeros = |like: &[f32]| vec![0.0; like.len()];
+        let results = [zeros(&grads[0]), zeros(&grads[1])];
+        let inputs = [zeros(&head), zeros(&parents)];
+        Ok(Self { head, parents, grads, results, inputs })
+    }
+
+    fn run(&mut self, case: &Case) -> Result<()> {
+        let [rows, gains] = &mut self.results;
+        spgr_into(&case.head, &case.parents, &case.call, rows, gains)?;
+        let Spgr { rules, cameras, near, per_view, first } = &case.call;
+        let source = kernel::Source { cameras, near, per_view: *per_view, first: *first };
+        let args = kernel::Args { rules, source, head: &self.head, parents: &self.parents };
+        let [head, parents] = &mut self.inputs;
+        kernel::backward(args, &self.grads[0], head, parents);
+        kernel::gains_backward(rules, &self.head, &self.grads[1], head);
+        Ok(())
+    }
 }
 
 #[derive(Clone, Copy, PartialEq)]
 enum Pass {
     Forward,
     Both,
+}
+
+/// Least work of redistribution.
+fn share_work(rule: Rule, (parents, children): (usize, usize), pass: Pass) -> Work {
+    // Forward: logits, areas and per-parent numbers in, opacities out. Backward: the same
+    // and the gradient in, gradients of all inputs out.
+    let (pc, per_parent) = ((parents * children) as f64, parents as f64);
+    let singles = if rule.areas_are_relative() { 2.0 } else { 1.0 };
+    let (bytes, flops) = match pass {
+        Pass::Forward => (3.0 * pc + singles * per_parent, FLOPS_PER_SHARE),
+        Pass::Both => (8.0 * pc + 3.0 * singles * per_parent, 2.2 * FLOPS_PER_SHARE),
+    };
+    Work { bytes: 4.0 * bytes, flops: flops * pc }
 }
 
 fn redistribution(
@@ -195,7 +308,7 @@ fn redistribution(
     // Leaves without gradients do not keep the graph's parts.
     let leaf = |v: &Var| if pass == Pass::Both { v.as_tensor().clone() } else { v.detach() };
     let (l, a, o) = (leaf(&logits), leaf(&areas), leaf(&alpha));
-    let run = |fused: bool| -> Result<Vec<Tensor>> {
+    let run = |fused: bool, weighted: bool| -> Result<Vec<Tensor>> {
         let y = match (fused, rule) {
             (true, _) => redistribute(rule, &l, &a, &o, Some(&own))?,
             (false, Rule::Linear) => plain::linear(&l, &a, &o)?,
@@ -204,24 +317,42 @@ fn redistribution(
         if pass == Pass::Forward {
             return Ok(vec![y]);
         }
-        let grads = y.mul(&weights)?.sum_all()?.backward()?;
+        // Timed is the gradient of Σy, which candle seeds with ones and no other work.
+        let grads = if weighted { y.mul(&weights)?.sum_all()?.backward()? } else { y.backward()? };
         Ok([&logits, &areas, &alpha].into_iter().filter_map(|v| grads.get(v).cloned()).collect())
     };
-    let (fused, graph) = (run(true)?, run(false)?);
+    let (fused, graph) = (run(true, true)?, run(false, true)?);
     anyhow::ensure!(fused.len() == graph.len(), "{} and {} tensors", fused.len(), graph.len());
     for (got, expected) in fused.iter().zip(&graph) {
         agree(name, &host(got)?, &host(expected)?, TIGHT)?;
     }
-    let floats = (parents * (2 * children + 1) + parents * children) as f64;
-    // Backward reads the gradient and the inputs again and writes their gradients.
-    let passes = if pass == Pass::Both { 2.5 } else { 1.0 };
-    let flops = passes * FLOPS_PER_SHARE * (parents * children) as f64;
-    let work = Work { bytes: 4.0 * passes * floats, flops };
+    let work = share_work(rule, (parents, children), pass);
+    let [hl, ha, ho, hown, hw] = [host(&l)?, host(&a)?, host(&o)?, host(&own)?, host(&weights)?];
+    let args = shares::Args {
+        rule,
+        k: children,
+        logits: &hl,
+        areas: &ha,
+        alphas: &ho,
+        own: if rule.areas_are_relative() { &hown } else { &[] },
+    };
     let mut contenders = Vec::new();
     for (what, fused) in [("candle graph", false), ("fused", true)] {
         for threads in [Threads::One, Threads::All] {
-            let contender = Contender::new(what, threads, move || run(fused).map(drop));
+            let contender = Contender::new(what, threads, move || run(fused, false).map(drop));
             contenders.push(if fused { contender.with_work(work) } else { contender });
+        }
+    }
+    for threads in [Threads::One, Threads::All] {
+        if pass == Pass::Both {
+            let grad = hw.as_slice();
+            let run = move || {
+                shares::forward(args);
+                shares::backward(args, grad);
+                Ok(())
+            };
+            let contender = Contender::new("fused, no autograd", threads, run);
+            contenders.push(contender.with_work(work));
         }
     }
     let note = if pass == Pass::Both { "forward and backward" } else { "" };

@@ -3,7 +3,7 @@
 #[path = "common/scenes.rs"]
 mod scenes;
 
-use candle_core::{DType, Device, Tensor};
+use candle_core::{DType, Device, Tensor, Var};
 use scenes::*;
 use subsplat::ops::redistribute::{Rule, redistribute};
 
@@ -91,6 +91,38 @@ fn redistribution_gradients_match_differences() {
             }
             let f = |x: &[Tensor]| redistribute(rule, &x[0], &x[1], &x[2], x.get(3));
             check_gradients(&inputs, &f, 12, 1e-7, &mut r);
+        }
+    }
+}
+
+#[test]
+fn vectors_of_parents_give_what_single_ones_in_double_precision_do() {
+    // More than one block of 512 and a rest that fills no vector; K that has a path of
+    // its own and K that has none.
+    let mut r = Random(6);
+    for k in [1, 2, 4, 9, 16, 25] {
+        let inputs = shares(531, k, &mut r);
+        let weights = r.tensor(&[531, k], 1.0, DType::F64);
+        let run = |rule, dtype| -> Vec<Tensor> {
+            let vars = [0, 1, 2, 3]
+                .map(|i: usize| Var::from_tensor(&inputs[i].to_dtype(dtype).unwrap()).unwrap());
+            let [l, a, o, own] = &vars;
+            let y = redistribute(rule, l, a, o, Some(own)).unwrap();
+            let weights = weights.to_dtype(dtype).unwrap();
+            let grads = (&y * weights).unwrap().sum_all().unwrap().backward().unwrap();
+            let of = vars.iter().filter_map(|v| grads.get(v).cloned());
+            std::iter::once(y.clone()).chain(of).collect()
+        };
+        for rule in RULES {
+            let (got, want) = (run(rule, DType::F32), run(rule, DType::F64));
+            assert_eq!(got.len(), if rule.areas_are_relative() { 5 } else { 4 });
+            for (i, (got, want)) in got.iter().zip(&want).enumerate() {
+                let (got, want) = (host(got), host(want));
+                let size = want.iter().fold(0.0f64, |m, v| m.max(v.abs()));
+                for (j, (g, w)) in got.iter().zip(&want).enumerate() {
+                    assert!((g - w).abs() <= 2e-5 * size, "{rule:?} K={k} {i} {j}: {g} {w}");
+                }
+            }
         }
     }
 }

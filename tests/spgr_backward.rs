@@ -9,9 +9,9 @@ mod spgr_calls;
 use candle_core::{DType, Device, Result, Tensor, Var};
 use scenes::*;
 use spgr_calls::*;
-use subsplat::abi::{HEAD_LANES, SPLAT_LANES};
+use subsplat::abi::{HEAD_GAIN, HEAD_LANES, SPLAT_LANES};
 use subsplat::config::*;
-use subsplat::cpu::spgr::{self as kernel, Args, Cotangents};
+use subsplat::cpu::spgr::{self as kernel, Args};
 use subsplat::model::spgr_ref;
 use subsplat::ops::spgr::{Spgr, spgr};
 
@@ -245,8 +245,8 @@ impl Plain {
         let weights = |n: usize| -> Vec<f32> { (0..n).map(|i| (i as f32 * 0.37).sin()).collect() };
         let (g_rows, g_gains) = (weights(rows.len()), weights(gains.len()));
         let (mut head, mut parents) = (vec![0f32; self.head.len()], vec![0f32; self.parents.len()]);
-        let grad = Cotangents { rows: &g_rows, gains: &g_gains };
-        kernel::backward(self.args(), grad, &mut head, &mut parents);
+        kernel::backward(self.args(), &g_rows, &mut head, &mut parents);
+        kernel::gains_backward(rules, &self.head, &g_gains, &mut head);
         (finite, [rows, gains, head, parents])
     }
 }
@@ -265,6 +265,33 @@ fn one_thread_and_two_give_the_same_bytes() {
         for (a, b) in one.iter().zip(&two) {
             assert!(bits(a) == bits(b), "{preset:?}");
         }
+    }
+}
+
+#[test]
+fn gains_alone_have_a_gradient() {
+    // γ = 1 + δ·tanh γ̃ and, in RGB, three times δ/2·tanh γ̃.
+    for (name, config) in variants(2) {
+        let plain = Plain::new(&config, 38);
+        let (n, k) = (plain.parents.len() / SPLAT_LANES, 4);
+        let of = |v: &[f32], s: &[usize]| Var::from_slice(v, s, &Device::Cpu).unwrap();
+        let (h, p) = (of(&plain.head, &[n, k, HEAD_LANES]), of(&plain.parents, &[n, SPLAT_LANES]));
+        let (rows, gains) = spgr(&h, &p, &plain.call).unwrap();
+        let grads = gains.sum_all().unwrap().backward().unwrap();
+        let got = grads.get(&h).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let rules = &plain.call.rules;
+        let factor = rules.delta * if rules.rgb_gain { 2.5 } else { 1.0 };
+        for (record, d) in plain.head.chunks(HEAD_LANES).zip(got.chunks(HEAD_LANES)) {
+            let t = f64::from(record[HEAD_GAIN]).tanh();
+            let want = factor * (1.0 - t * t);
+            assert!((f64::from(d[HEAD_GAIN]) - want).abs() < 1e-6, "{name}: {d:?} {want}");
+            assert!(d[..HEAD_GAIN].iter().all(|v| *v == 0.0), "{name}: {d:?}");
+        }
+        // Children alone leave that lane without one.
+        let grads = rows.sum_all().unwrap().backward().unwrap();
+        let got = grads.get(&h).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        assert!(got.chunks(HEAD_LANES).all(|d| d[HEAD_GAIN] == 0.0), "{name}");
+        assert!(got.iter().any(|v| *v != 0.0), "{name}");
     }
 }
 

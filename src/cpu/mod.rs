@@ -19,6 +19,7 @@ pub mod detail;
 mod disjoint;
 pub mod ewa;
 mod ewa_bwd;
+mod fresh;
 pub mod gemm;
 pub mod lanes;
 pub mod matching;

@@ -16,6 +16,7 @@
 //! vector ([`super::lanes`]), so that a sum over children is a loop. Twin:
 //! ops/redistribute.rs.
 
+use super::fresh::{Block, Fresh, start};
 use super::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};
 use super::real::Real;
 use crate::abi::{AREA_EPS, AREA_RULE_OPACITY_MAX, OPACITY_CEILING};
@@ -45,8 +46,8 @@ impl Rule {
 
 /// Least relative area that is divided by.
 const RELATIVE_AREA_MIN: f64 = 1e-12;
-/// Parents per rayon task.
-const BLOCK: usize = 1024;
+/// Parents per rayon task: all that it reads and writes lies in the caches of a core.
+const BLOCK: usize = 512;
 
 /// eˣ⁻ᵐᵃˣ of `x` in place; returns one over their sum.
 #[inline(always)]
@@ -230,45 +231,40 @@ impl<'a, T: LaneReal> Args<'a, T> {
     }
 }
 
-/// `[parent][k]` of `count` parents from `first` on to a vector per child; lanes
-/// above `count` repeat the last parent.
-#[inline(always)]
-fn gather<M: Machine>(
-    m: M,
-    from: &[M::Scalar],
-    (first, count): (usize, usize),
-    out: &mut [M::V],
-    tile: &mut [[M::Scalar; WIDTH_MAX]],
-) {
-    let k = out.len();
-    for lane in 0..M::WIDTH {
-        let row = &from[(first + lane.min(count - 1)) * k..][..k];
-        for (tile, &v) in tile.iter_mut().zip(row) {
-            tile[lane] = v;
-        }
+/// K vectors of a group of parents, one per child: an array where K is that of a usual
+/// upscaling factor, so that loops over children unroll and stay in registers.
+trait Children<M: Machine>: AsMut<[M::V]> + AsRef<[M::V]> {
+    /// `count` rows of K numbers, one after the other; lanes above `count` repeat the
+    /// last row.
+    fn load(&mut self, m: M, rows: &[M::Scalar], count: usize);
+    /// The inverse of [`Children::load`].
+    fn store(&self, m: M, rows: &mut [M::Scalar], count: usize);
+}
+
+impl<M: Machine, const K: usize> Children<M> for [M::V; K] {
+    #[inline(always)]
+    fn load(&mut self, m: M, rows: &[M::Scalar], count: usize) {
+        *self = m.load_rows(rows, (K, count));
     }
-    for (out, tile) in out.iter_mut().zip(&*tile) {
-        *out = m.load(tile);
+    #[inline(always)]
+    fn store(&self, m: M, rows: &mut [M::Scalar], count: usize) {
+        m.store_rows(self, (K, count), rows);
     }
 }
 
-/// The inverse of [`gather`].
-#[inline(always)]
-fn scatter<M: Machine>(
-    m: M,
-    from: &[M::V],
-    (first, count): (usize, usize),
-    to: &mut [M::Scalar],
-    tile: &mut [[M::Scalar; WIDTH_MAX]],
-) {
-    let k = from.len();
-    for (&v, tile) in from.iter().zip(tile.iter_mut()) {
-        m.store(v, tile);
+impl<M: Machine> Children<M> for Vec<M::V> {
+    #[inline(always)]
+    fn load(&mut self, m: M, rows: &[M::Scalar], count: usize) {
+        let children = self.len();
+        for (k, v) in self.iter_mut().enumerate() {
+            let [only] = m.load_rows(&rows[k..], (children, count));
+            *v = only;
+        }
     }
-    for lane in 0..count {
-        let row = &mut to[(first + lane) * k..][..k];
-        for (v, tile) in row.iter_mut().zip(&*tile) {
-            *v = tile[lane];
+    #[inline(always)]
+    fn store(&self, m: M, rows: &mut [M::Scalar], count: usize) {
+        for (k, &v) in self.iter().enumerate() {
+            m.store_rows(&[v], (self.len(), count), &mut rows[k..]);
         }
     }
 }
@@ -276,13 +272,27 @@ fn scatter<M: Machine>(
 /// One number per parent, `count` of them from `first` on; 1 where there is none.
 #[inline(always)]
 fn single<M: Machine>(m: M, from: &[M::Scalar], (first, count): (usize, usize)) -> M::V {
+    match from.get(first..first + count) {
+        Some(from) => {
+            let [only] = load_singles(m, from, count);
+            only
+        }
+        None => m.of(1.0),
+    }
+}
+
+#[inline(always)]
+fn load_singles<M: Machine>(m: M, from: &[M::Scalar], count: usize) -> [M::V; 1] {
+    if let Some(whole) = from.first_chunk::<WIDTH_MAX>()
+        && M::WIDTH == WIDTH_MAX
+    {
+        return [m.load(whole)];
+    }
     let mut lanes = [M::Scalar::of(1.0); WIDTH_MAX];
     for (lane, out) in lanes[..M::WIDTH].iter_mut().enumerate() {
-        if let Some(&v) = from.get(first + lane.min(count - 1)) {
-            *out = v;
-        }
+        *out = from[lane.min(count - 1)];
     }
-    m.load(&lanes)
+    [m.load(&lanes)]
 }
 
 /// A block of parents forward.
@@ -291,28 +301,44 @@ struct Forward<'a, T> {
     out: &'a mut [T],
 }
 
-impl<T: LaneReal> Kernel<T> for Forward<'_, T> {
-    type Output = ();
+impl<T: LaneReal> Forward<'_, T> {
     #[inline(always)]
-    fn run<M: Machine<Scalar = T>>(self, m: M) {
+    fn of<M: Machine<Scalar = T>, C: Children<M>>(self, m: M, mut a: C, mut o: C) {
         let Args { rule, k, logits, areas, alphas, own } = self.args;
-        let mut tile = vec![[T::default(); WIDTH_MAX]; k];
-        let (mut a, mut o) = (vec![m.of(0.0); k], vec![m.of(0.0); k]);
         for first in (0..alphas.len()).step_by(M::WIDTH) {
-            let span = (first, M::WIDTH.min(alphas.len() - first));
-            gather(m, logits, span, &mut o, &mut tile);
-            gather(m, areas, span, &mut a, &mut tile);
-            share(rule, &a, single(m, alphas, span), single(m, own, span), &mut o);
-            scatter(m, &o, span, self.out, &mut tile);
+            let count = M::WIDTH.min(alphas.len() - first);
+            let (span, at) = ((first, count), first * k);
+            o.load(m, &logits[at..], count);
+            a.load(m, &areas[at..], count);
+            let (alpha, own) = (single(m, alphas, span), single(m, own, span));
+            share(rule, a.as_ref(), alpha, own, o.as_mut());
+            o.store(m, &mut self.out[at..], count);
         }
     }
 }
 
-/// Opacities `[P, K]` of the children into `out` (module doc).
-pub fn forward<T: LaneReal>(args: Args<T>, out: &mut [T]) {
-    out.par_chunks_mut(args.k * BLOCK).enumerate().for_each(|(block, out)| {
-        T::dispatch(Forward { args: args.parents(block * BLOCK, BLOCK), out });
+impl<T: LaneReal> Kernel<T> for Forward<'_, T> {
+    type Output = ();
+    #[inline(always)]
+    fn run<M: Machine<Scalar = T>>(self, m: M) {
+        let zero = m.of(0.0);
+        match self.args.k {
+            4 => self.of(m, [zero; 4], [zero; 4]),
+            9 => self.of(m, [zero; 9], [zero; 9]),
+            16 => self.of(m, [zero; 16], [zero; 16]),
+            k => self.of(m, vec![zero; k], vec![zero; k]),
+        }
+    }
+}
+
+/// Opacities `[P, K]` of the children (module doc).
+pub fn forward<T: LaneReal>(args: Args<T>) -> Vec<T> {
+    let mut out = Fresh::new(args.alphas.len() * args.k);
+    out.blocks(args.k * BLOCK).enumerate().for_each(|(block, out)| {
+        T::dispatch(Forward { args: args.parents(block * BLOCK, BLOCK), out: start(out) });
     });
+    // SAFETY: the loop above started every block.
+    unsafe { out.finish() }
 }
 
 /// Gradients of [`forward`].
@@ -337,28 +363,40 @@ struct Backward<'a, T> {
     own: &'a mut [T],
 }
 
+impl<T: LaneReal> Backward<'_, T> {
+    #[inline(always)]
+    fn of<M: Machine<Scalar = T>, C: Children<M>>(self, m: M, [mut l, mut a, mut g]: [C; 3]) {
+        let Args { rule, k, logits, areas, alphas, own } = self.args;
+        for first in (0..alphas.len()).step_by(M::WIDTH) {
+            let count = M::WIDTH.min(alphas.len() - first);
+            let (span, at) = ((first, count), first * k);
+            l.load(m, &logits[at..], count);
+            a.load(m, &areas[at..], count);
+            g.load(m, &self.grad[at..], count);
+            let per_parent = (single(m, alphas, span), single(m, own, span));
+            let (d_alpha, d_own) =
+                share_backward(rule, per_parent, g.as_mut(), l.as_mut(), a.as_mut());
+            l.store(m, &mut self.logits[at..], count);
+            a.store(m, &mut self.areas[at..], count);
+            for (v, out) in [(d_alpha, &mut *self.alphas), (d_own, &mut *self.own)] {
+                let mut lanes = [T::default(); WIDTH_MAX];
+                m.store(v, &mut lanes);
+                out[first..first + count].copy_from_slice(&lanes[..count]);
+            }
+        }
+    }
+}
+
 impl<T: LaneReal> Kernel<T> for Backward<'_, T> {
     type Output = ();
     #[inline(always)]
     fn run<M: Machine<Scalar = T>>(self, m: M) {
-        let Args { rule, k, logits, areas, alphas, own } = self.args;
-        let mut tile = vec![[T::default(); WIDTH_MAX]; k];
-        let zeros = vec![m.of(0.0); k];
-        let (mut l, mut a, mut g) = (zeros.clone(), zeros.clone(), zeros);
-        for first in (0..alphas.len()).step_by(M::WIDTH) {
-            let span = (first, M::WIDTH.min(alphas.len() - first));
-            gather(m, logits, span, &mut l, &mut tile);
-            gather(m, areas, span, &mut a, &mut tile);
-            gather(m, self.grad, span, &mut g, &mut tile);
-            let per_parent = (single(m, alphas, span), single(m, own, span));
-            let (d_alpha, d_own) = share_backward(rule, per_parent, &mut g, &mut l, &mut a);
-            scatter(m, &l, span, self.logits, &mut tile);
-            scatter(m, &a, span, self.areas, &mut tile);
-            for (v, out) in [(d_alpha, &mut *self.alphas), (d_own, &mut *self.own)] {
-                let mut lanes = [T::default(); WIDTH_MAX];
-                m.store(v, &mut lanes);
-                out[first..first + span.1].copy_from_slice(&lanes[..span.1]);
-            }
+        let zero = m.of(0.0);
+        match self.args.k {
+            4 => self.of(m, [[zero; 4]; 3]),
+            9 => self.of(m, [[zero; 9]; 3]),
+            16 => self.of(m, [[zero; 16]; 3]),
+            k => self.of(m, [vec![zero; k], vec![zero; k], vec![zero; k]]),
         }
     }
 }
@@ -366,18 +404,29 @@ impl<T: LaneReal> Kernel<T> for Backward<'_, T> {
 /// Gradients of [`forward`] for the gradient `grad` `[P, K]` of its result.
 pub fn backward<T: LaneReal>(args: Args<T>, grad: &[T]) -> Gradients<T> {
     let (p, k) = (args.alphas.len(), args.k);
-    let zeros = |n: usize| vec![T::default(); n];
-    let mut g =
-        Gradients { logits: zeros(p * k), areas: zeros(p * k), alphas: zeros(p), own: zeros(p) };
-    g.logits
-        .par_chunks_mut(k * BLOCK)
-        .zip(g.areas.par_chunks_mut(k * BLOCK))
-        .zip(g.alphas.par_chunks_mut(BLOCK).zip(g.own.par_chunks_mut(BLOCK)))
-        .zip(grad.par_chunks(k * BLOCK))
+    let (mut logits, mut areas) = (Fresh::new(p * k), Fresh::new(p * k));
+    let (mut alphas, mut own) = (Fresh::new(p), Fresh::new(p));
+    type Own<'a, T> = ((&'a mut Block<T>, &'a mut Block<T>), (&'a mut Block<T>, &'a mut Block<T>));
+    let one = |block: usize, ((logits, areas), (alphas, own)): Own<T>| {
+        let args = args.parents(block * BLOCK, BLOCK);
+        let grad = &grad[block * BLOCK * k..];
+        let (logits, areas) = (start(logits), start(areas));
+        let (alphas, own) = (start(alphas), start(own));
+        T::dispatch(Backward { args, grad, logits, areas, alphas, own });
+    };
+    logits
+        .blocks(k * BLOCK)
+        .zip(areas.blocks(k * BLOCK))
+        .zip(alphas.blocks(BLOCK).zip(own.blocks(BLOCK)))
         .enumerate()
-        .for_each(|(block, (((logits, areas), (alphas, own)), grad))| {
-            let args = args.parents(block * BLOCK, BLOCK);
-            T::dispatch(Backward { args, grad, logits, areas, alphas, own });
-        });
-    g
+        .for_each(|(block, own)| one(block, own));
+    // SAFETY: the loop above started every block: all four have as many.
+    unsafe {
+        Gradients {
+            logits: logits.finish(),
+            areas: areas.finish(),
+            alphas: alphas.finish(),
+            own: own.finish(),
+        }
+    }
 }

@@ -114,8 +114,7 @@ fn forward<T: Number + LaneReal>(
     let data = slice::<T>(NAME, "logits", logits.0, logits.1)?;
     let areas = slice::<T>(NAME, "areas", areas.0, areas.1)?;
     let per_parent = slice::<T>(NAME, "opacities", per_parent.0, per_parent.1)?;
-    let mut out = vec![T::default(); data.len()];
-    cpu::forward(arguments(rule, &Tensor2 { data, parents, k }, areas, per_parent), &mut out);
+    let out = cpu::forward(arguments(rule, &Tensor2 { data, parents, k }, areas, per_parent));
     Ok((T::to_cpu_storage_owned(out), shape))
 }
 

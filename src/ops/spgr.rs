@@ -8,7 +8,8 @@ use crate::camera::Camera;
 use crate::cpu::lanes::LaneReal;
 use crate::cpu::spgr as cpu;
 use candle_core::backend::BackendStorage;
-use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Storage, Tensor, bail};
+use candle_core::{CpuStorage, CustomOp1, CustomOp2, Layout, Result, Shape, Storage, Tensor, bail};
+use std::sync::{Arc, Mutex};
 
 pub use cpu::{CHILDREN_MAX, Rules};
 
@@ -70,14 +71,17 @@ impl Spgr {
 /// finite (named by parent and child).
 pub fn spgr(head: &Tensor, parents: &Tensor, call: &Spgr) -> Result<(Tensor, Tensor)> {
     let n = call.check(head, parents)?;
-    let count = n * call.rules.children();
-    let lanes = call.rules.gain_lanes();
-    let packed = head.contiguous()?.apply_op2(&parents.contiguous()?, Fused(call.clone()))?;
-    let rows = packed.narrow(0, 0, count * SPLAT_LANES)?.reshape((count, SPLAT_LANES))?;
-    let gains = packed.narrow(0, count * SPLAT_LANES, count * lanes)?;
-    let gains = if lanes == 1 { gains } else { gains.reshape((count, lanes))? };
+    let (head, parents) = (head.contiguous()?, parents.contiguous()?);
+    let made = Made::default();
+    let rows = head.apply_op2(&parents, Children(call.clone(), made.clone()))?;
+    let gains =
+        head.apply_op1(Gains { rules: call.rules, count: n * call.rules.children(), made })?;
     Ok((rows, gains))
 }
+
+/// Gains on their way from [`Children`], whose pass makes both, to [`Gains`]: two ops,
+/// because the gradient of a part of one packed result is a padded copy of the whole.
+type Made = Arc<Mutex<Option<CpuStorage>>>;
 
 /// [`spgr`] of `f32` tensors into `rows` (N·K·11 floats) and `gains` (N·K or N·K·4).
 ///
@@ -161,9 +165,10 @@ fn finite_number<T: Number>(v: T) -> bool {
     crate::cpu::real::Real::is_finite(v)
 }
 
-struct Fused(Spgr);
+/// Children `[N·K, 11]` of head records and parents.
+struct Children(Spgr, Made);
 
-impl CustomOp2 for Fused {
+impl CustomOp2 for Children {
     fn name(&self) -> &'static str {
         NAME
     }
@@ -175,7 +180,7 @@ impl CustomOp2 for Fused {
         s2: &CpuStorage,
         l2: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        by_dtype!(NAME, s1.dtype(), forward(&self.0, (s1, l1), (s2, l2)))
+        by_dtype!(NAME, s1.dtype(), forward(self, (s1, l1), (s2, l2)))
     }
 
     fn bwd(
@@ -190,19 +195,20 @@ impl CustomOp2 for Fused {
 }
 
 fn forward<T: Number + LaneReal>(
-    call: &Spgr,
+    Children(call, made): &Children,
     (s1, l1): (&CpuStorage, &Layout),
     (s2, l2): (&CpuStorage, &Layout),
 ) -> Result<(CpuStorage, Shape)> {
     let head = slice::<T>(NAME, "head records", s1, l1)?;
     let parents = slice::<T>(NAME, "parents", s2, l2)?;
     let count = l2.dims()[0] * call.rules.children();
-    let rows = count * SPLAT_LANES;
-    let mut out = vec![T::default(); rows + count * call.rules.gain_lanes()];
-    let (children, gains) = out.split_at_mut(rows);
-    run(call, head, parents, children, gains)?;
-    let len = out.len();
-    Ok((T::to_cpu_storage_owned(out), Shape::from(len)))
+    let mut rows = vec![T::default(); count * SPLAT_LANES];
+    let mut gains = vec![T::default(); count * call.rules.gain_lanes()];
+    run(call, head, parents, &mut rows, &mut gains)?;
+    if let Ok(mut made) = made.lock() {
+        *made = Some(T::to_cpu_storage_owned(gains));
+    }
+    Ok((T::to_cpu_storage_owned(rows), Shape::from((count, SPLAT_LANES))))
 }
 
 fn backward<T: Number + LaneReal>(
@@ -212,17 +218,56 @@ fn backward<T: Number + LaneReal>(
     grad: &Tensor,
 ) -> Result<(Option<Tensor>, Option<Tensor>)> {
     let grad = grad.contiguous()?;
-    let rows = head.elem_count() / HEAD_LANES * SPLAT_LANES;
     let mut d_head = vec![T::default(); head.elem_count()];
     let mut d_parents = vec![T::default(); parents.elem_count()];
     borrowed::<T, (), 3>(NAME, [head, parents, &grad], |[head, parents, grad]| {
-        let (rows, gains) = grad.split_at(rows);
         let args = cpu::Args { rules: &call.rules, source: call.source(), head, parents };
-        cpu::backward(args, cpu::Cotangents { rows, gains }, &mut d_head, &mut d_parents);
+        cpu::backward(args, grad, &mut d_head, &mut d_parents);
     })?;
     let device = head.device();
     Ok((
         Some(Tensor::from_vec(d_head, head.dims(), device)?),
         Some(Tensor::from_vec(d_parents, parents.dims(), device)?),
     ))
+}
+
+/// Gains `[N·K]` or `[N·K, 4]` of head records.
+struct Gains {
+    rules: Rules,
+    /// N·K.
+    count: usize,
+    made: Made,
+}
+
+impl CustomOp1 for Gains {
+    fn name(&self) -> &'static str {
+        NAME
+    }
+
+    fn cpu_fwd(&self, _: &CpuStorage, _: &Layout) -> Result<(CpuStorage, Shape)> {
+        let made = self.made.lock().ok().and_then(|mut made| made.take());
+        let Some(gains) = made else { bail!("{NAME}: expected the gains of this call, got none") };
+        let shape = match self.rules.gain_lanes() {
+            1 => Shape::from(self.count),
+            lanes => Shape::from((self.count, lanes)),
+        };
+        Ok((gains, shape))
+    }
+
+    fn bwd(&self, head: &Tensor, _: &Tensor, grad: &Tensor) -> Result<Option<Tensor>> {
+        by_dtype!(NAME, head.dtype(), gains_backward(&self.rules, head, grad))
+    }
+}
+
+fn gains_backward<T: Number + LaneReal>(
+    rules: &Rules,
+    head: &Tensor,
+    grad: &Tensor,
+) -> Result<Option<Tensor>> {
+    let grad = grad.contiguous()?;
+    let mut d_head = vec![T::default(); head.elem_count()];
+    borrowed::<T, (), 2>(NAME, [head, &grad], |[head, grad]| {
+        cpu::gains_backward(rules, head, grad, &mut d_head);
+    })?;
+    Ok(Some(Tensor::from_vec(d_head, head.dims(), head.device())?))
 }

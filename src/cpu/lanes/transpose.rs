@@ -40,6 +40,52 @@ unsafe fn transpose(r: [__m512; 16]) -> [__m512; 16] {
     }
 }
 
+/// 16 rows of 4, one after the other, to 4 columns: 4 loads and 8 shuffles.
+///
+/// # Safety
+/// The processor has AVX-512F, and `from` points to 64 numbers.
+#[inline(always)]
+unsafe fn columns_of_4(from: *const f32) -> [__m512; 4] {
+    // SAFETY: loads inside the 64 numbers; else register operations.
+    unsafe {
+        // Numbers 0 and 1 of 8 rows, then 2 and 3: halves of a vector each.
+        let first = _mm512_setr_epi32(0, 4, 8, 12, 16, 20, 24, 28, 1, 5, 9, 13, 17, 21, 25, 29);
+        let second = _mm512_add_epi32(first, _mm512_set1_epi32(2));
+        let v = [0, 16, 32, 48].map(|i| _mm512_loadu_ps(from.add(i)));
+        let a = _mm512_permutex2var_ps(v[0], first, v[1]);
+        let b = _mm512_permutex2var_ps(v[0], second, v[1]);
+        let c = _mm512_permutex2var_ps(v[2], first, v[3]);
+        let d = _mm512_permutex2var_ps(v[2], second, v[3]);
+        [
+            _mm512_shuffle_f32x4::<0x44>(a, c),
+            _mm512_shuffle_f32x4::<0xee>(a, c),
+            _mm512_shuffle_f32x4::<0x44>(b, d),
+            _mm512_shuffle_f32x4::<0xee>(b, d),
+        ]
+    }
+}
+
+/// The inverse of [`columns_of_4`].
+///
+/// # Safety
+/// The processor has AVX-512F, and `to` points to 64 numbers.
+#[inline(always)]
+unsafe fn rows_of_4(v: [__m512; 4], to: *mut f32) {
+    // SAFETY: stores inside the 64 numbers; else register operations.
+    unsafe {
+        let first = _mm512_setr_epi32(0, 8, 16, 24, 1, 9, 17, 25, 2, 10, 18, 26, 3, 11, 19, 27);
+        let second = _mm512_add_epi32(first, _mm512_set1_epi32(4));
+        let a = _mm512_shuffle_f32x4::<0x44>(v[0], v[1]);
+        let b = _mm512_shuffle_f32x4::<0x44>(v[2], v[3]);
+        let c = _mm512_shuffle_f32x4::<0xee>(v[0], v[1]);
+        let d = _mm512_shuffle_f32x4::<0xee>(v[2], v[3]);
+        _mm512_storeu_ps(to, _mm512_permutex2var_ps(a, first, b));
+        _mm512_storeu_ps(to.add(16), _mm512_permutex2var_ps(a, second, b));
+        _mm512_storeu_ps(to.add(32), _mm512_permutex2var_ps(c, first, d));
+        _mm512_storeu_ps(to.add(48), _mm512_permutex2var_ps(c, second, d));
+    }
+}
+
 /// Number i of `count` rows, `stride` apart, for i < `length`; further lanes repeat the
 /// last row. `None` where `rows` ends before.
 ///
@@ -53,6 +99,14 @@ pub(super) unsafe fn load(
 ) -> Option<[__m512; 16]> {
     if count == 0 || length > WIDTH_MAX || rows.len() < (count - 1) * stride + length {
         return None;
+    }
+    if (length, stride, count) == (4, 4, 16) {
+        // SAFETY: `rows` holds 64 numbers by the check above.
+        let [a, b, c, d] = unsafe { columns_of_4(rows.as_ptr()) };
+        // SAFETY: all zeros is a vector of 16 `f32`.
+        let mut out: [__m512; 16] = unsafe { std::mem::zeroed() };
+        (out[0], out[1], out[2], out[3]) = (a, b, c, d);
+        return Some(out);
     }
     let mask = ((1u32 << length) - 1) as __mmask16;
     // SAFETY: every row's masked numbers lie in `rows` by the check above.
@@ -82,6 +136,11 @@ pub(super) unsafe fn store(
         && rows.len() >= (count - 1) * stride + length;
     if !fits {
         return false;
+    }
+    if (length, stride, count) == (4, 4, 16) {
+        // SAFETY: `rows` holds 64 numbers by the check above.
+        unsafe { rows_of_4([columns[0], columns[1], columns[2], columns[3]], rows.as_mut_ptr()) };
+        return true;
     }
     let mask = ((1u32 << length) - 1) as __mmask16;
     // SAFETY: every row's masked numbers lie in `rows` by the check above.

@@ -353,7 +353,7 @@ mod tests {
                     v.abs().ln(),
                     v.abs().log2(),
                     // Opacities: −1 < x ≤ 0.
-                    (-(v.abs() / (v.abs() + m.of(0.001)))).ln_1p(),
+                    (-(v.abs() / (v.abs() + m.of(0.001))).min(m.of(0.9999))).ln_1p(),
                 ];
                 out.push(of.map(|v| {
                     let mut lanes = [0.0; WIDTH_MAX];

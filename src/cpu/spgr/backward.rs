@@ -1,11 +1,12 @@
 //! Gradients of the children with respect to head records and parents (spec 2.12),
 //! everything recomputed from the inputs: a first walk over the children for their
-//! areas, which the opacity rule couples, and a second one for the rest.
+//! areas, which the opacity rule couples, and a second one for the rest. Gains depend
+//! on one lane of the head records alone and have a pass of their own.
 
 use super::child::{Child, ChildGradient};
 use super::parent::{Parent, ParentGradient};
 use super::view::Table;
-use super::{Args, BLOCK, records};
+use super::{Args, BLOCK, Rules, records};
 use crate::abi::{
     HEAD_GAIN, HEAD_LANES, HEAD_LOGIT, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES,
 };
@@ -13,19 +14,11 @@ use crate::cpu::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};
 use crate::cpu::redistribute::share_backward;
 use rayon::prelude::*;
 
-/// Gradients of what [`super::forward`] writes.
-#[derive(Clone, Copy, Debug)]
-pub struct Cotangents<'a, T> {
-    /// `[N·K, 11]`.
-    pub rows: &'a [T],
-    /// `[N·K]` or `[N·K, 4]`.
-    pub gains: &'a [T],
-}
-
 /// One block of parents; the mutable slices are the block's own.
 struct Backward<'a, T> {
     args: Args<'a, T>,
-    grad: Cotangents<'a, T>,
+    /// By children, `[N·K, 11]`.
+    grad: &'a [T],
     table: &'a Table<T>,
     range: std::ops::Range<usize>,
     head: &'a mut [T],
@@ -74,7 +67,6 @@ impl<T: LaneReal> Backward<'_, T> {
             let child = Child::new(rules, &parent, k, &head);
             let mut d_head = [m.of(0.0); HEAD_LANES];
             d_head[HEAD_LOGIT] = s.logits[k];
-            d_head[HEAD_GAIN] = self.gain(m, span, k, head[HEAD_GAIN]);
             let g = self.cotangents(m, span, k, s.areas[k]);
             child.backward((rules, &parent), g, &mut d_head, &mut d);
             let to = &mut self.head[(at * children + k) * HEAD_LANES..];
@@ -93,7 +85,7 @@ impl<T: LaneReal> Backward<'_, T> {
         k: usize,
     ) -> M::V {
         let children = self.args.rules.children();
-        let from = &self.grad.rows[(first * children + k) * SPLAT_LANES + LANE_OPACITY..];
+        let from = &self.grad[(first * children + k) * SPLAT_LANES + LANE_OPACITY..];
         let mut lanes = [T::default(); WIDTH_MAX];
         for (lane, out) in lanes[..M::WIDTH].iter_mut().enumerate() {
             *out = from[lane.min(count - 1) * children * SPLAT_LANES];
@@ -111,7 +103,7 @@ impl<T: LaneReal> Backward<'_, T> {
         area: M::V,
     ) -> ChildGradient<M::V> {
         let children = self.args.rules.children();
-        let from = &self.grad.rows[(first * children + k) * SPLAT_LANES..];
+        let from = &self.grad[(first * children + k) * SPLAT_LANES..];
         let g: [M::V; SPLAT_LANES] = m.load_rows(from, (children * SPLAT_LANES, count));
         let vector = |i: usize| [g[i], g[i + 1], g[i + 2]];
         let q = LANE_QUAT;
@@ -122,38 +114,12 @@ impl<T: LaneReal> Backward<'_, T> {
             area,
         }
     }
-
-    /// ∂/∂γ̃ of child `k`.
-    #[inline(always)]
-    fn gain<M: Machine<Scalar = T>>(
-        &self,
-        m: M,
-        (first, count): (usize, usize),
-        k: usize,
-        raw: M::V,
-    ) -> M::V {
-        let rules = self.args.rules;
-        let (children, lanes) = (rules.children(), rules.gain_lanes());
-        let mut sums = [T::default(); WIDTH_MAX];
-        for (lane, sum) in sums[..M::WIDTH].iter_mut().enumerate() {
-            let at = ((first + lane.min(count - 1)) * children + k) * lanes;
-            let residual: T = self.grad.gains[at + 1..at + lanes].iter().copied().sum();
-            *sum = self.grad.gains[at] + T::of(0.5) * residual;
-        }
-        let t = raw.tanh();
-        m.load(&sums) * m.of(rules.delta) * (m.of(1.0) - t * t)
-    }
 }
 
 /// Gradients into `head` `[N, K, 11]` and `parents` `[N, 11]` for those of the
-/// children and gains. Each parent is one task's own: any number of threads gives the
-/// same bytes.
-pub fn backward<T: LaneReal>(
-    args: Args<T>,
-    grad: Cotangents<T>,
-    head: &mut [T],
-    parents: &mut [T],
-) {
+/// children, `grad` `[N·K, 11]`. Each parent is one task's own: any number of threads
+/// gives the same bytes.
+pub fn backward<T: LaneReal>(args: Args<T>, grad: &[T], head: &mut [T], parents: &mut [T]) {
     let table = Table::new(&args.source);
     head.par_chunks_mut(BLOCK * args.rules.children() * HEAD_LANES)
         .zip(parents.par_chunks_mut(BLOCK * SPLAT_LANES))
@@ -162,4 +128,48 @@ pub fn backward<T: LaneReal>(
             let range = args.block(block);
             T::dispatch(Backward { args, grad, table: &table, range, head, parents });
         });
+}
+
+/// Head records per rayon task of [`gains_backward`].
+const GAIN_BLOCK: usize = 1024;
+
+/// A block of head records; all slices are the block's own.
+struct GainsBackward<'a, T> {
+    rules: &'a Rules,
+    head: &'a [T],
+    grad: &'a [T],
+    out: &'a mut [T],
+}
+
+impl<T: LaneReal> Kernel<T> for GainsBackward<'_, T> {
+    type Output = ();
+    #[inline(always)]
+    fn run<M: Machine<Scalar = T>>(self, m: M) {
+        let lanes = self.rules.gain_lanes();
+        let count = self.head.len() / HEAD_LANES;
+        for first in (0..count).step_by(M::WIDTH) {
+            let width = M::WIDTH.min(count - first);
+            let (mut raw, mut by_gain) = ([T::default(); WIDTH_MAX], [T::default(); WIDTH_MAX]);
+            for lane in 0..width {
+                raw[lane] = self.head[(first + lane) * HEAD_LANES + HEAD_GAIN];
+                let grad = &self.grad[(first + lane) * lanes..][..lanes];
+                let residual: T = grad[1..].iter().copied().sum();
+                by_gain[lane] = grad[0] + T::of(0.5) * residual;
+            }
+            let t = m.load(&raw).tanh();
+            m.store(m.load(&by_gain) * m.of(self.rules.delta) * (m.of(1.0) - t * t), &mut raw);
+            for (lane, &d) in raw[..width].iter().enumerate() {
+                self.out[(first + lane) * HEAD_LANES + HEAD_GAIN] = d;
+            }
+        }
+    }
+}
+
+/// Gradients into lane [`HEAD_GAIN`] of `out` `[N, K, 11]`, for those of the gains,
+/// `grad` `[N·K]` or `[N·K, 4]`; nothing else is written.
+pub fn gains_backward<T: LaneReal>(rules: &Rules, head: &[T], grad: &[T], out: &mut [T]) {
+    out.par_chunks_mut(GAIN_BLOCK * HEAD_LANES)
+        .zip(head.par_chunks(GAIN_BLOCK * HEAD_LANES))
+        .zip(grad.par_chunks(GAIN_BLOCK * rules.gain_lanes()))
+        .for_each(|((out, head), grad)| T::dispatch(GainsBackward { rules, head, grad, out }));
 }

@@ -31,7 +31,7 @@ mod project;
 mod shape;
 mod view;
 
-pub use backward::{Cotangents, backward};
+pub use backward::{backward, gains_backward};
 pub use project::{Target, project};
 
 use super::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};

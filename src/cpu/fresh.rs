@@ -1,0 +1,66 @@
+//! Large results without a pass of zeros by one thread before the kernel's own.
+
+use rayon::prelude::*;
+use std::mem::MaybeUninit;
+
+/// `n` numbers that are yet to be written.
+pub(crate) struct Fresh<T> {
+    data: Vec<T>,
+    n: usize,
+}
+
+/// A part of a [`Fresh`].
+pub(crate) type Block<T> = [MaybeUninit<T>];
+
+impl<T: Copy + Default + Send> Fresh<T> {
+    /// Room for `n`.
+    pub(crate) fn new(n: usize) -> Self {
+        Self { data: Vec::with_capacity(n), n }
+    }
+
+    /// Blocks of `size` ≥ 1, the last one maybe shorter.
+    pub(crate) fn blocks(&mut self, size: usize) -> rayon::slice::ChunksMut<'_, MaybeUninit<T>> {
+        let room = self.data.spare_capacity_mut();
+        let n = self.n.min(room.len());
+        room[..n].par_chunks_mut(size)
+    }
+
+    /// All of it.
+    ///
+    /// # Safety
+    /// [`start`] was called with every block.
+    pub(crate) unsafe fn finish(mut self) -> Vec<T> {
+        // SAFETY: within the capacity, and written (the caller's promise).
+        unsafe { self.data.set_len(self.n) };
+        self.data
+    }
+}
+
+/// A block filled with zeros, while it lies in the cache of the thread that goes on
+/// with it. First writes, and so page faults, fall on all threads.
+#[inline]
+pub(crate) fn start<T: Copy + Default>(block: &mut Block<T>) -> &mut [T] {
+    block.fill(MaybeUninit::new(T::default()));
+    // SAFETY: every place was just written.
+    unsafe { &mut *(block as *mut Block<T> as *mut [T]) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn blocks_make_the_whole() {
+        for n in [0, 1, 7, 64, 65] {
+            let mut fresh = Fresh::<f32>::new(n);
+            fresh.blocks(8).enumerate().for_each(|(i, block)| {
+                let block = start(block);
+                assert!(block.iter().all(|v| *v == 0.0));
+                block.iter_mut().enumerate().for_each(|(j, v)| *v = (8 * i + j) as f32);
+            });
+            // SAFETY: the loop above started every block.
+            let all = unsafe { fresh.finish() };
+            assert_eq!(all, (0..n).map(|i| i as f32).collect::<Vec<_>>());
+        }
+    }
+}
