@@ -80,8 +80,7 @@ impl Scene {
 fn beside(scene: &Scene, zoom: f32) -> Camera {
     let mut camera = scene.call.cameras[0];
     let turn = Quat::from_euler(glam::EulerRot::XYZ, 0.1, -0.25, 0.3);
-    camera.world_from_camera =
-        camera.world_from_camera * Mat4::from_rotation_translation(turn, Vec3::new(0.4, 0.1, 1.5));
+    camera.world_from_camera *= Mat4::from_rotation_translation(turn, Vec3::new(0.4, 0.1, 1.5));
     let k = &mut camera.intrinsics;
     (k.fx, k.fy, k.cx, k.cy) = (k.fx * zoom, k.fy * zoom, k.cx * zoom, k.cy * zoom);
     (k.width, k.height) = ((k.width as f32 * zoom) as usize, (k.height as f32 * zoom) as usize);

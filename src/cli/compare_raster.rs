@@ -29,6 +29,9 @@ const GRADIENT_NEEDLES: f32 = 2e-3;
 /// The case that holds such splats.
 const NEEDLES: &str = "needles";
 
+/// Name, what came, its shape, what is allowed, and from which size on errors are relative.
+type Output<'a> = (&'static str, &'a [f32], &'a [usize], f32, Option<f32>);
+
 /// Renders the case with the instructions of `tier` and compares every output that the file holds. `relative` of a row
 /// is the difference in the tensor's own measure: absolute for colours and alpha.
 ///
@@ -47,7 +50,7 @@ pub fn compare(case: &Case, tier: Tier) -> Result<Vec<Row>> {
     };
     let depth = got.depth();
     let rgb = [k.height, k.width, 3];
-    let outputs: [(&str, &[f32], &[usize], f32, Option<f32>); 4] = [
+    let outputs: [Output; 4] = [
         ("rgb", &got.rgb, &rgb, colour, None),
         ("alpha", &got.alpha, &pixels, colour, None),
         ("depth_sum", &got.depth_sum, &pixels, DEPTH, Some(DEPTH_SUM_LEAST)),

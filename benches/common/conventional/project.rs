@@ -1,6 +1,8 @@
 //! One splat to the picture and back, in scalar `f32`: EWA projection (3DGS section 4,
 //! gsplat's limits of the Jacobian), colour by SH, and the gradient of both.
 
+#![expect(clippy::needless_range_loop, reason = "plain loops, as such programs have them")]
+
 use super::sh;
 use subsplat::camera::Camera;
 

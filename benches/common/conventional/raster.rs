@@ -4,6 +4,8 @@
 //! front from a stored last place and recovers T by division. Some programs keep what
 //! each pixel blended instead (`keeps`): a faster backward for much memory.
 
+#![expect(clippy::needless_range_loop, reason = "plain loops, as such programs have them")]
+
 use super::project::{Gradients, Options, Projected, ProjectedGrad, Splats, View};
 use subsplat::camera::Camera;
 

@@ -123,7 +123,7 @@ impl<S: Simd> Vector<S> {
     }
 
     #[inline(always)]
-    fn from_bits(self, bits: S::u32s) -> Self {
+    fn with_bits(self, bits: S::u32s) -> Self {
         Self { s: self.s, v: self.s.transmute_f32s_u32s(bits) }
     }
 
@@ -156,7 +156,7 @@ impl<S: Simd> Vector<S> {
         ]);
         let s = self.s;
         let biased = s.sub_u32s(shifted.bits(), s.splat_u32s(MAGIC.to_bits().wrapping_sub(127)));
-        let scale = self.from_bits(s.wrapping_dyn_shl_u32s(biased, s.splat_u32s(23)));
+        let scale = self.with_bits(s.wrapping_dyn_shl_u32s(biased, s.splat_u32s(23)));
         (p.fma(r * r, r), scale)
     }
 
@@ -169,10 +169,10 @@ impl<S: Simd> Vector<S> {
         let s = self.s;
         let u = s.add_u32s(self.bits(), s.splat_u32s(SHIFT));
         let exponent = s.wrapping_dyn_shr_u32s(u, s.splat_u32s(23));
-        let e = self.from_bits(s.or_u32s(exponent, s.splat_u32s(0x4b00_0000)))
+        let e = self.with_bits(s.or_u32s(exponent, s.splat_u32s(0x4b00_0000)))
             - self.c(8_388_608.0 + 128.0);
         let mantissa = s.and_u32s(u, s.splat_u32s(0x007f_ffff));
-        let f = self.from_bits(s.add_u32s(mantissa, s.splat_u32s(ROOT))) - self.c(1.0);
+        let f = self.with_bits(s.add_u32s(mantissa, s.splat_u32s(ROOT))) - self.c(1.0);
         let p = f.polynomial([
             7.037_683_6e-2,
             -1.151_461e-1,
@@ -182,7 +182,7 @@ impl<S: Simd> Vector<S> {
             -1.666_805_8e-1,
             2.000_071_5e-1,
             -2.499_999_4e-1,
-            3.333_333_1e-1,
+            3.333_333e-1,
         ]);
         let z = f * f;
         (e, f, z.fma(p * f, z * self.c(-0.5)))
@@ -310,7 +310,7 @@ impl<S: Simd> Lanes for Vector<S> {
             let bit = s.and_u32s(q, s.splat_u32s(2));
             s.wrapping_dyn_shl_u32s(bit, s.splat_u32s(30))
         };
-        let flip = |v: Self, q: S::u32s| v.from_bits(s.xor_u32s(v.bits(), sign(q)));
+        let flip = |v: Self, q: S::u32s| v.with_bits(s.xor_u32s(v.bits(), sign(q)));
         let near = (
             flip(Self::select(odd, cos, sin), quadrant),
             flip(Self::select(odd, sin, cos), s.add_u32s(quadrant, one)),

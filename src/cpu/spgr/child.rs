@@ -92,6 +92,10 @@ impl<V: Lanes> Step<V> {
         let mut d_dz = d_s[2];
         if let Some((share, inverse, free)) = self.ray {
             let mut d_share = of(0.0);
+            #[expect(
+                clippy::needless_range_loop,
+                reason = "three arrays, and iterators do not inline"
+            )]
             for i in 0..2 {
                 d_share = d_s[i].fma(parent.in_camera[i] + self.side[i], d_share);
                 d.in_camera[i] = share.fma(d_s[i], d.in_camera[i]);

@@ -183,6 +183,7 @@ impl<T: LaneReal> Kernel<T> for Forward<'_, T> {
 
 /// 0 where all of `v` are finite, else NaN.
 #[inline(always)]
+#[expect(clippy::eq_op, reason = "v − v is 0 where v is finite and NaN elsewhere")]
 fn not_finite<V: Lanes>(v: &[V], mut sum: V) -> V {
     for &v in v {
         sum = sum + (v - v);

@@ -92,7 +92,7 @@ impl<V: Lanes> Parent<V> {
         view: View<V>,
         (mean, quat, scale, alpha): (V3<V>, [V; 4], V3<V>, V),
     ) -> Self {
-        let in_camera = view.to_camera(mean);
+        let in_camera = view.seen_from(mean);
         let z = in_camera[2].max(view.z_min);
         let one = z.of(1.0);
         let mut parent = Self {

@@ -120,6 +120,9 @@ fn half_angles(camera: &Camera) -> [f32; 2] {
     })
 }
 
+/// Where the children of one vector of parents are put: children, areas, opacities.
+type Seat<'a, V> = (&'a mut [Seen<V>], &'a mut [V], &'a mut [V]);
+
 /// A child as the target sees it, its opacity still unknown.
 #[derive(Clone, Copy)]
 struct Seen<V> {
@@ -204,7 +207,7 @@ impl<V: Lanes> Seen<V> {
             keep = kept(low.lt(high), keep);
         }
         keep = V::select(alpha.lt(m.splat(ALPHA_MIN)), zero, keep);
-        let sound = not_finite(&numbers, det - det).abs();
+        let sound = not_finite(&numbers, not_finite(&[det], zero)).abs();
         keep = kept(sound.lt(one), keep);
         let rgb = [rgb[0].max(zero), rgb[1].max(zero), rgb[2].max(zero)];
         (
@@ -301,7 +304,7 @@ impl Project<'_> {
         m: M,
         span: (usize, usize),
         colour: &Coefficients<f32>,
-        (seen, areas, alphas): (&mut [Seen<M::V>], &mut [M::V], &mut [M::V]),
+        (seen, areas, alphas): Seat<M::V>,
     ) -> M::V {
         let Args { rules, source, parents, .. } = self.args;
         let parent = Parent::load(m, (rules, self.table, &source), parents, span);

@@ -185,7 +185,7 @@ impl<T: Real> Table<T> {
         let (mut nearest, mut best) = (m.of(f64::INFINITY), m.of(-1.0));
         for (v, camera) in self.cameras.iter().enumerate() {
             let view = View::new(splat(m, camera));
-            let p = view.to_camera(mean);
+            let p = view.seen_from(mean);
             let closer = view.sees(p, p[2].lt(nearest));
             nearest = M::V::select(closer, p[2], nearest);
             best = M::V::select(closer, m.of(v as f64), best);
@@ -235,7 +235,7 @@ impl<V: Lanes> View<V> {
     }
 
     #[inline(always)]
-    pub(super) fn to_camera(&self, p: V3<V>) -> V3<V> {
+    pub(super) fn seen_from(&self, p: V3<V>) -> V3<V> {
         let o = self.position;
         transposed(&self.rotation, [p[0] - o[0], p[1] - o[1], p[2] - o[2]])
     }
