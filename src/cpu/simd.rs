@@ -1,6 +1,6 @@
 //! Sixteen `f32` lanes on every processor: one algorithm, chosen at run time.
 //!
-//! A kernel is written once against [`Simd`] and run by [`Tier::run`], which
+//! A kernel is written once against `Simd` and run by `Tier::run`, which
 //! compiles it for each instruction set. The number of lanes is 16 in every tier, so
 //! the tiers do the same operations in the same order. All operations round as IEEE
 //! 754 says, none is an approximation: `Avx2`, `Avx512` and `Neon`, which fuse
