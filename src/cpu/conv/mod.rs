@@ -11,6 +11,7 @@ mod shift;
 #[cfg(test)]
 mod tests;
 mod weights;
+mod winograd;
 
 use super::simd::{Kernel, LANES, Simd, Tier};
 use plan::Plan;
@@ -21,14 +22,25 @@ pub use weights::weight_grad;
 
 /// y = x ∗ w + bias. `y` is overwritten; `bias` is empty or `[O]`.
 pub fn forward(tier: Tier, s: &Sizes, x: &[f32], w: &[f32], bias: &[f32], y: &mut [f32]) {
-    let plan = Plan::forward(s);
-    shift::run(tier, &plan, x, &shift::Weights::new(&plan, w), bias, y);
+    run(tier, &Plan::forward(s), x, w, bias, y);
 }
 
 /// ∂L/∂x from ∂L/∂y, `dx` overwritten.
 pub fn input_grad(tier: Tier, s: &Sizes, dy: &[f32], w: &[f32], dx: &mut [f32]) {
-    let plan = Plan::input_grad(s);
-    shift::run(tier, &plan, dy, &shift::Weights::new(&plan, w), &[], dx);
+    run(tier, &Plan::input_grad(s), dy, w, &[], dx);
+}
+
+/// The faster of the two ways. Where it is [`winograd`], results are off by up to some
+/// 1e-6 of √(C·9)·|x|·|w|, the definition's own sums in f32 by a few 1e-7 (the tests).
+fn run(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y: &mut [f32]) {
+    if y.is_empty() {
+        return;
+    }
+    if winograd::suits(plan) {
+        winograd::run(tier, plan, x, &winograd::Weights::new(tier, plan, w), bias, y);
+    } else {
+        shift::run(tier, plan, x, &shift::Weights::new(plan, w), bias, y);
+    }
 }
 
 /// Numbers that are summed in f32 lanes before they go to an f64: a sum over a
