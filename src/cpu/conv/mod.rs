@@ -12,10 +12,12 @@ mod shift;
 mod tests;
 mod weights;
 mod winograd;
+mod winograd_weights;
 
 use super::simd::{Kernel, LANES, Simd, Tier};
 use plan::Plan;
 use rayon::prelude::*;
+use std::cell::RefCell;
 
 pub use plan::{Axes, Sizes};
 pub use weights::weight_grad;
@@ -40,6 +42,59 @@ fn run(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y: &mut [f32
         winograd::run(tier, plan, x, &winograd::Weights::new(tier, plan, w), bias, y);
     } else {
         shift::run(tier, plan, x, &shift::Weights::new(plan, w), bias, y);
+    }
+}
+
+thread_local! {
+    static BUFFERS: RefCell<Buffers> = RefCell::default();
+}
+
+/// What a thread keeps from call to call, so that calls need not ask for megabytes of
+/// fresh pages.
+#[derive(Default)]
+struct Buffers {
+    /// A packed tile.
+    x: Buffer,
+    /// Sums before they are written, or gradients turned over.
+    y: Buffer,
+    /// Transformed tiles of x.
+    tiles: Buffer,
+    /// Transformed tiles of ∂L/∂y.
+    gradients: Buffer,
+    /// Products of transformed tiles.
+    products: Buffer,
+}
+
+impl Buffers {
+    /// Runs `f` with this thread's own (empty ones, should `f` come here again).
+    fn with<R>(f: impl FnOnce(&mut Self) -> R) -> R {
+        let mut own = BUFFERS.take();
+        let result = f(&mut own);
+        BUFFERS.set(own);
+        result
+    }
+}
+
+/// Sixteen floats on a cache line of their own.
+#[derive(Clone, Copy, Default)]
+#[repr(C, align(64))]
+struct Line([f32; LANES]);
+
+/// Floats from the start of a cache line, so that whole vectors never straddle two.
+#[derive(Default)]
+struct Buffer(Vec<Line>);
+
+impl Buffer {
+    /// Room for `n` floats, with what the last use left there.
+    fn room(&mut self, n: usize) -> &mut [f32] {
+        if self.0.len() * LANES < n {
+            self.0.resize(n.div_ceil(LANES), Line::default());
+        }
+        let lines: &mut [Line] = &mut self.0;
+        let floats = lines.len() * LANES;
+        // SAFETY: a line is 16 floats and nothing else.
+        let all = unsafe { std::slice::from_raw_parts_mut(lines.as_mut_ptr().cast(), floats) };
+        &mut all[..n]
     }
 }
 

@@ -364,6 +364,8 @@ pub(crate) fn pack(plan: &Plan, layout: &Layout, x: &[f32], start: Axes, out: &m
     };
     let step = plan.src_step[2];
     for (x, channel) in x.chunks_exact(pixels).zip(out.chunks_mut(layout.channel)) {
+        // Narrow sums of weights multiply these by zeros.
+        channel[plan.planes.len() * layout.plane..].fill(0.0);
         for (phase, plane) in plan.planes.iter().zip(channel.chunks_exact_mut(layout.plane)) {
             let left = first[2] + phase[2] as isize;
             let begin = (-left).max(0).unsigned_abs().div_ceil(step).min(layout.pitch());

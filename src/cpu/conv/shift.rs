@@ -1,6 +1,7 @@
 //! The convolution itself: outputs of eight channels and 48 places in registers, all
 //! channels and taps of the source summed into them without a pause.
 
+use super::Buffers;
 use super::plan::{Axes, Layout, Plan, pack, starts};
 use crate::cpu::disjoint::Disjoint;
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
@@ -89,21 +90,22 @@ pub(crate) fn run(tier: Tier, plan: &Plan, x: &[f32], w: &Weights, bias: &[f32],
     let parts = JOBS.div_ceil(tiles).min(w.blocks.len());
     let share = w.blocks.len().div_ceil(parts);
     let y = Disjoint::new(y);
-    (0..tiles * parts).into_par_iter().for_each_init(
-        || (Vec::new(), Vec::new()),
-        |(packed, sums), job| {
-            let (image, start) = (job / parts / starts.len(), starts[job / parts % starts.len()]);
-            let first = (job % parts * share).min(w.blocks.len());
-            let blocks = first..(first + share).min(w.blocks.len());
-            if blocks.is_empty() {
-                return;
-            }
-            packed.resize(plan.src_channels * layout.channel + SLACK, 0.0);
-            let x = &x[image * plan.src_channels * src..][..plan.src_channels * src];
+    (0..tiles * parts).into_par_iter().for_each(|job| {
+        let (image, start) = (job / parts / starts.len(), starts[job / parts % starts.len()]);
+        let first = (job % parts * share).min(w.blocks.len());
+        let blocks = first..(first + share).min(w.blocks.len());
+        if blocks.is_empty() {
+            return;
+        }
+        let x = &x[image * plan.src_channels * src..][..plan.src_channels * src];
+        Buffers::with(|buffers| {
+            let Buffers { x: packed, y: sums, .. } = buffers;
+            let packed = packed.room(plan.src_channels * layout.channel + SLACK);
+            let sums = sums.room(plan.passes.len() * ROWS * layout.flat().next_multiple_of(LANES));
             pack(plan, &layout, x, start, packed);
             tier.run(Job { plan, layout, packed, sums, w, blocks, bias, image, start, y: &y });
-        },
-    );
+        });
+    });
 }
 
 /// One tile and some blocks of channels.
@@ -111,7 +113,7 @@ struct Job<'a> {
     plan: &'a Plan,
     layout: Layout,
     packed: &'a [f32],
-    sums: &'a mut Vec<f32>,
+    sums: &'a mut [f32],
     w: &'a Weights,
     blocks: std::ops::Range<usize>,
     bias: &'a [f32],
@@ -128,7 +130,6 @@ impl Kernel for Job<'_> {
         let (plan, layout) = (self.plan, self.layout);
         let depth = plan.src_channels * plan.all_taps();
         let length = layout.flat().next_multiple_of(LANES);
-        self.sums.resize(plan.passes.len() * ROWS * length, 0.0);
         let offsets: Vec<Vec<usize>> =
             plan.passes.iter().map(|p| p.taps.iter().map(|t| layout.offset(t)).collect()).collect();
         for index in self.blocks.clone() {

@@ -6,6 +6,7 @@
 //! are 36 matrix products over channels; one block's transformed tiles stay in the
 //! second-level cache.
 
+use super::Buffers;
 use super::plan::{Axes, Layout, Plan, pack};
 use super::shift::{Block, ROWS, Strip, blocks};
 use crate::cpu::disjoint::Disjoint;
@@ -14,10 +15,10 @@ use rayon::prelude::*;
 use std::f32::consts::{FRAC_1_SQRT_2, SQRT_2};
 
 /// Outputs of a tile along an axis, and inputs that they read.
-const TILE: usize = 4;
-const PATCH: usize = 6;
+pub(super) const TILE: usize = 4;
+pub(super) const PATCH: usize = 6;
 /// Products of a tile.
-const POINTS: usize = PATCH * PATCH;
+pub(super) const POINTS: usize = PATCH * PATCH;
 /// Most vectors of tiles at once.
 const VECTORS: usize = 3;
 /// Floats of the transformed tiles of a block, unless one vector needs more.
@@ -168,21 +169,13 @@ pub(crate) fn run(tier: Tier, plan: &Plan, x: &[f32], w: &Weights, bias: &[f32],
     let layout = plan.layout([1, down * TILE, across * TILE]);
     let starts = super::plan::starts(plan.grid(), layout.tile);
     let y = Disjoint::new(y);
-    (0..images * starts.len()).into_par_iter().for_each_init(Scratch::default, |scratch, job| {
+    (0..images * starts.len()).into_par_iter().for_each(|job| {
         let (image, start) = (job / starts.len(), starts[job % starts.len()]);
         let x = &x[image * plan.src_channels * src..][..plan.src_channels * src];
-        tier.run(Job { plan, layout, x, w, bias, image, start, scratch, y: &y });
+        Buffers::with(|buffers| {
+            tier.run(Job { plan, layout, x, w, bias, image, start, buffers, y: &y });
+        });
     });
-}
-
-#[derive(Default)]
-struct Scratch {
-    /// One channel of the block, with its halo.
-    patch: Vec<f32>,
-    /// `[point][channel][tile]`.
-    tiles: Vec<f32>,
-    /// `[point][channel of a block][tile]`.
-    products: Vec<f32>,
 }
 
 /// A block of tiles, all channels.
@@ -194,7 +187,7 @@ struct Job<'a> {
     bias: &'a [f32],
     image: usize,
     start: Axes,
-    scratch: &'a mut Scratch,
+    buffers: &'a mut Buffers,
     y: &'a Disjoint<'a, f32>,
 }
 
@@ -204,15 +197,16 @@ impl Kernel for Job<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
         let (plan, layout) = (self.plan, self.layout);
-        let Scratch { patch, tiles, products } = self.scratch;
+        let Buffers { x: patch, tiles, products, .. } = self.buffers;
         let inside = |a: usize| layout.tile[a].min(plan.dst_size[a] - self.start[a]);
         let [down, across] = [inside(1), inside(2)].map(|n| n.div_ceil(TILE));
         let length = (down * across).next_multiple_of(LANES);
+        // `tiles` is [point][channel][tile], `products` [point][channel of a block][tile].
         // Off a power of two, lest all points share one cache set.
         let point = plan.src_channels * length + LANES;
-        patch.resize(layout.channel + SLACK, 0.0);
-        tiles.resize(POINTS * point, 0.0);
-        products.resize(POINTS * ROWS * length, 0.0);
+        let patch = patch.room(layout.channel + SLACK);
+        let tiles = tiles.room(POINTS * point);
+        let products = products.room(POINTS * ROWS * length);
         let pixels: usize = plan.src_size.iter().product();
         for (c, x) in self.x.chunks_exact(pixels).enumerate() {
             pack(plan, &layout, x, self.start, &mut patch[..layout.channel]);
@@ -266,7 +260,12 @@ impl Kernel for Job<'_> {
 
 /// Transformed patches at sixteen places of a packed channel.
 #[inline(always)]
-fn transform<S: Simd>(s: S, x: &[f32], at: &[usize; LANES], pitch: usize) -> [S::F; POINTS] {
+pub(super) fn transform<S: Simd>(
+    s: S,
+    x: &[f32],
+    at: &[usize; LANES],
+    pitch: usize,
+) -> [S::F; POINTS] {
     let mut points = [s.splat(0.0); POINTS];
     for r in 0..PATCH {
         let [a, b, c, d] = s.load4(x, at, r * pitch);
