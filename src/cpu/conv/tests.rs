@@ -98,7 +98,7 @@ fn cases() -> Vec<Sizes> {
 
 /// Bound of [`worst`] where Winograd is used, and where it is not.
 const WINOGRAD: f64 = 3e-6;
-const DIRECT: f64 = 7e-7;
+const DIRECT: f64 = 1.5e-6;
 
 fn bound(plan: &Plan) -> f64 {
     if winograd::suits(plan) { WINOGRAD } else { DIRECT }
