@@ -5,6 +5,10 @@
 //! in two dimensions D = 1. `plan` says what is read and written, `shift` computes y
 //! and ∂L/∂x, `weights` ∂L/∂w. Any number of threads gives the same bytes.
 //! Twins: none yet. Oracle: the definition in f64 (the tests).
+#![expect(
+    clippy::needless_range_loop,
+    reason = "counted loops over register tiles unroll, iterators over them need not"
+)]
 
 mod plan;
 mod shift;

@@ -390,8 +390,11 @@ pub(crate) fn pack(plan: &Plan, layout: &Layout, x: &[f32], start: Axes, out: &m
                 match step {
                     1 => row.copy_from_slice(&src[..row.len()]),
                     2 => {
-                        let pairs = src.chunks(2);
+                        let (pairs, last) = src.as_chunks::<2>();
                         row.iter_mut().zip(pairs).for_each(|(v, pair)| *v = pair[0]);
+                        if let ([v], [x]) = (&mut row[pairs.len().min(past - begin)..], last) {
+                            *v = *x;
+                        }
                     }
                     _ => {
                         let picks = src.iter().step_by(step);
