@@ -17,9 +17,6 @@ const STEPS: usize = 4 << 20;
 pub struct Machine {
     /// GB/s, read and written bytes together.
     pub copy: [f64; 2],
-    /// The same where the target's pages are touched for the first time, as those of
-    /// every tensor that an op returns.
-    pub copy_new: [f64; 2],
     /// GFLOP/s of `f32`, a multiply-add being two.
     pub fma: [f64; 2],
 }
@@ -64,6 +61,8 @@ impl Machine {
             (0..turns).map(|_| once(&mut to)).fold(0.0, f64::max)
         };
         let copy = [copy(one), copy(all)];
+        // The same where the target's pages are touched for the first time, as those of
+        // every tensor that an op returns.
         let copy_new = |pool: &ThreadPool| {
             let once = || {
                 let start = Instant::now();
@@ -93,6 +92,6 @@ impl Machine {
             fma[1],
             n = all.current_num_threads()
         );
-        Self { copy, copy_new, fma }
+        Self { copy, fma }
     }
 }
