@@ -77,6 +77,7 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
                 plan: &plan,
                 layout,
                 outputs: first..(first + outputs).min(o),
+                pitch: way.pitch(outputs.min(o - first)),
                 rows: channels.min(c - channel) * taps,
             };
             let unit = |unit: usize| {
@@ -97,7 +98,7 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
         }
         let rows = channels.min(c - channel) * taps;
         let outputs = first..(first + outputs).min(o);
-        let pitch = pitch(outputs.len());
+        let pitch = way.pitch(outputs.len());
         for (lane, output) in outputs.enumerate() {
             let at = (output * c + channel) * taps;
             // SAFETY: parts differ in outputs or channels.
@@ -127,6 +128,14 @@ impl Way {
             0..=NARROW => Self::Narrow,
             _ if winograd::suits(plan) => Self::Winograd,
             _ => Self::Wide,
+        }
+    }
+
+    /// Floats of one row of sums of so many outputs.
+    fn pitch(self, outputs: usize) -> usize {
+        match self {
+            Self::Narrow => outputs.next_power_of_two(),
+            Self::Wide | Self::Winograd => outputs.next_multiple_of(LANES),
         }
     }
 
@@ -170,26 +179,20 @@ impl Way {
     }
 }
 
-/// Sums of one row, floats.
-fn pitch(outputs: usize) -> usize {
-    match outputs {
-        0..=NARROW => outputs.next_power_of_two(),
-        n => n.next_multiple_of(LANES),
-    }
-}
-
 /// A range of output channels and rows (channel × tap).
 pub(super) struct Work<'a> {
     pub plan: &'a Plan,
     pub layout: Layout,
     pub outputs: Range<usize>,
+    /// Floats of one row of sums: the outputs, rounded up.
+    pub pitch: usize,
     pub rows: usize,
 }
 
 impl Work<'_> {
     /// Sums of a job: `[rows rounded up][outputs rounded up]`.
     fn floats(&self) -> usize {
-        self.rows.next_multiple_of(STEP) * pitch(self.outputs.len())
+        self.rows.next_multiple_of(STEP) * self.pitch
     }
 
     /// Where each row of the packed tile begins, the last one repeated.
@@ -232,7 +235,7 @@ impl Kernel for Wide<'_, '_> {
         let (work, layout) = (self.work, self.work.layout);
         let [depth, height, width] = work.inside(self.start);
         let offsets = work.offsets();
-        let pitch = pitch(work.outputs.len());
+        let pitch = work.pitch;
         let rows = (CHUNK / width).clamp(1, height);
         let turned = self.turned.room(rows * width * pitch);
         for d in 0..depth {
@@ -262,7 +265,7 @@ pub(super) fn turn<S: Simd>(
     [rows, width]: [usize; 2],
     out: &mut [f32],
 ) {
-    let pitch = pitch(work.outputs.len());
+    let pitch = work.pitch;
     let row_pitch = work.plan.dst_size[2];
     // Whole rows lie one behind the other.
     let (runs, run) = if row_pitch == width { (1, rows * width) } else { (rows, width) };
@@ -405,7 +408,7 @@ impl Kernel for Narrow<'_, '_> {
         let (work, layout) = (self.work, self.work.layout);
         let [depth, height, width] = work.inside(self.start);
         let offsets = work.offsets();
-        let pitch = pitch(work.outputs.len());
+        let pitch = work.pitch;
         let length = layout.flat().next_multiple_of(LANES);
         let row_pitch = work.plan.dst_size[2];
         let packed = self.turned.room(pitch * length);

@@ -100,7 +100,7 @@ impl Kernel for Products<'_, '_> {
             let pitch = outputs.len().next_multiple_of(LANES);
             let (own, rest) = products.split_at_mut(POINTS * rows * pitch);
             products = rest;
-            let part = Work { outputs, ..*work };
+            let part = Work { outputs, pitch, ..*work };
             let gradients = gradients.room(POINTS * count * pitch);
             let turned = turned.room(TILE * across * TILE * pitch);
             for row in 0..down {
