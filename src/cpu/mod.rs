@@ -37,6 +37,7 @@ pub mod resize;
 pub mod sh;
 mod sh_bwd;
 pub mod simd;
+pub mod small;
 mod sort;
 pub mod spgr;
 mod tiles;

@@ -2,7 +2,8 @@
 //! names and with its initialisation. All have gradients.
 
 use crate::model::mlp::xavier;
-use crate::ops::activation::{Activation, activation};
+pub use crate::ops::activation::Activation;
+use crate::ops::activation::activation;
 use crate::ops::conv2d::conv2d;
 use crate::ops::norm;
 use candle_core::{Result, Tensor, bail};
@@ -207,6 +208,14 @@ impl GroupNorm {
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         norm::group_norm(x, self.groups, &self.weight, &self.bias)
     }
+
+    /// [`GroupNorm::forward`], then `activation`, in one pass.
+    ///
+    /// # Errors
+    /// As [`GroupNorm::forward`].
+    pub fn forward_then(&self, x: &Tensor, activation: Activation) -> Result<Tensor> {
+        norm::group_norm_then(x, self.groups, (&self.weight, &self.bias), Some(activation))
+    }
 }
 
 /// Each channel of each picture to zero mean and unit variance over its pixels, no
@@ -216,6 +225,14 @@ impl GroupNorm {
 /// Another rank.
 pub fn instance_norm(x: &Tensor) -> Result<Tensor> {
     norm::instance_norm(x)
+}
+
+/// max(0, [`instance_norm`]) in one pass.
+///
+/// # Errors
+/// As [`instance_norm`].
+pub fn instance_norm_relu(x: &Tensor) -> Result<Tensor> {
+    norm::instance_norm_then(x, Some(Activation::Relu))
 }
 
 /// Normalises the last dimension, then scales and shifts: `weight`, `bias` `[C]`.

@@ -14,6 +14,7 @@ pub mod plane_sweep;
 mod rasterize;
 pub mod redistribute;
 pub mod resize;
+pub mod small;
 pub mod spgr;
 
 pub use rasterize::{over_background, rasterize, rasterize_splats};

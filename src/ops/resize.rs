@@ -2,7 +2,7 @@
 //! gradients: candle's bilinear has none, and its nearest overwrites instead of
 //! adding. Kernels: [`crate::cpu::resize`]. Tests: `model::layers`.
 
-use super::{elements, output, slice};
+use super::{borrowed, output, slice};
 use crate::cpu::resize::{self as cpu, Resize};
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
 
@@ -56,12 +56,12 @@ impl CustomOp1 for Op {
     }
 
     fn bwd(&self, x: &Tensor, _y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
-        let dy = elements::<f32>(dy)?;
+        let dy = dy.contiguous()?;
         let mut dx = vec![0.0; x.elem_count()];
-        match self.nearest {
-            Some(s) => cpu::nearest_transposed(&self.sizes, s, &dy, &mut dx),
-            None => cpu::bilinear_transposed(&self.sizes, &dy, &mut dx),
-        }
+        borrowed("resize", [&dy], |[dy]: [&[f32]; 1]| match self.nearest {
+            Some(s) => cpu::nearest_transposed(&self.sizes, s, dy, &mut dx),
+            None => cpu::bilinear_transposed(&self.sizes, dy, &mut dx),
+        })?;
         super::tensor_like(dx, x).map(Some)
     }
 }

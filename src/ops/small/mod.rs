@@ -1,0 +1,15 @@
+//! The small backbone's own parts as candle ops with gradients. Kernels:
+//! [`crate::cpu::small`]. Tests: `tests.rs` here, against tensor operations and finite
+//! differences.
+
+mod convex;
+mod expectation;
+mod heads;
+mod join;
+#[cfg(test)]
+mod tests;
+
+pub use convex::upsample_convex;
+pub use expectation::{expectation, lift};
+pub use heads::{Start, head_input, head_output, ray_distance};
+pub use join::join;
