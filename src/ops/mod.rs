@@ -5,7 +5,9 @@
 pub mod activation;
 pub mod attention;
 pub mod attention_gather;
+mod conv;
 pub mod conv2d;
+pub mod conv3d;
 pub mod direct;
 pub mod linear;
 pub mod matching;
@@ -14,6 +16,8 @@ pub mod plane_sweep;
 mod rasterize;
 pub mod redistribute;
 pub mod resize;
+#[cfg(test)]
+mod same;
 pub mod small;
 pub mod spgr;
 

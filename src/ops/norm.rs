@@ -150,3 +150,57 @@ impl CustomOp3 for Normalise {
         Ok((Some(tensor_like(dx, x)?), Some(tensor_like(dw, w)?), Some(tensor_like(db, b)?)))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ops::same::{noise, same};
+
+    fn erf_gelu(x: &Tensor) -> Result<Tensor> {
+        ((x / 2f64.sqrt())?.erf()? + 1.0)? * (x * 0.5)?
+    }
+
+    /// `[R, n]` to zero mean and unit variance.
+    fn unit(x: &Tensor) -> Result<Tensor> {
+        let centred = x.broadcast_sub(&x.mean_keepdim(1)?)?;
+        centred.broadcast_div(&(centred.sqr()?.mean_keepdim(1)? + 1e-5)?.sqrt()?)
+    }
+
+    fn plain(x: &[Tensor], groups: usize) -> Result<Tensor> {
+        let (b, c) = (x[0].dim(0)?, x[1].elem_count());
+        let y = unit(&x[0].reshape((b * groups, ()))?)?.reshape(x[0].shape())?;
+        let y = y.broadcast_mul(&x[1].reshape((1, c, 1, 1))?)?;
+        y.broadcast_add(&x[2].reshape((1, c, 1, 1))?)
+    }
+
+    #[test]
+    fn norm_and_activation_agree_with_their_definitions() -> Result<()> {
+        let inputs = [noise(&[3, 6, 7, 11], 1)?, noise(&[6], 2)?, noise(&[6], 3)?];
+        for (kind, f) in [
+            (None, (|x: &Tensor| Ok(x.clone())) as fn(&Tensor) -> Result<Tensor>),
+            (Some(Activation::Gelu), erf_gelu),
+            (Some(Activation::Silu), |x: &Tensor| x / (x.neg()?.exp()? + 1.0)?),
+        ] {
+            same(
+                &inputs,
+                |x| Ok(vec![group_norm_then(&x[0], 3, (&x[1], &x[2]), kind)?]),
+                |x| Ok(vec![f(&plain(x, 3)?)?]),
+            )?;
+        }
+        same(
+            &inputs[..1],
+            |x| Ok(vec![instance_norm_then(&x[0], Some(Activation::Silu))?]),
+            |x| {
+                let y = unit(&x[0].reshape((18, ()))?)?.reshape(x[0].shape())?;
+                Ok(vec![(&y / (y.neg()?.exp()? + 1.0)?)?])
+            },
+        )?;
+        // More rows than one task takes.
+        let inputs = [noise(&[5000, 9], 4)?, noise(&[9], 5)?, noise(&[9], 6)?];
+        same(
+            &inputs,
+            |x| Ok(vec![layer_norm(&x[0], &x[1], &x[2])?]),
+            |x| Ok(vec![unit(&x[0])?.broadcast_mul(&x[1])?.broadcast_add(&x[2])?]),
+        )
+    }
+}

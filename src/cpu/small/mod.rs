@@ -6,3 +6,4 @@ pub mod convex;
 pub mod expectation;
 pub mod heads;
 pub mod join;
+pub mod unit;

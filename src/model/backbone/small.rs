@@ -23,9 +23,11 @@ use crate::model::layers::{
 use crate::model::{BackboneOutput, Views};
 use crate::ops::matching::raw_matching;
 use crate::ops::plane_sweep::{Pair, Sweep, pair, plane_sweep, relative_pose};
-use crate::ops::small::{Start, expectation, head_input, head_output, join, lift, ray_distance};
+use crate::ops::small::{
+    Start, expectation, head_input, head_output, join, lift, ray_distance, unit_channels,
+};
 use crate::sh::C0;
-use candle_core::{D, Result, Tensor, bail};
+use candle_core::{Result, Tensor, bail};
 use candle_nn::{Init, VarBuilder};
 
 /// Kernel 5×5, stride 2, half the size.
@@ -203,10 +205,8 @@ impl SmallBackbone {
 
     /// Volume of matching scores, through the stem.
     fn sweep(&self, views: &Views, feat4: &Tensor) -> Result<Swept> {
-        let unit = self.matching.forward(feat4)?;
-        let norm = (unit.sqr()?.transpose(1, 3)?.contiguous()?.sum_keepdim(D::Minus1)? + 1e-8)?;
-        let unit = unit.broadcast_div(&norm.sqrt()?.transpose(1, 3)?.contiguous()?)?;
-        let (_, channels, h, w) = unit.dims4()?;
+        let unit = unit_channels(&self.matching.forward(feat4)?)?;
+        let (rows, channels, h, w) = unit.dims4()?;
         let d = self.config.depth_candidates;
         let disparities = candidates(views, d);
         let sweep = Sweep {
@@ -222,15 +222,16 @@ impl SmallBackbone {
             channels,
             size: [h, w],
         };
-        // [B·V, 1, D, h, w]
-        let learned = plane_sweep(&unit, &unit, sweep)?.unsqueeze(1)?;
+        // [B·V, 1, D·h, w]
+        let learned = plane_sweep(&unit, &unit, sweep)?.reshape((rows, 1, d * h, w))?;
         let volume = match self.config.raw_matching {
             true => {
                 let raw = raw_matching(&views.images, &views.cameras, &disparities)?;
-                Tensor::cat(&[&learned, &raw], 1)?
+                join(&learned, &raw.flatten(2, 3)?, 1)?
             }
             false => learned,
         };
+        let volume = volume.reshape((rows, (), d, h, w))?;
         match &self.stem {
             Some(stem) => {
                 let scores = stem.forward(&volume)?;

@@ -1,46 +1,6 @@
 use super::*;
+use crate::ops::same::{far, noise, same};
 use candle_core::{D, Device, Result, Tensor, Var};
-
-fn noise(shape: &[usize], seed: usize) -> Result<Tensor> {
-    let n: usize = shape.iter().product();
-    let at = |i: usize| (((i + 131 * seed) as f32 * 12.9898).sin() * 43758.547).fract();
-    Tensor::from_vec((0..n).map(|i| 2.0 * at(i)).collect::<Vec<f32>>(), shape, &Device::Cpu)
-}
-
-fn far(a: &Tensor, b: &Tensor) -> Result<f32> {
-    assert_eq!(a.dims(), b.dims());
-    (a - b)?.abs()?.flatten_all()?.max(0)?.to_scalar()
-}
-
-/// Values and gradients of `ours` beside those of `plain`, which is made of tensor
-/// operations, for the loss Σ out·r over all outputs.
-fn same(
-    inputs: &[Tensor],
-    ours: impl Fn(&[Tensor]) -> Result<Vec<Tensor>>,
-    plain: impl Fn(&[Tensor]) -> Result<Vec<Tensor>>,
-) -> Result<()> {
-    let vars = inputs.iter().map(Var::from_tensor).collect::<Result<Vec<_>>>()?;
-    let tensors: Vec<Tensor> = vars.iter().map(|v| v.as_tensor().clone()).collect();
-    let (got, want) = (ours(&tensors)?, plain(&tensors)?);
-    assert_eq!(got.len(), want.len());
-    let (mut got_loss, mut want_loss) =
-        (Tensor::new(0f32, &Device::Cpu)?, Tensor::new(0f32, &Device::Cpu)?);
-    for (i, (g, w)) in got.iter().zip(&want).enumerate() {
-        let size = w.abs()?.flatten_all()?.max(0)?.to_scalar::<f32>()?;
-        assert!(far(g, w)? < 1e-5 * (1.0 + size), "output {i}: {}", far(g, w)?);
-        let r = noise(w.dims(), 77 + i)?;
-        got_loss = (got_loss + (g * &r)?.sum_all()?)?;
-        want_loss = (want_loss + (w * &r)?.sum_all()?)?;
-    }
-    let (got, want) = (got_loss.backward()?, want_loss.backward()?);
-    for (i, var) in vars.iter().enumerate() {
-        let (Some(g), Some(w)) = (got.get(var), want.get(var)) else { panic!("no gradient {i}") };
-        let size = w.abs()?.flatten_all()?.max(0)?.to_scalar::<f32>()?;
-        assert!(size > 0.0, "gradient {i} is nothing");
-        assert!(far(g, w)? < 3e-5 * (1.0 + size), "gradient {i}: {}", far(g, w)?);
-    }
-    Ok(())
-}
 
 fn nearest(x: &Tensor, s: usize) -> Result<Tensor> {
     let (b, c, h, w) = x.dims4()?;
@@ -210,5 +170,14 @@ fn distances_agree_with_the_definition() -> Result<()> {
         &[((noise(&[2, 1, 3, 7], 17)? + 3.0)? * 5.0)?],
         |x| Ok(vec![ray_distance(&x[0], ranges.clone(), lengths.clone())?]),
         |x| Ok(vec![plain(&x[0])?]),
+    )
+}
+
+#[test]
+fn unit_channels_agree_with_the_definition() -> Result<()> {
+    same(
+        &[noise(&[2, 5, 17, 19], 18)?],
+        |x| Ok(vec![unit_channels(&x[0])?]),
+        |x| Ok(vec![x[0].broadcast_div(&(x[0].sqr()?.sum_keepdim(1)? + 1e-8)?.sqrt()?)?]),
     )
 }
