@@ -114,6 +114,50 @@ pub fn backward(kind: Activation, x: &[f32], dy: &[f32], dx: &mut [f32]) {
     });
 }
 
+/// y = f(y), on the caller's thread.
+pub(super) fn in_place(kind: Activation, y: &mut [f32]) {
+    vectorised(
+        #[inline(always)]
+        || {
+            macro_rules! run {
+                ($value:expr, $slope:expr) => {
+                    map_in_place(y, $value)
+                };
+            }
+            by_kind!(kind, run)
+        },
+    );
+}
+
+/// x = dy·f′(x), on the caller's thread.
+pub(super) fn slopes_in_place(kind: Activation, x: &mut [f32], dy: &[f32]) {
+    vectorised(
+        #[inline(always)]
+        || {
+            macro_rules! run {
+                ($value:expr, $slope:expr) => {
+                    scale_in_place(x, dy, $slope)
+                };
+            }
+            by_kind!(kind, run)
+        },
+    );
+}
+
+#[inline(always)]
+fn map_in_place(y: &mut [f32], f: impl Fn(f32) -> f32) {
+    for y in y {
+        *y = f(*y);
+    }
+}
+
+#[inline(always)]
+fn scale_in_place(x: &mut [f32], dy: &[f32], f: impl Fn(f32) -> f32) {
+    for (x, dy) in x.iter_mut().zip(dy) {
+        *x = dy * f(*x);
+    }
+}
+
 #[inline(always)]
 fn scale(x: &[f32], dy: &[f32], dx: &mut [f32], f: impl Fn(f32) -> f32) {
     for ((dx, dy), x) in dx.iter_mut().zip(dy).zip(x) {

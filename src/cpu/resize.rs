@@ -1,6 +1,7 @@
 //! Bilinear resize with corner pixels on corner pixels (`align_corners = true`) and
 //! nearest upsampling by a whole factor, with their transposes (the gradients).
 
+use super::activation::{self, Activation};
 use super::math::vectorised;
 use rayon::prelude::*;
 
@@ -88,6 +89,32 @@ impl Bilinear {
             }
         }
     }
+}
+
+/// f of [`bilinear`] in one pass.
+pub fn bilinear_then(r: &Resize, kind: Activation, x: &[f32], y: &mut [f32]) {
+    let one = Bilinear::new(r);
+    let planes = x.par_chunks_exact(r.from[0] * r.from[1]);
+    let planes = planes.zip(y.par_chunks_exact_mut(r.to[0] * r.to[1]));
+    planes.for_each_init(Vec::new, |wide, (x, y)| {
+        one.plane(x, y, wide);
+        activation::in_place(kind, y);
+    });
+}
+
+/// The gradient of [`bilinear_then`], `dx` overwritten.
+pub fn bilinear_then_backward(r: &Resize, kind: Activation, x: &[f32], dy: &[f32], dx: &mut [f32]) {
+    let (one, n) = (Bilinear::new(r), r.to[0] * r.to[1]);
+    let planes = x.par_chunks_exact(r.from[0] * r.from[1]).zip(dy.par_chunks_exact(n));
+    let planes = planes.zip(dx.par_chunks_exact_mut(r.from[0] * r.from[1]));
+    planes.for_each_init(
+        || (Vec::new(), vec![0f32; n]),
+        |(wide, y), ((x, dy), dx)| {
+            one.plane(x, y, wide);
+            activation::slopes_in_place(kind, y, dy);
+            one.transposed(y, dx, wide);
+        },
+    );
 }
 
 /// `[planes, h, w]` to `[planes, H, W]`.

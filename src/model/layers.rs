@@ -296,7 +296,7 @@ pub fn sigmoid(x: &Tensor) -> Result<Tensor> {
 }
 
 pub use crate::ops::activation::softmax;
-pub use crate::ops::resize::{resize_bilinear, upsample_nearest};
+pub use crate::ops::resize::{resize_bilinear, resize_bilinear_then, upsample_nearest};
 
 #[cfg(test)]
 mod tests {
@@ -382,6 +382,9 @@ mod tests {
         }
         assert_eq!(resize_bilinear(&x, 2, 3)?.flatten_all()?.to_vec1::<f32>()?, values(&x)?);
         assert_eq!(resize_bilinear(&x, 1, 1)?.flatten_all()?.to_vec1::<f32>()?, [0.0, 6.0]);
+        let (got, want) =
+            (resize_bilinear_then(&x, 5, 9, Activation::Gelu)?, gelu(&resize_bilinear(&x, 5, 9)?)?);
+        assert_eq!(values(&got)?, values(&want)?);
         let y = upsample_nearest(&x, 3)?;
         for (i, v) in values(&y)?.into_iter().enumerate() {
             let (c, row, col) = (i / 54, i / 9 % 6, i % 9);
@@ -422,6 +425,7 @@ mod tests {
         check_grad(x.clone(), sigmoid)?;
         check_grad(x.clone(), softmax)?;
         check_grad(x.clone(), |x| resize_bilinear(x, 9, 11))?;
+        check_grad(x.clone(), |x| resize_bilinear_then(x, 9, 11, Activation::Gelu))?;
         check_grad(x.clone(), |x| upsample_nearest(x, 2))?;
         let linear = Linear::new(6, 7, vb.pp("linear"))?;
         check_grad(x.clone(), |x| linear.forward(x))?;

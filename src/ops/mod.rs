@@ -9,6 +9,7 @@ mod conv;
 pub mod conv2d;
 pub mod conv3d;
 pub mod direct;
+pub mod join;
 pub mod linear;
 pub mod matching;
 pub mod norm;

@@ -5,5 +5,4 @@
 pub mod convex;
 pub mod expectation;
 pub mod heads;
-pub mod join;
 pub mod unit;

@@ -21,10 +21,11 @@ use crate::model::layers::{
     Activation, Conv2d, ConvShape, GroupNorm, gelu, resize_bilinear, sigmoid,
 };
 use crate::model::{BackboneOutput, Views};
+use crate::ops::join::join;
 use crate::ops::matching::raw_matching;
 use crate::ops::plane_sweep::{Pair, Sweep, pair, plane_sweep, relative_pose};
 use crate::ops::small::{
-    Start, expectation, head_input, head_output, join, lift, ray_distance, unit_channels,
+    Start, expectation, head_input, head_output, lift, ray_distance, unit_channels,
 };
 use crate::sh::C0;
 use candle_core::{Result, Tensor, bail};

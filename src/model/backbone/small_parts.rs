@@ -3,7 +3,8 @@
 use crate::model::layers::{Activation, Conv2d, ConvShape, GroupNorm, default_init, gelu};
 use crate::ops::conv2d::conv2d;
 use crate::ops::conv3d::conv3d;
-use crate::ops::small::{join, upsample_convex};
+use crate::ops::join::join;
+use crate::ops::small::upsample_convex;
 use candle_core::{Result, Tensor};
 use candle_nn::{Init, VarBuilder};
 

@@ -8,6 +8,7 @@ use crate::model::layers::{
 use crate::model::trace::Trace;
 use crate::ops::attention::attention;
 use crate::ops::conv2d::conv2d;
+use crate::ops::join::join;
 use candle_core::{Result, Tensor};
 use candle_nn::VarBuilder;
 
@@ -114,7 +115,7 @@ impl UNet {
         }
         for (i, up) in self.up.iter().enumerate() {
             let joined = match skips.pop() {
-                Some(skip) => Tensor::cat(&[&x, &skip], 1)?,
+                Some(skip) => join(&x, &skip, 1)?,
                 None => x,
             };
             x = up.block.forward(&joined)?;

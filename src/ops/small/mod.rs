@@ -5,7 +5,6 @@
 mod convex;
 mod expectation;
 mod heads;
-mod join;
 #[cfg(test)]
 mod tests;
 mod unit;
@@ -13,5 +12,4 @@ mod unit;
 pub use convex::upsample_convex;
 pub use expectation::{expectation, lift};
 pub use heads::{Start, head_input, head_output, ray_distance};
-pub use join::join;
 pub use unit::unit_channels;

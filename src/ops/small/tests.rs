@@ -1,4 +1,5 @@
 use super::*;
+use crate::ops::join::join;
 use crate::ops::same::{far, noise, same};
 use candle_core::{D, Device, Result, Tensor, Var};
 

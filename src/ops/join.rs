@@ -1,5 +1,9 @@
-use crate::cpu::small::join::{self as cpu, Join};
-use crate::ops::{borrowed, output, slice, tensor_like};
+//! Two maps' channels beside one another as a candle op with gradients; candle's `cat`
+//! copies on one thread, and its backward adds into strided views. Kernel:
+//! [`crate::cpu::join`]. Tests: `small/tests.rs`.
+
+use super::{borrowed, output, slice, tensor_like};
+use crate::cpu::join::{self as cpu, Join};
 use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
 
 const NAME: &str = "join";
