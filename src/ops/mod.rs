@@ -17,8 +17,6 @@ pub mod plane_sweep;
 mod rasterize;
 pub mod redistribute;
 pub mod resize;
-#[cfg(test)]
-mod same;
 pub mod small;
 pub mod spgr;
 
@@ -92,3 +90,6 @@ macro_rules! by_dtype {
     };
 }
 pub(crate) use by_dtype;
+
+#[cfg(test)]
+mod same;

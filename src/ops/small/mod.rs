@@ -5,11 +5,12 @@
 mod convex;
 mod expectation;
 mod heads;
-#[cfg(test)]
-mod tests;
 mod unit;
 
 pub use convex::upsample_convex;
 pub use expectation::{expectation, lift};
 pub use heads::{Start, head_input, head_output, ray_distance};
 pub use unit::unit_channels;
+
+#[cfg(test)]
+mod tests;
