@@ -5,7 +5,7 @@
 //! arithmetic beside a loop of multiply-adds, both measured in the same run.
 //!
 //! `cargo bench --bench raster -- [NAME …] [--quick] [--seconds S] [--threads N]
-//! [--json FILE] [--write DIR]`; a group runs where its name contains every NAME.
+//! [--json FILE] [--write DIR] [--onnxruntime]`; a group runs where its name contains every NAME.
 
 #[allow(dead_code, reason = "each bench uses a part")]
 pub mod conventional;
@@ -37,6 +37,9 @@ pub struct Args {
     /// Folder to write scenes to, instead of timing.
     #[allow(dead_code, reason = "only scenes are written")]
     pub write: Option<PathBuf>,
+    /// Run onnxruntime beside ours.
+    #[allow(dead_code, reason = "only the network has such a rival")]
+    pub onnxruntime: bool,
 }
 
 impl Args {
@@ -49,6 +52,7 @@ impl Args {
                 // What `cargo bench` itself adds.
                 "--bench" => {}
                 "--quick" => out.quick = true,
+                "--onnxruntime" => out.onnxruntime = true,
                 "--seconds" => out.seconds = Some(value()?.parse().context("--seconds")?),
                 "--threads" => out.threads = Some(value()?.parse().context("--threads")?),
                 "--json" => out.json = Some(value()?.into()),
@@ -65,6 +69,7 @@ impl Args {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Threads {
     /// One.
+    #[allow(dead_code, reason = "each bench uses a part")]
     One,
     /// All that the machine has, or `--threads`.
     All,
@@ -110,6 +115,7 @@ impl<'a> Contender<'a> {
     }
 
     /// With its least work.
+    #[allow(dead_code, reason = "each bench uses a part")]
     pub fn with_work(mut self, work: Work) -> Self {
         self.work = Some(work);
         self
@@ -162,6 +168,12 @@ impl Bench {
         let pool = |n: usize| ThreadPoolBuilder::new().num_threads(n).build();
         let (one, all) = (pool(1)?, pool(args.threads.unwrap_or(cores))?);
         Ok(Self { args, name, one, all, machine: None, groups: Vec::new() })
+    }
+
+    /// Threads of [`Threads::All`].
+    #[allow(dead_code, reason = "each bench uses a part")]
+    pub fn threads(&self) -> usize {
+        self.all.current_num_threads()
     }
 
     /// Whether the command line asks for a group of this name.

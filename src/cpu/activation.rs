@@ -20,26 +20,70 @@ pub enum Activation {
 }
 
 #[inline(always)]
-fn sigmoid(x: f32) -> f32 {
+pub(super) fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + exp(-x))
 }
 
 #[inline(always)]
-fn normal_cdf(x: f32) -> f32 {
+pub(super) fn normal_cdf(x: f32) -> f32 {
     0.5 * (1.0 + erf(x * std::f32::consts::FRAC_1_SQRT_2))
 }
+
+/// Calls `$run!(value, slope)` with f and f′ of `$kind` as closures, so that the loop in
+/// `$run` is compiled for each function.
+macro_rules! by_kind {
+    ($kind:expr, $run:ident) => {
+        match $kind {
+            // Written so that NaN stays NaN.
+            $crate::cpu::activation::Activation::Relu => $run!(
+                #[inline(always)]
+                |x: f32| if x < 0.0 { 0.0 } else { x },
+                #[inline(always)]
+                |x: f32| if x > 0.0 { 1.0 } else { 0.0 }
+            ),
+            $crate::cpu::activation::Activation::Silu => $run!(
+                #[inline(always)]
+                |x: f32| x * $crate::cpu::activation::sigmoid(x),
+                #[inline(always)]
+                |x: f32| {
+                    let s = $crate::cpu::activation::sigmoid(x);
+                    s * (1.0 + x * (1.0 - s))
+                }
+            ),
+            $crate::cpu::activation::Activation::Gelu => $run!(
+                #[inline(always)]
+                |x: f32| x * $crate::cpu::activation::normal_cdf(x),
+                // Φ(x) + x·φ(x), φ the normal density.
+                #[inline(always)]
+                |x: f32| $crate::cpu::activation::normal_cdf(x)
+                    + x * 0.398_942_3 * $crate::cpu::math::exp(-0.5 * x * x)
+            ),
+            $crate::cpu::activation::Activation::Sigmoid => $run!(
+                #[inline(always)]
+                |x: f32| $crate::cpu::activation::sigmoid(x),
+                #[inline(always)]
+                |x: f32| {
+                    let s = $crate::cpu::activation::sigmoid(x);
+                    s * (1.0 - s)
+                }
+            ),
+        }
+    };
+}
+pub(super) use by_kind;
 
 /// y = f(x).
 pub fn forward(kind: Activation, x: &[f32], y: &mut [f32]) {
     x.par_chunks(CHUNK).zip(y.par_chunks_mut(CHUNK)).for_each(|(x, y)| {
         vectorised(
             #[inline(always)]
-            || match kind {
-                // Written so that NaN stays NaN.
-                Activation::Relu => map(x, y, |x| if x < 0.0 { 0.0 } else { x }),
-                Activation::Silu => map(x, y, |x| x * sigmoid(x)),
-                Activation::Gelu => map(x, y, |x| x * normal_cdf(x)),
-                Activation::Sigmoid => map(x, y, sigmoid),
+            || {
+                macro_rules! run {
+                    ($value:expr, $slope:expr) => {
+                        map(x, y, $value)
+                    };
+                }
+                by_kind!(kind, run)
             },
         );
     });
@@ -58,23 +102,60 @@ pub fn backward(kind: Activation, x: &[f32], dy: &[f32], dx: &mut [f32]) {
     chunks.zip(dx.par_chunks_mut(CHUNK)).for_each(|((x, dy), dx)| {
         vectorised(
             #[inline(always)]
-            || match kind {
-                Activation::Relu => scale(x, dy, dx, |x| if x > 0.0 { 1.0 } else { 0.0 }),
-                Activation::Silu => scale(x, dy, dx, |x| {
-                    let s = sigmoid(x);
-                    s * (1.0 + x * (1.0 - s))
-                }),
-                Activation::Gelu => scale(x, dy, dx, |x| {
-                    // Φ(x) + x·φ(x), φ the normal density.
-                    normal_cdf(x) + x * 0.398_942_3 * exp(-0.5 * x * x)
-                }),
-                Activation::Sigmoid => scale(x, dy, dx, |x| {
-                    let s = sigmoid(x);
-                    s * (1.0 - s)
-                }),
+            || {
+                macro_rules! run {
+                    ($value:expr, $slope:expr) => {
+                        scale(x, dy, dx, $slope)
+                    };
+                }
+                by_kind!(kind, run)
             },
         );
     });
+}
+
+/// y = f(y), on the caller's thread.
+pub(super) fn in_place(kind: Activation, y: &mut [f32]) {
+    vectorised(
+        #[inline(always)]
+        || {
+            macro_rules! run {
+                ($value:expr, $slope:expr) => {
+                    map_in_place(y, $value)
+                };
+            }
+            by_kind!(kind, run)
+        },
+    );
+}
+
+/// x = dy·f′(x), on the caller's thread.
+pub(super) fn slopes_in_place(kind: Activation, x: &mut [f32], dy: &[f32]) {
+    vectorised(
+        #[inline(always)]
+        || {
+            macro_rules! run {
+                ($value:expr, $slope:expr) => {
+                    scale_in_place(x, dy, $slope)
+                };
+            }
+            by_kind!(kind, run)
+        },
+    );
+}
+
+#[inline(always)]
+fn map_in_place(y: &mut [f32], f: impl Fn(f32) -> f32) {
+    for y in y {
+        *y = f(*y);
+    }
+}
+
+#[inline(always)]
+fn scale_in_place(x: &mut [f32], dy: &[f32], f: impl Fn(f32) -> f32) {
+    for (x, dy) in x.iter_mut().zip(dy) {
+        *x = dy * f(*x);
+    }
 }
 
 #[inline(always)]
@@ -121,11 +202,20 @@ pub fn softmax(n: usize, x: &[f32], y: &mut [f32]) {
 
 /// dx = y·(dy − Σ y·dy) row by row, y the softmax.
 pub fn softmax_backward(n: usize, y: &[f32], dy: &[f32], dx: &mut [f32]) {
-    let rows = y.par_chunks(n.max(1)).zip(dy.par_chunks(n.max(1)));
-    rows.zip(dx.par_chunks_mut(n.max(1))).for_each(|((y, dy), dx)| {
-        let mean = super::math::dot(y, dy);
-        for ((dx, y), dy) in dx.iter_mut().zip(y).zip(dy) {
-            *dx = y * (dy - mean);
-        }
+    let chunk = CHUNK.div_ceil(n.max(1)) * n.max(1);
+    let rows = y.par_chunks(chunk).zip(dy.par_chunks(chunk));
+    rows.zip(dx.par_chunks_mut(chunk)).for_each(|((y, dy), dx)| {
+        vectorised(
+            #[inline(always)]
+            || {
+                let pairs = y.chunks_exact(n).zip(dy.chunks_exact(n));
+                for ((y, dy), dx) in pairs.zip(dx.chunks_exact_mut(n)) {
+                    let mean = super::math::dot(y, dy);
+                    for ((dx, y), dy) in dx.iter_mut().zip(y).zip(dy) {
+                        *dx = y * (dy - mean);
+                    }
+                }
+            },
+        );
     });
 }

@@ -9,6 +9,7 @@
 //! quarter-resolution pixels, share of valid samples. A candidate's source pixel
 //! that lies outside the picture or behind the camera is left out of every window.
 
+use super::math::vectorised;
 use crate::camera::{Camera, Intrinsics};
 use glam::{Mat3, Vec3};
 use rayon::prelude::*;
@@ -92,46 +93,85 @@ impl PlaneWarp {
             shift: k_s * relative.w_axis.truncate(),
         }
     }
+}
 
-    /// Source position (px, centres at +0.5) of the reference pixel (x, y) at
-    /// `disparity` = 1 / camera z, or `None` behind the source camera.
-    #[inline]
-    pub fn apply(&self, x: usize, y: usize, disparity: f32) -> Option<(f32, f32)> {
-        let p =
-            self.from_px * Vec3::new(x as f32 + 0.5, y as f32 + 0.5, 1.0) + self.shift * disparity;
-        (p.z > Z_MIN).then(|| (p.x / p.z, p.y / p.z))
+/// Lanes that loops over pixels are written for.
+const LANES: usize = 16;
+
+/// Bilinear samples of one line of reference pixels: where the four neighbours are and
+/// their shares. Within half a pixel of the border the border pixel itself is read.
+#[derive(Default)]
+struct Line {
+    /// Upper left neighbour, and the steps to the right and the lower one.
+    index: Vec<u32>,
+    right: Vec<u32>,
+    down: Vec<u32>,
+    /// Shares of the right and the lower neighbours.
+    fx: Vec<f32>,
+    fy: Vec<f32>,
+    /// 1 inside the source picture and before the camera, else 0.
+    valid: Vec<f32>,
+}
+
+impl Line {
+    /// Line `y` of a picture of `size` (height, width) at `disparity`.
+    fn place(&mut self, warp: &PlaneWarp, y: usize, disparity: f32, size: (usize, usize)) {
+        let (height, width) = size;
+        let room = width.next_multiple_of(LANES);
+        for of_pixel in [&mut self.index, &mut self.right, &mut self.down] {
+            of_pixel.resize(room, 0);
+        }
+        for of_pixel in [&mut self.fx, &mut self.fy, &mut self.valid] {
+            of_pixel.resize(room, 0.0);
+        }
+        let base = warp.from_px * Vec3::new(0.0, y as f32 + 0.5, 1.0) + warp.shift * disparity;
+        vectorised(
+            #[inline(always)]
+            || {
+                for x in (0..room).step_by(LANES) {
+                    self.sixteen(x, base, warp.from_px.x_axis, (height, width));
+                }
+            },
+        );
     }
-}
 
-/// Position split into the four neighbours' index, offsets and shares.
-#[derive(Clone, Copy)]
-struct Taps {
-    index: [usize; 4],
-    weight: [f32; 4],
-}
-
-/// Bilinear taps at (u, v) px; `None` outside the picture. Within half a pixel of
-/// the border the border pixel itself is read.
-#[inline]
-fn taps(u: f32, v: f32, width: usize, height: usize) -> Option<Taps> {
-    if !(u >= 0.0 && v >= 0.0 && u <= width as f32 && v <= height as f32) {
-        return None;
+    #[inline(always)]
+    fn sixteen(&mut self, x: usize, base: Vec3, step: Vec3, (height, width): (usize, usize)) {
+        let (w, h) = (width as f32, height as f32);
+        let part = x..x + LANES;
+        let ints = self.index[part.clone()].iter_mut().zip(&mut self.right[part.clone()]);
+        let ints = ints.zip(&mut self.down[part.clone()]);
+        let floats = self.fx[part.clone()].iter_mut().zip(&mut self.fy[part.clone()]);
+        let all = ints.zip(floats).zip(&mut self.valid[part]);
+        for (l, ((((index, right), down), (fx, fy)), valid)) in all.enumerate() {
+            let at = (x + l) as f32 + 0.5;
+            let z = base.z + step.z * at;
+            let (u, v) = ((base.x + step.x * at) / z, (base.y + step.y * at) / z);
+            let inside = (z > Z_MIN) & (u >= 0.0) & (v >= 0.0) & (u <= w) & (v <= h);
+            let (u, v) = if inside { (u - 0.5, v - 0.5) } else { (0.0, 0.0) };
+            let (u, v) = (u.max(0.0).min(w - 1.0), v.max(0.0).min(h - 1.0));
+            let (left, top) = (u as i32, v as i32);
+            *fx = u - left as f32;
+            *fy = v - top as f32;
+            *index = (top * width as i32 + left) as u32;
+            *right = u32::from(left + 1 < width as i32);
+            *down = if top + 1 < height as i32 { width as u32 } else { 0 };
+            *valid = if inside { 1.0 } else { 0.0 };
+        }
     }
-    let x = (u - 0.5).clamp(0.0, (width - 1) as f32);
-    let y = (v - 0.5).clamp(0.0, (height - 1) as f32);
-    let (x0, y0) = (x as usize, y as usize);
-    let (x1, y1) = ((x0 + 1).min(width - 1), (y0 + 1).min(height - 1));
-    let (fx, fy) = (x - x0 as f32, y - y0 as f32);
-    Some(Taps {
-        index: [y0 * width + x0, y0 * width + x1, y1 * width + x0, y1 * width + x1],
-        weight: [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy],
-    })
-}
 
-impl Taps {
-    #[inline]
-    fn read(&self, plane: &[f32]) -> f32 {
-        (0..4).map(|i| self.weight[i] * plane[self.index[i]]).sum()
+    /// Samples of `plane`; 0 where none is valid.
+    fn read(&self, plane: &[f32], out: &mut [f32]) {
+        let ints = self.index.iter().zip(&self.right).zip(&self.down);
+        let floats = self.fx.iter().zip(&self.fy).zip(&self.valid);
+        for ((out, ((index, right), down)), ((fx, fy), valid)) in
+            out.iter_mut().zip(ints).zip(floats)
+        {
+            let (i, r, d) = (*index as usize, *right as usize, *down as usize);
+            let top = (1.0 - fx) * plane[i] + fx * plane[i + r];
+            let bottom = (1.0 - fx) * plane[i + d] + fx * plane[i + d + r];
+            *out = valid * ((1.0 - fy) * top + fy * bottom);
+        }
     }
 }
 
@@ -141,132 +181,247 @@ pub fn raw_matching(
     source: (&Pyramid, &Camera),
     disparities: &[f32],
 ) -> Vec<f32> {
+    let plane = reference.0.height * reference.0.width;
+    let mut out = vec![0.0; CHANNELS * disparities.len() * plane];
+    add_raw_matching(reference, source, disparities, 1.0, &mut out);
+    out
+}
+
+/// Adds `share` times [`raw_matching`] to `out`.
+pub fn add_raw_matching(
+    reference: (&Pyramid, &Camera),
+    source: (&Pyramid, &Camera),
+    disparities: &[f32],
+    share: f32,
+    out: &mut [f32],
+) {
     let (r, s) = (reference.0, source.0);
-    let (h, w, d) = (r.height, r.width, disparities.len());
-    let quarter = PlaneWarp::new(reference.1, source.1, w, h);
-    let half = PlaneWarp::new(reference.1, source.1, 2 * w, 2 * h);
-    let planes: Vec<[Vec<f32>; CHANNELS]> = disparities
-        .par_iter()
-        .map(|&disparity| {
-            let fine = Window { before: 2, after: 3, step: 2 };
-            let coarse = Window { before: 2, after: 2, step: 1 };
-            let (zncc_half, _) =
-                zncc(&r.half_grey, &s.half_grey, (2 * h, 2 * w), &half, disparity, fine);
-            let (zncc_quarter, valid) =
-                zncc(&r.quarter_grey, &s.quarter_grey, (h, w), &quarter, disparity, coarse);
-            [zncc_half, colour_difference(r, s, &quarter, disparity), zncc_quarter, valid]
-        })
-        .collect();
-    let mut out = vec![0.0; CHANNELS * d * h * w];
-    for (k, channels) in planes.iter().enumerate() {
-        for (c, plane) in channels.iter().enumerate() {
-            out[(c * d + k) * h * w..][..h * w].copy_from_slice(plane);
-        }
-    }
-    out
-}
-
-/// −mean |ΔRGB| per quarter-resolution pixel; invalid samples count as the
-/// difference of unrelated pixels, −0.25.
-fn colour_difference(r: &Pyramid, s: &Pyramid, warp: &PlaneWarp, disparity: f32) -> Vec<f32> {
     let (h, w) = (r.height, r.width);
-    let plane = h * w;
-    let mut out = vec![-0.25; plane];
-    for y in 0..h {
-        for x in 0..w {
-            let at = y * w + x;
-            let hit = warp.apply(x, y, disparity).and_then(|(u, v)| taps(u, v, w, h));
-            if let Some(t) = hit {
-                let sum: f32 = (0..3)
-                    .map(|c| {
-                        let channel = &s.quarter_rgb[c * plane..(c + 1) * plane];
-                        (t.read(channel) - r.quarter_rgb[c * plane + at]).abs()
-                    })
-                    .sum();
-                out[at] = -sum / 3.0;
-            }
-        }
+    let n = h * w;
+    if n * disparities.len() == 0 {
+        return;
     }
-    out
-}
-
-/// Window around output pixel j: inputs j·step − before ..= j·step + after.
-#[derive(Clone, Copy)]
-struct Window {
-    before: usize,
-    after: usize,
-    step: usize,
-}
-
-impl Window {
-    /// Box sums of `plane[height, width]` on the output grid.
-    fn sums(self, plane: &[f32], height: usize, width: usize) -> Vec<f32> {
-        let (h, w) = (height / self.step, width / self.step);
-        let range = |j: usize, n: usize| {
-            let centre = j * self.step;
-            centre.saturating_sub(self.before)..(centre + self.after + 1).min(n)
-        };
-        let mut rows = vec![0.0; height * w];
-        for y in 0..height {
-            let row = &plane[y * width..(y + 1) * width];
-            for (x, o) in rows[y * w..(y + 1) * w].iter_mut().enumerate() {
-                *o = row[range(x, width)].iter().sum();
-            }
-        }
-        let mut out = vec![0.0; h * w];
-        for y in 0..h {
-            for yy in range(y, height) {
-                let row = &rows[yy * w..(yy + 1) * w];
-                for (o, v) in out[y * w..(y + 1) * w].iter_mut().zip(row) {
-                    *o += v;
-                }
-            }
-        }
-        out
-    }
-}
-
-/// Zero-mean normalised cross-correlation in [−1, 1] and the share of valid samples
-/// in each window, both `[h, w]` of the output grid; 0 where less than half of the
-/// window is valid.
-fn zncc(
-    reference: &[f32],
-    source: &[f32],
-    (height, width): (usize, usize),
-    warp: &PlaneWarp,
-    disparity: f32,
-    window: Window,
-) -> (Vec<f32>, Vec<f32>) {
-    let n = height * width;
-    // Masked planes: 1, r, w, r², w², r·w.
-    let mut planes: [Vec<f32>; 6] = std::array::from_fn(|_| vec![0.0; n]);
-    for y in 0..height {
-        for x in 0..width {
-            let hit = warp.apply(x, y, disparity).and_then(|(u, v)| taps(u, v, width, height));
-            if let Some(t) = hit {
-                let at = y * width + x;
-                let (a, b) = (reference[at], t.read(source));
-                let values = [1.0, a, b, a * a, b * b, a * b];
-                for (plane, value) in planes.iter_mut().zip(values) {
-                    plane[at] = value;
-                }
-            }
-        }
-    }
-    let sums = planes.map(|p| window.sums(&p, height, width));
-    let full = ((window.before + window.after + 1) as f32).powi(2);
-    let score = |i: usize| {
-        let count = sums[0][i];
-        if count < 0.5 * full {
-            return 0.0;
-        }
-        let (a, b) = (sums[1][i] / count, sums[2][i] / count);
-        let var_a = (sums[3][i] / count - a * a).max(0.0) + VARIANCE_FLOOR;
-        let var_b = (sums[4][i] / count - b * b).max(0.0) + VARIANCE_FLOOR;
-        (sums[5][i] / count - a * b) / (var_a * var_b).sqrt()
+    let pair = Pair {
+        reference: r,
+        source: s,
+        half: PlaneWarp::new(reference.1, source.1, 2 * w, 2 * h),
+        quarter: PlaneWarp::new(reference.1, source.1, w, h),
     };
-    let outputs = sums[0].len();
-    ((0..outputs).map(score).collect(), sums[0].iter().map(|c| c / full).collect())
+    let (first, rest) = out.split_at_mut(n * disparities.len());
+    let (second, rest) = rest.split_at_mut(n * disparities.len());
+    let (third, fourth) = rest.split_at_mut(n * disparities.len());
+    let outs = first.par_chunks_exact_mut(n).zip(second.par_chunks_exact_mut(n));
+    let outs = outs.zip(third.par_chunks_exact_mut(n)).zip(fourth.par_chunks_exact_mut(n));
+    disparities.par_iter().zip(outs).for_each_init(Work::default, |work, (&disparity, outs)| {
+        let (((fine, colour), coarse), valid) = outs;
+        pair.half_resolution(disparity, work);
+        work.sums.score(share, fine, None);
+        pair.quarter_resolution(disparity, work, share, colour);
+        work.sums.score(share, coarse, Some(valid));
+    });
+}
+
+/// What one thread works in.
+#[derive(Default)]
+struct Work {
+    line: Line,
+    /// Samples of up to three channels along a line.
+    samples: [Vec<f32>; 3],
+    sums: Sums,
+}
+
+impl Work {
+    fn samples(&mut self, width: usize) {
+        for row in &mut self.samples {
+            row.resize(width, 0.0);
+        }
+    }
+}
+
+/// Two photographs.
+struct Pair<'a> {
+    reference: &'a Pyramid,
+    source: &'a Pyramid,
+    half: PlaneWarp,
+    quarter: PlaneWarp,
+}
+
+impl Pair<'_> {
+    /// Sums for windows of 6×6 half-resolution pixels, 2 before and 3 after the first of
+    /// each pair: three pairs.
+    fn half_resolution(&self, disparity: f32, work: &mut Work) {
+        let (h, w) = (self.reference.height, self.reference.width);
+        work.sums.begin([h, w], 1, 4.0);
+        work.samples(2 * w);
+        for y in 0..2 * h {
+            work.line.place(&self.half, y, disparity, (2 * h, 2 * w));
+            work.line.read(&self.source.half_grey, &mut work.samples[0]);
+            let own = &self.reference.half_grey[2 * y * w..2 * (y + 1) * w];
+            let (valid, samples, sums) = (&work.line.valid, &work.samples[0], &mut work.sums);
+            vectorised(
+                #[inline(always)]
+                || sums.add(y / 2, [valid, own, samples], 2),
+            );
+        }
+    }
+
+    /// Sums for windows of 5×5 quarter-resolution pixels; adds `share` times −mean |ΔRGB|
+    /// to `colour`, −0.25 (that of unrelated pixels) where there is no sample.
+    fn quarter_resolution(&self, disparity: f32, work: &mut Work, share: f32, colour: &mut [f32]) {
+        let (h, w) = (self.reference.height, self.reference.width);
+        let n = h * w;
+        work.sums.begin([h, w], 2, 1.0);
+        work.samples(w);
+        for y in 0..h {
+            work.line.place(&self.quarter, y, disparity, (h, w));
+            for (c, row) in work.samples.iter_mut().enumerate() {
+                work.line.read(&self.source.quarter_rgb[c * n..(c + 1) * n], row);
+            }
+            let own = |c: usize| &self.reference.quarter_rgb[c * n + y * w..][..w];
+            let rgb = [own(0), own(1), own(2)];
+            let grey = &self.reference.quarter_grey[y * w..(y + 1) * w];
+            let colour = &mut colour[y * w..(y + 1) * w];
+            let (valid, [red, green, blue], sums) =
+                (&work.line.valid, &mut work.samples, &mut work.sums);
+            vectorised(
+                #[inline(always)]
+                || {
+                    for x in 0..w {
+                        let samples = [red[x], green[x], blue[x]];
+                        let sum = (0..3).fold(0.0, |sum, c| sum + (samples[c] - rgb[c][x]).abs());
+                        colour[x] -= share * if valid[x] > 0.0 { sum / 3.0 } else { 0.25 };
+                        red[x] = (samples[0] + samples[1] + samples[2]) / 3.0;
+                    }
+                    sums.add(y, [valid, grey, red], 1);
+                },
+            );
+        }
+    }
+}
+
+/// Planes of [`Sums`]: Σ 1, r, s, r², s², r·s over valid samples s of reference r.
+const PLANES: usize = 6;
+
+/// Sums over blocks, then over windows of (2·radius + 1)² blocks.
+#[derive(Default)]
+struct Sums {
+    size: [usize; 2],
+    radius: usize,
+    /// Samples of a whole window.
+    full: f32,
+    /// `[6, h, w + 2·radius]`: of blocks, zeros at the sides.
+    blocks: Vec<f32>,
+    /// `[6, h, w]`: over the columns of the window.
+    columns: Vec<f32>,
+}
+
+impl Sums {
+    /// Zeros for a new picture of h × w blocks of `samples` each.
+    fn begin(&mut self, size: [usize; 2], radius: usize, samples: f32) {
+        let [h, w] = size;
+        let side = (2 * radius + 1) as f32;
+        (self.size, self.radius, self.full) = (size, radius, side * side * samples);
+        self.blocks.clear();
+        self.blocks.resize(PLANES * h * (w + 2 * radius), 0.0);
+        self.columns.clear();
+        self.columns.resize(PLANES * h * w, 0.0);
+    }
+
+    /// Adds a line (validity, reference, samples) to the blocks of row `y`; blocks are
+    /// `step` (1 or 2) pixels wide.
+    #[inline(always)]
+    fn add(&mut self, y: usize, [valid, own, samples]: [&[f32]; 3], step: usize) {
+        let [h, w] = self.size;
+        let wide = w + 2 * self.radius;
+        let row = |p: usize| p * h * wide + y * wide + self.radius;
+        let line = [valid, own, samples];
+        let to = |p: usize| row(p)..row(p) + w;
+        add_line(&mut self.blocks[to(0)], line, step, |v, _, _| v);
+        add_line(&mut self.blocks[to(1)], line, step, |v, a, _| v * a);
+        add_line(&mut self.blocks[to(2)], line, step, |_, _, b| b);
+        add_line(&mut self.blocks[to(3)], line, step, |v, a, _| v * a * a);
+        add_line(&mut self.blocks[to(4)], line, step, |_, _, b| b * b);
+        add_line(&mut self.blocks[to(5)], line, step, |_, a, b| a * b);
+    }
+
+    /// Adds `share` times the zero-mean normalised cross-correlation in [−1, 1] to `out`
+    /// `[h, w]` (0 where less than half of the window is valid), and that of the valid
+    /// share of the window to `valid`.
+    fn score(&mut self, share: f32, out: &mut [f32], valid: Option<&mut [f32]>) {
+        let ([h, w], r) = (self.size, self.radius);
+        let wide = w + 2 * r;
+        vectorised(
+            #[inline(always)]
+            || {
+                let rows = self.blocks.chunks_exact(wide).zip(self.columns.chunks_exact_mut(w));
+                for (blocks, sums) in rows {
+                    for t in 0..=2 * r {
+                        for (sum, v) in sums.iter_mut().zip(&blocks[t..t + w]) {
+                            *sum += v;
+                        }
+                    }
+                }
+            },
+        );
+        let mut windows = vec![0f32; PLANES * w];
+        let mut valid = valid;
+        for (y, out) in out.chunks_exact_mut(w).enumerate() {
+            windows.fill(0.0);
+            vectorised(
+                #[inline(always)]
+                || {
+                    for (p, sums) in windows.chunks_exact_mut(w).enumerate() {
+                        for row in y.saturating_sub(r)..(y + r + 1).min(h) {
+                            let row = &self.columns[(p * h + row) * w..][..w];
+                            sums.iter_mut().zip(row).for_each(|(sum, v)| *sum += v);
+                        }
+                    }
+                    score_line(&windows, self.full, share, out);
+                    if let Some(valid) = &mut valid {
+                        let counts = windows[..w].iter().zip(&mut valid[y * w..(y + 1) * w]);
+                        counts.for_each(|(count, to)| *to += share * (count / self.full));
+                    }
+                },
+            );
+        }
+    }
+}
+
+/// Adds f of (validity, reference, sample) to `sums`, `step` (1 or 2) pixels to each.
+#[inline(always)]
+fn add_line(
+    sums: &mut [f32],
+    [valid, own, samples]: [&[f32]; 3],
+    step: usize,
+    f: impl Fn(f32, f32, f32) -> f32,
+) {
+    if step == 1 {
+        for (((sum, v), a), b) in sums.iter_mut().zip(valid).zip(own).zip(samples) {
+            *sum += f(*v, *a, *b);
+        }
+    } else {
+        let pairs = valid.chunks_exact(2).zip(own.chunks_exact(2)).zip(samples.chunks_exact(2));
+        for (sum, ((v, a), b)) in sums.iter_mut().zip(pairs) {
+            *sum += f(v[0], a[0], b[0]) + f(v[1], a[1], b[1]);
+        }
+    }
+}
+
+/// Adds the scores of a line of windows, `[6, w]` sums.
+#[inline(always)]
+fn score_line(windows: &[f32], full: f32, share: f32, out: &mut [f32]) {
+    let w = out.len();
+    let plane = |p: usize| &windows[p * w..(p + 1) * w];
+    let (count, a, b) = (plane(0), plane(1), plane(2));
+    let (aa, bb, ab) = (plane(3), plane(4), plane(5));
+    for x in 0..w {
+        let inverse = 1.0 / count[x].max(1.0);
+        let (mean_a, mean_b) = (a[x] * inverse, b[x] * inverse);
+        let var_a = (aa[x] * inverse - mean_a * mean_a).max(0.0) + VARIANCE_FLOOR;
+        let var_b = (bb[x] * inverse - mean_b * mean_b).max(0.0) + VARIANCE_FLOOR;
+        let score = (ab[x] * inverse - mean_a * mean_b) / (var_a * var_b).sqrt();
+        out[x] += if count[x] < 0.5 * full { 0.0 } else { share * score };
+    }
 }
 
 #[cfg(test)]

@@ -96,6 +96,31 @@ pub fn sum_of(x: &[f32], f: impl Fn(f32) -> f32) -> f64 {
     total
 }
 
+/// Two sums over pairs, Σ f(aᵢ, bᵢ), as [`sum_of`].
+#[inline(always)]
+pub fn sums_of(a: &[f32], b: &[f32], f: impl Fn(f32, f32) -> [f32; 2]) -> [f64; 2] {
+    let mut total = [0f64; 2];
+    for (a, b) in a.chunks(512).zip(b.chunks(512)) {
+        let (mut first, mut second) = ([0f32; 16], [0f32; 16]);
+        let (ac, bc) = (a.chunks_exact(16), b.chunks_exact(16));
+        for (a, b) in ac.remainder().iter().zip(bc.remainder()) {
+            let [p, q] = f(*a, *b);
+            total[0] += f64::from(p);
+            total[1] += f64::from(q);
+        }
+        for (a, b) in ac.zip(bc) {
+            for i in 0..16 {
+                let [p, q] = f(a[i], b[i]);
+                first[i] += p;
+                second[i] += q;
+            }
+        }
+        total[0] += f64::from(fold(first));
+        total[1] += f64::from(fold(second));
+    }
+    total
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,8 +1,10 @@
 //! Normalisation of rows to zero mean and unit (biased) variance with a scale and a
 //! shift per channel, and its gradient: GroupNorm, InstanceNorm and LayerNorm are
-//! this with different readings of "row" and "channel".
+//! this with different readings of "row" and "channel". A pointwise function may
+//! follow in the same pass.
 
-use super::math::{sum_of, vectorised};
+use super::activation::{Activation, by_kind};
+use super::math::{sum_of, sums_of, vectorised};
 use rayon::prelude::*;
 
 /// How rows lie and which channel an element has: element i of row r belongs to
@@ -17,6 +19,8 @@ pub struct Rows {
     pub groups: usize,
     /// ε under the square root.
     pub eps: f32,
+    /// f of the result, if any.
+    pub activation: Option<Activation>,
 }
 
 impl Rows {
@@ -45,7 +49,7 @@ impl Rows {
     }
 }
 
-/// y = w·(x − mean)/σ + b; `w` and `b` are `[channels]`, or empty for none.
+/// y = f(w·(x − mean)/σ + b); `w` and `b` are `[channels]`, or empty for none.
 pub fn forward(rows: &Rows, x: &[f32], w: &[f32], b: &[f32], y: &mut [f32]) {
     let batch = rows.batch();
     let chunk = batch * rows.len;
@@ -55,9 +59,22 @@ pub fn forward(rows: &Rows, x: &[f32], w: &[f32], b: &[f32], y: &mut [f32]) {
             || {
                 let pairs = x.chunks_exact(rows.len).zip(y.chunks_exact_mut(rows.len));
                 for (r, (x, y)) in pairs.enumerate() {
-                    let (mean, inverse) = rows.moments(x);
+                    let moments = rows.moments(x);
                     let c = rows.channel(at * batch + r);
-                    affine_row(rows, x, y, (mean, inverse), w.get(c..).zip(b.get(c..)));
+                    let affine = w.get(c..).zip(b.get(c..)).filter(|(w, _)| !w.is_empty());
+                    macro_rules! run {
+                        ($value:expr, $slope:expr) => {
+                            affine_row(rows, x, y, moments, affine, $value)
+                        };
+                    }
+                    match rows.activation {
+                        Some(kind) => by_kind!(kind, run),
+                        None => run!(
+                            #[inline(always)]
+                            |v| v,
+                            ()
+                        ),
+                    }
                 }
             },
         );
@@ -71,74 +88,146 @@ fn affine_row(
     y: &mut [f32],
     (mean, inverse): (f32, f32),
     affine: Option<(&[f32], &[f32])>,
+    f: impl Fn(f32) -> f32,
 ) {
     match affine {
-        Some((w, b)) if !w.is_empty() && rows.run == 1 => {
+        Some((w, b)) if rows.run == 1 => {
             for (((y, x), w), b) in y.iter_mut().zip(x).zip(w).zip(b) {
-                *y = (x - mean) * inverse * w + b;
+                *y = f((x - mean) * inverse * w + b);
             }
         }
-        Some((w, b)) if !w.is_empty() => {
+        Some((w, b)) => {
             let runs = x.chunks_exact(rows.run).zip(y.chunks_exact_mut(rows.run));
             for ((x, y), (w, b)) in runs.zip(w.iter().zip(b)) {
                 for (y, x) in y.iter_mut().zip(x) {
-                    *y = (x - mean) * inverse * w + b;
+                    *y = f((x - mean) * inverse * w + b);
                 }
             }
         }
-        _ => {
+        None => {
             for (y, x) in y.iter_mut().zip(x) {
-                *y = (x - mean) * inverse;
+                *y = f((x - mean) * inverse);
             }
         }
     }
 }
 
-/// (dx, dw, db) from dy. With g = dy·w and x̂ the normalised x:
-/// dx = (g − mean(g) − x̂·mean(g·x̂))/σ, dw = Σ dy·x̂, db = Σ dy.
-pub fn backward(rows: &Rows, x: &[f32], w: &[f32], dy: &[f32]) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
-    let (per_row, n) = (rows.per_row(), rows.len as f64);
-    let mut dx = vec![0f32; x.len()];
-    // Per row and channel: Σ dy·x̂ and Σ dy.
-    let sums: Vec<Vec<[f64; 2]>> = x
-        .par_chunks_exact(rows.len)
-        .zip(dy.par_chunks_exact(rows.len))
-        .zip(dx.par_chunks_exact_mut(rows.len))
+/// What [`backward`] reads.
+pub struct Saved<'a> {
+    /// What [`forward`] took.
+    pub x: &'a [f32],
+    /// Scales, or empty.
+    pub w: &'a [f32],
+    /// Shifts, or empty.
+    pub b: &'a [f32],
+    /// ∂L/∂y.
+    pub dy: &'a [f32],
+}
+
+/// (dx, dw, db). With g = dy·f′·w and x̂ the normalised x:
+/// dx = (g − mean(g) − x̂·mean(g·x̂))/σ, dw = Σ dy·f′·x̂, db = Σ dy·f′.
+pub fn backward(rows: &Rows, s: &Saved<'_>) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
+    let (per_row, batch) = (rows.per_row(), rows.batch());
+    let chunk = batch * rows.len;
+    let count = s.x.len() / rows.len.max(1);
+    let mut dx = vec![0f32; s.x.len()];
+    // Per row and channel: Σ dy·f′·x̂ and Σ dy·f′. A LayerNorm's rows are summed by task.
+    let shared = rows.groups == 1 && rows.run == 1;
+    let kept = if shared { count.div_ceil(batch) } else { count };
+    let mut sums = vec![[0f64; 2]; kept * per_row];
+    let per_task = if shared { per_row } else { batch * per_row };
+    s.x.par_chunks(chunk)
+        .zip(s.dy.par_chunks(chunk))
+        .zip(dx.par_chunks_mut(chunk))
+        .zip(sums.par_chunks_mut(per_task))
         .enumerate()
-        .map(|(r, ((x, dy), dx))| {
-            let (mean, inverse) = rows.moments(x);
-            let weight = |i: usize| w.get(rows.channel(r) + i).copied().unwrap_or(1.0);
-            let mut sums = vec![[0f64; 2]; per_row];
-            let (mut mean_g, mut mean_gx) = (0f64, 0f64);
-            for (i, (x, dy)) in x.chunks_exact(rows.run).zip(dy.chunks_exact(rows.run)).enumerate()
-            {
-                for (x, dy) in x.iter().zip(dy) {
-                    sums[i][0] += f64::from(dy * (x - mean) * inverse);
-                    sums[i][1] += f64::from(*dy);
-                }
-                mean_g += sums[i][1] * f64::from(weight(i)) / n;
-                mean_gx += sums[i][0] * f64::from(weight(i)) / n;
-            }
-            let (mean_g, mean_gx) = (mean_g as f32, mean_gx as f32);
-            let triples = dx.chunks_exact_mut(rows.run).zip(x.chunks_exact(rows.run));
-            for (i, ((dx, x), dy)) in triples.zip(dy.chunks_exact(rows.run)).enumerate() {
-                let w = weight(i);
-                for ((dx, x), dy) in dx.iter_mut().zip(x).zip(dy) {
-                    *dx = (dy * w - mean_g - (x - mean) * inverse * mean_gx) * inverse;
-                }
-            }
-            sums
-        })
-        .collect();
-    let mut totals = vec![[0f64; 2]; w.len()];
-    if !w.is_empty() {
-        for (r, row) in sums.iter().enumerate() {
-            for (i, s) in row.iter().enumerate() {
-                totals[rows.channel(r) + i][0] += s[0];
-                totals[rows.channel(r) + i][1] += s[1];
+        .for_each(|(at, (((x, dy), dx), sums))| {
+            vectorised(
+                #[inline(always)]
+                || {
+                    let lines = x.chunks_exact(rows.len).zip(dy.chunks_exact(rows.len));
+                    for (r, ((x, dy), dx)) in lines.zip(dx.chunks_exact_mut(rows.len)).enumerate() {
+                        let c = rows.channel(at * batch + r);
+                        let own = if shared { 0 } else { r * per_row };
+                        let sums = &mut sums[own..own + per_row];
+                        let (w, b) = (s.w.get(c..).unwrap_or(&[]), s.b.get(c..).unwrap_or(&[]));
+                        macro_rules! run {
+                            ($value:expr, $slope:expr) => {
+                                backward_row(rows, (x, dy, dx), (w, b), sums, $slope)
+                            };
+                        }
+                        match rows.activation {
+                            Some(kind) => by_kind!(kind, run),
+                            None => run!(
+                                (),
+                                #[inline(always)]
+                                |_| 1.0
+                            ),
+                        }
+                    }
+                },
+            );
+        });
+    let mut totals = vec![[0f64; 2]; s.w.len()];
+    if !s.w.is_empty() {
+        for (r, row) in sums.chunks_exact(per_row).enumerate() {
+            let c = rows.channel(r);
+            for (total, s) in totals[c..].iter_mut().zip(row) {
+                total[0] += s[0];
+                total[1] += s[1];
             }
         }
     }
     let lane = |k: usize| totals.iter().map(|s| s[k] as f32).collect();
     (dx, lane(0), lane(1))
+}
+
+/// One row: `dx`, and its channels' sums added to `sums`. `w` and `b` begin at the row's
+/// first channel.
+#[inline(always)]
+fn backward_row(
+    rows: &Rows,
+    (x, dy, dx): (&[f32], &[f32], &mut [f32]),
+    (w, b): (&[f32], &[f32]),
+    sums: &mut [[f64; 2]],
+    slope: impl Fn(f32) -> f32,
+) {
+    let (n, (mean, inverse)) = (rows.len as f64, rows.moments(x));
+    let (mut mean_g, mut mean_gx) = (0f64, 0f64);
+    if rows.run == 1 {
+        // One element a channel: `dx` holds dy·f′·w until the means are known.
+        for (i, ((x, dy), dx)) in x.iter().zip(dy).zip(dx.iter_mut()).enumerate() {
+            let (w, b) = (w.get(i).copied().unwrap_or(1.0), b.get(i).copied().unwrap_or(0.0));
+            let unit = (x - mean) * inverse;
+            let g = dy * slope(unit * w + b);
+            sums[i][0] += f64::from(g * unit);
+            sums[i][1] += f64::from(g);
+            *dx = g * w;
+            mean_g += f64::from(*dx) / n;
+            mean_gx += f64::from(*dx * unit) / n;
+        }
+    } else {
+        let runs = x.chunks_exact(rows.run).zip(dy.chunks_exact(rows.run));
+        for (i, ((x, dy), dx)) in runs.zip(dx.chunks_exact_mut(rows.run)).enumerate() {
+            let (w, b) = (w.get(i).copied().unwrap_or(1.0), b.get(i).copied().unwrap_or(0.0));
+            for ((x, dy), dx) in x.iter().zip(dy).zip(dx.iter_mut()) {
+                *dx = dy * slope((x - mean) * inverse * w + b);
+            }
+            let own = sums_of(
+                dx,
+                x,
+                #[inline(always)]
+                |g, x| [g * ((x - mean) * inverse), g],
+            );
+            sums[i][0] += own[0];
+            sums[i][1] += own[1];
+            mean_gx += own[0] * f64::from(w) / n;
+            mean_g += own[1] * f64::from(w) / n;
+            dx.iter_mut().for_each(|g| *g *= w);
+        }
+    }
+    let (mean_g, mean_gx) = (mean_g as f32, mean_gx as f32);
+    for (dx, x) in dx.iter_mut().zip(x) {
+        *dx = (*dx - mean_g - (x - mean) * inverse * mean_gx) * inverse;
+    }
 }

@@ -1,6 +1,8 @@
 //! Bilinear resize with corner pixels on corner pixels (`align_corners = true`) and
 //! nearest upsampling by a whole factor, with their transposes (the gradients).
 
+use super::activation::{self, Activation};
+use super::math::vectorised;
 use rayon::prelude::*;
 
 /// Sizes of one resize of planes.
@@ -25,49 +27,112 @@ fn taps(from: usize, to: usize) -> Vec<(usize, usize, f32)> {
         .collect()
 }
 
-/// `[planes, h, w]` to `[planes, H, W]`.
-pub fn bilinear(r: &Resize, x: &[f32], y: &mut [f32]) {
-    let ([h, w], [to_h, to_w]) = (r.from, r.to);
-    let (rows, cols) = (taps(h, to_h), taps(w, to_w));
-    let planes = x.par_chunks_exact(h * w).zip(y.par_chunks_exact_mut(to_h * to_w));
-    planes.for_each_init(
-        || vec![0f32; w],
-        |mixed, (x, y)| {
-            for (y, &(top, bottom, f)) in y.chunks_exact_mut(to_w).zip(&rows) {
-                let (a, b) = (&x[top * w..(top + 1) * w], &x[bottom * w..(bottom + 1) * w]);
-                for ((m, a), b) in mixed.iter_mut().zip(a).zip(b) {
-                    *m = (1.0 - f) * a + f * b;
-                }
-                for (y, &(left, right, f)) in y.iter_mut().zip(&cols) {
-                    *y = (1.0 - f) * mixed[left] + f * mixed[right];
-                }
+/// Bilinear interpolation of one plane at a time.
+pub(crate) struct Bilinear {
+    rows: Vec<(usize, usize, f32)>,
+    cols: Vec<(usize, usize, f32)>,
+    from: [usize; 2],
+    to: [usize; 2],
+}
+
+impl Bilinear {
+    pub(crate) fn new(r: &Resize) -> Self {
+        let ([h, w], [to_h, to_w]) = (r.from, r.to);
+        Self { rows: taps(h, to_h), cols: taps(w, to_w), from: r.from, to: r.to }
+    }
+
+    /// `[h, w]` to `[H, W]`: the few input rows are widened first, so that all the work
+    /// per output pixel is on whole rows. `wide` is working memory.
+    pub(crate) fn plane(&self, x: &[f32], y: &mut [f32], wide: &mut Vec<f32>) {
+        let (w, to_w) = (self.from[1], self.to[1]);
+        wide.resize(self.from[0] * to_w, 0.0);
+        for (x, wide) in x.chunks_exact(w).zip(wide.chunks_exact_mut(to_w)) {
+            for (o, &(left, right, f)) in wide.iter_mut().zip(&self.cols) {
+                *o = (1.0 - f) * x[left] + f * x[right];
             }
+        }
+        vectorised(
+            #[inline(always)]
+            || {
+                for (y, &(top, bottom, f)) in y.chunks_exact_mut(to_w).zip(&self.rows) {
+                    let (a, b) = (&wide[top * to_w..][..to_w], &wide[bottom * to_w..][..to_w]);
+                    for ((y, a), b) in y.iter_mut().zip(a).zip(b) {
+                        *y = (1.0 - f) * a + f * b;
+                    }
+                }
+            },
+        );
+    }
+
+    /// The transpose of [`Bilinear::plane`]; `dx` is overwritten.
+    pub(crate) fn transposed(&self, dy: &[f32], dx: &mut [f32], wide: &mut Vec<f32>) {
+        let (w, to_w) = (self.from[1], self.to[1]);
+        wide.clear();
+        wide.resize(self.from[0] * to_w, 0.0);
+        vectorised(
+            #[inline(always)]
+            || {
+                for (dy, &(top, bottom, f)) in dy.chunks_exact(to_w).zip(&self.rows) {
+                    for (row, share) in [(top, 1.0 - f), (bottom, f)] {
+                        for (o, dy) in wide[row * to_w..][..to_w].iter_mut().zip(dy) {
+                            *o += share * dy;
+                        }
+                    }
+                }
+            },
+        );
+        dx.fill(0.0);
+        for (dx, wide) in dx.chunks_exact_mut(w).zip(wide.chunks_exact(to_w)) {
+            for (v, &(left, right, f)) in wide.iter().zip(&self.cols) {
+                dx[left] += (1.0 - f) * v;
+                dx[right] += f * v;
+            }
+        }
+    }
+}
+
+/// f of [`bilinear`] in one pass.
+pub fn bilinear_then(r: &Resize, kind: Activation, x: &[f32], y: &mut [f32]) {
+    let one = Bilinear::new(r);
+    let planes = x.par_chunks_exact(r.from[0] * r.from[1]);
+    let planes = planes.zip(y.par_chunks_exact_mut(r.to[0] * r.to[1]));
+    planes.for_each_init(Vec::new, |wide, (x, y)| {
+        one.plane(x, y, wide);
+        activation::in_place(kind, y);
+    });
+}
+
+/// The gradient of [`bilinear_then`], `dx` overwritten.
+pub fn bilinear_then_backward(r: &Resize, kind: Activation, x: &[f32], dy: &[f32], dx: &mut [f32]) {
+    let (one, n) = (Bilinear::new(r), r.to[0] * r.to[1]);
+    let planes = x.par_chunks_exact(r.from[0] * r.from[1]).zip(dy.par_chunks_exact(n));
+    let planes = planes.zip(dx.par_chunks_exact_mut(r.from[0] * r.from[1]));
+    planes.for_each_init(
+        || (Vec::new(), vec![0f32; n]),
+        |(wide, y), ((x, dy), dx)| {
+            one.plane(x, y, wide);
+            activation::slopes_in_place(kind, y, dy);
+            one.transposed(y, dx, wide);
         },
     );
 }
 
+/// `[planes, h, w]` to `[planes, H, W]`.
+pub fn bilinear(r: &Resize, x: &[f32], y: &mut [f32]) {
+    let one = Bilinear::new(r);
+    let planes = x.par_chunks_exact(r.from[0] * r.from[1]);
+    planes
+        .zip(y.par_chunks_exact_mut(r.to[0] * r.to[1]))
+        .for_each_init(Vec::new, |wide, (x, y)| one.plane(x, y, wide));
+}
+
 /// The transpose of [`bilinear`]: `[planes, H, W]` to `[planes, h, w]`, overwritten.
 pub fn bilinear_transposed(r: &Resize, dy: &[f32], dx: &mut [f32]) {
-    let ([h, w], [to_h, to_w]) = (r.from, r.to);
-    let (rows, cols) = (taps(h, to_h), taps(w, to_w));
-    let planes = dx.par_chunks_exact_mut(h * w).zip(dy.par_chunks_exact(to_h * to_w));
-    planes.for_each_init(
-        || vec![0f32; w],
-        |mixed, (dx, dy)| {
-            dx.fill(0.0);
-            for (dy, &(top, bottom, f)) in dy.chunks_exact(to_w).zip(&rows) {
-                mixed.fill(0.0);
-                for (dy, &(left, right, f)) in dy.iter().zip(&cols) {
-                    mixed[left] += (1.0 - f) * dy;
-                    mixed[right] += f * dy;
-                }
-                for (i, m) in mixed.iter().enumerate() {
-                    dx[top * w + i] += (1.0 - f) * m;
-                    dx[bottom * w + i] += f * m;
-                }
-            }
-        },
-    );
+    let one = Bilinear::new(r);
+    let planes = dx.par_chunks_exact_mut(r.from[0] * r.from[1]);
+    planes
+        .zip(dy.par_chunks_exact(r.to[0] * r.to[1]))
+        .for_each_init(Vec::new, |wide, (dx, dy)| one.transposed(dy, dx, wide));
 }
 
 /// Every pixel repeated `s` × `s` times; `to` = `s`·`from`.

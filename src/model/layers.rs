@@ -2,7 +2,8 @@
 //! names and with its initialisation. All have gradients.
 
 use crate::model::mlp::xavier;
-use crate::ops::activation::{Activation, activation};
+pub use crate::ops::activation::Activation;
+use crate::ops::activation::activation;
 use crate::ops::conv2d::conv2d;
 use crate::ops::norm;
 use candle_core::{Result, Tensor, bail};
@@ -207,6 +208,14 @@ impl GroupNorm {
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         norm::group_norm(x, self.groups, &self.weight, &self.bias)
     }
+
+    /// [`GroupNorm::forward`], then `activation`, in one pass.
+    ///
+    /// # Errors
+    /// As [`GroupNorm::forward`].
+    pub fn forward_then(&self, x: &Tensor, activation: Activation) -> Result<Tensor> {
+        norm::group_norm_then(x, self.groups, (&self.weight, &self.bias), Some(activation))
+    }
 }
 
 /// Each channel of each picture to zero mean and unit variance over its pixels, no
@@ -216,6 +225,14 @@ impl GroupNorm {
 /// Another rank.
 pub fn instance_norm(x: &Tensor) -> Result<Tensor> {
     norm::instance_norm(x)
+}
+
+/// max(0, [`instance_norm`]) in one pass.
+///
+/// # Errors
+/// As [`instance_norm`].
+pub fn instance_norm_relu(x: &Tensor) -> Result<Tensor> {
+    norm::instance_norm_then(x, Some(Activation::Relu))
 }
 
 /// Normalises the last dimension, then scales and shifts: `weight`, `bias` `[C]`.
@@ -279,7 +296,7 @@ pub fn sigmoid(x: &Tensor) -> Result<Tensor> {
 }
 
 pub use crate::ops::activation::softmax;
-pub use crate::ops::resize::{resize_bilinear, upsample_nearest};
+pub use crate::ops::resize::{resize_bilinear, resize_bilinear_then, upsample_nearest};
 
 #[cfg(test)]
 mod tests {
@@ -365,6 +382,9 @@ mod tests {
         }
         assert_eq!(resize_bilinear(&x, 2, 3)?.flatten_all()?.to_vec1::<f32>()?, values(&x)?);
         assert_eq!(resize_bilinear(&x, 1, 1)?.flatten_all()?.to_vec1::<f32>()?, [0.0, 6.0]);
+        let (got, want) =
+            (resize_bilinear_then(&x, 5, 9, Activation::Gelu)?, gelu(&resize_bilinear(&x, 5, 9)?)?);
+        assert_eq!(values(&got)?, values(&want)?);
         let y = upsample_nearest(&x, 3)?;
         for (i, v) in values(&y)?.into_iter().enumerate() {
             let (c, row, col) = (i / 54, i / 9 % 6, i % 9);
@@ -405,6 +425,7 @@ mod tests {
         check_grad(x.clone(), sigmoid)?;
         check_grad(x.clone(), softmax)?;
         check_grad(x.clone(), |x| resize_bilinear(x, 9, 11))?;
+        check_grad(x.clone(), |x| resize_bilinear_then(x, 9, 11, Activation::Gelu))?;
         check_grad(x.clone(), |x| upsample_nearest(x, 2))?;
         let linear = Linear::new(6, 7, vb.pp("linear"))?;
         check_grad(x.clone(), |x| linear.forward(x))?;

@@ -1,7 +1,7 @@
 //! Pointwise functions and softmax over the last dimension as candle ops with
 //! gradients. Kernels: [`crate::cpu::activation`]. Tests: `model::layers`.
 
-use super::{elements, output, slice, tensor_like};
+use super::{borrowed, output, slice, tensor_like};
 use crate::cpu::activation as cpu;
 pub use crate::cpu::activation::Activation;
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
@@ -29,9 +29,11 @@ impl CustomOp1 for Pointwise {
     }
 
     fn bwd(&self, x: &Tensor, _y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
-        let (x_values, dy) = (elements::<f32>(x)?, elements::<f32>(dy)?);
-        let mut dx = vec![0.0; dy.len()];
-        cpu::backward(self.0, &x_values, &dy, &mut dx);
+        let dy = dy.contiguous()?;
+        let mut dx = vec![0.0; x.elem_count()];
+        borrowed("activation", [x, &dy], |[x, dy]: [&[f32]; 2]| {
+            cpu::backward(self.0, x, dy, &mut dx);
+        })?;
         tensor_like(dx, x).map(Some)
     }
 }
@@ -63,9 +65,11 @@ impl CustomOp1 for Softmax {
     }
 
     fn bwd(&self, x: &Tensor, y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
-        let (y, dy) = (elements::<f32>(y)?, elements::<f32>(dy)?);
-        let mut dx = vec![0.0; dy.len()];
-        cpu::softmax_backward(self.0, &y, &dy, &mut dx);
+        let dy = dy.contiguous()?;
+        let mut dx = vec![0.0; x.elem_count()];
+        borrowed("softmax", [y, &dy], |[y, dy]: [&[f32]; 2]| {
+            cpu::softmax_backward(self.0, y, dy, &mut dx);
+        })?;
         tensor_like(dx, x).map(Some)
     }
 }

@@ -1,7 +1,7 @@
 //! Scaled dot-product attention as one candle op with gradients; the matrix of
 //! logits never exists. Kernel: [`crate::cpu::attention`]. Tests: below.
 
-use super::{elements, output, slice, tensor_like};
+use super::{borrowed, output, slice, tensor_like};
 use crate::cpu::attention::{self as cpu, Attention};
 pub use crate::cpu::attention::{Labels, PENALTY};
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
@@ -76,10 +76,11 @@ impl CustomOp3 for Op {
         out: &Tensor,
         grad: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let (qs, ks, vs) = (elements::<f32>(q)?, elements::<f32>(k)?, elements::<f32>(v)?);
-        let (out, grad) = (elements::<f32>(out)?, elements::<f32>(grad)?);
-        let saved = cpu::Saved { q: &qs, k: &ks, v: &vs, out: &out, grad: &grad };
-        let (dq, dk, dv) = cpu::backward(&self.0, &saved);
+        let grad = grad.contiguous()?;
+        let run = |[q, k, v, out, grad]: [&[f32]; 5]| {
+            cpu::backward(&self.0, &cpu::Saved { q, k, v, out, grad })
+        };
+        let (dq, dk, dv) = borrowed("attention", [q, k, v, out, &grad], run)?;
         Ok((Some(tensor_like(dq, q)?), Some(tensor_like(dk, k)?), Some(tensor_like(dv, v)?)))
     }
 }

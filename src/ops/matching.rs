@@ -4,6 +4,7 @@
 use crate::camera::Camera;
 use crate::cpu::matching::{self, Pyramid};
 use candle_core::{DType, Result, Tensor, bail};
+use rayon::prelude::*;
 
 pub use crate::cpu::matching::CHANNELS;
 
@@ -41,21 +42,17 @@ pub fn raw_matching(
     let pixels = images.flatten_all()?.to_vec1::<f32>()?;
     let picture = 3 * h * w;
     let pyramids: Vec<Pyramid> =
-        pixels.chunks_exact(picture).map(|p| Pyramid::new(p, h, w)).collect();
+        pixels.par_chunks_exact(picture).map(|p| Pyramid::new(p, h, w)).collect();
     let share = 1.0 / (v - 1) as f32;
     let size = CHANNELS * d * (h / 4) * (w / 4);
-    let mut out = Vec::with_capacity(b * v * size);
-    for scene in 0..b {
-        for i in 0..v {
-            let mut sum = vec![0f32; size];
-            for j in (0..v).filter(|&j| j != i) {
-                let reference = (&pyramids[scene * v + i], &cameras[scene][i]);
-                let source = (&pyramids[scene * v + j], &cameras[scene][j]);
-                let one = matching::raw_matching(reference, source, &disparities[scene][i]);
-                sum.iter_mut().zip(one).for_each(|(s, o)| *s += share * o);
-            }
-            out.extend(sum);
+    let mut out = vec![0f32; b * v * size];
+    out.par_chunks_exact_mut(size.max(1)).enumerate().for_each(|(row, out)| {
+        let (scene, i) = (row / v, row % v);
+        for j in (0..v).filter(|&j| j != i) {
+            let reference = (&pyramids[row], &cameras[scene][i]);
+            let source = (&pyramids[scene * v + j], &cameras[scene][j]);
+            matching::add_raw_matching(reference, source, &disparities[scene][i], share, out);
         }
-    }
+    });
     Tensor::from_vec(out, &[b * v, CHANNELS, d, h / 4, w / 4][..], images.device())
 }

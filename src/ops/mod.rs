@@ -9,6 +9,7 @@ mod conv;
 pub mod conv2d;
 pub mod conv3d;
 pub mod direct;
+pub mod join;
 pub mod linear;
 pub mod matching;
 pub mod norm;
@@ -16,6 +17,7 @@ pub mod plane_sweep;
 mod rasterize;
 pub mod redistribute;
 pub mod resize;
+pub mod small;
 pub mod spgr;
 
 pub use rasterize::{over_background, rasterize, rasterize_splats};
@@ -88,3 +90,6 @@ macro_rules! by_dtype {
     };
 }
 pub(crate) use by_dtype;
+
+#[cfg(test)]
+mod same;

@@ -1,8 +1,9 @@
 //! GroupNorm, InstanceNorm and LayerNorm as one candle op with gradients. Kernel:
 //! [`crate::cpu::norm`]. Tests: `model::layers`.
 
-use super::{elements, output, slice, tensor_like};
-use crate::cpu::norm::{self as cpu, Rows};
+use super::{borrowed, output, slice, tensor_like};
+use crate::cpu::activation::Activation;
+use crate::cpu::norm::{self as cpu, Rows, Saved};
 use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Tensor, bail};
 
 /// ε of every normalisation (PyTorch's default).
@@ -14,6 +15,20 @@ const EPS: f32 = 1e-5;
 /// # Errors
 /// Shapes that do not fit; a dtype other than f32.
 pub fn group_norm(x: &Tensor, groups: usize, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
+    group_norm_then(x, groups, (weight, bias), None)
+}
+
+/// [`group_norm`] with `affine` = (weight, bias), then `activation`, in one pass.
+///
+/// # Errors
+/// As [`group_norm`].
+pub fn group_norm_then(
+    x: &Tensor,
+    groups: usize,
+    affine: (&Tensor, &Tensor),
+    activation: Option<Activation>,
+) -> Result<Tensor> {
+    let (weight, bias) = affine;
     let dims = x.dims();
     let c = weight.elem_count();
     if dims.len() < 3 || dims[1] != c || groups == 0 || !c.is_multiple_of(groups) {
@@ -22,7 +37,8 @@ pub fn group_norm(x: &Tensor, groups: usize, weight: &Tensor, bias: &Tensor) -> 
         );
     }
     let run = dims[2..].iter().product();
-    normalise(x, Rows { len: c / groups * run, run, groups, eps: EPS }, Some((weight, bias)))
+    let rows = Rows { len: c / groups * run, run, groups, eps: EPS, activation };
+    normalise(x, rows, Some((weight, bias)))
 }
 
 /// Over the pixels of each channel of each picture, no parameters: `[B, C, H, W]`.
@@ -30,8 +46,16 @@ pub fn group_norm(x: &Tensor, groups: usize, weight: &Tensor, bias: &Tensor) -> 
 /// # Errors
 /// Another rank; a dtype other than f32.
 pub fn instance_norm(x: &Tensor) -> Result<Tensor> {
+    instance_norm_then(x, None)
+}
+
+/// [`instance_norm`], then `activation`, in one pass.
+///
+/// # Errors
+/// As [`instance_norm`].
+pub fn instance_norm_then(x: &Tensor, activation: Option<Activation>) -> Result<Tensor> {
     let (_, _, h, w) = x.dims4()?;
-    normalise(x, Rows { len: h * w, run: h * w, groups: 1, eps: EPS }, None)
+    normalise(x, Rows { len: h * w, run: h * w, groups: 1, eps: EPS, activation }, None)
 }
 
 /// Over the last dimension: `x` `[…, C]`, `weight` and `bias` `[C]`.
@@ -43,7 +67,8 @@ pub fn layer_norm(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> 
     if x.dims().last() != Some(&c) {
         bail!("layer norm: expected x [.., {c}], got {:?}", x.dims());
     }
-    normalise(x, Rows { len: c, run: 1, groups: 1, eps: EPS }, Some((weight, bias)))
+    let rows = Rows { len: c, run: 1, groups: 1, eps: EPS, activation: None };
+    normalise(x, rows, Some((weight, bias)))
 }
 
 fn normalise(x: &Tensor, rows: Rows, affine: Option<(&Tensor, &Tensor)>) -> Result<Tensor> {
@@ -82,7 +107,10 @@ impl CustomOp1 for Normalise {
     }
 
     fn bwd(&self, x: &Tensor, _y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
-        let (dx, _, _) = cpu::backward(&self.0, &elements::<f32>(x)?, &[], &elements::<f32>(dy)?);
+        let dy = dy.contiguous()?;
+        let (dx, _, _) = borrowed("normalise", [x, &dy], |[x, dy]: [&[f32]; 2]| {
+            cpu::backward(&self.0, &Saved { x, w: &[], b: &[], dy })
+        })?;
         tensor_like(dx, x).map(Some)
     }
 }
@@ -115,12 +143,64 @@ impl CustomOp3 for Normalise {
         _y: &Tensor,
         dy: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let (dx, dw, db) = cpu::backward(
-            &self.0,
-            &elements::<f32>(x)?,
-            &elements::<f32>(w)?,
-            &elements::<f32>(dy)?,
-        );
+        let dy = dy.contiguous()?;
+        let (dx, dw, db) = borrowed("normalise", [x, w, b, &dy], |[x, w, b, dy]: [&[f32]; 4]| {
+            cpu::backward(&self.0, &Saved { x, w, b, dy })
+        })?;
         Ok((Some(tensor_like(dx, x)?), Some(tensor_like(dw, w)?), Some(tensor_like(db, b)?)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ops::same::{noise, same};
+
+    fn erf_gelu(x: &Tensor) -> Result<Tensor> {
+        ((x / 2f64.sqrt())?.erf()? + 1.0)? * (x * 0.5)?
+    }
+
+    /// `[R, n]` to zero mean and unit variance.
+    fn unit(x: &Tensor) -> Result<Tensor> {
+        let centred = x.broadcast_sub(&x.mean_keepdim(1)?)?;
+        centred.broadcast_div(&(centred.sqr()?.mean_keepdim(1)? + 1e-5)?.sqrt()?)
+    }
+
+    fn plain(x: &[Tensor], groups: usize) -> Result<Tensor> {
+        let (b, c) = (x[0].dim(0)?, x[1].elem_count());
+        let y = unit(&x[0].reshape((b * groups, ()))?)?.reshape(x[0].shape())?;
+        let y = y.broadcast_mul(&x[1].reshape((1, c, 1, 1))?)?;
+        y.broadcast_add(&x[2].reshape((1, c, 1, 1))?)
+    }
+
+    #[test]
+    fn norm_and_activation_agree_with_their_definitions() -> Result<()> {
+        let inputs = [noise(&[3, 6, 7, 11], 1)?, noise(&[6], 2)?, noise(&[6], 3)?];
+        for (kind, f) in [
+            (None, (|x: &Tensor| Ok(x.clone())) as fn(&Tensor) -> Result<Tensor>),
+            (Some(Activation::Gelu), erf_gelu),
+            (Some(Activation::Silu), |x: &Tensor| x / (x.neg()?.exp()? + 1.0)?),
+        ] {
+            same(
+                &inputs,
+                |x| Ok(vec![group_norm_then(&x[0], 3, (&x[1], &x[2]), kind)?]),
+                |x| Ok(vec![f(&plain(x, 3)?)?]),
+            )?;
+        }
+        same(
+            &inputs[..1],
+            |x| Ok(vec![instance_norm_then(&x[0], Some(Activation::Silu))?]),
+            |x| {
+                let y = unit(&x[0].reshape((18, ()))?)?.reshape(x[0].shape())?;
+                Ok(vec![(&y / (y.neg()?.exp()? + 1.0)?)?])
+            },
+        )?;
+        // More rows than one task takes.
+        let inputs = [noise(&[5000, 9], 4)?, noise(&[9], 5)?, noise(&[9], 6)?];
+        same(
+            &inputs,
+            |x| Ok(vec![layer_norm(&x[0], &x[1], &x[2])?]),
+            |x| Ok(vec![unit(&x[0])?.broadcast_mul(&x[1])?.broadcast_add(&x[2])?]),
+        )
     }
 }

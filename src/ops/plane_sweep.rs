@@ -2,7 +2,7 @@
 //! [`crate::cpu::plane_sweep`]. Gradients reach both feature maps; the sampling grid
 //! carries none, as in MVSplat.
 
-use super::{elements, output, slice};
+use super::{borrowed, elements, output, slice};
 use crate::camera::{Camera, Intrinsics};
 use crate::cpu::plane_sweep as cpu;
 pub use crate::cpu::plane_sweep::{Pair, Sweep};
@@ -139,8 +139,9 @@ impl CustomOp2 for Op {
         _res: &Tensor,
         grad: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>)> {
-        let (f, g) = (elements::<f32>(reference)?, elements::<f32>(source)?);
-        let (d_f, d_g) = cpu::backward(&self.0, &f, &g, &elements::<f32>(grad)?);
+        let grad = grad.contiguous()?;
+        let run = |[f, g, grad]: [&[f32]; 3]| cpu::backward(&self.0, f, g, grad);
+        let (d_f, d_g) = borrowed("plane sweep", [reference, source, &grad], run)?;
         let device = reference.device();
         Ok((
             Some(Tensor::from_vec(d_f, reference.dims(), device)?),

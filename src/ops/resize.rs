@@ -2,7 +2,8 @@
 //! gradients: candle's bilinear has none, and its nearest overwrites instead of
 //! adding. Kernels: [`crate::cpu::resize`]. Tests: `model::layers`.
 
-use super::{elements, output, slice};
+use super::{borrowed, output, slice};
+use crate::cpu::activation::Activation;
 use crate::cpu::resize::{self as cpu, Resize};
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
 
@@ -12,7 +13,20 @@ use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
 /// # Errors
 /// Another rank, an empty size, a dtype other than f32.
 pub fn resize_bilinear(x: &Tensor, height: usize, width: usize) -> Result<Tensor> {
-    run(x, [height, width], None)
+    run(x, [height, width], Kind::Bilinear(None))
+}
+
+/// `activation` of [`resize_bilinear`] in one pass.
+///
+/// # Errors
+/// As [`resize_bilinear`].
+pub fn resize_bilinear_then(
+    x: &Tensor,
+    height: usize,
+    width: usize,
+    activation: Activation,
+) -> Result<Tensor> {
+    run(x, [height, width], Kind::Bilinear(Some(activation)))
 }
 
 /// `[B, C, h, w]` to `[B, C, s·h, s·w]`, each pixel repeated s × s times.
@@ -21,21 +35,27 @@ pub fn resize_bilinear(x: &Tensor, height: usize, width: usize) -> Result<Tensor
 /// Another rank, an empty size, a dtype other than f32.
 pub fn upsample_nearest(x: &Tensor, s: usize) -> Result<Tensor> {
     let (_, _, h, w) = x.dims4()?;
-    run(x, [s * h, s * w], Some(s))
+    run(x, [s * h, s * w], Kind::Nearest(s))
 }
 
-fn run(x: &Tensor, to: [usize; 2], nearest: Option<usize>) -> Result<Tensor> {
+fn run(x: &Tensor, to: [usize; 2], kind: Kind) -> Result<Tensor> {
     let (_, _, h, w) = x.dims4()?;
     if h * w == 0 || to[0] * to[1] == 0 {
         bail!("resize: expected sizes of at least 1, got {h}x{w} to {}x{}", to[0], to[1]);
     }
-    x.contiguous()?.apply_op1(Op { sizes: Resize { from: [h, w], to }, nearest })
+    x.contiguous()?.apply_op1(Op { sizes: Resize { from: [h, w], to }, kind })
+}
+
+#[derive(Clone, Copy)]
+enum Kind {
+    Bilinear(Option<Activation>),
+    /// By a whole factor.
+    Nearest(usize),
 }
 
 struct Op {
     sizes: Resize,
-    /// Whole factor of nearest upsampling; bilinear if none.
-    nearest: Option<usize>,
+    kind: Kind,
 }
 
 impl CustomOp1 for Op {
@@ -48,20 +68,24 @@ impl CustomOp1 for Op {
         let (b, c, _, _) = l.shape().dims4()?;
         let [h, w] = self.sizes.to;
         let mut y = vec![0.0; b * c * h * w];
-        match self.nearest {
-            Some(s) => cpu::nearest(&self.sizes, s, x, &mut y),
-            None => cpu::bilinear(&self.sizes, x, &mut y),
+        match self.kind {
+            Kind::Nearest(s) => cpu::nearest(&self.sizes, s, x, &mut y),
+            Kind::Bilinear(None) => cpu::bilinear(&self.sizes, x, &mut y),
+            Kind::Bilinear(Some(f)) => cpu::bilinear_then(&self.sizes, f, x, &mut y),
         }
         output(y, (b, c, h, w))
     }
 
     fn bwd(&self, x: &Tensor, _y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
-        let dy = elements::<f32>(dy)?;
+        let dy = dy.contiguous()?;
         let mut dx = vec![0.0; x.elem_count()];
-        match self.nearest {
-            Some(s) => cpu::nearest_transposed(&self.sizes, s, &dy, &mut dx),
-            None => cpu::bilinear_transposed(&self.sizes, &dy, &mut dx),
-        }
+        borrowed("resize", [x, &dy], |[x, dy]: [&[f32]; 2]| match self.kind {
+            Kind::Nearest(s) => cpu::nearest_transposed(&self.sizes, s, dy, &mut dx),
+            Kind::Bilinear(None) => cpu::bilinear_transposed(&self.sizes, dy, &mut dx),
+            Kind::Bilinear(Some(f)) => {
+                cpu::bilinear_then_backward(&self.sizes, f, x, dy, &mut dx);
+            }
+        })?;
         super::tensor_like(dx, x).map(Some)
     }
 }

@@ -1,7 +1,9 @@
 //! MVSplat's CNN (spec 1): a ResNet to 1/4 resolution, InstanceNorm without
 //! parameters. `[N, 3, H, W]` RGB in [0, 1], rows in any order.
 
-use crate::model::layers::{Conv2d, ConvShape, default_init, instance_norm, relu};
+use crate::model::layers::{
+    Conv2d, ConvShape, default_init, instance_norm, instance_norm_relu, relu,
+};
 use crate::model::trace::Trace;
 use candle_core::{Result, Tensor};
 use candle_nn::{Init, VarBuilder};
@@ -59,7 +61,7 @@ impl Cnn {
         trace.put("cnn.normalized_image", &x)?;
         let x = self.conv1.forward(&x)?;
         trace.put("cnn.conv1", &x)?;
-        let mut x = relu(&instance_norm(&x)?)?;
+        let mut x = instance_norm_relu(&x)?;
         let mut half = None;
         for (i, stage) in self.stages.iter().enumerate() {
             x = stage[1].forward(&stage[0].forward(&x)?)?;
@@ -99,8 +101,8 @@ impl Residual {
     }
 
     fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        let y = relu(&instance_norm(&self.conv1.forward(x)?)?)?;
-        let y = relu(&instance_norm(&self.conv2.forward(&y)?)?)?;
+        let y = instance_norm_relu(&self.conv1.forward(x)?)?;
+        let y = instance_norm_relu(&self.conv2.forward(&y)?)?;
         let skip = match &self.downsample {
             Some(conv) => instance_norm(&conv.forward(x)?)?,
             None => x.clone(),

@@ -6,6 +6,7 @@ use crate::config::Mvsplat as Settings;
 use crate::model::Views;
 use crate::model::layers::{Conv2d, ConvShape, GroupNorm, gelu};
 use crate::model::trace::Trace;
+use crate::ops::join::join;
 use crate::ops::plane_sweep::{Pair, Sweep, pair, plane_sweep, warped};
 use candle_core::{Device, Result, Tensor};
 use candle_nn::VarBuilder;
@@ -157,7 +158,7 @@ impl Refinement {
         trace: &mut Trace<'_>,
     ) -> Result<Tensor> {
         let name = "cv.corr_refine_net";
-        let input = Tensor::cat(&[volume, features], 1)?;
+        let input = join(volume, features, 1)?;
         let x = self.stem.0.forward(&input)?;
         trace.put(&format!("{name}.0"), &x)?;
         let x = self.stem.1.forward(&x)?;

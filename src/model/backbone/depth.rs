@@ -10,9 +10,11 @@ use crate::abi::sh_coefficients;
 use crate::config::Mvsplat as Settings;
 use crate::model::Views;
 use crate::model::layers::{
-    Conv2d, ConvShape, GroupNorm, gelu, resize_bilinear, sigmoid, softmax, upsample_nearest,
+    Activation, Conv2d, ConvShape, GroupNorm, gelu, resize_bilinear, resize_bilinear_then, sigmoid,
+    softmax, upsample_nearest,
 };
 use crate::model::trace::Trace;
+use crate::ops::join::join;
 use candle_core::{Device, Result, Tensor};
 use candle_nn::VarBuilder;
 
@@ -118,7 +120,10 @@ impl DepthPredictor {
     pub fn forward(&self, input: Input<'_>, trace: &mut Trace<'_>) -> Result<Output> {
         let Input { views, images, cnn, trans } = input;
         let disparity = self.coarse(views, &trans, trace)?;
-        let low = self.upsampler.forward(&Tensor::cat(&[trans, cnn], 1)?)?;
+        let joined = join(&trans, &cnn, 1)?;
+        drop((trans, cnn));
+        let low = self.upsampler.forward(&joined)?;
+        drop(joined);
         trace.put("depth.upsampler.0", &low)?;
         let up = Upsampled::new(low, trace)?;
         let refined = self.refine(&images, &up, &disparity, views.views(), trace)?;
@@ -184,7 +189,8 @@ impl DepthPredictor {
     ) -> Result<Tensor> {
         let raw = each_row(images, |r| {
             let row = |x: &Tensor| x.narrow(0, r, 1);
-            let x = Tensor::cat(&[row(refined)?, row(images)?, up.row(r)?], 1)?;
+            let x = Tensor::cat(&[row(refined)?, row(images)?], 1)?;
+            let x = join(&x, &up.row(r)?, 1)?;
             let y = self.to_gaussians.forward(&x)?;
             y.flatten_from(2)?.transpose(1, 2)?.contiguous()
         })?;
@@ -237,7 +243,7 @@ impl Upsampled {
 
     fn make(low: &Tensor) -> Result<Tensor> {
         let (_, _, h, w) = low.dims4()?;
-        gelu(&resize_bilinear(low, DOWNSCALE * h, DOWNSCALE * w)?)
+        resize_bilinear_then(low, DOWNSCALE * h, DOWNSCALE * w, Activation::Gelu)
     }
 
     /// Row `r`, `[1, C, H, W]`.

@@ -17,12 +17,18 @@ use super::small_parts::{ConvexUpsampling, Stem, Unet, conv_norm_gelu, local_mea
 use crate::abi::sh_coefficients;
 use crate::camera::Camera;
 use crate::config::{FeatureLevel, Small};
-use crate::model::layers::{Conv2d, ConvShape, GroupNorm, gelu, resize_bilinear, sigmoid, softmax};
+use crate::model::layers::{
+    Activation, Conv2d, ConvShape, GroupNorm, gelu, resize_bilinear, sigmoid,
+};
 use crate::model::{BackboneOutput, Views};
+use crate::ops::join::join;
 use crate::ops::matching::raw_matching;
 use crate::ops::plane_sweep::{Pair, Sweep, pair, plane_sweep, relative_pose};
+use crate::ops::small::{
+    Start, expectation, head_input, head_output, lift, ray_distance, unit_channels,
+};
 use crate::sh::C0;
-use candle_core::{D, Result, Tensor, bail};
+use candle_core::{Result, Tensor, bail};
 use candle_nn::{Init, VarBuilder};
 
 /// Kernel 5×5, stride 2, half the size.
@@ -67,7 +73,7 @@ impl Residual {
     }
 
     fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        let y = gelu(&self.norm1.forward(&self.conv1.forward(x)?)?)?;
+        let y = self.norm1.forward_then(&self.conv1.forward(x)?, Activation::Gelu)?;
         gelu(&(x + self.norm2.forward(&self.conv2.forward(&y)?)?)?)
     }
 }
@@ -161,27 +167,24 @@ impl SmallBackbone {
             feat4 = block.forward(&feat4)?;
         }
         let stem = self.sweep(views, &feat4)?;
-        let deep = self.unet.forward(&Tensor::cat(&[&stem.input, &feat4], 1)?)?;
+        let deep = self.unet.forward(&join(&stem.input, &feat4, 1)?)?;
         let mut logits = self.logits.forward(&deep)?;
         if let Some(scores) = &stem.scores
             && self.config.stem_skip
         {
-            logits = (logits + (scores * 4.0)?.broadcast_mul(&self.stem_factor)?)?;
+            logits = lift(&logits, scores, &self.stem_factor)?;
         }
         let (index, mass) = self.expected_index(&logits, training)?;
         let rough = (&index - local_mean(&index)?)?.abs()?;
-        let hidden = Tensor::cat(&[&deep, &mass, &(rough / 4.0)?], 1)?;
-        let hidden = gelu(&self.confidence.0.forward(&hidden)?)?;
+        let sides = Tensor::cat(&[&mass, &(rough / 4.0)?], 1)?;
+        let hidden = gelu(&self.confidence.0.forward(&join(&deep, &sides, 1)?)?)?;
         let confidence = (self.confidence.1.forward(&hidden)?
             + mass.affine(CONFIDENCE_SLOPE, CONFIDENCE_SHIFT)?)?;
-        let (index, confidence) = match &self.upsampling {
-            Some(convex) => {
-                let mask = convex.mask(&deep, &rgb)?;
-                (convex.apply(&mask, &index)?, convex.apply(&mask, &confidence)?)
-            }
-            None => (resize_bilinear(&index, h, w)?, resize_bilinear(&confidence, h, w)?),
+        let [index, confidence] = match &self.upsampling {
+            Some(convex) => convex.apply(&deep, &rgb, [&index, &confidence])?,
+            None => [resize_bilinear(&index, h, w)?, resize_bilinear(&confidence, h, w)?],
         };
-        let heads = self.heads(&rgb, &deep, &index, &confidence)?;
+        let heads = self.heads(&rgb, &deep, [&index, &confidence], training)?;
         let depths = self.ray_distance(views, &index)?;
         let pool = |s: usize| -> Result<Tensor> { split_views(&deep.avg_pool2d(s)?, b, v) };
         let features = vec![
@@ -203,10 +206,8 @@ impl SmallBackbone {
 
     /// Volume of matching scores, through the stem.
     fn sweep(&self, views: &Views, feat4: &Tensor) -> Result<Swept> {
-        let unit = self.matching.forward(feat4)?;
-        let norm = (unit.sqr()?.transpose(1, 3)?.contiguous()?.sum_keepdim(D::Minus1)? + 1e-8)?;
-        let unit = unit.broadcast_div(&norm.sqrt()?.transpose(1, 3)?.contiguous()?)?;
-        let (_, channels, h, w) = unit.dims4()?;
+        let unit = unit_channels(&self.matching.forward(feat4)?)?;
+        let (rows, channels, h, w) = unit.dims4()?;
         let d = self.config.depth_candidates;
         let disparities = candidates(views, d);
         let sweep = Sweep {
@@ -222,15 +223,16 @@ impl SmallBackbone {
             channels,
             size: [h, w],
         };
-        // [B·V, 1, D, h, w]
-        let learned = plane_sweep(&unit, &unit, sweep)?.unsqueeze(1)?;
+        // [B·V, 1, D·h, w]
+        let learned = plane_sweep(&unit, &unit, sweep)?.reshape((rows, 1, d * h, w))?;
         let volume = match self.config.raw_matching {
             true => {
                 let raw = raw_matching(&views.images, &views.cameras, &disparities)?;
-                Tensor::cat(&[&learned, &raw], 1)?
+                join(&learned, &raw.flatten(2, 3)?, 1)?
             }
             false => learned,
         };
+        let volume = volume.reshape((rows, (), d, h, w))?;
         match &self.stem {
             Some(stem) => {
                 let scores = stem.forward(&volume)?;
@@ -243,102 +245,78 @@ impl SmallBackbone {
     /// Expected candidate index `[B·V, 1, h, w]`, and the probability within the
     /// window around the mode.
     fn expected_index(&self, logits: &Tensor, training: bool) -> Result<(Tensor, Tensor)> {
-        let d = self.config.depth_candidates;
-        let pdf = softmax(&logits.permute((0, 2, 3, 1))?.contiguous()?)?;
-        let index = Tensor::arange(0f32, d as f32, pdf.device())?;
-        let mode = pdf.argmax_keepdim(D::Minus1)?.to_dtype(pdf.dtype())?;
-        let away = index.reshape((1, 1, 1, d))?.broadcast_sub(&mode)?.abs()?;
-        let window = away.le(self.config.mode_window.max(1) as f64 + 0.5)?.to_dtype(pdf.dtype())?;
-        let near = (&pdf * window)?;
-        let mass = near.sum_keepdim(D::Minus1)?;
-        let mean = if training || self.config.mode_window == 0 {
-            pdf.broadcast_mul(&index)?.sum_keepdim(D::Minus1)?
-        } else {
-            near.broadcast_mul(&index)?.sum_keepdim(D::Minus1)?.broadcast_div(&mass)?
-        };
-        let first = |t: Tensor| t.permute((0, 3, 1, 2))?.contiguous();
-        Ok((first(mean)?, first(mass)?))
+        let window = self.config.mode_window;
+        expectation(logits, window.max(1), !training && window > 0)
     }
 
+    /// `sides`: candidate index and confidence (a logit), `[B·V, 1, H, W]`.
     fn heads(
         &self,
         rgb: &Tensor,
         deep: &Tensor,
-        index: &Tensor,
-        confidence: &Tensor,
+        sides: [&Tensor; 2],
+        training: bool,
     ) -> Result<Heads> {
-        let (views, _, h, w) = rgb.dims4()?;
-        let d = sh_coefficients(self.config.primaries.sh_degree);
-        let d_max = (self.config.depth_candidates - 1) as f64;
+        let views = rgb.dim(0)?;
+        let share = 1.0 / (self.config.depth_candidates - 1) as f32;
         let projected = self.project.forward(deep)?;
-        // One view at a time: these are the largest tensors of the network.
+        // The largest tensors of the network: one view at a time, unless a gradient
+        // wants them all anyway.
+        let step = if training { views } else { 1 };
         let (mut raws, mut densities, mut hiddens) = (Vec::new(), Vec::new(), Vec::new());
-        for i in 0..views {
-            let one = |t: &Tensor| t.narrow(0, i, 1);
-            let (rgb, confidence) = (one(rgb)?, one(confidence)?);
-            let input = Tensor::cat(
-                &[
-                    &resize_bilinear(&one(&projected)?, h, w)?,
-                    &rgb,
-                    &(one(index)? / d_max)?,
-                    &sigmoid(&confidence)?,
-                ],
-                1,
-            )?;
+        for i in (0..views).step_by(step) {
+            let part = |t: &Tensor| if step == views { Ok(t.clone()) } else { t.narrow(0, i, 1) };
+            let (rgb, index, confidence) = (part(rgb)?, part(sides[0])?, part(sides[1])?);
+            let input = head_input(&part(&projected)?, &rgb, &index, &confidence, share)?;
             let hidden = gelu(&self.head1.forward(&input)?)?;
+            drop(input);
             let out = self.head2.forward(&hidden)?;
-            let raw = out.narrow(1, 0, 9 + 3 * d)?.flatten_from(2)?.transpose(1, 2)?;
-            raws.push((raw.contiguous()?.broadcast_add(&self.raw_start(&rgb)?))?);
-            let residual = out.narrow(1, 9 + 3 * d, 1)?;
-            densities.push(match self.config.confidence_opacity {
-                true => sigmoid(&(confidence + residual)?)?.sqr()?,
-                false => sigmoid(&(residual + 2.0)?)?,
-            });
+            let (raw, density) = head_output(&out, &confidence, &rgb, self.start())?;
+            raws.push(raw);
+            densities.push(density);
             hiddens.push(hidden);
         }
-        Ok(Heads {
-            raw: Tensor::cat(&raws, 0)?,
-            density: Tensor::cat(&densities, 0)?,
-            hidden: Tensor::cat(&hiddens, 0)?,
-        })
+        Ok(Heads { raw: whole(raws)?, density: whole(densities)?, hidden: whole(hiddens)? })
     }
 
-    /// `[1, H·W, 9 + 3·D]`: what the raw head corrects. Offset 0, σ of 0.6 px, no
-    /// rotation, the pixel's own colour (or mid-grey).
-    fn raw_start(&self, rgb: &Tensor) -> Result<Tensor> {
-        let (_, _, h, w) = rgb.dims4()?;
+    /// What the raw head corrects: offset 0, σ of 0.6 px, no rotation, the pixel's own
+    /// colour (or mid-grey).
+    fn start(&self) -> Start {
         let d = sh_coefficients(self.config.primaries.sh_degree);
-        let shape = [0.0, 0.0, SCALE_BIAS, SCALE_BIAS, SCALE_BIAS, 0.0, 0.0, 0.0, 1.0];
-        let shape = Tensor::new(&shape, rgb.device())?.reshape((1, 1, 9))?;
-        let mut parts = vec![shape.broadcast_as((1, h * w, 9))?.contiguous()?];
-        let colour = match self.config.pixel_colour {
-            true => ((rgb - 0.5)? / C0)?,
-            false => rgb.zeros_like()?,
-        };
-        let rest = Tensor::zeros((1, h * w, d - 1), rgb.dtype(), rgb.device())?;
-        for c in 0..3 {
-            parts.push(colour.narrow(1, c, 1)?.reshape((1, h * w, 1))?);
-            if d > 1 {
-                parts.push(rest.clone());
-            }
+        let mut row = vec![0.0; 9 + 3 * d];
+        row[2..5].fill(SCALE_BIAS);
+        row[8] = 1.0;
+        let colour = [9, 9 + d, 9 + 2 * d];
+        Start {
+            row,
+            colour: self.config.pixel_colour.then_some((
+                colour,
+                (1.0 / C0) as f32,
+                (-0.5 / C0) as f32,
+            )),
+            confident: self.config.confidence_opacity,
         }
-        Tensor::cat(&parts, 2)
     }
 
     /// Candidate index to distance along the unit ray, `[B, V, H·W, 1]`.
     fn ray_distance(&self, views: &Views, index: &Tensor) -> Result<Tensor> {
         let (b, v, _, h, w) = views.images.dims5()?;
-        let steps = (self.config.depth_candidates - 1) as f64;
-        let mut out = Vec::with_capacity(b * v);
-        for (i, (camera, &(near, far))) in
-            views.cameras.iter().flatten().zip(views.near_far.iter().flatten()).enumerate()
-        {
-            let (lo, hi) = (1.0 / f64::from(far), 1.0 / f64::from(near));
-            let disparity = index.narrow(0, i, 1)?.affine((hi - lo) / steps, lo)?;
-            let lengths = Tensor::from_vec(ray_lengths(camera), (1, 1, h, w), index.device())?;
-            out.push((lengths / disparity)?.reshape((1, h * w, 1))?);
-        }
-        Tensor::cat(&out, 0)?.reshape((b, v, h * w, 1))
+        let steps = (self.config.depth_candidates - 1) as f32;
+        let range = |&(near, far): &(f32, f32)| {
+            let (low, high) = (1.0 / far, 1.0 / near);
+            (low, (high - low) / steps)
+        };
+        let ranges = views.near_far.iter().flatten().map(range).collect();
+        let lengths = views.cameras.iter().flatten().flat_map(ray_lengths).collect();
+        ray_distance(index, ranges, lengths)?.reshape((b, v, h * w, 1))
+    }
+}
+
+/// All rows as one tensor; no copy where they are one already.
+fn whole(mut parts: Vec<Tensor>) -> Result<Tensor> {
+    match parts.len() {
+        1 => Ok(parts.swap_remove(0)),
+        _ => Tensor::cat(&parts, 0),
     }
 }
 

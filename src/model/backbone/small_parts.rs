@@ -1,16 +1,16 @@
 //! Parts of the small backbone: 3-D stem, U-Net, convex upsampling.
 
-use crate::model::layers::{
-    Conv2d, ConvShape, GroupNorm, default_init, gelu, softmax, upsample_nearest,
-};
+use crate::model::layers::{Activation, Conv2d, ConvShape, GroupNorm, default_init, gelu};
 use crate::ops::conv2d::conv2d;
 use crate::ops::conv3d::conv3d;
-use candle_core::{D, Result, Tensor};
+use crate::ops::join::join;
+use crate::ops::small::upsample_convex;
+use candle_core::{Result, Tensor};
 use candle_nn::{Init, VarBuilder};
 
 /// GELU(GroupNorm(conv x)).
 pub(super) fn conv_norm_gelu(x: &Tensor, layer: &(Conv2d, GroupNorm)) -> Result<Tensor> {
-    gelu(&layer.1.forward(&layer.0.forward(x)?)?)
+    layer.1.forward_then(&layer.0.forward(x)?, Activation::Gelu)
 }
 
 /// Edge pixels repeated once on every side of `[B, C, h, w]`.
@@ -124,7 +124,7 @@ impl Unet {
             skips.push(std::mem::replace(&mut x, next));
         }
         for (block, skip) in self.up.iter().zip(&skips).rev() {
-            x = block.forward(&Tensor::cat(&[skip, &upsample_nearest(&x, 2)?], 1)?)?;
+            x = block.forward(&join(skip, &x, 2)?)?;
         }
         Ok(x)
     }
@@ -150,30 +150,20 @@ impl ConvexUpsampling {
         })
     }
 
-    /// `[B, h, w, 16, 9]`: shares of the nine coarse pixels for each fine one.
-    pub(super) fn mask(&self, deep: &Tensor, rgb: &Tensor) -> Result<Tensor> {
+    /// `maps`, each `[B, 1, h, w]`, to `[B, 1, 4h, 4w]` under the mask that `deep`
+    /// `[B, C, h, w]` and the picture `rgb` `[B, 3, 4h, 4w]` give.
+    pub(super) fn apply(
+        &self,
+        deep: &Tensor,
+        rgb: &Tensor,
+        maps: [&Tensor; 2],
+    ) -> Result<[Tensor; 2]> {
         let (b, _, h, w) = deep.dims4()?;
         // The picture's 4×4 blocks as channels.
         let blocks = rgb.reshape(&[b, 3, h, 4, w, 4][..])?.permute([0, 1, 3, 5, 2, 4])?;
         let blocks = (blocks.contiguous()?.reshape((b, 48, h, w))? - 0.5)?;
-        let hidden = gelu(&self.hidden.forward(&Tensor::cat(&[deep, &blocks], 1)?)?)?;
-        let logits = self.mask.forward(&hidden)?.reshape((b, 16, 9, h * w))?;
-        let logits = logits.permute((0, 3, 1, 2))?.contiguous()?;
-        let start = Tensor::from_vec(bilinear_shares(), (1, 1, 16, 9), deep.device())?;
-        softmax(&logits.broadcast_add(&start.log()?)?)?.reshape((b, h, w, 16, 9))
-    }
-
-    /// `[B, 1, h, w]` to `[B, 1, 4h, 4w]` under a mask.
-    pub(super) fn apply(&self, mask: &Tensor, x: &Tensor) -> Result<Tensor> {
-        let (b, _, h, w) = x.dims4()?;
-        let padded = pad_edge(x)?;
-        let mut around = Vec::with_capacity(9);
-        for k in 0..9 {
-            around.push(padded.narrow(2, k / 3, h)?.narrow(3, k % 3, w)?.reshape((b, h, w, 1, 1))?);
-        }
-        let fine = mask.broadcast_mul(&Tensor::cat(&around, 4)?)?.sum(D::Minus1)?;
-        let fine = fine.reshape(&[b, h, w, 4, 4][..])?.permute([0, 1, 3, 2, 4])?;
-        fine.contiguous()?.reshape((b, 1, 4 * h, 4 * w))
+        let hidden = gelu(&self.hidden.forward(&join(deep, &blocks, 1)?)?)?;
+        upsample_convex(&self.mask.forward(&hidden)?, maps, &bilinear_shares())
     }
 }
 

@@ -2,10 +2,13 @@
 //! convolution, one residual block per level, and attention across the views of a
 //! scene at the lowest level. Rows (v b).
 
-use crate::model::layers::{Conv2d, ConvShape, GroupNorm, default_init, silu, upsample_nearest};
+use crate::model::layers::{
+    Activation, Conv2d, ConvShape, GroupNorm, default_init, upsample_nearest,
+};
 use crate::model::trace::Trace;
 use crate::ops::attention::attention;
 use crate::ops::conv2d::conv2d;
+use crate::ops::join::join;
 use candle_core::{Result, Tensor};
 use candle_nn::VarBuilder;
 
@@ -112,7 +115,7 @@ impl UNet {
         }
         for (i, up) in self.up.iter().enumerate() {
             let joined = match skips.pop() {
-                Some(skip) => Tensor::cat(&[&x, &skip], 1)?,
+                Some(skip) => join(&x, &skip, 1)?,
                 None => x,
             };
             x = up.block.forward(&joined)?;
@@ -124,7 +127,7 @@ impl UNet {
             }
             trace.put(&format!("{name}.output_blocks.{i}"), &x)?;
         }
-        let x = silu(&self.out.1.forward(&self.out.0.forward(&x)?)?)?;
+        let x = self.out.1.forward_then(&self.out.0.forward(&x)?, Activation::Silu)?;
         trace.put(&format!("{name}.out"), &x)?;
         Ok(x)
     }
@@ -157,8 +160,8 @@ impl ResBlock {
     }
 
     fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        let h = silu(&self.norm1.forward(&self.conv1.forward(x)?)?)?;
-        let h = silu(&self.norm2.forward(&self.conv2.forward(&h)?)?)?;
+        let h = self.norm1.forward_then(&self.conv1.forward(x)?, Activation::Silu)?;
+        let h = self.norm2.forward_then(&self.conv2.forward(&h)?, Activation::Silu)?;
         match &self.skip {
             Some(skip) => skip.forward(x)? + h,
             None => x + h,

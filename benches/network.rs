@@ -1,0 +1,213 @@
+//! The whole network: a training step of the small backbone, photographs to a picture
+//! with either backbone, where MVSplat's time goes, and with `--onnxruntime` the same
+//! backbone and the same operators in onnxruntime, in the same run:
+//!
+//! ```text
+//! tools/witness/setup.sh
+//! cargo bench --bench network -- --onnxruntime
+//! ```
+//!
+//! `SUBSPLAT_PYTHON` names another interpreter than `out/witness-venv/bin/python`.
+
+mod common;
+#[path = "network/ops.rs"]
+mod ops;
+#[path = "network/rival.rs"]
+mod rival;
+
+use anyhow::{Context, Result, bail};
+use candle_core::Tensor;
+use common::{Bench, Contender, Threads, inputs, scene};
+use rival::Rival;
+use std::collections::BTreeMap;
+use std::time::Instant;
+use subsplat::config::{Config, Mvsplat as Settings, Preset, Small};
+use subsplat::io::image::Rgb;
+use subsplat::model::Views;
+use subsplat::model::backbone::{Mvsplat, SmallBackbone};
+use subsplat::model::trace::Trace;
+use subsplat::model::weights::Weights;
+use subsplat::pipeline::{Photo, Reconstructor, Request};
+use subsplat::render::render;
+
+fn main() -> Result<()> {
+    let words: Vec<String> = std::env::args().collect();
+    if let Some(at) = words.iter().position(|w| w == "--peak") {
+        return peak_of(words.get(at + 1).map_or("", String::as_str));
+    }
+    let mut bench = Bench::new("network")?;
+    training_step(&mut bench)?;
+    for case in CASES {
+        let name = format!("photographs to picture, {case}");
+        if bench.wants(&name) {
+            let mut run = whole(case)?;
+            bench.group(
+                &name,
+                vec![Contender::new("ours", Threads::All, move || run().map(drop))],
+                "",
+            )?;
+        }
+    }
+    if bench.wants("stages") {
+        bench.on_all(stages)?;
+    }
+    if bench.args.onnxruntime {
+        let rival = Rival::find(bench.threads(), bench.args.quick)?;
+        if bench.wants("operators") {
+            ops::compare(&mut bench, &rival)?;
+        }
+        if bench.wants("backbones") {
+            rival::compare(&bench, &rival)?;
+        }
+        return Ok(());
+    }
+    bench.finish()
+}
+
+/// `batch` scenes of two pictures.
+fn views(batch: usize, side: usize) -> Result<Views> {
+    let cameras = scene::views(side).to_vec();
+    let images = (inputs::tensor(&[batch, 2, 3, side, side], 0.2, 7)? + 0.5)?.clamp(0.0, 1.0)?;
+    Ok(Views::new(images, vec![cameras; batch], vec![vec![(1.0, 100.0); 2]; batch])?)
+}
+
+/// Forward, a loss of every output, backward: 128², batch 4, without rendering.
+fn training_step(bench: &mut Bench) -> Result<()> {
+    let name = "small training step 128 batch 4";
+    if !bench.wants(name) {
+        return Ok(());
+    }
+    // As a training does.
+    subsplat::cpu::memory::keep_freed();
+    let weights = Weights::seeded(3).trainable();
+    let net = SmallBackbone::new(&Small::standard(), weights.builder().pp("small"))?;
+    // The untrained start closes most branches.
+    for (n, var) in weights.variables().values().enumerate() {
+        let nudge = inputs::tensor(var.dims(), 0.02, n as u64)?;
+        var.set(&(var.as_tensor() + nudge)?)?;
+    }
+    let v = views(4, 128)?;
+    let forward = || -> Result<()> {
+        std::hint::black_box(net.forward(&v, true)?);
+        Ok(())
+    };
+    let supervised = || -> Result<()> {
+        let (_, maps) = net.forward(&v, true)?;
+        let loss = (maps.logits.sqr()?.mean_all()? + maps.index.sqr()?.mean_all()?)?;
+        let loss = (loss + maps.confidence.sqr()?.mean_all()?)?;
+        std::hint::black_box(loss.backward()?);
+        Ok(())
+    };
+    let step = || -> Result<()> {
+        let (out, maps) = net.forward(&v, true)?;
+        let loss = (out.raw.sqr()?.mean_all()? + out.depths.recip()?.mean_all()?)?;
+        let loss = (loss + out.densities.sqr()?.mean_all()?)?;
+        let loss = (loss + (maps.logits.sqr()?.mean_all()? + maps.index.sqr()?.mean_all()?)?)?;
+        std::hint::black_box(loss.backward()?);
+        Ok(())
+    };
+    let contenders = vec![
+        Contender::new("all outputs, with backward", Threads::All, step),
+        Contender::new("depth losses, with backward", Threads::All, supervised),
+        Contender::new("forward alone", Threads::All, forward),
+    ];
+    bench.group(name, contenders, "")
+}
+
+/// Backbone, input side and output side.
+const CASES: [&str; 5] = [
+    "small 256 to 512",
+    "mvsplat 256 to 512",
+    "mvsplat 256 to 1024",
+    "mvsplat 512 to 1024",
+    "mvsplat backbone 512",
+];
+
+fn photo(side: usize, view: usize) -> Result<Photo> {
+    let planes = inputs::tensor(&[3, side / 4, side / 4], 0.25, 40 + view as u64)?;
+    let planes = subsplat::ops::resize::resize_bilinear(&planes.unsqueeze(0)?, side, side)?;
+    let rows = planes.squeeze(0)?.permute((1, 2, 0))?.flatten_all()?.to_vec1::<f32>()?;
+    let data = rows.iter().map(|v| (255.0 * (v + 0.5).clamp(0.0, 1.0)) as u8).collect();
+    let camera = scene::views(side)[view];
+    Ok(Photo { image: Rgb { width: side, height: side, data }, camera })
+}
+
+type Run = Box<dyn FnMut() -> Result<f64> + Send>;
+
+/// What one of [`CASES`] does, decoding aside.
+fn whole(case: &str) -> Result<Run> {
+    let words: Vec<&str> = case.split(' ').collect();
+    if let ["mvsplat", "backbone", side] = words[..] {
+        let (net, v) = (backbone()?, views(1, side.parse()?)?);
+        return Ok(Box::new(move || {
+            let out = net.forward(&v, &mut Trace::off())?;
+            Ok(f64::from(out.depths.mean_all()?.to_scalar::<f32>()?))
+        }));
+    }
+    let [kind, from, "to", to] = words[..] else { bail!("no case {case:?}") };
+    let (from, to): (usize, usize) = (from.parse()?, to.parse()?);
+    let config = match kind {
+        "small" => Config::small(Preset::Tuned, to / from),
+        _ => Config::re10k(Preset::Tuned, to / from),
+    };
+    let model = Reconstructor::untrained(&config, 3)?;
+    let photos = [photo(to, 0)?, photo(to, 1)?];
+    let request = Request { input_size: (from, from), ..Request::default() };
+    let camera = scene::camera(to);
+    Ok(Box::new(move || {
+        let out = model.reconstruct(&photos, &request)?;
+        let options = model.raster_options(1.0);
+        let picture = render(&out.splats, &camera, &options);
+        Ok(f64::from(picture.rgb.iter().sum::<f32>()))
+    }))
+}
+
+/// MVSplat of the released size, seeded.
+fn backbone() -> Result<Mvsplat> {
+    Ok(Mvsplat::new(&Settings::re10k(), Weights::seeded(3).builder())?)
+}
+
+/// Seconds between the stages that MVSplat's backbone announces, summed by the first two
+/// parts of their names; second of two runs.
+fn stages() -> Result<()> {
+    let (net, v) = (backbone()?, views(1, 256)?);
+    let mut table = BTreeMap::<String, f64>::new();
+    for _ in 0..2 {
+        table.clear();
+        let mut last = Instant::now();
+        let mut look = |name: &str, _: &Tensor| {
+            let parts: Vec<&str> = name.split('.').take(2).collect();
+            *table.entry(parts.join(".")).or_default() += last.elapsed().as_secs_f64();
+            last = Instant::now();
+            Ok(())
+        };
+        net.forward(&v, &mut Trace::to(&mut look))?;
+    }
+    let total: f64 = table.values().sum();
+    println!("\nstages of MVSplat's backbone, 256² (observed, so a little slower than alone)");
+    for (name, seconds) in &table {
+        println!("  {name:<40} {:>9.1} ms {:>5.1}%", 1e3 * seconds, 100.0 * seconds / total);
+    }
+    println!("  {:<40} {:>9.1} ms", "all", 1e3 * total);
+    Ok(())
+}
+
+/// One of [`CASES`], or the backbone at 256², once, in this process; prints its peak
+/// memory in bytes.
+fn peak_of(case: &str) -> Result<()> {
+    let sum = whole(case)?()?;
+    let status = std::fs::read_to_string("/proc/self/status").context("peak memory")?;
+    let line = status.lines().find(|l| l.starts_with("VmHWM:")).context("peak memory: no VmHWM")?;
+    let kib: f64 = line.split_whitespace().nth(1).context("peak memory")?.parse()?;
+    println!("{} {sum}", 1024.0 * kib);
+    Ok(())
+}
+
+/// Peak memory of `case` in a process of its own, bytes.
+fn peak(case: &str) -> Result<f64> {
+    let out =
+        std::process::Command::new(std::env::current_exe()?).args(["--peak", case]).output()?;
+    let said = String::from_utf8_lossy(&out.stdout);
+    let bytes = said.split_whitespace().next().context("the child said nothing")?;
+    bytes.parse().with_context(|| format!("{case}: {}", String::from_utf8_lossy(&out.stderr)))
+}

@@ -1,0 +1,70 @@
+//! Channels of one map beside those of a coarser one, each coarse pixel repeated.
+
+use rayon::prelude::*;
+
+/// Sizes: `[B, C₁, h, w]` beside `[B, C₂, h/s, w/s]` gives `[B, C₁ + C₂, h, w]`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Join {
+    /// C₁, C₂.
+    pub channels: [usize; 2],
+    /// h, w.
+    pub size: [usize; 2],
+    /// s: how often a coarse pixel is repeated along either side.
+    pub repeat: usize,
+}
+
+impl Join {
+    fn plane(&self) -> usize {
+        self.size[0] * self.size[1]
+    }
+}
+
+/// Both maps into `y`.
+pub fn forward(j: &Join, fine: &[f32], coarse: &[f32], y: &mut [f32]) {
+    let (n, [c1, c2], s, w) = (j.plane(), j.channels, j.repeat, j.size[1]);
+    let small = n / (s * s);
+    y.par_chunks_exact_mut(n).enumerate().for_each(|(i, y)| {
+        let (b, c) = (i / (c1 + c2), i % (c1 + c2));
+        if c < c1 {
+            return y.copy_from_slice(&fine[(b * c1 + c) * n..][..n]);
+        }
+        let x = &coarse[(b * c2 + c - c1) * small..][..small];
+        if s == 1 {
+            return y.copy_from_slice(x);
+        }
+        for (x, y) in x.chunks_exact(w / s).zip(y.chunks_exact_mut(s * w)) {
+            let (first, others) = y.split_at_mut(w);
+            for (x, y) in x.iter().zip(first.chunks_exact_mut(s)) {
+                y.fill(*x);
+            }
+            others.chunks_exact_mut(w).for_each(|row| row.copy_from_slice(first));
+        }
+    });
+}
+
+/// The fine map's gradient.
+pub fn backward_fine(j: &Join, dy: &[f32], dx: &mut [f32]) {
+    let (n, [c1, c2]) = (j.plane(), j.channels);
+    dx.par_chunks_exact_mut(n).enumerate().for_each(|(i, dx)| {
+        dx.copy_from_slice(&dy[(i / c1 * (c1 + c2) + i % c1) * n..][..n]);
+    });
+}
+
+/// The coarse map's gradient.
+pub fn backward_coarse(j: &Join, dy: &[f32], dx: &mut [f32]) {
+    let (n, [c1, c2], s, w) = (j.plane(), j.channels, j.repeat, j.size[1]);
+    dx.par_chunks_exact_mut(n / (s * s)).enumerate().for_each(|(i, dx)| {
+        let dy = &dy[(i / c2 * (c1 + c2) + c1 + i % c2) * n..][..n];
+        if s == 1 {
+            return dx.copy_from_slice(dy);
+        }
+        dx.fill(0.0);
+        for (dx, dy) in dx.chunks_exact_mut(w / s).zip(dy.chunks_exact(s * w)) {
+            for row in dy.chunks_exact(w) {
+                for (dx, dy) in dx.iter_mut().zip(row.chunks_exact(s)) {
+                    *dx += dy.iter().sum::<f32>();
+                }
+            }
+        }
+    });
+}

@@ -1,0 +1,136 @@
+//! Expected candidate of a softmax over candidates, and the probability near its mode.
+//!
+//! Logits `[B, D, n]`, out `[2, B, n]`: the mean of k under p = softmax(logits), and
+//! the mass Σ p over |k − mode| ≤ window. The mean is over all candidates, or over the
+//! window alone (divided by its mass). The mode is a constant to gradients.
+
+use crate::cpu::math::{exp, vectorised};
+use rayon::prelude::*;
+
+/// Pixels that a loop handles at once.
+const LANES: usize = 16;
+
+/// Sizes and rules.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Expectation {
+    /// D.
+    pub candidates: usize,
+    /// n: pixels of a map.
+    pub pixels: usize,
+    /// Half-width of the window around the mode, in candidates.
+    pub window: usize,
+    /// Whether the mean is over the window alone.
+    pub windowed: bool,
+}
+
+/// What the softmax of one pixel comes down to.
+#[derive(Clone, Copy, Debug, Default)]
+struct Pixel {
+    /// Largest logit, and 1 / Σ e^{logit − max}.
+    max: f32,
+    inverse: f32,
+    /// First candidate with the largest logit.
+    mode: f32,
+    mean: f32,
+    mass: f32,
+}
+
+impl Expectation {
+    /// Up to [`LANES`] pixels from `at` of one map's `logits` `[D, n]`.
+    #[inline(always)]
+    fn pixels(&self, logits: &[f32], at: usize, count: usize) -> [Pixel; LANES] {
+        let (n, d) = (self.pixels, self.candidates);
+        let row = |k: usize| -> [f32; LANES] {
+            let from = &logits[k * n + at..][..count];
+            match from.try_into() {
+                Ok(whole) => whole,
+                Err(_) => std::array::from_fn(|l| from.get(l).copied().unwrap_or(0.0)),
+            }
+        };
+        let (mut max, mut mode) = ([f32::NEG_INFINITY; LANES], [0f32; LANES]);
+        for k in 0..d {
+            let x = row(k);
+            for l in 0..LANES {
+                mode[l] = if x[l] > max[l] { k as f32 } else { mode[l] };
+                max[l] = if x[l] > max[l] { x[l] } else { max[l] };
+            }
+        }
+        let reach = self.window as f32 + 0.5;
+        let (mut all, mut near) = ([0f32; LANES], [0f32; LANES]);
+        let (mut first, mut first_near) = ([0f32; LANES], [0f32; LANES]);
+        for k in 0..d {
+            let x = row(k);
+            // From the mode, so that sums lose nothing to large indices.
+            for l in 0..LANES {
+                let e = exp(x[l] - max[l]);
+                let away = k as f32 - mode[l];
+                let inside = if away.abs() <= reach { e } else { 0.0 };
+                all[l] += e;
+                near[l] += inside;
+                first[l] += away * e;
+                first_near[l] += away * inside;
+            }
+        }
+        std::array::from_fn(|l| {
+            let inverse = 1.0 / all[l];
+            let away = if self.windowed { first_near[l] / near[l] } else { first[l] * inverse };
+            let (mean, mass) = (mode[l] + away, near[l] * inverse);
+            Pixel { max: max[l], inverse, mode: mode[l], mean, mass }
+        })
+    }
+}
+
+/// Mean and mass.
+pub fn forward(e: &Expectation, logits: &[f32], out: &mut [f32]) {
+    let (n, d) = (e.pixels, e.candidates);
+    let (means, masses) = out.split_at_mut(out.len() / 2);
+    let maps = means.par_chunks_exact_mut(n).zip(masses.par_chunks_exact_mut(n));
+    maps.zip(logits.par_chunks_exact(d * n)).for_each(|((means, masses), logits)| {
+        let parts = means.par_chunks_mut(LANES).zip(masses.par_chunks_mut(LANES));
+        parts.enumerate().with_min_len(8).for_each(|(i, (means, masses))| {
+            let pixels = vectorised(
+                #[inline(always)]
+                || e.pixels(logits, i * LANES, means.len()),
+            );
+            for ((mean, mass), p) in means.iter_mut().zip(masses).zip(pixels) {
+                (*mean, *mass) = (p.mean, p.mass);
+            }
+        });
+    });
+}
+
+/// Gradient of the logits for `grad` `[2, B, n]`.
+pub fn backward(e: &Expectation, logits: &[f32], grad: &[f32], out: &mut [f32]) {
+    let (n, d) = (e.pixels, e.candidates);
+    let (d_means, d_masses) = grad.split_at(grad.len() / 2);
+    let mut pixels = vec![Pixel::default(); d_means.len()];
+    pixels.par_chunks_exact_mut(n).zip(logits.par_chunks_exact(d * n)).for_each(|(all, logits)| {
+        all.par_chunks_mut(LANES).enumerate().with_min_len(8).for_each(|(i, part)| {
+            let found = vectorised(
+                #[inline(always)]
+                || e.pixels(logits, i * LANES, part.len()),
+            );
+            let count = part.len();
+            part.copy_from_slice(&found[..count]);
+        });
+    });
+    // dp/dlogit: p·(c_k − Σ p·c), c_k the gradient with respect to p_k.
+    let reach = e.window as f32 + 0.5;
+    out.par_chunks_exact_mut(n).enumerate().for_each(|(plane, out)| {
+        let (b, k) = (plane / d, (plane % d) as f32);
+        let (pixels, x) = (&pixels[b * n..(b + 1) * n], &logits[plane * n..(plane + 1) * n]);
+        let grads = d_means[b * n..(b + 1) * n].iter().zip(&d_masses[b * n..(b + 1) * n]);
+        vectorised(
+            #[inline(always)]
+            || {
+                for (((out, x), p), (g, m)) in out.iter_mut().zip(x).zip(pixels).zip(grads) {
+                    let inside = if (k - p.mode).abs() <= reach { 1.0 } else { 0.0 };
+                    let share = exp(x - p.max) * p.inverse;
+                    let of_mean =
+                        if e.windowed { inside * (k - p.mean) / p.mass } else { k - p.mean };
+                    *out = share * (of_mean * g + (inside - p.mass) * m);
+                }
+            },
+        );
+    });
+}

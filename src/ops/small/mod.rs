@@ -1,0 +1,16 @@
+//! The small backbone's own parts as candle ops with gradients. Kernels:
+//! [`crate::cpu::small`]. Tests: `tests.rs` here, against tensor operations and finite
+//! differences.
+
+mod convex;
+mod expectation;
+mod heads;
+mod unit;
+
+pub use convex::upsample_convex;
+pub use expectation::{expectation, lift};
+pub use heads::{Start, head_input, head_output, ray_distance};
+pub use unit::unit_channels;
+
+#[cfg(test)]
+mod tests;
