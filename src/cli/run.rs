@@ -55,10 +55,10 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     })?;
     let reports = match args.no_check {
         true => Vec::new(),
-        false => progress.stage("check", |_| range::check(&photos))?,
+        false => progress.stage("check", |_| pipeline::check_photos(&photos))?,
     };
     range::tell(&reports);
-    let range = range::refine(guess, given, &reports);
+    let range = pipeline::refine_range(guess, given, &reports);
     say(format!("near {:.4}, far {:.4}: {}", range.near, range.far, range.reason));
     let request = Request {
         input_size: plan.input_size,
