@@ -279,9 +279,8 @@ mod tests {
     #[test]
     fn the_mean_gradient_of_a_ramp_is_its_slope() {
         // 0.01 a column and 0.02 a row, clipped nowhere; 12·9 and 13·8 neighbours.
-        let ramp: Vec<f32> = (0..13 * 9 * 3)
-            .map(|i| 0.01 * (i / 3 % 13) as f32 + 0.02 * (i / 39) as f32)
-            .collect();
+        let ramp: Vec<f32> =
+            (0..13 * 9 * 3).map(|i| 0.01 * (i / 3 % 13) as f32 + 0.02 * (i / 39) as f32).collect();
         let expected = (108.0 * 0.01 + 104.0 * 0.02) / 212.0;
         assert!((mean_gradient(&ramp, 13, 9).unwrap() - expected).abs() < 1e-7);
         let over: Vec<f32> = ramp.iter().map(|v| 2.0 + v).collect();
