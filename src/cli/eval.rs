@@ -6,6 +6,7 @@ use super::report::{Answer, Progress, mebibytes, peak_memory_bytes, say, warn};
 use super::{frames, memory, model};
 use anyhow::{Context, Result, ensure};
 use serde_json::{Value, json};
+use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::Path;
 use subsplat::data::crop::{CropRule, LrFrom};
@@ -234,10 +235,22 @@ fn tell(scores: &Scores, upscale: usize, answer: Answer) {
         scores.cases.len(),
         scenes.len()
     ));
+    answer.line(sizes(scores));
     answer.line(&head);
     for method in &scores.methods {
         answer.line(line(method, scores.mean(method)));
     }
+}
+
+/// Sizes of inputs and targets: `128x128 to 256x256 (14 cases), …`.
+fn sizes(scores: &Scores) -> String {
+    let mut counts: BTreeMap<[(usize, usize); 2], usize> = BTreeMap::new();
+    scores.cases.iter().for_each(|c| *counts.entry(c.sizes).or_default() += 1);
+    let one = |(&[(w, h), (to_w, to_h)], count): (&[(usize, usize); 2], &usize)| {
+        let plural = if *count == 1 { "" } else { "s" };
+        format!("{w}x{h} to {to_w}x{to_h} ({count} case{plural})")
+    };
+    counts.iter().map(one).collect::<Vec<_>>().join(", ")
 }
 
 fn protocol(args: &EvalArgs, options: &Options, model: Option<&Reconstructor>) -> Value {
@@ -279,9 +292,10 @@ fn write(
     };
     let mut notes = vec![
         format!(
-            "{targets} targets of {} cases; target over input x{}; {weights}; LPIPS: {}.",
+            "{targets} targets of {} cases; target over input x{}, {}; {weights}; LPIPS: {}.",
             scores.cases.len(),
             text("upscale"),
+            sizes(scores),
             text("lpips")
         ),
         "Means are over a case's targets first, then over cases. Sharpness is the mean absolute \

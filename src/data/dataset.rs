@@ -38,17 +38,13 @@ const KEY_EXAMPLE: u64 = 2;
 /// A picture and its camera.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Posed {
-    /// `[3, H, W]`, RGB in [0, 1], rows from the top.
-    pub planes: Vec<f32>,
-    /// Its camera; H and W are the intrinsics' own.
+    /// Display values.
+    pub image: Rgb,
+    /// Pinhole camera of these pixels.
     pub camera: Camera,
 }
 
 impl Posed {
-    fn new(picture: &Rgb, camera: Camera) -> Self {
-        Self { planes: picture.to_planes(), camera }
-    }
-
     /// The view in a mirror: picture left to right, world and camera x negated, so that
     /// the mirrored world seen by the mirrored camera is the mirrored picture. The pose
     /// is S·E·S with S = diag(−1, 1, 1, 1) (MVSplat's augmentation); the principal point
@@ -56,12 +52,17 @@ impl Posed {
     #[must_use]
     pub fn flipped(&self) -> Self {
         let k = self.camera.intrinsics;
-        let mut planes = self.planes.clone();
-        planes.chunks_exact_mut(k.width.max(1)).for_each(<[f32]>::reverse);
+        let Rgb { width, height, .. } = self.image;
+        let mut image = Rgb::black(width, height);
+        let rows = image.data.chunks_exact_mut(3 * width.max(1));
+        for (to, from) in rows.zip(self.image.data.chunks_exact(3 * width.max(1))) {
+            let pixels = to.chunks_exact_mut(3).zip(from.chunks_exact(3).rev());
+            pixels.for_each(|(to, from)| to.copy_from_slice(from));
+        }
         let intrinsics = Intrinsics { cx: k.width as f32 - k.cx, ..k };
         let mirror = Mat4::from_scale(Vec3::new(-1.0, 1.0, 1.0));
         let world_from_camera = mirror * self.camera.world_from_camera * mirror;
-        Self { planes, camera: Camera { intrinsics, world_from_camera } }
+        Self { image, camera: Camera { intrinsics, world_from_camera } }
     }
 }
 
@@ -263,6 +264,31 @@ impl Dataset {
         Ok(example.map(|e| if flip { e.flipped() } else { e }))
     }
 
+    /// The example of `index` or, where the stream passes over it, the first after it, and
+    /// its index.
+    ///
+    /// # Errors
+    /// Those of [`Dataset::example`]; none in a whole round.
+    pub fn serve(&self, seed: u64, index: u64, step: usize) -> Result<(u64, TrainingExample)> {
+        // The one usable scene may be the first of a round and the last of the next.
+        for at in index..index + 2 * self.len() as u64 {
+            if let Some(example) = self.example(seed, at, step)? {
+                return Ok((at, example));
+            }
+        }
+        let ExampleOptions { sampler, crop, .. } = &self.options;
+        let ((w, h), r) = (crop.input_size, crop.upscale);
+        let expected = format!(
+            "a scene of more than {} frames of at least {}x{} pixels, none wider than {FOV_MAX} \
+             degrees",
+            sampler.bounds(step).0,
+            w * r,
+            h * r
+        );
+        let got = format!("none among {}", self.len());
+        Err(Error::format(&self.root, expected, got))
+    }
+
     /// The stream of `seed` from `index` on.
     pub fn stream(&self, seed: u64, index: u64) -> Stream<'_> {
         Stream { dataset: self, seed, index }
@@ -333,9 +359,9 @@ impl Dataset {
             }
             let c = crop(&photo, &camera, options)?;
             if i < frames.context.len() {
-                context.push(Posed::new(&c.input, c.input_camera));
+                context.push(Posed { image: c.input, camera: c.input_camera });
             } else {
-                targets.push(Posed::new(&c.target, c.target_camera));
+                targets.push(Posed { image: c.target, camera: c.target_camera });
             }
         }
         let name = name.to_owned();
@@ -372,26 +398,10 @@ impl Stream<'_> {
     /// The next example, passing over what [`Dataset::example`] passes over.
     ///
     /// # Errors
-    /// Those of [`Dataset::example`]; none in a whole round.
+    /// Those of [`Dataset::serve`].
     pub fn next_example(&mut self, step: usize) -> Result<TrainingExample> {
-        // The one usable scene may be the first of a round and the last of the next.
-        for _ in 0..2 * self.dataset.len() {
-            let example = self.dataset.example(self.seed, self.index, step)?;
-            self.index += 1;
-            if let Some(example) = example {
-                return Ok(example);
-            }
-        }
-        let ExampleOptions { sampler, crop, .. } = &self.dataset.options;
-        let ((w, h), r) = (crop.input_size, crop.upscale);
-        let expected = format!(
-            "a scene of more than {} frames of at least {}x{} pixels, none wider than {FOV_MAX} \
-             degrees",
-            sampler.bounds(step).0,
-            w * r,
-            h * r
-        );
-        let got = format!("none among {}", self.dataset.len());
-        Err(Error::format(&self.dataset.root, expected, got))
+        let (at, example) = self.dataset.serve(self.seed, self.index, step)?;
+        self.index = at + 1;
+        Ok(example)
     }
 }
