@@ -81,7 +81,8 @@ fn trivial_baselines_are_the_protocols() {
     };
     let mean = scores.cases.iter().map(best).sum::<f64>() / 16.0;
     println!("better of both: {mean:.2} dB");
-    assert!((mean - 13.78).abs() < 0.02, "{mean}");
+    // The prototype's report says 13.8.
+    assert!((mean - 13.8).abs() < 0.05, "{mean}");
 }
 
 /// Every method that renders, against the pipeline's own functions by hand.
@@ -134,6 +135,24 @@ fn methods_are_what_they_say() {
     for (i, want) in expected.iter().enumerate() {
         assert!((got[i] - want).abs() < 1e-6, "{}: {} {want}", methods[i].name(), got[i]);
     }
+    // Four times a pixel's middle is ¾ of it and ¼ of the neighbour's, each way.
+    let splats = alone.reconstruct(&photos, &request(false)).unwrap().splats;
+    let mut config = alone.config().clone();
+    config.upscale = 1;
+    let small = render(&splats, &truth.input_camera, &raster_options(&config, near_far.0)).rgb;
+    let mut large = Vec::new();
+    for i in 0..128usize * 128 {
+        let (x, y) = (i % 128, i / 128);
+        let beside =
+            |v: usize| if v % 2 == 0 { (v / 2).saturating_sub(1) } else { (v / 2 + 1).min(63) };
+        for c in 0..3 {
+            let at = |x: usize, y: usize| small[3 * (64 * y + x) + c];
+            let row = |y: usize| 0.75 * at(x / 2, y) + 0.25 * at(beside(x), y);
+            large.push(0.75 * row(y / 2) + 0.25 * row(beside(y)));
+        }
+    }
+    let want = psnr(&large, &truth.target.to_unit(), 128, 128).unwrap();
+    assert!((got[4] - want).abs() < 1e-4, "{} {want}", got[4]);
     // Untrained heads are closed: the model is the even split.
     assert!((got[5] - got[0]).abs() < 1e-6);
     // All others differ from one another.
@@ -229,7 +248,7 @@ impl safetensors::View for &Scalar {
 
 fn chunks(index: &str) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
-    write(&folder.path().join("test"), &[&[video("a", 6)], &[video("b", 8), video("c", 4)]]);
+    write(&folder.path().join("test"), &[&[video("m", 6)], &[video("b", 8), video("c", 4)]]);
     std::fs::write(folder.path().join("views.json"), index).unwrap();
     folder
 }
@@ -246,26 +265,26 @@ fn copying(folder: &Path, methods: &[Method]) -> Result<Scores, String> {
 fn chunks_with_an_index_are_cases() {
     let folder = chunks(
         r#"{"c": {"context": [0, 3], "target": [1, 2]}, "x": {"context": [0, 1], "target": [0]},
-            "b": null, "a": {"context": [0, 5], "target": [1, 5]}}"#,
+            "b": null, "m": {"context": [0, 5], "target": [1, 5]}}"#,
     );
     let index = folder.path().join("views.json");
     let mut data = Benchmark::open(folder.path(), Some(&index)).unwrap();
     // Chunk by chunk.
     let names = |d: &Benchmark| d.cases().iter().map(|c| c.scene.clone()).collect::<Vec<_>>();
-    assert_eq!((names(&data), data.is_chunks()), (vec!["a".to_owned(), "c".to_owned()], true));
+    assert_eq!((names(&data), data.is_chunks()), (vec!["m".to_owned(), "c".to_owned()], true));
     assert_eq!(
         data.notes(),
         ["of 4 entries of the index 1 have no views and 1 are not in the data; 2 are evaluated"]
     );
     let loaded = data.load(&data.cases()[0]).unwrap();
     assert_eq!((loaded.range.near, loaded.range.far), (1.0, 100.0));
-    assert_eq!(loaded.targets[1].image, frame(&video("a", 6), 5));
+    assert_eq!(loaded.targets[1].image, frame(&video("m", 6), 5));
     data.set_near_far(Some(0.5), None);
     assert_eq!(data.load(&data.cases()[1]).unwrap().range.near, 0.5);
     data.set_near_far(Some(500.0), None);
     assert!(data.load(&data.cases()[1]).err().unwrap().to_string().contains("near < far"));
     data.limit(1);
-    assert_eq!(names(&data), ["a"]);
+    assert_eq!(names(&data), ["m"]);
     let scores = copying(folder.path(), &[Method::Copy, Method::Mean]).unwrap();
     // Target 5 is an input: its copy is itself.
     assert_eq!(scores.cases[0].targets[1].scores[0].psnr, f64::INFINITY);
@@ -307,9 +326,9 @@ fn what_cannot_be_evaluated_is_named() {
             assert!(e.contains(word), "`{word}` is not in: {e}");
         }
     };
-    refused(r#"{"a": {"context": [0, 6], "target": [1]}}"#, &["000000.torch", "`a`", "below 6"]);
-    refused(r#"{"a": {"context": [0], "target": [1]}}"#, &["scene a", "at least 2 context"]);
-    refused(r#"{"a": {"context": [0, 1], "target": []}}"#, &["scene a", "a target"]);
+    refused(r#"{"m": {"context": [0, 6], "target": [1]}}"#, &["000000.torch", "`m`", "below 6"]);
+    refused(r#"{"m": {"context": [0], "target": [1]}}"#, &["scene m", "at least 2 context"]);
+    refused(r#"{"m": {"context": [0, 1], "target": []}}"#, &["scene m", "a target"]);
     refused(r#"{"x": {"context": [0, 1], "target": [2]}}"#, &["scenes that", "views.json", "none"]);
     refused("[]", &["views.json", "an evaluation index"]);
     let folder = chunks("{}");
