@@ -26,8 +26,8 @@ pub struct EvalArgs {
     /// test/index.json), a scene, or a folder of scenes with protocol.json.
     #[arg(value_name = "DATA")]
     pub data: PathBuf,
-    /// Evaluation index of MVSplat's form, {scene: {context, target} or null}; scenes
-    /// without it use their protocol.json.
+    /// Evaluation index of MVSplat's form, {scene: {context, target} or null}. Scenes need
+    /// none: without, their protocol.json says it.
     #[arg(long, value_name = "FILE")]
     pub index: Option<PathBuf>,
     /// Folder for eval.json, targets.csv, means.csv, index.html and the pictures

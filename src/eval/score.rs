@@ -128,7 +128,7 @@ mod tests {
             enlarged: false,
             targets: values.iter().map(|v| target(*v)).collect(),
         };
-        let cases = vec![case("a", &[10.0]), case("a", &[20.0, 20.0]), case("b", &[30.0])];
+        let cases = vec![case("a", &[10.0]), case("a", &[10.0, 30.0]), case("b", &[30.0])];
         let all = Scores { methods: vec!["x".into(), "y".into()], cases };
         assert_eq!(all.mean("y").unwrap().psnr, 20.0);
         assert_eq!(all.mean("x").unwrap().psnr, 0.0);
