@@ -27,7 +27,7 @@
 //! ```
 //!
 //! Where to look: [`pipeline`] is the whole path in one call; [`render()`] draws any
-//! [`splats::Splats`], [`rasterize`] does so with gradients; [`io`] reads and writes files; [`check`] judges poses;
+//! [`splats::Splats`], [`rasterize`] does so with gradients; [`io`] reads and writes files; [`check`] judges poses; [`eval`] scores methods;
 //! [`model`] is the network, its parts usable one by one, configured by
 //! [`config::Config`]; [`ops`] are the same kernels as candle ops. Every geometric
 //! convention is said once, in [`camera`].
@@ -40,6 +40,7 @@ pub mod check;
 pub mod config;
 pub mod cpu;
 pub mod data;
+pub mod eval;
 pub mod io;
 pub mod metrics;
 pub mod model;

@@ -188,6 +188,27 @@ pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize) -> Result<f64, Me
     Ok(total / counted as f64)
 }
 
+/// Mean absolute difference of neighbouring pixels, over both directions and the three
+/// channels, the picture clipped to [0, 1] first: the ratio of two pictures' values says
+/// how sharp one is beside the other.
+///
+/// # Errors
+/// A length that does not fit `width`×`height`, a side below 2, NaN or infinite values.
+pub fn mean_gradient(picture: &[f32], width: usize, height: usize) -> Result<f64, MetricsError> {
+    check(picture, picture, width, height, 2)?;
+    let stride = width * 3;
+    let apart = |(a, b): (&f32, &f32)| f64::from((a.clamp(0.0, 1.0) - b.clamp(0.0, 1.0)).abs());
+    let sum = |a: &[f32], b: &[f32]| a.iter().zip(b).map(apart).sum::<f64>();
+    let rows = |y: usize| {
+        let row = &picture[y * stride..][..stride];
+        let below = picture.get((y + 1) * stride..).map_or(&[][..], |rest| rest);
+        sum(row, &row[3..]) + sum(row, below)
+    };
+    let total: f64 = (0..height).into_par_iter().map(rows).collect::<Vec<_>>().iter().sum();
+    let pairs = 3 * ((width - 1) * height + width * (height - 1));
+    Ok(total / pairs as f64)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -253,6 +274,18 @@ mod tests {
             assert!((got - naive_ssim(&a, &b, w, h)).abs() < 1e-12);
             assert!((ssim(&a, &a, w, h).unwrap() - 1.0).abs() < 1e-12);
         }
+    }
+
+    #[test]
+    fn the_mean_gradient_of_a_ramp_is_its_slope() {
+        // 0.01 a column and 0.02 a row, clipped nowhere; 12·9 and 13·8 neighbours.
+        let ramp: Vec<f32> =
+            (0..13 * 9 * 3).map(|i| 0.01 * (i / 3 % 13) as f32 + 0.02 * (i / 39) as f32).collect();
+        let expected = (108.0 * 0.01 + 104.0 * 0.02) / 212.0;
+        assert!((mean_gradient(&ramp, 13, 9).unwrap() - expected).abs() < 1e-7);
+        let over: Vec<f32> = ramp.iter().map(|v| 2.0 + v).collect();
+        assert_eq!(mean_gradient(&over, 13, 9).unwrap(), 0.0);
+        assert!(mean_gradient(&ramp, 13, 8).is_err() && mean_gradient(&[0.0; 3], 1, 1).is_err());
     }
 
     #[test]

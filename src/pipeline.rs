@@ -14,9 +14,11 @@
 
 use crate::abi::RasterOptions;
 use crate::camera::Camera;
+use crate::check::{CheckOptions, GrayImage, PairReport, Verdict, check_pair};
 use crate::config::{Backbone, Config, ConfigError, Preset};
 use crate::cpu::detail::{Photograph, SourceView, residuals, with_residuals};
 use crate::data::crop::{CropOptions, Cropped, crop};
+use crate::data::depth::DepthRange;
 use crate::io;
 use crate::io::image::{Depth, Rgb};
 use crate::io::scene::Frame;
@@ -236,41 +238,43 @@ impl Reconstructor {
         warnings.dedup();
         if request.detail {
             clock.begin("detail");
-            self.add_detail(&mut splats, &inputs)?;
+            add_detail(&mut splats, &inputs, self.config().upscale)?;
         }
         let depths =
             inputs.iter().zip(depths).map(|(c, d)| camera_depth(&c.input_camera, d)).collect();
         let seconds = clock.end();
         Ok(Reconstruction { splats, inputs, depths, warnings, seconds })
     }
+}
 
-    fn add_detail(&self, splats: &mut Splats, inputs: &[Cropped]) -> Result<()> {
-        let ratio = self.config().upscale;
-        let pixels: Vec<Vec<f32>> = inputs
-            .iter()
-            .map(|c| c.target.data.iter().map(|&v| f32::from(v) / 255.0).collect())
-            .collect();
-        let mut sources = Vec::with_capacity(inputs.len());
-        for (c, pixels) in inputs.iter().zip(&pixels) {
-            let (w, h) = (c.target.width, c.target.height);
-            // Photograph pixels per input pixel: at most 1 holds nothing to add.
-            let photograph = match (c.window.scale * ratio as f32).min_element() > 1.0 {
-                true => Some(Photograph::new(pixels, w, h).ok_or_else(|| Error::Request {
-                    what: "photograph",
-                    expected: format!("{w}x{h} pixels"),
-                    got: pixels.len().to_string(),
-                })?),
-                false => None,
-            };
-            sources.push(SourceView { photograph, camera: c.input_camera });
-        }
-        let means: Vec<f32> = (0..splats.len()).flat_map(|i| splats.mean(i)).collect();
-        let per_view = splats.parents() / inputs.len();
-        let children = splats.children_per_parent();
-        let delta = residuals(&sources, &means, per_view, children, ratio);
-        splats.gain = with_residuals(&splats.gain, &delta);
-        Ok(())
+/// Adds to the children of cropped photographs what the photographs show beyond their
+/// parents' pixels ([`crate::cpu::detail`]); `upscale` is the children's, K = upscale².
+///
+/// # Errors
+/// A photograph without pixels.
+pub fn add_detail(splats: &mut Splats, inputs: &[Cropped], upscale: usize) -> Result<()> {
+    let pixels: Vec<Vec<f32>> = inputs.iter().map(|c| c.target.to_unit()).collect();
+    let mut sources = Vec::with_capacity(inputs.len());
+    for (c, pixels) in inputs.iter().zip(&pixels) {
+        let (w, h) = (c.target.width, c.target.height);
+        let ratio = w as f32 / c.input.width.max(1) as f32;
+        // Photograph pixels per input pixel: at most 1 holds nothing to add.
+        let photograph = match (c.window.scale * ratio).min_element() > 1.0 {
+            true => Some(Photograph::new(pixels, w, h).ok_or_else(|| Error::Request {
+                what: "photograph",
+                expected: format!("{w}x{h} pixels"),
+                got: pixels.len().to_string(),
+            })?),
+            false => None,
+        };
+        sources.push(SourceView { photograph, camera: c.input_camera });
     }
+    let means: Vec<f32> = (0..splats.len()).flat_map(|i| splats.mean(i)).collect();
+    let per_view = splats.parents() / inputs.len().max(1);
+    let children = splats.children_per_parent();
+    let delta = residuals(&sources, &means, per_view, children, upscale);
+    splats.gain = with_residuals(&splats.gain, &delta);
+    Ok(())
 }
 
 /// How Gaussians of a model with `config` are rendered at target resolution; `near`
@@ -298,12 +302,61 @@ pub fn is_mvsplat(config: &Config) -> bool {
 }
 
 /// Cropped photographs as the network takes them, one scene.
-fn views_of(inputs: &[Cropped], near_far: (f32, f32)) -> Result<Views> {
-    let (w, h) = (inputs[0].input.width, inputs[0].input.height);
+///
+/// # Errors
+/// No photograph, or photographs of several sizes; a bad depth range.
+pub fn views_of(inputs: &[Cropped], near_far: (f32, f32)) -> Result<Views> {
+    let (w, h) = inputs.first().map_or((0, 0), |c| (c.input.width, c.input.height));
     let pixels: Vec<f32> = inputs.iter().flat_map(|c| c.input.to_planes()).collect();
     let images = Tensor::from_vec(pixels, (1, inputs.len(), 3, h, w), &Device::Cpu)?;
     let cameras = inputs.iter().map(|c| c.input_camera).collect();
     Ok(Views::new(images, vec![cameras], vec![vec![near_far; inputs.len()]])?)
+}
+
+/// What matched points say about each photograph and the next ([`crate::check`]).
+///
+/// # Errors
+/// A photograph without pixels.
+pub fn check_photos(photos: &[Photo]) -> Result<Vec<PairReport>> {
+    let grey = |photo: &Photo| {
+        let Rgb { width, height, data } = &photo.image;
+        GrayImage::from_rgb8(*width, *height, data).ok_or_else(|| Error::Request {
+            what: "photograph",
+            expected: format!("{width}x{height} pixels"),
+            got: data.len().to_string(),
+        })
+    };
+    let pair = |w: &[Photo]| {
+        let [a, b] = [grey(&w[0])?, grey(&w[1])?];
+        Ok(check_pair(&a, &w[0].camera, &b, &w[1].camera, &CheckOptions::default()))
+    };
+    photos.windows(2).map(pair).collect()
+}
+
+/// `range` with what was only guessed, and not `given`, replaced by what the matched
+/// points of `reports` say.
+pub fn refine_range(
+    range: DepthRange,
+    given: (Option<f32>, Option<f32>),
+    reports: &[PairReport],
+) -> DepthRange {
+    let usable = reports.iter().filter(|r| r.verdict != Verdict::Bad);
+    let depths: Vec<_> = usable.filter_map(|r| r.depth).collect();
+    if !range.guessed || depths.is_empty() {
+        return range;
+    }
+    let near = given.0.unwrap_or(depths.iter().map(|d| d.near).fold(f32::INFINITY, f32::min));
+    let far = given.1.unwrap_or(depths.iter().map(|d| d.far).fold(0.0, f32::max));
+    if !(near > 0.0 && far > near && far.is_finite()) {
+        return range;
+    }
+    let points: usize = reports.iter().map(|r| r.consistent_matches).sum();
+    let reason = match given {
+        (None, None) => format!("from {points} matched points"),
+        (Some(_), _) => format!("near as given, far from {points} matched points"),
+        _ => format!("far as given, near from {points} matched points"),
+    };
+    DepthRange { near, far, reason, guessed: false }
 }
 
 /// Distance along the unit ray to camera z.
@@ -344,5 +397,37 @@ impl<'a> Clock<'a> {
     fn end(mut self) -> Vec<(&'static str, f64)> {
         self.close();
         self.seconds
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::check::DepthReport;
+
+    fn depth(near: f32, far: f32) -> PairReport {
+        let depth = DepthReport {
+            quantiles: [0.0; 5],
+            near,
+            far,
+            baseline_over_depth: 0.1,
+            parallax_px: 9.0,
+        };
+        PairReport { depth: Some(depth), ..PairReport::default() }
+    }
+
+    #[test]
+    fn only_a_guess_gives_way_to_matched_points() {
+        let guess = DepthRange { near: 0.01, far: 0.5, reason: "baseline".into(), guessed: true };
+        let known = DepthRange { guessed: false, ..guess.clone() };
+        let reports = [depth(0.6, 9.0), depth(0.7, 12.0)];
+        let ends = |r: DepthRange| (r.near, r.far);
+        assert_eq!(ends(refine_range(guess.clone(), (None, None), &reports)), (0.6, 12.0));
+        assert_eq!(ends(refine_range(guess.clone(), (Some(1.0), None), &reports)), (1.0, 12.0));
+        assert_eq!(ends(refine_range(guess.clone(), (None, Some(20.0)), &reports)), (0.6, 20.0));
+        assert_eq!(refine_range(known.clone(), (None, None), &reports), known);
+        assert_eq!(refine_range(guess.clone(), (None, None), &[]), guess);
+        let bad = PairReport { verdict: Verdict::Bad, ..depth(0.6, 9.0) };
+        assert_eq!(refine_range(guess.clone(), (None, None), &[bad]), guess);
     }
 }

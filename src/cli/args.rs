@@ -1,5 +1,6 @@
 //! Command-line arguments. The texts here are the program's manual.
 
+use super::args_eval::EvalArgs;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
@@ -54,6 +55,8 @@ pub enum Command {
     Check(CheckArgs),
     /// Say what a file or a scene folder holds.
     Info(InfoArgs),
+    /// Score a model, and baselines beside it, on photographs that it was not shown.
+    Eval(Box<EvalArgs>),
     /// Run the encoder, or the rasterizer, on a reference file's inputs and compare every
     /// tensor in it.
     Compare(CompareArgs),

@@ -5,9 +5,11 @@
 //! holds one object whatever the code is: the report, or `{"error": …}`.
 
 pub mod args;
+mod args_eval;
 mod check;
 mod compare;
 mod compare_raster;
+mod eval;
 mod failure;
 mod frames;
 mod info;
@@ -59,6 +61,7 @@ fn dispatch(cli: &Cli, answer: Answer) -> Result<bool> {
         Command::Render(args) => render::render(args, answer).map(|()| true),
         Command::Check(args) => check::check(args, answer),
         Command::Info(args) => info::info(args, answer).map(|()| true),
+        Command::Eval(args) => eval::eval(args, answer).map(|()| true),
         Command::Compare(args) => compare::compare(args, answer),
     }
 }

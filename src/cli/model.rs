@@ -1,6 +1,6 @@
 //! Which model the arguments, and the weight file, ask for.
 
-use super::args::{BackboneArg, RunArgs};
+use super::args::{BackboneArg, ModelArgs};
 use super::report::{say, warn};
 use anyhow::{Context, Result, bail, ensure};
 use std::path::Path;
@@ -12,9 +12,23 @@ use subsplat::pipeline::{self, Reconstructor};
 /// Target over input where nothing says otherwise.
 const UPSCALE: usize = 2;
 
+/// What a command's arguments say of the model.
+pub struct Asked<'a> {
+    /// `--weights`.
+    pub weights: Option<&'a Path>,
+    /// `--seed`.
+    pub seed: u64,
+    /// r: side of the children's grid, K = r²; must fit the weights.
+    pub upscale: Option<usize>,
+    /// r where the weights leave it open.
+    pub ratio: Option<usize>,
+    /// `--backbone`, `--preset`, `--config`.
+    pub model: &'a ModelArgs,
+}
+
 /// The model that the arguments ask for.
-pub fn load(args: &RunArgs) -> Result<Reconstructor> {
-    let Some(path) = &args.weights else {
+pub fn load(args: &Asked) -> Result<Reconstructor> {
+    let Some(path) = args.weights else {
         let config = config(args, None)?;
         let what = match pipeline::is_mvsplat(&config) {
             true => "MVSplat's network gives noise with them",
@@ -113,8 +127,9 @@ impl Holds {
     }
 }
 
-fn config(args: &RunArgs, file: Option<(&Weights, &Holds)>) -> Result<Config> {
-    let upscale = args.upscale;
+fn config(args: &Asked, file: Option<(&Weights, &Holds)>) -> Result<Config> {
+    let open = file.is_none_or(|(_, holds)| holds.children.is_none());
+    let upscale = args.upscale.or(args.ratio.filter(|_| open));
     if let Some(path) = &args.model.config {
         let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
         let mut config = Config::from_json(&text).with_context(|| path.display().to_string())?;

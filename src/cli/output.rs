@@ -164,7 +164,7 @@ impl Views<'_> {
             enlarged: false,
         };
         if let Some((frame, truth, enlarged)) = truth {
-            let truth: Vec<f32> = truth.data.iter().map(|&v| f32::from(v) / 255.0).collect();
+            let truth = truth.to_unit();
             scored.frame = Some(frame);
             scored.psnr = Some(psnr(&picture.rgb, &truth, width, height)?);
             scored.ssim = ssim(&picture.rgb, &truth, width, height).ok();

@@ -36,7 +36,14 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let given = (args.near, args.far);
     // Refuses early what was given; its guesses may give way to matched points below.
     let guess = depth_range(&plan.scene, &plan.context, given)?;
-    let model = progress.stage("model", |_| model::load(args))?;
+    let asked = model::Asked {
+        weights: args.weights.as_deref(),
+        seed: args.seed,
+        upscale: args.upscale,
+        ratio: None,
+        model: &args.model,
+    };
+    let model = progress.stage("model", |_| model::load(&asked))?;
     let (stride, (w, h)) = (model.config().stride(), plan.input_size);
     ensure!(
         w >= stride && h >= stride,
@@ -55,10 +62,10 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     })?;
     let reports = match args.no_check {
         true => Vec::new(),
-        false => progress.stage("check", |_| range::check(&photos))?,
+        false => progress.stage("check", |_| pipeline::check_photos(&photos))?,
     };
     range::tell(&reports);
-    let range = range::refine(guess, given, &reports);
+    let range = pipeline::refine_range(guess, given, &reports);
     say(format!("near {:.4}, far {:.4}: {}", range.near, range.far, range.reason));
     let request = Request {
         input_size: plan.input_size,

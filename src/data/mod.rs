@@ -1,8 +1,10 @@
 //! From scenes to what the network takes: crops, depth ranges, context pairs, chunks of
-//! pixelSplat's data sets, and procedural rooms.
+//! pixelSplat's data sets, training examples, and procedural rooms.
 
 pub mod chunks;
 pub mod crop;
+pub mod dataset;
 pub mod depth;
 pub mod pair;
 pub mod procedural;
+pub mod sampler;

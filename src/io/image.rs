@@ -31,6 +31,19 @@ impl Rgb {
         Self { width, height, data: vec![0; width * height * 3] }
     }
 
+    /// `[H, W, 3]` floats, value / 255.
+    pub fn to_unit(&self) -> Vec<f32> {
+        self.data.iter().map(|&v| f32::from(v) / 255.0).collect()
+    }
+
+    /// From `[H, W, 3]` floats, as [`Rgb::from_planes`] does it. `None` if `unit` is not
+    /// 3·W·H long.
+    pub fn from_unit(unit: &[f32], width: usize, height: usize) -> Option<Self> {
+        let length = width.checked_mul(height)?.checked_mul(3)?;
+        let data = || unit.iter().map(|&v| quantise(v)).collect();
+        (unit.len() == length).then(|| Self { width, height, data: data() })
+    }
+
     /// `[3, H, W]` floats, value / 255.
     pub fn to_planes(&self) -> Vec<f32> {
         let mut planes = Vec::with_capacity(self.data.len());
@@ -198,14 +211,22 @@ fn encode(
 /// # Errors
 /// A buffer that does not fit the size; everything of [`write_atomic`].
 pub fn save_png(path: &Path, picture: &Rgb) -> Result<()> {
+    let bytes = png_bytes(picture, path)?;
+    write_atomic(path, |f| f.write_all(&bytes))
+}
+
+/// The file that [`save_png`] writes; `path` names it in errors.
+///
+/// # Errors
+/// A buffer that does not fit the size.
+pub fn png_bytes(picture: &Rgb, path: &Path) -> Result<Vec<u8>> {
     let expected = 3 * picture.width * picture.height;
     if picture.data.len() != expected || expected == 0 {
         let got = format!("{} for {}x{}", picture.data.len(), picture.width, picture.height);
         return Err(Error::format(path, format!("{expected} bytes of pixels"), got));
     }
     let kind = image::ExtendedColorType::Rgb8;
-    let bytes = encode(path, &picture.data, picture.width, picture.height, kind)?;
-    write_atomic(path, |f| f.write_all(&bytes))
+    encode(path, &picture.data, picture.width, picture.height, kind)
 }
 
 /// A depth map: camera z of each pixel centre, world units; 0 where there is none.

@@ -153,6 +153,9 @@ impl Scene {
     }
 }
 
+/// Where COLMAP's model is looked for in a scene's folder.
+const MODEL_FOLDERS: [&str; 4] = ["sparse/0", "sparse", "colmap/sparse/0", ""];
+
 /// Reads the scene in a folder, or behind one pose file.
 ///
 /// # Errors
@@ -169,7 +172,7 @@ pub fn load_scene(path: &Path) -> Result<Scene> {
             return load_file(&file);
         }
     }
-    for folder in ["sparse/0", "sparse", "colmap/sparse/0", ""] {
+    for folder in MODEL_FOLDERS {
         let model = path.join(folder);
         if colmap::is_model(&model) {
             return colmap::load(&model);
@@ -187,6 +190,14 @@ pub fn load_scene(path: &Path) -> Result<Scene> {
          poses.txt with K.txt",
         "a folder with none of them",
     ))
+}
+
+/// Whether `path` is a folder with a pose file that [`load_scene`] takes.
+pub fn is_scene(path: &Path) -> bool {
+    let file = |name: &str| path.join(name).is_file();
+    ["cameras.json", "transforms.json", "poses.txt"].into_iter().any(file)
+        || MODEL_FOLDERS.iter().any(|f| colmap::is_model(&path.join(f)))
+        || re10k::find(path).is_ok_and(|f| f.is_some())
 }
 
 fn load_file(path: &Path) -> Result<Scene> {

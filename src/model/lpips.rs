@@ -9,9 +9,11 @@
 //! weights is inactive outside its own training and absent here. Tests: `tests/lpips.rs`.
 
 use super::layers::{Conv2d, ConvShape};
+use super::weights::Weights;
 use crate::ops::activation::{Activation, activation};
-use candle_core::{Device, Result, Tensor, bail};
+use candle_core::{Device, Error, Result, Tensor, bail};
 use candle_nn::{Init, VarBuilder};
+use std::path::Path;
 
 /// Blocks of VGG16: torchvision's indices of the convolutions, and their channels.
 pub(super) const BLOCKS: [(&[usize], usize); 5] = [
@@ -68,6 +70,29 @@ impl Lpips {
         }
         let three = |v: [f32; 3]| Tensor::from_slice(&v, (1, 3, 1, 1), &Device::Cpu);
         Ok(Self { blocks, linear, shift: three(SHIFT)?, scale: three(SCALE)? })
+    }
+
+    /// From a weight file (`subsplat-convert` makes one of torchvision's VGG16 and the
+    /// `lpips` package's linear weights).
+    ///
+    /// # Errors
+    /// No weight file; a tensor is missing or has another shape.
+    pub fn load(path: &Path) -> Result<Self> {
+        let weights = Weights::load(path).map_err(Error::wrap)?;
+        Self::new(weights.builder()).map_err(|e| Error::msg(format!("{}: {e}", path.display())))
+    }
+
+    /// Distance of two pictures `[height, width, 3]`, values as in [`Lpips::forward`].
+    ///
+    /// # Errors
+    /// As [`Lpips::forward`].
+    pub fn distance(&self, a: &[f32], b: &[f32], width: usize, height: usize) -> Result<f64> {
+        let picture = |p: &[f32]| {
+            Tensor::from_slice(p, (1, height, width, 3), &Device::Cpu)?
+                .permute((0, 3, 1, 2))?
+                .contiguous()
+        };
+        Ok(f64::from(self.forward(&picture(a)?, &picture(b)?)?.get(0)?.to_scalar::<f32>()?))
     }
 
     /// Distances of the pictures `a` and `b`, `[N, 3, H, W]` in [0, 1] (values outside

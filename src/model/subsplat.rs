@@ -60,6 +60,11 @@ impl SubSplat {
         &self.config
     }
 
+    /// What turns primaries into children.
+    pub fn trunk(&self) -> &Trunk {
+        &self.trunk
+    }
+
     /// The backbone alone, at inference.
     ///
     /// # Errors

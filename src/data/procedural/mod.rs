@@ -20,7 +20,7 @@ mod layout;
 mod light;
 mod material;
 mod render;
-mod rng;
+pub(in crate::data) mod rng;
 mod shape;
 mod synthesis;
 mod texture;

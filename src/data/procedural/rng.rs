@@ -15,25 +15,25 @@ fn mix(mut z: u64) -> u64 {
 
 /// 64 random bits that belong to a place, for jitter and noise that must not depend
 /// on the order of drawing.
-pub(super) fn hash(seed: u64, x: u64, y: u64) -> u64 {
+pub(in crate::data) fn hash(seed: u64, x: u64, y: u64) -> u64 {
     let row = mix(seed.wrapping_add(GOLDEN.wrapping_mul(y.wrapping_add(1))));
     mix(row.wrapping_add(GOLDEN.wrapping_mul(x.wrapping_add(1))))
 }
 
 /// The upper 24 of `bits` as a number in [0, 1): exact in f32.
-pub(super) fn unit(bits: u64) -> f32 {
+pub(in crate::data) fn unit(bits: u64) -> f32 {
     (bits >> 40) as f32 * (1.0 / (1 << 24) as f32)
 }
 
 /// Two numbers in [0, 1) from one hash.
-pub(super) fn unit_pair(bits: u64) -> (f32, f32) {
+pub(in crate::data) fn unit_pair(bits: u64) -> (f32, f32) {
     (unit(bits), unit(bits << 24))
 }
 
 /// A nearly normal number, mean 0, variance 1, from the four 16-bit quarters of
 /// `bits` (Irwin-Hall of order 4: tails end at ±3.46): no logarithm, so the same
 /// digits everywhere.
-pub(super) fn normal(bits: u64) -> f32 {
+pub(in crate::data) fn normal(bits: u64) -> f32 {
     let sum = (0..4).map(|i| (bits >> (16 * i)) & 0xFFFF).sum::<u64>();
     // Four quarters of mean 32767.5 and variance (2³² − 1)/12.
     (sum as f32 - 131_070.0) * (1.732_050_8 / 65_536.0)
@@ -41,57 +41,57 @@ pub(super) fn normal(bits: u64) -> f32 {
 
 /// A stream of random numbers.
 #[derive(Clone, Debug)]
-pub(super) struct Rng {
+pub(in crate::data) struct Rng {
     state: u64,
 }
 
 impl Rng {
-    pub(super) fn new(seed: u64) -> Self {
+    pub(in crate::data) fn new(seed: u64) -> Self {
         Self { state: mix(seed ^ 0x5355_4253_504C_4154) }
     }
 
     /// An independent stream for `key`; this one does not move.
-    pub(super) fn fork(&self, key: u64) -> Self {
+    pub(in crate::data) fn fork(&self, key: u64) -> Self {
         Self { state: hash(self.state, key, 0x0F0F) }
     }
 
-    pub(super) fn bits(&mut self) -> u64 {
+    pub(in crate::data) fn bits(&mut self) -> u64 {
         self.state = self.state.wrapping_add(GOLDEN);
         mix(self.state)
     }
 
     /// In [0, 1).
-    pub(super) fn unit(&mut self) -> f32 {
+    pub(in crate::data) fn unit(&mut self) -> f32 {
         unit(self.bits())
     }
 
     /// In [low, high).
-    pub(super) fn range(&mut self, low: f32, high: f32) -> f32 {
+    pub(in crate::data) fn range(&mut self, low: f32, high: f32) -> f32 {
         low + (high - low) * self.unit()
     }
 
     /// In [low, high), uniform in the logarithm. Both positive.
-    pub(super) fn log_range(&mut self, low: f32, high: f32) -> f32 {
+    pub(in crate::data) fn log_range(&mut self, low: f32, high: f32) -> f32 {
         low * (high / low).powf(self.unit())
     }
 
     /// low, low + 1, …, high, each alike.
-    pub(super) fn count(&mut self, low: usize, high: usize) -> usize {
+    pub(in crate::data) fn count(&mut self, low: usize, high: usize) -> usize {
         low + (self.bits() >> 32) as usize % (high - low + 1)
     }
 
     /// True with probability `p`.
-    pub(super) fn chance(&mut self, p: f32) -> bool {
+    pub(in crate::data) fn chance(&mut self, p: f32) -> bool {
         self.unit() < p
     }
 
     /// Mean 0, variance 1, within ±3.46.
-    pub(super) fn normal(&mut self) -> f32 {
+    pub(in crate::data) fn normal(&mut self) -> f32 {
         normal(self.bits())
     }
 
     /// −1 or 1.
-    pub(super) fn sign(&mut self) -> f32 {
+    pub(in crate::data) fn sign(&mut self) -> f32 {
         if self.chance(0.5) { 1.0 } else { -1.0 }
     }
 }

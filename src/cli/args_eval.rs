@@ -1,0 +1,100 @@
+//! Arguments of `eval`. The texts here are the program's manual.
+
+use super::args::{DetailArg, ModelArgs};
+use clap::{Args, ValueEnum};
+use std::path::PathBuf;
+use subsplat::eval::Method;
+
+const NOTES: &str = "\
+Methods: subsplat (the model), detail (the model with detail from the photographs), backbone (its \
+backbone's Gaussians alone, rendered at the target's size: spgr=off), lowpass (the same, low-pass \
+scaled to the input), bilinear (the same rendered at the input's size and enlarged), uniform (K \
+equal Gaussians a pixel, nothing learned), copy (the input nearest to the target), mean (of the \
+inputs).
+
+Figures: PSNR (dB), SSIM, LPIPS (VGG16; needs --lpips), sharpness (mean absolute gradient over the \
+photograph's). Means are over a case's targets first, then over cases; a case is one set of inputs.
+
+Photographs too small for a target of R times --input-size: that case's input is halved until they \
+are large enough.";
+
+/// Arguments of `eval`.
+#[derive(Debug, Args)]
+#[command(after_long_help = NOTES)]
+pub struct EvalArgs {
+    /// Chunks of pixelSplat's form (RealEstate10K, ACID; a folder with index.json or
+    /// test/index.json), a scene, or a folder of scenes with protocol.json.
+    #[arg(value_name = "DATA")]
+    pub data: PathBuf,
+    /// Evaluation index of MVSplat's form, {scene: {context, target} or null}. Scenes need
+    /// none: without, their protocol.json says it.
+    #[arg(long, value_name = "FILE")]
+    pub index: Option<PathBuf>,
+    /// Folder for eval.json, targets.csv, means.csv, index.html and the pictures
+    /// (pictures/METHOD/SCENE/INPUTS/FRAME.png). Without: nothing is written.
+    #[arg(short, long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// Target over input, side over side. Default: the weights' own, else 2.
+    #[arg(long, value_name = "R", value_parser = ["1", "2", "4"])]
+    pub upscale: Option<String>,
+    /// Side of the network's input, px: N, or WxH (default: protocol.json's, else 256).
+    #[arg(long, value_name = "N | WxH")]
+    pub input_size: Option<String>,
+    /// What is compared, in this order (default: all but detail that differ at this
+    /// --upscale).
+    #[arg(long, value_delimiter = ',', value_name = "M,…")]
+    pub methods: Vec<Method>,
+    /// Score PNGs of another program too: DIR/SCENE/INPUTS/NNNNNN.png, or
+    /// SCENE/color/NNNNNN.png, SCENE/NNNNNN.png, SCENE/FRAMENAME.png.
+    #[arg(long, value_name = "NAME=DIR")]
+    pub pred: Vec<Method>,
+    /// `photo` adds the method detail after subsplat.
+    #[arg(long, value_enum, default_value = "off")]
+    pub detail: DetailArg,
+    /// VGG16 and LPIPS weights (.safetensors, made by subsplat-convert).
+    #[arg(long, value_name = "FILE")]
+    pub lpips: Option<PathBuf>,
+    /// Weights (.safetensors). Without: seeded, untrained weights.
+    #[arg(long, value_name = "FILE")]
+    pub weights: Option<PathBuf>,
+    /// Seed of untrained weights.
+    #[arg(long, default_value_t = 0)]
+    pub seed: u64,
+    /// Nearest depth candidate, world units (default: as `run`; chunks 1).
+    #[arg(long)]
+    pub near: Option<f32>,
+    /// Farthest depth candidate, world units (default: as `run`; chunks 100).
+    #[arg(long)]
+    pub far: Option<f32>,
+    /// Only the first N scenes.
+    #[arg(long, value_name = "N")]
+    pub limit: Option<usize>,
+    /// What a crop does to the principal point (default: mvsplat for chunks under the
+    /// re10k backbone, else exact).
+    #[arg(long, value_enum)]
+    pub crop: Option<CropArg>,
+    /// From what the network's input is made.
+    #[arg(long, value_enum, default_value = "hr-crop")]
+    pub lr_from: LrFromArg,
+    /// What the model is.
+    #[command(flatten)]
+    pub model: ModelArgs,
+}
+
+/// Principal point after a crop.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum CropArg {
+    /// It moves with the pixels.
+    Exact,
+    /// Its fraction of the width and height stays (MVSplat's published numbers).
+    Mvsplat,
+}
+
+/// Source of the network's input.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum LrFromArg {
+    /// The target's crop, reduced: aligned with it to the pixel.
+    HrCrop,
+    /// The photograph, resized and cropped on its own, as MVSplat does it.
+    Independent,
+}

@@ -1,0 +1,419 @@
+//! Pictures of every method, and their scores.
+
+use super::methods::{enlarged, mean, nearest};
+use super::{
+    Benchmark, Case, CaseScores, Error, Loaded, Method, Result, Score, Scores, TargetScores, bad,
+};
+use crate::abi::RasterOptions;
+use crate::camera::Camera;
+use crate::config::{Config, LowpassRef};
+use crate::cpu::Rasterizer;
+use crate::data::crop::{CropOptions, CropRule, Cropped, LrFrom};
+use crate::io::image::Rgb;
+use crate::metrics::{mean_gradient, psnr, ssim};
+use crate::model::lpips::Lpips;
+use crate::model::subsplat::{SubSplat, feature_channels};
+use crate::model::trunk::Trunk;
+use crate::model::weights::Weights;
+use crate::pipeline::{self, Photo, add_detail, raster_options, views_of};
+use crate::render::render_with;
+use crate::splats::Splats;
+use std::path::Path;
+
+/// Input side where neither the caller nor the protocol says one, px.
+const SIDE: usize = 256;
+
+/// What is evaluated.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Options {
+    /// r: target side over input side.
+    pub upscale: usize,
+    /// Width and height of the inputs, px; else the protocol's, else 256×256.
+    pub input_size: Option<(usize, usize)>,
+    /// Methods, in the order of the tables.
+    pub methods: Vec<Method>,
+    /// Principal points after the crop.
+    pub rule: CropRule,
+    /// From what the inputs are made.
+    pub lr_from: LrFrom,
+}
+
+impl Options {
+    /// The model and every baseline that differs from the others at this `upscale`.
+    pub fn new(upscale: usize) -> Self {
+        use Method::{Backbone, Bilinear, Copy, Lowpass, Mean, Subsplat, Uniform};
+        let methods = match upscale {
+            1 => vec![Subsplat, Backbone, Copy, Mean],
+            _ => vec![Subsplat, Backbone, Lowpass, Bilinear, Uniform, Copy, Mean],
+        };
+        Self { upscale, input_size: None, methods, rule: CropRule::Exact, lr_from: LrFrom::HrCrop }
+    }
+}
+
+/// Pictures of one target.
+#[derive(Clone, Debug)]
+pub struct TargetPictures {
+    /// The photograph.
+    pub truth: Rgb,
+    /// One for each method, in their order.
+    pub methods: Vec<Rgb>,
+}
+
+/// What came out of one case.
+#[derive(Clone, Debug)]
+pub struct CaseResult {
+    /// The scores.
+    pub scores: CaseScores,
+    /// The inputs as the network saw them.
+    pub inputs: Vec<Rgb>,
+    /// Pictures, one set a target.
+    pub pictures: Vec<TargetPictures>,
+}
+
+/// Scores methods on cases.
+pub struct Evaluator {
+    options: Options,
+    lpips: Option<Lpips>,
+}
+
+/// Inputs and truth at their sizes.
+struct Prepared {
+    inputs: Vec<Cropped>,
+    targets: Vec<Cropped>,
+    range: (f32, f32),
+}
+
+impl Evaluator {
+    /// An evaluator without LPIPS.
+    pub fn new(options: Options) -> Self {
+        Self { options, lpips: None }
+    }
+
+    /// With LPIPS from a weight file ([`Lpips::load`]).
+    ///
+    /// # Errors
+    /// A file that holds no such weights.
+    pub fn with_lpips(mut self, path: &Path) -> Result<Self> {
+        self.lpips = Some(Lpips::load(path).map_err(pipeline::Error::from)?);
+        Ok(self)
+    }
+
+    /// What is evaluated.
+    pub fn options(&self) -> &Options {
+        &self.options
+    }
+
+    /// Names of the methods, in their order.
+    pub fn methods(&self) -> Vec<String> {
+        self.options.methods.iter().map(|m| m.name().to_owned()).collect()
+    }
+
+    /// All cases of `benchmark`, without keeping a picture.
+    ///
+    /// # Errors
+    /// As [`Evaluator::case`].
+    pub fn run(&self, model: Option<&SubSplat>, benchmark: &Benchmark) -> Result<Scores> {
+        let one = |case: &Case| Ok(self.case(model, case, benchmark.load(case)?)?.scores);
+        let cases = benchmark.cases().iter().map(one).collect::<Result<_>>()?;
+        Ok(Scores { methods: self.methods(), cases })
+    }
+
+    /// One case, with its pictures.
+    ///
+    /// # Errors
+    /// A method that needs a model, without one; a crop or the network refuses what came;
+    /// a picture of another program that is missing; a picture that is not finite.
+    pub fn case(
+        &self,
+        model: Option<&SubSplat>,
+        case: &Case,
+        loaded: Loaded,
+    ) -> Result<CaseResult> {
+        let names = loaded.names.clone();
+        let prepared = self.prepare(model, case, loaded)?;
+        let place = format!("{} ({})", case.scene, case.pair());
+        let mut result = self.empty(case, &prepared, &names);
+        let mut players = Players::new(self, model, &prepared)?;
+        for (m, method) in self.options.methods.iter().enumerate() {
+            players.change_to(method, &prepared)?;
+            for (t, target) in prepared.targets.iter().enumerate() {
+                let (w, h) = (target.target.width, target.target.height);
+                let rgb = match method {
+                    Method::Other { folder, .. } => {
+                        let pair = case.pair();
+                        let frame = (case.views.target[t], names[t].as_str());
+                        let scene = (case.scene.as_str(), pair.as_str());
+                        Method::other_picture(folder, scene, frame, (w, h))?.to_unit()
+                    }
+                    _ => players.picture(method, &prepared, target),
+                };
+                let place = format!("{place} target {} {}", names[t], method.name());
+                let score = self.score(&rgb, &target.target, &place)?;
+                result.scores.targets[t].scores.push(score);
+                let Some(picture) = Rgb::from_unit(&rgb, w, h) else {
+                    return bad(place, format!("a picture of {w}x{h}"), rgb.len().to_string());
+                };
+                debug_assert_eq!(result.pictures[t].methods.len(), m);
+                result.pictures[t].methods.push(picture);
+            }
+        }
+        Ok(result)
+    }
+
+    fn empty(&self, case: &Case, prepared: &Prepared, names: &[String]) -> CaseResult {
+        let size = |p: Option<&Rgb>| p.map_or((0, 0), |p| (p.width, p.height));
+        let Prepared { inputs, targets, range } = prepared;
+        let target = |(&frame, name): (&usize, &String)| TargetScores {
+            frame,
+            name: name.clone(),
+            scores: Vec::new(),
+        };
+        let pictures = targets.iter();
+        let pictures =
+            pictures.map(|t| TargetPictures { truth: t.target.clone(), methods: Vec::new() });
+        CaseResult {
+            scores: CaseScores {
+                scene: case.scene.clone(),
+                context: case.views.context.clone(),
+                sizes: [
+                    size(inputs.first().map(|c| &c.input)),
+                    size(targets.first().map(|c| &c.target)),
+                ],
+                near_far: *range,
+                enlarged: targets.iter().any(|c| c.window.scale.min_element() < 1.0),
+                targets: case.views.target.iter().zip(names).map(target).collect(),
+            },
+            inputs: inputs.iter().map(|c| c.input.clone()).collect(),
+            pictures: pictures.collect(),
+        }
+    }
+
+    fn prepare(&self, model: Option<&SubSplat>, case: &Case, loaded: Loaded) -> Result<Prepared> {
+        let Options { upscale, rule, lr_from, .. } = self.options;
+        let stride = model.map_or(1, |m| m.config().stride());
+        let nominal = self.options.input_size;
+        let nominal = nominal.or(case.resolution.map(|[w, h]| (w, h))).unwrap_or((SIDE, SIDE));
+        let photos = || loaded.context.iter().chain(&loaded.targets);
+        let least = |side: fn(&Photo) -> usize| photos().map(side).min().unwrap_or(0);
+        let least = (least(|p| p.image.width), least(|p| p.image.height));
+        let input_size = fitting(nominal, upscale, stride, least);
+        let options = CropOptions { input_size, upscale, stride, rule, lr_from };
+        let cropped = |photos: &[Photo]| {
+            photos.iter().map(|p| p.crop(&options)).collect::<pipeline::Result<Vec<_>>>()
+        };
+        let range = (loaded.range.near, loaded.range.far);
+        Ok(Prepared {
+            inputs: cropped(&loaded.context)?,
+            targets: cropped(&loaded.targets)?,
+            range,
+        })
+    }
+
+    fn score(&self, picture: &[f32], truth: &Rgb, place: &str) -> Result<Score> {
+        let (w, h) = (truth.width, truth.height);
+        let truth = truth.to_unit();
+        let measured = |e| Error::Metrics { place: place.to_owned(), source: e };
+        let lpips = match &self.lpips {
+            Some(lpips) => {
+                Some(lpips.distance(picture, &truth, w, h).map_err(pipeline::Error::from)?)
+            }
+            None => None,
+        };
+        let own = mean_gradient(picture, w, h).map_err(measured)?;
+        let theirs = mean_gradient(&truth, w, h).map_err(measured)?;
+        Ok(Score {
+            psnr: psnr(picture, &truth, w, h).map_err(measured)?,
+            ssim: ssim(picture, &truth, w, h).map_err(measured)?,
+            lpips,
+            sharpness: (theirs > 0.0).then(|| own / theirs),
+        })
+    }
+}
+
+/// The input size of a case: `nominal`, halved while the smallest photograph (`least`)
+/// does not cover the target and the target stays no smaller than `nominal`.
+fn fitting(
+    nominal: (usize, usize),
+    upscale: usize,
+    stride: usize,
+    least: (usize, usize),
+) -> (usize, usize) {
+    let (mut size, mut ratio) = (nominal, upscale);
+    let covers = |s: (usize, usize)| s.0 * upscale <= least.0 && s.1 * upscale <= least.1;
+    while ratio > 1 && !covers(size) && size.0 / 2 >= stride && size.1 / 2 >= stride {
+        size = (size.0 / 2, size.1 / 2);
+        ratio /= 2;
+    }
+    size
+}
+
+/// The Gaussians of one case, one set in memory at a time.
+struct Players<'a> {
+    r: usize,
+    near: f32,
+    network: Option<Network<'a>>,
+    /// Whose Gaussians `splats` are.
+    current: Option<Set>,
+    splats: Option<Splats>,
+    rasterizer: Rasterizer,
+}
+
+/// The backbone's outputs of one case, and what may follow it.
+struct Network<'a> {
+    model: &'a SubSplat,
+    views: crate::model::Views,
+    output: crate::model::BackboneOutput,
+    parents: crate::model::Primaries,
+}
+
+/// Gaussians that methods share.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Set {
+    Children,
+    Detailed,
+    Parents,
+    Uniform,
+}
+
+impl Set {
+    fn of(method: &Method) -> Option<Self> {
+        match method {
+            Method::Subsplat => Some(Self::Children),
+            Method::Detail => Some(Self::Detailed),
+            Method::Backbone | Method::Lowpass | Method::Bilinear => Some(Self::Parents),
+            Method::Uniform => Some(Self::Uniform),
+            Method::Copy | Method::Mean | Method::Other { .. } => None,
+        }
+    }
+}
+
+impl<'a> Players<'a> {
+    fn new(
+        evaluator: &Evaluator,
+        model: Option<&'a SubSplat>,
+        prepared: &Prepared,
+    ) -> Result<Self> {
+        let needed = evaluator.options.methods.iter().find(|m| m.needs_model());
+        let network = match (needed, model) {
+            (None, _) => None,
+            (Some(method), None) => return bad(method.name(), "a model", "none"),
+            (Some(_), Some(model)) => {
+                let views = views_of(&prepared.inputs, prepared.range)?;
+                let output = model.encode(&views).map_err(pipeline::Error::from)?;
+                let parents = model.primaries(&views, &output).map_err(pipeline::Error::from)?;
+                Some(Network { model, views, output, parents })
+            }
+        };
+        Ok(Self {
+            r: evaluator.options.upscale,
+            near: prepared.range.0,
+            network,
+            current: None,
+            splats: None,
+            rasterizer: Rasterizer::new(),
+        })
+    }
+
+    /// Makes the Gaussians of `method`, unless they are there.
+    fn change_to(&mut self, method: &Method, prepared: &Prepared) -> Result<()> {
+        let (Some(set), Some(network)) = (Set::of(method), &self.network) else { return Ok(()) };
+        if self.current == Some(set) {
+            return Ok(());
+        }
+        let children = match (self.current, set, self.splats.take()) {
+            (Some(Set::Children), Set::Detailed, Some(splats)) => splats,
+            _ => network.splats(set, self.r)?,
+        };
+        let mut splats = children;
+        if set == Set::Detailed {
+            add_detail(&mut splats, &prepared.inputs, network.model.config().upscale)?;
+        }
+        (self.current, self.splats) = (Some(set), Some(splats));
+        Ok(())
+    }
+
+    fn picture(&mut self, method: &Method, prepared: &Prepared, target: &Cropped) -> Vec<f32> {
+        let (r, camera) = (self.r, &target.target_camera);
+        match method {
+            Method::Copy => nearest(&prepared.inputs, camera, r),
+            Method::Mean => mean(&prepared.inputs, r),
+            Method::Lowpass => self.rendered(camera, r, Some(LowpassRef::Input)),
+            Method::Backbone => self.rendered(camera, r, Some(LowpassRef::Target)),
+            Method::Bilinear => {
+                let small = self.rendered(&target.input_camera, 1, None);
+                enlarged(&small, (target.input.width, target.input.height), r)
+            }
+            _ => self.rendered(camera, r, None),
+        }
+    }
+
+    /// The current Gaussians seen by `camera`, whose pixels are 1/`ratio` input pixels.
+    fn rendered(
+        &mut self,
+        camera: &Camera,
+        ratio: usize,
+        reference: Option<LowpassRef>,
+    ) -> Vec<f32> {
+        let (Some(network), Some(splats)) = (&self.network, &self.splats) else {
+            return Vec::new();
+        };
+        let options = rendering(network.model.config(), ratio, reference, self.near);
+        render_with(&mut self.rasterizer, splats, camera, &options).rgb
+    }
+}
+
+fn rendering(
+    config: &Config,
+    ratio: usize,
+    reference: Option<LowpassRef>,
+    near: f32,
+) -> RasterOptions {
+    let mut config = config.clone();
+    config.upscale = ratio;
+    config.render.lowpass_ref = reference.unwrap_or(config.render.lowpass_ref);
+    raster_options(&config, near)
+}
+
+impl Network<'_> {
+    fn splats(&self, set: Set, r: usize) -> Result<Splats> {
+        let mut config = self.model.config().clone();
+        let own;
+        let trunk = match set {
+            Set::Children | Set::Detailed => self.model.trunk(),
+            Set::Parents | Set::Uniform => {
+                config.upscale = r;
+                config.spgr.enabled = set == Set::Uniform;
+                // With closed last layers the heads' inputs count for nothing.
+                config.spgr.zero_init = true;
+                config.agg.enabled = false;
+                let start = Weights::seeded(0).builder();
+                own = Trunk::new(&config, &feature_channels(&config), start)
+                    .map_err(pipeline::Error::from)?;
+                &own
+            }
+        };
+        let children = trunk.forward(&self.views, &self.output, &self.parents);
+        let splats = children.and_then(|c| c.to_splats());
+        Ok(splats.map_err(pipeline::Error::from)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn inputs_are_halved_where_photographs_are_small() {
+        let side = |upscale, least| fitting((256, 256), upscale, 32, least).0;
+        assert_eq!(side(1, (256, 300)), 256);
+        assert_eq!(side(2, (512, 600)), 256);
+        assert_eq!(side(2, (540, 360)), 128);
+        // The target is never smaller than the nominal input.
+        assert_eq!(side(2, (200, 200)), 128);
+        assert_eq!(side(1, (200, 200)), 256);
+        assert_eq!(side(4, (1920, 1080)), 256);
+        assert_eq!(side(4, (800, 600)), 128);
+        assert_eq!(side(4, (400, 300)), 64);
+        assert_eq!(fitting((64, 48), 4, 32, (100, 100)), (64, 48));
+    }
+}

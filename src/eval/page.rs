@@ -1,0 +1,200 @@
+//! One HTML page with every picture inside: tables of scores, and the same window of
+//! each method's picture side by side.
+
+use super::{CaseResult, Score, Scores};
+use crate::io::Result;
+use crate::io::image::{Rgb, png_bytes};
+use crate::metrics::mean_gradient;
+use std::fmt::Write;
+use std::path::Path;
+
+/// Side of the windows, target px.
+const WINDOW: usize = 128;
+/// Windows tried along each side of a target.
+const TRIED: usize = 7;
+
+/// One case on the page: a window of one of its targets.
+#[derive(Clone, Debug)]
+pub struct Sheet {
+    title: String,
+    /// Caption and PNG: inputs whole, then the photograph's and each method's window.
+    cells: Vec<(String, Vec<u8>)>,
+}
+
+impl Sheet {
+    /// The target in the middle of a case's list, and the window where its photograph has
+    /// the most detail.
+    ///
+    /// # Errors
+    /// A picture that cannot be encoded.
+    pub fn new(result: &CaseResult, methods: &[String]) -> Result<Self> {
+        let scores = &result.scores;
+        let place = result.pictures.len() / 2;
+        let (Some(target), Some(pictures)) =
+            (scores.targets.get(place), result.pictures.get(place))
+        else {
+            return Ok(Self { title: scores.scene.clone(), cells: Vec::new() });
+        };
+        let png = |picture: &Rgb| png_bytes(picture, Path::new("page"));
+        let mut cells = Vec::new();
+        for (frame, input) in scores.context.iter().zip(&result.inputs) {
+            cells.push((format!("input {frame}, whole"), png(input)?));
+        }
+        let window = busiest(&pictures.truth);
+        let cut =
+            |p: &Rgb| p.window(window.0, window.1, window.2, window.3).unwrap_or_else(|| p.clone());
+        cells.push(("photograph".to_owned(), png(&cut(&pictures.truth))?));
+        for ((method, picture), score) in methods.iter().zip(&pictures.methods).zip(&target.scores)
+        {
+            cells.push((format!("{method} {:.2} dB", score.psnr), png(&cut(picture))?));
+        }
+        let context: Vec<String> = scores.context.iter().map(usize::to_string).collect();
+        let title = format!(
+            "{}: inputs {}, target {} ({}x{} at {},{})",
+            scores.scene,
+            context.join(" "),
+            target.frame,
+            window.2,
+            window.3,
+            window.0,
+            window.1
+        );
+        Ok(Self { title, cells })
+    }
+}
+
+/// The window (left, top, width, height) with the largest mean gradient.
+fn busiest(truth: &Rgb) -> (usize, usize, usize, usize) {
+    let (w, h) = (WINDOW.min(truth.width), WINDOW.min(truth.height));
+    let mut best = (-1.0, (0, 0, w, h));
+    for i in 0..TRIED * TRIED {
+        let at = |room: usize, k: usize| room * k / (TRIED - 1);
+        let (left, top) = (at(truth.width - w, i % TRIED), at(truth.height - h, i / TRIED));
+        let Some(window) = truth.window(left, top, w, h) else { continue };
+        let detail = mean_gradient(&window.to_unit(), w, h).unwrap_or(0.0);
+        if detail > best.0 {
+            best = (detail, (left, top, w, h));
+        }
+    }
+    best.1
+}
+
+const STYLE: &str = "body{font:14px/1.4 system-ui,sans-serif;margin:2em;color:#222}\
+table{border-collapse:collapse;margin:1em 0}td,th{padding:.2em .7em;text-align:right;\
+border-bottom:1px solid #ddd}td:first-child,th:first-child{text-align:left}\
+.row{display:flex;flex-wrap:wrap;gap:8px}figure{margin:0}figcaption{font-size:12px}\
+img{width:256px;image-rendering:pixelated;background:#eee;display:block}\
+h2{font-size:15px;margin:1.6em 0 .4em}p{max-width:60em}";
+
+/// The page. `notes` say, one paragraph each, how it was made.
+pub fn page(title: &str, notes: &[String], scores: &Scores, sheets: &[Sheet]) -> String {
+    let mut html = format!(
+        "<!DOCTYPE html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><title>{0}</title>\
+         <style>{STYLE}</style></head><body><h1>{0}</h1>\n",
+        escaped(title)
+    );
+    // Writing to a String does not fail.
+    for note in notes {
+        let _ = writeln!(html, "<p>{}</p>", escaped(note));
+    }
+    let _ = writeln!(html, "<table><tr><th>method</th>{HEADER}</tr>");
+    for method in &scores.methods {
+        let _ = writeln!(html, "<tr><td>{}</td>{}</tr>", escaped(method), row(scores.mean(method)));
+    }
+    let _ = writeln!(html, "</table>\n<table><tr><th>scene</th><th>method</th>{HEADER}</tr>");
+    for scene in scores.scenes() {
+        for method in &scores.methods {
+            let cells = row(scores.scene_mean(scene, method));
+            let (scene, method) = (escaped(scene), escaped(method));
+            let _ = writeln!(html, "<tr><td>{scene}</td><td>{method}</td>{cells}</tr>");
+        }
+    }
+    html.push_str("</table>\n");
+    for sheet in sheets {
+        let _ = writeln!(html, "<h2>{}</h2><div class=\"row\">", escaped(&sheet.title));
+        for (caption, png) in &sheet.cells {
+            let caption = escaped(caption);
+            let _ = writeln!(
+                html,
+                "<figure><img alt=\"{caption}\" src=\"data:image/png;base64,{}\"><figcaption>\
+                 {caption}</figcaption></figure>",
+                base64(png)
+            );
+        }
+        html.push_str("</div>\n");
+    }
+    html.push_str("</body></html>\n");
+    html
+}
+
+const HEADER: &str = "<th>PSNR, dB</th><th>SSIM</th><th>LPIPS</th><th>sharpness</th>";
+
+fn row(mean: Option<Score>) -> String {
+    let cell = |v: Option<f64>, digits: usize| {
+        v.map_or_else(|| "<td>–</td>".to_owned(), |v| format!("<td>{v:.digits$}</td>"))
+    };
+    [
+        cell(mean.map(|s| s.psnr), 2),
+        cell(mean.map(|s| s.ssim), 4),
+        cell(mean.and_then(|s| s.lpips), 4),
+        cell(mean.and_then(|s| s.sharpness), 3),
+    ]
+    .concat()
+}
+
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+/// RFC 4648, with padding.
+fn base64(bytes: &[u8]) -> String {
+    const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let mut out = String::with_capacity(bytes.len().div_ceil(3) * 4);
+    for group in bytes.chunks(3) {
+        let byte = |i: usize| u32::from(group.get(i).copied().unwrap_or(0));
+        let bits = byte(0) << 16 | byte(1) << 8 | byte(2);
+        for i in 0..4 {
+            match i <= group.len() {
+                true => out.push(char::from(DIGITS[(bits >> (18 - 6 * i)) as usize & 63])),
+                false => out.push('='),
+            }
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Test vectors of RFC 4648, section 10.
+    #[test]
+    fn base64_is_the_rfcs() {
+        for (plain, coded) in [
+            ("", ""),
+            ("f", "Zg=="),
+            ("fo", "Zm8="),
+            ("foo", "Zm9v"),
+            ("foob", "Zm9vYg=="),
+            ("fooba", "Zm9vYmE="),
+            ("foobar", "Zm9vYmFy"),
+        ] {
+            assert_eq!(base64(plain.as_bytes()), coded);
+        }
+        assert_eq!(base64(&[0xFB, 0xFF]), "+/8=");
+    }
+
+    #[test]
+    fn the_window_finds_the_detail() {
+        let mut picture = Rgb::black(300, 200);
+        for y in 60..190 {
+            for x in 150..290 {
+                picture.data[3 * (300 * y + x)] = if (x + y) % 2 == 0 { 255 } else { 0 };
+            }
+        }
+        let (left, top, w, h) = busiest(&picture);
+        assert_eq!((w, h), (128, 128));
+        assert!((left, top) == (143, 60) || (left, top) == (172, 60), "{left} {top}");
+        assert_eq!(busiest(&Rgb::black(20, 10)), (0, 0, 20, 10));
+    }
+}

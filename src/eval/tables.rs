@@ -1,0 +1,97 @@
+//! Scores as JSON and CSV.
+
+use super::{Score, Scores};
+use serde_json::{Map, Value, json};
+use std::fmt::Write;
+
+/// `{"methods": {NAME: {psnr, ssim, lpips, sharpness}}, "scenes": {SCENE: {"methods": …,
+/// "cases": [{"context": …, "targets": [{"frame": …, "methods": …}]}]}}}`. What has no
+/// value, and an infinite PSNR, is null.
+pub fn report(scores: &Scores) -> Value {
+    let methods = |of: &dyn Fn(&str) -> Option<Score>| -> Map<String, Value> {
+        scores.methods.iter().map(|m| (m.clone(), json!(of(m)))).collect()
+    };
+    let scene = |name: &&str| {
+        let cases = scores.cases.iter().filter(|c| c.scene == *name).map(|case| {
+            let place = |m: &str| scores.methods.iter().position(|x| x == m);
+            let targets = case.targets.iter().map(|t| {
+                let of = |m: &str| t.scores.get(place(m)?).copied();
+                json!({ "frame": t.name, "index": t.frame, "methods": methods(&of) })
+            });
+            let targets: Vec<Value> = targets.collect();
+            let [(iw, ih), (tw, th)] = case.sizes;
+            json!({
+                "context": case.context,
+                "input": [iw, ih],
+                "target": [tw, th],
+                "near": case.near_far.0,
+                "far": case.near_far.1,
+                "photograph_enlarged": case.enlarged,
+                "methods": methods(&|m| case.mean(place(m)?)),
+                "targets": targets,
+            })
+        });
+        let cases: Vec<Value> = cases.collect();
+        let mean = methods(&|m| scores.scene_mean(name, m));
+        ((*name).to_owned(), json!({ "methods": mean, "cases": cases }))
+    };
+    let scenes: Map<String, Value> = scores.scenes().iter().map(scene).collect();
+    json!({
+        "methods": methods(&|m| scores.mean(m)),
+        "scenes": scenes,
+        "cases": scores.cases.len(),
+        "targets": scores.cases.iter().map(|c| c.targets.len()).sum::<usize>(),
+    })
+}
+
+/// Columns of the figures.
+const COLUMNS: &str = "psnr,ssim,lpips,sharpness";
+
+fn figures(score: &Score) -> String {
+    let cell = |v: Option<f64>| v.map_or_else(String::new, |v| format!("{v:.6}"));
+    let Score { psnr, ssim, lpips, sharpness } = score;
+    format!("{psnr:.6},{ssim:.6},{},{}", cell(*lpips), cell(*sharpness))
+}
+
+/// A cell of a CSV file, quoted where it must be (RFC 4180).
+fn quoted(text: &str) -> String {
+    match text.contains([',', '"', '\n', '\r']) {
+        true => format!("\"{}\"", text.replace('"', "\"\"")),
+        false => text.to_owned(),
+    }
+}
+
+/// One line for each target and method.
+pub fn targets_csv(scores: &Scores) -> String {
+    let mut text = format!("scene,context,target,frame,method,{COLUMNS}\n");
+    for case in &scores.cases {
+        let context: Vec<String> = case.context.iter().map(usize::to_string).collect();
+        let (scene, context) = (quoted(&case.scene), context.join(" "));
+        for t in &case.targets {
+            for (method, score) in scores.methods.iter().zip(&t.scores) {
+                let (name, figures) = (quoted(&t.name), figures(score));
+                // Writing to a String does not fail.
+                let _ = writeln!(text, "{scene},{context},{},{name},{method},{figures}", t.frame);
+            }
+        }
+    }
+    text
+}
+
+/// One line for each method and scene, and for each method over all (scene `*`).
+pub fn means_csv(scores: &Scores) -> String {
+    let mut text = format!("scene,method,{COLUMNS}\n");
+    let mut line = |scene: &str, method: &str, mean: Option<Score>| {
+        let figures = mean.map_or_else(|| ",,,".to_owned(), |s| figures(&s));
+        let _ = writeln!(text, "{scene},{method},{figures}");
+    };
+    for method in &scores.methods {
+        line("*", method, scores.mean(method));
+    }
+    for scene in scores.scenes() {
+        for method in &scores.methods {
+            line(&quoted(scene), method, scores.scene_mean(scene, method));
+        }
+    }
+    text
+}
