@@ -20,6 +20,7 @@ mod raster_case;
 mod render;
 mod report;
 mod run;
+mod train;
 
 use anyhow::{Context, Result, ensure};
 use args::{Cli, Command};
@@ -60,6 +61,7 @@ fn dispatch(cli: &Cli, answer: Answer) -> Result<bool> {
         Command::Check(args) => check::check(args, answer),
         Command::Info(args) => info::info(args, answer).map(|()| true),
         Command::Compare(args) => compare::compare(args, answer),
+        Command::Train(args) => train::train(args, answer).map(|()| true),
     }
 }
 
