@@ -28,6 +28,7 @@ const ARROWS: &[(&str, &[&str])] = &[
             "sh", "splats",
         ],
     ),
+    ("train", &["abi", "camera", "config", "data", "io", "metrics", "model", "ops"]),
 ];
 
 /// Rooms of the program, not of the library: public API only.

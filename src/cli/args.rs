@@ -401,6 +401,10 @@ pub struct TrainArgs {
     /// from.
     #[arg(short, long, default_value = "out", value_name = "DIR")]
     pub out: PathBuf,
+    /// Photographs to score from time to time, never to learn from: scenes with a
+    /// protocol.json, or one.
+    #[arg(long, value_name = "DIR")]
+    pub validate: Option<PathBuf>,
     /// Stop after so many minutes, with a checkpoint.
     #[arg(long, value_name = "M")]
     pub minutes: Option<f64>,

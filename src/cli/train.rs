@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use subsplat::train::TrainConfig;
 use subsplat::train::run::{Event, Limits, StepReport, Training};
 use subsplat::train::step::Seconds;
+use subsplat::train::validate::{Found, Validator};
 
 /// Between two lines where stderr is no terminal.
 const LINE_EVERY: Duration = Duration::from_secs(20);
@@ -29,7 +30,8 @@ pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
     let limits = Limits { minutes: args.minutes, steps: args.steps };
     let mut training = Training::open(&config, &args.out)?;
     let mut watch = Watch::new(&config);
-    let outcome = training.run(limits, &mut |event| watch.hear(event));
+    let validator = Validator::new(&config, args.validate.as_deref())?;
+    let outcome = training.run(limits, &validator, &mut |event| watch.hear(event));
     watch.bar.finish_and_clear();
     outcome?;
     let progress = training.progress();
@@ -107,15 +109,13 @@ impl Watch {
                 warn(format!("step {step}: loss or gradient not finite, skipped"));
             }
             Event::Saved(path) => self.tell(&format!("saved {}", path.display())),
-            Event::Validated { step, found } => self.tell(&format!(
-                "step {step}, held out: PSNR {:.2} dB (copy {:.2}), SSIM {:.4}, depth off by {:.2} \
-                 candidates, {:.1} % within 1",
-                found.psnr,
-                found.copy_psnr,
-                found.ssim,
-                found.disparity,
-                100.0 * found.within_one
-            )),
+            Event::Validated { step, rooms, photos } => {
+                for (what, found) in [("held-out rooms", rooms), ("photographs", photos)] {
+                    if let Some(found) = found {
+                        self.tell(&looked(*step, what, found));
+                    }
+                }
+            }
         }
     }
 
@@ -161,7 +161,7 @@ impl Watch {
         }
         line += &format!(" norm {:.2} lr {:.2e} {each:.2} s/step", report.norm, report.rate);
         if let Some(bytes) = resident_bytes() {
-            line += &format!(" {} MiB", mebibytes(bytes));
+            line += &format!(" {}", mebibytes(bytes));
         }
         line + &format!(" left {}", duration(left))
     }
@@ -175,6 +175,21 @@ impl Watch {
             parts.iter().map(|(name, s)| format!("{name} {:.3}", share(*s))).collect();
         say(format!("  seconds a step: {}", list.join(", ")));
     }
+}
+
+fn looked(step: u64, what: &str, found: &Found) -> String {
+    let mut line = format!(
+        "step {step}, {what}: PSNR {:.2} dB (nearer input {:.2}), SSIM {:.4}",
+        found.psnr, found.copy_psnr, found.ssim
+    );
+    if found.within_one > 0.0 {
+        line += &format!(
+            ", depth off by {:.2} candidates, {:.1} % within 1",
+            found.disparity,
+            100.0 * found.within_one
+        );
+    }
+    line
 }
 
 fn duration(seconds: f64) -> String {

@@ -104,9 +104,8 @@ pub fn load(path: &Path) -> Result<Checkpoint> {
             crate::io::Error::format(path, "a training checkpoint", format!("no `{key}`"))
         })
     };
-    let progress = serde_json::from_str(text(PROGRESS_KEY)?).map_err(|e| {
-        crate::io::Error::format(path, "a training checkpoint", e.to_string())
-    })?;
+    let progress = serde_json::from_str(text(PROGRESS_KEY)?)
+        .map_err(|e| crate::io::Error::format(path, "a training checkpoint", e.to_string()))?;
     let config = TrainConfig::from_json(text(CONFIG_KEY)?)?;
     Ok(Checkpoint { progress, config, state })
 }

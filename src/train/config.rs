@@ -287,9 +287,7 @@ impl TrainConfig {
         let json = path.extension().is_some_and(|e| e == "json");
         let parsed = if json { Self::from_json(&text) } else { Self::from_toml(&text) };
         let mut config = parsed.map_err(|e| match e {
-            Error::Parse(got) => {
-                io::Error::format(path, "a training configuration", got).into()
-            }
+            Error::Parse(got) => io::Error::format(path, "a training configuration", got).into(),
             other => other,
         })?;
         let folder = path.parent().unwrap_or(Path::new(""));
@@ -320,8 +318,7 @@ impl TrainConfig {
     /// # Errors
     /// As [`TrainConfig::load`].
     pub fn from_json(text: &str) -> Result<Self> {
-        let config: Self =
-            serde_json::from_str(text).map_err(|e| Error::Parse(e.to_string()))?;
+        let config: Self = serde_json::from_str(text).map_err(|e| Error::Parse(e.to_string()))?;
         config.check()?;
         Ok(config)
     }

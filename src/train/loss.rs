@@ -268,7 +268,9 @@ pub fn confidence(confidence: &[f32], index: &[f32], target: &[f32]) -> Scored {
     let mut gradient = vec![0.0; confidence.len()];
     let sums: Vec<f64> = gradient
         .par_chunks_mut(CHUNK)
-        .zip(confidence.par_chunks(CHUNK).zip(index.par_chunks(CHUNK)).zip(target.par_chunks(CHUNK)))
+        .zip(
+            confidence.par_chunks(CHUNK).zip(index.par_chunks(CHUNK)).zip(target.par_chunks(CHUNK)),
+        )
         .map(|(g, ((p, x), t))| {
             let mut sum = 0.0;
             for (g, item) in g.iter_mut().zip(p.iter().zip(x).zip(t)) {

@@ -12,6 +12,7 @@ pub mod config;
 pub mod loading;
 pub mod loss;
 pub mod optimizer;
+pub mod photos;
 pub mod run;
 pub mod schedule;
 pub mod source;
@@ -48,7 +49,9 @@ pub enum Error {
         got: String,
     },
     /// Loss or gradient were not finite several times in a row.
-    #[error("step {step}: loss or gradient not finite in {times} steps in a row; the last checkpoint stands")]
+    #[error(
+        "step {step}: loss or gradient not finite in {times} steps in a row; the last checkpoint stands"
+    )]
     Diverged {
         /// The last of them.
         step: u64,
@@ -59,11 +62,7 @@ pub enum Error {
 
 impl Error {
     fn value(what: impl ToString, expected: impl ToString, got: impl ToString) -> Self {
-        Self::Value {
-            what: what.to_string(),
-            expected: expected.to_string(),
-            got: got.to_string(),
-        }
+        Self::Value { what: what.to_string(), expected: expected.to_string(), got: got.to_string() }
     }
 }
 

@@ -6,7 +6,7 @@ use super::loading::Loader;
 use super::optimizer::Optimizer;
 use super::source::{Replay, Source};
 use super::step::{Learner, Seconds, Terms};
-use super::validate::{Found, Validator, rooms};
+use super::validate::{self, Found, Validator};
 use super::{Error, Result};
 use crate::io;
 use crate::model::weights::{self, Weights};
@@ -45,8 +45,10 @@ pub enum Event {
     Validated {
         /// Steps done.
         step: u64,
-        /// What came out.
-        found: Found,
+        /// Of made-up scenes.
+        rooms: Option<Found>,
+        /// Of photographs.
+        photos: Option<Found>,
     },
 }
 
@@ -88,7 +90,7 @@ pub struct Training {
 
 /// The source that `config` asks for.
 fn source(config: &TrainConfig) -> Result<Arc<dyn Source>> {
-    let rooms = rooms(config, false)?;
+    let rooms = validate::rooms(config, false)?;
     Ok(Arc::new(Replay::new(rooms, config.data.window, config.data.replay)))
 }
 
@@ -230,18 +232,22 @@ impl Training {
     }
 
     /// Steps until the configuration's last one or a limit, with checkpoints, looks at
-    /// held-out scenes, and `log.csv`.
+    /// what `validator` holds, and `log.csv`.
     ///
     /// # Errors
     /// As [`Training::step`] and [`Training::save`].
-    pub fn run(&mut self, limits: Limits, tell: &mut dyn FnMut(&Event)) -> Result<()> {
+    pub fn run(
+        &mut self,
+        limits: Limits,
+        validator: &Validator,
+        tell: &mut dyn FnMut(&Event),
+    ) -> Result<()> {
         tell(&Event::Begin {
             step: self.progress.step,
             parameters: self.optimizer.parameters(),
             resumed: self.resumed.clone(),
             untrained: self.untrained,
         });
-        let validator = Validator::new(&self.config)?;
         let mut log = Log::open(&self.folder)?;
         let begin = Instant::now();
         let minutes = |since: Instant| since.elapsed().as_secs_f64() / 60.0;
@@ -264,13 +270,13 @@ impl Training {
                 saved = Instant::now();
             }
             if minutes(looked) >= self.config.validate.minutes {
-                self.look(&validator, &mut log, tell)?;
+                self.look(validator, &mut log, tell)?;
                 looked = Instant::now();
             }
         }
         if done > 0 {
             tell(&Event::Saved(self.save()?));
-            self.look(&validator, &mut log, tell)?;
+            self.look(validator, &mut log, tell)?;
         }
         Ok(())
     }
@@ -281,14 +287,15 @@ impl Training {
         log: &mut Log,
         tell: &mut dyn FnMut(&Event),
     ) -> Result<()> {
-        if validator.is_empty() {
-            return Ok(());
-        }
         let step = self.progress.step;
-        let sheet = self.folder.join(format!("sheet-{step:08}.png"));
-        let found = validator.look(self.optimizer.averaged()?, Some(&sheet))?;
-        log.validated(step, self.progress.seconds, &found)?;
-        tell(&Event::Validated { step, found });
+        let sheet = self.folder.join(format!("sheet-{step:08}"));
+        let [rooms, photos] = validator.look(self.optimizer.averaged()?, Some(&sheet))?;
+        for (what, found) in [("rooms", &rooms), ("photos", &photos)] {
+            if let Some(found) = found {
+                log.validated((step, what), self.progress.seconds, found)?;
+            }
+        }
+        tell(&Event::Validated { step, rooms, photos });
         Ok(())
     }
 }
@@ -325,7 +332,7 @@ impl Log {
             steps: appended(&folder.join("log.csv"), &header)?,
             looks: appended(
                 &folder.join("validation.csv"),
-                "step,seconds,psnr,ssim,disparity,within_one,copy_psnr",
+                "step,seconds,what,psnr,ssim,disparity,within_one,copy_psnr",
             )?,
             folder: folder.to_owned(),
             terms: Terms::default(),
@@ -356,9 +363,9 @@ impl Log {
         writeln!(self.steps, "{line}").map_err(|e| io::Error::io(&self.folder, e).into())
     }
 
-    fn validated(&mut self, step: u64, seconds: f64, f: &Found) -> Result<()> {
+    fn validated(&mut self, (step, what): (u64, &str), seconds: f64, f: &Found) -> Result<()> {
         let line = format!(
-            "{step},{seconds:.1},{:.3},{:.4},{:.3},{:.4},{:.3}",
+            "{step},{seconds:.1},{what},{:.3},{:.4},{:.3},{:.4},{:.3}",
             f.psnr, f.ssim, f.disparity, f.within_one, f.copy_psnr
         );
         writeln!(self.looks, "{line}").map_err(|e| io::Error::io(&self.folder, e).into())

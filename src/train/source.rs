@@ -76,11 +76,8 @@ pub struct Rooms {
 impl Source for Rooms {
     fn example(&self, index: u64) -> Result<Arc<Example>> {
         let scene = index.checked_rem(self.scenes).unwrap_or(index);
-        let made = procedural::Example::with_targets(
-            word(self.seed, scene),
-            &self.spec,
-            &self.targets,
-        );
+        let made =
+            procedural::Example::with_targets(word(self.seed, scene), &self.spec, &self.targets);
         let mut pictures = Vec::with_capacity(made.views.len());
         let mut inverse_depth = Vec::new();
         for (i, (view, camera)) in made.views.iter().zip(&made.cameras).enumerate() {
@@ -181,8 +178,7 @@ impl Default for Augmentation {
 }
 
 /// The six orders of three channels.
-const ORDERS: [[usize; 3]; 6] =
-    [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
+const ORDERS: [[usize; 3]; 6] = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
 
 impl Augmentation {
     /// `example` as it is shown at place `index` of the sequence of `seed`.

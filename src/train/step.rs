@@ -279,8 +279,7 @@ impl Learner {
         seconds: &mut Seconds,
     ) -> Result<(Tensor, Terms)> {
         let start = Instant::now();
-        let (output, maps) =
-            self.model.encode_for_training(views, self.config.loss.around_mode)?;
+        let (output, maps) = self.model.encode_for_training(views, self.config.loss.around_mode)?;
         seconds.backbone += start.elapsed().as_secs_f64();
         let (mut parts, mut terms) = (Vec::new(), Terms::default());
         match &maps {
@@ -331,8 +330,8 @@ impl Learner {
     /// once, so that one picture's graph is held at a time.
     fn pictures(&self, children: &Children, example: &Example) -> Result<Seen> {
         let leaves = [leaf(&children.rows)?, leaf(&children.sh)?, leaf(&children.gain)?];
-        let mut gradients = [&children.rows, &children.sh, &children.gain]
-            .map(|t| Scored::zero(t.elem_count()));
+        let mut gradients =
+            [&children.rows, &children.sh, &children.gain].map(|t| Scored::zero(t.elem_count()));
         let mut terms = Terms::default();
         let share = 1.0 / example.targets.len().max(1) as f64;
         let [w, _] = self.config.data.input;
@@ -340,8 +339,7 @@ impl Learner {
             let ratio = target.camera.intrinsics.width as f32 / w as f32;
             let mut options = raster_options(self.model.config(), ratio, example.near_far.0);
             options.sh_basis = children.sh_basis;
-            let planes =
-                rasterize(&leaves[0], &leaves[1], &leaves[2], &target.camera, &options)?;
+            let planes = rasterize(&leaves[0], &leaves[1], &leaves[2], &target.camera, &options)?;
             let rgb = planes.narrow(0, 0, 3)?.contiguous()?;
             let (loss, found) = self.picture_loss(&rgb, target)?;
             terms.add(&found, share);

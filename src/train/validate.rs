@@ -1,11 +1,11 @@
 //! Looks at scenes that are never trained on, through the inference path and with the
 //! averaged weights: what would be shipped now.
 
+use super::Result;
 use super::config::TrainConfig;
 use super::loss::{block_median, candidate_index};
 use super::source::{Example, Picture, Rooms, Source, word};
 use super::step::{raster_options, views_of};
-use super::Result;
 use crate::config::{Backbone, Config};
 use crate::io::image::{Rgb, save_png};
 use crate::metrics::{psnr, ssim};
@@ -13,7 +13,7 @@ use crate::model::subsplat::SubSplat;
 use crate::model::weights::Weights;
 use candle_core::Tensor;
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// Mixed into the data's seed: held-out scenes are other scenes.
@@ -36,11 +36,11 @@ pub struct Found {
     pub copy_psnr: f64,
 }
 
-/// Held-out scenes, made once.
+/// Held-out scenes, made once, and photographs.
 pub struct Validator {
-    config: TrainConfig,
     model: Config,
     scenes: Vec<Arc<Example>>,
+    photos: Vec<Arc<Example>>,
 }
 
 /// The generator that `config` asks for, with another seed mixed in.
@@ -52,61 +52,87 @@ pub fn rooms(config: &TrainConfig, held_out: bool) -> Result<Rooms> {
     spec.cameras.crop = data.crop;
     spec.photographic = data.photographic;
     spec.samples = data.samples;
-    let targets = crate::data::procedural::TargetSpec {
-        ratio,
-        samples: data.target_samples,
-        clean: true,
-    };
+    let targets =
+        crate::data::procedural::TargetSpec { ratio, samples: data.target_samples, clean: true };
     let seed = if held_out { word(data.seed, HELD_OUT) } else { data.seed };
     Ok(Rooms { seed, scenes: if held_out { 0 } else { data.scenes }, spec, targets })
 }
 
 impl Validator {
-    /// Makes the scenes.
+    /// Makes the scenes, and reads the photographs in `photos`, which are looked at
+    /// only.
     ///
     /// # Errors
-    /// A configuration out of range.
-    pub fn new(config: &TrainConfig) -> Result<Self> {
+    /// A configuration out of range; photographs that cannot be read.
+    pub fn new(config: &TrainConfig, photos: Option<&Path>) -> Result<Self> {
         let mut rooms = rooms(config, true)?;
         rooms.targets.samples = rooms.targets.samples.max(2);
         rooms.spec.cameras.targets = 1;
         let scenes = (0..config.validate.scenes as u64)
             .map(|i| rooms.example(i))
             .collect::<Result<Vec<_>>>()?;
-        Ok(Self { config: config.clone(), model: config.model_config()?, scenes })
+        let model = config.model_config()?;
+        let photos = match photos {
+            Some(folder) => super::photos::pairs(folder, model.stride())?,
+            None => Vec::new(),
+        };
+        Ok(Self { model, scenes, photos })
     }
 
-    /// Whether there is anything to look at.
-    pub fn is_empty(&self) -> bool {
-        self.scenes.is_empty()
-    }
-
-    /// Scores `weights` and, with a path, writes a sheet of inputs, prediction, truth
-    /// and depth.
+    /// Scores `weights` on made-up scenes and on photographs (`None` where there are
+    /// none) and, with a path, writes a sheet a piece of inputs, prediction, truth and
+    /// depth: `path` with `-rooms.png` and `-photos.png`.
     ///
     /// # Errors
     /// Weights that do not fit, or give numbers that are not finite; a sheet that
     /// cannot be written.
-    pub fn look(&self, weights: BTreeMap<String, Tensor>, sheet: Option<&Path>) -> Result<Found> {
+    pub fn look(
+        &self,
+        weights: BTreeMap<String, Tensor>,
+        sheet: Option<&Path>,
+    ) -> Result<[Option<Found>; 2]> {
         let model = SubSplat::new(&self.model, Weights::from_tensors(weights).builder())?;
+        let path = |end: &str| {
+            let path = sheet?;
+            let mut name = path.file_name()?.to_owned();
+            name.push(end);
+            Some(path.with_file_name(name))
+        };
+        Ok([
+            self.look_all(&model, &self.scenes, path("-rooms.png"))?,
+            self.look_all(&model, &self.photos, path("-photos.png"))?,
+        ])
+    }
+
+    fn look_all(
+        &self,
+        model: &SubSplat,
+        scenes: &[Arc<Example>],
+        sheet: Option<PathBuf>,
+    ) -> Result<Option<Found>> {
+        if scenes.is_empty() {
+            return Ok(None);
+        }
         let mut found = Found::default();
         let mut rows = Vec::new();
-        for scene in &self.scenes {
-            let one = self.look_at(&model, scene)?;
-            let share = 1.0 / self.scenes.len() as f64;
+        // One row of every few scenes, so that the sheet shows different ones.
+        let stride = scenes.len().div_ceil(SHEET_SCENES);
+        for (i, scene) in scenes.iter().enumerate() {
+            let one = self.look_at(model, scene)?;
+            let share = 1.0 / scenes.len() as f64;
             found.psnr += share * one.found.psnr;
             found.ssim += share * one.found.ssim;
             found.disparity += share * one.found.disparity;
             found.within_one += share * one.found.within_one;
             found.copy_psnr += share * one.found.copy_psnr;
-            if rows.len() < SHEET_SCENES {
+            if i % stride == 0 {
                 rows.push(one.pictures);
             }
         }
         if let Some(path) = sheet {
-            save_png(path, &tiled(&rows))?;
+            save_png(&path, &tiled(&rows))?;
         }
-        Ok(found)
+        Ok(Some(found))
     }
 
     fn look_at(&self, model: &SubSplat, scene: &Example) -> Result<One> {
@@ -118,9 +144,8 @@ impl Validator {
         let depth = self.depth_scores(scene, &distances, &mut found);
         let mut pictures: Vec<Rgb> = scene.context.iter().map(|p| p.image.clone()).collect();
         for target in &scene.targets {
-            let [w, _] = self.config.data.input;
             let k = target.camera.intrinsics;
-            let ratio = k.width as f32 / w as f32;
+            let ratio = k.width as f32 / scene.context[0].image.width as f32;
             let options = raster_options(&self.model, ratio, scene.near_far.0);
             let planes =
                 model.trunk().render(&views, &output, &parents, &target.camera, &options)?;
@@ -134,10 +159,12 @@ impl Validator {
             found.psnr += share * psnr(&seen, &truth, k.width, k.height).unwrap_or(f64::NAN);
             found.ssim += share * ssim(&seen, &truth, k.width, k.height).unwrap_or(f64::NAN);
             let copy = enlarged(nearer(scene, target), k.width, k.height);
-            found.copy_psnr += share
-                * psnr(&values(&copy), &truth, k.width, k.height).unwrap_or(f64::NAN);
-            pictures.push(picture);
-            pictures.push(target.image.clone());
+            found.copy_psnr +=
+                share * psnr(&values(&copy), &truth, k.width, k.height).unwrap_or(f64::NAN);
+            if pictures.len() < scene.context.len() + 2 {
+                pictures.push(picture);
+                pictures.push(target.image.clone());
+            }
         }
         pictures.extend(depth);
         Ok(One { found, pictures })
@@ -169,9 +196,11 @@ impl Validator {
                 count += 1;
             }
             if v == 0 {
-                let top = block_median(&truth, w).into_iter().filter(|v| v.is_finite());
+                let known = if truth.is_empty() { &seen } else { &truth };
+                let top = block_median(known, w).into_iter().filter(|v| v.is_finite());
                 let top = top.fold(1.0, f32::max);
-                pictures = [seen, truth].map(|index| grey(&index, w, h, top)).into();
+                let both = [seen, truth].into_iter().filter(|index| !index.is_empty());
+                pictures = both.map(|index| grey(&index, w, h, top)).collect();
             }
         }
         found.disparity = sum / count.max(1) as f64;
@@ -220,10 +249,8 @@ fn enlarged(picture: &Rgb, w: usize, h: usize) -> Rgb {
 /// Pictures in rows and columns, all as large as the largest.
 fn tiled(rows: &[Vec<Rgb>]) -> Rgb {
     let all = || rows.iter().flatten();
-    let (w, h) = (
-        all().map(|p| p.width).max().unwrap_or(1),
-        all().map(|p| p.height).max().unwrap_or(1),
-    );
+    let (w, h) =
+        (all().map(|p| p.width).max().unwrap_or(1), all().map(|p| p.height).max().unwrap_or(1));
     let columns = rows.iter().map(Vec::len).max().unwrap_or(1);
     let mut sheet = Rgb::black(w * columns.max(1), h * rows.len().max(1));
     for (r, row) in rows.iter().enumerate() {
