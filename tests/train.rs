@@ -97,6 +97,20 @@ fn a_resumed_run_equals_an_unstopped_one_bit_for_bit() {
     }
 }
 
+/// Lanes and threads are the machine's business alone.
+#[test]
+fn the_number_of_lanes_changes_nothing() {
+    for phase in ["depth", "render"] {
+        let run = |lanes: usize| {
+            let config = TrainConfig { lanes, batch: 3, ..tiny(phase) };
+            let folder = tempfile::tempdir().unwrap();
+            let mut training = Training::open(&config, folder.path()).unwrap();
+            (steps(&mut training, 2), state(&training))
+        };
+        assert!(run(1) == run(3), "{phase}");
+    }
+}
+
 #[test]
 fn a_few_scenes_are_learnt() {
     for (phase, share) in [("depth", 0.75), ("render", 0.8)] {

@@ -328,9 +328,6 @@ fn augmentation_is_a_function_of_the_place() {
     let all = Augmentation { flip: 0.5, permute: 0.5, swap: 0.5 };
     let shown: Vec<Example> = (0..24).map(|i| all.apply(&example, 1, i)).collect();
     assert_eq!(shown[5], all.apply(&example, 1, 5));
-    let swapped =
-        |e: &Example| e.context[0].camera.intrinsics == example.context[0].camera.intrinsics;
-    let _ = swapped;
     let different = shown.iter().filter(|e| **e != *example).count();
     assert!((12..24).contains(&different), "{different}");
     let off = Augmentation { flip: 0.0, permute: 0.0, swap: 0.0 };

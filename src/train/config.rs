@@ -28,6 +28,10 @@ pub struct TrainConfig {
     /// Scenes that pass through the backbone together: memory against calls. The
     /// rendering phase holds the graphs of so many scenes' backbones.
     pub together: usize,
+    /// Groups of `together` scenes that are worked on at the same time, each with its
+    /// share of the threads and a graph of its own; 0: one for each thread. The result
+    /// does not depend on it.
+    pub lanes: usize,
     /// The network.
     pub model: Model,
     /// Weights to begin with.
@@ -250,6 +254,7 @@ impl Default for TrainConfig {
             batch: 4,
             accumulate: 1,
             together: 1,
+            lanes: 0,
             model: Model::default(),
             init: Start::Scratch,
             data: Data::default(),

@@ -16,7 +16,10 @@ use crate::model::trunk::Children;
 use crate::model::weights::Weights;
 use crate::model::{BackboneOutput, Views};
 use crate::ops::rasterize;
+use candle_core::backprop::GradStore;
 use candle_core::{Device, Tensor, Var};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 /// Parents that the trunk takes at once while training: few calls, and activations of
@@ -60,7 +63,7 @@ impl Terms {
     }
 }
 
-/// Seconds by part, for the profile.
+/// Seconds by part, for the profile; those of lanes side by side are added up.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Seconds {
     /// Waiting for examples.
@@ -110,7 +113,13 @@ pub struct Learner {
     model: SubSplat,
     config: TrainConfig,
     lpips: Option<Lpips>,
+    /// Groups of scenes are worked on side by side, each in its share of the threads: a
+    /// step then waits for its threads once, not at every operation.
+    lanes: Vec<rayon::ThreadPool>,
 }
+
+/// What one group of scenes gave.
+type Found = Result<(GradStore, Terms, Seconds)>;
 
 /// Context views of `examples` as the network takes them.
 ///
@@ -165,7 +174,15 @@ impl Learner {
             }
             _ => None,
         };
-        Ok(Self { model, config: config.clone(), lpips })
+        let threads = rayon::current_num_threads();
+        let count = if config.lanes == 0 { threads } else { config.lanes };
+        let pool = |i: usize| {
+            let share = (threads + count - 1 - i) / count;
+            let built = rayon::ThreadPoolBuilder::new().num_threads(share.max(1)).build();
+            built.map_err(|e| Error::value("threads", "a pool of them", e))
+        };
+        let lanes = (0..count).map(pool).collect::<Result<_>>()?;
+        Ok(Self { model, config: config.clone(), lpips, lanes })
     }
 
     /// The model.
@@ -186,25 +203,49 @@ impl Learner {
         gradients: &mut Gradients,
         seconds: &mut Seconds,
     ) -> Result<Terms> {
+        let groups: Vec<Vec<&Example>> =
+            examples.chunks(self.config.together.max(1)).map(|g| g.iter().collect()).collect();
+        let next = AtomicUsize::new(0);
+        let found: Vec<Mutex<Option<Found>>> = groups.iter().map(|_| Mutex::new(None)).collect();
+        let work = || {
+            while let Some(i) = Some(next.fetch_add(1, Ordering::Relaxed)).filter(|i| *i < groups.len())
+            {
+                let one = self.group(&groups[i], (share, step));
+                *found[i].lock().unwrap_or_else(PoisonError::into_inner) = Some(one);
+            }
+        };
+        std::thread::scope(|scope| {
+            for pool in self.lanes.iter().take(groups.len()) {
+                scope.spawn(|| pool.install(work));
+            }
+        });
+        // In the order of the groups: the same sums for any number of lanes.
         let mut terms = Terms::default();
-        for group in examples.chunks(self.config.together.max(1)) {
-            let group: Vec<&Example> = group.iter().collect();
-            let views = views_of(&group)?;
-            let found = match self.config.phase {
-                Phase::Depth => self.depth_group(&group, &views, share, seconds)?,
-                Phase::Render => self.render_group(&group, &views, (share, step), seconds)?,
-            };
-            let (total, group_terms) = found;
-            let start = Instant::now();
-            let store = total.backward()?;
-            drop(total);
-            seconds.backward += start.elapsed().as_secs_f64();
+        for (group, one) in groups.iter().zip(found) {
+            let one = one.into_inner().unwrap_or_else(PoisonError::into_inner);
+            let nothing = || Error::value("step", "a result of every scene", "none");
+            let (store, group_terms, group_seconds) = one.ok_or_else(nothing)??;
             let start = Instant::now();
             optimizer.collect(&store, gradients)?;
+            seconds.add(&group_seconds);
             seconds.optimizer += start.elapsed().as_secs_f64();
             terms.add(&group_terms, group.len() as f64 / examples.len() as f64);
         }
         Ok(terms)
+    }
+
+    /// Gradients and terms of scenes that pass through the backbone together.
+    fn group(&self, group: &[&Example], (share, step): (f64, u64)) -> Found {
+        let mut seconds = Seconds::default();
+        let views = views_of(group)?;
+        let (total, terms) = match self.config.phase {
+            Phase::Depth => self.depth_group(group, &views, share, &mut seconds)?,
+            Phase::Render => self.render_group(group, &views, (share, step), &mut seconds)?,
+        };
+        let start = Instant::now();
+        let store = total.backward()?;
+        seconds.backward += start.elapsed().as_secs_f64();
+        Ok((store, terms, seconds))
     }
 
     fn depth_group(

@@ -2,7 +2,7 @@
 //! averaged weights: what would be shipped now.
 
 use super::Result;
-use super::config::TrainConfig;
+use super::config::{Phase, TrainConfig};
 use super::loss::{block_median, candidate_index};
 use super::source::{Example, Picture, Rooms, Source, word};
 use super::step::{raster_options, views_of};
@@ -48,7 +48,9 @@ pub fn rooms(config: &TrainConfig, held_out: bool) -> Result<Rooms> {
     let data = &config.data;
     let ratio = config.model_config()?.upscale;
     let [w, h] = data.input;
-    let mut spec = crate::data::procedural::ExampleSpec::new(w, h, data.targets);
+    // Nothing is rendered in the depth phase but to look.
+    let count = if config.phase == Phase::Depth && !held_out { 0 } else { data.targets };
+    let mut spec = crate::data::procedural::ExampleSpec::new(w, h, count);
     spec.cameras.crop = data.crop;
     spec.photographic = data.photographic;
     spec.samples = data.samples;
