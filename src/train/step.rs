@@ -208,7 +208,8 @@ impl Learner {
         let next = AtomicUsize::new(0);
         let found: Vec<Mutex<Option<Found>>> = groups.iter().map(|_| Mutex::new(None)).collect();
         let work = || {
-            while let Some(i) = Some(next.fetch_add(1, Ordering::Relaxed)).filter(|i| *i < groups.len())
+            while let Some(i) =
+                Some(next.fetch_add(1, Ordering::Relaxed)).filter(|i| *i < groups.len())
             {
                 let one = self.group(&groups[i], (share, step));
                 *found[i].lock().unwrap_or_else(PoisonError::into_inner) = Some(one);
