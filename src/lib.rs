@@ -49,6 +49,7 @@ pub mod pipeline;
 pub mod render;
 pub mod sh;
 pub mod splats;
+pub mod train;
 
 pub use ops::rasterize_splats as rasterize;
 pub use render::{Picture, render};

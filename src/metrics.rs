@@ -14,10 +14,10 @@ const SSIM_SIGMA: f64 = 1.5;
 /// Rows and columns next to the border that do not count, px.
 const SSIM_BORDER: usize = SSIM_WINDOW / 2;
 /// (K1·L)² and (K2·L)² of Wang et al. 2004 with K1 = 0.01, K2 = 0.03, L = 1.
-const SSIM_C1: f64 = 0.01 * 0.01;
-const SSIM_C2: f64 = 0.03 * 0.03;
+pub(crate) const SSIM_C1: f64 = 0.01 * 0.01;
+pub(crate) const SSIM_C2: f64 = 0.03 * 0.03;
 /// n/(n − 1) for the n = 121 pixels of a window: sample covariance.
-const SSIM_COVARIANCE: f64 = 121.0 / 120.0;
+pub(crate) const SSIM_COVARIANCE: f64 = 121.0 / 120.0;
 
 /// Why two pictures were not compared.
 #[derive(Debug, Error, PartialEq, Eq)]
@@ -107,7 +107,7 @@ pub fn psnr(a: &[f32], b: &[f32], width: usize, height: usize) -> Result<f64, Me
     Ok(-10.0 * mse.log10())
 }
 
-fn window() -> [f64; SSIM_WINDOW] {
+pub(crate) fn window() -> [f64; SSIM_WINDOW] {
     let mut taps = [0.0; SSIM_WINDOW];
     for (i, tap) in taps.iter_mut().enumerate() {
         let d = i as f64 - SSIM_BORDER as f64;

@@ -35,6 +35,7 @@ const ARROWS: &[(&str, &[&str])] = &[
             "render", "splats",
         ],
     ),
+    ("train", &["abi", "camera", "config", "data", "io", "metrics", "model", "ops"]),
 ];
 
 /// Rooms of the program, not of the library: public API only.

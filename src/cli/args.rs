@@ -60,6 +60,8 @@ pub enum Command {
     /// Run the encoder, or the rasterizer, on a reference file's inputs and compare every
     /// tensor in it.
     Compare(CompareArgs),
+    /// Learn weights; the same command goes on where it was stopped.
+    Train(TrainArgs),
 }
 
 /// Which rasterizer's rules a render follows.
@@ -391,4 +393,25 @@ pub struct CompareArgs {
     /// Instruction set of the rasterizer (default: SUBSPLAT_SIMD, else the widest here).
     #[arg(long, value_enum, conflicts_with = "weights")]
     pub simd: Option<SimdArg>,
+}
+
+/// Arguments of `train`.
+#[derive(Debug, Args)]
+pub struct TrainArgs {
+    /// What to learn from and how: TOML or JSON (examples: tools/train).
+    pub config: PathBuf,
+    /// Folder of checkpoints, weights, logs and sheets. Checkpoints in it are gone on
+    /// from.
+    #[arg(short, long, default_value = "out", value_name = "DIR")]
+    pub out: PathBuf,
+    /// Photographs to score from time to time, never to learn from: scenes with a
+    /// protocol.json, or one.
+    #[arg(long, value_name = "DIR")]
+    pub validate: Option<PathBuf>,
+    /// Stop after so many minutes, with a checkpoint.
+    #[arg(long, value_name = "M")]
+    pub minutes: Option<f64>,
+    /// Stop after so many steps, with a checkpoint.
+    #[arg(long, value_name = "N")]
+    pub steps: Option<u64>,
 }

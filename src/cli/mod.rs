@@ -22,6 +22,7 @@ mod raster_case;
 mod render;
 mod report;
 mod run;
+mod train;
 
 use anyhow::{Context, Result, ensure};
 use args::{Cli, Command};
@@ -63,6 +64,7 @@ fn dispatch(cli: &Cli, answer: Answer) -> Result<bool> {
         Command::Info(args) => info::info(args, answer).map(|()| true),
         Command::Eval(args) => eval::eval(args, answer).map(|()| true),
         Command::Compare(args) => compare::compare(args, answer),
+        Command::Train(args) => train::train(args, answer).map(|()| true),
     }
 }
 

@@ -1,5 +1,6 @@
 //! The whole model: posed pictures to children.
 
+use super::backbone::small::DepthMaps;
 use super::backbone::{Mvsplat, SmallBackbone};
 use super::primaries::primaries;
 use super::trace::Trace;
@@ -79,6 +80,43 @@ impl SubSplat {
             Encoder::Mvsplat(encoder) => encoder.forward(views, &mut Trace::off()),
             Encoder::Small(encoder) => Ok(encoder.forward(views, false)?.0),
         }
+    }
+
+    /// The backbone for training: with every gradient, and with its depth maps where it
+    /// is the small one. `around_mode` averages disparity as inference does, else over
+    /// all candidates.
+    ///
+    /// # Errors
+    /// Sides that are no multiples of [`Config::stride`].
+    pub fn encode_for_training(
+        &self,
+        views: &Views,
+        around_mode: bool,
+    ) -> Result<(BackboneOutput, Option<DepthMaps>)> {
+        match &self.encoder {
+            Encoder::Mvsplat(encoder) => Ok((encoder.forward(views, &mut Trace::off())?, None)),
+            Encoder::Small(encoder) => {
+                let (output, maps) = encoder.forward(views, !around_mode)?;
+                Ok((output, Some(maps)))
+            }
+        }
+    }
+
+    /// The small backbone's depth alone; `around_mode` as in
+    /// [`SubSplat::encode_for_training`].
+    ///
+    /// # Errors
+    /// Another backbone; sides that are no multiples of [`Config::stride`].
+    pub fn depth_maps(&self, views: &Views, around_mode: bool) -> Result<DepthMaps> {
+        match &self.encoder {
+            Encoder::Mvsplat(_) => bail!("depth maps: expected the small backbone, got MVSplat's"),
+            Encoder::Small(encoder) => encoder.depth(views, !around_mode),
+        }
+    }
+
+    /// What stands behind the primaries.
+    pub fn trunk(&self) -> &Trunk {
+        &self.trunk
     }
 
     /// World-frame primaries of what the backbone gave.

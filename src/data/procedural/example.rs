@@ -28,6 +28,18 @@ impl ExampleSpec {
     }
 }
 
+/// How the targets of an example differ from its context views.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TargetSpec {
+    /// Side of a target over side of a context view; at least 1.
+    pub ratio: usize,
+    /// Samples along each side of a target's pixel; at least 1.
+    pub samples: usize,
+    /// The scene's gain and gamma alone: no exposure of its own, softness or noise, which
+    /// nothing could predict.
+    pub clean: bool,
+}
+
 /// Views, cameras, near and far of one scene, in the example's unit of length.
 #[derive(Clone, Debug)]
 pub struct Example {
@@ -43,6 +55,8 @@ pub struct Example {
     pub far: f32,
 }
 
+/// Context views of an example.
+const CONTEXT: usize = 2;
 /// Depth that both rules put the 2 % quantile of depth at, units.
 const NEAR_DEPTH: [f32; 2] = [0.9, 2.4];
 /// Share of examples with near 1 and far 100, RealEstate10K's habit.
@@ -66,29 +80,51 @@ impl Example {
     /// The example of `seed`. A room without a place for cameras is replaced by the
     /// next of a fixed sequence: every seed gives an example.
     pub fn new(seed: u64, spec: &ExampleSpec) -> Self {
+        let targets = TargetSpec { ratio: 1, samples: spec.samples, clean: false };
+        Self::with_targets(seed, spec, &targets)
+    }
+
+    /// [`Example::new`] with targets of another size or grade: the same rooms and cameras.
+    pub fn with_targets(seed: u64, spec: &ExampleSpec, targets: &TargetSpec) -> Self {
         let mut rng = Rng::new(seed).fork(11);
         loop {
             let seed = rng.bits();
             let room = Room::new(seed);
             if let Some(rig) = sample_cameras(&room, seed, &spec.cameras) {
-                return Self::of(seed, &room, &rig, spec, &mut rng);
+                return Self::of(seed, &room, &rig, (spec, targets), &mut rng);
             }
         }
     }
 
-    fn of(seed: u64, room: &Room, rig: &Rig, spec: &ExampleSpec, rng: &mut Rng) -> Self {
+    fn of(
+        seed: u64,
+        room: &Room,
+        rig: &Rig,
+        (spec, targets): (&ExampleSpec, &TargetSpec),
+        rng: &mut Rng,
+    ) -> Self {
         let (scale, near, far) = planes(rig, rng);
         let scene = Grade::of_scene(rng);
         let soft = rng.chance(0.3);
-        let render = |camera: &Camera| {
-            let grade = if spec.photographic { scene.of_view(soft, rng) } else { Grade::default() };
-            let quality = Quality { samples: spec.samples, ..Quality::training(grade) };
+        let mut cameras = rig.cameras.clone();
+        for camera in cameras.iter_mut().skip(CONTEXT) {
+            let (w, h) = (camera.intrinsics.width, camera.intrinsics.height);
+            *camera = camera.resized(w * targets.ratio.max(1), h * targets.ratio.max(1));
+        }
+        let render = |(i, camera): (usize, &Camera)| {
+            let target = i >= CONTEXT;
+            let grade = match spec.photographic {
+                true if target && targets.clean => scene,
+                true => scene.of_view(soft, rng),
+                false => Grade::default(),
+            };
+            let samples = if target { targets.samples } else { spec.samples };
+            let quality = Quality { samples, ..Quality::training(grade) };
             let mut view = room.render(camera, &quality);
             view.depth.iter_mut().for_each(|d| *d *= scale);
             view
         };
-        let views = rig.cameras.iter().map(render).collect();
-        let mut cameras = rig.cameras.clone();
+        let views = cameras.iter().enumerate().map(render).collect();
         for camera in &mut cameras {
             let eye = camera.position() * scale;
             camera.world_from_camera.w_axis = eye.extend(1.0);

@@ -26,7 +26,7 @@ mod synthesis;
 mod texture;
 
 pub use cameras::{CameraSpec, Motion, Rig, sample_cameras};
-pub use example::{Example, ExampleSpec};
+pub use example::{Example, ExampleSpec, TargetSpec};
 pub use render::{Grade, Quality, View};
 pub use texture::TextureBank;
 

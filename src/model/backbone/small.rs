@@ -156,6 +156,40 @@ impl SmallBackbone {
     /// A picture whose sides are no multiples of the configuration's stride.
     pub fn forward(&self, views: &Views, training: bool) -> Result<(BackboneOutput, DepthMaps)> {
         let (b, v, _, h, w) = views.images.dims5()?;
+        let Seen { rgb, feat2, feat4, deep, logits, index, confidence } =
+            self.see(views, training)?;
+        let heads = self.heads(&rgb, &deep, [&index, &confidence], training)?;
+        let depths = self.ray_distance(views, &index)?;
+        let pool = |s: usize| -> Result<Tensor> { split_views(&deep.avg_pool2d(s)?, b, v) };
+        let features = vec![
+            (FeatureLevel::Trans4, split_views(&deep, b, v)?),
+            (FeatureLevel::Trans8, pool(2)?),
+            (FeatureLevel::Trans16, pool(4)?),
+            (FeatureLevel::Cnn4, split_views(&feat4, b, v)?),
+            (FeatureLevel::Cnn2, split_views(&feat2, b, v)?),
+            (FeatureLevel::Refine1, split_views(&heads.hidden, b, v)?),
+        ];
+        let output = BackboneOutput {
+            raw: heads.raw.reshape((b, v, h * w, ()))?,
+            depths,
+            densities: heads.density.reshape((b, v, h * w, 1))?,
+            features,
+        };
+        Ok((output, DepthMaps { logits, index, confidence: sigmoid(&confidence)? }))
+    }
+
+    /// Depth alone, without the heads at full resolution: what depth supervision needs.
+    ///
+    /// # Errors
+    /// As [`SmallBackbone::forward`].
+    pub fn depth(&self, views: &Views, training: bool) -> Result<DepthMaps> {
+        let Seen { logits, index, confidence, .. } = self.see(views, training)?;
+        Ok(DepthMaps { logits, index, confidence: sigmoid(&confidence)? })
+    }
+
+    /// Everything before the heads.
+    fn see(&self, views: &Views, training: bool) -> Result<Seen> {
+        let (b, v, _, h, w) = views.images.dims5()?;
         let stride = 4 << (self.config.unet_channels.len() - 1);
         if h % stride != 0 || w % stride != 0 {
             bail!("small backbone: expected sides that are multiples of {stride}, got {h}x{w}");
@@ -184,24 +218,7 @@ impl SmallBackbone {
             Some(convex) => convex.apply(&deep, &rgb, [&index, &confidence])?,
             None => [resize_bilinear(&index, h, w)?, resize_bilinear(&confidence, h, w)?],
         };
-        let heads = self.heads(&rgb, &deep, [&index, &confidence], training)?;
-        let depths = self.ray_distance(views, &index)?;
-        let pool = |s: usize| -> Result<Tensor> { split_views(&deep.avg_pool2d(s)?, b, v) };
-        let features = vec![
-            (FeatureLevel::Trans4, split_views(&deep, b, v)?),
-            (FeatureLevel::Trans8, pool(2)?),
-            (FeatureLevel::Trans16, pool(4)?),
-            (FeatureLevel::Cnn4, split_views(&feat4, b, v)?),
-            (FeatureLevel::Cnn2, split_views(&feat2, b, v)?),
-            (FeatureLevel::Refine1, split_views(&heads.hidden, b, v)?),
-        ];
-        let output = BackboneOutput {
-            raw: heads.raw.reshape((b, v, h * w, ()))?,
-            depths,
-            densities: heads.density.reshape((b, v, h * w, 1))?,
-            features,
-        };
-        Ok((output, DepthMaps { logits, index, confidence: sigmoid(&confidence)? }))
+        Ok(Seen { rgb, feat2, feat4, deep, logits, index, confidence })
     }
 
     /// Volume of matching scores, through the stem.
@@ -318,6 +335,18 @@ fn whole(mut parts: Vec<Tensor>) -> Result<Tensor> {
         1 => Ok(parts.swap_remove(0)),
         _ => Tensor::cat(&parts, 0),
     }
+}
+
+/// What the heads and depth supervision build on. `confidence` before its sigmoid;
+/// `index` and `confidence` at full resolution.
+struct Seen {
+    rgb: Tensor,
+    feat2: Tensor,
+    feat4: Tensor,
+    deep: Tensor,
+    logits: Tensor,
+    index: Tensor,
+    confidence: Tensor,
 }
 
 struct Swept {

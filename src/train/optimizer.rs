@@ -1,0 +1,302 @@
+//! Adam and AdamW over all parameters as one row of numbers: one pass a step for clip,
+//! moments, weights and their moving average.
+
+use candle_core::backprop::GradStore;
+use candle_core::{Device, Result, Tensor, Var, bail};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::ops::Range;
+
+/// What the optimizer is told. Defaults: PyTorch's AdamW, clip at 1, moving average
+/// 0.997.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Settings {
+    /// Decay of the first and of the second moment.
+    pub betas: [f64; 2],
+    /// Added to the root of the second moment.
+    pub epsilon: f64,
+    /// Decoupled decay of weights with two or more axes (AdamW); 0 is Adam.
+    pub weight_decay: f64,
+    /// Largest norm of all gradients together; 0 for any.
+    pub clip: f64,
+    /// Decay of the moving average of the weights, which is what is shipped; 0 keeps the
+    /// weights themselves. It rises to this as (1 + step)/(10 + step).
+    pub average: f64,
+    /// Factor on the learning rate of the backbone.
+    pub backbone_rate: f64,
+    /// The backbone stays as it is.
+    pub freeze_backbone: bool,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            betas: [0.9, 0.999],
+            epsilon: 1e-8,
+            weight_decay: 0.01,
+            clip: 1.0,
+            average: 0.997,
+            backbone_rate: 1.0,
+            freeze_backbone: false,
+        }
+    }
+}
+
+/// One parameter's place in the row.
+#[derive(Clone, Debug)]
+struct Slot {
+    name: String,
+    var: Var,
+    span: Range<usize>,
+    decays: bool,
+    backbone: bool,
+}
+
+/// All parameters of a model, in the order of their names, and the optimizer's state.
+#[derive(Clone, Debug)]
+pub struct Optimizer {
+    settings: Settings,
+    slots: Vec<Slot>,
+    values: Vec<f32>,
+    first: Vec<f32>,
+    second: Vec<f32>,
+    average: Vec<f32>,
+    /// Updates of each parameter so far: a parameter that no loss has reached stands
+    /// still, and its bias correction with it.
+    updates: Vec<u64>,
+}
+
+/// Sum of the gradients of several backward passes.
+#[derive(Clone, Debug)]
+pub struct Gradients {
+    sum: Vec<f32>,
+    touched: Vec<bool>,
+}
+
+impl Gradients {
+    /// Norm of all gradients together.
+    pub fn norm(&self) -> f64 {
+        let sums: Vec<f64> = self
+            .sum
+            .par_chunks(4096)
+            .map(|c| c.iter().map(|g| f64::from(*g) * f64::from(*g)).sum())
+            .collect();
+        sums.iter().sum::<f64>().sqrt()
+    }
+
+    /// All to zero.
+    pub fn clear(&mut self) {
+        self.sum.fill(0.0);
+        self.touched.fill(false);
+    }
+}
+
+/// The optimizer's state under names, for a checkpoint.
+pub type State = BTreeMap<String, Tensor>;
+
+/// Prefixes of the state's tensors.
+const ROWS: [&str; 4] = ["weights/", "first/", "second/", "average/"];
+/// Name of the numbers of updates, exact in f32 up to 2²⁴.
+const UPDATES: &str = "updates";
+
+impl Optimizer {
+    /// Over `variables`, by name. Backbone parameters are those whose names do not start
+    /// with `subsplat.`.
+    ///
+    /// # Errors
+    /// A variable that is not f32.
+    pub fn new(settings: Settings, variables: BTreeMap<String, Var>) -> Result<Self> {
+        let (mut slots, mut values) = (Vec::new(), Vec::new());
+        for (name, var) in variables {
+            let start = values.len();
+            values.extend(var.flatten_all()?.to_vec1::<f32>()?);
+            slots.push(Slot {
+                decays: var.rank() >= 2,
+                backbone: !name.starts_with(crate::model::weights::SUBSPLAT_PREFIX),
+                span: start..values.len(),
+                name,
+                var,
+            });
+        }
+        let n = values.len();
+        Ok(Self {
+            settings,
+            updates: vec![0; slots.len()],
+            slots,
+            first: vec![0.0; n],
+            second: vec![0.0; n],
+            average: values.clone(),
+            values,
+        })
+    }
+
+    /// Number of parameters.
+    pub fn parameters(&self) -> usize {
+        self.values.len()
+    }
+
+    /// Zeros, to add gradients to.
+    pub fn gradients(&self) -> Gradients {
+        Gradients { sum: vec![0.0; self.values.len()], touched: vec![false; self.slots.len()] }
+    }
+
+    /// Adds what a backward pass found.
+    ///
+    /// # Errors
+    /// A gradient that is not f32.
+    pub fn collect(&self, store: &GradStore, gradients: &mut Gradients) -> Result<()> {
+        for (i, slot) in self.slots.iter().enumerate() {
+            if slot.backbone && self.settings.freeze_backbone {
+                continue;
+            }
+            let Some(gradient) = store.get(&slot.var) else { continue };
+            let found = gradient.flatten_all()?.to_vec1::<f32>()?;
+            let sum = &mut gradients.sum[slot.span.clone()];
+            if found.len() != sum.len() {
+                bail!("gradient of `{}`: expected {} elements", slot.name, sum.len());
+            }
+            sum.iter_mut().zip(&found).for_each(|(s, g)| *s += g);
+            gradients.touched[i] = true;
+        }
+        Ok(())
+    }
+
+    /// One step with learning rate `rate`, number `step` of the training. The norm of
+    /// `gradients` is given, since the caller has looked at it.
+    ///
+    /// # Errors
+    /// Whatever candle says of the assignment.
+    pub fn step(&mut self, gradients: &Gradients, norm: f64, rate: f64, step: u64) -> Result<()> {
+        let s = self.settings;
+        let clip = if s.clip > 0.0 && norm > s.clip { s.clip / norm } else { 1.0 };
+        let decay = s.average.min((1.0 + step as f64) / (10.0 + step as f64));
+        let decay = if s.average > 0.0 { decay } else { 0.0 };
+        for (i, slot) in self.slots.iter().enumerate() {
+            if !gradients.touched[i] {
+                continue;
+            }
+            self.updates[i] += 1;
+            let t = self.updates[i] as i32;
+            let rate = if slot.backbone { rate * s.backbone_rate } else { rate };
+            let update = Update {
+                clip: clip as f32,
+                betas: s.betas.map(|b| b as f32),
+                // Both bias corrections folded into rate and ε's scale.
+                rate: (rate / (1.0 - s.betas[0].powi(t))) as f32,
+                root: (1.0 / (1.0 - s.betas[1].powi(t)).sqrt()) as f32,
+                epsilon: s.epsilon as f32,
+                keep: if slot.decays { (1.0 - rate * s.weight_decay) as f32 } else { 1.0 },
+                average: decay as f32,
+            };
+            let span = slot.span.clone();
+            update.run(
+                &gradients.sum[span.clone()],
+                &mut self.values[span.clone()],
+                [&mut self.first[span.clone()], &mut self.second[span.clone()]],
+                &mut self.average[span.clone()],
+            );
+            slot.var.set(&Tensor::from_slice(
+                &self.values[span],
+                slot.var.shape(),
+                &Device::Cpu,
+            )?)?;
+        }
+        Ok(())
+    }
+
+    /// The moving average of the weights, by the model's names.
+    ///
+    /// # Errors
+    /// Whatever candle says of the allocation.
+    pub fn averaged(&self) -> Result<BTreeMap<String, Tensor>> {
+        self.named("", &self.average)
+    }
+
+    fn named(&self, prefix: &str, row: &[f32]) -> Result<BTreeMap<String, Tensor>> {
+        let tensor = |s: &Slot| -> Result<(String, Tensor)> {
+            let t = Tensor::from_slice(&row[s.span.clone()], s.var.shape(), &Device::Cpu)?;
+            Ok((format!("{prefix}{}", s.name), t))
+        };
+        self.slots.iter().map(tensor).collect()
+    }
+
+    /// Everything that the next step depends on.
+    ///
+    /// # Errors
+    /// Whatever candle says of the allocation.
+    pub fn state(&self) -> Result<State> {
+        let mut state = State::new();
+        for (prefix, row) in
+            ROWS.into_iter().zip([&self.values, &self.first, &self.second, &self.average])
+        {
+            state.extend(self.named(prefix, row)?);
+        }
+        let updates: Vec<f32> = self.updates.iter().map(|u| *u as f32).collect();
+        state.insert(UPDATES.into(), Tensor::from_vec(updates, self.slots.len(), &Device::Cpu)?);
+        Ok(state)
+    }
+
+    /// Takes [`Optimizer::state`] back.
+    ///
+    /// # Errors
+    /// A tensor that is missing, of another shape, or of no parameter.
+    pub fn restore(&mut self, mut state: State) -> Result<()> {
+        for slot in &self.slots {
+            let rows = [&mut self.values, &mut self.first, &mut self.second, &mut self.average];
+            for (prefix, row) in ROWS.into_iter().zip(rows) {
+                let name = format!("{prefix}{}", slot.name);
+                let tensor = taken(&mut state, &name, slot.var.dims())?;
+                row[slot.span.clone()].copy_from_slice(&tensor.flatten_all()?.to_vec1::<f32>()?);
+            }
+            let value = &self.values[slot.span.clone()];
+            slot.var.set(&Tensor::from_slice(value, slot.var.shape(), &Device::Cpu)?)?;
+        }
+        let updates = taken(&mut state, UPDATES, &[self.slots.len()])?.to_vec1::<f32>()?;
+        self.updates = updates.into_iter().map(|u| u as u64).collect();
+        match state.keys().next() {
+            Some(name) => bail!("checkpoint: `{name}` is no part of this model"),
+            None => Ok(()),
+        }
+    }
+}
+
+fn taken(state: &mut State, name: &str, dims: &[usize]) -> Result<Tensor> {
+    match state.remove(name) {
+        Some(t) if t.dims() == dims => Ok(t),
+        Some(t) => bail!("checkpoint tensor `{name}`: expected {dims:?}, got {:?}", t.dims()),
+        None => bail!("checkpoint: expected a tensor `{name}`, got none"),
+    }
+}
+
+/// One parameter's step (Kingma and Ba 2015, algorithm 1; Loshchilov and Hutter 2019).
+struct Update {
+    clip: f32,
+    betas: [f32; 2],
+    rate: f32,
+    root: f32,
+    epsilon: f32,
+    keep: f32,
+    average: f32,
+}
+
+impl Update {
+    fn run(&self, g: &[f32], value: &mut [f32], [m, v]: [&mut [f32]; 2], average: &mut [f32]) {
+        const SHARE: usize = 1 << 14;
+        g.par_chunks(SHARE)
+            .zip(value.par_chunks_mut(SHARE).zip(average.par_chunks_mut(SHARE)))
+            .zip(m.par_chunks_mut(SHARE).zip(v.par_chunks_mut(SHARE)))
+            .for_each(|((g, (value, average)), (m, v))| {
+                let [b1, b2] = self.betas;
+                for i in 0..g.len() {
+                    let g = g[i] * self.clip;
+                    m[i] = b1 * m[i] + (1.0 - b1) * g;
+                    v[i] = b2 * v[i] + (1.0 - b2) * g * g;
+                    let step = self.rate * m[i] / (v[i].sqrt() * self.root + self.epsilon);
+                    value[i] = self.keep * value[i] - step;
+                    average[i] += (1.0 - self.average) * (value[i] - average[i]);
+                }
+            });
+    }
+}

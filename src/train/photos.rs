@@ -1,0 +1,58 @@
+//! Photographs to look at while training: scenes with a `protocol.json`. Nothing is
+//! ever learnt from them.
+
+use super::Result;
+use super::source::{Example, Picture};
+use crate::data::crop::{CropOptions, crop};
+use crate::data::depth::depth_range;
+use crate::io::protocol::{Views, load_protocol};
+use crate::io::scene::{Scene, load_scene};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// Side of input and of target, px: the protocol's.
+const SIDE: usize = 256;
+
+/// The pairs of all scenes in `folder` (or of the one scene that it is), in the order
+/// of their names; targets at the input's size.
+///
+/// # Errors
+/// No scene with a `protocol.json`; a scene, a protocol or a photograph that cannot be
+/// read.
+pub fn pairs(folder: &Path, stride: usize) -> Result<Vec<Arc<Example>>> {
+    let entries = std::fs::read_dir(folder).map_err(|e| crate::io::Error::io(folder, e))?;
+    let mut scenes: Vec<PathBuf> = entries.filter_map(|e| Some(e.ok()?.path())).collect();
+    scenes.push(folder.to_owned());
+    scenes.retain(|p| p.join("protocol.json").is_file());
+    scenes.sort();
+    let mut found = Vec::new();
+    for path in &scenes {
+        let file = path.join("protocol.json");
+        let scene = load_scene(path)?;
+        for test in load_protocol(&file)?.tests {
+            test.check(&file, scene.frames.len())?;
+            found.push(Arc::new(pair(&scene, &test, stride)?));
+        }
+    }
+    if found.is_empty() {
+        let expected = "scenes with a protocol.json that names pairs";
+        return Err(crate::io::Error::format(folder, expected, "none").into());
+    }
+    Ok(found)
+}
+
+fn pair(scene: &Scene, test: &Views, stride: usize) -> Result<Example> {
+    let options = CropOptions::square(SIDE, 1, stride);
+    let load = |&i: &usize| -> Result<Picture> {
+        let (photo, camera) = scene.frames[i].load()?;
+        let cropped = crop(&photo, &camera, &options)?;
+        Ok(Picture { image: cropped.input, camera: cropped.input_camera })
+    };
+    let range = depth_range(scene, &test.context, (None, None))?;
+    Ok(Example {
+        context: test.context.iter().map(load).collect::<Result<_>>()?,
+        targets: test.target.iter().map(load).collect::<Result<_>>()?,
+        inverse_depth: Vec::new(),
+        near_far: (range.near, range.far),
+    })
+}

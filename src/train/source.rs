@@ -1,0 +1,222 @@
+//! Where examples come from: an endless sequence that an index determines, so that a
+//! training is resumed by a number.
+
+use super::Result;
+use crate::camera::Camera;
+use crate::data::procedural::{self, ExampleSpec, TargetSpec};
+use crate::io::image::Rgb;
+use glam::{Mat4, Vec4};
+use half::f16;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// A picture and its camera.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Picture {
+    /// Display values.
+    pub image: Rgb,
+    /// Pinhole camera of these pixels.
+    pub camera: Camera,
+}
+
+/// What one step learns from, of one scene.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Example {
+    /// Views that the network sees; all of one size.
+    pub context: Vec<Picture>,
+    /// Views that it is to predict, at target size.
+    pub targets: Vec<Picture>,
+    /// 1 / camera z of each context view's pixels, 0 where there is no surface. Empty
+    /// where depth is unknown.
+    pub inverse_depth: Vec<Vec<f16>>,
+    /// Nearest and farthest depth candidate.
+    pub near_far: (f32, f32),
+}
+
+/// An endless sequence of examples. The same index gives the same example, on any
+/// thread.
+pub trait Source: Send + Sync {
+    /// Example number `index`.
+    ///
+    /// # Errors
+    /// What a file says; nothing in a generator.
+    fn example(&self, index: u64) -> Result<Arc<Example>>;
+}
+
+/// Words that belong to a seed and a place (SplitMix64's finaliser).
+pub(super) fn word(seed: u64, key: u64) -> u64 {
+    let mut z = seed ^ key.wrapping_add(1).wrapping_mul(0x9E37_79B9_7F4A_7C15);
+    for _ in 0..2 {
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        z ^= z >> 31;
+    }
+    z
+}
+
+/// In [0, 1).
+fn share(seed: u64, key: u64) -> f64 {
+    (word(seed, key) >> 11) as f64 / (1u64 << 53) as f64
+}
+
+/// Made-up rooms ([`procedural`]): a training set is one seed.
+#[derive(Clone, Debug)]
+pub struct Rooms {
+    /// Which rooms.
+    pub seed: u64,
+    /// Distinct scenes, repeated in order; 0 for any number.
+    pub scenes: u64,
+    /// Context views.
+    pub spec: ExampleSpec,
+    /// Targets.
+    pub targets: TargetSpec,
+}
+
+impl Source for Rooms {
+    fn example(&self, index: u64) -> Result<Arc<Example>> {
+        let scene = index.checked_rem(self.scenes).unwrap_or(index);
+        let made =
+            procedural::Example::with_targets(word(self.seed, scene), &self.spec, &self.targets);
+        let mut pictures = Vec::with_capacity(made.views.len());
+        let mut inverse_depth = Vec::new();
+        for (i, (view, camera)) in made.views.iter().zip(&made.cameras).enumerate() {
+            let data = view.rgb.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8).collect();
+            let image = Rgb { width: view.width, height: view.height, data };
+            pictures.push(Picture { image, camera: *camera });
+            if i < 2 {
+                let inverse = |z: &f32| f16::from_f32(if *z > 0.0 { 1.0 / z } else { 0.0 });
+                inverse_depth.push(view.depth.iter().map(inverse).collect());
+            }
+        }
+        let targets = pictures.split_off(2.min(pictures.len()));
+        let near_far = (made.near, made.far);
+        Ok(Arc::new(Example { context: pictures, targets, inverse_depth, near_far }))
+    }
+}
+
+/// Shows each example of `inner` several times, in windows: `window` examples in one
+/// order, then again in another, `times` in all, then the next window. Making an
+/// example once and using it often is what keeps a slow source ahead of the step.
+pub struct Replay<S> {
+    inner: S,
+    window: u64,
+    times: u64,
+    /// Of the windows in use.
+    kept: Mutex<BTreeMap<u64, Arc<Example>>>,
+}
+
+impl<S: Source> Replay<S> {
+    /// `window` and `times` at least 1.
+    pub fn new(inner: S, window: u64, times: u64) -> Self {
+        Self { inner, window: window.max(1), times: times.max(1), kept: Mutex::default() }
+    }
+
+    /// Which of `inner`'s examples stands at `index`.
+    pub fn place(&self, index: u64) -> u64 {
+        let block = index / (self.window * self.times);
+        let within = index % (self.window * self.times);
+        let (pass, i) = (within / self.window, within % self.window);
+        block * self.window + shuffled(i, self.window, word(block, pass))
+    }
+}
+
+/// Place of `i` in a random order of `0..n`: a Feistel cipher over the next power of
+/// four, walked until it lands inside.
+fn shuffled(i: u64, n: u64, key: u64) -> u64 {
+    let bits = (64 - n.saturating_sub(1).leading_zeros()).div_ceil(2).max(1);
+    let mask = (1u64 << bits) - 1;
+    let mut at = i;
+    loop {
+        let (mut left, mut right) = (at >> bits, at & mask);
+        for round in 0..4 {
+            (left, right) = (right, left ^ (word(key, right * 4 + round) & mask));
+        }
+        at = left << bits | right;
+        if at < n {
+            return at;
+        }
+    }
+}
+
+impl<S: Source> Source for Replay<S> {
+    fn example(&self, index: u64) -> Result<Arc<Example>> {
+        let place = self.place(index);
+        if self.times == 1 {
+            return self.inner.example(place);
+        }
+        let lock = || self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(example) = lock().get(&place) {
+            return Ok(example.clone());
+        }
+        let example = self.inner.example(place)?;
+        let mut kept = lock();
+        // Loading runs ahead: the window before may still be wanted.
+        let oldest = (place / self.window).saturating_sub(1) * self.window;
+        *kept = kept.split_off(&oldest);
+        kept.insert(place, example.clone());
+        Ok(example)
+    }
+}
+
+/// Changes that leave an example true. Defaults: those of `learning.md`'s recipe.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Augmentation {
+    /// Chance of a mirror image of views and poses.
+    pub flip: f64,
+    /// Chance of another order of the colour channels.
+    pub permute: f64,
+    /// Chance that the context views change places.
+    pub swap: f64,
+}
+
+impl Default for Augmentation {
+    fn default() -> Self {
+        Self { flip: 0.5, permute: 0.5, swap: 0.5 }
+    }
+}
+
+/// The six orders of three channels.
+const ORDERS: [[usize; 3]; 6] = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
+
+impl Augmentation {
+    /// `example` as it is shown at place `index` of the sequence of `seed`.
+    pub fn apply(&self, example: &Example, seed: u64, index: u64) -> Example {
+        let draw = |what: u64| share(word(seed, 0xA0_6E), index * 8 + what);
+        let mut out = example.clone();
+        if draw(0) < self.flip {
+            out.context.iter_mut().chain(&mut out.targets).for_each(mirror);
+            for (map, view) in out.inverse_depth.iter_mut().zip(&out.context) {
+                map.chunks_mut(view.image.width.max(1)).for_each(<[f16]>::reverse);
+            }
+        }
+        if draw(1) < self.permute {
+            let order = ORDERS[(draw(2) * 6.0) as usize % 6];
+            for picture in out.context.iter_mut().chain(&mut out.targets) {
+                for px in picture.image.data.chunks_exact_mut(3) {
+                    let old = [px[0], px[1], px[2]];
+                    px.copy_from_slice(&order.map(|c| old[c]));
+                }
+            }
+        }
+        if draw(3) < self.swap {
+            out.context.reverse();
+            out.inverse_depth.reverse();
+        }
+        out
+    }
+}
+
+/// The picture and the world in a mirror that swaps left and right: x becomes −x in
+/// the world and in the camera.
+pub fn mirror(picture: &mut Picture) {
+    let (w, camera) = (picture.image.width, &mut picture.camera);
+    for row in picture.image.data.chunks_mut((3 * w).max(1)) {
+        row.reverse();
+        row.chunks_exact_mut(3).for_each(<[u8]>::reverse);
+    }
+    let flip = Mat4::from_diagonal(Vec4::new(-1.0, 1.0, 1.0, 1.0));
+    camera.world_from_camera = flip * camera.world_from_camera * flip;
+    camera.intrinsics.cx = w as f32 - camera.intrinsics.cx;
+}

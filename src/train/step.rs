@@ -1,0 +1,453 @@
+//! One step's gradients: examples through the network, losses, and back.
+
+use super::config::{Phase, TrainConfig};
+use super::loss::{self, Scored, with_gradient};
+use super::optimizer::{Gradients, Optimizer};
+use super::source::{Example, Picture};
+use super::{Error, Result};
+use crate::abi::RasterOptions;
+use crate::config::{Backbone, Config};
+use crate::model::backbone::small::DepthMaps;
+use crate::model::lpips::Lpips;
+use crate::model::primaries::primaries;
+use crate::model::subsplat::SubSplat;
+use crate::model::trace::Trace;
+use crate::model::trunk::Children;
+use crate::model::weights::Weights;
+use crate::model::{BackboneOutput, Views};
+use crate::ops::rasterize;
+use candle_core::backprop::GradStore;
+use candle_core::{Device, Tensor, Var};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
+use std::time::Instant;
+
+/// Parents that the trunk takes at once while training: few calls, and activations of
+/// some ten megabytes each.
+const CHUNK: usize = 4096;
+
+/// Means over the examples of a step; NaN where a step has no such term.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Terms {
+    /// What is made small.
+    pub loss: f64,
+    /// Mean squared difference of the pictures.
+    pub mse: f64,
+    /// (1 − SSIM)/2 of the pictures.
+    pub dssim: f64,
+    /// LPIPS of the pictures.
+    pub lpips: f64,
+    /// Cross-entropy of the depth candidates.
+    pub cross_entropy: f64,
+    /// Smooth L1 of disparity, candidates.
+    pub disparity: f64,
+    /// Cross-entropy of confidence.
+    pub confidence: f64,
+}
+
+impl Terms {
+    /// −10·log₁₀ of the mean squared difference, dB.
+    pub fn psnr(&self) -> f64 {
+        -10.0 * self.mse.log10()
+    }
+
+    /// Adds `share` of another's.
+    pub fn add(&mut self, other: &Self, share: f64) {
+        self.loss += share * other.loss;
+        self.mse += share * other.mse;
+        self.dssim += share * other.dssim;
+        self.lpips += share * other.lpips;
+        self.cross_entropy += share * other.cross_entropy;
+        self.disparity += share * other.disparity;
+        self.confidence += share * other.confidence;
+    }
+}
+
+/// Seconds by part, for the profile; those of lanes side by side are added up.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Seconds {
+    /// Waiting for examples.
+    pub data: f64,
+    /// Backbone, forward.
+    pub backbone: f64,
+    /// Primaries and trunk, forward.
+    pub trunk: f64,
+    /// Rasterizer and picture losses, there and back.
+    pub raster: f64,
+    /// Depth losses.
+    pub loss: f64,
+    /// Everything else backward.
+    pub backward: f64,
+    /// Gathering gradients, norm, optimizer.
+    pub optimizer: f64,
+}
+
+impl Seconds {
+    /// By name.
+    pub fn parts(&self) -> [(&'static str, f64); 7] {
+        [
+            ("data", self.data),
+            ("backbone", self.backbone),
+            ("trunk", self.trunk),
+            ("raster", self.raster),
+            ("loss", self.loss),
+            ("backward", self.backward),
+            ("optimizer", self.optimizer),
+        ]
+    }
+
+    /// Adds another's.
+    pub fn add(&mut self, other: &Self) {
+        self.data += other.data;
+        self.backbone += other.backbone;
+        self.trunk += other.trunk;
+        self.raster += other.raster;
+        self.loss += other.loss;
+        self.backward += other.backward;
+        self.optimizer += other.optimizer;
+    }
+}
+
+/// The model with everything that its loss needs.
+pub struct Learner {
+    model: SubSplat,
+    config: TrainConfig,
+    lpips: Option<Lpips>,
+    /// Groups of scenes are worked on side by side, each in its share of the threads: a
+    /// step then waits for its threads once, not at every operation.
+    lanes: Vec<rayon::ThreadPool>,
+}
+
+/// What one group of scenes gave.
+type Found = Result<(GradStore, Terms, Seconds)>;
+
+/// Context views of `examples` as the network takes them.
+///
+/// # Errors
+/// Views of several sizes, or fewer than two.
+pub fn views_of(examples: &[&Example]) -> Result<Views> {
+    let first = examples.iter().flat_map(|e| &e.context).next();
+    let Some(first) = first else { return Err(Error::value("examples", "at least one", "none")) };
+    let (w, h, v) = (first.image.width, first.image.height, examples[0].context.len());
+    let mut pixels = Vec::with_capacity(examples.len() * v * 3 * w * h);
+    for picture in examples.iter().flat_map(|e| &e.context) {
+        pixels.extend(picture.image.to_planes());
+    }
+    let images = Tensor::from_vec(pixels, (examples.len(), v, 3, h, w), &Device::Cpu)?;
+    let cameras = examples.iter().map(|e| e.context.iter().map(|p| p.camera).collect()).collect();
+    let planes = examples.iter().map(|e| vec![e.near_far; e.context.len()]).collect();
+    Ok(Views::new(images, cameras, planes)?)
+}
+
+/// How pictures of a model with `config` are rasterized at target size.
+pub fn raster_options(config: &Config, ratio: f32, near: f32) -> RasterOptions {
+    let render = &config.render;
+    let mut options = RasterOptions::new(render.convention);
+    options.sh_degree = render.sh_degree;
+    options.sh_direction = render.sh_dir;
+    options.lowpass = render.lowpass_px2(ratio);
+    if render.convention == crate::abi::Convention::Mvsplat {
+        options.near = near;
+    }
+    options
+}
+
+/// A detached copy with a gradient of its own.
+fn leaf(t: &Tensor) -> Result<Var> {
+    Ok(Var::from_tensor(&t.detach())?)
+}
+
+fn flat(t: &Tensor) -> Result<Vec<f32>> {
+    Ok(t.flatten_all()?.to_vec1::<f32>()?)
+}
+
+impl Learner {
+    /// Builds the model from `weights`, which must be trainable.
+    ///
+    /// # Errors
+    /// Weights that do not fit; LPIPS's file.
+    pub fn new(config: &TrainConfig, weights: &Weights) -> Result<Self> {
+        let model = SubSplat::new(&config.model_config()?, weights.builder())?;
+        let lpips = match &config.loss.lpips_weights {
+            Some(path) if config.loss.lpips > 0.0 => {
+                Some(Lpips::new(Weights::load(path)?.builder())?)
+            }
+            _ => None,
+        };
+        let threads = rayon::current_num_threads();
+        let count = if config.lanes == 0 { threads } else { config.lanes };
+        let pool = |i: usize| {
+            let share = (threads + count - 1 - i) / count;
+            let built = rayon::ThreadPoolBuilder::new().num_threads(share.max(1)).build();
+            built.map_err(|e| Error::value("threads", "a pool of them", e))
+        };
+        let lanes = (0..count).map(pool).collect::<Result<_>>()?;
+        Ok(Self { model, config: config.clone(), lpips, lanes })
+    }
+
+    /// The model.
+    pub fn model(&self) -> &SubSplat {
+        &self.model
+    }
+
+    /// Adds the gradients of the mean loss of `examples`, each counting `share`, and
+    /// gives the mean terms. `step` seeds what is random.
+    ///
+    /// # Errors
+    /// Whatever the network finds wrong with its input.
+    pub fn accumulate(
+        &self,
+        examples: &[Example],
+        (share, step): (f64, u64),
+        optimizer: &Optimizer,
+        gradients: &mut Gradients,
+        seconds: &mut Seconds,
+    ) -> Result<Terms> {
+        let groups: Vec<Vec<&Example>> =
+            examples.chunks(self.config.together.max(1)).map(|g| g.iter().collect()).collect();
+        let next = AtomicUsize::new(0);
+        let found: Vec<Mutex<Option<Found>>> = groups.iter().map(|_| Mutex::new(None)).collect();
+        let work = || {
+            while let Some(i) =
+                Some(next.fetch_add(1, Ordering::Relaxed)).filter(|i| *i < groups.len())
+            {
+                let one = self.group(&groups[i], (share, step));
+                *found[i].lock().unwrap_or_else(PoisonError::into_inner) = Some(one);
+            }
+        };
+        std::thread::scope(|scope| {
+            for pool in self.lanes.iter().take(groups.len()) {
+                scope.spawn(|| pool.install(work));
+            }
+        });
+        // In the order of the groups: the same sums for any number of lanes.
+        let mut terms = Terms::default();
+        for (group, one) in groups.iter().zip(found) {
+            let one = one.into_inner().unwrap_or_else(PoisonError::into_inner);
+            let nothing = || Error::value("step", "a result of every scene", "none");
+            let (store, group_terms, group_seconds) = one.ok_or_else(nothing)??;
+            let start = Instant::now();
+            optimizer.collect(&store, gradients)?;
+            seconds.add(&group_seconds);
+            seconds.optimizer += start.elapsed().as_secs_f64();
+            terms.add(&group_terms, group.len() as f64 / examples.len() as f64);
+        }
+        Ok(terms)
+    }
+
+    /// Gradients and terms of scenes that pass through the backbone together.
+    fn group(&self, group: &[&Example], (share, step): (f64, u64)) -> Found {
+        let mut seconds = Seconds::default();
+        let views = views_of(group)?;
+        let (total, terms) = match self.config.phase {
+            Phase::Depth => self.depth_group(group, &views, share, &mut seconds)?,
+            Phase::Render => self.render_group(group, &views, (share, step), &mut seconds)?,
+        };
+        let start = Instant::now();
+        let store = total.backward()?;
+        seconds.backward += start.elapsed().as_secs_f64();
+        Ok((store, terms, seconds))
+    }
+
+    fn depth_group(
+        &self,
+        group: &[&Example],
+        views: &Views,
+        share: f64,
+        seconds: &mut Seconds,
+    ) -> Result<(Tensor, Terms)> {
+        let start = Instant::now();
+        let maps = self.model.depth_maps(views, self.config.loss.around_mode)?;
+        seconds.backbone += start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let nothing = Terms { mse: f64::NAN, dssim: f64::NAN, lpips: f64::NAN, ..Terms::default() };
+        let (mut parts, mut terms) = (Vec::new(), nothing);
+        let weight = share * group.len() as f64;
+        self.depth_losses(group, &maps, weight, &mut parts, &mut terms)?;
+        seconds.loss += start.elapsed().as_secs_f64();
+        Ok((sum(parts)?, terms))
+    }
+
+    /// Scalars whose sum is `weight` times the mean depth loss of `group`.
+    fn depth_losses(
+        &self,
+        group: &[&Example],
+        maps: &DepthMaps,
+        weight: f64,
+        parts: &mut Vec<Tensor>,
+        terms: &mut Terms,
+    ) -> Result<()> {
+        let Backbone::Small(small) = &self.model.config().backbone else { return Ok(()) };
+        if group.iter().any(|e| e.inverse_depth.len() != e.context.len()) {
+            return Ok(());
+        }
+        let d = small.depth_candidates;
+        let (mut fine, mut coarse) = (Vec::new(), Vec::new());
+        for example in group {
+            for (inverse, view) in example.inverse_depth.iter().zip(&example.context) {
+                let inverse: Vec<f32> = inverse.iter().map(|v| v.to_f32()).collect();
+                let index = loss::candidate_index(&inverse, example.near_far, d);
+                coarse.extend(loss::block_median(&index, view.image.width));
+                fine.extend(index);
+            }
+        }
+        let w = &self.config.loss;
+        let (_, _, h4, w4) = maps.logits.dims4()?;
+        let index = flat(&maps.index)?;
+        let entropy = loss::two_hot_cross_entropy(&flat(&maps.logits)?, &coarse, [d, h4 * w4]);
+        let disparity = loss::smooth_l1(&index, &fine);
+        let confidence = loss::confidence(&flat(&maps.confidence)?, &index, &fine);
+        (terms.cross_entropy, terms.disparity) = (entropy.value, disparity.value);
+        terms.confidence = confidence.value;
+        let all = [
+            (&maps.logits, entropy, w.cross_entropy),
+            (&maps.index, disparity, w.disparity),
+            (&maps.confidence, confidence, w.confidence),
+        ];
+        for (tensor, scored, factor) in all {
+            terms.loss += factor * scored.value;
+            if factor > 0.0 {
+                parts.push(with_gradient(tensor, scored.scaled(factor * weight))?);
+            }
+        }
+        Ok(())
+    }
+
+    fn render_group(
+        &self,
+        group: &[&Example],
+        views: &Views,
+        (share, step): (f64, u64),
+        seconds: &mut Seconds,
+    ) -> Result<(Tensor, Terms)> {
+        let start = Instant::now();
+        let (output, maps) = self.model.encode_for_training(views, self.config.loss.around_mode)?;
+        seconds.backbone += start.elapsed().as_secs_f64();
+        let (mut parts, mut terms) = (Vec::new(), Terms::default());
+        match &maps {
+            Some(maps) => {
+                let start = Instant::now();
+                let weight = share * group.len() as f64;
+                self.depth_losses(group, maps, weight, &mut parts, &mut terms)?;
+                seconds.loss += start.elapsed().as_secs_f64();
+            }
+            None => {
+                (terms.cross_entropy, terms.disparity, terms.confidence) =
+                    (f64::NAN, f64::NAN, f64::NAN);
+            }
+        }
+        for (b, example) in group.iter().enumerate() {
+            let start = Instant::now();
+            let one = scene_of(&output, b)?;
+            let views = views.scene(b)?;
+            let mut settings = self.model.config().primaries().clone();
+            settings.opacity_exponent = self.opacity_exponent(step, settings.opacity_exponent);
+            let parents = primaries(&one, &views, &settings, &mut Trace::off())?;
+            let children =
+                self.model.trunk().forward_train(&views, &one, &parents, (CHUNK, step))?;
+            seconds.trunk += start.elapsed().as_secs_f64();
+            let start = Instant::now();
+            let seen = self.pictures(&children, example)?;
+            let [rows, sh, gain] = seen.gradients;
+            parts.push(with_gradient(&children.rows, rows.scaled(share))?);
+            parts.push(with_gradient(&children.sh, sh.scaled(share))?);
+            parts.push(with_gradient(&children.gain, gain.scaled(share))?);
+            terms.add(&seen.terms, 1.0 / group.len() as f64);
+            seconds.raster += start.elapsed().as_secs_f64();
+        }
+        Ok((sum(parts)?, terms))
+    }
+
+    /// x of the opacity mapping at `step` (MVSplat, `map_pdf_to_opacity`).
+    fn opacity_exponent(&self, step: u64, last: f64) -> f64 {
+        let l = &self.config.loss;
+        if l.opacity_steps == 0 {
+            return last;
+        }
+        let share = (step as f64 / l.opacity_steps as f64).min(1.0);
+        l.opacity_start + share * (last - l.opacity_start)
+    }
+
+    /// Renders every target of `example` and takes the loss back to the children at
+    /// once, so that one picture's graph is held at a time.
+    fn pictures(&self, children: &Children, example: &Example) -> Result<Seen> {
+        let leaves = [leaf(&children.rows)?, leaf(&children.sh)?, leaf(&children.gain)?];
+        let mut gradients =
+            [&children.rows, &children.sh, &children.gain].map(|t| Scored::zero(t.elem_count()));
+        let mut terms = Terms::default();
+        let share = 1.0 / example.targets.len().max(1) as f64;
+        let [w, _] = self.config.data.input;
+        for target in &example.targets {
+            let ratio = target.camera.intrinsics.width as f32 / w as f32;
+            let mut options = raster_options(self.model.config(), ratio, example.near_far.0);
+            options.sh_basis = children.sh_basis;
+            let planes = rasterize(&leaves[0], &leaves[1], &leaves[2], &target.camera, &options)?;
+            let rgb = planes.narrow(0, 0, 3)?.contiguous()?;
+            let (loss, found) = self.picture_loss(&rgb, target)?;
+            terms.add(&found, share);
+            let store = loss.backward()?;
+            for (leaf, sum) in leaves.iter().zip(&mut gradients) {
+                if let Some(g) = store.get(leaf) {
+                    let gradient = flat(g)?;
+                    sum.add(&Scored { value: 0.0, gradient }, share);
+                }
+            }
+        }
+        gradients[0].value = terms.loss;
+        Ok(Seen { gradients, terms })
+    }
+
+    fn picture_loss(&self, rgb: &Tensor, target: &Picture) -> Result<(Tensor, Terms)> {
+        let w = &self.config.loss;
+        let (_, height, width) = rgb.dims3()?;
+        let (x, truth) = (flat(rgb)?, target.image.to_planes());
+        let mut all = loss::mse(&x, &truth).scaled(w.mse);
+        let mut terms = Terms { mse: all.value / w.mse.max(1e-30), ..Terms::default() };
+        if w.mse == 0.0 {
+            terms.mse = loss::mse(&x, &truth).value;
+        }
+        if w.dssim > 0.0 {
+            let found = loss::dssim(&x, &truth, width, height);
+            terms.dssim = found.value;
+            all.add(&found, w.dssim);
+        }
+        terms.loss = all.value;
+        let mut total = with_gradient(rgb, all)?;
+        if let Some(lpips) = &self.lpips {
+            let truth = Tensor::from_vec(truth, (1, 3, height, width), &Device::Cpu)?;
+            let found = lpips.forward(&rgb.unsqueeze(0)?, &truth)?.mean_all()?;
+            terms.lpips = f64::from(found.to_scalar::<f32>()?);
+            terms.loss += w.lpips * terms.lpips;
+            total = (total + (found * w.lpips)?)?;
+        }
+        Ok((total, terms))
+    }
+}
+
+struct Seen {
+    gradients: [Scored; 3],
+    terms: Terms,
+}
+
+fn sum(parts: Vec<Tensor>) -> Result<Tensor> {
+    let mut parts = parts.into_iter();
+    let Some(mut total) = parts.next() else {
+        return Err(Error::value("loss", "at least one weight above 0", "none"));
+    };
+    for part in parts {
+        total = (total + part)?;
+    }
+    Ok(total)
+}
+
+/// Scene `b` of a backbone's output.
+fn scene_of(output: &BackboneOutput, b: usize) -> Result<BackboneOutput> {
+    let one = |t: &Tensor| t.narrow(0, b, 1);
+    let features = output.features.iter().map(|(level, map)| Ok((*level, one(map)?)));
+    Ok(BackboneOutput {
+        raw: one(&output.raw)?,
+        depths: one(&output.depths)?,
+        densities: one(&output.densities)?,
+        features: features.collect::<Result<_>>()?,
+    })
+}

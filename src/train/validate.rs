@@ -1,0 +1,269 @@
+//! Looks at scenes that are never trained on, through the inference path and with the
+//! averaged weights: what would be shipped now.
+
+use super::Result;
+use super::config::{Phase, TrainConfig};
+use super::loss::{block_median, candidate_index};
+use super::source::{Example, Picture, Rooms, Source, word};
+use super::step::{raster_options, views_of};
+use crate::config::{Backbone, Config};
+use crate::io::image::{Rgb, save_png};
+use crate::metrics::{psnr, ssim};
+use crate::model::subsplat::SubSplat;
+use crate::model::weights::Weights;
+use candle_core::Tensor;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// Mixed into the data's seed: held-out scenes are other scenes.
+const HELD_OUT: u64 = 0x48_45_4C_44;
+/// Scenes on the sheet.
+const SHEET_SCENES: usize = 4;
+
+/// Means over the held-out scenes.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Found {
+    /// Of the targets, dB.
+    pub psnr: f64,
+    /// Of the targets.
+    pub ssim: f64,
+    /// Error of disparity, candidates (small backbone only).
+    pub disparity: f64,
+    /// Share of pixels within one candidate.
+    pub within_one: f64,
+    /// PSNR of the nearer input copied, dB: what any model must beat.
+    pub copy_psnr: f64,
+}
+
+/// Held-out scenes, made once, and photographs.
+pub struct Validator {
+    model: Config,
+    scenes: Vec<Arc<Example>>,
+    photos: Vec<Arc<Example>>,
+}
+
+/// The generator that `config` asks for, with another seed mixed in.
+pub fn rooms(config: &TrainConfig, held_out: bool) -> Result<Rooms> {
+    let data = &config.data;
+    let ratio = config.model_config()?.upscale;
+    let [w, h] = data.input;
+    // Nothing is rendered in the depth phase but to look.
+    let count = if config.phase == Phase::Depth && !held_out { 0 } else { data.targets };
+    let mut spec = crate::data::procedural::ExampleSpec::new(w, h, count);
+    spec.cameras.crop = data.crop;
+    spec.photographic = data.photographic;
+    spec.samples = data.samples;
+    let targets =
+        crate::data::procedural::TargetSpec { ratio, samples: data.target_samples, clean: true };
+    let seed = if held_out { word(data.seed, HELD_OUT) } else { data.seed };
+    Ok(Rooms { seed, scenes: if held_out { 0 } else { data.scenes }, spec, targets })
+}
+
+impl Validator {
+    /// Makes the scenes, and reads the photographs in `photos`, which are looked at
+    /// only.
+    ///
+    /// # Errors
+    /// A configuration out of range; photographs that cannot be read.
+    pub fn new(config: &TrainConfig, photos: Option<&Path>) -> Result<Self> {
+        let mut rooms = rooms(config, true)?;
+        rooms.targets.samples = rooms.targets.samples.max(2);
+        rooms.spec.cameras.targets = 1;
+        let scenes = (0..config.validate.scenes as u64)
+            .map(|i| rooms.example(i))
+            .collect::<Result<Vec<_>>>()?;
+        let model = config.model_config()?;
+        let photos = match photos {
+            Some(folder) => super::photos::pairs(folder, model.stride())?,
+            None => Vec::new(),
+        };
+        Ok(Self { model, scenes, photos })
+    }
+
+    /// Scores `weights` on made-up scenes and on photographs (`None` where there are
+    /// none) and, with a path, writes a sheet a piece of inputs, prediction, truth and
+    /// depth: `path` with `-rooms.png` and `-photos.png`.
+    ///
+    /// # Errors
+    /// Weights that do not fit, or give numbers that are not finite; a sheet that
+    /// cannot be written.
+    pub fn look(
+        &self,
+        weights: BTreeMap<String, Tensor>,
+        sheet: Option<&Path>,
+    ) -> Result<[Option<Found>; 2]> {
+        let model = SubSplat::new(&self.model, Weights::from_tensors(weights).builder())?;
+        let path = |end: &str| {
+            let path = sheet?;
+            let mut name = path.file_name()?.to_owned();
+            name.push(end);
+            Some(path.with_file_name(name))
+        };
+        Ok([
+            self.look_all(&model, &self.scenes, path("-rooms.png"))?,
+            self.look_all(&model, &self.photos, path("-photos.png"))?,
+        ])
+    }
+
+    fn look_all(
+        &self,
+        model: &SubSplat,
+        scenes: &[Arc<Example>],
+        sheet: Option<PathBuf>,
+    ) -> Result<Option<Found>> {
+        if scenes.is_empty() {
+            return Ok(None);
+        }
+        let mut found = Found::default();
+        let mut rows = Vec::new();
+        // One row of every few scenes, so that the sheet shows different ones.
+        let stride = scenes.len().div_ceil(SHEET_SCENES);
+        for (i, scene) in scenes.iter().enumerate() {
+            let one = self.look_at(model, scene)?;
+            let share = 1.0 / scenes.len() as f64;
+            found.psnr += share * one.found.psnr;
+            found.ssim += share * one.found.ssim;
+            found.disparity += share * one.found.disparity;
+            found.within_one += share * one.found.within_one;
+            found.copy_psnr += share * one.found.copy_psnr;
+            if i % stride == 0 {
+                rows.push(one.pictures);
+            }
+        }
+        if let Some(path) = sheet {
+            save_png(&path, &tiled(&rows))?;
+        }
+        Ok(Some(found))
+    }
+
+    fn look_at(&self, model: &SubSplat, scene: &Example) -> Result<One> {
+        let views = views_of(&[scene])?;
+        let output = model.encode(&views)?;
+        let parents = model.primaries(&views, &output)?;
+        let mut found = Found::default();
+        let distances = output.depths.narrow(3, 0, 1)?.flatten_all()?.to_vec1::<f32>()?;
+        let depth = self.depth_scores(scene, &distances, &mut found);
+        let mut pictures: Vec<Rgb> = scene.context.iter().map(|p| p.image.clone()).collect();
+        for target in &scene.targets {
+            let k = target.camera.intrinsics;
+            let ratio = k.width as f32 / scene.context[0].image.width as f32;
+            let options = raster_options(&self.model, ratio, scene.near_far.0);
+            let planes =
+                model.trunk().render(&views, &output, &parents, &target.camera, &options)?;
+            let rgb = planes.narrow(0, 0, 3)?.flatten_all()?.to_vec1::<f32>()?;
+            let rgb: Vec<f32> = rgb.iter().map(|v| v.clamp(0.0, 1.0)).collect();
+            let Some(picture) = Rgb::from_planes(&rgb, k.width, k.height) else { continue };
+            let share = 1.0 / scene.targets.len() as f64;
+            let truth = values(&target.image);
+            let seen = interleaved(&rgb);
+            // Both pictures are this function's own: of one size, and finite.
+            found.psnr += share * psnr(&seen, &truth, k.width, k.height).unwrap_or(f64::NAN);
+            found.ssim += share * ssim(&seen, &truth, k.width, k.height).unwrap_or(f64::NAN);
+            let copy = enlarged(nearer(scene, target), k.width, k.height);
+            found.copy_psnr +=
+                share * psnr(&values(&copy), &truth, k.width, k.height).unwrap_or(f64::NAN);
+            if pictures.len() < scene.context.len() + 2 {
+                pictures.push(picture);
+                pictures.push(target.image.clone());
+            }
+        }
+        pictures.extend(depth);
+        Ok(One { found, pictures })
+    }
+
+    /// Depth against the generator's, and both as pictures.
+    fn depth_scores(&self, scene: &Example, distances: &[f32], found: &mut Found) -> Vec<Rgb> {
+        let Some(view) = scene.context.first() else { return Vec::new() };
+        let (w, h) = (view.image.width, view.image.height);
+        let mut pictures = Vec::new();
+        let d = match &self.model.backbone {
+            Backbone::Small(small) => small.depth_candidates,
+            Backbone::Mvsplat(mvsplat) => mvsplat.depth_candidates,
+        };
+        let (mut sum, mut near, mut count) = (0.0, 0usize, 0usize);
+        for (v, view) in scene.context.iter().enumerate() {
+            let k = view.camera.intrinsics;
+            let inverse = (0..w * h).map(|i| {
+                let at = glam::Vec2::new((i % w) as f32 + 0.5, (i / w) as f32 + 0.5);
+                k.unproject(at).length() / distances.get(v * w * h + i).unwrap_or(&1.0)
+            });
+            let seen = candidate_index(&inverse.collect::<Vec<_>>(), scene.near_far, d);
+            let truth: Vec<f32> =
+                scene.inverse_depth.get(v).into_iter().flatten().map(|x| x.to_f32()).collect();
+            let truth = candidate_index(&truth, scene.near_far, d);
+            for (s, t) in seen.iter().zip(&truth).filter(|(s, t)| s.is_finite() && t.is_finite()) {
+                sum += f64::from((s - t).abs());
+                near += usize::from((s - t).abs() <= 1.0);
+                count += 1;
+            }
+            if v == 0 {
+                let known = if truth.is_empty() { &seen } else { &truth };
+                let top = block_median(known, w).into_iter().filter(|v| v.is_finite());
+                let top = top.fold(1.0, f32::max);
+                let both = [seen, truth].into_iter().filter(|index| !index.is_empty());
+                pictures = both.map(|index| grey(&index, w, h, top)).collect();
+            }
+        }
+        found.disparity = sum / count.max(1) as f64;
+        found.within_one = near as f64 / count.max(1) as f64;
+        pictures
+    }
+}
+
+struct One {
+    found: Found,
+    pictures: Vec<Rgb>,
+}
+
+/// The context view whose eye is nearer to the target's.
+fn nearer<'a>(scene: &'a Example, target: &'a Picture) -> &'a Rgb {
+    let distance = |p: &Picture| p.camera.position().distance(target.camera.position());
+    let best = scene.context.iter().min_by(|a, b| distance(a).total_cmp(&distance(b)));
+    best.map_or(&target.image, |p| &p.image)
+}
+
+fn values(picture: &Rgb) -> Vec<f32> {
+    picture.data.iter().map(|v| f32::from(*v) / 255.0).collect()
+}
+
+/// `[3, H, W]` to `[H, W, 3]`.
+fn interleaved(planes: &[f32]) -> Vec<f32> {
+    let n = planes.len() / 3;
+    (0..n).flat_map(|i| [planes[i], planes[n + i], planes[2 * n + i]]).collect()
+}
+
+fn grey(index: &[f32], w: usize, h: usize, top: f32) -> Rgb {
+    let value = |v: &f32| if v.is_finite() { (255.0 * (v / top).clamp(0.0, 1.0)) as u8 } else { 0 };
+    Rgb { width: w, height: h, data: index.iter().flat_map(|v| [value(v); 3]).collect() }
+}
+
+/// Each pixel repeated: for looking, and for a copied input.
+fn enlarged(picture: &Rgb, w: usize, h: usize) -> Rgb {
+    let mut data = Vec::with_capacity(3 * w * h);
+    for (y, x) in (0..h).flat_map(|y| (0..w).map(move |x| (y, x))) {
+        let (sy, sx) = (y * picture.height / h.max(1), x * picture.width / w.max(1));
+        data.extend_from_slice(&picture.data[3 * (sy * picture.width + sx)..][..3]);
+    }
+    Rgb { width: w, height: h, data }
+}
+
+/// Pictures in rows and columns, all as large as the largest.
+fn tiled(rows: &[Vec<Rgb>]) -> Rgb {
+    let all = || rows.iter().flatten();
+    let (w, h) =
+        (all().map(|p| p.width).max().unwrap_or(1), all().map(|p| p.height).max().unwrap_or(1));
+    let columns = rows.iter().map(Vec::len).max().unwrap_or(1);
+    let mut sheet = Rgb::black(w * columns.max(1), h * rows.len().max(1));
+    for (r, row) in rows.iter().enumerate() {
+        for (c, picture) in row.iter().enumerate() {
+            let picture = enlarged(picture, w, h);
+            for y in 0..h {
+                let at = 3 * ((r * h + y) * sheet.width + c * w);
+                sheet.data[at..at + 3 * w]
+                    .copy_from_slice(&picture.data[3 * y * w..3 * (y + 1) * w]);
+            }
+        }
+    }
+    sheet
+}

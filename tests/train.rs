@@ -1,0 +1,303 @@
+//! The training loop on a tiny network: stopping changes nothing, bad steps change
+//! nothing, examples are learnt, files are whole.
+
+use std::path::Path;
+use subsplat::train::TrainConfig;
+use subsplat::train::checkpoint;
+use subsplat::train::optimizer::State;
+use subsplat::train::run::{Event, Limits, Training};
+use subsplat::train::validate::Validator;
+
+/// A network of some thousand numbers, pictures of 32², targets of 64².
+const TINY: &str = r#"
+phase = "PHASE"
+seed = 3
+steps = 40
+batch = 2
+
+[model]
+preset = "tuned"
+
+[model.set.embed]
+mlp = "lite"
+dim = 16
+
+[model.set.agg]
+stages_geo = 1
+levels = ["trans4"]
+
+[model.set.spgr]
+hidden = 16
+
+[model.set.backbone]
+cnn_channels = [8, 8]
+cnn_blocks = 1
+match_channels = 4
+depth_candidates = 16
+stem_channels = 2
+unet_channels = [16, 16]
+head_channels = 8
+primaries = { sh_degree = 1 }
+
+[data]
+input = [32, 32]
+scenes = 4
+window = 2
+replay = 2
+photographic = false
+
+[schedule]
+kind = "cosine"
+rate = 3e-3
+warmup = 2
+
+[validate]
+scenes = 1
+"#;
+
+fn tiny(phase: &str) -> TrainConfig {
+    TrainConfig::from_toml(&TINY.replace("PHASE", phase)).unwrap()
+}
+
+fn steps(training: &mut Training, n: usize) -> Vec<f64> {
+    (0..n).map(|_| training.step().unwrap().unwrap().terms.loss).collect()
+}
+
+fn state(training: &Training) -> Vec<(String, Vec<u32>)> {
+    let bits = |t: &candle_core::Tensor| -> Vec<u32> {
+        t.flatten_all().unwrap().to_vec1::<f32>().unwrap().iter().map(|v| v.to_bits()).collect()
+    };
+    let state: State = training.optimizer().state().unwrap();
+    state.iter().map(|(name, t)| (name.clone(), bits(t))).collect()
+}
+
+#[test]
+fn a_resumed_run_equals_an_unstopped_one_bit_for_bit() {
+    for phase in ["depth", "render"] {
+        let config = tiny(phase);
+        let [whole, cut] = [(); 2].map(|()| tempfile::tempdir().unwrap());
+        let mut unstopped = Training::open(&config, whole.path()).unwrap();
+        let losses = steps(&mut unstopped, 5);
+        let mut first = Training::open(&config, cut.path()).unwrap();
+        let begun = steps(&mut first, 3);
+        first.save().unwrap();
+        // Steps after the checkpoint are lost with the process.
+        steps(&mut first, 1);
+        drop(first);
+        let mut second = Training::open(&config, cut.path()).unwrap();
+        assert_eq!((second.progress().step, second.progress().examples), (3, 6));
+        let rest = steps(&mut second, 2);
+        assert_eq!([begun, rest].concat(), losses, "{phase}");
+        assert_eq!(state(&second), state(&unstopped), "{phase}");
+        // The comparison sees a difference.
+        steps(&mut unstopped, 1);
+        assert_ne!(state(&second), state(&unstopped));
+    }
+}
+
+/// Lanes and threads are the machine's business alone.
+#[test]
+fn the_number_of_lanes_changes_nothing() {
+    for phase in ["depth", "render"] {
+        let run = |lanes: usize| {
+            let config = TrainConfig { lanes, batch: 3, ..tiny(phase) };
+            let folder = tempfile::tempdir().unwrap();
+            let mut training = Training::open(&config, folder.path()).unwrap();
+            (steps(&mut training, 2), state(&training))
+        };
+        assert!(run(1) == run(3), "{phase}");
+    }
+}
+
+#[test]
+fn a_few_scenes_are_learnt() {
+    for (phase, share) in [("depth", 0.75), ("render", 0.8)] {
+        let mut config = tiny(phase);
+        config.data.augment.flip = 0.0;
+        config.data.augment.permute = 0.0;
+        config.data.augment.swap = 0.0;
+        config.data.scenes = 2;
+        config.schedule = toml_schedule("kind = \"cosine\"\nrate = 1e-2\nwarmup = 2");
+        let folder = tempfile::tempdir().unwrap();
+        let mut training = Training::open(&config, folder.path()).unwrap();
+        let losses = steps(&mut training, 40);
+        let (first, last) = (losses[0], losses[39]);
+        println!("{phase}: {first:.4} to {last:.4}");
+        assert!(last < share * first, "{phase}: {first} to {last}");
+    }
+}
+
+fn toml_schedule(text: &str) -> subsplat::train::schedule::Schedule {
+    toml::from_str(text).unwrap()
+}
+
+/// A checkpoint in which one tensor is as large as f32 goes: everything after it
+/// overflows.
+#[test]
+fn a_step_that_is_not_finite_changes_nothing() {
+    let config = tiny("depth");
+    let folder = tempfile::tempdir().unwrap();
+    let mut training = Training::open(&config, folder.path()).unwrap();
+    steps(&mut training, 2);
+    let path = training.save().unwrap();
+    drop(training);
+    let good = checkpoint::load(&path).unwrap();
+    let mut bad = good.state.clone();
+    let name = "weights/small.down2.conv.weight";
+    let huge = (bad[name].ones_like().unwrap() * 3e38).unwrap();
+    bad.insert(name.to_owned(), huge);
+    checkpoint::save(folder.path(), (&good.progress, &good.config), &bad, 3).unwrap();
+    let mut training = Training::open(&config, folder.path()).unwrap();
+    let before = state(&training);
+    assert!(training.step().unwrap().is_none());
+    assert_eq!((training.progress().bad, training.progress().step), (1, 3));
+    assert_eq!(training.progress().examples, 6);
+    assert_eq!(state(&training), before);
+    drop(training);
+    checkpoint::save(folder.path(), (&good.progress, &good.config), &good.state, 3).unwrap();
+    let mut training = Training::open(&config, folder.path()).unwrap();
+    steps(&mut training, 1);
+    assert_eq!(training.progress().bad, 0);
+    assert_ne!(state(&training), before);
+}
+
+#[test]
+fn many_bad_steps_end_the_run() {
+    let mut config = tiny("depth");
+    config.schedule = toml_schedule("kind = \"cosine\"\nrate = 1e30");
+    config.checkpoint.bad_steps = 3;
+    let folder = tempfile::tempdir().unwrap();
+    let mut training = Training::open(&config, folder.path()).unwrap();
+    let mut skipped = 0;
+    let mut count = |event: &Event| skipped += usize::from(matches!(event, Event::Skipped { .. }));
+    let nothing = Validator::new(&config, None).unwrap();
+    let error = training.run(Limits::default(), &nothing, &mut count).unwrap_err().to_string();
+    assert!(error.contains("3 steps in a row"), "{error}");
+    assert_eq!(skipped, 2);
+}
+
+#[test]
+fn checkpoints_are_whole_and_few() {
+    let config = tiny("depth");
+    let folder = tempfile::tempdir().unwrap();
+    let mut training = Training::open(&config, folder.path()).unwrap();
+    for _ in 0..5 {
+        steps(&mut training, 1);
+        training.save().unwrap();
+    }
+    assert_eq!(checkpoint::steps(folder.path()), [3, 4, 5]);
+    drop(training);
+    // What an interrupted write leaves is not a checkpoint.
+    std::fs::write(folder.path().join("step-00000009.safetensors.1.part"), "half").unwrap();
+    assert_eq!(Training::open(&config, folder.path()).unwrap().progress().step, 5);
+    let newest = checkpoint::path(folder.path(), 5);
+    let bytes = std::fs::read(&newest).unwrap();
+    std::fs::write(&newest, &bytes[..bytes.len() - 9]).unwrap();
+    let error = refused(&config, folder.path());
+    assert!(error.contains("step-00000005") && error.contains("safetensors"), "{error}");
+    std::fs::write(&newest, bytes).unwrap();
+    let mut other = config;
+    other.model.upscale = 3;
+    let error = refused(&other, folder.path());
+    assert!(error.contains("the same model"), "{error}");
+}
+
+fn refused(config: &TrainConfig, folder: &Path) -> String {
+    match Training::open(config, folder) {
+        Ok(_) => panic!("accepted"),
+        Err(error) => error.to_string(),
+    }
+}
+
+#[test]
+fn the_weights_that_are_written_are_a_model() {
+    let config = tiny("render");
+    let folder = tempfile::tempdir().unwrap();
+    let mut training = Training::open(&config, folder.path()).unwrap();
+    steps(&mut training, 2);
+    training.save().unwrap();
+    let path = folder.path().join("weights.safetensors");
+    let model = subsplat::pipeline::Reconstructor::load(&path, None).unwrap();
+    assert_eq!(*model.config(), config.model_config().unwrap());
+    assert!(model.untrained_tensors().is_empty() && model.unexpected_tensors().is_empty());
+    // And a start for another training, of other parts too.
+    let mut next = tiny("render");
+    next.init = subsplat::train::config::Start::Weights { path };
+    next.model.set = serde_json::from_str(
+        &serde_json::to_string(&next.model.set)
+            .unwrap()
+            .replace("\"hidden\":16", "\"hidden\":16,\"head\":\"pg\""),
+    )
+    .unwrap();
+    let other = tempfile::tempdir().unwrap();
+    let begun = Training::open(&next, other.path());
+    assert!(begun.is_err(), "a head of another shape must be named");
+}
+
+#[test]
+fn errors_name_key_and_value() {
+    let rows = [
+        ("seed = 3", "sed = 3", "sed"),
+        ("steps = 40", "steps = 0", "steps"),
+        ("steps = 40", "steps = \"many\"", "line 4"),
+        ("input = [32, 32]", "input = [30, 32]", "data.input"),
+        ("hidden = 16", "hiden = 16", "hiden"),
+        ("rate = 3e-3", "rate = -1.0", "schedule.rate"),
+        ("rate = 3e-3", "rate = 1.0\npeak = 3", "peak"),
+        ("batch = 2", "batch = 2\n[loss]\nlpips = 0.05", "lpips_weights"),
+        ("batch = 2", "batch = 2\n[optimizer]\naverage = 1.5", "optimizer.average"),
+    ];
+    for (old, new, named) in rows {
+        let text = TINY.replace("PHASE", "depth").replace(old, new);
+        let error = TrainConfig::from_toml(&text).unwrap_err().to_string();
+        assert!(error.contains(named), "{new}: expected `{named}` in: {error}");
+        assert!(!error.contains('\n'), "{error}");
+    }
+    let mvsplat = "phase = \"depth\"\n[model]\nbackbone = \"re10k\"";
+    let error = TrainConfig::from_toml(mvsplat).unwrap_err().to_string();
+    assert!(error.contains("phase"), "{error}");
+    let config = tiny("depth");
+    let again = TrainConfig::from_json(&config.to_json().unwrap()).unwrap();
+    assert_eq!(config, again);
+}
+
+#[test]
+fn every_preset_file_is_a_configuration() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tools/train");
+    let mut count = 0;
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.extension().is_some_and(|e| e == "toml") {
+            TrainConfig::load(&path).unwrap();
+            count += 1;
+        }
+    }
+    assert!(count >= 3, "{count}");
+}
+
+/// Exit code, stdout and stderr of the program in `folder`.
+fn call(folder: &Path, arguments: &str) -> (i32, String, String) {
+    let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_subsplat"));
+    let output = command.args(arguments.split_whitespace()).current_dir(folder).output().unwrap();
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    (output.status.code().unwrap(), text(output.stdout), text(output.stderr))
+}
+
+#[test]
+fn the_program_trains_and_goes_on() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("t.toml"), TINY.replace("PHASE", "render")).unwrap();
+    let step =
+        |stdout: &str| serde_json::from_str::<serde_json::Value>(stdout).unwrap()["step"].clone();
+    let (code, stdout, stderr) = call(folder.path(), "--json train t.toml --out run --steps 2");
+    assert_eq!(code, 0, "{stderr}");
+    assert_eq!(step(&stdout), 2);
+    let (_, stdout, stderr) = call(folder.path(), "--json train t.toml --out run --steps 1");
+    assert_eq!(step(&stdout), 3);
+    assert!(stderr.contains("going on from"), "{stderr}");
+    for name in ["weights.safetensors", "validation.csv", "sheet-00000003-rooms.png", "log.csv"] {
+        assert!(folder.path().join("run").join(name).is_file(), "{name}");
+    }
+    let (code, _, stderr) = call(folder.path(), "train t.toml --out run --minutes 0");
+    assert!(code == 1 && stderr.contains("--minutes"), "{stderr}");
+}
