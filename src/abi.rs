@@ -3,7 +3,11 @@
 //! options of one rasterizer call. Imports nothing of the crate.
 //!
 //! A constant that appears in a kernel appears here first; nothing else may
-//! restate it.
+//! restate it. `kernels/shared/abi.wgsl` does, and `tests/shaders.rs` compares the two.
+
+mod uniforms;
+
+pub use uniforms::RedistributeUniform;
 
 use serde::{Deserialize, Serialize};
 
@@ -176,12 +180,38 @@ pub const HEAD_GAIN: usize = 10;
 /// Lanes that the geometry head g_θ gives; the appearance head h_φ gives the rest.
 pub const HEAD_GEOMETRY_LANES: usize = 9;
 
+/// How a parent's opacity is shared among its children ([`crate::ops::redistribute`]).
+/// The numbers are the kernels'.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u32)]
+pub enum Rule {
+    /// Sums to the parent's.
+    Linear = 0,
+    /// Conserves footprint-weighted optical depth.
+    OpticalDepth = 1,
+    /// Conserves transmittance through all children.
+    Transmittance = 2,
+    /// Conserves integrated opacity.
+    Area = 3,
+    /// Every child has the parent's.
+    None = 4,
+}
+
+impl Rule {
+    /// Whether areas count in units of the parent's own.
+    pub fn areas_are_relative(self) -> bool {
+        matches!(self, Rule::OpticalDepth | Rule::Area)
+    }
+}
+
 /// ε of w̃ = w / (A + ε), px² (supp. A.3).
 pub const AREA_EPS: f64 = 1e-8;
 /// Largest parent opacity of which a logarithm is taken (spec 2.11).
 pub const OPACITY_CEILING: f64 = 0.9999;
 /// Largest child opacity under the `area` rule.
 pub const AREA_RULE_OPACITY_MAX: f64 = 0.99;
+/// Least relative area that is divided by.
+pub const RELATIVE_AREA_MIN: f64 = 1e-12;
 /// Most that the minimum-footprint rule multiplies a σ by (spec 2.6).
 pub const GROWTH_MAX: f64 = 50.0;
 /// Added to the squared area, so that its root has a gradient at zero, px⁴.

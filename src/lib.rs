@@ -32,7 +32,8 @@
 //! [`config::Config`]; [`ops`] are the same kernels as candle ops. Every geometric
 //! convention is said once, in [`camera`].
 //!
-//! Features: `cli` (default) builds the programs `subsplat` and `subsplat-convert`.
+//! Features, both default: `cli` builds the programs `subsplat` and `subsplat-convert`;
+//! `gpu` the WGSL kernels ([`gpu`]).
 
 pub mod abi;
 pub mod camera;
@@ -40,6 +41,8 @@ pub mod check;
 pub mod config;
 pub mod cpu;
 pub mod data;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod io;
 pub mod metrics;
 pub mod model;

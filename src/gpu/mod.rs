@@ -1,0 +1,28 @@
+//! The kernels as WGSL compute, on any adapter that wgpu finds (Vulkan, Metal, DX12).
+//!
+//! Same stems and arguments as [`crate::cpu`], same results within the tolerances that
+//! `tests/gpu_twins.rs` states. [`Gpu::open`] chooses the adapter; every error leaves the
+//! caller the CPU kernels. Nothing here needs more than WebGPU's default limits: 8 storage
+//! buffers a stage, 256 threads and 16 KiB a workgroup, 128 MiB a binding.
+//!
+//! A kernel x is `kernels/x.wgsl`, a [`Kernel`] and a method of [`Gpu`] in `x.rs`, and
+//! has a CPU twin of the same stem; `tests/shaders.rs` holds its text against
+//! [`crate::abi`] and this table.
+
+mod adapter;
+mod buffers;
+mod commands;
+mod device;
+mod error;
+mod pipelines;
+mod redistribute;
+
+pub use adapter::{AdapterSummary, DeviceChoice, adapters, choose};
+pub use buffers::Buffer;
+pub use device::Gpu;
+pub use error::GpuError;
+pub use pipelines::{Access, Kernel};
+pub use redistribute::RedistributeArgs;
+
+/// Every kernel of the room.
+pub const KERNELS: &[&Kernel] = &[&redistribute::REDISTRIBUTE];
