@@ -5,9 +5,12 @@
 //! A constant that appears in a kernel appears here first; nothing else may
 //! restate it. `kernels/shared/abi.wgsl` does, and `tests/shaders.rs` compares the two.
 
+mod frame;
 mod uniforms;
 
-pub use uniforms::RedistributeUniform;
+pub(crate) use frame::lanes_at;
+pub use frame::{Geometry, Rendered, Rules, SplatSlices};
+pub use uniforms::{RasterUniform, RedistributeUniform, SortUniform};
 
 use serde::{Deserialize, Serialize};
 
@@ -58,6 +61,30 @@ pub const RADIUS_SIGMAS_MVSPLAT: f32 = 3.0;
 /// Smallest divisor of Σ w z where depth is divided by the accumulated alpha.
 pub const DEPTH_ALPHA_MIN: f32 = 1e-10;
 
+/// Relative and absolute widening of a support, in log₂ of alpha: pixels on its
+/// rim are found whatever the rounding, and the per-pixel test decides.
+pub const SUPPORT_SLACK: f32 = 1e-4;
+/// Widening of a row's interval, px, for the rounding of pixel positions.
+pub const SPAN_SLACK_PX: f32 = 1e-3;
+/// Larger opacities act as this one, far beyond any alpha cap, so that their
+/// logarithm stays within what an exponent can hold.
+pub const OPACITY_MAX: f32 = 1e36;
+/// Side of the tiles that the GPU kernels work in, px: a thread a pixel.
+pub const TILE_GPU: usize = 16;
+/// Floats of a projected splat in the GPU kernels (kernels/shared/raster.wgsl).
+pub const FOOTPRINT_LANES: usize = 12;
+/// Elements that a workgroup of the GPU's sort and prefix sum takes.
+pub const GPU_BLOCK: usize = 2048;
+/// Place of a number in the plan of a sort: elements.
+pub const PLAN_COUNT: usize = 3;
+/// Blocks of [`GPU_BLOCK`] elements.
+pub const PLAN_BLOCKS: usize = 4;
+/// Elements that were asked for, room or not.
+pub const PLAN_ASKED: usize = 5;
+/// Workgroups of 256 elements along x, y and z; those of blocks stand at 0.
+pub const PLAN_EACH: usize = 8;
+/// Words of a plan.
+pub const PLAN_WORDS: usize = 12;
 /// Side of the tiles that the kernels work in, px. Invisible in the picture.
 pub const TILE: usize = 32;
 /// Side of the pixel blocks inside a tile, px: 4 × 4 = one 16-lane register.

@@ -51,6 +51,7 @@ pub mod pipeline;
 pub mod render;
 pub mod sh;
 pub mod splats;
+pub mod view;
 
 pub use ops::rasterize_splats as rasterize;
 pub use render::{Picture, render};

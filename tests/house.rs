@@ -14,8 +14,9 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("sh", &["abi"]),
     ("config", &["abi"]),
     ("splats", &["abi", "camera", "sh"]),
-    ("cpu", &["abi", "camera", "sh"]),
-    ("gpu", &["abi", "camera"]),
+    ("view", &["abi", "camera"]),
+    ("cpu", &["abi", "camera", "sh", "view"]),
+    ("gpu", &["abi", "camera", "view"]),
     ("render", &["abi", "camera", "cpu", "splats"]),
     ("check", &["camera", "metrics"]),
     ("io", &["abi", "camera", "config", "sh", "splats"]),
@@ -178,7 +179,7 @@ fn candle_stays_out_of_the_kernels() {
     for path in sources(&root().join("src")) {
         let room = room(&path);
         if [
-            "abi", "camera", "config", "sh", "cpu", "gpu", "render", "metrics", "check", "io",
+            "abi", "camera", "config", "sh", "cpu", "gpu", "render", "view", "metrics", "check", "io",
             "data",
         ]
         .contains(&room.as_str())

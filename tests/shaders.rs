@@ -10,7 +10,7 @@ use naga::{AddressSpace, Expression, Handle, Literal, Module, StorageAccess, Typ
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::PathBuf;
-use subsplat::abi::{self, RedistributeUniform, Rule};
+use subsplat::abi::{self, RasterUniform, RedistributeUniform, Rule, SortUniform};
 use subsplat::gpu::{Access, KERNELS, Kernel};
 
 /// Storage buffers of a stage, threads and bytes of a workgroup: WebGPU's defaults.
@@ -19,7 +19,16 @@ const THREADS_MAX: u32 = 256;
 const WORKGROUP_BYTES_MAX: u32 = 16 << 10;
 
 /// Kernels whose CPU twin has another stem.
-const TWINS: &[(&str, &str)] = &[];
+const TWINS: &[(&str, &str)] = &[
+    ("sort_count", "sort"),
+    ("sort_scatter", "sort"),
+    ("scan_reduce", "tiles"),
+    ("scan_whole", "tiles"),
+    ("scan_apply", "tiles"),
+    ("plan", "tiles"),
+    ("intersect", "tiles"),
+    ("ranges", "tiles"),
+];
 
 /// Name and value of everything in kernels/shared/abi.wgsl.
 fn constants() -> BTreeMap<&'static str, f64> {
@@ -27,7 +36,26 @@ fn constants() -> BTreeMap<&'static str, f64> {
         ($($name:ident),* $(,)?) => { [$((stringify!($name), f64::from(abi::$name as f32))),*] };
     }
     let mut all =
-        BTreeMap::from(same!(AREA_EPS, AREA_RULE_OPACITY_MAX, OPACITY_CEILING, RELATIVE_AREA_MIN,));
+        BTreeMap::from(same!(
+        AREA_EPS,
+        AREA_RULE_OPACITY_MAX,
+        OPACITY_CEILING,
+        RELATIVE_AREA_MIN,
+        ALPHA_MIN,
+        ALPHA_MIN_LOG2,
+        DISCRIMINANT_MIN_MVSPLAT,
+        RADIUS_SIGMAS_MVSPLAT,
+        SUPPORT_SLACK,
+        SPAN_SLACK_PX,
+        OPACITY_MAX,
+        TILE_GPU,
+        FOOTPRINT_LANES,
+        GPU_BLOCK,
+        PLAN_COUNT,
+        PLAN_BLOCKS,
+        PLAN_ASKED,
+        PLAN_EACH,
+    ));
     let rules = [
         ("RULE_LINEAR", Rule::Linear),
         ("RULE_OPTICAL_DEPTH", Rule::OpticalDepth),
@@ -46,7 +74,7 @@ macro_rules! uniforms {
     ($($name:ident),* $(,)?) => { &[$((stringify!($name), size_of::<$name>(), $name::FIELDS)),*] };
 }
 
-const UNIFORMS: &[Uniform] = uniforms!(RedistributeUniform);
+const UNIFORMS: &[Uniform] = uniforms!(RasterUniform, RedistributeUniform, SortUniform);
 
 fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
@@ -138,10 +166,11 @@ fn uniforms_have_the_fields_of_abi() {
     }
     let all: BTreeSet<String> = UNIFORMS.iter().map(|(name, ..)| (*name).to_owned()).collect();
     assert_eq!(seen, all, "a uniform of the table belongs to no kernel");
-    let swapped = KERNELS[0]
+    let redistribute = KERNELS.iter().find(|k| k.name == "redistribute").unwrap();
+    let swapped = redistribute
         .source
         .replace("parents: u32,\n    children: u32,", "children: u32, parents: u32,");
-    assert_ne!(swapped, KERNELS[0].source);
+    assert_ne!(swapped, redistribute.source);
     assert_eq!(uniforms_off(&parse(&swapped).unwrap()).0.len(), 1, "swapped fields pass");
 }
 

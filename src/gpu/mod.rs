@@ -15,14 +15,32 @@ mod commands;
 mod device;
 mod error;
 mod pipelines;
+mod raster_kernels;
+mod rasterize;
 mod redistribute;
+mod scene;
+mod sort;
 
 pub use adapter::{AdapterSummary, DeviceChoice, adapters, choose};
 pub use buffers::Buffer;
 pub use device::Gpu;
 pub use error::GpuError;
 pub use pipelines::{Access, Kernel};
+pub use rasterize::Rasterizer;
 pub use redistribute::RedistributeArgs;
+pub use scene::Scene;
 
 /// Every kernel of the room.
-pub const KERNELS: &[&Kernel] = &[&redistribute::REDISTRIBUTE];
+pub const KERNELS: &[&Kernel] = &[
+    &raster_kernels::PROJECT,
+    &raster_kernels::SORT_COUNT,
+    &raster_kernels::SORT_SCATTER,
+    &raster_kernels::SCAN_REDUCE,
+    &raster_kernels::SCAN_WHOLE,
+    &raster_kernels::SCAN_APPLY,
+    &raster_kernels::PLAN,
+    &raster_kernels::INTERSECT,
+    &raster_kernels::RANGES,
+    &raster_kernels::RASTERIZE,
+    &redistribute::REDISTRIBUTE,
+];
