@@ -3,9 +3,9 @@
 
 #![cfg(feature = "gpu")]
 
-mod common;
 #[path = "common/gpu.rs"]
 mod adapter;
+mod common;
 #[path = "common/oracle.rs"]
 #[allow(dead_code, reason = "not every test binary uses every helper")]
 mod oracle;
@@ -31,6 +31,9 @@ const COLOUR: f32 = 3e-5;
 const COLOUR_MVSPLAT: f32 = 1e-4;
 /// Largest relative difference of depths.
 const DEPTH: f32 = 1e-4;
+/// The same for needles whose covariance comes as six numbers: the GPU has no f64 for the
+/// determinant that cancels.
+const DEPTH_COV6: f32 = 5e-4;
 
 /// Largest differences off the boundary: colour and alpha, depth sums (relative to them or
 /// to 0.1, since 1 − T has few digits where almost nothing covers a pixel).
@@ -138,19 +141,20 @@ fn random_scenes_are_those_of_the_cpu() {
                 background: [0.2, -0.1, 0.7],
                 ..RasterOptions::new(convention)
             };
-            let boundary =
-                oracle::render(&scene.for_oracle(), &scene.camera, &options).boundary;
+            let boundary = oracle::render(&scene.for_oracle(), &scene.camera, &options).boundary;
             let found = scene.with_slices(|splats| {
                 let got = rasterizer.render(&splats, &scene.camera, &options).unwrap();
-                let expected =
-                    cpu::Rasterizer::new().render(&splats, &scene.camera, &options);
+                let expected = cpu::Rasterizer::new().render(&splats, &scene.camera, &options);
                 assert!(expected.alpha.iter().any(|&a| a > 0.1) || kind != Kind::Plain);
                 differences(&got, &expected, &boundary)
             });
             worst_seen = [worst_seen[0].max(found[0]), worst_seen[1].max(found[1])];
             // Needles whose covariance comes as six numbers: their f32 determinant.
-            let colour = if scene.cov6.is_empty() { COLOUR } else { COLOUR_MVSPLAT };
-            assert!(found[0] < colour && found[1] < DEPTH, "{kind:?} {variant}: {found:?}");
+            let [colour, depth] = match scene.cov6.is_empty() {
+                true => [COLOUR, DEPTH],
+                false => [COLOUR_MVSPLAT, DEPTH_COV6],
+            };
+            assert!(found[0] < colour && found[1] < depth, "{kind:?} {variant}: {found:?}");
         }
     }
     eprintln!("largest: colour {:.1e}, depth {:.1e}", worst_seen[0], worst_seen[1]);
@@ -188,9 +192,9 @@ fn an_empty_scene_is_background() {
     let got = Rasterizer::new(gpu.clone()).render(&none, &camera, &options).unwrap();
     assert!(got.rgb.chunks(3).all(|p| p == [0.25, 0.5, 1.0]));
     assert!(got.alpha.iter().chain(&got.depth_sum).all(|&v| v == 0.0));
-    let odd = SplatSlices { sh: &[0.0; 3], ..none };
-    let error = Rasterizer::new(gpu).render(&odd, &camera, &options).unwrap_err();
-    assert!(matches!(error, GpuError::Argument { what: "splats", .. }), "{error}");
+    let odd = SplatSlices { gain: &[0.0; 3], ..none };
+    let error = Rasterizer::new(gpu).render(&odd, &camera, &options).err();
+    assert!(matches!(error, Some(GpuError::Argument { what: "splats", .. })), "{error:?}");
 }
 
 /// The sort is stable, at lengths around a thread's, a block's and many blocks'.

@@ -179,8 +179,8 @@ fn candle_stays_out_of_the_kernels() {
     for path in sources(&root().join("src")) {
         let room = room(&path);
         if [
-            "abi", "camera", "config", "sh", "cpu", "gpu", "render", "view", "metrics", "check", "io",
-            "data",
+            "abi", "camera", "config", "sh", "cpu", "gpu", "render", "view", "metrics", "check",
+            "io", "data",
         ]
         .contains(&room.as_str())
         {

@@ -35,8 +35,7 @@ fn constants() -> BTreeMap<&'static str, f64> {
     macro_rules! same {
         ($($name:ident),* $(,)?) => { [$((stringify!($name), f64::from(abi::$name as f32))),*] };
     }
-    let mut all =
-        BTreeMap::from(same!(
+    let mut all = BTreeMap::from(same!(
         AREA_EPS,
         AREA_RULE_OPACITY_MAX,
         OPACITY_CEILING,

@@ -10,11 +10,11 @@
 
 pub use crate::abi::{Geometry, SplatSlices};
 
+pub(crate) use crate::abi::lanes_at;
 use crate::abi::{
     LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, RasterOptions, SPLAT_LANES, ShBasis,
     ShDirection, sh_coefficients,
 };
-pub(crate) use crate::abi::lanes_at;
 use crate::cpu::covariance::Shape;
 use crate::cpu::ewa::{FIELDS, Footprint, View};
 use crate::cpu::sh::{direction_lanes, radiance_lanes};

@@ -39,6 +39,8 @@ impl Use {
 
 /// Bytes are a multiple of this: no binding and no copy is empty or odd.
 const GRAIN: u64 = 256;
+/// Bytes of a kernel's smallest argument, an array of one vec4.
+const LEAST: u64 = 16;
 
 /// Buffers that wait for their next use.
 #[derive(Debug)]
@@ -176,7 +178,7 @@ impl Gpu {
                 raw
             }
         };
-        let bytes = bytes.max(4).next_multiple_of(4);
+        let bytes = bytes.max(LEAST).next_multiple_of(4);
         Ok(Buffer(Arc::new(Inner { raw, purpose, bytes, pool: self.pool.clone() })))
     }
 
