@@ -17,7 +17,7 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("view", &["abi", "camera"]),
     ("cpu", &["abi", "camera", "sh", "view"]),
     ("gpu", &["abi", "camera", "view"]),
-    ("render", &["abi", "camera", "cpu", "splats"]),
+    ("render", &["abi", "camera", "cpu", "gpu", "splats"]),
     ("check", &["camera", "metrics"]),
     ("io", &["abi", "camera", "config", "sh", "splats"]),
     ("data", &["camera", "io", "metrics", "splats"]),
