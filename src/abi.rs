@@ -10,7 +10,7 @@ mod uniforms;
 
 pub(crate) use frame::lanes_at;
 pub use frame::{Geometry, Rendered, Rules, SplatSlices};
-pub use uniforms::{RasterUniform, RedistributeUniform, SortUniform};
+pub use uniforms::{RasterUniform, RedistributeUniform, ShowUniform, SortUniform};
 
 use serde::{Deserialize, Serialize};
 

@@ -216,3 +216,93 @@ fn order_is_that_of_a_stable_sort() {
         }
     }
 }
+
+/// An application's own device and texture: the bytes of the picture that is read back.
+#[test]
+fn a_texture_of_another_device_shows_the_picture() {
+    use subsplat::gpu::{Gpu, wgpu};
+    if gpu().is_none() {
+        return;
+    }
+    let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
+    let adapter =
+        pollster::block_on(instance.request_adapter(&wgpu::RequestAdapterOptions::default()))
+            .unwrap();
+    let (device, queue) =
+        pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor::default())).unwrap();
+    let gpu = Gpu::from_device(device.clone(), queue.clone());
+    let scene = Scene::new(Kind::Plain, 9, 30, 2, 4);
+    let k = scene.camera.intrinsics.resized(64, 48);
+    let camera = subsplat::camera::Camera { intrinsics: k, ..scene.camera };
+    let options = RasterOptions { background: [0.3, 0.2, 0.1], ..RasterOptions::default() };
+    let format = wgpu::TextureFormat::Rgba8Unorm;
+    let texture = |width, height| {
+        device.create_texture(&wgpu::TextureDescriptor {
+            label: None,
+            size: wgpu::Extent3d { width, height, depth_or_array_layers: 1 },
+            mip_level_count: 1,
+            sample_count: 1,
+            dimension: wgpu::TextureDimension::D2,
+            format,
+            usage: wgpu::TextureUsages::RENDER_ATTACHMENT | wgpu::TextureUsages::COPY_SRC,
+            view_formats: &[],
+        })
+    };
+    let target = texture(64, 48);
+    let view = target.create_view(&wgpu::TextureViewDescriptor::default());
+    let uploaded = scene.with_slices(|s| gpu.upload_splats(&s)).unwrap();
+    // So little room that the first frame has to be drawn twice.
+    let mut rasterizer = Rasterizer::new(gpu.clone()).with_capacity(3);
+    for _ in 0..3 {
+        rasterizer.draw(&uploaded, &camera, &options, &view).unwrap();
+    }
+    let read = device.create_buffer(&wgpu::BufferDescriptor {
+        label: None,
+        size: 4 * 64 * 48,
+        usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
+        mapped_at_creation: false,
+    });
+    let mut encoder = device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+    let layout =
+        wgpu::TexelCopyBufferLayout { offset: 0, bytes_per_row: Some(256), rows_per_image: None };
+    let to = wgpu::TexelCopyBufferInfo { buffer: &read, layout };
+    encoder.copy_texture_to_buffer(target.as_image_copy(), to, target.size());
+    queue.submit([encoder.finish()]);
+    read.slice(..).map_async(wgpu::MapMode::Read, |r| r.unwrap());
+    device.poll(wgpu::PollType::wait_indefinitely()).unwrap();
+    let bytes = read.slice(..).get_mapped_range().unwrap().to_vec();
+    let expected = rasterizer.render_scene(&uploaded, &camera, &options).unwrap();
+    assert!(expected.alpha.iter().any(|&a| a > 0.5));
+    for (p, rgba) in bytes.chunks(4).enumerate() {
+        let want = [0, 1, 2].map(|c| expected.rgb[3 * p + c]);
+        for (got, want) in rgba.iter().zip(want.iter().chain([&expected.alpha[p]])) {
+            let want = want.clamp(0.0, 1.0) * 255.0;
+            // Half a step of rounding, and what a tie may go to.
+            assert!((f32::from(*got) - want).abs() < 0.51, "pixel {p}: {got} {want}");
+        }
+    }
+    let small = texture(32, 48).create_view(&wgpu::TextureViewDescriptor::default());
+    let error = rasterizer.draw(&uploaded, &camera, &options, &small).err();
+    assert!(matches!(error, Some(GpuError::Argument { .. })), "{error:?}");
+}
+
+/// A device that goes away gives one clear error, and no panic.
+#[test]
+fn a_lost_device_is_an_error() {
+    use subsplat::gpu::{DeviceChoice, Gpu};
+    if gpu().is_none() {
+        return;
+    }
+    let own = Gpu::open(&DeviceChoice::Gpu).unwrap().unwrap();
+    let scene = Scene::new(Kind::Plain, 9, 30, 2, 4);
+    let mut rasterizer = Rasterizer::new(own.clone());
+    let options = RasterOptions::default();
+    let mut render = || scene.with_slices(|s| rasterizer.render(&s, &scene.camera, &options));
+    assert!(render().is_ok());
+    own.device().destroy();
+    own.device().poll(subsplat::gpu::wgpu::PollType::Poll).ok();
+    for _ in 0..2 {
+        let error = render().err();
+        assert!(matches!(error, Some(GpuError::Lost { .. })), "{error:?}");
+    }
+}

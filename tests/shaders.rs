@@ -10,7 +10,7 @@ use naga::{AddressSpace, Expression, Handle, Literal, Module, StorageAccess, Typ
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::PathBuf;
-use subsplat::abi::{self, RasterUniform, RedistributeUniform, Rule, SortUniform};
+use subsplat::abi::{self, RasterUniform, RedistributeUniform, Rule, ShowUniform, SortUniform};
 use subsplat::gpu::{Access, KERNELS, Kernel};
 
 /// Storage buffers of a stage, threads and bytes of a workgroup: WebGPU's defaults.
@@ -28,6 +28,7 @@ const TWINS: &[(&str, &str)] = &[
     ("plan", "tiles"),
     ("intersect", "tiles"),
     ("ranges", "tiles"),
+    ("show", "rasterize"),
 ];
 
 /// Name and value of everything in kernels/shared/abi.wgsl.
@@ -73,7 +74,8 @@ macro_rules! uniforms {
     ($($name:ident),* $(,)?) => { &[$((stringify!($name), size_of::<$name>(), $name::FIELDS)),*] };
 }
 
-const UNIFORMS: &[Uniform] = uniforms!(RasterUniform, RedistributeUniform, SortUniform);
+const UNIFORMS: &[Uniform] =
+    uniforms!(RasterUniform, RedistributeUniform, ShowUniform, SortUniform);
 
 fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))

@@ -114,3 +114,17 @@ uniform! {
         pad_c: u32,
     }
 }
+
+uniform! {
+    /// Of kernels/show.wgsl.
+    ShowUniform {
+        /// W, px.
+        width: u32,
+        /// H, px.
+        height: u32,
+        /// 1: the texture encodes sRGB itself.
+        srgb: u32,
+        /// Unused.
+        pad: u32,
+    }
+}

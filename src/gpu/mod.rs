@@ -19,6 +19,7 @@ mod raster_kernels;
 mod rasterize;
 mod redistribute;
 mod scene;
+mod show;
 mod sort;
 
 pub use adapter::{AdapterSummary, DeviceChoice, adapters, choose};
@@ -29,6 +30,8 @@ pub use pipelines::{Access, Kernel};
 pub use rasterize::Rasterizer;
 pub use redistribute::RedistributeArgs;
 pub use scene::Scene;
+/// The wgpu that devices and textures belong to.
+pub use wgpu;
 
 /// Every kernel of the room.
 pub const KERNELS: &[&Kernel] = &[
@@ -43,4 +46,5 @@ pub const KERNELS: &[&Kernel] = &[
     &raster_kernels::RANGES,
     &raster_kernels::RASTERIZE,
     &redistribute::REDISTRIBUTE,
+    &show::SHOW,
 ];

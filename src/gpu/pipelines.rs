@@ -59,6 +59,7 @@ type Key = (&'static str, &'static str, Vec<(&'static str, u64)>);
 pub(crate) struct Pipelines {
     modules: Mutex<HashMap<&'static str, wgpu::ShaderModule>>,
     built: Mutex<HashMap<Key, Arc<Pipeline>>>,
+    pub(crate) shows: Mutex<HashMap<wgpu::TextureFormat, wgpu::RenderPipeline>>,
 }
 
 impl Gpu {
@@ -99,11 +100,7 @@ impl Gpu {
     fn build(&self, kernel: &'static Kernel, constants: Constants) -> Pipeline {
         let label = kernel.label();
         let module = self.module(kernel.name, kernel.source);
-        let entries: Vec<_> = (0..).zip(kernel.bindings).map(|(i, &a)| entry(i, a)).collect();
-        let layout = self.device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
-            label: Some(&label),
-            entries: &entries,
-        });
+        let layout = layout(&self.device, kernel, wgpu::ShaderStages::COMPUTE);
         let whole = self.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
             label: Some(&label),
             bind_group_layouts: &[Some(&layout)],
@@ -125,7 +122,25 @@ impl Gpu {
     }
 }
 
-fn entry(binding: u32, access: Access) -> wgpu::BindGroupLayoutEntry {
+/// Layout of a kernel's arguments.
+pub(crate) fn layout(
+    device: &wgpu::Device,
+    kernel: &Kernel,
+    visibility: wgpu::ShaderStages,
+) -> wgpu::BindGroupLayout {
+    let entry = |(i, &access)| entry(i, access, visibility);
+    let entries: Vec<_> = (0..).zip(kernel.bindings).map(entry).collect();
+    device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
+        label: Some(&kernel.label()),
+        entries: &entries,
+    })
+}
+
+fn entry(
+    binding: u32,
+    access: Access,
+    visibility: wgpu::ShaderStages,
+) -> wgpu::BindGroupLayoutEntry {
     let ty = match access {
         Access::Uniform => wgpu::BufferBindingType::Uniform,
         Access::Read => wgpu::BufferBindingType::Storage { read_only: true },
@@ -133,7 +148,7 @@ fn entry(binding: u32, access: Access) -> wgpu::BindGroupLayoutEntry {
     };
     wgpu::BindGroupLayoutEntry {
         binding,
-        visibility: wgpu::ShaderStages::COMPUTE,
+        visibility,
         ty: wgpu::BindingType::Buffer { ty, has_dynamic_offset: false, min_binding_size: None },
         count: None,
     }

@@ -9,7 +9,7 @@ use crate::abi::{
     Rendered, Rules, ShBasis, ShDirection, SplatSlices, TILE_GPU,
 };
 use crate::camera::Camera;
-use crate::gpu::buffers::{Binding, Buffer};
+use crate::gpu::buffers::{Binding, Buffer, Reading};
 use crate::gpu::commands::{Commands, Groups};
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
@@ -36,6 +36,10 @@ pub struct Rasterizer {
     /// Room for (splat, tile) pairs.
     capacity: usize,
     pairs: usize,
+    /// Counts of the last frame that was drawn to a texture, on their way.
+    pub(crate) pending: Option<Reading<u32>>,
+    /// Whether a frame has told how much room it takes.
+    pub(crate) seen: bool,
     times: Vec<(&'static str, Duration)>,
 }
 
@@ -59,7 +63,15 @@ pub(crate) enum Channels {
 impl Rasterizer {
     /// A rasterizer on `gpu`.
     pub fn new(gpu: Arc<Gpu>) -> Self {
-        Self { gpu, timed: false, capacity: CAPACITY_START, pairs: 0, times: Vec::new() }
+        Self {
+            gpu,
+            timed: false,
+            capacity: CAPACITY_START,
+            pairs: 0,
+            pending: None,
+            seen: false,
+            times: Vec::new(),
+        }
     }
 
     /// Measures what [`Rasterizer::stage_times`] tells, where the adapter can.
