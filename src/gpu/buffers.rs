@@ -135,13 +135,6 @@ impl Binding {
     }
 }
 
-/// Rows `rows` of an array that one binding cannot hold.
-#[derive(Clone, Debug)]
-pub(crate) struct Chunk {
-    pub(crate) rows: Range<usize>,
-    pub(crate) buffer: Buffer,
-}
-
 impl Gpu {
     /// Memory for `count` values of `T`, whatever it held before.
     ///
@@ -217,27 +210,6 @@ impl Gpu {
     pub(crate) fn chunks(rows: usize, most: usize) -> impl Iterator<Item = Range<usize>> {
         let most = most.max(1);
         (0..rows.div_ceil(most)).map(move |i| i * most..((i + 1) * most).min(rows))
-    }
-
-    /// `data`, rows of `floats` numbers, in as many buffers as the binding limit asks
-    /// for, each of at most `most` rows.
-    ///
-    /// # Errors
-    /// As [`Gpu::empty`].
-    pub(crate) fn upload_chunks(
-        &self,
-        what: &'static str,
-        data: &[f32],
-        floats: usize,
-        most: usize,
-    ) -> Result<Vec<Chunk>, GpuError> {
-        let most = most.min(self.rows_per_binding(floats));
-        Self::chunks(data.len() / floats.max(1), most)
-            .map(|rows| {
-                let part = data.get(rows.start * floats..rows.end * floats).unwrap_or(&[]);
-                Ok(Chunk { buffer: self.upload(what, part)?, rows })
-            })
-            .collect()
     }
 
     /// Bytes of device memory that are allocated, in use or waiting.
