@@ -13,7 +13,7 @@ pub mod attention_gather;
 mod blend;
 mod blocks;
 mod colour_bwd;
-pub mod conv2d;
+pub mod conv;
 mod covariance;
 pub mod detail;
 mod disjoint;

@@ -162,6 +162,9 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     type M: Mask;
     type I: Ints;
 
+    /// Vectors that fit in the registers at once: how large a register tile may be.
+    const REGISTERS: usize;
+
     /// `v` in every lane.
     fn splat(self, v: f32) -> Self::F;
     fn load(self, v: &[f32; LANES]) -> Self::F;

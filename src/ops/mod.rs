@@ -5,7 +5,9 @@
 pub mod activation;
 pub mod attention;
 pub mod attention_gather;
+mod conv;
 pub mod conv2d;
+pub mod conv3d;
 pub mod direct;
 pub mod linear;
 pub mod matching;

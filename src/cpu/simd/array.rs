@@ -124,6 +124,8 @@ macro_rules! tier {
             type M = M;
             type I = I;
 
+            const REGISTERS: usize = 8;
+
             #[inline(always)]
             fn splat(self, v: f32) -> F {
                 F([v; LANES])

@@ -110,6 +110,8 @@ impl Simd for Token {
     type M = M;
     type I = I;
 
+    const REGISTERS: usize = 8;
+
     #[inline(always)]
     fn splat(self, v: f32) -> F {
         let v = unsafe { _mm256_set1_ps(v) };

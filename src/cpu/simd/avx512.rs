@@ -97,6 +97,8 @@ impl Simd for Token {
     type M = M;
     type I = I;
 
+    const REGISTERS: usize = 32;
+
     #[inline(always)]
     fn splat(self, v: f32) -> F {
         F(unsafe { _mm512_set1_ps(v) })

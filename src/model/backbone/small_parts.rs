@@ -4,6 +4,7 @@ use crate::model::layers::{
     Conv2d, ConvShape, GroupNorm, default_init, gelu, softmax, upsample_nearest,
 };
 use crate::ops::conv2d::conv2d;
+use crate::ops::conv3d::conv3d;
 use candle_core::{D, Result, Tensor};
 use candle_nn::{Init, VarBuilder};
 
@@ -26,8 +27,6 @@ pub(super) fn local_mean(x: &Tensor) -> Result<Tensor> {
 /// Two 3×3×3 convolutions over (disparity, y, x), shared over all of them:
 /// `[B, C, D, h, w]` to scores `[B, D, h, w]`. PyTorch's Conv3d layout,
 /// `0.weight` `[S, C, 3, 3, 3]`, `1.weight` `[1, S, 3, 3, 3]`.
-///
-/// Run as 2-D convolutions over three neighbouring candidates' channels.
 #[derive(Clone, Debug)]
 pub(super) struct Stem {
     weights: [Tensor; 2],
@@ -54,22 +53,9 @@ impl Stem {
     }
 
     pub(super) fn forward(&self, volume: &Tensor) -> Result<Tensor> {
-        let (b, _, d, h, w) = volume.dims5()?;
-        let x = volume.transpose(1, 2)?.contiguous()?; // [B, D, C, h, w]
-        let x = gelu(&conv3(&x, &self.weights[0], &self.biases[0])?)?;
-        conv3(&x, &self.weights[1], &self.biases[1])?.reshape((b, d, h, w))
+        let hidden = gelu(&conv3d(volume, &self.weights[0], Some(&self.biases[0]), 1)?)?;
+        conv3d(&hidden, &self.weights[1], Some(&self.biases[1]), 1)?.squeeze(1)
     }
-}
-
-/// 3×3×3 convolution of `[B, D, C, h, w]` (channels inside candidates), zero padding.
-fn conv3(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
-    let (b, d, c, h, w) = x.dims5()?;
-    let o = weight.dim(0)?;
-    let x = x.pad_with_zeros(1, 1, 1)?;
-    let neighbours = (0..3).map(|k| x.narrow(1, k, d)).collect::<Result<Vec<_>>>()?;
-    let x = Tensor::cat(&neighbours, 2)?.reshape((b * d, 3 * c, h, w))?;
-    let weight = weight.transpose(1, 2)?.contiguous()?.reshape((o, 3 * c, 3, 3))?;
-    conv2d(&x, &weight, Some(bias), 1, 1)?.reshape((b, d, o, h, w))
 }
 
 /// Starts of the stem's tensors that a hint cannot say.

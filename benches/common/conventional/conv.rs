@@ -1,13 +1,11 @@
 //! 2-D convolution, forward and both gradients, as im2col in cache-sized blocks and
-//! matrix products. The whole im2col matrix never exists: a thread holds one block
-//! of at most 640 KiB and one output tile.
+//! products by the `gemm` crate: what a careful program does without kernels of its own.
 //!
 //! x `[B, C, H, W]`, w `[O, C, kh, kw]`, y `[B, O, H', W']`, zero padding, one
-//! stride for both axes (cross-correlation, as in PyTorch).
-//! Twins: none yet. Oracle: `naive` in the tests below.
+//! stride for both axes.
 
-use super::gemm::{Mat, gemm};
 use rayon::prelude::*;
+use subsplat::cpu::gemm::{Mat, gemm};
 
 /// Pixels of one output tile.
 const TILE: usize = 512;
@@ -283,124 +281,6 @@ pub fn weight_grad(g: &Geometry, x: &[f32], dy: &[f32], dw: &mut [f32]) {
         let n = part.len() / o;
         for (row, src) in dw.chunks_exact_mut(k).zip(part.chunks_exact(n)) {
             row[c * taps..c * taps + n].copy_from_slice(src);
-        }
-    }
-}
-
-/// ∂L/∂bias: sums of `dy` `[B, O, pixels]` over pictures and pixels, `db` overwritten.
-pub fn bias_grad(pixels: usize, dy: &[f32], db: &mut [f32]) {
-    let channels = db.len();
-    db.par_iter_mut().enumerate().for_each(|(o, sum)| {
-        // f64: a sum over a million pixels in f32 loses three digits.
-        *sum = dy
-            .chunks_exact(pixels.max(1))
-            .skip(o)
-            .step_by(channels)
-            .map(|row| row.iter().map(|&v| f64::from(v)).sum::<f64>())
-            .sum::<f64>() as f32;
-    });
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// The definition, seven loops.
-    fn naive(g: &Geometry, x: &[f32], w: &[f32], bias: &[f32]) -> Vec<f32> {
-        let ([ho, wo], [h, wi], [kh, kw]) = (g.out_size(), g.size, g.kernel);
-        let images = x.len() / (g.in_channels * h * wi);
-        let mut y = Vec::new();
-        for b in 0..images {
-            for o in 0..g.out_channels {
-                for i in 0..ho {
-                    for j in 0..wo {
-                        let mut sum = bias.get(o).copied().unwrap_or(0.0) as f64;
-                        for c in 0..g.in_channels {
-                            for ky in 0..kh {
-                                for kx in 0..kw {
-                                    let yy = (i * g.stride + ky) as isize - g.padding as isize;
-                                    let xx = (j * g.stride + kx) as isize - g.padding as isize;
-                                    if yy < 0 || xx < 0 || yy >= h as isize || xx >= wi as isize {
-                                        continue;
-                                    }
-                                    let xi = ((b * g.in_channels + c) * h + yy as usize) * wi
-                                        + xx as usize;
-                                    let wj = ((o * g.in_channels + c) * kh + ky) * kw + kx;
-                                    sum += f64::from(x[xi]) * f64::from(w[wj]);
-                                }
-                            }
-                        }
-                        y.push(sum as f32);
-                    }
-                }
-            }
-        }
-        y
-    }
-
-    fn noise(n: usize, seed: u32) -> Vec<f32> {
-        let mut s = seed.wrapping_mul(2_654_435_761).wrapping_add(1);
-        (0..n)
-            .map(|_| {
-                s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-                (s >> 8) as f32 / 8_388_608.0 - 1.0
-            })
-            .collect()
-    }
-
-    fn cases() -> Vec<Geometry> {
-        let g = |c, o, kernel, stride, padding, size| Geometry {
-            in_channels: c,
-            out_channels: o,
-            kernel,
-            stride,
-            padding,
-            size,
-        };
-        vec![
-            g(3, 5, [7, 7], 2, 3, [16, 12]),
-            g(40, 7, [3, 3], 1, 1, [9, 11]),
-            g(6, 4, [3, 3], 2, 1, [8, 9]),
-            g(6, 4, [1, 1], 2, 0, [8, 9]),
-            g(37, 8, [1, 1], 1, 0, [5, 7]),
-            g(2, 3, [3, 1], 1, 1, [1, 1]),
-            g(2, 3, [5, 5], 3, 4, [2, 3]),
-            g(1, 1, [3, 3], 1, 1, [33, 40]),
-        ]
-    }
-
-    #[test]
-    fn forward_agrees_with_the_definition() {
-        for g in cases() {
-            let x = noise(2 * g.in_channels * g.in_pixels(), 1);
-            let w = noise(g.out_channels * g.in_channels * g.taps(), 2);
-            for bias in [vec![], noise(g.out_channels, 3)] {
-                let mut y = vec![f32::NAN; 2 * g.out_channels * g.out_pixels()];
-                forward(&g, &x, &w, &bias, &mut y);
-                for (i, (a, b)) in y.iter().zip(naive(&g, &x, &w, &bias)).enumerate() {
-                    assert!((a - b).abs() < 2e-5 * (1.0 + b.abs()), "{g:?} {i}: {a} {b}");
-                }
-            }
-        }
-    }
-
-    /// The convolution is linear in x and in w: ⟨dy, A x⟩ = ⟨Aᵀ dy, x⟩ exactly.
-    #[test]
-    fn gradients_are_the_adjoints() {
-        let dot = |a: &[f32], b: &[f32]| -> f64 {
-            a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
-        };
-        for g in cases() {
-            let x = noise(2 * g.in_channels * g.in_pixels(), 4);
-            let w = noise(g.out_channels * g.in_channels * g.taps(), 5);
-            let dy = noise(2 * g.out_channels * g.out_pixels(), 6);
-            let forward = dot(&dy, &naive(&g, &x, &w, &[]));
-            let (mut dx, mut dw) = (vec![f32::NAN; x.len()], vec![f32::NAN; w.len()]);
-            input_grad(&g, &dy, &w, &mut dx);
-            weight_grad(&g, &x, &dy, &mut dw);
-            let tolerance = 1e-4 * (1.0 + forward.abs());
-            assert!((dot(&dx, &x) - forward).abs() < tolerance, "{g:?} dx");
-            assert!((dot(&dw, &w) - forward).abs() < tolerance, "{g:?} dw");
         }
     }
 }

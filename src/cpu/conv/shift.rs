@@ -1,0 +1,333 @@
+//! The convolution itself: outputs of eight channels and 48 places in registers, all
+//! channels and taps of the source summed into them without a pause.
+
+use super::Buffers;
+use super::plan::{Axes, Layout, Plan, pack, starts};
+use crate::cpu::disjoint::Disjoint;
+use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
+use rayon::prelude::*;
+
+/// Output channels of a full block of weights.
+pub(super) const ROWS: usize = 8;
+/// Pieces of work that a call is cut into at least, where it can be.
+const JOBS: usize = 16;
+/// Floats past a packed tile's end that a strip may read and not use.
+const SLACK: usize = 16 * LANES;
+
+/// Weights in the order in which the kernel reads them: for each block of output
+/// channels and each pass, `[source channel][tap][channel of the block]`.
+#[derive(Clone, Debug)]
+pub(crate) struct Weights {
+    data: Vec<f32>,
+    blocks: Vec<Block>,
+}
+
+/// Output channels `first..first + rows`, their weights stored `pitch` apart.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Block {
+    pub first: usize,
+    pub rows: usize,
+    pub pitch: usize,
+}
+
+/// `channels` in blocks of [`ROWS`].
+pub(super) fn blocks(channels: usize) -> Vec<Block> {
+    let block = |first: usize| {
+        let rows = ROWS.min(channels - first);
+        Block { first, rows, pitch: rows.next_power_of_two() }
+    };
+    (0..channels).step_by(ROWS).map(block).collect()
+}
+
+impl Weights {
+    /// Of `w` as the caller stores them.
+    pub fn new(plan: &Plan, w: &[f32]) -> Self {
+        let depth = plan.src_channels * plan.all_taps();
+        let blocks = blocks(plan.dst_channels);
+        let floats = blocks.iter().map(|b| b.pitch * depth).sum();
+        let mut data = vec![0.0; floats];
+        data.par_chunks_mut((ROWS * depth).max(1)).zip(&blocks).for_each(|(panel, block)| {
+            let mut panel = panel;
+            for pass in &plan.passes {
+                let n = plan.src_channels * pass.taps.len() * block.pitch;
+                let (own, rest) = panel.split_at_mut(n);
+                panel = rest;
+                for m in 0..block.rows {
+                    let dst = block.first + m;
+                    let mut at = m;
+                    for src in 0..plan.src_channels {
+                        let row = match plan.transposed {
+                            true => src * plan.dst_channels + dst,
+                            false => dst * plan.src_channels + src,
+                        };
+                        let taps = &w[row * plan.kernel_taps..][..plan.kernel_taps];
+                        for tap in &pass.taps {
+                            own[at] = taps[tap.kernel];
+                            at += block.pitch;
+                        }
+                    }
+                }
+            }
+        });
+        Self { data, blocks }
+    }
+}
+
+/// Runs `plan` on pictures `x` into `y`, which is overwritten; `bias` is empty or one
+/// value a channel written.
+pub(crate) fn run(tier: Tier, plan: &Plan, x: &[f32], w: &Weights, bias: &[f32], y: &mut [f32]) {
+    let src: usize = plan.src_size.iter().product();
+    let dst: usize = plan.dst_size.iter().product();
+    let image = plan.dst_channels * dst;
+    if y.is_empty() || image == 0 {
+        return;
+    }
+    let images = y.len() / image;
+    let tile = plan.tile(plan.src_channels, images, JOBS);
+    let layout = plan.layout(tile);
+    let starts = starts(plan.grid(), tile);
+    let tiles = images * starts.len();
+    let parts = JOBS.div_ceil(tiles).min(w.blocks.len());
+    let share = w.blocks.len().div_ceil(parts);
+    let y = Disjoint::new(y);
+    (0..tiles * parts).into_par_iter().for_each(|job| {
+        let (image, start) = (job / parts / starts.len(), starts[job / parts % starts.len()]);
+        let first = (job % parts * share).min(w.blocks.len());
+        let blocks = first..(first + share).min(w.blocks.len());
+        if blocks.is_empty() {
+            return;
+        }
+        let x = &x[image * plan.src_channels * src..][..plan.src_channels * src];
+        Buffers::with(|buffers| {
+            let Buffers { x: packed, y: sums, .. } = buffers;
+            let packed = packed.room(plan.src_channels * layout.channel + SLACK);
+            let sums = sums.room(plan.passes.len() * ROWS * layout.flat().next_multiple_of(LANES));
+            pack(plan, &layout, x, start, packed);
+            tier.run(Job { plan, layout, packed, sums, w, blocks, bias, image, start, y: &y });
+        });
+    });
+}
+
+/// One tile and some blocks of channels.
+struct Job<'a> {
+    plan: &'a Plan,
+    layout: Layout,
+    packed: &'a [f32],
+    sums: &'a mut [f32],
+    w: &'a Weights,
+    blocks: std::ops::Range<usize>,
+    bias: &'a [f32],
+    image: usize,
+    start: Axes,
+    y: &'a Disjoint<'a, f32>,
+}
+
+impl Kernel for Job<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        let (plan, layout) = (self.plan, self.layout);
+        let depth = plan.src_channels * plan.all_taps();
+        let length = layout.flat().next_multiple_of(LANES);
+        let offsets: Vec<Vec<usize>> =
+            plan.passes.iter().map(|p| p.taps.iter().map(|t| layout.offset(t)).collect()).collect();
+        for index in self.blocks.clone() {
+            let block = self.w.blocks[index];
+            let panel = &self.w.data[index * ROWS * depth..][..block.pitch * depth];
+            let mut bias = [0.0; ROWS];
+            for (m, b) in bias.iter_mut().take(block.rows).enumerate() {
+                *b = self.bias.get(block.first + m).copied().unwrap_or(0.0);
+            }
+            let room = self.plan.grid()[0] - self.start[0];
+            for d in 0..layout.tile[0].min(room) {
+                let x = &self.packed[d * layout.depth()..];
+                let mut from = 0;
+                for (p, offsets) in offsets.iter().enumerate() {
+                    let n = plan.src_channels * offsets.len() * block.pitch;
+                    let strip = Strip {
+                        x,
+                        channel: layout.channel,
+                        channels: plan.src_channels,
+                        offsets,
+                        w: &panel[from..from + n],
+                        bias,
+                        length,
+                    };
+                    from += n;
+                    let sums = &mut self.sums[p * ROWS * length..][..ROWS * length];
+                    strip.run(s, block.pitch, sums);
+                }
+                for m in 0..block.rows {
+                    self.write(block.first + m, m, d, length);
+                }
+            }
+        }
+    }
+}
+
+impl Job<'_> {
+    /// Copies channel `m` of the block's sums at depth `d` to channel `channel` of y.
+    #[inline(always)]
+    fn write(&self, channel: usize, m: usize, d: usize, length: usize) {
+        let (plan, layout) = (self.plan, &self.layout);
+        let ([depth, height, width], step) = (plan.dst_size, plan.dst_step);
+        let base = (self.image * plan.dst_channels + channel) * depth * height * width;
+        let left = self.start[2] * step[2];
+        let columns = (layout.tile[2] * step[2]).min(width - left);
+        for (rows, passes) in plan.passes.chunks_exact(step[2]).enumerate() {
+            let [fd, fh, _] = passes[0].phase;
+            let z = (self.start[0] + d) * step[0] + fd;
+            if z >= depth {
+                continue;
+            }
+            for r in 0..layout.tile[1] {
+                let row = (self.start[1] + r) * step[1] + fh;
+                if row >= height {
+                    break;
+                }
+                let at = base + (z * height + row) * width + left;
+                // SAFETY: jobs differ in picture, tile or channels, and so in the
+                // rows, or pieces of rows, that they write.
+                let to = unsafe { self.y.part(at..at + columns) };
+                let source = |p: usize| {
+                    let first = ((rows * step[2] + p) * ROWS + m) * length + r * layout.pitch();
+                    &self.sums[first..first + layout.tile[2]]
+                };
+                match step[2] {
+                    1 => to.copy_from_slice(&source(0)[..columns]),
+                    2 => {
+                        let (even, odd) = (source(0), source(1));
+                        let mut pairs = to.chunks_exact_mut(2);
+                        for ((pair, a), b) in (&mut pairs).zip(even).zip(odd) {
+                            pair[0] = *a;
+                            pair[1] = *b;
+                        }
+                        if let ([last], Some(a)) = (pairs.into_remainder(), even.get(columns / 2)) {
+                            *last = *a;
+                        }
+                    }
+                    n => {
+                        for p in 0..n {
+                            let places = to.iter_mut().skip(p).step_by(n);
+                            places.zip(source(p)).for_each(|(to, v)| *to = *v);
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// One pass over one depth of a tile, for one block of channels.
+pub(super) struct Strip<'a> {
+    pub x: &'a [f32],
+    /// Distance of channels in `x`.
+    pub channel: usize,
+    pub channels: usize,
+    /// Where taps read, from an output's own place.
+    pub offsets: &'a [usize],
+    /// `[channel][tap][channel of the block]`.
+    pub w: &'a [f32],
+    pub bias: [f32; ROWS],
+    /// Outputs, whole vectors.
+    pub length: usize,
+}
+
+impl Strip<'_> {
+    /// Sums `[channel of the block][length]` of `pitch` channels.
+    #[inline(always)]
+    pub fn run<S: Simd>(&self, s: S, pitch: usize, sums: &mut [f32]) {
+        let farthest = self.offsets.iter().max().copied().unwrap_or(0) + self.length;
+        assert!(self.channels.saturating_sub(1) * self.channel + farthest <= self.x.len());
+        assert!(sums.len() >= pitch * self.length && self.length.is_multiple_of(LANES));
+        assert!(self.w.len() >= self.channels * self.offsets.len() * pitch);
+        if S::REGISTERS >= 32 {
+            match pitch {
+                8 => self.strips::<S, 8, 8, 3, 2>(s, 0, sums),
+                4 => self.strips::<S, 4, 4, 6, 3>(s, 0, sums),
+                2 => self.strips::<S, 2, 2, 8, 3>(s, 0, sums),
+                _ => self.strips::<S, 1, 1, 12, 3>(s, 0, sums),
+            }
+        } else {
+            match pitch {
+                8 => {
+                    self.strips::<S, 8, 4, 1, 1>(s, 0, sums);
+                    self.strips::<S, 8, 4, 1, 1>(s, 4, sums);
+                }
+                4 => self.strips::<S, 4, 4, 1, 1>(s, 0, sums),
+                2 => self.strips::<S, 2, 2, 2, 1>(s, 0, sums),
+                _ => self.strips::<S, 1, 1, 4, 1>(s, 0, sums),
+            }
+        }
+    }
+
+    /// `M` channels from `first` of a block of `P`, `A` vectors at a time, then `B`,
+    /// then one.
+    #[inline(always)]
+    fn strips<S: Simd, const P: usize, const M: usize, const A: usize, const B: usize>(
+        &self,
+        s: S,
+        first: usize,
+        sums: &mut [f32],
+    ) {
+        let mut at = 0;
+        while at < self.length {
+            let left = (self.length - at) / LANES;
+            if left >= A {
+                self.tile::<S, P, M, A>(s, first, at, sums);
+                at += A * LANES;
+            } else if left >= B {
+                self.tile::<S, P, M, B>(s, first, at, sums);
+                at += B * LANES;
+            } else {
+                self.tile::<S, P, M, 1>(s, first, at, sums);
+                at += LANES;
+            }
+        }
+    }
+
+    /// `M` channels × `N` vectors.
+    #[inline(always)]
+    fn tile<S: Simd, const P: usize, const M: usize, const N: usize>(
+        &self,
+        s: S,
+        first: usize,
+        at: usize,
+        sums: &mut [f32],
+    ) {
+        let mut acc = [[s.splat(0.0); N]; M];
+        for m in 0..M {
+            acc[m] = [s.splat(self.bias[first + m]); N];
+        }
+        let mut w = self.w.as_ptr().wrapping_add(first);
+        let mut x = self.x.as_ptr().wrapping_add(at);
+        for _ in 0..self.channels {
+            for &offset in self.offsets {
+                let from = x.wrapping_add(offset);
+                let mut v = [s.splat(0.0); N];
+                for n in 0..N {
+                    // SAFETY: the last channel's farthest tap ends inside the packed
+                    // tile (asserted by `run`).
+                    v[n] = s.load(unsafe { &*from.wrapping_add(n * LANES).cast() });
+                }
+                for m in 0..M {
+                    // SAFETY: the panel holds P weights for every channel and tap
+                    // (asserted by `run`), first + M ≤ P.
+                    let weight = s.splat(unsafe { *w.wrapping_add(m) });
+                    for n in 0..N {
+                        acc[m][n] = s.fma(weight, v[n], acc[m][n]);
+                    }
+                }
+                w = w.wrapping_add(P);
+            }
+            x = x.wrapping_add(self.channel);
+        }
+        for m in 0..M {
+            let row = &mut sums[(first + m) * self.length + at..][..N * LANES];
+            for (to, v) in row.as_chunks_mut().0.iter_mut().zip(acc[m]) {
+                s.store(v, to);
+            }
+        }
+    }
+}

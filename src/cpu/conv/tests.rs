@@ -1,0 +1,233 @@
+//! Against the definition in f64, in every tier.
+
+use super::*;
+use crate::cpu::simd::Tier;
+
+/// y in f64: nine loops.
+fn definition(s: &Sizes, x: &[f32], w: &[f32], bias: &[f32]) -> Vec<f64> {
+    let (out, [d, h, wi], taps) = (s.out_size(), s.size, s.taps());
+    let images = x.len() / (s.in_channels * s.in_pixels());
+    let mut y = Vec::new();
+    for b in 0..images {
+        for o in 0..s.out_channels {
+            for at in 0..s.out_pixels() {
+                let place = [at / (out[1] * out[2]), at / out[2] % out[1], at % out[2]];
+                let mut sum = bias.get(o).map_or(0.0, |&b| f64::from(b));
+                for tap in 0..taps {
+                    let k = [
+                        tap / (s.kernel[1] * s.kernel[2]),
+                        tap / s.kernel[2] % s.kernel[1],
+                        tap % s.kernel[2],
+                    ];
+                    let from: Vec<usize> = (0..3)
+                        .filter_map(|a| {
+                            (place[a] * s.stride[a] + k[a])
+                                .checked_sub(s.padding[a])
+                                .filter(|&v| v < s.size[a])
+                        })
+                        .collect();
+                    let [z, y, x_at] = from[..] else { continue };
+                    for c in 0..s.in_channels {
+                        let i = (((b * s.in_channels + c) * d + z) * h + y) * wi + x_at;
+                        let j = (o * s.in_channels + c) * taps + tap;
+                        sum += f64::from(x[i]) * f64::from(w[j]);
+                    }
+                }
+                y.push(sum);
+            }
+        }
+    }
+    y
+}
+
+/// Numbers in ±1.
+fn noise(n: usize, seed: u32) -> Vec<f32> {
+    let mut s = seed.wrapping_mul(2_654_435_761).wrapping_add(1);
+    (0..n)
+        .map(|_| {
+            s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (s >> 8) as f32 / 8_388_608.0 - 1.0
+        })
+        .collect()
+}
+
+fn flat(
+    c: usize,
+    o: usize,
+    k: [usize; 2],
+    stride: usize,
+    padding: usize,
+    size: [usize; 2],
+) -> Sizes {
+    Sizes::flat([c, o], k, stride, padding, size)
+}
+
+fn solid(c: usize, o: usize, kernel: [usize; 3], padding: usize, size: [usize; 3]) -> Sizes {
+    Sizes::solid([c, o], kernel, padding, size)
+}
+
+/// Every kernel, stride and remainder that differs in the code: one to nine output
+/// channels, several blocks of 48, tiles cut in rows, columns and depths.
+fn cases() -> Vec<Sizes> {
+    vec![
+        flat(3, 5, [7, 7], 2, 3, [16, 12]),
+        flat(40, 7, [3, 3], 1, 1, [9, 11]),
+        flat(6, 4, [3, 3], 2, 1, [8, 9]),
+        flat(6, 4, [1, 1], 2, 0, [8, 9]),
+        flat(37, 8, [1, 1], 1, 0, [5, 7]),
+        flat(2, 3, [3, 1], 1, 1, [1, 1]),
+        flat(2, 3, [5, 5], 3, 4, [2, 3]),
+        flat(1, 1, [3, 3], 1, 1, [33, 40]),
+        flat(5, 17, [5, 5], 2, 2, [20, 33]),
+        flat(4, 50, [3, 3], 1, 1, [16, 16]),
+        flat(21, 110, [3, 3], 2, 1, [13, 10]),
+        flat(2, 100, [3, 3], 1, 1, [5, 20]),
+        flat(3, 9, [3, 3], 1, 0, [6, 300]),
+        flat(20, 2, [3, 3], 1, 1, [70, 140]),
+        flat(2, 20, [1, 1], 3, 0, [7, 7]),
+        // By Winograd, borders within tiles, several blocks each way.
+        flat(24, 30, [3, 3], 1, 1, [30, 33]),
+        flat(41, 26, [3, 3], 1, 0, [36, 31]),
+        flat(33, 100, [3, 3], 1, 2, [22, 35]),
+        flat(25, 24, [3, 3], 1, 1, [70, 141]),
+        solid(5, 8, [3, 3, 3], 1, [6, 7, 9]),
+        solid(8, 1, [3, 3, 3], 1, [5, 4, 20]),
+        solid(2, 11, [3, 1, 2], 1, [3, 4, 5]),
+        solid(1, 3, [3, 3, 3], 1, [20, 3, 3]),
+    ]
+}
+
+/// Bound of [`worst`] where Winograd is used, and where it is not.
+const WINOGRAD: f64 = 3e-6;
+const DIRECT: f64 = 1.5e-6;
+
+fn bound(plan: &Plan) -> f64 {
+    if winograd::suits(plan) { WINOGRAD } else { DIRECT }
+}
+
+/// Largest difference over the size of what is summed.
+fn worst(got: &[f32], want: &[f64], scale: f64) -> f64 {
+    assert_eq!(got.len(), want.len());
+    let differences = got.iter().zip(want).map(|(a, b)| (f64::from(*a) - b).abs());
+    differences.fold(0.0, |m: f64, d| if d <= m { m } else { d }) / scale
+}
+
+#[test]
+fn forward_agrees_with_the_definition() {
+    for s in cases() {
+        let x = noise(2 * s.in_channels * s.in_pixels(), 1);
+        let w = noise(s.out_channels * s.in_channels * s.taps(), 2);
+        let scale = ((s.in_channels * s.taps()) as f64).sqrt();
+        for bias in [vec![], noise(s.out_channels, 3)] {
+            let want = definition(&s, &x, &w, &bias);
+            for &tier in Tier::available() {
+                let mut y = vec![f32::NAN; 2 * s.out_channels * s.out_pixels()];
+                forward(tier, &s, &x, &w, &bias, &mut y);
+                let worst = worst(&y, &want, scale);
+                assert!(worst < bound(&Plan::forward(&s)), "{tier:?} {s:?}: {worst:e}");
+            }
+        }
+    }
+}
+
+/// The convolution is linear in x and in w, so both gradients follow from its
+/// definition: ∂⟨dy, y⟩/∂w[j] = ⟨dy, y of the j-th unit w⟩.
+fn gradients(s: &Sizes, x: &[f32], w: &[f32], dy: &[f32]) -> [Vec<f64>; 2] {
+    let (out, taps) = (s.out_size(), s.taps());
+    let images = x.len() / (s.in_channels * s.in_pixels());
+    let (mut dx, mut dw) = (vec![0.0; x.len()], vec![0.0; w.len()]);
+    for (i, &dy) in dy.iter().enumerate() {
+        let at = i % s.out_pixels();
+        let (o, b) = (i / s.out_pixels() % s.out_channels, i / s.out_pixels() / s.out_channels);
+        assert!(b < images);
+        let place = [at / (out[1] * out[2]), at / out[2] % out[1], at % out[2]];
+        for tap in 0..taps {
+            let k = [
+                tap / (s.kernel[1] * s.kernel[2]),
+                tap / s.kernel[2] % s.kernel[1],
+                tap % s.kernel[2],
+            ];
+            let from: [Option<usize>; 3] = std::array::from_fn(|a| {
+                (place[a] * s.stride[a] + k[a]).checked_sub(s.padding[a]).filter(|&v| v < s.size[a])
+            });
+            let [Some(z), Some(y), Some(x_at)] = from else { continue };
+            for c in 0..s.in_channels {
+                let i = (((b * s.in_channels + c) * s.size[0] + z) * s.size[1] + y) * s.size[2];
+                let j = (o * s.in_channels + c) * taps + tap;
+                dx[i + x_at] += f64::from(dy) * f64::from(w[j]);
+                dw[j] += f64::from(dy) * f64::from(x[i + x_at]);
+            }
+        }
+    }
+    [dx, dw]
+}
+
+#[test]
+fn gradients_agree_with_the_definition() {
+    for s in cases() {
+        let x = noise(2 * s.in_channels * s.in_pixels(), 4);
+        let w = noise(s.out_channels * s.in_channels * s.taps(), 5);
+        let dy = noise(2 * s.out_channels * s.out_pixels(), 6);
+        let [want_x, want_w] = gradients(&s, &x, &w, &dy);
+        for &tier in Tier::available() {
+            let (mut dx, mut dw) = (vec![f32::NAN; x.len()], vec![f32::NAN; w.len()]);
+            input_grad(tier, &s, &dy, &w, &mut dx);
+            weight_grad(tier, &s, &x, &dy, &mut dw);
+            let worst_x = worst(&dx, &want_x, ((s.out_channels * s.taps()) as f64).sqrt());
+            let worst_w = worst(&dw, &want_w, ((2 * s.out_pixels()) as f64).sqrt());
+            assert!(worst_x < bound(&Plan::input_grad(&s)), "{tier:?} {s:?}: dx {worst_x:e}");
+            assert!(worst_w < bound(&Plan::forward(&s)), "{tier:?} {s:?}: dw {worst_w:e}");
+        }
+    }
+}
+
+#[test]
+fn bias_gradients_are_sums() {
+    for pixels in [1, 63, 64, 5000] {
+        let dy = noise(2 * 3 * pixels, 7);
+        let mut db = [f32::NAN; 3];
+        bias_grad(pixels, &dy, &mut db);
+        for (o, got) in db.into_iter().enumerate() {
+            let rows = dy.chunks_exact(pixels).skip(o).step_by(3);
+            let want: f64 = rows.flatten().map(|&v| f64::from(v)).sum();
+            assert!((f64::from(got) - want).abs() < 1e-6 * (pixels as f64), "{got} {want}");
+        }
+    }
+}
+
+/// Bytes do not depend on the number of threads.
+#[test]
+fn threads_do_not_matter() {
+    let s = flat(24, 40, [3, 3], 1, 1, [48, 48]);
+    let x = noise(2 * s.in_channels * s.in_pixels(), 8);
+    let w = noise(s.out_channels * s.in_channels * s.taps(), 9);
+    let dy = noise(2 * s.out_channels * s.out_pixels(), 10);
+    let run = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().ok();
+        pool.map(|pool| {
+            pool.install(|| {
+                let (mut y, mut dx, mut dw) = (dy.clone(), x.clone(), w.clone());
+                forward(Tier::best(), &s, &x, &w, &[], &mut y);
+                input_grad(Tier::best(), &s, &dy, &w, &mut dx);
+                weight_grad(Tier::best(), &s, &x, &dy, &mut dw);
+                [y, dx, dw].concat().iter().map(|v| v.to_bits()).collect::<Vec<_>>()
+            })
+        })
+    };
+    let one = run(1);
+    assert!(one.is_some() && one == run(2) && one == run(5));
+}
+
+#[test]
+fn empty_calls_are_harmless() {
+    let s = flat(0, 3, [3, 3], 1, 1, [4, 4]);
+    let mut y = vec![f32::NAN; 3 * 16];
+    forward(Tier::best(), &s, &[], &[], &[1.0, 2.0, 3.0], &mut y);
+    assert!(y.chunks(16).zip([1.0, 2.0, 3.0]).all(|(row, b)| row.iter().all(|v| *v == b)));
+    weight_grad(Tier::best(), &s, &[], &y, &mut []);
+    input_grad(Tier::best(), &s, &y, &[], &mut []);
+    let s = flat(2, 0, [3, 3], 1, 1, [4, 4]);
+    let mut dx = vec![f32::NAN; 32];
+    input_grad(Tier::best(), &s, &[], &[], &mut dx);
+    assert!(dx.iter().all(|v| *v == 0.0));
+}

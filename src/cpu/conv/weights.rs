@@ -1,0 +1,491 @@
+//! ∂L/∂w: products of shifted tiles of x with ∂L/∂y, summed over all outputs.
+//!
+//! Wide: vectors hold output channels (∂L/∂y turned over, 48 channels of some 128
+//! outputs in the first-level cache), rows are (channel, tap) of x, read as scalars
+//! where they lie. Narrow, for at most eight output channels: vectors hold
+//! neighbouring outputs, and lanes are added at the end.
+
+use super::plan::{Axes, Layout, Plan, Sizes, pack, starts};
+use super::winograd;
+use super::winograd_weights::{self, Finish, Products};
+use super::{Buffer, Buffers};
+use crate::cpu::disjoint::Disjoint;
+use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
+use rayon::prelude::*;
+use std::ops::Range;
+
+/// Rows of a register tile.
+pub(super) const ROWS: usize = 8;
+/// Output channels of one job.
+pub(super) const LANES_WIDE: usize = 3 * LANES;
+/// Rows of a job come in multiples of this: register tiles of either kind divide it.
+const STEP: usize = 24;
+/// Outputs whose gradients are turned over at once.
+const CHUNK: usize = 128;
+/// Rows (channel × tap) of a job, at least, where there are as many.
+const DEPTH: usize = 144;
+/// Jobs of a call, where it can be cut into as many.
+const JOBS: usize = 16;
+/// Output channels up to which vectors hold outputs.
+const NARROW: usize = 8;
+/// Floats past a packed tile's end that may be read and not used.
+const SLACK: usize = 2 * LANES;
+
+/// ∂L/∂w from x and ∂L/∂y, `dw` overwritten.
+pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32]) {
+    let (c, o, taps) = (s.in_channels, s.out_channels, s.taps());
+    let (in_image, out_image) = (c * s.in_pixels(), o * s.out_pixels());
+    if dw.is_empty() || x.is_empty() || dy.is_empty() {
+        dw.fill(0.0);
+        return;
+    }
+    let images = x.len() / in_image;
+    let plan = Plan::forward(s);
+    let way = Way::of(&plan, o);
+    let (outputs, channels) = match way {
+        Way::Narrow => (o, even(c, (c * taps).div_ceil(DEPTH))),
+        Way::Wide => {
+            let outputs = o.div_ceil(o.div_ceil(LANES_WIDE)).next_multiple_of(LANES);
+            (outputs, even(c, (c * taps / DEPTH).max(1)))
+        }
+        Way::Winograd => {
+            let parts = c.div_ceil(winograd_weights::CHANNELS);
+            (o, even(c, parts).next_multiple_of(ROWS))
+        }
+    };
+    let parts: Vec<(usize, usize)> = (0..o)
+        .step_by(outputs)
+        .flat_map(|first| (0..c).step_by(channels).map(move |channel| (first, channel)))
+        .collect();
+    let tile = match way {
+        Way::Winograd => winograd_weights::tile(&plan),
+        _ => plan.tile(channels, images, JOBS.div_ceil(parts.len())),
+    };
+    let layout = plan.layout(tile);
+    let starts = starts(plan.grid(), tile);
+    let units = images * starts.len();
+    let groups = match way {
+        Way::Winograd => winograd_weights::groups(&plan, units, parts.len(), JOBS),
+        _ => JOBS.div_ceil(parts.len()).min(units),
+    };
+    let sums: Vec<Vec<f32>> = (0..parts.len() * groups)
+        .into_par_iter()
+        .map(|job| {
+            let (part, group) = (job / groups, job % groups);
+            let (first, channel) = parts[part];
+            let work = Work {
+                plan: &plan,
+                layout,
+                outputs: first..(first + outputs).min(o),
+                pitch: way.pitch(outputs.min(o - first)),
+                rows: channels.min(c - channel) * taps,
+            };
+            let unit = |unit: usize| {
+                let (image, start) = (unit / starts.len(), starts[unit % starts.len()]);
+                let x = &x[image * in_image..][..in_image];
+                let x = &x[channel * s.in_pixels()..][..work.rows / taps * s.in_pixels()];
+                (x, &dy[image * out_image..][..out_image], start)
+            };
+            let units = (units * group / groups..units * (group + 1) / groups).map(unit);
+            Buffers::with(|buffers| way.sums(tier, &work, units, buffers))
+        })
+        .collect();
+    let dw = Disjoint::new(dw);
+    sums.par_chunks(groups).zip(&parts).for_each(|(sums, &(first, channel))| {
+        let mut total = sums[0].clone();
+        for other in &sums[1..] {
+            total.iter_mut().zip(other).for_each(|(t, v)| *t += v);
+        }
+        let rows = channels.min(c - channel) * taps;
+        let outputs = first..(first + outputs).min(o);
+        let pitch = way.pitch(outputs.len());
+        for (lane, output) in outputs.enumerate() {
+            let at = (output * c + channel) * taps;
+            // SAFETY: parts differ in outputs or channels.
+            let to = unsafe { dw.part(at..at + rows) };
+            let from = total.iter().skip(lane).step_by(pitch);
+            to.iter_mut().zip(from).for_each(|(to, v)| *to = *v);
+        }
+    });
+}
+
+/// `n` in `parts` equal parts: the size of one.
+fn even(n: usize, parts: usize) -> usize {
+    n.div_ceil(parts.clamp(1, n.max(1))).max(1)
+}
+
+/// How the sums are made; see the top of this file and [`winograd_weights`].
+#[derive(Clone, Copy)]
+enum Way {
+    Narrow,
+    Wide,
+    Winograd,
+}
+
+impl Way {
+    fn of(plan: &Plan, outputs: usize) -> Self {
+        match outputs {
+            0..=NARROW => Self::Narrow,
+            _ if winograd::suits(plan) => Self::Winograd,
+            _ => Self::Wide,
+        }
+    }
+
+    /// Floats of one row of sums of so many outputs.
+    fn pitch(self, outputs: usize) -> usize {
+        match self {
+            Self::Narrow => outputs.next_power_of_two(),
+            Self::Wide | Self::Winograd => outputs.next_multiple_of(LANES),
+        }
+    }
+
+    /// Sums of one job over `units`: channels of x, ∂L/∂y of the same picture, and the
+    /// first output of a tile.
+    fn sums<'a>(
+        self,
+        tier: Tier,
+        work: &Work<'_>,
+        units: impl Iterator<Item = (&'a [f32], &'a [f32], Axes)>,
+        buffers: &mut Buffers,
+    ) -> Vec<f32> {
+        let mut sums = vec![0.0; work.floats()];
+        if let Self::Winograd = self {
+            // Apart, since `Products` uses the other buffers.
+            let mut own = std::mem::take(&mut buffers.products);
+            let products = own.room(winograd_weights::floats(work));
+            products.fill(0.0);
+            for (x, dy, start) in units {
+                tier.run(Products { work, x, dy, start, buffers, products });
+            }
+            tier.run(Finish { work, products, sums: &mut sums });
+            buffers.products = own;
+            return sums;
+        }
+        let channels = work.rows / work.plan.kernel_taps;
+        for (x, dy, start) in units {
+            let floats = channels * work.layout.channel;
+            let x_packed = buffers.x.room(floats + SLACK);
+            // Multiplied by zeros: it must be no NaN.
+            x_packed[floats..].fill(0.0);
+            pack(work.plan, &work.layout, x, start, x_packed);
+            let (x, turned) = (&*x_packed, &mut buffers.y);
+            let sums = &mut sums;
+            match self {
+                Self::Narrow => tier.run(Narrow { work, x, dy, start, turned, sums }),
+                _ => tier.run(Wide { work, x, dy, start, turned, sums }),
+            }
+        }
+        sums
+    }
+}
+
+/// A range of output channels and rows (channel × tap).
+pub(super) struct Work<'a> {
+    pub plan: &'a Plan,
+    pub layout: Layout,
+    pub outputs: Range<usize>,
+    /// Floats of one row of sums: the outputs, rounded up.
+    pub pitch: usize,
+    pub rows: usize,
+}
+
+impl Work<'_> {
+    /// Sums of a job: `[rows rounded up][outputs rounded up]`.
+    fn floats(&self) -> usize {
+        self.rows.next_multiple_of(STEP) * self.pitch
+    }
+
+    /// Where each row of the packed tile begins, the last one repeated.
+    fn offsets(&self) -> Vec<usize> {
+        let taps = &self.plan.passes[0].taps;
+        let row = |r: usize| {
+            let r = r.min(self.rows - 1);
+            r / taps.len() * self.layout.channel + self.layout.offset(&taps[r % taps.len()])
+        };
+        (0..self.rows.next_multiple_of(STEP)).map(row).collect()
+    }
+
+    /// Outputs of the tile at `start` that exist.
+    pub fn inside(&self, start: Axes) -> Axes {
+        std::array::from_fn(|a| self.layout.tile[a].min(self.plan.dst_size[a] - start[a]))
+    }
+
+    /// One output channel's depth `d` of the tile: its rows begin at the result, one
+    /// picture row apart.
+    fn dy_at(&self, output: usize, start: Axes, d: usize) -> usize {
+        let [depth, height, width] = self.plan.dst_size;
+        ((output * depth + start[0] + d) * height + start[1]) * width + start[2]
+    }
+}
+
+struct Wide<'a, 'b> {
+    work: &'a Work<'b>,
+    x: &'a [f32],
+    dy: &'a [f32],
+    start: Axes,
+    turned: &'a mut Buffer,
+    sums: &'a mut [f32],
+}
+
+impl Kernel for Wide<'_, '_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        let (work, layout) = (self.work, self.work.layout);
+        let [depth, height, width] = work.inside(self.start);
+        let offsets = work.offsets();
+        let pitch = work.pitch;
+        let rows = (CHUNK / width).clamp(1, height);
+        let turned = self.turned.room(rows * width * pitch);
+        for d in 0..depth {
+            for first in (0..height).step_by(rows) {
+                let count = rows.min(height - first);
+                let turned = &mut turned[..count * width * pitch];
+                let x = &self.x[d * layout.depth() + first * layout.pitch()..];
+                turn(s, work, self.dy, (self.start, d, first), [count, width], turned);
+                let tile = Tile { x, x_pitch: layout.pitch(), dy: turned, pitch, count, width };
+                for (offsets, sums) in
+                    offsets.as_chunks().0.iter().zip(self.sums.chunks_exact_mut(ROWS * pitch))
+                {
+                    tile.rows(s, offsets, sums);
+                }
+            }
+        }
+    }
+}
+
+/// ∂L/∂y of `[rows, width]` outputs, turned over to `[output][channel]`.
+#[inline(always)]
+pub(super) fn turn<S: Simd>(
+    s: S,
+    work: &Work<'_>,
+    dy: &[f32],
+    (start, d, first): (Axes, usize, usize),
+    [rows, width]: [usize; 2],
+    out: &mut [f32],
+) {
+    let pitch = work.pitch;
+    let row_pitch = work.plan.dst_size[2];
+    // Whole rows lie one behind the other.
+    let (runs, run) = if row_pitch == width { (1, rows * width) } else { (rows, width) };
+    for v in (0..pitch).step_by(LANES) {
+        let outputs = LANES.min(work.outputs.len().saturating_sub(v));
+        for r in 0..runs {
+            let to = &mut out[r * run * pitch..][..run * pitch];
+            let at = |i: usize| {
+                work.dy_at(work.outputs.start + v + i, start, d) + (first + r) * row_pitch
+            };
+            let mut places = [0; LANES];
+            for i in 0..LANES {
+                places[i] = at(i.min(outputs.saturating_sub(1)));
+            }
+            let whole = run / LANES * LANES;
+            for p in (0..whole).step_by(LANES) {
+                let mut m = [s.splat(0.0); LANES];
+                for i in 0..LANES {
+                    if i < outputs
+                        && let Some(from) = dy[places[i] + p..].first_chunk()
+                    {
+                        m[i] = s.load(from);
+                    }
+                }
+                let m = s.transpose(m);
+                for i in 0..LANES {
+                    if let Some(to) = to[(p + i) * pitch + v..].first_chunk_mut() {
+                        s.store(m[i], to);
+                    }
+                }
+            }
+            for p in whole..run {
+                let to = &mut to[p * pitch + v..][..LANES];
+                for i in 0..LANES {
+                    to[i] = if i < outputs { dy[places[i] + p] } else { 0.0 };
+                }
+            }
+        }
+    }
+}
+
+/// Some rows of a tile and their turned gradients.
+pub(super) struct Tile<'a> {
+    pub x: &'a [f32],
+    /// Distance of rows in `x`.
+    pub x_pitch: usize,
+    /// `[count][width][pitch]`.
+    pub dy: &'a [f32],
+    pub pitch: usize,
+    pub count: usize,
+    pub width: usize,
+}
+
+impl Tile<'_> {
+    /// Adds to `[ROWS][pitch]` sums.
+    #[inline(always)]
+    pub fn rows<S: Simd>(&self, s: S, offsets: &[usize; ROWS], sums: &mut [f32]) {
+        let farthest = offsets.iter().max().copied().unwrap_or(0) + self.width;
+        assert!(farthest + self.count.saturating_sub(1) * self.x_pitch <= self.x.len());
+        assert!(self.dy.len() >= self.count * self.width * self.pitch);
+        assert!(sums.len() >= ROWS * self.pitch);
+        if S::REGISTERS >= 32 {
+            match self.pitch / LANES {
+                3 => self.block::<S, 8, 3>(s, offsets, 0, 0, sums),
+                2 => self.block::<S, 8, 2>(s, offsets, 0, 0, sums),
+                _ => self.block::<S, 8, 1>(s, offsets, 0, 0, sums),
+            }
+        } else {
+            for v in (0..self.pitch).step_by(LANES) {
+                self.block::<S, 4, 1>(s, offsets, 0, v, sums);
+                self.block::<S, 4, 1>(s, offsets, 4, v, sums);
+            }
+        }
+    }
+
+    /// `M` rows from `first` × `N` vectors from channel `from`.
+    #[inline(always)]
+    fn block<S: Simd, const M: usize, const N: usize>(
+        &self,
+        s: S,
+        offsets: &[usize; ROWS],
+        first: usize,
+        from: usize,
+        sums: &mut [f32],
+    ) {
+        let mut acc = [[s.splat(0.0); N]; M];
+        for m in 0..M {
+            let row = &sums[(first + m) * self.pitch + from..][..N * LANES];
+            for n in 0..N {
+                if let Some(v) = row[n * LANES..].first_chunk() {
+                    acc[m][n] = s.load(v);
+                }
+            }
+        }
+        let mut dy = self.dy.as_ptr().wrapping_add(from);
+        for r in 0..self.count {
+            let mut x = [self.x.as_ptr(); M];
+            for m in 0..M {
+                x[m] = self.x.as_ptr().wrapping_add(offsets[first + m] + r * self.x_pitch);
+            }
+            for i in 0..self.width {
+                let mut v = [s.splat(0.0); N];
+                for n in 0..N {
+                    // SAFETY: count·width·pitch floats (asserted by `rows`).
+                    v[n] = s.load(unsafe { &*dy.wrapping_add(n * LANES).cast() });
+                }
+                for m in 0..M {
+                    // SAFETY: the farthest row ends inside x (asserted by `rows`).
+                    let x = s.splat(unsafe { *x[m].wrapping_add(i) });
+                    for n in 0..N {
+                        acc[m][n] = s.fma(x, v[n], acc[m][n]);
+                    }
+                }
+                dy = dy.wrapping_add(self.pitch);
+            }
+        }
+        for m in 0..M {
+            let row = &mut sums[(first + m) * self.pitch + from..][..N * LANES];
+            for (to, v) in row.as_chunks_mut().0.iter_mut().zip(acc[m]) {
+                s.store(v, to);
+            }
+        }
+    }
+}
+
+struct Narrow<'a, 'b> {
+    work: &'a Work<'b>,
+    x: &'a [f32],
+    dy: &'a [f32],
+    start: Axes,
+    turned: &'a mut Buffer,
+    sums: &'a mut [f32],
+}
+
+impl Kernel for Narrow<'_, '_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        let (work, layout) = (self.work, self.work.layout);
+        let [depth, height, width] = work.inside(self.start);
+        let offsets = work.offsets();
+        let pitch = work.pitch;
+        let length = layout.flat().next_multiple_of(LANES);
+        let row_pitch = work.plan.dst_size[2];
+        let packed = self.turned.room(pitch * length);
+        packed.fill(0.0);
+        let farthest = offsets.iter().max().copied().unwrap_or(0);
+        for d in 0..depth {
+            // Zeros wherever the tile has no output.
+            for (output, plane) in work.outputs.clone().zip(packed.chunks_exact_mut(length)) {
+                let at = work.dy_at(output, self.start, d);
+                for r in 0..height {
+                    let from = &self.dy[at + r * row_pitch..][..width];
+                    plane[r * layout.pitch()..][..width].copy_from_slice(from);
+                }
+            }
+            let x = &self.x[d * layout.depth()..];
+            assert!(farthest + length <= x.len());
+            let dots = Dots { x, dy: packed, length };
+            if S::REGISTERS >= 32 {
+                match pitch {
+                    8 => dots.run::<S, 8, 3>(s, &offsets, self.sums),
+                    4 => dots.run::<S, 4, 6>(s, &offsets, self.sums),
+                    2 => dots.run::<S, 2, 8>(s, &offsets, self.sums),
+                    _ => dots.run::<S, 1, 12>(s, &offsets, self.sums),
+                }
+            } else {
+                match pitch {
+                    8 => dots.run::<S, 8, 1>(s, &offsets, self.sums),
+                    4 => dots.run::<S, 4, 1>(s, &offsets, self.sums),
+                    2 => dots.run::<S, 2, 2>(s, &offsets, self.sums),
+                    _ => dots.run::<S, 1, 4>(s, &offsets, self.sums),
+                }
+            }
+        }
+    }
+}
+
+/// Gradients `[outputs][length]` and a packed tile.
+struct Dots<'a> {
+    x: &'a [f32],
+    dy: &'a [f32],
+    length: usize,
+}
+
+impl Dots<'_> {
+    /// Adds to `[rows][M]` sums, `T` rows at a time.
+    #[inline(always)]
+    fn run<S: Simd, const M: usize, const T: usize>(
+        &self,
+        s: S,
+        offsets: &[usize],
+        sums: &mut [f32],
+    ) {
+        assert!(self.dy.len() >= M * self.length);
+        for (offsets, sums) in offsets.chunks_exact(T).zip(sums.chunks_exact_mut(M * T)) {
+            let mut acc = [[s.splat(0.0); M]; T];
+            for at in (0..self.length).step_by(LANES) {
+                let mut dy = [s.splat(0.0); M];
+                for m in 0..M {
+                    let from = self.dy.as_ptr().wrapping_add(m * self.length + at);
+                    // SAFETY: M·length floats (asserted above), length whole vectors.
+                    dy[m] = s.load(unsafe { &*from.cast() });
+                }
+                for t in 0..T {
+                    let from = self.x.as_ptr().wrapping_add(offsets[t] + at);
+                    // SAFETY: the farthest row ends inside x (asserted by `run`).
+                    let x = s.load(unsafe { &*from.cast() });
+                    for m in 0..M {
+                        acc[t][m] = s.fma(x, dy[m], acc[t][m]);
+                    }
+                }
+            }
+            for t in 0..T {
+                let added = s.sums(acc[t]);
+                for m in 0..M {
+                    sums[t * M + m] += added[m];
+                }
+            }
+        }
+    }
+}
