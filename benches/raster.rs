@@ -23,6 +23,8 @@ use std::path::Path;
 use subsplat::abi::RasterOptions;
 use subsplat::camera::Camera;
 use subsplat::cpu::{Gradients, Rasterizer, Rendered, Stats, Tier};
+#[cfg(feature = "gpu")]
+use subsplat::gpu::{DeviceChoice, Gpu, Rasterizer as GpuRasterizer};
 use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
 use subsplat::io::scene::Units;
 use subsplat::io::{save_splats, write_atomic};
@@ -190,8 +192,25 @@ fn forward(bench: &mut Bench, name: &str, case: &Case, stats: Stats) -> Result<(
             Ok(())
         }));
     }
+    let mut stages = String::new();
+    #[cfg(feature = "gpu")]
+    if let Ok(Some(gpu)) = Gpu::open(&DeviceChoice::Gpu) {
+        let name = format!("subsplat, {}", gpu.adapter().name);
+        let mut ours = GpuRasterizer::new(gpu).with_stage_times();
+        let got = ours.render(&slices(&case.splats), &case.camera, &case.options)?;
+        let expected = Rasterizer::new().render(&slices(&case.splats), &case.camera, &case.options);
+        agree("rgb of the GPU", &got.rgb, &expected.rgb, PICTURE)?;
+        stages.push_str("; GPU");
+        for (stage, time) in ours.stage_times() {
+            stages.push_str(&format!(", {stage} {:.1} ms", 1e3 * time.as_secs_f64()));
+        }
+        contenders.push(Contender::new(name, Threads::All, move || {
+            ours.render(&slices(&case.splats), &case.camera, &case.options)?;
+            Ok(())
+        }));
+    }
     let note = format!(
-        "{} of {} splats visible, {} (splat, tile) pairs, {} block items, {:.0} MiB held",
+        "{} of {} splats visible, {} (splat, tile) pairs, {} block items, {:.0} MiB held{stages}",
         stats.visible,
         case.splats.len(),
         stats.pairs,

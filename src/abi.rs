@@ -3,7 +3,14 @@
 //! options of one rasterizer call. Imports nothing of the crate.
 //!
 //! A constant that appears in a kernel appears here first; nothing else may
-//! restate it.
+//! restate it. `kernels/shared/abi.wgsl` does, and `tests/shaders.rs` compares the two.
+
+mod frame;
+mod uniforms;
+
+pub(crate) use frame::lanes_at;
+pub use frame::{Geometry, Rendered, Rules, SplatSlices};
+pub use uniforms::{RasterUniform, RedistributeUniform, ShowUniform, SortUniform};
 
 use serde::{Deserialize, Serialize};
 
@@ -54,6 +61,30 @@ pub const RADIUS_SIGMAS_MVSPLAT: f32 = 3.0;
 /// Smallest divisor of Σ w z where depth is divided by the accumulated alpha.
 pub const DEPTH_ALPHA_MIN: f32 = 1e-10;
 
+/// Relative and absolute widening of a support, in log₂ of alpha: pixels on its
+/// rim are found whatever the rounding, and the per-pixel test decides.
+pub const SUPPORT_SLACK: f32 = 1e-4;
+/// Widening of a row's interval, px, for the rounding of pixel positions.
+pub const SPAN_SLACK_PX: f32 = 1e-3;
+/// Larger opacities act as this one, far beyond any alpha cap, so that their
+/// logarithm stays within what an exponent can hold.
+pub const OPACITY_MAX: f32 = 1e36;
+/// Side of the tiles that the GPU kernels work in, px: a thread a pixel.
+pub const TILE_GPU: usize = 16;
+/// Floats of a projected splat in the GPU kernels (kernels/shared/raster.wgsl).
+pub const FOOTPRINT_LANES: usize = 12;
+/// Elements that a workgroup of the GPU's sort and prefix sum takes.
+pub const GPU_BLOCK: usize = 2048;
+/// Place of a number in the plan of a sort: elements.
+pub const PLAN_COUNT: usize = 3;
+/// Blocks of [`GPU_BLOCK`] elements.
+pub const PLAN_BLOCKS: usize = 4;
+/// Elements that were asked for, room or not.
+pub const PLAN_ASKED: usize = 5;
+/// Workgroups of 256 elements along x, y and z; those of blocks stand at 0.
+pub const PLAN_EACH: usize = 8;
+/// Words of a plan.
+pub const PLAN_WORDS: usize = 12;
 /// Side of the tiles that the kernels work in, px. Invisible in the picture.
 pub const TILE: usize = 32;
 /// Side of the pixel blocks inside a tile, px: 4 × 4 = one 16-lane register.
@@ -176,12 +207,38 @@ pub const HEAD_GAIN: usize = 10;
 /// Lanes that the geometry head g_θ gives; the appearance head h_φ gives the rest.
 pub const HEAD_GEOMETRY_LANES: usize = 9;
 
+/// How a parent's opacity is shared among its children ([`crate::ops::redistribute`]).
+/// The numbers are the kernels'.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u32)]
+pub enum Rule {
+    /// Sums to the parent's.
+    Linear = 0,
+    /// Conserves footprint-weighted optical depth.
+    OpticalDepth = 1,
+    /// Conserves transmittance through all children.
+    Transmittance = 2,
+    /// Conserves integrated opacity.
+    Area = 3,
+    /// Every child has the parent's.
+    None = 4,
+}
+
+impl Rule {
+    /// Whether areas count in units of the parent's own.
+    pub fn areas_are_relative(self) -> bool {
+        matches!(self, Rule::OpticalDepth | Rule::Area)
+    }
+}
+
 /// ε of w̃ = w / (A + ε), px² (supp. A.3).
 pub const AREA_EPS: f64 = 1e-8;
 /// Largest parent opacity of which a logarithm is taken (spec 2.11).
 pub const OPACITY_CEILING: f64 = 0.9999;
 /// Largest child opacity under the `area` rule.
 pub const AREA_RULE_OPACITY_MAX: f64 = 0.99;
+/// Least relative area that is divided by.
+pub const RELATIVE_AREA_MIN: f64 = 1e-12;
 /// Most that the minimum-footprint rule multiplies a σ by (spec 2.6).
 pub const GROWTH_MAX: f64 = 50.0;
 /// Added to the squared area, so that its root has a gradient at zero, px⁴.

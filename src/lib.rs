@@ -32,7 +32,8 @@
 //! [`config::Config`]; [`ops`] are the same kernels as candle ops. Every geometric
 //! convention is said once, in [`camera`].
 //!
-//! Features: `cli` (default) builds the programs `subsplat` and `subsplat-convert`.
+//! Features, both default: `cli` builds the programs `subsplat` and `subsplat-convert`;
+//! `gpu` the WGSL kernels ([`gpu`]).
 
 pub mod abi;
 pub mod camera;
@@ -41,6 +42,8 @@ pub mod config;
 pub mod cpu;
 pub mod data;
 pub mod eval;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod io;
 pub mod metrics;
 pub mod model;
@@ -50,6 +53,7 @@ pub mod render;
 pub mod sh;
 pub mod splats;
 pub mod train;
+pub mod view;
 
 pub use ops::rasterize_splats as rasterize;
 pub use render::{Picture, render};

@@ -1,6 +1,10 @@
-//! Splats to a picture in one call, on the CPU.
+//! Splats to a picture in one call: on the CPU, or on the device that is asked for.
 
-use crate::abi::RasterOptions;
+mod device;
+
+pub use device::{DeviceError, Renderer};
+
+use crate::abi::{RasterOptions, Rendered};
 use crate::camera::Camera;
 use crate::cpu::{Geometry, Rasterizer, SplatSlices};
 use crate::splats::Splats;
@@ -24,7 +28,7 @@ pub struct Picture {
 /// Renders `splats` seen by `camera`.
 ///
 /// The SH basis is the splats' own; `options.sh_basis` is not read. To render many
-/// views, keep a [`Rasterizer`] and use [`render_with`].
+/// views, keep a [`Rasterizer`] and use [`render_with`], or a [`Renderer`] for a GPU.
 pub fn render(splats: &Splats, camera: &Camera, options: &RasterOptions) -> Picture {
     render_with(&mut Rasterizer::new(), splats, camera, options)
 }
@@ -37,10 +41,15 @@ pub fn render_with(
     options: &RasterOptions,
 ) -> Picture {
     let options = RasterOptions { sh_basis: splats.sh_basis, ..*options };
-    let rendered = rasterizer.render(&slices(splats), camera, &options);
-    let depth = rendered.depth();
-    let (width, height) = (rendered.width, rendered.height);
-    Picture { width, height, rgb: rendered.rgb, alpha: rendered.alpha, depth }
+    Picture::from(rasterizer.render(&slices(splats), camera, &options))
+}
+
+impl From<Rendered> for Picture {
+    fn from(rendered: Rendered) -> Self {
+        let depth = rendered.depth();
+        let (width, height) = (rendered.width, rendered.height);
+        Self { width, height, rgb: rendered.rgb, alpha: rendered.alpha, depth }
+    }
 }
 
 /// `splats` as the kernels read them.

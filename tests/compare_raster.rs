@@ -1,6 +1,9 @@
 //! `subsplat compare` of rasterizer cases: every conformance case passes, a damaged
 //! one does not, a malformed one is refused by name.
 
+#[cfg(feature = "gpu")]
+#[path = "common/gpu.rs"]
+mod adapter;
 mod common;
 #[path = "common/program.rs"]
 #[allow(dead_code, reason = "not every test binary uses every helper")]
@@ -46,6 +49,28 @@ fn every_case_passes() {
             assert!(names.contains(&"grad.sh") && names.len() >= 9, "{names:?}");
         }
     }
+}
+
+/// The GPU's picture of every case, by the program.
+#[cfg(feature = "gpu")]
+#[test]
+fn every_picture_passes_on_a_gpu() {
+    if adapter::gpu().is_none() {
+        return;
+    }
+    for path in cases().iter().filter(|p| p.file_stem().unwrap() != FOREIGN) {
+        let called = compare(path, &["--device", "gpu"]);
+        assert_eq!(called.code, 0, "{}: {} {}", path.display(), called.stdout, called.stderr);
+        let report = called.json();
+        assert_eq!(report["ok"], true);
+        let tensors = report["tensors"].as_array().unwrap();
+        let names: Vec<_> = tensors.iter().map(|t| t["tensor"].as_str().unwrap()).collect();
+        assert_eq!(names, ["rgb", "alpha", "depth_sum", "depth"]);
+    }
+    let Some(path) = cases().pop() else { return };
+    let called = compare(&path, &["--device", "no such adapter"]);
+    assert_eq!(called.code, 1, "{}", called.stdout);
+    assert!(called.json()["error"].to_string().contains("no such adapter"), "{}", called.stdout);
 }
 
 /// A case that can be changed and written again.

@@ -10,12 +10,28 @@ use std::path::Path;
 use subsplat::cpu::Tier;
 use subsplat::model::compare::{self, Row};
 use subsplat::model::weights::Weights;
+use subsplat::render::Renderer;
 
 /// Runs the command; `false` where a tensor is out of tolerance.
 pub fn compare(args: &CompareArgs, answer: Answer) -> Result<bool> {
     match &args.weights {
         Some(weights) => encoder(weights, &args.reference, answer),
-        None => rasterizer(&args.reference, tier(args.simd)?, answer),
+        None if args.device.eq_ignore_ascii_case("cpu") => {
+            let tier = tier(args.simd)?;
+            let compare = |case: &Case| compare_raster::compare(case, tier);
+            rasterizer(
+                &args.reference,
+                &format!("instruction set: {}", tier.name()),
+                compare,
+                answer,
+            )
+        }
+        None => {
+            let mut renderer = Renderer::open(&args.device)?;
+            let device = format!("device: {}", renderer.device());
+            let compare = |case: &Case| compare_raster::compare_picture(case, &mut renderer);
+            rasterizer(&args.reference, &device, compare, answer)
+        }
     }
 }
 
@@ -46,7 +62,12 @@ fn tier(asked: Option<SimdArg>) -> Result<Tier> {
     Ok(tier)
 }
 
-fn rasterizer(reference: &Path, tier: Tier, answer: Answer) -> Result<bool> {
+fn rasterizer(
+    reference: &Path,
+    with: &str,
+    compare: impl FnOnce(&Case) -> Result<Vec<Row>>,
+    answer: Answer,
+) -> Result<bool> {
     let mut progress = Progress::new();
     let rows = progress.stage("rasterizer", |_| -> Result<_> {
         let Some(case) = Case::read(reference)? else {
@@ -56,10 +77,9 @@ fn rasterizer(reference: &Path, tier: Tier, answer: Answer) -> Result<bool> {
                 reference.display()
             )
         };
-        let rows = compare_raster::compare(&case, tier);
-        rows.with_context(|| format!("{} {}", reference.display(), case.name))
+        compare(&case).with_context(|| format!("{} {}", reference.display(), case.name))
     })?;
-    answer.line(format!("instruction set: {}", tier.name()));
+    answer.line(with);
     table(&rows, answer);
     let ok = rows.iter().all(|r| r.ok);
     finish(&rows, ok, &[], &progress, answer)

@@ -7,8 +7,9 @@
 use super::raster_case::Case;
 use anyhow::{Result, ensure};
 use subsplat::abi::{Convention, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES};
-use subsplat::cpu::{Gradients, Rasterizer, Tier};
+use subsplat::cpu::{Gradients, Rasterizer, Rendered, Tier};
 use subsplat::model::compare::Row;
+use subsplat::render::Renderer;
 
 /// Largest |difference| of RGB and alpha, `standard`: ten times the f32 floor.
 const COLOUR_STANDARD: f32 = 3e-5;
@@ -38,12 +39,29 @@ type Output<'a> = (&'static str, &'a [f32], &'a [usize], f32, Option<f32>);
 /// # Errors
 /// A tensor is missing or has another shape; every pixel is marked as boundary.
 pub fn compare(case: &Case, tier: Tier) -> Result<Vec<Row>> {
+    let mut rasterizer = Rasterizer::new().with_tier(tier);
+    let got = rasterizer.render(&case.splats(), &case.camera, &case.options);
+    let mut rows = picture(case, &got)?;
+    if case.has("v_rgb") {
+        gradients(case, &mut rasterizer, &mut rows)?;
+    }
+    Ok(rows)
+}
+
+/// [`compare`] of the picture alone, rendered by `renderer`'s device.
+///
+/// # Errors
+/// As [`compare`]; the device fails.
+pub fn compare_picture(case: &Case, renderer: &mut Renderer) -> Result<Vec<Row>> {
+    let got = renderer.render_slices(&case.splats(), &case.camera, &case.options)?;
+    picture(case, &got)
+}
+
+fn picture(case: &Case, got: &Rendered) -> Result<Vec<Row>> {
     let k = case.camera.intrinsics;
     let pixels = [k.height, k.width];
     let boundary = case.array("boundary", &pixels)?;
     ensure!(boundary.contains(&0.0), "tensor `boundary`: expected a pixel to compare, got none");
-    let mut rasterizer = Rasterizer::new().with_tier(tier);
-    let got = rasterizer.render(&case.splats(), &case.camera, &case.options);
     let colour = match case.options.convention {
         Convention::Standard => COLOUR_STANDARD,
         Convention::Mvsplat => COLOUR_MVSPLAT,
@@ -69,9 +87,6 @@ pub fn compare(case: &Case, tier: Tier) -> Result<Vec<Row>> {
             relative = worst(relative, least.map_or(d, |least| d / theirs.abs().max(least)));
         }
         rows.push(row(name, max_abs, relative, allowed));
-    }
-    if case.has("v_rgb") {
-        gradients(case, &mut rasterizer, &mut rows)?;
     }
     Ok(rows)
 }

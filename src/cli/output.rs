@@ -6,6 +6,7 @@
 
 use super::args::SceneFormatArg;
 use super::frames;
+use super::report::warn;
 use anyhow::{Context, Result, bail};
 use indicatif::ProgressBar;
 use serde_json::{Value, json};
@@ -13,7 +14,6 @@ use std::path::Path;
 use subsplat::abi::{Convention, RasterOptions};
 use subsplat::camera::Camera;
 use subsplat::config::Config;
-use subsplat::cpu::Rasterizer;
 use subsplat::data::crop::CropOptions;
 use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
 use subsplat::io::image::{Depth, Rgb, save_depth_png, save_png};
@@ -21,7 +21,7 @@ use subsplat::io::scene::{Scene, Units};
 use subsplat::io::{SaveOptions, save_splats};
 use subsplat::metrics::{psnr, ssim};
 use subsplat::pipeline::{Photo, Reconstruction};
-use subsplat::render::render_with;
+use subsplat::render::Renderer;
 
 /// Folders inside the output folder.
 const FOLDERS: [&str; 3] = ["images", "depth", "inputs"];
@@ -109,6 +109,7 @@ impl Views<'_> {
     /// All of `views`; one step of `bar` each.
     pub fn render(
         &self,
+        renderer: &mut Renderer,
         result: &Reconstruction,
         views: &[View],
         bar: &ProgressBar,
@@ -123,10 +124,9 @@ impl Views<'_> {
         };
         let names: Vec<String> = views.iter().enumerate().map(name).collect();
         let stems = frames::file_stems(&names);
-        let mut rasterizer = Rasterizer::new();
         let mut scored = Vec::with_capacity(views.len());
         for (view, (name, stem)) in views.iter().zip(names.into_iter().zip(stems)) {
-            scored.push(self.one(&mut rasterizer, result, view, (name, stem))?);
+            scored.push(self.one(renderer, result, view, (name, stem))?);
             bar.inc(1);
         }
         Ok(scored)
@@ -134,7 +134,7 @@ impl Views<'_> {
 
     fn one(
         &self,
-        rasterizer: &mut Rasterizer,
+        renderer: &mut Renderer,
         result: &Reconstruction,
         view: &View,
         (name, stem): (String, String),
@@ -147,7 +147,8 @@ impl Views<'_> {
                 (cropped.target_camera, Some((*i, cropped.target, enlarged)))
             }
         };
-        let picture = render_with(rasterizer, &result.splats, &camera, &self.options);
+        let picture = renderer.render(&result.splats, &camera, &self.options);
+        renderer.take_warning().iter().for_each(warn);
         let (width, height) = (picture.width, picture.height);
         let file = self.out.join(format!("images/{stem}.png"));
         save_png(&file, &to_rgb8(&picture.rgb, width, height))?;

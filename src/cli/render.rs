@@ -11,12 +11,11 @@ use serde_json::json;
 use std::path::Path;
 use subsplat::abi::{Convention, RasterOptions};
 use subsplat::camera::{Camera, Intrinsics};
-use subsplat::cpu::Rasterizer;
 use subsplat::io::cameras_json::load_cameras_json;
 use subsplat::io::image::{Depth, save_depth_png, save_png};
 use subsplat::io::load_with_comments;
 use subsplat::io::scene::load_scene;
-use subsplat::render::render_with;
+use subsplat::render::Renderer;
 use subsplat::splats::Splats;
 
 /// Side of a picture where no camera says otherwise, px.
@@ -32,6 +31,13 @@ pub fn background(look: &LookArgs) -> Result<[f32; 3]> {
     Ok(look.background)
 }
 
+/// The renderer that is asked for, or the CPU's with a warning.
+pub fn open(look: &LookArgs) -> Renderer {
+    let mut renderer = Renderer::open_or_cpu(&look.device);
+    renderer.take_warning().iter().for_each(warn);
+    renderer
+}
+
 /// Runs the command.
 pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
@@ -42,10 +48,11 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
     std::fs::create_dir_all(&args.out)
         .with_context(|| format!("output folder {}", args.out.display()))?;
     let mut views = Vec::new();
+    let mut renderer = open(&args.look);
     progress.steps("rendering", cameras.len(), |bar| {
-        let mut rasterizer = Rasterizer::new();
         for (name, camera) in &cameras {
-            let picture = render_with(&mut rasterizer, &splats, camera, &options);
+            let picture = renderer.render(&splats, camera, &options);
+            renderer.take_warning().iter().for_each(warn);
             let (width, height) = (picture.width, picture.height);
             let file = args.out.join(format!("{name}.png"));
             save_png(&file, &to_rgb8(&picture.rgb, width, height))?;
@@ -76,6 +83,7 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
     answer.finish(&json!({
         "scene": args.scene.display().to_string(),
         "gaussians": splats.len(),
+        "device": renderer.device(),
         "convention": if mvsplat_rules { "mvsplat" } else { "standard" },
         "views": views,
         "seconds": seconds,

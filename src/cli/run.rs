@@ -86,8 +86,9 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
         crop: model.crop_options(plan.input_size),
         options,
     };
-    let scored =
-        progress.steps("rendering", views.len(), |bar| job.render(&result, &views, bar))?;
+    let mut renderer = render::open(&args.look);
+    let scored = progress
+        .steps("rendering", views.len(), |bar| job.render(&mut renderer, &result, &views, bar))?;
     let files = progress.stage("writing", |_| {
         let near_far = (range.near, range.far);
         output::write_config(&args.out, model.config())?;

@@ -11,10 +11,9 @@
 //! blending stops before the splat that would take T to 10⁻⁴ or below (`standard`)
 //! or below 10⁻⁴ (`mvsplat`).
 
-use crate::abi::{
-    ALPHA_MAX_MVSPLAT, ALPHA_MAX_STANDARD, ALPHA_MIN_LOG2, BLOCK, Convention, TILE,
-    TRANSMITTANCE_MIN,
-};
+pub(crate) use crate::abi::Rules;
+
+use crate::abi::{ALPHA_MIN_LOG2, BLOCK, TILE};
 use crate::cpu::blocks::{met, transpose_bits};
 use crate::cpu::ewa::Footprint;
 use crate::cpu::simd::{self, Kernel, Simd};
@@ -57,25 +56,6 @@ pub(crate) struct Tile {
 impl Default for Tile {
     fn default() -> Self {
         Self { blocks: [Block::default(); BLOCKS * BLOCKS] }
-    }
-}
-
-/// The two numbers in which the conventions blend differently.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Rules {
-    pub(crate) alpha_max: f32,
-    /// Blending stops where T would become this or less.
-    pub(crate) stop: f32,
-}
-
-impl Rules {
-    pub(crate) fn new(convention: Convention) -> Self {
-        match convention {
-            Convention::Standard => Self { alpha_max: ALPHA_MAX_STANDARD, stop: TRANSMITTANCE_MIN },
-            Convention::Mvsplat => {
-                Self { alpha_max: ALPHA_MAX_MVSPLAT, stop: TRANSMITTANCE_MIN.next_down() }
-            }
-        }
     }
 }
 

@@ -1,9 +1,9 @@
 //! Which 4×4 blocks of a tile a splat can meet, for sixteen splats at a time, and the
 //! turn from "blocks of a splat" to "splats of a block".
 
-use crate::abi::BLOCK;
+use crate::abi::{BLOCK, SPAN_SLACK_PX};
 use crate::cpu::blend::BLOCKS;
-use crate::cpu::ewa::{FIELDS, SPAN_SLACK_PX, support_lanes};
+use crate::cpu::ewa::{FIELDS, support_lanes};
 use crate::cpu::simd::{LANES, ROUGH, Simd};
 
 /// Masks of the blocks that sixteen splats can meet in the tile whose first pixel is at

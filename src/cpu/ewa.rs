@@ -14,24 +14,16 @@
 //! zero is a point, drawn as wide as the low-pass makes it; the sign of σ does not
 //! matter; an opacity above 1 acts through the alpha cap.
 
+pub use crate::view::View;
+
 use crate::abi::{
-    ALPHA_MIN, ALPHA_MIN_LOG2, BLOCK, Convention, DISCRIMINANT_MIN_MVSPLAT, JACOBIAN_LIMIT_MVSPLAT,
-    JACOBIAN_MARGIN_STANDARD, NEAR_MVSPLAT, RADIUS_SIGMAS_MVSPLAT, RasterOptions, TILE_MVSPLAT,
-    Z_EPSILON_MVSPLAT,
+    ALPHA_MIN, ALPHA_MIN_LOG2, BLOCK, DISCRIMINANT_MIN_MVSPLAT, OPACITY_MAX, RADIUS_SIGMAS_MVSPLAT,
+    SPAN_SLACK_PX, SUPPORT_SLACK, TILE_MVSPLAT,
 };
-use crate::camera::{Camera, Intrinsics};
 use crate::cpu::covariance::{Covariance2d, Shape, covariance_cov6, covariance_quat, dot};
 use crate::cpu::simd::{LANES, Simd, log2};
 use std::f32::consts::{LN_2, LOG2_E};
 
-/// Relative and absolute widening of a support, in log₂ of alpha: pixels on its
-/// rim are found whatever the rounding, and the per-pixel test decides.
-const SUPPORT_SLACK: f32 = 1e-4;
-/// Widening of a row's interval, px, for the rounding of pixel positions.
-pub(crate) const SPAN_SLACK_PX: f32 = 1e-3;
-/// Larger opacities act as this one, far beyond any alpha cap, so that their
-/// logarithm stays within what an exponent can hold.
-const OPACITY_MAX: f32 = 1e36;
 /// Four-byte fields of a [`Footprint`].
 pub(crate) const FIELDS: usize = 16;
 
@@ -141,66 +133,7 @@ pub(crate) fn support_lanes<S: Simd>(s: S, power: S::F) -> S::F {
     s.fma(s.splat(SUPPORT_SLACK), s.splat(1.0) + reach, reach)
 }
 
-/// A camera and the options of a call, as projection needs them.
-#[derive(Clone, Debug)]
-pub struct View {
-    /// Rows of the rotation from world to camera.
-    pub(crate) rows: [[f32; 3]; 3],
-    /// The eye, world.
-    pub(crate) eye: [f32; 3],
-    pub(crate) focal: [f32; 2],
-    /// Pixel position of the axis, centres at integers.
-    pub(crate) centre: [f32; 2],
-    /// Intervals to which x/z and y/z are clamped inside J.
-    pub(crate) limit: [(f32, f32); 2],
-    pub(crate) near: f32,
-    pub(crate) z_epsilon: f32,
-    pub(crate) lowpass: f32,
-    pub(crate) antialiased: bool,
-    pub(crate) tile_cut: bool,
-    pub(crate) size: [usize; 2],
-}
-
 impl View {
-    /// What `camera` and `options` mean for projection.
-    pub fn new(camera: &Camera, options: &RasterOptions) -> Self {
-        let k = &camera.intrinsics;
-        let size = [k.width, k.height];
-        let sides = [k.width as f32, k.height as f32];
-        let rotation = camera.rotation();
-        let standard = options.convention == Convention::Standard;
-        let (focal, centre, limit) = if standard {
-            let focal = [k.fx, k.fy];
-            let principal = [k.cx, k.cy];
-            let limit = std::array::from_fn(|i| {
-                let margin = JACOBIAN_MARGIN_STANDARD * 0.5 * sides[i] / focal[i];
-                let (low, high) = (principal[i] / focal[i], (sides[i] - principal[i]) / focal[i]);
-                (-low - margin, high + margin)
-            });
-            (focal, principal.map(|c| c - 0.5), limit)
-        } else {
-            let tan = tan_half_fov(k);
-            let focal = std::array::from_fn(|i| 0.5 * sides[i] / tan[i]);
-            let limit = tan.map(|t| (-JACOBIAN_LIMIT_MVSPLAT * t, JACOBIAN_LIMIT_MVSPLAT * t));
-            (focal, sides.map(|s| 0.5 * s - 0.5), limit)
-        };
-        let near = if standard { options.near } else { NEAR_MVSPLAT * options.near };
-        Self {
-            rows: std::array::from_fn(|i| rotation.col(i).to_array()),
-            eye: camera.position().to_array(),
-            focal,
-            centre,
-            limit,
-            // z = 0 projects nowhere, whatever the caller's near plane.
-            near: near.max(f32::MIN_POSITIVE),
-            z_epsilon: if standard { 0.0 } else { Z_EPSILON_MVSPLAT * options.near },
-            lowpass: options.lowpass,
-            antialiased: standard && options.antialiased,
-            tile_cut: !standard,
-            size,
-        }
-    }
-
     /// World to camera, as Rᵀ(p − t).
     #[inline(always)]
     fn to_camera<S: Simd>(&self, s: S, p: [S::F; 3]) -> [S::F; 3] {
@@ -355,22 +288,6 @@ fn radius_mvsplat<S: Simd>(s: S, xx: S::F, yy: S::F, det: S::F) -> S::F {
     let mid = s.splat(0.5) * (xx + yy);
     let discriminant = s.max(s.fma(mid, mid, -det), s.splat(DISCRIMINANT_MIN_MVSPLAT));
     s.ceil(s.splat(RADIUS_SIGMAS_MVSPLAT) * s.sqrt(mid + s.sqrt(discriminant)))
-}
-
-/// tan of half the angle between the rays through the middles of opposite picture
-/// edges, horizontally and vertically, as MVSplat derives its frustum.
-fn tan_half_fov(k: &Intrinsics) -> [f32; 2] {
-    let (w, h) = (k.width as f64, k.height as f64);
-    let ray = |u: f64, v: f64| {
-        glam::DVec3::new(
-            (u - f64::from(k.cx)) / f64::from(k.fx),
-            (v - f64::from(k.cy)) / f64::from(k.fy),
-            1.0,
-        )
-    };
-    let half =
-        |a: glam::DVec3, b: glam::DVec3| (0.5 * a.cross(b).length().atan2(a.dot(b))).tan() as f32;
-    [half(ray(0.0, 0.5 * h), ray(w, 0.5 * h)), half(ray(0.5 * w, 0.0), ray(0.5 * w, h))]
 }
 
 #[inline(always)]

@@ -8,6 +8,9 @@
 //! Colour of child i of parent p: max(0, ½ + γ_i·Σ_k sh_{p,k} Y_k(d) + δ_i)
 //! (SubSplat, colour gain; 3DGS for γ = 1, δ = 0).
 
+pub use crate::abi::{Geometry, SplatSlices};
+
+pub(crate) use crate::abi::lanes_at;
 use crate::abi::{
     LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, RasterOptions, SPLAT_LANES, ShBasis,
     ShDirection, sh_coefficients,
@@ -23,91 +26,6 @@ use rayon::prelude::*;
 const PARENTS: usize = 256;
 
 const _: () = assert!(LANE_OPACITY == LANE_SCALE + 3 && LANE_QUAT == LANE_MEAN + 3);
-
-/// Where N splats' positions, shapes and opacities lie.
-#[derive(Clone, Copy, Debug)]
-pub enum Geometry<'a> {
-    /// `[N, 11]` rows: mean, quaternion wxyz, σ, opacity (lanes in [`crate::abi`]).
-    Packed(&'a [f32]),
-    /// World covariances instead of quaternions and σ.
-    Cov6 {
-        /// `[N, 3]`, world.
-        means: &'a [f32],
-        /// `[N, 6]`: 00, 01, 02, 11, 12, 22.
-        cov6: &'a [f32],
-        /// `[N]`, after the sigmoid.
-        opacities: &'a [f32],
-    },
-}
-
-/// Borrowed splats, as the kernels read them. Lengths must fit one another
-/// (checked in debug builds; otherwise missing numbers read as neutral ones).
-#[derive(Clone, Copy, Debug)]
-pub struct SplatSlices<'a> {
-    /// Positions, shapes and opacities of N splats.
-    pub geometry: Geometry<'a>,
-    /// `[P, D, 3]` with D = (`sh_degree` + 1)²; splat i reads set i / (N / P).
-    pub sh: &'a [f32],
-    /// `[]` (γ = 1, δ = 0), `[N]` (γ) or `[N, 4]` (γ, δ RGB).
-    pub gain: &'a [f32],
-    /// Degree that `sh` stores.
-    pub sh_degree: usize,
-}
-
-impl SplatSlices<'_> {
-    /// N.
-    pub fn len(&self) -> usize {
-        match self.geometry {
-            Geometry::Packed(rows) => rows.len() / SPLAT_LANES,
-            Geometry::Cov6 { means, cov6, opacities } => {
-                (means.len() / 3).min(cov6.len() / 6).min(opacities.len())
-            }
-        }
-    }
-
-    /// Whether there is no splat.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
-    /// P.
-    pub fn parents(&self) -> usize {
-        self.sh.len() / (3 * sh_coefficients(self.sh_degree))
-    }
-
-    /// K = N / P.
-    pub fn children_per_parent(&self) -> usize {
-        self.len().div_ceil(self.parents().max(1)).max(1)
-    }
-
-    /// Whether all lengths fit one another.
-    pub fn is_consistent(&self) -> bool {
-        let n = self.len();
-        let geometry = match self.geometry {
-            Geometry::Packed(rows) => rows.len() == n * SPLAT_LANES,
-            Geometry::Cov6 { means, cov6, opacities } => {
-                means.len() == 3 * n && cov6.len() == 6 * n && opacities.len() == n
-            }
-        };
-        let p = self.parents();
-        let sh = self.sh.len() == p * 3 * sh_coefficients(self.sh_degree);
-        let children = if p == 0 { n == 0 } else { n.is_multiple_of(p) };
-        let gain = self.gain.is_empty() || self.gain.len() == n || self.gain.len() == 4 * n;
-        geometry && sh && children && gain
-    }
-
-    pub(crate) fn mean(&self, i: usize) -> [f32; 3] {
-        match self.geometry {
-            Geometry::Packed(rows) => lanes_at(rows, i * SPLAT_LANES + LANE_MEAN),
-            Geometry::Cov6 { means, .. } => lanes_at(means, 3 * i),
-        }
-    }
-}
-
-/// `L` floats from `at` on; zeros where the slice ends before.
-pub(crate) fn lanes_at<const L: usize>(from: &[f32], at: usize) -> [f32; L] {
-    from.get(at..at + L).and_then(|s| s.try_into().ok()).unwrap_or([0.0; L])
-}
 
 /// Footprints of a frame, reused from frame to frame.
 #[derive(Debug, Default)]

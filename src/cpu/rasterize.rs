@@ -7,7 +7,9 @@
 //! current pool; the same bytes come out whatever its size. Of the tiers only
 //! [`Tier::Scalar`] gives other bytes than the rest, since it rounds products.
 
-use crate::abi::{BLOCK, DEPTH_ALPHA_MIN, RasterOptions, TILE};
+pub use crate::abi::Rendered;
+
+use crate::abi::{BLOCK, RasterOptions, TILE};
 use crate::camera::Camera;
 use crate::cpu::blend::{BLOCKS, RenderTile, Rules, Tile, Workplace};
 use crate::cpu::disjoint::Disjoint;
@@ -21,29 +23,6 @@ use rayon::prelude::*;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering::Relaxed};
 use std::time::{Duration, Instant};
-
-/// A rendered picture, row-major.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Rendered {
-    /// W, px.
-    pub width: usize,
-    /// H, px.
-    pub height: usize,
-    /// `[H, W, 3]`: Σ w·c + T·background.
-    pub rgb: Vec<f32>,
-    /// `[H, W]`: 1 − T.
-    pub alpha: Vec<f32>,
-    /// `[H, W]`: Σ w·z, camera z in world units.
-    pub depth_sum: Vec<f32>,
-}
-
-impl Rendered {
-    /// `[H, W]`: Σ w·z / max(alpha, 1e-10), camera z in world units.
-    pub fn depth(&self) -> Vec<f32> {
-        let pixels = self.depth_sum.iter().zip(&self.alpha);
-        pixels.map(|(z, a)| z / a.max(DEPTH_ALPHA_MIN)).collect()
-    }
-}
 
 /// What the last frame cost.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

@@ -13,39 +13,17 @@
 //! | none | α | unused |
 //!
 //! α is taken as at most 0.9999 wherever a logarithm is. Parents are the lanes of a
-//! vector ([`super::lanes`]), so that a sum over children is a loop. Twin:
-//! ops/redistribute.rs.
+//! vector ([`super::lanes`]), so that a sum over children is a loop. Twins:
+//! kernels/redistribute.wgsl, src/gpu/redistribute.rs. Op: ops/redistribute.rs.
 
 use super::fresh::{Block, Fresh, start};
 use super::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};
 use super::real::Real;
-use crate::abi::{AREA_EPS, AREA_RULE_OPACITY_MAX, OPACITY_CEILING};
+use crate::abi::{AREA_EPS, AREA_RULE_OPACITY_MAX, OPACITY_CEILING, RELATIVE_AREA_MIN};
 use rayon::prelude::*;
 
-/// How the parent's opacity is shared (module doc).
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Rule {
-    /// Sums to the parent's.
-    Linear,
-    /// Conserves footprint-weighted optical depth.
-    OpticalDepth,
-    /// Conserves transmittance through all children.
-    Transmittance,
-    /// Conserves integrated opacity.
-    Area,
-    /// Every child has the parent's.
-    None,
-}
+pub use crate::abi::Rule;
 
-impl Rule {
-    /// Whether areas count in units of the parent's own.
-    pub fn areas_are_relative(self) -> bool {
-        matches!(self, Rule::OpticalDepth | Rule::Area)
-    }
-}
-
-/// Least relative area that is divided by.
-const RELATIVE_AREA_MIN: f64 = 1e-12;
 /// Parents per rayon task: all that it reads and writes lies in the caches of a core.
 const BLOCK: usize = 512;
 

@@ -1,0 +1,96 @@
+// Front-to-back compositing, a workgroup a tile, a thread a pixel (3DGS section 6, eq. 3).
+// Twin: src/cpu/rasterize.rs (blend there). Per pixel: α = min(cap, o·e^(−σ)), skipped
+// below 1/255; blending stops before the splat that would take T to `stop` or below.
+//
+// Out: RGB over the background, 1 − T, Σ w·z: channel c of pixel p at p·step + c·channel,
+// then H·W alphas and H·W depth sums.
+
+@group(0) @binding(0) var<uniform> call: RasterUniform;
+@group(0) @binding(1) var<storage, read> footprints: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read> ranges: array<u32>;
+@group(0) @binding(3) var<storage, read> splats: array<u32>;
+@group(0) @binding(4) var<storage, read_write> picture: array<f32>;
+
+var<workgroup> batch_a: array<vec4<f32>, 256>;
+var<workgroup> batch_b: array<vec4<f32>, 256>;
+var<workgroup> batch_c: array<vec4<f32>, 256>;
+var<workgroup> live: atomic<u32>;
+var<workgroup> live_seen: u32;
+
+@compute @workgroup_size(256)
+fn main(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let tile = workgroup_number(workgroup, workgroups);
+    if tile >= call.columns * call.rows {
+        return;
+    }
+    let x = tile % call.columns * TILE_GPU + lane % TILE_GPU;
+    let y = tile / call.columns * TILE_GPU + lane / TILE_GPU;
+    let pixel = vec2<f32>(f32(x), f32(y));
+    var goes = x < call.width && y < call.height;
+    let inside = goes;
+    if lane == 0u {
+        atomicStore(&live, 256u);
+    }
+    workgroupBarrier();
+    if !goes {
+        atomicSub(&live, 1u);
+    }
+    let first = ranges[2u * tile];
+    let past = ranges[2u * tile + 1u];
+    var t = 1.0;
+    var sum = vec4<f32>(0.0);
+    for (var base = first; base < past; base += 256u) {
+        workgroupBarrier();
+        if lane == 0u {
+            live_seen = atomicLoad(&live);
+        }
+        if workgroupUniformLoad(&live_seen) == 0u {
+            break;
+        }
+        if base + lane < past {
+            let i = splats[base + lane];
+            batch_a[lane] = footprints[3u * i];
+            batch_b[lane] = footprints[3u * i + 1u];
+            batch_c[lane] = footprints[3u * i + 2u];
+        }
+        workgroupBarrier();
+        if goes {
+            let count = min(256u, past - base);
+            for (var s = 0u; s < count; s++) {
+                let a = batch_a[s];
+                let b = batch_b[s];
+                let d = pixel - a.xy;
+                let across = (d.x + a.w * d.y) * a.z;
+                let down = d.y * b.x;
+                let power = b.y - across * across - down * down;
+                if power < ALPHA_MIN_LOG2 {
+                    continue;
+                }
+                let alpha = min(exp2(power), call.alpha_max);
+                let rest = t - alpha * t;
+                if rest <= call.stop {
+                    goes = false;
+                    atomicSub(&live, 1u);
+                    break;
+                }
+                sum += alpha * t * vec4<f32>(batch_c[s].xyz, b.z);
+                t = rest;
+            }
+        }
+    }
+    if inside {
+        let p = y * call.width + x;
+        let plane = call.width * call.height;
+        let at = p * call.step;
+        let rgb = sum.xyz + t * call.background.xyz;
+        picture[at] = rgb.x;
+        picture[at + call.channel] = rgb.y;
+        picture[at + 2u * call.channel] = rgb.z;
+        picture[3u * plane + p] = 1.0 - t;
+        picture[4u * plane + p] = sum.w;
+    }
+}

@@ -1,0 +1,29 @@
+// Constants of src/abi.rs, by the same names; tests/shaders.rs compares every one.
+
+// Rule (how a parent's opacity is shared).
+const RULE_LINEAR: u32 = 0u;
+const RULE_OPTICAL_DEPTH: u32 = 1u;
+const RULE_TRANSMITTANCE: u32 = 2u;
+const RULE_AREA: u32 = 3u;
+const RULE_NONE: u32 = 4u;
+
+const AREA_EPS: f32 = 1e-8;
+const AREA_RULE_OPACITY_MAX: f32 = 0.99;
+const OPACITY_CEILING: f32 = 0.9999;
+const RELATIVE_AREA_MIN: f32 = 1e-12;
+
+// The rasterizer.
+const ALPHA_MIN: f32 = 0.003921568859368563;
+const ALPHA_MIN_LOG2: f32 = -7.9943533;
+const DISCRIMINANT_MIN_MVSPLAT: f32 = 0.1;
+const RADIUS_SIGMAS_MVSPLAT: f32 = 3.0;
+const SUPPORT_SLACK: f32 = 1e-4;
+const SPAN_SLACK_PX: f32 = 1e-3;
+const OPACITY_MAX: f32 = 1e36;
+const TILE_GPU: u32 = 16u;
+const FOOTPRINT_LANES: u32 = 12u;
+const GPU_BLOCK: u32 = 2048u;
+const PLAN_COUNT: u32 = 3u;
+const PLAN_BLOCKS: u32 = 4u;
+const PLAN_ASKED: u32 = 5u;
+const PLAN_EACH: u32 = 8u;

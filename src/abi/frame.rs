@@ -1,0 +1,136 @@
+//! What goes into a frame and what comes out, in host memory: the same for every
+//! rasterizer of the crate.
+
+use super::{
+    ALPHA_MAX_MVSPLAT, ALPHA_MAX_STANDARD, Convention, DEPTH_ALPHA_MIN, LANE_MEAN, SPLAT_LANES,
+    TRANSMITTANCE_MIN, sh_coefficients,
+};
+
+/// Where N splats' positions, shapes and opacities lie.
+#[derive(Clone, Copy, Debug)]
+pub enum Geometry<'a> {
+    /// `[N, 11]` rows: mean, quaternion wxyz, σ, opacity (lanes in [`crate::abi`]).
+    Packed(&'a [f32]),
+    /// World covariances instead of quaternions and σ.
+    Cov6 {
+        /// `[N, 3]`, world.
+        means: &'a [f32],
+        /// `[N, 6]`: 00, 01, 02, 11, 12, 22.
+        cov6: &'a [f32],
+        /// `[N]`, after the sigmoid.
+        opacities: &'a [f32],
+    },
+}
+
+/// Borrowed splats, as the kernels read them. Lengths must fit one another
+/// (checked in debug builds; otherwise missing numbers read as neutral ones).
+#[derive(Clone, Copy, Debug)]
+pub struct SplatSlices<'a> {
+    /// Positions, shapes and opacities of N splats.
+    pub geometry: Geometry<'a>,
+    /// `[P, D, 3]` with D = (`sh_degree` + 1)²; splat i reads set i / (N / P).
+    pub sh: &'a [f32],
+    /// `[]` (γ = 1, δ = 0), `[N]` (γ) or `[N, 4]` (γ, δ RGB).
+    pub gain: &'a [f32],
+    /// Degree that `sh` stores.
+    pub sh_degree: usize,
+}
+
+impl SplatSlices<'_> {
+    /// N.
+    pub fn len(&self) -> usize {
+        match self.geometry {
+            Geometry::Packed(rows) => rows.len() / SPLAT_LANES,
+            Geometry::Cov6 { means, cov6, opacities } => {
+                (means.len() / 3).min(cov6.len() / 6).min(opacities.len())
+            }
+        }
+    }
+
+    /// Whether there is no splat.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// P.
+    pub fn parents(&self) -> usize {
+        self.sh.len() / (3 * sh_coefficients(self.sh_degree))
+    }
+
+    /// K = N / P.
+    pub fn children_per_parent(&self) -> usize {
+        self.len().div_ceil(self.parents().max(1)).max(1)
+    }
+
+    /// Whether all lengths fit one another.
+    pub fn is_consistent(&self) -> bool {
+        let n = self.len();
+        let geometry = match self.geometry {
+            Geometry::Packed(rows) => rows.len() == n * SPLAT_LANES,
+            Geometry::Cov6 { means, cov6, opacities } => {
+                means.len() == 3 * n && cov6.len() == 6 * n && opacities.len() == n
+            }
+        };
+        let p = self.parents();
+        let sh = self.sh.len() == p * 3 * sh_coefficients(self.sh_degree);
+        let children = if p == 0 { n == 0 } else { n.is_multiple_of(p) };
+        let gain = self.gain.is_empty() || self.gain.len() == n || self.gain.len() == 4 * n;
+        geometry && sh && children && gain
+    }
+
+    pub(crate) fn mean(&self, i: usize) -> [f32; 3] {
+        match self.geometry {
+            Geometry::Packed(rows) => lanes_at(rows, i * SPLAT_LANES + LANE_MEAN),
+            Geometry::Cov6 { means, .. } => lanes_at(means, 3 * i),
+        }
+    }
+}
+
+/// `L` floats from `at` on; zeros where the slice ends before.
+pub(crate) fn lanes_at<const L: usize>(from: &[f32], at: usize) -> [f32; L] {
+    from.get(at..at + L).and_then(|s| s.try_into().ok()).unwrap_or([0.0; L])
+}
+
+/// A rendered picture, row-major.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Rendered {
+    /// W, px.
+    pub width: usize,
+    /// H, px.
+    pub height: usize,
+    /// `[H, W, 3]`: Σ w·c + T·background.
+    pub rgb: Vec<f32>,
+    /// `[H, W]`: 1 − T.
+    pub alpha: Vec<f32>,
+    /// `[H, W]`: Σ w·z, camera z in world units.
+    pub depth_sum: Vec<f32>,
+}
+
+impl Rendered {
+    /// `[H, W]`: Σ w·z / max(alpha, 1e-10), camera z in world units.
+    pub fn depth(&self) -> Vec<f32> {
+        let pixels = self.depth_sum.iter().zip(&self.alpha);
+        pixels.map(|(z, a)| z / a.max(DEPTH_ALPHA_MIN)).collect()
+    }
+}
+
+/// The two numbers in which the conventions blend differently.
+#[derive(Clone, Copy, Debug)]
+pub struct Rules {
+    /// Largest alpha of one splat at one pixel.
+    pub alpha_max: f32,
+    /// Blending stops where T would become this or less.
+    pub stop: f32,
+}
+
+impl Rules {
+    /// Those of `convention`.
+    pub fn new(convention: Convention) -> Self {
+        match convention {
+            Convention::Standard => Self { alpha_max: ALPHA_MAX_STANDARD, stop: TRANSMITTANCE_MIN },
+            Convention::Mvsplat => {
+                Self { alpha_max: ALPHA_MAX_MVSPLAT, stop: TRANSMITTANCE_MIN.next_down() }
+            }
+        }
+    }
+}

@@ -1,0 +1,50 @@
+//! The kernels as WGSL compute, on any adapter that wgpu finds (Vulkan, Metal, DX12).
+//!
+//! Same stems and arguments as [`crate::cpu`], same results within the tolerances that
+//! `tests/gpu_twins.rs` states. [`Gpu::open`] chooses the adapter; every error leaves the
+//! caller the CPU kernels. Nothing here needs more than WebGPU's default limits: 8 storage
+//! buffers a stage, 256 threads and 16 KiB a workgroup, 128 MiB a binding.
+//!
+//! A kernel x is `kernels/x.wgsl`, a [`Kernel`] and a method of [`Gpu`] in `x.rs`, and
+//! has a CPU twin of the same stem; `tests/shaders.rs` holds its text against
+//! [`crate::abi`] and this table.
+
+mod adapter;
+mod buffers;
+mod commands;
+mod device;
+mod error;
+mod pipelines;
+mod raster_kernels;
+mod rasterize;
+mod redistribute;
+mod scene;
+mod show;
+mod sort;
+
+pub use adapter::{AdapterSummary, DeviceChoice, adapters, choose};
+pub use buffers::Buffer;
+pub use device::Gpu;
+pub use error::GpuError;
+pub use pipelines::{Access, Kernel};
+pub use rasterize::Rasterizer;
+pub use redistribute::RedistributeArgs;
+pub use scene::Scene;
+/// The wgpu that devices and textures belong to.
+pub use wgpu;
+
+/// Every kernel of the room.
+pub const KERNELS: &[&Kernel] = &[
+    &raster_kernels::PROJECT,
+    &raster_kernels::SORT_COUNT,
+    &raster_kernels::SORT_SCATTER,
+    &raster_kernels::SCAN_REDUCE,
+    &raster_kernels::SCAN_WHOLE,
+    &raster_kernels::SCAN_APPLY,
+    &raster_kernels::PLAN,
+    &raster_kernels::INTERSECT,
+    &raster_kernels::RANGES,
+    &raster_kernels::RASTERIZE,
+    &redistribute::REDISTRIBUTE,
+    &show::SHOW,
+];

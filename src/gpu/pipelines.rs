@@ -1,0 +1,155 @@
+//! Kernels: WGSL text, its arguments, and its compiled form, built once per device.
+//!
+//! A kernel's text is `concat!` of files under `kernels/`: what several share
+//! (`kernels/shared`) first, then its own. No preprocessor. Binding i of group 0 is
+//! argument i.
+
+use crate::gpu::device::Gpu;
+use crate::gpu::error::GpuError;
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// How a kernel uses an argument.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Access {
+    /// `var<uniform>`.
+    Uniform,
+    /// `var<storage, read>`.
+    Read,
+    /// `var<storage, read_write>`.
+    Write,
+}
+
+/// One entry point of one file under `kernels/`.
+#[derive(Debug)]
+pub struct Kernel {
+    /// Stem of its file.
+    pub name: &'static str,
+    /// Its entry point.
+    pub entry: &'static str,
+    /// Its whole text.
+    pub source: &'static str,
+    /// Its arguments, in the order of their bindings. At most 8 are storage buffers
+    /// (WebGPU's default limit).
+    pub bindings: &'static [Access],
+}
+
+impl Kernel {
+    /// Name and entry point.
+    pub(crate) fn label(&self) -> String {
+        format!("{}::{}", self.name, self.entry)
+    }
+}
+
+/// Values of a kernel's `override` constants.
+pub(crate) type Constants<'a> = &'a [(&'static str, f64)];
+
+#[derive(Debug)]
+pub(crate) struct Pipeline {
+    pub(crate) raw: wgpu::ComputePipeline,
+    pub(crate) layout: wgpu::BindGroupLayout,
+    pub(crate) label: String,
+}
+
+/// Kernel, entry point, and the bits of its constants.
+type Key = (&'static str, &'static str, Vec<(&'static str, u64)>);
+
+/// What is compiled on one device.
+#[derive(Debug, Default)]
+pub(crate) struct Pipelines {
+    modules: Mutex<HashMap<&'static str, wgpu::ShaderModule>>,
+    built: Mutex<HashMap<Key, Arc<Pipeline>>>,
+    pub(crate) shows: Mutex<HashMap<wgpu::TextureFormat, wgpu::RenderPipeline>>,
+}
+
+impl Gpu {
+    /// `kernel` with `constants`, compiled at its first use.
+    ///
+    /// # Errors
+    /// [`GpuError::Refused`] with the compiler's own message.
+    pub(crate) fn pipeline(
+        &self,
+        kernel: &'static Kernel,
+        constants: Constants,
+    ) -> Result<Arc<Pipeline>, GpuError> {
+        let bits = constants.iter().map(|(name, v)| (*name, v.to_bits())).collect();
+        let key = (kernel.name, kernel.entry, bits);
+        let mut built = self.pipelines.built.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(found) = built.get(&key) {
+            return Ok(found.clone());
+        }
+        let label = kernel.label();
+        let new = self.checked(&label, || Ok(self.build(kernel, constants)))?;
+        let new = Arc::new(new);
+        built.insert(key, new.clone());
+        Ok(new)
+    }
+
+    /// The compiled text of a kernel's file; errors go to the open scope.
+    pub(crate) fn module(&self, name: &'static str, source: &'static str) -> wgpu::ShaderModule {
+        let mut modules = self.pipelines.modules.lock().unwrap_or_else(PoisonError::into_inner);
+        let compile = || {
+            self.device.create_shader_module(wgpu::ShaderModuleDescriptor {
+                label: Some(name),
+                source: wgpu::ShaderSource::Wgsl(source.into()),
+            })
+        };
+        modules.entry(name).or_insert_with(compile).clone()
+    }
+
+    fn build(&self, kernel: &'static Kernel, constants: Constants) -> Pipeline {
+        let label = kernel.label();
+        let module = self.module(kernel.name, kernel.source);
+        let layout = layout(&self.device, kernel, wgpu::ShaderStages::COMPUTE);
+        let whole = self.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+            label: Some(&label),
+            bind_group_layouts: &[Some(&layout)],
+            immediate_size: 0,
+        });
+        let raw = self.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+            label: Some(&label),
+            layout: Some(&whole),
+            module: &module,
+            entry_point: Some(kernel.entry),
+            compilation_options: wgpu::PipelineCompilationOptions {
+                constants,
+                // Kernels write their workgroup memory before they read it.
+                zero_initialize_workgroup_memory: false,
+            },
+            cache: None,
+        });
+        Pipeline { raw, layout, label }
+    }
+}
+
+/// Layout of a kernel's arguments.
+pub(crate) fn layout(
+    device: &wgpu::Device,
+    kernel: &Kernel,
+    visibility: wgpu::ShaderStages,
+) -> wgpu::BindGroupLayout {
+    let entry = |(i, &access)| entry(i, access, visibility);
+    let entries: Vec<_> = (0..).zip(kernel.bindings).map(entry).collect();
+    device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
+        label: Some(&kernel.label()),
+        entries: &entries,
+    })
+}
+
+fn entry(
+    binding: u32,
+    access: Access,
+    visibility: wgpu::ShaderStages,
+) -> wgpu::BindGroupLayoutEntry {
+    let ty = match access {
+        Access::Uniform => wgpu::BufferBindingType::Uniform,
+        Access::Read => wgpu::BufferBindingType::Storage { read_only: true },
+        Access::Write => wgpu::BufferBindingType::Storage { read_only: false },
+    };
+    wgpu::BindGroupLayoutEntry {
+        binding,
+        visibility,
+        ty: wgpu::BindingType::Buffer { ty, has_dynamic_offset: false, min_binding_size: None },
+        count: None,
+    }
+}

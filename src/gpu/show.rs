@@ -1,0 +1,157 @@
+//! A frame onto a texture of the application's, on its device: the picture does not pass
+//! through host memory. Kernel: kernels/show.wgsl.
+
+use crate::abi::{PLAN_WORDS, RasterOptions, ShowUniform};
+use crate::camera::Camera;
+use crate::gpu::buffers::Binding;
+use crate::gpu::device::Gpu;
+use crate::gpu::error::GpuError;
+use crate::gpu::pipelines::{Access, Kernel, layout};
+use crate::gpu::rasterize::{Channels, Rasterizer};
+use crate::gpu::scene::Scene;
+use std::sync::PoisonError;
+
+pub(crate) static SHOW: Kernel = Kernel {
+    name: "show",
+    entry: "fragment",
+    source: include_str!("../../kernels/show.wgsl"),
+    bindings: &[Access::Uniform, Access::Read],
+};
+
+impl Rasterizer {
+    /// Renders splats to `target`, a texture view of this rasterizer's device that may be
+    /// rendered to: RGB over the background, accumulated alpha. One submit; it does not wait
+    /// for the device but for the last frame's counts.
+    ///
+    /// The first frame is always whole. A later one that needs more room for (splat, tile)
+    /// pairs than any before lacks its farthest splats, and the next has the room.
+    ///
+    /// # Errors
+    /// A target of another size than the camera's picture; as [`Rasterizer::render`].
+    pub fn draw(
+        &mut self,
+        scene: &Scene,
+        camera: &Camera,
+        options: &RasterOptions,
+        target: &wgpu::TextureView,
+    ) -> Result<(), GpuError> {
+        let (size, format) = (target.texture().size(), target.texture().format());
+        let k = camera.intrinsics;
+        if (size.width as usize, size.height as usize) != (k.width, k.height) {
+            return Err(GpuError::Argument {
+                kernel: SHOW.name,
+                what: "the texture, px",
+                expected: format!("{}x{}", k.width, k.height),
+                got: format!("{}x{}", size.width, size.height),
+            });
+        }
+        let gpu = self.gpu().clone();
+        if let Some(plan) = self.pending.take() {
+            self.learn(&plan.take(&gpu)?)?;
+        }
+        let uniform = gpu.uniform(&ShowUniform {
+            width: size.width,
+            height: size.height,
+            srgb: u32::from(format.is_srgb()),
+            pad: 0,
+        })?;
+        loop {
+            let mut commands = gpu.commands("frame", false);
+            let frame =
+                self.record(&mut commands, scene, camera, options, Channels::Interleaved)?;
+            let plan = commands.read::<u32>(&frame.plan, PLAN_WORDS)?;
+            let bindings = [Binding::from(&uniform), Binding::from(&frame.picture)];
+            let pipeline = gpu.show_pipeline(format)?;
+            let (device, target) = (gpu.device.clone(), target.clone());
+            commands.draw(move |encoder| show(&device, encoder, &pipeline, &bindings, &target));
+            commands.submit()?;
+            if self.seen {
+                self.pending = Some(plan);
+                return Ok(());
+            }
+            // Nothing is known of the scene yet.
+            self.seen = self.learn(&plan.take(&gpu)?)?;
+            if self.seen {
+                return Ok(());
+            }
+        }
+    }
+}
+
+fn show(
+    device: &wgpu::Device,
+    encoder: &mut wgpu::CommandEncoder,
+    pipeline: &wgpu::RenderPipeline,
+    bindings: &[Binding],
+    target: &wgpu::TextureView,
+) {
+    let entries: Vec<_> = (0..)
+        .zip(bindings)
+        .map(|(binding, b)| wgpu::BindGroupEntry { binding, resource: b.resource() })
+        .collect();
+    let group = device.create_bind_group(&wgpu::BindGroupDescriptor {
+        label: Some(SHOW.name),
+        layout: &pipeline.get_bind_group_layout(0),
+        entries: &entries,
+    });
+    let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
+        label: Some(SHOW.name),
+        color_attachments: &[Some(wgpu::RenderPassColorAttachment {
+            view: target,
+            depth_slice: None,
+            resolve_target: None,
+            ops: wgpu::Operations {
+                load: wgpu::LoadOp::Clear(wgpu::Color::BLACK),
+                store: wgpu::StoreOp::Store,
+            },
+        })],
+        ..wgpu::RenderPassDescriptor::default()
+    });
+    pass.set_pipeline(pipeline);
+    pass.set_bind_group(0, &group, &[]);
+    pass.draw(0..3, 0..1);
+}
+
+impl Gpu {
+    /// The render pipeline of [`SHOW`] for a texture format, built at its first use.
+    fn show_pipeline(&self, format: wgpu::TextureFormat) -> Result<wgpu::RenderPipeline, GpuError> {
+        let mut built = self.pipelines.shows.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(found) = built.get(&format) {
+            return Ok(found.clone());
+        }
+        let new = self.checked(SHOW.name, || Ok(self.build_show(format)))?;
+        built.insert(format, new.clone());
+        Ok(new)
+    }
+
+    fn build_show(&self, format: wgpu::TextureFormat) -> wgpu::RenderPipeline {
+        let module = self.module(SHOW.name, SHOW.source);
+        let group = layout(&self.device, &SHOW, wgpu::ShaderStages::FRAGMENT);
+        let whole = self.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+            label: Some(SHOW.name),
+            bind_group_layouts: &[Some(&group)],
+            immediate_size: 0,
+        });
+        self.device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
+            label: Some(SHOW.name),
+            layout: Some(&whole),
+            vertex: wgpu::VertexState {
+                module: &module,
+                entry_point: Some("vertex"),
+                compilation_options: wgpu::PipelineCompilationOptions::default(),
+                buffers: &[],
+            },
+            primitive: wgpu::PrimitiveState::default(),
+            depth_stencil: None,
+            multisample: wgpu::MultisampleState::default(),
+            fragment: Some(wgpu::FragmentState {
+                module: &module,
+                entry_point: Some("fragment"),
+                compilation_options: wgpu::PipelineCompilationOptions::default(),
+                targets: &[Some(format.into())],
+            }),
+            multiview_mask: None,
+            cache: None,
+        })
+    }
+}

@@ -1,0 +1,78 @@
+//! One renderer for any device: what was asked for renders, and the CPU where that fails.
+
+#[cfg(feature = "gpu")]
+#[path = "common/gpu.rs"]
+mod adapter;
+
+use glam::Mat4;
+use subsplat::abi::{RasterOptions, SPLAT_LANES, ShBasis};
+use subsplat::camera::{Camera, Intrinsics};
+use subsplat::render::{Renderer, render};
+use subsplat::splats::Splats;
+
+fn scene() -> (Splats, Camera) {
+    let mut rows = Vec::new();
+    for i in 0..50 {
+        let t = i as f32 * 0.37;
+        rows.extend([t.sin(), (1.7 * t).cos() * 0.7, 3.0 + (2.3 * t).sin()]);
+        rows.extend([1.0, 0.3 * t.sin(), 0.2, -0.1 * t.cos(), 0.1, 0.15, 0.05, 0.7]);
+    }
+    let n = rows.len() / SPLAT_LANES;
+    let sh = (0..3 * n).map(|i| (i as f32 * 0.9).sin()).collect();
+    let splats = Splats { rows, sh, gain: Vec::new(), sh_degree: 0, sh_basis: ShBasis::Standard };
+    let k = Intrinsics::from_fov_x(0.9, 64, 48);
+    (splats, Camera::new(k, Mat4::IDENTITY).unwrap())
+}
+
+#[test]
+fn an_absent_adapter_leaves_the_cpu_and_a_warning() {
+    let (splats, camera) = scene();
+    let options = RasterOptions::default();
+    let expected = render(&splats, &camera, &options);
+    assert!(Renderer::open("no such adapter").is_err());
+    let mut renderer = Renderer::open_or_cpu("no such adapter");
+    let warning = renderer.take_warning().unwrap();
+    assert!(warning.contains("no such adapter") && warning.contains("on the CPU"), "{warning}");
+    assert_eq!(renderer.device(), "CPU");
+    assert!(renderer.render(&splats, &camera, &options) == expected);
+    assert_eq!(renderer.take_warning(), None);
+    let mut plain = Renderer::open("cpu").unwrap();
+    assert!(plain.render(&splats, &camera, &options) == expected);
+}
+
+#[cfg(feature = "gpu")]
+#[test]
+fn a_gpu_renders_what_the_cpu_does() {
+    if adapter::gpu().is_none() {
+        return;
+    }
+    let (splats, camera) = scene();
+    let options = RasterOptions::default();
+    let expected = render(&splats, &camera, &options);
+    let mut renderer = Renderer::open("gpu").unwrap();
+    assert_ne!(renderer.device(), "CPU");
+    let got = renderer.render(&splats, &camera, &options);
+    assert_eq!(renderer.take_warning(), None);
+    // A decision at a threshold may flip at single pixels, worth 1/255 of a colour.
+    let off = got.rgb.iter().zip(&expected.rgb).filter(|(a, b)| (*a - *b).abs() > 3e-5).count();
+    assert!(off <= expected.rgb.len() / 1000, "{off} of {} numbers", expected.rgb.len());
+    assert!(got.rgb.iter().zip(&expected.rgb).all(|(a, b)| (a - b).abs() < 0.02));
+}
+
+/// The picture is too large for a binding of WebGPU's default 128 MiB: the CPU takes it.
+#[cfg(feature = "gpu")]
+#[test]
+fn what_a_gpu_is_too_small_for_the_cpu_renders() {
+    if adapter::gpu().is_none() {
+        return;
+    }
+    let (splats, camera) = scene();
+    let camera = Camera { intrinsics: camera.intrinsics.resized(3200, 2400), ..camera };
+    let options = RasterOptions::default();
+    let mut renderer = Renderer::open("gpu").unwrap();
+    let got = renderer.render(&splats, &camera, &options);
+    let warning = renderer.take_warning().unwrap();
+    assert!(warning.contains("too small for the picture"), "{warning}");
+    assert_eq!(renderer.device(), "CPU");
+    assert!(got == render(&splats, &camera, &options));
+}

@@ -1,0 +1,90 @@
+//! Every WGSL kernel against its CPU twin. Tolerances have their reasons beside them, and
+//! each comparison is seen to fail on a perturbed side.
+
+#![cfg(feature = "gpu")]
+
+#[path = "common/gpu.rs"]
+mod adapter;
+
+use adapter::gpu;
+use subsplat::abi::Rule;
+use subsplat::cpu::redistribute as cpu;
+use subsplat::gpu::{GpuError, RedistributeArgs};
+
+/// WGSL allows exp and log 3 + 2|x| units in the last place, |x| up to 20 here: 3e-6 of
+/// the result, in numerator and sum.
+const REDISTRIBUTE: f32 = 1e-5;
+
+const RULES: [Rule; 5] =
+    [Rule::Linear, Rule::OpticalDepth, Rule::Transmittance, Rule::Area, Rule::None];
+
+/// xorshift64*: uniform in [from, to).
+struct Random(u64);
+
+impl Random {
+    fn range(&mut self, from: f32, to: f32) -> f32 {
+        self.0 ^= self.0 >> 12;
+        self.0 ^= self.0 << 25;
+        self.0 ^= self.0 >> 27;
+        let unit = (self.0.wrapping_mul(0x2545_F491_4F6C_DD1D) >> 40) as f32 / (1u64 << 24) as f32;
+        from + (to - from) * unit
+    }
+
+    fn many(&mut self, count: usize, from: f32, to: f32) -> Vec<f32> {
+        (0..count).map(|_| self.range(from, to)).collect()
+    }
+}
+
+/// Largest |got − expected| / |expected|; NaN where one is.
+fn relative(got: &[f32], expected: &[f32]) -> f32 {
+    assert_eq!(got.len(), expected.len());
+    let pairs = got.iter().zip(expected);
+    pairs
+        .map(|(g, e)| (g - e).abs() / e.abs().max(f32::MIN_POSITIVE))
+        .fold(0.0, |m, d| if d > m || d.is_nan() { d } else { m })
+}
+
+#[test]
+fn redistribute() {
+    let Some(gpu) = gpu() else { return };
+    let mut random = Random(7);
+    for (p, k) in [(1, 1), (3, 4), (1000, 4), (777, 9), (513, 16), (70, 5)] {
+        let logits = random.many(p * k, -10.0, 10.0);
+        // From far below a pixel to many pixels.
+        let areas: Vec<f32> = random.many(p * k, -12.0, 6.0).iter().map(|e| e.exp2()).collect();
+        let mut alphas = random.many(p, 0.0, 1.0);
+        for (a, special) in alphas.iter_mut().zip([1e-7, 1.0, 0.9999, 1e-3]) {
+            *a = special;
+        }
+        let own: Vec<f32> = random.many(p, -4.0, 6.0).iter().map(|e| e.exp2()).collect();
+        for rule in RULES {
+            let (logits, areas, alphas, own) = (&logits[..], &areas[..], &alphas[..], &own[..]);
+            let expected = cpu::forward(cpu::Args { rule, k, logits, areas, alphas, own });
+            let args = RedistributeArgs { rule, k, logits, areas, alphas, own };
+            let got = gpu.redistribute(&args).unwrap();
+            let off = relative(&got, &expected);
+            assert!(off < REDISTRIBUTE, "{rule:?} {p}x{k}: {off:e}");
+            // 0.1 % on one number is seen.
+            let mut perturbed = got;
+            perturbed[p * k / 2] *= 1.001;
+            assert!(relative(&perturbed, &expected) > REDISTRIBUTE);
+        }
+    }
+}
+
+#[test]
+fn arguments_that_do_not_fit_are_named() {
+    let Some(gpu) = gpu() else { return };
+    let args = RedistributeArgs {
+        rule: Rule::OpticalDepth,
+        k: 2,
+        logits: &[0.0; 4],
+        areas: &[1.0; 4],
+        alphas: &[0.5; 2],
+        own: &[1.0],
+    };
+    let error = gpu.redistribute(&args).unwrap_err();
+    assert!(matches!(error, GpuError::Argument { what: "own areas", .. }), "{error}");
+    let error = gpu.redistribute(&RedistributeArgs { k: 0, ..args }).unwrap_err();
+    assert!(matches!(error, GpuError::Argument { .. }), "{error}");
+}
