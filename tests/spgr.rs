@@ -395,6 +395,33 @@ fn disc_steps_stay_on_the_disc_and_reduce_to_the_flat_step() {
 }
 
 #[test]
+fn disc_steps_of_needles_survive_single_precision() {
+    let mut config = Config::re10k(Preset::Tuned, 2);
+    config.spgr.slide = Slide::Disc;
+    let call = call(&config, 8);
+    let camera = &call.cameras[0];
+    let mut r = Random(31);
+    let mut worst = 0f64;
+    for _ in 0..200 {
+        let axis = Vec3::new(r.normal() as f32, r.normal() as f32, r.normal() as f32);
+        let q = Quat::from_axis_angle(axis.normalize(), r.uniform(0.0, 3.0) as f32);
+        let at = camera.position() + camera.rotation() * Vec3::new(0.1, -0.1, 3.0);
+        // A needle a thousand times as long as thick.
+        let row = [at.x, at.y, at.z, q.w, q.x, q.y, q.z, 0.5, 5e-4, 5e-4, 0.8];
+        let p = cpu(row.iter().map(|&v| f64::from(v)).collect(), &[1, 11]);
+        let zero = Tensor::zeros((1, 4, HEAD_LANES), DType::F64, &Device::Cpu).unwrap();
+        let single = |t: &Tensor| t.to_dtype(DType::F32).unwrap();
+        let exact = host(&spgr(&zero, &p, &call).unwrap().0);
+        let got = host(&spgr(&single(&zero), &single(&p), &call).unwrap().0);
+        for (a, b) in got.chunks(11).zip(exact.chunks(11)) {
+            let step = (mean(b) - at).length();
+            worst = worst.max(f64::from((mean(a) - mean(b)).length() / step));
+        }
+    }
+    assert!(worst < 1e-5, "{worst}");
+}
+
+#[test]
 fn rotations_compose_in_the_parents_axes() {
     let config = Config::re10k(Preset::Tuned, 1);
     let call = call(&config, 8);

@@ -61,6 +61,18 @@ impl Machine {
             (0..turns).map(|_| once(&mut to)).fold(0.0, f64::max)
         };
         let copy = [copy(one), copy(all)];
+        // The same where the target's pages are touched for the first time, as those of
+        // every tensor that an op returns.
+        let copy_new = |pool: &ThreadPool| {
+            let once = || {
+                let start = Instant::now();
+                let new: Vec<f32> = pool.install(|| from.par_iter().copied().collect());
+                black_box(&new);
+                8e-9 * COPY as f64 / start.elapsed().as_secs_f64()
+            };
+            (0..turns).map(|_| once()).fold(0.0, f64::max)
+        };
+        let copy_new = [copy_new(one), copy_new(all)];
         let fma = [one, all].map(|pool| {
             let once = || {
                 let start = Instant::now();
@@ -70,10 +82,12 @@ impl Machine {
             (0..turns).map(|_| once()).fold(0.0, f64::max)
         });
         println!(
-            "machine: copy {:.1} GB/s on 1 thread, {:.1} on {n}; multiply-adds {:.0} GFLOP/s on 1, \
-             {:.0} on {n} (f32)",
+            "machine: copy {:.1} GB/s on 1 thread, {:.1} on {n} (into new pages {:.1}, {:.1}); \
+             multiply-adds {:.0} GFLOP/s on 1, {:.0} on {n} (f32)",
             copy[0],
             copy[1],
+            copy_new[0],
+            copy_new[1],
             fma[0],
             fma[1],
             n = all.current_num_threads()

@@ -150,15 +150,15 @@ pub struct View {
     pub(crate) eye: [f32; 3],
     pub(crate) focal: [f32; 2],
     /// Pixel position of the axis, centres at integers.
-    centre: [f32; 2],
+    pub(crate) centre: [f32; 2],
     /// Intervals to which x/z and y/z are clamped inside J.
     pub(crate) limit: [(f32, f32); 2],
-    near: f32,
+    pub(crate) near: f32,
     pub(crate) z_epsilon: f32,
     pub(crate) lowpass: f32,
     pub(crate) antialiased: bool,
-    tile_cut: bool,
-    size: [usize; 2],
+    pub(crate) tile_cut: bool,
+    pub(crate) size: [usize; 2],
 }
 
 impl View {

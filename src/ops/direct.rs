@@ -3,10 +3,10 @@
 //! fusion). For inference; no gradient. Kernels: [`crate::cpu::spgr::project`] and
 //! [`crate::cpu::Rasterizer::render_footprints`].
 
-use super::rasterize::check_options;
+use super::rasterize::{check_options, degree_of};
 use super::slice;
 use super::spgr::{Spgr, spgr_into};
-use crate::abi::{RasterOptions, SH_DEGREE_MAX, SPLAT_LANES, sh_coefficients};
+use crate::abi::{RasterOptions, SPLAT_LANES};
 use crate::camera::Camera;
 use crate::cpu::Rasterizer;
 use crate::cpu::spgr as cpu;
@@ -49,8 +49,8 @@ pub fn spgr_footprints(
     let n = call.check(head, parents)?;
     let count = n * call.rules.children();
     let (rows, d, rgb) = sh.dims3()?;
-    let degree = (0..=SH_DEGREE_MAX).find(|&l| sh_coefficients(l) == d);
-    let Some(sh_degree) = degree.filter(|_| rows == n && rgb == 3 && out.len() == count) else {
+    let Some(sh_degree) = degree_of(d).filter(|_| rows == n && rgb == 3 && out.len() == count)
+    else {
         bail!(
             "{NAME}: expected sh [{n}, 1, 4, 9, 16 or 25, 3] and {count} footprints, got {:?} and {}",
             sh.dims(),

@@ -157,7 +157,7 @@ pub(super) fn check_options(camera: &Camera, options: &RasterOptions) -> Result<
 }
 
 /// l with (l + 1)² = `d`.
-fn degree_of(d: usize) -> Option<usize> {
+pub(super) fn degree_of(d: usize) -> Option<usize> {
     (0..=SH_DEGREE_MAX).find(|&l| sh_coefficients(l) == d)
 }
 

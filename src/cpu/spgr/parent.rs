@@ -227,12 +227,9 @@ impl<V: Lanes> Disc<V> {
         let det = dot(normal, normal) + one.of(crate::abi::AREA_SQ_EPS);
         let solid = one.of(SOLID).lt(det);
         let inverse_det = one / V::select(solid, det, one);
-        let [a, b] = m;
-        let (aa, ab, bb) = (dot(a, a), dot(a, b), dot(b, b));
-        let weights = [
-            scaled(axpy(-ab, b, scaled(a, bb)), inverse_det),
-            scaled(axpy(-ab, a, scaled(b, aa)), inverse_det),
-        ];
+        // Rows of (M Mᵀ)⁻¹·M as cross products: (b·b)·a − (a·b)·b cancels for needles.
+        let weights =
+            [scaled(cross(m[1], normal), inverse_det), scaled(cross(normal, m[0]), inverse_det)];
         let steps = [times(&g, weights[0]), times(&g, weights[1])];
         Self { steps, solid, unit, turned, g, j, m, normal, inverse_det, weights }
     }
@@ -256,16 +253,12 @@ impl<V: Lanes> Disc<V> {
             scaled(transposed(&self.g, du), self.inverse_det),
             scaled(transposed(&self.g, dv), self.inverse_det),
         );
-        // t_u = (bb·a − ab·b)/det, t_v = (aa·b − ab·a)/det.
-        let (aa, ab, bb) = (dot(a, a), dot(a, b), dot(b, b));
-        let two = aa.of(2.0);
-        let (d_bb, d_aa) = (dot(eu, a), dot(ev, b));
-        let d_ab = -(dot(eu, b) + dot(ev, a));
+        // t_u = b×n/det, t_v = n×a/det, det = n·n, n = a×b.
+        let n = self.normal;
         let d_det = -(dot(eu, tu) + dot(ev, tv));
-        let n = scaled(self.normal, two * d_det);
-        let d_a = axpy(bb, eu, axpy(-ab, ev, axpy(two * d_aa, a, scaled(b, d_ab))));
-        let d_b = axpy(aa, ev, axpy(-ab, eu, axpy(two * d_bb, b, scaled(a, d_ab))));
-        let (d_a, d_b) = (add(d_a, cross(b, n)), add(d_b, cross(n, a)));
+        let d_n = axpy(d_det + d_det, n, add(cross(eu, b), cross(a, ev)));
+        let d_a = add(cross(ev, n), cross(b, d_n));
+        let d_b = add(cross(n, eu), cross(d_n, a));
         // m = J·G.
         for (i, row) in d_g.iter_mut().enumerate() {
             *row = axpy(self.j[0][i], d_a, axpy(self.j[1][i], d_b, *row));
@@ -276,7 +269,7 @@ impl<V: Lanes> Disc<V> {
             let z = parent.z;
             let per = parent.view.focal[i] / (z * z);
             d.in_camera[i] = d.in_camera[i] - d_x * per;
-            d.z = d.z - d_f * per - two * d_x * self.j[i][2] / z;
+            d.z = d.z - d_f * per - z.of(2.0) * d_x * self.j[i][2] / z;
         }
         // G = R_w2c·R·S.
         let s = parent.scale;

@@ -9,17 +9,14 @@
 use super::child::Child;
 use super::colour::Coefficients;
 use super::parent::Parent;
-use super::view::{
-    M3, V3, axpy, cross, dot, each, kept, product, scaled, splat, times, transposed,
-};
+use super::view::{V3, axpy, cross, dot, each, kept, product, scaled, splat, times, transposed};
 use super::{Args, BLOCK, gain, not_finite, records};
 use crate::abi::{
-    ALPHA_MIN, ALPHA_MIN_LOG2, Convention, DISCRIMINANT_MIN_MVSPLAT, HEAD_GAIN, HEAD_LOGIT,
-    JACOBIAN_LIMIT_MVSPLAT, JACOBIAN_MARGIN_STANDARD, NEAR_MVSPLAT, RADIUS_SIGMAS_MVSPLAT,
-    RasterOptions, ShDirection, TILE_MVSPLAT, Z_EPSILON_MVSPLAT, sh_coefficients,
+    ALPHA_MIN, ALPHA_MIN_LOG2, DISCRIMINANT_MIN_MVSPLAT, HEAD_GAIN, HEAD_LOGIT,
+    RADIUS_SIGMAS_MVSPLAT, RasterOptions, ShDirection, TILE_MVSPLAT, sh_coefficients,
 };
 use crate::camera::Camera;
-use crate::cpu::ewa::Footprint;
+use crate::cpu::ewa::{Footprint, View};
 use crate::cpu::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};
 use crate::cpu::redistribute::share;
 use crate::cpu::spgr::view::Table;
@@ -45,81 +42,6 @@ pub struct Target<'a> {
     pub sh_degree: usize,
 }
 
-/// Numbers of the target camera.
-#[derive(Clone, Copy)]
-struct Lens {
-    /// Rows of the rotation from world to camera.
-    rows: M3<f32>,
-    eye: [f32; 3],
-    focal: [f32; 2],
-    /// Pixel position of the axis, centres at integers.
-    centre: [f32; 2],
-    limit: [(f32, f32); 2],
-    near: f32,
-    z_epsilon: f32,
-    lowpass: f32,
-    antialiased: bool,
-    tile_cut: bool,
-    size: [f32; 2],
-}
-
-impl Lens {
-    fn new(camera: &Camera, options: &RasterOptions) -> Self {
-        let k = &camera.intrinsics;
-        let size = [k.width as f32, k.height as f32];
-        let rotation = camera.rotation();
-        let standard = options.convention == Convention::Standard;
-        let principal = [k.cx, k.cy];
-        let (focal, centre, limit) = if standard {
-            let focal = [k.fx, k.fy];
-            let limit = std::array::from_fn(|i| {
-                let margin = JACOBIAN_MARGIN_STANDARD * 0.5 * size[i] / focal[i];
-                let (low, high) = (principal[i] / focal[i], (size[i] - principal[i]) / focal[i]);
-                (-low - margin, high + margin)
-            });
-            (focal, principal.map(|c| c - 0.5), limit)
-        } else {
-            let tan = half_angles(camera);
-            let focal = std::array::from_fn(|i| 0.5 * size[i] / tan[i]);
-            let limit = tan.map(|t| (-JACOBIAN_LIMIT_MVSPLAT * t, JACOBIAN_LIMIT_MVSPLAT * t));
-            (focal, size.map(|s| 0.5 * s - 0.5), limit)
-        };
-        let near = if standard { options.near } else { NEAR_MVSPLAT * options.near };
-        Self {
-            rows: std::array::from_fn(|i| rotation.col(i).to_array()),
-            eye: camera.position().to_array(),
-            focal,
-            centre,
-            limit,
-            near: near.max(f32::MIN_POSITIVE),
-            z_epsilon: if standard { 0.0 } else { Z_EPSILON_MVSPLAT * options.near },
-            lowpass: options.lowpass,
-            antialiased: standard && options.antialiased,
-            tile_cut: !standard,
-            size,
-        }
-    }
-}
-
-/// tan of half the angle between the rays through the middles of opposite picture
-/// edges, as MVSplat derives its frustum.
-fn half_angles(camera: &Camera) -> [f32; 2] {
-    let k = &camera.intrinsics;
-    let focal = [f64::from(k.fx), f64::from(k.fy)];
-    let centre = [f64::from(k.cx), f64::from(k.cy)];
-    let size = [k.width as f64, k.height as f64];
-    std::array::from_fn(|i| {
-        let ray = |at: f64| {
-            let mut v = glam::DVec3::new(0.0, 0.0, 1.0);
-            v[i] = (at - centre[i]) / focal[i];
-            v[1 - i] = (0.5 * size[1 - i] - centre[1 - i]) / focal[1 - i];
-            v
-        };
-        let (a, b) = (ray(0.0), ray(size[i]));
-        (0.5 * a.cross(b).length().atan2(a.dot(b))).tan() as f32
-    })
-}
-
 /// Where the children of one vector of parents are put: children, areas, opacities.
 type Seat<'a, V> = (&'a mut [Seen<V>], &'a mut [V], &'a mut [V]);
 
@@ -140,15 +62,15 @@ struct Seen<V> {
 
 impl<V: Lanes> Seen<V> {
     #[inline(always)]
-    fn new<M: Machine<Scalar = f32, V = V>>(m: M, lens: &Lens, d: V3<V>, child: &Child<V>) -> Self {
-        let rows = [splat(m, &lens.rows[0]), splat(m, &lens.rows[1]), splat(m, &lens.rows[2])];
+    fn new<M: Machine<Scalar = f32, V = V>>(m: M, view: &View, d: V3<V>, child: &Child<V>) -> Self {
+        let rows = [splat(m, &view.rows[0]), splat(m, &view.rows[1]), splat(m, &view.rows[2])];
         let p = times(&rows, d);
         let inverse = m.of(1.0) / p[2];
         let mut footprint = [[inverse; 3]; 2];
         for (i, row) in footprint.iter_mut().enumerate() {
-            let (low, high) = lens.limit[i];
+            let (low, high) = view.limit[i];
             let slope = (p[i] * inverse).max(m.splat(low)).min(m.splat(high));
-            let world = scaled(axpy(-slope, rows[2], rows[i]), m.splat(lens.focal[i]) * inverse);
+            let world = scaled(axpy(-slope, rows[2], rows[i]), m.splat(view.focal[i]) * inverse);
             *row = product(transposed(child.rotation(), world), child.scale);
         }
         let [a, b] = footprint;
@@ -168,21 +90,21 @@ impl<V: Lanes> Seen<V> {
     /// The footprint's 12 numbers and four extents in the order of [`Footprint`], and
     /// 1 where it is kept.
     #[inline(always)]
-    fn finish<M: Machine<Scalar = f32, V = V>>(&self, m: M, lens: &Lens, alpha: V) -> ([V; 16], V) {
-        let (zero, one, lowpass) = (m.of(0.0), m.of(1.0), m.splat(lens.lowpass));
+    fn finish<M: Machine<Scalar = f32, V = V>>(&self, m: M, view: &View, alpha: V) -> ([V; 16], V) {
+        let (zero, one, lowpass) = (m.of(0.0), m.of(1.0), m.splat(view.lowpass));
         let (xx, yy) = (self.xx + lowpass, self.yy + lowpass);
         let det = self.det + lowpass * (self.xx + self.yy) + lowpass * lowpass;
         let mut alpha = alpha;
-        if lens.antialiased {
+        if view.antialiased {
             alpha = alpha * (self.det / det).max(zero).sqrt();
         }
         let power = alpha.log2();
         let reach = power - m.splat(ALPHA_MIN_LOG2);
         let reach = reach + m.of(SUPPORT_SLACK) * (one + reach);
         let reach = m.of(2.0 * std::f64::consts::LN_2) * reach;
-        let inverse_z = one / (self.p[2] + m.splat(lens.z_epsilon));
+        let inverse_z = one / (self.p[2] + m.splat(view.z_epsilon));
         let place =
-            |i: usize| (m.splat(lens.focal[i]) * self.p[i]).fma(inverse_z, m.splat(lens.centre[i]));
+            |i: usize| (m.splat(view.focal[i]) * self.p[i]).fma(inverse_z, m.splat(view.centre[i]));
         let (u, v) = (place(0), place(1));
         let half = m.of(0.5 * std::f64::consts::LOG2_E);
         let inverse_yy = one / yy;
@@ -190,19 +112,19 @@ impl<V: Lanes> Seen<V> {
         let shear = -self.xy * inverse_yy;
         let sy = (half * inverse_yy).sqrt();
         let (width, height) = ((reach * xx).sqrt(), (reach * yy).sqrt());
-        let radius = lens.tile_cut.then(|| {
+        let radius = view.tile_cut.then(|| {
             let mid = m.of(0.5) * (xx + yy);
             let spread = (mid * mid - det).max(m.splat(DISCRIMINANT_MIN_MVSPLAT)).sqrt();
             -(-(m.splat(RADIUS_SIGMAS_MVSPLAT) * (mid + spread).sqrt())).floor()
         });
-        let (x0, x1) = extent(m, lens.size[0], (u, width), radius);
-        let (y0, y1) = extent(m, lens.size[1], (v, height), radius);
+        let (x0, x1) = extent(m, view.size[0] as f32, (u, width), radius);
+        let (y0, y1) = extent(m, view.size[1] as f32, (v, height), radius);
         let grey = m.of(0.5) + self.gain[1];
         let rgb = axpy(self.gain[0], self.sum, [grey; 3]);
         let numbers =
             [u, v, sx, shear, sy, power, rgb[0], rgb[1], rgb[2], self.p[2], width, height];
         // Every test fails for NaN.
-        let mut keep = kept(m.splat(lens.near).lt(self.p[2]), one);
+        let mut keep = kept(m.splat(view.near).lt(self.p[2]), one);
         for (low, high) in [(zero, det), (zero, xx), (zero, yy), (x0, x1), (y0, y1)] {
             keep = kept(low.lt(high), keep);
         }
@@ -255,7 +177,7 @@ fn extent<M: Machine<Scalar = f32>>(
 struct Project<'a> {
     args: Args<'a, f32>,
     target: Target<'a>,
-    lens: &'a Lens,
+    view: &'a View,
     table: &'a Table<f32>,
     range: std::ops::Range<usize>,
     out: &'a mut [Footprint],
@@ -309,7 +231,7 @@ impl Project<'_> {
         let Args { rules, source, parents, .. } = self.args;
         let parent = Parent::load(m, (rules, self.table, &source), parents, span);
         let mut bad = not_finite(&[parent.alpha, parent.z], m.of(0.0));
-        let eye = splat(m, &self.lens.eye);
+        let eye = splat(m, &self.view.eye);
         let shared = self.target.options.sh_direction == ShDirection::Parent;
         let mut towards = [m.of(0.0); 3];
         for (k, seen) in seen.iter_mut().enumerate() {
@@ -319,7 +241,7 @@ impl Project<'_> {
             (areas[k], alphas[k]) = (child.area, head[HEAD_LOGIT]);
             bad = not_finite(&child.mean, not_finite(&child.scale, bad));
             let d = axpy(m.of(-1.0), eye, child.mean);
-            *seen = Seen::new(m, self.lens, d, &child);
+            *seen = Seen::new(m, self.view, d, &child);
             let [gamma, residual, ..] = gain(m, rules, head[HEAD_GAIN]);
             seen.gain = [gamma, residual];
             if shared {
@@ -347,7 +269,7 @@ impl Project<'_> {
         let children = seen.len();
         let at = (first - self.range.start) * children;
         for (k, (seen, &alpha)) in seen.iter().zip(alphas).enumerate() {
-            let (numbers, keep) = seen.finish(m, self.lens, alpha);
+            let (numbers, keep) = seen.finish(m, self.view, alpha);
             let mut tile = [[0.0; WIDTH_MAX]; 16];
             for (i, (v, tile)) in numbers.into_iter().zip(&mut tile).enumerate() {
                 let v = if i < 12 { v } else { v + m.splat(MANTISSA) };
@@ -386,12 +308,12 @@ impl Project<'_> {
 /// parent n at n·K + k. False as in [`super::forward`].
 pub fn project(args: Args<f32>, target: Target, out: &mut [Footprint]) -> bool {
     let table = Table::new(&args.source);
-    let lens = Lens::new(target.camera, target.options);
+    let view = View::new(target.camera, target.options);
     out.par_chunks_mut(BLOCK * args.rules.children())
         .enumerate()
         .map(|(block, out)| {
             let range = args.block(block);
-            f32::dispatch(Project { args, target, lens: &lens, table: &table, range, out })
+            f32::dispatch(Project { args, target, view: &view, table: &table, range, out })
         })
         .reduce(|| true, |a, b| a && b)
 }
