@@ -5,9 +5,15 @@
 //! A constant that appears in a kernel appears here first; nothing else may
 //! restate it. `kernels/shared/abi.wgsl` does, and `tests/shaders.rs` compares the two.
 
+mod gather;
+mod spgr;
+mod sweep;
 mod uniforms;
 
-pub use uniforms::RedistributeUniform;
+pub use gather::{Drop, GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, Gather, Level};
+pub use spgr::{CHILDREN_MAX, Rules};
+pub use sweep::{Pair, Sweep};
+pub use uniforms::{AttentionGatherUniform, RedistributeUniform};
 
 use serde::{Deserialize, Serialize};
 

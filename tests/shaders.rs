@@ -10,7 +10,7 @@ use naga::{AddressSpace, Expression, Handle, Literal, Module, StorageAccess, Typ
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::PathBuf;
-use subsplat::abi::{self, RedistributeUniform, Rule};
+use subsplat::abi::{self, AttentionGatherUniform, RedistributeUniform, Rule};
 use subsplat::gpu::{Access, KERNELS, Kernel};
 
 /// Storage buffers of a stage, threads and bytes of a workgroup: WebGPU's defaults.
@@ -35,6 +35,7 @@ fn constants() -> BTreeMap<&'static str, f64> {
         ("RULE_AREA", Rule::Area),
         ("RULE_NONE", Rule::None),
     ];
+    all.extend(same!(GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX));
     all.extend(rules.map(|(name, rule)| (name, f64::from(rule as u32))));
     all
 }
@@ -46,7 +47,7 @@ macro_rules! uniforms {
     ($($name:ident),* $(,)?) => { &[$((stringify!($name), size_of::<$name>(), $name::FIELDS)),*] };
 }
 
-const UNIFORMS: &[Uniform] = uniforms!(RedistributeUniform);
+const UNIFORMS: &[Uniform] = uniforms!(RedistributeUniform, AttentionGatherUniform);
 
 fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
@@ -208,7 +209,11 @@ fn stems(folder: &str, extension: &str) -> BTreeSet<String> {
 /// Kernels without a Rust side or without a CPU twin.
 fn orphans(kernels: &BTreeSet<String>) -> Vec<String> {
     let used: BTreeSet<&str> = KERNELS.iter().map(|k| k.name).collect();
-    let cpu = stems("src/cpu", "rs");
+    let mut cpu = stems("src/cpu", "rs");
+    let folders = fs::read_dir(root().join("src/cpu")).unwrap().map(|e| e.unwrap().path());
+    cpu.extend(folders.filter(|p| p.is_dir()).map(|p| {
+        p.file_name().unwrap().to_string_lossy().into_owned()
+    }));
     let twin = |stem: &str| {
         let other = TWINS.iter().find(|(kernel, _)| *kernel == stem);
         cpu.contains(other.map_or(stem, |(_, twin)| *twin))

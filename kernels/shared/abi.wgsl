@@ -11,3 +11,7 @@ const AREA_EPS: f32 = 1e-8;
 const AREA_RULE_OPACITY_MAX: f32 = 0.99;
 const OPACITY_CEILING: f32 = 0.9999;
 const RELATIVE_AREA_MIN: f32 = 1e-12;
+
+// Most samples of a parent, and samples x groups, that attention_gather holds.
+const GATHER_SAMPLES_MAX: u32 = 128u;
+const GATHER_WEIGHTS_MAX: u32 = 1024u;

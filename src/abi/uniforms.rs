@@ -34,3 +34,57 @@ uniform! {
         pad: u32,
     }
 }
+
+uniform! {
+    /// Of kernels/shared/gather.wgsl; fields as in [`super::Gather`] where not said.
+    AttentionGatherUniform {
+        /// N.
+        parents: u32,
+        /// V.
+        views: u32,
+        /// L.
+        levels: u32,
+        /// M.
+        points: u32,
+        /// Floats of the points of one parent and view.
+        points_width: u32,
+        /// E.
+        dim: u32,
+        /// G.
+        groups: u32,
+        /// Floats of a cell's row.
+        stride: u32,
+        /// First key channel.
+        key: u32,
+        /// Whether there are keys.
+        has_key: u32,
+        /// First value channel.
+        value: u32,
+        /// Whether samples outside leave the softmax.
+        renormalise: u32,
+        /// Whether each level has points of its own.
+        points_per_level: u32,
+        /// ½ or 0, px.
+        half_pixel: f32,
+        /// Factor of q·k.
+        logit_scale: f32,
+        /// Whether weights are dropped.
+        drops: u32,
+        /// 1 / (1 − p).
+        kept_factor: f32,
+        /// Index of parent 0 in the scene.
+        first_parent: u32,
+        /// Low word of the seed.
+        seed_low: u32,
+        /// High word.
+        seed_high: u32,
+        /// Low word of ⌈p·2⁵³⌉.
+        dropped_low: u32,
+        /// High word.
+        dropped_high: u32,
+        /// Unused.
+        pad0: u32,
+        /// Unused.
+        pad1: u32,
+    }
+}

@@ -10,6 +10,7 @@
 //! [`crate::abi`] and this table.
 
 mod adapter;
+mod attention_gather;
 mod buffers;
 mod commands;
 mod device;
@@ -18,6 +19,7 @@ mod pipelines;
 mod redistribute;
 
 pub use adapter::{AdapterSummary, DeviceChoice, adapters, choose};
+pub use attention_gather::AttentionGatherArgs;
 pub use buffers::Buffer;
 pub use device::Gpu;
 pub use error::GpuError;
@@ -25,4 +27,5 @@ pub use pipelines::{Access, Kernel};
 pub use redistribute::RedistributeArgs;
 
 /// Every kernel of the room.
-pub const KERNELS: &[&Kernel] = &[&redistribute::REDISTRIBUTE];
+pub const KERNELS: &[&Kernel] =
+    &[&redistribute::REDISTRIBUTE, &attention_gather::ATTENTION_GATHER];
