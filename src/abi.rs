@@ -12,8 +12,8 @@ mod uniforms;
 
 pub use gather::{Drop, GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, Gather, Level};
 pub use spgr::{CHILDREN_MAX, Rules};
-pub use sweep::{Pair, Sweep};
-pub use uniforms::{AttentionGatherUniform, RedistributeUniform};
+pub use sweep::{Pair, SWEEP_PAIR_LANES, Sweep};
+pub use uniforms::{AttentionGatherUniform, PlaneSweepUniform, RedistributeUniform};
 
 use serde::{Deserialize, Serialize};
 

@@ -8,9 +8,9 @@ mod adapter;
 mod twins;
 
 use adapter::gpu;
-use subsplat::abi::{Drop, Gather, Level};
-use subsplat::cpu::attention_gather as cpu;
-use subsplat::gpu::{AttentionGatherArgs, GpuError};
+use subsplat::abi::{Drop, Gather, Level, Pair, Sweep};
+use subsplat::cpu::{attention_gather as cpu, plane_sweep};
+use subsplat::gpu::{AttentionGatherArgs, GpuError, PlaneSweepArgs};
 use twins::{Random, assert_twins};
 
 /// Sums of at most 64 products in another order, samples placed within an f32's rounding
@@ -121,4 +121,69 @@ fn a_gather_that_does_not_fit_is_named() {
     assert_eq!(error(&Gather { groups: 3, ..g.clone() }, &maps, &points), "groups");
     let many = Gather { points: 65, ..g.clone() };
     assert_eq!(error(&many, &maps, &points), "samples per parent");
+}
+
+/// Sample positions of up to 40 px, rounded in another order (fused or not): 1e-5 px times
+/// slopes of at most 2 a px; the correlation sums 40 products.
+const SWEEP: f32 = 2e-5;
+
+/// A source camera turned by `turn` about y and moved along x.
+fn pair(size: [usize; 2], x: f32, turn: f32, source: usize) -> Pair {
+    let [h, w] = size.map(|v| v as f32);
+    let (f, cx, cy) = (0.9 * w, 0.51 * w, 0.48 * h);
+    let (sin, cos) = turn.sin_cos();
+    Pair {
+        source,
+        inverse: [1.0 / f, 1.0 / f, -cx / f, -cy / f],
+        rotation: [cos, 0.0, sin, 0.0, 1.0, 0.0, -sin, 0.0, cos],
+        t: [x, 0.13, -0.2],
+        k: [f, f, cx, cy],
+    }
+}
+
+/// Reference rows with two pairs, with one whose camera has turned away (most samples are
+/// behind it or outside), with a depth at the camera itself, and with no pair.
+fn sweep(centre: f32, size: [usize; 2], channels: usize) -> Sweep {
+    let to = |x: f32, turn: f32, row: usize| pair(size, x, turn, row);
+    Sweep {
+        pairs: vec![
+            vec![to(0.4, 0.1, 1), to(-0.3, -0.2, 0)],
+            vec![to(0.2, 0.8, 1)],
+            vec![],
+            vec![to(-0.4, -0.1, 0)],
+        ],
+        depths: vec![vec![0.7, 1.0, 1.1, 1.3, 2.0, 40.0, 0.0]; 4],
+        centre,
+        min_z: 1e-3,
+        scale: 1.0 / (channels as f32).sqrt(),
+        channels,
+        size,
+    }
+}
+
+fn sweeps() -> Vec<(String, Sweep)> {
+    let sizes = [([7, 9], 5), ([40, 33], 40)];
+    let all = [0.0, 0.5].into_iter().flat_map(|centre| {
+        sizes.map(|(size, c)| (format!("{size:?} centre {centre}"), sweep(centre, size, c)))
+    });
+    all.collect()
+}
+
+#[test]
+fn plane_sweeps() {
+    let Some(gpu) = gpu() else { return };
+    let mut r = Random(3);
+    for (name, s) in sweeps() {
+        let plane = s.size[0] * s.size[1];
+        let reference = r.many(4 * s.channels * plane, -1.0, 1.0);
+        let source = r.many(2 * s.channels * plane, -1.0, 1.0);
+        let mut expected = vec![0.0; 4 * s.candidates() * plane];
+        plane_sweep::correlation(&s, &reference, &source, &mut expected);
+        let (reference, source) = (&reference[..], &source[..]);
+        let args = PlaneSweepArgs { sweep: &s, reference, source };
+        assert_twins(&name, &gpu.plane_sweep(&args).unwrap(), &expected, SWEEP);
+        let short = PlaneSweepArgs { source: &source[1..], ..args };
+        let error = gpu.plane_sweep(&short).unwrap_err();
+        assert!(matches!(error, GpuError::Argument { what: "source", .. }), "{error}");
+    }
 }

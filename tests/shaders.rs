@@ -10,7 +10,9 @@ use naga::{AddressSpace, Expression, Handle, Literal, Module, StorageAccess, Typ
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::PathBuf;
-use subsplat::abi::{self, AttentionGatherUniform, RedistributeUniform, Rule};
+use subsplat::abi::{
+    self, AttentionGatherUniform, PlaneSweepUniform, RedistributeUniform, Rule,
+};
 use subsplat::gpu::{Access, KERNELS, Kernel};
 
 /// Storage buffers of a stage, threads and bytes of a workgroup: WebGPU's defaults.
@@ -35,7 +37,7 @@ fn constants() -> BTreeMap<&'static str, f64> {
         ("RULE_AREA", Rule::Area),
         ("RULE_NONE", Rule::None),
     ];
-    all.extend(same!(GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX));
+    all.extend(same!(GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, SWEEP_PAIR_LANES));
     all.extend(rules.map(|(name, rule)| (name, f64::from(rule as u32))));
     all
 }
@@ -47,7 +49,7 @@ macro_rules! uniforms {
     ($($name:ident),* $(,)?) => { &[$((stringify!($name), size_of::<$name>(), $name::FIELDS)),*] };
 }
 
-const UNIFORMS: &[Uniform] = uniforms!(RedistributeUniform, AttentionGatherUniform);
+const UNIFORMS: &[Uniform] = uniforms!(RedistributeUniform, AttentionGatherUniform, PlaneSweepUniform);
 
 fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))

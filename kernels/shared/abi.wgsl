@@ -15,3 +15,6 @@ const RELATIVE_AREA_MIN: f32 = 1e-12;
 // Most samples of a parent, and samples x groups, that attention_gather holds.
 const GATHER_SAMPLES_MAX: u32 = 128u;
 const GATHER_WEIGHTS_MAX: u32 = 1024u;
+
+// Floats of one pair of views of a plane sweep.
+const SWEEP_PAIR_LANES: u32 = 20u;

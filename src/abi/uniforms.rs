@@ -88,3 +88,25 @@ uniform! {
         pad1: u32,
     }
 }
+
+uniform! {
+    /// Of kernels/shared/sweep.wgsl; fields as in [`super::Sweep`] where not said.
+    PlaneSweepUniform {
+        /// R of the call.
+        rows: u32,
+        /// C.
+        channels: u32,
+        /// D.
+        candidates: u32,
+        /// h.
+        height: u32,
+        /// w.
+        width: u32,
+        /// Coordinate of the centre of pixel 0.
+        centre: f32,
+        /// Least z that the division sees.
+        min_z: f32,
+        /// Factor of the correlation.
+        scale: f32,
+    }
+}

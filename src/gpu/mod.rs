@@ -16,6 +16,7 @@ mod commands;
 mod device;
 mod error;
 mod pipelines;
+mod plane_sweep;
 mod redistribute;
 
 pub use adapter::{AdapterSummary, DeviceChoice, adapters, choose};
@@ -24,8 +25,12 @@ pub use buffers::Buffer;
 pub use device::Gpu;
 pub use error::GpuError;
 pub use pipelines::{Access, Kernel};
+pub use plane_sweep::PlaneSweepArgs;
 pub use redistribute::RedistributeArgs;
 
 /// Every kernel of the room.
-pub const KERNELS: &[&Kernel] =
-    &[&redistribute::REDISTRIBUTE, &attention_gather::ATTENTION_GATHER];
+pub const KERNELS: &[&Kernel] = &[
+    &redistribute::REDISTRIBUTE,
+    &attention_gather::ATTENTION_GATHER,
+    &plane_sweep::PLANE_SWEEP,
+];
