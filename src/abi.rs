@@ -11,9 +11,11 @@ mod sweep;
 mod uniforms;
 
 pub use gather::{Drop, GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, Gather, Level};
-pub use spgr::{CHILDREN_MAX, Rules};
+pub use spgr::{CHILDREN_MAX, DISC_AREA_SQ_MIN, Rules, SPGR_CAMERA_LANES};
 pub use sweep::{Pair, SWEEP_PAIR_LANES, Sweep};
-pub use uniforms::{AttentionGatherUniform, PlaneSweepUniform, RedistributeUniform};
+pub use uniforms::{
+    AttentionGatherUniform, PlaneSweepUniform, RedistributeUniform, SpgrUniform,
+};
 
 use serde::{Deserialize, Serialize};
 

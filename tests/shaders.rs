@@ -11,7 +11,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::PathBuf;
 use subsplat::abi::{
-    self, AttentionGatherUniform, PlaneSweepUniform, RedistributeUniform, Rule,
+    self, AttentionGatherUniform, PlaneSweepUniform, RedistributeUniform, Rule, SpgrUniform,
 };
 use subsplat::gpu::{Access, KERNELS, Kernel};
 
@@ -38,6 +38,10 @@ fn constants() -> BTreeMap<&'static str, f64> {
         ("RULE_NONE", Rule::None),
     ];
     all.extend(same!(GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, SWEEP_PAIR_LANES));
+    all.extend(same!(SPLAT_LANES, LANE_MEAN, LANE_QUAT, LANE_SCALE, LANE_OPACITY));
+    all.extend(same!(HEAD_LANES, HEAD_OFFSET, HEAD_DEPTH, HEAD_LOG_SCALE, HEAD_ROTATION));
+    all.extend(same!(HEAD_LOGIT, HEAD_GAIN, SPGR_CAMERA_LANES, AREA_SQ_EPS, GROWTH_MAX));
+    all.extend(same!(DEPTH_FRACTION_MIN, DISC_AREA_SQ_MIN, VISIBLE_Z_MIN));
     all.extend(rules.map(|(name, rule)| (name, f64::from(rule as u32))));
     all
 }
@@ -49,7 +53,7 @@ macro_rules! uniforms {
     ($($name:ident),* $(,)?) => { &[$((stringify!($name), size_of::<$name>(), $name::FIELDS)),*] };
 }
 
-const UNIFORMS: &[Uniform] = uniforms!(RedistributeUniform, AttentionGatherUniform, PlaneSweepUniform);
+const UNIFORMS: &[Uniform] = uniforms!(RedistributeUniform, AttentionGatherUniform, PlaneSweepUniform, SpgrUniform);
 
 fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))

@@ -55,3 +55,8 @@ impl Rules {
         if self.rgb_gain { 4 } else { 1 }
     }
 }
+
+/// Floats of one context camera in the GPU's table.
+pub const SPGR_CAMERA_LANES: usize = 23;
+/// Least squared area of a disc that children slide on, px⁴.
+pub const DISC_AREA_SQ_MIN: f64 = 1e-20;

@@ -110,3 +110,57 @@ uniform! {
         scale: f32,
     }
 }
+
+uniform! {
+    /// Of kernels/shared/spgr.wgsl; what each rule means is said at [`super::Rules`].
+    SpgrUniform {
+        /// N.
+        parents: u32,
+        /// r.
+        side: u32,
+        /// Parents per view.
+        per_view: u32,
+        /// Index of parent 0 in the scene.
+        first: u32,
+        /// V.
+        views: u32,
+        /// [`super::Rule`] as a number.
+        rule: u32,
+        /// Whether v* is the nearest view that sees the parent.
+        nearest_visible: u32,
+        /// Whether offsets are bounded.
+        bounded: u32,
+        /// Whether depth residuals run along the ray.
+        ray: u32,
+        /// Whether β_z is in units of the depth.
+        relative_depth: u32,
+        /// Whether children slide along the disc.
+        disc: u32,
+        /// Whether footprints take the parent's Jacobian.
+        area_at_parent: u32,
+        /// Whether two axes grow.
+        two_axis: u32,
+        /// Whether gains have four lanes.
+        rgb_gain: u32,
+        /// Unused.
+        pad0: u32,
+        /// Unused.
+        pad1: u32,
+        /// ρ, sub-pixels.
+        offset_bound: f32,
+        /// β_z.
+        beta_z: f32,
+        /// λ_s.
+        lambda_s: f32,
+        /// c.
+        dlog_clamp: f32,
+        /// A_min, target px².
+        a_min: f32,
+        /// Low-pass of the target picture, target px².
+        lowpass_target: f32,
+        /// Low-pass of a native render, input px².
+        lowpass_input: f32,
+        /// δ.
+        delta: f32,
+    }
+}

@@ -18,6 +18,7 @@ mod error;
 mod pipelines;
 mod plane_sweep;
 mod redistribute;
+mod spgr;
 
 pub use adapter::{AdapterSummary, DeviceChoice, adapters, choose};
 pub use attention_gather::AttentionGatherArgs;
@@ -27,10 +28,12 @@ pub use error::GpuError;
 pub use pipelines::{Access, Kernel};
 pub use plane_sweep::PlaneSweepArgs;
 pub use redistribute::RedistributeArgs;
+pub use spgr::SpgrArgs;
 
 /// Every kernel of the room.
 pub const KERNELS: &[&Kernel] = &[
     &redistribute::REDISTRIBUTE,
     &attention_gather::ATTENTION_GATHER,
     &plane_sweep::PLANE_SWEEP,
+    &spgr::SPGR,
 ];
