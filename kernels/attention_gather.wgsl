@@ -1,5 +1,5 @@
 // Attention of parents over bilinear samples of the views' feature maps (SubSplat A.2):
-// twin of src/cpu/attention_gather. Arguments but the last: kernels/shared/gather.wgsl.
+// twin of src/cpu/attention_gather. Arguments but the last: kernels/shared/gather_samples.wgsl.
 //
 // Out: [N, E].   One workgroup per parent: threads are samples, then weights, then
 // channels; nothing of it leaves workgroup memory but the output.

@@ -1,6 +1,6 @@
 // Correlation of every reference pixel with the source pixels that it would fall on at
 // each candidate depth; the warped features never exist. Twin of src/cpu/plane_sweep.
-// Arguments but the last: kernels/shared/sweep.wgsl.
+// Arguments but the last: kernels/shared/sweep_taps.wgsl.
 //
 // reference [R,C,h,w], source [S,C,h,w]   Out: [R,D,h,w].   One thread per number.
 

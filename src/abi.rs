@@ -14,7 +14,8 @@ pub use gather::{Drop, GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, Gather, Level};
 pub use spgr::{CHILDREN_MAX, DISC_AREA_SQ_MIN, Rules, SPGR_CAMERA_LANES};
 pub use sweep::{Pair, SWEEP_PAIR_LANES, Sweep};
 pub use uniforms::{
-    AttentionGatherUniform, PlaneSweepUniform, RedistributeUniform, SpgrUniform,
+    AttentionGatherUniform, InvertUniform, PlaneSweepUniform, RedistributeUniform, SpgrGainsBwdUniform,
+    SpgrUniform,
 };
 
 use serde::{Deserialize, Serialize};
@@ -211,6 +212,9 @@ impl Rule {
         matches!(self, Rule::OpticalDepth | Rule::Area)
     }
 }
+
+/// No cell, in the lists that gradients are summed by.
+pub const NONE: u32 = u32::MAX;
 
 /// ε of w̃ = w / (A + ε), px² (supp. A.3).
 pub const AREA_EPS: f64 = 1e-8;

@@ -18,6 +18,9 @@ use twins::{Random, assert_twins};
 /// units in the last place: 1e-6 each, times the handful of samples that meet.
 const GATHER: f32 = 4e-6;
 
+/// The same, and differences of such sums: logits' gradients cancel, points' times 14.
+const GATHER_BWD: f32 = 1e-5;
+
 fn base() -> Gather {
     Gather {
         levels: vec![Level { height: 5, width: 7, first_cell: 0 }],
@@ -48,7 +51,8 @@ fn forms() -> Vec<(&'static str, Gather)> {
         Level { height: 10, width: 14, first_cell: 105 },
     ];
     let two = levels;
-    let drop = |probability| Some(Drop { probability, seed: 0xDEAD_BEEF_1234_5678, first_parent: 7 });
+    let drop =
+        |probability| Some(Drop { probability, seed: 0xDEAD_BEEF_1234_5678, first_parent: 7 });
     vec![
         ("ref", base()),
         ("integer", Gather { half_pixel: false, ..base() }),
@@ -60,7 +64,10 @@ fn forms() -> Vec<(&'static str, Gather)> {
         ("offsets", Gather { points: 3, points_per_level: true, levels: two(), ..base() }),
         ("no projection", Gather { stride: 8, value: 0, ..base() }),
         ("linear", Gather { stride: 8, value: 0, key: None, groups: 2, points: 4, ..base() }),
-        ("odd width", Gather { dim: 18, stride: 36, value: 18, groups: 2, levels: two(), ..base() }),
+        (
+            "odd width",
+            Gather { dim: 18, stride: 36, value: 18, groups: 2, levels: two(), ..base() },
+        ),
         ("wide", Gather { dim: 192, stride: 384, value: 192, groups: 6, points: 4, ..base() }),
         ("dropping", Gather { drop: drop(0.3), points: 4, groups: 2, ..base() }),
         ("all dropped", Gather { drop: drop(1.0), ..base() }),
@@ -101,6 +108,30 @@ fn attention_gather() {
         assert_twins(name, &got, &expected, GATHER);
         let nothing = expected.iter().all(|v| *v == 0.0);
         assert_eq!(nothing, name == "all dropped", "{name}: nothing to compare");
+    }
+}
+
+#[test]
+fn attention_gather_gradients() {
+    let Some(gpu) = gpu() else { return };
+    let mut r = Random(5);
+    for (name, g) in forms() {
+        let n = 150;
+        let [maps, query, points] = inputs(&g, n, &mut r);
+        let grad = r.many(n * g.dim, -1.0, 1.0);
+        let expected = cpu::backward(&g, &maps, &query, &points, &grad);
+        let (maps, query, points) = (&maps[..], &query[..], &points[..]);
+        let args = AttentionGatherArgs { gather: &g, maps, query, points };
+        let got = gpu.attention_gather_backward(&args, &grad).unwrap();
+        assert_twins(&format!("{name} maps"), &got.maps, &expected.maps, GATHER_BWD);
+        assert_twins(&format!("{name} query"), &got.query, &expected.query, GATHER_BWD);
+        assert_twins(&format!("{name} points"), &got.points, &expected.points, GATHER_BWD);
+        let again = gpu.attention_gather_backward(&args, &grad).unwrap();
+        assert!(got == again, "{name}: other bytes the second time");
+        let fixed = Gather { point_gradient: false, ..g.clone() };
+        let fixed = AttentionGatherArgs { gather: &fixed, ..args };
+        let got = gpu.attention_gather_backward(&fixed, &grad).unwrap();
+        assert!(got.points.iter().all(|v| *v == 0.0) && got.maps == again.maps);
     }
 }
 
@@ -182,6 +213,13 @@ fn plane_sweeps() {
         let (reference, source) = (&reference[..], &source[..]);
         let args = PlaneSweepArgs { sweep: &s, reference, source };
         assert_twins(&name, &gpu.plane_sweep(&args).unwrap(), &expected, SWEEP);
+        let grad = r.many(expected.len(), -1.0, 1.0);
+        let expected = plane_sweep::backward(&s, reference, source, &grad);
+        let got = gpu.plane_sweep_backward(&args, &grad).unwrap();
+        assert_twins(&format!("{name} reference"), &got.0, &expected.0, SWEEP);
+        assert_twins(&format!("{name} source"), &got.1, &expected.1, SWEEP);
+        let again = gpu.plane_sweep_backward(&args, &grad).unwrap();
+        assert!(got == again, "{name}: other bytes the second time");
         let short = PlaneSweepArgs { source: &source[1..], ..args };
         let error = gpu.plane_sweep(&short).unwrap_err();
         assert!(matches!(error, GpuError::Argument { what: "source", .. }), "{error}");

@@ -11,7 +11,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::PathBuf;
 use subsplat::abi::{
-    self, AttentionGatherUniform, PlaneSweepUniform, RedistributeUniform, Rule, SpgrUniform,
+    self, AttentionGatherUniform, InvertUniform, PlaneSweepUniform, RedistributeUniform, Rule,
+    SpgrGainsBwdUniform, SpgrUniform,
 };
 use subsplat::gpu::{Access, KERNELS, Kernel};
 
@@ -21,7 +22,16 @@ const THREADS_MAX: u32 = 256;
 const WORKGROUP_BYTES_MAX: u32 = 16 << 10;
 
 /// Kernels whose CPU twin has another stem.
-const TWINS: &[(&str, &str)] = &[];
+const TWINS: &[(&str, &str)] = &[
+    ("spgr_bwd", "spgr"),
+    ("spgr_gains_bwd", "spgr"),
+    ("invert", "plane_sweep"),
+    ("attention_gather_bwd", "attention_gather"),
+    ("attention_gather_scatter", "attention_gather"),
+    ("plane_sweep_taps", "plane_sweep"),
+    ("plane_sweep_reference_bwd", "plane_sweep"),
+    ("plane_sweep_source_bwd", "plane_sweep"),
+];
 
 /// Name and value of everything in kernels/shared/abi.wgsl.
 fn constants() -> BTreeMap<&'static str, f64> {
@@ -40,7 +50,7 @@ fn constants() -> BTreeMap<&'static str, f64> {
     all.extend(same!(GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, SWEEP_PAIR_LANES));
     all.extend(same!(SPLAT_LANES, LANE_MEAN, LANE_QUAT, LANE_SCALE, LANE_OPACITY));
     all.extend(same!(HEAD_LANES, HEAD_OFFSET, HEAD_DEPTH, HEAD_LOG_SCALE, HEAD_ROTATION));
-    all.extend(same!(HEAD_LOGIT, HEAD_GAIN, SPGR_CAMERA_LANES, AREA_SQ_EPS, GROWTH_MAX));
+    all.extend(same!(HEAD_LOGIT, HEAD_GAIN, NONE, SPGR_CAMERA_LANES, AREA_SQ_EPS, GROWTH_MAX));
     all.extend(same!(DEPTH_FRACTION_MIN, DISC_AREA_SQ_MIN, VISIBLE_Z_MIN));
     all.extend(rules.map(|(name, rule)| (name, f64::from(rule as u32))));
     all
@@ -53,7 +63,14 @@ macro_rules! uniforms {
     ($($name:ident),* $(,)?) => { &[$((stringify!($name), size_of::<$name>(), $name::FIELDS)),*] };
 }
 
-const UNIFORMS: &[Uniform] = uniforms!(RedistributeUniform, AttentionGatherUniform, PlaneSweepUniform, SpgrUniform);
+const UNIFORMS: &[Uniform] = uniforms!(
+    RedistributeUniform,
+    AttentionGatherUniform,
+    PlaneSweepUniform,
+    SpgrUniform,
+    SpgrGainsBwdUniform,
+    InvertUniform
+);
 
 fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
@@ -217,9 +234,11 @@ fn orphans(kernels: &BTreeSet<String>) -> Vec<String> {
     let used: BTreeSet<&str> = KERNELS.iter().map(|k| k.name).collect();
     let mut cpu = stems("src/cpu", "rs");
     let folders = fs::read_dir(root().join("src/cpu")).unwrap().map(|e| e.unwrap().path());
-    cpu.extend(folders.filter(|p| p.is_dir()).map(|p| {
-        p.file_name().unwrap().to_string_lossy().into_owned()
-    }));
+    cpu.extend(
+        folders
+            .filter(|p| p.is_dir())
+            .map(|p| p.file_name().unwrap().to_string_lossy().into_owned()),
+    );
     let twin = |stem: &str| {
         let other = TWINS.iter().find(|(kernel, _)| *kernel == stem);
         cpu.contains(other.map_or(stem, |(_, twin)| *twin))

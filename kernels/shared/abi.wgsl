@@ -40,3 +40,6 @@ const DEPTH_FRACTION_MIN: f32 = 0.1;
 const DISC_AREA_SQ_MIN: f32 = 1e-20;
 const GROWTH_MAX: f32 = 50.0;
 const VISIBLE_Z_MIN: f32 = 1e-5;
+
+// No cell, in the lists of invert.
+const NONE: u32 = 0xffffffffu;

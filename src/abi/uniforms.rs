@@ -82,10 +82,10 @@ uniform! {
         dropped_low: u32,
         /// High word.
         dropped_high: u32,
-        /// Unused.
-        pad0: u32,
-        /// Unused.
-        pad1: u32,
+        /// Cells of the maps.
+        cells: u32,
+        /// Whether the points' gradient is wanted.
+        point_gradient: u32,
     }
 }
 
@@ -102,12 +102,20 @@ uniform! {
         height: u32,
         /// w.
         width: u32,
+        /// Pairs of all rows.
+        pairs: u32,
+        /// S.
+        sources: u32,
+        /// Unused.
+        pad0: u32,
         /// Coordinate of the centre of pixel 0.
         centre: f32,
         /// Least z that the division sees.
         min_z: f32,
         /// Factor of the correlation.
         scale: f32,
+        /// Unused.
+        pad1: u32,
     }
 }
 
@@ -162,5 +170,33 @@ uniform! {
         lowpass_input: f32,
         /// δ.
         delta: f32,
+    }
+}
+
+uniform! {
+    /// Of kernels/spgr_gains_bwd.wgsl.
+    SpgrGainsBwdUniform {
+        /// N·K.
+        records: u32,
+        /// Floats of gain per record, 1 or 4.
+        lanes: u32,
+        /// δ.
+        delta: f32,
+        /// Unused.
+        pad: u32,
+    }
+}
+
+uniform! {
+    /// Of kernels/invert.wgsl.
+    InvertUniform {
+        /// Entries.
+        entries: u32,
+        /// Cells that they fall on.
+        cells: u32,
+        /// Unused.
+        pad0: u32,
+        /// Unused.
+        pad1: u32,
     }
 }

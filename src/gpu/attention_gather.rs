@@ -17,6 +17,7 @@ pub(crate) static ATTENTION_GATHER: Kernel = Kernel {
         include_str!("../../kernels/shared/grid.wgsl"),
         include_str!("../../kernels/shared/wide.wgsl"),
         include_str!("../../kernels/shared/gather.wgsl"),
+        include_str!("../../kernels/shared/gather_samples.wgsl"),
         include_str!("../../kernels/attention_gather.wgsl"),
     ),
     bindings: &[
@@ -65,8 +66,7 @@ impl<'a> AttentionGatherArgs<'a> {
             return wrong("samples per parent", expected, g.samples().to_string());
         }
         if !divides || g.samples() * g.groups > GATHER_WEIGHTS_MAX {
-            let expected =
-                format!("a divisor of E, at most {}", GATHER_WEIGHTS_MAX / g.samples());
+            let expected = format!("a divisor of E, at most {}", GATHER_WEIGHTS_MAX / g.samples());
             return wrong("groups", expected, g.groups.to_string());
         }
         if g.stride < channels {
@@ -109,6 +109,8 @@ impl<'a> AttentionGatherArgs<'a> {
             points_per_level: u32::from(g.points_per_level),
             half_pixel: if g.half_pixel { 0.5 } else { 0.0 },
             logit_scale: g.logit_scale as f32,
+            cells: number(self.maps.len() / g.stride.max(1)),
+            point_gradient: u32::from(g.point_gradient),
             ..Default::default()
         };
         if let Some(drop) = g.drop {

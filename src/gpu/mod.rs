@@ -11,17 +11,22 @@
 
 mod adapter;
 mod attention_gather;
+mod attention_gather_bwd;
 mod buffers;
 mod commands;
 mod device;
 mod error;
+mod invert;
 mod pipelines;
 mod plane_sweep;
+mod plane_sweep_bwd;
 mod redistribute;
 mod spgr;
+mod spgr_bwd;
 
 pub use adapter::{AdapterSummary, DeviceChoice, adapters, choose};
 pub use attention_gather::AttentionGatherArgs;
+pub use attention_gather_bwd::AttentionGatherGradients;
 pub use buffers::Buffer;
 pub use device::Gpu;
 pub use error::GpuError;
@@ -36,4 +41,15 @@ pub const KERNELS: &[&Kernel] = &[
     &attention_gather::ATTENTION_GATHER,
     &plane_sweep::PLANE_SWEEP,
     &spgr::SPGR,
+    &spgr_bwd::SPGR_BWD,
+    &spgr_bwd::SPGR_GAINS_BWD,
+    &invert::COUNT,
+    &invert::SCAN,
+    &invert::FILL,
+    &invert::ORDER,
+    &attention_gather_bwd::ATTENTION_GATHER_BWD,
+    &attention_gather_bwd::ATTENTION_GATHER_SCATTER,
+    &plane_sweep_bwd::PLANE_SWEEP_TAPS,
+    &plane_sweep_bwd::PLANE_SWEEP_REFERENCE_BWD,
+    &plane_sweep_bwd::PLANE_SWEEP_SOURCE_BWD,
 ];

@@ -16,6 +16,7 @@ pub(crate) static PLANE_SWEEP: Kernel = Kernel {
         include_str!("../../kernels/shared/abi.wgsl"),
         include_str!("../../kernels/shared/grid.wgsl"),
         include_str!("../../kernels/shared/sweep.wgsl"),
+        include_str!("../../kernels/shared/sweep_taps.wgsl"),
         include_str!("../../kernels/plane_sweep.wgsl"),
     ),
     bindings: &[
@@ -86,9 +87,13 @@ impl<'a> PlaneSweepArgs<'a> {
             candidates: s.candidates() as u32,
             height: s.size[0] as u32,
             width: s.size[1] as u32,
+            pairs: s.pairs.get(rows.clone()).unwrap_or(&[]).iter().flatten().count() as u32,
+            sources: (self.source.len() / self.features().max(1)) as u32,
+            pad0: 0,
             centre: s.centre,
             min_z: s.min_z,
             scale: s.scale,
+            pad1: 0,
         }
     }
 
