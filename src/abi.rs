@@ -14,8 +14,8 @@ pub use gather::{Drop, GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, Gather, Level};
 pub use spgr::{CHILDREN_MAX, DISC_AREA_SQ_MIN, Rules, SPGR_CAMERA_LANES};
 pub use sweep::{Pair, SWEEP_PAIR_LANES, Sweep};
 pub use uniforms::{
-    AttentionGatherUniform, InvertUniform, PlaneSweepUniform, RedistributeUniform, SpgrGainsBwdUniform,
-    SpgrUniform,
+    AttentionGatherUniform, InvertUniform, PlaneSweepUniform, RedistributeUniform,
+    SpgrGainsBwdUniform, SpgrUniform,
 };
 
 use serde::{Deserialize, Serialize};

@@ -20,7 +20,7 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("check", &["camera", "metrics"]),
     ("io", &["abi", "camera", "config", "sh", "splats"]),
     ("data", &["camera", "io", "metrics", "splats"]),
-    ("ops", &["abi", "camera", "cpu", "splats"]),
+    ("ops", &["abi", "camera", "cpu", "gpu", "splats"]),
     ("model", &["abi", "camera", "config", "io", "ops", "sh", "splats"]),
     (
         "pipeline",

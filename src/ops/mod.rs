@@ -5,6 +5,7 @@
 pub mod activation;
 pub mod attention;
 pub mod attention_gather;
+mod backend;
 pub mod conv2d;
 pub mod direct;
 pub mod linear;
@@ -16,6 +17,7 @@ pub mod redistribute;
 pub mod resize;
 pub mod spgr;
 
+pub use backend::Backend;
 pub use rasterize::{over_background, rasterize, rasterize_splats};
 
 use crate::cpu::real::Real;
