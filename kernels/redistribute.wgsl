@@ -20,10 +20,7 @@ struct RedistributeUniform {
 
 // Softmax argument of child i.
 fn weight_log(i: u32) -> f32 {
-    if call.rule == RULE_LINEAR {
-        return logits[i] - log(areas[i] + AREA_EPS);
-    }
-    return logits[i];
+    return share_log(call.rule, logits[i], areas[i]);
 }
 
 @compute @workgroup_size(64)
@@ -55,26 +52,12 @@ fn main(
         shared_out[i] = w;
         sum += w;
     }
-    let relative = call.rule == RULE_OPTICAL_DEPTH || call.rule == RULE_AREA;
     var per_own = 1.0;
-    if relative {
+    if rule_is_relative(call.rule) {
         per_own = 1.0 / own[p];
     }
-    var whole = alpha;
-    if call.rule == RULE_OPTICAL_DEPTH || call.rule == RULE_TRANSMITTANCE {
-        whole = -ln_1p(-min(alpha, OPACITY_CEILING));
-    }
-    let factor = whole / sum;
+    let factor = share_whole(call.rule, alpha) / sum;
     for (var i = first; i < past; i++) {
-        var x = factor * shared_out[i];
-        if relative {
-            x /= max(areas[i] * per_own, RELATIVE_AREA_MIN);
-        }
-        if call.rule == RULE_AREA {
-            x = min(x, AREA_RULE_OPACITY_MAX);
-        } else if call.rule != RULE_LINEAR {
-            x = -exp_m1(-x);
-        }
-        shared_out[i] = x;
+        shared_out[i] = share_one(call.rule, factor * shared_out[i], areas[i], per_own);
     }
 }

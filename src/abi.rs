@@ -6,11 +6,20 @@
 //! restate it. `kernels/shared/abi.wgsl` does, and `tests/shaders.rs` compares the two.
 
 mod frame;
+mod gather;
+mod spgr;
+mod sweep;
 mod uniforms;
 
 pub(crate) use frame::lanes_at;
-pub use frame::{Geometry, Rendered, Rules, SplatSlices};
-pub use uniforms::{RasterUniform, RedistributeUniform, ShowUniform, SortUniform};
+pub use frame::{BlendRules, Geometry, Rendered, SplatSlices};
+pub use gather::{Drop, GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, Gather, Level};
+pub use spgr::{CHILDREN_MAX, DISC_AREA_SQ_MIN, Rules, SPGR_CAMERA_LANES};
+pub use sweep::{Pair, SWEEP_PAIR_LANES, Sweep};
+pub use uniforms::{
+    AttentionGatherUniform, InvertUniform, PlaneSweepUniform, RasterUniform, RedistributeUniform,
+    ShowUniform, SortUniform, SpgrGainsBwdUniform, SpgrUniform,
+};
 
 use serde::{Deserialize, Serialize};
 
@@ -230,6 +239,9 @@ impl Rule {
         matches!(self, Rule::OpticalDepth | Rule::Area)
     }
 }
+
+/// No cell, in the lists that gradients are summed by.
+pub const NONE: u32 = u32::MAX;
 
 /// ε of w̃ = w / (A + ε), px² (supp. A.3).
 pub const AREA_EPS: f64 = 1e-8;

@@ -10,7 +10,10 @@ use naga::{AddressSpace, Expression, Handle, Literal, Module, StorageAccess, Typ
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::PathBuf;
-use subsplat::abi::{self, RasterUniform, RedistributeUniform, Rule, ShowUniform, SortUniform};
+use subsplat::abi::{
+    self, AttentionGatherUniform, InvertUniform, PlaneSweepUniform, RasterUniform,
+    RedistributeUniform, Rule, ShowUniform, SortUniform, SpgrGainsBwdUniform, SpgrUniform,
+};
 use subsplat::gpu::{Access, KERNELS, Kernel};
 
 /// Storage buffers of a stage, threads and bytes of a workgroup: WebGPU's defaults.
@@ -29,6 +32,14 @@ const TWINS: &[(&str, &str)] = &[
     ("intersect", "tiles"),
     ("ranges", "tiles"),
     ("show", "rasterize"),
+    ("spgr_bwd", "spgr"),
+    ("spgr_gains_bwd", "spgr"),
+    ("invert", "plane_sweep"),
+    ("attention_gather_bwd", "attention_gather"),
+    ("attention_gather_scatter", "attention_gather"),
+    ("plane_sweep_taps", "plane_sweep"),
+    ("plane_sweep_reference_bwd", "plane_sweep"),
+    ("plane_sweep_source_bwd", "plane_sweep"),
 ];
 
 /// Name and value of everything in kernels/shared/abi.wgsl.
@@ -63,6 +74,11 @@ fn constants() -> BTreeMap<&'static str, f64> {
         ("RULE_AREA", Rule::Area),
         ("RULE_NONE", Rule::None),
     ];
+    all.extend(same!(GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, SWEEP_PAIR_LANES));
+    all.extend(same!(SPLAT_LANES, LANE_MEAN, LANE_QUAT, LANE_SCALE, LANE_OPACITY));
+    all.extend(same!(HEAD_LANES, HEAD_OFFSET, HEAD_DEPTH, HEAD_LOG_SCALE, HEAD_ROTATION));
+    all.extend(same!(HEAD_LOGIT, HEAD_GAIN, NONE, SPGR_CAMERA_LANES, AREA_SQ_EPS, GROWTH_MAX));
+    all.extend(same!(DEPTH_FRACTION_MIN, DISC_AREA_SQ_MIN, VISIBLE_Z_MIN));
     all.extend(rules.map(|(name, rule)| (name, f64::from(rule as u32))));
     all
 }
@@ -74,8 +90,17 @@ macro_rules! uniforms {
     ($($name:ident),* $(,)?) => { &[$((stringify!($name), size_of::<$name>(), $name::FIELDS)),*] };
 }
 
-const UNIFORMS: &[Uniform] =
-    uniforms!(RasterUniform, RedistributeUniform, ShowUniform, SortUniform);
+const UNIFORMS: &[Uniform] = uniforms!(
+    AttentionGatherUniform,
+    InvertUniform,
+    PlaneSweepUniform,
+    RasterUniform,
+    RedistributeUniform,
+    ShowUniform,
+    SortUniform,
+    SpgrGainsBwdUniform,
+    SpgrUniform
+);
 
 fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
@@ -238,7 +263,13 @@ fn stems(folder: &str, extension: &str) -> BTreeSet<String> {
 /// Kernels without a Rust side or without a CPU twin.
 fn orphans(kernels: &BTreeSet<String>) -> Vec<String> {
     let used: BTreeSet<&str> = KERNELS.iter().map(|k| k.name).collect();
-    let cpu = stems("src/cpu", "rs");
+    let mut cpu = stems("src/cpu", "rs");
+    let folders = fs::read_dir(root().join("src/cpu")).unwrap().map(|e| e.unwrap().path());
+    cpu.extend(
+        folders
+            .filter(|p| p.is_dir())
+            .map(|p| p.file_name().unwrap().to_string_lossy().into_owned()),
+    );
     let twin = |stem: &str| {
         let other = TWINS.iter().find(|(kernel, _)| *kernel == stem);
         cpu.contains(other.map_or(stem, |(_, twin)| *twin))

@@ -27,3 +27,34 @@ const PLAN_COUNT: u32 = 3u;
 const PLAN_BLOCKS: u32 = 4u;
 const PLAN_ASKED: u32 = 5u;
 const PLAN_EACH: u32 = 8u;
+// Most samples of a parent, and samples x groups, that attention_gather holds.
+const GATHER_SAMPLES_MAX: u32 = 128u;
+const GATHER_WEIGHTS_MAX: u32 = 1024u;
+
+// Floats of one pair of views of a plane sweep.
+const SWEEP_PAIR_LANES: u32 = 20u;
+
+// Lanes of packed splats and of head records.
+const SPLAT_LANES: u32 = 11u;
+const LANE_MEAN: u32 = 0u;
+const LANE_QUAT: u32 = 3u;
+const LANE_SCALE: u32 = 7u;
+const LANE_OPACITY: u32 = 10u;
+const HEAD_LANES: u32 = 11u;
+const HEAD_OFFSET: u32 = 0u;
+const HEAD_DEPTH: u32 = 2u;
+const HEAD_LOG_SCALE: u32 = 3u;
+const HEAD_ROTATION: u32 = 6u;
+const HEAD_LOGIT: u32 = 9u;
+const HEAD_GAIN: u32 = 10u;
+
+// SPGR.
+const SPGR_CAMERA_LANES: u32 = 23u;
+const AREA_SQ_EPS: f32 = 1e-24;
+const DEPTH_FRACTION_MIN: f32 = 0.1;
+const DISC_AREA_SQ_MIN: f32 = 1e-20;
+const GROWTH_MAX: f32 = 50.0;
+const VISIBLE_Z_MIN: f32 = 1e-5;
+
+// No cell, in the lists of invert.
+const NONE: u32 = 0xffffffffu;

@@ -21,3 +21,27 @@ fn exp_m1(x: f32) -> f32 {
     }
     return exp(x) - 1.0;
 }
+
+// Hyperbolic tangent; WGSL's own may overflow or lose small arguments.
+fn tanh_of(x: f32) -> f32 {
+    let e = exp_m1(-2.0 * abs(x));
+    return sign(x) * (-e / (e + 2.0));
+}
+
+// Sine and cosine, radians; WGSL's own may be off by 5e-4. Reduced by pi/2 in three parts,
+// then Cephes' polynomials: 1e-7 for |x| < 1000.
+fn sin_cos(x: f32) -> vec2<f32> {
+    let n = round(x * 0.636619772);
+    let r = ((x - n * 1.5703125) - n * 4.837512969970703e-4) - n * 7.549789954891882e-8;
+    let z = r * r;
+    let s = r + r * z * (-1.6666654611e-1 + z * (8.3321608736e-3 - z * 1.9515295891e-4));
+    let c = 1.0 - 0.5 * z
+        + z * z * (4.166664568298827e-2 + z * (-1.388731625493765e-3 + z * 2.443315711809948e-5));
+    let quarter = i32(n) & 3;
+    let turned = select(vec2<f32>(s, c), vec2<f32>(c, s), (quarter & 1) == 1);
+    let signs = vec2<f32>(
+        select(1.0, -1.0, quarter >= 2),
+        select(1.0, -1.0, quarter == 1 || quarter == 2),
+    );
+    return turned * signs;
+}

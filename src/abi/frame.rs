@@ -116,14 +116,14 @@ impl Rendered {
 
 /// The two numbers in which the conventions blend differently.
 #[derive(Clone, Copy, Debug)]
-pub struct Rules {
+pub struct BlendRules {
     /// Largest alpha of one splat at one pixel.
     pub alpha_max: f32,
     /// Blending stops where T would become this or less.
     pub stop: f32,
 }
 
-impl Rules {
+impl BlendRules {
     /// Those of `convention`.
     pub fn new(convention: Convention) -> Self {
         match convention {

@@ -128,3 +128,169 @@ uniform! {
         pad: u32,
     }
 }
+
+uniform! {
+    /// Of kernels/shared/gather.wgsl; fields as in [`super::Gather`] where not said.
+    AttentionGatherUniform {
+        /// N.
+        parents: u32,
+        /// V.
+        views: u32,
+        /// L.
+        levels: u32,
+        /// M.
+        points: u32,
+        /// Floats of the points of one parent and view.
+        points_width: u32,
+        /// E.
+        dim: u32,
+        /// G.
+        groups: u32,
+        /// Floats of a cell's row.
+        stride: u32,
+        /// First key channel.
+        key: u32,
+        /// Whether there are keys.
+        has_key: u32,
+        /// First value channel.
+        value: u32,
+        /// Whether samples outside leave the softmax.
+        renormalise: u32,
+        /// Whether each level has points of its own.
+        points_per_level: u32,
+        /// ½ or 0, px.
+        half_pixel: f32,
+        /// Factor of q·k.
+        logit_scale: f32,
+        /// Whether weights are dropped.
+        drops: u32,
+        /// 1 / (1 − p).
+        kept_factor: f32,
+        /// Index of parent 0 in the scene.
+        first_parent: u32,
+        /// Low word of the seed.
+        seed_low: u32,
+        /// High word.
+        seed_high: u32,
+        /// Low word of ⌈p·2⁵³⌉.
+        dropped_low: u32,
+        /// High word.
+        dropped_high: u32,
+        /// Cells of the maps.
+        cells: u32,
+        /// Whether the points' gradient is wanted.
+        point_gradient: u32,
+    }
+}
+
+uniform! {
+    /// Of kernels/shared/sweep.wgsl; fields as in [`super::Sweep`] where not said.
+    PlaneSweepUniform {
+        /// R of the call.
+        rows: u32,
+        /// C.
+        channels: u32,
+        /// D.
+        candidates: u32,
+        /// h.
+        height: u32,
+        /// w.
+        width: u32,
+        /// Pairs of all rows.
+        pairs: u32,
+        /// S.
+        sources: u32,
+        /// Unused.
+        pad0: u32,
+        /// Coordinate of the centre of pixel 0.
+        centre: f32,
+        /// Least z that the division sees.
+        min_z: f32,
+        /// Factor of the correlation.
+        scale: f32,
+        /// Unused.
+        pad1: u32,
+    }
+}
+
+uniform! {
+    /// Of kernels/shared/spgr.wgsl; what each rule means is said at [`super::Rules`].
+    SpgrUniform {
+        /// N.
+        parents: u32,
+        /// r.
+        side: u32,
+        /// Parents per view.
+        per_view: u32,
+        /// Index of parent 0 in the scene.
+        first: u32,
+        /// V.
+        views: u32,
+        /// [`super::Rule`] as a number.
+        rule: u32,
+        /// Whether v* is the nearest view that sees the parent.
+        nearest_visible: u32,
+        /// Whether offsets are bounded.
+        bounded: u32,
+        /// Whether depth residuals run along the ray.
+        ray: u32,
+        /// Whether β_z is in units of the depth.
+        relative_depth: u32,
+        /// Whether children slide along the disc.
+        disc: u32,
+        /// Whether footprints take the parent's Jacobian.
+        area_at_parent: u32,
+        /// Whether two axes grow.
+        two_axis: u32,
+        /// Whether gains have four lanes.
+        rgb_gain: u32,
+        /// Unused.
+        pad0: u32,
+        /// Unused.
+        pad1: u32,
+        /// ρ, sub-pixels.
+        offset_bound: f32,
+        /// β_z.
+        beta_z: f32,
+        /// λ_s.
+        lambda_s: f32,
+        /// c.
+        dlog_clamp: f32,
+        /// A_min, target px².
+        a_min: f32,
+        /// Low-pass of the target picture, target px².
+        lowpass_target: f32,
+        /// Low-pass of a native render, input px².
+        lowpass_input: f32,
+        /// δ.
+        delta: f32,
+    }
+}
+
+uniform! {
+    /// Of kernels/spgr_gains_bwd.wgsl.
+    SpgrGainsBwdUniform {
+        /// N·K.
+        records: u32,
+        /// Floats of gain per record, 1 or 4.
+        lanes: u32,
+        /// δ.
+        delta: f32,
+        /// Unused.
+        pad: u32,
+    }
+}
+
+uniform! {
+    /// Of kernels/invert.wgsl.
+    InvertUniform {
+        /// Entries.
+        entries: u32,
+        /// Cells that they fall on.
+        cells: u32,
+        /// Unused.
+        pad0: u32,
+        /// Unused.
+        pad1: u32,
+    }
+}

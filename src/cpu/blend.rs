@@ -11,7 +11,7 @@
 //! blending stops before the splat that would take T to 10⁻⁴ or below (`standard`)
 //! or below 10⁻⁴ (`mvsplat`).
 
-pub(crate) use crate::abi::Rules;
+pub(crate) use crate::abi::BlendRules as Rules;
 
 use crate::abi::{ALPHA_MIN_LOG2, BLOCK, TILE};
 use crate::cpu::blocks::{met, transpose_bits};

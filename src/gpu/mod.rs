@@ -10,26 +10,37 @@
 //! [`crate::abi`] and this table.
 
 mod adapter;
+mod attention_gather;
+mod attention_gather_bwd;
 mod buffers;
 mod commands;
 mod device;
 mod error;
+mod invert;
 mod pipelines;
+mod plane_sweep;
+mod plane_sweep_bwd;
 mod raster_kernels;
 mod rasterize;
 mod redistribute;
 mod scene;
 mod show;
 mod sort;
+mod spgr;
+mod spgr_bwd;
 
 pub use adapter::{AdapterSummary, DeviceChoice, adapters, choose};
+pub use attention_gather::AttentionGatherArgs;
+pub use attention_gather_bwd::AttentionGatherGradients;
 pub use buffers::Buffer;
 pub use device::Gpu;
 pub use error::GpuError;
 pub use pipelines::{Access, Kernel};
+pub use plane_sweep::PlaneSweepArgs;
 pub use rasterize::Rasterizer;
 pub use redistribute::RedistributeArgs;
 pub use scene::Scene;
+pub use spgr::SpgrArgs;
 /// The wgpu that devices and textures belong to.
 pub use wgpu;
 
@@ -47,4 +58,18 @@ pub const KERNELS: &[&Kernel] = &[
     &raster_kernels::RASTERIZE,
     &redistribute::REDISTRIBUTE,
     &show::SHOW,
+    &attention_gather::ATTENTION_GATHER,
+    &plane_sweep::PLANE_SWEEP,
+    &spgr::SPGR,
+    &spgr_bwd::SPGR_BWD,
+    &spgr_bwd::SPGR_GAINS_BWD,
+    &invert::COUNT,
+    &invert::SCAN,
+    &invert::FILL,
+    &invert::ORDER,
+    &attention_gather_bwd::ATTENTION_GATHER_BWD,
+    &attention_gather_bwd::ATTENTION_GATHER_SCATTER,
+    &plane_sweep_bwd::PLANE_SWEEP_TAPS,
+    &plane_sweep_bwd::PLANE_SWEEP_REFERENCE_BWD,
+    &plane_sweep_bwd::PLANE_SWEEP_SOURCE_BWD,
 ];

@@ -16,6 +16,7 @@ pub(crate) static REDISTRIBUTE: Kernel = Kernel {
         include_str!("../../kernels/shared/abi.wgsl"),
         include_str!("../../kernels/shared/grid.wgsl"),
         include_str!("../../kernels/shared/math.wgsl"),
+        include_str!("../../kernels/shared/share.wgsl"),
         include_str!("../../kernels/redistribute.wgsl"),
     ),
     bindings: &[

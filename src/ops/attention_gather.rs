@@ -2,7 +2,9 @@
 //! gradients for maps, query and points (SubSplat A.2; spec 1.6). Formulas and
 //! layouts: [`crate::cpu::attention_gather`]. Tests: tests/attention_gather.rs.
 
-use super::{Number, by_dtype, elements, slice};
+#[cfg(feature = "gpu")]
+use super::borrowed;
+use super::{Backend, Number, by_dtype, elements, slice};
 use crate::cpu::attention_gather as cpu;
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, DType, Layout, Result, Shape, Storage, Tensor, bail};
@@ -18,6 +20,20 @@ const NAME: &str = "attention_gather";
 /// # Errors
 /// Shapes that do not fit `gather` or one another, mixed dtypes.
 pub fn attention_gather(
+    maps: &Tensor,
+    query: &Tensor,
+    points: &Tensor,
+    gather: Gather,
+) -> Result<Tensor> {
+    attention_gather_on(&Backend::Cpu, maps, query, points, gather)
+}
+
+/// [`attention_gather`] and its gradients on `backend`.
+///
+/// # Errors
+/// Those of [`attention_gather`].
+pub fn attention_gather_on(
+    backend: &Backend,
     maps: &Tensor,
     query: &Tensor,
     points: &Tensor,
@@ -51,11 +67,15 @@ pub fn attention_gather(
     if points.dims() != expected {
         bail!("{NAME} points: expected {expected:?}, got {:?}", points.dims());
     }
-    let op = AttentionGather(gather);
+    let op = AttentionGather(gather, backend.clone());
     maps.contiguous()?.apply_op3(&query.contiguous()?, &points.contiguous()?, op)
 }
 
-struct AttentionGather(Gather);
+struct AttentionGather(
+    Gather,
+    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "the GPU's path reads it"))]
+    Backend,
+);
 
 impl CustomOp3 for AttentionGather {
     fn name(&self) -> &'static str {
@@ -72,6 +92,10 @@ impl CustomOp3 for AttentionGather {
         l3: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
         let args = [(s1, l1), (s2, l2), (s3, l3)];
+        #[cfg(feature = "gpu")]
+        if let Some(done) = on_gpu(self, args)? {
+            return Ok(done);
+        }
         by_dtype!(NAME, s1.dtype(), forward(&self.0, args))
     }
 
@@ -83,6 +107,10 @@ impl CustomOp3 for AttentionGather {
         _: &Tensor,
         grad: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        #[cfg(feature = "gpu")]
+        if let Some(done) = gradients_on_gpu(self, [maps, query, points, grad])? {
+            return Ok(done);
+        }
         by_dtype!(NAME, maps.dtype(), backward(&self.0, [maps, query, points, grad]))
     }
 }
@@ -98,6 +126,52 @@ fn forward<T: Number>(
     let mut out = vec![T::default(); rows * g.dim];
     cpu::forward(g, maps, query, points, &mut out);
     Ok((T::to_cpu_storage_owned(out), Shape::from((rows, g.dim))))
+}
+
+/// [`forward`] on the GPU; `None` where the CPU is to do it.
+#[cfg(feature = "gpu")]
+fn on_gpu(
+    AttentionGather(gather, backend): &AttentionGather,
+    [maps, query, points]: [(&CpuStorage, &Layout); 3],
+) -> Result<Option<(CpuStorage, Shape)>> {
+    if maps.0.dtype() != DType::F32 {
+        return Ok(None);
+    }
+    let shape = Shape::from((query.1.dims()[0], gather.dim));
+    let maps = slice::<f32>(NAME, "maps", maps.0, maps.1)?;
+    let query = slice::<f32>(NAME, "query", query.0, query.1)?;
+    let points = slice::<f32>(NAME, "points", points.0, points.1)?;
+    let args = crate::gpu::AttentionGatherArgs { gather, maps, query, points };
+    let done = backend.offload(|gpu| gpu.attention_gather(&args));
+    Ok(done.map(|out| (CpuStorage::F32(out), shape)))
+}
+
+/// [`backward`] on the GPU; `None` where the CPU is to do it.
+#[cfg(feature = "gpu")]
+fn gradients_on_gpu(
+    AttentionGather(gather, backend): &AttentionGather,
+    [maps, query, points, grad]: [&Tensor; 4],
+) -> Result<Option<Triple>> {
+    if maps.dtype() != DType::F32 {
+        return Ok(None);
+    }
+    let grad = grad.contiguous()?;
+    let all = [maps, query, points, &grad];
+    let done = borrowed::<f32, _, 4>(NAME, all, |[maps, query, points, grad]| {
+        let args = crate::gpu::AttentionGatherArgs { gather, maps, query, points };
+        backend.offload(|gpu| gpu.attention_gather_backward(&args, grad))
+    })?;
+    let Some(d) = done else { return Ok(None) };
+    let device = maps.device();
+    let points = match gather.point_gradient {
+        true => Some(Tensor::from_vec(d.points, points.dims(), device)?),
+        false => None,
+    };
+    Ok(Some((
+        Some(Tensor::from_vec(d.maps, maps.dims(), device)?),
+        Some(Tensor::from_vec(d.query, query.dims(), device)?),
+        points,
+    )))
 }
 
 type Triple = (Option<Tensor>, Option<Tensor>, Option<Tensor>);

@@ -5,6 +5,7 @@
 pub mod activation;
 pub mod attention;
 pub mod attention_gather;
+mod backend;
 mod conv;
 pub mod conv2d;
 pub mod conv3d;
@@ -20,6 +21,7 @@ pub mod resize;
 pub mod small;
 pub mod spgr;
 
+pub use backend::Backend;
 pub use rasterize::{over_background, rasterize, rasterize_splats};
 
 use crate::cpu::real::Real;

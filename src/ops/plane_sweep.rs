@@ -2,7 +2,7 @@
 //! [`crate::cpu::plane_sweep`]. Gradients reach both feature maps; the sampling grid
 //! carries none, as in MVSplat.
 
-use super::{borrowed, elements, output, slice};
+use super::{Backend, borrowed, elements, output, slice};
 use crate::camera::{Camera, Intrinsics};
 use crate::cpu::plane_sweep as cpu;
 pub use crate::cpu::plane_sweep::{Pair, Sweep};
@@ -49,6 +49,19 @@ pub fn relative_pose(reference: &Camera, source: &Camera) -> Mat4 {
 /// # Errors
 /// Shapes, pairs or depths that do not fit one another; a dtype other than f32.
 pub fn plane_sweep(reference: &Tensor, source: &Tensor, sweep: Sweep) -> Result<Tensor> {
+    plane_sweep_on(&Backend::Cpu, reference, source, sweep)
+}
+
+/// [`plane_sweep`] and its gradients on `backend`.
+///
+/// # Errors
+/// Those of [`plane_sweep`].
+pub fn plane_sweep_on(
+    backend: &Backend,
+    reference: &Tensor,
+    source: &Tensor,
+    sweep: Sweep,
+) -> Result<Tensor> {
     let ((r, c, h, w), (s, ..)) = (reference.dims4()?, source.dims4()?);
     if source.dims()[1..] != [c, h, w] || sweep.channels != c || sweep.size != [h, w] {
         bail!(
@@ -74,7 +87,7 @@ pub fn plane_sweep(reference: &Tensor, source: &Tensor, sweep: Sweep) -> Result<
     if let Some(p) = sweep.pairs.iter().flatten().find(|p| p.source >= s) {
         bail!("plane sweep pair: expected a source row below {s}, got {}", p.source);
     }
-    reference.contiguous()?.apply_op2(&source.contiguous()?, Op(sweep))
+    reference.contiguous()?.apply_op2(&source.contiguous()?, Op(sweep, backend.clone()))
 }
 
 /// Share of the pairs of each reference pixel and candidate that fall inside their
@@ -110,7 +123,24 @@ pub fn warped(source: &Tensor, sweep: &Sweep, pair: usize, candidates: &[usize])
     Tensor::stack(&planes, 0)?.reshape((r, candidates.len(), c, h, w))?.transpose(1, 2)
 }
 
-struct Op(Sweep);
+struct Op(
+    Sweep,
+    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "the GPU's path reads it"))]
+    Backend,
+);
+
+impl Op {
+    fn gradients(&self, reference: &[f32], source: &[f32], grad: &[f32]) -> (Vec<f32>, Vec<f32>) {
+        #[cfg(feature = "gpu")]
+        {
+            let args = crate::gpu::PlaneSweepArgs { sweep: &self.0, reference, source };
+            if let Some(done) = self.1.offload(|gpu| gpu.plane_sweep_backward(&args, grad)) {
+                return done;
+            }
+        }
+        cpu::backward(&self.0, reference, source, grad)
+    }
+}
 
 impl CustomOp2 for Op {
     fn name(&self) -> &'static str {
@@ -127,6 +157,13 @@ impl CustomOp2 for Op {
         let reference = slice::<f32>("plane-sweep", "reference", s1, l1)?;
         let source = slice::<f32>("plane-sweep", "source", s2, l2)?;
         let ([h, w], r, d) = (self.0.size, l1.dims()[0], self.0.candidates());
+        #[cfg(feature = "gpu")]
+        {
+            let args = crate::gpu::PlaneSweepArgs { sweep: &self.0, reference, source };
+            if let Some(out) = self.1.offload(|gpu| gpu.plane_sweep(&args)) {
+                return output(out, (r, d, h, w));
+            }
+        }
         let mut out = vec![0.0; r * d * h * w];
         cpu::correlation(&self.0, reference, source, &mut out);
         output(out, (r, d, h, w))
@@ -140,7 +177,7 @@ impl CustomOp2 for Op {
         grad: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>)> {
         let grad = grad.contiguous()?;
-        let run = |[f, g, grad]: [&[f32]; 3]| cpu::backward(&self.0, f, g, grad);
+        let run = |[f, g, grad]: [&[f32]; 3]| self.gradients(f, g, grad);
         let (d_f, d_g) = borrowed("plane sweep", [reference, source, &grad], run)?;
         let device = reference.device();
         Ok((

@@ -2,7 +2,7 @@
 //! allocation"; supp. A.3; spec 2.7 and 2.8). Formulas: [`crate::cpu::redistribute`].
 //! Tests: tests/redistribute.rs (identities, finite differences in `f64`).
 
-use super::{Number, borrowed, by_dtype, slice};
+use super::{Backend, Number, borrowed, by_dtype, slice};
 use crate::cpu::lanes::LaneReal;
 use crate::cpu::redistribute as cpu;
 use candle_core::backend::BackendStorage;
@@ -19,6 +19,21 @@ pub use cpu::Rule;
 /// # Errors
 /// Shapes or dtypes that do not fit one another; parent areas missing.
 pub fn redistribute(
+    rule: Rule,
+    logits: &Tensor,
+    areas: &Tensor,
+    opacities: &Tensor,
+    parent_areas: Option<&Tensor>,
+) -> Result<Tensor> {
+    redistribute_on(&Backend::Cpu, rule, logits, areas, opacities, parent_areas)
+}
+
+/// [`redistribute`] on `backend`; the gradient is the CPU's.
+///
+/// # Errors
+/// Those of [`redistribute`].
+pub fn redistribute_on(
+    backend: &Backend,
     rule: Rule,
     logits: &Tensor,
     areas: &Tensor,
@@ -49,12 +64,16 @@ pub fn redistribute(
         None => opacities.contiguous()?.unsqueeze(0)?,
     };
     let (logits, areas) = (logits.contiguous()?, areas.contiguous()?);
-    logits.apply_op3(&areas, &per_parent, Redistribute(rule))
+    logits.apply_op3(&areas, &per_parent, Redistribute(rule, backend.clone()))
 }
 
 /// On logits `[P, K]`, areas `[P, K]` and, `[1, P]` or `[2, P]`, the parents'
 /// opacities and own areas.
-struct Redistribute(Rule);
+struct Redistribute(
+    Rule,
+    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "the GPU's path reads it"))]
+    Backend,
+);
 
 const NAME: &str = "redistribute";
 
@@ -73,6 +92,10 @@ impl CustomOp3 for Redistribute {
         l3: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
         let args = [(s1, l1), (s2, l2), (s3, l3)];
+        #[cfg(feature = "gpu")]
+        if let Some(done) = on_gpu(self, args)? {
+            return Ok(done);
+        }
         by_dtype!(NAME, s1.dtype(), forward(self.0, args))
     }
 
@@ -116,6 +139,26 @@ fn forward<T: Number + LaneReal>(
     let per_parent = slice::<T>(NAME, "opacities", per_parent.0, per_parent.1)?;
     let out = cpu::forward(arguments(rule, &Tensor2 { data, parents, k }, areas, per_parent));
     Ok((T::to_cpu_storage_owned(out), shape))
+}
+
+/// [`forward`] on the GPU; `None` where the CPU is to do it.
+#[cfg(feature = "gpu")]
+fn on_gpu(
+    Redistribute(rule, backend): &Redistribute,
+    [logits, areas, per_parent]: [(&CpuStorage, &Layout); 3],
+) -> Result<Option<(CpuStorage, Shape)>> {
+    if logits.0.dtype() != candle_core::DType::F32 {
+        return Ok(None);
+    }
+    let shape = logits.1.shape().clone();
+    let (parents, k) = shape.dims2()?;
+    let logits = slice::<f32>(NAME, "logits", logits.0, logits.1)?;
+    let areas = slice::<f32>(NAME, "areas", areas.0, areas.1)?;
+    let per_parent = slice::<f32>(NAME, "opacities", per_parent.0, per_parent.1)?;
+    let (alphas, own) = per_parent.split_at(parents);
+    let args = crate::gpu::RedistributeArgs { rule: *rule, k, logits, areas, alphas, own };
+    let done = backend.offload(|gpu| gpu.redistribute(&args));
+    Ok(done.map(|out| (CpuStorage::F32(out), shape)))
 }
 
 type Triple = (Option<Tensor>, Option<Tensor>, Option<Tensor>);

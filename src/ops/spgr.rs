@@ -2,7 +2,7 @@
 //! buffers of the caller's. Formulas and layouts: [`crate::cpu::spgr`]; the same
 //! unfused: `model/spgr_ref.rs`. Tests: tests/spgr.rs, tests/spgr_backward.rs.
 
-use super::{Number, borrowed, by_dtype, slice};
+use super::{Backend, Number, borrowed, by_dtype, slice};
 use crate::abi::{HEAD_LANES, SPLAT_LANES};
 use crate::camera::Camera;
 use crate::cpu::lanes::LaneReal;
@@ -70,12 +70,26 @@ impl Spgr {
 /// Shapes that do not fit one another, or an input that gives a number that is not
 /// finite (named by parent and child).
 pub fn spgr(head: &Tensor, parents: &Tensor, call: &Spgr) -> Result<(Tensor, Tensor)> {
+    spgr_on(&Backend::Cpu, head, parents, call)
+}
+
+/// [`spgr`] and its gradients on `backend`.
+///
+/// # Errors
+/// Those of [`spgr`].
+pub fn spgr_on(
+    backend: &Backend,
+    head: &Tensor,
+    parents: &Tensor,
+    call: &Spgr,
+) -> Result<(Tensor, Tensor)> {
     let n = call.check(head, parents)?;
     let (head, parents) = (head.contiguous()?, parents.contiguous()?);
     let made = Made::default();
-    let rows = head.apply_op2(&parents, Children(call.clone(), made.clone()))?;
-    let gains =
-        head.apply_op1(Gains { rules: call.rules, count: n * call.rules.children(), made })?;
+    let children = Children(call.clone(), made.clone(), backend.clone());
+    let rows = head.apply_op2(&parents, children)?;
+    let (count, backend) = (n * call.rules.children(), backend.clone());
+    let gains = head.apply_op1(Gains { rules: call.rules, count, made, backend })?;
     Ok((rows, gains))
 }
 
@@ -166,7 +180,12 @@ fn finite_number<T: Number>(v: T) -> bool {
 }
 
 /// Children `[N·K, 11]` of head records and parents.
-struct Children(Spgr, Made);
+struct Children(
+    Spgr,
+    Made,
+    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "the GPU's path reads it"))]
+    Backend,
+);
 
 impl CustomOp2 for Children {
     fn name(&self) -> &'static str {
@@ -180,6 +199,10 @@ impl CustomOp2 for Children {
         s2: &CpuStorage,
         l2: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
+        #[cfg(feature = "gpu")]
+        if let Some(done) = on_gpu(self, (s1, l1), (s2, l2))? {
+            return Ok(done);
+        }
         by_dtype!(NAME, s1.dtype(), forward(self, (s1, l1), (s2, l2)))
     }
 
@@ -190,12 +213,16 @@ impl CustomOp2 for Children {
         _: &Tensor,
         grad: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>)> {
+        #[cfg(feature = "gpu")]
+        if let Some(done) = gradients_on_gpu(self, head, parents, grad)? {
+            return Ok(done);
+        }
         by_dtype!(NAME, head.dtype(), backward(&self.0, head, parents, grad))
     }
 }
 
 fn forward<T: Number + LaneReal>(
-    Children(call, made): &Children,
+    Children(call, made, _): &Children,
     (s1, l1): (&CpuStorage, &Layout),
     (s2, l2): (&CpuStorage, &Layout),
 ) -> Result<(CpuStorage, Shape)> {
@@ -231,12 +258,81 @@ fn backward<T: Number + LaneReal>(
     ))
 }
 
+#[cfg(feature = "gpu")]
+impl Spgr {
+    fn on_gpu<'a>(&'a self, head: &'a [f32], parents: &'a [f32]) -> crate::gpu::SpgrArgs<'a> {
+        let Self { rules, cameras, near, per_view, first } = self;
+        let (per_view, first) = (*per_view, *first);
+        crate::gpu::SpgrArgs { rules, cameras, near, per_view, first, head, parents }
+    }
+}
+
+/// [`forward`] on the GPU; `None` where the CPU is to do it.
+#[cfg(feature = "gpu")]
+fn on_gpu(
+    Children(call, made, backend): &Children,
+    (s1, l1): (&CpuStorage, &Layout),
+    (s2, l2): (&CpuStorage, &Layout),
+) -> Result<Option<(CpuStorage, Shape)>> {
+    if s1.dtype() != candle_core::DType::F32 {
+        return Ok(None);
+    }
+    let head = slice::<f32>(NAME, "head records", s1, l1)?;
+    let parents = slice::<f32>(NAME, "parents", s2, l2)?;
+    let done = backend.offload(|gpu| gpu.spgr(&call.on_gpu(head, parents)));
+    let Some((rows, gains)) = done else { return Ok(None) };
+    finite(call, head, parents, &rows, &gains)?;
+    if let Ok(mut made) = made.lock() {
+        *made = Some(CpuStorage::F32(gains));
+    }
+    let count = l2.dims()[0] * call.rules.children();
+    Ok(Some((CpuStorage::F32(rows), Shape::from((count, SPLAT_LANES)))))
+}
+
+/// [`backward`] on the GPU; `None` where the CPU is to do it.
+#[cfg(feature = "gpu")]
+fn gradients_on_gpu(
+    Children(call, _, backend): &Children,
+    head: &Tensor,
+    parents: &Tensor,
+    grad: &Tensor,
+) -> Result<Option<(Option<Tensor>, Option<Tensor>)>> {
+    if head.dtype() != candle_core::DType::F32 {
+        return Ok(None);
+    }
+    let grad = grad.contiguous()?;
+    let done = borrowed::<f32, _, 3>(NAME, [head, parents, &grad], |[head, parents, grad]| {
+        backend.offload(|gpu| gpu.spgr_backward(&call.on_gpu(head, parents), grad))
+    })?;
+    let Some((d_head, d_parents)) = done else { return Ok(None) };
+    let device = head.device();
+    Ok(Some((
+        Some(Tensor::from_vec(d_head, head.dims(), device)?),
+        Some(Tensor::from_vec(d_parents, parents.dims(), device)?),
+    )))
+}
+
+/// [`gains_backward`] on the GPU; `None` where the CPU is to do it.
+#[cfg(feature = "gpu")]
+fn gains_gradients_on_gpu(gains: &Gains, head: &Tensor, grad: &Tensor) -> Result<Option<Tensor>> {
+    if head.dtype() != candle_core::DType::F32 {
+        return Ok(None);
+    }
+    let grad = grad.contiguous()?;
+    let done = borrowed::<f32, _, 2>(NAME, [head, &grad], |[head, grad]| {
+        gains.backend.offload(|gpu| gpu.spgr_gains_backward(&gains.rules, head, grad))
+    })?;
+    done.map(|d| Tensor::from_vec(d, head.dims(), head.device())).transpose()
+}
+
 /// Gains `[N·K]` or `[N·K, 4]` of head records.
 struct Gains {
     rules: Rules,
     /// N·K.
     count: usize,
     made: Made,
+    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "the GPU's path reads it"))]
+    backend: Backend,
 }
 
 impl CustomOp1 for Gains {
@@ -255,6 +351,10 @@ impl CustomOp1 for Gains {
     }
 
     fn bwd(&self, head: &Tensor, _: &Tensor, grad: &Tensor) -> Result<Option<Tensor>> {
+        #[cfg(feature = "gpu")]
+        if let Some(done) = gains_gradients_on_gpu(self, head, grad)? {
+            return Ok(Some(done));
+        }
         by_dtype!(NAME, head.dtype(), gains_backward(&self.rules, head, grad))
     }
 }

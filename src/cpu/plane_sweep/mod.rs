@@ -8,46 +8,11 @@
 
 mod backward;
 
+pub use crate::abi::{Pair, Sweep};
 pub use backward::backward;
 
 use super::math::{dot, vectorised};
 use rayon::prelude::*;
-
-/// Reference pixel and depth to source pixel: X = R·(K_r⁻¹·(x, y, 1))·depth + t in
-/// source camera coordinates, (u, v) = (fx·X + cx·Z, fy·Y + cy·Z)/max(Z, min_z), in
-/// this order: what rounding does then stays closest to the original.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Pair {
-    /// Row of the source features.
-    pub source: usize,
-    /// K_r⁻¹ as (1/fx, 1/fy, −cx/fx, −cy/fy), feature pixels.
-    pub inverse: [f32; 4],
-    /// R, row-major: reference camera to source camera.
-    pub rotation: [f32; 9],
-    /// The reference camera's centre in the source camera's frame, world units.
-    pub t: [f32; 3],
-    /// fx, fy, cx, cy of the projection, feature pixels.
-    pub k: [f32; 4],
-}
-
-/// Sizes and rules of one sweep.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Sweep {
-    /// For each reference row, whom it is compared with.
-    pub pairs: Vec<Vec<Pair>>,
-    /// `[R][D]`: candidate depths (camera z of the reference), world units.
-    pub depths: Vec<Vec<f32>>,
-    /// Coordinate of the centre of pixel 0: 0 (MVSplat) or ½ (`camera.rs`).
-    pub centre: f32,
-    /// Least z that the division sees.
-    pub min_z: f32,
-    /// Factor of the correlation (MVSplat: 1/√C).
-    pub scale: f32,
-    /// C.
-    pub channels: usize,
-    /// h, w of both feature maps.
-    pub size: [usize; 2],
-}
 
 /// Where a sample falls: index of the upper left tap and the four weights, zero for
 /// taps outside.
@@ -57,11 +22,6 @@ struct Sample {
 }
 
 impl Sweep {
-    /// D.
-    pub fn candidates(&self) -> usize {
-        self.depths.first().map_or(0, Vec::len)
-    }
-
     /// Source index coordinates (0 = centre of the first pixel) and camera z.
     #[inline(always)]
     fn place(&self, p: &Pair, x: usize, y: usize, depth: f32) -> (f32, f32, f32) {

@@ -7,12 +7,9 @@ use super::view::{
     scaled, times, transposed,
 };
 use super::{Rules, Source};
-use crate::abi::{LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES};
+use crate::abi::{DISC_AREA_SQ_MIN, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES};
 use crate::cpu::lanes::{Lanes, Machine, WIDTH_MAX};
 use crate::cpu::redistribute::Rule;
-
-/// Least squared area of a disc that children slide on, px⁴.
-const SOLID: f64 = 1e-20;
 
 pub(super) struct Parent<V: Lanes> {
     pub(super) view: View<V>,
@@ -225,7 +222,7 @@ impl<V: Lanes> Disc<V> {
         let m = [transposed(&g, j[0]), transposed(&g, j[1])];
         let normal = cross(m[0], m[1]);
         let det = dot(normal, normal) + one.of(crate::abi::AREA_SQ_EPS);
-        let solid = one.of(SOLID).lt(det);
+        let solid = one.of(DISC_AREA_SQ_MIN).lt(det);
         let inverse_det = one / V::select(solid, det, one);
         // Rows of (M Mᵀ)⁻¹·M as cross products: (b·b)·a − (a·b)·b cancels for needles.
         let weights =

@@ -1,0 +1,41 @@
+// Correlation of every reference pixel with the source pixels that it would fall on at
+// each candidate depth; the warped features never exist. Twin of src/cpu/plane_sweep.
+// Arguments but the last: kernels/shared/sweep_taps.wgsl.
+//
+// reference [R,C,h,w], source [S,C,h,w]   Out: [R,D,h,w].   One thread per number.
+
+@group(0) @binding(6) var<storage, read_write> correlation: array<f32>;
+
+@compute @workgroup_size(64)
+fn main(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = workgroup_number(workgroup, workgroups) * 64u + lane;
+    let plane = call.height * call.width;
+    if i >= call.rows * call.candidates * plane {
+        return;
+    }
+    let pixel = i % plane;
+    let k = i / plane % call.candidates;
+    let r = i / plane / call.candidates;
+    let depth = depths[r * call.candidates + k];
+    let own = r * call.channels * plane + pixel;
+    var sum = 0.0;
+    for (var pair = heads[r]; pair < heads[r + 1u]; pair++) {
+        let t = taps(fall(pair, pixel % call.width, pixel / call.width, depth));
+        if all(t.weights == vec4<f32>()) {
+            continue;
+        }
+        var at = t.cells + source_row(pair) * call.channels * plane;
+        var product = 0.0;
+        for (var c = 0u; c < call.channels; c++) {
+            let g = vec4<f32>(source[at.x], source[at.y], source[at.z], source[at.w]);
+            product += reference[own + c * plane] * dot(t.weights, g);
+            at += plane;
+        }
+        sum += product;
+    }
+    correlation[i] = share(r) * sum;
+}

@@ -1,0 +1,43 @@
+// How a parent's opacity is shared among its children, number by number: the rules and
+// formulas of src/cpu/redistribute.rs.
+
+// Whether areas count in units of the parent's own.
+fn rule_is_relative(rule: u32) -> bool {
+    return rule == RULE_OPTICAL_DEPTH || rule == RULE_AREA;
+}
+
+// Argument of the softmax.
+fn share_log(rule: u32, logit: f32, area: f32) -> f32 {
+    if rule == RULE_LINEAR {
+        return logit - log(area + AREA_EPS);
+    }
+    return logit;
+}
+
+// What the weights share: the opacity, or its optical depth.
+fn share_whole(rule: u32, alpha: f32) -> f32 {
+    if rule == RULE_OPTICAL_DEPTH || rule == RULE_TRANSMITTANCE {
+        return -ln_1p(-min(alpha, OPACITY_CEILING));
+    }
+    return alpha;
+}
+
+// What a share is divided by.
+fn share_divisor(rule: u32, area: f32, per_own: f32) -> f32 {
+    if rule_is_relative(rule) {
+        return max(area * per_own, RELATIVE_AREA_MIN);
+    }
+    return 1.0;
+}
+
+// Opacity of a child whose part of the whole is `part`.
+fn share_one(rule: u32, part: f32, area: f32, per_own: f32) -> f32 {
+    let x = part / share_divisor(rule, area, per_own);
+    if rule == RULE_LINEAR {
+        return x;
+    }
+    if rule == RULE_AREA {
+        return min(x, AREA_RULE_OPACITY_MAX);
+    }
+    return -exp_m1(-x);
+}

@@ -1,0 +1,19 @@
+// What the plane sweep's kernels are told. Formulas: src/cpu/plane_sweep.
+
+struct PlaneSweepUniform {
+    // R, C, D of this call, and h, w of the feature maps.
+    rows: u32,
+    channels: u32,
+    candidates: u32,
+    height: u32,
+    width: u32,
+    pairs: u32,
+    sources: u32,
+    pad0: u32,
+    centre: f32,
+    min_z: f32,
+    scale: f32,
+    pad1: u32,
+}
+
+@group(0) @binding(0) var<uniform> call: PlaneSweepUniform;

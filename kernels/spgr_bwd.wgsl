@@ -1,0 +1,380 @@
+// Gradients of the children with respect to head records and parents (spec 2.12): twin of
+// src/cpu/spgr/backward.rs. Arguments but the last three: kernels/shared/spgr.wgsl.
+//
+// In: gradient of the children [N·K, 11].   Out: of the head records [N, K, 11] (lane
+// HEAD_GAIN is 0: gains have a kernel of their own), of the parents [N, 11].
+// One thread per parent: a first walk over its children for their areas, which the opacity
+// rule couples, then the rest. Until the second walk, lanes of a child's own head gradient
+// hold its area, its softmax weight and its opacity's part.
+
+@group(0) @binding(4) var<storage, read> grad: array<f32>;
+@group(0) @binding(5) var<storage, read_write> d_head: array<f32>;
+@group(0) @binding(6) var<storage, read_write> d_parents: array<f32>;
+
+const AREA: u32 = 0u;
+const WEIGHT: u32 = 1u;
+
+// Gradients of a parent, summed over its children.
+struct ParentGradient {
+    mean: vec3<f32>,
+    quat: vec4<f32>,
+    scale: vec3<f32>,
+    alpha: f32,
+    in_camera: vec3<f32>,
+    z: f32,
+    disc_u: vec3<f32>,
+    disc_v: vec3<f32>,
+    ju: vec3<f32>,
+    jv: vec3<f32>,
+    own: f32,
+}
+
+fn kept(mask: bool, v: f32) -> f32 {
+    return select(0.0, v, mask);
+}
+
+fn conjugate(q: vec4<f32>) -> vec4<f32> {
+    return vec4<f32>(q.x, -q.yzw);
+}
+
+fn unit_bwd(u: Unit, d: vec4<f32>) -> vec4<f32> {
+    return (d - u.q * kept(u.free, dot(u.q, d))) * u.inverse;
+}
+
+fn rotation_bwd(q: vec4<f32>, g: mat3x3<f32>) -> vec4<f32> {
+    let turn = vec3<f32>(g[2][1] - g[1][2], g[0][2] - g[2][0], g[1][0] - g[0][1]);
+    let xy = g[0][1] + g[1][0];
+    let xz = g[0][2] + g[2][0];
+    let yz = g[1][2] + g[2][1];
+    let x = q.y;
+    let y = q.z;
+    let z = q.w;
+    return 2.0 * vec4<f32>(
+        dot(turn, q.yzw),
+        dot(vec3<f32>(y, z, q.x), vec3<f32>(xy, xz, turn.x)) - x * 2.0 * (g[1][1] + g[2][2]),
+        dot(vec3<f32>(x, z, q.x), vec3<f32>(xy, yz, turn.y)) - y * 2.0 * (g[0][0] + g[2][2]),
+        dot(vec3<f32>(x, y, q.x), vec3<f32>(xz, yz, turn.z)) - z * 2.0 * (g[0][0] + g[1][1]),
+    );
+}
+
+fn turn_bwd(t: Turn, d: vec4<f32>) -> vec3<f32> {
+    // (cos(t/2)/2 - sinc)/t², below 1 radian by its series.
+    let s = t.squared;
+    let series = -2.0 / 48.0 + s * (4.0 / 3840.0 + s * (-6.0 / 645120.0
+        + s * (8.0 / 185794560.0 - s * (10.0 / 81749606400.0))));
+    let slope = select((0.5 * t.e.x - t.sinc) / max(s, 1.0), series, s < 1.0);
+    let along = slope * dot(t.r, d.yzw) - 0.5 * t.sinc * d.x;
+    return t.sinc * d.yzw + along * t.r;
+}
+
+fn jacobian_bwd(j: Jacobian, du: vec3<f32>, dv: vec3<f32>) -> vec3<f32> {
+    let along = -j.focal * vec2<f32>(dot(du, j.axis), dot(dv, j.axis));
+    let slope = select(vec2<f32>(), along, j.free);
+    let z = -dot(du, j.u) - dot(dv, j.v) - dot(slope, j.raw);
+    return vec3<f32>(slope * j.inverse_z, kept(j.free_z, z * j.inverse_z));
+}
+
+// Of J·R_w2c, R(q) and the sigmas.
+struct FootprintGradient {
+    ju: vec3<f32>,
+    jv: vec3<f32>,
+    rotation: mat3x3<f32>,
+    scale: vec3<f32>,
+}
+
+// For the gradients of the area and of M's rows (the latter beside the area's own).
+fn footprint_bwd(
+    f: Footprint,
+    j: Jacobian,
+    rotation: mat3x3<f32>,
+    scale: vec3<f32>,
+    d_area: f32,
+    da: vec3<f32>,
+    db: vec3<f32>,
+) -> FootprintGradient {
+    let n = f.normal * (d_area / f.area);
+    let a = da + cross(f.b, n);
+    let b = db + cross(n, f.a);
+    let ta = a * scale;
+    let tb = b * scale;
+    return FootprintGradient(
+        ta * rotation,
+        tb * rotation,
+        mat3x3<f32>(j.u.x * ta + j.v.x * tb, j.u.y * ta + j.v.y * tb, j.u.z * ta + j.v.z * tb),
+        a * f.turned_a + b * f.turned_b,
+    );
+}
+
+// Adds what comes through the step of a child: `d` is the gradient of the step.
+fn step_bwd(
+    p: Parent,
+    t: Step,
+    d: vec3<f32>,
+    record: u32,
+    g: ptr<function, ParentGradient>,
+) {
+    var s = d;
+    var d_dz = d.z;
+    if call.ray != 0u {
+        let d_share = dot(s.xy, p.in_camera.xy + t.side);
+        (*g).in_camera += vec3<f32>(t.share * s.xy, 0.0);
+        s = vec3<f32>(s.xy + t.share * s.xy, s.z);
+        let each = d_share * t.inverse;
+        d_dz += each;
+        let d_ahead = kept(t.free_ahead, -each * t.share);
+        (*g).in_camera.z += d_ahead;
+        s.z += d_ahead;
+    }
+    let free_dz = kept(t.free_z, d_dz);
+    let bound_dz = d_dz - free_dz;
+    (*g).z += bound_dz * (DEPTH_FRACTION_MIN - 1.0);
+    s.z -= bound_dz;
+    var d_tanh = free_dz * call.beta_z;
+    if call.relative_depth != 0u {
+        (*g).z += d_tanh * t.tanh_z;
+        d_tanh *= p.z;
+    }
+    d_head[record + HEAD_DEPTH] = d_tanh * (1.0 - t.tanh_z * t.tanh_z);
+    var d_offset = vec2<f32>();
+    var flat = s.xy;
+    if call.disc != 0u {
+        let slid = s * t.along_disc;
+        (*g).disc_u += t.offset.x * slid;
+        (*g).disc_v += t.offset.y * slid;
+        d_offset = vec2<f32>(dot(p.disc.u, slid), dot(p.disc.v, slid));
+        flat -= slid.xy;
+    }
+    let per = flat / p.view.focal;
+    d_offset += per * p.z;
+    (*g).z += dot(per, t.offset);
+    d_offset /= f32(call.side);
+    if call.bounded != 0u {
+        d_offset *= call.offset_bound * (1.0 - t.bounded * t.bounded);
+    }
+    d_head[record + HEAD_OFFSET] = d_offset.x;
+    d_head[record + HEAD_OFFSET + 1u] = d_offset.y;
+}
+
+fn grad3(i: u32) -> vec3<f32> {
+    return vec3<f32>(grad[i], grad[i + 1u], grad[i + 2u]);
+}
+
+// Adds child i's part to its parent's gradient and writes its record's geometry lanes.
+fn child_bwd(p: Parent, k: u32, i: u32, d_of_area: f32, g: ptr<function, ParentGradient>) {
+    let record = i * HEAD_LANES;
+    let from_row = i * SPLAT_LANES;
+    let c = child_of(p, k, record);
+    let f = c.footprint;
+    var d_clamped = d_of_area;
+    var da = vec3<f32>();
+    var db = vec3<f32>();
+    if call.rule == RULE_OPTICAL_DEPTH {
+        let each = d_of_area / c.area;
+        d_clamped = each * c.clamped;
+        let by = c.growth * c.growth * (each * call.lowpass_target);
+        da = by * f.a;
+        db = by * f.b;
+    }
+    let d_area = kept(call.a_min < f.area, d_clamped);
+    let by = footprint_bwd(f, c.jacobian, c.rotation, c.small, d_area, da, db);
+    let d_small = grad3(from_row + LANE_SCALE) * c.growth + by.scale;
+    (*g).scale += d_small * c.factor;
+    let log_scale = d_small * c.small * (1.0 - c.soft * c.soft);
+    let q = from_row + LANE_QUAT;
+    let d_quat = vec4<f32>(grad[q], grad[q + 1u], grad[q + 2u], grad[q + 3u]);
+    let d_unit = unit_bwd(c.unit, d_quat + rotation_bwd(c.unit.q, by.rotation));
+    let turn = turn_bwd(c.turn, quat_product(conjugate(p.quat), d_unit));
+    for (var j = 0u; j < 3u; j++) {
+        d_head[record + HEAD_LOG_SCALE + j] = log_scale[j];
+        d_head[record + HEAD_ROTATION + j] = turn[j];
+    }
+    (*g).quat += quat_product(d_unit, conjugate(c.turn.e));
+    let d_mean = grad3(from_row + LANE_MEAN);
+    (*g).mean += d_mean;
+    var d_step = p.view.rotation * d_mean;
+    if call.area_at_parent != 0u {
+        (*g).ju += by.ju;
+        (*g).jv += by.jv;
+    } else {
+        let at = jacobian_bwd(c.jacobian, by.ju, by.jv);
+        (*g).in_camera += at;
+        d_step += at;
+    }
+    step_bwd(p, c.step, d_step, record, g);
+}
+
+fn own_bwd(p: Parent, g: ptr<function, ParentGradient>) {
+    let o = own_of(p);
+    let f = o.footprint;
+    let each = (*g).own * f32(call.side * call.side);
+    var d_area = each;
+    var da = vec3<f32>();
+    var db = vec3<f32>();
+    if call.rule == RULE_OPTICAL_DEPTH {
+        let per = each / o.blurred;
+        d_area = per * f.area;
+        da = per * call.lowpass_input * f.a;
+        db = per * call.lowpass_input * f.b;
+    }
+    let by = footprint_bwd(f, o.jacobian, o.rotation, p.scale, d_area, da, db);
+    (*g).in_camera += jacobian_bwd(o.jacobian, by.ju, by.jv);
+    (*g).scale += by.scale;
+    (*g).quat += unit_bwd(o.unit, rotation_bwd(o.unit.q, by.rotation));
+}
+
+fn disc_bwd(p: Parent, g: ptr<function, ParentGradient>) {
+    let c = p.disc;
+    if !c.solid {
+        return;
+    }
+    let du = (*g).disc_u;
+    let dv = (*g).disc_v;
+    let eu = (c.g * du) * c.inverse_det;
+    let ev = (c.g * dv) * c.inverse_det;
+    // t_u = b×n/det, t_v = n×a/det, det = n·n, n = a×b.
+    let n = c.normal;
+    let d_det = -(dot(eu, c.weight_u) + dot(ev, c.weight_v));
+    let dn = 2.0 * d_det * n + (cross(eu, c.b) + cross(c.a, ev));
+    let da = cross(ev, n) + cross(c.b, dn);
+    let db = cross(n, eu) + cross(dn, c.a);
+    // steps = G·t and m = J·G.
+    var dg: mat3x3<f32>;
+    for (var i = 0u; i < 3u; i++) {
+        dg[i] = du[i] * c.weight_u + dv[i] * c.weight_v + c.ju[i] * da + c.jv[i] * db;
+    }
+    // J's row is f/z at column i and -f·x/z² at column 2.
+    let per = p.view.focal / (p.z * p.z);
+    let d_f = vec2<f32>(dot(da, c.g[0]), dot(db, c.g[1]));
+    let d_x = vec2<f32>(dot(da, c.g[2]), dot(db, c.g[2]));
+    (*g).in_camera -= vec3<f32>(d_x * per, 0.0);
+    (*g).z -= dot(d_f, per) + 2.0 * (d_x.x * c.ju.z + d_x.y * c.jv.z) / p.z;
+    // G = R_w2c·R·S.
+    var turned: mat3x3<f32>;
+    for (var i = 0u; i < 3u; i++) {
+        (*g).scale += dg[i] * c.turned[i];
+        turned[i] = dg[i] * p.scale;
+    }
+    let r = p.view.rotation;
+    let rotation = mat3x3<f32>(turned * r[0], turned * r[1], turned * r[2]);
+    (*g).quat += unit_bwd(c.unit, rotation_bwd(c.unit.q, rotation));
+}
+
+// Gradients of the opacity rule of parent p, children first .. past: leaves those of areas
+// and logits in the children's lanes.
+fn share_bwd(p: Parent, first: u32, past: u32, g: ptr<function, ParentGradient>) {
+    if call.rule == RULE_NONE {
+        for (var i = first; i < past; i++) {
+            (*g).alpha += grad[i * SPLAT_LANES + LANE_OPACITY];
+            d_head[i * HEAD_LANES + AREA] = 0.0;
+            d_head[i * HEAD_LANES + HEAD_LOGIT] = 0.0;
+        }
+        return;
+    }
+    var top = argument(first);
+    for (var i = first + 1u; i < past; i++) {
+        top = max(top, argument(i));
+    }
+    var sum = 0.0;
+    for (var i = first; i < past; i++) {
+        let w = exp(argument(i) - top);
+        d_head[i * HEAD_LANES + WEIGHT] = w;
+        sum += w;
+    }
+    let per_own = 1.0 / own_of(p).value;
+    let whole = share_whole(call.rule, p.alpha);
+    var mean = 0.0;
+    var by_whole = 0.0;
+    var by_own = 0.0;
+    for (var i = first; i < past; i++) {
+        let at = i * HEAD_LANES;
+        let area = d_head[at + AREA];
+        let w = d_head[at + WEIGHT] / sum;
+        let inverse_b = 1.0 / share_divisor(call.rule, area, per_own);
+        let part = w * inverse_b;
+        let x = whole * part;
+        var dx = grad[i * SPLAT_LANES + LANE_OPACITY];
+        if call.rule == RULE_AREA {
+            dx = kept(x < AREA_RULE_OPACITY_MAX, dx);
+        } else if call.rule != RULE_LINEAR {
+            dx *= exp(-x);
+        }
+        by_whole += dx * part;
+        mean += dx * x;
+        var d_area = 0.0;
+        if rule_is_relative(call.rule) && RELATIVE_AREA_MIN < area * per_own {
+            let d_b = -dx * x * inverse_b;
+            by_own += d_b * area;
+            d_area = d_b * per_own;
+        }
+        d_head[at + WEIGHT] = w;
+        d_head[at + HEAD_LOGIT] = dx * x;
+        if call.rule != RULE_LINEAR {
+            d_head[at + AREA] = d_area;
+        }
+    }
+    for (var i = first; i < past; i++) {
+        let at = i * HEAD_LANES;
+        let d_logit = d_head[at + HEAD_LOGIT] - d_head[at + WEIGHT] * mean;
+        d_head[at + HEAD_LOGIT] = d_logit;
+        if call.rule == RULE_LINEAR {
+            d_head[at + AREA] = -d_logit / (d_head[at + AREA] + AREA_EPS);
+        }
+    }
+    (*g).alpha = by_whole;
+    if call.rule == RULE_OPTICAL_DEPTH || call.rule == RULE_TRANSMITTANCE {
+        (*g).alpha = kept(p.alpha < OPACITY_CEILING, by_whole / (1.0 - p.alpha));
+    }
+    (*g).own = -by_own * per_own * per_own;
+}
+
+// Softmax argument of child i, its area in its lane.
+fn argument(i: u32) -> f32 {
+    let at = i * HEAD_LANES;
+    return share_log(call.rule, head[at + HEAD_LOGIT], d_head[at + AREA]);
+}
+
+@compute @workgroup_size(64)
+fn main(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let n = workgroup_number(workgroup, workgroups) * 64u + lane;
+    if n >= call.parents {
+        return;
+    }
+    let count = call.side * call.side;
+    let first = n * count;
+    let p = load_parent(n);
+    for (var k = 0u; k < count; k++) {
+        let record = (first + k) * HEAD_LANES;
+        d_head[record + AREA] = child_of(p, k, record).area;
+    }
+    var g: ParentGradient;
+    share_bwd(p, first, first + count, &g);
+    for (var k = 0u; k < count; k++) {
+        let record = (first + k) * HEAD_LANES;
+        child_bwd(p, k, first + k, d_head[record + AREA], &g);
+        d_head[record + HEAD_GAIN] = 0.0;
+    }
+    if rule_is_relative(call.rule) {
+        own_bwd(p, &g);
+    }
+    if call.area_at_parent != 0u {
+        g.in_camera += jacobian_bwd(p.jacobian, g.ju, g.jv);
+    }
+    if call.disc != 0u {
+        disc_bwd(p, &g);
+    }
+    g.in_camera.z += kept(p.view.z_min < p.in_camera.z, g.z);
+    let mean = g.mean + g.in_camera * p.view.rotation;
+    let to = n * SPLAT_LANES;
+    for (var i = 0u; i < 3u; i++) {
+        d_parents[to + LANE_MEAN + i] = mean[i];
+        d_parents[to + LANE_SCALE + i] = g.scale[i];
+    }
+    for (var i = 0u; i < 4u; i++) {
+        d_parents[to + LANE_QUAT + i] = g.quat[i];
+    }
+    d_parents[to + LANE_OPACITY] = g.alpha;
+}

@@ -1,0 +1,35 @@
+// Gradient of the colour gains: lane HEAD_GAIN of the head records [M, 11], M = N·K, the
+// other lanes 0. Twin of src/cpu/spgr/backward.rs (gains).   One thread per record.
+
+struct SpgrGainsBwdUniform {
+    records: u32,
+    // 1 or 4 a record.
+    lanes: u32,
+    delta: f32,
+    pad: u32,
+}
+
+@group(0) @binding(0) var<uniform> call: SpgrGainsBwdUniform;
+@group(0) @binding(1) var<storage, read> head: array<f32>;
+@group(0) @binding(2) var<storage, read> grad: array<f32>;
+@group(0) @binding(3) var<storage, read_write> d_head: array<f32>;
+
+@compute @workgroup_size(64)
+fn main(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = workgroup_number(workgroup, workgroups) * 64u + lane;
+    if i >= call.records {
+        return;
+    }
+    var d = grad[i * call.lanes];
+    for (var k = 1u; k < call.lanes; k++) {
+        d += 0.5 * grad[i * call.lanes + k];
+    }
+    let t = tanh_of(head[i * HEAD_LANES + HEAD_GAIN]);
+    for (var k = 0u; k < HEAD_LANES; k++) {
+        d_head[i * HEAD_LANES + k] = select(0.0, d * call.delta * (1.0 - t * t), k == HEAD_GAIN);
+    }
+}

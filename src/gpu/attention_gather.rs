@@ -1,0 +1,170 @@
+//! Attention over bilinear samples of feature maps: twin of
+//! [`crate::cpu::attention_gather`]. Kernel: kernels/attention_gather.wgsl.
+
+use crate::abi::{AttentionGatherUniform, GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, Gather};
+use crate::gpu::buffers::Binding;
+use crate::gpu::commands::Groups;
+use crate::gpu::device::Gpu;
+use crate::gpu::error::GpuError;
+use crate::gpu::pipelines::{Access, Kernel};
+use std::ops::Range;
+
+pub(crate) static ATTENTION_GATHER: Kernel = Kernel {
+    name: "attention_gather",
+    entry: "main",
+    source: concat!(
+        include_str!("../../kernels/shared/abi.wgsl"),
+        include_str!("../../kernels/shared/grid.wgsl"),
+        include_str!("../../kernels/shared/wide.wgsl"),
+        include_str!("../../kernels/shared/gather.wgsl"),
+        include_str!("../../kernels/shared/gather_samples.wgsl"),
+        include_str!("../../kernels/attention_gather.wgsl"),
+    ),
+    bindings: &[
+        Access::Uniform,
+        Access::Read,
+        Access::Read,
+        Access::Read,
+        Access::Read,
+        Access::Write,
+    ],
+};
+
+/// Arguments of one call, laid out as [`crate::cpu::attention_gather`] says.
+#[derive(Clone, Copy, Debug)]
+pub struct AttentionGatherArgs<'a> {
+    /// Sizes and rules; at most [`GATHER_SAMPLES_MAX`] samples a parent and
+    /// [`GATHER_WEIGHTS_MAX`] samples × groups.
+    pub gather: &'a Gather,
+    /// `[cells, stride]`.
+    pub maps: &'a [f32],
+    /// `[N, Q]`.
+    pub query: &'a [f32],
+    /// `[N, V, M or L·M, 2]`.
+    pub points: &'a [f32],
+}
+
+impl<'a> AttentionGatherArgs<'a> {
+    /// Floats of one parent's points.
+    pub(super) fn points_row(&self) -> usize {
+        2 * self.gather.views * self.gather.points_width()
+    }
+
+    /// N, where all fits together.
+    pub(super) fn check(&self) -> Result<usize, GpuError> {
+        let g = self.gather;
+        let n = self.query.len() / g.query_width().max(1);
+        let divides = g.groups > 0 && g.dim.is_multiple_of(g.groups);
+        let channels = g.dim + g.value.max(g.key.unwrap_or(0));
+        let end = |l: &crate::abi::Level| l.first_cell + g.views * l.height * l.width;
+        let cells = g.levels.iter().map(end).max().unwrap_or(0);
+        let wrong = |what, expected: String, got: String| {
+            Err(GpuError::Argument { kernel: ATTENTION_GATHER.name, what, expected, got })
+        };
+        if g.samples() == 0 || g.samples() > GATHER_SAMPLES_MAX {
+            let expected = format!("1 to {GATHER_SAMPLES_MAX}");
+            return wrong("samples per parent", expected, g.samples().to_string());
+        }
+        if !divides || g.samples() * g.groups > GATHER_WEIGHTS_MAX {
+            let expected = format!("a divisor of E, at most {}", GATHER_WEIGHTS_MAX / g.samples());
+            return wrong("groups", expected, g.groups.to_string());
+        }
+        if g.stride < channels {
+            return wrong("row of the maps", format!("{channels} floats"), g.stride.to_string());
+        }
+        let lengths = [
+            ("query", self.query.len(), n * g.query_width()),
+            ("points", self.points.len(), n * self.points_row()),
+            ("maps", self.maps.len().min(cells * g.stride), cells * g.stride),
+        ];
+        match lengths.into_iter().find(|(_, got, expected)| got != expected) {
+            None => Ok(n),
+            Some((what, got, expected)) => wrong(what, expected.to_string(), got.to_string()),
+        }
+    }
+
+    /// Parents of one call: what one binding holds of the widest of their rows.
+    pub(super) fn parents_per_call(&self, gpu: &Gpu, floats: usize) -> usize {
+        let widest = self.gather.query_width().max(self.points_row()).max(floats);
+        gpu.rows_per_binding(widest)
+    }
+
+    /// What the kernels are told of `parents`.
+    pub(super) fn uniform(&self, parents: &Range<usize>) -> AttentionGatherUniform {
+        let g = self.gather;
+        let number = |v: usize| v as u32;
+        let mut u = AttentionGatherUniform {
+            parents: number(parents.len()),
+            views: number(g.views),
+            levels: number(g.levels.len()),
+            points: number(g.points),
+            points_width: number(2 * g.points_width()),
+            dim: number(g.dim),
+            groups: number(g.groups),
+            stride: number(g.stride),
+            key: number(g.key.unwrap_or(0)),
+            has_key: u32::from(g.key.is_some()),
+            value: number(g.value),
+            renormalise: u32::from(g.renormalise),
+            points_per_level: u32::from(g.points_per_level),
+            half_pixel: if g.half_pixel { 0.5 } else { 0.0 },
+            logit_scale: g.logit_scale as f32,
+            cells: number(self.maps.len() / g.stride.max(1)),
+            point_gradient: u32::from(g.point_gradient),
+            ..Default::default()
+        };
+        if let Some(drop) = g.drop {
+            let dropped = (drop.probability * (1u64 << 53) as f64).ceil() as u64;
+            u.drops = 1;
+            u.kept_factor = (1.0 / (1.0 - drop.probability)) as f32;
+            u.first_parent = number(drop.first_parent + parents.start);
+            (u.seed_low, u.seed_high) = (drop.seed as u32, (drop.seed >> 32) as u32);
+            (u.dropped_low, u.dropped_high) = (dropped as u32, (dropped >> 32) as u32);
+        }
+        u
+    }
+
+    /// Height, width and first cell of each level.
+    pub(super) fn levels(&self) -> Vec<u32> {
+        let levels = self.gather.levels.iter();
+        levels.flat_map(|l| [l.height, l.width, l.first_cell].map(|v| v as u32)).collect()
+    }
+
+    /// Query and points of `parents`.
+    pub(super) fn rows(&self, parents: &Range<usize>) -> [&'a [f32]; 2] {
+        let part = |of: &'a [f32], width: usize| {
+            of.get(parents.start * width..parents.end * width).unwrap_or(&[])
+        };
+        [part(self.query, self.gather.query_width()), part(self.points, self.points_row())]
+    }
+}
+
+impl Gpu {
+    /// Attention output `[N, E]`.
+    ///
+    /// # Errors
+    /// Lengths that do not fit, more samples or groups than the kernel holds; anything
+    /// the device refuses.
+    pub fn attention_gather(&self, args: &AttentionGatherArgs) -> Result<Vec<f32>, GpuError> {
+        let n = args.check()?;
+        let dim = args.gather.dim;
+        let maps = self.upload("feature maps", args.maps)?;
+        let levels = self.upload("feature levels", &args.levels())?;
+        let mut out = Vec::with_capacity(n * dim);
+        for parents in Self::chunks(n, args.parents_per_call(self, dim)) {
+            let uniform = self.uniform(&args.uniform(&parents))?;
+            let [query, points] = args.rows(&parents);
+            let query = self.upload("queries", query)?;
+            let points = self.upload("sample points", points)?;
+            let attended = self.empty::<f32>("attention output", parents.len() * dim)?;
+            let bindings = [&uniform, &maps, &query, &points, &levels, &attended];
+            let mut commands = self.commands("attention_gather", false);
+            let groups = Groups::of(parents.len(), 1);
+            commands.run(&ATTENTION_GATHER, &[], &bindings.map(Binding::from), groups)?;
+            let reading = commands.read::<f32>(&attended, parents.len() * dim)?;
+            commands.submit()?;
+            out.extend(reading.take(self)?);
+        }
+        Ok(out)
+    }
+}

@@ -1,0 +1,143 @@
+//! Gradients of the attention gather: twin of the backward half of
+//! [`crate::cpu::attention_gather`]. Kernels: kernels/attention_gather_bwd.wgsl, invert and
+//! kernels/attention_gather_scatter.wgsl.
+
+use crate::gpu::attention_gather::AttentionGatherArgs;
+use crate::gpu::buffers::{Binding, Buffer};
+use crate::gpu::commands::Groups;
+use crate::gpu::device::Gpu;
+use crate::gpu::error::GpuError;
+use crate::gpu::pipelines::{Access, Kernel};
+use std::ops::Range;
+
+pub(crate) static ATTENTION_GATHER_BWD: Kernel = Kernel {
+    name: "attention_gather_bwd",
+    entry: "main",
+    source: concat!(
+        include_str!("../../kernels/shared/abi.wgsl"),
+        include_str!("../../kernels/shared/grid.wgsl"),
+        include_str!("../../kernels/shared/wide.wgsl"),
+        include_str!("../../kernels/shared/gather.wgsl"),
+        include_str!("../../kernels/shared/gather_samples.wgsl"),
+        include_str!("../../kernels/attention_gather_bwd.wgsl"),
+    ),
+    bindings: &[
+        Access::Uniform,
+        Access::Read,
+        Access::Read,
+        Access::Read,
+        Access::Read,
+        Access::Read,
+        Access::Write,
+        Access::Write,
+        Access::Write,
+    ],
+};
+
+pub(crate) static ATTENTION_GATHER_SCATTER: Kernel = Kernel {
+    name: "attention_gather_scatter",
+    entry: "main",
+    source: concat!(
+        include_str!("../../kernels/shared/abi.wgsl"),
+        include_str!("../../kernels/shared/grid.wgsl"),
+        include_str!("../../kernels/shared/gather.wgsl"),
+        include_str!("../../kernels/attention_gather_scatter.wgsl"),
+    ),
+    bindings: &[
+        Access::Uniform,
+        Access::Read,
+        Access::Read,
+        Access::Read,
+        Access::Read,
+        Access::Read,
+        Access::Write,
+    ],
+};
+
+/// Threads of a workgroup of the scatter.
+const THREADS: usize = 64;
+
+/// Gradients of the attention gather.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct AttentionGatherGradients {
+    /// `[cells, stride]`.
+    pub maps: Vec<f32>,
+    /// `[N, Q]`.
+    pub query: Vec<f32>,
+    /// `[N, V, M or L·M, 2]`; zeros where [`crate::abi::Gather::point_gradient`] is off.
+    pub points: Vec<f32>,
+}
+
+impl Gpu {
+    /// Gradients for the gradient `grad` `[N, E]` of the output.
+    ///
+    /// # Errors
+    /// Those of [`Gpu::attention_gather`]; another length of `grad`.
+    pub fn attention_gather_backward(
+        &self,
+        args: &AttentionGatherArgs,
+        grad: &[f32],
+    ) -> Result<AttentionGatherGradients, GpuError> {
+        let n = args.check()?;
+        let g = args.gather;
+        if grad.len() != n * g.dim {
+            return Err(GpuError::Argument {
+                kernel: ATTENTION_GATHER_BWD.name,
+                what: "gradient of the output",
+                expected: (n * g.dim).to_string(),
+                got: grad.len().to_string(),
+            });
+        }
+        let maps = self.upload("feature maps", args.maps)?;
+        let levels = self.upload("feature levels", &args.levels())?;
+        let mut sum =
+            AttentionGatherGradients { maps: vec![0.0; args.maps.len()], ..Default::default() };
+        let row = g.query_width() + args.points_row();
+        let widest = row.max(g.samples() * (4 + 2 * g.groups)).max(g.dim);
+        for parents in Self::chunks(n, args.parents_per_call(self, widest)) {
+            let grad = grad.get(parents.start * g.dim..parents.end * g.dim).unwrap_or(&[]);
+            let (d_maps, rows) = self.gather_bwd(args, (&maps, &levels), &parents, grad)?;
+            for row in rows.chunks_exact(row) {
+                let (query, points) = row.split_at(g.query_width());
+                sum.query.extend_from_slice(query);
+                sum.points.extend_from_slice(points);
+            }
+            sum.maps.iter_mut().zip(d_maps).for_each(|(sum, d)| *sum += d);
+        }
+        Ok(sum)
+    }
+
+    /// What some parents add to the maps' gradient, and their rows of query and points.
+    fn gather_bwd(
+        &self,
+        args: &AttentionGatherArgs,
+        (maps, levels): (&Buffer, &Buffer),
+        parents: &Range<usize>,
+        grad: &[f32],
+    ) -> Result<(Vec<f32>, Vec<f32>), GpuError> {
+        let (g, n) = (args.gather, parents.len());
+        let samples = n * g.samples();
+        let floats = n * (g.query_width() + args.points_row());
+        let uniform = self.uniform(&args.uniform(parents))?;
+        let [query, points] = args.rows(parents);
+        let query = self.upload("queries", query)?;
+        let points = self.upload("sample points", points)?;
+        let grad = self.upload("gradient of the output", grad)?;
+        let d_rows = self.empty::<f32>("gradient of the queries", floats)?;
+        let cells_of = self.empty::<u32>("cells of samples", 4 * samples)?;
+        let factors = self.empty::<f32>("factors", samples * (4 + 2 * g.groups))?;
+        let d_maps = self.empty::<f32>("gradient of the maps", args.maps.len())?;
+        let mut commands = self.commands("attention_gather_bwd", false);
+        let all = [&uniform, maps, &query, &points, levels, &grad, &d_rows, &cells_of, &factors];
+        commands.run(&ATTENTION_GATHER_BWD, &[], &all.map(Binding::from), Groups::of(n, 1))?;
+        let cells = args.maps.len() / g.stride;
+        let lists = self.invert(&mut commands, &cells_of, 4 * samples, cells)?;
+        let all = [&uniform, &query, &grad, &factors, &lists.starts, &lists.list, &d_maps];
+        let groups = Groups::of(args.maps.len(), THREADS);
+        commands.run(&ATTENTION_GATHER_SCATTER, &[], &all.map(Binding::from), groups)?;
+        let d_maps = commands.read::<f32>(&d_maps, args.maps.len())?;
+        let d_rows = commands.read::<f32>(&d_rows, floats)?;
+        commands.submit()?;
+        Ok((d_maps.take(self)?, d_rows.take(self)?))
+    }
+}

@@ -1,0 +1,184 @@
+//! Sub-pixel Gaussian reparameterization: twin of [`crate::cpu::spgr`]. Kernels:
+//! kernels/spgr.wgsl.
+
+use crate::abi::{
+    CHILDREN_MAX, FRUSTUM_MARGIN, HEAD_LANES, Rules, SPGR_CAMERA_LANES, SPLAT_LANES, SpgrUniform,
+};
+use crate::camera::Camera;
+use crate::gpu::buffers::Binding;
+use crate::gpu::commands::Groups;
+use crate::gpu::device::Gpu;
+use crate::gpu::error::GpuError;
+use crate::gpu::pipelines::{Access, Kernel};
+use std::ops::Range;
+
+pub(crate) static SPGR: Kernel = Kernel {
+    name: "spgr",
+    entry: "main",
+    source: concat!(
+        include_str!("../../kernels/shared/abi.wgsl"),
+        include_str!("../../kernels/shared/grid.wgsl"),
+        include_str!("../../kernels/shared/math.wgsl"),
+        include_str!("../../kernels/shared/share.wgsl"),
+        include_str!("../../kernels/shared/spgr.wgsl"),
+        include_str!("../../kernels/spgr.wgsl"),
+    ),
+    bindings: &[
+        Access::Uniform,
+        Access::Read,
+        Access::Read,
+        Access::Read,
+        Access::Write,
+        Access::Write,
+    ],
+};
+
+/// Threads of a workgroup.
+const THREADS: usize = 64;
+
+/// Arguments of one call.
+#[derive(Clone, Copy, Debug)]
+pub struct SpgrArgs<'a> {
+    /// How children are made; K ≤ [`CHILDREN_MAX`].
+    pub rules: &'a Rules,
+    /// Context views, pixels of the input pictures.
+    pub cameras: &'a [Camera],
+    /// Near plane of each view, world units.
+    pub near: &'a [f32],
+    /// Parents per view.
+    pub per_view: usize,
+    /// Index of parent 0 of this call in the scene.
+    pub first: usize,
+    /// Head records `[N, K, 11]`.
+    pub head: &'a [f32],
+    /// `[N, 11]`.
+    pub parents: &'a [f32],
+}
+
+impl<'a> SpgrArgs<'a> {
+    /// N, where all fits together.
+    pub(super) fn check(&self) -> Result<usize, GpuError> {
+        let n = self.parents.len() / SPLAT_LANES;
+        let k = self.rules.children();
+        let lengths = [
+            ("children per parent", k, k.clamp(1, CHILDREN_MAX)),
+            ("cameras", self.cameras.len(), self.cameras.len().max(1)),
+            ("near planes", self.near.len(), self.cameras.len()),
+            ("parents per view", self.per_view, self.per_view.max(1)),
+            ("parents", self.parents.len(), n * SPLAT_LANES),
+            ("head records", self.head.len(), n * k * HEAD_LANES),
+        ];
+        match lengths.into_iter().find(|(_, got, expected)| got != expected) {
+            None => Ok(n),
+            Some((what, got, expected)) => Err(GpuError::Argument {
+                kernel: SPGR.name,
+                what,
+                expected: expected.to_string(),
+                got: got.to_string(),
+            }),
+        }
+    }
+
+    /// What the kernels are told of `parents`.
+    pub(super) fn uniform(&self, parents: &Range<usize>) -> SpgrUniform {
+        let r = self.rules;
+        SpgrUniform {
+            parents: parents.len() as u32,
+            side: r.side as u32,
+            per_view: self.per_view as u32,
+            first: (self.first + parents.start) as u32,
+            views: self.cameras.len() as u32,
+            rule: r.opacity as u32,
+            nearest_visible: u32::from(r.nearest_visible),
+            bounded: u32::from(r.offset_bound.is_some()),
+            ray: u32::from(r.ray),
+            relative_depth: u32::from(r.relative_depth),
+            disc: u32::from(r.disc),
+            area_at_parent: u32::from(r.area_at_parent),
+            two_axis: u32::from(r.two_axis),
+            rgb_gain: u32::from(r.rgb_gain),
+            pad0: 0,
+            pad1: 0,
+            offset_bound: r.offset_bound.unwrap_or(0.0) as f32,
+            beta_z: r.beta_z as f32,
+            lambda_s: r.lambda_s as f32,
+            dlog_clamp: r.dlog_clamp as f32,
+            a_min: r.a_min as f32,
+            lowpass_target: r.lowpass_target as f32,
+            lowpass_input: r.lowpass_input as f32,
+            delta: r.delta as f32,
+        }
+    }
+
+    /// The context cameras as the kernels read them.
+    pub(super) fn cameras(&self) -> Vec<f32> {
+        let rows = self.cameras.iter().zip(self.near);
+        rows.flat_map(|(camera, &near)| camera_lanes(camera, near)).collect()
+    }
+
+    /// Head records and rows of `parents`.
+    pub(super) fn rows(&self, parents: &Range<usize>) -> [&'a [f32]; 2] {
+        let part = |of: &'a [f32], width: usize| {
+            of.get(parents.start * width..parents.end * width).unwrap_or(&[])
+        };
+        [part(self.head, self.rules.children() * HEAD_LANES), part(self.parents, SPLAT_LANES)]
+    }
+}
+
+/// In the order of kernels/shared/spgr.wgsl; bounds in f64, as the CPU takes them.
+fn camera_lanes(camera: &Camera, near: f32) -> [f32; SPGR_CAMERA_LANES] {
+    let k = camera.intrinsics;
+    let focal = [f64::from(k.fx), f64::from(k.fy)];
+    let centre = [f64::from(k.cx), f64::from(k.cy)];
+    let size = [k.width as f64, k.height as f64];
+    let r = camera.rotation();
+    let rotation = (0..3).flat_map(|i| r.row(i).to_array().map(f64::from));
+    let position = camera.position().to_array().map(f64::from);
+    let margin = |i: usize| FRUSTUM_MARGIN * 0.5 * size[i] / focal[i];
+    let bounds = [
+        -centre[0] / focal[0] - margin(0),
+        -centre[1] / focal[1] - margin(1),
+        (size[0] - centre[0]) / focal[0] + margin(0),
+        (size[1] - centre[1]) / focal[1] + margin(1),
+    ];
+    let least = (0.01 * f64::from(near)).max(1e-3);
+    let all = rotation.chain(position).chain(focal).chain(centre).chain(size);
+    let mut lanes = [0.0; SPGR_CAMERA_LANES];
+    for (lane, v) in lanes.iter_mut().zip(all.chain([least]).chain(bounds)) {
+        *lane = v as f32;
+    }
+    lanes
+}
+
+impl Gpu {
+    /// Children `[N·K, 11]` and gains `[N·K]` or `[N·K, 4]`. Numbers that are not finite
+    /// are the caller's to look for, in what comes and in what goes.
+    ///
+    /// # Errors
+    /// Lengths that do not fit; anything the device refuses.
+    pub fn spgr(&self, args: &SpgrArgs) -> Result<(Vec<f32>, Vec<f32>), GpuError> {
+        let n = args.check()?;
+        let (k, lanes) = (args.rules.children(), args.rules.gain_lanes());
+        let cameras = self.upload("context cameras", &args.cameras())?;
+        let (mut rows, mut gains) = (Vec::new(), Vec::new());
+        for parents in Self::chunks(n, self.rows_per_binding(k * HEAD_LANES.max(SPLAT_LANES))) {
+            let count = parents.len() * k;
+            let uniform = self.uniform(&args.uniform(&parents))?;
+            let [head, own] = args.rows(&parents);
+            let head = self.upload("head records", head)?;
+            let own = self.upload("parents", own)?;
+            let children = self.empty::<f32>("children", count * SPLAT_LANES)?;
+            let gain = self.empty::<f32>("gains", count * lanes)?;
+            let bindings = [&uniform, &head, &own, &cameras, &children, &gain];
+            let mut commands = self.commands("spgr", false);
+            let groups = Groups::of(parents.len(), THREADS);
+            commands.run(&SPGR, &[], &bindings.map(Binding::from), groups)?;
+            let children = commands.read::<f32>(&children, count * SPLAT_LANES)?;
+            let gain = commands.read::<f32>(&gain, count * lanes)?;
+            commands.submit()?;
+            rows.extend(children.take(self)?);
+            gains.extend(gain.take(self)?);
+        }
+        Ok((rows, gains))
+    }
+}

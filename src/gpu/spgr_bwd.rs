@@ -1,0 +1,141 @@
+//! Gradients of SPGR: twin of the backward half of [`crate::cpu::spgr`]. Kernels:
+//! kernels/spgr_bwd.wgsl, kernels/spgr_gains_bwd.wgsl.
+
+use crate::abi::{HEAD_LANES, Rules, SPLAT_LANES, SpgrGainsBwdUniform};
+use crate::gpu::buffers::Binding;
+use crate::gpu::commands::Groups;
+use crate::gpu::device::Gpu;
+use crate::gpu::error::GpuError;
+use crate::gpu::pipelines::{Access, Kernel};
+use crate::gpu::spgr::SpgrArgs;
+
+pub(crate) static SPGR_BWD: Kernel = Kernel {
+    name: "spgr_bwd",
+    entry: "main",
+    source: concat!(
+        include_str!("../../kernels/shared/abi.wgsl"),
+        include_str!("../../kernels/shared/grid.wgsl"),
+        include_str!("../../kernels/shared/math.wgsl"),
+        include_str!("../../kernels/shared/share.wgsl"),
+        include_str!("../../kernels/shared/spgr.wgsl"),
+        include_str!("../../kernels/spgr_bwd.wgsl"),
+    ),
+    bindings: &[
+        Access::Uniform,
+        Access::Read,
+        Access::Read,
+        Access::Read,
+        Access::Read,
+        Access::Write,
+        Access::Write,
+    ],
+};
+
+pub(crate) static SPGR_GAINS_BWD: Kernel = Kernel {
+    name: "spgr_gains_bwd",
+    entry: "main",
+    source: concat!(
+        include_str!("../../kernels/shared/abi.wgsl"),
+        include_str!("../../kernels/shared/grid.wgsl"),
+        include_str!("../../kernels/shared/math.wgsl"),
+        include_str!("../../kernels/spgr_gains_bwd.wgsl"),
+    ),
+    bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Write],
+};
+
+/// Threads of a workgroup.
+const THREADS: usize = 64;
+
+fn lengths(
+    kernel: &Kernel,
+    what: &'static str,
+    expected: usize,
+    got: usize,
+) -> Result<(), GpuError> {
+    if expected == got {
+        return Ok(());
+    }
+    let (expected, got) = (expected.to_string(), got.to_string());
+    Err(GpuError::Argument { kernel: kernel.name, what, expected, got })
+}
+
+impl Gpu {
+    /// Gradients of head records `[N, K, 11]` and parents `[N, 11]` for those of the
+    /// children, `grad` `[N·K, 11]`. The gains' lane of the former is 0.
+    ///
+    /// # Errors
+    /// Lengths that do not fit; anything the device refuses.
+    pub fn spgr_backward(
+        &self,
+        args: &SpgrArgs,
+        grad: &[f32],
+    ) -> Result<(Vec<f32>, Vec<f32>), GpuError> {
+        let n = args.check()?;
+        let k = args.rules.children();
+        lengths(&SPGR_BWD, "gradient of the children", n * k * SPLAT_LANES, grad.len())?;
+        let cameras = self.upload("context cameras", &args.cameras())?;
+        let (mut of_head, mut of_parents) = (Vec::new(), Vec::new());
+        for parents in Self::chunks(n, self.rows_per_binding(k * HEAD_LANES.max(SPLAT_LANES))) {
+            let count = parents.len() * k;
+            let from = parents.start * k * SPLAT_LANES;
+            let uniform = self.uniform(&args.uniform(&parents))?;
+            let [head, own] = args.rows(&parents);
+            let head = self.upload("head records", head)?;
+            let own = self.upload("parents", own)?;
+            let grad = grad.get(from..from + count * SPLAT_LANES).unwrap_or(&[]);
+            let grad = self.upload("gradient of the children", grad)?;
+            let d_head = self.empty::<f32>("gradient of the head", count * HEAD_LANES)?;
+            let floats = parents.len() * SPLAT_LANES;
+            let d_parents = self.empty::<f32>("gradient of the parents", floats)?;
+            let bindings = [&uniform, &head, &own, &cameras, &grad, &d_head, &d_parents];
+            let mut commands = self.commands("spgr_bwd", false);
+            let groups = Groups::of(parents.len(), THREADS);
+            commands.run(&SPGR_BWD, &[], &bindings.map(Binding::from), groups)?;
+            let d_head = commands.read::<f32>(&d_head, count * HEAD_LANES)?;
+            let d_parents = commands.read::<f32>(&d_parents, floats)?;
+            commands.submit()?;
+            of_head.extend(d_head.take(self)?);
+            of_parents.extend(d_parents.take(self)?);
+        }
+        Ok((of_head, of_parents))
+    }
+
+    /// Gradient `[N, K, 11]` of head records, zero but for the gains' lane, for that of the
+    /// gains, `grad` `[N·K]` or `[N·K, 4]`.
+    ///
+    /// # Errors
+    /// Lengths that do not fit; anything the device refuses.
+    pub fn spgr_gains_backward(
+        &self,
+        rules: &Rules,
+        head: &[f32],
+        grad: &[f32],
+    ) -> Result<Vec<f32>, GpuError> {
+        let (records, lanes) = (head.len() / HEAD_LANES, rules.gain_lanes());
+        lengths(&SPGR_GAINS_BWD, "head records", records * HEAD_LANES, head.len())?;
+        lengths(&SPGR_GAINS_BWD, "gradient of the gains", records * lanes, grad.len())?;
+        let mut out = Vec::with_capacity(head.len());
+        for part in Self::chunks(records, self.rows_per_binding(HEAD_LANES)) {
+            let uniform = self.uniform(&SpgrGainsBwdUniform {
+                records: part.len() as u32,
+                lanes: lanes as u32,
+                delta: rules.delta as f32,
+                pad: 0,
+            })?;
+            let rows = |of: &[f32], width: usize| {
+                of.get(part.start * width..part.end * width).unwrap_or(&[]).to_vec()
+            };
+            let head = self.upload("head records", &rows(head, HEAD_LANES))?;
+            let grad = self.upload("gradient of the gains", &rows(grad, lanes))?;
+            let floats = part.len() * HEAD_LANES;
+            let d_head = self.empty::<f32>("gradient of the head", floats)?;
+            let bindings = [&uniform, &head, &grad, &d_head].map(Binding::from);
+            let mut commands = self.commands("spgr_gains_bwd", false);
+            commands.run(&SPGR_GAINS_BWD, &[], &bindings, Groups::of(part.len(), THREADS))?;
+            let reading = commands.read::<f32>(&d_head, floats)?;
+            commands.submit()?;
+            out.extend(reading.take(self)?);
+        }
+        Ok(out)
+    }
+}

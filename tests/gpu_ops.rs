@@ -1,0 +1,190 @@
+//! Ops on a GPU against the same ops on the CPU, values and gradients, under every rule of
+//! SPGR's configuration; and what happens to a call that a GPU cannot take.
+
+#![cfg(feature = "gpu")]
+
+#[path = "common/gpu.rs"]
+mod adapter;
+#[path = "common/scenes.rs"]
+mod scenes;
+#[path = "common/spgr_calls.rs"]
+mod spgr_calls;
+
+use adapter::gpu;
+use candle_core::{DType, Result, Tensor, Var};
+use scenes::Random;
+use subsplat::abi::{Gather, Level, Rule};
+use subsplat::ops::Backend;
+use subsplat::ops::attention_gather::attention_gather_on;
+use subsplat::ops::plane_sweep::{Sweep, pair, plane_sweep_on};
+use subsplat::ops::redistribute::redistribute_on;
+use subsplat::ops::spgr::spgr_on;
+
+/// Of the largest number. Kernels agree to 4e-5 (tests/gpu_spgr.rs, tests/gpu_network.rs);
+/// needles in random parents, whose CPU gradients in f32 are themselves 3e-5 off, the rest.
+const ALLOWED: f64 = 2e-4;
+
+fn host(t: &Tensor) -> Vec<f64> {
+    t.to_dtype(DType::F64).unwrap().flatten_all().unwrap().to_vec1().unwrap()
+}
+
+/// Results of `f` on `backend`, then the gradients of Σ w·result in its inputs, for weights
+/// that are all different.
+fn run(
+    backend: &Backend,
+    inputs: &[&Tensor],
+    f: impl Fn(&Backend, &[Tensor]) -> Result<Vec<Tensor>>,
+) -> Vec<Vec<f64>> {
+    let variables: Vec<Var> = inputs.iter().map(|t| Var::from_tensor(t).unwrap()).collect();
+    let tensors: Vec<Tensor> = variables.iter().map(|v| v.as_tensor().clone()).collect();
+    let results = f(backend, &tensors).unwrap();
+    let mut loss = Tensor::zeros((), inputs[0].dtype(), inputs[0].device()).unwrap();
+    for r in &results {
+        let mut weights = Random(9);
+        let w = weights.tensor(r.dims(), 1.0, r.dtype());
+        loss = (loss + (r * w).unwrap().sum_all().unwrap()).unwrap();
+    }
+    let gradients = loss.backward().unwrap();
+    let of = |v: &Var| gradients.get(v).map(host).unwrap_or_default();
+    results.iter().map(host).chain(variables.iter().map(of)).collect()
+}
+
+/// `f` on the GPU against the CPU; the GPU refuses nothing.
+fn agrees(
+    name: &str,
+    backend: &Backend,
+    inputs: &[&Tensor],
+    f: impl Fn(&Backend, &[Tensor]) -> Result<Vec<Tensor>>,
+) {
+    let (got, expected) = (run(backend, inputs, &f), run(&Backend::Cpu, inputs, &f));
+    assert_eq!(backend.warning(), None, "{name}");
+    let mut same = true;
+    for (i, (got, expected)) in got.iter().zip(&expected).enumerate() {
+        assert_eq!(got.len(), expected.len(), "{name} {i}");
+        let largest = expected.iter().fold(1e-30f64, |m, v| m.max(v.abs()));
+        for (g, e) in got.iter().zip(expected) {
+            assert!((g - e).abs() <= ALLOWED * largest, "{name} {i}: {g} {e} of {largest}");
+        }
+        same &= got == expected;
+    }
+    // Other machines round otherwise: equal bytes would mean that one of them did both.
+    assert!(!same, "{name}: the GPU's result is the CPU's to the bit");
+}
+
+#[test]
+fn spgr_under_every_rule() {
+    let Some(gpu) = gpu() else { return };
+    let backend = Backend::from(gpu);
+    let mut r = Random(21);
+    for side in [2, 3] {
+        for (name, config) in spgr_calls::variants(side) {
+            let call = spgr_calls::call(&config, 8);
+            let parents = spgr_calls::parents(&call.cameras, &mut r);
+            let head = spgr_calls::head(128, side * side, 1.0, DType::F32, &mut r);
+            agrees(&name, &backend, &[&head, &parents], |backend, x| {
+                let (rows, gains) = spgr_on(backend, &x[0], &x[1], &call)?;
+                Ok(vec![rows, gains])
+            });
+        }
+    }
+}
+
+#[test]
+fn redistribution() {
+    let Some(gpu) = gpu() else { return };
+    let backend = Backend::from(gpu);
+    let mut r = Random(22);
+    let logits = r.tensor(&[300, 4], 3.0, DType::F32);
+    let areas = r.tensor(&[300, 4], 1.0, DType::F32).exp().unwrap();
+    let alphas = (r.tensor(&[300], 0.4, DType::F32) + 0.5).unwrap();
+    let alphas = alphas.clamp(0.01, 0.99).unwrap();
+    let own = r.tensor(&[300], 1.0, DType::F32).exp().unwrap();
+    for rule in [Rule::Linear, Rule::OpticalDepth, Rule::Transmittance, Rule::Area] {
+        let inputs = [&logits, &areas, &alphas, &own];
+        agrees(&format!("{rule:?}"), &backend, &inputs, |backend, x| {
+            Ok(vec![redistribute_on(backend, rule, &x[0], &x[1], &x[2], Some(&x[3]))?])
+        });
+    }
+}
+
+fn gather(points: usize) -> Gather {
+    Gather {
+        levels: vec![Level { height: 5, width: 7, first_cell: 0 }],
+        views: 2,
+        points,
+        points_per_level: false,
+        dim: 8,
+        groups: 2,
+        stride: 16,
+        key: Some(0),
+        value: 8,
+        logit_scale: 0.4,
+        renormalise: true,
+        half_pixel: true,
+        drop: None,
+        point_gradient: true,
+    }
+}
+
+/// Maps, query and points of 90 parents.
+fn gather_inputs(g: &Gather, dtype: DType) -> [Tensor; 3] {
+    let mut r = Random(23);
+    let points = (r.tensor(&[90, 2, g.points, 2], 0.3, dtype) + 0.5).unwrap();
+    [r.tensor(&[70, 16], 1.0, dtype), r.tensor(&[90, g.query_width()], 1.0, dtype), points]
+}
+
+#[test]
+fn attention() {
+    let Some(gpu) = gpu() else { return };
+    let backend = Backend::from(gpu);
+    let g = gather(4);
+    let [maps, query, points] = gather_inputs(&g, DType::F32);
+    agrees("gather", &backend, &[&maps, &query, &points], |backend, x| {
+        Ok(vec![attention_gather_on(backend, &x[0], &x[1], &x[2], g.clone())?])
+    });
+}
+
+#[test]
+fn sweep() {
+    let Some(gpu) = gpu() else { return };
+    let backend = Backend::from(gpu);
+    let cameras = scenes::cameras(2, 12, 9);
+    let k = cameras[0].intrinsics;
+    let to = |a: usize, b: usize| {
+        let pose = subsplat::ops::plane_sweep::relative_pose(&cameras[a], &cameras[b]);
+        pair(&k, &k, pose, b).unwrap()
+    };
+    let s = Sweep {
+        pairs: vec![vec![to(0, 1)], vec![to(1, 0)]],
+        depths: vec![vec![1.0, 1.5, 3.0, 10.0]; 2],
+        centre: 0.5,
+        min_z: 1e-3,
+        scale: 0.4,
+        channels: 6,
+        size: [9, 12],
+    };
+    let features = Random(24).tensor(&[2, 6, 9, 12], 1.0, DType::F32);
+    agrees("sweep", &backend, &[&features, &features], |backend, x| {
+        Ok(vec![plane_sweep_on(backend, &x[0], &x[1], s.clone())?])
+    });
+}
+
+/// More samples than the kernel holds, or double precision: the CPU's result, and a word.
+#[test]
+fn what_a_gpu_cannot_do_the_cpu_does() {
+    let Some(gpu) = gpu() else { return };
+    for (points, dtype, warns) in [(65, DType::F32, true), (4, DType::F64, false)] {
+        let backend = Backend::from(gpu.clone());
+        let g = gather(points);
+        let [maps, query, points] = gather_inputs(&g, dtype);
+        let of = |backend: &Backend| {
+            run(backend, &[&maps, &query, &points], |backend, x| {
+                Ok(vec![attention_gather_on(backend, &x[0], &x[1], &x[2], g.clone())?])
+            })
+        };
+        assert!(of(&backend) == of(&Backend::Cpu));
+        let warning = backend.warning();
+        assert_eq!(warning.is_some(), warns);
+        assert!(warning.is_none_or(|w| w.contains("samples per parent") && w.contains("128")));
+    }
+}
