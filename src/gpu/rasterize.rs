@@ -5,8 +5,8 @@
 //! the room for pairs grows when a frame's read-back says that it was too small.
 
 use crate::abi::{
-    FOOTPRINT_LANES, GPU_BLOCK, PLAN_ASKED, PLAN_EACH, PLAN_WORDS, RasterOptions, RasterUniform,
-    Rendered, Rules, ShBasis, ShDirection, SplatSlices, TILE_GPU,
+    BlendRules, FOOTPRINT_LANES, GPU_BLOCK, PLAN_ASKED, PLAN_EACH, PLAN_WORDS, RasterOptions,
+    RasterUniform, Rendered, ShBasis, ShDirection, SplatSlices, TILE_GPU,
 };
 use crate::camera::Camera;
 use crate::gpu::buffers::{Binding, Buffer, Reading};
@@ -292,7 +292,7 @@ fn uniform(
     channels: Channels,
 ) -> RasterUniform {
     let view = View::new(camera, options);
-    let rules = Rules::new(options.convention);
+    let rules = BlendRules::new(options.convention);
     let row = |i: usize| {
         let [x, y, z] = view.rows[i];
         [x, y, z, view.eye[i]]

@@ -114,11 +114,6 @@ impl SubSplat {
         }
     }
 
-    /// What stands behind the primaries.
-    pub fn trunk(&self) -> &Trunk {
-        &self.trunk
-    }
-
     /// World-frame primaries of what the backbone gave.
     ///
     /// # Errors
