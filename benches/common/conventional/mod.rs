@@ -3,6 +3,7 @@
 //! tests/conventional.rs holds them to the same references.
 
 pub mod attention;
+pub mod conv;
 pub mod project;
 pub mod raster;
 pub mod redistribute;

@@ -364,6 +364,8 @@ pub(crate) fn pack(plan: &Plan, layout: &Layout, x: &[f32], start: Axes, out: &m
     };
     let step = plan.src_step[2];
     for (x, channel) in x.chunks_exact(pixels).zip(out.chunks_mut(layout.channel)) {
+        // Narrow sums of weights multiply these by zeros.
+        channel[plan.planes.len() * layout.plane..].fill(0.0);
         for (phase, plane) in plan.planes.iter().zip(channel.chunks_exact_mut(layout.plane)) {
             let left = first[2] + phase[2] as isize;
             let begin = (-left).max(0).unsigned_abs().div_ceil(step).min(layout.pitch());
@@ -388,8 +390,11 @@ pub(crate) fn pack(plan: &Plan, layout: &Layout, x: &[f32], start: Axes, out: &m
                 match step {
                     1 => row.copy_from_slice(&src[..row.len()]),
                     2 => {
-                        let pairs = src.chunks(2);
+                        let (pairs, last) = src.as_chunks::<2>();
                         row.iter_mut().zip(pairs).for_each(|(v, pair)| *v = pair[0]);
+                        if let ([v], [x]) = (&mut row[pairs.len().min(past - begin)..], last) {
+                            *v = *x;
+                        }
                     }
                     _ => {
                         let picks = src.iter().step_by(step);

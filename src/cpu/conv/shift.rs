@@ -1,13 +1,14 @@
 //! The convolution itself: outputs of eight channels and 48 places in registers, all
 //! channels and taps of the source summed into them without a pause.
 
+use super::Buffers;
 use super::plan::{Axes, Layout, Plan, pack, starts};
 use crate::cpu::disjoint::Disjoint;
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
 use rayon::prelude::*;
 
 /// Output channels of a full block of weights.
-const ROWS: usize = 8;
+pub(super) const ROWS: usize = 8;
 /// Pieces of work that a call is cut into at least, where it can be.
 const JOBS: usize = 16;
 /// Floats past a packed tile's end that a strip may read and not use.
@@ -23,23 +24,26 @@ pub(crate) struct Weights {
 
 /// Output channels `first..first + rows`, their weights stored `pitch` apart.
 #[derive(Clone, Copy, Debug)]
-struct Block {
-    first: usize,
-    rows: usize,
-    pitch: usize,
+pub(super) struct Block {
+    pub first: usize,
+    pub rows: usize,
+    pub pitch: usize,
+}
+
+/// `channels` in blocks of [`ROWS`].
+pub(super) fn blocks(channels: usize) -> Vec<Block> {
+    let block = |first: usize| {
+        let rows = ROWS.min(channels - first);
+        Block { first, rows, pitch: rows.next_power_of_two() }
+    };
+    (0..channels).step_by(ROWS).map(block).collect()
 }
 
 impl Weights {
     /// Of `w` as the caller stores them.
     pub fn new(plan: &Plan, w: &[f32]) -> Self {
         let depth = plan.src_channels * plan.all_taps();
-        let blocks: Vec<Block> = (0..plan.dst_channels)
-            .step_by(ROWS)
-            .map(|first| {
-                let rows = ROWS.min(plan.dst_channels - first);
-                Block { first, rows, pitch: rows.next_power_of_two() }
-            })
-            .collect();
+        let blocks = blocks(plan.dst_channels);
         let floats = blocks.iter().map(|b| b.pitch * depth).sum();
         let mut data = vec![0.0; floats];
         data.par_chunks_mut((ROWS * depth).max(1)).zip(&blocks).for_each(|(panel, block)| {
@@ -86,21 +90,22 @@ pub(crate) fn run(tier: Tier, plan: &Plan, x: &[f32], w: &Weights, bias: &[f32],
     let parts = JOBS.div_ceil(tiles).min(w.blocks.len());
     let share = w.blocks.len().div_ceil(parts);
     let y = Disjoint::new(y);
-    (0..tiles * parts).into_par_iter().for_each_init(
-        || (Vec::new(), Vec::new()),
-        |(packed, sums), job| {
-            let (image, start) = (job / parts / starts.len(), starts[job / parts % starts.len()]);
-            let first = (job % parts * share).min(w.blocks.len());
-            let blocks = first..(first + share).min(w.blocks.len());
-            if blocks.is_empty() {
-                return;
-            }
-            packed.resize(plan.src_channels * layout.channel + SLACK, 0.0);
-            let x = &x[image * plan.src_channels * src..][..plan.src_channels * src];
+    (0..tiles * parts).into_par_iter().for_each(|job| {
+        let (image, start) = (job / parts / starts.len(), starts[job / parts % starts.len()]);
+        let first = (job % parts * share).min(w.blocks.len());
+        let blocks = first..(first + share).min(w.blocks.len());
+        if blocks.is_empty() {
+            return;
+        }
+        let x = &x[image * plan.src_channels * src..][..plan.src_channels * src];
+        Buffers::with(|buffers| {
+            let Buffers { x: packed, y: sums, .. } = buffers;
+            let packed = packed.room(plan.src_channels * layout.channel + SLACK);
+            let sums = sums.room(plan.passes.len() * ROWS * layout.flat().next_multiple_of(LANES));
             pack(plan, &layout, x, start, packed);
             tier.run(Job { plan, layout, packed, sums, w, blocks, bias, image, start, y: &y });
-        },
-    );
+        });
+    });
 }
 
 /// One tile and some blocks of channels.
@@ -108,7 +113,7 @@ struct Job<'a> {
     plan: &'a Plan,
     layout: Layout,
     packed: &'a [f32],
-    sums: &'a mut Vec<f32>,
+    sums: &'a mut [f32],
     w: &'a Weights,
     blocks: std::ops::Range<usize>,
     bias: &'a [f32],
@@ -125,10 +130,8 @@ impl Kernel for Job<'_> {
         let (plan, layout) = (self.plan, self.layout);
         let depth = plan.src_channels * plan.all_taps();
         let length = layout.flat().next_multiple_of(LANES);
-        self.sums.resize(plan.passes.len() * ROWS * length, 0.0);
         let offsets: Vec<Vec<usize>> =
             plan.passes.iter().map(|p| p.taps.iter().map(|t| layout.offset(t)).collect()).collect();
-        let farthest = offsets.iter().flatten().max().copied().unwrap_or(0);
         for index in self.blocks.clone() {
             let block = self.w.blocks[index];
             let panel = &self.w.data[index * ROWS * depth..][..block.pitch * depth];
@@ -139,8 +142,6 @@ impl Kernel for Job<'_> {
             let room = self.plan.grid()[0] - self.start[0];
             for d in 0..layout.tile[0].min(room) {
                 let x = &self.packed[d * layout.depth()..];
-                let last = plan.src_channels.saturating_sub(1) * layout.channel;
-                assert!(last + farthest + length <= x.len(), "conv: tile");
                 let mut from = 0;
                 for (p, offsets) in offsets.iter().enumerate() {
                     let n = plan.src_channels * offsets.len() * block.pitch;
@@ -219,20 +220,26 @@ impl Job<'_> {
 }
 
 /// One pass over one depth of a tile, for one block of channels.
-struct Strip<'a> {
-    x: &'a [f32],
-    channel: usize,
-    channels: usize,
-    offsets: &'a [usize],
-    w: &'a [f32],
-    bias: [f32; ROWS],
-    length: usize,
+pub(super) struct Strip<'a> {
+    pub x: &'a [f32],
+    /// Distance of channels in `x`.
+    pub channel: usize,
+    pub channels: usize,
+    /// Where taps read, from an output's own place.
+    pub offsets: &'a [usize],
+    /// `[channel][tap][channel of the block]`.
+    pub w: &'a [f32],
+    pub bias: [f32; ROWS],
+    /// Outputs, whole vectors.
+    pub length: usize,
 }
 
 impl Strip<'_> {
     /// Sums `[channel of the block][length]` of `pitch` channels.
     #[inline(always)]
-    fn run<S: Simd>(&self, s: S, pitch: usize, sums: &mut [f32]) {
+    pub fn run<S: Simd>(&self, s: S, pitch: usize, sums: &mut [f32]) {
+        let farthest = self.offsets.iter().max().copied().unwrap_or(0) + self.length;
+        assert!(self.channels.saturating_sub(1) * self.channel + farthest <= self.x.len());
         assert!(sums.len() >= pitch * self.length && self.length.is_multiple_of(LANES));
         assert!(self.w.len() >= self.channels * self.offsets.len() * pitch);
         if S::REGISTERS >= 32 {
@@ -301,7 +308,7 @@ impl Strip<'_> {
                 let mut v = [s.splat(0.0); N];
                 for n in 0..N {
                     // SAFETY: the last channel's farthest tap ends inside the packed
-                    // tile (asserted by `Job::run`).
+                    // tile (asserted by `run`).
                     v[n] = s.load(unsafe { &*from.wrapping_add(n * LANES).cast() });
                 }
                 for m in 0..M {

@@ -81,14 +81,28 @@ fn cases() -> Vec<Sizes> {
         flat(5, 17, [5, 5], 2, 2, [20, 33]),
         flat(4, 50, [3, 3], 1, 1, [16, 16]),
         flat(21, 110, [3, 3], 2, 1, [13, 10]),
+        flat(2, 100, [3, 3], 1, 1, [5, 20]),
         flat(3, 9, [3, 3], 1, 0, [6, 300]),
         flat(20, 2, [3, 3], 1, 1, [70, 140]),
         flat(2, 20, [1, 1], 3, 0, [7, 7]),
+        // By Winograd, borders within tiles, several blocks each way.
+        flat(24, 30, [3, 3], 1, 1, [30, 33]),
+        flat(41, 26, [3, 3], 1, 0, [36, 31]),
+        flat(33, 100, [3, 3], 1, 2, [22, 35]),
+        flat(25, 24, [3, 3], 1, 1, [70, 141]),
         solid(5, 8, [3, 3, 3], 1, [6, 7, 9]),
         solid(8, 1, [3, 3, 3], 1, [5, 4, 20]),
         solid(2, 11, [3, 1, 2], 1, [3, 4, 5]),
         solid(1, 3, [3, 3, 3], 1, [20, 3, 3]),
     ]
+}
+
+/// Bound of [`worst`] where Winograd is used, and where it is not.
+const WINOGRAD: f64 = 3e-6;
+const DIRECT: f64 = 1.5e-6;
+
+fn bound(plan: &Plan) -> f64 {
+    if winograd::suits(plan) { WINOGRAD } else { DIRECT }
 }
 
 /// Largest difference over the size of what is summed.
@@ -110,7 +124,7 @@ fn forward_agrees_with_the_definition() {
                 let mut y = vec![f32::NAN; 2 * s.out_channels * s.out_pixels()];
                 forward(tier, &s, &x, &w, &bias, &mut y);
                 let worst = worst(&y, &want, scale);
-                assert!(worst < 1e-6, "{tier:?} {s:?}: {worst:e}");
+                assert!(worst < bound(&Plan::forward(&s)), "{tier:?} {s:?}: {worst:e}");
             }
         }
     }
@@ -161,8 +175,8 @@ fn gradients_agree_with_the_definition() {
             weight_grad(tier, &s, &x, &dy, &mut dw);
             let worst_x = worst(&dx, &want_x, ((s.out_channels * s.taps()) as f64).sqrt());
             let worst_w = worst(&dw, &want_w, ((2 * s.out_pixels()) as f64).sqrt());
-            assert!(worst_x < 1e-6, "{tier:?} {s:?}: dx {worst_x:e}");
-            assert!(worst_w < 1e-6, "{tier:?} {s:?}: dw {worst_w:e}");
+            assert!(worst_x < bound(&Plan::input_grad(&s)), "{tier:?} {s:?}: dx {worst_x:e}");
+            assert!(worst_w < bound(&Plan::forward(&s)), "{tier:?} {s:?}: dw {worst_w:e}");
         }
     }
 }
@@ -189,17 +203,19 @@ fn threads_do_not_matter() {
     let w = noise(s.out_channels * s.in_channels * s.taps(), 9);
     let dy = noise(2 * s.out_channels * s.out_pixels(), 10);
     let run = |threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| {
-            let (mut y, mut dx, mut dw) = (dy.clone(), x.clone(), w.clone());
-            forward(Tier::best(), &s, &x, &w, &[], &mut y);
-            input_grad(Tier::best(), &s, &dy, &w, &mut dx);
-            weight_grad(Tier::best(), &s, &x, &dy, &mut dw);
-            [y, dx, dw].concat().iter().map(|v| v.to_bits()).collect::<Vec<_>>()
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().ok();
+        pool.map(|pool| {
+            pool.install(|| {
+                let (mut y, mut dx, mut dw) = (dy.clone(), x.clone(), w.clone());
+                forward(Tier::best(), &s, &x, &w, &[], &mut y);
+                input_grad(Tier::best(), &s, &dy, &w, &mut dx);
+                weight_grad(Tier::best(), &s, &x, &dy, &mut dw);
+                [y, dx, dw].concat().iter().map(|v| v.to_bits()).collect::<Vec<_>>()
+            })
         })
     };
     let one = run(1);
-    assert!(one == run(2) && one == run(5));
+    assert!(one.is_some() && one == run(2) && one == run(5));
 }
 
 #[test]

@@ -6,15 +6,20 @@
 //! neighbouring outputs, and lanes are added at the end.
 
 use super::plan::{Axes, Layout, Plan, Sizes, pack, starts};
+use super::winograd;
+use super::winograd_weights::{self, Finish, Products};
+use super::{Buffer, Buffers};
 use crate::cpu::disjoint::Disjoint;
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
 use rayon::prelude::*;
 use std::ops::Range;
 
 /// Rows of a register tile.
-const ROWS: usize = 8;
-/// Vectors of output channels of one job.
-const VECTORS: usize = 3;
+pub(super) const ROWS: usize = 8;
+/// Output channels of one job.
+pub(super) const LANES_WIDE: usize = 3 * LANES;
+/// Rows of a job come in multiples of this: register tiles of either kind divide it.
+const STEP: usize = 24;
 /// Outputs whose gradients are turned over at once.
 const CHUNK: usize = 128;
 /// Rows (channel × tap) of a job, at least, where there are as many.
@@ -36,45 +41,53 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
     }
     let images = x.len() / in_image;
     let plan = Plan::forward(s);
-    let narrow = o <= NARROW;
-    let outputs =
-        if narrow { o } else { o.div_ceil(o.div_ceil(VECTORS * LANES)).next_multiple_of(LANES) };
-    let channels = c.div_ceil((c * taps / DEPTH).clamp(1, c));
+    let way = Way::of(&plan, o);
+    let (outputs, channels) = match way {
+        Way::Narrow => (o, even(c, (c * taps).div_ceil(DEPTH))),
+        Way::Wide => {
+            let outputs = o.div_ceil(o.div_ceil(LANES_WIDE)).next_multiple_of(LANES);
+            (outputs, even(c, (c * taps / DEPTH).max(1)))
+        }
+        Way::Winograd => {
+            let parts = c.div_ceil(winograd_weights::CHANNELS);
+            (o, even(c, parts).next_multiple_of(ROWS))
+        }
+    };
     let parts: Vec<(usize, usize)> = (0..o)
         .step_by(outputs)
         .flat_map(|first| (0..c).step_by(channels).map(move |channel| (first, channel)))
         .collect();
-    let tile = plan.tile(channels, images, JOBS.div_ceil(parts.len()));
+    let tile = match way {
+        Way::Winograd => winograd_weights::tile(&plan),
+        _ => plan.tile(channels, images, JOBS.div_ceil(parts.len())),
+    };
     let layout = plan.layout(tile);
     let starts = starts(plan.grid(), tile);
     let units = images * starts.len();
-    let groups = JOBS.div_ceil(parts.len()).min(units);
+    let groups = match way {
+        Way::Winograd => winograd_weights::groups(&plan, units, parts.len(), JOBS),
+        _ => JOBS.div_ceil(parts.len()).min(units),
+    };
     let sums: Vec<Vec<f32>> = (0..parts.len() * groups)
         .into_par_iter()
-        .map_init(Scratch::default, |scratch, job| {
+        .map(|job| {
             let (part, group) = (job / groups, job % groups);
             let (first, channel) = parts[part];
             let work = Work {
                 plan: &plan,
                 layout,
                 outputs: first..(first + outputs).min(o),
+                pitch: way.pitch(outputs.min(o - first)),
                 rows: channels.min(c - channel) * taps,
-                dy_channels: o,
             };
-            let mut sums = vec![0.0; work.floats()];
-            for unit in units * group / groups..units * (group + 1) / groups {
+            let unit = |unit: usize| {
                 let (image, start) = (unit / starts.len(), starts[unit % starts.len()]);
                 let x = &x[image * in_image..][..in_image];
                 let x = &x[channel * s.in_pixels()..][..work.rows / taps * s.in_pixels()];
-                let dy = &dy[image * out_image..][..out_image];
-                scratch.x.resize(work.rows / taps * layout.channel + SLACK, 0.0);
-                pack(&plan, &layout, x, start, &mut scratch.x);
-                match narrow {
-                    true => tier.run(Narrow { work: &work, dy, start, scratch, sums: &mut sums }),
-                    false => tier.run(Wide { work: &work, dy, start, scratch, sums: &mut sums }),
-                }
-            }
-            sums
+                (x, &dy[image * out_image..][..out_image], start)
+            };
+            let units = (units * group / groups..units * (group + 1) / groups).map(unit);
+            Buffers::with(|buffers| way.sums(tier, &work, units, buffers))
         })
         .collect();
     let dw = Disjoint::new(dw);
@@ -85,7 +98,7 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
         }
         let rows = channels.min(c - channel) * taps;
         let outputs = first..(first + outputs).min(o);
-        let pitch = pitch(outputs.len());
+        let pitch = way.pitch(outputs.len());
         for (lane, output) in outputs.enumerate() {
             let at = (output * c + channel) * taps;
             // SAFETY: parts differ in outputs or channels.
@@ -96,34 +109,90 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
     });
 }
 
-/// Sums of one row, floats.
-fn pitch(outputs: usize) -> usize {
-    match outputs {
-        0..=NARROW => outputs.next_power_of_two(),
-        n => n.next_multiple_of(LANES),
+/// `n` in `parts` equal parts: the size of one.
+fn even(n: usize, parts: usize) -> usize {
+    n.div_ceil(parts.clamp(1, n.max(1))).max(1)
+}
+
+/// How the sums are made; see the top of this file and [`winograd_weights`].
+#[derive(Clone, Copy)]
+enum Way {
+    Narrow,
+    Wide,
+    Winograd,
+}
+
+impl Way {
+    fn of(plan: &Plan, outputs: usize) -> Self {
+        match outputs {
+            0..=NARROW => Self::Narrow,
+            _ if winograd::suits(plan) => Self::Winograd,
+            _ => Self::Wide,
+        }
+    }
+
+    /// Floats of one row of sums of so many outputs.
+    fn pitch(self, outputs: usize) -> usize {
+        match self {
+            Self::Narrow => outputs.next_power_of_two(),
+            Self::Wide | Self::Winograd => outputs.next_multiple_of(LANES),
+        }
+    }
+
+    /// Sums of one job over `units`: channels of x, ∂L/∂y of the same picture, and the
+    /// first output of a tile.
+    fn sums<'a>(
+        self,
+        tier: Tier,
+        work: &Work<'_>,
+        units: impl Iterator<Item = (&'a [f32], &'a [f32], Axes)>,
+        buffers: &mut Buffers,
+    ) -> Vec<f32> {
+        let mut sums = vec![0.0; work.floats()];
+        if let Self::Winograd = self {
+            // Apart, since `Products` uses the other buffers.
+            let mut own = std::mem::take(&mut buffers.products);
+            let products = own.room(winograd_weights::floats(work));
+            products.fill(0.0);
+            for (x, dy, start) in units {
+                tier.run(Products { work, x, dy, start, buffers, products });
+            }
+            tier.run(Finish { work, products, sums: &mut sums });
+            buffers.products = own;
+            return sums;
+        }
+        let channels = work.rows / work.plan.kernel_taps;
+        for (x, dy, start) in units {
+            let floats = channels * work.layout.channel;
+            let x_packed = buffers.x.room(floats + SLACK);
+            // Multiplied by zeros: it must be no NaN.
+            x_packed[floats..].fill(0.0);
+            pack(work.plan, &work.layout, x, start, x_packed);
+            let (x, turned) = (&*x_packed, &mut buffers.y);
+            let sums = &mut sums;
+            match self {
+                Self::Narrow => tier.run(Narrow { work, x, dy, start, turned, sums }),
+                _ => tier.run(Wide { work, x, dy, start, turned, sums }),
+            }
+        }
+        sums
     }
 }
 
-/// What a thread keeps from job to job.
-#[derive(Default)]
-struct Scratch {
-    x: Vec<f32>,
-    dy: Vec<f32>,
-}
-
 /// A range of output channels and rows (channel × tap).
-struct Work<'a> {
-    plan: &'a Plan,
-    layout: Layout,
-    outputs: Range<usize>,
-    rows: usize,
-    dy_channels: usize,
+pub(super) struct Work<'a> {
+    pub plan: &'a Plan,
+    pub layout: Layout,
+    pub outputs: Range<usize>,
+    /// Floats of one row of sums: the outputs, rounded up.
+    pub pitch: usize,
+    pub rows: usize,
 }
 
 impl Work<'_> {
     /// Sums of a job: `[rows rounded up][outputs rounded up]`.
     fn floats(&self) -> usize {
-        self.rows.next_multiple_of(ROWS * VECTORS) * pitch(self.outputs.len())
+        self.rows.next_multiple_of(STEP) * self.pitch
     }
 
     /// Where each row of the packed tile begins, the last one repeated.
@@ -133,11 +202,11 @@ impl Work<'_> {
             let r = r.min(self.rows - 1);
             r / taps.len() * self.layout.channel + self.layout.offset(&taps[r % taps.len()])
         };
-        (0..self.rows.next_multiple_of(ROWS * VECTORS)).map(row).collect()
+        (0..self.rows.next_multiple_of(STEP)).map(row).collect()
     }
 
     /// Outputs of the tile at `start` that exist.
-    fn inside(&self, start: Axes) -> Axes {
+    pub fn inside(&self, start: Axes) -> Axes {
         std::array::from_fn(|a| self.layout.tile[a].min(self.plan.dst_size[a] - start[a]))
     }
 
@@ -145,16 +214,16 @@ impl Work<'_> {
     /// picture row apart.
     fn dy_at(&self, output: usize, start: Axes, d: usize) -> usize {
         let [depth, height, width] = self.plan.dst_size;
-        debug_assert!(output < self.dy_channels);
         ((output * depth + start[0] + d) * height + start[1]) * width + start[2]
     }
 }
 
 struct Wide<'a, 'b> {
     work: &'a Work<'b>,
+    x: &'a [f32],
     dy: &'a [f32],
     start: Axes,
-    scratch: &'a mut Scratch,
+    turned: &'a mut Buffer,
     sums: &'a mut [f32],
 }
 
@@ -166,17 +235,15 @@ impl Kernel for Wide<'_, '_> {
         let (work, layout) = (self.work, self.work.layout);
         let [depth, height, width] = work.inside(self.start);
         let offsets = work.offsets();
-        let pitch = pitch(work.outputs.len());
+        let pitch = work.pitch;
         let rows = (CHUNK / width).clamp(1, height);
-        self.scratch.dy.resize(rows * width * pitch, 0.0);
-        let farthest = offsets.iter().max().copied().unwrap_or(0);
+        let turned = self.turned.room(rows * width * pitch);
         for d in 0..depth {
             for first in (0..height).step_by(rows) {
                 let count = rows.min(height - first);
-                let turned = &mut self.scratch.dy[..count * width * pitch];
-                let x = &self.scratch.x[d * layout.depth() + first * layout.pitch()..];
+                let turned = &mut turned[..count * width * pitch];
+                let x = &self.x[d * layout.depth() + first * layout.pitch()..];
                 turn(s, work, self.dy, (self.start, d, first), [count, width], turned);
-                assert!(farthest + (count - 1) * layout.pitch() + width <= x.len());
                 let tile = Tile { x, x_pitch: layout.pitch(), dy: turned, pitch, count, width };
                 for (offsets, sums) in
                     offsets.as_chunks().0.iter().zip(self.sums.chunks_exact_mut(ROWS * pitch))
@@ -190,7 +257,7 @@ impl Kernel for Wide<'_, '_> {
 
 /// ∂L/∂y of `[rows, width]` outputs, turned over to `[output][channel]`.
 #[inline(always)]
-fn turn<S: Simd>(
+pub(super) fn turn<S: Simd>(
     s: S,
     work: &Work<'_>,
     dy: &[f32],
@@ -198,7 +265,7 @@ fn turn<S: Simd>(
     [rows, width]: [usize; 2],
     out: &mut [f32],
 ) {
-    let pitch = pitch(work.outputs.len());
+    let pitch = work.pitch;
     let row_pitch = work.plan.dst_size[2];
     // Whole rows lie one behind the other.
     let (runs, run) = if row_pitch == width { (1, rows * width) } else { (rows, width) };
@@ -241,19 +308,23 @@ fn turn<S: Simd>(
 }
 
 /// Some rows of a tile and their turned gradients.
-struct Tile<'a> {
-    x: &'a [f32],
-    x_pitch: usize,
-    dy: &'a [f32],
-    pitch: usize,
-    count: usize,
-    width: usize,
+pub(super) struct Tile<'a> {
+    pub x: &'a [f32],
+    /// Distance of rows in `x`.
+    pub x_pitch: usize,
+    /// `[count][width][pitch]`.
+    pub dy: &'a [f32],
+    pub pitch: usize,
+    pub count: usize,
+    pub width: usize,
 }
 
 impl Tile<'_> {
     /// Adds to `[ROWS][pitch]` sums.
     #[inline(always)]
-    fn rows<S: Simd>(&self, s: S, offsets: &[usize; ROWS], sums: &mut [f32]) {
+    pub fn rows<S: Simd>(&self, s: S, offsets: &[usize; ROWS], sums: &mut [f32]) {
+        let farthest = offsets.iter().max().copied().unwrap_or(0) + self.width;
+        assert!(farthest + self.count.saturating_sub(1) * self.x_pitch <= self.x.len());
         assert!(self.dy.len() >= self.count * self.width * self.pitch);
         assert!(sums.len() >= ROWS * self.pitch);
         if S::REGISTERS >= 32 {
@@ -302,7 +373,7 @@ impl Tile<'_> {
                     v[n] = s.load(unsafe { &*dy.wrapping_add(n * LANES).cast() });
                 }
                 for m in 0..M {
-                    // SAFETY: the farthest row ends inside x (asserted by `run`).
+                    // SAFETY: the farthest row ends inside x (asserted by `rows`).
                     let x = s.splat(unsafe { *x[m].wrapping_add(i) });
                     for n in 0..N {
                         acc[m][n] = s.fma(x, v[n], acc[m][n]);
@@ -322,9 +393,10 @@ impl Tile<'_> {
 
 struct Narrow<'a, 'b> {
     work: &'a Work<'b>,
+    x: &'a [f32],
     dy: &'a [f32],
     start: Axes,
-    scratch: &'a mut Scratch,
+    turned: &'a mut Buffer,
     sums: &'a mut [f32],
 }
 
@@ -336,26 +408,24 @@ impl Kernel for Narrow<'_, '_> {
         let (work, layout) = (self.work, self.work.layout);
         let [depth, height, width] = work.inside(self.start);
         let offsets = work.offsets();
-        let pitch = pitch(work.outputs.len());
+        let pitch = work.pitch;
         let length = layout.flat().next_multiple_of(LANES);
         let row_pitch = work.plan.dst_size[2];
-        self.scratch.dy.clear();
-        self.scratch.dy.resize(pitch * length, 0.0);
+        let packed = self.turned.room(pitch * length);
+        packed.fill(0.0);
         let farthest = offsets.iter().max().copied().unwrap_or(0);
         for d in 0..depth {
             // Zeros wherever the tile has no output.
-            for (output, plane) in
-                work.outputs.clone().zip(self.scratch.dy.chunks_exact_mut(length))
-            {
+            for (output, plane) in work.outputs.clone().zip(packed.chunks_exact_mut(length)) {
                 let at = work.dy_at(output, self.start, d);
                 for r in 0..height {
                     let from = &self.dy[at + r * row_pitch..][..width];
                     plane[r * layout.pitch()..][..width].copy_from_slice(from);
                 }
             }
-            let x = &self.scratch.x[d * layout.depth()..];
+            let x = &self.x[d * layout.depth()..];
             assert!(farthest + length <= x.len());
-            let dots = Dots { x, dy: &self.scratch.dy, length };
+            let dots = Dots { x, dy: packed, length };
             if S::REGISTERS >= 32 {
                 match pitch {
                     8 => dots.run::<S, 8, 3>(s, &offsets, self.sums),
