@@ -77,8 +77,6 @@ fn training_step(bench: &mut Bench) -> Result<()> {
     if !bench.wants(name) {
         return Ok(());
     }
-    // As a training does.
-    subsplat::cpu::memory::keep_freed();
     let weights = Weights::seeded(3).trainable();
     let net = SmallBackbone::new(&Small::standard(), weights.builder().pp("small"))?;
     // The untrained start closes most branches.

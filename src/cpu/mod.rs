@@ -25,7 +25,6 @@ pub mod join;
 pub mod lanes;
 pub mod matching;
 pub mod math;
-pub mod memory;
 pub mod norm;
 pub mod plane_sweep;
 mod project;
