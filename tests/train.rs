@@ -220,9 +220,20 @@ fn the_weights_that_are_written_are_a_model() {
     let model = subsplat::pipeline::Reconstructor::load(&path, None).unwrap();
     assert_eq!(*model.config(), config.model_config().unwrap());
     assert!(model.untrained_tensors().is_empty() && model.unexpected_tensors().is_empty());
-    // And a start for another training, of other parts too.
+    // And a start for another training.
     let mut next = tiny("render");
-    next.init = subsplat::train::config::Start::Weights { path };
+    next.init = subsplat::train::config::Start::Weights { path, opacity: 2.0 };
+    let begun = tempfile::tempdir().unwrap();
+    let begun = Training::open(&next, begun.path()).unwrap().optimizer().averaged().unwrap();
+    for (name, tensor) in training.optimizer().averaged().unwrap() {
+        let flat = |t: &candle_core::Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let (mut want, got) = (flat(&tensor), flat(&begun[&name]));
+        if name == "small.head.1.bias" {
+            *want.last_mut().unwrap() += 2.0;
+        }
+        assert_eq!(want, got, "{name}");
+    }
+    // But not for one whose parts have other shapes.
     next.model.set = serde_json::from_str(
         &serde_json::to_string(&next.model.set)
             .unwrap()

@@ -99,7 +99,7 @@ impl Default for Model {
 }
 
 /// Weights to begin with.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Start {
     /// Drawn from the seed.
@@ -111,6 +111,11 @@ pub enum Start {
     Weights {
         /// The file.
         path: PathBuf,
+        /// Added to the logit of the small backbone's opacities at the start. After the
+        /// depth phase opacity is an honest confidence, squared, and so a picture dark
+        /// with what shines through; 2 makes it cover.
+        #[serde(default)]
+        opacity: f32,
     },
 }
 
@@ -296,7 +301,7 @@ impl TrainConfig {
             other => other,
         })?;
         let folder = path.parent().unwrap_or(Path::new(""));
-        if let Start::Weights { path } = &mut config.init {
+        if let Start::Weights { path, .. } = &mut config.init {
             *path = folder.join(&*path);
         }
         if let Some(path) = &mut config.loss.lpips_weights {
@@ -421,11 +426,18 @@ impl TrainConfig {
 
     fn check_together(&self) -> Result<()> {
         let config = self.model_config()?;
+        let small = matches!(config.backbone, Backbone::Small(_));
         let stride = config.stride();
         let [w, h] = self.data.input;
         if w == 0 || h == 0 || w % stride != 0 || h % stride != 0 {
             let expected = format!("multiples of {stride}");
             return Err(Error::value("data.input", expected, format!("{w}x{h}")));
+        }
+        if let Start::Weights { opacity, .. } = &self.init
+            && (!opacity.is_finite() || (!small && *opacity != 0.0))
+        {
+            let expected = "a finite number, and 0 but for the small backbone";
+            return Err(Error::value("init.opacity", expected, opacity));
         }
         if self.loss.lpips > 0.0 && self.loss.lpips_weights.is_none() {
             return Err(Error::value(
@@ -434,7 +446,6 @@ impl TrainConfig {
                 self.loss.lpips,
             ));
         }
-        let small = matches!(config.backbone, Backbone::Small(_));
         if self.phase == Phase::Depth && !small {
             return Err(Error::value("phase", "`render` for MVSplat's backbone", "depth"));
         }

@@ -10,6 +10,7 @@ use super::validate::{self, Found, Validator};
 use super::{Error, Result};
 use crate::io;
 use crate::model::weights::{self, Weights};
+use candle_core::Tensor;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -94,11 +95,22 @@ fn source(config: &TrainConfig) -> Result<Arc<dyn Source>> {
     Ok(Arc::new(Replay::new(rooms, config.data.window, config.data.replay)))
 }
 
+/// Its last element is the small backbone's correction of the opacity logit.
+const OPACITY_BIAS: &str = "small.head.1.bias";
+
 /// The weights that `config` begins with, trainable.
 fn start(config: &TrainConfig) -> Result<Weights> {
     Ok(match &config.init {
         Start::Scratch => Weights::seeded(config.seed),
-        Start::Weights { path } => Weights::load(path)?.allow_missing("", config.seed),
+        Start::Weights { path, opacity } => {
+            let mut tensors = Weights::load(path)?.tensors().clone();
+            if let Some(bias) = tensors.get_mut(OPACITY_BIAS).filter(|_| *opacity != 0.0) {
+                let mut values = bias.flatten_all()?.to_vec1::<f32>()?;
+                values.iter_mut().rev().take(1).for_each(|last| *last += opacity);
+                *bias = Tensor::from_vec(values, bias.shape(), bias.device())?;
+            }
+            Weights::from_tensors(tensors).allow_missing("", config.seed)
+        }
     }
     .trainable())
 }
