@@ -233,13 +233,13 @@ fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
             Ok(())
         }));
     }
-    let mut run = move || {
+    let run = move || {
         input_grad(tier, s, dy, w, &mut dx);
         weight_grad(tier, s, x, dy, &mut dw);
         bias_grad(s.out_pixels(), dy, &mut db);
         Ok(())
     };
-    let ours = Contender::new("ours, backward", Threads::All, move || run());
+    let ours = Contender::new("ours, backward", Threads::All, run);
     contenders.push(ours.with_work(case.work(2.0)?));
     bench.group(name, contenders, "input, weight and bias; ratios to the forward pass")
 }

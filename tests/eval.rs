@@ -143,8 +143,9 @@ fn methods_are_what_they_say() {
     let mut large = Vec::new();
     for i in 0..128usize * 128 {
         let (x, y) = (i % 128, i / 128);
-        let beside =
-            |v: usize| if v % 2 == 0 { (v / 2).saturating_sub(1) } else { (v / 2 + 1).min(63) };
+        let beside = |v: usize| {
+            if v.is_multiple_of(2) { (v / 2).saturating_sub(1) } else { (v / 2 + 1).min(63) }
+        };
         for c in 0..3 {
             let at = |x: usize, y: usize| small[3 * (64 * y + x) + c];
             let row = |y: usize| 0.75 * at(x / 2, y) + 0.25 * at(beside(x), y);

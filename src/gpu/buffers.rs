@@ -186,8 +186,10 @@ impl Gpu {
     ) -> Result<Buffer, GpuError> {
         let buffer = self.empty::<T>(what, data.len())?;
         if !data.is_empty() {
-            let write = || Ok(self.queue.write_buffer(buffer.raw(), 0, bytemuck::cast_slice(data)));
-            self.checked(what, write)?;
+            self.checked(what, || {
+                self.queue.write_buffer(buffer.raw(), 0, bytemuck::cast_slice(data));
+                Ok(())
+            })?;
         }
         Ok(buffer)
     }

@@ -72,7 +72,7 @@ impl Gpu {
         };
         let children = splats.children_per_parent();
         let sh_stride = 3 * sh_coefficients(splats.sh_degree);
-        let gain_lanes = if n == 0 { 0 } else { splats.gain.len() / n };
+        let gain_lanes = splats.gain.len().checked_div(n).unwrap_or(0);
         let most = [stride * children, sh_stride, gain_lanes * children]
             .into_iter()
             .map(|floats| self.rows_per_binding(floats))

@@ -71,11 +71,7 @@ pub fn attention_gather_on(
     maps.contiguous()?.apply_op3(&query.contiguous()?, &points.contiguous()?, op)
 }
 
-struct AttentionGather(
-    Gather,
-    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "the GPU's path reads it"))]
-    Backend,
-);
+struct AttentionGather(Gather, Backend);
 
 impl CustomOp3 for AttentionGather {
     fn name(&self) -> &'static str {

@@ -123,11 +123,7 @@ pub fn warped(source: &Tensor, sweep: &Sweep, pair: usize, candidates: &[usize])
     Tensor::stack(&planes, 0)?.reshape((r, candidates.len(), c, h, w))?.transpose(1, 2)
 }
 
-struct Op(
-    Sweep,
-    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "the GPU's path reads it"))]
-    Backend,
-);
+struct Op(Sweep, Backend);
 
 impl Op {
     fn gradients(&self, reference: &[f32], source: &[f32], grad: &[f32]) -> (Vec<f32>, Vec<f32>) {

@@ -69,11 +69,7 @@ pub fn redistribute_on(
 
 /// On logits `[P, K]`, areas `[P, K]` and, `[1, P]` or `[2, P]`, the parents'
 /// opacities and own areas.
-struct Redistribute(
-    Rule,
-    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "the GPU's path reads it"))]
-    Backend,
-);
+struct Redistribute(Rule, Backend);
 
 const NAME: &str = "redistribute";
 

@@ -180,12 +180,7 @@ fn finite_number<T: Number>(v: T) -> bool {
 }
 
 /// Children `[N·K, 11]` of head records and parents.
-struct Children(
-    Spgr,
-    Made,
-    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "the GPU's path reads it"))]
-    Backend,
-);
+struct Children(Spgr, Made, Backend);
 
 impl CustomOp2 for Children {
     fn name(&self) -> &'static str {

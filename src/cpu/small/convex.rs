@@ -207,21 +207,19 @@ impl Job<'_> {
                 let mut d = [[0f32; LANES]; NEIGHBOURS];
                 let mut mean = [0f32; LANES];
                 let from = (4 * y + self.fine / 4) * 4 * w + 4 * x + self.fine % 4;
-                for m in 0..2 {
+                for ((grad, around), sums) in self.grads.iter().zip(self.around).zip(&mut *sums) {
                     let mut g = [0f32; LANES];
-                    for (g, v) in
-                        g.iter_mut().zip(self.grads[m][from..].iter().step_by(4)).take(count)
-                    {
+                    for (g, v) in g.iter_mut().zip(grad[from..].iter().step_by(4)).take(count) {
                         *g = *v;
                     }
                     for k in 0..NEIGHBOURS {
                         let at = (y + k / 3) * (w + 2) + x + k % 3;
-                        let v = lanes(self.around[m], at, count);
+                        let v = lanes(around, at, count);
                         for l in 0..LANES {
                             d[k][l] += g[l] * v[l];
                             mean[l] += p[k][l] * g[l] * v[l];
                         }
-                        for (l, sum) in sums[m][at..at + count].iter_mut().enumerate() {
+                        for (l, sum) in sums[at..at + count].iter_mut().enumerate() {
                             *sum += p[k][l] * g[l];
                         }
                     }
