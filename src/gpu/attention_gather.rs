@@ -6,19 +6,19 @@ use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel};
+use crate::gpu::pipelines::{Access, Kernel, wgsl};
 use std::ops::Range;
 
 pub(crate) static ATTENTION_GATHER: Kernel = Kernel {
     name: "attention_gather",
     entry: "main",
-    source: concat!(
-        include_str!("../../kernels/shared/abi.wgsl"),
-        include_str!("../../kernels/shared/grid.wgsl"),
-        include_str!("../../kernels/shared/wide.wgsl"),
-        include_str!("../../kernels/shared/gather.wgsl"),
-        include_str!("../../kernels/shared/gather_samples.wgsl"),
-        include_str!("../../kernels/attention_gather.wgsl"),
+    source: wgsl!(
+        "shared/abi",
+        "shared/grid",
+        "shared/wide",
+        "shared/gather",
+        "shared/gather_samples",
+        "attention_gather"
     ),
     bindings: &[
         Access::Uniform,

@@ -7,19 +7,19 @@ use crate::gpu::buffers::{Binding, Buffer};
 use crate::gpu::commands::Groups;
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel};
+use crate::gpu::pipelines::{Access, Kernel, wgsl};
 use std::ops::Range;
 
 pub(crate) static ATTENTION_GATHER_BWD: Kernel = Kernel {
     name: "attention_gather_bwd",
     entry: "main",
-    source: concat!(
-        include_str!("../../kernels/shared/abi.wgsl"),
-        include_str!("../../kernels/shared/grid.wgsl"),
-        include_str!("../../kernels/shared/wide.wgsl"),
-        include_str!("../../kernels/shared/gather.wgsl"),
-        include_str!("../../kernels/shared/gather_samples.wgsl"),
-        include_str!("../../kernels/attention_gather_bwd.wgsl"),
+    source: wgsl!(
+        "shared/abi",
+        "shared/grid",
+        "shared/wide",
+        "shared/gather",
+        "shared/gather_samples",
+        "attention_gather_bwd"
     ),
     bindings: &[
         Access::Uniform,
@@ -37,12 +37,7 @@ pub(crate) static ATTENTION_GATHER_BWD: Kernel = Kernel {
 pub(crate) static ATTENTION_GATHER_SCATTER: Kernel = Kernel {
     name: "attention_gather_scatter",
     entry: "main",
-    source: concat!(
-        include_str!("../../kernels/shared/abi.wgsl"),
-        include_str!("../../kernels/shared/grid.wgsl"),
-        include_str!("../../kernels/shared/gather.wgsl"),
-        include_str!("../../kernels/attention_gather_scatter.wgsl"),
-    ),
+    source: wgsl!("shared/abi", "shared/grid", "shared/gather", "attention_gather_scatter"),
     bindings: &[
         Access::Uniform,
         Access::Read,

@@ -7,17 +7,13 @@ use crate::gpu::buffers::{Binding, Buffer};
 use crate::gpu::commands::{Commands, Groups};
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel};
+use crate::gpu::pipelines::{Access, Kernel, wgsl};
 
 const fn entry(entry: &'static str) -> Kernel {
     Kernel {
         name: "invert",
         entry,
-        source: concat!(
-            include_str!("../../kernels/shared/abi.wgsl"),
-            include_str!("../../kernels/shared/grid.wgsl"),
-            include_str!("../../kernels/invert.wgsl"),
-        ),
+        source: wgsl!("shared/abi", "shared/grid", "invert"),
         bindings: &[Access::Uniform, Access::Read, Access::Write, Access::Write, Access::Write],
     }
 }

@@ -9,6 +9,14 @@ use crate::gpu::error::GpuError;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
+/// Files under kernels/, joined.
+macro_rules! wgsl {
+    ($($file:literal),+ $(,)?) => {
+        concat!($(include_str!(concat!("../../kernels/", $file, ".wgsl"))),+)
+    };
+}
+pub(crate) use wgsl;
+
 /// How a kernel uses an argument.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Access {

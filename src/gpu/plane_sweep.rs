@@ -6,19 +6,13 @@ use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel};
+use crate::gpu::pipelines::{Access, Kernel, wgsl};
 use std::ops::Range;
 
 pub(crate) static PLANE_SWEEP: Kernel = Kernel {
     name: "plane_sweep",
     entry: "main",
-    source: concat!(
-        include_str!("../../kernels/shared/abi.wgsl"),
-        include_str!("../../kernels/shared/grid.wgsl"),
-        include_str!("../../kernels/shared/sweep.wgsl"),
-        include_str!("../../kernels/shared/sweep_taps.wgsl"),
-        include_str!("../../kernels/plane_sweep.wgsl"),
-    ),
+    source: wgsl!("shared/abi", "shared/grid", "shared/sweep", "shared/sweep_taps", "plane_sweep"),
     bindings: &[
         Access::Uniform,
         Access::Read,

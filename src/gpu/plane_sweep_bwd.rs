@@ -6,20 +6,20 @@ use crate::gpu::buffers::{Binding, Buffer};
 use crate::gpu::commands::Groups;
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel};
+use crate::gpu::pipelines::{Access, Kernel, wgsl};
 use crate::gpu::plane_sweep::PlaneSweepArgs;
 use std::ops::Range;
 
 pub(crate) static PLANE_SWEEP_TAPS: Kernel = Kernel {
     name: "plane_sweep_taps",
     entry: "main",
-    source: concat!(
-        include_str!("../../kernels/shared/abi.wgsl"),
-        include_str!("../../kernels/shared/grid.wgsl"),
-        include_str!("../../kernels/shared/sweep.wgsl"),
-        include_str!("../../kernels/shared/sweep_taps.wgsl"),
-        include_str!("../../kernels/shared/sweep_rows.wgsl"),
-        include_str!("../../kernels/plane_sweep_taps.wgsl"),
+    source: wgsl!(
+        "shared/abi",
+        "shared/grid",
+        "shared/sweep",
+        "shared/sweep_taps",
+        "shared/sweep_rows",
+        "plane_sweep_taps"
     ),
     bindings: &[
         Access::Uniform,
@@ -37,12 +37,7 @@ pub(crate) static PLANE_SWEEP_TAPS: Kernel = Kernel {
 pub(crate) static PLANE_SWEEP_REFERENCE_BWD: Kernel = Kernel {
     name: "plane_sweep_reference_bwd",
     entry: "main",
-    source: concat!(
-        include_str!("../../kernels/shared/abi.wgsl"),
-        include_str!("../../kernels/shared/grid.wgsl"),
-        include_str!("../../kernels/shared/sweep.wgsl"),
-        include_str!("../../kernels/plane_sweep_reference_bwd.wgsl"),
-    ),
+    source: wgsl!("shared/abi", "shared/grid", "shared/sweep", "plane_sweep_reference_bwd"),
     bindings: &[
         Access::Uniform,
         Access::Read,
@@ -56,12 +51,12 @@ pub(crate) static PLANE_SWEEP_REFERENCE_BWD: Kernel = Kernel {
 pub(crate) static PLANE_SWEEP_SOURCE_BWD: Kernel = Kernel {
     name: "plane_sweep_source_bwd",
     entry: "main",
-    source: concat!(
-        include_str!("../../kernels/shared/abi.wgsl"),
-        include_str!("../../kernels/shared/grid.wgsl"),
-        include_str!("../../kernels/shared/sweep.wgsl"),
-        include_str!("../../kernels/shared/sweep_rows.wgsl"),
-        include_str!("../../kernels/plane_sweep_source_bwd.wgsl"),
+    source: wgsl!(
+        "shared/abi",
+        "shared/grid",
+        "shared/sweep",
+        "shared/sweep_rows",
+        "plane_sweep_source_bwd"
     ),
     bindings: &[
         Access::Uniform,

@@ -1,14 +1,7 @@
 //! Texts and arguments of the rasterizer's kernels, in the order of a frame.
 
 use crate::gpu::pipelines::Access::{Read, Uniform, Write};
-use crate::gpu::pipelines::Kernel;
-
-/// Files under kernels/, joined.
-macro_rules! wgsl {
-    ($($file:literal),+ $(,)?) => {
-        concat!($(include_str!(concat!("../../kernels/", $file, ".wgsl"))),+)
-    };
-}
+use crate::gpu::pipelines::{Kernel, wgsl};
 
 pub(crate) static PROJECT: Kernel = Kernel {
     name: "project",

@@ -6,19 +6,13 @@ use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel};
+use crate::gpu::pipelines::{Access, Kernel, wgsl};
 use std::ops::Range;
 
 pub(crate) static REDISTRIBUTE: Kernel = Kernel {
     name: "redistribute",
     entry: "main",
-    source: concat!(
-        include_str!("../../kernels/shared/abi.wgsl"),
-        include_str!("../../kernels/shared/grid.wgsl"),
-        include_str!("../../kernels/shared/math.wgsl"),
-        include_str!("../../kernels/shared/share.wgsl"),
-        include_str!("../../kernels/redistribute.wgsl"),
-    ),
+    source: wgsl!("shared/abi", "shared/grid", "shared/math", "shared/share", "redistribute"),
     bindings: &[
         Access::Uniform,
         Access::Read,

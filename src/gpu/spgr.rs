@@ -9,19 +9,19 @@ use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel};
+use crate::gpu::pipelines::{Access, Kernel, wgsl};
 use std::ops::Range;
 
 pub(crate) static SPGR: Kernel = Kernel {
     name: "spgr",
     entry: "main",
-    source: concat!(
-        include_str!("../../kernels/shared/abi.wgsl"),
-        include_str!("../../kernels/shared/grid.wgsl"),
-        include_str!("../../kernels/shared/math.wgsl"),
-        include_str!("../../kernels/shared/share.wgsl"),
-        include_str!("../../kernels/shared/spgr.wgsl"),
-        include_str!("../../kernels/spgr.wgsl"),
+    source: wgsl!(
+        "shared/abi",
+        "shared/grid",
+        "shared/math",
+        "shared/share",
+        "shared/spgr",
+        "spgr"
     ),
     bindings: &[
         Access::Uniform,

@@ -6,19 +6,19 @@ use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
-use crate::gpu::pipelines::{Access, Kernel};
+use crate::gpu::pipelines::{Access, Kernel, wgsl};
 use crate::gpu::spgr::SpgrArgs;
 
 pub(crate) static SPGR_BWD: Kernel = Kernel {
     name: "spgr_bwd",
     entry: "main",
-    source: concat!(
-        include_str!("../../kernels/shared/abi.wgsl"),
-        include_str!("../../kernels/shared/grid.wgsl"),
-        include_str!("../../kernels/shared/math.wgsl"),
-        include_str!("../../kernels/shared/share.wgsl"),
-        include_str!("../../kernels/shared/spgr.wgsl"),
-        include_str!("../../kernels/spgr_bwd.wgsl"),
+    source: wgsl!(
+        "shared/abi",
+        "shared/grid",
+        "shared/math",
+        "shared/share",
+        "shared/spgr",
+        "spgr_bwd"
     ),
     bindings: &[
         Access::Uniform,
@@ -34,12 +34,7 @@ pub(crate) static SPGR_BWD: Kernel = Kernel {
 pub(crate) static SPGR_GAINS_BWD: Kernel = Kernel {
     name: "spgr_gains_bwd",
     entry: "main",
-    source: concat!(
-        include_str!("../../kernels/shared/abi.wgsl"),
-        include_str!("../../kernels/shared/grid.wgsl"),
-        include_str!("../../kernels/shared/math.wgsl"),
-        include_str!("../../kernels/spgr_gains_bwd.wgsl"),
-    ),
+    source: wgsl!("shared/abi", "shared/grid", "shared/math", "spgr_gains_bwd"),
     bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Write],
 };
 
