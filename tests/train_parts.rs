@@ -8,6 +8,7 @@ use candle_core::{Device, Tensor, Var};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use subsplat::camera::{Camera, Intrinsics};
+use subsplat::data::dataset::Posed;
 use subsplat::data::procedural::{ExampleSpec, TargetSpec};
 use subsplat::io::image::Rgb;
 use subsplat::metrics;
@@ -15,7 +16,7 @@ use subsplat::train::loading::Loader;
 use subsplat::train::loss::{self, Scored, with_gradient};
 use subsplat::train::optimizer::{Optimizer, Settings};
 use subsplat::train::schedule::{NamedWarmup, Schedule, Warmup};
-use subsplat::train::source::{Augmentation, Example, Picture, Replay, Rooms, Source, mirror};
+use subsplat::train::source::{Augmentation, Example, Replay, Rooms, Source};
 
 /// In [0, 1), the same every time.
 fn noise(n: usize, seed: u32) -> Vec<f32> {
@@ -308,9 +309,8 @@ fn the_mirror_keeps_the_geometry() {
     let camera = Camera::new(k, pose).unwrap();
     let data = (0..32 * 24 * 3).map(|i| (i % 251) as u8).collect();
     let image = Rgb { width: 32, height: 24, data };
-    let picture = Picture { image, camera };
-    let mut mirrored = picture.clone();
-    mirror(&mut mirrored);
+    let picture = Posed { image, camera };
+    let mirrored = picture.flipped();
     assert_eq!(mirrored.image.data[..3], picture.image.data[31 * 3..32 * 3]);
     let rotation = mirrored.camera.rotation();
     assert!((rotation.determinant() - 1.0).abs() < 1e-5);
@@ -319,8 +319,7 @@ fn the_mirror_keeps_the_geometry() {
         let after = mirrored.camera.project(glam::Vec3::new(-p.x, p.y, p.z)).unwrap();
         assert!((after.x - (32.0 - before.x)).abs() < 1e-4 && (after.y - before.y).abs() < 1e-4);
     }
-    mirror(&mut mirrored);
-    assert_eq!(mirrored.image, picture.image);
+    assert_eq!(mirrored.flipped().image, picture.image);
 }
 
 #[test]

@@ -2,8 +2,9 @@
 //! ever learnt from them.
 
 use super::Result;
-use super::source::{Example, Picture};
+use super::source::Example;
 use crate::data::crop::{CropOptions, crop};
+use crate::data::dataset::Posed;
 use crate::data::depth::depth_range;
 use crate::io::protocol::{Views, load_protocol};
 use crate::io::scene::{Scene, load_scene};
@@ -43,10 +44,10 @@ pub fn pairs(folder: &Path, stride: usize) -> Result<Vec<Arc<Example>>> {
 
 fn pair(scene: &Scene, test: &Views, stride: usize) -> Result<Example> {
     let options = CropOptions::square(SIDE, 1, stride);
-    let load = |&i: &usize| -> Result<Picture> {
+    let load = |&i: &usize| -> Result<Posed> {
         let (photo, camera) = scene.frames[i].load()?;
         let cropped = crop(&photo, &camera, &options)?;
-        Ok(Picture { image: cropped.input, camera: cropped.input_camera })
+        Ok(Posed { image: cropped.input, camera: cropped.input_camera })
     };
     let range = depth_range(scene, &test.context, (None, None))?;
     Ok(Example {

@@ -2,31 +2,21 @@
 //! training is resumed by a number.
 
 use super::Result;
-use crate::camera::Camera;
+use crate::data::dataset::Posed;
 use crate::data::procedural::{self, ExampleSpec, TargetSpec};
 use crate::io::image::Rgb;
-use glam::{Mat4, Vec4};
 use half::f16;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// A picture and its camera.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Picture {
-    /// Display values.
-    pub image: Rgb,
-    /// Pinhole camera of these pixels.
-    pub camera: Camera,
-}
-
 /// What one step learns from, of one scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Example {
     /// Views that the network sees; all of one size.
-    pub context: Vec<Picture>,
+    pub context: Vec<Posed>,
     /// Views that it is to predict, at target size.
-    pub targets: Vec<Picture>,
+    pub targets: Vec<Posed>,
     /// 1 / camera z of each context view's pixels, 0 where there is no surface. Empty
     /// where depth is unknown.
     pub inverse_depth: Vec<Vec<f16>>,
@@ -83,7 +73,7 @@ impl Source for Rooms {
         for (i, (view, camera)) in made.views.iter().zip(&made.cameras).enumerate() {
             let data = view.rgb.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8).collect();
             let image = Rgb { width: view.width, height: view.height, data };
-            pictures.push(Picture { image, camera: *camera });
+            pictures.push(Posed { image, camera: *camera });
             if i < 2 {
                 let inverse = |z: &f32| f16::from_f32(if *z > 0.0 { 1.0 / z } else { 0.0 });
                 inverse_depth.push(view.depth.iter().map(inverse).collect());
@@ -186,7 +176,9 @@ impl Augmentation {
         let draw = |what: u64| share(word(seed, 0xA0_6E), index * 8 + what);
         let mut out = example.clone();
         if draw(0) < self.flip {
-            out.context.iter_mut().chain(&mut out.targets).for_each(mirror);
+            for view in out.context.iter_mut().chain(&mut out.targets) {
+                *view = view.flipped();
+            }
             for (map, view) in out.inverse_depth.iter_mut().zip(&out.context) {
                 map.chunks_mut(view.image.width.max(1)).for_each(<[f16]>::reverse);
             }
@@ -206,17 +198,4 @@ impl Augmentation {
         }
         out
     }
-}
-
-/// The picture and the world in a mirror that swaps left and right: x becomes −x in
-/// the world and in the camera.
-pub fn mirror(picture: &mut Picture) {
-    let (w, camera) = (picture.image.width, &mut picture.camera);
-    for row in picture.image.data.chunks_mut((3 * w).max(1)) {
-        row.reverse();
-        row.chunks_exact_mut(3).for_each(<[u8]>::reverse);
-    }
-    let flip = Mat4::from_diagonal(Vec4::new(-1.0, 1.0, 1.0, 1.0));
-    camera.world_from_camera = flip * camera.world_from_camera * flip;
-    camera.intrinsics.cx = w as f32 - camera.intrinsics.cx;
 }

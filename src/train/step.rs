@@ -3,10 +3,11 @@
 use super::config::{Phase, TrainConfig};
 use super::loss::{self, Scored, with_gradient};
 use super::optimizer::{Gradients, Optimizer};
-use super::source::{Example, Picture};
+use super::source::Example;
 use super::{Error, Result};
 use crate::abi::RasterOptions;
 use crate::config::{Backbone, Config};
+use crate::data::dataset::Posed;
 use crate::model::backbone::small::DepthMaps;
 use crate::model::lpips::Lpips;
 use crate::model::primaries::primaries;
@@ -397,7 +398,7 @@ impl Learner {
         Ok(Seen { gradients, terms })
     }
 
-    fn picture_loss(&self, rgb: &Tensor, target: &Picture) -> Result<(Tensor, Terms)> {
+    fn picture_loss(&self, rgb: &Tensor, target: &Posed) -> Result<(Tensor, Terms)> {
         let w = &self.config.loss;
         let (_, height, width) = rgb.dims3()?;
         let (x, truth) = (flat(rgb)?, target.image.to_planes());

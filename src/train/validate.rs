@@ -4,9 +4,10 @@
 use super::Result;
 use super::config::{Phase, TrainConfig};
 use super::loss::{block_median, candidate_index};
-use super::source::{Example, Picture, Rooms, Source, word};
+use super::source::{Example, Rooms, Source, word};
 use super::step::{raster_options, views_of};
 use crate::config::{Backbone, Config};
+use crate::data::dataset::Posed;
 use crate::io::image::{Rgb, save_png};
 use crate::metrics::{psnr, ssim};
 use crate::model::subsplat::SubSplat;
@@ -217,8 +218,8 @@ struct One {
 }
 
 /// The context view whose eye is nearer to the target's.
-fn nearer<'a>(scene: &'a Example, target: &'a Picture) -> &'a Rgb {
-    let distance = |p: &Picture| p.camera.position().distance(target.camera.position());
+fn nearer<'a>(scene: &'a Example, target: &'a Posed) -> &'a Rgb {
+    let distance = |p: &Posed| p.camera.position().distance(target.camera.position());
     let best = scene.context.iter().min_by(|a, b| distance(a).total_cmp(&distance(b)));
     best.map_or(&target.image, |p| &p.image)
 }
