@@ -9,8 +9,10 @@ use crate::gpu::error::GpuError;
 use bytemuck::Pod;
 use std::marker::PhantomData;
 use std::ops::Range;
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
-use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
+use std::sync::mpsc::{RecvTimeoutError, channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 use wgpu::BufferUsages;
 
 /// What a buffer of the pool is for.
@@ -41,6 +43,9 @@ impl Use {
 const GRAIN: u64 = 256;
 /// Bytes of a kernel's smallest argument, an array of one vec4.
 const LEAST: u64 = 16;
+/// How long a thread whose poll found the device idle waits for another thread, whose
+/// poll took the mapping's answer, to hand it over.
+const HANDOVER: Duration = Duration::from_secs(60);
 
 /// Buffers that wait for their next use.
 #[derive(Debug)]
@@ -82,10 +87,17 @@ struct Inner {
     purpose: Use,
     bytes: u64,
     pool: Arc<Pool>,
+    /// Its mapping failed, so no one can say what state it is in.
+    spoilt: AtomicBool,
 }
 
 impl Drop for Inner {
     fn drop(&mut self) {
+        if self.spoilt.load(Relaxed) {
+            self.pool.held.fetch_sub(self.raw.size(), Relaxed);
+            self.raw.destroy();
+            return;
+        }
         let mut free = self.pool.free.lock().unwrap_or_else(PoisonError::into_inner);
         free.push((self.purpose, self.raw.clone()));
     }
@@ -172,7 +184,8 @@ impl Gpu {
             }
         };
         let bytes = bytes.max(LEAST).next_multiple_of(4);
-        Ok(Buffer(Arc::new(Inner { raw, purpose, bytes, pool: self.pool.clone() })))
+        let (pool, spoilt) = (self.pool.clone(), AtomicBool::new(false));
+        Ok(Buffer(Arc::new(Inner { raw, purpose, bytes, pool, spoilt })))
     }
 
     /// `data` in device memory.
@@ -262,19 +275,20 @@ impl<T: Pod> Reading<T> {
         }
         let refused =
             |reason: String| GpuError::Refused { what: "the read-back".to_owned(), reason };
-        let mapped = Arc::new(OnceLock::new());
-        let signal = mapped.clone();
-        gpu.checked("the read-back", || {
+        let read = gpu.checked("the read-back", || {
             let slice = self.staging.raw().slice(..self.staging.bytes());
+            let (answer, answered) = channel();
             slice.map_async(wgpu::MapMode::Read, move |done| {
-                signal.get_or_init(|| done.map_err(|e| e.to_string()));
+                // The receiver is gone only where this read-back was given up.
+                answer.send(done).ok();
             });
             let waited = gpu.device.poll(wgpu::PollType::wait_indefinitely());
             waited.map_err(|e| refused(e.to_string()))?;
-            match mapped.get() {
-                Some(Ok(())) => {}
-                Some(Err(e)) => return Err(refused(e.clone())),
-                None => return Err(refused("the device did not answer".to_owned())),
+            match answered.recv_timeout(HANDOVER) {
+                Ok(done) => done.map_err(|e| refused(e.to_string()))?,
+                Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => {
+                    return Err(refused("the device did not answer".to_owned()));
+                }
             }
             let view = slice.get_mapped_range().map_err(|e| refused(e.to_string()))?;
             let to: &mut [u8] = bytemuck::cast_slice_mut(out);
@@ -284,6 +298,10 @@ impl<T: Pod> Reading<T> {
             drop(view);
             self.staging.raw().unmap();
             Ok(())
-        })
+        });
+        if read.is_err() {
+            self.staging.0.spoilt.store(true, Relaxed);
+        }
+        read
     }
 }
