@@ -1,8 +1,8 @@
 // (splat, tile) pairs in order of depth: which splats touch which tile, exactly. Twin:
 // src/cpu/tiles.rs.
 //
-// In: splats by depth, the place of each one's first pair.  Out: tile and splat of every
-// pair. Exactly as many pairs as were counted, whatever a compiler made of the arithmetic
+// In: splats by depth, the place of each one's first pair.  Out: tile and splat (owner) of
+// every pair. Exactly as many pairs as were counted, whatever a compiler made of the arithmetic
 // there and here: what lacks goes to the tile behind the last, which is not drawn.
 
 @group(0) @binding(0) var<uniform> call: RasterUniform;
@@ -12,7 +12,7 @@
 @group(0) @binding(4) var<storage, read> counts: array<u32>;
 @group(0) @binding(5) var<storage, read> offsets: array<u32>;
 @group(0) @binding(6) var<storage, read_write> tiles: array<u32>;
-@group(0) @binding(7) var<storage, read_write> splats: array<u32>;
+@group(0) @binding(7) var<storage, read_write> owners: array<u32>;
 
 @compute @workgroup_size(64)
 fn main(
@@ -46,12 +46,12 @@ fn main(
         }
         for (var column = span.x; column < span.y && next < past; column++) {
             tiles[next] = line * call.columns + column;
-            splats[next] = i;
+            owners[next] = i;
             next++;
         }
     }
     for (; next < past; next++) {
         tiles[next] = call.columns * call.rows;
-        splats[next] = i;
+        owners[next] = i;
     }
 }

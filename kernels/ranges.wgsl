@@ -1,5 +1,6 @@
-// First and past-the-last pair of every tile, from pairs sorted by tile; tiles without
-// pairs keep what the buffer was cleared to. One thread per pair.
+// First and past-the-last pair of every tile, and of the place behind the last tile, from
+// pairs sorted by tile; tiles without pairs keep what the buffer was cleared to. One thread
+// per pair.
 
 @group(0) @binding(0) var<uniform> call: RasterUniform;
 @group(0) @binding(1) var<storage, read> plan: array<u32>;
@@ -18,9 +19,6 @@ fn main(
         return;
     }
     let tile = tiles[i];
-    if tile >= call.columns * call.rows {
-        return;
-    }
     if i == 0u || tiles[max(i, 1u) - 1u] != tile {
         ranges[2u * tile] = i;
     }

@@ -3,13 +3,16 @@
 // below 1/255; blending stops before the splat that would take T to `stop` or below.
 //
 // Out: RGB over the background, 1 − T, Σ w·z: channel c of pixel p at p·step + c·channel,
-// then H·W alphas and H·W depth sums.
+// then H·W alphas and H·W depth sums. For the way back, per pixel: the bits of T, and the
+// place in the sorted pairs behind the last splat that was blended.
 
 @group(0) @binding(0) var<uniform> call: RasterUniform;
 @group(0) @binding(1) var<storage, read> footprints: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read> ranges: array<u32>;
-@group(0) @binding(3) var<storage, read> splats: array<u32>;
-@group(0) @binding(4) var<storage, read_write> picture: array<f32>;
+@group(0) @binding(3) var<storage, read> pairs: array<u32>;
+@group(0) @binding(4) var<storage, read> owners: array<u32>;
+@group(0) @binding(5) var<storage, read_write> picture: array<f32>;
+@group(0) @binding(6) var<storage, read_write> finals: array<vec2<u32>>;
 
 var<workgroup> batch_a: array<vec4<f32>, 256>;
 var<workgroup> batch_b: array<vec4<f32>, 256>;
@@ -41,6 +44,7 @@ fn main(
     }
     let first = ranges[2u * tile];
     let past = ranges[2u * tile + 1u];
+    var end = first;
     var t = 1.0;
     var sum = vec4<f32>(0.0);
     for (var base = first; base < past; base += 256u) {
@@ -52,7 +56,7 @@ fn main(
             break;
         }
         if base + lane < past {
-            let i = splats[base + lane];
+            let i = owners[pairs[base + lane]];
             batch_a[lane] = footprints[3u * i];
             batch_b[lane] = footprints[3u * i + 1u];
             batch_c[lane] = footprints[3u * i + 2u];
@@ -61,17 +65,13 @@ fn main(
         if goes {
             let count = min(256u, past - base);
             for (var s = 0u; s < count; s++) {
-                let a = batch_a[s];
                 let b = batch_b[s];
-                let d = pixel - a.xy;
-                let across = (d.x + a.w * d.y) * a.z;
-                let down = d.y * b.x;
-                let power = b.y - across * across - down * down;
+                let power = exponent(b, whitened(batch_a[s], b, pixel));
                 if power < ALPHA_MIN_LOG2 {
                     continue;
                 }
                 let alpha = min(exp2(power), call.alpha_max);
-                let rest = t - alpha * t;
+                let rest = t * (1.0 - alpha);
                 if rest <= call.stop {
                     goes = false;
                     atomicSub(&live, 1u);
@@ -79,6 +79,7 @@ fn main(
                 }
                 sum += alpha * t * vec4<f32>(batch_c[s].xyz, b.z);
                 t = rest;
+                end = base + s + 1u;
             }
         }
     }
@@ -92,5 +93,6 @@ fn main(
         picture[at + 2u * call.channel] = rgb.z;
         picture[3u * plane + p] = 1.0 - t;
         picture[4u * plane + p] = sum.w;
+        finals[p] = vec2<u32>(bitcast<u32>(t), end);
     }
 }

@@ -12,7 +12,7 @@ mod sweep;
 mod uniforms;
 
 pub(crate) use frame::lanes_at;
-pub use frame::{BlendRules, Geometry, Rendered, SplatSlices};
+pub use frame::{BlendRules, Geometry, Gradients, Rendered, SplatSlices};
 pub use gather::{Drop, GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, Gather, Level};
 pub use spgr::{CHILDREN_MAX, DISC_AREA_SQ_MIN, Rules, SPGR_CAMERA_LANES};
 pub use sweep::{Pair, SWEEP_PAIR_LANES, Sweep};
@@ -82,6 +82,9 @@ pub const OPACITY_MAX: f32 = 1e36;
 pub const TILE_GPU: usize = 16;
 /// Floats of a projected splat in the GPU kernels (kernels/shared/raster.wgsl).
 pub const FOOTPRINT_LANES: usize = 12;
+/// Sums over pixels that the rasterizer's backward kernels keep per (splat, tile) pair:
+/// of ∂L/∂ln α times six moments, of weights times four gradients.
+pub const PAIR_SUMS: usize = 10;
 /// Elements that a workgroup of the GPU's sort and prefix sum takes.
 pub const GPU_BLOCK: usize = 2048;
 /// Place of a number in the plan of a sort: elements.

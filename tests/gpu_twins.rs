@@ -88,3 +88,25 @@ fn arguments_that_do_not_fit_are_named() {
     let error = gpu.redistribute(&RedistributeArgs { k: 0, ..args }).unwrap_err();
     assert!(matches!(error, GpuError::Argument { .. }), "{error}");
 }
+
+/// Threads that read back at the same time each get their own answer, though one thread's
+/// poll may finish another's mapping.
+#[test]
+fn threads_get_their_own_answers() {
+    let Some(gpu) = gpu() else { return };
+    let gpu = &gpu;
+    std::thread::scope(|scope| {
+        for thread in 0..16u32 {
+            scope.spawn(move || {
+                for round in 0..40u32 {
+                    // Descending keys of another length in every thread and round.
+                    let count = 1 + (37 * thread + 11 * round) % 300;
+                    let keys: Vec<u32> = (0..count).map(|i| 7 * (count - i) + thread).collect();
+                    let expected: Vec<u32> = (0..count).rev().collect();
+                    let got = gpu.sort_order(&keys);
+                    assert!(got.as_ref() == Ok(&expected), "{thread} {round}: {got:?}");
+                }
+            });
+        }
+    });
+}

@@ -4,51 +4,16 @@
 mod common;
 #[path = "common/raster_case.rs"]
 mod raster_case;
+#[path = "common/raster_gradients.rs"]
+mod raster_gradients;
 
 use common::shared;
 use glam::{DVec3, Mat4, Vec3};
 use raster_case::{File, degree_of, rows};
+use raster_gradients::{check, part, planes, worst_row};
 use subsplat::abi::{Convention, RasterOptions, SPLAT_LANES};
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::cpu::{Geometry, Gradients, Rasterizer, SplatSlices};
-
-/// `[5, H, W]` from the gradients of rgb `[H, W, 3]` and alpha `[H, W]`; depth gets none.
-fn planes(v_rgb: &[f32], v_alpha: &[f32]) -> Vec<f32> {
-    let n = v_alpha.len();
-    let mut out = vec![0.0; 5 * n];
-    for p in 0..n {
-        for c in 0..3 {
-            out[c * n + p] = v_rgb[3 * p + c];
-        }
-        out[3 * n + p] = v_alpha[p];
-    }
-    out
-}
-
-/// Largest error over rows of `lanes` numbers, as the README measures it:
-/// max|difference| / (max|row| + median of max|row| over non-zero rows).
-fn worst_row(got: &[f32], expected: &[f32], lanes: usize) -> f32 {
-    assert_eq!(got.len(), expected.len());
-    let most = |row: &[f32]| row.iter().fold(0.0f32, |m, v| m.max(v.abs()));
-    let mut sizes: Vec<f32> = expected.chunks(lanes).map(most).filter(|&m| m > 0.0).collect();
-    assert!(!sizes.is_empty(), "nothing to compare with");
-    sizes.sort_by(f32::total_cmp);
-    let median = sizes[sizes.len() / 2];
-    let mut worst = 0.0f32;
-    for (g, e) in got.chunks(lanes).zip(expected.chunks(lanes)) {
-        let difference = g.iter().zip(e).fold(0.0f32, |m, (g, e)| {
-            assert!(g.is_finite(), "{g} for {e}");
-            m.max((g - e).abs())
-        });
-        worst = worst.max(difference / (most(e) + median));
-    }
-    worst
-}
-
-/// Numbers `from..from + N` of every packed row.
-fn part(rows: &[f32], from: usize, lanes: usize) -> Vec<f32> {
-    rows.chunks_exact(SPLAT_LANES).flat_map(|r| r[from..from + lanes].to_vec()).collect()
-}
 
 fn check_case(name: &str) {
     let Some(path) = shared(&format!("fixtures/raster/{name}.safetensors")) else { return };
@@ -70,29 +35,7 @@ fn check_case(name: &str) {
     let mut got = Gradients::default();
     Rasterizer::new().backward(&splats, &camera, &options, &upstream, &mut got);
 
-    let tolerance = if name == "needles" { 2e-3 } else { 5e-4 };
-    let mut report = String::new();
-    let mut check = |what: &str, got: &[f32], lanes: usize| {
-        let e = worst_row(got, file.get(&format!("grad.{what}")), lanes);
-        report += &format!(" {what} {e:.1e}");
-        assert!(e < tolerance, "{name} {what}: {e}");
-    };
-    if cov {
-        check("means", &got.means, 3);
-        check("cov6", &got.cov6, 6);
-        check("opacities", &got.opacities, 1);
-    } else {
-        check("means", &part(&got.rows, 0, 3), 3);
-        check("quats", &part(&got.rows, 3, 4), 4);
-        check("scales", &part(&got.rows, 7, 3), 3);
-        check("opacities", &part(&got.rows, 10, 1), 1);
-    }
-    check("sh", &got.sh, file.tensors["sh"].1.len() / splats.parents());
-    if !gain.is_empty() {
-        check("gain", &got.gain, 1);
-    }
-    check("background", &got.background, 3);
-    eprintln!("{name}:{report}");
+    check(name, &file, &got, splats.parents());
 }
 
 macro_rules! cases {

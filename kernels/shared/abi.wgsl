@@ -22,6 +22,7 @@ const SPAN_SLACK_PX: f32 = 1e-3;
 const OPACITY_MAX: f32 = 1e36;
 const TILE_GPU: u32 = 16u;
 const FOOTPRINT_LANES: u32 = 12u;
+const PAIR_SUMS: u32 = 10u;
 const GPU_BLOCK: u32 = 2048u;
 const PLAN_COUNT: u32 = 3u;
 const PLAN_BLOCKS: u32 = 4u;

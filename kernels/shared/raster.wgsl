@@ -49,6 +49,18 @@ struct Footprint {
     half_height: f32,
 }
 
+// Distance of a pixel from a splat's mean in coordinates in which the splat is round;
+// `a` and `b` are the first two vec4 of its footprint.
+fn whitened(a: vec4<f32>, b: vec4<f32>, pixel: vec2<f32>) -> vec2<f32> {
+    let d = pixel - a.xy;
+    return vec2<f32>((d.x + a.w * d.y) * a.z, d.y * b.x);
+}
+
+// log2 of alpha there, before the cap.
+fn exponent(b: vec4<f32>, d: vec2<f32>) -> f32 {
+    return b.y - d.x * d.x - d.y * d.y;
+}
+
 // Where exponents have fallen by this much, alpha is below 1/255; with slack.
 fn support(power: f32) -> f32 {
     let reach = power - ALPHA_MIN_LOG2;

@@ -91,6 +91,50 @@ pub(crate) fn lanes_at<const L: usize>(from: &[f32], at: usize) -> [f32; L] {
     from.get(at..at + L).and_then(|s| s.try_into().ok()).unwrap_or([0.0; L])
 }
 
+/// Gradients of a scalar loss with respect to what [`SplatSlices`] holds, in its
+/// layouts; buffers are reused from call to call. Splats that were dropped, and all that
+/// no pixel saw, have zeros.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Gradients {
+    /// `[N, 11]` for [`Geometry::Packed`], lanes as in [`crate::abi`] (the quaternion's
+    /// through its normalisation); else empty.
+    pub rows: Vec<f32>,
+    /// `[N, 3]` for [`Geometry::Cov6`], else empty.
+    pub means: Vec<f32>,
+    /// `[N, 6]` for [`Geometry::Cov6`], else empty; an off-diagonal number stands for
+    /// both entries of the matrix.
+    pub cov6: Vec<f32>,
+    /// `[N]` for [`Geometry::Cov6`], else empty.
+    pub opacities: Vec<f32>,
+    /// `[P, D, 3]`: summed over the children of each parent.
+    pub sh: Vec<f32>,
+    /// As long as [`SplatSlices::gain`].
+    pub gain: Vec<f32>,
+    /// RGB of the background.
+    pub background: [f32; 3],
+}
+
+impl Gradients {
+    /// Gives every buffer the length that `splats` asks for.
+    pub(crate) fn fit(&mut self, splats: &SplatSlices) {
+        let n = splats.len();
+        let packed = matches!(splats.geometry, Geometry::Packed(_));
+        let (packed, cov) = if packed { (n, 0) } else { (0, n) };
+        self.rows.resize(packed * SPLAT_LANES, 0.0);
+        self.means.resize(3 * cov, 0.0);
+        self.cov6.resize(6 * cov, 0.0);
+        self.opacities.resize(cov, 0.0);
+        self.sh.resize(splats.sh.len(), 0.0);
+        self.gain.resize(splats.gain.len(), 0.0);
+    }
+
+    /// Zeros for `splats`.
+    pub(crate) fn clear(&mut self, splats: &SplatSlices) {
+        *self = Self::default();
+        self.fit(splats);
+    }
+}
+
 /// A rendered picture, row-major.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Rendered {

@@ -20,6 +20,7 @@ mod invert;
 mod pipelines;
 mod plane_sweep;
 mod plane_sweep_bwd;
+mod raster_bwd;
 mod raster_kernels;
 mod rasterize;
 mod redistribute;
@@ -37,6 +38,7 @@ pub use device::Gpu;
 pub use error::GpuError;
 pub use pipelines::{Access, Kernel};
 pub use plane_sweep::PlaneSweepArgs;
+pub use raster_bwd::Frame;
 pub use rasterize::Rasterizer;
 pub use redistribute::RedistributeArgs;
 pub use scene::Scene;
@@ -56,6 +58,10 @@ pub const KERNELS: &[&Kernel] = &[
     &raster_kernels::INTERSECT,
     &raster_kernels::RANGES,
     &raster_kernels::RASTERIZE,
+    &raster_kernels::RASTERIZE_BWD,
+    &raster_kernels::PAIR_SUMS,
+    &raster_kernels::PROJECT_BWD,
+    &raster_kernels::COLOUR_BWD,
     &redistribute::REDISTRIBUTE,
     &show::SHOW,
     &attention_gather::ATTENTION_GATHER,

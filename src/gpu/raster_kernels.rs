@@ -77,5 +77,48 @@ pub(crate) static RASTERIZE: Kernel = Kernel {
     name: "rasterize",
     entry: "main",
     source: wgsl!("shared/abi", "shared/grid", "shared/raster", "rasterize"),
+    bindings: &[Uniform, Read, Read, Read, Read, Write, Write],
+};
+
+pub(crate) static RASTERIZE_BWD: Kernel = Kernel {
+    name: "rasterize_bwd",
+    entry: "main",
+    source: wgsl!("shared/abi", "shared/grid", "shared/raster", "rasterize_bwd"),
+    bindings: &[Uniform, Read, Read, Read, Read, Read, Read, Write, Write],
+};
+
+pub(crate) static PAIR_SUMS: Kernel = Kernel {
+    name: "pair_sums",
+    entry: "main",
+    source: wgsl!("shared/abi", "shared/grid", "shared/raster", "pair_sums"),
+    bindings: &[Uniform, Read, Read, Read, Read, Read, Write],
+};
+
+pub(crate) static PROJECT_BWD: Kernel = Kernel {
+    name: "project_bwd",
+    entry: "main",
+    source: wgsl!(
+        "shared/abi",
+        "shared/grid",
+        "shared/raster",
+        "shared/ewa",
+        "shared/moments",
+        "project_bwd"
+    ),
     bindings: &[Uniform, Read, Read, Read, Write],
+};
+
+pub(crate) static COLOUR_BWD: Kernel = Kernel {
+    name: "colour_bwd",
+    entry: "main",
+    source: wgsl!(
+        "shared/abi",
+        "shared/grid",
+        "shared/raster",
+        "shared/sh",
+        "shared/sh_bwd",
+        "shared/moments",
+        "colour_bwd"
+    ),
+    bindings: &[Uniform, Read, Read, Read, Read, Write, Write, Write],
 };

@@ -23,7 +23,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 /// Threads of a workgroup that takes one splat a thread.
-const THREADS: usize = 64;
+pub(crate) const THREADS: usize = 64;
 /// Room for pairs at the first frame.
 const CAPACITY_START: usize = 1 << 16;
 
@@ -32,7 +32,7 @@ const CAPACITY_START: usize = 1 << 16;
 #[derive(Debug)]
 pub struct Rasterizer {
     gpu: Arc<Gpu>,
-    timed: bool,
+    pub(crate) timed: bool,
     /// Room for (splat, tile) pairs.
     capacity: usize,
     pairs: usize,
@@ -43,12 +43,31 @@ pub struct Rasterizer {
     times: Vec<(&'static str, Duration)>,
 }
 
-/// Where a frame's results lie on the device.
+/// Where a frame's results lie on the device, and what its backward pass needs.
+#[derive(Debug)]
 pub(crate) struct FrameBuffers {
+    /// Of all splats.
+    pub(crate) call: RasterUniform,
     /// `[5·H·W]`, see [`RasterUniform::step`].
     pub(crate) picture: Buffer,
     /// Of the pairs.
     pub(crate) plan: Buffer,
+    /// `[N, 12]`.
+    pub(crate) footprints: Buffer,
+    /// Splats by depth.
+    pub(crate) order: Buffer,
+    /// `[N]`: tiles that a splat meets.
+    pub(crate) counts: Buffer,
+    /// Place of the first pair of every splat, in the splats' order by depth.
+    pub(crate) offsets: Buffer,
+    /// Splat of every pair, as they were made.
+    pub(crate) owners: Buffer,
+    /// Places of the pairs, by tile.
+    pub(crate) pairs: Buffer,
+    /// First and past-the-last of `pairs` of every tile, and of those behind the last.
+    pub(crate) ranges: Buffer,
+    /// `[H, W, 2]`: see kernels/rasterize.wgsl.
+    pub(crate) finals: Buffer,
 }
 
 /// How a picture's channels lie in memory.
@@ -155,6 +174,17 @@ impl Rasterizer {
         options: &RasterOptions,
         channels: Channels,
     ) -> Result<Vec<f32>, GpuError> {
+        self.drawn(scene, camera, options, channels).map(|(picture, _)| picture)
+    }
+
+    /// A frame's picture, and the frame.
+    pub(crate) fn drawn(
+        &mut self,
+        scene: &Scene,
+        camera: &Camera,
+        options: &RasterOptions,
+        channels: Channels,
+    ) -> Result<(Vec<f32>, FrameBuffers), GpuError> {
         let floats = 5 * camera.intrinsics.width * camera.intrinsics.height;
         loop {
             let gpu = self.gpu.clone();
@@ -163,13 +193,12 @@ impl Rasterizer {
             let picture = commands.read::<f32>(&frame.picture, floats)?;
             let plan = commands.read::<u32>(&frame.plan, PLAN_WORDS)?;
             let submitted = commands.submit()?;
-            drop(frame);
             let plan = plan.take(&gpu)?;
             if !self.learn(&plan)? {
                 continue;
             }
             self.times = submitted.times(&gpu)?;
-            return picture.take(&gpu);
+            return Ok((picture.take(&gpu)?, frame));
         }
     }
 
@@ -229,33 +258,34 @@ impl Rasterizer {
         }
         commands.stage("sort by depth");
         depth.record(commands, u32::BITS)?;
-        let order = &depth.values[0];
+        let order = depth.values[0].clone();
 
         commands.stage("prefix sum");
         let sums = gpu.empty::<u32>("sums", n.div_ceil(GPU_BLOCK) + 1)?;
         let offsets = gpu.empty::<u32>("offsets", n)?;
         let plan = gpu.empty::<u32>("plan", PLAN_WORDS)?;
-        let bindings = bind([&splat_plan, order, &counts, &sums]);
+        let bindings = bind([&splat_plan, &order, &counts, &sums]);
         commands.run(&SCAN_REDUCE, &[], &bindings, blocks.clone())?;
         let bindings = bind([&splat_plan, &sums]);
         commands.run(&SCAN_WHOLE, &[], &bindings, Groups::Of([1; 3]))?;
-        let bindings = bind([&splat_plan, order, &counts, &sums, &offsets]);
+        let bindings = bind([&splat_plan, &order, &counts, &sums, &offsets]);
         commands.run(&SCAN_APPLY, &[], &bindings, blocks)?;
         let bindings = bind([&whole, &splat_plan, &sums, &plan]);
         commands.run(&PLAN, &[], &bindings, Groups::Of([1; 3]))?;
 
         commands.stage("intersect");
         let groups = Groups::Indirect(plan.clone(), 0);
-        let mut pairs = Sort::new(gpu, plan.clone(), groups, self.capacity, false)?;
+        let owners = gpu.empty::<u32>("owners of pairs", self.capacity)?;
+        let mut pairs = Sort::new(gpu, plan.clone(), groups, self.capacity, true)?;
         let bindings = bind([
             &whole,
             &footprints,
             &rectangles,
-            order,
+            &order,
             &counts,
             &offsets,
             &pairs.keys[0],
-            &pairs.values[0],
+            &owners,
         ]);
         commands.run(&INTERSECT, &[], &bindings, Groups::of(n, THREADS))?;
 
@@ -265,7 +295,7 @@ impl Rasterizer {
         pairs.record(commands, u32::BITS - (tiles as u32).leading_zeros())?;
 
         commands.stage("ranges");
-        let ranges = gpu.empty::<u32>("tile ranges", 2 * tiles)?;
+        let ranges = gpu.empty::<u32>("tile ranges", 2 * (tiles + 1))?;
         commands.clear(&ranges);
         let bindings = bind([&whole, &plan, &pairs.keys[0], &ranges]);
         let each = Groups::Indirect(plan.clone(), 4 * PLAN_EACH as u64);
@@ -274,13 +304,28 @@ impl Rasterizer {
         commands.stage("rasterize");
         let pixels = (call.width * call.height) as usize;
         let picture = gpu.empty::<f32>("the picture", 5 * pixels)?;
-        let bindings = bind([&whole, &footprints, &ranges, &pairs.values[0], &picture]);
+        let finals = gpu.empty::<u32>("ends of pixels", 2 * pixels)?;
+        let pairs = pairs.values[0].clone();
+        let bindings = bind([&whole, &footprints, &ranges, &pairs, &owners, &picture, &finals]);
         commands.run(&RASTERIZE, &[], &bindings, Groups::of(tiles, 1))?;
-        Ok(FrameBuffers { picture, plan })
+        (call.first, call.count) = (0, n as u32);
+        Ok(FrameBuffers {
+            call,
+            picture,
+            plan,
+            footprints,
+            order,
+            counts,
+            offsets,
+            owners,
+            pairs,
+            ranges,
+            finals,
+        })
     }
 }
 
-fn bind<const N: usize>(buffers: [&Buffer; N]) -> [Binding; N] {
+pub(crate) fn bind<const N: usize>(buffers: [&Buffer; N]) -> [Binding; N] {
     buffers.map(Binding::from)
 }
 

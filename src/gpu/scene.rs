@@ -6,7 +6,7 @@ use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
 
 /// Floats of a row with covariance: mean 3, covariance 6, opacity 1.
-const COV6_LANES: usize = 10;
+pub(crate) const COV6_LANES: usize = 10;
 
 /// Splats in device memory, drawn from any number of cameras.
 #[derive(Clone, Debug)]

@@ -1,0 +1,32 @@
+// What the pixels say of one splat, the ten sums of kernels/pair_sums.wgsl
+// (src/cpu/ewa_bwd.rs). Reads the binding `sums`.
+
+struct Moments {
+    // Of v = ∂L/∂ln α.
+    one: f32,
+    // Of v times (d, s), the whitened distance.
+    first: vec2<f32>,
+    // Of v times d², d·s, s².
+    second: vec3<f32>,
+    // Of the weight times ∂L/∂(R, G, B).
+    rgb: vec3<f32>,
+    // Of the weight times ∂L/∂(Σ w·z).
+    z: f32,
+}
+
+fn moments(i: u32) -> Moments {
+    let at = PAIR_SUMS * i;
+    return Moments(
+        sums[at],
+        vec2<f32>(sums[at + 1u], sums[at + 2u]),
+        vec3<f32>(sums[at + 3u], sums[at + 4u], sums[at + 5u]),
+        vec3<f32>(sums[at + 6u], sums[at + 7u], sums[at + 8u]),
+        sums[at + 9u],
+    );
+}
+
+// Whether a pixel saw the splat; NaN counts.
+fn seen(m: Moments) -> bool {
+    return m.one != 0.0 || any(m.first != vec2<f32>(0.0)) || any(m.second != vec3<f32>(0.0))
+        || any(m.rgb != vec3<f32>(0.0)) || m.z != 0.0;
+}
