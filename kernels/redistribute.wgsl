@@ -4,13 +4,6 @@
 // In: logits [P,K]; areas [P,K], px²; opacities [P]; own areas [P] (read by the rules
 // whose areas are relative).   Out: [P,K].   One thread per parent.
 
-struct RedistributeUniform {
-    parents: u32,
-    children: u32,
-    rule: u32,
-    pad: u32,
-}
-
 @group(0) @binding(0) var<uniform> call: RedistributeUniform;
 @group(0) @binding(1) var<storage, read> logits: array<f32>;
 @group(0) @binding(2) var<storage, read> areas: array<f32>;

@@ -22,6 +22,7 @@ use crate::data::depth::DepthRange;
 use crate::io;
 use crate::io::image::{Depth, Rgb};
 use crate::io::scene::Frame;
+pub use crate::model::Backend;
 use crate::model::Views;
 use crate::model::subsplat::{SceneOutput, SubSplat};
 use crate::model::weights::{SUBSPLAT_PREFIX, Weights};
@@ -160,6 +161,13 @@ impl Reconstructor {
             (None, None) => Config::re10k(Preset::Tuned, 2),
         };
         Self::build(&config, weights)
+    }
+
+    /// The same with the kernels that have a twin there on `backend`
+    /// ([`SubSplat::with_backend`]); [`Backend::warning`] says afterwards whether the CPU had
+    /// to take over.
+    pub fn with_backend(self, backend: &Backend) -> Self {
+        Self { model: self.model.with_backend(backend), ..self }
     }
 
     fn build(config: &Config, weights: Weights) -> Result<Self> {

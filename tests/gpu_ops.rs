@@ -14,11 +14,11 @@ use adapter::gpu;
 use candle_core::{DType, Result, Tensor, Var};
 use scenes::Random;
 use subsplat::abi::{Gather, Level, Rule};
-use subsplat::ops::Backend;
 use subsplat::ops::attention_gather::attention_gather_on;
 use subsplat::ops::plane_sweep::{Sweep, pair, plane_sweep_on};
 use subsplat::ops::redistribute::redistribute_on;
 use subsplat::ops::spgr::spgr_on;
+use subsplat::ops::{Backend, rasterize_on};
 
 /// Of the largest number. Kernels agree to 4e-5 (tests/gpu_spgr.rs, tests/gpu_network.rs);
 /// needles in random parents, whose CPU gradients in f32 are themselves 3e-5 off, the rest.
@@ -167,6 +167,45 @@ fn sweep() {
     agrees("sweep", &backend, &[&features, &features], |backend, x| {
         Ok(vec![plane_sweep_on(backend, &x[0], &x[1], s.clone())?])
     });
+}
+
+/// The rasterizer's op, with every gradient; a camera that sees all, and gains of one lane
+/// and of four.
+#[test]
+fn rasterization() {
+    use subsplat::abi::{Convention, RasterOptions, ShDirection};
+    let Some(gpu) = gpu() else { return };
+    let backend = Backend::from(gpu);
+    let mut r = Random(25);
+    let camera = scenes::cameras(2, 40, 30)[0];
+    let n = 60;
+    let means: Vec<f32> = (0..n)
+        .flat_map(|_| {
+            let z = r.uniform(2.0, 6.0);
+            let at = [r.uniform(-0.3, 0.3) * z, r.uniform(-0.3, 0.3) * z, z].map(|v| v as f32);
+            camera.world_from_camera.transform_point3(at.into()).to_array()
+        })
+        .collect();
+    let means = Tensor::from_vec(means, (n, 3), &candle_core::Device::Cpu).unwrap();
+    let quats = r.tensor(&[n, 4], 1.0, DType::F32);
+    let scales = r.tensor(&[n, 3], 0.3, DType::F32).exp().unwrap();
+    let scales = (scales * 0.15).unwrap();
+    let alphas = r.tensor(&[n, 1], 0.1, DType::F32).clamp(-0.4, 0.4).unwrap();
+    let alphas = (alphas + 0.5).unwrap();
+    let rows = Tensor::cat(&[means, quats, scales, alphas], 1).unwrap();
+    let sh = r.tensor(&[n / 4, 9, 3], 0.4, DType::F32);
+    for (lanes, convention, sh_direction) in [
+        (1, Convention::Standard, ShDirection::Child),
+        (4, Convention::Mvsplat, ShDirection::Parent),
+    ] {
+        let options = RasterOptions { sh_direction, ..RasterOptions::new(convention) };
+        let gain = (r.tensor(&[n, lanes], 0.2, DType::F32) + 1.0).unwrap();
+        let gain = if lanes == 1 { gain.flatten_all().unwrap() } else { gain };
+        let inputs = [&rows, &sh, &gain];
+        agrees(&format!("{convention:?}"), &backend, &inputs, |backend, x| {
+            Ok(vec![rasterize_on(backend, &x[0], &x[1], &x[2], &camera, &options)?])
+        });
+    }
 }
 
 /// More samples than the kernel holds, or double precision: the CPU's result, and a word.

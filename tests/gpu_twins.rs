@@ -15,6 +15,9 @@ use subsplat::gpu::{GpuError, RedistributeArgs};
 /// the result, in numerator and sum.
 const REDISTRIBUTE: f32 = 1e-5;
 
+/// The same of gradients, of the largest.
+const REDISTRIBUTE_BACKWARD: f32 = 1e-5;
+
 const RULES: [Rule; 5] =
     [Rule::Linear, Rule::OpticalDepth, Rule::Transmittance, Rule::Area, Rule::None];
 
@@ -70,6 +73,65 @@ fn redistribute() {
             assert!(relative(&perturbed, &expected) > REDISTRIBUTE);
         }
     }
+}
+
+/// The largest difference beside the largest number (or 1e-3 of the gradient that comes
+/// in): gradients of the softmax are differences of near-equal numbers.
+fn of_largest(got: &[f32], expected: &[f32]) -> f32 {
+    assert_eq!(got.len(), expected.len());
+    let largest = expected.iter().fold(1e-3f32, |m, v| m.max(v.abs()));
+    let pairs = got.iter().zip(expected);
+    pairs
+        .map(|(g, e)| (g - e).abs() / largest)
+        .fold(0.0, |m, d| if d > m || d.is_nan() { d } else { m })
+}
+
+#[test]
+fn redistribute_backward() {
+    let Some(gpu) = gpu() else { return };
+    let mut random = Random(8);
+    for (p, k) in [(1, 1), (3, 4), (1000, 4), (777, 9), (513, 16), (70, 5)] {
+        let logits = random.many(p * k, -4.0, 4.0);
+        let areas: Vec<f32> = random.many(p * k, -3.0, 3.0).iter().map(|e| e.exp2()).collect();
+        let mut alphas = random.many(p, 0.0, 0.99);
+        for (a, special) in alphas.iter_mut().zip([1e-7, 1.0, 0.99995, 1e-3]) {
+            *a = special;
+        }
+        let own: Vec<f32> = random.many(p, -1.0, 3.0).iter().map(|e| e.exp2()).collect();
+        let grad = random.many(p * k, -1.0, 1.0);
+        for rule in RULES {
+            let (logits, areas, alphas, own) = (&logits[..], &areas[..], &alphas[..], &own[..]);
+            let args = cpu::Args { rule, k, logits, areas, alphas, own };
+            let expected = cpu::backward(args, &grad);
+            let args = RedistributeArgs { rule, k, logits, areas, alphas, own };
+            let got = gpu.redistribute_backward(&args, &grad).unwrap();
+            let all = [
+                ("logits", got.logits, expected.logits),
+                ("areas", got.areas, expected.areas),
+                ("alphas", got.alphas, expected.alphas),
+                ("own", got.own, expected.own),
+            ];
+            for (what, mut got, expected) in all {
+                let off = of_largest(&got, &expected);
+                assert!(off < REDISTRIBUTE_BACKWARD, "{rule:?} {p}x{k} {what}: {off:e}");
+                if expected.iter().any(|&v| v != 0.0) {
+                    let largest = expected.iter().fold(1e-3f32, |m, v| m.max(v.abs()));
+                    got[expected.len() / 2] += 2.0 * REDISTRIBUTE_BACKWARD * largest;
+                    assert!(of_largest(&got, &expected) > REDISTRIBUTE_BACKWARD, "{what}");
+                }
+            }
+        }
+    }
+    let args = RedistributeArgs {
+        rule: Rule::Linear,
+        k: 2,
+        logits: &[0.0; 4],
+        areas: &[1.0; 4],
+        alphas: &[0.5; 2],
+        own: &[],
+    };
+    let error = gpu.redistribute_backward(&args, &[0.0; 3]).unwrap_err();
+    assert!(matches!(error, GpuError::Argument { what: "gradient", .. }), "{error}");
 }
 
 #[test]

@@ -33,6 +33,7 @@ const TWINS: &[(&str, &str)] = &[
     ("ranges", "tiles"),
     ("rasterize_bwd", "raster_bwd"),
     ("pair_sums", "raster_bwd"),
+    ("redistribute_bwd", "redistribute"),
     ("show", "rasterize"),
     ("spgr_bwd", "spgr"),
     ("spgr_gains_bwd", "spgr"),

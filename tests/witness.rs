@@ -89,7 +89,13 @@ fn plane_sweep() -> Result<()> {
         let blank = Tensor::zeros((1, cameras.len(), 3, height, width), DType::F32, &Device::Cpu)?;
         let views = Views::new(blank, vec![cameras], vec![near_far])?;
         let candidates = disparities(&views, 24);
-        let volume = correlation(&views, &candidates, &features, &mut Trace::off())?;
+        let volume = correlation(
+            &subsplat::ops::Backend::Cpu,
+            &views,
+            &candidates,
+            &features,
+            &mut Trace::off(),
+        )?;
         golden.compare("disparities", &Tensor::new(candidates, &Device::Cpu)?);
         golden.compare("correlation", &volume);
         golden.done(&golden.weights());

@@ -248,7 +248,7 @@ pub struct LookArgs {
     /// Background colour, R,G,B in [0, 1].
     #[arg(long, value_parser = triple, default_value = "0,0,0", value_name = "R,G,B")]
     pub background: [f32; 3],
-    /// What renders: cpu; auto (a GPU where there is one that is no software adapter); gpu
+    /// What renders, and with `run` sweeps depths, gathers features and makes children: cpu; auto (a GPU where there is one that is no software adapter); gpu
     /// (any adapter); or an adapter by a part of its name. The CPU takes over, with a
     /// warning, where that fails.
     #[arg(long, default_value = "cpu", value_name = "auto|cpu|gpu|NAME")]
@@ -398,8 +398,8 @@ pub struct CompareArgs {
     /// Instruction set of the rasterizer (default: SUBSPLAT_SIMD, else the widest here).
     #[arg(long, value_enum, conflicts_with = "weights")]
     pub simd: Option<SimdArg>,
-    /// What renders the case: as of `render --device`, but an error where that fails. A GPU
-    /// renders the picture; gradients are the CPU's alone.
+    /// What renders the case and makes its gradients: as of `render --device`, but an error
+    /// where that fails.
     #[arg(
         long,
         default_value = "cpu",

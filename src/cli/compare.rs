@@ -29,7 +29,7 @@ pub fn compare(args: &CompareArgs, answer: Answer) -> Result<bool> {
         None => {
             let mut renderer = Renderer::open(&args.device)?;
             let device = format!("device: {}", renderer.device());
-            let compare = |case: &Case| compare_raster::compare_picture(case, &mut renderer);
+            let compare = |case: &Case| compare_raster::compare_on(case, &mut renderer);
             rasterizer(&args.reference, &device, compare, answer)
         }
     }

@@ -43,18 +43,26 @@ pub fn compare(case: &Case, tier: Tier) -> Result<Vec<Row>> {
     let got = rasterizer.render(&case.splats(), &case.camera, &case.options);
     let mut rows = picture(case, &got)?;
     if case.has("v_rgb") {
-        gradients(case, &mut rasterizer, &mut rows)?;
+        let (planes, mut got) = (upstream(case)?, Gradients::default());
+        rasterizer.backward(&case.splats(), &case.camera, &case.options, &planes, &mut got);
+        gradients(case, &got, &mut rows)?;
     }
     Ok(rows)
 }
 
-/// [`compare`] of the picture alone, rendered by `renderer`'s device.
+/// [`compare`] of what `renderer`'s device makes.
 ///
 /// # Errors
 /// As [`compare`]; the device fails.
-pub fn compare_picture(case: &Case, renderer: &mut Renderer) -> Result<Vec<Row>> {
-    let got = renderer.render_slices(&case.splats(), &case.camera, &case.options)?;
-    picture(case, &got)
+pub fn compare_on(case: &Case, renderer: &mut Renderer) -> Result<Vec<Row>> {
+    let (splats, camera, options) = (case.splats(), &case.camera, &case.options);
+    let got = renderer.render_slices(&splats, camera, options)?;
+    let mut rows = picture(case, &got)?;
+    if case.has("v_rgb") {
+        let got = renderer.backward(&splats, camera, options, &upstream(case)?)?;
+        gradients(case, &got, &mut rows)?;
+    }
+    Ok(rows)
 }
 
 fn picture(case: &Case, got: &Rendered) -> Result<Vec<Row>> {
@@ -91,8 +99,8 @@ fn picture(case: &Case, got: &Rendered) -> Result<Vec<Row>> {
     Ok(rows)
 }
 
-/// Compares the gradients of Σ rgb·v_rgb + Σ alpha·v_alpha.
-fn gradients(case: &Case, rasterizer: &mut Rasterizer, rows: &mut Vec<Row>) -> Result<()> {
+/// The case's gradients of the picture as planes `[5, H, W]`.
+fn upstream(case: &Case) -> Result<Vec<f32>> {
     let k = case.camera.intrinsics;
     let v_rgb = case.array("v_rgb", &[k.height, k.width, 3])?;
     let v_alpha = case.array("v_alpha", &[k.height, k.width])?;
@@ -102,10 +110,12 @@ fn gradients(case: &Case, rasterizer: &mut Rasterizer, rows: &mut Vec<Row>) -> R
     }
     planes.extend(v_alpha);
     planes.resize(5 * v_alpha.len(), 0.0);
-    let splats = case.splats();
-    let mut got = Gradients::default();
-    rasterizer.backward(&splats, &case.camera, &case.options, &planes, &mut got);
+    Ok(planes)
+}
 
+/// Compares the gradients of Σ rgb·v_rgb + Σ alpha·v_alpha.
+fn gradients(case: &Case, got: &Gradients, rows: &mut Vec<Row>) -> Result<()> {
+    let splats = case.splats();
     let allowed = if case.name == NEEDLES { GRADIENT_NEEDLES } else { GRADIENT };
     let lanes = |from: usize, count: usize| -> Vec<f32> {
         got.rows

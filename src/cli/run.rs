@@ -16,6 +16,7 @@ use subsplat::data::depth::{DepthRange, depth_range};
 use subsplat::data::pair::choose_pair;
 use subsplat::io::SaveOptions;
 use subsplat::io::scene::Scene;
+use subsplat::ops::Backend;
 use subsplat::pipeline::{self, Photo, Reconstruction, Reconstructor, Request};
 
 /// Most targets that are chosen without being asked for.
@@ -43,7 +44,8 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
         ratio: None,
         model: &args.model,
     };
-    let model = progress.stage("model", |_| model::load(&asked))?;
+    let backend = backend(&args.look.device);
+    let model = progress.stage("model", |_| model::load(&asked))?.with_backend(&backend);
     let (stride, (w, h)) = (model.config().stride(), plan.input_size);
     ensure!(
         w >= stride && h >= stride,
@@ -72,11 +74,12 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
         near_far: (range.near, range.far),
         detail: args.detail == DetailArg::Photo,
     };
-    let result = progress.stage("network", |bar: &ProgressBar| {
+    let mut result = progress.stage("network", |bar: &ProgressBar| {
         model.reconstruct_with(&photos, &request, &mut |name| bar.set_message(name))
     })?;
     drop(photos);
     progress.split_last(&result.seconds);
+    result.warnings.extend(backend.warning());
     result.warnings.iter().for_each(warn);
     let options = raster_options(args, &plan, &model, range.near);
     let views = views(args, &targets, &result)?;
@@ -102,6 +105,14 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     })?;
     let done = Done { range, reports, model, result, options, scored, files };
     done.finish(args, &plan, progress, answer)
+}
+
+/// The kernels of `device`, or the CPU's with a warning where that fails.
+fn backend(device: &str) -> Backend {
+    Backend::open(device).unwrap_or_else(|e| {
+        warn(format!("{e}; reconstructing on the CPU"));
+        Backend::Cpu
+    })
 }
 
 /// Everything that can be wrong with the arguments and the scene is found here.

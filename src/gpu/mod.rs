@@ -40,7 +40,7 @@ pub use pipelines::{Access, Kernel};
 pub use plane_sweep::PlaneSweepArgs;
 pub use raster_bwd::Frame;
 pub use rasterize::Rasterizer;
-pub use redistribute::RedistributeArgs;
+pub use redistribute::{RedistributeArgs, RedistributeGradients};
 pub use scene::Scene;
 pub use spgr::SpgrArgs;
 /// The wgpu that devices and textures belong to.
@@ -63,6 +63,7 @@ pub const KERNELS: &[&Kernel] = &[
     &raster_kernels::PROJECT_BWD,
     &raster_kernels::COLOUR_BWD,
     &redistribute::REDISTRIBUTE,
+    &redistribute::REDISTRIBUTE_BWD,
     &show::SHOW,
     &attention_gather::ATTENTION_GATHER,
     &plane_sweep::PLANE_SWEEP,

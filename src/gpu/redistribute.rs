@@ -12,13 +12,44 @@ use std::ops::Range;
 pub(crate) static REDISTRIBUTE: Kernel = Kernel {
     name: "redistribute",
     entry: "main",
-    source: wgsl!("shared/abi", "shared/grid", "shared/math", "shared/share", "redistribute"),
+    source: wgsl!(
+        "shared/abi",
+        "shared/grid",
+        "shared/math",
+        "shared/share",
+        "shared/redistribute",
+        "redistribute"
+    ),
     bindings: &[
         Access::Uniform,
         Access::Read,
         Access::Read,
         Access::Read,
         Access::Read,
+        Access::Write,
+    ],
+};
+
+pub(crate) static REDISTRIBUTE_BWD: Kernel = Kernel {
+    name: "redistribute_bwd",
+    entry: "main",
+    source: wgsl!(
+        "shared/abi",
+        "shared/grid",
+        "shared/math",
+        "shared/share",
+        "shared/redistribute",
+        "redistribute_bwd"
+    ),
+    bindings: &[
+        Access::Uniform,
+        Access::Read,
+        Access::Read,
+        Access::Read,
+        Access::Read,
+        Access::Read,
+        Access::Write,
+        Access::Write,
         Access::Write,
     ],
 };
@@ -70,6 +101,40 @@ fn part<'a>(of: &'a [f32], range: &Range<usize>) -> &'a [f32] {
     of.get(range.clone()).unwrap_or(&[])
 }
 
+/// Gradients of [`Gpu::redistribute`].
+#[derive(Clone, Debug, Default)]
+pub struct RedistributeGradients {
+    /// `[P, K]`.
+    pub logits: Vec<f32>,
+    /// `[P, K]`.
+    pub areas: Vec<f32>,
+    /// `[P]`.
+    pub alphas: Vec<f32>,
+    /// `[P]`; zeros for the rules that do not read it.
+    pub own: Vec<f32>,
+}
+
+impl RedistributeArgs<'_> {
+    /// Uniform and inputs of some parents.
+    fn upload(&self, gpu: &Gpu, parents: &Range<usize>) -> Result<Vec<Binding>, GpuError> {
+        let children = parents.start * self.k..parents.end * self.k;
+        let uniform = gpu.uniform(&RedistributeUniform {
+            parents: parents.len() as u32,
+            children: self.k as u32,
+            rule: self.rule as u32,
+            pad: 0,
+        })?;
+        let inputs = [
+            uniform,
+            gpu.upload("logits", part(self.logits, &children))?,
+            gpu.upload("areas", part(self.areas, &children))?,
+            gpu.upload("opacities", part(self.alphas, parents))?,
+            gpu.upload("own areas", part(self.own, parents))?,
+        ];
+        Ok(inputs.iter().map(Binding::from).collect())
+    }
+}
+
 impl Gpu {
     /// Opacities `[P, K]` of the children.
     ///
@@ -77,31 +142,60 @@ impl Gpu {
     /// Lengths that do not fit one another; anything the device refuses.
     pub fn redistribute(&self, args: &RedistributeArgs) -> Result<Vec<f32>, GpuError> {
         args.check()?;
-        let k = args.k;
-        let most = self.rows_per_binding(k);
         let mut out = Vec::with_capacity(args.logits.len());
-        for parents in Self::chunks(args.alphas.len(), most) {
-            let children = parents.start * k..parents.end * k;
-            let uniform = self.uniform(&RedistributeUniform {
-                parents: parents.len() as u32,
-                children: k as u32,
-                rule: args.rule as u32,
-                pad: 0,
-            })?;
-            let inputs = [
-                self.upload("logits", part(args.logits, &children))?,
-                self.upload("areas", part(args.areas, &children))?,
-                self.upload("opacities", part(args.alphas, &parents))?,
-                self.upload("own areas", part(args.own, &parents))?,
-            ];
-            let shared = self.empty::<f32>("children's opacities", children.len())?;
-            let mut bindings = vec![Binding::from(&uniform)];
-            bindings.extend(inputs.iter().chain([&shared]).map(Binding::from));
+        for parents in Self::chunks(args.alphas.len(), self.rows_per_binding(args.k)) {
+            let mut bindings = args.upload(self, &parents)?;
+            let count = parents.len() * args.k;
+            let shared = self.empty::<f32>("children's opacities", count)?;
+            bindings.push(Binding::from(&shared));
             let mut commands = self.commands("redistribute", false);
             commands.run(&REDISTRIBUTE, &[], &bindings, Groups::of(parents.len(), THREADS))?;
-            let reading = commands.read::<f32>(&shared, children.len())?;
+            let reading = commands.read::<f32>(&shared, count)?;
             commands.submit()?;
             out.extend(reading.take(self)?);
+        }
+        Ok(out)
+    }
+
+    /// Gradients of [`Gpu::redistribute`] for the gradient `grad` `[P, K]` of its result.
+    ///
+    /// # Errors
+    /// As [`Gpu::redistribute`].
+    pub fn redistribute_backward(
+        &self,
+        args: &RedistributeArgs,
+        grad: &[f32],
+    ) -> Result<RedistributeGradients, GpuError> {
+        args.check()?;
+        if grad.len() != args.logits.len() {
+            return Err(GpuError::Argument {
+                kernel: REDISTRIBUTE_BWD.name,
+                what: "gradient",
+                expected: args.logits.len().to_string(),
+                got: grad.len().to_string(),
+            });
+        }
+        let mut out = RedistributeGradients::default();
+        for parents in Self::chunks(args.alphas.len(), self.rows_per_binding(args.k.max(2))) {
+            let mut bindings = args.upload(self, &parents)?;
+            let (p, count) = (parents.len(), parents.len() * args.k);
+            let grad = part(grad, &(parents.start * args.k..parents.end * args.k));
+            let grad = self.upload("gradient of opacities", grad)?;
+            let logits = self.empty::<f32>("gradient of logits", count)?;
+            let areas = self.empty::<f32>("gradient of areas", count)?;
+            let own = self.empty::<f32>("gradient of parents", 2 * p)?;
+            bindings.extend([&grad, &logits, &areas, &own].map(Binding::from));
+            let mut commands = self.commands("redistribute backward", false);
+            commands.run(&REDISTRIBUTE_BWD, &[], &bindings, Groups::of(p, THREADS))?;
+            let logits = commands.read::<f32>(&logits, count)?;
+            let areas = commands.read::<f32>(&areas, count)?;
+            let own = commands.read::<f32>(&own, 2 * p)?;
+            commands.submit()?;
+            out.logits.extend(logits.take(self)?);
+            out.areas.extend(areas.take(self)?);
+            let own = own.take(self)?;
+            out.alphas.extend(own.iter().step_by(2));
+            out.own.extend(own.iter().skip(1).step_by(2));
         }
         Ok(out)
     }

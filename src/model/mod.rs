@@ -20,6 +20,8 @@ pub mod trace;
 pub mod trunk;
 pub mod weights;
 
+pub use crate::ops::Backend;
+
 use crate::camera::Camera;
 use crate::config::FeatureLevel;
 use candle_core::{Result, Tensor, bail};

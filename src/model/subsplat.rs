@@ -9,6 +9,7 @@ use super::{BackboneOutput, Primaries, Views};
 use crate::abi::RasterOptions;
 use crate::camera::Camera;
 use crate::config::{Backbone, Config, FeatureLevel};
+use crate::ops::Backend;
 use candle_core::{Error, Result, Tensor, bail};
 use candle_nn::VarBuilder;
 
@@ -54,6 +55,17 @@ impl SubSplat {
         };
         let trunk = Trunk::new(config, &feature_channels(config), vb)?;
         Ok(Self { config: config.clone(), encoder, trunk })
+    }
+
+    /// The model with the plane sweep, the attention's gather, SPGR and the rasterizer on
+    /// `backend`, the rest in candle on the CPU as before.
+    pub fn with_backend(mut self, backend: &Backend) -> Self {
+        match &mut self.encoder {
+            Encoder::Mvsplat(encoder) => encoder.set_backend(backend),
+            Encoder::Small(encoder) => encoder.set_backend(backend),
+        }
+        self.trunk.set_backend(backend);
+        self
     }
 
     /// The configuration that the model was built from.

@@ -14,8 +14,8 @@ use crate::abi::{RasterOptions, SPLAT_LANES, ShBasis, sh_coefficients};
 use crate::camera::Camera;
 use crate::config::{Config, FeatureLevel, HeadInput, ShInput, SpgrHead};
 use crate::ops::direct::{Footprint, rasterize_footprints, spgr_footprints};
-use crate::ops::rasterize;
-use crate::ops::spgr::{Rules, Spgr, spgr, spgr_into};
+use crate::ops::spgr::{Rules, Spgr, spgr_into_on, spgr_on};
+use crate::ops::{Backend, rasterize_on};
 use crate::splats::Splats;
 use candle_core::{DType, Result, Tensor, bail};
 use candle_nn::{VarBuilder, VarMap};
@@ -25,6 +25,10 @@ use rayon::prelude::*;
 /// below the 65,536 elements from which candle spreads one elementwise operation over
 /// a spinning thread pool of its own, whose lock the chunks would fight for.
 pub const CHUNK: usize = 256;
+
+/// Parents per chunk where a GPU gathers: every chunk brings the feature maps over anew,
+/// and one at a time is what the device takes. 16384·E floats are 8 MiB at E = 128.
+const CHUNK_GPU: usize = 1 << 14;
 
 /// Gaussians of one scene that share SH by parent.
 #[derive(Clone, Debug)]
@@ -65,6 +69,7 @@ pub struct Trunk {
     side: usize,
     /// `None` where SPGR is off.
     parts: Option<Parts>,
+    backend: Backend,
 }
 
 /// What all chunks of one scene share.
@@ -108,7 +113,15 @@ impl Trunk {
         } else {
             None
         };
-        Ok(Self { config: config.clone(), side: config.upscale, parts })
+        Ok(Self { config: config.clone(), side: config.upscale, parts, backend: Backend::Cpu })
+    }
+
+    /// Where the next calls gather, make children and rasterize.
+    pub fn set_backend(&mut self, backend: &Backend) {
+        self.backend = backend.clone();
+        if let Some(agg) = self.parts.as_mut().and_then(|p| p.aggregation.as_mut()) {
+            agg.set_backend(backend);
+        }
     }
 
     /// r of the next calls; the `coord` head serves any, the others what they have
@@ -126,7 +139,8 @@ impl Trunk {
         Ok(())
     }
 
-    /// Children of the one scene in `views`, without gradient, chunks in parallel.
+    /// Children of the one scene in `views`, without gradient; chunks in parallel, or on a
+    /// GPU one after the other.
     ///
     /// # Errors
     /// Inputs that do not fit one another or the configuration, or that give numbers
@@ -148,17 +162,23 @@ impl Trunk {
         let mut gains = vec![0f32; n * k * lanes];
         let mut jobs = Vec::new();
         let (mut rows_left, mut gains_left) = (&mut rows[..], &mut gains[..]);
-        for (first, len) in chunks(n, scene.per_view, CHUNK) {
+        let chunk = if self.backend.is_cpu() { CHUNK } else { CHUNK_GPU };
+        for (first, len) in chunks(n, scene.per_view, chunk) {
             let (r, rest) = rows_left.split_at_mut(len * k * SPLAT_LANES);
             rows_left = rest;
             let (g, rest) = gains_left.split_at_mut(len * k * lanes);
             gains_left = rest;
             jobs.push((first, len, r, g));
         }
-        jobs.into_par_iter().try_for_each(|(first, len, rows, gains)| {
+        type Job<'a> = (usize, usize, &'a mut [f32], &'a mut [f32]);
+        let run = |(first, len, rows, gains): Job| {
             let (head, parents) = self.records(parts, &scene, (first, len), Mode::Infer)?;
-            spgr_into(&head, &parents, &scene.call(first), rows, gains)
-        })?;
+            spgr_into_on(&self.backend, &head, &parents, &scene.call(first), (rows, gains))
+        };
+        match self.backend.is_cpu() {
+            true => jobs.into_par_iter().try_for_each(run)?,
+            false => jobs.into_iter().try_for_each(run)?,
+        }
         let device = scene.means.device();
         let gain = Tensor::from_vec(gains, n * k * lanes, device)?;
         Ok(Children {
@@ -172,7 +192,8 @@ impl Trunk {
 
     /// The picture `[5, H, W]` (R, G, B, alpha, Σ w·z) that `camera` sees of the one
     /// scene in `views`, without children in memory: head records become footprints
-    /// chunk by chunk. The basis of `options` gives way to the primaries' own.
+    /// chunk by chunk; a GPU makes the children and rasterizes them. The basis of `options`
+    /// gives way to the primaries' own.
     ///
     /// # Errors
     /// Those of [`Trunk::forward`] and of the rasterizer.
@@ -185,9 +206,13 @@ impl Trunk {
         options: &RasterOptions,
     ) -> Result<Tensor> {
         let options = &RasterOptions { sh_basis: primaries.sh_basis, ..*options };
-        let Some(parts) = &self.parts else {
-            let all = self.pass_through(views, primaries)?;
-            return rasterize(&all.rows, &all.sh, &all.gain, camera, options);
+        let parts = match &self.parts {
+            Some(parts) if self.backend.is_cpu() => parts,
+            _ => {
+                let all = self.forward(views, backbone, primaries)?;
+                let (rows, sh, gain) = (&all.rows, &all.sh, &all.gain);
+                return rasterize_on(&self.backend, rows, sh, gain, camera, options);
+            }
         };
         let scene = self.scene(parts, views, backbone, primaries)?;
         let (k, n) = (scene.rules.children(), scene.means.dim(0)?);
@@ -242,7 +267,7 @@ impl Trunk {
         let (mut rows, mut gains) = (Vec::new(), Vec::new());
         for span in chunks(scene.means.dim(0)?, scene.per_view, chunk.max(1)) {
             let (head, parents) = self.records(parts, &scene, span, Mode::Train { seed })?;
-            let (r, g) = spgr(&head, &parents, &scene.call(span.0))?;
+            let (r, g) = spgr_on(&self.backend, &head, &parents, &scene.call(span.0))?;
             rows.push(r);
             gains.push(g);
         }

@@ -4,7 +4,8 @@
 //! Tests: tests/gpu_ops.rs.
 
 #[cfg(feature = "gpu")]
-use crate::gpu::{Gpu, GpuError};
+use crate::gpu::{DeviceChoice, Gpu, GpuError};
+use candle_core::{Error, Result};
 #[cfg(feature = "gpu")]
 use std::sync::{Arc, OnceLock};
 
@@ -35,6 +36,36 @@ impl From<Arc<Gpu>> for Backend {
 }
 
 impl Backend {
+    /// The kernels of `device`: `cpu`; `auto`, a GPU where there is one that is no software
+    /// adapter; `gpu`, any adapter; else an adapter by a part of its name.
+    ///
+    /// # Errors
+    /// A GPU was asked for and none answers, or the library was built without one.
+    #[cfg(feature = "gpu")]
+    pub fn open(device: &str) -> Result<Self> {
+        let choice = device.parse::<DeviceChoice>().unwrap_or_default();
+        Ok(Gpu::open(&choice).map_err(Error::wrap)?.map_or(Self::Cpu, Self::from))
+    }
+
+    /// The kernels of `device`: `cpu` or `auto`, as this build has no feature `gpu`.
+    ///
+    /// # Errors
+    /// Another device.
+    #[cfg(not(feature = "gpu"))]
+    pub fn open(device: &str) -> Result<Self> {
+        match device.to_ascii_lowercase().as_str() {
+            "cpu" | "auto" => Ok(Self::Cpu),
+            _ => Err(Error::msg(format!(
+                "device {device}: expected cpu, as this build has no feature `gpu`"
+            ))),
+        }
+    }
+
+    /// Whether everything is meant for the CPU.
+    pub fn is_cpu(&self) -> bool {
+        matches!(self, Self::Cpu)
+    }
+
     /// Why the CPU first did what was meant for the GPU; `None` where it did not.
     pub fn warning(&self) -> Option<String> {
         match self {
@@ -48,7 +79,10 @@ impl Backend {
 
     /// `f` on the GPU; `None` where the CPU is to do it.
     #[cfg(feature = "gpu")]
-    pub(super) fn offload<R>(&self, f: impl FnOnce(&Gpu) -> Result<R, GpuError>) -> Option<R> {
+    pub(super) fn offload<R>(
+        &self,
+        f: impl FnOnce(&Arc<Gpu>) -> std::result::Result<R, GpuError>,
+    ) -> Option<R> {
         let Self::Wgpu(offload) = self else { return None };
         match f(&offload.gpu) {
             Ok(done) => Some(done),

@@ -22,7 +22,7 @@ pub mod small;
 pub mod spgr;
 
 pub use backend::Backend;
-pub use rasterize::{over_background, rasterize, rasterize_splats};
+pub use rasterize::{over_background, rasterize, rasterize_on, rasterize_splats};
 
 use crate::cpu::real::Real;
 use candle_core::{CpuStorage, Layout, Result, Shape, Storage, Tensor, WithDType, bail};

@@ -11,7 +11,7 @@
 use crate::abi::{Convention, RasterOptions, SH_DEGREE_MAX, SPLAT_LANES, sh_coefficients};
 use crate::camera::Camera;
 use crate::cpu::{Geometry, Gradients, Rasterizer, SplatSlices};
-use crate::ops::{elements, tensor_like};
+use crate::ops::{Backend, elements, tensor_like};
 use crate::splats::SplatTensors;
 use candle_core::{CpuStorage, CustomOp3, DType, Layout, Result, Shape, Tensor, bail};
 use std::sync::{Mutex, PoisonError};
@@ -19,8 +19,17 @@ use std::sync::{Mutex, PoisonError};
 struct Rasterize {
     camera: Camera,
     options: RasterOptions,
-    /// What the forward left.
-    rasterizer: Mutex<Rasterizer>,
+    backend: Backend,
+    left: Mutex<Left>,
+}
+
+/// What the forward left.
+#[derive(Default)]
+struct Left {
+    rasterizer: Rasterizer,
+    /// Of a GPU that drew the picture.
+    #[cfg(feature = "gpu")]
+    frame: Option<crate::gpu::Frame>,
 }
 
 /// Renders packed splats: `[5, H, W]` planes R, G, B, alpha, Σ w·z.
@@ -35,10 +44,27 @@ pub fn rasterize(
     camera: &Camera,
     options: &RasterOptions,
 ) -> Result<Tensor> {
+    rasterize_on(&Backend::Cpu, splats, sh, gain, camera, options)
+}
+
+/// [`rasterize`] and its gradients on `backend`; a GPU keeps the frame until the graph is
+/// dropped.
+///
+/// # Errors
+/// Those of [`rasterize`].
+pub fn rasterize_on(
+    backend: &Backend,
+    splats: &Tensor,
+    sh: &Tensor,
+    gain: &Tensor,
+    camera: &Camera,
+    options: &RasterOptions,
+) -> Result<Tensor> {
     check_shapes(splats, sh, gain)?;
     check_options(camera, options)?;
-    let rasterizer = Mutex::default();
-    splats.apply_op3(sh, gain, Rasterize { camera: *camera, options: *options, rasterizer })
+    let (backend, left) = (backend.clone(), Mutex::default());
+    let op = Rasterize { camera: *camera, options: *options, backend, left };
+    splats.apply_op3(sh, gain, op)
 }
 
 /// [`rasterize`] of splats with everything that belongs to them: `[5, H, W]` planes R,
@@ -168,6 +194,32 @@ fn floats<'a>(name: &str, storage: &'a CpuStorage, layout: &Layout) -> Result<&'
     }
 }
 
+impl Rasterize {
+    /// Draws on the GPU; `None` where the CPU is to do it.
+    #[cfg(feature = "gpu")]
+    fn frame(&self, splats: &SplatSlices) -> Option<(Vec<f32>, crate::gpu::Frame)> {
+        self.backend.offload(|gpu| {
+            let mut rasterizer = crate::gpu::Rasterizer::new(gpu.clone());
+            rasterizer.frame(splats, &self.camera, &self.options)
+        })
+    }
+
+    fn gradients(&self, splats: &SplatSlices, gradient: &[f32]) -> Gradients {
+        let mut left = self.left.lock().unwrap_or_else(PoisonError::into_inner);
+        let (mut out, camera, options) = (Gradients::default(), &self.camera, &self.options);
+        #[cfg(feature = "gpu")]
+        if let Some(frame) = &mut left.frame {
+            return self.backend.offload(|_| frame.backward(gradient)).unwrap_or_else(|| {
+                // The CPU has not drawn this frame.
+                left.rasterizer.backward(splats, camera, options, gradient, &mut out);
+                out
+            });
+        }
+        left.rasterizer.backward_of_last(splats, camera, options, gradient, &mut out);
+        out
+    }
+}
+
 impl CustomOp3 for Rasterize {
     fn name(&self) -> &'static str {
         "rasterize"
@@ -192,11 +244,17 @@ impl CustomOp3 for Rasterize {
             gain: floats("gain", gain, gain_layout)?,
             sh_degree,
         };
-        let mut out = Vec::new();
-        let mut rasterizer = self.rasterizer.lock().unwrap_or_else(PoisonError::into_inner);
-        rasterizer.render_planes(&slices, &self.camera, &self.options, &mut out);
         let k = self.camera.intrinsics;
-        Ok((CpuStorage::F32(out), (5, k.height, k.width).into()))
+        let shape = Shape::from((5, k.height, k.width));
+        let mut left = self.left.lock().unwrap_or_else(PoisonError::into_inner);
+        #[cfg(feature = "gpu")]
+        if let Some((planes, frame)) = self.frame(&slices) {
+            left.frame = Some(frame);
+            return Ok((CpuStorage::F32(planes), shape));
+        }
+        let mut out = Vec::new();
+        left.rasterizer.render_planes(&slices, &self.camera, &self.options, &mut out);
+        Ok((CpuStorage::F32(out), shape))
     }
 
     fn bwd(
@@ -215,10 +273,7 @@ impl CustomOp3 for Rasterize {
         let slices =
             SplatSlices { geometry: Geometry::Packed(&rows), sh: &set, gain: &gains, sh_degree };
         let gradient = elements::<f32>(gradient)?;
-        let mut out = Gradients::default();
-        let mut rasterizer = self.rasterizer.lock().unwrap_or_else(PoisonError::into_inner);
-        let (camera, options) = (&self.camera, &self.options);
-        rasterizer.backward_of_last(&slices, camera, options, &gradient, &mut out);
+        let out = self.gradients(&slices, &gradient);
         Ok((
             Some(tensor_like(out.rows, splats)?),
             Some(tensor_like(out.sh, sh)?),

@@ -28,7 +28,7 @@ pub fn redistribute(
     redistribute_on(&Backend::Cpu, rule, logits, areas, opacities, parent_areas)
 }
 
-/// [`redistribute`] on `backend`; the gradient is the CPU's.
+/// [`redistribute`] and its gradient on `backend`.
 ///
 /// # Errors
 /// Those of [`redistribute`].
@@ -103,7 +103,12 @@ impl CustomOp3 for Redistribute {
         _: &Tensor,
         grad: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        by_dtype!(NAME, logits.dtype(), backward(self.0, [logits, areas, per_parent, grad]))
+        let args = [logits, areas, per_parent, grad];
+        #[cfg(feature = "gpu")]
+        if let Some(done) = gradients_on_gpu(self, args)? {
+            return Ok(done);
+        }
+        by_dtype!(NAME, logits.dtype(), backward(self.0, args))
     }
 }
 
@@ -164,19 +169,48 @@ fn backward<T: Number + LaneReal>(
     [logits, areas, per_parent, grad]: [&Tensor; 4],
 ) -> Result<Triple> {
     let (parents, k) = logits.dims2()?;
-    let device = logits.device();
     let grad = grad.contiguous()?;
     let d = borrowed::<T, _, 4>(NAME, [logits, areas, per_parent, &grad], |[l, a, p, g]| {
         let l = Tensor2 { data: l, parents, k };
         cpu::backward(arguments(rule, &l, a, p), g)
     })?;
-    let mut per_parent_grad = d.alphas;
+    let parts = [d.logits, d.areas, d.alphas, d.own];
+    gradients(parts, [logits, per_parent])
+}
+
+/// Gradients as tensors like `logits` and `per_parent`.
+fn gradients<T: Number>(
+    [logits_grad, areas_grad, mut alphas, own]: [Vec<T>; 4],
+    [logits, per_parent]: [&Tensor; 2],
+) -> Result<Triple> {
+    let device = logits.device();
     if per_parent.dim(0)? == 2 {
-        per_parent_grad.extend(d.own);
+        alphas.extend(own);
     }
     Ok((
-        Some(Tensor::from_vec(d.logits, (parents, k), device)?),
-        Some(Tensor::from_vec(d.areas, (parents, k), device)?),
-        Some(Tensor::from_vec(per_parent_grad, per_parent.dims(), device)?),
+        Some(Tensor::from_vec(logits_grad, logits.dims(), device)?),
+        Some(Tensor::from_vec(areas_grad, logits.dims(), device)?),
+        Some(Tensor::from_vec(alphas, per_parent.dims(), device)?),
     ))
+}
+
+/// [`backward`] on the GPU; `None` where the CPU is to do it.
+#[cfg(feature = "gpu")]
+fn gradients_on_gpu(
+    Redistribute(rule, backend): &Redistribute,
+    [logits, areas, per_parent, grad]: [&Tensor; 4],
+) -> Result<Option<Triple>> {
+    if logits.dtype() != candle_core::DType::F32 {
+        return Ok(None);
+    }
+    let (parents, k) = logits.dims2()?;
+    let grad = grad.contiguous()?;
+    let done = borrowed::<f32, _, 4>(NAME, [logits, areas, per_parent, &grad], |[l, a, p, g]| {
+        let (alphas, own) = p.split_at(parents);
+        let (rule, logits, areas) = (*rule, l, a);
+        let args = crate::gpu::RedistributeArgs { rule, k, logits, areas, alphas, own };
+        backend.offload(|gpu| gpu.redistribute_backward(&args, g))
+    })?;
+    let parts = done.map(|d| [d.logits, d.areas, d.alphas, d.own]);
+    parts.map(|parts| gradients(parts, [logits, per_parent])).transpose()
 }

@@ -108,6 +108,20 @@ pub fn spgr_into(
     rows: &mut [f32],
     gains: &mut [f32],
 ) -> Result<()> {
+    spgr_into_on(&Backend::Cpu, head, parents, call, (rows, gains))
+}
+
+/// [`spgr_into`] on `backend`.
+///
+/// # Errors
+/// Those of [`spgr_into`].
+pub fn spgr_into_on(
+    backend: &Backend,
+    head: &Tensor,
+    parents: &Tensor,
+    call: &Spgr,
+    (rows, gains): (&mut [f32], &mut [f32]),
+) -> Result<()> {
     let n = call.check(head, parents)?;
     let count = n * call.rules.children();
     let expected = (count * SPLAT_LANES, count * call.rules.gain_lanes());
@@ -123,6 +137,15 @@ pub fn spgr_into(
     };
     let head = slice::<f32>(NAME, "head records", hs, hl)?;
     let parents = slice::<f32>(NAME, "parents", ps, pl)?;
+    #[cfg(feature = "gpu")]
+    if let Some((made, gained)) = backend.offload(|gpu| gpu.spgr(&call.on_gpu(head, parents))) {
+        finite(call, head, parents, &made, &gained)?;
+        rows.copy_from_slice(&made);
+        gains.copy_from_slice(&gained);
+        return Ok(());
+    }
+    #[cfg(not(feature = "gpu"))]
+    let Backend::Cpu = backend;
     run(call, head, parents, rows, gains)
 }
 

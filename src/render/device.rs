@@ -1,7 +1,7 @@
 //! One renderer for any device: the CPU's kernels, or a GPU's with the CPU's behind them.
 
 use super::{Picture, slices};
-use crate::abi::{RasterOptions, Rendered, SplatSlices};
+use crate::abi::{Gradients, RasterOptions, Rendered, SplatSlices};
 use crate::camera::Camera;
 use crate::cpu;
 #[cfg(feature = "gpu")]
@@ -100,6 +100,33 @@ impl Renderer {
             Backend::Gpu(rasterizer) => {
                 rasterizer.render(splats, camera, options).map_err(|e| DeviceError(e.to_string()))
             }
+        }
+    }
+}
+
+impl Renderer {
+    /// Gradients of a loss whose gradient with respect to the planes `[5, H, W]` of this
+    /// view (R, G, B, alpha, Σ w·z) is `gradients`, by the device itself.
+    ///
+    /// # Errors
+    /// As [`Renderer::render_slices`].
+    pub fn backward(
+        &mut self,
+        splats: &SplatSlices,
+        camera: &Camera,
+        options: &RasterOptions,
+        gradients: &[f32],
+    ) -> Result<Gradients, DeviceError> {
+        match &mut self.backend {
+            Backend::Cpu => {
+                let mut out = Gradients::default();
+                self.cpu.backward(splats, camera, options, gradients, &mut out);
+                Ok(out)
+            }
+            #[cfg(feature = "gpu")]
+            Backend::Gpu(rasterizer) => rasterizer
+                .backward(splats, camera, options, gradients)
+                .map_err(|e| DeviceError(e.to_string())),
         }
     }
 }

@@ -19,6 +19,7 @@ use super::geometry::{Frames, ParentChunk};
 use super::mlp::{Mode, xavier};
 use super::{BackboneOutput, Primaries, Views};
 use crate::config::{Aggregation as Keys, FeatureLevel, Gate, MaskMode, Points};
+use crate::ops::Backend;
 use crate::ops::attention_gather::{Level, occlusion_gate};
 use candle_core::{Result, Tensor, bail};
 use candle_nn::{Linear, Module, VarBuilder};
@@ -34,6 +35,7 @@ pub struct Aggregation {
     input: Vec<Option<Linear>>,
     geometry: Vec<Stage>,
     appearance: Vec<Stage>,
+    backend: Backend,
 }
 
 /// What is computed once per scene.
@@ -58,6 +60,7 @@ struct Shared<'a> {
     occlusion: Option<Tensor>,
     levels: &'a [Level],
     mode: Mode,
+    backend: &'a Backend,
 }
 
 impl Aggregation {
@@ -100,7 +103,12 @@ impl Aggregation {
         }
         let appearance = (0..keys.stages_app).map(|t| stage(format!("a{t}")));
         let appearance = appearance.collect::<Result<_>>()?;
-        Ok(Self { keys, dim, input, geometry, appearance })
+        Ok(Self { keys, dim, input, geometry, appearance, backend: Backend::Cpu })
+    }
+
+    /// Where the next calls gather.
+    pub fn set_backend(&mut self, backend: &Backend) {
+        self.backend = backend.clone();
     }
 
     /// Projects the maps of the one scene in `backbone`, and its depth maps.
@@ -201,8 +209,8 @@ impl Aggregation {
             }
             None => None,
         };
-        let levels = &prepared.levels;
-        let shared = Shared { parents, frames, centres, occlusion, levels, mode };
+        let (levels, backend) = (&prepared.levels, &self.backend);
+        let shared = Shared { parents, frames, centres, occlusion, levels, mode, backend };
         let mut f_g = z_g.zeros_like()?;
         for (t, (stage, maps)) in self.geometry.iter().zip(&prepared.geometry).enumerate() {
             f_g = stage.forward(&self.keys, &shared, (t, maps), (&f_g, z_g))?;

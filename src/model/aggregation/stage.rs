@@ -7,7 +7,7 @@ use crate::config::{
     SampleConvention, StageNorm,
 };
 use crate::model::mlp::{LayerNorm, Mode, affine, linear, xavier};
-use crate::ops::attention_gather::{Drop, Gather, attention_gather};
+use crate::ops::attention_gather::{Drop, Gather, attention_gather_on};
 use candle_core::{Result, Tensor};
 use candle_nn::{Init, Linear, Module, VarBuilder};
 
@@ -131,7 +131,7 @@ impl Stage {
         let points = sample_points(keys, shared, self.learned.as_ref(), (f, &q))?;
         let gather = self.gather(keys, shared, t, q.dim(1)?);
         let query = self.query(keys, shared, &gather, &q)?;
-        let mut o = attention_gather(maps, &query, &points, gather)?;
+        let mut o = attention_gather_on(shared.backend, maps, &query, &points, gather)?;
         if let Some(wo) = &self.wo {
             o = affine(wo, &o, shared.mode)?;
         }

@@ -6,8 +6,9 @@ use crate::config::Mvsplat as Settings;
 use crate::model::Views;
 use crate::model::layers::{Conv2d, ConvShape, GroupNorm, gelu};
 use crate::model::trace::Trace;
+use crate::ops::Backend;
 use crate::ops::join::join;
-use crate::ops::plane_sweep::{Pair, Sweep, pair, plane_sweep, warped};
+use crate::ops::plane_sweep::{Pair, Sweep, pair, plane_sweep_on, warped};
 use candle_core::{Device, Result, Tensor};
 use candle_nn::VarBuilder;
 use glam::Mat4;
@@ -66,11 +67,12 @@ pub fn sweep(views: &Views, disparities: &[Vec<f32>], features: &Tensor) -> Resu
     })
 }
 
-/// Correlation `[V·B, D, h, w]` of transformer features `[V·B, C, h, w]`.
+/// Correlation `[V·B, D, h, w]` of transformer features `[V·B, C, h, w]`, on `backend`.
 ///
 /// # Errors
 /// Cameras that cannot be inverted.
 pub fn correlation(
+    backend: &Backend,
     views: &Views,
     disparities: &[Vec<f32>],
     features: &Tensor,
@@ -80,7 +82,7 @@ pub fn correlation(
     if trace.is_on() {
         trace_geometry(views, &sweep, features, trace)?;
     }
-    let volume = plane_sweep(features, features, sweep)?;
+    let volume = plane_sweep_on(backend, features, features, sweep)?;
     trace.put("cv.raw_correlation_vb", &volume)?;
     Ok(volume)
 }

@@ -14,6 +14,7 @@ use crate::model::layers::{
     softmax, upsample_nearest,
 };
 use crate::model::trace::Trace;
+use crate::ops::Backend;
 use crate::ops::join::join;
 use candle_core::{Device, Result, Tensor};
 use candle_nn::VarBuilder;
@@ -83,6 +84,8 @@ pub struct DepthPredictor {
     to_disparity: Head,
     candidates: usize,
     per_pixel: usize,
+    /// Where the plane sweep runs.
+    pub(super) backend: Backend,
 }
 
 impl DepthPredictor {
@@ -110,6 +113,7 @@ impl DepthPredictor {
             to_disparity: Head::new(r, 2 * r, 2 * g, vb.pp("to_disparity"))?,
             candidates: d,
             per_pixel: g,
+            backend: Backend::Cpu,
         })
     }
 
@@ -134,7 +138,7 @@ impl DepthPredictor {
 
     fn coarse(&self, views: &Views, trans: &Tensor, trace: &mut Trace<'_>) -> Result<Disparity> {
         let candidates = disparities(views, self.candidates);
-        let volume = correlation(views, &candidates, trans, trace)?;
+        let volume = correlation(&self.backend, views, &candidates, trans, trace)?;
         let volume = self.refinement.forward(&volume, trans, views.views(), trace)?;
         let logits = self.depth_head_lowres.forward(&volume)?;
         trace.put("depth.logits_vb", &logits)?;

@@ -18,6 +18,7 @@ pub(crate) use small_parts::small_start;
 use super::trace::Trace;
 use super::{BackboneOutput, Views};
 use crate::config::{Config, FeatureLevel, Mvsplat as Settings};
+use crate::ops::Backend;
 use candle_core::{Result, Tensor, bail};
 use candle_nn::VarBuilder;
 
@@ -43,6 +44,11 @@ impl Mvsplat {
             depth: depth::DepthPredictor::new(settings, vb.pp("depth_predictor"))?,
             settings: settings.clone(),
         })
+    }
+
+    /// Where the plane sweep of the next calls runs.
+    pub fn set_backend(&mut self, backend: &Backend) {
+        self.depth.backend = backend.clone();
     }
 
     /// Any number of scenes and of views ≥ 2; H and W multiples of

@@ -21,9 +21,10 @@ use crate::model::layers::{
     Activation, Conv2d, ConvShape, GroupNorm, gelu, resize_bilinear, sigmoid,
 };
 use crate::model::{BackboneOutput, Views};
+use crate::ops::Backend;
 use crate::ops::join::join;
 use crate::ops::matching::raw_matching;
-use crate::ops::plane_sweep::{Pair, Sweep, pair, plane_sweep, relative_pose};
+use crate::ops::plane_sweep::{Pair, Sweep, pair, plane_sweep_on, relative_pose};
 use crate::ops::small::{
     Start, expectation, head_input, head_output, lift, ray_distance, unit_channels,
 };
@@ -95,6 +96,7 @@ pub struct SmallBackbone {
     project: Conv2d,
     head1: Conv2d,
     head2: Conv2d,
+    backend: Backend,
 }
 
 impl SmallBackbone {
@@ -146,7 +148,13 @@ impl SmallBackbone {
                 vb.pp("head.1"),
             )?,
             config: config.clone(),
+            backend: Backend::Cpu,
         })
+    }
+
+    /// Where the plane sweep of the next calls runs.
+    pub fn set_backend(&mut self, backend: &Backend) {
+        self.backend = backend.clone();
     }
 
     /// Runs the network. `training` averages disparity over all candidates; else over
@@ -241,7 +249,8 @@ impl SmallBackbone {
             size: [h, w],
         };
         // [B·V, 1, D·h, w]
-        let learned = plane_sweep(&unit, &unit, sweep)?.reshape((rows, 1, d * h, w))?;
+        let learned =
+            plane_sweep_on(&self.backend, &unit, &unit, sweep)?.reshape((rows, 1, d * h, w))?;
         let volume = match self.config.raw_matching {
             true => {
                 let raw = raw_matching(&views.images, &views.cameras, &disparities)?;
