@@ -200,10 +200,7 @@ fn forward(bench: &mut Bench, name: &str, case: &Case, stats: Stats) -> Result<(
         let got = ours.render(&slices(&case.splats), &case.camera, &case.options)?;
         let expected = Rasterizer::new().render(&slices(&case.splats), &case.camera, &case.options);
         agree("rgb of the GPU", &got.rgb, &expected.rgb, PICTURE)?;
-        stages.push_str("; GPU");
-        for (stage, time) in ours.stage_times() {
-            stages.push_str(&format!(", {stage} {:.1} ms", 1e3 * time.as_secs_f64()));
-        }
+        stages = stages_of(ours.pairs(), ours.stage_times());
         contenders.push(Contender::new(name, Threads::All, move || {
             ours.render(&slices(&case.splats), &case.camera, &case.options)?;
             Ok(())
@@ -218,6 +215,15 @@ fn forward(bench: &mut Bench, name: &str, case: &Case, stats: Stats) -> Result<(
         stats.bytes as f64 / f64::from(1 << 20)
     );
     bench.group(name, contenders, &note)
+}
+
+/// Time of each stage on the device, for a group's note.
+#[cfg(feature = "gpu")]
+fn stages_of(pairs: usize, times: &[(&'static str, std::time::Duration)]) -> String {
+    let each = |(stage, time): &(&str, std::time::Duration)| {
+        format!(", {stage} {:.1} ms", 1e3 * time.as_secs_f64())
+    };
+    format!("; GPU: {pairs} pairs{}", times.iter().map(each).collect::<String>())
 }
 
 fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
@@ -269,7 +275,29 @@ fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
             Ok(())
         }));
     }
-    bench.group(name, contenders, "gradients of everything; compare like with like")
+    let mut note = "gradients of everything; compare like with like".to_owned();
+    #[cfg(feature = "gpu")]
+    if let Ok(Some(gpu)) = Gpu::open(&DeviceChoice::Gpu) {
+        let name = format!("subsplat, {}, both passes", gpu.adapter().name);
+        let mut ours = GpuRasterizer::new(gpu).with_stage_times();
+        let slices = slices(&case.splats);
+        let (camera, options) = (&case.camera, &case.options);
+        let mut frame = ours.frame(&slices, camera, options)?.1;
+        let got = frame.backward(planes)?;
+        let mut cpu = Frames::default();
+        bench.on_all(|| {
+            cpu.rasterizer.backward(&slices, camera, options, planes, &mut cpu.gradients);
+        });
+        let g = &cpu.gradients;
+        agree_all("GPU, ", &got, [&g.rows, &g.sh, &g.gain, &g.background])?;
+        let times = [ours.stage_times(), frame.stage_times()].concat();
+        note.push_str(&stages_of(ours.pairs(), &times));
+        contenders.push(Contender::new(name, Threads::All, move || {
+            std::hint::black_box(ours.backward(&slices, camera, options, planes)?);
+            Ok(())
+        }));
+    }
+    bench.group(name, contenders, &note)
 }
 
 /// Our rasterizer with its results' buffers.
@@ -303,16 +331,21 @@ fn check_gradients(bench: &Bench, case: &Case, seeds: &(Vec<f32>, Vec<f32>)) -> 
         let out = &mut ours.gradients;
         ours.rasterizer.backward(&slices, &case.camera, &case.options, &planes, out);
     });
-    let got = &ours.gradients;
+    let e = &expected;
+    agree_all("", &ours.gradients, [&e.rows, &e.sh, &e.gain, &e.background])
+}
+
+/// Gradients against those of rows, SH, gain and background.
+fn agree_all(whose: &str, got: &Gradients, [rows, sh, gain, back]: [&[f32]; 4]) -> Result<()> {
     for lane in 0..11 {
         let column = |rows: &[f32]| rows.iter().skip(lane).step_by(11).copied().collect::<Vec<_>>();
-        let what = format!("gradient of lane {lane}");
-        agree(&what, &column(&got.rows), &column(&expected.rows), GRADIENT)?;
+        let what = format!("{whose}gradient of lane {lane}");
+        agree(&what, &column(&got.rows), &column(rows), GRADIENT)?;
     }
-    agree("gradient of sh", &got.sh, &expected.sh, GRADIENT)?;
-    agree("gradient of the background", &got.background, &expected.background, GRADIENT)?;
-    if !expected.gain.is_empty() {
-        agree("gradient of gain", &got.gain, &expected.gain, GRADIENT)?;
+    agree(&format!("{whose}gradient of sh"), &got.sh, sh, GRADIENT)?;
+    agree(&format!("{whose}gradient of the background"), &got.background, back, GRADIENT)?;
+    if !gain.is_empty() {
+        agree(&format!("{whose}gradient of gain"), &got.gain, gain, GRADIENT)?;
     }
     Ok(())
 }
