@@ -3,31 +3,42 @@
 
 mod common;
 
+use candle_core::Tensor;
+use std::collections::BTreeMap;
 use std::path::Path;
 use subsplat::config::{Config, Preset};
+use subsplat::model::subsplat::SubSplat;
 use subsplat::model::weights::Weights;
 use subsplat::pipeline::Reconstructor;
 use subsplat::train::TrainConfig;
 use subsplat::train::config::Model;
 use subsplat::train::validate::{Found, Validator};
 
-/// Looks at `weights` as training does: held-out rooms of a seed that no training used,
-/// and photographs, at ×2.
-fn look(weights: Weights, photos: Option<&Path>) -> [Option<Found>; 2] {
-    let own = Weights::shipped().unwrap().config().unwrap().clone();
-    let set = serde_json::from_str(&own.to_json().unwrap()).unwrap();
-    let mut config = TrainConfig { model: Model { set, ..Model::default() }, ..TrainConfig::default() };
+/// The shipped model's configuration.
+fn shipped() -> Config {
+    Weights::shipped().unwrap().config().unwrap().clone()
+}
+
+/// The same model as it begins: a plane sweep.
+fn untrained() -> BTreeMap<String, Tensor> {
+    let weights = Weights::seeded(0).trainable();
+    SubSplat::new(&shipped(), weights.builder()).unwrap();
+    weights.variables().into_iter().map(|(name, v)| (name, v.as_tensor().clone())).collect()
+}
+
+/// Looks at a model as training does: at held-out rooms of a seed that no training used,
+/// and at photographs, at ×2.
+fn look(tensors: BTreeMap<String, Tensor>, photos: Option<&Path>) -> [Option<Found>; 2] {
+    let set = serde_json::from_str(&shipped().to_json().unwrap()).unwrap();
+    let model = Model { set, ..Model::default() };
+    let mut config = TrainConfig { model, ..TrainConfig::default() };
     config.data.seed = 77;
     config.validate.scenes = 6;
-    let mut tensors = weights.tensors().clone();
-    // A seeded start draws its tensors when a model asks for them.
-    subsplat::model::subsplat::SubSplat::new(&own, weights.clone().trainable().builder()).unwrap();
-    if tensors.is_empty() {
-        let drawn = weights.trainable();
-        subsplat::model::subsplat::SubSplat::new(&own, drawn.builder()).unwrap();
-        tensors = drawn.variables().into_iter().map(|(n, v)| (n, v.as_tensor().clone())).collect();
-    }
     Validator::new(&config, photos).unwrap().look(tensors, None).unwrap()
+}
+
+fn learnt() -> BTreeMap<String, Tensor> {
+    Weights::shipped().unwrap().tensors().clone()
 }
 
 #[test]
@@ -50,8 +61,8 @@ fn the_file_is_small_and_whole() {
 
 #[test]
 fn rooms_that_were_never_trained_on_are_reconstructed() {
-    let [rooms, _] = look(Weights::shipped().unwrap(), None);
-    let [plain, _] = look(Weights::seeded(0), None);
+    let [rooms, _] = look(learnt(), None);
+    let [plain, _] = look(untrained(), None);
     let (rooms, plain) = (rooms.unwrap(), plain.unwrap());
     println!("shipped {rooms:?}\nplane sweep {plain:?}");
     assert!(rooms.psnr > ROOMS.0 && rooms.ssim > ROOMS.1, "{rooms:?}");
@@ -62,7 +73,7 @@ fn rooms_that_were_never_trained_on_are_reconstructed() {
 #[test]
 fn photographs_are_reconstructed() {
     let Some(folder) = common::shared("photos") else { return };
-    let [_, photos] = look(Weights::shipped().unwrap(), Some(&folder));
+    let [_, photos] = look(learnt(), Some(&folder));
     let photos = photos.unwrap();
     println!("{photos:?}");
     assert!(photos.psnr > photos.copy_psnr + 3.5 && photos.ssim > PHOTOS_SSIM, "{photos:?}");
