@@ -16,7 +16,7 @@
 //! let request = Request { near_far: (0.67, 4.89), ..Request::default() };
 //! let room = model.reconstruct(&photos, &request)?;
 //! let camera = room.inputs[0].target_camera; // any camera
-//! let picture = subsplat::render(&room.splats, &camera, &model.raster_options(0.67));
+//! let picture = subsplat::render(&room.splats, &camera, &model.raster_options(0.67, &room.inputs));
 //! assert_eq!((picture.width, picture.height, room.splats.len()), (512, 512, 524_288));
 //! # let out = std::env::temp_dir().join(format!("subsplat-doc-{}.ply", std::process::id()));
 //! # let room_ply = out.as_path();

@@ -148,8 +148,7 @@ impl Validator {
         let mut pictures: Vec<Rgb> = scene.context.iter().map(|p| p.image.clone()).collect();
         for target in &scene.targets {
             let k = target.camera.intrinsics;
-            let ratio = k.width as f32 / scene.context[0].image.width as f32;
-            let options = raster_options(&self.model, ratio, scene.near_far.0);
+            let options = raster_options(&self.model, scene, &target.camera);
             let planes =
                 model.trunk().render(&views, &output, &parents, &target.camera, &options)?;
             let rgb = planes.narrow(0, 0, 3)?.flatten_all()?.to_vec1::<f32>()?;
