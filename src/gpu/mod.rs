@@ -8,6 +8,29 @@
 //! A kernel x is `kernels/x.wgsl`, a [`Kernel`] and a method of [`Gpu`] in `x.rs`, and
 //! has a CPU twin of the same stem; `tests/shaders.rs` holds its text against
 //! [`crate::abi`] and this table.
+//!
+//! A frame of N splats with P (splat, tile) pairs on T tiles and px pixels, stage by stage;
+//! bytes are those that kernels read and write, SH, gain and caches left out. A device runs
+//! as many workgroups side by side as their memory and threads fit its cores: on one of
+//! 1,024 threads and 32 KiB, 16 of `project` (threads), 3 of the sorts, 2 of either
+//! `rasterize` (memory).
+//!
+//! | stage | dispatches | threads | workgroup bytes | bytes |
+//! |---|---|---|---|---|
+//! | project | 1 a part | 64 | 0 | 44 N + 64 N |
+//! | sort by depth | 24 | 256 | 9,216 | 160 N |
+//! | prefix sum, plan | 4 | 256 | 1,092 | 20 N |
+//! | intersect | 1 | 64 | 0 | 68 N + 8 P |
+//! | sort by tile | 3 per 4 bits of T | 256 | 9,216 | 20 P per 4 bits |
+//! | ranges | 1 | 256 | 0 | 12 P + 8 T |
+//! | rasterize | 1 | 256 | 12,296 | 56 P + 28 px |
+//! | rasterize backward | 1 | 32 | 15,368 | 96 P + 28 px |
+//! | sum pairs | 1 | 64 | 0 | 40 P + 68 N |
+//! | project backward | 2 a part | 64 | 0 | 288 N |
+//!
+//! A binding of 128 MiB holds 2.79 M footprints, 33 M pairs forward and 3.35 M back, and
+//! 6.7 Mpx; splats and their gradients are cut into parts. Beyond that a call is refused,
+//! and the caller's CPU does it.
 
 mod adapter;
 mod attention_gather;
