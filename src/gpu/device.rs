@@ -8,6 +8,7 @@ use crate::gpu::buffers::Pool;
 use crate::gpu::error::GpuError;
 use crate::gpu::pipelines::Pipelines;
 use std::fmt;
+use std::sync::atomic::AtomicUsize;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 /// An opened GPU with its buffers and compiled kernels. Share it in an [`Arc`].
@@ -17,6 +18,9 @@ pub struct Gpu {
     pub(crate) limits: wgpu::Limits,
     pub(crate) pool: Arc<Pool>,
     pub(crate) pipelines: Pipelines,
+    /// (splat, tile) pairs that frames have needed room for: where the next rasterizer
+    /// begins.
+    pub(crate) pairs: AtomicUsize,
     summary: AdapterSummary,
     timestamps: bool,
     health: Arc<Health>,
@@ -102,6 +106,7 @@ impl Gpu {
             limits,
             pool,
             pipelines: Pipelines::default(),
+            pairs: AtomicUsize::new(0),
             summary,
             timestamps,
             health,

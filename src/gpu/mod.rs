@@ -26,7 +26,7 @@
 //! | rasterize | 1 | 256 | 12,296 | 56 P + 28 px |
 //! | rasterize backward | 1 | 32 | 15,368 | 96 P + 28 px |
 //! | sum pairs | 1 | 64 | 0 | 40 P + 68 N |
-//! | project backward | 2 a part | 64 | 0 | 288 N |
+//! | project backward | 2 a part | 64 | 0 | 236 N |
 //!
 //! A binding of 128 MiB holds 2.79 M footprints, 33 M pairs forward and 3.35 M back, and
 //! 6.7 Mpx; splats and their gradients are cut into parts. Beyond that a call is refused,

@@ -20,11 +20,12 @@ use crate::gpu::scene::Scene;
 use crate::gpu::sort::{Sort, plan_of};
 use crate::view::View;
 use std::sync::Arc;
+use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 
 /// Threads of a workgroup that takes one splat a thread.
 pub(crate) const THREADS: usize = 64;
-/// Room for pairs at the first frame.
+/// Room for pairs at the first frame, unless the GPU has seen more.
 const CAPACITY_START: usize = 1 << 16;
 
 /// The rasterizer with what it learnt about frames: same meaning as
@@ -82,10 +83,11 @@ pub(crate) enum Channels {
 impl Rasterizer {
     /// A rasterizer on `gpu`.
     pub fn new(gpu: Arc<Gpu>) -> Self {
+        let capacity = gpu.pairs.load(Relaxed).max(CAPACITY_START);
         Self {
             gpu,
             timed: false,
-            capacity: CAPACITY_START,
+            capacity,
             pairs: 0,
             pending: None,
             seen: false,
@@ -215,6 +217,7 @@ impl Rasterizer {
             return Err(GpuError::TooSmall { what: "(splat, tile) pairs", needed, limit });
         }
         self.capacity = asked.next_power_of_two().min(most);
+        self.gpu.pairs.fetch_max(self.capacity, Relaxed);
         Ok(false)
     }
 
