@@ -13,7 +13,9 @@ mod spgr_calls;
 use adapter::gpu;
 use candle_core::{DType, Result, Tensor, Var};
 use scenes::Random;
-use subsplat::abi::{Gather, Level, Rule};
+use subsplat::abi::{Convention, Gather, Level, RasterOptions, Rule, ShDirection};
+use subsplat::camera::Camera;
+use subsplat::gpu::{DeviceChoice, Gpu};
 use subsplat::ops::attention_gather::attention_gather_on;
 use subsplat::ops::plane_sweep::{Sweep, pair, plane_sweep_on};
 use subsplat::ops::redistribute::redistribute_on;
@@ -169,43 +171,79 @@ fn sweep() {
     });
 }
 
-/// The rasterizer's op, with every gradient; a camera that sees all, and gains of one lane
-/// and of four.
+/// 60 splats in front of a camera, and the SH of their 15 parents.
+fn splats(r: &mut Random) -> (Camera, Tensor, Tensor) {
+    let camera = scenes::cameras(2, 40, 30)[0];
+    let n = 60;
+    let place = |r: &mut Random| {
+        let z = r.uniform(2.0, 6.0);
+        let at = [r.uniform(-0.3, 0.3) * z, r.uniform(-0.3, 0.3) * z, z].map(|v| v as f32);
+        camera.world_from_camera.transform_point3(at.into()).to_array()
+    };
+    let means: Vec<f32> = (0..n).flat_map(|_| place(r)).collect();
+    let means = Tensor::from_vec(means, (n, 3), &candle_core::Device::Cpu).unwrap();
+    let quats = r.tensor(&[n, 4], 1.0, DType::F32);
+    let scales = (r.tensor(&[n, 3], 0.3, DType::F32).exp().unwrap() * 0.15).unwrap();
+    let alphas = r.tensor(&[n, 1], 0.1, DType::F32).clamp(-0.4, 0.4).unwrap();
+    let rows = [means, quats, scales, (alphas + 0.5).unwrap()];
+    (camera, Tensor::cat(&rows, 1).unwrap(), r.tensor(&[n / 4, 9, 3], 0.4, DType::F32))
+}
+
+/// The rasterizer's op with every gradient, gains of one lane and of four.
 #[test]
 fn rasterization() {
-    use subsplat::abi::{Convention, RasterOptions, ShDirection};
     let Some(gpu) = gpu() else { return };
     let backend = Backend::from(gpu);
     let mut r = Random(25);
-    let camera = scenes::cameras(2, 40, 30)[0];
-    let n = 60;
-    let means: Vec<f32> = (0..n)
-        .flat_map(|_| {
-            let z = r.uniform(2.0, 6.0);
-            let at = [r.uniform(-0.3, 0.3) * z, r.uniform(-0.3, 0.3) * z, z].map(|v| v as f32);
-            camera.world_from_camera.transform_point3(at.into()).to_array()
-        })
-        .collect();
-    let means = Tensor::from_vec(means, (n, 3), &candle_core::Device::Cpu).unwrap();
-    let quats = r.tensor(&[n, 4], 1.0, DType::F32);
-    let scales = r.tensor(&[n, 3], 0.3, DType::F32).exp().unwrap();
-    let scales = (scales * 0.15).unwrap();
-    let alphas = r.tensor(&[n, 1], 0.1, DType::F32).clamp(-0.4, 0.4).unwrap();
-    let alphas = (alphas + 0.5).unwrap();
-    let rows = Tensor::cat(&[means, quats, scales, alphas], 1).unwrap();
-    let sh = r.tensor(&[n / 4, 9, 3], 0.4, DType::F32);
+    let (camera, rows, sh) = splats(&mut r);
     for (lanes, convention, sh_direction) in [
         (1, Convention::Standard, ShDirection::Child),
         (4, Convention::Mvsplat, ShDirection::Parent),
     ] {
         let options = RasterOptions { sh_direction, ..RasterOptions::new(convention) };
-        let gain = (r.tensor(&[n, lanes], 0.2, DType::F32) + 1.0).unwrap();
+        let gain = (r.tensor(&[60, lanes], 0.2, DType::F32) + 1.0).unwrap();
         let gain = if lanes == 1 { gain.flatten_all().unwrap() } else { gain };
         let inputs = [&rows, &sh, &gain];
         agrees(&format!("{convention:?}"), &backend, &inputs, |backend, x| {
             Ok(vec![rasterize_on(backend, &x[0], &x[1], &x[2], &camera, &options)?])
         });
     }
+}
+
+/// A picture that no binding holds, and a device that goes away between the two passes:
+/// the CPU's numbers, and a word.
+#[test]
+fn a_rasterizer_that_fails_leaves_the_cpu() {
+    let Some(gpu) = gpu() else { return };
+    let mut r = Random(26);
+    let (camera, rows, sh) = splats(&mut r);
+    let gain = Tensor::ones(60, DType::F32, rows.device()).unwrap();
+    let inputs = [&rows, &sh, &gain];
+    let options = RasterOptions::default();
+    let large = Camera { intrinsics: camera.intrinsics.resized(3200, 2400), ..camera };
+    let of = |backend: &Backend, camera: &Camera| {
+        run(backend, &inputs, |backend, x| {
+            Ok(vec![rasterize_on(backend, &x[0], &x[1], &x[2], camera, &options)?])
+        })
+    };
+    let backend = Backend::from(gpu);
+    assert!(of(&backend, &large) == of(&Backend::Cpu, &large));
+    let warning = backend.warning().unwrap();
+    assert!(warning.contains("too small for the picture") && warning.contains("CPU"), "{warning}");
+
+    let own = Gpu::open(&DeviceChoice::Gpu).unwrap().unwrap();
+    let backend = Backend::from(own.clone());
+    let got = run(&backend, &inputs, |backend, x| {
+        let planes = rasterize_on(backend, &x[0], &x[1], &x[2], &camera, &options)?;
+        assert_eq!(backend.warning(), None);
+        own.device().destroy();
+        own.device().poll(subsplat::gpu::wgpu::PollType::Poll).ok();
+        Ok(vec![planes])
+    });
+    let expected = of(&Backend::Cpu, &camera);
+    assert!(got[0] != expected[0], "the GPU did not draw");
+    assert!(got[1..] == expected[1..], "the CPU did not go back");
+    assert!(backend.warning().is_some_and(|w| w.contains("GPU lost")), "{:?}", backend.warning());
 }
 
 /// More samples than the kernel holds, or double precision: the CPU's result, and a word.

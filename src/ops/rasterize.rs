@@ -19,6 +19,7 @@ use std::sync::{Mutex, PoisonError};
 struct Rasterize {
     camera: Camera,
     options: RasterOptions,
+    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "the GPU's path reads it"))]
     backend: Backend,
     left: Mutex<Left>,
 }
