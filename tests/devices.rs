@@ -4,7 +4,12 @@
 #[path = "common/gpu.rs"]
 mod adapter;
 
+#[path = "common/program.rs"]
+#[allow(dead_code, reason = "not every test binary uses every helper")]
+mod program;
+
 use glam::Mat4;
+use program::{call_in, workplace};
 use subsplat::abi::{RasterOptions, SPLAT_LANES, ShBasis};
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::render::{Renderer, render};
@@ -75,4 +80,36 @@ fn what_a_gpu_is_too_small_for_the_cpu_renders() {
     assert!(warning.contains("too small for the picture"), "{warning}");
     assert_eq!(renderer.device(), "CPU");
     assert!(got == render(&splats, &camera, &options));
+}
+
+const RUN: &str = "--json run scene --context 0,2 --input-size 64 --no-check";
+
+/// The whole program on a GPU scores as it does on the CPU, and says nothing of it.
+#[cfg(feature = "gpu")]
+#[test]
+fn run_reconstructs_on_a_gpu() {
+    if adapter::gpu().is_none() {
+        return;
+    }
+    let place = workplace();
+    let [cpu, gpu] = ["cpu", "gpu"].map(|device| {
+        let called = call_in(place.path(), &format!("{RUN} --device {device} -o {device}"));
+        assert_eq!(called.code, 0, "{}", called.stderr);
+        assert!(!called.stderr.contains("on the CPU"), "{}", called.stderr);
+        called.json()
+    });
+    assert_eq!(cpu["gaussians"], gpu["gaussians"]);
+    assert_eq!(cpu["warnings"], gpu["warnings"]);
+    let [cpu, gpu] = [cpu, gpu].map(|report| report["psnr"].as_f64().unwrap());
+    assert!((cpu - gpu).abs() < 0.05 && cpu != gpu, "{cpu} and {gpu} dB");
+}
+
+#[test]
+fn run_without_the_adapter_that_was_asked_for_goes_on() {
+    let place = workplace();
+    let called = call_in(place.path(), &format!("{RUN} --device nonesuch -o out"));
+    assert_eq!(called.code, 0, "{}", called.stderr);
+    let told = called.stderr.lines().filter(|l| l.contains("nonesuch")).collect::<Vec<_>>();
+    assert!(told.iter().any(|l| l.contains("reconstructing on the CPU")), "{}", called.stderr);
+    assert!(called.json()["gaussians"].as_u64().unwrap() > 0);
 }
