@@ -5,9 +5,14 @@
 
 #[cfg(feature = "gpu")]
 use crate::gpu::{DeviceChoice, Gpu, GpuError};
-use candle_core::{Error, Result};
 #[cfg(feature = "gpu")]
 use std::sync::{Arc, OnceLock};
+use thiserror::Error;
+
+/// Why a device does not open.
+#[derive(Clone, Debug, Error, PartialEq, Eq)]
+#[error("{0}")]
+pub struct NoDevice(String);
 
 /// The CPU kernels, or a GPU's. Clones share the GPU and its warning.
 #[derive(Clone, Debug, Default)]
@@ -42,9 +47,10 @@ impl Backend {
     /// # Errors
     /// A GPU was asked for and none answers, or the library was built without one.
     #[cfg(feature = "gpu")]
-    pub fn open(device: &str) -> Result<Self> {
+    pub fn open(device: &str) -> Result<Self, NoDevice> {
         let choice = device.parse::<DeviceChoice>().unwrap_or_default();
-        Ok(Gpu::open(&choice).map_err(Error::wrap)?.map_or(Self::Cpu, Self::from))
+        let gpu = Gpu::open(&choice).map_err(|e| NoDevice(e.to_string()))?;
+        Ok(gpu.map_or(Self::Cpu, Self::from))
     }
 
     /// The kernels of `device`: `cpu` or `auto`, as this build has no feature `gpu`.
@@ -52,10 +58,10 @@ impl Backend {
     /// # Errors
     /// Another device.
     #[cfg(not(feature = "gpu"))]
-    pub fn open(device: &str) -> Result<Self> {
+    pub fn open(device: &str) -> Result<Self, NoDevice> {
         match device.to_ascii_lowercase().as_str() {
             "cpu" | "auto" => Ok(Self::Cpu),
-            _ => Err(Error::msg(format!(
+            _ => Err(NoDevice(format!(
                 "device {device}: expected cpu, as this build has no feature `gpu`"
             ))),
         }
@@ -79,10 +85,7 @@ impl Backend {
 
     /// `f` on the GPU; `None` where the CPU is to do it.
     #[cfg(feature = "gpu")]
-    pub(super) fn offload<R>(
-        &self,
-        f: impl FnOnce(&Arc<Gpu>) -> std::result::Result<R, GpuError>,
-    ) -> Option<R> {
+    pub(super) fn offload<R>(&self, f: impl FnOnce(&Arc<Gpu>) -> Result<R, GpuError>) -> Option<R> {
         let Self::Wgpu(offload) = self else { return None };
         match f(&offload.gpu) {
             Ok(done) => Some(done),

@@ -21,7 +21,7 @@ pub mod resize;
 pub mod small;
 pub mod spgr;
 
-pub use backend::Backend;
+pub use backend::{Backend, NoDevice};
 pub use rasterize::{over_background, rasterize, rasterize_on, rasterize_splats};
 
 use crate::cpu::real::Real;
