@@ -63,8 +63,10 @@ fn unasked(args: &Asked) -> Result<Reconstructor> {
     if args.seed.is_none() && !mvsplat && args.model.config.is_none() {
         let model = shipped(args)?;
         if !model.untrained_tensors().is_empty() {
-            say("no --weights: using those that ship, whose heads of SubSplat do not serve this \
-                 preset or --upscale: children are the plain split of their parents");
+            say(
+                "SubSplat's heads of the weights that ship start untrained for this --upscale and \
+                 preset: children are the plain split of their parents",
+            );
         }
         return Ok(model);
     }
