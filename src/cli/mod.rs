@@ -6,6 +6,8 @@
 
 pub mod args;
 mod args_eval;
+#[cfg(feature = "view")]
+mod args_view;
 mod check;
 mod compare;
 mod compare_raster;
@@ -23,6 +25,8 @@ mod render;
 mod report;
 mod run;
 mod train;
+#[cfg(feature = "view")]
+mod view;
 
 use anyhow::{Context, Result, ensure};
 use args::{Cli, Command};
@@ -60,6 +64,8 @@ fn dispatch(cli: &Cli, answer: Answer) -> Result<bool> {
     match &cli.command {
         Command::Run(args) => run::run(args, answer).map(|()| true),
         Command::Render(args) => render::render(args, answer).map(|()| true),
+        #[cfg(feature = "view")]
+        Command::View(args) => view::view(args, answer).map(|()| true),
         Command::Check(args) => check::check(args, answer),
         Command::Info(args) => info::info(args, answer).map(|()| true),
         Command::Eval(args) => eval::eval(args, answer).map(|()| true),
