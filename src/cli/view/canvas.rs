@@ -120,8 +120,7 @@ impl Canvas {
             .with_context(|| format!("window: expected {choice}, got none that can show it"))?;
         let (gpu, fault) = device_of(&adapter)?;
         let size = window.inner_size();
-        let config =
-            configuration(&surface.get_capabilities(&adapter), (size.width, size.height))?;
+        let config = configuration(&surface.get_capabilities(&adapter), (size.width, size.height))?;
         let rasterizer = Rasterizer::new(gpu.clone());
         let mut new = Self { window, instance, surface, config, gpu, rasterizer, fault };
         new.resize(size.width, size.height)?;
@@ -263,8 +262,7 @@ impl Canvas {
             usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
             mapped_at_creation: false,
         });
-        let mut encoder =
-            device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        let mut encoder = device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
         let layout = wgpu::TexelCopyBufferLayout {
             offset: 0,
             bytes_per_row: Some(row),
