@@ -56,12 +56,12 @@ pub struct ViewArgs {
     /// weights' own, else 2.
     #[arg(long, value_name = "R")]
     pub upscale: Option<usize>,
-    /// Weights (.safetensors). Without: seeded, untrained weights.
+    /// Weights (.safetensors). Default: those that ship with the program.
     #[arg(long, value_name = "FILE")]
     pub weights: Option<PathBuf>,
-    /// Seed of untrained weights.
-    #[arg(long, default_value_t = 0)]
-    pub seed: u64,
+    /// Untrained weights, drawn from this seed.
+    #[arg(long, value_name = "N", conflicts_with = "weights")]
+    pub seed: Option<u64>,
     /// Nearest depth candidate, world units (default: as for `run`). For a finished scene
     /// the near plane, as for `render`.
     #[arg(long)]
@@ -79,9 +79,10 @@ pub struct ViewArgs {
     /// them (.ply, .glb), else `standard`.
     #[arg(long, value_enum)]
     pub convention: Option<ConventionArg>,
-    /// Background colour, R,G,B in [0, 1].
-    #[arg(long, value_parser = triple, default_value = "0,0,0", value_name = "R,G,B")]
-    pub background: [f32; 3],
+    /// Background colour, R,G,B in [0, 1]. Default: the model's own (the inputs' mean
+    /// colour, or black); for scene files what `run` noted in them, else black.
+    #[arg(long, value_parser = triple, value_name = "R,G,B")]
+    pub background: Option<[f32; 3]>,
     /// What the model is.
     #[command(flatten)]
     pub model: ModelArgs,
@@ -107,6 +108,7 @@ impl ViewArgs {
             (!self.context.is_empty(), "--context"),
             (self.upscale.is_some(), "--upscale"),
             (self.weights.is_some(), "--weights"),
+            (self.seed.is_some(), "--seed"),
             (self.far.is_some(), "--far"),
             (self.detail != DetailArg::Off, "--detail"),
             (self.model.backbone.is_some(), "--backbone"),

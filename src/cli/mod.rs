@@ -24,6 +24,7 @@ mod raster_case;
 mod render;
 mod report;
 mod run;
+mod tensorboard;
 mod train;
 #[cfg(feature = "view")]
 mod view;

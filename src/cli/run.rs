@@ -12,6 +12,7 @@ use subsplat::abi::{Convention, RasterOptions};
 use subsplat::camera::Camera;
 use subsplat::check::PairReport;
 use subsplat::config::{Config, LowpassRef};
+use subsplat::data::crop::Cropped;
 use subsplat::data::depth::{DepthRange, depth_range};
 use subsplat::data::pair::choose_pair;
 use subsplat::io::SaveOptions;
@@ -26,7 +27,6 @@ struct Plan {
     scene: Scene,
     context: Vec<usize>,
     input_size: (usize, usize),
-    background: [f32; 3],
 }
 
 /// Runs the command.
@@ -66,7 +66,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     drop(photos);
     progress.split_last(&result.seconds);
     result.warnings.iter().for_each(warn);
-    let options = raster_options(&args.look, plan.background, model.config(), range.near);
+    let options = raster_options(&args.look, model.config(), (range.near, &result.inputs));
     let views = views(args, &targets, &result)?;
     let job = Views {
         out: &args.out,
@@ -95,7 +95,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
 /// Everything that can be wrong with the arguments and the scene is found here.
 fn plan(args: &RunArgs, progress: &mut Progress) -> Result<Plan> {
     let input_size = frames::size(&args.input_size)?;
-    let background = render::background(&args.look)?;
+    render::background(&args.look)?;
     frames::count(args.frames)?;
     ensure!(
         (0.0..=1.0).contains(&args.min_opacity),
@@ -115,7 +115,7 @@ fn plan(args: &RunArgs, progress: &mut Progress) -> Result<Plan> {
         scene.frames.len(),
         scene.source.name(),
     ));
-    Ok(Plan { scene, context, input_size, background })
+    Ok(Plan { scene, context, input_size })
 }
 
 /// The model's network takes inputs of this size, and the machine holds so many.
@@ -237,12 +237,11 @@ pub fn median(values: &[f32]) -> f32 {
 }
 
 /// How Gaussians of a model with `config` are rendered, by the arguments and else as the
-/// model says.
+/// model and its inputs say.
 pub fn raster_options(
     look: &LookArgs,
-    background: [f32; 3],
     config: &Config,
-    near: f32,
+    (near, inputs): (f32, &[Cropped]),
 ) -> RasterOptions {
     let mut config = config.clone();
     if let Some(convention) = look.convention {
@@ -254,8 +253,8 @@ pub fn raster_options(
             LowpassArg::Input => LowpassRef::Input,
         };
     }
-    let mut options = pipeline::raster_options(&config, near);
-    options.background = background;
+    let mut options = pipeline::raster_options(&config, near, inputs);
+    options.background = look.background.unwrap_or(options.background);
     options
 }
 

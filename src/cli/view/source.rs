@@ -123,7 +123,7 @@ fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
         distance: run::median(&depth.data),
         radius: render::bounds(&result.splats)?.radius(),
     };
-    let made = photographs.made(&model, result.splats);
+    let made = photographs.made(&model, result);
     Ok(Source { name: scene.name, start, made, photographs: Some(photographs) })
 }
 
@@ -144,7 +144,7 @@ impl Photographs {
         let model = load_model(&self.args, Some(upscale))?;
         run::check_size(&model, self.photos.len(), self.request.input_size)?;
         let result = self.reconstruct(&model, stage)?;
-        Ok(self.made(&model, result.splats))
+        Ok(self.made(&model, result))
     }
 
     fn reconstruct(
@@ -155,10 +155,10 @@ impl Photographs {
         Ok(model.reconstruct_with(&self.photos, &self.request, stage)?)
     }
 
-    fn made(&self, model: &Reconstructor, splats: Splats) -> Made {
-        let (look, config) = (self.args.look(), model.config());
-        let near = self.request.near_far.0;
-        let options = run::raster_options(&look, self.args.background, config, near);
-        Made { splats, options, upscale: Some(config.upscale) }
+    fn made(&self, model: &Reconstructor, result: Reconstruction) -> Made {
+        let (near, _) = self.request.near_far;
+        let config = model.config();
+        let options = run::raster_options(&self.args.look(), config, (near, &result.inputs));
+        Made { splats: result.splats, options, upscale: Some(config.upscale) }
     }
 }
