@@ -90,6 +90,8 @@ pub fn run(events: EventLoop<Message>, plan: Plan, source: Source) -> Result<Don
 #[derive(Default)]
 struct Rate {
     last: Option<Instant>,
+    /// Whether the first time is over, in which kernels are compiled.
+    warm: bool,
     mean: Option<f32>,
 }
 
@@ -98,7 +100,9 @@ impl Rate {
     fn begin(&mut self, now: Instant, follows: bool) -> f32 {
         let since = self.last.replace(now).filter(|_| follows);
         let Some(seconds) = since.map(|last| (now - last).as_secs_f32()) else { return STEP.0 };
-        self.mean = Some(self.mean.map_or(seconds, |m| m + FRESH * (seconds - m)));
+        if std::mem::replace(&mut self.warm, true) {
+            self.mean = Some(self.mean.map_or(seconds, |m| m + FRESH * (seconds - m)));
+        }
         seconds.min(STEP.1)
     }
 
@@ -276,7 +280,10 @@ impl Viewer {
     fn tell(&mut self) {
         let Some(canvas) = &self.canvas else { return };
         let splats = self.ready.get(&self.current).map_or(0, |r| r.scene.len());
-        let fps = self.rate.fps().map_or(String::new(), |fps| format!(", {fps:.0} fps"));
+        let fps = self.rate.fps().map_or(String::new(), |fps| {
+            let digits = usize::from(fps < 10.0);
+            format!(", {fps:.digits$} fps")
+        });
         let mode = match self.navigator.mode() {
             Mode::Orbit => "orbit",
             Mode::Fly => "fly",
