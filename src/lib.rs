@@ -29,10 +29,10 @@
 //! [`splats::Splats`], [`rasterize`] does so with gradients; [`io`] reads and writes files; [`check`] judges poses; [`eval`] scores methods;
 //! [`model`] is the network, its parts usable one by one, configured by
 //! [`config::Config`]; [`ops`] are the same kernels as candle ops. Every geometric
-//! convention is said once, in [`camera`].
+//! convention is said once, in [`camera`]; [`navigation`] moves one by hand.
 //!
 //! Features, both default: `cli` builds the programs `subsplat` and `subsplat-convert`;
-//! `gpu` the WGSL kernels ([`gpu`]).
+//! `gpu` the WGSL kernels ([`gpu`]). `view` adds `subsplat view`, a window.
 
 pub mod abi;
 pub mod camera;
@@ -46,6 +46,7 @@ pub mod gpu;
 pub mod io;
 pub mod metrics;
 pub mod model;
+pub mod navigation;
 pub mod ops;
 pub mod pipeline;
 pub mod render;

@@ -1,6 +1,8 @@
 //! Command-line arguments. The texts here are the program's manual.
 
 use super::args_eval::EvalArgs;
+#[cfg(feature = "view")]
+use super::args_view::{KEYS, ViewArgs};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
@@ -12,7 +14,7 @@ is no (check: bad poses; compare: a tensor out of tolerance).
 --json: one object on stdout, nothing else there; {\"error\": ...} with exit codes 1 and 2.";
 
 /// Three numbers, separated by commas or white space.
-fn triple(text: &str) -> Result<[f32; 3], String> {
+pub fn triple(text: &str) -> Result<[f32; 3], String> {
     let numbers: Result<Vec<f32>, _> = text
         .split(|c: char| c == ',' || c.is_whitespace())
         .filter(|w| !w.is_empty())
@@ -51,6 +53,10 @@ pub enum Command {
     Run(Box<RunArgs>),
     /// Render a finished scene (.ply, .splat, .spz, .ksplat, .glb).
     Render(RenderArgs),
+    /// Look at a scene in a window: a finished one, or photographs.
+    #[cfg(feature = "view")]
+    #[command(after_help = KEYS)]
+    View(Box<ViewArgs>),
     /// Judge poses and intrinsics before anyone wastes an hour on wrong ones.
     Check(CheckArgs),
     /// Say what a file or a scene folder holds.
@@ -220,7 +226,7 @@ pub struct RunArgs {
 }
 
 /// The model, where weights do not say it.
-#[derive(Debug, Args)]
+#[derive(Clone, Debug, Args)]
 pub struct ModelArgs {
     /// Network that gives the primary Gaussians. Default: the weights' own, `re10k`
     /// for a bare MVSplat checkpoint; `re10k` without weights is untrained.
@@ -259,7 +265,7 @@ pub struct LookArgs {
 
 /// Cameras of two photographs that come without a pose file. The first camera is
 /// the world unless --pose-a is given.
-#[derive(Debug, Args)]
+#[derive(Clone, Debug, Args)]
 pub struct PairArgs {
     /// Horizontal field of view of both photographs, degrees.
     #[arg(long, value_name = "DEG", conflicts_with = "intrinsics")]

@@ -37,7 +37,8 @@ fn file(path: &Path, answer: Answer) -> Result<Value> {
     }
 }
 
-fn head(path: &Path) -> Result<Vec<u8>> {
+/// The first 64 bytes of a file.
+pub fn head(path: &Path) -> Result<Vec<u8>> {
     use std::io::Read;
     let mut head = Vec::new();
     let file = std::fs::File::open(path).with_context(|| path.display().to_string())?;

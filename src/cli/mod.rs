@@ -6,6 +6,8 @@
 
 pub mod args;
 mod args_eval;
+#[cfg(feature = "view")]
+mod args_view;
 mod check;
 mod compare;
 mod compare_raster;
@@ -24,6 +26,8 @@ mod report;
 mod run;
 mod tensorboard;
 mod train;
+#[cfg(feature = "view")]
+mod view;
 
 use anyhow::{Context, Result, ensure};
 use args::{Cli, Command};
@@ -61,6 +65,8 @@ fn dispatch(cli: &Cli, answer: Answer) -> Result<bool> {
     match &cli.command {
         Command::Run(args) => run::run(args, answer).map(|()| true),
         Command::Render(args) => render::render(args, answer).map(|()| true),
+        #[cfg(feature = "view")]
+        Command::View(args) => view::view(args, answer).map(|()| true),
         Command::Check(args) => check::check(args, answer),
         Command::Info(args) => info::info(args, answer).map(|()| true),
         Command::Eval(args) => eval::eval(args, answer).map(|()| true),

@@ -1,10 +1,12 @@
 //! What matched points say before the network runs: whether the poses are right.
 
-use super::report::warn;
+use super::report::{say, warn};
 use anyhow::{Context, Result};
 use serde_json::{Value, json};
 use subsplat::check::{GrayImage, PairReport, Verdict};
+use subsplat::data::depth::DepthRange;
 use subsplat::io::image::Rgb;
+use subsplat::pipeline;
 
 /// Grey copy of a photograph.
 pub fn grey(photo: &Rgb) -> Result<GrayImage> {
@@ -20,6 +22,19 @@ pub fn tell(reports: &[PairReport]) {
     if reports.iter().any(|r| r.verdict == Verdict::Bad) {
         warn("these cameras look wrong, so the result will; `subsplat check` says more");
     }
+}
+
+/// Tells the user what `reports` found, and the depth range that follows from a `guess`
+/// where near and far are not `given`.
+pub fn refine(
+    guess: DepthRange,
+    given: (Option<f32>, Option<f32>),
+    reports: &[PairReport],
+) -> DepthRange {
+    tell(reports);
+    let range = pipeline::refine_range(guess, given, reports);
+    say(format!("near {:.4}, far {:.4}: {}", range.near, range.far, range.reason));
+    range
 }
 
 /// The findings for programs.

@@ -6,7 +6,6 @@ use super::memory;
 use super::output::{self, to_rgb8};
 use super::report::{Answer, Progress, mebibytes, peak_memory_bytes, say, warn};
 use anyhow::{Context, Result, ensure};
-use glam::{Mat4, Vec3};
 use serde_json::json;
 use std::path::Path;
 use subsplat::abi::{Convention, RasterOptions};
@@ -15,6 +14,7 @@ use subsplat::io::cameras_json::load_cameras_json;
 use subsplat::io::image::{Depth, save_depth_png, save_png};
 use subsplat::io::load_with_comments;
 use subsplat::io::scene::load_scene;
+use subsplat::navigation::Bounds;
 use subsplat::render::Renderer;
 use subsplat::splats::Splats;
 
@@ -45,7 +45,7 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
     check(args)?;
     let (splats, comments) = progress.stage("scene", |_| load_with_comments(&args.scene))?;
     let cameras = cameras(args, &splats)?;
-    let options = options(args, &comments)?;
+    let options = options(&args.look, args.near, args.sh_degree, &comments)?;
     std::fs::create_dir_all(&args.out)
         .with_context(|| format!("output folder {}", args.out.display()))?;
     let mut views = Vec::new();
@@ -96,26 +96,36 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
 fn check(args: &RenderArgs) -> Result<()> {
     background(&args.look)?;
     ensure!(args.sh_degree <= 4, "--sh-degree: expected 0 to 4, got {}", args.sh_degree);
-    if let Some(near) = args.near {
-        ensure!(near > 0.0 && near.is_finite(), "--near: expected above 0, got {near}");
-    }
+    check_near(args.near)?;
     frames::count(args.frames)?;
     args.size.as_deref().map_or(Ok(()), |text| memory::check_picture(frames::size(text)?))
 }
 
+/// `--near`, checked.
+pub fn check_near(near: Option<f32>) -> Result<()> {
+    let Some(near) = near else { return Ok(()) };
+    ensure!(near > 0.0 && near.is_finite(), "--near: expected above 0, got {near}");
+    Ok(())
+}
+
 /// The arguments', else what `run` noted in the file, else the standard.
-fn options(args: &RenderArgs, comments: &[String]) -> Result<RasterOptions> {
+pub fn options(
+    look: &LookArgs,
+    near: Option<f32>,
+    sh_degree: usize,
+    comments: &[String],
+) -> Result<RasterOptions> {
     let noted = output::rendering(comments);
-    let asked = args.look.convention.map(Convention::from);
+    let asked = look.convention.map(Convention::from);
     // What was noted for one convention says nothing about the other.
     let mut options = match noted.filter(|n| asked.is_none_or(|a| a == n.convention)) {
         Some(noted) => noted,
         None => RasterOptions::new(asked.unwrap_or(Convention::Standard)),
     };
-    options.near = args.near.unwrap_or(options.near);
-    options.sh_degree = args.sh_degree;
-    options.background = background(&args.look)?.unwrap_or(options.background);
-    if matches!(args.look.lowpass_ref, Some(LowpassArg::Input)) {
+    options.near = near.unwrap_or(options.near);
+    options.sh_degree = sh_degree;
+    options.background = background(look)?.unwrap_or(options.background);
+    if matches!(look.lowpass_ref, Some(LowpassArg::Input)) {
         warn("--lowpass-ref input: a scene file does not know its input's size; ignored");
     }
     Ok(options)
@@ -182,7 +192,7 @@ fn named_cameras(args: &RenderArgs, splats: &Splats) -> Result<Vec<(String, Came
 }
 
 /// Names and cameras of a pose file or scene folder.
-fn read_cameras(source: &Path) -> Result<Vec<(String, Camera)>> {
+pub fn read_cameras(source: &Path) -> Result<Vec<(String, Camera)>> {
     let inside = source.join("cameras.json");
     let list = if inside.is_file() { &inside } else { source };
     // A camera list needs no pictures; any other pose file goes through its reader.
@@ -200,7 +210,8 @@ fn read_cameras(source: &Path) -> Result<Vec<(String, Camera)>> {
     scene.frames.iter().map(|f| Ok((f.name.clone(), f.pinhole()?))).collect()
 }
 
-fn median_depth(splats: &Splats, camera: &Camera) -> f32 {
+/// Of the splats in front of `camera`, camera z; 1 where there is none.
+pub fn median_depth(splats: &Splats, camera: &Camera) -> f32 {
     let mut z: Vec<f32> = (0..splats.len())
         .map(|i| camera.to_camera(splats.mean(i).into()).z)
         .filter(|z| *z > 0.0)
@@ -209,21 +220,14 @@ fn median_depth(splats: &Splats, camera: &Camera) -> f32 {
     z.get(z.len() / 2).copied().unwrap_or(1.0)
 }
 
+/// The middle of a scene's splats.
+pub fn bounds(splats: &Splats) -> Result<Bounds> {
+    Bounds::of((0..splats.len()).map(|i| splats.mean(i))).context("the scene holds no Gaussian")
+}
+
 /// A camera that looks along +z at the middle 96 % of the means.
-fn whole(splats: &Splats) -> Result<Camera> {
-    ensure!(!splats.is_empty(), "the scene holds no Gaussian");
-    let axis = |a: usize| {
-        let mut v: Vec<f32> = (0..splats.len()).map(|i| splats.mean(i)[a]).collect();
-        v.sort_by(f32::total_cmp);
-        let at = |q: f32| v[(q * (v.len() - 1) as f32) as usize];
-        (at(0.02), at(0.98))
-    };
-    let (x, y, z) = (axis(0), axis(1), axis(2));
-    let low = Vec3::new(x.0, y.0, z.0);
-    let high = Vec3::new(x.1, y.1, z.1);
-    let middle = 0.5 * (low + high);
-    let extent = (high - low).truncate().max_element().max(1e-3);
-    let away = 0.5 * extent / (0.5 * DEFAULT_FOV_X).tan() + 0.5 * (high.z - low.z);
-    let intrinsics = Intrinsics::from_fov_x(DEFAULT_FOV_X, DEFAULT_SIDE, DEFAULT_SIDE);
-    Ok(Camera::new(intrinsics, Mat4::from_translation(middle - away * Vec3::Z))?)
+pub fn whole(splats: &Splats) -> Result<Camera> {
+    let Camera { intrinsics, world_from_camera } =
+        bounds(splats)?.camera(DEFAULT_FOV_X, DEFAULT_SIDE);
+    Ok(Camera::new(intrinsics, world_from_camera)?)
 }

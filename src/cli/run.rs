@@ -1,6 +1,6 @@
 //! `subsplat run`: photographs to Gaussians, views and files.
 
-use super::args::{DetailArg, LowpassArg, PathArg, RunArgs};
+use super::args::{DetailArg, LookArgs, LowpassArg, PathArg, RunArgs};
 use super::output::{self, Scored, View, Views};
 use super::report::{Answer, Progress, mebibytes, peak_memory_bytes, say, warn};
 use super::{frames, memory, model, pair, range, render};
@@ -11,7 +11,7 @@ use std::path::Path;
 use subsplat::abi::{Convention, RasterOptions};
 use subsplat::camera::Camera;
 use subsplat::check::PairReport;
-use subsplat::config::LowpassRef;
+use subsplat::config::{Config, LowpassRef};
 use subsplat::data::crop::Cropped;
 use subsplat::data::depth::{DepthRange, depth_range};
 use subsplat::data::pair::choose_pair;
@@ -28,8 +28,6 @@ struct Plan {
     scene: Scene,
     context: Vec<usize>,
     input_size: (usize, usize),
-    /// `--background`.
-    background: Option<[f32; 3]>,
 }
 
 /// Runs the command.
@@ -48,29 +46,17 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     };
     let backend = backend(&args.look.device);
     let model = progress.stage("model", |_| model::load(&asked))?.with_backend(&backend);
-    let (stride, (w, h)) = (model.config().stride(), plan.input_size);
-    ensure!(
-        w >= stride && h >= stride,
-        "--input-size: expected at least {stride} pixels a side, got {w}x{h}"
-    );
-    memory::check_run(model.config(), plan.context.len(), (w, h))?;
+    let (w, h) = plan.input_size;
+    check_size(&model, plan.context.len(), (w, h))?;
     let r = model.config().upscale;
     let targets = targets(args, &plan, (w * r, h * r))?;
     output::prepare(&args.out, &plan.scene)?;
-    let photos = progress.steps("photographs", plan.context.len(), |bar| {
-        let photo = |&i: &usize| {
-            bar.inc(1);
-            Photo::from_frame(&plan.scene.frames[i])
-        };
-        plan.context.iter().map(photo).collect::<Result<Vec<_>, _>>()
-    })?;
+    let photos = photographs(&plan.scene, &plan.context, &mut progress)?;
     let reports = match args.no_check {
         true => Vec::new(),
         false => progress.stage("check", |_| pipeline::check_photos(&photos))?,
     };
-    range::tell(&reports);
-    let range = pipeline::refine_range(guess, given, &reports);
-    say(format!("near {:.4}, far {:.4}: {}", range.near, range.far, range.reason));
+    let range = range::refine(guess, given, &reports);
     let request = Request {
         input_size: plan.input_size,
         near_far: (range.near, range.far),
@@ -83,7 +69,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     progress.split_last(&result.seconds);
     result.warnings.extend(backend.warning());
     result.warnings.iter().for_each(warn);
-    let options = raster_options(args, &plan, &model, (range.near, &result.inputs));
+    let options = raster_options(&args.look, model.config(), (range.near, &result.inputs));
     let views = views(args, &targets, &result)?;
     let job = Views {
         out: &args.out,
@@ -120,7 +106,7 @@ fn backend(device: &str) -> Backend {
 /// Everything that can be wrong with the arguments and the scene is found here.
 fn plan(args: &RunArgs, progress: &mut Progress) -> Result<Plan> {
     let input_size = frames::size(&args.input_size)?;
-    let background = render::background(&args.look)?;
+    render::background(&args.look)?;
     frames::count(args.frames)?;
     ensure!(
         (0.0..=1.0).contains(&args.min_opacity),
@@ -129,7 +115,7 @@ fn plan(args: &RunArgs, progress: &mut Progress) -> Result<Plan> {
     );
     let scene = progress.stage("scene", |_| pair::load(&args.input, &args.pair))?;
     scene.warnings.iter().for_each(warn);
-    let (context, why) = context(args, &scene)?;
+    let (context, why) = context(&args.context, &args.input[0], &scene)?;
     ensure!(
         args.path == PathArg::Targets || args.target.is_empty(),
         "--target: only with --path targets"
@@ -140,14 +126,40 @@ fn plan(args: &RunArgs, progress: &mut Progress) -> Result<Plan> {
         scene.frames.len(),
         scene.source.name(),
     ));
-    Ok(Plan { scene, context, input_size, background })
+    Ok(Plan { scene, context, input_size })
 }
 
-/// Context frames, and how they were chosen.
-fn context(args: &RunArgs, scene: &Scene) -> Result<(Vec<usize>, String)> {
+/// The model's network takes inputs of this size, and the machine holds so many.
+pub fn check_size(model: &Reconstructor, views: usize, (w, h): (usize, usize)) -> Result<()> {
+    let stride = model.config().stride();
+    ensure!(
+        w >= stride && h >= stride,
+        "--input-size: expected at least {stride} pixels a side, got {w}x{h}"
+    );
+    memory::check_run(model.config(), views, (w, h))
+}
+
+/// The photographs of a scene's `context` frames.
+pub fn photographs(
+    scene: &Scene,
+    context: &[usize],
+    progress: &mut Progress,
+) -> Result<Vec<Photo>> {
+    progress.steps("photographs", context.len(), |bar| {
+        let photo = |&i: &usize| {
+            bar.inc(1);
+            Ok(Photo::from_frame(&scene.frames[i])?)
+        };
+        context.iter().map(photo).collect()
+    })
+}
+
+/// Context frames of the scene at `input`, `asked` where that is not empty, and how they
+/// were chosen.
+pub fn context(asked: &[String], input: &Path, scene: &Scene) -> Result<(Vec<usize>, String)> {
     let list = |frames: &[usize]| frames.iter().map(usize::to_string).collect::<Vec<_>>().join(",");
-    if !args.context.is_empty() {
-        let chosen = frames::indices(scene, &args.context, "--context")?;
+    if !asked.is_empty() {
+        let chosen = frames::indices(scene, asked, "--context")?;
         ensure!(chosen.len() >= 2, "--context: expected at least 2 frames, got {}", chosen.len());
         for (n, i) in chosen.iter().enumerate() {
             let name = &scene.frames[*i].name;
@@ -162,7 +174,7 @@ fn context(args: &RunArgs, scene: &Scene) -> Result<(Vec<usize>, String)> {
     if scene.frames.len() == 2 {
         return Ok((vec![0, 1], "0,1: the only two".to_owned()));
     }
-    if let Some(test) = frames::protocol(&args.input[0], scene)?.into_iter().next()
+    if let Some(test) = frames::protocol(input, scene)?.into_iter().next()
         && test.context.len() >= 2
     {
         let text = format!("{} from protocol.json", list(&test.context));
@@ -228,30 +240,32 @@ fn views(args: &RunArgs, targets: &[usize], result: &Reconstruction) -> Result<V
     Ok(path.into_iter().map(View::Path).collect())
 }
 
-fn median(values: &[f32]) -> f32 {
+/// The middle value; 1 where there is none.
+pub fn median(values: &[f32]) -> f32 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f32::total_cmp);
     sorted.get(sorted.len() / 2).copied().unwrap_or(1.0)
 }
 
-fn raster_options(
-    args: &RunArgs,
-    plan: &Plan,
-    model: &Reconstructor,
+/// How Gaussians of a model with `config` are rendered, by the arguments and else as the
+/// model and its inputs say.
+pub fn raster_options(
+    look: &LookArgs,
+    config: &Config,
     (near, inputs): (f32, &[Cropped]),
 ) -> RasterOptions {
-    let mut config = model.config().clone();
-    if let Some(convention) = args.look.convention {
+    let mut config = config.clone();
+    if let Some(convention) = look.convention {
         config.render.convention = convention.into();
     }
-    if let Some(reference) = args.look.lowpass_ref {
+    if let Some(reference) = look.lowpass_ref {
         config.render.lowpass_ref = match reference {
             LowpassArg::Target => LowpassRef::Target,
             LowpassArg::Input => LowpassRef::Input,
         };
     }
     let mut options = pipeline::raster_options(&config, near, inputs);
-    options.background = plan.background.unwrap_or(options.background);
+    options.background = look.background.unwrap_or(options.background);
     options
 }
 

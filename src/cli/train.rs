@@ -104,7 +104,7 @@ impl Watch {
     fn hear(&mut self, event: &Event) {
         match event {
             Event::Begin { step, parameters, resumed, untrained, warnings } => {
-                warnings.iter().for_each(|w| warn(w));
+                warnings.iter().for_each(warn);
                 self.first = *step;
                 self.started = Instant::now();
                 match resumed {

@@ -86,7 +86,9 @@ pub fn adapters() -> Vec<AdapterSummary> {
     all.iter().map(|a| AdapterSummary::of(&a.get_info())).collect()
 }
 
-pub(crate) fn instance() -> wgpu::Instance {
+/// Where adapters are looked for: the platform's own back-ends. A surface made from it
+/// brings its display with it.
+pub fn instance() -> wgpu::Instance {
     let mut descriptor = wgpu::InstanceDescriptor::new_without_display_handle();
     descriptor.backends = wgpu::Backends::PRIMARY;
     // Our indirect counts are written by our own kernels within limits.
@@ -136,10 +138,24 @@ pub fn choose(choice: &DeviceChoice, found: &[AdapterSummary]) -> Result<Option<
 
 /// The adapter that `choice` means; `None` for the CPU kernels.
 pub(crate) fn find(choice: &DeviceChoice) -> Result<Option<wgpu::Adapter>, GpuError> {
+    find_for(&instance(), choice, None)
+}
+
+/// The adapter of `instance` that `choice` means, among those that can show pictures on
+/// `surface` where there is one; `None` for the CPU kernels.
+///
+/// # Errors
+/// As [`choose`].
+pub fn find_for(
+    instance: &wgpu::Instance,
+    choice: &DeviceChoice,
+    surface: Option<&wgpu::Surface>,
+) -> Result<Option<wgpu::Adapter>, GpuError> {
     if *choice == DeviceChoice::Cpu {
         return Ok(None);
     }
-    let mut all = enumerate(&instance());
+    let mut all = enumerate(instance);
+    all.retain(|a| surface.is_none_or(|s| a.is_surface_supported(s)));
     let summaries: Vec<_> = all.iter().map(|a| AdapterSummary::of(&a.get_info())).collect();
     Ok(choose(choice, &summaries)?.map(|i| all.swap_remove(i)))
 }

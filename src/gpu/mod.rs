@@ -53,7 +53,7 @@ mod sort;
 mod spgr;
 mod spgr_bwd;
 
-pub use adapter::{AdapterSummary, DeviceChoice, adapters, choose};
+pub use adapter::{AdapterSummary, DeviceChoice, adapters, choose, find_for, instance};
 pub use attention_gather::AttentionGatherArgs;
 pub use attention_gather_bwd::AttentionGatherGradients;
 pub use buffers::Buffer;

@@ -1,0 +1,120 @@
+//! Arguments of `view`, and its keys.
+
+use super::args::{ConventionArg, DetailArg, LookArgs, ModelArgs, PairArgs, triple};
+use clap::Args;
+use std::path::PathBuf;
+
+/// What the window listens to: `--help` and the H key show it.
+pub const KEYS: &str = "\
+In the window:
+  left drag                turn around the scene (orbit), look around (fly)
+  right or shift drag      pan
+  wheel                    nearer or farther (orbit), faster or slower (fly)
+  W A S D Q E              forward, left, back, right, down, up; with shift four times as fast
+  F                        orbit or fly
+  R                        back to the first camera
+  1 2 4                    children a side of a pixel: x1, x2, x4 (of photographs)
+  P                        save the picture
+  H                        this list
+  Esc                      quit";
+
+/// Arguments of `view`.
+#[derive(Clone, Debug, Args)]
+pub struct ViewArgs {
+    /// A finished scene (.ply, .compressed.ply, .splat, .spz, .ksplat, .glb); or what `run`
+    /// takes, which is reconstructed first: a scene folder, a pose file, two photographs.
+    #[arg(required = true, num_args = 1..=2, value_name = "SPLATS | SCENE | IMG IMG")]
+    pub input: Vec<PathBuf>,
+    /// Size of the window at first, px: N, or WxH (default: the first camera's picture, at
+    /// most 1280x960).
+    #[arg(long, value_name = "N | WxH")]
+    pub size: Option<String>,
+    /// What renders: gpu (any adapter), auto (one that is no software adapter), or an
+    /// adapter by a part of its name.
+    #[arg(long, default_value = "gpu", value_name = "auto|gpu|NAME")]
+    pub device: String,
+    /// Draw so many frames, one after another, and quit.
+    #[arg(long, value_name = "N")]
+    pub frames: Option<usize>,
+    /// Save what the window shows in the last of `--frames` (PNG).
+    #[arg(long, value_name = "FILE", requires = "frames")]
+    pub save: Option<PathBuf>,
+    /// Folder for the pictures that P saves, as NAME-0001.png and so on.
+    #[arg(short, long, default_value = ".", value_name = "DIR")]
+    pub out: PathBuf,
+    /// Cameras of a finished scene: any pose file or scene folder; the first is where the
+    /// window begins. Default: cameras.json beside the scene, else a view of the whole.
+    #[arg(long, value_name = "SCENE")]
+    pub cameras: Option<PathBuf>,
+    /// Context frames: indices into the scene's frames, or file names.
+    #[arg(long, value_delimiter = ',', value_name = "I,J")]
+    pub context: Vec<String>,
+    /// Side of the network's input, px: N, or WxH.
+    #[arg(long, default_value = "256", value_name = "N | WxH")]
+    pub input_size: String,
+    /// Children a side of a pixel at first: 2 gives 4 per pixel, 4 gives 16. Default: the
+    /// weights' own, else 2.
+    #[arg(long, value_name = "R")]
+    pub upscale: Option<usize>,
+    /// Weights (.safetensors). Default: those that ship with the program.
+    #[arg(long, value_name = "FILE")]
+    pub weights: Option<PathBuf>,
+    /// Untrained weights, drawn from this seed.
+    #[arg(long, value_name = "N", conflicts_with = "weights")]
+    pub seed: Option<u64>,
+    /// Nearest depth candidate, world units (default: as for `run`). For a finished scene
+    /// the near plane, as for `render`.
+    #[arg(long)]
+    pub near: Option<f32>,
+    /// Farthest depth candidate, world units (default: as for `run`).
+    #[arg(long)]
+    pub far: Option<f32>,
+    /// Do not match points between the context photographs to check their poses first.
+    #[arg(long)]
+    pub no_check: bool,
+    /// Detail from the photograph.
+    #[arg(long, value_enum, default_value = "off")]
+    pub detail: DetailArg,
+    /// Rasterizer rules. Default: the model's own; for scene files what `run` noted in
+    /// them (.ply, .glb), else `standard`.
+    #[arg(long, value_enum)]
+    pub convention: Option<ConventionArg>,
+    /// Background colour, R,G,B in [0, 1]. Default: the model's own (the inputs' mean
+    /// colour, or black); for scene files what `run` noted in them, else black.
+    #[arg(long, value_parser = triple, value_name = "R,G,B")]
+    pub background: Option<[f32; 3]>,
+    /// What the model is.
+    #[command(flatten)]
+    pub model: ModelArgs,
+    /// Cameras of two loose photographs.
+    #[command(flatten)]
+    pub pair: PairArgs,
+}
+
+impl ViewArgs {
+    /// How it is rendered, as the other commands say it.
+    pub fn look(&self) -> LookArgs {
+        LookArgs {
+            convention: self.convention,
+            lowpass_ref: None,
+            background: self.background,
+            device: self.device.clone(),
+        }
+    }
+
+    /// A flag that only photographs have a use for and that was given.
+    pub fn for_photographs(&self) -> Option<&'static str> {
+        let flags = [
+            (!self.context.is_empty(), "--context"),
+            (self.upscale.is_some(), "--upscale"),
+            (self.weights.is_some(), "--weights"),
+            (self.seed.is_some(), "--seed"),
+            (self.far.is_some(), "--far"),
+            (self.detail != DetailArg::Off, "--detail"),
+            (self.model.backbone.is_some(), "--backbone"),
+            (self.model.preset.is_some(), "--preset"),
+            (self.model.config.is_some(), "--config"),
+        ];
+        flags.into_iter().find(|f| f.0).map(|f| f.1)
+    }
+}

@@ -1,0 +1,328 @@
+//! A window's surface, and the GPU that draws on it.
+
+use anyhow::{Context, Result, anyhow, ensure};
+use std::sync::{Arc, Mutex, PoisonError};
+use subsplat::abi::RasterOptions;
+use subsplat::camera::Camera;
+use subsplat::gpu::{DeviceChoice, Gpu, Rasterizer, Scene, find_for, instance, wgpu};
+use subsplat::io::image::Rgb;
+use wgpu::CurrentSurfaceTexture as Current;
+use winit::window::Window;
+
+/// Formats that frames are drawn in and read back from, best first; the others of a surface
+/// are deep or wide colour.
+const FORMATS: [wgpu::TextureFormat; 4] = [
+    wgpu::TextureFormat::Bgra8Unorm,
+    wgpu::TextureFormat::Rgba8Unorm,
+    wgpu::TextureFormat::Bgra8UnormSrgb,
+    wgpu::TextureFormat::Rgba8UnormSrgb,
+];
+/// Most bytes of one buffer, where the adapter has more: indices are 32 bits of words.
+const BINDING_MAX: u64 = 1 << 30;
+/// Bytes to which rows of a texture are padded in a copy.
+const ROW: u32 = wgpu::COPY_BYTES_PER_ROW_ALIGNMENT;
+
+/// What became of a frame.
+pub enum Frame {
+    /// It is on the window; what it shows, if that was asked for.
+    Shown(Option<Rgb>),
+    /// The window has no place for it now (hidden, being resized): try again.
+    Skipped,
+}
+
+/// What the driver said outside of any call.
+type Fault = Arc<Mutex<Option<String>>>;
+
+/// A window that is drawn on.
+pub struct Canvas {
+    window: Arc<Window>,
+    instance: wgpu::Instance,
+    surface: wgpu::Surface<'static>,
+    config: wgpu::SurfaceConfiguration,
+    gpu: Arc<Gpu>,
+    rasterizer: Rasterizer,
+    fault: Fault,
+}
+
+fn surface_of(
+    instance: &wgpu::Instance,
+    window: &Arc<Window>,
+) -> Result<wgpu::Surface<'static>, wgpu::CreateSurfaceError> {
+    let target = wgpu::SurfaceTarget::DisplayAndWindow(Box::new(window.clone()));
+    instance.create_surface(target)
+}
+
+/// What a surface on this adapter is set to.
+fn configuration(
+    caps: &wgpu::SurfaceCapabilities,
+    (width, height): (u32, u32),
+) -> Result<wgpu::SurfaceConfiguration> {
+    let format = FORMATS.into_iter().find(|f| caps.formats.contains(f)).with_context(|| {
+        format!("window: expected a surface of one of {FORMATS:?}, got {:?}", caps.formats)
+    })?;
+    // Alpha is how much of the scene covers a pixel, not of the window.
+    let opaque = wgpu::CompositeAlphaMode::Opaque;
+    let alpha_mode = match caps.alpha_modes.contains(&opaque) {
+        true => opaque,
+        false => wgpu::CompositeAlphaMode::Auto,
+    };
+    Ok(wgpu::SurfaceConfiguration {
+        usage: wgpu::TextureUsages::RENDER_ATTACHMENT
+            | (caps.usages & wgpu::TextureUsages::COPY_SRC),
+        format,
+        color_space: wgpu::SurfaceColorSpace::Auto,
+        width,
+        height,
+        present_mode: wgpu::PresentMode::AutoVsync,
+        desired_maximum_frame_latency: 2,
+        alpha_mode,
+        view_formats: Vec::new(),
+    })
+}
+
+/// A device of `adapter` that holds as much as it can, and where it puts its complaints.
+fn device_of(adapter: &wgpu::Adapter) -> Result<(Arc<Gpu>, Fault)> {
+    let own = adapter.limits();
+    let usual = wgpu::Limits::default();
+    let binding = own.max_storage_buffer_binding_size.min(BINDING_MAX);
+    let limits = wgpu::Limits {
+        max_storage_buffer_binding_size: binding.max(usual.max_storage_buffer_binding_size),
+        max_buffer_size: own.max_buffer_size.min(BINDING_MAX).max(usual.max_buffer_size),
+        max_texture_dimension_2d: own.max_texture_dimension_2d,
+        ..usual
+    };
+    let descriptor = wgpu::DeviceDescriptor {
+        label: Some("subsplat view"),
+        required_limits: limits,
+        ..wgpu::DeviceDescriptor::default()
+    };
+    let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))
+        .with_context(|| format!("GPU {}: no device", adapter.get_info().name))?;
+    let fault = Fault::default();
+    let heard = fault.clone();
+    // wgpu's own handler panics.
+    device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| {
+        let mut fault = heard.lock().unwrap_or_else(PoisonError::into_inner);
+        fault.get_or_insert_with(|| e.to_string());
+    }));
+    Ok((Gpu::from_device(device, queue), fault))
+}
+
+impl Canvas {
+    /// Opens the adapter that `choice` means for `window`.
+    ///
+    /// # Errors
+    /// No adapter that can show pictures there, no device, no format that fits.
+    pub fn open(window: Arc<Window>, choice: &DeviceChoice) -> Result<Self> {
+        let instance = instance();
+        let surface = surface_of(&instance, &window).context("window: no surface")?;
+        let adapter = find_for(&instance, choice, Some(&surface))?
+            .with_context(|| format!("window: expected {choice}, got none that can show it"))?;
+        let (gpu, fault) = device_of(&adapter)?;
+        let size = window.inner_size();
+        let config = configuration(&surface.get_capabilities(&adapter), (size.width, size.height))?;
+        let rasterizer = Rasterizer::new(gpu.clone());
+        let mut new = Self { window, instance, surface, config, gpu, rasterizer, fault };
+        new.resize(size.width, size.height)?;
+        Ok(new)
+    }
+
+    /// The GPU, for uploads.
+    pub fn gpu(&self) -> &Arc<Gpu> {
+        &self.gpu
+    }
+
+    /// The window.
+    pub fn window(&self) -> &Window {
+        &self.window
+    }
+
+    /// Width and height of a frame, px.
+    pub fn size(&self) -> (usize, usize) {
+        (self.config.width as usize, self.config.height as usize)
+    }
+
+    /// The window's new size, px; one without pixels (minimised) changes nothing.
+    ///
+    /// # Errors
+    /// More pixels a side than the adapter draws.
+    pub fn resize(&mut self, width: u32, height: u32) -> Result<()> {
+        if width == 0 || height == 0 {
+            return Ok(());
+        }
+        let most = self.gpu.limits().max_texture_dimension_2d;
+        ensure!(
+            width.max(height) <= most,
+            "window: expected at most {most} pixels a side, got {width}x{height}"
+        );
+        (self.config.width, self.config.height) = (width, height);
+        self.configure()
+    }
+
+    fn configure(&self) -> Result<()> {
+        self.surface.configure(self.gpu.device(), &self.config);
+        self.check()
+    }
+
+    /// What went wrong with the device since the last call.
+    fn check(&self) -> Result<()> {
+        self.gpu.check()?;
+        let fault = self.fault.lock().unwrap_or_else(PoisonError::into_inner).take();
+        fault.map_or(Ok(()), |reason| Err(anyhow!("GPU refused a frame: {reason}")))
+    }
+
+    /// Whether the device is gone, so that no other frame can be drawn.
+    pub fn is_lost(&self) -> bool {
+        self.gpu.check().is_err()
+    }
+
+    /// The texture that the window shows next. A surface that is out of date is set up
+    /// again, one that is lost made anew.
+    fn next(&mut self) -> Result<Option<wgpu::SurfaceTexture>> {
+        for _ in 0..2 {
+            match self.surface.get_current_texture() {
+                Current::Success(texture) | Current::Suboptimal(texture) => {
+                    return Ok(Some(texture));
+                }
+                Current::Timeout | Current::Occluded => return Ok(None),
+                Current::Outdated => {
+                    let size = self.window.inner_size();
+                    self.resize(size.width, size.height)?;
+                }
+                Current::Lost => {
+                    self.surface = surface_of(&self.instance, &self.window)
+                        .context("window: its surface was lost")?;
+                    self.configure()?;
+                }
+                Current::Validation => {
+                    self.check()?;
+                    return Err(anyhow!("window: its surface gives no texture"));
+                }
+            }
+        }
+        Ok(None)
+    }
+
+    /// Draws a frame and shows it; `camera` is asked for the frame's width and height, and
+    /// `capture` wants the pixels.
+    ///
+    /// # Errors
+    /// The scene is too large for the device, the device is lost or refuses.
+    pub fn draw(
+        &mut self,
+        scene: &Scene,
+        options: &RasterOptions,
+        camera: impl FnOnce(usize, usize) -> Camera,
+        capture: bool,
+    ) -> Result<Frame> {
+        let Some(shown) = self.next()? else { return Ok(Frame::Skipped) };
+        let (width, height) = self.size();
+        let camera = camera(width, height);
+        let view = shown.texture.create_view(&wgpu::TextureViewDescriptor::default());
+        self.rasterizer.draw(scene, &camera, options, &view)?;
+        let readable = self.config.usage.contains(wgpu::TextureUsages::COPY_SRC);
+        let picture = match (capture, readable) {
+            (false, _) => None,
+            (true, true) => Some(self.read(&shown.texture)?),
+            (true, false) => {
+                let own = self.texture();
+                let view = own.create_view(&wgpu::TextureViewDescriptor::default());
+                self.rasterizer.draw(scene, &camera, options, &view)?;
+                Some(self.read(&own)?)
+            }
+        };
+        self.window.pre_present_notify();
+        self.gpu.queue().present(shown);
+        self.check()?;
+        Ok(Frame::Shown(picture))
+    }
+
+    /// A texture like the window's that can be read.
+    fn texture(&self) -> wgpu::Texture {
+        let (width, height) = (self.config.width, self.config.height);
+        self.gpu.device().create_texture(&wgpu::TextureDescriptor {
+            label: Some("picture"),
+            size: wgpu::Extent3d { width, height, depth_or_array_layers: 1 },
+            mip_level_count: 1,
+            sample_count: 1,
+            dimension: wgpu::TextureDimension::D2,
+            format: self.config.format,
+            usage: wgpu::TextureUsages::RENDER_ATTACHMENT | wgpu::TextureUsages::COPY_SRC,
+            view_formats: &[],
+        })
+    }
+
+    /// The pixels of a texture of the window's format.
+    fn read(&self, texture: &wgpu::Texture) -> Result<Rgb> {
+        let (device, size) = (self.gpu.device(), texture.size());
+        let row = (4 * size.width).next_multiple_of(ROW);
+        let buffer = device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some("picture"),
+            size: u64::from(row) * u64::from(size.height),
+            usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        });
+        let mut encoder = device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        let layout = wgpu::TexelCopyBufferLayout {
+            offset: 0,
+            bytes_per_row: Some(row),
+            rows_per_image: None,
+        };
+        let to = wgpu::TexelCopyBufferInfo { buffer: &buffer, layout };
+        encoder.copy_texture_to_buffer(texture.as_image_copy(), to, size);
+        self.gpu.queue().submit([encoder.finish()]);
+        let (answer, answered) = std::sync::mpsc::channel();
+        buffer.slice(..).map_async(wgpu::MapMode::Read, move |done| {
+            // The receiver is gone only where the picture was given up.
+            answer.send(done).ok();
+        });
+        device.poll(wgpu::PollType::wait_indefinitely()).context("reading the picture")?;
+        answered.recv().context("reading the picture")?.context("reading the picture")?;
+        let mapped = buffer.slice(..).get_mapped_range().context("reading the picture")?;
+        let bytes: Vec<u8> = mapped.iter().copied().collect();
+        Ok(rgb(&bytes, row as usize, (size.width as usize, size.height as usize), self.is_bgra()))
+    }
+
+    fn is_bgra(&self) -> bool {
+        use wgpu::TextureFormat::{Bgra8Unorm, Bgra8UnormSrgb};
+        matches!(self.config.format, Bgra8Unorm | Bgra8UnormSrgb)
+    }
+}
+
+/// Rows of `row` bytes that begin with `width` pixels of four bytes, as a picture.
+fn rgb(bytes: &[u8], row: usize, (width, height): (usize, usize), bgra: bool) -> Rgb {
+    let mut data = Vec::with_capacity(3 * width * height);
+    for line in bytes.chunks_exact(row).take(height) {
+        for pixel in line.chunks_exact(4).take(width) {
+            let (first, rest) = (pixel.iter().take(3), pixel.iter().take(3).rev());
+            if bgra { data.extend(rest) } else { data.extend(first) }
+        }
+    }
+    Rgb { width, height, data }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn padding_goes_and_channels_come_in_order() {
+        let bytes = [1, 2, 3, 9, 4, 5, 6, 9, 0, 0, 7, 8, 9, 9, 10, 11, 12, 9, 0, 0];
+        let as_is = rgb(&bytes, 10, (2, 2), false);
+        assert_eq!(as_is.data, [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12]);
+        let turned = rgb(&bytes, 10, (1, 2), true);
+        assert_eq!((turned.width, turned.height, turned.data), (1, 2, vec![3, 2, 1, 9, 8, 7]));
+    }
+
+    #[test]
+    fn a_surface_without_a_known_format_is_named() {
+        let mut caps = wgpu::SurfaceCapabilities::default();
+        caps.formats = vec![wgpu::TextureFormat::Rgba16Float];
+        let error = configuration(&caps, (4, 3)).unwrap_err().to_string();
+        assert!(error.contains("Bgra8Unorm") && error.contains("Rgba16Float"), "{error}");
+        caps.formats.push(wgpu::TextureFormat::Rgba8UnormSrgb);
+        caps.formats.push(wgpu::TextureFormat::Rgba8Unorm);
+        let found = configuration(&caps, (4, 3)).unwrap();
+        assert_eq!((found.format, found.width), (wgpu::TextureFormat::Rgba8Unorm, 4));
+    }
+}
