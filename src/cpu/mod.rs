@@ -8,6 +8,7 @@
 //! tile), `rasterize` (the frame).
 
 pub mod activation;
+pub mod adapter;
 pub mod attention;
 pub mod attention_gather;
 mod blend;
@@ -17,6 +18,7 @@ pub mod conv;
 mod covariance;
 pub mod detail;
 mod disjoint;
+pub mod dssim;
 pub mod ewa;
 mod ewa_bwd;
 mod fresh;

@@ -6,7 +6,7 @@
 //! four linear maps), φ_c through 64, a LayerNorm at the end of each.
 
 use super::geometry::{Frames, ParentChunk, canonical};
-use super::mlp::{Block2, LayerNorm, Mode, affine, gelu, linear, xavier};
+use super::mlp::{Block2, LayerNorm, affine, gelu, linear, xavier};
 use crate::config::{AlphaInput, AnchorFrame, Embed, EmbedMlp, MuInput, ScaleInput};
 use candle_core::{Result, Tensor};
 use candle_nn::{Linear, VarBuilder};
@@ -124,28 +124,23 @@ impl Embeddings {
     }
 
     /// z^g and z^a, `[n, E]`.
-    pub fn forward(
-        &self,
-        parents: &ParentChunk,
-        frames: &Frames,
-        mode: Mode,
-    ) -> Result<(Tensor, Tensor)> {
+    pub fn forward(&self, parents: &ParentChunk, frames: &Frames) -> Result<(Tensor, Tensor)> {
         let inputs = self.inputs(parents, frames)?;
         match &self.mlps {
             Mlps::Pg { geometry, w_g, colour } => {
-                let mut sum = geometry[0].forward(&inputs[0], mode)?;
+                let mut sum = geometry[0].forward(&inputs[0])?;
                 for (block, x) in geometry.iter().zip(&inputs).skip(1) {
-                    sum = sum.add(&block.forward(x, mode)?)?;
+                    sum = sum.add(&block.forward(x)?)?;
                 }
-                Ok((affine(w_g, &sum, mode)?, colour.forward(&parents.sh, mode)?))
+                Ok((affine(w_g, &sum)?, colour.forward(&parents.sh)?))
             }
             Mlps::Lite { geometry, w_g, ln_g, colour, ln_c } => {
-                let hidden = geometry.iter().zip(&inputs).map(|(l, x)| affine(l, x, mode));
+                let hidden = geometry.iter().zip(&inputs).map(|(l, x)| affine(l, x));
                 let hidden = Tensor::cat(&hidden.collect::<Result<Vec<_>>>()?, 1)?;
-                let z_g = ln_g.forward(&affine(w_g, &gelu(&hidden, mode)?, mode)?, mode)?;
-                let hidden = gelu(&affine(&colour[0], &parents.sh, mode)?, mode)?;
-                let z_a = affine(&colour[1], &hidden, mode)?;
-                Ok((z_g, ln_c.forward(&z_a, mode)?))
+                let z_g = ln_g.forward(&affine(w_g, &gelu(&hidden)?)?)?;
+                let hidden = gelu(&affine(&colour[0], &parents.sh)?)?;
+                let z_a = affine(&colour[1], &hidden)?;
+                Ok((z_g, ln_c.forward(&z_a)?))
             }
         }
     }

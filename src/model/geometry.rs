@@ -7,6 +7,7 @@
 use crate::abi::VISIBLE_Z_MIN;
 use crate::camera::Camera;
 use crate::config::MaskMode;
+use crate::ops::linear::linear;
 use candle_core::{D, DType, Device, Result, Tensor, bail};
 
 /// Picture position given to points behind a camera: outside by more than any
@@ -47,6 +48,15 @@ pub struct Frame {
     pub turn: Tensor,
 }
 
+/// x·m of `x` `[n, k]` and `m` `[k, k]`. f32 goes round candle's product, which asks the
+/// system for the number of processors each time.
+fn times(x: &Tensor, m: &Tensor) -> Result<Tensor> {
+    if x.dtype() != DType::F32 {
+        return x.matmul(m);
+    }
+    linear(x, &m.t()?, &Tensor::zeros(m.dim(1)?, DType::F32, m.device())?)
+}
+
 impl Frame {
     /// Tensors of `camera`.
     pub fn new(camera: Camera, dtype: DType, device: &Device) -> Result<Self> {
@@ -67,12 +77,12 @@ impl Frame {
 
     /// World points `[n, 3]` to camera coordinates.
     pub fn to_camera(&self, means: &Tensor) -> Result<Tensor> {
-        means.broadcast_sub(&self.position)?.matmul(&self.rotation)
+        times(&means.broadcast_sub(&self.position)?, &self.rotation)
     }
 
     /// World quaternions `[n, 4]` to this camera's frame.
     pub fn quat_to_camera(&self, quats_wxyz: &Tensor) -> Result<Tensor> {
-        quats_wxyz.matmul(&self.turn)
+        times(quats_wxyz, &self.turn)
     }
 }
 

@@ -8,6 +8,7 @@ use super::aggregation::{Aggregation, Prepared, ring};
 use super::embed::Embeddings;
 use super::geometry::{Frames, ParentChunk};
 use super::mlp::Mode;
+use super::primaries::Packed;
 use super::spgr::{Heads, rules};
 use super::{BackboneOutput, Primaries, Views};
 use crate::abi::{RasterOptions, SPLAT_LANES, ShBasis, sh_coefficients};
@@ -42,6 +43,21 @@ pub struct Children {
 }
 
 impl Children {
+    /// The primaries of one scene themselves, K = 1: what a trunk with SPGR off gives.
+    ///
+    /// # Errors
+    /// Whatever candle says.
+    pub fn whole(parents: &Packed) -> Result<Self> {
+        let rows = parents.rows().clone();
+        Ok(Self {
+            gain: Tensor::ones(rows.dim(0)?, rows.dtype(), rows.device())?,
+            rows,
+            sh: parents.sh()?,
+            sh_basis: parents.sh_basis,
+            k: 1,
+        })
+    }
+
     /// Packed rows for the renderer and the writers.
     ///
     /// # Errors
@@ -109,6 +125,11 @@ impl Trunk {
             None
         };
         Ok(Self { config: config.clone(), side: config.upscale, parts })
+    }
+
+    /// Whether SPGR is off: children are then the primaries ([`Children::whole`]).
+    pub fn is_off(&self) -> bool {
+        self.parts.is_none()
     }
 
     /// r of the next calls; the `coord` head serves any, the others what they have
@@ -302,7 +323,7 @@ impl Trunk {
         mode: Mode,
     ) -> Result<(Tensor, Tensor)> {
         let parents = scene.chunk(first, len)?;
-        let (z_g, z_a) = parts.embeddings.forward(&parents, &scene.frames, mode)?;
+        let (z_g, z_a) = parts.embeddings.forward(&parents, &scene.frames)?;
         let (geo, app) = match (&parts.aggregation, &scene.prepared) {
             (Some(agg), Some(prepared)) => {
                 let z = (&z_g, &z_a);
@@ -316,7 +337,7 @@ impl Trunk {
             // (spec 1.6).
             _ => (z_g, z_a),
         };
-        let head = parts.heads.forward(&geo, &app, self.side, mode)?;
+        let head = parts.heads.forward(&geo, &app, self.side)?;
         let rows = [&parents.means, &parents.quats_wxyz, &parents.scales, &parents.opacities];
         Ok((head, Tensor::cat(&rows, 1)?))
     }
