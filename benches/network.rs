@@ -154,7 +154,7 @@ fn whole(case: &str) -> Result<Run> {
     let camera = scene::camera(to);
     Ok(Box::new(move || {
         let out = model.reconstruct(&photos, &request)?;
-        let options = model.raster_options(1.0);
+        let options = model.raster_options(1.0, &out.inputs);
         let picture = render(&out.splats, &camera, &options);
         Ok(f64::from(picture.rgb.iter().sum::<f32>()))
     }))

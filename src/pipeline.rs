@@ -136,6 +136,25 @@ impl Reconstructor {
         Self::build(config, Weights::seeded(seed))
     }
 
+    /// The model that ships, [`Weights::shipped`], at ×`upscale`. SubSplat's heads serve
+    /// the r that they were trained for; at another, children are the plain split of their
+    /// parents, and [`Reconstructor::untrained_tensors`] lists the heads.
+    ///
+    /// # Errors
+    /// An `upscale` out of range.
+    pub fn shipped(upscale: usize) -> Result<Self> {
+        let weights = Weights::shipped()?;
+        let own = weights.config().cloned();
+        let mut config = own.unwrap_or_else(|| Config::small(Preset::Tuned, upscale));
+        if config.upscale == upscale {
+            return Self::from_weights(weights, Some(&config));
+        }
+        config.upscale = upscale;
+        // Heads that start closed ask nothing of the views.
+        config.agg.enabled = false;
+        Self::from_weights(weights.without(SUBSPLAT_PREFIX), Some(&config))
+    }
+
     /// A model from a weight file. Its own configuration is used unless `config` is
     /// given; a file without one must fit `config`, which is then by default MVSplat
     /// with the `tuned` preset and ×2. SubSplat's tensors may be missing (a converted
@@ -193,9 +212,9 @@ impl Reconstructor {
         CropOptions { input_size, ..CropOptions::square(0, config.upscale, config.stride()) }
     }
 
-    /// How this model's Gaussians are rendered at target resolution.
-    pub fn raster_options(&self, near: f32) -> RasterOptions {
-        raster_options(self.config(), near)
+    /// How this model's Gaussians of `inputs` are rendered at target resolution.
+    pub fn raster_options(&self, near: f32, inputs: &[Cropped]) -> RasterOptions {
+        raster_options(self.config(), near, inputs)
     }
 
     /// Photographs to Gaussians.
@@ -277,18 +296,11 @@ pub fn add_detail(splats: &mut Splats, inputs: &[Cropped], upscale: usize) -> Re
     Ok(())
 }
 
-/// How Gaussians of a model with `config` are rendered at target resolution; `near`
-/// is the near plane that the reconstruction was made with.
-pub fn raster_options(config: &Config, near: f32) -> RasterOptions {
-    let render = &config.render;
-    let mut options = RasterOptions::new(render.convention);
-    options.sh_degree = render.sh_degree;
-    options.sh_direction = render.sh_dir;
-    options.lowpass = render.lowpass_px2(config.upscale as f32);
-    if render.convention == crate::abi::Convention::Mvsplat {
-        options.near = near;
-    }
-    options
+/// How Gaussians of a model with `config`, made from `inputs`, are rendered at target
+/// resolution; `near` is the near plane that the reconstruction was made with.
+pub fn raster_options(config: &Config, near: f32, inputs: &[Cropped]) -> RasterOptions {
+    let colour = Rgb::mean_colour(inputs.iter().map(|c| &c.input));
+    config.raster_options(config.upscale as f32, near, colour)
 }
 
 /// The preset configuration for a backbone by name.

@@ -25,7 +25,7 @@ const SIZE: (usize, usize) = (64, 64);
 
 /// Rendering as the model asks for it, SH up to degree 3, which is what files hold.
 fn options(model: &Reconstructor) -> RasterOptions {
-    RasterOptions { sh_degree: 3, ..model.raster_options(NEAR_FAR.0) }
+    RasterOptions { sh_degree: 3, ..model.raster_options(NEAR_FAR.0, &[]) }
 }
 
 fn cameras(result: &subsplat::pipeline::Reconstruction) -> Vec<Camera> {
@@ -393,7 +393,7 @@ fn straight_to_the_picture_is_the_same_picture() {
         for config in [native(&config), config] {
             let model = lively(&config);
             let views = batch(&model, &shoots, SIZE);
-            let options = model.raster_options(NEAR_FAR.0);
+            let options = model.raster_options(NEAR_FAR.0, &[]);
             let camera = views.cameras[0][0].resized(2 * SIZE.0, 2 * SIZE.1);
             let direct = model.model().render(&views, &camera, &options).unwrap();
             let scenes = model.model().forward(&views, &mut |_| {}).unwrap();
@@ -445,7 +445,7 @@ fn any_number_of_views_any_shape_any_depth_range() {
                 let range = near_far.0 / slope * 0.99..near_far.1 * 1.01;
                 assert!(depth.data.iter().all(|z| range.contains(z)), "{near_far:?}");
             }
-            let options = model.raster_options(near_far.0);
+            let options = model.raster_options(near_far.0, &[]);
             for c in &result.inputs {
                 let picture = render(&result.splats, &c.target_camera, &options);
                 assert_eq!((picture.width, picture.height), (2 * size.0, 2 * size.1));

@@ -115,12 +115,12 @@ fn methods_are_what_they_say() {
     let request = |detail| Request { input_size: (64, 64), near_far, detail };
     let photos = [photo(0), photo(2)];
     let seen = |model: &Reconstructor, detail: bool, lowpass: LowpassRef| {
-        let splats = model.reconstruct(&photos, &request(detail)).unwrap().splats;
+        let made = model.reconstruct(&photos, &request(detail)).unwrap();
         let mut config = model.config().clone();
         config.upscale = 2;
         config.render.lowpass_ref = lowpass;
-        let options = raster_options(&config, near_far.0);
-        let picture = render(&splats, &truth.target_camera, &options);
+        let options = raster_options(&config, near_far.0, &made.inputs);
+        let picture = render(&made.splats, &truth.target_camera, &options);
         psnr(&picture.rgb, &truth.target.to_unit(), 128, 128).unwrap()
     };
     let mut alone = Config::small(Preset::Tuned, 2);
@@ -136,10 +136,11 @@ fn methods_are_what_they_say() {
         assert!((got[i] - want).abs() < 1e-6, "{}: {} {want}", methods[i].name(), got[i]);
     }
     // Four times a pixel's middle is ¾ of it and ¼ of the neighbour's, each way.
-    let splats = alone.reconstruct(&photos, &request(false)).unwrap().splats;
+    let made = alone.reconstruct(&photos, &request(false)).unwrap();
     let mut config = alone.config().clone();
     config.upscale = 1;
-    let small = render(&splats, &truth.input_camera, &raster_options(&config, near_far.0)).rgb;
+    let rules = raster_options(&config, near_far.0, &made.inputs);
+    let small = render(&made.splats, &truth.input_camera, &rules).rgb;
     let mut large = Vec::new();
     for i in 0..128usize * 128 {
         let (x, y) = (i % 128, i / 128);

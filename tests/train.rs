@@ -294,6 +294,33 @@ fn call(folder: &Path, arguments: &str) -> (i32, String, String) {
     (output.status.code().unwrap(), text(output.stdout), text(output.stderr))
 }
 
+/// TensorFlow's checksum of a record, bit by bit: CRC-32C (Castagnoli), turned and moved.
+fn masked_crc(bytes: &[u8]) -> u32 {
+    let mut crc = !0u32;
+    for byte in bytes {
+        crc ^= u32::from(*byte);
+        for _ in 0..8 {
+            crc = if crc & 1 == 1 { crc >> 1 ^ 0x82F6_3B78 } else { crc >> 1 };
+        }
+    }
+    (!crc).rotate_right(15).wrapping_add(0xA282_EAD8)
+}
+
+/// Messages of a TensorBoard file, their framing checked.
+fn records(mut bytes: &[u8]) -> Vec<&[u8]> {
+    let mut found = Vec::new();
+    while !bytes.is_empty() {
+        let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap());
+        let length = word(0) as usize;
+        assert_eq!((word(4), word(8)), (0, masked_crc(&bytes[..8])));
+        let message = &bytes[12..12 + length];
+        assert_eq!(word(12 + length), masked_crc(message));
+        found.push(message);
+        bytes = &bytes[16 + length..];
+    }
+    found
+}
+
 #[test]
 fn the_program_trains_and_goes_on() {
     let folder = tempfile::tempdir().unwrap();
@@ -309,6 +336,19 @@ fn the_program_trains_and_goes_on() {
     for name in ["weights.safetensors", "validation.csv", "sheet-00000003-rooms.png", "log.csv"] {
         assert!(folder.path().join("run").join(name).is_file(), "{name}");
     }
+    let mut events: Vec<_> = std::fs::read_dir(folder.path().join("run")).unwrap().collect();
+    events.retain(|e| e.as_ref().unwrap().file_name().to_string_lossy().contains(".tfevents."));
+    assert_eq!(events.len(), 2, "one a call");
+    let bytes = std::fs::read(events[0].as_ref().unwrap().path()).unwrap();
+    let records = records(&bytes);
+    let of = |text: &str| {
+        records.iter().filter(|r| r.windows(text.len()).any(|w| w == text.as_bytes())).count()
+    };
+    assert!(records[0].ends_with(b"brain.Event:2"));
+    let steps = of("loss/total");
+    assert!(steps == 1 || steps == 2, "{steps}");
+    assert_eq!((of("train/psnr"), of("rooms/psnr"), of("photos/psnr")), (steps, 1, 0));
+    assert!(of("rooms/sheet") == 1 && of("IEND") == 1);
     let (code, _, stderr) = call(folder.path(), "train t.toml --out run --minutes 0");
     assert!(code == 1 && stderr.contains("--minutes"), "{stderr}");
 }

@@ -177,12 +177,12 @@ pub struct RunArgs {
     /// Default: the weights' own, else 2.
     #[arg(long, value_name = "R")]
     pub upscale: Option<usize>,
-    /// Weights (.safetensors). Without: seeded, untrained weights.
+    /// Weights (.safetensors). Default: those that ship with the program.
     #[arg(long, value_name = "FILE")]
     pub weights: Option<PathBuf>,
-    /// Seed of untrained weights.
-    #[arg(long, default_value_t = 0)]
-    pub seed: u64,
+    /// Untrained weights, drawn from this seed.
+    #[arg(long, value_name = "N", conflicts_with = "weights")]
+    pub seed: Option<u64>,
     /// Rendered frames.
     #[arg(long, value_enum, default_value = "targets")]
     pub path: PathArg,
@@ -223,7 +223,7 @@ pub struct RunArgs {
 #[derive(Debug, Args)]
 pub struct ModelArgs {
     /// Network that gives the primary Gaussians. Default: the weights' own, `re10k`
-    /// for a bare MVSplat checkpoint, `small` without weights.
+    /// for a bare MVSplat checkpoint; `re10k` without weights is untrained.
     #[arg(long, value_enum)]
     pub backbone: Option<BackboneArg>,
     /// SubSplat's equations. Default: the weights' own, `tuned` for weights without
@@ -245,9 +245,10 @@ pub struct LookArgs {
     /// Of which picture's pixels the 0.3 px² low-pass is measured in.
     #[arg(long, value_enum)]
     pub lowpass_ref: Option<LowpassArg>,
-    /// Background colour, R,G,B in [0, 1].
-    #[arg(long, value_parser = triple, default_value = "0,0,0", value_name = "R,G,B")]
-    pub background: [f32; 3],
+    /// Background colour, R,G,B in [0, 1]. Default: the model's own (the inputs' mean
+    /// colour, or black); for scene files what `run` noted in them, else black.
+    #[arg(long, value_parser = triple, value_name = "R,G,B")]
+    pub background: Option<[f32; 3]>,
     /// What renders: cpu; auto (a GPU where there is one that is no software adapter); gpu
     /// (any adapter); or an adapter by a part of its name. The CPU takes over, with a
     /// warning, where that fails.

@@ -54,12 +54,12 @@ pub struct EvalArgs {
     /// VGG16 and LPIPS weights (.safetensors, made by subsplat-convert).
     #[arg(long, value_name = "FILE")]
     pub lpips: Option<PathBuf>,
-    /// Weights (.safetensors). Without: seeded, untrained weights.
+    /// Weights (.safetensors). Default: those that ship with the program.
     #[arg(long, value_name = "FILE")]
     pub weights: Option<PathBuf>,
-    /// Seed of untrained weights.
-    #[arg(long, default_value_t = 0)]
-    pub seed: u64,
+    /// Untrained weights, drawn from this seed.
+    #[arg(long, value_name = "N", conflicts_with = "weights")]
+    pub seed: Option<u64>,
     /// Nearest depth candidate, world units (default: as `run`; chunks 1).
     #[arg(long)]
     pub near: Option<f32>,

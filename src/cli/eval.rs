@@ -288,7 +288,10 @@ fn write(
     };
     let weights = match &args.weights {
         Some(path) => format!("weights {}", path.display()),
-        None => format!("untrained weights, seed {}", args.seed),
+        None => match args.seed {
+            Some(seed) => format!("untrained weights, seed {seed}"),
+            None => "the weights that ship".to_owned(),
+        },
     };
     let mut notes = vec![
         format!(

@@ -22,6 +22,7 @@ mod raster_case;
 mod render;
 mod report;
 mod run;
+mod tensorboard;
 mod train;
 
 use anyhow::{Context, Result, ensure};

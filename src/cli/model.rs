@@ -6,7 +6,7 @@ use anyhow::{Context, Result, bail, ensure};
 use std::path::Path;
 use subsplat::abi::HEAD_GEOMETRY_LANES;
 use subsplat::config::{Config, Preset, SpgrHead};
-use subsplat::model::weights::Weights;
+use subsplat::model::weights::{SUBSPLAT_PREFIX, Weights};
 use subsplat::pipeline::{self, Reconstructor};
 
 /// Target over input where nothing says otherwise.
@@ -16,8 +16,8 @@ const UPSCALE: usize = 2;
 pub struct Asked<'a> {
     /// `--weights`.
     pub weights: Option<&'a Path>,
-    /// `--seed`.
-    pub seed: u64,
+    /// `--seed`: untrained weights.
+    pub seed: Option<u64>,
     /// r: side of the children's grid, K = r²; must fit the weights.
     pub upscale: Option<usize>,
     /// r where the weights leave it open.
@@ -28,15 +28,7 @@ pub struct Asked<'a> {
 
 /// The model that the arguments ask for.
 pub fn load(args: &Asked) -> Result<Reconstructor> {
-    let Some(path) = args.weights else {
-        let config = config(args, None)?;
-        let what = match pipeline::is_mvsplat(&config) {
-            true => "MVSplat's network gives noise with them",
-            false => "the small network is then a plain plane sweep, without anything learned",
-        };
-        warn(format!("no --weights: using seeded random weights (seed {}); {what}", args.seed));
-        return Ok(Reconstructor::untrained(&config, args.seed)?);
-    };
+    let Some(path) = args.weights else { return unasked(args) };
     let weights = Weights::load(path)?;
     let holds = Holds::of(&weights);
     let config = config(args, Some((&weights, &holds)))?;
@@ -62,6 +54,46 @@ pub fn load(args: &Asked) -> Result<Reconstructor> {
         ));
     }
     Ok(model)
+}
+
+/// Without `--weights`: those that ship, or untrained ones where the arguments ask for a
+/// model or a start of their own.
+fn unasked(args: &Asked) -> Result<Reconstructor> {
+    let mvsplat = args.model.backbone == Some(BackboneArg::Re10k);
+    if args.seed.is_none() && !mvsplat && args.model.config.is_none() {
+        let model = shipped(args)?;
+        if !model.untrained_tensors().is_empty() {
+            say(
+                "SubSplat's heads of the weights that ship start untrained for this --upscale and \
+                 preset: children are the plain split of their parents",
+            );
+        }
+        return Ok(model);
+    }
+    let (config, seed) = (config(args, None)?, args.seed.unwrap_or(0));
+    let what = match pipeline::is_mvsplat(&config) {
+        true => "MVSplat's network gives noise with them",
+        false => "the small network is then a plain plane sweep, without anything learned",
+    };
+    warn(format!("no --weights: using seeded random weights (seed {seed}); {what}"));
+    Ok(Reconstructor::untrained(&config, seed)?)
+}
+
+/// The shipped backbone, with SubSplat's heads where the arguments leave them their own
+/// preset and r.
+fn shipped(args: &Asked) -> Result<Reconstructor> {
+    let upscale = args.upscale.or(args.ratio).unwrap_or(UPSCALE);
+    let asked = || format!("--upscale {upscale}");
+    let Some(preset) = args.model.preset else {
+        return Reconstructor::shipped(upscale).with_context(asked);
+    };
+    let weights = Weights::shipped()?.without(SUBSPLAT_PREFIX);
+    let preset = Preset::from(preset);
+    let config = match weights.config() {
+        Some(own) => own.with_preset(preset, upscale),
+        None => Config::small(preset, upscale),
+    };
+    Reconstructor::from_weights(weights, Some(&config)).with_context(asked)
 }
 
 /// What a weight file holds, by its names.
@@ -150,8 +182,12 @@ fn config(args: &Asked, file: Option<(&Weights, &Holds)>) -> Result<Config> {
     let wanted = upscale.or(known).unwrap_or(UPSCALE);
     let mut config = match (stored, args.model.preset) {
         (Some(config), None) if pipeline::is_mvsplat(config) == mvsplat => config.clone(),
-        (_, preset) => {
-            pipeline::preset(mvsplat, preset.map_or(Preset::Tuned, Preset::from), wanted)
+        (stored, preset) => {
+            let preset = preset.map_or(Preset::Tuned, Preset::from);
+            match stored.filter(|c| pipeline::is_mvsplat(c) == mvsplat) {
+                Some(stored) => stored.with_preset(preset, wanted),
+                None => pipeline::preset(mvsplat, preset, wanted),
+            }
         }
     };
     config.upscale = wanted;

@@ -245,10 +245,15 @@ pub fn note(options: &RasterOptions) -> String {
         Convention::Standard => "standard",
         Convention::Mvsplat => "mvsplat",
     };
-    format!("{NOTE} convention={convention} near={} lowpass={}", options.near, options.lowpass)
+    let [r, g, b] = options.background;
+    format!(
+        "{NOTE} convention={convention} near={} lowpass={} background={r},{g},{b}",
+        options.near, options.lowpass
+    )
 }
 
-/// Convention, near plane and low-pass that [`note`] left among a file's comments.
+/// Convention, near plane, low-pass and background that [`note`] left among a file's
+/// comments.
 pub fn rendering(comments: &[String]) -> Option<RasterOptions> {
     let text = comments.iter().find_map(|c| c.trim().strip_prefix(NOTE))?;
     let value = |key: &str| text.split_whitespace().find_map(|w| w.strip_prefix(key));
@@ -260,7 +265,16 @@ pub fn rendering(comments: &[String]) -> Option<RasterOptions> {
     };
     let near = number("near=").filter(|v| *v > 0.0)?;
     let lowpass = number("lowpass=").filter(|v| *v >= 0.0)?;
-    Some(RasterOptions { near, lowpass, ..RasterOptions::new(convention) })
+    let mut options = RasterOptions { near, lowpass, ..RasterOptions::new(convention) };
+    // Not in files of earlier versions.
+    let channels = value("background=").map(|v| v.split(',').map(str::parse::<f32>));
+    if let Some(Ok(rgb)) = channels.map(|all| all.collect::<Result<Vec<_>, _>>())
+        && let Ok(rgb) = <[f32; 3]>::try_from(rgb)
+        && rgb.iter().all(|v| (0.0..=1.0).contains(v))
+    {
+        options.background = rgb;
+    }
+    Some(options)
 }
 
 #[cfg(test)]
@@ -270,9 +284,11 @@ mod tests {
     #[test]
     fn a_scene_file_remembers_how_it_is_rendered() {
         for (convention, near, lowpass) in
-            [(Convention::Standard, 0.01, 0.3), (Convention::Mvsplat, 1.25, 1.2)]
+            [(Convention::Standard, 0.01f32, 0.3f32), (Convention::Mvsplat, 1.25, 1.2)]
         {
-            let options = RasterOptions { near, lowpass, ..RasterOptions::new(convention) };
+            let background = [near.min(1.0), 0.25, 0.0];
+            let plain = RasterOptions::new(convention);
+            let options = RasterOptions { near, lowpass, background, ..plain };
             assert_eq!(rendering(&["up is -y".to_owned(), note(&options)]), Some(options));
         }
         for bad in [

@@ -23,11 +23,12 @@ const DEFAULT_SIDE: usize = 512;
 /// Horizontal field of view of the view that is made up where there is no camera.
 const DEFAULT_FOV_X: f32 = 0.9;
 
-/// The background colour, checked.
-pub fn background(look: &LookArgs) -> Result<[f32; 3]> {
-    let [r, g, b] = look.background;
-    let ok = look.background.iter().all(|v| (0.0..=1.0).contains(v));
-    ensure!(ok, "--background: expected three numbers in [0, 1], got {r},{g},{b}");
+/// `--background`, checked.
+pub fn background(look: &LookArgs) -> Result<Option<[f32; 3]>> {
+    if let Some([r, g, b]) = look.background {
+        let ok = [r, g, b].iter().all(|v| (0.0..=1.0).contains(v));
+        ensure!(ok, "--background: expected three numbers in [0, 1], got {r},{g},{b}");
+    }
     Ok(look.background)
 }
 
@@ -113,7 +114,7 @@ fn options(args: &RenderArgs, comments: &[String]) -> Result<RasterOptions> {
     };
     options.near = args.near.unwrap_or(options.near);
     options.sh_degree = args.sh_degree;
-    options.background = background(&args.look)?;
+    options.background = background(&args.look)?.unwrap_or(options.background);
     if matches!(args.look.lowpass_ref, Some(LowpassArg::Input)) {
         warn("--lowpass-ref input: a scene file does not know its input's size; ignored");
     }

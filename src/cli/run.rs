@@ -12,6 +12,7 @@ use subsplat::abi::{Convention, RasterOptions};
 use subsplat::camera::Camera;
 use subsplat::check::PairReport;
 use subsplat::config::LowpassRef;
+use subsplat::data::crop::Cropped;
 use subsplat::data::depth::{DepthRange, depth_range};
 use subsplat::data::pair::choose_pair;
 use subsplat::io::SaveOptions;
@@ -26,7 +27,8 @@ struct Plan {
     scene: Scene,
     context: Vec<usize>,
     input_size: (usize, usize),
-    background: [f32; 3],
+    /// `--background`.
+    background: Option<[f32; 3]>,
 }
 
 /// Runs the command.
@@ -78,7 +80,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     drop(photos);
     progress.split_last(&result.seconds);
     result.warnings.iter().for_each(warn);
-    let options = raster_options(args, &plan, &model, range.near);
+    let options = raster_options(args, &plan, &model, (range.near, &result.inputs));
     let views = views(args, &targets, &result)?;
     let job = Views {
         out: &args.out,
@@ -221,7 +223,12 @@ fn median(values: &[f32]) -> f32 {
     sorted.get(sorted.len() / 2).copied().unwrap_or(1.0)
 }
 
-fn raster_options(args: &RunArgs, plan: &Plan, model: &Reconstructor, near: f32) -> RasterOptions {
+fn raster_options(
+    args: &RunArgs,
+    plan: &Plan,
+    model: &Reconstructor,
+    (near, inputs): (f32, &[Cropped]),
+) -> RasterOptions {
     let mut config = model.config().clone();
     if let Some(convention) = args.look.convention {
         config.render.convention = convention.into();
@@ -232,8 +239,8 @@ fn raster_options(args: &RunArgs, plan: &Plan, model: &Reconstructor, near: f32)
             LowpassArg::Input => LowpassRef::Input,
         };
     }
-    let mut options = pipeline::raster_options(&config, near);
-    options.background = plan.background;
+    let mut options = pipeline::raster_options(&config, near, inputs);
+    options.background = plan.background.unwrap_or(options.background);
     options
 }
 

@@ -2,6 +2,7 @@
 
 use super::args::TrainArgs;
 use super::report::{Answer, mebibytes, say, warn};
+use super::tensorboard::Board;
 use anyhow::{Result, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
@@ -30,10 +31,20 @@ pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
     let limits = Limits { minutes: args.minutes, steps: args.steps };
     let mut training = Training::open(&config, &args.out)?;
     let mut watch = Watch::new(&config);
+    let mut board = Board::create(&args.out)?;
+    let mut unwritten = None;
     let validator = Validator::new(&config, args.validate.as_deref())?;
-    let outcome = training.run(limits, &validator, &mut |event| watch.hear(event));
+    let outcome = training.run(limits, &validator, &mut |event| {
+        watch.hear(event);
+        if unwritten.is_none() {
+            unwritten = board.hear(event).err();
+        }
+    });
     watch.bar.finish_and_clear();
     outcome?;
+    if let Some(e) = unwritten {
+        warn(format!("{e:#}: TensorBoard's file ends there"));
+    }
     let progress = training.progress();
     say(format!(
         "{} of {} steps done; weights in {}",
@@ -92,7 +103,8 @@ impl Watch {
 
     fn hear(&mut self, event: &Event) {
         match event {
-            Event::Begin { step, parameters, resumed, untrained } => {
+            Event::Begin { step, parameters, resumed, untrained, warnings } => {
+                warnings.iter().for_each(|w| warn(w));
                 self.first = *step;
                 self.started = Instant::now();
                 match resumed {

@@ -16,7 +16,7 @@ pub use aggregation::*;
 pub use backbone::*;
 pub use spgr::*;
 
-use crate::abi::{Convention, LOWPASS, ShDirection};
+use crate::abi::{Convention, LOWPASS, RasterOptions, ShDirection};
 use serde::{Deserialize, Serialize};
 use std::str::FromStr;
 use thiserror::Error;
@@ -80,6 +80,9 @@ pub struct Render {
     pub sh_degree: usize,
     /// Direction of view-dependent colour.
     pub sh_dir: ShDirection,
+    /// What shows where no Gaussian is.
+    #[serde(default)]
+    pub background: Background,
 }
 
 impl Render {
@@ -91,6 +94,17 @@ impl Render {
             LowpassRef::Input => self.lowpass * ratio * ratio,
         }
     }
+}
+
+/// What shows where no Gaussian is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Background {
+    /// Black (MVSplat).
+    #[default]
+    Black,
+    /// The mean colour of the pictures that the network saw.
+    Inputs,
 }
 
 /// Of which picture's pixels the low-pass is measured in.
@@ -131,9 +145,9 @@ impl Config {
     pub const METADATA_KEY: &'static str = "subsplat.config";
 
     fn preset(backbone: Backbone, preset: Preset, upscale: usize) -> Self {
-        let convention = match &backbone {
-            Backbone::Mvsplat(_) => Convention::Mvsplat,
-            Backbone::Small(_) => Convention::Standard,
+        let (convention, background) = match &backbone {
+            Backbone::Mvsplat(_) => (Convention::Mvsplat, Background::Black),
+            Backbone::Small(_) => (Convention::Standard, Background::Inputs),
         };
         Self {
             upscale,
@@ -147,6 +161,7 @@ impl Config {
                 lowpass_ref: LowpassRef::Target,
                 sh_degree: 3,
                 sh_dir: ShDirection::Child,
+                background,
             },
         }
     }
@@ -166,6 +181,21 @@ impl Config {
         Self::preset(Backbone::Small(Small::standard()), preset, upscale)
     }
 
+    /// Another preset and r around the same backbone: its shape stays, its frame of SH
+    /// becomes the preset's.
+    #[must_use]
+    pub fn with_preset(&self, preset: Preset, upscale: usize) -> Self {
+        match self.backbone.clone() {
+            Backbone::Mvsplat(mut b) => {
+                let mut config = Self::re10k(preset, upscale);
+                b.primaries.sh_frame = config.primaries().sh_frame;
+                config.backbone = Backbone::Mvsplat(b);
+                config
+            }
+            small => Self::preset(small, preset, upscale),
+        }
+    }
+
     /// The paper's ×2 model: 256 → 512, K = 4.
     pub fn x2() -> Self {
         Self::re10k(Preset::Paper, 2)
@@ -174,6 +204,24 @@ impl Config {
     /// The paper's ×4 model: 256 → 1024, K = 16.
     pub fn x4() -> Self {
         Self::re10k(Preset::Paper, 4)
+    }
+
+    /// How this model's Gaussians are rendered to a picture `ratio` times as large (side
+    /// over side) as the network's input. `near`: the nearest depth candidate, world
+    /// units; `inputs`: mean colour of the pictures that the network saw.
+    pub fn raster_options(&self, ratio: f32, near: f32, inputs: [f32; 3]) -> RasterOptions {
+        let render = &self.render;
+        let mut options = RasterOptions::new(render.convention);
+        options.sh_degree = render.sh_degree;
+        options.sh_direction = render.sh_dir;
+        options.lowpass = render.lowpass_px2(ratio);
+        if render.convention == Convention::Mvsplat {
+            options.near = near;
+        }
+        if render.background == Background::Inputs {
+            options.background = inputs;
+        }
+        options
     }
 
     /// K: children per primary, r².

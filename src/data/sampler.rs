@@ -16,9 +16,11 @@
 //! lower bound gives nothing.
 
 use super::procedural::rng::Rng;
+use serde::{Deserialize, Serialize};
 
 /// Reading of the gap between the context frames.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum GapMode {
     /// The gap is its lower bound (MVSplat's code).
     #[default]

@@ -4,9 +4,8 @@ use super::methods::{enlarged, mean, nearest};
 use super::{
     Benchmark, Case, CaseScores, Error, Loaded, Method, Result, Score, Scores, TargetScores, bad,
 };
-use crate::abi::RasterOptions;
 use crate::camera::Camera;
-use crate::config::{Config, LowpassRef};
+use crate::config::LowpassRef;
 use crate::cpu::Rasterizer;
 use crate::data::crop::{CropOptions, CropRule, Cropped, LrFrom};
 use crate::io::image::Rgb;
@@ -15,7 +14,7 @@ use crate::model::lpips::Lpips;
 use crate::model::subsplat::{SubSplat, feature_channels};
 use crate::model::trunk::Trunk;
 use crate::model::weights::Weights;
-use crate::pipeline::{self, Photo, add_detail, raster_options, views_of};
+use crate::pipeline::{self, Photo, add_detail, views_of};
 use crate::render::render_with;
 use crate::splats::Splats;
 use std::path::Path;
@@ -251,6 +250,8 @@ fn fitting(
 struct Players<'a> {
     r: usize,
     near: f32,
+    /// Mean colour of the inputs.
+    colour: [f32; 3],
     network: Option<Network<'a>>,
     /// Whose Gaussians `splats` are.
     current: Option<Set>,
@@ -307,6 +308,7 @@ impl<'a> Players<'a> {
         Ok(Self {
             r: evaluator.options.upscale,
             near: prepared.range.0,
+            colour: Rgb::mean_colour(prepared.inputs.iter().map(|c| &c.input)),
             network,
             current: None,
             splats: None,
@@ -357,21 +359,12 @@ impl<'a> Players<'a> {
         let (Some(network), Some(splats)) = (&self.network, &self.splats) else {
             return Vec::new();
         };
-        let options = rendering(network.model.config(), ratio, reference, self.near);
+        let mut config = network.model.config().clone();
+        config.upscale = ratio;
+        config.render.lowpass_ref = reference.unwrap_or(config.render.lowpass_ref);
+        let options = config.raster_options(ratio as f32, self.near, self.colour);
         render_with(&mut self.rasterizer, splats, camera, &options).rgb
     }
-}
-
-fn rendering(
-    config: &Config,
-    ratio: usize,
-    reference: Option<LowpassRef>,
-    near: f32,
-) -> RasterOptions {
-    let mut config = config.clone();
-    config.upscale = ratio;
-    config.render.lowpass_ref = reference.unwrap_or(config.render.lowpass_ref);
-    raster_options(&config, near)
 }
 
 impl Network<'_> {

@@ -31,6 +31,22 @@ impl Rgb {
         Self { width, height, data: vec![0; width * height * 3] }
     }
 
+    /// Mean colour of all pixels of `pictures`, each picture counting the same, value / 255;
+    /// black of none.
+    pub fn mean_colour<'a>(pictures: impl IntoIterator<Item = &'a Self>) -> [f32; 3] {
+        let (mut sum, mut count) = ([0f64; 3], 0u32);
+        for picture in pictures {
+            let mut own = [0u64; 3];
+            for px in picture.data.chunks_exact(3) {
+                own.iter_mut().zip(px).for_each(|(sum, v)| *sum += u64::from(*v));
+            }
+            let pixels = (255 * (picture.data.len() / 3).max(1)) as f64;
+            sum.iter_mut().zip(own).for_each(|(sum, v)| *sum += v as f64 / pixels);
+            count += 1;
+        }
+        sum.map(|v| (v / f64::from(count.max(1))) as f32)
+    }
+
     /// `[H, W, 3]` floats, value / 255.
     pub fn to_unit(&self) -> Vec<f32> {
         self.data.iter().map(|&v| f32::from(v) / 255.0).collect()

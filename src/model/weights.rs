@@ -65,7 +65,21 @@ impl Weights {
     /// Not a safetensors file, a dtype other than f32, f16 and bf16, numbers that are
     /// not finite, a configuration that does not parse.
     pub fn load(path: &Path) -> io::Result<Self> {
-        let (tensors, metadata) = read_tensors(path)?;
+        Self::parse(&io::read(path)?, path)
+    }
+
+    /// The weights that ship in the crate: the small backbone and SubSplat at ×2, learned
+    /// from made-up rooms alone (`src/model/shipped/README.md` is their model card).
+    ///
+    /// # Errors
+    /// None that a whole build can give: those of [`Weights::load`].
+    pub fn shipped() -> io::Result<Self> {
+        Self::parse(include_bytes!("shipped/small.safetensors"), Path::new("shipped weights"))
+    }
+
+    /// [`Weights::load`] of bytes in memory; `path` names them in errors.
+    fn parse(bytes: &[u8], path: &Path) -> io::Result<Self> {
+        let (tensors, metadata) = parse_tensors(bytes, path)?;
         let config = match metadata.get(Config::METADATA_KEY) {
             Some(json) => Some(Config::from_json(json).map_err(|e| {
                 io::Error::format(path, "a configuration in the metadata", e.to_string())
@@ -103,6 +117,14 @@ impl Weights {
     #[must_use]
     pub fn trainable(mut self) -> Self {
         self.trainable = true;
+        self
+    }
+
+    /// Without the tensors whose names start with `prefix`.
+    #[must_use]
+    pub fn without(mut self, prefix: &str) -> Self {
+        let kept = self.tensors.iter().filter(|(name, _)| !name.starts_with(prefix));
+        self.tensors = Arc::new(kept.map(|(n, t)| (n.clone(), t.clone())).collect());
         self
     }
 

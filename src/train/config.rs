@@ -1,6 +1,7 @@
 //! What a training is told: one TOML or JSON file, every key with a default, unknown
 //! keys refused.
 
+use super::files::Files;
 use super::optimizer::Settings;
 use super::schedule::Schedule;
 use super::source::Augmentation;
@@ -139,6 +140,9 @@ pub struct Data {
     pub crop: f32,
     /// Exposure, softness and noise of cameras on the context views.
     pub photographic: bool,
+    /// Pictures on disk in place of made-up rooms: then `scenes`, `samples`,
+    /// `target_samples`, `crop` and `photographic` mean nothing, and depth is unknown.
+    pub files: Option<Files>,
     /// Scenes that are shown in turns before the next ones are made.
     pub window: u64,
     /// How often each is shown in its window.
@@ -162,6 +166,7 @@ impl Default for Data {
             target_samples: 1,
             crop: 0.5,
             photographic: true,
+            files: None,
             window: 256,
             replay: 1,
             workers: 1,
@@ -304,6 +309,9 @@ impl TrainConfig {
         if let Start::Weights { path, .. } = &mut config.init {
             *path = folder.join(&*path);
         }
+        if let Some(files) = &mut config.data.files {
+            files.path = folder.join(&files.path);
+        }
         if let Some(path) = &mut config.loss.lpips_weights {
             *path = folder.join(&*path);
         }
@@ -445,6 +453,13 @@ impl TrainConfig {
                 "0, or loss.lpips_weights with a file",
                 self.loss.lpips,
             ));
+        }
+        if let Some(files) = &self.data.files {
+            files.check()?;
+            if self.phase == Phase::Depth {
+                let expected = "none in the depth phase, which needs the generator's own depth";
+                return Err(Error::value("data.files", expected, files.path.display()));
+            }
         }
         if self.phase == Phase::Depth && !small {
             return Err(Error::value("phase", "`render` for MVSplat's backbone", "depth"));

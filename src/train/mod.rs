@@ -9,6 +9,7 @@
 
 pub mod checkpoint;
 pub mod config;
+pub mod files;
 pub mod loading;
 pub mod loss;
 pub mod optimizer;

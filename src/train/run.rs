@@ -2,6 +2,7 @@
 
 use super::checkpoint::{self, Progress};
 use super::config::{Start, TrainConfig};
+use super::files::Pictures;
 use super::loading::Loader;
 use super::optimizer::Optimizer;
 use super::source::{Replay, Source};
@@ -11,7 +12,8 @@ use super::{Error, Result};
 use crate::io;
 use crate::model::weights::{self, Weights};
 use candle_core::Tensor;
-use std::io::Write;
+use std::fs::{File, TryLockError};
+use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
@@ -32,6 +34,8 @@ pub enum Event {
         resumed: Option<PathBuf>,
         /// Tensors that the initial weights lack.
         untrained: usize,
+        /// Harmless oddities of the data set, one line each.
+        warnings: Vec<String>,
     },
     /// After each step.
     Step(StepReport),
@@ -87,12 +91,34 @@ pub struct Training {
     progress: Progress,
     resumed: Option<PathBuf>,
     untrained: usize,
+    warnings: Vec<String>,
+    /// Held so that no other process trains in the folder.
+    _lock: File,
 }
 
 /// The source that `config` asks for.
 fn source(config: &TrainConfig) -> Result<Arc<dyn Source>> {
-    let rooms = validate::rooms(config, false)?;
-    Ok(Arc::new(Replay::new(rooms, config.data.window, config.data.replay)))
+    let (window, times) = (config.data.window, config.data.replay);
+    Ok(match &config.data.files {
+        Some(files) => Arc::new(Replay::new(Pictures::open(files, config)?, window, times)),
+        None => Arc::new(Replay::new(validate::rooms(config, false)?, window, times)),
+    })
+}
+
+/// The folder's lock, for as long as the file is open.
+fn locked(folder: &Path) -> Result<File> {
+    let path = folder.join("lock");
+    let file = File::options().create(true).append(true).open(&path);
+    let file = file.map_err(|e| io::Error::io(&path, e))?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => {
+            Err(Error::value(folder.display(), "a folder that nothing trains in", "one in use"))
+        }
+        // A file system without locks: nothing to go by.
+        Err(TryLockError::Error(e)) if e.kind() == ErrorKind::Unsupported => Ok(file),
+        Err(TryLockError::Error(e)) => Err(io::Error::io(&path, e).into()),
+    }
 }
 
 /// Its last element is the small backbone's correction of the opacity logit.
@@ -116,8 +142,8 @@ fn start(config: &TrainConfig) -> Result<Weights> {
 }
 
 impl Training {
-    /// Begins in `folder`, or goes on from its newest checkpoint, with the examples of
-    /// the procedural generator.
+    /// Begins in `folder`, or goes on from its newest checkpoint, with the examples that
+    /// `config` asks for.
     ///
     /// # Errors
     /// A configuration that does not check; weights or a checkpoint that do not fit; a
@@ -137,6 +163,8 @@ impl Training {
     ) -> Result<Self> {
         config.check()?;
         std::fs::create_dir_all(folder).map_err(|e| io::Error::io(folder, e))?;
+        let lock = locked(folder)?;
+        let warnings = source.warnings();
         let newest = checkpoint::steps(folder).last().map(|s| checkpoint::path(folder, *s));
         let weights = match newest {
             // The checkpoint holds every tensor.
@@ -171,6 +199,8 @@ impl Training {
             progress,
             resumed: newest,
             untrained,
+            warnings,
+            _lock: lock,
         })
     }
 
@@ -259,6 +289,7 @@ impl Training {
             parameters: self.optimizer.parameters(),
             resumed: self.resumed.clone(),
             untrained: self.untrained,
+            warnings: self.warnings.clone(),
         });
         let mut log = Log::open(&self.folder)?;
         let begin = Instant::now();

@@ -32,6 +32,11 @@ pub trait Source: Send + Sync {
     /// # Errors
     /// What a file says; nothing in a generator.
     fn example(&self, index: u64) -> Result<Arc<Example>>;
+
+    /// Harmless oddities that opening it found, one line each.
+    fn warnings(&self) -> Vec<String> {
+        Vec::new()
+    }
 }
 
 /// Words that belong to a seed and a place (SplitMix64's finaliser).
@@ -130,6 +135,10 @@ fn shuffled(i: u64, n: u64, key: u64) -> u64 {
 }
 
 impl<S: Source> Source for Replay<S> {
+    fn warnings(&self) -> Vec<String> {
+        self.inner.warnings()
+    }
+
     fn example(&self, index: u64) -> Result<Arc<Example>> {
         let place = self.place(index);
         if self.times == 1 {

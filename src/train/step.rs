@@ -6,8 +6,10 @@ use super::optimizer::{Gradients, Optimizer};
 use super::source::Example;
 use super::{Error, Result};
 use crate::abi::RasterOptions;
+use crate::camera::Camera;
 use crate::config::{Backbone, Config};
 use crate::data::dataset::Posed;
+use crate::io::image::Rgb;
 use crate::model::backbone::small::DepthMaps;
 use crate::model::lpips::Lpips;
 use crate::model::primaries::packed;
@@ -139,17 +141,12 @@ pub fn views_of(examples: &[&Example]) -> Result<Views> {
     Ok(Views::new(images, cameras, planes)?)
 }
 
-/// How pictures of a model with `config` are rasterized at target size.
-pub fn raster_options(config: &Config, ratio: f32, near: f32) -> RasterOptions {
-    let render = &config.render;
-    let mut options = RasterOptions::new(render.convention);
-    options.sh_degree = render.sh_degree;
-    options.sh_direction = render.sh_dir;
-    options.lowpass = render.lowpass_px2(ratio);
-    if render.convention == crate::abi::Convention::Mvsplat {
-        options.near = near;
-    }
-    options
+/// How `example`'s target `camera` is rendered by a model with `config`.
+pub fn raster_options(config: &Config, example: &Example, camera: &Camera) -> RasterOptions {
+    let width = example.context.first().map_or(1, |p| p.image.width.max(1));
+    let ratio = camera.intrinsics.width as f32 / width as f32;
+    let inputs = Rgb::mean_colour(example.context.iter().map(|p| &p.image));
+    config.raster_options(ratio, example.near_far.0, inputs)
 }
 
 /// A detached copy with a gradient of its own.
@@ -379,10 +376,8 @@ impl Learner {
             [&children.rows, &children.sh, &children.gain].map(|t| Scored::zero(t.elem_count()));
         let mut terms = Terms::default();
         let share = 1.0 / example.targets.len().max(1) as f64;
-        let [w, _] = self.config.data.input;
         for target in &example.targets {
-            let ratio = target.camera.intrinsics.width as f32 / w as f32;
-            let mut options = raster_options(self.model.config(), ratio, example.near_far.0);
+            let mut options = raster_options(self.model.config(), example, &target.camera);
             options.sh_basis = children.sh_basis;
             let planes = rasterize(&leaves[0], &leaves[1], &leaves[2], &target.camera, &options)?;
             let rgb = planes.narrow(0, 0, 3)?.contiguous()?;

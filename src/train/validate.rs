@@ -11,7 +11,7 @@ use crate::data::dataset::Posed;
 use crate::io::image::{Rgb, save_png};
 use crate::metrics::{psnr, ssim};
 use crate::model::subsplat::SubSplat;
-use crate::model::weights::Weights;
+use crate::model::weights::{SUBSPLAT_PREFIX, Weights};
 use candle_core::Tensor;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -94,7 +94,9 @@ impl Validator {
         weights: BTreeMap<String, Tensor>,
         sheet: Option<&Path>,
     ) -> Result<[Option<Found>; 2]> {
-        let model = SubSplat::new(&self.model, Weights::from_tensors(weights).builder())?;
+        // As in `pipeline`: heads that no file gave start closed.
+        let weights = Weights::from_tensors(weights).allow_missing(SUBSPLAT_PREFIX, 0);
+        let model = SubSplat::new(&self.model, weights.builder())?;
         let path = |end: &str| {
             let path = sheet?;
             let mut name = path.file_name()?.to_owned();
@@ -148,8 +150,7 @@ impl Validator {
         let mut pictures: Vec<Rgb> = scene.context.iter().map(|p| p.image.clone()).collect();
         for target in &scene.targets {
             let k = target.camera.intrinsics;
-            let ratio = k.width as f32 / scene.context[0].image.width as f32;
-            let options = raster_options(&self.model, ratio, scene.near_far.0);
+            let options = raster_options(&self.model, scene, &target.camera);
             let planes =
                 model.trunk().render(&views, &output, &parents, &target.camera, &options)?;
             let rgb = planes.narrow(0, 0, 3)?.flatten_all()?.to_vec1::<f32>()?;

@@ -1,0 +1,62 @@
+//! Makes a test set of procedural rooms for `subsplat eval`, one scene folder each:
+//!
+//! ```text
+//! cargo run --release --example make_rooms -- out/rooms 24 77   # folder, rooms, seed
+//! subsplat eval out/rooms --upscale 2
+//! ```
+//!
+//! Two context pictures and two targets of 256², drawn as training draws its examples
+//! but from another seed; `eval` halves the context pictures to get its ×2 input.
+
+use anyhow::{Context, Result};
+use serde_json::json;
+use std::path::PathBuf;
+use subsplat::data::dataset::Posed;
+use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
+use subsplat::io::image::save_png;
+use subsplat::train::TrainConfig;
+use subsplat::train::source::Source;
+use subsplat::train::validate::rooms;
+
+/// Side of every picture, px.
+const SIDE: usize = 256;
+const TARGETS: usize = 2;
+
+fn main() -> Result<()> {
+    let mut arguments = std::env::args().skip(1);
+    let folder = PathBuf::from(arguments.next().unwrap_or_else(|| "out/rooms".to_owned()));
+    let mut number = |default: u64| -> Result<u64> {
+        arguments.next().map_or(Ok(default), |text| text.parse().context("a number"))
+    };
+    let (count, seed) = (number(24)?, number(77)?);
+    let mut config = TrainConfig::default();
+    config.model.upscale = 1;
+    config.data.input = [SIDE, SIDE];
+    config.data.targets = TARGETS;
+    config.data.target_samples = 2;
+    config.data.seed = seed;
+    let source = rooms(&config, true)?;
+    for i in 0..count {
+        let example = source.example(i)?;
+        let place = folder.join(format!("room_{i:03}"));
+        std::fs::create_dir_all(place.join("images"))?;
+        let save = |(v, view): (usize, &Posed)| -> Result<NamedCamera> {
+            let file = format!("images/{v}.png");
+            save_png(&place.join(&file), &view.image)?;
+            Ok(NamedCamera { file, camera: view.camera, timestamp: None, depth: None })
+        };
+        let views = example.context.iter().chain(&example.targets).enumerate();
+        let cameras = views.map(save).collect::<Result<Vec<_>>>()?;
+        let contexts = example.context.len();
+        let target: Vec<usize> = (contexts..cameras.len()).collect();
+        let near_far = Some(example.near_far);
+        let file = CameraFile { cameras, units: Default::default(), near_far };
+        save_cameras_json(&place.join("cameras.json"), &file)?;
+        let context: Vec<usize> = (0..contexts).collect();
+        let tests = json!([{ "context": context, "target": target }]);
+        let protocol = json!({ "resolution": [SIDE, SIDE], "tests": tests });
+        std::fs::write(place.join("protocol.json"), format!("{protocol:#}\n"))?;
+    }
+    println!("{count} rooms in {}", folder.display());
+    Ok(())
+}
