@@ -11,6 +11,7 @@ pub mod activation;
 pub mod adapter;
 pub mod attention;
 pub mod attention_gather;
+pub mod attributes;
 mod blend;
 mod blocks;
 mod colour_bwd;

@@ -7,6 +7,8 @@
 use crate::abi::VISIBLE_Z_MIN;
 use crate::camera::Camera;
 use crate::config::MaskMode;
+use crate::ops::attributes;
+use crate::ops::columns::columns;
 use crate::ops::linear::linear;
 use candle_core::{D, DType, Device, Result, Tensor, bail};
 
@@ -33,6 +35,14 @@ pub struct ParentChunk {
     pub opacities: Tensor,
     /// `[n, 3·D]`, colour-major, in the frame that the embedding reads.
     pub sh: Tensor,
+}
+
+impl ParentChunk {
+    /// `[n, 11]`: packed, lanes in [`crate::abi`].
+    pub fn rows(&self) -> Result<Tensor> {
+        let most = columns(&self.means, &self.quats_wxyz, Some(&self.scales))?;
+        columns(&most, &self.opacities, None)
+    }
 }
 
 /// One context view.
@@ -73,6 +83,18 @@ impl Frame {
             position: tensor(camera.position().to_array().to_vec(), (1, 3))?,
             turn: tensor(turn, (4, 4))?.t()?.contiguous()?,
         })
+    }
+
+    /// The same in numbers.
+    pub fn numbers(&self) -> attributes::Frame {
+        let r = self.camera.rotation();
+        let q = glam::Quat::from_mat3(&r).normalize();
+        let turn = left_product([q.w, -q.x, -q.y, -q.z]).map(f64::from);
+        attributes::Frame {
+            rotation: std::array::from_fn(|i| r.row(i).as_dvec3().to_array()),
+            position: self.camera.position().as_dvec3().to_array(),
+            turn: std::array::from_fn(|i| std::array::from_fn(|j| turn[4 * i + j])),
+        }
     }
 
     /// World points `[n, 3]` to camera coordinates.

@@ -16,6 +16,7 @@ use crate::config::{
     AMin, AMinMode, AreaAt, Config, DepthDir, DepthUnit, GainSpace, OpacityRule, PrimaryView,
     Slide, SpgrHead,
 };
+use crate::ops::columns::columns;
 use crate::ops::redistribute::Rule;
 use crate::ops::spgr::Rules;
 use candle_core::{Result, Tensor};
@@ -147,7 +148,8 @@ impl Heads {
     pub fn forward(&self, geo: &Tensor, app: &Tensor, side: usize) -> Result<Tensor> {
         let geometry = self.geometry.forward(geo, side)?;
         let appearance = self.appearance.forward(app, side)?;
-        Tensor::cat(&[geometry, appearance], 2)
+        let flat = columns(&geometry.flatten(0, 1)?, &appearance.flatten(0, 1)?, None)?;
+        flat.reshape((geo.dim(0)?, side * side, HEAD_LANES))
     }
 }
 

@@ -284,7 +284,9 @@ impl Trunk {
         primaries: &Primaries,
     ) -> Result<Scene<'a>> {
         check_single(views, primaries)?;
-        let means = primaries.means.squeeze(0)?;
+        // Whole rows, so that no chunk gathers its own from wider ones.
+        let own = |t: &Tensor| t.squeeze(0)?.contiguous();
+        let means = own(&primaries.means)?;
         let n = means.dim(0)?;
         let frames = Frames::new(&views.cameras[0], means.dtype(), means.device())?;
         let sh = match self.config.embed.sh {
@@ -304,9 +306,9 @@ impl Trunk {
             views,
             frames,
             means,
-            quats_wxyz: primaries.quats_wxyz.squeeze(0)?,
-            scales: primaries.scales.squeeze(0)?,
-            opacities: primaries.opacities.squeeze(0)?.unsqueeze(1)?,
+            quats_wxyz: own(&primaries.quats_wxyz)?,
+            scales: own(&primaries.scales)?,
+            opacities: own(&primaries.opacities)?.unsqueeze(1)?,
             sh_input: sh.reshape((n, 3 * d))?,
             per_view: primaries.per_view,
             prepared,
@@ -338,8 +340,7 @@ impl Trunk {
             _ => (z_g, z_a),
         };
         let head = parts.heads.forward(&geo, &app, self.side)?;
-        let rows = [&parents.means, &parents.quats_wxyz, &parents.scales, &parents.opacities];
-        Ok((head, Tensor::cat(&rows, 1)?))
+        Ok((head, parents.rows()?))
     }
 
     /// The primaries themselves, K = 1 (SPGR off).

@@ -8,6 +8,7 @@ use crate::config::{
 };
 use crate::model::mlp::{LayerNorm, Mode, affine, linear, xavier};
 use crate::ops::attention_gather::{Drop, Gather, attention_gather};
+use crate::ops::columns::columns;
 use candle_core::{Result, Tensor};
 use candle_nn::{Init, Linear, Module, VarBuilder};
 
@@ -137,7 +138,7 @@ impl Stage {
         }
         let (joined, next) = match (keys.residual, &self.cat) {
             (Residual::Cat, Some(cat)) => {
-                let joined = Tensor::cat(&[f, &o], 1)?;
+                let joined = columns(f, &o, None)?;
                 let next = affine(cat, &joined)?;
                 (joined, next)
             }
@@ -215,8 +216,8 @@ impl Stage {
             None => gates,
         };
         match g.key {
-            Some(_) => Tensor::cat(&[q, &bias, &gates], 1),
-            None => Tensor::cat(&[&bias, &gates], 1),
+            Some(_) => columns(q, &bias, Some(&gates)),
+            None => columns(&bias, &gates, None),
         }
     }
 }
