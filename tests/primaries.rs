@@ -7,8 +7,10 @@ use subsplat::abi::ShBasis;
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::config::{Mvsplat, Primaries as Settings, ShFrame};
 use subsplat::model::primaries::{primaries, sh_mask};
+use subsplat::model::primaries_ref;
 use subsplat::model::trace::Trace;
 use subsplat::model::{BackboneOutput, Primaries, Views};
+use subsplat::ops::adapter::{Adapter, Turn, View, place};
 use subsplat::sh;
 
 const SIZE: (usize, usize) = (4, 6);
@@ -216,6 +218,149 @@ fn gradients_reach_every_input() -> Result<()> {
             let numeric = (eval(0.02)? - eval(-0.02)?) / 0.04;
             let g = f64::from(grad[i]);
             assert!((numeric - g).abs() < 0.02 * (1.0 + g.abs()), "{name}[{i}]: {numeric} {g}");
+        }
+    }
+    Ok(())
+}
+
+/// Two views of `size`, G Gaussians a pixel, SH of `degree`.
+fn larger((h, w): (usize, usize), g: usize, degree: usize) -> (BackboneOutput, Views) {
+    let mut views = views(Mat4::from_rotation_y(0.4));
+    for camera in views.cameras[0].iter_mut() {
+        let k = &mut camera.intrinsics;
+        (k.width, k.height, k.cx) = (w, h, 0.4 * w as f32);
+    }
+    views.images = Tensor::zeros((1, 2, 3, h, w), DType::F32, &Device::Cpu).unwrap();
+    let (n, lanes) = (h * w, 9 + 3 * (degree + 1) * (degree + 1));
+    let t = |v: Vec<f32>, d: usize| Tensor::from_vec(v, (1, 2, n, d), &Device::Cpu).unwrap();
+    let mut raw = wave(2 * n * lanes, 0.37);
+    raw[3 * lanes + 5..3 * lanes + 9].fill(0.0);
+    let out = BackboneOutput {
+        raw: t(raw, lanes),
+        depths: t(wave(2 * n * g, 0.9).into_iter().map(|v| v.abs() + 1.0).collect(), g),
+        densities: t(wave(2 * n * g, 0.5).into_iter().map(|v| (0.1 + v.abs()) / 3.0).collect(), g),
+        features: Vec::new(),
+    };
+    (out, views)
+}
+
+type Made = Vec<(&'static str, Vec<f32>)>;
+
+/// All attributes, and the gradients of a mix of them by raw rows, distances and
+/// densities.
+fn with_gradients(
+    out: &BackboneOutput,
+    make: impl Fn(&BackboneOutput) -> Result<Primaries>,
+) -> Result<(Made, Made)> {
+    let vars = [&out.raw, &out.depths, &out.densities].map(|t| Var::from_tensor(t).unwrap());
+    let [raw, depths, densities] = vars.each_ref().map(|v| v.as_tensor().clone());
+    let p = make(&BackboneOutput { raw, depths, densities, features: Vec::new() })?;
+    let flat = |t: &Tensor| t.flatten_all()?.to_vec1::<f32>();
+    let all = [
+        ("means", &p.means),
+        ("quats", &p.quats_wxyz),
+        ("scales", &p.scales),
+        ("opacities", &p.opacities),
+        ("sh", &p.sh),
+        ("sh_camera", &p.sh_camera),
+    ];
+    let (mut made, mut loss) = (Vec::new(), Tensor::new(0f32, &Device::Cpu)?);
+    for (i, (name, t)) in all.into_iter().enumerate() {
+        made.push((name, flat(t)?));
+        let w = wave(t.elem_count(), 0.11 + 0.02 * i as f32);
+        let w = Tensor::from_vec(w, t.shape(), t.device())?;
+        loss = (loss + (t * w)?.sum_all()?)?;
+    }
+    let grads = loss.backward()?;
+    let of = |name, i: usize| (name, flat(grads.get(&vars[i]).unwrap()).unwrap());
+    Ok((made, vec![of("d raw", 0), of("d depths", 1), of("d densities", 2)]))
+}
+
+#[test]
+fn the_op_agrees_with_tensor_operations_and_so_do_its_gradients() -> Result<()> {
+    // Rows that fill vectors and rows that do not; one Gaussian a pixel and three.
+    let frames = [ShFrame::Mvsplat, ShFrame::MvsplatExact, ShFrame::Standard];
+    let cases = [((3, 37), 1, 1, 0.0), ((2, 16), 3, 4, 0.7), ((4, 5), 2, 0, -1.0)];
+    for (size, g, degree, exponent) in cases {
+        for frame in frames {
+            let (out, views) = larger(size, g, degree);
+            let mut s = settings(frame);
+            (s.sh_degree, s.opacity_exponent) = (degree, exponent);
+            let op = |out: &BackboneOutput| primaries(out, &views, &s, &mut Trace::off());
+            let graph = |out: &BackboneOutput| primaries_ref::primaries(out, &views, &s);
+            let (got, want) = (with_gradients(&out, op)?, with_gradients(&out, graph)?);
+            let pairs = got.0.iter().zip(&want.0).map(|p| (p, 4e-6));
+            for (((name, got), (_, want)), within) in
+                pairs.chain(got.1.iter().zip(&want.1).map(|p| (p, 2e-5)))
+            {
+                assert_eq!(got.len(), want.len(), "{name}");
+                // Row 3 has a quaternion of zero, whose slopes are up to 1e8.
+                let lanes = out.raw.dim(3)?;
+                let zero =
+                    |i: usize| *name == "d raw" && i / lanes == 3 && (5..9).contains(&(i % lanes));
+                for (i, (a, b)) in got.iter().zip(want).enumerate() {
+                    let (off, size) = ((a - b).abs(), if zero(i) { 1e8 } else { 4.0 + b.abs() });
+                    assert!(off < within * size, "{frame:?} {g} {name}[{i}]: {a} {b}");
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn gradients_are_those_of_finite_differences() -> Result<()> {
+    let (h, w, g, d) = (2, 5, 2, 4);
+    let turn = |k: f64| Turn::new(&(0..16).map(|i| (i as f64 * k).sin()).collect::<Vec<_>>(), d);
+    let view = View {
+        focal: [4.0, 5.0],
+        centre: [2.2, 1.1],
+        rotation: [[0.6, 0.0, 0.8], [0.0, 1.0, 0.0], [-0.8, 0.0, 0.6]],
+        origin: [1.0, -2.0, 0.5],
+        quat: std::array::from_fn(|i| {
+            std::array::from_fn(|k| if k == (i + 1) % 4 { 1.0 } else { 0.2 })
+        }),
+        scale: [0.1, 0.7],
+        turn: turn(0.7),
+    };
+    let adapter = Adapter {
+        views: vec![view],
+        size: [h, w],
+        per_pixel: g,
+        functions: d,
+        exponent: 0.6,
+        camera: turn(0.3),
+    };
+    let wave = |n: usize, k: f64| (0..n).map(|i| (i as f64 * k).sin()).collect::<Vec<f64>>();
+    let of = |v: Vec<f64>, last: usize| Tensor::from_vec(v, (1, h * w, last), &Device::Cpu);
+    let inputs = [
+        of(wave(h * w * 21, 0.37), 21)?,
+        of(wave(h * w * g, 0.9).into_iter().map(|v| v + 2.0).collect(), g)?,
+        of(wave(h * w * g, 0.5).into_iter().map(|v| 0.5 + 0.4 * v).collect(), g)?,
+    ];
+    let loss = |x: &[Tensor; 3]| -> Result<Tensor> {
+        let all = place(&x[0], &x[1], &x[2], adapter.clone())?;
+        let mix = |t: &Tensor, k: f64| -> Result<Tensor> {
+            (t * Tensor::from_vec(wave(t.elem_count(), k), t.shape(), t.device())?)?.sum_all()
+        };
+        (mix(&all.rows, 1.1)? + mix(&all.sh()?, 1.3)?)? + mix(&all.sh_camera()?, 1.7)?
+    };
+    let vars = inputs.each_ref().map(|t| Var::from_tensor(t).unwrap());
+    let grads = loss(&vars.each_ref().map(|v| v.as_tensor().clone()))?.backward()?;
+    for (which, var) in vars.iter().enumerate() {
+        let grad = grads.get(var).unwrap().flatten_all()?.to_vec1::<f64>()?;
+        let at = inputs[which].flatten_all()?.to_vec1::<f64>()?;
+        for i in 0..at.len() {
+            let eval = |step: f64| -> Result<f64> {
+                let mut v = at.clone();
+                v[i] += step;
+                let mut x = inputs.clone();
+                x[which] = Tensor::from_vec(v, inputs[which].shape(), &Device::Cpu)?;
+                loss(&x)?.to_scalar::<f64>()
+            };
+            let numeric = (eval(1e-5)? - eval(-1e-5)?) / 2e-5;
+            let off = (numeric - grad[i]).abs();
+            assert!(off < 1e-7 * (1.0 + numeric.abs()), "{which}[{i}]: {} {numeric}", grad[i]);
         }
     }
     Ok(())

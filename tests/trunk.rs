@@ -11,7 +11,6 @@ use subsplat::camera::Camera;
 use subsplat::config::*;
 use subsplat::model::embed::Embeddings;
 use subsplat::model::geometry::{Frames, ParentChunk};
-use subsplat::model::mlp::Mode;
 use subsplat::model::trunk::{Children, Trunk, set_initial_values};
 use subsplat::model::{BackboneOutput, Primaries, Views};
 
@@ -392,7 +391,7 @@ fn pixel_unit_embeddings_transfer_to_another_resolution() {
                 sh: t(&local.sh_camera).reshape((256, 12)).unwrap(),
             };
             let frames = Frames::new(cams, DType::F32, &Device::Cpu).unwrap();
-            embeddings.forward(&parents, &frames, Mode::Infer).unwrap()
+            embeddings.forward(&parents, &frames).unwrap()
         };
         let large: Vec<Camera> = small.iter().map(|c| c.resized(32, 32)).collect();
         let (a, b) = (run(&small, 1.0), run(&large, 0.5));

@@ -8,8 +8,10 @@
 //! tile), `rasterize` (the frame).
 
 pub mod activation;
+pub mod adapter;
 pub mod attention;
 pub mod attention_gather;
+pub mod attributes;
 mod blend;
 mod blocks;
 mod colour_bwd;
@@ -17,6 +19,7 @@ pub mod conv;
 mod covariance;
 pub mod detail;
 mod disjoint;
+pub mod dssim;
 pub mod ewa;
 mod ewa_bwd;
 mod fresh;

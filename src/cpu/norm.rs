@@ -194,18 +194,24 @@ fn backward_row(
 ) {
     let (n, (mean, inverse)) = (rows.len as f64, rows.moments(x));
     let (mut mean_g, mut mean_gx) = (0f64, 0f64);
-    if rows.run == 1 {
+    if let (1, Some(w), Some(b)) = (rows.run, w.get(..rows.len), b.get(..rows.len)) {
         // One element a channel: `dx` holds dy·f′·w until the means are known.
-        for (i, ((x, dy), dx)) in x.iter().zip(dy).zip(dx.iter_mut()).enumerate() {
-            let (w, b) = (w.get(i).copied().unwrap_or(1.0), b.get(i).copied().unwrap_or(0.0));
-            let unit = (x - mean) * inverse;
-            let g = dy * slope(unit * w + b);
+        let (x, dy, sums) = (&x[..rows.len], &dy[..rows.len], &mut sums[..rows.len]);
+        let dx = &mut dx[..rows.len];
+        for i in 0..rows.len {
+            let unit = (x[i] - mean) * inverse;
+            let g = dy[i] * slope(unit * w[i] + b[i]);
             sums[i][0] += f64::from(g * unit);
             sums[i][1] += f64::from(g);
-            *dx = g * w;
-            mean_g += f64::from(*dx) / n;
-            mean_gx += f64::from(*dx * unit) / n;
+            dx[i] = g * w[i];
         }
+        let own = sums_of(
+            dx,
+            x,
+            #[inline(always)]
+            |g, x| [g, g * ((x - mean) * inverse)],
+        );
+        (mean_g, mean_gx) = (own[0] / n, own[1] / n);
     } else {
         let runs = x.chunks_exact(rows.run).zip(dy.chunks_exact(rows.run));
         for (i, ((x, dy), dx)) in runs.zip(dx.chunks_exact_mut(rows.run)).enumerate() {

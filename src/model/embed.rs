@@ -6,8 +6,9 @@
 //! four linear maps), φ_c through 64, a LayerNorm at the end of each.
 
 use super::geometry::{Frames, ParentChunk, canonical};
-use super::mlp::{Block2, LayerNorm, Mode, affine, gelu, linear, xavier};
+use super::mlp::{Block2, LayerNorm, affine, gelu, linear, xavier};
 use crate::config::{AlphaInput, AnchorFrame, Embed, EmbedMlp, MuInput, ScaleInput};
+use crate::ops::attributes::{Attributes, attributes};
 use candle_core::{Result, Tensor};
 use candle_nn::{Linear, VarBuilder};
 
@@ -83,7 +84,32 @@ impl Embeddings {
         Ok(Self { config: config.clone(), mlps })
     }
 
-    /// Conditioned attributes μ `[n,3]`, s `[n,3]`, q `[n,4]`, α `[n,1]` (spec 1.1).
+    /// Conditioned attributes μ, s, q, α side by side, `[n, 11]` (spec 1.1).
+    ///
+    /// # Errors
+    /// Whatever candle says.
+    pub fn attributes(&self, parents: &ParentChunk, frames: &Frames) -> Result<Tensor> {
+        let (c, source) = (&self.config, &frames.0[parents.source]);
+        let rules = Attributes {
+            frame: match c.anchor_frame {
+                AnchorFrame::World => None,
+                AnchorFrame::SrcCam => Some(source.numbers()),
+                AnchorFrame::View0 => Some(frames.0[0].numbers()),
+            },
+            source: source.numbers(),
+            log_px: (c.scale == ScaleInput::LogPx)
+                .then_some(f64::from(source.camera.intrinsics.fx)),
+            ray: c.mu == MuInput::RayLogz,
+            logit: (c.alpha == AlphaInput::Logit).then_some(LOGIT_MAX),
+            z_min: Z_MIN,
+            slope_max: SLOPE_MAX,
+            scale_min: SCALE_MIN,
+        };
+        attributes(&parents.rows()?, rules)
+    }
+
+    /// [`Embeddings::attributes`] in tensor operations, one tensor each: their reference
+    /// in tests. μ `[n,3]`, s `[n,3]`, q `[n,4]`, α `[n,1]`.
     pub fn inputs(&self, parents: &ParentChunk, frames: &Frames) -> Result<[Tensor; 4]> {
         let source = &frames.0[parents.source];
         let frame = match self.config.anchor_frame {
@@ -124,29 +150,38 @@ impl Embeddings {
     }
 
     /// z^g and z^a, `[n, E]`.
-    pub fn forward(
-        &self,
-        parents: &ParentChunk,
-        frames: &Frames,
-        mode: Mode,
-    ) -> Result<(Tensor, Tensor)> {
-        let inputs = self.inputs(parents, frames)?;
+    pub fn forward(&self, parents: &ParentChunk, frames: &Frames) -> Result<(Tensor, Tensor)> {
+        let all = self.attributes(parents, frames)?;
         match &self.mlps {
             Mlps::Pg { geometry, w_g, colour } => {
-                let mut sum = geometry[0].forward(&inputs[0], mode)?;
-                for (block, x) in geometry.iter().zip(&inputs).skip(1) {
-                    sum = sum.add(&block.forward(x, mode)?)?;
+                let mut sum = geometry[0].forward(&all.narrow(1, 0, WIDTHS[0].1)?)?;
+                let mut first = WIDTHS[0].1;
+                for (block, (_, width)) in geometry.iter().zip(WIDTHS).skip(1) {
+                    sum = sum.add(&block.forward(&all.narrow(1, first, width)?)?)?;
+                    first += width;
                 }
-                Ok((affine(w_g, &sum, mode)?, colour.forward(&parents.sh, mode)?))
+                Ok((affine(w_g, &sum)?, colour.forward(&parents.sh)?))
             }
             Mlps::Lite { geometry, w_g, ln_g, colour, ln_c } => {
-                let hidden = geometry.iter().zip(&inputs).map(|(l, x)| affine(l, x, mode));
-                let hidden = Tensor::cat(&hidden.collect::<Result<Vec<_>>>()?, 1)?;
-                let z_g = ln_g.forward(&affine(w_g, &gelu(&hidden, mode)?, mode)?, mode)?;
-                let hidden = gelu(&affine(&colour[0], &parents.sh, mode)?, mode)?;
-                let z_a = affine(&colour[1], &hidden, mode)?;
-                Ok((z_g, ln_c.forward(&z_a, mode)?))
+                let hidden = affine(&side_by_side(geometry)?, &all)?;
+                let z_g = ln_g.forward(&affine(w_g, &gelu(&hidden)?)?)?;
+                let hidden = gelu(&affine(&colour[0], &parents.sh)?)?;
+                let z_a = affine(&colour[1], &hidden)?;
+                Ok((z_g, ln_c.forward(&z_a)?))
             }
         }
     }
+}
+
+/// One layer that gives the outputs of all, side by side, of their inputs side by side.
+fn side_by_side(layers: &[Linear]) -> Result<Linear> {
+    let widths = layers.iter().map(|l| l.weight().dim(1)).collect::<Result<Vec<_>>>()?;
+    let all: usize = widths.iter().sum();
+    let (mut weights, mut biases, mut first) = (Vec::new(), Vec::new(), 0);
+    for (layer, width) in layers.iter().zip(widths) {
+        weights.push(layer.weight().pad_with_zeros(1, first, all - first - width)?);
+        biases.extend(layer.bias());
+        first += width;
+    }
+    Ok(Linear::new(Tensor::cat(&weights, 0)?, Some(Tensor::cat(&biases, 0)?)))
 }

@@ -7,6 +7,9 @@
 use crate::abi::VISIBLE_Z_MIN;
 use crate::camera::Camera;
 use crate::config::MaskMode;
+use crate::ops::attributes;
+use crate::ops::columns::columns;
+use crate::ops::linear::linear;
 use candle_core::{D, DType, Device, Result, Tensor, bail};
 
 /// Picture position given to points behind a camera: outside by more than any
@@ -34,6 +37,14 @@ pub struct ParentChunk {
     pub sh: Tensor,
 }
 
+impl ParentChunk {
+    /// `[n, 11]`: packed, lanes in [`crate::abi`].
+    pub fn rows(&self) -> Result<Tensor> {
+        let most = columns(&self.means, &self.quats_wxyz, Some(&self.scales))?;
+        columns(&most, &self.opacities, None)
+    }
+}
+
 /// One context view.
 #[derive(Clone, Debug)]
 pub struct Frame {
@@ -45,6 +56,15 @@ pub struct Frame {
     pub position: Tensor,
     /// `[4, 4]`: q·turn = conj(q_R) ⊗ q for rows q wxyz.
     pub turn: Tensor,
+}
+
+/// x·m of `x` `[n, k]` and `m` `[k, k]`. f32 goes round candle's product, which asks the
+/// system for the number of processors each time.
+fn times(x: &Tensor, m: &Tensor) -> Result<Tensor> {
+    if x.dtype() != DType::F32 {
+        return x.matmul(m);
+    }
+    linear(x, &m.t()?, &Tensor::zeros(m.dim(1)?, DType::F32, m.device())?)
 }
 
 impl Frame {
@@ -65,14 +85,26 @@ impl Frame {
         })
     }
 
+    /// The same in numbers.
+    pub fn numbers(&self) -> attributes::Frame {
+        let r = self.camera.rotation();
+        let q = glam::Quat::from_mat3(&r).normalize();
+        let turn = left_product([q.w, -q.x, -q.y, -q.z]).map(f64::from);
+        attributes::Frame {
+            rotation: std::array::from_fn(|i| r.row(i).as_dvec3().to_array()),
+            position: self.camera.position().as_dvec3().to_array(),
+            turn: std::array::from_fn(|i| std::array::from_fn(|j| turn[4 * i + j])),
+        }
+    }
+
     /// World points `[n, 3]` to camera coordinates.
     pub fn to_camera(&self, means: &Tensor) -> Result<Tensor> {
-        means.broadcast_sub(&self.position)?.matmul(&self.rotation)
+        times(&means.broadcast_sub(&self.position)?, &self.rotation)
     }
 
     /// World quaternions `[n, 4]` to this camera's frame.
     pub fn quat_to_camera(&self, quats_wxyz: &Tensor) -> Result<Tensor> {
-        quats_wxyz.matmul(&self.turn)
+        times(quats_wxyz, &self.turn)
     }
 }
 

@@ -1,5 +1,5 @@
-//! Linear layers with chosen initial values, and a LayerNorm that keeps its
-//! gradient where one is wanted.
+//! Linear layers with chosen initial values, and a LayerNorm: our ops for f32, tensor
+//! operations for the f64 of oracles.
 
 use crate::ops;
 use crate::ops::activation::{Activation, activation};
@@ -9,9 +9,9 @@ use candle_nn::{Init, Linear, Module, VarBuilder};
 /// Whether a forward pass serves a picture or a gradient.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Mode {
-    /// Fused kernels without gradient, nothing random.
+    /// Nothing random.
     Infer,
-    /// Everything differentiable; `seed` decides what is dropped.
+    /// Attention drops what `seed` decides.
     Train {
         /// Of this step.
         seed: u64,
@@ -36,21 +36,19 @@ pub(crate) fn linear(
     Ok(Linear::new(w, Some(b)))
 }
 
-/// x·Wᵀ + b of `x` `[n, inputs]`. In [`Mode::Infer`] it stays on the caller's thread
-/// ([`ops::linear`]): chunks of parents are the parallel tasks.
-pub(crate) fn affine(layer: &Linear, x: &Tensor, mode: Mode) -> Result<Tensor> {
-    match (layer.bias(), mode) {
-        (Some(bias), Mode::Infer) if x.dtype() == DType::F32 => {
-            ops::linear::linear(x, layer.weight(), bias)
-        }
+/// x·Wᵀ + b of `x` `[n, inputs]`; f32 stays on the caller's thread ([`ops::linear`]):
+/// chunks of parents, or scenes, are the parallel tasks.
+pub(crate) fn affine(layer: &Linear, x: &Tensor) -> Result<Tensor> {
+    match layer.bias() {
+        Some(bias) if x.dtype() == DType::F32 => ops::linear::linear(x, layer.weight(), bias),
         _ => layer.forward(x),
     }
 }
 
 /// x·Φ(x), exact form.
-pub(crate) fn gelu(x: &Tensor, mode: Mode) -> Result<Tensor> {
-    match mode {
-        Mode::Infer if x.dtype() == DType::F32 => activation(x, Activation::Gelu),
+pub(crate) fn gelu(x: &Tensor) -> Result<Tensor> {
+    match x.dtype() {
+        DType::F32 => activation(x, Activation::Gelu),
         _ => x.gelu_erf(),
     }
 }
@@ -74,9 +72,9 @@ impl LayerNorm {
         })
     }
 
-    /// `x` `[.., dim]`. The fused kernel knows f32 only, so it serves [`Mode::Infer`].
-    pub fn forward(&self, x: &Tensor, mode: Mode) -> Result<Tensor> {
-        if mode == Mode::Infer && x.dtype() == DType::F32 {
+    /// `x` `[.., dim]`. The fused kernel knows f32 only; f64 is the tests' oracle.
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        if x.dtype() == DType::F32 {
             return ops::norm::layer_norm(x, &self.weight, &self.bias);
         }
         let x = x.broadcast_sub(&x.mean_keepdim(D::Minus1)?)?;
@@ -107,10 +105,10 @@ impl Block2 {
         })
     }
 
-    pub(crate) fn forward(&self, x: &Tensor, mode: Mode) -> Result<Tensor> {
+    pub(crate) fn forward(&self, x: &Tensor) -> Result<Tensor> {
         let mut x = x.clone();
         for (lin, ln) in self.lin.iter().zip(&self.ln) {
-            x = ln.forward(&affine(lin, &x, mode)?.relu()?, mode)?;
+            x = ln.forward(&affine(lin, &x)?.relu()?)?;
         }
         Ok(x)
     }

@@ -13,6 +13,7 @@ pub mod layers;
 pub mod lpips;
 pub mod mlp;
 pub mod primaries;
+pub mod primaries_ref;
 pub mod spgr;
 pub mod spgr_ref;
 pub mod subsplat;

@@ -1,27 +1,27 @@
 //! From raw head outputs to Gaussians in world frame: MVSplat's Gaussian adapter
-//! (spec 6), differentiable.
+//! (spec 6), differentiable. The op: [`crate::ops::adapter`].
 //!
 //! Foreign layouts end here: quaternions arrive as xyzw in camera frame and leave as
 //! wxyz in world frame, unit, w ≥ 0; SH arrives colour-major in camera frame, is masked
 //! by degree and leaves in world frame.
 
-use super::layers::sigmoid;
 use super::trace::Trace;
 use super::{BackboneOutput, Primaries, Views};
-use crate::abi::{ShBasis, sh_coefficients};
+use crate::abi::{LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, ShBasis, sh_coefficients};
 use crate::camera::Camera;
 use crate::config::{Primaries as Settings, ShFrame};
+use crate::ops::adapter::{Adapter, Placed, Turn, View, place};
 use crate::sh::{Rotation, RotationBasis, standard_from_mvsplat};
-use candle_core::{DType, Device, Result, Tensor, bail};
+use candle_core::{Device, Result, Tensor, bail};
 use glam::{DMat3, DQuat};
 
 /// Scales are in tenths of a pixel's extent at the Gaussian's depth, summed over both
 /// axes: a fifth of a square pixel (MVS).
-const PIXEL_SHARE: f64 = 0.1;
+pub(super) const PIXEL_SHARE: f64 = 0.1;
 /// Degree l ≥ 1 of the colour is damped by 0.1·0.25^l (MVS).
 const SH_DAMPING: (f64, f64) = (0.1, 0.25);
 /// ε of the quaternion's normalisation (MVS).
-const QUAT_EPS: f64 = 1e-8;
+pub(super) const QUAT_EPS: f64 = 1e-8;
 
 /// Factor of every SH coefficient: 1, then 0.1·0.25^l for degree l.
 pub fn sh_mask(degree: usize) -> Vec<f32> {
@@ -32,16 +32,52 @@ pub fn sh_mask(degree: usize) -> Vec<f32> {
     (0..=degree).flat_map(|l| std::iter::repeat_n(factor(l), 2 * l + 1)).collect()
 }
 
-/// One view's share of the primaries, G Gaussians for each of P pixels.
-struct ViewPart {
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    sh: Tensor,
-    sh_camera: Tensor,
-    /// For tracing only: `[P, 2]` and `[P, 4]`.
-    ray: Tensor,
-    rotations: Tensor,
+/// All primaries of all scenes as packed rows and SH: what is rendered without a trunk.
+pub struct Packed {
+    placed: Placed,
+    scenes: usize,
+    /// Functions that the SH multiplies.
+    pub sh_basis: ShBasis,
+    /// Gaussians per view, H·W·G.
+    pub per_view: usize,
+}
+
+impl Packed {
+    /// `[B·N, 11]`, lanes in [`crate::abi`].
+    pub fn rows(&self) -> &Tensor {
+        &self.placed.rows
+    }
+
+    /// `[B·N, D, 3]`: SH in world frame, RGB innermost.
+    ///
+    /// # Errors
+    /// Whatever candle says.
+    pub fn sh(&self) -> Result<Tensor> {
+        self.placed.sh()
+    }
+
+    /// `[B·N, …]` to `[B, N, …]`.
+    fn by_scene(&self, t: &Tensor) -> Result<Tensor> {
+        t.reshape([&[self.scenes, t.dim(0)? / self.scenes], &t.dims()[1..]].concat())
+    }
+
+    /// Attribute by attribute.
+    ///
+    /// # Errors
+    /// Whatever candle says.
+    pub fn split(&self) -> Result<Primaries> {
+        let rows = self.by_scene(self.rows())?;
+        Ok(Primaries {
+            means: rows.narrow(2, LANE_MEAN, 3)?,
+            quats_wxyz: rows.narrow(2, LANE_QUAT, 4)?,
+            scales: rows.narrow(2, LANE_SCALE, 3)?,
+            opacities: rows.narrow(2, LANE_OPACITY, 1)?.squeeze(2)?,
+            sh: self.by_scene(&self.sh()?)?.transpose(2, 3)?,
+            sh_camera: self.by_scene(&self.placed.sh_camera()?)?,
+            sh_basis: self.sh_basis,
+            per_view: self.per_view,
+        })
+    }
 }
 
 /// All primaries of all scenes, in world frame.
@@ -54,6 +90,16 @@ pub fn primaries(
     settings: &Settings,
     trace: &mut Trace<'_>,
 ) -> Result<Primaries> {
+    let all = packed(out, views, settings)?.split()?;
+    trace_parts(out, views, settings, &all, trace)?;
+    Ok(all)
+}
+
+/// [`primaries`] as packed rows.
+///
+/// # Errors
+/// Those of [`primaries`].
+pub fn packed(out: &BackboneOutput, views: &Views, settings: &Settings) -> Result<Packed> {
     let (b, v, _, h, w) = views.images.dims5()?;
     let d = sh_coefficients(settings.sh_degree);
     let (rb, rv, pixels, channels) = out.raw.dims4()?;
@@ -68,28 +114,17 @@ pub fn primaries(
             "primaries depths, densities: expected [{b}, {v}, {pixels}, G], got {depths:?}, {densities:?}"
         );
     }
-    let mut parts = Vec::with_capacity(b * v);
-    for scene in 0..b {
-        for view in 0..v {
-            let raw = out.raw.get(scene)?.get(view)?;
-            let depths = out.depths.get(scene)?.get(view)?;
-            parts.push(view_part(&raw, &depths, &views.cameras[scene][view], settings)?);
-        }
-    }
-    trace_parts(out, views, settings, &parts, trace)?;
-    let join = |f: &dyn Fn(&ViewPart) -> &Tensor| -> Result<Tensor> {
-        let all = Tensor::cat(&parts.iter().map(f).collect::<Vec<_>>(), 0)?;
-        let mut dims = vec![b, v * pixels * g];
-        dims.extend_from_slice(&all.dims()[1..]);
-        all.reshape(dims)
+    let adapter = Adapter {
+        views: views.cameras.iter().flatten().map(|camera| view(camera, settings)).collect(),
+        size: [h, w],
+        per_pixel: g,
+        functions: d,
+        exponent: settings.opacity_exponent,
+        camera: Turn::new(&masked(settings), d),
     };
-    Ok(Primaries {
-        means: join(&|p| &p.means)?,
-        quats_wxyz: join(&|p| &p.quats)?,
-        scales: join(&|p| &p.scales)?,
-        opacities: opacities(&out.densities, settings.opacity_exponent)?.reshape((b, ()))?,
-        sh: join(&|p| &p.sh)?,
-        sh_camera: join(&|p| &p.sh_camera)?,
+    Ok(Packed {
+        placed: place(&out.raw, &out.depths, &out.densities, adapter)?,
+        scenes: b,
         sh_basis: match settings.sh_frame {
             ShFrame::Mvsplat => ShBasis::Mvsplat,
             ShFrame::MvsplatExact | ShFrame::Standard => ShBasis::Standard,
@@ -98,29 +133,103 @@ pub fn primaries(
     })
 }
 
+/// One view's constants.
+fn view(camera: &Camera, s: &Settings) -> View {
+    let (k, rotation) = (camera.intrinsics, camera.rotation().as_dmat3());
+    let pixel = PIXEL_SHARE * (1.0 / f64::from(k.fx) + 1.0 / f64::from(k.fy));
+    let d = sh_coefficients(s.sh_degree);
+    let basis = match s.sh_frame {
+        ShFrame::Mvsplat => RotationBasis::E3nn,
+        ShFrame::MvsplatExact | ShFrame::Standard => RotationBasis::Standard,
+    };
+    let turn = product(&Rotation::new(rotation, basis).matrix(s.sh_degree), &masked(s), d);
+    View {
+        focal: [k.fx, k.fy].map(f64::from),
+        centre: [k.cx, k.cy].map(f64::from),
+        rotation: rotation.transpose().to_cols_array_2d(),
+        origin: camera.position().as_dvec3().to_array(),
+        quat: world_quaternions(rotation),
+        scale: [s.scale_min * pixel, (s.scale_max - s.scale_min) * pixel],
+        turn: Turn::new(&turn, d),
+    }
+}
+
+/// Row i: where the i-th of x, y, z, w of a camera-frame quaternion goes, as wxyz in
+/// world frame: quat(R) ⊗ q is linear in q.
+pub(super) fn world_quaternions(rotation: DMat3) -> [[f64; 4]; 4] {
+    let a = DQuat::from_mat3(&rotation);
+    let units = [
+        DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0),
+        DQuat::from_xyzw(0.0, 1.0, 0.0, 0.0),
+        DQuat::from_xyzw(0.0, 0.0, 1.0, 0.0),
+        DQuat::from_xyzw(0.0, 0.0, 0.0, 1.0),
+    ];
+    units.map(|q| {
+        let p = a * q;
+        [p.w, p.x, p.y, p.z]
+    })
+}
+
+/// From raw SH to the camera's frame, `[D, D]` row-major: the mask by degree, and for
+/// [`ShFrame::MvsplatExact`] the map from MVSplat's basis to the standard one, to which
+/// degree 4 (which MVSplat never evaluates) is zero.
+fn masked(s: &Settings) -> Vec<f64> {
+    let d = sh_coefficients(s.sh_degree);
+    let map = standard_from_mvsplat();
+    let mask = sh_mask(s.sh_degree);
+    let at = |i: usize, j: usize| match s.sh_frame {
+        ShFrame::MvsplatExact if i < 16 && j < 16 => map[i * 16 + j],
+        ShFrame::MvsplatExact => 0.0,
+        ShFrame::Mvsplat | ShFrame::Standard if i == j => 1.0,
+        ShFrame::Mvsplat | ShFrame::Standard => 0.0,
+    };
+    (0..d * d).map(|i| at(i / d, i % d) * f64::from(mask[i % d])).collect()
+}
+
+/// a·b of row-major `[d, d]` matrices.
+fn product(a: &[f64], b: &[f64], d: usize) -> Vec<f64> {
+    let at = |i: usize, j: usize| (0..d).map(|k| a[i * d + k] * b[k * d + j]).sum();
+    (0..d * d).map(|i| at(i / d, i % d)).collect()
+}
+
 fn trace_parts(
     out: &BackboneOutput,
     views: &Views,
     settings: &Settings,
-    parts: &[ViewPart],
+    all: &Primaries,
     trace: &mut Trace<'_>,
 ) -> Result<()> {
     if !trace.is_on() {
         return Ok(());
     }
     let (b, v) = (views.scenes(), views.views());
-    let join = |f: &dyn Fn(&ViewPart) -> &Tensor| -> Result<Tensor> {
-        let all = Tensor::stack(&parts.iter().map(f).collect::<Vec<_>>(), 0)?;
-        let dims = [&[b, v], &all.dims()[1..]].concat();
-        all.reshape(dims)
+    let rays = |camera: &Camera, raw: &[f32]| -> Vec<f32> {
+        let k = camera.intrinsics;
+        let size = [k.width as f32, k.height as f32];
+        let at = |i: usize| [i % k.width, i / k.width].map(|p| p as f32);
+        let lanes = raw.len() / (k.width * k.height);
+        let ray = |(i, row): (usize, &[f32])| {
+            let pixel = at(i);
+            [0, 1].map(|j| (pixel[j] + 1.0 / (1.0 + (-row[j]).exp())) / size[j])
+        };
+        raw.chunks(lanes).enumerate().flat_map(ray).collect()
     };
+    let mut xy = Vec::new();
+    for (camera, raw) in views.cameras.iter().flatten().zip(out.raw.flatten(0, 1)?.to_vec3()?) {
+        xy.extend(rays(camera, &raw.concat()));
+    }
+    let q = out.raw.narrow(3, 5, 4)?;
+    let rotations = q.broadcast_div(&(q.sqr()?.sum_keepdim(3)?.sqrt()? + QUAT_EPS)?)?;
+    let g = out.depths.dim(3)?;
+    let (n, pixels) = (all.per_view, all.per_view / g);
+    let rotations = rotations.unsqueeze(3)?.broadcast_as((b, v, pixels, g, 4))?;
     let d = sh_coefficients(settings.sh_degree);
     trace.put("gauss.depths", &out.depths.flatten_from(2)?)?;
     trace.put("gauss.opacities_in", &out.densities.flatten_from(2)?)?;
     trace.put("gauss.raw82", &out.raw.narrow(3, 2, out.raw.dim(3)? - 2)?)?;
-    trace.put("gauss.xy_ray", &join(&|p| &p.ray)?)?;
-    trace.put("gauss.scales", &join(&|p| &p.scales)?)?;
-    trace.put("gauss.rotations_xyzw", &join(&|p| &p.rotations)?)?;
+    trace.put("gauss.xy_ray", &Tensor::from_vec(xy, (b, v, pixels, 2), &Device::Cpu)?)?;
+    trace.put("gauss.scales", &all.scales.reshape((b, v, n, 3))?)?;
+    trace.put("gauss.rotations_xyzw", &rotations.reshape((b, v, n, 4))?)?;
     trace.put("gauss.sh_mask", &Tensor::new(sh_mask(settings.sh_degree), &Device::Cpu)?)?;
     let (mut wigner, mut angles) = (Vec::new(), Vec::new());
     for camera in views.cameras.iter().flatten() {
@@ -141,141 +250,6 @@ fn e3nn_angles(r: DMat3) -> [f64; 3] {
     let alpha = at(0, 1).atan2(at(2, 1));
     let m = (DMat3::from_rotation_y(alpha) * DMat3::from_rotation_x(beta)).transpose() * r;
     [alpha, beta, m.col(2)[0].atan2(m.col(0)[0])]
-}
-
-fn view_part(raw: &Tensor, depths: &Tensor, camera: &Camera, s: &Settings) -> Result<ViewPart> {
-    let (pixels, g) = depths.dims2()?;
-    let k = camera.intrinsics;
-    let n = pixels * g;
-    let ray = ray_positions(&raw.narrow(1, 0, 2)?, k.width, k.height)?;
-    let depth = depths.reshape((pixels, g, 1))?;
-
-    let size = Tensor::new(&[k.width as f32, k.height as f32], &Device::Cpu)?;
-    let focal = Tensor::new(&[k.fx, k.fy], &Device::Cpu)?;
-    let centre = Tensor::new(&[k.cx, k.cy], &Device::Cpu)?;
-    let plane = ray.broadcast_mul(&size)?.broadcast_sub(&centre)?.broadcast_div(&focal)?;
-    let direction =
-        Tensor::cat(&[&plane, &Tensor::ones((pixels, 1), DType::F32, &Device::Cpu)?], 1)?;
-    let direction = direction.broadcast_div(&norm(&direction)?)?;
-    let rotation = camera.rotation().as_dmat3();
-    let direction = direction.matmul(&matrix3(rotation)?)?.reshape((pixels, 1, 3))?;
-    let origin = Tensor::new(&camera.position().to_array(), &Device::Cpu)?;
-    let means = direction.broadcast_mul(&depth)?.broadcast_add(&origin)?;
-
-    let pixel = PIXEL_SHARE * (1.0 / f64::from(k.fx) + 1.0 / f64::from(k.fy));
-    let scales = sigmoid(&raw.narrow(1, 2, 3)?)?
-        .affine((s.scale_max - s.scale_min) * pixel, s.scale_min * pixel)?;
-    let scales = scales.reshape((pixels, 1, 3))?.broadcast_mul(&depth)?;
-
-    let q = raw.narrow(1, 5, 4)?;
-    let rotations = q.broadcast_div(&(norm(&q)? + QUAT_EPS)?)?;
-    let quats = world_quaternions(&rotations, rotation)?;
-
-    let d = sh_coefficients(s.sh_degree);
-    let mask = Tensor::new(sh_mask(s.sh_degree), &Device::Cpu)?;
-    let sh = raw.narrow(1, 9, 3 * d)?.contiguous()?.reshape((pixels * 3, d))?;
-    let sh = sh.broadcast_mul(&mask)?;
-    let sh_camera = match s.sh_frame {
-        ShFrame::MvsplatExact => sh.matmul(&mvsplat_map_transposed(d)?)?,
-        ShFrame::Mvsplat | ShFrame::Standard => sh,
-    };
-    let basis = match s.sh_frame {
-        ShFrame::Mvsplat => RotationBasis::E3nn,
-        ShFrame::MvsplatExact | ShFrame::Standard => RotationBasis::Standard,
-    };
-    let turn = Rotation::new(rotation, basis).matrix(s.sh_degree);
-    let turn: Vec<f32> = turn.into_iter().map(|v| v as f32).collect();
-    let turn = Tensor::from_vec(turn, (d, d), &Device::Cpu)?;
-    let sh = sh_camera.matmul(&turn.t()?)?;
-    // Per pixel to per Gaussian: shape and colour are shared by the G of a pixel.
-    let shared = |x: Tensor, dims: &[usize]| -> Result<Tensor> {
-        let pixel = x.reshape([&[pixels, 1], dims].concat())?;
-        let all = pixel.broadcast_as([&[pixels, g], dims].concat())?.contiguous()?;
-        all.reshape([&[n], dims].concat())
-    };
-    Ok(ViewPart {
-        means: means.reshape((n, 3))?,
-        quats: shared(quats, &[4])?,
-        scales: scales.reshape((n, 3))?,
-        sh: shared(sh, &[3, d])?,
-        sh_camera: shared(sh_camera, &[3, d])?,
-        ray,
-        rotations: shared(rotations, &[4])?,
-    })
-}
-
-/// `[P, 2]`: pixel centres over the picture's size, moved by at most half a pixel.
-fn ray_positions(offsets: &Tensor, width: usize, height: usize) -> Result<Tensor> {
-    let (w, h) = (width as f32, height as f32);
-    let centres: Vec<f32> = (0..height)
-        .flat_map(|row| {
-            (0..width).flat_map(move |col| [(col as f32 + 0.5) / w, (row as f32 + 0.5) / h])
-        })
-        .collect();
-    let centres = Tensor::from_vec(centres, (width * height, 2), &Device::Cpu)?;
-    let pixel = Tensor::new(&[1.0 / w, 1.0 / h], &Device::Cpu)?;
-    let offsets = (sigmoid(offsets)? - 0.5)?;
-    centres + offsets.broadcast_mul(&pixel)?
-}
-
-/// `[P, n]` to `[P, 1]`: Euclidean norms, with a finite gradient at zero.
-fn norm(x: &Tensor) -> Result<Tensor> {
-    (x.sqr()?.sum_keepdim(1)? + 1e-30)?.sqrt()
-}
-
-/// For row vectors: x·matrix3(R) is R·x.
-fn matrix3(r: DMat3) -> Result<Tensor> {
-    // Column-major storage of R is row-major storage of Rᵀ.
-    Tensor::from_vec(r.to_cols_array().map(|v| v as f32).to_vec(), (3, 3), &Device::Cpu)
-}
-
-/// Camera-frame xyzw `[P, 4]` to world-frame wxyz, unit, w ≥ 0: quat(R) ⊗ q, which is
-/// linear in q. A zero quaternion is no rotation.
-fn world_quaternions(xyzw: &Tensor, rotation: DMat3) -> Result<Tensor> {
-    let a = DQuat::from_mat3(&rotation);
-    let column = |q: DQuat| {
-        let p = a * q;
-        [p.w, p.x, p.y, p.z].map(|v| v as f32)
-    };
-    // Row i: where the i-th of x, y, z, w goes.
-    let map = [
-        column(DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0)),
-        column(DQuat::from_xyzw(0.0, 1.0, 0.0, 0.0)),
-        column(DQuat::from_xyzw(0.0, 0.0, 1.0, 0.0)),
-        column(DQuat::from_xyzw(0.0, 0.0, 0.0, 1.0)),
-    ];
-    let squared = xyzw.detach().sqr()?.sum_keepdim(1)?;
-    let zero = squared.lt(1e-12)?.to_dtype(DType::F32)?;
-    let identity = Tensor::new(&[[0f32, 0.0, 0.0, 1.0]], &Device::Cpu)?;
-    let q = (xyzw + zero.matmul(&identity)?)?.matmul(&Tensor::new(&map, &Device::Cpu)?)?;
-    let negative = q.detach().narrow(1, 0, 1)?.lt(0.0)?.to_dtype(DType::F32)?;
-    let sign = negative.affine(-2.0, 1.0)?;
-    q.broadcast_mul(&sign)?.broadcast_div(&norm(&q)?)
-}
-
-/// Transposed map from MVSplat's basis to the standard one, `[D, D]`; degree 4, which
-/// MVSplat never evaluates, maps to zero.
-fn mvsplat_map_transposed(d: usize) -> Result<Tensor> {
-    let m = standard_from_mvsplat();
-    let used = d.min(16);
-    let mut t = vec![0f32; d * d];
-    for i in 0..used {
-        for j in 0..used {
-            t[j * d + i] = m[i * 16 + j] as f32;
-        }
-    }
-    Tensor::from_vec(t, (d, d), &Device::Cpu)
-}
-
-/// α = ½(1 − (1 − p)^e + p^{1/e})/G, e = 2^x; x = 0 is α = p/G.
-fn opacities(p: &Tensor, exponent: f64) -> Result<Tensor> {
-    let g = p.dim(3)? as f64;
-    if exponent == 0.0 {
-        return p / g;
-    }
-    let e = exponent.exp2();
-    let low = p.affine(-1.0, 1.0)?.powf(e)?;
-    ((p.powf(1.0 / e)? - low)? + 1.0)? * (0.5 / g)
 }
 
 impl Primaries {

@@ -10,12 +10,13 @@
 //!   c_k = `pos1`·GELU(`pos0`·posenc(g_k)) of the sub-pixel's place g_k: parameters
 //!   do not depend on K.
 
-use super::mlp::{LayerNorm, Mode, affine, gelu, linear};
+use super::mlp::{LayerNorm, affine, gelu, linear};
 use crate::abi::{HEAD_GEOMETRY_LANES, HEAD_LANES};
 use crate::config::{
     AMin, AMinMode, AreaAt, Config, DepthDir, DepthUnit, GainSpace, OpacityRule, PrimaryView,
     Slide, SpgrHead,
 };
+use crate::ops::columns::columns;
 use crate::ops::redistribute::Rule;
 use crate::ops::spgr::Rules;
 use candle_core::{Result, Tensor};
@@ -78,29 +79,29 @@ impl Head {
     }
 
     /// `x` `[n, E]` to `[n, r², lanes]`.
-    pub fn forward(&self, x: &Tensor, side: usize, mode: Mode) -> Result<Tensor> {
+    pub fn forward(&self, x: &Tensor, side: usize) -> Result<Tensor> {
         let (n, k) = (x.dim(0)?, side * side);
         let out = match &self.form {
             Form::Mlp2 { norm, lin0, lin1 } => {
-                let hidden = affine(lin0, &norm.forward(x, mode)?, mode)?;
-                affine(lin1, &gelu(&hidden, mode)?, mode)?
+                let hidden = affine(lin0, &norm.forward(x)?)?;
+                affine(lin1, &gelu(&hidden)?)?
             }
             Form::Pg { lin, ln } => {
                 let mut x = x.clone();
                 for (i, ln) in ln.iter().enumerate() {
-                    x = affine(&lin[2 * i], &x, mode)?.relu()?;
-                    x = ln.forward(&affine(&lin[2 * i + 1], &x, mode)?.relu()?, mode)?;
+                    x = affine(&lin[2 * i], &x)?.relu()?;
+                    x = ln.forward(&affine(&lin[2 * i + 1], &x)?.relu()?)?;
                 }
-                affine(&lin[4], &x, mode)?
+                affine(&lin[4], &x)?
             }
             Form::Coord { norm, lin0, lin1, pos } => {
-                let x = affine(lin0, &norm.forward(x, mode)?, mode)?;
-                let places = gelu(&affine(&pos[0], &posenc(side, &x)?, mode)?, mode)?;
-                let places = affine(&pos[1], &places, mode)?;
+                let x = affine(lin0, &norm.forward(x)?)?;
+                let places = gelu(&affine(&pos[0], &posenc(side, &x)?)?)?;
+                let places = affine(&pos[1], &places)?;
                 // One child at a time: [n, K, hidden] never exists.
                 let child = |i: usize| {
                     let hidden = x.broadcast_add(&places.narrow(0, i, 1)?)?;
-                    affine(lin1, &gelu(&hidden, mode)?, mode)
+                    affine(lin1, &gelu(&hidden)?)
                 };
                 Tensor::cat(&(0..k).map(child).collect::<Result<Vec<_>>>()?, 1)?
             }
@@ -144,10 +145,11 @@ impl Heads {
     }
 
     /// Records `[n, r², 11]` from the heads' inputs `[n, E]`.
-    pub fn forward(&self, geo: &Tensor, app: &Tensor, side: usize, mode: Mode) -> Result<Tensor> {
-        let geometry = self.geometry.forward(geo, side, mode)?;
-        let appearance = self.appearance.forward(app, side, mode)?;
-        Tensor::cat(&[geometry, appearance], 2)
+    pub fn forward(&self, geo: &Tensor, app: &Tensor, side: usize) -> Result<Tensor> {
+        let geometry = self.geometry.forward(geo, side)?;
+        let appearance = self.appearance.forward(app, side)?;
+        let flat = columns(&geometry.flatten(0, 1)?, &appearance.flatten(0, 1)?, None)?;
+        flat.reshape((geo.dim(0)?, side * side, HEAD_LANES))
     }
 }
 

@@ -8,6 +8,7 @@ use super::aggregation::{Aggregation, Prepared, ring};
 use super::embed::Embeddings;
 use super::geometry::{Frames, ParentChunk};
 use super::mlp::Mode;
+use super::primaries::Packed;
 use super::spgr::{Heads, rules};
 use super::{BackboneOutput, Primaries, Views};
 use crate::abi::{RasterOptions, SPLAT_LANES, ShBasis, sh_coefficients};
@@ -46,6 +47,21 @@ pub struct Children {
 }
 
 impl Children {
+    /// The primaries of one scene themselves, K = 1: what a trunk with SPGR off gives.
+    ///
+    /// # Errors
+    /// Whatever candle says.
+    pub fn whole(parents: &Packed) -> Result<Self> {
+        let rows = parents.rows().clone();
+        Ok(Self {
+            gain: Tensor::ones(rows.dim(0)?, rows.dtype(), rows.device())?,
+            rows,
+            sh: parents.sh()?,
+            sh_basis: parents.sh_basis,
+            k: 1,
+        })
+    }
+
     /// Packed rows for the renderer and the writers.
     ///
     /// # Errors
@@ -122,6 +138,11 @@ impl Trunk {
         if let Some(agg) = self.parts.as_mut().and_then(|p| p.aggregation.as_mut()) {
             agg.set_backend(backend);
         }
+    }
+
+    /// Whether SPGR is off: children are then the primaries ([`Children::whole`]).
+    pub fn is_off(&self) -> bool {
+        self.parts.is_none()
     }
 
     /// r of the next calls; the `coord` head serves any, the others what they have
@@ -288,7 +309,9 @@ impl Trunk {
         primaries: &Primaries,
     ) -> Result<Scene<'a>> {
         check_single(views, primaries)?;
-        let means = primaries.means.squeeze(0)?;
+        // Whole rows, so that no chunk gathers its own from wider ones.
+        let own = |t: &Tensor| t.squeeze(0)?.contiguous();
+        let means = own(&primaries.means)?;
         let n = means.dim(0)?;
         let frames = Frames::new(&views.cameras[0], means.dtype(), means.device())?;
         let sh = match self.config.embed.sh {
@@ -308,9 +331,9 @@ impl Trunk {
             views,
             frames,
             means,
-            quats_wxyz: primaries.quats_wxyz.squeeze(0)?,
-            scales: primaries.scales.squeeze(0)?,
-            opacities: primaries.opacities.squeeze(0)?.unsqueeze(1)?,
+            quats_wxyz: own(&primaries.quats_wxyz)?,
+            scales: own(&primaries.scales)?,
+            opacities: own(&primaries.opacities)?.unsqueeze(1)?,
             sh_input: sh.reshape((n, 3 * d))?,
             per_view: primaries.per_view,
             prepared,
@@ -327,7 +350,7 @@ impl Trunk {
         mode: Mode,
     ) -> Result<(Tensor, Tensor)> {
         let parents = scene.chunk(first, len)?;
-        let (z_g, z_a) = parts.embeddings.forward(&parents, &scene.frames, mode)?;
+        let (z_g, z_a) = parts.embeddings.forward(&parents, &scene.frames)?;
         let (geo, app) = match (&parts.aggregation, &scene.prepared) {
             (Some(agg), Some(prepared)) => {
                 let z = (&z_g, &z_a);
@@ -341,9 +364,8 @@ impl Trunk {
             // (spec 1.6).
             _ => (z_g, z_a),
         };
-        let head = parts.heads.forward(&geo, &app, self.side, mode)?;
-        let rows = [&parents.means, &parents.quats_wxyz, &parents.scales, &parents.opacities];
-        Ok((head, Tensor::cat(&rows, 1)?))
+        let head = parts.heads.forward(&geo, &app, self.side)?;
+        Ok((head, parents.rows()?))
     }
 
     /// The primaries themselves, K = 1 (SPGR off).

@@ -2,9 +2,7 @@
 //! gradients for maps, query and points (SubSplat A.2; spec 1.6). Formulas and
 //! layouts: [`crate::cpu::attention_gather`]. Tests: tests/attention_gather.rs.
 
-#[cfg(feature = "gpu")]
-use super::borrowed;
-use super::{Backend, Number, by_dtype, elements, slice};
+use super::{Backend, Number, borrowed, by_dtype, slice};
 use crate::cpu::attention_gather as cpu;
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, DType, Layout, Result, Shape, Storage, Tensor, bail};
@@ -174,9 +172,10 @@ type Triple = (Option<Tensor>, Option<Tensor>, Option<Tensor>);
 
 fn backward<T: Number>(g: &Gather, [maps, query, points, grad]: [&Tensor; 4]) -> Result<Triple> {
     let device = maps.device();
-    let (m, q) = (elements::<T>(maps)?, elements::<T>(query)?);
-    let (p, o) = (elements::<T>(points)?, elements::<T>(grad)?);
-    let d = cpu::backward(g, &m, &q, &p, &o);
+    let grad = grad.contiguous()?;
+    let d = borrowed::<T, _, 4>(NAME, [maps, query, points, &grad], |[m, q, p, o]| {
+        cpu::backward(g, m, q, p, o)
+    })?;
     let points = match g.point_gradient {
         true => Some(Tensor::from_vec(d.points, points.dims(), device)?),
         false => None,

@@ -5,7 +5,7 @@
 //! barrier of their own: called from many tasks at once they wait for one another.
 //! This one stays on the caller's thread for up to one block of rows.
 
-use super::{output, slice};
+use super::{borrowed, output, slice, tensor_like};
 use crate::cpu::gemm::{Mat, gemm};
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Tensor, bail};
 use rayon::prelude::*;
@@ -14,6 +14,8 @@ const NAME: &str = "linear";
 
 /// Rows per task: 256 × 128 floats are 128 KiB, a part of a core's L2.
 const BLOCK: usize = 256;
+/// Rows whose part of the parameters' gradients is one sum.
+const PART: usize = 1024;
 
 /// y = x·Wᵀ + b: `x` `[N, C]`, `weight` `[O, C]`, `bias` `[O]`, f32.
 ///
@@ -67,8 +69,52 @@ impl CustomOp3 for Linear {
         _y: &Tensor,
         dy: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        Ok((Some(dy.matmul(w)?), Some(dy.t()?.matmul(x)?), Some(dy.sum(0)?)))
+        let (o, c) = w.dims2()?;
+        let dy = dy.contiguous()?;
+        let (dx, dw, db) = borrowed(NAME, [x, w, &dy], |[x, w, dy]: [&[f32]; 3]| {
+            let dx = match o > 0 && c > 0 {
+                true => input_grad(dy, w, [o, c]),
+                false => vec![0.0; x.len()],
+            };
+            let (dw, db) = parameter_grads(x, dy, [o, c]);
+            (dx, dw, db)
+        })?;
+        let db = Tensor::from_vec(db, o, x.device())?;
+        Ok((Some(tensor_like(dx, x)?), Some(tensor_like(dw, w)?), Some(db)))
     }
+}
+
+/// dy `[N, O]` · W `[O, C]`.
+fn input_grad(dy: &[f32], w: &[f32], [o, c]: [usize; 2]) -> Vec<f32> {
+    let mut dx = vec![0.0; dy.len() / o * c];
+    dx.par_chunks_mut(BLOCK * c).zip(dy.par_chunks(BLOCK * o)).for_each(|(dx, dy)| {
+        gemm(dx, c, Mat::new(dy, dy.len() / o, o, o), Mat::new(w, o, c, c), 1.0, false);
+    });
+    dx
+}
+
+/// (dyᵀ·x `[O, C]`, column sums of dy `[O]`): parts of [`PART`] rows, added in order.
+fn parameter_grads(x: &[f32], dy: &[f32], [o, c]: [usize; 2]) -> (Vec<f32>, Vec<f32>) {
+    let (mut dw, mut db) = (vec![0f32; o * c], vec![0f32; o]);
+    if o * c == 0 {
+        return (dw, db);
+    }
+    let part = |(x, dy): (&[f32], &[f32])| {
+        let rows = dy.len() / o;
+        let mut dw = vec![0f32; o * c];
+        gemm(&mut dw, c, Mat::new(dy, rows, o, o).t(), Mat::new(x, rows, c, c), 1.0, false);
+        let mut db = vec![0f32; o];
+        for row in dy.chunks_exact(o) {
+            db.iter_mut().zip(row).for_each(|(sum, v)| *sum += v);
+        }
+        (dw, db)
+    };
+    let parts: Vec<_> = x.par_chunks(PART * c).zip(dy.par_chunks(PART * o)).map(part).collect();
+    for (part_w, part_b) in &parts {
+        dw.iter_mut().zip(part_w).for_each(|(sum, v)| *sum += v);
+        db.iter_mut().zip(part_b).for_each(|(sum, v)| *sum += v);
+    }
+    (dw, db)
 }
 
 #[cfg(test)]

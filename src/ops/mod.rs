@@ -3,13 +3,17 @@
 //! plainly that it has none; none drops it silently.
 
 pub mod activation;
+pub mod adapter;
 pub mod attention;
 pub mod attention_gather;
+pub mod attributes;
 mod backend;
+pub mod columns;
 mod conv;
 pub mod conv2d;
 pub mod conv3d;
 pub mod direct;
+pub mod dssim;
 pub mod join;
 pub mod linear;
 pub mod matching;

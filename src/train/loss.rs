@@ -5,6 +5,7 @@
 //! loss costs about one pass over the prediction.
 
 use crate::metrics::{SSIM_C1, SSIM_C2, SSIM_COVARIANCE, SSIM_WINDOW, window};
+use crate::ops::dssim;
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
 use rayon::prelude::*;
 
@@ -96,86 +97,19 @@ pub fn dssim(x: &[f32], target: &[f32], width: usize, height: usize) -> Scored {
     let plane = width * height;
     let channels = (x.len() / plane).max(1);
     let windows = (width - SSIM_WINDOW + 1) * (height - SSIM_WINDOW + 1) * channels;
+    let shape = dssim::Window {
+        taps: window().map(|t| t as f32),
+        c: [SSIM_C1 as f32, SSIM_C2 as f32],
+        covariance: SSIM_COVARIANCE as f32,
+    };
+    let factor = (-0.5 / windows as f64) as f32;
     let mut gradient = vec![0.0; x.len()];
     let sums: Vec<f64> = gradient
         .par_chunks_mut(plane)
         .zip(x.par_chunks(plane).zip(target.par_chunks(plane)))
-        .map(|(g, (x, t))| dssim_plane(x, t, width, -0.5 / windows as f64, g))
+        .map(|(g, (x, t))| dssim::plane(&shape, [x, t], width, factor, g))
         .collect();
     Scored { value: 0.5 * (1.0 - sums.iter().sum::<f64>() / windows as f64), gradient }
-}
-
-/// Sum of SSIM over one plane's windows; `g` becomes `factor` times its derivative.
-fn dssim_plane(x: &[f32], t: &[f32], width: usize, factor: f64, g: &mut [f32]) -> f64 {
-    let taps = window().map(|t| t as f32);
-    let products = |f: &dyn Fn(f32, f32) -> f32| -> Vec<f32> {
-        let map: Vec<f32> = x.iter().zip(t).map(|(x, t)| f(*x, *t)).collect();
-        blurred(&map, width, &taps)
-    };
-    let (mx, mt) = (products(&|x, _| x), products(&|_, t| t));
-    let (mxx, mtt) = (products(&|x, _| x * x), products(&|_, t| t * t));
-    let mxt = products(&|x, t| x * t);
-    let [c1, c2, cov] = [SSIM_C1, SSIM_C2, SSIM_COVARIANCE].map(|c| c as f32);
-    // Derivatives of SSIM by the window's mean of x, of x² and of x·t.
-    let (mut dx, mut dxx, mut dxt) = (mx.clone(), mxx.clone(), mxt.clone());
-    let mut sum = 0.0;
-    for i in 0..mx.len() {
-        let (ux, ut) = (mx[i], mt[i]);
-        let variances = cov * (mxx[i] - ux * ux + mtt[i] - ut * ut) + c2;
-        let covariance = 2.0 * cov * (mxt[i] - ux * ut) + c2;
-        let (light, lights) = (2.0 * ux * ut + c1, ux * ux + ut * ut + c1);
-        let s = light * covariance / (lights * variances);
-        sum += f64::from(s);
-        let by_light = 2.0 * ut / light - 2.0 * ux / lights;
-        let by_structure = 2.0 * cov * (ux / variances - ut / covariance);
-        dx[i] = s * (by_light + by_structure);
-        dxx[i] = -s * cov / variances;
-        dxt[i] = 2.0 * s * cov / covariance;
-    }
-    let [dx, dxx, dxt] = [dx, dxx, dxt].map(|d| spread(&d, width, &taps));
-    for (i, g) in g.iter_mut().enumerate() {
-        *g = factor as f32 * (dx[i] + 2.0 * x[i] * dxx[i] + t[i] * dxt[i]);
-    }
-    sum
-}
-
-/// Windowed means, `[h − 10, width − 10]`.
-fn blurred(plane: &[f32], width: usize, taps: &[f32; SSIM_WINDOW]) -> Vec<f32> {
-    let (inner, height) = (width + 1 - SSIM_WINDOW, plane.len() / width);
-    let mut rows = vec![0.0; inner * height];
-    for (out, row) in rows.chunks_mut(inner).zip(plane.chunks(width)) {
-        for (k, tap) in taps.iter().enumerate() {
-            out.iter_mut().zip(&row[k..]).for_each(|(o, v)| *o += tap * v);
-        }
-    }
-    let mut out = vec![0.0; inner * (height + 1 - SSIM_WINDOW)];
-    for (y, out) in out.chunks_mut(inner).enumerate() {
-        for (k, tap) in taps.iter().enumerate() {
-            let row = &rows[(y + k) * inner..];
-            out.iter_mut().zip(row).for_each(|(o, v)| *o += tap * v);
-        }
-    }
-    out
-}
-
-/// The transpose of [`blurred`]: `[h − 10, width − 10]` back to `[h, width]`.
-fn spread(map: &[f32], width: usize, taps: &[f32; SSIM_WINDOW]) -> Vec<f32> {
-    let inner = width + 1 - SSIM_WINDOW;
-    let height = map.len() / inner + SSIM_WINDOW - 1;
-    let mut rows = vec![0.0; inner * height];
-    for (y, source) in map.chunks(inner).enumerate() {
-        for (k, tap) in taps.iter().enumerate() {
-            let row = &mut rows[(y + k) * inner..][..inner];
-            row.iter_mut().zip(source).for_each(|(o, v)| *o += tap * v);
-        }
-    }
-    let mut out = vec![0.0; width * height];
-    for (out, row) in out.chunks_mut(width).zip(rows.chunks(inner)) {
-        for (k, tap) in taps.iter().enumerate() {
-            out[k..].iter_mut().zip(row).for_each(|(o, v)| *o += tap * v);
-        }
-    }
-    out
 }
 
 /// Cross-entropy of logits `[B, D, n]` to the two candidates around `target` `[B, n]`

@@ -12,9 +12,8 @@ use crate::data::dataset::Posed;
 use crate::io::image::Rgb;
 use crate::model::backbone::small::DepthMaps;
 use crate::model::lpips::Lpips;
-use crate::model::primaries::primaries;
+use crate::model::primaries::packed;
 use crate::model::subsplat::SubSplat;
-use crate::model::trace::Trace;
 use crate::model::trunk::Children;
 use crate::model::weights::Weights;
 use crate::model::{BackboneOutput, Views};
@@ -25,9 +24,9 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
-/// Parents that the trunk takes at once while training: few calls, and activations of
-/// some ten megabytes each.
-const CHUNK: usize = 4096;
+/// Parents that the trunk takes at once while training: few calls, each of which adds to
+/// the gradients of whole feature maps.
+const CHUNK: usize = 16_384;
 
 /// Means over the examples of a step; NaN where a step has no such term.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -340,9 +339,12 @@ impl Learner {
             let views = views.scene(b)?;
             let mut settings = self.model.config().primaries().clone();
             settings.opacity_exponent = self.opacity_exponent(step, settings.opacity_exponent);
-            let parents = primaries(&one, &views, &settings, &mut Trace::off())?;
-            let children =
-                self.model.trunk().forward_train(&views, &one, &parents, (CHUNK, step))?;
+            let parents = packed(&one, &views, &settings)?;
+            let trunk = self.model.trunk();
+            let children = match trunk.is_off() {
+                true => Children::whole(&parents)?,
+                false => trunk.forward_train(&views, &one, &parents.split()?, (CHUNK, step))?,
+            };
             seconds.trunk += start.elapsed().as_secs_f64();
             let start = Instant::now();
             let seen = self.pictures(&children, example)?;

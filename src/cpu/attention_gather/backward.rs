@@ -218,8 +218,10 @@ impl<T: Real> Args<'_, T> {
         let g = self.g;
         let cells = self.maps.len() / g.stride;
         let width = g.dim / g.groups;
-        // Channels per task: within one group, at most two cache lines of f32.
-        let lanes = (1..=32.min(width)).rev().find(|b| width.is_multiple_of(*b)).unwrap_or(1);
+        // Channels per task: within one group, as many as leave every thread a task, at
+        // least two cache lines of f32. The sums do not depend on it.
+        let most = (g.stride / rayon::current_num_threads().max(1)).max(32).min(width);
+        let lanes = (1..=most).rev().find(|b| width.is_multiple_of(*b)).unwrap_or(1);
         let blocks: Vec<Vec<T>> = (0..g.stride / lanes)
             .into_par_iter()
             .map(|block| {

@@ -134,7 +134,7 @@ impl Aggregation {
                 bail!("feature map {level:?}: expected 1 scene of {v} views, got {b} of {got}");
             }
             let map = backbone.feature(*level)?.squeeze(0)?.permute((0, 2, 3, 1))?;
-            let map = map.reshape((v * height * width, c))?;
+            let map = map.contiguous()?.reshape((v * height * width, c))?;
             let map = match input {
                 Some(linear) => linear.forward(&map)?,
                 None => map,

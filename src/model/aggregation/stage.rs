@@ -8,6 +8,7 @@ use crate::config::{
 };
 use crate::model::mlp::{LayerNorm, Mode, affine, linear, xavier};
 use crate::ops::attention_gather::{Drop, Gather, attention_gather_on};
+use crate::ops::columns::columns;
 use candle_core::{Result, Tensor};
 use candle_nn::{Init, Linear, Module, VarBuilder};
 
@@ -106,9 +107,9 @@ impl Stage {
         for (l, map) in maps.iter().enumerate() {
             // Without projections keys and values are one and the same row.
             levels.push(match (self.wk.get(l), self.wv.get(l)) {
-                (Some(wk), Some(wv)) => stacked(wk, wv)?.forward(map)?,
-                (Some(wk), None) => Tensor::cat(&[&wk.forward(map)?, map], 1)?,
-                (None, Some(wv)) => wv.forward(map)?,
+                (Some(wk), Some(wv)) => affine(&stacked(wk, wv)?, map)?,
+                (Some(wk), None) => Tensor::cat(&[&affine(wk, map)?, map], 1)?,
+                (None, Some(wv)) => affine(wv, map)?,
                 (None, None) => map.clone(),
             });
         }
@@ -126,19 +127,19 @@ impl Stage {
     ) -> Result<Tensor> {
         let mut q = f.add(z)?;
         if let Some(norm) = &self.norm {
-            q = norm.forward(&q, shared.mode)?;
+            q = norm.forward(&q)?;
         }
         let points = sample_points(keys, shared, self.learned.as_ref(), (f, &q))?;
         let gather = self.gather(keys, shared, t, q.dim(1)?);
         let query = self.query(keys, shared, &gather, &q)?;
         let mut o = attention_gather_on(shared.backend, maps, &query, &points, gather)?;
         if let Some(wo) = &self.wo {
-            o = affine(wo, &o, shared.mode)?;
+            o = affine(wo, &o)?;
         }
         let (joined, next) = match (keys.residual, &self.cat) {
             (Residual::Cat, Some(cat)) => {
-                let joined = Tensor::cat(&[f, &o], 1)?;
-                let next = affine(cat, &joined, shared.mode)?;
+                let joined = columns(f, &o, None)?;
+                let next = affine(cat, &joined)?;
                 (joined, next)
             }
             (Residual::None, _) => (o.clone(), o),
@@ -148,7 +149,7 @@ impl Stage {
             }
         };
         match &self.ffn {
-            Some(ffn) => next.add(&ffn.forward(&joined, shared.mode)?),
+            Some(ffn) => next.add(&ffn.forward(&joined)?),
             None => Ok(next),
         }
     }
@@ -190,7 +191,7 @@ impl Stage {
         let (v, l, m) = (g.views, g.levels.len(), g.points);
         let width = v * l * m * keys.groups;
         let bias = match (&self.weights, &self.level_bias) {
-            (Some(weights), _) => affine(weights, q, shared.mode)?.narrow(1, 0, width)?,
+            (Some(weights), _) => affine(weights, q)?.narrow(1, 0, width)?,
             (None, Some(bias)) => {
                 let bias = bias.reshape((1, 1, l, 1, 1))?;
                 bias.broadcast_as((n, v, l, m, keys.groups))?.reshape((n, width))?
@@ -215,8 +216,8 @@ impl Stage {
             None => gates,
         };
         match g.key {
-            Some(_) => Tensor::cat(&[q, &bias, &gates], 1),
-            None => Tensor::cat(&[&bias, &gates], 1),
+            Some(_) => columns(q, &bias, Some(&gates)),
+            None => columns(&bias, &gates, None),
         }
     }
 }
@@ -232,9 +233,9 @@ impl FeedForward {
         })
     }
 
-    fn forward(&self, x: &Tensor, mode: Mode) -> Result<Tensor> {
-        let x = self.norm.forward(x, mode)?;
-        affine(&self.lin1, &affine(&self.lin0, &x, mode)?.relu()?, mode)
+    fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        let x = self.norm.forward(x)?;
+        affine(&self.lin1, &affine(&self.lin0, &x)?.relu()?)
     }
 }
 

@@ -1,0 +1,176 @@
+//! SH of the primaries: masked, mapped and turned by one matrix per view, and the
+//! gradient of all that.
+
+use super::{Adapter, GEOMETRY};
+use crate::cpu::lanes::{Kernel, LaneReal, Lanes, Machine};
+use rayon::prelude::*;
+
+/// Most SH functions of a set.
+const FUNCTIONS_MAX: usize = 25;
+
+/// A square matrix by its non-zero elements, with its transpose.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Turn {
+    rows: Vec<Vec<(usize, f64)>>,
+    columns: Vec<Vec<(usize, f64)>>,
+}
+
+impl Turn {
+    /// Of the row-major `[D, D]` matrix `m`, D ≤ 25.
+    pub fn new(m: &[f64], d: usize) -> Self {
+        let line = |at: &dyn Fn(usize) -> f64| -> Vec<(usize, f64)> {
+            (0..d).map(|j| (j, at(j))).filter(|(_, v)| *v != 0.0).collect()
+        };
+        Self {
+            rows: (0..d).map(|i| line(&|j| m[i * d + j])).collect(),
+            columns: (0..d).map(|j| line(&|i| m[i * d + j])).collect(),
+        }
+    }
+}
+
+/// Which SH: turned into world frame, `[N, D, 3]`, or in the camera's, `[N, 3, D]`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Frame {
+    /// Into world frame, RGB innermost.
+    World,
+    /// In camera frame, colour-major like the raw row.
+    Camera,
+}
+
+/// Numbers i < 3·D of rows `stride` apart: 3·D is 3, 12, 27, 48 or 75.
+#[inline(always)]
+pub(super) fn load<M: Machine>(m: M, rows: &[M::Scalar], span: (usize, usize), to: &mut [M::V]) {
+    let mut at = 0;
+    while to.len() - at >= 16 {
+        to[at..at + 16].copy_from_slice(&m.load_rows::<16>(&rows[at..], span));
+        at += 16;
+    }
+    match to.len() - at {
+        3 => to[at..].copy_from_slice(&m.load_rows::<3>(&rows[at..], span)),
+        11 => to[at..].copy_from_slice(&m.load_rows::<11>(&rows[at..], span)),
+        12 => to[at..].copy_from_slice(&m.load_rows::<12>(&rows[at..], span)),
+        _ => {}
+    }
+}
+
+/// The inverse of [`load`].
+#[inline(always)]
+pub(super) fn store<M: Machine>(m: M, from: &[M::V], span: (usize, usize), rows: &mut [M::Scalar]) {
+    let mut at = 0;
+    while from.len() - at >= 16 {
+        let mut part = [m.of(0.0); 16];
+        part.copy_from_slice(&from[at..at + 16]);
+        m.store_rows(&part, span, &mut rows[at..]);
+        at += 16;
+    }
+    let rest = from.len() - at;
+    let mut part = [m.of(0.0); 12];
+    part[..rest.min(12)].copy_from_slice(&from[at..at + rest.min(12)]);
+    let [a, b, c, d, e, f, g, h, i, j, k, _] = part;
+    match rest {
+        3 => m.store_rows(&[a, b, c], span, &mut rows[at..]),
+        11 => m.store_rows(&[a, b, c, d, e, f, g, h, i, j, k], span, &mut rows[at..]),
+        12 => m.store_rows(&part, span, &mut rows[at..]),
+        _ => {}
+    }
+}
+
+/// Σⱼ lines[i][j]·from[function j of colour c], added to function i of colour c in `to`;
+/// `steps`: how far apart colours and functions lie in `from` and in `to`.
+#[inline(always)]
+fn apply<M: Machine>(
+    m: M,
+    lines: &[Vec<(usize, f64)>],
+    (from, to): (&[M::V], &mut [M::V]),
+    steps: [(usize, usize); 2],
+) {
+    let [(colour, function), (to_colour, to_function)] = steps;
+    for (i, line) in lines.iter().enumerate() {
+        let mut sums = [m.of(0.0); 3];
+        for &(j, v) in line {
+            let v = m.of(v);
+            for (c, sum) in sums.iter_mut().enumerate() {
+                *sum = v.fma(from[c * colour + j * function], *sum);
+            }
+        }
+        for (c, sum) in sums.into_iter().enumerate() {
+            let to = &mut to[c * to_colour + i * to_function];
+            *to = *to + sum;
+        }
+    }
+}
+
+impl Frame {
+    fn turn(self, adapter: &Adapter, view: usize) -> &Turn {
+        match self {
+            Self::World => &adapter.views[view].turn,
+            Self::Camera => &adapter.camera,
+        }
+    }
+
+    /// How far apart colours and functions lie in a set of `d` functions.
+    fn steps(self, d: usize) -> (usize, usize) {
+        match self {
+            Self::World => (1, 3),
+            Self::Camera => (d, 1),
+        }
+    }
+}
+
+struct Forward<'a, T> {
+    adapter: &'a Adapter,
+    frame: Frame,
+    view: usize,
+    raw: &'a [T],
+    out: &'a mut [T],
+}
+
+impl<T: LaneReal> Kernel<T> for Forward<'_, T> {
+    type Output = ();
+    #[inline(always)]
+    fn run<M: Machine<Scalar = T>>(self, m: M) {
+        let (g, d) = (self.adapter.per_pixel, self.adapter.functions);
+        let n = 3 * d;
+        let (width, lanes) = (self.adapter.size[1], self.adapter.raw_lanes());
+        let turn = self.frame.turn(self.adapter, self.view);
+        for first in (0..width).step_by(M::WIDTH) {
+            let count = M::WIDTH.min(width - first);
+            let mut from = [m.of(0.0); 3 * FUNCTIONS_MAX];
+            load(m, &self.raw[first * lanes + GEOMETRY..], (lanes, count), &mut from[..n]);
+            let mut to = [m.of(0.0); 3 * FUNCTIONS_MAX];
+            apply(m, &turn.rows, (&from[..n], &mut to[..n]), [(d, 1), self.frame.steps(d)]);
+            for k in 0..g {
+                store(m, &to[..n], (g * n, count), &mut self.out[(first * g + k) * n..]);
+            }
+        }
+    }
+}
+
+/// SH of all views' Gaussians into `out` `[views·H·W·G, 3·D]`, ordered as `frame` says.
+pub fn forward<T: LaneReal>(a: &Adapter, frame: Frame, raw: &[T], out: &mut [T]) {
+    let ([height, width], lanes) = (a.size, a.raw_lanes());
+    let set = width * a.per_pixel * 3 * a.functions;
+    out.par_chunks_mut(set).enumerate().for_each(|(i, out)| {
+        let raw = &raw[i * width * lanes..][..width * lanes];
+        T::dispatch(Forward { adapter: a, frame, view: i / height, raw, out });
+    });
+}
+
+/// Adds to `to` `[3·D]` the gradient of a vector of pixels' raw SH by what reached the
+/// SH of their Gaussians, `d_out` from the first one on.
+#[inline(always)]
+pub(super) fn backward<M: Machine>(
+    m: M,
+    (adapter, frame, view): (&Adapter, Frame, usize),
+    (d_out, count): (&[M::Scalar], usize),
+    to: &mut [M::V],
+) {
+    let (g, d) = (adapter.per_pixel, adapter.functions);
+    let n = 3 * d;
+    let lines = &frame.turn(adapter, view).columns;
+    for k in 0..g {
+        let mut from = [m.of(0.0); 3 * FUNCTIONS_MAX];
+        load(m, &d_out[k * n..], (g * n, count), &mut from[..n]);
+        apply(m, lines, (&from[..n], to), [frame.steps(d), (d, 1)]);
+    }
+}
