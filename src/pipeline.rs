@@ -274,6 +274,13 @@ impl Reconstructor {
     }
 }
 
+/// Whether a photograph shows more than the network's input does: more than one of its
+/// pixels for each of the input's.
+pub fn has_detail(c: &Cropped) -> bool {
+    let ratio = c.target.width as f32 / c.input.width.max(1) as f32;
+    (c.window.scale * ratio).min_element() > 1.0
+}
+
 /// Adds to the children of cropped photographs what the photographs show beyond their
 /// parents' pixels ([`crate::cpu::detail`]); `upscale` is the children's, K = upscale².
 ///
@@ -284,9 +291,7 @@ pub fn add_detail(splats: &mut Splats, inputs: &[Cropped], upscale: usize) -> Re
     let mut sources = Vec::with_capacity(inputs.len());
     for (c, pixels) in inputs.iter().zip(&pixels) {
         let (w, h) = (c.target.width, c.target.height);
-        let ratio = w as f32 / c.input.width.max(1) as f32;
-        // Photograph pixels per input pixel: at most 1 holds nothing to add.
-        let photograph = match (c.window.scale * ratio).min_element() > 1.0 {
+        let photograph = match has_detail(c) {
             true => Some(Photograph::new(pixels, w, h).ok_or_else(|| Error::Request {
                 what: "photograph",
                 expected: format!("{w}x{h} pixels"),

@@ -211,8 +211,8 @@ pub struct RunArgs {
     /// Do not match points between the context photographs to check their poses first.
     #[arg(long)]
     pub no_check: bool,
-    /// Detail from the photograph.
-    #[arg(long, value_enum, default_value = "off")]
+    /// Detail from photographs that are larger than the network's input.
+    #[arg(long, value_enum, default_value = "photo")]
     pub detail: DetailArg,
     /// What the model is.
     #[command(flatten)]

@@ -72,8 +72,8 @@ pub struct ViewArgs {
     /// Do not match points between the context photographs to check their poses first.
     #[arg(long)]
     pub no_check: bool,
-    /// Detail from the photograph.
-    #[arg(long, value_enum, default_value = "off")]
+    /// Detail from photographs that are larger than the network's input.
+    #[arg(long, value_enum, default_value = "photo")]
     pub detail: DetailArg,
     /// Rasterizer rules. Default: the model's own; for scene files what `run` noted in
     /// them (.ply, .glb), else `standard`.
@@ -110,7 +110,7 @@ impl ViewArgs {
             (self.weights.is_some(), "--weights"),
             (self.seed.is_some(), "--seed"),
             (self.far.is_some(), "--far"),
-            (self.detail != DetailArg::Off, "--detail"),
+            (self.detail != DetailArg::Photo, "--detail"),
             (self.model.backbone.is_some(), "--backbone"),
             (self.model.preset.is_some(), "--preset"),
             (self.model.config.is_some(), "--config"),

@@ -69,6 +69,10 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     progress.split_last(&result.seconds);
     result.warnings.extend(backend.warning());
     result.warnings.iter().for_each(warn);
+    let detailed = request.detail && result.inputs.iter().any(pipeline::has_detail);
+    if detailed {
+        say("children take detail from the photographs (--detail off: from the network alone)");
+    }
     let options = raster_options(&args.look, model.config(), (range.near, &result.inputs));
     let views = views(args, &targets, &result)?;
     let job = Views {
@@ -91,7 +95,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
         };
         output::write_scene(&args.out, &result, &args.save, &save)
     })?;
-    let done = Done { range, reports, model, result, options, scored, files };
+    let done = Done { range, reports, model, result, detailed, options, scored, files };
     done.finish(args, &plan, progress, answer)
 }
 
@@ -275,6 +279,8 @@ struct Done {
     reports: Vec<PairReport>,
     model: Reconstructor,
     result: Reconstruction,
+    /// Whether photographs added detail.
+    detailed: bool,
     options: RasterOptions,
     scored: Vec<Scored>,
     files: Vec<Value>,
@@ -311,7 +317,7 @@ impl Done {
             "weights": args.weights.as_ref().map(|p| p.display().to_string()),
             "seed": args.seed,
             "untrained_tensors": self.model.untrained_tensors().len(),
-            "detail": args.detail == DetailArg::Photo,
+            "detail": self.detailed,
             "gaussians": self.result.splats.len(),
             "targets": self.scored.iter().map(Scored::json).collect::<Vec<_>>(),
             "psnr": self.mean(|s| s.psnr),
