@@ -70,7 +70,7 @@ fn eval_scores_writes_and_reads_its_own_pictures() {
     // Two inputs, the photograph and eight methods, twice; nothing from elsewhere.
     assert_eq!(page.matches("<img ").count(), 22);
     assert_eq!(page.matches("src=\"data:image/png;base64,").count(), 22);
-    assert!(!page.contains("http") && page.contains("untrained weights, seed 0"));
+    assert!(!page.contains("http") && page.contains("the weights that ship"));
 
     // Its own pictures, read back as another program's: 8 bits apart.
     let preds = "--pred again=out/pictures/subsplat --pred same=out/pictures/truth";
