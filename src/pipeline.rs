@@ -282,11 +282,15 @@ pub fn has_detail(c: &Cropped) -> bool {
 }
 
 /// Adds to the children of cropped photographs what the photographs show beyond their
-/// parents' pixels ([`crate::cpu::detail`]); `upscale` is the children's, K = upscale².
+/// parents' pixels ([`crate::cpu::detail`]), if one has anything to show; `upscale` is the
+/// children's, K = upscale².
 ///
 /// # Errors
 /// A photograph without pixels.
 pub fn add_detail(splats: &mut Splats, inputs: &[Cropped], upscale: usize) -> Result<()> {
+    if !inputs.iter().any(has_detail) {
+        return Ok(());
+    }
     let pixels: Vec<Vec<f32>> = inputs.iter().map(|c| c.target.to_unit()).collect();
     let mut sources = Vec::with_capacity(inputs.len());
     for (c, pixels) in inputs.iter().zip(&pixels) {
