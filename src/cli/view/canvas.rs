@@ -316,8 +316,8 @@ mod tests {
 
     #[test]
     fn a_surface_without_a_known_format_is_named() {
-        let mut caps = wgpu::SurfaceCapabilities::default();
-        caps.formats = vec![wgpu::TextureFormat::Rgba16Float];
+        let formats = vec![wgpu::TextureFormat::Rgba16Float];
+        let mut caps = wgpu::SurfaceCapabilities { formats, ..Default::default() };
         let error = configuration(&caps, (4, 3)).unwrap_err().to_string();
         assert!(error.contains("Bgra8Unorm") && error.contains("Rgba16Float"), "{error}");
         caps.formats.push(wgpu::TextureFormat::Rgba8UnormSrgb);
