@@ -360,7 +360,6 @@ impl<'a> Players<'a> {
             return Vec::new();
         };
         let mut config = network.model.config().clone();
-        config.upscale = ratio;
         config.render.lowpass_ref = reference.unwrap_or(config.render.lowpass_ref);
         let options = config.raster_options(ratio as f32, self.near, self.colour);
         render_with(&mut self.rasterizer, splats, camera, &options).rgb
