@@ -1,7 +1,7 @@
 // From the pixels' sums to SH, gain, and the mean's share of the direction. Twin:
 // src/cpu/colour_bwd.rs. A parent's SH gradient is summed over its children in their order.
 //
-// In: rows, sh, gain as project.wgsl has them, sums [N, 10] from splat `first` on.  Out:
+// In: rows, sh, gain as project.wgsl has them, sums [N, 10] from splat `own` on.  Out:
 // gradients of sh and gain; the mean's share is added to `d_rows`, which project_bwd.wgsl
 // has filled.   One thread per parent.
 
@@ -54,7 +54,7 @@ fn put_gain(i: u32, g: f32, rgb: vec3<f32>) {
 // Every child looks along its own mean.
 fn each_for_itself(own_sh: u32, first: u32, past: u32) {
     for (var i = first; i < past; i++) {
-        let m = moments(call.first + i);
+        let m = moments(call.own + i);
         if !seen(m) {
             put_gain(i, 0.0, vec3<f32>(0.0));
             continue;
@@ -77,7 +77,7 @@ fn together(own_sh: u32, first: u32, past: u32) {
             sum += d;
             count += 1.0;
         }
-        let rgb = moments(call.first + i).rgb;
+        let rgb = moments(call.own + i).rgb;
         if any(rgb != vec3<f32>(0.0)) {
             weighted += gain_of(i) * rgb;
         }
@@ -91,7 +91,7 @@ fn together(own_sh: u32, first: u32, past: u32) {
     }
     let radiated = radiance(own_sh, call.sh_degree, mvsplat, direction);
     for (var i = first; i < past; i++) {
-        let rgb = moments(call.first + i).rgb;
+        let rgb = moments(call.own + i).rgb;
         let alive = any(rgb != vec3<f32>(0.0));
         put_gain(i, select(0.0, dot(rgb, radiated), alive), rgb);
     }

@@ -39,13 +39,14 @@ fn main(
     let b = footprints[3u * i + 1u];
     let half_height = footprints[3u * i + 2u].w;
     let f = Footprint(a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w, half_height);
-    for (var line = lines.x; line < lines.y; line++) {
+    let met = lines_of_call(lines);
+    for (var line = met.x; line < met.y; line++) {
         var span = columns;
         if !whole {
             span = tiles_of_row(f, line, columns);
         }
         for (var column = span.x; column < span.y && next < past; column++) {
-            tiles[next] = line * call.columns + column;
+            tiles[next] = (line - call.top) * call.columns + column;
             owners[next] = i;
             next++;
         }

@@ -2,9 +2,9 @@
 // Twin: src/cpu/project.rs (and ewa, covariance, sh, tiles there).
 //
 // In: rows [N, 11] (mean, quat wxyz, σ, opacity) or [N, 10] (mean, covariance 6, opacity);
-// sh [P, D, 3]; gain [], [N] or [N, 4].  Out, from splat `first` on: footprints [N, 12],
-// rectangles of tiles [N, 2] (packed), depth keys [N] (all ones where dropped), tile
-// counts [N].   One thread per splat.
+// sh [P, D, 3]; gain [], [N] or [N, 4].  Out, from splat `own` on: footprints [N, 12],
+// rectangles of tiles [N, 2] (packed); from splat `first` on: depth keys [N] (all ones
+// where dropped), counts [N] of the call's tiles.   One thread per splat.
 
 @group(0) @binding(0) var<uniform> call: RasterUniform;
 @group(0) @binding(1) var<storage, read> rows: array<f32>;
@@ -122,21 +122,22 @@ fn project(i: u32) -> bool {
     let columns = vec2<u32>(u32(across.x) / TILE_GPU, (u32(across.y) + TILE_GPU - 1u) / TILE_GPU);
     let lines = vec2<u32>(u32(down.x) / TILE_GPU, (u32(down.y) + TILE_GPU - 1u) / TILE_GPU);
     let found = Footprint(mean.x, mean.y, sx, shear, sy, power, p.z, half.x, half.y);
-    var tiles = (columns.y - columns.x) * (lines.y - lines.x);
+    let met = lines_of_call(lines);
+    var tiles = (columns.y - columns.x) * (met.y - met.x);
     if !small(columns, lines) {
         tiles = 0u;
-        for (var line = lines.x; line < lines.y; line++) {
+        for (var line = met.x; line < met.y; line++) {
             let span = tiles_of_row(found, line, columns);
             tiles += span.y - span.x;
         }
     }
-    let i_out = call.first + i;
+    let i_out = call.own + i;
     footprints[3u * i_out] = vec4<f32>(mean, sx, shear);
     footprints[3u * i_out + 1u] = vec4<f32>(sy, power, p.z, half.x);
     footprints[3u * i_out + 2u] = vec4<f32>(rgb.xyz, half.y);
     rectangles[i_out] = vec2<u32>(pack(columns), pack(lines));
-    keys[i_out] = bitcast<u32>(p.z);
-    counts[i_out] = tiles;
+    keys[call.first + i] = bitcast<u32>(p.z);
+    counts[call.first + i] = tiles;
     return true;
 }
 

@@ -3,7 +3,7 @@
 // direction is added by colour_bwd.wgsl.
 //
 // In: rows as project.wgsl has them, footprints [N, 12] and sums [N, 10] from splat
-// `first` on.  Out: gradients of the rows, lane by lane; zeros for splats that no pixel
+// `own` on.  Out: gradients of the rows, lane by lane; zeros for splats that no pixel
 // saw, whatever numbers they hold.   One thread per splat.
 
 @group(0) @binding(0) var<uniform> call: RasterUniform;
@@ -59,8 +59,8 @@ fn axis(h: vec3<f32>, row: vec3<f32>, p: vec2<f32>, limits: vec2<f32>, f: f32, p
 
 fn geometry(i: u32, m: Moments) {
     let row = i * call.stride;
-    let a = footprints[3u * (call.first + i)];
-    let b = footprints[3u * (call.first + i) + 1u];
+    let a = footprints[3u * (call.own + i)];
+    let b = footprints[3u * (call.own + i) + 1u];
     let w = vec3<f32>(a.z, a.z * a.w, b.x);
     let d = three(row) - vec3<f32>(call.right.w, call.down.w, call.ahead.w);
     let p = vec3<f32>(dot(call.right.xyz, d), dot(call.down.xyz, d), dot(call.ahead.xyz, d));
@@ -149,7 +149,7 @@ fn main(
     if i >= call.count {
         return;
     }
-    let m = moments(call.first + i);
+    let m = moments(call.own + i);
     if seen(m) {
         geometry(i, m);
         return;

@@ -3,8 +3,12 @@
 // below 1/255; blending stops before the splat that would take T to `stop` or below.
 //
 // Out: RGB over the background, 1 − T, Σ w·z: channel c of pixel p at p·step + c·channel,
-// then H·W alphas and H·W depth sums. For the way back, per pixel: the bits of T, and the
-// place in the sorted pairs behind the last splat that was blended.
+// then H·W alphas and H·W depth sums; H the rows of the call's band. For the way back, per
+// pixel: the bits of T, and the place in the sorted pairs behind the last splat that was
+// blended.
+//
+// Splats may come in several calls, nearest first: one that carries leaves sums without
+// background and T in place of alpha, below 0 where blending has stopped.
 
 @group(0) @binding(0) var<uniform> call: RasterUniform;
 @group(0) @binding(1) var<storage, read> footprints: array<vec4<f32>>;
@@ -31,10 +35,21 @@ fn main(
         return;
     }
     let x = tile % call.columns * TILE_GPU + lane % TILE_GPU;
-    let y = tile / call.columns * TILE_GPU + lane / TILE_GPU;
+    let y = (call.top + tile / call.columns) * TILE_GPU + lane / TILE_GPU;
     let pixel = vec2<f32>(f32(x), f32(y));
     var goes = x < call.width && y < call.height;
     let inside = goes;
+    let rows = band();
+    let p = (y - rows.x) * call.width + x;
+    let plane = call.width * rows.y;
+    let at = p * call.step;
+    var t = 1.0;
+    var sum = vec4<f32>(0.0);
+    if inside && call.resumes != 0u {
+        sum = vec4<f32>(picture[at], picture[at + call.channel], picture[at + 2u * call.channel], picture[4u * plane + p]);
+        t = abs(picture[3u * plane + p]);
+        goes = picture[3u * plane + p] > 0.0;
+    }
     if lane == 0u {
         atomicStore(&live, 256u);
     }
@@ -45,8 +60,6 @@ fn main(
     let first = ranges[2u * tile];
     let past = ranges[2u * tile + 1u];
     var end = first;
-    var t = 1.0;
-    var sum = vec4<f32>(0.0);
     for (var base = first; base < past; base += 256u) {
         workgroupBarrier();
         if lane == 0u {
@@ -83,16 +96,19 @@ fn main(
             }
         }
     }
-    if inside {
-        let p = y * call.width + x;
-        let plane = call.width * call.height;
-        let at = p * call.step;
-        let rgb = sum.xyz + t * call.background.xyz;
-        picture[at] = rgb.x;
-        picture[at + call.channel] = rgb.y;
-        picture[at + 2u * call.channel] = rgb.z;
-        picture[3u * plane + p] = 1.0 - t;
-        picture[4u * plane + p] = sum.w;
-        finals[p] = vec2<u32>(bitcast<u32>(t), end);
+    if !inside {
+        return;
     }
+    var rgb = sum.xyz;
+    var alpha = select(-t, t, goes);
+    if call.carries == 0u {
+        rgb += t * call.background.xyz;
+        alpha = 1.0 - t;
+    }
+    picture[at] = rgb.x;
+    picture[at + call.channel] = rgb.y;
+    picture[at + 2u * call.channel] = rgb.z;
+    picture[3u * plane + p] = alpha;
+    picture[4u * plane + p] = sum.w;
+    finals[p] = vec2<u32>(bitcast<u32>(t), end);
 }

@@ -7,7 +7,9 @@
 // the same rows. Each sums its pixels, then the tile's sums of a splat are added thread by
 // thread: the same bytes each time, no float atomics, two barriers for SPLATS splats.
 //
-// In: what rasterize.wgsl left (T and the end of the list, per pixel), upstream [5, H, W].
+// In: what rasterize.wgsl left (T and the end of the list, per pixel), upstream [5, H, W];
+// where splats come in several calls, farthest first, [6, H, W]: what a call leaves for the
+// next is B in the plane of alpha and T in the last. H: the rows of the call's band.
 // Out: per (splat, tile) pair, at the place where intersect.wgsl made it, ten sums over
 // the tile's pixels: of v = ∂L/∂ln α times 1, d, s, d², ds, s² (whitened distances), and
 // of w times the gradients of R, G, B, Σ w·z; per tile Σ T·∂L/∂RGB.
@@ -19,7 +21,7 @@
 @group(0) @binding(3) var<storage, read> pairs: array<u32>;
 @group(0) @binding(4) var<storage, read> owners: array<u32>;
 @group(0) @binding(5) var<storage, read> finals: array<vec2<u32>>;
-@group(0) @binding(6) var<storage, read> upstream: array<f32>;
+@group(0) @binding(6) var<storage, read_write> upstream: array<f32>;
 @group(0) @binding(7) var<storage, read_write> sums: array<f32>;
 @group(0) @binding(8) var<storage, read_write> behind: array<vec4<f32>>;
 
@@ -54,8 +56,9 @@ fn begin(slot: u32, x: u32, y: u32) -> vec3<f32> {
     if x >= call.width || y >= call.height {
         return vec3<f32>(0.0);
     }
-    let p = y * call.width + x;
-    let plane = call.width * call.height;
+    let rows = band();
+    let p = (y - rows.x) * call.width + x;
+    let plane = call.width * rows.y;
     let g = vec4<f32>(
         upstream[p],
         upstream[plane + p],
@@ -67,9 +70,23 @@ fn begin(slot: u32, x: u32, y: u32) -> vec3<f32> {
     gradient[slot] = g;
     // The background is what lies behind the last.
     state[slot] = vec2<f32>(t, dot(call.background.xyz, g.xyz) - upstream[3u * plane + p]);
+    if call.resumes != 0u {
+        state[slot] = vec2<f32>(upstream[5u * plane + p], upstream[3u * plane + p]);
+    }
     ends[slot] = left.y;
     atomicMax(&last, left.y);
     return t * g.xyz;
+}
+
+// Leaves the pixel for a call of nearer splats.
+fn leave(slot: u32, x: u32, y: u32) {
+    if x < call.width && y < call.height {
+        let rows = band();
+        let p = (y - rows.x) * call.width + x;
+        let plane = call.width * rows.y;
+        upstream[5u * plane + p] = state[slot].x;
+        upstream[3u * plane + p] = state[slot].y;
+    }
 }
 
 // The part of rows 0..ROWS from `top` on that a splat can meet in column `x`.
@@ -107,7 +124,7 @@ fn main(
     let column = (lane / 8u) % 2u * 8u + lane % 8u;
     let line = lane / 16u * ROWS;
     let x = tile % call.columns * TILE_GPU + column;
-    let top = tile / call.columns * TILE_GPU + line;
+    let top = (call.top + tile / call.columns) * TILE_GPU + line;
     if lane == 0u {
         atomicStore(&last, first);
     }
@@ -207,5 +224,10 @@ fn main(
             atomicStore(&masks[turn + lane], 0u);
         }
         end -= count;
+    }
+    if call.carries != 0u {
+        for (var r = 0u; r < ROWS; r++) {
+            leave(ROWS * lane + r, x, top + r);
+        }
     }
 }

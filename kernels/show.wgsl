@@ -1,11 +1,12 @@
-// A rendered picture onto a texture of the application's: one triangle over all of it.
+// A band of a rendered picture onto a texture of the application's: one triangle over all of
+// it, cut to the band.
 // Colours are display values; a texture that encodes sRGB itself is given the linear ones.
 
 struct ShowUniform {
     width: u32,
     height: u32,
     srgb: u32,
-    pad: u32,
+    top: u32,
 }
 
 @group(0) @binding(0) var<uniform> call: ShowUniform;
@@ -27,7 +28,7 @@ fn linear(v: f32) -> f32 {
 
 @fragment
 fn fragment(@builtin(position) at: vec4<f32>) -> @location(0) vec4<f32> {
-    let p = min(u32(at.y), call.height - 1u) * call.width + min(u32(at.x), call.width - 1u);
+    let p = min(u32(at.y) - call.top, call.height - 1u) * call.width + min(u32(at.x), call.width - 1u);
     let i = 3u * p;
     var rgb = clamp(vec3<f32>(picture[i], picture[i + 1u], picture[i + 2u]), vec3<f32>(0.0), vec3<f32>(1.0));
     if call.srgb != 0u {

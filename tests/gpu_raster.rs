@@ -239,16 +239,33 @@ fn order_is_that_of_a_stable_sort() {
 /// An application's own device and texture: the bytes of the picture that is read back.
 #[test]
 fn a_texture_of_another_device_shows_the_picture() {
-    use subsplat::gpu::{Gpu, wgpu};
-    if gpu().is_none() {
-        return;
+    if gpu().is_some() {
+        draw_to_texture(128 << 20);
     }
+}
+
+/// The same where a binding holds one row of tiles of the picture, three of which there are.
+#[test]
+fn a_texture_is_drawn_in_bands() {
+    if gpu().is_some() {
+        draw_to_texture(24 << 10);
+    }
+}
+
+fn draw_to_texture(binding: u64) {
+    use subsplat::gpu::{Gpu, wgpu};
     let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
     let adapter =
         pollster::block_on(instance.request_adapter(&wgpu::RequestAdapterOptions::default()))
             .unwrap();
-    let (device, queue) =
-        pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor::default())).unwrap();
+    let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
+        required_limits: wgpu::Limits {
+            max_storage_buffer_binding_size: binding,
+            ..wgpu::Limits::default()
+        },
+        ..wgpu::DeviceDescriptor::default()
+    }))
+    .unwrap();
     let gpu = Gpu::from_device(device.clone(), queue.clone());
     let scene = Scene::new(Kind::Plain, 9, 30, 2, 4);
     let k = scene.camera.intrinsics.resized(64, 48);

@@ -29,6 +29,7 @@ const TWINS: &[(&str, &str)] = &[
     ("scan_whole", "tiles"),
     ("scan_apply", "tiles"),
     ("plan", "tiles"),
+    ("pick", "tiles"),
     ("intersect", "tiles"),
     ("ranges", "tiles"),
     ("rasterize_bwd", "raster_bwd"),

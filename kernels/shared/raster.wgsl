@@ -1,4 +1,5 @@
-// What the rasterizer's kernels share: the uniform, a projected splat, its tiles.
+// What the rasterizer's kernels share: the uniform (binding `call`), a projected splat, its
+// tiles.
 
 struct RasterUniform {
     right: vec4<f32>,
@@ -30,7 +31,28 @@ struct RasterUniform {
     capacity: u32,
     step: u32,
     channel: u32,
-    pad: u32,
+    top: u32,
+    resumes: u32,
+    carries: u32,
+    own: u32,
+    place: u32,
+    places: u32,
+    pad_a: u32,
+    pad_b: u32,
+    pad_c: u32,
+}
+
+// The call's band of the picture: its first row of pixels, and how many there are.
+fn band() -> vec2<u32> {
+    let first = call.top * TILE_GPU;
+    return vec2<u32>(first, min(call.height, first + call.rows * TILE_GPU) - first);
+}
+
+// Of rows of tiles [x, y), those of the call.
+fn lines_of_call(lines: vec2<u32>) -> vec2<u32> {
+    let past = call.top + call.rows;
+    let first = clamp(lines.x, call.top, past);
+    return vec2<u32>(first, clamp(lines.y, first, past));
 }
 
 // A projected splat, as src/cpu/ewa.rs has it: mean u, v (px, pixel centres at integers),

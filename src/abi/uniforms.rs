@@ -70,9 +70,9 @@ uniform! {
         height: u32,
         /// Tiles along x.
         columns: u32,
-        /// Tiles along y.
+        /// Tiles along y, of the call.
         rows: u32,
-        /// First splat of the call.
+        /// First splat of the call, in the scene.
         first: u32,
         /// Splats of the call.
         count: u32,
@@ -96,8 +96,24 @@ uniform! {
         step: u32,
         /// See `step`.
         channel: u32,
+        /// First row of tiles of the call: a picture may be drawn in bands.
+        top: u32,
+        /// 1: pixels and sums go on from what a call before left.
+        resumes: u32,
+        /// 1: pixels are left for a call after.
+        carries: u32,
+        /// Where the call's first splat stands in its footprints and sums.
+        own: u32,
+        /// First place of the call, in the order by depth.
+        place: u32,
+        /// Places of the call.
+        places: u32,
         /// Unused.
-        pad: u32,
+        pad_a: u32,
+        /// Unused.
+        pad_b: u32,
+        /// Unused.
+        pad_c: u32,
     }
 }
 
@@ -120,12 +136,12 @@ uniform! {
     ShowUniform {
         /// W, px.
         width: u32,
-        /// H, px.
+        /// Rows of pixels of the band.
         height: u32,
         /// 1: the texture encodes sRGB itself.
         srgb: u32,
-        /// Unused.
-        pad: u32,
+        /// First row of pixels of the band.
+        top: u32,
     }
 }
 

@@ -43,12 +43,15 @@ fn spread(groups: usize) -> [u32; 3] {
     [groups.div_ceil(y) as u32, y as u32, 1]
 }
 
+/// Encodes something that reads these.
+type Draw = Box<dyn FnOnce(&mut wgpu::CommandEncoder, &[Binding])>;
+
 enum Step {
     Stage(&'static str),
     Run { pipeline: Arc<Pipeline>, bindings: Vec<Binding>, groups: Groups },
     Clear(Buffer),
     Copy { from: Buffer, to: Buffer, bytes: u64 },
-    Draw(Box<dyn FnOnce(&mut wgpu::CommandEncoder)>),
+    Draw(Vec<Binding>, Draw),
 }
 
 /// Kernel calls in order; nothing reaches the device before [`Commands::submit`].
@@ -131,9 +134,13 @@ impl Commands<'_> {
         Ok(Reading { staging, count, kind: PhantomData })
     }
 
-    /// Something else than a kernel call, a render pass say.
-    pub(crate) fn draw(&mut self, f: impl FnOnce(&mut wgpu::CommandEncoder) + 'static) {
-        self.steps.push(Step::Draw(Box::new(f)));
+    /// Something else than a kernel call, a render pass say, that reads `bindings`.
+    pub(crate) fn draw(
+        &mut self,
+        bindings: Vec<Binding>,
+        f: impl FnOnce(&mut wgpu::CommandEncoder, &[Binding]) + 'static,
+    ) {
+        self.steps.push(Step::Draw(bindings, Box::new(f)));
     }
 
     /// Hands all to the device in one submit, and does not wait for it.
@@ -163,7 +170,10 @@ impl Commands<'_> {
                         encoder.copy_buffer_to_buffer(from.raw(), 0, to.raw(), 0, bytes);
                         held.extend([&from, &to].map(Binding::from));
                     }
-                    Step::Draw(draw) => draw(&mut encoder),
+                    Step::Draw(bindings, draw) => {
+                        draw(&mut encoder, &bindings);
+                        held.extend(bindings);
+                    }
                     Step::Run { pipeline, bindings, groups } => {
                         let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
                             label: Some(stage),

@@ -1,7 +1,9 @@
 //! One opened GPU: device, queue, limits, and what has gone wrong with it.
 //!
 //! A [`Gpu`] opened here asks for WebGPU's default limits, so that what runs on it runs
-//! in a browser too. An application hands in its own device with [`Gpu::from_device`].
+//! in a browser too, but for sizes: bindings, buffers and textures are as large as the
+//! adapter has them ([`limits_of`]). An application hands in its own device with
+//! [`Gpu::from_device`].
 
 use crate::gpu::adapter::{AdapterSummary, DeviceChoice, find};
 use crate::gpu::buffers::Pool;
@@ -10,6 +12,22 @@ use crate::gpu::pipelines::Pipelines;
 use std::fmt;
 use std::sync::atomic::AtomicUsize;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+
+/// Most bytes of a binding or buffer, where the adapter has more: kernels count words in 32
+/// bits, and some drivers bytes in 31.
+const BINDING_MAX: u64 = 1 << 30;
+
+/// What devices are asked for: WebGPU's default limits, and the adapter's own sizes.
+pub fn limits_of(adapter: &wgpu::Adapter) -> wgpu::Limits {
+    let (own, usual) = (adapter.limits(), wgpu::Limits::default());
+    let binding = own.max_storage_buffer_binding_size.min(BINDING_MAX);
+    wgpu::Limits {
+        max_storage_buffer_binding_size: binding.max(usual.max_storage_buffer_binding_size),
+        max_buffer_size: own.max_buffer_size.min(BINDING_MAX).max(usual.max_buffer_size),
+        max_texture_dimension_2d: own.max_texture_dimension_2d,
+        ..usual
+    }
+}
 
 /// An opened GPU with its buffers and compiled kernels. Share it in an [`Arc`].
 pub struct Gpu {
@@ -63,7 +81,7 @@ impl Gpu {
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("subsplat"),
             required_features: wanted,
-            required_limits: wgpu::Limits::default(),
+            required_limits: limits_of(adapter),
             ..wgpu::DeviceDescriptor::default()
         };
         let (device, queue) =
@@ -128,7 +146,7 @@ impl Gpu {
         &self.queue
     }
 
-    /// Limits of the device: WebGPU's defaults unless the application opened it.
+    /// Limits of the device: [`limits_of`] its adapter unless the application opened it.
     pub fn limits(&self) -> &wgpu::Limits {
         &self.limits
     }

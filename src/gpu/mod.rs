@@ -39,7 +39,9 @@ mod buffers;
 mod commands;
 mod device;
 mod error;
+mod frame;
 mod invert;
+mod layers;
 mod pipelines;
 mod plane_sweep;
 mod plane_sweep_bwd;
@@ -57,7 +59,7 @@ pub use adapter::{AdapterSummary, DeviceChoice, adapters, choose, find_for, inst
 pub use attention_gather::AttentionGatherArgs;
 pub use attention_gather_bwd::AttentionGatherGradients;
 pub use buffers::Buffer;
-pub use device::Gpu;
+pub use device::{Gpu, limits_of};
 pub use error::GpuError;
 pub use pipelines::{Access, Kernel};
 pub use plane_sweep::PlaneSweepArgs;
@@ -78,6 +80,7 @@ pub const KERNELS: &[&Kernel] = &[
     &raster_kernels::SCAN_WHOLE,
     &raster_kernels::SCAN_APPLY,
     &raster_kernels::PLAN,
+    &raster_kernels::PICK,
     &raster_kernels::INTERSECT,
     &raster_kernels::RANGES,
     &raster_kernels::RASTERIZE,

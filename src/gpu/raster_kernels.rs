@@ -59,6 +59,13 @@ pub(crate) static PLAN: Kernel = Kernel {
     bindings: &[Uniform, Read, Read, Write],
 };
 
+pub(crate) static PICK: Kernel = Kernel {
+    name: "pick",
+    entry: "main",
+    source: wgsl!("shared/abi", "shared/grid", "shared/raster", "pick"),
+    bindings: &[Uniform, Read, Read, Read, Read, Write, Write, Write, Write],
+};
+
 pub(crate) static INTERSECT: Kernel = Kernel {
     name: "intersect",
     entry: "main",
@@ -84,7 +91,7 @@ pub(crate) static RASTERIZE_BWD: Kernel = Kernel {
     name: "rasterize_bwd",
     entry: "main",
     source: wgsl!("shared/abi", "shared/grid", "shared/raster", "rasterize_bwd"),
-    bindings: &[Uniform, Read, Read, Read, Read, Read, Read, Write, Write],
+    bindings: &[Uniform, Read, Read, Read, Read, Read, Write, Write, Write],
 };
 
 pub(crate) static PAIR_SUMS: Kernel = Kernel {

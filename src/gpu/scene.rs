@@ -1,6 +1,6 @@
 //! Splats in device memory, cut where one binding does not hold them.
 
-use crate::abi::{Geometry, SPLAT_LANES, SplatSlices, sh_coefficients};
+use crate::abi::{FOOTPRINT_LANES, Geometry, SPLAT_LANES, SplatSlices, sh_coefficients};
 use crate::gpu::buffers::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
@@ -73,7 +73,8 @@ impl Gpu {
         let children = splats.children_per_parent();
         let sh_stride = 3 * sh_coefficients(splats.sh_degree);
         let gain_lanes = splats.gain.len().checked_div(n).unwrap_or(0);
-        let most = [stride * children, sh_stride, gain_lanes * children]
+        // A part's footprints fit a binding too (src/gpu/layers.rs).
+        let most = [FOOTPRINT_LANES * children, sh_stride, gain_lanes * children]
             .into_iter()
             .map(|floats| self.rows_per_binding(floats))
             .min()

@@ -1,13 +1,15 @@
 //! A frame onto a texture of the application's, on its device: the picture does not pass
 //! through host memory. Kernel: kernels/show.wgsl.
 
-use crate::abi::{PLAN_WORDS, RasterOptions, ShowUniform};
+use crate::abi::{PLAN_WORDS, RasterOptions, RasterUniform, ShowUniform, TILE_GPU};
 use crate::camera::Camera;
-use crate::gpu::buffers::Binding;
+use crate::gpu::buffers::{Binding, Buffer};
+use crate::gpu::commands::Commands;
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
+use crate::gpu::frame::{Channels, pixels, uniform};
 use crate::gpu::pipelines::{Access, Kernel, layout};
-use crate::gpu::rasterize::{Channels, Rasterizer};
+use crate::gpu::rasterize::Rasterizer;
 use crate::gpu::scene::Scene;
 use std::sync::PoisonError;
 
@@ -24,7 +26,8 @@ impl Rasterizer {
     /// for the device but for the last frame's counts.
     ///
     /// The first frame is always whole. A later one that needs more room for (splat, tile)
-    /// pairs than any before lacks its farthest splats, and the next has the room.
+    /// pairs than any before lacks its farthest splats, and the next has the room. A frame of
+    /// more than a binding holds takes several submits, and waits.
     ///
     /// # Errors
     /// A target of another size than the camera's picture; as [`Rasterizer::render`].
@@ -35,7 +38,7 @@ impl Rasterizer {
         options: &RasterOptions,
         target: &wgpu::TextureView,
     ) -> Result<(), GpuError> {
-        let (size, format) = (target.texture().size(), target.texture().format());
+        let size = target.texture().size();
         let k = camera.intrinsics;
         if (size.width as usize, size.height as usize) != (k.width, k.height) {
             return Err(GpuError::Argument {
@@ -47,30 +50,27 @@ impl Rasterizer {
         }
         let gpu = self.gpu().clone();
         if let Some(plan) = self.pending.take() {
-            self.learn(&plan.take(&gpu)?)?;
+            self.learn(&plan.take(&gpu)?);
         }
-        let uniform = gpu.uniform(&ShowUniform {
-            width: size.width,
-            height: size.height,
-            srgb: u32::from(format.is_srgb()),
-            pad: 0,
-        })?;
+        let call = uniform(scene, camera, options, Channels::Interleaved);
         loop {
+            if self.needs_layers(scene, &call) {
+                let show = |commands: &mut Commands, call: &RasterUniform, picture: &Buffer| {
+                    gpu.show(commands, call, picture, target)
+                };
+                return self.layered(scene, &call, show).map(drop);
+            }
             let mut commands = gpu.commands("frame", false);
-            let frame =
-                self.record(&mut commands, scene, camera, options, Channels::Interleaved)?;
+            let frame = self.record(&mut commands, scene, &call)?;
             let plan = commands.read::<u32>(&frame.plan, PLAN_WORDS)?;
-            let bindings = [Binding::from(&uniform), Binding::from(&frame.picture)];
-            let pipeline = gpu.show_pipeline(format)?;
-            let (device, target) = (gpu.device.clone(), target.clone());
-            commands.draw(move |encoder| show(&device, encoder, &pipeline, &bindings, &target));
+            gpu.show(&mut commands, &call, &frame.picture, target)?;
             commands.submit()?;
             if self.seen {
                 self.pending = Some(plan);
                 return Ok(());
             }
             // Nothing is known of the scene yet.
-            self.seen = self.learn(&plan.take(&gpu)?)?;
+            self.seen = self.learn(&plan.take(&gpu)?);
             if self.seen {
                 return Ok(());
             }
@@ -83,7 +83,7 @@ fn show(
     encoder: &mut wgpu::CommandEncoder,
     pipeline: &wgpu::RenderPipeline,
     bindings: &[Binding],
-    target: &wgpu::TextureView,
+    (target, band): (&wgpu::TextureView, &ShowUniform),
 ) {
     let entries: Vec<_> = (0..)
         .zip(bindings)
@@ -94,25 +94,49 @@ fn show(
         layout: &pipeline.get_bind_group_layout(0),
         entries: &entries,
     });
+    let first = band.top == 0;
+    let load = if first { wgpu::LoadOp::Clear(wgpu::Color::BLACK) } else { wgpu::LoadOp::Load };
     let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
         label: Some(SHOW.name),
         color_attachments: &[Some(wgpu::RenderPassColorAttachment {
             view: target,
             depth_slice: None,
             resolve_target: None,
-            ops: wgpu::Operations {
-                load: wgpu::LoadOp::Clear(wgpu::Color::BLACK),
-                store: wgpu::StoreOp::Store,
-            },
+            ops: wgpu::Operations { load, store: wgpu::StoreOp::Store },
         })],
         ..wgpu::RenderPassDescriptor::default()
     });
     pass.set_pipeline(pipeline);
     pass.set_bind_group(0, &group, &[]);
+    pass.set_scissor_rect(0, band.top, band.width, band.height);
     pass.draw(0..3, 0..1);
 }
 
 impl Gpu {
+    /// Adds to `commands` what shows a call's band, drawn to `picture`, on `target`.
+    fn show(
+        &self,
+        commands: &mut Commands,
+        call: &RasterUniform,
+        picture: &Buffer,
+        target: &wgpu::TextureView,
+    ) -> Result<(), GpuError> {
+        let format = target.texture().format();
+        let band = ShowUniform {
+            width: call.width,
+            height: pixels(call) as u32 / call.width.max(1),
+            srgb: u32::from(format.is_srgb()),
+            top: call.top * TILE_GPU as u32,
+        };
+        let bindings = vec![Binding::from(&self.uniform(&band)?), Binding::from(picture)];
+        let pipeline = self.show_pipeline(format)?;
+        let (device, target) = (self.device.clone(), target.clone());
+        commands.draw(bindings, move |encoder, bindings| {
+            show(&device, encoder, &pipeline, bindings, (&target, &band));
+        });
+        Ok(())
+    }
+
     /// The render pipeline of [`SHOW`] for a texture format, built at its first use.
     fn show_pipeline(&self, format: wgpu::TextureFormat) -> Result<wgpu::RenderPipeline, GpuError> {
         let mut built = self.pipelines.shows.lock().unwrap_or_else(PoisonError::into_inner);

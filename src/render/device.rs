@@ -47,6 +47,12 @@ impl Renderer {
         Ok(Self { backend, ..Self::default() })
     }
 
+    /// The renderer of a GPU that is open already.
+    #[cfg(feature = "gpu")]
+    pub fn with_gpu(gpu: std::sync::Arc<gpu::Gpu>) -> Self {
+        Self { backend: Backend::Gpu(gpu::Rasterizer::new(gpu)), ..Self::default() }
+    }
+
     /// [`Renderer::open`], but the CPU's with a warning where that fails.
     pub fn open_or_cpu(device: &str) -> Self {
         Self::open(device).unwrap_or_else(|e| Self {

@@ -24,6 +24,24 @@ pub fn gpu() -> Option<Arc<Gpu>> {
     .clone()
 }
 
+/// The same adapter with a device of whose buffers at most `binding` bytes are bound.
+#[allow(dead_code, reason = "not every test binary uses every helper")]
+pub fn limited(binding: u64) -> Option<Arc<Gpu>> {
+    use subsplat::gpu::{find_for, instance, wgpu};
+    gpu()?;
+    let adapter = find_for(&instance(), &DeviceChoice::Gpu, None).unwrap().unwrap();
+    let descriptor = wgpu::DeviceDescriptor {
+        required_features: adapter.features() & wgpu::Features::TIMESTAMP_QUERY,
+        required_limits: wgpu::Limits {
+            max_storage_buffer_binding_size: binding,
+            ..wgpu::Limits::default()
+        },
+        ..wgpu::DeviceDescriptor::default()
+    };
+    let (device, queue) = pollster::block_on(adapter.request_device(&descriptor)).unwrap();
+    Some(Gpu::from_device(device, queue))
+}
+
 /// Not `eprintln!`, which cargo hides for tests that pass.
 fn tell(line: &str) {
     std::io::Write::write_all(&mut std::io::stderr(), line.as_bytes()).ok();

@@ -4,7 +4,7 @@ use anyhow::{Context, Result, anyhow, ensure};
 use std::sync::{Arc, Mutex, PoisonError};
 use subsplat::abi::RasterOptions;
 use subsplat::camera::Camera;
-use subsplat::gpu::{DeviceChoice, Gpu, Rasterizer, Scene, find_for, instance, wgpu};
+use subsplat::gpu::{DeviceChoice, Gpu, Rasterizer, Scene, find_for, instance, limits_of, wgpu};
 use subsplat::io::image::Rgb;
 use wgpu::CurrentSurfaceTexture as Current;
 use winit::window::Window;
@@ -17,8 +17,6 @@ const FORMATS: [wgpu::TextureFormat; 4] = [
     wgpu::TextureFormat::Bgra8UnormSrgb,
     wgpu::TextureFormat::Rgba8UnormSrgb,
 ];
-/// Most bytes of one buffer, where the adapter has more: indices are 32 bits of words.
-const BINDING_MAX: u64 = 1 << 30;
 /// Bytes to which rows of a texture are padded in a copy.
 const ROW: u32 = wgpu::COPY_BYTES_PER_ROW_ALIGNMENT;
 
@@ -82,18 +80,9 @@ fn configuration(
 
 /// A device of `adapter` that holds as much as it can, and where it puts its complaints.
 fn device_of(adapter: &wgpu::Adapter) -> Result<(Arc<Gpu>, Fault)> {
-    let own = adapter.limits();
-    let usual = wgpu::Limits::default();
-    let binding = own.max_storage_buffer_binding_size.min(BINDING_MAX);
-    let limits = wgpu::Limits {
-        max_storage_buffer_binding_size: binding.max(usual.max_storage_buffer_binding_size),
-        max_buffer_size: own.max_buffer_size.min(BINDING_MAX).max(usual.max_buffer_size),
-        max_texture_dimension_2d: own.max_texture_dimension_2d,
-        ..usual
-    };
     let descriptor = wgpu::DeviceDescriptor {
         label: Some("subsplat view"),
-        required_limits: limits,
+        required_limits: limits_of(adapter),
         ..wgpu::DeviceDescriptor::default()
     };
     let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))

@@ -1,0 +1,297 @@
+//! The parts of a frame as lists of calls: projection with the sort by depth, then a
+//! picture's (splat, tile) pairs and its pixels.
+
+use crate::abi::{
+    BlendRules, FOOTPRINT_LANES, GPU_BLOCK, PLAN_EACH, PLAN_WORDS, RasterOptions, RasterUniform,
+    ShBasis, ShDirection, TILE_GPU,
+};
+use crate::camera::Camera;
+use crate::gpu::buffers::{Binding, Buffer};
+use crate::gpu::commands::{Commands, Groups};
+use crate::gpu::device::Gpu;
+use crate::gpu::error::GpuError;
+use crate::gpu::raster_kernels::{
+    INTERSECT, PLAN, PROJECT, RANGES, RASTERIZE, SCAN_APPLY, SCAN_REDUCE, SCAN_WHOLE,
+};
+use crate::gpu::scene::Scene;
+use crate::gpu::sort::{Sort, plan_of};
+use crate::view::View;
+
+/// Threads of a workgroup that takes one splat a thread.
+pub(crate) const THREADS: usize = 64;
+
+/// How a picture's channels lie in memory.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Channels {
+    /// RGB pixel by pixel, then alpha, then depth sums.
+    Interleaved,
+    /// Five planes.
+    Planes,
+}
+
+/// What projection writes of a part of the scene.
+#[derive(Clone, Debug)]
+pub(crate) struct Store {
+    /// Splat of the scene that stands first.
+    pub(crate) first: usize,
+    /// `[n, 12]`.
+    pub(crate) footprints: Buffer,
+    /// `[n, 2]`: rectangles of tiles.
+    pub(crate) rectangles: Buffer,
+}
+
+impl Store {
+    pub(crate) fn new(gpu: &Gpu, first: usize, count: usize) -> Result<Self, GpuError> {
+        Ok(Self {
+            first,
+            footprints: gpu.empty::<f32>("footprints", FOOTPRINT_LANES * count)?,
+            rectangles: gpu.empty::<u32>("tile rectangles", 2 * count)?,
+        })
+    }
+}
+
+/// The order of a scene's splats, and how many tiles each meets.
+#[derive(Debug)]
+pub(crate) struct Depths {
+    /// `[N]`: splats by depth.
+    pub(crate) order: Buffer,
+    /// `[N]`: tiles that a splat meets.
+    pub(crate) counts: Buffer,
+}
+
+/// Where a frame's results lie on the device, and what its backward pass needs.
+#[derive(Debug)]
+pub(crate) struct FrameBuffers {
+    /// Of all splats.
+    pub(crate) call: RasterUniform,
+    /// `[5·H·W]`, see [`RasterUniform::step`].
+    pub(crate) picture: Buffer,
+    /// Of the pairs.
+    pub(crate) plan: Buffer,
+    /// `[N, 12]`.
+    pub(crate) footprints: Buffer,
+    pub(crate) depths: Depths,
+    /// Place of the first pair of every splat, in the splats' order by depth.
+    pub(crate) offsets: Buffer,
+    /// Splat of every pair, as they were made.
+    pub(crate) owners: Buffer,
+    /// Places of the pairs, by tile.
+    pub(crate) pairs: Buffer,
+    /// First and past-the-last of `pairs` of every tile, and of those behind the last.
+    pub(crate) ranges: Buffer,
+    /// `[H, W, 2]`: see kernels/rasterize.wgsl.
+    pub(crate) finals: Buffer,
+}
+
+pub(crate) fn bind<const N: usize>(buffers: [&Buffer; N]) -> [Binding; N] {
+    buffers.map(Binding::from)
+}
+
+/// Pixels of a call's band.
+pub(crate) fn pixels(call: &RasterUniform) -> usize {
+    let [top, rows] = [call.top, call.rows].map(|t| t as usize * TILE_GPU);
+    call.width as usize * rows.min((call.height as usize).saturating_sub(top))
+}
+
+/// Tiles of a call's band.
+pub(crate) fn tiles(call: &RasterUniform) -> usize {
+    call.columns as usize * call.rows as usize
+}
+
+/// Projects `scene` into `stores`, one for each of its parts, and sorts it by depth.
+pub(crate) fn project(
+    gpu: &Gpu,
+    commands: &mut Commands,
+    scene: &Scene,
+    mut call: RasterUniform,
+    stores: &[Store],
+) -> Result<Depths, GpuError> {
+    let n = scene.len;
+    let counts = gpu.empty::<u32>("tile counts", n)?;
+    let plan = gpu.upload("plan", &plan_of(n))?;
+    let mut depth = Sort::new(gpu, plan, Groups::of(n, GPU_BLOCK), n, true)?;
+    commands.stage("project");
+    for (part, store) in scene.parts.iter().zip(stores) {
+        (call.first, call.count) = (part.first as u32, part.count as u32);
+        call.own = (part.first - store.first) as u32;
+        let own = gpu.uniform(&call)?;
+        let bindings = bind([
+            &own,
+            &part.rows,
+            &part.sh,
+            &part.gain,
+            &store.footprints,
+            &store.rectangles,
+            &depth.keys[0],
+            &counts,
+        ]);
+        commands.run(&PROJECT, &[], &bindings, Groups::of(part.count, THREADS))?;
+    }
+    commands.stage("sort by depth");
+    depth.record(commands, u32::BITS)?;
+    let [order, _] = depth.values;
+    Ok(Depths { order, counts })
+}
+
+/// Where pairs begin: per splat by depth, and `sums`, behind whose blocks stands how many
+/// pairs there are.
+pub(crate) struct Offsets {
+    /// A plan of the splats.
+    splats: Buffer,
+    sums: Buffer,
+    /// `[N]`.
+    pub(crate) offsets: Buffer,
+}
+
+impl Offsets {
+    /// Sums up the counts of `n` splats in their order by depth.
+    pub(crate) fn record(
+        gpu: &Gpu,
+        commands: &mut Commands,
+        depths: &Depths,
+        n: usize,
+    ) -> Result<Self, GpuError> {
+        commands.stage("prefix sum");
+        let (blocks, Depths { order, counts }) = (Groups::of(n, GPU_BLOCK), depths);
+        let splats = gpu.upload("plan", &plan_of(n))?;
+        let sums = gpu.empty::<u32>("sums", n.div_ceil(GPU_BLOCK) + 1)?;
+        let offsets = gpu.empty::<u32>("offsets", n)?;
+        let bindings = bind([&splats, order, counts, &sums]);
+        commands.run(&SCAN_REDUCE, &[], &bindings, blocks.clone())?;
+        let bindings = bind([&splats, &sums]);
+        commands.run(&SCAN_WHOLE, &[], &bindings, Groups::Of([1; 3]))?;
+        let bindings = bind([&splats, order, counts, &sums, &offsets]);
+        commands.run(&SCAN_APPLY, &[], &bindings, blocks)?;
+        Ok(Self { splats, sums, offsets })
+    }
+
+    /// The pairs' own plan, within the call's room for them.
+    pub(crate) fn plan(
+        &self,
+        gpu: &Gpu,
+        commands: &mut Commands,
+        whole: &Buffer,
+    ) -> Result<Buffer, GpuError> {
+        let plan = gpu.empty::<u32>("plan", PLAN_WORDS)?;
+        let bindings = bind([whole, &self.splats, &self.sums, &plan]);
+        commands.run(&PLAN, &[], &bindings, Groups::Of([1; 3]))?;
+        Ok(plan)
+    }
+}
+
+/// Lists the pairs of a call's splats, which `store` holds, and draws them to `picture`.
+pub(crate) fn composite(
+    gpu: &Gpu,
+    commands: &mut Commands,
+    call: RasterUniform,
+    (store, depths): (Store, Depths),
+    picture: &Buffer,
+) -> Result<FrameBuffers, GpuError> {
+    let (n, capacity) = (call.count as usize, call.capacity as usize);
+    let whole = gpu.uniform(&call)?;
+    let offsets = Offsets::record(gpu, commands, &depths, n)?;
+    let plan = offsets.plan(gpu, commands, &whole)?;
+    let Offsets { offsets, .. } = offsets;
+
+    commands.stage("intersect");
+    let groups = Groups::Indirect(plan.clone(), 0);
+    let owners = gpu.empty::<u32>("owners of pairs", capacity)?;
+    let mut pairs = Sort::new(gpu, plan.clone(), groups, capacity, true)?;
+    let bindings = bind([
+        &whole,
+        &store.footprints,
+        &store.rectangles,
+        &depths.order,
+        &depths.counts,
+        &offsets,
+        &pairs.keys[0],
+        &owners,
+    ]);
+    commands.run(&INTERSECT, &[], &bindings, Groups::of(n, THREADS))?;
+
+    commands.stage("sort by tile");
+    // The tile behind the last is one too.
+    let tiles = tiles(&call);
+    pairs.record(commands, u32::BITS - (tiles as u32).leading_zeros())?;
+
+    commands.stage("ranges");
+    let ranges = gpu.empty::<u32>("tile ranges", 2 * (tiles + 1))?;
+    commands.clear(&ranges);
+    let bindings = bind([&whole, &plan, &pairs.keys[0], &ranges]);
+    let each = Groups::Indirect(plan.clone(), 4 * PLAN_EACH as u64);
+    commands.run(&RANGES, &[], &bindings, each)?;
+
+    commands.stage("rasterize");
+    let finals = gpu.empty::<u32>("ends of pixels", 2 * pixels(&call))?;
+    let [pairs, _] = pairs.values;
+    let footprints = store.footprints;
+    let bindings = bind([&whole, &footprints, &ranges, &pairs, &owners, picture, &finals]);
+    commands.run(&RASTERIZE, &[], &bindings, Groups::of(tiles, 1))?;
+    let picture = picture.clone();
+    Ok(FrameBuffers {
+        call,
+        picture,
+        plan,
+        footprints,
+        depths,
+        offsets,
+        owners,
+        pairs,
+        ranges,
+        finals,
+    })
+}
+
+/// The uniform of a call for all splats and the whole picture; capacity left out.
+pub(crate) fn uniform(
+    scene: &Scene,
+    camera: &Camera,
+    options: &RasterOptions,
+    channels: Channels,
+) -> RasterUniform {
+    let view = View::new(camera, options);
+    let rules = BlendRules::new(options.convention);
+    let row = |i: usize| {
+        let [x, y, z] = view.rows[i];
+        [x, y, z, view.eye[i]]
+    };
+    let [(x_low, x_high), (y_low, y_high)] = view.limit;
+    let [r, g, b] = options.background;
+    let [width, height] = view.size.map(|s| s as u32);
+    let (step, channel) = match channels {
+        Channels::Interleaved => (3, 1),
+        Channels::Planes => (1, width * height),
+    };
+    let flag = u32::from;
+    RasterUniform {
+        right: row(0),
+        down: row(1),
+        ahead: row(2),
+        focal_centre: [view.focal[0], view.focal[1], view.centre[0], view.centre[1]],
+        limits: [x_low, x_high, y_low, y_high],
+        background: [r, g, b, 0.0],
+        near: view.near,
+        z_epsilon: view.z_epsilon,
+        lowpass: view.lowpass,
+        alpha_max: rules.alpha_max,
+        stop: rules.stop,
+        antialiased: flag(view.antialiased),
+        tile_cut: flag(view.tile_cut),
+        width,
+        height,
+        columns: width.div_ceil(TILE_GPU as u32),
+        rows: height.div_ceil(TILE_GPU as u32),
+        count: scene.len as u32,
+        places: scene.len as u32,
+        children: scene.children as u32,
+        stride: scene.stride as u32,
+        sh_stride: scene.sh_stride() as u32,
+        sh_degree: options.sh_degree.min(scene.sh_degree) as u32,
+        sh_mvsplat: flag(options.sh_basis == ShBasis::Mvsplat),
+        sh_shared: flag(options.sh_direction == ShDirection::Parent),
+        gain_lanes: scene.gain_lanes as u32,
+        step,
+        channel,
+        ..RasterUniform::default()
+    }
+}
