@@ -30,37 +30,32 @@ fn main(
         return;
     }
     let own = call.own + i - call.first;
-    let to = PAIR_SUMS * own;
-    let count = counts[i];
-    var v_low = vec3<f32>(0.0);
-    var v_high = vec3<f32>(0.0);
-    var rgb = vec3<f32>(0.0);
-    var z = 0.0;
+    var m = Moments(0.0, vec2<f32>(0.0), vec3<f32>(0.0), vec3<f32>(0.0), 0.0);
     if call.resumes != 0u {
-        v_low = vec3<f32>(sums[to], sums[to + 1u], sums[to + 2u]);
-        v_high = vec3<f32>(sums[to + 3u], sums[to + 4u], sums[to + 5u]);
-        rgb = vec3<f32>(sums[to + 6u], sums[to + 7u], sums[to + 8u]);
-        z = sums[to + 9u];
+        m = moments(own);
     }
+    let count = counts[i];
     var at = PAIR_SUMS * offsets[place];
     for (var k = 0u; k < count; k++) {
-        v_low += vec3<f32>(pairs[at], pairs[at + 1u], pairs[at + 2u]);
-        v_high += vec3<f32>(pairs[at + 3u], pairs[at + 4u], pairs[at + 5u]);
-        rgb += vec3<f32>(pairs[at + 6u], pairs[at + 7u], pairs[at + 8u]);
-        z += pairs[at + 9u];
+        m.one += pairs[at];
+        m.first += vec2<f32>(pairs[at + 1u], pairs[at + 2u]);
+        m.second += vec3<f32>(pairs[at + 3u], pairs[at + 4u], pairs[at + 5u]);
+        m.rgb += vec3<f32>(pairs[at + 6u], pairs[at + 7u], pairs[at + 8u]);
+        m.z += pairs[at + 9u];
         at += PAIR_SUMS;
     }
     if count > 0u {
-        rgb = select(vec3<f32>(0.0), rgb, footprints[3u * own + 2u].xyz > vec3<f32>(0.0));
+        m.rgb = select(vec3<f32>(0.0), m.rgb, footprints[3u * own + 2u].xyz > vec3<f32>(0.0));
     }
-    sums[to] = v_low.x;
-    sums[to + 1u] = v_low.y;
-    sums[to + 2u] = v_low.z;
-    sums[to + 3u] = v_high.x;
-    sums[to + 4u] = v_high.y;
-    sums[to + 5u] = v_high.z;
-    sums[to + 6u] = rgb.x;
-    sums[to + 7u] = rgb.y;
-    sums[to + 8u] = rgb.z;
-    sums[to + 9u] = z;
+    let to = PAIR_SUMS * own;
+    sums[to] = m.one;
+    sums[to + 1u] = m.first.x;
+    sums[to + 2u] = m.first.y;
+    sums[to + 3u] = m.second.x;
+    sums[to + 4u] = m.second.y;
+    sums[to + 5u] = m.second.z;
+    sums[to + 6u] = m.rgb.x;
+    sums[to + 7u] = m.rgb.y;
+    sums[to + 8u] = m.rgb.z;
+    sums[to + 9u] = m.z;
 }

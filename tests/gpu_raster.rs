@@ -17,9 +17,9 @@ mod raster_scene;
 
 use adapter::gpu;
 use common::shared;
-use raster_case::{File, degree_of, rows};
+use raster_case::File;
 use raster_scene::{KINDS, Kind, Random, Scene};
-use subsplat::abi::{Convention, RasterOptions, Rendered, ShBasis, ShDirection};
+use subsplat::abi::{Convention, RasterOptions, Rendered};
 use subsplat::cpu::{self, Geometry, SplatSlices};
 use subsplat::gpu::{GpuError, Rasterizer};
 
@@ -63,23 +63,8 @@ fn check_case(name: &str) {
     let file = File::read(&path);
     let (camera, options) = (file.camera(), file.options());
     let mvsplat = options.convention == Convention::Mvsplat;
-    let packed;
-    let geometry = if mvsplat {
-        Geometry::Cov6 {
-            means: file.get("means"),
-            cov6: file.get("cov6"),
-            opacities: file.get("opacities"),
-        }
-    } else {
-        let f = |name| file.get(name);
-        packed = rows(f("means"), f("quats"), f("scales"), f("opacities"));
-        Geometry::Packed(&packed)
-    };
-    let gain = file.tensors.get("gain").map_or(&[][..], |t| &t.1);
-    let sh_degree = degree_of(file.tensors["sh"].0[1]);
-    let splats = SplatSlices { geometry, sh: file.get("sh"), gain, sh_degree };
     let mut rasterizer = Rasterizer::new(gpu);
-    let got = rasterizer.render(&splats, &camera, &options).unwrap();
+    let got = file.with_splats(|splats| rasterizer.render(splats, &camera, &options)).unwrap();
     let expected = Rendered {
         rgb: file.get("rgb").to_vec(),
         alpha: file.get("alpha").to_vec(),
@@ -127,20 +112,8 @@ fn random_scenes_are_those_of_the_cpu() {
     let mut rasterizer = Rasterizer::new(gpu);
     let mut worst_seen = [0.0f32; 2];
     for (seed, kind) in (1u64..).zip(KINDS) {
-        for variant in 0..6u64 {
-            let (degree, lanes) = ((variant as usize) % 5, [0, 1, 4][variant as usize % 3]);
-            let scene = Scene::new(kind, 10 * seed + variant, 12, degree, lanes);
-            let scene = if variant == 4 { scene.with_covariances() } else { scene };
-            let convention =
-                if variant % 2 == 1 { Convention::Mvsplat } else { Convention::Standard };
-            let options = RasterOptions {
-                antialiased: variant == 2,
-                sh_direction: [ShDirection::Child, ShDirection::Parent][variant as usize / 3],
-                sh_basis: [ShBasis::Standard, ShBasis::Mvsplat][variant as usize % 2],
-                near: if convention == Convention::Mvsplat { 1.0 } else { 0.2 },
-                background: [0.2, -0.1, 0.7],
-                ..RasterOptions::new(convention)
-            };
+        for variant in 0..6 {
+            let (scene, options) = Scene::variant(kind, seed, variant);
             let boundary = oracle::render(&scene.for_oracle(), &scene.camera, &options).boundary;
             let found = scene.with_slices(|splats| {
                 let got = rasterizer.render(&splats, &scene.camera, &options).unwrap();
@@ -322,23 +295,52 @@ fn draw_to_texture(binding: u64) {
     assert!(matches!(error, Some(GpuError::Argument { .. })), "{error:?}");
 }
 
-/// A device that goes away gives one clear error, and no panic.
+/// A device that goes away gives one clear error, and no panic: to who reads pictures, to
+/// who draws to a texture, to who uploads, and on the way back of a frame that it drew.
 #[test]
 fn a_lost_device_is_an_error() {
-    use subsplat::gpu::{DeviceChoice, Gpu};
+    use subsplat::gpu::{DeviceChoice, Gpu, wgpu};
     if gpu().is_none() {
         return;
     }
     let own = Gpu::open(&DeviceChoice::Gpu).unwrap().unwrap();
     let scene = Scene::new(Kind::Plain, 9, 30, 2, 4);
     let mut rasterizer = Rasterizer::new(own.clone());
-    let options = RasterOptions::default();
-    let mut render = || scene.with_slices(|s| rasterizer.render(&s, &scene.camera, &options));
-    assert!(render().is_ok());
+    let (camera, options) = (scene.camera, RasterOptions::default());
+    let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
+    let target = own.device().create_texture(&wgpu::TextureDescriptor {
+        label: None,
+        size: wgpu::Extent3d {
+            width: width as u32,
+            height: height as u32,
+            depth_or_array_layers: 1,
+        },
+        mip_level_count: 1,
+        sample_count: 1,
+        dimension: wgpu::TextureDimension::D2,
+        format: wgpu::TextureFormat::Rgba8Unorm,
+        usage: wgpu::TextureUsages::RENDER_ATTACHMENT,
+        view_formats: &[],
+    });
+    let target = target.create_view(&wgpu::TextureViewDescriptor::default());
+    let uploaded = scene.with_slices(|s| own.upload_splats(&s)).unwrap();
+    rasterizer.draw(&uploaded, &camera, &options, &target).unwrap();
+    let frame = scene.with_slices(|s| rasterizer.frame(&s, &camera, &options));
+    let (_, mut frame) = frame.unwrap();
+    // A frame's counts are on their way.
+    rasterizer.draw(&uploaded, &camera, &options, &target).unwrap();
     own.device().destroy();
-    own.device().poll(subsplat::gpu::wgpu::PollType::Poll).ok();
+    own.device().poll(wgpu::PollType::Poll).ok();
     for _ in 0..2 {
-        let error = render().err();
-        assert!(matches!(error, Some(GpuError::Lost { .. })), "{error:?}");
+        let errors = [
+            ("draw", rasterizer.draw(&uploaded, &camera, &options, &target).err()),
+            ("backward", frame.backward(&vec![0.0; 5 * width * height]).err()),
+            ("render", rasterizer.render_scene(&uploaded, &camera, &options).err()),
+            ("upload", scene.with_slices(|s| own.upload_splats(&s)).err()),
+            ("check", own.check().err()),
+        ];
+        for (what, error) in errors {
+            assert!(matches!(error, Some(GpuError::Lost { .. })), "{what}: {error:?}");
+        }
     }
 }

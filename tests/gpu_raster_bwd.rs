@@ -19,10 +19,10 @@ mod raster_scene;
 
 use adapter::gpu;
 use common::shared;
-use raster_case::{File, degree_of, rows};
+use raster_case::File;
 use raster_gradients::{check, named, planes, worst_row};
 use raster_scene::{KINDS, Kind, Random, Scene};
-use subsplat::abi::{Convention, Gradients, RasterOptions, ShBasis, ShDirection};
+use subsplat::abi::{Gradients, RasterOptions, ShDirection};
 use subsplat::cpu::{Geometry, SplatSlices};
 use subsplat::gpu::{GpuError, Rasterizer};
 
@@ -37,20 +37,12 @@ fn check_case(name: &str) {
     let Some(path) = shared(&format!("fixtures/raster/{name}.safetensors")) else { return };
     let file = File::read(&path);
     let (camera, options) = (file.camera(), file.options());
-    let f = |name| file.get(name);
-    let packed;
-    let geometry = if options.convention == Convention::Mvsplat {
-        Geometry::Cov6 { means: f("means"), cov6: f("cov6"), opacities: f("opacities") }
-    } else {
-        packed = rows(f("means"), f("quats"), f("scales"), f("opacities"));
-        Geometry::Packed(&packed)
-    };
-    let gain = file.tensors.get("gain").map_or(&[][..], |t| &t.1);
-    let sh_degree = degree_of(file.tensors["sh"].0[1]);
-    let splats = SplatSlices { geometry, sh: f("sh"), gain, sh_degree };
-    let upstream = planes(f("v_rgb"), f("v_alpha"));
-    let got = Rasterizer::new(gpu).backward(&splats, &camera, &options, &upstream).unwrap();
-    check(name, &file, &got, splats.parents());
+    let upstream = planes(file.get("v_rgb"), file.get("v_alpha"));
+    file.with_splats(|splats| {
+        let mut rasterizer = Rasterizer::new(gpu);
+        let got = rasterizer.backward(splats, &camera, &options, &upstream).unwrap();
+        check(name, &file, &got, splats.parents());
+    });
 }
 
 macro_rules! cases {
@@ -98,21 +90,9 @@ fn random_scenes_are_those_of_the_cpu() {
     let Some(gpu) = gpu() else { return };
     let mut rasterizer = Rasterizer::new(gpu);
     for (seed, kind) in (1u64..).zip(KINDS) {
-        for variant in 0..6u64 {
-            let (degree, lanes) = ((variant as usize) % 5, [0, 1, 4][variant as usize % 3]);
-            let scene = Scene::new(kind, 10 * seed + variant, 12, degree, lanes);
-            let scene = if variant == 4 { scene.with_covariances() } else { scene };
-            let convention =
-                if variant % 2 == 1 { Convention::Mvsplat } else { Convention::Standard };
-            let options = RasterOptions {
-                antialiased: variant == 2,
-                sh_direction: [ShDirection::Child, ShDirection::Parent][variant as usize / 3],
-                sh_basis: [ShBasis::Standard, ShBasis::Mvsplat][variant as usize % 2],
-                near: if convention == Convention::Mvsplat { 1.0 } else { 0.2 },
-                background: [0.2, -0.1, 0.7],
-                ..RasterOptions::new(convention)
-            };
-            let v = scene.upstream(&options, 100 * seed + variant);
+        for variant in 0..6 {
+            let (scene, options) = Scene::variant(kind, seed, variant);
+            let v = scene.upstream(&options, 100 * seed + variant as u64);
             let expected = scene.gradients(&options, &v);
             let got = scene
                 .with_slices(|s| rasterizer.backward(&s, &scene.camera, &options, &v))

@@ -8,7 +8,7 @@ mod raster_case;
 
 use common::shared;
 use glam::{Mat4, Vec3};
-use raster_case::{File, degree_of, rows};
+use raster_case::{File, rows};
 use std::path::Path;
 use subsplat::abi::{Convention, RasterOptions, ShBasis};
 use subsplat::camera::{Camera, Intrinsics};
@@ -45,24 +45,11 @@ fn check_case_in(name: &str, tier: Tier) {
     let (camera, options) = (file.camera(), file.options());
     let mvsplat = options.convention == Convention::Mvsplat;
     let n = file.get("opacities").len();
-    let packed;
-    let geometry = if mvsplat {
-        Geometry::Cov6 {
-            means: file.get("means"),
-            cov6: file.get("cov6"),
-            opacities: file.get("opacities"),
-        }
-    } else {
-        let f = |name| file.get(name);
-        packed = rows(f("means"), f("quats"), f("scales"), f("opacities"));
-        Geometry::Packed(&packed)
-    };
-    let gain = file.tensors.get("gain").map_or(&[][..], |t| &t.1);
-    let sh_degree = degree_of(file.tensors["sh"].0[1]);
-    let splats = SplatSlices { geometry, sh: file.get("sh"), gain, sh_degree };
-    assert_eq!(splats.children_per_parent(), file.meta::<usize>("children"));
     let mut rasterizer = Rasterizer::new().with_tier(tier);
-    let got = rasterizer.render(&splats, &camera, &options);
+    let got = file.with_splats(|splats| {
+        assert_eq!(splats.children_per_parent(), file.meta::<usize>("children"));
+        rasterizer.render(splats, &camera, &options)
+    });
 
     let boundary = file.get("boundary");
     let share = boundary.iter().sum::<f32>() / boundary.len() as f32;

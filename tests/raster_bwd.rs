@@ -9,7 +9,7 @@ mod raster_gradients;
 
 use common::shared;
 use glam::{DVec3, Mat4, Vec3};
-use raster_case::{File, degree_of, rows};
+use raster_case::{File, rows};
 use raster_gradients::{check, part, planes, worst_row};
 use subsplat::abi::{Convention, RasterOptions, SPLAT_LANES};
 use subsplat::camera::{Camera, Intrinsics};
@@ -19,23 +19,12 @@ fn check_case(name: &str) {
     let Some(path) = shared(&format!("fixtures/raster/{name}.safetensors")) else { return };
     let file = File::read(&path);
     let (camera, options) = (file.camera(), file.options());
-    let cov = options.convention == Convention::Mvsplat;
-    let f = |name| file.get(name);
-    let packed;
-    let geometry = if cov {
-        Geometry::Cov6 { means: f("means"), cov6: f("cov6"), opacities: f("opacities") }
-    } else {
-        packed = rows(f("means"), f("quats"), f("scales"), f("opacities"));
-        Geometry::Packed(&packed)
-    };
-    let gain = file.tensors.get("gain").map_or(&[][..], |t| &t.1);
-    let sh_degree = degree_of(file.tensors["sh"].0[1]);
-    let splats = SplatSlices { geometry, sh: f("sh"), gain, sh_degree };
-    let upstream = planes(f("v_rgb"), f("v_alpha"));
-    let mut got = Gradients::default();
-    Rasterizer::new().backward(&splats, &camera, &options, &upstream, &mut got);
-
-    check(name, &file, &got, splats.parents());
+    let upstream = planes(file.get("v_rgb"), file.get("v_alpha"));
+    file.with_splats(|splats| {
+        let mut got = Gradients::default();
+        Rasterizer::new().backward(splats, &camera, &options, &upstream, &mut got);
+        check(name, &file, &got, splats.parents());
+    });
 }
 
 macro_rules! cases {

@@ -169,13 +169,36 @@ pub struct RunArgs {
     /// Folder for everything that is written.
     #[arg(short, long, default_value = "out", value_name = "DIR")]
     pub out: PathBuf,
-    /// Context frames: indices into the scene's frames, or file names.
-    #[arg(long, value_delimiter = ',', value_name = "I,J")]
-    pub context: Vec<String>,
+    /// How photographs become a scene.
+    #[command(flatten)]
+    pub source: SourceArgs,
     /// Frames to render and to score against their photographs (default: protocol.json's,
     /// else those between the contexts, else a path).
     #[arg(long, value_delimiter = ',', value_name = "I,J,…")]
     pub target: Vec<String>,
+    /// Rendered frames.
+    #[arg(long, value_enum, default_value = "targets")]
+    pub path: PathArg,
+    /// Number of views of `--path interpolate` and `orbit`.
+    #[arg(long, default_value_t = 30, value_name = "N")]
+    pub frames: usize,
+    /// Formats of the scene, written as scene.ply and so on.
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "ply", value_name = "F,…")]
+    pub save: Vec<SceneFormatArg>,
+    /// Leave Gaussians of less opacity out of the scene files.
+    #[arg(long, default_value_t = 0.0, value_name = "ALPHA")]
+    pub min_opacity: f32,
+    /// How it is rendered.
+    #[command(flatten)]
+    pub look: LookArgs,
+}
+
+/// How photographs become a scene: of `run` and `view`.
+#[derive(Clone, Debug, Args)]
+pub struct SourceArgs {
+    /// Context frames: indices into the scene's frames, or file names.
+    #[arg(long, value_delimiter = ',', value_name = "I,J")]
+    pub context: Vec<String>,
     /// Side of the network's input, px: N, or WxH.
     #[arg(long, default_value = "256", value_name = "N | WxH")]
     pub input_size: String,
@@ -189,24 +212,13 @@ pub struct RunArgs {
     /// Untrained weights, drawn from this seed.
     #[arg(long, value_name = "N", conflicts_with = "weights")]
     pub seed: Option<u64>,
-    /// Rendered frames.
-    #[arg(long, value_enum, default_value = "targets")]
-    pub path: PathArg,
-    /// Number of views of `--path interpolate` and `orbit`.
-    #[arg(long, default_value_t = 30, value_name = "N")]
-    pub frames: usize,
-    /// Formats of the scene, written as scene.ply and so on.
-    #[arg(long, value_enum, value_delimiter = ',', default_value = "ply", value_name = "F,…")]
-    pub save: Vec<SceneFormatArg>,
-    /// Leave Gaussians of less opacity out of the scene files.
-    #[arg(long, default_value_t = 0.0, value_name = "ALPHA")]
-    pub min_opacity: f32,
     /// Nearest depth candidate, world units (default: the pose file's, RealEstate10K's 1,
-    /// or from sparse points, matched points or the baseline).
-    #[arg(long)]
+    /// or from sparse points, matched points or the baseline). To `view` a finished scene:
+    /// the near plane.
+    #[arg(long, allow_negative_numbers = true)]
     pub near: Option<f32>,
     /// Farthest depth candidate, world units (default: likewise; RealEstate10K's 100).
-    #[arg(long)]
+    #[arg(long, allow_negative_numbers = true)]
     pub far: Option<f32>,
     /// Do not match points between the context photographs to check their poses first.
     #[arg(long)]
@@ -217,9 +229,6 @@ pub struct RunArgs {
     /// What the model is.
     #[command(flatten)]
     pub model: ModelArgs,
-    /// How it is rendered.
-    #[command(flatten)]
-    pub look: LookArgs,
     /// Cameras of two loose photographs.
     #[command(flatten)]
     pub pair: PairArgs,
@@ -338,7 +347,7 @@ pub struct RenderArgs {
     pub look: LookArgs,
     /// Near plane of the `mvsplat` convention, whose 0.2-fold is the nearest depth
     /// drawn; nearest depth itself under `standard`.
-    #[arg(long)]
+    #[arg(long, allow_negative_numbers = true)]
     pub near: Option<f32>,
 }
 

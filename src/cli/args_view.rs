@@ -1,6 +1,6 @@
 //! Arguments of `view`, and its keys.
 
-use super::args::{ConventionArg, DetailArg, LookArgs, ModelArgs, PairArgs, triple};
+use super::args::{ConventionArg, DetailArg, LookArgs, SourceArgs, triple};
 use clap::Args;
 use std::path::PathBuf;
 
@@ -46,35 +46,9 @@ pub struct ViewArgs {
     /// window begins. Default: cameras.json beside the scene, else a view of the whole.
     #[arg(long, value_name = "SCENE")]
     pub cameras: Option<PathBuf>,
-    /// Context frames: indices into the scene's frames, or file names.
-    #[arg(long, value_delimiter = ',', value_name = "I,J")]
-    pub context: Vec<String>,
-    /// Side of the network's input, px: N, or WxH.
-    #[arg(long, default_value = "256", value_name = "N | WxH")]
-    pub input_size: String,
-    /// Children a side of a pixel at first: 2 gives 4 per pixel, 4 gives 16. Default: the
-    /// weights' own, else 2.
-    #[arg(long, value_name = "R")]
-    pub upscale: Option<usize>,
-    /// Weights (.safetensors). Default: those that ship with the program.
-    #[arg(long, value_name = "FILE")]
-    pub weights: Option<PathBuf>,
-    /// Untrained weights, drawn from this seed.
-    #[arg(long, value_name = "N", conflicts_with = "weights")]
-    pub seed: Option<u64>,
-    /// Nearest depth candidate, world units (default: as for `run`). For a finished scene
-    /// the near plane, as for `render`.
-    #[arg(long)]
-    pub near: Option<f32>,
-    /// Farthest depth candidate, world units (default: as for `run`).
-    #[arg(long)]
-    pub far: Option<f32>,
-    /// Do not match points between the context photographs to check their poses first.
-    #[arg(long)]
-    pub no_check: bool,
-    /// Detail from photographs that are larger than the network's input.
-    #[arg(long, value_enum, default_value = "photo")]
-    pub detail: DetailArg,
+    /// How photographs become a scene.
+    #[command(flatten)]
+    pub source: SourceArgs,
     /// Rasterizer rules. Default: the model's own; for scene files what `run` noted in
     /// them (.ply, .glb), else `standard`.
     #[arg(long, value_enum)]
@@ -83,12 +57,6 @@ pub struct ViewArgs {
     /// colour, or black); for scene files what `run` noted in them, else black.
     #[arg(long, value_parser = triple, value_name = "R,G,B")]
     pub background: Option<[f32; 3]>,
-    /// What the model is.
-    #[command(flatten)]
-    pub model: ModelArgs,
-    /// Cameras of two loose photographs.
-    #[command(flatten)]
-    pub pair: PairArgs,
 }
 
 impl ViewArgs {
@@ -104,16 +72,17 @@ impl ViewArgs {
 
     /// A flag that only photographs have a use for and that was given.
     pub fn for_photographs(&self) -> Option<&'static str> {
+        let source = &self.source;
         let flags = [
-            (!self.context.is_empty(), "--context"),
-            (self.upscale.is_some(), "--upscale"),
-            (self.weights.is_some(), "--weights"),
-            (self.seed.is_some(), "--seed"),
-            (self.far.is_some(), "--far"),
-            (self.detail != DetailArg::Photo, "--detail"),
-            (self.model.backbone.is_some(), "--backbone"),
-            (self.model.preset.is_some(), "--preset"),
-            (self.model.config.is_some(), "--config"),
+            (!source.context.is_empty(), "--context"),
+            (source.upscale.is_some(), "--upscale"),
+            (source.weights.is_some(), "--weights"),
+            (source.seed.is_some(), "--seed"),
+            (source.far.is_some(), "--far"),
+            (source.detail != DetailArg::Photo, "--detail"),
+            (source.model.backbone.is_some(), "--backbone"),
+            (source.model.preset.is_some(), "--preset"),
+            (source.model.config.is_some(), "--config"),
         ];
         flags.into_iter().find(|f| f.0).map(|f| f.1)
     }

@@ -1,6 +1,6 @@
 //! Which model the arguments, and the weight file, ask for.
 
-use super::args::{BackboneArg, ModelArgs};
+use super::args::{BackboneArg, ModelArgs, SourceArgs};
 use super::report::{say, warn};
 use anyhow::{Context, Result, bail, ensure};
 use std::path::Path;
@@ -24,6 +24,19 @@ pub struct Asked<'a> {
     pub ratio: Option<usize>,
     /// `--backbone`, `--preset`, `--config`.
     pub model: &'a ModelArgs,
+}
+
+impl<'a> Asked<'a> {
+    /// What `run` and `view` are told.
+    pub fn of(source: &'a SourceArgs) -> Self {
+        Self {
+            weights: source.weights.as_deref(),
+            seed: source.seed,
+            upscale: source.upscale,
+            ratio: None,
+            model: &source.model,
+        }
+    }
 }
 
 /// The model that the arguments ask for.

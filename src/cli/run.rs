@@ -34,25 +34,20 @@ struct Plan {
 pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
     let plan = plan(args, &mut progress)?;
-    let given = (args.near, args.far);
+    let given = (args.source.near, args.source.far);
     // Refuses early what was given; its guesses may give way to matched points below.
     let guess = depth_range(&plan.scene, &plan.context, given)?;
-    let asked = model::Asked {
-        weights: args.weights.as_deref(),
-        seed: args.seed,
-        upscale: args.upscale,
-        ratio: None,
-        model: &args.model,
-    };
     let backend = backend(&args.look.device);
-    let model = progress.stage("model", |_| model::load(&asked))?.with_backend(&backend);
+    let model = progress
+        .stage("model", |_| model::load(&model::Asked::of(&args.source)))?
+        .with_backend(&backend);
     let (w, h) = plan.input_size;
     check_size(&model, plan.context.len(), (w, h))?;
     let r = model.config().upscale;
     let targets = targets(args, &plan, (w * r, h * r))?;
     output::prepare(&args.out, &plan.scene)?;
     let photos = photographs(&plan.scene, &plan.context, &mut progress)?;
-    let reports = match args.no_check {
+    let reports = match args.source.no_check {
         true => Vec::new(),
         false => progress.stage("check", |_| pipeline::check_photos(&photos))?,
     };
@@ -60,7 +55,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let request = Request {
         input_size: plan.input_size,
         near_far: (range.near, range.far),
-        detail: args.detail == DetailArg::Photo,
+        detail: args.source.detail == DetailArg::Photo,
     };
     let mut result = progress.stage("network", |bar: &ProgressBar| {
         model.reconstruct_with(&photos, &request, &mut |name| bar.set_message(name))
@@ -109,7 +104,7 @@ fn backend(device: &str) -> Backend {
 
 /// Everything that can be wrong with the arguments and the scene is found here.
 fn plan(args: &RunArgs, progress: &mut Progress) -> Result<Plan> {
-    let input_size = frames::size(&args.input_size)?;
+    let input_size = frames::size(&args.source.input_size)?;
     render::background(&args.look)?;
     frames::count(args.frames)?;
     ensure!(
@@ -117,9 +112,9 @@ fn plan(args: &RunArgs, progress: &mut Progress) -> Result<Plan> {
         "--min-opacity: expected 0 to 1, got {}",
         args.min_opacity
     );
-    let scene = progress.stage("scene", |_| pair::load(&args.input, &args.pair))?;
+    let scene = progress.stage("scene", |_| pair::load(&args.input, &args.source.pair))?;
     scene.warnings.iter().for_each(warn);
-    let (context, why) = context(&args.context, &args.input[0], &scene)?;
+    let (context, why) = context(&args.source.context, &args.input[0], &scene)?;
     ensure!(
         args.path == PathArg::Targets || args.target.is_empty(),
         "--target: only with --path targets"
@@ -314,8 +309,8 @@ impl Done {
             "backbone": if pipeline::is_mvsplat(config) { "re10k" } else { "small" },
             "upscale": config.upscale,
             "convention": if mvsplat_rules { "mvsplat" } else { "standard" },
-            "weights": args.weights.as_ref().map(|p| p.display().to_string()),
-            "seed": args.seed,
+            "weights": args.source.weights.as_ref().map(|p| p.display().to_string()),
+            "seed": args.source.seed,
             "untrained_tensors": self.model.untrained_tensors().len(),
             "detail": self.detailed,
             "gaussians": self.result.splats.len(),

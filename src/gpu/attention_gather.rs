@@ -77,10 +77,7 @@ impl<'a> AttentionGatherArgs<'a> {
             ("points", self.points.len(), n * self.points_row()),
             ("maps", self.maps.len().min(cells * g.stride), cells * g.stride),
         ];
-        match lengths.into_iter().find(|(_, got, expected)| got != expected) {
-            None => Ok(n),
-            Some((what, got, expected)) => wrong(what, expected.to_string(), got.to_string()),
-        }
+        GpuError::unless_fitting(ATTENTION_GATHER.name, lengths).map(|()| n)
     }
 
     /// Parents of one call: what one binding holds of the widest of their rows.

@@ -75,14 +75,8 @@ impl Gpu {
     ) -> Result<AttentionGatherGradients, GpuError> {
         let n = args.check()?;
         let g = args.gather;
-        if grad.len() != n * g.dim {
-            return Err(GpuError::Argument {
-                kernel: ATTENTION_GATHER_BWD.name,
-                what: "gradient of the output",
-                expected: (n * g.dim).to_string(),
-                got: grad.len().to_string(),
-            });
-        }
+        let lengths = [("gradient of the output", grad.len(), n * g.dim)];
+        GpuError::unless_fitting(ATTENTION_GATHER_BWD.name, lengths)?;
         let maps = self.upload("feature maps", args.maps)?;
         let levels = self.upload("feature levels", &args.levels())?;
         let mut sum =

@@ -65,3 +65,22 @@ pub enum GpuError {
         got: String,
     },
 }
+
+impl GpuError {
+    /// Whether arguments of `kernel` fit one another: each with what came and what would fit.
+    ///
+    /// # Errors
+    /// [`GpuError::Argument`] of the first that does not.
+    pub(crate) fn unless_fitting<const N: usize>(
+        kernel: &'static str,
+        lengths: [(&'static str, usize, usize); N],
+    ) -> Result<(), Self> {
+        match lengths.into_iter().find(|(_, got, expected)| got != expected) {
+            None => Ok(()),
+            Some((what, got, expected)) => {
+                let (expected, got) = (expected.to_string(), got.to_string());
+                Err(Self::Argument { kernel, what, expected, got })
+            }
+        }
+    }
+}

@@ -61,15 +61,7 @@ impl<'a> PlaneSweepArgs<'a> {
             ("rows of depths", s.depths.len(), rows),
             ("depths of a row", ragged.map_or(s.candidates(), Vec::len), s.candidates()),
         ];
-        match lengths.into_iter().find(|(_, got, expected)| got != expected) {
-            None => Ok(rows),
-            Some((what, got, expected)) => Err(GpuError::Argument {
-                kernel: PLANE_SWEEP.name,
-                what,
-                expected: expected.to_string(),
-                got: got.to_string(),
-            }),
-        }
+        GpuError::unless_fitting(PLANE_SWEEP.name, lengths).map(|()| rows)
     }
 
     /// What the kernels are told of `rows`.

@@ -85,14 +85,8 @@ impl Gpu {
     ) -> Result<(Vec<f32>, Vec<f32>), GpuError> {
         let rows = args.check()?;
         let volume = args.sweep.candidates() * args.plane();
-        if grad.len() != rows * volume {
-            return Err(GpuError::Argument {
-                kernel: PLANE_SWEEP_TAPS.name,
-                what: "gradient of the correlation",
-                expected: (rows * volume).to_string(),
-                got: grad.len().to_string(),
-            });
-        }
+        let lengths = [("gradient of the correlation", grad.len(), rows * volume)];
+        GpuError::unless_fitting(PLANE_SWEEP_TAPS.name, lengths)?;
         let source = self.upload("source features", args.source)?;
         let mut d_reference = Vec::with_capacity(args.reference.len());
         let mut d_source = vec![0.0; args.source.len()];

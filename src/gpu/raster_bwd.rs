@@ -100,14 +100,8 @@ impl Frame {
     /// CPU's rasterizer takes it.
     pub fn backward(&mut self, gradients: &[f32]) -> Result<Gradients, GpuError> {
         let numbers = PICTURE_LANES * pixels(&self.call);
-        if gradients.len() != numbers {
-            return Err(GpuError::Argument {
-                kernel: RASTERIZE_BWD.name,
-                what: "gradients",
-                expected: format!("{numbers} numbers"),
-                got: gradients.len().to_string(),
-            });
-        }
+        let lengths = [("gradients", gradients.len(), numbers)];
+        GpuError::unless_fitting(RASTERIZE_BWD.name, lengths)?;
         self.times.clear();
         let (parts, behind) = match self.buffers.take() {
             Some(frame) if self.pairs <= self.gpu.rows_per_binding(PAIR_SUMS) => {

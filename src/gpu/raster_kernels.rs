@@ -97,7 +97,7 @@ pub(crate) static RASTERIZE_BWD: Kernel = Kernel {
 pub(crate) static PAIR_SUMS: Kernel = Kernel {
     name: "pair_sums",
     entry: "main",
-    source: wgsl!("shared/abi", "shared/grid", "shared/raster", "pair_sums"),
+    source: wgsl!("shared/abi", "shared/grid", "shared/raster", "shared/moments", "pair_sums"),
     bindings: &[Uniform, Read, Read, Read, Read, Read, Write],
 };
 

@@ -84,15 +84,7 @@ impl RedistributeArgs<'_> {
             ("own areas", self.own.len(), own),
             ("children", k.min(1), 1),
         ];
-        match lengths.into_iter().find(|(_, got, expected)| got != expected) {
-            None => Ok(()),
-            Some((what, got, expected)) => Err(GpuError::Argument {
-                kernel: REDISTRIBUTE.name,
-                what,
-                expected: expected.to_string(),
-                got: got.to_string(),
-            }),
-        }
+        GpuError::unless_fitting(REDISTRIBUTE.name, lengths)
     }
 }
 
@@ -167,14 +159,8 @@ impl Gpu {
         grad: &[f32],
     ) -> Result<RedistributeGradients, GpuError> {
         args.check()?;
-        if grad.len() != args.logits.len() {
-            return Err(GpuError::Argument {
-                kernel: REDISTRIBUTE_BWD.name,
-                what: "gradient",
-                expected: args.logits.len().to_string(),
-                got: grad.len().to_string(),
-            });
-        }
+        let lengths = [("gradient", grad.len(), args.logits.len())];
+        GpuError::unless_fitting(REDISTRIBUTE_BWD.name, lengths)?;
         let mut out = RedistributeGradients::default();
         for parents in Self::chunks(args.alphas.len(), self.rows_per_binding(args.k.max(2))) {
             let mut bindings = args.upload(self, &parents)?;

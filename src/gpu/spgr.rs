@@ -68,15 +68,7 @@ impl<'a> SpgrArgs<'a> {
             ("parents", self.parents.len(), n * SPLAT_LANES),
             ("head records", self.head.len(), n * k * HEAD_LANES),
         ];
-        match lengths.into_iter().find(|(_, got, expected)| got != expected) {
-            None => Ok(n),
-            Some((what, got, expected)) => Err(GpuError::Argument {
-                kernel: SPGR.name,
-                what,
-                expected: expected.to_string(),
-                got: got.to_string(),
-            }),
-        }
+        GpuError::unless_fitting(SPGR.name, lengths).map(|()| n)
     }
 
     /// What the kernels are told of `parents`.

@@ -41,19 +41,6 @@ pub(crate) static SPGR_GAINS_BWD: Kernel = Kernel {
 /// Threads of a workgroup.
 const THREADS: usize = 64;
 
-fn lengths(
-    kernel: &Kernel,
-    what: &'static str,
-    expected: usize,
-    got: usize,
-) -> Result<(), GpuError> {
-    if expected == got {
-        return Ok(());
-    }
-    let (expected, got) = (expected.to_string(), got.to_string());
-    Err(GpuError::Argument { kernel: kernel.name, what, expected, got })
-}
-
 impl Gpu {
     /// Gradients of head records `[N, K, 11]` and parents `[N, 11]` for those of the
     /// children, `grad` `[N·K, 11]`. The gains' lane of the former is 0.
@@ -67,7 +54,8 @@ impl Gpu {
     ) -> Result<(Vec<f32>, Vec<f32>), GpuError> {
         let n = args.check()?;
         let k = args.rules.children();
-        lengths(&SPGR_BWD, "gradient of the children", n * k * SPLAT_LANES, grad.len())?;
+        let lengths = [("gradient of the children", grad.len(), n * k * SPLAT_LANES)];
+        GpuError::unless_fitting(SPGR_BWD.name, lengths)?;
         let cameras = self.upload("context cameras", &args.cameras())?;
         let (mut of_head, mut of_parents) = (Vec::new(), Vec::new());
         for parents in Self::chunks(n, self.rows_per_binding(k * HEAD_LANES.max(SPLAT_LANES))) {
@@ -107,8 +95,11 @@ impl Gpu {
         grad: &[f32],
     ) -> Result<Vec<f32>, GpuError> {
         let (records, lanes) = (head.len() / HEAD_LANES, rules.gain_lanes());
-        lengths(&SPGR_GAINS_BWD, "head records", records * HEAD_LANES, head.len())?;
-        lengths(&SPGR_GAINS_BWD, "gradient of the gains", records * lanes, grad.len())?;
+        let lengths = [
+            ("head records", head.len(), records * HEAD_LANES),
+            ("gradient of the gains", grad.len(), records * lanes),
+        ];
+        GpuError::unless_fitting(SPGR_GAINS_BWD.name, lengths)?;
         let mut out = Vec::with_capacity(head.len());
         for part in Self::chunks(records, self.rows_per_binding(HEAD_LANES)) {
             let uniform = self.uniform(&SpgrGainsBwdUniform {

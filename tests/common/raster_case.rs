@@ -4,7 +4,9 @@ use glam::Mat4;
 use safetensors::SafeTensors;
 use std::collections::HashMap;
 use std::path::Path;
-use subsplat::abi::{Convention, RasterOptions, SH_DEGREE_MAX, ShBasis, sh_coefficients};
+use subsplat::abi::{
+    Convention, Geometry, RasterOptions, SH_DEGREE_MAX, ShBasis, SplatSlices, sh_coefficients,
+};
 use subsplat::camera::{Camera, Intrinsics};
 
 /// A fixture file, decoded.
@@ -72,6 +74,21 @@ impl File {
             background: self.get("background").try_into().unwrap(),
             ..RasterOptions::new(convention)
         }
+    }
+
+    /// Runs `f` on the kernels' view of the case's splats.
+    pub fn with_splats<R>(&self, f: impl FnOnce(&SplatSlices) -> R) -> R {
+        let t = |name| self.get(name);
+        let packed;
+        let geometry = if self.options().convention == Convention::Mvsplat {
+            Geometry::Cov6 { means: t("means"), cov6: t("cov6"), opacities: t("opacities") }
+        } else {
+            packed = rows(t("means"), t("quats"), t("scales"), t("opacities"));
+            Geometry::Packed(&packed)
+        };
+        let gain = self.tensors.get("gain").map_or(&[][..], |t| &t.1);
+        let sh_degree = degree_of(self.tensors["sh"].0[1]);
+        f(&SplatSlices { geometry, sh: t("sh"), gain, sh_degree })
     }
 }
 

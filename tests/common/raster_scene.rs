@@ -4,7 +4,8 @@
 use crate::oracle::{self, Shape, Splat};
 use glam::{EulerRot, Mat4, Quat, Vec3};
 use subsplat::abi::{
-    LANE_OPACITY, LANE_QUAT, LANE_SCALE, RasterOptions, SPLAT_LANES, sh_coefficients,
+    Convention, LANE_OPACITY, LANE_QUAT, LANE_SCALE, RasterOptions, SPLAT_LANES, ShBasis,
+    ShDirection, sh_coefficients,
 };
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::cpu::{Geometry, Gradients, Rasterizer, SplatSlices};
@@ -117,6 +118,24 @@ impl Scene {
             sh.extend((0..set).map(|i| r.range(-1.0, 1.0) * if i < 3 { 1.0 } else { 0.4 }));
         }
         Self { rows, cov6: Vec::new(), sh, gain, degree, camera }
+    }
+
+    /// One of six scenes of `kind` for each `seed`, with 12 parents, and options: every
+    /// option that projection knows, in some scene.
+    pub fn variant(kind: Kind, seed: u64, variant: usize) -> (Self, RasterOptions) {
+        let (degree, lanes) = (variant % 5, [0, 1, 4][variant % 3]);
+        let scene = Self::new(kind, 10 * seed + variant as u64, 12, degree, lanes);
+        let scene = if variant == 4 { scene.with_covariances() } else { scene };
+        let convention = if variant % 2 == 1 { Convention::Mvsplat } else { Convention::Standard };
+        let options = RasterOptions {
+            antialiased: variant == 2,
+            sh_direction: [ShDirection::Child, ShDirection::Parent][variant / 3],
+            sh_basis: [ShBasis::Standard, ShBasis::Mvsplat][variant % 2],
+            near: if convention == Convention::Mvsplat { 1.0 } else { 0.2 },
+            background: [0.2, -0.1, 0.7],
+            ..RasterOptions::new(convention)
+        };
+        (scene, options)
     }
 
     pub fn len(&self) -> usize {

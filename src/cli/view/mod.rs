@@ -68,7 +68,7 @@ pub fn view(args: &ViewArgs, answer: Answer) -> Result<()> {
 /// What is wrong with the arguments themselves.
 fn plan(args: &ViewArgs) -> Result<Plan> {
     render::background(&args.look())?;
-    render::check_near(args.near)?;
+    render::check_near(args.source.near)?;
     let size = args.size.as_deref().map(frames::size).transpose()?;
     size.map_or(Ok(()), memory::check_picture)?;
     args.frames.map_or(Ok(0), frames::count)?;

@@ -63,7 +63,7 @@ fn finished(args: &ViewArgs, path: &Path, progress: &mut Progress) -> Result<Sou
         bail!("{flag}: only with photographs; {} is a finished scene", path.display());
     }
     let (splats, comments) = progress.stage("scene", |_| load_with_comments(path))?;
-    let options = render::options(&args.look(), args.near, SH_DEGREE, &comments)?;
+    let options = render::options(&args.look(), args.source.near, SH_DEGREE, &comments)?;
     let beside = path.parent().unwrap_or(Path::new("")).join("cameras.json");
     let cameras = match &args.cameras {
         Some(source) => render::read_cameras(source)?,
@@ -87,18 +87,18 @@ fn finished(args: &ViewArgs, path: &Path, progress: &mut Progress) -> Result<Sou
 
 fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     ensure!(args.cameras.is_none(), "--cameras: only with a finished scene");
-    let input_size = frames::size(&args.input_size)?;
-    let scene = progress.stage("scene", |_| pair::load(&args.input, &args.pair))?;
+    let input_size = frames::size(&args.source.input_size)?;
+    let scene = progress.stage("scene", |_| pair::load(&args.input, &args.source.pair))?;
     scene.warnings.iter().for_each(warn);
     let first = args.input.first().context("no input")?;
-    let (context, why) = run::context(&args.context, first, &scene)?;
+    let (context, why) = run::context(&args.source.context, first, &scene)?;
     say(format!("{}: {} frames; context {why}", scene.name, scene.frames.len()));
-    let given = (args.near, args.far);
+    let given = (args.source.near, args.source.far);
     let guess = depth_range(&scene, &context, given)?;
-    let model = progress.stage("model", |_| load_model(args, args.upscale))?;
+    let model = progress.stage("model", |_| load_model(args, args.source.upscale))?;
     run::check_size(&model, context.len(), input_size)?;
     let photos = run::photographs(&scene, &context, progress)?;
-    let reports = match args.no_check {
+    let reports = match args.source.no_check {
         true => Vec::new(),
         false => progress.stage("check", |_| pipeline::check_photos(&photos))?,
     };
@@ -106,7 +106,7 @@ fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     let request = Request {
         input_size,
         near_far: (range.near, range.far),
-        detail: args.detail == DetailArg::Photo,
+        detail: args.source.detail == DetailArg::Photo,
     };
     let photographs = Photographs { args: args.clone(), photos, request };
     let result = progress.stage("network", |bar| {
@@ -128,13 +128,7 @@ fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
 }
 
 fn load_model(args: &ViewArgs, upscale: Option<usize>) -> Result<Reconstructor> {
-    model::load(&model::Asked {
-        weights: args.weights.as_deref(),
-        seed: args.seed,
-        upscale,
-        ratio: None,
-        model: &args.model,
-    })
+    model::load(&model::Asked { upscale, ..model::Asked::of(&args.source) })
 }
 
 impl Photographs {
