@@ -74,9 +74,9 @@ fn check(
 fn a_crowd_in_layers_is_the_crowd_at_once() {
     let Some(small) = limited(BINDING) else { return };
     for (seed, kind) in [(1, Kind::Plain), (2, Kind::Behind)] {
-        let scene = Scene::new(kind, seed, 3000, 1, 4);
+        let scene = Scene::new(kind, seed, 1500, 1, 4);
         let scene = if seed == 2 { scene.with_covariances() } else { scene };
-        assert!(scene.len() * 4 * FOOTPRINT_LANES > 8 * BINDING as usize);
+        assert!(scene.len() * 4 * FOOTPRINT_LANES > 4 * BINDING as usize);
         let options = RasterOptions {
             background: [0.2, 0.5, 0.7],
             sh_direction: [ShDirection::Child, ShDirection::Parent][seed as usize - 1],

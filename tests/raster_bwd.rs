@@ -11,7 +11,7 @@ use common::shared;
 use glam::{DVec3, Mat4, Vec3};
 use raster_case::{File, rows};
 use raster_gradients::{check, part, planes, worst_row};
-use subsplat::abi::{Convention, RasterOptions, SPLAT_LANES};
+use subsplat::abi::{RasterOptions, SPLAT_LANES};
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::cpu::{Geometry, Gradients, Rasterizer, SplatSlices};
 

@@ -61,10 +61,10 @@ pub struct EvalArgs {
     #[arg(long, value_name = "N", conflicts_with = "weights")]
     pub seed: Option<u64>,
     /// Nearest depth candidate, world units (default: as `run`; chunks 1).
-    #[arg(long)]
+    #[arg(long, allow_negative_numbers = true)]
     pub near: Option<f32>,
     /// Farthest depth candidate, world units (default: as `run`; chunks 100).
-    #[arg(long)]
+    #[arg(long, allow_negative_numbers = true)]
     pub far: Option<f32>,
     /// Only the first N scenes.
     #[arg(long, value_name = "N")]
