@@ -225,6 +225,17 @@ fn arguments(module: &Module) -> BTreeMap<u32, Access> {
         .collect()
 }
 
+/// Threads and bytes of a kernel's workgroup.
+fn workgroup(kernel: &Kernel, module: &Module) -> (u32, u32) {
+    let entry = module.entry_points.iter().find(|e| e.name == kernel.entry);
+    let entry = entry.unwrap_or_else(|| panic!("{}: no entry {}", kernel.name, kernel.entry));
+    let mut layouter = Layouter::default();
+    layouter.update(module.to_ctx()).unwrap();
+    let variables = module.global_variables.iter().map(|(_, v)| v);
+    let shared = variables.filter(|v| v.space == AddressSpace::WorkGroup);
+    (entry.workgroup_size.iter().product(), shared.map(|v| layouter[v.ty].size).sum())
+}
+
 fn check_kernel(kernel: &Kernel) {
     let name = kernel.name;
     let module = validate(kernel.source).unwrap_or_else(|e| panic!("{name}: {e}"));
@@ -232,19 +243,53 @@ fn check_kernel(kernel: &Kernel) {
     assert_eq!(arguments(&module), ours, "{name}: arguments");
     let storage = kernel.bindings.iter().filter(|a| **a != Access::Uniform).count();
     assert!(storage <= STORAGE_MAX, "{name}: {storage} storage buffers");
-    let entry = module.entry_points.iter().find(|e| e.name == kernel.entry);
-    let entry = entry.unwrap_or_else(|| panic!("{name}: no entry point {}", kernel.entry));
-    let threads: u32 = entry.workgroup_size.iter().product();
+    let (threads, bytes) = workgroup(kernel, &module);
     assert!(threads <= THREADS_MAX, "{name}: {threads} threads");
-    let mut layouter = Layouter::default();
-    layouter.update(module.to_ctx()).unwrap();
-    let bytes: u32 = module
-        .global_variables
-        .iter()
-        .filter(|(_, v)| v.space == AddressSpace::WorkGroup)
-        .map(|(_, v)| layouter[v.ty].size)
-        .sum();
     assert!(bytes <= WORKGROUP_BYTES_MAX, "{name}: {bytes} bytes of workgroup memory");
+}
+
+/// What a stage's largest kernel is called.
+const STAGES: &[(&str, &str)] = &[
+    ("project", "project"),
+    ("sort by depth", "sort_scatter"),
+    ("prefix sum, plan", "scan_apply"),
+    ("intersect", "intersect"),
+    ("sort by tile", "sort_count"),
+    ("ranges", "ranges"),
+    ("rasterize", "rasterize"),
+    ("rasterize backward", "rasterize_bwd"),
+    ("sum pairs", "pair_sums"),
+    ("project backward", "project_bwd"),
+];
+
+/// Stages of the table in `docs` whose threads, bytes, or workgroups at once on two kinds
+/// of core are other than their kernels'.
+fn stages_off(docs: &str) -> Vec<&'static str> {
+    let cells = |line: &str| line.split('|').map(|c| c.trim().to_owned()).collect::<Vec<_>>();
+    let rows: Vec<_> = docs.lines().map(cells).filter(|c| c.len() == 8).collect();
+    let wrong = |(stage, name): &(&str, &str)| {
+        let kernel = KERNELS.iter().find(|k| k.name == *name).unwrap();
+        let (threads, bytes) = workgroup(kernel, &parse(kernel.source).unwrap());
+        let at_once = |most: u32, memory: u32| (most / threads).min(memory / bytes.max(1));
+        let expected = [
+            threads.to_string(),
+            bytes.to_string(),
+            format!("{}, {}", at_once(1024, 32 << 10), at_once(2048, 100 << 10)),
+        ];
+        let found = rows.iter().find(|row| row[1] == *stage);
+        !found.is_some_and(|row| {
+            [row[3].clone(), row[4].replace(',', ""), row[5].clone()] == expected
+        })
+    };
+    STAGES.iter().filter(|s| wrong(s)).map(|s| s.0).collect()
+}
+
+#[test]
+fn the_table_of_stages_is_that_of_the_kernels() {
+    let docs = fs::read_to_string(root().join("src/gpu/mod.rs")).unwrap();
+    assert_eq!(stages_off(&docs), Vec::<&str>::new());
+    assert_eq!(stages_off(&docs.replace("15,368", "15,372")), ["rasterize backward"]);
+    assert_eq!(stages_off(&docs.replace("| 3, 8 | 160 N", "| 4, 8 | 160 N")), ["sort by depth"]);
 }
 
 #[test]
