@@ -102,7 +102,8 @@ fn what_a_gpu_cannot_do_the_cpu_does() {
             let warning = renderer.take_warning();
             assert_eq!(warning.is_some(), first, "{warning:?}");
             let told = warning.unwrap_or_else(|| format!("{hint} on the CPU"));
-            assert!(told.contains(hint) && told.contains("on the CPU"), "{told}");
+            assert!(told.starts_with(hint) && told.contains("on the CPU"), "{told}");
+            assert_eq!(told.lines().count(), 1, "{told}");
         }
         assert_eq!(renderer.device(), "CPU");
     }

@@ -130,3 +130,28 @@ fn what_is_still_too_large_is_named() {
         "{error:?}"
     );
 }
+
+/// Sizes are asked of the adapter; all else is what every WebGPU device has.
+#[test]
+fn devices_have_their_adapters_sizes_and_webgpus_limits() {
+    use subsplat::gpu::{DeviceChoice, find_for, instance, wgpu::Limits};
+    let Some(gpu) = gpu() else { return };
+    let adapter = find_for(&instance(), &DeviceChoice::Gpu, None).unwrap().unwrap();
+    let (own, usual) = (adapter.limits(), Limits::default());
+    let sizes = |limits: &Limits| (limits.max_storage_buffer_binding_size, limits.max_buffer_size);
+    let most = |own: u64, usual: u64| own.min(1 << 30).max(usual);
+    let (binding, buffer) = sizes(&own);
+    let (usual_binding, usual_buffer) = sizes(&usual);
+    let expected = (most(binding, usual_binding), most(buffer, usual_buffer));
+    eprintln!("adapter {:?}, device {:?}", sizes(&own), sizes(gpu.limits()));
+    assert_eq!(sizes(gpu.limits()), expected);
+    let (max_storage_buffer_binding_size, max_buffer_size) = expected;
+    let max_texture_dimension_2d = own.max_texture_dimension_2d;
+    let all = Limits {
+        max_storage_buffer_binding_size,
+        max_buffer_size,
+        max_texture_dimension_2d,
+        ..usual
+    };
+    assert_eq!(*gpu.limits(), all);
+}

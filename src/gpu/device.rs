@@ -92,7 +92,7 @@ impl Gpu {
         let stray = health.clone();
         // wgpu's own handler panics.
         device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| {
-            stray.stray.lock().unwrap_or_else(PoisonError::into_inner).replace(e.to_string());
+            stray.stray.lock().unwrap_or_else(PoisonError::into_inner).replace(in_one_line(&e));
         }));
         Ok(Self::assemble(device, queue, summary, health))
     }
@@ -182,10 +182,21 @@ impl Gpu {
         let scopes = Scopes::open(&self.device);
         let done = f();
         let found = scopes.close(what);
+        if found.is_err() {
+            // A device that is gone tells so when it is polled, and refuses all before.
+            self.device.poll(wgpu::PollType::Poll).ok();
+        }
         self.check()?;
         found?;
         done
     }
+}
+
+/// wgpu's words and their causes, which it puts on lines of their own.
+fn in_one_line(error: &wgpu::Error) -> String {
+    let text = error.to_string();
+    let lines = text.lines().map(str::trim).filter(|l| !l.is_empty() && *l != "Caused by:");
+    lines.collect::<Vec<_>>().join(": ")
 }
 
 /// Error scopes around calls to a device.
@@ -206,7 +217,7 @@ impl Scopes {
         let internal = pollster::block_on(internal.pop());
         match (memory, validation.or(internal)) {
             (Some(_), _) => Err(GpuError::OutOfMemory { what }),
-            (None, Some(e)) => Err(GpuError::Refused { what, reason: e.to_string() }),
+            (None, Some(e)) => Err(GpuError::Refused { what, reason: in_one_line(&e) }),
             (None, None) => Ok(()),
         }
     }
