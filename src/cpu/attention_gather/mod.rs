@@ -20,7 +20,7 @@
 mod backward;
 
 pub use crate::abi::{Drop, Gather, Level};
-pub use backward::{Gradients, backward};
+pub use backward::{Gradients, Scatter, backward, factors, scatter_into};
 
 use super::math::vectorised;
 use super::real::Real;
