@@ -22,6 +22,7 @@ mod disjoint;
 pub mod dssim;
 pub mod ewa;
 mod ewa_bwd;
+pub mod feed_forward;
 mod fresh;
 pub mod gemm;
 pub mod join;

@@ -14,6 +14,7 @@ pub mod conv2d;
 pub mod conv3d;
 pub mod direct;
 pub mod dssim;
+pub mod feed_forward;
 pub mod join;
 pub mod linear;
 pub mod matching;

@@ -6,12 +6,13 @@ use super::{bv_rows, vb_rows};
 use crate::config::Mvsplat as Settings;
 use crate::model::layers::{LayerNorm, Linear, gelu};
 use crate::model::trace::Trace;
+use crate::ops;
 use crate::ops::attention::{Labels, attention};
 use candle_core::{Result, Tensor, bail};
 use candle_nn::VarBuilder;
 
-/// Tokens that pass the feed-forward block at once: its hidden layer is 8 × as wide
-/// as the tokens, 16 MiB per block of this many.
+/// Tokens that pass the feed-forward block at once where gradients are asked for: its
+/// hidden layer is 8 × as wide as the tokens, 16 MiB per block of this many.
 const FFN_ROWS: usize = 4096;
 
 /// The network.
@@ -159,11 +160,18 @@ impl SubLayer {
     }
 }
 
+/// In one pass, or in single ops where a gradient must pass.
 fn feed_forward(
     (up, down, norm): &(Linear, Linear, LayerNorm),
     x: &Tensor,
     message: &Tensor,
 ) -> Result<Tensor> {
+    let parameters = [up.weight(), down.weight()];
+    let tracked = |t: &Tensor| t.track_op();
+    let gradient = tracked(x) || tracked(message) || parameters.into_iter().any(tracked);
+    if !gradient && !norm.parameters().into_iter().any(tracked) {
+        return ops::feed_forward::feed_forward(x, message, parameters, norm.parameters());
+    }
     let rows = x.dim(0)?;
     let blocks = (0..rows).step_by(FFN_ROWS).map(|start| {
         let n = FFN_ROWS.min(rows - start);
