@@ -460,11 +460,7 @@ unsafe fn tile<S: Simd, const R: usize, const V: usize>(s: S, part: Part, width:
 /// # Safety
 /// As [`rows`].
 #[inline(always)]
-unsafe fn finish<S: Simd, const R: usize, const V: usize>(
-    s: S,
-    part: Part,
-    sums: [[S::F; V]; R],
-) {
+unsafe fn finish<S: Simd, const R: usize, const V: usize>(s: S, part: Part, sums: [[S::F; V]; R]) {
     let scale = s.splat(part.scale);
     // SAFETY: the caller's; columns past the last are in the buffer alone.
     unsafe {
@@ -551,7 +547,10 @@ mod tests {
                         };
                         let want = f64::from(base) + 2.0 * dot(lhs, rhs, i, j);
                         let far = (f64::from(v) - want).abs();
-                        assert!(far < 4e-6 * (k as f64).sqrt() + 1e-6, "{m} {k} {n} {i} {j}: {far}");
+                        assert!(
+                            far < 4e-6 * (k as f64).sqrt() + 1e-6,
+                            "{m} {k} {n} {i} {j}: {far}"
+                        );
                     }
                 }
             }
@@ -588,7 +587,13 @@ mod tests {
     #[test]
     fn empty_sums_give_the_base() {
         let mut dst = [5.0; 4];
-        product((&mut dst, 2), Mat::new(&[], 2, 0, 0), &Packed::new(Mat::new(&[], 0, 2, 2)), 1.0, Base::Row(&[1.0, 2.0]));
+        product(
+            (&mut dst, 2),
+            Mat::new(&[], 2, 0, 0),
+            &Packed::new(Mat::new(&[], 0, 2, 2)),
+            1.0,
+            Base::Row(&[1.0, 2.0]),
+        );
         assert_eq!(dst, [1.0, 2.0, 1.0, 2.0]);
     }
 

@@ -30,6 +30,7 @@ pub mod lanes;
 pub mod matching;
 pub mod math;
 pub mod norm;
+pub mod pages;
 pub mod plane_sweep;
 mod project;
 mod project_bwd;
@@ -47,6 +48,7 @@ mod sort;
 pub mod spgr;
 mod tiles;
 
+pub use fresh::zeros;
 pub use project::{Geometry, SplatSlices};
 pub use project_bwd::Gradients;
 pub use raster_bwd::{BackwardTimes, Frame};

@@ -150,7 +150,13 @@ unsafe fn lanes<S: Simd>(s: S, p: *const f32) -> S::F {
 /// # Safety
 /// Rows of `dim` keys at every one of `taps`, `dim` floats in `q`; `dim` in whole vectors.
 #[inline(always)]
-unsafe fn products<S: Simd>(s: S, q: &[f32], keys: *const f32, taps: &Taps, dots: &mut [f32; TAPS]) {
+unsafe fn products<S: Simd>(
+    s: S,
+    q: &[f32],
+    keys: *const f32,
+    taps: &Taps,
+    dots: &mut [f32; TAPS],
+) {
     for first in (0..taps.count).step_by(WIDE) {
         let mut rows = [keys; WIDE];
         for (row, at) in rows.iter_mut().zip(&taps.at[first..taps.count]) {
