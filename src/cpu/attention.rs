@@ -7,7 +7,8 @@
 
 use super::activation::exp_row;
 use super::gemm::{Base, Mat, Packed, gemm, product};
-use super::math::{dot, vectorised};
+use super::math::dot;
+use super::simd::{Kernel, Simd, Tier};
 use rayon::prelude::*;
 
 /// Added to the logit of a masked pair: −100, not −∞ (Swin).
@@ -65,22 +66,34 @@ impl Attention {
             let queries = &l.queries[w * self.queries + first..][..rows];
             (queries, &l.keys[w * m..(w + 1) * m])
         });
-        vectorised(
-            #[inline(always)]
-            || {
-                let mut inverse = Vec::with_capacity(rows);
-                for (i, row) in p.chunks_exact_mut(m).enumerate() {
-                    if let Some((queries, keys)) = labels {
-                        let own = queries[i];
-                        for (x, &label) in row.iter_mut().zip(keys) {
-                            *x += if label == own { 0.0 } else { PENALTY };
-                        }
-                    }
-                    inverse.push(1.0 / exp_row(row));
+        Tier::best().run(Weigh { p, keys: m, labels })
+    }
+}
+
+/// Logits to weights, row by row.
+struct Weigh<'a> {
+    p: &'a mut [f32],
+    keys: usize,
+    /// Of the rows, and of the keys.
+    labels: Option<(&'a [u8], &'a [u8])>,
+}
+
+impl Kernel for Weigh<'_> {
+    type Output = Vec<f32>;
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) -> Vec<f32> {
+        let mut inverse = Vec::with_capacity(self.p.len() / self.keys);
+        for (i, row) in self.p.chunks_exact_mut(self.keys).enumerate() {
+            if let Some((queries, keys)) = self.labels {
+                let own = queries[i];
+                for (x, &label) in row.iter_mut().zip(keys) {
+                    *x += if label == own { 0.0 } else { PENALTY };
                 }
-                inverse
-            },
-        )
+            }
+            inverse.push(1.0 / exp_row(s, row));
+        }
+        inverse
     }
 }
 

@@ -45,6 +45,20 @@ pub(crate) fn start<T: Copy + Default>(block: &mut Block<T>) -> &mut [T] {
     unsafe { &mut *(block as *mut Block<T> as *mut [T]) }
 }
 
+/// A block with the numbers of `from`, which is as long.
+///
+/// # Panics
+/// Where it is not.
+#[inline]
+pub(crate) fn fill<'a, T: Copy>(block: &'a mut Block<T>, from: &[T]) -> &'a mut [T] {
+    assert_eq!(block.len(), from.len(), "fresh block: lengths");
+    for (to, from) in block.iter_mut().zip(from) {
+        *to = MaybeUninit::new(*from);
+    }
+    // SAFETY: every place was just written.
+    unsafe { &mut *(block as *mut Block<T> as *mut [T]) }
+}
+
 /// Numbers below which [`zeros`] is not worth several threads.
 const SMALL: usize = 1 << 17;
 /// Numbers a task.

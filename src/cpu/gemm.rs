@@ -137,7 +137,7 @@ impl Kernel for Pack<'_> {
 
 /// `from` into rows `pitch` ≥ `from.cols` long, the rest of each zeros.
 #[inline(always)]
-fn copy<S: Simd>(s: S, from: Mat<'_>, pitch: usize, to: &mut [f32]) {
+pub(super) fn copy<S: Simd>(s: S, from: Mat<'_>, pitch: usize, to: &mut [f32]) {
     let Mat { data, rows, cols, row_stride, col_stride } = from;
     if col_stride == 1 {
         for (i, to) in to.chunks_exact_mut(pitch).enumerate() {

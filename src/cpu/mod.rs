@@ -29,6 +29,7 @@ pub mod join;
 pub mod lanes;
 pub mod matching;
 pub mod math;
+pub mod moves;
 pub mod norm;
 pub mod pages;
 pub mod plane_sweep;

@@ -60,9 +60,7 @@ impl CustomOp1 for Softmax {
 
     fn cpu_fwd(&self, s: &CpuStorage, l: &Layout) -> Result<(CpuStorage, Shape)> {
         let x = slice::<f32>("softmax", "x", s, l)?;
-        let mut y = zeros(x.len());
-        cpu::softmax(self.0, x, &mut y);
-        output(y, l.shape().clone())
+        output(cpu::softmax(self.0, x), l.shape().clone())
     }
 
     fn bwd(&self, x: &Tensor, y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {

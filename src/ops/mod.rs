@@ -18,6 +18,7 @@ pub mod feed_forward;
 pub mod join;
 pub mod linear;
 pub mod matching;
+pub mod moves;
 pub mod norm;
 pub mod plane_sweep;
 mod rasterize;

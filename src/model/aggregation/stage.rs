@@ -9,6 +9,7 @@ use crate::config::{
 use crate::model::mlp::{LayerNorm, Mode, affine, linear, xavier};
 use crate::ops::attention_gather::{Drop, Gather, attention_gather_on};
 use crate::ops::columns::columns;
+use crate::ops::moves;
 use candle_core::{Result, Tensor};
 use candle_nn::{Init, Linear, Module, VarBuilder};
 
@@ -113,7 +114,7 @@ impl Stage {
                 (None, None) => map.clone(),
             });
         }
-        Tensor::cat(&levels, 0)?.contiguous()
+        moves::stacked(&levels)
     }
 
     /// The next f from this one and the embedding z, both `[n, E]`; `(t, maps)`: index

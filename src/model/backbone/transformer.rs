@@ -8,6 +8,7 @@ use crate::model::layers::{LayerNorm, Linear, gelu};
 use crate::model::trace::Trace;
 use crate::ops;
 use crate::ops::attention::{Labels, attention};
+use crate::ops::moves::{channels_last, sum};
 use candle_core::{Result, Tensor, bail};
 use candle_nn::VarBuilder;
 
@@ -61,7 +62,7 @@ impl Transformer {
         }
         let x = cnn.broadcast_add(&position_encoding(c, [h, w], s, cnn)?)?;
         trace.put("transformer.pos_added", &x)?;
-        let mut x = vb_rows(&x)?.flatten_from(2)?.transpose(1, 2)?.contiguous()?;
+        let mut x = channels_last(&vb_rows(&x)?)?;
         for (i, layer) in self.layers.iter().enumerate() {
             // A single window has no seams to shift.
             let shifted = i % 2 == 1 && s > 1;
@@ -77,7 +78,7 @@ impl Transformer {
             trace.put(&format!("transformer.layer{i}.out_vb"), &x)?;
         }
         let rows = x.dim(0)?;
-        let x = bv_rows(&x.transpose(1, 2)?.contiguous()?.reshape((rows, c, h, w))?, v)?;
+        let x = bv_rows(&channels_last(&x)?.reshape((rows, c, h, w))?, v)?;
         trace.put("transformer.features", &x)?;
         Ok(x)
     }
@@ -150,7 +151,7 @@ impl SubLayer {
         let message = self.norm1.forward(&self.merge.forward(&message)?)?;
         let message = message.reshape((rows, tokens, c))?;
         match &self.ffn {
-            None => x + message,
+            None => sum(x, &message),
             Some(ffn) => {
                 let x = x.reshape((rows * tokens, c))?;
                 let message = message.reshape((rows * tokens, c))?;
