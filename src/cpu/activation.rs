@@ -211,8 +211,12 @@ pub fn softmax(n: usize, x: &[f32]) -> Vec<f32> {
     let chunk = CHUNK.div_ceil(n.max(1)) * n.max(1);
     let mut fresh = Fresh::new(x.len());
     fresh.blocks(chunk).zip(x.par_chunks(chunk)).for_each(|(block, x)| {
-        let y = fill(block, x);
-        Tier::best().run(Softmax { n, y });
+        // A few rows at a time stay in the first-level cache.
+        let few = (SUM / n.max(1)).max(1) * n.max(1);
+        for (block, x) in block.chunks_mut(few).zip(x.chunks(few)) {
+            let y = fill(block, x);
+            Tier::best().run(Softmax { n, y });
+        }
     });
     // SAFETY: the loop above filled every block.
     unsafe { fresh.finish() }

@@ -11,6 +11,7 @@ use super::activation::{Activation, in_place};
 use super::fresh::{Fresh, start};
 use super::gemm::{Base, Mat, Packed, product};
 use super::norm::{self, Rows};
+use super::simd::LANES;
 use rayon::prelude::*;
 
 /// Rows of a task: 96 · 1024 hidden floats are 384 KiB.
@@ -41,6 +42,8 @@ pub fn forward(f: &FeedForward<'_>, x: &[f32], message: &[f32]) -> Vec<f32> {
     let up = [Packed::new(own.t()), Packed::new(theirs.t())];
     let down = Packed::new(Mat::new(f.down, c, h, h).t());
     let rows = Rows { len: c, run: 1, groups: 1, eps: f.eps, activation: None };
+    // Off the powers of two, at which rows lie in one another's cache lines.
+    let pitch = h + LANES;
     let mut fresh = Fresh::new(x.len());
     let size = BLOCK * c.max(1);
     let blocks = fresh.blocks(size).zip(x.par_chunks(size)).zip(message.par_chunks(size));
@@ -48,12 +51,12 @@ pub fn forward(f: &FeedForward<'_>, x: &[f32], message: &[f32]) -> Vec<f32> {
         || (Vec::new(), Vec::new()),
         |(hidden, narrow), ((block, x), message)| {
             let (y, n) = (start(block), x.len() / c);
-            hidden.resize(n * h, 0.0);
+            hidden.resize(n * pitch, 0.0);
             narrow.resize(n * c, 0.0);
-            product((hidden, h), Mat::new(x, n, c, c), &up[0], 1.0, Base::Zero);
-            product((hidden, h), Mat::new(message, n, c, c), &up[1], 1.0, Base::Own);
+            product((hidden, pitch), Mat::new(x, n, c, c), &up[0], 1.0, Base::Zero);
+            product((hidden, pitch), Mat::new(message, n, c, c), &up[1], 1.0, Base::Own);
             in_place(Activation::Gelu, hidden);
-            product((narrow, c), Mat::new(hidden, n, h, h), &down, 1.0, Base::Zero);
+            product((narrow, c), Mat::new(hidden, n, h, pitch), &down, 1.0, Base::Zero);
             norm::forward(&rows, narrow, f.norm[0], f.norm[1], y);
             y.iter_mut().zip(x).for_each(|(y, x)| *y += x);
         },

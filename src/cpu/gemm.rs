@@ -148,8 +148,9 @@ pub(super) fn copy<S: Simd>(s: S, from: Mat<'_>, pitch: usize, to: &mut [f32]) {
     }
     let (whole_rows, whole_cols) = (rows / LANES * LANES, cols / LANES * LANES);
     if row_stride == 1 {
-        for i in (0..whole_rows).step_by(LANES) {
-            for j in (0..whole_cols).step_by(LANES) {
+        // Along the lines of the source, however far apart they lie.
+        for j in (0..whole_cols).step_by(LANES) {
+            for i in (0..whole_rows).step_by(LANES) {
                 let mut square = [s.splat(0.0); LANES];
                 for (c, v) in square.iter_mut().enumerate() {
                     *v = s.load(lanes(&data[(j + c) * col_stride + i..]));

@@ -34,7 +34,7 @@ pub fn stacked(parts: &[&[f32]]) -> Vec<f32> {
             let own = part.get(skip..).unwrap_or(&[]);
             skip = skip.saturating_sub(part.len());
             let (now, rest) = block.split_at_mut(own.len().min(block.len()));
-            fill(now, own);
+            fill(now, &own[..now.len()]);
             block = rest;
         }
     });
@@ -43,8 +43,8 @@ pub fn stacked(parts: &[&[f32]]) -> Vec<f32> {
     unsafe { fresh.finish() }
 }
 
-/// Rows of a task of [`transposed`]: lines of the result.
-const ROWS: usize = 64;
+/// Rows of the result in a task of [`transposed`].
+const ROWS: usize = 256;
 
 /// `[count, rows, cols]` to `[count, cols, rows]`.
 pub fn transposed(x: &[f32], rows: usize, cols: usize) -> Vec<f32> {
@@ -110,7 +110,7 @@ mod tests {
     #[test]
     fn transposes_agree_with_indices() {
         for (count, rows, cols) in
-            [(2, 37, 128), (3, 16, 21), (2, 84, 1024), (2, 84, 1001), (20_000, 3, 25), (2, 0, 4)]
+            [(2, 37, 256), (3, 16, 21), (2, 84, 1024), (2, 84, 1001), (20_000, 3, 25), (2, 0, 4)]
         {
             let x = numbers(count * rows * cols);
             let got = transposed(&x, rows, cols);

@@ -45,9 +45,7 @@ impl CustomOp2 for Op {
             (slice::<f32>(NAME, "fine", s1, l1)?, slice::<f32>(NAME, "coarse", s2, l2)?);
         let ([c1, c2], [h, w]) = (self.0.channels, self.0.size);
         let shape = (l1.dims()[0], c1 + c2, h, w);
-        let mut y = zeros(shape.0 * shape.1 * h * w);
-        cpu::forward(&self.0, fine, coarse, &mut y);
-        output(y, shape)
+        output(cpu::forward(&self.0, shape.0, fine, coarse), shape)
     }
 
     fn bwd(

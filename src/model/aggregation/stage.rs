@@ -126,7 +126,7 @@ impl Stage {
         (t, maps): (usize, &Tensor),
         (f, z): (&Tensor, &Tensor),
     ) -> Result<Tensor> {
-        let mut q = f.add(z)?;
+        let mut q = moves::sum(f, z)?;
         if let Some(norm) = &self.norm {
             q = norm.forward(&q)?;
         }
@@ -145,12 +145,12 @@ impl Stage {
             }
             (Residual::None, _) => (o.clone(), o),
             _ => {
-                let next = f.add(&o)?;
+                let next = moves::sum(f, &o)?;
                 (next.clone(), next)
             }
         };
         match &self.ffn {
-            Some(ffn) => next.add(&ffn.forward(&joined)?),
+            Some(ffn) => moves::sum(&next, &ffn.forward(&joined)?),
             None => Ok(next),
         }
     }
