@@ -93,6 +93,26 @@ impl Packed {
         packed
     }
 
+    /// [`Packed::new`] by all threads, panel by panel.
+    ///
+    /// # Panics
+    /// As [`Packed::new`].
+    pub fn new_parallel(rhs: Mat<'_>) -> Self {
+        rhs.check("operands");
+        let mut fresh = Fresh::new(rhs.rows * rhs.cols.next_multiple_of(LANES));
+        if rhs.rows > 0 && rhs.cols > 0 {
+            fresh.blocks(PANEL * rhs.rows).enumerate().for_each(|(i, block)| {
+                let first = i * PANEL;
+                let data = &rhs.data[first * rhs.col_stride..];
+                let rhs = Mat { data, cols: PANEL.min(rhs.cols - first), ..rhs };
+                Tier::best().run(Pack { rhs, to: start(block) });
+            });
+        }
+        // SAFETY: the loop above started every block; there is none of an empty factor.
+        let data = unsafe { fresh.finish() };
+        Self { data, depth: rhs.rows, cols: rhs.cols }
+    }
+
     fn fill(&mut self, rhs: Mat<'_>) {
         rhs.check("operands");
         self.depth = rhs.rows;
@@ -202,7 +222,13 @@ pub enum Base<'a> {
 /// # Panics
 /// Where a matrix reaches past its slice or the sizes differ: the bounds check that the
 /// kernel rests on.
-pub fn product(
+pub fn product(dst: (&mut [f32], usize), lhs: Mat<'_>, rhs: &Packed, scale: f32, base: Base<'_>) {
+    product_on(Tier::best(), dst, lhs, rhs, scale, base);
+}
+
+/// [`product`] compiled for `tier`.
+pub(crate) fn product_on(
+    tier: Tier,
     (dst, row_stride): (&mut [f32], usize),
     lhs: Mat<'_>,
     rhs: &Packed,
@@ -220,7 +246,7 @@ pub fn product(
     if let Base::Row(row) = base {
         assert_eq!(row.len(), n, "gemm: row");
     }
-    Tier::best().run(Product { dst, row_stride, lhs, rhs, scale, base });
+    tier.run(Product { dst, row_stride, lhs, rhs, scale, base });
 }
 
 /// `dst = scale · lhs · rhs`, or `dst += …` with `accumulate`: [`product`] with a right
@@ -534,7 +560,9 @@ mod tests {
                 };
                 for base in [Base::Zero, Base::Own, Base::Row(&row)] {
                     let mut dst = own.clone();
-                    product((&mut dst, n + 2), lhs, &Packed::new(rhs), 2.0, base);
+                    let packed = Packed::new_parallel(rhs);
+                    assert_eq!(packed.data, Packed::new(rhs).data);
+                    product((&mut dst, n + 2), lhs, &packed, 2.0, base);
                     for (at, (&v, &before)) in dst.iter().zip(&own).enumerate() {
                         let (i, j) = (at / (n + 2), at % (n + 2));
                         if j >= n {
