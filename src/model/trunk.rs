@@ -15,7 +15,7 @@ use crate::abi::{RasterOptions, SPLAT_LANES, ShBasis, sh_coefficients};
 use crate::camera::Camera;
 use crate::config::{Config, FeatureLevel, HeadInput, ShInput, SpgrHead};
 use crate::ops::direct::{Footprint, rasterize_footprints, spgr_footprints};
-use crate::ops::moves::{channels_last, sum};
+use crate::ops::moves::sum;
 use crate::ops::spgr::{Rules, Spgr, spgr_into_on, spgr_on};
 use crate::ops::{Backend, rasterize_on};
 use crate::splats::Splats;
@@ -448,10 +448,7 @@ fn check_single(views: &Views, primaries: &Primaries) -> Result<()> {
 
 /// `[1, N, 3, D]` to `[N, D, 3]`.
 fn interleaved(sh: &Tensor) -> Result<Tensor> {
-    match sh.dtype() {
-        DType::F32 => channels_last(&sh.squeeze(0)?),
-        _ => sh.squeeze(0)?.transpose(1, 2)?.contiguous(),
-    }
+    sh.squeeze(0)?.transpose(1, 2)?.contiguous()
 }
 
 fn scene_of(backbone: &BackboneOutput, b: usize) -> Result<BackboneOutput> {
