@@ -93,27 +93,11 @@ impl Packed {
         packed
     }
 
-    /// [`Packed::new`] by all threads, panel by panel.
+    /// [`Packed::new`] in the memory that this one has.
     ///
     /// # Panics
     /// As [`Packed::new`].
-    pub fn new_parallel(rhs: Mat<'_>) -> Self {
-        rhs.check("operands");
-        let mut fresh = Fresh::new(rhs.rows * rhs.cols.next_multiple_of(LANES));
-        if rhs.rows > 0 && rhs.cols > 0 {
-            fresh.blocks(PANEL * rhs.rows).enumerate().for_each(|(i, block)| {
-                let first = i * PANEL;
-                let data = &rhs.data[first * rhs.col_stride..];
-                let rhs = Mat { data, cols: PANEL.min(rhs.cols - first), ..rhs };
-                Tier::best().run(Pack { rhs, to: start(block) });
-            });
-        }
-        // SAFETY: the loop above started every block; there is none of an empty factor.
-        let data = unsafe { fresh.finish() };
-        Self { data, depth: rhs.rows, cols: rhs.cols }
-    }
-
-    fn fill(&mut self, rhs: Mat<'_>) {
+    pub(crate) fn fill(&mut self, rhs: Mat<'_>) {
         rhs.check("operands");
         self.depth = rhs.rows;
         self.cols = rhs.cols;
@@ -560,8 +544,7 @@ mod tests {
                 };
                 for base in [Base::Zero, Base::Own, Base::Row(&row)] {
                     let mut dst = own.clone();
-                    let packed = Packed::new_parallel(rhs);
-                    assert_eq!(packed.data, Packed::new(rhs).data);
+                    let packed = Packed::new(rhs);
                     product((&mut dst, n + 2), lhs, &packed, 2.0, base);
                     for (at, (&v, &before)) in dst.iter().zip(&own).enumerate() {
                         let (i, j) = (at / (n + 2), at % (n + 2));
