@@ -109,6 +109,27 @@ fn the_number_of_lanes_changes_nothing() {
     }
 }
 
+/// No gradient is sent through a frozen backbone, and its depth losses are no part of
+/// the step.
+#[test]
+fn a_frozen_backbone_is_left_out_of_the_step() {
+    let mut config = tiny("render");
+    config.optimizer.freeze_backbone = true;
+    let folder = tempfile::tempdir().unwrap();
+    let mut training = Training::open(&config, folder.path()).unwrap();
+    let before = state(&training);
+    let terms = training.step().unwrap().unwrap().terms;
+    assert!(terms.loss > 0.0 && terms.mse > 0.0 && terms.cross_entropy.is_nan(), "{terms:?}");
+    let after = state(&training);
+    let moved = |own: &str| {
+        let pairs = before.iter().zip(&after).filter(|((name, _), _)| name.contains(own));
+        pairs.fold([0, 0], |[all, moved], (b, a)| [all + 1, moved + usize::from(b != a)])
+    };
+    let ([backbone, still], [heads, learnt]) = (moved("small."), moved("subsplat."));
+    assert!(backbone > 0 && still == 0, "{still} of {backbone}");
+    assert!(heads > 0 && learnt > 0, "{learnt} of {heads}");
+}
+
 #[test]
 fn a_few_scenes_are_learnt() {
     for (phase, share) in [("depth", 0.75), ("render", 0.8)] {
@@ -257,6 +278,7 @@ fn errors_name_key_and_value() {
         ("rate = 3e-3", "rate = 1.0\npeak = 3", "peak"),
         ("batch = 2", "batch = 2\n[loss]\nlpips = 0.05", "lpips_weights"),
         ("batch = 2", "batch = 2\n[optimizer]\naverage = 1.5", "optimizer.average"),
+        ("batch = 2", "batch = 2\n[optimizer]\nfreeze_backbone = true", "freeze_backbone"),
     ];
     for (old, new, named) in rows {
         let text = TINY.replace("PHASE", "depth").replace(old, new);

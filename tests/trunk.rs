@@ -268,6 +268,99 @@ fn gradients_reach_the_backbone_and_the_whole_chain_is_right() {
     }
 }
 
+/// Children, and the gradients of all parameters, of a map and of the primaries, of the
+/// chunked walk against those of one graph over all parents.
+#[test]
+fn the_recomputed_pass_is_the_graphs() {
+    let scene = Scene::new(&cameras(2, SIZE, SIZE), 11);
+    let wanted = ["as is", "no aggregation", "shared weights", "all levels", "PixelGaussian"];
+    for (name, change) in switches().into_iter().filter(|(name, _)| wanted.contains(name)) {
+        let mut c = config(Preset::Tuned, 2);
+        c.embed.sh = ShInput::World;
+        change(&mut c);
+        let (trunk, variables) = trunk(&c, 12);
+        let [map, means, sh] = [
+            scene.backbone.features[0].1.clone(),
+            scene.primaries.means.clone(),
+            scene.primaries.sh.clone(),
+        ]
+        .map(|t| candle_core::Var::from_tensor(&t).unwrap());
+        let mut backbone = scene.backbone.clone();
+        backbone.features[0].1 = map.as_tensor().clone();
+        let (at, sh_at) = (means.as_tensor().clone(), sh.as_tensor().clone());
+        let primaries = Primaries { means: at, sh: sh_at, ..scene.primaries.clone() };
+        let args = (&scene.views, &backbone, &primaries);
+        let graph = trunk.forward_train(args.0, args.1, args.2, (512, 3)).unwrap();
+        let w = [&graph.rows, &graph.gain, &graph.sh]
+            .map(|t| Random(13).tensor(t.dims(), 1.0, DType::F32));
+        let along = |t: &Tensor, w: &Tensor| (t * w).unwrap().sum_all().unwrap();
+        let loss = (along(&graph.rows, &w[0]) + along(&graph.gain, &w[1])).unwrap();
+        let store = (loss + along(&graph.sh, &w[2])).unwrap().backward().unwrap();
+        let mut vars = variables.all_vars();
+        vars.extend([map, means, sh]);
+
+        // 100 does not divide a view's 256 parents.
+        let pass = trunk.forward_recomputed(args.0, args.1, args.2, (100, 3)).unwrap();
+        close(&pass.children().rows, &graph.rows, name);
+        close(&pass.children().gain, &graph.gain, name);
+        assert!(!pass.children().rows.track_op());
+        let mut sums: Vec<Option<Tensor>> = vec![None; vars.len()];
+        let mut collect = |store: &candle_core::backprop::GradStore| -> candle_core::Result<()> {
+            for (sum, var) in sums.iter_mut().zip(&vars) {
+                let Some(g) = store.get(var) else { continue };
+                *sum = Some(match sum.take() {
+                    Some(sum) => (sum + g)?,
+                    None => g.clone(),
+                });
+            }
+            Ok(())
+        };
+        let flat = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let mut total = along(&pass.children().sh, &w[2]);
+        let short = pass_error(&trunk, args, &flat(&w[0]));
+        assert!(short.contains("gradients"), "{short}");
+        for rest in pass.backward([&flat(&w[0]), &flat(&w[1])], &mut collect).unwrap() {
+            total = (total + rest).unwrap();
+        }
+        collect(&total.backward().unwrap()).unwrap();
+        for (sum, var) in sums.iter().zip(&vars) {
+            match (sum, store.get(var)) {
+                (Some(sum), Some(expected)) => close(sum, expected, name),
+                // The graph's own accounting makes zeros of what nothing has reached.
+                (None, Some(expected)) => assert!(host(expected).iter().all(|v| *v == 0.0)),
+                (Some(sum), None) => assert!(host(sum).iter().all(|v| *v == 0.0)),
+                (None, None) => {}
+            }
+        }
+    }
+    let mut off = config(Preset::Tuned, 1);
+    off.spgr.enabled = false;
+    let (off, _) = trunk(&off, 12);
+    assert!(
+        off.forward_recomputed(&scene.views, &scene.backbone, &scene.primaries, (64, 0)).is_err()
+    );
+}
+
+fn pass_error(
+    trunk: &Trunk,
+    (views, backbone, primaries): (&Views, &BackboneOutput, &Primaries),
+    rows: &[f32],
+) -> String {
+    let pass = trunk.forward_recomputed(views, backbone, primaries, (100, 3)).unwrap();
+    let done = pass.backward([rows, &[]], |_| Ok::<(), candle_core::Error>(()));
+    done.map(|_| String::new()).unwrap_or_else(|e| e.to_string())
+}
+
+/// Within 2e-4 of the largest: f32 sums over some hundred parents in another order.
+fn close(got: &Tensor, expected: &Tensor, name: &str) {
+    assert_eq!(got.dims(), expected.dims(), "{name}");
+    let (got, expected) = (host(got), host(expected));
+    let scale = expected.iter().fold(1e-6f64, |m, v| m.max(v.abs()));
+    for (i, (a, b)) in got.iter().zip(&expected).enumerate() {
+        assert!((a - b).abs() < 2e-4 * scale, "{name}: {i}: {a}, expected {b} (scale {scale})");
+    }
+}
+
 fn moved(cameras: &[Camera]) -> Vec<Camera> {
     let m = motion();
     let each = |c: &Camera| Camera::new(c.intrinsics, m * c.world_from_camera).unwrap();

@@ -27,6 +27,9 @@ pub use crate::abi::Rule;
 /// Parents per rayon task: all that it reads and writes lies in the caches of a core.
 const BLOCK: usize = 512;
 
+/// Areas above count as this, px²: over [`AREA_EPS`] it is still far from overflow.
+const AREA_MAX: f64 = 1e28;
+
 /// eˣ⁻ᵐᵃˣ of `x` in place; returns one over their sum.
 #[inline(always)]
 fn exponentials<V: Lanes>(x: &mut [V]) -> V {
@@ -40,6 +43,25 @@ fn exponentials<V: Lanes>(x: &mut [V]) -> V {
         sum = sum + *v;
     }
     sum.of(1.0) / sum
+}
+
+/// e^{ℓ_k − max ℓ}·(A_0 + ε)/(A_k + ε) in place of ℓ: softmax(ℓ − ln(A + ε)) before its
+/// division by the sum, which is returned, without a logarithm. An only child gets 1.
+#[inline(always)]
+fn per_area<V: Lanes>(areas: &[V], logits: &mut [V]) -> V {
+    let mut top = logits[0];
+    for &v in &logits[1..] {
+        top = top.max(v);
+    }
+    let (mut sum, eps) = (top.of(0.0), top.of(AREA_EPS));
+    // Bounded, so that no quotient leaves f32.
+    let bounded = |a: V| (a + eps).min(a.of(AREA_MAX));
+    let first = bounded(areas[0]);
+    for (l, &a) in logits.iter_mut().zip(areas) {
+        *l = (*l - top).exp() * first / bounded(a);
+        sum = sum + *l;
+    }
+    sum
 }
 
 #[inline(always)]
@@ -65,11 +87,7 @@ pub(super) fn share<V: Lanes>(rule: Rule, areas: &[V], alpha: V, own: V, alphas:
         return;
     }
     if rule == Rule::Linear {
-        let eps = alpha.of(AREA_EPS);
-        for (l, &a) in alphas.iter_mut().zip(areas) {
-            *l = *l - (a + eps).ln();
-        }
-        let factor = alpha * exponentials(alphas);
+        let factor = alpha / per_area(areas, alphas);
         alphas.iter_mut().for_each(|o| *o = *o * factor);
         return;
     }
@@ -107,10 +125,7 @@ pub(super) fn share_backward<V: Lanes>(
         }
         Rule::Linear => {
             let eps = alpha.of(AREA_EPS);
-            for (l, &a) in logits.iter_mut().zip(areas.iter()) {
-                *l = *l - (a + eps).ln();
-            }
-            let inverse = exponentials(logits);
+            let inverse = alpha.of(1.0) / per_area(areas, logits);
             let weighted = logits.iter().zip(&*grads).fold(zero, |sum, (&w, &g)| w.fma(g, sum));
             let mean = weighted * inverse;
             let factor = alpha * inverse;
@@ -276,7 +291,7 @@ fn load_singles<M: Machine>(m: M, from: &[M::Scalar], count: usize) -> [M::V; 1]
 /// A block of parents forward.
 struct Forward<'a, T> {
     args: Args<'a, T>,
-    out: &'a mut [T],
+    out: &'a mut Block<T>,
 }
 
 impl<T: LaneReal> Forward<'_, T> {
@@ -290,7 +305,7 @@ impl<T: LaneReal> Forward<'_, T> {
             a.load(m, &areas[at..], count);
             let (alpha, own) = (single(m, alphas, span), single(m, own, span));
             share(rule, a.as_ref(), alpha, own, o.as_mut());
-            o.store(m, &mut self.out[at..], count);
+            o.store(m, start(&mut self.out[at..at + count * k]), count);
         }
     }
 }
@@ -313,7 +328,7 @@ impl<T: LaneReal> Kernel<T> for Forward<'_, T> {
 pub fn forward<T: LaneReal>(args: Args<T>) -> Vec<T> {
     let mut out = Fresh::new(args.alphas.len() * args.k);
     out.blocks(args.k * BLOCK).enumerate().for_each(|(block, out)| {
-        T::dispatch(Forward { args: args.parents(block * BLOCK, BLOCK), out: start(out) });
+        T::dispatch(Forward { args: args.parents(block * BLOCK, BLOCK), out });
     });
     // SAFETY: the loop above started every block.
     unsafe { out.finish() }
@@ -335,10 +350,10 @@ pub struct Gradients<T> {
 struct Backward<'a, T> {
     args: Args<'a, T>,
     grad: &'a [T],
-    logits: &'a mut [T],
-    areas: &'a mut [T],
-    alphas: &'a mut [T],
-    own: &'a mut [T],
+    logits: &'a mut Block<T>,
+    areas: &'a mut Block<T>,
+    alphas: &'a mut Block<T>,
+    own: &'a mut Block<T>,
 }
 
 impl<T: LaneReal> Backward<'_, T> {
@@ -354,12 +369,12 @@ impl<T: LaneReal> Backward<'_, T> {
             let per_parent = (single(m, alphas, span), single(m, own, span));
             let (d_alpha, d_own) =
                 share_backward(rule, per_parent, g.as_mut(), l.as_mut(), a.as_mut());
-            l.store(m, &mut self.logits[at..], count);
-            a.store(m, &mut self.areas[at..], count);
+            l.store(m, start(&mut self.logits[at..at + count * k]), count);
+            a.store(m, start(&mut self.areas[at..at + count * k]), count);
             for (v, out) in [(d_alpha, &mut *self.alphas), (d_own, &mut *self.own)] {
                 let mut lanes = [T::default(); WIDTH_MAX];
                 m.store(v, &mut lanes);
-                out[first..first + count].copy_from_slice(&lanes[..count]);
+                start(&mut out[first..first + count]).copy_from_slice(&lanes[..count]);
             }
         }
     }
@@ -388,8 +403,6 @@ pub fn backward<T: LaneReal>(args: Args<T>, grad: &[T]) -> Gradients<T> {
     let one = |block: usize, ((logits, areas), (alphas, own)): Own<T>| {
         let args = args.parents(block * BLOCK, BLOCK);
         let grad = &grad[block * BLOCK * k..];
-        let (logits, areas) = (start(logits), start(areas));
-        let (alphas, own) = (start(alphas), start(own));
         T::dispatch(Backward { args, grad, logits, areas, alphas, own });
     };
     logits

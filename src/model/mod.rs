@@ -134,6 +134,18 @@ pub struct BackboneOutput {
 }
 
 impl BackboneOutput {
+    /// The same numbers, from which no gradient goes back to the backbone.
+    #[must_use]
+    pub fn detach(&self) -> Self {
+        let features = self.features.iter().map(|(level, map)| (*level, map.detach()));
+        Self {
+            raw: self.raw.detach(),
+            depths: self.depths.detach(),
+            densities: self.densities.detach(),
+            features: features.collect(),
+        }
+    }
+
     /// The feature map of `level`.
     ///
     /// # Errors

@@ -4,6 +4,8 @@
 //!
 //! Parameters under `subsplat`: `embed`, `agg`, `geo`, `app`; none with SPGR off.
 
+mod recompute;
+
 use super::aggregation::{Aggregation, Prepared, ring};
 use super::embed::Embeddings;
 use super::geometry::{Frames, ParentChunk};
@@ -175,17 +177,29 @@ impl Trunk {
     ) -> Result<Children> {
         let Some(parts) = &self.parts else { return self.pass_through(views, primaries) };
         let scene = self.scene(parts, views, backbone, primaries)?;
+        let sh = interleaved(&primaries.sh)?;
+        let chunk = if self.backend.is_cpu() { CHUNK } else { CHUNK_GPU };
+        self.children(parts, &scene, (sh, primaries.sh_basis), (chunk, Mode::Infer))
+    }
+
+    /// Children with coefficients `sh` outside any graph, `chunk` parents at a time.
+    fn children(
+        &self,
+        parts: &Parts,
+        scene: &Scene,
+        (sh, sh_basis): (Tensor, ShBasis),
+        (chunk, mode): (usize, Mode),
+    ) -> Result<Children> {
         let (k, lanes) = (scene.rules.children(), scene.rules.gain_lanes());
         let n = scene.means.dim(0)?;
         if scene.means.dtype() != DType::F32 {
-            bail!("primaries: expected f32 at inference, got {:?}", scene.means.dtype());
+            bail!("primaries: expected f32, got {:?}", scene.means.dtype());
         }
         let mut rows = vec![0f32; n * k * SPLAT_LANES];
         let mut gains = vec![0f32; n * k * lanes];
         let mut jobs = Vec::new();
         let (mut rows_left, mut gains_left) = (&mut rows[..], &mut gains[..]);
-        let chunk = if self.backend.is_cpu() { CHUNK } else { CHUNK_GPU };
-        for (first, len) in chunks(n, scene.per_view, chunk) {
+        for (first, len) in chunks(n, scene.per_view, chunk.max(1)) {
             let (r, rest) = rows_left.split_at_mut(len * k * SPLAT_LANES);
             rows_left = rest;
             let (g, rest) = gains_left.split_at_mut(len * k * lanes);
@@ -194,7 +208,7 @@ impl Trunk {
         }
         type Job<'a> = (usize, usize, &'a mut [f32], &'a mut [f32]);
         let run = |(first, len, rows, gains): Job| {
-            let (head, parents) = self.records(parts, &scene, (first, len), Mode::Infer)?;
+            let (head, parents) = self.records(parts, scene, (first, len), mode)?;
             spgr_into_on(&self.backend, &head, &parents, &scene.call(first), (rows, gains))
         };
         match self.backend.is_cpu() {
@@ -206,8 +220,8 @@ impl Trunk {
         Ok(Children {
             rows: Tensor::from_vec(rows, (n * k, SPLAT_LANES), device)?,
             gain: if lanes == 1 { gain } else { gain.reshape((n * k, lanes))? },
-            sh: interleaved(&primaries.sh)?,
-            sh_basis: primaries.sh_basis,
+            sh,
+            sh_basis,
             k,
         })
     }
@@ -350,7 +364,16 @@ impl Trunk {
         (first, len): (usize, usize),
         mode: Mode,
     ) -> Result<(Tensor, Tensor)> {
-        let parents = scene.chunk(first, len)?;
+        self.records_of(parts, scene, scene.chunk(first, len)?, mode)
+    }
+
+    fn records_of(
+        &self,
+        parts: &Parts,
+        scene: &Scene,
+        parents: ParentChunk,
+        mode: Mode,
+    ) -> Result<(Tensor, Tensor)> {
         let (z_g, z_a) = parts.embeddings.forward(&parents, &scene.frames)?;
         let (geo, app) = match (&parts.aggregation, &scene.prepared) {
             (Some(agg), Some(prepared)) => {

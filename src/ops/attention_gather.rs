@@ -6,6 +6,7 @@ use super::{Backend, Number, borrowed, by_dtype, slice};
 use crate::cpu::attention_gather as cpu;
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, DType, Layout, Result, Shape, Storage, Tensor, bail};
+use std::sync::{Arc, Mutex, PoisonError};
 
 pub use cpu::{Drop, Gather, Level};
 
@@ -37,6 +38,58 @@ pub fn attention_gather_on(
     points: &Tensor,
     gather: Gather,
 ) -> Result<Tensor> {
+    attention_gather_deferred(backend, maps, query, points, gather, None)
+}
+
+/// The maps' gradient of calls of [`attention_gather_deferred`], as what each parent adds
+/// to which cells: a chunk of parents sees few of the cells, so that a dense gradient for
+/// every chunk is mostly zeros that are made, added and thrown away.
+#[derive(Clone, Debug, Default)]
+pub struct Deferred(Arc<Mutex<Vec<Part>>>);
+
+/// Of one call.
+#[derive(Debug)]
+struct Part {
+    gather: Gather,
+    scatters: Vec<cpu::Scatter<f32>>,
+    query: Vec<f32>,
+    grad: Vec<f32>,
+}
+
+impl Deferred {
+    /// Adds what the backward passes since the last call found to `maps`
+    /// `[cells, stride]`, and forgets it.
+    ///
+    /// # Errors
+    /// `maps` of another length than the maps had.
+    pub fn add_to(&self, maps: &mut [f32]) -> Result<()> {
+        let parts = std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
+        for part in parts {
+            let Part { gather, scatters, query, grad } = part;
+            let cells = scatters.iter().flat_map(|s| s.cells()).max().map_or(0, |last| last + 1);
+            if maps.len() < cells * gather.stride {
+                let expected = cells * gather.stride;
+                bail!("{NAME} deferred: expected maps of {expected} or more, got {}", maps.len());
+            }
+            cpu::scatter_into(&gather, &scatters, (&query, &grad), maps);
+        }
+        Ok(())
+    }
+}
+
+/// [`attention_gather_on`] whose gradient of the maps goes to `deferred`, where there is
+/// one, instead of candle's graph (f32; then computed on the CPU).
+///
+/// # Errors
+/// Those of [`attention_gather`].
+pub fn attention_gather_deferred(
+    backend: &Backend,
+    maps: &Tensor,
+    query: &Tensor,
+    points: &Tensor,
+    gather: Gather,
+    deferred: Option<&Deferred>,
+) -> Result<Tensor> {
     let g = &gather;
     let rows = query.dim(0)?;
     let level_ends = |l: &Level| l.first_cell + g.views * l.height * l.width;
@@ -65,11 +118,11 @@ pub fn attention_gather_on(
     if points.dims() != expected {
         bail!("{NAME} points: expected {expected:?}, got {:?}", points.dims());
     }
-    let op = AttentionGather(gather, backend.clone());
+    let op = AttentionGather(gather, backend.clone(), deferred.cloned());
     maps.contiguous()?.apply_op3(&query.contiguous()?, &points.contiguous()?, op)
 }
 
-struct AttentionGather(Gather, Backend);
+struct AttentionGather(Gather, Backend, Option<Deferred>);
 
 impl CustomOp3 for AttentionGather {
     fn name(&self) -> &'static str {
@@ -104,6 +157,9 @@ impl CustomOp3 for AttentionGather {
         _: &Tensor,
         grad: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        if let (Some(deferred), DType::F32) = (&self.2, maps.dtype()) {
+            return defer(&self.0, deferred, [maps, query, points, grad]);
+        }
         #[cfg(feature = "gpu")]
         if let Some(done) = gradients_on_gpu(self, [maps, query, points, grad])? {
             return Ok(done);
@@ -129,7 +185,7 @@ fn forward<T: Number>(
 /// [`forward`] on the GPU; `None` where the CPU is to do it.
 #[cfg(feature = "gpu")]
 fn on_gpu(
-    AttentionGather(gather, backend): &AttentionGather,
+    AttentionGather(gather, backend, _): &AttentionGather,
     [maps, query, points]: [(&CpuStorage, &Layout); 3],
 ) -> Result<Option<(CpuStorage, Shape)>> {
     if maps.0.dtype() != DType::F32 {
@@ -147,7 +203,7 @@ fn on_gpu(
 /// [`backward`] on the GPU; `None` where the CPU is to do it.
 #[cfg(feature = "gpu")]
 fn gradients_on_gpu(
-    AttentionGather(gather, backend): &AttentionGather,
+    AttentionGather(gather, backend, _): &AttentionGather,
     [maps, query, points, grad]: [&Tensor; 4],
 ) -> Result<Option<Triple>> {
     if maps.dtype() != DType::F32 {
@@ -170,6 +226,28 @@ fn gradients_on_gpu(
         Some(Tensor::from_vec(d.query, query.dims(), device)?),
         points,
     )))
+}
+
+/// [`backward`] but for the maps' part, which `deferred` keeps.
+fn defer(
+    g: &Gather,
+    deferred: &Deferred,
+    [maps, query, points, grad]: [&Tensor; 4],
+) -> Result<Triple> {
+    let device = maps.device();
+    let grad = grad.contiguous()?;
+    let all = [maps, query, points, &grad];
+    let (part, d_query, d_points) = borrowed::<f32, _, 4>(NAME, all, |[m, q, p, o]| {
+        let (scatters, d_query, d_points) = cpu::factors(g, m, q, p, o);
+        let part = Part { gather: g.clone(), scatters, query: q.to_vec(), grad: o.to_vec() };
+        (part, d_query, d_points)
+    })?;
+    deferred.0.lock().unwrap_or_else(PoisonError::into_inner).push(part);
+    let points = match g.point_gradient {
+        true => Some(Tensor::from_vec(d_points, points.dims(), device)?),
+        false => None,
+    };
+    Ok((None, Some(Tensor::from_vec(d_query, query.dims(), device)?), points))
 }
 
 type Triple = (Option<Tensor>, Option<Tensor>, Option<Tensor>);

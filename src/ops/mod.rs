@@ -15,6 +15,7 @@ pub mod conv3d;
 pub mod direct;
 pub mod dssim;
 pub mod feed_forward;
+pub mod given;
 pub mod join;
 pub mod linear;
 pub mod matching;

@@ -461,6 +461,11 @@ impl TrainConfig {
                 return Err(Error::value("data.files", expected, files.path.display()));
             }
         }
+        let learns_more = self.phase == Phase::Render && config.spgr.enabled;
+        if self.optimizer.freeze_backbone && !learns_more {
+            let expected = "false where nothing but the backbone is learnt";
+            return Err(Error::value("optimizer.freeze_backbone", expected, true));
+        }
         if self.phase == Phase::Depth && !small {
             return Err(Error::value("phase", "`render` for MVSplat's backbone", "depth"));
         }

@@ -6,7 +6,8 @@
 
 use crate::metrics::{SSIM_C1, SSIM_C2, SSIM_COVARIANCE, SSIM_WINDOW, window};
 use crate::ops::dssim;
-use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
+use crate::ops::given::given;
+use candle_core::{Result, Tensor};
 use rayon::prelude::*;
 
 /// A loss and its gradient by one of its arguments.
@@ -40,35 +41,12 @@ impl Scored {
     }
 }
 
-/// A scalar that candle differentiates to what a loss says.
-struct Given(Scored);
-
-impl CustomOp1 for Given {
-    fn name(&self) -> &'static str {
-        "given-loss"
-    }
-
-    fn cpu_fwd(&self, _: &CpuStorage, _: &Layout) -> Result<(CpuStorage, Shape)> {
-        Ok((CpuStorage::F32(vec![self.0.value as f32]), Shape::from(())))
-    }
-
-    fn bwd(&self, x: &Tensor, _: &Tensor, upstream: &Tensor) -> Result<Option<Tensor>> {
-        let by = f64::from(upstream.to_scalar::<f32>()?);
-        let gradient = Tensor::from_slice(&self.0.gradient, x.shape(), x.device())?;
-        Ok(Some(if by == 1.0 { gradient } else { (gradient * by)? }))
-    }
-}
-
 /// The scalar `scored.value` whose derivative by `x` is `scored.gradient`.
 ///
 /// # Errors
 /// A gradient of another length than `x`.
 pub fn with_gradient(x: &Tensor, scored: Scored) -> Result<Tensor> {
-    if scored.gradient.len() != x.elem_count() {
-        let got = scored.gradient.len();
-        bail!("loss: expected a gradient of {} elements, got {got}", x.elem_count());
-    }
-    x.apply_op1(Given(scored))
+    given(x, scored.value, scored.gradient)
 }
 
 /// Mean squared difference of `x` and `target`.

@@ -26,7 +26,8 @@ pub struct Settings {
     pub average: f64,
     /// Factor on the learning rate of the backbone.
     pub backbone_rate: f64,
-    /// The backbone stays as it is.
+    /// The backbone stays as it is: no gradient is sent through it, and its depth losses,
+    /// which could change nothing, are left out.
     pub freeze_backbone: bool,
 }
 
@@ -84,6 +85,12 @@ impl Gradients {
             .map(|c| c.iter().map(|g| f64::from(*g) * f64::from(*g)).sum())
             .collect();
         sums.iter().sum::<f64>().sqrt()
+    }
+
+    /// Adds another sum over the same parameters.
+    pub fn add(&mut self, other: &Self) {
+        self.sum.par_iter_mut().zip(&other.sum).for_each(|(a, b)| *a += b);
+        self.touched.iter_mut().zip(&other.touched).for_each(|(a, b)| *a |= b);
     }
 
     /// All to zero.

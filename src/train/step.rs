@@ -24,9 +24,9 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
-/// Parents that the trunk takes at once while training: few calls, each of which adds to
-/// the gradients of whole feature maps.
-const CHUNK: usize = 16_384;
+/// Parents that the trunk takes back at once: a `[2048, 128]` activation is 1 MiB, a part
+/// of a core's L2 or L3.
+const CHUNK: usize = 2048;
 
 /// Means over the examples of a step; NaN where a step has no such term.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -121,7 +121,7 @@ pub struct Learner {
 }
 
 /// What one group of scenes gave.
-type Found = Result<(GradStore, Terms, Seconds)>;
+type Found = Result<(Gradients, Terms, Seconds)>;
 
 /// Context views of `examples` as the network takes them.
 ///
@@ -208,7 +208,7 @@ impl Learner {
             while let Some(i) =
                 Some(next.fetch_add(1, Ordering::Relaxed)).filter(|i| *i < groups.len())
             {
-                let one = self.group(&groups[i], (share, step));
+                let one = self.group(&groups[i], (share, step), optimizer);
                 *found[i].lock().unwrap_or_else(PoisonError::into_inner) = Some(one);
             }
         };
@@ -222,9 +222,9 @@ impl Learner {
         for (group, one) in groups.iter().zip(found) {
             let one = one.into_inner().unwrap_or_else(PoisonError::into_inner);
             let nothing = || Error::value("step", "a result of every scene", "none");
-            let (store, group_terms, group_seconds) = one.ok_or_else(nothing)??;
+            let (found, group_terms, group_seconds) = one.ok_or_else(nothing)??;
             let start = Instant::now();
-            optimizer.collect(&store, gradients)?;
+            gradients.add(&found);
             seconds.add(&group_seconds);
             seconds.optimizer += start.elapsed().as_secs_f64();
             terms.add(&group_terms, group.len() as f64 / examples.len() as f64);
@@ -233,17 +233,24 @@ impl Learner {
     }
 
     /// Gradients and terms of scenes that pass through the backbone together.
-    fn group(&self, group: &[&Example], (share, step): (f64, u64)) -> Found {
+    fn group(&self, group: &[&Example], (share, step): (f64, u64), optimizer: &Optimizer) -> Found {
         let mut seconds = Seconds::default();
+        let mut gradients = optimizer.gradients();
         let views = views_of(group)?;
         let (total, terms) = match self.config.phase {
             Phase::Depth => self.depth_group(group, &views, share, &mut seconds)?,
-            Phase::Render => self.render_group(group, &views, (share, step), &mut seconds)?,
+            Phase::Render => {
+                let into = (optimizer, &mut gradients);
+                self.render_group(group, &views, (share, step), into, &mut seconds)?
+            }
         };
         let start = Instant::now();
         let store = total.backward()?;
         seconds.backward += start.elapsed().as_secs_f64();
-        Ok((store, terms, seconds))
+        let start = Instant::now();
+        optimizer.collect(&store, &mut gradients)?;
+        seconds.optimizer += start.elapsed().as_secs_f64();
+        Ok((gradients, terms, seconds))
     }
 
     fn depth_group(
@@ -315,36 +322,58 @@ impl Learner {
         group: &[&Example],
         views: &Views,
         (share, step): (f64, u64),
+        (optimizer, gradients): (&Optimizer, &mut Gradients),
         seconds: &mut Seconds,
     ) -> Result<(Tensor, Terms)> {
         let start = Instant::now();
         let (output, maps) = self.model.encode_for_training(views, self.config.loss.around_mode)?;
+        let frozen = self.config.optimizer.freeze_backbone;
+        let output = if frozen { output.detach() } else { output };
         seconds.backbone += start.elapsed().as_secs_f64();
         let (mut parts, mut terms) = (Vec::new(), Terms::default());
         match &maps {
-            Some(maps) => {
+            Some(maps) if !frozen => {
                 let start = Instant::now();
                 let weight = share * group.len() as f64;
                 self.depth_losses(group, maps, weight, &mut parts, &mut terms)?;
                 seconds.loss += start.elapsed().as_secs_f64();
             }
-            None => {
+            _ => {
                 (terms.cross_entropy, terms.disparity, terms.confidence) =
                     (f64::NAN, f64::NAN, f64::NAN);
             }
         }
         for (b, example) in group.iter().enumerate() {
-            let start = Instant::now();
-            let one = scene_of(&output, b)?;
-            let views = views.scene(b)?;
-            let mut settings = self.model.config().primaries().clone();
-            settings.opacity_exponent = self.opacity_exponent(step, settings.opacity_exponent);
-            let parents = packed(&one, &views, &settings)?;
-            let trunk = self.model.trunk();
-            let children = match trunk.is_off() {
-                true => Children::whole(&parents)?,
-                false => trunk.forward_train(&views, &one, &parents.split()?, (CHUNK, step))?,
-            };
+            let scene = (&views.scene(b)?, &scene_of(&output, b)?, *example);
+            let seen = self.render_scene(
+                scene,
+                (share, step),
+                (optimizer, gradients),
+                &mut parts,
+                seconds,
+            )?;
+            terms.add(&seen, 1.0 / group.len() as f64);
+        }
+        Ok((sum(parts)?, terms))
+    }
+
+    /// Renders one scene and takes its loss back as far as the backbone: the trunk's
+    /// gradients go `into` the optimizer's row, what is left of the way to `parts`.
+    fn render_scene(
+        &self,
+        (views, output, example): (&Views, &BackboneOutput, &Example),
+        (share, step): (f64, u64),
+        (optimizer, gradients): (&Optimizer, &mut Gradients),
+        parts: &mut Vec<Tensor>,
+        seconds: &mut Seconds,
+    ) -> Result<Terms> {
+        let start = Instant::now();
+        let mut settings = self.model.config().primaries().clone();
+        settings.opacity_exponent = self.opacity_exponent(step, settings.opacity_exponent);
+        let parents = packed(output, views, &settings)?;
+        let trunk = self.model.trunk();
+        if trunk.is_off() {
+            let children = Children::whole(&parents)?;
             seconds.trunk += start.elapsed().as_secs_f64();
             let start = Instant::now();
             let seen = self.pictures(&children, example)?;
@@ -352,10 +381,22 @@ impl Learner {
             parts.push(with_gradient(&children.rows, rows.scaled(share))?);
             parts.push(with_gradient(&children.sh, sh.scaled(share))?);
             parts.push(with_gradient(&children.gain, gain.scaled(share))?);
-            terms.add(&seen.terms, 1.0 / group.len() as f64);
             seconds.raster += start.elapsed().as_secs_f64();
+            return Ok(seen.terms);
         }
-        Ok((sum(parts)?, terms))
+        let primaries = parents.split()?;
+        let pass = trunk.forward_recomputed(views, output, &primaries, (CHUNK, step))?;
+        seconds.trunk += start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let seen = self.pictures(pass.children(), example)?;
+        let [rows, sh, gain] = seen.gradients.map(|g| g.scaled(share));
+        parts.push(with_gradient(&pass.children().sh, sh)?);
+        seconds.raster += start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let collect = |store: &GradStore| optimizer.collect(store, gradients);
+        parts.extend(pass.backward([&rows.gradient, &gain.gradient], collect)?);
+        seconds.backward += start.elapsed().as_secs_f64();
+        Ok(seen.terms)
     }
 
     /// x of the opacity mapping at `step` (MVSplat, `map_pdf_to_opacity`).

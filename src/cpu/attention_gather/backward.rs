@@ -20,15 +20,22 @@ pub struct Gradients<T> {
     pub points: Vec<T>,
 }
 
-/// What one parent adds to the maps' gradient.
-#[derive(Default)]
-struct Scatter<T> {
+/// The maps' gradient as factors of a block of parents: what is added where.
+#[derive(Clone, Debug, Default)]
+pub struct Scatter<T> {
     /// Parent and cell of each tap.
     taps: Vec<(usize, usize)>,
     /// `[taps, G]`: factor of q in the key channels.
     keys: Vec<T>,
     /// `[taps, G]`: factor of ∂o in the value channels.
     values: Vec<T>,
+}
+
+impl<T> Scatter<T> {
+    /// Cells that are added to, each as often as a parent sees it.
+    pub fn cells(&self) -> impl Iterator<Item = usize> {
+        self.taps.iter().map(|&(_, cell)| cell)
+    }
 }
 
 /// The forward pass' arguments and the gradient `[N, E]` of its result.
@@ -49,6 +56,20 @@ pub fn backward<T: Real>(
     points: &[T],
     grad: &[T],
 ) -> Gradients<T> {
+    let (scatters, d_query, d_points) = factors(g, maps, query, points, grad);
+    let args = Args { g, maps, query, points, grad };
+    Gradients { maps: args.scatter(&scatters), query: d_query, points: d_points }
+}
+
+/// [`backward`] with the maps' gradient as factors, for [`scatter_into`]; gradients of
+/// query and points beside it.
+pub fn factors<T: Real>(
+    g: &Gather,
+    maps: &[T],
+    query: &[T],
+    points: &[T],
+    grad: &[T],
+) -> (Vec<Scatter<T>>, Vec<T>, Vec<T>) {
     let args = Args { g, maps, query, points, grad };
     let mut d_query = vec![T::default(); query.len()];
     let mut d_points = vec![T::default(); points.len()];
@@ -71,7 +92,42 @@ pub fn backward<T: Real>(
             out
         })
         .collect();
-    Gradients { maps: args.scatter(&scatters), query: d_query, points: d_points }
+    (scatters, d_query, d_points)
+}
+
+/// Adds what `scatters` of the call with `query` and `grad` say to `maps`
+/// `[cells, stride]`, on the caller's thread, in the order of parents. Cells that no
+/// parent sees are not touched: of a few parents among many cells, most.
+pub fn scatter_into<T: Real>(
+    g: &Gather,
+    scatters: &[Scatter<T>],
+    (query, grad): (&[T], &[T]),
+    maps: &mut [T],
+) {
+    let (width, q_width) = (g.dim / g.groups, g.query_width());
+    let add = |row: &mut [T], factors: &[T], from: &[T]| {
+        for (i, &factor) in factors.iter().enumerate() {
+            let span = i * width..(i + 1) * width;
+            axpy(&mut row[span.clone()], factor, &from[span]);
+        }
+    };
+    vectorised(
+        #[inline(always)]
+        || {
+            for scatter in scatters {
+                let values = scatter.values.chunks_exact(g.groups);
+                let mut keys = scatter.keys.chunks_exact(g.groups);
+                for (&(n, cell), values) in scatter.taps.iter().zip(values) {
+                    let row = &mut maps[cell * g.stride..(cell + 1) * g.stride];
+                    add(&mut row[g.value..], values, &grad[n * g.dim..(n + 1) * g.dim]);
+                    if let (Some(key), Some(keys)) = (g.key, keys.next()) {
+                        let query = &query[n * q_width..][..g.dim];
+                        add(&mut row[key..], keys, query);
+                    }
+                }
+            }
+        },
+    );
 }
 
 impl<T: Real> Args<'_, T> {

@@ -21,7 +21,7 @@ mod backward;
 mod narrow;
 
 pub use crate::abi::{Drop, Gather, Level};
-pub use backward::{Gradients, backward};
+pub use backward::{Gradients, Scatter, backward, factors, scatter_into};
 
 use super::math::vectorised;
 use super::real::Real;

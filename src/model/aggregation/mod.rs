@@ -20,7 +20,7 @@ use super::mlp::{Mode, xavier};
 use super::{BackboneOutput, Primaries, Views};
 use crate::config::{Aggregation as Keys, FeatureLevel, Gate, MaskMode, Points};
 use crate::ops::Backend;
-use crate::ops::attention_gather::{Level, occlusion_gate};
+use crate::ops::attention_gather::{Deferred, Level, occlusion_gate};
 use crate::ops::moves::channels_last;
 use candle_core::{DType, Result, Tensor, bail};
 use candle_nn::{Linear, Module, VarBuilder};
@@ -49,6 +49,33 @@ pub struct Prepared {
     levels: Vec<Level>,
     /// `[V, H, W]`, where occlusion counts.
     depths: Option<Tensor>,
+    /// Where each stage's gradient of its maps goes; none for candle's graph.
+    deferred: Vec<Deferred>,
+}
+
+impl Prepared {
+    /// The same maps outside any graph, their gradients deferred: stage by stage, geometry
+    /// first, in the order of [`Prepared::maps`].
+    pub fn deferring(&self) -> Self {
+        let detached = |maps: &[Tensor]| maps.iter().map(Tensor::detach).collect();
+        Self {
+            geometry: detached(&self.geometry),
+            appearance: detached(&self.appearance),
+            levels: self.levels.clone(),
+            depths: self.depths.clone(),
+            deferred: self.maps().map(|_| Deferred::default()).collect(),
+        }
+    }
+
+    /// Projected maps of every stage, `[cells, stride]`.
+    pub fn maps(&self) -> impl Iterator<Item = &Tensor> {
+        self.geometry.iter().chain(&self.appearance)
+    }
+
+    /// Gradients that wait, stage by stage; none but of [`Prepared::deferring`].
+    pub fn deferred(&self) -> &[Deferred] {
+        &self.deferred
+    }
 }
 
 /// What all stages of one chunk share.
@@ -62,6 +89,7 @@ struct Shared<'a> {
     levels: &'a [Level],
     mode: Mode,
     backend: &'a Backend,
+    deferred: &'a [Deferred],
 }
 
 impl Aggregation {
@@ -161,7 +189,7 @@ impl Aggregation {
             true => Some(frames.depth_maps(&primaries.means.squeeze(0)?.detach(), views.size()?)?),
             false => None,
         };
-        Ok(Prepared { geometry, appearance, levels, depths })
+        Ok(Prepared { geometry, appearance, levels, depths, deferred: Vec::new() })
     }
 
     fn check_views(&self, v: usize) -> Result<()> {
@@ -215,7 +243,9 @@ impl Aggregation {
             None => None,
         };
         let (levels, backend) = (&prepared.levels, &self.backend);
-        let shared = Shared { parents, frames, centres, occlusion, levels, mode, backend };
+        let deferred = &prepared.deferred;
+        let shared =
+            Shared { parents, frames, centres, occlusion, levels, mode, backend, deferred };
         let mut f_g = z_g.zeros_like()?;
         for (t, (stage, maps)) in self.geometry.iter().zip(&prepared.geometry).enumerate() {
             f_g = stage.forward(&self.keys, &shared, (t, maps), (&f_g, z_g))?;

@@ -7,7 +7,7 @@ use crate::config::{
     SampleConvention, StageNorm,
 };
 use crate::model::mlp::{LayerNorm, Mode, affine, linear, xavier};
-use crate::ops::attention_gather::{Drop, Gather, attention_gather_on};
+use crate::ops::attention_gather::{Drop, Gather, attention_gather_deferred};
 use crate::ops::columns::columns;
 use crate::ops::moves;
 use candle_core::{Result, Tensor};
@@ -133,7 +133,8 @@ impl Stage {
         let points = sample_points(keys, shared, self.learned.as_ref(), (f, &q))?;
         let gather = self.gather(keys, shared, t, q.dim(1)?);
         let query = self.query(keys, shared, &gather, &q)?;
-        let mut o = attention_gather_on(shared.backend, maps, &query, &points, gather)?;
+        let (backend, deferred) = (shared.backend, shared.deferred.get(t));
+        let mut o = attention_gather_deferred(backend, maps, &query, &points, gather, deferred)?;
         if let Some(wo) = &self.wo {
             o = affine(wo, &o)?;
         }
