@@ -110,8 +110,8 @@ pub fn rows_product(lhs: Mat<'_>, rhs: &Packed, base: Base<'_>) -> Vec<f32> {
     let (m, n) = (lhs.rows, rhs.cols);
     lhs.check("operands");
     let mut fresh = Fresh::new(m * n);
-    if n > 0 {
-        let rows = (BLOCK_FLOATS / n).clamp(BLOCK_LEAST, BLOCK);
+    if let Some(rows) = BLOCK_FLOATS.checked_div(n) {
+        let rows = rows.clamp(BLOCK_LEAST, BLOCK);
         let rows = if m <= BLOCK { BLOCK } else { rows };
         fresh.blocks(rows * n).enumerate().for_each(|(i, block)| {
             let dst = start(block);

@@ -59,8 +59,8 @@ pub fn transposed(x: &[f32], rows: usize, cols: usize) -> Vec<f32> {
             let from = Mat { data, rows: size, cols: rows, row_stride: 1, col_stride: cols };
             Tier::best().run(Turn { from, to: start(block) });
         });
-    } else if area > 0 {
-        let size = PART / area * area;
+    } else if let Some(matrices) = PART.checked_div(area) {
+        let size = matrices * area;
         fresh.blocks(size).zip(x.par_chunks(size)).for_each(|(block, x)| {
             let all = start(block).chunks_exact_mut(area).zip(x.chunks_exact(area));
             for (to, data) in all {

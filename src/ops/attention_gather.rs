@@ -168,10 +168,13 @@ impl CustomOp3 for AttentionGather {
     }
 }
 
+/// Maps, query, points and the result, as [`cpu::forward`].
+type Run<T> = fn(&Gather, &[T], &[T], &[T], &mut [T]);
+
 fn forward<T: Number>(
     g: &Gather,
     [maps, query, points]: [(&CpuStorage, &Layout); 3],
-    run: fn(&Gather, &[T], &[T], &[T], &mut [T]),
+    run: Run<T>,
 ) -> Result<(CpuStorage, Shape)> {
     let rows = query.1.dims()[0];
     let maps = slice::<T>(NAME, "maps", maps.0, maps.1)?;

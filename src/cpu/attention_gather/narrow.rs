@@ -3,6 +3,10 @@
 //!
 //! The same formulas as [`super::forward`], which is its oracle in
 //! tests/attention_gather.rs.
+#![expect(
+    clippy::needless_range_loop,
+    reason = "counted loops over registers unroll, iterators over them need not"
+)]
 
 use super::{BLOCK, Gather};
 use crate::cpu::math::exp;
