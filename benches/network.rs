@@ -30,6 +30,10 @@ use subsplat::model::weights::Weights;
 use subsplat::pipeline::{Photo, Reconstructor, Request};
 use subsplat::render::render;
 
+/// As in the program.
+#[global_allocator]
+static PAGES: subsplat::cpu::pages::Pages = subsplat::cpu::pages::Pages;
+
 fn main() -> Result<()> {
     let words: Vec<String> = std::env::args().collect();
     if let Some(at) = words.iter().position(|w| w == "--peak") {

@@ -5,6 +5,9 @@ mod cli;
 
 use std::process::ExitCode;
 
+#[global_allocator]
+static PAGES: subsplat::cpu::pages::Pages = subsplat::cpu::pages::Pages;
+
 fn main() -> ExitCode {
     cli::main()
 }

@@ -6,7 +6,7 @@ use anyhow::{Context, Result};
 use candle_core::{Device, Tensor};
 use std::collections::HashMap;
 use subsplat::model::layers::{self, Activation};
-use subsplat::ops::{attention::attention, join::join, norm};
+use subsplat::ops::{attention::attention, join::join, linear::linear_no_bias, norm};
 
 type Run = fn(&HashMap<String, Tensor>) -> candle_core::Result<Tensor>;
 
@@ -62,12 +62,12 @@ const CASES: [Case; 15] = [
     Case {
         name: "linear 8192x256 to 1024",
         inputs: &[("x", &[8192, 256]), ("w", &[1024, 256])],
-        run: |t| t["x"].matmul(&t["w"].t()?),
+        run: |t| linear_no_bias(&t["x"], &t["w"]),
     },
     Case {
         name: "linear 8192x128 to 128",
         inputs: &[("x", &[8192, 128]), ("w", &[128, 128])],
-        run: |t| t["x"].matmul(&t["w"].t()?),
+        run: |t| linear_no_bias(&t["x"], &t["w"]),
     },
     Case {
         name: "attention 8x1024x128",

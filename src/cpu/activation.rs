@@ -1,6 +1,8 @@
 //! Pointwise functions and softmax over rows, with gradients.
 
-use super::math::{erf, exp, sum_of, vectorised};
+use super::fresh::{Fresh, fill};
+use super::math::{erf, exp, vectorised};
+use super::simd::{Kernel, LANES, Simd, Tier, exp as exp_lanes};
 use rayon::prelude::*;
 
 /// Elements per task: long enough to hide the scheduling, short enough to balance.
@@ -165,39 +167,78 @@ fn scale(x: &[f32], dy: &[f32], dx: &mut [f32], f: impl Fn(f32) -> f32) {
     }
 }
 
-/// One row to e^{x − max}; returns the sum. To be called inside `vectorised`.
+/// Elements whose exponentials are one sum in single precision.
+const SUM: usize = 4096;
+
+/// A row to e^{x − max}; returns the sum. To be called inside a kernel.
 #[inline(always)]
-pub(super) fn exp_row(row: &mut [f32]) -> f32 {
-    let mut lanes = [f32::NEG_INFINITY; 16];
-    let chunks = row.chunks_exact(16);
-    let tail = chunks.remainder().iter().fold(f32::NEG_INFINITY, |m, &v| m.max(v));
-    for c in chunks {
-        for i in 0..16 {
-            lanes[i] = if c[i] > lanes[i] { c[i] } else { lanes[i] };
+pub(super) fn exp_row<S: Simd>(s: S, row: &mut [f32]) -> f32 {
+    let mut top = s.splat(f32::NEG_INFINITY);
+    let (chunks, tail) = row.as_chunks::<LANES>();
+    for v in chunks {
+        top = s.max(s.load(v), top);
+    }
+    let mut last = [f32::NEG_INFINITY; LANES];
+    last[..tail.len()].copy_from_slice(tail);
+    top = s.max(s.load(&last), top);
+    let mut lanes = [0.0; LANES];
+    s.store(top, &mut lanes);
+    let max = lanes.iter().fold(f32::NEG_INFINITY, |m, &v| if v > m { v } else { m });
+    let (max, mut total) = (s.splat(max), 0.0);
+    for part in row.chunks_mut(SUM) {
+        let (chunks, tail) = part.as_chunks_mut::<LANES>();
+        let mut sum = s.splat(0.0);
+        for v in chunks {
+            let e = exp_lanes(s, s.load(v) - max);
+            sum = sum + e;
+            s.store(e, v);
         }
+        if !tail.is_empty() {
+            let mut last = [f32::NEG_INFINITY; LANES];
+            last[..tail.len()].copy_from_slice(tail);
+            let e = exp_lanes(s, s.load(&last) - max);
+            sum = sum + e;
+            s.store(e, &mut last);
+            tail.copy_from_slice(&last[..tail.len()]);
+        }
+        total += f64::from(s.sum(sum));
     }
-    let max = lanes.iter().fold(tail, |m, &v| m.max(v));
-    for v in row.iter_mut() {
-        *v = exp(*v - max);
-    }
-    sum_of(row, |v| v) as f32
+    total as f32
 }
 
-/// Softmax of every row of `x` `[rows, n]`.
-pub fn softmax(n: usize, x: &[f32], y: &mut [f32]) {
-    let rows = CHUNK.div_ceil(n.max(1));
-    x.par_chunks(rows * n.max(1)).zip(y.par_chunks_mut(rows * n.max(1))).for_each(|(x, y)| {
-        y.copy_from_slice(x);
-        vectorised(
-            #[inline(always)]
-            || {
-                for row in y.chunks_exact_mut(n) {
-                    let inverse = 1.0 / exp_row(row);
-                    row.iter_mut().for_each(|v| *v *= inverse);
-                }
-            },
-        );
+/// Softmax of every row of `x` `[rows, n]`, new memory.
+pub fn softmax(n: usize, x: &[f32]) -> Vec<f32> {
+    let chunk = CHUNK.div_ceil(n.max(1)) * n.max(1);
+    let mut fresh = Fresh::new(x.len());
+    fresh.blocks(chunk).zip(x.par_chunks(chunk)).for_each(|(block, x)| {
+        // A few rows at a time stay in the first-level cache.
+        let few = (SUM / n.max(1)).max(1) * n.max(1);
+        for (block, x) in block.chunks_mut(few).zip(x.chunks(few)) {
+            let y = fill(block, x);
+            Tier::best().run(Softmax { n, y });
+        }
     });
+    // SAFETY: the loop above filled every block.
+    unsafe { fresh.finish() }
+}
+
+struct Softmax<'a> {
+    n: usize,
+    y: &'a mut [f32],
+}
+
+impl Kernel for Softmax<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        for row in self.y.chunks_exact_mut(self.n) {
+            let inverse = 1.0 / exp_row(s, row);
+            for v in row {
+                *v *= inverse;
+            }
+        }
+    }
 }
 
 /// dx = y·(dy − Σ y·dy) row by row, y the softmax.

@@ -6,8 +6,9 @@
 //! of query and key differ (Swin's shifted windows; MVSplat section 2).
 
 use super::activation::exp_row;
-use super::gemm::{Mat, gemm};
-use super::math::{dot, vectorised};
+use super::gemm::{Base, Mat, Packed, gemm, product};
+use super::math::dot;
+use super::simd::{Kernel, Simd, Tier};
 use rayon::prelude::*;
 
 /// Added to the logit of a masked pair: −100, not −∞ (Swin).
@@ -51,30 +52,48 @@ impl Attention {
 
     /// Row `r`, queries from `first`: e^{logit − max} in `p` `[rows, M]`, and 1/Σ of
     /// every row.
-    fn weights(&self, r: usize, first: usize, q: &[f32], k: &[f32], p: &mut [f32]) -> Vec<f32> {
+    fn weights(
+        &self,
+        (r, first): (usize, usize),
+        q: &[f32],
+        k: &Packed,
+        p: &mut [f32],
+    ) -> Vec<f32> {
         let (rows, m, d) = (p.len() / self.keys, self.keys, self.width);
-        gemm(p, m, Mat::new(q, rows, d, d), Mat::new(k, m, d, d).t(), self.scale, false);
+        product((p, m), Mat::new(q, rows, d, d), k, self.scale, Base::Zero);
         let labels = self.labels.as_ref().map(|l| {
             let w = r % l.windows;
             let queries = &l.queries[w * self.queries + first..][..rows];
             (queries, &l.keys[w * m..(w + 1) * m])
         });
-        vectorised(
-            #[inline(always)]
-            || {
-                let mut inverse = Vec::with_capacity(rows);
-                for (i, row) in p.chunks_exact_mut(m).enumerate() {
-                    if let Some((queries, keys)) = labels {
-                        let own = queries[i];
-                        for (x, &label) in row.iter_mut().zip(keys) {
-                            *x += if label == own { 0.0 } else { PENALTY };
-                        }
-                    }
-                    inverse.push(1.0 / exp_row(row));
+        Tier::best().run(Weigh { p, keys: m, labels })
+    }
+}
+
+/// Logits to weights, row by row.
+struct Weigh<'a> {
+    p: &'a mut [f32],
+    keys: usize,
+    /// Of the rows, and of the keys.
+    labels: Option<(&'a [u8], &'a [u8])>,
+}
+
+impl Kernel for Weigh<'_> {
+    type Output = Vec<f32>;
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) -> Vec<f32> {
+        let mut inverse = Vec::with_capacity(self.p.len() / self.keys);
+        for (i, row) in self.p.chunks_exact_mut(self.keys).enumerate() {
+            if let Some((queries, keys)) = self.labels {
+                let own = queries[i];
+                for (x, &label) in row.iter_mut().zip(keys) {
+                    *x += if label == own { 0.0 } else { PENALTY };
                 }
-                inverse
-            },
-        )
+            }
+            inverse.push(1.0 / exp_row(s, row));
+        }
+        inverse
     }
 }
 
@@ -86,6 +105,12 @@ pub fn forward(a: &Attention, q: &[f32], k: &[f32], v: &[f32], out: &mut [f32]) 
         return;
     }
     let block = a.block();
+    let pack = |r: usize| {
+        let k = Mat::new(&k[r * m * d..(r + 1) * m * d], m, d, d).t();
+        let v = Mat::new(&v[r * m * e..(r + 1) * m * e], m, e, e);
+        (Packed::new(k), Packed::new(v))
+    };
+    let packed: Vec<_> = (0..out.len() / (l * e)).into_par_iter().map(pack).collect();
     let jobs: Vec<(usize, usize, &mut [f32])> = out
         .chunks_exact_mut(l * e)
         .enumerate()
@@ -97,9 +122,9 @@ pub fn forward(a: &Attention, q: &[f32], k: &[f32], v: &[f32], out: &mut [f32]) 
         let rows = part.len() / e;
         p.resize(rows * m, 0.0);
         let q = &q[(r * l + first) * d..][..rows * d];
-        let inverse = a.weights(r, first, q, &k[r * m * d..(r + 1) * m * d], p);
-        let v = Mat::new(&v[r * m * e..(r + 1) * m * e], m, e, e);
-        gemm(part, e, Mat::new(p, rows, m, m), v, 1.0, false);
+        let (k, v) = &packed[r];
+        let inverse = a.weights((r, first), q, k, p);
+        product((part, e), Mat::new(p, rows, m, m), v, 1.0, Base::Zero);
         for (row, inverse) in part.chunks_exact_mut(e).zip(inverse) {
             row.iter_mut().for_each(|x| *x *= inverse);
         }
@@ -135,6 +160,8 @@ pub fn backward(a: &Attention, s: &Saved<'_>) -> (Vec<f32>, Vec<f32>, Vec<f32>) 
         .zip(dv.par_chunks_exact_mut(m * e));
     grads.enumerate().for_each(|(r, ((dq, dk), dv))| {
         let (k, v) = (&s.k[r * m * d..(r + 1) * m * d], &s.v[r * m * e..(r + 1) * m * e]);
+        let packed = Packed::new(Mat::new(k, m, d, d).t());
+        let values = Packed::new(Mat::new(v, m, e, e).t());
         let (mut p, mut ds) = (Vec::new(), Vec::new());
         for first in (0..l).step_by(a.block()) {
             let rows = a.block().min(l - first);
@@ -143,9 +170,9 @@ pub fn backward(a: &Attention, s: &Saved<'_>) -> (Vec<f32>, Vec<f32>, Vec<f32>) 
             let q = &s.q[(r * l + first) * d..][..rows * d];
             let grad = &s.grad[(r * l + first) * e..][..rows * e];
             let out = &s.out[(r * l + first) * e..][..rows * e];
-            let inverse = a.weights(r, first, q, k, &mut p);
+            let inverse = a.weights((r, first), q, &packed, &mut p);
             // dS = P·(dO·Vᵀ − dO·O).
-            gemm(&mut ds, m, Mat::new(grad, rows, e, e), Mat::new(v, m, e, e).t(), 1.0, false);
+            product((&mut ds, m), Mat::new(grad, rows, e, e), &values, 1.0, Base::Zero);
             for (i, (p, ds)) in p.chunks_exact_mut(m).zip(ds.chunks_exact_mut(m)).enumerate() {
                 let own = dot(&grad[i * e..(i + 1) * e], &out[i * e..(i + 1) * e]);
                 for (p, ds) in p.iter_mut().zip(ds) {

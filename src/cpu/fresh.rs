@@ -45,9 +45,50 @@ pub(crate) fn start<T: Copy + Default>(block: &mut Block<T>) -> &mut [T] {
     unsafe { &mut *(block as *mut Block<T> as *mut [T]) }
 }
 
+/// A block with the numbers of `from`, which is as long.
+///
+/// # Panics
+/// Where it is not.
+#[inline]
+pub(crate) fn fill<'a, T: Copy>(block: &'a mut Block<T>, from: &[T]) -> &'a mut [T] {
+    assert_eq!(block.len(), from.len(), "fresh block: lengths");
+    for (to, from) in block.iter_mut().zip(from) {
+        *to = MaybeUninit::new(*from);
+    }
+    // SAFETY: every place was just written.
+    unsafe { &mut *(block as *mut Block<T> as *mut [T]) }
+}
+
+/// Numbers below which [`zeros`] is not worth several threads.
+const SMALL: usize = 1 << 17;
+/// Numbers a task.
+const PART: usize = 1 << 16;
+
+/// `n` zeros, written by all threads where there are many: memory that was used before
+/// is to be cleared, new memory to be faulted in.
+pub fn zeros(n: usize) -> Vec<f32> {
+    if n < SMALL {
+        return vec![0.0; n];
+    }
+    let mut fresh = Fresh::new(n);
+    fresh.blocks(PART).for_each(|block| {
+        start::<f32>(block);
+    });
+    // SAFETY: the line above started every block.
+    unsafe { fresh.finish() }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn zeros_are_zeros() {
+        for n in [0, 5, SMALL, SMALL + PART + 3] {
+            drop(vec![1f32; n]);
+            assert_eq!(zeros(n), vec![0.0; n]);
+        }
+    }
 
     #[test]
     fn blocks_make_the_whole() {

@@ -1,56 +1,82 @@
-//! Matrix product on slices: the safe face of the `gemm` crate, one thread.
+//! Matrix product on slices: own register tiles on [`super::simd`], the
+//! right factor packed once and used by any number of callers.
 //!
-//! Callers parallelise over tiles themselves, so that the packed operands stay in
-//! each core's own cache.
+//! Callers parallelise over blocks of rows themselves. A result is a sum over k in
+//! order, in parts of [`DEPTH`], whatever the block of rows that it is computed with:
+//! how rows are cut into tasks does not show, and fused tiers agree to the byte.
+//! Oracle: three loops in f64 (the tests).
 
-/// A matrix inside a slice, any strides.
-#[derive(Clone, Copy)]
-pub struct Mat<'a> {
-    /// Storage; element (i, j) is `data[i * row_stride + j * col_stride]`.
-    pub data: &'a [f32],
-    /// Rows.
-    pub rows: usize,
-    /// Columns.
-    pub cols: usize,
-    /// Distance between rows, elements.
-    pub row_stride: usize,
-    /// Distance between columns, elements.
-    pub col_stride: usize,
+mod packed;
+#[cfg(test)]
+mod tests;
+mod tile;
+
+use super::fresh::{Fresh, start};
+use super::simd::{Kernel, LANES, Simd, Tier};
+pub(super) use packed::copy;
+pub use packed::{Mat, Packed};
+use rayon::prelude::*;
+use std::cell::RefCell;
+use tile::{Part, rows};
+
+/// Columns of a full panel of the right factor: four vectors.
+const PANEL: usize = 4 * LANES;
+/// Products of one sum in registers: 128 · 64 floats of a panel are 32 KiB, which stay
+/// in the first-level cache while the rows of the left factor pass.
+const DEPTH: usize = 128;
+/// Rows this many floats apart (4 KiB) lie in one set of the first-level cache, where
+/// they put one another and the panel out.
+const ALIAS: usize = 1024;
+
+/// What a product is added to.
+#[derive(Clone, Copy, Debug)]
+pub enum Base<'a> {
+    /// Nothing.
+    Zero,
+    /// What the destination holds.
+    Own,
+    /// One number a column.
+    Row(&'a [f32]),
 }
 
-impl<'a> Mat<'a> {
-    /// Row-major matrix whose rows lie `row_stride` elements apart.
-    pub fn new(data: &'a [f32], rows: usize, cols: usize, row_stride: usize) -> Self {
-        Self { data, rows, cols, row_stride, col_stride: 1 }
-    }
-
-    /// The transposed view.
-    #[must_use]
-    pub fn t(self) -> Self {
-        Self {
-            rows: self.cols,
-            cols: self.rows,
-            row_stride: self.col_stride,
-            col_stride: self.row_stride,
-            ..self
-        }
-    }
-
-    /// One past the last element touched.
-    fn extent(&self) -> usize {
-        if self.rows == 0 || self.cols == 0 {
-            return 0;
-        }
-        (self.rows - 1) * self.row_stride + (self.cols - 1) * self.col_stride + 1
-    }
-}
-
-/// `dst = scale · lhs · rhs`, or `dst += …` with `accumulate`. `dst` is row-major,
-/// its rows `row_stride` elements apart.
+/// `dst = base + scale · lhs · rhs`. `dst` is row-major, its rows `row_stride` elements
+/// apart.
 ///
 /// # Panics
-/// Where a matrix reaches past its slice or the inner sizes differ: the bounds
-/// check that makes the call below sound.
+/// Where a matrix reaches past its slice or the sizes differ: the bounds check that the
+/// kernel rests on.
+pub fn product(dst: (&mut [f32], usize), lhs: Mat<'_>, rhs: &Packed, scale: f32, base: Base<'_>) {
+    product_on(Tier::best(), dst, lhs, rhs, scale, base);
+}
+
+/// [`product`] compiled for `tier`.
+pub(crate) fn product_on(
+    tier: Tier,
+    (dst, row_stride): (&mut [f32], usize),
+    lhs: Mat<'_>,
+    rhs: &Packed,
+    scale: f32,
+    base: Base<'_>,
+) {
+    let (m, k, n) = (lhs.rows, lhs.cols, rhs.cols);
+    assert_eq!(k, rhs.depth, "gemm: inner sizes");
+    lhs.check("operands");
+    if m == 0 || n == 0 {
+        return;
+    }
+    assert!(row_stride >= n && (m - 1) * row_stride + n <= dst.len(), "gemm: destination");
+    assert!(rhs.data.len() == k * n.next_multiple_of(LANES), "gemm: panels");
+    if let Base::Row(row) = base {
+        assert_eq!(row.len(), n, "gemm: row");
+    }
+    tier.run(Product { dst, row_stride, lhs, rhs, scale, base });
+}
+
+/// `dst = scale · lhs · rhs`, or `dst += …` with `accumulate`: [`product`] with a right
+/// factor that is used once.
+///
+/// # Panics
+/// As [`product`].
 pub fn gemm(
     dst: &mut [f32],
     row_stride: usize,
@@ -59,66 +85,109 @@ pub fn gemm(
     scale: f32,
     accumulate: bool,
 ) {
-    let (m, k, n) = (lhs.rows, lhs.cols, rhs.cols);
-    assert_eq!(k, rhs.rows, "gemm: inner sizes");
-    assert!(lhs.extent() <= lhs.data.len() && rhs.extent() <= rhs.data.len(), "gemm: operands");
-    if m == 0 || n == 0 {
-        return;
+    thread_local! {
+        static PACKED: RefCell<Packed> = RefCell::default();
     }
-    assert!(row_stride >= n && (m - 1) * row_stride + n <= dst.len(), "gemm: destination");
-    // SAFETY: every element that the product reads or writes lies inside its slice
-    // (asserted above), `dst` is borrowed exclusively, and its rows do not overlap.
-    #[allow(unsafe_code, reason = "the gemm crate takes raw pointers")]
-    unsafe {
-        gemm::gemm(
-            m,
-            n,
-            k,
-            dst.as_mut_ptr(),
-            1,
-            row_stride as isize,
-            accumulate,
-            lhs.data.as_ptr(),
-            lhs.col_stride as isize,
-            lhs.row_stride as isize,
-            rhs.data.as_ptr(),
-            rhs.col_stride as isize,
-            rhs.row_stride as isize,
-            1.0,
-            scale,
-            false,
-            false,
-            false,
-            gemm::Parallelism::None,
-        );
-    }
+    let base = if accumulate { Base::Own } else { Base::Zero };
+    PACKED.with_borrow_mut(|packed| {
+        packed.fill(rhs);
+        product((dst, row_stride), lhs, packed, scale, base);
+    });
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
+/// Rows of a task of [`rows_product`]: a chunk of the trunk's parents is one.
+const BLOCK: usize = 256;
+/// Least rows of a task, and floats of its result beyond which it has fewer rows.
+const BLOCK_LEAST: usize = 48;
+const BLOCK_FLOATS: usize = 1 << 16;
 
-    #[test]
-    fn agrees_with_three_loops() {
-        let (m, k, n) = (7, 13, 9);
-        let a: Vec<f32> = (0..m * k).map(|i| (i as f32 * 0.7).sin()).collect();
-        let b: Vec<f32> = (0..k * n).map(|i| (i as f32 * 0.3).cos()).collect();
-        let mut dst = vec![1.0; m * (n + 2)];
-        gemm(&mut dst, n + 2, Mat::new(&a, m, k, k), Mat::new(&b, k, n, n), 2.0, true);
-        for i in 0..m {
-            for j in 0..n + 2 {
-                let dot: f32 =
-                    (0..k).map(|x| if j < n { a[i * k + x] * b[x * n + j] } else { 0.0 }).sum();
-                let v = dst[i * (n + 2) + j];
-                assert!((v - 1.0 - 2.0 * dot).abs() < 1e-5, "{i} {j}: {v}");
+/// `base + lhs · rhs` into new memory, row-major, blocks of rows in parallel; up to
+/// [`BLOCK`] rows on the caller's thread.
+///
+/// # Panics
+/// As [`product`].
+pub fn rows_product(lhs: Mat<'_>, rhs: &Packed, base: Base<'_>) -> Vec<f32> {
+    let (m, n) = (lhs.rows, rhs.cols);
+    lhs.check("operands");
+    let mut fresh = Fresh::new(m * n);
+    if let Some(rows) = BLOCK_FLOATS.checked_div(n) {
+        let rows = rows.clamp(BLOCK_LEAST, BLOCK);
+        let rows = if m <= BLOCK { BLOCK } else { rows };
+        fresh.blocks(rows * n).enumerate().for_each(|(i, block)| {
+            let dst = start(block);
+            let lhs = Mat {
+                data: &lhs.data[(i * rows * lhs.row_stride).min(lhs.data.len())..],
+                rows: dst.len() / n,
+                ..lhs
+            };
+            product((dst, n), lhs, rhs, 1.0, base);
+        });
+    }
+    // SAFETY: the loop above started every block; without columns there is none.
+    unsafe { fresh.finish() }
+}
+
+struct Product<'a> {
+    dst: &'a mut [f32],
+    row_stride: usize,
+    lhs: Mat<'a>,
+    rhs: &'a Packed,
+    scale: f32,
+    base: Base<'a>,
+}
+
+impl Kernel for Product<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        let (m, k, n) = (self.lhs.rows, self.lhs.cols, self.rhs.cols);
+        let mut turned = Vec::new();
+        let mut first = 0;
+        loop {
+            let depth = DEPTH.min(k - first);
+            let mut lhs = Mat { cols: depth, ..self.lhs };
+            // An empty part is there for the base alone.
+            lhs.data = if depth == 0 { &[] } else { &lhs.data[first * lhs.col_stride..] };
+            if lhs.col_stride != 1 || (lhs.row_stride.is_multiple_of(ALIAS) && n > PANEL) {
+                turned.resize(m * depth, 0.0);
+                copy(s, lhs, depth, &mut turned);
+                lhs = Mat::new(&turned, m, depth, depth);
+            }
+            for j in (0..n).step_by(PANEL) {
+                let width = (n - j).next_multiple_of(LANES).min(PANEL);
+                let mut start = [0.0; PANEL];
+                let base = match self.base {
+                    Base::Own => None,
+                    _ if first > 0 => None,
+                    Base::Zero => Some(start.as_ptr()),
+                    Base::Row(row) => {
+                        let row = &row[j..(j + PANEL).min(n)];
+                        start[..row.len()].copy_from_slice(row);
+                        Some(start.as_ptr())
+                    }
+                };
+                let part = Part {
+                    a: lhs.data.as_ptr(),
+                    a_stride: lhs.row_stride,
+                    b: self.rhs.data[j * k + first * width..].as_ptr(),
+                    depth,
+                    dst: self.dst[j..].as_mut_ptr(),
+                    dst_stride: self.row_stride,
+                    cols: (n - j).min(PANEL),
+                    scale: self.scale,
+                    base,
+                };
+                // SAFETY: rows 0..m of `lhs` (checked, or just copied), columns
+                // j..j + cols of `dst` (checked) and `depth` rows of a panel `width`
+                // wide (checked) lie inside their slices; `dst` is borrowed
+                // exclusively; `base` points at PANEL floats that outlive the call.
+                unsafe { rows(s, part, m, width) };
+            }
+            first += depth;
+            if first >= k {
+                break;
             }
         }
-    }
-
-    #[test]
-    #[should_panic(expected = "gemm: destination")]
-    fn short_destination_is_refused() {
-        let a = [1.0; 4];
-        gemm(&mut [0.0; 3], 2, Mat::new(&a, 2, 2, 2), Mat::new(&a, 2, 2, 2), 1.0, false);
     }
 }

@@ -1,6 +1,8 @@
 //! Channels of one map beside those of a coarser one, each coarse pixel repeated.
 
+use super::fresh::{Block, Fresh, fill};
 use rayon::prelude::*;
+use std::mem::MaybeUninit;
 
 /// Sizes: `[B, C₁, h, w]` beside `[B, C₂, h/s, w/s]` gives `[B, C₁ + C₂, h, w]`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -19,27 +21,53 @@ impl Join {
     }
 }
 
-/// Both maps into `y`.
-pub fn forward(j: &Join, fine: &[f32], coarse: &[f32], y: &mut [f32]) {
+/// Both maps of `batch` pictures, new memory.
+pub fn forward(j: &Join, batch: usize, fine: &[f32], coarse: &[f32]) -> Vec<f32> {
     let (n, [c1, c2], s, w) = (j.plane(), j.channels, j.repeat, j.size[1]);
     let small = n / (s * s);
-    y.par_chunks_exact_mut(n).enumerate().for_each(|(i, y)| {
+    let mut fresh = Fresh::new(batch * (c1 + c2) * n);
+    fresh.blocks(n).enumerate().for_each(|(i, y)| {
         let (b, c) = (i / (c1 + c2), i % (c1 + c2));
         if c < c1 {
-            return y.copy_from_slice(&fine[(b * c1 + c) * n..][..n]);
-        }
-        let x = &coarse[(b * c2 + c - c1) * small..][..small];
-        if s == 1 {
-            return y.copy_from_slice(x);
-        }
-        for (x, y) in x.chunks_exact(w / s).zip(y.chunks_exact_mut(s * w)) {
-            let (first, others) = y.split_at_mut(w);
-            for (x, y) in x.iter().zip(first.chunks_exact_mut(s)) {
-                y.fill(*x);
-            }
-            others.chunks_exact_mut(w).for_each(|row| row.copy_from_slice(first));
+            fill(y, &fine[(b * c1 + c) * n..][..n]);
+        } else {
+            repeat(&coarse[(b * c2 + c - c1) * small..][..small], w, s, y);
         }
     });
+    // SAFETY: the loop above filled every block.
+    unsafe { fresh.finish() }
+}
+
+/// A plane of which every pixel is repeated `s` × `s` times into one `w` wide.
+///
+/// # Panics
+/// Where the sizes do not fit: the block is then not all written.
+pub(super) fn repeat(x: &[f32], w: usize, s: usize, y: &mut Block<f32>) {
+    assert!(x.len() * s * s == y.len() && y.len().is_multiple_of(w * s) && w.is_multiple_of(s));
+    if s == 1 {
+        fill(y, x);
+        return;
+    }
+    for (x, y) in x.chunks_exact(w / s).zip(y.chunks_exact_mut(s * w)) {
+        let (first, others) = y.split_at_mut(w);
+        match s {
+            2 => spread::<2>(x, first),
+            4 => spread::<4>(x, first),
+            _ => {
+                for (x, y) in x.iter().zip(first.chunks_exact_mut(s)) {
+                    y.fill(MaybeUninit::new(*x));
+                }
+            }
+        }
+        others.chunks_exact_mut(w).for_each(|row| row.copy_from_slice(first));
+    }
+}
+
+/// Each number S times; a count that is known makes it shuffles of vectors.
+fn spread<const S: usize>(x: &[f32], y: &mut Block<f32>) {
+    for (x, y) in x.iter().zip(y.as_chunks_mut::<S>().0) {
+        *y = [MaybeUninit::new(*x); S];
+    }
 }
 
 /// The fine map's gradient.

@@ -2,6 +2,8 @@
 //! nearest upsampling by a whole factor, with their transposes (the gradients).
 
 use super::activation::{self, Activation};
+use super::fresh::Fresh;
+use super::join::repeat;
 use super::math::vectorised;
 use rayon::prelude::*;
 
@@ -135,18 +137,15 @@ pub fn bilinear_transposed(r: &Resize, dy: &[f32], dx: &mut [f32]) {
         .for_each_init(Vec::new, |wide, (dx, dy)| one.transposed(dy, dx, wide));
 }
 
-/// Every pixel repeated `s` × `s` times; `to` = `s`·`from`.
-pub fn nearest(r: &Resize, s: usize, x: &[f32], y: &mut [f32]) {
+/// Every pixel repeated `s` × `s` times, new memory; `to` = `s`·`from`.
+pub fn nearest(r: &Resize, s: usize, x: &[f32]) -> Vec<f32> {
     let ([h, w], [to_h, to_w]) = (r.from, r.to);
-    x.par_chunks_exact(h * w).zip(y.par_chunks_exact_mut(to_h * to_w)).for_each(|(x, y)| {
-        for (x, y) in x.chunks_exact(w).zip(y.chunks_exact_mut(s * to_w)) {
-            for row in y.chunks_exact_mut(to_w) {
-                for (x, y) in x.iter().zip(row.chunks_exact_mut(s)) {
-                    y.fill(*x);
-                }
-            }
-        }
-    });
+    let mut fresh = Fresh::new(x.len() / (h * w) * to_h * to_w);
+    let planes = x.par_chunks_exact(h * w).zip(fresh.blocks(to_h * to_w));
+    planes.for_each(|(x, y)| repeat(x, to_w, s, y));
+    // SAFETY: the loop above wrote every block: there is one for each plane of `x`, and
+    // `repeat` panics where it does not write all of one.
+    unsafe { fresh.finish() }
 }
 
 /// The transpose of [`nearest`]: sums of `s` × `s` blocks, `dx` overwritten.

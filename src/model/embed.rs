@@ -9,6 +9,7 @@ use super::geometry::{Frames, ParentChunk, canonical};
 use super::mlp::{Block2, LayerNorm, affine, gelu, linear, xavier};
 use crate::config::{AlphaInput, AnchorFrame, Embed, EmbedMlp, MuInput, ScaleInput};
 use crate::ops::attributes::{Attributes, attributes};
+use crate::ops::moves;
 use candle_core::{Result, Tensor};
 use candle_nn::{Linear, VarBuilder};
 
@@ -157,7 +158,8 @@ impl Embeddings {
                 let mut sum = geometry[0].forward(&all.narrow(1, 0, WIDTHS[0].1)?)?;
                 let mut first = WIDTHS[0].1;
                 for (block, (_, width)) in geometry.iter().zip(WIDTHS).skip(1) {
-                    sum = sum.add(&block.forward(&all.narrow(1, first, width)?)?)?;
+                    let next = block.forward(&all.narrow(1, first, width)?)?;
+                    sum = moves::sum(&sum, &next)?;
                     first += width;
                 }
                 Ok((affine(w_g, &sum)?, colour.forward(&parents.sh)?))

@@ -5,7 +5,7 @@ use crate::model::mlp::xavier;
 pub use crate::ops::activation::Activation;
 use crate::ops::activation::activation;
 use crate::ops::conv2d::conv2d;
-use crate::ops::norm;
+use crate::ops::{self, norm};
 use candle_core::{Result, Tensor, bail};
 use candle_nn::{Init, VarBuilder};
 
@@ -142,6 +142,11 @@ impl Linear {
         Ok(Self { weight, bias })
     }
 
+    /// `[O, C]`.
+    pub(crate) fn weight(&self) -> &Tensor {
+        &self.weight
+    }
+
     /// `[…, C]` to `[…, O]`.
     ///
     /// # Errors
@@ -152,10 +157,10 @@ impl Linear {
         if dims.last() != Some(&c) {
             bail!("linear: expected x [.., {c}], got {:?}", x.dims());
         }
-        let y = x.contiguous()?.reshape(((), c))?.matmul(&self.weight.t()?)?;
+        let x = x.contiguous()?.reshape(((), c))?;
         let y = match &self.bias {
-            Some(bias) => y.broadcast_add(bias)?,
-            None => y,
+            Some(bias) => ops::linear::linear(&x, &self.weight, bias)?,
+            None => ops::linear::linear_no_bias(&x, &self.weight)?,
         };
         if let Some(last) = dims.last_mut() {
             *last = o;
@@ -252,6 +257,11 @@ impl LayerNorm {
             weight: vb.get_with_hints(width, "weight", Init::Const(1.0))?,
             bias: vb.get_with_hints(width, "bias", Init::Const(0.0))?,
         })
+    }
+
+    /// Scale and shift, `[C]` each.
+    pub(crate) fn parameters(&self) -> [&Tensor; 2] {
+        [&self.weight, &self.bias]
     }
 
     /// `[…, C]` to the same shape.

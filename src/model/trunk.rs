@@ -17,6 +17,7 @@ use crate::abi::{RasterOptions, SPLAT_LANES, ShBasis, sh_coefficients};
 use crate::camera::Camera;
 use crate::config::{Config, FeatureLevel, HeadInput, ShInput, SpgrHead};
 use crate::ops::direct::{Footprint, rasterize_footprints, spgr_footprints};
+use crate::ops::moves::sum;
 use crate::ops::spgr::{Rules, Spgr, spgr_into_on, spgr_on};
 use crate::ops::{Backend, rasterize_on};
 use crate::splats::Splats;
@@ -379,7 +380,7 @@ impl Trunk {
                 let z = (&z_g, &z_a);
                 let (f_g, f_a) = agg.forward(prepared, &parents, &scene.frames, z, mode)?;
                 match self.config.agg.resolved().head_input {
-                    HeadInput::FPlusZ => (f_g.add(&z_g)?, f_a.add(&z_a)?),
+                    HeadInput::FPlusZ => (sum(&f_g, &z_g)?, sum(&f_a, &z_a)?),
                     HeadInput::F => (f_g, f_a),
                 }
             }

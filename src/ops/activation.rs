@@ -4,6 +4,7 @@
 use super::{borrowed, output, slice, tensor_like};
 use crate::cpu::activation as cpu;
 pub use crate::cpu::activation::Activation;
+use crate::cpu::zeros;
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
 
 /// y = f(x), any shape.
@@ -23,14 +24,14 @@ impl CustomOp1 for Pointwise {
 
     fn cpu_fwd(&self, s: &CpuStorage, l: &Layout) -> Result<(CpuStorage, Shape)> {
         let x = slice::<f32>("activation", "x", s, l)?;
-        let mut y = vec![0.0; x.len()];
+        let mut y = zeros(x.len());
         cpu::forward(self.0, x, &mut y);
         output(y, l.shape().clone())
     }
 
     fn bwd(&self, x: &Tensor, _y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
         let dy = dy.contiguous()?;
-        let mut dx = vec![0.0; x.elem_count()];
+        let mut dx = zeros(x.elem_count());
         borrowed("activation", [x, &dy], |[x, dy]: [&[f32]; 2]| {
             cpu::backward(self.0, x, dy, &mut dx);
         })?;
@@ -59,14 +60,12 @@ impl CustomOp1 for Softmax {
 
     fn cpu_fwd(&self, s: &CpuStorage, l: &Layout) -> Result<(CpuStorage, Shape)> {
         let x = slice::<f32>("softmax", "x", s, l)?;
-        let mut y = vec![0.0; x.len()];
-        cpu::softmax(self.0, x, &mut y);
-        output(y, l.shape().clone())
+        output(cpu::softmax(self.0, x), l.shape().clone())
     }
 
     fn bwd(&self, x: &Tensor, y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
         let dy = dy.contiguous()?;
-        let mut dx = vec![0.0; x.elem_count()];
+        let mut dx = zeros(x.elem_count());
         borrowed("softmax", [y, &dy], |[y, dy]: [&[f32]; 2]| {
             cpu::softmax_backward(self.0, y, dy, &mut dx);
         })?;

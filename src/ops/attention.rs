@@ -4,6 +4,7 @@
 use super::{borrowed, output, slice, tensor_like};
 use crate::cpu::attention::{self as cpu, Attention};
 pub use crate::cpu::attention::{Labels, PENALTY};
+use crate::cpu::zeros;
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
 
 /// softmax(scale·q·kᵀ + mask)·v for `q` `[R, L, d]`, `k` `[R, M, d]`, `v`
@@ -63,7 +64,7 @@ impl CustomOp3 for Op {
         let k = slice::<f32>("attention", "k", s2, l2)?;
         let v = slice::<f32>("attention", "v", s3, l3)?;
         let shape = (l1.dims()[0], self.0.queries, self.0.value_width);
-        let mut out = vec![0.0; shape.0 * shape.1 * shape.2];
+        let mut out = zeros(shape.0 * shape.1 * shape.2);
         cpu::forward(&self.0, q, k, v, &mut out);
         output(out, shape)
     }

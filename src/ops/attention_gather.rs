@@ -143,7 +143,10 @@ impl CustomOp3 for AttentionGather {
         if let Some(done) = on_gpu(self, args)? {
             return Ok(done);
         }
-        by_dtype!(NAME, s1.dtype(), forward(&self.0, args))
+        match s1.dtype() {
+            DType::F32 => forward(&self.0, args, cpu::forward_f32),
+            dtype => by_dtype!(NAME, dtype, forward(&self.0, args, cpu::forward)),
+        }
     }
 
     fn bwd(
@@ -165,16 +168,20 @@ impl CustomOp3 for AttentionGather {
     }
 }
 
+/// Maps, query, points and the result, as [`cpu::forward`].
+type Run<T> = fn(&Gather, &[T], &[T], &[T], &mut [T]);
+
 fn forward<T: Number>(
     g: &Gather,
     [maps, query, points]: [(&CpuStorage, &Layout); 3],
+    run: Run<T>,
 ) -> Result<(CpuStorage, Shape)> {
     let rows = query.1.dims()[0];
     let maps = slice::<T>(NAME, "maps", maps.0, maps.1)?;
     let query = slice::<T>(NAME, "query", query.0, query.1)?;
     let points = slice::<T>(NAME, "points", points.0, points.1)?;
     let mut out = vec![T::default(); rows * g.dim];
-    cpu::forward(g, maps, query, points, &mut out);
+    run(g, maps, query, points, &mut out);
     Ok((T::to_cpu_storage_owned(out), Shape::from((rows, g.dim))))
 }
 

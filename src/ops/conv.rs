@@ -4,6 +4,7 @@
 use super::{output, slice};
 use crate::cpu::Tier;
 use crate::cpu::conv::{self as cpu, Sizes};
+use crate::cpu::zeros;
 use candle_core::{
     CpuStorage, CustomOp1, CustomOp2, CustomOp3, Layout, Result, Shape, Tensor, bail,
 };
@@ -49,7 +50,7 @@ impl Conv {
         bias: &[f32],
     ) -> Result<(CpuStorage, Shape)> {
         let shape = Self::shape(like, self.sizes.out_channels, self.sizes.out_size());
-        let mut y = vec![0.0; shape.elem_count()];
+        let mut y = zeros(shape.elem_count());
         cpu::forward(Tier::best(), &self.sizes, x, w, bias, &mut y);
         output(y, shape)
     }
@@ -157,7 +158,7 @@ impl CustomOp2 for InputGrad {
         let dy = slice::<f32>(name, "dy", s1, l1)?;
         let w = slice::<f32>(name, "weight", s2, l2)?;
         let shape = Conv::shape(l1, sizes.in_channels, sizes.size);
-        let mut dx = vec![0.0; shape.elem_count()];
+        let mut dx = zeros(shape.elem_count());
         cpu::input_grad(Tier::best(), &sizes, dy, w, &mut dx);
         output(dx, shape)
     }
@@ -185,7 +186,7 @@ impl CustomOp2 for WeightGrad {
         let mut dims = vec![sizes.out_channels, sizes.in_channels];
         dims.extend(&sizes.kernel[3 - sides..]);
         let shape = Shape::from(dims);
-        let mut dw = vec![0.0; shape.elem_count()];
+        let mut dw = zeros(shape.elem_count());
         cpu::weight_grad(Tier::best(), &sizes, x, dy, &mut dw);
         output(dw, shape)
     }

@@ -4,6 +4,7 @@
 
 use super::{borrowed, output, slice, tensor_like};
 use crate::cpu::join::{self as cpu, Join};
+use crate::cpu::zeros;
 use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
 
 const NAME: &str = "join";
@@ -44,9 +45,7 @@ impl CustomOp2 for Op {
             (slice::<f32>(NAME, "fine", s1, l1)?, slice::<f32>(NAME, "coarse", s2, l2)?);
         let ([c1, c2], [h, w]) = (self.0.channels, self.0.size);
         let shape = (l1.dims()[0], c1 + c2, h, w);
-        let mut y = vec![0.0; shape.0 * shape.1 * h * w];
-        cpu::forward(&self.0, fine, coarse, &mut y);
-        output(y, shape)
+        output(cpu::forward(&self.0, shape.0, fine, coarse), shape)
     }
 
     fn bwd(
@@ -61,7 +60,7 @@ impl CustomOp2 for Op {
             if !x.track_op() {
                 return Ok(None);
             }
-            let mut dx = vec![0.0; x.elem_count()];
+            let mut dx = zeros(x.elem_count());
             borrowed(NAME, [&dy], |[dy]: [&[f32]; 1]| run(&self.0, dy, &mut dx))?;
             tensor_like(dx, x).map(Some)
         };

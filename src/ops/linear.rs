@@ -1,19 +1,17 @@
 //! Linear layer as a candle op with gradients, bias and product in one pass over
-//! blocks of rows. Kernel: [`crate::cpu::gemm`].
+//! blocks of rows, the weight packed once a call. Kernel: [`crate::cpu::gemm`].
 //!
 //! Candle's own product splits itself over all threads, and its sums wait on a
 //! barrier of their own: called from many tasks at once they wait for one another.
 //! This one stays on the caller's thread for up to one block of rows.
 
 use super::{borrowed, output, slice, tensor_like};
-use crate::cpu::gemm::{Mat, gemm};
-use candle_core::{CpuStorage, CustomOp3, Layout, Result, Tensor, bail};
+use crate::cpu::gemm::{Base, Mat, Packed, gemm, rows_product};
+use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Result, Tensor, bail};
 use rayon::prelude::*;
 
 const NAME: &str = "linear";
 
-/// Rows per task: 256 × 128 floats are 128 KiB, a part of a core's L2.
-const BLOCK: usize = 256;
 /// Rows whose part of the parameters' gradients is one sum.
 const PART: usize = 1024;
 
@@ -29,7 +27,55 @@ pub fn linear(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
     x.contiguous()?.apply_op3(&weight.contiguous()?, &bias.contiguous()?, Linear)
 }
 
+/// y = x·Wᵀ, as [`linear`].
+///
+/// # Errors
+/// As [`linear`].
+pub fn linear_no_bias(x: &Tensor, weight: &Tensor) -> Result<Tensor> {
+    let (_, c) = weight.dims2()?;
+    if x.rank() != 2 || x.dims()[1] != c {
+        bail!("{NAME}: expected x [N, {c}], got {:?}", x.dims());
+    }
+    x.contiguous()?.apply_op2(&weight.contiguous()?, Linear)
+}
+
 struct Linear;
+
+/// x·Wᵀ + b into new memory.
+fn forward(x: &[f32], w: &[f32], b: Option<&[f32]>, [n, c, o]: [usize; 3]) -> Vec<f32> {
+    let packed = Packed::new(Mat::new(w, o, c, c).t());
+    rows_product(Mat::new(x, n, c, c), &packed, b.map_or(Base::Zero, Base::Row))
+}
+
+impl CustomOp2 for Linear {
+    fn name(&self) -> &'static str {
+        NAME
+    }
+
+    fn cpu_fwd(
+        &self,
+        s1: &CpuStorage,
+        l1: &Layout,
+        s2: &CpuStorage,
+        l2: &Layout,
+    ) -> Result<(CpuStorage, candle_core::Shape)> {
+        let x = slice::<f32>(NAME, "x", s1, l1)?;
+        let w = slice::<f32>(NAME, "weight", s2, l2)?;
+        let ((n, c), o) = (l1.shape().dims2()?, l2.dims()[0]);
+        output(forward(x, w, None, [n, c, o]), (n, o))
+    }
+
+    fn bwd(
+        &self,
+        x: &Tensor,
+        w: &Tensor,
+        _y: &Tensor,
+        dy: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
+        let (dx, dw, _) = gradients(x, w, dy)?;
+        Ok((dx, Some(dw)))
+    }
+}
 
 impl CustomOp3 for Linear {
     fn name(&self) -> &'static str {
@@ -48,17 +94,8 @@ impl CustomOp3 for Linear {
         let x = slice::<f32>(NAME, "x", s1, l1)?;
         let w = slice::<f32>(NAME, "weight", s2, l2)?;
         let b = slice::<f32>(NAME, "bias", s3, l3)?;
-        let ((n, c), o) = (l1.shape().dims2()?, b.len());
-        let mut y = vec![0.0; n * o];
-        if o > 0 {
-            y.par_chunks_mut(BLOCK * o).enumerate().for_each(|(i, y)| {
-                y.chunks_exact_mut(o).for_each(|row| row.copy_from_slice(b));
-                let rows = y.len() / o;
-                let x = &x[i * BLOCK * c..][..rows * c];
-                gemm(y, o, Mat::new(x, rows, c, c), Mat::new(w, o, c, c).t(), 1.0, true);
-            });
-        }
-        output(y, (n, o))
+        let (n, c) = l1.shape().dims2()?;
+        output(forward(x, w, Some(b), [n, c, b.len()]), (n, b.len()))
     }
 
     fn bwd(
@@ -69,28 +106,33 @@ impl CustomOp3 for Linear {
         _y: &Tensor,
         dy: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let (o, c) = w.dims2()?;
-        let dy = dy.contiguous()?;
-        let (dx, dw, db) = borrowed(NAME, [x, w, &dy], |[x, w, dy]: [&[f32]; 3]| {
-            let dx = match o > 0 && c > 0 {
-                true => input_grad(dy, w, [o, c]),
-                false => vec![0.0; x.len()],
-            };
-            let (dw, db) = parameter_grads(x, dy, [o, c]);
-            (dx, dw, db)
-        })?;
-        let db = Tensor::from_vec(db, o, x.device())?;
-        Ok((Some(tensor_like(dx, x)?), Some(tensor_like(dw, w)?), Some(db)))
+        let (dx, dw, db) = gradients(x, w, dy)?;
+        Ok((dx, Some(dw), Some(db)))
     }
+}
+
+/// By x (where it is asked for), weight and bias.
+fn gradients(x: &Tensor, w: &Tensor, dy: &Tensor) -> Result<(Option<Tensor>, Tensor, Tensor)> {
+    let (o, c) = w.dims2()?;
+    let dy = dy.contiguous()?;
+    let wanted = x.track_op();
+    let (dx, dw, db) = borrowed(NAME, [x, w, &dy], |[x, w, dy]: [&[f32]; 3]| {
+        let dx = match (wanted, o > 0 && c > 0) {
+            (false, _) => None,
+            (true, true) => Some(input_grad(dy, w, [o, c])),
+            (true, false) => Some(vec![0.0; x.len()]),
+        };
+        let (dw, db) = parameter_grads(x, dy, [o, c]);
+        (dx, dw, db)
+    })?;
+    let dx = dx.map(|dx| tensor_like(dx, x)).transpose()?;
+    Ok((dx, tensor_like(dw, w)?, Tensor::from_vec(db, o, x.device())?))
 }
 
 /// dy `[N, O]` · W `[O, C]`.
 fn input_grad(dy: &[f32], w: &[f32], [o, c]: [usize; 2]) -> Vec<f32> {
-    let mut dx = vec![0.0; dy.len() / o * c];
-    dx.par_chunks_mut(BLOCK * c).zip(dy.par_chunks(BLOCK * o)).for_each(|(dx, dy)| {
-        gemm(dx, c, Mat::new(dy, dy.len() / o, o, o), Mat::new(w, o, c, c), 1.0, false);
-    });
-    dx
+    let packed = Packed::new(Mat::new(w, o, c, c));
+    rows_product(Mat::new(dy, dy.len() / o, o, o), &packed, Base::Zero)
 }
 
 /// (dyᵀ·x `[O, C]`, column sums of dy `[O]`): parts of [`PART`] rows, added in order.
@@ -130,7 +172,7 @@ mod tests {
             Var::from_tensor(&Tensor::from_vec(data, shape, &Device::Cpu)?)
         };
         // More rows than a block, and a block that is not full.
-        let (n, c, o) = (BLOCK + 37, 19, 11);
+        let (n, c, o) = (256 + 37, 19, 11);
         let x = make(n * c, 0.71, &[n, c])?;
         let (w, b) = (make(o * c, 1.3, &[o, c])?, make(o, 2.1, &[o])?);
         let y = f(&x, &w, &b)?;

@@ -6,6 +6,7 @@ use super::{Backend, borrowed, elements, output, slice};
 use crate::camera::{Camera, Intrinsics};
 use crate::cpu::plane_sweep as cpu;
 pub use crate::cpu::plane_sweep::{Pair, Sweep};
+use crate::cpu::zeros;
 use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
 use glam::{Mat3, Mat4};
 
@@ -97,7 +98,7 @@ pub fn plane_sweep_on(
 /// Whatever candle says of the allocation.
 pub fn validity(sweep: &Sweep) -> Result<Tensor> {
     let ([h, w], r, d) = (sweep.size, sweep.pairs.len(), sweep.candidates());
-    let mut out = vec![0.0; r * d * h * w];
+    let mut out = zeros(r * d * h * w);
     cpu::validity(sweep, &mut out);
     Tensor::from_vec(out, (r, d, h, w), &candle_core::Device::Cpu)
 }
@@ -160,7 +161,7 @@ impl CustomOp2 for Op {
                 return output(out, (r, d, h, w));
             }
         }
-        let mut out = vec![0.0; r * d * h * w];
+        let mut out = zeros(r * d * h * w);
         cpu::correlation(&self.0, reference, source, &mut out);
         output(out, (r, d, h, w))
     }

@@ -5,6 +5,7 @@
 use super::{borrowed, output, slice};
 use crate::cpu::activation::Activation;
 use crate::cpu::resize::{self as cpu, Resize};
+use crate::cpu::zeros;
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
 
 /// `[B, C, h, w]` to `[B, C, H, W]`, corner pixels on corner pixels
@@ -67,18 +68,20 @@ impl CustomOp1 for Op {
         let x = slice::<f32>("resize", "x", s, l)?;
         let (b, c, _, _) = l.shape().dims4()?;
         let [h, w] = self.sizes.to;
-        let mut y = vec![0.0; b * c * h * w];
+        if let Kind::Nearest(s) = self.kind {
+            return output(cpu::nearest(&self.sizes, s, x), (b, c, h, w));
+        }
+        let mut y = zeros(b * c * h * w);
         match self.kind {
-            Kind::Nearest(s) => cpu::nearest(&self.sizes, s, x, &mut y),
-            Kind::Bilinear(None) => cpu::bilinear(&self.sizes, x, &mut y),
             Kind::Bilinear(Some(f)) => cpu::bilinear_then(&self.sizes, f, x, &mut y),
+            _ => cpu::bilinear(&self.sizes, x, &mut y),
         }
         output(y, (b, c, h, w))
     }
 
     fn bwd(&self, x: &Tensor, _y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
         let dy = dy.contiguous()?;
-        let mut dx = vec![0.0; x.elem_count()];
+        let mut dx = zeros(x.elem_count());
         borrowed("resize", [x, &dy], |[x, dy]: [&[f32]; 2]| match self.kind {
             Kind::Nearest(s) => cpu::nearest_transposed(&self.sizes, s, dy, &mut dx),
             Kind::Bilinear(None) => cpu::bilinear_transposed(&self.sizes, dy, &mut dx),

@@ -18,6 +18,7 @@
 //! Twin: ops/attention_gather.rs. Tests: tests/attention_gather.rs.
 
 mod backward;
+mod narrow;
 
 pub use crate::abi::{Drop, Gather, Level};
 pub use backward::{Gradients, Scatter, backward, factors, scatter_into};
@@ -170,10 +171,12 @@ impl<T: Real> Scratch<T> {
         let (q, rest) = query.split_at(g.query_channels());
         if let Some(key) = g.key {
             self.dots.clear();
+            // No closure: it would be compiled without the vectors of its caller.
             for &cell in &self.taps {
                 let row = &maps[cell * g.stride + key..][..g.dim];
-                let groups = row.chunks_exact(width).zip(q.chunks_exact(width));
-                self.dots.extend(groups.map(|(k, q)| dot(k, q)));
+                for (k, q) in row.chunks_exact(width).zip(q.chunks_exact(width)) {
+                    self.dots.push(dot(k, q));
+                }
             }
         }
         let scale = T::of(g.logit_scale);
@@ -251,6 +254,14 @@ fn axpy<T: Real>(y: &mut [T], c: T, x: &[T]) {
 
 /// Parents per rayon task.
 const BLOCK: usize = 64;
+
+/// [`forward`] in single precision, faster where the presets' shape allows it.
+pub fn forward_f32(g: &Gather, maps: &[f32], query: &[f32], points: &[f32], out: &mut [f32]) {
+    match narrow::suits(g) {
+        true => narrow::forward(g, maps, query, points, out),
+        false => forward(g, maps, query, points, out),
+    }
+}
 
 /// Attention output of N parents into `out` `[N, E]` (module doc).
 pub fn forward<T: Real>(g: &Gather, maps: &[T], query: &[T], points: &[T], out: &mut [T]) {

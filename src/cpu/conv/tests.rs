@@ -75,6 +75,8 @@ fn cases() -> Vec<Sizes> {
         flat(6, 4, [3, 3], 2, 1, [8, 9]),
         flat(6, 4, [1, 1], 2, 0, [8, 9]),
         flat(37, 8, [1, 1], 1, 0, [5, 7]),
+        // As a matrix product, with rows and columns left over.
+        flat(37, 50, [1, 1], 1, 0, [18, 16]),
         flat(2, 3, [3, 1], 1, 1, [1, 1]),
         flat(2, 3, [5, 5], 3, 4, [2, 3]),
         flat(1, 1, [3, 3], 1, 1, [33, 40]),

@@ -21,7 +21,8 @@ use super::{BackboneOutput, Primaries, Views};
 use crate::config::{Aggregation as Keys, FeatureLevel, Gate, MaskMode, Points};
 use crate::ops::Backend;
 use crate::ops::attention_gather::{Deferred, Level, occlusion_gate};
-use candle_core::{Result, Tensor, bail};
+use crate::ops::moves::channels_last;
+use candle_core::{DType, Result, Tensor, bail};
 use candle_nn::{Linear, Module, VarBuilder};
 pub use points::ring;
 use stage::Stage;
@@ -161,8 +162,12 @@ impl Aggregation {
             if b != 1 || got != v {
                 bail!("feature map {level:?}: expected 1 scene of {v} views, got {b} of {got}");
             }
-            let map = backbone.feature(*level)?.squeeze(0)?.permute((0, 2, 3, 1))?;
-            let map = map.contiguous()?.reshape((v * height * width, c))?;
+            let map = backbone.feature(*level)?.squeeze(0)?;
+            let map = match map.dtype() {
+                DType::F32 => channels_last(&map)?,
+                _ => map.permute((0, 2, 3, 1))?.contiguous()?,
+            };
+            let map = map.reshape((v * height * width, c))?;
             let map = match input {
                 Some(linear) => linear.forward(&map)?,
                 None => map,

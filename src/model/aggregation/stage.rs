@@ -9,6 +9,7 @@ use crate::config::{
 use crate::model::mlp::{LayerNorm, Mode, affine, linear, xavier};
 use crate::ops::attention_gather::{Drop, Gather, attention_gather_deferred};
 use crate::ops::columns::columns;
+use crate::ops::moves;
 use candle_core::{Result, Tensor};
 use candle_nn::{Init, Linear, Module, VarBuilder};
 
@@ -113,7 +114,7 @@ impl Stage {
                 (None, None) => map.clone(),
             });
         }
-        Tensor::cat(&levels, 0)?.contiguous()
+        moves::stacked(&levels)
     }
 
     /// The next f from this one and the embedding z, both `[n, E]`; `(t, maps)`: index
@@ -125,7 +126,7 @@ impl Stage {
         (t, maps): (usize, &Tensor),
         (f, z): (&Tensor, &Tensor),
     ) -> Result<Tensor> {
-        let mut q = f.add(z)?;
+        let mut q = moves::sum(f, z)?;
         if let Some(norm) = &self.norm {
             q = norm.forward(&q)?;
         }
@@ -145,12 +146,12 @@ impl Stage {
             }
             (Residual::None, _) => (o.clone(), o),
             _ => {
-                let next = f.add(&o)?;
+                let next = moves::sum(f, &o)?;
                 (next.clone(), next)
             }
         };
         match &self.ffn {
-            Some(ffn) => next.add(&ffn.forward(&joined)?),
+            Some(ffn) => moves::sum(&next, &ffn.forward(&joined)?),
             None => Ok(next),
         }
     }

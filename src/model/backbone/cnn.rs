@@ -5,6 +5,7 @@ use crate::model::layers::{
     Conv2d, ConvShape, default_init, instance_norm, instance_norm_relu, relu,
 };
 use crate::model::trace::Trace;
+use crate::ops::moves::sum;
 use candle_core::{Result, Tensor};
 use candle_nn::{Init, VarBuilder};
 
@@ -107,6 +108,6 @@ impl Residual {
             Some(conv) => instance_norm(&conv.forward(x)?)?,
             None => x.clone(),
         };
-        relu(&(skip + y)?)
+        relu(&sum(&skip, &y)?)
     }
 }

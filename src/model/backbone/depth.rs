@@ -16,6 +16,7 @@ use crate::model::layers::{
 use crate::model::trace::Trace;
 use crate::ops::Backend;
 use crate::ops::join::join;
+use crate::ops::moves::{channels_last, stacked};
 use candle_core::{Device, Result, Tensor};
 use candle_nn::VarBuilder;
 
@@ -144,7 +145,7 @@ impl DepthPredictor {
         trace.put("depth.logits_vb", &logits)?;
         let (rows, d, h, w) = logits.dims4()?;
         // Candidates last: a strided softmax or sum is many times slower.
-        let pdf = softmax(&logits.flatten_from(2)?.transpose(1, 2)?.contiguous()?)?;
+        let pdf = softmax(&channels_last(&logits)?)?;
         trace.put_with("depth.pdf_vb", || {
             pdf.transpose(1, 2)?.contiguous()?.reshape((rows, d, h, w))
         })?;
@@ -196,7 +197,7 @@ impl DepthPredictor {
             let x = Tensor::cat(&[row(refined)?, row(images)?], 1)?;
             let x = join(&x, &up.row(r)?, 1)?;
             let y = self.to_gaussians.forward(&x)?;
-            y.flatten_from(2)?.transpose(1, 2)?.contiguous()
+            channels_last(&y)
         })?;
         trace.put_with("depth.to_gaussians_vb", || {
             let (rows, _, h, w) = images.dims4()?;
@@ -216,7 +217,7 @@ impl DepthPredictor {
         let (b, g) = (views.scenes(), self.per_pixel);
         let out = self.to_disparity.forward(refined)?;
         trace.put("depth.to_disparity_vb", &out)?;
-        let last = |x: Tensor| x.flatten_from(2)?.transpose(1, 2)?.contiguous();
+        let last = |x: Tensor| channels_last(&x);
         let full = last(disparity.full.broadcast_add(&out.narrow(1, 0, g)?)?)?;
         let depths = each_row(&full, |r| {
             let (near, far) = views.near_far[r % b][r / b];
@@ -261,5 +262,5 @@ impl Upsampled {
 
 /// `f` of every row index of `like`, joined along the first dimension.
 fn each_row(like: &Tensor, f: impl Fn(usize) -> Result<Tensor>) -> Result<Tensor> {
-    Tensor::cat(&(0..like.dim(0)?).map(f).collect::<Result<Vec<_>>>()?, 0)
+    stacked(&(0..like.dim(0)?).map(f).collect::<Result<Vec<_>>>()?)
 }

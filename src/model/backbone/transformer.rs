@@ -6,12 +6,14 @@ use super::{bv_rows, vb_rows};
 use crate::config::Mvsplat as Settings;
 use crate::model::layers::{LayerNorm, Linear, gelu};
 use crate::model::trace::Trace;
+use crate::ops;
 use crate::ops::attention::{Labels, attention};
+use crate::ops::moves::{channels_last, sum};
 use candle_core::{Result, Tensor, bail};
 use candle_nn::VarBuilder;
 
-/// Tokens that pass the feed-forward block at once: its hidden layer is 8 × as wide
-/// as the tokens, 16 MiB per block of this many.
+/// Tokens that pass the feed-forward block at once where gradients are asked for: its
+/// hidden layer is 8 × as wide as the tokens, 16 MiB per block of this many.
 const FFN_ROWS: usize = 4096;
 
 /// The network.
@@ -60,7 +62,7 @@ impl Transformer {
         }
         let x = cnn.broadcast_add(&position_encoding(c, [h, w], s, cnn)?)?;
         trace.put("transformer.pos_added", &x)?;
-        let mut x = vb_rows(&x)?.flatten_from(2)?.transpose(1, 2)?.contiguous()?;
+        let mut x = channels_last(&vb_rows(&x)?)?;
         for (i, layer) in self.layers.iter().enumerate() {
             // A single window has no seams to shift.
             let shifted = i % 2 == 1 && s > 1;
@@ -76,7 +78,7 @@ impl Transformer {
             trace.put(&format!("transformer.layer{i}.out_vb"), &x)?;
         }
         let rows = x.dim(0)?;
-        let x = bv_rows(&x.transpose(1, 2)?.contiguous()?.reshape((rows, c, h, w))?, v)?;
+        let x = bv_rows(&channels_last(&x)?.reshape((rows, c, h, w))?, v)?;
         trace.put("transformer.features", &x)?;
         Ok(x)
     }
@@ -149,7 +151,7 @@ impl SubLayer {
         let message = self.norm1.forward(&self.merge.forward(&message)?)?;
         let message = message.reshape((rows, tokens, c))?;
         match &self.ffn {
-            None => x + message,
+            None => sum(x, &message),
             Some(ffn) => {
                 let x = x.reshape((rows * tokens, c))?;
                 let message = message.reshape((rows * tokens, c))?;
@@ -159,11 +161,18 @@ impl SubLayer {
     }
 }
 
+/// In one pass, or in single ops where a gradient must pass.
 fn feed_forward(
     (up, down, norm): &(Linear, Linear, LayerNorm),
     x: &Tensor,
     message: &Tensor,
 ) -> Result<Tensor> {
+    let parameters = [up.weight(), down.weight()];
+    let tracked = |t: &Tensor| t.track_op();
+    let gradient = tracked(x) || tracked(message) || parameters.into_iter().any(tracked);
+    if !gradient && !norm.parameters().into_iter().any(tracked) {
+        return ops::feed_forward::feed_forward(x, message, parameters, norm.parameters());
+    }
     let rows = x.dim(0)?;
     let blocks = (0..rows).step_by(FFN_ROWS).map(|start| {
         let n = FFN_ROWS.min(rows - start);

@@ -9,6 +9,7 @@ use crate::model::trace::Trace;
 use crate::ops::attention::attention;
 use crate::ops::conv2d::conv2d;
 use crate::ops::join::join;
+use crate::ops::moves::sum;
 use candle_core::{Result, Tensor};
 use candle_nn::VarBuilder;
 
@@ -163,8 +164,8 @@ impl ResBlock {
         let h = self.norm1.forward_then(&self.conv1.forward(x)?, Activation::Silu)?;
         let h = self.norm2.forward_then(&self.conv2.forward(&h)?, Activation::Silu)?;
         match &self.skip {
-            Some(skip) => skip.forward(x)? + h,
-            None => x + h,
+            Some(skip) => sum(&skip.forward(x)?, &h),
+            None => sum(x, &h),
         }
     }
 }
@@ -210,6 +211,6 @@ impl Attention {
         let y = y.reshape((scenes, heads, views, n, HEAD))?.permute((2, 0, 1, 4, 3))?;
         let y = y.contiguous()?.reshape((rows, c, h, w))?;
         let y = conv2d(&y, &self.proj_out.0, Some(&self.proj_out.1), 1, 0)?;
-        x + self.norm.forward(&y)?
+        sum(x, &self.norm.forward(&y)?)
     }
 }

@@ -1,0 +1,123 @@
+//! Sums and moves of whole tensors: no arithmetic to speak of, so one pass, by all
+//! threads, into memory that nothing has cleared before.
+
+use super::fresh::{Fresh, fill, start};
+use super::gemm::{Mat, copy};
+use super::simd::{Kernel, Simd, Tier};
+use rayon::prelude::*;
+use std::mem::MaybeUninit;
+
+/// Elements a task.
+const PART: usize = 1 << 15;
+
+/// a + b.
+pub fn sum(a: &[f32], b: &[f32]) -> Vec<f32> {
+    assert_eq!(a.len(), b.len(), "sum: lengths");
+    let mut fresh = Fresh::new(a.len());
+    let parts = fresh.blocks(PART).zip(a.par_chunks(PART)).zip(b.par_chunks(PART));
+    parts.for_each(|((block, a), b)| {
+        for ((to, a), b) in block.iter_mut().zip(a).zip(b) {
+            *to = MaybeUninit::new(a + b);
+        }
+    });
+    // SAFETY: the loop above wrote every place of every block, the lengths being equal.
+    unsafe { fresh.finish() }
+}
+
+/// One after the other.
+pub fn stacked(parts: &[&[f32]]) -> Vec<f32> {
+    let mut fresh = Fresh::new(parts.iter().map(|p| p.len()).sum());
+    fresh.blocks(PART).enumerate().for_each(|(i, block)| {
+        let mut skip = i * PART;
+        let mut block = block;
+        for part in parts {
+            let own = part.get(skip..).unwrap_or(&[]);
+            skip = skip.saturating_sub(part.len());
+            let (now, rest) = block.split_at_mut(own.len().min(block.len()));
+            fill(now, &own[..now.len()]);
+            block = rest;
+        }
+    });
+    // SAFETY: the blocks together are as long as the parts together, and block i begins
+    // where i·PART of them are written.
+    unsafe { fresh.finish() }
+}
+
+/// Rows of the result in a task of [`transposed`].
+const ROWS: usize = 256;
+
+/// `[count, rows, cols]` to `[count, cols, rows]`.
+pub fn transposed(x: &[f32], rows: usize, cols: usize) -> Vec<f32> {
+    let mut fresh = Fresh::new(x.len());
+    let area = rows * cols;
+    if area > PART {
+        // Tasks end where a matrix does.
+        let size = if cols.is_multiple_of(ROWS) { ROWS } else { cols };
+        fresh.blocks(size * rows).enumerate().for_each(|(i, block)| {
+            let (matrix, first) = (i * size / cols, i * size % cols);
+            let data = &x[matrix * area + first..(matrix + 1) * area];
+            let from = Mat { data, rows: size, cols: rows, row_stride: 1, col_stride: cols };
+            Tier::best().run(Turn { from, to: start(block) });
+        });
+    } else if let Some(matrices) = PART.checked_div(area) {
+        let size = matrices * area;
+        fresh.blocks(size).zip(x.par_chunks(size)).for_each(|(block, x)| {
+            let all = start(block).chunks_exact_mut(area).zip(x.chunks_exact(area));
+            for (to, data) in all {
+                let from = Mat::new(data, rows, cols, cols).t();
+                Tier::best().run(Turn { from, to });
+            }
+        });
+    }
+    // SAFETY: either loop above started every block; there is none of an empty matrix.
+    unsafe { fresh.finish() }
+}
+
+struct Turn<'a> {
+    from: Mat<'a>,
+    to: &'a mut [f32],
+}
+
+impl Kernel for Turn<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        copy(s, self.from, self.from.cols, self.to);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn numbers(n: usize) -> Vec<f32> {
+        (0..n).map(|i| i as f32).collect()
+    }
+
+    #[test]
+    fn sums_and_stacks_are_what_they_say() {
+        let (a, b) = (numbers(2 * PART + 7), vec![0.5; 2 * PART + 7]);
+        let got = sum(&a, &b);
+        assert!(got.iter().zip(&a).all(|(got, a)| *got == a + 0.5));
+        let whole = numbers(5 * PART / 2);
+        let (first, rest) = whole.split_at(PART + 3);
+        let (second, third) = rest.split_at(11);
+        assert_eq!(stacked(&[first, &[], second, third]), whole);
+        assert!(stacked(&[]).is_empty());
+    }
+
+    #[test]
+    fn transposes_agree_with_indices() {
+        for (count, rows, cols) in
+            [(2, 37, 256), (3, 16, 21), (2, 84, 1024), (2, 84, 1001), (20_000, 3, 25), (2, 0, 4)]
+        {
+            let x = numbers(count * rows * cols);
+            let got = transposed(&x, rows, cols);
+            for (i, v) in got.iter().enumerate() {
+                let (m, c, r) = (i / (rows * cols), i / rows % cols, i % rows);
+                assert_eq!(*v, x[(m * rows + r) * cols + c], "{count} {rows} {cols} {i}");
+            }
+        }
+    }
+}
