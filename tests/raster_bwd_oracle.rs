@@ -6,6 +6,7 @@
 #[path = "common/oracle.rs"]
 mod oracle;
 #[path = "common/raster_scene.rs"]
+#[expect(dead_code, reason = "scenes with options are the GPU's tests'")]
 mod raster_scene;
 
 use glam::Vec3;
