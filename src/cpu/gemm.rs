@@ -2,7 +2,7 @@
 //! right factor packed once and used by any number of callers.
 //!
 //! Callers parallelise over blocks of rows themselves. A result is a sum over k in
-//! order, in parts of [`DEPTH`], whatever the block of rows that it is computed with:
+//! order, in parts of 128, whatever the block of rows that it is computed with:
 //! how rows are cut into tasks does not show, and fused tiers agree to the byte.
 //! Oracle: three loops in f64 (the tests).
 
@@ -102,7 +102,7 @@ const BLOCK_LEAST: usize = 48;
 const BLOCK_FLOATS: usize = 1 << 16;
 
 /// `base + lhs · rhs` into new memory, row-major, blocks of rows in parallel; up to
-/// [`BLOCK`] rows on the caller's thread.
+/// 256 rows on the caller's thread.
 ///
 /// # Panics
 /// As [`product`].

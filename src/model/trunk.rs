@@ -6,6 +6,8 @@
 
 mod recompute;
 
+pub use recompute::Recomputed;
+
 use super::aggregation::{Aggregation, Prepared, ring};
 use super::embed::Embeddings;
 use super::geometry::{Frames, ParentChunk};

@@ -50,7 +50,7 @@ impl<'a> Mat<'a> {
     }
 }
 
-/// The right factor `[k, n]` in panels of [`PANEL`] columns (the last one as wide as it
+/// The right factor `[k, n]` in panels of 64 columns (the last one as wide as it
 /// must be, in whole vectors, padded with zeros): `[panel][k][column]`.
 #[derive(Clone, Debug, Default)]
 pub struct Packed {
