@@ -12,10 +12,10 @@
 //! let scene = load_scene("examples/room".as_ref())?;
 //! let photos = [Photo::from_frame(&scene.frames[0])?, Photo::from_frame(&scene.frames[1])?];
 //! let model = Reconstructor::shipped(2)?; // or ::load(weights)
-//! let request = Request { near_far: (0.67, 4.89), ..Request::default() };
-//! let room = model.reconstruct(&photos, &request)?;
+//! let room = model.reconstruct(&photos, &Request::default())?;
 //! let camera = room.inputs[0].target_camera; // any camera
-//! let picture = subsplat::render(&room.splats, &camera, &model.raster_options(0.67, &room.inputs));
+//! let options = model.raster_options(room.near_far.0, &room.inputs);
+//! let picture = subsplat::render(&room.splats, &camera, &options);
 //! assert_eq!((picture.width, picture.height, room.splats.len()), (512, 512, 524_288));
 //! # let out = std::env::temp_dir().join(format!("subsplat-doc-{}.ply", std::process::id()));
 //! # let room_ply = out.as_path();

@@ -97,12 +97,15 @@ pub struct Request {
     /// Add to each child what the photograph shows at its place beyond its parent's
     /// pixel ([`crate::cpu::detail`]).
     pub detail: bool,
+    /// `near_far` is a guess, which the small backbone replaces by what it sees
+    /// ([`SubSplat::look`]).
+    pub look: bool,
 }
 
 impl Default for Request {
-    /// 256×256, depth 1 to 100, no detail: RealEstate10K's habit.
+    /// 256×256, no detail; depth 1 to 100, RealEstate10K's habit, as a guess.
     fn default() -> Self {
-        Self { input_size: (256, 256), near_far: (1.0, 100.0), detail: false }
+        Self { input_size: (256, 256), near_far: (1.0, 100.0), detail: false, look: true }
     }
 }
 
@@ -115,6 +118,8 @@ pub struct Reconstruction {
     pub inputs: Vec<Cropped>,
     /// Predicted depth of each input, camera z, world units.
     pub depths: Vec<Depth>,
+    /// Nearest and farthest depth candidate, world units.
+    pub near_far: (f32, f32),
     /// Harmless oddities, one line each, for the user.
     pub warnings: Vec<String>,
     /// Seconds by stage, in order.
@@ -252,7 +257,12 @@ impl Reconstructor {
         clock.begin("crop");
         let options = self.crop_options(request.input_size);
         let inputs = photos.iter().map(|p| p.crop(&options)).collect::<Result<Vec<_>>>()?;
-        let views = views_of(&inputs, request.near_far)?;
+        let mut views = views_of(&inputs, request.near_far)?;
+        if request.look {
+            clock.begin("depth range");
+            views = self.model.look(&views)?;
+        }
+        let near_far = views.near_far[0][0];
         let mut scenes = self.model.forward(&views, &mut |name| clock.begin(name))?;
         let Some(SceneOutput { children, depths }) = scenes.pop() else {
             let (expected, got) = ("one scene".to_owned(), "none".to_owned());
@@ -270,7 +280,7 @@ impl Reconstructor {
         let depths =
             inputs.iter().zip(depths).map(|(c, d)| camera_depth(&c.input_camera, d)).collect();
         let seconds = clock.end();
-        Ok(Reconstruction { splats, inputs, depths, warnings, seconds })
+        Ok(Reconstruction { splats, inputs, depths, near_far, warnings, seconds })
     }
 }
 

@@ -433,7 +433,7 @@ fn any_number_of_views_any_shape_any_depth_range() {
         let size = if mvsplat { (96, 64) } else { (128, 64) };
         for (views, near_far) in [(3, NEAR_FAR), (2, (0.05, 3.0)), (3, (5.0, 400.0))] {
             let shoot = shoot(9, views, 2 * size.0, 2 * size.1);
-            let request = Request { input_size: size, near_far, detail: false };
+            let request = Request { input_size: size, near_far, detail: false, look: false };
             let result = model.reconstruct(&shoot.photos, &request).unwrap();
             assert_eq!(result.splats.len(), 4 * views * size.0 * size.1);
             assert!(result.splats.rows.iter().all(|v| v.is_finite()));

@@ -112,7 +112,7 @@ fn methods_are_what_they_say() {
     let crop = CropOptions::square(64, 2, 32);
     let truth = photo(1).crop(&crop).unwrap();
     let near_far = scene.near_far.unwrap();
-    let request = |detail| Request { input_size: (64, 64), near_far, detail };
+    let request = |detail| Request { input_size: (64, 64), near_far, detail, look: true };
     let photos = [photo(0), photo(2)];
     let seen = |model: &Reconstructor, detail: bool, lowpass: LowpassRef| {
         let made = model.reconstruct(&photos, &request(detail)).unwrap();

@@ -118,7 +118,7 @@ fn room() -> (Scene, Vec<Photo>, Request) {
     let scene = load_scene(Path::new(&folder)).unwrap();
     let photos = scene.frames[..2].iter().map(|f| Photo::from_frame(f).unwrap()).collect();
     let near_far = scene.near_far.unwrap();
-    (scene, photos, Request { input_size: (256, 256), near_far, detail: true })
+    (scene, photos, Request { input_size: (256, 256), near_far, detail: true, look: false })
 }
 
 /// Share of the rows of a reconstruction that are elsewhere.

@@ -265,7 +265,13 @@ fn a_frozen_backbone_stands_still_and_state_comes_back() {
 fn rooms() -> Rooms {
     let mut spec = ExampleSpec::new(32, 24, 1);
     spec.photographic = false;
-    Rooms { seed: 4, scenes: 0, spec, targets: TargetSpec { ratio: 2, samples: 1, clean: true } }
+    Rooms {
+        seed: 4,
+        scenes: 0,
+        spec,
+        targets: TargetSpec { ratio: 2, samples: 1, clean: true },
+        seen_range: 0.0,
+    }
 }
 
 #[test]

@@ -213,8 +213,9 @@ pub struct SourceArgs {
     #[arg(long, value_name = "N", conflicts_with = "weights")]
     pub seed: Option<u64>,
     /// Nearest depth candidate, world units (default: the pose file's, RealEstate10K's 1,
-    /// or from sparse points, matched points or the baseline). To `view` a finished scene:
-    /// the near plane.
+    /// or from sparse points, matched points or the baseline; the small backbone then
+    /// replaces both by what it sees in a first look at half size). To `view` a finished
+    /// scene: the near plane.
     #[arg(long, allow_negative_numbers = true)]
     pub near: Option<f32>,
     /// Farthest depth candidate, world units (default: likewise; RealEstate10K's 100).

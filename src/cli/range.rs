@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 use subsplat::check::{GrayImage, PairReport, Verdict};
 use subsplat::data::depth::DepthRange;
 use subsplat::io::image::Rgb;
-use subsplat::pipeline;
+use subsplat::pipeline::{self, Reconstruction};
 
 /// Grey copy of a photograph.
 pub fn grey(photo: &Rgb) -> Result<GrayImage> {
@@ -35,6 +35,17 @@ pub fn refine(
     let range = pipeline::refine_range(guess, given, reports);
     say(format!("near {:.4}, far {:.4}: {}", range.near, range.far, range.reason));
     range
+}
+
+/// The range that the network worked with, said where it is its own.
+pub fn looked(range: DepthRange, result: &Reconstruction) -> DepthRange {
+    let (near, far) = result.near_far;
+    if (near, far) == (range.near, range.far) {
+        return range;
+    }
+    say(format!("near {near:.4}, far {far:.4}: from a first look at half size"));
+    let reason = format!("a first look at half size, after {}", range.reason);
+    DepthRange { near, far, reason, ..range }
 }
 
 /// The findings for programs.

@@ -56,11 +56,13 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
         input_size: plan.input_size,
         near_far: (range.near, range.far),
         detail: args.source.detail == DetailArg::Photo,
+        look: given == (None, None),
     };
     let mut result = progress.stage("network", |bar: &ProgressBar| {
         model.reconstruct_with(&photos, &request, &mut |name| bar.set_message(name))
     })?;
     drop(photos);
+    let range = range::looked(range, &result);
     progress.split_last(&result.seconds);
     result.warnings.extend(backend.warning());
     result.warnings.iter().for_each(warn);

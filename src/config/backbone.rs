@@ -79,8 +79,17 @@ pub struct Small {
     pub pixel_colour: bool,
     /// Channels of the full-resolution feature map that the heads read (32).
     pub head_channels: usize,
+    /// Near and far are narrowed to what a first look at half the size shows
+    /// ([`crate::model::subsplat::SubSplat::look`]).
+    #[serde(default = "yes")]
+    pub first_look: bool,
     /// Shape, colour and frame of the primaries.
     pub primaries: Primaries,
+}
+
+/// What a file says by saying nothing.
+fn yes() -> bool {
+    true
 }
 
 /// From raw head outputs to world-frame Gaussians (MVS, Gaussian adapter).
@@ -175,6 +184,7 @@ impl Small {
             confidence_opacity: true,
             pixel_colour: true,
             head_channels: 32,
+            first_look: true,
             primaries: Primaries::with(ShFrame::Standard),
         }
     }

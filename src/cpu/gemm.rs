@@ -20,7 +20,7 @@ use std::cell::RefCell;
 use tile::{Part, rows};
 
 /// Columns of a full panel of the right factor: four vectors.
-const PANEL: usize = 4 * LANES;
+pub(super) const PANEL: usize = 4 * LANES;
 /// Products of one sum in registers: 128 · 64 floats of a panel are 32 KiB, which stay
 /// in the first-level cache while the rows of the left factor pass.
 const DEPTH: usize = 128;

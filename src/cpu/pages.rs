@@ -211,6 +211,14 @@ mod large {
 mod tests {
     use super::*;
 
+    /// Blocks that wait are one list for the process: what one test takes may send
+    /// another's away.
+    static ALONE: std::sync::Mutex<()> = std::sync::Mutex::new(());
+
+    fn alone() -> std::sync::MutexGuard<'static, ()> {
+        ALONE.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+    }
+
     fn filled(layout: Layout, value: u8) -> *mut u8 {
         // SAFETY: the layout is not empty; the block is as long.
         unsafe {
@@ -223,6 +231,7 @@ mod tests {
 
     #[test]
     fn blocks_are_used_again_and_zeroed_when_asked() {
+        let _alone = alone();
         let layout = Layout::from_size_align(3 * HUGE + 12_345, 64).unwrap();
         let first = filled(layout, 7);
         // SAFETY: allocated above with this layout; then blocks as long as they are read.
@@ -240,6 +249,7 @@ mod tests {
 
     #[test]
     fn growing_and_shrinking_keep_what_is_there() {
+        let _alone = alone();
         let (small, large) = (1 << 10, HUGE + 1);
         let layout = |size| Layout::from_size_align(size, 8).unwrap();
         let at = filled(layout(small), 9);
@@ -257,6 +267,7 @@ mod tests {
 
     #[test]
     fn many_threads_get_blocks_of_their_own() {
+        let _alone = alone();
         let work = |seed: usize| {
             for i in 0..20 {
                 let layout = Layout::from_size_align(HUGE + 4096 * ((seed + i) % 3), 8).unwrap();

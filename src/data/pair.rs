@@ -199,7 +199,7 @@ pub(super) fn points_in_view(camera: &Camera, points: &[Vec3]) -> Vec<f32> {
 }
 
 /// The `q` quantile of values that are not empty (nearest rank).
-pub(super) fn quantile(values: &mut [f32], q: f32) -> f32 {
+pub(crate) fn quantile(values: &mut [f32], q: f32) -> f32 {
     values.sort_by(f32::total_cmp);
     let rank = (q * (values.len().max(1) - 1) as f32).round() as usize;
     values.get(rank).copied().unwrap_or(f32::NAN)

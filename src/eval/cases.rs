@@ -52,6 +52,10 @@ pub struct Loaded {
     pub names: Vec<String>,
     /// Depth candidates.
     pub range: DepthRange,
+    /// Nobody said what `range` is: the model may look ([`SubSplat::look`]).
+    ///
+    /// [`SubSplat::look`]: crate::model::subsplat::SubSplat::look
+    pub look: bool,
 }
 
 /// Cases of a data set.
@@ -242,7 +246,7 @@ impl Benchmark {
         let reason = "RealEstate10K's habit".to_owned();
         let range = DepthRange { near, far, reason, guessed: false };
         let (context, targets) = (photos(&case.views.context)?, photos(&case.views.target)?);
-        Ok(Loaded { context, targets, names, range })
+        Ok(Loaded { context, targets, names, range, look: self.given == (None, None) })
     }
 
     fn of_scene(&self, case: &Case, scene: &Scene) -> Result<Loaded> {
@@ -267,7 +271,7 @@ impl Benchmark {
                 case.range.get_or_init(|| range).clone()
             }
         };
-        Ok(Loaded { context, targets, names, range })
+        Ok(Loaded { context, targets, names, range, look: self.given == (None, None) })
     }
 
     fn chunk(&self, file: &Path) -> Result<Arc<Chunk>> {

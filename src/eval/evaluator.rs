@@ -79,7 +79,8 @@ pub struct Evaluator {
 struct Prepared {
     inputs: Vec<Cropped>,
     targets: Vec<Cropped>,
-    range: (f32, f32),
+    near_far: (f32, f32),
+    look: bool,
 }
 
 impl Evaluator {
@@ -131,8 +132,8 @@ impl Evaluator {
         let names = loaded.names.clone();
         let prepared = self.prepare(model, case, loaded)?;
         let place = format!("{} ({})", case.scene, case.pair());
-        let mut result = self.empty(case, &prepared, &names);
         let mut players = Players::new(self, model, &prepared)?;
+        let mut result = self.empty(case, (&prepared, players.near_far), &names);
         for (m, method) in self.options.methods.iter().enumerate() {
             players.change_to(method, &prepared)?;
             for (t, target) in prepared.targets.iter().enumerate() {
@@ -159,9 +160,14 @@ impl Evaluator {
         Ok(result)
     }
 
-    fn empty(&self, case: &Case, prepared: &Prepared, names: &[String]) -> CaseResult {
+    fn empty(
+        &self,
+        case: &Case,
+        (prepared, near_far): (&Prepared, (f32, f32)),
+        names: &[String],
+    ) -> CaseResult {
         let size = |p: Option<&Rgb>| p.map_or((0, 0), |p| (p.width, p.height));
-        let Prepared { inputs, targets, range } = prepared;
+        let Prepared { inputs, targets, .. } = prepared;
         let target = |(&frame, name): (&usize, &String)| TargetScores {
             frame,
             name: name.clone(),
@@ -178,7 +184,7 @@ impl Evaluator {
                     size(inputs.first().map(|c| &c.input)),
                     size(targets.first().map(|c| &c.target)),
                 ],
-                near_far: *range,
+                near_far,
                 enlarged: targets.iter().any(|c| c.window.scale.min_element() < 1.0),
                 targets: case.views.target.iter().zip(names).map(target).collect(),
             },
@@ -200,11 +206,11 @@ impl Evaluator {
         let cropped = |photos: &[Photo]| {
             photos.iter().map(|p| p.crop(&options)).collect::<pipeline::Result<Vec<_>>>()
         };
-        let range = (loaded.range.near, loaded.range.far);
         Ok(Prepared {
             inputs: cropped(&loaded.context)?,
             targets: cropped(&loaded.targets)?,
-            range,
+            near_far: (loaded.range.near, loaded.range.far),
+            look: loaded.look,
         })
     }
 
@@ -249,7 +255,8 @@ fn fitting(
 /// The Gaussians of one case, one set in memory at a time.
 struct Players<'a> {
     r: usize,
-    near: f32,
+    /// Depth candidates.
+    near_far: (f32, f32),
     /// Mean colour of the inputs.
     colour: [f32; 3],
     network: Option<Network<'a>>,
@@ -295,11 +302,16 @@ impl<'a> Players<'a> {
         prepared: &Prepared,
     ) -> Result<Self> {
         let needed = evaluator.options.methods.iter().find(|m| m.needs_model());
+        let mut near_far = prepared.near_far;
         let network = match (needed, model) {
             (None, _) => None,
             (Some(method), None) => return bad(method.name(), "a model", "none"),
             (Some(_), Some(model)) => {
-                let views = views_of(&prepared.inputs, prepared.range)?;
+                let mut views = views_of(&prepared.inputs, near_far)?;
+                if prepared.look {
+                    views = model.look(&views).map_err(pipeline::Error::from)?;
+                    near_far = views.near_far[0][0];
+                }
                 let output = model.encode(&views).map_err(pipeline::Error::from)?;
                 let parents = model.primaries(&views, &output).map_err(pipeline::Error::from)?;
                 Some(Network { model, views, output, parents })
@@ -307,7 +319,7 @@ impl<'a> Players<'a> {
         };
         Ok(Self {
             r: evaluator.options.upscale,
-            near: prepared.range.0,
+            near_far,
             colour: Rgb::mean_colour(prepared.inputs.iter().map(|c| &c.input)),
             network,
             current: None,
@@ -361,7 +373,7 @@ impl<'a> Players<'a> {
         };
         let mut config = network.model.config().clone();
         config.render.lowpass_ref = reference.unwrap_or(config.render.lowpass_ref);
-        let options = config.raster_options(ratio as f32, self.near, self.colour);
+        let options = config.raster_options(ratio as f32, self.near_far.0, self.colour);
         render_with(&mut self.rasterizer, splats, camera, &options).rgb
     }
 }

@@ -10,6 +10,7 @@ pub mod embed;
 mod floors;
 pub mod geometry;
 pub mod layers;
+mod look;
 pub mod lpips;
 pub mod mlp;
 pub mod primaries;
@@ -134,16 +135,31 @@ pub struct BackboneOutput {
 }
 
 impl BackboneOutput {
+    /// Every tensor through `f`.
+    fn map(&self, f: impl Fn(&Tensor) -> Result<Tensor>) -> Result<Self> {
+        let features = self.features.iter().map(|(level, map)| Ok((*level, f(map)?)));
+        Ok(Self {
+            raw: f(&self.raw)?,
+            depths: f(&self.depths)?,
+            densities: f(&self.densities)?,
+            features: features.collect::<Result<_>>()?,
+        })
+    }
+
     /// The same numbers, from which no gradient goes back to the backbone.
-    #[must_use]
-    pub fn detach(&self) -> Self {
-        let features = self.features.iter().map(|(level, map)| (*level, map.detach()));
-        Self {
-            raw: self.raw.detach(),
-            depths: self.depths.detach(),
-            densities: self.densities.detach(),
-            features: features.collect(),
-        }
+    ///
+    /// # Errors
+    /// None in practice.
+    pub fn detach(&self) -> Result<Self> {
+        self.map(|t| Ok(t.detach()))
+    }
+
+    /// Scene `b` alone.
+    ///
+    /// # Errors
+    /// There is none of this index.
+    pub fn scene(&self, b: usize) -> Result<Self> {
+        self.map(|t| t.narrow(0, b, 1))
     }
 
     /// The feature map of `level`.

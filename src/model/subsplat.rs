@@ -2,6 +2,7 @@
 
 use super::backbone::small::DepthMaps;
 use super::backbone::{Mvsplat, SmallBackbone};
+use super::look;
 use super::primaries::primaries;
 use super::trace::Trace;
 use super::trunk::{Children, Trunk};
@@ -91,6 +92,22 @@ impl SubSplat {
         match &self.encoder {
             Encoder::Mvsplat(encoder) => encoder.forward(views, &mut Trace::off()),
             Encoder::Small(encoder) => Ok(encoder.forward(views, false)?.0),
+        }
+    }
+
+    /// `views` with near and far by what a first look at half the size shows, from half
+    /// of their near to twice their far; the same for all views of a scene. Unchanged
+    /// where the configuration looks once ([`crate::config::Small::first_look`]; MVSplat
+    /// always does: its weights know no depths but those that it was trained with).
+    ///
+    /// # Errors
+    /// Sides that are no multiples of [`Config::stride`].
+    pub fn look(&self, views: &Views) -> Result<Views> {
+        match (&self.encoder, &self.config.backbone) {
+            (Encoder::Small(network), Backbone::Small(c)) if c.first_look => {
+                look::ranges(network, views, self.config.stride())
+            }
+            _ => Ok(views.clone()),
         }
     }
 

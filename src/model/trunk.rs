@@ -282,7 +282,7 @@ impl Trunk {
         primaries: &Primaries,
     ) -> Result<Vec<Children>> {
         let scene = |b: usize| {
-            self.forward(&views.scene(b)?, &scene_of(backbone, b)?, &primaries_of(primaries, b)?)
+            self.forward(&views.scene(b)?, &backbone.scene(b)?, &primaries_of(primaries, b)?)
         };
         (0..views.scenes()).map(scene).collect()
     }
@@ -474,17 +474,6 @@ fn check_single(views: &Views, primaries: &Primaries) -> Result<()> {
 /// `[1, N, 3, D]` to `[N, D, 3]`.
 fn interleaved(sh: &Tensor) -> Result<Tensor> {
     sh.squeeze(0)?.transpose(1, 2)?.contiguous()
-}
-
-fn scene_of(backbone: &BackboneOutput, b: usize) -> Result<BackboneOutput> {
-    let one = |t: &Tensor| t.narrow(0, b, 1);
-    let features = backbone.features.iter().map(|(level, map)| Ok((*level, one(map)?)));
-    Ok(BackboneOutput {
-        raw: one(&backbone.raw)?,
-        depths: one(&backbone.depths)?,
-        densities: one(&backbone.densities)?,
-        features: features.collect::<Result<_>>()?,
-    })
 }
 
 fn primaries_of(p: &Primaries, b: usize) -> Result<Primaries> {

@@ -140,8 +140,12 @@ pub struct Data {
     pub crop: f32,
     /// Exposure, softness and noise of cameras on the context views.
     pub photographic: bool,
+    /// Share of scenes whose near and far are what can be seen
+    /// ([`super::source::Rooms::seen_range`]).
+    pub seen_range: f32,
     /// Pictures on disk in place of made-up rooms: then `scenes`, `samples`,
-    /// `target_samples`, `crop` and `photographic` mean nothing, and depth is unknown.
+    /// `target_samples`, `crop`, `photographic` and `seen_range` mean nothing, and depth
+    /// is unknown.
     pub files: Option<Files>,
     /// Scenes that are shown in turns before the next ones are made.
     pub window: u64,
@@ -166,6 +170,7 @@ impl Default for Data {
             target_samples: 1,
             crop: 0.5,
             photographic: true,
+            seen_range: 0.0,
             files: None,
             window: 256,
             replay: 1,
@@ -420,6 +425,7 @@ impl TrainConfig {
             ("optimizer.betas", o.betas[0].max(o.betas[1])),
             ("optimizer.average", o.average),
             ("data.crop", f64::from(self.data.crop)),
+            ("data.seen_range", f64::from(self.data.seen_range)),
             ("data.augment.flip", a.flip),
             ("data.augment.permute", a.permute),
             ("data.augment.swap", a.swap),

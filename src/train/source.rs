@@ -3,6 +3,7 @@
 
 use super::Result;
 use crate::data::dataset::Posed;
+use crate::data::pair::quantile;
 use crate::data::procedural::{self, ExampleSpec, TargetSpec};
 use crate::io::image::Rgb;
 use half::f16;
@@ -66,7 +67,31 @@ pub struct Rooms {
     pub spec: ExampleSpec,
     /// Targets.
     pub targets: TargetSpec,
+    /// Share of the examples whose near and far are what the context views show, a
+    /// little wider: what a first look finds at inference
+    /// ([`crate::model::subsplat::SubSplat::look`]). The others keep the habits of data
+    /// sets.
+    pub seen_range: f32,
 }
+
+impl Rooms {
+    /// near and far of an example whose context views have these depths, from `key`; none
+    /// for the share that keeps its own.
+    fn seen(&self, key: u64, depths: impl Iterator<Item = f32>) -> Option<(f32, f32)> {
+        if share(key, 1) >= f64::from(self.seen_range) {
+            return None;
+        }
+        let mut depths: Vec<f32> = depths.filter(|z| *z > 0.0).collect();
+        let [near, far] = [SEEN.0, 1.0 - SEEN.0].map(|q| quantile(&mut depths, q));
+        let between = |low: f32, high: f32, k: u64| low + (high - low) * share(key, k) as f32;
+        let range = (near * between(SEEN.1, 1.0, 2), far * between(1.0, SEEN.2, 3));
+        (range.0 > 0.0 && range.1 > range.0).then_some(range)
+    }
+}
+
+/// Quantile of depth that a seen range begins at, and the least share of it and the most
+/// multiple of its counterpart that near and far are: a first look errs by so much.
+const SEEN: (f32, f32, f32) = (0.01, 0.75, 1.4);
 
 impl Source for Rooms {
     fn example(&self, index: u64) -> Result<Arc<Example>> {
@@ -85,7 +110,9 @@ impl Source for Rooms {
             }
         }
         let targets = pictures.split_off(2.min(pictures.len()));
-        let near_far = (made.near, made.far);
+        let shown = made.views.iter().take(inverse_depth.len()).flat_map(|v| &v.depth);
+        let near_far = self.seen(word(made.seed, 0x5EE), shown.copied());
+        let near_far = near_far.unwrap_or((made.near, made.far));
         Ok(Arc::new(Example { context: pictures, targets, inverse_depth, near_far }))
     }
 }

@@ -328,7 +328,7 @@ impl Learner {
         let start = Instant::now();
         let (output, maps) = self.model.encode_for_training(views, self.config.loss.around_mode)?;
         let frozen = self.config.optimizer.freeze_backbone;
-        let output = if frozen { output.detach() } else { output };
+        let output = if frozen { output.detach()? } else { output };
         seconds.backbone += start.elapsed().as_secs_f64();
         let (mut parts, mut terms) = (Vec::new(), Terms::default());
         match &maps {
@@ -344,7 +344,7 @@ impl Learner {
             }
         }
         for (b, example) in group.iter().enumerate() {
-            let scene = (&views.scene(b)?, &scene_of(&output, b)?, *example);
+            let scene = (&views.scene(b)?, &output.scene(b)?, *example);
             let seen = self.render_scene(
                 scene,
                 (share, step),
@@ -477,16 +477,4 @@ fn sum(parts: Vec<Tensor>) -> Result<Tensor> {
         total = (total + part)?;
     }
     Ok(total)
-}
-
-/// Scene `b` of a backbone's output.
-fn scene_of(output: &BackboneOutput, b: usize) -> Result<BackboneOutput> {
-    let one = |t: &Tensor| t.narrow(0, b, 1);
-    let features = output.features.iter().map(|(level, map)| Ok((*level, one(map)?)));
-    Ok(BackboneOutput {
-        raw: one(&output.raw)?,
-        depths: one(&output.depths)?,
-        densities: one(&output.densities)?,
-        features: features.collect::<Result<_>>()?,
-    })
 }

@@ -58,7 +58,8 @@ pub fn rooms(config: &TrainConfig, held_out: bool) -> Result<Rooms> {
     let targets =
         crate::data::procedural::TargetSpec { ratio, samples: data.target_samples, clean: true };
     let seed = if held_out { word(data.seed, HELD_OUT) } else { data.seed };
-    Ok(Rooms { seed, scenes: if held_out { 0 } else { data.scenes }, spec, targets })
+    let scenes = if held_out { 0 } else { data.scenes };
+    Ok(Rooms { seed, scenes, spec, targets, seen_range: data.seen_range })
 }
 
 impl Validator {
@@ -141,7 +142,11 @@ impl Validator {
     }
 
     fn look_at(&self, model: &SubSplat, scene: &Example) -> Result<One> {
-        let views = views_of(&[scene])?;
+        let mut views = views_of(&[scene])?;
+        // Where depth is known its error is told in candidates: those of the example.
+        if scene.inverse_depth.is_empty() {
+            views = model.look(&views)?;
+        }
         let output = model.encode(&views)?;
         let parents = model.primaries(&views, &output)?;
         let mut found = Found::default();

@@ -107,6 +107,7 @@ fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
         input_size,
         near_far: (range.near, range.far),
         detail: args.source.detail == DetailArg::Photo,
+        look: given == (None, None),
     };
     let photographs = Photographs { args: args.clone(), photos, request };
     let result = progress.stage("network", |bar| {
@@ -150,7 +151,7 @@ impl Photographs {
     }
 
     fn made(&self, model: &Reconstructor, result: Reconstruction) -> Made {
-        let (near, _) = self.request.near_far;
+        let (near, _) = result.near_far;
         let config = model.config();
         let options = run::raster_options(&self.args.look(), config, (near, &result.inputs));
         Made { splats: result.splats, options, upscale: Some(config.upscale) }

@@ -3,16 +3,15 @@
 
 use super::plan::Plan;
 use crate::cpu::disjoint::Disjoint;
-use crate::cpu::gemm::{Base, Mat, Packed, product_on};
+use crate::cpu::gemm::{Base, Mat, PANEL, Packed, product_on};
 use crate::cpu::simd::Tier;
 use rayon::prelude::*;
 use std::cell::RefCell;
 
 /// Floats of a task's pixels, all channels: they stay in the second-level cache.
 const FLOATS: usize = 1 << 17;
-/// Most pixels of a task, and the multiple that they are of.
+/// Most pixels of a task; whole panels of [`PANEL`].
 const SPAN: usize = 2048;
-const PANEL: usize = 64;
 /// Least channels read, and pixels, for which it wins.
 const CHANNELS: usize = 16;
 const PIXELS: usize = 256;

@@ -186,6 +186,11 @@ impl SmallBackbone {
         Ok((output, DepthMaps { logits, index, confidence: sigmoid(&confidence)? }))
     }
 
+    /// D: depth candidates.
+    pub fn candidates(&self) -> usize {
+        self.config.depth_candidates
+    }
+
     /// Depth alone, without the heads at full resolution: what depth supervision needs.
     ///
     /// # Errors
