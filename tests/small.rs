@@ -94,7 +94,7 @@ fn half_a_million_to_two_million_parameters() {
 
 #[test]
 fn every_part_can_be_switched() {
-    let parts: [fn(&mut Small); 9] = [
+    let parts: [fn(&mut Small); 10] = [
         |_| {},
         |c| c.raw_matching = false,
         |c| c.stem_channels = 0,
@@ -104,6 +104,7 @@ fn every_part_can_be_switched() {
         |c| c.confidence_opacity = false,
         |c| c.pixel_colour = false,
         |c| c.unet_channels = vec![32, 40],
+        |c| c.cross_check = false,
     ];
     let v = views(&[example(5)]);
     let mut seen = Vec::new();

@@ -20,7 +20,7 @@ pub struct Asked<'a> {
     pub seed: Option<u64>,
     /// r: side of the children's grid, K = r²; must fit the weights.
     pub upscale: Option<usize>,
-    /// r where the weights leave it open.
+    /// Target over input: the least r where the weights leave it open.
     pub ratio: Option<usize>,
     /// `--backbone`, `--preset`, `--config`.
     pub model: &'a ModelArgs,
@@ -95,7 +95,10 @@ fn unasked(args: &Asked) -> Result<Reconstructor> {
 /// The shipped backbone, with SubSplat's heads where the arguments leave them their own
 /// preset and r.
 fn shipped(args: &Asked) -> Result<Reconstructor> {
-    let upscale = args.upscale.or(args.ratio).unwrap_or(UPSCALE);
+    // Children finer than the target's pixels do it no harm, so heads that were trained
+    // serve a lower ratio too.
+    let least = args.ratio.map(|r| r.max(UPSCALE));
+    let upscale = args.upscale.or(least).unwrap_or(UPSCALE);
     let asked = || format!("--upscale {upscale}");
     let Some(preset) = args.model.preset else {
         return Reconstructor::shipped(upscale).with_context(asked);

@@ -79,6 +79,10 @@ pub struct Small {
     pub pixel_colour: bool,
     /// Channels of the full-resolution feature map that the heads read (32).
     pub head_channels: usize,
+    /// Opacity is lowered where another view that sees the place sees another colour
+    /// ([`crate::cpu::small::cross_check`]).
+    #[serde(default = "yes")]
+    pub cross_check: bool,
     /// Near and far are narrowed to what a first look at half the size shows
     /// ([`crate::model::subsplat::SubSplat::look`]).
     #[serde(default = "yes")]
@@ -184,6 +188,7 @@ impl Small {
             confidence_opacity: true,
             pixel_colour: true,
             head_channels: 32,
+            cross_check: true,
             first_look: true,
             primaries: Primaries::with(ShFrame::Standard),
         }

@@ -26,7 +26,7 @@ use crate::ops::join::join;
 use crate::ops::matching::raw_matching;
 use crate::ops::plane_sweep::{Pair, Sweep, pair, plane_sweep_on, relative_pose};
 use crate::ops::small::{
-    Start, expectation, head_input, head_output, lift, ray_distance, unit_channels,
+    Start, cross_check, expectation, head_input, head_output, lift, ray_distance, unit_channels,
 };
 use crate::sh::C0;
 use candle_core::{Result, Tensor, bail};
@@ -177,10 +177,14 @@ impl SmallBackbone {
             (FeatureLevel::Cnn2, split_views(&feat2, b, v)?),
             (FeatureLevel::Refine1, split_views(&heads.hidden, b, v)?),
         ];
+        let mut densities = heads.density.reshape((b, v, h * w, 1))?;
+        if self.config.cross_check {
+            densities = (densities * cross_check(&views.images, &views.cameras, &depths)?)?;
+        }
         let output = BackboneOutput {
             raw: heads.raw.reshape((b, v, h * w, ()))?,
             depths,
-            densities: heads.density.reshape((b, v, h * w, 1))?,
+            densities,
             features,
         };
         Ok((output, DepthMaps { logits, index, confidence: sigmoid(&confidence)? }))

@@ -3,11 +3,13 @@
 //! differences.
 
 mod convex;
+mod cross_check;
 mod expectation;
 mod heads;
 mod unit;
 
 pub use convex::upsample_convex;
+pub use cross_check::cross_check;
 pub use expectation::{expectation, lift};
 pub use heads::{Start, head_input, head_output, ray_distance};
 pub use unit::unit_channels;

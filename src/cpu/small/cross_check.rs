@@ -1,0 +1,166 @@
+//! What one view says of another's surface: a factor for its opacity.
+//!
+//! A pixel's point is looked up in every other view. Where nothing stands before it
+//! there, that view sees it, and should see it in the pixel's colour; in another colour
+//! it is most likely at the wrong depth, and would hang in the air. Colours are compared
+//! with the nearest of 3×3 pixels, as depth is right to a pixel at best.
+//!
+//! In: pictures, cameras, distance along the unit ray of each pixel. Out: `[V, H·W]`,
+//! factors from [`LEAST`] (doubted by all views that see it) to 1 (agreed with, or seen
+//! by none). No gradient is owed: pictures are given, and that a point leaves a
+//! silhouette has no derivative.
+
+use crate::camera::Camera;
+use rayon::prelude::*;
+
+/// Factor of a pixel that is doubted altogether.
+pub const LEAST: f32 = 0.1;
+/// Σ|ΔRGB| of display values from which doubt is whole.
+const COLOUR: f32 = 1.0;
+/// A point is hidden where it lies behind the other view's surface by more than this
+/// share of that surface's z.
+const BEHIND: f32 = 0.05;
+
+/// One view.
+#[derive(Clone, Copy, Debug)]
+pub struct Seen<'a> {
+    /// Of pictures of H × W pixels.
+    pub camera: &'a Camera,
+    /// `[3, H, W]`, display values.
+    pub rgb: &'a [f32],
+    /// `[H·W]`: distance along the unit ray, world units.
+    pub distances: &'a [f32],
+}
+
+/// Where the surface of a view is, and what it looks like.
+struct Surface<'a> {
+    view: Seen<'a>,
+    /// `[H·W]`: camera z.
+    z: Vec<f32>,
+}
+
+impl<'a> Surface<'a> {
+    fn new(view: Seen<'a>) -> Self {
+        let z = (0..view.distances.len()).into_par_iter();
+        let z = z.map(|i| view.distances[i] / ray(view.camera, i).length()).collect();
+        Self { view, z }
+    }
+
+    fn colour(&self, i: usize) -> [f32; 3] {
+        let plane = self.z.len();
+        [0, 1, 2].map(|c| self.view.rgb[c * plane + i])
+    }
+
+    /// How much this view doubts a `point` (world) of `colour`: 0 to 1; none where it does
+    /// not see it.
+    fn doubt(&self, point: glam::Vec3, colour: [f32; 3]) -> Option<f32> {
+        let k = self.view.camera.intrinsics;
+        let p = self.view.camera.to_camera(point);
+        let at = k.project(p);
+        let inside = at.x >= 0.0 && at.y >= 0.0 && at.x < k.width as f32 && at.y < k.height as f32;
+        if !(inside && p.z > 0.0) {
+            return None;
+        }
+        let (x, y) = (at.x as usize, at.y as usize);
+        let (mut surface, mut apart) = (0.0f32, COLOUR);
+        for row in y.saturating_sub(1)..(y + 2).min(k.height) {
+            for i in row * k.width + x.saturating_sub(1)..row * k.width + (x + 2).min(k.width) {
+                surface = surface.max(self.z[i]);
+                let own = self.colour(i);
+                apart = apart.min((0..3).map(|c| (own[c] - colour[c]).abs()).sum());
+            }
+        }
+        (p.z <= surface * (1.0 + BEHIND)).then_some(apart / COLOUR)
+    }
+}
+
+fn ray(camera: &Camera, i: usize) -> glam::Vec3 {
+    let k = camera.intrinsics;
+    k.unproject(glam::Vec2::new((i % k.width) as f32 + 0.5, (i / k.width) as f32 + 0.5))
+}
+
+/// The factors of all views' pixels, `[V, H·W]`: one less the mean doubt of the other
+/// views that see the pixel's point.
+pub fn cross_check(views: &[Seen<'_>]) -> Vec<f32> {
+    let surfaces: Vec<Surface> = views.iter().map(|v| Surface::new(*v)).collect();
+    let mut out: Vec<f32> = Vec::with_capacity(views.iter().map(|v| v.distances.len()).sum());
+    for (v, own) in surfaces.iter().enumerate() {
+        let camera = own.view.camera;
+        let factor = |i: usize| {
+            let in_camera = ray(camera, i) * own.z[i];
+            let point = camera.rotation() * in_camera + camera.position();
+            let others = surfaces.iter().enumerate().filter(|(u, _)| *u != v);
+            let doubts = others.filter_map(|(_, u)| u.doubt(point, own.colour(i)));
+            let (sum, count) = doubts.fold((0.0, 0u32), |(s, n), d| (s + d, n + 1));
+            1.0 - (1.0 - LEAST) * sum / count.max(1) as f32
+        };
+        let factors = (0..own.z.len()).into_par_iter().with_min_len(1024).map(factor);
+        out.par_extend(factors);
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::Intrinsics;
+    use glam::{Mat4, Vec3};
+
+    const SIDE: usize = 32;
+
+    fn camera(x: f32) -> Camera {
+        let k = Intrinsics { fx: 32.0, fy: 32.0, cx: 16.0, cy: 16.0, width: SIDE, height: SIDE };
+        Camera::new(k, Mat4::from_translation(Vec3::new(x, 0.0, 0.0))).unwrap()
+    }
+
+    /// A wall at z = 2 whose left half is dark, seen from x: `[3, H, W]` and distances.
+    fn wall(camera: &Camera) -> (Vec<f32>, Vec<f32>) {
+        let (mut grey, mut distances) = (Vec::new(), Vec::new());
+        for i in 0..SIDE * SIDE {
+            let ray = ray(camera, i);
+            let x = camera.position().x + 2.0 * ray.x;
+            grey.push(if x < 0.0 { 0.1 } else { 0.9 });
+            distances.push(2.0 * ray.length());
+        }
+        (grey.repeat(3), distances)
+    }
+
+    fn factors(change: impl Fn(&mut [f32])) -> Vec<f32> {
+        let cameras = [camera(0.0), camera(0.5)];
+        let [a, b] = [wall(&cameras[0]), wall(&cameras[1])];
+        let mut distances = a.1;
+        change(&mut distances);
+        cross_check(&[
+            Seen { camera: &cameras[0], rgb: &a.0, distances: &distances },
+            Seen { camera: &cameras[1], rgb: &b.0, distances: &b.1 },
+        ])
+    }
+
+    #[test]
+    fn what_agrees_stays() {
+        assert!(factors(|_| ()).iter().all(|f| *f == 1.0));
+    }
+
+    #[test]
+    fn a_bright_point_before_the_dark_half_is_doubted() {
+        // Pixel (17, 16) of the first view looks at the bright half, 1.5 px right of the
+        // edge at x = 0. At z = 1 its point lies at x = 0.047, which the second view
+        // (8 px of parallax at z = 2, 16 at z = 1) sees 7 px left of the edge.
+        let at = 16 * SIDE + 17;
+        let all = factors(|d| d[at] *= 0.5);
+        let expected = 1.0 - (1.0 - LEAST) * 1.0;
+        assert!((all[at] - expected).abs() < 1e-6, "{}", all[at]);
+        // Nothing else of the first view is; the second sees its own points before it.
+        assert!(all[..SIDE * SIDE].iter().enumerate().all(|(i, f)| i == at || *f == 1.0));
+    }
+
+    #[test]
+    fn what_is_hidden_or_outside_is_not_doubted() {
+        let at = 16 * SIDE + 17;
+        // Behind the second view's wall by half; beyond its border (64 px of parallax).
+        assert_eq!(factors(|d| d[at] *= 1.5)[at], 1.0);
+        assert_eq!(factors(|d| d[at] *= 0.125)[at], 1.0);
+        // No number, no verdict.
+        assert_eq!(factors(|d| d[at] = f32::NAN)[at], 1.0);
+    }
+}
