@@ -94,7 +94,7 @@ pub fn run(
     size: (usize, usize),
     detail: bool,
 ) -> Reconstruction {
-    let request = Request { input_size: size, near_far: NEAR_FAR, detail, look: true };
+    let request = Request { input_size: size, near_far: NEAR_FAR, detail, look: false };
     model.reconstruct(photos, &request).unwrap()
 }
 
