@@ -20,9 +20,6 @@ const PROFILE_EVERY: usize = 15;
 /// Share of the newest step in the shown means.
 const FRESH: f64 = 0.05;
 
-/// What candle reads the number of its own threads from.
-const CANDLE_THREADS: &str = "CANDLE_NUM_THREADS";
-
 /// Starts this very program anew with one thread for candle, unless the user says how many.
 ///
 /// Candle gives operations on large tensors to a thread pool of its own, whose threads spin
@@ -32,6 +29,7 @@ const CANDLE_THREADS: &str = "CANDLE_NUM_THREADS";
 #[cfg(unix)]
 fn leave_the_cores_to_us() {
     use std::os::unix::process::CommandExt;
+    const CANDLE_THREADS: &str = "CANDLE_NUM_THREADS";
     if std::env::var_os(CANDLE_THREADS).is_some() {
         return;
     }
