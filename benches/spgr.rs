@@ -17,10 +17,6 @@ use subsplat::model::spgr_ref;
 use subsplat::ops::redistribute::{Rule, redistribute};
 use subsplat::ops::spgr::{Spgr, spgr, spgr_into};
 
-/// As in the program.
-#[global_allocator]
-static PAGES: subsplat::cpu::pages::Pages = subsplat::cpu::pages::Pages;
-
 /// Side of the two input pictures, px: 131,072 parents, as MVSplat's 256² gives them.
 const SIDE: usize = 256;
 /// The same with `--quick`.
