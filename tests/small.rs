@@ -1,10 +1,11 @@
 //! The small backbone: what its untrained start sees, and its switches.
 
 use candle_core::{Device, Tensor};
-use subsplat::config::Small;
+use subsplat::config::{Backbone, Config, Preset, Small};
 use subsplat::data::procedural::{Example, ExampleSpec};
 use subsplat::model::Views;
 use subsplat::model::backbone::SmallBackbone;
+use subsplat::model::subsplat::SubSplat;
 use subsplat::model::weights::Weights;
 
 const SIDE: usize = 128;
@@ -141,6 +142,25 @@ fn a_batch_equals_its_parts() {
             assert!(worst.fold(0.0, f32::max) < 1e-4);
         }
     }
+}
+
+#[test]
+fn a_first_look_narrows_a_wide_range_unless_it_is_switched_off() {
+    let e = example(2);
+    let mut v = views(std::slice::from_ref(&e));
+    v.near_far[0].fill((0.2 * e.near, 20.0 * e.far));
+    let look = |config: &Config| {
+        let weights = Weights::seeded(3);
+        SubSplat::new(config, weights.builder()).unwrap().look(&v).unwrap().near_far
+    };
+    let mut config = Config::small(Preset::Tuned, 2);
+    let (near, far) = look(&config)[0][0];
+    assert_eq!(look(&config)[0], [(near, far); 2]);
+    assert!(near > v.near_far[0][0].0 && far < v.near_far[0][0].1, "{near} {far}");
+    let Backbone::Small(small) = &mut config.backbone else { panic!("another backbone") };
+    small.first_look = false;
+    assert_eq!(look(&config), v.near_far);
+    assert_eq!(look(&Config::re10k(Preset::Tuned, 2)), v.near_far);
 }
 
 #[test]

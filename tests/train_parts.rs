@@ -288,6 +288,24 @@ fn rooms_are_a_number() {
 }
 
 #[test]
+fn a_seen_range_is_a_little_wider_than_what_is_seen() {
+    let all = Rooms { seen_range: 1.0, ..rooms() };
+    for i in 0..6 {
+        let (own, seen) = (rooms().example(i).unwrap(), all.example(i).unwrap());
+        assert_eq!((&own.context, &own.inverse_depth), (&seen.context, &seen.inverse_depth));
+        let mut depths: Vec<f32> =
+            seen.inverse_depth.iter().flatten().map(|d| d.to_f32().recip()).collect();
+        depths.sort_by(f32::total_cmp);
+        let last = depths.len() - 1;
+        let (low, high) = (depths[last / 100], depths[last - last / 100]);
+        let (near, far) = seen.near_far;
+        assert!((0.74 * low..=1.01 * low).contains(&near), "{near} {low}");
+        assert!((0.99 * high..=1.41 * high).contains(&far), "{far} {high}");
+        assert_eq!(seen, all.example(i).unwrap());
+    }
+}
+
+#[test]
 fn replay_shows_each_scene_so_often_and_no_other() {
     let replay = Replay::new(rooms(), 7, 3);
     let places: Vec<u64> = (0..42).map(|i| replay.place(i)).collect();
