@@ -99,7 +99,7 @@ mod large {
 mod large {
     use super::HUGE;
     use std::ffi::{c_int, c_void};
-    use std::sync::{Mutex, PoisonError};
+    use std::sync::{Mutex, MutexGuard, PoisonError};
 
     // Linux's PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS and MADV_HUGEPAGE.
     const READ_WRITE: c_int = 3;
@@ -119,13 +119,100 @@ mod large {
         fn madvise(at: *mut c_void, length: usize, advice: c_int) -> c_int;
     }
 
-    /// Most blocks that wait.
-    const SLOTS: usize = 64;
+    /// Most pieces that wait.
+    const SLOTS: usize = 128;
     /// Lengths are multiples of the largest page size that these kernels have.
     const PAGE: usize = 1 << 16;
 
-    /// Address and length of blocks that wait, oldest first.
-    static WAITING: Mutex<([(usize, usize); SLOTS], usize)> = Mutex::new(([(0, 0); SLOTS], 0));
+    /// Memory that waits, resident for the most part.
+    #[derive(Clone, Copy)]
+    struct Piece {
+        at: usize,
+        length: usize,
+        /// When it came: the least goes first.
+        stamp: u64,
+    }
+
+    /// What waits, by address; neighbours are one piece, whatever mappings they came from.
+    struct Waiting {
+        pieces: [Piece; SLOTS],
+        n: usize,
+        stamp: u64,
+    }
+
+    static WAITING: Mutex<Waiting> = Mutex::new(Waiting {
+        pieces: [Piece { at: 0, length: 0, stamp: 0 }; SLOTS],
+        n: 0,
+        stamp: 0,
+    });
+
+    impl Waiting {
+        fn remove(&mut self, i: usize) -> Piece {
+            let piece = self.pieces[i];
+            self.pieces.copy_within(i + 1..self.n, i);
+            self.n -= 1;
+            piece
+        }
+
+        fn oldest(&self) -> Option<usize> {
+            (0..self.n).min_by_key(|&i| self.pieces[i].stamp)
+        }
+
+        /// The front of the shortest piece that is long enough.
+        fn take(&mut self, length: usize) -> Option<usize> {
+            let fits = |&i: &usize| self.pieces[i].length >= length;
+            let i = (0..self.n).filter(fits).min_by_key(|&i| self.pieces[i].length)?;
+            let piece = &mut self.pieces[i];
+            let at = piece.at;
+            piece.at += length;
+            piece.length -= length;
+            if piece.length == 0 {
+                self.remove(i);
+            }
+            Some(at)
+        }
+
+        /// Takes a block back; what has no room is for the caller to unmap.
+        fn give(&mut self, at: usize, length: usize) -> Option<Piece> {
+            self.stamp += 1;
+            let mut new = Piece { at, length, stamp: self.stamp };
+            let mut i = self.pieces[..self.n].partition_point(|p| p.at < at);
+            if i < self.n && self.pieces[i].at == at + length {
+                new.length += self.remove(i).length;
+            }
+            if i > 0 && self.pieces[i - 1].at + self.pieces[i - 1].length == at {
+                i -= 1;
+                let before = self.remove(i);
+                new = Piece { at: before.at, length: before.length + new.length, ..new };
+            }
+            let out = match self.n == SLOTS {
+                true => self.oldest().map(|oldest| {
+                    i -= usize::from(oldest < i);
+                    self.remove(oldest)
+                }),
+                false => None,
+            };
+            self.pieces.copy_within(i..self.n, i + 1);
+            self.pieces[i] = new;
+            self.n += 1;
+            out
+        }
+
+        /// Up to `length` bytes of what waits, the oldest piece's.
+        fn part(&mut self, length: usize) -> Option<Piece> {
+            let i = self.oldest()?;
+            let piece = &mut self.pieces[i];
+            if piece.length <= length {
+                return Some(self.remove(i));
+            }
+            piece.length -= length;
+            Some(Piece { at: piece.at + piece.length, length, ..*piece })
+        }
+    }
+
+    fn waiting() -> MutexGuard<'static, Waiting> {
+        WAITING.lock().unwrap_or_else(PoisonError::into_inner)
+    }
 
     /// A block of `size` bytes, and whether it was used before (else it is zero). Null if
     /// there is no memory.
@@ -133,50 +220,24 @@ mod large {
         let Some(length) = size.checked_next_multiple_of(PAGE) else {
             return (std::ptr::null_mut(), false);
         };
-        let mut out = [(0, 0); SLOTS];
-        let mut count = 0;
-        {
-            let mut waiting = WAITING.lock().unwrap_or_else(PoisonError::into_inner);
-            let (slots, n) = &mut *waiting;
-            if let Some(i) = slots[..*n].iter().rposition(|&(_, l)| l == length) {
-                let (at, _) = remove(slots, n, i);
-                return (at as *mut u8, true);
-            }
-            let mut freed = 0;
-            while freed < length && *n > 0 {
-                let block = remove(slots, n, 0);
-                freed += block.1;
-                out[count] = block;
-                count += 1;
-            }
+        if let Some(at) = waiting().take(length) {
+            return (at as *mut u8, true);
         }
-        out[..count].iter().for_each(|&(at, length)| unmap(at, length));
+        let mut left = length;
+        while left > 0 {
+            let Some(piece) = waiting().part(left) else { break };
+            left -= piece.length;
+            unmap(piece.at, piece.length);
+        }
         (map(length), false)
     }
 
     /// Takes a block back.
     pub(super) fn give(at: *mut u8, size: usize) {
-        let length = size.next_multiple_of(PAGE);
-        let mut oldest = None;
-        {
-            let mut waiting = WAITING.lock().unwrap_or_else(PoisonError::into_inner);
-            let (slots, n) = &mut *waiting;
-            if *n == SLOTS {
-                oldest = Some(remove(slots, n, 0));
-            }
-            slots[*n] = (at as usize, length);
-            *n += 1;
+        let out = waiting().give(at as usize, size.next_multiple_of(PAGE));
+        if let Some(piece) = out {
+            unmap(piece.at, piece.length);
         }
-        if let Some((at, length)) = oldest {
-            unmap(at, length);
-        }
-    }
-
-    fn remove(slots: &mut [(usize, usize); SLOTS], n: &mut usize, i: usize) -> (usize, usize) {
-        let block = slots[i];
-        slots.copy_within(i + 1..*n, i);
-        *n -= 1;
-        block
     }
 
     /// New pages at a multiple of [`HUGE`]; null if there are none.
