@@ -22,6 +22,10 @@ use subsplat::cpu::conv::{Sizes, bias_grad, forward, input_grad, weight_grad};
 use subsplat::ops::conv2d::conv2d;
 use subsplat::ops::conv3d::conv3d;
 
+/// As in the program.
+#[global_allocator]
+static PAGES: subsplat::cpu::pages::Pages = subsplat::cpu::pages::Pages;
+
 /// Name, channels in and out, kernel, stride, side of the input.
 type Row = (&'static str, usize, usize, usize, usize, usize);
 
@@ -211,16 +215,16 @@ fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
     let (s, tier) = (&case.sizes, Tier::best());
     let (x, w, b) = (host(&case.x)?, host(&case.w)?, host(&case.b)?);
     let dy = host(&tensor(case.run()?.dims(), 1.0, 4)?)?;
-    let mut y = vec![0.0; dy.len()];
-    let (mut dx, mut dw, mut db) = (x.clone(), w.clone(), b.clone());
+    let images = x.len() / (s.in_channels * s.in_pixels());
+    let (mut dw, mut db) = (w.clone(), b.clone());
     let (mut plain_dx, mut plain_dw) = (x.clone(), w.clone());
     let mut contenders = Vec::new();
     let (x, w, b, dy) = (&x, &w, &b, &dy);
     contenders.push(Contender::new("ours, forward", Threads::All, move || {
-        forward(tier, s, x, w, b, &mut y);
+        std::hint::black_box(forward(tier, s, images, x, w, b));
         Ok(())
     }));
-    input_grad(tier, s, dy, w, &mut dx);
+    let dx = input_grad(tier, s, images, dy, w);
     weight_grad(tier, s, x, dy, &mut dw);
     if let Some(g) = case.plain() {
         plain::input_grad(&g, dy, w, &mut plain_dx);
@@ -234,7 +238,7 @@ fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
         }));
     }
     let run = move || {
-        input_grad(tier, s, dy, w, &mut dx);
+        std::hint::black_box(input_grad(tier, s, images, dy, w));
         weight_grad(tier, s, x, dy, &mut dw);
         bias_grad(s.out_pixels(), dy, &mut db);
         Ok(())

@@ -69,10 +69,16 @@ pub fn median(seconds: &[f64]) -> f64 {
     sorted.get(sorted.len() / 2).copied().unwrap_or(f64::NAN)
 }
 
-/// Seconds of `runs` runs after one that does not count.
+/// Seconds below which more runs are timed than asked for, and how many.
+const QUICK: (f64, usize) = (0.02, 50);
+
+/// Seconds of `runs` runs after two that do not count; of more where they are short.
 pub fn timed(runs: usize, mut run: impl FnMut() -> Result<()>) -> Result<Vec<f64>> {
     run()?;
-    (0..runs)
+    let start = Instant::now();
+    run()?;
+    let short = start.elapsed().as_secs_f64() < QUICK.0;
+    (0..if short { runs.max(QUICK.1) } else { runs })
         .map(|_| {
             let start = Instant::now();
             run()?;

@@ -1,9 +1,10 @@
 //! Pointwise functions and softmax over rows, with gradients.
 
-use super::fresh::{Fresh, fill};
+use super::fresh::{Block, Fresh, fill};
 use super::math::{erf, exp, vectorised};
 use super::simd::{Kernel, LANES, Simd, Tier, exp as exp_lanes};
 use rayon::prelude::*;
+use std::mem::MaybeUninit;
 
 /// Elements per task: long enough to hide the scheduling, short enough to balance.
 const CHUNK: usize = 16_384;
@@ -74,9 +75,10 @@ macro_rules! by_kind {
 }
 pub(super) use by_kind;
 
-/// y = f(x).
-pub fn forward(kind: Activation, x: &[f32], y: &mut [f32]) {
-    x.par_chunks(CHUNK).zip(y.par_chunks_mut(CHUNK)).for_each(|(x, y)| {
+/// f(x), new memory.
+pub fn forward(kind: Activation, x: &[f32]) -> Vec<f32> {
+    let mut fresh = Fresh::new(x.len());
+    fresh.blocks(CHUNK).zip(x.par_chunks(CHUNK)).for_each(|(y, x)| {
         vectorised(
             #[inline(always)]
             || {
@@ -89,12 +91,15 @@ pub fn forward(kind: Activation, x: &[f32], y: &mut [f32]) {
             },
         );
     });
+    // SAFETY: the loop above wrote every block.
+    unsafe { fresh.finish() }
 }
 
 #[inline(always)]
-fn map(x: &[f32], y: &mut [f32], f: impl Fn(f32) -> f32) {
+fn map(x: &[f32], y: &mut Block<f32>, f: impl Fn(f32) -> f32) {
+    assert_eq!(x.len(), y.len(), "activation: lengths");
     for (y, x) in y.iter_mut().zip(x) {
-        *y = f(*x);
+        *y = MaybeUninit::new(f(*x));
     }
 }
 
@@ -167,23 +172,45 @@ fn scale(x: &[f32], dy: &[f32], dx: &mut [f32], f: impl Fn(f32) -> f32) {
     }
 }
 
+/// Rows of a pass of [`softmax`].
+const TOGETHER: usize = 16;
 /// Elements whose exponentials are one sum in single precision.
 const SUM: usize = 4096;
 
 /// A row to e^{x − max}; returns the sum. To be called inside a kernel.
 #[inline(always)]
 pub(super) fn exp_row<S: Simd>(s: S, row: &mut [f32]) -> f32 {
+    let most = largest(s, row);
+    exp_below(s, row, most)
+}
+
+/// The largest number of a row; NaN are passed over.
+#[inline(always)]
+fn largest<S: Simd>(s: S, row: &[f32]) -> f32 {
     let mut top = s.splat(f32::NEG_INFINITY);
     let (chunks, tail) = row.as_chunks::<LANES>();
     for v in chunks {
         top = s.max(s.load(v), top);
     }
-    let mut last = [f32::NEG_INFINITY; LANES];
-    last[..tail.len()].copy_from_slice(tail);
-    top = s.max(s.load(&last), top);
+    if !tail.is_empty() {
+        let mut last = [f32::NEG_INFINITY; LANES];
+        last[..tail.len()].copy_from_slice(tail);
+        top = s.max(s.load(&last), top);
+    }
     let mut lanes = [0.0; LANES];
     s.store(top, &mut lanes);
-    let max = lanes.iter().fold(f32::NEG_INFINITY, |m, &v| if v > m { v } else { m });
+    for half in [8, 4, 2, 1] {
+        for i in 0..half {
+            let other = lanes[i + half];
+            lanes[i] = if other > lanes[i] { other } else { lanes[i] };
+        }
+    }
+    lanes[0]
+}
+
+/// A row to e^{x − max}; returns the sum.
+#[inline(always)]
+fn exp_below<S: Simd>(s: S, row: &mut [f32], max: f32) -> f32 {
     let (max, mut total) = (s.splat(max), 0.0);
     for part in row.chunks_mut(SUM) {
         let (chunks, tail) = part.as_chunks_mut::<LANES>();
@@ -232,10 +259,20 @@ impl Kernel for Softmax<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        for row in self.y.chunks_exact_mut(self.n) {
-            let inverse = 1.0 / exp_row(s, row);
-            for v in row {
-                *v *= inverse;
+        // Pass by pass over some rows: within one each step waits for the last.
+        for rows in self.y.chunks_mut(TOGETHER * self.n) {
+            let mut kept = [0.0; TOGETHER];
+            for (row, most) in rows.chunks_exact(self.n).zip(&mut kept) {
+                *most = largest(s, row);
+            }
+            for (row, kept) in rows.chunks_exact_mut(self.n).zip(&mut kept) {
+                *kept = exp_below(s, row, *kept);
+            }
+            for (row, sum) in rows.chunks_exact_mut(self.n).zip(&kept) {
+                let inverse = 1.0 / sum;
+                for v in row {
+                    *v *= inverse;
+                }
             }
         }
     }

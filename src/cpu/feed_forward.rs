@@ -8,7 +8,7 @@
 //! ops/feed_forward.rs compare with.
 
 use super::activation::{Activation, in_place};
-use super::fresh::{Fresh, start};
+use super::fresh::{Fresh, over, start};
 use super::gemm::{Base, Mat, Packed, product};
 use super::norm::{self, Rows};
 use super::simd::LANES;
@@ -57,7 +57,8 @@ pub fn forward(f: &FeedForward<'_>, x: &[f32], message: &[f32]) -> Vec<f32> {
             product((hidden, pitch), Mat::new(message, n, c, c), &up[1], 1.0, Base::Own);
             in_place(Activation::Gelu, hidden);
             product((narrow, c), Mat::new(hidden, n, h, pitch), &down, 1.0, Base::Zero);
-            norm::forward(&rows, narrow, f.norm[0], f.norm[1], y);
+            // SAFETY: `forward_to` writes numbers.
+            norm::forward_to(&rows, narrow, f.norm[0], f.norm[1], unsafe { over(y) });
             y.iter_mut().zip(x).for_each(|(y, x)| *y += x);
         },
     );

@@ -20,15 +20,20 @@ impl<T: Copy + Default + Send> Fresh<T> {
 
     /// Blocks of `size` ≥ 1, the last one maybe shorter.
     pub(crate) fn blocks(&mut self, size: usize) -> rayon::slice::ChunksMut<'_, MaybeUninit<T>> {
+        self.whole().par_chunks_mut(size)
+    }
+
+    /// All places at once.
+    pub(crate) fn whole(&mut self) -> &mut Block<T> {
         let room = self.data.spare_capacity_mut();
         let n = self.n.min(room.len());
-        room[..n].par_chunks_mut(size)
+        &mut room[..n]
     }
 
     /// All of it.
     ///
     /// # Safety
-    /// [`start`] was called with every block.
+    /// Every place was written.
     pub(crate) unsafe fn finish(mut self) -> Vec<T> {
         // SAFETY: within the capacity, and written (the caller's promise).
         unsafe { self.data.set_len(self.n) };
@@ -57,6 +62,16 @@ pub(crate) fn fill<'a, T: Copy>(block: &'a mut Block<T>, from: &[T]) -> &'a mut 
     }
     // SAFETY: every place was just written.
     unsafe { &mut *(block as *mut Block<T> as *mut [T]) }
+}
+
+/// Numbers that are there already, to be written over.
+///
+/// # Safety
+/// What is written are numbers, never memory that nobody wrote.
+#[inline(always)]
+pub(crate) unsafe fn over<T>(numbers: &mut [T]) -> &mut Block<T> {
+    // SAFETY: the same layout; every place stays written (the caller's promise).
+    unsafe { &mut *(numbers as *mut [T] as *mut Block<T>) }
 }
 
 /// Numbers below which [`zeros`] is not worth several threads.

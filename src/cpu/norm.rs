@@ -4,8 +4,10 @@
 //! follow in the same pass.
 
 use super::activation::{Activation, by_kind};
+use super::fresh::{Block, Fresh};
 use super::math::{sum_of, sums_of, vectorised};
 use rayon::prelude::*;
+use std::mem::MaybeUninit;
 
 /// How rows lie and which channel an element has: element i of row r belongs to
 /// channel (r mod `groups`)·(`len` / `run`) + i / `run`.
@@ -49,8 +51,22 @@ impl Rows {
     }
 }
 
-/// y = f(w·(x − mean)/σ + b); `w` and `b` are `[channels]`, or empty for none.
-pub fn forward(rows: &Rows, x: &[f32], w: &[f32], b: &[f32], y: &mut [f32]) {
+/// f(w·(x − mean)/σ + b), new memory; `w` and `b` are `[channels]`, or empty for none.
+pub fn forward(rows: &Rows, x: &[f32], w: &[f32], b: &[f32]) -> Vec<f32> {
+    let mut fresh = Fresh::new(x.len());
+    forward_to(rows, x, w, b, fresh.whole());
+    // SAFETY: every element of every row was written.
+    unsafe { fresh.finish() }
+}
+
+/// [`forward`] into `y`.
+///
+/// # Panics
+/// Where the sizes do not fit: not all of `y` is written then.
+pub(super) fn forward_to(rows: &Rows, x: &[f32], w: &[f32], b: &[f32], y: &mut Block<f32>) {
+    assert!(x.len() == y.len() && x.len().is_multiple_of(rows.len), "normalisation: rows");
+    assert!(rows.len.is_multiple_of(rows.run) && w.len() == b.len(), "normalisation: channels");
+    assert!(w.is_empty() || w.len() == rows.groups * rows.per_row(), "normalisation: channels");
     let batch = rows.batch();
     let chunk = batch * rows.len;
     x.par_chunks(chunk).zip(y.par_chunks_mut(chunk)).enumerate().for_each(|(at, (x, y))| {
@@ -85,7 +101,7 @@ pub fn forward(rows: &Rows, x: &[f32], w: &[f32], b: &[f32], y: &mut [f32]) {
 fn affine_row(
     rows: &Rows,
     x: &[f32],
-    y: &mut [f32],
+    y: &mut Block<f32>,
     (mean, inverse): (f32, f32),
     affine: Option<(&[f32], &[f32])>,
     f: impl Fn(f32) -> f32,
@@ -93,20 +109,20 @@ fn affine_row(
     match affine {
         Some((w, b)) if rows.run == 1 => {
             for (((y, x), w), b) in y.iter_mut().zip(x).zip(w).zip(b) {
-                *y = f((x - mean) * inverse * w + b);
+                *y = MaybeUninit::new(f((x - mean) * inverse * w + b));
             }
         }
         Some((w, b)) => {
             let runs = x.chunks_exact(rows.run).zip(y.chunks_exact_mut(rows.run));
             for ((x, y), (w, b)) in runs.zip(w.iter().zip(b)) {
                 for (y, x) in y.iter_mut().zip(x) {
-                    *y = f((x - mean) * inverse * w + b);
+                    *y = MaybeUninit::new(f((x - mean) * inverse * w + b));
                 }
             }
         }
         None => {
             for (y, x) in y.iter_mut().zip(x) {
-                *y = f((x - mean) * inverse);
+                *y = MaybeUninit::new(f((x - mean) * inverse));
             }
         }
     }

@@ -2,7 +2,7 @@
 //! nearest upsampling by a whole factor, with their transposes (the gradients).
 
 use super::activation::{self, Activation};
-use super::fresh::Fresh;
+use super::fresh::{Fresh, start};
 use super::join::repeat;
 use super::math::vectorised;
 use rayon::prelude::*;
@@ -93,15 +93,24 @@ impl Bilinear {
     }
 }
 
-/// f of [`bilinear`] in one pass.
-pub fn bilinear_then(r: &Resize, kind: Activation, x: &[f32], y: &mut [f32]) {
+/// f of [`bilinear`] in one pass, new memory.
+pub fn bilinear_then(r: &Resize, kind: Activation, x: &[f32]) -> Vec<f32> {
+    planes(r, x, |y| activation::in_place(kind, y))
+}
+
+/// Every plane resized, then `f` of it.
+fn planes(r: &Resize, x: &[f32], f: impl Fn(&mut [f32]) + Sync) -> Vec<f32> {
     let one = Bilinear::new(r);
-    let planes = x.par_chunks_exact(r.from[0] * r.from[1]);
-    let planes = planes.zip(y.par_chunks_exact_mut(r.to[0] * r.to[1]));
+    let (from, to) = (r.from[0] * r.from[1], r.to[0] * r.to[1]);
+    let mut fresh = Fresh::new(x.len() / from * to);
+    let planes = x.par_chunks_exact(from).zip(fresh.blocks(to));
     planes.for_each_init(Vec::new, |wide, (x, y)| {
+        let y = start(y);
         one.plane(x, y, wide);
-        activation::in_place(kind, y);
+        f(y);
     });
+    // SAFETY: the loop above started every block: there is one for each plane of `x`.
+    unsafe { fresh.finish() }
 }
 
 /// The gradient of [`bilinear_then`], `dx` overwritten.
@@ -119,13 +128,9 @@ pub fn bilinear_then_backward(r: &Resize, kind: Activation, x: &[f32], dy: &[f32
     );
 }
 
-/// `[planes, h, w]` to `[planes, H, W]`.
-pub fn bilinear(r: &Resize, x: &[f32], y: &mut [f32]) {
-    let one = Bilinear::new(r);
-    let planes = x.par_chunks_exact(r.from[0] * r.from[1]);
-    planes
-        .zip(y.par_chunks_exact_mut(r.to[0] * r.to[1]))
-        .for_each_init(Vec::new, |wide, (x, y)| one.plane(x, y, wide));
+/// `[planes, h, w]` to `[planes, H, W]`, new memory.
+pub fn bilinear(r: &Resize, x: &[f32]) -> Vec<f32> {
+    planes(r, x, |_| ())
 }
 
 /// The transpose of [`bilinear`]: `[planes, H, W]` to `[planes, h, w]`, overwritten.

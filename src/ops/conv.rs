@@ -50,9 +50,7 @@ impl Conv {
         bias: &[f32],
     ) -> Result<(CpuStorage, Shape)> {
         let shape = Self::shape(like, self.sizes.out_channels, self.sizes.out_size());
-        let mut y = zeros(shape.elem_count());
-        cpu::forward(Tier::best(), &self.sizes, x, w, bias, &mut y);
-        output(y, shape)
+        output(cpu::forward(Tier::best(), &self.sizes, like.dims()[0], x, w, bias), shape)
     }
 
     fn grads(
@@ -158,9 +156,7 @@ impl CustomOp2 for InputGrad {
         let dy = slice::<f32>(name, "dy", s1, l1)?;
         let w = slice::<f32>(name, "weight", s2, l2)?;
         let shape = Conv::shape(l1, sizes.in_channels, sizes.size);
-        let mut dx = zeros(shape.elem_count());
-        cpu::input_grad(Tier::best(), &sizes, dy, w, &mut dx);
-        output(dx, shape)
+        output(cpu::input_grad(Tier::best(), &sizes, l1.dims()[0], dy, w), shape)
     }
 }
 

@@ -4,7 +4,6 @@
 use super::{borrowed, output, slice, tensor_like};
 use crate::cpu::activation::Activation;
 use crate::cpu::norm::{self as cpu, Rows, Saved};
-use crate::cpu::zeros;
 use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Tensor, bail};
 
 /// ε of every normalisation (PyTorch's default).
@@ -92,9 +91,7 @@ struct Normalise(Rows);
 
 impl Normalise {
     fn run(&self, x: &[f32], w: &[f32], b: &[f32], shape: &Shape) -> Result<(CpuStorage, Shape)> {
-        let mut y = zeros(x.len());
-        cpu::forward(&self.0, x, w, b, &mut y);
-        output(y, shape.clone())
+        output(cpu::forward(&self.0, x, w, b), shape.clone())
     }
 }
 

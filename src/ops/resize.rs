@@ -68,14 +68,11 @@ impl CustomOp1 for Op {
         let x = slice::<f32>("resize", "x", s, l)?;
         let (b, c, _, _) = l.shape().dims4()?;
         let [h, w] = self.sizes.to;
-        if let Kind::Nearest(s) = self.kind {
-            return output(cpu::nearest(&self.sizes, s, x), (b, c, h, w));
-        }
-        let mut y = zeros(b * c * h * w);
-        match self.kind {
-            Kind::Bilinear(Some(f)) => cpu::bilinear_then(&self.sizes, f, x, &mut y),
-            _ => cpu::bilinear(&self.sizes, x, &mut y),
-        }
+        let y = match self.kind {
+            Kind::Bilinear(Some(f)) => cpu::bilinear_then(&self.sizes, f, x),
+            Kind::Bilinear(None) => cpu::bilinear(&self.sizes, x),
+            Kind::Nearest(s) => cpu::nearest(&self.sizes, s, x),
+        };
         output(y, (b, c, h, w))
     }
 

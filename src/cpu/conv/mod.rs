@@ -19,28 +19,50 @@ mod weights;
 mod winograd;
 mod winograd_weights;
 
+use super::fresh::Fresh;
 use super::simd::{Kernel, LANES, Simd, Tier};
 use plan::Plan;
 use rayon::prelude::*;
 use std::cell::RefCell;
+use std::mem::MaybeUninit;
 
 pub use plan::{Axes, Sizes};
 pub use weights::weight_grad;
 
-/// y = x ∗ w + bias. `y` is overwritten; `bias` is empty or `[O]`.
-pub fn forward(tier: Tier, s: &Sizes, x: &[f32], w: &[f32], bias: &[f32], y: &mut [f32]) {
-    run(tier, &Plan::forward(s), x, w, bias, y);
+/// Results to be written, every place of them.
+type Out = [MaybeUninit<f32>];
+
+/// y = x ∗ w + bias of `images` pictures; `bias` is empty or `[O]`.
+pub fn forward(
+    tier: Tier,
+    s: &Sizes,
+    images: usize,
+    x: &[f32],
+    w: &[f32],
+    bias: &[f32],
+) -> Vec<f32> {
+    fresh(tier, &Plan::forward(s), images, x, w, bias)
 }
 
-/// ∂L/∂x from ∂L/∂y, `dx` overwritten.
-pub fn input_grad(tier: Tier, s: &Sizes, dy: &[f32], w: &[f32], dx: &mut [f32]) {
-    run(tier, &Plan::input_grad(s), dy, w, &[], dx);
+/// ∂L/∂x from ∂L/∂y of `images` pictures.
+pub fn input_grad(tier: Tier, s: &Sizes, images: usize, dy: &[f32], w: &[f32]) -> Vec<f32> {
+    fresh(tier, &Plan::input_grad(s), images, dy, w, &[])
+}
+
+/// [`run`] into new memory.
+fn fresh(tier: Tier, plan: &Plan, images: usize, x: &[f32], w: &[f32], bias: &[f32]) -> Vec<f32> {
+    let pixels: usize = plan.dst_size.iter().product();
+    let mut y = Fresh::new(images * plan.dst_channels * pixels);
+    run(tier, plan, x, w, bias, y.whole());
+    // SAFETY: each of the three ways writes every channel of every picture in tiles that
+    // cover it (the tests run them over memory full of NaN).
+    unsafe { y.finish() }
 }
 
 /// The fastest of the three ways. For numbers in ±1 and n products a sum, [`winograd`] is
 /// within 3e-6·√n of the exact sum, [`shift`] and [`pointwise`] within 1.5e-6·√n (the
 /// tests hold them).
-fn run(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y: &mut [f32]) {
+fn run(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y: &mut Out) {
     if y.is_empty() {
         return;
     }

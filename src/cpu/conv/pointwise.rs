@@ -1,8 +1,10 @@
 //! 1×1 convolutions of stride 1: a matrix product of weights and pixels, in which
 //! nothing is shifted and no tile need be packed.
 
+use super::Out;
 use super::plan::Plan;
 use crate::cpu::disjoint::Disjoint;
+use crate::cpu::fresh::fill;
 use crate::cpu::gemm::{Base, Mat, PANEL, Packed, product_on};
 use crate::cpu::simd::Tier;
 use rayon::prelude::*;
@@ -34,7 +36,7 @@ thread_local! {
 }
 
 /// As [`super::shift::run`].
-pub(super) fn run(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y: &mut [f32]) {
+pub(super) fn run(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y: &mut Out) {
     let (c, o) = (plan.src_channels, plan.dst_channels);
     let pixels: usize = plan.dst_size.iter().product();
     let weights = match plan.transposed {
@@ -62,7 +64,7 @@ pub(super) fn run(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y
         for (channel, row) in sums.chunks_exact(n).enumerate() {
             let at = (image * o + channel) * pixels + first;
             // SAFETY: this span of this channel is this job's alone.
-            unsafe { y.part(at..at + n) }.copy_from_slice(row);
+            fill(unsafe { y.part(at..at + n) }, row);
         }
         BUFFERS.set((packed, sums));
     });

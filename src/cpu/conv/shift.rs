@@ -1,11 +1,13 @@
 //! The convolution itself: outputs of eight channels and 48 places in registers, all
 //! channels and taps of the source summed into them without a pause.
 
-use super::Buffers;
+use super::{Buffers, Out};
 use super::plan::{Axes, Layout, Plan, pack, starts};
 use crate::cpu::disjoint::Disjoint;
+use crate::cpu::fresh::fill;
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
 use rayon::prelude::*;
+use std::mem::MaybeUninit;
 
 /// Output channels of a full block of weights.
 pub(super) const ROWS: usize = 8;
@@ -75,7 +77,7 @@ impl Weights {
 
 /// Runs `plan` on pictures `x` into `y`, which is overwritten; `bias` is empty or one
 /// value a channel written.
-pub(crate) fn run(tier: Tier, plan: &Plan, x: &[f32], w: &Weights, bias: &[f32], y: &mut [f32]) {
+pub(crate) fn run(tier: Tier, plan: &Plan, x: &[f32], w: &Weights, bias: &[f32], y: &mut Out) {
     let src: usize = plan.src_size.iter().product();
     let dst: usize = plan.dst_size.iter().product();
     let image = plan.dst_channels * dst;
@@ -119,7 +121,7 @@ struct Job<'a> {
     bias: &'a [f32],
     image: usize,
     start: Axes,
-    y: &'a Disjoint<'a, f32>,
+    y: &'a Disjoint<'a, MaybeUninit<f32>>,
 }
 
 impl Kernel for Job<'_> {
@@ -195,22 +197,22 @@ impl Job<'_> {
                     &self.sums[first..first + layout.tile[2]]
                 };
                 match step[2] {
-                    1 => to.copy_from_slice(&source(0)[..columns]),
+                    1 => drop(fill(to, &source(0)[..columns])),
                     2 => {
                         let (even, odd) = (source(0), source(1));
                         let mut pairs = to.chunks_exact_mut(2);
                         for ((pair, a), b) in (&mut pairs).zip(even).zip(odd) {
-                            pair[0] = *a;
-                            pair[1] = *b;
+                            pair[0] = MaybeUninit::new(*a);
+                            pair[1] = MaybeUninit::new(*b);
                         }
                         if let ([last], Some(a)) = (pairs.into_remainder(), even.get(columns / 2)) {
-                            *last = *a;
+                            *last = MaybeUninit::new(*a);
                         }
                     }
                     n => {
                         for p in 0..n {
                             let places = to.iter_mut().skip(p).step_by(n);
-                            places.zip(source(p)).for_each(|(to, v)| *to = *v);
+                            places.zip(source(p)).for_each(|(to, v)| *to = MaybeUninit::new(*v));
                         }
                     }
                 }

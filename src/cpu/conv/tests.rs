@@ -1,6 +1,7 @@
 //! Against the definition in f64, in every tier.
 
 use super::*;
+use crate::cpu::fresh::over;
 use crate::cpu::simd::Tier;
 
 /// y in f64: nine loops.
@@ -114,6 +115,16 @@ fn worst(got: &[f32], want: &[f64], scale: f64) -> f64 {
     differences.fold(0.0, |m: f64, d| if d <= m { m } else { d }) / scale
 }
 
+/// [`run`] into memory full of NaN: what it leaves out shows.
+fn over_nan(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32]) -> Vec<f32> {
+    let count = |channels: usize, size: Axes| channels * size.iter().product::<usize>();
+    let images = x.len() / count(plan.src_channels, plan.src_size);
+    let mut y = vec![f32::NAN; images * count(plan.dst_channels, plan.dst_size)];
+    // SAFETY: `run` writes numbers.
+    run(tier, plan, x, w, bias, unsafe { over(&mut y) });
+    y
+}
+
 #[test]
 fn forward_agrees_with_the_definition() {
     for s in cases() {
@@ -123,8 +134,7 @@ fn forward_agrees_with_the_definition() {
         for bias in [vec![], noise(s.out_channels, 3)] {
             let want = definition(&s, &x, &w, &bias);
             for &tier in Tier::available() {
-                let mut y = vec![f32::NAN; 2 * s.out_channels * s.out_pixels()];
-                forward(tier, &s, &x, &w, &bias, &mut y);
+                let y = over_nan(tier, &Plan::forward(&s), &x, &w, &bias);
                 let worst = worst(&y, &want, scale);
                 assert!(worst < bound(&Plan::forward(&s)), "{tier:?} {s:?}: {worst:e}");
             }
@@ -172,8 +182,8 @@ fn gradients_agree_with_the_definition() {
         let dy = noise(2 * s.out_channels * s.out_pixels(), 6);
         let [want_x, want_w] = gradients(&s, &x, &w, &dy);
         for &tier in Tier::available() {
-            let (mut dx, mut dw) = (vec![f32::NAN; x.len()], vec![f32::NAN; w.len()]);
-            input_grad(tier, &s, &dy, &w, &mut dx);
+            let mut dw = vec![f32::NAN; w.len()];
+            let dx = over_nan(tier, &Plan::input_grad(&s), &dy, &w, &[]);
             weight_grad(tier, &s, &x, &dy, &mut dw);
             let worst_x = worst(&dx, &want_x, ((s.out_channels * s.taps()) as f64).sqrt());
             let worst_w = worst(&dw, &want_w, ((2 * s.out_pixels()) as f64).sqrt());
@@ -208,9 +218,9 @@ fn threads_do_not_matter() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().ok();
         pool.map(|pool| {
             pool.install(|| {
-                let (mut y, mut dx, mut dw) = (dy.clone(), x.clone(), w.clone());
-                forward(Tier::best(), &s, &x, &w, &[], &mut y);
-                input_grad(Tier::best(), &s, &dy, &w, &mut dx);
+                let mut dw = w.clone();
+                let y = forward(Tier::best(), &s, 2, &x, &w, &[]);
+                let dx = input_grad(Tier::best(), &s, 2, &dy, &w);
                 weight_grad(Tier::best(), &s, &x, &dy, &mut dw);
                 [y, dx, dw].concat().iter().map(|v| v.to_bits()).collect::<Vec<_>>()
             })
@@ -223,13 +233,11 @@ fn threads_do_not_matter() {
 #[test]
 fn empty_calls_are_harmless() {
     let s = flat(0, 3, [3, 3], 1, 1, [4, 4]);
-    let mut y = vec![f32::NAN; 3 * 16];
-    forward(Tier::best(), &s, &[], &[], &[1.0, 2.0, 3.0], &mut y);
+    let y = forward(Tier::best(), &s, 1, &[], &[], &[1.0, 2.0, 3.0]);
+    assert_eq!(y.len(), 3 * 16);
     assert!(y.chunks(16).zip([1.0, 2.0, 3.0]).all(|(row, b)| row.iter().all(|v| *v == b)));
     weight_grad(Tier::best(), &s, &[], &y, &mut []);
-    input_grad(Tier::best(), &s, &y, &[], &mut []);
+    assert!(input_grad(Tier::best(), &s, 1, &y, &[]).is_empty());
     let s = flat(2, 0, [3, 3], 1, 1, [4, 4]);
-    let mut dx = vec![f32::NAN; 32];
-    input_grad(Tier::best(), &s, &[], &[], &mut dx);
-    assert!(dx.iter().all(|v| *v == 0.0));
+    assert_eq!(input_grad(Tier::best(), &s, 1, &[], &[]), [0.0; 32]);
 }

@@ -6,13 +6,14 @@
 //! are 36 matrix products over channels; one block's transformed tiles stay in the
 //! second-level cache.
 
-use super::Buffers;
+use super::{Buffers, Out};
 use super::plan::{Axes, Layout, Plan, pack};
 use super::shift::{Block, ROWS, Strip, blocks};
 use crate::cpu::disjoint::Disjoint;
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
 use rayon::prelude::*;
 use std::f32::consts::{FRAC_1_SQRT_2, SQRT_2};
+use std::mem::MaybeUninit;
 
 /// Outputs of a tile along an axis, and inputs that they read.
 pub(super) const TILE: usize = 4;
@@ -158,7 +159,7 @@ fn outputs_1d<S: Simd>(s: S, y: [S::F; PATCH]) -> [S::F; TILE] {
 
 /// Runs `plan` on pictures `x` into `y`, which is overwritten; `bias` is empty or one
 /// value a channel written.
-pub(crate) fn run(tier: Tier, plan: &Plan, x: &[f32], w: &Weights, bias: &[f32], y: &mut [f32]) {
+pub(crate) fn run(tier: Tier, plan: &Plan, x: &[f32], w: &Weights, bias: &[f32], y: &mut Out) {
     let src: usize = plan.src_size.iter().product();
     let [depth, height, width] = plan.dst_size;
     let images = y.len() / (plan.dst_channels * depth * height * width);
@@ -188,7 +189,7 @@ struct Job<'a> {
     image: usize,
     start: Axes,
     buffers: &'a mut Buffers,
-    y: &'a Disjoint<'a, f32>,
+    y: &'a Disjoint<'a, MaybeUninit<f32>>,
 }
 
 impl Kernel for Job<'_> {
@@ -329,7 +330,7 @@ fn outputs<S: Simd>(
 #[inline(always)]
 fn write(
     plan: &Plan,
-    y: &Disjoint<'_, f32>,
+    y: &Disjoint<'_, MaybeUninit<f32>>,
     image: usize,
     channel: usize,
     start: Axes,
@@ -348,8 +349,8 @@ fn write(
         // SAFETY: no two jobs, and no two tiles of a job, hold the same outputs.
         let to = unsafe { y.part(at..at + columns) };
         match to.first_chunk_mut::<TILE>() {
-            Some(to) => *to = *row,
-            None => to.iter_mut().zip(row).for_each(|(to, v)| *to = *v),
+            Some(to) => *to = row.map(MaybeUninit::new),
+            None => to.iter_mut().zip(row).for_each(|(to, v)| *to = MaybeUninit::new(*v)),
         }
     }
 }
