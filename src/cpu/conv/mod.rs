@@ -23,7 +23,7 @@ use super::fresh::Fresh;
 use super::simd::{Kernel, LANES, Simd, Tier};
 use plan::Plan;
 use rayon::prelude::*;
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::mem::MaybeUninit;
 
 pub use plan::{Axes, Sizes};
@@ -69,14 +69,20 @@ fn run(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y: &mut Out)
     if pointwise::suits(plan) {
         pointwise::run(tier, plan, x, w, bias, y);
     } else if winograd::suits(plan) {
-        winograd::run(tier, plan, x, &winograd::Weights::new(tier, plan, w), bias, y);
+        let w = winograd::Weights::new(tier, plan, w, WEIGHTS.take());
+        winograd::run(tier, plan, x, &w, bias, y);
+        WEIGHTS.set(w.into_memory());
     } else {
-        shift::run(tier, plan, x, &shift::Weights::new(plan, w), bias, y);
+        let w = shift::Weights::new(plan, w, WEIGHTS.take());
+        shift::run(tier, plan, x, &w, bias, y);
+        WEIGHTS.set(w.into_memory());
     }
 }
 
 thread_local! {
     static BUFFERS: RefCell<Buffers> = RefCell::default();
+    /// Memory of the weights in the kernels' order.
+    static WEIGHTS: Cell<Vec<f32>> = Cell::default();
 }
 
 /// What a thread keeps from call to call, so that calls need not ask for megabytes of

@@ -42,18 +42,21 @@ pub(super) fn blocks(channels: usize) -> Vec<Block> {
 }
 
 impl Weights {
-    /// Of `w` as the caller stores them.
-    pub fn new(plan: &Plan, w: &[f32]) -> Self {
+    /// Of `w` as the caller stores them, in the memory of `data`.
+    pub fn new(plan: &Plan, w: &[f32], mut data: Vec<f32>) -> Self {
         let depth = plan.src_channels * plan.all_taps();
         let blocks = blocks(plan.dst_channels);
         let floats = blocks.iter().map(|b| b.pitch * depth).sum();
-        let mut data = vec![0.0; floats];
+        data.resize(floats, 0.0);
         data.par_chunks_mut((ROWS * depth).max(1)).zip(&blocks).for_each(|(panel, block)| {
             let mut panel = panel;
             for pass in &plan.passes {
                 let n = plan.src_channels * pass.taps.len() * block.pitch;
                 let (own, rest) = panel.split_at_mut(n);
                 panel = rest;
+                for m in block.rows..block.pitch {
+                    own.iter_mut().skip(m).step_by(block.pitch).for_each(|v| *v = 0.0);
+                }
                 for m in 0..block.rows {
                     let dst = block.first + m;
                     let mut at = m;
@@ -72,6 +75,11 @@ impl Weights {
             }
         });
         Self { data, blocks }
+    }
+
+    /// Its memory, for other weights.
+    pub fn into_memory(self) -> Vec<f32> {
+        self.data
     }
 }
 

@@ -50,15 +50,20 @@ pub(crate) struct Weights {
 }
 
 impl Weights {
-    /// Of `w` as the caller stores them.
-    pub fn new(tier: Tier, plan: &Plan, w: &[f32]) -> Self {
+    /// Of `w` as the caller stores them, in the memory of `data`.
+    pub fn new(tier: Tier, plan: &Plan, w: &[f32], mut data: Vec<f32>) -> Self {
         let blocks = blocks(plan.dst_channels);
         let depth = plan.src_channels * POINTS;
-        let mut data = vec![0.0; blocks.iter().map(|b| b.pitch * depth).sum()];
+        data.resize(blocks.iter().map(|b| b.pitch * depth).sum(), 0.0);
         data.par_chunks_mut(ROWS * depth)
             .zip(&blocks)
             .for_each(|(panel, block)| tier.run(Transform { plan, w, block, panel }));
         Self { data, blocks }
+    }
+
+    /// Its memory, for other weights.
+    pub fn into_memory(self) -> Vec<f32> {
+        self.data
     }
 }
 
