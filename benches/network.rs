@@ -1,6 +1,7 @@
 //! The whole network: a training step of the small backbone, photographs to a picture
-//! with either backbone, where MVSplat's time goes, and with `--onnxruntime` the same
-//! backbone and the same operators in onnxruntime, in the same run:
+//! with either backbone, where MVSplat's time goes (`-- stages`), what more threads do
+//! not shorten (`-- serial`), and with `--onnxruntime` the same backbone and the same
+//! operators in onnxruntime, in the same run:
 //!
 //! ```text
 //! tools/witness/setup.sh
@@ -18,7 +19,7 @@ mod rival;
 use anyhow::{Context, Result, bail};
 use candle_core::Tensor;
 use common::{Bench, Contender, Threads, inputs, scene};
-use rival::Rival;
+use rival::{Rival, median, timed};
 use std::collections::BTreeMap;
 use std::time::Instant;
 use subsplat::config::{Config, Mvsplat as Settings, Preset, Small};
@@ -52,8 +53,12 @@ fn main() -> Result<()> {
             )?;
         }
     }
-    if bench.wants("stages") {
+    let tables = ["stages", "serial"].map(|name| bench.wants(name));
+    if tables[0] {
         bench.on_all(stages)?;
+    }
+    if tables[1] {
+        serial(&bench)?;
     }
     if bench.args.onnxruntime {
         let rival = Rival::find(bench.threads(), bench.args.quick)?;
@@ -63,6 +68,10 @@ fn main() -> Result<()> {
         if bench.wants("backbones") {
             rival::compare(&bench, &rival)?;
         }
+        return Ok(());
+    }
+    // Tables of their own are no groups.
+    if tables.contains(&true) && !bench.args.names.is_empty() {
         return Ok(());
     }
     bench.finish()
@@ -116,11 +125,12 @@ fn training_step(bench: &mut Bench) -> Result<()> {
     bench.group(name, contenders, "")
 }
 
-/// Backbone, input side and output side.
-const CASES: [&str; 5] = [
+/// Backbone, input side and output side (the same: MVSplat alone).
+const CASES: [&str; 6] = [
     "small 256 to 512",
     "mvsplat 256 to 512",
     "mvsplat 256 to 1024",
+    "mvsplat 512 to 512",
     "mvsplat 512 to 1024",
     "mvsplat backbone 512",
 ];
@@ -148,10 +158,12 @@ fn whole(case: &str) -> Result<Run> {
     }
     let [kind, from, "to", to] = words[..] else { bail!("no case {case:?}") };
     let (from, to): (usize, usize) = (from.parse()?, to.parse()?);
-    let config = match kind {
+    let mut config = match kind {
         "small" => Config::small(Preset::Tuned, to / from),
         _ => Config::re10k(Preset::Tuned, to / from),
     };
+    // MVSplat itself: one Gaussian a pixel.
+    config.spgr.enabled = to > from;
     let model = Reconstructor::untrained(&config, 3)?;
     let photos = [photo(to, 0)?, photo(to, 1)?];
     let request = Request { input_size: (from, from), ..Request::default() };
@@ -191,6 +203,25 @@ fn stages() -> Result<()> {
         println!("  {name:<40} {:>9.1} ms {:>5.1}%", 1e3 * seconds, 100.0 * seconds / total);
     }
     println!("  {:<40} {:>9.1} ms", "all", 1e3 * total);
+    Ok(())
+}
+
+/// The share of the time that does not get shorter with more threads, by Amdahl's law
+/// from one thread and all: what is serial, and what waits for the memory that all
+/// threads share.
+fn serial(bench: &Bench) -> Result<()> {
+    let threads = bench.threads();
+    anyhow::ensure!(threads > 1, "serial share: expected 2 threads or more, got {threads}");
+    println!("\nserial share, {threads} threads, medians of 5");
+    println!("  {:<40} {:>9} {:>9} {:>8} {:>8}", "", "one s", "all s", "speed", "serial");
+    for case in &CASES[..3] {
+        let mut run = whole(case)?;
+        let one = median(&bench.on_one(|| timed(5, || run().map(drop)))?);
+        let all = median(&bench.on_all(|| timed(5, || run().map(drop)))?);
+        let speed = one / all;
+        let share = (threads as f64 / speed - 1.0) / (threads as f64 - 1.0);
+        println!("  {case:<40} {one:>9.3} {all:>9.3} {speed:>7.2}x {:>7.1}%", 100.0 * share);
+    }
     Ok(())
 }
 

@@ -30,7 +30,7 @@ const QUICK_S: f64 = 0.05;
 /// What the command line says.
 #[derive(Default)]
 pub struct Args {
-    names: Vec<String>,
+    pub names: Vec<String>,
     /// Fewer and smaller cases.
     pub quick: bool,
     seconds: Option<f64>,
@@ -188,6 +188,12 @@ impl Bench {
     #[allow(dead_code, reason = "each bench uses a part")]
     pub fn on_all<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
         self.all.install(work)
+    }
+
+    /// `work` on the pool of one thread.
+    #[allow(dead_code, reason = "each bench uses a part")]
+    pub fn on_one<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
+        self.one.install(work)
     }
 
     fn pool(&self, threads: Threads) -> &ThreadPool {

@@ -148,7 +148,11 @@ pub fn compare(bench: &Bench, rival: &Rival) -> Result<()> {
         let peak = peak(&format!("mvsplat backbone {side}"))?;
         rows.push((format!("ours: MVSplat backbone {side}² (same results)"), median(&ours), peak));
     }
-    for case in ["mvsplat 256 to 512", "mvsplat 256 to 1024", "small 256 to 512"] {
+    let mut cases = vec!["mvsplat 256 to 512", "mvsplat 256 to 1024", "small 256 to 512"];
+    if !rival.quick {
+        cases.push("mvsplat 512 to 512");
+    }
+    for case in cases {
         let mut run = whole(case)?;
         let seconds = bench.on_all(|| timed(rival.runs, || run().map(drop)))?;
         rows.push((format!("ours: photographs to picture, {case}"), median(&seconds), peak(case)?));

@@ -187,11 +187,18 @@ pub(super) fn exp_row<S: Simd>(s: S, row: &mut [f32]) -> f32 {
 /// The largest number of a row; NaN are passed over.
 #[inline(always)]
 fn largest<S: Simd>(s: S, row: &[f32]) -> f32 {
-    let mut top = s.splat(f32::NEG_INFINITY);
+    let mut tops = [s.splat(f32::NEG_INFINITY); 4];
     let (chunks, tail) = row.as_chunks::<LANES>();
-    for v in chunks {
-        top = s.max(s.load(v), top);
+    let (fours, rest) = chunks.as_chunks::<4>();
+    for four in fours {
+        for (top, v) in tops.iter_mut().zip(four) {
+            *top = s.max(s.load(v), *top);
+        }
     }
+    for v in rest {
+        tops[0] = s.max(s.load(v), tops[0]);
+    }
+    let mut top = s.max(s.max(tops[0], tops[1]), s.max(tops[2], tops[3]));
     if !tail.is_empty() {
         let mut last = [f32::NEG_INFINITY; LANES];
         last[..tail.len()].copy_from_slice(tail);

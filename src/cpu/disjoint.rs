@@ -22,7 +22,7 @@ impl<'a, T> Disjoint<'a, T> {
         Self { start: slice.as_mut_ptr(), len: slice.len(), slice: PhantomData }
     }
 
-    /// Where place `i` is, for a prefetch.
+    /// Where place `i` is, for a prefetch or a kernel.
     #[inline(always)]
     pub(crate) fn address(&self, i: usize) -> *const T {
         self.start.wrapping_add(i)

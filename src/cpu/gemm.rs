@@ -11,7 +11,7 @@ mod packed;
 mod tests;
 mod tile;
 
-use super::fresh::{Fresh, start};
+use super::fresh::Fresh;
 use super::simd::{Kernel, LANES, Simd, Tier};
 pub(super) use packed::copy;
 pub use packed::{Mat, Packed};
@@ -58,13 +58,36 @@ pub(crate) fn product_on(
     scale: f32,
     base: Base<'_>,
 ) {
+    let (m, n) = (lhs.rows, rhs.cols);
+    if m == 0 || n == 0 {
+        return;
+    }
+    assert!(row_stride >= n && (m - 1) * row_stride + n <= dst.len(), "gemm: destination");
+    // SAFETY: the rows lie in `dst` (checked), apart from one another.
+    unsafe { product_at(tier, (dst.as_mut_ptr(), row_stride), lhs, rhs, scale, base) };
+}
+
+/// [`product_on`] into memory that need hold no numbers yet, unless `base` is
+/// [`Base::Own`]. Every column of every row is written.
+///
+/// # Safety
+/// `lhs.rows` rows of `rhs.cols` floats, `row_stride` apart, are there to be written
+/// (with [`Base::Own`]: are numbers) and nobody else's meanwhile.
+pub(crate) unsafe fn product_at(
+    tier: Tier,
+    (dst, row_stride): (*mut f32, usize),
+    lhs: Mat<'_>,
+    rhs: &Packed,
+    scale: f32,
+    base: Base<'_>,
+) {
     let (m, k, n) = (lhs.rows, lhs.cols, rhs.cols);
     assert_eq!(k, rhs.depth, "gemm: inner sizes");
     lhs.check("operands");
     if m == 0 || n == 0 {
         return;
     }
-    assert!(row_stride >= n && (m - 1) * row_stride + n <= dst.len(), "gemm: destination");
+    assert!(row_stride >= n, "gemm: destination");
     assert!(rhs.data.len() == k * n.next_multiple_of(LANES), "gemm: panels");
     if let Base::Row(row) = base {
         assert_eq!(row.len(), n, "gemm: row");
@@ -109,26 +132,29 @@ const BLOCK_FLOATS: usize = 1 << 16;
 pub fn rows_product(lhs: Mat<'_>, rhs: &Packed, base: Base<'_>) -> Vec<f32> {
     let (m, n) = (lhs.rows, rhs.cols);
     lhs.check("operands");
+    assert!(!matches!(base, Base::Own), "gemm: new memory holds nothing");
     let mut fresh = Fresh::new(m * n);
     if let Some(rows) = BLOCK_FLOATS.checked_div(n) {
         let rows = rows.clamp(BLOCK_LEAST, BLOCK);
         let rows = if m <= BLOCK { BLOCK } else { rows };
         fresh.blocks(rows * n).enumerate().for_each(|(i, block)| {
-            let dst = start(block);
             let lhs = Mat {
                 data: &lhs.data[(i * rows * lhs.row_stride).min(lhs.data.len())..],
-                rows: dst.len() / n,
+                rows: block.len() / n,
                 ..lhs
             };
-            product((dst, n), lhs, rhs, 1.0, base);
+            let dst = (block.as_mut_ptr().cast(), n);
+            // SAFETY: the block is that many rows, this task's alone; `base` is not
+            // `Own` (asserted above).
+            unsafe { product_at(Tier::best(), dst, lhs, rhs, 1.0, base) };
         });
     }
-    // SAFETY: the loop above started every block; without columns there is none.
+    // SAFETY: the products above wrote every block; without columns there is none.
     unsafe { fresh.finish() }
 }
 
 struct Product<'a> {
-    dst: &'a mut [f32],
+    dst: *mut f32,
     row_stride: usize,
     lhs: Mat<'a>,
     rhs: &'a Packed,
@@ -167,21 +193,23 @@ impl Kernel for Product<'_> {
                         Some(start.as_ptr())
                     }
                 };
+                // SAFETY: j < n, the floats of each row.
+                let dst = unsafe { self.dst.add(j) };
                 let part = Part {
                     a: lhs.data.as_ptr(),
                     a_stride: lhs.row_stride,
                     b: self.rhs.data[j * k + first * width..].as_ptr(),
                     depth,
-                    dst: self.dst[j..].as_mut_ptr(),
+                    dst,
                     dst_stride: self.row_stride,
                     cols: (n - j).min(PANEL),
                     scale: self.scale,
                     base,
                 };
                 // SAFETY: rows 0..m of `lhs` (checked, or just copied), columns
-                // j..j + cols of `dst` (checked) and `depth` rows of a panel `width`
-                // wide (checked) lie inside their slices; `dst` is borrowed
-                // exclusively; `base` points at PANEL floats that outlive the call.
+                // j..j + cols of `dst` (the callers' promise) and `depth` rows of a panel
+                // `width` wide (checked) are there; `base` points at PANEL floats that
+                // outlive the call.
                 unsafe { rows(s, part, m, width) };
             }
             first += depth;

@@ -3,10 +3,12 @@
 //!
 //! Tensors of megabytes come and go by the hundred. The system's allocator asks the
 //! kernel for each, which clears it in pages of 4 KiB, a fault each: a seventh of the
-//! time of two photographs to a picture. Here a block that is freed waits for the next
-//! of about its size. What waits never makes the process larger than its largest set
-//! of living blocks: a request that finds nothing fitting first returns to the
-//! kernel as much as it asks for, as far as there is any.
+//! time of two photographs to a picture. Here a block that is freed waits, one piece
+//! with its neighbours, and the shortest piece that is long enough gives its front to
+//! the next request: a call after the first hardly asks the kernel. What waits never
+//! makes the process larger than its largest set of living blocks: a request that
+//! finds nothing fitting first returns to the kernel as much as it asks for, as far as
+//! there is any.
 //!
 //! A program declares it; a library must not:
 //! ```
@@ -34,7 +36,7 @@ fn ours(layout: &Layout) -> bool {
 
 // SAFETY: small blocks are the system's. A large one is a mapping of its own, as long
 // as the layout in whole pages, so its length is known when it comes back; it is
-// handed out again only after that.
+// handed out again, whole or in parts, only after that.
 unsafe impl GlobalAlloc for Pages {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         match ours(&layout) {
@@ -93,6 +95,9 @@ mod large {
     }
 
     pub(super) fn give(_: *mut u8, _: usize) {}
+
+    #[cfg(test)]
+    pub(super) fn forget() {}
 }
 
 #[cfg(all(target_os = "linux", any(target_arch = "x86_64", target_arch = "aarch64")))]
@@ -240,6 +245,14 @@ mod large {
         }
     }
 
+    /// Sends all that waits back to the kernel.
+    #[cfg(test)]
+    pub(super) fn forget() {
+        while let Some(piece) = waiting().part(usize::MAX) {
+            unmap(piece.at, piece.length);
+        }
+    }
+
     /// New pages at a multiple of [`HUGE`]; null if there are none.
     fn map(length: usize) -> *mut u8 {
         let Some(room) = length.checked_add(HUGE) else { return std::ptr::null_mut() };
@@ -277,7 +290,9 @@ mod tests {
     static ALONE: std::sync::Mutex<()> = std::sync::Mutex::new(());
 
     fn alone() -> std::sync::MutexGuard<'static, ()> {
-        ALONE.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+        let guard = ALONE.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        large::forget();
+        guard
     }
 
     fn filled(layout: Layout, value: u8) -> *mut u8 {
@@ -305,6 +320,31 @@ mod tests {
             let all = std::slice::from_raw_parts(again, layout.size());
             assert!(all.iter().all(|v| *v == 0));
             Pages.dealloc(again, layout);
+        }
+    }
+
+    #[test]
+    fn pieces_are_cut_and_joined() {
+        let _alone = alone();
+        let layout = |huge: usize| Layout::from_size_align(huge * HUGE, 8).unwrap();
+        let long = filled(layout(6), 1);
+        // SAFETY: each block comes back with the layout that it was asked for with.
+        unsafe {
+            Pages.dealloc(long, layout(6));
+            let parts = [filled(layout(2), 2), filled(layout(3), 3)];
+            if ours(&layout(1)) {
+                assert_eq!(parts[0], long, "the front of the piece that waits");
+                assert_eq!(parts[1], long.add(2 * HUGE), "then what is left of it");
+            }
+            let all = std::slice::from_raw_parts(parts[0], 2 * HUGE);
+            assert!(all.iter().all(|v| *v == 2));
+            Pages.dealloc(parts[0], layout(2));
+            Pages.dealloc(parts[1], layout(3));
+            let again = filled(layout(6), 4);
+            if ours(&layout(1)) {
+                assert_eq!(again, long, "neighbours are one piece again");
+            }
+            Pages.dealloc(again, layout(6));
         }
     }
 

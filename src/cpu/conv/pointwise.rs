@@ -4,11 +4,11 @@
 use super::Out;
 use super::plan::Plan;
 use crate::cpu::disjoint::Disjoint;
-use crate::cpu::fresh::fill;
-use crate::cpu::gemm::{Base, Mat, PANEL, Packed, product_on};
+use crate::cpu::gemm::{Base, Mat, PANEL, Packed, product_at};
 use crate::cpu::simd::Tier;
 use rayon::prelude::*;
-use std::cell::RefCell;
+use std::cell::Cell;
+use std::mem::MaybeUninit;
 
 /// Floats of a task's pixels, all channels: they stay in the second-level cache.
 const FLOATS: usize = 1 << 17;
@@ -32,7 +32,7 @@ pub(super) fn suits(plan: &Plan) -> bool {
 }
 
 thread_local! {
-    static BUFFERS: RefCell<(Packed, Vec<f32>)> = RefCell::default();
+    static PACKED: Cell<Packed> = Cell::default();
 }
 
 /// As [`super::shift::run`].
@@ -46,26 +46,26 @@ pub(super) fn run(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y
     let span = (FLOATS / c.max(o)).clamp(PANEL, SPAN).next_multiple_of(PANEL);
     let spans = pixels.div_ceil(span);
     let images = y.len() / (o * pixels);
+    assert!(y.len() == images * o * pixels && (bias.is_empty() || bias.len() == o));
     let y = Disjoint::new(y);
     (0..images * spans).into_par_iter().for_each(|job| {
         let (image, first) = (job / spans, job % spans * span);
         let n = span.min(pixels - first);
         let x = &x[image * c * pixels + first..(image + 1) * c * pixels];
         // Taken, not borrowed: a job may run inside another one's wait.
-        let (mut packed, mut sums) = BUFFERS.take();
+        let mut packed = PACKED.take();
         packed.fill(Mat::new(x, c, n, pixels));
-        sums.resize(o * n, 0.0);
         let mut base = Base::Zero;
-        if !bias.is_empty() {
-            sums.chunks_exact_mut(n).zip(bias).for_each(|(row, bias)| row.fill(*bias));
-            base = Base::Own;
-        }
-        product_on(tier, (&mut sums, n), weights, &packed, 1.0, base);
-        for (channel, row) in sums.chunks_exact(n).enumerate() {
+        for (channel, bias) in bias.iter().enumerate() {
             let at = (image * o + channel) * pixels + first;
             // SAFETY: this span of this channel is this job's alone.
-            fill(unsafe { y.part(at..at + n) }, row);
+            unsafe { y.part(at..at + n) }.fill(MaybeUninit::new(*bias));
+            base = Base::Own;
         }
-        BUFFERS.set((packed, sums));
+        let dst = (y.address(image * o * pixels + first).cast_mut().cast(), pixels);
+        // SAFETY: spans of all channels of one picture, this job's alone, inside `y`
+        // (asserted above); numbers where there is a bias.
+        unsafe { product_at(tier, dst, weights, &packed, 1.0, base) };
+        PACKED.set(packed);
     });
 }

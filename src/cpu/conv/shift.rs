@@ -1,8 +1,8 @@
 //! The convolution itself: outputs of eight channels and 48 places in registers, all
 //! channels and taps of the source summed into them without a pause.
 
-use super::{Buffers, Out};
 use super::plan::{Axes, Layout, Plan, pack, starts};
+use super::{Buffers, Out};
 use crate::cpu::disjoint::Disjoint;
 use crate::cpu::fresh::fill;
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};

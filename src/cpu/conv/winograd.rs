@@ -6,9 +6,9 @@
 //! are 36 matrix products over channels; one block's transformed tiles stay in the
 //! second-level cache.
 
-use super::{Buffers, Out};
 use super::plan::{Axes, Layout, Plan, pack};
 use super::shift::{Block, ROWS, Strip, blocks};
+use super::{Buffers, Out};
 use crate::cpu::disjoint::Disjoint;
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
 use rayon::prelude::*;

@@ -63,6 +63,7 @@ fn every_tier_agrees_and_rows_may_be_cut_anywhere() {
         for (first, dst) in (0..m).step_by(cut).zip(dst.chunks_mut(cut * n)) {
             let lhs = Mat::new(&a[first * k..], dst.len() / n, k, k);
             let (row_stride, rhs, base) = (n, &rhs, Base::Zero);
+            let dst = dst.as_mut_ptr();
             tier.run(Product { dst, row_stride, lhs, rhs, scale: 1.0, base });
         }
         dst

@@ -8,7 +8,7 @@
 //! In: pictures, cameras, distance along the unit ray of each pixel. Out: `[V, H·W]`,
 //! factors from [`LEAST`] (doubted by all views that see it) to 1 (agreed with, or seen
 //! by none). No gradient is owed: pictures are given, and that a point leaves a
-//! silhouette has no derivative.
+//! silhouette has no derivative. Oracle: the same in f64 by matrices (the tests).
 
 use crate::camera::Camera;
 use rayon::prelude::*;
@@ -104,7 +104,7 @@ pub fn cross_check(views: &[Seen<'_>]) -> Vec<f32> {
 mod tests {
     use super::*;
     use crate::camera::Intrinsics;
-    use glam::{Mat4, Vec3};
+    use glam::{DVec3, Mat4, Vec3};
 
     const SIDE: usize = 32;
 
@@ -162,5 +162,101 @@ mod tests {
         assert_eq!(factors(|d| d[at] *= 0.125)[at], 1.0);
         // No number, no verdict.
         assert_eq!(factors(|d| d[at] = f32::NAN)[at], 1.0);
+    }
+
+    /// The same in f64 by 4×4 matrices, one pixel after the other.
+    fn oracle(views: &[Seen<'_>]) -> Vec<f64> {
+        let mut out = Vec::new();
+        for (v, own) in views.iter().enumerate() {
+            for i in 0..own.distances.len() {
+                let point = place(own, i);
+                let doubts: Vec<f64> = (0..views.len())
+                    .filter(|u| *u != v)
+                    .filter_map(|u| doubt(&views[u], point, colour(own, i)))
+                    .collect();
+                let mean = doubts.iter().sum::<f64>() / doubts.len().max(1) as f64;
+                out.push(1.0 - (1.0 - f64::from(LEAST)) * mean);
+            }
+        }
+        out
+    }
+
+    fn colour(view: &Seen<'_>, i: usize) -> [f64; 3] {
+        [0, 1, 2].map(|c| f64::from(view.rgb[c * view.distances.len() + i]))
+    }
+
+    /// World point of a pixel.
+    fn place(view: &Seen<'_>, i: usize) -> DVec3 {
+        let k = view.camera.intrinsics;
+        let x = ((i % k.width) as f64 + 0.5 - f64::from(k.cx)) / f64::from(k.fx);
+        let y = ((i / k.width) as f64 + 0.5 - f64::from(k.cy)) / f64::from(k.fy);
+        let ray = DVec3::new(x, y, 1.0);
+        let in_camera = ray * (f64::from(view.distances[i]) / ray.length());
+        view.camera.world_from_camera.as_dmat4().transform_point3(in_camera)
+    }
+
+    fn doubt(view: &Seen<'_>, point: DVec3, wanted: [f64; 3]) -> Option<f64> {
+        let (k, world) = (view.camera.intrinsics, view.camera.world_from_camera.as_dmat4());
+        let p = world.inverse().transform_point3(point);
+        let x = f64::from(k.fx) * p.x / p.z + f64::from(k.cx);
+        let y = f64::from(k.fy) * p.y / p.z + f64::from(k.cy);
+        if p.z <= 0.0 || x < 0.0 || y < 0.0 || x >= k.width as f64 || y >= k.height as f64 {
+            return None;
+        }
+        let (mut surface, mut apart) = (0.0f64, f64::from(COLOUR));
+        for row in 0..k.height {
+            for column in 0..k.width {
+                let near = |a: usize, b: f64| (a as f64 - b.floor()).abs() <= 1.0;
+                if near(row, y) && near(column, x) {
+                    let i = row * k.width + column;
+                    let seen = world.inverse().transform_point3(place(view, i));
+                    surface = surface.max(seen.z);
+                    let own = colour(view, i);
+                    apart = apart.min((0..3).map(|c| (own[c] - wanted[c]).abs()).sum());
+                }
+            }
+        }
+        let hidden = p.z > surface * (1.0 + f64::from(BEHIND));
+        (!hidden).then_some(apart / f64::from(COLOUR))
+    }
+
+    #[test]
+    fn three_turned_views_agree_with_the_oracle() {
+        let noise = |n: usize, seed: f32| -> Vec<f32> {
+            (0..n).map(|i| 0.5 + 0.5 * ((i as f32 + seed) * 12.9898).sin()).collect()
+        };
+        let cameras: Vec<Camera> = (0..3u8)
+            .map(|v| {
+                let turn = Mat4::from_rotation_y(0.1 * f32::from(v) - 0.1)
+                    * Mat4::from_rotation_z(0.05 * f32::from(v));
+                let at = Mat4::from_translation(Vec3::new(0.2 * f32::from(v), 0.1, 0.0));
+                let side = 24;
+                let k = Intrinsics {
+                    fx: 26.0,
+                    fy: 25.0,
+                    cx: 11.7,
+                    cy: 12.4,
+                    width: side,
+                    height: side,
+                };
+                Camera::new(k, at * turn).unwrap()
+            })
+            .collect();
+        let n = 24 * 24;
+        let pictures: Vec<Vec<f32>> = (0..3u8).map(|v| noise(3 * n, 7.0 * f32::from(v))).collect();
+        let depths: Vec<Vec<f32>> = (0..3u8)
+            .map(|v| noise(n, 100.0 + f32::from(v)).iter().map(|d| 1.5 + 0.5 * d).collect())
+            .collect();
+        let views: Vec<Seen> = (0..3)
+            .map(|v| Seen { camera: &cameras[v], rgb: &pictures[v], distances: &depths[v] })
+            .collect();
+        let (got, want) = (cross_check(&views), oracle(&views));
+        assert_eq!(got.len(), want.len());
+        // Pixels that round, or surfaces that hide, the other way.
+        let off = got.iter().zip(&want).filter(|(a, b)| (f64::from(**a) - **b).abs() > 1e-4);
+        let off = off.count();
+        assert!(off * 200 <= got.len(), "{off} of {}", got.len());
+        let doubted = want.iter().filter(|w| **w < 0.9).count();
+        assert!(doubted * 10 > want.len() && doubted < want.len(), "{doubted}: nothing to see");
     }
 }
