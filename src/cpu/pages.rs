@@ -338,13 +338,20 @@ mod tests {
             }
             let all = std::slice::from_raw_parts(parts[0], 2 * HUGE);
             assert!(all.iter().all(|v| *v == 2));
-            Pages.dealloc(parts[0], layout(2));
-            Pages.dealloc(parts[1], layout(3));
-            let again = filled(layout(6), 4);
-            if ours(&layout(1)) {
-                assert_eq!(again, long, "neighbours are one piece again");
+            // The one before joins what waits behind it, or the other way round.
+            for first in [0, 1] {
+                let lengths = [2, 3];
+                Pages.dealloc(parts[first], layout(lengths[first]));
+                Pages.dealloc(parts[1 - first], layout(lengths[1 - first]));
+                if ours(&layout(1)) {
+                    assert_eq!(large::take(6 * HUGE), (long, true), "one piece again");
+                    large::give(long, 6 * HUGE);
+                }
+                if first == 0 {
+                    let parts = [filled(layout(2), 2), filled(layout(3), 3)];
+                    assert!(!ours(&layout(1)) || parts == [long, long.add(2 * HUGE)]);
+                }
             }
-            Pages.dealloc(again, layout(6));
         }
     }
 
