@@ -71,11 +71,21 @@ fn run(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y: &mut Out)
     } else if winograd::suits(plan) {
         let w = winograd::Weights::new(tier, plan, w, WEIGHTS.take());
         winograd::run(tier, plan, x, &w, bias, y);
-        WEIGHTS.set(w.into_memory());
+        keep(w.into_memory());
     } else {
         let w = shift::Weights::new(plan, w, WEIGHTS.take());
         shift::run(tier, plan, x, &w, bias, y);
-        WEIGHTS.set(w.into_memory());
+        keep(w.into_memory());
+    }
+}
+
+/// Most floats of weights that a thread keeps: longer blocks are the allocator's to
+/// keep, where a program has one that does ([`super::pages`]).
+const KEPT: usize = 1 << 19;
+
+fn keep(memory: Vec<f32>) {
+    if memory.capacity() < KEPT {
+        WEIGHTS.set(memory);
     }
 }
 
