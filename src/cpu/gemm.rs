@@ -16,7 +16,6 @@ use super::simd::{Kernel, LANES, Simd, Tier};
 pub(super) use packed::copy;
 pub use packed::{Mat, Packed};
 use rayon::prelude::*;
-use std::cell::RefCell;
 use tile::{Part, rows};
 
 /// Columns of a full panel of the right factor: four vectors.
@@ -108,14 +107,8 @@ pub fn gemm(
     scale: f32,
     accumulate: bool,
 ) {
-    thread_local! {
-        static PACKED: RefCell<Packed> = RefCell::default();
-    }
     let base = if accumulate { Base::Own } else { Base::Zero };
-    PACKED.with_borrow_mut(|packed| {
-        packed.fill(rhs);
-        product((dst, row_stride), lhs, packed, scale, base);
-    });
+    Packed::kept(rhs, |packed| product((dst, row_stride), lhs, packed, scale, base));
 }
 
 /// Rows of a task of [`rows_product`]: a chunk of the trunk's parents is one.

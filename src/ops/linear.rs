@@ -9,7 +9,6 @@ use super::{borrowed, output, slice, tensor_like};
 use crate::cpu::gemm::{Base, Mat, Packed, gemm, rows_product};
 use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Result, Tensor, bail};
 use rayon::prelude::*;
-use std::cell::Cell;
 
 const NAME: &str = "linear";
 
@@ -45,20 +44,7 @@ struct Linear;
 /// x·Wᵀ + b into new memory.
 fn forward(x: &[f32], w: &[f32], b: Option<&[f32]>, [n, c, o]: [usize; 3]) -> Vec<f32> {
     let base = b.map_or(Base::Zero, Base::Row);
-    product_with(Mat::new(w, o, c, c).t(), |w| rows_product(Mat::new(x, n, c, c), w, base))
-}
-
-/// `f` of the right factor packed into memory that this thread keeps.
-fn product_with<R>(rhs: Mat<'_>, f: impl FnOnce(&Packed) -> R) -> R {
-    thread_local! {
-        static PACKED: Cell<Packed> = Cell::default();
-    }
-    // Taken, not borrowed: a product may run inside another one's wait.
-    let mut packed = PACKED.take();
-    packed.fill(rhs);
-    let result = f(&packed);
-    PACKED.set(packed);
-    result
+    Packed::kept(Mat::new(w, o, c, c).t(), |w| rows_product(Mat::new(x, n, c, c), w, base))
 }
 
 impl CustomOp2 for Linear {
@@ -146,7 +132,7 @@ fn gradients(x: &Tensor, w: &Tensor, dy: &Tensor) -> Result<(Option<Tensor>, Ten
 /// dy `[N, O]` · W `[O, C]`.
 fn input_grad(dy: &[f32], w: &[f32], [o, c]: [usize; 2]) -> Vec<f32> {
     let dy = Mat::new(dy, dy.len() / o, o, o);
-    product_with(Mat::new(w, o, c, c), |w| rows_product(dy, w, Base::Zero))
+    Packed::kept(Mat::new(w, o, c, c), |w| rows_product(dy, w, Base::Zero))
 }
 
 /// (dyᵀ·x `[O, C]`, column sums of dy `[O]`): parts of [`PART`] rows, added in order.

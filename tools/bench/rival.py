@@ -10,8 +10,8 @@ onnxruntime may fold and pack them. Writes FOLDER/SIDE.safetensors: inputs, weig
 `ops`: single operators on the inputs in FOLDER/ops.safetensors (NAME.INPUT); writes their results to
 FOLDER/ops_out.safetensors.
 
-Prints one line of JSON: times of RUNS runs in seconds (of 50 where they are short) after two that are not counted, by name, and the process's peak
-memory in bytes. CPU provider, all optimisations."""
+Prints one line of JSON: times of RUNS runs in seconds (of 50 where they are short) after two that are not counted, by
+name, and the process's peak memory in bytes. CPU provider, all optimisations."""
 
 import json
 import pathlib

@@ -19,18 +19,14 @@ mod weights;
 mod winograd;
 mod winograd_weights;
 
-use super::fresh::Fresh;
+use super::fresh::{Block, Fresh};
 use super::simd::{Kernel, LANES, Simd, Tier};
 use plan::Plan;
 use rayon::prelude::*;
 use std::cell::{Cell, RefCell};
-use std::mem::MaybeUninit;
 
 pub use plan::{Axes, Sizes};
 pub use weights::weight_grad;
-
-/// Results to be written, every place of them.
-type Out = [MaybeUninit<f32>];
 
 /// y = x ∗ w + bias of `images` pictures; `bias` is empty or `[O]`.
 pub fn forward(
@@ -62,7 +58,7 @@ fn fresh(tier: Tier, plan: &Plan, images: usize, x: &[f32], w: &[f32], bias: &[f
 /// The fastest of the three ways. For numbers in ±1 and n products a sum, [`winograd`] is
 /// within 3e-6·√n of the exact sum, [`shift`] and [`pointwise`] within 1.5e-6·√n (the
 /// tests hold them).
-fn run(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y: &mut Out) {
+fn run(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y: &mut Block<f32>) {
     if y.is_empty() {
         return;
     }

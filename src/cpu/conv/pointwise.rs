@@ -1,13 +1,12 @@
 //! 1×1 convolutions of stride 1: a matrix product of weights and pixels, in which
 //! nothing is shifted and no tile need be packed.
 
-use super::Out;
 use super::plan::Plan;
 use crate::cpu::disjoint::Disjoint;
+use crate::cpu::fresh;
 use crate::cpu::gemm::{Base, Mat, PANEL, Packed, product_at};
 use crate::cpu::simd::Tier;
 use rayon::prelude::*;
-use std::cell::Cell;
 use std::mem::MaybeUninit;
 
 /// Floats of a task's pixels, all channels: they stay in the second-level cache.
@@ -31,12 +30,15 @@ pub(super) fn suits(plan: &Plan) -> bool {
         && plan.dst_size.iter().product::<usize>() >= PIXELS
 }
 
-thread_local! {
-    static PACKED: Cell<Packed> = Cell::default();
-}
-
 /// As [`super::shift::run`].
-pub(super) fn run(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y: &mut Out) {
+pub(super) fn run(
+    tier: Tier,
+    plan: &Plan,
+    x: &[f32],
+    w: &[f32],
+    bias: &[f32],
+    y: &mut fresh::Block<f32>,
+) {
     let (c, o) = (plan.src_channels, plan.dst_channels);
     let pixels: usize = plan.dst_size.iter().product();
     let weights = match plan.transposed {
@@ -52,9 +54,6 @@ pub(super) fn run(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y
         let (image, first) = (job / spans, job % spans * span);
         let n = span.min(pixels - first);
         let x = &x[image * c * pixels + first..(image + 1) * c * pixels];
-        // Taken, not borrowed: a job may run inside another one's wait.
-        let mut packed = PACKED.take();
-        packed.fill(Mat::new(x, c, n, pixels));
         let mut base = Base::Zero;
         for (channel, bias) in bias.iter().enumerate() {
             let at = (image * o + channel) * pixels + first;
@@ -65,7 +64,8 @@ pub(super) fn run(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y
         let dst = (y.address(image * o * pixels + first).cast_mut().cast(), pixels);
         // SAFETY: spans of all channels of one picture, this job's alone, inside `y`
         // (asserted above); numbers where there is a bias.
-        unsafe { product_at(tier, dst, weights, &packed, 1.0, base) };
-        PACKED.set(packed);
+        Packed::kept(Mat::new(x, c, n, pixels), |x| unsafe {
+            product_at(tier, dst, weights, x, 1.0, base);
+        });
     });
 }

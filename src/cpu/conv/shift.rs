@@ -1,10 +1,10 @@
 //! The convolution itself: outputs of eight channels and 48 places in registers, all
 //! channels and taps of the source summed into them without a pause.
 
+use super::Buffers;
 use super::plan::{Axes, Layout, Plan, pack, starts};
-use super::{Buffers, Out};
 use crate::cpu::disjoint::Disjoint;
-use crate::cpu::fresh::fill;
+use crate::cpu::fresh::{self, fill};
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
@@ -85,7 +85,14 @@ impl Weights {
 
 /// Runs `plan` on pictures `x` into `y`, which is overwritten; `bias` is empty or one
 /// value a channel written.
-pub(crate) fn run(tier: Tier, plan: &Plan, x: &[f32], w: &Weights, bias: &[f32], y: &mut Out) {
+pub(crate) fn run(
+    tier: Tier,
+    plan: &Plan,
+    x: &[f32],
+    w: &Weights,
+    bias: &[f32],
+    y: &mut fresh::Block<f32>,
+) {
     let src: usize = plan.src_size.iter().product();
     let dst: usize = plan.dst_size.iter().product();
     let image = plan.dst_channels * dst;

@@ -6,10 +6,11 @@
 //! are 36 matrix products over channels; one block's transformed tiles stay in the
 //! second-level cache.
 
+use super::Buffers;
 use super::plan::{Axes, Layout, Plan, pack};
 use super::shift::{Block, ROWS, Strip, blocks};
-use super::{Buffers, Out};
 use crate::cpu::disjoint::Disjoint;
+use crate::cpu::fresh;
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
 use rayon::prelude::*;
 use std::f32::consts::{FRAC_1_SQRT_2, SQRT_2};
@@ -164,7 +165,14 @@ fn outputs_1d<S: Simd>(s: S, y: [S::F; PATCH]) -> [S::F; TILE] {
 
 /// Runs `plan` on pictures `x` into `y`, which is overwritten; `bias` is empty or one
 /// value a channel written.
-pub(crate) fn run(tier: Tier, plan: &Plan, x: &[f32], w: &Weights, bias: &[f32], y: &mut Out) {
+pub(crate) fn run(
+    tier: Tier,
+    plan: &Plan,
+    x: &[f32],
+    w: &Weights,
+    bias: &[f32],
+    y: &mut fresh::Block<f32>,
+) {
     let src: usize = plan.src_size.iter().product();
     let [depth, height, width] = plan.dst_size;
     let images = y.len() / (plan.dst_channels * depth * height * width);

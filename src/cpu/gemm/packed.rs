@@ -2,6 +2,7 @@
 
 use super::PANEL;
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
+use std::cell::Cell;
 
 /// A matrix inside a slice, any strides.
 #[derive(Clone, Copy)]
@@ -83,6 +84,22 @@ impl Packed {
         if rhs.rows > 0 && rhs.cols > 0 {
             Tier::best().run(Pack { rhs, to: &mut self.data });
         }
+    }
+
+    /// `f` of `rhs`, packed into memory that this thread keeps.
+    ///
+    /// # Panics
+    /// As [`Packed::new`].
+    pub(crate) fn kept<R>(rhs: Mat<'_>, f: impl FnOnce(&Self) -> R) -> R {
+        thread_local! {
+            static KEPT: Cell<Packed> = Cell::default();
+        }
+        // Taken, not borrowed: a task may run inside another one's wait.
+        let mut packed = KEPT.take();
+        packed.fill(rhs);
+        let result = f(&packed);
+        KEPT.set(packed);
+        result
     }
 
     /// k.
