@@ -1,8 +1,8 @@
 //! Pointwise functions and softmax over rows, with gradients.
 
-use super::fresh::{Block, Fresh, fill};
+use super::fresh::{Block, Fresh};
 use super::math::{erf, exp, vectorised};
-use super::simd::{Kernel, LANES, Simd, Tier, exp as exp_lanes};
+use super::simd::{Kernel, LANES, Simd, Tier, exp2};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
@@ -180,8 +180,10 @@ const SUM: usize = 4096;
 /// A row to e^{x − max}; returns the sum. To be called inside a kernel.
 #[inline(always)]
 pub(super) fn exp_row<S: Simd>(s: S, row: &mut [f32]) -> f32 {
-    let most = largest(s, row);
-    exp_below(s, row, most)
+    let (most, n) = (largest(s, row), row.len());
+    let row = row.as_mut_ptr();
+    // SAFETY: the row itself.
+    unsafe { exp_below(s, row, row, n, most) }
 }
 
 /// The largest number of a row; NaN are passed over.
@@ -215,25 +217,45 @@ fn largest<S: Simd>(s: S, row: &[f32]) -> f32 {
     lanes[0]
 }
 
-/// A row to e^{x − max}; returns the sum.
+/// e^d for d ≤ 0 or NaN, to 1e-6 where the result is above 1e-5; 0 below 2⁻¹²⁵, so that
+/// no denormals arise.
 #[inline(always)]
-fn exp_below<S: Simd>(s: S, row: &mut [f32], max: f32) -> f32 {
+fn exp_negative<S: Simd>(s: S, d: S::F) -> S::F {
+    let (p, least) = (d * s.splat(std::f32::consts::LOG2_E), s.splat(-125.0));
+    // The second operand is what comes out where the first is compared with NaN.
+    s.select(s.lt(p, least), s.splat(0.0), exp2(s, s.max(least, p)))
+}
+
+/// e^{x − max} of `n` numbers at `x` to `y`; returns the sum.
+///
+/// # Safety
+/// `x` points to n numbers, `y` to as many places, written or not: the same ones, or none
+/// of them.
+#[inline(always)]
+unsafe fn exp_below<S: Simd>(s: S, x: *const f32, y: *mut f32, n: usize, max: f32) -> f32 {
     let (max, mut total) = (s.splat(max), 0.0);
-    for part in row.chunks_mut(SUM) {
-        let (chunks, tail) = part.as_chunks_mut::<LANES>();
+    for part in (0..n).step_by(SUM) {
+        let end = n.min(part + SUM);
         let mut sum = s.splat(0.0);
-        for v in chunks {
-            let e = exp_lanes(s, s.load(v) - max);
-            sum = sum + e;
-            s.store(e, v);
-        }
-        if !tail.is_empty() {
-            let mut last = [f32::NEG_INFINITY; LANES];
-            last[..tail.len()].copy_from_slice(tail);
-            let e = exp_lanes(s, s.load(&last) - max);
-            sum = sum + e;
-            s.store(e, &mut last);
-            tail.copy_from_slice(&last[..tail.len()]);
+        for at in (part..end).step_by(LANES) {
+            let mut lanes = [f32::NEG_INFINITY; LANES];
+            if at + LANES <= end {
+                // SAFETY: 16 places inside both.
+                unsafe {
+                    let e = exp_negative(s, s.load(&*x.add(at).cast()) - max);
+                    sum = sum + e;
+                    s.store(e, &mut lanes);
+                    y.add(at).cast::<[f32; LANES]>().write(lanes);
+                }
+            } else {
+                // SAFETY: the rest of both, fewer than 16.
+                unsafe { x.add(at).copy_to_nonoverlapping(lanes.as_mut_ptr(), end - at) };
+                let e = exp_negative(s, s.load(&lanes) - max);
+                sum = sum + e;
+                s.store(e, &mut lanes);
+                // SAFETY: as above.
+                unsafe { y.add(at).copy_from_nonoverlapping(lanes.as_ptr(), end - at) };
+            }
         }
         total += f64::from(s.sum(sum));
     }
@@ -244,21 +266,17 @@ fn exp_below<S: Simd>(s: S, row: &mut [f32], max: f32) -> f32 {
 pub fn softmax(n: usize, x: &[f32]) -> Vec<f32> {
     let chunk = CHUNK.div_ceil(n.max(1)) * n.max(1);
     let mut fresh = Fresh::new(x.len());
-    fresh.blocks(chunk).zip(x.par_chunks(chunk)).for_each(|(block, x)| {
-        // A few rows at a time stay in the first-level cache.
-        let few = (SUM / n.max(1)).max(1) * n.max(1);
-        for (block, x) in block.chunks_mut(few).zip(x.chunks(few)) {
-            let y = fill(block, x);
-            Tier::best().run(Softmax { n, y });
-        }
+    fresh.blocks(chunk).zip(x.par_chunks(chunk)).for_each(|(y, x)| {
+        Tier::best().run(Softmax { n, x, y });
     });
-    // SAFETY: the loop above filled every block.
+    // SAFETY: the loop above wrote every block.
     unsafe { fresh.finish() }
 }
 
 struct Softmax<'a> {
     n: usize,
-    y: &'a mut [f32],
+    x: &'a [f32],
+    y: &'a mut Block<f32>,
 }
 
 impl Kernel for Softmax<'_> {
@@ -266,19 +284,26 @@ impl Kernel for Softmax<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        // Pass by pass over some rows: within one each step waits for the last.
-        for rows in self.y.chunks_mut(TOGETHER * self.n) {
+        let Self { n, x, y } = self;
+        assert_eq!(x.len(), y.len(), "softmax: lengths");
+        // Pass by pass over some rows, which stay in the first-level cache: within one
+        // each step waits for the last.
+        let few = (SUM / n).clamp(1, TOGETHER) * n;
+        for (x, y) in x.chunks(few).zip(y.chunks_mut(few)) {
             let mut kept = [0.0; TOGETHER];
-            for (row, most) in rows.chunks_exact(self.n).zip(&mut kept) {
-                *most = largest(s, row);
+            for (x, most) in x.chunks_exact(n).zip(&mut kept) {
+                *most = largest(s, x);
             }
-            for (row, kept) in rows.chunks_exact_mut(self.n).zip(&mut kept) {
-                *kept = exp_below(s, row, *kept);
+            let rows = x.chunks_exact(n).zip(y.chunks_exact_mut(n));
+            for ((x, y), kept) in rows.zip(&mut kept) {
+                // SAFETY: n numbers and n places apart from them.
+                *kept = unsafe { exp_below(s, x.as_ptr(), y.as_mut_ptr().cast(), n, *kept) };
             }
-            for (row, sum) in rows.chunks_exact_mut(self.n).zip(&kept) {
+            for (y, sum) in y.chunks_exact_mut(n).zip(&kept) {
                 let inverse = 1.0 / sum;
-                for v in row {
-                    *v *= inverse;
+                for v in y {
+                    // SAFETY: written by the loop above.
+                    *v = MaybeUninit::new(unsafe { v.assume_init() } * inverse);
                 }
             }
         }

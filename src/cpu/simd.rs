@@ -269,28 +269,6 @@ pub(crate) fn exp2<S: Simd>(s: S, p: S::F) -> S::F {
     s.scale(m, n)
 }
 
-/// eˣ to 2 ulp for −86.6 ≤ x ≤ 88; 0 below, e⁸⁸ above; NaN for NaN. Reduction by ln 2 in
-/// two parts and a polynomial of degree 7 (Cephes' coefficients).
-#[inline(always)]
-pub(crate) fn exp<S: Simd>(s: S, x: S::F) -> S::F {
-    const C: [f32; 6] =
-        [0.5, 1.666_666_5e-1, 4.166_579_6e-2, 8.333_452e-3, 1.398_199_9e-3, 1.987_569_1e-4];
-    let least = s.splat(-86.6);
-    // The second operand is what comes out where the first is compared with NaN.
-    let c = s.min(s.splat(88.0), s.max(least, x));
-    let (n, _) = s.split(c * s.splat(std::f32::consts::LOG2_E));
-    let r = s.fnma(n, s.splat(0.693_359_4), c);
-    let r = s.fnma(n, s.splat(-2.121_944_4e-4), r);
-    let mut p = s.splat(C[5]);
-    p = s.fma(p, r, s.splat(C[4]));
-    p = s.fma(p, r, s.splat(C[3]));
-    p = s.fma(p, r, s.splat(C[2]));
-    p = s.fma(p, r, s.splat(C[1]));
-    p = s.fma(p, r, s.splat(C[0]));
-    let y = s.scale(s.fma(p * r, r, r) + s.splat(1.0), n);
-    s.select(s.lt(x, least), s.splat(0.0), y)
-}
-
 /// log₂ of a normal positive number to 3 ulp or 1e-7, whichever is more; anything
 /// elsewhere. Mantissa in [√½, √2) by a minimax polynomial of degree 8 for
 /// log₂(1 + t) / t (relative error 2.6e-8; Remez).

@@ -312,7 +312,7 @@ pub use crate::ops::resize::{resize_bilinear, resize_bilinear_then, upsample_nea
 mod tests {
     use super::*;
     use crate::model::weights::Weights;
-    use candle_core::{Device, Var};
+    use candle_core::{DType, Device, Var};
 
     /// Compares the gradient of Σ f(x)·r with central differences.
     fn check_grad(x: Tensor, f: impl Fn(&Tensor) -> Result<Tensor>) -> Result<()> {
@@ -377,6 +377,21 @@ mod tests {
         assert!(far(&softmax(&x)?, &e.broadcast_div(&e.sum_keepdim(1)?)?)? < 1e-6);
         let spread = Tensor::new(&[-1e30f32, 0.0, 88.0, 1e30], &Device::Cpu)?;
         assert_eq!(softmax(&spread)?.to_vec1::<f32>()?, [0.0, 0.0, 0.0, 1.0]);
+        // Rows longer than a part of the sum, numbers far apart, and one NaN.
+        let mut x = (noise(&[3, 5003])? * 20.0)?.flatten_all()?.to_vec1::<f32>()?;
+        x[5003] = f32::NAN;
+        let x = Tensor::from_vec(x, (3, 5003), &Device::Cpu)?;
+        let e = x.to_dtype(DType::F64)?.exp()?;
+        let want = e.broadcast_div(&e.sum_keepdim(1)?)?.to_vec2::<f64>()?;
+        for (row, (got, want)) in softmax(&x)?.to_vec2::<f32>()?.into_iter().zip(want).enumerate() {
+            for (got, want) in got.into_iter().zip(want) {
+                let off = (f64::from(got) - want).abs();
+                assert!(
+                    if row == 1 { got.is_nan() } else { off <= 2e-6 * want + 1e-11 },
+                    "{got} {want}"
+                );
+            }
+        }
         Ok(())
     }
 
