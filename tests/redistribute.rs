@@ -140,6 +140,15 @@ fn redistribution_survives_extremes_and_refuses_misfits() {
             assert!(host(&got).iter().all(|v| (0.0..=1.0).contains(v)), "{rule:?} {got}");
         }
     }
+    // A child that covers the sky takes nothing from its sibling's share.
+    let (l, o) = (t(&[0.0; 2], &[1, 2]), t(&[0.75], &[1]));
+    let beside = |sky: f32| {
+        redistribute(Rule::OpticalDepth, &l, &t(&[sky, 1.0], &[1, 2]), &o, Some(&t(&[1.0], &[1])))
+    };
+    for sky in [1e30, f32::MAX, f32::INFINITY] {
+        let got = host(&beside(sky).unwrap());
+        assert!(got[0].abs() < 1e-12 && (got[1] - 0.5).abs() < 1e-6, "{sky}: {got:?}");
+    }
     let o = t(&[0.5, 0.5], &[2]);
     let error = redistribute(Rule::Area, &logits, &areas, &o, None).unwrap_err().to_string();
     assert!(error.contains("parents' areas"), "{error}");

@@ -30,6 +30,10 @@ const BLOCK: usize = 512;
 /// Areas above count as this, px²: over [`AREA_EPS`] it is still far from overflow.
 const AREA_MAX: f64 = 1e28;
 
+/// B above counts as this: such a child gets less than 1e-17 of the parent, and the
+/// product of two is far from overflow.
+const RELATIVE_AREA_MAX: f64 = 1e18;
+
 /// eˣ⁻ᵐᵃˣ of `x` in place; returns one over their sum.
 #[inline(always)]
 fn exponentials<V: Lanes>(x: &mut [V]) -> V {
@@ -69,12 +73,19 @@ fn optical_depth<V: Lanes>(alpha: V) -> V {
     -(-alpha.min(alpha.of(OPACITY_CEILING))).ln_1p()
 }
 
-/// What the rule divides by, where it divides.
+/// B: what the rules with relative areas divide by, bounded so that two of them may be
+/// multiplied.
 #[inline(always)]
-fn divisor<V: Lanes>(rule: Rule, area: V, per_own: V) -> V {
+fn divisor<V: Lanes>(area: V, per_own: V) -> V {
+    (area * per_own).max(area.of(RELATIVE_AREA_MIN)).min(area.of(RELATIVE_AREA_MAX))
+}
+
+/// F of the rules α_k = F(x_k).
+#[inline(always)]
+fn opacity_of<V: Lanes>(rule: Rule, x: V) -> V {
     match rule {
-        Rule::Transmittance => area.of(1.0),
-        _ => (area * per_own).max(area.of(RELATIVE_AREA_MIN)),
+        Rule::Area => x.min(x.of(AREA_RULE_OPACITY_MAX)),
+        _ => -(-x).exp_m1(),
     }
 }
 
@@ -96,12 +107,19 @@ pub(super) fn share<V: Lanes>(rule: Rule, areas: &[V], alpha: V, own: V, alphas:
     let per_own = if rule.areas_are_relative() { one / own } else { one };
     let whole = if rule == Rule::Area { alpha } else { optical_depth(alpha) };
     let factor = whole * inverse;
-    for (o, &a) in alphas.iter_mut().zip(areas) {
-        let x = factor * *o / divisor(rule, a, per_own);
-        *o = match rule {
-            Rule::Area => x.min(one.of(AREA_RULE_OPACITY_MAX)),
-            _ => -(-x).exp_m1(),
-        };
+    if rule == Rule::Transmittance {
+        alphas.iter_mut().for_each(|o| *o = opacity_of(rule, factor * *o));
+        return;
+    }
+    let (mut areas, mut pairs) = (areas.chunks_exact(2), alphas.chunks_exact_mut(2));
+    for (o, a) in pairs.by_ref().zip(areas.by_ref()) {
+        // One division for two: it costs as much as an exponential.
+        let (a, b) = (divisor(a[0], per_own), divisor(a[1], per_own));
+        let both = factor / (a * b);
+        (o[0], o[1]) = (opacity_of(rule, both * b * o[0]), opacity_of(rule, both * a * o[1]));
+    }
+    if let (Some(o), Some(&a)) = (pairs.into_remainder().first_mut(), areas.remainder().first()) {
+        *o = opacity_of(rule, factor * *o / divisor(a, per_own));
     }
 }
 
@@ -154,7 +172,10 @@ fn weighted_backward<V: Lanes>(
     let s = if rule == Rule::Area { alpha } else { optical_depth(alpha) };
     let (mut by_s, mut mean, mut by_own) = (zero, zero, zero);
     for ((l, a), g) in logits.iter_mut().zip(areas.iter_mut()).zip(grads.iter_mut()) {
-        let inverse_b = one / divisor(rule, *a, per_own);
+        let inverse_b = match rule {
+            Rule::Transmittance => one,
+            _ => one / divisor(*a, per_own),
+        };
         *l = *l * inverse;
         let share = *l * inverse_b;
         let x = s * share;
