@@ -1,7 +1,8 @@
 //! Makes a test set of procedural rooms for `subsplat eval`, one scene folder each:
 //!
 //! ```text
-//! cargo run --release --example make_rooms -- out/rooms 24 77   # folder, rooms, seed
+//! cargo run --release --example make_rooms -- out/rooms 24 77   # folder, rooms, seed (and
+//!     # the share of rooms with things close before the cameras: 0)
 //! subsplat eval out/rooms --upscale 2
 //! ```
 //!
@@ -29,12 +30,14 @@ fn main() -> Result<()> {
         arguments.next().map_or(Ok(default), |text| text.parse().context("a number"))
     };
     let (count, seed) = (number(24)?, number(77)?);
+    let foreground = arguments.next().map_or(Ok(0.0), |text| text.parse().context("a share"))?;
     let mut config = TrainConfig::default();
     config.model.upscale = 1;
     config.data.input = [SIDE, SIDE];
     config.data.targets = TARGETS;
     config.data.target_samples = 2;
     config.data.seed = seed;
+    config.data.foreground = foreground;
     let source = rooms(&config, true)?;
     for i in 0..count {
         let example = source.example(i)?;

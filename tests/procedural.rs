@@ -230,6 +230,30 @@ fn pictures_of_any_shape_are_finite_and_full() {
 }
 
 #[test]
+fn what_stands_before_the_cameras_changes_nothing_else() {
+    let plain = ExampleSpec::new(40, 30, 1);
+    let crowded = ExampleSpec { foreground: 1.0, ..plain };
+    let mut closer = 0;
+    for seed in 0..12 {
+        let [a, b] = [plain, crowded].map(|spec| Example::new(seed, &spec));
+        assert_eq!(a.seed, b.seed);
+        // The same poses in another unit of length.
+        let rotations = |e: &Example| e.cameras.iter().map(|c| c.rotation()).collect::<Vec<_>>();
+        assert_eq!(rotations(&a), rotations(&b));
+        let share = |e: &Example| {
+            let mut depth: Vec<f32> = e.views.iter().flat_map(|v| v.depth.clone()).collect();
+            depth.sort_by(f32::total_cmp);
+            depth[depth.len() / 20] / depth[depth.len() / 2]
+        };
+        closer += usize::from(share(&b) < 0.9 * share(&a));
+        let half = Example::new(seed, &ExampleSpec { foreground: 0.5, ..plain });
+        let same = |x: &Example| x.views[0].rgb == half.views[0].rgb;
+        assert!(same(&a) || same(&b), "seed {seed}: neither with nor without");
+    }
+    assert!(closer >= 4, "{closer} of 12");
+}
+
+#[test]
 fn rooms_have_the_size_and_number_of_things_that_rooms_have() {
     let n = 200;
     let mut solids = 0;

@@ -140,12 +140,14 @@ pub struct Data {
     pub crop: f32,
     /// Exposure, softness and noise of cameras on the context views.
     pub photographic: bool,
+    /// Share of scenes with things close before the cameras, half out of the picture.
+    pub foreground: f32,
     /// Share of scenes whose near and far are what can be seen
     /// ([`super::source::Rooms::seen_range`]).
     pub seen_range: f32,
     /// Pictures on disk in place of made-up rooms: then `scenes`, `samples`,
-    /// `target_samples`, `crop`, `photographic` and `seen_range` mean nothing, and depth
-    /// is unknown.
+    /// `target_samples`, `crop`, `photographic`, `foreground` and `seen_range` mean nothing,
+    /// and depth is unknown.
     pub files: Option<Files>,
     /// Scenes that are shown in turns before the next ones are made.
     pub window: u64,
@@ -170,6 +172,7 @@ impl Default for Data {
             target_samples: 1,
             crop: 0.5,
             photographic: true,
+            foreground: 0.0,
             seen_range: 0.0,
             files: None,
             window: 256,
@@ -426,6 +429,7 @@ impl TrainConfig {
             ("optimizer.average", o.average),
             ("data.crop", f64::from(self.data.crop)),
             ("data.seen_range", f64::from(self.data.seen_range)),
+            ("data.foreground", f64::from(self.data.foreground)),
             ("data.augment.flip", a.flip),
             ("data.augment.permute", a.permute),
             ("data.augment.swap", a.swap),

@@ -54,6 +54,7 @@ pub fn rooms(config: &TrainConfig, held_out: bool) -> Result<Rooms> {
     let mut spec = crate::data::procedural::ExampleSpec::new(w, h, count);
     spec.cameras.crop = data.crop;
     spec.photographic = data.photographic;
+    spec.foreground = data.foreground;
     spec.samples = data.samples;
     let targets =
         crate::data::procedural::TargetSpec { ratio, samples: data.target_samples, clean: true };

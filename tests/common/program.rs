@@ -96,7 +96,7 @@ fn example() -> &'static Example {
     static EXAMPLE: OnceLock<Example> = OnceLock::new();
     EXAMPLE.get_or_init(|| {
         let cameras = CameraSpec { width: SIDE, height: SIDE, targets: 1, crop: 0.0 };
-        Example::new(3, &ExampleSpec { cameras, photographic: false, samples: 1 })
+        Example::new(3, &ExampleSpec { cameras, photographic: false, foreground: 0.0, samples: 1 })
     })
 }
 

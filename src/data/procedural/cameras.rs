@@ -13,7 +13,7 @@ use crate::camera::{Camera, Intrinsics};
 use glam::{EulerRot, Mat3, Mat4, Quat, Vec2, Vec3};
 
 /// Smallest distance of an eye from any surface, m.
-const CLEARANCE: f32 = 0.1;
+pub(super) const CLEARANCE: f32 = 0.1;
 /// Smallest share of either context view that the other sees.
 const OVERLAP: f32 = 0.4;
 /// Largest rotation between the context views about each axis, radians.
@@ -208,7 +208,7 @@ fn between(room: &Room, first: &Camera, second: &Camera, rng: &mut Rng) -> Optio
 }
 
 /// World points and depths that a camera sees, on a grid.
-fn probe(room: &Room, camera: &Camera) -> Vec<(Vec3, f32)> {
+pub(super) fn probe(room: &Room, camera: &Camera) -> Vec<(Vec3, f32)> {
     let k = &camera.intrinsics;
     let mut seen = Vec::with_capacity(PROBE * PROBE);
     for j in 0..PROBE {
@@ -226,7 +226,7 @@ fn probe(room: &Room, camera: &Camera) -> Vec<(Vec3, f32)> {
 }
 
 /// Share of the points that `camera` sees: in front, inside the picture and not hidden.
-fn visible(room: &Room, points: &[(Vec3, f32)], camera: &Camera) -> f32 {
+pub(super) fn visible(room: &Room, points: &[(Vec3, f32)], camera: &Camera) -> f32 {
     let (w, h) = (camera.intrinsics.width as f32, camera.intrinsics.height as f32);
     let sees = |point: Vec3| {
         let inside = camera

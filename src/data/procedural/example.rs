@@ -15,16 +15,19 @@ pub struct ExampleSpec {
     /// Gain and gamma per scene; exposure, white balance, softness and noise per view.
     /// Off: [`Quality::clean`]'s grade in all views.
     pub photographic: bool,
+    /// Share of examples with things close before the cameras, half out of the picture:
+    /// chairs, plants, the edge of a door.
+    pub foreground: f32,
     /// Samples along each side of a pixel.
     pub samples: usize,
 }
 
 impl ExampleSpec {
     /// Two context views and `targets` more, 4 samples a pixel, half of the examples
-    /// cropped from pictures twice as large, photographic.
+    /// cropped from pictures twice as large, photographic, nothing close before the cameras.
     pub fn new(width: usize, height: usize, targets: usize) -> Self {
         let cameras = CameraSpec { width, height, targets, crop: 0.5 };
-        Self { cameras, photographic: true, samples: 2 }
+        Self { cameras, photographic: true, foreground: 0.0, samples: 2 }
     }
 }
 
@@ -62,6 +65,9 @@ const NEAR_DEPTH: [f32; 2] = [0.9, 2.4];
 /// Share of examples with near 1 and far 100, RealEstate10K's habit.
 const FIXED_PLANES: f32 = 0.7;
 
+/// Key of the draws for what stands before the cameras.
+const FOREGROUND: u64 = 12;
+
 /// Unit of length (units per metre), near and far for a rig.
 fn planes(rig: &Rig, rng: &mut Rng) -> (f32, f32, f32) {
     let scale = rng.log_range(NEAR_DEPTH[0], NEAR_DEPTH[1]) / rig.near_depth.max(1e-3);
@@ -89,8 +95,13 @@ impl Example {
         let mut rng = Rng::new(seed).fork(11);
         loop {
             let seed = rng.bits();
-            let room = Room::new(seed);
-            if let Some(rig) = sample_cameras(&room, seed, &spec.cameras) {
+            let mut room = Room::new(seed);
+            if let Some(mut rig) = sample_cameras(&room, seed, &spec.cameras) {
+                // A stream of its own: without these things the example stays what it was.
+                let mut extra = Rng::new(seed).fork(FOREGROUND);
+                if extra.chance(spec.foreground) {
+                    room.crowd(&mut rig, &mut extra);
+                }
                 return Self::of(seed, &room, &rig, (spec, targets), &mut rng);
             }
         }

@@ -15,6 +15,7 @@
 
 mod cameras;
 mod example;
+mod foreground;
 mod furniture;
 mod layout;
 mod light;
