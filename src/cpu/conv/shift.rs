@@ -36,7 +36,8 @@ pub(super) struct Block {
 pub(super) fn blocks(channels: usize) -> Vec<Block> {
     let block = |first: usize| {
         let rows = ROWS.min(channels - first);
-        Block { first, rows, pitch: rows.next_power_of_two() }
+        // Three go through the kernel of four.
+        Block { first, rows, pitch: if rows == 3 { 4 } else { rows } }
     };
     (0..channels).step_by(ROWS).map(block).collect()
 }
@@ -262,6 +263,9 @@ impl Strip<'_> {
         if S::REGISTERS >= 32 {
             match pitch {
                 8 => self.strips::<S, 8, 8, 3, 2>(s, 0, sums),
+                7 => self.strips::<S, 7, 7, 3, 2>(s, 0, sums),
+                6 => self.strips::<S, 6, 6, 4, 2>(s, 0, sums),
+                5 => self.strips::<S, 5, 5, 5, 2>(s, 0, sums),
                 4 => self.strips::<S, 4, 4, 6, 3>(s, 0, sums),
                 2 => self.strips::<S, 2, 2, 8, 3>(s, 0, sums),
                 _ => self.strips::<S, 1, 1, 12, 3>(s, 0, sums),
@@ -272,6 +276,12 @@ impl Strip<'_> {
                     self.strips::<S, 8, 4, 1, 1>(s, 0, sums);
                     self.strips::<S, 8, 4, 1, 1>(s, 4, sums);
                 }
+                7 => {
+                    self.strips::<S, 7, 4, 1, 1>(s, 0, sums);
+                    self.strips::<S, 7, 3, 1, 1>(s, 4, sums);
+                }
+                6 => self.strips::<S, 6, 6, 1, 1>(s, 0, sums),
+                5 => self.strips::<S, 5, 5, 1, 1>(s, 0, sums),
                 4 => self.strips::<S, 4, 4, 1, 1>(s, 0, sums),
                 2 => self.strips::<S, 2, 2, 2, 1>(s, 0, sums),
                 _ => self.strips::<S, 1, 1, 4, 1>(s, 0, sums),
