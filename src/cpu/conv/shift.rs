@@ -58,18 +58,18 @@ impl Weights {
                 for m in block.rows..block.pitch {
                     own.iter_mut().skip(m).step_by(block.pitch).for_each(|v| *v = 0.0);
                 }
-                for m in 0..block.rows {
-                    let dst = block.first + m;
-                    let mut at = m;
-                    for src in 0..plan.src_channels {
+                // Channel by channel of the source: what is written stays in the cache.
+                let group = pass.taps.len() * block.pitch;
+                for (src, own) in own.chunks_exact_mut(group.max(1)).enumerate() {
+                    for m in 0..block.rows {
+                        let dst = block.first + m;
                         let row = match plan.transposed {
                             true => src * plan.dst_channels + dst,
                             false => dst * plan.src_channels + src,
                         };
                         let taps = &w[row * plan.kernel_taps..][..plan.kernel_taps];
-                        for tap in &pass.taps {
-                            own[at] = taps[tap.kernel];
-                            at += block.pitch;
+                        for (tap, own) in pass.taps.iter().zip(own.chunks_exact_mut(block.pitch)) {
+                            own[m] = taps[tap.kernel];
                         }
                     }
                 }
