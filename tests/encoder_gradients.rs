@@ -12,11 +12,11 @@ use subsplat::model::primaries::primaries;
 use subsplat::model::trace::Trace;
 use subsplat::model::weights::{Weights, read_tensors};
 
-/// Norm of a difference over the norm, thrice the worst seen (a convolution of the CNN):
+/// Norm of a difference over the norm; the worst seen is 4e-3 (a convolution of the CNN):
 /// depth turns the last digits of features into its third, and a gradient of the CNN has
 /// come through all of it.
 const APART: f64 = 1e-2;
-/// Gradients with a smaller norm are rounding; the next larger one is 1e-2.
+/// Gradients with a smaller norm are rounding; the next larger one is 7e-3.
 const NOTHING: f64 = 1e-6;
 
 type Tensors = BTreeMap<String, Tensor>;

@@ -100,7 +100,7 @@ fn propose(room: &Room, rng: &mut Rng, spec: &CameraSpec) -> Option<Rig> {
         return None;
     }
     let seen_by_second = probe(room, &second);
-    let overlap = visible(room, &seen, &second).min(visible(room, &seen_by_second, &first));
+    let overlap = overlap(room, [&first, &second], [&seen, &seen_by_second]);
     if overlap < OVERLAP {
         return None;
     }
@@ -108,13 +108,12 @@ fn propose(room: &Room, rng: &mut Rng, spec: &CameraSpec) -> Option<Rig> {
     for _ in 0..spec.targets {
         cameras.push(between(room, &first, &second, rng)?);
     }
-    depths.extend(seen_by_second.iter().map(|p| p.1));
-    depths.sort_by(f32::total_cmp);
+    let (near_depth, far_depth) = extent(seen.iter().chain(&seen_by_second))?;
     Some(Rig {
         baseline: first.position().distance(second.position()),
-        near_depth: *depths.get(depths.len() / 50)?,
+        near_depth,
         median_depth,
-        far_depth: *depths.last()?,
+        far_depth,
         overlap,
         motion,
         orbit,
@@ -207,6 +206,18 @@ fn between(room: &Room, first: &Camera, second: &Camera, rng: &mut Rng) -> Optio
     clear.then(|| posed(first.intrinsics, Mat3::from_quat(rotation), eye))
 }
 
+/// Depth below which 2 % of the points lie, and the largest.
+pub(super) fn extent<'a>(seen: impl Iterator<Item = &'a (Vec3, f32)>) -> Option<(f32, f32)> {
+    let mut depths: Vec<f32> = seen.map(|p| p.1).collect();
+    depths.sort_by(f32::total_cmp);
+    Some((*depths.get(depths.len() / 50)?, *depths.last()?))
+}
+
+/// Share of what either of two cameras sees that the other sees too, the smaller one.
+pub(super) fn overlap(room: &Room, [a, b]: [&Camera; 2], seen: [&[(Vec3, f32)]; 2]) -> f32 {
+    visible(room, seen[0], b).min(visible(room, seen[1], a))
+}
+
 /// World points and depths that a camera sees, on a grid.
 pub(super) fn probe(room: &Room, camera: &Camera) -> Vec<(Vec3, f32)> {
     let k = &camera.intrinsics;
@@ -226,7 +237,7 @@ pub(super) fn probe(room: &Room, camera: &Camera) -> Vec<(Vec3, f32)> {
 }
 
 /// Share of the points that `camera` sees: in front, inside the picture and not hidden.
-pub(super) fn visible(room: &Room, points: &[(Vec3, f32)], camera: &Camera) -> f32 {
+fn visible(room: &Room, points: &[(Vec3, f32)], camera: &Camera) -> f32 {
     let (w, h) = (camera.intrinsics.width as f32, camera.intrinsics.height as f32);
     let sees = |point: Vec3| {
         let inside = camera

@@ -59,7 +59,7 @@ pub struct Example {
 }
 
 /// Context views of an example.
-const CONTEXT: usize = 2;
+pub(super) const CONTEXT: usize = 2;
 /// Depth that both rules put the 2 % quantile of depth at, units.
 const NEAR_DEPTH: [f32; 2] = [0.9, 2.4];
 /// Share of examples with near 1 and far 100, RealEstate10K's habit.

@@ -3,7 +3,8 @@
 //! learned from rooms without them tears them apart.
 
 use super::Room;
-use super::cameras::{CLEARANCE, Rig, probe, visible};
+use super::cameras::{CLEARANCE, Rig, extent, overlap, probe};
+use super::example::CONTEXT;
 use super::layout::yaw;
 use super::material::{Material, Palette, Role};
 use super::rng::Rng;
@@ -17,8 +18,6 @@ const AWAY: [f32; 2] = [0.14, 0.55];
 const AWAY_MIN: f32 = 0.3;
 /// Least share of a context view that the other must still see.
 const OVERLAP: f32 = 0.3;
-/// Context views of a rig.
-const CONTEXT: usize = 2;
 
 impl Room {
     /// One to three things before the context cameras of `rig`; those that come too close
@@ -29,30 +28,25 @@ impl Room {
             let eye = rig.cameras[rng.count(0, CONTEXT - 1)];
             let (solids, materials) = (self.primitives.len(), self.materials.len());
             Thing { room: self, palette: &palette, rng }.put(&eye, rig.median_depth);
-            if !self.still_works(rig, solids) {
-                self.primitives.truncate(solids);
-                self.materials.truncate(materials);
+            match self.still_works(rig) {
+                Some(extent) => (rig.near_depth, rig.far_depth) = extent,
+                None => {
+                    self.primitives.truncate(solids);
+                    self.materials.truncate(materials);
+                }
             }
-        }
-        let mut depths: Vec<f32> =
-            rig.cameras[..CONTEXT].iter().flat_map(|c| probe(self, c)).map(|p| p.1).collect();
-        depths.sort_by(f32::total_cmp);
-        if let (Some(near), Some(far)) = (depths.get(depths.len() / 50), depths.last()) {
-            (rig.near_depth, rig.far_depth) = (*near, *far);
         }
     }
 
-    /// Whether all eyes are clear of the solids from `first` on, and both views still
-    /// share enough.
-    fn still_works(&self, rig: &Rig, first: usize) -> bool {
-        let added = &self.primitives[first..];
-        let near = |c: &Camera| added.iter().any(|p| p.distance(c.position()) < CLEARANCE);
-        if rig.cameras.iter().any(near) {
-            return false;
+    /// Nearest and farthest depth, if all eyes are clear and both views share enough.
+    fn still_works(&self, rig: &Rig) -> Option<(f32, f32)> {
+        if rig.cameras.iter().any(|c| self.clearance(c.position()) < CLEARANCE) {
+            return None;
         }
         let [a, b] = [&rig.cameras[0], &rig.cameras[1]];
         let (from_a, from_b) = (probe(self, a), probe(self, b));
-        visible(self, &from_a, b).min(visible(self, &from_b, a)) >= OVERLAP
+        let enough = overlap(self, [a, b], [&from_a, &from_b]) >= OVERLAP;
+        if enough { extent(from_a.iter().chain(&from_b)) } else { None }
     }
 }
 
@@ -200,8 +194,7 @@ mod tests {
                 assert!(room.clearance(camera.position()) >= CLEARANCE, "seed {seed}");
             }
             let [a, b] = [0, 1].map(|i| probe(&room, &rig.cameras[i]));
-            let shared =
-                visible(&room, &a, &rig.cameras[1]).min(visible(&room, &b, &rig.cameras[0]));
+            let shared = overlap(&room, [&rig.cameras[0], &rig.cameras[1]], [&a, &b]);
             assert!(shared >= OVERLAP, "seed {seed}: {shared}");
             assert!(rig.near_depth <= was.near_depth && rig.near_depth > 0.0);
             crowded += usize::from(room.solids() > solids);
