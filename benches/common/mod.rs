@@ -24,8 +24,11 @@ use std::time::{Duration, Instant};
 
 /// Fewest and most turns of a contender.
 const TURNS: (usize, usize) = (3, 200);
-/// Seconds below which each turn has a run before it that does not count.
+/// Seconds below which runs before each turn do not count.
 const QUICK_S: f64 = 0.05;
+/// Seconds of such runs: the system spreads threads that have slept over the cores only
+/// after some milliseconds, and on two cores a call of one millisecond never saw the second.
+const WARM_S: f64 = 0.03;
 
 /// What the command line says.
 #[derive(Default)]
@@ -229,7 +232,10 @@ impl Bench {
                 // What is quick is timed as within a longer computation: its data in the
                 // caches, its threads awake.
                 if !contender.elsewhere && times.wall.last().is_none_or(|t| *t < QUICK_S) {
-                    pool.install(&mut *run).with_context(|| contender.name.clone())?;
+                    let start = Instant::now();
+                    while start.elapsed().as_secs_f64() < WARM_S {
+                        pool.install(&mut *run).with_context(|| contender.name.clone())?;
+                    }
                 }
                 let cpu = cpu_seconds();
                 let start = Instant::now();
