@@ -241,6 +241,34 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     fn load4(self, from: &[f32], at: &[usize; LANES], offset: usize) -> [Self::F; 4];
     /// Rows and columns exchanged: lane j of vector i goes to lane i of vector j.
     fn transpose(self, v: [Self::F; LANES]) -> [Self::F; LANES];
+    /// Columns of a matrix of 16 rows of four, of which each vector holds four rows.
+    fn columns4(self, v: [Self::F; 4]) -> [Self::F; 4];
+    /// The inverse of [`Simd::columns4`].
+    fn rows4(self, v: [Self::F; 4]) -> [Self::F; 4];
+    /// Quarters 0 and 2 of `a`, then of `b`; and quarters 1 and 3.
+    fn split_quarters(self, a: Self::F, b: Self::F) -> [Self::F; 2];
+    /// The inverse of [`Simd::split_quarters`].
+    fn join_quarters(self, even: Self::F, odd: Self::F) -> [Self::F; 2];
+    /// Columns of a matrix of 16 rows of eight, of which each vector holds two rows.
+    #[inline(always)]
+    fn columns8(self, v: [Self::F; 8]) -> [Self::F; 8] {
+        let (mut left, mut right) = ([v[0]; 4], [v[0]; 4]);
+        for i in 0..4 {
+            [left[i], right[i]] = self.split_quarters(v[2 * i], v[2 * i + 1]);
+        }
+        let ([a, b, c, d], [e, f, g, h]) = (self.columns4(left), self.columns4(right));
+        [a, b, c, d, e, f, g, h]
+    }
+    /// The inverse of [`Simd::columns8`].
+    #[inline(always)]
+    fn rows8(self, [a, b, c, d, e, f, g, h]: [Self::F; 8]) -> [Self::F; 8] {
+        let (left, right) = (self.rows4([a, b, c, d]), self.rows4([e, f, g, h]));
+        let mut out = [a; 8];
+        for i in 0..4 {
+            [out[2 * i], out[2 * i + 1]] = self.join_quarters(left[i], right[i]);
+        }
+        out
+    }
 }
 
 /// Whether four floats from `offset` past each place of `at` lie inside `len`.
@@ -411,6 +439,13 @@ mod tests {
                 put(&mut exact, s.load4(&self.1[..3], &[0; LANES], 0)[0]);
                 let rows = [a, b, c, a, b, c, -a, a, b, c, a, b, -c, a, b, c];
                 for v in s.transpose(rows) {
+                    put(&mut exact, v);
+                }
+                let eight = [a, b, c, -a, -b, -c, a + b, b + c];
+                for v in s.columns8(eight).into_iter().chain(s.rows8(eight)) {
+                    put(&mut exact, v);
+                }
+                for v in s.columns4([a, b, c, -a]).into_iter().chain(s.rows4([a, b, c, -a])) {
                     put(&mut exact, v);
                 }
 

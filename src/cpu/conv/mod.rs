@@ -10,6 +10,7 @@
     reason = "counted loops over register tiles unroll, iterators over them need not"
 )]
 
+mod forms;
 mod plan;
 mod pointwise;
 mod shift;
@@ -64,9 +65,9 @@ fn run(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y: &mut Bloc
     }
     if pointwise::suits(plan) {
         pointwise::run(tier, plan, x, w, bias, y);
-    } else if winograd::suits(plan) {
-        let w = winograd::Weights::new(tier, plan, w, WEIGHTS.take());
-        winograd::run(tier, plan, x, &w, bias, y);
+    } else if let Some(way) = winograd::Way::of(plan) {
+        let w = winograd::Weights::new(tier, plan, way, w, WEIGHTS.take());
+        winograd::run(tier, plan, way, x, &w, bias, y);
         keep(w.into_memory());
     } else {
         let w = shift::Weights::new(plan, w, WEIGHTS.take());

@@ -239,6 +239,19 @@ impl Plan {
         }
     }
 
+    /// Places before the source's first that the first output reads.
+    pub fn before(&self) -> Axes {
+        let taps = self.passes.iter().flat_map(|p| &p.taps);
+        let place = |a: usize, t: &Tap| {
+            let at = (self.origin[a] + t.shift[a] as isize) * self.src_step[a] as isize;
+            at + self.planes[t.plane][a] as isize
+        };
+        std::array::from_fn(|a| {
+            let first = taps.clone().map(|t| place(a, t)).min().unwrap_or(0);
+            first.min(0).unsigned_abs()
+        })
+    }
+
     /// Grid positions: outputs of the largest phase.
     pub fn grid(&self) -> Axes {
         std::array::from_fn(|a| self.dst_size[a].div_ceil(self.dst_step[a]))

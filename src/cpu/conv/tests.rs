@@ -93,6 +93,11 @@ fn cases() -> Vec<Sizes> {
         flat(41, 26, [3, 3], 1, 0, [36, 31]),
         flat(33, 100, [3, 3], 1, 2, [22, 35]),
         flat(25, 24, [3, 3], 1, 1, [70, 141]),
+        // The same of stride 2.
+        flat(24, 30, [3, 3], 2, 1, [60, 66]),
+        flat(41, 26, [3, 3], 2, 1, [71, 63]),
+        flat(33, 100, [3, 3], 2, 0, [55, 60]),
+        flat(25, 24, [3, 3], 2, 1, [139, 280]),
         solid(5, 8, [3, 3, 3], 1, [6, 7, 9]),
         solid(8, 1, [3, 3, 3], 1, [5, 4, 20]),
         solid(2, 11, [3, 1, 2], 1, [3, 4, 5]),
@@ -105,7 +110,7 @@ const WINOGRAD: f64 = 3e-6;
 const DIRECT: f64 = 1.5e-6;
 
 fn bound(plan: &Plan) -> f64 {
-    if winograd::suits(plan) { WINOGRAD } else { DIRECT }
+    if winograd::Way::of(plan).is_some() { WINOGRAD } else { DIRECT }
 }
 
 /// Largest difference over the size of what is summed.

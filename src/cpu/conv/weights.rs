@@ -48,7 +48,7 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
             let outputs = o.div_ceil(o.div_ceil(LANES_WIDE)).next_multiple_of(LANES);
             (outputs, even(c, (c * taps / DEPTH).max(1)))
         }
-        Way::Winograd => {
+        Way::Winograd(_) => {
             let parts = c.div_ceil(winograd_weights::CHANNELS);
             (o, even(c, parts).next_multiple_of(ROWS))
         }
@@ -58,14 +58,14 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
         .flat_map(|first| (0..c).step_by(channels).map(move |channel| (first, channel)))
         .collect();
     let tile = match way {
-        Way::Winograd => winograd_weights::tile(&plan),
+        Way::Winograd(_) => winograd_weights::tile(&plan),
         _ => plan.tile(channels, images, JOBS.div_ceil(parts.len())),
     };
     let layout = plan.layout(tile);
     let starts = starts(plan.grid(), tile);
     let units = images * starts.len();
     let groups = match way {
-        Way::Winograd => winograd_weights::groups(&plan, units, parts.len(), JOBS),
+        Way::Winograd(_) => winograd_weights::groups(&plan, units, parts.len(), JOBS),
         _ => JOBS.div_ceil(parts.len()).min(units),
     };
     let sums: Vec<Vec<f32>> = (0..parts.len() * groups)
@@ -119,15 +119,14 @@ fn even(n: usize, parts: usize) -> usize {
 enum Way {
     Narrow,
     Wide,
-    Winograd,
+    Winograd(winograd::Way),
 }
 
 impl Way {
     fn of(plan: &Plan, outputs: usize) -> Self {
         match outputs {
             0..=NARROW => Self::Narrow,
-            _ if winograd::suits(plan) => Self::Winograd,
-            _ => Self::Wide,
+            _ => winograd::Way::of(plan).map_or(Self::Wide, Self::Winograd),
         }
     }
 
@@ -135,7 +134,7 @@ impl Way {
     fn pitch(self, outputs: usize) -> usize {
         match self {
             Self::Narrow => outputs.next_power_of_two(),
-            Self::Wide | Self::Winograd => outputs.next_multiple_of(LANES),
+            Self::Wide | Self::Winograd(_) => outputs.next_multiple_of(LANES),
         }
     }
 
@@ -149,15 +148,15 @@ impl Way {
         buffers: &mut Buffers,
     ) -> Vec<f32> {
         let mut sums = vec![0.0; work.floats()];
-        if let Self::Winograd = self {
+        if let Self::Winograd(way) = self {
             // Apart, since `Products` uses the other buffers.
             let mut own = std::mem::take(&mut buffers.products);
             let products = own.room(winograd_weights::floats(work));
             products.fill(0.0);
             for (x, dy, start) in units {
-                tier.run(Products { work, x, dy, start, buffers, products });
+                tier.run(Products { work, way, x, dy, start, buffers, products });
             }
-            tier.run(Finish { work, products, sums: &mut sums });
+            tier.run(Finish { work, way, products, sums: &mut sums });
             buffers.products = own;
             return sums;
         }

@@ -1,26 +1,20 @@
-//! 3×3 convolutions of stride 1 by F(4×4, 3×3) (Winograd 1980; Lavin and Gray 2016,
-//! section 4): 36 products for 16 outputs where the definition needs 144.
+//! 3×3 convolutions of stride 1 and 2 by the forms of [`super::forms`], two of them
+//! nested: 36 products for 16 outputs where the definition needs 144, of stride 2 81.
 //!
-//! Interpolation points 0, ±1/√2, ±√2, ∞: on noise the error is half of that of the
-//! usual 0, ±1, ±2, ∞. Lanes are tiles, in the transforms and in the products, which
-//! are 36 matrix products over channels; one block's transformed tiles stay in the
-//! second-level cache.
+//! Lanes are tiles, in the transforms and in the products, which are 36 matrix products
+//! over channels; one block's transformed tiles stay in the second-level cache.
 
 use super::Buffers;
-use super::plan::{Axes, Layout, Plan, pack};
+use super::forms::{Down, Form, GROUPS, Places, TILE, Unit, Up, WEIGHTS};
+use super::plan::{Axes, Layout, Plan, Sizes, pack};
 use super::shift::{Block, ROWS, Strip, blocks};
 use crate::cpu::disjoint::Disjoint;
 use crate::cpu::fresh;
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
 use rayon::prelude::*;
-use std::f32::consts::{FRAC_1_SQRT_2, SQRT_2};
+use std::marker::PhantomData;
 use std::mem::MaybeUninit;
 
-/// Outputs of a tile along an axis, and inputs that they read.
-pub(super) const TILE: usize = 4;
-pub(super) const PATCH: usize = 6;
-/// Products of a tile.
-pub(super) const POINTS: usize = PATCH * PATCH;
 /// Most vectors of tiles at once.
 const VECTORS: usize = 3;
 /// Floats of the transformed tiles of a block, unless one vector needs more.
@@ -29,21 +23,60 @@ const FLOATS: usize = 300_000;
 const CHANNELS: usize = 24;
 const TILES: usize = 48;
 /// Floats past a packed patch's end that may be read and not used.
-const SLACK: usize = LANES;
+pub(super) const SLACK: usize = 2 * LANES;
 
-/// Whether `plan` can be, and had better be, run here.
-pub(crate) fn suits(plan: &Plan) -> bool {
-    let [_, height, width] = plan.dst_size;
-    let plain = plan.passes.len() == 1 && plan.planes.len() == 1 && plan.src_step == [1; 3];
-    plain
-        && plan.kernel_taps == 9
-        && plan.span == [0, 2, 2]
-        && plan.src_channels.min(plan.dst_channels) >= CHANNELS
-        && plan.dst_size[0] * height.div_ceil(TILE) * width.div_ceil(TILE) >= TILES
+/// What the algorithm does for a plan.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Way {
+    /// Stride 1.
+    Unit,
+    /// Stride 2.
+    Down,
+    /// The gradient of that.
+    Up,
+}
+
+impl Way {
+    /// Which it is, if `plan` can be, and had better be, run here.
+    pub fn of(plan: &Plan) -> Option<Self> {
+        let (whole, halves) = ([1; 3], [1, 2, 2]);
+        let parts = (plan.passes.len(), plan.planes.len());
+        // Taps of nine places and such a span are those of 3×3.
+        let way = match (plan.span, parts) {
+            ([0, 2, 2], (1, 1)) if [plan.src_step, plan.dst_step] == [whole; 2] => Self::Unit,
+            ([0, 1, 1], (1, 4)) if [plan.src_step, plan.dst_step] == [halves, whole] => Self::Down,
+            ([0, 1, 1], (4, 1))
+                if [plan.src_step, plan.dst_step] == [whole, halves] && plan.origin == [0; 3] =>
+            {
+                Self::Up
+            }
+            _ => return None,
+        };
+        let [depth, height, width] = plan.grid();
+        let wins = plan.src_channels.min(plan.dst_channels) >= CHANNELS
+            && depth * height.div_ceil(TILE) * width.div_ceil(TILE) >= TILES;
+        (plan.kernel_taps == 9 && wins).then_some(way)
+    }
+
+    /// How the tiles of `plan` are read: every place between the first and the last.
+    pub fn reader(self, plan: &Plan) -> Plan {
+        if self != Self::Down {
+            return plan.clone();
+        }
+        // A kernel of two places reaches one place beyond its tile.
+        Plan::forward(&Sizes {
+            in_channels: plan.src_channels,
+            out_channels: plan.dst_channels,
+            kernel: [1, 2, 2],
+            stride: [1; 3],
+            padding: plan.before(),
+            size: plan.src_size,
+        })
+    }
 }
 
 /// Transformed weights: for each block of output channels
-/// `[point][source channel][channel of the block]`.
+/// `[group][source channel][channel of the block]`.
 #[derive(Clone, Debug)]
 pub(crate) struct Weights {
     data: Vec<f32>,
@@ -52,13 +85,13 @@ pub(crate) struct Weights {
 
 impl Weights {
     /// Of `w` as the caller stores them, in the memory of `data`.
-    pub fn new(tier: Tier, plan: &Plan, w: &[f32], mut data: Vec<f32>) -> Self {
+    pub fn new(tier: Tier, plan: &Plan, way: Way, w: &[f32], mut data: Vec<f32>) -> Self {
         let blocks = blocks(plan.dst_channels);
-        let depth = plan.src_channels * POINTS;
+        let depth = plan.src_channels * GROUPS;
         data.resize(blocks.iter().map(|b| b.pitch * depth).sum(), 0.0);
         data.par_chunks_mut(ROWS * depth)
             .zip(&blocks)
-            .for_each(|(panel, block)| tier.run(Transform { plan, w, block, panel }));
+            .for_each(|(panel, block)| tier.run(Transform { plan, way, w, block, panel }));
         Self { data, blocks }
     }
 
@@ -71,6 +104,7 @@ impl Weights {
 /// G·g·Gᵀ of the weights of one block.
 struct Transform<'a> {
     plan: &'a Plan,
+    way: Way,
     w: &'a [f32],
     block: &'a Block,
     panel: &'a mut [f32],
@@ -81,10 +115,24 @@ impl Kernel for Transform<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, _: S) {
-        let Self { plan, w, block, panel } = self;
+        match self.way {
+            Way::Unit => self.with::<Unit, 6, 6, 4>(),
+            Way::Down => self.with::<Down, 9, 9, 4>(),
+            Way::Up => self.with::<Up, 5, 9, 8>(),
+        }
+    }
+}
+
+impl Transform<'_> {
+    #[inline(always)]
+    fn with<F, const IN: usize, const POINTS: usize, const OUT: usize>(self)
+    where
+        F: Form<IN, POINTS, OUT>,
+    {
+        let Self { plan, w, block, panel, .. } = self;
         let channels = plan.src_channels;
         for src in 0..channels {
-            // By place in the patch, channels of the block innermost.
+            // By place in what a tile reads, channels of the block innermost.
             let mut g = [[[0.0; ROWS]; 3]; 3];
             for m in 0..block.rows {
                 let dst = block.first + m;
@@ -93,74 +141,27 @@ impl Kernel for Transform<'_> {
                     false => dst * channels + src,
                 };
                 let taps = &w[row * 9..][..9];
-                for tap in &plan.passes[0].taps {
-                    let [_, y, x] = tap.shift;
-                    g[y][x][m] = taps[tap.kernel];
+                for tap in 0..9 {
+                    // A gradient reads backwards.
+                    let place = if plan.transposed { 8 - tap } else { tap };
+                    g[place / 3][place % 3][m] = taps[tap];
                 }
             }
-            let mut half = [[[0.0; ROWS]; 3]; PATCH];
+            let mut half = [[[0.0; ROWS]; 3]; WEIGHTS];
             for x in 0..3 {
-                let column = weights_1d([g[0][x], g[1][x], g[2][x]]);
-                for i in 0..PATCH {
+                let column = F::weights([g[0][x], g[1][x], g[2][x]]);
+                for i in 0..WEIGHTS {
                     half[i][x] = column[i];
                 }
             }
-            for i in 0..PATCH {
-                for (j, point) in weights_1d(half[i]).into_iter().enumerate() {
-                    let at = ((i * PATCH + j) * channels + src) * block.pitch;
-                    panel[at..at + block.pitch].copy_from_slice(&point[..block.pitch]);
+            for i in 0..WEIGHTS {
+                for (j, weight) in F::weights(half[i]).into_iter().enumerate() {
+                    let at = ((i * WEIGHTS + j) * channels + src) * block.pitch;
+                    panel[at..at + block.pitch].copy_from_slice(&weight[..block.pitch]);
                 }
             }
         }
     }
-}
-
-/// G: value at each point of the polynomial with these coefficients, over the product
-/// of the point's distances to the others.
-#[inline(always)]
-fn weights_1d(g: [[f32; ROWS]; 3]) -> [[f32; ROWS]; PATCH] {
-    let mut out = [[0.0; ROWS]; PATCH];
-    for m in 0..ROWS {
-        let [g0, g1, g2] = [g[0][m], g[1][m], g[2][m]];
-        // 2·½·(½ − 2) = −3/2 and 2·2·(2 − ½) = 6.
-        let (even, odd) = ((g0 + 0.5 * g2) * (-2.0 / 3.0), g1 * (-2.0 / 3.0 * FRAC_1_SQRT_2));
-        (out[1][m], out[2][m]) = (even + odd, even - odd);
-        let (even, odd) = ((g0 + 2.0 * g2) * (1.0 / 6.0), g1 * (1.0 / 6.0 * SQRT_2));
-        (out[3][m], out[4][m]) = (even + odd, even - odd);
-        (out[0][m], out[5][m]) = (g0, g2);
-    }
-    out
-}
-
-/// Bᵀ along one axis.
-#[inline(always)]
-fn patch_1d<S: Simd>(s: S, x: [S::F; PATCH]) -> [S::F; PATCH] {
-    let (half, two) = (s.splat(0.5), s.splat(2.0));
-    let both = s.splat(2.5);
-    let first = s.fnma(both, x[2], x[0] + x[4]);
-    let last = s.fnma(both, x[3], x[1] + x[5]);
-    let (even, odd) = (s.fnma(two, x[2], x[4]), s.fnma(two, x[1], x[3]));
-    let root = s.splat(FRAC_1_SQRT_2);
-    let (a, b) = (s.fma(root, odd, even), s.fnma(root, odd, even));
-    let (even, odd) = (s.fnma(half, x[2], x[4]), s.fnma(half, x[1], x[3]));
-    let root = s.splat(SQRT_2);
-    [first, a, b, s.fma(root, odd, even), s.fnma(root, odd, even), last]
-}
-
-/// Aᵀ along one axis.
-#[inline(always)]
-fn outputs_1d<S: Simd>(s: S, y: [S::F; PATCH]) -> [S::F; TILE] {
-    let (near, far) = (y[1] + y[2], y[3] + y[4]);
-    let (near_odd, far_odd) = (y[1] - y[2], y[3] - y[4]);
-    let near_odd = near_odd * s.splat(FRAC_1_SQRT_2);
-    let far_odd = far_odd * s.splat(SQRT_2);
-    let (half, two) = (s.splat(0.5), s.splat(2.0));
-    [
-        y[0] + near + far,
-        near_odd + far_odd,
-        s.fma(half, near, two * far),
-        s.fma(half, near_odd, s.fma(two, far_odd, y[5])),
-    ]
 }
 
 /// Runs `plan` on pictures `x` into `y`, which is overwritten; `bias` is empty or one
@@ -168,103 +169,136 @@ fn outputs_1d<S: Simd>(s: S, y: [S::F; PATCH]) -> [S::F; TILE] {
 pub(crate) fn run(
     tier: Tier,
     plan: &Plan,
+    way: Way,
     x: &[f32],
     w: &Weights,
     bias: &[f32],
     y: &mut fresh::Block<f32>,
 ) {
-    let src: usize = plan.src_size.iter().product();
-    let [depth, height, width] = plan.dst_size;
-    let images = y.len() / (plan.dst_channels * depth * height * width);
-    // Tiles of a block: rows of at most 16.
-    let vectors = (FLOATS / (POINTS * LANES * plan.src_channels)).clamp(1, VECTORS);
-    let across = width.div_ceil(TILE).min(LANES);
-    let down = (vectors * LANES / across).clamp(1, height.div_ceil(TILE));
-    let layout = plan.layout([1, down * TILE, across * TILE]);
-    let starts = super::plan::starts(plan.grid(), layout.tile);
-    let y = Disjoint::new(y);
-    (0..images * starts.len()).into_par_iter().for_each(|job| {
-        let (image, start) = (job / starts.len(), starts[job % starts.len()]);
-        let x = &x[image * plan.src_channels * src..][..plan.src_channels * src];
-        Buffers::with(|buffers| {
-            tier.run(Job { plan, layout, x, w, bias, image, start, buffers, y: &y });
-        });
-    });
+    let call = Call { tier, plan, reader: way.reader(plan), x, w, bias };
+    match way {
+        Way::Unit => call.run::<Unit, 6, 6, 4>(y),
+        Way::Down => call.run::<Down, 9, 9, 4>(y),
+        Way::Up => call.run::<Up, 5, 9, 8>(y),
+    }
 }
 
-/// A block of tiles, all channels.
-struct Job<'a> {
+/// What all blocks of tiles have in common.
+struct Call<'a> {
+    tier: Tier,
     plan: &'a Plan,
-    layout: Layout,
+    reader: Plan,
     x: &'a [f32],
     w: &'a Weights,
     bias: &'a [f32],
+}
+
+impl Call<'_> {
+    fn run<F, const IN: usize, const POINTS: usize, const OUT: usize>(
+        &self,
+        y: &mut fresh::Block<f32>,
+    ) where
+        F: Form<IN, POINTS, OUT>,
+    {
+        let plan = self.plan;
+        let dst: usize = plan.dst_size.iter().product();
+        let images = y.len() / (plan.dst_channels * dst);
+        let [_, height, width] = plan.grid();
+        // Tiles of a block: rows of at most 16.
+        let vectors = FLOATS / (POINTS * POINTS * LANES * plan.src_channels);
+        let across = width.div_ceil(TILE).min(LANES);
+        let down = (vectors.clamp(1, VECTORS) * LANES / across).clamp(1, height.div_ceil(TILE));
+        let layout = self.reader.layout([1, down * F::READ, across * F::READ]);
+        let starts = super::plan::starts(plan.grid(), [1, down * TILE, across * TILE]);
+        let y = Disjoint::new(y);
+        (0..images * starts.len()).into_par_iter().for_each(|job| {
+            let (image, start) = (job / starts.len(), starts[job % starts.len()]);
+            Buffers::with(|buffers| {
+                let tiles = [down, across];
+                let form = PhantomData::<F>;
+                let job = Job { call: self, layout, tiles, image, start, buffers, y: &y, form };
+                self.tier.run::<Job<'_, F, IN, POINTS, OUT>>(job);
+            });
+        });
+    }
+}
+
+/// A block of tiles, all channels.
+struct Job<'a, F, const IN: usize, const POINTS: usize, const OUT: usize> {
+    call: &'a Call<'a>,
+    layout: Layout,
+    /// Rows and columns of tiles of a whole block.
+    tiles: [usize; 2],
     image: usize,
+    /// Grid position.
     start: Axes,
     buffers: &'a mut Buffers,
     y: &'a Disjoint<'a, MaybeUninit<f32>>,
+    form: PhantomData<F>,
 }
 
-impl Kernel for Job<'_> {
+impl<F, const IN: usize, const POINTS: usize, const OUT: usize> Kernel
+    for Job<'_, F, IN, POINTS, OUT>
+where
+    F: Form<IN, POINTS, OUT>,
+{
     type Output = ();
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let (plan, layout) = (self.plan, self.layout);
+        let Call { plan, ref reader, x, w, bias, .. } = *self.call;
+        let (layout, grid) = (self.layout, plan.grid());
         let Buffers { x: patch, tiles, products, .. } = self.buffers;
-        let inside = |a: usize| layout.tile[a].min(plan.dst_size[a] - self.start[a]);
-        let [down, across] = [inside(1), inside(2)].map(|n| n.div_ceil(TILE));
-        let length = (down * across).next_multiple_of(LANES);
-        // `tiles` is [point][channel][tile], `products` [point][channel of a block][tile].
-        // Off a power of two, lest all points share one cache set.
-        let point = plan.src_channels * length + LANES;
+        let inside = |a: usize| self.tiles[a - 1].min((grid[a] - self.start[a]).div_ceil(TILE));
+        let [down, across] = [inside(1), inside(2)];
+        let block = Tiles { count: down * across, across };
+        let length = block.count.next_multiple_of(LANES);
+        let places = block.places(layout.pitch(), F::READ);
+        // Off a power of two, lest all groups share one cache set.
+        let sources = Places::new(POINTS, plan.src_channels, length, LANES);
+        let sums = Places::new(POINTS, ROWS, length, 0);
         let patch = patch.room(layout.channel + SLACK);
-        let tiles = tiles.room(POINTS * point);
-        let products = products.room(POINTS * ROWS * length);
+        let tiles = tiles.room(sources.floats);
+        let products = products.room(sums.floats);
         let pixels: usize = plan.src_size.iter().product();
-        for (c, x) in self.x.chunks_exact(pixels).enumerate() {
-            pack(plan, &layout, x, self.start, &mut patch[..layout.channel]);
-            for first in (0..length).step_by(LANES) {
-                let mut at = [0; LANES];
-                for i in 0..LANES {
-                    let t = (first + i).min(down * across - 1);
-                    at[i] = (t / across * layout.pitch() + t % across) * TILE;
-                }
-                let points = transform(s, patch, &at, layout.pitch());
-                for i in 0..POINTS {
-                    let to = &mut tiles[i * point + c * length + first..];
-                    if let Some(to) = to.first_chunk_mut() {
-                        s.store(points[i], to);
-                    }
-                }
+        let channels = plan.src_channels;
+        let [depth, top, left] = self.start;
+        let from = [depth, top * F::READ / TILE, left * F::READ / TILE];
+        let picture = &x[self.image * channels * pixels..][..channels * pixels];
+        for (c, x) in picture.chunks_exact(pixels).enumerate() {
+            pack(reader, &layout, x, from, &mut patch[..layout.channel]);
+            for (v, places) in places.iter().enumerate() {
+                let points = transform::<S, F, IN, POINTS, OUT>(s, patch, places, layout.pitch());
+                scatter(s, &points, tiles, &sources, [c, v * LANES]);
             }
         }
-        let depth = plan.src_channels * POINTS;
-        for (index, block) in self.w.blocks.iter().enumerate() {
-            let panel = &self.w.data[index * ROWS * depth..][..block.pitch * depth];
-            for (i, w) in panel.chunks_exact(block.pitch * plan.src_channels).enumerate() {
+        let weights = channels * GROUPS;
+        for (index, part) in w.blocks.iter().enumerate() {
+            let panel = &w.data[index * ROWS * weights..][..part.pitch * weights];
+            for (i, w) in panel.chunks_exact(part.pitch * channels).enumerate() {
+                let ((at, length), (to, _)) = (sources.groups[i], sums.groups[i]);
                 let strip = Strip {
-                    x: &tiles[i * point..][..plan.src_channels * length],
+                    x: &tiles[at..][..channels * length],
                     channel: length,
-                    channels: plan.src_channels,
+                    channels,
                     offsets: &[0],
                     w,
                     bias: [0.0; ROWS],
                     length,
                 };
-                strip.run(s, block.pitch, &mut products[i * ROWS * length..][..ROWS * length]);
+                strip.run(s, part.pitch, &mut products[to..][..ROWS * length]);
             }
-            for m in 0..block.rows {
-                let channel = block.first + m;
-                let bias = self.bias.get(channel).copied().unwrap_or(0.0);
+            for m in 0..part.rows {
+                let channel = part.first + m;
+                let bias = bias.get(channel).copied().unwrap_or(0.0);
+                let plane = (self.image * plan.dst_channels + channel) * plan.dst_size[0] + depth;
                 for first in (0..length).step_by(LANES) {
-                    let mut out = [[0.0; LANES]; LANES];
-                    outputs(s, &products[m * length + first..], ROWS * length, bias, &mut out);
-                    let count = LANES.min(down * across - first);
-                    for (i, out) in out.iter().enumerate().take(count) {
-                        let t = first + i;
-                        let place = [t / across, t % across].map(|v| v * TILE);
-                        write(plan, self.y, self.image, channel, self.start, place, out);
+                    let rows = columns::<S, F, IN, POINTS, OUT>(s, products, &sums, [m, first]);
+                    let corner = [top, left].map(|v| v * OUT / TILE);
+                    let to = Outputs { y: self.y, plane, size: plan.dst_size, corner, block };
+                    for (r, row) in rows.into_iter().enumerate() {
+                        let row = F::outputs(s, row);
+                        to.write(s, row.map(|v| v + s.splat(bias)), [first, r]);
                     }
                 }
             }
@@ -272,98 +306,235 @@ impl Kernel for Job<'_> {
     }
 }
 
-/// Transformed patches at sixteen places of a packed channel.
-#[inline(always)]
-pub(super) fn transform<S: Simd>(
-    s: S,
-    x: &[f32],
-    at: &[usize; LANES],
-    pitch: usize,
-) -> [S::F; POINTS] {
-    let mut points = [s.splat(0.0); POINTS];
-    for r in 0..PATCH {
-        let [a, b, c, d] = s.load4(x, at, r * pitch);
-        let [e, f, _, _] = s.load4(x, at, r * pitch + TILE);
-        let row = patch_1d(s, [a, b, c, d, e, f]);
-        for j in 0..PATCH {
-            points[r * PATCH + j] = row[j];
-        }
-    }
-    for j in 0..PATCH {
-        let mut column = [s.splat(0.0); PATCH];
-        for i in 0..PATCH {
-            column[i] = points[i * PATCH + j];
-        }
-        let column = patch_1d(s, column);
-        for i in 0..PATCH {
-            points[i * PATCH + j] = column[i];
-        }
-    }
-    points
+/// The tiles of a block, row by row.
+#[derive(Clone, Copy)]
+pub(super) struct Tiles {
+    pub count: usize,
+    /// Tiles of a row.
+    pub across: usize,
 }
 
-/// Sixteen tiles of 4×4 outputs from their products, which lie `pitch` apart.
-#[inline(always)]
-fn outputs<S: Simd>(
-    s: S,
-    products: &[f32],
-    pitch: usize,
-    bias: f32,
-    out: &mut [[f32; LANES]; LANES],
-) {
-    let mut rows = [[s.splat(0.0); PATCH]; TILE];
-    for j in 0..PATCH {
-        let mut column = [s.splat(0.0); PATCH];
-        for i in 0..PATCH {
-            if let Some(v) = products[(i * PATCH + j) * pitch..].first_chunk() {
-                column[i] = s.load(v);
+impl Tiles {
+    /// Where each vector of tiles begins in a packed channel, `read` places from tile to
+    /// tile. Lanes beyond the last tile repeat earlier ones.
+    pub fn places(self, pitch: usize, read: usize) -> Vec<Lanes> {
+        let group = LANES / read;
+        let place = |t: usize| {
+            let last = self.count.saturating_sub(group) + t % group;
+            let t = if t < self.count { t } else { last.min(self.count - 1) };
+            (t / self.across * pitch + t % self.across) * read
+        };
+        let vector = |first: usize| {
+            let at: [usize; LANES] = std::array::from_fn(|i| place(first + i));
+            let joined = (0..LANES).all(|i| at[i] == at[i / group * group] + i % group * read);
+            Lanes { at, joined }
+        };
+        (0..self.count).step_by(LANES).map(vector).collect()
+    }
+}
+
+/// Sixteen tiles in a packed channel.
+pub(super) struct Lanes {
+    at: [usize; LANES],
+    /// Whether those whose places make whole vectors lie one behind the other.
+    joined: bool,
+}
+
+impl Lanes {
+    /// One row of the tiles, `offset` behind their first; `READ` as the form's.
+    #[inline(always)]
+    fn row<S: Simd, const IN: usize>(
+        &self,
+        s: S,
+        x: &[f32],
+        offset: usize,
+        read: usize,
+    ) -> [S::F; IN] {
+        let mut row = [s.splat(0.0); IN];
+        if self.joined && read == 8 {
+            for first in (0..IN).step_by(8) {
+                let mut v = [s.splat(0.0); 8];
+                for k in 0..8 {
+                    if let Some(x) = x[self.at[2 * k] + offset + first..].first_chunk() {
+                        v[k] = s.load(x);
+                    }
+                }
+                for (to, v) in row[first..].iter_mut().zip(s.columns8(v)) {
+                    *to = v;
+                }
+            }
+        } else if self.joined {
+            for first in (0..IN).step_by(4) {
+                let mut v = [s.splat(0.0); 4];
+                for k in 0..4 {
+                    if let Some(x) = x[self.at[4 * k] + offset + first..].first_chunk() {
+                        v[k] = s.load(x);
+                    }
+                }
+                for (to, v) in row[first..].iter_mut().zip(s.columns4(v)) {
+                    *to = v;
+                }
+            }
+        } else {
+            for first in (0..IN).step_by(4) {
+                let four = s.load4(x, &self.at, offset + first);
+                for (to, v) in row[first..].iter_mut().zip(four) {
+                    *to = v;
+                }
             }
         }
-        let column = outputs_1d(s, column);
-        for i in 0..TILE {
+        row
+    }
+}
+
+/// Transformed tiles of a packed channel.
+#[inline(always)]
+pub(super) fn transform<S, F, const IN: usize, const POINTS: usize, const OUT: usize>(
+    s: S,
+    x: &[f32],
+    lanes: &Lanes,
+    pitch: usize,
+) -> [[S::F; POINTS]; POINTS]
+where
+    S: Simd,
+    F: Form<IN, POINTS, OUT>,
+{
+    let mut rows = [[s.splat(0.0); POINTS]; IN];
+    for r in 0..IN {
+        rows[r] = F::points(s, lanes.row(s, x, r * pitch, F::READ));
+    }
+    let mut out = [[s.splat(0.0); POINTS]; POINTS];
+    for j in 0..POINTS {
+        let mut column = [s.splat(0.0); IN];
+        for i in 0..IN {
+            column[i] = rows[i][j];
+        }
+        let column = F::points(s, column);
+        for i in 0..POINTS {
+            out[i][j] = column[i];
+        }
+    }
+    out
+}
+
+/// Writes a vector of transformed tiles, from tile `first` of channel `c` on.
+#[inline(always)]
+pub(super) fn scatter<S: Simd, const POINTS: usize>(
+    s: S,
+    points: &[[S::F; POINTS]; POINTS],
+    tiles: &mut [f32],
+    places: &Places,
+    [c, first]: [usize; 2],
+) {
+    for i in 0..POINTS {
+        for j in 0..POINTS {
+            let p = i * POINTS + j;
+            let to = &mut tiles[places.at[p] + c * places.step[p] + first..];
+            if let Some(to) = to.first_chunk_mut() {
+                s.store(points[i][j], to);
+            }
+        }
+    }
+}
+
+/// Rows of outputs of sixteen tiles, not yet transformed along themselves.
+#[inline(always)]
+fn columns<S, F, const IN: usize, const POINTS: usize, const OUT: usize>(
+    s: S,
+    products: &[f32],
+    places: &Places,
+    [m, first]: [usize; 2],
+) -> [[S::F; POINTS]; OUT]
+where
+    S: Simd,
+    F: Form<IN, POINTS, OUT>,
+{
+    let mut rows = [[s.splat(0.0); POINTS]; OUT];
+    for j in 0..POINTS {
+        let mut column = [s.splat(0.0); POINTS];
+        for i in 0..POINTS {
+            let p = i * POINTS + j;
+            let from = &products[places.at[p] + m * places.step[p] + first..];
+            if let Some(from) = from.first_chunk() {
+                column[i] = s.load(from);
+            }
+        }
+        let column = F::outputs(s, column);
+        for i in 0..OUT {
             rows[i][j] = column[i];
         }
     }
-    let bias = s.splat(bias);
-    let mut tiles = [s.splat(0.0); LANES];
-    for i in 0..TILE {
-        let row = outputs_1d(s, rows[i]);
-        for j in 0..TILE {
-            tiles[i * TILE + j] = row[j] + bias;
-        }
-    }
-    let tiles = s.transpose(tiles);
-    for i in 0..LANES {
-        s.store(tiles[i], &mut out[i]);
-    }
+    rows
 }
 
-/// Copies one tile, `place` pixels from the block's corner `start`, to y; what lies
-/// beyond its border is dropped.
-#[inline(always)]
-fn write(
-    plan: &Plan,
-    y: &Disjoint<'_, MaybeUninit<f32>>,
-    image: usize,
-    channel: usize,
-    start: Axes,
-    place: [usize; 2],
-    tile: &[f32; LANES],
-) {
-    let [depth, height, width] = plan.dst_size;
-    let (top, left) = (start[1] + place[0], start[2] + place[1]);
-    let plane = ((image * plan.dst_channels + channel) * depth + start[0]) * height;
-    for (r, row) in tile.as_chunks::<TILE>().0.iter().enumerate() {
-        if top + r >= height || left >= width {
-            break;
+/// Where a block's outputs go.
+struct Outputs<'a> {
+    y: &'a Disjoint<'a, MaybeUninit<f32>>,
+    /// Slice of y, over pictures, channels and depths.
+    plane: usize,
+    size: Axes,
+    /// Row and column of the first.
+    corner: [usize; 2],
+    block: Tiles,
+}
+
+impl Outputs<'_> {
+    /// Writes row `r` of sixteen tiles from `first` on; what lies beyond the border is
+    /// dropped.
+    #[inline(always)]
+    fn write<S: Simd, const OUT: usize>(&self, s: S, v: [S::F; OUT], [first, r]: [usize; 2]) {
+        let mut rows = [[0.0; LANES]; OUT];
+        match OUT {
+            8 => {
+                let mut eight = [v[0]; 8];
+                eight.iter_mut().zip(v).for_each(|(to, v)| *to = v);
+                let eight = s.rows8(eight);
+                for k in 0..OUT {
+                    s.store(eight[k], &mut rows[k]);
+                }
+            }
+            _ => {
+                let mut four = [v[0]; 4];
+                four.iter_mut().zip(v).for_each(|(to, v)| *to = v);
+                let four = s.rows4(four);
+                for k in 0..OUT {
+                    s.store(four[k], &mut rows[k]);
+                }
+            }
         }
-        let at = (plane + top + r) * width + left;
-        let columns = TILE.min(width - left);
-        // SAFETY: no two jobs, and no two tiles of a job, hold the same outputs.
-        let to = unsafe { y.part(at..at + columns) };
-        match to.first_chunk_mut::<TILE>() {
-            Some(to) => *to = row.map(MaybeUninit::new),
-            None => to.iter_mut().zip(row).for_each(|(to, v)| *to = MaybeUninit::new(*v)),
+        let [_, height, width] = self.size;
+        let Tiles { count, across } = self.block;
+        let group = LANES / OUT;
+        for k in 0..OUT {
+            let t = first + k * group;
+            let row = self.corner[0] + t / across * OUT + r;
+            let column = self.corner[1] + t % across * OUT;
+            // Tiles of one row, none of them cut.
+            if t + group <= count
+                && t % across + group <= across
+                && row < height
+                && column + LANES <= width
+            {
+                let at = (self.plane * height + row) * width + column;
+                // SAFETY: no two jobs, and no two tiles of a job, hold the same outputs.
+                let to = unsafe { self.y.part(at..at + LANES) };
+                if let Some(to) = to.first_chunk_mut() {
+                    *to = rows[k].map(MaybeUninit::new);
+                }
+                continue;
+            }
+            for (i, tile) in rows[k].as_chunks::<OUT>().0.iter().enumerate() {
+                let t = t + i;
+                let row = self.corner[0] + t / across * OUT + r;
+                let column = self.corner[1] + t % across * OUT;
+                if t >= count || row >= height || column >= width {
+                    continue;
+                }
+                let at = (self.plane * height + row) * width + column;
+                // SAFETY: as above.
+                let to = unsafe { self.y.part(at..at + OUT.min(width - column)) };
+                to.iter_mut().zip(tile).for_each(|(to, v)| *to = MaybeUninit::new(*v));
+            }
         }
     }
 }

@@ -1,24 +1,21 @@
-//! ∂L/∂w of 3×3 convolutions of stride 1 by the adjoint of F(4×4, 3×3): 36 products
-//! for each pair of channels and tile where the definition needs 144.
+//! ∂L/∂w of 3×3 convolutions of stride 1 and 2 by the adjoint of [`super::winograd`]: as
+//! many products for each pair of channels and tile as there.
 //!
-//! With V = Bᵀ·x·B (lanes are tiles, as in [`super::winograd`]) and Z = A·∂y·Aᵀ (lanes
-//! are output channels), ∂w = Gᵀ·(Σ over tiles of V⊙Z)·G.
+//! With V = Bᵀ·x·B (lanes are tiles, as there) and Z = A·∂y·Aᵀ (lanes are output
+//! channels), ∂w = Gᵀ·(Σ over tiles of V⊙Z)·G.
 
 use super::Buffers;
-use super::plan::{Axes, Plan, pack};
+use super::forms::{Adjoint, Down, Form, GROUPS, Places, TILE, Unit, WEIGHTS};
+use super::plan::{Axes, Layout, Plan, pack};
 use super::weights::{LANES_WIDE, ROWS, Tile, Work, turn};
-use super::winograd::{PATCH, POINTS, TILE, transform};
+use super::winograd::{SLACK, Tiles, Way, scatter, transform};
 use crate::cpu::simd::{Kernel, LANES, Simd};
-use std::f32::consts::{FRAC_1_SQRT_2, SQRT_2};
 use std::ops::Range;
 
 /// Input channels of a job.
 pub(super) const CHANNELS: usize = 64;
 /// Vectors of tiles at once.
 const VECTORS: usize = 4;
-/// Floats past a packed patch's end that may be read and not used.
-const SLACK: usize = LANES;
-
 /// Outputs whose tiles make one block, for `plan`.
 pub(super) fn tile(plan: &Plan) -> Axes {
     let [_, height, width] = plan.dst_size.map(|n| n.div_ceil(TILE));
@@ -45,15 +42,16 @@ fn blocks(outputs: &Range<usize>) -> Vec<Range<usize>> {
 }
 
 /// Floats of a job's sums of products: for each block of output channels
-/// `[point][channel][output]`.
+/// `[group][channel][output]`.
 pub(super) fn floats(work: &Work<'_>) -> usize {
     let channels = (work.rows / 9).next_multiple_of(ROWS);
-    blocks(&work.outputs).iter().map(|b| POINTS * channels * b.len().next_multiple_of(LANES)).sum()
+    blocks(&work.outputs).iter().map(|b| GROUPS * channels * b.len().next_multiple_of(LANES)).sum()
 }
 
 /// Adds one block of tiles to `products`.
 pub(super) struct Products<'a, 'b> {
     pub work: &'a Work<'b>,
+    pub way: Way,
     /// The job's channels of one picture.
     pub x: &'a [f32],
     pub dy: &'a [f32],
@@ -67,41 +65,53 @@ impl Kernel for Products<'_, '_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let (work, layout) = (self.work, self.work.layout);
+        match self.way {
+            Way::Down => self.with::<S, Down, 9, 9>(s),
+            _ => self.with::<S, Unit, 6, 6>(s),
+        }
+    }
+}
+
+impl Products<'_, '_> {
+    #[inline(always)]
+    fn with<S, F, const IN: usize, const POINTS: usize>(self, s: S)
+    where
+        S: Simd,
+        F: Form<IN, POINTS, TILE> + Adjoint<POINTS>,
+    {
+        let work = self.work;
+        let reader = self.way.reader(work.plan);
+        let [_, height, width] = work.layout.tile;
+        let layout: Layout = reader.layout([1, height * F::READ / TILE, width * F::READ / TILE]);
         let inside = work.inside(self.start);
         let [_, down, across] = inside.map(|n| n.div_ceil(TILE));
         let (count, channels) = (down * across, work.rows / 9);
         let length = count.next_multiple_of(LANES);
-        let point = channels * length + LANES;
+        let places = Tiles { count, across }.places(layout.pitch(), F::READ);
+        let sources = Places::new(POINTS, channels, length, LANES);
         let Buffers { x: patch, y: turned, tiles, gradients, .. } = self.buffers;
         let patch = patch.room(layout.channel + SLACK);
-        let tiles = tiles.room(POINTS * point);
+        let tiles = tiles.room(sources.floats);
         let pixels: usize = work.plan.src_size.iter().product();
+        let [depth, top, left] = self.start;
+        let from = [depth, top * F::READ / TILE, left * F::READ / TILE];
         for (c, x) in self.x.chunks_exact(pixels).enumerate() {
-            pack(work.plan, &layout, x, self.start, &mut patch[..layout.channel]);
-            for first in (0..length).step_by(LANES) {
-                let mut at = [0; LANES];
-                for i in 0..LANES {
-                    let t = (first + i).min(count - 1);
-                    at[i] = (t / across * layout.pitch() + t % across) * TILE;
-                }
-                let points = transform(s, patch, &at, layout.pitch());
-                for i in 0..POINTS {
-                    let to = &mut tiles[i * point + c * length + first..];
-                    if let Some(to) = to.first_chunk_mut() {
-                        s.store(points[i], to);
-                    }
-                }
+            pack(&reader, &layout, x, from, &mut patch[..layout.channel]);
+            for (v, places) in places.iter().enumerate() {
+                let points = transform::<S, F, IN, POINTS, TILE>(s, patch, places, layout.pitch());
+                scatter(s, &points, tiles, &sources, [c, v * LANES]);
             }
         }
         let mut products = self.products;
         let rows = channels.next_multiple_of(ROWS);
         for outputs in blocks(&work.outputs) {
             let pitch = outputs.len().next_multiple_of(LANES);
-            let (own, rest) = products.split_at_mut(POINTS * rows * pitch);
+            let (own, rest) = products.split_at_mut(GROUPS * rows * pitch);
             products = rest;
             let part = Work { outputs, pitch, ..*work };
-            let gradients = gradients.room(POINTS * count * pitch);
+            // One row of tiles after the other, each `pitch` gradients.
+            let outward = Places::new(POINTS, 1, count * pitch, 0);
+            let gradients = gradients.room(outward.floats);
             let turned = turned.room(TILE * across * TILE * pitch);
             for row in 0..down {
                 if inside[1] - row * TILE < TILE || inside[2] < across * TILE {
@@ -111,22 +121,24 @@ impl Kernel for Products<'_, '_> {
                     let to = &mut turned[r * across * TILE * pitch..][..inside[2] * pitch];
                     turn(s, &part, self.dy, (self.start, 0, row * TILE + r), [1, inside[2]], to);
                 }
-                spread(s, turned, [row * across, across, count], pitch, gradients);
+                let first = row * across * pitch;
+                spread::<S, F, POINTS>(s, turned, [first, across, pitch], &outward, gradients);
             }
-            for i in 0..POINTS {
+            for i in 0..GROUPS {
+                let ((at, step), (from, floats)) = (sources.groups[i], outward.groups[i]);
                 let tile = Tile {
-                    x: &tiles[i * point..][..channels * length],
-                    x_pitch: 0,
-                    dy: &gradients[i * count * pitch..][..count * pitch],
+                    x: &tiles[at..][..channels * step],
+                    x_pitch: length,
+                    dy: &gradients[from..][..floats],
                     pitch,
-                    count: 1,
+                    count: step / length,
                     width: count,
                 };
                 let sums = own[i * rows * pitch..][..rows * pitch].chunks_exact_mut(ROWS * pitch);
                 for (group, sums) in sums.enumerate() {
                     let mut offsets = [0; ROWS];
                     for m in 0..ROWS {
-                        offsets[m] = (group * ROWS + m).min(channels - 1) * length;
+                        offsets[m] = (group * ROWS + m).min(channels - 1) * step;
                     }
                     tile.rows(s, &offsets, sums);
                 }
@@ -135,19 +147,18 @@ impl Kernel for Products<'_, '_> {
     }
 }
 
-/// Z of one row of tiles from `[4 rows][4·across][pitch]` gradients, into
-/// `[point][tile][pitch]`.
+/// Z of one row of tiles from `[4 rows][4·across][pitch]` gradients.
 #[inline(always)]
-fn spread<S: Simd>(
+fn spread<S: Simd, F: Adjoint<POINTS>, const POINTS: usize>(
     s: S,
     dy: &[f32],
-    [first, across, count]: [usize; 3],
-    pitch: usize,
+    [first, across, pitch]: [usize; 3],
+    places: &Places,
     out: &mut [f32],
 ) {
     for t in 0..across {
         for v in (0..pitch).step_by(LANES) {
-            let mut rows = [[s.splat(0.0); PATCH]; TILE];
+            let mut rows = [[s.splat(0.0); POINTS]; TILE];
             for r in 0..TILE {
                 let mut d = [s.splat(0.0); TILE];
                 for q in 0..TILE {
@@ -156,12 +167,12 @@ fn spread<S: Simd>(
                         d[q] = s.load(from);
                     }
                 }
-                rows[r] = spread_1d(s, d);
+                rows[r] = F::spread(s, d);
             }
-            for j in 0..PATCH {
-                let column = spread_1d(s, [rows[0][j], rows[1][j], rows[2][j], rows[3][j]]);
-                for i in 0..PATCH {
-                    let at = ((i * PATCH + j) * count + first + t) * pitch + v;
+            for j in 0..POINTS {
+                let column = F::spread(s, [rows[0][j], rows[1][j], rows[2][j], rows[3][j]]);
+                for i in 0..POINTS {
+                    let at = places.at[i * POINTS + j] + first + t * pitch + v;
                     if let Some(to) = out[at..].first_chunk_mut() {
                         s.store(column[i], to);
                     }
@@ -171,34 +182,10 @@ fn spread<S: Simd>(
     }
 }
 
-/// A along one axis: the polynomial with these coefficients at the six points.
-#[inline(always)]
-fn spread_1d<S: Simd>(s: S, d: [S::F; TILE]) -> [S::F; PATCH] {
-    let (half, two) = (s.splat(0.5), s.splat(2.0));
-    let (even, odd) = (s.fma(half, d[2], d[0]), s.fma(half, d[3], d[1]));
-    let root = s.splat(FRAC_1_SQRT_2);
-    let (a, b) = (s.fma(root, odd, even), s.fnma(root, odd, even));
-    let (even, odd) = (s.fma(two, d[2], d[0]), s.fma(two, d[3], d[1]));
-    let root = s.splat(SQRT_2);
-    [d[0], a, b, s.fma(root, odd, even), s.fnma(root, odd, even), d[3]]
-}
-
-/// Gᵀ along one axis.
-#[inline(always)]
-fn weights_1d<S: Simd>(s: S, q: [S::F; PATCH]) -> [S::F; 3] {
-    let (near, far) = (q[1] + q[2], q[3] + q[4]);
-    let (near_odd, far_odd) = (q[1] - q[2], q[3] - q[4]);
-    let (two_thirds, sixth, third) = (s.splat(2.0 / 3.0), s.splat(1.0 / 6.0), s.splat(1.0 / 3.0));
-    [
-        s.fma(sixth, far, s.fnma(two_thirds, near, q[0])),
-        s.fnma(s.splat(2.0 / 3.0 * FRAC_1_SQRT_2), near_odd, s.splat(1.0 / 6.0 * SQRT_2) * far_odd),
-        s.fma(third, far - near, q[5]),
-    ]
-}
-
 /// Turns a job's products into sums `[channel · 9 + tap][output]`.
 pub(super) struct Finish<'a, 'b> {
     pub work: &'a Work<'b>,
+    pub way: Way,
     pub products: &'a [f32],
     pub sums: &'a mut [f32],
 }
@@ -208,33 +195,43 @@ impl Kernel for Finish<'_, '_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
+        match self.way {
+            Way::Down => self.with::<S, Down, 9>(s),
+            _ => self.with::<S, Unit, 6>(s),
+        }
+    }
+}
+
+impl Finish<'_, '_> {
+    #[inline(always)]
+    fn with<S: Simd, F: Adjoint<POINTS>, const POINTS: usize>(self, s: S) {
         let channels = self.work.rows / 9;
         let rows = channels.next_multiple_of(ROWS);
         let total = self.work.outputs.len().next_multiple_of(LANES);
         let (mut products, mut column) = (self.products, 0);
         for outputs in blocks(&self.work.outputs) {
             let pitch = outputs.len().next_multiple_of(LANES);
-            let (own, rest) = products.split_at(POINTS * rows * pitch);
+            let (own, rest) = products.split_at(GROUPS * rows * pitch);
             products = rest;
             for c in 0..channels {
                 for v in (0..pitch).step_by(LANES) {
-                    let mut half = [[s.splat(0.0); 3]; PATCH];
-                    for i in 0..PATCH {
-                        let mut q = [s.splat(0.0); PATCH];
-                        for j in 0..PATCH {
-                            let at = ((i * PATCH + j) * rows + c) * pitch + v;
+                    let mut half = [[s.splat(0.0); 3]; WEIGHTS];
+                    for i in 0..WEIGHTS {
+                        let mut q = [s.splat(0.0); WEIGHTS];
+                        for j in 0..WEIGHTS {
+                            let at = ((i * WEIGHTS + j) * rows + c) * pitch + v;
                             if let Some(from) = own[at..].first_chunk() {
                                 q[j] = s.load(from);
                             }
                         }
-                        half[i] = weights_1d(s, q);
+                        half[i] = F::taps(s, q);
                     }
                     for x in 0..3 {
-                        let mut q = [s.splat(0.0); PATCH];
-                        for i in 0..PATCH {
+                        let mut q = [s.splat(0.0); WEIGHTS];
+                        for i in 0..WEIGHTS {
                             q[i] = half[i][x];
                         }
-                        let g = weights_1d(s, q);
+                        let g = F::taps(s, q);
                         for y in 0..3 {
                             let at = (c * 9 + y * 3 + x) * total + column + v;
                             if let Some(to) = self.sums[at..].first_chunk_mut() {

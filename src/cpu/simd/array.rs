@@ -297,6 +297,42 @@ macro_rules! tier {
                 out.map(F)
             }
             #[inline(always)]
+            fn columns4(self, v: [F; 4]) -> [F; 4] {
+                let mut out = v;
+                for i in 0..4 * LANES {
+                    out[i % 4].0[i / 4] = v[i / LANES].0[i % LANES];
+                }
+                out
+            }
+            #[inline(always)]
+            fn rows4(self, v: [F; 4]) -> [F; 4] {
+                let mut out = v;
+                for i in 0..4 * LANES {
+                    out[i / LANES].0[i % LANES] = v[i % 4].0[i / 4];
+                }
+                out
+            }
+            #[inline(always)]
+            fn split_quarters(self, a: F, b: F) -> [F; 2] {
+                let mut out = [a, b];
+                for i in 0..2 * LANES {
+                    let (quarter, place) = (i / 4, i % 4);
+                    let from = if i < LANES { a.0[i] } else { b.0[i - LANES] };
+                    out[quarter % 2].0[quarter / 2 * 4 + place] = from;
+                }
+                out
+            }
+            #[inline(always)]
+            fn join_quarters(self, even: F, odd: F) -> [F; 2] {
+                let mut out = [even, odd];
+                for i in 0..2 * LANES {
+                    let (quarter, place) = (i / 4, i % 4);
+                    let from = [even, odd][quarter % 2].0[quarter / 2 * 4 + place];
+                    out[i / LANES].0[i % LANES] = from;
+                }
+                out
+            }
+            #[inline(always)]
             fn transpose(self, v: [F; LANES]) -> [F; LANES] {
                 let mut out = v;
                 for i in 0..LANES {

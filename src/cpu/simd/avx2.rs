@@ -303,6 +303,40 @@ impl Simd for Token {
         }
     }
     #[inline(always)]
+    fn columns4(self, v: [F; 4]) -> [F; 4] {
+        unsafe {
+            let ([a, b], [c, d]) = (halves(v[0].0, v[1].0), halves(v[0].1, v[1].1));
+            let low = transpose4([a, b, c, d]);
+            let ([a, b], [c, d]) = (halves(v[2].0, v[3].0), halves(v[2].1, v[3].1));
+            let high = transpose4([a, b, c, d]);
+            [F(low[0], high[0]), F(low[1], high[1]), F(low[2], high[2]), F(low[3], high[3])]
+        }
+    }
+    #[inline(always)]
+    fn rows4(self, v: [F; 4]) -> [F; 4] {
+        unsafe {
+            let low = transpose4([v[0].0, v[1].0, v[2].0, v[3].0]);
+            let high = transpose4([v[0].1, v[1].1, v[2].1, v[3].1]);
+            let ([a, c], [b, d]) = (halves(low[0], low[1]), halves(low[2], low[3]));
+            let ([e, g], [f, h]) = (halves(high[0], high[1]), halves(high[2], high[3]));
+            [F(a, b), F(c, d), F(e, f), F(g, h)]
+        }
+    }
+    #[inline(always)]
+    fn split_quarters(self, a: F, b: F) -> [F; 2] {
+        unsafe {
+            let ([a, c], [b, d]) = (halves(a.0, a.1), halves(b.0, b.1));
+            [F(a, b), F(c, d)]
+        }
+    }
+    #[inline(always)]
+    fn join_quarters(self, even: F, odd: F) -> [F; 2] {
+        unsafe {
+            let ([a, b], [c, d]) = (halves(even.0, odd.0), halves(even.1, odd.1));
+            [F(a, b), F(c, d)]
+        }
+    }
+    #[inline(always)]
     fn transpose(self, v: [F; LANES]) -> [F; LANES] {
         unsafe {
             let mut out = v;
@@ -326,6 +360,12 @@ impl Simd for Token {
             out
         }
     }
+}
+
+/// Both first halves, and both second ones.
+#[inline(always)]
+unsafe fn halves(a: __m256, b: __m256) -> [__m256; 2] {
+    unsafe { [_mm256_permute2f128_ps::<0x20>(a, b), _mm256_permute2f128_ps::<0x31>(a, b)] }
 }
 
 /// 4×4 transposes inside each 128-bit part.

@@ -297,6 +297,36 @@ impl Simd for Token {
         }
     }
     #[inline(always)]
+    fn columns4(self, v: [F; 4]) -> [F; 4] {
+        unsafe {
+            let [a, b, c, d] = transpose4(exchange_quarters([v[0].0, v[1].0, v[2].0, v[3].0]));
+            [F(a), F(b), F(c), F(d)]
+        }
+    }
+    #[inline(always)]
+    fn rows4(self, v: [F; 4]) -> [F; 4] {
+        unsafe {
+            let [a, b, c, d] = exchange_quarters(transpose4([v[0].0, v[1].0, v[2].0, v[3].0]));
+            [F(a), F(b), F(c), F(d)]
+        }
+    }
+    #[inline(always)]
+    fn split_quarters(self, a: F, b: F) -> [F; 2] {
+        unsafe {
+            let even = _mm512_shuffle_f32x4::<0x88>(a.0, b.0);
+            [F(even), F(_mm512_shuffle_f32x4::<0xdd>(a.0, b.0))]
+        }
+    }
+    #[inline(always)]
+    fn join_quarters(self, even: F, odd: F) -> [F; 2] {
+        unsafe {
+            let low = _mm512_shuffle_f32x4::<0x44>(even.0, odd.0);
+            let high = _mm512_shuffle_f32x4::<0xee>(even.0, odd.0);
+            let low = _mm512_shuffle_f32x4::<0xd8>(low, low);
+            [F(low), F(_mm512_shuffle_f32x4::<0xd8>(high, high))]
+        }
+    }
+    #[inline(always)]
     fn transpose(self, v: [F; LANES]) -> [F; LANES] {
         unsafe {
             // q[a][c]: part b holds rows 4a..4a + 4 of column 4b + c.
@@ -317,6 +347,23 @@ impl Simd for Token {
             }
             out
         }
+    }
+}
+
+/// The 4×4 matrix of 128-bit parts transposed.
+#[inline(always)]
+unsafe fn exchange_quarters(v: [__m512; 4]) -> [__m512; 4] {
+    unsafe {
+        let (a, b) =
+            (_mm512_shuffle_f32x4::<0x44>(v[0], v[1]), _mm512_shuffle_f32x4::<0xee>(v[0], v[1]));
+        let (c, d) =
+            (_mm512_shuffle_f32x4::<0x44>(v[2], v[3]), _mm512_shuffle_f32x4::<0xee>(v[2], v[3]));
+        [
+            _mm512_shuffle_f32x4::<0x88>(a, c),
+            _mm512_shuffle_f32x4::<0xdd>(a, c),
+            _mm512_shuffle_f32x4::<0x88>(b, d),
+            _mm512_shuffle_f32x4::<0xdd>(b, d),
+        ]
     }
 }
 
