@@ -142,23 +142,14 @@ impl Reconstructor {
         Self::build(config, Weights::seeded(seed))
     }
 
-    /// The model that ships, [`Weights::shipped`], at ×`upscale`. SubSplat's heads serve
-    /// the r that they were trained for; at another, children are the plain split of their
-    /// parents, and [`Reconstructor::untrained_tensors`] lists the heads.
+    /// The model that ships, [`Weights::shipped`], at ×`upscale`. SubSplat's heads are
+    /// trained at ×2 and ×4; at another r children are the plain split of their parents, and
+    /// [`Reconstructor::untrained_tensors`] lists the heads.
     ///
     /// # Errors
     /// An `upscale` out of range.
     pub fn shipped(upscale: usize) -> Result<Self> {
-        let weights = Weights::shipped()?;
-        let own = weights.config().cloned();
-        let mut config = own.unwrap_or_else(|| Config::small(Preset::Tuned, upscale));
-        if config.upscale == upscale {
-            return Self::from_weights(weights, Some(&config));
-        }
-        config.upscale = upscale;
-        // Heads that start closed ask nothing of the views.
-        config.agg.enabled = false;
-        Self::from_weights(weights.without(SUBSPLAT_PREFIX), Some(&config))
+        Self::from_weights(Weights::shipped(upscale)?, None)
     }
 
     /// A model from a weight file. Its own configuration is used unless `config` is

@@ -15,30 +15,36 @@ use subsplat::train::config::Model;
 use subsplat::train::validate::{Found, Validator};
 
 /// The shipped model's configuration.
-fn shipped() -> Config {
-    Weights::shipped().unwrap().config().unwrap().clone()
+fn shipped(upscale: usize) -> Config {
+    Weights::shipped(upscale).unwrap().config().unwrap().clone()
 }
 
-/// The same model as it begins: a plane sweep.
+/// The same model as it begins, at ×2: a plane sweep.
 fn untrained() -> BTreeMap<String, Tensor> {
     let weights = Weights::seeded(0).trainable();
-    SubSplat::new(&shipped(), weights.builder()).unwrap();
+    SubSplat::new(&shipped(2), weights.builder()).unwrap();
     weights.variables().into_iter().map(|(name, v)| (name, v.as_tensor().clone())).collect()
 }
 
 /// Looks at a model as training does: at held-out rooms of a seed that no training used,
-/// and at photographs, at ×2.
-fn look(tensors: BTreeMap<String, Tensor>, photos: Option<&Path>) -> [Option<Found>; 2] {
-    let set = serde_json::from_str(&shipped().to_json().unwrap()).unwrap();
-    let model = Model { set, ..Model::default() };
-    let mut config = TrainConfig { model, ..TrainConfig::default() };
+/// and at photographs.
+fn look(
+    tensors: BTreeMap<String, Tensor>,
+    model: &Config,
+    photos: Option<&Path>,
+) -> [Option<Found>; 2] {
+    let set = serde_json::from_str(&model.to_json().unwrap()).unwrap();
+    let own = Model { set, upscale: model.upscale, ..Model::default() };
+    let mut config = TrainConfig { model: own, ..TrainConfig::default() };
+    // Both to 256².
+    config.data.input = [256 / model.upscale; 2];
     config.data.seed = 77;
     config.validate.scenes = 6;
     Validator::new(&config, photos).unwrap().look(tensors, None).unwrap()
 }
 
-fn learnt() -> BTreeMap<String, Tensor> {
-    Weights::shipped().unwrap().tensors().clone()
+fn learnt(upscale: usize) -> BTreeMap<String, Tensor> {
+    Weights::shipped(upscale).unwrap().tensors().clone()
 }
 
 #[test]
@@ -51,19 +57,24 @@ fn the_file_is_small_and_whole() {
     assert!(model.unexpected_tensors().is_empty(), "{:?}", model.unexpected_tensors());
     let heads = model.untrained_tensors();
     assert!(heads.iter().all(|n| n.starts_with(SUBSPLAT_PREFIX)), "{heads:?}");
-    let plain = Reconstructor::shipped(4).unwrap();
-    assert_eq!(plain.config().children(), 16);
+    let finer = Reconstructor::shipped(4).unwrap();
+    assert_eq!((finer.config().upscale, finer.config().children()), (4, 16));
+    assert!(finer.unexpected_tensors().is_empty() && finer.untrained_tensors().is_empty());
+    let plain = Reconstructor::shipped(3).unwrap();
+    assert_eq!(plain.config().children(), 9);
     let heads = plain.untrained_tensors();
     assert!(!heads.is_empty() && heads.iter().all(|n| n.starts_with(SUBSPLAT_PREFIX)), "{heads:?}");
     assert!(Reconstructor::shipped(9).is_err());
-    assert_eq!(model.config().backbone, plain.config().backbone);
+    for other in [finer.config(), plain.config()] {
+        assert_eq!(model.config().backbone, other.backbone);
+    }
     assert_ne!(*model.config(), Config::small(Preset::Paper, 2));
 }
 
 #[test]
 fn rooms_that_were_never_trained_on_are_reconstructed() {
-    let [rooms, _] = look(learnt(), None);
-    let [plain, _] = look(untrained(), None);
+    let [rooms, _] = look(learnt(2), &shipped(2), None);
+    let [plain, _] = look(untrained(), &shipped(2), None);
     let (rooms, plain) = (rooms.unwrap(), plain.unwrap());
     println!("shipped {rooms:?}\nplane sweep {plain:?}");
     assert!(rooms.psnr > ROOMS.0 && rooms.ssim > ROOMS.1, "{rooms:?}");
@@ -71,10 +82,26 @@ fn rooms_that_were_never_trained_on_are_reconstructed() {
     assert!(rooms.disparity < 0.5 * plain.disparity, "{rooms:?} {plain:?}");
 }
 
+/// Sixteen children that were trained show more of a room than sixteen equal ones.
+#[test]
+fn heads_for_four_times_the_size_beat_the_plain_split() {
+    let backbone = || learnt(4).into_iter().filter(|(n, _)| !n.starts_with(SUBSPLAT_PREFIX));
+    let heads = Weights::seeded(0).trainable();
+    SubSplat::new(&shipped(4), heads.builder()).unwrap();
+    let heads = heads.variables().into_iter().map(|(name, v)| (name, v.as_tensor().clone()));
+    let heads = heads.filter(|(n, _)| n.starts_with(SUBSPLAT_PREFIX));
+    let [trained, _] = look(learnt(4), &shipped(4), None);
+    let [plain, _] = look(backbone().chain(heads).collect(), &shipped(4), None);
+    let (trained, plain) = (trained.unwrap(), plain.unwrap());
+    println!("trained {trained:?}\nplain split {plain:?}");
+    assert!(trained.psnr > plain.psnr + 0.4 && trained.ssim > plain.ssim + 0.005);
+    assert!(trained.psnr > trained.copy_psnr + 3.0, "{trained:?}");
+}
+
 #[test]
 fn photographs_are_reconstructed() {
     let Some(folder) = common::shared("photos") else { return };
-    let [_, photos] = look(learnt(), Some(&folder));
+    let [_, photos] = look(learnt(2), &shipped(2), Some(&folder));
     let photos = photos.unwrap();
     println!("{photos:?}");
     assert!(photos.psnr > photos.copy_psnr + 3.5 && photos.ssim > PHOTOS_SSIM, "{photos:?}");

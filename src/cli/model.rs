@@ -103,7 +103,7 @@ fn shipped(args: &Asked) -> Result<Reconstructor> {
     let Some(preset) = args.model.preset else {
         return Reconstructor::shipped(upscale).with_context(asked);
     };
-    let weights = Weights::shipped()?.without(SUBSPLAT_PREFIX);
+    let weights = Weights::shipped(upscale)?.without(SUBSPLAT_PREFIX);
     let preset = Preset::from(preset);
     let config = match weights.config() {
         Some(own) => own.with_preset(preset, upscale),

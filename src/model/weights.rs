@@ -68,13 +68,32 @@ impl Weights {
         Self::parse(&io::read(path)?, path)
     }
 
-    /// The weights that ship in the crate: the small backbone and SubSplat at ×2, learned
-    /// from made-up rooms alone (`src/model/shipped/README.md` is their model card).
+    /// The weights that ship in the crate, at ×`upscale`, learned from made-up rooms alone
+    /// (`src/model/shipped/README.md` is their model card): the small backbone, and SubSplat's
+    /// heads at ×2 and ×4. At another r there are no heads: children that start untrained are
+    /// the plain split of their parents.
     ///
     /// # Errors
     /// None that a whole build can give: those of [`Weights::load`].
-    pub fn shipped() -> io::Result<Self> {
-        Self::parse(include_bytes!("shipped/small.safetensors"), Path::new("shipped weights"))
+    pub fn shipped(upscale: usize) -> io::Result<Self> {
+        let at = |bytes: &[u8], name: &str| Self::parse(bytes, Path::new(name));
+        let whole = at(include_bytes!("shipped/small.safetensors"), "shipped weights")?;
+        if whole.config().is_some_and(|c| c.upscale == upscale) {
+            return Ok(whole);
+        }
+        let mut backbone = whole.without(SUBSPLAT_PREFIX);
+        if upscale == 4 {
+            let heads = at(include_bytes!("shipped/heads-x4.safetensors"), "shipped heads")?;
+            let both = backbone.tensors().iter().chain(heads.tensors());
+            let both = both.map(|(name, tensor)| (name.clone(), tensor.clone())).collect();
+            return Ok(Self { config: heads.config, ..Self::from_tensors(both) });
+        }
+        if let Some(config) = &mut backbone.config {
+            config.upscale = upscale;
+            // Heads that start closed ask nothing of the views.
+            config.agg.enabled = false;
+        }
+        Ok(backbone)
     }
 
     /// [`Weights::load`] of bytes in memory; `path` names them in errors.

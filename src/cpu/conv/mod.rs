@@ -18,6 +18,7 @@ mod shift;
 mod tests;
 mod weights;
 mod winograd;
+mod winograd_few;
 mod winograd_weights;
 
 use super::fresh::{Block, Fresh};
@@ -66,6 +67,10 @@ fn run(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y: &mut Bloc
     if pointwise::suits(plan) {
         pointwise::run(tier, plan, x, w, bias, y);
     } else if let Some(way) = winograd::Way::of(plan) {
+        if winograd::Way::few(plan) {
+            winograd_few::run(tier, plan, way, x, w, bias, y);
+            return;
+        }
         let w = winograd::Weights::new(tier, plan, way, w, WEIGHTS.take());
         winograd::run(tier, plan, way, x, &w, bias, y);
         keep(w.into_memory());

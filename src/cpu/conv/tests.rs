@@ -98,6 +98,10 @@ fn cases() -> Vec<Sizes> {
         flat(41, 26, [3, 3], 2, 1, [71, 63]),
         flat(33, 100, [3, 3], 2, 0, [55, 60]),
         flat(25, 24, [3, 3], 2, 1, [139, 280]),
+        // All tiles of both pictures at once.
+        flat(41, 26, [3, 3], 1, 1, [16, 16]),
+        flat(24, 53, [3, 3], 1, 1, [13, 18]),
+        flat(33, 26, [3, 3], 2, 1, [31, 34]),
         solid(5, 8, [3, 3, 3], 1, [6, 7, 9]),
         solid(8, 1, [3, 3, 3], 1, [5, 4, 20]),
         solid(2, 11, [3, 1, 2], 1, [3, 4, 5]),
@@ -233,6 +237,19 @@ fn threads_do_not_matter() {
     };
     let one = run(1);
     assert!(one.is_some() && one == run(2) && one == run(5));
+}
+
+/// A picture of a batch is the picture alone, however many tiles share a vector.
+#[test]
+fn pictures_do_not_mix() {
+    for s in [flat(24, 30, [3, 3], 1, 1, [16, 20]), flat(24, 30, [3, 3], 2, 1, [32, 32])] {
+        let w = noise(s.out_channels * s.in_channels * s.taps(), 11);
+        let x = noise(3 * s.in_channels * s.in_pixels(), 12);
+        let together = forward(Tier::best(), &s, 3, &x, &w, &[]);
+        let one = s.in_channels * s.in_pixels();
+        let apart = x.chunks(one).flat_map(|x| forward(Tier::best(), &s, 1, x, &w, &[]));
+        assert!(together.iter().map(|v| v.to_bits()).eq(apart.map(f32::to_bits)), "{s:?}");
+    }
 }
 
 #[test]

@@ -21,7 +21,9 @@ const VECTORS: usize = 3;
 const FLOATS: usize = 300_000;
 /// Least channels on both sides, and tiles of a picture, for which it wins.
 const CHANNELS: usize = 24;
-const TILES: usize = 48;
+const TILES: usize = 16;
+/// Tiles of a picture below which [`super::winograd_few`] is better.
+const FEW: usize = 48;
 /// Floats past a packed patch's end that may be read and not used.
 pub(super) const SLACK: usize = 2 * LANES;
 
@@ -52,10 +54,13 @@ impl Way {
             }
             _ => return None,
         };
-        let [depth, height, width] = plan.grid();
-        let wins = plan.src_channels.min(plan.dst_channels) >= CHANNELS
-            && depth * height.div_ceil(TILE) * width.div_ceil(TILE) >= TILES;
+        let wins = plan.src_channels.min(plan.dst_channels) >= CHANNELS && tiles_of(plan) >= TILES;
         (plan.kernel_taps == 9 && wins).then_some(way)
+    }
+
+    /// Whether `plan`'s pictures are so small that they are better taken all at once.
+    pub fn few(plan: &Plan) -> bool {
+        plan.dst_size[0] == 1 && tiles_of(plan) < FEW
     }
 
     /// How the tiles of `plan` are read: every place between the first and the last.
@@ -73,6 +78,12 @@ impl Way {
             size: plan.src_size,
         })
     }
+}
+
+/// Tiles of a picture.
+fn tiles_of(plan: &Plan) -> usize {
+    let [depth, height, width] = plan.grid();
+    depth * height.div_ceil(TILE) * width.div_ceil(TILE)
 }
 
 /// Transformed weights: for each block of output channels
@@ -102,12 +113,13 @@ impl Weights {
 }
 
 /// G·g·Gᵀ of the weights of one block.
-struct Transform<'a> {
-    plan: &'a Plan,
-    way: Way,
-    w: &'a [f32],
-    block: &'a Block,
-    panel: &'a mut [f32],
+pub(super) struct Transform<'a> {
+    pub plan: &'a Plan,
+    pub way: Way,
+    pub w: &'a [f32],
+    pub block: &'a Block,
+    /// `[group][source channel][channel of the block]`.
+    pub panel: &'a mut [f32],
 }
 
 impl Kernel for Transform<'_> {
@@ -251,9 +263,10 @@ where
         let Buffers { x: patch, tiles, products, .. } = self.buffers;
         let inside = |a: usize| self.tiles[a - 1].min((grid[a] - self.start[a]).div_ceil(TILE));
         let [down, across] = [inside(1), inside(2)];
-        let block = Tiles { count: down * across, across };
+        let count = down * across;
+        let block = Tiles { count, across, picture: count };
         let length = block.count.next_multiple_of(LANES);
-        let places = block.places(layout.pitch(), F::READ);
+        let places = block.places(&layout, F::READ);
         // Off a power of two, lest all groups share one cache set.
         let sources = Places::new(POINTS, plan.src_channels, length, LANES);
         let sums = Places::new(POINTS, ROWS, length, 0);
@@ -291,38 +304,39 @@ where
             for m in 0..part.rows {
                 let channel = part.first + m;
                 let bias = bias.get(channel).copied().unwrap_or(0.0);
-                let plane = (self.image * plan.dst_channels + channel) * plan.dst_size[0] + depth;
                 for first in (0..length).step_by(LANES) {
                     let rows = columns::<S, F, IN, POINTS, OUT>(s, products, &sums, [m, first]);
                     let corner = [top, left].map(|v| v * OUT / TILE);
-                    let to = Outputs { y: self.y, plane, size: plan.dst_size, corner, block };
-                    for (r, row) in rows.into_iter().enumerate() {
-                        let row = F::outputs(s, row);
-                        to.write(s, row.map(|v| v + s.splat(bias)), [first, r]);
-                    }
+                    let (y, image) = (self.y, self.image);
+                    let to = Outputs { plan, y, image, channel, depth, corner, block };
+                    to.finish::<S, F, IN, POINTS, OUT>(s, rows, bias, first);
                 }
             }
         }
     }
 }
 
-/// The tiles of a block, row by row.
+/// The tiles of a block, row by row, of one picture after the other.
 #[derive(Clone, Copy)]
 pub(super) struct Tiles {
     pub count: usize,
     /// Tiles of a row.
     pub across: usize,
+    /// Tiles of a picture.
+    pub picture: usize,
 }
 
 impl Tiles {
-    /// Where each vector of tiles begins in a packed channel, `read` places from tile to
-    /// tile. Lanes beyond the last tile repeat earlier ones.
-    pub fn places(self, pitch: usize, read: usize) -> Vec<Lanes> {
+    /// Where each vector of tiles begins in a packed channel of all pictures, `read` places
+    /// from tile to tile. Lanes beyond the last tile repeat earlier ones.
+    pub fn places(self, layout: &Layout, read: usize) -> Vec<Lanes> {
         let group = LANES / read;
         let place = |t: usize| {
             let last = self.count.saturating_sub(group) + t % group;
             let t = if t < self.count { t } else { last.min(self.count - 1) };
-            (t / self.across * pitch + t % self.across) * read
+            let (picture, t) = (t / self.picture, t % self.picture);
+            let place = (t / self.across * layout.pitch() + t % self.across) * read;
+            picture * layout.channel + place
         };
         let vector = |first: usize| {
             let at: [usize; LANES] = std::array::from_fn(|i| place(first + i));
@@ -439,7 +453,7 @@ pub(super) fn scatter<S: Simd, const POINTS: usize>(
 
 /// Rows of outputs of sixteen tiles, not yet transformed along themselves.
 #[inline(always)]
-fn columns<S, F, const IN: usize, const POINTS: usize, const OUT: usize>(
+pub(super) fn columns<S, F, const IN: usize, const POINTS: usize, const OUT: usize>(
     s: S,
     products: &[f32],
     places: &Places,
@@ -468,54 +482,73 @@ where
 }
 
 /// Where a block's outputs go.
-struct Outputs<'a> {
-    y: &'a Disjoint<'a, MaybeUninit<f32>>,
-    /// Slice of y, over pictures, channels and depths.
-    plane: usize,
-    size: Axes,
+pub(super) struct Outputs<'a> {
+    pub plan: &'a Plan,
+    pub y: &'a Disjoint<'a, MaybeUninit<f32>>,
+    /// The first picture.
+    pub image: usize,
+    pub channel: usize,
+    pub depth: usize,
     /// Row and column of the first.
-    corner: [usize; 2],
-    block: Tiles,
+    pub corner: [usize; 2],
+    pub block: Tiles,
 }
 
 impl Outputs<'_> {
+    /// Transforms the rows of sixteen tiles from `first` on, and writes them.
+    #[inline(always)]
+    pub fn finish<S, F, const IN: usize, const POINTS: usize, const OUT: usize>(
+        &self,
+        s: S,
+        rows: [[S::F; POINTS]; OUT],
+        bias: f32,
+        first: usize,
+    ) where
+        S: Simd,
+        F: Form<IN, POINTS, OUT>,
+    {
+        let bias = s.splat(bias);
+        for (r, row) in rows.into_iter().enumerate() {
+            let mut row = F::outputs(s, row);
+            for v in &mut row {
+                *v = *v + bias;
+            }
+            self.write(s, row, [first, r]);
+        }
+    }
+
     /// Writes row `r` of sixteen tiles from `first` on; what lies beyond the border is
     /// dropped.
     #[inline(always)]
     fn write<S: Simd, const OUT: usize>(&self, s: S, v: [S::F; OUT], [first, r]: [usize; 2]) {
         let mut rows = [[0.0; LANES]; OUT];
-        match OUT {
-            8 => {
-                let mut eight = [v[0]; 8];
-                eight.iter_mut().zip(v).for_each(|(to, v)| *to = v);
-                let eight = s.rows8(eight);
-                for k in 0..OUT {
-                    s.store(eight[k], &mut rows[k]);
-                }
+        if OUT == 8 {
+            let mut eight = [v[0]; 8];
+            eight.iter_mut().zip(v).for_each(|(to, v)| *to = v);
+            for (to, v) in rows.iter_mut().zip(s.rows8(eight)) {
+                s.store(v, to);
             }
-            _ => {
-                let mut four = [v[0]; 4];
-                four.iter_mut().zip(v).for_each(|(to, v)| *to = v);
-                let four = s.rows4(four);
-                for k in 0..OUT {
-                    s.store(four[k], &mut rows[k]);
-                }
+        } else {
+            let mut four = [v[0]; 4];
+            four.iter_mut().zip(v).for_each(|(to, v)| *to = v);
+            for (to, v) in rows.iter_mut().zip(s.rows4(four)) {
+                s.store(v, to);
             }
         }
-        let [_, height, width] = self.size;
-        let Tiles { count, across } = self.block;
+        let [_, height, width] = self.plan.dst_size;
+        let Tiles { count, across, .. } = self.block;
         let group = LANES / OUT;
         for k in 0..OUT {
             let t = first + k * group;
-            let row = self.corner[0] + t / across * OUT + r;
-            let column = self.corner[1] + t % across * OUT;
+            let (plane, row, column) = self.place(t, OUT);
+            let row = row + r;
             // Tiles of one row, none of them cut.
             if t + group <= count
                 && t % across + group <= across
                 && row < height
                 && column + LANES <= width
             {
-                let at = (self.plane * height + row) * width + column;
+                let at = (plane * height + row) * width + column;
                 // SAFETY: no two jobs, and no two tiles of a job, hold the same outputs.
                 let to = unsafe { self.y.part(at..at + LANES) };
                 if let Some(to) = to.first_chunk_mut() {
@@ -524,17 +557,26 @@ impl Outputs<'_> {
                 continue;
             }
             for (i, tile) in rows[k].as_chunks::<OUT>().0.iter().enumerate() {
-                let t = t + i;
-                let row = self.corner[0] + t / across * OUT + r;
-                let column = self.corner[1] + t % across * OUT;
-                if t >= count || row >= height || column >= width {
+                let (plane, row, column) = self.place(t + i, OUT);
+                let row = row + r;
+                if t + i >= count || row >= height || column >= width {
                     continue;
                 }
-                let at = (self.plane * height + row) * width + column;
+                let at = (plane * height + row) * width + column;
                 // SAFETY: as above.
                 let to = unsafe { self.y.part(at..at + OUT.min(width - column)) };
                 to.iter_mut().zip(tile).for_each(|(to, v)| *to = MaybeUninit::new(*v));
             }
         }
+    }
+
+    /// Slice of y, over pictures, channels and depths, row and column of tile `t`.
+    #[inline(always)]
+    fn place(&self, t: usize, out: usize) -> (usize, usize, usize) {
+        let Tiles { across, picture, .. } = self.block;
+        let (image, t) = (self.image + t / picture, t % picture);
+        let channel = image * self.plan.dst_channels + self.channel;
+        let plane = channel * self.plan.dst_size[0] + self.depth;
+        (plane, self.corner[0] + t / across * out, self.corner[1] + t % across * out)
     }
 }

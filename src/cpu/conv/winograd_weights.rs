@@ -87,7 +87,7 @@ impl Products<'_, '_> {
         let [_, down, across] = inside.map(|n| n.div_ceil(TILE));
         let (count, channels) = (down * across, work.rows / 9);
         let length = count.next_multiple_of(LANES);
-        let places = Tiles { count, across }.places(layout.pitch(), F::READ);
+        let places = Tiles { count, across, picture: count }.places(&layout, F::READ);
         let sources = Places::new(POINTS, channels, length, LANES);
         let Buffers { x: patch, y: turned, tiles, gradients, .. } = self.buffers;
         let patch = patch.room(layout.channel + SLACK);
