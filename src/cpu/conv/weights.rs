@@ -49,7 +49,7 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
             (outputs, even(c, (c * taps / DEPTH).max(1)))
         }
         Way::Winograd(_) => {
-            let parts = c.div_ceil(winograd_weights::CHANNELS);
+            let parts = winograd_weights::parts(c, images * winograd::tiles_of(&plan));
             (o, even(c, parts).next_multiple_of(ROWS))
         }
     };

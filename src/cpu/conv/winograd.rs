@@ -81,7 +81,7 @@ impl Way {
 }
 
 /// Tiles of a picture.
-fn tiles_of(plan: &Plan) -> usize {
+pub(super) fn tiles_of(plan: &Plan) -> usize {
     let [depth, height, width] = plan.grid();
     depth * height.div_ceil(TILE) * width.div_ceil(TILE)
 }

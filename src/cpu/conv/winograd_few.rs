@@ -15,6 +15,9 @@ use rayon::prelude::*;
 use std::marker::PhantomData;
 use std::mem::{MaybeUninit, take};
 
+/// Channels that a job transforms at least: one takes microseconds.
+const LEAST: usize = 8;
+
 /// Runs `plan` on pictures `x` of one slice into `y`, which is overwritten; `bias` is empty
 /// or one value a channel written.
 pub(super) fn run(
@@ -67,7 +70,8 @@ impl Call<'_> {
         // Apart from this thread's own, which its jobs use.
         let mut transformed = Buffers::with(|buffers| take(&mut buffers.tiles));
         let all = transformed.room(plan.src_channels * stride);
-        all.par_chunks_exact_mut(stride).enumerate().for_each(|(channel, tiles)| {
+        let gather = all.par_chunks_exact_mut(stride).enumerate().with_min_len(LEAST);
+        gather.for_each(|(channel, tiles)| {
             let (lanes, own, form) = (&lanes, &own, PhantomData::<F>);
             Buffers::with(|buffers| {
                 let job = Gather { call: self, layout, lanes, own, channel, buffers, tiles, form };

@@ -12,8 +12,11 @@ use super::winograd::{SLACK, Tiles, Way, scatter, transform};
 use crate::cpu::simd::{Kernel, LANES, Simd};
 use std::ops::Range;
 
-/// Input channels of a job.
-pub(super) const CHANNELS: usize = 64;
+/// Input channels of a job: at most, and at least for the sake of more jobs.
+const CHANNELS: usize = 64;
+const FEW_CHANNELS: usize = 16;
+/// Jobs of a call where tiles are few: each turns all gradients over again.
+const JOBS: usize = 2;
 /// Vectors of tiles at once.
 const VECTORS: usize = 4;
 /// Outputs whose tiles make one block, for `plan`.
@@ -25,6 +28,13 @@ pub(super) fn tile(plan: &Plan) -> Axes {
 
 /// Tiles of a job at least, since its products are to be transformed at the end.
 const TILES: usize = 128;
+
+/// Parts of so many input channels, over `tiles` tiles of all pictures.
+pub(super) fn parts(channels: usize, tiles: usize) -> usize {
+    let groups = (tiles / TILES).max(1);
+    let wanted = JOBS.div_ceil(groups).min(channels.div_ceil(FEW_CHANNELS));
+    channels.div_ceil(CHANNELS).max(wanted)
+}
 
 /// Groups of `units` blocks of tiles that are summed apart.
 pub(super) fn groups(plan: &Plan, units: usize, parts: usize, jobs: usize) -> usize {
