@@ -12,6 +12,7 @@ use subsplat::config::*;
 use subsplat::model::embed::Embeddings;
 use subsplat::model::geometry::{Frames, ParentChunk};
 use subsplat::model::trunk::{Children, Trunk, set_initial_values};
+use subsplat::model::weights::Weights;
 use subsplat::model::{BackboneOutput, Primaries, Views};
 
 const SIZE: usize = 16;
@@ -36,10 +37,17 @@ fn trunk(config: &Config, seed: u64) -> (Trunk, VarMap) {
     let variables = VarMap::new();
     let vb = VarBuilder::from_varmap(&variables, DType::F32, &Device::Cpu);
     let trunk = Trunk::new(config, &channels(), vb).unwrap();
-    set_initial_values(&variables).unwrap();
-    let mut r = Random(seed);
     let mut named: Vec<_> = variables.data().lock().unwrap().clone().into_iter().collect();
     named.sort_by(|a, b| a.0.cmp(&b.0));
+    // Candle's own draws are others in every run.
+    let seeded = Weights::seeded(seed).trainable();
+    Trunk::new(config, &channels(), seeded.builder()).unwrap();
+    let seeded = seeded.variables();
+    for (name, var) in &named {
+        var.set(&seeded[name]).unwrap();
+    }
+    set_initial_values(&variables).unwrap();
+    let mut r = Random(seed);
     for (_, var) in named {
         let noise = r.tensor(var.dims(), 0.1, DType::F32);
         var.set(&(var.as_tensor() + noise).unwrap()).unwrap();
