@@ -4,10 +4,10 @@
 //! Lanes are tiles, in the transforms and in the products, which are 36 matrix products
 //! over channels; one block's transformed tiles stay in the second-level cache.
 
-use super::Buffers;
 use super::forms::{Down, Form, GROUPS, Places, TILE, Unit, Up, WEIGHTS};
 use super::plan::{Axes, Layout, Plan, Sizes, pack};
 use super::shift::{Block, ROWS, Strip, blocks};
+use super::{Buffer, Buffers};
 use crate::cpu::disjoint::Disjoint;
 use crate::cpu::fresh;
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
@@ -269,10 +269,8 @@ where
         let places = block.places(&layout, F::READ);
         // Off a power of two, lest all groups share one cache set.
         let sources = Places::new(POINTS, plan.src_channels, length, LANES);
-        let sums = Places::new(POINTS, ROWS, length, 0);
         let patch = patch.room(layout.channel + SLACK);
         let tiles = tiles.room(sources.floats);
-        let products = products.room(sums.floats);
         let pixels: usize = plan.src_size.iter().product();
         let channels = plan.src_channels;
         let [depth, top, left] = self.start;
@@ -288,29 +286,61 @@ where
         let weights = channels * GROUPS;
         for (index, part) in w.blocks.iter().enumerate() {
             let panel = &w.data[index * ROWS * weights..][..part.pitch * weights];
-            for (i, w) in panel.chunks_exact(part.pitch * channels).enumerate() {
-                let ((at, length), (to, _)) = (sources.groups[i], sums.groups[i]);
-                let strip = Strip {
-                    x: &tiles[at..][..channels * length],
-                    channel: length,
-                    channels,
-                    offsets: &[0],
-                    w,
-                    bias: [0.0; ROWS],
-                    length,
-                };
-                strip.run(s, part.pitch, &mut products[to..][..ROWS * length]);
-            }
-            for m in 0..part.rows {
-                let channel = part.first + m;
-                let bias = bias.get(channel).copied().unwrap_or(0.0);
-                for first in (0..length).step_by(LANES) {
-                    let rows = columns::<S, F, IN, POINTS, OUT>(s, products, &sums, [m, first]);
-                    let corner = [top, left].map(|v| v * OUT / TILE);
-                    let (y, image) = (self.y, self.image);
-                    let to = Outputs { plan, y, image, channel, depth, corner, block };
-                    to.finish::<S, F, IN, POINTS, OUT>(s, rows, bias, first);
-                }
+            let corner = [top, left].map(|v| v * OUT / TILE);
+            let to = Outputs { plan, y: self.y, image: self.image, depth, corner, block };
+            let product = Product { x: tiles, sources: &sources, stride: None, part, panel, bias };
+            product.run::<S, F, IN, POINTS, OUT>(s, products, to);
+        }
+    }
+}
+
+/// A block of output channels of transformed tiles.
+pub(super) struct Product<'a> {
+    pub x: &'a [f32],
+    pub sources: &'a Places,
+    /// From channel to channel of the tiles, where that is not the group's own length.
+    pub stride: Option<usize>,
+    pub part: &'a Block,
+    /// Transformed weights of `part`.
+    pub panel: &'a [f32],
+    pub bias: &'a [f32],
+}
+
+impl Product<'_> {
+    /// Multiplies, transforms back and writes.
+    #[inline(always)]
+    pub fn run<S, F, const IN: usize, const POINTS: usize, const OUT: usize>(
+        &self,
+        s: S,
+        products: &mut Buffer,
+        to: Outputs<'_>,
+    ) where
+        S: Simd,
+        F: Form<IN, POINTS, OUT>,
+    {
+        let (part, channels) = (self.part, to.plan.src_channels);
+        let length = to.block.count.next_multiple_of(LANES);
+        let sums = Places::new(POINTS, ROWS, length, 0);
+        let products = products.room(sums.floats);
+        for (i, w) in self.panel.chunks_exact(part.pitch * channels).enumerate() {
+            let ((at, length), (to, _)) = (self.sources.groups[i], sums.groups[i]);
+            let strip = Strip {
+                x: &self.x[at..],
+                channel: self.stride.unwrap_or(length),
+                channels,
+                offsets: &[0],
+                w,
+                bias: [0.0; ROWS],
+                length,
+            };
+            strip.run(s, part.pitch, &mut products[to..][..ROWS * length]);
+        }
+        for m in 0..part.rows {
+            let channel = part.first + m;
+            let bias = self.bias.get(channel).copied().unwrap_or(0.0);
+            for first in (0..length).step_by(LANES) {
+                let rows = columns::<S, F, IN, POINTS, OUT>(s, products, &sums, [m, first]);
+                to.finish::<S, F, IN, POINTS, OUT>(s, rows, bias, [channel, first]);
             }
         }
     }
@@ -453,7 +483,7 @@ pub(super) fn scatter<S: Simd, const POINTS: usize>(
 
 /// Rows of outputs of sixteen tiles, not yet transformed along themselves.
 #[inline(always)]
-pub(super) fn columns<S, F, const IN: usize, const POINTS: usize, const OUT: usize>(
+fn columns<S, F, const IN: usize, const POINTS: usize, const OUT: usize>(
     s: S,
     products: &[f32],
     places: &Places,
@@ -487,7 +517,6 @@ pub(super) struct Outputs<'a> {
     pub y: &'a Disjoint<'a, MaybeUninit<f32>>,
     /// The first picture.
     pub image: usize,
-    pub channel: usize,
     pub depth: usize,
     /// Row and column of the first.
     pub corner: [usize; 2],
@@ -495,14 +524,14 @@ pub(super) struct Outputs<'a> {
 }
 
 impl Outputs<'_> {
-    /// Transforms the rows of sixteen tiles from `first` on, and writes them.
+    /// Transforms the rows of sixteen tiles of `channel` from `first` on, and writes them.
     #[inline(always)]
-    pub fn finish<S, F, const IN: usize, const POINTS: usize, const OUT: usize>(
+    fn finish<S, F, const IN: usize, const POINTS: usize, const OUT: usize>(
         &self,
         s: S,
         rows: [[S::F; POINTS]; OUT],
         bias: f32,
-        first: usize,
+        at: [usize; 2],
     ) where
         S: Simd,
         F: Form<IN, POINTS, OUT>,
@@ -513,14 +542,20 @@ impl Outputs<'_> {
             for v in &mut row {
                 *v = *v + bias;
             }
-            self.write(s, row, [first, r]);
+            self.write(s, row, at, r);
         }
     }
 
     /// Writes row `r` of sixteen tiles from `first` on; what lies beyond the border is
     /// dropped.
     #[inline(always)]
-    fn write<S: Simd, const OUT: usize>(&self, s: S, v: [S::F; OUT], [first, r]: [usize; 2]) {
+    fn write<S: Simd, const OUT: usize>(
+        &self,
+        s: S,
+        v: [S::F; OUT],
+        [channel, first]: [usize; 2],
+        r: usize,
+    ) {
         let mut rows = [[0.0; LANES]; OUT];
         if OUT == 8 {
             let mut eight = [v[0]; 8];
@@ -540,7 +575,7 @@ impl Outputs<'_> {
         let group = LANES / OUT;
         for k in 0..OUT {
             let t = first + k * group;
-            let (plane, row, column) = self.place(t, OUT);
+            let (plane, row, column) = self.place(channel, t, OUT);
             let row = row + r;
             // Tiles of one row, none of them cut.
             if t + group <= count
@@ -557,7 +592,7 @@ impl Outputs<'_> {
                 continue;
             }
             for (i, tile) in rows[k].as_chunks::<OUT>().0.iter().enumerate() {
-                let (plane, row, column) = self.place(t + i, OUT);
+                let (plane, row, column) = self.place(channel, t + i, OUT);
                 let row = row + r;
                 if t + i >= count || row >= height || column >= width {
                     continue;
@@ -572,10 +607,10 @@ impl Outputs<'_> {
 
     /// Slice of y, over pictures, channels and depths, row and column of tile `t`.
     #[inline(always)]
-    fn place(&self, t: usize, out: usize) -> (usize, usize, usize) {
+    fn place(&self, channel: usize, t: usize, out: usize) -> (usize, usize, usize) {
         let Tiles { across, picture, .. } = self.block;
         let (image, t) = (self.image + t / picture, t % picture);
-        let channel = image * self.plan.dst_channels + self.channel;
+        let channel = image * self.plan.dst_channels + channel;
         let plane = channel * self.plan.dst_size[0] + self.depth;
         (plane, self.corner[0] + t / across * out, self.corner[1] + t % across * out)
     }

@@ -6,8 +6,8 @@
 use super::Buffers;
 use super::forms::{Down, Form, GROUPS, Places, TILE, Unit, Up};
 use super::plan::{Layout, Plan, pack};
-use super::shift::{Block, ROWS, Strip, blocks};
-use super::winograd::{Lanes, Outputs, SLACK, Tiles, Transform, Way, columns, scatter, transform};
+use super::shift::{Block, blocks};
+use super::winograd::{Lanes, Outputs, Product, SLACK, Tiles, Transform, Way, scatter, transform};
 use crate::cpu::disjoint::Disjoint;
 use crate::cpu::fresh;
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
@@ -154,34 +154,12 @@ where
         let Call { plan, way, w, bias, .. } = *self.call;
         let (block, y) = (self.block, self.y);
         let channels = plan.src_channels;
-        let length = self.tiles.count.next_multiple_of(LANES);
         let Buffers { y: panel, products, .. } = self.buffers;
         let panel = panel.room(GROUPS * channels * block.pitch);
         Transform { plan, way, w, block, panel }.run(s);
-        let sums = Places::new(POINTS, ROWS, length, 0);
-        let products = products.room(sums.floats);
-        for (i, w) in panel.chunks_exact(block.pitch * channels).enumerate() {
-            let ((at, length), (to, _)) = (self.own.groups[i], sums.groups[i]);
-            let strip = Strip {
-                x: &self.x[at..],
-                channel: self.stride,
-                channels,
-                offsets: &[0],
-                w,
-                bias: [0.0; ROWS],
-                length,
-            };
-            strip.run(s, block.pitch, &mut products[to..][..ROWS * length]);
-        }
-        for m in 0..block.rows {
-            let channel = block.first + m;
-            let bias = bias.get(channel).copied().unwrap_or(0.0);
-            for first in (0..length).step_by(LANES) {
-                let rows = columns::<S, F, IN, POINTS, OUT>(s, products, &sums, [m, first]);
-                let (corner, block) = ([0; 2], self.tiles);
-                let to = Outputs { plan, y, image: 0, channel, depth: 0, corner, block };
-                to.finish::<S, F, IN, POINTS, OUT>(s, rows, bias, first);
-            }
-        }
+        let (sources, stride) = (self.own, Some(self.stride));
+        let product = Product { x: self.x, sources, stride, part: block, panel, bias };
+        let to = Outputs { plan, y, image: 0, depth: 0, corner: [0; 2], block: self.tiles };
+        product.run::<S, F, IN, POINTS, OUT>(s, products, to);
     }
 }
