@@ -269,6 +269,7 @@ where
         let places = block.places(&layout, F::READ);
         // Off a power of two, lest all groups share one cache set.
         let sources = Places::new(POINTS, plan.src_channels, length, LANES);
+        let sums = &Places::new(POINTS, ROWS, length, 0);
         let patch = patch.room(layout.channel + SLACK);
         let tiles = tiles.room(sources.floats);
         let pixels: usize = plan.src_size.iter().product();
@@ -288,7 +289,8 @@ where
             let panel = &w.data[index * ROWS * weights..][..part.pitch * weights];
             let corner = [top, left].map(|v| v * OUT / TILE);
             let to = Outputs { plan, y: self.y, image: self.image, depth, corner, block };
-            let product = Product { x: tiles, sources: &sources, stride: None, part, panel, bias };
+            let product =
+                Product { x: tiles, sources: &sources, sums, stride: None, part, panel, bias };
             product.run::<S, F, IN, POINTS, OUT>(s, products, to);
         }
     }
@@ -298,6 +300,8 @@ where
 pub(super) struct Product<'a> {
     pub x: &'a [f32],
     pub sources: &'a Places,
+    /// Of the products: [`ROWS`] channels.
+    pub sums: &'a Places,
     /// From channel to channel of the tiles, where that is not the group's own length.
     pub stride: Option<usize>,
     pub part: &'a Block,
@@ -320,7 +324,7 @@ impl Product<'_> {
     {
         let (part, channels) = (self.part, to.plan.src_channels);
         let length = to.block.count.next_multiple_of(LANES);
-        let sums = Places::new(POINTS, ROWS, length, 0);
+        let sums = self.sums;
         let products = products.room(sums.floats);
         for (i, w) in self.panel.chunks_exact(part.pitch * channels).enumerate() {
             let ((at, length), (to, _)) = (self.sources.groups[i], sums.groups[i]);
@@ -339,7 +343,7 @@ impl Product<'_> {
             let channel = part.first + m;
             let bias = self.bias.get(channel).copied().unwrap_or(0.0);
             for first in (0..length).step_by(LANES) {
-                let rows = columns::<S, F, IN, POINTS, OUT>(s, products, &sums, [m, first]);
+                let rows = columns::<S, F, IN, POINTS, OUT>(s, products, sums, [m, first]);
                 to.finish::<S, F, IN, POINTS, OUT>(s, rows, bias, [channel, first]);
             }
         }

@@ -6,7 +6,7 @@
 use super::Buffers;
 use super::forms::{Down, Form, GROUPS, Places, TILE, Unit, Up};
 use super::plan::{Layout, Plan, pack};
-use super::shift::{Block, blocks};
+use super::shift::{Block, ROWS, blocks};
 use super::winograd::{Lanes, Outputs, Product, SLACK, Tiles, Transform, Way, scatter, transform};
 use crate::cpu::disjoint::Disjoint;
 use crate::cpu::fresh;
@@ -158,7 +158,9 @@ where
         let panel = panel.room(GROUPS * channels * block.pitch);
         Transform { plan, way, w, block, panel }.run(s);
         let (sources, stride) = (self.own, Some(self.stride));
-        let product = Product { x: self.x, sources, stride, part: block, panel, bias };
+        let length = self.tiles.count.next_multiple_of(LANES);
+        let sums = &Places::new(POINTS, ROWS, length, 0);
+        let product = Product { x: self.x, sources, sums, stride, part: block, panel, bias };
         let to = Outputs { plan, y, image: 0, depth: 0, corner: [0; 2], block: self.tiles };
         product.run::<S, F, IN, POINTS, OUT>(s, products, to);
     }
