@@ -39,6 +39,30 @@ fn cameras_json_reads_back_what_was_written() {
     }
 }
 
+/// Cameras alone and the scene with its pictures are the same, where the file's rotations
+/// have few digits too.
+#[test]
+fn a_camera_list_is_straightened_as_a_scene_is() {
+    let (folder, cameras) = made_up(2);
+    let path = folder.path().join("cameras.json");
+    let content = CameraFile { cameras, units: Units::Unknown, near_far: None };
+    save_cameras_json(&path, &content).unwrap();
+    let mut json: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    for value in json["frames"][1]["c2w"].as_array_mut().unwrap() {
+        for v in value.as_array_mut().unwrap() {
+            *v = ((v.as_f64().unwrap() * 1000.0).round() / 1000.0).into();
+        }
+    }
+    std::fs::write(&path, json.to_string()).unwrap();
+    let list = load_cameras_json(&path).unwrap().cameras;
+    let scene = load_scene(folder.path()).unwrap();
+    for (c, frame) in list.iter().zip(&scene.frames) {
+        assert_eq!(c.camera, frame.camera);
+    }
+    assert_ne!(list[1].camera, content.cameras[1].camera);
+}
+
 #[test]
 fn three_dgs_camera_lists_are_read() {
     let (folder, cameras) = made_up(2);
@@ -311,6 +335,49 @@ fn re10k_frames_are_matched_by_time_order_or_number() {
     put(&["p.png", "q.png"]);
     let e = load_scene(folder.path()).unwrap_err().to_string();
     assert!(e.contains("4 pictures"), "{e}");
+}
+
+/// Ten pictures and more without leading zeros: `10.png` is not the third of them.
+#[test]
+fn names_are_sorted_as_people_count() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let line = |i: usize| format!("{} 1 1.5 .5 .5 0 0 1 0 0 {i} 0 1 0 0 0 0 1 0", 1000 * i + 500);
+    let lines: Vec<String> = (0..12).map(line).collect();
+    std::fs::write(at("a.txt"), format!("url://x\n{}\n", lines.join("\n"))).unwrap();
+    let poses: Vec<String> = (0..12).map(|i| format!("1 0 0 -{i} 0 1 0 0 0 0 1 0")).collect();
+    std::fs::write(at("poses.txt"), poses.join("\n")).unwrap();
+    std::fs::write(at("K.txt"), "12 12 6 4").unwrap();
+    let names: [&dyn Fn(usize) -> String; 4] =
+        [&|i| i.to_string(), &|i| (i + 1).to_string(), &|i| format!("frame_{i}"), &|i| {
+            format!("take2-{:02}", i + 95)
+        }];
+    for name in names {
+        let _ = std::fs::remove_dir_all(at("images"));
+        std::fs::create_dir(at("images")).unwrap();
+        for i in 0..12 {
+            image::save_png(&at("images").join(name(i) + ".png"), &noise(12, 8)).unwrap();
+        }
+        for file in ["a.txt", "poses.txt"] {
+            let scene = load_scene(&at(file)).unwrap();
+            assert_eq!(scene.frames.len(), 12);
+            for (i, frame) in scene.frames.iter().enumerate() {
+                let x = -frame.camera.position().x;
+                assert_eq!((&*frame.name, x), (&*name(i), i as f32), "{file}");
+            }
+        }
+    }
+    // Fewer pictures than lines, the first of which is a time stamp too: still indices.
+    let text = format!("url://x\n{}\n", lines.join("\n")).replace("\n500 ", "\n0 ");
+    std::fs::write(at("a.txt"), text).unwrap();
+    std::fs::remove_dir_all(at("images")).unwrap();
+    std::fs::create_dir(at("images")).unwrap();
+    for name in ["images/0.png", "images/7.png"] {
+        image::save_png(&at(name), &noise(12, 8)).unwrap();
+    }
+    let x = |f: &subsplat::io::scene::Frame| -f.camera.position().x;
+    let scene = load_scene(&at("a.txt")).unwrap();
+    assert_eq!(scene.frames.iter().map(x).collect::<Vec<_>>(), [0.0, 7.0]);
 }
 
 #[test]

@@ -93,7 +93,28 @@ fn with_extensions(place: &Path) -> impl Iterator<Item = PathBuf> + '_ {
     })
 }
 
-/// Pictures of a folder, sorted by name; empty if there is no such folder.
+/// What file names are sorted by: a run of digits is one number, so that `9.png` stands
+/// before `10.png`; everything else by character.
+fn counted(path: &Path) -> Vec<(char, usize, String)> {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let (mut key, mut rest) = (Vec::new(), &*name);
+    while let Some(first) = rest.chars().next() {
+        let digits = rest.find(|c: char| !c.is_ascii_digit()).unwrap_or(rest.len());
+        if digits == 0 {
+            key.push((first, 0, String::new()));
+            rest = &rest[first.len_utf8()..];
+        } else {
+            // Of two numbers the longer one is the larger; `0` is where digits sort.
+            let number = rest[..digits].trim_start_matches('0');
+            key.push(('0', number.len(), number.to_owned()));
+            rest = &rest[digits..];
+        }
+    }
+    key
+}
+
+/// Pictures of a folder, sorted by name with numbers in their order; empty if there is
+/// no such folder.
 pub(super) fn list_images(folder: &Path) -> Vec<PathBuf> {
     let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
     let is_picture = |p: &PathBuf| {
@@ -102,14 +123,15 @@ pub(super) fn list_images(folder: &Path) -> Vec<PathBuf> {
     };
     let mut images: Vec<PathBuf> =
         entries.filter_map(|e| Some(e.ok()?.path())).filter(is_picture).collect();
-    images.sort();
+    // `01.png` and `1.png` are the same number.
+    images.sort_by_cached_key(|p| (counted(p), p.clone()));
     images
 }
 
 /// Nearest rotation, where the file's few digits or an exporter's float noise left
 /// something to correct; what [`Camera::new`] would refuse stays as it is, and so
 /// does what f32 cannot express better. Second value: how far off it was.
-fn orthonormal(pose: DMat4) -> (DMat4, f64) {
+pub(super) fn orthonormal(pose: DMat4) -> (DMat4, f64) {
     let error = |r: DMat3| {
         let gram = r.transpose() * r - DMat3::IDENTITY;
         gram.to_cols_array().into_iter().fold(0.0f64, |m, v| m.max(v.abs()))

@@ -16,7 +16,7 @@
 //! 3DGS's list has `img_name, width, height, fx, fy, rotation` (camera to world),
 //! `position` (the eye): same axes, principal point in the middle.
 
-use super::assemble::{Draft, Lens, assemble, camera_error, find_image};
+use super::assemble::{Draft, Lens, assemble, camera_error, find_image, orthonormal};
 use super::scene::{Frame, Scene, SceneFormat, Units};
 use super::{Error, Result, read, write_atomic};
 use crate::camera::{Camera, Intrinsics};
@@ -152,8 +152,16 @@ pub(super) fn matrix(rows: &[Vec<f64>]) -> std::result::Result<DMat4, String> {
     Ok(DMat4::from_cols(row(0), row(1), row(2), row(3)).transpose())
 }
 
-/// Whether a JSON file has this layout, rather than `transforms.json`'s.
-pub(super) fn is_cameras_json(path: &Path) -> Result<bool> {
+/// Whether a pose file has this layout, or is called as if it had: `cameras.json`, or any
+/// other JSON file but `transforms.json` that begins with a camera of this layout.
+///
+/// # Errors
+/// A file of another name that is no JSON.
+pub fn is_cameras_json(path: &Path) -> Result<bool> {
+    let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
+    if ["cameras.json", "transforms.json"].contains(&&*name) || !name.ends_with(".json") {
+        return Ok(name == "cameras.json");
+    }
     let value: serde_json::Value = serde_json::from_slice(&read(path)?)
         .map_err(|e| json_error(path, "a JSON file with cameras", &e))?;
     Ok(value.is_array() || value["frames"][0].get("c2w").is_some())
@@ -248,7 +256,8 @@ pub fn load_cameras_json(path: &Path) -> Result<CameraFile> {
         let (Some((width, height)), Lens::Pixels(k)) = (d.size, d.lens) else { continue };
         let [fx, fy, cx, cy] = k.map(|v| v as f32);
         let intrinsics = Intrinsics { fx, fy, cx, cy, width, height };
-        let camera = Camera::new(intrinsics, d.world_from_camera.as_mat4())
+        let (pose, _) = orthonormal(d.world_from_camera);
+        let camera = Camera::new(intrinsics, pose.as_mat4())
             .map_err(|e| camera_error(path, &d.place, &e))?;
         let depth = d
             .depth

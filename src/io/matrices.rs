@@ -1,6 +1,7 @@
 //! Plain matrices: `poses.txt`, one pose a line (12 or 16 numbers, row by row), and
 //! `K.txt`, the intrinsics in pixels of the stored pictures (3×3, or fx fy cx cy).
-//! Pictures are those of `images/`, sorted by name, one for each line.
+//! Pictures are those of `images/`, sorted by name (numbers in their order), one for each
+//! line.
 //!
 //! Numbers may be separated by white space, commas or brackets; `#` begins a comment.
 

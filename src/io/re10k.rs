@@ -8,9 +8,9 @@
 //!
 //! Frames are looked for in `images/`, `frames/`, a folder with the txt's name, and
 //! beside the txt. They are matched by time stamp where all names are time stamps of
-//! the file (as downloaders write), else in order where there are as many as lines,
-//! else by time stamp where some are, else by number where every name is the index of
-//! a line, from 0.
+//! the file (as downloaders write), else by number where every name is the index of a
+//! line, from 0, else in the order of their names (numbers in theirs) where there are as
+//! many as lines, else by time stamp where some are.
 
 use super::assemble::{Draft, Lens, assemble, list_images};
 use super::scene::{Scene, SceneFormat, Units};
@@ -159,12 +159,12 @@ fn matched(
     let all_stamped = images.iter().all(|p| number(p).is_some_and(|n| stamps.contains(&n)));
     let (list, rule) = if all_stamped {
         (by_time, "time stamp")
+    } else if numbered.len() == images.len() && found(&by_index) == images.len() {
+        (by_index, "number")
     } else if images.len() == cameras.len() {
         return Ok(images.iter().cloned().map(Some).collect());
     } else if found(&by_time) > 0 {
         (by_time, "time stamp")
-    } else if numbered.len() == images.len() && found(&by_index) == images.len() {
-        (by_index, "number")
     } else {
         return Err(Error::format(
             path,

@@ -205,8 +205,6 @@ fn load_file(path: &Path) -> Result<Scene> {
     let folder = path.parent().unwrap_or(Path::new(""));
     let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
     match (name.as_str(), extension.as_str()) {
-        ("cameras.json", _) => cameras_json::load(path),
-        ("transforms.json", _) => transforms::load(path),
         (_, "json") if cameras_json::is_cameras_json(path)? => cameras_json::load(path),
         (_, "json") => transforms::load(path),
         ("cameras.txt" | "images.txt" | "points3d.txt", _) | (_, "bin") => colmap::load(folder),
