@@ -2,14 +2,21 @@
 //! same every time.
 
 mod common;
+#[path = "common/one_splat.rs"]
+mod one_splat;
 #[path = "common/program.rs"]
 mod program;
 
-use program::{Called, SIDE, call_in, call_with, files, workplace};
+use one_splat::save_one_splat;
+use program::{Called, SIDE, call_in, call_with, files, named, workplace};
 use serde_json::Value;
+use std::collections::BTreeSet;
 use std::path::Path;
+use subsplat::camera::{Camera, Intrinsics};
 use subsplat::config::{Config, Preset, SpgrHead};
+use subsplat::io::cameras_json::{CameraFile, save_cameras_json};
 use subsplat::io::image::load;
+use subsplat::io::scene::{Frame, Units, load_scene};
 use subsplat::metrics::psnr;
 use subsplat::model::subsplat::SubSplat;
 use subsplat::model::weights::{Weights, save};
@@ -222,6 +229,11 @@ fn two_loose_photographs() {
     assert!(moved == inverse);
     let (_, turned) = run("d", &["--fov", "90", "--move", "-0.5,0,0.25", "--turn", "0,3,0"]);
     assert!(moved != turned);
+    // Another scene's protocol beside them has indices that a pair does not.
+    let protocol = r#"{"tests": [{"context": [0, 1], "target": [7]}]}"#;
+    std::fs::write(place.path().join("scene/images/protocol.json"), protocol).unwrap();
+    let (_, beside) = run("e", &["--fov", "90", "--move", "-0.5,0,0.25"]);
+    assert!(moved == beside);
     let called = call_with(
         place.path(),
         &[
@@ -318,6 +330,109 @@ fn output_never_overwrites_what_is_read() {
     assert!(called.error().contains("choose another"), "{}", called.error());
     assert_eq!(std::fs::read(place.path().join("scene/cameras.json")).unwrap(), before);
     assert_eq!(load(&place.path().join("scene/images/view0.png")).unwrap().width, SIDE);
+
+    // The pictures are safe in another folder, but the poses would not be.
+    let at = |name: &str| place.path().join(name);
+    for name in ["rgb", "ngp", "bare"] {
+        std::fs::create_dir(at(name)).unwrap();
+    }
+    std::fs::rename(at("scene/images"), at("rgb/rgb")).unwrap();
+    let listed = String::from_utf8(before).unwrap().replace("images/", "rgb/");
+    std::fs::write(at("rgb/cameras.json"), &listed).unwrap();
+    // nerfstudio's, of which only the cameras.json that is written would be read.
+    let turned = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]";
+    let frame = |i: usize| {
+        let pose = turned.replacen(",0]", &format!(",{i}]"), 1);
+        format!(r#"{{"file_path": "../rgb/rgb/view{i}.png", "transform_matrix": {pose}}}"#)
+    };
+    let frames = [frame(0), frame(2)].join(",");
+    let transforms = format!(r#"{{"fl_x": 100, "frames": [{frames}]}}"#);
+    std::fs::write(at("ngp/transforms.json"), &transforms).unwrap();
+    std::fs::write(at("bare/transforms.json"), &transforms).unwrap();
+    let quick = "--input-size 32 --no-check --near 0.5 --far 50";
+    for (input, out) in [
+        ("rgb", "rgb"),
+        ("rgb/cameras.json", "bare/../rgb"),
+        ("ngp", "ngp"),
+        ("ngp/transforms.json", "ngp"),
+        ("rgb", "ngp"),
+    ] {
+        let words = format!("run {input} --context 0,1 {quick} -o {out}");
+        let called = call_in(place.path(), &words);
+        assert_eq!(called.code, 1, "{words}");
+        assert!(called.error().contains("choose another"), "{}", called.error());
+    }
+    let called = call_in(&at("rgb"), &format!("run cameras.json --context 0,1 {quick} -o ."));
+    assert!(called.error().contains("choose another"), "{}", called.error());
+    assert_eq!(std::fs::read_to_string(at("rgb/cameras.json")).unwrap(), listed);
+    let left = files(&at("ngp"));
+    assert_eq!(left, [Path::new("transforms.json")]);
+    // A folder of an earlier run is written again.
+    for _ in 0..2 {
+        let words = format!("run rgb/cameras.json --context 0,2 {quick} -o again");
+        let called = call_in(place.path(), &words);
+        assert_eq!(called.code, 0, "{}", called.stderr);
+    }
+}
+
+/// A least opacity that leaves nothing is told before pictures are rendered.
+#[test]
+fn nothing_is_rendered_of_a_scene_that_cannot_be_saved() {
+    let place = workplace();
+    let words = "run scene --context 0,2 --input-size 32 --no-check --min-opacity 0.99999994";
+    let called = call_in(place.path(), words);
+    assert_eq!(called.code, 1, "{}", called.stderr);
+    let error = called.error();
+    assert!(error.contains("--min-opacity: expected at most 0."), "{error}");
+    assert_eq!(files(&place.path().join("out")), [""; 0].map(std::path::PathBuf::from));
+}
+
+/// poses.txt means what it is said to mean.
+#[test]
+fn plain_matrices_take_a_convention() {
+    let place = workplace();
+    let scene = load_scene(&place.path().join("scene")).unwrap();
+    let at = |name: &str| place.path().join("scene").join(name);
+    let pose = |f: &Frame| {
+        let m = f.camera.camera_from_world().transpose().to_cols_array();
+        m.map(|v| v.to_string()).join(" ")
+    };
+    let poses: Vec<String> = scene.frames.iter().map(pose).collect();
+    std::fs::write(at("poses.txt"), poses.join("\n")).unwrap();
+    let k = scene.frames[0].camera.intrinsics;
+    std::fs::write(at("K.txt"), format!("{} {} {} {}", k.fx, k.fy, k.cx, k.cy)).unwrap();
+    let baseline = |words: &str| {
+        let called = call_in(place.path(), &format!("--json check {words} --context 0,2"));
+        called.json()["pairs"][0]["baseline"].as_f64().unwrap()
+    };
+    let want = baseline("scene");
+    std::fs::remove_file(at("cameras.json")).unwrap();
+    for named in ["scene", "scene/poses.txt"] {
+        let got = baseline(&format!("{named} --pose-convention opencv-w2c"));
+        assert!((got - want).abs() < 1e-4 * want, "{got} {want}");
+    }
+    let other = baseline("scene --pose-convention opencv-c2w");
+    assert_eq!(other, baseline("scene"));
+    assert!((other - want).abs() > 1e-3 * want, "the convention has no effect");
+}
+
+/// Colour and depth of frames whose names end alike.
+#[test]
+fn depth_pictures_do_not_overwrite_colour() {
+    let place = tempfile::tempdir().unwrap();
+    let at = |name: &str| place.path().join(name);
+    save_one_splat(&at("one.ply"));
+    let k = Intrinsics::from_fov_x(1.0, 32, 32);
+    let camera = Camera::new(k, glam::Mat4::IDENTITY).unwrap();
+    let cameras = ["a.png", "a_depth.png", "depth/a.png"].map(|n| named(n.to_owned(), camera));
+    let content = CameraFile { cameras: cameras.to_vec(), units: Units::Unknown, near_far: None };
+    save_cameras_json(&at("cameras.json"), &content).unwrap();
+    let report = done(&call_in(place.path(), "--json render one.ply --depth -o out"));
+    let views = report["views"].as_array().unwrap();
+    let written = views.iter().flat_map(|v| [&v["file"], &v["depth_file"]]);
+    let written: BTreeSet<&str> = written.map(|f| f.as_str().unwrap()).collect();
+    assert_eq!((written.len(), files(&at("out")).len()), (6, 6), "{written:?}");
+    assert!(written.contains("out/a_depth.png") && written.contains("out/depth/a.png"));
 }
 
 #[test]

@@ -2,9 +2,12 @@
 //! `error:` and names the thing, the same in the one object of `--json`, and nothing
 //! half written.
 
+#[path = "common/one_splat.rs"]
+mod one_splat;
 #[path = "common/program.rs"]
 mod program;
 
+use one_splat::save_one_splat;
 use program::{call_in, call_with, files, workplace};
 use std::path::Path;
 
@@ -31,7 +34,7 @@ fn refused(folder: &Path, rows: &[Row]) {
 fn bad_arguments() {
     let place = workplace();
     std::fs::write(place.path().join("file"), "text").unwrap();
-    let rows: [Row; 40] = [
+    let rows: [Row; 43] = [
         ("run nowhere", "nowhere"),
         ("check nowhere", "nowhere"),
         ("info nowhere", "nowhere"),
@@ -56,6 +59,13 @@ fn bad_arguments() {
         ("run scene --context 0,2 --upscale 9", "--upscale 9"),
         ("run scene --frames 0 --path orbit", "--frames"),
         ("run scene --min-opacity nan", "--min-opacity"),
+        ("run scene --min-opacity 1", "--min-opacity"),
+        ("run scene --pose-convention opengl-c2w", "--pose-convention"),
+        (
+            "run scene/images/view0.png scene/images/view2.png --fov 50 --move 1,0,0 \
+             --pose-convention opengl-c2w",
+            "--pose-a or --pose-b",
+        ),
         ("run scene --background 0,2,0", "--background"),
         ("run scene --fov 50", "--fov"),
         ("run scene --threads 0", "--threads"),
@@ -117,6 +127,41 @@ fn broken_files() {
         ("info empty.spz", "empty.spz"),
         ("render scene.ply --cameras poseless", "scene.ply"),
     ];
+    refused(place.path(), &rows);
+}
+
+/// What is wrong with a camera list is told, though another reader might get through, and
+/// so is a picture that no memory holds.
+#[test]
+fn cameras_of_a_finished_scene() {
+    let place = workplace();
+    let at = |name: &str| place.path().join(name);
+    save_one_splat(&at("one.ply"));
+    let listed = std::fs::read_to_string(at("scene/cameras.json")).unwrap();
+    let mut json: serde_json::Value = serde_json::from_str(&listed).unwrap();
+    json["frames"][1]["file"] = "images/nowhere.png".into();
+    json["frames"][1]["fx"] = 0.0.into();
+    std::fs::write(at("scene/cameras.json"), json.to_string()).unwrap();
+    std::fs::write(at("list.json"), json.to_string()).unwrap();
+    std::fs::write(at("cut.json"), &listed[..listed.len() / 2]).unwrap();
+    json["frames"][1]["fx"] = 9.0.into();
+    json["frames"][1]["width"] = 32768.into();
+    json["frames"][1]["height"] = 32768.into();
+    std::fs::write(at("huge.json"), json.to_string()).unwrap();
+    let mut rows: Vec<Row> = vec![
+        ("render one.ply --cameras scene", "cameras.json frame 1: expected a camera focal length"),
+        ("render one.ply --cameras list.json", "list.json frame 1"),
+        ("render one.ply --cameras cut.json", "cut.json:"),
+    ];
+    // 32768 x 32768 pixels of 30 bytes; some machines have that.
+    let text = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
+    let kib = |key: &str| -> u64 {
+        let line = text.lines().find(|l| l.starts_with(key));
+        line.and_then(|l| l.split_whitespace().nth(1)?.parse().ok()).unwrap_or(u64::MAX / 4)
+    };
+    if kib("MemAvailable:") + kib("SwapFree:") < 30 << 20 {
+        rows.push(("render one.ply --cameras huge.json", "frame nowhere: 32768x32768: needs"));
+    }
     refused(place.path(), &rows);
 }
 

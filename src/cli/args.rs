@@ -166,7 +166,7 @@ pub struct RunArgs {
     /// RealEstate10K txt), or two photographs.
     #[arg(required = true, num_args = 1..=2, value_name = "SCENE | IMG IMG")]
     pub input: Vec<PathBuf>,
-    /// Folder for everything that is written.
+    /// Folder for everything that is written; not one that holds a scene's poses.
     #[arg(short, long, default_value = "out", value_name = "DIR")]
     pub out: PathBuf,
     /// How photographs become a scene.
@@ -297,9 +297,10 @@ pub struct PairArgs {
     /// Pose of the second photograph: 12 or 16 numbers, row by row.
     #[arg(long, allow_hyphen_values = true, value_name = "M", conflicts_with_all = ["translation", "turn"])]
     pub pose_b: Option<String>,
-    /// What --pose-a and --pose-b are.
-    #[arg(long, value_enum, default_value = "opencv-c2w")]
-    pub pose_convention: PoseConventionArg,
+    /// What --pose-a and --pose-b are, or the lines of a scene's poses.txt. Default:
+    /// opencv-c2w.
+    #[arg(long, value_enum)]
+    pub pose_convention: Option<PoseConventionArg>,
 }
 
 /// Axes and direction of a pose matrix.
@@ -340,7 +341,7 @@ pub struct RenderArgs {
     /// Highest SH degree evaluated.
     #[arg(long, default_value_t = 4, value_name = "0…4")]
     pub sh_degree: usize,
-    /// Write 16-bit depth pictures too.
+    /// Write 16-bit depth pictures too, in depth/ of that folder.
     #[arg(long)]
     pub depth: bool,
     /// How it is rendered.

@@ -1,11 +1,12 @@
 //! Which frames and cameras a command means.
 
+use super::pair::folder_of;
 use anyhow::{Context, Result, bail, ensure};
 use glam::{Mat4, Quat, Vec3};
 use std::path::Path;
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::io::protocol::{Views, load_protocol};
-use subsplat::io::scene::Scene;
+use subsplat::io::scene::{Scene, SceneFormat};
 
 /// Width and height of `N` or `WxH`, px.
 pub fn size(text: &str) -> Result<(usize, usize)> {
@@ -91,11 +92,11 @@ pub fn file_stems(names: &[String]) -> Vec<String> {
     names.iter().enumerate().map(unique).collect()
 }
 
-/// The scene's protocol.json, if it has one: its tests.
+/// The scene's protocol.json, if it has one: its tests. What lies beside two loose
+/// photographs speaks of another scene's frames.
 pub fn protocol(path: &Path, scene: &Scene) -> Result<Vec<Views>> {
-    let folder = if path.is_dir() { path } else { path.parent().unwrap_or(path) };
-    let file = folder.join("protocol.json");
-    if !file.is_file() {
+    let file = folder_of(path).join("protocol.json");
+    if scene.source == SceneFormat::Pair || !file.is_file() {
         return Ok(Vec::new());
     }
     let tests = load_protocol(&file)?.tests;

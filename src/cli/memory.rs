@@ -23,10 +23,10 @@ pub fn check_run(config: &Config, views: usize, (w, h): (usize, usize)) -> Resul
     fits(&what, network.saturating_add(rendered), available())
 }
 
-/// Refuses a picture that cannot fit.
-pub fn check_picture((w, h): (usize, usize)) -> Result<()> {
+/// Refuses a picture that cannot fit; `what` asks for it.
+pub fn check_picture(what: &str, (w, h): (usize, usize)) -> Result<()> {
     let bytes = (w as u64).saturating_mul(h as u64).saturating_mul(PER_RENDERED);
-    fits(&format!("--size {w}x{h}"), bytes, available())
+    fits(&format!("{what} {w}x{h}"), bytes, available())
 }
 
 fn fits(what: &str, needed: u64, available: Option<u64>) -> Result<()> {
@@ -64,6 +64,6 @@ mod tests {
         let config = Config::x4();
         // Far beyond any machine, and no overflow on the way.
         assert!(available().is_none() || check_run(&config, 2, (1 << 20, 1 << 20)).is_err());
-        assert!(available().is_none() || check_picture((usize::MAX, usize::MAX)).is_err());
+        assert!(available().is_none() || check_picture("", (usize::MAX, usize::MAX)).is_err());
     }
 }

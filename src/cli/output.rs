@@ -6,6 +6,7 @@
 
 use super::args::SceneFormatArg;
 use super::frames;
+use super::pair::folder_of;
 use super::report::warn;
 use anyhow::{Context, Result, bail};
 use indicatif::ProgressBar;
@@ -17,7 +18,7 @@ use subsplat::config::Config;
 use subsplat::data::crop::CropOptions;
 use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
 use subsplat::io::image::{Depth, Rgb, save_depth_png, save_png};
-use subsplat::io::scene::{Scene, Units};
+use subsplat::io::scene::{Scene, SceneFormat, Units, is_scene};
 use subsplat::io::{SaveOptions, save_splats};
 use subsplat::metrics::{psnr, ssim};
 use subsplat::pipeline::{Photo, Reconstruction};
@@ -70,10 +71,12 @@ impl Scored {
 }
 
 /// Makes the output folder; before the network runs, so that nobody waits for nothing.
+/// `input`: what the scene was read from.
 ///
 /// # Errors
-/// It cannot be made; it holds the very scene that is read, which would be overwritten.
-pub fn prepare(out: &Path, scene: &Scene) -> Result<()> {
+/// It cannot be made; it holds the very scene that is read, or poses of another one, which
+/// would be overwritten or hidden by the new cameras.json.
+pub fn prepare(out: &Path, input: &Path, scene: &Scene) -> Result<()> {
     let make = |folder: &Path| {
         std::fs::create_dir_all(folder)
             .with_context(|| format!("output folder {}", folder.display()))
@@ -89,6 +92,16 @@ pub fn prepare(out: &Path, scene: &Scene) -> Result<()> {
                 out.display()
             );
         }
+    }
+    let own = scene.source != SceneFormat::Pair
+        && std::fs::canonicalize(folder_of(input)).is_ok_and(|folder| folder == real);
+    // Where cameras.json is read already, an earlier run's may lie.
+    if own || (is_scene(&real) && !real.join("cameras.json").is_file()) {
+        bail!(
+            "output folder {}: holds the poses of a scene, which the cameras.json that is written \
+             would replace; choose another",
+            out.display()
+        );
     }
     FOLDERS.iter().try_for_each(|f| make(&out.join(f)))
 }

@@ -6,8 +6,8 @@ use glam::{EulerRot, Mat4, Quat, Vec3};
 use std::path::{Path, PathBuf};
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::io::image::probe;
-use subsplat::io::matrices::{PoseConvention, parse_intrinsics, parse_matrix};
-use subsplat::io::scene::{Scene, load_scene};
+use subsplat::io::matrices::{self, PoseConvention, parse_intrinsics, parse_matrix};
+use subsplat::io::scene::{Scene, SceneFormat, load_scene};
 
 /// The scene that `input` names: a scene's path, or two photographs with the cameras
 /// of `args`.
@@ -24,14 +24,39 @@ pub fn load(input: &[PathBuf], args: &PairArgs) -> Result<Scene> {
                 "{}: expected a scene or two photographs, got one photograph",
                 one.display()
             );
-            Ok(load_scene(one)?)
+            let scene = load_scene(one)?;
+            let Some(asked) = args.pose_convention else { return Ok(scene) };
+            ensure!(
+                scene.source == SceneFormat::Matrices,
+                "--pose-convention: expected two photographs or a scene with poses.txt, got {} ({})",
+                one.display(),
+                scene.source.name()
+            );
+            let folder = folder_of(one);
+            Ok(matrices::load(folder, asked.into())?)
         }
         _ => bail!("expected a scene or two photographs, got {} paths", input.len()),
     }
 }
 
+/// The folder of a scene that is named by it or by its pose file.
+pub fn folder_of(scene: &Path) -> &Path {
+    let parent = || scene.parent().filter(|p| !p.as_os_str().is_empty());
+    if scene.is_dir() { scene } else { parent().unwrap_or(Path::new(".")) }
+}
+
+impl From<PoseConventionArg> for PoseConvention {
+    fn from(arg: PoseConventionArg) -> Self {
+        match arg {
+            PoseConventionArg::OpencvC2w => Self::WorldFromCameraOpenCv,
+            PoseConventionArg::OpencvW2c => Self::CameraFromWorldOpenCv,
+            PoseConventionArg::OpenglC2w => Self::WorldFromCameraOpenGl,
+        }
+    }
+}
+
 impl PairArgs {
-    /// A flag of these that was given.
+    /// A flag of these that was given and that only photographs have a use for.
     fn given(&self) -> Option<&'static str> {
         let flags = [
             (self.fov.is_some(), "--fov"),
@@ -47,12 +72,18 @@ impl PairArgs {
 
 /// The scene of photographs `a` and `b`.
 fn of_photographs(a: &Path, b: &Path, args: &PairArgs) -> Result<Scene> {
+    ensure!(
+        args.pose_convention.is_none() || args.pose_a.is_some() || args.pose_b.is_some(),
+        "--pose-convention: expected --pose-a or --pose-b beside it, got neither (--move and \
+         --turn are in OpenCV axes)"
+    );
+    let convention = args.pose_convention.map_or(PoseConvention::default(), Into::into);
     let pose_a = match &args.pose_a {
-        Some(text) => pose(text, "--pose-a", args.pose_convention)?,
+        Some(text) => pose(text, "--pose-a", convention)?,
         None => Mat4::IDENTITY,
     };
     let pose_b = match &args.pose_b {
-        Some(text) => pose(text, "--pose-b", args.pose_convention)?,
+        Some(text) => pose(text, "--pose-b", convention)?,
         None if args.translation.is_none() => bail!(
             "two photographs need to know where the second camera stands: give --move X,Y,Z (and \
              --turn RX,RY,RZ) in the first camera's frame, or --pose-b, or a scene with a pose file"
@@ -69,14 +100,9 @@ fn of_photographs(a: &Path, b: &Path, args: &PairArgs) -> Result<Scene> {
     Ok(Scene::from_pair(a, b, camera(a, pose_a)?, camera(b, pose_b)?)?)
 }
 
-fn pose(text: &str, flag: &str, convention: PoseConventionArg) -> Result<Mat4> {
+fn pose(text: &str, flag: &str, convention: PoseConvention) -> Result<Mat4> {
     let matrix = parse_matrix(text)
         .map_err(|got| anyhow::anyhow!("{flag}: expected 12 or 16 numbers, got {got}"))?;
-    let convention = match convention {
-        PoseConventionArg::OpencvC2w => PoseConvention::WorldFromCameraOpenCv,
-        PoseConventionArg::OpencvW2c => PoseConvention::CameraFromWorldOpenCv,
-        PoseConventionArg::OpenglC2w => PoseConvention::WorldFromCameraOpenGl,
-    };
     Ok(convention.to_world_from_camera(matrix).as_mat4())
 }
 

@@ -10,7 +10,7 @@ use serde_json::json;
 use std::path::Path;
 use subsplat::abi::{Convention, RasterOptions};
 use subsplat::camera::{Camera, Intrinsics};
-use subsplat::io::cameras_json::load_cameras_json;
+use subsplat::io::cameras_json::{is_cameras_json, load_cameras_json};
 use subsplat::io::image::{Depth, save_depth_png, save_png};
 use subsplat::io::load_with_comments;
 use subsplat::io::scene::load_scene;
@@ -45,9 +45,11 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
     check(args)?;
     let (splats, comments) = progress.stage("scene", |_| load_with_comments(&args.scene))?;
     let cameras = cameras(args, &splats)?;
+    check_sizes(&cameras)?;
     let options = options(&args.look, args.near, args.sh_degree, &comments)?;
-    std::fs::create_dir_all(&args.out)
-        .with_context(|| format!("output folder {}", args.out.display()))?;
+    let folder = if args.depth { args.out.join("depth") } else { args.out.clone() };
+    std::fs::create_dir_all(&folder)
+        .with_context(|| format!("output folder {}", folder.display()))?;
     let mut views = Vec::new();
     let mut renderer = open(&args.look);
     progress.steps("rendering", cameras.len(), |bar| {
@@ -60,7 +62,7 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
             let file = file.display().to_string();
             let mut view = json!({ "file": file, "width": width, "height": height });
             if args.depth {
-                let file = args.out.join(format!("{name}_depth.png"));
+                let file = args.out.join(format!("depth/{name}.png"));
                 let unit = save_depth_png(&file, &Depth { width, height, data: picture.depth })?;
                 view["depth_file"] = json!(file.display().to_string());
                 view["depth_unit"] = json!(unit);
@@ -98,7 +100,21 @@ fn check(args: &RenderArgs) -> Result<()> {
     ensure!(args.sh_degree <= 4, "--sh-degree: expected 0 to 4, got {}", args.sh_degree);
     check_near(args.near)?;
     frames::count(args.frames)?;
-    args.size.as_deref().map_or(Ok(()), |text| memory::check_picture(frames::size(text)?))
+    args.size.as_deref().map_or(Ok(()), |text| memory::check_picture("--size", frames::size(text)?))
+}
+
+/// Refuses cameras of a file whose pictures the machine cannot hold, by the frame's name.
+fn check_sizes(cameras: &[(String, Camera)]) -> Result<()> {
+    let mut fits = None;
+    for (name, camera) in cameras {
+        let size = (camera.intrinsics.width, camera.intrinsics.height);
+        // A path has thousands of one size.
+        if fits != Some(size) {
+            memory::check_picture(&format!("frame {name}:"), size)?;
+            fits = Some(size);
+        }
+    }
+    Ok(())
 }
 
 /// `--near`, checked.
@@ -196,9 +212,8 @@ pub fn read_cameras(source: &Path) -> Result<Vec<(String, Camera)>> {
     let inside = source.join("cameras.json");
     let list = if inside.is_file() { &inside } else { source };
     // A camera list needs no pictures; any other pose file goes through its reader.
-    if list.is_file()
-        && let Ok(content) = load_cameras_json(list)
-    {
+    if list.is_file() && is_cameras_json(list)? {
+        let content = load_cameras_json(list)?;
         let name = |file: &str| {
             let file = file.strip_prefix("images/").unwrap_or(file);
             Path::new(file).with_extension("").to_string_lossy().into_owned()

@@ -19,6 +19,7 @@ use subsplat::io::SaveOptions;
 use subsplat::io::scene::Scene;
 use subsplat::ops::Backend;
 use subsplat::pipeline::{self, Photo, Reconstruction, Reconstructor, Request};
+use subsplat::splats::Splats;
 
 /// Most targets that are chosen without being asked for.
 const DEFAULT_TARGETS: usize = 30;
@@ -45,7 +46,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     check_size(&model, plan.context.len(), (w, h))?;
     let r = model.config().upscale;
     let targets = targets(args, &plan, (w * r, h * r))?;
-    output::prepare(&args.out, &plan.scene)?;
+    output::prepare(&args.out, &args.input[0], &plan.scene)?;
     let photos = photographs(&plan.scene, &plan.context, &mut progress)?;
     let reports = match args.source.no_check {
         true => Vec::new(),
@@ -62,6 +63,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
         model.reconstruct_with(&photos, &request, &mut |name| bar.set_message(name))
     })?;
     drop(photos);
+    keeps_some(&result.splats, args.min_opacity)?;
     let range = range::looked(range, &result);
     progress.split_last(&result.seconds);
     result.warnings.extend(backend.warning());
@@ -96,6 +98,18 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     done.finish(args, &plan, progress, answer)
 }
 
+/// Refuses a least opacity that leaves nothing to save, before any picture is rendered.
+fn keeps_some(splats: &Splats, least: f32) -> Result<()> {
+    let opacities = (0..splats.len()).map(|i| splats.opacity(i));
+    let most = opacities.fold(0.0f32, f32::max);
+    ensure!(
+        most >= least,
+        "--min-opacity: expected at most {most}, the highest opacity of {} Gaussians, got {least}",
+        splats.len()
+    );
+    Ok(())
+}
+
 /// The kernels of `device`, or the CPU's with a warning where that fails.
 fn backend(device: &str) -> Backend {
     Backend::open(device).unwrap_or_else(|e| {
@@ -110,8 +124,8 @@ fn plan(args: &RunArgs, progress: &mut Progress) -> Result<Plan> {
     render::background(&args.look)?;
     frames::count(args.frames)?;
     ensure!(
-        (0.0..=1.0).contains(&args.min_opacity),
-        "--min-opacity: expected 0 to 1, got {}",
+        (0.0..1.0).contains(&args.min_opacity),
+        "--min-opacity: expected 0 to below 1 (1 leaves nothing), got {}",
         args.min_opacity
     );
     let scene = progress.stage("scene", |_| pair::load(&args.input, &args.source.pair))?;

@@ -70,7 +70,7 @@ fn plan(args: &ViewArgs) -> Result<Plan> {
     render::background(&args.look())?;
     render::check_near(args.source.near)?;
     let size = args.size.as_deref().map(frames::size).transpose()?;
-    size.map_or(Ok(()), memory::check_picture)?;
+    size.map_or(Ok(()), |size| memory::check_picture("--size", size))?;
     args.frames.map_or(Ok(0), frames::count)?;
     let device = args.device.parse().unwrap_or_else(|e: Infallible| match e {});
     if device == DeviceChoice::Cpu {
