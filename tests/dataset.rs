@@ -214,6 +214,37 @@ fn folders_of_scenes_are_data_sets() {
     assert_eq!((one.len(), one.stream(0, 0).next_example(0).unwrap().near_far), (1, (2.0, 3.0)));
 }
 
+/// A camera that stands still for a while says nothing of depth there, and is no end of a
+/// training.
+#[test]
+fn pairs_without_a_baseline_are_passed_over() {
+    let folder = tempfile::tempdir().unwrap();
+    let still = |name: &str, moves: usize| {
+        let path = folder.path().join(name);
+        scene_folder(&path, 12, Units::Unknown, None);
+        let file = path.join("cameras.json");
+        let mut json: serde_json::Value =
+            serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+        let first = json["frames"][0]["c2w"].clone();
+        for frame in json["frames"].as_array_mut().unwrap().iter_mut().skip(moves) {
+            frame["c2w"] = first.clone();
+        }
+        std::fs::write(file, json.to_string()).unwrap();
+        path
+    };
+    let (half, all) = (still("half", 3), still("all", 0));
+    let data = open(&half, options(false));
+    assert!((0..40).any(|i| data.example(1, i, 0).unwrap().is_none()));
+    for i in 0..40 {
+        let e = data.serve(1, i, 0).unwrap().1;
+        assert!(e.context[0].camera.position() != e.context[1].camera.position());
+    }
+    let e = open(&all, options(false)).serve(1, 0, 0).unwrap_err().to_string();
+    assert!(e.contains("a camera that moves or near and far given"), "{e}");
+    let given = ExampleOptions { near_far: Some((2.0, 3.0)), ..options(false) };
+    assert_eq!(open(&all, given).serve(1, 0, 0).unwrap().1.near_far, (2.0, 3.0));
+}
+
 fn posed() -> Posed {
     let (w, h) = (48, 32);
     let k = Intrinsics { fx: 50.0, fy: 47.0, cx: 20.3, cy: 17.1, width: w, height: h };

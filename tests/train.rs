@@ -1,7 +1,14 @@
 //! The training loop on a tiny network: stopping changes nothing, bad steps change
 //! nothing, examples are learnt, files are whole.
 
+#[path = "common/made_up.rs"]
+mod made_up;
+#[path = "common/noise.rs"]
+mod noise;
+
 use std::path::Path;
+use subsplat::io::cameras_json::{CameraFile, save_cameras_json};
+use subsplat::io::scene::Units;
 use subsplat::train::TrainConfig;
 use subsplat::train::checkpoint;
 use subsplat::train::optimizer::State;
@@ -182,6 +189,73 @@ fn a_step_that_is_not_finite_changes_nothing() {
     assert_ne!(state(&training), before);
 }
 
+/// What a process that was killed left: rows of lost steps, half a row, no weights.
+#[test]
+fn a_killed_run_leaves_no_row_twice_and_gets_its_weights() {
+    let config = tiny("depth");
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let nothing = Validator::new(&config, None).unwrap();
+    let run = |steps: u64| {
+        let mut training = Training::open(&config, folder.path()).unwrap();
+        let limits = Limits { steps: Some(steps), ..Limits::default() };
+        training.run(limits, &nothing, &mut |_| {}).unwrap();
+    };
+    // Nothing done and nothing to go on from: no weights.
+    run(0);
+    assert!(!at("weights.safetensors").exists());
+    run(12);
+    let whole = ["log.csv", "validation.csv"].map(|n| std::fs::read_to_string(at(n)).unwrap());
+    assert_eq!(whole.each_ref().map(|t| t.lines().count()), [2, 2], "{whole:?}");
+    std::fs::write(at("log.csv"), format!("{}20,1\n2", whole[0])).unwrap();
+    std::fs::write(at("validation.csv"), format!("{}13,1,rooms\n", whole[1])).unwrap();
+    std::fs::remove_file(at("weights.safetensors")).unwrap();
+    run(0);
+    let left = ["log.csv", "validation.csv"].map(|n| std::fs::read_to_string(at(n)).unwrap());
+    assert_eq!(left, whole);
+    assert!(at("weights.safetensors").is_file());
+    run(9);
+    let log = std::fs::read_to_string(at("log.csv")).unwrap();
+    let steps: Vec<&str> = log.lines().skip(1).filter_map(|l| l.split(',').next()).collect();
+    assert_eq!(steps, ["10", "20"]);
+    // Nothing is rendered in this phase: empty, and not 0.
+    let header: Vec<&str> = log.lines().next().unwrap().split(',').collect();
+    let row: Vec<&str> = log.lines().nth(1).unwrap().split(',').collect();
+    let cell = |name: &str| row[header.iter().position(|h| *h == name).unwrap()];
+    assert_eq!(["psnr", "dssim", "lpips"].map(cell), [""; 3]);
+    assert!(cell("cross_entropy").parse::<f64>().unwrap() > 0.0);
+}
+
+/// Rows of numbers that nothing measured would draw a line at 0.
+#[test]
+fn terms_that_are_not_measured_are_not_numbers() {
+    let mut config = tiny("render");
+    config.loss.dssim = 0.0;
+    let folder = tempfile::tempdir().unwrap();
+    let terms = Training::open(&config, folder.path()).unwrap().step().unwrap().unwrap().terms;
+    assert!(terms.dssim.is_nan() && terms.lpips.is_nan(), "{terms:?}");
+    assert!(terms.mse > 0.0 && terms.loss > 0.0 && terms.disparity > 0.0, "{terms:?}");
+}
+
+/// A test without a picture to compare with is no 0 dB.
+#[test]
+fn photographs_without_targets_are_refused() {
+    let (made, cameras) = made_up::made_up(3);
+    let content = CameraFile { cameras, units: Units::Unknown, near_far: Some((1.0, 9.0)) };
+    save_cameras_json(&made.path().join("cameras.json"), &content).unwrap();
+    let refused = |tests: &str| {
+        let file = made.path().join("protocol.json");
+        std::fs::write(file, format!(r#"{{"tests": [{tests}]}}"#)).unwrap();
+        let found = Validator::new(&tiny("render"), Some(made.path()));
+        found.err().map(|e| e.to_string()).unwrap_or_default()
+    };
+    for test in [r#"{"context": [0, 2], "target": []}"#, r#"{"context": [0], "target": [1]}"#] {
+        let error = refused(test);
+        assert!(error.contains("protocol.json") && error.contains("and a target"), "{error}");
+    }
+    assert_eq!(refused(r#"{"context": [0, 2], "target": [1]}"#), "");
+}
+
 #[test]
 fn many_bad_steps_end_the_run() {
     let mut config = tiny("depth");
@@ -279,6 +353,19 @@ fn errors_name_key_and_value() {
         ("batch = 2", "batch = 2\n[loss]\nlpips = 0.05", "lpips_weights"),
         ("batch = 2", "batch = 2\n[optimizer]\naverage = 1.5", "optimizer.average"),
         ("batch = 2", "batch = 2\n[optimizer]\nfreeze_backbone = true", "freeze_backbone"),
+        ("batch = 2", "batch = 2\n[optimizer]\nbetas = [1.0, 0.9]", "optimizer.betas"),
+        ("batch = 2", "batch = 2\n[optimizer]\nbetas = [nan, 0.9]", "optimizer.betas"),
+        ("batch = 2", "batch = 2\n[optimizer]\nepsilon = 0.0", "optimizer.epsilon"),
+        ("batch = 2", "batch = 2\n[optimizer]\nepsilon = nan", "optimizer.epsilon"),
+        ("batch = 2", "batch = 2\n[loss]\nopacity_start = inf", "loss.opacity_start"),
+        ("rate = 3e-3", "rate = 3e-3\nfloor = nan", "schedule.floor"),
+        ("batch = 2", "batch = 4294967296", "batch"),
+        ("batch = 2", "batch = 2\nlanes = 4294967296", "lanes"),
+        ("input = [32, 32]", "input = [4294967296, 32]", "data.input"),
+        ("input = [32, 32]", "input = [32, 32]\ntargets = 4294967296", "data.targets"),
+        ("window = 2", "window = 4294967296", "data.window"),
+        ("replay = 2", "replay = 4294967296", "data.replay"),
+        ("[validate]\nscenes = 1", "[validate]\nscenes = 4294967296", "validate.scenes"),
     ];
     for (old, new, named) in rows {
         let text = TINY.replace("PHASE", "depth").replace(old, new);
@@ -371,6 +458,10 @@ fn the_program_trains_and_goes_on() {
     assert!(steps == 1 || steps == 2, "{steps}");
     assert_eq!((of("train/psnr"), of("rooms/psnr"), of("photos/psnr")), (steps, 1, 0));
     assert!(of("rooms/sheet") == 1 && of("IEND") == 1);
+    // No step, no weights to name.
+    let (_, stdout, stderr) = call(folder.path(), "--json train t.toml --out none --steps 0");
+    let report = serde_json::from_str::<serde_json::Value>(&stdout).unwrap();
+    assert!(report["weights"].is_null() && !stderr.contains("weights.safe"), "{report} {stderr}");
     let (code, _, stderr) = call(folder.path(), "train t.toml --out run --minutes 0");
     assert!(code == 1 && stderr.contains("--minutes"), "{stderr}");
 }

@@ -68,19 +68,18 @@ pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
         warn(format!("{e:#}: TensorBoard's file ends there"));
     }
     let progress = training.progress();
-    say(format!(
-        "{} of {} steps done; weights in {}",
-        progress.step,
-        config.steps,
-        args.out.join("weights.safetensors").display()
-    ));
+    // None before the first checkpoint.
+    let weights = Some(args.out.join("weights.safetensors")).filter(|file| file.is_file());
+    let place = weights.as_ref().map(|file| format!("; weights in {}", file.display()));
+    let (done, steps) = (progress.step, config.steps);
+    say(format!("{done} of {steps} steps done{}", place.unwrap_or_default()));
     answer.finish(&json!({
         "step": progress.step,
         "steps": config.steps,
         "examples": progress.examples,
         "seconds": progress.seconds,
         "loss": watch.loss,
-        "weights": args.out.join("weights.safetensors"),
+        "weights": weights,
     }))
 }
 

@@ -11,7 +11,8 @@
 //! What the reference passes over is passed over here too: videos shorter than the gap
 //! between the contexts, and videos with a frame wider than 100 degrees. The reference
 //! also drops pictures that are not 360×640; here those are dropped that are smaller
-//! than the target, which a crop could only enlarge.
+//! than the target, which a crop could only enlarge, and pairs of a scene's frames that
+//! nothing says near and far of because the camera stood still between them.
 
 use super::chunks::{Chunk, NEAR_FAR, load_index};
 use super::crop::{CropOptions, crop};
@@ -31,6 +32,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 const FOV_MAX: f32 = 100.0;
 /// Chunks kept open: enough for loaders that work on neighbouring indices.
 const OPEN_CHUNKS: usize = 3;
+/// Examples looked at beyond two rounds: what is passed over for the pair that was drawn
+/// may serve with another.
+const STILL_PAIRS: u64 = 64;
 /// Keys that split the random numbers of one seed.
 const KEY_ORDER: u64 = 1;
 const KEY_EXAMPLE: u64 = 2;
@@ -270,8 +274,9 @@ impl Dataset {
     /// # Errors
     /// Those of [`Dataset::example`]; none in a whole round.
     pub fn serve(&self, seed: u64, index: u64, step: usize) -> Result<(u64, TrainingExample)> {
-        // The one usable scene may be the first of a round and the last of the next.
-        for at in index..index + 2 * self.len() as u64 {
+        // The one usable scene may be the first of a round and the last of the next, and
+        // its first pairs may be taken where the camera stood still.
+        for at in index..index + 2 * self.len() as u64 + STILL_PAIRS {
             if let Some(example) = self.example(seed, at, step)? {
                 return Ok((at, example));
             }
@@ -280,7 +285,7 @@ impl Dataset {
         let ((w, h), r) = (crop.input_size, crop.upscale);
         let expected = format!(
             "a scene of more than {} frames of at least {}x{} pixels, none wider than {FOV_MAX} \
-             degrees",
+             degrees, with a camera that moves or near and far given",
             sampler.bounds(step).0,
             w * r,
             h * r
@@ -329,10 +334,11 @@ impl Dataset {
         };
         let near_far = match self.options.near_far {
             Some(given) => given,
-            None => {
-                let range = depth_range(scene, &drawn.context, (None, None))?;
-                (range.near, range.far)
-            }
+            // Its frames and near_far are checked, so that this says: the camera stood still.
+            None => match depth_range(scene, &drawn.context, (None, None)) {
+                Ok(range) => (range.near, range.far),
+                Err(_) => return Ok(None),
+            },
         };
         let load = |frame: usize| match scene.frames.get(frame) {
             Some(frame) => frame.load(),

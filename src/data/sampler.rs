@@ -65,7 +65,7 @@ impl ViewSampler {
         let part = step as f64 / self.steps as f64;
         let grown = |from: usize, to: usize| {
             // Python's int(): towards zero.
-            let moved = from as i64 + ((to as f64 - from as f64) * part) as i64;
+            let moved = (from as i64).saturating_add(((to as f64 - from as f64) * part) as i64);
             // The reference stops at the end by min(), for bounds that grow.
             if to >= from { moved.min(to as i64) } else { moved.max(to as i64) }.max(0) as usize
         };

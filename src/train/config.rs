@@ -285,6 +285,9 @@ impl Default for TrainConfig {
     }
 }
 
+/// Longest side of a training's input, px.
+const INPUT_MAX: usize = 4096;
+
 /// Puts the keys of `change` into `base`, tables into tables.
 fn merge(base: &mut Value, change: &Value) {
     match (base, change) {
@@ -382,26 +385,7 @@ impl TrainConfig {
     /// # Errors
     /// The first key that does not.
     pub fn check(&self) -> Result<()> {
-        let at_least_one = [
-            ("steps", self.steps as usize),
-            ("batch", self.batch),
-            ("accumulate", self.accumulate),
-            ("together", self.together),
-            ("data.targets", self.data.targets),
-            ("data.samples", self.data.samples),
-            ("data.target_samples", self.data.target_samples),
-            ("data.window", self.data.window as usize),
-            ("data.replay", self.data.replay as usize),
-            ("data.workers", self.data.workers),
-            ("data.ahead", self.data.ahead),
-            ("checkpoint.keep", self.checkpoint.keep),
-            ("checkpoint.bad_steps", self.checkpoint.bad_steps),
-        ];
-        for (key, value) in at_least_one {
-            if !(1..=1 << 32).contains(&value) {
-                return Err(Error::value(key, "1 or more", value));
-            }
-        }
+        self.check_counts()?;
         let o = &self.optimizer;
         let l = &self.loss;
         let not_negative = [
@@ -423,10 +407,26 @@ impl TrainConfig {
                 return Err(Error::value(key, "0 or more", value));
             }
         }
+        for beta in o.betas {
+            // 1 would never take a gradient in, and divides by 1 - 1.
+            if !(0.0..1.0).contains(&beta) {
+                return Err(Error::value("optimizer.betas", "two numbers in [0, 1)", beta));
+            }
+        }
+        if !(o.epsilon > 0.0 && o.epsilon.is_finite()) {
+            return Err(Error::value("optimizer.epsilon", "above 0", o.epsilon));
+        }
+        if !l.opacity_start.is_finite() {
+            return Err(Error::value("loss.opacity_start", "a finite number", l.opacity_start));
+        }
+        let floor = match self.schedule {
+            Schedule::Cosine { floor, .. } => floor,
+            Schedule::OneCycle { .. } => 0.0,
+        };
         let a = &self.data.augment;
         let shares = [
-            ("optimizer.betas", o.betas[0].max(o.betas[1])),
             ("optimizer.average", o.average),
+            ("schedule.floor", floor),
             ("data.crop", f64::from(self.data.crop)),
             ("data.seen_range", f64::from(self.data.seen_range)),
             ("data.foreground", f64::from(self.data.foreground)),
@@ -442,13 +442,43 @@ impl TrainConfig {
         self.check_together()
     }
 
+    /// Whole numbers. The upper ends are far beyond use; they keep products from running
+    /// over, and a slip of the pen from asking for more memory or threads than there are.
+    fn check_counts(&self) -> Result<()> {
+        let d = &self.data;
+        let counts = [
+            ("steps", self.steps, 1, 1 << 32),
+            ("batch", self.batch as u64, 1, 1 << 16),
+            ("accumulate", self.accumulate as u64, 1, 1 << 16),
+            ("together", self.together as u64, 1, 1 << 16),
+            ("lanes", self.lanes as u64, 0, 1 << 10),
+            ("data.targets", d.targets as u64, 1, 1 << 10),
+            ("data.samples", d.samples as u64, 1, 1 << 6),
+            ("data.target_samples", d.target_samples as u64, 1, 1 << 6),
+            ("data.window", d.window, 1, 1 << 31),
+            ("data.replay", d.replay, 1, 1 << 31),
+            ("data.workers", d.workers as u64, 1, 1 << 10),
+            ("data.ahead", d.ahead as u64, 1, 1 << 16),
+            ("checkpoint.keep", self.checkpoint.keep as u64, 1, 1 << 32),
+            ("checkpoint.bad_steps", self.checkpoint.bad_steps as u64, 1, 1 << 32),
+            ("validate.scenes", self.validate.scenes as u64, 0, 1 << 16),
+        ];
+        match counts.into_iter().find(|(_, value, low, high)| !(low..=high).contains(&value)) {
+            Some((key, value, low, high)) => {
+                Err(Error::value(key, format!("{low} to {high}"), value))
+            }
+            None => Ok(()),
+        }
+    }
+
     fn check_together(&self) -> Result<()> {
         let config = self.model_config()?;
         let small = matches!(config.backbone, Backbone::Small(_));
         let stride = config.stride();
         let [w, h] = self.data.input;
-        if w == 0 || h == 0 || w % stride != 0 || h % stride != 0 {
-            let expected = format!("multiples of {stride}");
+        let side = |n: usize| (1..=INPUT_MAX).contains(&n) && n.is_multiple_of(stride);
+        if !(side(w) && side(h)) {
+            let expected = format!("multiples of {stride}, at most {INPUT_MAX}");
             return Err(Error::value("data.input", expected, format!("{w}x{h}")));
         }
         if let Start::Weights { opacity, .. } = &self.init

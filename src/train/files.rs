@@ -80,8 +80,10 @@ impl Files {
 pub struct Pictures {
     dataset: Dataset,
     seed: u64,
-    /// Examples of one step, from which an index tells its step.
+    /// Examples of one step, and how often each of this stream is shown: from them an index
+    /// tells its step.
     per_step: u64,
+    replay: u64,
 }
 
 impl Pictures {
@@ -110,13 +112,19 @@ impl Pictures {
             near_far: files.near_far.map(|[near, far]| (near, far)),
         };
         let dataset = Dataset::open(&files.path, options)?;
-        Ok(Self { dataset, seed: config.data.seed, per_step: config.examples_per_step().max(1) })
+        Ok(Self {
+            dataset,
+            seed: config.data.seed,
+            per_step: config.examples_per_step().max(1),
+            replay: config.data.replay,
+        })
     }
 }
 
 impl Source for Pictures {
     fn example(&self, index: u64) -> Result<Arc<Example>> {
-        let step = usize::try_from(index / self.per_step).unwrap_or(usize::MAX);
+        let step = index.saturating_mul(self.replay) / self.per_step;
+        let step = usize::try_from(step).unwrap_or(usize::MAX);
         let (_, one) = self.dataset.serve(self.seed, index, step)?;
         Ok(Arc::new(Example {
             context: one.context,

@@ -32,6 +32,11 @@ pub fn pairs(folder: &Path, stride: usize) -> Result<Vec<Arc<Example>>> {
         let scene = load_scene(path)?;
         for test in load_protocol(&file)?.tests {
             test.check(&file, scene.frames.len())?;
+            if test.target.is_empty() || test.context.len() < 2 {
+                let expected = "at least 2 context frames and a target in every test";
+                let got = format!("{} and {}", test.context.len(), test.target.len());
+                return Err(crate::io::Error::format(&file, expected, got).into());
+            }
             found.push(Arc::new(pair(&scene, &test, stride)?));
         }
     }

@@ -268,9 +268,13 @@ impl Training {
         let state = self.optimizer.state()?;
         let about = (&self.progress, &self.config);
         let path = checkpoint::save(&self.folder, about, &state, self.config.checkpoint.keep)?;
-        let file = self.folder.join("weights.safetensors");
-        weights::save(&file, &self.optimizer.averaged()?, &self.config.model_config()?)?;
+        self.save_weights()?;
         Ok(path)
+    }
+
+    fn save_weights(&self) -> Result<()> {
+        let file = self.folder.join("weights.safetensors");
+        Ok(weights::save(&file, &self.optimizer.averaged()?, &self.config.model_config()?)?)
     }
 
     /// Steps until the configuration's last one or a limit, with checkpoints, looks at
@@ -291,7 +295,7 @@ impl Training {
             untrained: self.untrained,
             warnings: self.warnings.clone(),
         });
-        let mut log = Log::open(&self.folder)?;
+        let mut log = Log::open(&self.folder, self.progress.step)?;
         let begin = Instant::now();
         let minutes = |since: Instant| since.elapsed().as_secs_f64() / 60.0;
         let (mut saved, mut looked) = (Instant::now(), Instant::now());
@@ -320,6 +324,9 @@ impl Training {
         if done > 0 {
             tell(&Event::Saved(self.save()?));
             self.look(validator, &mut log, tell)?;
+        } else if self.resumed.is_some() {
+            // What was stopped after its checkpoint has older ones, or none.
+            self.save_weights()?;
         }
         Ok(())
     }
@@ -345,37 +352,50 @@ impl Training {
 
 /// `log.csv` and `validation.csv`: appended to, one line at a time.
 struct Log {
-    steps: std::fs::File,
-    looks: std::fs::File,
+    steps: File,
+    looks: File,
     folder: PathBuf,
     terms: Terms,
     seconds: Seconds,
     count: u64,
 }
 
-/// A file to append to, with `header` where it is new.
-fn appended(path: &Path, header: &str) -> Result<std::fs::File> {
-    let fresh = !path.exists();
-    let open = std::fs::OpenOptions::new().create(true).append(true).open(path);
-    let mut file = open.map_err(|e| io::Error::io(path, e))?;
-    if fresh {
-        writeln!(file, "{header}").map_err(|e| io::Error::io(path, e))?;
+/// A file to append to, with `header` where it is new. Rows of steps after `step`, which
+/// were lost with the process that took them and will be taken again, are removed, and so
+/// is a row that was cut off.
+fn appended(path: &Path, header: &str, step: u64) -> Result<File> {
+    let old = match std::fs::read_to_string(path) {
+        Ok(text) => text,
+        Err(e) if e.kind() == ErrorKind::NotFound => String::new(),
+        Err(e) => return Err(io::Error::io(path, e).into()),
+    };
+    let mut rows = old.split_inclusive('\n').filter(|row| row.ends_with('\n'));
+    let mut kept = rows.next().map_or_else(|| format!("{header}\n"), str::to_owned);
+    let done = |row: &&str| {
+        let of = row.split(',').next().and_then(|n| n.parse::<u64>().ok());
+        of.is_none_or(|n| n <= step)
+    };
+    kept.extend(rows.filter(done));
+    if kept != old {
+        io::write_atomic(path, |f| f.write_all(kept.as_bytes()))?;
     }
-    Ok(file)
+    Ok(File::options().append(true).open(path).map_err(|e| io::Error::io(path, e))?)
 }
 
 impl Log {
-    fn open(folder: &Path) -> Result<Self> {
+    /// Of a training that has done `step` steps.
+    fn open(folder: &Path, step: u64) -> Result<Self> {
         let parts: Vec<&str> = Seconds::default().parts().map(|p| p.0).to_vec();
         let header = format!(
             "step,seconds,rate,loss,psnr,dssim,lpips,cross_entropy,disparity,confidence,norm,{}",
             parts.join(",")
         );
         Ok(Self {
-            steps: appended(&folder.join("log.csv"), &header)?,
+            steps: appended(&folder.join("log.csv"), &header, step)?,
             looks: appended(
                 &folder.join("validation.csv"),
                 "step,seconds,what,psnr,ssim,disparity,within_one,copy_psnr",
+                step,
             )?,
             folder: folder.to_owned(),
             terms: Terms::default(),

@@ -87,8 +87,8 @@ impl Schedule {
                 if step < warmup {
                     return rate * (step + 1) as f64 / warmup as f64;
                 }
-                let from = warmup + hold;
-                let fall = steps.saturating_sub(from + 1).max(1) as f64;
+                let from = warmup.saturating_add(hold);
+                let fall = steps.saturating_sub(from).saturating_sub(1).max(1) as f64;
                 let share = (step.saturating_sub(from) as f64 / fall).min(1.0);
                 anneal(rate, floor * rate, share)
             }

@@ -129,9 +129,11 @@ pub struct Replay<S> {
 }
 
 impl<S: Source> Replay<S> {
-    /// `window` and `times` at least 1.
+    /// `window` and `times` from 1 to 2³¹: more is that.
     pub fn new(inner: S, window: u64, times: u64) -> Self {
-        Self { inner, window: window.max(1), times: times.max(1), kept: Mutex::default() }
+        // Their product is a number of examples.
+        let [window, times] = [window, times].map(|n| n.clamp(1, 1 << 31));
+        Self { inner, window, times, kept: Mutex::default() }
     }
 
     /// Which of `inner`'s examples stands at `index`.

@@ -281,6 +281,7 @@ impl Learner {
         parts: &mut Vec<Tensor>,
         terms: &mut Terms,
     ) -> Result<()> {
+        (terms.cross_entropy, terms.disparity, terms.confidence) = (f64::NAN, f64::NAN, f64::NAN);
         let Backbone::Small(small) = &self.model.config().backbone else { return Ok(()) };
         if group.iter().any(|e| e.inverse_depth.len() != e.context.len()) {
             return Ok(());
@@ -441,7 +442,12 @@ impl Learner {
         let (_, height, width) = rgb.dims3()?;
         let (x, truth) = (flat(rgb)?, target.image.to_planes());
         let mut all = loss::mse(&x, &truth).scaled(w.mse);
-        let mut terms = Terms { mse: all.value / w.mse.max(1e-30), ..Terms::default() };
+        let mut terms = Terms {
+            mse: all.value / w.mse.max(1e-30),
+            dssim: f64::NAN,
+            lpips: f64::NAN,
+            ..Terms::default()
+        };
         if w.mse == 0.0 {
             terms.mse = loss::mse(&x, &truth).value;
         }
