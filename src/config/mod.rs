@@ -315,6 +315,46 @@ mod tests {
         assert!(Config::from_json(&json).unwrap_err().to_string().contains("betaz"));
     }
 
+    /// What comes as JSON in weights or by `--config` never runs over, divides by zero or
+    /// asks for all memory.
+    #[test]
+    fn numbers_beyond_all_use_are_refused_by_key() {
+        let one = |config: &Config, pointer: &str, value: serde_json::Value| {
+            let mut json = serde_json::to_value(config).unwrap();
+            *json.pointer_mut(pointer).unwrap() = value.clone();
+            let key = pointer.split('/').rfind(|k| k.parse::<usize>().is_err()).unwrap();
+            let refused = Config::from_json(&json.to_string());
+            let error = refused.expect_err(&format!("{pointer} {value}")).to_string();
+            // One key speaks for both lists of the small backbone.
+            let named = [key, "unet_channels"].iter().any(|k| error.contains(k));
+            assert!(named, "{pointer} {value}: {error}");
+        };
+        let huge = [1u64 << 31, 1 << 62];
+        let (mvsplat, small) = (Config::x2(), Config::small(Preset::Tuned, 2));
+        let both = ["/embed/dim", "/agg/n_learned", "/agg/gate_views", "/spgr/hidden"];
+        let of_mvsplat = "cnn_channels/0 cnn_channels/2 transformer_layers ffn_expansion \
+             window_splits depth_candidates costvolume_channels costvolume_levels \
+             refine_channels refine_levels gaussians_per_pixel";
+        let of_small = "cnn_channels/0 cnn_blocks match_channels depth_candidates stem_channels \
+             unet_channels/1 mode_window head_channels";
+        for value in huge {
+            for pointer in both {
+                one(&mvsplat, pointer, value.into());
+                one(&small, pointer, value.into());
+            }
+            for (config, keys) in [(&mvsplat, of_mvsplat), (&small, of_small)] {
+                for key in keys.split_whitespace() {
+                    one(config, &format!("/backbone/{key}"), value.into());
+                }
+            }
+        }
+        for key in ["cnn_channels/0", "cnn_channels/1", "ffn_expansion", "window_splits"] {
+            one(&mvsplat, &format!("/backbone/{key}"), 0.into());
+        }
+        one(&mvsplat, "/agg/gate_views", 0.into());
+        one(&small, "/spgr/offset_bound", (-1.0).into());
+    }
+
     #[test]
     fn paper_values() {
         let c = Config::x4();
