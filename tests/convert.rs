@@ -18,7 +18,7 @@ use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::Command;
-use subsplat::config::{Config, Preset};
+use subsplat::config::{Backbone, Config, Preset, SpgrHead};
 use subsplat::io::tensors::{TensorFile, TensorSpec, write_tensors};
 use subsplat::model::lpips::Lpips;
 use subsplat::model::subsplat::SubSplat;
@@ -314,6 +314,31 @@ fn our_own_weights_pass_through_with_their_configuration() {
         let called = convert(place, &format!("own.pt told.safetensors --force {arguments}"));
         assert!(called.code == 1 && called.error().contains("expected"), "{}", called.stderr);
     }
+}
+
+/// `--upscale` and `--preset` change what they say, and nothing else of what IN says.
+#[test]
+fn a_configuration_that_comes_along_is_kept() {
+    let folder = tempfile::tempdir().unwrap();
+    let place = folder.path();
+    let mut config = Config::small(Preset::Tuned, 2);
+    config.spgr.beta_z = 0.125;
+    if let Backbone::Small(b) = &mut config.backbone {
+        (b.mode_window, b.cross_check, b.primaries.scale_max) = (5, !b.cross_check, 11.0);
+    }
+    let told = |arguments: &str| {
+        let report = converted(place, &format!("own.safetensors told.safetensors {arguments}"));
+        Config::from_json(&report["config"].to_string()).unwrap()
+    };
+    own(place, &config);
+    assert_eq!(told("--upscale 2"), config);
+    let preset = told("--preset tuned --force");
+    assert_eq!(preset, config.with_preset(Preset::Tuned, 2));
+    assert!(preset.backbone == config.backbone && preset.spgr.beta_z != 0.125);
+    // One head for any K.
+    config.spgr.head = SpgrHead::Coord;
+    own(place, &config);
+    assert_eq!(told("--upscale 4 --force"), Config { upscale: 4, ..config });
 }
 
 #[test]

@@ -4,9 +4,8 @@ use crate::args::Args;
 use crate::source::{Content, Entry, Source};
 use anyhow::{Context, Result, bail, ensure};
 use std::collections::BTreeMap;
-use subsplat::config::{Backbone, Config, Preset};
+use subsplat::config::{Config, Preset};
 use subsplat::model::architecture::{Kind, Shapes, expected, guess_config};
-use subsplat::pipeline;
 
 /// The outcome of holding names and shapes against the architecture.
 pub struct Plan {
@@ -122,12 +121,11 @@ fn config(
         Some(config) => config,
         None => guess_config(&shapes)?,
     };
-    if args.preset.is_none() && args.upscale.is_none() {
-        return Ok(Some(base));
-    }
-    let mvsplat = matches!(base.backbone, Backbone::Mvsplat(_));
-    let preset = args.preset.unwrap_or(Preset::Tuned);
-    let config = pipeline::preset(mvsplat, preset, args.upscale.unwrap_or(base.upscale));
+    let upscale = args.upscale.unwrap_or(base.upscale);
+    let config = match args.preset {
+        Some(preset) => base.with_preset(preset, upscale),
+        None => Config { upscale, ..base },
+    };
     config.check().context("--upscale")?;
     Ok(Some(config))
 }
