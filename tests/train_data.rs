@@ -152,6 +152,7 @@ fn errors_name_the_key() {
     let rows = [
         ("first = [2, 3]", "first = [3, 2]", "data.files.first"),
         ("last = [3, 5]", "last = [0, 5]", "data.files.last"),
+        ("last = [3, 5]", "last = [3, 4294967296]", "data.files.last"),
         ("gap_steps = 10", "near_far = [2.0, 1.0]", "data.files.near_far"),
         ("gap_steps = 10", "gaps = 10", "gaps"),
         ("seed = 3", "phase = \"depth\"", "data.files"),

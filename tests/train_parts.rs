@@ -318,6 +318,8 @@ fn replay_shows_each_scene_so_often_and_no_other() {
         }
     }
     assert_ne!(places[..7], places[7..14], "the same order again");
+    // A window and a number of times whose product no number holds.
+    assert!(Replay::new(rooms(), 1 << 32, 1 << 32).place(5) < 1 << 32);
     assert_eq!(replay.example(9).unwrap(), rooms().example(places[9]).unwrap());
     assert_eq!(replay.example(9).unwrap(), replay.example(9).unwrap());
 }

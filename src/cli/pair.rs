@@ -32,8 +32,7 @@ pub fn load(input: &[PathBuf], args: &PairArgs) -> Result<Scene> {
                 one.display(),
                 scene.source.name()
             );
-            let folder = folder_of(one);
-            Ok(matrices::load(folder, asked.into())?)
+            Ok(matrices::load(folder_of(one), asked.into())?)
         }
         _ => bail!("expected a scene or two photographs, got {} paths", input.len()),
     }

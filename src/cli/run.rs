@@ -125,7 +125,7 @@ fn plan(args: &RunArgs, progress: &mut Progress) -> Result<Plan> {
     frames::count(args.frames)?;
     ensure!(
         (0.0..1.0).contains(&args.min_opacity),
-        "--min-opacity: expected 0 to below 1 (1 leaves nothing), got {}",
+        "--min-opacity: expected 0 to below 1, got {}",
         args.min_opacity
     );
     let scene = progress.stage("scene", |_| pair::load(&args.input, &args.source.pair))?;

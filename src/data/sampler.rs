@@ -120,6 +120,8 @@ mod tests {
         for step in [150_000, 400_000] {
             assert_eq!(sampler.bounds(step), (45, 192));
         }
+        let endless = ViewSampler { last: (45, 1 << 40), steps: 1, ..sampler };
+        assert_eq!(endless.bounds(1 << 40), (45, 1 << 40));
         // n − 1 frames apart is the most that n frames allow.
         assert_eq!(sampler.draw(26, 0, 1).unwrap().context, [0, 25]);
         assert_eq!(sampler.draw(25, 0, 1), None);

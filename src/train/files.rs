@@ -52,6 +52,9 @@ fn gap_steps() -> usize {
     ViewSampler::re10k(GapMode::Mvs).steps
 }
 
+/// More frames than any video has.
+const FRAMES_END: usize = 1 << 31;
+
 impl Files {
     /// Checks ranges.
     ///
@@ -60,9 +63,9 @@ impl Files {
     pub fn check(&self) -> Result<()> {
         for (key, [low, high]) in [("data.files.first", self.first), ("data.files.last", self.last)]
         {
-            if low == 0 || high < low {
-                let got = format!("[{low}, {high}]");
-                return Err(Error::value(key, "[low, high] with 1 <= low <= high", got));
+            if low == 0 || high < low || high >= FRAMES_END {
+                let expected = format!("[low, high] with 1 <= low <= high < {FRAMES_END}");
+                return Err(Error::value(key, expected, format!("[{low}, {high}]")));
             }
         }
         match self.near_far {

@@ -131,6 +131,9 @@ mod tests {
         assert!((at(13) - 1.1).abs() < 1e-12, "{}", at(13));
         assert!((at(19) - 0.2).abs() < 1e-12 && (at(50) - 0.2).abs() < 1e-12);
         assert!((7..19).all(|i| at(i + 1) < at(i)));
+        // Held for good, and no overflow on the way.
+        let s = Schedule::Cosine { rate: 2.0, warmup: 4, hold: u64::MAX, floor: 0.1 };
+        assert_eq!(s.rate(19, 20), 2.0);
     }
 
     #[test]
