@@ -16,6 +16,7 @@ mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
 
+use std::mem::MaybeUninit;
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
 use std::sync::OnceLock;
 
@@ -169,6 +170,8 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     fn splat(self, v: f32) -> Self::F;
     fn load(self, v: &[f32; LANES]) -> Self::F;
     fn store(self, v: Self::F, to: &mut [f32; LANES]);
+    /// Into memory that nobody has written yet.
+    fn store_fresh(self, v: Self::F, to: &mut [MaybeUninit<f32>; LANES]);
     /// a·b + c; rounded once where the tier fuses.
     fn fma(self, a: Self::F, b: Self::F, c: Self::F) -> Self::F;
     /// c − a·b; rounded once where the tier fuses.
@@ -239,6 +242,13 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     /// Four floats at each of 16 places of `from`, as four vectors: lane i of
     /// vector c is `from[at[i] + offset + c]`. Zeros if any of them lies outside.
     fn load4(self, from: &[f32], at: &[usize; LANES], offset: usize) -> [Self::F; 4];
+    /// The float i places behind `from` in the lanes whose bit i is set, zeros in the others.
+    ///
+    /// # Safety
+    /// Those floats must be there.
+    unsafe fn load_lanes(self, from: *const f32, bits: u16) -> Self::F;
+    /// Lane i + 1 in lane i, the first in the last.
+    fn rotate(self, v: Self::F) -> Self::F;
     /// Rows and columns exchanged: lane j of vector i goes to lane i of vector j.
     fn transpose(self, v: [Self::F; LANES]) -> [Self::F; LANES];
     /// Columns of a matrix of 16 rows of four, of which each vector holds four rows.
@@ -437,6 +447,21 @@ mod tests {
                     put(&mut exact, s.load4(self.1, &[at; LANES], offset)[0]);
                 }
                 put(&mut exact, s.load4(&self.1[..3], &[0; LANES], 0)[0]);
+                put(&mut exact, s.rotate(a));
+                let mut fresh = [MaybeUninit::uninit(); LANES];
+                s.store_fresh(b, &mut fresh);
+                // SAFETY: just written.
+                let fresh = fresh.map(|v| unsafe { v.assume_init() });
+                put(&mut exact, s.load(&fresh));
+                let past = self.1.len() - at;
+                for bits in [u16::MAX, 0x8421, 0, 0xff, 0x7ffe] {
+                    let inside = if past < LANES { bits & ((1 << past) - 1) } else { bits };
+                    // SAFETY: no bit of a place beyond the slice's end is set.
+                    put(&mut exact, unsafe { s.load_lanes(&self.1[at], inside) });
+                    // SAFETY: as above; what lies before the slice is not read.
+                    let before = unsafe { s.load_lanes(self.1.as_ptr().wrapping_sub(4), !15) };
+                    put(&mut exact, before);
+                }
                 let rows = [a, b, c, a, b, c, -a, a, b, c, a, b, -c, a, b, c];
                 for v in s.transpose(rows) {
                     put(&mut exact, v);

@@ -35,8 +35,8 @@ pub(super) trait Form<const IN: usize, const POINTS: usize, const OUT: usize>:
     /// Outputs from the products.
     fn outputs<S: Simd>(s: S, y: [S::F; POINTS]) -> [S::F; OUT];
 
-    /// The kernel's weights from its taps, `M` kernels at once.
-    fn weights<const M: usize>(g: [[f32; M]; 3]) -> [[f32; M]; WEIGHTS];
+    /// The kernel's weights from its taps.
+    fn weights<S: Simd>(s: S, g: [S::F; 3]) -> [S::F; WEIGHTS];
 }
 
 /// What ∂L/∂w needs besides.
@@ -86,18 +86,14 @@ impl Form<6, 6, 4> for Unit {
     /// Value at each point of the polynomial with these coefficients, over the product
     /// of the point's distances to the others.
     #[inline(always)]
-    fn weights<const M: usize>(g: [[f32; M]; 3]) -> [[f32; M]; WEIGHTS] {
-        let mut out = [[0.0; M]; WEIGHTS];
-        for m in 0..M {
-            let [g0, g1, g2] = [g[0][m], g[1][m], g[2][m]];
-            // 2·½·(½ − 2) = −3/2 and 2·2·(2 − ½) = 6.
-            let (even, odd) = ((g0 + 0.5 * g2) * (-2.0 / 3.0), g1 * (-2.0 / 3.0 * FRAC_1_SQRT_2));
-            (out[1][m], out[2][m]) = (even + odd, even - odd);
-            let (even, odd) = ((g0 + 2.0 * g2) * (1.0 / 6.0), g1 * (1.0 / 6.0 * SQRT_2));
-            (out[3][m], out[4][m]) = (even + odd, even - odd);
-            (out[0][m], out[5][m]) = (g0, g2);
-        }
-        out
+    fn weights<S: Simd>(s: S, [g0, g1, g2]: [S::F; 3]) -> [S::F; WEIGHTS] {
+        // 2·½·(½ − 2) = −3/2 and 2·2·(2 − ½) = 6.
+        let even = s.fma(s.splat(0.5), g2, g0) * s.splat(-2.0 / 3.0);
+        let odd = g1 * s.splat(-2.0 / 3.0 * FRAC_1_SQRT_2);
+        let (a, b) = (even + odd, even - odd);
+        let even = s.fma(s.splat(2.0), g2, g0) * s.splat(1.0 / 6.0);
+        let odd = g1 * s.splat(1.0 / 6.0 * SQRT_2);
+        [g0, a, b, even + odd, even - odd, g2]
     }
 }
 
@@ -128,6 +124,16 @@ impl Adjoint<6> for Unit {
             ),
             s.fma(third, far - near, q[5]),
         ]
+    }
+}
+
+/// `to` = `from`, one by one: an array of vectors that is copied as a whole goes to memory
+/// and is copied there, for which a convolution of 32 channels took half as long again.
+#[inline(always)]
+#[expect(clippy::manual_memcpy, reason = "this is the point of it")]
+pub(super) fn put<V: Copy, const N: usize>(to: &mut [V; N], from: [V; N]) {
+    for i in 0..N {
+        to[i] = from[i];
     }
 }
 
@@ -166,17 +172,11 @@ fn pair_outputs<S: Simd>(s: S, y: [S::F; 5]) -> [S::F; 4] {
 
 /// The kernel's weights where its outer taps are F(4, 2)'s.
 #[inline(always)]
-fn pair_weights<const M: usize>(g: [[f32; M]; 3]) -> [[f32; M]; WEIGHTS] {
-    let mut out = [[0.0; M]; WEIGHTS];
-    for m in 0..M {
-        let [g0, g1, g2] = [g[0][m], g[1][m], g[2][m]];
-        let (even, odd) = (g2 * (A / AT_A), g0 * (1.0 / AT_A));
-        (out[0][m], out[1][m]) = (even + odd, even - odd);
-        let (even, odd) = (g2 * (B / AT_B), g0 * (1.0 / AT_B));
-        (out[2][m], out[3][m]) = (even + odd, even - odd);
-        (out[4][m], out[5][m]) = (g2, g1);
-    }
-    out
+fn pair_weights<S: Simd>(s: S, [g0, g1, g2]: [S::F; 3]) -> [S::F; WEIGHTS] {
+    let (even, odd) = (g2 * s.splat(A / AT_A), g0 * s.splat(1.0 / AT_A));
+    let (a, b) = (even + odd, even - odd);
+    let (even, odd) = (g2 * s.splat(B / AT_B), g0 * s.splat(1.0 / AT_B));
+    [a, b, even + odd, even - odd, g2, g1]
 }
 
 /// Stride 2, forward.
@@ -198,8 +198,8 @@ impl Form<9, 9, 4> for Down {
     }
 
     #[inline(always)]
-    fn weights<const M: usize>(g: [[f32; M]; 3]) -> [[f32; M]; WEIGHTS] {
-        pair_weights(g)
+    fn weights<S: Simd>(s: S, g: [S::F; 3]) -> [S::F; WEIGHTS] {
+        pair_weights(s, g)
     }
 }
 
@@ -244,8 +244,8 @@ impl Form<5, 9, 8> for Up {
     }
 
     #[inline(always)]
-    fn weights<const M: usize>(g: [[f32; M]; 3]) -> [[f32; M]; WEIGHTS] {
-        pair_weights(g)
+    fn weights<S: Simd>(s: S, g: [S::F; 3]) -> [S::F; WEIGHTS] {
+        pair_weights(s, g)
     }
 }
 

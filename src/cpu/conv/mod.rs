@@ -11,6 +11,7 @@
 )]
 
 mod forms;
+mod gather;
 mod plan;
 mod pointwise;
 mod shift;

@@ -10,6 +10,7 @@ use super::winograd;
 use super::winograd_weights::{self, Finish, Products};
 use super::{Buffer, Buffers};
 use crate::cpu::disjoint::Disjoint;
+use crate::cpu::fresh;
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
 use rayon::prelude::*;
 use std::ops::Range;
@@ -68,32 +69,33 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
         Way::Winograd(_) => winograd_weights::groups(&plan, units, parts.len(), JOBS),
         _ => JOBS.div_ceil(parts.len()).min(units),
     };
-    let sums: Vec<Vec<f32>> = (0..parts.len() * groups)
-        .into_par_iter()
-        .map(|job| {
-            let (part, group) = (job / groups, job % groups);
-            let (first, channel) = parts[part];
-            let work = Work {
-                plan: &plan,
-                layout,
-                outputs: first..(first + outputs).min(o),
-                pitch: way.pitch(outputs.min(o - first)),
-                rows: channels.min(c - channel) * taps,
-            };
-            let unit = |unit: usize| {
-                let (image, start) = (unit / starts.len(), starts[unit % starts.len()]);
-                let x = &x[image * in_image..][..in_image];
-                let x = &x[channel * s.in_pixels()..][..work.rows / taps * s.in_pixels()];
-                (x, &dy[image * out_image..][..out_image], start)
-            };
-            let units = (units * group / groups..units * (group + 1) / groups).map(unit);
-            Buffers::with(|buffers| way.sums(tier, &work, units, buffers))
-        })
-        .collect();
+    let work = |(first, channel): (usize, usize)| Work {
+        plan: &plan,
+        layout,
+        outputs: first..(first + outputs).min(o),
+        pitch: way.pitch(outputs.min(o - first)),
+        rows: channels.min(c - channel) * taps,
+    };
+    // The first part is the largest.
+    let floats = work(parts[0]).floats();
+    let mut sums = fresh::zeros(parts.len() * groups * floats);
+    sums.par_chunks_exact_mut(floats).enumerate().for_each(|(job, sums)| {
+        let (part, group) = (job / groups, job % groups);
+        let (first, channel) = parts[part];
+        let work = work((first, channel));
+        let unit = |unit: usize| {
+            let (image, start) = (unit / starts.len(), starts[unit % starts.len()]);
+            let x = &x[image * in_image..][..in_image];
+            let x = &x[channel * s.in_pixels()..][..work.rows / taps * s.in_pixels()];
+            (x, &dy[image * out_image..][..out_image], start)
+        };
+        let units = (units * group / groups..units * (group + 1) / groups).map(unit);
+        Buffers::with(|buffers| way.sums(tier, &work, units, buffers, sums));
+    });
     let dw = Disjoint::new(dw);
-    sums.par_chunks(groups).zip(&parts).for_each(|(sums, &(first, channel))| {
-        let mut total = sums[0].clone();
-        for other in &sums[1..] {
+    sums.par_chunks_exact_mut(groups * floats).zip(&parts).for_each(|(sums, &(first, channel))| {
+        let (total, others) = sums.split_at_mut(floats);
+        for other in others.chunks_exact(floats) {
             total.iter_mut().zip(other).for_each(|(t, v)| *t += v);
         }
         let rows = channels.min(c - channel) * taps;
@@ -138,16 +140,17 @@ impl Way {
         }
     }
 
-    /// Sums of one job over `units`: channels of x, ∂L/∂y of the same picture, and the
-    /// first output of a tile.
+    /// Adds the sums of one job over `units` to `sums`, which is zero: channels of x, ∂L/∂y
+    /// of the same picture, and the first output of a tile.
     fn sums<'a>(
         self,
         tier: Tier,
         work: &Work<'_>,
         units: impl Iterator<Item = (&'a [f32], &'a [f32], Axes)>,
         buffers: &mut Buffers,
-    ) -> Vec<f32> {
-        let mut sums = vec![0.0; work.floats()];
+        sums: &mut [f32],
+    ) {
+        let sums = &mut sums[..work.floats()];
         if let Self::Winograd(way) = self {
             // Apart, since `Products` uses the other buffers.
             let mut own = std::mem::take(&mut buffers.products);
@@ -156,9 +159,9 @@ impl Way {
             for (x, dy, start) in units {
                 tier.run(Products { work, way, x, dy, start, buffers, products });
             }
-            tier.run(Finish { work, way, products, sums: &mut sums });
+            tier.run(Finish { work, way, products, sums });
             buffers.products = own;
-            return sums;
+            return;
         }
         let channels = work.rows / work.plan.kernel_taps;
         for (x, dy, start) in units {
@@ -168,13 +171,12 @@ impl Way {
             x_packed[floats..].fill(0.0);
             pack(work.plan, &work.layout, x, start, x_packed);
             let (x, turned) = (&*x_packed, &mut buffers.y);
-            let sums = &mut sums;
+            let sums = &mut *sums;
             match self {
                 Self::Narrow => tier.run(Narrow { work, x, dy, start, turned, sums }),
                 _ => tier.run(Wide { work, x, dy, start, turned, sums }),
             }
         }
-        sums
     }
 }
 
@@ -211,7 +213,7 @@ impl Work<'_> {
 
     /// One output channel's depth `d` of the tile: its rows begin at the result, one
     /// picture row apart.
-    fn dy_at(&self, output: usize, start: Axes, d: usize) -> usize {
+    pub fn dy_at(&self, output: usize, start: Axes, d: usize) -> usize {
         let [depth, height, width] = self.plan.dst_size;
         ((output * depth + start[0] + d) * height + start[1]) * width + start[2]
     }
@@ -256,7 +258,7 @@ impl Kernel for Wide<'_, '_> {
 
 /// ∂L/∂y of `[rows, width]` outputs, turned over to `[output][channel]`.
 #[inline(always)]
-pub(super) fn turn<S: Simd>(
+fn turn<S: Simd>(
     s: S,
     work: &Work<'_>,
     dy: &[f32],

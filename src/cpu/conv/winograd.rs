@@ -5,27 +5,27 @@
 //! over channels; one block's transformed tiles stay in the second-level cache.
 
 use super::forms::{Down, Form, GROUPS, Places, TILE, Unit, Up, WEIGHTS};
-use super::plan::{Axes, Layout, Plan, Sizes, pack};
+use super::gather::{Gather, Tiles};
+use super::plan::{Axes, Plan, Sizes};
 use super::shift::{Block, ROWS, Strip, blocks};
 use super::{Buffer, Buffers};
 use crate::cpu::disjoint::Disjoint;
 use crate::cpu::fresh;
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
 use rayon::prelude::*;
+use std::array::from_fn;
 use std::marker::PhantomData;
 use std::mem::MaybeUninit;
 
 /// Most vectors of tiles at once.
-const VECTORS: usize = 3;
+const VECTORS: usize = 2;
 /// Floats of the transformed tiles of a block, unless one vector needs more.
-const FLOATS: usize = 300_000;
+const FLOATS: usize = 250_000;
 /// Least channels on both sides, and tiles of a picture, for which it wins.
 const CHANNELS: usize = 24;
 const TILES: usize = 16;
 /// Tiles of a picture below which [`super::winograd_few`] is better.
 const FEW: usize = 48;
-/// Floats past a packed patch's end that may be read and not used.
-pub(super) const SLACK: usize = 2 * LANES;
 
 /// What the algorithm does for a plan.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -78,6 +78,23 @@ impl Way {
             size: plan.src_size,
         })
     }
+
+    /// Does `work` in the form that this is.
+    #[inline(always)]
+    pub fn give<W: Formed>(self, work: W) {
+        match self {
+            Self::Unit => work.with::<Unit, 6, 6, 4>(),
+            Self::Down => work.with::<Down, 9, 9, 4>(),
+            Self::Up => work.with::<Up, 5, 9, 8>(),
+        }
+    }
+}
+
+/// Work in any form.
+pub(super) trait Formed {
+    fn with<F, const IN: usize, const POINTS: usize, const OUT: usize>(self)
+    where
+        F: Form<IN, POINTS, OUT>;
 }
 
 /// Tiles of a picture.
@@ -86,8 +103,14 @@ pub(super) fn tiles_of(plan: &Plan) -> usize {
     depth * height.div_ceil(TILE) * width.div_ceil(TILE)
 }
 
+/// Floats from group to group of the weights of a block: off a power of two, lest all
+/// groups share one cache set.
+pub(super) fn group_step(channels: usize) -> usize {
+    channels * ROWS + LANES
+}
+
 /// Transformed weights: for each block of output channels
-/// `[group][source channel][channel of the block]`.
+/// `[group][source channel][channel of the block]`, groups [`group_step`] apart.
 #[derive(Clone, Debug)]
 pub(crate) struct Weights {
     data: Vec<f32>,
@@ -98,9 +121,9 @@ impl Weights {
     /// Of `w` as the caller stores them, in the memory of `data`.
     pub fn new(tier: Tier, plan: &Plan, way: Way, w: &[f32], mut data: Vec<f32>) -> Self {
         let blocks = blocks(plan.dst_channels);
-        let depth = plan.src_channels * GROUPS;
-        data.resize(blocks.iter().map(|b| b.pitch * depth).sum(), 0.0);
-        data.par_chunks_mut(ROWS * depth)
+        let floats = GROUPS * group_step(plan.src_channels);
+        data.resize(blocks.len() * floats, 0.0);
+        data.par_chunks_exact_mut(floats)
             .zip(&blocks)
             .for_each(|(panel, block)| tier.run(Transform { plan, way, w, block, panel }));
         Self { data, blocks }
@@ -126,50 +149,70 @@ impl Kernel for Transform<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(self, _: S) {
-        match self.way {
-            Way::Unit => self.with::<Unit, 6, 6, 4>(),
-            Way::Down => self.with::<Down, 9, 9, 4>(),
-            Way::Up => self.with::<Up, 5, 9, 8>(),
-        }
+    fn run<S: Simd>(self, s: S) {
+        self.way.give(Lanes(s, self));
     }
 }
 
-impl Transform<'_> {
+/// Work on vectors.
+struct Lanes<S, W>(S, W);
+
+impl<S: Simd> Formed for Lanes<S, Transform<'_>> {
     #[inline(always)]
     fn with<F, const IN: usize, const POINTS: usize, const OUT: usize>(self)
     where
         F: Form<IN, POINTS, OUT>,
     {
-        let Self { plan, w, block, panel, .. } = self;
+        let Self(s, Transform { plan, w, block, panel, .. }) = self;
         let channels = plan.src_channels;
-        for src in 0..channels {
-            // By place in what a tile reads, channels of the block innermost.
-            let mut g = [[[0.0; ROWS]; 3]; 3];
-            for m in 0..block.rows {
+        // Lanes are two source channels, each with the channels of the block.
+        for first in (0..channels).step_by(2) {
+            let mut kernels = [s.splat(0.0); LANES];
+            for lane in 0..LANES {
+                let (src, m) = (first + lane / ROWS, lane % ROWS);
+                if src >= channels || m >= block.rows {
+                    continue;
+                }
                 let dst = block.first + m;
                 let row = match plan.transposed {
                     true => src * plan.dst_channels + dst,
                     false => dst * channels + src,
                 };
                 let taps = &w[row * 9..][..9];
-                for tap in 0..9 {
-                    // A gradient reads backwards.
-                    let place = if plan.transposed { 8 - tap } else { tap };
-                    g[place / 3][place % 3][m] = taps[tap];
-                }
+                // SAFETY: nine are there.
+                kernels[lane] = unsafe { s.load_lanes(taps.as_ptr(), 0x1ff) };
             }
-            let mut half = [[[0.0; ROWS]; 3]; WEIGHTS];
+            let taps = s.transpose(kernels);
+            let mut half = [[s.splat(0.0); 3]; WEIGHTS];
             for x in 0..3 {
-                let column = F::weights([g[0][x], g[1][x], g[2][x]]);
+                let column = match plan.transposed {
+                    // A gradient reads backwards.
+                    true => [taps[8 - x], taps[5 - x], taps[2 - x]],
+                    false => [taps[x], taps[3 + x], taps[6 + x]],
+                };
+                let column = F::weights(s, column);
                 for i in 0..WEIGHTS {
                     half[i][x] = column[i];
                 }
             }
             for i in 0..WEIGHTS {
-                for (j, weight) in F::weights(half[i]).into_iter().enumerate() {
-                    let at = ((i * WEIGHTS + j) * channels + src) * block.pitch;
-                    panel[at..at + block.pitch].copy_from_slice(&weight[..block.pitch]);
+                let row = F::weights(s, half[i]);
+                for j in 0..WEIGHTS {
+                    let group = (i * WEIGHTS + j) * group_step(channels);
+                    let to = &mut panel[group + first * block.pitch..];
+                    // What lies past the last channel is between groups.
+                    if block.pitch == ROWS
+                        && let Some(to) = to.first_chunk_mut()
+                    {
+                        s.store(row[j], to);
+                        continue;
+                    }
+                    let mut both = [0.0; LANES];
+                    s.store(row[j], &mut both);
+                    let to = to.chunks_exact_mut(block.pitch).take(channels - first);
+                    for (to, from) in to.zip(both.chunks_exact(ROWS)) {
+                        to.copy_from_slice(&from[..block.pitch]);
+                    }
                 }
             }
         }
@@ -187,48 +230,56 @@ pub(crate) fn run(
     bias: &[f32],
     y: &mut fresh::Block<f32>,
 ) {
-    let call = Call { tier, plan, reader: way.reader(plan), x, w, bias };
-    match way {
-        Way::Unit => call.run::<Unit, 6, 6, 4>(y),
-        Way::Down => call.run::<Down, 9, 9, 4>(y),
-        Way::Up => call.run::<Up, 5, 9, 8>(y),
+    way.give(&Call::new(tier, plan, way, x, w, bias, y));
+}
+
+/// What all jobs have in common.
+pub(super) struct Call<'a, W: ?Sized> {
+    pub tier: Tier,
+    pub plan: &'a Plan,
+    pub way: Way,
+    pub reader: Plan,
+    pub x: &'a [f32],
+    pub w: &'a W,
+    pub bias: &'a [f32],
+    pub images: usize,
+    pub y: Disjoint<'a, MaybeUninit<f32>>,
+}
+
+impl<'a, W: ?Sized> Call<'a, W> {
+    pub fn new(
+        tier: Tier,
+        plan: &'a Plan,
+        way: Way,
+        x: &'a [f32],
+        w: &'a W,
+        bias: &'a [f32],
+        y: &'a mut fresh::Block<f32>,
+    ) -> Self {
+        let pixels: usize = plan.dst_size.iter().product();
+        let images = y.len() / (plan.dst_channels * pixels);
+        let (reader, y) = (way.reader(plan), Disjoint::new(y));
+        Self { tier, plan, way, reader, x, w, bias, images, y }
     }
 }
 
-/// What all blocks of tiles have in common.
-struct Call<'a> {
-    tier: Tier,
-    plan: &'a Plan,
-    reader: Plan,
-    x: &'a [f32],
-    w: &'a Weights,
-    bias: &'a [f32],
-}
-
-impl Call<'_> {
-    fn run<F, const IN: usize, const POINTS: usize, const OUT: usize>(
-        &self,
-        y: &mut fresh::Block<f32>,
-    ) where
+impl Formed for &Call<'_, Weights> {
+    fn with<F, const IN: usize, const POINTS: usize, const OUT: usize>(self)
+    where
         F: Form<IN, POINTS, OUT>,
     {
         let plan = self.plan;
-        let dst: usize = plan.dst_size.iter().product();
-        let images = y.len() / (plan.dst_channels * dst);
         let [_, height, width] = plan.grid();
         // Tiles of a block: rows of at most 16.
         let vectors = FLOATS / (POINTS * POINTS * LANES * plan.src_channels);
         let across = width.div_ceil(TILE).min(LANES);
         let down = (vectors.clamp(1, VECTORS) * LANES / across).clamp(1, height.div_ceil(TILE));
-        let layout = self.reader.layout([1, down * F::READ, across * F::READ]);
         let starts = super::plan::starts(plan.grid(), [1, down * TILE, across * TILE]);
-        let y = Disjoint::new(y);
-        (0..images * starts.len()).into_par_iter().for_each(|job| {
+        (0..self.images * starts.len()).into_par_iter().for_each(|job| {
             let (image, start) = (job / starts.len(), starts[job % starts.len()]);
             Buffers::with(|buffers| {
-                let tiles = [down, across];
-                let form = PhantomData::<F>;
-                let job = Job { call: self, layout, tiles, image, start, buffers, y: &y, form };
+                let (tiles, form) = ([down, across], PhantomData::<F>);
+                let job = Job { call: self, tiles, image, start, buffers, form };
                 self.tier.run::<Job<'_, F, IN, POINTS, OUT>>(job);
             });
         });
@@ -237,15 +288,13 @@ impl Call<'_> {
 
 /// A block of tiles, all channels.
 struct Job<'a, F, const IN: usize, const POINTS: usize, const OUT: usize> {
-    call: &'a Call<'a>,
-    layout: Layout,
+    call: &'a Call<'a, Weights>,
     /// Rows and columns of tiles of a whole block.
     tiles: [usize; 2],
     image: usize,
     /// Grid position.
     start: Axes,
     buffers: &'a mut Buffers,
-    y: &'a Disjoint<'a, MaybeUninit<f32>>,
     form: PhantomData<F>,
 }
 
@@ -258,40 +307,31 @@ where
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let Call { plan, ref reader, x, w, bias, .. } = *self.call;
-        let (layout, grid) = (self.layout, plan.grid());
+        let Call { plan, ref reader, x, w, bias, ref y, .. } = *self.call;
+        let grid = plan.grid();
         let Buffers { x: patch, tiles, products, .. } = self.buffers;
         let inside = |a: usize| self.tiles[a - 1].min((grid[a] - self.start[a]).div_ceil(TILE));
         let [down, across] = [inside(1), inside(2)];
         let count = down * across;
         let block = Tiles { count, across, picture: count };
         let length = block.count.next_multiple_of(LANES);
-        let places = block.places(&layout, F::READ);
+        let gather = Gather::new::<F, IN, POINTS, OUT>(reader, block, self.start, x.len());
         // Off a power of two, lest all groups share one cache set.
         let sources = Places::new(POINTS, plan.src_channels, length, LANES);
         let sums = &Places::new(POINTS, ROWS, length, 0);
-        let patch = patch.room(layout.channel + SLACK);
         let tiles = tiles.room(sources.floats);
         let pixels: usize = plan.src_size.iter().product();
         let channels = plan.src_channels;
-        let [depth, top, left] = self.start;
-        let from = [depth, top * F::READ / TILE, left * F::READ / TILE];
         let picture = &x[self.image * channels * pixels..][..channels * pixels];
         for (c, x) in picture.chunks_exact(pixels).enumerate() {
-            pack(reader, &layout, x, from, &mut patch[..layout.channel]);
-            for (v, places) in places.iter().enumerate() {
-                let points = transform::<S, F, IN, POINTS, OUT>(s, patch, places, layout.pitch());
-                scatter(s, &points, tiles, &sources, [c, v * LANES]);
-            }
+            gather.channel::<S, F, IN, POINTS, OUT>(s, x, patch, tiles, (&sources, c));
         }
-        let weights = channels * GROUPS;
-        for (index, part) in w.blocks.iter().enumerate() {
-            let panel = &w.data[index * ROWS * weights..][..part.pitch * weights];
-            let corner = [top, left].map(|v| v * OUT / TILE);
-            let to = Outputs { plan, y: self.y, image: self.image, depth, corner, block };
+        let to = Outputs::new::<OUT>(plan, y, block, self.image, self.start);
+        let panels = w.data.chunks_exact(GROUPS * group_step(channels));
+        for (part, panel) in w.blocks.iter().zip(panels) {
             let product =
                 Product { x: tiles, sources: &sources, sums, stride: None, part, panel, bias };
-            product.run::<S, F, IN, POINTS, OUT>(s, products, to);
+            product.run::<S, F, IN, POINTS, OUT>(s, products, &to);
         }
     }
 }
@@ -317,16 +357,15 @@ impl Product<'_> {
         &self,
         s: S,
         products: &mut Buffer,
-        to: Outputs<'_>,
+        to: &Outputs<'_>,
     ) where
         S: Simd,
         F: Form<IN, POINTS, OUT>,
     {
         let (part, channels) = (self.part, to.plan.src_channels);
-        let length = to.block.count.next_multiple_of(LANES);
         let sums = self.sums;
         let products = products.room(sums.floats);
-        for (i, w) in self.panel.chunks_exact(part.pitch * channels).enumerate() {
+        for (i, w) in self.panel.chunks_exact(group_step(channels)).enumerate() {
             let ((at, length), (to, _)) = (self.sources.groups[i], sums.groups[i]);
             let strip = Strip {
                 x: &self.x[at..],
@@ -339,147 +378,20 @@ impl Product<'_> {
             };
             strip.run(s, part.pitch, &mut products[to..][..ROWS * length]);
         }
+        let mut rows = [[s.splat(0.0); POINTS]; OUT];
         for m in 0..part.rows {
             let channel = part.first + m;
             let bias = self.bias.get(channel).copied().unwrap_or(0.0);
-            for first in (0..length).step_by(LANES) {
-                let rows = columns::<S, F, IN, POINTS, OUT>(s, products, sums, [m, first]);
-                to.finish::<S, F, IN, POINTS, OUT>(s, rows, bias, [channel, first]);
-            }
-        }
-    }
-}
-
-/// The tiles of a block, row by row, of one picture after the other.
-#[derive(Clone, Copy)]
-pub(super) struct Tiles {
-    pub count: usize,
-    /// Tiles of a row.
-    pub across: usize,
-    /// Tiles of a picture.
-    pub picture: usize,
-}
-
-impl Tiles {
-    /// Where each vector of tiles begins in a packed channel of all pictures, `read` places
-    /// from tile to tile. Lanes beyond the last tile repeat earlier ones.
-    pub fn places(self, layout: &Layout, read: usize) -> Vec<Lanes> {
-        let group = LANES / read;
-        let place = |t: usize| {
-            let last = self.count.saturating_sub(group) + t % group;
-            let t = if t < self.count { t } else { last.min(self.count - 1) };
-            let (picture, t) = (t / self.picture, t % self.picture);
-            let place = (t / self.across * layout.pitch() + t % self.across) * read;
-            picture * layout.channel + place
-        };
-        let vector = |first: usize| {
-            let at: [usize; LANES] = std::array::from_fn(|i| place(first + i));
-            let joined = (0..LANES).all(|i| at[i] == at[i / group * group] + i % group * read);
-            Lanes { at, joined }
-        };
-        (0..self.count).step_by(LANES).map(vector).collect()
-    }
-}
-
-/// Sixteen tiles in a packed channel.
-pub(super) struct Lanes {
-    at: [usize; LANES],
-    /// Whether those whose places make whole vectors lie one behind the other.
-    joined: bool,
-}
-
-impl Lanes {
-    /// One row of the tiles, `offset` behind their first; `READ` as the form's.
-    #[inline(always)]
-    fn row<S: Simd, const IN: usize>(
-        &self,
-        s: S,
-        x: &[f32],
-        offset: usize,
-        read: usize,
-    ) -> [S::F; IN] {
-        let mut row = [s.splat(0.0); IN];
-        if self.joined && read == 8 {
-            for first in (0..IN).step_by(8) {
-                let mut v = [s.splat(0.0); 8];
-                for k in 0..8 {
-                    if let Some(x) = x[self.at[2 * k] + offset + first..].first_chunk() {
-                        v[k] = s.load(x);
+            for (v, places) in to.places.iter().enumerate() {
+                let at = [m, v * LANES];
+                columns::<S, F, IN, POINTS, OUT>(s, products, sums, at, &mut rows);
+                for r in 0..OUT {
+                    let mut row = F::outputs(s, rows[r]);
+                    for k in 0..OUT {
+                        row[k] = row[k] + s.splat(bias);
                     }
+                    to.write(s, row, channel, places, r);
                 }
-                for (to, v) in row[first..].iter_mut().zip(s.columns8(v)) {
-                    *to = v;
-                }
-            }
-        } else if self.joined {
-            for first in (0..IN).step_by(4) {
-                let mut v = [s.splat(0.0); 4];
-                for k in 0..4 {
-                    if let Some(x) = x[self.at[4 * k] + offset + first..].first_chunk() {
-                        v[k] = s.load(x);
-                    }
-                }
-                for (to, v) in row[first..].iter_mut().zip(s.columns4(v)) {
-                    *to = v;
-                }
-            }
-        } else {
-            for first in (0..IN).step_by(4) {
-                let four = s.load4(x, &self.at, offset + first);
-                for (to, v) in row[first..].iter_mut().zip(four) {
-                    *to = v;
-                }
-            }
-        }
-        row
-    }
-}
-
-/// Transformed tiles of a packed channel.
-#[inline(always)]
-pub(super) fn transform<S, F, const IN: usize, const POINTS: usize, const OUT: usize>(
-    s: S,
-    x: &[f32],
-    lanes: &Lanes,
-    pitch: usize,
-) -> [[S::F; POINTS]; POINTS]
-where
-    S: Simd,
-    F: Form<IN, POINTS, OUT>,
-{
-    let mut rows = [[s.splat(0.0); POINTS]; IN];
-    for r in 0..IN {
-        rows[r] = F::points(s, lanes.row(s, x, r * pitch, F::READ));
-    }
-    let mut out = [[s.splat(0.0); POINTS]; POINTS];
-    for j in 0..POINTS {
-        let mut column = [s.splat(0.0); IN];
-        for i in 0..IN {
-            column[i] = rows[i][j];
-        }
-        let column = F::points(s, column);
-        for i in 0..POINTS {
-            out[i][j] = column[i];
-        }
-    }
-    out
-}
-
-/// Writes a vector of transformed tiles, from tile `first` of channel `c` on.
-#[inline(always)]
-pub(super) fn scatter<S: Simd, const POINTS: usize>(
-    s: S,
-    points: &[[S::F; POINTS]; POINTS],
-    tiles: &mut [f32],
-    places: &Places,
-    [c, first]: [usize; 2],
-) {
-    for i in 0..POINTS {
-        for j in 0..POINTS {
-            let p = i * POINTS + j;
-            let to = &mut tiles[places.at[p] + c * places.step[p] + first..];
-            if let Some(to) = to.first_chunk_mut() {
-                s.store(points[i][j], to);
             }
         }
     }
@@ -492,18 +404,17 @@ fn columns<S, F, const IN: usize, const POINTS: usize, const OUT: usize>(
     products: &[f32],
     places: &Places,
     [m, first]: [usize; 2],
-) -> [[S::F; POINTS]; OUT]
-where
+    rows: &mut [[S::F; POINTS]; OUT],
+) where
     S: Simd,
     F: Form<IN, POINTS, OUT>,
 {
-    let mut rows = [[s.splat(0.0); POINTS]; OUT];
     for j in 0..POINTS {
         let mut column = [s.splat(0.0); POINTS];
         for i in 0..POINTS {
             let p = i * POINTS + j;
-            let from = &products[places.at[p] + m * places.step[p] + first..];
-            if let Some(from) = from.first_chunk() {
+            let from = places.at[p] + m * places.step[p] + first;
+            if let Some(from) = products.get(from..).and_then(|from| from.first_chunk()) {
                 column[i] = s.load(from);
             }
         }
@@ -512,110 +423,110 @@ where
             rows[i][j] = column[i];
         }
     }
-    rows
 }
 
-/// Where a block's outputs go.
+/// Where a block's outputs go, the same in every channel.
 pub(super) struct Outputs<'a> {
-    pub plan: &'a Plan,
-    pub y: &'a Disjoint<'a, MaybeUninit<f32>>,
-    /// The first picture.
-    pub image: usize,
-    pub depth: usize,
-    /// Row and column of the first.
-    pub corner: [usize; 2],
-    pub block: Tiles,
+    plan: &'a Plan,
+    y: &'a Disjoint<'a, MaybeUninit<f32>>,
+    /// For each vector of tiles.
+    places: Vec<Pieces>,
 }
 
-impl Outputs<'_> {
-    /// Transforms the rows of sixteen tiles of `channel` from `first` on, and writes them.
-    #[inline(always)]
-    fn finish<S, F, const IN: usize, const POINTS: usize, const OUT: usize>(
-        &self,
-        s: S,
-        rows: [[S::F; POINTS]; OUT],
-        bias: f32,
-        at: [usize; 2],
-    ) where
-        S: Simd,
-        F: Form<IN, POINTS, OUT>,
-    {
-        let bias = s.splat(bias);
-        for (r, row) in rows.into_iter().enumerate() {
-            let mut row = F::outputs(s, row);
-            for v in &mut row {
-                *v = *v + bias;
-            }
-            self.write(s, row, at, r);
-        }
+/// Where the outputs of sixteen tiles go.
+struct Pieces {
+    /// Where each vector of a row of them goes as a whole, if all do.
+    whole: Option<[usize; 8]>,
+    /// Else by tiles.
+    tiles: Vec<Piece>,
+}
+
+struct Piece {
+    lane: usize,
+    at: usize,
+    /// What the picture has of the tile.
+    rows: usize,
+    columns: usize,
+}
+
+impl<'a> Outputs<'a> {
+    /// Of `tiles`, the first of which has the grid position `start` in picture `image`.
+    pub fn new<const OUT: usize>(
+        plan: &'a Plan,
+        y: &'a Disjoint<'a, MaybeUninit<f32>>,
+        tiles: Tiles,
+        image: usize,
+        [depth, top, left]: Axes,
+    ) -> Self {
+        let Tiles { count, across, picture } = tiles;
+        let [slices, height, width] = plan.dst_size;
+        let piece = |lane: usize, t: usize| {
+            let (image, t) = (image + t / picture, t % picture);
+            let row = top * OUT / TILE + t / across * OUT;
+            let column = left * OUT / TILE + t % across * OUT;
+            let slice = image * plan.dst_channels * slices + depth;
+            let at = (slice * height + row) * width + column;
+            let [rows, columns] = [height.saturating_sub(row), width.saturating_sub(column)];
+            Piece { lane, at, rows: rows.min(OUT), columns: columns.min(OUT) }
+        };
+        let vector = |first: usize| {
+            let lanes = 0..LANES.min(count - first);
+            let tiles: Vec<_> = lanes.map(|lane| piece(lane, first + lane)).collect();
+            let full = |p: &Piece| [p.rows, p.columns] == [OUT; 2];
+            let joined = |group: &[Piece]| {
+                let last = group.len() - 1;
+                group[last].at == group[0].at + last * OUT
+            };
+            let group = LANES / OUT;
+            let all = tiles.len() == LANES && tiles.iter().all(full);
+            let whole = all && tiles.chunks_exact(group).all(joined);
+            let places = || from_fn(|k| tiles.get(k * group).map_or(0, |piece| piece.at));
+            Pieces { whole: whole.then(places), tiles }
+        };
+        let places = (0..count).step_by(LANES).map(vector).collect();
+        Self { plan, y, places }
     }
 
-    /// Writes row `r` of sixteen tiles from `first` on; what lies beyond the border is
-    /// dropped.
+    /// Writes row `r` of sixteen tiles of `channel`.
     #[inline(always)]
     fn write<S: Simd, const OUT: usize>(
         &self,
         s: S,
         v: [S::F; OUT],
-        [channel, first]: [usize; 2],
+        channel: usize,
+        pieces: &Pieces,
         r: usize,
     ) {
-        let mut rows = [[0.0; LANES]; OUT];
-        if OUT == 8 {
-            let mut eight = [v[0]; 8];
-            eight.iter_mut().zip(v).for_each(|(to, v)| *to = v);
-            for (to, v) in rows.iter_mut().zip(s.rows8(eight)) {
-                s.store(v, to);
+        let [slices, height, width] = self.plan.dst_size;
+        let down = channel * slices * height * width + r * width;
+        let rows = match OUT {
+            8 => s.rows8([v[0], v[1], v[2], v[3], v[OUT - 4], v[OUT - 3], v[OUT - 2], v[OUT - 1]]),
+            _ => {
+                let [a, b, c, d] = s.rows4([v[0], v[1], v[2], v[3]]);
+                [a, b, c, d, a, b, c, d]
             }
-        } else {
-            let mut four = [v[0]; 4];
-            four.iter_mut().zip(v).for_each(|(to, v)| *to = v);
-            for (to, v) in rows.iter_mut().zip(s.rows4(four)) {
-                s.store(v, to);
-            }
-        }
-        let [_, height, width] = self.plan.dst_size;
-        let Tiles { count, across, .. } = self.block;
-        let group = LANES / OUT;
-        for k in 0..OUT {
-            let t = first + k * group;
-            let (plane, row, column) = self.place(channel, t, OUT);
-            let row = row + r;
-            // Tiles of one row, none of them cut.
-            if t + group <= count
-                && t % across + group <= across
-                && row < height
-                && column + LANES <= width
-            {
-                let at = (plane * height + row) * width + column;
+        };
+        if let Some(places) = pieces.whole {
+            for k in 0..OUT {
+                let at = places[k] + down;
                 // SAFETY: no two jobs, and no two tiles of a job, hold the same outputs.
                 let to = unsafe { self.y.part(at..at + LANES) };
                 if let Some(to) = to.first_chunk_mut() {
-                    *to = rows[k].map(MaybeUninit::new);
+                    s.store_fresh(rows[k], to);
                 }
-                continue;
             }
-            for (i, tile) in rows[k].as_chunks::<OUT>().0.iter().enumerate() {
-                let (plane, row, column) = self.place(channel, t + i, OUT);
-                let row = row + r;
-                if t + i >= count || row >= height || column >= width {
-                    continue;
-                }
-                let at = (plane * height + row) * width + column;
-                // SAFETY: as above.
-                let to = unsafe { self.y.part(at..at + OUT.min(width - column)) };
-                to.iter_mut().zip(tile).for_each(|(to, v)| *to = MaybeUninit::new(*v));
-            }
+            return;
         }
-    }
-
-    /// Slice of y, over pictures, channels and depths, row and column of tile `t`.
-    #[inline(always)]
-    fn place(&self, channel: usize, t: usize, out: usize) -> (usize, usize, usize) {
-        let Tiles { across, picture, .. } = self.block;
-        let (image, t) = (self.image + t / picture, t % picture);
-        let channel = image * self.plan.dst_channels + channel;
-        let plane = channel * self.plan.dst_size[0] + self.depth;
-        (plane, self.corner[0] + t / across * out, self.corner[1] + t % across * out)
+        let mut floats = [[0.0; LANES]; OUT];
+        for k in 0..OUT {
+            s.store(rows[k], &mut floats[k]);
+        }
+        let tiles = floats.as_flattened().as_chunks::<OUT>().0;
+        for piece in pieces.tiles.iter().filter(|piece| r < piece.rows) {
+            let at = piece.at + down;
+            // SAFETY: as above.
+            let to = unsafe { self.y.part(at..at + piece.columns) };
+            to.iter_mut().zip(tiles[piece.lane]).for_each(|(to, v)| *to = MaybeUninit::new(v));
+        }
     }
 }

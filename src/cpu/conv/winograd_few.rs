@@ -4,16 +4,16 @@
 //! sums are those of [`super::winograd`], bit for bit.
 
 use super::Buffers;
-use super::forms::{Down, Form, GROUPS, Places, TILE, Unit, Up};
-use super::plan::{Layout, Plan, pack};
+use super::forms::{Form, GROUPS, Places, TILE};
+use super::gather::{Gather, Tiles};
+use super::plan::Plan;
 use super::shift::{Block, ROWS, blocks};
-use super::winograd::{Lanes, Outputs, Product, SLACK, Tiles, Transform, Way, scatter, transform};
-use crate::cpu::disjoint::Disjoint;
+use super::winograd::{Call, Formed, Outputs, Product, Transform, Way, group_step};
 use crate::cpu::fresh;
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
 use rayon::prelude::*;
 use std::marker::PhantomData;
-use std::mem::{MaybeUninit, take};
+use std::mem::take;
 
 /// Channels that a job transforms at least: one takes microseconds.
 const LEAST: usize = 8;
@@ -29,60 +29,41 @@ pub(super) fn run(
     bias: &[f32],
     y: &mut fresh::Block<f32>,
 ) {
-    let call = Call { tier, plan, way, reader: way.reader(plan), x, w, bias };
-    match way {
-        Way::Unit => call.run::<Unit, 6, 6, 4>(y),
-        Way::Down => call.run::<Down, 9, 9, 4>(y),
-        Way::Up => call.run::<Up, 5, 9, 8>(y),
-    }
+    way.give(&Call::new(tier, plan, way, x, w, bias, y));
 }
 
-struct Call<'a> {
-    tier: Tier,
-    plan: &'a Plan,
-    way: Way,
-    reader: Plan,
-    x: &'a [f32],
-    w: &'a [f32],
-    bias: &'a [f32],
-}
-
-impl Call<'_> {
-    fn run<F, const IN: usize, const POINTS: usize, const OUT: usize>(
-        &self,
-        y: &mut fresh::Block<f32>,
-    ) where
+impl Formed for &Call<'_, [f32]> {
+    fn with<F, const IN: usize, const POINTS: usize, const OUT: usize>(self)
+    where
         F: Form<IN, POINTS, OUT>,
     {
         let plan = self.plan;
-        let pixels: usize = plan.dst_size.iter().product();
-        let images = y.len() / (plan.dst_channels * pixels);
+        let pixels: usize = plan.src_size.iter().product();
         let [_, height, width] = plan.grid();
         let [down, across] = [height, width].map(|n| n.div_ceil(TILE));
         let picture = down * across;
-        let tiles = Tiles { count: images * picture, across, picture };
+        let tiles = Tiles { count: self.images * picture, across, picture };
         let length = tiles.count.next_multiple_of(LANES);
-        let layout = self.reader.layout([1, down * F::READ, across * F::READ]);
-        let lanes = tiles.places(&layout, F::READ);
-        let own = Places::new(POINTS, 1, length, 0);
+        let apart = plan.src_channels * pixels;
+        let gather = &Gather::new::<F, IN, POINTS, OUT>(&self.reader, tiles, [0; 3], apart);
+        let own = &Places::new(POINTS, 1, length, 0);
         // Off a power of two, lest all channels share one cache set.
         let stride = own.floats + LANES;
         // Apart from this thread's own, which its jobs use.
         let mut transformed = Buffers::with(|buffers| take(&mut buffers.tiles));
         let all = transformed.room(plan.src_channels * stride);
-        let gather = all.par_chunks_exact_mut(stride).enumerate().with_min_len(LEAST);
-        gather.for_each(|(channel, tiles)| {
-            let (lanes, own, form) = (&lanes, &own, PhantomData::<F>);
+        let each = all.par_chunks_exact_mut(stride).enumerate().with_min_len(LEAST);
+        each.for_each(|(channel, tiles)| {
+            let (x, form) = (&self.x[channel * pixels..], PhantomData::<F>);
             Buffers::with(|buffers| {
-                let job = Gather { call: self, layout, lanes, own, channel, buffers, tiles, form };
-                self.tier.run::<Gather<'_, F, IN, POINTS, OUT>>(job);
+                let job = Read { gather, own, x, buffers, tiles, form };
+                self.tier.run::<Read<'_, F, IN, POINTS, OUT>>(job);
             });
         });
-        let y = Disjoint::new(y);
         blocks(plan.dst_channels).par_iter().for_each(|block| {
-            let (x, own, y, form) = (&*all, &own, &y, PhantomData::<F>);
+            let (x, form) = (&*all, PhantomData::<F>);
             Buffers::with(|buffers| {
-                let job = Multiply { call: self, tiles, x, stride, own, block, buffers, y, form };
+                let job = Multiply { call: self, tiles, x, stride, own, block, buffers, form };
                 self.tier.run::<Multiply<'_, F, IN, POINTS, OUT>>(job);
             });
         });
@@ -91,19 +72,18 @@ impl Call<'_> {
 }
 
 /// Transformed tiles of one channel of all pictures, `[product][tile]`.
-struct Gather<'a, F, const IN: usize, const POINTS: usize, const OUT: usize> {
-    call: &'a Call<'a>,
-    layout: Layout,
-    lanes: &'a [Lanes],
+struct Read<'a, F, const IN: usize, const POINTS: usize, const OUT: usize> {
+    gather: &'a Gather<'a>,
     own: &'a Places,
-    channel: usize,
+    /// From the channel's first picture on.
+    x: &'a [f32],
     buffers: &'a mut Buffers,
     tiles: &'a mut [f32],
     form: PhantomData<F>,
 }
 
 impl<F, const IN: usize, const POINTS: usize, const OUT: usize> Kernel
-    for Gather<'_, F, IN, POINTS, OUT>
+    for Read<'_, F, IN, POINTS, OUT>
 where
     F: Form<IN, POINTS, OUT>,
 {
@@ -111,25 +91,14 @@ where
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let Call { plan, ref reader, x, .. } = *self.call;
-        let pixels: usize = plan.src_size.iter().product();
-        let pictures = x.chunks_exact(pixels).skip(self.channel).step_by(plan.src_channels);
-        let floats = pictures.len() * self.layout.channel;
-        let patch = self.buffers.x.room(floats + SLACK);
-        for (x, patch) in pictures.zip(patch.chunks_exact_mut(self.layout.channel)) {
-            pack(reader, &self.layout, x, [0; 3], patch);
-        }
-        for (v, lanes) in self.lanes.iter().enumerate() {
-            let pitch = self.layout.pitch();
-            let points = transform::<S, F, IN, POINTS, OUT>(s, patch, lanes, pitch);
-            scatter(s, &points, self.tiles, self.own, [0, v * LANES]);
-        }
+        let Self { gather, own, x, buffers, tiles, .. } = self;
+        gather.channel::<S, F, IN, POINTS, OUT>(s, x, &mut buffers.x, tiles, (own, 0));
     }
 }
 
 /// A block of output channels of all pictures.
 struct Multiply<'a, F, const IN: usize, const POINTS: usize, const OUT: usize> {
-    call: &'a Call<'a>,
+    call: &'a Call<'a, [f32]>,
     tiles: Tiles,
     /// `[channel][product][tile]`.
     x: &'a [f32],
@@ -138,7 +107,6 @@ struct Multiply<'a, F, const IN: usize, const POINTS: usize, const OUT: usize> {
     own: &'a Places,
     block: &'a Block,
     buffers: &'a mut Buffers,
-    y: &'a Disjoint<'a, MaybeUninit<f32>>,
     form: PhantomData<F>,
 }
 
@@ -151,17 +119,17 @@ where
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let Call { plan, way, w, bias, .. } = *self.call;
-        let (block, y) = (self.block, self.y);
+        let Call { plan, way, w, bias, ref y, .. } = *self.call;
+        let block = self.block;
         let channels = plan.src_channels;
         let Buffers { y: panel, products, .. } = self.buffers;
-        let panel = panel.room(GROUPS * channels * block.pitch);
+        let panel = panel.room(GROUPS * group_step(channels));
         Transform { plan, way, w, block, panel }.run(s);
         let (sources, stride) = (self.own, Some(self.stride));
         let length = self.tiles.count.next_multiple_of(LANES);
         let sums = &Places::new(POINTS, ROWS, length, 0);
         let product = Product { x: self.x, sources, sums, stride, part: block, panel, bias };
-        let to = Outputs { plan, y, image: 0, depth: 0, corner: [0; 2], block: self.tiles };
-        product.run::<S, F, IN, POINTS, OUT>(s, products, to);
+        let to = Outputs::new::<OUT>(plan, y, self.tiles, 0, [0; 3]);
+        product.run::<S, F, IN, POINTS, OUT>(s, products, &to);
     }
 }

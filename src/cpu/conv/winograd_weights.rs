@@ -5,10 +5,11 @@
 //! channels), ∂w = Gᵀ·(Σ over tiles of V⊙Z)·G.
 
 use super::Buffers;
-use super::forms::{Adjoint, Down, Form, GROUPS, Places, TILE, Unit, WEIGHTS};
-use super::plan::{Axes, Layout, Plan, pack};
-use super::weights::{LANES_WIDE, ROWS, Tile, Work, turn};
-use super::winograd::{SLACK, Tiles, Way, scatter, transform};
+use super::forms::{Adjoint, Down, Form, GROUPS, Places, TILE, Unit, WEIGHTS, put};
+use super::gather::{Gather, Tiles};
+use super::plan::{Axes, Plan};
+use super::weights::{LANES_WIDE, ROWS, Tile, Work};
+use super::winograd::Way;
 use crate::cpu::simd::{Kernel, LANES, Simd};
 use std::ops::Range;
 
@@ -91,26 +92,18 @@ impl Products<'_, '_> {
     {
         let work = self.work;
         let reader = self.way.reader(work.plan);
-        let [_, height, width] = work.layout.tile;
-        let layout: Layout = reader.layout([1, height * F::READ / TILE, width * F::READ / TILE]);
         let inside = work.inside(self.start);
         let [_, down, across] = inside.map(|n| n.div_ceil(TILE));
         let (count, channels) = (down * across, work.rows / 9);
         let length = count.next_multiple_of(LANES);
-        let places = Tiles { count, across, picture: count }.places(&layout, F::READ);
+        let block = Tiles { count, across, picture: count };
+        let gather = Gather::new::<F, IN, POINTS, TILE>(&reader, block, self.start, self.x.len());
         let sources = Places::new(POINTS, channels, length, LANES);
-        let Buffers { x: patch, y: turned, tiles, gradients, .. } = self.buffers;
-        let patch = patch.room(layout.channel + SLACK);
+        let Buffers { x: patch, tiles, gradients, .. } = self.buffers;
         let tiles = tiles.room(sources.floats);
         let pixels: usize = work.plan.src_size.iter().product();
-        let [depth, top, left] = self.start;
-        let from = [depth, top * F::READ / TILE, left * F::READ / TILE];
         for (c, x) in self.x.chunks_exact(pixels).enumerate() {
-            pack(&reader, &layout, x, from, &mut patch[..layout.channel]);
-            for (v, places) in places.iter().enumerate() {
-                let points = transform::<S, F, IN, POINTS, TILE>(s, patch, places, layout.pitch());
-                scatter(s, &points, tiles, &sources, [c, v * LANES]);
-            }
+            gather.channel::<S, F, IN, POINTS, TILE>(s, x, patch, tiles, (&sources, c));
         }
         let mut products = self.products;
         let rows = channels.next_multiple_of(ROWS);
@@ -119,20 +112,12 @@ impl Products<'_, '_> {
             let (own, rest) = products.split_at_mut(GROUPS * rows * pitch);
             products = rest;
             let part = Work { outputs, pitch, ..*work };
-            // One row of tiles after the other, each `pitch` gradients.
-            let outward = Places::new(POINTS, 1, count * pitch, 0);
+            // One row of tiles after the other, each `pitch` gradients; off a power of two.
+            let outward = Places::new(POINTS, 1, count * pitch, LANES);
             let gradients = gradients.room(outward.floats);
-            let turned = turned.room(TILE * across * TILE * pitch);
+            let part = Spread { work: &part, dy: self.dy, start: self.start, inside };
             for row in 0..down {
-                if inside[1] - row * TILE < TILE || inside[2] < across * TILE {
-                    turned.fill(0.0);
-                }
-                for r in 0..TILE.min(inside[1] - row * TILE) {
-                    let to = &mut turned[r * across * TILE * pitch..][..inside[2] * pitch];
-                    turn(s, &part, self.dy, (self.start, 0, row * TILE + r), [1, inside[2]], to);
-                }
-                let first = row * across * pitch;
-                spread::<S, F, POINTS>(s, turned, [first, across, pitch], &outward, gradients);
+                part.row::<S, F, POINTS>(s, row, &outward, gradients);
             }
             for i in 0..GROUPS {
                 let ((at, step), (from, floats)) = (sources.groups[i], outward.groups[i]);
@@ -157,34 +142,69 @@ impl Products<'_, '_> {
     }
 }
 
-/// Z of one row of tiles from `[4 rows][4·across][pitch]` gradients.
-#[inline(always)]
-fn spread<S: Simd, F: Adjoint<POINTS>, const POINTS: usize>(
-    s: S,
-    dy: &[f32],
-    [first, across, pitch]: [usize; 3],
-    places: &Places,
-    out: &mut [f32],
-) {
-    for t in 0..across {
+/// Z of a block of tiles.
+struct Spread<'a, 'b> {
+    work: &'a Work<'b>,
+    dy: &'a [f32],
+    start: Axes,
+    /// Outputs of the block that there are.
+    inside: Axes,
+}
+
+impl Spread<'_, '_> {
+    /// Of row `row` of tiles, to `out`: `[tile][channel]` of each product.
+    #[inline(always)]
+    fn row<S: Simd, F: Adjoint<POINTS>, const POINTS: usize>(
+        &self,
+        s: S,
+        row: usize,
+        places: &Places,
+        out: &mut [f32],
+    ) {
+        let Work { pitch, ref outputs, plan, .. } = *self.work;
+        let [_, height, width] = self.inside;
+        let across = width.div_ceil(TILE);
+        // Of sixteen columns, lanes being channels.
+        let mut d = [[s.splat(0.0); LANES]; TILE];
+        let mut rows = [[s.splat(0.0); POINTS]; TILE];
         for v in (0..pitch).step_by(LANES) {
-            let mut rows = [[s.splat(0.0); POINTS]; TILE];
-            for r in 0..TILE {
-                let mut d = [s.splat(0.0); TILE];
-                for q in 0..TILE {
-                    let at = ((r * across + t) * TILE + q) * pitch + v;
-                    if let Some(from) = dy[at..].first_chunk() {
-                        d[q] = s.load(from);
+            let lanes = LANES.min(outputs.len().saturating_sub(v));
+            for left in (0..width).step_by(LANES) {
+                let columns = LANES.min(width - left);
+                let bits = u16::MAX >> (LANES - columns);
+                for r in 0..TILE {
+                    let mut m = [s.splat(0.0); LANES];
+                    for i in 0..LANES {
+                        if i >= lanes || row * TILE + r >= height {
+                            continue;
+                        }
+                        let at = self.work.dy_at(outputs.start + v + i, self.start, 0)
+                            + (row * TILE + r) * plan.dst_size[2]
+                            + left;
+                        let from = &self.dy[at..][..columns];
+                        // The next columns, in whose lines nothing else is near.
+                        s.prefetch(from.as_ptr().wrapping_add(LANES));
+                        // SAFETY: as many are there.
+                        m[i] = unsafe { s.load_lanes(from.as_ptr(), bits) };
                     }
+                    put(&mut d[r], s.transpose(m));
                 }
-                rows[r] = F::spread(s, d);
-            }
-            for j in 0..POINTS {
-                let column = F::spread(s, [rows[0][j], rows[1][j], rows[2][j], rows[3][j]]);
-                for i in 0..POINTS {
-                    let at = places.at[i * POINTS + j] + first + t * pitch + v;
-                    if let Some(to) = out[at..].first_chunk_mut() {
-                        s.store(column[i], to);
+                for t in 0..columns.div_ceil(TILE) {
+                    for r in 0..TILE {
+                        let d = &d[r];
+                        let four = [d[t * TILE], d[t * TILE + 1], d[t * TILE + 2], d[t * TILE + 3]];
+                        put(&mut rows[r], F::spread(s, four));
+                    }
+                    let tile = row * across + left / TILE + t;
+                    for j in 0..POINTS {
+                        let column = F::spread(s, [rows[0][j], rows[1][j], rows[2][j], rows[3][j]]);
+                        for i in 0..POINTS {
+                            let at = places.at[i * POINTS + j] + tile * pitch + v;
+                            if let Some(to) = out.get_mut(at..).and_then(|to| to.first_chunk_mut())
+                            {
+                                s.store(column[i], to);
+                            }
+                        }
                     }
                 }
             }
@@ -223,9 +243,9 @@ impl Finish<'_, '_> {
             let pitch = outputs.len().next_multiple_of(LANES);
             let (own, rest) = products.split_at(GROUPS * rows * pitch);
             products = rest;
+            let mut half = [[s.splat(0.0); 3]; WEIGHTS];
             for c in 0..channels {
                 for v in (0..pitch).step_by(LANES) {
-                    let mut half = [[s.splat(0.0); 3]; WEIGHTS];
                     for i in 0..WEIGHTS {
                         let mut q = [s.splat(0.0); WEIGHTS];
                         for j in 0..WEIGHTS {
@@ -234,7 +254,7 @@ impl Finish<'_, '_> {
                                 q[j] = s.load(from);
                             }
                         }
-                        half[i] = F::taps(s, q);
+                        put(&mut half[i], F::taps(s, q));
                     }
                     for x in 0..3 {
                         let mut q = [s.splat(0.0); WEIGHTS];

@@ -2,6 +2,7 @@
 //! least vectors, and NEON, where they turn into its registers with fused products.
 
 use super::{Floats, Ints, LANES, Mask, Simd, all_inside};
+use std::mem::MaybeUninit;
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
 
 /// Products and sums round separately: no fused instruction is assumed.
@@ -137,6 +138,10 @@ macro_rules! tier {
             #[inline(always)]
             fn store(self, v: F, to: &mut [f32; LANES]) {
                 *to = v.0;
+            }
+            #[inline(always)]
+            fn store_fresh(self, v: F, to: &mut [MaybeUninit<f32>; LANES]) {
+                *to = v.0.map(MaybeUninit::new);
             }
             #[inline(always)]
             fn fma(self, a: F, b: F, c: F) -> F {
@@ -295,6 +300,29 @@ macro_rules! tier {
                     }
                 }
                 out.map(F)
+            }
+            #[inline(always)]
+            unsafe fn load_lanes(self, from: *const f32, bits: u16) -> F {
+                if bits == u16::MAX {
+                    // SAFETY: all sixteen are there, as the caller says.
+                    return F(unsafe { *from.cast() });
+                }
+                let mut out = [0.0; LANES];
+                for i in 0..LANES {
+                    if bits & (1 << i) != 0 {
+                        // SAFETY: there, as the caller says.
+                        out[i] = unsafe { *from.wrapping_add(i) };
+                    }
+                }
+                F(out)
+            }
+            #[inline(always)]
+            fn rotate(self, v: F) -> F {
+                let mut out = v;
+                for i in 0..LANES {
+                    out.0[i] = v.0[(i + 1) % LANES];
+                }
+                out
             }
             #[inline(always)]
             fn columns4(self, v: [F; 4]) -> [F; 4] {

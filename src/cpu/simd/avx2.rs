@@ -8,6 +8,7 @@
 
 use super::{Floats, Ints, Kernel, LANES, Mask, Simd, all_inside};
 use std::arch::x86_64::*;
+use std::mem::MaybeUninit;
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
 
 /// Proof that the processor has x86-64-v3.
@@ -126,6 +127,14 @@ impl Simd for Token {
         unsafe {
             _mm256_storeu_ps(to.as_mut_ptr(), v.0);
             _mm256_storeu_ps(to.as_mut_ptr().add(8), v.1);
+        }
+    }
+    #[inline(always)]
+    fn store_fresh(self, v: F, to: &mut [MaybeUninit<f32>; LANES]) {
+        let to: *mut f32 = to.as_mut_ptr().cast();
+        unsafe {
+            _mm256_storeu_ps(to, v.0);
+            _mm256_storeu_ps(to.add(8), v.1);
         }
     }
     #[inline(always)]
@@ -300,6 +309,27 @@ impl Simd for Token {
             }
             let [low, high] = halves;
             [F(low[0], high[0]), F(low[1], high[1]), F(low[2], high[2]), F(low[3], high[3])]
+        }
+    }
+    #[inline(always)]
+    unsafe fn load_lanes(self, from: *const f32, bits: u16) -> F {
+        unsafe {
+            if bits == u16::MAX {
+                return self.load(&*from.cast());
+            }
+            let lanes = self.mask(u32::from(bits));
+            let low = _mm256_maskload_ps(from, _mm256_castps_si256(lanes.0));
+            let high = _mm256_castps_si256(lanes.1);
+            F(low, _mm256_maskload_ps(from.wrapping_add(8), high))
+        }
+    }
+    #[inline(always)]
+    fn rotate(self, v: F) -> F {
+        unsafe {
+            let one = _mm256_setr_epi32(1, 2, 3, 4, 5, 6, 7, 0);
+            let low = _mm256_permutevar8x32_ps(v.0, one);
+            let high = _mm256_permutevar8x32_ps(v.1, one);
+            F(_mm256_blend_ps::<0x80>(low, high), _mm256_blend_ps::<0x80>(high, low))
         }
     }
     #[inline(always)]

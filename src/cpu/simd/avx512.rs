@@ -8,6 +8,7 @@
 
 use super::{Floats, Ints, Kernel, LANES, Mask, Simd, all_inside};
 use std::arch::x86_64::*;
+use std::mem::MaybeUninit;
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
 
 /// Proof that the processor has x86-64-v4.
@@ -110,6 +111,10 @@ impl Simd for Token {
     #[inline(always)]
     fn store(self, v: F, to: &mut [f32; LANES]) {
         unsafe { _mm512_storeu_ps(to.as_mut_ptr(), v.0) }
+    }
+    #[inline(always)]
+    fn store_fresh(self, v: F, to: &mut [MaybeUninit<f32>; LANES]) {
+        unsafe { _mm512_storeu_ps(to.as_mut_ptr().cast(), v.0) }
     }
     #[inline(always)]
     fn fma(self, a: F, b: F, c: F) -> F {
@@ -295,6 +300,17 @@ impl Simd for Token {
             let [a, b, c, d] = transpose4(joined);
             [F(a), F(b), F(c), F(d)]
         }
+    }
+    #[inline(always)]
+    unsafe fn load_lanes(self, from: *const f32, bits: u16) -> F {
+        F(unsafe { _mm512_maskz_loadu_ps(bits, from) })
+    }
+    #[inline(always)]
+    fn rotate(self, v: F) -> F {
+        F(unsafe {
+            let v = _mm512_castps_si512(v.0);
+            _mm512_castsi512_ps(_mm512_alignr_epi32::<1>(v, v))
+        })
     }
     #[inline(always)]
     fn columns4(self, v: [F; 4]) -> [F; 4] {
