@@ -14,7 +14,7 @@ use crate::cpu::simd::{Kernel, LANES, Simd};
 use std::ops::Range;
 
 /// Input channels of a job: at most, and at least for the sake of more jobs.
-const CHANNELS: usize = 64;
+const CHANNELS: usize = 256;
 const FEW_CHANNELS: usize = 16;
 /// Jobs of a call where tiles are few: each turns all gradients over again.
 const JOBS: usize = 2;
