@@ -128,6 +128,7 @@ impl Way {
     fn of(plan: &Plan, outputs: usize) -> Self {
         match outputs {
             0..=NARROW => Self::Narrow,
+            _ if winograd::tiles_of(plan) < winograd_weights::LEAST => Self::Wide,
             _ => winograd::Way::of(plan).map_or(Self::Wide, Self::Winograd),
         }
     }

@@ -21,9 +21,8 @@ use std::mem::MaybeUninit;
 const VECTORS: usize = 2;
 /// Floats of the transformed tiles of a block, unless one vector needs more.
 const FLOATS: usize = 250_000;
-/// Least channels on both sides, and tiles of a picture, for which it wins.
+/// Least channels on both sides for which it wins.
 const CHANNELS: usize = 24;
-const TILES: usize = 16;
 /// Tiles of a picture below which [`super::winograd_few`] is better.
 const FEW: usize = 48;
 
@@ -54,7 +53,7 @@ impl Way {
             }
             _ => return None,
         };
-        let wins = plan.src_channels.min(plan.dst_channels) >= CHANNELS && tiles_of(plan) >= TILES;
+        let wins = plan.src_channels.min(plan.dst_channels) >= CHANNELS;
         (plan.kernel_taps == 9 && wins).then_some(way)
     }
 

@@ -27,6 +27,8 @@ pub(super) fn tile(plan: &Plan) -> Axes {
     [1, (VECTORS * LANES / across).clamp(1, height) * TILE, across * TILE]
 }
 
+/// Least tiles of a picture for which it wins.
+pub(super) const LEAST: usize = 4;
 /// Tiles of a job at least, since its products are to be transformed at the end.
 const TILES: usize = 128;
 
