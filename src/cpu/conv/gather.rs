@@ -100,7 +100,7 @@ impl<'a> Gather<'a> {
                 let place = (t / across * layout.pitch() + t % across) * F::READ;
                 picture * layout.channel + place
             };
-            let vector = |first: usize| std::array::from_fn(|i| place(first + i));
+            let vector = |first: usize| from_fn(|i| place(first + i));
             let at = (0..count).step_by(LANES).map(vector).collect();
             let rows = Rows::Packed(Packed { reader, layout, start, stride, at });
             return Self { pitch: layout.pitch(), floats, rows };
