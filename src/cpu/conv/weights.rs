@@ -93,21 +93,27 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
         Buffers::with(|buffers| way.sums(tier, &work, units, buffers, sums));
     });
     let dw = Disjoint::new(dw);
-    sums.par_chunks_exact_mut(groups * floats).zip(&parts).for_each(|(sums, &(first, channel))| {
-        let (total, others) = sums.split_at_mut(floats);
-        for other in others.chunks_exact(floats) {
-            total.iter_mut().zip(other).for_each(|(t, v)| *t += v);
-        }
+    sums.par_chunks_exact(groups * floats).zip(&parts).for_each(|(sums, &(first, channel))| {
         let rows = channels.min(c - channel) * taps;
         let outputs = first..(first + outputs).min(o);
         let pitch = way.pitch(outputs.len());
-        for (lane, output) in outputs.enumerate() {
-            let at = (output * c + channel) * taps;
-            // SAFETY: parts differ in outputs or channels.
-            let to = unsafe { dw.part(at..at + rows) };
-            let from = total.iter().skip(lane).step_by(pitch);
-            to.iter_mut().zip(from).for_each(|(to, v)| *to = *v);
-        }
+        (0..outputs.len().div_ceil(LANES)).into_par_iter().for_each(|block| {
+            let lanes = block * LANES..(block * LANES + LANES).min(outputs.len());
+            let part = |lane: usize| {
+                let at = ((first + lane) * c + channel) * taps;
+                // SAFETY: parts and blocks differ in outputs or channels.
+                unsafe { dw.part(at..at + rows) }
+            };
+            let mut to: Vec<&mut [f32]> = lanes.clone().map(part).collect();
+            for r in 0..rows {
+                let mut total = [0.0; LANES];
+                for sums in sums.chunks_exact(floats) {
+                    let row = &sums[r * pitch..][lanes.clone()];
+                    total.iter_mut().zip(row).for_each(|(t, v)| *t += v);
+                }
+                to.iter_mut().zip(total).for_each(|(to, v)| to[r] = v);
+            }
+        });
     });
 }
 
