@@ -163,8 +163,9 @@ impl Way {
             let mut own = std::mem::take(&mut buffers.products);
             let products = own.room(winograd_weights::floats(work));
             products.fill(0.0);
+            let reader = &way.reader(work.plan);
             for (x, dy, start) in units {
-                tier.run(Products { work, way, x, dy, start, buffers, products });
+                tier.run(Products { work, way, reader, x, dy, start, buffers, products });
             }
             tier.run(Finish { work, way, products, sums });
             buffers.products = own;

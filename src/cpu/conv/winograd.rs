@@ -433,11 +433,11 @@ pub(super) struct Outputs<'a> {
 }
 
 /// Where the outputs of sixteen tiles go.
-struct Pieces {
-    /// Where each vector of a row of them goes as a whole, if all do.
-    whole: Option<[usize; 8]>,
-    /// Else by tiles.
-    tiles: Vec<Piece>,
+enum Pieces {
+    /// Vectors of a row of them, each as a whole.
+    Whole([usize; 8]),
+    /// By tiles.
+    Tiles(Vec<Piece>),
 }
 
 struct Piece {
@@ -478,9 +478,10 @@ impl<'a> Outputs<'a> {
             };
             let group = LANES / OUT;
             let all = tiles.len() == LANES && tiles.iter().all(full);
-            let whole = all && tiles.chunks_exact(group).all(joined);
-            let places = || from_fn(|k| tiles.get(k * group).map_or(0, |piece| piece.at));
-            Pieces { whole: whole.then(places), tiles }
+            if !(all && tiles.chunks_exact(group).all(joined)) {
+                return Pieces::Tiles(tiles);
+            }
+            Pieces::Whole(from_fn(|k| tiles.get(k * group).map_or(0, |piece| piece.at)))
         };
         let places = (0..count).step_by(LANES).map(vector).collect();
         Self { plan, y, places }
@@ -505,23 +506,26 @@ impl<'a> Outputs<'a> {
                 [a, b, c, d, a, b, c, d]
             }
         };
-        if let Some(places) = pieces.whole {
-            for k in 0..OUT {
-                let at = places[k] + down;
-                // SAFETY: no two jobs, and no two tiles of a job, hold the same outputs.
-                let to = unsafe { self.y.part(at..at + LANES) };
-                if let Some(to) = to.first_chunk_mut() {
-                    s.store_fresh(rows[k], to);
+        let pieces = match pieces {
+            Pieces::Tiles(pieces) => pieces,
+            Pieces::Whole(places) => {
+                for k in 0..OUT {
+                    let at = places[k] + down;
+                    // SAFETY: no two jobs, and no two tiles of a job, hold the same outputs.
+                    let to = unsafe { self.y.part(at..at + LANES) };
+                    if let Some(to) = to.first_chunk_mut() {
+                        s.store_fresh(rows[k], to);
+                    }
                 }
+                return;
             }
-            return;
-        }
+        };
         let mut floats = [[0.0; LANES]; OUT];
         for k in 0..OUT {
             s.store(rows[k], &mut floats[k]);
         }
         let tiles = floats.as_flattened().as_chunks::<OUT>().0;
-        for piece in pieces.tiles.iter().filter(|piece| r < piece.rows) {
+        for piece in pieces.iter().filter(|piece| r < piece.rows) {
             let at = piece.at + down;
             // SAFETY: as above.
             let to = unsafe { self.y.part(at..at + piece.columns) };

@@ -60,10 +60,12 @@ impl Formed for &Call<'_, [f32]> {
                 self.tier.run::<Read<'_, F, IN, POINTS, OUT>>(job);
             });
         });
+        let sums = &Places::new(POINTS, ROWS, length, 0);
+        let to = &Outputs::new::<OUT>(plan, &self.y, tiles, 0, [0; 3]);
         blocks(plan.dst_channels).par_iter().for_each(|block| {
             let (x, form) = (&*all, PhantomData::<F>);
             Buffers::with(|buffers| {
-                let job = Multiply { call: self, tiles, x, stride, own, block, buffers, form };
+                let job = Multiply { call: self, x, stride, own, sums, to, block, buffers, form };
                 self.tier.run::<Multiply<'_, F, IN, POINTS, OUT>>(job);
             });
         });
@@ -99,12 +101,13 @@ where
 /// A block of output channels of all pictures.
 struct Multiply<'a, F, const IN: usize, const POINTS: usize, const OUT: usize> {
     call: &'a Call<'a, [f32]>,
-    tiles: Tiles,
     /// `[channel][product][tile]`.
     x: &'a [f32],
     /// Floats of a channel.
     stride: usize,
     own: &'a Places,
+    sums: &'a Places,
+    to: &'a Outputs<'a>,
     block: &'a Block,
     buffers: &'a mut Buffers,
     form: PhantomData<F>,
@@ -119,17 +122,14 @@ where
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let Call { plan, way, w, bias, ref y, .. } = *self.call;
-        let block = self.block;
+        let Call { plan, way, w, bias, .. } = *self.call;
+        let (block, sums) = (self.block, self.sums);
         let channels = plan.src_channels;
         let Buffers { y: panel, products, .. } = self.buffers;
         let panel = panel.room(GROUPS * group_step(channels));
         Transform { plan, way, w, block, panel }.run(s);
         let (sources, stride) = (self.own, Some(self.stride));
-        let length = self.tiles.count.next_multiple_of(LANES);
-        let sums = &Places::new(POINTS, ROWS, length, 0);
         let product = Product { x: self.x, sources, sums, stride, part: block, panel, bias };
-        let to = Outputs::new::<OUT>(plan, y, self.tiles, 0, [0; 3]);
-        product.run::<S, F, IN, POINTS, OUT>(s, products, &to);
+        product.run::<S, F, IN, POINTS, OUT>(s, products, self.to);
     }
 }

@@ -65,6 +65,8 @@ pub(super) fn floats(work: &Work<'_>) -> usize {
 pub(super) struct Products<'a, 'b> {
     pub work: &'a Work<'b>,
     pub way: Way,
+    /// [`Way::reader`] of the work's plan.
+    pub reader: &'a Plan,
     /// The job's channels of one picture.
     pub x: &'a [f32],
     pub dy: &'a [f32],
@@ -93,13 +95,13 @@ impl Products<'_, '_> {
         F: Form<IN, POINTS, TILE> + Adjoint<POINTS>,
     {
         let work = self.work;
-        let reader = self.way.reader(work.plan);
         let inside = work.inside(self.start);
         let [_, down, across] = inside.map(|n| n.div_ceil(TILE));
         let (count, channels) = (down * across, work.rows / 9);
         let length = count.next_multiple_of(LANES);
         let block = Tiles { count, across, picture: count };
-        let gather = Gather::new::<F, IN, POINTS, TILE>(&reader, block, self.start, self.x.len());
+        let gather =
+            Gather::new::<F, IN, POINTS, TILE>(self.reader, block, self.start, self.x.len());
         let sources = Places::new(POINTS, channels, length, LANES);
         let Buffers { x: patch, tiles, gradients, .. } = self.buffers;
         let tiles = tiles.room(sources.floats);
