@@ -11,27 +11,34 @@ const BLOCKS: RangeInclusive<usize> = 0..=64;
 /// Depth candidates, D.
 const CANDIDATES: RangeInclusive<usize> = 2..=1024;
 
+fn need(
+    ok: bool,
+    key: &'static str,
+    expected: &str,
+    got: impl std::fmt::Debug,
+) -> Result<(), ConfigError> {
+    if ok {
+        return Ok(());
+    }
+    Err(ConfigError::Value { key, expected: expected.to_owned(), got: format!("{got:?}") })
+}
+
+/// [`need`] of a whole number in a range.
+fn within(range: RangeInclusive<usize>, key: &'static str, got: usize) -> Result<(), ConfigError> {
+    let (low, high) = (range.start(), range.end());
+    need(range.contains(&got), key, &format!("{low} to {high}"), got)
+}
+
 impl Config {
     /// Checks every range and every pair of keys that must fit.
     ///
     /// # Errors
     /// [`ConfigError::Value`] names the key.
     pub fn check(&self) -> Result<(), ConfigError> {
-        fn need(
-            ok: bool,
-            key: &'static str,
-            expected: &str,
-            got: impl std::fmt::Debug,
-        ) -> Result<(), ConfigError> {
-            if ok {
-                return Ok(());
-            }
-            Err(ConfigError::Value { key, expected: expected.to_owned(), got: format!("{got:?}") })
-        }
-        need((1..=8).contains(&self.upscale), "upscale", "1 to 8", self.upscale)?;
+        within(1..=8, "upscale", self.upscale)?;
         match &self.backbone {
-            Backbone::Mvsplat(b) => check_mvsplat(b, need)?,
-            Backbone::Small(b) => check_small(b, need)?,
+            Backbone::Mvsplat(b) => check_mvsplat(b)?,
+            Backbone::Small(b) => check_small(b)?,
         }
         let p = self.primaries();
         need(p.sh_degree <= 4, "backbone.primaries.sh_degree", "0 to 4", p.sh_degree)?;
@@ -48,7 +55,7 @@ impl Config {
             p.opacity_exponent,
         )?;
         let a = self.agg.resolved();
-        need(WIDTHS.contains(&self.embed.dim), "embed.dim", "1 to 4096", self.embed.dim)?;
+        within(WIDTHS, "embed.dim", self.embed.dim)?;
         need(
             a.groups > 0 && self.embed.dim.is_multiple_of(a.groups),
             "agg.groups",
@@ -63,8 +70,8 @@ impl Config {
             (a.stages_geo, a.stages_app),
         )?;
         need(a.n_fixed <= 7, "agg.n_fixed", "0 to 7", a.n_fixed)?;
-        need(BLOCKS.contains(&a.n_learned), "agg.n_learned", "0 to 64", a.n_learned)?;
-        need((1..=64).contains(&a.gate_views), "agg.gate_views", "1 to 64", a.gate_views)?;
+        within(BLOCKS, "agg.n_learned", a.n_learned)?;
+        within(1..=64, "agg.gate_views", a.gate_views)?;
         need(
             a.points == Points::Ref || a.n_fixed + a.n_learned > 0,
             "agg.n_learned",
@@ -73,7 +80,7 @@ impl Config {
         )?;
         need((0.0..1.0).contains(&a.attn_drop), "agg.attn_drop", "in [0, 1)", a.attn_drop)?;
         let s = &self.spgr;
-        need(WIDTHS.contains(&s.hidden), "spgr.hidden", "1 to 4096", s.hidden)?;
+        within(WIDTHS, "spgr.hidden", s.hidden)?;
         need(
             s.offset_bound.is_none_or(|rho| rho > 0.0 && rho.is_finite()),
             "spgr.offset_bound",
@@ -101,15 +108,9 @@ impl Config {
     }
 }
 
-type Need<T> = fn(bool, &'static str, &str, T) -> Result<(), ConfigError>;
-
-fn check_candidates(d: usize, need: Need<usize>) -> Result<(), ConfigError> {
-    need(CANDIDATES.contains(&d), "backbone.depth_candidates", "2 to 1024", d)
-}
-
-fn check_mvsplat(b: &Mvsplat, need: Need<usize>) -> Result<(), ConfigError> {
+fn check_mvsplat(b: &Mvsplat) -> Result<(), ConfigError> {
     for c in b.cnn_channels {
-        need(WIDTHS.contains(&c), "backbone.cnn_channels", "1 to 4096", c)?;
+        within(WIDTHS, "backbone.cnn_channels", c)?;
     }
     let width = b.cnn_channels[2];
     need(
@@ -118,53 +119,28 @@ fn check_mvsplat(b: &Mvsplat, need: Need<usize>) -> Result<(), ConfigError> {
         "a last stage that is a multiple of 4",
         width,
     )?;
-    need(
-        (1..=64).contains(&b.ffn_expansion),
-        "backbone.ffn_expansion",
-        "1 to 64",
-        b.ffn_expansion,
-    )?;
-    need(
-        (1..=64).contains(&b.transformer_layers),
-        "backbone.transformer_layers",
-        "1 to 64",
-        b.transformer_layers,
-    )?;
-    need(
-        (1..=64).contains(&b.window_splits),
-        "backbone.window_splits",
-        "1 to 64",
-        b.window_splits,
-    )?;
-    check_candidates(b.depth_candidates, need)?;
+    within(1..=64, "backbone.ffn_expansion", b.ffn_expansion)?;
+    within(1..=64, "backbone.transformer_layers", b.transformer_layers)?;
+    within(1..=64, "backbone.window_splits", b.window_splits)?;
+    within(CANDIDATES, "backbone.depth_candidates", b.depth_candidates)?;
     need(
         WIDTHS.contains(&b.costvolume_channels) && b.costvolume_channels.is_multiple_of(32),
         "backbone.costvolume_channels",
         "a multiple of 32, at most 4096",
         b.costvolume_channels,
     )?;
-    need(
-        (1..=3).contains(&b.costvolume_levels),
-        "backbone.costvolume_levels",
-        "1 to 3",
-        b.costvolume_levels,
-    )?;
+    within(1..=3, "backbone.costvolume_levels", b.costvolume_levels)?;
     need(
         WIDTHS.contains(&b.refine_channels) && b.refine_channels.is_multiple_of(32),
         "backbone.refine_channels",
         "a multiple of 32, at most 4096",
         b.refine_channels,
     )?;
-    need((1..=6).contains(&b.refine_levels), "backbone.refine_levels", "1 to 6", b.refine_levels)?;
-    need(
-        (1..=64).contains(&b.gaussians_per_pixel),
-        "backbone.gaussians_per_pixel",
-        "1 to 64",
-        b.gaussians_per_pixel,
-    )
+    within(1..=6, "backbone.refine_levels", b.refine_levels)?;
+    within(1..=64, "backbone.gaussians_per_pixel", b.gaussians_per_pixel)
 }
 
-fn check_small(b: &Small, need: Need<usize>) -> Result<(), ConfigError> {
+fn check_small(b: &Small) -> Result<(), ConfigError> {
     for c in b.cnn_channels.into_iter().chain(b.unet_channels.iter().copied()) {
         need(
             WIDTHS.contains(&c) && c % 8 == 0,
@@ -179,16 +155,11 @@ fn check_small(b: &Small, need: Need<usize>) -> Result<(), ConfigError> {
         "1 to 5 levels",
         b.unet_channels.len(),
     )?;
-    check_candidates(b.depth_candidates, need)?;
-    need(BLOCKS.contains(&b.cnn_blocks), "backbone.cnn_blocks", "0 to 64", b.cnn_blocks)?;
-    need(
-        WIDTHS.contains(&b.match_channels),
-        "backbone.match_channels",
-        "1 to 4096",
-        b.match_channels,
-    )?;
-    need(b.stem_channels <= *WIDTHS.end(), "backbone.stem_channels", "0 to 4096", b.stem_channels)?;
-    need(b.mode_window <= *CANDIDATES.end(), "backbone.mode_window", "0 to 1024", b.mode_window)?;
+    within(CANDIDATES, "backbone.depth_candidates", b.depth_candidates)?;
+    within(BLOCKS, "backbone.cnn_blocks", b.cnn_blocks)?;
+    within(WIDTHS, "backbone.match_channels", b.match_channels)?;
+    within(0..=*WIDTHS.end(), "backbone.stem_channels", b.stem_channels)?;
+    within(0..=*CANDIDATES.end(), "backbone.mode_window", b.mode_window)?;
     need(
         WIDTHS.contains(&b.head_channels) && b.head_channels.is_multiple_of(8),
         "backbone.head_channels",
