@@ -6,8 +6,8 @@
 
 use super::Buffer;
 use super::forms::{Form, Places, TILE, put};
-use super::plan::{Axes, Layout, Plan, pack};
-use crate::cpu::simd::{LANES, Simd};
+use super::plan::{Axes, Layout, Pack, Plan};
+use crate::cpu::simd::{Kernel, LANES, Simd};
 use std::array::from_fn;
 
 /// The tiles of a block, row by row, of one picture after the other.
@@ -180,7 +180,8 @@ impl<'a> Gather<'a> {
         let pictures = x.chunks(packed.stride);
         let patch = patch.room(pictures.len() * packed.layout.channel + SLACK);
         for (x, to) in pictures.zip(patch.chunks_exact_mut(packed.layout.channel)) {
-            pack(packed.reader, &packed.layout, &x[..pixels], packed.start, to);
+            let (plan, layout, start) = (packed.reader, &packed.layout, packed.start);
+            Pack { plan, layout, x: &x[..pixels], start, out: to }.run(s);
         }
         for (v, at) in packed.at.iter().enumerate() {
             for r in 0..IN {

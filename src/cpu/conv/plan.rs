@@ -7,6 +7,8 @@
 //! p whatever the width of the rows; what they compute in the halo's columns is not
 //! written out.
 
+use crate::cpu::simd::{Kernel, LANES, Simd};
+
 /// (depth, height, width).
 pub type Axes = [usize; 3];
 
@@ -366,55 +368,74 @@ pub(crate) fn starts(grid: Axes, tile: Axes) -> Vec<Axes> {
 }
 
 /// Copies the tile at `start` of one picture's channels `x` into `out`.
-pub(crate) fn pack(plan: &Plan, layout: &Layout, x: &[f32], start: Axes, out: &mut [f32]) {
-    let [_, height, width] = plan.src_size;
-    let pixels: usize = plan.src_size.iter().product();
-    let first: [isize; 3] =
-        std::array::from_fn(|a| (start[a] as isize + plan.origin[a]) * plan.src_step[a] as isize);
-    let place = |a: usize, i: usize, phase: usize| {
-        let at = first[a] + (i * plan.src_step[a] + phase) as isize;
-        usize::try_from(at).ok().filter(|&at| at < plan.src_size[a])
-    };
-    let step = plan.src_step[2];
-    for (x, channel) in x.chunks_exact(pixels).zip(out.chunks_mut(layout.channel)) {
-        // Narrow sums of weights multiply these by zeros.
-        channel[plan.planes.len() * layout.plane..].fill(0.0);
-        for (phase, plane) in plan.planes.iter().zip(channel.chunks_exact_mut(layout.plane)) {
-            let left = first[2] + phase[2] as isize;
-            let begin = (-left).max(0).unsigned_abs().div_ceil(step).min(layout.pitch());
-            let past = (width as isize - left).max(0).unsigned_abs().div_ceil(step);
-            let past = past.clamp(begin, layout.pitch());
-            let from = (left + (begin * step) as isize).max(0).unsigned_abs();
-            for (i, row) in plane.chunks_exact_mut(layout.pitch()).enumerate() {
-                let d = place(0, i / layout.rows[1], phase[0]);
-                let h = place(1, i % layout.rows[1], phase[1]);
-                let (Some(d), Some(h)) = (d, h) else {
-                    row.fill(0.0);
-                    continue;
-                };
-                let src = &x[(d * height + h) * width..][..width];
-                row[..begin].fill(0.0);
-                row[past..].fill(0.0);
-                let row = &mut row[begin..past];
-                if row.is_empty() {
-                    continue;
-                }
-                let src = &src[from..];
-                match step {
-                    1 => row.copy_from_slice(&src[..row.len()]),
-                    2 => {
-                        let (pairs, last) = src.as_chunks::<2>();
-                        row.iter_mut().zip(pairs).for_each(|(v, pair)| *v = pair[0]);
-                        if let ([v], [x]) = (&mut row[pairs.len().min(past - begin)..], last) {
-                            *v = *x;
-                        }
-                    }
-                    _ => {
-                        let picks = src.iter().step_by(step);
-                        row.iter_mut().zip(picks).for_each(|(v, x)| *v = *x);
+pub(crate) struct Pack<'a> {
+    pub plan: &'a Plan,
+    pub layout: &'a Layout,
+    pub x: &'a [f32],
+    pub start: Axes,
+    pub out: &'a mut [f32],
+}
+
+impl Kernel for Pack<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        let Self { plan, layout, x, start, out } = self;
+        let [_, height, width] = plan.src_size;
+        let pixels: usize = plan.src_size.iter().product();
+        let first: [isize; 3] = std::array::from_fn(|a| {
+            (start[a] as isize + plan.origin[a]) * plan.src_step[a] as isize
+        });
+        let place = |a: usize, i: usize, phase: usize| {
+            let at = first[a] + (i * plan.src_step[a] + phase) as isize;
+            usize::try_from(at).ok().filter(|&at| at < plan.src_size[a])
+        };
+        let step = plan.src_step[2];
+        for (x, channel) in x.chunks_exact(pixels).zip(out.chunks_mut(layout.channel)) {
+            // Narrow sums of weights multiply these by zeros.
+            channel[plan.planes.len() * layout.plane..].fill(0.0);
+            for (phase, plane) in plan.planes.iter().zip(channel.chunks_exact_mut(layout.plane)) {
+                let left = first[2] + phase[2] as isize;
+                let begin = (-left).max(0).unsigned_abs().div_ceil(step).min(layout.pitch());
+                let past = (width as isize - left).max(0).unsigned_abs().div_ceil(step);
+                let past = past.clamp(begin, layout.pitch());
+                let from = (left + (begin * step) as isize).max(0).unsigned_abs();
+                for (i, row) in plane.chunks_exact_mut(layout.pitch()).enumerate() {
+                    let d = place(0, i / layout.rows[1], phase[0]);
+                    let h = place(1, i % layout.rows[1], phase[1]);
+                    let (Some(d), Some(h)) = (d, h) else {
+                        row.fill(0.0);
+                        continue;
+                    };
+                    row[..begin].fill(0.0);
+                    row[past..].fill(0.0);
+                    if past > begin {
+                        let src = &x[(d * height + h) * width..][from..width];
+                        pick(s, src, step, &mut row[begin..past]);
                     }
                 }
             }
         }
     }
+}
+
+/// Every `step`th float of `from`, as many as `to` holds; `from` need not reach past the
+/// last one.
+#[inline(always)]
+pub(super) fn pick<S: Simd>(s: S, from: &[f32], step: usize, to: &mut [f32]) {
+    if step == 1 {
+        to.copy_from_slice(&from[..to.len()]);
+        return;
+    }
+    let pairs = if step == 2 { from.chunks_exact(2 * LANES) } else { [].chunks_exact(1) };
+    let whole = (to.len() / LANES).min(pairs.len()) * LANES;
+    let (vectors, rest) = to.split_at_mut(whole);
+    for (to, pair) in vectors.as_chunks_mut().0.iter_mut().zip(pairs) {
+        if let [a, b] = pair.as_chunks().0 {
+            s.store(s.unzip(s.load(a), s.load(b))[0], to);
+        }
+    }
+    let picks = from[whole * step..].iter().step_by(step);
+    rest.iter_mut().zip(picks).for_each(|(to, v)| *to = *v);
 }

@@ -2,7 +2,7 @@
 //! channels and taps of the source summed into them without a pause.
 
 use super::Buffers;
-use super::plan::{Axes, Layout, Plan, pack, starts};
+use super::plan::{Axes, Layout, Pack, Plan, starts};
 use crate::cpu::disjoint::Disjoint;
 use crate::cpu::fresh::{self, fill};
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
@@ -120,7 +120,7 @@ pub(crate) fn run(
             let Buffers { x: packed, y: sums, .. } = buffers;
             let packed = packed.room(plan.src_channels * layout.channel + SLACK);
             let sums = sums.room(plan.passes.len() * ROWS * layout.flat().next_multiple_of(LANES));
-            pack(plan, &layout, x, start, packed);
+            tier.run(Pack { plan, layout: &layout, x, start, out: packed });
             tier.run(Job { plan, layout, packed, sums, w, blocks, bias, image, start, y: &y });
         });
     });
@@ -177,7 +177,7 @@ impl Kernel for Job<'_> {
                     strip.run(s, block.pitch, sums);
                 }
                 for m in 0..block.rows {
-                    self.write(block.first + m, m, d, length);
+                    self.write(s, block.first + m, m, d, length);
                 }
             }
         }
@@ -187,7 +187,7 @@ impl Kernel for Job<'_> {
 impl Job<'_> {
     /// Copies channel `m` of the block's sums at depth `d` to channel `channel` of y.
     #[inline(always)]
-    fn write(&self, channel: usize, m: usize, d: usize, length: usize) {
+    fn write<S: Simd>(&self, s: S, channel: usize, m: usize, d: usize, length: usize) {
         let (plan, layout) = (self.plan, &self.layout);
         let ([depth, height, width], step) = (plan.dst_size, plan.dst_step);
         let base = (self.image * plan.dst_channels + channel) * depth * height * width;
@@ -214,17 +214,7 @@ impl Job<'_> {
                 };
                 match step[2] {
                     1 => drop(fill(to, &source(0)[..columns])),
-                    2 => {
-                        let (even, odd) = (source(0), source(1));
-                        let mut pairs = to.chunks_exact_mut(2);
-                        for ((pair, a), b) in (&mut pairs).zip(even).zip(odd) {
-                            pair[0] = MaybeUninit::new(*a);
-                            pair[1] = MaybeUninit::new(*b);
-                        }
-                        if let ([last], Some(a)) = (pairs.into_remainder(), even.get(columns / 2)) {
-                            *last = MaybeUninit::new(*a);
-                        }
-                    }
+                    2 => zip(s, source(0), source(1), to),
                     n => {
                         for p in 0..n {
                             let places = to.iter_mut().skip(p).step_by(n);
@@ -234,6 +224,24 @@ impl Job<'_> {
                 }
             }
         }
+    }
+}
+
+/// `even` and `odd` in turns; `to` is as long as both, or shorter.
+#[inline(always)]
+pub(super) fn zip<S: Simd>(s: S, even: &[f32], odd: &[f32], to: &mut [MaybeUninit<f32>]) {
+    let whole = to.len() / (2 * LANES) * LANES;
+    let (vectors, rest) = to.split_at_mut(2 * whole);
+    let pairs = even.as_chunks().0.iter().zip(odd.as_chunks().0);
+    for (to, (even, odd)) in vectors.chunks_exact_mut(2 * LANES).zip(pairs) {
+        let pair = s.zip(s.load(even), s.load(odd));
+        for (to, v) in to.as_chunks_mut().0.iter_mut().zip(pair) {
+            s.store_fresh(v, to);
+        }
+    }
+    for (i, to) in rest.iter_mut().enumerate() {
+        let from = if i.is_multiple_of(2) { even } else { odd };
+        *to = MaybeUninit::new(from[whole + i / 2]);
     }
 }
 

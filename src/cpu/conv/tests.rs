@@ -78,6 +78,11 @@ fn cases() -> Vec<Sizes> {
         flat(37, 8, [1, 1], 1, 0, [5, 7]),
         // As a matrix product, with rows and columns left over.
         flat(37, 50, [1, 1], 1, 0, [18, 16]),
+        flat(130, 20, [1, 1], 1, 0, [40, 43]),
+        // The same of pixels that are not neighbours.
+        flat(37, 50, [1, 1], 2, 0, [36, 73]),
+        flat(130, 20, [1, 1], 2, 0, [81, 79]),
+        flat(19, 23, [1, 1], 3, 0, [50, 61]),
         flat(2, 3, [3, 1], 1, 1, [1, 1]),
         flat(2, 3, [5, 5], 3, 4, [2, 3]),
         flat(1, 1, [3, 3], 1, 1, [33, 40]),
@@ -93,6 +98,8 @@ fn cases() -> Vec<Sizes> {
         flat(41, 26, [3, 3], 1, 0, [36, 31]),
         flat(33, 100, [3, 3], 1, 2, [22, 35]),
         flat(25, 24, [3, 3], 1, 1, [70, 141]),
+        // Gradients to weights in several groups of tiles.
+        flat(26, 70, [3, 3], 1, 1, [66, 67]),
         // The same of stride 2.
         flat(24, 30, [3, 3], 2, 1, [60, 66]),
         flat(41, 26, [3, 3], 2, 1, [71, 63]),
@@ -219,7 +226,17 @@ fn bias_gradients_are_sums() {
 /// Bytes do not depend on the number of threads.
 #[test]
 fn threads_do_not_matter() {
-    let s = flat(24, 40, [3, 3], 1, 1, [48, 48]);
+    for s in [
+        flat(24, 40, [3, 3], 1, 1, [48, 48]),
+        flat(40, 150, [3, 3], 1, 1, [64, 64]),
+        flat(40, 50, [3, 3], 2, 1, [64, 64]),
+        flat(70, 40, [1, 1], 2, 0, [64, 70]),
+    ] {
+        check_threads(&s);
+    }
+}
+
+fn check_threads(s: &Sizes) {
     let x = noise(2 * s.in_channels * s.in_pixels(), 8);
     let w = noise(s.out_channels * s.in_channels * s.taps(), 9);
     let dy = noise(2 * s.out_channels * s.out_pixels(), 10);
@@ -228,15 +245,15 @@ fn threads_do_not_matter() {
         pool.map(|pool| {
             pool.install(|| {
                 let mut dw = w.clone();
-                let y = forward(Tier::best(), &s, 2, &x, &w, &[]);
-                let dx = input_grad(Tier::best(), &s, 2, &dy, &w);
-                weight_grad(Tier::best(), &s, &x, &dy, &mut dw);
+                let y = forward(Tier::best(), s, 2, &x, &w, &[]);
+                let dx = input_grad(Tier::best(), s, 2, &dy, &w);
+                weight_grad(Tier::best(), s, &x, &dy, &mut dw);
                 [y, dx, dw].concat().iter().map(|v| v.to_bits()).collect::<Vec<_>>()
             })
         })
     };
     let one = run(1);
-    assert!(one.is_some() && one == run(2) && one == run(5));
+    assert!(one.is_some() && one == run(2) && one == run(5), "{s:?}");
 }
 
 /// A picture of a batch is the picture alone, however many tiles share a vector.

@@ -5,7 +5,8 @@
 //! where they lie. Narrow, for at most eight output channels: vectors hold
 //! neighbouring outputs, and lanes are added at the end.
 
-use super::plan::{Axes, Layout, Plan, Sizes, pack, starts};
+use super::plan::{Axes, Layout, Pack, Plan, Sizes, starts};
+use super::pointwise;
 use super::winograd;
 use super::winograd_weights::{self, Finish, Products};
 use super::{Buffer, Buffers};
@@ -42,17 +43,18 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
     }
     let images = x.len() / in_image;
     let plan = Plan::forward(s);
+    if pointwise::suits(&plan) && o > NARROW {
+        return pointwise::weight_grad(tier, &plan, x, dy, dw);
+    }
     let way = Way::of(&plan, o);
+    let tiles = images * winograd::tiles_of(&plan);
     let (outputs, channels) = match way {
         Way::Narrow => (o, even(c, (c * taps).div_ceil(DEPTH))),
         Way::Wide => {
             let outputs = o.div_ceil(o.div_ceil(LANES_WIDE)).next_multiple_of(LANES);
             (outputs, even(c, (c * taps / DEPTH).max(1)))
         }
-        Way::Winograd(_) => {
-            let parts = winograd_weights::parts(c, images * winograd::tiles_of(&plan));
-            (o, even(c, parts).next_multiple_of(ROWS))
-        }
+        Way::Winograd(_) => winograd_weights::part([c, o], tiles, rayon::current_num_threads()),
     };
     let parts: Vec<(usize, usize)> = (0..o)
         .step_by(outputs)
@@ -66,7 +68,7 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
     let starts = starts(plan.grid(), tile);
     let units = images * starts.len();
     let groups = match way {
-        Way::Winograd(_) => winograd_weights::groups(&plan, units, parts.len(), JOBS),
+        Way::Winograd(_) => winograd_weights::groups(tiles),
         _ => JOBS.div_ceil(parts.len()).min(units),
     };
     let work = |(first, channel): (usize, usize)| Work {
@@ -76,6 +78,7 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
         pitch: way.pitch(outputs.min(o - first)),
         rows: channels.min(c - channel) * taps,
     };
+    assert!(groups <= units, "conv: no group of tiles is empty");
     // The first part is the largest.
     let floats = work(parts[0]).floats();
     let mut sums = fresh::zeros(parts.len() * groups * floats);
@@ -162,10 +165,10 @@ impl Way {
             // Apart, since `Products` uses the other buffers.
             let mut own = std::mem::take(&mut buffers.products);
             let products = own.room(winograd_weights::floats(work));
-            products.fill(0.0);
             let reader = &way.reader(work.plan);
-            for (x, dy, start) in units {
-                tier.run(Products { work, way, reader, x, dy, start, buffers, products });
+            for (i, (x, dy, start)) in units.enumerate() {
+                let first = i == 0;
+                tier.run(Products { work, way, reader, x, dy, start, first, buffers, products });
             }
             tier.run(Finish { work, way, products, sums });
             buffers.products = own;
@@ -177,7 +180,7 @@ impl Way {
             let x_packed = buffers.x.room(floats + SLACK);
             // Multiplied by zeros: it must be no NaN.
             x_packed[floats..].fill(0.0);
-            pack(work.plan, &work.layout, x, start, x_packed);
+            tier.run(Pack { plan: work.plan, layout: &work.layout, x, start, out: x_packed });
             let (x, turned) = (&*x_packed, &mut buffers.y);
             let sums = &mut *sums;
             match self {
@@ -257,7 +260,7 @@ impl Kernel for Wide<'_, '_> {
                 for (offsets, sums) in
                     offsets.as_chunks().0.iter().zip(self.sums.chunks_exact_mut(ROWS * pitch))
                 {
-                    tile.rows(s, offsets, sums);
+                    tile.rows(s, offsets, true, sums);
                 }
             }
         }
@@ -329,23 +332,23 @@ pub(super) struct Tile<'a> {
 }
 
 impl Tile<'_> {
-    /// Adds to `[ROWS][pitch]` sums.
+    /// `[ROWS][pitch]` sums, added to those that are there with `add`.
     #[inline(always)]
-    pub fn rows<S: Simd>(&self, s: S, offsets: &[usize; ROWS], sums: &mut [f32]) {
+    pub fn rows<S: Simd>(&self, s: S, offsets: &[usize; ROWS], add: bool, sums: &mut [f32]) {
         let farthest = offsets.iter().max().copied().unwrap_or(0) + self.width;
         assert!(farthest + self.count.saturating_sub(1) * self.x_pitch <= self.x.len());
         assert!(self.dy.len() >= self.count * self.width * self.pitch);
         assert!(sums.len() >= ROWS * self.pitch);
         if S::REGISTERS >= 32 {
             match self.pitch / LANES {
-                3 => self.block::<S, 8, 3>(s, offsets, 0, 0, sums),
-                2 => self.block::<S, 8, 2>(s, offsets, 0, 0, sums),
-                _ => self.block::<S, 8, 1>(s, offsets, 0, 0, sums),
+                3 => self.block::<S, 8, 3>(s, offsets, [0, 0], add, sums),
+                2 => self.block::<S, 8, 2>(s, offsets, [0, 0], add, sums),
+                _ => self.block::<S, 8, 1>(s, offsets, [0, 0], add, sums),
             }
         } else {
             for v in (0..self.pitch).step_by(LANES) {
-                self.block::<S, 4, 1>(s, offsets, 0, v, sums);
-                self.block::<S, 4, 1>(s, offsets, 4, v, sums);
+                self.block::<S, 4, 1>(s, offsets, [0, v], add, sums);
+                self.block::<S, 4, 1>(s, offsets, [4, v], add, sums);
             }
         }
     }
@@ -356,19 +359,11 @@ impl Tile<'_> {
         &self,
         s: S,
         offsets: &[usize; ROWS],
-        first: usize,
-        from: usize,
+        [first, from]: [usize; 2],
+        add: bool,
         sums: &mut [f32],
     ) {
         let mut acc = [[s.splat(0.0); N]; M];
-        for m in 0..M {
-            let row = &sums[(first + m) * self.pitch + from..][..N * LANES];
-            for n in 0..N {
-                if let Some(v) = row[n * LANES..].first_chunk() {
-                    acc[m][n] = s.load(v);
-                }
-            }
-        }
         let mut dy = self.dy.as_ptr().wrapping_add(from);
         for r in 0..self.count {
             let mut x = [self.x.as_ptr(); M];
@@ -394,6 +389,8 @@ impl Tile<'_> {
         for m in 0..M {
             let row = &mut sums[(first + m) * self.pitch + from..][..N * LANES];
             for (to, v) in row.as_chunks_mut().0.iter_mut().zip(acc[m]) {
+                // Sums of sums: shorter ones, which lose less.
+                let v = if add { s.load(to) + v } else { v };
                 s.store(v, to);
             }
         }

@@ -20,7 +20,7 @@ use std::mem::MaybeUninit;
 /// Most vectors of tiles at once.
 const VECTORS: usize = 2;
 /// Floats of the transformed tiles of a block, unless one vector needs more.
-const FLOATS: usize = 250_000;
+const FLOATS: usize = 300_000;
 /// Least channels on both sides for which it wins.
 const CHANNELS: usize = 24;
 /// Tiles of a picture below which [`super::winograd_few`] is better.

@@ -16,8 +16,8 @@ use std::ops::Range;
 /// Input channels of a job: at most, and at least for the sake of more jobs.
 const CHANNELS: usize = 256;
 const FEW_CHANNELS: usize = 16;
-/// Jobs of a call where tiles are few: each turns all gradients over again.
-const JOBS: usize = 2;
+/// Output channels of a job at least.
+const FEW_OUTPUTS: usize = 64;
 /// Vectors of tiles at once.
 const VECTORS: usize = 4;
 /// Outputs whose tiles make one block, for `plan`.
@@ -29,21 +29,26 @@ pub(super) fn tile(plan: &Plan) -> Axes {
 
 /// Least tiles of a picture for which it wins.
 pub(super) const LEAST: usize = 4;
-/// Tiles of a job at least, since its products are to be transformed at the end.
-const TILES: usize = 128;
+/// Tiles of a group at least, since its products are to be transformed at the end.
+const TILES: usize = 256;
+/// Most groups.
+const GROUPED: usize = 16;
 
-/// Parts of so many input channels, over `tiles` tiles of all pictures.
-pub(super) fn parts(channels: usize, tiles: usize) -> usize {
-    let groups = (tiles / TILES).max(1);
-    let wanted = JOBS.div_ceil(groups).min(channels.div_ceil(FEW_CHANNELS));
-    channels.div_ceil(CHANNELS).max(wanted)
+/// Groups of tiles that are summed apart: a function of the sizes alone, so that sums
+/// never depend on the threads.
+pub(super) fn groups(tiles: usize) -> usize {
+    (tiles / TILES).clamp(1, GROUPED)
 }
 
-/// Groups of `units` blocks of tiles that are summed apart.
-pub(super) fn groups(plan: &Plan, units: usize, parts: usize, jobs: usize) -> usize {
-    let [_, height, width] = tile(plan);
-    let tiles = units * (height / TILE) * (width / TILE);
-    jobs.div_ceil(parts).min(tiles / TILES).clamp(1, units)
+/// Output and input channels of a job, for as many jobs as there are threads. Which
+/// channels a job has shows in no sum.
+pub(super) fn part([c, o]: [usize; 2], tiles: usize, threads: usize) -> (usize, usize) {
+    let wanted = threads.div_ceil(groups(tiles));
+    // Tiles are read and transformed in less time than gradients are.
+    let outputs = wanted.min(o.div_ceil(FEW_OUTPUTS));
+    let channels = wanted.div_ceil(outputs).min(c.div_ceil(FEW_CHANNELS));
+    let channels = c.div_ceil(channels.max(c.div_ceil(CHANNELS)));
+    (o.div_ceil(outputs).next_multiple_of(LANES), channels.next_multiple_of(ROWS))
 }
 
 /// Output channels in blocks of equal numbers of vectors.
@@ -61,7 +66,7 @@ pub(super) fn floats(work: &Work<'_>) -> usize {
     blocks(&work.outputs).iter().map(|b| GROUPS * channels * b.len().next_multiple_of(LANES)).sum()
 }
 
-/// Adds one block of tiles to `products`.
+/// Adds one block of tiles to `products`, or begins them with it.
 pub(super) struct Products<'a, 'b> {
     pub work: &'a Work<'b>,
     pub way: Way,
@@ -71,6 +76,8 @@ pub(super) struct Products<'a, 'b> {
     pub x: &'a [f32],
     pub dy: &'a [f32],
     pub start: Axes,
+    /// Of the job: `products` holds nothing yet.
+    pub first: bool,
     pub buffers: &'a mut Buffers,
     pub products: &'a mut [f32],
 }
@@ -139,7 +146,7 @@ impl Products<'_, '_> {
                     for m in 0..ROWS {
                         offsets[m] = (group * ROWS + m).min(channels - 1) * step;
                     }
-                    tile.rows(s, &offsets, sums);
+                    tile.rows(s, &offsets, !self.first, sums);
                 }
             }
         }

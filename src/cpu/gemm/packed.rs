@@ -91,13 +91,34 @@ impl Packed {
     /// # Panics
     /// As [`Packed::new`].
     pub(crate) fn kept<R>(rhs: Mat<'_>, f: impl FnOnce(&Self) -> R) -> R {
+        Self::in_kept(|packed| {
+            packed.fill(rhs);
+            f(packed)
+        })
+    }
+
+    /// `f` of a matrix `[depth, cols]` that is no [`Mat`], in memory that this thread
+    /// keeps: `fill` writes its panels, those floats too that pad the last one.
+    pub(crate) fn kept_by<R>(
+        [depth, cols]: [usize; 2],
+        fill: impl FnOnce(&mut [f32]),
+        f: impl FnOnce(&Self) -> R,
+    ) -> R {
+        Self::in_kept(|packed| {
+            (packed.depth, packed.cols) = (depth, cols);
+            packed.data.resize(depth * cols.next_multiple_of(LANES), 0.0);
+            fill(&mut packed.data);
+            f(packed)
+        })
+    }
+
+    fn in_kept<R>(f: impl FnOnce(&mut Self) -> R) -> R {
         thread_local! {
             static KEPT: Cell<Packed> = Cell::default();
         }
         // Taken, not borrowed: a task may run inside another one's wait.
         let mut packed = KEPT.take();
-        packed.fill(rhs);
-        let result = f(&packed);
+        let result = f(&mut packed);
         KEPT.set(packed);
         result
     }

@@ -361,6 +361,25 @@ macro_rules! tier {
                 out
             }
             #[inline(always)]
+            fn zip(self, a: F, b: F) -> [F; 2] {
+                let mut out = [a, b];
+                for i in 0..LANES {
+                    let (vector, place) = (2 * i / LANES, 2 * i % LANES);
+                    out[vector].0[place] = a.0[i];
+                    out[vector].0[place + 1] = b.0[i];
+                }
+                out
+            }
+            #[inline(always)]
+            fn unzip(self, a: F, b: F) -> [F; 2] {
+                let mut out = [a, b];
+                for i in 0..2 * LANES {
+                    let from = if i < LANES { a.0[i] } else { b.0[i - LANES] };
+                    out[i % 2].0[i / 2] = from;
+                }
+                out
+            }
+            #[inline(always)]
             fn transpose(self, v: [F; LANES]) -> [F; LANES] {
                 let mut out = v;
                 for i in 0..LANES {

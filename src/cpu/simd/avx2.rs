@@ -367,6 +367,22 @@ impl Simd for Token {
         }
     }
     #[inline(always)]
+    fn zip(self, a: F, b: F) -> [F; 2] {
+        let zip = |a, b| unsafe {
+            let [low, high] = halves(_mm256_unpacklo_ps(a, b), _mm256_unpackhi_ps(a, b));
+            F(low, high)
+        };
+        [zip(a.0, b.0), zip(a.1, b.1)]
+    }
+    #[inline(always)]
+    fn unzip(self, a: F, b: F) -> [F; 2] {
+        unsafe {
+            let ([a, c], [b, d]) = (halves(a.0, a.1), halves(b.0, b.1));
+            let even = F(_mm256_shuffle_ps::<0x88>(a, c), _mm256_shuffle_ps::<0x88>(b, d));
+            [even, F(_mm256_shuffle_ps::<0xdd>(a, c), _mm256_shuffle_ps::<0xdd>(b, d))]
+        }
+    }
+    #[inline(always)]
     fn transpose(self, v: [F; LANES]) -> [F; LANES] {
         unsafe {
             let mut out = v;
