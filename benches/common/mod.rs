@@ -231,17 +231,23 @@ impl Bench {
                 let run = &mut contender.run;
                 // What is quick is timed as within a longer computation: its data in the
                 // caches, its threads awake.
-                if !contender.elsewhere && times.wall.last().is_none_or(|t| *t < QUICK_S) {
+                let warm = match times.wall.last().is_none_or(|t| *t < QUICK_S) {
+                    true if !contender.elsewhere => WARM_S,
+                    _ => 0.0,
+                };
+                let timed = || {
                     let start = Instant::now();
-                    while start.elapsed().as_secs_f64() < WARM_S {
-                        pool.install(&mut *run).with_context(|| contender.name.clone())?;
+                    while start.elapsed().as_secs_f64() < warm {
+                        run()?;
                     }
-                }
-                let cpu = cpu_seconds();
-                let start = Instant::now();
-                let told = pool.install(run).with_context(|| contender.name.clone())?;
-                times.wall.push(told.unwrap_or(start.elapsed().as_secs_f64()));
-                let used = cpu_seconds().zip(cpu).map(|(after, before)| after - before);
+                    let cpu = cpu_seconds();
+                    let start = Instant::now();
+                    let told = run()?;
+                    let wall = told.unwrap_or(start.elapsed().as_secs_f64());
+                    anyhow::Ok((wall, cpu_seconds().zip(cpu).map(|(after, before)| after - before)))
+                };
+                let (wall, used) = pool.install(timed).with_context(|| contender.name.clone())?;
+                times.wall.push(wall);
                 times.cpu = used.map(|used| used + times.cpu.unwrap_or(0.0));
             }
         }

@@ -24,21 +24,16 @@ pub(crate) struct Weights {
     blocks: Vec<Block>,
 }
 
-/// Output channels `first..first + rows`, their weights stored `pitch` apart.
+/// Output channels `first..first + rows`.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Block {
     pub first: usize,
     pub rows: usize,
-    pub pitch: usize,
 }
 
 /// `channels` in blocks of [`ROWS`].
 pub(super) fn blocks(channels: usize) -> Vec<Block> {
-    let block = |first: usize| {
-        let rows = ROWS.min(channels - first);
-        // Three go through the kernel of four.
-        Block { first, rows, pitch: if rows == 3 { 4 } else { rows } }
-    };
+    let block = |first: usize| Block { first, rows: ROWS.min(channels - first) };
     (0..channels).step_by(ROWS).map(block).collect()
 }
 
@@ -47,19 +42,16 @@ impl Weights {
     pub fn new(plan: &Plan, w: &[f32], mut data: Vec<f32>) -> Self {
         let depth = plan.src_channels * plan.all_taps();
         let blocks = blocks(plan.dst_channels);
-        let floats = blocks.iter().map(|b| b.pitch * depth).sum();
+        let floats = blocks.iter().map(|b| b.rows * depth).sum();
         data.resize(floats, 0.0);
         data.par_chunks_mut((ROWS * depth).max(1)).zip(&blocks).for_each(|(panel, block)| {
             let mut panel = panel;
             for pass in &plan.passes {
-                let n = plan.src_channels * pass.taps.len() * block.pitch;
+                let n = plan.src_channels * pass.taps.len() * block.rows;
                 let (own, rest) = panel.split_at_mut(n);
                 panel = rest;
-                for m in block.rows..block.pitch {
-                    own.iter_mut().skip(m).step_by(block.pitch).for_each(|v| *v = 0.0);
-                }
                 // Channel by channel of the source: what is written stays in the cache.
-                let group = pass.taps.len() * block.pitch;
+                let group = pass.taps.len() * block.rows;
                 for (src, own) in own.chunks_exact_mut(group.max(1)).enumerate() {
                     for m in 0..block.rows {
                         let dst = block.first + m;
@@ -68,7 +60,7 @@ impl Weights {
                             false => dst * plan.src_channels + src,
                         };
                         let taps = &w[row * plan.kernel_taps..][..plan.kernel_taps];
-                        for (tap, own) in pass.taps.iter().zip(own.chunks_exact_mut(block.pitch)) {
+                        for (tap, own) in pass.taps.iter().zip(own.chunks_exact_mut(block.rows)) {
                             own[m] = taps[tap.kernel];
                         }
                     }
@@ -152,32 +144,50 @@ impl Kernel for Job<'_> {
             plan.passes.iter().map(|p| p.taps.iter().map(|t| layout.offset(t)).collect()).collect();
         for index in self.blocks.clone() {
             let block = self.w.blocks[index];
-            let panel = &self.w.data[index * ROWS * depth..][..block.pitch * depth];
+            let panel = &self.w.data[index * ROWS * depth..][..block.rows * depth];
             let mut bias = [0.0; ROWS];
             for (m, b) in bias.iter_mut().take(block.rows).enumerate() {
                 *b = self.bias.get(block.first + m).copied().unwrap_or(0.0);
             }
-            let room = self.plan.grid()[0] - self.start[0];
-            for d in 0..layout.tile[0].min(room) {
+            let [depths, rows, columns] = self.inside();
+            // Rows of whole vectors need no detour, if they fill a register tile.
+            let direct = plan.dst_step == [1; 3]
+                && columns.is_multiple_of(LANES)
+                && block.rows * (columns / LANES) >= 2 * ROWS
+                && block.rows > ROWS / 2;
+            for d in 0..depths {
                 let x = &self.packed[d * layout.depth()..];
                 let mut from = 0;
-                for (p, offsets) in offsets.iter().enumerate() {
-                    let n = plan.src_channels * offsets.len() * block.pitch;
+                for i in 0..if direct { rows } else { offsets.len() } {
+                    let offsets = &offsets[if direct { 0 } else { i }];
+                    let n = plan.src_channels * offsets.len() * block.rows;
                     let strip = Strip {
-                        x,
+                        x: if direct { &x[i * layout.pitch()..] } else { x },
                         channel: layout.channel,
                         channels: plan.src_channels,
                         offsets,
                         w: &panel[from..from + n],
                         bias,
-                        length,
+                        length: if direct { columns } else { length },
                     };
-                    from += n;
-                    let sums = &mut self.sums[p * ROWS * length..][..ROWS * length];
-                    strip.run(s, block.pitch, sums);
+                    let to = if direct {
+                        let at = self.at(block.first, d, i);
+                        let stride = plan.dst_size.iter().product();
+                        To { at: self.y.address(at).cast_mut().cast(), stride }
+                    } else {
+                        from += n;
+                        let at = self.sums[i * ROWS * length..][..ROWS * length].as_mut_ptr();
+                        To { at, stride: length }
+                    };
+                    // SAFETY: eight rows of sums; or the same piece of a row of y in each
+                    // channel of the block, this job's alone, since jobs differ in picture,
+                    // tile or channels.
+                    unsafe { strip.run_to(s, block.rows, to) };
                 }
-                for m in 0..block.rows {
-                    self.write(s, block.first + m, m, d, length);
+                if !direct {
+                    for m in 0..block.rows {
+                        self.write(s, block.first + m, m, d, length);
+                    }
                 }
             }
         }
@@ -185,6 +195,21 @@ impl Kernel for Job<'_> {
 }
 
 impl Job<'_> {
+    /// Grid positions of the tile that there are.
+    #[inline(always)]
+    fn inside(&self) -> Axes {
+        let grid = self.plan.grid();
+        std::array::from_fn(|a| self.layout.tile[a].min(grid[a] - self.start[a]))
+    }
+
+    /// Where row `r` of the tile at depth `d` of a channel begins in y, stride 1.
+    #[inline(always)]
+    fn at(&self, channel: usize, d: usize, r: usize) -> usize {
+        let [depth, height, width] = self.plan.dst_size;
+        let row = (self.image * self.plan.dst_channels + channel) * depth + self.start[0] + d;
+        (row * height + self.start[1] + r) * width + self.start[2]
+    }
+
     /// Copies channel `m` of the block's sums at depth `d` to channel `channel` of y.
     #[inline(always)]
     fn write<S: Simd>(&self, s: S, channel: usize, m: usize, d: usize, length: usize) {
@@ -260,39 +285,59 @@ pub(super) struct Strip<'a> {
     pub length: usize,
 }
 
+/// Where sums go: channel m of the block to `at + m·stride`.
+#[derive(Clone, Copy)]
+struct To {
+    at: *mut f32,
+    stride: usize,
+}
+
 impl Strip<'_> {
-    /// Sums `[channel of the block][length]` of `pitch` channels.
+    /// Sums `[channel of the block][length]` of `rows` channels.
     #[inline(always)]
-    pub fn run<S: Simd>(&self, s: S, pitch: usize, sums: &mut [f32]) {
+    pub fn run<S: Simd>(&self, s: S, rows: usize, sums: &mut [f32]) {
+        assert!(sums.len() >= rows * self.length);
+        let to = To { at: sums.as_mut_ptr(), stride: self.length };
+        // SAFETY: as many rows of `length` floats (just asserted).
+        unsafe { self.run_to(s, rows, to) };
+    }
+
+    /// # Safety
+    /// Each of `rows` channels has room for `length` floats at `to`, which nobody else
+    /// reads or writes.
+    #[inline(always)]
+    unsafe fn run_to<S: Simd>(&self, s: S, rows: usize, to: To) {
         let farthest = self.offsets.iter().max().copied().unwrap_or(0) + self.length;
         assert!(self.channels.saturating_sub(1) * self.channel + farthest <= self.x.len());
-        assert!(sums.len() >= pitch * self.length && self.length.is_multiple_of(LANES));
-        assert!(self.w.len() >= self.channels * self.offsets.len() * pitch);
+        assert!(self.length.is_multiple_of(LANES));
+        assert!(self.w.len() >= self.channels * self.offsets.len() * rows);
         if S::REGISTERS >= 32 {
-            match pitch {
-                8 => self.strips::<S, 8, 8, 3, 2>(s, 0, sums),
-                7 => self.strips::<S, 7, 7, 3, 2>(s, 0, sums),
-                6 => self.strips::<S, 6, 6, 4, 2>(s, 0, sums),
-                5 => self.strips::<S, 5, 5, 5, 2>(s, 0, sums),
-                4 => self.strips::<S, 4, 4, 6, 3>(s, 0, sums),
-                2 => self.strips::<S, 2, 2, 8, 3>(s, 0, sums),
-                _ => self.strips::<S, 1, 1, 12, 3>(s, 0, sums),
+            match rows {
+                8 => self.strips::<S, 8, 8, 3, 2>(s, 0, to),
+                7 => self.strips::<S, 7, 7, 3, 2>(s, 0, to),
+                6 => self.strips::<S, 6, 6, 4, 2>(s, 0, to),
+                5 => self.strips::<S, 5, 5, 5, 2>(s, 0, to),
+                4 => self.strips::<S, 4, 4, 6, 3>(s, 0, to),
+                3 => self.strips::<S, 3, 3, 7, 3>(s, 0, to),
+                2 => self.strips::<S, 2, 2, 8, 3>(s, 0, to),
+                _ => self.strips::<S, 1, 1, 12, 3>(s, 0, to),
             }
         } else {
-            match pitch {
+            match rows {
                 8 => {
-                    self.strips::<S, 8, 4, 1, 1>(s, 0, sums);
-                    self.strips::<S, 8, 4, 1, 1>(s, 4, sums);
+                    self.strips::<S, 8, 4, 1, 1>(s, 0, to);
+                    self.strips::<S, 8, 4, 1, 1>(s, 4, to);
                 }
                 7 => {
-                    self.strips::<S, 7, 4, 1, 1>(s, 0, sums);
-                    self.strips::<S, 7, 3, 1, 1>(s, 4, sums);
+                    self.strips::<S, 7, 4, 1, 1>(s, 0, to);
+                    self.strips::<S, 7, 3, 1, 1>(s, 4, to);
                 }
-                6 => self.strips::<S, 6, 6, 1, 1>(s, 0, sums),
-                5 => self.strips::<S, 5, 5, 1, 1>(s, 0, sums),
-                4 => self.strips::<S, 4, 4, 1, 1>(s, 0, sums),
-                2 => self.strips::<S, 2, 2, 2, 1>(s, 0, sums),
-                _ => self.strips::<S, 1, 1, 4, 1>(s, 0, sums),
+                6 => self.strips::<S, 6, 6, 1, 1>(s, 0, to),
+                5 => self.strips::<S, 5, 5, 1, 1>(s, 0, to),
+                4 => self.strips::<S, 4, 4, 1, 1>(s, 0, to),
+                3 => self.strips::<S, 3, 3, 2, 1>(s, 0, to),
+                2 => self.strips::<S, 2, 2, 2, 1>(s, 0, to),
+                _ => self.strips::<S, 1, 1, 4, 1>(s, 0, to),
             }
         }
     }
@@ -304,19 +349,20 @@ impl Strip<'_> {
         &self,
         s: S,
         first: usize,
-        sums: &mut [f32],
+        to: To,
     ) {
         let mut at = 0;
         while at < self.length {
             let left = (self.length - at) / LANES;
-            if left >= A {
-                self.tile::<S, P, M, A>(s, first, at, sums);
+            // Two pairs rather than three and one.
+            if left >= A && (A, left) != (3, 4) {
+                self.tile::<S, P, M, A>(s, first, at, to);
                 at += A * LANES;
             } else if left >= B {
-                self.tile::<S, P, M, B>(s, first, at, sums);
+                self.tile::<S, P, M, B>(s, first, at, to);
                 at += B * LANES;
             } else {
-                self.tile::<S, P, M, 1>(s, first, at, sums);
+                self.tile::<S, P, M, 1>(s, first, at, to);
                 at += LANES;
             }
         }
@@ -329,7 +375,7 @@ impl Strip<'_> {
         s: S,
         first: usize,
         at: usize,
-        sums: &mut [f32],
+        to: To,
     ) {
         let mut acc = [[s.splat(0.0); N]; M];
         for m in 0..M {
@@ -359,9 +405,10 @@ impl Strip<'_> {
             x = x.wrapping_add(self.channel);
         }
         for m in 0..M {
-            let row = &mut sums[(first + m) * self.length + at..][..N * LANES];
-            for (to, v) in row.as_chunks_mut().0.iter_mut().zip(acc[m]) {
-                s.store(v, to);
+            let row = to.at.wrapping_add((first + m) * to.stride + at);
+            for n in 0..N {
+                // SAFETY: inside the row (the promise of `run_to`'s caller).
+                s.store(acc[m][n], unsafe { &mut *row.wrapping_add(n * LANES).cast() });
             }
         }
     }

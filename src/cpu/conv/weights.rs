@@ -20,7 +20,7 @@ use std::ops::Range;
 pub(super) const ROWS: usize = 8;
 /// Output channels of one job.
 pub(super) const LANES_WIDE: usize = 3 * LANES;
-/// Rows of a job come in multiples of this: register tiles of either kind divide it.
+/// The rows of any narrow register tile divide it.
 const STEP: usize = 24;
 /// Outputs whose gradients are turned over at once.
 const CHUNK: usize = 128;
@@ -77,6 +77,7 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
         outputs: first..(first + outputs).min(o),
         pitch: way.pitch(outputs.min(o - first)),
         rows: channels.min(c - channel) * taps,
+        step: if let Way::Narrow = way { STEP } else { ROWS },
     };
     assert!(groups <= units, "conv: no group of tiles is empty");
     // The first part is the largest.
@@ -107,17 +108,54 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
                 // SAFETY: parts and blocks differ in outputs or channels.
                 unsafe { dw.part(at..at + rows) }
             };
-            let mut to: Vec<&mut [f32]> = lanes.clone().map(part).collect();
-            for r in 0..rows {
-                let mut total = [0.0; LANES];
-                for sums in sums.chunks_exact(floats) {
-                    let row = &sums[r * pitch..][lanes.clone()];
-                    total.iter_mut().zip(row).for_each(|(t, v)| *t += v);
-                }
-                to.iter_mut().zip(total).for_each(|(to, v)| to[r] = v);
-            }
+            let to = lanes.clone().map(part).collect();
+            tier.run(Add { sums, floats, pitch, first: lanes.start, to });
         });
     });
+}
+
+/// Adds `sums` `[group][row][pitch]`, groups `floats` apart, and turns them: column
+/// `first + i` to row i of `to`.
+struct Add<'a> {
+    sums: &'a [f32],
+    floats: usize,
+    pitch: usize,
+    first: usize,
+    to: Vec<&'a mut [f32]>,
+}
+
+impl Kernel for Add<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        let Self { sums, floats, pitch, first, mut to } = self;
+        let rows = to.first().map_or(0, |to| to.len());
+        // Narrow sums have no whole vectors.
+        let whole = if pitch.is_multiple_of(LANES) { rows / LANES * LANES } else { 0 };
+        for r in (0..whole).step_by(LANES) {
+            let mut square = [s.splat(0.0); LANES];
+            for sums in sums.chunks_exact(floats) {
+                for i in 0..LANES {
+                    if let Some(row) = sums[(r + i) * pitch + first..].first_chunk() {
+                        square[i] = square[i] + s.load(row);
+                    }
+                }
+            }
+            let turned = s.transpose(square);
+            for i in 0..LANES {
+                if let Some(to) = to.get_mut(i).and_then(|to| to[r..].first_chunk_mut()) {
+                    s.store(turned[i], to);
+                }
+            }
+        }
+        for r in whole..rows {
+            for (i, to) in to.iter_mut().enumerate() {
+                let parts = sums.chunks_exact(floats).map(|sums| sums[r * pitch + first + i]);
+                to[r] = parts.fold(0.0, |total, v| total + v);
+            }
+        }
+    }
 }
 
 /// `n` in `parts` equal parts: the size of one.
@@ -199,12 +237,14 @@ pub(super) struct Work<'a> {
     /// Floats of one row of sums: the outputs, rounded up.
     pub pitch: usize,
     pub rows: usize,
+    /// Rows come in multiples of this, the last ones repeated.
+    pub step: usize,
 }
 
 impl Work<'_> {
     /// Sums of a job: `[rows rounded up][outputs rounded up]`.
     fn floats(&self) -> usize {
-        self.rows.next_multiple_of(STEP) * self.pitch
+        self.rows.next_multiple_of(self.step) * self.pitch
     }
 
     /// Where each row of the packed tile begins, the last one repeated.
@@ -214,7 +254,7 @@ impl Work<'_> {
             let r = r.min(self.rows - 1);
             r / taps.len() * self.layout.channel + self.layout.offset(&taps[r % taps.len()])
         };
-        (0..self.rows.next_multiple_of(STEP)).map(row).collect()
+        (0..self.rows.next_multiple_of(self.step)).map(row).collect()
     }
 
     /// Outputs of the tile at `start` that exist.
@@ -299,6 +339,8 @@ fn turn<S: Simd>(
                     if i < outputs
                         && let Some(from) = dy[places[i] + p..].first_chunk()
                     {
+                        // The next columns, in whose lines nothing else is near.
+                        s.prefetch(from.as_ptr().wrapping_add(LANES));
                         m[i] = s.load(from);
                     }
                 }

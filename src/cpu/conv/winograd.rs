@@ -198,9 +198,9 @@ impl<S: Simd> Formed for Lanes<S, Transform<'_>> {
                 let row = F::weights(s, half[i]);
                 for j in 0..WEIGHTS {
                     let group = (i * WEIGHTS + j) * group_step(channels);
-                    let to = &mut panel[group + first * block.pitch..];
+                    let to = &mut panel[group + first * block.rows..];
                     // What lies past the last channel is between groups.
-                    if block.pitch == ROWS
+                    if block.rows == ROWS
                         && let Some(to) = to.first_chunk_mut()
                     {
                         s.store(row[j], to);
@@ -208,9 +208,9 @@ impl<S: Simd> Formed for Lanes<S, Transform<'_>> {
                     }
                     let mut both = [0.0; LANES];
                     s.store(row[j], &mut both);
-                    let to = to.chunks_exact_mut(block.pitch).take(channels - first);
+                    let to = to.chunks_exact_mut(block.rows).take(channels - first);
                     for (to, from) in to.zip(both.chunks_exact(ROWS)) {
-                        to.copy_from_slice(&from[..block.pitch]);
+                        to.copy_from_slice(&from[..block.rows]);
                     }
                 }
             }
@@ -375,7 +375,7 @@ impl Product<'_> {
                 bias: [0.0; ROWS],
                 length,
             };
-            strip.run(s, part.pitch, &mut products[to..][..ROWS * length]);
+            strip.run(s, part.rows, &mut products[to..][..ROWS * length]);
         }
         let mut rows = [[s.splat(0.0); POINTS]; OUT];
         for m in 0..part.rows {
