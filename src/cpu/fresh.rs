@@ -79,6 +79,15 @@ const SMALL: usize = 1 << 17;
 /// Numbers a task.
 const PART: usize = 1 << 16;
 
+/// The first `n` of what `kept` holds, with what the last use left there: it never
+/// shrinks, so that no use fills again what another one has made.
+pub(crate) fn room(kept: &mut Vec<f32>, n: usize) -> &mut [f32] {
+    if kept.len() < n {
+        kept.resize(n, 0.0);
+    }
+    &mut kept[..n]
+}
+
 /// `n` zeros, written by all threads where there are many: memory that was used before
 /// is to be cleared, new memory to be faulted in.
 pub fn zeros(n: usize) -> Vec<f32> {

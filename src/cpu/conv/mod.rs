@@ -84,7 +84,7 @@ fn run(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y: &mut Bloc
 
 /// Most floats of weights that a thread keeps: longer blocks are the allocator's to
 /// keep, where a program has one that does ([`super::pages`]).
-const KEPT: usize = 1 << 19;
+const KEPT: usize = 1 << 20;
 
 fn keep(memory: Vec<f32>) {
     if memory.capacity() < KEPT {

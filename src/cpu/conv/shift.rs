@@ -4,7 +4,7 @@
 use super::Buffers;
 use super::plan::{Axes, Layout, Pack, Plan, starts};
 use crate::cpu::disjoint::Disjoint;
-use crate::cpu::fresh::{self, fill};
+use crate::cpu::fresh::{self, fill, room};
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
@@ -43,8 +43,8 @@ impl Weights {
         let depth = plan.src_channels * plan.all_taps();
         let blocks = blocks(plan.dst_channels);
         let floats = blocks.iter().map(|b| b.rows * depth).sum();
-        data.resize(floats, 0.0);
-        data.par_chunks_mut((ROWS * depth).max(1)).zip(&blocks).for_each(|(panel, block)| {
+        let panels = room(&mut data, floats).par_chunks_mut((ROWS * depth).max(1));
+        panels.zip(&blocks).for_each(|(panel, block)| {
             let mut panel = panel;
             for pass in &plan.passes {
                 let n = plan.src_channels * pass.taps.len() * block.rows;

@@ -10,7 +10,7 @@ use super::plan::{Axes, Plan, Sizes};
 use super::shift::{Block, ROWS, Strip, blocks};
 use super::{Buffer, Buffers};
 use crate::cpu::disjoint::Disjoint;
-use crate::cpu::fresh;
+use crate::cpu::fresh::{self, room};
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
 use rayon::prelude::*;
 use std::array::from_fn;
@@ -121,8 +121,8 @@ impl Weights {
     pub fn new(tier: Tier, plan: &Plan, way: Way, w: &[f32], mut data: Vec<f32>) -> Self {
         let blocks = blocks(plan.dst_channels);
         let floats = GROUPS * group_step(plan.src_channels);
-        data.resize(blocks.len() * floats, 0.0);
-        data.par_chunks_exact_mut(floats)
+        room(&mut data, blocks.len() * floats)
+            .par_chunks_exact_mut(floats)
             .zip(&blocks)
             .for_each(|(panel, block)| tier.run(Transform { plan, way, w, block, panel }));
         Self { data, blocks }

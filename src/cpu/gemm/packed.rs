@@ -1,6 +1,7 @@
 //! Factors of a product as slices, and the right one as the register tiles read it.
 
 use super::PANEL;
+use crate::cpu::fresh::room;
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
 use std::cell::Cell;
 
@@ -55,6 +56,7 @@ impl<'a> Mat<'a> {
 /// must be, in whole vectors, padded with zeros): `[panel][k][column]`.
 #[derive(Clone, Debug, Default)]
 pub struct Packed {
+    /// Beyond the panels: what an earlier matrix left in this memory.
     pub(super) data: Vec<f32>,
     pub(super) depth: usize,
     pub(super) cols: usize,
@@ -79,10 +81,9 @@ impl Packed {
         rhs.check("operands");
         self.depth = rhs.rows;
         self.cols = rhs.cols;
-        // Every place is written below.
-        self.data.resize(rhs.rows * rhs.cols.next_multiple_of(LANES), 0.0);
-        if rhs.rows > 0 && rhs.cols > 0 {
-            Tier::best().run(Pack { rhs, to: &mut self.data });
+        let to = room(&mut self.data, rhs.rows * rhs.cols.next_multiple_of(LANES));
+        if !to.is_empty() {
+            Tier::best().run(Pack { rhs, to });
         }
     }
 
@@ -106,8 +107,7 @@ impl Packed {
     ) -> R {
         Self::in_kept(|packed| {
             (packed.depth, packed.cols) = (depth, cols);
-            packed.data.resize(depth * cols.next_multiple_of(LANES), 0.0);
-            fill(&mut packed.data);
+            fill(room(&mut packed.data, depth * cols.next_multiple_of(LANES)));
             f(packed)
         })
     }
