@@ -3,9 +3,13 @@
 //! this with different readings of "row" and "channel". A pointwise function may
 //! follow in the same pass.
 
+mod layer;
+
 use super::activation::{Activation, by_kind};
 use super::fresh::{Block, Fresh};
 use super::math::{sum_of, sums_of, vectorised};
+use super::simd::Tier;
+use layer::{LONGEST, Layer};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
@@ -69,7 +73,12 @@ pub(super) fn forward_to(rows: &Rows, x: &[f32], w: &[f32], b: &[f32], y: &mut B
     assert!(w.is_empty() || w.len() == rows.groups * rows.per_row(), "normalisation: channels");
     let batch = rows.batch();
     let chunk = batch * rows.len;
+    // Short rows of all channels.
+    let layer = rows.run == 1 && rows.groups == 1 && rows.len <= LONGEST;
     x.par_chunks(chunk).zip(y.par_chunks_mut(chunk)).enumerate().for_each(|(at, (x, y))| {
+        if layer && rows.activation.is_none() {
+            return Tier::best().run(Layer { n: rows.len, eps: rows.eps, x, y, affine: [w, b] });
+        }
         vectorised(
             #[inline(always)]
             || {

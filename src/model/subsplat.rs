@@ -89,10 +89,10 @@ impl SubSplat {
         if h % stride != 0 || w % stride != 0 {
             bail!("input images: expected sides that are multiples of {stride}, got {w}x{h}");
         }
-        match &self.encoder {
+        in_pool(|| match &self.encoder {
             Encoder::Mvsplat(encoder) => encoder.forward(views, &mut Trace::off()),
             Encoder::Small(encoder) => Ok(encoder.forward(views, false)?.0),
-        }
+        })
     }
 
     /// `views` with near and far by what a first look at half the size shows, from half
@@ -105,7 +105,7 @@ impl SubSplat {
     pub fn look(&self, views: &Views) -> Result<Views> {
         match (&self.encoder, &self.config.backbone) {
             (Encoder::Small(network), Backbone::Small(c)) if c.first_look => {
-                look::ranges(network, views, self.config.stride())
+                in_pool(|| look::ranges(network, views, self.config.stride()))
             }
             _ => Ok(views.clone()),
         }
@@ -170,7 +170,7 @@ impl SubSplat {
             stage(STAGES[1]);
             let parents = self.primaries(&views, &output)?;
             stage(STAGES[2]);
-            let children = self.trunk.forward(&views, &output, &parents)?;
+            let children = in_pool(|| self.trunk.forward(&views, &output, &parents))?;
             let depths = output.depths.narrow(3, 0, 1)?.squeeze(3)?.squeeze(0)?.to_vec2()?;
             scenes.push(SceneOutput { children, depths });
         }
@@ -196,6 +196,12 @@ impl SubSplat {
         };
         (0..views.scenes()).map(one).collect()
     }
+}
+
+/// Runs `work` on a thread of the current pool: from there a parallel call does not wait
+/// for another thread to wake up, and the network makes hundreds of them.
+fn in_pool<R: Send>(work: impl FnOnce() -> R + Send) -> R {
+    rayon::scope(|_| work())
 }
 
 /// Channels of every feature level that the configuration's backbone has.

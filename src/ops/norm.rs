@@ -193,12 +193,15 @@ mod tests {
                 Ok(vec![(&y / (y.neg()?.exp()? + 1.0)?)?])
             },
         )?;
-        // More rows than one task takes.
-        let inputs = [noise(&[5000, 9], 4)?, noise(&[9], 5)?, noise(&[9], 6)?];
-        same(
-            &inputs,
-            |x| Ok(vec![layer_norm(&x[0], &x[1], &x[2])?]),
-            |x| Ok(vec![unit(&x[0])?.broadcast_mul(&x[1])?.broadcast_add(&x[2])?]),
-        )
+        // More rows than one task takes; whole vectors, parts of them, long rows.
+        for (rows, n) in [(5000, 9), (37, 128), (11, 41), (5, 700)] {
+            let inputs = [noise(&[rows, n], 4)?, noise(&[n], 5)?, noise(&[n], 6)?];
+            same(
+                &inputs,
+                |x| Ok(vec![layer_norm(&x[0], &x[1], &x[2])?]),
+                |x| Ok(vec![unit(&x[0])?.broadcast_mul(&x[1])?.broadcast_add(&x[2])?]),
+            )?;
+        }
+        Ok(())
     }
 }
