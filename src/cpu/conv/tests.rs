@@ -91,6 +91,7 @@ fn cases() -> Vec<Sizes> {
         flat(21, 110, [3, 3], 2, 1, [13, 10]),
         flat(2, 100, [3, 3], 1, 1, [5, 20]),
         flat(3, 9, [3, 3], 1, 0, [6, 300]),
+        flat(3, 8, [3, 3], 1, 1, [6, 288]),
         flat(20, 2, [3, 3], 1, 1, [70, 140]),
         flat(2, 20, [1, 1], 3, 0, [7, 7]),
         // By Winograd, borders within tiles, several blocks each way.
