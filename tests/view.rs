@@ -2,10 +2,13 @@
 //! The camera's part is tests/navigation.rs; keys and pictures are tested beside them.
 #![cfg(feature = "view")]
 
+#[path = "common/one_splat.rs"]
+mod one_splat;
 #[path = "common/program.rs"]
 #[expect(dead_code, reason = "other test binaries use the rest")]
 mod program;
 
+use one_splat::save_one_splat;
 use program::{Called, called};
 use std::path::Path;
 use std::process::Command;
@@ -36,6 +39,25 @@ fn wrong_arguments_are_told_before_a_window_is_looked_for() {
         let got = view(folder.path(), arguments, None);
         assert_eq!(got.code, code, "{arguments}: {}", got.stderr);
         assert!(got.stderr.contains(hint), "{arguments}: {}", got.stderr);
+    }
+}
+
+#[test]
+fn a_finished_scene_has_no_use_for_the_flags_of_photographs() {
+    let folder = tempfile::tempdir().unwrap();
+    save_one_splat(&folder.path().join("one.ply"));
+    for flag in [
+        "--fov 60",
+        "--move 1,0,0",
+        "--pose-convention opencv-c2w",
+        "--upscale 2",
+        "--detail off",
+        "--no-check",
+    ] {
+        let got = view(folder.path(), &format!("one.ply {flag}"), None);
+        let name = flag.split(' ').next().unwrap();
+        let want = format!("error: {name}: only with photographs; one.ply is a finished scene");
+        assert_eq!((got.code, got.error()), (1, want.as_str()), "{flag}");
     }
 }
 

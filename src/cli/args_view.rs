@@ -83,7 +83,9 @@ impl ViewArgs {
             (source.model.backbone.is_some(), "--backbone"),
             (source.model.preset.is_some(), "--preset"),
             (source.model.config.is_some(), "--config"),
+            (source.no_check, "--no-check"),
+            (source.pair.pose_convention.is_some(), "--pose-convention"),
         ];
-        flags.into_iter().find(|f| f.0).map(|f| f.1)
+        flags.into_iter().find(|f| f.0).map(|f| f.1).or(source.pair.given())
     }
 }

@@ -56,7 +56,7 @@ impl From<PoseConventionArg> for PoseConvention {
 
 impl PairArgs {
     /// A flag of these that was given and that only photographs have a use for.
-    fn given(&self) -> Option<&'static str> {
+    pub(super) fn given(&self) -> Option<&'static str> {
         let flags = [
             (self.fov.is_some(), "--fov"),
             (self.intrinsics.is_some(), "--intrinsics"),

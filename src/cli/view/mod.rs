@@ -72,6 +72,7 @@ fn plan(args: &ViewArgs) -> Result<Plan> {
     let size = args.size.as_deref().map(frames::size).transpose()?;
     size.map_or(Ok(()), |size| memory::check_picture("--size", size))?;
     args.frames.map_or(Ok(0), frames::count)?;
+    source::check(args)?;
     let device = args.device.parse().unwrap_or_else(|e: Infallible| match e {});
     if device == DeviceChoice::Cpu {
         bail!("--device: expected auto, gpu or an adapter's name, as a window needs one; got cpu");

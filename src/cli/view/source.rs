@@ -50,6 +50,16 @@ pub fn open(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     }
 }
 
+/// Refuses what photographs alone have a use for where a finished scene is named.
+pub fn check(args: &ViewArgs) -> Result<()> {
+    if let ([one], Some(flag)) = (args.input.as_slice(), args.for_photographs())
+        && is_splats(one)?
+    {
+        bail!("{flag}: only with photographs; {} is a finished scene", one.display());
+    }
+    Ok(())
+}
+
 fn is_splats(path: &Path) -> Result<bool> {
     if !path.is_file() {
         return Ok(false);
@@ -59,9 +69,6 @@ fn is_splats(path: &Path) -> Result<bool> {
 }
 
 fn finished(args: &ViewArgs, path: &Path, progress: &mut Progress) -> Result<Source> {
-    if let Some(flag) = args.for_photographs() {
-        bail!("{flag}: only with photographs; {} is a finished scene", path.display());
-    }
     let (splats, comments) = progress.stage("scene", |_| load_with_comments(path))?;
     let options = render::options(&args.look(), args.source.near, SH_DEGREE, &comments)?;
     let beside = path.parent().unwrap_or(Path::new("")).join("cameras.json");
