@@ -156,38 +156,35 @@ impl Kernel for Job<'_> {
                 && block.rows * (columns / LANES) >= 2 * ROWS
                 && block.rows > ROWS / 2;
             for d in 0..depths {
-                let x = &self.packed[d * layout.depth()..];
-                let mut from = 0;
-                for i in 0..if direct { rows } else { offsets.len() } {
-                    let offsets = &offsets[if direct { 0 } else { i }];
-                    let n = plan.src_channels * offsets.len() * block.rows;
-                    let strip = Strip {
-                        x: if direct { &x[i * layout.pitch()..] } else { x },
-                        channel: layout.channel,
-                        channels: plan.src_channels,
-                        offsets,
-                        w: &panel[from..from + n],
-                        bias,
-                        length: if direct { columns } else { length },
-                    };
-                    let to = if direct {
-                        let at = self.at(block.first, d, i);
-                        let stride = plan.dst_size.iter().product();
-                        To { at: self.y.address(at).cast_mut().cast(), stride }
-                    } else {
-                        from += n;
-                        let at = self.sums[i * ROWS * length..][..ROWS * length].as_mut_ptr();
-                        To { at, stride: length }
-                    };
-                    // SAFETY: eight rows of sums; or the same piece of a row of y in each
-                    // channel of the block, this job's alone, since jobs differ in picture,
-                    // tile or channels.
-                    unsafe { strip.run_to(s, block.rows, to) };
-                }
-                if !direct {
-                    for m in 0..block.rows {
-                        self.write(s, block.first + m, m, d, length);
+                let strip = Strip {
+                    x: &self.packed[d * layout.depth()..],
+                    channel: layout.channel,
+                    channels: plan.src_channels,
+                    offsets: &offsets[0],
+                    w: panel,
+                    bias,
+                    length,
+                };
+                if direct {
+                    for r in 0..rows {
+                        let x = &strip.x[r * layout.pitch()..];
+                        let strip = Strip { x, length: columns, ..strip };
+                        // SAFETY: the same piece of a row of y in each channel of the block,
+                        // this job's alone: jobs differ in picture, tile or channels.
+                        unsafe { strip.run_to(s, block.rows, self.row(block.first, d, r)) };
                     }
+                    continue;
+                }
+                let mut from = 0;
+                for (p, offsets) in offsets.iter().enumerate() {
+                    let n = plan.src_channels * offsets.len() * block.rows;
+                    let strip = Strip { offsets, w: &panel[from..from + n], ..strip };
+                    from += n;
+                    let sums = &mut self.sums[p * ROWS * length..][..ROWS * length];
+                    strip.run(s, block.rows, sums);
+                }
+                for m in 0..block.rows {
+                    self.write(s, block.first + m, m, d, length);
                 }
             }
         }
@@ -202,12 +199,13 @@ impl Job<'_> {
         std::array::from_fn(|a| self.layout.tile[a].min(grid[a] - self.start[a]))
     }
 
-    /// Where row `r` of the tile at depth `d` of a channel begins in y, stride 1.
+    /// Row `r` of the tile at depth `d` in y, from channel `channel` on, stride 1.
     #[inline(always)]
-    fn at(&self, channel: usize, d: usize, r: usize) -> usize {
+    fn row(&self, channel: usize, d: usize, r: usize) -> To {
         let [depth, height, width] = self.plan.dst_size;
         let row = (self.image * self.plan.dst_channels + channel) * depth + self.start[0] + d;
-        (row * height + self.start[1] + r) * width + self.start[2]
+        let at = (row * height + self.start[1] + r) * width + self.start[2];
+        To { at: self.y.address(at).cast_mut().cast(), stride: depth * height * width }
     }
 
     /// Copies channel `m` of the block's sums at depth `d` to channel `channel` of y.
@@ -271,6 +269,7 @@ pub(super) fn zip<S: Simd>(s: S, even: &[f32], odd: &[f32], to: &mut [MaybeUnini
 }
 
 /// One pass over one depth of a tile, for one block of channels.
+#[derive(Clone, Copy)]
 pub(super) struct Strip<'a> {
     pub x: &'a [f32],
     /// Distance of channels in `x`.
