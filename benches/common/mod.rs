@@ -231,10 +231,8 @@ impl Bench {
                 let run = &mut contender.run;
                 // What is quick is timed as within a longer computation: its data in the
                 // caches, its threads awake.
-                let warm = match times.wall.last().is_none_or(|t| *t < QUICK_S) {
-                    true if !contender.elsewhere => WARM_S,
-                    _ => 0.0,
-                };
+                let quick = times.wall.last().is_none_or(|t| *t < QUICK_S);
+                let warm = if quick && !contender.elsewhere { WARM_S } else { 0.0 };
                 let timed = || {
                     let start = Instant::now();
                     while start.elapsed().as_secs_f64() < warm {

@@ -9,7 +9,7 @@ use super::activation::{Activation, by_kind};
 use super::fresh::{Block, Fresh};
 use super::math::{sum_of, sums_of, vectorised};
 use super::simd::Tier;
-use layer::{LONGEST, Layer};
+use layer::Layer;
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
@@ -73,10 +73,9 @@ pub(super) fn forward_to(rows: &Rows, x: &[f32], w: &[f32], b: &[f32], y: &mut B
     assert!(w.is_empty() || w.len() == rows.groups * rows.per_row(), "normalisation: channels");
     let batch = rows.batch();
     let chunk = batch * rows.len;
-    // Short rows of all channels.
-    let layer = rows.run == 1 && rows.groups == 1 && rows.len <= LONGEST;
+    let layer = rows.run == 1 && rows.groups == 1 && rows.activation.is_none();
     x.par_chunks(chunk).zip(y.par_chunks_mut(chunk)).enumerate().for_each(|(at, (x, y))| {
-        if layer && rows.activation.is_none() {
+        if layer {
             return Tier::best().run(Layer { n: rows.len, eps: rows.eps, x, y, affine: [w, b] });
         }
         vectorised(
@@ -116,11 +115,6 @@ fn affine_row(
     f: impl Fn(f32) -> f32,
 ) {
     match affine {
-        Some((w, b)) if rows.run == 1 => {
-            for (((y, x), w), b) in y.iter_mut().zip(x).zip(w).zip(b) {
-                *y = MaybeUninit::new(f((x - mean) * inverse * w + b));
-            }
-        }
         Some((w, b)) => {
             let runs = x.chunks_exact(rows.run).zip(y.chunks_exact_mut(rows.run));
             for ((x, y), (w, b)) in runs.zip(w.iter().zip(b)) {

@@ -192,7 +192,7 @@ impl SubSplat {
             let views = views.scene(b)?;
             let output = self.encode(&views)?;
             let parents = self.primaries(&views, &output)?;
-            self.trunk.render(&views, &output, &parents, camera, options)
+            in_pool(|| self.trunk.render(&views, &output, &parents, camera, options))
         };
         (0..views.scenes()).map(one).collect()
     }

@@ -1,6 +1,6 @@
 //! 1×1 convolutions without padding: a matrix product of weights and pixels, in which
-//! nothing is shifted and no tile need be packed. Where the stride is 2 or more, every
-//! second pixel of every second row is read, or (∂L/∂x) written, zeros between.
+//! nothing is shifted and no tile need be packed. Where the stride is not 1, its multiples
+//! alone are read, or (∂L/∂x) written, zeros between.
 
 use super::Buffers;
 use super::plan::{Plan, pick};
@@ -23,13 +23,11 @@ const PIXELS: usize = 256;
 
 /// Whether `plan` can be, and had better be, run here.
 pub(super) fn suits(plan: &Plan) -> bool {
-    let reads = |plan: &Plan| plan.passes.iter().filter(|p| !p.taps.is_empty()).count();
     let grid = plan.grid();
     plan.kernel_taps == 1
         // Padding would move the first place that is read, or the one that is written.
         && plan.origin == [0; 3]
         && plan.planes == [[0; 3]]
-        && reads(plan) == 1
         && plan.passes[0].taps.len() == 1
         && (0..3).all(|a| plan.src_size[a].div_ceil(plan.src_step[a]) == grid[a])
         && plan.src_channels >= CHANNELS

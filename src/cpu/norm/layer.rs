@@ -1,5 +1,5 @@
-//! LayerNorm of short rows: passes over several rows together, since within one each
-//! step waits for the last.
+//! LayerNorm: passes over several rows together, since within one each step waits for
+//! the last.
 
 use crate::cpu::fresh::Block;
 use crate::cpu::simd::{Kernel, LANES, Simd};
@@ -8,11 +8,11 @@ use std::mem::MaybeUninit;
 
 /// Rows of a pass.
 const TOGETHER: usize = 8;
-/// Most numbers of a row: sums in f32 lanes lose digits beyond.
-pub(super) const LONGEST: usize = 512;
+/// Numbers that are summed in f32 lanes before they go to an f64.
+const BLOCK: usize = 512;
 
-/// w·(x − mean)/σ + b of rows of `n` numbers, n = 1 to [`LONGEST`]; `affine` are w and b,
-/// both of `n` numbers or both empty.
+/// w·(x − mean)/σ + b of rows of `n` numbers; `affine` are w and b, both of `n` numbers or
+/// both empty.
 pub(super) struct Layer<'a> {
     pub n: usize,
     pub eps: f32,
@@ -37,7 +37,7 @@ impl Kernel for Layer<'_> {
                     #[inline(always)]
                     |v| v,
                 );
-                *mean = (f64::from(sum) / n as f64) as f32;
+                *mean = (sum / n as f64) as f32;
             }
             for ((x, mean), inverse) in x.chunks_exact(n).zip(means).zip(&mut inverses) {
                 let mean = s.splat(mean);
@@ -47,8 +47,7 @@ impl Kernel for Layer<'_> {
                     #[inline(always)]
                     |v| (v - mean) * (v - mean),
                 );
-                let variance = f64::from(sum) / n as f64;
-                *inverse = (1.0 / (variance + f64::from(eps)).sqrt()) as f32;
+                *inverse = (1.0 / (sum / n as f64 + f64::from(eps)).sqrt()) as f32;
             }
             let rows = x.chunks_exact(n).zip(y.chunks_exact_mut(n));
             for ((x, y), (mean, inverse)) in rows.zip(means.into_iter().zip(inverses)) {
@@ -84,14 +83,18 @@ fn part<S: Simd>(s: S, row: &[f32], at: usize) -> S::F {
 
 /// Σ f(xᵢ).
 #[inline(always)]
-fn total<S: Simd>(s: S, x: &[f32], f: impl Fn(S::F) -> S::F) -> f32 {
-    let mut sum = s.splat(0.0);
-    for at in (0..x.len()).step_by(LANES) {
-        let inside = (x.len() - at).min(LANES);
-        let v = f(part(s, x, at));
-        // What f makes of the zeros past the end does not count.
-        let v = if inside < LANES { s.keep(s.mask((1 << inside) - 1), v) } else { v };
-        sum = sum + v;
+fn total<S: Simd>(s: S, x: &[f32], f: impl Fn(S::F) -> S::F) -> f64 {
+    let mut total = 0.0;
+    for x in x.chunks(BLOCK) {
+        let mut sum = s.splat(0.0);
+        for at in (0..x.len()).step_by(LANES) {
+            let inside = (x.len() - at).min(LANES);
+            let v = f(part(s, x, at));
+            // What f makes of the zeros past the end does not count.
+            let v = if inside < LANES { s.keep(s.mask((1 << inside) - 1), v) } else { v };
+            sum = sum + v;
+        }
+        total += f64::from(s.sum(sum));
     }
-    s.sum(sum)
+    total
 }

@@ -368,11 +368,11 @@ impl Simd for Token {
     }
     #[inline(always)]
     fn zip(self, a: F, b: F) -> [F; 2] {
-        let zip = |a, b| unsafe {
-            let [low, high] = halves(_mm256_unpacklo_ps(a, b), _mm256_unpackhi_ps(a, b));
-            F(low, high)
-        };
-        [zip(a.0, b.0), zip(a.1, b.1)]
+        unsafe {
+            let [p, q] = halves(_mm256_unpacklo_ps(a.0, b.0), _mm256_unpackhi_ps(a.0, b.0));
+            let [r, t] = halves(_mm256_unpacklo_ps(a.1, b.1), _mm256_unpackhi_ps(a.1, b.1));
+            [F(p, q), F(r, t)]
+        }
     }
     #[inline(always)]
     fn unzip(self, a: F, b: F) -> [F; 2] {

@@ -348,8 +348,8 @@ impl Simd for Token {
             let low = _mm512_setr_epi32(0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
             let high =
                 _mm512_setr_epi32(8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
-            let zip = |lanes| F(_mm512_permutex2var_ps(a.0, lanes, b.0));
-            [zip(low), zip(high)]
+            let low = _mm512_permutex2var_ps(a.0, low, b.0);
+            [F(low), F(_mm512_permutex2var_ps(a.0, high, b.0))]
         }
     }
     #[inline(always)]
@@ -357,8 +357,8 @@ impl Simd for Token {
         unsafe {
             let even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
             let odd = _mm512_setr_epi32(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
-            let pick = |lanes| F(_mm512_permutex2var_ps(a.0, lanes, b.0));
-            [pick(even), pick(odd)]
+            let even = _mm512_permutex2var_ps(a.0, even, b.0);
+            [F(even), F(_mm512_permutex2var_ps(a.0, odd, b.0))]
         }
     }
     #[inline(always)]
