@@ -25,6 +25,12 @@ use std::sync::OnceLock;
 /// Lanes of a vector, in every tier.
 pub const LANES: usize = 16;
 
+/// The lane of number i of sixteen that are a 4×4 square read by columns, not rows; its
+/// own inverse.
+pub(crate) const fn square(i: usize) -> usize {
+    i % 4 * 4 + i / 4
+}
+
 /// Relative error of [`Simd::rough_sqrt`]: AVX2's reciprocal root has 11.4 bits.
 pub(crate) const ROUGH: f32 = 4e-4;
 
@@ -230,6 +236,9 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
 
     /// Asks for the cache line at `v`; any address will do.
     fn prefetch<T>(self, v: *const T);
+    /// The same into the second-level cache, where more can be under way: for what is
+    /// needed microseconds later.
+    fn prefetch_early<T>(self, v: *const T);
     /// Sum of the lanes: lane i + lane (i + 8), then + 4, + 2, + 1.
     fn sum(self, v: Self::F) -> f32;
     /// [`Simd::sum`] of each of up to 16 vectors.
@@ -249,41 +258,49 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     /// # Safety
     /// Those floats must be there.
     unsafe fn load_lanes(self, from: *const f32, bits: u16) -> Self::F;
-    /// Lane i + 1 in lane i, the first in the last.
-    fn rotate(self, v: Self::F) -> Self::F;
+    /// The lanes whose bit i is set to i places behind `to`.
+    ///
+    /// # Safety
+    /// Those places must be there, and nobody else's.
+    unsafe fn store_lanes(self, v: Self::F, to: *mut MaybeUninit<f32>, bits: u16);
+    /// Of sixteen in the order of [`square`]: the one after each, the first after the last.
+    fn after(self, v: Self::F) -> Self::F;
+    /// The inverse of [`Simd::after`].
+    fn before(self, v: Self::F) -> Self::F;
     /// The lanes of `a` and `b` in turns, as two vectors: a₀ b₀ a₁ b₁ …
     fn zip(self, a: Self::F, b: Self::F) -> [Self::F; 2];
     /// The inverse of [`Simd::zip`]: even lanes of `a`, then of `b`; and odd ones.
     fn unzip(self, a: Self::F, b: Self::F) -> [Self::F; 2];
     /// Rows and columns exchanged: lane j of vector i goes to lane i of vector j.
     fn transpose(self, v: [Self::F; LANES]) -> [Self::F; LANES];
-    /// Columns of a matrix of 16 rows of four, of which each vector holds four rows.
-    fn columns4(self, v: [Self::F; 4]) -> [Self::F; 4];
-    /// The inverse of [`Simd::columns4`].
-    fn rows4(self, v: [Self::F; 4]) -> [Self::F; 4];
+    /// Rows and columns of the 4×4 matrix exchanged that each quarter of the vectors makes.
+    /// Of sixteen rows of four, of which each vector holds four, it makes columns in the
+    /// order of [`square`], and is its own inverse.
+    fn transpose4(self, v: [Self::F; 4]) -> [Self::F; 4];
     /// Quarters 0 and 2 of `a`, then of `b`; and quarters 1 and 3.
     fn split_quarters(self, a: Self::F, b: Self::F) -> [Self::F; 2];
     /// The inverse of [`Simd::split_quarters`].
     fn join_quarters(self, even: Self::F, odd: Self::F) -> [Self::F; 2];
-    /// Columns of a matrix of 16 rows of eight, of which each vector holds two rows.
+    /// Columns, in the order of [`square`], of a matrix of 16 rows of eight, of which each
+    /// vector holds two rows.
     #[inline(always)]
-    fn columns8(self, v: [Self::F; 8]) -> [Self::F; 8] {
-        let (mut left, mut right) = ([v[0]; 4], [v[0]; 4]);
+    fn columns8(self, [a, b, c, d, e, f, g, h]: [Self::F; 8]) -> [Self::F; 8] {
+        let (even, odd) = (self.transpose4([a, c, e, g]), self.transpose4([b, d, f, h]));
+        let mut out = [a; 8];
         for i in 0..4 {
-            [left[i], right[i]] = self.split_quarters(v[2 * i], v[2 * i + 1]);
+            [out[i], out[4 + i]] = self.split_quarters(even[i], odd[i]);
         }
-        let ([a, b, c, d], [e, f, g, h]) = (self.columns4(left), self.columns4(right));
-        [a, b, c, d, e, f, g, h]
+        out
     }
     /// The inverse of [`Simd::columns8`].
     #[inline(always)]
-    fn rows8(self, [a, b, c, d, e, f, g, h]: [Self::F; 8]) -> [Self::F; 8] {
-        let (left, right) = (self.rows4([a, b, c, d]), self.rows4([e, f, g, h]));
-        let mut out = [a; 8];
+    fn rows8(self, v: [Self::F; 8]) -> [Self::F; 8] {
+        let (mut even, mut odd) = ([v[0]; 4], [v[0]; 4]);
         for i in 0..4 {
-            [out[2 * i], out[2 * i + 1]] = self.join_quarters(left[i], right[i]);
+            [even[i], odd[i]] = self.join_quarters(v[i], v[4 + i]);
         }
-        out
+        let ([a, c, e, g], [b, d, f, h]) = (self.transpose4(even), self.transpose4(odd));
+        [a, b, c, d, e, f, g, h]
     }
 }
 
@@ -296,21 +313,36 @@ fn all_inside(len: usize, at: &[usize; LANES], offset: usize) -> bool {
     len >= 4 && offset <= len - 4 && most <= room
 }
 
-/// 2^p to 2 ulp for −125 ≤ p ≤ 126, any number elsewhere: the nearest whole number by
-/// exponent, the rest by a minimax polynomial of degree 5 on [−½, ½] (relative
-/// error 7.5e-8; Remez).
+/// 2^p to 2 ulp for −125 ≤ p ≤ 126, any number elsewhere.
 #[inline(always)]
 pub(crate) fn exp2<S: Simd>(s: S, p: S::F) -> S::F {
+    let (n, f) = s.split(p);
+    s.scale(exp2_part(s, f), n)
+}
+
+/// 2^p to 2 ulp for −125 ≤ p ≤ 126, NaN for NaN, any number elsewhere: with sums in place
+/// of [`Simd::split`] and [`Simd::scale`], which keep busy what products need.
+#[inline(always)]
+pub(crate) fn exp2_by_sums<S: Simd>(s: S, p: S::F) -> S::F {
+    // 1.5·2²³: a sum with it is rounded to a whole number that stands in the low bits of
+    // the mantissa; 127 is the exponent's bias.
+    let magic = s.splat(12_582_912.0 + 127.0);
+    let shifted = p + magic;
+    let f = p - (shifted - magic);
+    exp2_part(s, f) * s.of_bits(s.shl::<23>(s.to_bits(shifted)))
+}
+
+/// 2^f on [−½, ½]: a minimax polynomial of degree 5 (relative error 7.5e-8; Remez).
+#[inline(always)]
+fn exp2_part<S: Simd>(s: S, f: S::F) -> S::F {
     const C: [f32; 6] =
         [1.000_000_1, 0.693_146_94, 0.240_221_2, 0.055_507_13, 0.009_675_541, 0.001_327_647_2];
-    let (n, f) = s.split(p);
     let mut m = s.splat(C[5]);
     m = s.fma(m, f, s.splat(C[4]));
     m = s.fma(m, f, s.splat(C[3]));
     m = s.fma(m, f, s.splat(C[2]));
     m = s.fma(m, f, s.splat(C[1]));
-    m = s.fma(m, f, s.splat(C[0]));
-    s.scale(m, n)
+    s.fma(m, f, s.splat(C[0]))
 }
 
 /// log₂ of a normal positive number to 3 ulp or 1e-7, whichever is more; anything

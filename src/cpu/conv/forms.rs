@@ -11,7 +11,7 @@
 //! weight: nine for four outputs where the definition needs twelve, 81 and not 144 in two
 //! dimensions. ∂L/∂x is the same algorithm turned over.
 
-use crate::cpu::simd::Simd;
+use crate::cpu::simd::{LANES, Simd};
 use std::f32::consts::{FRAC_1_SQRT_2, SQRT_2};
 
 /// Grid positions of a tile along an axis: outputs, or pairs of outputs.
@@ -28,6 +28,8 @@ pub(super) trait Form<const IN: usize, const POINTS: usize, const OUT: usize>:
 {
     /// From what one tile reads to what the next does.
     const READ: usize;
+    /// Of the places read beyond that, those before; it and what comes after are at most one.
+    const BEFORE: usize;
 
     /// What the products are taken of.
     fn points<S: Simd>(s: S, x: [S::F; IN]) -> [S::F; POINTS];
@@ -53,6 +55,7 @@ pub(super) struct Unit;
 
 impl Form<6, 6, 4> for Unit {
     const READ: usize = TILE;
+    const BEFORE: usize = 1;
 
     #[inline(always)]
     fn points<S: Simd>(s: S, x: [S::F; 6]) -> [S::F; 6] {
@@ -184,6 +187,7 @@ pub(super) struct Down;
 
 impl Form<9, 9, 4> for Down {
     const READ: usize = 2 * TILE;
+    const BEFORE: usize = 1;
 
     #[inline(always)]
     fn points<S: Simd>(s: S, x: [S::F; 9]) -> [S::F; 9] {
@@ -230,6 +234,7 @@ pub(super) struct Up;
 
 impl Form<5, 9, 8> for Up {
     const READ: usize = TILE;
+    const BEFORE: usize = 0;
 
     #[inline(always)]
     fn points<S: Simd>(s: S, x: [S::F; 5]) -> [S::F; 9] {
@@ -249,14 +254,19 @@ impl Form<5, 9, 8> for Up {
     }
 }
 
+/// Most products of a tile.
+const PRODUCTS: usize = 81;
+
 /// Where the products of a tile lie in a buffer of `channels` rows of `length` tiles:
 /// one matrix for each of [`GROUPS`], whose rows hold the tiles of all products that
 /// share its weight.
 pub(super) struct Places {
+    channels: usize,
+    length: usize,
     /// Of each product, row-major: its place in the first channel.
-    pub at: Vec<usize>,
-    /// From channel to channel.
-    pub step: Vec<usize>,
+    at: [usize; PRODUCTS],
+    /// From channel to channel, by the number of axes along which its weight is shared.
+    steps: [usize; 3],
     /// Of each group: where it begins and the length of its rows.
     pub groups: Vec<(usize, usize)>,
     /// Floats of all.
@@ -276,14 +286,38 @@ impl Places {
             groups.push((floats, row));
             floats += channels * row + apart;
         }
-        let place = |product: usize| {
+        let mut at = [0; PRODUCTS];
+        for (product, at) in at.iter_mut().enumerate().take(points * points) {
             let axes = [product / points, product % points];
             let [i, j] = axes.map(|p| p.min(WEIGHTS - 1));
             let [p, q] = [axes[0] - i, axes[1] - j];
-            let (first, row) = groups[i * WEIGHTS + j];
-            (first + (p * count(j) + q) * length, row)
-        };
-        let (at, step) = (0..points * points).map(place).unzip();
-        Self { at, step, groups, floats }
+            *at = groups[i * WEIGHTS + j].0 + (p * count(j) + q) * length;
+        }
+        let steps = [1, shared, shared * shared].map(|n| n * length);
+        Self { channels, length, at, steps, groups, floats }
+    }
+
+    /// Those of lanes `first..first + LANES` of `channel`.
+    #[inline(always)]
+    pub fn vectors(&self, channel: usize, first: usize) -> Vectors<'_> {
+        assert!(channel < self.channels && first + LANES <= self.length, "conv: no such tiles");
+        Vectors { at: &self.at, from: self.steps.map(|step| channel * step + first) }
+    }
+}
+
+/// Where the products of sixteen tiles lie.
+pub(super) struct Vectors<'a> {
+    at: &'a [usize; PRODUCTS],
+    from: [usize; 3],
+}
+
+impl Vectors<'_> {
+    /// Product i, j of a form with `points` along an axis: whole vectors, inside
+    /// [`Places::floats`].
+    #[inline(always)]
+    pub fn place(&self, points: usize, i: usize, j: usize) -> usize {
+        let shared = usize::from(i >= WEIGHTS - 1) + usize::from(j >= WEIGHTS - 1);
+        // A form without products that share a weight has steps of one length.
+        self.at[i * points + j] + self.from[shared]
     }
 }

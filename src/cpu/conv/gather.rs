@@ -2,12 +2,13 @@
 //!
 //! Where the tiles of a row make whole vectors, rows of pictures are read as they lie and
 //! turned in registers; what lies beyond a border is masked. Other rows are packed first,
-//! and each tile is read for itself.
+//! and each tile is read for itself. The tiles of a vector lie in the order of [`square`],
+//! which costs the fewest turns.
 
 use super::Buffer;
 use super::forms::{Form, Places, TILE, put};
 use super::plan::{Axes, Layout, Pack, Plan};
-use crate::cpu::simd::{Kernel, LANES, Simd};
+use crate::cpu::simd::{Kernel, LANES, Simd, square};
 use std::array::from_fn;
 
 /// The tiles of a block, row by row, of one picture after the other.
@@ -18,6 +19,29 @@ pub(super) struct Tiles {
     pub across: usize,
     /// Tiles of a picture.
     pub picture: usize,
+}
+
+impl Tiles {
+    /// Lanes of their vectors.
+    pub fn length(&self) -> usize {
+        self.count.next_multiple_of(LANES)
+    }
+
+    /// Whether their vectors are in the order of [`square`]: a few tiles come first in
+    /// their only vector.
+    fn squared(&self) -> bool {
+        self.count >= LANES
+    }
+
+    /// The lane of tile `t`.
+    pub fn lane(&self, t: usize) -> usize {
+        if self.squared() { t / LANES * LANES + square(t % LANES) } else { t }
+    }
+
+    /// Lanes up to the last that holds a tile, others between them perhaps.
+    pub fn lanes(&self) -> usize {
+        if self.squared() { self.length() } else { self.count }
+    }
 }
 
 /// Where a block of tiles is read, the same in every channel.
@@ -40,26 +64,29 @@ enum Rows<'a> {
 const SLACK: usize = 2 * LANES;
 
 /// Sixteen tiles in spans: neighbours, of which one row makes a vector. There are as many
-/// spans as places that a tile reads of a row before the next tile begins.
+/// spans as places from tile to tile; those are a tile's own, and what it reads besides is
+/// its neighbours'.
 struct Spans {
-    /// Where the first tile of each begins: before the picture, where it has a border.
+    /// Where the first tile's own of each begins: before the picture, where it has a border.
     at: [isize; 8],
     /// For each row of tiles and span, the lanes that the picture has.
     lanes: [[u16; 8]; ROWS],
-    /// The tiles that end a row: what they read of the next is not in these vectors.
-    ends: Vec<End>,
+    /// The tiles whose neighbours are in no lane beside them: before the first of a row,
+    /// after the last.
+    firsts: Vec<End>,
+    lasts: Vec<End>,
 }
 
 /// Most rows of a tile.
 const ROWS: usize = 9;
 
+/// A place that a tile reads of a neighbour.
 struct End {
-    /// The tile as a bit.
+    /// The tile's lane as a bit.
     lane: u32,
-    /// Where the next one would begin.
     at: isize,
-    /// Whether the picture has the first two places there, for each row of the tile.
-    has: [[bool; 2]; ROWS],
+    /// Whether the picture has it, for each row of the tile.
+    has: [bool; ROWS],
 }
 
 struct Packed<'a> {
@@ -91,28 +118,28 @@ impl<'a> Gather<'a> {
         let floats = count.div_ceil(picture).saturating_sub(1) * stride + slices * height * width;
         // Tiles of a span.
         let group = LANES / F::READ;
-        if !across.is_multiple_of(group) {
+        if !across.is_multiple_of(group) || !tiles.squared() {
             let layout = reader.layout([1, picture / across * F::READ, across * F::READ]);
             let place = |t: usize| {
-                // Lanes beyond the last tile repeat it.
-                let t = t.min(count - 1);
                 let (picture, t) = (t / picture, t % picture);
                 let place = (t / across * layout.pitch() + t % across) * F::READ;
                 picture * layout.channel + place
             };
-            let vector = |first: usize| from_fn(|i| place(first + i));
-            let at = (0..count).step_by(LANES).map(vector).collect();
+            // Lanes without a tile repeat the last.
+            let mut at = vec![[place(count - 1); LANES]; count.div_ceil(LANES)];
+            let lanes = at.as_flattened_mut();
+            (0..count).for_each(|t| lanes[tiles.lane(t)] = place(t));
             let rows = Rows::Packed(Packed { reader, layout, start, stride, at });
             return Self { pitch: layout.pitch(), floats, rows };
         }
         let origin = reader.origin;
         let [depth, top, left]: [isize; 3] = from_fn(|a| start[a] as isize + origin[a]);
         let has_depth = usize::try_from(depth).is_ok_and(|d| d < slices);
-        // Where a tile begins in the channel and in its row, and the rows that there are.
-        let corner = |t: usize| {
+        // Place `column` of tile t in the channel and in its row, and the rows that there are.
+        let place = |t: usize, column: isize| {
             let (image, t) = (t / picture, t % picture);
             let top = top + (t / across * F::READ) as isize;
-            let left = left + (t % across * F::READ) as isize;
+            let left = left + (t % across * F::READ) as isize + column;
             let row = (depth * height as isize + top) * width as isize;
             let clamp = |v: isize| v.clamp(0, IN as isize).unsigned_abs();
             let past = if has_depth { clamp(height as isize - top) } else { 0 };
@@ -120,28 +147,32 @@ impl<'a> Gather<'a> {
             ((image * stride) as isize + row + left, left, first..past)
         };
         let has = |column: isize| (0..width as isize).contains(&column);
-        let end = |lane: usize, t: usize| {
-            let (at, left, rows) = corner(t);
-            let [at, left] = [at, left].map(|v| v + F::READ as isize);
-            let mut end = End { lane: 1 << lane, at, has: [[false; 2]; ROWS] };
-            end.has[rows].fill([has(left), has(left + 1)]);
+        let end = |i: usize, t: usize, column: isize| {
+            let (at, left, rows) = place(t, column);
+            let mut end = End { lane: 1 << square(i), at, has: [false; ROWS] };
+            end.has[rows].fill(has(left));
             end
         };
+        let own = F::BEFORE as isize;
         let vector = |first: usize| {
             // Spans beyond the last repeat it.
             let begin = |k: usize| (first + k * group).min(count - group);
             let (mut at, mut lanes) = ([0; 8], [[0; 8]; ROWS]);
             for k in 0..F::READ {
-                let (first, left, rows) = corner(begin(k));
+                let (first, left, rows) = place(begin(k), own);
                 let columns = (0..LANES).filter(|lane| has(left + *lane as isize));
                 let columns = columns.fold(0, |bits, lane| bits | 1 << lane);
                 at[k] = first;
                 lanes[rows].iter_mut().for_each(|row| row[k] = columns);
             }
-            let tile = |lane: usize| begin(lane / group) + lane % group;
-            let ends = |lane: &usize| (tile(*lane) + 1).is_multiple_of(across) || lane + 1 == LANES;
-            let ends = (0..LANES).filter(ends).map(|lane| end(lane, tile(lane))).collect();
-            Spans { at, lanes, ends }
+            let tile = |i: usize| begin(i / group) + i % group;
+            let first = |i: &usize| *i == 0 || tile(*i).is_multiple_of(across);
+            let last = |i: &usize| i + 1 == LANES || (tile(*i) + 1).is_multiple_of(across);
+            let all = 0..LANES;
+            let firsts = all.clone().filter(first).map(|i| end(i, tile(i), own - 1)).collect();
+            let next = own + F::READ as isize;
+            let lasts = all.filter(last).map(|i| end(i, tile(i), next)).collect();
+            Spans { at, lanes, firsts, lasts }
         };
         let vectors = (0..count).step_by(LANES).map(vector).collect();
         Self { pitch: width, floats, rows: Rows::Lying(vectors) }
@@ -206,7 +237,7 @@ impl<'a> Gather<'a> {
         &self,
         s: S,
         x: &[f32],
-        Spans { at, lanes, ends }: &Spans,
+        Spans { at, lanes, firsts, lasts }: &Spans,
         r: usize,
     ) -> [S::F; IN]
     where
@@ -218,7 +249,7 @@ impl<'a> Gather<'a> {
         for k in 0..F::READ {
             let from = x.as_ptr().wrapping_offset(at[k] + down);
             // The next channel's, which the cache may not have.
-            s.prefetch(from.wrapping_add(self.floats));
+            s.prefetch_early(from.wrapping_add(self.floats));
             // SAFETY: `new` sets the lanes that the picture has, and the channel all
             // `floats` of it.
             v[k] = unsafe { s.load_lanes(from, lanes[r][k]) };
@@ -226,28 +257,33 @@ impl<'a> Gather<'a> {
         let own = match F::READ {
             8 => s.columns8(v),
             _ => {
-                let [a, b, c, d] = s.columns4([v[0], v[1], v[2], v[3]]);
+                let [a, b, c, d] = s.transpose4([v[0], v[1], v[2], v[3]]);
                 [a, b, c, d, v[4], v[5], v[6], v[7]]
             }
         };
         let mut row = [s.splat(0.0); IN];
         for j in 0..IN {
-            if j < F::READ {
-                row[j] = own[j];
-                continue;
-            }
-            // The next tile's first.
-            let next = j - F::READ;
-            row[j] = s.rotate(own[next]);
-            for end in ends {
-                let from = x.as_ptr().wrapping_offset(end.at + down).wrapping_add(next);
-                // SAFETY: as above.
-                let v = if end.has[r][next] { unsafe { *from } } else { 0.0 };
-                row[j] = s.select(s.mask(end.lane), s.splat(v), row[j]);
-            }
+            row[j] = match j {
+                _ if j < F::BEFORE => with_ends(s, s.before(own[F::READ - 1]), firsts, x, r, down),
+                _ if j < F::BEFORE + F::READ => own[j - F::BEFORE],
+                _ => with_ends(s, s.after(own[0]), lasts, x, r, down),
+            };
         }
         row
     }
+}
+
+/// `row` with the neighbours of `ends`, for their rows `r`, which lie `down` floats on.
+#[inline(always)]
+fn with_ends<S: Simd>(s: S, mut row: S::F, ends: &[End], x: &[f32], r: usize, down: isize) -> S::F {
+    for end in ends {
+        let from = x.as_ptr().wrapping_offset(end.at + down);
+        s.prefetch_early(from.wrapping_add(x.len()));
+        // SAFETY: `new` sets whether the picture has it, and the channel all of the picture.
+        let v = if end.has[r] { unsafe { *from } } else { 0.0 };
+        row = s.select(s.mask(end.lane), s.splat(v), row);
+    }
+    row
 }
 
 /// Transforms the other axis of sixteen tiles, and writes them from tile `first` of
@@ -263,6 +299,8 @@ fn scatter<S, F, const IN: usize, const POINTS: usize, const OUT: usize>(
     S: Simd,
     F: Form<IN, POINTS, OUT>,
 {
+    assert!(tiles.len() >= places.floats);
+    let (vectors, tiles) = (places.vectors(c, first), tiles.as_mut_ptr());
     for j in 0..POINTS {
         let mut column = [s.splat(0.0); IN];
         for i in 0..IN {
@@ -270,11 +308,9 @@ fn scatter<S, F, const IN: usize, const POINTS: usize, const OUT: usize>(
         }
         let column = F::points(s, column);
         for i in 0..POINTS {
-            let p = i * POINTS + j;
-            let at = places.at[p] + c * places.step[p] + first;
-            if let Some(to) = tiles.get_mut(at..).and_then(|to| to.first_chunk_mut()) {
-                s.store(column[i], to);
-            }
+            let to = tiles.wrapping_add(vectors.place(POINTS, i, j));
+            // SAFETY: inside `places` (its promise), and those inside `tiles` (asserted).
+            s.store(column[i], unsafe { &mut *to.cast() });
         }
     }
 }

@@ -340,7 +340,7 @@ fn turn<S: Simd>(
                         && let Some(from) = dy[places[i] + p..].first_chunk()
                     {
                         // The next columns, in whose lines nothing else is near.
-                        s.prefetch(from.as_ptr().wrapping_add(LANES));
+                        s.prefetch_early(from.as_ptr().wrapping_add(LANES));
                         m[i] = s.load(from);
                     }
                 }

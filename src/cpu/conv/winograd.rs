@@ -11,7 +11,7 @@ use super::shift::{Block, ROWS, Strip, blocks};
 use super::{Buffer, Buffers};
 use crate::cpu::disjoint::Disjoint;
 use crate::cpu::fresh::{self, room};
-use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
+use crate::cpu::simd::{Kernel, LANES, Simd, Tier, square};
 use rayon::prelude::*;
 use std::array::from_fn;
 use std::marker::PhantomData;
@@ -25,6 +25,9 @@ const FLOATS: usize = 300_000;
 const CHANNELS: usize = 24;
 /// Tiles of a picture below which [`super::winograd_few`] is better.
 const FEW: usize = 48;
+
+/// Source channels whose weights are asked for before their turn.
+const AHEAD: usize = 8;
 
 /// What the algorithm does for a plan.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -164,6 +167,7 @@ impl<S: Simd> Formed for Lanes<S, Transform<'_>> {
     {
         let Self(s, Transform { plan, w, block, panel, .. }) = self;
         let channels = plan.src_channels;
+        let ahead = AHEAD * 9 * if plan.transposed { plan.dst_channels } else { 1 };
         // Lanes are two source channels, each with the channels of the block.
         for first in (0..channels).step_by(2) {
             let mut kernels = [s.splat(0.0); LANES];
@@ -178,6 +182,7 @@ impl<S: Simd> Formed for Lanes<S, Transform<'_>> {
                     false => dst * channels + src,
                 };
                 let taps = &w[row * 9..][..9];
+                s.prefetch(taps.as_ptr().wrapping_add(ahead));
                 // SAFETY: nine are there.
                 kernels[lane] = unsafe { s.load_lanes(taps.as_ptr(), 0x1ff) };
             }
@@ -313,7 +318,7 @@ where
         let [down, across] = [inside(1), inside(2)];
         let count = down * across;
         let block = Tiles { count, across, picture: count };
-        let length = block.count.next_multiple_of(LANES);
+        let length = block.length();
         let gather = Gather::new::<F, IN, POINTS, OUT>(reader, block, self.start, x.len());
         // Off a power of two, lest all groups share one cache set.
         let sources = Places::new(POINTS, plan.src_channels, length, LANES);
@@ -408,14 +413,14 @@ fn columns<S, F, const IN: usize, const POINTS: usize, const OUT: usize>(
     S: Simd,
     F: Form<IN, POINTS, OUT>,
 {
+    assert!(products.len() >= places.floats);
+    let (vectors, products) = (places.vectors(m, first), products.as_ptr());
     for j in 0..POINTS {
         let mut column = [s.splat(0.0); POINTS];
         for i in 0..POINTS {
-            let p = i * POINTS + j;
-            let from = places.at[p] + m * places.step[p] + first;
-            if let Some(from) = products.get(from..).and_then(|from| from.first_chunk()) {
-                column[i] = s.load(from);
-            }
+            let from = products.wrapping_add(vectors.place(POINTS, i, j));
+            // SAFETY: inside `places` (its promise), and those inside `products` (asserted).
+            column[i] = s.load(unsafe { &*from.cast() });
         }
         let column = F::outputs(s, column);
         for i in 0..OUT {
@@ -459,7 +464,9 @@ impl<'a> Outputs<'a> {
     ) -> Self {
         let Tiles { count, across, picture } = tiles;
         let [slices, height, width] = plan.dst_size;
-        let piece = |lane: usize, t: usize| {
+        let piece = |t: usize| {
+            // The tile's place among those of its vector, once they are in order.
+            let lane = square(tiles.lane(t) % LANES);
             let (image, t) = (image + t / picture, t % picture);
             let row = top * OUT / TILE + t / across * OUT;
             let column = left * OUT / TILE + t % across * OUT;
@@ -469,8 +476,7 @@ impl<'a> Outputs<'a> {
             Piece { lane, at, rows: rows.min(OUT), columns: columns.min(OUT) }
         };
         let vector = |first: usize| {
-            let lanes = 0..LANES.min(count - first);
-            let tiles: Vec<_> = lanes.map(|lane| piece(lane, first + lane)).collect();
+            let tiles: Vec<_> = (first..count.min(first + LANES)).map(piece).collect();
             let full = |p: &Piece| [p.rows, p.columns] == [OUT; 2];
             let joined = |group: &[Piece]| {
                 let last = group.len() - 1;
@@ -502,7 +508,7 @@ impl<'a> Outputs<'a> {
         let rows = match OUT {
             8 => s.rows8([v[0], v[1], v[2], v[3], v[OUT - 4], v[OUT - 3], v[OUT - 2], v[OUT - 1]]),
             _ => {
-                let [a, b, c, d] = s.rows4([v[0], v[1], v[2], v[3]]);
+                let [a, b, c, d] = s.transpose4([v[0], v[1], v[2], v[3]]);
                 [a, b, c, d, a, b, c, d]
             }
         };

@@ -43,7 +43,7 @@ impl Formed for &Call<'_, [f32]> {
         let [down, across] = [height, width].map(|n| n.div_ceil(TILE));
         let picture = down * across;
         let tiles = Tiles { count: self.images * picture, across, picture };
-        let length = tiles.count.next_multiple_of(LANES);
+        let length = tiles.length();
         let apart = plan.src_channels * pixels;
         let gather = &Gather::new::<F, IN, POINTS, OUT>(&self.reader, tiles, [0; 3], apart);
         let own = &Places::new(POINTS, 1, length, 0);

@@ -105,8 +105,8 @@ impl Products<'_, '_> {
         let inside = work.inside(self.start);
         let [_, down, across] = inside.map(|n| n.div_ceil(TILE));
         let (count, channels) = (down * across, work.rows / 9);
-        let length = count.next_multiple_of(LANES);
         let block = Tiles { count, across, picture: count };
+        let (length, lanes) = (block.length(), block.lanes());
         let gather =
             Gather::new::<F, IN, POINTS, TILE>(self.reader, block, self.start, self.x.len());
         let sources = Places::new(POINTS, channels, length, LANES);
@@ -123,10 +123,14 @@ impl Products<'_, '_> {
             let (own, rest) = products.split_at_mut(GROUPS * rows * pitch);
             products = rest;
             let part = Work { outputs, pitch, ..*work };
-            // One row of tiles after the other, each `pitch` gradients; off a power of two.
-            let outward = Places::new(POINTS, 1, count * pitch, LANES);
+            // By lanes, each `pitch` gradients; off a power of two.
+            let outward = Places::new(POINTS, 1, lanes * pitch, LANES);
             let gradients = gradients.room(outward.floats);
-            let part = Spread { work: &part, dy: self.dy, start: self.start, inside };
+            if lanes > count {
+                // Of lanes without a tile.
+                gradients.fill(0.0);
+            }
+            let part = Spread { work: &part, dy: self.dy, start: self.start, inside, block };
             for row in 0..down {
                 part.row::<S, F, POINTS>(s, row, &outward, gradients);
             }
@@ -138,7 +142,7 @@ impl Products<'_, '_> {
                     dy: &gradients[from..][..floats],
                     pitch,
                     count: step / length,
-                    width: count,
+                    width: lanes,
                 };
                 let sums = own[i * rows * pitch..][..rows * pitch].chunks_exact_mut(ROWS * pitch);
                 for (group, sums) in sums.enumerate() {
@@ -160,10 +164,11 @@ struct Spread<'a, 'b> {
     start: Axes,
     /// Outputs of the block that there are.
     inside: Axes,
+    block: Tiles,
 }
 
 impl Spread<'_, '_> {
-    /// Of row `row` of tiles, to `out`: `[tile][channel]` of each product.
+    /// Of row `row` of tiles, to `out`: `[lane][channel]` of each product.
     #[inline(always)]
     fn row<S: Simd, F: Adjoint<POINTS>, const POINTS: usize>(
         &self,
@@ -173,6 +178,8 @@ impl Spread<'_, '_> {
         out: &mut [f32],
     ) {
         let Work { pitch, ref outputs, plan, .. } = *self.work;
+        assert!(out.len() >= places.floats);
+        let out = out.as_mut_ptr();
         let [_, height, width] = self.inside;
         let across = width.div_ceil(TILE);
         // Of sixteen columns, lanes being channels.
@@ -194,7 +201,7 @@ impl Spread<'_, '_> {
                             + left;
                         let from = &self.dy[at..][..columns];
                         // The next columns, in whose lines nothing else is near.
-                        s.prefetch(from.as_ptr().wrapping_add(LANES));
+                        s.prefetch_early(from.as_ptr().wrapping_add(LANES));
                         // SAFETY: as many are there.
                         m[i] = unsafe { s.load_lanes(from.as_ptr(), bits) };
                     }
@@ -206,15 +213,15 @@ impl Spread<'_, '_> {
                         let four = [d[t * TILE], d[t * TILE + 1], d[t * TILE + 2], d[t * TILE + 3]];
                         put(&mut rows[r], F::spread(s, four));
                     }
-                    let tile = row * across + left / TILE + t;
+                    let lane = self.block.lane(row * across + left / TILE + t);
+                    let vectors = places.vectors(0, lane * pitch + v);
                     for j in 0..POINTS {
                         let column = F::spread(s, [rows[0][j], rows[1][j], rows[2][j], rows[3][j]]);
                         for i in 0..POINTS {
-                            let at = places.at[i * POINTS + j] + tile * pitch + v;
-                            if let Some(to) = out.get_mut(at..).and_then(|to| to.first_chunk_mut())
-                            {
-                                s.store(column[i], to);
-                            }
+                            let to = out.wrapping_add(vectors.place(POINTS, i, j));
+                            // SAFETY: inside `places` (its promise), and those inside `out`
+                            // (asserted above).
+                            s.store(column[i], unsafe { &mut *to.cast() });
                         }
                     }
                 }

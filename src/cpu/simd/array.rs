@@ -1,7 +1,7 @@
 //! Lanes as an array of 16: the scalar tier, which compilers turn into the target's
 //! least vectors, and NEON, where they turn into its registers with fused products.
 
-use super::{Floats, Ints, LANES, Mask, Simd, all_inside};
+use super::{Floats, Ints, LANES, Mask, Simd, all_inside, square};
 use std::mem::MaybeUninit;
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
 
@@ -280,6 +280,8 @@ macro_rules! tier {
             #[inline(always)]
             fn prefetch<T>(self, _: *const T) {}
             #[inline(always)]
+            fn prefetch_early<T>(self, _: *const T) {}
+            #[inline(always)]
             fn sum(self, v: F) -> f32 {
                 let mut v = v.0;
                 for half in [8, 4, 2, 1] {
@@ -317,26 +319,37 @@ macro_rules! tier {
                 F(out)
             }
             #[inline(always)]
-            fn rotate(self, v: F) -> F {
+            unsafe fn store_lanes(self, v: F, to: *mut MaybeUninit<f32>, bits: u16) {
+                for i in 0..LANES {
+                    if bits & (1 << i) != 0 {
+                        // SAFETY: there, and nobody else's, as the caller says.
+                        unsafe { to.wrapping_add(i).write(MaybeUninit::new(v.0[i])) };
+                    }
+                }
+            }
+            #[inline(always)]
+            fn after(self, v: F) -> F {
                 let mut out = v;
                 for i in 0..LANES {
-                    out.0[i] = v.0[(i + 1) % LANES];
+                    out.0[square(i)] = v.0[square((i + 1) % LANES)];
                 }
                 out
             }
             #[inline(always)]
-            fn columns4(self, v: [F; 4]) -> [F; 4] {
+            fn before(self, v: F) -> F {
                 let mut out = v;
-                for i in 0..4 * LANES {
-                    out[i % 4].0[i / 4] = v[i / LANES].0[i % LANES];
+                for i in 0..LANES {
+                    out.0[square((i + 1) % LANES)] = v.0[square(i)];
                 }
                 out
             }
             #[inline(always)]
-            fn rows4(self, v: [F; 4]) -> [F; 4] {
+            fn transpose4(self, v: [F; 4]) -> [F; 4] {
                 let mut out = v;
-                for i in 0..4 * LANES {
-                    out[i / LANES].0[i % LANES] = v[i % 4].0[i / 4];
+                for i in 0..4 {
+                    for lane in 0..LANES {
+                        out[lane % 4].0[lane / 4 * 4 + i] = v[i].0[lane];
+                    }
                 }
                 out
             }

@@ -288,6 +288,10 @@ impl Simd for Token {
         unsafe { _mm_prefetch::<_MM_HINT_T0>(v.cast()) }
     }
     #[inline(always)]
+    fn prefetch_early<T>(self, v: *const T) {
+        unsafe { _mm_prefetch::<_MM_HINT_T1>(v.cast()) }
+    }
+    #[inline(always)]
     fn sum(self, v: F) -> f32 {
         unsafe { sum8(_mm256_add_ps(v.0, v.1)) }
     }
@@ -324,32 +328,38 @@ impl Simd for Token {
         }
     }
     #[inline(always)]
-    fn rotate(self, v: F) -> F {
+    unsafe fn store_lanes(self, v: F, to: *mut MaybeUninit<f32>, bits: u16) {
         unsafe {
-            let one = _mm256_setr_epi32(1, 2, 3, 4, 5, 6, 7, 0);
-            let low = _mm256_permutevar8x32_ps(v.0, one);
-            let high = _mm256_permutevar8x32_ps(v.1, one);
-            F(_mm256_blend_ps::<0x80>(low, high), _mm256_blend_ps::<0x80>(high, low))
+            let (lanes, to) = (self.mask(u32::from(bits)), to.cast::<f32>());
+            _mm256_maskstore_ps(to, _mm256_castps_si256(lanes.0), v.0);
+            _mm256_maskstore_ps(to.wrapping_add(8), _mm256_castps_si256(lanes.1), v.1);
         }
     }
     #[inline(always)]
-    fn columns4(self, v: [F; 4]) -> [F; 4] {
+    fn after(self, v: F) -> F {
         unsafe {
-            let ([a, b], [c, d]) = (halves(v[0].0, v[1].0), halves(v[0].1, v[1].1));
-            let low = transpose4([a, b, c, d]);
-            let ([a, b], [c, d]) = (halves(v[2].0, v[3].0), halves(v[2].1, v[3].1));
-            let high = transpose4([a, b, c, d]);
-            [F(low[0], high[0]), F(low[1], high[1]), F(low[2], high[2]), F(low[3], high[3])]
+            // Quarters 1, 2, 3 and what quarter 0 holds, one place on.
+            let low = _mm256_permute2f128_ps::<0x21>(v.0, v.1);
+            let high = _mm256_permute2f128_ps::<0x03>(v.0, v.1);
+            let turned = _mm256_permute_ps::<0x39>(high);
+            F(low, _mm256_blend_ps::<0xf0>(high, turned))
         }
     }
     #[inline(always)]
-    fn rows4(self, v: [F; 4]) -> [F; 4] {
+    fn before(self, v: F) -> F {
+        unsafe {
+            let low = _mm256_permute2f128_ps::<0x03>(v.0, v.1);
+            let high = _mm256_permute2f128_ps::<0x21>(v.0, v.1);
+            let turned = _mm256_permute_ps::<0x93>(low);
+            F(_mm256_blend_ps::<0x0f>(low, turned), high)
+        }
+    }
+    #[inline(always)]
+    fn transpose4(self, v: [F; 4]) -> [F; 4] {
         unsafe {
             let low = transpose4([v[0].0, v[1].0, v[2].0, v[3].0]);
             let high = transpose4([v[0].1, v[1].1, v[2].1, v[3].1]);
-            let ([a, c], [b, d]) = (halves(low[0], low[1]), halves(low[2], low[3]));
-            let ([e, g], [f, h]) = (halves(high[0], high[1]), halves(high[2], high[3]));
-            [F(a, b), F(c, d), F(e, f), F(g, h)]
+            [F(low[0], high[0]), F(low[1], high[1]), F(low[2], high[2]), F(low[3], high[3])]
         }
     }
     #[inline(always)]

@@ -161,8 +161,8 @@ impl Simd for Token {
     #[inline(always)]
     fn split(self, v: F) -> (F, F) {
         const NEAREST: i32 = _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
-        let f = F(unsafe { _mm512_reduce_ps::<NEAREST>(v.0) });
-        (v - f, f)
+        let n = F(unsafe { _mm512_roundscale_ps::<NEAREST>(v.0) });
+        (n, v - n)
     }
     #[inline(always)]
     fn scale(self, v: F, e: F) -> F {
@@ -240,6 +240,10 @@ impl Simd for Token {
         unsafe { _mm_prefetch::<_MM_HINT_T0>(v.cast()) }
     }
     #[inline(always)]
+    fn prefetch_early<T>(self, v: *const T) {
+        unsafe { _mm_prefetch::<_MM_HINT_T1>(v.cast()) }
+    }
+    #[inline(always)]
     fn sum(self, v: F) -> f32 {
         unsafe {
             let half = _mm256_add_ps(_mm512_castps512_ps256(v.0), _mm512_extractf32x8_ps::<1>(v.0));
@@ -306,25 +310,27 @@ impl Simd for Token {
         F(unsafe { _mm512_maskz_loadu_ps(bits, from) })
     }
     #[inline(always)]
-    fn rotate(self, v: F) -> F {
-        F(unsafe {
-            let v = _mm512_castps_si512(v.0);
-            _mm512_castsi512_ps(_mm512_alignr_epi32::<1>(v, v))
-        })
+    unsafe fn store_lanes(self, v: F, to: *mut MaybeUninit<f32>, bits: u16) {
+        unsafe { _mm512_mask_storeu_ps(to.cast(), bits, v.0) }
     }
     #[inline(always)]
-    fn columns4(self, v: [F; 4]) -> [F; 4] {
+    fn after(self, v: F) -> F {
         unsafe {
-            let [a, b, c, d] = transpose4(exchange_quarters([v[0].0, v[1].0, v[2].0, v[3].0]));
-            [F(a), F(b), F(c), F(d)]
+            let next = _mm512_setr_epi32(4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 1, 2, 3, 0);
+            F(_mm512_permutexvar_ps(next, v.0))
         }
     }
     #[inline(always)]
-    fn rows4(self, v: [F; 4]) -> [F; 4] {
+    fn before(self, v: F) -> F {
         unsafe {
-            let [a, b, c, d] = exchange_quarters(transpose4([v[0].0, v[1].0, v[2].0, v[3].0]));
-            [F(a), F(b), F(c), F(d)]
+            let last = _mm512_setr_epi32(15, 12, 13, 14, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11);
+            F(_mm512_permutexvar_ps(last, v.0))
         }
+    }
+    #[inline(always)]
+    fn transpose4(self, v: [F; 4]) -> [F; 4] {
+        let [a, b, c, d] = unsafe { transpose4([v[0].0, v[1].0, v[2].0, v[3].0]) };
+        [F(a), F(b), F(c), F(d)]
     }
     #[inline(always)]
     fn split_quarters(self, a: F, b: F) -> [F; 2] {
@@ -336,10 +342,12 @@ impl Simd for Token {
     #[inline(always)]
     fn join_quarters(self, even: F, odd: F) -> [F; 2] {
         unsafe {
-            let low = _mm512_shuffle_f32x4::<0x44>(even.0, odd.0);
-            let high = _mm512_shuffle_f32x4::<0xee>(even.0, odd.0);
-            let low = _mm512_shuffle_f32x4::<0xd8>(low, low);
-            [F(low), F(_mm512_shuffle_f32x4::<0xd8>(high, high))]
+            let (even, odd) = (_mm512_castps_pd(even.0), _mm512_castps_pd(odd.0));
+            let low = _mm512_setr_epi64(0, 1, 8, 9, 2, 3, 10, 11);
+            let high = _mm512_setr_epi64(4, 5, 12, 13, 6, 7, 14, 15);
+            let low = _mm512_permutex2var_pd(even, low, odd);
+            let high = _mm512_permutex2var_pd(even, high, odd);
+            [F(_mm512_castpd_ps(low)), F(_mm512_castpd_ps(high))]
         }
     }
     #[inline(always)]
@@ -382,23 +390,6 @@ impl Simd for Token {
             }
             out
         }
-    }
-}
-
-/// The 4×4 matrix of 128-bit parts transposed.
-#[inline(always)]
-unsafe fn exchange_quarters(v: [__m512; 4]) -> [__m512; 4] {
-    unsafe {
-        let (a, b) =
-            (_mm512_shuffle_f32x4::<0x44>(v[0], v[1]), _mm512_shuffle_f32x4::<0xee>(v[0], v[1]));
-        let (c, d) =
-            (_mm512_shuffle_f32x4::<0x44>(v[2], v[3]), _mm512_shuffle_f32x4::<0xee>(v[2], v[3]));
-        [
-            _mm512_shuffle_f32x4::<0x88>(a, c),
-            _mm512_shuffle_f32x4::<0xdd>(a, c),
-            _mm512_shuffle_f32x4::<0x88>(b, d),
-            _mm512_shuffle_f32x4::<0xdd>(b, d),
-        ]
     }
 }
 

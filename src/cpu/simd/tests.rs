@@ -102,7 +102,8 @@ impl Kernel for Everything<'_> {
                 put(&mut exact, s.load4(self.1, &[at; LANES], offset)[0]);
             }
             put(&mut exact, s.load4(&self.1[..3], &[0; LANES], 0)[0]);
-            put(&mut exact, s.rotate(a));
+            put(&mut exact, s.after(a));
+            put(&mut exact, s.before(a));
             for v in s.zip(a, b).into_iter().chain(s.unzip(b, c)) {
                 put(&mut exact, v);
             }
@@ -119,6 +120,10 @@ impl Kernel for Everything<'_> {
                 // SAFETY: as above; what lies before the slice is not read.
                 let before = unsafe { s.load_lanes(self.1.as_ptr().wrapping_sub(4), !15) };
                 put(&mut exact, before);
+                let mut to = *lanes(self.2, at);
+                // SAFETY: sixteen places; what is written are numbers.
+                unsafe { s.store_lanes(a, to.as_mut_ptr().cast(), bits) };
+                put(&mut exact, s.load(&to));
             }
             let rows = [a, b, c, a, b, c, -a, a, b, c, a, b, -c, a, b, c];
             for v in s.transpose(rows) {
@@ -128,7 +133,7 @@ impl Kernel for Everything<'_> {
             for v in s.columns8(eight).into_iter().chain(s.rows8(eight)) {
                 put(&mut exact, v);
             }
-            for v in s.columns4([a, b, c, -a]).into_iter().chain(s.rows4([a, b, c, -a])) {
+            for v in s.transpose4([a, b, c, -a]) {
                 put(&mut exact, v);
             }
 
@@ -137,6 +142,8 @@ impl Kernel for Everything<'_> {
             }
             let p = s.min(s.max(a, s.splat(-125.0)), s.splat(126.0));
             put(&mut fused, exp2(s, p));
+            put(&mut fused, exp2_by_sums(s, p));
+            put(&mut exact, s.keep(s.lt(b, a), exp2_by_sums(s, s.splat(f32::NAN))));
             put(&mut fused, log2(s, s.max(s.abs(a), s.splat(f32::MIN_POSITIVE))));
         }
         (exact, fused)
@@ -189,9 +196,11 @@ impl Kernel for Elementary<'_> {
         let mut out = Vec::new();
         for v in self.0.as_chunks().0 {
             let v = s.load(v);
-            s.store(exp2(s, v), &mut p);
-            s.store(log2(s, exp2(s, v)), &mut q);
-            out.extend(p.into_iter().zip(q));
+            for power in [exp2(s, v), exp2_by_sums(s, v)] {
+                s.store(power, &mut p);
+                s.store(log2(s, power), &mut q);
+                out.extend(p.into_iter().zip(q));
+            }
         }
         out
     }
@@ -202,7 +211,8 @@ fn exponential_and_logarithm() {
     let x: Vec<f32> = (0..1 << 16).map(|i| (i as f32 / 65_536.0 - 0.5) * 250.0).collect();
     for &tier in Tier::available() {
         let (mut worst_exp, mut worst_log) = (0.0f64, 0.0f64);
-        for (x, (exp, log)) in x.iter().zip(tier.run(Elementary(&x))) {
+        let twice = x.as_chunks::<LANES>().0.iter().flat_map(|x| x.iter().chain(x));
+        for (x, (exp, log)) in twice.zip(tier.run(Elementary(&x))) {
             worst_exp = worst_exp.max((f64::from(exp) / f64::from(*x).exp2() - 1.0).abs());
             let exact = f64::from(exp).log2();
             worst_log = worst_log.max((f64::from(log) - exact).abs() / exact.abs().max(1.0));
