@@ -5,10 +5,10 @@
 //! independent windows or heads. An optional mask adds [`PENALTY`] where the labels
 //! of query and key differ (Swin's shifted windows; MVSplat section 2).
 
-use super::activation::exp_row;
 use super::gemm::{Base, Mat, Packed, gemm, product};
 use super::math::dot;
 use super::simd::{Kernel, Simd, Tier};
+use super::softmax::exp_row;
 use rayon::prelude::*;
 
 /// Added to the logit of a masked pair: −100, not −∞ (Swin).

@@ -45,6 +45,7 @@ pub mod sh;
 mod sh_bwd;
 pub mod simd;
 pub mod small;
+pub mod softmax;
 mod sort;
 pub mod spgr;
 mod tiles;

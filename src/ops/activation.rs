@@ -1,10 +1,11 @@
 //! Pointwise functions and softmax over the last dimension as candle ops with
-//! gradients. Kernels: [`crate::cpu::activation`]. Tests: `model::layers`.
+//! gradients. Kernels: [`crate::cpu::activation`], [`crate::cpu::softmax`]. Tests:
+//! `model::layers`.
 
 use super::{borrowed, output, slice, tensor_like};
 use crate::cpu::activation as cpu;
 pub use crate::cpu::activation::Activation;
-use crate::cpu::zeros;
+use crate::cpu::{softmax, zeros};
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
 
 /// y = f(x), any shape.
@@ -58,14 +59,14 @@ impl CustomOp1 for Softmax {
 
     fn cpu_fwd(&self, s: &CpuStorage, l: &Layout) -> Result<(CpuStorage, Shape)> {
         let x = slice::<f32>("softmax", "x", s, l)?;
-        output(cpu::softmax(self.0, x), l.shape().clone())
+        output(softmax::softmax(self.0, x), l.shape().clone())
     }
 
     fn bwd(&self, x: &Tensor, y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
         let dy = dy.contiguous()?;
         let mut dx = zeros(x.elem_count());
         borrowed("softmax", [y, &dy], |[y, dy]: [&[f32]; 2]| {
-            cpu::softmax_backward(self.0, y, dy, &mut dx);
+            softmax::backward(self.0, y, dy, &mut dx);
         })?;
         tensor_like(dx, x).map(Some)
     }

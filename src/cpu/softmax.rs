@@ -1,0 +1,218 @@
+//! Softmax over rows, with its gradient.
+//! Oracle: the definition in f64 (`model::layers`' tests).
+
+use super::fresh::{Block, Fresh};
+use super::math::vectorised;
+use super::simd::{Kernel, LANES, Simd, Tier, exp2_by_sums};
+use rayon::prelude::*;
+use std::mem::MaybeUninit;
+
+/// Elements per task.
+const CHUNK: usize = 16_384;
+/// Numbers whose exponentials are one sum in single precision, and of a pass.
+const SUM: usize = 4096;
+
+/// A row to e^{x − max}; returns the sum. To be called inside a kernel.
+#[inline(always)]
+pub(super) fn exp_row<S: Simd>(s: S, row: &mut [f32]) -> f32 {
+    let mut tops = [s.splat(f32::NEG_INFINITY); LANES];
+    tops[0] = largest(s, row);
+    let mut most = [0.0; LANES];
+    s.store(across(s, tops), &mut most);
+    // SAFETY: a number is a place; numbers are written to each.
+    let places = unsafe { super::fresh::over(row) }.as_mut_ptr();
+    // SAFETY: the row, read from where it is written.
+    unsafe { exps(s, places.cast(), places, row.len(), most[0]) }
+}
+
+/// Lane by lane the largest number of a row, −∞ where a lane has none; NaN are passed over.
+#[inline(always)]
+fn largest<S: Simd>(s: S, row: &[f32]) -> S::F {
+    let mut tops = [s.splat(f32::NEG_INFINITY); 4];
+    let (chunks, tail) = row.as_chunks::<LANES>();
+    let (fours, rest) = chunks.as_chunks::<4>();
+    for four in fours {
+        for (top, v) in tops.iter_mut().zip(four) {
+            *top = s.max(s.load(v), *top);
+        }
+    }
+    for v in rest {
+        tops[0] = s.max(s.load(v), tops[0]);
+    }
+    if !tail.is_empty() {
+        let bits = lanes(tail.len());
+        // SAFETY: as many are there.
+        let v = unsafe { s.load_lanes(tail.as_ptr(), bits) };
+        let v = s.select(s.mask(u32::from(bits)), v, tops[1]);
+        tops[1] = s.max(v, tops[1]);
+    }
+    s.max(s.max(tops[0], tops[1]), s.max(tops[2], tops[3]))
+}
+
+/// The first `n` < 16 lanes as bits.
+#[inline(always)]
+fn lanes(n: usize) -> u16 {
+    (1 << n) - 1
+}
+
+/// The largest lane of each vector.
+#[inline(always)]
+fn across<S: Simd>(s: S, v: [S::F; LANES]) -> S::F {
+    let mut v = s.transpose(v);
+    for half in [8, 4, 2, 1] {
+        for i in 0..half {
+            v[i] = s.max(v[i + half], v[i]);
+        }
+    }
+    v[0]
+}
+
+/// e^d for d ≤ 0 or NaN, to 1e-6 where the result is above 1e-5; 0 below 2⁻¹²⁵, so that
+/// no denormals arise.
+#[inline(always)]
+fn exp_negative<S: Simd>(s: S, d: S::F) -> S::F {
+    let p = d * s.splat(std::f32::consts::LOG2_E);
+    s.select(s.lt(p, s.splat(-125.0)), s.splat(0.0), exp2_by_sums(s, p))
+}
+
+/// e^{x − max} of `n` numbers at `x` to `y`; returns the sum.
+///
+/// # Safety
+/// As of [`exp_part`].
+#[inline(always)]
+unsafe fn exps<S: Simd>(s: S, x: *const f32, y: *mut MaybeUninit<f32>, n: usize, max: f32) -> f32 {
+    let (max, mut total) = (s.splat(max), 0.0);
+    for at in (0..n).step_by(SUM) {
+        // SAFETY: a part of both.
+        let sum = unsafe { exp_part(s, x.add(at), y.add(at), SUM.min(n - at), max) };
+        total += f64::from(s.sum(sum));
+    }
+    total as f32
+}
+
+/// e^{x − max} of `n` numbers at `x` to `y`; returns sums by lanes.
+///
+/// # Safety
+/// `x` points to n numbers, `y` to as many places: the same ones, or none of them.
+#[inline(always)]
+unsafe fn exp_part<S: Simd>(
+    s: S,
+    x: *const f32,
+    y: *mut MaybeUninit<f32>,
+    n: usize,
+    max: S::F,
+) -> S::F {
+    let (mut sum, whole) = (s.splat(0.0), n / LANES * LANES);
+    for at in (0..whole).step_by(LANES) {
+        // SAFETY: 16 places inside both.
+        unsafe {
+            let e = exp_negative(s, s.load(&*x.add(at).cast()) - max);
+            sum = sum + e;
+            s.store_fresh(e, &mut *y.add(at).cast());
+        }
+    }
+    if whole < n {
+        let bits = lanes(n - whole);
+        // SAFETY: the rest of both.
+        unsafe {
+            let e = exp_negative(s, s.load_lanes(x.add(whole), bits) - max);
+            let e = s.keep(s.mask(u32::from(bits)), e);
+            sum = sum + e;
+            s.store_lanes(e, y.add(whole), bits);
+        }
+    }
+    sum
+}
+
+/// `row` times `by`.
+#[inline(always)]
+fn times<S: Simd>(s: S, row: &mut [f32], by: f32) {
+    let (vectors, rest) = row.as_chunks_mut();
+    let factor = s.splat(by);
+    for v in vectors {
+        s.store(s.load(v) * factor, v);
+    }
+    rest.iter_mut().for_each(
+        #[inline(always)]
+        |v| *v *= by,
+    );
+}
+
+/// Softmax of every row of `x` `[rows, n]`, new memory.
+pub fn softmax(n: usize, x: &[f32]) -> Vec<f32> {
+    let chunk = CHUNK.div_ceil(n.max(1)) * n.max(1);
+    let mut fresh = Fresh::new(x.len());
+    fresh.blocks(chunk).zip(x.par_chunks(chunk)).for_each(|(y, x)| {
+        Tier::best().run(Softmax { n, x, y });
+    });
+    // SAFETY: the loop above wrote every block.
+    unsafe { fresh.finish() }
+}
+
+struct Softmax<'a> {
+    n: usize,
+    x: &'a [f32],
+    y: &'a mut Block<f32>,
+}
+
+impl Kernel for Softmax<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        let Self { n, x, y } = self;
+        assert_eq!(x.len(), y.len(), "softmax: lengths");
+        // Pass by pass over some rows, which stay in the first-level cache: within one
+        // each step waits for the last.
+        let few = (SUM / n).clamp(1, LANES) * n;
+        for (x, y) in x.chunks(few).zip(y.chunks_mut(few)) {
+            let mut tops = [s.splat(0.0); LANES];
+            for (x, top) in x.chunks_exact(n).zip(&mut tops) {
+                *top = largest(s, x);
+            }
+            let mut kept = [0.0; LANES];
+            s.store(across(s, tops), &mut kept);
+            let rows = x.chunks_exact(n).zip(y.chunks_exact_mut(n));
+            if n <= SUM {
+                let mut sums = [s.splat(1.0); LANES];
+                for ((x, y), (sum, max)) in rows.zip(sums.iter_mut().zip(kept)) {
+                    let max = s.splat(max);
+                    // SAFETY: n numbers and n places apart from them.
+                    *sum = unsafe { exp_part(s, x.as_ptr(), y.as_mut_ptr(), n, max) };
+                }
+                kept = s.sums(sums);
+            } else {
+                for ((x, y), kept) in rows.zip(&mut kept) {
+                    // SAFETY: as above.
+                    *kept = unsafe { exps(s, x.as_ptr(), y.as_mut_ptr(), n, *kept) };
+                }
+            }
+            let mut inverses = [0.0; LANES];
+            s.store(s.splat(1.0) / s.load(&kept), &mut inverses);
+            for (y, inverse) in y.chunks_exact_mut(n).zip(inverses) {
+                // SAFETY: written by the loops above.
+                times(s, unsafe { &mut *(y as *mut Block<f32> as *mut [f32]) }, inverse);
+            }
+        }
+    }
+}
+
+/// dx = y·(dy − Σ y·dy) row by row, y the softmax.
+pub fn backward(n: usize, y: &[f32], dy: &[f32], dx: &mut [f32]) {
+    let chunk = CHUNK.div_ceil(n.max(1)) * n.max(1);
+    let rows = y.par_chunks(chunk).zip(dy.par_chunks(chunk));
+    rows.zip(dx.par_chunks_mut(chunk)).for_each(|((y, dy), dx)| {
+        vectorised(
+            #[inline(always)]
+            || {
+                let pairs = y.chunks_exact(n).zip(dy.chunks_exact(n));
+                for ((y, dy), dx) in pairs.zip(dx.chunks_exact_mut(n)) {
+                    let mean = super::math::dot(y, dy);
+                    for ((dx, y), dy) in dx.iter_mut().zip(y).zip(dy) {
+                        *dx = y * (dy - mean);
+                    }
+                }
+            },
+        );
+    });
+}
