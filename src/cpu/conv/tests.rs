@@ -87,6 +87,8 @@ fn cases() -> Vec<Sizes> {
         flat(2, 3, [5, 5], 3, 4, [2, 3]),
         flat(1, 1, [3, 3], 1, 1, [33, 40]),
         flat(5, 17, [5, 5], 2, 2, [20, 33]),
+        // Three narrow passes of some rows each, the last ones fewer.
+        flat(3, 23, [5, 5], 2, 2, [76, 65]),
         flat(4, 50, [3, 3], 1, 1, [16, 16]),
         flat(21, 110, [3, 3], 2, 1, [13, 10]),
         flat(2, 100, [3, 3], 1, 1, [5, 20]),

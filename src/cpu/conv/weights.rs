@@ -2,8 +2,9 @@
 //!
 //! Wide: vectors hold output channels (∂L/∂y turned over, 48 channels of some 128
 //! outputs in the first-level cache), rows are (channel, tap) of x, read as scalars
-//! where they lie. Narrow, for at most eight output channels: vectors hold
-//! neighbouring outputs, and lanes are added at the end.
+//! where they lie. Narrow, for at most eight output channels, or three times as many that
+//! would leave half of a vector empty: vectors hold neighbouring outputs, and lanes are
+//! added at the end.
 
 use super::plan::{Axes, Layout, Pack, Plan, Sizes, starts};
 use super::pointwise;
@@ -28,8 +29,10 @@ const CHUNK: usize = 128;
 const DEPTH: usize = 144;
 /// Jobs of a call, where it can be cut into as many.
 const JOBS: usize = 16;
-/// Output channels up to which vectors hold outputs.
+/// Output channels of a pass whose vectors hold outputs.
 const NARROW: usize = 8;
+/// Floats of ∂L/∂y of such a pass, which stay in a first-level cache.
+const NARROW_FLOATS: usize = 6144;
 /// Floats past a packed tile's end that may be read and not used.
 const SLACK: usize = 2 * LANES;
 
@@ -173,17 +176,22 @@ enum Way {
 
 impl Way {
     fn of(plan: &Plan, outputs: usize) -> Self {
-        match outputs {
-            0..=NARROW => Self::Narrow,
-            _ if winograd::tiles_of(plan) < winograd_weights::LEAST => Self::Wide,
-            _ => winograd::Way::of(plan).map_or(Self::Wide, Self::Winograd),
+        let plain = match outputs {
+            0..=NARROW => return Self::Narrow,
+            17..=24 => Self::Narrow,
+            _ => Self::Wide,
+        };
+        if winograd::tiles_of(plan) < winograd_weights::LEAST {
+            return plain;
         }
+        winograd::Way::of(plan).map_or(plain, Self::Winograd)
     }
 
     /// Floats of one row of sums of so many outputs.
     fn pitch(self, outputs: usize) -> usize {
         match self {
-            Self::Narrow => outputs.next_power_of_two(),
+            Self::Narrow if outputs < NARROW => outputs.next_power_of_two(),
+            Self::Narrow => outputs.next_multiple_of(NARROW),
             Self::Wide | Self::Winograd(_) => outputs.next_multiple_of(LANES),
         }
     }
@@ -456,37 +464,44 @@ impl Kernel for Narrow<'_, '_> {
         let (work, layout) = (self.work, self.work.layout);
         let [depth, height, width] = work.inside(self.start);
         let offsets = work.offsets();
-        let pitch = work.pitch;
-        let length = layout.flat().next_multiple_of(LANES);
-        let row_pitch = work.plan.dst_size[2];
-        let packed = self.turned.room(pitch * length);
-        packed.fill(0.0);
+        let (row_pitch, x_pitch) = (work.plan.dst_size[2], layout.pitch());
+        let pass = NARROW.min(work.pitch);
+        let rows = (NARROW_FLOATS / (pass * x_pitch)).clamp(1, height);
         let farthest = offsets.iter().max().copied().unwrap_or(0);
-        for d in 0..depth {
-            // Zeros wherever the tile has no output.
-            for (output, plane) in work.outputs.clone().zip(packed.chunks_exact_mut(length)) {
-                let at = work.dy_at(output, self.start, d);
-                for r in 0..height {
-                    let from = &self.dy[at + r * row_pitch..][..width];
-                    plane[r * layout.pitch()..][..width].copy_from_slice(from);
-                }
-            }
-            let x = &self.x[d * layout.depth()..];
+        for (d, top) in (0..depth).flat_map(|d| (0..height).step_by(rows).map(move |r| (d, r))) {
+            let count = rows.min(height - top);
+            let length = ((count - 1) * x_pitch + width).next_multiple_of(LANES);
+            let x = &self.x[d * layout.depth() + top * x_pitch..];
             assert!(farthest + length <= x.len());
-            let dots = Dots { x, dy: packed, length };
-            if S::REGISTERS >= 32 {
-                match pitch {
-                    8 => dots.run::<S, 8, 3>(s, &offsets, self.sums),
-                    4 => dots.run::<S, 4, 6>(s, &offsets, self.sums),
-                    2 => dots.run::<S, 2, 8>(s, &offsets, self.sums),
-                    _ => dots.run::<S, 1, 12>(s, &offsets, self.sums),
+            let packed = self.turned.room(pass * length);
+            for first in (0..work.pitch).step_by(NARROW) {
+                // Zeros wherever the tile has no output.
+                packed.fill(0.0);
+                let outputs = work.outputs.clone().skip(first);
+                for (output, plane) in outputs.zip(packed.chunks_exact_mut(length)) {
+                    let at = work.dy_at(output, self.start, d) + top * row_pitch;
+                    for r in 0..count {
+                        let from = &self.dy[at + r * row_pitch..][..width];
+                        plane[r * x_pitch..][..width].copy_from_slice(from);
+                    }
                 }
-            } else {
-                match pitch {
-                    8 => dots.run::<S, 8, 1>(s, &offsets, self.sums),
-                    4 => dots.run::<S, 4, 1>(s, &offsets, self.sums),
-                    2 => dots.run::<S, 2, 2>(s, &offsets, self.sums),
-                    _ => dots.run::<S, 1, 4>(s, &offsets, self.sums),
+                let (dy, rows, pitch) = (&*packed, work.rows, work.pitch);
+                let dots = Dots { x, dy, length, offsets: &offsets, rows, pitch };
+                let sums = &mut self.sums[first..];
+                if S::REGISTERS >= 32 {
+                    match pass {
+                        8 => dots.run::<S, 8, 3>(s, 0, sums),
+                        4 => dots.run::<S, 4, 6>(s, 0, sums),
+                        2 => dots.run::<S, 2, 8>(s, 0, sums),
+                        _ => dots.run::<S, 1, 12>(s, 0, sums),
+                    }
+                } else if pass == 1 {
+                    dots.run::<S, 1, 4>(s, 0, sums);
+                } else {
+                    (0..pass).step_by(2).for_each(
+                        #[inline(always)]
+                        |first| dots.run::<S, 2, 2>(s, first, sums),
+                    );
                 }
             }
         }
@@ -498,40 +513,42 @@ struct Dots<'a> {
     x: &'a [f32],
     dy: &'a [f32],
     length: usize,
+    /// Where each row of sums reads, and some rows too many.
+    offsets: &'a [usize],
+    rows: usize,
+    /// Floats of a row of sums.
+    pitch: usize,
 }
 
 impl Dots<'_> {
-    /// Adds to `[rows][M]` sums, `T` rows at a time.
+    /// Adds to the sums of outputs `first..first + M`, `T` rows at a time.
     #[inline(always)]
-    fn run<S: Simd, const M: usize, const T: usize>(
-        &self,
-        s: S,
-        offsets: &[usize],
-        sums: &mut [f32],
-    ) {
-        assert!(self.dy.len() >= M * self.length);
-        for (offsets, sums) in offsets.chunks_exact(T).zip(sums.chunks_exact_mut(M * T)) {
+    fn run<S: Simd, const M: usize, const T: usize>(&self, s: S, first: usize, sums: &mut [f32]) {
+        assert!(self.dy.len() >= (first + M) * self.length);
+        let dy = self.dy.as_ptr().wrapping_add(first * self.length);
+        let offsets = self.offsets[..self.rows.next_multiple_of(T)].chunks_exact(T);
+        for (offsets, sums) in offsets.zip(sums.chunks_mut(T * self.pitch)) {
             let mut acc = [[s.splat(0.0); M]; T];
             for at in (0..self.length).step_by(LANES) {
-                let mut dy = [s.splat(0.0); M];
-                for m in 0..M {
-                    let from = self.dy.as_ptr().wrapping_add(m * self.length + at);
-                    // SAFETY: M·length floats (asserted above), length whole vectors.
-                    dy[m] = s.load(unsafe { &*from.cast() });
-                }
+                let mut x = [s.splat(0.0); T];
                 for t in 0..T {
                     let from = self.x.as_ptr().wrapping_add(offsets[t] + at);
                     // SAFETY: the farthest row ends inside x (asserted by `run`).
-                    let x = s.load(unsafe { &*from.cast() });
-                    for m in 0..M {
-                        acc[t][m] = s.fma(x, dy[m], acc[t][m]);
+                    x[t] = s.load(unsafe { &*from.cast() });
+                }
+                for m in 0..M {
+                    let from = dy.wrapping_add(m * self.length + at);
+                    // SAFETY: as many outputs (asserted above) of whole vectors.
+                    let v = s.load(unsafe { &*from.cast() });
+                    for t in 0..T {
+                        acc[t][m] = s.fma(x[t], v, acc[t][m]);
                     }
                 }
             }
             for t in 0..T {
                 let added = s.sums(acc[t]);
                 for m in 0..M {
-                    sums[t * M + m] += added[m];
+                    sums[t * self.pitch + first + m] += added[m];
                 }
             }
         }
