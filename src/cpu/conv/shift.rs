@@ -13,6 +13,8 @@ use std::mem::MaybeUninit;
 pub(super) const ROWS: usize = 8;
 /// Pieces of work that a call is cut into at least, where it can be.
 const JOBS: usize = 16;
+/// Least vectors of a register tile that hide how long one sum takes.
+const DIRECT: usize = 10;
 /// Floats past a packed tile's end that a strip may read and not use.
 const SLACK: usize = 16 * LANES;
 
@@ -153,7 +155,7 @@ impl Kernel for Job<'_> {
             // Rows of whole vectors need no detour, if they fill a register tile.
             let direct = plan.dst_step == [1; 3]
                 && columns.is_multiple_of(LANES)
-                && block.rows * (columns / LANES) >= 2 * ROWS
+                && block.rows * (columns / LANES) >= DIRECT
                 && block.rows > ROWS / 2;
             for d in 0..depths {
                 let strip = Strip {

@@ -272,6 +272,31 @@ fn pictures_do_not_mix() {
     }
 }
 
+/// Weights have the sum of the gradients that single pictures give, however many share a
+/// block of tiles.
+#[test]
+fn gradients_of_pictures_add_up() {
+    for s in [
+        flat(24, 30, [3, 3], 1, 1, [13, 18]),
+        flat(25, 26, [3, 3], 2, 1, [8, 66]),
+        flat(24, 26, [3, 3], 1, 1, [4, 3]),
+        Sizes { size: [3, 5, 9], ..flat(24, 25, [3, 3], 1, 1, [5, 9]) },
+    ] {
+        let [one, out] = [s.in_channels * s.in_pixels(), s.out_channels * s.out_pixels()];
+        let [x, dy] = [noise(17 * one, 13), noise(17 * out, 14)];
+        let mut together = vec![f32::NAN; s.out_channels * s.in_channels * s.taps()];
+        weight_grad(Tier::best(), &s, &x, &dy, &mut together);
+        let mut sum = vec![0.0; together.len()];
+        for (x, dy) in x.chunks(one).zip(dy.chunks(out)) {
+            let mut dw = together.clone();
+            weight_grad(Tier::best(), &s, x, dy, &mut dw);
+            sum.iter_mut().zip(dw).for_each(|(sum, v)| *sum += f64::from(v));
+        }
+        let worst = worst(&together, &sum, ((17 * s.out_pixels()) as f64).sqrt());
+        assert!(worst < WINOGRAD, "{s:?}: {worst:e}");
+    }
+}
+
 #[test]
 fn empty_calls_are_harmless() {
     let s = flat(0, 3, [3, 3], 1, 1, [4, 4]);

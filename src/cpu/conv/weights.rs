@@ -49,8 +49,8 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
     if pointwise::suits(&plan) && o > NARROW {
         return pointwise::weight_grad(tier, &plan, x, dy, dw);
     }
-    let way = Way::of(&plan, o);
     let tiles = images * winograd::tiles_of(&plan);
+    let way = Way::of(&plan, o, tiles);
     let (outputs, channels) = match way {
         Way::Narrow => (o, even(c, (c * taps).div_ceil(DEPTH))),
         Way::Wide => {
@@ -69,7 +69,12 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
     };
     let layout = plan.layout(tile);
     let starts = starts(plan.grid(), tile);
-    let units = images * starts.len();
+    // Pictures of a unit.
+    let together = match way {
+        Way::Winograd(_) => winograd_weights::together(&plan),
+        _ => 1,
+    };
+    let units = images.div_ceil(together) * starts.len();
     let groups = match way {
         Way::Winograd(_) => winograd_weights::groups(tiles),
         _ => JOBS.div_ceil(parts.len()).min(units),
@@ -91,10 +96,11 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
         let (first, channel) = parts[part];
         let work = work((first, channel));
         let unit = |unit: usize| {
-            let (image, start) = (unit / starts.len(), starts[unit % starts.len()]);
-            let x = &x[image * in_image..][..in_image];
-            let x = &x[channel * s.in_pixels()..][..work.rows / taps * s.in_pixels()];
-            (x, &dy[image * out_image..][..out_image], start)
+            let (first, start) = (unit / starts.len() * together, starts[unit % starts.len()]);
+            let count = together.min(images - first);
+            let x = &x[first * in_image + channel * s.in_pixels()..];
+            let x = &x[..(count - 1) * in_image + work.rows / taps * s.in_pixels()];
+            (x, &dy[first * out_image..][..count * out_image], start)
         };
         let units = (units * group / groups..units * (group + 1) / groups).map(unit);
         Buffers::with(|buffers| way.sums(tier, &work, units, buffers, sums));
@@ -175,13 +181,13 @@ enum Way {
 }
 
 impl Way {
-    fn of(plan: &Plan, outputs: usize) -> Self {
+    fn of(plan: &Plan, outputs: usize, tiles: usize) -> Self {
         let plain = match outputs {
             0..=NARROW => return Self::Narrow,
             17..=24 => Self::Narrow,
             _ => Self::Wide,
         };
-        if winograd::tiles_of(plan) < winograd_weights::LEAST {
+        if tiles < winograd_weights::LEAST {
             return plain;
         }
         winograd::Way::of(plan).map_or(plain, Self::Winograd)
@@ -196,8 +202,8 @@ impl Way {
         }
     }
 
-    /// Adds the sums of one job over `units` to `sums`, which is zero: channels of x, ∂L/∂y
-    /// of the same picture, and the first output of a tile.
+    /// Adds the sums of one job over `units` to `sums`, which is zero: x from the job's
+    /// channels on, ∂L/∂y of the same pictures, and the first output of a tile.
     fn sums<'a>(
         self,
         tier: Tier,

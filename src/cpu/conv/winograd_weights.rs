@@ -9,7 +9,7 @@ use super::forms::{Adjoint, Down, Form, GROUPS, Places, TILE, Unit, WEIGHTS, put
 use super::gather::{Gather, Tiles};
 use super::plan::{Axes, Plan};
 use super::weights::{LANES_WIDE, ROWS, Tile, Work};
-use super::winograd::Way;
+use super::winograd::{self, Way};
 use crate::cpu::simd::{Kernel, LANES, Simd};
 use std::ops::Range;
 
@@ -27,8 +27,13 @@ pub(super) fn tile(plan: &Plan) -> Axes {
     [1, (VECTORS * LANES / across).clamp(1, height) * TILE, across * TILE]
 }
 
-/// Least tiles of a picture for which it wins.
-pub(super) const LEAST: usize = 4;
+/// Pictures whose tiles make one block, where all of a picture's do.
+pub(super) fn together(plan: &Plan) -> usize {
+    (VECTORS * LANES / winograd::tiles_of(plan)).max(1)
+}
+
+/// Least tiles for which it wins.
+pub(super) const LEAST: usize = 8;
 /// Tiles of a group at least, since its products are to be transformed at the end.
 const TILES: usize = 256;
 /// Most groups.
@@ -72,8 +77,9 @@ pub(super) struct Products<'a, 'b> {
     pub way: Way,
     /// [`Way::reader`] of the work's plan.
     pub reader: &'a Plan,
-    /// The job's channels of one picture.
+    /// From the job's first channel of a picture to its last, of the last picture.
     pub x: &'a [f32],
+    /// Of the same pictures.
     pub dy: &'a [f32],
     pub start: Axes,
     /// Of the job: `products` holds nothing yet.
@@ -104,16 +110,20 @@ impl Products<'_, '_> {
         let work = self.work;
         let inside = work.inside(self.start);
         let [_, down, across] = inside.map(|n| n.div_ceil(TILE));
-        let (count, channels) = (down * across, work.rows / 9);
-        let block = Tiles { count, across, picture: count };
+        let pixels = |size: Axes| size.into_iter().product::<usize>();
+        let (x_pixels, dy_pixels) = (pixels(work.plan.src_size), pixels(work.plan.dst_size));
+        let dy_apart = work.plan.dst_channels * dy_pixels;
+        let (picture, channels) = (down * across, work.rows / 9);
+        let count = self.dy.len() / dy_apart * picture;
+        let block = Tiles { count, across, picture };
         let (length, lanes) = (block.length(), block.lanes());
-        let gather =
-            Gather::new::<F, IN, POINTS, TILE>(self.reader, block, self.start, self.x.len());
+        let apart = work.plan.src_channels * x_pixels;
+        let gather = Gather::new::<F, IN, POINTS, TILE>(self.reader, block, self.start, apart);
         let sources = Places::new(POINTS, channels, length, LANES);
         let Buffers { x: patch, tiles, gradients, .. } = self.buffers;
         let tiles = tiles.room(sources.floats);
-        let pixels: usize = work.plan.src_size.iter().product();
-        for (c, x) in self.x.chunks_exact(pixels).enumerate() {
+        for c in 0..channels {
+            let x = &self.x[c * x_pixels..];
             gather.channel::<S, F, IN, POINTS, TILE>(s, x, patch, tiles, (&sources, c));
         }
         let mut products = self.products;
@@ -130,9 +140,11 @@ impl Products<'_, '_> {
                 // Of lanes without a tile.
                 gradients.fill(0.0);
             }
-            let part = Spread { work: &part, dy: self.dy, start: self.start, inside, block };
-            for row in 0..down {
-                part.row::<S, F, POINTS>(s, row, &outward, gradients);
+            for (first, dy) in (0..count).step_by(picture).zip(self.dy.chunks_exact(dy_apart)) {
+                let part = Spread { work: &part, dy, start: self.start, inside, block, first };
+                for row in 0..down {
+                    part.row::<S, F, POINTS>(s, row, &outward, gradients);
+                }
             }
             for i in 0..GROUPS {
                 let ((at, step), (from, floats)) = (sources.groups[i], outward.groups[i]);
@@ -157,7 +169,7 @@ impl Products<'_, '_> {
     }
 }
 
-/// Z of a block of tiles.
+/// Z of a block of tiles, for one picture.
 struct Spread<'a, 'b> {
     work: &'a Work<'b>,
     dy: &'a [f32],
@@ -165,6 +177,8 @@ struct Spread<'a, 'b> {
     /// Outputs of the block that there are.
     inside: Axes,
     block: Tiles,
+    /// The picture's first tile.
+    first: usize,
 }
 
 impl Spread<'_, '_> {
@@ -213,7 +227,7 @@ impl Spread<'_, '_> {
                         let four = [d[t * TILE], d[t * TILE + 1], d[t * TILE + 2], d[t * TILE + 3]];
                         put(&mut rows[r], F::spread(s, four));
                     }
-                    let lane = self.block.lane(row * across + left / TILE + t);
+                    let lane = self.block.lane(self.first + row * across + left / TILE + t);
                     let vectors = places.vectors(0, lane * pitch + v);
                     for j in 0..POINTS {
                         let column = F::spread(s, [rows[0][j], rows[1][j], rows[2][j], rows[3][j]]);
