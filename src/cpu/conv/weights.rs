@@ -32,7 +32,7 @@ const JOBS: usize = 16;
 /// Output channels of a pass whose vectors hold outputs.
 const NARROW: usize = 8;
 /// Floats of ∂L/∂y of such a pass, which stay in a first-level cache.
-const NARROW_FLOATS: usize = 6144;
+const NARROW_FLOATS: usize = 8192;
 /// Floats past a packed tile's end that may be read and not used.
 const SLACK: usize = 2 * LANES;
 
@@ -472,27 +472,36 @@ impl Kernel for Narrow<'_, '_> {
         let offsets = work.offsets();
         let (row_pitch, x_pitch) = (work.plan.dst_size[2], layout.pitch());
         let pass = NARROW.min(work.pitch);
-        let rows = (NARROW_FLOATS / (pass * x_pitch)).clamp(1, height);
+        let rows = (NARROW_FLOATS / (pass * width)).clamp(1, height);
         let farthest = offsets.iter().max().copied().unwrap_or(0);
         for (d, top) in (0..depth).flat_map(|d| (0..height).step_by(rows).map(move |r| (d, r))) {
             let count = rows.min(height - top);
-            let length = ((count - 1) * x_pitch + width).next_multiple_of(LANES);
+            // Rows of whole vectors lie close, others as far apart as those of x.
+            let (lines, line, apart) = match width.is_multiple_of(LANES) {
+                true => (count, width, width),
+                false => (1, ((count - 1) * x_pitch + width).next_multiple_of(LANES), x_pitch),
+            };
             let x = &self.x[d * layout.depth() + top * x_pitch..];
-            assert!(farthest + length <= x.len());
-            let packed = self.turned.room(pass * length);
+            assert!(farthest + (lines - 1) * x_pitch + line <= x.len());
+            let packed = self.turned.room(pass * lines * line);
             for first in (0..work.pitch).step_by(NARROW) {
-                // Zeros wherever the tile has no output.
-                packed.fill(0.0);
                 let outputs = work.outputs.clone().skip(first);
-                for (output, plane) in outputs.zip(packed.chunks_exact_mut(length)) {
-                    let at = work.dy_at(output, self.start, d) + top * row_pitch;
-                    for r in 0..count {
-                        let from = &self.dy[at + r * row_pitch..][..width];
-                        plane[r * x_pitch..][..width].copy_from_slice(from);
+                if apart > width || outputs.len() < pass {
+                    // Zeros wherever the tile has no output.
+                    packed.fill(0.0);
+                }
+                for (output, plane) in outputs.zip(packed.chunks_exact_mut(lines * line)) {
+                    let from = &self.dy[work.dy_at(output, self.start, d) + top * row_pitch..];
+                    if [apart, row_pitch] == [width; 2] {
+                        plane.copy_from_slice(&from[..plane.len()]);
+                        continue;
+                    }
+                    for (r, to) in plane.chunks_mut(apart).take(count).enumerate() {
+                        to[..width].copy_from_slice(&from[r * row_pitch..][..width]);
                     }
                 }
                 let (dy, rows, pitch) = (&*packed, work.rows, work.pitch);
-                let dots = Dots { x, dy, length, offsets: &offsets, rows, pitch };
+                let dots = Dots { x, x_pitch, dy, lines, line, offsets: &offsets, rows, pitch };
                 let sums = &mut self.sums[first..];
                 if S::REGISTERS >= 32 {
                     match pass {
@@ -514,11 +523,13 @@ impl Kernel for Narrow<'_, '_> {
     }
 }
 
-/// Gradients `[outputs][length]` and a packed tile.
+/// Gradients `[outputs][lines][line]` and a packed tile, whose lines are `x_pitch` apart.
 struct Dots<'a> {
     x: &'a [f32],
+    x_pitch: usize,
     dy: &'a [f32],
-    length: usize,
+    lines: usize,
+    line: usize,
     /// Where each row of sums reads, and some rows too many.
     offsets: &'a [usize],
     rows: usize,
@@ -530,26 +541,32 @@ impl Dots<'_> {
     /// Adds to the sums of outputs `first..first + M`, `T` rows at a time.
     #[inline(always)]
     fn run<S: Simd, const M: usize, const T: usize>(&self, s: S, first: usize, sums: &mut [f32]) {
-        assert!(self.dy.len() >= (first + M) * self.length);
-        let dy = self.dy.as_ptr().wrapping_add(first * self.length);
+        let length = self.lines * self.line;
+        assert!(self.dy.len() >= (first + M) * length);
         let offsets = self.offsets[..self.rows.next_multiple_of(T)].chunks_exact(T);
         for (offsets, sums) in offsets.zip(sums.chunks_mut(T * self.pitch)) {
             let mut acc = [[s.splat(0.0); M]; T];
-            for at in (0..self.length).step_by(LANES) {
-                let mut x = [s.splat(0.0); T];
-                for t in 0..T {
-                    let from = self.x.as_ptr().wrapping_add(offsets[t] + at);
-                    // SAFETY: the farthest row ends inside x (asserted by `run`).
-                    x[t] = s.load(unsafe { &*from.cast() });
-                }
-                for m in 0..M {
-                    let from = dy.wrapping_add(m * self.length + at);
-                    // SAFETY: as many outputs (asserted above) of whole vectors.
-                    let v = s.load(unsafe { &*from.cast() });
+            let mut x_line = self.x.as_ptr();
+            let mut dy = self.dy.as_ptr().wrapping_add(first * length);
+            for _ in 0..self.lines {
+                for at in (0..self.line).step_by(LANES) {
+                    let mut x = [s.splat(0.0); T];
                     for t in 0..T {
-                        acc[t][m] = s.fma(x[t], v, acc[t][m]);
+                        let from = x_line.wrapping_add(offsets[t] + at);
+                        // SAFETY: the farthest row ends inside x (asserted by `run`).
+                        x[t] = s.load(unsafe { &*from.cast() });
                     }
+                    for m in 0..M {
+                        let from = dy.wrapping_add(m * length);
+                        // SAFETY: as many outputs (asserted above) of whole vectors.
+                        let v = s.load(unsafe { &*from.cast() });
+                        for t in 0..T {
+                            acc[t][m] = s.fma(x[t], v, acc[t][m]);
+                        }
+                    }
+                    dy = dy.wrapping_add(LANES);
                 }
+                x_line = x_line.wrapping_add(self.x_pitch);
             }
             for t in 0..T {
                 let added = s.sums(acc[t]);
