@@ -311,10 +311,13 @@ impl Kernel for Wide<'_, '_> {
                 let x = &self.x[d * layout.depth() + first * layout.pitch()..];
                 turn(s, work, self.dy, (self.start, d, first), [count, width], turned);
                 let tile = Tile { x, x_pitch: layout.pitch(), dy: turned, pitch, count, width };
-                for (offsets, sums) in
-                    offsets.as_chunks().0.iter().zip(self.sums.chunks_exact_mut(ROWS * pitch))
-                {
-                    tile.rows(s, offsets, true, sums);
+                let sums = self.sums.chunks_exact_mut(ROWS * pitch);
+                for (i, (offsets, sums)) in offsets.as_chunks().0.iter().zip(sums).enumerate() {
+                    if work.rows - i * ROWS > ROWS / 2 {
+                        tile.rows(s, offsets, true, sums);
+                    } else {
+                        tile.half(s, offsets, sums);
+                    }
                 }
             }
         }
@@ -391,10 +394,7 @@ impl Tile<'_> {
     /// `[ROWS][pitch]` sums, added to those that are there with `add`.
     #[inline(always)]
     pub fn rows<S: Simd>(&self, s: S, offsets: &[usize; ROWS], add: bool, sums: &mut [f32]) {
-        let farthest = offsets.iter().max().copied().unwrap_or(0) + self.width;
-        assert!(farthest + self.count.saturating_sub(1) * self.x_pitch <= self.x.len());
-        assert!(self.dy.len() >= self.count * self.width * self.pitch);
-        assert!(sums.len() >= ROWS * self.pitch);
+        self.check(offsets, sums);
         if S::REGISTERS >= 32 {
             match self.pitch / LANES {
                 3 => self.block::<S, 8, 3>(s, offsets, [0, 0], add, sums),
@@ -407,6 +407,32 @@ impl Tile<'_> {
                 self.block::<S, 4, 1>(s, offsets, [4, v], add, sums);
             }
         }
+    }
+
+    /// Adds `[ROWS / 2][pitch]` sums: what is left over.
+    #[inline(always)]
+    fn half<S: Simd>(&self, s: S, offsets: &[usize; ROWS], sums: &mut [f32]) {
+        self.check(offsets, sums);
+        if S::REGISTERS >= 32 {
+            match self.pitch / LANES {
+                3 => self.block::<S, 4, 3>(s, offsets, [0, 0], true, sums),
+                2 => self.block::<S, 4, 2>(s, offsets, [0, 0], true, sums),
+                _ => self.block::<S, 4, 1>(s, offsets, [0, 0], true, sums),
+            }
+        } else {
+            for v in (0..self.pitch).step_by(LANES) {
+                self.block::<S, 4, 1>(s, offsets, [0, v], true, sums);
+            }
+        }
+    }
+
+    /// That every place which [`Tile::block`] reads or writes is there.
+    #[inline(always)]
+    fn check(&self, offsets: &[usize; ROWS], sums: &[f32]) {
+        let farthest = offsets.iter().max().copied().unwrap_or(0) + self.width;
+        assert!(farthest + self.count.saturating_sub(1) * self.x_pitch <= self.x.len());
+        assert!(self.dy.len() >= self.count * self.width * self.pitch);
+        assert!(sums.len() >= ROWS * self.pitch);
     }
 
     /// `M` rows from `first` × `N` vectors from channel `from`.
@@ -429,11 +455,11 @@ impl Tile<'_> {
             for i in 0..self.width {
                 let mut v = [s.splat(0.0); N];
                 for n in 0..N {
-                    // SAFETY: count·width·pitch floats (asserted by `rows`).
+                    // SAFETY: count·width·pitch floats (`check`).
                     v[n] = s.load(unsafe { &*dy.wrapping_add(n * LANES).cast() });
                 }
                 for m in 0..M {
-                    // SAFETY: the farthest row ends inside x (asserted by `rows`).
+                    // SAFETY: the farthest row ends inside x (`check`).
                     let x = s.splat(unsafe { *x[m].wrapping_add(i) });
                     for n in 0..N {
                         acc[m][n] = s.fma(x, v[n], acc[m][n]);
