@@ -179,13 +179,14 @@ impl<'a> Gather<'a> {
     }
 
     /// Reads the tiles of a channel that begins with `x` and writes them, transformed,
-    /// to channel `c` of `tiles`. `patch` holds the packed copy.
+    /// to channel `c` of `tiles`. `patch` holds the packed copy, `rows` those of tiles.
     #[inline(always)]
     pub fn channel<S, F, const IN: usize, const POINTS: usize, const OUT: usize>(
         &self,
         s: S,
         x: &[f32],
         patch: &mut Buffer,
+        rows: &mut [[S::F; POINTS]; IN],
         tiles: &mut [f32],
         (places, c): (&Places, usize),
     ) where
@@ -193,7 +194,6 @@ impl<'a> Gather<'a> {
         F: Form<IN, POINTS, OUT>,
     {
         let x = &x[..self.floats];
-        let mut rows = [[s.splat(0.0); POINTS]; IN];
         let packed = match &self.rows {
             Rows::Lying(vectors) => {
                 for (v, spans) in vectors.iter().enumerate() {
@@ -201,7 +201,7 @@ impl<'a> Gather<'a> {
                         let row = self.row::<S, F, IN, POINTS, OUT>(s, x, spans, r);
                         put(&mut rows[r], F::points(s, row));
                     }
-                    scatter::<S, F, IN, POINTS, OUT>(s, &rows, tiles, places, [c, v * LANES]);
+                    scatter::<S, F, IN, POINTS, OUT>(s, rows, tiles, places, [c, v * LANES]);
                 }
                 return;
             }
@@ -227,7 +227,7 @@ impl<'a> Gather<'a> {
                 }
                 put(&mut rows[r], F::points(s, row));
             }
-            scatter::<S, F, IN, POINTS, OUT>(s, &rows, tiles, places, [c, v * LANES]);
+            scatter::<S, F, IN, POINTS, OUT>(s, rows, tiles, places, [c, v * LANES]);
         }
     }
 

@@ -401,18 +401,19 @@ impl Kernel for Pack<'_> {
                 let past = (width as isize - left).max(0).unsigned_abs().div_ceil(step);
                 let past = past.clamp(begin, layout.pitch());
                 let from = (left + (begin * step) as isize).max(0).unsigned_abs();
-                for (i, row) in plane.chunks_exact_mut(layout.pitch()).enumerate() {
-                    let d = place(0, i / layout.rows[1], phase[0]);
-                    let h = place(1, i % layout.rows[1], phase[1]);
-                    let (Some(d), Some(h)) = (d, h) else {
-                        row.fill(0.0);
-                        continue;
-                    };
-                    row[..begin].fill(0.0);
-                    row[past..].fill(0.0);
-                    if past > begin {
-                        let src = &x[(d * height + h) * width..][from..width];
-                        pick(s, src, step, &mut row[begin..past]);
+                for (i, slice) in plane.chunks_exact_mut(layout.depth()).enumerate() {
+                    let d = place(0, i, phase[0]);
+                    for (i, row) in slice.chunks_exact_mut(layout.pitch()).enumerate() {
+                        let (Some(d), Some(h)) = (d, place(1, i, phase[1])) else {
+                            row.fill(0.0);
+                            continue;
+                        };
+                        row[..begin].fill(0.0);
+                        row[past..].fill(0.0);
+                        if past > begin {
+                            let src = &x[(d * height + h) * width..][from..width];
+                            pick(s, src, step, &mut row[begin..past]);
+                        }
                     }
                 }
             }

@@ -503,7 +503,8 @@ impl Kernel for Narrow<'_, '_> {
         for (d, top) in (0..depth).flat_map(|d| (0..height).step_by(rows).map(move |r| (d, r))) {
             let count = rows.min(height - top);
             // Rows of whole vectors lie close, others as far apart as those of x.
-            let (lines, line, apart) = match width.is_multiple_of(LANES) {
+            let whole = width.is_multiple_of(LANES);
+            let (lines, line, apart) = match whole {
                 true => (count, width, width),
                 false => (1, ((count - 1) * x_pitch + width).next_multiple_of(LANES), x_pitch),
             };
@@ -512,13 +513,13 @@ impl Kernel for Narrow<'_, '_> {
             let packed = self.turned.room(pass * lines * line);
             for first in (0..work.pitch).step_by(NARROW) {
                 let outputs = work.outputs.clone().skip(first);
-                if apart > width || outputs.len() < pass {
+                if !whole || outputs.len() < pass {
                     // Zeros wherever the tile has no output.
                     packed.fill(0.0);
                 }
                 for (output, plane) in outputs.zip(packed.chunks_exact_mut(lines * line)) {
                     let from = &self.dy[work.dy_at(output, self.start, d) + top * row_pitch..];
-                    if [apart, row_pitch] == [width; 2] {
+                    if whole && row_pitch == width {
                         plane.copy_from_slice(&from[..plane.len()]);
                         continue;
                     }

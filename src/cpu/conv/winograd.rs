@@ -327,8 +327,9 @@ where
         let pixels: usize = plan.src_size.iter().product();
         let channels = plan.src_channels;
         let picture = &x[self.image * channels * pixels..][..channels * pixels];
+        let rows = &mut [[s.splat(0.0); POINTS]; IN];
         for (c, x) in picture.chunks_exact(pixels).enumerate() {
-            gather.channel::<S, F, IN, POINTS, OUT>(s, x, patch, tiles, (&sources, c));
+            gather.channel::<S, F, IN, POINTS, OUT>(s, x, patch, rows, tiles, (&sources, c));
         }
         let to = Outputs::new::<OUT>(plan, y, block, self.image, self.start);
         let panels = w.data.chunks_exact(GROUPS * group_step(channels));

@@ -94,7 +94,8 @@ where
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
         let Self { gather, own, x, buffers, tiles, .. } = self;
-        gather.channel::<S, F, IN, POINTS, OUT>(s, x, &mut buffers.x, tiles, (own, 0));
+        let (patch, rows) = (&mut buffers.x, &mut [[s.splat(0.0); POINTS]; IN]);
+        gather.channel::<S, F, IN, POINTS, OUT>(s, x, patch, rows, tiles, (own, 0));
     }
 }
 

@@ -122,10 +122,13 @@ impl Products<'_, '_> {
         let sources = Places::new(POINTS, channels, length, LANES);
         let Buffers { x: patch, tiles, gradients, .. } = self.buffers;
         let tiles = tiles.room(sources.floats);
+        let rows = &mut [[s.splat(0.0); POINTS]; IN];
         for c in 0..channels {
             let x = &self.x[c * x_pixels..];
-            gather.channel::<S, F, IN, POINTS, TILE>(s, x, patch, tiles, (&sources, c));
+            gather.channel::<S, F, IN, POINTS, TILE>(s, x, patch, rows, tiles, (&sources, c));
         }
+        let squares = &mut [[s.splat(0.0); LANES]; TILE];
+        let spread = &mut [[s.splat(0.0); POINTS]; TILE];
         let mut products = self.products;
         let rows = channels.next_multiple_of(ROWS);
         for outputs in blocks(&work.outputs) {
@@ -143,7 +146,7 @@ impl Products<'_, '_> {
             for (first, dy) in (0..count).step_by(picture).zip(self.dy.chunks_exact(dy_apart)) {
                 let part = Spread { work: &part, dy, start: self.start, inside, block, first };
                 for row in 0..down {
-                    part.row::<S, F, POINTS>(s, row, &outward, gradients);
+                    part.row::<S, F, POINTS>(s, row, (squares, spread), &outward, gradients);
                 }
             }
             for i in 0..GROUPS {
@@ -188,6 +191,8 @@ impl Spread<'_, '_> {
         &self,
         s: S,
         row: usize,
+        // Of sixteen columns, lanes being channels; the same transformed along one axis.
+        (d, rows): (&mut [[S::F; LANES]; TILE], &mut [[S::F; POINTS]; TILE]),
         places: &Places,
         out: &mut [f32],
     ) {
@@ -196,9 +201,6 @@ impl Spread<'_, '_> {
         let out = out.as_mut_ptr();
         let [_, height, width] = self.inside;
         let across = width.div_ceil(TILE);
-        // Of sixteen columns, lanes being channels.
-        let mut d = [[s.splat(0.0); LANES]; TILE];
-        let mut rows = [[s.splat(0.0); POINTS]; TILE];
         for v in (0..pitch).step_by(LANES) {
             let lanes = LANES.min(outputs.len().saturating_sub(v));
             for left in (0..width).step_by(LANES) {
