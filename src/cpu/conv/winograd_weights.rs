@@ -201,11 +201,20 @@ impl Spread<'_, '_> {
         let out = out.as_mut_ptr();
         let [_, height, width] = self.inside;
         let across = width.div_ceil(TILE);
+        let channel: usize = plan.dst_size.iter().product();
         for v in (0..pitch).step_by(LANES) {
             let lanes = LANES.min(outputs.len().saturating_sub(v));
             for left in (0..width).step_by(LANES) {
                 let columns = LANES.min(width - left);
                 let bits = u16::MAX >> (LANES - columns);
+                // To what is read next, in whose lines nothing else is near.
+                let next = if left + LANES < width {
+                    LANES
+                } else if v + LANES < pitch {
+                    (LANES * channel).wrapping_sub(left)
+                } else {
+                    (TILE * plan.dst_size[2]).wrapping_sub(v * channel + left)
+                };
                 for r in 0..TILE {
                     let mut m = [s.splat(0.0); LANES];
                     for i in 0..LANES {
@@ -216,8 +225,7 @@ impl Spread<'_, '_> {
                             + (row * TILE + r) * plan.dst_size[2]
                             + left;
                         let from = &self.dy[at..][..columns];
-                        // The next columns, in whose lines nothing else is near.
-                        s.prefetch_early(from.as_ptr().wrapping_add(LANES));
+                        s.prefetch_early(from.as_ptr().wrapping_add(next));
                         // SAFETY: as many are there.
                         m[i] = unsafe { s.load_lanes(from.as_ptr(), bits) };
                     }
