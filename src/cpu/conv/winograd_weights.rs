@@ -127,8 +127,8 @@ impl Products<'_, '_> {
             let x = &self.x[c * x_pixels..];
             gather.channel::<S, F, IN, POINTS, TILE>(s, x, patch, rows, tiles, (&sources, c));
         }
-        let squares = &mut [[s.splat(0.0); LANES]; TILE];
-        let spread = &mut [[s.splat(0.0); POINTS]; TILE];
+        let zero = s.splat(0.0);
+        let scratch = &mut Scratch { d: [[zero; LANES]; TILE], rows: [[zero; POINTS]; TILE] };
         let mut products = self.products;
         let rows = channels.next_multiple_of(ROWS);
         for outputs in blocks(&work.outputs) {
@@ -146,7 +146,7 @@ impl Products<'_, '_> {
             for (first, dy) in (0..count).step_by(picture).zip(self.dy.chunks_exact(dy_apart)) {
                 let part = Spread { work: &part, dy, start: self.start, inside, block, first };
                 for row in 0..down {
-                    part.row::<S, F, POINTS>(s, row, (squares, spread), &outward, gradients);
+                    part.row::<S, F, POINTS>(s, row, scratch, &outward, gradients);
                 }
             }
             for i in 0..GROUPS {
@@ -172,6 +172,14 @@ impl Products<'_, '_> {
     }
 }
 
+/// Vectors that [`Spread::row`] works in, lanes being channels.
+struct Scratch<V, const POINTS: usize> {
+    /// ∂L/∂y of sixteen columns.
+    d: [[V; LANES]; TILE],
+    /// A tile's, transformed along one axis.
+    rows: [[V; POINTS]; TILE],
+}
+
 /// Z of a block of tiles, for one picture.
 struct Spread<'a, 'b> {
     work: &'a Work<'b>,
@@ -191,8 +199,7 @@ impl Spread<'_, '_> {
         &self,
         s: S,
         row: usize,
-        // Of sixteen columns, lanes being channels; the same transformed along one axis.
-        (d, rows): (&mut [[S::F; LANES]; TILE], &mut [[S::F; POINTS]; TILE]),
+        Scratch { d, rows }: &mut Scratch<S::F, POINTS>,
         places: &Places,
         out: &mut [f32],
     ) {
