@@ -87,8 +87,9 @@ fn cases() -> Vec<Sizes> {
         flat(2, 3, [5, 5], 3, 4, [2, 3]),
         flat(1, 1, [3, 3], 1, 1, [33, 40]),
         flat(5, 17, [5, 5], 2, 2, [20, 33]),
-        // Three narrow passes of some rows each, the last ones fewer.
-        flat(3, 23, [5, 5], 2, 2, [76, 65]),
+        // Three narrow passes.
+        flat(3, 23, [5, 5], 2, 2, [20, 31]),
+        flat(3, 18, [5, 5], 2, 2, [21, 64]),
         flat(4, 50, [3, 3], 1, 1, [16, 16]),
         flat(21, 110, [3, 3], 2, 1, [13, 10]),
         flat(2, 100, [3, 3], 1, 1, [5, 20]),
@@ -114,6 +115,9 @@ fn cases() -> Vec<Sizes> {
         flat(33, 26, [3, 3], 2, 1, [31, 34]),
         solid(5, 8, [3, 3, 3], 1, [6, 7, 9]),
         solid(8, 1, [3, 3, 3], 1, [5, 4, 20]),
+        // Narrow passes of some rows each, the last ones fewer.
+        solid(1, 7, [3, 3, 3], 1, [8, 40, 30]),
+        solid(1, 8, [3, 3, 3], 1, [8, 40, 32]),
         solid(2, 11, [3, 1, 2], 1, [3, 4, 5]),
         solid(1, 3, [3, 3, 3], 1, [20, 3, 3]),
     ]
