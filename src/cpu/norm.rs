@@ -4,6 +4,7 @@
 //! follow in the same pass.
 
 mod layer;
+mod silu;
 
 use super::activation::{Activation, by_kind};
 use super::fresh::{Block, Fresh};
@@ -11,6 +12,7 @@ use super::math::{sum_of, sums_of, vectorised};
 use super::simd::Tier;
 use layer::Layer;
 use rayon::prelude::*;
+use silu::Silu;
 use std::mem::MaybeUninit;
 
 /// How rows lie and which channel an element has: element i of row r belongs to
@@ -77,6 +79,10 @@ pub(super) fn forward_to(rows: &Rows, x: &[f32], w: &[f32], b: &[f32], y: &mut B
     x.par_chunks(chunk).zip(y.par_chunks_mut(chunk)).enumerate().for_each(|(at, (x, y))| {
         if layer {
             return Tier::best().run(Layer { n: rows.len, eps: rows.eps, x, y, affine: [w, b] });
+        }
+        if rows.activation == Some(Activation::Silu) {
+            let (first, affine) = (at * batch, [w, b]);
+            return Tier::best().run(Silu { rows, first, x, y, affine });
         }
         vectorised(
             #[inline(always)]

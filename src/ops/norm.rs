@@ -153,6 +153,7 @@ impl CustomOp3 for Normalise {
 mod tests {
     use super::*;
     use crate::ops::same::{noise, same};
+    use candle_core::{DType, Device};
 
     fn erf_gelu(x: &Tensor) -> Result<Tensor> {
         ((x / 2f64.sqrt())?.erf()? + 1.0)? * (x * 0.5)?
@@ -169,6 +170,29 @@ mod tests {
         let y = unit(&x[0].reshape((b * groups, ()))?)?.reshape(x[0].shape())?;
         let y = y.broadcast_mul(&x[1].reshape((1, c, 1, 1))?)?;
         y.broadcast_add(&x[2].reshape((1, c, 1, 1))?)
+    }
+
+    /// Where e^{-v} leaves the range of f32, and where there is no number.
+    #[test]
+    fn silu_of_far_values() -> Result<()> {
+        let (w, b) = (
+            Tensor::new(&[400f32, -90.0], &Device::Cpu)?,
+            Tensor::zeros(2, DType::F32, &Device::Cpu)?,
+        );
+        let x = noise(&[1, 2, 5, 9], 7)?;
+        let got = group_norm_then(&x, 1, (&w, &b), Some(Activation::Silu))?;
+        let values = group_norm(&x, 1, &w, &b)?.flatten_all()?.to_vec1::<f32>()?;
+        assert!(values.iter().any(|v| *v < -300.0) && values.iter().any(|v| *v > 300.0));
+        for (got, v) in got.flatten_all()?.to_vec1::<f32>()?.into_iter().zip(values) {
+            let want = f64::from(v) / (1.0 + (-f64::from(v)).exp());
+            assert!(
+                (f64::from(got) - want).abs() <= 1e-6 * want.abs().max(1.0),
+                "{v}: {got} {want}"
+            );
+        }
+        let lost = group_norm_then(&(x * f64::NAN)?, 1, (&w, &b), Some(Activation::Silu))?;
+        assert!(lost.flatten_all()?.to_vec1::<f32>()?.iter().all(|v| v.is_nan()));
+        Ok(())
     }
 
     #[test]
