@@ -31,6 +31,12 @@ pub(crate) const fn square(i: usize) -> usize {
     i % 4 * 4 + i / 4
 }
 
+/// The first `n` lanes as bits, 1 ≤ n ≤ 16.
+#[inline(always)]
+pub(crate) const fn first_lanes(n: usize) -> u16 {
+    u16::MAX >> (LANES - n)
+}
+
 /// Relative error of [`Simd::rough_sqrt`]: AVX2's reciprocal root has 11.4 bits.
 pub(crate) const ROUGH: f32 = 4e-4;
 

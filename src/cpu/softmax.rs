@@ -3,7 +3,7 @@
 
 use super::fresh::{Block, Fresh};
 use super::math::vectorised;
-use super::simd::{Kernel, LANES, Simd, Tier, exp2_by_sums};
+use super::simd::{Kernel, LANES, Simd, Tier, exp2_by_sums, first_lanes};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
@@ -40,19 +40,13 @@ fn largest<S: Simd>(s: S, row: &[f32]) -> S::F {
         tops[0] = s.max(s.load(v), tops[0]);
     }
     if !tail.is_empty() {
-        let bits = lanes(tail.len());
+        let bits = first_lanes(tail.len());
         // SAFETY: as many are there.
         let v = unsafe { s.load_lanes(tail.as_ptr(), bits) };
         let v = s.select(s.mask(u32::from(bits)), v, tops[1]);
         tops[1] = s.max(v, tops[1]);
     }
     s.max(s.max(tops[0], tops[1]), s.max(tops[2], tops[3]))
-}
-
-/// The first `n` < 16 lanes as bits.
-#[inline(always)]
-fn lanes(n: usize) -> u16 {
-    (1 << n) - 1
 }
 
 /// The largest lane of each vector.
@@ -112,7 +106,7 @@ unsafe fn exp_part<S: Simd>(
         }
     }
     if whole < n {
-        let bits = lanes(n - whole);
+        let bits = first_lanes(n - whole);
         // SAFETY: the rest of both.
         unsafe {
             let e = exp_negative(s, s.load_lanes(x.add(whole), bits) - max);

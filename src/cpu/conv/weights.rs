@@ -184,7 +184,8 @@ impl Way {
     fn of(plan: &Plan, outputs: usize, tiles: usize) -> Self {
         let plain = match outputs {
             0..=NARROW => return Self::Narrow,
-            17..=24 => Self::Narrow,
+            // Half of their last vector would be empty.
+            n if (LANES + 1..=LANES + NARROW).contains(&n) => Self::Narrow,
             _ => Self::Wide,
         };
         if tiles < winograd_weights::LEAST {
@@ -314,9 +315,9 @@ impl Kernel for Wide<'_, '_> {
                 let sums = self.sums.chunks_exact_mut(ROWS * pitch);
                 for (i, (offsets, sums)) in offsets.as_chunks().0.iter().zip(sums).enumerate() {
                     if work.rows - i * ROWS > ROWS / 2 {
-                        tile.rows(s, offsets, true, sums);
+                        tile.rows::<S, ROWS>(s, offsets, true, sums);
                     } else {
-                        tile.half(s, offsets, sums);
+                        tile.rows::<S, { ROWS / 2 }>(s, offsets, true, sums);
                     }
                 }
             }
@@ -391,48 +392,34 @@ pub(super) struct Tile<'a> {
 }
 
 impl Tile<'_> {
-    /// `[ROWS][pitch]` sums, added to those that are there with `add`.
+    /// `[M][pitch]` sums of the first `M` rows, four or eight, added to those that are there
+    /// with `add`.
     #[inline(always)]
-    pub fn rows<S: Simd>(&self, s: S, offsets: &[usize; ROWS], add: bool, sums: &mut [f32]) {
-        self.check(offsets, sums);
+    pub fn rows<S: Simd, const M: usize>(
+        &self,
+        s: S,
+        offsets: &[usize; ROWS],
+        add: bool,
+        sums: &mut [f32],
+    ) {
+        let farthest = offsets.iter().max().copied().unwrap_or(0) + self.width;
+        assert!(farthest + self.count.saturating_sub(1) * self.x_pitch <= self.x.len());
+        assert!(self.dy.len() >= self.count * self.width * self.pitch);
+        assert!(sums.len() >= M * self.pitch);
         if S::REGISTERS >= 32 {
             match self.pitch / LANES {
-                3 => self.block::<S, 8, 3>(s, offsets, [0, 0], add, sums),
-                2 => self.block::<S, 8, 2>(s, offsets, [0, 0], add, sums),
-                _ => self.block::<S, 8, 1>(s, offsets, [0, 0], add, sums),
+                3 => self.block::<S, M, 3>(s, offsets, [0, 0], add, sums),
+                2 => self.block::<S, M, 2>(s, offsets, [0, 0], add, sums),
+                _ => self.block::<S, M, 1>(s, offsets, [0, 0], add, sums),
             }
         } else {
             for v in (0..self.pitch).step_by(LANES) {
                 self.block::<S, 4, 1>(s, offsets, [0, v], add, sums);
-                self.block::<S, 4, 1>(s, offsets, [4, v], add, sums);
+                if M > 4 {
+                    self.block::<S, 4, 1>(s, offsets, [4, v], add, sums);
+                }
             }
         }
-    }
-
-    /// Adds `[ROWS / 2][pitch]` sums: what is left over.
-    #[inline(always)]
-    fn half<S: Simd>(&self, s: S, offsets: &[usize; ROWS], sums: &mut [f32]) {
-        self.check(offsets, sums);
-        if S::REGISTERS >= 32 {
-            match self.pitch / LANES {
-                3 => self.block::<S, 4, 3>(s, offsets, [0, 0], true, sums),
-                2 => self.block::<S, 4, 2>(s, offsets, [0, 0], true, sums),
-                _ => self.block::<S, 4, 1>(s, offsets, [0, 0], true, sums),
-            }
-        } else {
-            for v in (0..self.pitch).step_by(LANES) {
-                self.block::<S, 4, 1>(s, offsets, [0, v], true, sums);
-            }
-        }
-    }
-
-    /// That every place which [`Tile::block`] reads or writes is there.
-    #[inline(always)]
-    fn check(&self, offsets: &[usize; ROWS], sums: &[f32]) {
-        let farthest = offsets.iter().max().copied().unwrap_or(0) + self.width;
-        assert!(farthest + self.count.saturating_sub(1) * self.x_pitch <= self.x.len());
-        assert!(self.dy.len() >= self.count * self.width * self.pitch);
-        assert!(sums.len() >= ROWS * self.pitch);
     }
 
     /// `M` rows from `first` × `N` vectors from channel `from`.
@@ -455,11 +442,11 @@ impl Tile<'_> {
             for i in 0..self.width {
                 let mut v = [s.splat(0.0); N];
                 for n in 0..N {
-                    // SAFETY: count·width·pitch floats (`check`).
+                    // SAFETY: count·width·pitch floats (asserted by `rows`).
                     v[n] = s.load(unsafe { &*dy.wrapping_add(n * LANES).cast() });
                 }
                 for m in 0..M {
-                    // SAFETY: the farthest row ends inside x (`check`).
+                    // SAFETY: the farthest row ends inside x (asserted by `rows`).
                     let x = s.splat(unsafe { *x[m].wrapping_add(i) });
                     for n in 0..N {
                         acc[m][n] = s.fma(x, v[n], acc[m][n]);

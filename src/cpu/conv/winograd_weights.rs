@@ -10,7 +10,7 @@ use super::gather::{Gather, Tiles};
 use super::plan::{Axes, Plan};
 use super::weights::{LANES_WIDE, ROWS, Tile, Work};
 use super::winograd::{self, Way};
-use crate::cpu::simd::{Kernel, LANES, Simd};
+use crate::cpu::simd::{Kernel, LANES, Simd, first_lanes};
 use std::ops::Range;
 
 /// Input channels of a job: at most, and at least for the sake of more jobs.
@@ -165,7 +165,7 @@ impl Products<'_, '_> {
                     for m in 0..ROWS {
                         offsets[m] = (group * ROWS + m).min(channels - 1) * step;
                     }
-                    tile.rows(s, &offsets, !self.first, sums);
+                    tile.rows::<S, ROWS>(s, &offsets, !self.first, sums);
                 }
             }
         }
@@ -213,7 +213,7 @@ impl Spread<'_, '_> {
             let lanes = LANES.min(outputs.len().saturating_sub(v));
             for left in (0..width).step_by(LANES) {
                 let columns = LANES.min(width - left);
-                let bits = u16::MAX >> (LANES - columns);
+                let bits = first_lanes(columns);
                 // To what is read next, in whose lines nothing else is near.
                 let next = if left + LANES < width {
                     LANES

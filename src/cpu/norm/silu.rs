@@ -2,7 +2,7 @@
 
 use super::Rows;
 use crate::cpu::fresh::Block;
-use crate::cpu::simd::{Kernel, LANES, Simd, exp2_by_sums};
+use crate::cpu::simd::{Kernel, LANES, Simd, exp2_by_sums, first_lanes};
 
 /// Rows from number `first` on.
 pub(super) struct Silu<'a> {
@@ -54,7 +54,7 @@ impl Line {
         if last.is_empty() {
             return;
         }
-        let bits = (1 << last.len()) - 1;
+        let bits = first_lanes(last.len());
         // SAFETY: as many numbers and places.
         unsafe {
             s.store_lanes(self.of(s, s.load_lanes(last.as_ptr(), bits)), rest.as_mut_ptr(), bits)
