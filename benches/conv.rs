@@ -23,8 +23,12 @@ use subsplat::ops::conv2d::conv2d;
 use subsplat::ops::conv3d::conv3d;
 
 /// As in the program.
+#[path = "../tools/cli/src/pages.rs"]
+#[allow(dead_code, reason = "its unit tests run with the programs")]
+mod pages;
+
 #[global_allocator]
-static PAGES: subsplat::cpu::pages::Pages = subsplat::cpu::pages::Pages;
+static PAGES: pages::Pages = pages::Pages;
 
 /// Name, channels in and out, kernel, stride, side of the input.
 type Row = (&'static str, usize, usize, usize, usize, usize);

@@ -32,8 +32,12 @@ use subsplat::pipeline::{Photo, Reconstructor, Request};
 use subsplat::render::render;
 
 /// As in the program.
+#[path = "../tools/cli/src/pages.rs"]
+#[allow(dead_code, reason = "its unit tests run with the programs")]
+mod pages;
+
 #[global_allocator]
-static PAGES: subsplat::cpu::pages::Pages = subsplat::cpu::pages::Pages;
+static PAGES: pages::Pages = pages::Pages;
 
 fn main() -> Result<()> {
     let words: Vec<String> = std::env::args().collect();

@@ -7,9 +7,6 @@
 //! metadata.
 
 mod common;
-#[path = "../tests/common/oracle.rs"]
-#[allow(dead_code, reason = "the scenes have no covariances")]
-mod oracle;
 
 use anyhow::Result;
 use common::conventional::project::{Gradients as PlainGradients, Options, Splats as Plain};
@@ -30,6 +27,7 @@ use subsplat::io::scene::Units;
 use subsplat::io::{save_splats, write_atomic};
 use subsplat::render::slices;
 use subsplat::splats::Splats;
+use subsplat_test_support::oracle;
 
 /// Side of a splat's box in σ: what most programs take, and what the baseline is timed
 /// with.

@@ -18,8 +18,12 @@ use subsplat::ops::redistribute::{Rule, redistribute};
 use subsplat::ops::spgr::{Spgr, spgr, spgr_into};
 
 /// As in the program.
+#[path = "../tools/cli/src/pages.rs"]
+#[allow(dead_code, reason = "its unit tests run with the programs")]
+mod pages;
+
 #[global_allocator]
-static PAGES: subsplat::cpu::pages::Pages = subsplat::cpu::pages::Pages;
+static PAGES: pages::Pages = pages::Pages;
 
 /// Side of the two input pictures, px: 131,072 parents, as MVSplat's 256² gives them.
 const SIDE: usize = 256;

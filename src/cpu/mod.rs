@@ -31,7 +31,6 @@ pub mod matching;
 pub mod math;
 pub mod moves;
 pub mod norm;
-pub mod pages;
 pub mod plane_sweep;
 mod project;
 mod project_bwd;

@@ -1,0 +1,13 @@
+//! The WGSL kernels against their CPU versions.
+#![cfg(feature = "gpu")]
+
+mod layers;
+mod model;
+mod network;
+mod ops;
+mod raster;
+mod raster_bwd;
+mod scenes;
+mod shaders;
+mod spgr;
+mod twins;

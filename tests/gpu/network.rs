@@ -1,0 +1,223 @@
+//! The network's WGSL kernels against their CPU twins: attention gather, plane sweep.
+
+use subsplat_test_support::gpu as adapter;
+use subsplat_test_support::twins;
+
+use adapter::gpu;
+use subsplat::abi::{Drop, Gather, Level, Pair, Sweep};
+use subsplat::cpu::{attention_gather as cpu, plane_sweep};
+use subsplat::gpu::{AttentionGatherArgs, GpuError, PlaneSweepArgs};
+use twins::{Random, assert_twins};
+
+/// Sums of at most 64 products in another order, samples placed within an f32's rounding
+/// of 14 columns (1e-6 of a pixel), and softmax weights whose exponent carries 3 + 2|x|
+/// units in the last place: 1e-6 each, times the handful of samples that meet.
+const GATHER: f32 = 4e-6;
+
+/// The same, and differences of such sums: logits' gradients cancel, points' times 14.
+const GATHER_BWD: f32 = 1e-5;
+
+fn base() -> Gather {
+    Gather {
+        levels: vec![Level { height: 5, width: 7, first_cell: 0 }],
+        views: 2,
+        points: 1,
+        points_per_level: false,
+        dim: 8,
+        groups: 1,
+        stride: 16,
+        key: Some(0),
+        value: 8,
+        logit_scale: 0.4,
+        renormalise: true,
+        half_pixel: true,
+        drop: None,
+        point_gradient: true,
+    }
+}
+
+/// Every option of a gather, and a paper-sized one.
+fn forms() -> Vec<(&'static str, Gather)> {
+    let levels = || {
+        let fine = Level { height: 10, width: 14, first_cell: 70 };
+        vec![Level { height: 5, width: 7, first_cell: 0 }, fine]
+    };
+    let three = vec![
+        Level { height: 5, width: 7, first_cell: 0 },
+        Level { height: 10, width: 14, first_cell: 105 },
+    ];
+    let two = levels;
+    let drop =
+        |probability| Some(Drop { probability, seed: 0xDEAD_BEEF_1234_5678, first_parent: 7 });
+    vec![
+        ("ref", base()),
+        ("integer", Gather { half_pixel: false, ..base() }),
+        ("clamp", Gather { renormalise: false, ..base() }),
+        ("two levels", Gather { levels: two(), ..base() }),
+        ("three views", Gather { views: 3, levels: three, ..base() }),
+        ("13 points", Gather { points: 13, ..base() }),
+        ("13 points, groups", Gather { points: 13, groups: 4, levels: two(), ..base() }),
+        ("offsets", Gather { points: 3, points_per_level: true, levels: two(), ..base() }),
+        ("no projection", Gather { stride: 8, value: 0, ..base() }),
+        ("linear", Gather { stride: 8, value: 0, key: None, groups: 2, points: 4, ..base() }),
+        (
+            "odd width",
+            Gather { dim: 18, stride: 36, value: 18, groups: 2, levels: two(), ..base() },
+        ),
+        ("wide", Gather { dim: 192, stride: 384, value: 192, groups: 6, points: 4, ..base() }),
+        ("dropping", Gather { drop: drop(0.3), points: 4, groups: 2, ..base() }),
+        ("all dropped", Gather { drop: drop(1.0), ..base() }),
+    ]
+}
+
+/// Maps, query, points; points of one parent clustered, some outside, one no number.
+fn inputs(g: &Gather, n: usize, r: &mut Random) -> [Vec<f32>; 3] {
+    let ends = g.levels.iter().map(|l| l.first_cell + g.views * l.height * l.width);
+    let maps = r.many(ends.max().unwrap() * g.stride, -1.0, 1.0);
+    let query = r.many(n * g.query_width(), -1.0, 1.0);
+    let mut points = Vec::new();
+    for _ in 0..n * g.views {
+        let centre = [r.range(-0.1, 1.1), r.range(-0.1, 1.1)];
+        for _ in 0..g.points_width() {
+            points.extend(centre.map(|c| c + r.range(-0.06, 0.06)));
+        }
+    }
+    points[0] = f32::NAN;
+    // The second parent sees nothing.
+    let row = points.len() / n;
+    points[row..2 * row].fill(1.25);
+    [maps, query, points]
+}
+
+#[test]
+fn attention_gather() {
+    let Some(gpu) = gpu() else { return };
+    let mut r = Random(1);
+    for (name, g) in forms() {
+        let n = 150;
+        let [maps, query, points] = inputs(&g, n, &mut r);
+        let mut expected = vec![0.0; n * g.dim];
+        cpu::forward(&g, &maps, &query, &points, &mut expected);
+        let (maps, query, points) = (&maps[..], &query[..], &points[..]);
+        let args = AttentionGatherArgs { gather: &g, maps, query, points };
+        let got = gpu.attention_gather(&args).unwrap();
+        assert_twins(name, &got, &expected, GATHER);
+        let nothing = expected.iter().all(|v| *v == 0.0);
+        assert_eq!(nothing, name == "all dropped", "{name}: nothing to compare");
+    }
+}
+
+#[test]
+fn attention_gather_gradients() {
+    let Some(gpu) = gpu() else { return };
+    let mut r = Random(5);
+    for (name, g) in forms() {
+        let n = 150;
+        let [maps, query, points] = inputs(&g, n, &mut r);
+        let grad = r.many(n * g.dim, -1.0, 1.0);
+        let expected = cpu::backward(&g, &maps, &query, &points, &grad);
+        let (maps, query, points) = (&maps[..], &query[..], &points[..]);
+        let args = AttentionGatherArgs { gather: &g, maps, query, points };
+        let got = gpu.attention_gather_backward(&args, &grad).unwrap();
+        assert_twins(&format!("{name} maps"), &got.maps, &expected.maps, GATHER_BWD);
+        assert_twins(&format!("{name} query"), &got.query, &expected.query, GATHER_BWD);
+        assert_twins(&format!("{name} points"), &got.points, &expected.points, GATHER_BWD);
+        let again = gpu.attention_gather_backward(&args, &grad).unwrap();
+        assert!(got == again, "{name}: other bytes the second time");
+        let fixed = Gather { point_gradient: false, ..g.clone() };
+        let fixed = AttentionGatherArgs { gather: &fixed, ..args };
+        let got = gpu.attention_gather_backward(&fixed, &grad).unwrap();
+        assert!(got.points.iter().all(|v| *v == 0.0) && got.maps == again.maps);
+    }
+}
+
+#[test]
+fn a_gather_that_does_not_fit_is_named() {
+    let Some(gpu) = gpu() else { return };
+    let g = base();
+    let [maps, query, points] = inputs(&g, 3, &mut Random(2));
+    let error = |g: &Gather, maps: &[f32], points: &[f32]| {
+        let args = AttentionGatherArgs { gather: g, maps, query: &query, points };
+        match gpu.attention_gather(&args) {
+            Err(GpuError::Argument { what, .. }) => what,
+            other => panic!("{other:?}"),
+        }
+    };
+    assert_eq!(error(&g, &maps[1..], &points), "maps");
+    assert_eq!(error(&g, &maps, &points[1..]), "points");
+    assert_eq!(error(&Gather { groups: 3, ..g.clone() }, &maps, &points), "groups");
+    let many = Gather { points: 65, ..g.clone() };
+    assert_eq!(error(&many, &maps, &points), "samples per parent");
+}
+
+/// Sample positions of up to 40 px, rounded in another order (fused or not): 1e-5 px times
+/// slopes of at most 2 a px; the correlation sums 40 products.
+const SWEEP: f32 = 2e-5;
+
+/// A source camera turned by `turn` about y and moved along x.
+fn pair(size: [usize; 2], x: f32, turn: f32, source: usize) -> Pair {
+    let [h, w] = size.map(|v| v as f32);
+    let (f, cx, cy) = (0.9 * w, 0.51 * w, 0.48 * h);
+    let (sin, cos) = turn.sin_cos();
+    Pair {
+        source,
+        inverse: [1.0 / f, 1.0 / f, -cx / f, -cy / f],
+        rotation: [cos, 0.0, sin, 0.0, 1.0, 0.0, -sin, 0.0, cos],
+        t: [x, 0.13, -0.2],
+        k: [f, f, cx, cy],
+    }
+}
+
+/// Reference rows with two pairs, with one whose camera has turned away (most samples are
+/// behind it or outside), with a depth at the camera itself, and with no pair.
+fn sweep(centre: f32, size: [usize; 2], channels: usize) -> Sweep {
+    let to = |x: f32, turn: f32, row: usize| pair(size, x, turn, row);
+    Sweep {
+        pairs: vec![
+            vec![to(0.4, 0.1, 1), to(-0.3, -0.2, 0)],
+            vec![to(0.2, 0.8, 1)],
+            vec![],
+            vec![to(-0.4, -0.1, 0)],
+        ],
+        depths: vec![vec![0.7, 1.0, 1.1, 1.3, 2.0, 40.0, 0.0]; 4],
+        centre,
+        min_z: 1e-3,
+        scale: 1.0 / (channels as f32).sqrt(),
+        channels,
+        size,
+    }
+}
+
+fn sweeps() -> Vec<(String, Sweep)> {
+    let sizes = [([7, 9], 5), ([40, 33], 40)];
+    let all = [0.0, 0.5].into_iter().flat_map(|centre| {
+        sizes.map(|(size, c)| (format!("{size:?} centre {centre}"), sweep(centre, size, c)))
+    });
+    all.collect()
+}
+
+#[test]
+fn plane_sweeps() {
+    let Some(gpu) = gpu() else { return };
+    let mut r = Random(3);
+    for (name, s) in sweeps() {
+        let plane = s.size[0] * s.size[1];
+        let reference = r.many(4 * s.channels * plane, -1.0, 1.0);
+        let source = r.many(2 * s.channels * plane, -1.0, 1.0);
+        let mut expected = vec![0.0; 4 * s.candidates() * plane];
+        plane_sweep::correlation(&s, &reference, &source, &mut expected);
+        let (reference, source) = (&reference[..], &source[..]);
+        let args = PlaneSweepArgs { sweep: &s, reference, source };
+        assert_twins(&name, &gpu.plane_sweep(&args).unwrap(), &expected, SWEEP);
+        let grad = r.many(expected.len(), -1.0, 1.0);
+        let expected = plane_sweep::backward(&s, reference, source, &grad);
+        let got = gpu.plane_sweep_backward(&args, &grad).unwrap();
+        assert_twins(&format!("{name} reference"), &got.0, &expected.0, SWEEP);
+        assert_twins(&format!("{name} source"), &got.1, &expected.1, SWEEP);
+        let again = gpu.plane_sweep_backward(&args, &grad).unwrap();
+        assert!(got == again, "{name}: other bytes the second time");
+        let short = PlaneSweepArgs { source: &source[1..], ..args };
+        let error = gpu.plane_sweep(&short).unwrap_err();
+        assert!(matches!(error, GpuError::Argument { what: "source", .. }), "{error}");
+    }
+}

@@ -1,0 +1,262 @@
+//! Ops on a GPU against the same ops on the CPU, values and gradients, under every rule of
+//! SPGR's configuration; and what happens to a call that a GPU cannot take.
+
+use subsplat_test_support::gpu as adapter;
+use subsplat_test_support::scenes;
+use subsplat_test_support::spgr_calls;
+
+use adapter::{gpu, limited};
+use candle_core::{DType, Result, Tensor, Var};
+use scenes::Random;
+use subsplat::abi::{Convention, Gather, Level, RasterOptions, Rule, ShDirection};
+use subsplat::camera::Camera;
+use subsplat::gpu::{DeviceChoice, Gpu};
+use subsplat::ops::attention_gather::attention_gather_on;
+use subsplat::ops::plane_sweep::{Sweep, pair, plane_sweep_on};
+use subsplat::ops::redistribute::redistribute_on;
+use subsplat::ops::spgr::spgr_on;
+use subsplat::ops::{Backend, rasterize_on};
+
+/// Of the largest number. Kernels agree to 4e-5 (tests/gpu_spgr.rs, tests/gpu_network.rs);
+/// needles in random parents, whose CPU gradients in f32 are themselves 3e-5 off, the rest.
+const ALLOWED: f64 = 2e-4;
+
+fn host(t: &Tensor) -> Vec<f64> {
+    t.to_dtype(DType::F64).unwrap().flatten_all().unwrap().to_vec1().unwrap()
+}
+
+/// Results of `f` on `backend`, then the gradients of Σ w·result in its inputs, for weights
+/// that are all different.
+fn run(
+    backend: &Backend,
+    inputs: &[&Tensor],
+    f: impl Fn(&Backend, &[Tensor]) -> Result<Vec<Tensor>>,
+) -> Vec<Vec<f64>> {
+    let variables: Vec<Var> = inputs.iter().map(|t| Var::from_tensor(t).unwrap()).collect();
+    let tensors: Vec<Tensor> = variables.iter().map(|v| v.as_tensor().clone()).collect();
+    let results = f(backend, &tensors).unwrap();
+    let mut loss = Tensor::zeros((), inputs[0].dtype(), inputs[0].device()).unwrap();
+    for r in &results {
+        let mut weights = Random(9);
+        let w = weights.tensor(r.dims(), 1.0, r.dtype());
+        loss = (loss + (r * w).unwrap().sum_all().unwrap()).unwrap();
+    }
+    let gradients = loss.backward().unwrap();
+    let of = |v: &Var| gradients.get(v).map(host).unwrap_or_default();
+    results.iter().map(host).chain(variables.iter().map(of)).collect()
+}
+
+/// `f` on the GPU against the CPU; the GPU refuses nothing.
+fn agrees(
+    name: &str,
+    backend: &Backend,
+    inputs: &[&Tensor],
+    f: impl Fn(&Backend, &[Tensor]) -> Result<Vec<Tensor>>,
+) {
+    let (got, expected) = (run(backend, inputs, &f), run(&Backend::Cpu, inputs, &f));
+    assert_eq!(backend.warning(), None, "{name}");
+    let mut same = true;
+    for (i, (got, expected)) in got.iter().zip(&expected).enumerate() {
+        assert_eq!(got.len(), expected.len(), "{name} {i}");
+        let largest = expected.iter().fold(1e-30f64, |m, v| m.max(v.abs()));
+        for (g, e) in got.iter().zip(expected) {
+            assert!((g - e).abs() <= ALLOWED * largest, "{name} {i}: {g} {e} of {largest}");
+        }
+        same &= got == expected;
+    }
+    // Other machines round otherwise: equal bytes would mean that one of them did both.
+    assert!(!same, "{name}: the GPU's result is the CPU's to the bit");
+}
+
+#[test]
+fn spgr_under_every_rule() {
+    let Some(gpu) = gpu() else { return };
+    let backend = Backend::from(gpu);
+    let mut r = Random(21);
+    for side in [2, 3] {
+        for (name, config) in spgr_calls::variants(side) {
+            let call = spgr_calls::call(&config, 8);
+            let parents = spgr_calls::parents(&call.cameras, &mut r);
+            let head = spgr_calls::head(128, side * side, 1.0, DType::F32, &mut r);
+            agrees(&name, &backend, &[&head, &parents], |backend, x| {
+                let (rows, gains) = spgr_on(backend, &x[0], &x[1], &call)?;
+                Ok(vec![rows, gains])
+            });
+        }
+    }
+}
+
+#[test]
+fn redistribution() {
+    let Some(gpu) = gpu() else { return };
+    let backend = Backend::from(gpu);
+    let mut r = Random(22);
+    let logits = r.tensor(&[300, 4], 3.0, DType::F32);
+    let areas = r.tensor(&[300, 4], 1.0, DType::F32).exp().unwrap();
+    let alphas = (r.tensor(&[300], 0.4, DType::F32) + 0.5).unwrap();
+    let alphas = alphas.clamp(0.01, 0.99).unwrap();
+    let own = r.tensor(&[300], 1.0, DType::F32).exp().unwrap();
+    for rule in [Rule::Linear, Rule::OpticalDepth, Rule::Transmittance, Rule::Area] {
+        let inputs = [&logits, &areas, &alphas, &own];
+        agrees(&format!("{rule:?}"), &backend, &inputs, |backend, x| {
+            Ok(vec![redistribute_on(backend, rule, &x[0], &x[1], &x[2], Some(&x[3]))?])
+        });
+    }
+}
+
+fn gather(points: usize) -> Gather {
+    Gather {
+        levels: vec![Level { height: 5, width: 7, first_cell: 0 }],
+        views: 2,
+        points,
+        points_per_level: false,
+        dim: 8,
+        groups: 2,
+        stride: 16,
+        key: Some(0),
+        value: 8,
+        logit_scale: 0.4,
+        renormalise: true,
+        half_pixel: true,
+        drop: None,
+        point_gradient: true,
+    }
+}
+
+/// Maps, query and points of 90 parents.
+fn gather_inputs(g: &Gather, dtype: DType) -> [Tensor; 3] {
+    let mut r = Random(23);
+    let points = (r.tensor(&[90, 2, g.points, 2], 0.3, dtype) + 0.5).unwrap();
+    [r.tensor(&[70, 16], 1.0, dtype), r.tensor(&[90, g.query_width()], 1.0, dtype), points]
+}
+
+#[test]
+fn attention() {
+    let Some(gpu) = gpu() else { return };
+    let backend = Backend::from(gpu);
+    let g = gather(4);
+    let [maps, query, points] = gather_inputs(&g, DType::F32);
+    agrees("gather", &backend, &[&maps, &query, &points], |backend, x| {
+        Ok(vec![attention_gather_on(backend, &x[0], &x[1], &x[2], g.clone())?])
+    });
+}
+
+#[test]
+fn sweep() {
+    let Some(gpu) = gpu() else { return };
+    let backend = Backend::from(gpu);
+    let cameras = scenes::cameras(2, 12, 9);
+    let k = cameras[0].intrinsics;
+    let to = |a: usize, b: usize| {
+        let pose = subsplat::ops::plane_sweep::relative_pose(&cameras[a], &cameras[b]);
+        pair(&k, &k, pose, b).unwrap()
+    };
+    let s = Sweep {
+        pairs: vec![vec![to(0, 1)], vec![to(1, 0)]],
+        depths: vec![vec![1.0, 1.5, 3.0, 10.0]; 2],
+        centre: 0.5,
+        min_z: 1e-3,
+        scale: 0.4,
+        channels: 6,
+        size: [9, 12],
+    };
+    let features = Random(24).tensor(&[2, 6, 9, 12], 1.0, DType::F32);
+    agrees("sweep", &backend, &[&features, &features], |backend, x| {
+        Ok(vec![plane_sweep_on(backend, &x[0], &x[1], s.clone())?])
+    });
+}
+
+/// 60 splats in front of a camera, and the SH of their 15 parents.
+fn splats(r: &mut Random) -> (Camera, Tensor, Tensor) {
+    let camera = scenes::cameras(2, 40, 30)[0];
+    let n = 60;
+    let place = |r: &mut Random| {
+        let z = r.uniform(2.0, 6.0);
+        let at = [r.uniform(-0.3, 0.3) * z, r.uniform(-0.3, 0.3) * z, z].map(|v| v as f32);
+        camera.world_from_camera.transform_point3(at.into()).to_array()
+    };
+    let means: Vec<f32> = (0..n).flat_map(|_| place(r)).collect();
+    let means = Tensor::from_vec(means, (n, 3), &candle_core::Device::Cpu).unwrap();
+    let quats = r.tensor(&[n, 4], 1.0, DType::F32);
+    let scales = (r.tensor(&[n, 3], 0.3, DType::F32).exp().unwrap() * 0.15).unwrap();
+    let alphas = r.tensor(&[n, 1], 0.1, DType::F32).clamp(-0.4, 0.4).unwrap();
+    let rows = [means, quats, scales, (alphas + 0.5).unwrap()];
+    (camera, Tensor::cat(&rows, 1).unwrap(), r.tensor(&[n / 4, 9, 3], 0.4, DType::F32))
+}
+
+/// The rasterizer's op with every gradient, gains of one lane and of four.
+#[test]
+fn rasterization() {
+    let Some(gpu) = gpu() else { return };
+    let backend = Backend::from(gpu);
+    let mut r = Random(25);
+    let (camera, rows, sh) = splats(&mut r);
+    for (lanes, convention, sh_direction) in [
+        (1, Convention::Standard, ShDirection::Child),
+        (4, Convention::Mvsplat, ShDirection::Parent),
+    ] {
+        let options = RasterOptions { sh_direction, ..RasterOptions::new(convention) };
+        let gain = (r.tensor(&[60, lanes], 0.2, DType::F32) + 1.0).unwrap();
+        let gain = if lanes == 1 { gain.flatten_all().unwrap() } else { gain };
+        let inputs = [&rows, &sh, &gain];
+        agrees(&format!("{convention:?}"), &backend, &inputs, |backend, x| {
+            Ok(vec![rasterize_on(backend, &x[0], &x[1], &x[2], &camera, &options)?])
+        });
+    }
+}
+
+/// A device that binds less than a row of tiles, and one that goes away between the two passes:
+/// the CPU's numbers, and a word.
+#[test]
+fn a_rasterizer_that_fails_leaves_the_cpu() {
+    let Some(small) = limited(2 << 10) else { return };
+    let mut r = Random(26);
+    let (camera, rows, sh) = splats(&mut r);
+    let gain = Tensor::ones(60, DType::F32, rows.device()).unwrap();
+    let inputs = [&rows, &sh, &gain];
+    let options = RasterOptions::default();
+    let of = |backend: &Backend, camera: &Camera| {
+        run(backend, &inputs, |backend, x| {
+            Ok(vec![rasterize_on(backend, &x[0], &x[1], &x[2], camera, &options)?])
+        })
+    };
+    let backend = Backend::from(small);
+    assert!(of(&backend, &camera) == of(&Backend::Cpu, &camera));
+    let warning = backend.warning().unwrap();
+    assert!(warning.contains("GPU too small for a row of tiles"), "{warning}");
+    assert!(warning.contains("CPU"), "{warning}");
+
+    let own = Gpu::open(&DeviceChoice::Gpu).unwrap().unwrap();
+    let backend = Backend::from(own.clone());
+    let got = run(&backend, &inputs, |backend, x| {
+        let planes = rasterize_on(backend, &x[0], &x[1], &x[2], &camera, &options)?;
+        assert_eq!(backend.warning(), None);
+        own.device().destroy();
+        own.device().poll(subsplat::gpu::wgpu::PollType::Poll).ok();
+        Ok(vec![planes])
+    });
+    let expected = of(&Backend::Cpu, &camera);
+    assert!(got[0] != expected[0], "the GPU did not draw");
+    assert!(got[1..] == expected[1..], "the CPU did not go back");
+    assert!(backend.warning().is_some_and(|w| w.contains("GPU lost")), "{:?}", backend.warning());
+}
+
+/// More samples than the kernel holds, or double precision: the CPU's result, and a word.
+#[test]
+fn what_a_gpu_cannot_do_the_cpu_does() {
+    let Some(gpu) = gpu() else { return };
+    for (points, dtype, warns) in [(65, DType::F32, true), (4, DType::F64, false)] {
+        let backend = Backend::from(gpu.clone());
+        let g = gather(points);
+        let [maps, query, points] = gather_inputs(&g, dtype);
+        let of = |backend: &Backend| {
+            run(backend, &[&maps, &query, &points], |backend, x| {
+                Ok(vec![attention_gather_on(backend, &x[0], &x[1], &x[2], g.clone())?])
+            })
+        };
+        assert!(of(&backend) == of(&Backend::Cpu));
+        let warning = backend.warning();
+        assert_eq!(warning.is_some(), warns);
+        assert!(warning.is_none_or(|w| w.contains("samples per parent") && w.contains("128")));
+    }
+}

@@ -1,0 +1,346 @@
+//! The WGSL kernels without a GPU: naga takes every one, their constants, uniforms and
+//! arguments are those of the Rust side, they stay within WebGPU's default limits, and
+//! none stands without a CPU twin.
+
+use naga::proc::Layouter;
+use naga::valid::{Capabilities, ValidationFlags, Validator};
+use naga::{AddressSpace, Expression, Handle, Literal, Module, StorageAccess, TypeInner};
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::path::PathBuf;
+use subsplat::abi::{
+    self, AttentionGatherUniform, InvertUniform, PlaneSweepUniform, RasterUniform,
+    RedistributeUniform, Rule, ShowUniform, SortUniform, SpgrGainsBwdUniform, SpgrUniform,
+};
+use subsplat::gpu::{Access, KERNELS, Kernel};
+
+/// Storage buffers of a stage, threads and bytes of a workgroup: WebGPU's defaults.
+const STORAGE_MAX: usize = 8;
+const THREADS_MAX: u32 = 256;
+const WORKGROUP_BYTES_MAX: u32 = 16 << 10;
+
+/// Kernels whose CPU twin has another stem.
+const TWINS: &[(&str, &str)] = &[
+    ("sort_count", "sort"),
+    ("sort_scatter", "sort"),
+    ("scan_reduce", "tiles"),
+    ("scan_whole", "tiles"),
+    ("scan_apply", "tiles"),
+    ("plan", "tiles"),
+    ("pick", "tiles"),
+    ("intersect", "tiles"),
+    ("ranges", "tiles"),
+    ("rasterize_bwd", "raster_bwd"),
+    ("pair_sums", "raster_bwd"),
+    ("redistribute_bwd", "redistribute"),
+    ("show", "rasterize"),
+    ("spgr_bwd", "spgr"),
+    ("spgr_gains_bwd", "spgr"),
+    ("invert", "plane_sweep"),
+    ("attention_gather_bwd", "attention_gather"),
+    ("attention_gather_scatter", "attention_gather"),
+    ("plane_sweep_taps", "plane_sweep"),
+    ("plane_sweep_reference_bwd", "plane_sweep"),
+    ("plane_sweep_source_bwd", "plane_sweep"),
+];
+
+/// Name and value of everything in kernels/shared/abi.wgsl.
+fn constants() -> BTreeMap<&'static str, f64> {
+    macro_rules! same {
+        ($($name:ident),* $(,)?) => { [$((stringify!($name), f64::from(abi::$name as f32))),*] };
+    }
+    let mut all = BTreeMap::from(same!(
+        AREA_EPS,
+        AREA_RULE_OPACITY_MAX,
+        OPACITY_CEILING,
+        RELATIVE_AREA_MIN,
+        ALPHA_MIN,
+        ALPHA_MIN_LOG2,
+        DISCRIMINANT_MIN_MVSPLAT,
+        RADIUS_SIGMAS_MVSPLAT,
+        SUPPORT_SLACK,
+        SPAN_SLACK_PX,
+        OPACITY_MAX,
+        TILE_GPU,
+        FOOTPRINT_LANES,
+        PAIR_SUMS,
+        GPU_BLOCK,
+        PLAN_COUNT,
+        PLAN_BLOCKS,
+        PLAN_ASKED,
+        PLAN_EACH,
+    ));
+    let rules = [
+        ("RULE_LINEAR", Rule::Linear),
+        ("RULE_OPTICAL_DEPTH", Rule::OpticalDepth),
+        ("RULE_TRANSMITTANCE", Rule::Transmittance),
+        ("RULE_AREA", Rule::Area),
+        ("RULE_NONE", Rule::None),
+    ];
+    all.extend(same!(GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, SWEEP_PAIR_LANES));
+    all.extend(same!(SPLAT_LANES, LANE_MEAN, LANE_QUAT, LANE_SCALE, LANE_OPACITY));
+    all.extend(same!(HEAD_LANES, HEAD_OFFSET, HEAD_DEPTH, HEAD_LOG_SCALE, HEAD_ROTATION));
+    all.extend(same!(HEAD_LOGIT, HEAD_GAIN, NONE, SPGR_CAMERA_LANES, AREA_SQ_EPS, GROWTH_MAX));
+    all.extend(same!(DEPTH_FRACTION_MIN, DISC_AREA_SQ_MIN, VISIBLE_Z_MIN));
+    all.extend(rules.map(|(name, rule)| (name, f64::from(rule as u32))));
+    all
+}
+
+/// Name, size, and fields with offsets of every uniform.
+type Uniform = (&'static str, usize, &'static [(&'static str, usize)]);
+
+macro_rules! uniforms {
+    ($($name:ident),* $(,)?) => { &[$((stringify!($name), size_of::<$name>(), $name::FIELDS)),*] };
+}
+
+const UNIFORMS: &[Uniform] = uniforms!(
+    AttentionGatherUniform,
+    InvertUniform,
+    PlaneSweepUniform,
+    RasterUniform,
+    RedistributeUniform,
+    ShowUniform,
+    SortUniform,
+    SpgrGainsBwdUniform,
+    SpgrUniform
+);
+
+fn root() -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR"))
+}
+
+fn parse(source: &str) -> Result<Module, String> {
+    naga::front::wgsl::parse_str(source).map_err(|e| e.emit_to_string(source))
+}
+
+fn validate(source: &str) -> Result<Module, String> {
+    let module = parse(source)?;
+    let mut validator = Validator::new(ValidationFlags::all(), Capabilities::empty());
+    validator.validate(&module).map_err(|e| e.emit_to_string(source))?;
+    Ok(module)
+}
+
+fn value(module: &Module, init: Handle<Expression>) -> f64 {
+    match module.global_expressions[init] {
+        Expression::Literal(Literal::F32(v)) => f64::from(v),
+        Expression::Literal(Literal::U32(v)) => f64::from(v),
+        Expression::Literal(Literal::I32(v)) => f64::from(v),
+        Expression::Literal(Literal::AbstractInt(v)) => v as f64,
+        Expression::Literal(Literal::AbstractFloat(v)) => v,
+        ref other => panic!("a constant that is no number: {other:?}"),
+    }
+}
+
+/// Differences between the constants of `module` and ours.
+fn constants_off(module: &Module) -> Vec<String> {
+    let mut ours = constants();
+    let mut wrong = Vec::new();
+    for (_, c) in module.constants.iter() {
+        let name = c.name.clone().unwrap();
+        let theirs = value(module, c.init);
+        match ours.remove(name.as_str()) {
+            Some(v) if v as f32 == theirs as f32 => {}
+            Some(v) => wrong.push(format!("{name}: {v} in Rust, {theirs} in WGSL")),
+            None => wrong.push(format!("{name} is not in this test's table")),
+        }
+    }
+    wrong.extend(ours.keys().map(|name| format!("{name} is not in abi.wgsl")));
+    wrong
+}
+
+#[test]
+fn constants_are_those_of_abi() {
+    let text = fs::read_to_string(root().join("kernels/shared/abi.wgsl")).unwrap();
+    assert_eq!(constants_off(&parse(&text).unwrap()), Vec::<String>::new());
+    let changed = text.replace("0.9999;", "0.999;");
+    assert_eq!(constants_off(&parse(&changed).unwrap()).len(), 1, "a changed constant passes");
+    let named = text.replace("const AREA_EPS", "const AREA_EPSILON");
+    assert_eq!(constants_off(&parse(&named).unwrap()).len(), 2, "a renamed constant passes");
+}
+
+/// Differences between the uniform structs of `module` and ours; the names compared.
+fn uniforms_off(module: &Module) -> (Vec<String>, BTreeSet<String>) {
+    let (mut wrong, mut seen) = (Vec::new(), BTreeSet::new());
+    for (_, variable) in module.global_variables.iter() {
+        if variable.space != AddressSpace::Uniform {
+            continue;
+        }
+        let ty = &module.types[variable.ty];
+        let name = ty.name.clone().unwrap_or_default();
+        let TypeInner::Struct { members, span } = &ty.inner else {
+            wrong.push(format!("uniform {:?} is no struct", variable.name));
+            continue;
+        };
+        let Some((_, size, fields)) = UNIFORMS.iter().find(|(n, ..)| *n == name) else {
+            wrong.push(format!("uniform {name} is not in this test's table"));
+            continue;
+        };
+        let theirs: Vec<_> =
+            members.iter().map(|m| (m.name.as_deref().unwrap(), m.offset as usize)).collect();
+        if theirs != *fields || *span as usize != *size {
+            wrong.push(format!("{name}: {fields:?}, {size} bytes; WGSL {theirs:?}, {span}"));
+        }
+        seen.insert(name);
+    }
+    (wrong, seen)
+}
+
+#[test]
+fn uniforms_have_the_fields_of_abi() {
+    let mut seen = BTreeSet::new();
+    for kernel in KERNELS {
+        let (wrong, names) = uniforms_off(&parse(kernel.source).unwrap());
+        assert_eq!(wrong, Vec::<String>::new(), "{}", kernel.name);
+        seen.extend(names);
+    }
+    let all: BTreeSet<String> = UNIFORMS.iter().map(|(name, ..)| (*name).to_owned()).collect();
+    assert_eq!(seen, all, "a uniform of the table belongs to no kernel");
+    let redistribute = KERNELS.iter().find(|k| k.name == "redistribute").unwrap();
+    let swapped = redistribute
+        .source
+        .replace("parents: u32,\n    children: u32,", "children: u32, parents: u32,");
+    assert_ne!(swapped, redistribute.source);
+    assert_eq!(uniforms_off(&parse(&swapped).unwrap()).0.len(), 1, "swapped fields pass");
+}
+
+/// How the arguments of an entry point are used, by binding.
+fn arguments(module: &Module) -> BTreeMap<u32, Access> {
+    let variables = module.global_variables.iter();
+    variables
+        .filter_map(|(_, v)| {
+            let binding = v.binding.as_ref()?;
+            assert_eq!(binding.group, 0, "{:?}: group 0 alone is used", v.name);
+            let access = match v.space {
+                AddressSpace::Uniform => Access::Uniform,
+                AddressSpace::Storage { access } if access.contains(StorageAccess::STORE) => {
+                    Access::Write
+                }
+                AddressSpace::Storage { .. } => Access::Read,
+                other => panic!("{:?} in {other:?}", v.name),
+            };
+            Some((binding.binding, access))
+        })
+        .collect()
+}
+
+/// Threads and bytes of a kernel's workgroup.
+fn workgroup(kernel: &Kernel, module: &Module) -> (u32, u32) {
+    let entry = module.entry_points.iter().find(|e| e.name == kernel.entry);
+    let entry = entry.unwrap_or_else(|| panic!("{}: no entry {}", kernel.name, kernel.entry));
+    let mut layouter = Layouter::default();
+    layouter.update(module.to_ctx()).unwrap();
+    let variables = module.global_variables.iter().map(|(_, v)| v);
+    let shared = variables.filter(|v| v.space == AddressSpace::WorkGroup);
+    (entry.workgroup_size.iter().product(), shared.map(|v| layouter[v.ty].size).sum())
+}
+
+fn check_kernel(kernel: &Kernel) {
+    let name = kernel.name;
+    let module = validate(kernel.source).unwrap_or_else(|e| panic!("{name}: {e}"));
+    let ours: BTreeMap<u32, Access> = (0..).zip(kernel.bindings.iter().copied()).collect();
+    assert_eq!(arguments(&module), ours, "{name}: arguments");
+    let storage = kernel.bindings.iter().filter(|a| **a != Access::Uniform).count();
+    assert!(storage <= STORAGE_MAX, "{name}: {storage} storage buffers");
+    let (threads, bytes) = workgroup(kernel, &module);
+    assert!(threads <= THREADS_MAX, "{name}: {threads} threads");
+    assert!(bytes <= WORKGROUP_BYTES_MAX, "{name}: {bytes} bytes of workgroup memory");
+}
+
+/// What a stage's largest kernel is called.
+const STAGES: &[(&str, &str)] = &[
+    ("project", "project"),
+    ("sort by depth", "sort_scatter"),
+    ("prefix sum, plan", "scan_apply"),
+    ("intersect", "intersect"),
+    ("sort by tile", "sort_count"),
+    ("ranges", "ranges"),
+    ("rasterize", "rasterize"),
+    ("rasterize backward", "rasterize_bwd"),
+    ("sum pairs", "pair_sums"),
+    ("project backward", "project_bwd"),
+];
+
+/// Stages of the table in `docs` whose threads, bytes, or workgroups at once on two kinds
+/// of core are other than their kernels'.
+fn stages_off(docs: &str) -> Vec<&'static str> {
+    let cells = |line: &str| line.split('|').map(|c| c.trim().to_owned()).collect::<Vec<_>>();
+    let rows: Vec<_> = docs.lines().map(cells).filter(|c| c.len() == 8).collect();
+    let wrong = |(stage, name): &(&str, &str)| {
+        let kernel = KERNELS.iter().find(|k| k.name == *name).unwrap();
+        let (threads, bytes) = workgroup(kernel, &parse(kernel.source).unwrap());
+        let at_once = |most: u32, memory: u32| (most / threads).min(memory / bytes.max(1));
+        let expected = [
+            threads.to_string(),
+            bytes.to_string(),
+            format!("{}, {}", at_once(1024, 32 << 10), at_once(2048, 100 << 10)),
+        ];
+        let found = rows.iter().find(|row| row[1] == *stage);
+        !found.is_some_and(|row| {
+            [row[3].clone(), row[4].replace(',', ""), row[5].clone()] == expected
+        })
+    };
+    STAGES.iter().filter(|s| wrong(s)).map(|s| s.0).collect()
+}
+
+#[test]
+fn the_table_of_stages_is_that_of_the_kernels() {
+    let docs = fs::read_to_string(root().join("src/gpu/mod.rs")).unwrap();
+    assert_eq!(stages_off(&docs), Vec::<&str>::new());
+    assert_eq!(stages_off(&docs.replace("15,368", "15,372")), ["rasterize backward"]);
+    assert_eq!(stages_off(&docs.replace("| 3, 8 | 160 N", "| 4, 8 | 160 N")), ["sort by depth"]);
+}
+
+#[test]
+fn every_kernel_is_valid_and_within_the_default_limits() {
+    assert!(!KERNELS.is_empty());
+    for kernel in KERNELS {
+        check_kernel(kernel);
+    }
+    assert!(validate("fn f() -> f32 { return 1u; }").is_err(), "naga takes anything");
+}
+
+/// Stems of the `.wgsl` or `.rs` files of a folder.
+fn stems(folder: &str, extension: &str) -> BTreeSet<String> {
+    let files = fs::read_dir(root().join(folder)).unwrap().map(|e| e.unwrap().path());
+    files
+        .filter(|p| p.extension().is_some_and(|e| e == extension))
+        .map(|p| p.file_stem().unwrap().to_string_lossy().into_owned())
+        .collect()
+}
+
+/// Kernels without a Rust side or without a CPU twin.
+fn orphans(kernels: &BTreeSet<String>) -> Vec<String> {
+    let used: BTreeSet<&str> = KERNELS.iter().map(|k| k.name).collect();
+    let mut cpu = stems("src/cpu", "rs");
+    let folders = fs::read_dir(root().join("src/cpu")).unwrap().map(|e| e.unwrap().path());
+    cpu.extend(
+        folders
+            .filter(|p| p.is_dir())
+            .map(|p| p.file_name().unwrap().to_string_lossy().into_owned()),
+    );
+    let twin = |stem: &str| {
+        let other = TWINS.iter().find(|(kernel, _)| *kernel == stem);
+        cpu.contains(other.map_or(stem, |(_, twin)| *twin))
+    };
+    kernels.iter().filter(|k| !used.contains(k.as_str()) || !twin(k)).cloned().collect()
+}
+
+#[test]
+fn no_kernel_is_an_orphan() {
+    let mut kernels = stems("kernels", "wgsl");
+    assert_eq!(orphans(&kernels), Vec::<String>::new());
+    for kernel in KERNELS {
+        assert!(kernels.contains(kernel.name), "kernels/{}.wgsl is not there", kernel.name);
+    }
+    kernels.insert("stray".to_owned());
+    assert_eq!(orphans(&kernels), ["stray"]);
+}
+
+/// A kernel's text is whole files: each file under kernels/shared is in some kernel.
+#[test]
+fn shared_files_are_used() {
+    for stem in stems("kernels/shared", "wgsl") {
+        let text = fs::read_to_string(root().join(format!("kernels/shared/{stem}.wgsl"))).unwrap();
+        assert!(KERNELS.iter().any(|k| k.source.contains(&text)), "shared/{stem}.wgsl");
+    }
+}

@@ -1,0 +1,253 @@
+//! SPGR's WGSL kernels against their CPU twins, under every rule.
+
+use subsplat_test_support::gpu as adapter;
+use subsplat_test_support::twins;
+
+use adapter::gpu;
+use glam::{EulerRot, Mat4, Quat, Vec3};
+use subsplat::abi::{
+    HEAD_LANES, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, Rule, Rules, SPLAT_LANES,
+};
+use subsplat::camera::{Camera, Intrinsics};
+use subsplat::cpu::spgr as cpu;
+use subsplat::gpu::{GpuError, SpgrArgs};
+use twins::{Random, assert_twins};
+
+/// A few hundred roundings of 6e-8, WGSL's looser ones (division 2.5 units in the last
+/// place, exponential 3 + 2|x|) included; the growth of two axes divides by what a cross
+/// product leaves.
+const SPGR: f32 = 3e-5;
+
+/// Of the gradients, in units of the lane's largest: needles and edge-on discs divide by
+/// areas that cancel, 1e-5 of the double kernel on either side; the CPU's single one is up
+/// to 3e-5 away from it.
+const OF_DOUBLE: f32 = 4e-5;
+const OF_SINGLE: f32 = 1e-4;
+
+/// Two looks at one place, turned a little.
+fn cameras(size: usize) -> Vec<Camera> {
+    let each = |v: usize| {
+        let s = size as f32;
+        let (fx, fy, cx, cy) = (0.9 * s, 0.95 * s, 0.51 * s, 0.48 * s);
+        let k = Intrinsics { fx, fy, cx, cy, width: size, height: size };
+        let turn = v as f32 - 0.5;
+        let q = Quat::from_euler(EulerRot::XYZ, 0.05 * turn, -0.12 * turn, 0.08 * turn);
+        let at = Vec3::new(0.3 * turn, 0.05 * turn, 0.1 * v as f32);
+        Camera::new(k, Mat4::from_rotation_translation(q, at)).unwrap()
+    };
+    (0..2).map(each).collect()
+}
+
+/// One parent per pixel and view, from a hundredth of a pixel to several, flat and round.
+fn parents(cameras: &[Camera], r: &mut Random) -> Vec<f32> {
+    let mut rows = Vec::new();
+    for camera in cameras {
+        let k = camera.intrinsics;
+        for i in 0..k.width * k.height {
+            let z = r.range(1.5, 12.0);
+            let (x, y) = ((i % k.width) as f32 + 0.5, (i / k.width) as f32 + 0.5);
+            let p = Vec3::new((x - k.cx) / k.fx * z, (y - k.cy) / k.fy * z, z);
+            let mean = camera.rotation() * p + camera.position();
+            rows.extend(mean.to_array());
+            rows.extend(r.many(4, -1.0, 1.0));
+            let px = z / k.fx;
+            rows.extend(r.many(3, -5.0, 2.0).iter().map(|e| e.exp2() * px));
+            rows.push(r.range(0.0, 1.0));
+        }
+    }
+    rows
+}
+
+/// The presets' numbers at K = r².
+fn base(tuned: bool, side: usize) -> Rules {
+    let k = (side * side) as f64;
+    Rules {
+        side,
+        nearest_visible: !tuned,
+        offset_bound: tuned.then_some(0.5),
+        beta_z: if tuned { 0.1 } else { 0.25 },
+        ray: tuned,
+        relative_depth: tuned,
+        disc: false,
+        lambda_s: if tuned { 1.0 / k.sqrt() } else { 0.6 },
+        dlog_clamp: 2.0,
+        area_at_parent: false,
+        a_min: if side == 1 { 0.0 } else { 1.0 / k },
+        two_axis: false,
+        opacity: if tuned { Rule::OpticalDepth } else { Rule::Linear },
+        lowpass_target: 0.3,
+        lowpass_input: 0.3,
+        delta: 0.5,
+        rgb_gain: false,
+    }
+}
+
+/// Every rule, one at a time on top of either preset.
+fn variants(side: usize) -> Vec<(String, Rules)> {
+    type Change = (&'static str, fn(&mut Rules));
+    let changes: [Change; 22] = [
+        ("as is", |_| {}),
+        ("nearest", |s| s.nearest_visible = true),
+        ("source", |s| s.nearest_visible = false),
+        ("unbounded", |s| s.offset_bound = None),
+        ("bounded", |s| s.offset_bound = Some(0.5)),
+        ("axis", |s| s.ray = false),
+        ("ray", |s| s.ray = true),
+        ("world", |s| (s.relative_depth, s.beta_z) = (false, 9.0)),
+        ("relative", |s| (s.relative_depth, s.beta_z) = (true, 1.0)),
+        ("disc", |s| s.disc = true),
+        ("lambda", |s| s.lambda_s = 1.2 / s.side as f64),
+        ("at parent", |s| s.area_at_parent = true),
+        ("a_min px", |s| s.a_min = 2.0),
+        ("a_min in", |s| s.a_min = 0.5 * (s.side * s.side) as f64),
+        ("a_min off", |s| s.a_min = 0.0),
+        ("two axis", |s| (s.a_min, s.two_axis) = (2.0, true)),
+        ("linear", |s| s.opacity = Rule::Linear),
+        ("depth", |s| s.opacity = Rule::OpticalDepth),
+        ("through", |s| s.opacity = Rule::Transmittance),
+        ("area", |s| s.opacity = Rule::Area),
+        ("none", |s| s.opacity = Rule::None),
+        ("rgb", |s| s.rgb_gain = true),
+    ];
+    let mut all = Vec::new();
+    for tuned in [false, true] {
+        for (name, change) in changes {
+            let mut rules = base(tuned, side);
+            change(&mut rules);
+            all.push((format!("{} {name} r={side}", if tuned { "tuned" } else { "paper" }), rules));
+        }
+    }
+    all
+}
+
+/// Cameras, near planes, parents and head records.
+struct Inputs {
+    cameras: Vec<Camera>,
+    near: Vec<f32>,
+    parents: Vec<f32>,
+    head: Vec<f32>,
+}
+
+impl Inputs {
+    fn new(side: usize, r: &mut Random) -> Self {
+        let cameras = cameras(12);
+        let parents = parents(&cameras, r);
+        let n = parents.len() / SPLAT_LANES;
+        let head = r.many(n * side * side * HEAD_LANES, -1.5, 1.5);
+        Self { cameras, near: vec![1.0; 2], parents, head }
+    }
+
+    fn gpu<'a>(&'a self, rules: &'a Rules) -> SpgrArgs<'a> {
+        let Self { cameras, near, parents, head } = self;
+        SpgrArgs { rules, cameras, near, per_view: 144, first: 0, head, parents }
+    }
+}
+
+fn on_cpu(inputs: &Inputs, rules: &Rules) -> (Vec<f32>, Vec<f32>) {
+    let Inputs { cameras, near, parents, head } = inputs;
+    let source = cpu::Source { cameras, near, per_view: 144, first: 0 };
+    let count = parents.len() / SPLAT_LANES * rules.children();
+    let mut rows = vec![0.0; count * SPLAT_LANES];
+    let mut gains = vec![0.0; count * rules.gain_lanes()];
+    assert!(cpu::forward(cpu::Args { rules, source, head, parents }, &mut rows, &mut gains));
+    (rows, gains)
+}
+
+/// One kind of lanes of all rows.
+fn lanes(rows: &[f32], first: usize, count: usize) -> Vec<f32> {
+    rows.chunks_exact(SPLAT_LANES).flat_map(|r| r[first..first + count].to_vec()).collect()
+}
+
+const PARTS: [(&str, usize, usize); 4] = [
+    ("mean", LANE_MEAN, 3),
+    ("quaternion", LANE_QUAT, 4),
+    ("scale", LANE_SCALE, 3),
+    ("opacity", LANE_OPACITY, 1),
+];
+
+#[test]
+fn children() {
+    let Some(gpu) = gpu() else { return };
+    let mut r = Random(11);
+    for side in [1, 2, 3] {
+        let inputs = Inputs::new(side, &mut r);
+        for (name, rules) in variants(side) {
+            let expected = on_cpu(&inputs, &rules);
+            let got = gpu.spgr(&inputs.gpu(&rules)).unwrap();
+            for (part, first, count) in PARTS {
+                let of = |rows: &[f32]| lanes(rows, first, count);
+                let (got, expected) = (of(&got.0), of(&expected.0));
+                assert_twins(&format!("{name} {part}"), &got, &expected, SPGR);
+            }
+            assert_twins(&format!("{name} gain"), &got.1, &expected.1, SPGR);
+        }
+    }
+}
+
+/// Gradients on the CPU: head records, parents, and head records by the gains.
+fn gradients<T: subsplat::cpu::lanes::LaneReal>(
+    inputs: &Inputs,
+    rules: &Rules,
+    grad: &[f32],
+    by_gain: &[f32],
+) -> [Vec<f32>; 3] {
+    let wide = |v: &[f32]| v.iter().map(|&v| T::of(f64::from(v))).collect::<Vec<T>>();
+    let narrow = |v: Vec<T>| v.into_iter().map(|v| v.to_f64() as f32).collect::<Vec<f32>>();
+    let (head, parents) = (wide(&inputs.head), wide(&inputs.parents));
+    let source =
+        cpu::Source { cameras: &inputs.cameras, near: &inputs.near, per_view: 144, first: 0 };
+    let zeros = |n: usize| vec![T::default(); n];
+    let [mut d_head, mut d_gain] = [0; 2].map(|_| zeros(head.len()));
+    let mut d_parents = zeros(parents.len());
+    let args = cpu::Args { rules, source, head: &head, parents: &parents };
+    cpu::backward(args, &wide(grad), &mut d_head, &mut d_parents);
+    cpu::gains_backward(rules, &head, &wide(by_gain), &mut d_gain);
+    [narrow(d_head), narrow(d_parents), narrow(d_gain)]
+}
+
+#[test]
+fn gradients_of_children() {
+    let Some(gpu) = gpu() else { return };
+    let mut r = Random(12);
+    for side in [1, 2, 3] {
+        let inputs = Inputs::new(side, &mut r);
+        for (name, rules) in variants(side) {
+            let count = inputs.parents.len() / SPLAT_LANES * rules.children();
+            let grad = r.many(count * SPLAT_LANES, -1.0, 1.0);
+            let by_gain = r.many(count * rules.gain_lanes(), -1.0, 1.0);
+            let [head, parents, gain] = gradients::<f32>(&inputs, &rules, &grad, &by_gain);
+            let exact = gradients::<f64>(&inputs, &rules, &grad, &by_gain);
+            let got = gpu.spgr_backward(&inputs.gpu(&rules), &grad).unwrap();
+            let got_gain = gpu.spgr_gains_backward(&rules, &inputs.head, &by_gain).unwrap();
+            for lane in 0..SPLAT_LANES {
+                let of = |rows: &[f32]| lanes(rows, lane, 1);
+                let all =
+                    [("head", &got.0, &head, &exact[0]), ("parents", &got.1, &parents, &exact[1])];
+                for (what, got, twin, exact) in all {
+                    let name = format!("{name} {what} {lane}");
+                    assert_twins(&name, &of(got), &of(exact), OF_DOUBLE);
+                    assert_twins(&name, &of(got), &of(twin), OF_SINGLE);
+                }
+            }
+            assert_twins(&format!("{name} gain"), &got_gain, &gain, SPGR);
+        }
+    }
+}
+
+#[test]
+fn arguments_that_do_not_fit_are_named() {
+    let Some(gpu) = gpu() else { return };
+    let inputs = Inputs::new(2, &mut Random(3));
+    let error = |change: &dyn Fn(&mut SpgrArgs)| {
+        let rules = base(true, 2);
+        let mut args = inputs.gpu(&rules);
+        change(&mut args);
+        match gpu.spgr(&args) {
+            Err(GpuError::Argument { what, .. }) => what,
+            other => panic!("{other:?}"),
+        }
+    };
+    assert_eq!(error(&|a| a.head = &a.head[1..]), "head records");
+    assert_eq!(error(&|a| a.near = &a.near[1..]), "near planes");
+    assert_eq!(error(&|a| a.per_view = 0), "parents per view");
+}

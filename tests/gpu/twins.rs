@@ -1,0 +1,171 @@
+//! Every WGSL kernel against its CPU twin. Tolerances have their reasons beside them, and
+//! each comparison is seen to fail on a perturbed side.
+
+use subsplat_test_support::gpu as adapter;
+
+use adapter::gpu;
+use subsplat::abi::Rule;
+use subsplat::cpu::redistribute as cpu;
+use subsplat::gpu::{GpuError, RedistributeArgs};
+
+/// WGSL allows exp and log 3 + 2|x| units in the last place, |x| up to 20 here: 3e-6 of
+/// the result, in numerator and sum.
+const REDISTRIBUTE: f32 = 1e-5;
+
+/// The same of gradients, of the largest.
+const REDISTRIBUTE_BACKWARD: f32 = 1e-5;
+
+const RULES: [Rule; 5] =
+    [Rule::Linear, Rule::OpticalDepth, Rule::Transmittance, Rule::Area, Rule::None];
+
+/// xorshift64*: uniform in [from, to).
+struct Random(u64);
+
+impl Random {
+    fn range(&mut self, from: f32, to: f32) -> f32 {
+        self.0 ^= self.0 >> 12;
+        self.0 ^= self.0 << 25;
+        self.0 ^= self.0 >> 27;
+        let unit = (self.0.wrapping_mul(0x2545_F491_4F6C_DD1D) >> 40) as f32 / (1u64 << 24) as f32;
+        from + (to - from) * unit
+    }
+
+    fn many(&mut self, count: usize, from: f32, to: f32) -> Vec<f32> {
+        (0..count).map(|_| self.range(from, to)).collect()
+    }
+}
+
+/// Largest |got − expected| / |expected|; NaN where one is.
+fn relative(got: &[f32], expected: &[f32]) -> f32 {
+    assert_eq!(got.len(), expected.len());
+    let pairs = got.iter().zip(expected);
+    pairs
+        .map(|(g, e)| (g - e).abs() / e.abs().max(f32::MIN_POSITIVE))
+        .fold(0.0, |m, d| if d > m || d.is_nan() { d } else { m })
+}
+
+#[test]
+fn redistribute() {
+    let Some(gpu) = gpu() else { return };
+    let mut random = Random(7);
+    for (p, k) in [(1, 1), (3, 4), (1000, 4), (777, 9), (513, 16), (70, 5)] {
+        let logits = random.many(p * k, -10.0, 10.0);
+        // From far below a pixel to many pixels.
+        let areas: Vec<f32> = random.many(p * k, -12.0, 6.0).iter().map(|e| e.exp2()).collect();
+        let mut alphas = random.many(p, 0.0, 1.0);
+        for (a, special) in alphas.iter_mut().zip([1e-7, 1.0, 0.9999, 1e-3]) {
+            *a = special;
+        }
+        let own: Vec<f32> = random.many(p, -4.0, 6.0).iter().map(|e| e.exp2()).collect();
+        for rule in RULES {
+            let (logits, areas, alphas, own) = (&logits[..], &areas[..], &alphas[..], &own[..]);
+            let expected = cpu::forward(cpu::Args { rule, k, logits, areas, alphas, own });
+            let args = RedistributeArgs { rule, k, logits, areas, alphas, own };
+            let got = gpu.redistribute(&args).unwrap();
+            let off = relative(&got, &expected);
+            assert!(off < REDISTRIBUTE, "{rule:?} {p}x{k}: {off:e}");
+            // 0.1 % on one number is seen.
+            let mut perturbed = got;
+            perturbed[p * k / 2] *= 1.001;
+            assert!(relative(&perturbed, &expected) > REDISTRIBUTE);
+        }
+    }
+}
+
+/// The largest difference beside the largest number (or 1e-3 of the gradient that comes
+/// in): gradients of the softmax are differences of near-equal numbers.
+fn of_largest(got: &[f32], expected: &[f32]) -> f32 {
+    assert_eq!(got.len(), expected.len());
+    let largest = expected.iter().fold(1e-3f32, |m, v| m.max(v.abs()));
+    let pairs = got.iter().zip(expected);
+    pairs
+        .map(|(g, e)| (g - e).abs() / largest)
+        .fold(0.0, |m, d| if d > m || d.is_nan() { d } else { m })
+}
+
+#[test]
+fn redistribute_backward() {
+    let Some(gpu) = gpu() else { return };
+    let mut random = Random(8);
+    for (p, k) in [(1, 1), (3, 4), (1000, 4), (777, 9), (513, 16), (70, 5)] {
+        let logits = random.many(p * k, -4.0, 4.0);
+        let areas: Vec<f32> = random.many(p * k, -3.0, 3.0).iter().map(|e| e.exp2()).collect();
+        let mut alphas = random.many(p, 0.0, 0.99);
+        for (a, special) in alphas.iter_mut().zip([1e-7, 1.0, 0.99995, 1e-3]) {
+            *a = special;
+        }
+        let own: Vec<f32> = random.many(p, -1.0, 3.0).iter().map(|e| e.exp2()).collect();
+        let grad = random.many(p * k, -1.0, 1.0);
+        for rule in RULES {
+            let (logits, areas, alphas, own) = (&logits[..], &areas[..], &alphas[..], &own[..]);
+            let args = cpu::Args { rule, k, logits, areas, alphas, own };
+            let expected = cpu::backward(args, &grad);
+            let args = RedistributeArgs { rule, k, logits, areas, alphas, own };
+            let got = gpu.redistribute_backward(&args, &grad).unwrap();
+            let all = [
+                ("logits", got.logits, expected.logits),
+                ("areas", got.areas, expected.areas),
+                ("alphas", got.alphas, expected.alphas),
+                ("own", got.own, expected.own),
+            ];
+            for (what, mut got, expected) in all {
+                let off = of_largest(&got, &expected);
+                assert!(off < REDISTRIBUTE_BACKWARD, "{rule:?} {p}x{k} {what}: {off:e}");
+                if expected.iter().any(|&v| v != 0.0) {
+                    let largest = expected.iter().fold(1e-3f32, |m, v| m.max(v.abs()));
+                    got[expected.len() / 2] += 2.0 * REDISTRIBUTE_BACKWARD * largest;
+                    assert!(of_largest(&got, &expected) > REDISTRIBUTE_BACKWARD, "{what}");
+                }
+            }
+        }
+    }
+    let args = RedistributeArgs {
+        rule: Rule::Linear,
+        k: 2,
+        logits: &[0.0; 4],
+        areas: &[1.0; 4],
+        alphas: &[0.5; 2],
+        own: &[],
+    };
+    let error = gpu.redistribute_backward(&args, &[0.0; 3]).unwrap_err();
+    assert!(matches!(error, GpuError::Argument { what: "gradient", .. }), "{error}");
+}
+
+#[test]
+fn arguments_that_do_not_fit_are_named() {
+    let Some(gpu) = gpu() else { return };
+    let args = RedistributeArgs {
+        rule: Rule::OpticalDepth,
+        k: 2,
+        logits: &[0.0; 4],
+        areas: &[1.0; 4],
+        alphas: &[0.5; 2],
+        own: &[1.0],
+    };
+    let error = gpu.redistribute(&args).unwrap_err();
+    assert!(matches!(error, GpuError::Argument { what: "own areas", .. }), "{error}");
+    let error = gpu.redistribute(&RedistributeArgs { k: 0, ..args }).unwrap_err();
+    assert!(matches!(error, GpuError::Argument { .. }), "{error}");
+}
+
+/// Threads that read back at the same time each get their own answer, though one thread's
+/// poll may finish another's mapping.
+#[test]
+fn threads_get_their_own_answers() {
+    let Some(gpu) = gpu() else { return };
+    let gpu = &gpu;
+    std::thread::scope(|scope| {
+        for thread in 0..16u32 {
+            scope.spawn(move || {
+                for round in 0..40u32 {
+                    // Descending keys of another length in every thread and round.
+                    let count = 1 + (37 * thread + 11 * round) % 300;
+                    let keys: Vec<u32> = (0..count).map(|i| 7 * (count - i) + thread).collect();
+                    let expected: Vec<u32> = (0..count).rev().collect();
+                    let got = gpu.sort_order(&keys);
+                    assert!(got.as_ref() == Ok(&expected), "{thread} {round}: {got:?}");
+                }
+            });
+        }
+    });
+}

@@ -1,0 +1,14 @@
+//! The network: each module against its oracle or reference.
+
+mod aggregation;
+mod attention_gather;
+mod backbone;
+mod encoder_gradients;
+mod end_to_end;
+mod parity;
+mod plane_sweep;
+mod primaries;
+mod shipped_weights;
+mod small;
+mod trunk;
+mod trunk_parts;

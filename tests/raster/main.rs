@@ -1,0 +1,9 @@
+//! The rasterizer: pictures and gradients against oracles, fixtures and a conventional one.
+
+mod conventional;
+mod coverage;
+mod raster;
+mod raster_bwd;
+mod raster_bwd_oracle;
+mod raster_op;
+mod raster_oracle;

@@ -1,0 +1,9 @@
+//! Scenes: pose formats, pictures, the check of poses, navigation.
+
+mod check;
+mod check_rendered;
+mod hostile_scenes;
+mod navigation;
+mod resize;
+mod scene_formats;
+mod scenes;

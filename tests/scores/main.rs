@@ -1,0 +1,7 @@
+//! Metrics, evaluation and the parts of training.
+
+mod eval;
+mod lpips;
+mod metrics;
+mod train_mvsplat;
+mod train_parts;

@@ -1,0 +1,379 @@
+//! Parts of training, each against its formula: losses by finite differences, the
+//! optimizer and the schedule against other writings of them, sources and augmentation
+//! by what must stay true.
+
+use subsplat_test_support as common;
+
+use candle_core::{Device, Tensor, Var};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use subsplat::camera::{Camera, Intrinsics};
+use subsplat::data::dataset::Posed;
+use subsplat::data::procedural::{ExampleSpec, TargetSpec};
+use subsplat::io::image::Rgb;
+use subsplat::metrics;
+use subsplat::train::loading::Loader;
+use subsplat::train::loss::{self, Scored, with_gradient};
+use subsplat::train::optimizer::{Optimizer, Settings};
+use subsplat::train::schedule::{NamedWarmup, Schedule, Warmup};
+use subsplat::train::source::{Augmentation, Example, Replay, Rooms, Source};
+
+/// In [0, 1), the same every time.
+fn noise(n: usize, seed: u32) -> Vec<f32> {
+    let mut s = seed.wrapping_mul(747_796_405).wrapping_add(1);
+    let mut next = || {
+        s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        (s >> 8) as f32 / (1 << 24) as f32
+    };
+    (0..n).map(|_| next()).collect()
+}
+
+/// The gradient of `f` at `x` against central differences of its value, which is f64.
+fn check_gradient(x: &[f32], h: f32, tolerance: f64, f: impl Fn(&[f32]) -> Scored) {
+    let gradient = f(x).gradient;
+    let largest = gradient.iter().fold(0f32, |a, g| a.max(g.abs()));
+    assert!(largest > 0.0);
+    for i in (0..x.len()).step_by(1 + x.len() / 41) {
+        let at = |d: f32| {
+            let mut x = x.to_vec();
+            x[i] += d;
+            (f64::from(x[i]), f(&x).value)
+        };
+        let ((a, low), (b, high)) = (at(-h), at(h));
+        let numeric = (high - low) / (b - a);
+        let off = (numeric - f64::from(gradient[i])).abs();
+        assert!(off < tolerance * f64::from(largest), "[{i}]: {numeric} and {}", gradient[i]);
+    }
+}
+
+#[test]
+fn mse_is_its_formula() {
+    let (x, t) = (noise(300, 1), noise(300, 2));
+    let want: f64 = x.iter().zip(&t).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>() / 300.0;
+    assert!((loss::mse(&x, &t).value - want).abs() < 1e-9);
+    check_gradient(&x, 1e-2, 1e-3, |x| loss::mse(x, &t));
+}
+
+#[test]
+fn dssim_is_the_metric_and_has_its_gradient() {
+    let (w, h) = (23, 17);
+    let (x, t) = (noise(3 * w * h, 3), noise(3 * w * h, 4));
+    // The truth and a disturbed truth: SSIM far from 0.
+    let x: Vec<f32> = x.iter().zip(&t).map(|(x, t)| 0.3 * x + 0.7 * t).collect();
+    let inner = |p: &[f32]| -> Vec<f32> {
+        (0..w * h)
+            .flat_map(|i| (0..3).map(move |c| (c, i)))
+            .map(|(c, i)| p[c * w * h + i])
+            .collect()
+    };
+    let ssim = metrics::ssim(&inner(&x), &inner(&t), w, h).unwrap();
+    let found = loss::dssim(&x, &t, w, h);
+    assert!((found.value - 0.5 * (1.0 - ssim)).abs() < 1e-5, "{} {ssim}", found.value);
+    check_gradient(&x, 1e-2, 2e-2, |x| loss::dssim(x, &t, w, h));
+    // Too small for one window.
+    assert_eq!(loss::dssim(&x[..300], &t[..300], 10, 10), Scored::zero(300));
+}
+
+#[test]
+fn cross_entropy_shares_by_distance() {
+    let (d, n) = (7, 5);
+    let logits: Vec<f32> = noise(2 * d * n, 5).iter().map(|v| 4.0 * v - 2.0).collect();
+    let mut target: Vec<f32> = noise(2 * n, 6).iter().map(|v| v * (d - 1) as f32).collect();
+    (target[1], target[2], target[3], target[8]) = (f32::NAN, 6.0, 0.0, 6.5);
+    let found = loss::two_hot_cross_entropy(&logits, &target, [d, n]);
+    // Straight from the definition.
+    let (mut sum, mut count) = (0.0, 0.0);
+    for (i, t) in target.iter().enumerate() {
+        if !(0.0..=6.0).contains(t) {
+            continue;
+        }
+        let at = |k: usize| f64::from(logits[(i / n * d + k) * n + i % n]);
+        let total: f64 = (0..d).map(|k| at(k).exp()).sum();
+        let (k, share) = (t.floor() as usize, f64::from(t.fract()));
+        let p = |k: usize| (at(k).exp() / total).ln();
+        sum -= (1.0 - share) * p(k) + if share > 0.0 { share * p(k + 1) } else { 0.0 };
+        count += 1.0;
+    }
+    assert_eq!(count, 8.0);
+    assert!((found.value - sum / count).abs() < 1e-6, "{} {}", found.value, sum / count);
+    check_gradient(&logits, 1e-2, 1e-3, |x| loss::two_hot_cross_entropy(x, &target, [d, n]));
+    let unknown = loss::two_hot_cross_entropy(&logits, &vec![f32::NAN; 2 * n], [d, n]);
+    assert_eq!(unknown, Scored::zero(2 * d * n));
+}
+
+#[test]
+fn disparity_and_confidence_losses() {
+    let target: Vec<f32> = noise(60, 7).iter().map(|v| 5.0 * v).collect();
+    let mut with_gaps = target.clone();
+    with_gaps[7] = f32::NAN;
+    let x: Vec<f32> = noise(60, 8).iter().map(|v| 5.0 * v).collect();
+    check_gradient(&x, 1e-2, 1e-2, |x| loss::smooth_l1(x, &with_gaps));
+    let one = loss::smooth_l1(&[0.5, 4.0, 9.0], &[0.0, 1.0, f32::NAN]);
+    assert!((one.value - (0.125 + 2.5) / 2.0).abs() < 1e-9, "{}", one.value);
+    let p: Vec<f32> = noise(60, 9).iter().map(|v| 0.1 + 0.8 * v).collect();
+    check_gradient(&p, 1e-3, 1e-2, |p| loss::confidence(p, &x, &with_gaps));
+    // Least where the confidence is what it should be.
+    let wanted = (-1.0f32).exp();
+    let at = |p: f32| loss::confidence(&[p], &[1.5], &[0.0]);
+    assert!(at(wanted).gradient[0].abs() < 1e-5);
+    assert!(at(wanted).value < at(0.3).value && at(wanted).value < at(0.5).value);
+}
+
+#[test]
+fn candidates_and_blocks() {
+    // D = 5 between 1/4 and 1: index 0 is far.
+    let inverse = [0.25, 1.0, 0.625, 0.0, 0.2, 0.1, 1.2];
+    let index = loss::candidate_index(&inverse, (1.0, 4.0), 5);
+    assert_eq!(index[..3], [0.0, 4.0, 2.0]);
+    assert!(index[3].is_nan() && index[5].is_nan() && index[6].is_nan());
+    assert_eq!(index[4], 0.0);
+    let mut map: Vec<f32> = (0..32).map(|i| i as f32).collect();
+    // Left block: rows of 0 1 2 3, 8 9 10 11, …: the 8th of 16.
+    assert_eq!(loss::block_median(&map, 8), [11.0, 15.0]);
+    (0..9).for_each(|i| map[i % 3 + 8 * (i / 3)] = f32::NAN);
+    assert!(loss::block_median(&map, 8)[0].is_nan());
+}
+
+#[test]
+fn a_given_gradient_reaches_the_variable() {
+    let x = Var::new(&[[1f32, 2.0], [3.0, 4.0]], &Device::Cpu).unwrap();
+    let y = (x.as_tensor() * 3.0).unwrap();
+    let scored = Scored { value: 7.5, gradient: vec![1.0, 2.0, 3.0, 4.0] };
+    let loss = with_gradient(&y, scored.clone()).unwrap();
+    assert_eq!(loss.to_scalar::<f32>().unwrap(), 7.5);
+    let store = (loss * 2.0).unwrap().backward().unwrap();
+    let gradient = store.get(&x).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    assert_eq!(gradient, [6.0, 12.0, 18.0, 24.0]);
+    let short = Scored { gradient: vec![1.0], ..scored };
+    assert!(with_gradient(&y, short).unwrap_err().to_string().contains("4 elements"));
+}
+
+#[test]
+fn one_cycle_equals_pytorch() {
+    let Some(path) = common::shared("golden/onecycle_lr.json") else { return };
+    let text = std::fs::read_to_string(path).unwrap();
+    let golden: BTreeMap<String, f64> = serde_json::from_str(&text).unwrap();
+    let released = Warmup::Named(NamedWarmup::Released);
+    let schedule = Schedule::OneCycle { rate: 2e-4, warmup: released };
+    for (step, want) in &golden {
+        // MVSplat's `max_steps` is 300,001.
+        let got = schedule.rate(step.parse().unwrap(), 300_001);
+        assert!((got - want).abs() < 1e-9 * want + 1e-18, "{step}: {got} {want}");
+    }
+    // The other reading: 2,000 of 300,000 steps.
+    let schedule = Schedule::OneCycle { rate: 2e-4, warmup: Warmup::Steps(2000) };
+    assert!((schedule.rate(1999, 300_000) - 2e-4).abs() < 1e-12);
+    assert!(schedule.rate(1990, 300_000) < 2e-4 && schedule.rate(2010, 300_000) < 2e-4);
+}
+
+/// A loss of three variables, one of them a matrix.
+fn quadratic(vars: &BTreeMap<String, Var>) -> Tensor {
+    let term = |name: &str, to: f64| {
+        ((vars[name].as_tensor() - to).unwrap().sqr().unwrap().sum_all().unwrap() * 0.5).unwrap()
+    };
+    (term("small.w", 1.0) + term("subsplat.b", -2.0)).unwrap()
+}
+
+fn variables() -> BTreeMap<String, Var> {
+    let var = |v: &[f32], shape: &[usize]| {
+        Var::from_tensor(&Tensor::from_slice(v, shape, &Device::Cpu).unwrap()).unwrap()
+    };
+    BTreeMap::from([
+        ("small.w".to_owned(), var(&[0.5, -1.0, 2.0, 3.0], &[2, 2])),
+        ("small.unused".to_owned(), var(&[5.0], &[1])),
+        ("subsplat.b".to_owned(), var(&[0.0, 1.0], &[2])),
+    ])
+}
+
+/// AdamW as its paper writes it, in f64.
+#[test]
+fn the_optimizer_is_adamw() {
+    let settings = Settings { clip: 3.0, average: 0.9, weight_decay: 0.1, ..Settings::default() };
+    let vars = variables();
+    let mut optimizer = Optimizer::new(settings, vars.clone()).unwrap();
+    let mut value = [0.5f64, -1.0, 2.0, 3.0, 0.0, 1.0];
+    let (mut m, mut v, mut average) = ([0.0; 6], [0.0; 6], value);
+    for step in 0..5u64 {
+        let rate = 0.1 / (1.0 + step as f64);
+        let store = quadratic(&vars).backward().unwrap();
+        let mut gradients = optimizer.gradients();
+        optimizer.collect(&store, &mut gradients).unwrap();
+        let norm = gradients.norm();
+        optimizer.step(&gradients, norm, rate, step).unwrap();
+
+        let g: Vec<f64> = (0..6).map(|i| value[i] - if i < 4 { 1.0 } else { -2.0 }).collect();
+        let want = g.iter().map(|g| g * g).sum::<f64>().sqrt();
+        assert!((norm - want).abs() < 1e-5, "{norm} {want}");
+        let decay = 0.9f64.min((1.0 + step as f64) / (10.0 + step as f64));
+        for i in 0..6 {
+            let g = g[i] * (3.0 / want).min(1.0);
+            m[i] = 0.9 * m[i] + 0.1 * g;
+            v[i] = 0.999 * v[i] + 0.001 * g * g;
+            let t = step as i32 + 1;
+            let (mh, vh) = (m[i] / (1.0 - 0.9f64.powi(t)), v[i] / (1.0 - 0.999f64.powi(t)));
+            if i < 4 {
+                value[i] -= rate * 0.1 * value[i];
+            }
+            value[i] -= rate * mh / (vh.sqrt() + 1e-8);
+            average[i] = decay * average[i] + (1.0 - decay) * value[i];
+        }
+    }
+    let flat = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    let got = [flat(&vars["small.w"]), flat(&vars["subsplat.b"])].concat();
+    let averaged = optimizer.averaged().unwrap();
+    let got_average = [flat(&averaged["small.w"]), flat(&averaged["subsplat.b"])].concat();
+    for i in 0..6 {
+        assert!((f64::from(got[i]) - value[i]).abs() < 1e-5, "{i}: {} {}", got[i], value[i]);
+        assert!((f64::from(got_average[i]) - average[i]).abs() < 1e-5);
+    }
+    // No loss reached it: not even decayed.
+    assert_eq!(flat(&vars["small.unused"]), [5.0]);
+}
+
+#[test]
+fn a_frozen_backbone_stands_still_and_state_comes_back() {
+    let settings = Settings { freeze_backbone: true, ..Settings::default() };
+    let vars = variables();
+    let mut optimizer = Optimizer::new(settings, vars.clone()).unwrap();
+    let step = |optimizer: &mut Optimizer, vars: &BTreeMap<String, Var>, n: u64| {
+        let store = quadratic(vars).backward().unwrap();
+        let mut gradients = optimizer.gradients();
+        optimizer.collect(&store, &mut gradients).unwrap();
+        let norm = gradients.norm();
+        optimizer.step(&gradients, norm, 0.1, n).unwrap();
+    };
+    step(&mut optimizer, &vars, 0);
+    let flat = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    assert_eq!(flat(&vars["small.w"]), [0.5, -1.0, 2.0, 3.0]);
+    assert_ne!(flat(&vars["subsplat.b"]), [0.0, 1.0]);
+    let state = optimizer.state().unwrap();
+    let others = variables();
+    let mut other = Optimizer::new(settings, others.clone()).unwrap();
+    other.restore(state.clone()).unwrap();
+    step(&mut optimizer, &vars, 1);
+    step(&mut other, &others, 1);
+    assert_eq!(flat(&vars["subsplat.b"]), flat(&others["subsplat.b"]));
+    let mut lacking = state.clone();
+    lacking.remove("first/small.w");
+    assert!(other.restore(lacking).unwrap_err().to_string().contains("first/small.w"));
+    let mut foreign = state;
+    foreign
+        .insert("first/x".into(), Tensor::zeros(1, candle_core::DType::F32, &Device::Cpu).unwrap());
+    assert!(other.restore(foreign).unwrap_err().to_string().contains("first/x"));
+}
+
+fn rooms() -> Rooms {
+    let mut spec = ExampleSpec::new(32, 24, 1);
+    spec.photographic = false;
+    Rooms {
+        seed: 4,
+        scenes: 0,
+        spec,
+        targets: TargetSpec { ratio: 2, samples: 1, clean: true },
+        seen_range: 0.0,
+    }
+}
+
+#[test]
+fn rooms_are_a_number() {
+    let one = rooms().example(3).unwrap();
+    assert_eq!(one, rooms().example(3).unwrap());
+    assert_ne!(one, rooms().example(4).unwrap());
+    assert_eq!(one.context.len(), 2);
+    assert_eq!((one.targets[0].image.width, one.targets[0].image.height), (64, 48));
+    assert_eq!(one.targets[0].camera.intrinsics.width, 64);
+    assert_eq!(one.inverse_depth[1].len(), 32 * 24);
+    let finite = Rooms { scenes: 3, ..rooms() };
+    assert_eq!(finite.example(4).unwrap(), rooms().example(1).unwrap());
+}
+
+#[test]
+fn a_seen_range_is_a_little_wider_than_what_is_seen() {
+    let all = Rooms { seen_range: 1.0, ..rooms() };
+    for i in 0..6 {
+        let (own, seen) = (rooms().example(i).unwrap(), all.example(i).unwrap());
+        assert_eq!((&own.context, &own.inverse_depth), (&seen.context, &seen.inverse_depth));
+        let mut depths: Vec<f32> =
+            seen.inverse_depth.iter().flatten().map(|d| d.to_f32().recip()).collect();
+        depths.sort_by(f32::total_cmp);
+        let last = depths.len() - 1;
+        let (low, high) = (depths[last / 100], depths[last - last / 100]);
+        let (near, far) = seen.near_far;
+        assert!((0.74 * low..=1.01 * low).contains(&near), "{near} {low}");
+        assert!((0.99 * high..=1.41 * high).contains(&far), "{far} {high}");
+        assert_eq!(seen, all.example(i).unwrap());
+    }
+}
+
+#[test]
+fn replay_shows_each_scene_so_often_and_no_other() {
+    let replay = Replay::new(rooms(), 7, 3);
+    let places: Vec<u64> = (0..42).map(|i| replay.place(i)).collect();
+    for block in 0..2u64 {
+        for pass in 0..3 {
+            let start = (block * 21 + pass * 7) as usize;
+            let mut window = places[start..start + 7].to_vec();
+            window.sort_unstable();
+            assert_eq!(window, (block * 7..block * 7 + 7).collect::<Vec<_>>());
+        }
+    }
+    assert_ne!(places[..7], places[7..14], "the same order again");
+    // A window and a number of times whose product no number holds.
+    assert!(Replay::new(rooms(), 1 << 32, 1 << 32).place(5) < 1 << 32);
+    assert_eq!(replay.example(9).unwrap(), rooms().example(places[9]).unwrap());
+    assert_eq!(replay.example(9).unwrap(), replay.example(9).unwrap());
+}
+
+/// A point of the world, its picture and the mirror's must agree.
+#[test]
+fn the_mirror_keeps_the_geometry() {
+    let k = Intrinsics { fx: 30.0, fy: 31.0, cx: 13.0, cy: 9.0, width: 32, height: 24 };
+    let pose = glam::Mat4::from_rotation_translation(
+        glam::Quat::from_euler(glam::EulerRot::YXZ, 0.3, -0.2, 0.1),
+        glam::Vec3::new(0.4, -0.3, 0.2),
+    );
+    let camera = Camera::new(k, pose).unwrap();
+    let data = (0..32 * 24 * 3).map(|i| (i % 251) as u8).collect();
+    let image = Rgb { width: 32, height: 24, data };
+    let picture = Posed { image, camera };
+    let mirrored = picture.flipped();
+    assert_eq!(mirrored.image.data[..3], picture.image.data[31 * 3..32 * 3]);
+    let rotation = mirrored.camera.rotation();
+    assert!((rotation.determinant() - 1.0).abs() < 1e-5);
+    for p in [glam::Vec3::new(0.5, 0.2, 3.0), glam::Vec3::new(-1.0, 0.4, 2.0)] {
+        let before = camera.project(p).unwrap();
+        let after = mirrored.camera.project(glam::Vec3::new(-p.x, p.y, p.z)).unwrap();
+        assert!((after.x - (32.0 - before.x)).abs() < 1e-4 && (after.y - before.y).abs() < 1e-4);
+    }
+    assert_eq!(mirrored.flipped().image, picture.image);
+}
+
+#[test]
+fn augmentation_is_a_function_of_the_place() {
+    let example = rooms().example(0).unwrap();
+    let all = Augmentation { flip: 0.5, permute: 0.5, swap: 0.5 };
+    let shown: Vec<Example> = (0..24).map(|i| all.apply(&example, 1, i)).collect();
+    assert_eq!(shown[5], all.apply(&example, 1, 5));
+    let different = shown.iter().filter(|e| **e != *example).count();
+    assert!((12..24).contains(&different), "{different}");
+    let off = Augmentation { flip: 0.0, permute: 0.0, swap: 0.0 };
+    assert_eq!(off.apply(&example, 1, 5), *example);
+    let swap = Augmentation { swap: 1.0, ..off }.apply(&example, 1, 5);
+    assert_eq!(swap.context[0], example.context[1]);
+    assert_eq!(swap.inverse_depth[0], example.inverse_depth[1]);
+    let flip = Augmentation { flip: 1.0, ..off }.apply(&example, 1, 5);
+    assert_eq!(flip.inverse_depth[0][0], example.inverse_depth[0][31]);
+    assert_eq!(flip.targets[0].image.data[..3], example.targets[0].image.data[63 * 3..64 * 3]);
+}
+
+#[test]
+fn loading_gives_the_sequence_for_any_number_of_threads() {
+    let off = Augmentation { flip: 0.0, permute: 0.0, swap: 0.0 };
+    for workers in [1, 3] {
+        let mut loader = Loader::start(Arc::new(rooms()), (off, 0), (workers, 4), 2).unwrap();
+        for i in 2..8 {
+            assert_eq!(loader.position(), i);
+            assert_eq!(loader.take().unwrap(), *rooms().example(i).unwrap());
+        }
+    }
+}

@@ -1,0 +1,47 @@
+//! The GPU that tests run on: any adapter, a software one too.
+
+use std::sync::{Arc, OnceLock};
+use subsplat::gpu::{DeviceChoice, Gpu};
+
+/// The adapter, opened once, or `None`, loudly, where there is none.
+/// `SUBSPLAT_GPU=require` (CI) turns absence into failure.
+pub fn gpu() -> Option<Arc<Gpu>> {
+    static GPU: OnceLock<Option<Arc<Gpu>>> = OnceLock::new();
+    GPU.get_or_init(|| {
+        let required = std::env::var("SUBSPLAT_GPU").is_ok_and(|v| v == "require");
+        let line = match Gpu::open(&DeviceChoice::Gpu) {
+            Ok(Some(gpu)) => {
+                tell(&format!("GPU: {}\n", gpu.adapter()));
+                return Some(gpu);
+            }
+            Ok(None) => "no GPU".to_owned(),
+            Err(e) => e.to_string(),
+        };
+        assert!(!required, "a GPU adapter is required: {line}");
+        tell(&format!("SKIP: {line}; this test checked nothing\n"));
+        None
+    })
+    .clone()
+}
+
+/// The same adapter with a device of whose buffers at most `binding` bytes are bound.
+pub fn limited(binding: u64) -> Option<Arc<Gpu>> {
+    use subsplat::gpu::{find_for, instance, wgpu};
+    gpu()?;
+    let adapter = find_for(&instance(), &DeviceChoice::Gpu, None).unwrap().unwrap();
+    let descriptor = wgpu::DeviceDescriptor {
+        required_features: adapter.features() & wgpu::Features::TIMESTAMP_QUERY,
+        required_limits: wgpu::Limits {
+            max_storage_buffer_binding_size: binding,
+            ..wgpu::Limits::default()
+        },
+        ..wgpu::DeviceDescriptor::default()
+    };
+    let (device, queue) = pollster::block_on(adapter.request_device(&descriptor)).unwrap();
+    Some(Gpu::from_device(device, queue))
+}
+
+/// Not `eprintln!`, which cargo hides for tests that pass.
+fn tell(line: &str) {
+    std::io::Write::write_all(&mut std::io::stderr(), line.as_bytes()).ok();
+}

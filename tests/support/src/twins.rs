@@ -1,0 +1,43 @@
+//! Numbers and comparisons for tests that hold a WGSL kernel to its CPU twin.
+
+/// xorshift64*: uniform in [from, to).
+pub struct Random(pub u64);
+
+impl Random {
+    pub fn range(&mut self, from: f32, to: f32) -> f32 {
+        self.0 ^= self.0 >> 12;
+        self.0 ^= self.0 << 25;
+        self.0 ^= self.0 >> 27;
+        let unit = (self.0.wrapping_mul(0x2545_F491_4F6C_DD1D) >> 40) as f32 / (1u64 << 24) as f32;
+        from + (to - from) * unit
+    }
+
+    pub fn many(&mut self, count: usize, from: f32, to: f32) -> Vec<f32> {
+        (0..count).map(|_| self.range(from, to)).collect()
+    }
+}
+
+/// Largest |got − expected| in units of the largest |expected|; NaN where one is.
+pub fn of_largest(got: &[f32], expected: &[f32]) -> f32 {
+    assert_eq!(got.len(), expected.len());
+    let largest = expected.iter().fold(0f32, |m, v| m.max(v.abs())).max(f32::MIN_POSITIVE);
+    let pairs = got.iter().zip(expected);
+    let off = pairs.map(|(g, e)| (g - e).abs() / largest);
+    off.fold(0.0, |m, d| if d > m || d.is_nan() { d } else { m })
+}
+
+/// [`of_largest`] is below `allowed`, and is not once one number in the middle is off by
+/// twice that.
+#[track_caller]
+pub fn assert_twins(name: &str, got: &[f32], expected: &[f32], allowed: f32) {
+    let off = of_largest(got, expected);
+    if std::env::var_os("SUBSPLAT_SHOW").is_some() {
+        eprintln!("{name}: {off:e}");
+    }
+    assert!(off < allowed, "{name}: {off:e}");
+    let largest = expected.iter().fold(0f32, |m, v| m.max(v.abs())).max(f32::MIN_POSITIVE);
+    let mut perturbed = got.to_vec();
+    let middle = got.len() / 2;
+    perturbed[middle] = expected[middle] + 2.0 * allowed * largest;
+    assert!(of_largest(&perturbed, expected) > allowed, "{name}: a perturbed side passes");
+}

@@ -1,0 +1,4 @@
+//! PyTorch files, good and hostile.
+
+mod hostile_torch;
+mod torch_files;

@@ -1,0 +1,131 @@
+//! `subsplat check`: are these poses right?
+
+use super::args::CheckArgs;
+use super::range::grey;
+use super::{frames, pair};
+use crate::report::{Answer, Progress, peak_memory_bytes, say, warn};
+use anyhow::{Context, Result, ensure};
+use serde_json::json;
+use subsplat::check::{
+    CheckOptions, PairReport, RgbPicture, Verdict, check_pair, epipolar_picture,
+};
+use subsplat::data::pair::choose_pair;
+use subsplat::io::image::{Rgb, save_png};
+use subsplat::io::scene::Scene;
+
+/// Runs the command; `false` where the poses are judged bad.
+pub fn check(args: &CheckArgs, answer: Answer) -> Result<bool> {
+    let mut progress = Progress::new();
+    let scene = progress.stage("scene", |_| pair::load(&args.input, &args.pair))?;
+    scene.warnings.iter().for_each(warn);
+    let pairs = pairs(args, &scene)?;
+    say(format!(
+        "{}: {} frames ({}), {} pair(s) to judge",
+        scene.name,
+        scene.frames.len(),
+        scene.source.name(),
+        pairs.len()
+    ));
+    std::fs::create_dir_all(&args.out)
+        .with_context(|| format!("output folder {}", args.out.display()))?;
+    let mut reports = Vec::new();
+    let mut good = true;
+    progress.steps("matching", pairs.len(), |bar| {
+        for &[i, j] in &pairs {
+            let (report, picture) = judge(&scene, i, j)?;
+            good &= report.verdict != Verdict::Bad;
+            let file = args.out.join(format!("epipolar_{i}_{j}.png"));
+            if let Some(picture) = &picture {
+                save_png(&file, picture)?;
+            }
+            bar.suspend(|| tell(answer, &scene, [i, j], &report));
+            // Without the hundreds of matched points: the picture shows them.
+            let mut value = serde_json::to_value(&report)?;
+            value["frames"] = json!([scene.frames[i].name, scene.frames[j].name]);
+            value["epipolar_picture"] = json!(picture.map(|_| file.display().to_string()));
+            reports.push(value);
+            bar.inc(1);
+        }
+        anyhow::Ok(())
+    })?;
+    say(format!("epipolar pictures in {}", args.out.display()));
+    answer.finish(&json!({
+        "scene": scene.name,
+        "ok": good,
+        "pairs": reports,
+        "seconds": progress.seconds(),
+        "peak_memory_bytes": peak_memory_bytes(),
+    }))?;
+    Ok(good)
+}
+
+fn pairs(args: &CheckArgs, scene: &Scene) -> Result<Vec<[usize; 2]>> {
+    let n = scene.frames.len();
+    ensure!(n >= 2, "{}: expected at least 2 frames, got {n}", args.input[0].display());
+    if !args.context.is_empty() {
+        let chosen = frames::indices(scene, &args.context, "--context")?;
+        ensure!(chosen.len() >= 2, "--context: expected at least 2 frames, got {}", chosen.len());
+        return Ok(chosen.windows(2).map(|w| [w[0], w[1]]).collect());
+    }
+    if n == 2 {
+        return Ok(vec![[0, 1]]);
+    }
+    let tests = frames::protocol(&args.input[0], scene)?;
+    let pairs: Vec<[usize; 2]> = tests
+        .iter()
+        .filter(|t| t.context.len() >= 2)
+        .map(|t| [t.context[0], t.context[1]])
+        .collect();
+    if !pairs.is_empty() {
+        return Ok(pairs);
+    }
+    Ok(choose_pair(scene).map_or(vec![[0, n - 1]], |pair| vec![pair.frames]))
+}
+
+fn judge(scene: &Scene, i: usize, j: usize) -> Result<(PairReport, Option<Rgb>)> {
+    let (a, camera_a) = scene.frames[i].load()?;
+    let (b, camera_b) = scene.frames[j].load()?;
+    let options = CheckOptions::default();
+    let report = check_pair(&grey(&a)?, &camera_a, &grey(&b)?, &camera_b, &options);
+    fn picture(p: &Rgb) -> RgbPicture<'_> {
+        RgbPicture { width: p.width, height: p.height, pixels: &p.data }
+    }
+    let drawn =
+        epipolar_picture([picture(&a), picture(&b)], [&camera_a, &camera_b], &report.points)
+            .map(|(width, height, data)| Rgb { width, height, data });
+    Ok((report, drawn))
+}
+
+fn word(verdict: Verdict) -> &'static str {
+    match verdict {
+        Verdict::Ok => "ok",
+        Verdict::Warning => "warning",
+        Verdict::Bad => "bad",
+    }
+}
+
+fn tell(answer: Answer, scene: &Scene, [i, j]: [usize; 2], report: &PairReport) {
+    let names = [&scene.frames[i].name, &scene.frames[j].name];
+    answer.line(format!(
+        "frames {i} ({}) and {j} ({}): {}",
+        names[0],
+        names[1],
+        word(report.verdict)
+    ));
+    let median = report.epipolar.as_ref().and_then(|e| e.median_px);
+    answer.line(format!(
+        "  {} matches; median epipolar error {}; baseline {:.4}, rotation {:.1}°, field of view {:.1}°×{:.1}°{}",
+        report.matches,
+        median.map_or("unknown".to_owned(), |m| format!("{m:.2} px at 640 px wide")),
+        report.baseline,
+        report.rotation_deg,
+        report.fov_deg[0][0],
+        report.fov_deg[0][1],
+        report
+            .overlap
+            .map_or(String::new(), |o| format!(", overlap {:.0} %", 100.0 * o[0].min(o[1])))
+    ));
+    for finding in &report.findings {
+        answer.line(format!("  {}: {}", word(finding.severity), finding.sentence));
+    }
+}

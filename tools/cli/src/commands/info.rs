@@ -1,0 +1,157 @@
+//! `subsplat info`: what a file or a scene holds.
+
+use super::args::InfoArgs;
+use crate::report::Answer;
+use anyhow::{Context, Result, bail};
+use serde_json::{Value, json};
+use std::path::Path;
+use subsplat::config::Config;
+use subsplat::io::image::probe;
+use subsplat::io::scene::{Scene, load_scene};
+use subsplat::io::{SplatFormat, SplatInfo, splat_info};
+use subsplat::model::weights::Weights;
+
+/// Runs the command.
+pub fn info(args: &InfoArgs, answer: Answer) -> Result<()> {
+    let path = args.file.as_path();
+    let metadata = std::fs::metadata(path).with_context(|| path.display().to_string())?;
+    let report = if metadata.is_dir() { scene(path, answer)? } else { file(path, answer)? };
+    answer.finish(&report)
+}
+
+fn file(path: &Path, answer: Answer) -> Result<Value> {
+    let head = head(path)?;
+    if SplatFormat::from_magic(&head).is_some() || SplatFormat::from_name(path).is_some() {
+        return splats(path, answer);
+    }
+    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+    match extension.as_str() {
+        "safetensors" => weights(path, answer),
+        "json" | "txt" | "bin" => scene(path, answer),
+        "png" | "jpg" | "jpeg" | "webp" | "bmp" | "tif" | "tiff" => picture(path, answer),
+        _ => bail!(
+            "{}: expected a splat file (.ply .glb .spz .splat .ksplat), weights (.safetensors), a \
+             picture, a pose file or a scene folder, got `.{extension}`",
+            path.display()
+        ),
+    }
+}
+
+/// The first 64 bytes of a file.
+pub fn head(path: &Path) -> Result<Vec<u8>> {
+    use std::io::Read;
+    let mut head = Vec::new();
+    let file = std::fs::File::open(path).with_context(|| path.display().to_string())?;
+    file.take(64).read_to_end(&mut head).with_context(|| path.display().to_string())?;
+    Ok(head)
+}
+
+fn splats(path: &Path, answer: Answer) -> Result<Value> {
+    let info = splat_info(path)?;
+    answer.line(format!(
+        "{}: {}, {} Gaussians, SH degree {}, {} bytes",
+        path.display(),
+        info.flavour,
+        info.count,
+        info.sh_degree,
+        info.bytes
+    ));
+    if let Some([low, high]) = info.bounds {
+        answer.line(format!("  means from {low:?} to {high:?}"));
+    }
+    answer.line(format!("  quantiles {:?}", SplatInfo::QUANTILES));
+    answer.line(format!("  opacity   {:?}", info.opacity));
+    answer.line(format!("  sigma     {:?}", info.scale));
+    answer.line(format!("  {} invisible, {} not finite", info.invisible, info.non_finite));
+    info.comments.iter().for_each(|c| answer.line(format!("  comment: {c}")));
+    Ok(json!({ "kind": "splats", "file": path.display().to_string(), "splats": info }))
+}
+
+fn weights(path: &Path, answer: Answer) -> Result<Value> {
+    let weights = Weights::load(path)?;
+    let tensors = weights.tensors();
+    let parameters: usize = tensors.values().map(|t| t.elem_count()).sum();
+    let config: Option<Value> = match weights.config() {
+        Some(config) => Some(serde_json::to_value(config)?),
+        None => None,
+    };
+    answer.line(format!("{}: {} tensors, {parameters} parameters", path.display(), tensors.len()));
+    match weights.config().map(Config::to_json) {
+        Some(json) => answer.line(format!("  configuration: {}", json?)),
+        None => answer.line("  no configuration in the metadata (a bare checkpoint)"),
+    }
+    let shapes: serde_json::Map<String, Value> =
+        tensors.iter().map(|(name, t)| (name.clone(), json!(t.dims()))).collect();
+    Ok(json!({
+        "kind": "weights",
+        "file": path.display().to_string(),
+        "tensors": shapes,
+        "parameters": parameters,
+        "config": config,
+    }))
+}
+
+fn picture(path: &Path, answer: Answer) -> Result<Value> {
+    let p = probe(path)?;
+    answer.line(format!("{}: {}x{} pixels", path.display(), p.width, p.height));
+    if let Some(orientation) = p.orientation.filter(|o| *o != 1) {
+        answer.line(format!(
+            "  EXIF orientation {orientation}, which pose files do not know: ignored"
+        ));
+    }
+    Ok(json!({
+        "kind": "picture",
+        "file": path.display().to_string(),
+        "width": p.width,
+        "height": p.height,
+        "exif_orientation": p.orientation,
+    }))
+}
+
+fn scene(path: &Path, answer: Answer) -> Result<Value> {
+    let scene: Scene = load_scene(path)?;
+    answer.line(format!(
+        "{}: {} frames ({}), {} sparse points",
+        scene.name,
+        scene.frames.len(),
+        scene.source.name(),
+        scene.points.as_ref().map_or(0, Vec::len)
+    ));
+    scene.warnings.iter().for_each(|w| answer.line(format!("  warning: {w}")));
+    let frame = |(i, f): (usize, &subsplat::io::scene::Frame)| {
+        let k = f.camera.intrinsics;
+        let p = f.camera.position();
+        answer.line(format!(
+            "  {i:>3} {:<12} {}x{} fx {:.1} fy {:.1} fov {:.1}°×{:.1}° at ({:.3}, {:.3}, {:.3})",
+            f.name,
+            k.width,
+            k.height,
+            k.fx,
+            k.fy,
+            k.fov_x().to_degrees(),
+            k.fov_y().to_degrees(),
+            p.x,
+            p.y,
+            p.z
+        ));
+        json!({
+            "name": f.name,
+            "image": f.image.display().to_string(),
+            "width": k.width,
+            "height": k.height,
+            "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy,
+            "world_from_camera": f.camera.world_from_camera.transpose().to_cols_array_2d(),
+        })
+    };
+    let frames: Vec<Value> = scene.frames.iter().enumerate().map(frame).collect();
+    Ok(json!({
+        "kind": "scene",
+        "file": path.display().to_string(),
+        "name": scene.name,
+        "format": scene.source.name(),
+        "frames": frames,
+        "near_far": scene.near_far,
+        "sparse_points": scene.points.as_ref().map_or(0, Vec::len),
+        "warnings": scene.warnings,
+    }))
+}

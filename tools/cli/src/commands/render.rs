@@ -1,0 +1,248 @@
+//! `subsplat render`: a finished scene to pictures.
+
+use super::args::{LookArgs, LowpassArg, PathArg, RenderArgs};
+use super::frames;
+use super::memory;
+use super::output::{self, to_rgb8};
+use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, say, warn};
+use anyhow::{Context, Result, ensure};
+use serde_json::json;
+use std::path::Path;
+use subsplat::abi::{Convention, RasterOptions};
+use subsplat::camera::{Camera, Intrinsics};
+use subsplat::io::cameras_json::{is_cameras_json, load_cameras_json};
+use subsplat::io::image::{Depth, save_depth_png, save_png};
+use subsplat::io::load_with_comments;
+use subsplat::io::scene::load_scene;
+use subsplat::navigation::Bounds;
+use subsplat::render::Renderer;
+use subsplat::splats::Splats;
+
+/// Side of a picture where no camera says otherwise, px.
+const DEFAULT_SIDE: usize = 512;
+/// Horizontal field of view of the view that is made up where there is no camera.
+const DEFAULT_FOV_X: f32 = 0.9;
+
+/// `--background`, checked.
+pub fn background(look: &LookArgs) -> Result<Option<[f32; 3]>> {
+    if let Some([r, g, b]) = look.background {
+        let ok = [r, g, b].iter().all(|v| (0.0..=1.0).contains(v));
+        ensure!(ok, "--background: expected three numbers in [0, 1], got {r},{g},{b}");
+    }
+    Ok(look.background)
+}
+
+/// The renderer that is asked for, or the CPU's with a warning.
+pub fn open(look: &LookArgs) -> Renderer {
+    let mut renderer = Renderer::open_or_cpu(&look.device);
+    renderer.take_warning().iter().for_each(warn);
+    renderer
+}
+
+/// Runs the command.
+pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
+    let mut progress = Progress::new();
+    check(args)?;
+    let (splats, comments) = progress.stage("scene", |_| load_with_comments(&args.scene))?;
+    let cameras = cameras(args, &splats)?;
+    check_sizes(&cameras)?;
+    let options = options(&args.look, args.near, args.sh_degree, &comments)?;
+    let folder = if args.depth { args.out.join("depth") } else { args.out.clone() };
+    std::fs::create_dir_all(&folder)
+        .with_context(|| format!("output folder {}", folder.display()))?;
+    let mut views = Vec::new();
+    let mut renderer = open(&args.look);
+    progress.steps("rendering", cameras.len(), |bar| {
+        for (name, camera) in &cameras {
+            let picture = renderer.render(&splats, camera, &options);
+            renderer.take_warning().iter().for_each(warn);
+            let (width, height) = (picture.width, picture.height);
+            let file = args.out.join(format!("{name}.png"));
+            save_png(&file, &to_rgb8(&picture.rgb, width, height))?;
+            let file = file.display().to_string();
+            let mut view = json!({ "file": file, "width": width, "height": height });
+            if args.depth {
+                let file = args.out.join(format!("depth/{name}.png"));
+                let unit = save_depth_png(&file, &Depth { width, height, data: picture.depth })?;
+                view["depth_file"] = json!(file.display().to_string());
+                view["depth_unit"] = json!(unit);
+            }
+            views.push(view);
+            bar.inc(1);
+        }
+        anyhow::Ok(())
+    })?;
+    let seconds = progress.seconds();
+    let peak = peak_memory_bytes();
+    answer.line(format!(
+        "{} Gaussians, {} views in {}; {:.1} s{}",
+        splats.len(),
+        views.len(),
+        args.out.display(),
+        seconds["total"].as_f64().unwrap_or(0.0),
+        peak.map_or(String::new(), |p| format!(", peak memory {}", mebibytes(p)))
+    ));
+    let mvsplat_rules = options.convention == Convention::Mvsplat;
+    answer.finish(&json!({
+        "scene": args.scene.display().to_string(),
+        "gaussians": splats.len(),
+        "device": renderer.device(),
+        "convention": if mvsplat_rules { "mvsplat" } else { "standard" },
+        "views": views,
+        "seconds": seconds,
+        "peak_memory_bytes": peak,
+    }))
+}
+
+/// What is wrong with the arguments themselves, before a large file is read.
+fn check(args: &RenderArgs) -> Result<()> {
+    background(&args.look)?;
+    ensure!(args.sh_degree <= 4, "--sh-degree: expected 0 to 4, got {}", args.sh_degree);
+    check_near(args.near)?;
+    frames::count(args.frames)?;
+    args.size.as_deref().map_or(Ok(()), |text| memory::check_picture("--size", frames::size(text)?))
+}
+
+/// Refuses cameras of a file whose pictures the machine cannot hold, by the frame's name.
+fn check_sizes(cameras: &[(String, Camera)]) -> Result<()> {
+    let mut fits = None;
+    for (name, camera) in cameras {
+        let size = (camera.intrinsics.width, camera.intrinsics.height);
+        // A path has thousands of one size.
+        if fits != Some(size) {
+            memory::check_picture(&format!("frame {name}:"), size)?;
+            fits = Some(size);
+        }
+    }
+    Ok(())
+}
+
+/// `--near`, checked.
+pub fn check_near(near: Option<f32>) -> Result<()> {
+    let Some(near) = near else { return Ok(()) };
+    ensure!(near > 0.0 && near.is_finite(), "--near: expected above 0, got {near}");
+    Ok(())
+}
+
+/// The arguments', else what `run` noted in the file, else the standard.
+pub fn options(
+    look: &LookArgs,
+    near: Option<f32>,
+    sh_degree: usize,
+    comments: &[String],
+) -> Result<RasterOptions> {
+    let noted = output::rendering(comments);
+    let asked = look.convention.map(Convention::from);
+    // What was noted for one convention says nothing about the other.
+    let mut options = match noted.filter(|n| asked.is_none_or(|a| a == n.convention)) {
+        Some(noted) => noted,
+        None => RasterOptions::new(asked.unwrap_or(Convention::Standard)),
+    };
+    options.near = near.unwrap_or(options.near);
+    options.sh_degree = sh_degree;
+    options.background = background(look)?.unwrap_or(options.background);
+    if matches!(look.lowpass_ref, Some(LowpassArg::Input)) {
+        warn("--lowpass-ref input: a scene file does not know its input's size; ignored");
+    }
+    Ok(options)
+}
+
+/// File stems and cameras.
+fn cameras(args: &RenderArgs, splats: &Splats) -> Result<Vec<(String, Camera)>> {
+    let named = named_cameras(args, splats)?;
+    let sized = |camera: Camera| -> Result<Camera> {
+        let Some(text) = &args.size else { return Ok(camera) };
+        let (w, h) = frames::size(text)?;
+        let k = camera.intrinsics;
+        // Square pixels stay square: the picture is fitted, then widened or cropped.
+        let scale = (w as f32 / k.width as f32).max(h as f32 / k.height as f32);
+        let intrinsics = Intrinsics {
+            fx: k.fx * scale,
+            fy: k.fy * scale,
+            cx: w as f32 * 0.5 + (k.cx - 0.5 * k.width as f32) * scale,
+            cy: h as f32 * 0.5 + (k.cy - 0.5 * k.height as f32) * scale,
+            width: w,
+            height: h,
+        };
+        Ok(Camera { intrinsics, ..camera })
+    };
+    let path = |cameras: Vec<Camera>| -> Result<Vec<(String, Camera)>> {
+        let name = |i| format!("path_{i:04}");
+        cameras.into_iter().enumerate().map(|(i, c)| Ok((name(i), sized(c)?))).collect()
+    };
+    let through: Vec<Camera> = named.iter().map(|(_, c)| *c).collect();
+    match args.path {
+        PathArg::Targets => named.into_iter().map(|(n, c)| Ok((n, sized(c)?))).collect(),
+        PathArg::Interpolate => path(frames::interpolate(&through, args.frames)?),
+        PathArg::Orbit => {
+            let depth = median_depth(splats, &through[0]);
+            path(frames::orbit(&through, depth, args.frames)?)
+        }
+    }
+}
+
+fn named_cameras(args: &RenderArgs, splats: &Splats) -> Result<Vec<(String, Camera)>> {
+    let beside = args.scene.parent().unwrap_or(Path::new("")).join("cameras.json");
+    let source = match &args.cameras {
+        Some(path) => path.clone(),
+        None if beside.is_file() => beside,
+        None => {
+            ensure!(
+                args.target.is_empty(),
+                "--target: expected --cameras or cameras.json beside the scene"
+            );
+            say("no cameras given and no cameras.json beside the scene: a view of the whole");
+            return Ok(vec![("view".to_owned(), whole(splats)?)]);
+        }
+    };
+    let all = read_cameras(&source)?;
+    ensure!(!all.is_empty(), "{}: expected a camera, got none", source.display());
+    let names: Vec<&str> = all.iter().map(|(n, _)| n.as_str()).collect();
+    let chosen = match args.target.is_empty() {
+        true => (0..all.len()).collect(),
+        false => frames::pick(&names, &args.target, "--target")?,
+    };
+    let (names, cameras): (Vec<String>, Vec<Camera>) =
+        chosen.into_iter().map(|i| all[i].clone()).unzip();
+    Ok(frames::file_stems(&names).into_iter().zip(cameras).collect())
+}
+
+/// Names and cameras of a pose file or scene folder.
+pub fn read_cameras(source: &Path) -> Result<Vec<(String, Camera)>> {
+    let inside = source.join("cameras.json");
+    let list = if inside.is_file() { &inside } else { source };
+    // A camera list needs no pictures; any other pose file goes through its reader.
+    if list.is_file() && is_cameras_json(list)? {
+        let content = load_cameras_json(list)?;
+        let name = |file: &str| {
+            let file = file.strip_prefix("images/").unwrap_or(file);
+            Path::new(file).with_extension("").to_string_lossy().into_owned()
+        };
+        return Ok(content.cameras.iter().map(|c| (name(&c.file), c.camera)).collect());
+    }
+    let scene = load_scene(source)?;
+    scene.warnings.iter().for_each(warn);
+    scene.frames.iter().map(|f| Ok((f.name.clone(), f.pinhole()?))).collect()
+}
+
+/// Of the splats in front of `camera`, camera z; 1 where there is none.
+pub fn median_depth(splats: &Splats, camera: &Camera) -> f32 {
+    let mut z: Vec<f32> = (0..splats.len())
+        .map(|i| camera.to_camera(splats.mean(i).into()).z)
+        .filter(|z| *z > 0.0)
+        .collect();
+    z.sort_by(f32::total_cmp);
+    z.get(z.len() / 2).copied().unwrap_or(1.0)
+}
+
+/// The middle of a scene's splats.
+pub fn bounds(splats: &Splats) -> Result<Bounds> {
+    Bounds::of((0..splats.len()).map(|i| splats.mean(i))).context("the scene holds no Gaussian")
+}
+
+/// A camera that looks along +z at the middle 96 % of the means.
+pub fn whole(splats: &Splats) -> Result<Camera> {
+    let Camera { intrinsics, world_from_camera } =
+        bounds(splats)?.camera(DEFAULT_FOV_X, DEFAULT_SIDE);
+    Ok(Camera::new(intrinsics, world_from_camera)?)
+}

@@ -1,0 +1,377 @@
+//! `subsplat run`: photographs to Gaussians, views and files.
+
+use super::args::{DetailArg, LookArgs, LowpassArg, PathArg, RunArgs};
+use super::output::{self, Scored, View, Views};
+use super::{frames, memory, model, pair, range, render};
+use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, say, warn};
+use anyhow::{Result, bail, ensure};
+use indicatif::ProgressBar;
+use serde_json::{Value, json};
+use std::path::Path;
+use subsplat::abi::{Convention, RasterOptions};
+use subsplat::camera::Camera;
+use subsplat::check::PairReport;
+use subsplat::config::{Config, LowpassRef};
+use subsplat::data::crop::Cropped;
+use subsplat::data::depth::{DepthRange, depth_range};
+use subsplat::data::pair::choose_pair;
+use subsplat::io::SaveOptions;
+use subsplat::io::scene::Scene;
+use subsplat::ops::Backend;
+use subsplat::pipeline::{self, Photo, Reconstruction, Reconstructor, Request};
+use subsplat::splats::Splats;
+
+/// Most targets that are chosen without being asked for.
+const DEFAULT_TARGETS: usize = 30;
+
+/// What to do, settled before the first second of work.
+struct Plan {
+    scene: Scene,
+    context: Vec<usize>,
+    input_size: (usize, usize),
+}
+
+/// Runs the command.
+pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
+    let mut progress = Progress::new();
+    let plan = plan(args, &mut progress)?;
+    let given = (args.source.near, args.source.far);
+    // Refuses early what was given; its guesses may give way to matched points below.
+    let guess = depth_range(&plan.scene, &plan.context, given)?;
+    let backend = backend(&args.look.device);
+    let model = progress
+        .stage("model", |_| model::load(&model::Asked::of(&args.source)))?
+        .with_backend(&backend);
+    let (w, h) = plan.input_size;
+    check_size(&model, plan.context.len(), (w, h))?;
+    let r = model.config().upscale;
+    let targets = targets(args, &plan, (w * r, h * r))?;
+    output::prepare(&args.out, &args.input[0], &plan.scene)?;
+    let photos = photographs(&plan.scene, &plan.context, &mut progress)?;
+    let reports = match args.source.no_check {
+        true => Vec::new(),
+        false => progress.stage("check", |_| pipeline::check_photos(&photos))?,
+    };
+    let range = range::refine(guess, given, &reports);
+    let request = Request {
+        input_size: plan.input_size,
+        near_far: (range.near, range.far),
+        detail: args.source.detail == DetailArg::Photo,
+        look: given == (None, None),
+    };
+    let mut result = progress.stage("network", |bar: &ProgressBar| {
+        model.reconstruct_with(&photos, &request, &mut |name| bar.set_message(name))
+    })?;
+    drop(photos);
+    keeps_some(&result.splats, args.min_opacity)?;
+    let range = range::looked(range, &result);
+    progress.split_last(&result.seconds);
+    result.warnings.extend(backend.warning());
+    result.warnings.iter().for_each(warn);
+    let detailed = request.detail && result.inputs.iter().any(pipeline::has_detail);
+    if detailed {
+        say("children take detail from the photographs (--detail off: from the network alone)");
+    }
+    let options = raster_options(&args.look, model.config(), (range.near, &result.inputs));
+    let views = views(args, &targets, &result)?;
+    let job = Views {
+        out: &args.out,
+        scene: &plan.scene,
+        crop: model.crop_options(plan.input_size),
+        options,
+    };
+    let mut renderer = render::open(&args.look);
+    let scored = progress
+        .steps("rendering", views.len(), |bar| job.render(&mut renderer, &result, &views, bar))?;
+    let files = progress.stage("writing", |_| {
+        let near_far = (range.near, range.far);
+        output::write_config(&args.out, model.config())?;
+        output::write_cameras(&args.out, &scored, plan.scene.units, near_far)?;
+        let save = SaveOptions {
+            min_opacity: args.min_opacity,
+            comments: vec![output::note(&options)],
+            ..SaveOptions::default()
+        };
+        output::write_scene(&args.out, &result, &args.save, &save)
+    })?;
+    let done = Done { range, reports, model, result, detailed, options, scored, files };
+    done.finish(args, &plan, progress, answer)
+}
+
+/// Refuses a least opacity that leaves nothing to save, before any picture is rendered.
+fn keeps_some(splats: &Splats, least: f32) -> Result<()> {
+    let opacities = (0..splats.len()).map(|i| splats.opacity(i));
+    let most = opacities.fold(0.0f32, f32::max);
+    ensure!(
+        most >= least,
+        "--min-opacity: expected at most {most}, the highest opacity of {} Gaussians, got {least}",
+        splats.len()
+    );
+    Ok(())
+}
+
+/// The kernels of `device`, or the CPU's with a warning where that fails.
+fn backend(device: &str) -> Backend {
+    Backend::open(device).unwrap_or_else(|e| {
+        warn(format!("{e}; reconstructing on the CPU"));
+        Backend::Cpu
+    })
+}
+
+/// Everything that can be wrong with the arguments and the scene is found here.
+fn plan(args: &RunArgs, progress: &mut Progress) -> Result<Plan> {
+    let input_size = frames::size(&args.source.input_size)?;
+    render::background(&args.look)?;
+    frames::count(args.frames)?;
+    ensure!(
+        (0.0..1.0).contains(&args.min_opacity),
+        "--min-opacity: expected 0 to below 1, got {}",
+        args.min_opacity
+    );
+    let scene = progress.stage("scene", |_| pair::load(&args.input, &args.source.pair))?;
+    scene.warnings.iter().for_each(warn);
+    let (context, why) = context(&args.source.context, &args.input[0], &scene)?;
+    ensure!(
+        args.path == PathArg::Targets || args.target.is_empty(),
+        "--target: only with --path targets"
+    );
+    say(format!(
+        "{}: {} frames ({}); context {why}",
+        scene.name,
+        scene.frames.len(),
+        scene.source.name(),
+    ));
+    Ok(Plan { scene, context, input_size })
+}
+
+/// The model's network takes inputs of this size, and the machine holds so many.
+pub fn check_size(model: &Reconstructor, views: usize, (w, h): (usize, usize)) -> Result<()> {
+    let stride = model.config().stride();
+    ensure!(
+        w >= stride && h >= stride,
+        "--input-size: expected at least {stride} pixels a side, got {w}x{h}"
+    );
+    memory::check_run(model.config(), views, (w, h))
+}
+
+/// The photographs of a scene's `context` frames.
+pub fn photographs(
+    scene: &Scene,
+    context: &[usize],
+    progress: &mut Progress,
+) -> Result<Vec<Photo>> {
+    progress.steps("photographs", context.len(), |bar| {
+        let photo = |&i: &usize| {
+            bar.inc(1);
+            Ok(Photo::from_frame(&scene.frames[i])?)
+        };
+        context.iter().map(photo).collect()
+    })
+}
+
+/// Context frames of the scene at `input`, `asked` where that is not empty, and how they
+/// were chosen.
+pub fn context(asked: &[String], input: &Path, scene: &Scene) -> Result<(Vec<usize>, String)> {
+    let list = |frames: &[usize]| frames.iter().map(usize::to_string).collect::<Vec<_>>().join(",");
+    if !asked.is_empty() {
+        let chosen = frames::indices(scene, asked, "--context")?;
+        ensure!(chosen.len() >= 2, "--context: expected at least 2 frames, got {}", chosen.len());
+        for (n, i) in chosen.iter().enumerate() {
+            let name = &scene.frames[*i].name;
+            ensure!(
+                !chosen[..n].contains(i),
+                "--context: expected different frames, got {name} twice"
+            );
+        }
+        let text = format!("{} as given", list(&chosen));
+        return Ok((chosen, text));
+    }
+    if scene.frames.len() == 2 {
+        return Ok((vec![0, 1], "0,1: the only two".to_owned()));
+    }
+    if let Some(test) = frames::protocol(input, scene)?.into_iter().next()
+        && test.context.len() >= 2
+    {
+        let text = format!("{} from protocol.json", list(&test.context));
+        return Ok((test.context, text));
+    }
+    let Some(pair) = choose_pair(scene) else {
+        bail!(
+            "{}: expected two photographs taken from different places, got {} frames at one",
+            scene.name,
+            scene.frames.len()
+        )
+    };
+    let text = format!("{}: {}", list(&pair.frames), pair.reason);
+    Ok((pair.frames.to_vec(), text))
+}
+
+/// Frames to render, given the size of the pictures; empty for a path.
+fn targets(args: &RunArgs, plan: &Plan, size: (usize, usize)) -> Result<Vec<usize>> {
+    if args.path != PathArg::Targets {
+        return Ok(Vec::new());
+    }
+    let chosen = match args.target.is_empty() {
+        false => frames::indices(&plan.scene, &args.target, "--target")?,
+        true => default_targets(&args.input[0], plan, size)?,
+    };
+    if chosen.is_empty() {
+        say(format!("no target frames: {} views from the first context to the last", args.frames));
+    }
+    Ok(chosen)
+}
+
+/// The protocol's targets for these contexts, else frames between them, spread evenly
+/// where they are many. A protocol may have targets of several sizes: the
+/// smallest photographs that are no smaller than `size`, else the largest.
+fn default_targets(input: &Path, plan: &Plan, size: (usize, usize)) -> Result<Vec<usize>> {
+    let Plan { scene, context, .. } = plan;
+    let misfit = |targets: &[usize]| {
+        let k = targets.first().map(|&i| scene.frames[i].camera.intrinsics);
+        let area = k.map_or(0, |k| k.width * k.height);
+        let small = k.is_none_or(|k| k.width < size.0 || k.height < size.1);
+        (small, if small { usize::MAX - area } else { area })
+    };
+    let tests = frames::protocol(input, scene)?.into_iter().filter(|t| t.context == *context);
+    if let Some(test) = tests.min_by_key(|t| misfit(&t.target)) {
+        return Ok(test.target);
+    }
+    let (first, last) = (context.iter().min(), context.iter().max());
+    let (Some(&first), Some(&last)) = (first, last) else { return Ok(Vec::new()) };
+    let all: Vec<usize> = (first + 1..last).filter(|i| !context.contains(i)).collect();
+    let count = all.len().min(DEFAULT_TARGETS);
+    Ok((0..count).map(|i| all[i * all.len() / count]).collect())
+}
+
+fn views(args: &RunArgs, targets: &[usize], result: &Reconstruction) -> Result<Vec<View>> {
+    let inputs: Vec<Camera> = result.inputs.iter().map(|c| c.target_camera).collect();
+    let path = match args.path {
+        PathArg::Orbit => frames::orbit(&inputs, median(&result.depths[0].data), args.frames)?,
+        PathArg::Targets if !targets.is_empty() => {
+            return Ok(targets.iter().map(|&i| View::Frame(i)).collect());
+        }
+        PathArg::Targets | PathArg::Interpolate => frames::interpolate(&inputs, args.frames)?,
+    };
+    Ok(path.into_iter().map(View::Path).collect())
+}
+
+/// The middle value; 1 where there is none.
+pub fn median(values: &[f32]) -> f32 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f32::total_cmp);
+    sorted.get(sorted.len() / 2).copied().unwrap_or(1.0)
+}
+
+/// How Gaussians of a model with `config` are rendered, by the arguments and else as the
+/// model and its inputs say.
+pub fn raster_options(
+    look: &LookArgs,
+    config: &Config,
+    (near, inputs): (f32, &[Cropped]),
+) -> RasterOptions {
+    let mut config = config.clone();
+    if let Some(convention) = look.convention {
+        config.render.convention = convention.into();
+    }
+    if let Some(reference) = look.lowpass_ref {
+        config.render.lowpass_ref = match reference {
+            LowpassArg::Target => LowpassRef::Target,
+            LowpassArg::Input => LowpassRef::Input,
+        };
+    }
+    let mut options = pipeline::raster_options(&config, near, inputs);
+    options.background = look.background.unwrap_or(options.background);
+    options
+}
+
+/// Everything that the report names.
+struct Done {
+    range: DepthRange,
+    reports: Vec<PairReport>,
+    model: Reconstructor,
+    result: Reconstruction,
+    /// Whether photographs added detail.
+    detailed: bool,
+    options: RasterOptions,
+    scored: Vec<Scored>,
+    files: Vec<Value>,
+}
+
+impl Done {
+    /// Mean over the views that have a finite value.
+    fn mean(&self, value: fn(&Scored) -> Option<f64>) -> Option<f64> {
+        let all: Vec<f64> =
+            self.scored.iter().filter_map(value).filter(|v| v.is_finite()).collect();
+        (!all.is_empty()).then(|| all.iter().sum::<f64>() / all.len() as f64)
+    }
+
+    fn report(&self, args: &RunArgs, plan: &Plan) -> Value {
+        let camera = |c: &Camera| {
+            let k = c.intrinsics;
+            json!({ "width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy })
+        };
+        let inputs = &self.result.inputs;
+        let name = |i: &usize| plan.scene.frames[*i].name.clone();
+        let config = self.model.config();
+        let mvsplat_rules = self.options.convention == Convention::Mvsplat;
+        json!({
+            "scene": plan.scene.name,
+            "context": plan.context.iter().map(name).collect::<Vec<_>>(),
+            "near": self.range.near,
+            "far": self.range.far,
+            "near_far_from": self.range.reason,
+            "check": range::report(&self.reports),
+            "input_intrinsics": inputs.iter().map(|c| camera(&c.input_camera)).collect::<Vec<_>>(),
+            "backbone": if pipeline::is_mvsplat(config) { "re10k" } else { "small" },
+            "upscale": config.upscale,
+            "convention": if mvsplat_rules { "mvsplat" } else { "standard" },
+            "weights": args.source.weights.as_ref().map(|p| p.display().to_string()),
+            "seed": args.source.seed,
+            "untrained_tensors": self.model.untrained_tensors().len(),
+            "detail": self.detailed,
+            "gaussians": self.result.splats.len(),
+            "targets": self.scored.iter().map(Scored::json).collect::<Vec<_>>(),
+            "psnr": self.mean(|s| s.psnr),
+            "ssim": self.mean(|s| s.ssim),
+            "warnings": self.result.warnings,
+            "files": self.files,
+        })
+    }
+
+    fn finish(self, args: &RunArgs, plan: &Plan, progress: Progress, answer: Answer) -> Result<()> {
+        let mut report = self.report(args, plan);
+        let seconds = progress.seconds();
+        let total = seconds["total"].as_f64().unwrap_or(0.0);
+        let peak = peak_memory_bytes();
+        report["seconds"] = Value::Object(seconds);
+        report["peak_memory_bytes"] = json!(peak);
+        let path = args.out.join("metrics.json");
+        let text = serde_json::to_string_pretty(&report)?;
+        subsplat::io::write_atomic(&path, |f| std::io::Write::write_all(f, text.as_bytes()))?;
+        self.scores(answer);
+        answer.line(format!(
+            "{} Gaussians, {} views in {}; {total:.1} s{}",
+            self.result.splats.len(),
+            self.scored.len(),
+            args.out.display(),
+            peak.map_or(String::new(), |p| format!(", peak memory {}", mebibytes(p)))
+        ));
+        answer.finish(&report)
+    }
+
+    fn scores(&self, answer: Answer) {
+        let cell = |v: Option<f64>, digits: usize| {
+            v.map_or_else(|| format!("{:>6}", "-"), |v| format!("{v:6.digits$}"))
+        };
+        let compared: Vec<&Scored> = self.scored.iter().filter(|s| s.psnr.is_some()).collect();
+        for s in &compared {
+            let note = if s.enlarged { "  (photograph smaller than the target)" } else { "" };
+            let (psnr, ssim) = (cell(s.psnr, 2), cell(s.ssim, 4));
+            answer.line(format!("  {:<12} PSNR {psnr}  SSIM {ssim}{note}", s.name));
+        }
+        if compared.len() > 1 {
+            let (psnr, ssim) = (cell(self.mean(|s| s.psnr), 2), cell(self.mean(|s| s.ssim), 4));
+            answer.line(format!("  {:<12} PSNR {psnr}  SSIM {ssim}", "mean"));
+        }
+    }
+}

@@ -1,0 +1,238 @@
+//! `subsplat train`: a training from its configuration, with what a person watches.
+
+use super::args::TrainArgs;
+use super::tensorboard::Board;
+use crate::report::{Answer, mebibytes, say, warn};
+use anyhow::{Result, ensure};
+use indicatif::{ProgressBar, ProgressStyle};
+use serde_json::json;
+use std::io::IsTerminal;
+use std::time::{Duration, Instant};
+use subsplat::train::TrainConfig;
+use subsplat::train::run::{Event, Limits, StepReport, Training};
+use subsplat::train::step::Seconds;
+use subsplat::train::validate::{Found, Validator};
+
+/// Between two lines where stderr is no terminal.
+const LINE_EVERY: Duration = Duration::from_secs(20);
+/// Lines between two profiles.
+const PROFILE_EVERY: usize = 15;
+/// Share of the newest step in the shown means.
+const FRESH: f64 = 0.05;
+
+/// Starts this very program anew with one thread for candle, unless the user says how many.
+///
+/// Candle gives operations on large tensors to a thread pool of its own, whose threads spin
+/// while they wait and take the cores from our lanes: 40 steps took 28.8 s with it and
+/// 20.7 s without. The number is read from the environment, which a running process cannot
+/// change for itself without `unsafe`.
+#[cfg(unix)]
+fn leave_the_cores_to_us() {
+    use std::os::unix::process::CommandExt;
+    const CANDLE_THREADS: &str = "CANDLE_NUM_THREADS";
+    if std::env::var_os(CANDLE_THREADS).is_some() {
+        return;
+    }
+    if let Ok(program) = std::env::current_exe() {
+        let mut again = std::process::Command::new(program);
+        // Comes back only where it fails; training is then slower, and no less right.
+        let _ = again.args(std::env::args_os().skip(1)).env(CANDLE_THREADS, "1").exec();
+    }
+}
+
+/// Runs the command.
+pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
+    #[cfg(unix)]
+    leave_the_cores_to_us();
+    let config = TrainConfig::load(&args.config)?;
+    ensure!(
+        args.minutes.is_none_or(|m| m > 0.0),
+        "--minutes: expected more than 0, got {}",
+        args.minutes.unwrap_or(0.0)
+    );
+    let limits = Limits { minutes: args.minutes, steps: args.steps };
+    let mut training = Training::open(&config, &args.out)?;
+    let mut watch = Watch::new(&config);
+    let mut board = Board::create(&args.out)?;
+    let mut unwritten = None;
+    let validator = Validator::new(&config, args.validate.as_deref())?;
+    let outcome = training.run(limits, &validator, &mut |event| {
+        watch.hear(event);
+        if unwritten.is_none() {
+            unwritten = board.hear(event).err();
+        }
+    });
+    watch.bar.finish_and_clear();
+    outcome?;
+    if let Some(e) = unwritten {
+        warn(format!("{e:#}: TensorBoard's file ends there"));
+    }
+    let progress = training.progress();
+    // None before the first checkpoint.
+    let weights = Some(args.out.join("weights.safetensors")).filter(|file| file.is_file());
+    let place = weights.as_ref().map(|file| format!("; weights in {}", file.display()));
+    let (done, steps) = (progress.step, config.steps);
+    say(format!("{done} of {steps} steps done{}", place.unwrap_or_default()));
+    answer.finish(&json!({
+        "step": progress.step,
+        "steps": config.steps,
+        "examples": progress.examples,
+        "seconds": progress.seconds,
+        "loss": watch.loss,
+        "weights": weights,
+    }))
+}
+
+/// What is shown: a bar on a terminal, else a line from time to time.
+struct Watch {
+    bar: ProgressBar,
+    terminal: bool,
+    steps: u64,
+    started: Instant,
+    first: u64,
+    shown: Instant,
+    lines: usize,
+    loss: f64,
+    psnr: f64,
+    profile: (Seconds, u64),
+}
+
+fn mean(old: f64, new: f64) -> f64 {
+    if old.is_finite() { old + FRESH * (new - old) } else { new }
+}
+
+impl Watch {
+    fn new(config: &TrainConfig) -> Self {
+        let bar = ProgressBar::new(config.steps);
+        let style = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len} [{elapsed}]");
+        if let Ok(style) = style {
+            bar.set_style(style);
+        }
+        Self {
+            bar,
+            terminal: std::io::stderr().is_terminal(),
+            steps: config.steps,
+            started: Instant::now(),
+            first: 0,
+            shown: Instant::now(),
+            lines: 0,
+            loss: f64::NAN,
+            psnr: f64::NAN,
+            profile: (Seconds::default(), 0),
+        }
+    }
+
+    fn hear(&mut self, event: &Event) {
+        match event {
+            Event::Begin { step, parameters, resumed, untrained, warnings } => {
+                warnings.iter().for_each(warn);
+                self.first = *step;
+                self.started = Instant::now();
+                match resumed {
+                    Some(path) => self.tell(&format!("going on from {}", path.display())),
+                    None if *untrained > 0 => {
+                        self.tell(&format!("{untrained} tensors start from the seed"));
+                    }
+                    None => {}
+                }
+                self.tell(&format!("{parameters} parameters, step {step} of {}", self.steps));
+            }
+            Event::Step(report) => self.step(report),
+            Event::Skipped { step } => {
+                warn(format!("step {step}: loss or gradient not finite, skipped"));
+            }
+            Event::Saved(path) => self.tell(&format!("saved {}", path.display())),
+            Event::Validated { step, rooms, photos } => {
+                for (what, found) in [("held-out rooms", rooms), ("photographs", photos)] {
+                    if let Some(found) = found {
+                        self.tell(&looked(*step, what, found));
+                    }
+                }
+            }
+        }
+    }
+
+    fn tell(&self, line: &str) {
+        self.bar.suspend(|| say(line));
+    }
+
+    fn step(&mut self, report: &StepReport) {
+        self.loss = mean(self.loss, report.terms.loss);
+        if report.terms.mse.is_finite() {
+            self.psnr = mean(self.psnr, report.terms.psnr());
+        }
+        self.profile.0.add(&report.seconds);
+        self.profile.1 += 1;
+        if self.terminal {
+            self.bar.set_position(report.step);
+            self.bar.set_message(self.line(report));
+            return;
+        }
+        if self.shown.elapsed() < LINE_EVERY && report.step > self.first + 1 {
+            return;
+        }
+        self.shown = Instant::now();
+        say(format!("step {} {}", report.step, self.line(report)));
+        self.lines += 1;
+        if self.lines.is_multiple_of(PROFILE_EVERY) {
+            self.show_profile();
+        }
+    }
+
+    /// Loss, PSNR, rate, speed, memory, time left.
+    fn line(&self, report: &StepReport) -> String {
+        let done = (report.step - self.first).max(1) as f64;
+        let each = self.started.elapsed().as_secs_f64() / done;
+        let left = each * self.steps.saturating_sub(report.step) as f64;
+        let mut line = format!("loss {:.4}", self.loss);
+        if self.psnr.is_finite() {
+            line += &format!(" psnr {:.2}", self.psnr);
+        }
+        let t = &report.terms;
+        if t.disparity.is_finite() {
+            line += &format!(" ce {:.3} disp {:.3}", t.cross_entropy, t.disparity);
+        }
+        line += &format!(" norm {:.2} lr {:.2e} {each:.2} s/step", report.norm, report.rate);
+        if let Some(bytes) = resident_bytes() {
+            line += &format!(" {}", mebibytes(bytes));
+        }
+        line + &format!(" left {}", duration(left))
+    }
+
+    /// Mean seconds of each part of a step since the last profile.
+    fn show_profile(&mut self) {
+        let (seconds, steps) = std::mem::take(&mut self.profile);
+        let parts = seconds.parts();
+        let share = |s: f64| s / steps.max(1) as f64;
+        let list: Vec<String> =
+            parts.iter().map(|(name, s)| format!("{name} {:.3}", share(*s))).collect();
+        say(format!("  seconds a step: {}", list.join(", ")));
+    }
+}
+
+fn looked(step: u64, what: &str, found: &Found) -> String {
+    let mut line = format!(
+        "step {step}, {what}: PSNR {:.2} dB (nearer input {:.2}), SSIM {:.4}",
+        found.psnr, found.copy_psnr, found.ssim
+    );
+    if found.within_one > 0.0 {
+        line += &format!(
+            ", depth off by {:.2} candidates, {:.1} % within 1",
+            found.disparity,
+            100.0 * found.within_one
+        );
+    }
+    line
+}
+
+fn duration(seconds: f64) -> String {
+    let minutes = (seconds / 60.0).ceil() as u64;
+    format!("{}:{:02}", minutes / 60, minutes % 60)
+}
+
+/// Memory of this process, bytes; `None` where the system does not say.
+fn resident_bytes() -> Option<u64> {
+    let text = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = text.lines().find(|l| l.starts_with("VmRSS:"))?;
+    Some(line.split_whitespace().nth(1)?.parse::<u64>().ok()? * 1024)
+}

@@ -1,0 +1,98 @@
+//! `subsplat view`: a window to look at a scene. `source` finds the splats, `canvas` draws
+//! them, `controls` understands keys and mouse, `window` holds them together; the camera's
+//! movements are [`subsplat::navigation`].
+
+mod canvas;
+mod controls;
+mod pictures;
+mod source;
+mod window;
+
+use super::args_view::ViewArgs;
+use super::{frames, memory, render};
+use crate::report::{Answer, Progress, say};
+use anyhow::{Context, Result, bail};
+use serde_json::json;
+use std::convert::Infallible;
+use std::path::PathBuf;
+use subsplat::gpu::{self, DeviceChoice};
+use winit::event_loop::EventLoop;
+
+/// What the arguments say of the window.
+pub struct Plan {
+    /// At first, px; without, the first camera's.
+    size: Option<(usize, usize)>,
+    device: DeviceChoice,
+    /// To draw before the end; without, until the user closes the window.
+    frames: Option<usize>,
+    /// Where the last of `frames` goes.
+    save: Option<PathBuf>,
+    /// Folder of pictures.
+    out: PathBuf,
+}
+
+/// Runs the command.
+pub fn view(args: &ViewArgs, answer: Answer) -> Result<()> {
+    let mut progress = Progress::new();
+    let plan = plan(args)?;
+    // What a window needs is looked for before minutes of work.
+    let events = EventLoop::with_user_event().build().map_err(no_display)?;
+    adapter(&plan.device)?;
+    let source = source::open(args, &mut progress)?;
+    if plan.frames.is_none() {
+        say("H shows the keys");
+    }
+    let done = window::run(events, plan, source)?;
+    let saved: Vec<String> = done.saved.iter().map(|p| p.display().to_string()).collect();
+    answer.line(format!(
+        "{}: {} Gaussians, {} frames on {}{}",
+        done.name,
+        done.gaussians,
+        done.frames,
+        done.adapter,
+        done.fps.map_or(String::new(), |fps| format!(", {fps:.1} a second"))
+    ));
+    answer.finish(&json!({
+        "scene": done.name,
+        "gaussians": done.gaussians,
+        "upscale": done.upscale,
+        "device": done.adapter,
+        "frames": done.frames,
+        "frames_per_second": done.fps,
+        "size": [done.size.0, done.size.1],
+        "files": saved,
+        "seconds": progress.seconds(),
+    }))
+}
+
+/// What is wrong with the arguments themselves.
+fn plan(args: &ViewArgs) -> Result<Plan> {
+    render::background(&args.look())?;
+    render::check_near(args.source.near)?;
+    let size = args.size.as_deref().map(frames::size).transpose()?;
+    size.map_or(Ok(()), |size| memory::check_picture("--size", size))?;
+    args.frames.map_or(Ok(0), frames::count)?;
+    source::check(args)?;
+    let device = args.device.parse().unwrap_or_else(|e: Infallible| match e {});
+    if device == DeviceChoice::Cpu {
+        bail!("--device: expected auto, gpu or an adapter's name, as a window needs one; got cpu");
+    }
+    let (frames, save, out) = (args.frames, args.save.clone(), args.out.clone());
+    Ok(Plan { size, device, frames, save, out })
+}
+
+/// Refuses a choice that no adapter answers to.
+fn adapter(choice: &DeviceChoice) -> Result<()> {
+    let found = gpu::choose(choice, &gpu::adapters())?;
+    found.map(|_| ()).with_context(|| format!("no GPU: expected {choice}, found none"))
+}
+
+/// The system's own words, without the place in winit's source that stands in front.
+fn no_display(error: winit::error::EventLoopError) -> anyhow::Error {
+    let text = error.to_string();
+    let words = match text.strip_prefix("os error at ") {
+        Some(rest) => rest.split_once(": ").map_or(rest, |(_, words)| words),
+        None => &text,
+    };
+    anyhow::anyhow!("no display for a window: {}", words.trim_end_matches('.'))
+}

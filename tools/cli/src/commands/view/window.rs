@@ -1,0 +1,449 @@
+//! The window: events to the navigator, frames to the canvas, and children that are made
+//! in the background.
+
+use super::Plan;
+use super::canvas::{Canvas, Frame};
+use super::controls::{Controls, Drag, Wish};
+use super::pictures::save_next;
+use super::source::{Made, Photographs, Source};
+use crate::commands::args_view::KEYS;
+use crate::report::{say, warn};
+use anyhow::{Context, Result};
+use glam::Vec2;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use subsplat::abi::RasterOptions;
+use subsplat::gpu::{Gpu, Scene};
+use subsplat::io::image::{Rgb, save_png};
+use subsplat::navigation::{Mode, Navigator};
+use subsplat::render::slices;
+use winit::application::ApplicationHandler;
+use winit::dpi::PhysicalSize;
+use winit::event::{KeyEvent, StartCause, WindowEvent};
+use winit::event_loop::{ActiveEventLoop, ControlFlow, EventLoop, EventLoopProxy};
+use winit::keyboard::PhysicalKey;
+use winit::window::{Window, WindowId};
+
+/// Largest window that is opened without being asked for, px.
+const SIZE_MAX: (usize, usize) = (1280, 960);
+/// Frames that a change takes: one to show it, and one that has the room for all splats
+/// that the first asked for.
+const SETTLE: u32 = 2;
+/// Until a window without a place for a frame is asked again.
+const RETRY: Duration = Duration::from_millis(50);
+/// Least time between two titles while frames follow one another.
+const TITLE_EVERY: Duration = Duration::from_millis(250);
+/// What a frame that follows none moves for, and the most that any does, seconds.
+const STEP: (f32, f32) = (1.0 / 60.0, 0.25);
+/// Weight of a new frame's time in the mean.
+const FRESH: f32 = 0.1;
+
+/// What the window did.
+pub struct Done {
+    pub name: String,
+    pub gaussians: usize,
+    pub upscale: Option<usize>,
+    pub adapter: String,
+    pub frames: usize,
+    pub fps: Option<f32>,
+    pub size: (usize, usize),
+    pub saved: Vec<PathBuf>,
+}
+
+/// What the background says.
+pub enum Message {
+    /// A stage of the work begins.
+    Stage(&'static str),
+    /// r×r children to a pixel are ready, or not to be had.
+    Made(usize, Result<Ready, String>),
+}
+
+/// Splats in device memory.
+pub struct Ready {
+    scene: Scene,
+    options: RasterOptions,
+}
+
+/// Opens a window and shows `source` until the user, or the plan, ends it.
+pub fn run(events: EventLoop<Message>, plan: Plan, source: Source) -> Result<Done> {
+    let mut viewer = Viewer::new(plan, source, events.create_proxy());
+    events.set_control_flow(ControlFlow::Wait);
+    events.run_app(&mut viewer).context("window")?;
+    viewer.outcome?;
+    let canvas = viewer.canvas.context("window: closed before it opened")?;
+    let shown = viewer.ready.get(&viewer.current);
+    Ok(Done {
+        gaussians: shown.map_or(0, |r| r.scene.len()),
+        upscale: (viewer.current > 0).then_some(viewer.current),
+        adapter: canvas.gpu().adapter().to_string(),
+        frames: viewer.drawn,
+        fps: viewer.rate.fps(),
+        size: canvas.size(),
+        saved: viewer.saved,
+        name: viewer.name,
+    })
+}
+
+/// Time between frames that follow one another.
+#[derive(Default)]
+struct Rate {
+    last: Option<Instant>,
+    /// Whether the first time is over, in which kernels are compiled.
+    warm: bool,
+    mean: Option<f32>,
+}
+
+impl Rate {
+    /// A frame begins, which `follows` the last without a rest; seconds to move for.
+    fn begin(&mut self, now: Instant, follows: bool) -> f32 {
+        let since = self.last.replace(now).filter(|_| follows);
+        let Some(seconds) = since.map(|last| (now - last).as_secs_f32()) else { return STEP.0 };
+        if std::mem::replace(&mut self.warm, true) {
+            self.mean = Some(self.mean.map_or(seconds, |m| m + FRESH * (seconds - m)));
+        }
+        seconds.min(STEP.1)
+    }
+
+    fn fps(&self) -> Option<f32> {
+        self.mean.filter(|m| *m > 0.0).map(|m| 1.0 / m)
+    }
+}
+
+struct Viewer {
+    plan: Plan,
+    name: String,
+    photographs: Option<Arc<Photographs>>,
+    proxy: EventLoopProxy<Message>,
+    /// Of the source, until there is a device to put it on.
+    first: Option<Made>,
+    canvas: Option<Canvas>,
+    navigator: Navigator,
+    controls: Controls,
+    /// By r; a finished scene's is 0.
+    ready: BTreeMap<usize, Ready>,
+    /// What is shown, what was before it, and what was asked for last.
+    current: usize,
+    before: usize,
+    wish: usize,
+    /// What is being made, and which stage of it.
+    busy: Option<(usize, &'static str)>,
+    /// Frames to draw, though nothing changes.
+    due: u32,
+    /// Whether the last frame asked for the next.
+    running: bool,
+    /// Whether P waits for a frame.
+    picture: bool,
+    drawn: usize,
+    rate: Rate,
+    title: (String, Option<Instant>),
+    saved: Vec<PathBuf>,
+    outcome: Result<()>,
+}
+
+impl Viewer {
+    fn new(plan: Plan, source: Source, proxy: EventLoopProxy<Message>) -> Self {
+        let current = source.made.upscale.unwrap_or(0);
+        Self {
+            plan,
+            name: source.name,
+            photographs: source.photographs.map(Arc::new),
+            proxy,
+            first: Some(source.made),
+            canvas: None,
+            navigator: Navigator::new(source.start),
+            controls: Controls::default(),
+            ready: BTreeMap::new(),
+            current,
+            before: current,
+            wish: current,
+            busy: None,
+            due: SETTLE,
+            running: false,
+            picture: false,
+            drawn: 0,
+            rate: Rate::default(),
+            title: (String::new(), None),
+            saved: Vec::new(),
+            outcome: Ok(()),
+        }
+    }
+
+    fn open(&mut self, events: &ActiveEventLoop) -> Result<()> {
+        let (width, height) = self.plan.size.unwrap_or_else(|| {
+            let k = self.navigator.camera().intrinsics;
+            let sides = [(SIZE_MAX.0, k.width), (SIZE_MAX.1, k.height)];
+            let scale = sides.map(|(most, side)| most as f32 / side as f32);
+            let scale = scale.into_iter().fold(1.0, f32::min);
+            let side = |v: usize| ((v as f32 * scale) as usize).max(1);
+            (side(k.width), side(k.height))
+        });
+        let size = PhysicalSize::new(width as u32, height as u32);
+        let attributes = Window::default_attributes().with_title(&self.name).with_inner_size(size);
+        let window = events.create_window(attributes).context("window")?;
+        let canvas = Canvas::open(Arc::new(window), &self.plan.device)?;
+        say(format!("drawing on {}", canvas.gpu().adapter()));
+        if let Some(made) = self.first.take() {
+            self.ready.insert(self.current, upload(canvas.gpu(), &made)?);
+        }
+        self.canvas = Some(canvas);
+        self.change();
+        Ok(())
+    }
+
+    /// Something is to be seen that was not.
+    fn change(&mut self) {
+        self.due = SETTLE;
+        self.redraw();
+    }
+
+    fn redraw(&self) {
+        if let Some(canvas) = &self.canvas {
+            canvas.window().request_redraw();
+        }
+    }
+
+    /// Whether frames follow one another by themselves.
+    fn goes_on(&self) -> bool {
+        self.due > 0 || self.picture || self.controls.moving() || self.plan.frames.is_some()
+    }
+
+    fn frame(&mut self, events: &ActiveEventLoop) -> Result<()> {
+        let Some(canvas) = &mut self.canvas else { return Ok(()) };
+        let Some(ready) = self.ready.get(&self.current) else { return Ok(()) };
+        let seconds = self.rate.begin(Instant::now(), self.running);
+        if self.controls.moving() {
+            let (along, haste) = self.controls.motion();
+            self.navigator.fly(along, seconds, haste);
+            self.due = SETTLE;
+        }
+        let last = self.plan.frames.is_some_and(|n| self.drawn + 1 >= n);
+        let capture = self.picture || (last && self.plan.save.is_some());
+        let navigator = &mut self.navigator;
+        let camera = |width, height| {
+            navigator.resize(width, height);
+            navigator.camera()
+        };
+        let frame = match canvas.draw(&ready.scene, &ready.options, camera, capture) {
+            Ok(frame) => frame,
+            Err(e) if self.before != self.current && !canvas.is_lost() => {
+                warn(format!("x{}: {e:#}; back to x{}", self.current, self.before));
+                self.ready.remove(&self.current);
+                (self.current, self.wish) = (self.before, self.before);
+                self.change();
+                return Ok(());
+            }
+            Err(e) => return Err(e),
+        };
+        let Frame::Shown(picture) = frame else {
+            self.running = false;
+            events.set_control_flow(ControlFlow::WaitUntil(Instant::now() + RETRY));
+            return Ok(());
+        };
+        self.before = self.current;
+        self.drawn += 1;
+        self.due = self.due.saturating_sub(1);
+        self.keep(picture, last)?;
+        if last {
+            events.exit();
+            return Ok(());
+        }
+        self.running = self.goes_on();
+        if self.running {
+            self.redraw();
+        }
+        self.tell();
+        Ok(())
+    }
+
+    /// Writes what a frame showed where it was asked for.
+    fn keep(&mut self, picture: Option<Rgb>, last: bool) -> Result<()> {
+        let Some(picture) = picture else { return Ok(()) };
+        if std::mem::take(&mut self.picture) {
+            match save_next(&self.plan.out, &self.name, &picture) {
+                Ok(path) => {
+                    say(format!("saved {}", path.display()));
+                    self.saved.push(path);
+                }
+                Err(e) => warn(format!("{e:#}")),
+            }
+        }
+        if let Some(path) = self.plan.save.clone().filter(|_| last) {
+            save_png(&path, &picture)?;
+            self.saved.push(path);
+        }
+        Ok(())
+    }
+
+    /// The title says how things are; not more often than one can read.
+    fn tell(&mut self) {
+        let Some(canvas) = &self.canvas else { return };
+        let splats = self.ready.get(&self.current).map_or(0, |r| r.scene.len());
+        let fps = self.rate.fps().map_or(String::new(), |fps| {
+            let digits = usize::from(fps < 10.0);
+            format!(", {fps:.digits$} fps")
+        });
+        let mode = match self.navigator.mode() {
+            Mode::Orbit => "orbit",
+            Mode::Fly => "fly",
+        };
+        let upscale =
+            if self.current > 0 { format!(" (x{})", self.current) } else { String::new() };
+        let busy = self.busy.map_or(String::new(), |(r, stage)| format!(", x{r}: {stage} …"));
+        let title = format!("{}: {splats} splats{upscale}{fps}, {mode}{busy}", self.name);
+        let soon = self.title.1.is_some_and(|t| self.running && t.elapsed() < TITLE_EVERY);
+        if title != self.title.0 && !soon {
+            canvas.window().set_title(&title);
+            self.title = (title, Some(Instant::now()));
+        }
+    }
+
+    fn grant(&mut self, wish: Wish, events: &ActiveEventLoop) {
+        match wish {
+            Wish::Toggle => self.navigator.toggle(),
+            Wish::Reset => {
+                self.navigator.reset();
+                self.change();
+            }
+            Wish::Upscale(r) if self.photographs.is_none() => {
+                say(format!("x{r}: {} is a finished scene and has one resolution", self.name));
+            }
+            Wish::Upscale(r) => {
+                self.wish = r;
+                self.follow_wish();
+            }
+            Wish::Save => {
+                self.picture = true;
+                self.redraw();
+            }
+            Wish::Help => say(KEYS),
+            Wish::Quit => events.exit(),
+        }
+        self.tell();
+    }
+
+    /// Shows what was asked for last, or has it made; one is made at a time.
+    fn follow_wish(&mut self) {
+        if self.ready.contains_key(&self.wish) {
+            if self.current != self.wish {
+                self.current = self.wish;
+                self.change();
+            }
+            return;
+        }
+        let (None, Some(photographs), Some(canvas)) =
+            (self.busy, self.photographs.clone(), &self.canvas)
+        else {
+            return;
+        };
+        let (r, gpu, proxy) = (self.wish, canvas.gpu().clone(), self.proxy.clone());
+        self.busy = Some((r, "begins"));
+        // An event loop that is gone needs no answer.
+        let work = move || {
+            let mut stage = |name| drop(proxy.send_event(Message::Stage(name)));
+            let made = photographs.make(r, &mut stage).and_then(|made| upload(&gpu, &made));
+            drop(proxy.send_event(Message::Made(r, made.map_err(|e| format!("{e:#}")))));
+        };
+        if let Err(e) = std::thread::Builder::new().name(format!("x{r}")).spawn(work) {
+            warn(format!("x{r}: no thread to make it: {e}"));
+            (self.busy, self.wish) = (None, self.current);
+        }
+    }
+
+    fn event(&mut self, event: WindowEvent, events: &ActiveEventLoop) -> Result<()> {
+        match event {
+            WindowEvent::CloseRequested => events.exit(),
+            WindowEvent::RedrawRequested => self.frame(events)?,
+            WindowEvent::Resized(size) => {
+                if let Some(canvas) = &mut self.canvas {
+                    canvas.resize(size.width, size.height)?;
+                }
+                self.change();
+            }
+            WindowEvent::Focused(false) => self.controls.release(),
+            WindowEvent::ModifiersChanged(m) => self.controls.shift(m.state().shift_key()),
+            WindowEvent::KeyboardInput { event, .. } => self.key(&event, events),
+            WindowEvent::MouseInput { button, state, .. } => self.controls.button(button, state),
+            WindowEvent::MouseWheel { delta, .. } => {
+                self.navigator.wheel(Controls::wheel(delta));
+                self.change();
+            }
+            WindowEvent::CursorMoved { position, .. } => {
+                let at = Vec2::new(position.x as f32, position.y as f32);
+                match self.controls.cursor(at) {
+                    Some(Drag::Turn(px)) => self.navigator.turn(px),
+                    Some(Drag::Pan(px)) => self.navigator.pan(px),
+                    None => return Ok(()),
+                }
+                self.change();
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn key(&mut self, event: &KeyEvent, events: &ActiveEventLoop) {
+        let PhysicalKey::Code(code) = event.physical_key else { return };
+        if let Some(wish) = self.controls.key(code, event.state, event.repeat) {
+            self.grant(wish, events);
+        } else if self.controls.moving() && !self.running {
+            self.redraw();
+        }
+    }
+
+    /// Ends with `error`, where there is one.
+    fn or_end(&mut self, done: Result<()>, events: &ActiveEventLoop) {
+        if let Err(e) = done {
+            self.outcome = Err(e);
+            events.exit();
+        }
+    }
+}
+
+fn upload(gpu: &Gpu, made: &Made) -> Result<Ready> {
+    let scene = gpu.upload_splats(&slices(&made.splats))?;
+    let options = RasterOptions { sh_basis: made.splats.sh_basis, ..made.options };
+    Ok(Ready { scene, options })
+}
+
+impl ApplicationHandler<Message> for Viewer {
+    fn resumed(&mut self, events: &ActiveEventLoop) {
+        if self.canvas.is_none() {
+            let opened = self.open(events);
+            self.or_end(opened, events);
+        }
+    }
+
+    fn new_events(&mut self, events: &ActiveEventLoop, cause: StartCause) {
+        if let StartCause::ResumeTimeReached { .. } = cause {
+            events.set_control_flow(ControlFlow::Wait);
+            self.redraw();
+        }
+    }
+
+    fn window_event(&mut self, events: &ActiveEventLoop, _: WindowId, event: WindowEvent) {
+        let done = self.event(event, events);
+        self.or_end(done, events);
+    }
+
+    fn user_event(&mut self, _: &ActiveEventLoop, message: Message) {
+        match message {
+            Message::Stage(name) => self.busy = self.busy.map(|(r, _)| (r, name)),
+            Message::Made(r, made) => {
+                self.busy = None;
+                match made {
+                    Ok(ready) => drop(self.ready.insert(r, ready)),
+                    Err(e) => {
+                        warn(format!("x{r}: {e}"));
+                        if self.wish == r {
+                            self.wish = self.current;
+                        }
+                    }
+                }
+                self.follow_wish();
+            }
+        }
+        self.tell();
+    }
+}

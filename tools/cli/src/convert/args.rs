@@ -1,0 +1,118 @@
+//! Command-line arguments. The texts here are the program's manual.
+
+use crate::convert::numbers::Float;
+use clap::{Parser, ValueEnum};
+use std::path::PathBuf;
+use subsplat::config::Preset;
+use subsplat::model::architecture::Kind;
+
+/// What scripts may rely on.
+const EXIT_CODES: &str = "\
+Exit codes: 0 done; 1 an error, told on stderr in one line, and nothing written; 2 wrong usage.
+
+--json: one object on stdout, nothing else there; {\"error\": ...} with exit codes 1 and 2.";
+
+/// PyTorch checkpoints to .safetensors weights of subsplat.
+///
+/// Reads what torch.save writes without running anything in it, and .safetensors: Lightning
+/// checkpoints, state dicts, {"model": ...}. Every tensor is held against the architecture
+/// by name and shape; what the model does not need (optimizer state, classifiers) is left
+/// out and counted.
+#[derive(Debug, Parser)]
+#[command(name = "subsplat-convert", version, max_term_width = 100, after_help = EXIT_CODES)]
+pub struct Args {
+    /// Checkpoint (.ckpt, .pth, .pt) or .safetensors.
+    #[arg(value_name = "IN")]
+    pub input: PathBuf,
+    /// Weights to write (.safetensors).
+    #[arg(value_name = "OUT")]
+    pub output: PathBuf,
+    /// What the weights are.
+    #[arg(long, value_enum, default_value = "auto")]
+    pub kind: KindArg,
+    /// Element type to write. Numbers that it cannot hold are refused.
+    #[arg(long, value_enum, default_value = "f32")]
+    pub dtype: DtypeArg,
+    /// Take only tensors whose names begin like this, and remove it (`module.`). `encoder.`
+    /// needs no mention.
+    #[arg(long, default_value = "", hide_default_value = true, value_name = "PREFIX")]
+    pub prefix: String,
+    /// LPIPS' linear weights (the lpips package's weights/v0.1/vgg.pth), where IN is the
+    /// VGG16 trunk alone.
+    #[arg(long, value_name = "FILE")]
+    pub lpips_linear: Option<PathBuf>,
+    /// Write what is there although the architecture has more tensors. An MVSplat
+    /// checkpoint needs it for `--kind subsplat`.
+    #[arg(long)]
+    pub allow_missing: bool,
+    /// Refuse names that the architecture does not have, instead of leaving them out.
+    #[arg(long)]
+    pub strict: bool,
+    /// Replace OUT if it exists.
+    #[arg(long)]
+    pub force: bool,
+    /// SubSplat's equations, for the configuration in OUT (mvsplat, subsplat). Default: what
+    /// IN says or its tensors fit, else `tuned`.
+    #[arg(long, value_name = "paper | tuned")]
+    pub preset: Option<Preset>,
+    /// Target over input, side over side, for the configuration in OUT. Default: likewise,
+    /// else 2.
+    #[arg(long, value_name = "R")]
+    pub upscale: Option<usize>,
+    /// A whole configuration (JSON) for OUT instead of the two above.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["preset", "upscale"])]
+    pub config: Option<PathBuf>,
+    /// Print one JSON object on stdout; everything else goes to stderr.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// What the weights are.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub enum KindArg {
+    /// What the names tell.
+    Auto,
+    /// MVSplat's encoder (471 tensors in the re10k configuration).
+    Mvsplat,
+    /// A whole model: MVSplat or the small backbone, and SubSplat's tensors.
+    Subsplat,
+    /// GMDepth (UniMatch), from which MVSplat's CNN and transformer start.
+    Gmdepth,
+    /// LPIPS with VGG16: torchvision's VGG16 and --lpips-linear, or the lpips package's
+    /// whole state dict.
+    Lpips,
+}
+
+impl KindArg {
+    /// `None` for `auto`.
+    pub fn kind(self) -> Option<Kind> {
+        match self {
+            Self::Auto => None,
+            Self::Mvsplat => Some(Kind::Mvsplat),
+            Self::Subsplat => Some(Kind::Subsplat),
+            Self::Gmdepth => Some(Kind::Gmdepth),
+            Self::Lpips => Some(Kind::Lpips),
+        }
+    }
+}
+
+/// Element type to write.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub enum DtypeArg {
+    /// The same numbers as in PyTorch.
+    F32,
+    /// Half the size, 11 bits of precision, at most 65504.
+    F16,
+    /// Half the size, 8 bits of precision, the range of f32.
+    Bf16,
+}
+
+impl From<DtypeArg> for Float {
+    fn from(arg: DtypeArg) -> Self {
+        match arg {
+            DtypeArg::F32 => Self::F32,
+            DtypeArg::F16 => Self::F16,
+            DtypeArg::Bf16 => Self::Bf16,
+        }
+    }
+}

@@ -1,0 +1,10 @@
+//! The programs `subsplat` and `subsplat-convert`: command lines over the library's API.
+//!
+//! The two binaries contain an allocator and one call each; this crate holds what they run,
+//! so that they share error reporting, progress bars and the JSON answer.
+
+pub mod commands;
+pub mod convert;
+mod failure;
+pub mod pages;
+mod report;

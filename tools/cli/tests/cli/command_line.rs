@@ -1,0 +1,466 @@
+//! The program from outside: what it prints, what it writes, and that both are the
+//! same every time.
+
+use crate::program;
+use subsplat_test_support as common;
+use subsplat_test_support::one_splat;
+
+use one_splat::save_one_splat;
+use program::{Called, SIDE, call_in, call_with, files, named, workplace};
+use serde_json::Value;
+use std::collections::BTreeSet;
+use std::path::Path;
+use subsplat::camera::{Camera, Intrinsics};
+use subsplat::config::{Config, Preset, SpgrHead};
+use subsplat::io::cameras_json::{CameraFile, save_cameras_json};
+use subsplat::io::image::load;
+use subsplat::io::scene::{Frame, Units, load_scene};
+use subsplat::metrics::psnr;
+use subsplat::model::subsplat::SubSplat;
+use subsplat::model::weights::{Weights, save};
+
+/// A quick reconstruction: 64 px input, 128 px target, all frames named.
+const QUICK: &str = "--json run scene --context 0,2 --input-size 64";
+
+#[track_caller]
+fn done(called: &Called) -> Value {
+    assert_eq!(called.code, 0, "{}", called.stderr);
+    for sign in ['\r', '\u{1b}'] {
+        assert!(!called.stderr.contains(sign), "a bar without a terminal: {:?}", called.stderr);
+    }
+    called.json()
+}
+
+#[track_caller]
+fn keys(value: &Value, expected: &[&str]) {
+    let object = value.as_object().unwrap();
+    for key in expected {
+        assert!(object.contains_key(*key), "no `{key}` in {value}");
+    }
+}
+
+/// Stages add up to the total, which is the only double count.
+#[track_caller]
+fn seconds(report: &Value, stages: &[&str]) {
+    keys(&report["seconds"], stages);
+    let object = report["seconds"].as_object().unwrap();
+    let total = object["total"].as_f64().unwrap();
+    let sum: f64 =
+        object.iter().filter(|(k, _)| *k != "total").map(|(_, v)| v.as_f64().unwrap()).sum();
+    // Each is rounded to a millisecond.
+    assert!(sum <= total + 0.02, "{object:?}");
+    let peak = report["peak_memory_bytes"].as_u64();
+    assert!(cfg!(not(target_os = "linux")) || peak > Some(1 << 20), "{peak:?}");
+}
+
+/// PSNR of two 8-bit pictures.
+fn likeness(a: &Path, b: &Path) -> f64 {
+    let [a, b] = [a, b].map(|p| load(p).unwrap());
+    assert_eq!((a.width, a.height), (b.width, b.height));
+    let unit = |v: &[u8]| v.iter().map(|&v| f32::from(v) / 255.0).collect::<Vec<f32>>();
+    psnr(&unit(&a.data), &unit(&b.data), a.width, a.height).unwrap()
+}
+
+#[test]
+fn run_reports_and_writes_what_every_command_reads() {
+    let place = workplace();
+    let report = done(&call_in(place.path(), &format!("{QUICK} -o out --save ply,glb,splat,spz")));
+    keys(
+        &report,
+        &["scene", "context", "near", "far", "input_intrinsics", "upscale", "convention"],
+    );
+    seconds(&report, &["scene", "model", "crop", "backbone", "primaries", "subsplat", "rendering"]);
+    let gaussians = 2 * 64 * 64 * 4;
+    assert_eq!(report["gaussians"], gaussians);
+    assert_eq!(report["context"], serde_json::json!(["view0", "view2"]));
+    let target = &report["targets"][0];
+    assert_eq!(target["frame"], "view1");
+    assert!(target["psnr"].as_f64().unwrap() > 5.0 && target["ssim"].as_f64().unwrap() < 1.0);
+    assert_eq!(report["targets"].as_array().unwrap().len(), 1);
+
+    let out = place.path().join("out");
+    let written: Vec<String> = files(&out).iter().map(|p| p.to_string_lossy().into()).collect();
+    let expected = "cameras.json config.json depth/view1.png images/view1.png inputs/0.png \
+         inputs/0_depth.png inputs/1.png inputs/1_depth.png metrics.json scene.glb scene.ply \
+         scene.splat scene.spz";
+    assert_eq!(written, expected.split_whitespace().collect::<Vec<_>>());
+    let metrics: Value =
+        serde_json::from_slice(&std::fs::read(out.join("metrics.json")).unwrap()).unwrap();
+    assert_eq!(metrics, report);
+
+    for format in ["ply", "glb", "splat", "spz"] {
+        let info = done(&call_in(place.path(), &format!("--json info out/scene.{format}")));
+        assert_eq!(info["kind"], "splats");
+        assert_eq!(info["splats"]["count"], gaussians, "{format}");
+        assert_eq!(info["splats"]["non_finite"], 0);
+    }
+    let info = done(&call_in(place.path(), "--json info out"));
+    assert_eq!(
+        (info["kind"].as_str(), info["frames"][0]["width"].as_u64()),
+        (Some("scene"), Some(128))
+    );
+    let info = done(&call_in(place.path(), "--json info out/images/view1.png"));
+    assert_eq!((info["kind"].as_str(), info["width"].as_u64()), (Some("picture"), Some(128)));
+
+    // cameras.json beside the scene is found, and the picture is the same again.
+    let rendered = done(&call_in(place.path(), "--json render out/scene.ply -o again --depth"));
+    seconds(&rendered, &["scene", "rendering"]);
+    keys(&rendered["views"][0], &["file", "width", "height", "depth_file", "depth_unit"]);
+    let again = place.path().join("again/view1.png");
+    assert!(likeness(&again, &out.join("images/view1.png")) >= 50.0);
+}
+
+/// Without --convention a scene file is rendered as `run` rendered it.
+#[test]
+fn a_scene_file_renders_as_it_was_run_under_either_convention() {
+    let place = workplace();
+    let run = "run scene --context 0,2 --input-size 64 --no-check --near 0.7 --far 60";
+    let mut pictures = Vec::new();
+    for (convention, lowpass) in [("standard", "input"), ("mvsplat", "target")] {
+        let command = format!(
+            "{run} -o {convention} --convention {convention} --lowpass-ref {lowpass} --save ply,glb"
+        );
+        assert_eq!(call_in(place.path(), &command).code, 0);
+        let direct = place.path().join(convention).join("images/view1.png");
+        for format in ["ply", "glb"] {
+            let command = format!("--json render {convention}/scene.{format} -o {format}");
+            assert_eq!(done(&call_in(place.path(), &command))["convention"], convention);
+            let again = place.path().join(format).join("view1.png");
+            let likeness = likeness(&again, &direct);
+            // The field asks for 50 dB. Ours are the same pictures; 88 dB are five
+            // differences of one level, for another platform's `ln`.
+            assert!(likeness >= 88.0, "{convention} {format}: {likeness}");
+        }
+        pictures.push(direct);
+    }
+    // The wrong convention would not pass above (82.7 dB here: they differ little).
+    assert!(likeness(&pictures[0], &pictures[1]) < 86.0);
+}
+
+#[test]
+fn the_same_call_gives_the_same_bytes() {
+    let place = workplace();
+    let quick = "run scene --context 0,2 --input-size 64 --no-check --backbone re10k";
+    let calls = [
+        ("first", "--seed 7", None),
+        ("second", "--seed 7", None),
+        ("one", "--seed 7 --threads 1", None),
+        ("three", "--seed 7", Some(("RAYON_NUM_THREADS", "3"))),
+        ("other", "--seed 8", None),
+    ];
+    let bytes = calls.map(|(out, more, variable)| {
+        let command = format!("{quick} {more} -o {out}");
+        let arguments: Vec<&str> = command.split_whitespace().collect();
+        let called = call_with(place.path(), &arguments, variable.as_slice());
+        assert_eq!(called.code, 0, "{}", called.stderr);
+        assert!(called.stderr.contains("random weights"), "{}", called.stderr);
+        std::fs::read(place.path().join(out).join("scene.ply")).unwrap()
+    });
+    assert!(bytes[0] == bytes[1], "two calls differ");
+    assert!(bytes[0] == bytes[2], "one thread differs");
+    assert!(bytes[0] == bytes[3], "three threads differ");
+    assert!(bytes[0] != bytes[4], "the seed has no effect");
+}
+
+#[test]
+fn paths_sizes_and_detail() {
+    let place = workplace();
+    let quick = "--json run scene --context view0,view2.png --no-check";
+    let more = "--path interpolate --frames 3 --input-size 64x32 -o a";
+    let report = done(&call_in(place.path(), &format!("{quick} {more}")));
+    let names: Vec<&str> = report["targets"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|t| t["frame"].as_str().unwrap())
+        .collect();
+    assert_eq!(names, ["path_0000", "path_0001", "path_0002"]);
+    assert!(report["targets"][0]["psnr"].is_null() && report["psnr"].is_null());
+    let picture = load(&place.path().join("a/images/path_0002.png")).unwrap();
+    assert_eq!((picture.width, picture.height), (128, 64));
+
+    // The photograph is four times the input, so that it has detail to give. (Whether it
+    // helps is the network's matter: untrained depths put much of it in wrong places.)
+    let more = "--target 0 --input-size 32 --upscale 4";
+    let psnr = |detail: &str| {
+        let command = format!("{quick} {more} --detail {detail} -o {detail}");
+        let report = done(&call_in(place.path(), &command));
+        assert_eq!(report["gaussians"], 2 * 32 * 32 * 16);
+        assert_eq!(report["targets"][0]["photograph_enlarged"], false);
+        assert_eq!(report["detail"], detail == "photo");
+        report["targets"][0]["psnr"].as_f64().unwrap()
+    };
+    let (without, with) = (psnr("off"), psnr("photo"));
+    assert!((with - without).abs() > 1e-3, "{without} {with}");
+
+    let command = "--json render a/scene.ply --path orbit --frames 2 --size 40x24 -o b";
+    let report = done(&call_in(place.path(), command));
+    assert_eq!(report["views"].as_array().unwrap().len(), 2);
+    let picture = load(&place.path().join("b/path_0001.png")).unwrap();
+    assert_eq!((picture.width, picture.height), (40, 24));
+}
+
+/// The same two cameras three ways: matrices in two conventions, and a move.
+#[test]
+fn two_loose_photographs() {
+    let place = workplace();
+    let run = |out: &str, cameras: &[&str]| {
+        let mut arguments =
+            vec!["--json", "run", "scene/images/view0.png", "scene/images/view2.png"];
+        arguments.extend(["--input-size", "64", "--frames", "2", "--no-check", "-o", out]);
+        arguments.extend(cameras);
+        let report = done(&call_with(place.path(), &arguments, &[]));
+        assert_eq!(report["targets"].as_array().unwrap().len(), 2);
+        let bytes = std::fs::read(place.path().join(out).join("scene.ply")).unwrap();
+        (report, bytes)
+    };
+    let (report, moved) = run("a", &["--fov", "90", "--move", "-0.5,0,0.25"]);
+    // 90°: the focal length is half the side; the input is half the photograph.
+    assert_eq!(report["input_intrinsics"][0]["fx"], 32.0);
+    let (_, matrix) =
+        run("b", &["--intrinsics", "64,64,64,64", "--pose-b", "1 0 0 -0.5  0 1 0 0  0 0 1 0.25"]);
+    assert!(moved == matrix);
+    let (_, inverse) = run(
+        "c",
+        &["--fov=90", "--pose-b=1,0,0,0.5,0,1,0,0,0,0,1,-0.25", "--pose-convention", "opencv-w2c"],
+    );
+    assert!(moved == inverse);
+    let (_, turned) = run("d", &["--fov", "90", "--move", "-0.5,0,0.25", "--turn", "0,3,0"]);
+    assert!(moved != turned);
+    // Another scene's protocol beside them has indices that a pair does not.
+    let protocol = r#"{"tests": [{"context": [0, 1], "target": [7]}]}"#;
+    std::fs::write(place.path().join("scene/images/protocol.json"), protocol).unwrap();
+    let (_, beside) = run("e", &["--fov", "90", "--move", "-0.5,0,0.25"]);
+    assert!(moved == beside);
+    let called = call_with(
+        place.path(),
+        &[
+            "--json",
+            "check",
+            "scene/images/view0.png",
+            "scene/images/view2.png",
+            "--fov",
+            "90",
+            "--move=0.1,0,0",
+        ],
+        &[],
+    );
+    assert!([0, 3].contains(&called.code), "{}", called.stderr);
+    assert_eq!(called.json()["pairs"].as_array().unwrap().len(), 1);
+}
+
+#[test]
+fn check_says_no_with_exit_code_3() {
+    let place = workplace();
+    let called = call_in(place.path(), "--json check scene --context 0,0");
+    assert_eq!(called.code, 3, "{}", called.stderr);
+    let report = called.json();
+    assert_eq!(
+        (report["ok"].as_bool(), report["pairs"][0]["verdict"].as_str()),
+        (Some(false), Some("bad"))
+    );
+    keys(&report["pairs"][0], &["frames", "findings", "matches", "baseline", "epipolar_picture"]);
+    seconds(&report, &["scene", "matching"]);
+    // For people the answer is on stdout.
+    let called = call_in(place.path(), "check scene --context 0,0");
+    assert!(called.stdout.contains("bad") && !called.stderr.contains("bad:"), "{}", called.stdout);
+    // No path to the other photograph: the picture is written all the same where it can be.
+    let called = call_in(place.path(), "--json check scene --context 0,2 -o judged");
+    let report = called.json();
+    assert_eq!(called.code == 0, report["ok"].as_bool().unwrap());
+    let picture = report["pairs"][0]["epipolar_picture"].as_str().unwrap();
+    assert!(load(&place.path().join(picture)).is_ok());
+}
+
+/// Weights as training will write them: configuration and all tensors in one file.
+fn write_weights(path: &Path, config: &Config) {
+    let weights = Weights::seeded(1).trainable();
+    SubSplat::new(config, weights.builder()).unwrap();
+    let tensors =
+        weights.variables().into_iter().map(|(n, v)| (n, v.as_tensor().clone())).collect();
+    save(path, &tensors, config).unwrap();
+}
+
+#[test]
+fn weights_say_what_they_are_for() {
+    let place = workplace();
+    let config = Config::small(Preset::Tuned, 4);
+    write_weights(&place.path().join("w.safetensors"), &config);
+    let info = done(&call_in(place.path(), "--json info w.safetensors"));
+    assert_eq!(
+        (info["kind"].as_str(), info["config"]["upscale"].as_u64()),
+        (Some("weights"), Some(4))
+    );
+
+    let run =
+        "--json run scene --context 0,2 --input-size 32 --no-check -o out --weights w.safetensors";
+    let report = done(&call_in(place.path(), run));
+    assert_eq!(
+        (report["upscale"].as_u64(), report["untrained_tensors"].as_u64()),
+        (Some(4), Some(0))
+    );
+    let called = call_in(place.path(), &format!("{run} --backbone re10k"));
+    assert_eq!(called.code, 1);
+    assert!(called.error().contains("got the small one"), "{}", called.error());
+
+    let called = call_in(place.path(), &format!("{run} --upscale 2"));
+    match config.spgr.head {
+        // One head for any K.
+        SpgrHead::Coord => assert_eq!(called.code, 0),
+        _ => {
+            assert_eq!(called.code, 1);
+            let error = called.error();
+            let parts = ["w.safetensors", "--upscale 2 (4 children", "--upscale 4 (16 children"];
+            assert!(parts.iter().all(|p| error.contains(p)), "{error}");
+        }
+    }
+    // The configuration that `run` writes is one that it takes.
+    let command = "--json run scene --context 0,2 --input-size 32 --no-check -o again --config out/config.json";
+    assert_eq!(done(&call_in(place.path(), command))["upscale"], 4);
+}
+
+#[test]
+fn output_never_overwrites_what_is_read() {
+    let place = workplace();
+    let before = std::fs::read(place.path().join("scene/cameras.json")).unwrap();
+    let called = call_in(place.path(), "run scene --context 0,2 --input-size 64 -o scene");
+    assert_eq!(called.code, 1);
+    assert!(called.error().contains("choose another"), "{}", called.error());
+    assert_eq!(std::fs::read(place.path().join("scene/cameras.json")).unwrap(), before);
+    assert_eq!(load(&place.path().join("scene/images/view0.png")).unwrap().width, SIDE);
+
+    // The pictures are safe in another folder, but the poses would not be.
+    let at = |name: &str| place.path().join(name);
+    for name in ["rgb", "ngp", "bare"] {
+        std::fs::create_dir(at(name)).unwrap();
+    }
+    std::fs::rename(at("scene/images"), at("rgb/rgb")).unwrap();
+    let listed = String::from_utf8(before).unwrap().replace("images/", "rgb/");
+    std::fs::write(at("rgb/cameras.json"), &listed).unwrap();
+    // nerfstudio's, of which only the cameras.json that is written would be read.
+    let turned = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]";
+    let frame = |i: usize| {
+        let pose = turned.replacen(",0]", &format!(",{i}]"), 1);
+        format!(r#"{{"file_path": "../rgb/rgb/view{i}.png", "transform_matrix": {pose}}}"#)
+    };
+    let frames = [frame(0), frame(2)].join(",");
+    let transforms = format!(r#"{{"fl_x": 100, "frames": [{frames}]}}"#);
+    std::fs::write(at("ngp/transforms.json"), &transforms).unwrap();
+    std::fs::write(at("bare/transforms.json"), &transforms).unwrap();
+    let quick = "--input-size 32 --no-check --near 0.5 --far 50";
+    for (input, out) in [
+        ("rgb", "rgb"),
+        ("rgb/cameras.json", "bare/../rgb"),
+        ("ngp", "ngp"),
+        ("ngp/transforms.json", "ngp"),
+        ("rgb", "ngp"),
+    ] {
+        let words = format!("run {input} --context 0,1 {quick} -o {out}");
+        let called = call_in(place.path(), &words);
+        assert_eq!(called.code, 1, "{words}");
+        assert!(called.error().contains("choose another"), "{}", called.error());
+    }
+    let called = call_in(&at("rgb"), &format!("run cameras.json --context 0,1 {quick} -o ."));
+    assert!(called.error().contains("choose another"), "{}", called.error());
+    assert_eq!(std::fs::read_to_string(at("rgb/cameras.json")).unwrap(), listed);
+    let left = files(&at("ngp"));
+    assert_eq!(left, [Path::new("transforms.json")]);
+    // A folder of an earlier run is written again.
+    for _ in 0..2 {
+        let words = format!("run rgb/cameras.json --context 0,2 {quick} -o again");
+        let called = call_in(place.path(), &words);
+        assert_eq!(called.code, 0, "{}", called.stderr);
+    }
+}
+
+/// A least opacity that leaves nothing is told before pictures are rendered.
+#[test]
+fn nothing_is_rendered_of_a_scene_that_cannot_be_saved() {
+    let place = workplace();
+    let words = "run scene --context 0,2 --input-size 32 --no-check --min-opacity 0.99999994";
+    let called = call_in(place.path(), words);
+    assert_eq!(called.code, 1, "{}", called.stderr);
+    let error = called.error();
+    assert!(error.contains("--min-opacity: expected at most 0."), "{error}");
+    assert_eq!(files(&place.path().join("out")), [""; 0].map(std::path::PathBuf::from));
+}
+
+/// poses.txt means what it is said to mean.
+#[test]
+fn plain_matrices_take_a_convention() {
+    let place = workplace();
+    let scene = load_scene(&place.path().join("scene")).unwrap();
+    let at = |name: &str| place.path().join("scene").join(name);
+    let pose = |f: &Frame| {
+        let m = f.camera.camera_from_world().transpose().to_cols_array();
+        m.map(|v| v.to_string()).join(" ")
+    };
+    let poses: Vec<String> = scene.frames.iter().map(pose).collect();
+    std::fs::write(at("poses.txt"), poses.join("\n")).unwrap();
+    let k = scene.frames[0].camera.intrinsics;
+    std::fs::write(at("K.txt"), format!("{} {} {} {}", k.fx, k.fy, k.cx, k.cy)).unwrap();
+    let baseline = |words: &str| {
+        let called = call_in(place.path(), &format!("--json check {words} --context 0,2"));
+        called.json()["pairs"][0]["baseline"].as_f64().unwrap()
+    };
+    let want = baseline("scene");
+    std::fs::remove_file(at("cameras.json")).unwrap();
+    for named in ["scene", "scene/poses.txt"] {
+        let got = baseline(&format!("{named} --pose-convention opencv-w2c"));
+        assert!((got - want).abs() < 1e-4 * want, "{got} {want}");
+    }
+    let other = baseline("scene --pose-convention opencv-c2w");
+    assert_eq!(other, baseline("scene"));
+    assert!((other - want).abs() > 1e-3 * want, "the convention has no effect");
+}
+
+/// Colour and depth of frames whose names end alike.
+#[test]
+fn depth_pictures_do_not_overwrite_colour() {
+    let place = tempfile::tempdir().unwrap();
+    let at = |name: &str| place.path().join(name);
+    save_one_splat(&at("one.ply"));
+    let k = Intrinsics::from_fov_x(1.0, 32, 32);
+    let camera = Camera::new(k, glam::Mat4::IDENTITY).unwrap();
+    let cameras = ["a.png", "a_depth.png", "depth/a.png"].map(|n| named(n.to_owned(), camera));
+    let content = CameraFile { cameras: cameras.to_vec(), units: Units::Unknown, near_far: None };
+    save_cameras_json(&at("cameras.json"), &content).unwrap();
+    let report = done(&call_in(place.path(), "--json render one.ply --depth -o out"));
+    let views = report["views"].as_array().unwrap();
+    let written = views.iter().flat_map(|v| [&v["file"], &v["depth_file"]]);
+    let written: BTreeSet<&str> = written.map(|f| f.as_str().unwrap()).collect();
+    assert_eq!((written.len(), files(&at("out")).len()), (6, 6), "{written:?}");
+    assert!(written.contains("out/a_depth.png") && written.contains("out/depth/a.png"));
+}
+
+#[test]
+fn compare_says_yes_and_no() {
+    let (Some(weights), Some(reference)) = (
+        common::shared("golden/mvsplat_weights.safetensors"),
+        common::shared("golden/mvsplat_64x64_b1v2.safetensors"),
+    ) else {
+        return;
+    };
+    let place = tempfile::tempdir().unwrap();
+    let compare = |reference: &Path| {
+        let words = ["--json", "compare", "--weights", weights.to_str().unwrap(), "--reference"];
+        let called =
+            call_with(place.path(), &[&words[..], &[reference.to_str().unwrap()]].concat(), &[]);
+        let report = called.json();
+        keys(&report["tensors"][0], &["tensor", "max_abs", "relative", "allowed", "ok"]);
+        seconds(&report, &["encoder"]);
+        assert_eq!(report["ok"].as_bool().unwrap(), called.code == 0);
+        (called.code, report["tensors"].as_array().unwrap().len())
+    };
+    let (code, tensors) = compare(&reference);
+    assert_eq!(code, 0);
+    assert!(tensors > 20, "{tensors}");
+    // The inputs and one tensor that is a hundredth of its range off.
+    let (mut all, _) = subsplat::model::weights::read_tensors(&reference).unwrap();
+    all.retain(|name, _| name.starts_with("in.") || name == "out.means");
+    let off = all["out.means"].affine(1.0, 1.0).unwrap();
+    all.insert("out.means".to_owned(), off);
+    let wrong = place.path().join("wrong.safetensors");
+    save(&wrong, &all, &Config::x2()).unwrap();
+    assert_eq!(compare(&wrong), (3, 1));
+}

@@ -1,0 +1,13 @@
+//! The programs, called as a user calls them.
+
+mod cli_errors;
+mod cli_photos;
+mod command_line;
+mod compare_raster;
+mod convert;
+mod devices;
+mod eval_cli;
+mod program;
+mod train;
+#[cfg(feature = "view")]
+mod view;

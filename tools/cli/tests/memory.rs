@@ -1,0 +1,71 @@
+//! Peak memory of whole runs, as the program itself reports it (`VmHWM`).
+
+use subsplat_test_support::whole;
+
+use std::path::Path;
+use std::process::Command;
+use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
+use subsplat::io::image::save_png;
+
+/// A scene folder of two photographs.
+fn scene(folder: &Path, side: usize) {
+    let shoot = whole::shoot(3, 2, side, side);
+    std::fs::create_dir_all(folder.join("images")).unwrap();
+    let frame = |(i, photo): (usize, &subsplat::pipeline::Photo)| {
+        let file = format!("images/{i}.png");
+        save_png(&folder.join(&file), &photo.image).unwrap();
+        NamedCamera { file, camera: photo.camera, timestamp: None, depth: None }
+    };
+    let cameras = shoot.photos.iter().enumerate().map(frame).collect();
+    save_cameras_json(
+        &folder.join("cameras.json"),
+        &CameraFile { cameras, units: Default::default(), near_far: None },
+    )
+    .unwrap();
+}
+
+/// MiB at the peak of `subsplat run --json` with these arguments.
+fn peak(scene: &Path, arguments: &[&str]) -> f64 {
+    let out = tempfile::tempdir().unwrap();
+    let run = Command::new(env!("CARGO_BIN_EXE_subsplat"))
+        .args([
+            "run",
+            "--json",
+            "--path",
+            "interpolate",
+            "--frames",
+            "2",
+            "--near",
+            "0.4",
+            "--far",
+            "12",
+        ])
+        .args(arguments)
+        .arg("-o")
+        .arg(out.path())
+        .arg(scene)
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&run.stderr);
+    assert!(run.status.success(), "{said}");
+    let report: serde_json::Value = serde_json::from_slice(&run.stdout).unwrap();
+    let bytes = report["peak_memory_bytes"].as_f64().unwrap();
+    let mib = bytes / f64::from(1 << 20);
+    eprintln!("{arguments:?}: {mib:.0} MiB, seconds {}", report["seconds"]);
+    // A number that no process of this size could have would be a broken report.
+    let gaussians = report["gaussians"].as_f64().unwrap();
+    assert!(bytes > gaussians * 60.0, "{mib:.0} MiB for {gaussians} Gaussians");
+    mib
+}
+
+/// The PyTorch backbone alone takes 2.2 GiB at 2 × 256².
+#[test]
+fn runs_stay_within_their_memory() {
+    let folder = tempfile::tempdir().unwrap();
+    scene(folder.path(), 1024);
+    let limits = [("re10k", "2", 1.2), ("re10k", "4", 1.5), ("small", "2", 1.2)];
+    for (backbone, upscale, gib) in limits {
+        let mib = peak(folder.path(), &["--backbone", backbone, "--upscale", upscale]);
+        assert!(mib <= 1024.0 * gib, "{backbone} x{upscale}: {mib:.0} MiB");
+    }
+}
