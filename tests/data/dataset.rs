@@ -4,7 +4,6 @@ use subsplat_test_support as common;
 use subsplat_test_support::chunk_files;
 use subsplat_test_support::made_up;
 use subsplat_test_support::noise;
-use subsplat_test_support::torch_writer as writer;
 
 use chunk_files::{Video, frame, video, write};
 use glam::{Mat4, Quat, Vec3};

@@ -1,8 +1,6 @@
 //! Training on pictures from disk, and the folder that a run holds for itself.
 
 use subsplat_test_support::chunk_files;
-use subsplat_test_support::noise;
-use subsplat_test_support::torch_writer as writer;
 
 use chunk_files::{video, write};
 use std::path::Path;
