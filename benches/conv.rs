@@ -98,7 +98,7 @@ struct Case {
 
 impl Case {
     fn flat(network: &str, images: usize, &(name, c, o, k, stride, side): &Row) -> Result<Self> {
-        let sizes = Sizes::flat([c, o], [k, k], stride, k / 2, [side, side]);
+        let sizes = Sizes::conv2d([c, o], [k, k], stride, k / 2, [side, side]);
         let scale = 1.0 / ((c * k * k) as f32).sqrt();
         Ok(Self {
             name: format!("{network} {name}"),
@@ -112,7 +112,7 @@ impl Case {
     fn stem(&(name, c, o): &(&str, usize, usize)) -> Result<Self> {
         Ok(Self {
             name: format!("small {name}"),
-            sizes: Sizes::solid([c, o], [3; 3], 1, [64, 32, 32]),
+            sizes: Sizes::conv3d([c, o], [3; 3], 1, [64, 32, 32]),
             x: tensor(&[8, c, 64, 32, 32], 1.0, 1)?,
             w: tensor(&[o, c, 3, 3, 3], 0.1, 2)?,
             b: tensor(&[o], 1.0, 3)?,

@@ -30,7 +30,7 @@ pub fn conv2d(
              {kh}x{kw}, picture {h}x{w}, padding {padding}, stride {stride}"
         );
     }
-    apply("conv2d", x, weight, bias, Sizes::flat([c, o], [kh, kw], stride, padding, [h, w]))
+    apply("conv2d", x, weight, bias, Sizes::conv2d([c, o], [kh, kw], stride, padding, [h, w]))
 }
 
 #[cfg(test)]

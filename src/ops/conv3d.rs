@@ -30,7 +30,7 @@ pub fn conv3d(
              {d}x{h}x{w}, padding {padding}"
         );
     }
-    apply("conv3d", x, weight, bias, Sizes::solid([c, o], [kd, kh, kw], padding, [d, h, w]))
+    apply("conv3d", x, weight, bias, Sizes::conv3d([c, o], [kd, kh, kw], padding, [d, h, w]))
 }
 
 #[cfg(test)]

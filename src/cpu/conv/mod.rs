@@ -1,37 +1,83 @@
-//! Convolutions of any kernel, stride and padding over two or three axes, forward and
-//! both gradients, without im2col (cross-correlation, as in PyTorch).
+//! Convolutions (cross-correlations, as in PyTorch) over two or three axes: forward and both
+//! gradients, any kernel, stride and zero padding, without an im2col matrix.
 //!
-//! x `[B, C, D, H, W]`, w `[O, C, kd, kh, kw]`, y `[B, O, D', H', W']`, zero padding;
-//! in two dimensions D = 1. `plan` says what is read and written, `shift` computes y
-//! and ∂L/∂x, `weights` ∂L/∂w. Any number of threads gives the same bytes.
-//! Twins: none yet. Oracle: the definition in f64 (the tests).
+//! y[b][o][p] = bias[o] + Σ_c Σ_tap w[o][c][tap] · x[b][c][stride·p + tap − padding]
+//!
+//! Input: x `[B, C, D, H, W]`, w `[O, C, kd, kh, kw]`, bias `[O]` or empty. Output:
+//! y `[B, O, D', H', W']`. In two dimensions D = 1 and kd = 1.
+//! Invariant: the number of threads does not change a byte.
+//! WGSL: none. Oracle and tests: conv/tests.rs (the definition in f64).
+//!
+//! `algorithm` chooses the algorithm, for each direction in one function:
+//!
+//! | algorithm | y and ∂L/∂x | ∂L/∂w | error bound | files |
+//! |---|---|---|---|---|
+//! | pointwise | 1×1 kernel, no padding, ≥ 16 source channels, ≥ 256 positions | the same, and > 8 output channels | 1.5e-6·√n | `pointwise` |
+//! | Winograd | 3×3 kernel of stride 1 or 2, ≥ 24 channels on both sides | the same, ≥ 8 tiles | 3e-6·√n | `winograd` |
+//! | direct | all others | all others; `narrow` for ≤ 8 or 17–24 output channels | 1.5e-6·√n | `direct` |
+//!
+//! The bound holds for numbers in ±1 and n products per sum; tests check it. Winograd for
+//! images of fewer than 48 tiles is `winograd/small_images`.
+//!
+//! A tile on its way (C source channels, 8 destination channels at a time):
+//!
+//! ```text
+//!  source image [C,H,W]       packed tile [C,plane,row,column]        register tile
+//!  ┌───────────────┐          ┌0─0─0─0─0─0┐                      8 channels × 48 places
+//!  │   ┌─────┐     │  pack    │0┌───────┐0│  shift by tap        ┌──────────────────────┐
+//!  │   │tile │halo │ ───────> │0│ tile  │0│ ───────────────────> │ Σ over C and taps of │
+//!  │   └─────┘     │          │0└───────┘0│     weights ───────> │ weight × shifted tile│
+//!  └───────────────┘          └0─0─0─0─0─0┘                      └──────────┬───────────┘
+//!    │                          direct: packed_tile      direct: register_tile  │ store
+//!    │                                                                          v
+//!    │                                                            destination [O,H',W']
+//!    │                                                                          ^
+//!    │ load 16 tiles           transformed tiles                 products       │ Aᵀ·m·A
+//!    │ and Bᵀ·d·B              [36 groups][C][tile]              [36][8][tile]  │
+//!    └──────────────────────>  ┌─┬─┬─┬─┐   36 matrix products    ┌─┬─┬─┬─┐      │
+//!      winograd/load_tiles     └─┴─┴─┴─┘ ─────────────────────>  └─┴─┴─┴─┘ ─────┘
+//!                              winograd/product_layout          winograd/products
+//!                                          ^ register_tile
+//!                              G·g·Gᵀ of the weights: winograd/weights
+//!
+//!  pointwise: source pixels ── gemm packs panels ──> register tile of gemm ──> destination
+//! ```
+//!
+//! ∂L/∂x is a convolution of ∂L/∂y and takes the same path (`plan`). ∂L/∂w multiplies the
+//! packed or transformed tiles of x with those of ∂L/∂y and sums over all tiles
+//! (`weight_grad_jobs`, `weight_grad_tile`).
 #![expect(
     clippy::needless_range_loop,
     reason = "counted loops over register tiles unroll, iterators over them need not"
 )]
 
-mod forms;
-mod gather;
+mod algorithm;
+mod bias_grad;
+mod buffers;
+mod direct;
+mod packed_tile;
 mod plan;
 mod pointwise;
-mod shift;
+mod register_tile;
+mod sizes;
 #[cfg(test)]
 mod tests;
-mod weights;
+mod weight_grad_jobs;
+mod weight_grad_tile;
 mod winograd;
-mod winograd_few;
-mod winograd_weights;
 
 use super::fresh::{Block, Fresh};
-use super::simd::{Kernel, LANES, Simd, Tier};
+use super::simd::Tier;
+use algorithm::{
+    Convolve, ConvolveArgs, WeightGrad, WeightGradArgs, choose_algorithm,
+    choose_weight_grad_algorithm,
+};
 use plan::Plan;
-use rayon::prelude::*;
-use std::cell::{Cell, RefCell};
 
-pub use plan::{Axes, Sizes};
-pub use weights::weight_grad;
+pub use bias_grad::bias_grad;
+pub use sizes::{Axes, Sizes};
 
-/// y = x ∗ w + bias of `images` pictures; `bias` is empty or `[O]`.
+/// Computes y = x ∗ w + bias of `images` images; `bias` is empty or `[O]`.
 pub fn forward(
     tier: Tier,
     s: &Sizes,
@@ -40,148 +86,36 @@ pub fn forward(
     w: &[f32],
     bias: &[f32],
 ) -> Vec<f32> {
-    fresh(tier, &Plan::forward(s), images, x, w, bias)
+    convolve(&ConvolveArgs { tier, plan: &Plan::forward(s), x, w, bias }, images)
 }
 
-/// ∂L/∂x from ∂L/∂y of `images` pictures.
+/// Computes ∂L/∂x from ∂L/∂y of `images` images.
 pub fn input_grad(tier: Tier, s: &Sizes, images: usize, dy: &[f32], w: &[f32]) -> Vec<f32> {
-    fresh(tier, &Plan::input_grad(s), images, dy, w, &[])
+    convolve(&ConvolveArgs { tier, plan: &Plan::input_grad(s), x: dy, w, bias: &[] }, images)
 }
 
-/// [`run`] into new memory.
-fn fresh(tier: Tier, plan: &Plan, images: usize, x: &[f32], w: &[f32], bias: &[f32]) -> Vec<f32> {
-    let pixels: usize = plan.dst_size.iter().product();
-    let mut y = Fresh::new(images * plan.dst_channels * pixels);
-    run(tier, plan, x, w, bias, y.whole());
-    // SAFETY: each of the three ways writes every channel of every picture in tiles that
-    // cover it (the tests run them over memory full of NaN).
+/// Computes ∂L/∂w from x and ∂L/∂y; overwrites `dw`.
+pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32]) {
+    if dw.is_empty() || x.is_empty() || dy.is_empty() {
+        dw.fill(0.0);
+        return;
+    }
+    let args = WeightGradArgs { tier, plan: &Plan::forward(s), x, dy };
+    choose_weight_grad_algorithm(args.plan, args.images()).weight_grad(&args, dw);
+}
+
+/// Convolves into new memory.
+fn convolve(args: &ConvolveArgs<'_>, images: usize) -> Vec<f32> {
+    let mut y = Fresh::new(images * args.plan.dst_channels * args.plan.dst_pixels());
+    convolve_into(args, y.whole());
+    // SAFETY: each algorithm writes every channel of every image, in tiles that cover it
+    // (the tests run them over memory full of NaN).
     unsafe { y.finish() }
 }
 
-/// The fastest of the three ways. For numbers in ±1 and n products a sum, [`winograd`] is
-/// within 3e-6·√n of the exact sum, [`shift`] and [`pointwise`] within 1.5e-6·√n (the
-/// tests hold them).
-fn run(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y: &mut Block<f32>) {
-    if y.is_empty() {
-        return;
-    }
-    if pointwise::suits(plan) {
-        pointwise::run(tier, plan, x, w, bias, y);
-    } else if let Some(way) = winograd::Way::of(plan) {
-        if winograd::Way::few(plan) {
-            winograd_few::run(tier, plan, way, x, w, bias, y);
-            return;
-        }
-        let w = winograd::Weights::new(tier, plan, way, w, WEIGHTS.take());
-        winograd::run(tier, plan, way, x, &w, bias, y);
-        keep(w.into_memory());
-    } else {
-        let w = shift::Weights::new(plan, w, WEIGHTS.take());
-        shift::run(tier, plan, x, &w, bias, y);
-        keep(w.into_memory());
-    }
-}
-
-/// Most floats of weights that a thread keeps: longer blocks are the allocator's to
-/// keep, where a program has one that does ([`super::pages`]).
-const KEPT: usize = 1 << 20;
-
-fn keep(memory: Vec<f32>) {
-    if memory.capacity() < KEPT {
-        WEIGHTS.set(memory);
-    }
-}
-
-thread_local! {
-    static BUFFERS: RefCell<Buffers> = RefCell::default();
-    /// Memory of the weights in the kernels' order.
-    static WEIGHTS: Cell<Vec<f32>> = Cell::default();
-}
-
-/// What a thread keeps from call to call, so that calls need not ask for megabytes of
-/// fresh pages.
-#[derive(Default)]
-struct Buffers {
-    /// A packed tile.
-    x: Buffer,
-    /// Sums before they are written, or gradients turned over.
-    y: Buffer,
-    /// Transformed tiles of x.
-    tiles: Buffer,
-    /// Transformed tiles of ∂L/∂y.
-    gradients: Buffer,
-    /// Products of transformed tiles.
-    products: Buffer,
-}
-
-impl Buffers {
-    /// Runs `f` with this thread's own (empty ones, should `f` come here again).
-    fn with<R>(f: impl FnOnce(&mut Self) -> R) -> R {
-        let mut own = BUFFERS.take();
-        let result = f(&mut own);
-        BUFFERS.set(own);
-        result
-    }
-}
-
-/// Sixteen floats on a cache line of their own.
-#[derive(Clone, Copy, Default)]
-#[repr(C, align(64))]
-struct Line([f32; LANES]);
-
-/// Floats from the start of a cache line, so that whole vectors never straddle two.
-#[derive(Default)]
-struct Buffer(Vec<Line>);
-
-impl Buffer {
-    /// Room for `n` floats, with what the last use left there.
-    fn room(&mut self, n: usize) -> &mut [f32] {
-        if self.0.len() * LANES < n {
-            self.0.resize(n.div_ceil(LANES), Line::default());
-        }
-        let lines: &mut [Line] = &mut self.0;
-        let floats = lines.len() * LANES;
-        // SAFETY: a line is 16 floats and nothing else.
-        let all = unsafe { std::slice::from_raw_parts_mut(lines.as_mut_ptr().cast(), floats) };
-        &mut all[..n]
-    }
-}
-
-/// Numbers that are summed in f32 lanes before they go to an f64: a sum over a
-/// million in f32 alone loses three digits.
-const BLOCK: usize = 4096;
-
-/// ∂L/∂bias: sums of `dy` `[B, O, pixels]` over pictures and pixels, `db` overwritten.
-pub fn bias_grad(pixels: usize, dy: &[f32], db: &mut [f32]) {
-    let channels = db.len();
-    db.par_iter_mut().enumerate().for_each(|(o, sum)| {
-        let rows = dy.chunks_exact(pixels.max(1)).skip(o).step_by(channels);
-        *sum = Tier::best().run(Sum(rows)) as f32;
-    });
-}
-
-/// Sum of all numbers of some rows.
-struct Sum<I>(I);
-
-impl<'a, I: Iterator<Item = &'a [f32]>> Kernel for Sum<I> {
-    type Output = f64;
-
-    #[inline(always)]
-    fn run<S: Simd>(self, s: S) -> f64 {
-        let mut total = 0.0;
-        for row in self.0 {
-            for block in row.chunks(BLOCK) {
-                let mut sums = [s.splat(0.0); 4];
-                let (groups, rest) = block.as_chunks::<{ 4 * LANES }>();
-                for group in groups {
-                    for (sum, v) in sums.iter_mut().zip(group.as_chunks().0) {
-                        *sum = *sum + s.load(v);
-                    }
-                }
-                let lanes = s.sum((sums[0] + sums[1]) + (sums[2] + sums[3]));
-                total += f64::from(lanes) + f64::from(rest.iter().sum::<f32>());
-            }
-        }
-        total
+/// Convolves into `y`, by the algorithm that [`choose_algorithm`] returns.
+fn convolve_into(args: &ConvolveArgs<'_>, y: &mut Block<f32>) {
+    if !y.is_empty() {
+        choose_algorithm(args.plan).convolve(args, y);
     }
 }

@@ -1,10 +1,10 @@
-//! Against the definition in f64, in every tier.
+//! Compares every direction with the definition in f64, at every SIMD level.
 
+use super::algorithm::Algorithm;
 use super::*;
 use crate::cpu::fresh::over;
-use crate::cpu::simd::Tier;
 
-/// y in f64: nine loops.
+/// Computes y in f64 by nested loops.
 fn definition(s: &Sizes, x: &[f32], w: &[f32], bias: &[f32]) -> Vec<f64> {
     let (out, [d, h, wi], taps) = (s.out_size(), s.size, s.taps());
     let images = x.len() / (s.in_channels * s.in_pixels());
@@ -41,7 +41,7 @@ fn definition(s: &Sizes, x: &[f32], w: &[f32], bias: &[f32]) -> Vec<f64> {
     y
 }
 
-/// Numbers in ±1.
+/// Returns pseudo-random numbers in ±1.
 fn noise(n: usize, seed: u32) -> Vec<f32> {
     let mut s = seed.wrapping_mul(2_654_435_761).wrapping_add(1);
     (0..n)
@@ -52,7 +52,7 @@ fn noise(n: usize, seed: u32) -> Vec<f32> {
         .collect()
 }
 
-fn flat(
+fn conv2d(
     c: usize,
     o: usize,
     k: [usize; 2],
@@ -60,91 +60,95 @@ fn flat(
     padding: usize,
     size: [usize; 2],
 ) -> Sizes {
-    Sizes::flat([c, o], k, stride, padding, size)
+    Sizes::conv2d([c, o], k, stride, padding, size)
 }
 
-fn solid(c: usize, o: usize, kernel: [usize; 3], padding: usize, size: [usize; 3]) -> Sizes {
-    Sizes::solid([c, o], kernel, padding, size)
+fn conv3d(c: usize, o: usize, kernel: [usize; 3], padding: usize, size: [usize; 3]) -> Sizes {
+    Sizes::conv3d([c, o], kernel, padding, size)
 }
 
-/// Every kernel, stride and remainder that differs in the code: one to nine output
-/// channels, several blocks of 48, tiles cut in rows, columns and depths.
+/// Returns sizes that cover every case of the code: kernels, strides and remainders, one to
+/// nine output channels, several blocks of 48, tiles cut in rows, columns and depths.
 fn cases() -> Vec<Sizes> {
     vec![
-        flat(3, 5, [7, 7], 2, 3, [16, 12]),
-        flat(40, 7, [3, 3], 1, 1, [9, 11]),
-        flat(6, 4, [3, 3], 2, 1, [8, 9]),
-        flat(6, 4, [1, 1], 2, 0, [8, 9]),
-        flat(37, 8, [1, 1], 1, 0, [5, 7]),
-        // As a matrix product, with rows and columns left over.
-        flat(37, 50, [1, 1], 1, 0, [18, 16]),
-        flat(130, 20, [1, 1], 1, 0, [40, 43]),
-        // The same of pixels that are not neighbours.
-        flat(37, 50, [1, 1], 2, 0, [36, 73]),
-        flat(130, 20, [1, 1], 2, 0, [81, 79]),
-        flat(19, 23, [1, 1], 3, 0, [50, 61]),
-        flat(2, 3, [3, 1], 1, 1, [1, 1]),
-        flat(2, 3, [5, 5], 3, 4, [2, 3]),
-        flat(1, 1, [3, 3], 1, 1, [33, 40]),
-        flat(5, 17, [5, 5], 2, 2, [20, 33]),
-        // Three narrow passes.
-        flat(3, 23, [5, 5], 2, 2, [20, 31]),
-        flat(3, 18, [5, 5], 2, 2, [21, 64]),
-        flat(4, 50, [3, 3], 1, 1, [16, 16]),
-        flat(21, 110, [3, 3], 2, 1, [13, 10]),
-        flat(2, 100, [3, 3], 1, 1, [5, 20]),
-        flat(3, 9, [3, 3], 1, 0, [6, 300]),
-        flat(3, 8, [3, 3], 1, 1, [6, 288]),
-        flat(20, 2, [3, 3], 1, 1, [70, 140]),
-        flat(2, 20, [1, 1], 3, 0, [7, 7]),
-        // By Winograd, borders within tiles, several blocks each way.
-        flat(24, 30, [3, 3], 1, 1, [30, 33]),
-        flat(41, 26, [3, 3], 1, 0, [36, 31]),
-        flat(33, 100, [3, 3], 1, 2, [22, 35]),
-        flat(25, 24, [3, 3], 1, 1, [70, 141]),
-        // Gradients to weights in several groups of tiles.
-        flat(26, 70, [3, 3], 1, 1, [66, 67]),
-        // The same of stride 2.
-        flat(24, 30, [3, 3], 2, 1, [60, 66]),
-        flat(41, 26, [3, 3], 2, 1, [71, 63]),
-        flat(33, 100, [3, 3], 2, 0, [55, 60]),
-        flat(25, 24, [3, 3], 2, 1, [139, 280]),
-        // All tiles of both pictures at once.
-        flat(41, 26, [3, 3], 1, 1, [16, 16]),
-        flat(24, 53, [3, 3], 1, 1, [13, 18]),
-        flat(33, 26, [3, 3], 2, 1, [31, 34]),
-        solid(5, 8, [3, 3, 3], 1, [6, 7, 9]),
-        solid(8, 1, [3, 3, 3], 1, [5, 4, 20]),
-        // Narrow passes of some rows each, the last ones fewer.
-        solid(1, 7, [3, 3, 3], 1, [8, 40, 30]),
-        solid(1, 8, [3, 3, 3], 1, [8, 40, 32]),
-        solid(2, 11, [3, 1, 2], 1, [3, 4, 5]),
-        solid(1, 3, [3, 3, 3], 1, [20, 3, 3]),
+        conv2d(3, 5, [7, 7], 2, 3, [16, 12]),
+        conv2d(40, 7, [3, 3], 1, 1, [9, 11]),
+        conv2d(6, 4, [3, 3], 2, 1, [8, 9]),
+        conv2d(6, 4, [1, 1], 2, 0, [8, 9]),
+        conv2d(37, 8, [1, 1], 1, 0, [5, 7]),
+        // Pointwise, with rows and columns left over.
+        conv2d(37, 50, [1, 1], 1, 0, [18, 16]),
+        conv2d(130, 20, [1, 1], 1, 0, [40, 43]),
+        // Pointwise with strides.
+        conv2d(37, 50, [1, 1], 2, 0, [36, 73]),
+        conv2d(130, 20, [1, 1], 2, 0, [81, 79]),
+        conv2d(19, 23, [1, 1], 3, 0, [50, 61]),
+        conv2d(2, 3, [3, 1], 1, 1, [1, 1]),
+        conv2d(2, 3, [5, 5], 3, 4, [2, 3]),
+        conv2d(1, 1, [3, 3], 1, 1, [33, 40]),
+        conv2d(5, 17, [5, 5], 2, 2, [20, 33]),
+        // Weight gradients in three narrow passes.
+        conv2d(3, 23, [5, 5], 2, 2, [20, 31]),
+        conv2d(3, 18, [5, 5], 2, 2, [21, 64]),
+        conv2d(4, 50, [3, 3], 1, 1, [16, 16]),
+        conv2d(21, 110, [3, 3], 2, 1, [13, 10]),
+        conv2d(2, 100, [3, 3], 1, 1, [5, 20]),
+        conv2d(3, 9, [3, 3], 1, 0, [6, 300]),
+        conv2d(3, 8, [3, 3], 1, 1, [6, 288]),
+        conv2d(20, 2, [3, 3], 1, 1, [70, 140]),
+        conv2d(2, 20, [1, 1], 3, 0, [7, 7]),
+        // Winograd, borders within tiles, several blocks along both axes.
+        conv2d(24, 30, [3, 3], 1, 1, [30, 33]),
+        conv2d(41, 26, [3, 3], 1, 0, [36, 31]),
+        conv2d(33, 100, [3, 3], 1, 2, [22, 35]),
+        conv2d(25, 24, [3, 3], 1, 1, [70, 141]),
+        // Weight gradients in several groups of tiles.
+        conv2d(26, 70, [3, 3], 1, 1, [66, 67]),
+        // Winograd of stride 2.
+        conv2d(24, 30, [3, 3], 2, 1, [60, 66]),
+        conv2d(41, 26, [3, 3], 2, 1, [71, 63]),
+        conv2d(33, 100, [3, 3], 2, 0, [55, 60]),
+        conv2d(25, 24, [3, 3], 2, 1, [139, 280]),
+        // Winograd for small images: the tiles of both images together.
+        conv2d(41, 26, [3, 3], 1, 1, [16, 16]),
+        conv2d(24, 53, [3, 3], 1, 1, [13, 18]),
+        conv2d(33, 26, [3, 3], 2, 1, [31, 34]),
+        conv3d(5, 8, [3, 3, 3], 1, [6, 7, 9]),
+        conv3d(8, 1, [3, 3, 3], 1, [5, 4, 20]),
+        // Narrow weight gradients in passes of some rows each, fewer in the last one.
+        conv3d(1, 7, [3, 3, 3], 1, [8, 40, 30]),
+        conv3d(1, 8, [3, 3, 3], 1, [8, 40, 32]),
+        conv3d(2, 11, [3, 1, 2], 1, [3, 4, 5]),
+        conv3d(1, 3, [3, 3, 3], 1, [20, 3, 3]),
     ]
 }
 
-/// Bound of [`worst`] where Winograd is used, and where it is not.
-const WINOGRAD: f64 = 3e-6;
-const DIRECT: f64 = 1.5e-6;
+/// Bound of [`worst`] for Winograd's algorithm.
+const WINOGRAD_BOUND: f64 = 3e-6;
+/// Bound of [`worst`] for the other algorithms.
+const DIRECT_BOUND: f64 = 1.5e-6;
 
+/// Returns the bound of [`worst`] for the algorithm that `plan` is computed with.
 fn bound(plan: &Plan) -> f64 {
-    if winograd::Way::of(plan).is_some() { WINOGRAD } else { DIRECT }
+    match choose_algorithm(plan) {
+        Algorithm::Winograd(_) | Algorithm::WinogradSmallImages(_) => WINOGRAD_BOUND,
+        Algorithm::Pointwise | Algorithm::Direct => DIRECT_BOUND,
+    }
 }
 
-/// Largest difference over the size of what is summed.
+/// Returns the largest difference, divided by `scale`.
 fn worst(got: &[f32], want: &[f64], scale: f64) -> f64 {
     assert_eq!(got.len(), want.len());
     let differences = got.iter().zip(want).map(|(a, b)| (f64::from(*a) - b).abs());
     differences.fold(0.0, |m: f64, d| if d <= m { m } else { d }) / scale
 }
 
-/// [`run`] into memory full of NaN: what it leaves out shows.
+/// Convolves into memory full of NaN, so that a place that is not written shows.
 fn over_nan(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32]) -> Vec<f32> {
-    let count = |channels: usize, size: Axes| channels * size.iter().product::<usize>();
-    let images = x.len() / count(plan.src_channels, plan.src_size);
-    let mut y = vec![f32::NAN; images * count(plan.dst_channels, plan.dst_size)];
-    // SAFETY: `run` writes numbers.
-    run(tier, plan, x, w, bias, unsafe { over(&mut y) });
+    let images = x.len() / (plan.src_channels * plan.src_pixels());
+    let mut y = vec![f32::NAN; images * plan.dst_channels * plan.dst_pixels()];
+    // SAFETY: `convolve_into` writes numbers only.
+    convolve_into(&ConvolveArgs { tier, plan, x, w, bias }, unsafe { over(&mut y) });
     y
 }
 
@@ -165,8 +169,8 @@ fn forward_agrees_with_the_definition() {
     }
 }
 
-/// The convolution is linear in x and in w, so both gradients follow from its
-/// definition: ∂⟨dy, y⟩/∂w[j] = ⟨dy, y of the j-th unit w⟩.
+/// Computes ∂L/∂x and ∂L/∂w in f64. The convolution is linear in x and in w, so both follow
+/// from its definition: ∂⟨dy, y⟩/∂w[j] = ⟨dy, y of the j-th unit w⟩.
 fn gradients(s: &Sizes, x: &[f32], w: &[f32], dy: &[f32]) -> [Vec<f64>; 2] {
     let (out, taps) = (s.out_size(), s.taps());
     let images = x.len() / (s.in_channels * s.in_pixels());
@@ -230,14 +234,13 @@ fn bias_gradients_are_sums() {
     }
 }
 
-/// Bytes do not depend on the number of threads.
 #[test]
-fn threads_do_not_matter() {
+fn the_number_of_threads_changes_no_byte() {
     for s in [
-        flat(24, 40, [3, 3], 1, 1, [48, 48]),
-        flat(40, 150, [3, 3], 1, 1, [64, 64]),
-        flat(40, 50, [3, 3], 2, 1, [64, 64]),
-        flat(70, 40, [1, 1], 2, 0, [64, 70]),
+        conv2d(24, 40, [3, 3], 1, 1, [48, 48]),
+        conv2d(40, 150, [3, 3], 1, 1, [64, 64]),
+        conv2d(40, 50, [3, 3], 2, 1, [64, 64]),
+        conv2d(70, 40, [1, 1], 2, 0, [64, 70]),
     ] {
         check_threads(&s);
     }
@@ -263,10 +266,11 @@ fn check_threads(s: &Sizes) {
     assert!(one.is_some() && one == run(2) && one == run(5), "{s:?}");
 }
 
-/// A picture of a batch is the picture alone, however many tiles share a vector.
+/// An image of a batch gives the same bytes as the image alone, also where its tiles share
+/// vectors with tiles of other images.
 #[test]
-fn pictures_do_not_mix() {
-    for s in [flat(24, 30, [3, 3], 1, 1, [16, 20]), flat(24, 30, [3, 3], 2, 1, [32, 32])] {
+fn images_of_a_batch_are_independent() {
+    for s in [conv2d(24, 30, [3, 3], 1, 1, [16, 20]), conv2d(24, 30, [3, 3], 2, 1, [32, 32])] {
         let w = noise(s.out_channels * s.in_channels * s.taps(), 11);
         let x = noise(3 * s.in_channels * s.in_pixels(), 12);
         let together = forward(Tier::best(), &s, 3, &x, &w, &[]);
@@ -276,15 +280,15 @@ fn pictures_do_not_mix() {
     }
 }
 
-/// Weights have the sum of the gradients that single pictures give, however many share a
-/// block of tiles.
+/// The weight gradient of a batch is the sum of the weight gradients of its images, also
+/// where a block of tiles holds several images.
 #[test]
-fn gradients_of_pictures_add_up() {
+fn weight_gradients_of_images_add_up() {
     for s in [
-        flat(24, 30, [3, 3], 1, 1, [13, 18]),
-        flat(25, 26, [3, 3], 2, 1, [8, 66]),
-        flat(24, 26, [3, 3], 1, 1, [4, 3]),
-        Sizes { size: [3, 5, 9], ..flat(24, 25, [3, 3], 1, 1, [5, 9]) },
+        conv2d(24, 30, [3, 3], 1, 1, [13, 18]),
+        conv2d(25, 26, [3, 3], 2, 1, [8, 66]),
+        conv2d(24, 26, [3, 3], 1, 1, [4, 3]),
+        Sizes { size: [3, 5, 9], ..conv2d(24, 25, [3, 3], 1, 1, [5, 9]) },
     ] {
         let [one, out] = [s.in_channels * s.in_pixels(), s.out_channels * s.out_pixels()];
         let [x, dy] = [noise(17 * one, 13), noise(17 * out, 14)];
@@ -297,18 +301,49 @@ fn gradients_of_pictures_add_up() {
             sum.iter_mut().zip(dw).for_each(|(sum, v)| *sum += f64::from(v));
         }
         let worst = worst(&together, &sum, ((17 * s.out_pixels()) as f64).sqrt());
-        assert!(worst < WINOGRAD, "{s:?}: {worst:e}");
+        assert!(worst < WINOGRAD_BOUND, "{s:?}: {worst:e}");
     }
 }
 
 #[test]
-fn empty_calls_are_harmless() {
-    let s = flat(0, 3, [3, 3], 1, 1, [4, 4]);
+fn empty_tensors_are_accepted() {
+    let s = conv2d(0, 3, [3, 3], 1, 1, [4, 4]);
     let y = forward(Tier::best(), &s, 1, &[], &[], &[1.0, 2.0, 3.0]);
     assert_eq!(y.len(), 3 * 16);
     assert!(y.chunks(16).zip([1.0, 2.0, 3.0]).all(|(row, b)| row.iter().all(|v| *v == b)));
     weight_grad(Tier::best(), &s, &[], &y, &mut []);
     assert!(input_grad(Tier::best(), &s, 1, &y, &[]).is_empty());
-    let s = flat(2, 0, [3, 3], 1, 1, [4, 4]);
+    let s = conv2d(2, 0, [3, 3], 1, 1, [4, 4]);
     assert_eq!(input_grad(Tier::best(), &s, 1, &[], &[]), [0.0; 32]);
+}
+
+/// The choice for layers of each kind, so that a change of a threshold shows.
+#[test]
+fn algorithms_are_chosen_by_size() {
+    use algorithm::WeightGradAlgorithm as Grad;
+    use winograd::Kind::{Stride1, Stride2, Stride2InputGrad};
+    let choose = |s: &Sizes, images: usize| {
+        let (forward, input) = (Plan::forward(s), Plan::input_grad(s));
+        let weights = choose_weight_grad_algorithm(&forward, images);
+        (choose_algorithm(&forward), choose_algorithm(&input), weights)
+    };
+    let wide = |stride: usize, side: usize| conv2d(64, 96, [3, 3], stride, 1, [side, side]);
+    let expected =
+        (Algorithm::Winograd(Stride1), Algorithm::Winograd(Stride1), Grad::Winograd(Stride1));
+    assert_eq!(choose(&wide(1, 64), 1), expected);
+    let expected = (
+        Algorithm::Winograd(Stride2),
+        Algorithm::Winograd(Stride2InputGrad),
+        Grad::Winograd(Stride2),
+    );
+    assert_eq!(choose(&wide(2, 64), 1), expected);
+    let small = Algorithm::WinogradSmallImages(Stride1);
+    assert_eq!(choose(&wide(1, 16), 1), (small, small, Grad::Winograd(Stride1)));
+    assert_eq!(choose(&wide(1, 8), 1), (small, small, Grad::DirectWide));
+    let pointwise = conv2d(64, 96, [1, 1], 2, 0, [64, 64]);
+    let expected = (Algorithm::Pointwise, Algorithm::Pointwise, Grad::Pointwise);
+    assert_eq!(choose(&pointwise, 1), expected);
+    let narrow = conv2d(64, 20, [3, 3], 1, 1, [64, 64]);
+    let expected = (Algorithm::Direct, Algorithm::Direct, Grad::DirectNarrow);
+    assert_eq!(choose(&narrow, 1), expected);
 }

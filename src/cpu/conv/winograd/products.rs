@@ -1,0 +1,231 @@
+//! Products of transformed tiles and weights, their transform back and the store to y:
+//! Aᵀ·[Σ_c U ⊙ V]·A + bias.
+
+use super::load_tiles::TileBlock;
+use super::product_layout::ProductLayout;
+use super::transforms::{TILE, Transform};
+use super::weights::group_stride;
+use crate::cpu::conv::buffers::Buffer;
+use crate::cpu::conv::plan::Plan;
+use crate::cpu::conv::register_tile::{BLOCK_CHANNELS, ChannelBlock, Strip};
+use crate::cpu::conv::sizes::Axes;
+use crate::cpu::disjoint::Disjoint;
+use crate::cpu::simd::{LANES, Simd, square};
+use std::array::from_fn;
+use std::mem::MaybeUninit;
+
+/// One block of destination channels of transformed tiles.
+pub(super) struct BlockProducts<'a> {
+    /// Transformed tiles.
+    pub tiles: &'a [f32],
+    /// Layout of `tiles`, or of each of its channels if `channel_stride` is set.
+    pub tiles_layout: &'a ProductLayout,
+    /// Layout of the products: [`BLOCK_CHANNELS`] channels.
+    pub products_layout: &'a ProductLayout,
+    /// Floats from channel to channel of `tiles`, where each channel holds all its groups.
+    pub channel_stride: Option<usize>,
+    pub block: &'a ChannelBlock,
+    /// Transformed weights of the block.
+    pub panel: &'a [f32],
+    /// Bias of all destination channels, or empty.
+    pub bias: &'a [f32],
+}
+
+impl BlockProducts<'_> {
+    /// Multiplies into `products`, transforms back and writes to `output`.
+    #[inline(always)]
+    pub fn run<S, T, const IN: usize, const POINTS: usize, const OUT: usize>(
+        &self,
+        s: S,
+        products: &mut Buffer,
+        output: &OutputWriter<'_>,
+    ) where
+        S: Simd,
+        T: Transform<IN, POINTS, OUT>,
+    {
+        let (block, channels) = (self.block, output.plan.src_channels);
+        let layout = self.products_layout;
+        let products = products.floats(layout.floats);
+        for (i, w) in self.panel.chunks_exact(group_stride(channels)).enumerate() {
+            let (from, to) = (self.tiles_layout.groups[i], layout.groups[i]);
+            let length = from.channel_stride;
+            let strip = Strip {
+                x: &self.tiles[from.start..],
+                channel_stride: self.channel_stride.unwrap_or(length),
+                channels,
+                offsets: &[0],
+                w,
+                bias: [0.0; BLOCK_CHANNELS],
+                length,
+            };
+            strip.run(s, block.channels, &mut products[to.start..][..BLOCK_CHANNELS * length]);
+        }
+        let mut rows = [[s.splat(0.0); POINTS]; OUT];
+        for m in 0..block.channels {
+            let channel = block.first + m;
+            let bias = self.bias.get(channel).copied().unwrap_or(0.0);
+            for (v, places) in output.places.iter().enumerate() {
+                transform_columns::<S, T, IN, POINTS, OUT>(
+                    s,
+                    products,
+                    layout,
+                    m,
+                    v * LANES,
+                    &mut rows,
+                );
+                for r in 0..OUT {
+                    let mut row = T::outputs(s, rows[r]);
+                    for k in 0..OUT {
+                        row[k] = row[k] + s.splat(bias);
+                    }
+                    output.write_row(s, row, channel, places, r);
+                }
+            }
+        }
+    }
+}
+
+/// Transforms the columns of the products of the sixteen tiles from `first` on: `rows`
+/// become rows of outputs that are not yet transformed along themselves.
+#[inline(always)]
+fn transform_columns<S, T, const IN: usize, const POINTS: usize, const OUT: usize>(
+    s: S,
+    products: &[f32],
+    layout: &ProductLayout,
+    channel: usize,
+    first: usize,
+    rows: &mut [[S::F; POINTS]; OUT],
+) where
+    S: Simd,
+    T: Transform<IN, POINTS, OUT>,
+{
+    assert!(products.len() >= layout.floats);
+    let (vectors, products) = (layout.vectors(channel, first), products.as_ptr());
+    for j in 0..POINTS {
+        let mut column = [s.splat(0.0); POINTS];
+        for i in 0..POINTS {
+            let from = products.wrapping_add(vectors.place(POINTS, i, j));
+            // SAFETY: `vectors` lie inside `layout`, which lies inside `products`
+            // (asserted).
+            column[i] = s.load(unsafe { &*from.cast() });
+        }
+        let column = T::outputs(s, column);
+        for i in 0..OUT {
+            rows[i][j] = column[i];
+        }
+    }
+}
+
+/// Writes the outputs of a block of tiles, in any channel.
+pub(super) struct OutputWriter<'a> {
+    plan: &'a Plan,
+    y: &'a Disjoint<'a, MaybeUninit<f32>>,
+    /// One entry per vector of tiles.
+    places: Vec<OutputPlaces>,
+}
+
+/// Where the outputs of sixteen tiles go, in channel 0.
+enum OutputPlaces {
+    /// A row of outputs of neighbouring tiles fills whole vectors, which begin here.
+    Vectors([usize; 8]),
+    /// Tile by tile.
+    Tiles(Vec<OutputTile>),
+}
+
+/// Where the outputs of one tile go.
+struct OutputTile {
+    /// The tile's lane, after rows have been transposed to image order.
+    lane: usize,
+    start: usize,
+    /// Rows and columns of the tile that lie inside the image.
+    rows: usize,
+    columns: usize,
+}
+
+impl<'a> OutputWriter<'a> {
+    /// Prepares writing `tiles`; the first lies at grid position `start` of image `image`.
+    pub fn new<const OUT: usize>(
+        plan: &'a Plan,
+        y: &'a Disjoint<'a, MaybeUninit<f32>>,
+        tiles: TileBlock,
+        image: usize,
+        [depth, top, left]: Axes,
+    ) -> Self {
+        let TileBlock { count, per_row, per_image } = tiles;
+        let [slices, height, width] = plan.dst_size;
+        let output_tile = |t: usize| {
+            let lane = square(tiles.lane(t) % LANES);
+            let (image, t) = (image + t / per_image, t % per_image);
+            let row = top * OUT / TILE + t / per_row * OUT;
+            let column = left * OUT / TILE + t % per_row * OUT;
+            let slice = image * plan.dst_channels * slices + depth;
+            let start = (slice * height + row) * width + column;
+            let [rows, columns] = [height.saturating_sub(row), width.saturating_sub(column)];
+            OutputTile { lane, start, rows: rows.min(OUT), columns: columns.min(OUT) }
+        };
+        let vector = |first: usize| {
+            let tiles: Vec<_> = (first..count.min(first + LANES)).map(output_tile).collect();
+            let whole = |tile: &OutputTile| [tile.rows, tile.columns] == [OUT; 2];
+            let contiguous = |group: &[OutputTile]| {
+                let last = group.len() - 1;
+                group[last].start == group[0].start + last * OUT
+            };
+            // Tiles whose rows make one vector.
+            let group = LANES / OUT;
+            let all_whole = tiles.len() == LANES && tiles.iter().all(whole);
+            if !(all_whole && tiles.chunks_exact(group).all(contiguous)) {
+                return OutputPlaces::Tiles(tiles);
+            }
+            let start = |k: usize| tiles.get(k * group).map_or(0, |tile| tile.start);
+            OutputPlaces::Vectors(from_fn(start))
+        };
+        let places = (0..count).step_by(LANES).map(vector).collect();
+        Self { plan, y, places }
+    }
+
+    /// Writes row `r` of the outputs `v` `[column]` of sixteen tiles to channel `channel`.
+    #[inline(always)]
+    fn write_row<S: Simd, const OUT: usize>(
+        &self,
+        s: S,
+        v: [S::F; OUT],
+        channel: usize,
+        places: &OutputPlaces,
+        r: usize,
+    ) {
+        let [slices, height, width] = self.plan.dst_size;
+        let down = channel * slices * height * width + r * width;
+        let rows = match OUT {
+            8 => s.rows8([v[0], v[1], v[2], v[3], v[OUT - 4], v[OUT - 3], v[OUT - 2], v[OUT - 1]]),
+            _ => {
+                let [a, b, c, d] = s.transpose4([v[0], v[1], v[2], v[3]]);
+                [a, b, c, d, a, b, c, d]
+            }
+        };
+        let tiles = match places {
+            OutputPlaces::Tiles(tiles) => tiles,
+            OutputPlaces::Vectors(starts) => {
+                for k in 0..OUT {
+                    let at = starts[k] + down;
+                    // SAFETY: no two jobs, and no two tiles of a job, hold the same outputs.
+                    let to = unsafe { self.y.part(at..at + LANES) };
+                    if let Some(to) = to.first_chunk_mut() {
+                        s.store_fresh(rows[k], to);
+                    }
+                }
+                return;
+            }
+        };
+        let mut floats = [[0.0; LANES]; OUT];
+        for k in 0..OUT {
+            s.store(rows[k], &mut floats[k]);
+        }
+        let values = floats.as_flattened().as_chunks::<OUT>().0;
+        for tile in tiles.iter().filter(|tile| r < tile.rows) {
+            let at = tile.start + down;
+            // SAFETY: no two jobs, and no two tiles of a job, hold the same outputs.
+            let to = unsafe { self.y.part(at..at + tile.columns) };
+            to.iter_mut().zip(values[tile.lane]).for_each(|(to, v)| *to = MaybeUninit::new(v));
+        }
+    }
+}
