@@ -6,7 +6,9 @@
 
 use super::raster_case::Case;
 use anyhow::{Result, ensure};
-use subsplat::abi::{Convention, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES};
+use subsplat::abi::{
+    Convention, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE,
+};
 use subsplat::cpu::{Gradients, Rasterizer, Rendered, Tier};
 use subsplat::model::compare::Row;
 use subsplat::render::Renderer;
@@ -242,15 +244,15 @@ fn gradients(
     let allowed = if case.name == NEEDLES { GRADIENT_NEEDLES } else { GRADIENT };
     let packed = case.options.convention == Convention::Standard;
     let column = |from: usize, count: usize| -> Vec<f32> {
-        let rows = got.rows.chunks_exact(SPLAT_LANES);
+        let rows = got.rows.chunks_exact(SPLAT_STRIDE);
         rows.flat_map(|r| r.iter().skip(from).take(count)).copied().collect()
     };
     for GradientReference { name, values, width } in &references.gradients {
         let ours = match *name {
-            "grad.means" if packed => column(LANE_MEAN, 3),
-            "grad.quats" => column(LANE_QUAT, 4),
-            "grad.scales" => column(LANE_SCALE, 3),
-            "grad.opacities" if packed => column(LANE_OPACITY, 1),
+            "grad.means" if packed => column(MEAN_OFFSET, 3),
+            "grad.quats" => column(QUAT_OFFSET, 4),
+            "grad.scales" => column(SCALE_OFFSET, 3),
+            "grad.opacities" if packed => column(OPACITY_OFFSET, 1),
             "grad.means" => got.means.clone(),
             "grad.cov6" => got.cov6.clone(),
             "grad.opacities" => got.opacities.clone(),

@@ -1,7 +1,7 @@
 //! What a camera and the options of a call mean for projection: one set of numbers that
 //! the CPU and the GPU kernels read.
 
-use crate::abi::{
+use super::{
     Convention, JACOBIAN_LIMIT_MVSPLAT, JACOBIAN_MARGIN_STANDARD, NEAR_MVSPLAT, RasterOptions,
     Z_EPSILON_MVSPLAT,
 };
