@@ -1,28 +1,27 @@
-//! The pinhole camera, and every geometric convention of the crate, said once.
+//! The pinhole camera, and the one definition of every geometric convention of the crate.
 //!
 //! * Camera axes are OpenCV's: +x right, +y down, +z forward (into the scene).
-//! * `world_from_camera` maps camera coordinates to world coordinates (the
-//!   paper's c2w); it is rigid.
+//! * `world_from_camera` maps camera coordinates to world coordinates (c2w in the paper);
+//!   it is rigid.
 //! * Intrinsics are in pixels of the picture they belong to. Pixel (i, j), column
 //!   i and row j, has its centre at (i + 0.5, j + 0.5): the picture covers
 //!   [0, width] × [0, height].
 //! * A point projects to u = fx·x/z + cx, v = fy·y/z + cy.
-//! * Quaternions are (w, x, y, z); `glam`'s own are (x, y, z, w), converted at
-//!   the call.
+//! * Quaternions are (w, x, y, z). Those of `glam` are (x, y, z, w), converted at the call.
 //!
-//! Normalised intrinsics (divided by the picture's size) exist only at borders:
-//! [`Intrinsics::from_normalised`] and [`Intrinsics::normalised`].
+//! Normalised intrinsics (divided by the picture's size) appear in file formats and network
+//! inputs only; [`Intrinsics::from_normalised`] and [`Intrinsics::normalised`] convert them.
 
 use glam::{Mat3, Mat4, Vec2, Vec3};
 use thiserror::Error;
 
-/// Why a camera was refused.
+/// Reason for which a camera is refused.
 #[derive(Debug, Error, PartialEq)]
 pub enum CameraError {
     /// A number is NaN or infinite.
     #[error("camera {what}: expected finite numbers, got {got}")]
     NotFinite {
-        /// Which part of the camera.
+        /// Part of the camera.
         what: &'static str,
         /// The offending values.
         got: String,
@@ -35,7 +34,7 @@ pub enum CameraError {
         /// Vertical focal length, px.
         fy: f32,
     },
-    /// The picture has no pixels, or more than any kernel is made for.
+    /// The picture has no pixels, or a side longer than [`Intrinsics::SIDE_MAX`].
     #[error(
         "camera picture size: expected 1 to {} pixels a side, got {width}x{height}",
         Intrinsics::SIDE_MAX
@@ -77,50 +76,50 @@ pub struct Intrinsics {
 }
 
 impl Intrinsics {
-    /// Most pixels along a side of a picture.
+    /// Largest number of pixels along a side of a picture.
     pub const SIDE_MAX: usize = 32_768;
 
-    /// From intrinsics divided by the picture's size, (fx/W, fy/H, cx/W, cy/H).
+    /// Converts intrinsics divided by the picture's size, (fx/W, fy/H, cx/W, cy/H).
     pub fn from_normalised(k: [f32; 4], width: usize, height: usize) -> Self {
         let (w, h) = (width as f32, height as f32);
         Self { fx: k[0] * w, fy: k[1] * h, cx: k[2] * w, cy: k[3] * h, width, height }
     }
 
-    /// (fx/W, fy/H, cx/W, cy/H), as MVSplat and RealEstate10K write them.
+    /// Returns (fx/W, fy/H, cx/W, cy/H), the form of MVSplat and RealEstate10K.
     pub fn normalised(&self) -> [f32; 4] {
         let (w, h) = (self.width as f32, self.height as f32);
         [self.fx / w, self.fy / h, self.cx / w, self.cy / h]
     }
 
-    /// A camera with square pixels, the principal point in the middle, and
-    /// `fov_x` radians from the left edge to the right.
+    /// Returns a camera with square pixels, the principal point in the middle, and `fov_x`
+    /// radians from the left edge to the right.
     pub fn from_fov_x(fov_x: f32, width: usize, height: usize) -> Self {
         let f = 0.5 * width as f32 / (0.5 * fov_x).tan();
         Self { fx: f, fy: f, cx: 0.5 * width as f32, cy: 0.5 * height as f32, width, height }
     }
 
-    /// The same camera for a picture resampled to `width` × `height`.
+    /// Returns the same camera for a picture resampled to `width` × `height`.
     pub fn resized(&self, width: usize, height: usize) -> Self {
         Self::from_normalised(self.normalised(), width, height)
     }
 
-    /// The same camera for the window of `width` × `height` pixels whose corner
-    /// lies `left`, `top` pixels from this picture's.
+    /// Returns the same camera for the window of `width` × `height` pixels whose corner lies
+    /// `left`, `top` pixels from this picture's.
     pub fn cropped(&self, left: f32, top: f32, width: usize, height: usize) -> Self {
         Self { cx: self.cx - left, cy: self.cy - top, width, height, ..*self }
     }
 
-    /// Horizontal field of view, radians.
+    /// Returns the horizontal field of view, radians.
     pub fn fov_x(&self) -> f32 {
         (self.cx / self.fx).atan() + ((self.width as f32 - self.cx) / self.fx).atan()
     }
 
-    /// Vertical field of view, radians.
+    /// Returns the vertical field of view, radians.
     pub fn fov_y(&self) -> f32 {
         (self.cy / self.fy).atan() + ((self.height as f32 - self.cy) / self.fy).atan()
     }
 
-    /// The 3×3 matrix K, pixels.
+    /// Returns the 3×3 matrix K, pixels.
     pub fn matrix(&self) -> Mat3 {
         Mat3::from_cols(
             Vec3::new(self.fx, 0.0, 0.0),
@@ -129,7 +128,7 @@ impl Intrinsics {
         )
     }
 
-    /// Point in camera coordinates to pixels. The caller sees to z > 0.
+    /// Projects a point in camera coordinates to pixels; z must be above 0.
     pub fn project(&self, in_camera: Vec3) -> Vec2 {
         Vec2::new(
             self.fx * in_camera.x / in_camera.z + self.cx,
@@ -137,12 +136,12 @@ impl Intrinsics {
         )
     }
 
-    /// Pixel position to the point on its ray at camera z = 1.
+    /// Returns the point at camera z = 1 on the ray of a pixel position.
     pub fn unproject(&self, px: Vec2) -> Vec3 {
         Vec3::new((px.x - self.cx) / self.fx, (px.y - self.cy) / self.fy, 1.0)
     }
 
-    /// Rows of ∂(u, v)/∂(x, y, z) at a point in camera coordinates, px per unit.
+    /// Returns the rows of ∂(u, v)/∂(x, y, z) at a point in camera coordinates, px per unit.
     pub fn jacobian(&self, in_camera: Vec3) -> [Vec3; 2] {
         let Vec3 { x, y, z } = in_camera;
         [
@@ -151,8 +150,11 @@ impl Intrinsics {
         ]
     }
 
-    /// Checks that the numbers are finite, the focal lengths positive and the
-    /// picture not empty.
+    /// Checks that the numbers are finite, the focal lengths positive and the sides of the
+    /// picture within 1 to [`Intrinsics::SIDE_MAX`].
+    ///
+    /// # Errors
+    /// [`CameraError`] names the part.
     pub fn check(&self) -> Result<(), CameraError> {
         let k = [self.fx, self.fy, self.cx, self.cy];
         if k.iter().any(|v| !v.is_finite()) {
@@ -179,14 +181,14 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// Largest entry of |RᵀR − I| that still counts as a rotation. Pose files
-    /// with six digits reach 1e-5; hand-edited ones more.
+    /// Largest entry of |RᵀR − I| of a rotation. Pose files with six digits reach 1e-5;
+    /// hand-edited ones more.
     pub const RIGID_TOLERANCE: f32 = 1e-2;
 
-    /// Checks everything that [`Camera`] promises.
+    /// Checks the intrinsics, and that the pose is finite and rigid.
     ///
     /// # Errors
-    /// [`CameraError`] names the part, what was expected and what came.
+    /// [`CameraError`] names the part, the expected value and the one found.
     pub fn new(intrinsics: Intrinsics, world_from_camera: Mat4) -> Result<Self, CameraError> {
         intrinsics.check()?;
         if !world_from_camera.is_finite() {
@@ -208,7 +210,7 @@ impl Camera {
         Ok(Self { intrinsics, world_from_camera })
     }
 
-    /// World to camera: the inverse of a rigid matrix, (Rᵀ, −Rᵀt).
+    /// Returns the inverse of the pose, (Rᵀ, −Rᵀt): world to camera.
     pub fn camera_from_world(&self) -> Mat4 {
         let r = self.rotation().transpose();
         let t = -(r * self.position());
@@ -220,29 +222,30 @@ impl Camera {
         )
     }
 
-    /// Rotation from camera to world.
+    /// Returns the rotation from camera to world.
     pub fn rotation(&self) -> Mat3 {
         Mat3::from_mat4(self.world_from_camera)
     }
 
-    /// The eye, world coordinates.
+    /// Returns the position of the camera, world coordinates.
     pub fn position(&self) -> Vec3 {
         self.world_from_camera.w_axis.truncate()
     }
 
-    /// World point to camera coordinates, as Rᵀ(p − t): less cancellation than
+    /// Maps a world point to camera coordinates as Rᵀ(p − t), which cancels less than
     /// Rᵀp − Rᵀt far from the origin.
     pub fn to_camera(&self, in_world: Vec3) -> Vec3 {
         self.rotation().transpose() * (in_world - self.position())
     }
 
-    /// World point to pixels, or `None` where it does not lie in front (z ≤ 0).
+    /// Projects a world point to pixels; `None` where its camera z is 0 or less.
     pub fn project(&self, in_world: Vec3) -> Option<Vec2> {
         let p = self.to_camera(in_world);
         (p.z > 0.0).then(|| self.intrinsics.project(p))
     }
 
-    /// The same pose with the intrinsics of a picture resampled to `width` × `height`.
+    /// Returns the same pose with the intrinsics of a picture resampled to `width` × `height`.
+
     pub fn resized(&self, width: usize, height: usize) -> Self {
         Self { intrinsics: self.intrinsics.resized(width, height), ..*self }
     }

@@ -53,7 +53,6 @@ pub mod render;
 pub mod sh;
 pub mod splats;
 pub mod train;
-pub mod view;
 
 pub use ops::rasterize_splats as rasterize;
 pub use render::{Picture, render};

@@ -1,45 +1,44 @@
-//! PSNR and SSIM of two pictures, by the protocol that MVSplat's and SubSplat's
-//! tables use (`tests/metrics.rs` holds both against outside figures).
+//! PSNR and SSIM of two pictures by the protocol of MVSplat's and SubSplat's tables.
 //!
-//! Pictures are `[H, W, 3]`, row-major, RGB innermost, display values with 1 as
-//! white. Sums are in f64. Imports nothing of the crate.
+//! Pictures are `[H, W, 3]`, row-major, RGB innermost, display values with 1 as white. Sums
+//! are in f64. `tests/metrics.rs` compares with scikit-image. Imports nothing of the crate.
 
 use rayon::prelude::*;
 use thiserror::Error;
 
-/// Side of the SSIM window, px: skimage's `win_size`.
+/// Side of the SSIM window, px: `win_size` of scikit-image.
 pub const SSIM_WINDOW: usize = 11;
 /// σ of the window's Gaussian, px; 3.5σ rounds to a radius of 5, the whole window.
 const SSIM_SIGMA: f64 = 1.5;
-/// Rows and columns next to the border that do not count, px.
+/// Rows and columns at the border that are left out of the mean, px.
 const SSIM_BORDER: usize = SSIM_WINDOW / 2;
-/// (K1·L)² and (K2·L)² of Wang et al. 2004 with K1 = 0.01, K2 = 0.03, L = 1.
+/// (K1·L)² and (K2·L)² (Wang et al. 2004) with K1 = 0.01, K2 = 0.03, L = 1.
 pub(crate) const SSIM_C1: f64 = 0.01 * 0.01;
 pub(crate) const SSIM_C2: f64 = 0.03 * 0.03;
 /// n/(n − 1) for the n = 121 pixels of a window: sample covariance.
 pub(crate) const SSIM_COVARIANCE: f64 = 121.0 / 120.0;
 
-/// Why two pictures were not compared.
+/// Reason for which two pictures are not compared.
 #[derive(Debug, Error, PartialEq, Eq)]
 pub enum MetricsError {
-    /// Buffer and size do not fit.
+    /// The length of a buffer does not match the size.
     #[error("picture {which}: expected {expected} values ({width}x{height} RGB), got {got}")]
     Length {
         /// `a` or `b`.
         which: &'static str,
-        /// Width that the caller gave, px.
+        /// Width given, px.
         width: usize,
-        /// Height that the caller gave, px.
+        /// Height given, px.
         height: usize,
-        /// Values wanted.
+        /// Values expected.
         expected: usize,
-        /// Values that came.
+        /// Values found.
         got: usize,
     },
-    /// No pixels, or fewer than the SSIM window needs.
+    /// The pictures have no pixels, or a side shorter than the SSIM window.
     #[error("pictures: expected at least {least}x{least} pixels, got {width}x{height}")]
     TooSmall {
-        /// Shortest side that is accepted, px.
+        /// Shortest accepted side, px.
         least: usize,
         /// Width, px.
         width: usize,
@@ -84,14 +83,14 @@ fn check(
     Ok(())
 }
 
-/// Peak signal-to-noise ratio, dB: −10·log₁₀ of the mean squared difference over
-/// all pixels and channels, both pictures clipped to [0, 1] first.
+/// Computes the peak signal-to-noise ratio, dB: −10·log₁₀ of the mean squared difference
+/// over all pixels and channels. Both pictures are clipped to [0, 1] first.
 ///
-/// Pictures that agree everywhere give `f64::INFINITY`; JSON has no such number,
-/// so a caller that writes a report decides what stands there.
+/// Equal pictures give `f64::INFINITY`, which JSON cannot express; the writer of a report
+/// handles it.
 ///
 /// # Errors
-/// Lengths that do not fit `width`×`height`, no pixels, NaN or infinite values.
+/// Lengths that do not match `width`×`height`, no pixels, NaN or infinite values.
 pub fn psnr(a: &[f32], b: &[f32], width: usize, height: usize) -> Result<f64, MetricsError> {
     check(a, b, width, height, 1)?;
     let row = |(a, b): (&[f32], &[f32])| -> f64 {
@@ -101,7 +100,7 @@ pub fn psnr(a: &[f32], b: &[f32], width: usize, height: usize) -> Result<f64, Me
         };
         a.iter().zip(b).map(square).sum()
     };
-    // Collected, then summed in order: the same digits for any number of threads.
+    // The sum over rows is sequential: the same digits for any number of threads.
     let rows: Vec<f64> = a.par_chunks(width * 3).zip(b.par_chunks(width * 3)).map(row).collect();
     let mse = rows.iter().sum::<f64>() / a.len() as f64;
     Ok(-10.0 * mse.log10())
@@ -117,11 +116,11 @@ pub(crate) fn window() -> [f64; SSIM_WINDOW] {
     taps.map(|t| t / sum)
 }
 
-/// The five images whose blurs SSIM needs: x, y, x², y², xy.
+/// Number of images that SSIM blurs: x, y, x², y², xy.
 const MOMENTS: usize = 5;
 
-/// Horizontal blur of the moments of one row of one channel:
-/// `[width − 10][MOMENTS]`, window centres 5 … width − 6.
+/// Blurs the moments of one row of one channel horizontally: `[width − 10][MOMENTS]`, window
+/// centres 5 … width − 6.
 fn blur_row(a: &[f32], b: &[f32], channel: usize, taps: &[f64; SSIM_WINDOW]) -> Vec<[f64; 5]> {
     let width = a.len() / 3;
     let moments: Vec<[f64; MOMENTS]> = (0..width)
@@ -154,16 +153,16 @@ fn ssim_at([ux, uy, uxx, uyy, uxy]: [f64; MOMENTS]) -> f64 {
     structure / ((ux * ux + uy * uy + SSIM_C1) * (vx + vy + SSIM_C2))
 }
 
-/// Structural similarity as skimage's `structural_similarity(win_size=11,
-/// gaussian_weights=True, channel_axis=…, data_range=1)`: Gaussian σ = 1.5 on
-/// 11×11, sample covariance, mean over pixels at least 5 from the border and over
-/// the three channels. Values are **not** clipped.
+/// Computes the structural similarity of Wang et al. 2004: Gaussian σ = 1.5 on 11×11,
+/// sample covariance, mean over the pixels at least 5 from the border and over the three
+/// channels. Values are **not** clipped.
 ///
-/// skimage pads by reflection before the blur; the window reaches exactly as far
-/// as the border that is then cropped, so no padded pixel counts and none is made.
+/// Equals `structural_similarity(win_size=11, gaussian_weights=True, channel_axis=2,
+/// data_range=1)` of scikit-image. That function pads by reflection before the blur and
+/// crops as many pixels after it; this one makes no padding.
 ///
 /// # Errors
-/// Lengths that do not fit `width`×`height`, a side below 11, NaN or infinite values.
+/// Lengths that do not match `width`×`height`, a side below 11, NaN or infinite values.
 pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize) -> Result<f64, MetricsError> {
     check(a, b, width, height, SSIM_WINDOW)?;
     let taps = window();
@@ -188,12 +187,12 @@ pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize) -> Result<f64, Me
     Ok(total / counted as f64)
 }
 
-/// Mean absolute difference of neighbouring pixels, over both directions and the three
-/// channels, the picture clipped to [0, 1] first: the ratio of two pictures' values says
-/// how sharp one is beside the other.
+/// Computes the mean absolute difference of neighbouring pixels over both directions and the
+/// three channels, a measure of sharpness. The picture is clipped to [0, 1] first.
 ///
 /// # Errors
-/// A length that does not fit `width`×`height`, a side below 2, NaN or infinite values.
+/// A length that does not match `width`×`height`, a side below 2, NaN or infinite values.
+
 pub fn mean_gradient(picture: &[f32], width: usize, height: usize) -> Result<f64, MetricsError> {
     check(picture, picture, width, height, 2)?;
     let stride = width * 3;

@@ -1,19 +1,19 @@
-//! Real spherical harmonics: the two bases of [`ShBasis`], exact rotation to any
-//! degree up to 4, and the change from MVSplat's basis to the standard one.
+//! Real spherical harmonics: the two bases of [`ShBasis`], exact rotation up to degree 4, and
+//! the change from MVSplat's basis to the standard one.
 //!
 //! Standard basis (3DGS): index l² + l + m, Condon-Shortley sign, so that l = 1 is
-//! C₁·(−y, z, −x). e3nn's basis, in which MVSplat rotates, is the same without that
-//! sign at (z, x, y): its l = 1 is C₁·√…(x, y, z) up to the common factor.
+//! C₁·(−y, z, −x). MVSplat rotates in e3nn's basis: the standard functions at (z, x, y)
+//! without that sign, so that l = 1 is C₁·(x, y, z).
 //!
-//! Everything here is `f64`: it runs once per camera, not per Gaussian.
+//! All numbers are `f64`: the functions run once per camera, not per Gaussian.
 
 use crate::abi::ShBasis;
 use glam::{DMat3, DVec3};
 
-/// √(1/4π), the constant function: colour = ½ + C₀·h₀ for degree 0.
+/// C₀ = √(1/4π), the constant function: colour = ½ + C₀·h₀ for degree 0.
 pub const C0: f64 = 0.282_094_791_773_878_14;
 
-/// Standard basis functions of degree ≤ 4 at the unit vector `d`.
+/// Evaluates the standard basis functions of degree ≤ 4 at the unit vector `d`.
 pub fn standard(d: DVec3) -> [f64; 25] {
     let DVec3 { x, y, z } = d;
     let (xx, yy, zz) = (x * x, y * y, z * z);
@@ -47,7 +47,7 @@ pub fn standard(d: DVec3) -> [f64; 25] {
     ]
 }
 
-/// The 16 functions of [`ShBasis::Mvsplat`] at the unit vector `d`.
+/// Evaluates the 16 functions of [`ShBasis::Mvsplat`] at the unit vector `d`.
 pub fn mvsplat(d: DVec3) -> [f64; 16] {
     let y = standard(DVec3::new(d.z, d.x, d.y));
     let mut out = [0.0; 16];
@@ -56,7 +56,7 @@ pub fn mvsplat(d: DVec3) -> [f64; 16] {
     out
 }
 
-/// e3nn's functions of degree ≤ 4 at `d`, with the standard basis' normalisation:
+/// Evaluates e3nn's functions of degree ≤ 4 at `d` with the standard basis' normalisation:
 /// [`standard`] at (z, x, y) without the Condon-Shortley sign.
 pub fn e3nn(d: DVec3) -> [f64; 25] {
     let mut y = standard(DVec3::new(d.z, d.x, d.y));
@@ -68,12 +68,12 @@ pub fn e3nn(d: DVec3) -> [f64; 25] {
     y
 }
 
-/// (l, m + l, index) for all coefficients of degree ≤ 4.
+/// Lists (l, m + l, index) of all coefficients of degree ≤ 4.
 fn degrees() -> impl Iterator<Item = (usize, usize, usize)> {
     (0..=4usize).flat_map(|l| (0..=2 * l).map(move |m| (l, m, l * l + m)))
 }
 
-/// Which basis a [`Rotation`] acts in.
+/// The basis of a [`Rotation`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RotationBasis {
     /// [`standard`].
@@ -82,16 +82,16 @@ pub enum RotationBasis {
     E3nn,
 }
 
-/// Block-diagonal D(R) with Y(R d) = D(R)·Y(d): a function with coefficients h,
-/// turned by R, has coefficients D(R)·h.
+/// Block-diagonal matrix D(R) with Y(R d) = D(R)·Y(d): a function with coefficients h,
+/// rotated by R, has coefficients D(R)·h.
 #[derive(Clone, Debug)]
 pub struct Rotation {
-    /// Row-major (2l + 1)² block of each degree 0 to 4.
+    /// Row-major (2l + 1)² blocks of degrees 0 to 4.
     blocks: [Vec<f64>; 5],
 }
 
 impl Rotation {
-    /// D of the rotation `r`, exact to rounding for any proper rotation.
+    /// Computes D of the proper rotation `r`, exact to rounding.
     pub fn new(r: DMat3, basis: RotationBasis) -> Self {
         let eval = match basis {
             RotationBasis::Standard => standard,
@@ -109,7 +109,7 @@ impl Rotation {
                 }
                 m
             };
-            // D·Y = Y_R  ⇔  Yᵀ·Dᵀ = Y_Rᵀ, columns being fixed generic directions.
+            // D·Y = Y_R  ⇔  Yᵀ·Dᵀ = Y_Rᵀ; the columns are fixed directions in general position.
             let y = transpose(&columns(&eval), n);
             let turned = transpose(&columns(&|d| eval(r * d)), n);
             transpose(&solve(y, turned, n, n), n)
@@ -117,12 +117,12 @@ impl Rotation {
         Self { blocks: std::array::from_fn(block) }
     }
 
-    /// Row-major (2l + 1) × (2l + 1) block of degree `l` ≤ 4.
+    /// Returns the row-major (2l + 1) × (2l + 1) block of degree `l` ≤ 4.
     pub fn block(&self, l: usize) -> &[f64] {
         &self.blocks[l]
     }
 
-    /// The whole (degree + 1)² square matrix, row-major.
+    /// Returns the whole (degree + 1)² square matrix, row-major.
     pub fn matrix(&self, degree: usize) -> Vec<f64> {
         let d = (degree + 1) * (degree + 1);
         let mut m = vec![0.0; d * d];
@@ -138,12 +138,12 @@ impl Rotation {
     }
 }
 
-/// Row-major 16×16 matrix M that turns coefficients of [`ShBasis::Mvsplat`] into
-/// coefficients of [`ShBasis::Standard`] of the same function: Σ (M h)_i Y_i = Σ h_j Ỹ_j.
-/// Exact, since function 14's stand-in is a cubic polynomial, hence of degree ≤ 3.
+/// Computes the row-major 16×16 matrix M from coefficients of [`ShBasis::Mvsplat`] to those
+/// of [`ShBasis::Standard`] of the same function: Σ (M h)_i Y_i = Σ h_j Ỹ_j. The map is
+/// exact: MVSplat's function 14 is a cubic polynomial, hence of degree ≤ 3.
 pub fn standard_from_mvsplat() -> Vec<f64> {
     const N: usize = 16;
-    // Normal equations over more directions than coefficients; the residual is zero.
+    // Normal equations with more directions than coefficients; the residual is zero.
     let mut gram = vec![0.0; N * N];
     let mut rhs = vec![0.0; N * N];
     for d in directions(96) {
@@ -164,8 +164,8 @@ pub fn standard_from_mvsplat() -> Vec<f64> {
     m
 }
 
-/// Coefficients of many functions, `sets[P, D, 3]`, moved from `basis` to the standard
-/// one (in place; coefficients 16 and up of [`ShBasis::Mvsplat`] become zero).
+/// Converts the coefficients `sets[P, D, 3]` from `basis` to the standard one, in place.
+/// Coefficients 16 and up of [`ShBasis::Mvsplat`] become zero.
 pub fn all_to_standard(sets: &mut [f32], coefficients: usize, basis: ShBasis) {
     if basis == ShBasis::Mvsplat {
         let m = standard_from_mvsplat();
@@ -194,8 +194,8 @@ fn apply_mvsplat_map(sh: &mut [f32], m: &[f64]) {
     }
 }
 
-/// `n` directions spread over the sphere in generic position (golden-angle spiral,
-/// tilted so that no symmetry of a basis function meets one of the set).
+/// Returns `n` directions on the sphere in general position: a golden-angle spiral, tilted
+/// so that it shares no symmetry with a basis function.
 fn directions(n: usize) -> Vec<DVec3> {
     let tilt = DMat3::from_euler(glam::EulerRot::XYZ, 0.4, 1.1, 2.3);
     (0..n)
@@ -212,7 +212,8 @@ fn transpose(m: &[f64], n: usize) -> Vec<f64> {
     (0..n * n).map(|i| m[(i % n) * n + i / n]).collect()
 }
 
-/// Solves A·X = B for A `[n, n]` and B `[n, k]` by elimination with row pivots.
+/// Solves A·X = B for A `[n, n]` and B `[n, k]` by Gaussian elimination with row pivots.
+
 fn solve(mut a: Vec<f64>, mut b: Vec<f64>, n: usize, k: usize) -> Vec<f64> {
     for col in 0..n {
         let pivot = (col..n)

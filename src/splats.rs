@@ -1,49 +1,48 @@
-//! Gaussians as every room passes them on: packed rows, one SH set per parent,
-//! and a colour gain per child.
+//! A set of Gaussians: packed rows, one SH set per parent, and a colour gain per child.
 //!
-//! A child stores no SH of its own (SubSplat, Eq. for h_{p,k}: γ_k · h_p), so N
-//! children of P parents (N = P·K) cost 12 to 15 floats each instead of 86.
+//! A child stores no SH of its own (SubSplat, h_{p,k} = γ_k · h_p). N children of P parents
+//! (N = P·K) take 12 to 15 floats each instead of 86.
 
 use crate::abi::{
-    LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SH_DEGREE_MAX, SPLAT_LANES, ShBasis,
+    MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SH_DEGREE_MAX, SPLAT_STRIDE, ShBasis,
 };
 use candle_core::{Device, Tensor};
 use thiserror::Error;
 
-/// Why packed splats were refused.
+/// Reason for which packed splats are refused.
 #[derive(Debug, Error, PartialEq)]
 pub enum SplatsError {
-    /// A buffer's length does not fit the others.
+    /// The length of a buffer does not match the others.
     #[error("splats {what}: expected {expected}, got {got}")]
     Shape {
-        /// Which buffer.
+        /// The buffer.
         what: &'static str,
-        /// What would have fitted.
+        /// The expected length.
         expected: String,
-        /// What came.
+        /// The length found.
         got: String,
     },
 }
 
-/// A set of Gaussians in world frame.
+/// A set of Gaussians in the world frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Splats {
-    /// `[N, 11]`: mean 3, quaternion wxyz 4 (not necessarily unit), σ 3, opacity 1;
-    /// lanes in [`crate::abi`].
+    /// `[N, 11]`: mean 3, quaternion wxyz 4 (of any length but zero), σ 3, opacity 1; offsets
+    /// in [`crate::abi`].
     pub rows: Vec<f32>,
-    /// `[P, D, 3]`: SH coefficients per parent, D = (degree + 1)², RGB innermost.
-    /// Splat `i` uses set `i / K`, K = N / P.
+    /// `[P, D, 3]`: SH coefficients per parent, D = (degree + 1)², RGB innermost. Splat `i`
+    /// uses set `i / K`, K = N / P.
     pub sh: Vec<f32>,
-    /// `[N]` or `[N, 4]`: colour = max(0, ½ + γ·Σ_j sh_j Y_j + δ). Four lanes are
-    /// γ and the residual δ (RGB); one lane is γ alone; empty means γ = 1, δ = 0.
+    /// `[N]`, `[N, 4]` or empty: colour = max(0, ½ + γ·Σ_j sh_j Y_j + δ). Four numbers are γ
+    /// and the residual δ (RGB); one number is γ alone; empty means γ = 1, δ = 0.
     pub gain: Vec<f32>,
-    /// Highest degree stored, 0 to 4.
+    /// Highest SH degree, 0 to 4.
     pub sh_degree: usize,
-    /// Functions that `sh` multiplies.
+    /// Basis functions of `sh`.
     pub sh_basis: ShBasis,
 }
 
-/// [`Splats`] as tensors, for optimisation: gradients reach what they were made of.
+/// [`Splats`] as tensors, for optimisation: gradients flow to the tensors' inputs.
 #[derive(Clone, Debug)]
 pub struct SplatTensors {
     /// `[N, 11]`, as [`Splats::rows`].
@@ -52,16 +51,16 @@ pub struct SplatTensors {
     pub sh: Tensor,
     /// `[N]` (γ) or `[N, 4]` (γ, δ); none means γ = 1, δ = 0.
     pub gain: Option<Tensor>,
-    /// Functions that `sh` multiplies.
+    /// Basis functions of `sh`.
     pub sh_basis: ShBasis,
 }
 
 impl SplatTensors {
-    /// Packs means `[N, 3]`, quaternions wxyz `[N, 4]` (of any length), σ `[N, 3]`,
-    /// opacities `[N]` and SH `[P, D, 3]`, P dividing N; no gain.
+    /// Packs means `[N, 3]`, quaternions wxyz `[N, 4]` (of any length but zero), σ `[N, 3]`,
+    /// opacities `[N]` and SH `[P, D, 3]` without a gain. P divides N.
     ///
     /// # Errors
-    /// Tensors that cannot stand side by side.
+    /// Shapes, dtypes or devices that do not match.
     pub fn from_parts(
         means: &Tensor,
         quats_wxyz: &Tensor,
@@ -74,10 +73,10 @@ impl SplatTensors {
         Ok(Self { rows, sh: sh.clone(), gain: None, sh_basis })
     }
 
-    /// Copies of `splats` on `device`.
+    /// Copies `splats` to `device`.
     ///
     /// # Errors
-    /// Whatever candle says of the allocation.
+    /// Errors of candle's allocation.
     pub fn new(splats: &Splats, device: &Device) -> candle_core::Result<Self> {
         let (rows, sh, gain) = splats.to_tensors(device)?;
         let gain = (splats.gain_lanes() > 0).then_some(gain);
@@ -86,7 +85,7 @@ impl SplatTensors {
 }
 
 impl Splats {
-    /// Checks that the three buffers fit one another.
+    /// Checks that the lengths of the three buffers match.
     ///
     /// # Errors
     /// [`SplatsError::Shape`] names the buffer.
@@ -103,10 +102,10 @@ impl Splats {
         if sh_degree > SH_DEGREE_MAX {
             return shape("SH degree", format!("0 to {SH_DEGREE_MAX}"), sh_degree);
         }
-        if !rows.len().is_multiple_of(SPLAT_LANES) {
-            return shape("rows", format!("a multiple of {SPLAT_LANES} floats"), rows.len());
+        if !rows.len().is_multiple_of(SPLAT_STRIDE) {
+            return shape("rows", format!("a multiple of {SPLAT_STRIDE} floats"), rows.len());
         }
-        let n = rows.len() / SPLAT_LANES;
+        let n = rows.len() / SPLAT_STRIDE;
         let set = 3 * (sh_degree + 1) * (sh_degree + 1);
         let p = sh.len() / set;
         if !sh.len().is_multiple_of(set) || (n == 0) != (p == 0) || (p > 0 && !n.is_multiple_of(p))
@@ -120,72 +119,72 @@ impl Splats {
         Ok(Self { rows, sh, gain, sh_degree, sh_basis })
     }
 
-    /// Number of Gaussians, N.
+    /// Returns N, the number of Gaussians.
     pub fn len(&self) -> usize {
-        self.rows.len() / SPLAT_LANES
+        self.rows.len() / SPLAT_STRIDE
     }
 
-    /// Whether there is none.
+    /// Reports whether there is no Gaussian.
     pub fn is_empty(&self) -> bool {
         self.rows.is_empty()
     }
 
-    /// SH coefficients per colour channel, D.
+    /// Returns D, the SH coefficients per colour channel.
     pub fn sh_coefficients(&self) -> usize {
         (self.sh_degree + 1) * (self.sh_degree + 1)
     }
 
-    /// Number of SH sets, P.
+    /// Returns P, the number of SH sets.
     pub fn parents(&self) -> usize {
         self.sh.len() / (3 * self.sh_coefficients())
     }
 
-    /// Children per parent, K = N / P (1 where there is none).
+    /// Returns K = N / P, the children per parent (1 for an empty set).
     pub fn children_per_parent(&self) -> usize {
         self.len().checked_div(self.parents()).unwrap_or(1)
     }
 
-    /// Floats of `gain` per splat: 0, 1 or 4.
+    /// Returns the floats of `gain` per splat: 0, 1 or 4.
     pub fn gain_lanes(&self) -> usize {
         self.gain.len().checked_div(self.len()).unwrap_or(0)
     }
 
-    /// Row of splat `i`.
+    /// Returns the row of splat `i`, `[11]`.
     pub fn row(&self, i: usize) -> &[f32] {
-        &self.rows[i * SPLAT_LANES..(i + 1) * SPLAT_LANES]
+        &self.rows[i * SPLAT_STRIDE..(i + 1) * SPLAT_STRIDE]
     }
 
-    /// Mean of splat `i`, world.
+    /// Returns the mean of splat `i`, world.
     pub fn mean(&self, i: usize) -> [f32; 3] {
         let r = self.row(i);
-        [r[LANE_MEAN], r[LANE_MEAN + 1], r[LANE_MEAN + 2]]
+        [r[MEAN_OFFSET], r[MEAN_OFFSET + 1], r[MEAN_OFFSET + 2]]
     }
 
-    /// Quaternion of splat `i`, wxyz, as stored.
+    /// Returns the quaternion of splat `i`, wxyz, as stored.
     pub fn quat_wxyz(&self, i: usize) -> [f32; 4] {
         let r = self.row(i);
-        [r[LANE_QUAT], r[LANE_QUAT + 1], r[LANE_QUAT + 2], r[LANE_QUAT + 3]]
+        [r[QUAT_OFFSET], r[QUAT_OFFSET + 1], r[QUAT_OFFSET + 2], r[QUAT_OFFSET + 3]]
     }
 
-    /// σ of splat `i`, world units.
+    /// Returns σ of splat `i`, world units.
     pub fn scale(&self, i: usize) -> [f32; 3] {
         let r = self.row(i);
-        [r[LANE_SCALE], r[LANE_SCALE + 1], r[LANE_SCALE + 2]]
+        [r[SCALE_OFFSET], r[SCALE_OFFSET + 1], r[SCALE_OFFSET + 2]]
     }
 
-    /// Opacity of splat `i`.
+    /// Returns the opacity of splat `i`.
     pub fn opacity(&self, i: usize) -> f32 {
-        self.row(i)[LANE_OPACITY]
+        self.row(i)[OPACITY_OFFSET]
     }
 
-    /// SH set of splat `i`, `[D, 3]`: its parent's.
+    /// Returns the SH set of splat `i`'s parent, `[D, 3]`.
     pub fn sh_of(&self, i: usize) -> &[f32] {
         let set = 3 * self.sh_coefficients();
         let p = i / self.children_per_parent();
         &self.sh[p * set..(p + 1) * set]
     }
 
-    /// γ and δ of splat `i`.
+    /// Returns γ and δ of splat `i`.
     pub fn gain_of(&self, i: usize) -> (f32, [f32; 3]) {
         match self.gain_lanes() {
             0 => (1.0, [0.0; 3]),
@@ -197,14 +196,14 @@ impl Splats {
         }
     }
 
-    /// Three tensors `([N,11], [P,D,3], [N] | [N,4])` on `device`; a missing gain
-    /// becomes ones.
+    /// Copies the buffers to tensors `([N,11], [P,D,3], [N] | [N,4])` on `device`. An empty
+    /// gain becomes ones.
     ///
     /// # Errors
-    /// Whatever candle says of the allocation.
+    /// Errors of candle's allocation.
     pub fn to_tensors(&self, device: &Device) -> candle_core::Result<(Tensor, Tensor, Tensor)> {
         let n = self.len();
-        let rows = Tensor::from_slice(&self.rows, (n, SPLAT_LANES), device)?;
+        let rows = Tensor::from_slice(&self.rows, (n, SPLAT_STRIDE), device)?;
         let sh = Tensor::from_slice(&self.sh, (self.parents(), self.sh_coefficients(), 3), device)?;
         let gain = match self.gain_lanes() {
             0 => Tensor::ones(n, candle_core::DType::F32, device)?,
@@ -214,10 +213,11 @@ impl Splats {
         Ok((rows, sh, gain))
     }
 
-    /// The inverse of [`Splats::to_tensors`].
+    /// Copies tensors of [`Splats::to_tensors`]'s shapes back.
     ///
     /// # Errors
-    /// A tensor of another rank or dtype, or shapes that do not fit one another.
+    /// A tensor of another rank or dtype, or shapes that do not match.
+
     pub fn from_tensors(
         rows: &Tensor,
         sh: &Tensor,

@@ -1,6 +1,6 @@
-//! Sizes and rules of one attention gather ([`crate::cpu::attention_gather`]).
+//! Sizes and options of an attention gather ([`crate::cpu::attention_gather`]).
 
-/// Where one level's cells lie in the packed maps.
+/// One feature level of the packed maps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Level {
     /// Rows of one view's map.
@@ -11,78 +11,79 @@ pub struct Level {
     pub first_cell: usize,
 }
 
-/// Dropping of attention weights while training, a pure function of its numbers.
+/// Dropout of attention weights in training; a pure function of its fields and the index.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Drop {
-    /// Probability that a weight becomes 0; the others grow by 1/(1 − p).
+    /// p: probability that a weight becomes 0; the others are divided by 1 − p.
     pub probability: f64,
     /// Seed of the stage and step.
     pub seed: u64,
-    /// Index of parent 0 of this call in the scene.
+    /// Index in the scene of the call's first parent.
     pub first_parent: usize,
 }
 
-/// Everything of one call that is not a tensor.
+/// Sizes and options of one call.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Gather {
-    /// Feature levels, as the maps are packed.
+    /// Feature levels in the order of the packed maps.
     pub levels: Vec<Level>,
-    /// V.
+    /// V, context views.
     pub views: usize,
     /// M: points per view and level.
     pub points: usize,
-    /// Whether every level has points of its own (`[N, V, L·M, 2]`).
+    /// Every level has points of its own: `[N, V, L·M, 2]`.
     pub points_per_level: bool,
-    /// E.
+    /// E, channels of a value.
     pub dim: usize,
-    /// G, a divisor of E.
+    /// G, attention groups; a divisor of E.
     pub groups: usize,
     /// Floats of one cell's row.
     pub stride: usize,
-    /// First key channel in a row, or no dot product at all.
+    /// First key channel in a row; `None` has no dot product.
     pub key: Option<usize>,
     /// First value channel in a row.
     pub value: usize,
     /// Factor of the dot product.
     pub logit_scale: f64,
-    /// Samples outside (0, 1)² leave the softmax; else they stay in it as zeros.
+    /// Leaves samples outside (0, 1)² out of the softmax; else they are zeros in it.
     pub renormalise: bool,
-    /// Column x of a map is at R·W − ½ rather than R·W.
+    /// Reads column R·W − ½ of a map at the normalised coordinate R, rather than R·W.
     pub half_pixel: bool,
-    /// Dropping, while training.
+    /// Dropout, in training.
     pub drop: Option<Drop>,
-    /// Whether the gradient with respect to the points is wanted.
+    /// The backward pass computes the gradient with respect to the points.
     pub point_gradient: bool,
 }
 
 impl Gather {
-    /// Samples per parent, V·L·M.
+    /// Returns the samples per parent, V·L·M.
     pub fn samples(&self) -> usize {
         self.views * self.levels.len() * self.points
     }
 
-    /// Floats of q in a query row.
+    /// Returns the floats of q in a query row.
     pub fn query_channels(&self) -> usize {
         if self.key.is_some() { self.dim } else { 0 }
     }
 
-    /// Q: floats of a query row.
+    /// Returns Q, the floats of a query row.
     pub fn query_width(&self) -> usize {
         self.query_channels() + self.samples() * self.groups + self.views
     }
 
-    /// Points per view in the points tensor.
+    /// Returns the points per parent and view in the points tensor.
     pub fn points_width(&self) -> usize {
         self.points * if self.points_per_level { self.levels.len() } else { 1 }
     }
 
-    /// Cells of all levels and views.
+    /// Returns the cells of all levels and views.
     pub fn cells(&self) -> usize {
         self.levels.iter().map(|l| self.views * l.height * l.width).sum()
     }
 }
 
-/// Most samples per parent, V·L·M, that the GPU's kernel holds.
+/// Largest number of samples per parent, V·L·M, in the GPU's kernel.
 pub const GATHER_SAMPLES_MAX: usize = 128;
-/// Most samples × groups per parent that it holds.
+/// Largest number of samples × groups per parent in the GPU's kernel.
+
 pub const GATHER_WEIGHTS_MAX: usize = 1024;

@@ -1,36 +1,36 @@
-//! The rules of one SPGR call ([`crate::cpu::spgr`]).
+//! Options of an SPGR call ([`crate::cpu::spgr`]).
 
 use super::Rule;
 
-/// Most children per parent: they live on the stack.
+/// Largest number of children per parent; they are kept on the stack.
 pub const CHILDREN_MAX: usize = 64;
 
-/// The rules in numbers; what each means is said at `config::Spgr`.
+/// Options of SPGR as the kernels read them. `config::Spgr` documents each.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rules {
-    /// r: K = r² children, and the target picture is r times the input.
+    /// r: K = r² children; the target picture is r times the input.
     pub side: usize,
-    /// v* is the nearest view that sees the parent; else the source view.
+    /// v* is the nearest of the views in whose picture the parent lies; else the source view.
     pub nearest_visible: bool,
     /// ρ, sub-pixels.
     pub offset_bound: Option<f64>,
     /// β_z.
     pub beta_z: f64,
-    /// Depth residuals run along the viewing ray; else along the optical axis.
+    /// Applies depth residuals along the viewing ray; else along the optical axis.
     pub ray: bool,
-    /// β_z in units of the parent's depth; else world units.
+    /// β_z is in units of the parent's depth; else in world units.
     pub relative_depth: bool,
-    /// Children slide along the parent's disc; else at constant camera z.
+    /// Moves children along the parent's disc; else at constant camera z.
     pub disc: bool,
     /// λ_s.
     pub lambda_s: f64,
-    /// c of the soft bound of Δlog s.
+    /// c of the soft bound c·tanh(x/c) of Δlog s.
     pub dlog_clamp: f64,
-    /// Footprints take the parent's Jacobian; else the child's.
+    /// Takes the Jacobian of a footprint at the parent; else at the child.
     pub area_at_parent: bool,
-    /// A_min, target px²; 0 is no clamp.
+    /// A_min, target px²; 0 disables the clamp.
     pub a_min: f64,
-    /// The clamp grows the two axes that make the footprint; else all three.
+    /// The clamp grows the two axes that span the footprint; else all three.
     pub two_axis: bool,
     /// Opacity rule.
     pub opacity: Rule,
@@ -40,23 +40,24 @@ pub struct Rules {
     pub lowpass_input: f64,
     /// δ of γ = 1 + δ·tanh γ̃.
     pub delta: f64,
-    /// The gain multiplies ½ + Σ, not Σ alone: four lanes per child.
+    /// The gain multiplies ½ + Σ rather than Σ alone: four floats per child.
     pub rgb_gain: bool,
 }
 
 impl Rules {
-    /// K.
+    /// Returns K.
     pub fn children(&self) -> usize {
         self.side * self.side
     }
 
-    /// Floats of gain per child.
+    /// Returns the floats of gain per child, 1 or 4.
     pub fn gain_lanes(&self) -> usize {
         if self.rgb_gain { 4 } else { 1 }
     }
 }
 
-/// Floats of one context camera in the GPU's table.
-pub const SPGR_CAMERA_LANES: usize = 23;
-/// Least squared area of a disc that children slide on, px⁴.
+/// Floats of a context camera in the GPU's table.
+pub const SPGR_CAMERA_STRIDE: usize = 23;
+/// Smallest squared area of a disc along which children move, px⁴.
+
 pub const DISC_AREA_SQ_MIN: f64 = 1e-20;

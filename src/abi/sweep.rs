@@ -1,11 +1,12 @@
-//! Sizes and rules of one plane sweep ([`crate::cpu::plane_sweep`]).
+//! Sizes and options of a plane sweep ([`crate::cpu::plane_sweep`]).
 
-/// Reference pixel and depth to source pixel: X = R·(K_r⁻¹·(x, y, 1))·depth + t in
-/// source camera coordinates, (u, v) = (fx·X + cx·Z, fy·Y + cy·Z)/max(Z, min_z), in
-/// this order: what rounding does then stays closest to the original.
+/// Maps a reference pixel at a depth to a source pixel.
+///
+/// X = R·(K_r⁻¹·(x, y, 1))·depth + t in source camera coordinates, (u, v) = (fx·X + cx·Z,
+/// fy·Y + cy·Z)/max(Z, min_z). The order of operations is MVSplat's, so that rounding is too.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pair {
-    /// Row of the source features.
+    /// Index of the source view's features.
     pub source: usize,
     /// K_r⁻¹ as (1/fx, 1/fy, −cx/fx, −cy/fy), feature pixels.
     pub inverse: [f32; 4],
@@ -17,31 +18,32 @@ pub struct Pair {
     pub k: [f32; 4],
 }
 
-/// Sizes and rules of one sweep.
+/// Sizes and options of one sweep.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Sweep {
-    /// For each reference row, whom it is compared with.
+    /// `[R]`: for each reference view, its pairs with source views.
     pub pairs: Vec<Vec<Pair>>,
     /// `[R][D]`: candidate depths (camera z of the reference), world units.
     pub depths: Vec<Vec<f32>>,
     /// Coordinate of the centre of pixel 0: 0 (MVSplat) or ½ (`camera.rs`).
     pub centre: f32,
-    /// Least z that the division sees.
+    /// Smallest divisor z.
     pub min_z: f32,
     /// Factor of the correlation (MVSplat: 1/√C).
     pub scale: f32,
-    /// C.
+    /// C, channels of a feature.
     pub channels: usize,
     /// h, w of both feature maps.
     pub size: [usize; 2],
 }
 
 impl Sweep {
-    /// D.
+    /// Returns D, the number of depth candidates.
+
     pub fn candidates(&self) -> usize {
         self.depths.first().map_or(0, Vec::len)
     }
 }
 
 /// Floats of one [`Pair`] in the GPU's table: inverse, rotation, t, k.
-pub const SWEEP_PAIR_LANES: usize = 20;
+pub const SWEEP_PAIR_STRIDE: usize = 20;

@@ -1,7 +1,7 @@
-//! Uniforms of the WGSL kernels: what a kernel is told beside its arrays.
+//! Uniforms of the WGSL kernels: the parameters of a call beside its arrays.
 //!
 //! Fields have the order, the types and the offsets of the WGSL struct of the same name
-//! (`tests/shaders.rs` compares). No hidden padding: bytemuck refuses it.
+//! (`tests/shaders.rs` compares them). bytemuck refuses hidden padding.
 
 /// A uniform struct and the table of its fields' offsets.
 macro_rules! uniform {
@@ -22,7 +22,7 @@ macro_rules! uniform {
 }
 
 uniform! {
-    /// Of kernels/redistribute.wgsl.
+    /// Parameters of kernels/redistribute.wgsl.
     RedistributeUniform {
         /// P.
         parents: u32,
@@ -36,33 +36,33 @@ uniform! {
 }
 
 uniform! {
-    /// Of the rasterizer's kernels: camera, options, and where what lies.
+    /// Parameters of the rasterizer's kernels: camera, options, sizes, offsets.
     RasterUniform {
-        /// Row 0 of the rotation from world to camera; the eye's x.
+        /// Row 0 of the rotation from world to camera; the camera's x in world.
         right: [f32; 4],
-        /// Row 1; the eye's y.
+        /// Row 1; the camera's y.
         down: [f32; 4],
-        /// Row 2; the eye's z.
+        /// Row 2; the camera's z.
         ahead: [f32; 4],
-        /// fx, fy, px; pixel position of the axis, centres at integers.
+        /// fx, fy, px; principal point, px, pixel centres at integers.
         focal_centre: [f32; 4],
-        /// Interval of x/z, then of y/z, inside the Jacobian.
+        /// Bounds of x/z, then of y/z, inside the Jacobian: low, high.
         limits: [f32; 4],
         /// Background R, G, B; unused.
         background: [f32; 4],
-        /// Nearest camera z drawn.
+        /// Nearest camera z that is rendered, world units.
         near: f32,
-        /// Added to camera z where a mean is projected.
+        /// Term added to camera z in the projection of a mean, world units.
         z_epsilon: f32,
-        /// px².
+        /// Low-pass, px².
         lowpass: f32,
         /// Largest alpha of a splat at a pixel.
         alpha_max: f32,
-        /// Blending stops where T would become this or less.
+        /// Blending stops where the transmittance would fall to this or below.
         stop: f32,
-        /// 1: opacities shrink with what the low-pass adds.
+        /// 1: opacities are scaled by √(det Σ / det(Σ + low-pass)).
         antialiased: u32,
-        /// 1: splats end at tile edges.
+        /// 1: splats are cut at the edges of 16×16 tiles.
         tile_cut: u32,
         /// W, px.
         width: u32,
@@ -70,7 +70,7 @@ uniform! {
         height: u32,
         /// Tiles along x.
         columns: u32,
-        /// Tiles along y, of the call.
+        /// Tiles along y of the call.
         rows: u32,
         /// First splat of the call, in the scene.
         first: u32,
@@ -90,23 +90,23 @@ uniform! {
         sh_shared: u32,
         /// Floats of a splat's gain: 0, 1 or 4.
         gain_lanes: u32,
-        /// Room for (splat, tile) pairs.
+        /// Largest number of (splat, tile) pairs that the buffers hold.
         capacity: u32,
-        /// Channel c of pixel p stands at p·`step` + c·`channel` of the picture.
+        /// Channel c of pixel p is at p·`step` + c·`channel` of the picture.
         step: u32,
         /// See `step`.
         channel: u32,
-        /// First row of tiles of the call: a picture may be drawn in bands.
+        /// First row of tiles of the call; a picture may be rendered in bands.
         top: u32,
-        /// 1: pixels and sums go on from what a call before left.
+        /// 1: pixels and sums start from the results of the previous call.
         resumes: u32,
-        /// 1: pixels are left for a call after.
+        /// 1: the next call continues the pixels.
         carries: u32,
-        /// Where the call's first splat stands in its footprints and sums.
+        /// Index of the call's first splat in its footprints and sums.
         own: u32,
-        /// First place of the call, in the order by depth.
+        /// First position of the call in the order by depth.
         place: u32,
-        /// Places of the call.
+        /// Positions of the call.
         places: u32,
         /// Unused.
         pad_a: u32,
@@ -118,7 +118,7 @@ uniform! {
 }
 
 uniform! {
-    /// Of the sort's kernels.
+    /// Parameters of the kernels of the sort.
     SortUniform {
         /// Lowest bit of the digit.
         shift: u32,
@@ -132,7 +132,7 @@ uniform! {
 }
 
 uniform! {
-    /// Of kernels/show.wgsl.
+    /// Parameters of kernels/show.wgsl.
     ShowUniform {
         /// W, px.
         width: u32,
@@ -146,7 +146,7 @@ uniform! {
 }
 
 uniform! {
-    /// Of kernels/shared/gather.wgsl; fields as in [`super::Gather`] where not said.
+    /// Parameters of kernels/shared/gather.wgsl; [`super::Gather`] documents the fields in full.
     AttentionGatherUniform {
         /// N.
         parents: u32,
@@ -166,23 +166,23 @@ uniform! {
         stride: u32,
         /// First key channel.
         key: u32,
-        /// Whether there are keys.
+        /// 1: there are keys.
         has_key: u32,
         /// First value channel.
         value: u32,
-        /// Whether samples outside leave the softmax.
+        /// 1: samples outside the map are left out of the softmax.
         renormalise: u32,
-        /// Whether each level has points of its own.
+        /// 1: each level has points of its own.
         points_per_level: u32,
         /// ½ or 0, px.
         half_pixel: f32,
         /// Factor of q·k.
         logit_scale: f32,
-        /// Whether weights are dropped.
+        /// 1: dropout.
         drops: u32,
         /// 1 / (1 − p).
         kept_factor: f32,
-        /// Index of parent 0 in the scene.
+        /// Index in the scene of the call's first parent.
         first_parent: u32,
         /// Low word of the seed.
         seed_low: u32,
@@ -192,15 +192,15 @@ uniform! {
         dropped_low: u32,
         /// High word.
         dropped_high: u32,
-        /// Cells of the maps.
+        /// Number of cells of the maps.
         cells: u32,
-        /// Whether the points' gradient is wanted.
+        /// 1: the gradient of the points is computed.
         point_gradient: u32,
     }
 }
 
 uniform! {
-    /// Of kernels/shared/sweep.wgsl; fields as in [`super::Sweep`] where not said.
+    /// Parameters of kernels/shared/sweep.wgsl; [`super::Sweep`] documents the fields in full.
     PlaneSweepUniform {
         /// R of the call.
         rows: u32,
@@ -220,7 +220,7 @@ uniform! {
         pad0: u32,
         /// Coordinate of the centre of pixel 0.
         centre: f32,
-        /// Least z that the division sees.
+        /// Smallest divisor z.
         min_z: f32,
         /// Factor of the correlation.
         scale: f32,
@@ -230,7 +230,7 @@ uniform! {
 }
 
 uniform! {
-    /// Of kernels/shared/spgr.wgsl; what each rule means is said at [`super::Rules`].
+    /// Parameters of kernels/shared/spgr.wgsl; [`super::Rules`] documents the options.
     SpgrUniform {
         /// N.
         parents: u32,
@@ -238,27 +238,27 @@ uniform! {
         side: u32,
         /// Parents per view.
         per_view: u32,
-        /// Index of parent 0 in the scene.
+        /// Index in the scene of the call's first parent.
         first: u32,
         /// V.
         views: u32,
         /// [`super::Rule`] as a number.
         rule: u32,
-        /// Whether v* is the nearest view that sees the parent.
+        /// 1: v* is the nearest of the views in whose picture the parent lies.
         nearest_visible: u32,
-        /// Whether offsets are bounded.
+        /// 1: offsets are bounded.
         bounded: u32,
-        /// Whether depth residuals run along the ray.
+        /// 1: depth residuals are applied along the viewing ray.
         ray: u32,
-        /// Whether β_z is in units of the depth.
+        /// 1: β_z is in units of the parent's depth.
         relative_depth: u32,
-        /// Whether children slide along the disc.
+        /// 1: children move along the parent's disc.
         disc: u32,
-        /// Whether footprints take the parent's Jacobian.
+        /// 1: the Jacobian of a footprint is taken at the parent.
         area_at_parent: u32,
-        /// Whether two axes grow.
+        /// 1: the clamp of the footprint grows two axes.
         two_axis: u32,
-        /// Whether gains have four lanes.
+        /// 1: gains have four floats.
         rgb_gain: u32,
         /// Unused.
         pad0: u32,
@@ -270,7 +270,7 @@ uniform! {
         beta_z: f32,
         /// λ_s.
         lambda_s: f32,
-        /// c.
+        /// c of the soft bound of Δlog s.
         dlog_clamp: f32,
         /// A_min, target px².
         a_min: f32,
@@ -284,7 +284,7 @@ uniform! {
 }
 
 uniform! {
-    /// Of kernels/spgr_gains_bwd.wgsl.
+    /// Parameters of kernels/spgr_gains_bwd.wgsl.
     SpgrGainsBwdUniform {
         /// N·K.
         records: u32,
@@ -298,11 +298,11 @@ uniform! {
 }
 
 uniform! {
-    /// Of kernels/invert.wgsl.
+    /// Parameters of kernels/invert.wgsl.
     InvertUniform {
-        /// Entries.
+        /// Number of entries.
         entries: u32,
-        /// Cells that they fall on.
+        /// Number of cells that the entries refer to.
         cells: u32,
         /// Unused.
         pad0: u32,

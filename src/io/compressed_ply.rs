@@ -68,6 +68,7 @@ pub(super) fn decode(header: Header, source: &mut Source) -> Result<Decoded> {
             _ => header.rows(element, source, |_, _| Ok(()))?,
         }
     }
+    source.finish(header.encoding)?;
     let incoming = incoming.ok_or_else(|| Error::format(path, "an element `vertex`", "none"))?;
     let splats = incoming.into_splats(path)?;
     let flavour = format!("compressed ply {}", header.encoding.name());

@@ -180,9 +180,13 @@ fn chunks<'a>(bytes: &'a [u8], path: &Path) -> Result<(&'a [u8], &'a [u8])> {
     if length > bytes.len() {
         return Err(truncated(path, length as u64, bytes.len() as u64));
     }
-    let chunk = |at: usize, kind: u32, name: &str| -> Result<(&'a [u8], usize)> {
+    if length < bytes.len() {
+        let expected = format!("the {length} bytes that the header gives");
+        return Err(Error::format(path, expected, bytes.len().to_string()));
+    }
+    let chunk = |at: usize, kind: Option<(u32, &str)>| -> Result<(&'a [u8], usize)> {
         let (size, got) = (u32_at(bytes, at, path)? as usize, u32_at(bytes, at + 4, path)?);
-        if got != kind {
+        if let Some((_, name)) = kind.filter(|(kind, _)| got != *kind) {
             let expected = format!("a {name} chunk");
             let place = format!(" at byte {at}");
             return Err(Error::format(path, expected, format!("type {got:#010x}")).at(place));
@@ -193,15 +197,20 @@ fn chunks<'a>(bytes: &'a [u8], path: &Path) -> Result<(&'a [u8], &'a [u8])> {
             .ok_or_else(|| truncated(path, start as u64 + size as u64, bytes.len() as u64))?;
         Ok((body, start + size))
     };
-    let (json, end) = chunk(12, CHUNK_JSON, "JSON")?;
+    let (json, mut end) = chunk(12, Some((CHUNK_JSON, "JSON")))?;
     if json.len() > JSON_MAX {
         let got = json.len().to_string();
         return Err(Error::format(path, format!("at most {JSON_MAX} bytes of JSON"), got));
     }
-    if end + 8 > length {
-        return Ok((json, &[]));
+    let mut binary = &[][..];
+    if end < length {
+        (binary, end) = chunk(end, Some((CHUNK_BIN, "BIN")))?;
     }
-    Ok((json, chunk(end, CHUNK_BIN, "BIN")?.0))
+    // Chunks of other types follow these two, and readers ignore them (glTF 2.0, section 4.4).
+    while end < length {
+        (_, end) = chunk(end, None)?;
+    }
+    Ok((json, binary))
 }
 
 impl File<'_> {
@@ -379,8 +388,9 @@ impl File<'_> {
         if view.buffer != 0 || buffer.uri.is_some() {
             return Err(at(self.bad("data in the file's own BIN chunk", "another buffer")));
         }
+        // The chunk is padded to a multiple of 4 (glTF 2.0, section 3.6.1.2).
         let have = buffer.byte_length;
-        if have > self.binary.len() as u64 {
+        if (self.binary.len() as u64).checked_sub(have).is_none_or(|padding| padding > 3) {
             let got = self.binary.len().to_string();
             return Err(at(self.bad(format!("{have} bytes in the BIN chunk"), got)));
         }

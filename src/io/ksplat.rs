@@ -26,7 +26,7 @@ const STEPS: u32 = 32767;
 /// Reads a `.ksplat` from memory. `name` is for errors.
 ///
 /// # Errors
-/// Another version or compression level, sections that do not fit the bytes, numbers
+/// Another version or compression level, sections that do not fill the bytes, numbers
 /// that are not finite.
 pub fn parse_ksplat(bytes: &[u8], name: &Path) -> Result<Splats> {
     let decoded = decode(bytes, name)?;
@@ -59,7 +59,9 @@ struct Section {
     bucket_count: usize,
     bucket_bytes: usize,
     data: usize,
-    end: usize,
+    /// After the Gaussians that are there, and after the section's capacity.
+    used: usize,
+    end: u128,
 }
 
 pub(super) fn decode(bytes: &[u8], path: &Path) -> Result<Decoded> {
@@ -105,15 +107,25 @@ impl File<'_> {
             return Err(Error::format(self.path, expected, format!("{} bytes", self.bytes.len())));
         };
         let mut sections = Vec::new();
+        // The two lengths that the file may have.
+        let mut whole = [at as u128; 2];
         for i in 0..declared {
             let section = self.section(HEADER + i * SECTION_HEADER, at).map_err(|e| match e {
                 Error::Format { .. } => e.at(format!(" section {i}")),
                 Error::Io { .. } => e,
             })?;
-            at = section.end;
+            // The last section may be written shorter than its capacity.
+            at = section.end.min(self.bytes.len() as u128) as usize;
+            whole = [section.used as u128, section.end];
             if section.count > 0 {
                 sections.push(section);
             }
+        }
+        let length = self.bytes.len() as u128;
+        if !whole.contains(&length) {
+            let [used, end] = whole;
+            let expected = format!("{used} bytes, or {end} with the last section's capacity");
+            return Err(Error::format(self.path, expected, length.to_string()));
         }
         Ok(sections)
     }
@@ -165,8 +177,8 @@ impl File<'_> {
             bucket_count,
             bucket_bytes,
             data: data as usize,
-            // The last section may be written shorter than its capacity.
-            end: end.min(self.bytes.len() as u128) as usize,
+            used: used as usize,
+            end,
         })
     }
 

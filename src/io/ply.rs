@@ -28,7 +28,8 @@ const BLOCK: usize = 1024;
 /// `name` is for errors.
 ///
 /// # Errors
-/// Not a PLY, not a splat file, cut short, lying counts, numbers that are not finite.
+/// Not a PLY, not a splat file, a truncated file, a count that the bytes do not bear out,
+/// bytes after the last element, numbers that are not finite.
 pub fn parse_ply(bytes: &[u8], name: &Path) -> Result<Splats> {
     let mut reader = bytes;
     let decoded = decode(&mut reader, bytes.len() as u64, name)?;
@@ -47,11 +48,11 @@ pub(super) fn decode(reader: &mut dyn BufRead, length: u64, path: &Path) -> Resu
     for element in &header.elements {
         if element.name == "vertex" && incoming.is_none() {
             incoming = Some(read_vertices(&header, element, &mut source)?);
-            // Faces and the like may follow; nothing in them is needed.
-            break;
+        } else {
+            header.rows(element, &mut source, |_, _| Ok(()))?;
         }
-        header.rows(element, &mut source, |_, _| Ok(()))?;
     }
+    source.finish(header.encoding)?;
     let incoming = incoming.ok_or_else(|| Error::format(path, "an element `vertex`", "none"))?;
     let splats = incoming.into_splats(path)?;
     let flavour = format!("ply {}", header.encoding.name());

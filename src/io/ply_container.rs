@@ -44,16 +44,19 @@ impl<'a> Source<'a> {
         Error::format(self.path, expected, format!("{}: the file is cut short", self.left))
     }
 
-    /// One line without its end; an error at the end of the file.
+    /// Reads one line and drops its end. A line without an end is an error, since a number
+    /// at its end may have lost digits.
     fn line(&mut self, what: &str) -> Result<Vec<u8>> {
         let mut line = Vec::new();
         let mut limited = Read::take(&mut *self.reader, LINE_MAX.min(self.left));
         limited.read_until(b'\n', &mut line).map_err(|e| Error::io(self.path, e))?;
         self.line += 1;
         self.left -= line.len() as u64;
-        if line.last() != Some(&b'\n') && (self.left > 0 || line.is_empty()) {
+        if line.last() != Some(&b'\n') {
             let got = if line.is_empty() {
                 "the end of the file".to_owned()
+            } else if self.left == 0 {
+                "the end of the file within the line (no line end: cut short?)".to_owned()
             } else {
                 format!("a line of more than {LINE_MAX} bytes")
             };
@@ -63,6 +66,25 @@ impl<'a> Source<'a> {
             line.pop();
         }
         Ok(line)
+    }
+
+    /// Refuses bytes after the last element; blank lines may follow the rows of an ascii file.
+    pub fn finish(&mut self, encoding: Encoding) -> Result<()> {
+        let expected = "the end of the file after the last element";
+        while self.left > 0 {
+            if encoding != Encoding::Ascii {
+                return Err(Error::format(
+                    self.path,
+                    expected,
+                    format!("{} more bytes", self.left),
+                ));
+            }
+            let line = self.line(expected)?;
+            if !line.iter().all(u8::is_ascii_whitespace) {
+                return Err(self.bad_line(expected, &line));
+            }
+        }
+        Ok(())
     }
 
     fn bad_line(&self, expected: impl Into<String>, got: &[u8]) -> Error {
@@ -251,10 +273,8 @@ impl Header {
 
     /// Number of rows of `element`, if that many can follow.
     pub fn room(&self, element: &Element, source: &Source) -> Result<usize> {
-        // The last row of an ascii file may lack its line end.
-        let slack = u64::from(self.encoding == Encoding::Ascii);
         let needed = u128::from(element.least(self.encoding)) * u128::from(element.count);
-        if needed > u128::from(source.left + slack) {
+        if needed > u128::from(source.left) {
             let expected = format!(
                 "{} rows of `{}`, at least {needed} bytes, as the header says",
                 element.count, element.name
@@ -381,6 +401,10 @@ fn ascii_row(element: &Element, source: &mut Source, values: &mut [f64]) -> Resu
             }
             *v = f64::NAN;
         }
+    }
+    if words.next().is_some() {
+        let expected = format!("the {} properties of `{}`", values.len(), element.name);
+        return Err(source.bad_line(expected, &line));
     }
     Ok(())
 }

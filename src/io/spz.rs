@@ -21,7 +21,7 @@ use super::splat::unit_byte;
 use super::{Error, Result};
 use crate::abi::sh_coefficients;
 use crate::splats::Splats;
-use flate2::read::GzDecoder;
+use flate2::bufread::GzDecoder;
 use flate2::write::GzEncoder;
 use glam::DVec3;
 use half::f16;
@@ -38,6 +38,8 @@ const COUNT_MAX: u32 = 10_000_000;
 /// been compressed: real scenes shrink 2 to 20 times.
 const INFLATED_FREE: u64 = 64 << 20;
 const RATIO_MAX: u64 = 256;
+/// Bit of the flags that announces extension records.
+const FLAG_EXTENSIONS: u8 = 2;
 /// Constant of the colour byte.
 const COLOUR_SCALE: f64 = 0.15;
 /// Largest fixed-point coordinate: 24 bits with sign.
@@ -48,8 +50,8 @@ const FRACTION_MAX: i32 = 20;
 /// Reads a `.spz` from memory. `name` is for errors.
 ///
 /// # Errors
-/// Another magic or version, cut short, streams that do not inflate to what the count
-/// demands, a file that would inflate beyond reason.
+/// Another magic or version, a truncated file, a wrong checksum, streams that do not inflate
+/// to the size that the count gives, bytes after the end, a decompression bomb.
 pub fn parse_spz(bytes: &[u8], name: &Path) -> Result<Splats> {
     let decoded = decode(bytes, name)?;
     check_finite(&decoded.splats, name)?;
@@ -61,6 +63,8 @@ struct Header {
     count: usize,
     sh_degree: usize,
     fraction_bits: u32,
+    /// Extension records follow (versions 1 to 3: the Gaussians; 4: the header).
+    has_extensions: bool,
     streams: usize,
 }
 
@@ -95,6 +99,7 @@ impl Header {
             count: count as usize,
             sh_degree: usize::from(b[12]),
             fraction_bits: u32::from(b[13]),
+            has_extensions: b[14] & FLAG_EXTENSIONS != 0,
             streams: usize::from(b[15]),
         })
     }
@@ -119,11 +124,12 @@ pub(super) fn decode(bytes: &[u8], path: &Path) -> Result<Decoded> {
         let columns = if header.version == 4 {
             inflate_streams(bytes, &header, path)?
         } else {
-            let needed = (HEADER + header.sizes().iter().sum::<usize>()) as u64;
-            if (bytes.len() as u64) < needed {
-                return Err(truncated(path, needed, bytes.len() as u64));
-            }
-            split(&bytes[HEADER..], &header)
+            let needed = HEADER + header.sizes().iter().sum::<usize>();
+            let Some(mut rest) = bytes.get(needed..) else {
+                return Err(truncated(path, needed as u64, bytes.len() as u64));
+            };
+            read_end(&mut rest, &header, bytes.len() as u64, path)?;
+            split(&bytes[HEADER..needed], &header)
         };
         (header, columns)
     };
@@ -132,6 +138,53 @@ pub(super) fn decode(bytes: &[u8], path: &Path) -> Result<Decoded> {
     transform(&mut splats, &by);
     let flavour = format!("spz {}", header.version);
     Ok(Decoded { splats, flavour, comments: Vec::new() })
+}
+
+/// Reads what follows the Gaussians of versions 1 to 3 to its end, at most `limit` bytes:
+/// nothing, or the extension records that the header announces.
+fn read_end(rest: &mut dyn Read, header: &Header, limit: u64, path: &Path) -> Result<()> {
+    let wrong = |e| unreadable(path, &e);
+    if header.has_extensions {
+        return skip_extensions(rest, limit, path);
+    }
+    let mut byte = [0];
+    if rest.read(&mut byte).map_err(wrong)? > 0 {
+        let expected = format!("the end of the data after {} Gaussians", header.count);
+        return Err(Error::format(path, expected, "more bytes"));
+    }
+    Ok(())
+}
+
+/// Reads extension records (u32 type, u32 length, payload) up to the end of `rest`, at
+/// most `limit` bytes. No type is interpreted.
+fn skip_extensions(rest: &mut dyn Read, limit: u64, path: &Path) -> Result<()> {
+    let wrong = |e| unreadable(path, &e);
+    let short = |wanted: u64, got: u64| {
+        let expected = format!("{wanted} bytes of an extension record");
+        Err(Error::format(path, expected, got.to_string()))
+    };
+    let mut left = limit;
+    loop {
+        let mut head = Vec::new();
+        Read::take(&mut *rest, 8).read_to_end(&mut head).map_err(wrong)?;
+        let &[_, _, _, _, a, b, c, d] = head.as_slice() else {
+            return if head.is_empty() { Ok(()) } else { short(8, head.len() as u64) };
+        };
+        let length = u64::from(u32::from_le_bytes([a, b, c, d]));
+        left = left.checked_sub(8 + length).ok_or_else(|| {
+            let expected = format!("extension records of at most {limit} bytes");
+            Error::format(path, expected, format!("{length} bytes or more"))
+        })?;
+        let payload = &mut Read::take(&mut *rest, length);
+        let got = std::io::copy(payload, &mut std::io::sink()).map_err(wrong)?;
+        if got < length {
+            return short(length, got);
+        }
+    }
+}
+
+fn unreadable(path: &Path, e: &std::io::Error) -> Error {
+    Error::format(path, "a whole gzip stream (.spz)", e.to_string())
 }
 
 fn split(mut body: &[u8], header: &Header) -> Columns {
@@ -153,8 +206,7 @@ fn check_ratio(inflated: u64, compressed: u64, path: &Path) -> Result<()> {
 }
 
 fn inflate_gzip(bytes: &[u8], path: &Path) -> Result<(Header, Columns)> {
-    let wrong =
-        |e: std::io::Error| Error::format(path, "a whole gzip stream (.spz)", e.to_string());
+    let wrong = |e| unreadable(path, &e);
     let mut decoder = GzDecoder::new(bytes);
     let mut head = Vec::new();
     Read::take(&mut decoder, HEADER as u64).read_to_end(&mut head).map_err(wrong)?;
@@ -165,10 +217,17 @@ fn inflate_gzip(bytes: &[u8], path: &Path) -> Result<(Header, Columns)> {
     let needed = header.sizes().iter().sum::<usize>();
     check_ratio(needed as u64, bytes.len() as u64, path)?;
     let mut body = Vec::new();
-    // What follows (extensions) is not needed, and never inflated.
     Read::take(&mut decoder, needed as u64).read_to_end(&mut body).map_err(wrong)?;
     if body.len() < needed {
         return Err(truncated(path, (HEADER + needed) as u64, (HEADER + body.len()) as u64));
+    }
+    // The read that meets the end of the stream compares CRC-32 and length.
+    let limit = INFLATED_FREE.max(RATIO_MAX.saturating_mul(bytes.len() as u64));
+    read_end(&mut decoder, &header, limit, path)?;
+    let after = decoder.into_inner().len();
+    if after > 0 {
+        let expected = "the end of the file after the gzip stream";
+        return Err(Error::format(path, expected, format!("{after} more bytes")));
     }
     let columns = split(&body, &header);
     Ok((header, columns))
@@ -181,7 +240,7 @@ fn inflate_streams(bytes: &[u8], header: &Header, path: &Path) -> Result<Columns
     }
     let sizes = header.sizes();
     let expected = if header.sh_degree == 0 { 5 } else { 6 };
-    if header.streams < expected {
+    if header.streams != expected {
         let got = header.streams.to_string();
         return Err(Error::format(path, format!("{expected} streams (spz 4)"), got));
     }
@@ -189,6 +248,13 @@ fn inflate_streams(bytes: &[u8], header: &Header, path: &Path) -> Result<Columns
     let mut at = table + 16 * header.streams as u64;
     if table < HEADER_V4 as u64 || at > length {
         let wanted = format!("a stream table within {length} bytes");
+        return Err(Error::format(path, wanted, format!("one at byte {table}")));
+    }
+    let mut extensions = &bytes[HEADER_V4..table as usize];
+    if header.has_extensions {
+        skip_extensions(&mut extensions, length, path)?;
+    } else if !extensions.is_empty() {
+        let wanted = format!("the stream table at byte {HEADER_V4}, without extensions");
         return Err(Error::format(path, wanted, format!("one at byte {table}")));
     }
     let mut columns = Columns::default();
@@ -212,6 +278,10 @@ fn inflate_streams(bytes: &[u8], header: &Header, path: &Path) -> Result<Columns
         })?;
         at += compressed;
     }
+    if at < length {
+        let expected = "the end of the file after the last stream";
+        return Err(Error::format(path, expected, format!("{} more bytes", length - at)));
+    }
     Ok(columns)
 }
 
@@ -219,15 +289,30 @@ fn u64_at(bytes: &[u8], at: usize, path: &Path) -> Result<u64> {
     Ok(u64::from_le_bytes(super::gaussians::array(bytes, at, path)?))
 }
 
-/// Exactly `size` bytes of one zstd frame.
+/// Inflates one zstd frame that fills `stream` and holds exactly `size` bytes; compares its
+/// checksum, where it has one.
 fn zstd(stream: &[u8], size: usize) -> std::result::Result<Vec<u8>, String> {
     let mut out = Vec::new();
-    if size == 0 {
+    // No Gaussians: an absent stream.
+    if size == 0 && stream.is_empty() {
         return Ok(out);
     }
-    let decoder = ruzstd::decoding::StreamingDecoder::new(stream).map_err(|e| e.to_string())?;
-    Read::take(decoder, size as u64 + 1).read_to_end(&mut out).map_err(|e| e.to_string())?;
-    if out.len() == size { Ok(out) } else { Err(format!("{} bytes or more", out.len())) }
+    let mut decoder = ruzstd::decoding::StreamingDecoder::new(stream).map_err(|e| e.to_string())?;
+    let mut limited = Read::take(&mut decoder, size as u64 + 1);
+    limited.read_to_end(&mut out).map_err(|e| e.to_string())?;
+    if out.len() != size {
+        return Err(format!("{} bytes or more", out.len()));
+    }
+    let (rest, frame) = decoder.into_parts();
+    if !rest.is_empty() {
+        return Err(format!("{} bytes after the frame", rest.len()));
+    }
+    match (frame.get_checksum_from_data(), frame.get_calculated_checksum()) {
+        (Some(stored), Some(found)) if stored != found => {
+            Err(format!("checksum {found:08x} where the frame says {stored:08x}"))
+        }
+        _ => Ok(out),
+    }
 }
 
 fn gaussians(header: &Header, columns: &Columns) -> Incoming {

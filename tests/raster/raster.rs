@@ -1,11 +1,12 @@
-//! The rasterizer against other people's numbers: the conformance cases of
-//! `shared/fixtures/raster` (float64, both conventions; one case by gsplat), and an
-//! independent render of a real .ply (`shared/fixtures/ref_render`).
+//! The rasterizer against references of other makers: the conformance cases of
+//! `shared/fixtures/raster` (float64, both conventions; one case by gsplat), five of which
+//! are committed in `tests/goldens/raster`, and an independent render of a real .ply
+//! (`shared/fixtures/ref_render`).
 
 use subsplat_test_support as common;
 use subsplat_test_support::raster_case;
 
-use common::shared;
+use common::{committed, raster_cases, shared};
 use glam::{Mat4, Vec3};
 use raster_case::{File, rows};
 use std::path::Path;
@@ -149,18 +150,20 @@ cases! {
 
 #[test]
 fn every_fixture_has_a_test() {
-    let Some(folder) = shared("fixtures/raster") else { return };
-    let source = include_str!("raster.rs");
-    let mut cases = 0;
-    for entry in std::fs::read_dir(folder).unwrap() {
-        let path = entry.unwrap().path();
-        if path.extension().is_some_and(|e| e == "safetensors") {
-            let stem = path.file_stem().unwrap().to_str().unwrap();
-            assert!(source.contains(stem), "no test for {stem}");
-            cases += 1;
+    for path in raster_cases() {
+        let stem = path.file_stem().unwrap().to_str().unwrap();
+        assert!(include_str!("raster.rs").contains(stem), "no test for {stem}");
+    }
+}
+
+#[test]
+fn committed_cases_are_the_references() {
+    for path in raster_cases() {
+        let name = format!("fixtures/raster/{}", path.file_name().unwrap().to_str().unwrap());
+        if let Some(copy) = committed(&name) {
+            assert!(std::fs::read(copy).unwrap() == std::fs::read(path).unwrap(), "{name}");
         }
     }
-    assert!(cases >= 16);
 }
 
 /// gsplat's own picture, through brush.

@@ -5,11 +5,11 @@ use subsplat_test_support as common;
 use subsplat_test_support::raster_case;
 use subsplat_test_support::raster_gradients;
 
-use common::shared;
+use common::{raster_cases, shared};
 use glam::{DVec3, Mat4, Vec3};
 use raster_case::{File, rows};
 use raster_gradients::{check, part, planes, worst_row};
-use subsplat::abi::{RasterOptions, SPLAT_LANES};
+use subsplat::abi::{RasterOptions, SPLAT_STRIDE};
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::cpu::{Geometry, Gradients, Rasterizer, SplatSlices};
 
@@ -107,18 +107,13 @@ fn brush_tiny() {
 }
 
 fn splat_mean(packed: &[f32], i: usize) -> [f64; 3] {
-    std::array::from_fn(|c| f64::from(packed[SPLAT_LANES * i + c]))
+    std::array::from_fn(|c| f64::from(packed[SPLAT_STRIDE * i + c]))
 }
 
 #[test]
 fn every_fixture_has_a_test() {
-    let Some(folder) = shared("fixtures/raster") else { return };
-    let source = include_str!("raster_bwd.rs");
-    for entry in std::fs::read_dir(folder).unwrap() {
-        let path = entry.unwrap().path();
-        if path.extension().is_some_and(|e| e == "safetensors") {
-            let stem = path.file_stem().unwrap().to_str().unwrap();
-            assert!(source.contains(stem), "no test for {stem}");
-        }
+    for path in raster_cases() {
+        let stem = path.file_stem().unwrap().to_str().unwrap();
+        assert!(include_str!("raster_bwd.rs").contains(stem), "no test for {stem}");
     }
 }

@@ -5,6 +5,7 @@ use subsplat_test_support as common;
 
 use common::shared;
 use glam::{DMat4, Vec2};
+use std::path::Path;
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::data::crop::{CropOptions, CropRule, crop};
 use subsplat::data::depth::depth_range;
@@ -153,6 +154,22 @@ fn protocol_geometry_is_ours() {
         assert_eq!(name.starts_with("re10k"), range.near == 1.0 && range.far == 100.0, "{range:?}");
     }
     assert!(compared >= 13, "{compared}");
+}
+
+#[test]
+fn an_evaluation_index_is_read_as_it_stands() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/goldens/eval_index.json");
+    let index = load_index(&path).unwrap();
+    let views = |name: &str| {
+        let views = index[name].as_ref().unwrap();
+        (views.context.as_slice(), views.target.as_slice())
+    };
+    assert_eq!(index.len(), 4);
+    assert_eq!(views("made_up_a"), (&[0, 13, 26, 39][..], &[23][..]));
+    assert_eq!(views("made_up_b"), (&[58, 133][..], &[84, 102, 129][..]));
+    // The order of targets is the file's.
+    assert_eq!(views("made_up_c"), (&[17, 63][..], &[63, 17, 26][..]));
+    assert!(index["made_up_without_a_pair"].is_none());
 }
 
 #[test]

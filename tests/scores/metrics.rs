@@ -1,6 +1,7 @@
-//! PSNR and SSIM against figures that other programs computed.
+//! PSNR and SSIM against values that other programs computed.
 
 use subsplat_test_support as common;
+use subsplat_test_support::noise;
 
 use safetensors::SafeTensors;
 use subsplat::metrics::{psnr, ssim};
@@ -9,6 +10,30 @@ fn png(path: &std::path::Path) -> (Vec<f32>, usize, usize) {
     let image = image::open(path).unwrap().to_rgb8();
     let (w, h) = (image.width() as usize, image.height() as usize);
     (image.into_raw().iter().map(|v| f32::from(*v) / 255.0).collect(), w, h)
+}
+
+/// The pictures of tools/make_metrics_golden.py: a ramp, and the ramp with some noise.
+#[test]
+fn agrees_with_skimage_on_made_up_pictures() {
+    let mut lines = 0;
+    for line in include_str!("goldens/metrics.txt").lines().filter(|l| !l.starts_with('#')) {
+        let words: Vec<&str> = line.split(' ').collect();
+        let [w, h, weight] = [0, 1, 2].map(|i| words[i].parse::<usize>().unwrap());
+        let [want_psnr, want_ssim] = [3, 4].map(|i| words[i].parse::<f64>().unwrap());
+        let ramp: Vec<usize> = (0..w * h * 3)
+            .map(|i| (3 * (i / 3 % w) + 5 * (i / 3 / w) + 40 * (i % 3)) % 256)
+            .collect();
+        let noise = noise::noise(w, h).data;
+        let mixed = |(a, b): (&usize, &u8)| (a * (256 - weight) + usize::from(*b) * weight) / 256;
+        let display = |v: usize| v as f32 / 255.0;
+        let b: Vec<f32> = ramp.iter().zip(&noise).map(mixed).map(display).collect();
+        let a: Vec<f32> = ramp.into_iter().map(display).collect();
+        let (p, s) = (psnr(&a, &b, w, h).unwrap(), ssim(&a, &b, w, h).unwrap());
+        assert!((p - want_psnr).abs() < 1e-9, "{line}: psnr {p}");
+        assert!((s - want_ssim).abs() < 1e-9, "{line}: ssim {s}");
+        lines += 1;
+    }
+    assert_eq!(lines, 5);
 }
 
 #[test]

@@ -438,6 +438,10 @@ fn truncated_and_damaged_files_are_answered() {
         for length in 0..good.len() {
             assert!(answer(good[..length].to_vec()).is_err(), "{name} of {length} bytes");
         }
+        for more in [&b"\0"[..], b"\xff", b"PK\x05\x06", &good] {
+            let longer = [&good[..], more].concat();
+            assert!(answer(longer).is_err(), "{name} and {} bytes more", more.len());
+        }
         for at in 0..good.len() {
             for value in [0xff, good[at] ^ 1] {
                 let mut bytes = good.clone();
@@ -446,6 +450,61 @@ fn truncated_and_damaged_files_are_answered() {
             }
         }
     }
+}
+
+/// Every bit of the entries' data: each has a checksum, those of views too.
+#[test]
+fn every_bit_of_an_archive_is_checked() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/goldens/torch");
+    for name in ["views.pt", "protocol5.pt"] {
+        let good = std::fs::read(folder.join(name)).unwrap();
+        let end = good.windows(4).position(|w| w == b"PK\x01\x02").unwrap();
+        let mut unread = Vec::new();
+        for at in 0..end {
+            let mut bytes = good.clone();
+            bytes[at] ^= 1;
+            if answer(bytes).is_ok() {
+                unread.push(at);
+            }
+        }
+        // Padding and fields of local headers that repeat the directory: no data.
+        let data = |at: usize| {
+            let starts = good.windows(4).enumerate().filter(|(_, w)| *w == b"PK\x03\x04");
+            let header = starts.map(|(i, _)| i).take_while(|i| *i <= at).last().unwrap();
+            let length =
+                |o: usize| usize::from(good[header + o]) + 256 * usize::from(good[header + o + 1]);
+            at >= header + 30 + length(26) + length(28)
+        };
+        let lost: Vec<_> = unread.into_iter().filter(|at| data(*at)).collect();
+        assert!(lost.is_empty(), "{name}: changed and read all the same: {lost:?}");
+    }
+}
+
+/// Bytes between two entries are a data descriptor that repeats the directory, or nothing.
+#[test]
+fn bytes_between_entries_are_an_error() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/goldens/torch");
+    let good = std::fs::read(folder.join("views.pt")).unwrap();
+    let descriptor = good.windows(4).position(|w| w == b"PK\x07\x08").unwrap();
+    for at in descriptor..descriptor + 16 {
+        let mut bytes = good.clone();
+        bytes[at] ^= 1;
+        refused("descriptor", bytes, &["a data descriptor"]);
+    }
+    let entries = [entry("a/data.pkl", &dict(vec![]).pickle()), entry("a/version", b"3\n")];
+    assert!(answer(zip(&entries)).is_ok());
+    // Longer by a byte that no entry has: the second one starts later than it could.
+    let mut holed = Vec::new();
+    let mut first = entries[0].clone();
+    if let Data::Bytes(data) = &mut first.data {
+        first.size = Some(data.len() as u64);
+        data.push(b'.');
+    }
+    write_zip(&mut std::io::Cursor::new(&mut holed), &[first, entries[1].clone()]).unwrap();
+    refused("hole", holed, &["a data descriptor"]);
+    // A pickle that ends before its entry does.
+    let longer = [&dict(vec![]).pickle()[..], b"."].concat();
+    refused("pickle", zip(&[entry("a/data.pkl", &longer)]), &["the end of the pickle"]);
 }
 
 #[test]
@@ -518,6 +577,8 @@ fn legacy_files_that_lie() {
         &["2 elements in storage `k`", "truncated"],
     );
     refused("nothing", legacy(true, root(), &["k"], &[]), &["8 bytes at byte", "truncated"]);
+    let longer = [&data[..], b"\0"].concat();
+    refused("more", legacy(true, root(), &["k"], &longer), &["the end of the file", "1 more"]);
     let endless =
         dict(vec![("w", tensor(storage("torch FloatStorage", "k", i64::MAX), 0, &[2], &[1]))]);
     refused(

@@ -98,5 +98,10 @@ fn storages(
         }
         at = end;
     }
+    let more = source.len() - at;
+    if more > 0 {
+        let expected = "the end of the file after the last storage".to_owned();
+        return bad(expected, format!("{more} more bytes"));
+    }
     Ok(places)
 }

@@ -31,9 +31,9 @@ pub use value::{StorageRef, TensorRef, TorchDtype, Value};
 
 use super::{Error, Result};
 use source::{Source, Stream};
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashSet};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 /// Deepest nesting of a [`Value`].
 pub const MAX_DEPTH: usize = 64;
@@ -56,6 +56,8 @@ pub struct TorchFile {
     root: Value,
     opaque: BTreeSet<String>,
     source: Source,
+    /// Positions of the storages whose checksum was compared.
+    checked: Mutex<HashSet<u64>>,
 }
 
 impl TorchFile {
@@ -96,7 +98,8 @@ impl TorchFile {
             let got = foreign::name(&head, length);
             return Err(Error::format(path, "a file of torch.save", got));
         };
-        Ok(Self { path: path.to_owned(), form, root, opaque: pickle.opaque, source })
+        let (path, opaque, checked) = (path.to_owned(), pickle.opaque, Mutex::default());
+        Ok(Self { path, form, root, opaque, source, checked })
     }
 
     /// Name of the file, for messages.
@@ -120,21 +123,33 @@ impl TorchFile {
         &self.opaque
     }
 
-    /// Elements of a tensor of this file, contiguous and little-endian, in the order of
-    /// its shape. Memory: the elements, and for a view with gaps at most four times them
-    /// or 16 MiB, whichever is more.
+    /// Reads the elements of a tensor of this file, contiguous and little-endian, in the
+    /// order of its shape. Memory: the elements, and for a view with gaps at most four times
+    /// them or 16 MiB, whichever is more. The first read of a storage reads it whole, in
+    /// pieces, for its checksum.
     ///
     /// # Errors
-    /// The file has become shorter, or unreadable; a whole storage that does not have the
+    /// The file has become shorter, or unreadable; a storage that does not have the
     /// archive's checksum; an expanded tensor (stride 0) of more than 64 MiB beyond its
     /// storage.
     pub fn read(&self, t: &TensorRef) -> Result<Vec<u8>> {
-        read::read(&self.source, &self.path, t)
+        let bytes = read::read(&self.source, &self.path, t)?;
+        let storage = &t.storage;
+        let known =
+            |at: &u64| self.checked.lock().unwrap_or_else(PoisonError::into_inner).contains(at);
+        if let Some(crc) = storage.crc.filter(|_| !bytes.is_empty() && !known(&storage.at)) {
+            let range = storage.at..storage.at + storage.bytes;
+            let name = format!("storage `{}`", shown(&storage.key));
+            check_crc(&self.source, &self.path, range, crc, &name)?;
+            self.checked.lock().unwrap_or_else(PoisonError::into_inner).insert(storage.at);
+        }
+        Ok(bytes)
     }
 }
 
-/// The pickle of an archive, which must be little-endian.
+/// Runs the pickle of an archive, which must be little-endian.
 fn archived(archive: &zip::Archive, source: &Source, path: &Path) -> Result<pickle::Pickle> {
+    archive.check_small(source, path)?;
     if let Some(order) = archive.get("byteorder") {
         let order = source.bytes(order.at, order.bytes.min(16), path)?;
         if order != b"little" {
@@ -146,18 +161,41 @@ fn archived(archive: &zip::Archive, source: &Source, path: &Path) -> Result<pick
         return Err(Error::format(path, "data.pkl in the archive", "none"));
     };
     let end = entry.at + entry.bytes;
+    if entry.bytes <= pickle::MAX_PICKLE {
+        check_crc(source, path, entry.at..end, entry.crc, "data.pkl")?;
+    }
+    let mut stream = Stream::new(source, path, entry.at, end, pickle::MAX_PICKLE);
+    let pickle = pickle::run(&mut stream)?;
+    let more = end - stream.position();
+    if more > 0 {
+        let expected = "the end of the pickle at the end of data.pkl";
+        return Err(Error::format(path, expected, format!("{more} more bytes")));
+    }
+    Ok(pickle)
+}
+
+/// Compares the CRC-32 of a range of the file with an archive's. PyTorch writes 0 where it
+/// was told to compute none; such a range is not read.
+fn check_crc(
+    source: &Source,
+    path: &Path,
+    range: std::ops::Range<u64>,
+    expected: u32,
+    name: &str,
+) -> Result<()> {
+    if expected == 0 {
+        return Ok(());
+    }
     let mut sum = flate2::Crc::new();
-    let mut whole = Stream::new(source, path, entry.at, end, pickle::MAX_PICKLE);
-    while whole.left() > 0 {
-        sum.update(whole.take(whole.left().min(1 << 16) as usize)?);
+    let mut stream = Stream::new(source, path, range.start, range.end, u64::MAX);
+    while stream.left() > 0 {
+        sum.update(stream.take(stream.left().min(1 << 16) as usize)?);
     }
-    // PyTorch writes 0 where it was told to compute none.
-    if entry.crc != 0 && entry.bytes <= pickle::MAX_PICKLE && sum.sum() != entry.crc {
-        let expected = format!("CRC-32 {:08x} of data.pkl", entry.crc);
-        let got = format!("{:08x} (a damaged file)", sum.sum());
-        return Err(Error::format(path, expected, got));
+    if sum.sum() == expected {
+        return Ok(());
     }
-    pickle::run(&mut Stream::new(source, path, entry.at, end, pickle::MAX_PICKLE))
+    let got = format!("{:08x} (a damaged file)", sum.sum());
+    Err(Error::format(path, format!("CRC-32 {expected:08x} of {name}"), got))
 }
 
 /// A name of the file as messages show it: on one line, and cut where it is long.

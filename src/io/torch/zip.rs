@@ -8,9 +8,10 @@
 //! it happens to look at. Entry names are keys of a map and never become paths.
 
 use super::super::{Error, Result};
-use super::shown;
 use super::source::Source;
+use super::{check_crc, shown};
 use std::collections::HashMap;
+use std::ops::Range;
 use std::path::Path;
 
 /// A central directory of more bytes than this is refused.
@@ -59,8 +60,21 @@ impl Archive {
             plain(name, entry, path)?;
             locate(name, entry, source, path)?;
         }
-        apart(&entries, at, path)?;
+        contiguous(&entries, at, source, path)?;
         Ok(Self { entries, folder })
+    }
+
+    /// Compares the checksums of entries that are neither a pickle nor a storage.
+    pub(super) fn check_small(&self, source: &Source, path: &Path) -> Result<()> {
+        let pickle = format!("{}/data.pkl", self.folder);
+        let storages = format!("{}/data/", self.folder);
+        for (name, entry) in &self.entries {
+            if *name != pickle && !name.starts_with(&storages) {
+                let range = entry.at..entry.at + entry.bytes;
+                check_crc(source, path, range, entry.crc, &format!("`{}`", shown(name)))?;
+            }
+        }
+        Ok(())
     }
 
     /// The entry `name` of the saved folder.
@@ -269,17 +283,49 @@ fn locate(name: &str, entry: &mut Entry, source: &Source, path: &Path) -> Result
     Ok(())
 }
 
-/// Entries neither overlap each other nor the directory at `directory`.
-fn apart(entries: &HashMap<String, Entry>, directory: u64, path: &Path) -> Result<()> {
+/// Checks that entries follow one another without overlap up to the directory at
+/// `directory`, with nothing between them but data descriptors that repeat it.
+fn contiguous(
+    entries: &HashMap<String, Entry>,
+    directory: u64,
+    source: &Source,
+    path: &Path,
+) -> Result<()> {
     let mut order: Vec<(&String, &Entry)> = entries.iter().collect();
     order.sort_by_key(|(_, e)| e.header);
     let next = order.iter().skip(1).map(|(_, e)| e.header).chain([directory]);
     for ((name, entry), next) in order.iter().zip(next) {
-        if entry.at.checked_add(entry.bytes).is_none_or(|end| end > next) {
+        let Some(end) = entry.at.checked_add(entry.bytes).filter(|end| *end <= next) else {
             let (name, bytes) = (shown(name), entry.bytes);
             let got = format!("`{name}`, {bytes} bytes at {}, over byte {next}", entry.at);
             return refuse(path, "entries that do not overlap", got);
+        };
+        if !is_descriptor(entry, end..next, source, path)? {
+            let got = format!("{} other bytes after `{}`", next - end, shown(name));
+            return refuse(path, "a data descriptor, or nothing, after an entry", got);
         }
     }
     Ok(())
+}
+
+/// Reports whether `range` is empty or holds a data descriptor of `entry`: a signature
+/// (which may be absent), CRC-32, and two sizes of 4 or 8 bytes.
+fn is_descriptor(entry: &Entry, range: Range<u64>, source: &Source, path: &Path) -> Result<bool> {
+    let length = range.end - range.start;
+    if length == 0 {
+        return Ok(true);
+    }
+    if length > 24 || entry.flags & 8 == 0 {
+        return Ok(false);
+    }
+    let bytes = source.bytes(range.start, length, path)?;
+    let fields = bytes.strip_prefix(b"PK\x07\x08").unwrap_or(&bytes);
+    let size = match fields.len() {
+        12 => 4,
+        20 => 8,
+        _ => return Ok(false),
+    };
+    Ok(number(fields, 0, 4) == u64::from(entry.crc)
+        && number(fields, 4, size) == entry.compressed
+        && number(fields, 4 + size, size) == entry.bytes)
 }

@@ -1,7 +1,7 @@
 //! `subsplat compare`: the encoder, or the rasterizer, against a reference file.
 
 use super::args::{CompareArgs, SimdArg};
-use super::compare_raster;
+use super::compare_raster::{self, Comparison};
 use super::raster_case::Case;
 use crate::report::{Answer, Progress, peak_memory_bytes, warn};
 use anyhow::{Context, Result, bail, ensure};
@@ -46,10 +46,11 @@ fn encoder(weights: &Path, reference: &Path, answer: Answer) -> Result<bool> {
         warn(format!("the reference holds `{name}`, which the encoder does not produce"));
     }
     let ok = report.ok();
-    finish(&report.rows, ok, &report.not_produced, &progress, answer)
+    let extra = json!({ "not_produced": report.not_produced });
+    finish(&report.rows, ok, extra, &progress, answer)
 }
 
-/// The instruction set that is asked for, or the best one.
+/// Gives the requested instruction set, or the best one.
 fn tier(asked: Option<SimdArg>) -> Result<Tier> {
     let tier = asked.map_or_else(Tier::best, Tier::from);
     let here: Vec<&str> = Tier::available().iter().map(|t| t.name()).collect();
@@ -65,11 +66,11 @@ fn tier(asked: Option<SimdArg>) -> Result<Tier> {
 fn rasterizer(
     reference: &Path,
     with: &str,
-    compare: impl FnOnce(&Case) -> Result<Vec<Row>>,
+    compare: impl FnOnce(&Case) -> Result<Comparison>,
     answer: Answer,
 ) -> Result<bool> {
     let mut progress = Progress::new();
-    let rows = progress.stage("rasterizer", |_| -> Result<_> {
+    let Comparison { rows, absent } = progress.stage("rasterizer", |_| -> Result<_> {
         let Some(case) = Case::read(reference)? else {
             bail!(
                 "{}: expected a rasterizer case (metadata `convention`), or --weights beside a \
@@ -81,8 +82,11 @@ fn rasterizer(
     })?;
     answer.line(with);
     table(&rows, answer);
+    if !absent.is_empty() {
+        answer.line(format!("not in the file, not compared: {}", absent.join(", ")));
+    }
     let ok = rows.iter().all(|r| r.ok);
-    finish(&rows, ok, &[], &progress, answer)
+    finish(&rows, ok, json!({ "absent": absent, "not_produced": [] }), &progress, answer)
 }
 
 fn table(rows: &[Row], answer: Answer) {
@@ -101,10 +105,11 @@ fn table(rows: &[Row], answer: Answer) {
     answer.line(format!("{} tensors compared, {out} out of tolerance", rows.len()));
 }
 
+/// Answers with the rows and the fields of `extra`, an object.
 fn finish(
     rows: &[Row],
     ok: bool,
-    not_produced: &[String],
+    extra: Value,
     progress: &Progress,
     answer: Answer,
 ) -> Result<bool> {
@@ -120,12 +125,15 @@ fn finish(
             })
         })
         .collect();
-    answer.finish(&json!({
+    let mut report = json!({
         "ok": ok,
         "tensors": tensors,
-        "not_produced": not_produced,
         "seconds": progress.seconds(),
         "peak_memory_bytes": peak_memory_bytes(),
-    }))?;
+    });
+    if let (Some(report), Value::Object(extra)) = (report.as_object_mut(), extra) {
+        report.extend(extra);
+    }
+    answer.finish(&report)?;
     Ok(ok)
 }

@@ -1,12 +1,14 @@
-//! `subsplat compare` of a rasterizer case: our picture, and its gradients, against the
-//! reference's.
+//! `subsplat compare` of a rasterizer case: our picture and its gradients against those of
+//! the reference, as far as the file holds them.
 //!
-//! Pixels that the file marks as boundary are left out: there a decision (alpha below
-//! 1/255, the stop, the cap, a tile's edge) hangs on rounding, and a flip is no error.
+//! Boundary pixels are left out, where the file marks them: there rounding may flip a
+//! decision (alpha below 1/255, the end of blending, the cap on alpha, the edge of a tile).
 
 use super::raster_case::Case;
 use anyhow::{Result, ensure};
-use subsplat::abi::{Convention, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES};
+use subsplat::abi::{
+    Convention, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE,
+};
 use subsplat::cpu::{Gradients, Rasterizer, Rendered, Tier};
 use subsplat::model::compare::Row;
 use subsplat::render::Renderer;
@@ -17,11 +19,11 @@ const COLOUR_STANDARD: f32 = 3e-5;
 const COLOUR_MVSPLAT: f32 = 1e-4;
 /// Largest relative difference of depths.
 const DEPTH: f32 = 1e-4;
-/// Least Σ w·z that a difference is divided by, world units: alpha = 1 − T has few
+/// Smallest Σ w·z that a difference is divided by, world units: alpha = 1 − T has few
 /// digits where almost nothing covers a pixel.
-const DEPTH_SUM_LEAST: f32 = 0.1;
-/// Least depth that a difference is divided by, world units.
-const DEPTH_LEAST: f32 = 1e-3;
+const DEPTH_SUM_MIN: f32 = 0.1;
+/// Smallest depth that a difference is divided by, world units.
+const DEPTH_MIN: f32 = 1e-3;
 
 /// Largest error of a gradient, as [`gradient_error`] measures it: ten times the floor.
 const GRADIENT: f32 = 5e-4;
@@ -30,132 +32,237 @@ const GRADIENT_NEEDLES: f32 = 2e-3;
 /// The case that holds such splats.
 const NEEDLES: &str = "needles";
 
-/// Name, what came, its shape, what is allowed, and from which size on errors are relative.
-type Output<'a> = (&'static str, &'a [f32], &'a [usize], f32, Option<f32>);
-
-/// Renders the case with the instructions of `tier` and compares every output that the file holds. `relative` of a row
-/// is the difference in the tensor's own measure: absolute for colours and alpha.
-///
-/// # Errors
-/// A tensor is missing or has another shape; every pixel is marked as boundary.
-pub fn compare(case: &Case, tier: Tier) -> Result<Vec<Row>> {
-    let mut rasterizer = Rasterizer::new().with_tier(tier);
-    let got = rasterizer.render(&case.splats(), &case.camera, &case.options);
-    let mut rows = picture(case, &got)?;
-    if case.has("v_rgb") {
-        let (planes, mut got) = (upstream(case)?, Gradients::default());
-        rasterizer.backward(&case.splats(), &case.camera, &case.options, &planes, &mut got);
-        gradients(case, &got, &mut rows)?;
-    }
-    Ok(rows)
+/// The comparison of one case.
+#[derive(Default)]
+pub struct Comparison {
+    /// The tensors that the file holds.
+    pub rows: Vec<Row>,
+    /// Optional tensors that it does not hold.
+    pub absent: Vec<String>,
 }
 
-/// [`compare`] of what `renderer`'s device makes.
+impl Comparison {
+    /// Gives the values of an optional tensor, or notes its absence.
+    fn take<'a>(
+        &mut self,
+        case: &'a Case,
+        name: &str,
+        shape: &[usize],
+    ) -> Result<Option<&'a [f32]>> {
+        let values = case.optional(name, shape)?;
+        if values.is_none() {
+            self.absent.push(name.to_owned());
+        }
+        Ok(values)
+    }
+}
+
+/// One output of our rasterizer.
+struct Output<'a> {
+    name: &'static str,
+    values: &'a [f32],
+    shape: &'a [usize],
+    /// Largest difference that passes.
+    allowed: f32,
+    /// The difference is divided by |reference|, or by this where that is smaller; `None`
+    /// compares absolute differences.
+    relative_to: Option<f32>,
+}
+
+/// Renders the case with the instructions of `tier` and compares the outputs that the file
+/// holds. `relative` of a row is the difference in the tensor's own measure: absolute for
+/// colours and alpha.
+///
+/// # Errors
+/// The file holds nothing to compare; a tensor has another shape; every pixel is marked as
+/// boundary.
+pub fn compare(case: &Case, tier: Tier) -> Result<Comparison> {
+    let mut rasterizer = Rasterizer::new().with_tier(tier);
+    let got = rasterizer.render(&case.splats(), &case.camera, &case.options);
+    let mut comparison = picture(case, &got)?;
+    let references = gradient_references(case, &mut comparison)?;
+    if let Some(upstream) = &references.upstream {
+        let mut got = Gradients::default();
+        rasterizer.backward(&case.splats(), &case.camera, &case.options, upstream, &mut got);
+        gradients(case, &got, &references, &mut comparison);
+    }
+    finished(comparison)
+}
+
+/// Compares the outputs of `renderer`'s device as [`compare`] does.
 ///
 /// # Errors
 /// As [`compare`]; the device fails.
-pub fn compare_on(case: &Case, renderer: &mut Renderer) -> Result<Vec<Row>> {
+pub fn compare_on(case: &Case, renderer: &mut Renderer) -> Result<Comparison> {
     let (splats, camera, options) = (case.splats(), &case.camera, &case.options);
     let got = renderer.render_slices(&splats, camera, options)?;
-    let mut rows = picture(case, &got)?;
-    if case.has("v_rgb") {
-        let got = renderer.backward(&splats, camera, options, &upstream(case)?)?;
-        gradients(case, &got, &mut rows)?;
+    let mut comparison = picture(case, &got)?;
+    let references = gradient_references(case, &mut comparison)?;
+    if let Some(upstream) = &references.upstream {
+        let got = renderer.backward(&splats, camera, options, upstream)?;
+        gradients(case, &got, &references, &mut comparison);
     }
-    Ok(rows)
+    finished(comparison)
 }
 
-fn picture(case: &Case, got: &Rendered) -> Result<Vec<Row>> {
+fn finished(comparison: Comparison) -> Result<Comparison> {
+    ensure!(
+        !comparison.rows.is_empty(),
+        "rasterizer case: expected a tensor to compare, got none of {}",
+        comparison.absent.join(", ")
+    );
+    Ok(comparison)
+}
+
+/// Compares the outputs of the forward pass.
+fn picture(case: &Case, got: &Rendered) -> Result<Comparison> {
     let k = case.camera.intrinsics;
     let pixels = [k.height, k.width];
-    let boundary = case.array("boundary", &pixels)?;
-    ensure!(boundary.contains(&0.0), "tensor `boundary`: expected a pixel to compare, got none");
+    let mut comparison = Comparison::default();
+    let boundary = comparison.take(case, "boundary", &pixels)?;
+    ensure!(
+        boundary.is_none_or(|b| b.contains(&0.0)),
+        "tensor `boundary`: expected a pixel to compare, got none"
+    );
     let colour = match case.options.convention {
         Convention::Standard => COLOUR_STANDARD,
         Convention::Mvsplat => COLOUR_MVSPLAT,
     };
     let depth = got.depth();
     let rgb = [k.height, k.width, 3];
-    let outputs: [Output; 4] = [
-        ("rgb", &got.rgb, &rgb, colour, None),
-        ("alpha", &got.alpha, &pixels, colour, None),
-        ("depth_sum", &got.depth_sum, &pixels, DEPTH, Some(DEPTH_SUM_LEAST)),
-        ("depth", &depth, &pixels, DEPTH, Some(DEPTH_LEAST)),
+    let output = |name, values, shape, allowed, relative_to| Output {
+        name,
+        values,
+        shape,
+        allowed,
+        relative_to,
+    };
+    let outputs = [
+        output("rgb", &got.rgb[..], &rgb[..], colour, None),
+        output("alpha", &got.alpha, &pixels, colour, None),
+        output("depth_sum", &got.depth_sum, &pixels, DEPTH, Some(DEPTH_SUM_MIN)),
+        output("depth", &depth, &pixels, DEPTH, Some(DEPTH_MIN)),
     ];
-    let mut rows = Vec::new();
-    for (name, ours, shape, allowed, least) in outputs {
-        let theirs = case.array(name, shape)?;
-        let lanes = shape.get(2).copied().unwrap_or(1);
-        let inner = |i: usize| boundary.get(i / lanes).is_some_and(|&b| b == 0.0);
-        let pairs = ours.iter().zip(theirs).enumerate().filter(|(i, _)| inner(*i));
+    for Output { name, values, shape, allowed, relative_to } in outputs {
+        let Some(reference) = comparison.take(case, name, shape)? else { continue };
+        let channels = shape.get(2).copied().unwrap_or(1);
+        let inner = |i: usize| {
+            boundary.is_none_or(|b| b.get(i / channels).is_some_and(|&pixel| pixel == 0.0))
+        };
+        let pairs = values.iter().zip(reference).enumerate().filter(|(i, _)| inner(*i));
         let (mut max_abs, mut relative) = (0.0, 0.0);
-        for (_, (ours, theirs)) in pairs {
-            let d = (ours - theirs).abs();
+        for (_, (ours, reference)) in pairs {
+            let d = (ours - reference).abs();
             max_abs = worst(max_abs, d);
-            relative = worst(relative, least.map_or(d, |least| d / theirs.abs().max(least)));
+            let size = relative_to.map_or(1.0, |least| reference.abs().max(least));
+            relative = worst(relative, d / size);
         }
-        rows.push(row(name, max_abs, relative, allowed));
+        comparison.rows.push(row(name, max_abs, relative, allowed));
     }
-    Ok(rows)
+    Ok(comparison)
 }
 
-/// The case's gradients of the picture as planes `[5, H, W]`.
-fn upstream(case: &Case) -> Result<Vec<f32>> {
-    let k = case.camera.intrinsics;
-    let v_rgb = case.array("v_rgb", &[k.height, k.width, 3])?;
-    let v_alpha = case.array("v_alpha", &[k.height, k.width])?;
-    let mut planes: Vec<f32> = Vec::with_capacity(5 * v_alpha.len());
-    for c in 0..3 {
-        planes.extend(v_rgb.iter().skip(c).step_by(3));
-    }
-    planes.extend(v_alpha);
-    planes.resize(5 * v_alpha.len(), 0.0);
-    Ok(planes)
+/// A gradient of the file.
+struct GradientReference<'a> {
+    name: &'static str,
+    values: &'a [f32],
+    /// Numbers of one splat, or of one parent's SH; the background is one row.
+    width: usize,
 }
 
-/// Compares the gradients of Σ rgb·v_rgb + Σ alpha·v_alpha.
-fn gradients(case: &Case, got: &Gradients, rows: &mut Vec<Row>) -> Result<()> {
+/// The gradients that a case holds.
+struct GradientReferences<'a> {
+    /// ∂L/∂(rgb, alpha, depth), planes `[5, H, W]`; `None` where there is nothing to compare.
+    upstream: Option<Vec<f32>>,
+    gradients: Vec<GradientReference<'a>>,
+}
+
+/// Collects the gradients of the file and those of the picture that they follow from.
+fn gradient_references<'a>(
+    case: &'a Case,
+    comparison: &mut Comparison,
+) -> Result<GradientReferences<'a>> {
     let splats = case.splats();
-    let allowed = if case.name == NEEDLES { GRADIENT_NEEDLES } else { GRADIENT };
-    let lanes = |from: usize, count: usize| -> Vec<f32> {
-        got.rows
-            .chunks_exact(SPLAT_LANES)
-            .flat_map(|r| r.iter().skip(from).take(count))
-            .copied()
-            .collect()
-    };
     let (n, p) = (splats.len(), splats.parents());
-    let coefficients = got.sh.len() / (3 * p.max(1));
-    let mut all: Vec<(&str, Vec<f32>, Vec<usize>)> = match case.options.convention {
+    let coefficients = splats.sh.len() / (3 * p.max(1));
+    let mut shapes: Vec<(&str, Vec<usize>)> = match case.options.convention {
         Convention::Standard => vec![
-            ("grad.means", lanes(LANE_MEAN, 3), vec![n, 3]),
-            ("grad.quats", lanes(LANE_QUAT, 4), vec![n, 4]),
-            ("grad.scales", lanes(LANE_SCALE, 3), vec![n, 3]),
-            ("grad.opacities", lanes(LANE_OPACITY, 1), vec![n]),
+            ("grad.means", vec![n, 3]),
+            ("grad.quats", vec![n, 4]),
+            ("grad.scales", vec![n, 3]),
+            ("grad.opacities", vec![n]),
         ],
-        Convention::Mvsplat => vec![
-            ("grad.means", got.means.clone(), vec![n, 3]),
-            ("grad.cov6", got.cov6.clone(), vec![n, 6]),
-            ("grad.opacities", got.opacities.clone(), vec![n]),
-        ],
+        Convention::Mvsplat => {
+            vec![("grad.means", vec![n, 3]), ("grad.cov6", vec![n, 6]), ("grad.opacities", vec![n])]
+        }
     };
-    all.push(("grad.sh", got.sh.clone(), vec![p, coefficients, 3]));
+    shapes.push(("grad.sh", vec![p, coefficients, 3]));
     if !splats.gain.is_empty() {
-        all.push(("grad.gain", got.gain.clone(), vec![n]));
+        shapes.push(("grad.gain", vec![n]));
     }
-    all.push(("grad.background", got.background.to_vec(), vec![3]));
-    for (name, ours, shape) in all {
-        let theirs = case.array(name, &shape)?;
-        // One splat's, or one parent's, numbers; the background is one row.
+    shapes.push(("grad.background", vec![3]));
+    let mut gradients = Vec::new();
+    for (name, shape) in shapes {
         let width = match shape.as_slice() {
             [3] => 3,
             [_, rest @ ..] => rest.iter().product(),
             [] => 1,
         };
-        let (max_abs, relative) = gradient_error(&ours, theirs, width);
-        rows.push(row(name, max_abs, relative, allowed));
+        if let Some(values) = comparison.take(case, name, &shape)? {
+            gradients.push(GradientReference { name, values, width });
+        }
     }
-    Ok(())
+    let k = case.camera.intrinsics;
+    let pixels = k.height * k.width;
+    let v_rgb = comparison.take(case, "v_rgb", &[k.height, k.width, 3])?;
+    let v_alpha = comparison.take(case, "v_alpha", &[k.height, k.width])?;
+    let Some(first) = gradients.first() else {
+        return Ok(GradientReferences { upstream: None, gradients });
+    };
+    ensure!(
+        v_rgb.is_some() || v_alpha.is_some(),
+        "tensor `{}`: expected v_rgb or v_alpha beside it, got neither",
+        first.name
+    );
+    let mut planes = vec![0.0; 5 * pixels];
+    for (c, plane) in planes.chunks_exact_mut(pixels).take(3).enumerate() {
+        let values = v_rgb.unwrap_or_default().iter().skip(c).step_by(3);
+        plane.iter_mut().zip(values).for_each(|(to, v)| *to = *v);
+    }
+    let values = v_alpha.unwrap_or_default();
+    planes.iter_mut().skip(3 * pixels).zip(values).for_each(|(to, v)| *to = *v);
+    Ok(GradientReferences { upstream: Some(planes), gradients })
+}
+
+/// Compares the gradients of Σ rgb·v_rgb + Σ alpha·v_alpha.
+fn gradients(
+    case: &Case,
+    got: &Gradients,
+    references: &GradientReferences,
+    comparison: &mut Comparison,
+) {
+    let allowed = if case.name == NEEDLES { GRADIENT_NEEDLES } else { GRADIENT };
+    let packed = case.options.convention == Convention::Standard;
+    let column = |from: usize, count: usize| -> Vec<f32> {
+        let rows = got.rows.chunks_exact(SPLAT_STRIDE);
+        rows.flat_map(|r| r.iter().skip(from).take(count)).copied().collect()
+    };
+    for GradientReference { name, values, width } in &references.gradients {
+        let ours = match *name {
+            "grad.means" if packed => column(MEAN_OFFSET, 3),
+            "grad.quats" => column(QUAT_OFFSET, 4),
+            "grad.scales" => column(SCALE_OFFSET, 3),
+            "grad.opacities" if packed => column(OPACITY_OFFSET, 1),
+            "grad.means" => got.means.clone(),
+            "grad.cov6" => got.cov6.clone(),
+            "grad.opacities" => got.opacities.clone(),
+            "grad.sh" => got.sh.clone(),
+            "grad.gain" => got.gain.clone(),
+            _ => got.background.to_vec(),
+        };
+        let (max_abs, relative) = gradient_error(&ours, values, *width);
+        comparison.rows.push(row(name, max_abs, relative, allowed));
+    }
 }
 
 /// Largest |difference|, and the largest over rows of `width` numbers of

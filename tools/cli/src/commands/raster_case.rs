@@ -1,8 +1,9 @@
-//! Reads a rasterizer case for `subsplat compare`: one `.safetensors` file with
-//! splats, a camera, and the picture and gradients that a reference rasterizer made
-//! of them. Options travel as metadata strings (`convention`, `width`, `height`,
-//! `near`, `lowpass`, `antialiased`, `children`, `sh_degree`, and the constants
-//! `alpha_min`, `alpha_max`, `t_min`).
+//! Reads a rasterizer case for `subsplat compare`: one `.safetensors` file with splats, a
+//! camera, and the pictures and gradients of a reference rasterizer.
+//!
+//! Pictures and gradients are optional, each by itself. Options are metadata strings
+//! (`convention`, `width`, `height`, `near`, `lowpass`, `antialiased`, `children`,
+//! `sh_degree`, and the constants `alpha_min`, `alpha_max`, `t_min`).
 
 use anyhow::{Context, Result, bail, ensure};
 use glam::Mat4;
@@ -12,7 +13,7 @@ use std::path::Path;
 use std::str::FromStr;
 use subsplat::abi::{
     ALPHA_MAX_MVSPLAT, ALPHA_MAX_STANDARD, ALPHA_MIN, Convention, NEAR_MVSPLAT, RasterOptions,
-    SH_DEGREE_MAX, SPLAT_LANES, ShBasis, TRANSMITTANCE_MIN, sh_coefficients,
+    SH_DEGREE_MAX, SPLAT_STRIDE, ShBasis, TRANSMITTANCE_MIN, sh_coefficients,
 };
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::cpu::{Geometry, SplatSlices};
@@ -22,8 +23,24 @@ const MARK: &str = "convention";
 /// Largest relative difference between a constant of the file and ours: f32 rounding.
 const CONSTANT_TOLERANCE: f64 = 1e-6;
 
-/// Shape and values.
-type Array = (Vec<usize>, Vec<f32>);
+/// Values of a tensor, row-major.
+struct Array {
+    shape: Vec<usize>,
+    values: Vec<f32>,
+}
+
+type Tensors = BTreeMap<String, Array>;
+
+/// Tensors `[H, W]` or `[H, W, 3]`, all of them optional: name and channels.
+const PICTURES: [(&str, usize); 7] = [
+    ("rgb", 3),
+    ("alpha", 1),
+    ("depth_sum", 1),
+    ("depth", 1),
+    ("boundary", 1),
+    ("v_rgb", 3),
+    ("v_alpha", 1),
+];
 
 /// A rasterizer case, checked: shapes fit one another, camera and options are valid.
 pub struct Case {
@@ -33,7 +50,7 @@ pub struct Case {
     pub camera: Camera,
     /// Rules and background.
     pub options: RasterOptions,
-    tensors: BTreeMap<String, Array>,
+    tensors: Tensors,
     /// `[N, 11]`; empty where the case gives covariances.
     rows: Vec<f32>,
     sh_degree: usize,
@@ -70,13 +87,13 @@ impl Case {
                 Dtype::U8 => data.iter().map(|&b| f32::from(b)).collect(),
                 other => bail!("tensor `{name}`: expected f32 or u8, got {other:?}"),
             };
-            tensors.insert(name, (view.shape().to_vec(), values));
+            tensors.insert(name, Array { shape: view.shape().to_vec(), values });
         }
         let meta = Meta(metadata);
         let options = options(&meta, array(&tensors, "background", &[3])?)?;
         let camera = camera(&meta, &tensors)?;
-        let n = tensors.get("opacities").map_or(0, |(_, o)| o.len());
-        let (p, sh_degree) = sh_shape(&tensors)?;
+        let n = tensors.get("opacities").map_or(0, |o| o.values.len());
+        let ShShape { parents: p, degree: sh_degree } = sh_shape(&tensors)?;
         let children = meta.number::<usize>("children")?;
         ensure!(
             p.checked_mul(children) == Some(n) && n > 0,
@@ -112,21 +129,19 @@ impl Case {
         SplatSlices { geometry, sh, gain, sh_degree: self.sh_degree }
     }
 
-    /// A tensor of the file, of the shape that is expected.
+    /// Gives the values of an optional tensor; `None` where the file does not hold it.
     ///
     /// # Errors
-    /// It is missing or has another shape.
-    pub fn array(&self, name: &str, shape: &[usize]) -> Result<&[f32]> {
-        array(&self.tensors, name, shape)
-    }
-
-    /// Whether the file has the tensor.
-    pub fn has(&self, name: &str) -> bool {
-        self.tensors.contains_key(name)
+    /// It has another shape.
+    pub fn optional(&self, name: &str, shape: &[usize]) -> Result<Option<&[f32]>> {
+        match self.tensors.contains_key(name) {
+            true => array(&self.tensors, name, shape).map(Some),
+            false => Ok(None),
+        }
     }
 
     fn values(&self, name: &str) -> &[f32] {
-        self.tensors.get(name).map_or(&[], |(_, values)| values)
+        self.tensors.get(name).map_or(&[], |array| &array.values)
     }
 }
 
@@ -156,12 +171,8 @@ impl Meta<'_> {
     }
 }
 
-fn array<'a>(
-    tensors: &'a BTreeMap<String, Array>,
-    name: &str,
-    expected: &[usize],
-) -> Result<&'a [f32]> {
-    let Some((shape, values)) = tensors.get(name) else {
+fn array<'a>(tensors: &'a Tensors, name: &str, expected: &[usize]) -> Result<&'a [f32]> {
+    let Some(Array { shape, values }) = tensors.get(name) else {
         bail!("rasterizer case: expected a tensor `{name}` {expected:?}, got none")
     };
     ensure!(shape == expected, "tensor `{name}`: expected shape {expected:?}, got {shape:?}");
@@ -206,7 +217,7 @@ fn options(meta: &Meta, background: &[f32]) -> Result<RasterOptions> {
     Ok(RasterOptions { sh_basis, sh_degree, lowpass, antialiased, near, background, ..base })
 }
 
-fn camera(meta: &Meta, tensors: &BTreeMap<String, Array>) -> Result<Camera> {
+fn camera(meta: &Meta, tensors: &Tensors) -> Result<Camera> {
     let (width, height) = (meta.number("width")?, meta.number("height")?);
     let &[fx, fy, cx, cy] = array(tensors, "intrinsics", &[4])? else {
         bail!("tensor `intrinsics`: expected fx, fy, cx, cy")
@@ -215,28 +226,45 @@ fn camera(meta: &Meta, tensors: &BTreeMap<String, Array>) -> Result<Camera> {
     pose.copy_from_slice(array(tensors, "world_from_camera", &[4, 4])?);
     let intrinsics = Intrinsics { fx, fy, cx, cy, width, height };
     let camera = Camera::new(intrinsics, Mat4::from_cols_array(&pose).transpose())?;
-    // The pictures stand in the file: their size bounds what is rendered.
-    array(tensors, "rgb", &[height, width, 3])?;
+    // A picture of the file bounds the size that is rendered.
+    let mut found = false;
+    for (name, channels) in PICTURES.iter().filter(|(name, _)| tensors.contains_key(*name)) {
+        let shape = [height, width, *channels];
+        array(tensors, name, if *channels == 1 { &shape[..2] } else { &shape })?;
+        found = true;
+    }
+    ensure!(
+        found,
+        "rasterizer case: expected a picture to compare (rgb, alpha, depth_sum, depth) or \
+         gradients (v_rgb, v_alpha), got neither"
+    );
     Ok(camera)
 }
 
-/// (P, degree) of `sh` `[P, D, 3]`.
-fn sh_shape(tensors: &BTreeMap<String, Array>) -> Result<(usize, usize)> {
-    let shape = tensors.get("sh").map_or(&[][..], |(shape, _)| shape);
+/// Sizes of `sh` `[P, D, 3]`.
+struct ShShape {
+    parents: usize,
+    degree: usize,
+}
+
+fn sh_shape(tensors: &Tensors) -> Result<ShShape> {
+    let shape = tensors.get("sh").map_or(&[][..], |array| &array.shape);
     let degree = |d: usize| (0..=SH_DEGREE_MAX).find(|&l| sh_coefficients(l) == d);
     match *shape {
-        [p, d, 3] if degree(d).is_some() => Ok((p, degree(d).unwrap_or_default())),
+        [parents, d, 3] if degree(d).is_some() => {
+            Ok(ShShape { parents, degree: degree(d).unwrap_or_default() })
+        }
         _ => bail!("tensor `sh`: expected [P, 1, 4, 9, 16 or 25, 3], got {shape:?}"),
     }
 }
 
 /// `[N, 11]` rows of the file's separate tensors.
-fn pack(tensors: &BTreeMap<String, Array>, n: usize) -> Result<Vec<f32>> {
+fn pack(tensors: &Tensors, n: usize) -> Result<Vec<f32>> {
     let means = array(tensors, "means", &[n, 3])?.chunks_exact(3);
     let quats = array(tensors, "quats", &[n, 4])?.chunks_exact(4);
     let scales = array(tensors, "scales", &[n, 3])?.chunks_exact(3);
     let opacities = array(tensors, "opacities", &[n])?;
-    let mut rows = Vec::with_capacity(n * SPLAT_LANES);
+    let mut rows = Vec::with_capacity(n * SPLAT_STRIDE);
     for (((mean, quat), scale), opacity) in means.zip(quats).zip(scales).zip(opacities) {
         rows.extend(mean.iter().chain(quat).chain(scale).chain([opacity]));
     }

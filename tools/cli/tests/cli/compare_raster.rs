@@ -6,26 +6,16 @@ use subsplat_test_support as common;
 #[cfg(feature = "gpu")]
 use subsplat_test_support::gpu as adapter;
 
-use common::shared;
+use common::{raster_cases, shared};
 use program::{Called, call_with};
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use std::collections::{BTreeMap, HashMap};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use subsplat::cpu::Tier;
 
 /// Not ours: it holds no camera and no metadata (tests/raster.rs has its test).
 const FOREIGN: &str = "brush_tiny";
-
-fn cases() -> Vec<PathBuf> {
-    let Some(folder) = shared("fixtures/raster") else { return Vec::new() };
-    let all = std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().path());
-    let mut cases: Vec<_> =
-        all.filter(|p| p.extension().is_some_and(|e| e == "safetensors")).collect();
-    cases.sort();
-    assert!(cases.len() >= 16);
-    cases
-}
 
 fn compare(reference: &Path, more: &[&str]) -> Called {
     let words = ["--json", "compare", "--reference", reference.to_str().unwrap()];
@@ -34,7 +24,7 @@ fn compare(reference: &Path, more: &[&str]) -> Called {
 
 #[test]
 fn every_case_passes() {
-    for path in cases().iter().filter(|p| p.file_stem().unwrap() != FOREIGN) {
+    for path in raster_cases().iter().filter(|p| p.file_stem().unwrap() != FOREIGN) {
         for (tier, threads) in Tier::available().iter().zip(["1", "2", "3", "4"]) {
             let called = compare(path, &["--threads", threads, "--simd", tier.name()]);
             assert_eq!(called.code, 0, "{}: {} {}", path.display(), called.stdout, called.stderr);
@@ -55,7 +45,7 @@ fn every_case_passes_on_a_gpu() {
     if adapter::gpu().is_none() {
         return;
     }
-    for path in cases().iter().filter(|p| p.file_stem().unwrap() != FOREIGN) {
+    for path in raster_cases().iter().filter(|p| p.file_stem().unwrap() != FOREIGN) {
         let called = compare(path, &["--device", "gpu"]);
         assert_eq!(called.code, 0, "{}: {} {}", path.display(), called.stdout, called.stderr);
         let report = called.json();
@@ -73,7 +63,7 @@ fn every_case_passes_on_a_gpu() {
     off.write(&file);
     let called = compare(&file, &["--device", "gpu"]);
     assert_eq!(called.code, 3, "{} {}", called.stdout, called.stderr);
-    let Some(path) = cases().pop() else { return };
+    let Some(path) = raster_cases().pop() else { return };
     let called = compare(&path, &["--device", "no such adapter"]);
     assert_eq!(called.code, 1, "{}", called.stdout);
     assert!(called.json()["error"].to_string().contains("no such adapter"), "{}", called.stdout);
@@ -175,9 +165,95 @@ fn boundary_pixels_are_left_out() {
     assert_eq!(compare(&file, &[]).code, 3);
 }
 
+/// Pictures and gradients are optional: the others are compared, and the report names the
+/// absent ones.
+#[test]
+fn absent_tensors_are_reported() {
+    let Some(path) = shared("fixtures/raster/gain.safetensors") else { return };
+    let place = tempfile::tempdir().unwrap();
+    let file = place.path().join("part.safetensors");
+    let good = Copy::read(&path);
+    let without = |names: &[&str]| {
+        let mut case = Copy { metadata: good.metadata.clone(), tensors: good.tensors.clone() };
+        for name in names {
+            assert!(case.tensors.remove(*name).is_some(), "{name}");
+        }
+        case.write(&file);
+        compare(&file, &[])
+    };
+    let listed = |report: &serde_json::Value, key: &str, field: Option<&str>| -> Vec<String> {
+        let all = report[key].as_array().unwrap().iter();
+        all.map(|v| field.map_or(v, |f| &v[f]).as_str().unwrap().to_owned()).collect()
+    };
+    let whole = without(&[]).json();
+    assert_eq!(whole["absent"], serde_json::json!([]));
+    let all = listed(&whole, "tensors", Some("tensor"));
+    assert_eq!(all.len(), 11, "{all:?}");
+    let grads: Vec<&str> =
+        all.iter().map(String::as_str).filter(|n| n.starts_with("grad.")).collect();
+    let pictures = ["rgb", "alpha", "depth_sum", "depth"];
+    for names in [
+        &["depth_sum"][..],
+        &["rgb"],
+        &["alpha", "depth"],
+        &["boundary"],
+        &["grad.gain"],
+        &["v_alpha"],
+        &pictures,
+        &grads,
+        &["v_rgb", "v_alpha"],
+    ] {
+        // Gradients without those of the picture are refused below.
+        let more = if names.contains(&"v_rgb") { &grads[..] } else { &[] };
+        let names = [names, more].concat();
+        let called = without(&names);
+        // Without a mask, a boundary pixel may be out of tolerance; without v_alpha, the
+        // gradients are others.
+        let exact =
+            !names.contains(&"boundary") && !names.contains(&"v_alpha") || names.contains(&"v_rgb");
+        assert!(called.code == 0 || !exact, "{names:?}: {} {}", called.stdout, called.stderr);
+        let report = called.json();
+        let mut absent = listed(&report, "absent", None);
+        let mut wanted: Vec<String> = names.iter().map(|n| (*n).to_owned()).collect();
+        absent.sort();
+        wanted.sort();
+        assert_eq!(absent, wanted);
+        let kept: Vec<String> =
+            all.iter().filter(|n| !names.contains(&n.as_str())).cloned().collect();
+        assert_eq!(listed(&report, "tensors", Some("tensor")), kept);
+    }
+    // Half of the loss alone is compared too: the gradient of the background is that of rgb.
+    let report = without(&["v_alpha"]).json();
+    let row = |r: &serde_json::Value| r["tensor"] == "grad.background";
+    assert_eq!(report["tensors"].as_array().unwrap().iter().find(|r| row(r)).unwrap()["ok"], true);
+    let refused = |names: &[&str], words: &[&str]| {
+        let called = without(names);
+        assert_eq!(called.code, 1, "{names:?}: {} {}", called.stdout, called.stderr);
+        for word in words {
+            assert!(called.error().contains(word), "{} lacks {word}", called.error());
+        }
+    };
+    let v = ["v_rgb", "v_alpha"];
+    refused(&v, &["grad.means", "v_rgb or v_alpha"]);
+    refused(&[&pictures[..], &grads].concat(), &["a tensor to compare", "rgb", "grad.sh"]);
+    refused(
+        &[&pictures[..], &grads, &v, &["boundary"]].concat(),
+        &["a picture to compare", "neither"],
+    );
+    // The text for people names them too.
+    let words = ["compare", "--reference", file.to_str().unwrap()];
+    without(&["depth_sum"]);
+    let called = call_with(Path::new("."), &words, &[]);
+    assert!(
+        called.stdout.contains("not in the file, not compared: depth_sum"),
+        "{}",
+        called.stdout
+    );
+}
+
 #[test]
 fn malformed_cases_are_refused_by_name() {
-    let Some(path) = shared("fixtures/raster/sh1.safetensors") else { return };
+    let Some(path) = shared("fixtures/raster/gain.safetensors") else { return };
     let place = tempfile::tempdir().unwrap();
     let file = place.path().join("bad.safetensors");
     let good = Copy::read(&path);
@@ -205,7 +281,7 @@ fn malformed_cases_are_refused_by_name() {
         case.metadata.insert(key.to_owned(), value.to_owned());
         refused(&case, words);
     }
-    for name in ["rgb", "alpha", "means", "quats", "scales", "opacities", "sh", "intrinsics"] {
+    for name in ["means", "quats", "scales", "opacities", "sh", "intrinsics"] {
         let mut case = copy();
         case.tensors.remove(name);
         refused(&case, &[name]);
@@ -231,7 +307,7 @@ fn malformed_cases_are_refused_by_name() {
 
 #[test]
 fn an_instruction_set_that_is_not_here_is_refused() {
-    let Some(path) = shared("fixtures/raster/sh1.safetensors") else { return };
+    let Some(path) = shared("fixtures/raster/gain.safetensors") else { return };
     let all = [Tier::Scalar, Tier::Avx2, Tier::Avx512, Tier::Neon];
     let absent: Vec<_> = all.into_iter().filter(|t| !t.is_available()).collect();
     assert!(!absent.is_empty());

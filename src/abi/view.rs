@@ -1,41 +1,41 @@
-//! What a camera and the options of a call mean for projection: one set of numbers that
-//! the CPU and the GPU kernels read.
+//! The parameters of projection that the CPU and the GPU kernels derive from a camera and
+//! the options of a call.
 
-use crate::abi::{
+use super::{
     Convention, JACOBIAN_LIMIT_MVSPLAT, JACOBIAN_MARGIN_STANDARD, NEAR_MVSPLAT, RasterOptions,
     Z_EPSILON_MVSPLAT,
 };
 use crate::camera::{Camera, Intrinsics};
 
-/// A camera and the options of a call, as projection needs them.
+/// Parameters of projection: a camera under a convention.
 #[derive(Clone, Debug)]
 pub struct View {
-    /// Rows of the rotation from world to camera.
+    /// Rows of the rotation that maps world to camera.
     pub rows: [[f32; 3]; 3],
-    /// The eye, world.
+    /// Position of the camera in world.
     pub eye: [f32; 3],
-    /// px.
+    /// fx, fy, px.
     pub focal: [f32; 2],
-    /// Pixel position of the axis, centres at integers.
+    /// Principal point, px, pixel centres at integers.
     pub centre: [f32; 2],
-    /// Intervals to which x/z and y/z are clamped inside J.
+    /// Intervals (low, high) to which x/z and y/z are clamped inside the Jacobian.
     pub limit: [(f32, f32); 2],
-    /// Nearest camera z that is drawn, world units.
+    /// Nearest camera z that is rendered, world units.
     pub near: f32,
-    /// Added to camera z where a mean is projected, world units.
+    /// Term added to camera z in the projection of a mean, world units.
     pub z_epsilon: f32,
-    /// px².
+    /// Low-pass of the 2-D covariance, px².
     pub lowpass: f32,
-    /// Whether opacities shrink with what the low-pass adds.
+    /// Opacities are scaled by √(det Σ / det(Σ + low-pass)).
     pub antialiased: bool,
-    /// Whether splats end at the edges of 16×16 tiles.
+    /// Splats are cut at the edges of 16×16 tiles.
     pub tile_cut: bool,
     /// Width and height, px.
     pub size: [usize; 2],
 }
 
 impl View {
-    /// What `camera` and `options` mean for projection.
+    /// Derives the parameters from `camera` and `options`.
     pub fn new(camera: &Camera, options: &RasterOptions) -> Self {
         let k = &camera.intrinsics;
         let size = [k.width, k.height];
@@ -64,7 +64,7 @@ impl View {
             focal,
             centre,
             limit,
-            // z = 0 projects nowhere, whatever the caller's near plane.
+            // A point at z = 0 has no projection.
             near: near.max(f32::MIN_POSITIVE),
             z_epsilon: if standard { 0.0 } else { Z_EPSILON_MVSPLAT * options.near },
             lowpass: options.lowpass,
@@ -75,8 +75,9 @@ impl View {
     }
 }
 
-/// tan of half the angle between the rays through the middles of opposite picture
-/// edges, horizontally and vertically, as MVSplat derives its frustum.
+/// Returns tan of half the angle between the rays through the middles of opposite picture
+/// edges, horizontally and vertically: MVSplat's frustum.
+
 fn tan_half_fov(k: &Intrinsics) -> [f32; 2] {
     let (w, h) = (k.width as f64, k.height as f64);
     let ray = |u: f64, v: f64| {
