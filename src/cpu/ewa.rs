@@ -14,7 +14,7 @@
 //! zero is a point, drawn as wide as the low-pass makes it; the sign of σ does not
 //! matter; an opacity above 1 acts through the alpha cap.
 
-pub use crate::view::View;
+pub use crate::abi::View;
 
 use crate::abi::{
     ALPHA_MIN, ALPHA_MIN_LOG2, BLOCK, DISCRIMINANT_MIN_MVSPLAT, OPACITY_MAX, RADIUS_SIGMAS_MVSPLAT,

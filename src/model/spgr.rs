@@ -12,7 +12,7 @@
 
 use super::embed::Descriptors;
 use super::mlp::{LayerNorm, affine, gelu, linear};
-use crate::abi::{HEAD_GEOMETRY_LANES, HEAD_LANES};
+use crate::abi::{HEAD_GEOMETRY_LEN, HEAD_STRIDE};
 use crate::config::{
     AMin, AMinMode, AreaAt, Config, DepthDir, DepthUnit, GainSpace, OpacityRule, PrimaryView,
     Slide, SpgrHead,
@@ -147,9 +147,9 @@ impl Heads {
     /// # Errors
     /// A tensor is missing or has another shape.
     pub fn new(config: &Config, vb: VarBuilder) -> Result<Self> {
-        let rest = HEAD_LANES - HEAD_GEOMETRY_LANES;
+        let rest = HEAD_STRIDE - HEAD_GEOMETRY_LEN;
         Ok(Self {
-            geometry: Head::new(config, HEAD_GEOMETRY_LANES, vb.pp("geo"))?,
+            geometry: Head::new(config, HEAD_GEOMETRY_LEN, vb.pp("geo"))?,
             appearance: Head::new(config, rest, vb.pp("app"))?,
         })
     }
@@ -162,7 +162,7 @@ impl Heads {
         let geometry = self.geometry.forward(&inputs.geometry, side)?;
         let appearance = self.appearance.forward(&inputs.appearance, side)?;
         let flat = columns(&geometry.flatten(0, 1)?, &appearance.flatten(0, 1)?, None)?;
-        flat.reshape((geometry.dim(0)?, side * side, HEAD_LANES))
+        flat.reshape((geometry.dim(0)?, side * side, HEAD_STRIDE))
     }
 }
 
