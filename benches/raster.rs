@@ -97,7 +97,7 @@ impl Case {
 
     fn plain(&self) -> Plain<'_> {
         let s = &self.splats;
-        Plain { rows: &s.rows, sh: &s.sh, gain: &s.gain, sh_degree: s.sh_degree }
+        Plain { rows: &s.rows(), sh: &s.sh(), gain: &s.gain(), sh_degree: s.sh_degree() }
     }
 
     fn plain_options(&self, box_sigmas: f32) -> Options {
@@ -157,11 +157,11 @@ impl Case {
         let s = &self.splats;
         let (n, pairs) = (s.len() as f64, stats.pairs as f64);
         let pixels = (self.camera.intrinsics.width * self.camera.intrinsics.height) as f64;
-        let input = 4.0 * (s.rows.len() + s.sh.len() + s.gain.len()) as f64;
+        let input = 4.0 * (s.rows().len() + s.sh().len() + s.gain().len()) as f64;
         // A 64-byte record a splat, written and read per tile; sort keys and values,
         // written and read thrice; lists, written and read; RGB, alpha, depth.
         let bytes = input + 64.0 * (n + pairs) + 48.0 * n + 8.0 * pairs + 20.0 * pixels;
-        let sh = 2.0 * s.sh.len() as f64 + 40.0 * s.parents() as f64;
+        let sh = 2.0 * s.sh().len() as f64 + 40.0 * s.parents() as f64;
         let flops = 16.0 * FLOPS_PER_PIXEL * stats.items as f64 + FLOPS_PER_SPLAT * n + sh;
         Work { bytes, flops }
     }
@@ -372,7 +372,7 @@ fn write(folder: &Path, bench: &Bench) -> Result<()> {
 fn write_tensors(path: &Path, splats: &Splats, camera: &Camera) -> Result<()> {
     let (n, p, d) = (splats.len(), splats.parents(), splats.sh_coefficients());
     let column = |from: usize, lanes: usize| -> Vec<f32> {
-        splats.rows.chunks_exact(11).flat_map(|r| r[from..from + lanes].iter().copied()).collect()
+        splats.rows().chunks_exact(11).flat_map(|r| r[from..from + lanes].iter().copied()).collect()
     };
     let k = camera.intrinsics;
     let pose = camera.world_from_camera.transpose().to_cols_array().to_vec();
@@ -381,13 +381,13 @@ fn write_tensors(path: &Path, splats: &Splats, camera: &Camera) -> Result<()> {
         ("quats", vec![n, 4], column(3, 4)),
         ("scales", vec![n, 3], column(7, 3)),
         ("opacities", vec![n], column(10, 1)),
-        ("sh", vec![p, d, 3], splats.sh.clone()),
+        ("sh", vec![p, d, 3], splats.sh().to_vec()),
         ("intrinsics", vec![4], vec![k.fx, k.fy, k.cx, k.cy]),
         ("world_from_camera", vec![4, 4], pose.clone()),
         ("background", vec![3], vec![0.0; 3]),
     ];
-    if !splats.gain.is_empty() {
-        tensors.push(("gain", vec![n], splats.gain.clone()));
+    if !splats.gain().is_empty() {
+        tensors.push(("gain", vec![n], splats.gain().to_vec()));
     }
     let list = |v: &[f32]| v.iter().map(f32::to_string).collect::<Vec<_>>().join(",");
     let metadata = [
@@ -396,7 +396,7 @@ fn write_tensors(path: &Path, splats: &Splats, camera: &Camera) -> Result<()> {
         ("intrinsics", list(&[k.fx, k.fy, k.cx, k.cy])),
         ("world_from_camera", list(&pose)),
         ("children", (n / p).to_string()),
-        ("sh_degree", splats.sh_degree.to_string()),
+        ("sh_degree", splats.sh_degree().to_string()),
         ("near", "0.01".to_owned()),
         ("lowpass", "0.3".to_owned()),
         ("axes", "OpenCV: x right, y down, z forward; quaternions wxyz; sigma".to_owned()),

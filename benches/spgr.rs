@@ -139,7 +139,7 @@ impl Case {
         };
         let spec = Spec { name: "", grid: side, sigma_at: side, sigma_px: 1.0, side };
         let n = 2 * side * side;
-        let rows = scene::shared(&spec).rows;
+        let rows = scene::shared(&spec).into_parts().rows;
         let parents = Tensor::from_vec(rows, (n, SPLAT_STRIDE), &candle_core::Device::Cpu)?;
         let (k, lanes) = (call.rules.children(), call.rules.gain_lanes());
         let gains = if lanes == 1 { vec![n * k] } else { vec![n * k, lanes] };

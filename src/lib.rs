@@ -34,25 +34,107 @@
 //! Features, both default: `cli` builds the programs `subsplat` and `subsplat-convert`;
 //! `gpu` the WGSL kernels ([`gpu`]). `view` adds `subsplat view`, a window.
 
+#![cfg_attr(
+    not(feature = "internals"),
+    allow(
+        dead_code,
+        unused_imports,
+        reason = "programs, tests and benches use more of the crate than its public items do"
+    )
+)]
+
+#[cfg(feature = "internals")]
 pub mod abi;
+#[cfg(feature = "internals")]
 pub mod camera;
+#[cfg(feature = "internals")]
 pub mod check;
+#[cfg(feature = "internals")]
 pub mod config;
+#[cfg(feature = "internals")]
 pub mod cpu;
+#[cfg(feature = "internals")]
 pub mod data;
+#[cfg(all(feature = "internals", feature = "network"))]
 pub mod eval;
-#[cfg(feature = "gpu")]
+#[cfg(all(feature = "internals", feature = "gpu"))]
 pub mod gpu;
+#[cfg(feature = "internals")]
 pub mod io;
+#[cfg(feature = "internals")]
 pub mod metrics;
+#[cfg(all(feature = "internals", feature = "network"))]
 pub mod model;
+#[cfg(feature = "internals")]
 pub mod navigation;
+#[cfg(all(feature = "internals", feature = "network"))]
 pub mod ops;
+#[cfg(all(feature = "internals", feature = "network"))]
 pub mod pipeline;
+#[cfg(feature = "internals")]
 pub mod render;
+#[cfg(feature = "internals")]
 pub mod sh;
+#[cfg(feature = "internals")]
 pub mod splats;
+#[cfg(all(feature = "internals", feature = "network"))]
 pub mod train;
 
-pub use ops::rasterize_splats as rasterize;
-pub use render::{Picture, render};
+#[cfg(not(feature = "internals"))]
+mod abi;
+#[cfg(not(feature = "internals"))]
+mod camera;
+#[cfg(not(feature = "internals"))]
+mod check;
+#[cfg(not(feature = "internals"))]
+mod config;
+#[cfg(not(feature = "internals"))]
+mod cpu;
+#[cfg(not(feature = "internals"))]
+mod data;
+#[cfg(all(not(feature = "internals"), feature = "network"))]
+mod eval;
+#[cfg(all(not(feature = "internals"), feature = "gpu"))]
+mod gpu;
+#[cfg(not(feature = "internals"))]
+mod io;
+#[cfg(not(feature = "internals"))]
+mod metrics;
+#[cfg(all(not(feature = "internals"), feature = "network"))]
+mod model;
+#[cfg(not(feature = "internals"))]
+mod navigation;
+#[cfg(all(not(feature = "internals"), feature = "network"))]
+mod ops;
+#[cfg(all(not(feature = "internals"), feature = "network"))]
+mod pipeline;
+#[cfg(not(feature = "internals"))]
+mod render;
+#[cfg(not(feature = "internals"))]
+mod sh;
+#[cfg(not(feature = "internals"))]
+mod splats;
+#[cfg(all(not(feature = "internals"), feature = "network"))]
+mod train;
+
+#[cfg(feature = "network")]
+pub use candle_core;
+pub use glam;
+
+pub use abi::{Convention, RasterOptions, ShBasis};
+pub use camera::{Camera, CameraError, Intrinsics};
+pub use check::{CheckOptions, GrayImage, PairReport, Verdict, check_pair};
+#[cfg(feature = "gpu")]
+pub use gpu::Gpu;
+pub use io::cameras_json::{CameraFile, NamedCamera, load_cameras_json, save_cameras_json};
+pub use io::image::{Depth, Rgb, save_depth_png, save_png};
+pub use io::scene::{Frame, Scene, SceneFormat, Units, load_scene};
+pub use io::{SaveOptions, SaveReport, SplatFormat, Up, load_splats, save_splats};
+pub use metrics::{MetricsError, psnr, ssim};
+pub use navigation::{Bounds, Navigator, Start};
+#[cfg(feature = "network")]
+pub use ops::{SplatTensors, rasterize_splats as rasterize};
+#[cfg(feature = "network")]
+pub use pipeline::{Photo, Reconstruction, Reconstructor, Request};
+pub use render::{Picture, Renderer, render};
+pub use splats::{SplatParts, Splats, SplatsError};

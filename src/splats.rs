@@ -6,7 +6,6 @@
 use crate::abi::{
     MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SH_DEGREE_MAX, SPLAT_STRIDE, ShBasis,
 };
-use candle_core::{Device, Tensor};
 use thiserror::Error;
 
 /// Reason for which packed splats are refused.
@@ -29,12 +28,28 @@ pub enum SplatsError {
 pub struct Splats {
     /// `[N, 11]`: mean 3, quaternion wxyz 4 (of any length but zero), σ 3, opacity 1; offsets
     /// in [`crate::abi`].
-    pub rows: Vec<f32>,
+    pub(crate) rows: Vec<f32>,
     /// `[P, D, 3]`: SH coefficients per parent, D = (degree + 1)², RGB innermost. Splat `i`
     /// uses set `i / K`, K = N / P.
-    pub sh: Vec<f32>,
+    pub(crate) sh: Vec<f32>,
     /// `[N]`, `[N, 4]` or empty: colour = max(0, ½ + γ·Σ_j sh_j Y_j + δ). Four numbers are γ
     /// and the residual δ (RGB); one number is γ alone; empty means γ = 1, δ = 0.
+    pub(crate) gain: Vec<f32>,
+    /// Highest SH degree, 0 to 4.
+    pub(crate) sh_degree: usize,
+    /// Basis functions of `sh`.
+    pub(crate) sh_basis: ShBasis,
+}
+
+/// The buffers of [`Splats`], not checked: what [`Splats::into_parts`] returns and
+/// [`Splats::try_from`] accepts.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SplatParts {
+    /// Rows, as [`Splats::rows`].
+    pub rows: Vec<f32>,
+    /// SH coefficients, as [`Splats::sh`].
+    pub sh: Vec<f32>,
+    /// Gains, as [`Splats::gain`].
     pub gain: Vec<f32>,
     /// Highest SH degree, 0 to 4.
     pub sh_degree: usize,
@@ -42,49 +57,46 @@ pub struct Splats {
     pub sh_basis: ShBasis,
 }
 
-/// [`Splats`] as tensors, for optimisation: gradients flow to the tensors' inputs.
-#[derive(Clone, Debug)]
-pub struct SplatTensors {
-    /// `[N, 11]`, as [`Splats::rows`].
-    pub rows: Tensor,
-    /// `[P, D, 3]`, as [`Splats::sh`].
-    pub sh: Tensor,
-    /// `[N]` (γ) or `[N, 4]` (γ, δ); none means γ = 1, δ = 0.
-    pub gain: Option<Tensor>,
-    /// Basis functions of `sh`.
-    pub sh_basis: ShBasis,
-}
+impl TryFrom<SplatParts> for Splats {
+    type Error = SplatsError;
 
-impl SplatTensors {
-    /// Packs means `[N, 3]`, quaternions wxyz `[N, 4]` (of any length but zero), σ `[N, 3]`,
-    /// opacities `[N]` and SH `[P, D, 3]` without a gain. P divides N.
-    ///
-    /// # Errors
-    /// Shapes, dtypes or devices that do not match.
-    pub fn from_parts(
-        means: &Tensor,
-        quats_wxyz: &Tensor,
-        scales: &Tensor,
-        opacities: &Tensor,
-        sh: &Tensor,
-        sh_basis: ShBasis,
-    ) -> candle_core::Result<Self> {
-        let rows = Tensor::cat(&[means, quats_wxyz, scales, &opacities.unsqueeze(1)?], 1)?;
-        Ok(Self { rows, sh: sh.clone(), gain: None, sh_basis })
-    }
-
-    /// Copies `splats` to `device`.
-    ///
-    /// # Errors
-    /// Errors of candle's allocation.
-    pub fn new(splats: &Splats, device: &Device) -> candle_core::Result<Self> {
-        let (rows, sh, gain) = splats.to_tensors(device)?;
-        let gain = (splats.gain_lanes() > 0).then_some(gain);
-        Ok(Self { rows, sh, gain, sh_basis: splats.sh_basis })
+    fn try_from(parts: SplatParts) -> Result<Self, SplatsError> {
+        let SplatParts { rows, sh, gain, sh_degree, sh_basis } = parts;
+        Self::new(rows, sh, gain, sh_degree, sh_basis)
     }
 }
 
 impl Splats {
+    /// Changes the rows without a check: tests poison them.
+    #[cfg(feature = "internals")]
+    pub fn rows_mut(&mut self) -> &mut Vec<f32> {
+        &mut self.rows
+    }
+
+    /// Changes the SH coefficients without a check.
+    #[cfg(feature = "internals")]
+    pub fn sh_mut(&mut self) -> &mut Vec<f32> {
+        &mut self.sh
+    }
+
+    /// Changes the gains without a check.
+    #[cfg(feature = "internals")]
+    pub fn gain_mut(&mut self) -> &mut Vec<f32> {
+        &mut self.gain
+    }
+
+    /// Changes the SH basis without converting the coefficients.
+    #[cfg(feature = "internals")]
+    pub fn set_sh_basis(&mut self, basis: ShBasis) {
+        self.sh_basis = basis;
+    }
+
+    /// Returns the buffers, to change them; [`Splats::try_from`] checks them again.
+    pub fn into_parts(self) -> SplatParts {
+        let Self { rows, sh, gain, sh_degree, sh_basis } = self;
+        SplatParts { rows, sh, gain, sh_degree, sh_basis }
+    }
+
     /// Checks that the lengths of the three buffers match.
     ///
     /// # Errors
@@ -117,6 +129,31 @@ impl Splats {
             return shape("gain", format!("0, {n} or {} floats", 4 * n), gain.len());
         }
         Ok(Self { rows, sh, gain, sh_degree, sh_basis })
+    }
+
+    /// Returns the packed rows `[N, 11]`: mean 3, quaternion wxyz 4, σ 3, opacity 1.
+    pub fn rows(&self) -> &[f32] {
+        &self.rows
+    }
+
+    /// Returns the SH coefficients of all parents, `[P, D, 3]`.
+    pub fn sh(&self) -> &[f32] {
+        &self.sh
+    }
+
+    /// Returns the gains, `[N]`, `[N, 4]` or empty.
+    pub fn gain(&self) -> &[f32] {
+        &self.gain
+    }
+
+    /// Returns the highest SH degree, 0 to 4.
+    pub fn sh_degree(&self) -> usize {
+        self.sh_degree
+    }
+
+    /// Returns the basis functions of the SH coefficients.
+    pub fn sh_basis(&self) -> ShBasis {
+        self.sh_basis
     }
 
     /// Returns N, the number of Gaussians.
@@ -194,43 +231,5 @@ impl Splats {
                 (g[0], [g[1], g[2], g[3]])
             }
         }
-    }
-
-    /// Copies the buffers to tensors `([N,11], [P,D,3], [N] | [N,4])` on `device`. An empty
-    /// gain becomes ones.
-    ///
-    /// # Errors
-    /// Errors of candle's allocation.
-    pub fn to_tensors(&self, device: &Device) -> candle_core::Result<(Tensor, Tensor, Tensor)> {
-        let n = self.len();
-        let rows = Tensor::from_slice(&self.rows, (n, SPLAT_STRIDE), device)?;
-        let sh = Tensor::from_slice(&self.sh, (self.parents(), self.sh_coefficients(), 3), device)?;
-        let gain = match self.gain_lanes() {
-            0 => Tensor::ones(n, candle_core::DType::F32, device)?,
-            1 => Tensor::from_slice(&self.gain, n, device)?,
-            _ => Tensor::from_slice(&self.gain, (n, 4), device)?,
-        };
-        Ok((rows, sh, gain))
-    }
-
-    /// Copies tensors of [`Splats::to_tensors`]'s shapes back.
-    ///
-    /// # Errors
-    /// A tensor of another rank or dtype, or shapes that do not match.
-
-    pub fn from_tensors(
-        rows: &Tensor,
-        sh: &Tensor,
-        gain: &Tensor,
-        sh_basis: ShBasis,
-    ) -> candle_core::Result<Self> {
-        let (_, d, _) = sh.dims3()?;
-        let degree = (0..=SH_DEGREE_MAX).find(|l| (l + 1) * (l + 1) == d);
-        let Some(degree) = degree else {
-            candle_core::bail!("splats SH: expected 1, 4, 9, 16 or 25 coefficients, got {d}")
-        };
-        let flat = |t: &Tensor| t.flatten_all()?.to_vec1::<f32>();
-        Self::new(flat(rows)?, flat(sh)?, flat(gain)?, degree, sh_basis)
-            .map_err(candle_core::Error::wrap)
     }
 }

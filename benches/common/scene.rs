@@ -124,7 +124,7 @@ pub fn shared(spec: &Spec) -> Splats {
             harmonics(first.unwrap_or_default(), index, &mut sh);
         }
     }
-    Splats { rows, sh, gain, sh_degree: DEGREE, sh_basis: ShBasis::Standard }
+    Splats::new(rows, sh, gain, DEGREE, ShBasis::Standard).expect("buffers of one length")
 }
 
 /// One splat of grid pixel `at`, with σ of about `px` times its depth; its mean.
@@ -168,5 +168,6 @@ pub fn unshared(shared: &Splats) -> Splats {
         let (gain, _) = shared.gain_of(i);
         sh.extend(shared.sh_of(i).iter().map(|v| gain * v));
     }
-    Splats { rows: shared.rows.clone(), sh, gain: Vec::new(), ..shared.clone() }
+    Splats::new(shared.rows().to_vec(), sh, Vec::new(), shared.sh_degree(), shared.sh_basis())
+        .expect("one set of coefficients a splat")
 }

@@ -27,9 +27,11 @@ pub mod redistribute;
 pub mod resize;
 pub mod small;
 pub mod spgr;
+mod splat_tensors;
 
 pub use backend::{Backend, NoDevice};
 pub use rasterize::{over_background, rasterize, rasterize_on, rasterize_splats};
+pub use splat_tensors::SplatTensors;
 
 use crate::cpu::real::Real;
 use candle_core::{CpuStorage, Layout, Result, Shape, Storage, Tensor, WithDType, bail};

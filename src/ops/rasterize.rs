@@ -8,11 +8,11 @@
 //! Until its graph is dropped, an op keeps its lists (about 150 bytes a splat), so that
 //! the backward pass need not make them again.
 
+use super::SplatTensors;
 use crate::abi::{Convention, RasterOptions, SH_DEGREE_MAX, SPLAT_STRIDE, sh_coefficients};
 use crate::camera::Camera;
 use crate::cpu::{Geometry, Gradients, Rasterizer, SplatSlices};
 use crate::ops::{Backend, elements, tensor_like};
-use crate::splats::SplatTensors;
 use candle_core::{CpuStorage, CustomOp3, DType, Layout, Result, Shape, Tensor, bail};
 use std::sync::{Mutex, PoisonError};
 
@@ -79,7 +79,7 @@ pub fn rasterize_on(
 /// use candle_core::{Device, Tensor, Var};
 /// use subsplat::abi::{RasterOptions, ShBasis};
 /// use subsplat::camera::{Camera, Intrinsics};
-/// use subsplat::splats::SplatTensors;
+/// use subsplat::SplatTensors;
 ///
 /// # fn main() -> Result<(), Box<dyn std::error::Error>> {
 /// let d = &Device::Cpu;

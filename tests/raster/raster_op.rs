@@ -6,8 +6,9 @@ use glam::{Mat4, Vec3};
 use subsplat::abi::{Convention, RasterOptions, ShBasis};
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::cpu::{Gradients, Rasterizer};
+use subsplat::ops::SplatTensors;
 use subsplat::ops::{over_background, rasterize};
-use subsplat::splats::{SplatTensors, Splats};
+use subsplat::splats::Splats;
 
 fn camera() -> Camera {
     let k = Intrinsics { fx: 30.0, fy: 32.0, cx: 14.0, cy: 10.0, width: 29, height: 21 };
@@ -54,7 +55,7 @@ fn forward_is_the_kernels() {
     // Gain of one lane.
     let one = gain.narrow(1, 0, 1).unwrap().flatten_all().unwrap().contiguous().unwrap();
     let mut single = s.clone();
-    single.gain = one.to_vec1().unwrap();
+    *single.gain_mut() = one.to_vec1().unwrap();
     let got = rasterize(&rows, &sh, &one, &camera, &o).unwrap();
     let got = got.flatten_all().unwrap().to_vec1::<f32>().unwrap();
     let expected = subsplat::render(&single, &camera, &o);
@@ -134,7 +135,7 @@ fn gradients_are_the_kernels_and_those_of_the_loss() {
     let (mut s, camera, o) = (splats(), camera(), RasterOptions::default());
     // So wide and faint that no support ends inside the picture and no pixel stops: a
     // finite step then meets no jump.
-    for row in s.rows.chunks_exact_mut(11) {
+    for row in s.rows_mut().chunks_exact_mut(11) {
         row[7..10].iter_mut().for_each(|scale| *scale *= 20.0);
         row[10] = 0.35;
     }
@@ -197,10 +198,10 @@ fn splat_tensors_pass_gradients_to_their_parts() {
     let opacities = Var::from_tensor(&part(10, 1).flatten_all().unwrap()).unwrap();
     let sh = Var::from_tensor(&sh).unwrap();
     let tensors =
-        SplatTensors::from_parts(&means, &quats, &scales, &opacities, &sh, s.sh_basis).unwrap();
+        SplatTensors::from_parts(&means, &quats, &scales, &opacities, &sh, s.sh_basis()).unwrap();
     let planes = subsplat::rasterize(&tensors, &camera, &o).unwrap();
     let mut plain = s.clone();
-    plain.gain = Vec::new();
+    *plain.gain_mut() = Vec::new();
     let picture = subsplat::render(&plain, &camera, &o);
     let got: Vec<f32> = planes.get(3).unwrap().flatten_all().unwrap().to_vec1().unwrap();
     assert!(got == picture.alpha);

@@ -35,7 +35,7 @@ fn answer(ending: &str, parse: Parse, bytes: &[u8]) -> std::result::Result<Splat
     match result {
         Ok(s) => {
             // What is accepted must be usable.
-            assert!(s.rows.iter().chain(&s.sh).all(|v| v.is_finite()));
+            assert!(s.rows().iter().chain(s.sh()).all(|v| v.is_finite()));
             Ok(s)
         }
         Err(e) => {

@@ -80,11 +80,11 @@ pub fn covariance(s: &Splats, i: usize) -> DMat3 {
 
 /// ½ + γΣ + δ of splat `i` in direction `d`, degrees above `degree` left out.
 pub fn colour(s: &Splats, i: usize, d: DVec3, degree: usize) -> [f64; 3] {
-    let basis: Vec<f64> = match s.sh_basis {
+    let basis: Vec<f64> = match s.sh_basis() {
         ShBasis::Standard => sh::standard(d).to_vec(),
         ShBasis::Mvsplat => sh::mvsplat(d).to_vec(),
     };
-    let used = if s.sh_basis == ShBasis::Standard { (degree + 1) * (degree + 1) } else { 16 };
+    let used = if s.sh_basis() == ShBasis::Standard { (degree + 1) * (degree + 1) } else { 16 };
     let (gamma, delta) = s.gain_of(i);
     std::array::from_fn(|c| {
         let sum: f64 = s
@@ -122,7 +122,7 @@ pub fn assert_same(
     allowed: Tolerance,
 ) {
     assert_eq!(after.len(), order.len(), "number of Gaussians");
-    assert_eq!((after.sh_basis, after.gain_lanes()), (ShBasis::Standard, 0));
+    assert_eq!((after.sh_basis(), after.gain_lanes()), (ShBasis::Standard, 0));
     let mut random = Random(99);
     for (j, &i) in order.iter().enumerate() {
         let m = turn * DVec3::from_array(before.mean(i).map(f64::from));

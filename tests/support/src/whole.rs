@@ -130,12 +130,14 @@ pub fn lively(config: &Config) -> Reconstructor {
 /// wrong rotation of them would hide in rounding: degree l times 2^l·`factor`.
 pub fn amplify_view_dependence(splats: &mut Splats, factor: f32) {
     let d = splats.sh_coefficients();
-    for (i, rgb) in splats.sh.chunks_exact_mut(3).enumerate() {
+    let mut parts = splats.clone().into_parts();
+    for (i, rgb) in parts.sh.chunks_exact_mut(3).enumerate() {
         let degree = ((i % d) as f32).sqrt() as i32;
         if degree > 0 {
             rgb.iter_mut().for_each(|v| *v *= factor * 2f32.powi(degree));
         }
     }
+    *splats = Splats::try_from(parts).unwrap();
 }
 
 /// Peak signal-to-noise ratio of the colours of two renders, dB.

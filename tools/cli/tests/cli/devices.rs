@@ -21,7 +21,7 @@ fn scene() -> (Splats, Camera) {
     }
     let n = rows.len() / SPLAT_STRIDE;
     let sh = (0..3 * n).map(|i| (i as f32 * 0.9).sin()).collect();
-    let splats = Splats { rows, sh, gain: Vec::new(), sh_degree: 0, sh_basis: ShBasis::Standard };
+    let splats = Splats::new(rows, sh, Vec::new(), 0, ShBasis::Standard).unwrap();
     let k = Intrinsics::from_fov_x(0.9, 64, 48);
     (splats, Camera::new(k, Mat4::IDENTITY).unwrap())
 }

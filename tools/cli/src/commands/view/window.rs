@@ -403,7 +403,7 @@ impl Viewer {
 
 fn upload(gpu: &Gpu, made: &Made) -> Result<Ready> {
     let scene = gpu.upload_splats(&slices(&made.splats))?;
-    let options = RasterOptions { sh_basis: made.splats.sh_basis, ..made.options };
+    let options = RasterOptions { sh_basis: made.splats.sh_basis(), ..made.options };
     Ok(Ready { scene, options })
 }
 
