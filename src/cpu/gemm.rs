@@ -1,54 +1,58 @@
-//! Matrix product on slices: own register tiles on [`super::simd`], the
-//! right factor packed once and used by any number of callers.
+//! Matrix product on slices.
 //!
-//! Callers parallelise over blocks of rows themselves. A result is a sum over k in
-//! order, in parts of 128, whatever the block of rows that it is computed with:
-//! how rows are cut into tasks does not show, and fused tiers agree to the byte.
-//! Oracle: three loops in f64 (the tests).
+//! dst[i][j] = base[i][j] + scale · Σ_k lhs[i][k] · rhs[k][j]
+//!
+//! Input: lhs `[m, k]` of any strides; rhs `[k, n]`, packed once into panels of 64 columns
+//! ([`Packed`], `packing`) and shared by any number of calls; base zero, dst itself or a row
+//! `[n]`. Output: dst `[m, n]`, row-major. A register tile of 6 rows × up to 64 columns sums
+//! 128 products of each element before its epilogue adds base and scale (`register_tile`).
+//! Callers parallelise over blocks of rows themselves.
+//! Invariant: each element is summed over k in order, in parts of 128. Cutting the rows into
+//! tasks therefore changes no byte, and SIMD levels with fused multiply-add agree bit for bit.
+//! WGSL: none. Oracle and tests: gemm/tests.rs (three loops in f64).
 
-mod packed;
+mod packing;
+mod register_tile;
 #[cfg(test)]
 mod tests;
-mod tile;
 
 use super::fresh::Fresh;
 use super::simd::{Kernel, LANES, Simd, Tier};
-pub(super) use packed::copy;
-pub use packed::{Mat, Packed};
+pub(super) use packing::copy;
+pub use packing::{Mat, Packed};
 use rayon::prelude::*;
-use tile::{Part, rows};
+use register_tile::{PanelProduct, multiply_panel};
 
 /// Columns of a full panel of the right factor: four vectors.
 pub(super) const PANEL: usize = 4 * LANES;
-/// Products of one sum in registers: 128 · 64 floats of a panel are 32 KiB, which stay
-/// in the first-level cache while the rows of the left factor pass.
-const DEPTH: usize = 128;
-/// Rows this many floats apart (4 KiB) lie in one set of the first-level cache, where
-/// they put one another and the panel out.
-const ALIAS: usize = 1024;
+/// Maximum products of one sum in registers. 128 · 64 floats of a panel are 32 KiB, which
+/// stay in the first-level cache while all rows of the left factor are multiplied with them.
+const MAX_DEPTH: usize = 128;
+/// Rows whose distance is a multiple of this (4 KiB) share one set of the first-level cache,
+/// where they evict each other and the panel.
+const CACHE_SET_STRIDE: usize = 1024;
 
-/// What a product is added to.
+/// The matrix that a product is added to.
 #[derive(Clone, Copy, Debug)]
 pub enum Base<'a> {
-    /// Nothing.
+    /// Zeros.
     Zero,
-    /// What the destination holds.
+    /// The destination's own numbers.
     Own,
-    /// One number a column.
+    /// The same row `[n]` for every row of the destination.
     Row(&'a [f32]),
 }
 
-/// `dst = base + scale · lhs · rhs`. `dst` is row-major, its rows `row_stride` elements
-/// apart.
+/// Computes `dst = base + scale · lhs · rhs`. `dst` is a row-major slice and the distance of
+/// its rows.
 ///
 /// # Panics
-/// Where a matrix reaches past its slice or the sizes differ: the bounds check that the
-/// kernel rests on.
+/// Where a matrix extends beyond its slice, or where sizes differ.
 pub fn product(dst: (&mut [f32], usize), lhs: Mat<'_>, rhs: &Packed, scale: f32, base: Base<'_>) {
     product_on(Tier::best(), dst, lhs, rhs, scale, base);
 }
 
-/// [`product`] compiled for `tier`.
+/// Computes [`product`] at one SIMD level.
 pub(crate) fn product_on(
     tier: Tier,
     (dst, row_stride): (&mut [f32], usize),
@@ -62,19 +66,28 @@ pub(crate) fn product_on(
         return;
     }
     assert!(row_stride >= n && (m - 1) * row_stride + n <= dst.len(), "gemm: destination");
-    // SAFETY: the rows lie in `dst` (checked), apart from one another.
-    unsafe { product_at(tier, (dst.as_mut_ptr(), row_stride), lhs, rhs, scale, base) };
+    // SAFETY: the rows lie in `dst` without overlap (checked), and `dst` is initialised.
+    unsafe {
+        product_at(tier, OutputRows { at: dst.as_mut_ptr(), row_stride }, lhs, rhs, scale, base)
+    };
 }
 
-/// [`product_on`] into memory that need hold no numbers yet, unless `base` is
-/// [`Base::Own`]. Every column of every row is written.
+/// Destination of [`product_at`]: row i begins at `at + i·row_stride`.
+#[derive(Clone, Copy)]
+pub(crate) struct OutputRows {
+    pub at: *mut f32,
+    pub row_stride: usize,
+}
+
+/// Computes [`product_on`] into memory that may be uninitialised, unless `base` is
+/// [`Base::Own`]. Writes every column of every row.
 ///
 /// # Safety
-/// `lhs.rows` rows of `rhs.cols` floats, `row_stride` apart, are there to be written
-/// (with [`Base::Own`]: are numbers) and nobody else's meanwhile.
+/// `dst` has `lhs.rows` writable rows of `rhs.cols` floats, initialised for [`Base::Own`],
+/// which no other thread accesses during the call.
 pub(crate) unsafe fn product_at(
     tier: Tier,
-    (dst, row_stride): (*mut f32, usize),
+    dst: OutputRows,
     lhs: Mat<'_>,
     rhs: &Packed,
     scale: f32,
@@ -86,16 +99,16 @@ pub(crate) unsafe fn product_at(
     if m == 0 || n == 0 {
         return;
     }
-    assert!(row_stride >= n, "gemm: destination");
+    assert!(dst.row_stride >= n, "gemm: destination");
     assert!(rhs.data.len() >= k * n.next_multiple_of(LANES), "gemm: panels");
     if let Base::Row(row) = base {
         assert_eq!(row.len(), n, "gemm: row");
     }
-    tier.run(Product { dst, row_stride, lhs, rhs, scale, base });
+    tier.run(Product { dst, lhs, rhs, scale, base });
 }
 
-/// `dst = scale · lhs · rhs`, or `dst += …` with `accumulate`: [`product`] with a right
-/// factor that is used once.
+/// Computes `dst = scale · lhs · rhs`, or `dst += scale · lhs · rhs` with `accumulate`, for a
+/// right factor that is used once.
 ///
 /// # Panics
 /// As [`product`].
@@ -108,47 +121,49 @@ pub fn gemm(
     accumulate: bool,
 ) {
     let base = if accumulate { Base::Own } else { Base::Zero };
-    Packed::kept(rhs, |packed| product((dst, row_stride), lhs, packed, scale, base));
+    Packed::with(rhs, |packed| product((dst, row_stride), lhs, packed, scale, base));
 }
 
-/// Rows of a task of [`rows_product`]: a chunk of the trunk's parents is one.
-const BLOCK: usize = 256;
-/// Least rows of a task, and floats of its result beyond which it has fewer rows.
-const BLOCK_LEAST: usize = 48;
-const BLOCK_FLOATS: usize = 1 << 16;
+/// Maximum rows of a task of [`rows_product`]. Products of at most as many rows, such as those
+/// of one chunk of primaries, run on the caller's thread.
+const MAX_TASK_ROWS: usize = 256;
+/// Minimum rows of a task.
+const MIN_TASK_ROWS: usize = 48;
+/// Floats of a task's result, within these limits.
+const TASK_FLOATS: usize = 1 << 16;
 
-/// `base + lhs · rhs` into new memory, row-major, blocks of rows in parallel; up to
-/// 256 rows on the caller's thread.
+/// Computes `base + lhs · rhs` into new memory, row-major, with blocks of rows in parallel.
+/// Up to 256 rows run on the caller's thread.
 ///
 /// # Panics
-/// As [`product`].
+/// As [`product`]; also where `base` is [`Base::Own`].
 pub fn rows_product(lhs: Mat<'_>, rhs: &Packed, base: Base<'_>) -> Vec<f32> {
     let (m, n) = (lhs.rows, rhs.cols);
     lhs.check("operands");
-    assert!(!matches!(base, Base::Own), "gemm: new memory holds nothing");
+    assert!(!matches!(base, Base::Own), "gemm: new memory has no numbers to add to");
     let mut fresh = Fresh::new(m * n);
-    if let Some(rows) = BLOCK_FLOATS.checked_div(n) {
-        let rows = rows.clamp(BLOCK_LEAST, BLOCK);
-        let rows = if m <= BLOCK { BLOCK } else { rows };
+    if let Some(rows) = TASK_FLOATS.checked_div(n) {
+        let rows = rows.clamp(MIN_TASK_ROWS, MAX_TASK_ROWS);
+        let rows = if m <= MAX_TASK_ROWS { MAX_TASK_ROWS } else { rows };
         fresh.blocks(rows * n).enumerate().for_each(|(i, block)| {
             let lhs = Mat {
                 data: &lhs.data[(i * rows * lhs.row_stride).min(lhs.data.len())..],
                 rows: block.len() / n,
                 ..lhs
             };
-            let dst = (block.as_mut_ptr().cast(), n);
-            // SAFETY: the block is that many rows, this task's alone; `base` is not
-            // `Own` (asserted above).
+            let dst = OutputRows { at: block.as_mut_ptr().cast(), row_stride: n };
+            // SAFETY: the block holds that many rows, which no other task accesses; `base`
+            // is not `Own` (asserted above).
             unsafe { product_at(Tier::best(), dst, lhs, rhs, 1.0, base) };
         });
     }
-    // SAFETY: the products above wrote every block; without columns there is none.
+    // SAFETY: the products above wrote every block; without columns there is no block.
     unsafe { fresh.finish() }
 }
 
+/// The kernel of [`product_at`].
 struct Product<'a> {
-    dst: *mut f32,
-    row_stride: usize,
+    dst: OutputRows,
     lhs: Mat<'a>,
     rhs: &'a Packed,
     scale: f32,
@@ -161,49 +176,51 @@ impl Kernel for Product<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
         let (m, k, n) = (self.lhs.rows, self.lhs.cols, self.rhs.cols);
-        let mut turned = Vec::new();
+        let mut copied = Vec::new();
         let mut first = 0;
         loop {
-            let depth = DEPTH.min(k - first);
+            let depth = MAX_DEPTH.min(k - first);
             let mut lhs = Mat { cols: depth, ..self.lhs };
-            // An empty part is there for the base alone.
+            // With k = 0 a single empty part writes the base.
             lhs.data = if depth == 0 { &[] } else { &lhs.data[first * lhs.col_stride..] };
-            if lhs.col_stride != 1 || (lhs.row_stride.is_multiple_of(ALIAS) && n > PANEL) {
-                turned.resize(m * depth, 0.0);
-                copy(s, lhs, depth, &mut turned);
-                lhs = Mat::new(&turned, m, depth, depth);
+            let aliased = lhs.row_stride.is_multiple_of(CACHE_SET_STRIDE) && n > PANEL;
+            if lhs.col_stride != 1 || aliased {
+                copied.resize(m * depth, 0.0);
+                copy(s, lhs, depth, &mut copied);
+                lhs = Mat::new(&copied, m, depth, depth);
             }
             for j in (0..n).step_by(PANEL) {
                 let width = (n - j).next_multiple_of(LANES).min(PANEL);
-                let mut start = [0.0; PANEL];
+                let mut base_row = [0.0; PANEL];
+                // Parts after the first one add to the destination.
                 let base = match self.base {
                     Base::Own => None,
                     _ if first > 0 => None,
-                    Base::Zero => Some(start.as_ptr()),
+                    Base::Zero => Some(base_row.as_ptr()),
                     Base::Row(row) => {
                         let row = &row[j..(j + PANEL).min(n)];
-                        start[..row.len()].copy_from_slice(row);
-                        Some(start.as_ptr())
+                        base_row[..row.len()].copy_from_slice(row);
+                        Some(base_row.as_ptr())
                     }
                 };
                 // SAFETY: j < n, the floats of each row.
-                let dst = unsafe { self.dst.add(j) };
-                let part = Part {
+                let dst = unsafe { self.dst.at.add(j) };
+                let panel = PanelProduct {
                     a: lhs.data.as_ptr(),
                     a_stride: lhs.row_stride,
                     b: self.rhs.data[j * k + first * width..].as_ptr(),
                     depth,
                     dst,
-                    dst_stride: self.row_stride,
+                    dst_stride: self.dst.row_stride,
                     cols: (n - j).min(PANEL),
                     scale: self.scale,
                     base,
                 };
                 // SAFETY: rows 0..m of `lhs` (checked, or just copied), columns
-                // j..j + cols of `dst` (the callers' promise) and `depth` rows of a panel
-                // `width` wide (checked) are there; `base` points at PANEL floats that
-                // outlive the call.
-                unsafe { rows(s, part, m, width) };
+                // j..j + cols of `dst` (the contract of `product_at`) and `depth` rows of
+                // a panel `width` wide (checked) are valid; `base` points at PANEL floats
+                // that outlive the call.
+                unsafe { multiply_panel(s, panel, m, width) };
             }
             first += depth;
             if first >= k {

@@ -1,5 +1,6 @@
-//! Convolution with bias as one candle op, with gradients for input, weight and bias.
-//! Kernels: [`crate::cpu::conv`]; candle's own are 6 to 12 times slower.
+//! Convolution with bias as one candle op, with gradients of input, weight and bias, for
+//! [`super::conv2d`] and [`super::conv3d`]. Kernels: [`crate::cpu::conv`]; candle's own are 6
+//! to 12 times slower.
 
 use super::{output, slice};
 use crate::cpu::Tier;
@@ -9,7 +10,8 @@ use candle_core::{
     CpuStorage, CustomOp1, CustomOp2, CustomOp3, Layout, Result, Shape, Tensor, bail,
 };
 
-/// y = x ∗ w + bias for tensors whose shapes `sizes` describes.
+/// Computes y = x ∗ w + bias for tensors whose shapes `sizes` describes; `name` is used in
+/// errors.
 pub(super) fn apply(
     name: &'static str,
     x: &Tensor,
@@ -26,6 +28,7 @@ pub(super) fn apply(
     }
 }
 
+/// The op.
 #[derive(Clone, Copy)]
 struct Conv {
     name: &'static str,
@@ -33,16 +36,17 @@ struct Conv {
 }
 
 impl Conv {
-    /// `[batch, channels]` and the sides of a tensor: two for a picture, three for a
-    /// volume, as `like` has them.
+    /// Returns `[batch, channels, …size]` with as many spatial axes as `like` has: two or
+    /// three.
     fn shape(like: &Layout, channels: usize, size: [usize; 3]) -> Shape {
-        let sides = like.dims().len().saturating_sub(2).min(3);
+        let axes = like.dims().len().saturating_sub(2).min(3);
         let mut dims = vec![like.dims()[0], channels];
-        dims.extend(&size[3 - sides..]);
+        dims.extend(&size[3 - axes..]);
         dims.into()
     }
 
-    fn run(
+    /// Runs the forward kernel; `like` is the layout of x.
+    fn forward(
         &self,
         like: &Layout,
         x: &[f32],
@@ -53,6 +57,7 @@ impl Conv {
         output(cpu::forward(Tier::best(), &self.sizes, like.dims()[0], x, w, bias), shape)
     }
 
+    /// Computes ∂L/∂x and ∂L/∂w of the tensors that are tracked.
     fn grads(
         &self,
         x: &Tensor,
@@ -85,7 +90,7 @@ impl CustomOp2 for Conv {
     ) -> Result<(CpuStorage, Shape)> {
         let x = slice::<f32>(self.name, "x", s1, l1)?;
         let w = slice::<f32>(self.name, "weight", s2, l2)?;
-        self.run(l1, x, w, &[])
+        self.forward(l1, x, w, &[])
     }
 
     fn bwd(
@@ -116,7 +121,7 @@ impl CustomOp3 for Conv {
         let x = slice::<f32>(self.name, "x", s1, l1)?;
         let w = slice::<f32>(self.name, "weight", s2, l2)?;
         let bias = slice::<f32>(self.name, "bias", s3, l3)?;
-        self.run(l1, x, w, bias)
+        self.forward(l1, x, w, bias)
     }
 
     fn bwd(
@@ -137,7 +142,7 @@ impl CustomOp3 for Conv {
     }
 }
 
-/// (dy, w) to dx.
+/// Computes ∂L/∂x from (∂L/∂y, w).
 struct InputGrad(Conv);
 
 impl CustomOp2 for InputGrad {
@@ -160,7 +165,7 @@ impl CustomOp2 for InputGrad {
     }
 }
 
-/// (x, dy) to dw.
+/// Computes ∂L/∂w from (x, ∂L/∂y).
 struct WeightGrad(Conv);
 
 impl CustomOp2 for WeightGrad {
@@ -178,9 +183,9 @@ impl CustomOp2 for WeightGrad {
         let Conv { name, sizes } = self.0;
         let x = slice::<f32>(name, "x", s1, l1)?;
         let dy = slice::<f32>(name, "dy", s2, l2)?;
-        let sides = l1.dims().len().saturating_sub(2).min(3);
+        let axes = l1.dims().len().saturating_sub(2).min(3);
         let mut dims = vec![sizes.out_channels, sizes.in_channels];
-        dims.extend(&sizes.kernel[3 - sides..]);
+        dims.extend(&sizes.kernel[3 - axes..]);
         let shape = Shape::from(dims);
         let mut dw = zeros(shape.elem_count());
         cpu::weight_grad(Tier::best(), &sizes, x, dy, &mut dw);
@@ -188,7 +193,7 @@ impl CustomOp2 for WeightGrad {
     }
 }
 
-/// dy to db `[O]`.
+/// Computes ∂L/∂bias `[O]` from ∂L/∂y.
 struct BiasGrad(Conv);
 
 impl CustomOp1 for BiasGrad {

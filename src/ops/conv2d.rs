@@ -1,17 +1,15 @@
-//! 2-D convolution with bias as one candle op, with gradients for input, weight and
-//! bias. Kernel: [`crate::cpu::conv`].
-//! Tests: below (finite differences), and the kernel's own.
+//! 2-D convolution with bias as one candle op, with gradients of input, weight and bias.
+//! Kernel: [`crate::cpu::conv`]. Tests: below (finite differences), and the kernel's own.
 
 use super::conv::apply;
 use crate::cpu::conv::Sizes;
 use candle_core::{Result, Tensor, bail};
 
-/// y = x ∗ w + bias: `x` `[B, C, H, W]`, `w` `[O, C, kh, kw]`, `bias` `[O]`, giving
-/// `[B, O, H', W']`. Zero padding; stride and padding are the same on both axes.
+/// Computes y = x ∗ w + bias: `x` `[B, C, H, W]`, `w` `[O, C, kh, kw]`, `bias` `[O]`,
+/// y `[B, O, H', W']`. Zero padding; stride and padding are the same on both axes.
 ///
 /// # Errors
-/// Shapes that do not fit one another, a dtype other than f32, a kernel larger than
-/// the padded picture.
+/// Where shapes disagree, a dtype is not f32, or the kernel is larger than the padded image.
 pub fn conv2d(
     x: &Tensor,
     weight: &Tensor,
@@ -26,8 +24,8 @@ pub fn conv2d(
     }
     if stride == 0 || kh == 0 || kw == 0 || h + 2 * padding < kh || w + 2 * padding < kw {
         bail!(
-            "conv2d: expected a kernel inside the padded picture and stride ≥ 1, got kernel \
-             {kh}x{kw}, picture {h}x{w}, padding {padding}, stride {stride}"
+            "conv2d: expected a kernel inside the padded image and stride ≥ 1, got kernel \
+             {kh}x{kw}, image {h}x{w}, padding {padding}, stride {stride}"
         );
     }
     apply("conv2d", x, weight, bias, Sizes::conv2d([c, o], [kh, kw], stride, padding, [h, w]))
@@ -74,7 +72,7 @@ mod tests {
     }
 
     #[test]
-    fn misfits_are_named() -> Result<()> {
+    fn wrong_shapes_are_errors() -> Result<()> {
         let d = &Device::Cpu;
         let x = Tensor::zeros((1, 3, 4, 4), candle_core::DType::F32, d)?;
         let w = Tensor::zeros((2, 5, 3, 3), candle_core::DType::F32, d)?;

@@ -1,17 +1,16 @@
-//! 3-D convolution with bias as one candle op, with gradients for input, weight and
-//! bias. Kernel: [`crate::cpu::conv`].
-//! Tests: below (against 2-D convolutions of neighbouring slices), and the kernel's own.
+//! 3-D convolution with bias as one candle op, with gradients of input, weight and bias.
+//! Kernel: [`crate::cpu::conv`]. Tests: below (against 2-D convolutions of neighbouring
+//! slices), and the kernel's own.
 
 use super::conv::apply;
 use crate::cpu::conv::Sizes;
 use candle_core::{Result, Tensor, bail};
 
-/// y = x ∗ w + bias: `x` `[B, C, D, H, W]`, `w` `[O, C, kd, kh, kw]`, `bias` `[O]`,
-/// giving `[B, O, D', H', W']`. Stride 1, `padding` zeros on every side.
+/// Computes y = x ∗ w + bias: `x` `[B, C, D, H, W]`, `w` `[O, C, kd, kh, kw]`, `bias` `[O]`,
+/// y `[B, O, D', H', W']`. Stride 1, `padding` zeros on every side.
 ///
 /// # Errors
-/// Shapes that do not fit one another, a dtype other than f32, a kernel larger than
-/// the padded volume.
+/// Where shapes disagree, a dtype is not f32, or the kernel is larger than the padded volume.
 pub fn conv3d(
     x: &Tensor,
     weight: &Tensor,
@@ -39,7 +38,7 @@ mod tests {
     use crate::ops::conv2d::conv2d;
     use candle_core::{DType, Device, Var};
 
-    /// The same as 2-D convolutions over three neighbouring slices' channels.
+    /// Computes the same as 2-D convolutions over the channels of three neighbouring slices.
     fn by_slices(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
         let (b, c, d, h, w) = x.dims5()?;
         let o = weight.dim(0)?;
@@ -54,7 +53,7 @@ mod tests {
     }
 
     #[test]
-    fn agrees_with_slices_forward_and_back() -> Result<()> {
+    fn agrees_with_2d_convolutions_of_slices() -> Result<()> {
         let dev = &Device::Cpu;
         for (c, o) in [(5, 8), (8, 1)] {
             let x = Var::randn(0f32, 1.0, (2, c, 6, 5, 7), dev)?;
@@ -78,7 +77,7 @@ mod tests {
     }
 
     #[test]
-    fn misfits_are_named() -> Result<()> {
+    fn wrong_shapes_are_errors() -> Result<()> {
         let zeros = |dims: [usize; 5]| Tensor::zeros(&dims[..], DType::F32, &Device::Cpu);
         let x = zeros([1, 3, 4, 4, 4])?;
         let refused = |w: Tensor| conv3d(&x, &w, None, 1).unwrap_err().to_string();

@@ -1,9 +1,9 @@
-//! Linear layer as a candle op with gradients, bias and product in one pass over
-//! blocks of rows, the weight packed once a call. Kernel: [`crate::cpu::gemm`].
+//! Linear layer as a candle op with gradients: y = x·Wᵀ + b.
 //!
-//! Candle's own product splits itself over all threads, and its sums wait on a
-//! barrier of their own: called from many tasks at once they wait for one another.
-//! This one stays on the caller's thread for up to one block of rows.
+//! Product and bias are one pass over blocks of rows; the weight is packed once per call.
+//! Up to 256 rows run on the caller's thread. Candle's own product distributes every call
+//! over all threads, so that calls from several rayon tasks block each other.
+//! Kernel: [`crate::cpu::gemm`]. Tests: below (against candle's product).
 
 use super::{borrowed, output, slice, tensor_like};
 use crate::cpu::gemm::{Base, Mat, Packed, gemm, rows_product};
@@ -12,13 +12,14 @@ use rayon::prelude::*;
 
 const NAME: &str = "linear";
 
-/// Rows whose part of the parameters' gradients is one sum.
-const PART: usize = 1024;
+/// Rows per partial sum of the parameters' gradients. A constant keeps the order of summation
+/// independent of the number of threads.
+const GRADIENT_ROWS: usize = 1024;
 
-/// y = x·Wᵀ + b: `x` `[N, C]`, `weight` `[O, C]`, `bias` `[O]`, f32.
+/// Computes y = x·Wᵀ + b: `x` `[N, C]`, `weight` `[O, C]`, `bias` `[O]`, y `[N, O]`, all f32.
 ///
 /// # Errors
-/// Shapes that do not fit; a dtype other than f32.
+/// Where shapes disagree or a dtype is not f32.
 pub fn linear(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
     let (o, c) = weight.dims2()?;
     if x.rank() != 2 || x.dims()[1] != c || bias.dims() != [o] {
@@ -27,7 +28,7 @@ pub fn linear(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
     x.contiguous()?.apply_op3(&weight.contiguous()?, &bias.contiguous()?, Linear)
 }
 
-/// y = x·Wᵀ, as [`linear`].
+/// Computes y = x·Wᵀ, as [`linear`] without a bias.
 ///
 /// # Errors
 /// As [`linear`].
@@ -41,10 +42,10 @@ pub fn linear_no_bias(x: &Tensor, weight: &Tensor) -> Result<Tensor> {
 
 struct Linear;
 
-/// x·Wᵀ + b into new memory.
+/// Computes x `[n, c]` · (w `[o, c]`)ᵀ + b.
 fn forward(x: &[f32], w: &[f32], b: Option<&[f32]>, [n, c, o]: [usize; 3]) -> Vec<f32> {
     let base = b.map_or(Base::Zero, Base::Row);
-    Packed::kept(Mat::new(w, o, c, c).t(), |w| rows_product(Mat::new(x, n, c, c), w, base))
+    Packed::with(Mat::new(w, o, c, c).t(), |w| rows_product(Mat::new(x, n, c, c), w, base))
 }
 
 impl CustomOp2 for Linear {
@@ -111,13 +112,13 @@ impl CustomOp3 for Linear {
     }
 }
 
-/// By x (where it is asked for), weight and bias.
+/// Computes the gradients of x (if x is tracked), weight and bias.
 fn gradients(x: &Tensor, w: &Tensor, dy: &Tensor) -> Result<(Option<Tensor>, Tensor, Tensor)> {
     let (o, c) = w.dims2()?;
     let dy = dy.contiguous()?;
-    let wanted = x.track_op();
+    let tracked = x.track_op();
     let (dx, dw, db) = borrowed(NAME, [x, w, &dy], |[x, w, dy]: [&[f32]; 3]| {
-        let dx = match (wanted, o > 0 && c > 0) {
+        let dx = match (tracked, o > 0 && c > 0) {
             (false, _) => None,
             (true, true) => Some(input_grad(dy, w, [o, c])),
             (true, false) => Some(vec![0.0; x.len()]),
@@ -129,13 +130,14 @@ fn gradients(x: &Tensor, w: &Tensor, dy: &Tensor) -> Result<(Option<Tensor>, Ten
     Ok((dx, tensor_like(dw, w)?, Tensor::from_vec(db, o, x.device())?))
 }
 
-/// dy `[N, O]` · W `[O, C]`.
+/// Computes dx = dy `[N, O]` · W `[O, C]`.
 fn input_grad(dy: &[f32], w: &[f32], [o, c]: [usize; 2]) -> Vec<f32> {
     let dy = Mat::new(dy, dy.len() / o, o, o);
-    Packed::kept(Mat::new(w, o, c, c), |w| rows_product(dy, w, Base::Zero))
+    Packed::with(Mat::new(w, o, c, c), |w| rows_product(dy, w, Base::Zero))
 }
 
-/// (dyᵀ·x `[O, C]`, column sums of dy `[O]`): parts of [`PART`] rows, added in order.
+/// Computes dW = dyᵀ·x `[O, C]` and db = column sums of dy `[O]`, in parts of
+/// [`GRADIENT_ROWS`] rows that are added in order.
 fn parameter_grads(x: &[f32], dy: &[f32], [o, c]: [usize; 2]) -> (Vec<f32>, Vec<f32>) {
     let (mut dw, mut db) = (vec![0f32; o * c], vec![0f32; o]);
     if o * c == 0 {
@@ -151,7 +153,8 @@ fn parameter_grads(x: &[f32], dy: &[f32], [o, c]: [usize; 2]) -> (Vec<f32>, Vec<
         }
         (dw, db)
     };
-    let parts: Vec<_> = x.par_chunks(PART * c).zip(dy.par_chunks(PART * o)).map(part).collect();
+    let parts: Vec<_> =
+        x.par_chunks(GRADIENT_ROWS * c).zip(dy.par_chunks(GRADIENT_ROWS * o)).map(part).collect();
     for (part_w, part_b) in &parts {
         dw.iter_mut().zip(part_w).for_each(|(sum, v)| *sum += v);
         db.iter_mut().zip(part_b).for_each(|(sum, v)| *sum += v);
@@ -164,14 +167,14 @@ mod tests {
     use super::*;
     use candle_core::{Device, Var};
 
-    /// (y, dx, dw, db) of Σ y·r.
+    /// Returns y and the gradients (dx, dw, db) of Σ y·r.
     fn run(f: impl Fn(&Tensor, &Tensor, &Tensor) -> Result<Tensor>) -> Result<[Vec<f32>; 4]> {
         let number = |i: usize, k: f32| ((i as f32 + 0.5) * k).sin();
         let make = |n: usize, k: f32, shape: &[usize]| {
             let data: Vec<f32> = (0..n).map(|i| number(i, k)).collect();
             Var::from_tensor(&Tensor::from_vec(data, shape, &Device::Cpu)?)
         };
-        // More rows than a block, and a block that is not full.
+        // One full block of rows and one that is not full.
         let (n, c, o) = (256 + 37, 19, 11);
         let x = make(n * c, 0.71, &[n, c])?;
         let (w, b) = (make(o * c, 1.3, &[o, c])?, make(o, 2.1, &[o])?);
@@ -187,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn agrees_with_candles_own_and_so_do_its_gradients() -> Result<()> {
+    fn output_and_gradients_agree_with_candle() -> Result<()> {
         let ours = run(linear)?;
         let theirs = run(|x, w, b| x.matmul(&w.t()?)?.broadcast_add(b))?;
         for (a, b) in ours.iter().zip(&theirs) {
@@ -200,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn misfits_are_refused() -> Result<()> {
+    fn wrong_shapes_are_errors() -> Result<()> {
         let zeros = |shape: &[usize]| Tensor::zeros(shape, candle_core::DType::F32, &Device::Cpu);
         let (w, b) = (zeros(&[2, 3])?, zeros(&[2])?);
         assert!(linear(&zeros(&[5, 4])?, &w, &b).is_err());

@@ -213,14 +213,13 @@ impl Plan {
         self.dst_size.iter().product()
     }
 
-    /// Returns the taps of the kernel that maps source channel `src` to destination channel
-    /// `dst`, from the weights `w` `[O, C, taps]`.
+    /// Returns the index in the weights `[O·C, taps]` of the kernel that maps source channel
+    /// `src` to destination channel `dst`.
     #[inline(always)]
-    pub fn kernel<'a>(&self, w: &'a [f32], src: usize, dst: usize) -> &'a [f32] {
-        let index = match self.direction {
+    pub fn kernel_index(&self, src: usize, dst: usize) -> usize {
+        match self.direction {
             Direction::Forward => dst * self.src_channels + src,
             Direction::InputGrad => src * self.dst_channels + dst,
-        };
-        &w[index * self.kernel_taps..][..self.kernel_taps]
+        }
     }
 }

@@ -14,7 +14,7 @@ use super::packed_tile::{load_strided, store_interleaved};
 use super::plan::{Direction, Plan};
 use crate::cpu::disjoint::Disjoint;
 use crate::cpu::fresh::{self, Block};
-use crate::cpu::gemm::{Base, Mat, PANEL, Packed, product_at, product_on};
+use crate::cpu::gemm::{Base, Mat, OutputRows, PANEL, Packed, product_at, product_on};
 use crate::cpu::simd::{Kernel, Simd, Tier};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
@@ -103,7 +103,7 @@ impl WeightGrad for Pointwise {
                 let x = &x[image * c * pixels..][..c * pixels];
                 let mut product = |x: Mat<'_>| {
                     let dst = (&mut *sums, c);
-                    Packed::kept(x.t(), |x| product_on(tier, dst, dy, x, 1.0, Base::Own));
+                    Packed::with(x.t(), |x| product_on(tier, dst, dy, x, 1.0, Base::Own));
                 };
                 if plan.src_step == [1; 3] {
                     product(Mat::new(&x[first * width..], c, cols, pixels));
@@ -143,7 +143,7 @@ impl Call<'_> {
         let c = self.plan.src_channels;
         let pixels = self.plan.src_pixels();
         let x = &self.x[image * c * pixels + span.start..(image + 1) * c * pixels];
-        Packed::kept(Mat::new(x, c, span.len(), pixels), |x| self.product(image, span.start, x));
+        Packed::with(Mat::new(x, c, span.len(), pixels), |x| self.product(image, span.start, x));
     }
 
     /// Computes the lines `lines` of an image's grid; any stride.
@@ -156,7 +156,7 @@ impl Call<'_> {
         let pack = |to: &mut [f32]| {
             tier.run(PackPixels { plan, x, first: lines.start, cols, panel: PANEL, to });
         };
-        Packed::kept_by([c, cols], pack, |x| {
+        Packed::with_panels([c, cols], pack, |x| {
             if plan.dst_step == [1; 3] {
                 return self.product(image, lines.start * across, x);
             }
@@ -182,7 +182,8 @@ impl Call<'_> {
             unsafe { self.y.part(at..at + x.cols()) }.fill(MaybeUninit::new(*bias));
             base = Base::Own;
         }
-        let dst = (self.y.address(image * o * pixels + first).cast_mut().cast(), pixels);
+        let at = self.y.address(image * o * pixels + first).cast_mut().cast();
+        let dst = OutputRows { at, row_stride: pixels };
         // SAFETY: these pixels of all channels of one image lie inside `y` (asserted by
         // `convolve`), no other task writes them, and they are initialised where `base` is
         // `Own`.

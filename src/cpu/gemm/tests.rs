@@ -1,4 +1,4 @@
-//! Against three loops in f64, in every tier.
+//! Compares products with three loops in f64, at every SIMD level.
 
 use super::*;
 
@@ -6,26 +6,26 @@ fn numbers(n: usize, k: f32) -> Vec<f32> {
     (0..n).map(|i| ((i as f32 + 0.5) * k).sin()).collect()
 }
 
-/// Σ lhs(i, x)·rhs(x, j) in f64.
+/// Returns Σ lhs(i, x)·rhs(x, j) in f64.
 fn dot(lhs: Mat<'_>, rhs: Mat<'_>, i: usize, j: usize) -> f64 {
     let at = |m: Mat<'_>, i: usize, j: usize| m.data[i * m.row_stride + j * m.col_stride];
     (0..lhs.cols).map(|x| f64::from(at(lhs, i, x)) * f64::from(at(rhs, x, j))).sum()
 }
 
-/// Sizes around every edge: rows of a tile, vectors and panels of columns, parts of
-/// the sums; each factor as it is and transposed.
+/// Sizes around every limit: rows of a tile, vectors and panels of columns, parts of the
+/// sums. Each factor as it is and transposed.
 #[test]
 fn agrees_with_three_loops() {
     for (m, k, n) in [(7, 13, 9), (6, 129, 64), (23, 256, 80), (1, 1, 1), (40, 300, 150)] {
         let (a, b) = (numbers(m * k, 0.7), numbers(k * n, 0.3));
         let own = numbers(m * (n + 2), 1.9);
         let row = numbers(n, 2.3);
-        for turned in 0..4 {
-            let lhs = match turned & 1 {
+        for transposed in 0..4 {
+            let lhs = match transposed & 1 {
                 0 => Mat::new(&a, m, k, k),
                 _ => Mat::new(&a, k, m, m).t(),
             };
-            let rhs = match turned & 2 {
+            let rhs = match transposed & 2 {
                 0 => Mat::new(&b, k, n, n),
                 _ => Mat::new(&b, n, k, k).t(),
             };
@@ -36,7 +36,7 @@ fn agrees_with_three_loops() {
                 for (at, (&v, &before)) in dst.iter().zip(&own).enumerate() {
                     let (i, j) = (at / (n + 2), at % (n + 2));
                     if j >= n {
-                        assert_eq!(v, before, "{m} {k} {n}: past the row at {i} {j}");
+                        assert_eq!(v, before, "{m} {k} {n}: beyond the row at {i} {j}");
                         continue;
                     }
                     let base = match base {
@@ -62,9 +62,9 @@ fn every_tier_agrees_and_rows_may_be_cut_anywhere() {
         let mut dst = vec![0.0; m * n];
         for (first, dst) in (0..m).step_by(cut).zip(dst.chunks_mut(cut * n)) {
             let lhs = Mat::new(&a[first * k..], dst.len() / n, k, k);
-            let (row_stride, rhs, base) = (n, &rhs, Base::Zero);
-            let dst = dst.as_mut_ptr();
-            tier.run(Product { dst, row_stride, lhs, rhs, scale: 1.0, base });
+            let dst = OutputRows { at: dst.as_mut_ptr(), row_stride: n };
+            let (rhs, base) = (&rhs, Base::Zero);
+            tier.run(Product { dst, lhs, rhs, scale: 1.0, base });
         }
         dst
     };

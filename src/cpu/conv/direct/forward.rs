@@ -105,7 +105,8 @@ impl BlockedWeights {
                 // Source channels outermost: the written group stays in the cache.
                 for (src, own) in own.chunks_exact_mut(group.max(1)).enumerate() {
                     for m in 0..block.channels {
-                        let taps = plan.kernel(w, src, block.first + m);
+                        let kernel = plan.kernel_index(src, block.first + m);
+                        let taps = &w[kernel * plan.kernel_taps..][..plan.kernel_taps];
                         let own = own.chunks_exact_mut(block.channels);
                         for (tap, own) in pass.taps.iter().zip(own) {
                             own[m] = taps[tap.kernel];

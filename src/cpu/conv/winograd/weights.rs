@@ -86,7 +86,7 @@ impl<S: Simd> TransformTask for WithSimd<S, TransformWeights<'_>> {
                 if src >= channels || m >= block.channels {
                     continue;
                 }
-                let taps = &plan.kernel(w, src, block.first + m)[..TAPS];
+                let taps = &w[plan.kernel_index(src, block.first + m) * TAPS..][..TAPS];
                 s.prefetch(taps.as_ptr().wrapping_add(ahead));
                 // SAFETY: `taps` has nine floats, the mask nine bits.
                 kernels[lane] = unsafe { s.load_lanes(taps.as_ptr(), 0x1ff) };

@@ -1,4 +1,8 @@
-//! Register tiles: six rows and up to four vectors of columns summed without a pause.
+//! Register tiles of the matrix product.
+//!
+//! A register tile holds the sums of 6 rows × up to four vectors of columns. The loop over k
+//! loads one row of the panel as vectors and six elements of the left factor as scalars, and
+//! adds their products. The epilogue computes `base + scale · sums` and stores it once.
 #![expect(
     clippy::needless_range_loop,
     reason = "counted loops over register tiles unroll, iterators over them need not"
@@ -7,34 +11,37 @@
 use crate::cpu::simd::{LANES, Simd};
 
 /// Rows of a register tile.
-const ROWS: usize = 6;
+const TILE_ROWS: usize = 6;
 
-/// One part of the sums: rows of the left factor, `depth` of its columns, one panel.
+/// Operands of a product of some rows of the left factor with one panel, over a part of k.
 #[derive(Clone, Copy)]
-pub(super) struct Part {
-    /// First element of the left factor, and the distance between its rows.
+pub(super) struct PanelProduct {
+    /// First element of the left factor.
     pub a: *const f32,
+    /// Distance of rows of the left factor.
     pub a_stride: usize,
-    /// First row of the panel, `depth` of them.
+    /// First row of the panel.
     pub b: *const f32,
+    /// Rows of the panel: products per sum.
     pub depth: usize,
-    /// First element of the destination, and the distance between its rows.
+    /// First element of the destination.
     pub dst: *mut f32,
+    /// Distance of rows of the destination.
     pub dst_stride: usize,
-    /// Columns that exist: the last vector may be partly padding.
+    /// Columns of the destination; the panel's last vector may be partly padding.
     pub cols: usize,
     pub scale: f32,
-    /// `None`: the destination's own; else a vector's worth a vector.
+    /// A row to add, as long as the panel is wide; `None` adds the destination's own numbers.
     pub base: Option<*const f32>,
 }
 
-/// All rows of a part, by register tiles.
+/// Multiplies `m` rows with a panel that is `width` columns wide.
 ///
 /// # Safety
-/// Every place that `part` names for `m` rows must be there (`Product::run`).
+/// All operands of `part` are valid for `m` rows; the destination for `part.cols` columns.
 #[inline(always)]
-pub(super) unsafe fn rows<S: Simd>(s: S, part: Part, m: usize, width: usize) {
-    // SAFETY: the caller's; tiles stay inside the rows and the panel.
+pub(super) unsafe fn multiply_panel<S: Simd>(s: S, part: PanelProduct, m: usize, width: usize) {
+    // SAFETY: the contract of this function; tiles stay inside the rows and the panel.
     unsafe {
         if S::REGISTERS >= 32 {
             match width / LANES {
@@ -45,7 +52,7 @@ pub(super) unsafe fn rows<S: Simd>(s: S, part: Part, m: usize, width: usize) {
             }
         } else {
             for j in (0..width).step_by(LANES) {
-                let own = Part {
+                let own = PanelProduct {
                     b: part.b.add(j),
                     dst: part.dst.add(j),
                     cols: (part.cols - j).min(LANES),
@@ -58,21 +65,23 @@ pub(super) unsafe fn rows<S: Simd>(s: S, part: Part, m: usize, width: usize) {
     }
 }
 
+/// Multiplies `m` rows with `V` vectors of columns, one register tile after another.
+///
 /// # Safety
-/// As [`rows`].
+/// As [`multiply_panel`].
 #[inline(always)]
-unsafe fn tiles<S: Simd, const V: usize>(s: S, part: Part, m: usize, width: usize) {
-    // SAFETY: the caller's.
+unsafe fn tiles<S: Simd, const V: usize>(s: S, part: PanelProduct, m: usize, width: usize) {
+    // SAFETY: the contract of this function.
     unsafe {
-        // Holds no vector, so that it may be a closure.
-        let at = |i: usize| Part {
+        // A closure is inlined well only where it holds no vector.
+        let at = |i: usize| PanelProduct {
             a: part.a.wrapping_add(i * part.a_stride),
             dst: part.dst.add(i * part.dst_stride),
             ..part
         };
-        let whole = m / ROWS * ROWS;
-        for i in (0..whole).step_by(ROWS) {
-            tile::<S, ROWS, V>(s, at(i), width);
+        let whole = m / TILE_ROWS * TILE_ROWS;
+        for i in (0..whole).step_by(TILE_ROWS) {
+            tile::<S, TILE_ROWS, V>(s, at(i), width);
         }
         match m - whole {
             0 => {}
@@ -85,28 +94,30 @@ unsafe fn tiles<S: Simd, const V: usize>(s: S, part: Part, m: usize, width: usiz
     }
 }
 
+/// Loads sixteen floats.
+///
 /// # Safety
-/// Sixteen floats at `p`.
+/// `p` points at sixteen floats.
 #[inline(always)]
-unsafe fn vector<S: Simd>(s: S, p: *const f32) -> S::F {
-    // SAFETY: the caller's; an array has the alignment of its elements.
+unsafe fn load<S: Simd>(s: S, p: *const f32) -> S::F {
+    // SAFETY: the contract of this function; an array is aligned as its elements are.
     s.load(unsafe { &*p.cast::<[f32; LANES]>() })
 }
 
-/// R rows, V vectors of columns.
+/// Computes one register tile of `R` rows and `V` vectors of columns.
 ///
 /// # Safety
-/// As [`rows`].
+/// As [`multiply_panel`], for `R` rows.
 #[inline(always)]
-unsafe fn tile<S: Simd, const R: usize, const V: usize>(s: S, part: Part, width: usize) {
-    // SAFETY: the caller's; a store past the last column goes through a buffer.
+unsafe fn tile<S: Simd, const R: usize, const V: usize>(s: S, part: PanelProduct, width: usize) {
+    // SAFETY: the contract of this function.
     unsafe {
         let mut sums = [[s.splat(0.0); V]; R];
         let (mut a, mut b) = (part.a, part.b);
         for _ in 0..part.depth {
             let mut columns = [s.splat(0.0); V];
             for v in 0..V {
-                columns[v] = vector(s, b.add(v * LANES));
+                columns[v] = load(s, b.add(v * LANES));
             }
             for r in 0..R {
                 let x = s.splat(*a.add(r * part.a_stride));
@@ -117,19 +128,23 @@ unsafe fn tile<S: Simd, const R: usize, const V: usize>(s: S, part: Part, width:
             a = a.add(1);
             b = b.wrapping_add(width);
         }
-        finish(s, part, sums);
+        epilogue(s, part, sums);
     }
 }
 
-/// base + scale · sums. Loops over registers hold nothing but their moves, or else
-/// they are not unrolled and the sums live on the stack.
+/// Stores base + scale · sums. Loops over registers do nothing but their loads and stores:
+/// longer loops are not unrolled, and the sums would live on the stack.
 ///
 /// # Safety
-/// As [`rows`].
+/// As [`tile`].
 #[inline(always)]
-unsafe fn finish<S: Simd, const R: usize, const V: usize>(s: S, part: Part, sums: [[S::F; V]; R]) {
+unsafe fn epilogue<S: Simd, const R: usize, const V: usize>(
+    s: S,
+    part: PanelProduct,
+    sums: [[S::F; V]; R],
+) {
     let scale = s.splat(part.scale);
-    // SAFETY: the caller's; columns past the last are in the buffer alone.
+    // SAFETY: the contract of this function; padded columns go to `edge`, not to `dst`.
     unsafe {
         if part.cols < V * LANES {
             let mut edge = [[[0.0; LANES]; V]; R];
@@ -158,7 +173,7 @@ unsafe fn finish<S: Simd, const R: usize, const V: usize>(s: S, part: Part, sums
         };
         for r in 0..R {
             for v in 0..V {
-                let base = vector(s, base.add(r * base_stride + v * LANES));
+                let base = load(s, base.add(r * base_stride + v * LANES));
                 let sum = s.fma(scale, sums[r][v], base);
                 let to = part.dst.add(r * part.dst_stride + v * LANES);
                 s.store(sum, &mut *to.cast::<[f32; LANES]>());

@@ -1,32 +1,32 @@
-//! Factors of a product as slices, and the right one as the register tiles read it.
+//! Factors of a matrix product: views of slices, and the right factor packed into panels.
 
 use super::PANEL;
 use crate::cpu::fresh::room;
 use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
 use std::cell::Cell;
 
-/// A matrix inside a slice, any strides.
+/// A matrix inside a slice, with any strides.
 #[derive(Clone, Copy)]
 pub struct Mat<'a> {
-    /// Storage; element (i, j) is `data[i * row_stride + j * col_stride]`.
+    /// Elements; (i, j) is `data[i * row_stride + j * col_stride]`.
     pub data: &'a [f32],
     /// Rows.
     pub rows: usize,
     /// Columns.
     pub cols: usize,
-    /// Distance between rows, elements.
+    /// Distance of rows in elements.
     pub row_stride: usize,
-    /// Distance between columns, elements.
+    /// Distance of columns in elements.
     pub col_stride: usize,
 }
 
 impl<'a> Mat<'a> {
-    /// Row-major matrix whose rows lie `row_stride` elements apart.
+    /// Views `data` as a row-major matrix whose rows are `row_stride` elements apart.
     pub fn new(data: &'a [f32], rows: usize, cols: usize, row_stride: usize) -> Self {
         Self { data, rows, cols, row_stride, col_stride: 1 }
     }
 
-    /// The transposed view.
+    /// Returns the transposed view.
     #[must_use]
     pub fn t(self) -> Self {
         Self {
@@ -38,7 +38,7 @@ impl<'a> Mat<'a> {
         }
     }
 
-    /// One past the last element touched.
+    /// Returns the elements from the first to the last one of the matrix.
     fn extent(&self) -> usize {
         if self.rows == 0 || self.cols == 0 {
             return 0;
@@ -46,34 +46,34 @@ impl<'a> Mat<'a> {
         (self.rows - 1) * self.row_stride + (self.cols - 1) * self.col_stride + 1
     }
 
-    /// Panics where the matrix reaches past its slice.
+    /// Panics where the matrix extends beyond its slice.
     pub(super) fn check(&self, name: &str) {
         assert!(self.extent() <= self.data.len(), "gemm: {name}");
     }
 }
 
-/// The right factor `[k, n]` in panels of 64 columns (the last one as wide as it
-/// must be, in whole vectors, padded with zeros): `[panel][k][column]`.
+/// The right factor `[k, n]` in panels of 64 columns: `[panel][k][column]`. The last panel
+/// has as many whole vectors as its columns need; zeros pad it.
 #[derive(Clone, Debug, Default)]
 pub struct Packed {
-    /// Beyond the panels: what an earlier matrix left in this memory.
+    /// The panels, then leftovers of an earlier, larger matrix.
     pub(super) data: Vec<f32>,
     pub(super) depth: usize,
     pub(super) cols: usize,
 }
 
 impl Packed {
-    /// Of `rhs`.
+    /// Packs `rhs`.
     ///
     /// # Panics
-    /// Where it reaches past its slice.
+    /// Where `rhs` extends beyond its slice.
     pub fn new(rhs: Mat<'_>) -> Self {
         let mut packed = Self::default();
         packed.fill(rhs);
         packed
     }
 
-    /// [`Packed::new`] in the memory that this one has.
+    /// Packs `rhs` into the memory of this matrix.
     ///
     /// # Panics
     /// As [`Packed::new`].
@@ -83,63 +83,65 @@ impl Packed {
         self.cols = rhs.cols;
         let to = room(&mut self.data, rhs.rows * rhs.cols.next_multiple_of(LANES));
         if !to.is_empty() {
-            Tier::best().run(Pack { rhs, to });
+            Tier::best().run(PackPanels { rhs, to });
         }
     }
 
-    /// `f` of `rhs`, packed into memory that this thread keeps.
+    /// Calls `f` with `rhs` packed into memory that this thread reuses.
     ///
     /// # Panics
     /// As [`Packed::new`].
-    pub(crate) fn kept<R>(rhs: Mat<'_>, f: impl FnOnce(&Self) -> R) -> R {
-        Self::in_kept(|packed| {
+    pub(crate) fn with<R>(rhs: Mat<'_>, f: impl FnOnce(&Self) -> R) -> R {
+        Self::with_thread_memory(|packed| {
             packed.fill(rhs);
             f(packed)
         })
     }
 
-    /// `f` of a matrix `[depth, cols]` that is no [`Mat`], in memory that this thread
-    /// keeps: `fill` writes its panels, those floats too that pad the last one.
-    pub(crate) fn kept_by<R>(
+    /// Calls `f` with a matrix `[depth, cols]` in memory that this thread reuses. `fill`
+    /// writes its panels, including the padding of the last one.
+    pub(crate) fn with_panels<R>(
         [depth, cols]: [usize; 2],
         fill: impl FnOnce(&mut [f32]),
         f: impl FnOnce(&Self) -> R,
     ) -> R {
-        Self::in_kept(|packed| {
+        Self::with_thread_memory(|packed| {
             (packed.depth, packed.cols) = (depth, cols);
             fill(room(&mut packed.data, depth * cols.next_multiple_of(LANES)));
             f(packed)
         })
     }
 
-    fn in_kept<R>(f: impl FnOnce(&mut Self) -> R) -> R {
+    fn with_thread_memory<R>(f: impl FnOnce(&mut Self) -> R) -> R {
         thread_local! {
             static KEPT: Cell<Packed> = Cell::default();
         }
-        // Taken, not borrowed: a task may run inside another one's wait.
+        // Taken rather than borrowed: while a task waits for rayon, its thread may run another
+        // one that packs.
         let mut packed = KEPT.take();
         let result = f(&mut packed);
         KEPT.set(packed);
         result
     }
 
-    /// k.
+    /// Returns k.
     pub fn depth(&self) -> usize {
         self.depth
     }
 
-    /// n.
+    /// Returns n.
     pub fn cols(&self) -> usize {
         self.cols
     }
 }
 
-struct Pack<'a> {
+/// Packs a matrix into panels.
+struct PackPanels<'a> {
     rhs: Mat<'a>,
     to: &'a mut [f32],
 }
 
-impl Kernel for Pack<'_> {
+impl Kernel for PackPanels<'_> {
     type Output = ();
 
     #[inline(always)]
@@ -154,12 +156,13 @@ impl Kernel for Pack<'_> {
     }
 }
 
-/// `from` into rows `pitch` ≥ `from.cols` long, the rest of each zeros.
+/// Copies `from` to rows that are `row_len` ≥ `from.cols` long; zeros fill the rest of each
+/// row.
 #[inline(always)]
-pub(in crate::cpu) fn copy<S: Simd>(s: S, from: Mat<'_>, pitch: usize, to: &mut [f32]) {
+pub(in crate::cpu) fn copy<S: Simd>(s: S, from: Mat<'_>, row_len: usize, to: &mut [f32]) {
     let Mat { data, rows, cols, row_stride, col_stride } = from;
     if col_stride == 1 {
-        for (i, to) in to.chunks_exact_mut(pitch).enumerate() {
+        for (i, to) in to.chunks_exact_mut(row_len).enumerate() {
             to[..cols].copy_from_slice(&data[i * row_stride..][..cols]);
             to[cols..].fill(0.0);
         }
@@ -167,7 +170,7 @@ pub(in crate::cpu) fn copy<S: Simd>(s: S, from: Mat<'_>, pitch: usize, to: &mut 
     }
     let (whole_rows, whole_cols) = (rows / LANES * LANES, cols / LANES * LANES);
     if row_stride == 1 {
-        // Along the lines of the source, however far apart they lie.
+        // The contiguous direction of the source is down its columns: transpose squares.
         for j in (0..whole_cols).step_by(LANES) {
             for i in (0..whole_rows).step_by(LANES) {
                 let mut square = [s.splat(0.0); LANES];
@@ -175,13 +178,13 @@ pub(in crate::cpu) fn copy<S: Simd>(s: S, from: Mat<'_>, pitch: usize, to: &mut 
                     *v = s.load(lanes(&data[(j + c) * col_stride + i..]));
                 }
                 for (r, v) in s.transpose(square).into_iter().enumerate() {
-                    s.store(v, lanes_mut(&mut to[(i + r) * pitch + j..]));
+                    s.store(v, lanes_mut(&mut to[(i + r) * row_len + j..]));
                 }
             }
         }
     }
     let done = if row_stride == 1 { [whole_rows, whole_cols] } else { [0, 0] };
-    for (i, to) in to.chunks_exact_mut(pitch).enumerate() {
+    for (i, to) in to.chunks_exact_mut(row_len).enumerate() {
         let first = if i < done[0] { done[1] } else { 0 };
         for (j, to) in to[..cols].iter_mut().enumerate().skip(first) {
             *to = data[i * row_stride + j * col_stride];
@@ -190,16 +193,17 @@ pub(in crate::cpu) fn copy<S: Simd>(s: S, from: Mat<'_>, pitch: usize, to: &mut 
     }
 }
 
-/// The first sixteen of `v`; zeros where it is shorter.
+/// Returns the first sixteen floats of `v`; zeros where `v` is shorter.
 #[inline(always)]
 fn lanes(v: &[f32]) -> &[f32; LANES] {
     v.first_chunk().unwrap_or(&[0.0; LANES])
 }
 
+/// Returns the first sixteen floats of `v`.
 #[inline(always)]
 fn lanes_mut(v: &mut [f32]) -> &mut [f32; LANES] {
     match v.first_chunk_mut() {
         Some(v) => v,
-        None => unreachable!("gemm: a whole vector was asked for"),
+        None => unreachable!("gemm: the caller passes whole vectors"),
     }
 }
