@@ -16,8 +16,8 @@ mod register_tile;
 #[cfg(test)]
 mod tests;
 
-use super::fresh::Fresh;
-use super::simd::{Kernel, LANES, Simd, Tier};
+use super::simd::{Kernel, LANES, Simd, SimdLevel};
+use super::uninit::UninitBuffer;
 pub(super) use packing::copy;
 pub use packing::{Mat, Packed};
 use rayon::prelude::*;
@@ -49,12 +49,12 @@ pub enum Base<'a> {
 /// # Panics
 /// Where a matrix extends beyond its slice, or where sizes differ.
 pub fn product(dst: (&mut [f32], usize), lhs: Mat<'_>, rhs: &Packed, scale: f32, base: Base<'_>) {
-    product_on(Tier::best(), dst, lhs, rhs, scale, base);
+    product_on(SimdLevel::best(), dst, lhs, rhs, scale, base);
 }
 
 /// Computes [`product`] at one SIMD level.
 pub(crate) fn product_on(
-    tier: Tier,
+    level: SimdLevel,
     (dst, row_stride): (&mut [f32], usize),
     lhs: Mat<'_>,
     rhs: &Packed,
@@ -68,7 +68,7 @@ pub(crate) fn product_on(
     assert!(row_stride >= n && (m - 1) * row_stride + n <= dst.len(), "gemm: destination");
     // SAFETY: the rows lie in `dst` without overlap (checked), and `dst` is initialised.
     unsafe {
-        product_at(tier, OutputRows { at: dst.as_mut_ptr(), row_stride }, lhs, rhs, scale, base)
+        product_at(level, OutputRows { at: dst.as_mut_ptr(), row_stride }, lhs, rhs, scale, base)
     };
 }
 
@@ -86,7 +86,7 @@ pub(crate) struct OutputRows {
 /// `dst` has `lhs.rows` writable rows of `rhs.cols` floats, initialised for [`Base::Own`],
 /// which no other thread accesses during the call.
 pub(crate) unsafe fn product_at(
-    tier: Tier,
+    level: SimdLevel,
     dst: OutputRows,
     lhs: Mat<'_>,
     rhs: &Packed,
@@ -104,7 +104,7 @@ pub(crate) unsafe fn product_at(
     if let Base::Row(row) = base {
         assert_eq!(row.len(), n, "gemm: row");
     }
-    tier.run(Product { dst, lhs, rhs, scale, base });
+    level.run(Product { dst, lhs, rhs, scale, base });
 }
 
 /// Computes `dst = scale · lhs · rhs`, or `dst += scale · lhs · rhs` with `accumulate`, for a
@@ -141,11 +141,11 @@ pub fn rows_product(lhs: Mat<'_>, rhs: &Packed, base: Base<'_>) -> Vec<f32> {
     let (m, n) = (lhs.rows, rhs.cols);
     lhs.check("operands");
     assert!(!matches!(base, Base::Own), "gemm: new memory has no numbers to add to");
-    let mut fresh = Fresh::new(m * n);
+    let mut fresh = UninitBuffer::new(m * n);
     if let Some(rows) = TASK_FLOATS.checked_div(n) {
         let rows = rows.clamp(MIN_TASK_ROWS, MAX_TASK_ROWS);
         let rows = if m <= MAX_TASK_ROWS { MAX_TASK_ROWS } else { rows };
-        fresh.blocks(rows * n).enumerate().for_each(|(i, block)| {
+        fresh.par_chunks_mut(rows * n).enumerate().for_each(|(i, block)| {
             let lhs = Mat {
                 data: &lhs.data[(i * rows * lhs.row_stride).min(lhs.data.len())..],
                 rows: block.len() / n,
@@ -154,11 +154,11 @@ pub fn rows_product(lhs: Mat<'_>, rhs: &Packed, base: Base<'_>) -> Vec<f32> {
             let dst = OutputRows { at: block.as_mut_ptr().cast(), row_stride: n };
             // SAFETY: the block holds that many rows, which no other task accesses; `base`
             // is not `Own` (asserted above).
-            unsafe { product_at(Tier::best(), dst, lhs, rhs, 1.0, base) };
+            unsafe { product_at(SimdLevel::best(), dst, lhs, rhs, 1.0, base) };
         });
     }
     // SAFETY: the products above wrote every block; without columns there is no block.
-    unsafe { fresh.finish() }
+    unsafe { fresh.assume_init() }
 }
 
 /// The kernel of [`product_at`].

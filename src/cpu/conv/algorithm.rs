@@ -8,8 +8,8 @@ use super::direct::{Direct, DirectWeightGrad, LaneAxis};
 use super::plan::Plan;
 use super::pointwise::{self, Pointwise};
 use super::winograd::{Kind, SmallImages, Winograd, WinogradWeightGrad, tiles_per_image};
-use crate::cpu::fresh::Block;
-use crate::cpu::simd::{LANES, Tier};
+use crate::cpu::simd::{LANES, SimdLevel};
+use crate::cpu::uninit::UninitSlice;
 
 /// Minimum source channels, and grid positions of an image, of [`Algorithm::Pointwise`].
 const MIN_POINTWISE_CHANNELS: usize = 16;
@@ -27,7 +27,7 @@ pub(super) const MAX_NARROW_CHANNELS: usize = 8;
 #[derive(Clone, Copy)]
 pub(super) struct ConvolveArgs<'a> {
     /// SIMD level.
-    pub tier: Tier,
+    pub level: SimdLevel,
     /// Geometry and direction: forward or input gradient.
     pub plan: &'a Plan,
     /// Source images `[B, source channels, …]`.
@@ -41,14 +41,14 @@ pub(super) struct ConvolveArgs<'a> {
 /// An algorithm for y = x ∗ w + bias, and for ∂L/∂x with a plan of that direction.
 pub(super) trait Convolve {
     /// Overwrites the images `y` `[B, destination channels, …]`. `y` is not empty.
-    fn convolve(&self, args: &ConvolveArgs<'_>, y: &mut Block<f32>);
+    fn convolve(&self, args: &ConvolveArgs<'_>, y: &mut UninitSlice<f32>);
 }
 
 /// Arguments of [`WeightGrad::weight_grad`].
 #[derive(Clone, Copy)]
 pub(super) struct WeightGradArgs<'a> {
     /// SIMD level.
-    pub tier: Tier,
+    pub level: SimdLevel,
     /// Geometry of the forward convolution.
     pub plan: &'a Plan,
     /// Images `[B, C, …]`.
@@ -98,7 +98,7 @@ pub(super) fn choose_algorithm(plan: &Plan) -> Algorithm {
 }
 
 impl Convolve for Algorithm {
-    fn convolve(&self, args: &ConvolveArgs<'_>, y: &mut Block<f32>) {
+    fn convolve(&self, args: &ConvolveArgs<'_>, y: &mut UninitSlice<f32>) {
         match *self {
             Self::Pointwise => Pointwise.convolve(args, y),
             Self::Winograd(kind) => Winograd { kind }.convolve(args, y),

@@ -1,6 +1,6 @@
 //! ∂L/∂bias: for each output channel the sum of ∂L/∂y over images and pixels.
 
-use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
+use crate::cpu::simd::{Kernel, LANES, Simd, SimdLevel};
 use rayon::prelude::*;
 
 /// Numbers that are summed in f32 lanes before the sum is added to an f64. A sum of a
@@ -12,7 +12,7 @@ pub fn bias_grad(pixels: usize, dy: &[f32], db: &mut [f32]) {
     let channels = db.len();
     db.par_iter_mut().enumerate().for_each(|(o, sum)| {
         let rows = dy.chunks_exact(pixels.max(1)).skip(o).step_by(channels);
-        *sum = Tier::best().run(SumRows(rows)) as f32;
+        *sum = SimdLevel::best().run(SumRows(rows)) as f32;
     });
 }
 

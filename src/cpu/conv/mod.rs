@@ -66,8 +66,8 @@ mod weight_grad_jobs;
 mod weight_grad_tile;
 mod winograd;
 
-use super::fresh::{Block, Fresh};
-use super::simd::Tier;
+use super::simd::SimdLevel;
+use super::uninit::{UninitBuffer, UninitSlice};
 use algorithm::{
     Convolve, ConvolveArgs, WeightGrad, WeightGradArgs, choose_algorithm,
     choose_weight_grad_algorithm,
@@ -79,42 +79,42 @@ pub use sizes::{Axes, Sizes};
 
 /// Computes y = x ∗ w + bias of `images` images; `bias` is empty or `[O]`.
 pub fn forward(
-    tier: Tier,
+    level: SimdLevel,
     s: &Sizes,
     images: usize,
     x: &[f32],
     w: &[f32],
     bias: &[f32],
 ) -> Vec<f32> {
-    convolve(&ConvolveArgs { tier, plan: &Plan::forward(s), x, w, bias }, images)
+    convolve(&ConvolveArgs { level, plan: &Plan::forward(s), x, w, bias }, images)
 }
 
 /// Computes ∂L/∂x from ∂L/∂y of `images` images.
-pub fn input_grad(tier: Tier, s: &Sizes, images: usize, dy: &[f32], w: &[f32]) -> Vec<f32> {
-    convolve(&ConvolveArgs { tier, plan: &Plan::input_grad(s), x: dy, w, bias: &[] }, images)
+pub fn input_grad(level: SimdLevel, s: &Sizes, images: usize, dy: &[f32], w: &[f32]) -> Vec<f32> {
+    convolve(&ConvolveArgs { level, plan: &Plan::input_grad(s), x: dy, w, bias: &[] }, images)
 }
 
 /// Computes ∂L/∂w from x and ∂L/∂y; overwrites `dw`.
-pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32]) {
+pub fn weight_grad(level: SimdLevel, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32]) {
     if dw.is_empty() || x.is_empty() || dy.is_empty() {
         dw.fill(0.0);
         return;
     }
-    let args = WeightGradArgs { tier, plan: &Plan::forward(s), x, dy };
+    let args = WeightGradArgs { level, plan: &Plan::forward(s), x, dy };
     choose_weight_grad_algorithm(args.plan, args.images()).weight_grad(&args, dw);
 }
 
 /// Convolves into new memory.
 fn convolve(args: &ConvolveArgs<'_>, images: usize) -> Vec<f32> {
-    let mut y = Fresh::new(images * args.plan.dst_channels * args.plan.dst_pixels());
-    convolve_into(args, y.whole());
+    let mut y = UninitBuffer::new(images * args.plan.dst_channels * args.plan.dst_pixels());
+    convolve_into(args, y.as_mut_slice());
     // SAFETY: each algorithm writes every channel of every image, in tiles that cover it
     // (the tests run them over memory full of NaN).
-    unsafe { y.finish() }
+    unsafe { y.assume_init() }
 }
 
 /// Convolves into `y`, by the algorithm that [`choose_algorithm`] returns.
-fn convolve_into(args: &ConvolveArgs<'_>, y: &mut Block<f32>) {
+fn convolve_into(args: &ConvolveArgs<'_>, y: &mut UninitSlice<f32>) {
     if !y.is_empty() {
         choose_algorithm(args.plan).convolve(args, y);
     }

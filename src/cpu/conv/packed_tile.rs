@@ -187,7 +187,7 @@ pub(super) fn load_strided<S: Simd>(s: S, from: &[f32], step: usize, to: &mut [f
     let (vectors, rest) = to.split_at_mut(whole);
     for (to, pair) in vectors.as_chunks_mut().0.iter_mut().zip(pairs) {
         if let [a, b] = pair.as_chunks().0 {
-            s.store(s.unzip(s.load(a), s.load(b))[0], to);
+            s.store(s.deinterleave(s.load(a), s.load(b))[0], to);
         }
     }
     let strided = from[whole * step..].iter().step_by(step);
@@ -206,9 +206,9 @@ pub(super) fn store_interleaved<S: Simd>(
     let (vectors, rest) = to.split_at_mut(2 * whole);
     let pairs = even.as_chunks().0.iter().zip(odd.as_chunks().0);
     for (to, (even, odd)) in vectors.chunks_exact_mut(2 * LANES).zip(pairs) {
-        let pair = s.zip(s.load(even), s.load(odd));
+        let pair = s.interleave(s.load(even), s.load(odd));
         for (to, v) in to.as_chunks_mut().0.iter_mut().zip(pair) {
-            s.store_fresh(v, to);
+            s.store_uninit(v, to);
         }
     }
     for (i, to) in rest.iter_mut().enumerate() {

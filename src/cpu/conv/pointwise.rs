@@ -12,10 +12,10 @@ use super::algorithm::{Convolve, ConvolveArgs, WeightGrad, WeightGradArgs};
 use super::buffers::Buffers;
 use super::packed_tile::{load_strided, store_interleaved};
 use super::plan::{Direction, Plan};
-use crate::cpu::disjoint::Disjoint;
-use crate::cpu::fresh::{self, Block};
 use crate::cpu::gemm::{Base, Mat, OutputRows, PANEL, Packed, product_at, product_on};
-use crate::cpu::simd::{Kernel, Simd, Tier};
+use crate::cpu::shared_slice::SharedSliceMut;
+use crate::cpu::simd::{Kernel, Simd, SimdLevel};
+use crate::cpu::uninit::{self, UninitSlice};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 use std::ops::Range;
@@ -45,8 +45,8 @@ pub(super) fn supports(plan: &Plan) -> bool {
 pub(super) struct Pointwise;
 
 impl Convolve for Pointwise {
-    fn convolve(&self, args: &ConvolveArgs<'_>, y: &mut Block<f32>) {
-        let &ConvolveArgs { tier, plan, x, w, bias } = args;
+    fn convolve(&self, args: &ConvolveArgs<'_>, y: &mut UninitSlice<f32>) {
+        let &ConvolveArgs { level, plan, x, w, bias } = args;
         let (c, o) = (plan.src_channels, plan.dst_channels);
         let weights = match plan.direction {
             Direction::Forward => Mat::new(w, o, c, c),
@@ -58,8 +58,8 @@ impl Convolve for Pointwise {
         let images = y.len() / (o * pixels);
         assert!(y.len() == images * o * pixels && (bias.is_empty() || bias.len() == o));
         assert!(bias.is_empty() || plan.dst_step == [1; 3], "conv: a gradient has no bias");
-        let y = &Disjoint::new(y);
-        let call = Call { tier, plan, x, weights, bias, y };
+        let y = &SharedSliceMut::new(y);
+        let call = Call { level, plan, x, weights, bias, y };
         if plan.src_step == [1; 3] && plan.dst_step == [1; 3] {
             let spans = pixels.div_ceil(span);
             (0..images * spans).into_par_iter().for_each(|task| {
@@ -81,7 +81,7 @@ impl Convolve for Pointwise {
 
 impl WeightGrad for Pointwise {
     fn weight_grad(&self, args: &WeightGradArgs<'_>, dw: &mut [f32]) {
-        let &WeightGradArgs { tier, plan, x, dy } = args;
+        let &WeightGradArgs { level, plan, x, dy } = args;
         let (c, o) = (plan.src_channels, plan.dst_channels);
         let pixels = plan.src_pixels();
         let [depth, height, width] = plan.grid();
@@ -93,7 +93,7 @@ impl WeightGrad for Pointwise {
         let spans = lines.div_ceil(each);
         let units = images * spans;
         let jobs = units.min(MAX_WEIGHT_GRAD_JOBS);
-        let mut sums = fresh::zeros(jobs * o * c);
+        let mut sums = uninit::zeros(jobs * o * c);
         sums.par_chunks_exact_mut(o * c).enumerate().for_each(|(job, sums)| {
             for unit in units * job / jobs..units * (job + 1) / jobs {
                 let (image, first) = (unit / spans, unit % spans * each);
@@ -103,7 +103,7 @@ impl WeightGrad for Pointwise {
                 let x = &x[image * c * pixels..][..c * pixels];
                 let mut product = |x: Mat<'_>| {
                     let dst = (&mut *sums, c);
-                    Packed::with(x.t(), |x| product_on(tier, dst, dy, x, 1.0, Base::Own));
+                    Packed::with(x.t(), |x| product_on(level, dst, dy, x, 1.0, Base::Own));
                 };
                 if plan.src_step == [1; 3] {
                     product(Mat::new(&x[first * width..], c, cols, pixels));
@@ -111,7 +111,7 @@ impl WeightGrad for Pointwise {
                 }
                 Buffers::with(|buffers| {
                     let picked = buffers.packed.floats(c * cols);
-                    tier.run(PackPixels { plan, x, first, cols, panel: cols, to: &mut *picked });
+                    level.run(PackPixels { plan, x, first, cols, panel: cols, to: &mut *picked });
                     product(Mat::new(picked, c, cols, cols));
                 });
             }
@@ -128,13 +128,13 @@ impl WeightGrad for Pointwise {
 
 /// Operands of all tasks of [`Pointwise::convolve`].
 struct Call<'a> {
-    tier: Tier,
+    level: SimdLevel,
     plan: &'a Plan,
     x: &'a [f32],
     /// `[destination channels, source channels]`.
     weights: Mat<'a>,
     bias: &'a [f32],
-    y: &'a Disjoint<'a, MaybeUninit<f32>>,
+    y: &'a SharedSliceMut<'a, MaybeUninit<f32>>,
 }
 
 impl Call<'_> {
@@ -148,13 +148,13 @@ impl Call<'_> {
 
     /// Computes the lines `lines` of an image's grid; any stride.
     fn strided(&self, image: usize, lines: Range<usize>) {
-        let Self { tier, plan, y, .. } = *self;
+        let Self { level, plan, y, .. } = *self;
         let (c, across) = (plan.src_channels, plan.grid()[2]);
         let cols = lines.len() * across;
         let pixels = plan.src_pixels();
         let x = &self.x[image * c * pixels..][..c * pixels];
         let pack = |to: &mut [f32]| {
-            tier.run(PackPixels { plan, x, first: lines.start, cols, panel: PANEL, to });
+            level.run(PackPixels { plan, x, first: lines.start, cols, panel: PANEL, to });
         };
         Packed::with_panels([c, cols], pack, |x| {
             if plan.dst_step == [1; 3] {
@@ -164,8 +164,8 @@ impl Call<'_> {
                 let floats = plan.dst_channels * cols;
                 let (sums, zeros) = buffers.scratch.floats(floats + across).split_at_mut(floats);
                 zeros.fill(0.0);
-                product_on(tier, (&mut *sums, cols), self.weights, x, 1.0, Base::Zero);
-                tier.run(StoreStrided { plan, image, lines: lines.clone(), sums, zeros, y });
+                product_on(level, (&mut *sums, cols), self.weights, x, 1.0, Base::Zero);
+                level.run(StoreStrided { plan, image, lines: lines.clone(), sums, zeros, y });
             });
         });
     }
@@ -187,7 +187,7 @@ impl Call<'_> {
         // SAFETY: these pixels of all channels of one image lie inside `y` (asserted by
         // `convolve`), no other task writes them, and they are initialised where `base` is
         // `Own`.
-        unsafe { product_at(self.tier, dst, self.weights, x, 1.0, base) };
+        unsafe { product_at(self.level, dst, self.weights, x, 1.0, base) };
     }
 }
 
@@ -240,7 +240,7 @@ struct StoreStrided<'a> {
     sums: &'a [f32],
     /// Zeros, as many as a line of the grid has pixels.
     zeros: &'a [f32],
-    y: &'a Disjoint<'a, MaybeUninit<f32>>,
+    y: &'a SharedSliceMut<'a, MaybeUninit<f32>>,
 }
 
 impl Kernel for StoreStrided<'_> {

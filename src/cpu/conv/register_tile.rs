@@ -7,7 +7,7 @@
 //! stored once. Direct sums call this with the taps of a kernel, Winograd's algorithm with a
 //! single tap (a matrix product of transformed tiles).
 
-use crate::cpu::simd::{LANES, Simd};
+use crate::cpu::simd::{LANES, Simd, Vector};
 
 /// Destination channels of a full block.
 pub(super) const BLOCK_CHANNELS: usize = 8;
@@ -159,7 +159,7 @@ impl Strip<'_> {
                     // `run_to`), and first + M ≤ P.
                     let weight = s.splat(unsafe { *w.wrapping_add(m) });
                     for n in 0..N {
-                        acc[m][n] = s.fma(weight, v[n], acc[m][n]);
+                        acc[m][n] = weight.fma(v[n], acc[m][n]);
                     }
                 }
                 w = w.wrapping_add(P);

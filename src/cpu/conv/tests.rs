@@ -2,7 +2,7 @@
 
 use super::algorithm::Algorithm;
 use super::*;
-use crate::cpu::fresh::over;
+use crate::cpu::uninit::as_uninit;
 
 /// Computes y in f64 by nested loops.
 fn definition(s: &Sizes, x: &[f32], w: &[f32], bias: &[f32]) -> Vec<f64> {
@@ -144,11 +144,11 @@ fn worst(got: &[f32], want: &[f64], scale: f64) -> f64 {
 }
 
 /// Convolves into memory full of NaN, so that a place that is not written shows.
-fn over_nan(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32]) -> Vec<f32> {
+fn over_nan(level: SimdLevel, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32]) -> Vec<f32> {
     let images = x.len() / (plan.src_channels * plan.src_pixels());
     let mut y = vec![f32::NAN; images * plan.dst_channels * plan.dst_pixels()];
     // SAFETY: `convolve_into` writes numbers only.
-    convolve_into(&ConvolveArgs { tier, plan, x, w, bias }, unsafe { over(&mut y) });
+    convolve_into(&ConvolveArgs { level, plan, x, w, bias }, unsafe { as_uninit(&mut y) });
     y
 }
 
@@ -160,10 +160,10 @@ fn forward_agrees_with_the_definition() {
         let scale = ((s.in_channels * s.taps()) as f64).sqrt();
         for bias in [vec![], noise(s.out_channels, 3)] {
             let want = definition(&s, &x, &w, &bias);
-            for &tier in Tier::available() {
-                let y = over_nan(tier, &Plan::forward(&s), &x, &w, &bias);
+            for &level in SimdLevel::available() {
+                let y = over_nan(level, &Plan::forward(&s), &x, &w, &bias);
                 let worst = worst(&y, &want, scale);
-                assert!(worst < bound(&Plan::forward(&s)), "{tier:?} {s:?}: {worst:e}");
+                assert!(worst < bound(&Plan::forward(&s)), "{level:?} {s:?}: {worst:e}");
             }
         }
     }
@@ -208,14 +208,14 @@ fn gradients_agree_with_the_definition() {
         let w = noise(s.out_channels * s.in_channels * s.taps(), 5);
         let dy = noise(2 * s.out_channels * s.out_pixels(), 6);
         let [want_x, want_w] = gradients(&s, &x, &w, &dy);
-        for &tier in Tier::available() {
+        for &level in SimdLevel::available() {
             let mut dw = vec![f32::NAN; w.len()];
-            let dx = over_nan(tier, &Plan::input_grad(&s), &dy, &w, &[]);
-            weight_grad(tier, &s, &x, &dy, &mut dw);
+            let dx = over_nan(level, &Plan::input_grad(&s), &dy, &w, &[]);
+            weight_grad(level, &s, &x, &dy, &mut dw);
             let worst_x = worst(&dx, &want_x, ((s.out_channels * s.taps()) as f64).sqrt());
             let worst_w = worst(&dw, &want_w, ((2 * s.out_pixels()) as f64).sqrt());
-            assert!(worst_x < bound(&Plan::input_grad(&s)), "{tier:?} {s:?}: dx {worst_x:e}");
-            assert!(worst_w < bound(&Plan::forward(&s)), "{tier:?} {s:?}: dw {worst_w:e}");
+            assert!(worst_x < bound(&Plan::input_grad(&s)), "{level:?} {s:?}: dx {worst_x:e}");
+            assert!(worst_w < bound(&Plan::forward(&s)), "{level:?} {s:?}: dw {worst_w:e}");
         }
     }
 }
@@ -255,9 +255,9 @@ fn check_threads(s: &Sizes) {
         pool.map(|pool| {
             pool.install(|| {
                 let mut dw = w.clone();
-                let y = forward(Tier::best(), s, 2, &x, &w, &[]);
-                let dx = input_grad(Tier::best(), s, 2, &dy, &w);
-                weight_grad(Tier::best(), s, &x, &dy, &mut dw);
+                let y = forward(SimdLevel::best(), s, 2, &x, &w, &[]);
+                let dx = input_grad(SimdLevel::best(), s, 2, &dy, &w);
+                weight_grad(SimdLevel::best(), s, &x, &dy, &mut dw);
                 [y, dx, dw].concat().iter().map(|v| v.to_bits()).collect::<Vec<_>>()
             })
         })
@@ -273,9 +273,9 @@ fn images_of_a_batch_are_independent() {
     for s in [conv2d(24, 30, [3, 3], 1, 1, [16, 20]), conv2d(24, 30, [3, 3], 2, 1, [32, 32])] {
         let w = noise(s.out_channels * s.in_channels * s.taps(), 11);
         let x = noise(3 * s.in_channels * s.in_pixels(), 12);
-        let together = forward(Tier::best(), &s, 3, &x, &w, &[]);
+        let together = forward(SimdLevel::best(), &s, 3, &x, &w, &[]);
         let one = s.in_channels * s.in_pixels();
-        let apart = x.chunks(one).flat_map(|x| forward(Tier::best(), &s, 1, x, &w, &[]));
+        let apart = x.chunks(one).flat_map(|x| forward(SimdLevel::best(), &s, 1, x, &w, &[]));
         assert!(together.iter().map(|v| v.to_bits()).eq(apart.map(f32::to_bits)), "{s:?}");
     }
 }
@@ -293,11 +293,11 @@ fn weight_gradients_of_images_add_up() {
         let [one, out] = [s.in_channels * s.in_pixels(), s.out_channels * s.out_pixels()];
         let [x, dy] = [noise(17 * one, 13), noise(17 * out, 14)];
         let mut together = vec![f32::NAN; s.out_channels * s.in_channels * s.taps()];
-        weight_grad(Tier::best(), &s, &x, &dy, &mut together);
+        weight_grad(SimdLevel::best(), &s, &x, &dy, &mut together);
         let mut sum = vec![0.0; together.len()];
         for (x, dy) in x.chunks(one).zip(dy.chunks(out)) {
             let mut dw = together.clone();
-            weight_grad(Tier::best(), &s, x, dy, &mut dw);
+            weight_grad(SimdLevel::best(), &s, x, dy, &mut dw);
             sum.iter_mut().zip(dw).for_each(|(sum, v)| *sum += f64::from(v));
         }
         let worst = worst(&together, &sum, ((17 * s.out_pixels()) as f64).sqrt());
@@ -308,13 +308,13 @@ fn weight_gradients_of_images_add_up() {
 #[test]
 fn empty_tensors_are_accepted() {
     let s = conv2d(0, 3, [3, 3], 1, 1, [4, 4]);
-    let y = forward(Tier::best(), &s, 1, &[], &[], &[1.0, 2.0, 3.0]);
+    let y = forward(SimdLevel::best(), &s, 1, &[], &[], &[1.0, 2.0, 3.0]);
     assert_eq!(y.len(), 3 * 16);
     assert!(y.chunks(16).zip([1.0, 2.0, 3.0]).all(|(row, b)| row.iter().all(|v| *v == b)));
-    weight_grad(Tier::best(), &s, &[], &y, &mut []);
-    assert!(input_grad(Tier::best(), &s, 1, &y, &[]).is_empty());
+    weight_grad(SimdLevel::best(), &s, &[], &y, &mut []);
+    assert!(input_grad(SimdLevel::best(), &s, 1, &y, &[]).is_empty());
     let s = conv2d(2, 0, [3, 3], 1, 1, [4, 4]);
-    assert_eq!(input_grad(Tier::best(), &s, 1, &[], &[]), [0.0; 32]);
+    assert_eq!(input_grad(SimdLevel::best(), &s, 1, &[], &[]), [0.0; 32]);
 }
 
 /// The choice for layers of each kind, so that a change of a threshold shows.

@@ -14,9 +14,9 @@ use super::buffers::Buffers;
 use super::packed_tile::{TileLayout, tile_starts};
 use super::plan::Plan;
 use super::sizes::Axes;
-use crate::cpu::disjoint::Disjoint;
-use crate::cpu::fresh;
-use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
+use crate::cpu::shared_slice::SharedSliceMut;
+use crate::cpu::simd::{Kernel, LANES, Simd, SimdLevel};
+use crate::cpu::uninit;
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -34,7 +34,7 @@ pub(super) trait TiledWeightGrad: Sync {
     /// Sums the products of all `tiles` into `sums`, which is zero.
     fn sum_tiles<'a>(
         &self,
-        tier: Tier,
+        level: SimdLevel,
         job: &Job<'_>,
         tiles: &mut dyn Iterator<Item = TileOperands<'a>>,
         buffers: &mut Buffers,
@@ -120,7 +120,7 @@ impl Job<'_> {
 
 /// Computes ∂L/∂w by `algorithm`; overwrites `dw`.
 pub(super) fn run(algorithm: &dyn TiledWeightGrad, args: &WeightGradArgs<'_>, dw: &mut [f32]) {
-    let &WeightGradArgs { tier, plan, x, dy } = args;
+    let &WeightGradArgs { level, plan, x, dy } = args;
     let (c, o, taps) = (plan.src_channels, plan.dst_channels, plan.kernel_taps);
     let in_pixels = plan.src_pixels();
     let (in_image, out_image) = (c * in_pixels, o * plan.dst_pixels());
@@ -146,7 +146,7 @@ pub(super) fn run(algorithm: &dyn TiledWeightGrad, args: &WeightGradArgs<'_>, dw
     };
     // The first part is the largest.
     let floats = job(parts[0]).floats();
-    let mut sums = fresh::zeros(parts.len() * groups * floats);
+    let mut sums = uninit::zeros(parts.len() * groups * floats);
     sums.par_chunks_exact_mut(floats).enumerate().for_each(|(i, sums)| {
         let (part, group) = (i / groups, i % groups);
         let (first, channel) = parts[part];
@@ -161,9 +161,9 @@ pub(super) fn run(algorithm: &dyn TiledWeightGrad, args: &WeightGradArgs<'_>, dw
         };
         let mut tiles = (tiles * group / groups..tiles * (group + 1) / groups).map(operands);
         let sums = &mut sums[..job.floats()];
-        Buffers::with(|buffers| algorithm.sum_tiles(tier, &job, &mut tiles, buffers, sums));
+        Buffers::with(|buffers| algorithm.sum_tiles(level, &job, &mut tiles, buffers, sums));
     });
-    let dw = Disjoint::new(dw);
+    let dw = SharedSliceMut::new(dw);
     sums.par_chunks_exact(groups * floats).zip(&parts).for_each(|(sums, &(first, channel))| {
         let rows = input_channels.min(c - channel) * taps;
         let outputs = first..(first + output_channels).min(o);
@@ -176,7 +176,7 @@ pub(super) fn run(algorithm: &dyn TiledWeightGrad, args: &WeightGradArgs<'_>, dw
                 unsafe { dw.part(at..at + rows) }
             };
             let to = lanes.clone().map(weights).collect();
-            tier.run(AddGroups { sums, floats, row_stride, first: lanes.start, to });
+            level.run(AddGroups { sums, floats, row_stride, first: lanes.start, to });
         });
     });
 }

@@ -6,7 +6,7 @@
 //! lanes; x is read as scalars where it lies. Direct sums call this with a packed tile and
 //! transposed gradients, Winograd's algorithm with transformed tiles of both.
 
-use crate::cpu::simd::{LANES, Simd};
+use crate::cpu::simd::{LANES, Simd, Vector};
 
 /// Rows of a register tile.
 pub(super) const TILE_ROWS: usize = 8;
@@ -96,7 +96,7 @@ impl OuterProducts<'_> {
                     // SAFETY: the farthest row ends inside `x` (asserted by `run`).
                     let x = s.splat(unsafe { *x[m].wrapping_add(i) });
                     for n in 0..N {
-                        acc[m][n] = s.fma(x, v[n], acc[m][n]);
+                        acc[m][n] = x.fma(v[n], acc[m][n]);
                     }
                 }
                 dy = dy.wrapping_add(self.stride);

@@ -16,9 +16,9 @@ use crate::cpu::conv::register_tile::{
     BLOCK_CHANNELS, ChannelBlock, Strip, StripOutput, channel_blocks,
 };
 use crate::cpu::conv::sizes::Axes;
-use crate::cpu::disjoint::Disjoint;
-use crate::cpu::fresh::{Block, fill, room};
+use crate::cpu::shared_slice::SharedSliceMut;
 use crate::cpu::simd::{Kernel, LANES, Simd};
+use crate::cpu::uninit::{UninitSlice, filled, grown};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 use std::ops::Range;
@@ -34,8 +34,8 @@ const OVERREAD: usize = 16 * LANES;
 pub(in crate::cpu::conv) struct Direct;
 
 impl Convolve for Direct {
-    fn convolve(&self, args: &ConvolveArgs<'_>, y: &mut Block<f32>) {
-        let &ConvolveArgs { tier, plan, x, w, bias } = args;
+    fn convolve(&self, args: &ConvolveArgs<'_>, y: &mut UninitSlice<f32>) {
+        let &ConvolveArgs { level, plan, x, w, bias } = args;
         let weights = BlockedWeights::new(plan, w, take_weight_memory());
         let image_floats = plan.dst_channels * plan.dst_pixels();
         let images = y.len() / image_floats;
@@ -46,7 +46,7 @@ impl Convolve for Direct {
         // With few tiles, several jobs share a tile and divide the channels.
         let parts = MIN_JOBS.div_ceil(tiles).min(weights.blocks.len());
         let blocks_per_part = weights.blocks.len().div_ceil(parts);
-        let y = Disjoint::new(y);
+        let y = SharedSliceMut::new(y);
         (0..tiles * parts).into_par_iter().for_each(|job| {
             let (image, start) = (job / parts / starts.len(), starts[job / parts % starts.len()]);
             let first = (job % parts * blocks_per_part).min(weights.blocks.len());
@@ -61,9 +61,9 @@ impl Convolve for Direct {
                 let packed = packed.floats(plan.src_channels * layout.channel_stride + OVERREAD);
                 let length = layout.places_per_depth().next_multiple_of(LANES);
                 let sums = sums.floats(plan.passes.len() * BLOCK_CHANNELS * length);
-                tier.run(PackTile { plan, layout: &layout, x, start, out: packed });
+                level.run(PackTile { plan, layout: &layout, x, start, out: packed });
                 let (weights, y) = (&weights, &y);
-                tier.run(TileJob {
+                level.run(TileJob {
                     plan,
                     layout,
                     packed,
@@ -94,7 +94,7 @@ impl BlockedWeights {
         let depth = plan.src_channels * plan.all_taps();
         let blocks = channel_blocks(plan.dst_channels);
         let floats = blocks.iter().map(|b| b.channels * depth).sum();
-        let panels = room(&mut data, floats).par_chunks_mut((BLOCK_CHANNELS * depth).max(1));
+        let panels = grown(&mut data, floats).par_chunks_mut((BLOCK_CHANNELS * depth).max(1));
         panels.zip(&blocks).for_each(|(panel, block)| {
             let mut panel = panel;
             for pass in &plan.passes {
@@ -133,7 +133,7 @@ struct TileJob<'a> {
     image: usize,
     /// First grid position of the tile.
     start: Axes,
-    y: &'a Disjoint<'a, MaybeUninit<f32>>,
+    y: &'a SharedSliceMut<'a, MaybeUninit<f32>>,
 }
 
 impl Kernel for TileJob<'_> {
@@ -249,7 +249,7 @@ impl TileJob<'_> {
                     &self.sums[first..first + layout.tile[2]]
                 };
                 match step[2] {
-                    1 => drop(fill(to, &source(0)[..columns])),
+                    1 => drop(filled(to, &source(0)[..columns])),
                     2 => store_interleaved(s, source(0), source(1), to),
                     n => {
                         for p in 0..n {

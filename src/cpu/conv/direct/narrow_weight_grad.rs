@@ -8,7 +8,7 @@ use crate::cpu::conv::algorithm::MAX_NARROW_CHANNELS;
 use crate::cpu::conv::buffers::Buffer;
 use crate::cpu::conv::sizes::Axes;
 use crate::cpu::conv::weight_grad_jobs::Job;
-use crate::cpu::simd::{Kernel, LANES, Simd};
+use crate::cpu::simd::{Kernel, LANES, Simd, Vector};
 
 /// Maximum floats of ∂L/∂y of a pass, which stay in a first-level cache, unless one row has
 /// more.
@@ -145,7 +145,7 @@ impl InnerProducts<'_> {
                         // (asserted above), and lines are whole vectors.
                         let v = s.load(unsafe { &*from.cast() });
                         for t in 0..T {
-                            acc[t][m] = s.fma(x[t], v, acc[t][m]);
+                            acc[t][m] = x[t].fma(v, acc[t][m]);
                         }
                     }
                     dy = dy.wrapping_add(LANES);

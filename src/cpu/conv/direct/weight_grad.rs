@@ -12,7 +12,7 @@ use crate::cpu::conv::packed_tile::{PackTile, tile_size, tile_starts};
 use crate::cpu::conv::plan::Plan;
 use crate::cpu::conv::weight_grad_jobs::{self, Job, Partition, TileOperands, TiledWeightGrad};
 use crate::cpu::conv::weight_grad_tile::{MAX_TILE_CHANNELS, TILE_ROWS};
-use crate::cpu::simd::{LANES, Tier};
+use crate::cpu::simd::{LANES, SimdLevel};
 
 /// Minimum rows (channel × tap) of a job, where there are as many.
 const MIN_JOB_ROWS: usize = 144;
@@ -79,7 +79,7 @@ impl TiledWeightGrad for DirectWeightGrad {
 
     fn sum_tiles<'a>(
         &self,
-        tier: Tier,
+        level: SimdLevel,
         job: &Job<'_>,
         tiles: &mut dyn Iterator<Item = TileOperands<'a>>,
         buffers: &mut Buffers,
@@ -91,14 +91,14 @@ impl TiledWeightGrad for DirectWeightGrad {
             let packed = buffers.packed.floats(floats + OVERREAD);
             // A leftover NaN times zero would be NaN.
             packed[floats..].fill(0.0);
-            tier.run(PackTile { plan, layout, x, start, out: packed });
+            level.run(PackTile { plan, layout, x, start, out: packed });
             let (x, scratch) = (&*packed, &mut buffers.scratch);
             let sums = &mut *sums;
             match self.lanes {
                 LaneAxis::OutputChannels => {
-                    tier.run(WideKernel { job, x, dy, start, scratch, sums });
+                    level.run(WideKernel { job, x, dy, start, scratch, sums });
                 }
-                LaneAxis::Outputs => tier.run(NarrowKernel { job, x, dy, start, scratch, sums }),
+                LaneAxis::Outputs => level.run(NarrowKernel { job, x, dy, start, scratch, sums }),
             }
         }
     }

@@ -108,7 +108,7 @@ impl OutputRows<'_, '_> {
                             && let Some(from) = dy[places[i] + p..].first_chunk()
                         {
                             // The next columns: every channel has a cache line of its own.
-                            s.prefetch_early(from.as_ptr().wrapping_add(LANES));
+                            s.prefetch_l2(from.as_ptr().wrapping_add(LANES));
                             m[i] = s.load(from);
                         }
                     }

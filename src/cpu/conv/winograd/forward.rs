@@ -16,9 +16,9 @@ use crate::cpu::conv::packed_tile::tile_starts;
 use crate::cpu::conv::plan::Plan;
 use crate::cpu::conv::register_tile::BLOCK_CHANNELS;
 use crate::cpu::conv::sizes::Axes;
-use crate::cpu::disjoint::Disjoint;
-use crate::cpu::fresh::Block;
+use crate::cpu::shared_slice::SharedSliceMut;
 use crate::cpu::simd::{Kernel, LANES, Simd};
+use crate::cpu::uninit::UninitSlice;
 use rayon::prelude::*;
 use std::marker::PhantomData;
 use std::mem::MaybeUninit;
@@ -34,7 +34,7 @@ pub(in crate::cpu::conv) struct Winograd {
 }
 
 impl Convolve for Winograd {
-    fn convolve(&self, args: &ConvolveArgs<'_>, y: &mut Block<f32>) {
+    fn convolve(&self, args: &ConvolveArgs<'_>, y: &mut UninitSlice<f32>) {
         let weights = TransformedWeights::new(args, self.kind, take_weight_memory());
         let call = Call::new(args, self.kind, y);
         self.kind.run(ImageBlocks { call: &call, weights: &weights });
@@ -48,14 +48,14 @@ pub(super) struct Call<'a> {
     /// [`Kind::reader`] of the plan.
     pub reader: Plan,
     pub images: usize,
-    pub y: Disjoint<'a, MaybeUninit<f32>>,
+    pub y: SharedSliceMut<'a, MaybeUninit<f32>>,
 }
 
 impl<'a> Call<'a> {
-    pub fn new(args: &ConvolveArgs<'a>, kind: Kind, y: &'a mut Block<f32>) -> Self {
+    pub fn new(args: &ConvolveArgs<'a>, kind: Kind, y: &'a mut UninitSlice<f32>) -> Self {
         let plan = args.plan;
         let images = y.len() / (plan.dst_channels * plan.dst_pixels());
-        Self { args: *args, reader: kind.reader(plan), images, y: Disjoint::new(y) }
+        Self { args: *args, reader: kind.reader(plan), images, y: SharedSliceMut::new(y) }
     }
 }
 
@@ -71,7 +71,7 @@ impl TransformTask for ImageBlocks<'_> {
         T: Transform<IN, POINTS, OUT>,
     {
         let Self { call, weights } = self;
-        let ConvolveArgs { tier, plan, .. } = call.args;
+        let ConvolveArgs { level, plan, .. } = call.args;
         let [_, height, width] = plan.grid();
         let vectors = MAX_TILE_FLOATS / (POINTS * POINTS * LANES * plan.src_channels);
         let tile_columns = width.div_ceil(TILE).min(LANES);
@@ -82,7 +82,7 @@ impl TransformTask for ImageBlocks<'_> {
             let (image, start) = (job / starts.len(), starts[job % starts.len()]);
             Buffers::with(|buffers| {
                 let transform = PhantomData::<T>;
-                tier.run::<BlockJob<'_, T, IN, POINTS, OUT>>(BlockJob {
+                level.run::<BlockJob<'_, T, IN, POINTS, OUT>>(BlockJob {
                     call,
                     weights,
                     tile_rows,

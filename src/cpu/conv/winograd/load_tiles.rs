@@ -3,7 +3,7 @@
 //! The lanes of a vector are tiles. Where the tiles of a row fill whole spans of a vector,
 //! rows of the image are loaded where they lie and transposed in registers; masks replace
 //! places beyond the border by zeros. Otherwise the channel is packed first and each tile is
-//! loaded by itself. The tiles of a vector lie in the lane order of [`square`], which needs
+//! loaded by itself. The tiles of a vector lie in the lane order of [`transpose4x4_index`], which needs
 //! the fewest shuffles.
 
 use super::product_layout::{ProductLayout, ProductVectors};
@@ -12,7 +12,7 @@ use crate::cpu::conv::buffers::Buffer;
 use crate::cpu::conv::packed_tile::{PackTile, TileLayout};
 use crate::cpu::conv::plan::Plan;
 use crate::cpu::conv::sizes::Axes;
-use crate::cpu::simd::{Kernel, LANES, Simd, square};
+use crate::cpu::simd::{Kernel, LANES, Mask, Simd, transpose4x4_index};
 use std::array::from_fn;
 
 /// A block of tiles: row by row, one image after the other.
@@ -32,7 +32,7 @@ impl TileBlock {
         self.count.next_multiple_of(LANES)
     }
 
-    /// Returns whether vectors are in the order of [`square`]. A block that does not fill
+    /// Returns whether vectors are in the order of [`transpose4x4_index`]. A block that does not fill
     /// its only vector has its tiles in the first lanes instead.
     fn squared(&self) -> bool {
         self.count >= LANES
@@ -40,7 +40,7 @@ impl TileBlock {
 
     /// Returns the lane of tile `t`.
     pub fn lane(&self, t: usize) -> usize {
-        if self.squared() { t / LANES * LANES + square(t % LANES) } else { t }
+        if self.squared() { t / LANES * LANES + transpose4x4_index(t % LANES) } else { t }
     }
 
     /// Returns the lanes up to the last one that holds a tile; lanes between may hold none.
@@ -234,7 +234,7 @@ impl Places<'_> {
             let Column { start, x, rows } = column(tile(i), at);
             let mut valid = [false; MAX_ROWS];
             valid[rows].fill(self.has(x));
-            NeighbourColumn { lane: 1 << square(i), start, valid }
+            NeighbourColumn { lane: 1 << transpose4x4_index(i), start, valid }
         };
         let next = own + T::INPUT_STEP as isize;
         let before = (0..LANES).filter(is_first).map(|i| neighbour(i, own - 1)).collect();
@@ -295,7 +295,7 @@ impl TileLoader<'_> {
             for r in 0..IN {
                 let mut row = [s.splat(0.0); IN];
                 for part in 0..IN.div_ceil(4) {
-                    let four = s.load4(packed, starts, r * self.row_stride + part * 4);
+                    let four = s.gather4(packed, starts, r * self.row_stride + part * 4);
                     for j in 0..4 {
                         if part * 4 + j < IN {
                             row[part * 4 + j] = four[j];
@@ -327,15 +327,15 @@ impl TileLoader<'_> {
         for k in 0..T::INPUT_STEP {
             let from = x.as_ptr().wrapping_offset(starts[k] + down);
             // The same row of the next channel: hardware does not predict such steps.
-            s.prefetch_early(from.wrapping_add(self.floats));
+            s.prefetch_l2(from.wrapping_add(self.floats));
             // SAFETY: `valid_lanes` marks the lanes inside the image, and `x` holds all
             // `floats` of the channel.
-            v[k] = unsafe { s.load_lanes(from, valid_lanes[r][k]) };
+            v[k] = unsafe { s.load_masked(from, valid_lanes[r][k]) };
         }
         let own = match T::INPUT_STEP {
-            8 => s.columns8(v),
+            8 => s.columns_of_8(v),
             _ => {
-                let [a, b, c, d] = s.transpose4([v[0], v[1], v[2], v[3]]);
+                let [a, b, c, d] = s.transpose_quarters([v[0], v[1], v[2], v[3]]);
                 [a, b, c, d, v[4], v[5], v[6], v[7]]
             }
         };
@@ -344,11 +344,11 @@ impl TileLoader<'_> {
         for j in 0..IN {
             row[j] = match j {
                 _ if j < first => {
-                    let column = s.before(own[T::INPUT_STEP - 1]);
+                    let column = s.rotate_right(own[T::INPUT_STEP - 1]);
                     insert_neighbours(s, column, before, x, r, down)
                 }
                 _ if j < last => own[j - first],
-                _ => insert_neighbours(s, s.after(own[0]), after, x, r, down),
+                _ => insert_neighbours(s, s.rotate_left(own[0]), after, x, r, down),
             };
         }
         row
@@ -368,11 +368,11 @@ fn insert_neighbours<S: Simd>(
 ) -> S::F {
     for neighbour in neighbours {
         let from = x.as_ptr().wrapping_offset(neighbour.start + down);
-        s.prefetch_early(from.wrapping_add(x.len()));
+        s.prefetch_l2(from.wrapping_add(x.len()));
         // SAFETY: `valid` says that the image has this place, and `x` holds the whole
         // channel of the image.
         let v = if neighbour.valid[r] { unsafe { *from } } else { 0.0 };
-        column = s.select(s.mask(neighbour.lane), s.splat(v), column);
+        column = s.mask_from_bits(neighbour.lane).select(s.splat(v), column);
     }
     column
 }

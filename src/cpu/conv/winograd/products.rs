@@ -9,8 +9,8 @@ use crate::cpu::conv::buffers::Buffer;
 use crate::cpu::conv::plan::Plan;
 use crate::cpu::conv::register_tile::{BLOCK_CHANNELS, ChannelBlock, Strip};
 use crate::cpu::conv::sizes::Axes;
-use crate::cpu::disjoint::Disjoint;
-use crate::cpu::simd::{LANES, Simd, square};
+use crate::cpu::shared_slice::SharedSliceMut;
+use crate::cpu::simd::{LANES, Simd, transpose4x4_index};
 use std::array::from_fn;
 use std::mem::MaybeUninit;
 
@@ -119,7 +119,7 @@ fn transform_columns<S, T, const IN: usize, const POINTS: usize, const OUT: usiz
 /// Writes the outputs of a block of tiles, in any channel.
 pub(super) struct OutputWriter<'a> {
     plan: &'a Plan,
-    y: &'a Disjoint<'a, MaybeUninit<f32>>,
+    y: &'a SharedSliceMut<'a, MaybeUninit<f32>>,
     /// One entry per vector of tiles.
     places: Vec<OutputPlaces>,
 }
@@ -146,7 +146,7 @@ impl<'a> OutputWriter<'a> {
     /// Prepares writing `tiles`; the first lies at grid position `start` of image `image`.
     pub fn new<const OUT: usize>(
         plan: &'a Plan,
-        y: &'a Disjoint<'a, MaybeUninit<f32>>,
+        y: &'a SharedSliceMut<'a, MaybeUninit<f32>>,
         tiles: TileBlock,
         image: usize,
         [depth, top, left]: Axes,
@@ -154,7 +154,7 @@ impl<'a> OutputWriter<'a> {
         let TileBlock { count, per_row, per_image } = tiles;
         let [slices, height, width] = plan.dst_size;
         let output_tile = |t: usize| {
-            let lane = square(tiles.lane(t) % LANES);
+            let lane = transpose4x4_index(tiles.lane(t) % LANES);
             let (image, t) = (image + t / per_image, t % per_image);
             let row = top * OUT / TILE + t / per_row * OUT;
             let column = left * OUT / TILE + t % per_row * OUT;
@@ -196,9 +196,18 @@ impl<'a> OutputWriter<'a> {
         let [slices, height, width] = self.plan.dst_size;
         let down = channel * slices * height * width + r * width;
         let rows = match OUT {
-            8 => s.rows8([v[0], v[1], v[2], v[3], v[OUT - 4], v[OUT - 3], v[OUT - 2], v[OUT - 1]]),
+            8 => s.rows_of_8([
+                v[0],
+                v[1],
+                v[2],
+                v[3],
+                v[OUT - 4],
+                v[OUT - 3],
+                v[OUT - 2],
+                v[OUT - 1],
+            ]),
             _ => {
-                let [a, b, c, d] = s.transpose4([v[0], v[1], v[2], v[3]]);
+                let [a, b, c, d] = s.transpose_quarters([v[0], v[1], v[2], v[3]]);
                 [a, b, c, d, a, b, c, d]
             }
         };
@@ -210,7 +219,7 @@ impl<'a> OutputWriter<'a> {
                     // SAFETY: no two jobs, and no two tiles of a job, hold the same outputs.
                     let to = unsafe { self.y.part(at..at + LANES) };
                     if let Some(to) = to.first_chunk_mut() {
-                        s.store_fresh(rows[k], to);
+                        s.store_uninit(rows[k], to);
                     }
                 }
                 return;

@@ -15,8 +15,8 @@ use super::weights::{TransformWeights, group_stride};
 use crate::cpu::conv::algorithm::{Convolve, ConvolveArgs};
 use crate::cpu::conv::buffers::Buffers;
 use crate::cpu::conv::register_tile::{BLOCK_CHANNELS, ChannelBlock, channel_blocks};
-use crate::cpu::fresh::Block;
 use crate::cpu::simd::{Kernel, LANES, Simd};
+use crate::cpu::uninit::UninitSlice;
 use rayon::prelude::*;
 use std::marker::PhantomData;
 use std::mem::take;
@@ -30,7 +30,7 @@ pub(in crate::cpu::conv) struct SmallImages {
 }
 
 impl Convolve for SmallImages {
-    fn convolve(&self, args: &ConvolveArgs<'_>, y: &mut Block<f32>) {
+    fn convolve(&self, args: &ConvolveArgs<'_>, y: &mut UninitSlice<f32>) {
         let call = Call::new(args, self.kind, y);
         self.kind.run(AllImages { call: &call, kind: self.kind });
     }
@@ -48,7 +48,7 @@ impl TransformTask for AllImages<'_> {
         T: Transform<IN, POINTS, OUT>,
     {
         let Self { call, kind } = self;
-        let ConvolveArgs { tier, plan, x, .. } = call.args;
+        let ConvolveArgs { level, plan, x, .. } = call.args;
         let pixels = plan.src_pixels();
         let [_, height, width] = plan.grid();
         let [tile_rows, per_row] = [height, width].map(|n| n.div_ceil(TILE));
@@ -68,14 +68,14 @@ impl TransformTask for AllImages<'_> {
             let (x, transform) = (&x[channel * pixels..], PhantomData::<T>);
             Buffers::with(|buffers| {
                 let job = LoadJob { loader, tiles_layout, x, buffers, tiles, transform };
-                tier.run::<LoadJob<'_, T, IN, POINTS, OUT>>(job);
+                level.run::<LoadJob<'_, T, IN, POINTS, OUT>>(job);
             });
         });
         let products_layout = &ProductLayout::new(POINTS, BLOCK_CHANNELS, tiles.lanes(), 0);
         let output = &OutputWriter::new::<OUT>(plan, &call.y, tiles, 0, [0; 3]);
         channel_blocks(plan.dst_channels).par_iter().for_each(|block| {
             Buffers::with(|buffers| {
-                tier.run::<ProductJob<'_, T, IN, POINTS, OUT>>(ProductJob {
+                level.run::<ProductJob<'_, T, IN, POINTS, OUT>>(ProductJob {
                     call,
                     kind,
                     tiles: all,

@@ -17,7 +17,7 @@ use crate::cpu::conv::plan::Plan;
 use crate::cpu::conv::sizes::Axes;
 use crate::cpu::conv::weight_grad_jobs::{self, Job, Partition, TileOperands, TiledWeightGrad};
 use crate::cpu::conv::weight_grad_tile::{MAX_TILE_CHANNELS, OuterProducts, Store, TILE_ROWS};
-use crate::cpu::simd::{Kernel, LANES, Simd, Tier, first_lanes};
+use crate::cpu::simd::{Kernel, LANES, Simd, SimdLevel, first_lanes_bits};
 use std::ops::Range;
 
 /// Maximum input channels of a job.
@@ -78,7 +78,7 @@ impl TiledWeightGrad for WinogradWeightGrad {
 
     fn sum_tiles<'a>(
         &self,
-        tier: Tier,
+        level: SimdLevel,
         job: &Job<'_>,
         tiles: &mut dyn Iterator<Item = TileOperands<'a>>,
         buffers: &mut Buffers,
@@ -91,9 +91,9 @@ impl TiledWeightGrad for WinogradWeightGrad {
         let reader = &kind.reader(job.plan);
         for (i, operands) in tiles.enumerate() {
             let store = if i == 0 { Store::Overwrite } else { Store::Add };
-            tier.run(SumProducts { job, kind, reader, operands, store, buffers, products });
+            level.run(SumProducts { job, kind, reader, operands, store, buffers, products });
         }
-        tier.run(TransformSums { job, kind, products, sums });
+        level.run(TransformSums { job, kind, products, sums });
         buffers.products = own;
     }
 }
@@ -266,7 +266,7 @@ impl ImageGradients<'_, '_> {
             let channels = LANES.min(output_channels.len().saturating_sub(v));
             for left in (0..width).step_by(LANES) {
                 let columns = LANES.min(width - left);
-                let bits = first_lanes(columns);
+                let bits = first_lanes_bits(columns);
                 // Distance to the floats of the next iteration: columns, channels or rows of
                 // tiles further on. Each is in a cache line of its own.
                 let next = if left + LANES < width {
@@ -286,9 +286,9 @@ impl ImageGradients<'_, '_> {
                             + (row * TILE + r) * plan.dst_size[2]
                             + left;
                         let from = &self.dy[at..][..columns];
-                        s.prefetch_early(from.as_ptr().wrapping_add(next));
+                        s.prefetch_l2(from.as_ptr().wrapping_add(next));
                         // SAFETY: `from` has as many floats as `bits` has bits.
-                        m[i] = unsafe { s.load_lanes(from.as_ptr(), bits) };
+                        m[i] = unsafe { s.load_masked(from.as_ptr(), bits) };
                     }
                     copy_vectors(&mut d[r], s.transpose(m));
                 }

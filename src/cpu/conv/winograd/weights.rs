@@ -6,8 +6,8 @@ use super::transforms::{Transform, WEIGHTS};
 use crate::cpu::conv::algorithm::ConvolveArgs;
 use crate::cpu::conv::plan::{Direction, Plan};
 use crate::cpu::conv::register_tile::{BLOCK_CHANNELS, ChannelBlock, channel_blocks};
-use crate::cpu::fresh::room;
 use crate::cpu::simd::{Kernel, LANES, Simd};
+use crate::cpu::uninit::grown;
 use rayon::prelude::*;
 
 /// Taps of a 3×3 kernel.
@@ -31,13 +31,13 @@ pub(super) struct TransformedWeights {
 impl TransformedWeights {
     /// Transforms the weights of a call; `data` provides the memory.
     pub fn new(args: &ConvolveArgs<'_>, kind: Kind, mut data: Vec<f32>) -> Self {
-        let &ConvolveArgs { tier, plan, w, .. } = args;
+        let &ConvolveArgs { level, plan, w, .. } = args;
         let blocks = channel_blocks(plan.dst_channels);
         let floats = GROUPS * group_stride(plan.src_channels);
-        room(&mut data, blocks.len() * floats)
+        grown(&mut data, blocks.len() * floats)
             .par_chunks_exact_mut(floats)
             .zip(&blocks)
-            .for_each(|(panel, block)| tier.run(TransformWeights { plan, kind, w, block, panel }));
+            .for_each(|(panel, block)| level.run(TransformWeights { plan, kind, w, block, panel }));
         Self { data, blocks }
     }
 }
@@ -89,7 +89,7 @@ impl<S: Simd> TransformTask for WithSimd<S, TransformWeights<'_>> {
                 let taps = &w[plan.kernel_index(src, block.first + m) * TAPS..][..TAPS];
                 s.prefetch(taps.as_ptr().wrapping_add(ahead));
                 // SAFETY: `taps` has nine floats, the mask nine bits.
-                kernels[lane] = unsafe { s.load_lanes(taps.as_ptr(), 0x1ff) };
+                kernels[lane] = unsafe { s.load_masked(taps.as_ptr(), 0x1ff) };
             }
             let taps = s.transpose(kernels);
             let mut half = [[s.splat(0.0); 3]; WEIGHTS];

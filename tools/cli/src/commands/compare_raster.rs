@@ -9,7 +9,7 @@ use anyhow::{Result, ensure};
 use subsplat::abi::{
     Convention, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE,
 };
-use subsplat::cpu::{Gradients, Rasterizer, Rendered, Tier};
+use subsplat::cpu::{Gradients, Rasterizer, Rendered, SimdLevel};
 use subsplat::model::compare::Row;
 use subsplat::render::Renderer;
 
@@ -69,15 +69,15 @@ struct Output<'a> {
     relative_to: Option<f32>,
 }
 
-/// Renders the case with the instructions of `tier` and compares the outputs that the file
+/// Renders the case with the instructions of `level` and compares the outputs that the file
 /// holds. `relative` of a row is the difference in the tensor's own measure: absolute for
 /// colours and alpha.
 ///
 /// # Errors
 /// The file holds nothing to compare; a tensor has another shape; every pixel is marked as
 /// boundary.
-pub fn compare(case: &Case, tier: Tier) -> Result<Comparison> {
-    let mut rasterizer = Rasterizer::new().with_tier(tier);
+pub fn compare(case: &Case, level: SimdLevel) -> Result<Comparison> {
+    let mut rasterizer = Rasterizer::new().with_simd_level(level);
     let got = rasterizer.render(&case.splats(), &case.camera, &case.options);
     let mut comparison = picture(case, &got)?;
     let references = gradient_references(case, &mut comparison)?;
