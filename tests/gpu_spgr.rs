@@ -189,7 +189,7 @@ fn children() {
 }
 
 /// Gradients on the CPU: head records, parents, and head records by the gains.
-fn gradients<T: subsplat::cpu::lanes::LaneReal>(
+fn gradients<T: subsplat::cpu::simd::Real>(
     inputs: &Inputs,
     rules: &Rules,
     grad: &[f32],

@@ -16,7 +16,7 @@ use subsplat::abi::{
     ShDirection, sh_coefficients,
 };
 use subsplat::camera::{Camera, Intrinsics};
-use subsplat::cpu::{Gradients, Rasterizer, Tier};
+use subsplat::cpu::{Gradients, Rasterizer, SimdLevel};
 
 /// Central difference of the loss in one number, which `of` finds. Steps are such that
 /// no alpha moves by more than the oracle's boundary is wide, and count as `f32` took
@@ -315,21 +315,21 @@ fn any_number_of_threads_and_any_memory_gives_the_same_bytes() {
 
 /// Every instruction set gives the gradients, and those that fuse the same bytes.
 #[test]
-fn tiers_agree() {
+fn levels_agree() {
     let scene = Scene::new(Kind::Plain, 21, 12, 3, 4);
     let o = options(Convention::Standard);
     let v = scene.upstream(&o, 3);
-    let run = |tier: Tier| {
+    let run = |level: SimdLevel| {
         let mut out = Gradients::default();
-        let mut rasterizer = Rasterizer::new().with_tier(tier);
+        let mut rasterizer = Rasterizer::new().with_simd_level(level);
         scene.with_slices(|s| rasterizer.backward(&s, &scene.camera, &o, &v, &mut out));
         out
     };
-    let best = run(Tier::best());
-    for &tier in Tier::available() {
-        let got = run(tier);
-        if tier != Tier::Scalar && Tier::best() != Tier::Scalar {
-            assert!(bytes(&got) == bytes(&best), "{tier:?}");
+    let best = run(SimdLevel::best());
+    for &level in SimdLevel::available() {
+        let got = run(level);
+        if level != SimdLevel::Scalar && SimdLevel::best() != SimdLevel::Scalar {
+            assert!(bytes(&got) == bytes(&best), "{level:?}");
         }
         for (what, got, best, lanes) in [
             ("rows", &got.rows, &best.rows, SPLAT_LANES),
@@ -338,7 +338,7 @@ fn tiers_agree() {
         ] {
             let best: Vec<f64> = best.iter().map(|&v| f64::from(v)).collect();
             let e = worst_row(got, &best, lanes, what);
-            assert!(e < 2e-4, "{tier:?} {what}: {e:.1e}");
+            assert!(e < 2e-4, "{level:?} {what}: {e:.1e}");
         }
     }
 }

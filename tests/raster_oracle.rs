@@ -11,7 +11,7 @@ use subsplat::abi::{
     ALPHA_MIN, Convention, LANE_OPACITY, RasterOptions, SPLAT_LANES, ShBasis, ShDirection,
 };
 use subsplat::camera::{Camera, Intrinsics};
-use subsplat::cpu::{Geometry, Rasterizer, Rendered, SplatSlices, Tier};
+use subsplat::cpu::{Geometry, Rasterizer, Rendered, SimdLevel, SplatSlices};
 use subsplat::splats::Splats;
 
 /// xorshift64*.
@@ -201,10 +201,10 @@ fn random_scenes_agree() {
                 for (v, o) in variants.into_iter().enumerate() {
                     let what = format!("{kind:?} {size:?} {convention:?} variant {v}");
                     let expected = oracle::render(&splats, &scene.camera, &o);
-                    for &tier in Tier::available() {
-                        let mut rasterizer = Rasterizer::new().with_tier(tier);
+                    for &level in SimdLevel::available() {
+                        let mut rasterizer = Rasterizer::new().with_simd_level(level);
                         let got = rasterizer.render(&slices(&scene.splats), &scene.camera, &o);
-                        let what = format!("{what} {tier:?}");
+                        let what = format!("{what} {level:?}");
                         let (d, b) = compare(&got, &expected, &what, 5e-5);
                         worst = worst.max(d);
                         boundary += b;
@@ -219,7 +219,7 @@ fn random_scenes_agree() {
         }
     }
     eprintln!("oracle: worst {worst:.1e}, boundary {boundary} of {pixels} pixels");
-    let pixels = pixels * Tier::available().len();
+    let pixels = pixels * SimdLevel::available().len();
     assert!(boundary * 200 < pixels, "boundary: {boundary} of {pixels} pixels");
 }
 
@@ -319,10 +319,10 @@ fn any_number_of_threads_and_any_memory_gives_the_same_bytes() {
         all.splats.gain.extend_from_slice(&more.splats.gain);
     }
     assert!(all.splats.len() > 10_000);
-    let tiers = Tier::available().iter().map(|&tier| (Convention::Standard, tier));
-    for (convention, tier) in tiers.chain([(Convention::Mvsplat, Tier::best())]) {
+    let levels = SimdLevel::available().iter().map(|&level| (Convention::Standard, level));
+    for (convention, level) in levels.chain([(Convention::Mvsplat, SimdLevel::best())]) {
         let o = options(convention);
-        let new = || Rasterizer::new().with_tier(tier);
+        let new = || Rasterizer::new().with_simd_level(level);
         let run = |threads: usize, mut rasterizer: Rasterizer| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             pool.install(|| {
@@ -340,14 +340,14 @@ fn any_number_of_threads_and_any_memory_gives_the_same_bytes() {
         let (three, stats3) = run(3, new());
         assert!(
             bytes(&one) == bytes(&three),
-            "{convention:?} {tier:?}: threads change the picture"
+            "{convention:?} {level:?}: threads change the picture"
         );
         assert_eq!((stats.pairs, stats.items), (stats3.pairs, stats3.items));
         for limit in [0, stats.pairs / 7] {
             let (few, _) = run(2, new().with_pairs_per_group(limit));
             assert!(
                 bytes(&one) == bytes(&few),
-                "{convention:?} {tier:?}: the limit changes the picture"
+                "{convention:?} {level:?}: the limit changes the picture"
             );
         }
         let mut planes = Vec::new();
@@ -361,21 +361,25 @@ fn any_number_of_threads_and_any_memory_gives_the_same_bytes() {
     }
 }
 
-/// Tiers with fused products agree to the byte, however wide their registers; the
+/// Levels with fused products agree to the byte, however wide their registers; the
 /// scalar one, which rounds products as well, to 1e-5 but for pixels where that flips
 /// a decision.
 #[test]
-fn tiers_agree() {
+fn levels_agree() {
     let (mut flipped, mut pixels) = (0, 0);
     for (i, kind) in KINDS.into_iter().enumerate() {
         let scene = scene(kind, 40 + i as u64, (100, 75), [0, 1, 4][i % 3]);
         for convention in [Convention::Standard, Convention::Mvsplat] {
             let o = options(convention);
-            let render = |tier| {
-                Rasterizer::new().with_tier(tier).render(&slices(&scene.splats), &scene.camera, &o)
+            let render = |level| {
+                Rasterizer::new().with_simd_level(level).render(
+                    &slices(&scene.splats),
+                    &scene.camera,
+                    &o,
+                )
             };
-            let scalar = render(Tier::Scalar);
-            let fused = Tier::available().iter().filter(|&&t| t != Tier::Scalar);
+            let scalar = render(SimdLevel::Scalar);
+            let fused = SimdLevel::available().iter().filter(|&&t| t != SimdLevel::Scalar);
             let fused: Vec<Rendered> = fused.map(|&t| render(t)).collect();
             for other in fused.windows(2) {
                 assert!(bytes(&other[0]) == bytes(&other[1]), "{kind:?} {convention:?}");
@@ -389,22 +393,24 @@ fn tiers_agree() {
             }
         }
     }
-    eprintln!("{flipped} of {pixels} pixels differ between scalar and fused tiers");
+    eprintln!("{flipped} of {pixels} pixels differ between scalar and fused levels");
     assert!(flipped * 100 <= pixels, "{flipped} of {pixels} pixels");
 }
 
-/// A context that was told no tier takes the best; one that is told a tier which the
+/// A context that was told no level takes the best; one that is told a level which the
 /// processor lacks still draws.
 #[test]
 fn foreign_tiers_draw_as_the_scalar_one() {
     let scene = scene(Kind::Plain, 11, (64, 48), 0);
     let o = options(Convention::Standard);
     let render = |r: Rasterizer| bytes(&{ r }.render(&slices(&scene.splats), &scene.camera, &o));
-    assert!(render(Rasterizer::new()) == render(Rasterizer::new().with_tier(Tier::best())));
-    for tier in [Tier::Avx2, Tier::Avx512, Tier::Neon] {
-        if !tier.is_available() {
-            let scalar = Rasterizer::new().with_tier(Tier::Scalar);
-            assert!(render(Rasterizer::new().with_tier(tier)) == render(scalar));
+    assert!(
+        render(Rasterizer::new()) == render(Rasterizer::new().with_simd_level(SimdLevel::best()))
+    );
+    for level in [SimdLevel::Avx2, SimdLevel::Avx512, SimdLevel::Neon] {
+        if !level.is_available() {
+            let scalar = Rasterizer::new().with_simd_level(SimdLevel::Scalar);
+            assert!(render(Rasterizer::new().with_simd_level(level)) == render(scalar));
         }
     }
 }

@@ -7,7 +7,7 @@
 use super::raster_case::Case;
 use anyhow::{Result, ensure};
 use subsplat::abi::{Convention, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES};
-use subsplat::cpu::{Gradients, Rasterizer, Rendered, Tier};
+use subsplat::cpu::{Gradients, Rasterizer, Rendered, SimdLevel};
 use subsplat::model::compare::Row;
 use subsplat::render::Renderer;
 
@@ -33,13 +33,13 @@ const NEEDLES: &str = "needles";
 /// Name, what came, its shape, what is allowed, and from which size on errors are relative.
 type Output<'a> = (&'static str, &'a [f32], &'a [usize], f32, Option<f32>);
 
-/// Renders the case with the instructions of `tier` and compares every output that the file holds. `relative` of a row
+/// Renders the case with the instructions of `level` and compares every output that the file holds. `relative` of a row
 /// is the difference in the tensor's own measure: absolute for colours and alpha.
 ///
 /// # Errors
 /// A tensor is missing or has another shape; every pixel is marked as boundary.
-pub fn compare(case: &Case, tier: Tier) -> Result<Vec<Row>> {
-    let mut rasterizer = Rasterizer::new().with_tier(tier);
+pub fn compare(case: &Case, level: SimdLevel) -> Result<Vec<Row>> {
+    let mut rasterizer = Rasterizer::new().with_simd_level(level);
     let got = rasterizer.render(&case.splats(), &case.camera, &case.options);
     let mut rows = picture(case, &got)?;
     if case.has("v_rgb") {

@@ -1,7 +1,8 @@
 //! Pointwise functions, with gradients.
 
 use super::fresh::{Block, Fresh};
-use super::math::{erf, exp, vectorised};
+use super::simd::elementary::{erf, exp};
+use super::simd::vectorize;
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
@@ -58,7 +59,7 @@ macro_rules! by_kind {
                 // Φ(x) + x·φ(x), φ the normal density.
                 #[inline(always)]
                 |x: f32| $crate::cpu::activation::normal_cdf(x)
-                    + x * 0.398_942_3 * $crate::cpu::math::exp(-0.5 * x * x)
+                    + x * 0.398_942_3 * $crate::cpu::simd::elementary::exp(-0.5 * x * x)
             ),
             $crate::cpu::activation::Activation::Sigmoid => $run!(
                 #[inline(always)]
@@ -78,7 +79,7 @@ pub(super) use by_kind;
 pub fn forward(kind: Activation, x: &[f32]) -> Vec<f32> {
     let mut fresh = Fresh::new(x.len());
     fresh.blocks(CHUNK).zip(x.par_chunks(CHUNK)).for_each(|(y, x)| {
-        vectorised(
+        vectorize(
             #[inline(always)]
             || {
                 macro_rules! run {
@@ -106,7 +107,7 @@ fn map(x: &[f32], y: &mut Block<f32>, f: impl Fn(f32) -> f32) {
 pub fn backward(kind: Activation, x: &[f32], dy: &[f32], dx: &mut [f32]) {
     let chunks = x.par_chunks(CHUNK).zip(dy.par_chunks(CHUNK));
     chunks.zip(dx.par_chunks_mut(CHUNK)).for_each(|((x, dy), dx)| {
-        vectorised(
+        vectorize(
             #[inline(always)]
             || {
                 macro_rules! run {
@@ -122,7 +123,7 @@ pub fn backward(kind: Activation, x: &[f32], dy: &[f32], dx: &mut [f32]) {
 
 /// y = f(y), on the caller's thread.
 pub(super) fn in_place(kind: Activation, y: &mut [f32]) {
-    vectorised(
+    vectorize(
         #[inline(always)]
         || {
             macro_rules! run {
@@ -137,7 +138,7 @@ pub(super) fn in_place(kind: Activation, y: &mut [f32]) {
 
 /// x = dy·f′(x), on the caller's thread.
 pub(super) fn slopes_in_place(kind: Activation, x: &mut [f32], dy: &[f32]) {
-    vectorised(
+    vectorize(
         #[inline(always)]
         || {
             macro_rules! run {

@@ -11,7 +11,7 @@
 //! Twin: ops/attributes.rs. The same in tensor operations:
 //! `model::embed::Embeddings::inputs`.
 
-use super::lanes::{Kernel, LaneReal, Lanes, Machine};
+use super::simd::{Mask, Real, RowLayout, Vector, VectorKernel};
 use crate::abi::{LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES};
 use rayon::prelude::*;
 
@@ -57,20 +57,20 @@ const OPACITY: usize = 10;
 
 /// μ − eye.
 #[inline(always)]
-fn centred<M: Machine>(m: M, frame: &Frame, row: &[M::V; SPLAT_LANES]) -> [M::V; 3] {
+fn centred<V: Vector>(frame: &Frame, row: &[V; SPLAT_LANES]) -> [V; 3] {
     let mut out = [row[LANE_MEAN], row[LANE_MEAN + 1], row[LANE_MEAN + 2]];
     for (v, o) in out.iter_mut().zip(frame.position) {
-        *v = *v - m.of(o);
+        *v = *v - V::constant(o);
     }
     out
 }
 
 /// Column `j` of R times v.
 #[inline(always)]
-fn along<M: Machine>(m: M, frame: &Frame, v: [M::V; 3], j: usize) -> M::V {
+fn along<V: Vector>(frame: &Frame, v: [V; 3], j: usize) -> V {
     let [x, y, z] = &frame.rotation;
-    let two = m.of(y[j]).fma(v[1], m.of(x[j]) * v[0]);
-    m.of(z[j]).fma(v[2], two)
+    let two = V::constant(y[j]).fma(v[1], V::constant(x[j]) * v[0]);
+    V::constant(z[j]).fma(v[2], two)
 }
 
 /// A position, its z bounded below, and the slopes before they are clamped.
@@ -82,28 +82,28 @@ struct Place<V> {
 
 impl Attributes {
     #[inline(always)]
-    fn place<M: Machine>(&self, m: M, row: &[M::V; SPLAT_LANES]) -> Place<M::V> {
+    fn place<V: Vector>(&self, row: &[V; SPLAT_LANES]) -> Place<V> {
         let own = match &self.frame {
             None => [row[LANE_MEAN], row[LANE_MEAN + 1], row[LANE_MEAN + 2]],
             Some(frame) => {
-                let c = centred(m, frame, row);
-                [along(m, frame, c, 0), along(m, frame, c, 1), along(m, frame, c, 2)]
+                let c = centred(frame, row);
+                [along(frame, c, 0), along(frame, c, 1), along(frame, c, 2)]
             }
         };
-        let z = own[2].max(m.of(self.z_min));
+        let z = own[2].max(V::constant(self.z_min));
         Place { own, z, slopes: [own[0] / z, own[1] / z] }
     }
 
     /// Quaternion in the frame, before its sign.
     #[inline(always)]
-    fn quat<M: Machine>(&self, m: M, row: &[M::V; SPLAT_LANES]) -> [M::V; 4] {
+    fn quat<V: Vector>(&self, row: &[V; SPLAT_LANES]) -> [V; 4] {
         let q = [row[LANE_QUAT], row[LANE_QUAT + 1], row[LANE_QUAT + 2], row[LANE_QUAT + 3]];
         let Some(frame) = &self.frame else { return q };
         let mut out = q;
         for (v, line) in out.iter_mut().zip(&frame.turn) {
-            *v = m.of(line[0]) * q[0];
+            *v = V::constant(line[0]) * q[0];
             for i in 1..4 {
-                *v = m.of(line[i]).fma(q[i], *v);
+                *v = V::constant(line[i]).fma(q[i], *v);
             }
         }
         out
@@ -111,17 +111,17 @@ impl Attributes {
 
     /// Camera z in the source view, not bounded.
     #[inline(always)]
-    fn depth<M: Machine>(&self, m: M, row: &[M::V; SPLAT_LANES]) -> M::V {
-        along(m, &self.source, centred(m, &self.source, row), 2)
+    fn depth<V: Vector>(&self, row: &[V; SPLAT_LANES]) -> V {
+        along(&self.source, centred(&self.source, row), 2)
     }
 
     #[inline(always)]
-    fn forward<M: Machine>(&self, m: M, row: &[M::V; SPLAT_LANES]) -> [M::V; SPLAT_LANES] {
-        let mut out = [m.of(0.0); SPLAT_LANES];
-        let place = self.place(m, row);
+    fn forward<V: Vector>(&self, row: &[V; SPLAT_LANES]) -> [V; SPLAT_LANES] {
+        let mut out = [V::constant(0.0); SPLAT_LANES];
+        let place = self.place(row);
         out[..3].copy_from_slice(&place.own);
         if self.ray {
-            let most = m.of(self.slope_max);
+            let most = V::constant(self.slope_max);
             for (to, slope) in out.iter_mut().zip(place.slopes) {
                 *to = slope.max(-most).min(most);
             }
@@ -129,94 +129,95 @@ impl Attributes {
         }
         out[SCALE..QUAT].copy_from_slice(&row[LANE_SCALE..LANE_SCALE + 3]);
         if let Some(fx) = self.log_px {
-            let z = self.depth(m, row).max(m.of(self.z_min)).ln() - m.of(fx.ln());
+            let z = self.depth(row).max(V::constant(self.z_min)).ln() - V::constant(fx.ln());
             for v in &mut out[SCALE..QUAT] {
-                *v = v.max(m.of(self.scale_min)).ln() - z;
+                *v = v.max(V::constant(self.scale_min)).ln() - z;
             }
         }
-        let quat = self.quat(m, row);
-        let negative = quat[0].lt(m.of(0.0));
+        let quat = self.quat(row);
+        let negative = quat[0].lt(V::constant(0.0));
         for (to, q) in out[QUAT..OPACITY].iter_mut().zip(quat) {
-            *to = M::V::select(negative, -q, q);
+            *to = negative.select(-q, q);
         }
         out[OPACITY] = row[LANE_OPACITY];
         if let Some(most) = self.logit {
             let low = 1.0 / (1.0 + most.exp());
-            let p = row[LANE_OPACITY].max(m.of(low)).min(m.of(1.0 - low));
-            out[OPACITY] = p.ln() - (m.of(1.0) - p).ln();
+            let p = row[LANE_OPACITY].max(V::constant(low)).min(V::constant(1.0 - low));
+            out[OPACITY] = p.ln() - (V::constant(1.0) - p).ln();
         }
         out
     }
 
     /// By the row, for what reached the result.
     #[inline(always)]
-    fn backward<M: Machine>(
+    fn backward<V: Vector>(
         &self,
-        m: M,
-        row: &[M::V; SPLAT_LANES],
-        d: &[M::V; SPLAT_LANES],
-    ) -> [M::V; SPLAT_LANES] {
-        let zero = m.of(0.0);
+        row: &[V; SPLAT_LANES],
+        d: &[V; SPLAT_LANES],
+    ) -> [V; SPLAT_LANES] {
+        let zero = V::constant(0.0);
         let mut out = [zero; SPLAT_LANES];
         let mut d_own = [d[0], d[1], d[2]];
         if self.ray {
-            let place = self.place(m, row);
-            let most = m.of(self.slope_max);
+            let place = self.place(row);
+            let most = V::constant(self.slope_max);
             let mut d_z = d[2];
             for i in 0..2 {
                 let inside = place.slopes[i].abs().lt(most);
-                let d_slope = M::V::select(inside, d[i], zero);
+                let d_slope = inside.select_or_zero(d[i]);
                 d_z = d_z - d_slope * place.slopes[i];
                 d_own[i] = d_slope / place.z;
             }
-            let free = m.of(self.z_min).lt(place.own[2]);
-            d_own[2] = M::V::select(free, d_z / place.z, zero);
+            let free = V::constant(self.z_min).lt(place.own[2]);
+            d_own[2] = free.select_or_zero(d_z / place.z);
         }
         for (i, to) in out[LANE_MEAN..LANE_MEAN + 3].iter_mut().enumerate() {
             *to = match &self.frame {
                 None => d_own[i],
                 Some(frame) => {
                     let r = frame.rotation[i];
-                    m.of(r[0]) * d_own[0] + m.of(r[1]) * d_own[1] + m.of(r[2]) * d_own[2]
+                    V::constant(r[0]) * d_own[0]
+                        + V::constant(r[1]) * d_own[1]
+                        + V::constant(r[2]) * d_own[2]
                 }
             };
         }
         out[LANE_SCALE..LANE_SCALE + 3].copy_from_slice(&d[SCALE..QUAT]);
         if self.log_px.is_some() {
-            let depth = self.depth(m, row);
-            let least = m.of(self.z_min);
+            let depth = self.depth(row);
+            let least = V::constant(self.z_min);
             let d_z = -(d[SCALE] + d[SCALE + 1] + d[SCALE + 2]) / depth.max(least);
-            let d_z = M::V::select(least.lt(depth), d_z, zero);
+            let d_z = least.lt(depth).select_or_zero(d_z);
             for i in 0..3 {
                 let mean = &mut out[LANE_MEAN + i];
-                *mean = m.of(self.source.rotation[i][2]).fma(d_z, *mean);
-                let (s, least) = (row[LANE_SCALE + i], m.of(self.scale_min));
+                *mean = V::constant(self.source.rotation[i][2]).fma(d_z, *mean);
+                let (s, least) = (row[LANE_SCALE + i], V::constant(self.scale_min));
                 let slope = d[SCALE + i] / s.max(least);
-                out[LANE_SCALE + i] = M::V::select(least.lt(s), slope, zero);
+                out[LANE_SCALE + i] = least.lt(s).select_or_zero(slope);
             }
         }
-        let negative = self.quat(m, row)[0].lt(zero);
+        let negative = self.quat(row)[0].lt(zero);
         let mut d_quat = [d[QUAT], d[QUAT + 1], d[QUAT + 2], d[QUAT + 3]];
         for v in &mut d_quat {
-            *v = M::V::select(negative, -*v, *v);
+            *v = negative.select(-*v, *v);
         }
         for (i, to) in out[LANE_QUAT..LANE_QUAT + 4].iter_mut().enumerate() {
             *to = d_quat[i];
             if let Some(frame) = &self.frame {
-                *to = m.of(frame.turn[0][i]) * d_quat[0];
+                *to = V::constant(frame.turn[0][i]) * d_quat[0];
                 for (row, d) in frame.turn.iter().zip(d_quat).skip(1) {
-                    *to = m.of(row[i]).fma(d, *to);
+                    *to = V::constant(row[i]).fma(d, *to);
                 }
             }
         }
         out[LANE_OPACITY] = d[OPACITY];
         if let Some(most) = self.logit {
             let low = 1.0 / (1.0 + most.exp());
-            let (p, low, high) = (row[LANE_OPACITY], m.of(low), m.of(1.0 - low));
+            let (p, low, high) = (row[LANE_OPACITY], V::constant(low), V::constant(1.0 - low));
             let held = p.max(low).min(high);
-            let slope = d[OPACITY] / (held * (m.of(1.0) - held));
-            let inside = M::V::select(p.lt(high), slope, zero);
-            out[LANE_OPACITY] = M::V::select(low.lt(p), inside, zero);
+            let slope = d[OPACITY] / (held * (V::constant(1.0) - held));
+            let inside = p.lt(high).select_or_zero(slope);
+            out[LANE_OPACITY] = low.lt(p).select_or_zero(inside);
         }
         out
     }
@@ -230,26 +231,26 @@ struct Block<'a, T> {
     out: &'a mut [T],
 }
 
-impl<T: LaneReal> Kernel<T> for Block<'_, T> {
+impl<T: Real> VectorKernel<T> for Block<'_, T> {
     type Output = ();
     #[inline(always)]
-    fn run<M: Machine<Scalar = T>>(self, m: M) {
+    fn run<V: Vector<Element = T>>(self) {
         let n = self.rows.len() / SPLAT_LANES;
-        for first in (0..n).step_by(M::WIDTH) {
-            let span = (SPLAT_LANES, M::WIDTH.min(n - first));
+        for first in (0..n).step_by(V::LANES) {
+            let layout = RowLayout { stride: SPLAT_LANES, count: V::LANES.min(n - first) };
             let at = first * SPLAT_LANES;
-            let row = m.load_rows(&self.rows[at..], span);
+            let row = V::load_rows(&self.rows[at..], layout);
             let out = match self.reached {
-                None => self.attributes.forward(m, &row),
-                Some(d) => self.attributes.backward(m, &row, &m.load_rows(&d[at..], span)),
+                None => self.attributes.forward(&row),
+                Some(d) => self.attributes.backward(&row, &V::load_rows(&d[at..], layout)),
             };
-            m.store_rows(&out, span, &mut self.out[at..]);
+            V::store_rows(&out, layout, &mut self.out[at..]);
         }
     }
 }
 
 /// Attributes of `rows` into `out` (module doc).
-pub fn forward<T: LaneReal>(attributes: &Attributes, rows: &[T], out: &mut [T]) {
+pub fn forward<T: Real>(attributes: &Attributes, rows: &[T], out: &mut [T]) {
     let size = BLOCK * SPLAT_LANES;
     rows.par_chunks(size).zip(out.par_chunks_mut(size)).for_each(|(rows, out)| {
         T::dispatch(Block { attributes, rows, reached: None, out });
@@ -257,7 +258,7 @@ pub fn forward<T: LaneReal>(attributes: &Attributes, rows: &[T], out: &mut [T]) 
 }
 
 /// The gradient by `rows` into `out`, for `reached` `[n, 11]`.
-pub fn backward<T: LaneReal>(attributes: &Attributes, rows: &[T], reached: &[T], out: &mut [T]) {
+pub fn backward<T: Real>(attributes: &Attributes, rows: &[T], reached: &[T], out: &mut [T]) {
     let size = BLOCK * SPLAT_LANES;
     let blocks = rows.par_chunks(size).zip(reached.par_chunks(size));
     blocks.zip(out.par_chunks_mut(size)).for_each(|((rows, reached), out)| {

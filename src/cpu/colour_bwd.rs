@@ -5,7 +5,7 @@ use crate::abi::{SH_COEFFICIENTS_MAX, ShBasis, sh_coefficients};
 use crate::cpu::project::SplatSlices;
 use crate::cpu::project_bwd::{GROUP, Group, L, Part, Pass, get, put};
 use crate::cpu::sh_bwd::{used_coefficients, values_and_slope};
-use crate::cpu::simd::Simd;
+use crate::cpu::simd::{Simd, Vector};
 
 /// Coefficients per channel of the degree that goes sixteen splats at a time: 3.
 const WIDE: usize = 16;
@@ -65,15 +65,15 @@ impl Directions {
     /// s_k of all lanes, [`WIDE`] of them, from the colour gradients `g` and the SH sets
     /// that begin at `sets` of `sh`.
     #[inline(always)]
-    fn weigh_all<S: Simd>(&mut self, lanes: S, sh: &[f32], sets: &[usize; GROUP], g: [&L; 3]) {
-        let [r, g, b] = g.map(|g| lanes.load(g));
+    fn weigh_all<S: Simd>(&mut self, s: S, sh: &[f32], sets: &[usize; GROUP], g: [&L; 3]) {
+        let [r, g, b] = g.map(|g| s.load(g));
         for q in 0..WIDE / 4 {
-            let [r0, g0, b0, r1] = lanes.load4(sh, sets, 12 * q);
-            let [g1, b1, r2, g2] = lanes.load4(sh, sets, 12 * q + 4);
-            let [b2, r3, g3, b3] = lanes.load4(sh, sets, 12 * q + 8);
+            let [r0, g0, b0, r1] = s.gather4(sh, sets, 12 * q);
+            let [g1, b1, r2, g2] = s.gather4(sh, sets, 12 * q + 4);
+            let [b2, r3, g3, b3] = s.gather4(sh, sets, 12 * q + 8);
             let sets = [[r0, g0, b0], [r1, g1, b1], [r2, g2, b2], [r3, g3, b3]];
-            for (s, h) in self.s[4 * q..].iter_mut().zip(sets) {
-                lanes.store(lanes.fma(h[0], r, lanes.fma(h[1], g, h[2] * b)), s);
+            for (to, h) in self.s[4 * q..].iter_mut().zip(sets) {
+                s.store(h[0].fma(r, h[1].fma(g, h[2] * b)), to);
             }
         }
     }
@@ -223,7 +223,7 @@ impl Pass<'_> {
         let gains = s.load(&gain);
         let mut weighted = [[0.0; GROUP]; 3];
         for (c, weighted) in weighted.iter_mut().enumerate() {
-            let moved = s.fma(gains, s.load(&seen.slope[c]), s.load(&group.d_mean[c]));
+            let moved = gains.fma(s.load(&seen.slope[c]), s.load(&group.d_mean[c]));
             s.store(moved, &mut group.d_mean[c]);
             s.store(gains * s.load(&group.sums[6 + c]), weighted);
         }

@@ -3,7 +3,7 @@
 
 use super::fresh::{Fresh, fill, start};
 use super::gemm::{Mat, copy};
-use super::simd::{Kernel, Simd, Tier};
+use super::simd::{Kernel, Simd, SimdLevel};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
@@ -57,7 +57,7 @@ pub fn transposed(x: &[f32], rows: usize, cols: usize) -> Vec<f32> {
             let (matrix, first) = (i * size / cols, i * size % cols);
             let data = &x[matrix * area + first..(matrix + 1) * area];
             let from = Mat { data, rows: size, cols: rows, row_stride: 1, col_stride: cols };
-            Tier::best().run(Turn { from, to: start(block) });
+            SimdLevel::best().run(Turn { from, to: start(block) });
         });
     } else if let Some(matrices) = PART.checked_div(area) {
         let size = matrices * area;
@@ -65,7 +65,7 @@ pub fn transposed(x: &[f32], rows: usize, cols: usize) -> Vec<f32> {
             let all = start(block).chunks_exact_mut(area).zip(x.chunks_exact(area));
             for (to, data) in all {
                 let from = Mat::new(data, rows, cols, cols).t();
-                Tier::best().run(Turn { from, to });
+                SimdLevel::best().run(Turn { from, to });
             }
         });
     }

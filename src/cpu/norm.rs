@@ -8,8 +8,9 @@ mod silu;
 
 use super::activation::{Activation, by_kind};
 use super::fresh::{Block, Fresh};
-use super::math::{sum_of, sums_of, vectorised};
-use super::simd::Tier;
+use super::simd::SimdLevel;
+use super::simd::vectorize;
+use super::sums::{sum_of, sums_of};
 use layer::Layer;
 use rayon::prelude::*;
 use silu::Silu;
@@ -78,13 +79,19 @@ pub(super) fn forward_to(rows: &Rows, x: &[f32], w: &[f32], b: &[f32], y: &mut B
     let layer = rows.run == 1 && rows.groups == 1 && rows.activation.is_none();
     x.par_chunks(chunk).zip(y.par_chunks_mut(chunk)).enumerate().for_each(|(at, (x, y))| {
         if layer {
-            return Tier::best().run(Layer { n: rows.len, eps: rows.eps, x, y, affine: [w, b] });
+            return SimdLevel::best().run(Layer {
+                n: rows.len,
+                eps: rows.eps,
+                x,
+                y,
+                affine: [w, b],
+            });
         }
         if rows.activation == Some(Activation::Silu) {
             let (first, affine) = (at * batch, [w, b]);
-            return Tier::best().run(Silu { rows, first, x, y, affine });
+            return SimdLevel::best().run(Silu { rows, first, x, y, affine });
         }
-        vectorised(
+        vectorize(
             #[inline(always)]
             || {
                 let pairs = x.chunks_exact(rows.len).zip(y.chunks_exact_mut(rows.len));
@@ -167,7 +174,7 @@ pub fn backward(rows: &Rows, s: &Saved<'_>) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
         .zip(sums.par_chunks_mut(per_task))
         .enumerate()
         .for_each(|(at, (((x, dy), dx), sums))| {
-            vectorised(
+            vectorize(
                 #[inline(always)]
                 || {
                     let lines = x.chunks_exact(rows.len).zip(dy.chunks_exact(rows.len));

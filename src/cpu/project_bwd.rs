@@ -17,7 +17,7 @@ use crate::cpu::ewa::{Footprint, View};
 use crate::cpu::ewa_bwd::{Moments, Whitening, cov6_gradient, quat_gradient};
 use crate::cpu::project::{Geometry, SplatSlices, lanes_at};
 use crate::cpu::raster_bwd_tile::{PairSums, SUMS};
-use crate::cpu::simd::{Kernel, Simd, Tier};
+use crate::cpu::simd::{Kernel, Simd, SimdLevel};
 use rayon::prelude::*;
 
 /// Splats side by side.
@@ -74,7 +74,7 @@ pub(crate) struct Group {
     d_opacity: L,
 }
 
-/// One part of a pass, compiled for a tier.
+/// One part of a pass, compiled for a level.
 struct PartOf<'a, 'b>(&'a Pass<'b>, Part<'a>);
 
 impl Kernel for PartOf<'_, '_> {
@@ -88,7 +88,7 @@ impl Kernel for PartOf<'_, '_> {
 
 impl Pass<'_> {
     /// Fills `out`, the background's gradient apart.
-    pub(crate) fn run(&self, tier: Tier, out: &mut Gradients) {
+    pub(crate) fn run(&self, level: SimdLevel, out: &mut Gradients) {
         let n = self.splats.len();
         out.fit(self.splats);
         let children = self.splats.children_per_parent();
@@ -116,7 +116,7 @@ impl Pass<'_> {
                 gain_lanes,
             })
             .collect();
-        parts.into_par_iter().for_each(|part| tier.run(PartOf(self, part)));
+        parts.into_par_iter().for_each(|part| level.run(PartOf(self, part)));
     }
 
     #[inline(always)]

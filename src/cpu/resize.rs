@@ -4,7 +4,7 @@
 use super::activation::{self, Activation};
 use super::fresh::{Fresh, start};
 use super::join::repeat;
-use super::math::vectorised;
+use super::simd::vectorize;
 use rayon::prelude::*;
 
 /// Sizes of one resize of planes.
@@ -53,7 +53,7 @@ impl Bilinear {
                 *o = (1.0 - f) * x[left] + f * x[right];
             }
         }
-        vectorised(
+        vectorize(
             #[inline(always)]
             || {
                 for (y, &(top, bottom, f)) in y.chunks_exact_mut(to_w).zip(&self.rows) {
@@ -71,7 +71,7 @@ impl Bilinear {
         let (w, to_w) = (self.from[1], self.to[1]);
         wide.clear();
         wide.resize(self.from[0] * to_w, 0.0);
-        vectorised(
+        vectorize(
             #[inline(always)]
             || {
                 for (dy, &(top, bottom, f)) in dy.chunks_exact(to_w).zip(&self.rows) {

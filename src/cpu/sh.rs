@@ -5,8 +5,7 @@
 //! coefficients `[D, 3]`, RGB innermost. Out: RGB before gain, offset and clamp.
 
 use crate::abi::{SH_COEFFICIENTS_MAX, ShBasis, sh_coefficients};
-use crate::cpu::simd::{LANES, Simd};
-use std::ops::{Add, Mul, Sub};
+use crate::cpu::simd::{LANES, Mask, Simd, Vector};
 
 /// Highest degree that `basis` evaluates.
 pub fn degree_max(basis: ShBasis) -> usize {
@@ -16,108 +15,71 @@ pub fn degree_max(basis: ShBasis) -> usize {
     }
 }
 
-/// Basis functions of `basis` up to `degree` at the unit vector `d`; the rest is 0.
-pub fn basis(basis: ShBasis, degree: usize, d: [f32; 3]) -> [f32; SH_COEFFICIENTS_MAX] {
-    functions(One, basis, degree, d)
-}
-
-/// One text for one direction and for lanes of them.
+/// Evaluates the functions of `basis` up to `degree` at the unit vectors `d`; the rest is 0.
 #[inline(always)]
-fn functions<T: Number, K: Constants<T>>(
-    k: K,
-    basis: ShBasis,
-    degree: usize,
-    d: [T; 3],
-) -> [T; SH_COEFFICIENTS_MAX] {
+pub fn basis<V: Vector>(basis: ShBasis, degree: usize, d: [V; 3]) -> [V; SH_COEFFICIENTS_MAX] {
     let [x, y, z] = d;
     match basis {
-        ShBasis::Standard => standard(k, degree, d),
+        ShBasis::Standard => standard(degree, d),
         ShBasis::Mvsplat => {
             let degree = degree.min(degree_max(ShBasis::Mvsplat));
-            let mut out = standard(k, degree, [z, x, y]);
+            let mut out = standard(degree, [z, x, y]);
             if degree == 3 {
-                out[14] = k.of(1.445_305_7) * z * (z * z - x * x);
+                out[14] = V::constant(1.445_305_7) * z * (z * z - x * x);
             }
             out
         }
     }
 }
 
-/// What [`functions`] needs of its numbers.
-trait Number: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> {}
-impl<T: Copy + Add<Output = T> + Sub<Output = T> + Mul<Output = T>> Number for T {}
-
-/// What makes constants among them.
-trait Constants<T>: Copy {
-    fn of(self, v: f32) -> T;
-}
-
-#[derive(Clone, Copy)]
-struct One;
-
-impl Constants<f32> for One {
-    #[inline(always)]
-    fn of(self, v: f32) -> f32 {
-        v
-    }
-}
-
-#[derive(Clone, Copy)]
-struct Sixteen<S>(S);
-
-impl<S: Simd> Constants<S::F> for Sixteen<S> {
-    #[inline(always)]
-    fn of(self, v: f32) -> S::F {
-        self.0.splat(v)
-    }
-}
-
+/// Real SH with the Condon-Shortley sign (3DGS) up to `degree`.
 #[inline(always)]
-fn standard<T: Number, K: Constants<T>>(
-    k: K,
-    degree: usize,
-    [x, y, z]: [T; 3],
-) -> [T; SH_COEFFICIENTS_MAX] {
-    let mut b = [k.of(0.0); SH_COEFFICIENTS_MAX];
-    b[0] = k.of(0.282_094_8);
+fn standard<V: Vector>(degree: usize, [x, y, z]: [V; 3]) -> [V; SH_COEFFICIENTS_MAX] {
+    let c = V::constant;
+    let mut b = [c(0.0); SH_COEFFICIENTS_MAX];
+    b[0] = c(0.282_094_8);
     if degree == 0 {
         return b;
     }
-    b[1] = k.of(-0.488_602_52) * y;
-    b[2] = k.of(0.488_602_52) * z;
-    b[3] = k.of(-0.488_602_52) * x;
+    b[1] = c(-0.488_602_52) * y;
+    b[2] = c(0.488_602_52) * z;
+    b[3] = c(-0.488_602_52) * x;
     if degree == 1 {
         return b;
     }
     let (xx, yy, zz) = (x * x, y * y, z * z);
     let (xy, yz, xz) = (x * y, y * z, x * z);
-    b[4] = k.of(1.092_548_5) * xy;
-    b[5] = k.of(-1.092_548_5) * yz;
-    b[6] = k.of(0.315_391_57) * (k.of(2.0) * zz - xx - yy);
-    b[7] = k.of(-1.092_548_5) * xz;
-    b[8] = k.of(0.546_274_24) * (xx - yy);
+    let (difference, two, three) = (xx - yy, c(2.0), c(3.0));
+    b[4] = c(1.092_548_5) * xy;
+    b[5] = c(-1.092_548_5) * yz;
+    b[6] = c(0.315_391_57) * (two * zz - xx - yy);
+    b[7] = c(-1.092_548_5) * xz;
+    b[8] = c(0.546_274_24) * difference;
     if degree == 2 {
         return b;
     }
-    b[9] = k.of(-0.590_043_6) * y * (k.of(3.0) * xx - yy);
-    b[10] = k.of(2.890_611_4) * xy * z;
-    b[11] = k.of(-0.457_045_8) * y * (k.of(4.0) * zz - xx - yy);
-    b[12] = k.of(0.373_176_34) * z * (k.of(2.0) * zz - k.of(3.0) * xx - k.of(3.0) * yy);
-    b[13] = k.of(-0.457_045_8) * x * (k.of(4.0) * zz - xx - yy);
-    b[14] = k.of(1.445_305_7) * z * (xx - yy);
-    b[15] = k.of(-0.590_043_6) * x * (xx - k.of(3.0) * yy);
+    let (left, right) = (three * xx - yy, xx - three * yy);
+    let rest = c(4.0) * zz - xx - yy;
+    b[9] = c(-0.590_043_6) * y * left;
+    b[10] = c(2.890_611_4) * xy * z;
+    b[11] = c(-0.457_045_8) * y * rest;
+    b[12] = c(0.373_176_34) * z * (two * zz - three * xx - three * yy);
+    b[13] = c(-0.457_045_8) * x * rest;
+    b[14] = c(1.445_305_7) * z * difference;
+    b[15] = c(-0.590_043_6) * x * right;
     if degree == 3 {
         return b;
     }
-    b[16] = k.of(2.503_343) * xy * (xx - yy);
-    b[17] = k.of(-1.770_130_8) * yz * (k.of(3.0) * xx - yy);
-    b[18] = k.of(0.946_174_7) * xy * (k.of(7.0) * zz - k.of(1.0));
-    b[19] = k.of(-0.669_046_5) * yz * (k.of(7.0) * zz - k.of(3.0));
-    b[20] = k.of(0.105_785_55) * (zz * (k.of(35.0) * zz - k.of(30.0)) + k.of(3.0));
-    b[21] = k.of(-0.669_046_5) * xz * (k.of(7.0) * zz - k.of(3.0));
-    b[22] = k.of(0.473_087_34) * (xx - yy) * (k.of(7.0) * zz - k.of(1.0));
-    b[23] = k.of(-1.770_130_8) * xz * (xx - k.of(3.0) * yy);
-    b[24] = k.of(0.625_835_7) * (xx * (xx - k.of(3.0) * yy) - yy * (k.of(3.0) * xx - yy));
+    let seven = c(7.0) * zz;
+    b[16] = c(2.503_343) * xy * difference;
+    b[17] = c(-1.770_130_8) * yz * left;
+    b[18] = c(0.946_174_7) * xy * (seven - c(1.0));
+    b[19] = c(-0.669_046_5) * yz * (seven - three);
+    b[20] = c(0.105_785_55) * (zz * (c(35.0) * zz - c(30.0)) + three);
+    b[21] = c(-0.669_046_5) * xz * (seven - three);
+    b[22] = c(0.473_087_34) * difference * (seven - c(1.0));
+    b[23] = c(-1.770_130_8) * xz * right;
+    b[24] = c(0.625_835_7) * (xx * right - yy * left);
     b
 }
 
@@ -147,18 +109,18 @@ pub(crate) fn radiance_lanes<S: Simd>(
 ) -> [S::F; 3] {
     let degree = degree.min(degree_max(kind));
     let used = sh_coefficients(degree);
-    let b = functions(Sixteen(s), kind, degree, d);
+    let b = basis(kind, degree, d);
     let mut rgb = [s.splat(0.0); 3];
     // Four coefficients are twelve floats, three transposed quads.
     let mut c = 0;
     while c + 4 <= used {
-        let [r0, g0, b0, r1] = s.load4(sh, at, 3 * c);
-        let [g1, b1, r2, g2] = s.load4(sh, at, 3 * c + 4);
-        let [b2, r3, g3, b3] = s.load4(sh, at, 3 * c + 8);
+        let [r0, g0, b0, r1] = s.gather4(sh, at, 3 * c);
+        let [g1, b1, r2, g2] = s.gather4(sh, at, 3 * c + 4);
+        let [b2, r3, g3, b3] = s.gather4(sh, at, 3 * c + 8);
         let (y0, y1, y2, y3) = (b[c], b[c + 1], b[c + 2], b[c + 3]);
-        rgb[0] = s.fma(r3, y3, s.fma(r2, y2, s.fma(r1, y1, s.fma(r0, y0, rgb[0]))));
-        rgb[1] = s.fma(g3, y3, s.fma(g2, y2, s.fma(g1, y1, s.fma(g0, y0, rgb[1]))));
-        rgb[2] = s.fma(b3, y3, s.fma(b2, y2, s.fma(b1, y1, s.fma(b0, y0, rgb[2]))));
+        rgb[0] = r3.fma(y3, r2.fma(y2, r1.fma(y1, r0.fma(y0, rgb[0]))));
+        rgb[1] = g3.fma(y3, g2.fma(y2, g1.fma(y1, g0.fma(y0, rgb[1]))));
+        rgb[2] = b3.fma(y3, b2.fma(y2, b1.fma(y1, b0.fma(y0, rgb[2]))));
         c += 4;
     }
     // (degree + 1)² leaves one or none.
@@ -170,9 +132,9 @@ pub(crate) fn radiance_lanes<S: Simd>(
                 lanes[l] = *v;
             }
         }
-        rgb[0] = s.fma(s.load(&last[0]), b[c], rgb[0]);
-        rgb[1] = s.fma(s.load(&last[1]), b[c], rgb[1]);
-        rgb[2] = s.fma(s.load(&last[2]), b[c], rgb[2]);
+        rgb[0] = s.load(&last[0]).fma(b[c], rgb[0]);
+        rgb[1] = s.load(&last[1]).fma(b[c], rgb[1]);
+        rgb[2] = s.load(&last[2]).fma(b[c], rgb[2]);
     }
     rgb
 }
@@ -180,10 +142,14 @@ pub(crate) fn radiance_lanes<S: Simd>(
 /// [`direction`] of sixteen vectors.
 #[inline(always)]
 pub(crate) fn direction_lanes<S: Simd>(s: S, v: [S::F; 3]) -> [S::F; 3] {
-    let norm = s.sqrt(s.fma(v[0], v[0], s.fma(v[1], v[1], v[2] * v[2])));
-    let good = s.lt(s.splat(0.0), norm) & s.lt(norm, s.splat(f32::INFINITY));
-    let inverse = s.keep(good, s.splat(1.0) / norm);
-    [s.keep(good, v[0] * inverse), s.keep(good, v[1] * inverse), s.keep(good, v[2] * inverse)]
+    let norm = v[0].fma(v[0], v[1].fma(v[1], v[2] * v[2])).sqrt();
+    let good = s.splat(0.0).lt(norm) & norm.lt(s.splat(f32::INFINITY));
+    let inverse = good.select_or_zero(s.splat(1.0) / norm);
+    [
+        good.select_or_zero(v[0] * inverse),
+        good.select_or_zero(v[1] * inverse),
+        good.select_or_zero(v[2] * inverse),
+    ]
 }
 
 /// `v` / ‖v‖, or the zero vector where that has no direction.
@@ -195,7 +161,7 @@ pub fn direction(v: [f32; 3]) -> [f32; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cpu::simd::{Kernel, Tier};
+    use crate::cpu::simd::{Kernel, SimdLevel};
     use glam::DVec3;
 
     fn directions() -> impl Iterator<Item = DVec3> {
@@ -267,7 +233,7 @@ mod tests {
         }
     }
 
-    /// Sixteen at a time give what one at a time does, in every tier, for sets of
+    /// Sixteen at a time give what one at a time does, in every level, for sets of
     /// any degree stored and evaluated, the last set of the slice included.
     #[test]
     fn lanes_are_the_single_one() {
@@ -282,14 +248,17 @@ mod tests {
             let at = std::array::from_fn(|l| (l * 5 % 9) * set);
             for degree in 0..=stored {
                 for kind in [ShBasis::Standard, ShBasis::Mvsplat] {
-                    for &tier in Tier::available() {
-                        let got = tier.run(Lanes(kind, degree, &vectors, &sh, &at));
+                    for &level in SimdLevel::available() {
+                        let got = level.run(Lanes(kind, degree, &vectors, &sh, &at));
                         for l in 0..LANES {
                             let set = &sh[at[l]..at[l] + set];
                             let expected = radiance(kind, degree, direction(vectors[l]), set);
                             for c in 0..3 {
                                 let (a, b) = (got[c][l], expected[c]);
-                                assert!((a - b).abs() < 2e-6, "{tier:?} {stored} {degree} {a} {b}");
+                                assert!(
+                                    (a - b).abs() < 2e-6,
+                                    "{level:?} {stored} {degree} {a} {b}"
+                                );
                             }
                         }
                     }

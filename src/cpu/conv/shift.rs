@@ -5,7 +5,7 @@ use super::Buffers;
 use super::plan::{Axes, Layout, Pack, Plan, starts};
 use crate::cpu::disjoint::Disjoint;
 use crate::cpu::fresh::{self, fill, room};
-use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
+use crate::cpu::simd::{Kernel, LANES, Simd, SimdLevel, Vector};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
@@ -81,7 +81,7 @@ impl Weights {
 /// Runs `plan` on pictures `x` into `y`, which is overwritten; `bias` is empty or one
 /// value a channel written.
 pub(crate) fn run(
-    tier: Tier,
+    level: SimdLevel,
     plan: &Plan,
     x: &[f32],
     w: &Weights,
@@ -114,8 +114,8 @@ pub(crate) fn run(
             let Buffers { x: packed, y: sums, .. } = buffers;
             let packed = packed.room(plan.src_channels * layout.channel + SLACK);
             let sums = sums.room(plan.passes.len() * ROWS * layout.flat().next_multiple_of(LANES));
-            tier.run(Pack { plan, layout: &layout, x, start, out: packed });
-            tier.run(Job { plan, layout, packed, sums, w, blocks, bias, image, start, y: &y });
+            level.run(Pack { plan, layout: &layout, x, start, out: packed });
+            level.run(Job { plan, layout, packed, sums, w, blocks, bias, image, start, y: &y });
         });
     });
 }
@@ -259,9 +259,9 @@ pub(super) fn zip<S: Simd>(s: S, even: &[f32], odd: &[f32], to: &mut [MaybeUnini
     let (vectors, rest) = to.split_at_mut(2 * whole);
     let pairs = even.as_chunks().0.iter().zip(odd.as_chunks().0);
     for (to, (even, odd)) in vectors.chunks_exact_mut(2 * LANES).zip(pairs) {
-        let pair = s.zip(s.load(even), s.load(odd));
+        let pair = s.interleave(s.load(even), s.load(odd));
         for (to, v) in to.as_chunks_mut().0.iter_mut().zip(pair) {
-            s.store_fresh(v, to);
+            s.store_uninit(v, to);
         }
     }
     for (i, to) in rest.iter_mut().enumerate() {
@@ -398,7 +398,7 @@ impl Strip<'_> {
                     // (asserted by `run`), first + M ≤ P.
                     let weight = s.splat(unsafe { *w.wrapping_add(m) });
                     for n in 0..N {
-                        acc[m][n] = s.fma(weight, v[n], acc[m][n]);
+                        acc[m][n] = weight.fma(v[n], acc[m][n]);
                     }
                 }
                 w = w.wrapping_add(P);

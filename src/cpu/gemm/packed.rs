@@ -2,7 +2,7 @@
 
 use super::PANEL;
 use crate::cpu::fresh::room;
-use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
+use crate::cpu::simd::{Kernel, LANES, Simd, SimdLevel};
 use std::cell::Cell;
 
 /// A matrix inside a slice, any strides.
@@ -83,7 +83,7 @@ impl Packed {
         self.cols = rhs.cols;
         let to = room(&mut self.data, rhs.rows * rhs.cols.next_multiple_of(LANES));
         if !to.is_empty() {
-            Tier::best().run(Pack { rhs, to });
+            SimdLevel::best().run(Pack { rhs, to });
         }
     }
 

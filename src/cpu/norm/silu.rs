@@ -2,7 +2,8 @@
 
 use super::Rows;
 use crate::cpu::fresh::Block;
-use crate::cpu::simd::{Kernel, LANES, Simd, exp2_by_sums, first_lanes};
+use crate::cpu::simd::elementary::exp2_by_sums;
+use crate::cpu::simd::{Kernel, LANES, Simd, Vector, first_lanes_bits};
 
 /// Rows from number `first` on.
 pub(super) struct Silu<'a> {
@@ -48,24 +49,24 @@ impl Line {
         let (sources, last) = x.as_chunks::<LANES>();
         let (places, rest) = y.as_chunks_mut::<LANES>();
         for (y, x) in places.iter_mut().zip(sources) {
-            s.store_fresh(self.of(s, s.load(x)), y);
+            s.store_uninit(self.of(s, s.load(x)), y);
         }
         assert_eq!(last.len(), rest.len(), "normalisation: lengths");
         if last.is_empty() {
             return;
         }
-        let bits = first_lanes(last.len());
+        let bits = first_lanes_bits(last.len());
         // SAFETY: as many numbers and places.
         unsafe {
-            s.store_lanes(self.of(s, s.load_lanes(last.as_ptr(), bits)), rest.as_mut_ptr(), bits)
+            s.store_masked(self.of(s, s.load_masked(last.as_ptr(), bits)), rest.as_mut_ptr(), bits)
         };
     }
 
     #[inline(always)]
     fn of<S: Simd>(&self, s: S, x: S::F) -> S::F {
-        let v = s.fma(x - s.splat(self.mean), s.splat(self.scale), s.splat(self.shift));
+        let v = (x - s.splat(self.mean)).fma(s.splat(self.scale), s.splat(self.shift));
         // The second operand is what comes out of comparisons with NaN.
-        let p = s.max(s.splat(-125.0), v * s.splat(-std::f32::consts::LOG2_E));
-        v / (s.splat(1.0) + exp2_by_sums(s, s.min(s.splat(126.0), p)))
+        let p = (v * s.splat(-std::f32::consts::LOG2_E)).max(s.splat(-125.0));
+        v / (s.splat(1.0) + exp2_by_sums(p.min(s.splat(126.0))))
     }
 }

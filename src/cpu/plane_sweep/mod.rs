@@ -11,7 +11,8 @@ mod backward;
 pub use crate::abi::{Pair, Sweep};
 pub use backward::backward;
 
-use super::math::{dot, vectorised};
+use super::simd::vectorize;
+use super::sums::dot;
 use rayon::prelude::*;
 
 /// Where a sample falls: index of the upper left tap and the four weights, zero for
@@ -153,7 +154,7 @@ pub fn correlation(s: &Sweep, reference: &[f32], source: &[f32], out: &mut [f32]
             for pair in &s.pairs[r] {
                 let other = &source[pair.source * n * c..(pair.source + 1) * n * c];
                 let own = &reference[(r * n + y * w) * c..(r * n + (y + 1) * w) * c];
-                vectorised(
+                vectorize(
                     #[inline(always)]
                     || {
                         for (x, f) in own.chunks_exact(c).enumerate() {

@@ -10,8 +10,8 @@ use super::{Args, BLOCK, Rules, records};
 use crate::abi::{
     HEAD_GAIN, HEAD_LANES, HEAD_LOGIT, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES,
 };
-use crate::cpu::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};
 use crate::cpu::redistribute::share_backward;
+use crate::cpu::simd::{LANES, Real, RowLayout, Vector, VectorKernel};
 use rayon::prelude::*;
 
 /// One block of parents; the mutable slices are the block's own.
@@ -32,79 +32,78 @@ struct Scratch<V> {
     alphas: Vec<V>,
 }
 
-impl<T: LaneReal> Kernel<T> for Backward<'_, T> {
+impl<T: Real> VectorKernel<T> for Backward<'_, T> {
     type Output = ();
     #[inline(always)]
-    fn run<M: Machine<Scalar = T>>(mut self, m: M) {
-        let zeros = vec![m.of(0.0); self.args.rules.children()];
+    fn run<V: Vector<Element = T>>(mut self) {
+        let zeros = vec![V::constant(0.0); self.args.rules.children()];
         let mut scratch = Scratch { areas: zeros.clone(), logits: zeros.clone(), alphas: zeros };
-        for first in self.range.clone().step_by(M::WIDTH) {
-            let count = M::WIDTH.min(self.range.end - first);
-            self.group(m, (first, count), &mut scratch);
+        for first in self.range.clone().step_by(V::LANES) {
+            let count = V::LANES.min(self.range.end - first);
+            self.group((first, count), &mut scratch);
         }
     }
 }
 
-impl<T: LaneReal> Backward<'_, T> {
+impl<T: Real> Backward<'_, T> {
     #[inline(always)]
-    fn group<M: Machine<Scalar = T>>(&mut self, m: M, span: (usize, usize), s: &mut Scratch<M::V>) {
+    fn group<V: Vector<Element = T>>(&mut self, span: (usize, usize), s: &mut Scratch<V>) {
         let Args { rules, source, parents, .. } = self.args;
         let children = rules.children();
-        let parent = Parent::load(m, (rules, self.table, &source), parents, span);
+        let parent = Parent::load((rules, self.table, &source), parents, span);
         for k in 0..children {
-            let head = records(m, &self.args, span, k);
+            let head = records(&self.args, span, k);
             let child = Child::new(rules, &parent, k, &head);
             (s.areas[k], s.logits[k]) = (child.area, head[HEAD_LOGIT]);
-            s.alphas[k] = self.opacity(m, span, k);
+            s.alphas[k] = self.opacity(span, k);
         }
-        let mut d = ParentGradient::zero(m.of(0.0));
+        let mut d = ParentGradient::zero(V::constant(0.0));
         let of_parent = (parent.alpha, parent.own);
         (d.alpha, d.own) =
             share_backward(rules.opacity, of_parent, &mut s.alphas, &mut s.logits, &mut s.areas);
         let at = span.0 - self.range.start;
         for k in 0..children {
-            let head = records(m, &self.args, span, k);
+            let head = records(&self.args, span, k);
             let child = Child::new(rules, &parent, k, &head);
-            let mut d_head = [m.of(0.0); HEAD_LANES];
+            let mut d_head = [V::constant(0.0); HEAD_LANES];
             d_head[HEAD_LOGIT] = s.logits[k];
-            let g = self.cotangents(m, span, k, s.areas[k]);
+            let g = self.cotangents(span, k, s.areas[k]);
             child.backward((rules, &parent), g, &mut d_head, &mut d);
             let to = &mut self.head[(at * children + k) * HEAD_LANES..];
-            m.store_rows(&d_head, (children * HEAD_LANES, span.1), to);
+            V::store_rows(&d_head, RowLayout { stride: children * HEAD_LANES, count: span.1 }, to);
         }
         let d_parents = parent.backward(rules, d);
-        m.store_rows(&d_parents, (SPLAT_LANES, span.1), &mut self.parents[at * SPLAT_LANES..]);
+        V::store_rows(
+            &d_parents,
+            RowLayout { stride: SPLAT_LANES, count: span.1 },
+            &mut self.parents[at * SPLAT_LANES..],
+        );
     }
 
     /// Gradients of the opacity of child `k`.
     #[inline(always)]
-    fn opacity<M: Machine<Scalar = T>>(
-        &self,
-        m: M,
-        (first, count): (usize, usize),
-        k: usize,
-    ) -> M::V {
+    fn opacity<V: Vector<Element = T>>(&self, (first, count): (usize, usize), k: usize) -> V {
         let children = self.args.rules.children();
         let from = &self.grad[(first * children + k) * SPLAT_LANES + LANE_OPACITY..];
-        let mut lanes = [T::default(); WIDTH_MAX];
-        for (lane, out) in lanes[..M::WIDTH].iter_mut().enumerate() {
+        let mut lanes = [T::default(); LANES];
+        for (lane, out) in lanes[..V::LANES].iter_mut().enumerate() {
             *out = from[lane.min(count - 1) * children * SPLAT_LANES];
         }
-        m.load(&lanes)
+        V::load(&lanes)
     }
 
     /// Gradients of mean, quaternion and σ of child `k`, and that of its area.
     #[inline(always)]
-    fn cotangents<M: Machine<Scalar = T>>(
+    fn cotangents<V: Vector<Element = T>>(
         &self,
-        m: M,
         (first, count): (usize, usize),
         k: usize,
-        area: M::V,
-    ) -> ChildGradient<M::V> {
+        area: V,
+    ) -> ChildGradient<V> {
         let children = self.args.rules.children();
         let from = &self.grad[(first * children + k) * SPLAT_LANES..];
-        let g: [M::V; SPLAT_LANES] = m.load_rows(from, (children * SPLAT_LANES, count));
+        let g: [V; SPLAT_LANES] =
+            V::load_rows(from, RowLayout { stride: children * SPLAT_LANES, count });
         let vector = |i: usize| [g[i], g[i + 1], g[i + 2]];
         let q = LANE_QUAT;
         ChildGradient {
@@ -119,7 +118,7 @@ impl<T: LaneReal> Backward<'_, T> {
 /// Gradients into `head` `[N, K, 11]` and `parents` `[N, 11]` for those of the
 /// children, `grad` `[N·K, 11]`. Each parent is one task's own: any number of threads
 /// gives the same bytes.
-pub fn backward<T: LaneReal>(args: Args<T>, grad: &[T], head: &mut [T], parents: &mut [T]) {
+pub fn backward<T: Real>(args: Args<T>, grad: &[T], head: &mut [T], parents: &mut [T]) {
     let table = Table::new(&args.source);
     head.par_chunks_mut(BLOCK * args.rules.children() * HEAD_LANES)
         .zip(parents.par_chunks_mut(BLOCK * SPLAT_LANES))
@@ -141,23 +140,24 @@ struct GainsBackward<'a, T> {
     out: &'a mut [T],
 }
 
-impl<T: LaneReal> Kernel<T> for GainsBackward<'_, T> {
+impl<T: Real> VectorKernel<T> for GainsBackward<'_, T> {
     type Output = ();
     #[inline(always)]
-    fn run<M: Machine<Scalar = T>>(self, m: M) {
+    fn run<V: Vector<Element = T>>(self) {
         let lanes = self.rules.gain_lanes();
         let count = self.head.len() / HEAD_LANES;
-        for first in (0..count).step_by(M::WIDTH) {
-            let width = M::WIDTH.min(count - first);
-            let (mut raw, mut by_gain) = ([T::default(); WIDTH_MAX], [T::default(); WIDTH_MAX]);
+        for first in (0..count).step_by(V::LANES) {
+            let width = V::LANES.min(count - first);
+            let (mut raw, mut by_gain) = ([T::default(); LANES], [T::default(); LANES]);
             for lane in 0..width {
                 raw[lane] = self.head[(first + lane) * HEAD_LANES + HEAD_GAIN];
                 let grad = &self.grad[(first + lane) * lanes..][..lanes];
                 let residual: T = grad[1..].iter().copied().sum();
-                by_gain[lane] = grad[0] + T::of(0.5) * residual;
+                by_gain[lane] = grad[0] + T::constant(0.5) * residual;
             }
-            let t = m.load(&raw).tanh();
-            m.store(m.load(&by_gain) * m.of(self.rules.delta) * (m.of(1.0) - t * t), &mut raw);
+            let t = V::load(&raw).tanh();
+            (V::load(&by_gain) * V::constant(self.rules.delta) * (V::constant(1.0) - t * t))
+                .store(&mut raw);
             for (lane, &d) in raw[..width].iter().enumerate() {
                 self.out[(first + lane) * HEAD_LANES + HEAD_GAIN] = d;
             }
@@ -167,7 +167,7 @@ impl<T: LaneReal> Kernel<T> for GainsBackward<'_, T> {
 
 /// Gradients into lane [`HEAD_GAIN`] of `out` `[N, K, 11]`, for those of the gains,
 /// `grad` `[N·K]` or `[N·K, 4]`; nothing else is written.
-pub fn gains_backward<T: LaneReal>(rules: &Rules, head: &[T], grad: &[T], out: &mut [T]) {
+pub fn gains_backward<T: Real>(rules: &Rules, head: &[T], grad: &[T], out: &mut [T]) {
     out.par_chunks_mut(GAIN_BLOCK * HEAD_LANES)
         .zip(head.par_chunks(GAIN_BLOCK * HEAD_LANES))
         .zip(grad.par_chunks(GAIN_BLOCK * rules.gain_lanes()))

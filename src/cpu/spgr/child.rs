@@ -4,17 +4,15 @@
 use super::Rules;
 use super::parent::{Parent, ParentGradient};
 use super::shape::{Footprint, Turn, Unit, conjugate, matrix, matrix_backward, multiply};
-use super::view::{
-    Jacobian, M3, V3, add, add4, axpy, dot, kept, product, scaled, times, transposed,
-};
+use super::view::{Jacobian, M3, V3, add, add4, axpy, dot, product, scaled, times, transposed};
 use crate::abi::{
     DEPTH_FRACTION_MIN, HEAD_DEPTH, HEAD_LANES, HEAD_LOG_SCALE, HEAD_OFFSET, HEAD_ROTATION,
 };
-use crate::cpu::lanes::Lanes;
 use crate::cpu::redistribute::Rule;
+use crate::cpu::simd::{Mask, Vector};
 
 /// The camera-frame step of a child, and what its gradient needs.
-struct Step<V: Lanes> {
+struct Step<V: Vector> {
     out: V3<V>,
     /// tanh of the learned offset, where it is bounded.
     bounded: [V; 2],
@@ -29,11 +27,10 @@ struct Step<V: Lanes> {
     ray: Option<(V, V, V::Mask)>,
 }
 
-impl<V: Lanes> Step<V> {
+impl<V: Vector> Step<V> {
     #[inline(always)]
     fn new(rules: &Rules, parent: &Parent<V>, k: usize, head: &[V; HEAD_LANES]) -> Self {
         let z = parent.z;
-        let of = |v: f64| z.of(v);
         let per_side = 1.0 / rules.side as f64;
         let cell = [k % rules.side, k / rules.side];
         let learned = [head[HEAD_OFFSET], head[HEAD_OFFSET + 1]];
@@ -41,33 +38,36 @@ impl<V: Lanes> Step<V> {
             Some(bound) => ([learned[0].tanh(), learned[1].tanh()], bound * per_side),
             None => (learned, per_side),
         };
-        let grid = |i: usize| of((cell[i] as f64 + 0.5) * per_side - 0.5);
-        let offset = [bounded[0].fma(of(per_px), grid(0)), bounded[1].fma(of(per_px), grid(1))];
+        let grid = |i: usize| V::constant((cell[i] as f64 + 0.5) * per_side - 0.5);
+        let offset = [
+            bounded[0].fma(V::constant(per_px), grid(0)),
+            bounded[1].fma(V::constant(per_px), grid(1)),
+        ];
         let f = parent.view.focal;
-        let mut s = [z * offset[0] / f[0], z * offset[1] / f[1], of(0.0)];
-        let mut along_disc = of(0.0);
+        let mut s = [z * offset[0] / f[0], z * offset[1] / f[1], V::constant(0.0)];
+        let mut along_disc = V::constant(0.0);
         if let Some(disc) = &parent.disc {
             let [u, v] = disc.steps;
             let d = axpy(offset[1], v, scaled(u, offset[0]));
             // Both steps project alike to first order, so a mixture does: an edge-on
             // disc slides at most a tenth of its depth.
-            let tenth = of(DEPTH_FRACTION_MIN) * z;
-            along_disc = kept(disc.solid, tenth / d[2].abs().max(tenth));
+            let tenth = V::constant(DEPTH_FRACTION_MIN) * z;
+            along_disc = disc.solid.select_or_zero(tenth / d[2].abs().max(tenth));
             s = axpy(along_disc, [d[0] - s[0], d[1] - s[1], d[2] - s[2]], s);
         }
         let tanh_z = head[HEAD_DEPTH].tanh();
-        let mut dz = of(rules.beta_z) * tanh_z;
+        let mut dz = V::constant(rules.beta_z) * tanh_z;
         if rules.relative_depth {
             dz = dz * z;
         }
-        let least = of(DEPTH_FRACTION_MIN - 1.0) * z - s[2];
+        let least = V::constant(DEPTH_FRACTION_MIN - 1.0) * z - s[2];
         let free_z = least.lt(dz);
         let dz = dz.max(least);
         let side = [s[0], s[1]];
         let mut ray = None;
         if rules.ray {
             let ahead = parent.in_camera[2] + s[2];
-            let inverse = of(1.0) / ahead.max(parent.view.z_min);
+            let inverse = V::constant(1.0) / ahead.max(parent.view.z_min);
             let share = dz * inverse;
             for (s, x) in s.iter_mut().zip(parent.in_camera).take(2) {
                 *s = share.fma(x + *s, *s);
@@ -88,10 +88,9 @@ impl<V: Lanes> Step<V> {
         d: &mut ParentGradient<V>,
     ) {
         let z = parent.z;
-        let of = |v: f64| z.of(v);
         let mut d_dz = d_s[2];
         if let Some((share, inverse, free)) = self.ray {
-            let mut d_share = of(0.0);
+            let mut d_share = V::constant(0.0);
             #[expect(
                 clippy::needless_range_loop,
                 reason = "three arrays, and iterators do not inline"
@@ -103,21 +102,21 @@ impl<V: Lanes> Step<V> {
             }
             let each = d_share * inverse;
             d_dz = d_dz + each;
-            let d_ahead = kept(free, -each * share);
+            let d_ahead = free.select_or_zero(-each * share);
             d.in_camera[2] = d.in_camera[2] + d_ahead;
             d_s[2] = d_s[2] + d_ahead;
         }
-        let free_dz = kept(self.free_z, d_dz);
+        let free_dz = self.free_z.select_or_zero(d_dz);
         let bound_dz = d_dz - free_dz;
-        d.z = bound_dz.fma(of(DEPTH_FRACTION_MIN - 1.0), d.z);
+        d.z = bound_dz.fma(V::constant(DEPTH_FRACTION_MIN - 1.0), d.z);
         d_s[2] = d_s[2] - bound_dz;
-        let mut d_tanh = free_dz * of(rules.beta_z);
+        let mut d_tanh = free_dz * V::constant(rules.beta_z);
         if rules.relative_depth {
             d.z = d_tanh.fma(self.tanh_z, d.z);
             d_tanh = d_tanh * z;
         }
-        d_head[HEAD_DEPTH] = d_tanh * (of(1.0) - self.tanh_z * self.tanh_z);
-        let mut d_offset = [of(0.0); 2];
+        d_head[HEAD_DEPTH] = d_tanh * (V::constant(1.0) - self.tanh_z * self.tanh_z);
+        let mut d_offset = [V::constant(0.0); 2];
         let mut d_flat = d_s;
         if let Some(disc) = &parent.disc {
             let d_slid = scaled(d_s, self.along_disc);
@@ -134,14 +133,16 @@ impl<V: Lanes> Step<V> {
             d.z = per.fma(self.offset[i], d.z);
             let t = self.bounded[i];
             d_head[HEAD_OFFSET + i] = match rules.offset_bound {
-                Some(bound) => d_offset[i] * of(bound * per_side) * (of(1.0) - t * t),
-                None => d_offset[i] * of(per_side),
+                Some(bound) => {
+                    d_offset[i] * V::constant(bound * per_side) * (V::constant(1.0) - t * t)
+                }
+                None => d_offset[i] * V::constant(per_side),
             };
         }
     }
 }
 
-pub(super) struct Child<V: Lanes> {
+pub(super) struct Child<V: Vector> {
     step: Step<V>,
     turn: Turn<V>,
     unit: Unit<V>,
@@ -172,19 +173,18 @@ pub(super) struct ChildGradient<V> {
     pub(super) area: V,
 }
 
-impl<V: Lanes> Child<V> {
+impl<V: Vector> Child<V> {
     #[inline(always)]
     pub(super) fn new(rules: &Rules, parent: &Parent<V>, k: usize, head: &[V; HEAD_LANES]) -> Self {
         let step = Step::new(rules, parent, k, head);
-        let of = |v: f64| parent.z.of(v);
         let mean = add(parent.mean, times(&parent.view.rotation, step.out));
-        let c = of(rules.dlog_clamp);
-        let per_c = of(1.0 / rules.dlog_clamp);
+        let c = V::constant(rules.dlog_clamp);
+        let per_c = V::constant(1.0 / rules.dlog_clamp);
         let l = HEAD_LOG_SCALE;
         let [x, y, z] = scaled([head[l], head[l + 1], head[l + 2]], per_c);
         let soft = [x.tanh(), y.tanh(), z.tanh()];
         let [x, y, z] = scaled(soft, c);
-        let factor = scaled([x.exp(), y.exp(), z.exp()], of(rules.lambda_s));
+        let factor = scaled([x.exp(), y.exp(), z.exp()], V::constant(rules.lambda_s));
         let small = product(factor, parent.scale);
         let r = HEAD_ROTATION;
         let turn = Turn::new([head[r], head[r + 1], head[r + 2]]);
@@ -195,7 +195,7 @@ impl<V: Lanes> Child<V> {
             Some(shared) => shared.jw,
             None => {
                 let at = add(parent.in_camera, step.out);
-                let own = Jacobian::new(&parent.view, at, of(rules.side as f64));
+                let own = Jacobian::new(&parent.view, at, V::constant(rules.side as f64));
                 let jw = own.jw;
                 jacobian = Some(own);
                 jw
@@ -203,7 +203,7 @@ impl<V: Lanes> Child<V> {
         };
         let footprint = Footprint::new(&jw, &rotation, small);
         let growth = footprint.growth(rules);
-        let clamped = footprint.area.max(of(rules.a_min));
+        let clamped = footprint.area.max(V::constant(rules.a_min));
         let area = match rules.opacity {
             Rule::OpticalDepth => footprint.blurred(growth, clamped, rules.lowpass_target),
             _ => clamped,
@@ -248,8 +248,7 @@ impl<V: Lanes> Child<V> {
         d_head: &mut [V; HEAD_LANES],
         d: &mut ParentGradient<V>,
     ) {
-        let of = |v: f64| parent.z.of(v);
-        let zero = of(0.0);
+        let zero = V::constant(0.0);
         let f = &self.footprint;
         let (d_clamped, d_m) = match rules.opacity {
             Rule::OpticalDepth => {
@@ -258,13 +257,13 @@ impl<V: Lanes> Child<V> {
             }
             _ => (g.area, [[zero; 3]; 2]),
         };
-        let d_area = kept(of(rules.a_min).lt(f.area), d_clamped);
+        let d_area = V::constant(rules.a_min).lt(f.area).select_or_zero(d_clamped);
         let jw = match (&parent.jacobian, &self.jacobian) {
             (Some(j), _) | (None, Some(j)) => &j.jw,
             (None, None) => return,
         };
         let (d_jw, d_rotation, by_area) = f.backward((jw, &self.rotation, self.small), d_area, d_m);
-        let c = of(1.0);
+        let c = V::constant(1.0);
         for i in 0..3 {
             let d_small = g.scale[i].fma(self.growth[i], by_area[i]);
             d.scale[i] = d_small.fma(self.factor[i], d.scale[i]);

@@ -35,8 +35,8 @@ pub use crate::abi::{CHILDREN_MAX, Rules};
 pub use backward::{backward, gains_backward};
 pub use project::{Target, project};
 
-use super::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};
 use super::redistribute::share;
+use super::simd::{LANES, Real, RowLayout, Vector, VectorKernel};
 use crate::abi::{
     HEAD_GAIN, HEAD_LANES, HEAD_LOGIT, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES,
 };
@@ -89,15 +89,14 @@ impl<T> Args<'_, T> {
 
 /// Head records of child `k` of `count` parents from `first` on.
 #[inline(always)]
-fn records<M: Machine>(
-    m: M,
-    args: &Args<M::Scalar>,
+fn records<V: Vector>(
+    args: &Args<V::Element>,
     (first, count): (usize, usize),
     k: usize,
-) -> [M::V; HEAD_LANES] {
+) -> [V; HEAD_LANES] {
     let children = args.rules.children();
     let from = &args.head[(first * children + k) * HEAD_LANES..];
-    m.load_rows(from, (children * HEAD_LANES, count))
+    V::load_rows(from, RowLayout { stride: children * HEAD_LANES, count })
 }
 
 /// One block of parents forward; `rows` and `gains` are the block's own.
@@ -109,56 +108,55 @@ struct Forward<'a, T> {
     gains: &'a mut [T],
 }
 
-impl<T: LaneReal> Kernel<T> for Forward<'_, T> {
+impl<T: Real> VectorKernel<T> for Forward<'_, T> {
     type Output = bool;
     #[inline(always)]
-    fn run<M: Machine<Scalar = T>>(mut self, m: M) -> bool {
+    fn run<V: Vector<Element = T>>(mut self) -> bool {
         let k = self.args.rules.children();
-        let (mut areas, mut alphas) = (vec![m.of(0.0); k], vec![m.of(0.0); k]);
+        let (mut areas, mut alphas) = (vec![V::constant(0.0); k], vec![V::constant(0.0); k]);
         // x − x is 0 for a finite number and NaN for any other.
-        let mut finite = m.of(0.0);
-        for first in self.parents.clone().step_by(M::WIDTH) {
-            let span = (first, M::WIDTH.min(self.parents.end - first));
-            let bad = self.group(m, span, &mut areas, &mut alphas);
+        let mut finite = V::constant(0.0);
+        for first in self.parents.clone().step_by(V::LANES) {
+            let span = (first, V::LANES.min(self.parents.end - first));
+            let bad = self.group(span, &mut areas, &mut alphas);
             finite = finite + bad;
         }
-        let mut lanes = [T::default(); WIDTH_MAX];
-        m.store(finite, &mut lanes);
-        lanes[..M::WIDTH].iter().all(|v| *v == T::default())
+        let mut lanes = [T::default(); LANES];
+        finite.store(&mut lanes);
+        lanes[..V::LANES].iter().all(|v| *v == T::default())
     }
 }
 
 /// 0 where all of `v` are finite, else NaN.
 #[inline(always)]
 #[expect(clippy::eq_op, reason = "v − v is 0 where v is finite and NaN elsewhere")]
-fn not_finite<V: Lanes>(v: &[V], mut sum: V) -> V {
+fn not_finite<V: Vector>(v: &[V], mut sum: V) -> V {
     for &v in v {
         sum = sum + (v - v);
     }
     sum
 }
 
-impl<T: LaneReal> Forward<'_, T> {
+impl<T: Real> Forward<'_, T> {
     /// The children of one vector of parents; 0 where all is finite, else NaN.
     #[inline(always)]
-    fn group<M: Machine<Scalar = T>>(
+    fn group<V: Vector<Element = T>>(
         &mut self,
-        m: M,
         (first, count): (usize, usize),
-        areas: &mut [M::V],
-        alphas: &mut [M::V],
-    ) -> M::V {
+        areas: &mut [V],
+        alphas: &mut [V],
+    ) -> V {
         let Args { rules, source, parents, .. } = self.args;
         let (children, lanes) = (rules.children(), rules.gain_lanes());
-        let parent = Parent::load(m, (rules, self.table, &source), parents, (first, count));
-        let mut bad = not_finite(&[parent.alpha, parent.z], m.of(0.0));
+        let parent = Parent::load((rules, self.table, &source), parents, (first, count));
+        let mut bad = not_finite(&[parent.alpha, parent.z], V::constant(0.0));
         let at = first - self.parents.start;
         for k in 0..children {
-            let head = records(m, &self.args, (first, count), k);
+            let head = records(&self.args, (first, count), k);
             bad = not_finite(&head, bad);
             let child = Child::new(rules, &parent, k, &head);
             (areas[k], alphas[k]) = (child.area, head[HEAD_LOGIT]);
-            let mut row = [m.of(0.0); SPLAT_LANES];
+            let mut row = [V::constant(0.0); SPLAT_LANES];
             let shape = [(LANE_MEAN, child.mean), (LANE_SCALE, child.scale)];
             for (lane, v) in shape {
                 row[lane..lane + 3].copy_from_slice(&v);
@@ -167,11 +165,11 @@ impl<T: LaneReal> Forward<'_, T> {
             row[LANE_QUAT..LANE_QUAT + 4].copy_from_slice(&child.quat());
             bad = not_finite(&child.quat(), bad);
             let rows = &mut self.rows[(at * children + k) * SPLAT_LANES..];
-            m.store_rows(&row, (children * SPLAT_LANES, count), rows);
-            let gain = gain(m, rules, head[HEAD_GAIN]);
-            let mut tile = [[T::default(); WIDTH_MAX]; 4];
+            V::store_rows(&row, RowLayout { stride: children * SPLAT_LANES, count }, rows);
+            let gain = gain(rules, head[HEAD_GAIN]);
+            let mut tile = [[T::default(); LANES]; 4];
             for (gain, tile) in gain.into_iter().zip(&mut tile) {
-                m.store(gain, tile);
+                gain.store(tile);
             }
             let gains = &mut self.gains[(at * children + k) * lanes..];
             for lane in 0..count {
@@ -183,8 +181,8 @@ impl<T: LaneReal> Forward<'_, T> {
         share(rules.opacity, areas, parent.alpha, parent.own, alphas);
         bad = not_finite(alphas, bad);
         for (k, &alpha) in alphas.iter().enumerate() {
-            let mut tile = [T::default(); WIDTH_MAX];
-            m.store(alpha, &mut tile);
+            let mut tile = [T::default(); LANES];
+            alpha.store(&mut tile);
             for (lane, &alpha) in tile[..count].iter().enumerate() {
                 let row = (at + lane) * children + k;
                 self.rows[row * SPLAT_LANES + LANE_OPACITY] = alpha;
@@ -196,16 +194,16 @@ impl<T: LaneReal> Forward<'_, T> {
 
 /// γ and δ: γ(½ + Σ) = ½ + γΣ + (γ − 1)/2.
 #[inline(always)]
-fn gain<M: Machine>(m: M, rules: &Rules, raw: M::V) -> [M::V; 4] {
-    let extra = m.of(rules.delta) * raw.tanh();
-    let residual = if rules.rgb_gain { m.of(0.5) * extra } else { m.of(0.0) };
-    [m.of(1.0) + extra, residual, residual, residual]
+fn gain<V: Vector>(rules: &Rules, raw: V) -> [V; 4] {
+    let extra = V::constant(rules.delta) * raw.tanh();
+    let residual = if rules.rgb_gain { V::constant(0.5) * extra } else { V::constant(0.0) };
+    [V::constant(1.0) + extra, residual, residual, residual]
 }
 
 /// Children of N parents into `rows` `[N·K, 11]` and `gains` (module doc). False if a
 /// number that came in or went out is not finite; its parent's children are then
 /// whatever they are, those of all others right.
-pub fn forward<T: LaneReal>(args: Args<T>, rows: &mut [T], gains: &mut [T]) -> bool {
+pub fn forward<T: Real>(args: Args<T>, rows: &mut [T], gains: &mut [T]) -> bool {
     let table = Table::new(&args.source);
     let per_block = BLOCK * args.rules.children();
     rows.par_chunks_mut(per_block * SPLAT_LANES)
