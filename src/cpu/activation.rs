@@ -6,7 +6,7 @@ use super::simd::vectorize;
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
-/// Elements per task: long enough to hide the scheduling, short enough to balance.
+/// Elements per task: a compromise between overhead and balance.
 const CHUNK: usize = 16_384;
 
 /// A function of one number.
@@ -37,7 +37,7 @@ pub(super) fn normal_cdf(x: f32) -> f32 {
 macro_rules! by_kind {
     ($kind:expr, $run:ident) => {
         match $kind {
-            // Written so that NaN stays NaN.
+            // This comparison keeps NaN.
             $crate::cpu::activation::Activation::Relu => $run!(
                 #[inline(always)]
                 |x: f32| if x < 0.0 { 0.0 } else { x },
@@ -75,7 +75,7 @@ macro_rules! by_kind {
 }
 pub(super) use by_kind;
 
-/// f(x), new memory.
+/// Computes f(x) into new memory.
 pub fn forward(kind: Activation, x: &[f32]) -> Vec<f32> {
     let mut fresh = Fresh::new(x.len());
     fresh.blocks(CHUNK).zip(x.par_chunks(CHUNK)).for_each(|(y, x)| {
@@ -103,7 +103,7 @@ fn map(x: &[f32], y: &mut Block<f32>, f: impl Fn(f32) -> f32) {
     }
 }
 
-/// dx = dy·f′(x).
+/// Computes dx = dy·f′(x).
 pub fn backward(kind: Activation, x: &[f32], dy: &[f32], dx: &mut [f32]) {
     let chunks = x.par_chunks(CHUNK).zip(dy.par_chunks(CHUNK));
     chunks.zip(dx.par_chunks_mut(CHUNK)).for_each(|((x, dy), dx)| {
@@ -121,7 +121,7 @@ pub fn backward(kind: Activation, x: &[f32], dy: &[f32], dx: &mut [f32]) {
     });
 }
 
-/// y = f(y), on the caller's thread.
+/// Replaces y by f(y), on the caller's thread.
 pub(super) fn in_place(kind: Activation, y: &mut [f32]) {
     vectorize(
         #[inline(always)]
@@ -136,7 +136,7 @@ pub(super) fn in_place(kind: Activation, y: &mut [f32]) {
     );
 }
 
-/// x = dy·f′(x), on the caller's thread.
+/// Replaces x by dy·f′(x), on the caller's thread.
 pub(super) fn slopes_in_place(kind: Activation, x: &mut [f32], dy: &[f32]) {
     vectorize(
         #[inline(always)]

@@ -1,15 +1,13 @@
-//! Attributes of parents as the embeddings read them, one pass per parent, with the
-//! gradient (spec 1.1).
+//! Attributes of parents for the embeddings, one pass per parent, with the gradient.
 //!
-//! In: packed rows `[n, 11]` (lanes in [`crate::abi`]).   Out: `[n, 11]`, position 3,
+//! Input: packed rows `[n, 11]` (offsets in [`crate::abi`]).   Output: `[n, 11]`, position 3,
 //! scale 3, quaternion wxyz 4, opacity 1:
 //! ```text
 //! p = Rᵀ(μ − eye)              position p,   or  (clamp(x/z), clamp(y/z), ln z)
 //! scale s,  or  ln s − ln z + ln f_x         z in the source view
 //! quaternion conj(q_R) ⊗ q with w ≥ 0        opacity α,  or  ln α − ln(1 − α)
 //! ```
-//! Twin: ops/attributes.rs. The same in tensor operations:
-//! `model::embed::Embeddings::inputs`.
+//! Op: ops/attributes.rs. Reference in tensor operations: `model::embed::Embeddings::inputs`.
 
 use super::simd::{Mask, Real, RowLayout, Vector, VectorKernel};
 use crate::abi::{LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES};
@@ -20,37 +18,37 @@ use rayon::prelude::*;
 pub struct Frame {
     /// Rows of R, world from camera.
     pub rotation: [[f64; 3]; 3],
-    /// The eye, world.
+    /// Position of the eye, world units.
     pub position: [f64; 3],
     /// Rows of the matrix L with L·q = conj(q_R) ⊗ q, wxyz.
     pub turn: [[f64; 4]; 4],
 }
 
-/// What is made of the rows.
+/// How rows become attributes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Attributes {
-    /// Where positions and quaternions are told; `None`: the world.
+    /// Frame of positions and quaternions; `None`: the world.
     pub frame: Option<Frame>,
-    /// The source view, whose z scales are measured by.
+    /// The source view; its z normalises scales.
     pub source: Frame,
-    /// f_x of the source view, px: scales as logarithms of pixels; `None`: as they are.
+    /// f_x of the source view, px: scales become logarithms of pixels. `None`: unchanged.
     pub log_px: Option<f64>,
-    /// Positions as slopes and ln z.
+    /// Whether positions become slopes and ln z.
     pub ray: bool,
-    /// Opacities as logits, clipped to ± this; `None`: as they are.
+    /// Opacities become logits, clipped to ± this. `None`: unchanged.
     pub logit: Option<f64>,
-    /// Least z that is divided by or a logarithm taken of, world units.
+    /// Lower clamp of z in divisions and logarithms, world units.
     pub z_min: f64,
-    /// Bound of slopes.
+    /// Clamp of slopes.
     pub slope_max: f64,
-    /// Least σ of which a logarithm is taken, world units.
+    /// Lower clamp of σ in logarithms, world units.
     pub scale_min: f64,
 }
 
 /// Parents per task.
 const BLOCK: usize = 256;
 
-/// Lanes of the result.
+// Offsets in a row of the result.
 const SCALE: usize = 3;
 const QUAT: usize = 6;
 const OPACITY: usize = 10;
@@ -73,7 +71,7 @@ fn along<V: Vector>(frame: &Frame, v: [V; 3], j: usize) -> V {
     V::constant(z[j]).fma(v[2], two)
 }
 
-/// A position, its z bounded below, and the slopes before they are clamped.
+/// A position, its clamped z, and the slopes before the clamp.
 struct Place<V> {
     own: [V; 3],
     z: V,
@@ -94,7 +92,7 @@ impl Attributes {
         Place { own, z, slopes: [own[0] / z, own[1] / z] }
     }
 
-    /// Quaternion in the frame, before its sign.
+    /// Quaternion in the frame, before its sign is fixed.
     #[inline(always)]
     fn quat<V: Vector>(&self, row: &[V; SPLAT_LANES]) -> [V; 4] {
         let q = [row[LANE_QUAT], row[LANE_QUAT + 1], row[LANE_QUAT + 2], row[LANE_QUAT + 3]];
@@ -109,7 +107,7 @@ impl Attributes {
         out
     }
 
-    /// Camera z in the source view, not bounded.
+    /// Camera z in the source view, not clamped.
     #[inline(always)]
     fn depth<V: Vector>(&self, row: &[V; SPLAT_LANES]) -> V {
         along(&self.source, centred(&self.source, row), 2)
@@ -148,7 +146,7 @@ impl Attributes {
         out
     }
 
-    /// By the row, for what reached the result.
+    /// Gradient with respect to the row, from the gradient `d` of the result.
     #[inline(always)]
     fn backward<V: Vector>(
         &self,
@@ -223,7 +221,7 @@ impl Attributes {
     }
 }
 
-/// One block of parents; `reached` is what came back, for the gradient.
+/// One block of parents; `reached` holds the gradient of the result in the backward pass.
 struct Block<'a, T> {
     attributes: &'a Attributes,
     rows: &'a [T],
@@ -249,7 +247,7 @@ impl<T: Real> VectorKernel<T> for Block<'_, T> {
     }
 }
 
-/// Attributes of `rows` into `out` (module doc).
+/// Computes the attributes of `rows` into `out` (module documentation).
 pub fn forward<T: Real>(attributes: &Attributes, rows: &[T], out: &mut [T]) {
     let size = BLOCK * SPLAT_LANES;
     rows.par_chunks(size).zip(out.par_chunks_mut(size)).for_each(|(rows, out)| {
@@ -257,7 +255,8 @@ pub fn forward<T: Real>(attributes: &Attributes, rows: &[T], out: &mut [T]) {
     });
 }
 
-/// The gradient by `rows` into `out`, for `reached` `[n, 11]`.
+/// Computes the gradient with respect to `rows` into `out`, from the gradient `reached`
+/// `[n, 11]` of the result.
 pub fn backward<T: Real>(attributes: &Attributes, rows: &[T], reached: &[T], out: &mut [T]) {
     let size = BLOCK * SPLAT_LANES;
     let blocks = rows.par_chunks(size).zip(reached.par_chunks(size));

@@ -1,7 +1,7 @@
 //! 2-D covariances of sixteen splats at a time.
 //!
-//! From quaternion and σ we keep M = J·W·R·S (2×3) and take det(MMᵀ) = ‖m₁ × m₂‖²
-//! (Cauchy-Binet), which no needle cancels.
+//! For quaternion and σ, M = J·W·R·S (2×3) and det(MMᵀ) = ‖m₁ × m₂‖² (Cauchy-Binet), which
+//! has no cancellation for needles.
 
 use crate::cpu::simd::{LANES, Simd, Vector};
 
@@ -21,7 +21,7 @@ pub(crate) struct Covariance2d<S: Simd> {
     pub(crate) det: S::F,
 }
 
-/// M·Mᵀ with M = J·W·R·S, and in which lanes the quaternion has a direction.
+/// Computes M·Mᵀ with M = J·W·R·S, and the lanes whose quaternion has a direction.
 #[inline(always)]
 pub(crate) fn covariance_quat<S: Simd>(
     s: S,
@@ -51,12 +51,11 @@ pub(crate) fn covariance_quat<S: Simd>(
     let [a, b] = m;
     let n =
         [a[2].fnma(b[1], a[1] * b[2]), a[0].fnma(b[2], a[2] * b[0]), a[1].fnma(b[0], a[0] * b[1])];
-    let c =
-        Covariance2d { xx: dot(a, a), xy: dot(a, b), yy: dot(b, b), det: dot(n, n) };
+    let c = Covariance2d { xx: dot(a, a), xy: dot(a, b), yy: dot(b, b), det: dot(n, n) };
     (c, whole)
 }
 
-/// J·Σ·Jᵀ of given covariances, in `f64`: its determinant cancels in needles.
+/// Computes J·Σ·Jᵀ of given covariances, in `f64`: its determinant cancels for needles.
 #[inline(always)]
 pub(crate) fn covariance_cov6<S: Simd>(
     s: S,

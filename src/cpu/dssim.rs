@@ -2,8 +2,8 @@
 //! 2004). Twin and conventions: train/loss.rs, [`crate::metrics::ssim`].
 //!
 //! Windowed means are two passes of N taps, each with a block of results in registers.
-//! The transpose of a windowed mean is a windowed mean of the map with N − 1 zeros
-//! around it, the taps turned round.
+//! The transpose of a windowed mean is a windowed mean with reversed taps of the map with
+//! N − 1 zeros around it.
 
 use super::simd::vectorize;
 use super::sums::sum_of;

@@ -1,10 +1,9 @@
-//! Matrix product on slices: own register tiles on [`super::simd`], the
-//! right factor packed once and used by any number of callers.
+//! Matrix product on slices: register tiles on [`super::simd`]; the right factor is packed
+//! once for any number of callers.
 //!
-//! Callers parallelise over blocks of rows themselves. A result is a sum over k in
-//! order, in parts of 128, whatever the block of rows that it is computed with:
-//! how rows are cut into tasks does not show, and fused levels agree to the byte.
-//! Oracle: three loops in f64 (the tests).
+//! Callers parallelise over blocks of rows. A result is a sum over k in order, in parts of
+//! 128, in every block of rows. Neither the cut into tasks nor the fused level changes a
+//! byte. Oracle: three loops in f64 (the tests).
 
 mod packed;
 #[cfg(test)]
@@ -20,21 +19,21 @@ use tile::{Part, rows};
 
 /// Columns of a full panel of the right factor: four vectors.
 pub(super) const PANEL: usize = 4 * LANES;
-/// Products of one sum in registers: 128 · 64 floats of a panel are 32 KiB, which stay
-/// in the first-level cache while the rows of the left factor pass.
+/// Products of one sum in registers: 128 · 64 floats of a panel are 32 KiB, which stay in the
+/// first-level cache for all rows of the left factor.
 const DEPTH: usize = 128;
-/// Rows this many floats apart (4 KiB) lie in one set of the first-level cache, where
-/// they put one another and the panel out.
+/// Rows this many floats apart (4 KiB) share a set of the first-level cache and evict one
+/// another and the panel.
 const ALIAS: usize = 1024;
 
-/// What a product is added to.
+/// Base that a product is added to.
 #[derive(Clone, Copy, Debug)]
 pub enum Base<'a> {
     /// Nothing.
     Zero,
-    /// What the destination holds.
+    /// The destination's own numbers.
     Own,
-    /// One number a column.
+    /// One number per column.
     Row(&'a [f32]),
 }
 
@@ -48,7 +47,7 @@ pub fn product(dst: (&mut [f32], usize), lhs: Mat<'_>, rhs: &Packed, scale: f32,
     product_on(SimdLevel::best(), dst, lhs, rhs, scale, base);
 }
 
-/// [`product`] compiled for `level`.
+/// Computes [`product`] with the instructions of `level`.
 pub(crate) fn product_on(
     level: SimdLevel,
     (dst, row_stride): (&mut [f32], usize),

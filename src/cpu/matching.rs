@@ -95,7 +95,7 @@ impl PlaneWarp {
     }
 }
 
-/// Lanes that loops over pixels are written for.
+/// Pixels per step of a loop.
 const LANES: usize = 16;
 
 /// Bilinear samples of one line of reference pixels: where the four neighbours are and

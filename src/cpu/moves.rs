@@ -1,5 +1,5 @@
-//! Sums and moves of whole tensors: no arithmetic to speak of, so one pass, by all
-//! threads, into memory that nothing has cleared before.
+//! Sums and moves of whole tensors. Memory limits them, so each is one pass by all threads
+//! into uninitialised memory.
 
 use super::fresh::{Fresh, fill, start};
 use super::gemm::{Mat, copy};
@@ -7,10 +7,10 @@ use super::simd::{Kernel, Simd, SimdLevel};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
-/// Elements a task.
+/// Elements per task.
 const PART: usize = 1 << 15;
 
-/// a + b.
+/// Computes a + b into new memory.
 pub fn sum(a: &[f32], b: &[f32]) -> Vec<f32> {
     assert_eq!(a.len(), b.len(), "sum: lengths");
     let mut fresh = Fresh::new(a.len());
@@ -24,7 +24,7 @@ pub fn sum(a: &[f32], b: &[f32]) -> Vec<f32> {
     unsafe { fresh.finish() }
 }
 
-/// One after the other.
+/// Concatenates slices into new memory.
 pub fn stacked(parts: &[&[f32]]) -> Vec<f32> {
     let mut fresh = Fresh::new(parts.iter().map(|p| p.len()).sum());
     fresh.blocks(PART).enumerate().for_each(|(i, block)| {

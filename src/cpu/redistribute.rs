@@ -1,7 +1,7 @@
-//! How a parent's opacity is shared among its children, and the gradient.
+//! Redistribution of a parent's opacity to its children, and the gradient.
 //!
-//! In: logits ℓ `[P,K]`; areas A `[P,K]`, px²; opacities α `[P]`; the parents' own
-//! areas `[P]` where the rule asks for them.   Out: `[P,K]`.
+//! Input: logits ℓ `[P,K]`; areas A `[P,K]`, px²; opacities α `[P]`; the parents' own
+//! areas `[P]` for relative rules.   Output: `[P,K]`.
 //! With w = softmax(ℓ) and B = A_k / own area:
 //!
 //! | rule | α_k | areas |
@@ -12,9 +12,9 @@
 //! | area | min(0.99, α·w_k / B_k) | without the low-pass |
 //! | none | α | unused |
 //!
-//! α is taken as at most 0.9999 wherever a logarithm is. Parents are the lanes of a
-//! vector ([`super::simd`]), so that a sum over children is a loop. Twins:
-//! kernels/redistribute.wgsl, src/gpu/redistribute.rs. Op: ops/redistribute.rs.
+//! Logarithms clamp α to 0.9999. Each lane of a vector ([`super::simd`]) is a parent, so
+//! that a sum over children is a loop. WGSL: kernels/redistribute.wgsl,
+//! src/gpu/redistribute.rs. Op: ops/redistribute.rs.
 
 use super::fresh::{Block, Fresh, start};
 use super::simd::{LANES, Mask, Real, RowLayout, Vector, VectorKernel};
@@ -23,17 +23,17 @@ use rayon::prelude::*;
 
 pub use crate::abi::Rule;
 
-/// Parents per rayon task: all that it reads and writes lies in the caches of a core.
+/// Parents per rayon task: its data fits the caches of a core.
 const BLOCK: usize = 512;
 
-/// Areas above count as this, px²: over [`AREA_EPS`] it is still far from overflow.
+/// Upper clamp of areas, px²: its quotient by [`AREA_EPS`] does not overflow.
 const AREA_MAX: f64 = 1e28;
 
-/// B above counts as this: such a child gets less than 1e-17 of the parent, and the
-/// product of two is far from overflow.
+/// Upper clamp of B: such a child gets less than 1e-17 of the parent, and the product of
+/// two does not overflow.
 const RELATIVE_AREA_MAX: f64 = 1e18;
 
-/// eˣ⁻ᵐᵃˣ of `x` in place; returns one over their sum.
+/// Replaces `x` by eˣ⁻ᵐᵃˣ and returns the reciprocal of their sum.
 #[inline(always)]
 fn exponentials<V: Vector>(x: &mut [V]) -> V {
     let mut top = x[0];
@@ -48,8 +48,8 @@ fn exponentials<V: Vector>(x: &mut [V]) -> V {
     V::constant(1.0) / sum
 }
 
-/// e^{ℓ_k − max ℓ}·(A_0 + ε)/(A_k + ε) in place of ℓ: softmax(ℓ − ln(A + ε)) before its
-/// division by the sum, which is returned, without a logarithm. An only child gets 1.
+/// Replaces ℓ_k by e^{ℓ_k − max ℓ}·(A_0 + ε)/(A_k + ε) and returns the sum. Their quotient
+/// is softmax(ℓ − ln(A + ε)) without a logarithm. An only child gets 1.
 #[inline(always)]
 fn per_area<V: Vector>(areas: &[V], logits: &mut [V]) -> V {
     let mut top = logits[0];
@@ -57,7 +57,7 @@ fn per_area<V: Vector>(areas: &[V], logits: &mut [V]) -> V {
         top = top.max(v);
     }
     let (mut sum, eps) = (V::constant(0.0), V::constant(AREA_EPS));
-    // Bounded, so that no quotient leaves f32.
+    // The clamp keeps quotients inside the range of f32.
     let bounded = |a: V| (a + eps).min(V::constant(AREA_MAX));
     let first = bounded(areas[0]);
     for (l, &a) in logits.iter_mut().zip(areas) {
@@ -72,14 +72,14 @@ fn optical_depth<V: Vector>(alpha: V) -> V {
     -(-alpha.min(V::constant(OPACITY_CEILING))).ln_1p()
 }
 
-/// B: what the rules with relative areas divide by, bounded so that two of them may be
-/// multiplied.
+/// Returns B, the divisor of rules with relative areas, clamped so that a product of two
+/// stays in range.
 #[inline(always)]
 fn divisor<V: Vector>(area: V, per_own: V) -> V {
     (area * per_own).max(V::constant(RELATIVE_AREA_MIN)).min(V::constant(RELATIVE_AREA_MAX))
 }
 
-/// F of the rules α_k = F(x_k).
+/// Evaluates F of the rules α_k = F(x_k).
 #[inline(always)]
 fn opacity_of<V: Vector>(rule: Rule, x: V) -> V {
     match rule {
@@ -88,8 +88,8 @@ fn opacity_of<V: Vector>(rule: Rule, x: V) -> V {
     }
 }
 
-/// α_k of K children in the lanes of their parents. `own` is read by the relative
-/// rules only. K = `areas.len()` ≥ 1; `alphas` comes in with the logits.
+/// Computes α_k of K children in the lanes of their parents. Relative rules alone read
+/// `own`. K = `areas.len()` ≥ 1; `alphas` holds the logits on entry.
 #[inline(always)]
 pub(super) fn share<V: Vector>(rule: Rule, areas: &[V], alpha: V, own: V, alphas: &mut [V]) {
     if rule == Rule::None {
@@ -112,7 +112,7 @@ pub(super) fn share<V: Vector>(rule: Rule, areas: &[V], alpha: V, own: V, alphas
     }
     let (mut areas, mut pairs) = (areas.chunks_exact(2), alphas.chunks_exact_mut(2));
     for (o, a) in pairs.by_ref().zip(areas.by_ref()) {
-        // One division for two: it costs as much as an exponential.
+        // One division for two children: a division costs as much as an exponential.
         let (a, b) = (divisor(a[0], per_own), divisor(a[1], per_own));
         let both = factor / (a * b);
         (o[0], o[1]) = (opacity_of(rule, both * b * o[0]), opacity_of(rule, both * a * o[1]));
@@ -122,9 +122,9 @@ pub(super) fn share<V: Vector>(rule: Rule, areas: &[V], alpha: V, own: V, alphas
     }
 }
 
-/// Gradients of [`share`]: `logits` and `areas` are overwritten by theirs, those of
-/// alpha and of the own area are returned. `grads` comes in with those of the result
-/// and is used up.
+/// Computes the gradients of [`share`]: overwrites `logits` and `areas` by theirs, returns
+/// those of alpha and of the own area. `grads` holds those of the result on entry and is
+/// overwritten.
 #[inline(always)]
 pub(super) fn share_backward<V: Vector>(
     rule: Rule,
@@ -212,7 +212,7 @@ fn weighted_backward<V: Vector>(
 /// Arguments of the whole rule, K = `k` children for each of P parents.
 #[derive(Clone, Copy, Debug)]
 pub struct Args<'a, T> {
-    /// How.
+    /// Rule of redistribution.
     pub rule: Rule,
     /// K, at least 1.
     pub k: usize,
@@ -222,12 +222,12 @@ pub struct Args<'a, T> {
     pub areas: &'a [T],
     /// α, `[P]`.
     pub alphas: &'a [T],
-    /// `[P]` for the rules whose areas are relative; else not read.
+    /// `[P]` for rules with relative areas; other rules do not read it.
     pub own: &'a [T],
 }
 
 impl<'a, T: Real> Args<'a, T> {
-    /// Those of the parents from `first` on, at most `count`.
+    /// Returns the arguments of at most `count` parents from `first` on.
     fn parents(self, first: usize, count: usize) -> Self {
         let span = |s: &'a [T], per: usize| {
             &s[(first * per).min(s.len())..((first + count) * per).min(s.len())]
@@ -244,13 +244,12 @@ impl<'a, T: Real> Args<'a, T> {
     }
 }
 
-/// K vectors of a group of parents, one per child: an array where K is that of a usual
-/// upscaling factor, so that loops over children unroll and stay in registers.
+/// K vectors of a group of parents, one per child. An array holds the K of a usual upscaling
+/// factor, so that loops over children unroll and stay in registers.
 trait Children<V: Vector>: AsMut<[V]> + AsRef<[V]> {
-    /// `count` rows of K numbers, one after the other; lanes above `count` repeat the
-    /// last row.
+    /// Loads `count` adjacent rows of K numbers; lanes past `count` repeat the last row.
     fn load(&mut self, rows: &[V::Element], count: usize);
-    /// The inverse of [`Children::load`].
+    /// Stores rows, the inverse of [`Children::load`].
     fn store(&self, rows: &mut [V::Element], count: usize);
 }
 
@@ -282,7 +281,7 @@ impl<V: Vector> Children<V> for Vec<V> {
     }
 }
 
-/// One number per parent, `count` of them from `first` on; 1 where there is none.
+/// Loads one number per parent, `count` of them from `first` on; 1 if `from` is empty.
 #[inline(always)]
 fn single<V: Vector>(from: &[V::Element], (first, count): (usize, usize)) -> V {
     match from.get(first..first + count) {
@@ -308,7 +307,7 @@ fn load_singles<V: Vector>(from: &[V::Element], count: usize) -> [V; 1] {
     [V::load(&lanes)]
 }
 
-/// A block of parents forward.
+/// The forward pass of a block of parents.
 struct Forward<'a, T> {
     args: Args<'a, T>,
     out: &'a mut Block<T>,
@@ -344,7 +343,7 @@ impl<T: Real> VectorKernel<T> for Forward<'_, T> {
     }
 }
 
-/// Opacities `[P, K]` of the children (module doc).
+/// Computes the opacities `[P, K]` of the children (module documentation).
 pub fn forward<T: Real>(args: Args<T>) -> Vec<T> {
     let mut out = Fresh::new(args.alphas.len() * args.k);
     out.blocks(args.k * BLOCK).enumerate().for_each(|(block, out)| {
@@ -362,11 +361,11 @@ pub struct Gradients<T> {
     pub areas: Vec<T>,
     /// `[P]`.
     pub alphas: Vec<T>,
-    /// `[P]`; zeros for the rules that do not read it.
+    /// `[P]`; zeros for rules without relative areas.
     pub own: Vec<T>,
 }
 
-/// A block of parents backward; the slices are the block's own.
+/// The backward pass of a block of parents; the slices are the block's own.
 struct Backward<'a, T> {
     args: Args<'a, T>,
     grad: &'a [T],
@@ -414,7 +413,7 @@ impl<T: Real> VectorKernel<T> for Backward<'_, T> {
     }
 }
 
-/// Gradients of [`forward`] for the gradient `grad` `[P, K]` of its result.
+/// Computes the gradients of [`forward`] from the gradient `grad` `[P, K]` of its result.
 pub fn backward<T: Real>(args: Args<T>, grad: &[T]) -> Gradients<T> {
     let (p, k) = (args.alphas.len(), args.k);
     let (mut logits, mut areas) = (Fresh::new(p * k), Fresh::new(p * k));

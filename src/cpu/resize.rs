@@ -43,8 +43,8 @@ impl Bilinear {
         Self { rows: taps(h, to_h), cols: taps(w, to_w), from: r.from, to: r.to }
     }
 
-    /// `[h, w]` to `[H, W]`: the few input rows are widened first, so that all the work
-    /// per output pixel is on whole rows. `wide` is working memory.
+    /// Resizes `[h, w]` to `[H, W]`. The first pass widens the few input rows, so that the
+    /// second one works on whole rows. `wide` is working memory.
     pub(crate) fn plane(&self, x: &[f32], y: &mut [f32], wide: &mut Vec<f32>) {
         let (w, to_w) = (self.from[1], self.to[1]);
         wide.resize(self.from[0] * to_w, 0.0);

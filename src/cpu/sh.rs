@@ -1,13 +1,13 @@
 //! Colour of a splat seen from one direction: Σ_k sh_k·Y_k(d) in `f32`.
 //!
-//! The functions are those of [`crate::sh`], whose `f64` text is the reference
-//! (a unit test holds the two together). In: a unit direction in world frame and
-//! coefficients `[D, 3]`, RGB innermost. Out: RGB before gain, offset and clamp.
+//! The functions are those of [`crate::sh`], whose `f64` code is the reference (a unit test
+//! compares the two). Input: a unit direction in world frame and coefficients `[D, 3]`, RGB
+//! innermost. Output: RGB before gain, offset and clamp.
 
 use crate::abi::{SH_COEFFICIENTS_MAX, ShBasis, sh_coefficients};
 use crate::cpu::simd::{LANES, Mask, Simd, Vector};
 
-/// Highest degree that `basis` evaluates.
+/// Returns the highest degree that `basis` evaluates.
 pub fn degree_max(basis: ShBasis) -> usize {
     match basis {
         ShBasis::Standard => 4,
@@ -83,8 +83,8 @@ fn standard<V: Vector>(degree: usize, [x, y, z]: [V; 3]) -> [V; SH_COEFFICIENTS_
     b
 }
 
-/// Σ_k sh_k·Y_k(d) per colour channel. `sh` is one set `[D, 3]`; coefficients
-/// above `degree`, or above what it holds, count as 0.
+/// Computes Σ_k sh_k·Y_k(d) per colour channel. `sh` is one set `[D, 3]`; coefficients above
+/// `degree`, or past the end of `sh`, count as 0.
 pub fn radiance(kind: ShBasis, degree: usize, d: [f32; 3], sh: &[f32]) -> [f32; 3] {
     let b = basis(kind, degree, d);
     let used = sh_coefficients(degree.min(degree_max(kind)));
@@ -97,8 +97,8 @@ pub fn radiance(kind: ShBasis, degree: usize, d: [f32; 3], sh: &[f32]) -> [f32; 
     rgb
 }
 
-/// [`radiance`] of sixteen sets along sixteen unit vectors: set l starts at `at[l]`
-/// of `sh`, and holds at least the coefficients of `degree`.
+/// Computes [`radiance`] of sixteen sets along sixteen unit vectors. Set l starts at `at[l]`
+/// of `sh` and holds at least the coefficients of `degree`.
 #[inline(always)]
 pub(crate) fn radiance_lanes<S: Simd>(
     s: S,
@@ -111,7 +111,7 @@ pub(crate) fn radiance_lanes<S: Simd>(
     let used = sh_coefficients(degree);
     let b = basis(kind, degree, d);
     let mut rgb = [s.splat(0.0); 3];
-    // Four coefficients are twelve floats, three transposed quads.
+    // Four coefficients are twelve floats: three gathers of four.
     let mut c = 0;
     while c + 4 <= used {
         let [r0, g0, b0, r1] = s.gather4(sh, at, 3 * c);
@@ -123,7 +123,7 @@ pub(crate) fn radiance_lanes<S: Simd>(
         rgb[2] = b3.fma(y3, b2.fma(y2, b1.fma(y1, b0.fma(y0, rgb[2]))));
         c += 4;
     }
-    // (degree + 1)² leaves one or none.
+    // (degree + 1)² modulo 4 is 0 or 1.
     if c < used {
         let mut last = [[0.0; LANES]; 3];
         for (l, &at) in at.iter().enumerate() {
@@ -139,7 +139,7 @@ pub(crate) fn radiance_lanes<S: Simd>(
     rgb
 }
 
-/// [`direction`] of sixteen vectors.
+/// Computes [`direction`] of sixteen vectors.
 #[inline(always)]
 pub(crate) fn direction_lanes<S: Simd>(s: S, v: [S::F; 3]) -> [S::F; 3] {
     let norm = v[0].fma(v[0], v[1].fma(v[1], v[2] * v[2])).sqrt();
@@ -152,7 +152,7 @@ pub(crate) fn direction_lanes<S: Simd>(s: S, v: [S::F; 3]) -> [S::F; 3] {
     ]
 }
 
-/// `v` / ‖v‖, or the zero vector where that has no direction.
+/// Returns `v` / ‖v‖, or the zero vector if `v` has no direction.
 pub fn direction(v: [f32; 3]) -> [f32; 3] {
     let norm = (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
     if norm > 0.0 && norm.is_finite() { v.map(|x| x / norm) } else { [0.0; 3] }
@@ -233,8 +233,8 @@ mod tests {
         }
     }
 
-    /// Sixteen at a time give what one at a time does, in every level, for sets of
-    /// any degree stored and evaluated, the last set of the slice included.
+    /// Sixteen at a time equal one at a time at every level, for sets of any degree stored
+    /// and evaluated, the last set of the slice included.
     #[test]
     fn lanes_are_the_single_one() {
         let vectors: [[f32; 3]; LANES] = std::array::from_fn(|l| match l {

@@ -6,12 +6,12 @@ use crate::abi::{LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES};
 use crate::cpu::simd::{LANES, Real, RowLayout, Vector, VectorKernel};
 use rayon::prelude::*;
 
-/// What reached the results.
+/// Gradients of the results.
 #[derive(Clone, Copy, Debug)]
 pub struct Reached<'a, T> {
     /// `[views·H·W·G, 11]`.
     pub rows: &'a [T],
-    /// The two SH of [`Frame`], as far as anything reached them.
+    /// Of the two SH of [`Frame`]; `None` where no gradient exists.
     pub colours: [Option<&'a [T]>; 2],
 }
 
@@ -58,7 +58,7 @@ impl<T: Real> Backward<'_, T> {
             V::load_rows(&raw[first * lanes..], RowLayout { stride: lanes, count });
         let at = (columns(first), V::constant(self.row as f64));
         let pixel = Pixel::new(view, &raw, at);
-        // By the ray in world frame, σ at distance 1, the quaternion.
+        // With respect to the ray in world frame, σ at distance 1, the quaternion.
         let zero = V::constant(0.0);
         let (mut d_towards, mut d_scale, mut d_quat) = ([zero; 3], [zero; 3], [zero; 4]);
         for k in 0..g {
@@ -97,7 +97,7 @@ impl<T: Real> Backward<'_, T> {
     }
 }
 
-/// The first `count` lanes to every `stride`-th place.
+/// Stores the first `count` lanes at every `stride`-th place.
 #[inline(always)]
 fn put<V: Vector>(v: V, (first, stride, count): (usize, usize, usize), to: &mut [V::Element]) {
     let mut tile = [V::Element::default(); LANES];
@@ -107,10 +107,10 @@ fn put<V: Vector>(v: V, (first, stride, count): (usize, usize, usize), to: &mut 
     }
 }
 
-/// Slopes by direction, scales and quaternion.
+/// Gradients with respect to direction, scales and quaternion.
 type Slopes<V> = ([V; 3], [V; 3], [V; 4]);
 
-/// By the raw row's geometry.
+/// Gradients with respect to the raw row's geometry.
 #[inline(always)]
 fn geometry<V: Vector>(
     view: &View,
@@ -156,7 +156,8 @@ fn geometry<V: Vector>(
     out
 }
 
-/// Gradients by raw rows, distances and densities, for what reached rows and SH.
+/// Computes gradients with respect to raw rows, distances and densities from those of rows
+/// and SH.
 pub fn backward<T: Real>(
     a: &Adapter,
     [raw, depths, densities]: [&[T]; 3],

@@ -1,5 +1,5 @@
-//! SH of the primaries: masked, mapped and turned by one matrix per view, and the
-//! gradient of all that.
+//! SH of the primaries: one matrix per view masks, maps and rotates the raw coefficients;
+//! with the gradient.
 
 use super::{Adapter, GEOMETRY};
 use crate::cpu::simd::{Real, RowLayout, Vector, VectorKernel};
@@ -8,7 +8,7 @@ use rayon::prelude::*;
 /// Most SH functions of a set.
 const FUNCTIONS_MAX: usize = 25;
 
-/// A square matrix by its non-zero elements, with its transpose.
+/// The non-zero elements of a square matrix, by rows and by columns.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Turn {
     rows: Vec<Vec<(usize, f64)>>,
@@ -16,7 +16,7 @@ pub struct Turn {
 }
 
 impl Turn {
-    /// Of the row-major `[D, D]` matrix `m`, D ≤ 25.
+    /// Lists the elements of the row-major `[D, D]` matrix `m`, D ≤ 25.
     pub fn new(m: &[f64], d: usize) -> Self {
         let line = |at: &dyn Fn(usize) -> f64| -> Vec<(usize, f64)> {
             (0..d).map(|j| (j, at(j))).filter(|(_, v)| *v != 0.0).collect()
@@ -28,16 +28,16 @@ impl Turn {
     }
 }
 
-/// Which SH: turned into world frame, `[N, D, 3]`, or in the camera's, `[N, 3, D]`.
+/// Frame and layout of SH: world `[N, D, 3]`, or camera `[N, 3, D]`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Frame {
-    /// Into world frame, RGB innermost.
+    /// World frame, RGB innermost.
     World,
-    /// In camera frame, colour-major like the raw row.
+    /// Camera frame, colour-major like the raw row.
     Camera,
 }
 
-/// Numbers i < 3·D of rows `stride` apart: 3·D is 3, 12, 27, 48 or 75.
+/// Loads numbers i < 3·D of rows; 3·D is 3, 12, 27, 48 or 75.
 #[inline(always)]
 pub(super) fn load<V: Vector>(rows: &[V::Element], layout: RowLayout, to: &mut [V]) {
     let mut at = 0;
@@ -53,7 +53,7 @@ pub(super) fn load<V: Vector>(rows: &[V::Element], layout: RowLayout, to: &mut [
     }
 }
 
-/// The inverse of [`load`].
+/// Stores rows, the inverse of [`load`].
 #[inline(always)]
 pub(super) fn store<V: Vector>(from: &[V], layout: RowLayout, rows: &mut [V::Element]) {
     let mut at = 0;
@@ -75,8 +75,8 @@ pub(super) fn store<V: Vector>(from: &[V], layout: RowLayout, rows: &mut [V::Ele
     }
 }
 
-/// Σⱼ lines[i][j]·from[function j of colour c], added to function i of colour c in `to`;
-/// `steps`: how far apart colours and functions lie in `from` and in `to`.
+/// Adds Σⱼ lines[i][j]·from[function j of colour c] to function i of colour c in `to`.
+/// `steps` are the strides of colours and functions in `from` and in `to`.
 #[inline(always)]
 fn apply<V: Vector>(
     lines: &[Vec<(usize, f64)>],
@@ -107,7 +107,7 @@ impl Frame {
         }
     }
 
-    /// How far apart colours and functions lie in a set of `d` functions.
+    /// Strides of colours and functions in a set of `d` functions.
     fn steps(self, d: usize) -> (usize, usize) {
         match self {
             Self::World => (1, 3),
@@ -153,7 +153,8 @@ impl<T: Real> VectorKernel<T> for Forward<'_, T> {
     }
 }
 
-/// SH of all views' Gaussians into `out` `[views·H·W·G, 3·D]`, ordered as `frame` says.
+/// Computes the SH of all views' Gaussians into `out` `[views·H·W·G, 3·D]`, in the layout of
+/// `frame`.
 pub fn forward<T: Real>(a: &Adapter, frame: Frame, raw: &[T], out: &mut [T]) {
     let ([height, width], lanes) = (a.size, a.raw_lanes());
     let set = width * a.per_pixel * 3 * a.functions;
@@ -163,8 +164,8 @@ pub fn forward<T: Real>(a: &Adapter, frame: Frame, raw: &[T], out: &mut [T]) {
     });
 }
 
-/// Adds to `to` `[3·D]` the gradient of a vector of pixels' raw SH by what reached the
-/// SH of their Gaussians, `d_out` from the first one on.
+/// Adds to `to` `[3·D]` the gradient of a vector of pixels' raw SH, from the gradient `d_out`
+/// of the SH of their Gaussians.
 #[inline(always)]
 pub(super) fn backward<V: Vector>(
     (adapter, frame, view): (&Adapter, Frame, usize),

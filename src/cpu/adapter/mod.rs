@@ -1,18 +1,17 @@
-//! From raw head rows to Gaussians in world frame, one pass per pixel (MVSplat's
-//! Gaussian adapter; spec 6), with gradients.
+//! Raw head rows to Gaussians in world frame, one pass per pixel (MVSplat's Gaussian
+//! adapter), with gradients.
 //!
-//! In, per view: raw rows `[H·W, 9 + 3·D]` (offset 2, scale 3, quaternion xyzw 4,
-//! colour-major SH), distances and densities `[H·W, G]`.   Out: packed rows
-//! `[H·W·G, 11]` (lanes in [`crate::abi`]); [`colour`] gives the SH.
+//! Input per view: raw rows `[H·W, 9 + 3·D]` (offset 2, scale 3, quaternion xyzw 4,
+//! colour-major SH), distances and densities `[H·W, G]`.   Output: packed rows
+//! `[H·W·G, 11]` (offsets in [`crate::abi`]); [`colour`] computes the SH.
 //! ```text
 //! d   = (x + σ(o_x) − c_x)/f_x, …, 1, over its length      x, y: whole pixels
 //! μ   = eye + t·R·d        s = t·(least + span·σ(·))       t: distance
 //! q   = R ⊗ quaternion, unit, w ≥ 0; zero is no rotation
 //! α   = ½(1 − (1 − p)^e + p^{1/e})/G,   p/G for e = 1
 //! ```
-//! The lanes of a vector are neighbouring pixels of a row. Twin: ops/adapter.rs. The
-//! same in tensor operations: model/primaries_ref.rs. Tests: ops/adapter.rs,
-//! tests/primaries.rs.
+//! The lanes of a vector are neighbouring pixels of a row. Op: ops/adapter.rs. Reference in
+//! tensor operations: model/primaries_ref.rs. Tests: ops/adapter.rs, tests/primaries.rs.
 
 mod backward;
 pub mod colour;
@@ -28,11 +27,11 @@ use rayon::prelude::*;
 pub const GEOMETRY: usize = 9;
 /// ε of the raw quaternion's normalisation (MVS).
 const QUAT_EPS: f64 = 1e-8;
-/// Under square roots, so that zero has a finite gradient.
+/// Added under square roots, so that zero has a finite gradient.
 const SQUARE_EPS: f64 = 1e-30;
 /// Squared length of a normalised quaternion below which it counts as zero.
 const QUAT_ZERO: f64 = 1e-12;
-/// Least p and 1 − p that a logarithm is taken of.
+/// Lower clamp of p and 1 − p in logarithms.
 const SHARE_MIN: f64 = 1e-30;
 
 /// One view's constants.
@@ -44,20 +43,20 @@ pub struct View {
     pub centre: [f64; 2],
     /// Rows of R, world from camera.
     pub rotation: [[f64; 3]; 3],
-    /// The eye, world.
+    /// Position of the eye, world units.
     pub origin: [f64; 3],
-    /// Row i: where the i-th of x, y, z, w goes, as wxyz in world frame.
+    /// Row i: image of the i-th of x, y, z, w, as wxyz in world frame.
     pub quat: [[f64; 4]; 4],
-    /// σ at distance 1: the least, and what a sigmoid of 1 adds.
+    /// σ at distance 1: the minimum, and the amount that a sigmoid of 1 adds.
     pub scale: [f64; 2],
-    /// SH into world frame.
+    /// Matrix of SH into world frame.
     pub turn: Turn,
 }
 
-/// All views of a call.
+/// Constants of all views of a call.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Adapter {
-    /// Scene after scene.
+    /// Views, scene after scene.
     pub views: Vec<View>,
     /// H, W.
     pub size: [usize; 2],
@@ -67,7 +66,7 @@ pub struct Adapter {
     pub functions: usize,
     /// x of the opacity mapping, e = 2^x.
     pub exponent: f64,
-    /// SH that stay in camera frame, the same for every view.
+    /// Matrix of SH that stay in camera frame, the same for every view.
     pub camera: Turn,
 }
 
@@ -78,7 +77,7 @@ impl Adapter {
     }
 }
 
-/// Some lanes' σ(x).
+/// σ(x).
 #[inline(always)]
 fn sigmoid<V: Vector>(x: V) -> V {
     V::constant(1.0) / (V::constant(1.0) + (-x).exp())
@@ -94,7 +93,7 @@ fn dot<V: Vector, const N: usize>(a: [V; N], b: [V; N]) -> V {
     sum
 }
 
-/// Number `first + lane` of every `stride` numbers.
+/// Loads element `first` + lane·`stride` into each lane.
 #[inline(always)]
 fn strided<V: Vector>(from: &[V::Element], (first, stride): (usize, usize)) -> V {
     let mut tile = [V::Element::default(); LANES];
@@ -104,19 +103,19 @@ fn strided<V: Vector>(from: &[V::Element], (first, stride): (usize, usize)) -> V
     V::load(&tile)
 }
 
-/// What the Gaussians of a pixel share.
+/// Values that the Gaussians of a pixel share.
 struct Pixel<V> {
     /// σ of the offset and the three scales.
     shares: [V; 5],
-    /// Unit ray, camera frame, and the length it was divided by.
+    /// Unit ray, camera frame, and its length before normalisation.
     ray: [V; 3],
     length: V,
     /// Unit ray, world frame.
     towards: [V; 3],
     /// σ at distance 1.
     scale: [V; 3],
-    /// Length of the raw quaternion; the quaternion's length after the turn, which
-    /// carries the sign that makes w ≥ 0; the result.
+    /// Length of the raw quaternion; length after rotation, with the sign that makes w ≥ 0;
+    /// the result.
     raw_length: V,
     turned_length: V,
     quat: [V; 4],
@@ -168,7 +167,7 @@ impl<V: Vector> Pixel<V> {
     }
 }
 
-/// yᵉ of y in [0, 1]; NaN for NaN.
+/// Computes yᵉ of y in [0, 1]; NaN for NaN.
 #[inline(always)]
 #[expect(clippy::eq_op, reason = "y − y is 0, and NaN for NaN and the infinities")]
 fn power<V: Vector>(y: V, e: f64) -> V {
@@ -177,7 +176,7 @@ fn power<V: Vector>(y: V, e: f64) -> V {
     y.lt(least).select(V::constant(0.0), p) + (y - y)
 }
 
-/// α of density p, and its slope.
+/// Computes α of density p, and its derivative.
 #[inline(always)]
 fn opacity<V: Vector>(adapter: &Adapter, p: V) -> (V, V) {
     let share = V::constant(1.0 / adapter.per_pixel as f64);
@@ -202,7 +201,7 @@ fn columns<V: Vector>(first: usize) -> V {
     V::load(&tile)
 }
 
-/// One row of pixels forward.
+/// The forward pass of one row of pixels.
 struct Forward<'a, T> {
     adapter: &'a Adapter,
     view: &'a View,
@@ -242,7 +241,8 @@ impl<T: Real> VectorKernel<T> for Forward<'_, T> {
     }
 }
 
-/// Packed rows of all views' Gaussians into `out` `[views·H·W·G, 11]` (module doc).
+/// Computes packed rows of all views' Gaussians into `out` `[views·H·W·G, 11]` (module
+/// documentation).
 pub fn forward<T: Real>(a: &Adapter, [raw, depths, densities]: [&[T]; 3], out: &mut [T]) {
     let ([height, width], g, lanes) = (a.size, a.per_pixel, a.raw_lanes());
     out.par_chunks_mut(width * g * SPLAT_LANES).enumerate().for_each(|(i, out)| {

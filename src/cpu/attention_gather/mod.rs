@@ -1,5 +1,5 @@
-//! Attention of parents over bilinear samples of the views' feature maps, fused:
-//! no tensor of N × taps × E ever exists (SubSplat A.2; spec 1.6).
+//! Attention of parents over bilinear samples of the views' feature maps, fused without a
+//! tensor of N × taps × E (SubSplat A.2).
 //!
 //! For parent n and group g, over the samples j = (view v, level ℓ, point m):
 //! ```text
@@ -46,7 +46,7 @@ fn mix(seed: u64) -> u64 {
     z ^ (z >> 31)
 }
 
-/// What a sample outside the picture does.
+/// Role of a sample in the softmax.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum State {
     /// Not in the softmax.
@@ -171,7 +171,7 @@ impl<T: Real> Scratch<T> {
         let (q, rest) = query.split_at(g.query_channels());
         if let Some(key) = g.key {
             self.dots.clear();
-            // No closure: it would be compiled without the vectors of its caller.
+            // A closure would be compiled without the level's instructions.
             for &cell in &self.taps {
                 let row = &maps[cell * g.stride + key..][..g.dim];
                 for (k, q) in row.chunks_exact(width).zip(q.chunks_exact(width)) {
@@ -308,7 +308,7 @@ pub struct DepthMap<'a> {
     pub width: usize,
 }
 
-/// Tolerance and softness of [`occlusion`], fractions of z (spec 5.3).
+/// Tolerance and softness of [`occlusion`], fractions of z.
 const OCCLUSION_TOLERANCE: f32 = 0.02;
 
 /// exp(−max(0, z − D(R) − τ)/τ′), τ = τ′ = 2 % of z: near 0 where the view's own

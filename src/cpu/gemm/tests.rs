@@ -1,4 +1,4 @@
-//! Against three loops in f64, in every level.
+//! Products against three loops in f64, at every level.
 
 use super::*;
 

@@ -1,4 +1,4 @@
-//! Register tiles: six rows and up to four vectors of columns summed without a pause.
+//! Register tiles: sums of six rows and up to four vectors of columns in registers.
 #![expect(
     clippy::needless_range_loop,
     reason = "counted loops over register tiles unroll, iterators over them need not"
@@ -34,7 +34,7 @@ pub(super) struct Part {
 /// Every place that `part` names for `m` rows must be there (`Product::run`).
 #[inline(always)]
 pub(super) unsafe fn rows<S: Simd>(s: S, part: Part, m: usize, width: usize) {
-    // SAFETY: the caller's; tiles stay inside the rows and the panel.
+    // SAFETY: as the caller's; tiles stay inside the rows and the panel.
     unsafe {
         if S::REGISTERS >= 32 {
             match width / LANES {
@@ -121,8 +121,8 @@ unsafe fn tile<S: Simd, const R: usize, const V: usize>(s: S, part: Part, width:
     }
 }
 
-/// base + scale · sums. Loops over registers hold nothing but their moves, or else
-/// they are not unrolled and the sums live on the stack.
+/// Stores base + scale · sums. Loops over registers contain moves only: compilers do not
+/// unroll others, and the sums would go to the stack.
 ///
 /// # Safety
 /// As [`rows`].

@@ -1,4 +1,4 @@
-//! Normalised rows through SiLU: v / (1 + e^{−v}) in vectors, with fused products.
+//! SiLU of normalised rows: v / (1 + e^{−v}) in vectors, with fused products.
 
 use super::Rows;
 use crate::cpu::fresh::Block;
@@ -36,7 +36,7 @@ impl Kernel for Silu<'_> {
     }
 }
 
-/// What makes one channel of a row.
+/// Mean, scale and shift of one channel of a row.
 struct Line {
     mean: f32,
     scale: f32,
@@ -56,7 +56,7 @@ impl Line {
             return;
         }
         let bits = first_lanes_bits(last.len());
-        // SAFETY: as many numbers and places.
+        // SAFETY: `bits` selects the floats of `last` and the places of `rest`, as many.
         unsafe {
             s.store_masked(self.of(s, s.load_masked(last.as_ptr(), bits)), rest.as_mut_ptr(), bits)
         };
@@ -65,7 +65,7 @@ impl Line {
     #[inline(always)]
     fn of<S: Simd>(&self, s: S, x: S::F) -> S::F {
         let v = (x - s.splat(self.mean)).fma(s.splat(self.scale), s.splat(self.shift));
-        // The second operand is what comes out of comparisons with NaN.
+        // NaN stays. One product is enough here: the result's error is below 1e-6.
         let p = (v * s.splat(-std::f32::consts::LOG2_E)).max(s.splat(-125.0));
         v / (s.splat(1.0) + exp2_by_sums(p.min(s.splat(126.0))))
     }

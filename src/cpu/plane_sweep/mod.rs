@@ -95,7 +95,7 @@ struct Walk {
     pixel: u32,
 }
 
-/// What the current pixel knows of a source cell.
+/// Values of a source cell for the current pixel.
 #[derive(Clone, Copy, Default)]
 struct Cell {
     pixel: u32,
@@ -108,7 +108,7 @@ impl Walk {
         Self { u: vec![0.0; d], v: vec![0.0; d], cells: vec![Cell::default(); n], pixel: 0 }
     }
 
-    /// Begins reference pixel (x, y): forgets the cells, places all candidates.
+    /// Starts reference pixel (x, y): clears the cells and places all candidates.
     #[inline(always)]
     fn begin(&mut self, s: &Sweep, pair: &Pair, (x, y): (usize, usize), depths: &[f32]) {
         self.pixel = self.pixel.wrapping_add(1);

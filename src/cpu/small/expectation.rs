@@ -8,7 +8,7 @@ use crate::cpu::simd::elementary::exp;
 use crate::cpu::simd::vectorize;
 use rayon::prelude::*;
 
-/// Pixels that a loop handles at once.
+/// Pixels per step of a loop.
 const LANES: usize = 16;
 
 /// Sizes and rules.
@@ -24,7 +24,7 @@ pub struct Expectation {
     pub windowed: bool,
 }
 
-/// What the softmax of one pixel comes down to.
+/// Results of the softmax of one pixel.
 #[derive(Clone, Copy, Debug, Default)]
 struct Pixel {
     /// Largest logit, and 1 / Σ e^{logit − max}.
@@ -61,7 +61,7 @@ impl Expectation {
         let (mut first, mut first_near) = ([0f32; LANES], [0f32; LANES]);
         for k in 0..d {
             let x = row(k);
-            // From the mode, so that sums lose nothing to large indices.
+            // Indices count from the mode, so that sums do not lose digits to large ones.
             for l in 0..LANES {
                 let e = exp(x[l] - max[l]);
                 let away = k as f32 - mode[l];

@@ -1,4 +1,4 @@
-//! What stands before and after the two convolutions of the small backbone's heads.
+//! Input and output of the two convolutions of the small backbone's heads.
 //!
 //! Before: `[B, C + 5, H, W]` of the projected features upsampled to the picture's size
 //! (bilinear, corners aligned), the picture, disparity as a share of the largest
@@ -24,7 +24,7 @@ pub struct Input {
     pub channels: usize,
     /// Feature map and picture.
     pub resize: Resize,
-    /// What disparity (in candidate indices) is multiplied by.
+    /// Factor of disparity (in candidate indices).
     pub share: f32,
 }
 
@@ -106,8 +106,8 @@ pub struct Output {
     pub size: [usize; 2],
     /// `[R]`: added to every raw row.
     pub start: Vec<f32>,
-    /// Where the pixel's own colour is added: its three places in a row, and factor and
-    /// offset of the colour in [0, 1].
+    /// Offsets in a row that the pixel's own colour is added to, and factor and offset of the
+    /// colour in [0, 1].
     pub colour: Option<([usize; 3], f32, f32)>,
     /// Opacity is σ(confidence + residual)²; else σ(residual + 2).
     pub confident: bool,

@@ -1,7 +1,8 @@
-//! Gradients of the children with respect to head records and parents (spec 2.12),
-//! everything recomputed from the inputs: a first walk over the children for their
-//! areas, which the opacity rule couples, and a second one for the rest. Gains depend
-//! on one lane of the head records alone and have a pass of their own.
+//! Gradients of the children with respect to head records and parents.
+//!
+//! The pass recomputes everything from the inputs. A first loop over the children computes
+//! their areas, which the opacity rule couples; a second loop computes the rest. Gains
+//! depend on one number of a head record and have a pass of their own.
 
 use super::child::{Child, ChildGradient};
 use super::parent::{Parent, ParentGradient};
@@ -17,7 +18,7 @@ use rayon::prelude::*;
 /// One block of parents; the mutable slices are the block's own.
 struct Backward<'a, T> {
     args: Args<'a, T>,
-    /// By children, `[N·K, 11]`.
+    /// With respect to children, `[N·K, 11]`.
     grad: &'a [T],
     table: &'a Table<T>,
     range: std::ops::Range<usize>,
@@ -25,7 +26,7 @@ struct Backward<'a, T> {
     parents: &'a mut [T],
 }
 
-/// A vector per child, reused from group to group.
+/// Vectors per child, reused from group to group.
 struct Scratch<V> {
     areas: Vec<V>,
     logits: Vec<V>,
@@ -115,9 +116,9 @@ impl<T: Real> Backward<'_, T> {
     }
 }
 
-/// Gradients into `head` `[N, K, 11]` and `parents` `[N, 11]` for those of the
-/// children, `grad` `[N·K, 11]`. Each parent is one task's own: any number of threads
-/// gives the same bytes.
+/// Computes gradients into `head` `[N, K, 11]` and `parents` `[N, 11]` from those of the
+/// children, `grad` `[N·K, 11]`. One task owns each parent, so any number of threads gives
+/// the same bytes.
 pub fn backward<T: Real>(args: Args<T>, grad: &[T], head: &mut [T], parents: &mut [T]) {
     let table = Table::new(&args.source);
     head.par_chunks_mut(BLOCK * args.rules.children() * HEAD_LANES)
@@ -165,8 +166,8 @@ impl<T: Real> VectorKernel<T> for GainsBackward<'_, T> {
     }
 }
 
-/// Gradients into lane [`HEAD_GAIN`] of `out` `[N, K, 11]`, for those of the gains,
-/// `grad` `[N·K]` or `[N·K, 4]`; nothing else is written.
+/// Computes gradients into element [`HEAD_GAIN`] of the rows of `out` `[N, K, 11]`, from
+/// those of the gains, `grad` `[N·K]` or `[N·K, 4]`. Writes nothing else.
 pub fn gains_backward<T: Real>(rules: &Rules, head: &[T], grad: &[T], out: &mut [T]) {
     out.par_chunks_mut(GAIN_BLOCK * HEAD_LANES)
         .zip(head.par_chunks(GAIN_BLOCK * HEAD_LANES))

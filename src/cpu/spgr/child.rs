@@ -1,5 +1,5 @@
-//! One vector of children, child k of as many parents: everything but the opacity,
-//! with gradients (spec 2.2 to 2.6, 2.9, 2.12).
+//! One vector of children, child k of each lane's parent: everything but the opacity, with
+//! gradients.
 
 use super::Rules;
 use super::parent::{Parent, ParentGradient};
@@ -11,7 +11,7 @@ use crate::abi::{
 use crate::cpu::redistribute::Rule;
 use crate::cpu::simd::{Mask, Vector};
 
-/// The camera-frame step of a child, and what its gradient needs.
+/// The camera-frame step from parent to child, and the values that its gradient needs.
 struct Step<V: Vector> {
     out: V3<V>,
     /// tanh of the learned offset, where it is bounded.
@@ -49,8 +49,8 @@ impl<V: Vector> Step<V> {
         if let Some(disc) = &parent.disc {
             let [u, v] = disc.steps;
             let d = axpy(offset[1], v, scaled(u, offset[0]));
-            // Both steps project alike to first order, so a mixture does: an edge-on
-            // disc slides at most a tenth of its depth.
+            // Both steps have the same projection to first order, and so has a mixture. It
+            // limits the slide of an edge-on disc to a tenth of its depth.
             let tenth = V::constant(DEPTH_FRACTION_MIN) * z;
             along_disc = disc.solid.select_or_zero(tenth / d[2].abs().max(tenth));
             s = axpy(along_disc, [d[0] - s[0], d[1] - s[1], d[2] - s[2]], s);
@@ -78,7 +78,7 @@ impl<V: Vector> Step<V> {
         Self { out: s, bounded, offset, along_disc, tanh_z, free_z, side, ray }
     }
 
-    /// Adds to the gradients of head and parent those that come through the step.
+    /// Adds the gradients through the step to those of head and parent.
     #[inline(always)]
     fn backward(
         &self,
@@ -161,11 +161,11 @@ pub(super) struct Child<V: Vector> {
     pub(super) mean: V3<V>,
     /// σ, world units.
     pub(super) scale: V3<V>,
-    /// What the opacity rule divides by, target px².
+    /// Divisor of the opacity rule, target px².
     pub(super) area: V,
 }
 
-/// Gradients of what a child gives.
+/// Gradients of a child's outputs.
 pub(super) struct ChildGradient<V> {
     pub(super) mean: V3<V>,
     pub(super) quat: [V; 4],
@@ -239,7 +239,7 @@ impl<V: Vector> Child<V> {
         &self.rotation
     }
 
-    /// Writes the gradients of the head's geometry lanes and adds to the parent's.
+    /// Writes the gradients of the head record's geometry and adds to the parent's.
     #[inline(always)]
     pub(super) fn backward(
         &self,

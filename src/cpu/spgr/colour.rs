@@ -14,7 +14,7 @@ pub(super) struct Coefficients<T> {
 }
 
 impl<T: Real> Coefficients<T> {
-    /// For functions up to `degree`, as far as `basis` has them.
+    /// Makes room for functions up to `degree`, as far as `basis` has them.
     pub(super) fn new(basis: ShBasis, degree: usize) -> Self {
         let tile = Box::new([[T::default(); LANES]; 3 * SH_COEFFICIENTS_MAX]);
         Self { tile, basis, degree: degree.min(degree_max(basis)) }
@@ -36,7 +36,7 @@ impl<T: Real> Coefficients<T> {
         }
     }
 
-    /// Σ_k sh_k·Y_k along `v`, any length; a vector without direction counts as 0.
+    /// Computes Σ_k sh_k·Y_k along `v` of any length; a vector without direction counts as 0.
     #[inline(always)]
     pub(super) fn radiance<V: Vector<Element = T>>(&self, v: V3<V>) -> V3<V> {
         let (zero, one) = (V::constant(0.0), V::constant(1.0));

@@ -1,9 +1,9 @@
-//! Sub-pixel Gaussian reparameterization, one pass per parent and no temporary in
-//! memory (SubSplat 3.2, supp. A.3; spec 2.9b).
+//! Sub-pixel Gaussian reparameterization, one pass per parent and no temporary in memory
+//! (SubSplat section 3.2, supplement A.3).
 //!
-//! In: head records `[N, K, 11]` and parents `[N, 11]` (lanes in [`crate::abi`]),
-//! cameras of the V context views.   Out: children `[N·K, 11]`, child k of parent n
-//! at row n·K + k, and their colour gain `[N·K]` or, in RGB, `[N·K, 4]` (γ, δ).
+//! Input: head records `[N, K, 11]` and parents `[N, 11]` (offsets in [`crate::abi`]),
+//! cameras of the V context views.   Output: children `[N·K, 11]`, child k of parent n at
+//! row n·K + k, and their colour gain `[N·K]` or, in RGB, `[N·K, 4]` (γ, δ).
 //!
 //! Child k = (i, j) of the r × r sub-pixel grid, row-major, in the parent's primary
 //! view v* with camera coordinates x_c of its mean and z its depth:
@@ -14,14 +14,14 @@
 //! M   = J(p)·R_w2c·R(q_k)·diag(s_k)                                target px
 //! A_k = |m₁ × m₂| = √det(J Σ Jᵀ), raised to A_min
 //! ```
-//! and opacities by [`super::redistribute`]. `backward` recomputes all of it from the
-//! same inputs; no gradient passes the choice of v*, the growth of small footprints
-//! and the share of a disc step. `project` goes on to 2-D splats of one camera without
-//! writing children.
+//! and opacities by [`super::redistribute`]. `backward` recomputes all of it from the same
+//! inputs. The choice of v*, the growth of small footprints and the share of a disc step
+//! are constant to gradients. `project` computes 2-D splats of one camera without writing
+//! children.
 //!
-//! The lanes of a vector are parents: child k of 16 parents at a time, so that sums
-//! over children are loops and any K fills the vector. Twin: ops/spgr.rs. The same in
-//! tensor operations: model/spgr_ref.rs. Tests: tests/spgr.rs, tests/spgr_backward.rs.
+//! Each lane of a vector is a parent: child k of 16 parents at a time, so that sums over
+//! children are loops and any K fills the vector. Op: ops/spgr.rs. Reference in tensor
+//! operations: model/spgr_ref.rs. Tests: tests/spgr.rs, tests/spgr_backward.rs.
 
 mod backward;
 mod child;
@@ -46,7 +46,7 @@ use parent::Parent;
 use rayon::prelude::*;
 use view::Table;
 
-/// Which parents, seen by which cameras.
+/// Origin of the parents: context cameras and indices.
 #[derive(Clone, Copy, Debug)]
 pub struct Source<'a> {
     /// Context views, pixels of the input pictures.
@@ -67,7 +67,7 @@ const BLOCK: usize = 64;
 pub struct Args<'a, T> {
     /// How children are made; K ≤ [`CHILDREN_MAX`].
     pub rules: &'a Rules,
-    /// Of which parents, seen by which cameras.
+    /// Origin of the parents.
     pub source: Source<'a>,
     /// Head records `[N, K, 11]`.
     pub head: &'a [T],
@@ -87,7 +87,7 @@ impl<T> Args<'_, T> {
     }
 }
 
-/// Head records of child `k` of `count` parents from `first` on.
+/// Loads the head records of child `k` of `count` parents from `first` on.
 #[inline(always)]
 fn records<V: Vector>(
     args: &Args<V::Element>,
@@ -99,7 +99,7 @@ fn records<V: Vector>(
     V::load_rows(from, RowLayout { stride: children * HEAD_LANES, count })
 }
 
-/// One block of parents forward; `rows` and `gains` are the block's own.
+/// The forward pass of one block of parents; `rows` and `gains` are the block's own.
 struct Forward<'a, T> {
     args: Args<'a, T>,
     table: &'a Table<T>,
@@ -127,7 +127,7 @@ impl<T: Real> VectorKernel<T> for Forward<'_, T> {
     }
 }
 
-/// 0 where all of `v` are finite, else NaN.
+/// Returns `sum` in lanes where all of `v` are finite, else NaN.
 #[inline(always)]
 #[expect(clippy::eq_op, reason = "v − v is 0 where v is finite and NaN elsewhere")]
 fn not_finite<V: Vector>(v: &[V], mut sum: V) -> V {
@@ -138,7 +138,8 @@ fn not_finite<V: Vector>(v: &[V], mut sum: V) -> V {
 }
 
 impl<T: Real> Forward<'_, T> {
-    /// The children of one vector of parents; 0 where all is finite, else NaN.
+    /// Computes the children of one vector of parents; returns 0 in lanes where all numbers
+    /// are finite, else NaN.
     #[inline(always)]
     fn group<V: Vector<Element = T>>(
         &mut self,
@@ -192,7 +193,7 @@ impl<T: Real> Forward<'_, T> {
     }
 }
 
-/// γ and δ: γ(½ + Σ) = ½ + γΣ + (γ − 1)/2.
+/// Computes γ and δ: γ(½ + Σ) = ½ + γΣ + (γ − 1)/2.
 #[inline(always)]
 fn gain<V: Vector>(rules: &Rules, raw: V) -> [V; 4] {
     let extra = V::constant(rules.delta) * raw.tanh();
@@ -200,9 +201,9 @@ fn gain<V: Vector>(rules: &Rules, raw: V) -> [V; 4] {
     [V::constant(1.0) + extra, residual, residual, residual]
 }
 
-/// Children of N parents into `rows` `[N·K, 11]` and `gains` (module doc). False if a
-/// number that came in or went out is not finite; its parent's children are then
-/// whatever they are, those of all others right.
+/// Computes the children of N parents into `rows` `[N·K, 11]` and `gains` (module
+/// documentation). Returns false if an input or output number is not finite: the children
+/// of that parent are then undefined, those of all others correct.
 pub fn forward<T: Real>(args: Args<T>, rows: &mut [T], gains: &mut [T]) -> bool {
     let table = Table::new(&args.source);
     let per_block = BLOCK * args.rules.children();

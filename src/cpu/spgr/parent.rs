@@ -1,4 +1,4 @@
-//! One vector of parents in their primary views: what all their children share, with
+//! One vector of parents in their primary views: the values that their children share, with
 //! gradients.
 
 use super::shape::{Footprint, Unit, matrix, matrix_backward};
@@ -18,10 +18,10 @@ pub(super) struct Parent<V: Vector> {
     pub(super) scale: V3<V>,
     pub(super) alpha: V,
     pub(super) in_camera: V3<V>,
-    /// Depth of the pitch, at least the view's least.
+    /// Depth that sets the pitch of the children, clamped to the view's `z_min`.
     pub(super) z: V,
     pub(super) disc: Option<Disc<V>>,
-    /// Where the children's footprints take the parent's Jacobian.
+    /// The parent's Jacobian, if the children's footprints use it.
     pub(super) jacobian: Option<Jacobian<V>>,
     /// Footprint in a native render, target px²: with the low-pass for optical depth,
     /// without for integrated opacity; 1 for the other rules.
@@ -60,7 +60,7 @@ impl<V: Vector> ParentGradient<V> {
 }
 
 impl<V: Vector> Parent<V> {
-    /// Parents `first .. first + count` of `rows` `[N, 11]`; further lanes repeat the
+    /// Loads parents `first .. first + count` of `rows` `[N, 11]`; further lanes repeat the
     /// last.
     #[inline(always)]
     pub(super) fn load(
@@ -117,7 +117,7 @@ impl<V: Vector> Parent<V> {
         parent
     }
 
-    /// Gradients `[11]` of the rows, from those of what children share.
+    /// Computes gradients `[11]` of the rows from those of the shared values.
     #[inline(always)]
     pub(super) fn backward(&self, rules: &Rules, mut d: ParentGradient<V>) -> [V; SPLAT_LANES] {
         if rules.opacity.areas_are_relative() {
@@ -190,7 +190,7 @@ impl<V: Vector> Own<V> {
 pub(super) struct Disc<V: Vector> {
     /// For one px of u and of v.
     pub(super) steps: [V3<V>; 2],
-    /// Where the disc has an area to slide on.
+    /// Lanes whose disc has an area to slide on.
     pub(super) solid: V::Mask,
     unit: Unit<V>,
     /// R_w2c·R(q), rows, and the same with scales.

@@ -1,10 +1,10 @@
-//! Head records straight to one camera's 2-D splats: no child's mean, quaternion,
-//! covariance or SH is ever in memory (spec 6, first fusion).
+//! Projection of children from head records to one camera's 2-D splats. No child's mean,
+//! quaternion, covariance or SH is stored in memory.
 //!
-//! In: what [`super::forward`] takes, the parents' SH `[N, D, 3]`, a target camera.
-//! Out: one [`Footprint`] per child, empty where dropped, by the rules of
-//! [`crate::cpu::ewa`] and of the frame's projection (tests/spgr_project.rs holds them
-//! together). SH is evaluated once per parent under [`ShDirection::Parent`].
+//! Input: that of [`super::forward`], the parents' SH `[N, D, 3]`, a target camera.
+//! Output: one [`Footprint`] per child, empty for a dropped one, by the rules of
+//! [`crate::cpu::ewa`] and of the frame's projection (tests/spgr_project.rs compares them).
+//! [`ShDirection::Parent`] evaluates SH once per parent.
 
 use super::child::Child;
 use super::colour::Coefficients;
@@ -26,15 +26,15 @@ use rayon::prelude::*;
 const SUPPORT_SLACK: f64 = 1e-4;
 /// Widening of an extent, px (as in `ewa`).
 const SPAN_SLACK_PX: f64 = 1e-3;
-/// Adding it to a whole number below 2²³ leaves that number in the mantissa.
+/// A sum with it has a whole number below 2²³ in its mantissa.
 const MANTISSA: f32 = 8_388_608.0;
 
-/// Who looks at the children, and their parents' colour.
+/// Target camera, rasterizer options and parents' SH.
 #[derive(Clone, Copy, Debug)]
 pub struct Target<'a> {
     /// The camera of the picture to be rendered.
     pub camera: &'a Camera,
-    /// How it is rendered.
+    /// Options of the rasterizer.
     pub options: &'a RasterOptions,
     /// `[N, D, 3]`, D = (`sh_degree` + 1)².
     pub sh: &'a [f32],
@@ -42,10 +42,10 @@ pub struct Target<'a> {
     pub sh_degree: usize,
 }
 
-/// Where the children of one vector of parents are put: children, areas, opacities.
+/// Children, areas and opacities of one vector of parents.
 type Seat<'a, V> = (&'a mut [Seen<V>], &'a mut [V], &'a mut [V]);
 
-/// A child as the target sees it, its opacity still unknown.
+/// A child in the target camera, before its opacity is known.
 #[derive(Clone, Copy)]
 struct Seen<V> {
     /// Camera point.
@@ -87,8 +87,8 @@ impl<V: Vector<Element = f32>> Seen<V> {
         }
     }
 
-    /// The footprint's 12 numbers and four extents in the order of [`Footprint`], and
-    /// 1 where it is kept.
+    /// Computes the footprint's 12 numbers and four extents in the order of [`Footprint`],
+    /// and 1 in lanes that are kept.
     #[inline(always)]
     fn finish(&self, view: &View, alpha: V) -> ([V; 16], V) {
         let (zero, one, lowpass) = (V::constant(0.0), V::constant(1.0), V::splat(view.lowpass));
@@ -143,13 +143,13 @@ impl<V: Vector<Element = f32>> Seen<V> {
     }
 }
 
-/// Pixels [first, past the last) along one axis of `side` pixels that the support
-/// meets and, with a radius, that the tile cut leaves; whole numbers.
+/// Computes the pixels [first, past the last) along one axis of `side` pixels that the
+/// support intersects and, with a radius, that the tile cut keeps; whole numbers.
 #[inline(always)]
 fn extent<V: Vector<Element = f32>>(side: f32, (mean, half): (V, V), radius: Option<V>) -> (V, V) {
     let (zero, one, side) = (V::constant(0.0), V::constant(1.0), V::splat(side));
     let half = half + V::constant(SPAN_SLACK_PX);
-    // Clamped first, so that a whole number fits the mantissa.
+    // The clamp comes first, so that a whole number fits the mantissa.
     let first = (mean - half).max(zero).min(side);
     let past = (mean + half).max(-one).min(side);
     let mut first = -(-first).floor();
@@ -215,7 +215,8 @@ impl VectorKernel<f32> for Project<'_> {
 }
 
 impl Project<'_> {
-    /// The children of one vector of parents; 0 where all is finite, else NaN.
+    /// Projects the children of one vector of parents; returns 0 in lanes where all numbers
+    /// are finite, else NaN.
     #[inline(always)]
     fn look<V: Vector<Element = f32>>(
         &self,
@@ -298,8 +299,8 @@ impl Project<'_> {
     }
 }
 
-/// Footprints `[N·K]` of the children as `target` sees them (module doc), child k of
-/// parent n at n·K + k. False as in [`super::forward`].
+/// Computes the footprints `[N·K]` of the children in `target` (module documentation),
+/// child k of parent n at n·K + k. Returns false as [`super::forward`].
 pub fn project(args: Args<f32>, target: Target, out: &mut [Footprint]) -> bool {
     let table = Table::new(&args.source);
     let view = View::new(target.camera, target.options);

@@ -1,11 +1,11 @@
-//! Orientation and footprint of one ellipsoid, with gradients (spec 2.5, 2.6, 2.12).
+//! Orientation and footprint of one ellipsoid, with gradients.
 
 use super::Rules;
 use super::view::{M3, V3, add, axpy, cross, dot, indexed, product, scaled, times, transposed};
 use crate::abi::{AREA_SQ_EPS, GROWTH_MAX};
 use crate::cpu::simd::{Mask, Vector};
 
-/// θ below which the derivative of sin(θ/2)/θ is taken from its series, radians.
+/// θ² below which the derivative of sin(θ/2)/θ comes from its series, radians².
 const SERIES_BELOW: f64 = 1.0;
 
 /// Hamilton product, wxyz.
@@ -178,7 +178,8 @@ impl<V: Vector> Footprint<V> {
         (each * area, [product(by, self.m[0]), product(by, self.m[1])])
     }
 
-    /// Gradients for those of the area and of M (the latter beside the area's own).
+    /// Computes gradients from those of the area and of M (the latter without the area's
+    /// part).
     #[inline(always)]
     pub(super) fn backward(
         &self,
@@ -200,7 +201,7 @@ impl<V: Vector> Footprint<V> {
         (d_jw, d_rotation, d_scale)
     }
 
-    /// Factors of the three σ that raise the area to `a_min` where it is below.
+    /// Computes factors of the three σ that raise a smaller area to `a_min`.
     #[inline(always)]
     pub(super) fn growth(&self, rules: &Rules) -> V3<V> {
         let area = self.area;

@@ -1,5 +1,4 @@
-//! Small vector algebra on lanes, the primary view, and the guarded Jacobian with its
-//! gradient.
+//! 3-D vector algebra in lanes, the primary view, and the guarded Jacobian with its gradient.
 
 use super::{Rules, Source};
 use crate::abi::{FRUSTUM_MARGIN, VISIBLE_Z_MIN};
@@ -29,8 +28,8 @@ pub(super) fn scaled<V: Vector>(a: V3<V>, s: V) -> V3<V> {
     [a[0] * s, a[1] * s, a[2] * s]
 }
 
-/// f of each. `array::map` and `from_fn` are not always inlined, and what is not inlined
-/// is compiled without vectors.
+/// Applies `f` to each element. Compilers do not always inline `array::map` and `from_fn`,
+/// and build calls without the level's vectors.
 #[inline(always)]
 pub(super) fn each<A: Copy, const N: usize>(mut a: [A; N], f: impl Fn(A) -> A) -> [A; N] {
     for v in &mut a {
@@ -39,7 +38,7 @@ pub(super) fn each<A: Copy, const N: usize>(mut a: [A; N], f: impl Fn(A) -> A) -
     a
 }
 
-/// f of each index, `N` times, on top of `start`.
+/// Returns `f` of each index below `N`; `start` initialises the array.
 #[inline(always)]
 pub(super) fn indexed<A: Copy, const N: usize>(start: A, f: impl Fn(usize) -> A) -> [A; N] {
     let mut out = [start; N];
@@ -55,7 +54,7 @@ pub(super) fn add4<V: Vector>(a: [V; 4], b: [V; 4]) -> [V; 4] {
     [a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3]]
 }
 
-/// Every row of a table of scalars in every lane.
+/// Puts each scalar into every lane of a vector.
 #[inline(always)]
 pub(super) fn splat<V: Vector, const N: usize>(from: &[V::Element; N]) -> [V; N] {
     indexed(
@@ -65,7 +64,7 @@ pub(super) fn splat<V: Vector, const N: usize>(from: &[V::Element; N]) -> [V; N]
     )
 }
 
-/// Every row of a tile as a vector.
+/// Loads each row of a tile as a vector.
 #[inline(always)]
 pub(super) fn load<V: Vector, const N: usize>(tile: &[[V::Element; LANES]; N]) -> [V; N] {
     indexed(
@@ -102,7 +101,7 @@ pub(super) fn transposed<V: Vector>(m: &M3<V>, v: V3<V>) -> V3<V> {
 /// Numbers of one context camera.
 const FIELDS: usize = 23;
 
-/// The context cameras in numbers of the kernel.
+/// The context cameras as numbers of the kernel's type.
 pub(super) struct Table<T> {
     cameras: Vec<[T; FIELDS]>,
 }
@@ -140,7 +139,7 @@ impl<T: Real> Table<T> {
         self.cameras.len()
     }
 
-    /// The view of every lane.
+    /// Loads the view of every lane.
     #[inline(always)]
     pub(super) fn views<V: Vector<Element = T>>(&self, index: &[usize; LANES]) -> View<V> {
         let lanes = &index[..V::LANES];
@@ -156,7 +155,7 @@ impl<T: Real> Table<T> {
         View::new(load(&tile))
     }
 
-    /// v* of every lane (module doc of [`super`]).
+    /// Loads v* of every lane (module documentation of [`super`]).
     #[inline(always)]
     pub(super) fn primary<V: Vector<Element = T>>(
         &self,
@@ -197,9 +196,9 @@ pub(super) struct View<V> {
     pub(super) focal: [V; 2],
     centre: [V; 2],
     size: [V; 2],
-    /// Least camera z that is divided by.
+    /// Lower clamp of camera z in divisions.
     pub(super) z_min: V,
-    /// Bounds of x/z and y/z in the Jacobian.
+    /// Clamps of x/z and y/z in the Jacobian.
     low: [V; 2],
     high: [V; 2],
 }
@@ -225,7 +224,7 @@ impl<V: Vector> View<V> {
         transposed(&self.rotation, [p[0] - o[0], p[1] - o[1], p[2] - o[2]])
     }
 
-    /// Where `also` holds, in front of the camera and inside the picture.
+    /// Lanes of `also` whose point is in front of the camera and inside the picture.
     #[inline(always)]
     fn sees(&self, p: V3<V>, also: V::Mask) -> V::Mask {
         let mut seen = also & V::constant(VISIBLE_Z_MIN).lt(p[2]);
@@ -247,13 +246,14 @@ pub(super) struct Jacobian<V: Vector> {
     inverse_z: V,
     /// Axis in world: the third column of R.
     axis: V3<V>,
-    /// Depth and slopes where no guard acts.
+    /// Lanes whose depth and slopes no guard clamps.
     free_z: V::Mask,
     free: [[V::Mask; 2]; 2],
 }
 
 impl<V: Vector> Jacobian<V> {
-    /// At camera point `p`, pixels `zoom` times finer than the view's.
+    /// Computes the Jacobian at camera point `p`, for pixels `zoom` times finer than the
+    /// view's.
     #[inline(always)]
     pub(super) fn new(view: &View<V>, p: V3<V>, zoom: V) -> Self {
         let r = &view.rotation;
