@@ -1,8 +1,8 @@
 //! Pointwise functions, with gradients.
 
-use super::fresh::{Block, Fresh};
 use super::simd::elementary::{erf, exp};
 use super::simd::vectorize;
+use super::uninit::{UninitBuffer, UninitSlice};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
@@ -77,8 +77,8 @@ pub(super) use by_kind;
 
 /// Computes f(x) into new memory.
 pub fn forward(kind: Activation, x: &[f32]) -> Vec<f32> {
-    let mut fresh = Fresh::new(x.len());
-    fresh.blocks(CHUNK).zip(x.par_chunks(CHUNK)).for_each(|(y, x)| {
+    let mut buffer = UninitBuffer::new(x.len());
+    buffer.par_chunks_mut(CHUNK).zip(x.par_chunks(CHUNK)).for_each(|(y, x)| {
         vectorize(
             #[inline(always)]
             || {
@@ -92,11 +92,11 @@ pub fn forward(kind: Activation, x: &[f32]) -> Vec<f32> {
         );
     });
     // SAFETY: the loop above wrote every block.
-    unsafe { fresh.finish() }
+    unsafe { buffer.assume_init() }
 }
 
 #[inline(always)]
-fn map(x: &[f32], y: &mut Block<f32>, f: impl Fn(f32) -> f32) {
+fn map(x: &[f32], y: &mut UninitSlice<f32>, f: impl Fn(f32) -> f32) {
     assert_eq!(x.len(), y.len(), "activation: lengths");
     for (y, x) in y.iter_mut().zip(x) {
         *y = MaybeUninit::new(f(*x));

@@ -10,8 +10,8 @@ mod packed;
 mod tests;
 mod tile;
 
-use super::fresh::Fresh;
 use super::simd::{Kernel, LANES, Simd, SimdLevel};
+use super::uninit::UninitBuffer;
 pub(super) use packed::copy;
 pub use packed::{Mat, Packed};
 use rayon::prelude::*;
@@ -125,11 +125,11 @@ pub fn rows_product(lhs: Mat<'_>, rhs: &Packed, base: Base<'_>) -> Vec<f32> {
     let (m, n) = (lhs.rows, rhs.cols);
     lhs.check("operands");
     assert!(!matches!(base, Base::Own), "gemm: new memory holds nothing");
-    let mut fresh = Fresh::new(m * n);
+    let mut buffer = UninitBuffer::new(m * n);
     if let Some(rows) = BLOCK_FLOATS.checked_div(n) {
         let rows = rows.clamp(BLOCK_LEAST, BLOCK);
         let rows = if m <= BLOCK { BLOCK } else { rows };
-        fresh.blocks(rows * n).enumerate().for_each(|(i, block)| {
+        buffer.par_chunks_mut(rows * n).enumerate().for_each(|(i, block)| {
             let lhs = Mat {
                 data: &lhs.data[(i * rows * lhs.row_stride).min(lhs.data.len())..],
                 rows: block.len() / n,
@@ -142,7 +142,7 @@ pub fn rows_product(lhs: Mat<'_>, rhs: &Packed, base: Base<'_>) -> Vec<f32> {
         });
     }
     // SAFETY: the products above wrote every block; without columns there is none.
-    unsafe { fresh.finish() }
+    unsafe { buffer.assume_init() }
 }
 
 struct Product<'a> {

@@ -6,10 +6,10 @@ mod layer;
 mod silu;
 
 use super::activation::{Activation, by_kind};
-use super::fresh::{Block, Fresh};
 use super::simd::SimdLevel;
 use super::simd::vectorize;
 use super::sums::{sum_of, sums_of};
+use super::uninit::{UninitBuffer, UninitSlice};
 use layer::Layer;
 use rayon::prelude::*;
 use silu::Silu;
@@ -59,17 +59,17 @@ impl Rows {
 
 /// Computes f(w·(x − mean)/σ + b) into new memory; `w` and `b` are `[channels]`, or empty.
 pub fn forward(rows: &Rows, x: &[f32], w: &[f32], b: &[f32]) -> Vec<f32> {
-    let mut fresh = Fresh::new(x.len());
-    forward_to(rows, x, w, b, fresh.whole());
+    let mut buffer = UninitBuffer::new(x.len());
+    forward_to(rows, x, w, b, buffer.as_mut_slice());
     // SAFETY: every element of every row was written.
-    unsafe { fresh.finish() }
+    unsafe { buffer.assume_init() }
 }
 
 /// Computes [`forward`] into `y` and writes all of it.
 ///
 /// # Panics
 /// If the sizes do not fit.
-pub(super) fn forward_to(rows: &Rows, x: &[f32], w: &[f32], b: &[f32], y: &mut Block<f32>) {
+pub(super) fn forward_to(rows: &Rows, x: &[f32], w: &[f32], b: &[f32], y: &mut UninitSlice<f32>) {
     assert!(x.len() == y.len() && x.len().is_multiple_of(rows.len), "normalisation: rows");
     assert!(rows.len.is_multiple_of(rows.run) && w.len() == b.len(), "normalisation: channels");
     assert!(w.is_empty() || w.len() == rows.groups * rows.per_row(), "normalisation: channels");
@@ -121,7 +121,7 @@ pub(super) fn forward_to(rows: &Rows, x: &[f32], w: &[f32], b: &[f32], y: &mut B
 fn affine_row(
     rows: &Rows,
     x: &[f32],
-    y: &mut Block<f32>,
+    y: &mut UninitSlice<f32>,
     (mean, inverse): (f32, f32),
     affine: Option<(&[f32], &[f32])>,
     f: impl Fn(f32) -> f32,

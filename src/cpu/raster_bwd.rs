@@ -14,12 +14,12 @@
 use crate::abi::RasterOptions;
 use crate::camera::Camera;
 use crate::cpu::blend::Rules;
-use crate::cpu::disjoint::Disjoint;
 use crate::cpu::ewa::View;
 use crate::cpu::project::SplatSlices;
 use crate::cpu::project_bwd::{Gradients, Pass};
 use crate::cpu::raster_bwd_tile::{PairSums, SUMS, Scratch, Upstream, WalkTile};
 use crate::cpu::rasterize::{Rasterizer, since};
+use crate::cpu::shared_slice::SharedSliceMut;
 use crate::cpu::sort::depth_order;
 use crate::cpu::tiles::Grid;
 use rayon::prelude::*;
@@ -199,8 +199,8 @@ impl Rasterizer {
         queue.sort_unstable_by_key(|&t| (std::cmp::Reverse(self.lists.tile_len(t)), t));
         let (grid, level) = (self.grid, self.level);
         let footprints = &self.projection.footprints;
-        let (pairs, masks) = (Disjoint::new(pairs), Disjoint::new(masks));
-        let background = Disjoint::new(background);
+        let (pairs, masks) = (SharedSliceMut::new(pairs), SharedSliceMut::new(masks));
+        let background = SharedSliceMut::new(background);
         let lists = self.lists.lists();
         let threads = rayon::current_num_threads().min(queue.len());
         if scratch.len() < threads {

@@ -12,10 +12,10 @@ pub use crate::abi::Rendered;
 use crate::abi::{BLOCK, RasterOptions, TILE};
 use crate::camera::Camera;
 use crate::cpu::blend::{BLOCKS, RenderTile, Rules, Tile, Workplace};
-use crate::cpu::disjoint::Disjoint;
 use crate::cpu::ewa::{Footprint, View};
 use crate::cpu::project::{Projection, SplatSlices};
 use crate::cpu::raster_bwd::Buffers;
+use crate::cpu::shared_slice::SharedSliceMut;
 use crate::cpu::simd::{Kernel, Simd, SimdLevel};
 use crate::cpu::sort::depth_order;
 use crate::cpu::tiles::{Grid, TileLists};
@@ -81,11 +81,11 @@ pub struct Rasterizer {
 /// A picture being written, tile by tile: pixel p's channel c stands at
 /// `rgb[p·step + c·channel]`.
 struct Target<'a> {
-    rgb: Disjoint<'a, f32>,
+    rgb: SharedSliceMut<'a, f32>,
     step: usize,
     channel: usize,
-    alpha: Disjoint<'a, f32>,
-    depth_sum: Disjoint<'a, f32>,
+    alpha: SharedSliceMut<'a, f32>,
+    depth_sum: SharedSliceMut<'a, f32>,
     background: [f32; 3],
 }
 
@@ -143,11 +143,11 @@ impl Rasterizer {
         out.alpha.resize(width * height, 0.0);
         out.depth_sum.resize(width * height, 0.0);
         let target = Target {
-            rgb: Disjoint::new(&mut out.rgb),
+            rgb: SharedSliceMut::new(&mut out.rgb),
             step: 3,
             channel: 1,
-            alpha: Disjoint::new(&mut out.alpha),
-            depth_sum: Disjoint::new(&mut out.depth_sum),
+            alpha: SharedSliceMut::new(&mut out.alpha),
+            depth_sum: SharedSliceMut::new(&mut out.depth_sum),
             background: options.background,
         };
         self.project(splats, camera, options);
@@ -310,11 +310,11 @@ fn planes<'a>(camera: &Camera, options: &RasterOptions, out: &'a mut Vec<f32>) -
     let (rgb, rest) = out.split_at_mut(3 * plane);
     let (alpha, depth_sum) = rest.split_at_mut(plane);
     Target {
-        rgb: Disjoint::new(rgb),
+        rgb: SharedSliceMut::new(rgb),
         step: 1,
         channel: plane,
-        alpha: Disjoint::new(alpha),
-        depth_sum: Disjoint::new(depth_sum),
+        alpha: SharedSliceMut::new(alpha),
+        depth_sum: SharedSliceMut::new(depth_sum),
         background: options.background,
     }
 }

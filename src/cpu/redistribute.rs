@@ -16,8 +16,8 @@
 //! that a sum over children is a loop. WGSL: kernels/redistribute.wgsl,
 //! src/gpu/redistribute.rs. Op: ops/redistribute.rs.
 
-use super::fresh::{Block, Fresh, start};
 use super::simd::{LANES, Mask, Real, RowLayout, Vector, VectorKernel};
+use super::uninit::{UninitBuffer, UninitSlice, zeroed};
 use crate::abi::{AREA_EPS, AREA_RULE_OPACITY_MAX, OPACITY_CEILING, RELATIVE_AREA_MIN};
 use rayon::prelude::*;
 
@@ -310,7 +310,7 @@ fn load_singles<V: Vector>(from: &[V::Element], count: usize) -> [V; 1] {
 /// The forward pass of a block of parents.
 struct Forward<'a, T> {
     args: Args<'a, T>,
-    out: &'a mut Block<T>,
+    out: &'a mut UninitSlice<T>,
 }
 
 impl<T: Real> Forward<'_, T> {
@@ -324,7 +324,7 @@ impl<T: Real> Forward<'_, T> {
             a.load(&areas[at..], count);
             let (alpha, own) = (single(alphas, span), single(own, span));
             share(rule, a.as_ref(), alpha, own, o.as_mut());
-            o.store(start(&mut self.out[at..at + count * k]), count);
+            o.store(zeroed(&mut self.out[at..at + count * k]), count);
         }
     }
 }
@@ -345,12 +345,12 @@ impl<T: Real> VectorKernel<T> for Forward<'_, T> {
 
 /// Computes the opacities `[P, K]` of the children (module documentation).
 pub fn forward<T: Real>(args: Args<T>) -> Vec<T> {
-    let mut out = Fresh::new(args.alphas.len() * args.k);
-    out.blocks(args.k * BLOCK).enumerate().for_each(|(block, out)| {
+    let mut out = UninitBuffer::new(args.alphas.len() * args.k);
+    out.par_chunks_mut(args.k * BLOCK).enumerate().for_each(|(block, out)| {
         T::dispatch(Forward { args: args.parents(block * BLOCK, BLOCK), out });
     });
-    // SAFETY: the loop above started every block.
-    unsafe { out.finish() }
+    // SAFETY: the loop above initialised every block.
+    unsafe { out.assume_init() }
 }
 
 /// Gradients of [`forward`].
@@ -369,10 +369,10 @@ pub struct Gradients<T> {
 struct Backward<'a, T> {
     args: Args<'a, T>,
     grad: &'a [T],
-    logits: &'a mut Block<T>,
-    areas: &'a mut Block<T>,
-    alphas: &'a mut Block<T>,
-    own: &'a mut Block<T>,
+    logits: &'a mut UninitSlice<T>,
+    areas: &'a mut UninitSlice<T>,
+    alphas: &'a mut UninitSlice<T>,
+    own: &'a mut UninitSlice<T>,
 }
 
 impl<T: Real> Backward<'_, T> {
@@ -388,12 +388,12 @@ impl<T: Real> Backward<'_, T> {
             let per_parent = (single(alphas, span), single(own, span));
             let (d_alpha, d_own) =
                 share_backward(rule, per_parent, g.as_mut(), l.as_mut(), a.as_mut());
-            l.store(start(&mut self.logits[at..at + count * k]), count);
-            a.store(start(&mut self.areas[at..at + count * k]), count);
+            l.store(zeroed(&mut self.logits[at..at + count * k]), count);
+            a.store(zeroed(&mut self.areas[at..at + count * k]), count);
             for (v, out) in [(d_alpha, &mut *self.alphas), (d_own, &mut *self.own)] {
                 let mut lanes = [T::default(); LANES];
                 v.store(&mut lanes);
-                start(&mut out[first..first + count]).copy_from_slice(&lanes[..count]);
+                zeroed(&mut out[first..first + count]).copy_from_slice(&lanes[..count]);
             }
         }
     }
@@ -416,27 +416,30 @@ impl<T: Real> VectorKernel<T> for Backward<'_, T> {
 /// Computes the gradients of [`forward`] from the gradient `grad` `[P, K]` of its result.
 pub fn backward<T: Real>(args: Args<T>, grad: &[T]) -> Gradients<T> {
     let (p, k) = (args.alphas.len(), args.k);
-    let (mut logits, mut areas) = (Fresh::new(p * k), Fresh::new(p * k));
-    let (mut alphas, mut own) = (Fresh::new(p), Fresh::new(p));
-    type Own<'a, T> = ((&'a mut Block<T>, &'a mut Block<T>), (&'a mut Block<T>, &'a mut Block<T>));
+    let (mut logits, mut areas) = (UninitBuffer::new(p * k), UninitBuffer::new(p * k));
+    let (mut alphas, mut own) = (UninitBuffer::new(p), UninitBuffer::new(p));
+    type Own<'a, T> = (
+        (&'a mut UninitSlice<T>, &'a mut UninitSlice<T>),
+        (&'a mut UninitSlice<T>, &'a mut UninitSlice<T>),
+    );
     let one = |block: usize, ((logits, areas), (alphas, own)): Own<T>| {
         let args = args.parents(block * BLOCK, BLOCK);
         let grad = &grad[block * BLOCK * k..];
         T::dispatch(Backward { args, grad, logits, areas, alphas, own });
     };
     logits
-        .blocks(k * BLOCK)
-        .zip(areas.blocks(k * BLOCK))
-        .zip(alphas.blocks(BLOCK).zip(own.blocks(BLOCK)))
+        .par_chunks_mut(k * BLOCK)
+        .zip(areas.par_chunks_mut(k * BLOCK))
+        .zip(alphas.par_chunks_mut(BLOCK).zip(own.par_chunks_mut(BLOCK)))
         .enumerate()
         .for_each(|(block, own)| one(block, own));
-    // SAFETY: the loop above started every block: all four have as many.
+    // SAFETY: the loop above initialised every block: all four have as many.
     unsafe {
         Gradients {
-            logits: logits.finish(),
-            areas: areas.finish(),
-            alphas: alphas.finish(),
-            own: own.finish(),
+            logits: logits.assume_init(),
+            areas: areas.assume_init(),
+            alphas: alphas.assume_init(),
+            own: own.assume_init(),
         }
     }
 }

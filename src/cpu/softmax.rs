@@ -1,10 +1,10 @@
 //! Softmax over rows, with its gradient.
 //! Oracle: the definition in f64 (`model::layers`' tests).
 
-use super::fresh::{Block, Fresh};
 use super::simd::elementary::exp2_by_sums;
 use super::simd::vectorize;
 use super::simd::{Kernel, LANES, Mask, Simd, SimdLevel, Vector, first_lanes_bits};
+use super::uninit::{UninitBuffer, UninitSlice};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
@@ -21,7 +21,7 @@ pub(super) fn exp_row<S: Simd>(s: S, row: &mut [f32]) -> f32 {
     let mut most = [0.0; LANES];
     s.store(across(s, tops), &mut most);
     // SAFETY: `exps` writes numbers to these places.
-    let places = unsafe { super::fresh::over(row) }.as_mut_ptr();
+    let places = unsafe { super::uninit::as_uninit(row) }.as_mut_ptr();
     // SAFETY: source and destination are the same row.
     unsafe { exps(s, places.cast(), places, row.len(), most[0]) }
 }
@@ -137,18 +137,18 @@ fn times<S: Simd>(s: S, row: &mut [f32], by: f32) {
 /// Computes the softmax of every row of `x` `[rows, n]` into new memory.
 pub fn softmax(n: usize, x: &[f32]) -> Vec<f32> {
     let chunk = CHUNK.div_ceil(n.max(1)) * n.max(1);
-    let mut fresh = Fresh::new(x.len());
-    fresh.blocks(chunk).zip(x.par_chunks(chunk)).for_each(|(y, x)| {
+    let mut buffer = UninitBuffer::new(x.len());
+    buffer.par_chunks_mut(chunk).zip(x.par_chunks(chunk)).for_each(|(y, x)| {
         SimdLevel::best().run(Softmax { n, x, y });
     });
     // SAFETY: the loop above wrote every block.
-    unsafe { fresh.finish() }
+    unsafe { buffer.assume_init() }
 }
 
 struct Softmax<'a> {
     n: usize,
     x: &'a [f32],
-    y: &'a mut Block<f32>,
+    y: &'a mut UninitSlice<f32>,
 }
 
 impl Kernel for Softmax<'_> {
@@ -187,7 +187,7 @@ impl Kernel for Softmax<'_> {
             s.store(s.splat(1.0) / s.load(&kept), &mut inverses);
             for (y, inverse) in y.chunks_exact_mut(n).zip(inverses) {
                 // SAFETY: the loops above wrote it.
-                times(s, unsafe { &mut *(y as *mut Block<f32> as *mut [f32]) }, inverse);
+                times(s, unsafe { &mut *(y as *mut UninitSlice<f32> as *mut [f32]) }, inverse);
             }
         }
     }

@@ -22,8 +22,8 @@ mod winograd;
 mod winograd_few;
 mod winograd_weights;
 
-use super::fresh::{Block, Fresh};
 use super::simd::{Kernel, LANES, Simd, SimdLevel};
+use super::uninit::{UninitBuffer, UninitSlice};
 use plan::Plan;
 use rayon::prelude::*;
 use std::cell::{Cell, RefCell};
@@ -58,17 +58,24 @@ fn fresh(
     bias: &[f32],
 ) -> Vec<f32> {
     let pixels: usize = plan.dst_size.iter().product();
-    let mut y = Fresh::new(images * plan.dst_channels * pixels);
-    run(level, plan, x, w, bias, y.whole());
+    let mut y = UninitBuffer::new(images * plan.dst_channels * pixels);
+    run(level, plan, x, w, bias, y.as_mut_slice());
     // SAFETY: each of the three ways writes every channel of every picture in tiles that
     // cover it (the tests run them over memory full of NaN).
-    unsafe { y.finish() }
+    unsafe { y.assume_init() }
 }
 
 /// The fastest of the three ways. For numbers in ±1 and n products a sum, [`winograd`] is
 /// within 3e-6·√n of the exact sum, [`shift`] and [`pointwise`] within 1.5e-6·√n (the
 /// tests hold them).
-fn run(level: SimdLevel, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y: &mut Block<f32>) {
+fn run(
+    level: SimdLevel,
+    plan: &Plan,
+    x: &[f32],
+    w: &[f32],
+    bias: &[f32],
+    y: &mut UninitSlice<f32>,
+) {
     if y.is_empty() {
         return;
     }

@@ -5,10 +5,10 @@
 use super::Buffers;
 use super::plan::{Plan, pick};
 use super::shift::zip;
-use crate::cpu::disjoint::Disjoint;
-use crate::cpu::fresh;
 use crate::cpu::gemm::{Base, Mat, PANEL, Packed, product_at, product_on};
+use crate::cpu::shared_slice::SharedSliceMut;
 use crate::cpu::simd::{Kernel, Simd, SimdLevel};
+use crate::cpu::uninit;
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 use std::ops::Range;
@@ -41,7 +41,7 @@ pub(super) fn run(
     x: &[f32],
     w: &[f32],
     bias: &[f32],
-    y: &mut fresh::Block<f32>,
+    y: &mut uninit::UninitSlice<f32>,
 ) {
     let (c, o) = (plan.src_channels, plan.dst_channels);
     let weights = match plan.transposed {
@@ -53,7 +53,7 @@ pub(super) fn run(
     let images = y.len() / (o * pixels);
     assert!(y.len() == images * o * pixels && (bias.is_empty() || bias.len() == o));
     assert!(bias.is_empty() || plan.dst_step == [1; 3], "conv: a gradient has no bias");
-    let y = &Disjoint::new(y);
+    let y = &SharedSliceMut::new(y);
     let call = Call { level, plan, x, weights, bias, y };
     if plan.src_step == [1; 3] && plan.dst_step == [1; 3] {
         let spans = pixels.div_ceil(span);
@@ -92,7 +92,7 @@ pub(super) fn weight_grad(level: SimdLevel, plan: &Plan, x: &[f32], dy: &[f32], 
     let spans = lines.div_ceil(each);
     let units = images * spans;
     let jobs = units.min(JOBS);
-    let mut sums = fresh::zeros(jobs * o * c);
+    let mut sums = uninit::zeros(jobs * o * c);
     sums.par_chunks_exact_mut(o * c).enumerate().for_each(|(job, sums)| {
         for unit in units * job / jobs..units * (job + 1) / jobs {
             let (image, first) = (unit / spans, unit % spans * each);
@@ -130,7 +130,7 @@ struct Call<'a> {
     /// `[channels written, channels read]`.
     weights: Mat<'a>,
     bias: &'a [f32],
-    y: &'a Disjoint<'a, MaybeUninit<f32>>,
+    y: &'a SharedSliceMut<'a, MaybeUninit<f32>>,
 }
 
 impl Call<'_> {
@@ -232,7 +232,7 @@ struct Scatter<'a> {
     sums: &'a [f32],
     /// Zeros, as many as a line has pixels.
     zeros: &'a [f32],
-    y: &'a Disjoint<'a, MaybeUninit<f32>>,
+    y: &'a SharedSliceMut<'a, MaybeUninit<f32>>,
 }
 
 impl Kernel for Scatter<'_> {

@@ -1,8 +1,8 @@
 //! Against the definition in f64, in every level.
 
 use super::*;
-use crate::cpu::fresh::over;
 use crate::cpu::simd::SimdLevel;
+use crate::cpu::uninit::as_uninit;
 
 /// y in f64: nine loops.
 fn definition(s: &Sizes, x: &[f32], w: &[f32], bias: &[f32]) -> Vec<f64> {
@@ -144,7 +144,7 @@ fn over_nan(level: SimdLevel, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32]) -
     let images = x.len() / count(plan.src_channels, plan.src_size);
     let mut y = vec![f32::NAN; images * count(plan.dst_channels, plan.dst_size)];
     // SAFETY: `run` writes numbers.
-    run(level, plan, x, w, bias, unsafe { over(&mut y) });
+    run(level, plan, x, w, bias, unsafe { as_uninit(&mut y) });
     y
 }
 

@@ -11,9 +11,9 @@ use super::pointwise;
 use super::winograd;
 use super::winograd_weights::{self, Finish, Products};
 use super::{Buffer, Buffers};
-use crate::cpu::disjoint::Disjoint;
-use crate::cpu::fresh;
+use crate::cpu::shared_slice::SharedSliceMut;
 use crate::cpu::simd::{Kernel, LANES, Simd, SimdLevel, Vector};
+use crate::cpu::uninit;
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -90,7 +90,7 @@ pub fn weight_grad(level: SimdLevel, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut 
     assert!(groups <= units, "conv: no group of tiles is empty");
     // The first part is the largest.
     let floats = work(parts[0]).floats();
-    let mut sums = fresh::zeros(parts.len() * groups * floats);
+    let mut sums = uninit::zeros(parts.len() * groups * floats);
     sums.par_chunks_exact_mut(floats).enumerate().for_each(|(job, sums)| {
         let (part, group) = (job / groups, job % groups);
         let (first, channel) = parts[part];
@@ -105,7 +105,7 @@ pub fn weight_grad(level: SimdLevel, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut 
         let units = (units * group / groups..units * (group + 1) / groups).map(unit);
         Buffers::with(|buffers| way.sums(level, &work, units, buffers, sums));
     });
-    let dw = Disjoint::new(dw);
+    let dw = SharedSliceMut::new(dw);
     sums.par_chunks_exact(groups * floats).zip(&parts).for_each(|(sums, &(first, channel))| {
         let rows = channels.min(c - channel) * taps;
         let outputs = first..(first + outputs).min(o);

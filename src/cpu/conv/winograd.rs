@@ -9,9 +9,9 @@ use super::gather::{Gather, Tiles};
 use super::plan::{Axes, Plan, Sizes};
 use super::shift::{Block, ROWS, Strip, blocks};
 use super::{Buffer, Buffers};
-use crate::cpu::disjoint::Disjoint;
-use crate::cpu::fresh::{self, room};
+use crate::cpu::shared_slice::SharedSliceMut;
 use crate::cpu::simd::{Kernel, LANES, Simd, SimdLevel, transpose4x4_index};
+use crate::cpu::uninit::{self, grown};
 use rayon::prelude::*;
 use std::array::from_fn;
 use std::marker::PhantomData;
@@ -124,7 +124,7 @@ impl Weights {
     pub fn new(level: SimdLevel, plan: &Plan, way: Way, w: &[f32], mut data: Vec<f32>) -> Self {
         let blocks = blocks(plan.dst_channels);
         let floats = GROUPS * group_step(plan.src_channels);
-        room(&mut data, blocks.len() * floats)
+        grown(&mut data, blocks.len() * floats)
             .par_chunks_exact_mut(floats)
             .zip(&blocks)
             .for_each(|(panel, block)| level.run(Transform { plan, way, w, block, panel }));
@@ -232,7 +232,7 @@ pub(crate) fn run(
     x: &[f32],
     w: &Weights,
     bias: &[f32],
-    y: &mut fresh::Block<f32>,
+    y: &mut uninit::UninitSlice<f32>,
 ) {
     way.give(&Call::new(level, plan, way, x, w, bias, y));
 }
@@ -247,7 +247,7 @@ pub(super) struct Call<'a, W: ?Sized> {
     pub w: &'a W,
     pub bias: &'a [f32],
     pub images: usize,
-    pub y: Disjoint<'a, MaybeUninit<f32>>,
+    pub y: SharedSliceMut<'a, MaybeUninit<f32>>,
 }
 
 impl<'a, W: ?Sized> Call<'a, W> {
@@ -258,11 +258,11 @@ impl<'a, W: ?Sized> Call<'a, W> {
         x: &'a [f32],
         w: &'a W,
         bias: &'a [f32],
-        y: &'a mut fresh::Block<f32>,
+        y: &'a mut uninit::UninitSlice<f32>,
     ) -> Self {
         let pixels: usize = plan.dst_size.iter().product();
         let images = y.len() / (plan.dst_channels * pixels);
-        let (reader, y) = (way.reader(plan), Disjoint::new(y));
+        let (reader, y) = (way.reader(plan), SharedSliceMut::new(y));
         Self { level, plan, way, reader, x, w, bias, images, y }
     }
 }
@@ -433,7 +433,7 @@ fn columns<S, F, const IN: usize, const POINTS: usize, const OUT: usize>(
 /// Where a block's outputs go, the same in every channel.
 pub(super) struct Outputs<'a> {
     plan: &'a Plan,
-    y: &'a Disjoint<'a, MaybeUninit<f32>>,
+    y: &'a SharedSliceMut<'a, MaybeUninit<f32>>,
     /// For each vector of tiles.
     places: Vec<Pieces>,
 }
@@ -458,7 +458,7 @@ impl<'a> Outputs<'a> {
     /// Of `tiles`, the first of which has the grid position `start` in picture `image`.
     pub fn new<const OUT: usize>(
         plan: &'a Plan,
-        y: &'a Disjoint<'a, MaybeUninit<f32>>,
+        y: &'a SharedSliceMut<'a, MaybeUninit<f32>>,
         tiles: Tiles,
         image: usize,
         [depth, top, left]: Axes,

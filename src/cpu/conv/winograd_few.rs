@@ -9,8 +9,8 @@ use super::gather::{Gather, Tiles};
 use super::plan::Plan;
 use super::shift::{Block, ROWS, blocks};
 use super::winograd::{Call, Formed, Outputs, Product, Transform, Way, group_step};
-use crate::cpu::fresh;
 use crate::cpu::simd::{Kernel, LANES, Simd, SimdLevel};
+use crate::cpu::uninit;
 use rayon::prelude::*;
 use std::marker::PhantomData;
 use std::mem::take;
@@ -27,7 +27,7 @@ pub(super) fn run(
     x: &[f32],
     w: &[f32],
     bias: &[f32],
-    y: &mut fresh::Block<f32>,
+    y: &mut uninit::UninitSlice<f32>,
 ) {
     way.give(&Call::new(level, plan, way, x, w, bias, y));
 }

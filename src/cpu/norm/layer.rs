@@ -1,8 +1,8 @@
 //! LayerNorm. Each pass covers several rows, because the steps of one row depend on one
 //! another.
 
-use crate::cpu::fresh::Block;
 use crate::cpu::simd::{Kernel, LANES, Mask, Simd};
+use crate::cpu::uninit::UninitSlice;
 use std::array::from_fn;
 use std::mem::MaybeUninit;
 
@@ -17,7 +17,7 @@ pub(super) struct Layer<'a> {
     pub n: usize,
     pub eps: f32,
     pub x: &'a [f32],
-    pub y: &'a mut Block<f32>,
+    pub y: &'a mut UninitSlice<f32>,
     pub affine: [&'a [f32]; 2],
 }
 

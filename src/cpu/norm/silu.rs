@@ -1,16 +1,16 @@
 //! SiLU of normalised rows: v / (1 + e^{−v}) in vectors, with fused products.
 
 use super::Rows;
-use crate::cpu::fresh::Block;
 use crate::cpu::simd::elementary::exp2_by_sums;
 use crate::cpu::simd::{Kernel, LANES, Simd, Vector, first_lanes_bits};
+use crate::cpu::uninit::UninitSlice;
 
 /// Rows from number `first` on.
 pub(super) struct Silu<'a> {
     pub rows: &'a Rows,
     pub first: usize,
     pub x: &'a [f32],
-    pub y: &'a mut Block<f32>,
+    pub y: &'a mut UninitSlice<f32>,
     /// Scales and shifts `[channels]`, or empty.
     pub affine: [&'a [f32]; 2],
 }
@@ -45,7 +45,7 @@ struct Line {
 
 impl Line {
     #[inline(always)]
-    fn run<S: Simd>(&self, s: S, x: &[f32], y: &mut Block<f32>) {
+    fn run<S: Simd>(&self, s: S, x: &[f32], y: &mut UninitSlice<f32>) {
         let (sources, last) = x.as_chunks::<LANES>();
         let (places, rest) = y.as_chunks_mut::<LANES>();
         for (y, x) in places.iter_mut().zip(sources) {
