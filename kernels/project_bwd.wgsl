@@ -75,9 +75,9 @@ fn geometry(i: u32, m: Moments) {
     }
     var h0: vec3<f32>;
     var h1: vec3<f32>;
-    if call.stride == SPLAT_LANES {
-        let q = vec4<f32>(rows[row + LANE_QUAT], three(row + LANE_QUAT + 1u));
-        let scale = three(row + LANE_SCALE);
+    if call.stride == SPLAT_STRIDE {
+        let q = vec4<f32>(rows[row + QUAT_OFFSET], three(row + QUAT_OFFSET + 1u));
+        let scale = three(row + SCALE_OFFSET);
         let s = 2.0 / dot(q, q);
         // Columns of R.
         let r0 = vec3<f32>(1.0 - s * (q.z * q.z + q.w * q.w), s * (q.y * q.z + q.x * q.w), s * (q.y * q.w - q.x * q.z));
@@ -97,15 +97,15 @@ fn geometry(i: u32, m: Moments) {
             g0 += area * cross(m1, n);
             g1 += area * cross(n, m0);
         }
-        put(row + LANE_SCALE, g0 * reach0 + g1 * reach1);
+        put(row + SCALE_OFFSET, g0 * reach0 + g1 * reach1);
         let s0 = g0 * scale;
         let s1 = g1 * scale;
         h0 = s0.x * r0 + s0.y * r1 + s0.z * r2;
         h1 = s1.x * r0 + s1.y * r1 + s1.z * r2;
         // A turn by ω adds ω x (columns of R S), and q moves by ½ (0, ω) q.
         let t = cross(h0, j0) + cross(h1, j1);
-        d_rows[row + LANE_QUAT] = -s * dot(t, q.yzw);
-        put(row + LANE_QUAT + 1u, s * (q.x * t + cross(t, q.yzw)));
+        d_rows[row + QUAT_OFFSET] = -s * dot(t, q.yzw);
+        put(row + QUAT_OFFSET + 1u, s * (q.x * t + cross(t, q.yzw)));
     } else {
         let c0 = three(row + 3u);
         let c1 = three(row + 6u);

@@ -2,7 +2,7 @@
 // src/cpu/spgr/backward.rs. Arguments but the last three: kernels/shared/spgr.wgsl.
 //
 // In: gradient of the children [N·K, 11].   Out: of the head records [N, K, 11] (lane
-// HEAD_GAIN is 0: gains have a kernel of their own), of the parents [N, 11].
+// HEAD_GAIN_OFFSET is 0: gains have a kernel of their own), of the parents [N, 11].
 // One thread per parent: a first walk over its children for their areas, which the opacity
 // rule couples, then the rest. Until the second walk, lanes of a child's own head gradient
 // hold its area, its softmax weight and its opacity's part.
@@ -134,7 +134,7 @@ fn step_bwd(
         (*g).z += d_tanh * t.tanh_z;
         d_tanh *= p.z;
     }
-    d_head[record + HEAD_DEPTH] = d_tanh * (1.0 - t.tanh_z * t.tanh_z);
+    d_head[record + HEAD_DEPTH_OFFSET] = d_tanh * (1.0 - t.tanh_z * t.tanh_z);
     var d_offset = vec2<f32>();
     var flat = s.xy;
     if call.disc != 0u {
@@ -151,8 +151,8 @@ fn step_bwd(
     if call.bounded != 0u {
         d_offset *= call.offset_bound * (1.0 - t.bounded * t.bounded);
     }
-    d_head[record + HEAD_OFFSET] = d_offset.x;
-    d_head[record + HEAD_OFFSET + 1u] = d_offset.y;
+    d_head[record + HEAD_UV_OFFSET] = d_offset.x;
+    d_head[record + HEAD_UV_OFFSET + 1u] = d_offset.y;
 }
 
 fn grad3(i: u32) -> vec3<f32> {
@@ -161,8 +161,8 @@ fn grad3(i: u32) -> vec3<f32> {
 
 // Adds child i's part to its parent's gradient and writes its record's geometry lanes.
 fn child_bwd(p: Parent, k: u32, i: u32, d_of_area: f32, g: ptr<function, ParentGradient>) {
-    let record = i * HEAD_LANES;
-    let from_row = i * SPLAT_LANES;
+    let record = i * HEAD_STRIDE;
+    let from_row = i * SPLAT_STRIDE;
     let c = child_of(p, k, record);
     let f = c.footprint;
     var d_clamped = d_of_area;
@@ -177,19 +177,19 @@ fn child_bwd(p: Parent, k: u32, i: u32, d_of_area: f32, g: ptr<function, ParentG
     }
     let d_area = kept(call.a_min < f.area, d_clamped);
     let by = footprint_bwd(f, c.jacobian, c.rotation, c.small, d_area, da, db);
-    let d_small = grad3(from_row + LANE_SCALE) * c.growth + by.scale;
+    let d_small = grad3(from_row + SCALE_OFFSET) * c.growth + by.scale;
     (*g).scale += d_small * c.factor;
     let log_scale = d_small * c.small * (1.0 - c.soft * c.soft);
-    let q = from_row + LANE_QUAT;
+    let q = from_row + QUAT_OFFSET;
     let d_quat = vec4<f32>(grad[q], grad[q + 1u], grad[q + 2u], grad[q + 3u]);
     let d_unit = unit_bwd(c.unit, d_quat + rotation_bwd(c.unit.q, by.rotation));
     let turn = turn_bwd(c.turn, quat_product(conjugate(p.quat), d_unit));
     for (var j = 0u; j < 3u; j++) {
-        d_head[record + HEAD_LOG_SCALE + j] = log_scale[j];
-        d_head[record + HEAD_ROTATION + j] = turn[j];
+        d_head[record + HEAD_LOG_SCALE_OFFSET + j] = log_scale[j];
+        d_head[record + HEAD_ROTATION_OFFSET + j] = turn[j];
     }
     (*g).quat += quat_product(d_unit, conjugate(c.turn.e));
-    let d_mean = grad3(from_row + LANE_MEAN);
+    let d_mean = grad3(from_row + MEAN_OFFSET);
     (*g).mean += d_mean;
     var d_step = p.view.rotation * d_mean;
     if call.area_at_parent != 0u {
@@ -264,9 +264,9 @@ fn disc_bwd(p: Parent, g: ptr<function, ParentGradient>) {
 fn share_bwd(p: Parent, first: u32, past: u32, g: ptr<function, ParentGradient>) {
     if call.rule == RULE_NONE {
         for (var i = first; i < past; i++) {
-            (*g).alpha += grad[i * SPLAT_LANES + LANE_OPACITY];
-            d_head[i * HEAD_LANES + AREA] = 0.0;
-            d_head[i * HEAD_LANES + HEAD_LOGIT] = 0.0;
+            (*g).alpha += grad[i * SPLAT_STRIDE + OPACITY_OFFSET];
+            d_head[i * HEAD_STRIDE + AREA] = 0.0;
+            d_head[i * HEAD_STRIDE + HEAD_LOGIT_OFFSET] = 0.0;
         }
         return;
     }
@@ -277,7 +277,7 @@ fn share_bwd(p: Parent, first: u32, past: u32, g: ptr<function, ParentGradient>)
     var sum = 0.0;
     for (var i = first; i < past; i++) {
         let w = exp(argument(i) - top);
-        d_head[i * HEAD_LANES + WEIGHT] = w;
+        d_head[i * HEAD_STRIDE + WEIGHT] = w;
         sum += w;
     }
     let per_own = 1.0 / own_of(p).value;
@@ -286,13 +286,13 @@ fn share_bwd(p: Parent, first: u32, past: u32, g: ptr<function, ParentGradient>)
     var by_whole = 0.0;
     var by_own = 0.0;
     for (var i = first; i < past; i++) {
-        let at = i * HEAD_LANES;
+        let at = i * HEAD_STRIDE;
         let area = d_head[at + AREA];
         let w = d_head[at + WEIGHT] / sum;
         let inverse_b = 1.0 / share_divisor(call.rule, area, per_own);
         let part = w * inverse_b;
         let x = whole * part;
-        var dx = grad[i * SPLAT_LANES + LANE_OPACITY];
+        var dx = grad[i * SPLAT_STRIDE + OPACITY_OFFSET];
         if call.rule == RULE_AREA {
             dx = kept(x < AREA_RULE_OPACITY_MAX, dx);
         } else if call.rule != RULE_LINEAR {
@@ -307,15 +307,15 @@ fn share_bwd(p: Parent, first: u32, past: u32, g: ptr<function, ParentGradient>)
             d_area = d_b * per_own;
         }
         d_head[at + WEIGHT] = w;
-        d_head[at + HEAD_LOGIT] = dx * x;
+        d_head[at + HEAD_LOGIT_OFFSET] = dx * x;
         if call.rule != RULE_LINEAR {
             d_head[at + AREA] = d_area;
         }
     }
     for (var i = first; i < past; i++) {
-        let at = i * HEAD_LANES;
-        let d_logit = d_head[at + HEAD_LOGIT] - d_head[at + WEIGHT] * mean;
-        d_head[at + HEAD_LOGIT] = d_logit;
+        let at = i * HEAD_STRIDE;
+        let d_logit = d_head[at + HEAD_LOGIT_OFFSET] - d_head[at + WEIGHT] * mean;
+        d_head[at + HEAD_LOGIT_OFFSET] = d_logit;
         if call.rule == RULE_LINEAR {
             d_head[at + AREA] = -d_logit / (d_head[at + AREA] + AREA_EPS);
         }
@@ -329,8 +329,8 @@ fn share_bwd(p: Parent, first: u32, past: u32, g: ptr<function, ParentGradient>)
 
 // Softmax argument of child i, its area in its lane.
 fn argument(i: u32) -> f32 {
-    let at = i * HEAD_LANES;
-    return share_log(call.rule, head[at + HEAD_LOGIT], d_head[at + AREA]);
+    let at = i * HEAD_STRIDE;
+    return share_log(call.rule, head[at + HEAD_LOGIT_OFFSET], d_head[at + AREA]);
 }
 
 @compute @workgroup_size(64)
@@ -347,15 +347,15 @@ fn main(
     let first = n * count;
     let p = load_parent(n);
     for (var k = 0u; k < count; k++) {
-        let record = (first + k) * HEAD_LANES;
+        let record = (first + k) * HEAD_STRIDE;
         d_head[record + AREA] = child_of(p, k, record).area;
     }
     var g: ParentGradient;
     share_bwd(p, first, first + count, &g);
     for (var k = 0u; k < count; k++) {
-        let record = (first + k) * HEAD_LANES;
+        let record = (first + k) * HEAD_STRIDE;
         child_bwd(p, k, first + k, d_head[record + AREA], &g);
-        d_head[record + HEAD_GAIN] = 0.0;
+        d_head[record + HEAD_GAIN_OFFSET] = 0.0;
     }
     if rule_is_relative(call.rule) {
         own_bwd(p, &g);
@@ -368,13 +368,13 @@ fn main(
     }
     g.in_camera.z += kept(p.view.z_min < p.in_camera.z, g.z);
     let mean = g.mean + g.in_camera * p.view.rotation;
-    let to = n * SPLAT_LANES;
+    let to = n * SPLAT_STRIDE;
     for (var i = 0u; i < 3u; i++) {
-        d_parents[to + LANE_MEAN + i] = mean[i];
-        d_parents[to + LANE_SCALE + i] = g.scale[i];
+        d_parents[to + MEAN_OFFSET + i] = mean[i];
+        d_parents[to + SCALE_OFFSET + i] = g.scale[i];
     }
     for (var i = 0u; i < 4u; i++) {
-        d_parents[to + LANE_QUAT + i] = g.quat[i];
+        d_parents[to + QUAT_OFFSET + i] = g.quat[i];
     }
-    d_parents[to + LANE_OPACITY] = g.alpha;
+    d_parents[to + OPACITY_OFFSET] = g.alpha;
 }

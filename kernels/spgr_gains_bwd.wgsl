@@ -1,4 +1,4 @@
-// Gradient of the colour gains: lane HEAD_GAIN of the head records [M, 11], M = N·K, the
+// Gradient of the colour gains: lane HEAD_GAIN_OFFSET of the head records [M, 11], M = N·K, the
 // other lanes 0. Twin of src/cpu/spgr/backward.rs (gains).   One thread per record.
 
 struct SpgrGainsBwdUniform {
@@ -28,8 +28,8 @@ fn main(
     for (var k = 1u; k < call.lanes; k++) {
         d += 0.5 * grad[i * call.lanes + k];
     }
-    let t = tanh_of(head[i * HEAD_LANES + HEAD_GAIN]);
-    for (var k = 0u; k < HEAD_LANES; k++) {
-        d_head[i * HEAD_LANES + k] = select(0.0, d * call.delta * (1.0 - t * t), k == HEAD_GAIN);
+    let t = tanh_of(head[i * HEAD_STRIDE + HEAD_GAIN_OFFSET]);
+    for (var k = 0u; k < HEAD_STRIDE; k++) {
+        d_head[i * HEAD_STRIDE + k] = select(0.0, d * call.delta * (1.0 - t * t), k == HEAD_GAIN_OFFSET);
     }
 }

@@ -8,7 +8,7 @@ mod oracle;
 use glam::{EulerRot, Mat4, Quat, Vec3};
 use oracle::{Shape, Splat};
 use subsplat::abi::{
-    ALPHA_MIN, Convention, LANE_OPACITY, RasterOptions, SPLAT_LANES, ShBasis, ShDirection,
+    ALPHA_MIN, Convention, OPACITY_OFFSET, RasterOptions, SPLAT_STRIDE, ShBasis, ShDirection,
 };
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::cpu::{Geometry, Rasterizer, Rendered, SimdLevel, SplatSlices};
@@ -266,7 +266,7 @@ fn mvsplat_lengths_are_in_units_of_near() {
     let base = Rasterizer::new().render(&slices(&scene.splats), &scene.camera, &o);
     // A power of two scales f32 exactly.
     let mut scaled = scene.splats.clone();
-    for row in scaled.rows.chunks_exact_mut(SPLAT_LANES) {
+    for row in scaled.rows.chunks_exact_mut(SPLAT_STRIDE) {
         for lane in [0, 1, 2, 7, 8, 9] {
             row[lane] *= 4.0;
         }
@@ -310,7 +310,7 @@ fn any_number_of_threads_and_any_memory_gives_the_same_bytes() {
         }
         let more = scene(kind, seed as u64, (150, 97), 4);
         let move_back = camera.world_from_camera * more.camera.camera_from_world();
-        for row in more.splats.rows.chunks_exact(SPLAT_LANES) {
+        for row in more.splats.rows.chunks_exact(SPLAT_STRIDE) {
             let at = move_back.transform_point3(Vec3::from_slice(&row[..3]));
             all.splats.rows.extend(at.to_array());
             all.splats.rows.extend_from_slice(&row[3..]);
@@ -422,7 +422,7 @@ fn crowds_and_giants_are_drawn() {
     let camera = Camera::new(k, Mat4::IDENTITY).unwrap();
     let mut r = Random(77);
     let n = 1 << 20;
-    let mut rows = Vec::with_capacity(SPLAT_LANES * n);
+    let mut rows = Vec::with_capacity(SPLAT_STRIDE * n);
     for i in 0..n {
         let z = 2.0 + 3.0 * r.unit();
         let giant = i % 50_000 == 0;
@@ -480,20 +480,20 @@ fn bad_numbers_drop_their_splat_and_nothing_else() {
         let without = |dropped: &[usize]| {
             let mut s = good.splats.clone();
             for &i in dropped {
-                s.rows[i * SPLAT_LANES + LANE_OPACITY] = 0.0;
+                s.rows[i * SPLAT_STRIDE + OPACITY_OFFSET] = 0.0;
             }
             rasterize(&s, &o)
         };
         assert!(without(&[]) != without(&(0..n).collect::<Vec<_>>()));
-        for lane in 0..SPLAT_LANES {
+        for lane in 0..SPLAT_STRIDE {
             for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e38] {
-                if lane == LANE_OPACITY && bad == 1e38 {
+                if lane == OPACITY_OFFSET && bad == 1e38 {
                     continue; // Opaque, not bad: the cap deals with it.
                 }
                 let mut s = good.splats.clone();
                 let hit: Vec<usize> = (lane..n).step_by(9).collect();
                 for &i in &hit {
-                    s.rows[i * SPLAT_LANES + lane] = bad;
+                    s.rows[i * SPLAT_STRIDE + lane] = bad;
                 }
                 let got = rasterize(&s, &o);
                 assert!(got == without(&hit), "lane {lane} = {bad} {convention:?}");
@@ -502,7 +502,7 @@ fn bad_numbers_drop_their_splat_and_nothing_else() {
         let mut s = good.splats.clone();
         let zero: Vec<usize> = (0..n).step_by(5).collect();
         for &i in &zero {
-            s.rows[i * SPLAT_LANES + 3..i * SPLAT_LANES + 7].fill(0.0);
+            s.rows[i * SPLAT_STRIDE + 3..i * SPLAT_STRIDE + 7].fill(0.0);
         }
         assert!(rasterize(&s, &o) == without(&zero), "zero quaternions {convention:?}");
         let mut s = good.splats.clone();
@@ -516,7 +516,7 @@ fn bad_numbers_drop_their_splat_and_nothing_else() {
         // A lost child does not blind its siblings under the parent's direction.
         let shared = RasterOptions { sh_direction: ShDirection::Parent, ..o };
         let mut s = good.splats.clone();
-        s.rows[8 * SPLAT_LANES] = f32::NAN;
+        s.rows[8 * SPLAT_STRIDE] = f32::NAN;
         let got = rasterize(&s, &shared);
         assert!(got.rgb.iter().all(|v| v.is_finite()));
         let all_gone = rasterize(&poisoned(&good.splats), &o);
@@ -591,7 +591,7 @@ fn opaque_layers_end_the_work() {
     let k = Intrinsics { cx: 0.5, cy: 0.5, width: 1, height: 1, ..k };
     let camera = Camera::new(k, Mat4::IDENTITY).unwrap();
     let mut points = splats.clone();
-    for row in points.rows.chunks_exact_mut(SPLAT_LANES) {
+    for row in points.rows.chunks_exact_mut(SPLAT_STRIDE) {
         row[7..10].fill(0.0);
     }
     rasterizer.render(&slices(&points), &camera, &RasterOptions::default());

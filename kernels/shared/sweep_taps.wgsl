@@ -2,7 +2,7 @@
 
 @group(0) @binding(1) var<storage, read> reference: array<f32>;
 @group(0) @binding(2) var<storage, read> source: array<f32>;
-// SWEEP_PAIR_LANES floats of a pair: K_r^-1 (4), rotation rows (9), t (3), K (4).
+// SWEEP_PAIR_STRIDE floats of a pair: K_r^-1 (4), rotation rows (9), t (3), K (4).
 @group(0) @binding(3) var<storage, read> pairs: array<f32>;
 // Rows + 1 numbers: pairs of row r are heads[r] .. heads[r + 1]; then each pair's row of
 // the source.
@@ -27,7 +27,7 @@ fn share(r: u32) -> f32 {
 
 // Source index coordinates of reference pixel (x, y) at this depth.
 fn fall(pair: u32, x: u32, y: u32, depth: f32) -> vec2<f32> {
-    let p = pair * SWEEP_PAIR_LANES;
+    let p = pair * SWEEP_PAIR_STRIDE;
     let ray = vec2<f32>(
         pairs[p] * (f32(x) + call.centre) + pairs[p + 2u],
         pairs[p + 1u] * (f32(y) + call.centre) + pairs[p + 3u],

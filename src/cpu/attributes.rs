@@ -10,7 +10,7 @@
 //! Op: ops/attributes.rs. Reference in tensor operations: `model::embed::Embeddings::inputs`.
 
 use super::simd::{Mask, Real, RowLayout, Vector, VectorKernel};
-use crate::abi::{LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES};
+use crate::abi::{MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE};
 use rayon::prelude::*;
 
 /// A camera's frame.
@@ -55,8 +55,8 @@ const OPACITY: usize = 10;
 
 /// μ − eye.
 #[inline(always)]
-fn centred<V: Vector>(frame: &Frame, row: &[V; SPLAT_LANES]) -> [V; 3] {
-    let mut out = [row[LANE_MEAN], row[LANE_MEAN + 1], row[LANE_MEAN + 2]];
+fn centred<V: Vector>(frame: &Frame, row: &[V; SPLAT_STRIDE]) -> [V; 3] {
+    let mut out = [row[MEAN_OFFSET], row[MEAN_OFFSET + 1], row[MEAN_OFFSET + 2]];
     for (v, o) in out.iter_mut().zip(frame.position) {
         *v = *v - V::constant(o);
     }
@@ -80,9 +80,9 @@ struct Place<V> {
 
 impl Attributes {
     #[inline(always)]
-    fn place<V: Vector>(&self, row: &[V; SPLAT_LANES]) -> Place<V> {
+    fn place<V: Vector>(&self, row: &[V; SPLAT_STRIDE]) -> Place<V> {
         let own = match &self.frame {
-            None => [row[LANE_MEAN], row[LANE_MEAN + 1], row[LANE_MEAN + 2]],
+            None => [row[MEAN_OFFSET], row[MEAN_OFFSET + 1], row[MEAN_OFFSET + 2]],
             Some(frame) => {
                 let c = centred(frame, row);
                 [along(frame, c, 0), along(frame, c, 1), along(frame, c, 2)]
@@ -94,8 +94,9 @@ impl Attributes {
 
     /// Quaternion in the frame, before its sign is fixed.
     #[inline(always)]
-    fn quat<V: Vector>(&self, row: &[V; SPLAT_LANES]) -> [V; 4] {
-        let q = [row[LANE_QUAT], row[LANE_QUAT + 1], row[LANE_QUAT + 2], row[LANE_QUAT + 3]];
+    fn quat<V: Vector>(&self, row: &[V; SPLAT_STRIDE]) -> [V; 4] {
+        let q =
+            [row[QUAT_OFFSET], row[QUAT_OFFSET + 1], row[QUAT_OFFSET + 2], row[QUAT_OFFSET + 3]];
         let Some(frame) = &self.frame else { return q };
         let mut out = q;
         for (v, line) in out.iter_mut().zip(&frame.turn) {
@@ -109,13 +110,13 @@ impl Attributes {
 
     /// Camera z in the source view, not clamped.
     #[inline(always)]
-    fn depth<V: Vector>(&self, row: &[V; SPLAT_LANES]) -> V {
+    fn depth<V: Vector>(&self, row: &[V; SPLAT_STRIDE]) -> V {
         along(&self.source, centred(&self.source, row), 2)
     }
 
     #[inline(always)]
-    fn forward<V: Vector>(&self, row: &[V; SPLAT_LANES]) -> [V; SPLAT_LANES] {
-        let mut out = [V::constant(0.0); SPLAT_LANES];
+    fn forward<V: Vector>(&self, row: &[V; SPLAT_STRIDE]) -> [V; SPLAT_STRIDE] {
+        let mut out = [V::constant(0.0); SPLAT_STRIDE];
         let place = self.place(row);
         out[..3].copy_from_slice(&place.own);
         if self.ray {
@@ -125,7 +126,7 @@ impl Attributes {
             }
             out[2] = place.z.ln();
         }
-        out[SCALE..QUAT].copy_from_slice(&row[LANE_SCALE..LANE_SCALE + 3]);
+        out[SCALE..QUAT].copy_from_slice(&row[SCALE_OFFSET..SCALE_OFFSET + 3]);
         if let Some(fx) = self.log_px {
             let z = self.depth(row).max(V::constant(self.z_min)).ln() - V::constant(fx.ln());
             for v in &mut out[SCALE..QUAT] {
@@ -137,10 +138,10 @@ impl Attributes {
         for (to, q) in out[QUAT..OPACITY].iter_mut().zip(quat) {
             *to = negative.select(-q, q);
         }
-        out[OPACITY] = row[LANE_OPACITY];
+        out[OPACITY] = row[OPACITY_OFFSET];
         if let Some(most) = self.logit {
             let low = 1.0 / (1.0 + most.exp());
-            let p = row[LANE_OPACITY].max(V::constant(low)).min(V::constant(1.0 - low));
+            let p = row[OPACITY_OFFSET].max(V::constant(low)).min(V::constant(1.0 - low));
             out[OPACITY] = p.ln() - (V::constant(1.0) - p).ln();
         }
         out
@@ -150,11 +151,11 @@ impl Attributes {
     #[inline(always)]
     fn backward<V: Vector>(
         &self,
-        row: &[V; SPLAT_LANES],
-        d: &[V; SPLAT_LANES],
-    ) -> [V; SPLAT_LANES] {
+        row: &[V; SPLAT_STRIDE],
+        d: &[V; SPLAT_STRIDE],
+    ) -> [V; SPLAT_STRIDE] {
         let zero = V::constant(0.0);
-        let mut out = [zero; SPLAT_LANES];
+        let mut out = [zero; SPLAT_STRIDE];
         let mut d_own = [d[0], d[1], d[2]];
         if self.ray {
             let place = self.place(row);
@@ -169,7 +170,7 @@ impl Attributes {
             let free = V::constant(self.z_min).lt(place.own[2]);
             d_own[2] = free.select_or_zero(d_z / place.z);
         }
-        for (i, to) in out[LANE_MEAN..LANE_MEAN + 3].iter_mut().enumerate() {
+        for (i, to) in out[MEAN_OFFSET..MEAN_OFFSET + 3].iter_mut().enumerate() {
             *to = match &self.frame {
                 None => d_own[i],
                 Some(frame) => {
@@ -180,18 +181,18 @@ impl Attributes {
                 }
             };
         }
-        out[LANE_SCALE..LANE_SCALE + 3].copy_from_slice(&d[SCALE..QUAT]);
+        out[SCALE_OFFSET..SCALE_OFFSET + 3].copy_from_slice(&d[SCALE..QUAT]);
         if self.log_px.is_some() {
             let depth = self.depth(row);
             let least = V::constant(self.z_min);
             let d_z = -(d[SCALE] + d[SCALE + 1] + d[SCALE + 2]) / depth.max(least);
             let d_z = least.lt(depth).select_or_zero(d_z);
             for i in 0..3 {
-                let mean = &mut out[LANE_MEAN + i];
+                let mean = &mut out[MEAN_OFFSET + i];
                 *mean = V::constant(self.source.rotation[i][2]).fma(d_z, *mean);
-                let (s, least) = (row[LANE_SCALE + i], V::constant(self.scale_min));
+                let (s, least) = (row[SCALE_OFFSET + i], V::constant(self.scale_min));
                 let slope = d[SCALE + i] / s.max(least);
-                out[LANE_SCALE + i] = least.lt(s).select_or_zero(slope);
+                out[SCALE_OFFSET + i] = least.lt(s).select_or_zero(slope);
             }
         }
         let negative = self.quat(row)[0].lt(zero);
@@ -199,7 +200,7 @@ impl Attributes {
         for v in &mut d_quat {
             *v = negative.select(-*v, *v);
         }
-        for (i, to) in out[LANE_QUAT..LANE_QUAT + 4].iter_mut().enumerate() {
+        for (i, to) in out[QUAT_OFFSET..QUAT_OFFSET + 4].iter_mut().enumerate() {
             *to = d_quat[i];
             if let Some(frame) = &self.frame {
                 *to = V::constant(frame.turn[0][i]) * d_quat[0];
@@ -208,14 +209,14 @@ impl Attributes {
                 }
             }
         }
-        out[LANE_OPACITY] = d[OPACITY];
+        out[OPACITY_OFFSET] = d[OPACITY];
         if let Some(most) = self.logit {
             let low = 1.0 / (1.0 + most.exp());
-            let (p, low, high) = (row[LANE_OPACITY], V::constant(low), V::constant(1.0 - low));
+            let (p, low, high) = (row[OPACITY_OFFSET], V::constant(low), V::constant(1.0 - low));
             let held = p.max(low).min(high);
             let slope = d[OPACITY] / (held * (V::constant(1.0) - held));
             let inside = p.lt(high).select_or_zero(slope);
-            out[LANE_OPACITY] = low.lt(p).select_or_zero(inside);
+            out[OPACITY_OFFSET] = low.lt(p).select_or_zero(inside);
         }
         out
     }
@@ -233,10 +234,10 @@ impl<T: Real> VectorKernel<T> for Block<'_, T> {
     type Output = ();
     #[inline(always)]
     fn run<V: Vector<Element = T>>(self) {
-        let n = self.rows.len() / SPLAT_LANES;
+        let n = self.rows.len() / SPLAT_STRIDE;
         for first in (0..n).step_by(V::LANES) {
-            let layout = RowLayout { stride: SPLAT_LANES, count: V::LANES.min(n - first) };
-            let at = first * SPLAT_LANES;
+            let layout = RowLayout { stride: SPLAT_STRIDE, count: V::LANES.min(n - first) };
+            let at = first * SPLAT_STRIDE;
             let row = V::load_rows(&self.rows[at..], layout);
             let out = match self.reached {
                 None => self.attributes.forward(&row),
@@ -249,7 +250,7 @@ impl<T: Real> VectorKernel<T> for Block<'_, T> {
 
 /// Computes the attributes of `rows` into `out` (module documentation).
 pub fn forward<T: Real>(attributes: &Attributes, rows: &[T], out: &mut [T]) {
-    let size = BLOCK * SPLAT_LANES;
+    let size = BLOCK * SPLAT_STRIDE;
     rows.par_chunks(size).zip(out.par_chunks_mut(size)).for_each(|(rows, out)| {
         T::dispatch(Block { attributes, rows, reached: None, out });
     });
@@ -258,7 +259,7 @@ pub fn forward<T: Real>(attributes: &Attributes, rows: &[T], out: &mut [T]) {
 /// Computes the gradient with respect to `rows` into `out`, from the gradient `reached`
 /// `[n, 11]` of the result.
 pub fn backward<T: Real>(attributes: &Attributes, rows: &[T], reached: &[T], out: &mut [T]) {
-    let size = BLOCK * SPLAT_LANES;
+    let size = BLOCK * SPLAT_STRIDE;
     let blocks = rows.par_chunks(size).zip(reached.par_chunks(size));
     blocks.zip(out.par_chunks_mut(size)).for_each(|((rows, reached), out)| {
         T::dispatch(Block { attributes, rows, reached: Some(reached), out });

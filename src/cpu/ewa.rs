@@ -13,7 +13,7 @@
 //! or infinite, a zero quaternion included. A σ of zero is a point, which the low-pass
 //! widens. The sign of σ does not matter. The alpha cap limits opacities above 1.
 
-pub use crate::view::View;
+pub use crate::abi::View;
 
 use crate::abi::{
     ALPHA_MIN, ALPHA_MIN_LOG2, BLOCK, DISCRIMINANT_MIN_MVSPLAT, OPACITY_MAX, RADIUS_SIGMAS_MVSPLAT,

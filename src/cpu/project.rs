@@ -10,9 +10,9 @@
 
 pub use crate::abi::{Geometry, SplatSlices};
 
-pub(crate) use crate::abi::lanes_at;
+pub(crate) use crate::abi::floats_at;
 use crate::abi::{
-    LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, RasterOptions, SPLAT_LANES, ShBasis,
+    MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE, ShBasis,
     ShDirection, sh_coefficients,
 };
 use crate::cpu::covariance::Shape;
@@ -25,7 +25,7 @@ use rayon::prelude::*;
 /// Parents per unit of parallel work.
 const PARENTS: usize = 256;
 
-const _: () = assert!(LANE_OPACITY == LANE_SCALE + 3 && LANE_QUAT == LANE_MEAN + 3);
+const _: () = assert!(OPACITY_OFFSET == SCALE_OFFSET + 3 && QUAT_OFFSET == MEAN_OFFSET + 3);
 
 /// Footprints of a frame, reused from frame to frame.
 #[derive(Debug, Default)]
@@ -255,11 +255,11 @@ impl Chunk<'_> {
         }
         match self.splats.geometry {
             Geometry::Packed(rows) => {
-                let at = index.map(|i| i * SPLAT_LANES);
-                let [x, y, z, qw] = s.gather4(rows, &at, LANE_MEAN);
-                let [qx, qy, qz, _] = s.gather4(rows, &at, LANE_QUAT + 1);
+                let at = index.map(|i| i * SPLAT_STRIDE);
+                let [x, y, z, qw] = s.gather4(rows, &at, MEAN_OFFSET);
+                let [qx, qy, qz, _] = s.gather4(rows, &at, QUAT_OFFSET + 1);
                 // The row's last four.
-                let [sx, sy, sz, opacity] = s.gather4(rows, &at, LANE_SCALE);
+                let [sx, sy, sz, opacity] = s.gather4(rows, &at, SCALE_OFFSET);
                 let shape = Shape::Quat([qw, qx, qy, qz], [sx, sy, sz]);
                 self.view.project(s, [x, y, z], shape, opacity)
             }
@@ -271,7 +271,7 @@ impl Chunk<'_> {
                     for (column, v) in columns.iter_mut().zip([x, y, z, opacities[i]]) {
                         column[l] = v;
                     }
-                    shapes[l] = lanes_at(cov6, 6 * i);
+                    shapes[l] = floats_at(cov6, 6 * i);
                 }
                 let [x, y, z, opacity] = columns;
                 let mean = [s.load(&x), s.load(&y), s.load(&z)];
@@ -300,7 +300,8 @@ impl Chunk<'_> {
             let set = 3 * sh_coefficients(splats.sh_degree);
             let mean = match splats.geometry {
                 Geometry::Packed(rows) => {
-                    let [x, y, z, _] = s.gather4(rows, &index.map(|i| i * SPLAT_LANES), LANE_MEAN);
+                    let [x, y, z, _] =
+                        s.gather4(rows, &index.map(|i| i * SPLAT_STRIDE), MEAN_OFFSET);
                     [x, y, z]
                 }
                 Geometry::Cov6 { .. } => {

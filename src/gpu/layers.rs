@@ -6,7 +6,7 @@
 //! What remains too small: a device on which 4 bytes of every splat, or one row of tiles,
 //! do not fit a binding.
 
-use crate::abi::{FOOTPRINT_LANES, PLAN_ASKED, PLAN_WORDS, RasterUniform, TILE_GPU};
+use crate::abi::{FOOTPRINT_STRIDE, PLAN_REQUESTED, PLAN_WORDS, RasterUniform, TILE_GPU};
 use crate::gpu::buffers::Buffer;
 use crate::gpu::commands::{Commands, Groups};
 use crate::gpu::device::Gpu;
@@ -20,7 +20,7 @@ use crate::gpu::scene::Scene;
 use std::time::Duration;
 
 /// Floats of a pixel: R, G, B, alpha, depth sum.
-pub(crate) const PICTURE_LANES: usize = 5;
+pub(crate) const PICTURE_CHANNELS: usize = 5;
 
 /// Time of stages, in order.
 pub(crate) type Times = Vec<(&'static str, Duration)>;
@@ -133,13 +133,13 @@ impl Band {
         let plan = commands.read::<u32>(&plan, PLAN_WORDS)?;
         let submitted = commands.submit()?;
         let (offsets, plan) = (offsets.take(gpu)?, plan.take(gpu)?);
-        let total = plan.get(PLAN_ASKED).copied().unwrap_or(u32::MAX);
+        let total = plan.get(PLAN_REQUESTED).copied().unwrap_or(u32::MAX);
         // Sums stop there (kernels/shared/scan.wgsl).
         if total == u32::MAX {
             let (needed, limit) = (u64::from(total), u64::from(total - 1));
             return Err(GpuError::TooSmall { what: "(splat, tile) pairs", needed, limit });
         }
-        let most = (gpu.rows_per_binding(FOOTPRINT_LANES), gpu.rows_per_binding(lanes));
+        let most = (gpu.rows_per_binding(FOOTPRINT_STRIDE), gpu.rows_per_binding(lanes));
         let layers = cut(&offsets, total, most)?;
         let times = submitted.times(gpu)?;
         Ok(Self { call, stores, depths, layers, pairs: total as usize, times })
@@ -208,9 +208,9 @@ impl Rasterizer {
     ) -> Result<Vec<(RasterUniform, R)>, GpuError> {
         let gpu = self.gpu().clone();
         let (mut ends, mut times, mut pairs) = (Vec::new(), Times::new(), 0);
-        for call in bands(&gpu, whole, PICTURE_LANES)? {
+        for call in bands(&gpu, whole, PICTURE_CHANNELS)? {
             let band = Band::open(&gpu, scene, call, 1, self.timed)?;
-            let picture = gpu.empty::<f32>("the picture", PICTURE_LANES * pixels(&call))?;
+            let picture = gpu.empty::<f32>("the picture", PICTURE_CHANNELS * pixels(&call))?;
             for at in 0..band.layers.len() {
                 let mut commands = gpu.commands("layer", self.timed);
                 band.draw(&gpu, &mut commands, scene, at, &picture)?;
@@ -234,11 +234,11 @@ impl Rasterizer {
         whole: &RasterUniform,
     ) -> Result<Vec<f32>, GpuError> {
         let bands = self.layered(scene, whole, |commands, call, picture| {
-            commands.read::<f32>(picture, PICTURE_LANES * pixels(call))
+            commands.read::<f32>(picture, PICTURE_CHANNELS * pixels(call))
         })?;
         let all = pixels(whole);
-        let mut out = vec![0.0; PICTURE_LANES * all];
-        let planes: &[usize] = if whole.step == 1 { &[1; PICTURE_LANES] } else { &[3, 1, 1] };
+        let mut out = vec![0.0; PICTURE_CHANNELS * all];
+        let planes: &[usize] = if whole.step == 1 { &[1; PICTURE_CHANNELS] } else { &[3, 1, 1] };
         for (call, picture) in bands {
             let (own, first) = (pixels(&call), call.top as usize * TILE_GPU * call.width as usize);
             let picture = picture.take(self.gpu())?;

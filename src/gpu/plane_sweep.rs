@@ -1,7 +1,7 @@
 //! Plane sweep, warp and correlation in one: twin of [`crate::cpu::plane_sweep`].
 //! Kernel: kernels/plane_sweep.wgsl.
 
-use crate::abi::{Pair, PlaneSweepUniform, SWEEP_PAIR_LANES, Sweep};
+use crate::abi::{Pair, PlaneSweepUniform, SWEEP_PAIR_STRIDE, Sweep};
 use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::device::Gpu;
@@ -114,7 +114,7 @@ impl<'a> PlaneSweepArgs<'a> {
 /// A pair as the kernels read it.
 fn lanes(p: &Pair) -> impl Iterator<Item = f32> {
     let all = p.inverse.into_iter().chain(p.rotation).chain(p.t).chain(p.k);
-    all.take(SWEEP_PAIR_LANES)
+    all.take(SWEEP_PAIR_STRIDE)
 }
 
 impl Gpu {

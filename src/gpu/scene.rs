@@ -1,6 +1,6 @@
 //! Splats in device memory, cut where one binding does not hold them.
 
-use crate::abi::{FOOTPRINT_LANES, Geometry, SPLAT_LANES, SplatSlices, sh_coefficients};
+use crate::abi::{FOOTPRINT_STRIDE, Geometry, SPLAT_STRIDE, SplatSlices, sh_coefficients};
 use crate::gpu::buffers::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
@@ -64,7 +64,7 @@ impl Gpu {
         }
         let packed;
         let (rows, stride) = match splats.geometry {
-            Geometry::Packed(rows) => (rows, SPLAT_LANES),
+            Geometry::Packed(rows) => (rows, SPLAT_STRIDE),
             Geometry::Cov6 { means, cov6, opacities } => {
                 packed = rows_of_covariances(means, cov6, opacities);
                 (&packed[..], COV6_LANES)
@@ -74,7 +74,7 @@ impl Gpu {
         let sh_stride = 3 * sh_coefficients(splats.sh_degree);
         let gain_lanes = splats.gain.len().checked_div(n).unwrap_or(0);
         // A part's footprints fit a binding too (src/gpu/layers.rs).
-        let most = [FOOTPRINT_LANES * children, sh_stride, gain_lanes * children]
+        let most = [FOOTPRINT_STRIDE * children, sh_stride, gain_lanes * children]
             .into_iter()
             .map(|floats| self.rows_per_binding(floats))
             .min()

@@ -2,7 +2,7 @@
 //! kernels/spgr.wgsl.
 
 use crate::abi::{
-    CHILDREN_MAX, FRUSTUM_MARGIN, HEAD_LANES, Rules, SPGR_CAMERA_LANES, SPLAT_LANES, SpgrUniform,
+    CHILDREN_MAX, FRUSTUM_MARGIN, HEAD_STRIDE, Rules, SPGR_CAMERA_STRIDE, SPLAT_STRIDE, SpgrUniform,
 };
 use crate::camera::Camera;
 use crate::gpu::buffers::Binding;
@@ -58,15 +58,15 @@ pub struct SpgrArgs<'a> {
 impl<'a> SpgrArgs<'a> {
     /// N, where all fits together.
     pub(super) fn check(&self) -> Result<usize, GpuError> {
-        let n = self.parents.len() / SPLAT_LANES;
+        let n = self.parents.len() / SPLAT_STRIDE;
         let k = self.rules.children();
         let lengths = [
             ("children per parent", k, k.clamp(1, CHILDREN_MAX)),
             ("cameras", self.cameras.len(), self.cameras.len().max(1)),
             ("near planes", self.near.len(), self.cameras.len()),
             ("parents per view", self.per_view, self.per_view.max(1)),
-            ("parents", self.parents.len(), n * SPLAT_LANES),
-            ("head records", self.head.len(), n * k * HEAD_LANES),
+            ("parents", self.parents.len(), n * SPLAT_STRIDE),
+            ("head records", self.head.len(), n * k * HEAD_STRIDE),
         ];
         GpuError::unless_fitting(SPGR.name, lengths).map(|()| n)
     }
@@ -113,12 +113,12 @@ impl<'a> SpgrArgs<'a> {
         let part = |of: &'a [f32], width: usize| {
             of.get(parents.start * width..parents.end * width).unwrap_or(&[])
         };
-        [part(self.head, self.rules.children() * HEAD_LANES), part(self.parents, SPLAT_LANES)]
+        [part(self.head, self.rules.children() * HEAD_STRIDE), part(self.parents, SPLAT_STRIDE)]
     }
 }
 
 /// In the order of kernels/shared/spgr.wgsl; bounds in f64, as the CPU takes them.
-fn camera_lanes(camera: &Camera, near: f32) -> [f32; SPGR_CAMERA_LANES] {
+fn camera_lanes(camera: &Camera, near: f32) -> [f32; SPGR_CAMERA_STRIDE] {
     let k = camera.intrinsics;
     let focal = [f64::from(k.fx), f64::from(k.fy)];
     let centre = [f64::from(k.cx), f64::from(k.cy)];
@@ -135,7 +135,7 @@ fn camera_lanes(camera: &Camera, near: f32) -> [f32; SPGR_CAMERA_LANES] {
     ];
     let least = (0.01 * f64::from(near)).max(1e-3);
     let all = rotation.chain(position).chain(focal).chain(centre).chain(size);
-    let mut lanes = [0.0; SPGR_CAMERA_LANES];
+    let mut lanes = [0.0; SPGR_CAMERA_STRIDE];
     for (lane, v) in lanes.iter_mut().zip(all.chain([least]).chain(bounds)) {
         *lane = v as f32;
     }
@@ -153,19 +153,19 @@ impl Gpu {
         let (k, lanes) = (args.rules.children(), args.rules.gain_lanes());
         let cameras = self.upload("context cameras", &args.cameras())?;
         let (mut rows, mut gains) = (Vec::new(), Vec::new());
-        for parents in Self::chunks(n, self.rows_per_binding(k * HEAD_LANES.max(SPLAT_LANES))) {
+        for parents in Self::chunks(n, self.rows_per_binding(k * HEAD_STRIDE.max(SPLAT_STRIDE))) {
             let count = parents.len() * k;
             let uniform = self.uniform(&args.uniform(&parents))?;
             let [head, own] = args.rows(&parents);
             let head = self.upload("head records", head)?;
             let own = self.upload("parents", own)?;
-            let children = self.empty::<f32>("children", count * SPLAT_LANES)?;
+            let children = self.empty::<f32>("children", count * SPLAT_STRIDE)?;
             let gain = self.empty::<f32>("gains", count * lanes)?;
             let bindings = [&uniform, &head, &own, &cameras, &children, &gain];
             let mut commands = self.commands("spgr", false);
             let groups = Groups::of(parents.len(), THREADS);
             commands.run(&SPGR, &[], &bindings.map(Binding::from), groups)?;
-            let children = commands.read::<f32>(&children, count * SPLAT_LANES)?;
+            let children = commands.read::<f32>(&children, count * SPLAT_STRIDE)?;
             let gain = commands.read::<f32>(&gain, count * lanes)?;
             commands.submit()?;
             rows.extend(children.take(self)?);

@@ -19,7 +19,7 @@ pub mod colour;
 pub use backward::{Gradients, Reached, backward};
 
 use super::simd::{LANES, Mask, Real, RowLayout, Vector, VectorKernel};
-use crate::abi::{LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES};
+use crate::abi::{MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE};
 use colour::Turn;
 use rayon::prelude::*;
 
@@ -227,15 +227,16 @@ impl<T: Real> VectorKernel<T> for Forward<'_, T> {
             for k in 0..g {
                 let t = strided(self.depths, (first * g + k, g));
                 let p = strided(self.densities, (first * g + k, g));
-                let mut row = [V::constant(0.0); SPLAT_LANES];
+                let mut row = [V::constant(0.0); SPLAT_STRIDE];
                 for i in 0..3 {
-                    row[LANE_MEAN + i] = pixel.towards[i].fma(t, V::constant(self.view.origin[i]));
-                    row[LANE_SCALE + i] = pixel.scale[i] * t;
+                    row[MEAN_OFFSET + i] =
+                        pixel.towards[i].fma(t, V::constant(self.view.origin[i]));
+                    row[SCALE_OFFSET + i] = pixel.scale[i] * t;
                 }
-                row[LANE_QUAT..LANE_QUAT + 4].copy_from_slice(&pixel.quat);
-                row[LANE_OPACITY] = opacity(self.adapter, p).0;
-                let out = &mut self.out[(first * g + k) * SPLAT_LANES..];
-                V::store_rows(&row, RowLayout { stride: g * SPLAT_LANES, count }, out);
+                row[QUAT_OFFSET..QUAT_OFFSET + 4].copy_from_slice(&pixel.quat);
+                row[OPACITY_OFFSET] = opacity(self.adapter, p).0;
+                let out = &mut self.out[(first * g + k) * SPLAT_STRIDE..];
+                V::store_rows(&row, RowLayout { stride: g * SPLAT_STRIDE, count }, out);
             }
         }
     }
@@ -245,7 +246,7 @@ impl<T: Real> VectorKernel<T> for Forward<'_, T> {
 /// documentation).
 pub fn forward<T: Real>(a: &Adapter, [raw, depths, densities]: [&[T]; 3], out: &mut [T]) {
     let ([height, width], g, lanes) = (a.size, a.per_pixel, a.raw_lanes());
-    out.par_chunks_mut(width * g * SPLAT_LANES).enumerate().for_each(|(i, out)| {
+    out.par_chunks_mut(width * g * SPLAT_STRIDE).enumerate().for_each(|(i, out)| {
         T::dispatch(Forward {
             adapter: a,
             view: &a.views[i / height],

@@ -9,7 +9,8 @@ use super::parent::{Parent, ParentGradient};
 use super::view::Table;
 use super::{Args, BLOCK, Rules, records};
 use crate::abi::{
-    HEAD_GAIN, HEAD_LANES, HEAD_LOGIT, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES,
+    HEAD_GAIN_OFFSET, HEAD_LOGIT_OFFSET, HEAD_STRIDE, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET,
+    SCALE_OFFSET, SPLAT_STRIDE,
 };
 use crate::cpu::redistribute::share_backward;
 use crate::cpu::simd::{LANES, Real, RowLayout, Vector, VectorKernel};
@@ -55,7 +56,7 @@ impl<T: Real> Backward<'_, T> {
         for k in 0..children {
             let head = records(&self.args, span, k);
             let child = Child::new(rules, &parent, k, &head);
-            (s.areas[k], s.logits[k]) = (child.area, head[HEAD_LOGIT]);
+            (s.areas[k], s.logits[k]) = (child.area, head[HEAD_LOGIT_OFFSET]);
             s.alphas[k] = self.opacity(span, k);
         }
         let mut d = ParentGradient::zero(V::constant(0.0));
@@ -66,18 +67,18 @@ impl<T: Real> Backward<'_, T> {
         for k in 0..children {
             let head = records(&self.args, span, k);
             let child = Child::new(rules, &parent, k, &head);
-            let mut d_head = [V::constant(0.0); HEAD_LANES];
-            d_head[HEAD_LOGIT] = s.logits[k];
+            let mut d_head = [V::constant(0.0); HEAD_STRIDE];
+            d_head[HEAD_LOGIT_OFFSET] = s.logits[k];
             let g = self.cotangents(span, k, s.areas[k]);
             child.backward((rules, &parent), g, &mut d_head, &mut d);
-            let to = &mut self.head[(at * children + k) * HEAD_LANES..];
-            V::store_rows(&d_head, RowLayout { stride: children * HEAD_LANES, count: span.1 }, to);
+            let to = &mut self.head[(at * children + k) * HEAD_STRIDE..];
+            V::store_rows(&d_head, RowLayout { stride: children * HEAD_STRIDE, count: span.1 }, to);
         }
         let d_parents = parent.backward(rules, d);
         V::store_rows(
             &d_parents,
-            RowLayout { stride: SPLAT_LANES, count: span.1 },
-            &mut self.parents[at * SPLAT_LANES..],
+            RowLayout { stride: SPLAT_STRIDE, count: span.1 },
+            &mut self.parents[at * SPLAT_STRIDE..],
         );
     }
 
@@ -85,10 +86,10 @@ impl<T: Real> Backward<'_, T> {
     #[inline(always)]
     fn opacity<V: Vector<Element = T>>(&self, (first, count): (usize, usize), k: usize) -> V {
         let children = self.args.rules.children();
-        let from = &self.grad[(first * children + k) * SPLAT_LANES + LANE_OPACITY..];
+        let from = &self.grad[(first * children + k) * SPLAT_STRIDE + OPACITY_OFFSET..];
         let mut lanes = [T::default(); LANES];
         for (lane, out) in lanes[..V::LANES].iter_mut().enumerate() {
-            *out = from[lane.min(count - 1) * children * SPLAT_LANES];
+            *out = from[lane.min(count - 1) * children * SPLAT_STRIDE];
         }
         V::load(&lanes)
     }
@@ -102,15 +103,15 @@ impl<T: Real> Backward<'_, T> {
         area: V,
     ) -> ChildGradient<V> {
         let children = self.args.rules.children();
-        let from = &self.grad[(first * children + k) * SPLAT_LANES..];
-        let g: [V; SPLAT_LANES] =
-            V::load_rows(from, RowLayout { stride: children * SPLAT_LANES, count });
+        let from = &self.grad[(first * children + k) * SPLAT_STRIDE..];
+        let g: [V; SPLAT_STRIDE] =
+            V::load_rows(from, RowLayout { stride: children * SPLAT_STRIDE, count });
         let vector = |i: usize| [g[i], g[i + 1], g[i + 2]];
-        let q = LANE_QUAT;
+        let q = QUAT_OFFSET;
         ChildGradient {
-            mean: vector(LANE_MEAN),
+            mean: vector(MEAN_OFFSET),
             quat: [g[q], g[q + 1], g[q + 2], g[q + 3]],
-            scale: vector(LANE_SCALE),
+            scale: vector(SCALE_OFFSET),
             area,
         }
     }
@@ -121,8 +122,8 @@ impl<T: Real> Backward<'_, T> {
 /// the same bytes.
 pub fn backward<T: Real>(args: Args<T>, grad: &[T], head: &mut [T], parents: &mut [T]) {
     let table = Table::new(&args.source);
-    head.par_chunks_mut(BLOCK * args.rules.children() * HEAD_LANES)
-        .zip(parents.par_chunks_mut(BLOCK * SPLAT_LANES))
+    head.par_chunks_mut(BLOCK * args.rules.children() * HEAD_STRIDE)
+        .zip(parents.par_chunks_mut(BLOCK * SPLAT_STRIDE))
         .enumerate()
         .for_each(|(block, (head, parents))| {
             let range = args.block(block);
@@ -146,12 +147,12 @@ impl<T: Real> VectorKernel<T> for GainsBackward<'_, T> {
     #[inline(always)]
     fn run<V: Vector<Element = T>>(self) {
         let lanes = self.rules.gain_lanes();
-        let count = self.head.len() / HEAD_LANES;
+        let count = self.head.len() / HEAD_STRIDE;
         for first in (0..count).step_by(V::LANES) {
             let width = V::LANES.min(count - first);
             let (mut raw, mut by_gain) = ([T::default(); LANES], [T::default(); LANES]);
             for lane in 0..width {
-                raw[lane] = self.head[(first + lane) * HEAD_LANES + HEAD_GAIN];
+                raw[lane] = self.head[(first + lane) * HEAD_STRIDE + HEAD_GAIN_OFFSET];
                 let grad = &self.grad[(first + lane) * lanes..][..lanes];
                 let residual: T = grad[1..].iter().copied().sum();
                 by_gain[lane] = grad[0] + T::constant(0.5) * residual;
@@ -160,17 +161,17 @@ impl<T: Real> VectorKernel<T> for GainsBackward<'_, T> {
             (V::load(&by_gain) * V::constant(self.rules.delta) * (V::constant(1.0) - t * t))
                 .store(&mut raw);
             for (lane, &d) in raw[..width].iter().enumerate() {
-                self.out[(first + lane) * HEAD_LANES + HEAD_GAIN] = d;
+                self.out[(first + lane) * HEAD_STRIDE + HEAD_GAIN_OFFSET] = d;
             }
         }
     }
 }
 
-/// Computes gradients into element [`HEAD_GAIN`] of the rows of `out` `[N, K, 11]`, from
+/// Computes gradients into element [`HEAD_GAIN_OFFSET`] of the rows of `out` `[N, K, 11]`, from
 /// those of the gains, `grad` `[N·K]` or `[N·K, 4]`. Writes nothing else.
 pub fn gains_backward<T: Real>(rules: &Rules, head: &[T], grad: &[T], out: &mut [T]) {
-    out.par_chunks_mut(GAIN_BLOCK * HEAD_LANES)
-        .zip(head.par_chunks(GAIN_BLOCK * HEAD_LANES))
+    out.par_chunks_mut(GAIN_BLOCK * HEAD_STRIDE)
+        .zip(head.par_chunks(GAIN_BLOCK * HEAD_STRIDE))
         .zip(grad.par_chunks(GAIN_BLOCK * rules.gain_lanes()))
         .for_each(|((out, head), grad)| T::dispatch(GainsBackward { rules, head, grad, out }));
 }
