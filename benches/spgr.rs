@@ -12,7 +12,7 @@ use common::{Bench, Contender, Threads, Work, agree, inputs};
 use rayon::prelude::*;
 use subsplat::abi::{HEAD_STRIDE, SPLAT_STRIDE};
 use subsplat::config::{Config, Preset};
-use subsplat::cpu::{math, redistribute as shares, spgr as kernel};
+use subsplat::cpu::{redistribute as shares, spgr as kernel, sums};
 use subsplat::model::spgr::rules;
 use subsplat::ops::redistribute::{Rule, redistribute};
 use subsplat::ops::spgr::{Spgr, spgr, spgr_into};
@@ -97,7 +97,7 @@ impl CustomOp2 for Dot {
             };
             let (x, w) = (&x.as_slice::<f32>()?[start..end], held.as_slice::<f32>()?);
             let chunks = x.par_chunks(1 << 14).zip(w.par_chunks(1 << 14));
-            sum += chunks.map(|(x, w)| f64::from(math::dot(x, w))).sum::<f64>();
+            sum += chunks.map(|(x, w)| f64::from(sums::dot(x, w))).sum::<f64>();
         }
         Ok((CpuStorage::F32(vec![sum as f32]), Shape::from(())))
     }

@@ -1,15 +1,13 @@
 //! What this machine can do, measured: copied bytes and multiply-adds per second.
 
-use pulp::{Arch, Simd, WithSimd};
 use rayon::ThreadPool;
 use rayon::prelude::*;
 use std::hint::black_box;
 use std::time::Instant;
+use subsplat::cpu::simd::{LANES, Real, Vector, VectorKernel};
 
 /// Floats of each buffer of the copy: 128 MiB, beyond most caches.
 const COPY: usize = 32 << 20;
-/// Independent multiply-add chains: more than latency × units of any present core.
-const CHAINS: usize = 12;
 /// Steps of each chain.
 const STEPS: usize = 4 << 20;
 
@@ -23,21 +21,36 @@ pub struct Machine {
 
 struct Chains(usize);
 
-impl WithSimd for Chains {
-    /// Multiply-adds of one lane times lanes, and a sum that depends on all of them.
-    type Output = (usize, f32);
-
+impl Chains {
+    /// `N` independent chains of multiply-adds: how many were done, and a sum that depends
+    /// on all of them.
     #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) -> Self::Output {
-        let (factor, term) = (simd.splat_f32s(black_box(0.999)), simd.splat_f32s(black_box(0.001)));
-        let mut sums = [simd.splat_f32s(1.0); CHAINS];
+    fn chains<V: Vector<Element = f32>, const N: usize>(self) -> (usize, f32) {
+        let (factor, term) = (V::splat(black_box(0.999)), V::splat(black_box(0.001)));
+        let mut sums = [V::splat(1.0); N];
         for _ in 0..self.0 {
             for sum in &mut sums {
-                *sum = simd.mul_add_f32s(*sum, factor, term);
+                *sum = sum.fma(factor, term);
             }
         }
-        let total = sums.into_iter().map(|s| simd.reduce_sum_f32s(s)).sum();
-        (self.0 * CHAINS * S::F32_LANES, total)
+        let mut lanes = [0.0; LANES];
+        let mut total = 0.0;
+        for sum in sums {
+            sum.store(&mut lanes);
+            total += lanes.iter().sum::<f32>();
+        }
+        (self.0 * N * V::LANES, total)
+    }
+}
+
+impl VectorKernel<f32> for Chains {
+    type Output = (usize, f32);
+
+    /// As many chains as the registers hold and hide the latency: where a vector is two
+    /// registers, each chain is two.
+    #[inline(always)]
+    fn run<V: Vector<Element = f32>>(self) -> (usize, f32) {
+        if V::REGISTERS > 16 { self.chains::<V, 12>() } else { self.chains::<V, 6>() }
     }
 }
 
@@ -76,7 +89,7 @@ impl Machine {
         let fma = [one, all].map(|pool| {
             let once = || {
                 let start = Instant::now();
-                let done = pool.broadcast(|_| black_box(Arch::new().dispatch(Chains(STEPS))).0);
+                let done = pool.broadcast(|_| black_box(f32::dispatch(Chains(STEPS))).0);
                 2e-9 * done.iter().sum::<usize>() as f64 / start.elapsed().as_secs_f64()
             };
             (0..turns).map(|_| once()).fold(0.0, f64::max)

@@ -1,11 +1,12 @@
 //! Pointwise functions, with gradients.
 
-use super::math::{erf, exp, vectorised};
+use super::simd::elementary::{erf, exp};
+use super::simd::vectorize;
 use super::uninit::{UninitBuffer, UninitSlice};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
-/// Elements per task: long enough to hide the scheduling, short enough to balance.
+/// Elements per task: a compromise between overhead and balance.
 const CHUNK: usize = 16_384;
 
 /// A function of one number.
@@ -36,7 +37,7 @@ pub(super) fn normal_cdf(x: f32) -> f32 {
 macro_rules! by_kind {
     ($kind:expr, $run:ident) => {
         match $kind {
-            // Written so that NaN stays NaN.
+            // This comparison keeps NaN.
             $crate::cpu::activation::Activation::Relu => $run!(
                 #[inline(always)]
                 |x: f32| if x < 0.0 { 0.0 } else { x },
@@ -58,7 +59,7 @@ macro_rules! by_kind {
                 // Φ(x) + x·φ(x), φ the normal density.
                 #[inline(always)]
                 |x: f32| $crate::cpu::activation::normal_cdf(x)
-                    + x * 0.398_942_3 * $crate::cpu::math::exp(-0.5 * x * x)
+                    + x * 0.398_942_3 * $crate::cpu::simd::elementary::exp(-0.5 * x * x)
             ),
             $crate::cpu::activation::Activation::Sigmoid => $run!(
                 #[inline(always)]
@@ -74,11 +75,11 @@ macro_rules! by_kind {
 }
 pub(super) use by_kind;
 
-/// f(x), new memory.
+/// Computes f(x) into new memory.
 pub fn forward(kind: Activation, x: &[f32]) -> Vec<f32> {
-    let mut fresh = UninitBuffer::new(x.len());
-    fresh.par_chunks_mut(CHUNK).zip(x.par_chunks(CHUNK)).for_each(|(y, x)| {
-        vectorised(
+    let mut buffer = UninitBuffer::new(x.len());
+    buffer.par_chunks_mut(CHUNK).zip(x.par_chunks(CHUNK)).for_each(|(y, x)| {
+        vectorize(
             #[inline(always)]
             || {
                 macro_rules! run {
@@ -91,7 +92,7 @@ pub fn forward(kind: Activation, x: &[f32]) -> Vec<f32> {
         );
     });
     // SAFETY: the loop above wrote every block.
-    unsafe { fresh.assume_init() }
+    unsafe { buffer.assume_init() }
 }
 
 #[inline(always)]
@@ -102,11 +103,11 @@ fn map(x: &[f32], y: &mut UninitSlice<f32>, f: impl Fn(f32) -> f32) {
     }
 }
 
-/// dx = dy·f′(x).
+/// Computes dx = dy·f′(x).
 pub fn backward(kind: Activation, x: &[f32], dy: &[f32], dx: &mut [f32]) {
     let chunks = x.par_chunks(CHUNK).zip(dy.par_chunks(CHUNK));
     chunks.zip(dx.par_chunks_mut(CHUNK)).for_each(|((x, dy), dx)| {
-        vectorised(
+        vectorize(
             #[inline(always)]
             || {
                 macro_rules! run {
@@ -120,9 +121,9 @@ pub fn backward(kind: Activation, x: &[f32], dy: &[f32], dx: &mut [f32]) {
     });
 }
 
-/// y = f(y), on the caller's thread.
+/// Replaces y by f(y), on the caller's thread.
 pub(super) fn in_place(kind: Activation, y: &mut [f32]) {
-    vectorised(
+    vectorize(
         #[inline(always)]
         || {
             macro_rules! run {
@@ -135,9 +136,9 @@ pub(super) fn in_place(kind: Activation, y: &mut [f32]) {
     );
 }
 
-/// x = dy·f′(x), on the caller's thread.
+/// Replaces x by dy·f′(x), on the caller's thread.
 pub(super) fn slopes_in_place(kind: Activation, x: &mut [f32], dy: &[f32]) {
-    vectorised(
+    vectorize(
         #[inline(always)]
         || {
             macro_rules! run {

@@ -6,9 +6,9 @@
 //! of query and key differ (Swin's shifted windows; MVSplat section 2).
 
 use super::gemm::{Base, Mat, Packed, gemm, product};
-use super::math::dot;
 use super::simd::{Kernel, Simd, SimdLevel};
 use super::softmax::exp_row;
+use super::sums::dot;
 use rayon::prelude::*;
 
 /// Added to the logit of a masked pair: −100, not −∞ (Swin).
@@ -139,13 +139,13 @@ pub struct Saved<'a> {
     pub k: &'a [f32],
     /// Values.
     pub v: &'a [f32],
-    /// What [`forward`] gave.
+    /// Result of [`forward`].
     pub out: &'a [f32],
     /// ∂L/∂out.
     pub grad: &'a [f32],
 }
 
-/// (dq, dk, dv). The weights are computed again, block by block.
+/// Computes (dq, dk, dv). It recomputes the weights block by block.
 pub fn backward(a: &Attention, s: &Saved<'_>) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
     let (l, m, d, e) = (a.queries, a.keys, a.width, a.value_width);
     let mut dq = vec![0f32; s.q.len()];

@@ -1,11 +1,11 @@
 //! Front-to-back compositing of one 32×32 tile (3DGS section 6, eq. 3):
 //! C = Σ c_i α_i T_i + T·background, T_i = Π_{j<i} (1 − α_j).
 //!
-//! A tile is 64 blocks of 4×4 pixels, a block one 16-lane register per quantity.
-//! Splats come in depth-ordered batches: each splat gets a bit for every block that its
-//! support can meet, the matrix of bits is turned, and each block walks its bits from
-//! the lowest, which is depth order again, with its accumulators in registers. Nothing
-//! branches on a pixel. A block whose pixels have all stopped leaves; so does the tile.
+//! A tile is 64 blocks of 4×4 pixels, a block one 16-lane vector per quantity. Splats come
+//! in depth-ordered batches. Each splat has a bit for every block that its support can
+//! intersect. The matrix of bits is transposed, so that each block reads its splats in depth
+//! order, with its accumulators in registers. The kernel does not branch on pixels. A block
+//! ends when all its pixels have stopped, and a tile when all its blocks have.
 //!
 //! Per pixel, in either convention: α = min(cap, o·e^(−σ)), skipped below 1/255;
 //! blending stops before the splat that would take T to 10⁻⁴ or below (`standard`)
@@ -16,6 +16,7 @@ pub(crate) use crate::abi::BlendRules as Rules;
 use crate::abi::{ALPHA_MIN_LOG2, BLOCK, TILE};
 use crate::cpu::blocks::{met, transpose_bits};
 use crate::cpu::ewa::Footprint;
+use crate::cpu::simd::elementary::exp2;
 use crate::cpu::simd::{self, F32Vector, Kernel, Mask, Simd, Vector};
 use crate::cpu::tiles::Grid;
 
@@ -25,8 +26,8 @@ pub(crate) const LANES: usize = BLOCK * BLOCK;
 pub(crate) const BLOCKS: usize = TILE / BLOCK;
 /// Words of a block's bits in one batch.
 const WORDS: usize = 4;
-/// Splats per batch: enough that loading and storing a block's accumulators is little
-/// beside blending, few enough for the first cache.
+/// Splats per batch: large enough to amortise the load and store of a block's accumulators,
+/// small enough for the first-level cache.
 const BATCH: usize = 64 * WORDS;
 
 const _: () = assert!(LANES == simd::LANES);
@@ -77,7 +78,7 @@ impl Tile {
     }
 }
 
-/// What a thread composites with.
+/// Working memory of a thread.
 #[derive(Default)]
 pub(crate) struct Workplace {
     pub(crate) tile: Tile,
@@ -87,7 +88,7 @@ pub(crate) struct Workplace {
 /// Composites one tile into `place.tile`.
 pub(crate) struct RenderTile<'a> {
     pub(crate) place: &'a mut Workplace,
-    /// Which tile of `grid`.
+    /// Index of the tile in `grid`.
     pub(crate) t: usize,
     pub(crate) grid: Grid,
     /// Places in `splats`, nearest first.
@@ -114,8 +115,8 @@ impl Kernel for RenderTile<'_> {
             let (now, later) = rest.split_at(rest.len().min(BATCH));
             batch.load(s, now, splats, footprints, corner);
             let mut blocks = live;
-            // The next batch's footprints are asked for a few at a time: the memory
-            // system holds no more requests than that, and would wait.
+            // Each block prefetches a few of the next batch's footprints: the number of
+            // outstanding requests is limited.
             let portion = BATCH.div_ceil(live.count_ones() as usize);
             let mut wanted = later[..later.len().min(BATCH)].chunks(portion);
             while blocks != 0 {
@@ -148,7 +149,7 @@ impl Default for Batch {
 }
 
 impl Batch {
-    /// Takes the splats at `places` and finds the blocks that they meet.
+    /// Loads the splats at `places` and finds the blocks that they intersect.
     #[inline(always)]
     fn load<S: Simd>(
         &mut self,
@@ -163,7 +164,7 @@ impl Batch {
         for ((places, to), masks) in groups.zip(&mut masks) {
             let mut rows = [s.splat(0.0); LANES];
             for l in 0..LANES {
-                // Spare lanes repeat the last splat; their bits are not kept.
+                // Spare lanes repeat the last splat; their bits are cleared below.
                 let place = places[l.min(places.len() - 1)];
                 rows[l] = s.load(footprints[splats[place as usize] as usize].fields());
                 s.store(rows[l], to[l].fields_mut());
@@ -179,8 +180,8 @@ impl Batch {
         }
     }
 
-    /// Blends the batch into block `b`. Returns how many splats it took and whether
-    /// a pixel still goes on.
+    /// Blends the batch into block `b`. Returns the number of splats and whether a pixel is
+    /// still live.
     #[inline(always)]
     fn blend<S: Simd>(
         &self,
@@ -212,12 +213,12 @@ impl Batch {
                 let across = s.splat(f.shear).fma(dy, dx) * s.splat(f.sx);
                 let down = dy * s.splat(f.sy);
                 let power = down.fnma(down, across.fnma(across, s.splat(f.power)));
-                // The clamp keeps denormals away.
-                let alpha = cap.min(simd::exp2(s, least.max(power)));
+                // The clamp avoids denormals.
+                let alpha = cap.min(exp2(least.max(power)));
                 let alpha = least.le(power).select_or_zero(alpha);
                 let rest = alpha.fnma(t, t);
-                // Where blending goes on, T > stop, so an alpha of 0 changes nothing;
-                // where it has stopped, T < 0, so it stays there.
+                // A live pixel has T > stop, so an alpha of 0 changes nothing. A stopped one
+                // has T < 0 and stays stopped.
                 let goes = stop.lt(rest);
                 let w = goes.select_or_zero(alpha * t);
                 t = goes.select(rest, t.neg_abs());

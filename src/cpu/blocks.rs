@@ -1,13 +1,13 @@
-//! Which 4×4 blocks of a tile a splat can meet, for sixteen splats at a time, and the
-//! turn from "blocks of a splat" to "splats of a block".
+//! Intersection of splats with the 4×4 blocks of a tile, for sixteen splats at a time, and
+//! the transpose from "blocks of a splat" to "splats of a block".
 
 use crate::abi::{BLOCK, SPAN_SLACK_PX};
 use crate::cpu::blend::BLOCKS;
 use crate::cpu::ewa::{FIELDS, support_lanes};
 use crate::cpu::simd::{APPROX_SQRT_ERROR, F32Vector, IntVector, LANES, Mask, Simd, Vector};
 
-/// Masks of the blocks that sixteen splats can meet in the tile whose first pixel is at
-/// `corner`: bit 8·row + column. `fields` are their footprints, field by field.
+/// Computes masks of the blocks that sixteen splats can intersect in the tile whose first
+/// pixel is at `corner`: bit 8·row + column. `fields` are their footprints, field by field.
 ///
 /// As in [`crate::cpu::ewa::Footprint::span`]: over the four pixel rows of a row of
 /// blocks, the ellipse spans the columns between its left edge at one row and its right
@@ -27,17 +27,17 @@ pub(crate) fn met<S: Simd>(
     let reach = support_lanes(s, power);
     let sy2 = sy * sy;
     let tip = -(shear * half_height * half_height / half_width);
-    let lowest = (whole(s, y0) - v).max(-half_height);
-    let highest = (whole(s, y1) - one - v).min(half_height);
-    // Edges in blocks, the roughness of the root made up for.
+    let lowest = (whole(y0) - v).max(-half_height);
+    let highest = (whole(y1) - one - v).min(half_height);
+    // Edges in blocks; the factor covers the error of the approximate root.
     let width = s.splat(PER_BLOCK * (1.0 + 2.0 * APPROX_SQRT_ERROR)) / sx;
     let slack = s.splat(SPAN_SLACK_PX * PER_BLOCK);
     let middle = (u - left) * quarter;
     let (middle_left, middle_right) = (middle - slack, middle + slack);
     let slant = shear * quarter;
-    let first = zero.max((whole(s, x0) - left) * quarter);
+    let first = zero.max((whole(x0) - left) * quarter);
     let last = s.splat(BLOCKS as f32 - PER_BLOCK);
-    let last = last.min((whole(s, x1) - one - left) * quarter);
+    let last = last.min((whole(x1) - one - left) * quarter);
     let mut halves = [S::I::splat(0); 2];
     for (half, bits) in halves.iter_mut().enumerate() {
         for r in 0..4 {
@@ -46,14 +46,14 @@ pub(crate) fn met<S: Simd>(
             let high = highest.min(y + s.splat(BLOCK as f32 - 1.0));
             let right = high.min(low.max(tip));
             let left = high.min(low.max(-tip));
-            let reach_left = edge(s, left, sy2, reach);
-            let reach_right = edge(s, right, sy2, reach);
+            let reach_left = edge(left, sy2, reach);
+            let reach_right = edge(right, sy2, reach);
             let from = reach_left.fnma(width, slant.fnma(left, middle_left));
             let to = reach_right.fma(width, slant.fnma(right, middle_right));
             let from = first.max(from);
             let to = low.le(high).select_or_zero(last.min(to) + one);
-            // Truncation floors: both are positive where anything is met.
-            let row = below(s, from.max(to)) - below(s, from);
+            // Truncation is floor here: both are positive where the splat intersects.
+            let row = below(from.max(to)) - below(from);
             *bits = *bits | row.shl_each(S::I::splat(8 * r as i32));
         }
     }
@@ -65,27 +65,27 @@ pub(crate) fn met<S: Simd>(
     }
 }
 
-/// The whole number whose bits a lane holds.
+/// Converts bits of whole numbers to floats.
 #[inline(always)]
-fn whole<S: Simd>(s: S, v: S::F) -> S::F {
-    S::F::from_int(v.to_bits())
+fn whole<V: F32Vector>(v: V) -> V {
+    V::from_int(v.to_bits())
 }
 
-/// Distance along x of the ellipse's edge from its middle, `dy` off the mean, before
-/// the division by sx.
+/// Computes the distance along x of the ellipse's edge from its middle, `dy` off the mean,
+/// before the division by sx.
 #[inline(always)]
-fn edge<S: Simd>(s: S, dy: S::F, sy2: S::F, reach: S::F) -> S::F {
-    s.splat(f32::MIN_POSITIVE).max((dy * dy).fnma(sy2, reach)).approx_sqrt()
+fn edge<V: F32Vector>(dy: V, sy2: V, reach: V) -> V {
+    V::splat(f32::MIN_POSITIVE).max((dy * dy).fnma(sy2, reach)).approx_sqrt()
 }
 
-/// Bits of columns 0 to `past` − 1.
+/// Sets the bits of columns 0 to `past` − 1.
 #[inline(always)]
-fn below<S: Simd>(s: S, past: S::F) -> S::I {
-    S::I::splat(1).shl_each(past.to_int())
+fn below<V: F32Vector>(past: V) -> V::Int {
+    V::Int::splat(1).shl_each(past.to_int())
 }
 
-/// Exchanges rows and columns of a 64×64 matrix of bits: bit c of word r becomes bit r
-/// of word c. Halves of ever smaller squares change places (Warren, Hacker's Delight).
+/// Transposes a 64×64 matrix of bits: bit c of word r becomes bit r of word c. It swaps the
+/// off-diagonal halves of ever smaller squares (Warren, Hacker's Delight).
 #[inline(always)]
 pub(crate) fn transpose_bits(m: &mut [u64; 64]) {
     macro_rules! step {
@@ -148,8 +148,8 @@ mod tests {
         }
     }
 
-    /// No block with a pixel that shows is missed, few without one are named, and none
-    /// outside the splat's rectangle.
+    /// The mask holds every block with a visible pixel, few others, and none outside the
+    /// splat's rectangle.
     #[test]
     fn blocks_are_those_with_pixels_that_show() {
         let mut state = 3u32;
@@ -166,7 +166,7 @@ mod tests {
                 let reach = power - ALPHA_MIN_LOG2;
                 let half_height = reach.sqrt() / sy;
                 let half_width = (reach / (sx * sx) + (shear * half_height).powi(2)).sqrt();
-                // Some cut, as `mvsplat` does.
+                // The tile cut of `mvsplat` for some.
                 let cut = if l % 4 == 0 { 80 } else { 1000 };
                 let (u, v) = (next(50.0, 110.0), next(20.0, 80.0));
                 Footprint {

@@ -7,10 +7,10 @@ use crate::cpu::project_bwd::{GROUP, Group, L, Part, Pass, get, put};
 use crate::cpu::sh_bwd::{used_coefficients, values_and_slope};
 use crate::cpu::simd::{Simd, Vector};
 
-/// Coefficients per channel of the degree that goes sixteen splats at a time: 3.
+/// Coefficients per channel of degree 3, which has a path for sixteen splats at a time.
 const WIDE: usize = 16;
 
-/// Directions in which SH are seen, sixteen at a time.
+/// Directions of SH evaluation, sixteen at a time.
 #[repr(C, align(64))]
 pub(crate) struct Directions {
     /// From the eye, world.
@@ -34,7 +34,7 @@ impl Default for Directions {
 }
 
 impl Directions {
-    /// s_k of lane `l` from the colour gradient `g` and one SH set.
+    /// Computes s_k of lane `l` from the colour gradient `g` and one SH set.
     #[inline(always)]
     fn weigh(&mut self, l: usize, used: usize, sh: &[f32], g: [f32; 3]) {
         for (s, h) in self.s[..used].iter_mut().zip(sh.chunks_exact(3)) {
@@ -62,23 +62,23 @@ impl Directions {
         unused.fill(0.0);
     }
 
-    /// s_k of all lanes, [`WIDE`] of them, from the colour gradients `g` and the SH sets
-    /// that begin at `sets` of `sh`.
+    /// Computes [`WIDE`] s_k of all lanes from the colour gradients `g` and the SH sets that
+    /// begin at `sets` of `sh`.
     #[inline(always)]
-    fn weigh_all<S: Simd>(&mut self, lanes: S, sh: &[f32], sets: &[usize; GROUP], g: [&L; 3]) {
-        let [r, g, b] = g.map(|g| lanes.load(g));
+    fn weigh_all<S: Simd>(&mut self, s: S, sh: &[f32], sets: &[usize; GROUP], g: [&L; 3]) {
+        let [r, g, b] = g.map(|g| s.load(g));
         for q in 0..WIDE / 4 {
-            let [r0, g0, b0, r1] = lanes.load4(sh, sets, 12 * q);
-            let [g1, b1, r2, g2] = lanes.load4(sh, sets, 12 * q + 4);
-            let [b2, r3, g3, b3] = lanes.load4(sh, sets, 12 * q + 8);
+            let [r0, g0, b0, r1] = s.gather4(sh, sets, 12 * q);
+            let [g1, b1, r2, g2] = s.gather4(sh, sets, 12 * q + 4);
+            let [b2, r3, g3, b3] = s.gather4(sh, sets, 12 * q + 8);
             let sets = [[r0, g0, b0], [r1, g1, b1], [r2, g2, b2], [r3, g3, b3]];
-            for (s, h) in self.s[4 * q..].iter_mut().zip(sets) {
-                lanes.store(lanes.fma(h[0], r, lanes.fma(h[1], g, h[2] * b)), s);
+            for (to, h) in self.s[4 * q..].iter_mut().zip(sets) {
+                s.store(h[0].fma(r, h[1].fma(g, h[2] * b)), to);
             }
         }
     }
 
-    /// Y ⊗ `g` of every lane, [`WIDE`] coefficients.
+    /// Computes Y ⊗ `g` of every lane, [`WIDE`] coefficients.
     #[inline(always)]
     fn spread<S: Simd>(&self, s: S, g: &[L; 3]) -> [[L; 3]; GROUP] {
         let mut out = [[[0.0; GROUP]; 3]; GROUP];
@@ -131,8 +131,8 @@ impl Directions {
 }
 
 impl Pass<'_> {
-    /// SH, gain and direction where every child looks along its own mean; `single`: no
-    /// child has siblings, and SH sets hold nothing yet.
+    /// Gradients of SH, gain and direction if every child has its own direction. `single`: no
+    /// child has siblings, and SH sets are not written yet.
     #[inline(always)]
     pub(crate) fn child_colours<S: Simd>(
         &self,
@@ -191,8 +191,8 @@ impl Pass<'_> {
         self.used() == WIDE
     }
 
-    /// The same with [`WIDE`] coefficients; writes the SH set of a parent with its first
-    /// child and adds the others'.
+    /// As `child_colours`, with [`WIDE`] coefficients. The first child of a parent writes its
+    /// SH set, the others add to it.
     #[inline(always)]
     fn child_colours_wide<S: Simd>(
         &self,
@@ -205,7 +205,7 @@ impl Pass<'_> {
     ) {
         let children = self.splats.children_per_parent();
         let set = 3 * sh_coefficients(self.splats.sh_degree);
-        // Lanes of zeros read a set that some alive lane has, whose numbers are finite.
+        // Dead lanes read the set of a live lane, whose numbers are finite.
         let spare = alive.trailing_zeros() as usize;
         let mut sets = [(part.first + at + spare) / children * set; GROUP];
         let mut gain = [0.0; GROUP];

@@ -1,7 +1,7 @@
 //! 2-D covariances of sixteen splats at a time.
 //!
-//! From quaternion and σ we keep M = J·W·R·S (2×3) and take det(MMᵀ) = ‖m₁ × m₂‖²
-//! (Cauchy-Binet), which no needle cancels.
+//! For quaternion and σ, M = J·W·R·S (2×3) and det(MMᵀ) = ‖m₁ × m₂‖² (Cauchy-Binet), which
+//! has no cancellation for needles.
 
 use crate::cpu::simd::{LANES, Simd, Vector};
 
@@ -21,7 +21,7 @@ pub(crate) struct Covariance2d<S: Simd> {
     pub(crate) det: S::F,
 }
 
-/// M·Mᵀ with M = J·W·R·S, and in which lanes the quaternion has a direction.
+/// Computes M·Mᵀ with M = J·W·R·S, and the lanes whose quaternion has a direction.
 #[inline(always)]
 pub(crate) fn covariance_quat<S: Simd>(
     s: S,
@@ -45,18 +45,17 @@ pub(crate) fn covariance_quat<S: Simd>(
     let mut m = j;
     for i in 0..2 {
         for k in 0..3 {
-            m[i][k] = dot(s, j[i], axes[k]) * scale[k];
+            m[i][k] = dot(j[i], axes[k]) * scale[k];
         }
     }
     let [a, b] = m;
     let n =
         [a[2].fnma(b[1], a[1] * b[2]), a[0].fnma(b[2], a[2] * b[0]), a[1].fnma(b[0], a[0] * b[1])];
-    let c =
-        Covariance2d { xx: dot(s, a, a), xy: dot(s, a, b), yy: dot(s, b, b), det: dot(s, n, n) };
+    let c = Covariance2d { xx: dot(a, a), xy: dot(a, b), yy: dot(b, b), det: dot(n, n) };
     (c, whole)
 }
 
-/// J·Σ·Jᵀ of given covariances, in `f64`: its determinant cancels in needles.
+/// Computes J·Σ·Jᵀ of given covariances, in `f64`: its determinant cancels for needles.
 #[inline(always)]
 pub(crate) fn covariance_cov6<S: Simd>(
     s: S,
@@ -96,6 +95,6 @@ pub(crate) fn covariance_cov6<S: Simd>(
 }
 
 #[inline(always)]
-pub(crate) fn dot<S: Simd>(s: S, a: [S::F; 3], b: [S::F; 3]) -> S::F {
+pub(crate) fn dot<V: Vector>(a: [V; 3], b: [V; 3]) -> V {
     a[0].fma(b[0], a[1].fma(b[1], a[2] * b[2]))
 }

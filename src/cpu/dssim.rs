@@ -2,10 +2,11 @@
 //! 2004). Twin and conventions: train/loss.rs, [`crate::metrics::ssim`].
 //!
 //! Windowed means are two passes of N taps, each with a block of results in registers.
-//! The transpose of a windowed mean is a windowed mean of the map with N − 1 zeros
-//! around it, the taps turned round.
+//! The transpose of a windowed mean is a windowed mean with reversed taps of the map with
+//! N − 1 zeros around it.
 
-use super::math::{sum_of, vectorised};
+use super::simd::vectorize;
+use super::sums::sum_of;
 
 /// Taps of the window's one axis, and the constants of SSIM.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -87,7 +88,7 @@ pub fn plane<const N: usize>(
     factor: f32,
     g: &mut [f32],
 ) -> f64 {
-    vectorised(
+    vectorize(
         #[inline(always)]
         || run(window, [x, t], width, factor, g),
     )

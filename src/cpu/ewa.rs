@@ -2,17 +2,16 @@
 //! splatting, Zwicker et al. 2001; 3DGS section 4).
 //!
 //! cov2d = J·W·Σ·Wᵀ·Jᵀ + low-pass·I, J the Jacobian of the projection at the mean, W
-//! the rotation from world to camera. Sixteen splats go side by side.
+//! the rotation from world to camera. Each lane is a splat.
 //!
 //! The conic is kept as its Cholesky factor, in units of log₂: with dx, dy the
 //! distance of a pixel centre from the mean,
 //! σ·log₂e = (sx·(dx + shear·dy))² + (sy·dy)²: never negative, no cancellation.
 //!
-//! Which splats are dropped: mean not in front of the near plane, opacity (after
-//! antialiasing) below 1/255, no overlap with the picture, and every splat with a
-//! number that is or becomes NaN or infinite, a zero quaternion included. A σ of
-//! zero is a point, drawn as wide as the low-pass makes it; the sign of σ does not
-//! matter; an opacity above 1 acts through the alpha cap.
+//! Dropped splats: mean not in front of the near plane, opacity (after antialiasing) below
+//! 1/255, no overlap with the picture, and every splat with a number that is or becomes NaN
+//! or infinite, a zero quaternion included. A σ of zero is a point, which the low-pass
+//! widens. The sign of σ does not matter. The alpha cap limits opacities above 1.
 
 pub use crate::abi::View;
 
@@ -21,7 +20,7 @@ use crate::abi::{
     SPAN_SLACK_PX, SUPPORT_SLACK, TILE_MVSPLAT,
 };
 use crate::cpu::covariance::{Covariance2d, Shape, covariance_cov6, covariance_quat, dot};
-use crate::cpu::simd::{F32Vector, LANES, Mask, Simd, Vector, log2};
+use crate::cpu::simd::{F32Vector, LANES, Mask, Simd, Vector};
 use std::f32::consts::{LN_2, LOG2_E};
 
 /// Four-byte fields of a [`Footprint`].
@@ -65,7 +64,7 @@ pub struct Footprint {
 }
 
 impl Footprint {
-    /// Its fields in order, the last four as the bits of whole numbers.
+    /// Borrows the fields in order, the last four as the bits of whole numbers.
     #[inline(always)]
     pub(crate) fn fields(&self) -> &[f32; FIELDS] {
         // SAFETY: sixteen fields of four bytes without padding (`repr(C)` and the
@@ -73,32 +72,32 @@ impl Footprint {
         unsafe { &*std::ptr::from_ref(self).cast() }
     }
 
-    /// The same to be written.
+    /// Borrows the fields mutably.
     #[inline(always)]
     pub(crate) fn fields_mut(&mut self) -> &mut [f32; FIELDS] {
         // SAFETY: as above; every pattern of 32 bits is a u32 as well.
         unsafe { &mut *std::ptr::from_mut(self).cast() }
     }
 
-    /// Whether the splat was kept.
+    /// Tells whether the splat is kept.
     pub fn visible(&self) -> bool {
         self.x1 > self.x0
     }
 
-    /// Inverse of the 2-D covariance, low-pass included: A, B, C in 1/px².
+    /// Computes the inverse of the 2-D covariance with low-pass: A, B, C in 1/px².
     pub fn conic(&self) -> [f32; 3] {
         let a = 2.0 * LN_2 * self.sx * self.sx;
         let b = a * self.shear;
         [a, b, 2.0 * LN_2 * self.sy * self.sy + b * self.shear]
     }
 
-    /// Opacity after antialiasing.
+    /// Computes the opacity after antialiasing.
     pub fn opacity(&self) -> f32 {
         self.power.exp2()
     }
 
-    /// Pixel columns, as a real interval, in which rows `y0..=y1` (pixel centres)
-    /// can meet the support; `None` where they cannot.
+    /// Computes the interval of columns in which rows `y0..=y1` (pixel centres) can intersect
+    /// the support; `None` if they cannot.
     pub fn span(&self, y0: f32, y1: f32) -> Option<(f32, f32)> {
         let low = (y0 - self.v).max(-self.half_height);
         let high = (y1 - self.v).min(self.half_height);
@@ -119,14 +118,14 @@ impl Footprint {
     }
 }
 
-/// log₂(255·opacity) from `power` = log₂ opacity, with slack: where the exponent of
-/// an alpha has fallen by this much, it is below 1/255.
+/// Computes log₂(255·opacity) from `power` = log₂ opacity, with slack: an alpha whose
+/// exponent is lower by this much is below 1/255.
 fn support(power: f32) -> f32 {
     let reach = power - ALPHA_MIN_LOG2;
     reach + SUPPORT_SLACK * (1.0 + reach)
 }
 
-/// [`support`] of sixteen splats.
+/// Computes [`support`] of sixteen splats.
 #[inline(always)]
 pub(crate) fn support_lanes<S: Simd>(s: S, power: S::F) -> S::F {
     let reach = power - s.splat(ALPHA_MIN_LOG2);
@@ -134,7 +133,7 @@ pub(crate) fn support_lanes<S: Simd>(s: S, power: S::F) -> S::F {
 }
 
 impl View {
-    /// World to camera, as Rᵀ(p − t).
+    /// Transforms world points to the camera, as Rᵀ(p − t).
     #[inline(always)]
     fn to_camera<S: Simd>(&self, s: S, p: [S::F; 3]) -> [S::F; 3] {
         let e = self.eye;
@@ -143,8 +142,8 @@ impl View {
         [dot_const(s, a, d), dot_const(s, b, d), dot_const(s, c, d)]
     }
 
-    /// Rows of J·W at points in camera coordinates, px per world unit; `slopes` are
-    /// x/z and y/z.
+    /// Computes the rows of J·W at points in camera coordinates, px per world unit; `slopes`
+    /// are x/z and y/z.
     #[inline(always)]
     fn jacobian_in_world<S: Simd>(&self, s: S, slopes: [S::F; 2], z: S::F) -> [[S::F; 3]; 2] {
         let inverse = s.splat(1.0) / z;
@@ -152,7 +151,7 @@ impl View {
         let mut j = [[z; 3]; 2];
         for i in 0..2 {
             let (low, high) = self.limit[i];
-            let slope = s.splat(high).min(s.splat(low).max(slopes[i]));
+            let slope = slopes[i].max(s.splat(low)).min(s.splat(high));
             let f = s.splat(self.focal[i]) * inverse;
             for c in 0..3 {
                 j[i][c] = f * slope.fnma(s.splat(away[c]), s.splat(self.rows[i][c]));
@@ -161,8 +160,8 @@ impl View {
         j
     }
 
-    /// Sixteen footprints, colours 0: vector k holds field k of [`Footprint`], zeros
-    /// in the lanes of dropped splats; and which lanes were kept.
+    /// Computes sixteen footprints with colours 0, and the kept lanes. Vector k holds field k
+    /// of [`Footprint`], zeros in the lanes of dropped splats.
     #[inline(always)]
     pub(crate) fn project<S: Simd>(
         &self,
@@ -172,8 +171,8 @@ impl View {
         opacity: S::F,
     ) -> ([S::F; FIELDS], S::M) {
         let p = self.to_camera(s, mean);
-        // So far away that the length of its direction overflows, it has no colour.
-        let within = dot(s, p, p).lt(s.splat(f32::INFINITY));
+        // A splat whose squared distance overflows has no colour.
+        let within = dot(p, p).lt(s.splat(f32::INFINITY));
         let front = s.splat(self.near).lt(p[2]) & within;
         let slopes = [p[0] / p[2], p[1] / p[2]];
         let j = self.jacobian_in_world(s, slopes, p[2]);
@@ -205,7 +204,7 @@ impl View {
         // Comparisons are false for NaN.
         let mut kept = kept & s.splat(ALPHA_MIN).le(opacity) & opacity.lt(infinity);
         kept = kept & zero.lt(det) & det.lt(infinity) & zero.lt(xx) & zero.lt(yy);
-        let power = log2(s, s.splat(OPACITY_MAX).min(opacity));
+        let power = s.splat(OPACITY_MAX).min(opacity).log2();
         let reach = s.splat(2.0 * LN_2) * support_lanes(s, power);
         let [mut u, mut v] = slopes;
         if self.z_epsilon != 0.0 {
@@ -219,8 +218,8 @@ impl View {
         let shear = -c.xy * inverse;
         let sy = (s.splat(0.5 * LOG2_E) * inverse).sqrt();
         let (half_width, half_height) = ((reach * xx).sqrt(), (reach * yy).sqrt());
-        // A sum is finite only if no term is NaN or infinite, bar overflow of huge
-        // finite terms, which is dropped alike.
+        // The sum is finite only if no term is NaN or infinite. Overflow of huge finite
+        // terms drops the splat, too.
         let sum = u + v + sx + shear + sy + p[2] + half_width + half_height;
         kept = kept & sum.abs().lt(infinity);
         let radius = if self.tile_cut { Some(radius_mvsplat(s, xx, yy, det)) } else { None };
@@ -254,8 +253,8 @@ impl View {
         (fields, kept)
     }
 
-    /// Pixels [first, past the last) along one axis that the support meets and,
-    /// with a radius, that the tile cut leaves: whole numbers from 0 to the side.
+    /// Computes the pixels [first, past the last) along one axis that the support intersects
+    /// and, with a radius, that the tile cut keeps: whole numbers from 0 to the side.
     #[inline(always)]
     fn extent<S: Simd>(
         &self,
@@ -271,7 +270,7 @@ impl View {
         let mut past = side.min((mean + half).floor() + s.splat(1.0));
         if let Some(r) = radius {
             const TILE_PX: f32 = TILE_MVSPLAT as f32;
-            // The original truncates towards zero; what is below 0 ends at 0 anyway.
+            // The original truncates towards zero; the clamp below gives 0 for either.
             let tile = s.splat(1.0 / TILE_PX);
             let from = ((mean - r) * tile).floor();
             let to = ((mean + r + s.splat(TILE_PX - 1.0)) * tile).floor();
@@ -282,7 +281,7 @@ impl View {
     }
 }
 
-/// ⌈3·√λ_max⌉ of the covariance with low-pass, px (INRIA).
+/// Computes ⌈3·√λ_max⌉ of the covariance with low-pass, px (INRIA).
 #[inline(always)]
 fn radius_mvsplat<S: Simd>(s: S, xx: S::F, yy: S::F, det: S::F) -> S::F {
     let mid = s.splat(0.5) * (xx + yy);
@@ -292,5 +291,5 @@ fn radius_mvsplat<S: Simd>(s: S, xx: S::F, yy: S::F, det: S::F) -> S::F {
 
 #[inline(always)]
 fn dot_const<S: Simd>(s: S, a: [f32; 3], b: [S::F; 3]) -> S::F {
-    dot(s, [s.splat(a[0]), s.splat(a[1]), s.splat(a[2])], b)
+    dot([s.splat(a[0]), s.splat(a[1]), s.splat(a[2])], b)
 }

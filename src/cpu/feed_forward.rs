@@ -44,9 +44,9 @@ pub fn forward(f: &FeedForward<'_>, x: &[f32], message: &[f32]) -> Vec<f32> {
     let rows = Rows { len: c, run: 1, groups: 1, eps: f.eps, activation: None };
     // Off the powers of two, at which rows lie in one another's cache lines.
     let pitch = h + LANES;
-    let mut fresh = UninitBuffer::new(x.len());
+    let mut buffer = UninitBuffer::new(x.len());
     let size = BLOCK * c.max(1);
-    let blocks = fresh.par_chunks_mut(size).zip(x.par_chunks(size)).zip(message.par_chunks(size));
+    let blocks = buffer.par_chunks_mut(size).zip(x.par_chunks(size)).zip(message.par_chunks(size));
     blocks.for_each_init(
         || (Vec::new(), Vec::new()),
         |(hidden, narrow), ((block, x), message)| {
@@ -62,6 +62,6 @@ pub fn forward(f: &FeedForward<'_>, x: &[f32], message: &[f32]) -> Vec<f32> {
             y.iter_mut().zip(x).for_each(|(y, x)| *y += x);
         },
     );
-    // SAFETY: the loop above started every block.
-    unsafe { fresh.assume_init() }
+    // SAFETY: the loop above initialised every block.
+    unsafe { buffer.assume_init() }
 }

@@ -25,8 +25,8 @@ impl Join {
 pub fn forward(j: &Join, batch: usize, fine: &[f32], coarse: &[f32]) -> Vec<f32> {
     let (n, [c1, c2], s, w) = (j.plane(), j.channels, j.repeat, j.size[1]);
     let small = n / (s * s);
-    let mut fresh = UninitBuffer::new(batch * (c1 + c2) * n);
-    fresh.par_chunks_mut(n).enumerate().for_each(|(i, y)| {
+    let mut buffer = UninitBuffer::new(batch * (c1 + c2) * n);
+    buffer.par_chunks_mut(n).enumerate().for_each(|(i, y)| {
         let (b, c) = (i / (c1 + c2), i % (c1 + c2));
         if c < c1 {
             filled(y, &fine[(b * c1 + c) * n..][..n]);
@@ -35,7 +35,7 @@ pub fn forward(j: &Join, batch: usize, fine: &[f32], coarse: &[f32]) -> Vec<f32>
         }
     });
     // SAFETY: the loop above filled every block.
-    unsafe { fresh.assume_init() }
+    unsafe { buffer.assume_init() }
 }
 
 /// A plane of which every pixel is repeated `s` × `s` times into one `w` wide.

@@ -9,7 +9,7 @@
 //! quarter-resolution pixels, share of valid samples. A candidate's source pixel
 //! that lies outside the picture or behind the camera is left out of every window.
 
-use super::math::vectorised;
+use super::simd::vectorize;
 use crate::camera::{Camera, Intrinsics};
 use glam::{Mat3, Vec3};
 use rayon::prelude::*;
@@ -95,7 +95,7 @@ impl PlaneWarp {
     }
 }
 
-/// Lanes that loops over pixels are written for.
+/// Pixels per step of a loop.
 const LANES: usize = 16;
 
 /// Bilinear samples of one line of reference pixels: where the four neighbours are and
@@ -125,7 +125,7 @@ impl Line {
             of_pixel.resize(room, 0.0);
         }
         let base = warp.from_px * Vec3::new(0.0, y as f32 + 0.5, 1.0) + warp.shift * disparity;
-        vectorised(
+        vectorize(
             #[inline(always)]
             || {
                 for x in (0..room).step_by(LANES) {
@@ -258,7 +258,7 @@ impl Pair<'_> {
             work.line.read(&self.source.half_grey, &mut work.samples[0]);
             let own = &self.reference.half_grey[2 * y * w..2 * (y + 1) * w];
             let (valid, samples, sums) = (&work.line.valid, &work.samples[0], &mut work.sums);
-            vectorised(
+            vectorize(
                 #[inline(always)]
                 || sums.add(y / 2, [valid, own, samples], 2),
             );
@@ -283,7 +283,7 @@ impl Pair<'_> {
             let colour = &mut colour[y * w..(y + 1) * w];
             let (valid, [red, green, blue], sums) =
                 (&work.line.valid, &mut work.samples, &mut work.sums);
-            vectorised(
+            vectorize(
                 #[inline(always)]
                 || {
                     for x in 0..w {
@@ -350,7 +350,7 @@ impl Sums {
     fn score(&mut self, share: f32, out: &mut [f32], valid: Option<&mut [f32]>) {
         let ([h, w], r) = (self.size, self.radius);
         let wide = w + 2 * r;
-        vectorised(
+        vectorize(
             #[inline(always)]
             || {
                 let rows = self.blocks.chunks_exact(wide).zip(self.columns.chunks_exact_mut(w));
@@ -367,7 +367,7 @@ impl Sums {
         let mut valid = valid;
         for (y, out) in out.chunks_exact_mut(w).enumerate() {
             windows.fill(0.0);
-            vectorised(
+            vectorize(
                 #[inline(always)]
                 || {
                     for (p, sums) in windows.chunks_exact_mut(w).enumerate() {

@@ -1,5 +1,5 @@
-//! Sums and moves of whole tensors: no arithmetic to speak of, so one pass, by all
-//! threads, into memory that nothing has cleared before.
+//! Sums and moves of whole tensors. Memory limits them, so each is one pass by all threads
+//! into uninitialised memory.
 
 use super::gemm::{Mat, copy};
 use super::simd::{Kernel, Simd, SimdLevel};
@@ -7,27 +7,27 @@ use super::uninit::{UninitBuffer, filled, zeroed};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
-/// Elements a task.
+/// Elements per task.
 const PART: usize = 1 << 15;
 
-/// a + b.
+/// Computes a + b into new memory.
 pub fn sum(a: &[f32], b: &[f32]) -> Vec<f32> {
     assert_eq!(a.len(), b.len(), "sum: lengths");
-    let mut fresh = UninitBuffer::new(a.len());
-    let parts = fresh.par_chunks_mut(PART).zip(a.par_chunks(PART)).zip(b.par_chunks(PART));
+    let mut buffer = UninitBuffer::new(a.len());
+    let parts = buffer.par_chunks_mut(PART).zip(a.par_chunks(PART)).zip(b.par_chunks(PART));
     parts.for_each(|((block, a), b)| {
         for ((to, a), b) in block.iter_mut().zip(a).zip(b) {
             *to = MaybeUninit::new(a + b);
         }
     });
     // SAFETY: the loop above wrote every place of every block, the lengths being equal.
-    unsafe { fresh.assume_init() }
+    unsafe { buffer.assume_init() }
 }
 
-/// One after the other.
+/// Concatenates slices into new memory.
 pub fn stacked(parts: &[&[f32]]) -> Vec<f32> {
-    let mut fresh = UninitBuffer::new(parts.iter().map(|p| p.len()).sum());
-    fresh.par_chunks_mut(PART).enumerate().for_each(|(i, block)| {
+    let mut buffer = UninitBuffer::new(parts.iter().map(|p| p.len()).sum());
+    buffer.par_chunks_mut(PART).enumerate().for_each(|(i, block)| {
         let mut skip = i * PART;
         let mut block = block;
         for part in parts {
@@ -40,7 +40,7 @@ pub fn stacked(parts: &[&[f32]]) -> Vec<f32> {
     });
     // SAFETY: the blocks together are as long as the parts together, and block i begins
     // where i·PART of them are written.
-    unsafe { fresh.assume_init() }
+    unsafe { buffer.assume_init() }
 }
 
 /// Rows of the result in a task of [`transposed`].
@@ -48,12 +48,12 @@ const ROWS: usize = 256;
 
 /// `[count, rows, cols]` to `[count, cols, rows]`.
 pub fn transposed(x: &[f32], rows: usize, cols: usize) -> Vec<f32> {
-    let mut fresh = UninitBuffer::new(x.len());
+    let mut buffer = UninitBuffer::new(x.len());
     let area = rows * cols;
     if area > PART {
         // Tasks end where a matrix does.
         let size = if cols.is_multiple_of(ROWS) { ROWS } else { cols };
-        fresh.par_chunks_mut(size * rows).enumerate().for_each(|(i, block)| {
+        buffer.par_chunks_mut(size * rows).enumerate().for_each(|(i, block)| {
             let (matrix, first) = (i * size / cols, i * size % cols);
             let data = &x[matrix * area + first..(matrix + 1) * area];
             let from = Mat { data, rows: size, cols: rows, row_stride: 1, col_stride: cols };
@@ -61,7 +61,7 @@ pub fn transposed(x: &[f32], rows: usize, cols: usize) -> Vec<f32> {
         });
     } else if let Some(matrices) = PART.checked_div(area) {
         let size = matrices * area;
-        fresh.par_chunks_mut(size).zip(x.par_chunks(size)).for_each(|(block, x)| {
+        buffer.par_chunks_mut(size).zip(x.par_chunks(size)).for_each(|(block, x)| {
             let all = zeroed(block).chunks_exact_mut(area).zip(x.chunks_exact(area));
             for (to, data) in all {
                 let from = Mat::new(data, rows, cols, cols).t();
@@ -69,8 +69,8 @@ pub fn transposed(x: &[f32], rows: usize, cols: usize) -> Vec<f32> {
             }
         });
     }
-    // SAFETY: either loop above started every block; there is none of an empty matrix.
-    unsafe { fresh.assume_init() }
+    // SAFETY: either loop above initialised every block; there is none of an empty matrix.
+    unsafe { buffer.assume_init() }
 }
 
 struct Turn<'a> {

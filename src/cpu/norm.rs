@@ -1,22 +1,22 @@
-//! Normalisation of rows to zero mean and unit (biased) variance with a scale and a
-//! shift per channel, and its gradient: GroupNorm, InstanceNorm and LayerNorm are
-//! this with different readings of "row" and "channel". A pointwise function may
-//! follow in the same pass.
+//! Normalisation of rows to zero mean and unit (biased) variance with a scale and a shift per
+//! channel, and its gradient. GroupNorm, InstanceNorm and LayerNorm differ in their rows and
+//! channels only. A pointwise function may follow in the same pass.
 
 mod layer;
 mod silu;
 
 use super::activation::{Activation, by_kind};
-use super::math::{sum_of, sums_of, vectorised};
 use super::simd::SimdLevel;
+use super::simd::vectorize;
+use super::sums::{sum_of, sums_of};
 use super::uninit::{UninitBuffer, UninitSlice};
 use layer::Layer;
 use rayon::prelude::*;
 use silu::Silu;
 use std::mem::MaybeUninit;
 
-/// How rows lie and which channel an element has: element i of row r belongs to
-/// channel (r mod `groups`)·(`len` / `run`) + i / `run`.
+/// Layout of rows and channels: element i of row r belongs to channel
+/// (r mod `groups`)·(`len` / `run`) + i / `run`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rows {
     /// Elements of a row.
@@ -27,7 +27,7 @@ pub struct Rows {
     pub groups: usize,
     /// ε under the square root.
     pub eps: f32,
-    /// f of the result, if any.
+    /// Function f of the result, if any.
     pub activation: Option<Activation>,
 }
 
@@ -57,18 +57,18 @@ impl Rows {
     }
 }
 
-/// f(w·(x − mean)/σ + b), new memory; `w` and `b` are `[channels]`, or empty for none.
+/// Computes f(w·(x − mean)/σ + b) into new memory; `w` and `b` are `[channels]`, or empty.
 pub fn forward(rows: &Rows, x: &[f32], w: &[f32], b: &[f32]) -> Vec<f32> {
-    let mut fresh = UninitBuffer::new(x.len());
-    forward_to(rows, x, w, b, fresh.as_mut_slice());
+    let mut buffer = UninitBuffer::new(x.len());
+    forward_to(rows, x, w, b, buffer.as_mut_slice());
     // SAFETY: every element of every row was written.
-    unsafe { fresh.assume_init() }
+    unsafe { buffer.assume_init() }
 }
 
-/// [`forward`] into `y`.
+/// Computes [`forward`] into `y` and writes all of it.
 ///
 /// # Panics
-/// Where the sizes do not fit: not all of `y` is written then.
+/// If the sizes do not fit.
 pub(super) fn forward_to(rows: &Rows, x: &[f32], w: &[f32], b: &[f32], y: &mut UninitSlice<f32>) {
     assert!(x.len() == y.len() && x.len().is_multiple_of(rows.len), "normalisation: rows");
     assert!(rows.len.is_multiple_of(rows.run) && w.len() == b.len(), "normalisation: channels");
@@ -90,7 +90,7 @@ pub(super) fn forward_to(rows: &Rows, x: &[f32], w: &[f32], b: &[f32], y: &mut U
             let (first, affine) = (at * batch, [w, b]);
             return SimdLevel::best().run(Silu { rows, first, x, y, affine });
         }
-        vectorised(
+        vectorize(
             #[inline(always)]
             || {
                 let pairs = x.chunks_exact(rows.len).zip(y.chunks_exact_mut(rows.len));
@@ -143,9 +143,9 @@ fn affine_row(
     }
 }
 
-/// What [`backward`] reads.
+/// Inputs of [`backward`].
 pub struct Saved<'a> {
-    /// What [`forward`] took.
+    /// Input of [`forward`].
     pub x: &'a [f32],
     /// Scales, or empty.
     pub w: &'a [f32],
@@ -155,14 +155,14 @@ pub struct Saved<'a> {
     pub dy: &'a [f32],
 }
 
-/// (dx, dw, db). With g = dy·f′·w and x̂ the normalised x:
+/// Computes (dx, dw, db). With g = dy·f′·w and x̂ the normalised x:
 /// dx = (g − mean(g) − x̂·mean(g·x̂))/σ, dw = Σ dy·f′·x̂, db = Σ dy·f′.
 pub fn backward(rows: &Rows, s: &Saved<'_>) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
     let (per_row, batch) = (rows.per_row(), rows.batch());
     let chunk = batch * rows.len;
     let count = s.x.len() / rows.len.max(1);
     let mut dx = vec![0f32; s.x.len()];
-    // Per row and channel: Σ dy·f′·x̂ and Σ dy·f′. A LayerNorm's rows are summed by task.
+    // Per row and channel: Σ dy·f′·x̂ and Σ dy·f′. A task adds its rows of a LayerNorm.
     let shared = rows.groups == 1 && rows.run == 1;
     let kept = if shared { count.div_ceil(batch) } else { count };
     let mut sums = vec![[0f64; 2]; kept * per_row];
@@ -173,7 +173,7 @@ pub fn backward(rows: &Rows, s: &Saved<'_>) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
         .zip(sums.par_chunks_mut(per_task))
         .enumerate()
         .for_each(|(at, (((x, dy), dx), sums))| {
-            vectorised(
+            vectorize(
                 #[inline(always)]
                 || {
                     let lines = x.chunks_exact(rows.len).zip(dy.chunks_exact(rows.len));
@@ -213,8 +213,8 @@ pub fn backward(rows: &Rows, s: &Saved<'_>) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
     (dx, lane(0), lane(1))
 }
 
-/// One row: `dx`, and its channels' sums added to `sums`. `w` and `b` begin at the row's
-/// first channel.
+/// Computes `dx` of one row and adds its channels' sums to `sums`. `w` and `b` begin at the
+/// row's first channel.
 #[inline(always)]
 fn backward_row(
     rows: &Rows,
@@ -226,7 +226,7 @@ fn backward_row(
     let (n, (mean, inverse)) = (rows.len as f64, rows.moments(x));
     let (mut mean_g, mut mean_gx) = (0f64, 0f64);
     if let (1, Some(w), Some(b)) = (rows.run, w.get(..rows.len), b.get(..rows.len)) {
-        // One element a channel: `dx` holds dy·f′·w until the means are known.
+        // One element per channel: `dx` holds dy·f′·w until the means are known.
         let (x, dy, sums) = (&x[..rows.len], &dy[..rows.len], &mut sums[..rows.len]);
         let dx = &mut dx[..rows.len];
         for i in 0..rows.len {

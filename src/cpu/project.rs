@@ -3,8 +3,8 @@
 //!
 //! In: [`SplatSlices`] in world frame. Out: one [`Footprint`] per splat (empty where
 //! dropped, see [`crate::cpu::ewa`]), and what [`crate::cpu::tiles`] needs to list
-//! them. Sixteen splats go side by side: first the geometry of all, then the SH of those
-//! that were kept, whose coefficients alone are read.
+//! them. Each lane is a splat. The kernel computes the geometry of all splats, then the colour
+//! of the kept ones, and reads no other coefficients.
 //! Colour of child i of parent p: max(0, ½ + γ_i·Σ_k sh_{p,k} Y_k(d) + δ_i)
 //! (SubSplat, colour gain; 3DGS for γ = 1, δ = 0).
 
@@ -43,7 +43,7 @@ impl Projection {
             + self.parents.capacity() * size_of::<[f32; 3]>()
     }
 
-    /// Counts the entries of footprints that are there already.
+    /// Counts the entries of existing footprints.
     pub(crate) fn cover(&self, lists: &mut TileLists) {
         let chunk = lists.chunk();
         let covers = lists.chunks(self.footprints.len());
@@ -86,8 +86,7 @@ impl Projection {
     }
 }
 
-/// Σ sh·Y of some parents, seen along the mean of their children's means (those that
-/// are finite).
+/// Computes Σ sh·Y of some parents along the mean of their children's finite means.
 struct Parents<'a> {
     splats: &'a SplatSlices<'a>,
     view: &'a View,
@@ -137,11 +136,10 @@ impl Kernel for Parents<'_> {
     }
 }
 
-/// Splats that are projected before any of them is coloured: their footprints stay in
-/// the first cache.
+/// Splats per pass of geometry, then colour: their footprints stay in the first-level cache.
 const STRIP: usize = 256;
 
-/// One chunk of splats on its way to footprints.
+/// Projects one chunk of splats to footprints.
 struct Chunk<'a> {
     splats: &'a SplatSlices<'a>,
     view: &'a View,
@@ -164,7 +162,7 @@ impl Kernel for Chunk<'_> {
         while start < self.footprints.len() {
             let past = (start + STRIP).min(self.footprints.len());
             let count = self.geometry(s, start, past, &mut kept);
-            // The last group is filled up with a splat that is there.
+            // The last group repeats a splat of the chunk.
             let last = kept[count.saturating_sub(1)];
             kept[count..count + LANES].fill(last);
             let mut g = 0;
@@ -185,11 +183,11 @@ impl Kernel for Chunk<'_> {
     }
 }
 
-/// How many splats ahead their coefficients are asked for.
+/// Distance of prefetches of coefficients, splats.
 const AHEAD: usize = 2 * LANES;
 
 impl Chunk<'_> {
-    /// Asks for the SH sets of some splats of the chunk.
+    /// Prefetches the SH sets of some splats of the chunk.
     #[inline(always)]
     fn prefetch<S: Simd>(&self, s: S, group: &[u32]) {
         /// Floats of a cache line.
@@ -214,8 +212,8 @@ impl Chunk<'_> {
         }
     }
 
-    /// Footprints without colour of the chunk's splats `start..past`; writes the
-    /// places of the kept ones to `kept` and returns how many they are.
+    /// Computes footprints without colour of the chunk's splats `start..past`. Writes the
+    /// indices of the kept ones to `kept` and returns their number.
     #[inline(always)]
     fn geometry<S: Simd>(
         &mut self,
@@ -282,8 +280,7 @@ impl Chunk<'_> {
         }
     }
 
-    /// Colours the splats at `group`, of which the first `count` are meant; drops
-    /// those whose colour is no number.
+    /// Colours the first `count` splats of `group`; drops those whose colour is not finite.
     #[inline(always)]
     fn colour<S: Simd>(&mut self, s: S, group: &[u32], count: usize) {
         let splats = self.splats;
@@ -341,7 +338,7 @@ impl Chunk<'_> {
         }
     }
 
-    /// γ and δ.
+    /// Loads γ and δ.
     #[inline(always)]
     fn gain<S: Simd>(&self, s: S, index: &[usize; LANES]) -> (S::F, [S::F; 3]) {
         let (gain, n) = (self.splats.gain, self.splats.len());

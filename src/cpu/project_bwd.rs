@@ -1,10 +1,9 @@
-//! Backward of [`crate::cpu::project`]: from the pixels' sums to gradients of what the
-//! caller gave, sixteen splats at a time, in parallel over families of children.
+//! Backward of [`crate::cpu::project`]: from the pixels' sums to gradients of the inputs,
+//! sixteen splats at a time, in parallel over families of children.
 //!
-//! A parent's SH gradient is summed over its children by one thread in their order, so
-//! that no thread count changes a byte. Splats that no pixel saw, dropped ones above
-//! all, are replaced by a harmless one with sums of zero: their gradients come out 0,
-//! whatever numbers they hold.
+//! One thread adds a parent's SH gradient over its children in their order, so that the
+//! number of threads does not change a byte. A harmless splat with sums of zero replaces
+//! every splat without pixels, so that its gradients are 0 whatever numbers it holds.
 
 pub use crate::abi::Gradients;
 

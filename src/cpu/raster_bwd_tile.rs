@@ -10,34 +10,35 @@
 //! nothing before it: B_{i−1} = B_i + α_i (q_i − B_i), b behind the last. Neither a
 //! division nor a difference of sums; what opaque splats hide keeps its digits.
 //!
-//! The way forward repeats the forward's decisions by the forward's own operations and
-//! leaves, per (splat, tile), the mask of blocks that it changed, and per (splat, block)
-//! of those an [`Item`]. The way back reads them.
+//! The first pass repeats the forward's decisions by the forward's own operations. It stores
+//! the mask of changed blocks per (splat, tile), and an [`Item`] per (splat, block) of those.
+//! The second pass reads them back to front.
 //!
-//! Splats go one by one, each over its blocks, its ten sums in registers; one reduction
-//! and one row per (splat, tile). Items are held for a stretch of the list at a time,
-//! [`ITEMS`] or little more; the stretches of a longer list, but for the last, are
-//! walked forward again from what was kept of T.
+//! It handles one splat at a time over its blocks, with ten sums in registers: one reduction
+//! and one row per (splat, tile). Items are stored for a stretch of the list at a time,
+//! [`ITEMS`] or little more. All stretches of a longer list but the last repeat the first
+//! pass from a stored T.
 
 use crate::abi::{ALPHA_MIN_LOG2, BLOCK, TILE};
 use crate::cpu::blend::{BLOCKS, Lanes, Rules};
 use crate::cpu::blocks::met;
 use crate::cpu::ewa::Footprint;
 use crate::cpu::ewa_bwd::Moments;
-use crate::cpu::simd::{self, F32Vector, Kernel, LANES, Mask, Simd, Vector};
+use crate::cpu::simd::elementary::exp2;
+use crate::cpu::simd::{F32Vector, Kernel, LANES, Mask, Simd, Vector};
 use crate::cpu::tiles::Grid;
 
 /// Sums kept per (splat, tile): the numbers of [`Moments`].
 pub(crate) const SUMS: usize = 10;
-/// Items after which a stretch of a list ends: 4 MiB a thread, where the next splats may
-/// add 128 KiB.
+/// Items after which a stretch of a list ends: 4 MiB per thread; the next splats may add
+/// 128 KiB.
 const ITEMS: usize = 1 << 15;
 /// Items that the splats of one step forward can make.
 const STEP: usize = LANES * BLOCKS * BLOCKS;
-/// Splats whose footprints are asked for ahead of their turn.
+/// Distance of prefetches, splats.
 const AHEAD: usize = LANES;
 
-/// What one tile says of one splat, in the order of [`Moments`].
+/// Sums of one splat over one tile, in the order of [`Moments`].
 pub(crate) type PairSums = [f32; SUMS];
 
 impl From<PairSums> for Moments {
@@ -47,7 +48,7 @@ impl From<PairSums> for Moments {
     }
 }
 
-/// The gradient that arrives at a picture.
+/// The gradient of the loss with respect to a picture.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Upstream<'a> {
     /// `[5, H, W]`: ∂L/∂ R, G, B, alpha, Σ w·z.
@@ -55,7 +56,7 @@ pub(crate) struct Upstream<'a> {
     pub(crate) background: [f32; 3],
 }
 
-/// What a splat does to the pixels of a block.
+/// The contribution of a splat to the pixels of a block.
 #[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
 struct Item {
@@ -65,7 +66,7 @@ struct Item {
     w: Lanes,
 }
 
-/// Where a stretch of a list begins.
+/// State at the start of a stretch of a list.
 #[derive(Clone, Debug)]
 struct Stretch {
     /// Place in the order.
@@ -75,7 +76,7 @@ struct Stretch {
     t: [Lanes; BLOCKS * BLOCKS],
 }
 
-/// What a thread walks with, reused from tile to tile.
+/// Working memory of a thread, reused from tile to tile.
 #[derive(Debug, Default)]
 pub(crate) struct Scratch {
     items: Vec<Item>,
@@ -111,7 +112,7 @@ struct Walks {
 
 /// The backward of one tile; returns Σ T·∂L/∂rgb over its pixels.
 pub(crate) struct WalkTile<'a> {
-    /// Which tile of `grid`.
+    /// Index of the tile in `grid`.
     pub(crate) t: usize,
     pub(crate) grid: Grid,
     /// Places in `splats` and `rows`, nearest first.
@@ -171,10 +172,9 @@ impl WalkTile<'_> {
         &self.footprints[self.splats[self.order[i] as usize] as usize]
     }
 
-    /// Takes `walks` from splat `from` of the order to the end of its stretch: there are
-    /// enough items, or no more splats, or all pixels have stopped. Returns where that
-    /// is and the number of items. Leaves in `masks`, by place in the order, the blocks
-    /// changed.
+    /// Advances `walks` from splat `from` of the order to the end of its stretch: enough
+    /// items, the last splat, or all pixels stopped. Returns the end and the number of items.
+    /// Writes the changed blocks to `masks`, by place in the order.
     #[inline(always)]
     fn forward<S: Simd>(
         &mut self,
@@ -200,7 +200,7 @@ impl WalkTile<'_> {
             let mut masks = [0; LANES];
             let mut fields = [s.splat(0.0); LANES];
             for (l, field) in fields.iter_mut().enumerate() {
-                // Spare lanes repeat the last splat and are not walked.
+                // Spare lanes repeat the last splat; the loop below skips them.
                 *field = s.load(self.footprint((from + l).min(past - 1)).fields());
             }
             met(s, s.transpose(fields), corner, &mut masks);
@@ -224,8 +224,8 @@ impl WalkTile<'_> {
         (from, items)
     }
 
-    /// Takes `walks` back over one stretch, whose items are the first `items`, and
-    /// writes the rows of its splats.
+    /// Moves `walks` back over one stretch, whose items are the first `items`, and writes the
+    /// rows of its splats.
     #[inline(always)]
     fn back<S: Simd>(
         &mut self,
@@ -345,7 +345,7 @@ impl Walks {
     }
 }
 
-/// Copies the first of `from` over `to`; a whole row of a block without asking how many.
+/// Copies the first of `from` over `to`; a whole row of a block without a loop.
 #[inline(always)]
 fn copy(to: &mut [f32], from: &[f32]) {
     match (<&mut [f32; BLOCK]>::try_from(&mut *to), from.first_chunk::<BLOCK>()) {
@@ -354,8 +354,8 @@ fn copy(to: &mut [f32], from: &[f32]) {
     }
 }
 
-/// A splat at block `b`, by the forward's own operations: whether it changed a pixel,
-/// and whether a pixel still goes on.
+/// Blends a splat into block `b` by the forward's own operations. Returns whether it changed
+/// a pixel, and whether a pixel is still live.
 #[inline(always)]
 fn step_forward<S: Simd>(
     s: S,
@@ -368,12 +368,12 @@ fn step_forward<S: Simd>(
     let (least, zero) = (s.splat(ALPHA_MIN_LOG2), s.splat(0.0));
     let [across, down] = walks.whitened(s, b, f);
     let power = down.fnma(down, across.fnma(across, s.splat(f.power)));
-    let alpha = s.splat(rules.alpha_max).min(simd::exp2(s, least.max(power)));
+    let alpha = s.splat(rules.alpha_max).min(exp2(least.max(power)));
     let walk = &mut walks.blocks[b % (BLOCKS * BLOCKS)];
     let t = s.load(&walk.t);
     let shows = least.le(power);
     let rest = shows.select_or_zero(alpha).fnma(t, t);
-    // Where blending has stopped, T < 0, and so is what is left of it.
+    // A stopped pixel has T < 0, and the rest is negative, too.
     let goes = s.splat(rules.stop).lt(rest);
     let adds = goes & shows;
     let alpha = adds.select_or_zero(alpha);
@@ -383,7 +383,7 @@ fn step_forward<S: Simd>(
     (adds.any(), goes.any())
 }
 
-/// The same on the way back; adds to `sums`.
+/// Steps back over a splat at block `b`; adds to `sums`.
 #[inline(always)]
 fn step_back<S: Simd>(
     s: S,

@@ -3,9 +3,9 @@
 //!
 //! In: [`SplatSlices`], a camera, [`RasterOptions`]. Out, H × W pixels row-major:
 //! RGB over the background, accumulated alpha 1 − T, and Σ w·z with z the camera z
-//! of the means in world units (in either convention). Work is spread over rayon's
-//! current pool; the same bytes come out whatever its size. Of the levels only
-//! [`SimdLevel::Scalar`] gives other bytes than the rest, since it rounds products.
+//! of the means in world units (in either convention). Tiles run in rayon's current pool;
+//! the bytes do not depend on its size. All SIMD levels give the same bytes except
+//! [`SimdLevel::Scalar`], which rounds products.
 
 pub use crate::abi::Rendered;
 
@@ -102,10 +102,10 @@ impl Rasterizer {
         self
     }
 
-    /// Uses the instructions of `level` (default [`SimdLevel::best`]; the scalar ones where
-    /// the processor lacks them). Levels that fuse multiply and add give the same
-    /// bytes; the scalar one differs in last bits (about 1e-6 of a colour, and
-    /// a splat's contribution of 1/255 where that decides whether it is skipped).
+    /// Uses the instructions of `level` (default [`SimdLevel::best`]), or the scalar ones if
+    /// the processor lacks them. Levels that fuse multiply and add give the same bytes. The
+    /// scalar one differs by about 1e-6 of a colour, and by a contribution of 1/255 where
+    /// rounding decides whether a splat is skipped.
     pub fn with_simd_level(mut self, level: SimdLevel) -> Self {
         self.level = level;
         self

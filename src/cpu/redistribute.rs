@@ -1,7 +1,7 @@
-//! How a parent's opacity is shared among its children, and the gradient.
+//! Redistribution of a parent's opacity to its children, and the gradient.
 //!
-//! In: logits ℓ `[P,K]`; areas A `[P,K]`, px²; opacities α `[P]`; the parents' own
-//! areas `[P]` where the rule asks for them.   Out: `[P,K]`.
+//! Input: logits ℓ `[P,K]`; areas A `[P,K]`, px²; opacities α `[P]`; the parents' own
+//! areas `[P]` for relative rules.   Output: `[P,K]`.
 //! With w = softmax(ℓ) and B = A_k / own area:
 //!
 //! | rule | α_k | areas |
@@ -12,54 +12,53 @@
 //! | area | min(0.99, α·w_k / B_k) | without the low-pass |
 //! | none | α | unused |
 //!
-//! α is taken as at most 0.9999 wherever a logarithm is. Parents are the lanes of a
-//! vector ([`super::lanes`]), so that a sum over children is a loop. Twins:
-//! kernels/redistribute.wgsl, src/gpu/redistribute.rs. Op: ops/redistribute.rs.
+//! Logarithms clamp α to 0.9999. Each lane of a vector ([`super::simd`]) is a parent, so
+//! that a sum over children is a loop. WGSL: kernels/redistribute.wgsl,
+//! src/gpu/redistribute.rs. Op: ops/redistribute.rs.
 
-use super::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};
-use super::real::Real;
+use super::simd::{LANES, Mask, Real, RowLayout, Vector, VectorKernel};
 use super::uninit::{UninitBuffer, UninitSlice, zeroed};
 use crate::abi::{AREA_EPS, AREA_RULE_OPACITY_MAX, OPACITY_CEILING, RELATIVE_AREA_MIN};
 use rayon::prelude::*;
 
 pub use crate::abi::Rule;
 
-/// Parents per rayon task: all that it reads and writes lies in the caches of a core.
+/// Parents per rayon task: its data fits the caches of a core.
 const BLOCK: usize = 512;
 
-/// Areas above count as this, px²: over [`AREA_EPS`] it is still far from overflow.
+/// Upper clamp of areas, px²: its quotient by [`AREA_EPS`] does not overflow.
 const AREA_MAX: f64 = 1e28;
 
-/// B above counts as this: such a child gets less than 1e-17 of the parent, and the
-/// product of two is far from overflow.
+/// Upper clamp of B: such a child gets less than 1e-17 of the parent, and the product of
+/// two does not overflow.
 const RELATIVE_AREA_MAX: f64 = 1e18;
 
-/// eˣ⁻ᵐᵃˣ of `x` in place; returns one over their sum.
+/// Replaces `x` by eˣ⁻ᵐᵃˣ and returns the reciprocal of their sum.
 #[inline(always)]
-fn exponentials<V: Lanes>(x: &mut [V]) -> V {
+fn exponentials<V: Vector>(x: &mut [V]) -> V {
     let mut top = x[0];
     for &v in &x[1..] {
         top = top.max(v);
     }
-    let mut sum = top.of(0.0);
+    let mut sum = V::constant(0.0);
     for v in x.iter_mut() {
         *v = (*v - top).exp();
         sum = sum + *v;
     }
-    sum.of(1.0) / sum
+    V::constant(1.0) / sum
 }
 
-/// e^{ℓ_k − max ℓ}·(A_0 + ε)/(A_k + ε) in place of ℓ: softmax(ℓ − ln(A + ε)) before its
-/// division by the sum, which is returned, without a logarithm. An only child gets 1.
+/// Replaces ℓ_k by e^{ℓ_k − max ℓ}·(A_0 + ε)/(A_k + ε) and returns the sum. Their quotient
+/// is softmax(ℓ − ln(A + ε)) without a logarithm. An only child gets 1.
 #[inline(always)]
-fn per_area<V: Lanes>(areas: &[V], logits: &mut [V]) -> V {
+fn per_area<V: Vector>(areas: &[V], logits: &mut [V]) -> V {
     let mut top = logits[0];
     for &v in &logits[1..] {
         top = top.max(v);
     }
-    let (mut sum, eps) = (top.of(0.0), top.of(AREA_EPS));
-    // Bounded, so that no quotient leaves f32.
-    let bounded = |a: V| (a + eps).min(a.of(AREA_MAX));
+    let (mut sum, eps) = (V::constant(0.0), V::constant(AREA_EPS));
+    // The clamp keeps quotients inside the range of f32.
+    let bounded = |a: V| (a + eps).min(V::constant(AREA_MAX));
     let first = bounded(areas[0]);
     for (l, &a) in logits.iter_mut().zip(areas) {
         *l = (*l - top).exp() * first / bounded(a);
@@ -69,30 +68,30 @@ fn per_area<V: Lanes>(areas: &[V], logits: &mut [V]) -> V {
 }
 
 #[inline(always)]
-fn optical_depth<V: Lanes>(alpha: V) -> V {
-    -(-alpha.min(alpha.of(OPACITY_CEILING))).ln_1p()
+fn optical_depth<V: Vector>(alpha: V) -> V {
+    -(-alpha.min(V::constant(OPACITY_CEILING))).ln_1p()
 }
 
-/// B: what the rules with relative areas divide by, bounded so that two of them may be
-/// multiplied.
+/// Returns B, the divisor of rules with relative areas, clamped so that a product of two
+/// stays in range.
 #[inline(always)]
-fn divisor<V: Lanes>(area: V, per_own: V) -> V {
-    (area * per_own).max(area.of(RELATIVE_AREA_MIN)).min(area.of(RELATIVE_AREA_MAX))
+fn divisor<V: Vector>(area: V, per_own: V) -> V {
+    (area * per_own).max(V::constant(RELATIVE_AREA_MIN)).min(V::constant(RELATIVE_AREA_MAX))
 }
 
-/// F of the rules α_k = F(x_k).
+/// Evaluates F of the rules α_k = F(x_k).
 #[inline(always)]
-fn opacity_of<V: Lanes>(rule: Rule, x: V) -> V {
+fn opacity_of<V: Vector>(rule: Rule, x: V) -> V {
     match rule {
-        Rule::Area => x.min(x.of(AREA_RULE_OPACITY_MAX)),
+        Rule::Area => x.min(V::constant(AREA_RULE_OPACITY_MAX)),
         _ => -(-x).exp_m1(),
     }
 }
 
-/// α_k of K children in the lanes of their parents. `own` is read by the relative
-/// rules only. K = `areas.len()` ≥ 1; `alphas` comes in with the logits.
+/// Computes α_k of K children in the lanes of their parents. Relative rules alone read
+/// `own`. K = `areas.len()` ≥ 1; `alphas` holds the logits on entry.
 #[inline(always)]
-pub(super) fn share<V: Lanes>(rule: Rule, areas: &[V], alpha: V, own: V, alphas: &mut [V]) {
+pub(super) fn share<V: Vector>(rule: Rule, areas: &[V], alpha: V, own: V, alphas: &mut [V]) {
     if rule == Rule::None {
         alphas.fill(alpha);
         return;
@@ -102,7 +101,7 @@ pub(super) fn share<V: Lanes>(rule: Rule, areas: &[V], alpha: V, own: V, alphas:
         alphas.iter_mut().for_each(|o| *o = *o * factor);
         return;
     }
-    let one = alpha.of(1.0);
+    let one = V::constant(1.0);
     let inverse = exponentials(alphas);
     let per_own = if rule.areas_are_relative() { one / own } else { one };
     let whole = if rule == Rule::Area { alpha } else { optical_depth(alpha) };
@@ -113,7 +112,7 @@ pub(super) fn share<V: Lanes>(rule: Rule, areas: &[V], alpha: V, own: V, alphas:
     }
     let (mut areas, mut pairs) = (areas.chunks_exact(2), alphas.chunks_exact_mut(2));
     for (o, a) in pairs.by_ref().zip(areas.by_ref()) {
-        // One division for two: it costs as much as an exponential.
+        // One division for two children: a division costs as much as an exponential.
         let (a, b) = (divisor(a[0], per_own), divisor(a[1], per_own));
         let both = factor / (a * b);
         (o[0], o[1]) = (opacity_of(rule, both * b * o[0]), opacity_of(rule, both * a * o[1]));
@@ -123,18 +122,18 @@ pub(super) fn share<V: Lanes>(rule: Rule, areas: &[V], alpha: V, own: V, alphas:
     }
 }
 
-/// Gradients of [`share`]: `logits` and `areas` are overwritten by theirs, those of
-/// alpha and of the own area are returned. `grads` comes in with those of the result
-/// and is used up.
+/// Computes the gradients of [`share`]: overwrites `logits` and `areas` by theirs, returns
+/// those of alpha and of the own area. `grads` holds those of the result on entry and is
+/// overwritten.
 #[inline(always)]
-pub(super) fn share_backward<V: Lanes>(
+pub(super) fn share_backward<V: Vector>(
     rule: Rule,
     (alpha, own): (V, V),
     grads: &mut [V],
     logits: &mut [V],
     areas: &mut [V],
 ) -> (V, V) {
-    let zero = alpha.of(0.0);
+    let zero = V::constant(0.0);
     match rule {
         Rule::None => {
             logits.fill(zero);
@@ -142,8 +141,8 @@ pub(super) fn share_backward<V: Lanes>(
             (grads.iter().fold(zero, |sum, &g| sum + g), zero)
         }
         Rule::Linear => {
-            let eps = alpha.of(AREA_EPS);
-            let inverse = alpha.of(1.0) / per_area(areas, logits);
+            let eps = V::constant(AREA_EPS);
+            let inverse = V::constant(1.0) / per_area(areas, logits);
             let weighted = logits.iter().zip(&*grads).fold(zero, |sum, (&w, &g)| w.fma(g, sum));
             let mean = weighted * inverse;
             let factor = alpha * inverse;
@@ -159,14 +158,14 @@ pub(super) fn share_backward<V: Lanes>(
 
 /// [`share_backward`] of the rules α_k = F(x_k), x_k = s·w_k / B_k, with s = τ(α) or α.
 #[inline(always)]
-fn weighted_backward<V: Lanes>(
+fn weighted_backward<V: Vector>(
     rule: Rule,
     (alpha, own): (V, V),
     grads: &mut [V],
     logits: &mut [V],
     areas: &mut [V],
 ) -> (V, V) {
-    let (zero, one) = (alpha.of(0.0), alpha.of(1.0));
+    let (zero, one) = (V::constant(0.0), V::constant(1.0));
     let inverse = exponentials(logits);
     let per_own = if rule.areas_are_relative() { one / own } else { one };
     let s = if rule == Rule::Area { alpha } else { optical_depth(alpha) };
@@ -180,7 +179,7 @@ fn weighted_backward<V: Lanes>(
         let share = *l * inverse_b;
         let x = s * share;
         let dx = match rule {
-            Rule::Area => V::select(x.lt(one.of(AREA_RULE_OPACITY_MAX)), *g, zero),
+            Rule::Area => x.lt(V::constant(AREA_RULE_OPACITY_MAX)).select_or_zero(*g),
             _ => *g * (-x).exp(),
         };
         by_s = dx.fma(share, by_s);
@@ -189,8 +188,8 @@ fn weighted_backward<V: Lanes>(
         let d_b = match rule {
             Rule::Transmittance => zero,
             _ => {
-                let free = one.of(RELATIVE_AREA_MIN).lt(*a * per_own);
-                V::select(free, -*g * inverse_b, zero)
+                let free = V::constant(RELATIVE_AREA_MIN).lt(*a * per_own);
+                free.select_or_zero(-*g * inverse_b)
             }
         };
         by_own = d_b.fma(*a, by_own);
@@ -203,8 +202,8 @@ fn weighted_backward<V: Lanes>(
     let d_alpha = match rule {
         Rule::Area => by_s,
         _ => {
-            let free = alpha.lt(one.of(OPACITY_CEILING));
-            by_s * V::select(free, one / (one - alpha), zero)
+            let free = alpha.lt(V::constant(OPACITY_CEILING));
+            by_s * free.select_or_zero(one / (one - alpha))
         }
     };
     (d_alpha, -by_own * per_own * per_own)
@@ -213,7 +212,7 @@ fn weighted_backward<V: Lanes>(
 /// Arguments of the whole rule, K = `k` children for each of P parents.
 #[derive(Clone, Copy, Debug)]
 pub struct Args<'a, T> {
-    /// How.
+    /// Rule of redistribution.
     pub rule: Rule,
     /// K, at least 1.
     pub k: usize,
@@ -223,12 +222,12 @@ pub struct Args<'a, T> {
     pub areas: &'a [T],
     /// α, `[P]`.
     pub alphas: &'a [T],
-    /// `[P]` for the rules whose areas are relative; else not read.
+    /// `[P]` for rules with relative areas; other rules do not read it.
     pub own: &'a [T],
 }
 
-impl<'a, T: LaneReal> Args<'a, T> {
-    /// Those of the parents from `first` on, at most `count`.
+impl<'a, T: Real> Args<'a, T> {
+    /// Returns the arguments of at most `count` parents from `first` on.
     fn parents(self, first: usize, count: usize) -> Self {
         let span = |s: &'a [T], per: usize| {
             &s[(first * per).min(s.len())..((first + count) * per).min(s.len())]
@@ -245,113 +244,112 @@ impl<'a, T: LaneReal> Args<'a, T> {
     }
 }
 
-/// K vectors of a group of parents, one per child: an array where K is that of a usual
-/// upscaling factor, so that loops over children unroll and stay in registers.
-trait Children<M: Machine>: AsMut<[M::V]> + AsRef<[M::V]> {
-    /// `count` rows of K numbers, one after the other; lanes above `count` repeat the
-    /// last row.
-    fn load(&mut self, m: M, rows: &[M::Scalar], count: usize);
-    /// The inverse of [`Children::load`].
-    fn store(&self, m: M, rows: &mut [M::Scalar], count: usize);
+/// K vectors of a group of parents, one per child. An array holds the K of a usual upscaling
+/// factor, so that loops over children unroll and stay in registers.
+trait Children<V: Vector>: AsMut<[V]> + AsRef<[V]> {
+    /// Loads `count` adjacent rows of K numbers; lanes past `count` repeat the last row.
+    fn load(&mut self, rows: &[V::Element], count: usize);
+    /// Stores rows, the inverse of [`Children::load`].
+    fn store(&self, rows: &mut [V::Element], count: usize);
 }
 
-impl<M: Machine, const K: usize> Children<M> for [M::V; K] {
+impl<V: Vector, const K: usize> Children<V> for [V; K] {
     #[inline(always)]
-    fn load(&mut self, m: M, rows: &[M::Scalar], count: usize) {
-        *self = m.load_rows(rows, (K, count));
+    fn load(&mut self, rows: &[V::Element], count: usize) {
+        *self = V::load_rows(rows, RowLayout { stride: K, count });
     }
     #[inline(always)]
-    fn store(&self, m: M, rows: &mut [M::Scalar], count: usize) {
-        m.store_rows(self, (K, count), rows);
+    fn store(&self, rows: &mut [V::Element], count: usize) {
+        V::store_rows(self, RowLayout { stride: K, count }, rows);
     }
 }
 
-impl<M: Machine> Children<M> for Vec<M::V> {
+impl<V: Vector> Children<V> for Vec<V> {
     #[inline(always)]
-    fn load(&mut self, m: M, rows: &[M::Scalar], count: usize) {
+    fn load(&mut self, rows: &[V::Element], count: usize) {
         let children = self.len();
         for (k, v) in self.iter_mut().enumerate() {
-            let [only] = m.load_rows(&rows[k..], (children, count));
+            let [only] = V::load_rows(&rows[k..], RowLayout { stride: children, count });
             *v = only;
         }
     }
     #[inline(always)]
-    fn store(&self, m: M, rows: &mut [M::Scalar], count: usize) {
+    fn store(&self, rows: &mut [V::Element], count: usize) {
         for (k, &v) in self.iter().enumerate() {
-            m.store_rows(&[v], (self.len(), count), &mut rows[k..]);
+            V::store_rows(&[v], RowLayout { stride: self.len(), count }, &mut rows[k..]);
         }
     }
 }
 
-/// One number per parent, `count` of them from `first` on; 1 where there is none.
+/// Loads one number per parent, `count` of them from `first` on; 1 if `from` is empty.
 #[inline(always)]
-fn single<M: Machine>(m: M, from: &[M::Scalar], (first, count): (usize, usize)) -> M::V {
+fn single<V: Vector>(from: &[V::Element], (first, count): (usize, usize)) -> V {
     match from.get(first..first + count) {
         Some(from) => {
-            let [only] = load_singles(m, from, count);
+            let [only] = load_singles(from, count);
             only
         }
-        None => m.of(1.0),
+        None => V::constant(1.0),
     }
 }
 
 #[inline(always)]
-fn load_singles<M: Machine>(m: M, from: &[M::Scalar], count: usize) -> [M::V; 1] {
-    if let Some(whole) = from.first_chunk::<WIDTH_MAX>()
-        && M::WIDTH == WIDTH_MAX
+fn load_singles<V: Vector>(from: &[V::Element], count: usize) -> [V; 1] {
+    if let Some(whole) = from.first_chunk::<LANES>()
+        && V::LANES == LANES
     {
-        return [m.load(whole)];
+        return [V::load(whole)];
     }
-    let mut lanes = [M::Scalar::of(1.0); WIDTH_MAX];
-    for (lane, out) in lanes[..M::WIDTH].iter_mut().enumerate() {
+    let mut lanes = [V::Element::constant(1.0); LANES];
+    for (lane, out) in lanes[..V::LANES].iter_mut().enumerate() {
         *out = from[lane.min(count - 1)];
     }
-    [m.load(&lanes)]
+    [V::load(&lanes)]
 }
 
-/// A block of parents forward.
+/// The forward pass of a block of parents.
 struct Forward<'a, T> {
     args: Args<'a, T>,
     out: &'a mut UninitSlice<T>,
 }
 
-impl<T: LaneReal> Forward<'_, T> {
+impl<T: Real> Forward<'_, T> {
     #[inline(always)]
-    fn of<M: Machine<Scalar = T>, C: Children<M>>(self, m: M, mut a: C, mut o: C) {
+    fn with_children<V: Vector<Element = T>, C: Children<V>>(self, mut a: C, mut o: C) {
         let Args { rule, k, logits, areas, alphas, own } = self.args;
-        for first in (0..alphas.len()).step_by(M::WIDTH) {
-            let count = M::WIDTH.min(alphas.len() - first);
+        for first in (0..alphas.len()).step_by(V::LANES) {
+            let count = V::LANES.min(alphas.len() - first);
             let (span, at) = ((first, count), first * k);
-            o.load(m, &logits[at..], count);
-            a.load(m, &areas[at..], count);
-            let (alpha, own) = (single(m, alphas, span), single(m, own, span));
+            o.load(&logits[at..], count);
+            a.load(&areas[at..], count);
+            let (alpha, own) = (single(alphas, span), single(own, span));
             share(rule, a.as_ref(), alpha, own, o.as_mut());
-            o.store(m, zeroed(&mut self.out[at..at + count * k]), count);
+            o.store(zeroed(&mut self.out[at..at + count * k]), count);
         }
     }
 }
 
-impl<T: LaneReal> Kernel<T> for Forward<'_, T> {
+impl<T: Real> VectorKernel<T> for Forward<'_, T> {
     type Output = ();
     #[inline(always)]
-    fn run<M: Machine<Scalar = T>>(self, m: M) {
-        let zero = m.of(0.0);
+    fn run<V: Vector<Element = T>>(self) {
+        let zero = V::constant(0.0);
         match self.args.k {
-            4 => self.of(m, [zero; 4], [zero; 4]),
-            9 => self.of(m, [zero; 9], [zero; 9]),
-            16 => self.of(m, [zero; 16], [zero; 16]),
-            k => self.of(m, vec![zero; k], vec![zero; k]),
+            4 => self.with_children::<V, _>([zero; 4], [zero; 4]),
+            9 => self.with_children::<V, _>([zero; 9], [zero; 9]),
+            16 => self.with_children::<V, _>([zero; 16], [zero; 16]),
+            k => self.with_children::<V, _>(vec![zero; k], vec![zero; k]),
         }
     }
 }
 
-/// Opacities `[P, K]` of the children (module doc).
-pub fn forward<T: LaneReal>(args: Args<T>) -> Vec<T> {
+/// Computes the opacities `[P, K]` of the children (module documentation).
+pub fn forward<T: Real>(args: Args<T>) -> Vec<T> {
     let mut out = UninitBuffer::new(args.alphas.len() * args.k);
     out.par_chunks_mut(args.k * BLOCK).enumerate().for_each(|(block, out)| {
         T::dispatch(Forward { args: args.parents(block * BLOCK, BLOCK), out });
     });
-    // SAFETY: the loop above started every block.
+    // SAFETY: the loop above initialised every block.
     unsafe { out.assume_init() }
 }
 
@@ -363,11 +361,11 @@ pub struct Gradients<T> {
     pub areas: Vec<T>,
     /// `[P]`.
     pub alphas: Vec<T>,
-    /// `[P]`; zeros for the rules that do not read it.
+    /// `[P]`; zeros for rules without relative areas.
     pub own: Vec<T>,
 }
 
-/// A block of parents backward; the slices are the block's own.
+/// The backward pass of a block of parents; the slices are the block's own.
 struct Backward<'a, T> {
     args: Args<'a, T>,
     grad: &'a [T],
@@ -377,46 +375,46 @@ struct Backward<'a, T> {
     own: &'a mut UninitSlice<T>,
 }
 
-impl<T: LaneReal> Backward<'_, T> {
+impl<T: Real> Backward<'_, T> {
     #[inline(always)]
-    fn of<M: Machine<Scalar = T>, C: Children<M>>(self, m: M, [mut l, mut a, mut g]: [C; 3]) {
+    fn with_children<V: Vector<Element = T>, C: Children<V>>(self, [mut l, mut a, mut g]: [C; 3]) {
         let Args { rule, k, logits, areas, alphas, own } = self.args;
-        for first in (0..alphas.len()).step_by(M::WIDTH) {
-            let count = M::WIDTH.min(alphas.len() - first);
+        for first in (0..alphas.len()).step_by(V::LANES) {
+            let count = V::LANES.min(alphas.len() - first);
             let (span, at) = ((first, count), first * k);
-            l.load(m, &logits[at..], count);
-            a.load(m, &areas[at..], count);
-            g.load(m, &self.grad[at..], count);
-            let per_parent = (single(m, alphas, span), single(m, own, span));
+            l.load(&logits[at..], count);
+            a.load(&areas[at..], count);
+            g.load(&self.grad[at..], count);
+            let per_parent = (single(alphas, span), single(own, span));
             let (d_alpha, d_own) =
                 share_backward(rule, per_parent, g.as_mut(), l.as_mut(), a.as_mut());
-            l.store(m, zeroed(&mut self.logits[at..at + count * k]), count);
-            a.store(m, zeroed(&mut self.areas[at..at + count * k]), count);
+            l.store(zeroed(&mut self.logits[at..at + count * k]), count);
+            a.store(zeroed(&mut self.areas[at..at + count * k]), count);
             for (v, out) in [(d_alpha, &mut *self.alphas), (d_own, &mut *self.own)] {
-                let mut lanes = [T::default(); WIDTH_MAX];
-                m.store(v, &mut lanes);
+                let mut lanes = [T::default(); LANES];
+                v.store(&mut lanes);
                 zeroed(&mut out[first..first + count]).copy_from_slice(&lanes[..count]);
             }
         }
     }
 }
 
-impl<T: LaneReal> Kernel<T> for Backward<'_, T> {
+impl<T: Real> VectorKernel<T> for Backward<'_, T> {
     type Output = ();
     #[inline(always)]
-    fn run<M: Machine<Scalar = T>>(self, m: M) {
-        let zero = m.of(0.0);
+    fn run<V: Vector<Element = T>>(self) {
+        let zero = V::constant(0.0);
         match self.args.k {
-            4 => self.of(m, [[zero; 4]; 3]),
-            9 => self.of(m, [[zero; 9]; 3]),
-            16 => self.of(m, [[zero; 16]; 3]),
-            k => self.of(m, [vec![zero; k], vec![zero; k], vec![zero; k]]),
+            4 => self.with_children::<V, _>([[zero; 4]; 3]),
+            9 => self.with_children::<V, _>([[zero; 9]; 3]),
+            16 => self.with_children::<V, _>([[zero; 16]; 3]),
+            k => self.with_children::<V, _>([vec![zero; k], vec![zero; k], vec![zero; k]]),
         }
     }
 }
 
-/// Gradients of [`forward`] for the gradient `grad` `[P, K]` of its result.
-pub fn backward<T: LaneReal>(args: Args<T>, grad: &[T]) -> Gradients<T> {
+/// Computes the gradients of [`forward`] from the gradient `grad` `[P, K]` of its result.
+pub fn backward<T: Real>(args: Args<T>, grad: &[T]) -> Gradients<T> {
     let (p, k) = (args.alphas.len(), args.k);
     let (mut logits, mut areas) = (UninitBuffer::new(p * k), UninitBuffer::new(p * k));
     let (mut alphas, mut own) = (UninitBuffer::new(p), UninitBuffer::new(p));
@@ -435,7 +433,7 @@ pub fn backward<T: LaneReal>(args: Args<T>, grad: &[T]) -> Gradients<T> {
         .zip(alphas.par_chunks_mut(BLOCK).zip(own.par_chunks_mut(BLOCK)))
         .enumerate()
         .for_each(|(block, own)| one(block, own));
-    // SAFETY: the loop above started every block: all four have as many.
+    // SAFETY: the loop above initialised every block: all four have as many.
     unsafe {
         Gradients {
             logits: logits.assume_init(),

@@ -3,7 +3,7 @@
 
 use super::activation::{self, Activation};
 use super::join::repeat;
-use super::math::vectorised;
+use super::simd::vectorize;
 use super::uninit::{UninitBuffer, zeroed};
 use rayon::prelude::*;
 
@@ -43,8 +43,8 @@ impl Bilinear {
         Self { rows: taps(h, to_h), cols: taps(w, to_w), from: r.from, to: r.to }
     }
 
-    /// `[h, w]` to `[H, W]`: the few input rows are widened first, so that all the work
-    /// per output pixel is on whole rows. `wide` is working memory.
+    /// Resizes `[h, w]` to `[H, W]`. The first pass widens the few input rows, so that the
+    /// second one works on whole rows. `wide` is working memory.
     pub(crate) fn plane(&self, x: &[f32], y: &mut [f32], wide: &mut Vec<f32>) {
         let (w, to_w) = (self.from[1], self.to[1]);
         wide.resize(self.from[0] * to_w, 0.0);
@@ -53,7 +53,7 @@ impl Bilinear {
                 *o = (1.0 - f) * x[left] + f * x[right];
             }
         }
-        vectorised(
+        vectorize(
             #[inline(always)]
             || {
                 for (y, &(top, bottom, f)) in y.chunks_exact_mut(to_w).zip(&self.rows) {
@@ -71,7 +71,7 @@ impl Bilinear {
         let (w, to_w) = (self.from[1], self.to[1]);
         wide.clear();
         wide.resize(self.from[0] * to_w, 0.0);
-        vectorised(
+        vectorize(
             #[inline(always)]
             || {
                 for (dy, &(top, bottom, f)) in dy.chunks_exact(to_w).zip(&self.rows) {
@@ -102,15 +102,15 @@ pub fn bilinear_then(r: &Resize, kind: Activation, x: &[f32]) -> Vec<f32> {
 fn planes(r: &Resize, x: &[f32], f: impl Fn(&mut [f32]) + Sync) -> Vec<f32> {
     let one = Bilinear::new(r);
     let (from, to) = (r.from[0] * r.from[1], r.to[0] * r.to[1]);
-    let mut fresh = UninitBuffer::new(x.len() / from * to);
-    let planes = x.par_chunks_exact(from).zip(fresh.par_chunks_mut(to));
+    let mut buffer = UninitBuffer::new(x.len() / from * to);
+    let planes = x.par_chunks_exact(from).zip(buffer.par_chunks_mut(to));
     planes.for_each_init(Vec::new, |wide, (x, y)| {
         let y = zeroed(y);
         one.plane(x, y, wide);
         f(y);
     });
-    // SAFETY: the loop above started every block: there is one for each plane of `x`.
-    unsafe { fresh.assume_init() }
+    // SAFETY: the loop above initialised every block: there is one for each plane of `x`.
+    unsafe { buffer.assume_init() }
 }
 
 /// The gradient of [`bilinear_then`], `dx` overwritten.
@@ -145,12 +145,12 @@ pub fn bilinear_transposed(r: &Resize, dy: &[f32], dx: &mut [f32]) {
 /// Every pixel repeated `s` × `s` times, new memory; `to` = `s`·`from`.
 pub fn nearest(r: &Resize, s: usize, x: &[f32]) -> Vec<f32> {
     let ([h, w], [to_h, to_w]) = (r.from, r.to);
-    let mut fresh = UninitBuffer::new(x.len() / (h * w) * to_h * to_w);
-    let planes = x.par_chunks_exact(h * w).zip(fresh.par_chunks_mut(to_h * to_w));
+    let mut buffer = UninitBuffer::new(x.len() / (h * w) * to_h * to_w);
+    let planes = x.par_chunks_exact(h * w).zip(buffer.par_chunks_mut(to_h * to_w));
     planes.for_each(|(x, y)| repeat(x, to_w, s, y));
     // SAFETY: the loop above wrote every block: there is one for each plane of `x`, and
     // `repeat` panics where it does not write all of one.
-    unsafe { fresh.assume_init() }
+    unsafe { buffer.assume_init() }
 }
 
 /// The transpose of [`nearest`]: sums of `s` × `s` blocks, `dx` overwritten.

@@ -1,14 +1,13 @@
 //! Colour of a splat seen from one direction: Σ_k sh_k·Y_k(d) in `f32`.
 //!
-//! The functions are those of [`crate::sh`], whose `f64` text is the reference
-//! (a unit test holds the two together). In: a unit direction in world frame and
-//! coefficients `[D, 3]`, RGB innermost. Out: RGB before gain, offset and clamp.
+//! The functions are those of [`crate::sh`], whose `f64` code is the reference (a unit test
+//! compares the two). Input: a unit direction in world frame and coefficients `[D, 3]`, RGB
+//! innermost. Output: RGB before gain, offset and clamp.
 
 use crate::abi::{SH_COEFFICIENTS_MAX, ShBasis, sh_coefficients};
 use crate::cpu::simd::{LANES, Mask, Simd, Vector};
-use std::ops::{Add, Mul, Sub};
 
-/// Highest degree that `basis` evaluates.
+/// Returns the highest degree that `basis` evaluates.
 pub fn degree_max(basis: ShBasis) -> usize {
     match basis {
         ShBasis::Standard => 4,
@@ -16,113 +15,76 @@ pub fn degree_max(basis: ShBasis) -> usize {
     }
 }
 
-/// Basis functions of `basis` up to `degree` at the unit vector `d`; the rest is 0.
-pub fn basis(basis: ShBasis, degree: usize, d: [f32; 3]) -> [f32; SH_COEFFICIENTS_MAX] {
-    functions(One, basis, degree, d)
-}
-
-/// One text for one direction and for lanes of them.
+/// Evaluates the functions of `basis` up to `degree` at the unit vectors `d`; the rest is 0.
 #[inline(always)]
-fn functions<T: Number, K: Constants<T>>(
-    k: K,
-    basis: ShBasis,
-    degree: usize,
-    d: [T; 3],
-) -> [T; SH_COEFFICIENTS_MAX] {
+pub fn basis<V: Vector>(basis: ShBasis, degree: usize, d: [V; 3]) -> [V; SH_COEFFICIENTS_MAX] {
     let [x, y, z] = d;
     match basis {
-        ShBasis::Standard => standard(k, degree, d),
+        ShBasis::Standard => standard(degree, d),
         ShBasis::Mvsplat => {
             let degree = degree.min(degree_max(ShBasis::Mvsplat));
-            let mut out = standard(k, degree, [z, x, y]);
+            let mut out = standard(degree, [z, x, y]);
             if degree == 3 {
-                out[14] = k.of(1.445_305_7) * z * (z * z - x * x);
+                out[14] = V::constant(1.445_305_7) * z * (z * z - x * x);
             }
             out
         }
     }
 }
 
-/// What [`functions`] needs of its numbers.
-trait Number: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> {}
-impl<T: Copy + Add<Output = T> + Sub<Output = T> + Mul<Output = T>> Number for T {}
-
-/// What makes constants among them.
-trait Constants<T>: Copy {
-    fn of(self, v: f32) -> T;
-}
-
-#[derive(Clone, Copy)]
-struct One;
-
-impl Constants<f32> for One {
-    #[inline(always)]
-    fn of(self, v: f32) -> f32 {
-        v
-    }
-}
-
-#[derive(Clone, Copy)]
-struct Sixteen<S>(S);
-
-impl<S: Simd> Constants<S::F> for Sixteen<S> {
-    #[inline(always)]
-    fn of(self, v: f32) -> S::F {
-        self.0.splat(v)
-    }
-}
-
+/// Real SH with the Condon-Shortley sign (3DGS) up to `degree`.
 #[inline(always)]
-fn standard<T: Number, K: Constants<T>>(
-    k: K,
-    degree: usize,
-    [x, y, z]: [T; 3],
-) -> [T; SH_COEFFICIENTS_MAX] {
-    let mut b = [k.of(0.0); SH_COEFFICIENTS_MAX];
-    b[0] = k.of(0.282_094_8);
+fn standard<V: Vector>(degree: usize, [x, y, z]: [V; 3]) -> [V; SH_COEFFICIENTS_MAX] {
+    let c = V::constant;
+    let mut b = [c(0.0); SH_COEFFICIENTS_MAX];
+    b[0] = c(0.282_094_8);
     if degree == 0 {
         return b;
     }
-    b[1] = k.of(-0.488_602_52) * y;
-    b[2] = k.of(0.488_602_52) * z;
-    b[3] = k.of(-0.488_602_52) * x;
+    b[1] = c(-0.488_602_52) * y;
+    b[2] = c(0.488_602_52) * z;
+    b[3] = c(-0.488_602_52) * x;
     if degree == 1 {
         return b;
     }
     let (xx, yy, zz) = (x * x, y * y, z * z);
     let (xy, yz, xz) = (x * y, y * z, x * z);
-    b[4] = k.of(1.092_548_5) * xy;
-    b[5] = k.of(-1.092_548_5) * yz;
-    b[6] = k.of(0.315_391_57) * (k.of(2.0) * zz - xx - yy);
-    b[7] = k.of(-1.092_548_5) * xz;
-    b[8] = k.of(0.546_274_24) * (xx - yy);
+    let (difference, two, three) = (xx - yy, c(2.0), c(3.0));
+    b[4] = c(1.092_548_5) * xy;
+    b[5] = c(-1.092_548_5) * yz;
+    b[6] = c(0.315_391_57) * (two * zz - xx - yy);
+    b[7] = c(-1.092_548_5) * xz;
+    b[8] = c(0.546_274_24) * difference;
     if degree == 2 {
         return b;
     }
-    b[9] = k.of(-0.590_043_6) * y * (k.of(3.0) * xx - yy);
-    b[10] = k.of(2.890_611_4) * xy * z;
-    b[11] = k.of(-0.457_045_8) * y * (k.of(4.0) * zz - xx - yy);
-    b[12] = k.of(0.373_176_34) * z * (k.of(2.0) * zz - k.of(3.0) * xx - k.of(3.0) * yy);
-    b[13] = k.of(-0.457_045_8) * x * (k.of(4.0) * zz - xx - yy);
-    b[14] = k.of(1.445_305_7) * z * (xx - yy);
-    b[15] = k.of(-0.590_043_6) * x * (xx - k.of(3.0) * yy);
+    let (left, right) = (three * xx - yy, xx - three * yy);
+    let rest = c(4.0) * zz - xx - yy;
+    b[9] = c(-0.590_043_6) * y * left;
+    b[10] = c(2.890_611_4) * xy * z;
+    b[11] = c(-0.457_045_8) * y * rest;
+    b[12] = c(0.373_176_34) * z * (two * zz - three * xx - three * yy);
+    b[13] = c(-0.457_045_8) * x * rest;
+    b[14] = c(1.445_305_7) * z * difference;
+    b[15] = c(-0.590_043_6) * x * right;
     if degree == 3 {
         return b;
     }
-    b[16] = k.of(2.503_343) * xy * (xx - yy);
-    b[17] = k.of(-1.770_130_8) * yz * (k.of(3.0) * xx - yy);
-    b[18] = k.of(0.946_174_7) * xy * (k.of(7.0) * zz - k.of(1.0));
-    b[19] = k.of(-0.669_046_5) * yz * (k.of(7.0) * zz - k.of(3.0));
-    b[20] = k.of(0.105_785_55) * (zz * (k.of(35.0) * zz - k.of(30.0)) + k.of(3.0));
-    b[21] = k.of(-0.669_046_5) * xz * (k.of(7.0) * zz - k.of(3.0));
-    b[22] = k.of(0.473_087_34) * (xx - yy) * (k.of(7.0) * zz - k.of(1.0));
-    b[23] = k.of(-1.770_130_8) * xz * (xx - k.of(3.0) * yy);
-    b[24] = k.of(0.625_835_7) * (xx * (xx - k.of(3.0) * yy) - yy * (k.of(3.0) * xx - yy));
+    let seven = c(7.0) * zz;
+    b[16] = c(2.503_343) * xy * difference;
+    b[17] = c(-1.770_130_8) * yz * left;
+    b[18] = c(0.946_174_7) * xy * (seven - c(1.0));
+    b[19] = c(-0.669_046_5) * yz * (seven - three);
+    b[20] = c(0.105_785_55) * (zz * (c(35.0) * zz - c(30.0)) + three);
+    b[21] = c(-0.669_046_5) * xz * (seven - three);
+    b[22] = c(0.473_087_34) * difference * (seven - c(1.0));
+    b[23] = c(-1.770_130_8) * xz * right;
+    b[24] = c(0.625_835_7) * (xx * right - yy * left);
     b
 }
 
-/// Σ_k sh_k·Y_k(d) per colour channel. `sh` is one set `[D, 3]`; coefficients
-/// above `degree`, or above what it holds, count as 0.
+/// Computes Σ_k sh_k·Y_k(d) per colour channel. `sh` is one set `[D, 3]`; coefficients above
+/// `degree`, or past the end of `sh`, count as 0.
 pub fn radiance(kind: ShBasis, degree: usize, d: [f32; 3], sh: &[f32]) -> [f32; 3] {
     let b = basis(kind, degree, d);
     let used = sh_coefficients(degree.min(degree_max(kind)));
@@ -135,8 +97,8 @@ pub fn radiance(kind: ShBasis, degree: usize, d: [f32; 3], sh: &[f32]) -> [f32; 
     rgb
 }
 
-/// [`radiance`] of sixteen sets along sixteen unit vectors: set l starts at `at[l]`
-/// of `sh`, and holds at least the coefficients of `degree`.
+/// Computes [`radiance`] of sixteen sets along sixteen unit vectors. Set l starts at `at[l]`
+/// of `sh` and holds at least the coefficients of `degree`.
 #[inline(always)]
 pub(crate) fn radiance_lanes<S: Simd>(
     s: S,
@@ -147,9 +109,9 @@ pub(crate) fn radiance_lanes<S: Simd>(
 ) -> [S::F; 3] {
     let degree = degree.min(degree_max(kind));
     let used = sh_coefficients(degree);
-    let b = functions(Sixteen(s), kind, degree, d);
+    let b = basis(kind, degree, d);
     let mut rgb = [s.splat(0.0); 3];
-    // Four coefficients are twelve floats, three transposed quads.
+    // Four coefficients are twelve floats: three gathers of four.
     let mut c = 0;
     while c + 4 <= used {
         let [r0, g0, b0, r1] = s.gather4(sh, at, 3 * c);
@@ -161,7 +123,7 @@ pub(crate) fn radiance_lanes<S: Simd>(
         rgb[2] = b3.fma(y3, b2.fma(y2, b1.fma(y1, b0.fma(y0, rgb[2]))));
         c += 4;
     }
-    // (degree + 1)² leaves one or none.
+    // (degree + 1)² modulo 4 is 0 or 1.
     if c < used {
         let mut last = [[0.0; LANES]; 3];
         for (l, &at) in at.iter().enumerate() {
@@ -177,7 +139,7 @@ pub(crate) fn radiance_lanes<S: Simd>(
     rgb
 }
 
-/// [`direction`] of sixteen vectors.
+/// Computes [`direction`] of sixteen vectors.
 #[inline(always)]
 pub(crate) fn direction_lanes<S: Simd>(s: S, v: [S::F; 3]) -> [S::F; 3] {
     let norm = v[0].fma(v[0], v[1].fma(v[1], v[2] * v[2])).sqrt();
@@ -190,7 +152,7 @@ pub(crate) fn direction_lanes<S: Simd>(s: S, v: [S::F; 3]) -> [S::F; 3] {
     ]
 }
 
-/// `v` / ‖v‖, or the zero vector where that has no direction.
+/// Returns `v` / ‖v‖, or the zero vector if `v` has no direction.
 pub fn direction(v: [f32; 3]) -> [f32; 3] {
     let norm = (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
     if norm > 0.0 && norm.is_finite() { v.map(|x| x / norm) } else { [0.0; 3] }
@@ -271,8 +233,8 @@ mod tests {
         }
     }
 
-    /// Sixteen at a time give what one at a time does, in every level, for sets of
-    /// any degree stored and evaluated, the last set of the slice included.
+    /// Sixteen at a time equal one at a time at every level, for sets of any degree stored
+    /// and evaluated, the last set of the slice included.
     #[test]
     fn lanes_are_the_single_one() {
         let vectors: [[f32; 3]; LANES] = std::array::from_fn(|l| match l {

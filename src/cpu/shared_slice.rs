@@ -1,17 +1,17 @@
-//! A slice that many threads write at once, each at places of its own.
+//! A mutable slice that threads share, each writing places of its own.
 
 use std::marker::PhantomData;
 use std::ops::Range;
 
-/// A borrowed slice without the borrow checker's watch over who writes where.
+/// A borrowed slice whose callers guarantee that no two threads write one place.
 pub(crate) struct SharedSliceMut<'a, T> {
     start: *mut T,
     len: usize,
     slice: PhantomData<&'a mut [T]>,
 }
 
-// SAFETY: a thread that holds it can do no more than with a part of the `&mut [T]` it
-// was made of; who takes which part is the callers' promise in the methods below.
+// SAFETY: a thread can use it as a part of the `&mut [T]` that it borrows; the callers of the
+// methods below guarantee that the parts are disjoint.
 unsafe impl<T: Send> Sync for SharedSliceMut<'_, T> {}
 // SAFETY: as above.
 unsafe impl<T: Send> Send for SharedSliceMut<'_, T> {}
@@ -22,34 +22,34 @@ impl<'a, T> SharedSliceMut<'a, T> {
         Self { start: slice.as_mut_ptr(), len: slice.len(), slice: PhantomData }
     }
 
-    /// Where place `i` is, for a prefetch or a kernel.
+    /// Returns the address of place `i`, for a prefetch or a kernel.
     #[inline(always)]
     pub(crate) fn address(&self, i: usize) -> *const T {
         self.start.wrapping_add(i)
     }
 
-    /// Writes `v` at place `i`; nothing where that lies outside.
+    /// Writes `v` at place `i`; does nothing if that lies outside.
     ///
     /// # Safety
     /// No other thread reads or writes place `i` at the same time.
     #[inline(always)]
     pub(crate) unsafe fn write(&self, i: usize, v: T) {
         if i < self.len {
-            // SAFETY: inside the slice, and this thread's alone (the caller's promise).
+            // SAFETY: inside the slice, and this thread's alone (the caller guarantees it).
             unsafe { self.start.add(i).write(v) }
         }
     }
 
-    /// The places of `range` (fewer where it reaches outside).
+    /// Borrows the places of `range`, clipped to the slice.
     ///
     /// # Safety
     /// No other reference to any of these places is used while this one lives.
     #[inline(always)]
-    #[expect(clippy::mut_from_ref, reason = "that is what this type is for")]
+    #[expect(clippy::mut_from_ref, reason = "the purpose of this type")]
     pub(crate) unsafe fn part(&self, range: Range<usize>) -> &mut [T] {
         let past = range.end.min(self.len);
         let first = range.start.min(past);
-        // SAFETY: inside the slice, and not aliased (the caller's promise).
+        // SAFETY: inside the slice, and not aliased (the caller guarantees it).
         unsafe { std::slice::from_raw_parts_mut(self.start.add(first), past - first) }
     }
 }

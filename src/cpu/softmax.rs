@@ -1,31 +1,32 @@
 //! Softmax over rows, with its gradient.
 //! Oracle: the definition in f64 (`model::layers`' tests).
 
-use super::math::vectorised;
-use super::simd::{Kernel, LANES, Mask, Simd, SimdLevel, Vector, exp2_by_sums, first_lanes_bits};
+use super::simd::elementary::exp2_by_sums;
+use super::simd::vectorize;
+use super::simd::{Kernel, LANES, Mask, Simd, SimdLevel, Vector, first_lanes_bits};
 use super::uninit::{UninitBuffer, UninitSlice};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
 /// Elements per task.
 const CHUNK: usize = 16_384;
-/// Numbers whose exponentials are one sum in single precision, and of a pass.
+/// Exponentials that one single-precision sum adds, and numbers of a pass.
 const SUM: usize = 4096;
 
-/// A row to e^{x − max}; returns the sum. To be called inside a kernel.
+/// Replaces a row by e^{x − max} and returns the sum. Call it inside a kernel.
 #[inline(always)]
 pub(super) fn exp_row<S: Simd>(s: S, row: &mut [f32]) -> f32 {
     let mut tops = [s.splat(f32::NEG_INFINITY); LANES];
     tops[0] = largest(s, row);
     let mut most = [0.0; LANES];
     s.store(across(s, tops), &mut most);
-    // SAFETY: a number is a place; numbers are written to each.
+    // SAFETY: `exps` writes numbers to these places.
     let places = unsafe { super::uninit::as_uninit(row) }.as_mut_ptr();
-    // SAFETY: the row, read from where it is written.
+    // SAFETY: source and destination are the same row.
     unsafe { exps(s, places.cast(), places, row.len(), most[0]) }
 }
 
-/// Lane by lane the largest number of a row, −∞ where a lane has none; NaN are passed over.
+/// Computes the maximum of a row lane by lane, −∞ in lanes without a number; ignores NaN.
 #[inline(always)]
 fn largest<S: Simd>(s: S, row: &[f32]) -> S::F {
     let mut tops = [s.splat(f32::NEG_INFINITY); 4];
@@ -41,7 +42,7 @@ fn largest<S: Simd>(s: S, row: &[f32]) -> S::F {
     }
     if !tail.is_empty() {
         let bits = first_lanes_bits(tail.len());
-        // SAFETY: as many are there.
+        // SAFETY: `bits` selects the floats of `tail`.
         let v = unsafe { s.load_masked(tail.as_ptr(), bits) };
         let v = s.mask_from_bits(u32::from(bits)).select(v, tops[1]);
         tops[1] = tops[1].max(v);
@@ -49,7 +50,7 @@ fn largest<S: Simd>(s: S, row: &[f32]) -> S::F {
     tops[3].max(tops[2]).max(tops[1].max(tops[0]))
 }
 
-/// The largest lane of each vector.
+/// Computes the maximum lane of each vector.
 #[inline(always)]
 fn across<S: Simd>(s: S, v: [S::F; LANES]) -> S::F {
     let mut v = s.transpose(v);
@@ -61,15 +62,16 @@ fn across<S: Simd>(s: S, v: [S::F; LANES]) -> S::F {
     v[0]
 }
 
-/// e^d for d ≤ 0 or NaN, to 1e-6 where the result is above 1e-5; 0 below 2⁻¹²⁵, so that
-/// no denormals arise.
+/// e^d for d ≤ 0 or NaN, to 1e-6 where the result is above 1e-5; 0 below 2⁻¹²⁵, so that no
+/// denormal arises. One product replaces the two-part range reduction of
+/// [`super::simd::elementary::exp`]: weights of attention do not need its last bits.
 #[inline(always)]
 fn exp_negative<S: Simd>(s: S, d: S::F) -> S::F {
     let p = d * s.splat(std::f32::consts::LOG2_E);
-    p.lt(s.splat(-125.0)).select(s.splat(0.0), exp2_by_sums(s, p))
+    p.lt(s.splat(-125.0)).select(s.splat(0.0), exp2_by_sums(p))
 }
 
-/// e^{x − max} of `n` numbers at `x` to `y`; returns the sum.
+/// Writes e^{x − max} of `n` numbers at `x` to `y` and returns the sum.
 ///
 /// # Safety
 /// As of [`exp_part`].
@@ -77,17 +79,17 @@ fn exp_negative<S: Simd>(s: S, d: S::F) -> S::F {
 unsafe fn exps<S: Simd>(s: S, x: *const f32, y: *mut MaybeUninit<f32>, n: usize, max: f32) -> f32 {
     let (max, mut total) = (s.splat(max), 0.0);
     for at in (0..n).step_by(SUM) {
-        // SAFETY: a part of both.
+        // SAFETY: a part of both ranges.
         let sum = unsafe { exp_part(s, x.add(at), y.add(at), SUM.min(n - at), max) };
         total += f64::from(s.sum(sum));
     }
     total as f32
 }
 
-/// e^{x − max} of `n` numbers at `x` to `y`; returns sums by lanes.
+/// Writes e^{x − max} of `n` numbers at `x` to `y` and returns sums by lanes.
 ///
 /// # Safety
-/// `x` points to n numbers, `y` to as many places: the same ones, or none of them.
+/// `x` points to n numbers, `y` to as many places; the ranges are equal or disjoint.
 #[inline(always)]
 unsafe fn exp_part<S: Simd>(
     s: S,
@@ -98,7 +100,7 @@ unsafe fn exp_part<S: Simd>(
 ) -> S::F {
     let (mut sum, whole) = (s.splat(0.0), n / LANES * LANES);
     for at in (0..whole).step_by(LANES) {
-        // SAFETY: 16 places inside both.
+        // SAFETY: 16 places inside both ranges.
         unsafe {
             let e = exp_negative(s, s.load(&*x.add(at).cast()) - max);
             sum = sum + e;
@@ -107,7 +109,7 @@ unsafe fn exp_part<S: Simd>(
     }
     if whole < n {
         let bits = first_lanes_bits(n - whole);
-        // SAFETY: the rest of both.
+        // SAFETY: the rest of both ranges.
         unsafe {
             let e = exp_negative(s, s.load_masked(x.add(whole), bits) - max);
             let e = s.mask_from_bits(u32::from(bits)).select_or_zero(e);
@@ -118,7 +120,7 @@ unsafe fn exp_part<S: Simd>(
     sum
 }
 
-/// `row` times `by`.
+/// Multiplies `row` by `by`.
 #[inline(always)]
 fn times<S: Simd>(s: S, row: &mut [f32], by: f32) {
     let (vectors, rest) = row.as_chunks_mut();
@@ -132,15 +134,15 @@ fn times<S: Simd>(s: S, row: &mut [f32], by: f32) {
     );
 }
 
-/// Softmax of every row of `x` `[rows, n]`, new memory.
+/// Computes the softmax of every row of `x` `[rows, n]` into new memory.
 pub fn softmax(n: usize, x: &[f32]) -> Vec<f32> {
     let chunk = CHUNK.div_ceil(n.max(1)) * n.max(1);
-    let mut fresh = UninitBuffer::new(x.len());
-    fresh.par_chunks_mut(chunk).zip(x.par_chunks(chunk)).for_each(|(y, x)| {
+    let mut buffer = UninitBuffer::new(x.len());
+    buffer.par_chunks_mut(chunk).zip(x.par_chunks(chunk)).for_each(|(y, x)| {
         SimdLevel::best().run(Softmax { n, x, y });
     });
     // SAFETY: the loop above wrote every block.
-    unsafe { fresh.assume_init() }
+    unsafe { buffer.assume_init() }
 }
 
 struct Softmax<'a> {
@@ -156,8 +158,8 @@ impl Kernel for Softmax<'_> {
     fn run<S: Simd>(self, s: S) {
         let Self { n, x, y } = self;
         assert_eq!(x.len(), y.len(), "softmax: lengths");
-        // Pass by pass over some rows, which stay in the first-level cache: within one
-        // each step waits for the last.
+        // Each pass covers several rows, which stay in the first-level cache: the steps of
+        // one row depend on one another.
         let few = (SUM / n).clamp(1, LANES) * n;
         for (x, y) in x.chunks(few).zip(y.chunks_mut(few)) {
             let mut tops = [s.splat(0.0); LANES];
@@ -171,7 +173,7 @@ impl Kernel for Softmax<'_> {
                 let mut sums = [s.splat(1.0); LANES];
                 for ((x, y), (sum, max)) in rows.zip(sums.iter_mut().zip(kept)) {
                     let max = s.splat(max);
-                    // SAFETY: n numbers and n places apart from them.
+                    // SAFETY: n numbers and n places in disjoint slices.
                     *sum = unsafe { exp_part(s, x.as_ptr(), y.as_mut_ptr(), n, max) };
                 }
                 kept = s.sums(sums);
@@ -184,24 +186,24 @@ impl Kernel for Softmax<'_> {
             let mut inverses = [0.0; LANES];
             s.store(s.splat(1.0) / s.load(&kept), &mut inverses);
             for (y, inverse) in y.chunks_exact_mut(n).zip(inverses) {
-                // SAFETY: written by the loops above.
+                // SAFETY: the loops above wrote it.
                 times(s, unsafe { &mut *(y as *mut UninitSlice<f32> as *mut [f32]) }, inverse);
             }
         }
     }
 }
 
-/// dx = y·(dy − Σ y·dy) row by row, y the softmax.
+/// Computes dx = y·(dy − Σ y·dy) row by row; y is the softmax.
 pub fn backward(n: usize, y: &[f32], dy: &[f32], dx: &mut [f32]) {
     let chunk = CHUNK.div_ceil(n.max(1)) * n.max(1);
     let rows = y.par_chunks(chunk).zip(dy.par_chunks(chunk));
     rows.zip(dx.par_chunks_mut(chunk)).for_each(|((y, dy), dx)| {
-        vectorised(
+        vectorize(
             #[inline(always)]
             || {
                 let pairs = y.chunks_exact(n).zip(dy.chunks_exact(n));
                 for ((y, dy), dx) in pairs.zip(dx.chunks_exact_mut(n)) {
-                    let mean = super::math::dot(y, dy);
+                    let mean = super::sums::dot(y, dy);
                     for ((dx, y), dy) in dx.iter_mut().zip(y).zip(dy) {
                         *dx = y * (dy - mean);
                     }

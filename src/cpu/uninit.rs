@@ -1,24 +1,24 @@
-//! Large results without a pass of zeros by one thread before the kernel's own.
+//! Output buffers that threads write for the first time: no pass of zeros by one thread.
 
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
-/// `n` numbers that are yet to be written.
+/// A buffer of `n` uninitialised numbers.
 pub(crate) struct UninitBuffer<T> {
     data: Vec<T>,
     n: usize,
 }
 
-/// A part of a [`UninitBuffer`].
+/// A part of an [`UninitBuffer`].
 pub(crate) type UninitSlice<T> = [MaybeUninit<T>];
 
 impl<T: Copy + Default + Send> UninitBuffer<T> {
-    /// Room for `n`.
+    /// Allocates memory for `n` numbers.
     pub(crate) fn new(n: usize) -> Self {
         Self { data: Vec::with_capacity(n), n }
     }
 
-    /// Blocks of `size` ≥ 1, the last one maybe shorter.
+    /// Iterates over blocks of `size` ≥ 1 in parallel; the last may be shorter.
     pub(crate) fn par_chunks_mut(
         &mut self,
         size: usize,
@@ -26,64 +26,64 @@ impl<T: Copy + Default + Send> UninitBuffer<T> {
         self.as_mut_slice().par_chunks_mut(size)
     }
 
-    /// All places at once.
+    /// Borrows all places.
     pub(crate) fn as_mut_slice(&mut self) -> &mut UninitSlice<T> {
         let room = self.data.spare_capacity_mut();
         let n = self.n.min(room.len());
         &mut room[..n]
     }
 
-    /// All of it.
+    /// Returns the buffer as initialised.
     ///
     /// # Safety
-    /// Every place was written.
+    /// The caller has written every place.
     pub(crate) unsafe fn assume_init(mut self) -> Vec<T> {
-        // SAFETY: within the capacity, and written (the caller's promise).
+        // SAFETY: within the capacity, and written (the caller guarantees it).
         unsafe { self.data.set_len(self.n) };
         self.data
     }
 }
 
-/// A block filled with zeros, while it lies in the cache of the thread that goes on
-/// with it. First writes, and so page faults, fall on all threads.
+/// Fills a block with zeros and returns it as initialised. The calling thread takes the page
+/// faults and then has the block in its cache.
 #[inline]
 pub(crate) fn zeroed<T: Copy + Default>(block: &mut UninitSlice<T>) -> &mut [T] {
     block.fill(MaybeUninit::new(T::default()));
-    // SAFETY: every place was just written.
+    // SAFETY: the line above wrote every place.
     unsafe { &mut *(block as *mut UninitSlice<T> as *mut [T]) }
 }
 
-/// A block with the numbers of `from`, which is as long.
+/// Copies `from` to a block of equal length and returns it as initialised.
 ///
 /// # Panics
-/// Where it is not.
+/// If the lengths differ.
 #[inline]
 pub(crate) fn filled<'a, T: Copy>(block: &'a mut UninitSlice<T>, from: &[T]) -> &'a mut [T] {
-    assert_eq!(block.len(), from.len(), "fresh block: lengths");
+    assert_eq!(block.len(), from.len(), "uninitialised slice: lengths");
     for (to, from) in block.iter_mut().zip(from) {
         *to = MaybeUninit::new(*from);
     }
-    // SAFETY: every place was just written.
+    // SAFETY: the line above wrote every place.
     unsafe { &mut *(block as *mut UninitSlice<T> as *mut [T]) }
 }
 
-/// Numbers that are there already, to be written over.
+/// Borrows initialised numbers as an uninitialised slice.
 ///
 /// # Safety
-/// What is written are numbers, never memory that nobody wrote.
+/// The caller writes initialised numbers only.
 #[inline(always)]
 pub(crate) unsafe fn as_uninit<T>(numbers: &mut [T]) -> &mut UninitSlice<T> {
-    // SAFETY: the same layout; every place stays written (the caller's promise).
+    // SAFETY: the same layout; every place stays written (the caller guarantees it).
     unsafe { &mut *(numbers as *mut [T] as *mut UninitSlice<T>) }
 }
 
-/// Numbers below which [`zeros`] is not worth several threads.
+/// [`zeros`] uses one thread below this many numbers.
 const SMALL: usize = 1 << 17;
-/// Numbers a task.
+/// Numbers per task.
 const PART: usize = 1 << 16;
 
-/// The first `n` of what `kept` holds, with what the last use left there: it never
-/// shrinks, so that no use fills again what another one has made.
+/// Returns the first `n` numbers of `kept`, with the values of its last use. The vector grows
+/// and never shrinks, so that each number is initialised once.
 pub(crate) fn grown(kept: &mut Vec<f32>, n: usize) -> &mut [f32] {
     if kept.len() < n {
         kept.resize(n, 0.0);
@@ -91,8 +91,8 @@ pub(crate) fn grown(kept: &mut Vec<f32>, n: usize) -> &mut [f32] {
     &mut kept[..n]
 }
 
-/// `n` zeros, written by all threads where there are many: memory that was used before
-/// is to be cleared, new memory to be faulted in.
+/// Returns `n` zeros; all threads write them if they are many, because clearing memory and
+/// page faults take time.
 pub fn zeros(n: usize) -> Vec<f32> {
     if n < SMALL {
         return vec![0.0; n];
@@ -101,7 +101,7 @@ pub fn zeros(n: usize) -> Vec<f32> {
     buffer.par_chunks_mut(PART).for_each(|block| {
         zeroed::<f32>(block);
     });
-    // SAFETY: the line above started every block.
+    // SAFETY: the line above initialised every block.
     unsafe { buffer.assume_init() }
 }
 
@@ -126,7 +126,7 @@ mod tests {
                 assert!(block.iter().all(|v| *v == 0.0));
                 block.iter_mut().enumerate().for_each(|(j, v)| *v = (8 * i + j) as f32);
             });
-            // SAFETY: the loop above started every block.
+            // SAFETY: the loop above initialised every block.
             let all = unsafe { buffer.assume_init() };
             assert_eq!(all, (0..n).map(|i| i as f32).collect::<Vec<_>>());
         }

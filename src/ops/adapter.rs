@@ -6,7 +6,6 @@ use super::{Number, borrowed, by_dtype, slice};
 use crate::abi::SPLAT_STRIDE;
 use crate::cpu::adapter as cpu;
 use crate::cpu::adapter::colour::Frame;
-use crate::cpu::lanes::LaneReal;
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Tensor, bail};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -119,7 +118,7 @@ impl CustomOp3 for Rows {
     }
 }
 
-fn rows<T: Number + LaneReal>(
+fn rows<T: Number>(
     adapter: &Adapter,
     [raw, depths, densities]: [(&CpuStorage, &Layout); 3],
 ) -> Result<(CpuStorage, Shape)> {
@@ -134,7 +133,7 @@ fn rows<T: Number + LaneReal>(
 
 type Triple = (Option<Tensor>, Option<Tensor>, Option<Tensor>);
 
-fn backward<T: Number + LaneReal>(
+fn backward<T: Number>(
     adapter: &Adapter,
     inputs: [&Tensor; 3],
     dy: &Tensor,
@@ -188,7 +187,7 @@ impl CustomOp1 for Colours {
     }
 }
 
-fn colours<T: Number + LaneReal>(op: &Colours, rows: &Layout) -> Result<(CpuStorage, Shape)> {
+fn colours<T: Number>(op: &Colours, rows: &Layout) -> Result<(CpuStorage, Shape)> {
     let (n, _) = rows.shape().dims2()?;
     let d = op.adapter.functions;
     let mut out = vec![T::default(); n * 3 * d];

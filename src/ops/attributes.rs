@@ -4,7 +4,6 @@
 use super::{Number, borrowed, by_dtype, slice};
 use crate::abi::SPLAT_STRIDE;
 use crate::cpu::attributes as cpu;
-use crate::cpu::lanes::LaneReal;
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
 
@@ -39,7 +38,7 @@ impl CustomOp1 for Op {
     }
 }
 
-fn forward<T: Number + LaneReal>(
+fn forward<T: Number>(
     rules: &Attributes,
     s: &CpuStorage,
     l: &Layout,
@@ -50,11 +49,7 @@ fn forward<T: Number + LaneReal>(
     Ok((T::to_cpu_storage_owned(out), l.shape().clone()))
 }
 
-fn backward<T: Number + LaneReal>(
-    rules: &Attributes,
-    rows: &Tensor,
-    dy: &Tensor,
-) -> Result<Tensor> {
+fn backward<T: Number>(rules: &Attributes, rows: &Tensor, dy: &Tensor) -> Result<Tensor> {
     let mut out = vec![T::default(); rows.elem_count()];
     borrowed::<T, _, 2>(NAME, [rows, dy], |[rows, dy]| cpu::backward(rules, rows, dy, &mut out))?;
     Tensor::from_vec(out, rows.dims(), rows.device())

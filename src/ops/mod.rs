@@ -33,7 +33,7 @@ pub use backend::{Backend, NoDevice};
 pub use rasterize::{over_background, rasterize, rasterize_on, rasterize_splats};
 pub use splat_tensors::SplatTensors;
 
-use crate::cpu::real::Real;
+use crate::cpu::simd::Real;
 use candle_core::{CpuStorage, Layout, Result, Shape, Storage, Tensor, WithDType, bail};
 
 /// A number that both candle and the kernels know: `f32` or `f64`.

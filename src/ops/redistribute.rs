@@ -3,7 +3,6 @@
 //! Tests: tests/redistribute.rs (identities, finite differences in `f64`).
 
 use super::{Backend, Number, borrowed, by_dtype, slice};
-use crate::cpu::lanes::LaneReal;
 use crate::cpu::redistribute as cpu;
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
@@ -112,7 +111,7 @@ impl CustomOp3 for Redistribute {
     }
 }
 
-fn arguments<'a, T: Number + LaneReal>(
+fn arguments<'a, T: Number>(
     rule: Rule,
     logits: &Tensor2<'a, T>,
     areas: &'a [T],
@@ -129,7 +128,7 @@ struct Tensor2<'a, T> {
     k: usize,
 }
 
-fn forward<T: Number + LaneReal>(
+fn forward<T: Number>(
     rule: Rule,
     [logits, areas, per_parent]: [(&CpuStorage, &Layout); 3],
 ) -> Result<(CpuStorage, Shape)> {
@@ -164,7 +163,7 @@ fn on_gpu(
 
 type Triple = (Option<Tensor>, Option<Tensor>, Option<Tensor>);
 
-fn backward<T: Number + LaneReal>(
+fn backward<T: Number>(
     rule: Rule,
     [logits, areas, per_parent, grad]: [&Tensor; 4],
 ) -> Result<Triple> {

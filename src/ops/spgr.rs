@@ -5,7 +5,6 @@
 use super::{Backend, Number, borrowed, by_dtype, slice};
 use crate::abi::{HEAD_STRIDE, SPLAT_STRIDE};
 use crate::camera::Camera;
-use crate::cpu::lanes::LaneReal;
 use crate::cpu::spgr as cpu;
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp1, CustomOp2, Layout, Result, Shape, Storage, Tensor, bail};
@@ -150,7 +149,7 @@ pub fn spgr_into_on(
 }
 
 /// The kernel, and a refusal of numbers that are not finite.
-fn run<T: Number + LaneReal>(
+fn run<T: Number>(
     call: &Spgr,
     head: &[T],
     parents: &[T],
@@ -199,7 +198,7 @@ fn finite<T: Number>(
 }
 
 fn finite_number<T: Number>(v: T) -> bool {
-    crate::cpu::real::Real::is_finite(v)
+    crate::cpu::simd::Real::is_finite(v)
 }
 
 /// Children `[N·K, 11]` of head records and parents.
@@ -239,7 +238,7 @@ impl CustomOp2 for Children {
     }
 }
 
-fn forward<T: Number + LaneReal>(
+fn forward<T: Number>(
     Children(call, made, _): &Children,
     (s1, l1): (&CpuStorage, &Layout),
     (s2, l2): (&CpuStorage, &Layout),
@@ -256,7 +255,7 @@ fn forward<T: Number + LaneReal>(
     Ok((T::to_cpu_storage_owned(rows), Shape::from((count, SPLAT_STRIDE))))
 }
 
-fn backward<T: Number + LaneReal>(
+fn backward<T: Number>(
     call: &Spgr,
     head: &Tensor,
     parents: &Tensor,
@@ -377,7 +376,7 @@ impl CustomOp1 for Gains {
     }
 }
 
-fn gains_backward<T: Number + LaneReal>(
+fn gains_backward<T: Number>(
     rules: &Rules,
     head: &Tensor,
     grad: &Tensor,

@@ -3,15 +3,15 @@
 use super::colour::{self, Frame};
 use super::{Adapter, GEOMETRY, Pixel, QUAT_EPS, View, columns, dot, opacity, strided};
 use crate::abi::{MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE};
-use crate::cpu::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};
+use crate::cpu::simd::{LANES, Real, RowLayout, Vector, VectorKernel};
 use rayon::prelude::*;
 
-/// What reached the results.
+/// Gradients of the results.
 #[derive(Clone, Copy, Debug)]
 pub struct Reached<'a, T> {
     /// `[views·H·W·G, 11]`.
     pub rows: &'a [T],
-    /// The two SH of [`Frame`], as far as anything reached them.
+    /// Of the two SH of [`Frame`]; `None` where no gradient exists.
     pub colours: [Option<&'a [T]>; 2],
 }
 
@@ -37,34 +37,36 @@ struct Backward<'a, T> {
     d_densities: &'a mut [T],
 }
 
-impl<T: LaneReal> Kernel<T> for Backward<'_, T> {
+impl<T: Real> VectorKernel<T> for Backward<'_, T> {
     type Output = ();
     #[inline(always)]
-    fn run<M: Machine<Scalar = T>>(mut self, m: M) {
+    fn run<V: Vector<Element = T>>(mut self) {
         let width = self.adapter.size[1];
-        for first in (0..width).step_by(M::WIDTH) {
-            self.group(m, (first, M::WIDTH.min(width - first)));
+        for first in (0..width).step_by(V::LANES) {
+            self.group::<V>((first, V::LANES.min(width - first)));
         }
     }
 }
 
-impl<T: LaneReal> Backward<'_, T> {
+impl<T: Real> Backward<'_, T> {
     #[inline(always)]
-    fn group<M: Machine<Scalar = T>>(&mut self, m: M, (first, count): (usize, usize)) {
+    fn group<V: Vector<Element = T>>(&mut self, (first, count): (usize, usize)) {
         let (lanes, g) = (self.adapter.raw_lanes(), self.adapter.per_pixel);
         let view = &self.adapter.views[self.view];
         let [raw, depths, densities] = self.inputs;
-        let raw: [M::V; GEOMETRY] = m.load_rows(&raw[first * lanes..], (lanes, count));
-        let at = (columns(m, first), m.of(self.row as f64));
-        let pixel = Pixel::new(m, view, &raw, at);
-        // By the ray in world frame, σ at distance 1, the quaternion.
-        let zero = m.of(0.0);
+        let raw: [V; GEOMETRY] =
+            V::load_rows(&raw[first * lanes..], RowLayout { stride: lanes, count });
+        let at = (columns(first), V::constant(self.row as f64));
+        let pixel = Pixel::new(view, &raw, at);
+        // With respect to the ray in world frame, σ at distance 1, the quaternion.
+        let zero = V::constant(0.0);
         let (mut d_towards, mut d_scale, mut d_quat) = ([zero; 3], [zero; 3], [zero; 4]);
         for k in 0..g {
-            let t = strided(m, depths, (first * g + k, g));
-            let p = strided(m, densities, (first * g + k, g));
+            let t: V = strided(depths, (first * g + k, g));
+            let p: V = strided(densities, (first * g + k, g));
             let from = &self.reached.rows[(first * g + k) * SPLAT_STRIDE..];
-            let d: [M::V; SPLAT_STRIDE] = m.load_rows(from, (g * SPLAT_STRIDE, count));
+            let d: [V; SPLAT_STRIDE] =
+                V::load_rows(from, RowLayout { stride: g * SPLAT_STRIDE, count });
             let mut d_t = zero;
             for i in 0..3 {
                 let (mean, scale) = (d[MEAN_OFFSET + i], d[SCALE_OFFSET + i]);
@@ -75,70 +77,64 @@ impl<T: LaneReal> Backward<'_, T> {
             for (sum, d) in d_quat.iter_mut().zip(&d[QUAT_OFFSET..QUAT_OFFSET + 4]) {
                 *sum = *sum + *d;
             }
-            let d_p = d[OPACITY_OFFSET] * opacity(m, self.adapter, p).1;
-            put(m, d_t, (first * g + k, g, count), self.d_depths);
-            put(m, d_p, (first * g + k, g, count), self.d_densities);
+            let d_p = d[OPACITY_OFFSET] * opacity(self.adapter, p).1;
+            put(d_t, (first * g + k, g, count), self.d_depths);
+            put(d_p, (first * g + k, g, count), self.d_densities);
         }
-        let d = geometry(m, view, (&raw, &pixel), (d_towards, d_scale, d_quat));
-        m.store_rows(&d, (lanes, count), &mut self.d_raw[first * lanes..]);
+        let d = geometry(view, (&raw, &pixel), (d_towards, d_scale, d_quat));
+        V::store_rows(&d, RowLayout { stride: lanes, count }, &mut self.d_raw[first * lanes..]);
         let n = 3 * self.adapter.functions;
         let mut d_colours = [zero; 75];
         for (frame, d_out) in [Frame::World, Frame::Camera].into_iter().zip(self.reached.colours) {
             if let Some(d_out) = d_out {
                 let from = (&d_out[first * g * n..], count);
                 let of = (self.adapter, frame, self.view);
-                colour::backward(m, of, from, &mut d_colours[..n]);
+                colour::backward(of, from, &mut d_colours[..n]);
             }
         }
         let to = &mut self.d_raw[first * lanes + GEOMETRY..];
-        colour::store(m, &d_colours[..n], (lanes, count), to);
+        colour::store(&d_colours[..n], RowLayout { stride: lanes, count }, to);
     }
 }
 
-/// The first `count` lanes to every `stride`-th place.
+/// Stores the first `count` lanes at every `stride`-th place.
 #[inline(always)]
-fn put<M: Machine>(
-    m: M,
-    v: M::V,
-    (first, stride, count): (usize, usize, usize),
-    to: &mut [M::Scalar],
-) {
-    let mut tile = [M::Scalar::default(); WIDTH_MAX];
-    m.store(v, &mut tile);
+fn put<V: Vector>(v: V, (first, stride, count): (usize, usize, usize), to: &mut [V::Element]) {
+    let mut tile = [V::Element::default(); LANES];
+    v.store(&mut tile);
     for (to, v) in to[first..].iter_mut().step_by(stride).zip(&tile[..count]) {
         *to = *v;
     }
 }
 
-/// Slopes by direction, scales and quaternion.
+/// Gradients with respect to direction, scales and quaternion.
 type Slopes<V> = ([V; 3], [V; 3], [V; 4]);
 
-/// By the raw row's geometry.
+/// Gradients with respect to the raw row's geometry.
 #[inline(always)]
-fn geometry<M: Machine>(
-    m: M,
+fn geometry<V: Vector>(
     view: &View,
-    (raw, pixel): (&[M::V; GEOMETRY], &Pixel<M::V>),
-    (d_towards, d_scale, d_quat): Slopes<M::V>,
-) -> [M::V; GEOMETRY] {
-    let mut out = [m.of(0.0); GEOMETRY];
+    (raw, pixel): (&[V; GEOMETRY], &Pixel<V>),
+    (d_towards, d_scale, d_quat): Slopes<V>,
+) -> [V; GEOMETRY] {
+    let mut out = [V::constant(0.0); GEOMETRY];
     let mut slope = pixel.shares;
     for s in &mut slope {
-        *s = *s * (m.of(1.0) - *s);
+        *s = *s * (V::constant(1.0) - *s);
     }
     let mut d_ray = d_towards;
     for (j, d) in d_ray.iter_mut().enumerate() {
         let [x, y, z] = &view.rotation;
-        let column = [m.of(x[j]), m.of(y[j]), m.of(z[j])];
+        let column = [V::constant(x[j]), V::constant(y[j]), V::constant(z[j])];
         *d = dot(column, d_towards);
     }
     let along = dot(pixel.ray, d_ray);
     for i in 0..2 {
         let d_plane = (d_ray[i] - pixel.ray[i] * along) / pixel.length;
-        out[i] = d_plane / m.of(view.focal[i]) * slope[i];
+        out[i] = d_plane / V::constant(view.focal[i]) * slope[i];
     }
     for i in 0..3 {
-        out[2 + i] = d_scale[i] * m.of(view.scale[1]) * slope[2 + i];
+        out[2 + i] = d_scale[i] * V::constant(view.scale[1]) * slope[2 + i];
     }
     let along = dot(pixel.quat, d_quat);
     let mut d_turned = d_quat;
@@ -147,11 +143,12 @@ fn geometry<M: Machine>(
     }
     let mut d_own = d_quat;
     for (d, row) in d_own.iter_mut().zip(&view.quat) {
-        let row = [m.of(row[0]), m.of(row[1]), m.of(row[2]), m.of(row[3])];
+        let row =
+            [V::constant(row[0]), V::constant(row[1]), V::constant(row[2]), V::constant(row[3])];
         *d = dot(row, d_turned);
     }
     let q = [raw[5], raw[6], raw[7], raw[8]];
-    let inverse = m.of(1.0) / (pixel.raw_length + m.of(QUAT_EPS));
+    let inverse = V::constant(1.0) / (pixel.raw_length + V::constant(QUAT_EPS));
     let along = dot(q, d_own) * inverse * inverse / pixel.raw_length;
     for i in 0..4 {
         out[5 + i] = d_own[i] * inverse - q[i] * along;
@@ -159,8 +156,9 @@ fn geometry<M: Machine>(
     out
 }
 
-/// Gradients by raw rows, distances and densities, for what reached rows and SH.
-pub fn backward<T: LaneReal>(
+/// Computes gradients with respect to raw rows, distances and densities from those of rows
+/// and SH.
+pub fn backward<T: Real>(
     a: &Adapter,
     [raw, depths, densities]: [&[T]; 3],
     reached: Reached<'_, T>,

@@ -1,14 +1,14 @@
-//! SH of the primaries: masked, mapped and turned by one matrix per view, and the
-//! gradient of all that.
+//! SH of the primaries: one matrix per view masks, maps and rotates the raw coefficients;
+//! with the gradient.
 
 use super::{Adapter, GEOMETRY};
-use crate::cpu::lanes::{Kernel, LaneReal, Lanes, Machine};
+use crate::cpu::simd::{Real, RowLayout, Vector, VectorKernel};
 use rayon::prelude::*;
 
 /// Most SH functions of a set.
 const FUNCTIONS_MAX: usize = 25;
 
-/// A square matrix by its non-zero elements, with its transpose.
+/// The non-zero elements of a square matrix, by rows and by columns.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Turn {
     rows: Vec<Vec<(usize, f64)>>,
@@ -16,7 +16,7 @@ pub struct Turn {
 }
 
 impl Turn {
-    /// Of the row-major `[D, D]` matrix `m`, D ≤ 25.
+    /// Lists the elements of the row-major `[D, D]` matrix `m`, D ≤ 25.
     pub fn new(m: &[f64], d: usize) -> Self {
         let line = |at: &dyn Fn(usize) -> f64| -> Vec<(usize, f64)> {
             (0..d).map(|j| (j, at(j))).filter(|(_, v)| *v != 0.0).collect()
@@ -28,67 +28,66 @@ impl Turn {
     }
 }
 
-/// Which SH: turned into world frame, `[N, D, 3]`, or in the camera's, `[N, 3, D]`.
+/// Frame and layout of SH: world `[N, D, 3]`, or camera `[N, 3, D]`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Frame {
-    /// Into world frame, RGB innermost.
+    /// World frame, RGB innermost.
     World,
-    /// In camera frame, colour-major like the raw row.
+    /// Camera frame, colour-major like the raw row.
     Camera,
 }
 
-/// Numbers i < 3·D of rows `stride` apart: 3·D is 3, 12, 27, 48 or 75.
+/// Loads numbers i < 3·D of rows; 3·D is 3, 12, 27, 48 or 75.
 #[inline(always)]
-pub(super) fn load<M: Machine>(m: M, rows: &[M::Scalar], span: (usize, usize), to: &mut [M::V]) {
+pub(super) fn load<V: Vector>(rows: &[V::Element], layout: RowLayout, to: &mut [V]) {
     let mut at = 0;
     while to.len() - at >= 16 {
-        to[at..at + 16].copy_from_slice(&m.load_rows::<16>(&rows[at..], span));
+        to[at..at + 16].copy_from_slice(&V::load_rows::<16>(&rows[at..], layout));
         at += 16;
     }
     match to.len() - at {
-        3 => to[at..].copy_from_slice(&m.load_rows::<3>(&rows[at..], span)),
-        11 => to[at..].copy_from_slice(&m.load_rows::<11>(&rows[at..], span)),
-        12 => to[at..].copy_from_slice(&m.load_rows::<12>(&rows[at..], span)),
+        3 => to[at..].copy_from_slice(&V::load_rows::<3>(&rows[at..], layout)),
+        11 => to[at..].copy_from_slice(&V::load_rows::<11>(&rows[at..], layout)),
+        12 => to[at..].copy_from_slice(&V::load_rows::<12>(&rows[at..], layout)),
         _ => {}
     }
 }
 
-/// The inverse of [`load`].
+/// Stores rows, the inverse of [`load`].
 #[inline(always)]
-pub(super) fn store<M: Machine>(m: M, from: &[M::V], span: (usize, usize), rows: &mut [M::Scalar]) {
+pub(super) fn store<V: Vector>(from: &[V], layout: RowLayout, rows: &mut [V::Element]) {
     let mut at = 0;
     while from.len() - at >= 16 {
-        let mut part = [m.of(0.0); 16];
+        let mut part = [V::constant(0.0); 16];
         part.copy_from_slice(&from[at..at + 16]);
-        m.store_rows(&part, span, &mut rows[at..]);
+        V::store_rows(&part, layout, &mut rows[at..]);
         at += 16;
     }
     let rest = from.len() - at;
-    let mut part = [m.of(0.0); 12];
+    let mut part = [V::constant(0.0); 12];
     part[..rest.min(12)].copy_from_slice(&from[at..at + rest.min(12)]);
     let [a, b, c, d, e, f, g, h, i, j, k, _] = part;
     match rest {
-        3 => m.store_rows(&[a, b, c], span, &mut rows[at..]),
-        11 => m.store_rows(&[a, b, c, d, e, f, g, h, i, j, k], span, &mut rows[at..]),
-        12 => m.store_rows(&part, span, &mut rows[at..]),
+        3 => V::store_rows(&[a, b, c], layout, &mut rows[at..]),
+        11 => V::store_rows(&[a, b, c, d, e, f, g, h, i, j, k], layout, &mut rows[at..]),
+        12 => V::store_rows(&part, layout, &mut rows[at..]),
         _ => {}
     }
 }
 
-/// Σⱼ lines[i][j]·from[function j of colour c], added to function i of colour c in `to`;
-/// `steps`: how far apart colours and functions lie in `from` and in `to`.
+/// Adds Σⱼ lines[i][j]·from[function j of colour c] to function i of colour c in `to`.
+/// `steps` are the strides of colours and functions in `from` and in `to`.
 #[inline(always)]
-fn apply<M: Machine>(
-    m: M,
+fn apply<V: Vector>(
     lines: &[Vec<(usize, f64)>],
-    (from, to): (&[M::V], &mut [M::V]),
+    (from, to): (&[V], &mut [V]),
     steps: [(usize, usize); 2],
 ) {
     let [(colour, function), (to_colour, to_function)] = steps;
     for (i, line) in lines.iter().enumerate() {
-        let mut sums = [m.of(0.0); 3];
+        let mut sums = [V::constant(0.0); 3];
         for &(j, v) in line {
-            let v = m.of(v);
+            let v = V::constant(v);
             for (c, sum) in sums.iter_mut().enumerate() {
                 *sum = v.fma(from[c * colour + j * function], *sum);
             }
@@ -108,7 +107,7 @@ impl Frame {
         }
     }
 
-    /// How far apart colours and functions lie in a set of `d` functions.
+    /// Strides of colours and functions in a set of `d` functions.
     fn steps(self, d: usize) -> (usize, usize) {
         match self {
             Self::World => (1, 3),
@@ -125,29 +124,38 @@ struct Forward<'a, T> {
     out: &'a mut [T],
 }
 
-impl<T: LaneReal> Kernel<T> for Forward<'_, T> {
+impl<T: Real> VectorKernel<T> for Forward<'_, T> {
     type Output = ();
     #[inline(always)]
-    fn run<M: Machine<Scalar = T>>(self, m: M) {
+    fn run<V: Vector<Element = T>>(self) {
         let (g, d) = (self.adapter.per_pixel, self.adapter.functions);
         let n = 3 * d;
         let (width, lanes) = (self.adapter.size[1], self.adapter.raw_lanes());
         let turn = self.frame.turn(self.adapter, self.view);
-        for first in (0..width).step_by(M::WIDTH) {
-            let count = M::WIDTH.min(width - first);
-            let mut from = [m.of(0.0); 3 * FUNCTIONS_MAX];
-            load(m, &self.raw[first * lanes + GEOMETRY..], (lanes, count), &mut from[..n]);
-            let mut to = [m.of(0.0); 3 * FUNCTIONS_MAX];
-            apply(m, &turn.rows, (&from[..n], &mut to[..n]), [(d, 1), self.frame.steps(d)]);
+        for first in (0..width).step_by(V::LANES) {
+            let count = V::LANES.min(width - first);
+            let mut from = [V::constant(0.0); 3 * FUNCTIONS_MAX];
+            load(
+                &self.raw[first * lanes + GEOMETRY..],
+                RowLayout { stride: lanes, count },
+                &mut from[..n],
+            );
+            let mut to = [V::constant(0.0); 3 * FUNCTIONS_MAX];
+            apply(&turn.rows, (&from[..n], &mut to[..n]), [(d, 1), self.frame.steps(d)]);
             for k in 0..g {
-                store(m, &to[..n], (g * n, count), &mut self.out[(first * g + k) * n..]);
+                store(
+                    &to[..n],
+                    RowLayout { stride: g * n, count },
+                    &mut self.out[(first * g + k) * n..],
+                );
             }
         }
     }
 }
 
-/// SH of all views' Gaussians into `out` `[views·H·W·G, 3·D]`, ordered as `frame` says.
-pub fn forward<T: LaneReal>(a: &Adapter, frame: Frame, raw: &[T], out: &mut [T]) {
+/// Computes the SH of all views' Gaussians into `out` `[views·H·W·G, 3·D]`, in the layout of
+/// `frame`.
+pub fn forward<T: Real>(a: &Adapter, frame: Frame, raw: &[T], out: &mut [T]) {
     let ([height, width], lanes) = (a.size, a.raw_lanes());
     let set = width * a.per_pixel * 3 * a.functions;
     out.par_chunks_mut(set).enumerate().for_each(|(i, out)| {
@@ -156,21 +164,20 @@ pub fn forward<T: LaneReal>(a: &Adapter, frame: Frame, raw: &[T], out: &mut [T])
     });
 }
 
-/// Adds to `to` `[3·D]` the gradient of a vector of pixels' raw SH by what reached the
-/// SH of their Gaussians, `d_out` from the first one on.
+/// Adds to `to` `[3·D]` the gradient of a vector of pixels' raw SH, from the gradient `d_out`
+/// of the SH of their Gaussians.
 #[inline(always)]
-pub(super) fn backward<M: Machine>(
-    m: M,
+pub(super) fn backward<V: Vector>(
     (adapter, frame, view): (&Adapter, Frame, usize),
-    (d_out, count): (&[M::Scalar], usize),
-    to: &mut [M::V],
+    (d_out, count): (&[V::Element], usize),
+    to: &mut [V],
 ) {
     let (g, d) = (adapter.per_pixel, adapter.functions);
     let n = 3 * d;
     let lines = &frame.turn(adapter, view).columns;
     for k in 0..g {
-        let mut from = [m.of(0.0); 3 * FUNCTIONS_MAX];
-        load(m, &d_out[k * n..], (g * n, count), &mut from[..n]);
-        apply(m, lines, (&from[..n], to), [frame.steps(d), (d, 1)]);
+        let mut from = [V::constant(0.0); 3 * FUNCTIONS_MAX];
+        load(&d_out[k * n..], RowLayout { stride: g * n, count }, &mut from[..n]);
+        apply(lines, (&from[..n], to), [frame.steps(d), (d, 1)]);
     }
 }

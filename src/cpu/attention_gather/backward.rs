@@ -6,8 +6,8 @@
 //! write one float, and the sums' order does not depend on the number of threads.
 
 use super::{BLOCK, Gather, Scratch, State, axpy, dot};
-use crate::cpu::math::vectorised;
-use crate::cpu::real::Real;
+use crate::cpu::simd::Real;
+use crate::cpu::simd::vectorize;
 use rayon::prelude::*;
 
 /// Gradients of the fused attention.
@@ -81,7 +81,7 @@ pub fn factors<T: Real>(
         .map_init(Scratch::new, |scratch, (block, (d_query, d_points))| {
             let mut out = Scatter::default();
             let rows = d_query.chunks_exact_mut(q_width).zip(d_points.chunks_exact_mut(p_width));
-            vectorised(
+            vectorize(
                 #[inline(always)]
                 || {
                     for (i, (d_query, d_points)) in rows.enumerate() {
@@ -111,7 +111,7 @@ pub fn scatter_into<T: Real>(
             axpy(&mut row[span.clone()], factor, &from[span]);
         }
     };
-    vectorised(
+    vectorize(
         #[inline(always)]
         || {
             for scatter in scatters {
@@ -211,8 +211,8 @@ impl<T: Real> Args<'_, T> {
         (d_logits, d_points): (&[T], &mut [T]),
     ) {
         let g = self.g;
-        let (one, levels) = (T::of(1.0), g.levels.len());
-        let scale = T::of(g.logit_scale);
+        let (one, levels) = (T::constant(1.0), g.levels.len());
+        let scale = T::constant(g.logit_scale);
         let gates = &self.query[(n + 1) * g.query_width() - g.views..(n + 1) * g.query_width()];
         for (j, sample) in scratch.samples.iter().enumerate() {
             if sample.state != State::Live {
@@ -239,8 +239,8 @@ impl<T: Real> Args<'_, T> {
             }
             let own = if g.points_per_level { l * g.points } else { 0 };
             let at = 2 * (v * g.points_width() + own + m);
-            d_points[at] += dx * T::of(g.levels[l].width as f64);
-            d_points[at + 1] += dy * T::of(g.levels[l].height as f64);
+            d_points[at] += dx * T::constant(g.levels[l].width as f64);
+            d_points[at + 1] += dy * T::constant(g.levels[l].height as f64);
         }
     }
 
@@ -250,7 +250,7 @@ impl<T: Real> Args<'_, T> {
         let g = self.g;
         let mut factors = vec![T::default(); scratch.taps.len() * g.groups];
         let Some(key) = g.key else { return factors };
-        let scale = T::of(g.logit_scale);
+        let scale = T::constant(g.logit_scale);
         for (sample, d) in scratch.samples.iter().zip(d_logits.chunks_exact(g.groups)) {
             for &(tap, w, _) in &sample.corners[..sample.count] {
                 for (i, &d) in d.iter().enumerate() {
@@ -318,7 +318,7 @@ fn add<'a, T: Real>(
     }
     let channel = first - start;
     let group = channel / (g.dim / g.groups);
-    vectorised(
+    vectorize(
         #[inline(always)]
         || {
             for scatter in scatters {

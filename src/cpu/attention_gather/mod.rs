@@ -1,5 +1,5 @@
-//! Attention of parents over bilinear samples of the views' feature maps, fused:
-//! no tensor of N × taps × E ever exists (SubSplat A.2; spec 1.6).
+//! Attention of parents over bilinear samples of the views' feature maps, fused without a
+//! tensor of N × taps × E (SubSplat A.2).
 //!
 //! For parent n and group g, over the samples j = (view v, level ℓ, point m):
 //! ```text
@@ -23,18 +23,18 @@ mod narrow;
 pub use crate::abi::{Drop, Gather, Level};
 pub use backward::{Gradients, Scatter, backward, factors, scatter_into};
 
-use super::math::vectorised;
-use super::real::Real;
+use super::simd::Real;
+use super::simd::vectorize;
 use rayon::prelude::*;
 
 impl Gather {
     /// Factor of the weight of sample `j`, group `g` of parent `n` after dropping.
     #[inline(always)]
     fn kept<T: Real>(&self, n: usize, j: usize, g: usize) -> T {
-        let Some(drop) = self.drop else { return T::of(1.0) };
+        let Some(drop) = self.drop else { return T::constant(1.0) };
         let index = ((drop.first_parent + n) * self.samples() + j) * self.groups + g;
         let u = (mix(drop.seed ^ mix(index as u64)) >> 11) as f64 / (1u64 << 53) as f64;
-        T::of(if u < drop.probability { 0.0 } else { 1.0 / (1.0 - drop.probability) })
+        T::constant(if u < drop.probability { 0.0 } else { 1.0 / (1.0 - drop.probability) })
     }
 }
 
@@ -46,7 +46,7 @@ fn mix(seed: u64) -> u64 {
     z ^ (z >> 31)
 }
 
-/// What a sample outside the picture does.
+/// Role of a sample in the softmax.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum State {
     /// Not in the softmax.
@@ -121,7 +121,7 @@ impl<T: Real> Scratch<T> {
         (first_cell, first_tap): (usize, usize),
         (rx, ry): (T, T),
     ) -> Sample<T> {
-        let (zero, one) = (T::default(), T::of(1.0));
+        let (zero, one) = (T::default(), T::constant(1.0));
         let mut s = Sample {
             state: State::Live,
             corners: [(0, zero, 0); 4],
@@ -132,9 +132,9 @@ impl<T: Real> Scratch<T> {
             s.state = if g.renormalise { State::Masked } else { State::Blank };
             return s;
         }
-        let shift = T::of(if g.half_pixel { 0.5 } else { 0.0 });
-        let x = rx * T::of(level.width as f64) - shift;
-        let y = ry * T::of(level.height as f64) - shift;
+        let shift = T::constant(if g.half_pixel { 0.5 } else { 0.0 });
+        let x = rx * T::constant(level.width as f64) - shift;
+        let y = ry * T::constant(level.height as f64) - shift;
         let (x0, y0) = (x.floor(), y.floor());
         let (fx, fy) = (x - x0, y - y0);
         s.fraction = (fx, fy);
@@ -171,7 +171,7 @@ impl<T: Real> Scratch<T> {
         let (q, rest) = query.split_at(g.query_channels());
         if let Some(key) = g.key {
             self.dots.clear();
-            // No closure: it would be compiled without the vectors of its caller.
+            // A closure would be compiled without the level's instructions.
             for &cell in &self.taps {
                 let row = &maps[cell * g.stride + key..][..g.dim];
                 for (k, q) in row.chunks_exact(width).zip(q.chunks_exact(width)) {
@@ -179,12 +179,12 @@ impl<T: Real> Scratch<T> {
                 }
             }
         }
-        let scale = T::of(g.logit_scale);
+        let scale = T::constant(g.logit_scale);
         self.weights.clear();
         self.weights.extend_from_slice(&rest[..self.samples.len() * groups]);
         for (sample, logits) in self.samples.iter().zip(self.weights.chunks_exact_mut(groups)) {
             if sample.state == State::Masked {
-                logits.fill(T::of(f64::NEG_INFINITY));
+                logits.fill(T::constant(f64::NEG_INFINITY));
             } else if g.key.is_some() {
                 for &(tap, w, _) in &sample.corners[..sample.count] {
                     for (i, logit) in logits.iter_mut().enumerate() {
@@ -198,13 +198,13 @@ impl<T: Real> Scratch<T> {
         }
         for i in 0..groups {
             let each = self.weights.iter().skip(i).step_by(groups);
-            let top = each.copied().fold(T::of(f64::NEG_INFINITY), T::max);
+            let top = each.copied().fold(T::constant(f64::NEG_INFINITY), T::max);
             let mut sum = T::default();
             for w in self.weights.iter_mut().skip(i).step_by(groups) {
                 *w = (*w - top).exp();
                 sum += *w;
             }
-            let inverse = T::of(1.0) / sum;
+            let inverse = T::constant(1.0) / sum;
             self.weights.iter_mut().skip(i).step_by(groups).for_each(|w| *w *= inverse);
         }
         true
@@ -270,7 +270,7 @@ pub fn forward<T: Real>(g: &Gather, maps: &[T], query: &[T], points: &[T], out: 
     out.par_chunks_mut(BLOCK * g.dim).enumerate().for_each_init(
         Scratch::new,
         |scratch, (block, out)| {
-            vectorised(
+            vectorize(
                 #[inline(always)]
                 || {
                     for (i, out) in out.chunks_exact_mut(g.dim).enumerate() {
@@ -308,7 +308,7 @@ pub struct DepthMap<'a> {
     pub width: usize,
 }
 
-/// Tolerance and softness of [`occlusion`], fractions of z (spec 5.3).
+/// Tolerance and softness of [`occlusion`], fractions of z.
 const OCCLUSION_TOLERANCE: f32 = 0.02;
 
 /// exp(−max(0, z − D(R) − τ)/τ′), τ = τ′ = 2 % of z: near 0 where the view's own

@@ -9,7 +9,7 @@
 )]
 
 use super::{BLOCK, Gather};
-use crate::cpu::math::exp;
+use crate::cpu::simd::elementary::exp;
 use crate::cpu::simd::{Kernel, LANES, Simd, SimdLevel, Vector};
 use rayon::prelude::*;
 
@@ -145,7 +145,7 @@ impl Taps {
 /// Sixteen floats at `p`.
 #[inline(always)]
 unsafe fn lanes<S: Simd>(s: S, p: *const f32) -> S::F {
-    // SAFETY: the caller's; an array has the alignment of its elements.
+    // SAFETY: as the caller's; an array has the alignment of its elements.
     s.load(unsafe { &*p.cast::<[f32; LANES]>() })
 }
 
@@ -168,7 +168,7 @@ unsafe fn products<S: Simd>(
         }
         let mut sums = [s.splat(0.0); WIDE];
         for c in (0..q.len()).step_by(LANES) {
-            // SAFETY: the caller's; rows past the last tap are the first of the maps.
+            // SAFETY: as the caller's; rows past the last tap are the first of the maps.
             unsafe {
                 let q = lanes(s, q.as_ptr().add(c));
                 for t in 0..WIDE {

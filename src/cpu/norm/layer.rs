@@ -1,18 +1,18 @@
-//! LayerNorm: passes over several rows together, since within one each step waits for
-//! the last.
+//! LayerNorm. Each pass covers several rows, because the steps of one row depend on one
+//! another.
 
 use crate::cpu::simd::{Kernel, LANES, Mask, Simd};
 use crate::cpu::uninit::UninitSlice;
 use std::array::from_fn;
 use std::mem::MaybeUninit;
 
-/// Rows of a pass.
+/// Rows per pass.
 const TOGETHER: usize = 8;
-/// Numbers that are summed in f32 lanes before they go to an f64.
+/// Numbers that f32 lanes add before an f64 takes their sum.
 const BLOCK: usize = 512;
 
-/// w·(x − mean)/σ + b of rows of `n` numbers; `affine` are w and b, both of `n` numbers or
-/// both empty.
+/// Computes w·(x − mean)/σ + b of rows of `n` numbers; `affine` holds w and b, both of `n`
+/// numbers or both empty.
 pub(super) struct Layer<'a> {
     pub n: usize,
     pub eps: f32,
@@ -72,7 +72,7 @@ impl Kernel for Layer<'_> {
     }
 }
 
-/// Sixteen numbers of a row from `at` on, zeros past its end.
+/// Loads sixteen numbers of a row from `at` on, zeros past its end.
 #[inline(always)]
 fn part<S: Simd>(s: S, row: &[f32], at: usize) -> S::F {
     match row[at..].first_chunk() {
@@ -90,7 +90,7 @@ fn total<S: Simd>(s: S, x: &[f32], f: impl Fn(S::F) -> S::F) -> f64 {
         for at in (0..x.len()).step_by(LANES) {
             let inside = (x.len() - at).min(LANES);
             let v = f(part(s, x, at));
-            // What f makes of the zeros past the end does not count.
+            // Lanes past the end do not count: f of 0 need not be 0.
             let v = if inside < LANES {
                 s.mask_from_bits((1 << inside) - 1).select_or_zero(v)
             } else {

@@ -1,7 +1,8 @@
-//! Normalised rows through SiLU: v / (1 + e^{−v}) in vectors, with fused products.
+//! SiLU of normalised rows: v / (1 + e^{−v}) in vectors, with fused products.
 
 use super::Rows;
-use crate::cpu::simd::{Kernel, LANES, Simd, Vector, exp2_by_sums, first_lanes_bits};
+use crate::cpu::simd::elementary::exp2_by_sums;
+use crate::cpu::simd::{Kernel, LANES, Simd, Vector, first_lanes_bits};
 use crate::cpu::uninit::UninitSlice;
 
 /// Rows from number `first` on.
@@ -35,7 +36,7 @@ impl Kernel for Silu<'_> {
     }
 }
 
-/// What makes one channel of a row.
+/// Mean, scale and shift of one channel of a row.
 struct Line {
     mean: f32,
     scale: f32,
@@ -55,7 +56,7 @@ impl Line {
             return;
         }
         let bits = first_lanes_bits(last.len());
-        // SAFETY: as many numbers and places.
+        // SAFETY: `bits` selects the floats of `last` and the places of `rest`, as many.
         unsafe {
             s.store_masked(self.of(s, s.load_masked(last.as_ptr(), bits)), rest.as_mut_ptr(), bits)
         };
@@ -64,8 +65,8 @@ impl Line {
     #[inline(always)]
     fn of<S: Simd>(&self, s: S, x: S::F) -> S::F {
         let v = (x - s.splat(self.mean)).fma(s.splat(self.scale), s.splat(self.shift));
-        // The second operand is what comes out of comparisons with NaN.
+        // NaN stays. One product is enough here: the result's error is below 1e-6.
         let p = (v * s.splat(-std::f32::consts::LOG2_E)).max(s.splat(-125.0));
-        v / (s.splat(1.0) + exp2_by_sums(s, p.min(s.splat(126.0))))
+        v / (s.splat(1.0) + exp2_by_sums(p.min(s.splat(126.0))))
     }
 }

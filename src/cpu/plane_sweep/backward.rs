@@ -9,7 +9,7 @@
 //! the sums do not depend on how many threads there are.
 
 use super::{Pair, Sweep, Walk, channels_last};
-use crate::cpu::math::vectorised;
+use crate::cpu::simd::vectorize;
 use rayon::prelude::*;
 
 /// Coefficients c_ij of one pair of views, by row: entries `starts[i]..starts[i + 1]`
@@ -44,7 +44,7 @@ impl Sparse {
     /// out_i += Σ_j c_ij·rows_j, for `[n, channels]` in and out.
     fn add_product(&self, rows: &[f32], channels: usize, out: &mut [f32]) {
         out.par_chunks_exact_mut(channels).enumerate().for_each(|(i, out)| {
-            vectorised(
+            vectorize(
                 #[inline(always)]
                 || {
                     for &(j, c) in &self.entries[self.starts[i]..self.starts[i + 1]] {

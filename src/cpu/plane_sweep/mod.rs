@@ -11,7 +11,8 @@ mod backward;
 pub use crate::abi::{Pair, Sweep};
 pub use backward::backward;
 
-use super::math::{dot, vectorised};
+use super::simd::vectorize;
+use super::sums::dot;
 use rayon::prelude::*;
 
 /// Where a sample falls: index of the upper left tap and the four weights, zero for
@@ -94,7 +95,7 @@ struct Walk {
     pixel: u32,
 }
 
-/// What the current pixel knows of a source cell.
+/// Values of a source cell for the current pixel.
 #[derive(Clone, Copy, Default)]
 struct Cell {
     pixel: u32,
@@ -107,7 +108,7 @@ impl Walk {
         Self { u: vec![0.0; d], v: vec![0.0; d], cells: vec![Cell::default(); n], pixel: 0 }
     }
 
-    /// Begins reference pixel (x, y): forgets the cells, places all candidates.
+    /// Starts reference pixel (x, y): clears the cells and places all candidates.
     #[inline(always)]
     fn begin(&mut self, s: &Sweep, pair: &Pair, (x, y): (usize, usize), depths: &[f32]) {
         self.pixel = self.pixel.wrapping_add(1);
@@ -153,7 +154,7 @@ pub fn correlation(s: &Sweep, reference: &[f32], source: &[f32], out: &mut [f32]
             for pair in &s.pairs[r] {
                 let other = &source[pair.source * n * c..(pair.source + 1) * n * c];
                 let own = &reference[(r * n + y * w) * c..(r * n + (y + 1) * w) * c];
-                vectorised(
+                vectorize(
                     #[inline(always)]
                     || {
                         for (x, f) in own.chunks_exact(c).enumerate() {

@@ -1,15 +1,18 @@
 //! AVX2 and FMA: sixteen lanes in two registers.
 //!
-//! SAFETY of every block below: the intrinsics need x86-64-v3. A vector comes only
-//! from [`Token`], and a token only from [`run`], whose caller has asked the
-//! processor. Loads and stores go through references to whole arrays, or to places
-//! checked beforehand.
+//! SAFETY of every block below: the intrinsics need x86-64-v3. A [`Token`] exists in
+//! [`run`] only, whose caller checked the processor, and the vector types are reachable
+//! through it only. Loads and stores go through references to whole arrays, or to places
+//! that were checked before.
 #![expect(clippy::undocumented_unsafe_blocks, reason = "one reason for all, stated above")]
 
-use super::{Floats, Ints, Kernel, LANES, Mask, Simd, all_inside};
+use super::{
+    F32Vector, IntVector, Kernel, LANES, Mask, RowLayout, Simd, Vector, all_inside, elementary,
+    rows,
+};
 use std::arch::x86_64::*;
 use std::mem::MaybeUninit;
-use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
+use std::ops::{Add, BitAnd, BitOr, BitXor, Div, Mul, Neg, Not, Sub};
 
 /// Proof that the processor has x86-64-v3.
 #[derive(Clone, Copy)]
@@ -25,11 +28,7 @@ pub(super) struct M(__m256, __m256);
 #[derive(Clone, Copy)]
 pub(super) struct I(__m256i, __m256i);
 
-impl Floats for F {}
-impl Mask for M {}
-impl Ints for I {}
-
-/// Whether the processor has what [`run`] needs.
+/// Tells whether the processor has the features that [`run`] needs.
 pub(super) fn detected() -> bool {
     is_x86_feature_detected!("avx2")
         && is_x86_feature_detected!("fma")
@@ -42,7 +41,7 @@ pub(super) fn detected() -> bool {
 /// Runs `kernel` compiled for x86-64-v3.
 ///
 /// # Safety
-/// [`detected`] must have said yes.
+/// [`detected`] returned true.
 #[target_feature(enable = "avx2,fma,bmi1,bmi2,lzcnt,popcnt")]
 pub(super) unsafe fn run<K: Kernel>(kernel: K) -> K::Output {
     kernel.run(Token(()))
@@ -69,6 +68,7 @@ operators! {
     I Sub sub _mm256_sub_epi32;
     I BitAnd bitand _mm256_and_si256;
     I BitOr bitor _mm256_or_si256;
+    I BitXor bitxor _mm256_xor_si256;
     M BitAnd bitand _mm256_and_ps;
     M BitOr bitor _mm256_or_ps;
 }
@@ -106,31 +106,213 @@ pub(super) unsafe fn sum8(v: __m256) -> f32 {
     }
 }
 
+impl Vector for F {
+    type Element = f32;
+    type Mask = M;
+    const LANES: usize = LANES;
+    const REGISTERS: usize = 8;
+
+    #[inline(always)]
+    fn splat(v: f32) -> F {
+        let v = unsafe { _mm256_set1_ps(v) };
+        F(v, v)
+    }
+    #[inline(always)]
+    fn constant(v: f64) -> F {
+        F::splat(v as f32)
+    }
+    #[inline(always)]
+    fn load(v: &[f32; LANES]) -> F {
+        unsafe { F(_mm256_loadu_ps(v.as_ptr()), _mm256_loadu_ps(v.as_ptr().add(8))) }
+    }
+    #[inline(always)]
+    fn store(self, to: &mut [f32; LANES]) {
+        unsafe {
+            _mm256_storeu_ps(to.as_mut_ptr(), self.0);
+            _mm256_storeu_ps(to.as_mut_ptr().add(8), self.1);
+        }
+    }
+    #[inline(always)]
+    fn load_rows<const L: usize>(rows: &[f32], layout: RowLayout) -> [F; L] {
+        rows::load_transposed(Token(()), rows, layout)
+    }
+    #[inline(always)]
+    fn store_rows<const L: usize>(from: &[F; L], layout: RowLayout, rows: &mut [f32]) {
+        let lines = rows::transposed(Token(()), from);
+        // Whole rows are copied: masked stores take dozens of cycles on AMD's processors.
+        for (lane, line) in lines.iter().enumerate().take(layout.count) {
+            let mut row = [0.0; LANES];
+            line.store(&mut row);
+            let start = lane * layout.stride;
+            rows[start..start + L].copy_from_slice(&row[..L]);
+        }
+    }
+    #[inline(always)]
+    fn fma(self, b: F, c: F) -> F {
+        unsafe { F(_mm256_fmadd_ps(self.0, b.0, c.0), _mm256_fmadd_ps(self.1, b.1, c.1)) }
+    }
+    #[inline(always)]
+    fn fnma(self, b: F, c: F) -> F {
+        unsafe { F(_mm256_fnmadd_ps(self.0, b.0, c.0), _mm256_fnmadd_ps(self.1, b.1, c.1)) }
+    }
+    #[inline(always)]
+    fn max(self, other: F) -> F {
+        unsafe { F(_mm256_max_ps(other.0, self.0), _mm256_max_ps(other.1, self.1)) }
+    }
+    #[inline(always)]
+    fn min(self, other: F) -> F {
+        unsafe { F(_mm256_min_ps(other.0, self.0), _mm256_min_ps(other.1, self.1)) }
+    }
+    #[inline(always)]
+    fn sqrt(self) -> F {
+        unsafe { F(_mm256_sqrt_ps(self.0), _mm256_sqrt_ps(self.1)) }
+    }
+    #[inline(always)]
+    fn abs(self) -> F {
+        unsafe {
+            let sign = _mm256_set1_ps(-0.0);
+            F(_mm256_andnot_ps(sign, self.0), _mm256_andnot_ps(sign, self.1))
+        }
+    }
+    #[inline(always)]
+    fn floor(self) -> F {
+        unsafe { F(_mm256_floor_ps(self.0), _mm256_floor_ps(self.1)) }
+    }
+    #[inline(always)]
+    fn lt(self, other: F) -> M {
+        unsafe {
+            M(
+                _mm256_cmp_ps::<_CMP_LT_OQ>(self.0, other.0),
+                _mm256_cmp_ps::<_CMP_LT_OQ>(self.1, other.1),
+            )
+        }
+    }
+    #[inline(always)]
+    fn le(self, other: F) -> M {
+        unsafe {
+            M(
+                _mm256_cmp_ps::<_CMP_LE_OQ>(self.0, other.0),
+                _mm256_cmp_ps::<_CMP_LE_OQ>(self.1, other.1),
+            )
+        }
+    }
+    elementary::functions!();
+}
+
+impl F32Vector for F {
+    type Int = I;
+
+    #[inline(always)]
+    fn approx_sqrt(self) -> F {
+        unsafe {
+            F(
+                _mm256_mul_ps(self.0, _mm256_rsqrt_ps(self.0)),
+                _mm256_mul_ps(self.1, _mm256_rsqrt_ps(self.1)),
+            )
+        }
+    }
+    #[inline(always)]
+    fn neg_abs(self) -> F {
+        unsafe {
+            let sign = _mm256_set1_ps(-0.0);
+            F(_mm256_or_ps(self.0, sign), _mm256_or_ps(self.1, sign))
+        }
+    }
+    #[inline(always)]
+    fn ceil(self) -> F {
+        unsafe { F(_mm256_ceil_ps(self.0), _mm256_ceil_ps(self.1)) }
+    }
+    #[inline(always)]
+    fn round_and_fraction(self) -> (F, F) {
+        const NEAREST: i32 = _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
+        let n =
+            unsafe { F(_mm256_round_ps::<NEAREST>(self.0), _mm256_round_ps::<NEAREST>(self.1)) };
+        (n, self - n)
+    }
+    #[inline(always)]
+    fn scale_by_power_of_two(self, e: F) -> F {
+        F::from_bits(self.to_bits() + e.to_int().shl::<23>())
+    }
+    #[inline(always)]
+    fn to_bits(self) -> I {
+        unsafe { I(_mm256_castps_si256(self.0), _mm256_castps_si256(self.1)) }
+    }
+    #[inline(always)]
+    fn from_bits(v: I) -> F {
+        unsafe { F(_mm256_castsi256_ps(v.0), _mm256_castsi256_ps(v.1)) }
+    }
+    #[inline(always)]
+    fn to_int(self) -> I {
+        unsafe { I(_mm256_cvttps_epi32(self.0), _mm256_cvttps_epi32(self.1)) }
+    }
+    #[inline(always)]
+    fn from_int(v: I) -> F {
+        unsafe { F(_mm256_cvtepi32_ps(v.0), _mm256_cvtepi32_ps(v.1)) }
+    }
+}
+
+impl Mask<F> for M {
+    #[inline(always)]
+    fn select(self, a: F, b: F) -> F {
+        unsafe { F(_mm256_blendv_ps(b.0, a.0, self.0), _mm256_blendv_ps(b.1, a.1, self.1)) }
+    }
+    #[inline(always)]
+    fn select_or_zero(self, v: F) -> F {
+        unsafe { F(_mm256_and_ps(self.0, v.0), _mm256_and_ps(self.1, v.1)) }
+    }
+    #[inline(always)]
+    fn any(self) -> bool {
+        unsafe { _mm256_movemask_ps(_mm256_or_ps(self.0, self.1)) != 0 }
+    }
+    #[inline(always)]
+    fn to_bits(self) -> u32 {
+        unsafe { _mm256_movemask_ps(self.0) as u32 | (_mm256_movemask_ps(self.1) as u32) << 8 }
+    }
+}
+
+impl IntVector for I {
+    #[inline(always)]
+    fn splat(v: i32) -> I {
+        let v = unsafe { _mm256_set1_epi32(v) };
+        I(v, v)
+    }
+    #[inline(always)]
+    fn store(self, to: &mut [i32; LANES]) {
+        unsafe {
+            _mm256_storeu_si256(to.as_mut_ptr().cast(), self.0);
+            _mm256_storeu_si256(to.as_mut_ptr().add(8).cast(), self.1);
+        }
+    }
+    #[inline(always)]
+    fn shl<const N: u32>(self) -> I {
+        // The intrinsic's constant is an i32; Rust cannot convert the generic u32.
+        let n = N as i32;
+        unsafe {
+            let n = _mm_cvtsi32_si128(n);
+            I(_mm256_sll_epi32(self.0, n), _mm256_sll_epi32(self.1, n))
+        }
+    }
+    #[inline(always)]
+    fn shl_each(self, by: I) -> I {
+        unsafe { I(_mm256_sllv_epi32(self.0, by.0), _mm256_sllv_epi32(self.1, by.1)) }
+    }
+    #[inline(always)]
+    fn shr<const N: u32>(self) -> I {
+        let n = N as i32;
+        unsafe {
+            let n = _mm_cvtsi32_si128(n);
+            I(_mm256_sra_epi32(self.0, n), _mm256_sra_epi32(self.1, n))
+        }
+    }
+}
+
 impl Simd for Token {
     type F = F;
     type M = M;
     type I = I;
 
-    const REGISTERS: usize = 8;
-
     #[inline(always)]
-    fn splat(self, v: f32) -> F {
-        let v = unsafe { _mm256_set1_ps(v) };
-        F(v, v)
-    }
-    #[inline(always)]
-    fn load(self, v: &[f32; LANES]) -> F {
-        unsafe { F(_mm256_loadu_ps(v.as_ptr()), _mm256_loadu_ps(v.as_ptr().add(8))) }
-    }
-    #[inline(always)]
-    fn store(self, v: F, to: &mut [f32; LANES]) {
-        unsafe {
-            _mm256_storeu_ps(to.as_mut_ptr(), v.0);
-            _mm256_storeu_ps(to.as_mut_ptr().add(8), v.1);
-        }
-    }
-    #[inline(always)]
-    fn store_fresh(self, v: F, to: &mut [MaybeUninit<f32>; LANES]) {
+    fn store_uninit(self, v: F, to: &mut [MaybeUninit<f32>; LANES]) {
         let to: *mut f32 = to.as_mut_ptr().cast();
         unsafe {
             _mm256_storeu_ps(to, v.0);
@@ -138,86 +320,7 @@ impl Simd for Token {
         }
     }
     #[inline(always)]
-    fn fma(self, a: F, b: F, c: F) -> F {
-        unsafe { F(_mm256_fmadd_ps(a.0, b.0, c.0), _mm256_fmadd_ps(a.1, b.1, c.1)) }
-    }
-    #[inline(always)]
-    fn fnma(self, a: F, b: F, c: F) -> F {
-        unsafe { F(_mm256_fnmadd_ps(a.0, b.0, c.0), _mm256_fnmadd_ps(a.1, b.1, c.1)) }
-    }
-    #[inline(always)]
-    fn min(self, a: F, b: F) -> F {
-        unsafe { F(_mm256_min_ps(a.0, b.0), _mm256_min_ps(a.1, b.1)) }
-    }
-    #[inline(always)]
-    fn max(self, a: F, b: F) -> F {
-        unsafe { F(_mm256_max_ps(a.0, b.0), _mm256_max_ps(a.1, b.1)) }
-    }
-    #[inline(always)]
-    fn sqrt(self, v: F) -> F {
-        unsafe { F(_mm256_sqrt_ps(v.0), _mm256_sqrt_ps(v.1)) }
-    }
-    #[inline(always)]
-    fn rough_sqrt(self, v: F) -> F {
-        unsafe {
-            F(_mm256_mul_ps(v.0, _mm256_rsqrt_ps(v.0)), _mm256_mul_ps(v.1, _mm256_rsqrt_ps(v.1)))
-        }
-    }
-    #[inline(always)]
-    fn abs(self, v: F) -> F {
-        unsafe {
-            let sign = _mm256_set1_ps(-0.0);
-            F(_mm256_andnot_ps(sign, v.0), _mm256_andnot_ps(sign, v.1))
-        }
-    }
-    #[inline(always)]
-    fn negative(self, v: F) -> F {
-        unsafe {
-            let sign = _mm256_set1_ps(-0.0);
-            F(_mm256_or_ps(v.0, sign), _mm256_or_ps(v.1, sign))
-        }
-    }
-    #[inline(always)]
-    fn floor(self, v: F) -> F {
-        unsafe { F(_mm256_floor_ps(v.0), _mm256_floor_ps(v.1)) }
-    }
-    #[inline(always)]
-    fn ceil(self, v: F) -> F {
-        unsafe { F(_mm256_ceil_ps(v.0), _mm256_ceil_ps(v.1)) }
-    }
-    #[inline(always)]
-    fn split(self, v: F) -> (F, F) {
-        const NEAREST: i32 = _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
-        let n = unsafe { F(_mm256_round_ps::<NEAREST>(v.0), _mm256_round_ps::<NEAREST>(v.1)) };
-        (n, v - n)
-    }
-    #[inline(always)]
-    fn scale(self, v: F, e: F) -> F {
-        self.of_bits(self.to_bits(v) + self.shl::<23>(self.to_int(e)))
-    }
-
-    #[inline(always)]
-    fn lt(self, a: F, b: F) -> M {
-        unsafe { M(_mm256_cmp_ps::<_CMP_LT_OQ>(a.0, b.0), _mm256_cmp_ps::<_CMP_LT_OQ>(a.1, b.1)) }
-    }
-    #[inline(always)]
-    fn le(self, a: F, b: F) -> M {
-        unsafe { M(_mm256_cmp_ps::<_CMP_LE_OQ>(a.0, b.0), _mm256_cmp_ps::<_CMP_LE_OQ>(a.1, b.1)) }
-    }
-    #[inline(always)]
-    fn select(self, m: M, a: F, b: F) -> F {
-        unsafe { F(_mm256_blendv_ps(b.0, a.0, m.0), _mm256_blendv_ps(b.1, a.1, m.1)) }
-    }
-    #[inline(always)]
-    fn keep(self, m: M, v: F) -> F {
-        unsafe { F(_mm256_and_ps(m.0, v.0), _mm256_and_ps(m.1, v.1)) }
-    }
-    #[inline(always)]
-    fn bits(self, m: M) -> u32 {
-        unsafe { _mm256_movemask_ps(m.0) as u32 | (_mm256_movemask_ps(m.1) as u32) << 8 }
-    }
-    #[inline(always)]
-    fn mask(self, bits: u32) -> M {
+    fn mask_from_bits(self, bits: u32) -> M {
         unsafe {
             let bits = _mm256_set1_epi32(bits as i32);
             let low = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
@@ -229,66 +332,11 @@ impl Simd for Token {
         }
     }
     #[inline(always)]
-    fn any(self, m: M) -> bool {
-        unsafe { _mm256_movemask_ps(_mm256_or_ps(m.0, m.1)) != 0 }
-    }
-
-    #[inline(always)]
-    fn splat_int(self, v: i32) -> I {
-        let v = unsafe { _mm256_set1_epi32(v) };
-        I(v, v)
-    }
-    #[inline(always)]
-    fn store_int(self, v: I, to: &mut [i32; LANES]) {
-        unsafe {
-            _mm256_storeu_si256(to.as_mut_ptr().cast(), v.0);
-            _mm256_storeu_si256(to.as_mut_ptr().add(8).cast(), v.1);
-        }
-    }
-    #[inline(always)]
-    fn to_bits(self, v: F) -> I {
-        unsafe { I(_mm256_castps_si256(v.0), _mm256_castps_si256(v.1)) }
-    }
-    #[inline(always)]
-    fn of_bits(self, v: I) -> F {
-        unsafe { F(_mm256_castsi256_ps(v.0), _mm256_castsi256_ps(v.1)) }
-    }
-    #[inline(always)]
-    fn to_int(self, v: F) -> I {
-        unsafe { I(_mm256_cvttps_epi32(v.0), _mm256_cvttps_epi32(v.1)) }
-    }
-    #[inline(always)]
-    fn of_int(self, v: I) -> F {
-        unsafe { F(_mm256_cvtepi32_ps(v.0), _mm256_cvtepi32_ps(v.1)) }
-    }
-    #[inline(always)]
-    fn shl<const N: u32>(self, v: I) -> I {
-        // The intrinsic's constant is an i32, which no generic u32 becomes.
-        let n = N as i32;
-        unsafe {
-            let n = _mm_cvtsi32_si128(n);
-            I(_mm256_sll_epi32(v.0, n), _mm256_sll_epi32(v.1, n))
-        }
-    }
-    #[inline(always)]
-    fn shift(self, v: I, by: I) -> I {
-        unsafe { I(_mm256_sllv_epi32(v.0, by.0), _mm256_sllv_epi32(v.1, by.1)) }
-    }
-    #[inline(always)]
-    fn shr<const N: u32>(self, v: I) -> I {
-        let n = N as i32;
-        unsafe {
-            let n = _mm_cvtsi32_si128(n);
-            I(_mm256_sra_epi32(v.0, n), _mm256_sra_epi32(v.1, n))
-        }
-    }
-
-    #[inline(always)]
     fn prefetch<T>(self, v: *const T) {
         unsafe { _mm_prefetch::<_MM_HINT_T0>(v.cast()) }
     }
     #[inline(always)]
-    fn prefetch_early<T>(self, v: *const T) {
+    fn prefetch_l2<T>(self, v: *const T) {
         unsafe { _mm_prefetch::<_MM_HINT_T1>(v.cast()) }
     }
     #[inline(always)]
@@ -296,7 +344,7 @@ impl Simd for Token {
         unsafe { sum8(_mm256_add_ps(v.0, v.1)) }
     }
     #[inline(always)]
-    fn load4(self, from: &[f32], at: &[usize; LANES], offset: usize) -> [F; 4] {
+    fn gather4(self, from: &[f32], at: &[usize; LANES], offset: usize) -> [F; 4] {
         if !all_inside(from.len(), at, offset) {
             return [self.splat(0.0); 4];
         }
@@ -316,46 +364,46 @@ impl Simd for Token {
         }
     }
     #[inline(always)]
-    unsafe fn load_lanes(self, from: *const f32, bits: u16) -> F {
+    unsafe fn load_masked(self, from: *const f32, bits: u16) -> F {
         unsafe {
             if bits == u16::MAX {
                 return self.load(&*from.cast());
             }
-            let lanes = self.mask(u32::from(bits));
+            let lanes = self.mask_from_bits(u32::from(bits));
             let low = _mm256_maskload_ps(from, _mm256_castps_si256(lanes.0));
             let high = _mm256_castps_si256(lanes.1);
             F(low, _mm256_maskload_ps(from.wrapping_add(8), high))
         }
     }
     #[inline(always)]
-    unsafe fn store_lanes(self, v: F, to: *mut MaybeUninit<f32>, bits: u16) {
+    unsafe fn store_masked(self, v: F, to: *mut MaybeUninit<f32>, bits: u16) {
         unsafe {
-            let (lanes, to) = (self.mask(u32::from(bits)), to.cast::<f32>());
+            let (lanes, to) = (self.mask_from_bits(u32::from(bits)), to.cast::<f32>());
             _mm256_maskstore_ps(to, _mm256_castps_si256(lanes.0), v.0);
             _mm256_maskstore_ps(to.wrapping_add(8), _mm256_castps_si256(lanes.1), v.1);
         }
     }
     #[inline(always)]
-    fn after(self, v: F) -> F {
+    fn rotate_left(self, v: F) -> F {
         unsafe {
-            // Quarters 1, 2, 3 and what quarter 0 holds, one place on.
+            // Quarters 1, 2, 3, and quarter 0 rotated by one lane.
             let low = _mm256_permute2f128_ps::<0x21>(v.0, v.1);
             let high = _mm256_permute2f128_ps::<0x03>(v.0, v.1);
-            let turned = _mm256_permute_ps::<0x39>(high);
-            F(low, _mm256_blend_ps::<0xf0>(high, turned))
+            let rotated = _mm256_permute_ps::<0x39>(high);
+            F(low, _mm256_blend_ps::<0xf0>(high, rotated))
         }
     }
     #[inline(always)]
-    fn before(self, v: F) -> F {
+    fn rotate_right(self, v: F) -> F {
         unsafe {
             let low = _mm256_permute2f128_ps::<0x03>(v.0, v.1);
             let high = _mm256_permute2f128_ps::<0x21>(v.0, v.1);
-            let turned = _mm256_permute_ps::<0x93>(low);
-            F(_mm256_blend_ps::<0x0f>(low, turned), high)
+            let rotated = _mm256_permute_ps::<0x93>(low);
+            F(_mm256_blend_ps::<0x0f>(low, rotated), high)
         }
     }
     #[inline(always)]
-    fn transpose4(self, v: [F; 4]) -> [F; 4] {
+    fn transpose_quarters(self, v: [F; 4]) -> [F; 4] {
         unsafe {
             let low = transpose4([v[0].0, v[1].0, v[2].0, v[3].0]);
             let high = transpose4([v[0].1, v[1].1, v[2].1, v[3].1]);
@@ -363,21 +411,21 @@ impl Simd for Token {
         }
     }
     #[inline(always)]
-    fn split_quarters(self, a: F, b: F) -> [F; 2] {
+    fn deinterleave_quarters(self, a: F, b: F) -> [F; 2] {
         unsafe {
             let ([a, c], [b, d]) = (halves(a.0, a.1), halves(b.0, b.1));
             [F(a, b), F(c, d)]
         }
     }
     #[inline(always)]
-    fn join_quarters(self, even: F, odd: F) -> [F; 2] {
+    fn interleave_quarters(self, even: F, odd: F) -> [F; 2] {
         unsafe {
             let ([a, b], [c, d]) = (halves(even.0, odd.0), halves(even.1, odd.1));
             [F(a, b), F(c, d)]
         }
     }
     #[inline(always)]
-    fn zip(self, a: F, b: F) -> [F; 2] {
+    fn interleave(self, a: F, b: F) -> [F; 2] {
         unsafe {
             let [p, q] = halves(_mm256_unpacklo_ps(a.0, b.0), _mm256_unpackhi_ps(a.0, b.0));
             let [r, t] = halves(_mm256_unpacklo_ps(a.1, b.1), _mm256_unpackhi_ps(a.1, b.1));
@@ -385,7 +433,7 @@ impl Simd for Token {
         }
     }
     #[inline(always)]
-    fn unzip(self, a: F, b: F) -> [F; 2] {
+    fn deinterleave(self, a: F, b: F) -> [F; 2] {
         unsafe {
             let ([a, c], [b, d]) = (halves(a.0, a.1), halves(b.0, b.1));
             let even = F(_mm256_shuffle_ps::<0x88>(a, c), _mm256_shuffle_ps::<0x88>(b, d));
@@ -418,7 +466,7 @@ impl Simd for Token {
     }
 }
 
-/// Both first halves, and both second ones.
+/// The first halves of `a` and `b`, and the second halves.
 #[inline(always)]
 unsafe fn halves(a: __m256, b: __m256) -> [__m256; 2] {
     unsafe { [_mm256_permute2f128_ps::<0x20>(a, b), _mm256_permute2f128_ps::<0x31>(a, b)] }

@@ -1,15 +1,18 @@
-//! AVX-512: sixteen lanes in one register, truths in a mask register.
+//! AVX-512: sixteen lanes in one register, truth values in a mask register.
 //!
-//! SAFETY of every block below: the intrinsics need x86-64-v4. A vector comes only
-//! from [`Token`], and a token only from [`run`], whose caller has asked the
-//! processor. Loads and stores go through references to whole arrays, or to places
-//! checked beforehand.
+//! SAFETY of every block below: the intrinsics need x86-64-v4. A [`Token`] exists in
+//! [`run`] only, whose caller checked the processor, and the vector types are reachable
+//! through it only. Loads and stores go through references to whole arrays, or to places
+//! that were checked before.
 #![expect(clippy::undocumented_unsafe_blocks, reason = "one reason for all, stated above")]
 
-use super::{Floats, Ints, Kernel, LANES, Mask, Simd, all_inside};
+use super::{
+    F32Vector, IntVector, Kernel, LANES, Mask, RowLayout, Simd, Vector, all_inside, elementary,
+    first_lanes_bits, rows,
+};
 use std::arch::x86_64::*;
 use std::mem::MaybeUninit;
-use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
+use std::ops::{Add, BitAnd, BitOr, BitXor, Div, Mul, Neg, Not, Sub};
 
 /// Proof that the processor has x86-64-v4.
 #[derive(Clone, Copy)]
@@ -27,11 +30,7 @@ pub(super) struct M(__mmask16);
 #[repr(transparent)]
 pub(super) struct I(__m512i);
 
-impl Floats for F {}
-impl Mask for M {}
-impl Ints for I {}
-
-/// Whether the processor has what [`run`] needs.
+/// Tells whether the processor has the features that [`run`] needs.
 pub(super) fn detected() -> bool {
     super::avx2::detected()
         && is_x86_feature_detected!("avx512f")
@@ -44,7 +43,7 @@ pub(super) fn detected() -> bool {
 /// Runs `kernel` compiled for x86-64-v4.
 ///
 /// # Safety
-/// [`detected`] must have said yes.
+/// [`detected`] returned true.
 #[target_feature(
     enable = "avx512f,avx512bw,avx512cd,avx512dq,avx512vl,avx2,fma,bmi1,bmi2,lzcnt,popcnt"
 )]
@@ -73,6 +72,7 @@ operators! {
     I Sub sub _mm512_sub_epi32;
     I BitAnd bitand _mm512_and_si512;
     I BitOr bitor _mm512_or_si512;
+    I BitXor bitxor _mm512_xor_si512;
     M BitAnd bitand _kand_mask16;
     M BitOr bitor _kor_mask16;
 }
@@ -93,154 +93,205 @@ impl Not for M {
     }
 }
 
+impl Vector for F {
+    type Element = f32;
+    type Mask = M;
+    const LANES: usize = LANES;
+    const REGISTERS: usize = 32;
+
+    #[inline(always)]
+    fn splat(v: f32) -> F {
+        F(unsafe { _mm512_set1_ps(v) })
+    }
+    #[inline(always)]
+    fn constant(v: f64) -> F {
+        F::splat(v as f32)
+    }
+    #[inline(always)]
+    fn load(v: &[f32; LANES]) -> F {
+        F(unsafe { _mm512_loadu_ps(v.as_ptr()) })
+    }
+    #[inline(always)]
+    fn store(self, to: &mut [f32; LANES]) {
+        unsafe { _mm512_storeu_ps(to.as_mut_ptr(), self.0) }
+    }
+    #[inline(always)]
+    fn load_rows<const L: usize>(rows: &[f32], layout: RowLayout) -> [F; L] {
+        if L == 4 && layout == DENSE_4 && rows.len() >= 4 * LANES {
+            let columns = unsafe { columns_of_4(rows.as_ptr()) };
+            let mut out = [F::splat(0.0); L];
+            for (out, column) in out.iter_mut().zip(columns) {
+                *out = F(column);
+            }
+            return out;
+        }
+        rows::load_transposed(Token(()), rows, layout)
+    }
+    #[inline(always)]
+    fn store_rows<const L: usize>(from: &[F; L], layout: RowLayout, rows: &mut [f32]) {
+        if L == 4 && layout == DENSE_4 && rows.len() >= 4 * LANES {
+            let mut columns = [unsafe { _mm512_setzero_ps() }; 4];
+            for (column, from) in columns.iter_mut().zip(from) {
+                *column = from.0;
+            }
+            unsafe { rows_of_4(columns, rows.as_mut_ptr()) };
+            return;
+        }
+        assert!(layout.fits(L, rows.len()), "rows: past the end of the slice");
+        let lines = rows::transposed(Token(()), from);
+        let bits = first_lanes_bits(L);
+        for (lane, line) in lines.iter().enumerate().take(layout.count) {
+            unsafe {
+                let row = rows.as_mut_ptr().add(lane * layout.stride);
+                Token(()).store_masked(*line, row.cast(), bits);
+            }
+        }
+    }
+    #[inline(always)]
+    fn fma(self, b: F, c: F) -> F {
+        F(unsafe { _mm512_fmadd_ps(self.0, b.0, c.0) })
+    }
+    #[inline(always)]
+    fn fnma(self, b: F, c: F) -> F {
+        F(unsafe { _mm512_fnmadd_ps(self.0, b.0, c.0) })
+    }
+    #[inline(always)]
+    fn max(self, other: F) -> F {
+        F(unsafe { _mm512_max_ps(other.0, self.0) })
+    }
+    #[inline(always)]
+    fn min(self, other: F) -> F {
+        F(unsafe { _mm512_min_ps(other.0, self.0) })
+    }
+    #[inline(always)]
+    fn sqrt(self) -> F {
+        F(unsafe { _mm512_sqrt_ps(self.0) })
+    }
+    #[inline(always)]
+    fn abs(self) -> F {
+        F(unsafe { _mm512_abs_ps(self.0) })
+    }
+    #[inline(always)]
+    fn floor(self) -> F {
+        const DOWN: i32 = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
+        F(unsafe { _mm512_roundscale_ps::<DOWN>(self.0) })
+    }
+    #[inline(always)]
+    fn lt(self, other: F) -> M {
+        M(unsafe { _mm512_cmp_ps_mask::<_CMP_LT_OQ>(self.0, other.0) })
+    }
+    #[inline(always)]
+    fn le(self, other: F) -> M {
+        M(unsafe { _mm512_cmp_ps_mask::<_CMP_LE_OQ>(self.0, other.0) })
+    }
+    elementary::functions!();
+}
+
+impl F32Vector for F {
+    type Int = I;
+
+    #[inline(always)]
+    fn approx_sqrt(self) -> F {
+        F(unsafe { _mm512_mul_ps(self.0, _mm512_rsqrt14_ps(self.0)) })
+    }
+    #[inline(always)]
+    fn neg_abs(self) -> F {
+        F(unsafe { _mm512_or_ps(self.0, _mm512_set1_ps(-0.0)) })
+    }
+    #[inline(always)]
+    fn ceil(self) -> F {
+        const UP: i32 = _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC;
+        F(unsafe { _mm512_roundscale_ps::<UP>(self.0) })
+    }
+    #[inline(always)]
+    fn round_and_fraction(self) -> (F, F) {
+        const NEAREST: i32 = _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
+        let n = F(unsafe { _mm512_roundscale_ps::<NEAREST>(self.0) });
+        (n, self - n)
+    }
+    #[inline(always)]
+    fn scale_by_power_of_two(self, e: F) -> F {
+        F(unsafe { _mm512_scalef_ps(self.0, e.0) })
+    }
+    #[inline(always)]
+    fn to_bits(self) -> I {
+        I(unsafe { _mm512_castps_si512(self.0) })
+    }
+    #[inline(always)]
+    fn from_bits(v: I) -> F {
+        F(unsafe { _mm512_castsi512_ps(v.0) })
+    }
+    #[inline(always)]
+    fn to_int(self) -> I {
+        I(unsafe { _mm512_cvttps_epi32(self.0) })
+    }
+    #[inline(always)]
+    fn from_int(v: I) -> F {
+        F(unsafe { _mm512_cvtepi32_ps(v.0) })
+    }
+}
+
+impl Mask<F> for M {
+    #[inline(always)]
+    fn select(self, a: F, b: F) -> F {
+        F(unsafe { _mm512_mask_blend_ps(self.0, b.0, a.0) })
+    }
+    #[inline(always)]
+    fn select_or_zero(self, v: F) -> F {
+        F(unsafe { _mm512_maskz_mov_ps(self.0, v.0) })
+    }
+    #[inline(always)]
+    fn any(self) -> bool {
+        self.0 != 0
+    }
+    #[inline(always)]
+    fn to_bits(self) -> u32 {
+        u32::from(self.0)
+    }
+}
+
+impl IntVector for I {
+    #[inline(always)]
+    fn splat(v: i32) -> I {
+        I(unsafe { _mm512_set1_epi32(v) })
+    }
+    #[inline(always)]
+    fn store(self, to: &mut [i32; LANES]) {
+        unsafe { _mm512_storeu_si512(to.as_mut_ptr().cast(), self.0) }
+    }
+    #[inline(always)]
+    fn shl<const N: u32>(self) -> I {
+        I(unsafe { _mm512_slli_epi32::<N>(self.0) })
+    }
+    #[inline(always)]
+    fn shl_each(self, by: I) -> I {
+        I(unsafe { _mm512_sllv_epi32(self.0, by.0) })
+    }
+    #[inline(always)]
+    fn shr<const N: u32>(self) -> I {
+        I(unsafe { _mm512_srai_epi32::<N>(self.0) })
+    }
+}
+
 impl Simd for Token {
     type F = F;
     type M = M;
     type I = I;
 
-    const REGISTERS: usize = 32;
-
     #[inline(always)]
-    fn splat(self, v: f32) -> F {
-        F(unsafe { _mm512_set1_ps(v) })
-    }
-    #[inline(always)]
-    fn load(self, v: &[f32; LANES]) -> F {
-        F(unsafe { _mm512_loadu_ps(v.as_ptr()) })
-    }
-    #[inline(always)]
-    fn store(self, v: F, to: &mut [f32; LANES]) {
-        unsafe { _mm512_storeu_ps(to.as_mut_ptr(), v.0) }
-    }
-    #[inline(always)]
-    fn store_fresh(self, v: F, to: &mut [MaybeUninit<f32>; LANES]) {
+    fn store_uninit(self, v: F, to: &mut [MaybeUninit<f32>; LANES]) {
         unsafe { _mm512_storeu_ps(to.as_mut_ptr().cast(), v.0) }
     }
     #[inline(always)]
-    fn fma(self, a: F, b: F, c: F) -> F {
-        F(unsafe { _mm512_fmadd_ps(a.0, b.0, c.0) })
-    }
-    #[inline(always)]
-    fn fnma(self, a: F, b: F, c: F) -> F {
-        F(unsafe { _mm512_fnmadd_ps(a.0, b.0, c.0) })
-    }
-    #[inline(always)]
-    fn min(self, a: F, b: F) -> F {
-        F(unsafe { _mm512_min_ps(a.0, b.0) })
-    }
-    #[inline(always)]
-    fn max(self, a: F, b: F) -> F {
-        F(unsafe { _mm512_max_ps(a.0, b.0) })
-    }
-    #[inline(always)]
-    fn sqrt(self, v: F) -> F {
-        F(unsafe { _mm512_sqrt_ps(v.0) })
-    }
-    #[inline(always)]
-    fn rough_sqrt(self, v: F) -> F {
-        F(unsafe { _mm512_mul_ps(v.0, _mm512_rsqrt14_ps(v.0)) })
-    }
-    #[inline(always)]
-    fn abs(self, v: F) -> F {
-        F(unsafe { _mm512_abs_ps(v.0) })
-    }
-    #[inline(always)]
-    fn negative(self, v: F) -> F {
-        F(unsafe { _mm512_or_ps(v.0, _mm512_set1_ps(-0.0)) })
-    }
-    #[inline(always)]
-    fn floor(self, v: F) -> F {
-        const DOWN: i32 = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
-        F(unsafe { _mm512_roundscale_ps::<DOWN>(v.0) })
-    }
-    #[inline(always)]
-    fn ceil(self, v: F) -> F {
-        const UP: i32 = _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC;
-        F(unsafe { _mm512_roundscale_ps::<UP>(v.0) })
-    }
-    #[inline(always)]
-    fn split(self, v: F) -> (F, F) {
-        const NEAREST: i32 = _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
-        let n = F(unsafe { _mm512_roundscale_ps::<NEAREST>(v.0) });
-        (n, v - n)
-    }
-    #[inline(always)]
-    fn scale(self, v: F, e: F) -> F {
-        F(unsafe { _mm512_scalef_ps(v.0, e.0) })
-    }
-
-    #[inline(always)]
-    fn lt(self, a: F, b: F) -> M {
-        M(unsafe { _mm512_cmp_ps_mask::<_CMP_LT_OQ>(a.0, b.0) })
-    }
-    #[inline(always)]
-    fn le(self, a: F, b: F) -> M {
-        M(unsafe { _mm512_cmp_ps_mask::<_CMP_LE_OQ>(a.0, b.0) })
-    }
-    #[inline(always)]
-    fn select(self, m: M, a: F, b: F) -> F {
-        F(unsafe { _mm512_mask_blend_ps(m.0, b.0, a.0) })
-    }
-    #[inline(always)]
-    fn keep(self, m: M, v: F) -> F {
-        F(unsafe { _mm512_maskz_mov_ps(m.0, v.0) })
-    }
-    #[inline(always)]
-    fn bits(self, m: M) -> u32 {
-        u32::from(m.0)
-    }
-    #[inline(always)]
-    fn mask(self, bits: u32) -> M {
+    fn mask_from_bits(self, bits: u32) -> M {
         M(bits as u16)
     }
-    #[inline(always)]
-    fn any(self, m: M) -> bool {
-        m.0 != 0
-    }
-
-    #[inline(always)]
-    fn splat_int(self, v: i32) -> I {
-        I(unsafe { _mm512_set1_epi32(v) })
-    }
-    #[inline(always)]
-    fn store_int(self, v: I, to: &mut [i32; LANES]) {
-        unsafe { _mm512_storeu_si512(to.as_mut_ptr().cast(), v.0) }
-    }
-    #[inline(always)]
-    fn to_bits(self, v: F) -> I {
-        I(unsafe { _mm512_castps_si512(v.0) })
-    }
-    #[inline(always)]
-    fn of_bits(self, v: I) -> F {
-        F(unsafe { _mm512_castsi512_ps(v.0) })
-    }
-    #[inline(always)]
-    fn to_int(self, v: F) -> I {
-        I(unsafe { _mm512_cvttps_epi32(v.0) })
-    }
-    #[inline(always)]
-    fn of_int(self, v: I) -> F {
-        F(unsafe { _mm512_cvtepi32_ps(v.0) })
-    }
-    #[inline(always)]
-    fn shl<const N: u32>(self, v: I) -> I {
-        I(unsafe { _mm512_slli_epi32::<N>(v.0) })
-    }
-    #[inline(always)]
-    fn shift(self, v: I, by: I) -> I {
-        I(unsafe { _mm512_sllv_epi32(v.0, by.0) })
-    }
-    #[inline(always)]
-    fn shr<const N: u32>(self, v: I) -> I {
-        I(unsafe { _mm512_srai_epi32::<N>(v.0) })
-    }
-
     #[inline(always)]
     fn prefetch<T>(self, v: *const T) {
         unsafe { _mm_prefetch::<_MM_HINT_T0>(v.cast()) }
     }
     #[inline(always)]
-    fn prefetch_early<T>(self, v: *const T) {
+    fn prefetch_l2<T>(self, v: *const T) {
         unsafe { _mm_prefetch::<_MM_HINT_T1>(v.cast()) }
     }
     #[inline(always)]
@@ -259,7 +310,7 @@ impl Simd for Token {
             for (a, v) in a.iter_mut().zip(v) {
                 *a = v.0;
             }
-            // Two vectors make one of half sums, four times.
+            // Each of four steps adds halves of two vectors into one vector.
             for i in 0..8 {
                 let (x, y) = (a[2 * i], a[2 * i + 1]);
                 let own = _mm512_mask_blend_ps(0xff00, x, y);
@@ -286,15 +337,15 @@ impl Simd for Token {
         first
     }
     #[inline(always)]
-    fn load4(self, from: &[f32], at: &[usize; LANES], offset: usize) -> [F; 4] {
+    fn gather4(self, from: &[f32], at: &[usize; LANES], offset: usize) -> [F; 4] {
         if !all_inside(from.len(), at, offset) {
             return [self.splat(0.0); 4];
         }
         unsafe {
             let p = from.as_ptr().add(offset);
             let mut joined = [_mm512_setzero_ps(); 4];
-            // Rows i, i + 4, i + 8, i + 12 side by side: the 4×4 transposes inside
-            // 128-bit parts then leave rows in order.
+            // Rows i, i + 4, i + 8, i + 12 form a vector, so that the 4×4 transposes inside
+            // 128-bit parts leave the rows in order.
             for i in 0..4 {
                 let v = _mm512_castps128_ps512(_mm_loadu_ps(p.add(at[i])));
                 let v = _mm512_insertf32x4::<1>(v, _mm_loadu_ps(p.add(at[i + 4])));
@@ -306,41 +357,41 @@ impl Simd for Token {
         }
     }
     #[inline(always)]
-    unsafe fn load_lanes(self, from: *const f32, bits: u16) -> F {
+    unsafe fn load_masked(self, from: *const f32, bits: u16) -> F {
         F(unsafe { _mm512_maskz_loadu_ps(bits, from) })
     }
     #[inline(always)]
-    unsafe fn store_lanes(self, v: F, to: *mut MaybeUninit<f32>, bits: u16) {
+    unsafe fn store_masked(self, v: F, to: *mut MaybeUninit<f32>, bits: u16) {
         unsafe { _mm512_mask_storeu_ps(to.cast(), bits, v.0) }
     }
     #[inline(always)]
-    fn after(self, v: F) -> F {
+    fn rotate_left(self, v: F) -> F {
         unsafe {
             let next = _mm512_setr_epi32(4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 1, 2, 3, 0);
             F(_mm512_permutexvar_ps(next, v.0))
         }
     }
     #[inline(always)]
-    fn before(self, v: F) -> F {
+    fn rotate_right(self, v: F) -> F {
         unsafe {
             let last = _mm512_setr_epi32(15, 12, 13, 14, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11);
             F(_mm512_permutexvar_ps(last, v.0))
         }
     }
     #[inline(always)]
-    fn transpose4(self, v: [F; 4]) -> [F; 4] {
+    fn transpose_quarters(self, v: [F; 4]) -> [F; 4] {
         let [a, b, c, d] = unsafe { transpose4([v[0].0, v[1].0, v[2].0, v[3].0]) };
         [F(a), F(b), F(c), F(d)]
     }
     #[inline(always)]
-    fn split_quarters(self, a: F, b: F) -> [F; 2] {
+    fn deinterleave_quarters(self, a: F, b: F) -> [F; 2] {
         unsafe {
             let even = _mm512_shuffle_f32x4::<0x88>(a.0, b.0);
             [F(even), F(_mm512_shuffle_f32x4::<0xdd>(a.0, b.0))]
         }
     }
     #[inline(always)]
-    fn join_quarters(self, even: F, odd: F) -> [F; 2] {
+    fn interleave_quarters(self, even: F, odd: F) -> [F; 2] {
         unsafe {
             let (even, odd) = (_mm512_castps_pd(even.0), _mm512_castps_pd(odd.0));
             let low = _mm512_setr_epi64(0, 1, 8, 9, 2, 3, 10, 11);
@@ -351,7 +402,7 @@ impl Simd for Token {
         }
     }
     #[inline(always)]
-    fn zip(self, a: F, b: F) -> [F; 2] {
+    fn interleave(self, a: F, b: F) -> [F; 2] {
         unsafe {
             let low = _mm512_setr_epi32(0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
             let high =
@@ -361,7 +412,7 @@ impl Simd for Token {
         }
     }
     #[inline(always)]
-    fn unzip(self, a: F, b: F) -> [F; 2] {
+    fn deinterleave(self, a: F, b: F) -> [F; 2] {
         unsafe {
             let even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
             let odd = _mm512_setr_epi32(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
@@ -405,5 +456,52 @@ unsafe fn transpose4(v: [__m512; 4]) -> [__m512; 4] {
             _mm512_shuffle_ps::<0x44>(b, d),
             _mm512_shuffle_ps::<0xee>(b, d),
         ]
+    }
+}
+
+/// Sixteen adjacent rows of 4.
+const DENSE_4: RowLayout = RowLayout { stride: 4, count: LANES };
+
+/// Loads 16 adjacent rows of 4 as 4 columns: 4 loads and 8 shuffles.
+///
+/// # Safety
+/// `from` points to 64 floats.
+#[inline(always)]
+unsafe fn columns_of_4(from: *const f32) -> [__m512; 4] {
+    unsafe {
+        // Elements 0 and 1 of 8 rows, then 2 and 3: half a vector each.
+        let first = _mm512_setr_epi32(0, 4, 8, 12, 16, 20, 24, 28, 1, 5, 9, 13, 17, 21, 25, 29);
+        let second = _mm512_add_epi32(first, _mm512_set1_epi32(2));
+        let v = [0, 16, 32, 48].map(|i| _mm512_loadu_ps(from.add(i)));
+        let a = _mm512_permutex2var_ps(v[0], first, v[1]);
+        let b = _mm512_permutex2var_ps(v[0], second, v[1]);
+        let c = _mm512_permutex2var_ps(v[2], first, v[3]);
+        let d = _mm512_permutex2var_ps(v[2], second, v[3]);
+        [
+            _mm512_shuffle_f32x4::<0x44>(a, c),
+            _mm512_shuffle_f32x4::<0xee>(a, c),
+            _mm512_shuffle_f32x4::<0x44>(b, d),
+            _mm512_shuffle_f32x4::<0xee>(b, d),
+        ]
+    }
+}
+
+/// The inverse of [`columns_of_4`].
+///
+/// # Safety
+/// `to` points to 64 floats.
+#[inline(always)]
+unsafe fn rows_of_4(v: [__m512; 4], to: *mut f32) {
+    unsafe {
+        let first = _mm512_setr_epi32(0, 8, 16, 24, 1, 9, 17, 25, 2, 10, 18, 26, 3, 11, 19, 27);
+        let second = _mm512_add_epi32(first, _mm512_set1_epi32(4));
+        let a = _mm512_shuffle_f32x4::<0x44>(v[0], v[1]);
+        let b = _mm512_shuffle_f32x4::<0x44>(v[2], v[3]);
+        let c = _mm512_shuffle_f32x4::<0xee>(v[0], v[1]);
+        let d = _mm512_shuffle_f32x4::<0xee>(v[2], v[3]);
+        _mm512_storeu_ps(to, _mm512_permutex2var_ps(a, first, b));
+        _mm512_storeu_ps(to.add(16), _mm512_permutex2var_ps(a, second, b));
+        _mm512_storeu_ps(to.add(32), _mm512_permutex2var_ps(c, first, d));
+        _mm512_storeu_ps(to.add(48), _mm512_permutex2var_ps(c, second, d));
     }
 }

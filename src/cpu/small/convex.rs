@@ -5,7 +5,8 @@
 //! Logits `[B, 16·9, h, w]` (fine pixel 4·row + column, then neighbour 3·row + column),
 //! maps `[B, h, w]`, out `[2, B, 4h, 4w]`.
 
-use crate::cpu::math::{exp, vectorised};
+use crate::cpu::simd::elementary::exp;
+use crate::cpu::simd::vectorize;
 use rayon::prelude::*;
 
 const LANES: usize = 16;
@@ -106,7 +107,7 @@ pub fn forward(c: &Convex, logits: &[f32], maps: [&[f32]; 2], out: &mut [f32]) {
         let (b, y) = (i / h, i % h);
         let logits = &logits[b * mask..(b + 1) * mask];
         let around = [&padded[0][b], &padded[1][b]];
-        vectorised(
+        vectorize(
             #[inline(always)]
             || {
                 for x in (0..w).step_by(LANES) {
@@ -165,7 +166,7 @@ pub fn backward(
                 ],
             };
             let mut sums = [vec![0f32; (h + 2) * (w + 2)], vec![0f32; (h + 2) * (w + 2)]];
-            vectorised(
+            vectorize(
                 #[inline(always)]
                 || job.run(d_logits, &mut sums),
             );

@@ -4,10 +4,11 @@
 //! the mass Σ p over |k − mode| ≤ window. The mean is over all candidates, or over the
 //! window alone (divided by its mass). The mode is a constant to gradients.
 
-use crate::cpu::math::{exp, vectorised};
+use crate::cpu::simd::elementary::exp;
+use crate::cpu::simd::vectorize;
 use rayon::prelude::*;
 
-/// Pixels that a loop handles at once.
+/// Pixels per step of a loop.
 const LANES: usize = 16;
 
 /// Sizes and rules.
@@ -23,7 +24,7 @@ pub struct Expectation {
     pub windowed: bool,
 }
 
-/// What the softmax of one pixel comes down to.
+/// Results of the softmax of one pixel.
 #[derive(Clone, Copy, Debug, Default)]
 struct Pixel {
     /// Largest logit, and 1 / Σ e^{logit − max}.
@@ -60,7 +61,7 @@ impl Expectation {
         let (mut first, mut first_near) = ([0f32; LANES], [0f32; LANES]);
         for k in 0..d {
             let x = row(k);
-            // From the mode, so that sums lose nothing to large indices.
+            // Indices count from the mode, so that sums do not lose digits to large ones.
             for l in 0..LANES {
                 let e = exp(x[l] - max[l]);
                 let away = k as f32 - mode[l];
@@ -88,7 +89,7 @@ pub fn forward(e: &Expectation, logits: &[f32], out: &mut [f32]) {
     maps.zip(logits.par_chunks_exact(d * n)).for_each(|((means, masses), logits)| {
         let parts = means.par_chunks_mut(LANES).zip(masses.par_chunks_mut(LANES));
         parts.enumerate().with_min_len(8).for_each(|(i, (means, masses))| {
-            let pixels = vectorised(
+            let pixels = vectorize(
                 #[inline(always)]
                 || e.pixels(logits, i * LANES, means.len()),
             );
@@ -106,7 +107,7 @@ pub fn backward(e: &Expectation, logits: &[f32], grad: &[f32], out: &mut [f32]) 
     let mut pixels = vec![Pixel::default(); d_means.len()];
     pixels.par_chunks_exact_mut(n).zip(logits.par_chunks_exact(d * n)).for_each(|(all, logits)| {
         all.par_chunks_mut(LANES).enumerate().with_min_len(8).for_each(|(i, part)| {
-            let found = vectorised(
+            let found = vectorize(
                 #[inline(always)]
                 || e.pixels(logits, i * LANES, part.len()),
             );
@@ -120,7 +121,7 @@ pub fn backward(e: &Expectation, logits: &[f32], grad: &[f32], out: &mut [f32]) 
         let (b, k) = (plane / d, (plane % d) as f32);
         let (pixels, x) = (&pixels[b * n..(b + 1) * n], &logits[plane * n..(plane + 1) * n]);
         let grads = d_means[b * n..(b + 1) * n].iter().zip(&d_masses[b * n..(b + 1) * n]);
-        vectorised(
+        vectorize(
             #[inline(always)]
             || {
                 for (((out, x), p), (g, m)) in out.iter_mut().zip(x).zip(pixels).zip(grads) {

@@ -1,4 +1,4 @@
-//! What stands before and after the two convolutions of the small backbone's heads.
+//! Input and output of the two convolutions of the small backbone's heads.
 //!
 //! Before: `[B, C + 5, H, W]` of the projected features upsampled to the picture's size
 //! (bilinear, corners aligned), the picture, disparity as a share of the largest
@@ -6,8 +6,8 @@
 //! opacity `[B, H·W]`.
 
 use crate::cpu::activation::sigmoid;
-use crate::cpu::math::vectorised;
 use crate::cpu::resize::{Bilinear, Resize};
+use crate::cpu::simd::vectorize;
 use rayon::prelude::*;
 
 /// Channels of [`Input`] beside the features.
@@ -24,7 +24,7 @@ pub struct Input {
     pub channels: usize,
     /// Feature map and picture.
     pub resize: Resize,
-    /// What disparity (in candidate indices) is multiplied by.
+    /// Factor of disparity (in candidate indices).
     pub share: f32,
 }
 
@@ -70,7 +70,7 @@ impl Input {
         let mut d_confidence = vec![0f32; batch * n];
         d_confidence.par_chunks_exact_mut(n).enumerate().for_each(|(b, dx)| {
             let x = &confidence[b * n..(b + 1) * n];
-            vectorised(
+            vectorize(
                 #[inline(always)]
                 || {
                     for ((dx, x), dy) in dx.iter_mut().zip(x).zip(side(4, b)) {
@@ -86,7 +86,7 @@ impl Input {
 
 #[inline(always)]
 fn map(x: &[f32], y: &mut [f32], f: impl Fn(f32) -> f32) {
-    vectorised(
+    vectorize(
         #[inline(always)]
         || {
             for (y, x) in y.iter_mut().zip(x) {
@@ -106,8 +106,8 @@ pub struct Output {
     pub size: [usize; 2],
     /// `[R]`: added to every raw row.
     pub start: Vec<f32>,
-    /// Where the pixel's own colour is added: its three places in a row, and factor and
-    /// offset of the colour in [0, 1].
+    /// Offsets in a row that the pixel's own colour is added to, and factor and offset of the
+    /// colour in [0, 1].
     pub colour: Option<([usize; 3], f32, f32)>,
     /// Opacity is σ(confidence + residual)²; else σ(residual + 2).
     pub confident: bool,
@@ -147,7 +147,7 @@ impl Output {
         let (n, r) = (self.plane(), self.raw);
         y.par_chunks_exact_mut(n).enumerate().for_each(|(b, y)| {
             let (x, c) = (&x[(b * (r + 1) + r) * n..][..n], &confidence[b * n..][..n]);
-            vectorised(
+            vectorize(
                 #[inline(always)]
                 || {
                     for ((y, x), c) in y.iter_mut().zip(x).zip(c) {
@@ -173,7 +173,7 @@ impl Output {
         d_logit.par_chunks_exact_mut(n).enumerate().for_each(|(b, d)| {
             let (x, c) = (&x[(b * (r + 1) + r) * n..][..n], &confidence[b * n..][..n]);
             let g = &d_opacity[b * n..][..n];
-            vectorised(
+            vectorize(
                 #[inline(always)]
                 || {
                     for (((d, x), c), g) in d.iter_mut().zip(x).zip(c).zip(g) {

@@ -1,6 +1,6 @@
 //! Channels of each pixel to unit length: y = x / √(Σ_c x² + ε), `[B, C, n]`.
 
-use crate::cpu::math::vectorised;
+use crate::cpu::simd::vectorize;
 use rayon::prelude::*;
 
 /// ε under the root.
@@ -23,7 +23,7 @@ fn inverse(channels: usize, n: usize, x: &[f32], at: usize, out: &mut [f32]) {
 pub fn forward(channels: usize, n: usize, x: &[f32], y: &mut [f32]) {
     let maps = x.par_chunks_exact(channels * n).zip(y.par_chunks_exact_mut(channels * n));
     maps.for_each(|(x, y)| {
-        vectorised(
+        vectorize(
             #[inline(always)]
             || {
                 let mut scale = [0f32; PIXELS];
@@ -46,7 +46,7 @@ pub fn forward(channels: usize, n: usize, x: &[f32], y: &mut [f32]) {
 pub fn backward(channels: usize, n: usize, x: &[f32], dy: &[f32], dx: &mut [f32]) {
     let maps = x.par_chunks_exact(channels * n).zip(dy.par_chunks_exact(channels * n));
     maps.zip(dx.par_chunks_exact_mut(channels * n)).for_each(|((x, dy), dx)| {
-        vectorised(
+        vectorize(
             #[inline(always)]
             || {
                 let (mut scale, mut along) = ([0f32; PIXELS], [0f32; PIXELS]);

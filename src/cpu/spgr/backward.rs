@@ -1,7 +1,8 @@
-//! Gradients of the children with respect to head records and parents (spec 2.12),
-//! everything recomputed from the inputs: a first walk over the children for their
-//! areas, which the opacity rule couples, and a second one for the rest. Gains depend
-//! on one lane of the head records alone and have a pass of their own.
+//! Gradients of the children with respect to head records and parents.
+//!
+//! The pass recomputes everything from the inputs. A first loop over the children computes
+//! their areas, which the opacity rule couples; a second loop computes the rest. Gains
+//! depend on one number of a head record and have a pass of their own.
 
 use super::child::{Child, ChildGradient};
 use super::parent::{Parent, ParentGradient};
@@ -11,14 +12,14 @@ use crate::abi::{
     HEAD_GAIN_OFFSET, HEAD_LOGIT_OFFSET, HEAD_STRIDE, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET,
     SCALE_OFFSET, SPLAT_STRIDE,
 };
-use crate::cpu::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};
 use crate::cpu::redistribute::share_backward;
+use crate::cpu::simd::{LANES, Real, RowLayout, Vector, VectorKernel};
 use rayon::prelude::*;
 
 /// One block of parents; the mutable slices are the block's own.
 struct Backward<'a, T> {
     args: Args<'a, T>,
-    /// By children, `[N·K, 11]`.
+    /// With respect to children, `[N·K, 11]`.
     grad: &'a [T],
     table: &'a Table<T>,
     range: std::ops::Range<usize>,
@@ -26,86 +27,85 @@ struct Backward<'a, T> {
     parents: &'a mut [T],
 }
 
-/// A vector per child, reused from group to group.
+/// Vectors per child, reused from group to group.
 struct Scratch<V> {
     areas: Vec<V>,
     logits: Vec<V>,
     alphas: Vec<V>,
 }
 
-impl<T: LaneReal> Kernel<T> for Backward<'_, T> {
+impl<T: Real> VectorKernel<T> for Backward<'_, T> {
     type Output = ();
     #[inline(always)]
-    fn run<M: Machine<Scalar = T>>(mut self, m: M) {
-        let zeros = vec![m.of(0.0); self.args.rules.children()];
+    fn run<V: Vector<Element = T>>(mut self) {
+        let zeros = vec![V::constant(0.0); self.args.rules.children()];
         let mut scratch = Scratch { areas: zeros.clone(), logits: zeros.clone(), alphas: zeros };
-        for first in self.range.clone().step_by(M::WIDTH) {
-            let count = M::WIDTH.min(self.range.end - first);
-            self.group(m, (first, count), &mut scratch);
+        for first in self.range.clone().step_by(V::LANES) {
+            let count = V::LANES.min(self.range.end - first);
+            self.group((first, count), &mut scratch);
         }
     }
 }
 
-impl<T: LaneReal> Backward<'_, T> {
+impl<T: Real> Backward<'_, T> {
     #[inline(always)]
-    fn group<M: Machine<Scalar = T>>(&mut self, m: M, span: (usize, usize), s: &mut Scratch<M::V>) {
+    fn group<V: Vector<Element = T>>(&mut self, span: (usize, usize), s: &mut Scratch<V>) {
         let Args { rules, source, parents, .. } = self.args;
         let children = rules.children();
-        let parent = Parent::load(m, (rules, self.table, &source), parents, span);
+        let parent = Parent::load((rules, self.table, &source), parents, span);
         for k in 0..children {
-            let head = records(m, &self.args, span, k);
+            let head = records(&self.args, span, k);
             let child = Child::new(rules, &parent, k, &head);
             (s.areas[k], s.logits[k]) = (child.area, head[HEAD_LOGIT_OFFSET]);
-            s.alphas[k] = self.opacity(m, span, k);
+            s.alphas[k] = self.opacity(span, k);
         }
-        let mut d = ParentGradient::zero(m.of(0.0));
+        let mut d = ParentGradient::zero(V::constant(0.0));
         let of_parent = (parent.alpha, parent.own);
         (d.alpha, d.own) =
             share_backward(rules.opacity, of_parent, &mut s.alphas, &mut s.logits, &mut s.areas);
         let at = span.0 - self.range.start;
         for k in 0..children {
-            let head = records(m, &self.args, span, k);
+            let head = records(&self.args, span, k);
             let child = Child::new(rules, &parent, k, &head);
-            let mut d_head = [m.of(0.0); HEAD_STRIDE];
+            let mut d_head = [V::constant(0.0); HEAD_STRIDE];
             d_head[HEAD_LOGIT_OFFSET] = s.logits[k];
-            let g = self.cotangents(m, span, k, s.areas[k]);
+            let g = self.cotangents(span, k, s.areas[k]);
             child.backward((rules, &parent), g, &mut d_head, &mut d);
             let to = &mut self.head[(at * children + k) * HEAD_STRIDE..];
-            m.store_rows(&d_head, (children * HEAD_STRIDE, span.1), to);
+            V::store_rows(&d_head, RowLayout { stride: children * HEAD_STRIDE, count: span.1 }, to);
         }
         let d_parents = parent.backward(rules, d);
-        m.store_rows(&d_parents, (SPLAT_STRIDE, span.1), &mut self.parents[at * SPLAT_STRIDE..]);
+        V::store_rows(
+            &d_parents,
+            RowLayout { stride: SPLAT_STRIDE, count: span.1 },
+            &mut self.parents[at * SPLAT_STRIDE..],
+        );
     }
 
     /// Gradients of the opacity of child `k`.
     #[inline(always)]
-    fn opacity<M: Machine<Scalar = T>>(
-        &self,
-        m: M,
-        (first, count): (usize, usize),
-        k: usize,
-    ) -> M::V {
+    fn opacity<V: Vector<Element = T>>(&self, (first, count): (usize, usize), k: usize) -> V {
         let children = self.args.rules.children();
         let from = &self.grad[(first * children + k) * SPLAT_STRIDE + OPACITY_OFFSET..];
-        let mut lanes = [T::default(); WIDTH_MAX];
-        for (lane, out) in lanes[..M::WIDTH].iter_mut().enumerate() {
+        let mut lanes = [T::default(); LANES];
+        for (lane, out) in lanes[..V::LANES].iter_mut().enumerate() {
             *out = from[lane.min(count - 1) * children * SPLAT_STRIDE];
         }
-        m.load(&lanes)
+        V::load(&lanes)
     }
 
     /// Gradients of mean, quaternion and σ of child `k`, and that of its area.
     #[inline(always)]
-    fn cotangents<M: Machine<Scalar = T>>(
+    fn cotangents<V: Vector<Element = T>>(
         &self,
-        m: M,
         (first, count): (usize, usize),
         k: usize,
-        area: M::V,
-    ) -> ChildGradient<M::V> {
+        area: V,
+    ) -> ChildGradient<V> {
         let children = self.args.rules.children();
         let from = &self.grad[(first * children + k) * SPLAT_STRIDE..];
-        let g: [M::V; SPLAT_STRIDE] = m.load_rows(from, (children * SPLAT_STRIDE, count));
+        let g: [V; SPLAT_STRIDE] =
+            V::load_rows(from, RowLayout { stride: children * SPLAT_STRIDE, count });
         let vector = |i: usize| [g[i], g[i + 1], g[i + 2]];
         let q = QUAT_OFFSET;
         ChildGradient {
@@ -117,10 +117,10 @@ impl<T: LaneReal> Backward<'_, T> {
     }
 }
 
-/// Gradients into `head` `[N, K, 11]` and `parents` `[N, 11]` for those of the
-/// children, `grad` `[N·K, 11]`. Each parent is one task's own: any number of threads
-/// gives the same bytes.
-pub fn backward<T: LaneReal>(args: Args<T>, grad: &[T], head: &mut [T], parents: &mut [T]) {
+/// Computes gradients into `head` `[N, K, 11]` and `parents` `[N, 11]` from those of the
+/// children, `grad` `[N·K, 11]`. One task owns each parent, so any number of threads gives
+/// the same bytes.
+pub fn backward<T: Real>(args: Args<T>, grad: &[T], head: &mut [T], parents: &mut [T]) {
     let table = Table::new(&args.source);
     head.par_chunks_mut(BLOCK * args.rules.children() * HEAD_STRIDE)
         .zip(parents.par_chunks_mut(BLOCK * SPLAT_STRIDE))
@@ -142,23 +142,24 @@ struct GainsBackward<'a, T> {
     out: &'a mut [T],
 }
 
-impl<T: LaneReal> Kernel<T> for GainsBackward<'_, T> {
+impl<T: Real> VectorKernel<T> for GainsBackward<'_, T> {
     type Output = ();
     #[inline(always)]
-    fn run<M: Machine<Scalar = T>>(self, m: M) {
+    fn run<V: Vector<Element = T>>(self) {
         let lanes = self.rules.gain_lanes();
         let count = self.head.len() / HEAD_STRIDE;
-        for first in (0..count).step_by(M::WIDTH) {
-            let width = M::WIDTH.min(count - first);
-            let (mut raw, mut by_gain) = ([T::default(); WIDTH_MAX], [T::default(); WIDTH_MAX]);
+        for first in (0..count).step_by(V::LANES) {
+            let width = V::LANES.min(count - first);
+            let (mut raw, mut by_gain) = ([T::default(); LANES], [T::default(); LANES]);
             for lane in 0..width {
                 raw[lane] = self.head[(first + lane) * HEAD_STRIDE + HEAD_GAIN_OFFSET];
                 let grad = &self.grad[(first + lane) * lanes..][..lanes];
                 let residual: T = grad[1..].iter().copied().sum();
-                by_gain[lane] = grad[0] + T::of(0.5) * residual;
+                by_gain[lane] = grad[0] + T::constant(0.5) * residual;
             }
-            let t = m.load(&raw).tanh();
-            m.store(m.load(&by_gain) * m.of(self.rules.delta) * (m.of(1.0) - t * t), &mut raw);
+            let t = V::load(&raw).tanh();
+            (V::load(&by_gain) * V::constant(self.rules.delta) * (V::constant(1.0) - t * t))
+                .store(&mut raw);
             for (lane, &d) in raw[..width].iter().enumerate() {
                 self.out[(first + lane) * HEAD_STRIDE + HEAD_GAIN_OFFSET] = d;
             }
@@ -166,9 +167,9 @@ impl<T: LaneReal> Kernel<T> for GainsBackward<'_, T> {
     }
 }
 
-/// Gradients into lane [`HEAD_GAIN_OFFSET`] of `out` `[N, K, 11]`, for those of the gains,
-/// `grad` `[N·K]` or `[N·K, 4]`; nothing else is written.
-pub fn gains_backward<T: LaneReal>(rules: &Rules, head: &[T], grad: &[T], out: &mut [T]) {
+/// Computes gradients into element [`HEAD_GAIN_OFFSET`] of the rows of `out` `[N, K, 11]`, from
+/// those of the gains, `grad` `[N·K]` or `[N·K, 4]`. Writes nothing else.
+pub fn gains_backward<T: Real>(rules: &Rules, head: &[T], grad: &[T], out: &mut [T]) {
     out.par_chunks_mut(GAIN_BLOCK * HEAD_STRIDE)
         .zip(head.par_chunks(GAIN_BLOCK * HEAD_STRIDE))
         .zip(grad.par_chunks(GAIN_BLOCK * rules.gain_lanes()))

@@ -1,21 +1,19 @@
-//! One vector of children, child k of as many parents: everything but the opacity,
-//! with gradients (spec 2.2 to 2.6, 2.9, 2.12).
+//! One vector of children, child k of each lane's parent: everything but the opacity, with
+//! gradients.
 
 use super::Rules;
 use super::parent::{Parent, ParentGradient};
 use super::shape::{Footprint, Turn, Unit, conjugate, matrix, matrix_backward, multiply};
-use super::view::{
-    Jacobian, M3, V3, add, add4, axpy, dot, kept, product, scaled, times, transposed,
-};
+use super::view::{Jacobian, M3, V3, add, add4, axpy, dot, product, scaled, times, transposed};
 use crate::abi::{
     DEPTH_FRACTION_MIN, HEAD_DEPTH_OFFSET, HEAD_LOG_SCALE_OFFSET, HEAD_ROTATION_OFFSET,
     HEAD_STRIDE, HEAD_UV_OFFSET,
 };
-use crate::cpu::lanes::Lanes;
 use crate::cpu::redistribute::Rule;
+use crate::cpu::simd::{Mask, Vector};
 
-/// The camera-frame step of a child, and what its gradient needs.
-struct Step<V: Lanes> {
+/// The camera-frame step from parent to child, and the values that its gradient needs.
+struct Step<V: Vector> {
     out: V3<V>,
     /// tanh of the learned offset, where it is bounded.
     bounded: [V; 2],
@@ -30,11 +28,10 @@ struct Step<V: Lanes> {
     ray: Option<(V, V, V::Mask)>,
 }
 
-impl<V: Lanes> Step<V> {
+impl<V: Vector> Step<V> {
     #[inline(always)]
     fn new(rules: &Rules, parent: &Parent<V>, k: usize, head: &[V; HEAD_STRIDE]) -> Self {
         let z = parent.z;
-        let of = |v: f64| z.of(v);
         let per_side = 1.0 / rules.side as f64;
         let cell = [k % rules.side, k / rules.side];
         let learned = [head[HEAD_UV_OFFSET], head[HEAD_UV_OFFSET + 1]];
@@ -42,33 +39,36 @@ impl<V: Lanes> Step<V> {
             Some(bound) => ([learned[0].tanh(), learned[1].tanh()], bound * per_side),
             None => (learned, per_side),
         };
-        let grid = |i: usize| of((cell[i] as f64 + 0.5) * per_side - 0.5);
-        let offset = [bounded[0].fma(of(per_px), grid(0)), bounded[1].fma(of(per_px), grid(1))];
+        let grid = |i: usize| V::constant((cell[i] as f64 + 0.5) * per_side - 0.5);
+        let offset = [
+            bounded[0].fma(V::constant(per_px), grid(0)),
+            bounded[1].fma(V::constant(per_px), grid(1)),
+        ];
         let f = parent.view.focal;
-        let mut s = [z * offset[0] / f[0], z * offset[1] / f[1], of(0.0)];
-        let mut along_disc = of(0.0);
+        let mut s = [z * offset[0] / f[0], z * offset[1] / f[1], V::constant(0.0)];
+        let mut along_disc = V::constant(0.0);
         if let Some(disc) = &parent.disc {
             let [u, v] = disc.steps;
             let d = axpy(offset[1], v, scaled(u, offset[0]));
-            // Both steps project alike to first order, so a mixture does: an edge-on
-            // disc slides at most a tenth of its depth.
-            let tenth = of(DEPTH_FRACTION_MIN) * z;
-            along_disc = kept(disc.solid, tenth / d[2].abs().max(tenth));
+            // Both steps have the same projection to first order, and so has a mixture. It
+            // limits the slide of an edge-on disc to a tenth of its depth.
+            let tenth = V::constant(DEPTH_FRACTION_MIN) * z;
+            along_disc = disc.solid.select_or_zero(tenth / d[2].abs().max(tenth));
             s = axpy(along_disc, [d[0] - s[0], d[1] - s[1], d[2] - s[2]], s);
         }
         let tanh_z = head[HEAD_DEPTH_OFFSET].tanh();
-        let mut dz = of(rules.beta_z) * tanh_z;
+        let mut dz = V::constant(rules.beta_z) * tanh_z;
         if rules.relative_depth {
             dz = dz * z;
         }
-        let least = of(DEPTH_FRACTION_MIN - 1.0) * z - s[2];
+        let least = V::constant(DEPTH_FRACTION_MIN - 1.0) * z - s[2];
         let free_z = least.lt(dz);
         let dz = dz.max(least);
         let side = [s[0], s[1]];
         let mut ray = None;
         if rules.ray {
             let ahead = parent.in_camera[2] + s[2];
-            let inverse = of(1.0) / ahead.max(parent.view.z_min);
+            let inverse = V::constant(1.0) / ahead.max(parent.view.z_min);
             let share = dz * inverse;
             for (s, x) in s.iter_mut().zip(parent.in_camera).take(2) {
                 *s = share.fma(x + *s, *s);
@@ -79,7 +79,7 @@ impl<V: Lanes> Step<V> {
         Self { out: s, bounded, offset, along_disc, tanh_z, free_z, side, ray }
     }
 
-    /// Adds to the gradients of head and parent those that come through the step.
+    /// Adds the gradients through the step to those of head and parent.
     #[inline(always)]
     fn backward(
         &self,
@@ -89,10 +89,9 @@ impl<V: Lanes> Step<V> {
         d: &mut ParentGradient<V>,
     ) {
         let z = parent.z;
-        let of = |v: f64| z.of(v);
         let mut d_dz = d_s[2];
         if let Some((share, inverse, free)) = self.ray {
-            let mut d_share = of(0.0);
+            let mut d_share = V::constant(0.0);
             #[expect(
                 clippy::needless_range_loop,
                 reason = "three arrays, and iterators do not inline"
@@ -104,21 +103,21 @@ impl<V: Lanes> Step<V> {
             }
             let each = d_share * inverse;
             d_dz = d_dz + each;
-            let d_ahead = kept(free, -each * share);
+            let d_ahead = free.select_or_zero(-each * share);
             d.in_camera[2] = d.in_camera[2] + d_ahead;
             d_s[2] = d_s[2] + d_ahead;
         }
-        let free_dz = kept(self.free_z, d_dz);
+        let free_dz = self.free_z.select_or_zero(d_dz);
         let bound_dz = d_dz - free_dz;
-        d.z = bound_dz.fma(of(DEPTH_FRACTION_MIN - 1.0), d.z);
+        d.z = bound_dz.fma(V::constant(DEPTH_FRACTION_MIN - 1.0), d.z);
         d_s[2] = d_s[2] - bound_dz;
-        let mut d_tanh = free_dz * of(rules.beta_z);
+        let mut d_tanh = free_dz * V::constant(rules.beta_z);
         if rules.relative_depth {
             d.z = d_tanh.fma(self.tanh_z, d.z);
             d_tanh = d_tanh * z;
         }
-        d_head[HEAD_DEPTH_OFFSET] = d_tanh * (of(1.0) - self.tanh_z * self.tanh_z);
-        let mut d_offset = [of(0.0); 2];
+        d_head[HEAD_DEPTH_OFFSET] = d_tanh * (V::constant(1.0) - self.tanh_z * self.tanh_z);
+        let mut d_offset = [V::constant(0.0); 2];
         let mut d_flat = d_s;
         if let Some(disc) = &parent.disc {
             let d_slid = scaled(d_s, self.along_disc);
@@ -135,14 +134,16 @@ impl<V: Lanes> Step<V> {
             d.z = per.fma(self.offset[i], d.z);
             let t = self.bounded[i];
             d_head[HEAD_UV_OFFSET + i] = match rules.offset_bound {
-                Some(bound) => d_offset[i] * of(bound * per_side) * (of(1.0) - t * t),
-                None => d_offset[i] * of(per_side),
+                Some(bound) => {
+                    d_offset[i] * V::constant(bound * per_side) * (V::constant(1.0) - t * t)
+                }
+                None => d_offset[i] * V::constant(per_side),
             };
         }
     }
 }
 
-pub(super) struct Child<V: Lanes> {
+pub(super) struct Child<V: Vector> {
     step: Step<V>,
     turn: Turn<V>,
     unit: Unit<V>,
@@ -161,11 +162,11 @@ pub(super) struct Child<V: Lanes> {
     pub(super) mean: V3<V>,
     /// σ, world units.
     pub(super) scale: V3<V>,
-    /// What the opacity rule divides by, target px².
+    /// Divisor of the opacity rule, target px².
     pub(super) area: V,
 }
 
-/// Gradients of what a child gives.
+/// Gradients of a child's outputs.
 pub(super) struct ChildGradient<V> {
     pub(super) mean: V3<V>,
     pub(super) quat: [V; 4],
@@ -173,7 +174,7 @@ pub(super) struct ChildGradient<V> {
     pub(super) area: V,
 }
 
-impl<V: Lanes> Child<V> {
+impl<V: Vector> Child<V> {
     #[inline(always)]
     pub(super) fn new(
         rules: &Rules,
@@ -182,15 +183,14 @@ impl<V: Lanes> Child<V> {
         head: &[V; HEAD_STRIDE],
     ) -> Self {
         let step = Step::new(rules, parent, k, head);
-        let of = |v: f64| parent.z.of(v);
         let mean = add(parent.mean, times(&parent.view.rotation, step.out));
-        let c = of(rules.dlog_clamp);
-        let per_c = of(1.0 / rules.dlog_clamp);
+        let c = V::constant(rules.dlog_clamp);
+        let per_c = V::constant(1.0 / rules.dlog_clamp);
         let l = HEAD_LOG_SCALE_OFFSET;
         let [x, y, z] = scaled([head[l], head[l + 1], head[l + 2]], per_c);
         let soft = [x.tanh(), y.tanh(), z.tanh()];
         let [x, y, z] = scaled(soft, c);
-        let factor = scaled([x.exp(), y.exp(), z.exp()], of(rules.lambda_s));
+        let factor = scaled([x.exp(), y.exp(), z.exp()], V::constant(rules.lambda_s));
         let small = product(factor, parent.scale);
         let r = HEAD_ROTATION_OFFSET;
         let turn = Turn::new([head[r], head[r + 1], head[r + 2]]);
@@ -201,7 +201,7 @@ impl<V: Lanes> Child<V> {
             Some(shared) => shared.jw,
             None => {
                 let at = add(parent.in_camera, step.out);
-                let own = Jacobian::new(&parent.view, at, of(rules.side as f64));
+                let own = Jacobian::new(&parent.view, at, V::constant(rules.side as f64));
                 let jw = own.jw;
                 jacobian = Some(own);
                 jw
@@ -209,7 +209,7 @@ impl<V: Lanes> Child<V> {
         };
         let footprint = Footprint::new(&jw, &rotation, small);
         let growth = footprint.growth(rules);
-        let clamped = footprint.area.max(of(rules.a_min));
+        let clamped = footprint.area.max(V::constant(rules.a_min));
         let area = match rules.opacity {
             Rule::OpticalDepth => footprint.blurred(growth, clamped, rules.lowpass_target),
             _ => clamped,
@@ -245,7 +245,7 @@ impl<V: Lanes> Child<V> {
         &self.rotation
     }
 
-    /// Writes the gradients of the head's geometry lanes and adds to the parent's.
+    /// Writes the gradients of the head record's geometry and adds to the parent's.
     #[inline(always)]
     pub(super) fn backward(
         &self,
@@ -254,8 +254,7 @@ impl<V: Lanes> Child<V> {
         d_head: &mut [V; HEAD_STRIDE],
         d: &mut ParentGradient<V>,
     ) {
-        let of = |v: f64| parent.z.of(v);
-        let zero = of(0.0);
+        let zero = V::constant(0.0);
         let f = &self.footprint;
         let (d_clamped, d_m) = match rules.opacity {
             Rule::OpticalDepth => {
@@ -264,13 +263,13 @@ impl<V: Lanes> Child<V> {
             }
             _ => (g.area, [[zero; 3]; 2]),
         };
-        let d_area = kept(of(rules.a_min).lt(f.area), d_clamped);
+        let d_area = V::constant(rules.a_min).lt(f.area).select_or_zero(d_clamped);
         let jw = match (&parent.jacobian, &self.jacobian) {
             (Some(j), _) | (None, Some(j)) => &j.jw,
             (None, None) => return,
         };
         let (d_jw, d_rotation, by_area) = f.backward((jw, &self.rotation, self.small), d_area, d_m);
-        let c = of(1.0);
+        let c = V::constant(1.0);
         for i in 0..3 {
             let d_small = g.scale[i].fma(self.growth[i], by_area[i]);
             d.scale[i] = d_small.fma(self.factor[i], d.scale[i]);

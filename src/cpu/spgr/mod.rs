@@ -1,9 +1,9 @@
-//! Sub-pixel Gaussian reparameterization, one pass per parent and no temporary in
-//! memory (SubSplat 3.2, supp. A.3; spec 2.9b).
+//! Sub-pixel Gaussian reparameterization, one pass per parent and no temporary in memory
+//! (SubSplat section 3.2, supplement A.3).
 //!
-//! In: head records `[N, K, 11]` and parents `[N, 11]` (lanes in [`crate::abi`]),
-//! cameras of the V context views.   Out: children `[N·K, 11]`, child k of parent n
-//! at row n·K + k, and their colour gain `[N·K]` or, in RGB, `[N·K, 4]` (γ, δ).
+//! Input: head records `[N, K, 11]` and parents `[N, 11]` (offsets in [`crate::abi`]),
+//! cameras of the V context views.   Output: children `[N·K, 11]`, child k of parent n at
+//! row n·K + k, and their colour gain `[N·K]` or, in RGB, `[N·K, 4]` (γ, δ).
 //!
 //! Child k = (i, j) of the r × r sub-pixel grid, row-major, in the parent's primary
 //! view v* with camera coordinates x_c of its mean and z its depth:
@@ -14,14 +14,14 @@
 //! M   = J(p)·R_w2c·R(q_k)·diag(s_k)                                target px
 //! A_k = |m₁ × m₂| = √det(J Σ Jᵀ), raised to A_min
 //! ```
-//! and opacities by [`super::redistribute`]. `backward` recomputes all of it from the
-//! same inputs; no gradient passes the choice of v*, the growth of small footprints
-//! and the share of a disc step. `project` goes on to 2-D splats of one camera without
-//! writing children.
+//! and opacities by [`super::redistribute`]. `backward` recomputes all of it from the same
+//! inputs. The choice of v*, the growth of small footprints and the share of a disc step
+//! are constant to gradients. `project` computes 2-D splats of one camera without writing
+//! children.
 //!
-//! The lanes of a vector are parents: child k of 16 parents at a time, so that sums
-//! over children are loops and any K fills the vector. Twin: ops/spgr.rs. The same in
-//! tensor operations: tests/common/spgr_reference.rs. Tests: tests/spgr.rs, tests/spgr_backward.rs.
+//! Each lane of a vector is a parent: child k of 16 parents at a time, so that sums over
+//! children are loops and any K fills the vector. Op: ops/spgr.rs. Reference in tensor
+//! operations: model/spgr_ref.rs. Tests: tests/spgr.rs, tests/spgr_backward.rs.
 
 mod backward;
 mod child;
@@ -35,8 +35,8 @@ pub use crate::abi::{CHILDREN_MAX, Rules};
 pub use backward::{backward, gains_backward};
 pub use project::{Target, project};
 
-use super::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};
 use super::redistribute::share;
+use super::simd::{LANES, Real, RowLayout, Vector, VectorKernel};
 use crate::abi::{
     HEAD_GAIN_OFFSET, HEAD_LOGIT_OFFSET, HEAD_STRIDE, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET,
     SCALE_OFFSET, SPLAT_STRIDE,
@@ -47,7 +47,7 @@ use parent::Parent;
 use rayon::prelude::*;
 use view::Table;
 
-/// Which parents, seen by which cameras.
+/// Origin of the parents: context cameras and indices.
 #[derive(Clone, Copy, Debug)]
 pub struct Source<'a> {
     /// Context views, pixels of the input pictures.
@@ -68,7 +68,7 @@ const BLOCK: usize = 64;
 pub struct Args<'a, T> {
     /// How children are made; K ≤ [`CHILDREN_MAX`].
     pub rules: &'a Rules,
-    /// Of which parents, seen by which cameras.
+    /// Origin of the parents.
     pub source: Source<'a>,
     /// Head records `[N, K, 11]`.
     pub head: &'a [T],
@@ -88,20 +88,19 @@ impl<T> Args<'_, T> {
     }
 }
 
-/// Head records of child `k` of `count` parents from `first` on.
+/// Loads the head records of child `k` of `count` parents from `first` on.
 #[inline(always)]
-fn records<M: Machine>(
-    m: M,
-    args: &Args<M::Scalar>,
+fn records<V: Vector>(
+    args: &Args<V::Element>,
     (first, count): (usize, usize),
     k: usize,
-) -> [M::V; HEAD_STRIDE] {
+) -> [V; HEAD_STRIDE] {
     let children = args.rules.children();
     let from = &args.head[(first * children + k) * HEAD_STRIDE..];
-    m.load_rows(from, (children * HEAD_STRIDE, count))
+    V::load_rows(from, RowLayout { stride: children * HEAD_STRIDE, count })
 }
 
-/// One block of parents forward; `rows` and `gains` are the block's own.
+/// The forward pass of one block of parents; `rows` and `gains` are the block's own.
 struct Forward<'a, T> {
     args: Args<'a, T>,
     table: &'a Table<T>,
@@ -110,56 +109,56 @@ struct Forward<'a, T> {
     gains: &'a mut [T],
 }
 
-impl<T: LaneReal> Kernel<T> for Forward<'_, T> {
+impl<T: Real> VectorKernel<T> for Forward<'_, T> {
     type Output = bool;
     #[inline(always)]
-    fn run<M: Machine<Scalar = T>>(mut self, m: M) -> bool {
+    fn run<V: Vector<Element = T>>(mut self) -> bool {
         let k = self.args.rules.children();
-        let (mut areas, mut alphas) = (vec![m.of(0.0); k], vec![m.of(0.0); k]);
+        let (mut areas, mut alphas) = (vec![V::constant(0.0); k], vec![V::constant(0.0); k]);
         // x − x is 0 for a finite number and NaN for any other.
-        let mut finite = m.of(0.0);
-        for first in self.parents.clone().step_by(M::WIDTH) {
-            let span = (first, M::WIDTH.min(self.parents.end - first));
-            let bad = self.group(m, span, &mut areas, &mut alphas);
+        let mut finite = V::constant(0.0);
+        for first in self.parents.clone().step_by(V::LANES) {
+            let span = (first, V::LANES.min(self.parents.end - first));
+            let bad = self.group(span, &mut areas, &mut alphas);
             finite = finite + bad;
         }
-        let mut lanes = [T::default(); WIDTH_MAX];
-        m.store(finite, &mut lanes);
-        lanes[..M::WIDTH].iter().all(|v| *v == T::default())
+        let mut lanes = [T::default(); LANES];
+        finite.store(&mut lanes);
+        lanes[..V::LANES].iter().all(|v| *v == T::default())
     }
 }
 
-/// 0 where all of `v` are finite, else NaN.
+/// Returns `sum` in lanes where all of `v` are finite, else NaN.
 #[inline(always)]
 #[expect(clippy::eq_op, reason = "v − v is 0 where v is finite and NaN elsewhere")]
-fn not_finite<V: Lanes>(v: &[V], mut sum: V) -> V {
+fn not_finite<V: Vector>(v: &[V], mut sum: V) -> V {
     for &v in v {
         sum = sum + (v - v);
     }
     sum
 }
 
-impl<T: LaneReal> Forward<'_, T> {
-    /// The children of one vector of parents; 0 where all is finite, else NaN.
+impl<T: Real> Forward<'_, T> {
+    /// Computes the children of one vector of parents; returns 0 in lanes where all numbers
+    /// are finite, else NaN.
     #[inline(always)]
-    fn group<M: Machine<Scalar = T>>(
+    fn group<V: Vector<Element = T>>(
         &mut self,
-        m: M,
         (first, count): (usize, usize),
-        areas: &mut [M::V],
-        alphas: &mut [M::V],
-    ) -> M::V {
+        areas: &mut [V],
+        alphas: &mut [V],
+    ) -> V {
         let Args { rules, source, parents, .. } = self.args;
         let (children, lanes) = (rules.children(), rules.gain_lanes());
-        let parent = Parent::load(m, (rules, self.table, &source), parents, (first, count));
-        let mut bad = not_finite(&[parent.alpha, parent.z], m.of(0.0));
+        let parent = Parent::load((rules, self.table, &source), parents, (first, count));
+        let mut bad = not_finite(&[parent.alpha, parent.z], V::constant(0.0));
         let at = first - self.parents.start;
         for k in 0..children {
-            let head = records(m, &self.args, (first, count), k);
+            let head = records(&self.args, (first, count), k);
             bad = not_finite(&head, bad);
             let child = Child::new(rules, &parent, k, &head);
             (areas[k], alphas[k]) = (child.area, head[HEAD_LOGIT_OFFSET]);
-            let mut row = [m.of(0.0); SPLAT_STRIDE];
+            let mut row = [V::constant(0.0); SPLAT_STRIDE];
             let shape = [(MEAN_OFFSET, child.mean), (SCALE_OFFSET, child.scale)];
             for (lane, v) in shape {
                 row[lane..lane + 3].copy_from_slice(&v);
@@ -168,11 +167,11 @@ impl<T: LaneReal> Forward<'_, T> {
             row[QUAT_OFFSET..QUAT_OFFSET + 4].copy_from_slice(&child.quat());
             bad = not_finite(&child.quat(), bad);
             let rows = &mut self.rows[(at * children + k) * SPLAT_STRIDE..];
-            m.store_rows(&row, (children * SPLAT_STRIDE, count), rows);
-            let gain = gain(m, rules, head[HEAD_GAIN_OFFSET]);
-            let mut tile = [[T::default(); WIDTH_MAX]; 4];
+            V::store_rows(&row, RowLayout { stride: children * SPLAT_STRIDE, count }, rows);
+            let gain = gain(rules, head[HEAD_GAIN_OFFSET]);
+            let mut tile = [[T::default(); LANES]; 4];
             for (gain, tile) in gain.into_iter().zip(&mut tile) {
-                m.store(gain, tile);
+                gain.store(tile);
             }
             let gains = &mut self.gains[(at * children + k) * lanes..];
             for lane in 0..count {
@@ -184,8 +183,8 @@ impl<T: LaneReal> Forward<'_, T> {
         share(rules.opacity, areas, parent.alpha, parent.own, alphas);
         bad = not_finite(alphas, bad);
         for (k, &alpha) in alphas.iter().enumerate() {
-            let mut tile = [T::default(); WIDTH_MAX];
-            m.store(alpha, &mut tile);
+            let mut tile = [T::default(); LANES];
+            alpha.store(&mut tile);
             for (lane, &alpha) in tile[..count].iter().enumerate() {
                 let row = (at + lane) * children + k;
                 self.rows[row * SPLAT_STRIDE + OPACITY_OFFSET] = alpha;
@@ -195,18 +194,18 @@ impl<T: LaneReal> Forward<'_, T> {
     }
 }
 
-/// γ and δ: γ(½ + Σ) = ½ + γΣ + (γ − 1)/2.
+/// Computes γ and δ: γ(½ + Σ) = ½ + γΣ + (γ − 1)/2.
 #[inline(always)]
-fn gain<M: Machine>(m: M, rules: &Rules, raw: M::V) -> [M::V; 4] {
-    let extra = m.of(rules.delta) * raw.tanh();
-    let residual = if rules.rgb_gain { m.of(0.5) * extra } else { m.of(0.0) };
-    [m.of(1.0) + extra, residual, residual, residual]
+fn gain<V: Vector>(rules: &Rules, raw: V) -> [V; 4] {
+    let extra = V::constant(rules.delta) * raw.tanh();
+    let residual = if rules.rgb_gain { V::constant(0.5) * extra } else { V::constant(0.0) };
+    [V::constant(1.0) + extra, residual, residual, residual]
 }
 
-/// Children of N parents into `rows` `[N·K, 11]` and `gains` (module doc). False if a
-/// number that came in or went out is not finite; its parent's children are then
-/// whatever they are, those of all others right.
-pub fn forward<T: LaneReal>(args: Args<T>, rows: &mut [T], gains: &mut [T]) -> bool {
+/// Computes the children of N parents into `rows` `[N·K, 11]` and `gains` (module
+/// documentation). Returns false if an input or output number is not finite: the children
+/// of that parent are then undefined, those of all others correct.
+pub fn forward<T: Real>(args: Args<T>, rows: &mut [T], gains: &mut [T]) -> bool {
     let table = Table::new(&args.source);
     let per_block = BLOCK * args.rules.children();
     rows.par_chunks_mut(per_block * SPLAT_STRIDE)

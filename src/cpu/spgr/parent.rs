@@ -1,29 +1,29 @@
-//! One vector of parents in their primary views: what all their children share, with
+//! One vector of parents in their primary views: the values that their children share, with
 //! gradients.
 
 use super::shape::{Footprint, Unit, matrix, matrix_backward};
 use super::view::{
-    Jacobian, M3, Table, V3, View, add, add4, axpy, cross, dot, each, indexed, kept, product,
-    scaled, times, transposed,
+    Jacobian, M3, Table, V3, View, add, add4, axpy, cross, dot, each, indexed, product, scaled,
+    times, transposed,
 };
 use super::{Rules, Source};
 use crate::abi::{
     DISC_AREA_SQ_MIN, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE,
 };
-use crate::cpu::lanes::{Lanes, Machine, WIDTH_MAX};
 use crate::cpu::redistribute::Rule;
+use crate::cpu::simd::{LANES, Mask, RowLayout, Vector};
 
-pub(super) struct Parent<V: Lanes> {
+pub(super) struct Parent<V: Vector> {
     pub(super) view: View<V>,
     pub(super) mean: V3<V>,
     pub(super) quat: [V; 4],
     pub(super) scale: V3<V>,
     pub(super) alpha: V,
     pub(super) in_camera: V3<V>,
-    /// Depth of the pitch, at least the view's least.
+    /// Depth that sets the pitch of the children, clamped to the view's `z_min`.
     pub(super) z: V,
     pub(super) disc: Option<Disc<V>>,
-    /// Where the children's footprints take the parent's Jacobian.
+    /// The parent's Jacobian, if the children's footprints use it.
     pub(super) jacobian: Option<Jacobian<V>>,
     /// Footprint in a native render, target px²: with the low-pass for optical depth,
     /// without for integrated opacity; 1 for the other rules.
@@ -43,7 +43,7 @@ pub(super) struct ParentGradient<V> {
     pub(super) own: V,
 }
 
-impl<V: Lanes> ParentGradient<V> {
+impl<V: Vector> ParentGradient<V> {
     #[inline(always)]
     pub(super) fn zero(zero: V) -> Self {
         let none = [zero; 3];
@@ -61,20 +61,19 @@ impl<V: Lanes> ParentGradient<V> {
     }
 }
 
-impl<V: Lanes> Parent<V> {
-    /// Parents `first .. first + count` of `rows` `[N, 11]`; further lanes repeat the
+impl<V: Vector> Parent<V> {
+    /// Loads parents `first .. first + count` of `rows` `[N, 11]`; further lanes repeat the
     /// last.
     #[inline(always)]
-    pub(super) fn load<M: Machine<V = V>>(
-        m: M,
-        (rules, table, source): (&Rules, &Table<M::Scalar>, &Source),
-        rows: &[M::Scalar],
+    pub(super) fn load(
+        (rules, table, source): (&Rules, &Table<V::Element>, &Source),
+        rows: &[V::Element],
         (first, count): (usize, usize),
     ) -> Self {
         let row: [V; SPLAT_STRIDE] =
-            m.load_rows(&rows[first * SPLAT_STRIDE..], (SPLAT_STRIDE, count));
-        let mut index = [0; WIDTH_MAX];
-        for (lane, index) in index[..M::WIDTH].iter_mut().enumerate() {
+            V::load_rows(&rows[first * SPLAT_STRIDE..], RowLayout { stride: SPLAT_STRIDE, count });
+        let mut index = [0; LANES];
+        for (lane, index) in index[..V::LANES].iter_mut().enumerate() {
             let n = source.first + first + lane.min(count - 1);
             *index = (n / source.per_view).min(table.len() - 1);
         }
@@ -82,7 +81,7 @@ impl<V: Lanes> Parent<V> {
         let mean = vector(MEAN_OFFSET);
         let q = QUAT_OFFSET;
         let quat = [row[q], row[q + 1], row[q + 2], row[q + 3]];
-        let view = table.primary(m, rules, mean, index);
+        let view = table.primary(rules, mean, index);
         Self::new(rules, view, (mean, quat, vector(SCALE_OFFSET), row[OPACITY_OFFSET]))
     }
 
@@ -94,7 +93,7 @@ impl<V: Lanes> Parent<V> {
     ) -> Self {
         let in_camera = view.seen_from(mean);
         let z = in_camera[2].max(view.z_min);
-        let one = z.of(1.0);
+        let one = V::constant(1.0);
         let mut parent = Self {
             view,
             mean,
@@ -111,7 +110,7 @@ impl<V: Lanes> Parent<V> {
             parent.disc = Some(Disc::new(&parent));
         }
         if rules.area_at_parent {
-            let zoom = z.of(rules.side as f64);
+            let zoom = V::constant(rules.side as f64);
             parent.jacobian = Some(Jacobian::new(&view, in_camera, zoom));
         }
         if rules.opacity.areas_are_relative() {
@@ -120,7 +119,7 @@ impl<V: Lanes> Parent<V> {
         parent
     }
 
-    /// Gradients `[11]` of the rows, from those of what children share.
+    /// Computes gradients `[11]` of the rows from those of the shared values.
     #[inline(always)]
     pub(super) fn backward(&self, rules: &Rules, mut d: ParentGradient<V>) -> [V; SPLAT_STRIDE] {
         if rules.opacity.areas_are_relative() {
@@ -133,7 +132,7 @@ impl<V: Lanes> Parent<V> {
             disc.backward(self, &mut d);
         }
         let free = self.view.z_min.lt(self.in_camera[2]);
-        d.in_camera[2] = d.in_camera[2] + kept(free, d.z);
+        d.in_camera[2] = d.in_camera[2] + free.select_or_zero(d.z);
         let mean = add(d.mean, times(&self.view.rotation, d.in_camera));
         let ([x, y, z], [a, b, c, e], [s, t, u]) = (mean, d.quat, d.scale);
         [x, y, z, a, b, c, e, s, t, u, d.alpha]
@@ -141,7 +140,7 @@ impl<V: Lanes> Parent<V> {
 }
 
 /// The parents' own footprints.
-struct Own<V: Lanes> {
+struct Own<V: Vector> {
     unit: Unit<V>,
     rotation: M3<V>,
     jacobian: Jacobian<V>,
@@ -150,10 +149,10 @@ struct Own<V: Lanes> {
     value: V,
 }
 
-impl<V: Lanes> Own<V> {
+impl<V: Vector> Own<V> {
     #[inline(always)]
     fn new(parent: &Parent<V>, rules: &Rules) -> Self {
-        let one = parent.z.of(1.0);
+        let one = V::constant(1.0);
         let unit = Unit::new(parent.quat);
         let rotation = matrix(unit.q);
         let jacobian = Jacobian::new(&parent.view, parent.in_camera, one);
@@ -162,15 +161,15 @@ impl<V: Lanes> Own<V> {
             Rule::OpticalDepth => footprint.blurred([one; 3], footprint.area, rules.lowpass_input),
             _ => footprint.area,
         };
-        let value = one.of(rules.children() as f64) * blurred;
+        let value = V::constant(rules.children() as f64) * blurred;
         Self { unit, rotation, jacobian, footprint, blurred, value }
     }
 
     #[inline(always)]
     fn backward(&self, parent: &Parent<V>, rules: &Rules, d: &mut ParentGradient<V>) {
-        let one = parent.z.of(1.0);
-        let each = d.own * one.of(rules.children() as f64);
-        let zero = [one.of(0.0); 3];
+        let one = V::constant(1.0);
+        let each = d.own * V::constant(rules.children() as f64);
+        let zero = [V::constant(0.0); 3];
         let f = &self.footprint;
         let (d_area, d_m) = match rules.opacity {
             Rule::OpticalDepth => {
@@ -190,10 +189,10 @@ impl<V: Lanes> Own<V> {
 
 /// Steps along the parent's disc: columns of G·Mᵀ·(M Mᵀ)⁻¹, G = R_w2c·R·S and M = J·G,
 /// the camera-frame steps of least Mahalanobis length that project to one pixel.
-pub(super) struct Disc<V: Lanes> {
+pub(super) struct Disc<V: Vector> {
     /// For one px of u and of v.
     pub(super) steps: [V3<V>; 2],
-    /// Where the disc has an area to slide on.
+    /// Lanes whose disc has an area to slide on.
     pub(super) solid: V::Mask,
     unit: Unit<V>,
     /// R_w2c·R(q), rows, and the same with scales.
@@ -206,11 +205,11 @@ pub(super) struct Disc<V: Lanes> {
     weights: [V3<V>; 2],
 }
 
-impl<V: Lanes> Disc<V> {
+impl<V: Vector> Disc<V> {
     #[inline(always)]
     fn new(parent: &Parent<V>) -> Self {
         let (z, x, s) = (parent.z, parent.in_camera, parent.scale);
-        let (zero, one) = (z.of(0.0), z.of(1.0));
+        let (zero, one) = (V::constant(0.0), V::constant(1.0));
         let unit = Unit::new(parent.quat);
         let rotation = matrix(unit.q);
         let columns = &parent.view.rotation;
@@ -224,9 +223,9 @@ impl<V: Lanes> Disc<V> {
         let j = [[f[0], zero, -f[0] * x[0] / z], [zero, f[1], -f[1] * x[1] / z]];
         let m = [transposed(&g, j[0]), transposed(&g, j[1])];
         let normal = cross(m[0], m[1]);
-        let det = dot(normal, normal) + one.of(crate::abi::AREA_SQ_EPS);
-        let solid = one.of(DISC_AREA_SQ_MIN).lt(det);
-        let inverse_det = one / V::select(solid, det, one);
+        let det = dot(normal, normal) + V::constant(crate::abi::AREA_SQ_EPS);
+        let solid = V::constant(DISC_AREA_SQ_MIN).lt(det);
+        let inverse_det = one / solid.select(det, one);
         // Rows of (M Mᵀ)⁻¹·M as cross products: (b·b)·a − (a·b)·b cancels for needles.
         let weights =
             [scaled(cross(m[1], normal), inverse_det), scaled(cross(normal, m[0]), inverse_det)];
@@ -240,7 +239,13 @@ impl<V: Lanes> Disc<V> {
         let [du, dv] = each(
             d.disc,
             #[inline(always)]
-            |[x, y, z]| [kept(self.solid, x), kept(self.solid, y), kept(self.solid, z)],
+            |[x, y, z]| {
+                [
+                    self.solid.select_or_zero(x),
+                    self.solid.select_or_zero(y),
+                    self.solid.select_or_zero(z),
+                ]
+            },
         );
         let [tu, tv] = self.weights;
         // steps = G·t: ∂G = d tᵀ, ∂t = Gᵀ d.
@@ -269,7 +274,7 @@ impl<V: Lanes> Disc<V> {
             let z = parent.z;
             let per = parent.view.focal[i] / (z * z);
             d.in_camera[i] = d.in_camera[i] - d_x * per;
-            d.z = d.z - d_f * per - z.of(2.0) * d_x * self.j[i][2] / z;
+            d.z = d.z - d_f * per - V::constant(2.0) * d_x * self.j[i][2] / z;
         }
         // G = R_w2c·R·S.
         let s = parent.scale;

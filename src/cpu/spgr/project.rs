@@ -1,15 +1,15 @@
-//! Head records straight to one camera's 2-D splats: no child's mean, quaternion,
-//! covariance or SH is ever in memory (spec 6, first fusion).
+//! Projection of children from head records to one camera's 2-D splats. No child's mean,
+//! quaternion, covariance or SH is stored in memory.
 //!
-//! In: what [`super::forward`] takes, the parents' SH `[N, D, 3]`, a target camera.
-//! Out: one [`Footprint`] per child, empty where dropped, by the rules of
-//! [`crate::cpu::ewa`] and of the frame's projection (tests/spgr_project.rs holds them
-//! together). SH is evaluated once per parent under [`ShDirection::Parent`].
+//! Input: that of [`super::forward`], the parents' SH `[N, D, 3]`, a target camera.
+//! Output: one [`Footprint`] per child, empty for a dropped one, by the rules of
+//! [`crate::cpu::ewa`] and of the frame's projection (tests/spgr_project.rs compares them).
+//! [`ShDirection::Parent`] evaluates SH once per parent.
 
 use super::child::Child;
 use super::colour::Coefficients;
 use super::parent::Parent;
-use super::view::{V3, axpy, cross, dot, each, kept, product, scaled, splat, times, transposed};
+use super::view::{V3, axpy, cross, dot, each, product, scaled, splat, times, transposed};
 use super::{Args, BLOCK, gain, not_finite, records};
 use crate::abi::{
     ALPHA_MIN, ALPHA_MIN_LOG2, DISCRIMINANT_MIN_MVSPLAT, HEAD_GAIN_OFFSET, HEAD_LOGIT_OFFSET,
@@ -17,8 +17,8 @@ use crate::abi::{
 };
 use crate::camera::Camera;
 use crate::cpu::ewa::{Footprint, View};
-use crate::cpu::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};
 use crate::cpu::redistribute::share;
+use crate::cpu::simd::{LANES, Mask, Real, Vector, VectorKernel};
 use crate::cpu::spgr::view::Table;
 use rayon::prelude::*;
 
@@ -26,15 +26,15 @@ use rayon::prelude::*;
 const SUPPORT_SLACK: f64 = 1e-4;
 /// Widening of an extent, px (as in `ewa`).
 const SPAN_SLACK_PX: f64 = 1e-3;
-/// Adding it to a whole number below 2²³ leaves that number in the mantissa.
+/// A sum with it has a whole number below 2²³ in its mantissa.
 const MANTISSA: f32 = 8_388_608.0;
 
-/// Who looks at the children, and their parents' colour.
+/// Target camera, rasterizer options and parents' SH.
 #[derive(Clone, Copy, Debug)]
 pub struct Target<'a> {
     /// The camera of the picture to be rendered.
     pub camera: &'a Camera,
-    /// How it is rendered.
+    /// Options of the rasterizer.
     pub options: &'a RasterOptions,
     /// `[N, D, 3]`, D = (`sh_degree` + 1)².
     pub sh: &'a [f32],
@@ -42,10 +42,10 @@ pub struct Target<'a> {
     pub sh_degree: usize,
 }
 
-/// Where the children of one vector of parents are put: children, areas, opacities.
+/// Children, areas and opacities of one vector of parents.
 type Seat<'a, V> = (&'a mut [Seen<V>], &'a mut [V], &'a mut [V]);
 
-/// A child as the target sees it, its opacity still unknown.
+/// A child in the target camera, before its opacity is known.
 #[derive(Clone, Copy)]
 struct Seen<V> {
     /// Camera point.
@@ -60,22 +60,22 @@ struct Seen<V> {
     sum: V3<V>,
 }
 
-impl<V: Lanes> Seen<V> {
+impl<V: Vector<Element = f32>> Seen<V> {
     #[inline(always)]
-    fn new<M: Machine<Scalar = f32, V = V>>(m: M, view: &View, d: V3<V>, child: &Child<V>) -> Self {
-        let rows = [splat(m, &view.rows[0]), splat(m, &view.rows[1]), splat(m, &view.rows[2])];
+    fn new(view: &View, d: V3<V>, child: &Child<V>) -> Self {
+        let rows = [splat(&view.rows[0]), splat(&view.rows[1]), splat(&view.rows[2])];
         let p = times(&rows, d);
-        let inverse = m.of(1.0) / p[2];
+        let inverse = V::constant(1.0) / p[2];
         let mut footprint = [[inverse; 3]; 2];
         for (i, row) in footprint.iter_mut().enumerate() {
             let (low, high) = view.limit[i];
-            let slope = (p[i] * inverse).max(m.splat(low)).min(m.splat(high));
-            let world = scaled(axpy(-slope, rows[2], rows[i]), m.splat(view.focal[i]) * inverse);
+            let slope = (p[i] * inverse).max(V::splat(low)).min(V::splat(high));
+            let world = scaled(axpy(-slope, rows[2], rows[i]), V::splat(view.focal[i]) * inverse);
             *row = product(transposed(child.rotation(), world), child.scale);
         }
         let [a, b] = footprint;
         let n = cross(a, b);
-        let zero = m.of(0.0);
+        let zero = V::constant(0.0);
         Self {
             p,
             xx: dot(a, a),
@@ -87,11 +87,11 @@ impl<V: Lanes> Seen<V> {
         }
     }
 
-    /// The footprint's 12 numbers and four extents in the order of [`Footprint`], and
-    /// 1 where it is kept.
+    /// Computes the footprint's 12 numbers and four extents in the order of [`Footprint`],
+    /// and 1 in lanes that are kept.
     #[inline(always)]
-    fn finish<M: Machine<Scalar = f32, V = V>>(&self, m: M, view: &View, alpha: V) -> ([V; 16], V) {
-        let (zero, one, lowpass) = (m.of(0.0), m.of(1.0), m.splat(view.lowpass));
+    fn finish(&self, view: &View, alpha: V) -> ([V; 16], V) {
+        let (zero, one, lowpass) = (V::constant(0.0), V::constant(1.0), V::splat(view.lowpass));
         let (xx, yy) = (self.xx + lowpass, self.yy + lowpass);
         let det = self.det + lowpass * (self.xx + self.yy) + lowpass * lowpass;
         let mut alpha = alpha;
@@ -99,38 +99,39 @@ impl<V: Lanes> Seen<V> {
             alpha = alpha * (self.det / det).max(zero).sqrt();
         }
         let power = alpha.log2();
-        let reach = power - m.splat(ALPHA_MIN_LOG2);
-        let reach = reach + m.of(SUPPORT_SLACK) * (one + reach);
-        let reach = m.of(2.0 * std::f64::consts::LN_2) * reach;
-        let inverse_z = one / (self.p[2] + m.splat(view.z_epsilon));
-        let place =
-            |i: usize| (m.splat(view.focal[i]) * self.p[i]).fma(inverse_z, m.splat(view.centre[i]));
+        let reach = power - V::splat(ALPHA_MIN_LOG2);
+        let reach = reach + V::constant(SUPPORT_SLACK) * (one + reach);
+        let reach = V::constant(2.0 * std::f64::consts::LN_2) * reach;
+        let inverse_z = one / (self.p[2] + V::splat(view.z_epsilon));
+        let place = |i: usize| {
+            (V::splat(view.focal[i]) * self.p[i]).fma(inverse_z, V::splat(view.centre[i]))
+        };
         let (u, v) = (place(0), place(1));
-        let half = m.of(0.5 * std::f64::consts::LOG2_E);
+        let half = V::constant(0.5 * std::f64::consts::LOG2_E);
         let inverse_yy = one / yy;
         let sx = (half * (yy / det)).sqrt();
         let shear = -self.xy * inverse_yy;
         let sy = (half * inverse_yy).sqrt();
         let (width, height) = ((reach * xx).sqrt(), (reach * yy).sqrt());
         let radius = view.tile_cut.then(|| {
-            let mid = m.of(0.5) * (xx + yy);
-            let spread = (mid * mid - det).max(m.splat(DISCRIMINANT_MIN_MVSPLAT)).sqrt();
-            -(-(m.splat(RADIUS_SIGMAS_MVSPLAT) * (mid + spread).sqrt())).floor()
+            let mid = V::constant(0.5) * (xx + yy);
+            let spread = (mid * mid - det).max(V::splat(DISCRIMINANT_MIN_MVSPLAT)).sqrt();
+            -(-(V::splat(RADIUS_SIGMAS_MVSPLAT) * (mid + spread).sqrt())).floor()
         });
-        let (x0, x1) = extent(m, view.size[0] as f32, (u, width), radius);
-        let (y0, y1) = extent(m, view.size[1] as f32, (v, height), radius);
-        let grey = m.of(0.5) + self.gain[1];
+        let (x0, x1) = extent(view.size[0] as f32, (u, width), radius);
+        let (y0, y1) = extent(view.size[1] as f32, (v, height), radius);
+        let grey = V::constant(0.5) + self.gain[1];
         let rgb = axpy(self.gain[0], self.sum, [grey; 3]);
         let numbers =
             [u, v, sx, shear, sy, power, rgb[0], rgb[1], rgb[2], self.p[2], width, height];
         // Every test fails for NaN.
-        let mut keep = kept(m.splat(view.near).lt(self.p[2]), one);
+        let mut keep = V::splat(view.near).lt(self.p[2]).select_or_zero(one);
         for (low, high) in [(zero, det), (zero, xx), (zero, yy), (x0, x1), (y0, y1)] {
-            keep = kept(low.lt(high), keep);
+            keep = low.lt(high).select_or_zero(keep);
         }
-        keep = V::select(alpha.lt(m.splat(ALPHA_MIN)), zero, keep);
+        keep = alpha.lt(V::splat(ALPHA_MIN)).select(zero, keep);
         let sound = not_finite(&numbers, not_finite(&[det], zero)).abs();
-        keep = kept(sound.lt(one), keep);
+        keep = sound.lt(one).select_or_zero(keep);
         let rgb = [rgb[0].max(zero), rgb[1].max(zero), rgb[2].max(zero)];
         (
             [
@@ -142,24 +143,19 @@ impl<V: Lanes> Seen<V> {
     }
 }
 
-/// Pixels [first, past the last) along one axis of `side` pixels that the support
-/// meets and, with a radius, that the tile cut leaves; whole numbers.
+/// Computes the pixels [first, past the last) along one axis of `side` pixels that the
+/// support intersects and, with a radius, that the tile cut keeps; whole numbers.
 #[inline(always)]
-fn extent<M: Machine<Scalar = f32>>(
-    m: M,
-    side: f32,
-    (mean, half): (M::V, M::V),
-    radius: Option<M::V>,
-) -> (M::V, M::V) {
-    let (zero, one, side) = (m.of(0.0), m.of(1.0), m.splat(side));
-    let half = half + m.of(SPAN_SLACK_PX);
-    // Clamped first, so that a whole number fits the mantissa.
+fn extent<V: Vector<Element = f32>>(side: f32, (mean, half): (V, V), radius: Option<V>) -> (V, V) {
+    let (zero, one, side) = (V::constant(0.0), V::constant(1.0), V::splat(side));
+    let half = half + V::constant(SPAN_SLACK_PX);
+    // The clamp comes first, so that a whole number fits the mantissa.
     let first = (mean - half).max(zero).min(side);
     let past = (mean + half).max(-one).min(side);
     let mut first = -(-first).floor();
     let mut past = (past.floor() + one).min(side);
     if let Some(r) = radius {
-        let tile = m.of(TILE_MVSPLAT as f64);
+        let tile = V::constant(TILE_MVSPLAT as f64);
         let per = one / tile;
         let ends = [mean - r, mean + r + (tile - one)];
         let cut = each(
@@ -183,15 +179,15 @@ struct Project<'a> {
     out: &'a mut [Footprint],
 }
 
-impl Kernel<f32> for Project<'_> {
+impl VectorKernel<f32> for Project<'_> {
     type Output = bool;
     #[inline(always)]
-    fn run<M: Machine<Scalar = f32>>(mut self, m: M) -> bool {
+    fn run<V: Vector<Element = f32>>(mut self) -> bool {
         let children = self.args.rules.children();
         let options = self.target.options;
         let degree = options.sh_degree.min(self.target.sh_degree);
         let mut colour = Coefficients::new(options.sh_basis, degree);
-        let zero = m.of(0.0);
+        let zero = V::constant(0.0);
         let empty = Seen {
             p: [zero; 3],
             xx: zero,
@@ -204,54 +200,54 @@ impl Kernel<f32> for Project<'_> {
         let mut seen = vec![empty; children];
         let (mut areas, mut alphas) = (vec![zero; children], vec![zero; children]);
         let mut bad = zero;
-        for first in self.range.clone().step_by(M::WIDTH) {
-            let span = (first, M::WIDTH.min(self.range.end - first));
+        for first in self.range.clone().step_by(V::LANES) {
+            let span = (first, V::LANES.min(self.range.end - first));
             let set = 3 * sh_coefficients(self.target.sh_degree);
-            colour.load(m, self.target.sh, (span.0, span.1, set));
+            colour.load::<V>(self.target.sh, (span.0, span.1, set));
             let scratch = (&mut seen[..], &mut areas[..], &mut alphas[..]);
-            bad = bad + self.look(m, span, &colour, scratch);
-            self.write(m, span, &seen, &alphas);
+            bad = bad + self.look(span, &colour, scratch);
+            self.write(span, &seen, &alphas);
         }
-        let mut lanes = [0.0; WIDTH_MAX];
-        m.store(bad, &mut lanes);
-        lanes[..M::WIDTH].iter().all(|&v| v == 0.0)
+        let mut lanes = [0.0; LANES];
+        bad.store(&mut lanes);
+        lanes[..V::LANES].iter().all(|&v| v == 0.0)
     }
 }
 
 impl Project<'_> {
-    /// The children of one vector of parents; 0 where all is finite, else NaN.
+    /// Projects the children of one vector of parents; returns 0 in lanes where all numbers
+    /// are finite, else NaN.
     #[inline(always)]
-    fn look<M: Machine<Scalar = f32>>(
+    fn look<V: Vector<Element = f32>>(
         &self,
-        m: M,
         span: (usize, usize),
         colour: &Coefficients<f32>,
-        (seen, areas, alphas): Seat<M::V>,
-    ) -> M::V {
+        (seen, areas, alphas): Seat<V>,
+    ) -> V {
         let Args { rules, source, parents, .. } = self.args;
-        let parent = Parent::load(m, (rules, self.table, &source), parents, span);
-        let mut bad = not_finite(&[parent.alpha, parent.z], m.of(0.0));
-        let eye = splat(m, &self.view.eye);
+        let parent = Parent::load((rules, self.table, &source), parents, span);
+        let mut bad = not_finite(&[parent.alpha, parent.z], V::constant(0.0));
+        let eye = splat(&self.view.eye);
         let shared = self.target.options.sh_direction == ShDirection::Parent;
-        let mut towards = [m.of(0.0); 3];
+        let mut towards = [V::constant(0.0); 3];
         for (k, seen) in seen.iter_mut().enumerate() {
-            let head = records(m, &self.args, span, k);
+            let head = records(&self.args, span, k);
             bad = not_finite(&head, bad);
             let child = Child::new(rules, &parent, k, &head);
             (areas[k], alphas[k]) = (child.area, head[HEAD_LOGIT_OFFSET]);
             bad = not_finite(&child.mean, not_finite(&child.scale, bad));
-            let d = axpy(m.of(-1.0), eye, child.mean);
-            *seen = Seen::new(m, self.view, d, &child);
-            let [gamma, residual, ..] = gain(m, rules, head[HEAD_GAIN_OFFSET]);
+            let d = axpy(V::constant(-1.0), eye, child.mean);
+            *seen = Seen::new(self.view, d, &child);
+            let [gamma, residual, ..] = gain(rules, head[HEAD_GAIN_OFFSET]);
             seen.gain = [gamma, residual];
             if shared {
-                towards = axpy(m.of(1.0), d, towards);
+                towards = axpy(V::constant(1.0), d, towards);
             } else {
-                seen.sum = colour.radiance(m, d);
+                seen.sum = colour.radiance(d);
             }
         }
         if shared {
-            let sum = colour.radiance(m, towards);
+            let sum = colour.radiance(towards);
             seen.iter_mut().for_each(|s| s.sum = sum);
         }
         share(rules.opacity, areas, parent.alpha, parent.own, alphas);
@@ -259,24 +255,23 @@ impl Project<'_> {
     }
 
     #[inline(always)]
-    fn write<M: Machine<Scalar = f32>>(
+    fn write<V: Vector<Element = f32>>(
         &mut self,
-        m: M,
         (first, count): (usize, usize),
-        seen: &[Seen<M::V>],
-        alphas: &[M::V],
+        seen: &[Seen<V>],
+        alphas: &[V],
     ) {
         let children = seen.len();
         let at = (first - self.range.start) * children;
         for (k, (seen, &alpha)) in seen.iter().zip(alphas).enumerate() {
-            let (numbers, keep) = seen.finish(m, self.view, alpha);
-            let mut tile = [[0.0; WIDTH_MAX]; 16];
+            let (numbers, keep) = seen.finish(self.view, alpha);
+            let mut tile = [[0.0; LANES]; 16];
             for (i, (v, tile)) in numbers.into_iter().zip(&mut tile).enumerate() {
-                let v = if i < 12 { v } else { v + m.splat(MANTISSA) };
-                m.store(v, tile);
+                let v = if i < 12 { v } else { v + V::splat(MANTISSA) };
+                v.store(tile);
             }
-            let mut keeps = [0.0; WIDTH_MAX];
-            m.store(keep, &mut keeps);
+            let mut keeps = [0.0; LANES];
+            keep.store(&mut keeps);
             for lane in 0..count {
                 let f = |i: usize| tile[i][lane];
                 let whole = |i: usize| tile[i][lane].to_bits() & 0x007f_ffff;
@@ -304,8 +299,8 @@ impl Project<'_> {
     }
 }
 
-/// Footprints `[N·K]` of the children as `target` sees them (module doc), child k of
-/// parent n at n·K + k. False as in [`super::forward`].
+/// Computes the footprints `[N·K]` of the children in `target` (module documentation),
+/// child k of parent n at n·K + k. Returns false as [`super::forward`].
 pub fn project(args: Args<f32>, target: Target, out: &mut [Footprint]) -> bool {
     let table = Table::new(&args.source);
     let view = View::new(target.camera, target.options);

@@ -1,18 +1,16 @@
-//! Orientation and footprint of one ellipsoid, with gradients (spec 2.5, 2.6, 2.12).
+//! Orientation and footprint of one ellipsoid, with gradients.
 
 use super::Rules;
-use super::view::{
-    M3, V3, add, axpy, cross, dot, indexed, kept, product, scaled, times, transposed,
-};
+use super::view::{M3, V3, add, axpy, cross, dot, indexed, product, scaled, times, transposed};
 use crate::abi::{AREA_SQ_EPS, GROWTH_MAX};
-use crate::cpu::lanes::Lanes;
+use crate::cpu::simd::{Mask, Vector};
 
-/// θ below which the derivative of sin(θ/2)/θ is taken from its series, radians.
+/// θ² below which the derivative of sin(θ/2)/θ comes from its series, radians².
 const SERIES_BELOW: f64 = 1.0;
 
 /// Hamilton product, wxyz.
 #[inline(always)]
-pub(super) fn multiply<V: Lanes>(a: [V; 4], b: [V; 4]) -> [V; 4] {
+pub(super) fn multiply<V: Vector>(a: [V; 4], b: [V; 4]) -> [V; 4] {
     let vector =
         |i: usize, j: usize, k: usize| (a[0] * b[i] + a[i] * b[0]) + (a[j] * b[k] - a[k] * b[j]);
     [
@@ -24,23 +22,23 @@ pub(super) fn multiply<V: Lanes>(a: [V; 4], b: [V; 4]) -> [V; 4] {
 }
 
 #[inline(always)]
-pub(super) fn conjugate<V: Lanes>([w, x, y, z]: [V; 4]) -> [V; 4] {
+pub(super) fn conjugate<V: Vector>([w, x, y, z]: [V; 4]) -> [V; 4] {
     [w, -x, -y, -z]
 }
 
 /// A quaternion divided by its length; zero stays zero.
-pub(super) struct Unit<V: Lanes> {
+pub(super) struct Unit<V: Vector> {
     pub(super) q: [V; 4],
     inverse: V,
     free: V::Mask,
 }
 
-impl<V: Lanes> Unit<V> {
+impl<V: Vector> Unit<V> {
     #[inline(always)]
     pub(super) fn new(q: [V; 4]) -> Self {
         let squared = (q[0] * q[0] + q[1] * q[1]) + (q[2] * q[2] + q[3] * q[3]);
-        let least = squared.of(AREA_SQ_EPS);
-        let inverse = squared.of(1.0) / squared.max(least).sqrt();
+        let least = V::constant(AREA_SQ_EPS);
+        let inverse = V::constant(1.0) / squared.max(least).sqrt();
         Self {
             q: [q[0] * inverse, q[1] * inverse, q[2] * inverse, q[3] * inverse],
             inverse,
@@ -52,7 +50,7 @@ impl<V: Lanes> Unit<V> {
     pub(super) fn backward(&self, d: [V; 4]) -> [V; 4] {
         let q = self.q;
         let along = (q[0] * d[0] + q[1] * d[1]) + (q[2] * d[2] + q[3] * d[3]);
-        let along = kept(self.free, along);
+        let along = self.free.select_or_zero(along);
         let s = self.inverse;
         [
             (d[0] - q[0] * along) * s,
@@ -65,8 +63,8 @@ impl<V: Lanes> Unit<V> {
 
 /// Rotation matrix (rows) of a unit quaternion wxyz.
 #[inline(always)]
-pub(super) fn matrix<V: Lanes>([w, x, y, z]: [V; 4]) -> M3<V> {
-    let (one, two) = (w.of(1.0), w.of(2.0));
+pub(super) fn matrix<V: Vector>([w, x, y, z]: [V; 4]) -> M3<V> {
+    let (one, two) = (V::constant(1.0), V::constant(2.0));
     let (x2, y2, z2) = (two * x, two * y, two * z);
     let on = |a: V, a2: V, b: V, b2: V| (-a).fma(a2, (-b).fma(b2, one));
     [
@@ -78,8 +76,8 @@ pub(super) fn matrix<V: Lanes>([w, x, y, z]: [V; 4]) -> M3<V> {
 
 /// Gradient of [`matrix`].
 #[inline(always)]
-pub(super) fn matrix_backward<V: Lanes>([w, x, y, z]: [V; 4], g: &M3<V>) -> [V; 4] {
-    let two = w.of(2.0);
+pub(super) fn matrix_backward<V: Vector>([w, x, y, z]: [V; 4], g: &M3<V>) -> [V; 4] {
+    let two = V::constant(2.0);
     let sum = |i: usize, j: usize| g[i][j] + g[j][i];
     let turn = [g[2][1] - g[1][2], g[0][2] - g[2][0], g[1][0] - g[0][1]];
     let diagonal = |i: usize, j: usize| two * (g[i][i] + g[j][j]);
@@ -101,31 +99,31 @@ pub(super) struct Turn<V> {
     sinc: V,
 }
 
-impl<V: Lanes> Turn<V> {
+impl<V: Vector> Turn<V> {
     #[inline(always)]
     pub(super) fn new(r: V3<V>) -> Self {
         let squared = dot(r, r);
-        let small = squared.lt(squared.of(1e-6));
-        let theta = squared.max(squared.of(1e-6)).sqrt();
-        let half = squared.of(0.5);
+        let small = squared.lt(V::constant(1e-6));
+        let theta = squared.max(V::constant(1e-6)).sqrt();
+        let half = V::constant(0.5);
         let (sin, cos) = (half * theta).sin_cos();
-        let sinc = V::select(small, squared.fma(squared.of(-0.5 / 24.0), half), sin / theta);
-        let w = V::select(small, squared.fma(squared.of(-0.125), squared.of(1.0)), cos);
+        let sinc = small.select(squared.fma(V::constant(-0.5 / 24.0), half), sin / theta);
+        let w = small.select(squared.fma(V::constant(-0.125), V::constant(1.0)), cos);
         Self { e: [w, sinc * r[0], sinc * r[1], sinc * r[2]], r, squared, sinc }
     }
 
     #[inline(always)]
     pub(super) fn backward(&self, d: [V; 4]) -> V3<V> {
-        let (t, of) = (self.squared, |v: f64| self.squared.of(v));
+        let t = self.squared;
         let d_v = [d[1], d[2], d[3]];
         // (½ cos(θ/2) − sinc)/θ², and its series Σ (−1)ⁿ 2n θ²ⁿ⁻² / (2²ⁿ⁺¹ (2n + 1)!).
-        let mut series = of(-10.0 / 81_749_606_400.0);
+        let mut series = V::constant(-10.0 / 81_749_606_400.0);
         for c in [8.0 / 185_794_560.0, -6.0 / 645_120.0, 4.0 / 3840.0, -2.0 / 48.0] {
-            series = t.fma(series, of(c));
+            series = t.fma(series, V::constant(c));
         }
-        let direct = (of(0.5) * self.e[0] - self.sinc) / t.max(of(SERIES_BELOW));
-        let slope = V::select(t.lt(of(SERIES_BELOW)), series, direct);
-        let along = slope * dot(self.r, d_v) - of(0.5) * self.sinc * d[0];
+        let direct = (V::constant(0.5) * self.e[0] - self.sinc) / t.max(V::constant(SERIES_BELOW));
+        let slope = t.lt(V::constant(SERIES_BELOW)).select(series, direct);
+        let along = slope * dot(self.r, d_v) - V::constant(0.5) * self.sinc * d[0];
         axpy(self.sinc, d_v, scaled(self.r, along))
     }
 }
@@ -144,13 +142,13 @@ pub(super) struct Footprint<V> {
 /// ∂/∂(J·R_w2c), ∂/∂R(q), ∂/∂s.
 pub(super) type FootprintGradient<V> = ([V3<V>; 2], M3<V>, V3<V>);
 
-impl<V: Lanes> Footprint<V> {
+impl<V: Vector> Footprint<V> {
     #[inline(always)]
     pub(super) fn new(jw: &[V3<V>; 2], rotation: &M3<V>, scale: V3<V>) -> Self {
         let turned = [transposed(rotation, jw[0]), transposed(rotation, jw[1])];
         let m = [product(turned[0], scale), product(turned[1], scale)];
         let normal = cross(m[0], m[1]);
-        let area = (dot(normal, normal) + scale[0].of(AREA_SQ_EPS)).sqrt();
+        let area = (dot(normal, normal) + V::constant(AREA_SQ_EPS)).sqrt();
         Self { turned, m, normal, area }
     }
 
@@ -162,7 +160,7 @@ impl<V: Lanes> Footprint<V> {
             g * self.m[0][i].fma(self.m[0][i], self.m[1][i] * self.m[1][i])
         };
         let trace = column(0) + column(1) + column(2);
-        let lowpass = area.of(lowpass);
+        let lowpass = V::constant(lowpass);
         area.fma(area, lowpass.fma(trace, lowpass * lowpass)).sqrt()
     }
 
@@ -175,12 +173,13 @@ impl<V: Lanes> Footprint<V> {
         d: V,
     ) -> (V, [V3<V>; 2]) {
         let each = d / value;
-        let by = each * each.of(lowpass);
+        let by = each * V::constant(lowpass);
         let by = scaled(product(growth, growth), by);
         (each * area, [product(by, self.m[0]), product(by, self.m[1])])
     }
 
-    /// Gradients for those of the area and of M (the latter beside the area's own).
+    /// Computes gradients from those of the area and of M (the latter without the area's
+    /// part).
     #[inline(always)]
     pub(super) fn backward(
         &self,
@@ -202,26 +201,26 @@ impl<V: Lanes> Footprint<V> {
         (d_jw, d_rotation, d_scale)
     }
 
-    /// Factors of the three σ that raise the area to `a_min` where it is below.
+    /// Computes factors of the three σ that raise a smaller area to `a_min`.
     #[inline(always)]
     pub(super) fn growth(&self, rules: &Rules) -> V3<V> {
         let area = self.area;
-        let (one, most) = (area.of(1.0), area.of(GROWTH_MAX));
+        let (one, most) = (V::constant(1.0), V::constant(GROWTH_MAX));
         if rules.a_min <= 0.0 {
             return [one; 3];
         }
-        let a_min = area.of(rules.a_min);
+        let a_min = V::constant(rules.a_min);
         let small = area.lt(a_min);
         if !rules.two_axis {
-            let c = V::select(small, (a_min / area).sqrt().min(most), one);
+            let c = small.select((a_min / area).sqrt().min(most), one);
             return [c; 3];
         }
         let length = |i: usize| self.m[0][i].fma(self.m[0][i], self.m[1][i] * self.m[1][i]);
         let (l0, l1, l2) = (length(0), length(1), length(2));
         // The axis that stays is the first of the shortest columns.
         let pick = |a: V, b: V, c: V| {
-            let not_first = V::select(l2.lt(l1), c, b);
-            V::select(l1.min(l2).lt(l0), not_first, a)
+            let not_first = l2.lt(l1).select(c, b);
+            l1.min(l2).lt(l0).select(not_first, a)
         };
         let n = self.normal;
         let s = [n[0] * n[0], n[1] * n[1], n[2] * n[2]];
@@ -229,9 +228,9 @@ impl<V: Lanes> Footprint<V> {
         let p = pick(s[0], s[1], s[2]);
         let q = pick(s[1] + s[2], s[0] + s[2], s[0] + s[1]);
         let target = a_min * a_min;
-        let root = q.fma(q, area.of(4.0) * p * target).sqrt();
-        let c2 = area.of(2.0) * target / (q + root);
-        let c = V::select(small, c2.sqrt().min(most), one);
+        let root = q.fma(q, V::constant(4.0) * p * target).sqrt();
+        let c2 = V::constant(2.0) * target / (q + root);
+        let c = small.select(c2.sqrt().min(most), one);
         [pick(one, c, c), pick(c, one, c), pick(c, c, one)]
     }
 }

@@ -1,37 +1,35 @@
-//! Small vector algebra on lanes, the primary view, and the guarded Jacobian with its
-//! gradient.
+//! 3-D vector algebra in lanes, the primary view, and the guarded Jacobian with its gradient.
 
 use super::{Rules, Source};
 use crate::abi::{FRUSTUM_MARGIN, VISIBLE_Z_MIN};
 use crate::camera::Camera;
-use crate::cpu::lanes::{Lanes, Machine, WIDTH_MAX};
-use crate::cpu::real::Real;
+use crate::cpu::simd::{LANES, Mask, Real, Vector};
 
 pub(super) type V3<V> = [V; 3];
 pub(super) type M3<V> = [[V; 3]; 3];
 
 #[inline(always)]
-pub(super) fn dot<V: Lanes>(a: V3<V>, b: V3<V>) -> V {
+pub(super) fn dot<V: Vector>(a: V3<V>, b: V3<V>) -> V {
     a[2].fma(b[2], a[1].fma(b[1], a[0] * b[0]))
 }
 
 #[inline(always)]
-pub(super) fn cross<V: Lanes>(a: V3<V>, b: V3<V>) -> V3<V> {
+pub(super) fn cross<V: Vector>(a: V3<V>, b: V3<V>) -> V3<V> {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
 #[inline(always)]
-pub(super) fn add<V: Lanes>(a: V3<V>, b: V3<V>) -> V3<V> {
+pub(super) fn add<V: Vector>(a: V3<V>, b: V3<V>) -> V3<V> {
     [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
 }
 
 #[inline(always)]
-pub(super) fn scaled<V: Lanes>(a: V3<V>, s: V) -> V3<V> {
+pub(super) fn scaled<V: Vector>(a: V3<V>, s: V) -> V3<V> {
     [a[0] * s, a[1] * s, a[2] * s]
 }
 
-/// f of each. `array::map` and `from_fn` are not always inlined, and what is not inlined
-/// is compiled without vectors.
+/// Applies `f` to each element. Compilers do not always inline `array::map` and `from_fn`,
+/// and build calls without the level's vectors.
 #[inline(always)]
 pub(super) fn each<A: Copy, const N: usize>(mut a: [A; N], f: impl Fn(A) -> A) -> [A; N] {
     for v in &mut a {
@@ -40,7 +38,7 @@ pub(super) fn each<A: Copy, const N: usize>(mut a: [A; N], f: impl Fn(A) -> A) -
     a
 }
 
-/// f of each index, `N` times, on top of `start`.
+/// Returns `f` of each index below `N`; `start` initialises the array.
 #[inline(always)]
 pub(super) fn indexed<A: Copy, const N: usize>(start: A, f: impl Fn(usize) -> A) -> [A; N] {
     let mut out = [start; N];
@@ -52,67 +50,58 @@ pub(super) fn indexed<A: Copy, const N: usize>(start: A, f: impl Fn(usize) -> A)
 
 /// a + b.
 #[inline(always)]
-pub(super) fn add4<V: Lanes>(a: [V; 4], b: [V; 4]) -> [V; 4] {
+pub(super) fn add4<V: Vector>(a: [V; 4], b: [V; 4]) -> [V; 4] {
     [a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3]]
 }
 
-/// Every row of a table of scalars in every lane.
+/// Puts each scalar into every lane of a vector.
 #[inline(always)]
-pub(super) fn splat<M: Machine, const N: usize>(m: M, from: &[M::Scalar; N]) -> [M::V; N] {
+pub(super) fn splat<V: Vector, const N: usize>(from: &[V::Element; N]) -> [V; N] {
     indexed(
-        m.of(0.0),
+        V::constant(0.0),
         #[inline(always)]
-        |i| m.splat(from[i]),
+        |i| V::splat(from[i]),
     )
 }
 
-/// Every row of a tile as a vector.
+/// Loads each row of a tile as a vector.
 #[inline(always)]
-pub(super) fn load<M: Machine, const N: usize>(
-    m: M,
-    tile: &[[M::Scalar; WIDTH_MAX]; N],
-) -> [M::V; N] {
+pub(super) fn load<V: Vector, const N: usize>(tile: &[[V::Element; LANES]; N]) -> [V; N] {
     indexed(
-        m.of(0.0),
+        V::constant(0.0),
         #[inline(always)]
-        |i| m.load(&tile[i]),
+        |i| V::load(&tile[i]),
     )
 }
 
 /// a ⊙ b.
 #[inline(always)]
-pub(super) fn product<V: Lanes>(a: V3<V>, b: V3<V>) -> V3<V> {
+pub(super) fn product<V: Vector>(a: V3<V>, b: V3<V>) -> V3<V> {
     [a[0] * b[0], a[1] * b[1], a[2] * b[2]]
 }
 
 /// s·a + b.
 #[inline(always)]
-pub(super) fn axpy<V: Lanes>(s: V, a: V3<V>, b: V3<V>) -> V3<V> {
+pub(super) fn axpy<V: Vector>(s: V, a: V3<V>, b: V3<V>) -> V3<V> {
     [s.fma(a[0], b[0]), s.fma(a[1], b[1]), s.fma(a[2], b[2])]
 }
 
 /// M·v.
 #[inline(always)]
-pub(super) fn times<V: Lanes>(m: &M3<V>, v: V3<V>) -> V3<V> {
+pub(super) fn times<V: Vector>(m: &M3<V>, v: V3<V>) -> V3<V> {
     [dot(m[0], v), dot(m[1], v), dot(m[2], v)]
 }
 
 /// Mᵀ·v.
 #[inline(always)]
-pub(super) fn transposed<V: Lanes>(m: &M3<V>, v: V3<V>) -> V3<V> {
+pub(super) fn transposed<V: Vector>(m: &M3<V>, v: V3<V>) -> V3<V> {
     axpy(v[2], m[2], axpy(v[1], m[1], scaled(m[0], v[0])))
-}
-
-/// `v` where `mask` holds, else 0.
-#[inline(always)]
-pub(super) fn kept<V: Lanes>(mask: V::Mask, v: V) -> V {
-    V::select(mask, v, v.of(0.0))
 }
 
 /// Numbers of one context camera.
 const FIELDS: usize = 23;
 
-/// The context cameras in numbers of the kernel.
+/// The context cameras as numbers of the kernel's type.
 pub(super) struct Table<T> {
     cameras: Vec<[T; FIELDS]>,
 }
@@ -143,63 +132,58 @@ impl<T: Real> Table<T> {
             row[21 + i] = (size[i] - centre[i]) / focal[i] + margin(i);
         }
         row[18] = (0.01 * f64::from(near)).max(1e-3);
-        row.map(T::of)
+        row.map(T::constant)
     }
 
     pub(super) fn len(&self) -> usize {
         self.cameras.len()
     }
 
-    /// The view of every lane.
+    /// Loads the view of every lane.
     #[inline(always)]
-    pub(super) fn views<M: Machine<Scalar = T>>(
-        &self,
-        m: M,
-        index: &[usize; WIDTH_MAX],
-    ) -> View<M::V> {
-        let lanes = &index[..M::WIDTH];
+    pub(super) fn views<V: Vector<Element = T>>(&self, index: &[usize; LANES]) -> View<V> {
+        let lanes = &index[..V::LANES];
         if lanes.iter().all(|&v| v == lanes[0]) {
-            return View::new(splat(m, &self.cameras[lanes[0]]));
+            return View::new(splat(&self.cameras[lanes[0]]));
         }
-        let mut tile = [[T::default(); WIDTH_MAX]; FIELDS];
+        let mut tile = [[T::default(); LANES]; FIELDS];
         for (lane, &v) in lanes.iter().enumerate() {
             for (tile, &v) in tile.iter_mut().zip(&self.cameras[v]) {
                 tile[lane] = v;
             }
         }
-        View::new(load(m, &tile))
+        View::new(load(&tile))
     }
 
-    /// v* of every lane (module doc of [`super`]).
+    /// Loads v* of every lane (module documentation of [`super`]).
     #[inline(always)]
-    pub(super) fn primary<M: Machine<Scalar = T>>(
+    pub(super) fn primary<V: Vector<Element = T>>(
         &self,
-        m: M,
         rules: &Rules,
-        mean: V3<M::V>,
-        source: [usize; WIDTH_MAX],
-    ) -> View<M::V> {
+        mean: V3<V>,
+        source: [usize; LANES],
+    ) -> View<V> {
         if !rules.nearest_visible || self.len() == 1 {
-            return self.views(m, &source);
+            return self.views(&source);
         }
-        let (mut nearest, mut best) = (m.of(f64::INFINITY), m.of(-1.0));
+        let (mut nearest, mut best) = (V::constant(f64::INFINITY), V::constant(-1.0));
         for (v, camera) in self.cameras.iter().enumerate() {
-            let view = View::new(splat(m, camera));
+            let view = View::new(splat(camera));
             let p = view.seen_from(mean);
             let closer = view.sees(p, p[2].lt(nearest));
-            nearest = M::V::select(closer, p[2], nearest);
-            best = M::V::select(closer, m.of(v as f64), best);
+            nearest = closer.select(p[2], nearest);
+            best = closer.select(V::constant(v as f64), best);
         }
-        let mut lanes = [T::default(); WIDTH_MAX];
-        m.store(best, &mut lanes);
+        let mut lanes = [T::default(); LANES];
+        best.store(&mut lanes);
         let mut index = source;
-        for (index, best) in index[..M::WIDTH].iter_mut().zip(lanes) {
+        for (index, best) in index[..V::LANES].iter_mut().zip(lanes) {
             let best = best.to_f64();
             if best >= 0.0 {
                 *index = best as usize;
             }
         }
-        self.views(m, &index)
+        self.views(&index)
     }
 }
 
@@ -212,14 +196,14 @@ pub(super) struct View<V> {
     pub(super) focal: [V; 2],
     centre: [V; 2],
     size: [V; 2],
-    /// Least camera z that is divided by.
+    /// Lower clamp of camera z in divisions.
     pub(super) z_min: V,
-    /// Bounds of x/z and y/z in the Jacobian.
+    /// Clamps of x/z and y/z in the Jacobian.
     low: [V; 2],
     high: [V; 2],
 }
 
-impl<V: Lanes> View<V> {
+impl<V: Vector> View<V> {
     #[inline(always)]
     fn new(f: [V; FIELDS]) -> Self {
         Self {
@@ -240,23 +224,21 @@ impl<V: Lanes> View<V> {
         transposed(&self.rotation, [p[0] - o[0], p[1] - o[1], p[2] - o[2]])
     }
 
-    /// Where `also` holds, in front of the camera and inside the picture.
+    /// Lanes of `also` whose point is in front of the camera and inside the picture.
     #[inline(always)]
     fn sees(&self, p: V3<V>, also: V::Mask) -> V::Mask {
-        let (zero, one) = (p[2].of(0.0), p[2].of(1.0));
-        let both = |m: V::Mask, n: V| V::select(m, n, zero);
-        let mut seen = both(also, both(p[2].of(VISIBLE_Z_MIN).lt(p[2]), one));
+        let mut seen = also & V::constant(VISIBLE_Z_MIN).lt(p[2]);
         for i in 0..2 {
             let u = self.focal[i] * p[i] / p[2] + self.centre[i];
-            seen = both(zero.lt(u), both(u.lt(self.size[i]), seen));
+            seen = seen & V::constant(0.0).lt(u) & u.lt(self.size[i]);
         }
-        zero.lt(seen)
+        seen
     }
 }
 
 /// J·R_w2c, J the Jacobian of the projection with the guards of the rasterizer, px per
 /// world unit.
-pub(super) struct Jacobian<V: Lanes> {
+pub(super) struct Jacobian<V: Vector> {
     /// Two rows.
     pub(super) jw: [V3<V>; 2],
     focal: [V; 2],
@@ -264,17 +246,18 @@ pub(super) struct Jacobian<V: Lanes> {
     inverse_z: V,
     /// Axis in world: the third column of R.
     axis: V3<V>,
-    /// Depth and slopes where no guard acts.
+    /// Lanes whose depth and slopes no guard clamps.
     free_z: V::Mask,
     free: [[V::Mask; 2]; 2],
 }
 
-impl<V: Lanes> Jacobian<V> {
-    /// At camera point `p`, pixels `zoom` times finer than the view's.
+impl<V: Vector> Jacobian<V> {
+    /// Computes the Jacobian at camera point `p`, for pixels `zoom` times finer than the
+    /// view's.
     #[inline(always)]
     pub(super) fn new(view: &View<V>, p: V3<V>, zoom: V) -> Self {
         let r = &view.rotation;
-        let inverse_z = zoom.of(1.0) / p[2].max(view.z_min);
+        let inverse_z = V::constant(1.0) / p[2].max(view.z_min);
         let axis = [r[0][2], r[1][2], r[2][2]];
         let raw = [p[0] * inverse_z, p[1] * inverse_z];
         let slope =
@@ -300,15 +283,15 @@ impl<V: Lanes> Jacobian<V> {
     /// ∂/∂p for the gradient of the two rows.
     #[inline(always)]
     pub(super) fn backward(&self, d: &[V3<V>; 2]) -> V3<V> {
-        let mut d_z = self.inverse_z.of(0.0);
+        let mut d_z = V::constant(0.0);
         let mut d_p = [d_z; 3];
         for i in 0..2 {
             let [above, below] = self.free[i];
-            let d_slope = kept(above, kept(below, -self.focal[i] * dot(d[i], self.axis)));
+            let d_slope = (above & below).select_or_zero(-self.focal[i] * dot(d[i], self.axis));
             d_p[i] = d_slope * self.inverse_z;
             d_z = d_z - dot(d[i], self.jw[i]) - d_slope * self.raw[i];
         }
-        d_p[2] = kept(self.free_z, d_z * self.inverse_z);
+        d_p[2] = self.free_z.select_or_zero(d_z * self.inverse_z);
         d_p
     }
 }

@@ -111,7 +111,7 @@ impl CustomOp3 for Lift {
             let parts = parts.zip(d_scores.par_chunks_mut(CHUNK));
             let one = |((x, dy), dx): ((&[f32], &[f32]), &mut [f32])| {
                 dx.iter_mut().zip(dy).for_each(|(dx, dy)| *dx = gain * dy);
-                f64::from(crate::cpu::math::dot(x, dy))
+                f64::from(crate::cpu::sums::dot(x, dy))
             };
             parts.map(one).collect()
         })?;

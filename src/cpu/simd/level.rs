@@ -1,0 +1,137 @@
+//! Instruction sets: detection, names, and the calls that enter them.
+
+use super::Simd;
+use super::array::Array;
+#[cfg(target_arch = "x86_64")]
+use super::{avx2, avx512};
+use std::sync::OnceLock;
+
+/// An instruction set that kernels are compiled for.
+///
+/// A new one (wasm32 simd128 is planned) needs a variant here, an entry in
+/// [`SimdLevel::available`], an arm in `SimdLevel::run`, and a module beside `avx2` that
+/// implements `Simd`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SimdLevel {
+    /// The instructions that every processor of the target has. Products round separately.
+    Scalar,
+    /// x86-64-v3: AVX2 and FMA. A vector is two registers.
+    Avx2,
+    /// x86-64-v4: AVX-512 F, BW, CD, DQ, VL. A vector is one register.
+    Avx512,
+    /// AArch64, where NEON and fused multiply-add always exist.
+    Neon,
+}
+
+impl SimdLevel {
+    /// All levels, supported here or not.
+    const ALL: [SimdLevel; 4] =
+        [SimdLevel::Scalar, SimdLevel::Avx2, SimdLevel::Avx512, SimdLevel::Neon];
+
+    /// Lists the levels that this processor supports, slowest first.
+    pub fn available() -> &'static [SimdLevel] {
+        static FOUND: OnceLock<Vec<SimdLevel>> = OnceLock::new();
+        FOUND.get_or_init(|| {
+            #[allow(unused_mut, reason = "targets other than these two have one level")]
+            let mut found = vec![SimdLevel::Scalar];
+            #[cfg(target_arch = "x86_64")]
+            {
+                if avx2::detected() {
+                    found.push(SimdLevel::Avx2);
+                }
+                if avx512::detected() {
+                    found.push(SimdLevel::Avx512);
+                }
+            }
+            #[cfg(target_arch = "aarch64")]
+            found.push(SimdLevel::Neon);
+            found
+        })
+    }
+
+    /// Returns the fastest level here, or the one that the environment variable
+    /// `SUBSPLAT_SIMD` names (`scalar`, `avx2`, `avx512`, `neon`). The variable is read
+    /// once; a level that the processor lacks is ignored.
+    pub fn best() -> SimdLevel {
+        static BEST: OnceLock<SimdLevel> = OnceLock::new();
+        *BEST.get_or_init(|| {
+            let named = std::env::var("SUBSPLAT_SIMD").ok();
+            let named = named.and_then(|name| Self::named(&name)).filter(|l| l.is_available());
+            named.or(Self::available().last().copied()).unwrap_or(SimdLevel::Scalar)
+        })
+    }
+
+    /// Finds the level that `SUBSPLAT_SIMD` calls `name`.
+    pub fn named(name: &str) -> Option<SimdLevel> {
+        Self::ALL.into_iter().find(|level| level.name() == name)
+    }
+
+    /// Returns the level's name in `SUBSPLAT_SIMD`.
+    pub fn name(self) -> &'static str {
+        match self {
+            SimdLevel::Scalar => "scalar",
+            SimdLevel::Avx2 => "avx2",
+            SimdLevel::Avx512 => "avx512",
+            SimdLevel::Neon => "neon",
+        }
+    }
+
+    /// Tells whether this processor supports the level.
+    pub fn is_available(self) -> bool {
+        Self::available().contains(&self)
+    }
+
+    /// Runs `kernel` compiled for this level, or for [`SimdLevel::Scalar`] where the
+    /// processor lacks it.
+    ///
+    /// Call it inside a parallel task, not around one: the compiler builds the code of
+    /// other threads' tasks without the level's instructions.
+    #[inline]
+    pub(crate) fn run<K: Kernel>(self, kernel: K) -> K::Output {
+        match self {
+            #[cfg(target_arch = "x86_64")]
+            SimdLevel::Avx512 if self.is_available() => {
+                // SAFETY: the guard checked the processor's features.
+                unsafe { avx512::run(kernel) }
+            }
+            #[cfg(target_arch = "x86_64")]
+            SimdLevel::Avx2 if self.is_available() => {
+                // SAFETY: the guard checked the processor's features.
+                unsafe { avx2::run(kernel) }
+            }
+            #[cfg(target_arch = "aarch64")]
+            SimdLevel::Neon => kernel.run(Array::<true>),
+            _ => kernel.run(Array::<false>),
+        }
+    }
+}
+
+impl Default for SimdLevel {
+    fn default() -> Self {
+        SimdLevel::best()
+    }
+}
+
+/// Work that [`SimdLevel::run`] compiles for a level. Mark `run` `#[inline(always)]`.
+pub(crate) trait Kernel {
+    /// Result of the work.
+    type Output;
+    /// Does the work with the vectors of `s`.
+    fn run<S: Simd>(self, s: S) -> Self::Output;
+}
+
+/// Runs `f` compiled for the best level, so that its plain loops use wide vectors.
+///
+/// Mark the closure, and the functions that it calls, `#[inline(always)]`.
+#[inline(always)]
+pub fn vectorize<R>(f: impl FnOnce() -> R) -> R {
+    struct Closure<F>(F);
+    impl<R, F: FnOnce() -> R> Kernel for Closure<F> {
+        type Output = R;
+        #[inline(always)]
+        fn run<S: Simd>(self, _: S) -> R {
+            (self.0)()
+        }
+    }
+    SimdLevel::best().run(Closure(f))
+}
