@@ -13,7 +13,7 @@
 
 use crate::camera::{Camera, Intrinsics};
 use crate::io::image::Rgb;
-use crate::io::resize::{Filter, resize, resize_window};
+use crate::io::resize::{Filter, Window, resize, resize_window};
 use crate::io::{Error, Result};
 use glam::Vec2;
 
@@ -140,7 +140,10 @@ impl Plan {
     }
 
     fn picture(&self, photo: &Rgb) -> Rgb {
-        resize_window(photo, self.full, self.origin, self.size, Filter::Lanczos)
+        let pair = |v: (usize, usize)| [v.0, v.1];
+        let (full, origin) = (pair(self.full), pair(self.origin));
+        let window = Window { full, origin, size: pair(self.size) };
+        resize_window(photo, &window, Filter::Lanczos)
     }
 
     fn intrinsics(&self, photo: &Intrinsics, rule: CropRule) -> Intrinsics {

@@ -1,5 +1,5 @@
-//! What all pose readers have in common: finding pictures, looking at their headers,
-//! and making checked [`Frame`]s of what a file says.
+//! Common parts of the pose readers: search for pictures, reading of their headers, and
+//! conversion of a file's entries to checked [`Frame`]s.
 
 use super::image::{Probe, probe};
 use super::scene::{Frame, Scene, SceneFormat, Units};
@@ -10,27 +10,27 @@ use glam::{DMat3, DMat4};
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 
-/// Intrinsics as a pose file gives them.
+/// Intrinsics in the form of a pose file.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Lens {
     /// fx, fy, cx, cy in pixels of the pose file's size.
     Pixels([f64; 4]),
-    /// The same, divided by width and height of the stored picture.
+    /// fx, fy, cx, cy divided by width and height of the stored picture.
     Normalised([f64; 4]),
 }
 
-/// A frame before its picture was looked at.
+/// A frame before its picture's header is read.
 #[derive(Clone, Debug)]
 pub(super) struct Draft {
-    /// Where in the pose file, in [`Error::at`]'s form.
+    /// Place in the pose file, in the form of [`Error::at`].
     pub place: String,
-    /// The picture's path as the pose file has it.
+    /// Path of the picture in the pose file.
     pub file: String,
-    /// The picture on disk, `None` if there is none.
+    /// Path of the picture on disk, `None` if there is none.
     pub image: Option<PathBuf>,
     /// Intrinsics.
     pub lens: Lens,
-    /// Picture size that the intrinsics belong to, if the file says so.
+    /// Picture size to which the intrinsics belong, if the file has it.
     pub size: Option<(usize, usize)>,
     /// OpenCV pose.
     pub world_from_camera: DMat4,
@@ -66,7 +66,7 @@ impl Draft {
 pub(super) const EXTENSIONS: [&str; 12] =
     ["png", "jpg", "jpeg", "PNG", "JPG", "JPEG", "webp", "tif", "tiff", "TIF", "bmp", "BMP"];
 
-/// Looks for a picture below `roots`, with and without `images/` between.
+/// Searches for a picture below `roots`, with and without `images/` between.
 pub(super) fn find_image(roots: &[&Path], name: &str) -> Option<PathBuf> {
     let name = name.replace('\\', "/");
     let name = name.trim_start_matches("./");
@@ -75,8 +75,8 @@ pub(super) fn find_image(roots: &[&Path], name: &str) -> Option<PathBuf> {
     }
     let places: Vec<PathBuf> =
         roots.iter().flat_map(|r| [r.join(name), r.join("images").join(name)]).collect();
-    // `exists` last and not `is_file`: a folder under the picture's name is an error
-    // that the probe names, not a missing picture.
+    // The last test is `exists`: a folder of the picture's name is an error of the probe,
+    // not a missing picture.
     let mut candidates = places.iter().filter(|p| p.is_file()).cloned();
     candidates
         .next()
@@ -93,28 +93,36 @@ fn with_extensions(place: &Path) -> impl Iterator<Item = PathBuf> + '_ {
     })
 }
 
-/// What file names are sorted by: a run of digits is one number, so that `9.png` stands
-/// before `10.png`; everything else by character.
-fn counted(path: &Path) -> Vec<(char, usize, String)> {
+/// A part of a file name, in the order of the fields: a character, or a number that sorts
+/// as `0` among characters, by its length and then by its digits.
+#[derive(PartialEq, Eq, PartialOrd, Ord)]
+struct NamePart {
+    first: char,
+    digit_count: usize,
+    digits: String,
+}
+
+/// Makes the sort key of a file name. A run of digits is one number, so that `9.png` comes
+/// before `10.png`.
+fn numeric_key(path: &Path) -> Vec<NamePart> {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     let (mut key, mut rest) = (Vec::new(), &*name);
     while let Some(first) = rest.chars().next() {
-        let digits = rest.find(|c: char| !c.is_ascii_digit()).unwrap_or(rest.len());
-        if digits == 0 {
-            key.push((first, 0, String::new()));
+        let run = rest.find(|c: char| !c.is_ascii_digit()).unwrap_or(rest.len());
+        if run == 0 {
+            key.push(NamePart { first, digit_count: 0, digits: String::new() });
             rest = &rest[first.len_utf8()..];
         } else {
-            // Of two numbers the longer one is the larger; `0` is where digits sort.
-            let number = rest[..digits].trim_start_matches('0');
-            key.push(('0', number.len(), number.to_owned()));
-            rest = &rest[digits..];
+            let digits = rest[..run].trim_start_matches('0').to_owned();
+            key.push(NamePart { first: '0', digit_count: digits.len(), digits });
+            rest = &rest[run..];
         }
     }
     key
 }
 
-/// Pictures of a folder, sorted by name with numbers in their order; empty if there is
-/// no such folder.
+/// Lists the pictures of a folder, sorted by name with numbers in numeric order; empty if
+/// there is no such folder.
 pub(super) fn list_images(folder: &Path) -> Vec<PathBuf> {
     let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
     let is_picture = |p: &PathBuf| {
@@ -123,25 +131,33 @@ pub(super) fn list_images(folder: &Path) -> Vec<PathBuf> {
     };
     let mut images: Vec<PathBuf> =
         entries.filter_map(|e| Some(e.ok()?.path())).filter(is_picture).collect();
-    // `01.png` and `1.png` are the same number.
-    images.sort_by_cached_key(|p| (counted(p), p.clone()));
+    // The path decides between `01.png` and `1.png`.
+    images.sort_by_cached_key(|p| (numeric_key(p), p.clone()));
     images
 }
 
-/// Nearest rotation, where the file's few digits or an exporter's float noise left
-/// something to correct; what [`Camera::new`] would refuse stays as it is, and so
-/// does what f32 cannot express better. Second value: how far off it was.
-pub(super) fn orthonormal(pose: DMat4) -> (DMat4, f64) {
+/// A pose after [`orthonormal`].
+pub(super) struct OrthonormalPose {
+    /// The corrected pose.
+    pub pose: DMat4,
+    /// Largest entry of |RᵀR − I| before the correction.
+    pub error: f64,
+}
+
+/// Replaces the rotation by the nearest orthonormal one, to undo rounding in the file. The
+/// pose stays as it is where [`Camera::new`] would refuse it, and where the error is below
+/// the precision of f32.
+pub(super) fn orthonormal(pose: DMat4) -> OrthonormalPose {
     let error = |r: DMat3| {
         let gram = r.transpose() * r - DMat3::IDENTITY;
         gram.to_cols_array().into_iter().fold(0.0f64, |m, v| m.max(v.abs()))
     };
     let mut rotation = DMat3::from_mat4(pose);
-    let off = error(rotation);
-    if !(2e-6..=f64::from(Camera::RIGID_TOLERANCE)).contains(&off) {
-        return (pose, off);
+    let error = error(rotation);
+    if !(2e-6..=f64::from(Camera::RIGID_TOLERANCE)).contains(&error) {
+        return OrthonormalPose { pose, error };
     }
-    // Newton's iteration for the polar decomposition: quadratic, and the start is
+    // Newton's iteration for the polar decomposition converges quadratically; the start is
     // within 1 %.
     for _ in 0..6 {
         rotation = (rotation + rotation.inverse().transpose()) * 0.5;
@@ -153,14 +169,21 @@ pub(super) fn orthonormal(pose: DMat4) -> (DMat4, f64) {
         column(rotation.z_axis),
         pose.w_axis,
     );
-    (pose, off)
+    OrthonormalPose { pose, error }
 }
 
-/// Intrinsics of the stored picture; the second value says that they were rescaled.
+/// Intrinsics of a stored picture.
+struct StoredIntrinsics {
+    intrinsics: Intrinsics,
+    /// They were scaled from the pose file's size.
+    rescaled: bool,
+}
+
+/// Computes the intrinsics of the stored picture; an error is the picture's size.
 fn stored_intrinsics(
     draft: &Draft,
     stored: &Probe,
-) -> std::result::Result<(Intrinsics, bool), String> {
+) -> std::result::Result<StoredIntrinsics, String> {
     let (w, h) = (stored.width as f64, stored.height as f64);
     let (k, rescaled) = match draft.lens {
         Lens::Normalised(k) => ([k[0] * w, k[1] * h, k[2] * w, k[3] * h], false),
@@ -179,12 +202,13 @@ fn stored_intrinsics(
         }
     };
     let [fx, fy, cx, cy] = k.map(|v| v as f32);
-    Ok((Intrinsics { fx, fy, cx, cy, width: stored.width, height: stored.height }, rescaled))
+    let intrinsics = Intrinsics { fx, fy, cx, cy, width: stored.width, height: stored.height };
+    Ok(StoredIntrinsics { intrinsics, rescaled })
 }
 
-/// A refused camera, at its place in a file.
+/// Makes an error of a refused camera at its place in a file.
 pub(super) fn camera_error(path: &Path, place: &str, error: &CameraError) -> Error {
-    // "part: expected this, got that", the form of all errors.
+    // Messages have the form "part: expected this, got that".
     let text = error.to_string();
     let parts = || {
         let (part, rest) = text.split_once(": expected ")?;
@@ -195,8 +219,8 @@ pub(super) fn camera_error(path: &Path, place: &str, error: &CameraError) -> Err
     Error::format(path, expected, got).at(place)
 }
 
-/// Makes frames of drafts: looks at every picture's header, checks every camera,
-/// and leaves out, with a warning, frames whose picture is missing.
+/// Makes frames of drafts: reads the header of every picture and checks every camera. A
+/// missing picture gives a warning and no frame.
 pub(super) fn assemble(path: &Path, source: SceneFormat, drafts: Vec<Draft>) -> Result<Scene> {
     if drafts.is_empty() {
         return Err(Error::format(path, "at least one frame", "none"));
@@ -240,9 +264,9 @@ fn frame(
         Err(Error::format(path, expected, got).at(draft.place.clone()))
     };
     if stored.orientation.is_some() {
-        notes.turned.push(draft.file.clone());
+        notes.with_orientation.push(draft.file.clone());
     }
-    let (intrinsics, rescaled) = match stored_intrinsics(&draft, stored) {
+    let StoredIntrinsics { intrinsics, rescaled } = match stored_intrinsics(&draft, stored) {
         Ok(k) => k,
         Err(got) => {
             let (w, h) = draft.size.unwrap_or_default();
@@ -252,8 +276,8 @@ fn frame(
     if rescaled {
         notes.rescaled.push(draft.file.clone());
     }
-    let (pose, off) = orthonormal(draft.world_from_camera);
-    if off > 1e-3 && off <= f64::from(Camera::RIGID_TOLERANCE) {
+    let OrthonormalPose { pose, error } = orthonormal(draft.world_from_camera);
+    if error > 1e-3 && error <= f64::from(Camera::RIGID_TOLERANCE) {
         notes.skewed.push(draft.file.clone());
     }
     let camera = match Camera::new(intrinsics, pose.as_mat4()) {
@@ -276,11 +300,11 @@ fn frame(
     })
 }
 
-/// Files to warn of, gathered so that each kind is one line.
+/// Files that give warnings, one line for each kind.
 #[derive(Default)]
 struct Notes {
     missing: Vec<String>,
-    turned: Vec<String>,
+    with_orientation: Vec<String>,
     rescaled: Vec<String>,
     skewed: Vec<String>,
 }
@@ -289,7 +313,10 @@ impl Notes {
     fn lines(&self, count: usize) -> Vec<String> {
         let kinds = [
             (&self.missing, "have no picture on disk and are left out"),
-            (&self.turned, "have an EXIF orientation: ignored, pose files speak of stored pixels"),
+            (
+                &self.with_orientation,
+                "have an EXIF orientation: ignored, pose files refer to the stored pixels",
+            ),
             (&self.rescaled, "are stored at another size than the pose file's: intrinsics scaled"),
             (&self.skewed, "have a rotation that is not orthonormal (0.1 % to 1 %): corrected"),
         ];
@@ -302,7 +329,8 @@ impl Notes {
     }
 }
 
-/// Name of the folder that a person would call the scene.
+/// Derives the scene's name from the nearest folder that is not part of a format's layout.
+
 fn scene_name(pose_file: &Path) -> String {
     let absolute = std::fs::canonicalize(pose_file).unwrap_or_else(|_| pose_file.to_owned());
     let mut folder = if absolute.is_dir() { Some(absolute.as_path()) } else { absolute.parent() };

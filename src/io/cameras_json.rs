@@ -1,5 +1,5 @@
-//! `cameras.json`: the layout of this project (and of `run`'s output), and the list
-//! that 3DGS training writes under the same name.
+//! `cameras.json`: the layout of this project and of `subsplat run`, and the list of 3DGS
+//! training under the same name.
 //!
 //! ```json
 //! {"convention": "...", "units": "metres",
@@ -8,13 +8,13 @@
 //!              "c2w": [[…], […], […], [0, 0, 0, 1]]}]}
 //! ```
 //!
-//! `c2w` is OpenCV camera-to-world, intrinsics are pixels of the stored picture,
-//! which is a pinhole's. Optional: `timestamp_us`, `depth` of a frame; `units`
-//! (`metres`, `re10k`), or `metric: true`, and `near` and `far` (camera z in world
-//! units, for all frames) of the file. Unknown keys are ignored.
+//! `c2w` is OpenCV camera-to-world; intrinsics are in pixels of the stored picture, without
+//! distortion. Optional keys of a frame are `timestamp_us` and `depth`. Optional keys of the
+//! file are `units` (`metres`, `re10k`) or `metric: true`, and `near` and `far` (camera z in
+//! world units, for all frames). Unknown keys are ignored.
 //!
-//! 3DGS's list has `img_name, width, height, fx, fy, rotation` (camera to world),
-//! `position` (the eye): same axes, principal point in the middle.
+//! The list of 3DGS has `img_name, width, height, fx, fy, rotation` (camera to world),
+//! `position` (of the camera): the same axes, principal point in the middle.
 
 use super::assemble::{Draft, Lens, assemble, camera_error, find_image, orthonormal};
 use super::scene::{Frame, Scene, SceneFormat, Units};
@@ -31,30 +31,30 @@ const CONVENTION: &str = "OpenCV camera-to-world (x right, y down, z forward); p
 /// A camera with the name of its picture, which need not exist.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NamedCamera {
-    /// The picture, relative to the folder of the file.
+    /// Path of the picture, relative to the folder of the file.
     pub file: String,
     /// The camera.
     pub camera: Camera,
     /// Time stamp, microseconds.
     pub timestamp: Option<i64>,
-    /// Depth map, relative to the folder of the file.
+    /// Path of the depth map, relative to the folder of the file.
     pub depth: Option<String>,
 }
 
 /// Content of a `cameras.json`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CameraFile {
-    /// In the file's order.
+    /// Cameras in the file's order.
     pub cameras: Vec<NamedCamera>,
     /// Unit of length.
     pub units: Units,
-    /// Nearest and farthest depth of the scene, world units of camera z.
+    /// Nearest and farthest depth of the scene, camera z in world units.
     pub near_far: Option<(f32, f32)>,
 }
 
-/// What the file says of all frames.
+/// Fields of the file that concern all frames.
 #[derive(Clone, Copy, Default)]
-struct Facts {
+struct FileInfo {
     units: Units,
     near_far: Option<(f32, f32)>,
 }
@@ -126,22 +126,23 @@ struct OutFrame<'a> {
     c2w: [[f32; 4]; 4],
 }
 
-/// A JSON error with its line and column; what serde expected and got stands in its message.
+/// Makes an error of a JSON error, with its line and column; serde's message has the
+/// expected and the found value.
 pub(super) fn json_error(path: &Path, expected: &str, error: &serde_json::Error) -> Error {
     let text = error.to_string();
-    // serde_json appends the place that `at` already says.
+    // serde_json appends the place, which `at` holds.
     let got = text.split(" at line ").next().unwrap_or(&text).to_owned();
     let place = format!(":{}:{}", error.line(), error.column());
     let at = if error.line() > 0 { place } else { String::new() };
     Error::format(path, expected, got).at(at)
 }
 
-/// A picture side that a JSON file wrote as a number of any kind.
+/// Converts a JSON number to the side of a picture.
 pub(super) fn side(value: f64) -> Option<usize> {
     (value >= 1.0 && value <= f64::from(1 << 20) && value.fract() == 0.0).then_some(value as usize)
 }
 
-/// A 3×4 or 4×4 matrix given as rows.
+/// Converts the rows of a 3×4 or 4×4 matrix.
 pub(super) fn matrix(rows: &[Vec<f64>]) -> std::result::Result<DMat4, String> {
     let shape_ok = (3..=4).contains(&rows.len()) && rows.iter().all(|r| r.len() == 4);
     if !shape_ok {
@@ -152,11 +153,11 @@ pub(super) fn matrix(rows: &[Vec<f64>]) -> std::result::Result<DMat4, String> {
     Ok(DMat4::from_cols(row(0), row(1), row(2), row(3)).transpose())
 }
 
-/// Whether a pose file has this layout, or is called as if it had: `cameras.json`, or any
-/// other JSON file but `transforms.json` that begins with a camera of this layout.
+/// Reports whether a pose file has this layout: `cameras.json` by its name, and any other
+/// JSON file but `transforms.json` that begins with a camera of this layout.
 ///
 /// # Errors
-/// A file of another name that is no JSON.
+/// A file of another name that is not JSON.
 pub fn is_cameras_json(path: &Path) -> Result<bool> {
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
     if ["cameras.json", "transforms.json"].contains(&&*name) || !name.ends_with(".json") {
@@ -167,14 +168,14 @@ pub fn is_cameras_json(path: &Path) -> Result<bool> {
     Ok(value.is_array() || value["frames"][0].get("c2w").is_some())
 }
 
-fn drafts(path: &Path) -> Result<(Vec<Draft>, Facts)> {
+fn drafts(path: &Path) -> Result<(Vec<Draft>, FileInfo)> {
     let bytes = read(path)?;
     let list = bytes.iter().find(|b| !b.is_ascii_whitespace()) == Some(&b'[');
     if list {
         let frames: Vec<SplatFrame> = serde_json::from_slice(&bytes)
             .map_err(|e| json_error(path, "a list of 3DGS cameras (img_name, rotation, …)", &e))?;
         let drafts = frames.into_iter().enumerate().map(|(i, f)| splat_draft(path, i, f));
-        return Ok((drafts.collect::<Result<_>>()?, Facts::default()));
+        return Ok((drafts.collect::<Result<_>>()?, FileInfo::default()));
     }
     let file: InFile = serde_json::from_slice(&bytes)
         .map_err(|e| json_error(path, "cameras.json (frames with file, fx, …, c2w)", &e))?;
@@ -195,7 +196,7 @@ fn drafts(path: &Path) -> Result<(Vec<Draft>, Facts)> {
         }
     };
     let drafts = file.frames.into_iter().enumerate().map(|(i, f)| draft(path, i, f));
-    Ok((drafts.collect::<Result<_>>()?, Facts { units, near_far }))
+    Ok((drafts.collect::<Result<_>>()?, FileInfo { units, near_far }))
 }
 
 fn size(path: &Path, place: &str, width: f64, height: f64) -> Result<Option<(usize, usize)>> {
@@ -233,30 +234,31 @@ fn folder(path: &Path) -> &Path {
     path.parent().unwrap_or(Path::new(""))
 }
 
-/// Reads a scene; frames without a picture are left out with a warning.
+/// Reads a scene. Frames without a picture are left out with a warning.
 pub(super) fn load(path: &Path) -> Result<Scene> {
-    let (mut drafts, facts) = drafts(path)?;
+    let (mut drafts, info) = drafts(path)?;
     for d in &mut drafts {
         d.image = find_image(&[folder(path)], &d.file);
     }
     let mut scene = assemble(path, SceneFormat::CamerasJson, drafts)?;
-    scene.units = facts.units;
-    scene.near_far = facts.near_far;
+    scene.units = info.units;
+    scene.near_far = info.near_far;
     Ok(scene)
 }
 
-/// Reads the cameras alone: their pictures need not exist.
+/// Reads the cameras; their pictures need not exist.
 ///
 /// # Errors
-/// Not this layout; a camera that is not usable (its frame is named).
+/// Another layout; an invalid camera (the error names its frame).
 pub fn load_cameras_json(path: &Path) -> Result<CameraFile> {
-    let (drafts, facts) = drafts(path)?;
+    let (drafts, info) = drafts(path)?;
     let mut cameras = Vec::with_capacity(drafts.len());
     for d in drafts {
         let (Some((width, height)), Lens::Pixels(k)) = (d.size, d.lens) else { continue };
         let [fx, fy, cx, cy] = k.map(|v| v as f32);
         let intrinsics = Intrinsics { fx, fy, cx, cy, width, height };
-        let (pose, _) = orthonormal(d.world_from_camera);
+        let pose = orthonormal(d.world_from_camera).pose;
+
         let camera = Camera::new(intrinsics, pose.as_mat4())
             .map_err(|e| camera_error(path, &d.place, &e))?;
         let depth = d
@@ -265,13 +267,13 @@ pub fn load_cameras_json(path: &Path) -> Result<CameraFile> {
             .map(|p| p.strip_prefix(folder(path)).unwrap_or(p).to_string_lossy().into_owned());
         cameras.push(NamedCamera { file: d.file, camera, timestamp: d.timestamp, depth });
     }
-    Ok(CameraFile { cameras, units: facts.units, near_far: facts.near_far })
+    Ok(CameraFile { cameras, units: info.units, near_far: info.near_far })
 }
 
-/// Writes this layout. Floats are written so that they read back the same.
+/// Writes this layout. Floats have enough digits to read back exactly.
 ///
 /// # Errors
-/// Everything of [`write_atomic`].
+/// Errors of [`write_atomic`].
 pub fn save_cameras_json(path: &Path, content: &CameraFile) -> Result<()> {
     let frame = |c: &'_ NamedCamera| {
         let Intrinsics { fx, fy, cx, cy, width, height } = c.camera.intrinsics;
@@ -296,7 +298,8 @@ pub fn save_cameras_json(path: &Path, content: &CameraFile) -> Result<()> {
 }
 
 impl NamedCamera {
-    /// A frame's camera, with `file` as the picture's new name.
+    /// Makes a named camera of a frame's camera and the new path `file` of its picture.
+
     pub fn of_frame(frame: &Frame, file: impl Into<String>) -> Self {
         Self { file: file.into(), camera: frame.camera, timestamp: frame.timestamp, depth: None }
     }

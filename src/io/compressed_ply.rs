@@ -1,12 +1,11 @@
-//! PlayCanvas' `.compressed.ply` (SuperSplat, splat-transform): 16 bytes a Gaussian,
-//! quantised within the bounds of its chunk of 256.
+//! Reader of PlayCanvas' `.compressed.ply` (SuperSplat, splat-transform): 16 bytes per
+//! Gaussian, quantised within the bounds of its chunk of 256.
 //!
 //! Element `chunk`: bounds of position, ln σ and (newer files) colour. Element
 //! `vertex`: `packed_position` and `packed_scale` 11+10+11 bits, `packed_rotation` 2
 //! bits for the largest component (order wxyz) and 3×10 for the others, scaled by
 //! √2; `packed_color` RGBA bytes, A the opacity after the sigmoid. Optional element
-//! `sh`: one byte a coefficient over [−4, 4], channel-major as `f_rest_*`.
-//! A reader only: no writer of ours makes it.
+//! `sh`: one byte per coefficient over [−4, 4], channel-major as `f_rest_*`.
 
 use super::gaussians::{Decoded, Incoming, dc_from_colour};
 use super::ply::{REST_COUNTS, rest_to_set};
@@ -33,12 +32,12 @@ const BOUNDS: [&str; 12] = [
 const COLOUR_BOUNDS: [&str; 6] = ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"];
 const PACKED: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
 
-/// Whether `header` is of this kind.
+/// Reports whether `header` is of this kind.
 pub(super) fn is_compressed(header: &Header) -> bool {
     header.elements.iter().any(|e| e.name == "vertex" && e.position(PACKED[0]).is_some())
 }
 
-/// Bounds of a chunk: least and largest position, ln σ, colour.
+/// Bounds of a chunk: smallest and largest position, ln σ, colour.
 struct Chunk {
     position: [[f64; 3]; 2],
     log_scale: [[f64; 3]; 2],
@@ -97,7 +96,7 @@ fn read_chunks(header: &Header, element: &Element, source: &mut Source) -> Resul
         }
         colour = Some(slots);
     }
-    let mut chunks = Vec::with_capacity(header.room(element, source)?);
+    let mut chunks = Vec::with_capacity(header.checked_count(element, source)?);
     header.rows(element, source, |_, v| {
         let triple = |slots: &[usize]| [v[slots[0]], v[slots[1]], v[slots[2]]];
         chunks.push(Chunk {
@@ -122,14 +121,14 @@ fn read_vertices(
         *slot = need(element, name, &[Scalar::U32], source)?;
     }
     let path = source.path;
-    let count = header.room(element, source)?;
+    let count = header.checked_count(element, source)?;
     if chunks.len() < count.div_ceil(CHUNK) {
         let expected = format!("{} chunks before {count} vertices", count.div_ceil(CHUNK));
         return Err(Error::format(path, expected, chunks.len().to_string()));
     }
-    // The `sh` rows come later: their room is checked before any is kept.
+    // The `sh` rows follow; their size is checked before any memory is allocated for them.
     if let Some(sh) = header.elements.iter().find(|e| e.name == "sh") {
-        header.room(sh, source)?;
+        header.checked_count(sh, source)?;
         if sh.count != element.count {
             let expected = format!("as many rows of `sh` as vertices, {count}");
             return Err(Error::format(path, expected, sh.count.to_string()));
@@ -174,7 +173,8 @@ fn read_sh(
     let mut rest = vec![0.0; rests];
     header.rows(element, source, |i, v| {
         for (r, &slot) in rest.iter_mut().zip(&at) {
-            // Bytes 0 and 255 are the ends of the range, the others bin centres.
+            // Bytes 0 and 255 are the ends of the range, the others centres of bins.
+
             let unit = match v[slot] as u8 {
                 0 => 0.0,
                 255 => 1.0,

@@ -1,9 +1,9 @@
-//! What the splat readers and writers share: Gaussians one by one in the form that
-//! files store them, axis changes that carry quaternions and SH along, and checks.
+//! Common parts of the splat readers and writers: single Gaussians in the form of the files,
+//! changes of axes for means, quaternions and SH, and checks.
 //!
-//! On the way out a child's colour is spelled out: coefficients γ·h of its parent,
-//! δ/C₀ added to the constant one, in the standard basis, truncated to the degree
-//! asked for. On the way in K = 1, no gain, standard basis, unit quaternions.
+//! Writers fold a child's colour into SH coefficients of its own: γ·h of its parent, δ/C₀
+//! added to the constant one, in the standard basis, truncated to the degree written.
+//! Readers give K = 1, no gain, the standard basis and unit quaternions.
 
 use super::{Error, Result, SaveOptions};
 use crate::abi::{
@@ -14,14 +14,14 @@ use crate::splats::Splats;
 use glam::{DMat3, DQuat, DVec3};
 use std::path::Path;
 
-/// σ below this is written as this, world units: its logarithm must be finite.
+/// Smallest σ that is written, world units: its logarithm is finite.
 pub(super) const SCALE_MIN: f32 = 1e-12;
-/// Opacity is kept this far from 0 and 1 where a file stores logits.
+/// Distance from 0 and 1 to which opacities are clamped for files that store logits.
 const LOGIT_MARGIN: f64 = 1e-7;
-/// Rounding may carry an opacity this far out of [0, 1]; more is an error.
+/// Largest distance of an opacity from [0, 1] by rounding; more is an error.
 const OPACITY_SLACK: f32 = 1e-4;
 
-/// One Gaussian as a file stores it.
+/// A Gaussian in the form of a file.
 pub(super) struct Gaussian {
     /// Mean, axes of the file.
     pub mean: [f32; 3],
@@ -35,14 +35,26 @@ pub(super) struct Gaussian {
     pub sh: [f32; 75],
 }
 
-/// Sparse rows of a linear map on SH coefficients: (input index, factor).
-type ShMap = Vec<Vec<(usize, f64)>>;
+/// An entry of a sparse matrix row.
+struct Entry {
+    column: usize,
+    factor: f64,
+}
 
-/// Splats on their way into a file.
+/// Sparse rows of a linear map on SH coefficients.
+type ShMap = Vec<Vec<Entry>>;
+
+/// A change of axes, as a matrix and as a quaternion.
+struct AxisRotation {
+    matrix: DMat3,
+    quat: DQuat,
+}
+
+/// Splats to be written to a file.
 pub(super) struct Outgoing<'a> {
     splats: &'a Splats,
     min_opacity: f32,
-    turn: Option<(DMat3, DQuat)>,
+    rotation: Option<AxisRotation>,
     map: Option<ShMap>,
     /// Degree written.
     pub sh_degree: usize,
@@ -52,25 +64,26 @@ pub(super) struct Outgoing<'a> {
     pub pruned: usize,
     /// Gaussians of which a σ was raised to [`SCALE_MIN`].
     pub clamped_scales: usize,
-    /// Least and largest mean, axes of the file.
+    /// Smallest and largest mean, axes of the file.
     pub bounds: [[f32; 3]; 2],
 }
 
 impl<'a> Outgoing<'a> {
-    /// Checks every number of `splats` and counts what will be written. `turn` is a
-    /// proper rotation from the world's axes to the file's; `path` is for errors.
+    /// Checks every number of `splats` and counts the Gaussians that will be written.
+    /// `rotation` maps the world's axes to the file's; `path` is for errors.
     pub fn new(
         splats: &'a Splats,
         options: &SaveOptions,
-        turn: Option<DMat3>,
+        rotation: Option<DMat3>,
         degree_limit: usize,
         path: &Path,
     ) -> Result<Self> {
         let wanted = options.sh_degree.unwrap_or(3);
         let sh_degree = wanted.min(splats.sh_degree).min(degree_limit);
         let d_in = splats.sh_coefficients();
-        let map = sh_map(splats.sh_basis, turn, d_in, sh_coefficients(sh_degree));
-        let turn = turn.map(|r| (r, DQuat::from_mat3(&r)));
+        let map = sh_map(splats.sh_basis, rotation, d_in, sh_coefficients(sh_degree));
+        let rotation =
+            rotation.map(|matrix| AxisRotation { matrix, quat: DQuat::from_mat3(&matrix) });
         let min_opacity = options.min_opacity;
         if !(0.0..=1.0).contains(&min_opacity) {
             return Err(Error::format(path, "a least opacity in [0, 1]", min_opacity.to_string()));
@@ -78,7 +91,7 @@ impl<'a> Outgoing<'a> {
         let mut out = Self {
             splats,
             min_opacity,
-            turn,
+            rotation,
             map,
             sh_degree,
             count: 0,
@@ -119,26 +132,26 @@ impl<'a> Outgoing<'a> {
         Ok(())
     }
 
-    /// Indices of the Gaussians that are written, in order.
+    /// Iterates over the indices of the Gaussians that are written.
     pub fn kept(&self) -> impl Iterator<Item = usize> {
         (0..self.splats.len()).filter(|&i| self.keeps(i))
     }
 
     fn keeps(&self, i: usize) -> bool {
-        // A hair below zero is zero.
+        // Rounding may leave an opacity slightly below zero.
         self.splats.opacity(i).max(0.0) >= self.min_opacity
     }
 
     fn mean(&self, i: usize) -> [f32; 3] {
         let mean = self.splats.mean(i);
-        match &self.turn {
+        match &self.rotation {
             None => mean,
-            Some((r, _)) => (*r * DVec3::from(mean.map(f64::from))).as_vec3().to_array(),
+            Some(r) => (r.matrix * DVec3::from(mean.map(f64::from))).as_vec3().to_array(),
         }
     }
 
-    /// A visitor with scratch space; the SH of a parent is mapped once for
-    /// successive children.
+    /// Makes a visitor with scratch space. It maps a parent's SH once for successive
+    /// children.
     pub fn visitor(&self) -> Visitor<'_> {
         let gaussian = Gaussian {
             mean: [0.0; 3],
@@ -151,7 +164,7 @@ impl<'a> Outgoing<'a> {
     }
 }
 
-/// Makes [`Gaussian`]s of an [`Outgoing`].
+/// Converts splats of an [`Outgoing`] to [`Gaussian`]s.
 pub(super) struct Visitor<'a> {
     out: &'a Outgoing<'a>,
     parent: Option<usize>,
@@ -160,14 +173,14 @@ pub(super) struct Visitor<'a> {
 }
 
 impl Visitor<'_> {
-    /// Gaussian `i` of the splats, in the form of the file.
+    /// Converts Gaussian `i` of the splats to the form of the file.
     pub fn at(&mut self, i: usize) -> std::io::Result<&Gaussian> {
         let s = self.out.splats;
         let g = &mut self.gaussian;
         g.mean = self.out.mean(i);
         let mut q = s.quat_wxyz(i);
-        if let Some((_, turn)) = &self.out.turn {
-            q = wxyz(*turn * quat(q));
+        if let Some(r) = &self.out.rotation {
+            q = wxyz(r.quat * quat(q));
         }
         g.quat = unit(q);
         g.scale = s.scale(i).map(|v| v.max(SCALE_MIN));
@@ -195,10 +208,10 @@ impl Visitor<'_> {
     }
 }
 
-/// From coefficients in `basis` to standard ones of the function turned by `turn`;
-/// `None` where that is a plain copy.
-fn sh_map(basis: ShBasis, turn: Option<DMat3>, d_in: usize, d_out: usize) -> Option<ShMap> {
-    if turn.is_none() && basis == ShBasis::Standard {
+/// Computes the map from `d_in` coefficients in `basis` to `d_out` standard ones of the
+/// rotated function; `None` for the identity.
+fn sh_map(basis: ShBasis, rotation: Option<DMat3>, d_in: usize, d_out: usize) -> Option<ShMap> {
+    if rotation.is_none() && basis == ShBasis::Standard {
         return None;
     }
     let mut base = vec![0.0; d_in * d_in];
@@ -212,14 +225,16 @@ fn sh_map(basis: ShBasis, turn: Option<DMat3>, d_in: usize, d_out: usize) -> Opt
             }
         }
     }
-    let turned = Rotation::new(turn.unwrap_or(DMat3::IDENTITY), RotationBasis::Standard).matrix(4);
+    let rotation = rotation.unwrap_or(DMat3::IDENTITY);
+    let rotated = Rotation::new(rotation, RotationBasis::Standard).matrix(4);
     let row = |i: usize| {
-        let entry = |j: usize| -> f64 {
-            let v = (0..d_in).map(|k| turned[i * 25 + k] * base[k * d_in + j]).sum::<f64>();
-            // Quarter and half turns permute and negate exactly; rounding must not blur that.
+        let factor = |j: usize| -> f64 {
+            let v = (0..d_in).map(|k| rotated[i * 25 + k] * base[k * d_in + j]).sum::<f64>();
+            // Rotations by 90° and 180° permute and negate coefficients: rounding is undone.
             if (v - v.round()).abs() < 1e-12 { v.round() } else { v }
         };
-        (0..d_in).map(|j| (j, entry(j))).filter(|(_, v)| *v != 0.0).collect()
+        let entries = (0..d_in).map(|column| Entry { column, factor: factor(column) });
+        entries.filter(|e| e.factor != 0.0).collect()
     };
     Some((0..d_out).map(row).collect())
 }
@@ -230,32 +245,32 @@ fn apply_map(map: Option<&ShMap>, from: &[f32], to: &mut [f32]) {
         Some(map) => {
             for (out, row) in to.chunks_exact_mut(3).zip(map) {
                 for (c, v) in out.iter_mut().enumerate() {
-                    *v = row.iter().map(|&(j, f)| f * f64::from(from[3 * j + c])).sum::<f64>()
-                        as f32;
+                    let term = |e: &Entry| e.factor * f64::from(from[3 * e.column + c]);
+                    *v = row.iter().map(term).sum::<f64>() as f32;
                 }
             }
         }
     }
 }
 
-/// A similarity: x ↦ s·R·x + t.
+/// A similarity transform: x ↦ s·R·x + t.
 pub(super) struct Similarity {
-    /// s > 0.
+    /// s, above 0.
     pub scale: f64,
-    /// R, proper.
+    /// R, a proper rotation.
     pub rotation: DMat3,
     /// t.
     pub translation: DVec3,
 }
 
-/// Half a turn about x: y-down, z-forward to y-up, z-backward, and back again.
+/// Rotation by 180° about x, between y-down, z-forward and y-up, z-backward axes.
 pub(super) const HALF_TURN_X: DMat3 =
     DMat3 { x_axis: DVec3::X, y_axis: DVec3::NEG_Y, z_axis: DVec3::NEG_Z };
 
-/// Moves splats of the standard basis without a gain (what readers make) by `by`.
+/// Transforms splats of the standard basis without a gain.
 pub(super) fn transform(splats: &mut Splats, by: &Similarity) {
-    let turns = (by.rotation - DMat3::IDENTITY).to_cols_array().iter().any(|v| v.abs() > 1e-9);
-    if !turns && by.translation == DVec3::ZERO && by.scale == 1.0 {
+    let rotates = (by.rotation - DMat3::IDENTITY).to_cols_array().iter().any(|v| v.abs() > 1e-9);
+    if !rotates && by.translation == DVec3::ZERO && by.scale == 1.0 {
         return;
     }
     let q = DQuat::from_mat3(&by.rotation);
@@ -263,7 +278,7 @@ pub(super) fn transform(splats: &mut Splats, by: &Similarity) {
         let mean = DVec3::new(f64::from(row[0]), f64::from(row[1]), f64::from(row[2]));
         let moved = by.scale * (by.rotation * mean) + by.translation;
         row[..3].copy_from_slice(&moved.as_vec3().to_array());
-        if turns {
+        if rotates {
             let stored = [
                 row[QUAT_OFFSET],
                 row[QUAT_OFFSET + 1],
@@ -277,7 +292,7 @@ pub(super) fn transform(splats: &mut Splats, by: &Similarity) {
         }
     }
     let d = splats.sh_coefficients();
-    if turns && d > 1 {
+    if rotates && d > 1 {
         let map = sh_map(ShBasis::Standard, Some(by.rotation), d, d);
         let mut set = vec![0.0; 3 * d];
         for sh in splats.sh.chunks_exact_mut(3 * d) {
@@ -296,8 +311,8 @@ fn wxyz(q: DQuat) -> [f32; 4] {
     [q.w as f32, q.x as f32, q.y as f32, q.z as f32]
 }
 
-/// `q` at length 1; the identity for the zero quaternion (what the 3DGS kernels make
-/// of it); unchanged where it is not finite, so that the check sees it.
+/// Normalises `q`. The zero quaternion becomes the identity, as in the 3DGS kernels; one
+/// that is not finite is left to [`check_finite`].
 pub(super) fn unit(q: [f32; 4]) -> [f32; 4] {
     let norm = q.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
     if norm == 0.0 {
@@ -309,23 +324,23 @@ pub(super) fn unit(q: [f32; 4]) -> [f32; 4] {
     q.map(|v| (f64::from(v) / norm) as f32)
 }
 
-/// Opacity before the sigmoid; finite for 0 and 1, which move by 1e-7.
+/// Computes the opacity before the sigmoid; 0 and 1 are clamped by 1e-7.
 pub(super) fn logit(opacity: f32) -> f32 {
     let a = f64::from(opacity).clamp(LOGIT_MARGIN, 1.0 - LOGIT_MARGIN);
     (a / (1.0 - a)).ln() as f32
 }
 
-/// Opacity after the sigmoid; ±∞ give 1 and 0.
+/// Computes the opacity after the sigmoid; ±∞ give 1 and 0.
 pub(super) fn sigmoid(logit: f32) -> f32 {
     (1.0 / (1.0 + (-f64::from(logit)).exp())) as f32
 }
 
-/// Coefficient of the constant function for a display colour in [0, 1].
+/// Computes the coefficient of the constant function for a display colour in [0, 1].
 pub(super) fn dc_from_colour(colour: f64) -> f32 {
     ((colour - 0.5) / C0) as f32
 }
 
-/// Gaussians collected by a reader.
+/// Gaussians that a reader collects.
 pub(super) struct Incoming {
     rows: Vec<f32>,
     sh: Vec<f32>,
@@ -333,7 +348,7 @@ pub(super) struct Incoming {
 }
 
 impl Incoming {
-    /// Room for `count` Gaussians; the caller has compared `count` with the bytes at hand.
+    /// Allocates for `count` Gaussians; the caller has compared `count` with the bytes.
     pub fn with_capacity(count: usize, sh_degree: usize) -> Self {
         let set = 3 * sh_coefficients(sh_degree);
         Self {
@@ -360,26 +375,26 @@ impl Incoming {
         &mut self.sh[start..]
     }
 
-    /// SH set of Gaussian `i`, `[D, 3]`.
+    /// Returns the SH set of Gaussian `i`, `[D, 3]`.
     pub fn sh_mut(&mut self, i: usize) -> Option<&mut [f32]> {
         let set = 3 * sh_coefficients(self.sh_degree);
         self.sh.get_mut(i * set..(i + 1) * set)
     }
 
-    /// All of them as one set.
+    /// Makes a set of all Gaussians.
     pub fn into_splats(self, path: &Path) -> Result<Splats> {
         Splats::new(self.rows, self.sh, Vec::new(), self.sh_degree, ShBasis::Standard)
             .map_err(|e| Error::format(path, "Gaussians of one shape", e.to_string()))
     }
 }
 
-/// A file as its reader understood it.
+/// The decoded content of a file.
 pub(super) struct Decoded {
-    /// The Gaussians, perhaps with numbers that are not finite.
+    /// The Gaussians; numbers may be NaN or infinite.
     pub splats: Splats,
     /// Flavour: `ply binary_little_endian`, `spz 3`.
     pub flavour: String,
-    /// Comments that the file carries.
+    /// Comments of the file.
     pub comments: Vec<String>,
 }
 
@@ -390,14 +405,14 @@ pub(super) fn check_finite(splats: &Splats, path: &Path) -> Result<()> {
         Err(Error::format(path, "finite numbers", got).at(format!(" splat {i}")))
     };
     for (i, row) in splats.rows.chunks_exact(SPLAT_STRIDE).enumerate() {
-        if let Some(lane) = row.iter().position(|v| !v.is_finite()) {
-            let what = match lane {
+        if let Some(offset) = row.iter().position(|v| !v.is_finite()) {
+            let what = match offset {
                 0..QUAT_OFFSET => "mean",
                 QUAT_OFFSET..SCALE_OFFSET => "quaternion",
                 SCALE_OFFSET..OPACITY_OFFSET => "scale",
                 _ => "opacity",
             };
-            return refuse(i, what, row[lane]);
+            return refuse(i, what, row[offset]);
         }
     }
     if let Some(at) = splats.sh.iter().position(|v| !v.is_finite()) {
@@ -410,7 +425,7 @@ pub(super) fn check_finite(splats: &Splats, path: &Path) -> Result<()> {
     Ok(())
 }
 
-/// `N` bytes at `at`, or an error that says how many there are.
+/// Returns `N` bytes at `at`.
 pub(super) fn array<const N: usize>(bytes: &[u8], at: usize, path: &Path) -> Result<[u8; N]> {
     at.checked_add(N)
         .and_then(|end| bytes.get(at..end))
@@ -418,17 +433,18 @@ pub(super) fn array<const N: usize>(bytes: &[u8], at: usize, path: &Path) -> Res
         .ok_or_else(|| truncated(path, at.saturating_add(N) as u64, bytes.len() as u64))
 }
 
-/// Little-endian u32 at `at`.
+/// Returns the little-endian u32 at `at`.
 pub(super) fn u32_at(bytes: &[u8], at: usize, path: &Path) -> Result<u32> {
     Ok(u32::from_le_bytes(array(bytes, at, path)?))
 }
 
-/// Little-endian f32 at `at`.
+/// Returns the little-endian f32 at `at`.
 pub(super) fn f32_at(bytes: &[u8], at: usize, path: &Path) -> Result<f32> {
     Ok(f32::from_le_bytes(array(bytes, at, path)?))
 }
 
-/// The error for a file that ends too soon.
+/// Makes the error for a truncated file.
+
 pub(super) fn truncated(path: &Path, expected: u64, got: u64) -> Error {
     Error::format(
         path,

@@ -1,15 +1,14 @@
-//! Binary glTF with `KHR_gaussian_splatting` (ratified 2026): writer and reader.
+//! Binary glTF with `KHR_gaussian_splatting` (ratified 2026): the writer.
 //!
 //! One POINTS primitive. `POSITION`; `KHR_gaussian_splatting:ROTATION` VEC4 unit, xyzw;
 //! `:SCALE` VEC3 linear σ; `:OPACITY` after the sigmoid; `:SH_DEGREE_l_COEF_n` VEC3,
-//! 3DGS signs, degrees complete, at most 3. `COLOR_0`, for viewers without the
-//! extension, is the colour of degree 0 as glTF has vertex colours: linear light (the
-//! sRGB curve undone), and the opacity as alpha.
+//! 3DGS signs, degrees complete, at most 3. `COLOR_0` is for viewers without the extension:
+//! the colour of degree 0 in linear light (the sRGB curve undone), and the opacity as alpha.
 //!
-//! glTF is y-up, we are y-down: the data keep our axes and the node carries the turn,
-//! so the stored numbers are exact and every viewer shows the scene upright.
-//! Attributes lie one after another, each its own buffer view without a stride. The
-//! reader is in `glb_read.rs`. Source: the extension's README, glTF 2.0 sections 3.6, 4.
+//! glTF is y-up, this crate y-down. The data keep this crate's axes and the node rotates
+//! them, so that the numbers are exact and viewers show the scene upright. Attributes
+//! follow one another, each with a buffer view of its own and without a stride.
+//! `glb_read.rs` is the reader. Source: the extension's README, glTF 2.0 sections 3.6, 4.
 
 use super::gaussians::{Gaussian, Outgoing};
 use super::{Error, Result, Up};
@@ -28,28 +27,28 @@ pub(super) const CHUNK_JSON: u32 = 0x4E4F_534A;
 pub(super) const CHUNK_BIN: u32 = 0x004E_4942;
 /// The extension's name, and the prefix of its attributes.
 pub(super) const EXTENSION: &str = "KHR_gaussian_splatting";
-/// glTF's numbers of component types.
+/// Component types of glTF.
 pub(super) const FLOAT: u64 = 5126;
 pub(super) const UNSIGNED_SHORT: u64 = 5123;
 /// `mode` of a primitive of points.
 pub(super) const POINTS: u64 = 0;
 /// Highest degree of the extension.
 pub(super) const SH_DEGREE_MAX: usize = 3;
-/// Gaussians encoded at a time.
+/// Gaussians per write.
 const BLOCK: usize = 1 << 14;
 
-/// An attribute on its way out.
+/// An attribute to be written.
 struct Attribute {
     name: String,
     kind: &'static str,
     component: u64,
     bytes: usize,
     put: fn(&Gaussian, usize, &mut Vec<u8>),
-    /// SH coefficient, where it is one.
+    /// Index of the SH coefficient, for SH attributes.
     index: usize,
 }
 
-/// Where everything of a file lies; made before the first byte is written.
+/// The layout of a file, computed before the first byte is written.
 pub(super) struct Plan {
     attributes: Vec<Attribute>,
     /// Offset of each attribute in the binary chunk.
@@ -65,8 +64,8 @@ fn floats(values: &[f32], to: &mut Vec<u8>) {
 fn attributes(sh_degree: usize) -> Vec<Attribute> {
     let extended = |n: &str| format!("{EXTENSION}:{n}");
     let float =
-        |name: String, kind, lanes: usize, put: fn(&Gaussian, usize, &mut Vec<u8>), index| {
-            Attribute { name, kind, component: FLOAT, bytes: 4 * lanes, put, index }
+        |name: String, kind, components: usize, put: fn(&Gaussian, usize, &mut Vec<u8>), index| {
+            Attribute { name, kind, component: FLOAT, bytes: 4 * components, put, index }
         };
     let mut all = vec![
         float("POSITION".to_owned(), "VEC3", 3, |g, _, b| floats(&g.mean, b), 0),
@@ -108,12 +107,12 @@ fn fallback_colour(g: &Gaussian, _: usize, to: &mut Vec<u8>) {
     to.extend(short(f64::from(g.opacity)).to_le_bytes());
 }
 
-/// IEC 61966-2-1, from display value to linear light.
+/// Converts a display value to linear light (IEC 61966-2-1).
 fn linear_from_srgb(v: f64) -> f64 {
     if v <= 0.040_45 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
 }
 
-/// Quaternion xyzw of the node, from the data's axes to glTF's (y up, z back).
+/// Returns the node's quaternion xyzw, from the data's axes to glTF's (y up, z back).
 fn node_rotation(up: Up) -> Option<[f64; 4]> {
     match up {
         Up::Keep => Some([1.0, 0.0, 0.0, 0.0]),
@@ -125,16 +124,16 @@ fn node_rotation(up: Up) -> Option<[f64; 4]> {
 }
 
 impl Plan {
-    /// Lays out the file.
+    /// Computes the layout of the file.
     ///
     /// # Errors
-    /// More than 4 GiB, glTF's limit.
+    /// More than 4 GiB, the limit of glTF.
     pub fn new(out: &Outgoing, up: Up, comments: &[String], path: &Path) -> Result<Self> {
         let attributes = attributes(out.sh_degree);
         let (mut offsets, mut binary) = (Vec::new(), 0u64);
         for a in &attributes {
             offsets.push(binary);
-            // Every size is a multiple of 4: so is every offset.
+            // Every size is a multiple of 4, hence every offset.
             binary += a.bytes as u64 * out.count as u64;
         }
         let json = document(&attributes, &offsets, binary, out, up, comments);
@@ -154,9 +153,9 @@ impl Plan {
         12 + 8 + self.json.len() as u64 + 8 + self.binary
     }
 
-    /// Writes the file, block by block, each attribute to its place.
+    /// Writes the file in blocks of Gaussians, each attribute at its offset.
     pub fn write<F: Write + Seek>(&self, file: &mut F, out: &Outgoing) -> std::io::Result<()> {
-        // `new` has checked that these fit.
+        // `new` has checked that the lengths fit.
         let word = |v: u64| (v as u32).to_le_bytes();
         let mut head = MAGIC.to_vec();
         head.extend(word(2));
@@ -193,7 +192,7 @@ impl Plan {
     }
 }
 
-/// Buffer views, accessors, and the attributes' indices.
+/// Makes buffer views, accessors, and the indices of the attributes.
 fn layout(
     attributes: &[Attribute],
     offsets: &[u64],
@@ -214,7 +213,8 @@ fn layout(
             accessor["normalized"] = json!(true);
         }
         if i == 0 {
-            // As f64, so that the decimal names the very f32 that is stored.
+            // As f64, so that the decimal is exactly the stored f32.
+
             let wide = |v: [f32; 3]| v.map(f64::from);
             accessor["min"] = json!(wide(out.bounds[0]));
             accessor["max"] = json!(wide(out.bounds[1]));

@@ -1,9 +1,9 @@
-//! The reader of `.glb` files with `KHR_gaussian_splatting`; layout in `glb.rs`.
+//! Reader of `.glb` files with `KHR_gaussian_splatting`; `glb.rs` describes the layout.
 //!
-//! Every splat primitive of the scene is read, each under its node's transform
-//! (rotation, translation, uniform scale), then turned from glTF's axes (y up, z back)
-//! into ours. Quantised attributes as the extension allows them. Counts, offsets,
-//! strides and chunk lengths are checked against the bytes before anything is kept.
+//! Reads every splat primitive of the scene under its node's transform (rotation,
+//! translation, uniform scale) and converts glTF's axes (y up, z back) to this crate's.
+//! Quantised attributes are read as the extension allows them. Counts, offsets, strides and
+//! chunk lengths are compared with the bytes before anything is allocated.
 
 use super::gaussians::{
     Decoded, HALF_TURN_X, Incoming, Similarity, check_finite, transform, truncated, u32_at,
@@ -18,17 +18,18 @@ use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// Deepest node hierarchy that is followed.
+/// Largest depth of the node hierarchy.
 const DEPTH_MAX: usize = 256;
 
-/// Longest JSON chunk, bytes; parsed, a document may take thirty times as much.
+/// Longest JSON chunk, bytes; the parsed document may take thirty times as much memory.
 const JSON_MAX: usize = 16 << 20;
 
 /// Reads a `.glb` from memory. `name` is for errors.
 ///
 /// # Errors
-/// Not glTF 2 binary, chunks that lie, no splats in it, an accessor beyond its buffer,
-/// a compressed or sparse one, a mirrored or sheared node, numbers that are not finite.
+/// Not glTF 2 binary, chunk lengths that do not fill the file, no splats, an accessor beyond
+/// its buffer, a compressed or sparse one, a mirrored or sheared node, numbers that are not
+/// finite.
 pub fn parse_glb(bytes: &[u8], name: &Path) -> Result<Splats> {
     let decoded = decode(bytes, name)?;
     check_finite(&decoded.splats, name)?;
@@ -58,7 +59,7 @@ struct Document {
 struct Asset {
     version: String,
     generator: Option<String>,
-    /// Anyone's: read only as far as it has the writer's form.
+    /// Read where it has the form of this crate's writer.
     #[serde(default)]
     extras: serde_json::Value,
 }
@@ -70,7 +71,7 @@ struct Scene {
 }
 
 #[derive(Deserialize)]
-// Boxed: a hostile document has millions of empty nodes.
+// Boxed: a hostile document may have millions of empty nodes.
 struct Node {
     mesh: Option<usize>,
     #[serde(default)]
@@ -94,7 +95,7 @@ struct Primitive {
     extensions: BTreeMap<String, Extension>,
 }
 
-/// Only what decides whether the attributes can be read as they stand.
+/// The fields that decide whether the attributes are uncompressed.
 #[derive(Deserialize)]
 struct Extension {
     #[serde(default)]
@@ -167,7 +168,7 @@ pub(super) fn decode(bytes: &[u8], path: &Path) -> Result<Decoded> {
     Ok(Decoded { splats, flavour: format!("glb {EXTENSION}"), comments })
 }
 
-/// The JSON chunk and the binary one (empty where there is none).
+/// Returns the JSON chunk and the binary one (empty where there is none).
 fn chunks<'a>(bytes: &'a [u8], path: &Path) -> Result<(&'a [u8], &'a [u8])> {
     if !bytes.starts_with(&MAGIC) {
         let got = format!("{:02x?}", &bytes[..bytes.len().min(4)]);
@@ -222,7 +223,7 @@ impl File<'_> {
         all.get(i).ok_or_else(|| self.bad(format!("{what} 0 to {}", all.len()), i.to_string()))
     }
 
-    /// Meshes of the default scene with their world matrices.
+    /// Lists the meshes of the default scene with their world matrices.
     fn instances(&self) -> Result<Vec<(usize, DMat4)>> {
         let d = &self.document;
         let roots = if d.scenes.is_empty() {
@@ -273,7 +274,7 @@ impl File<'_> {
         ))
     }
 
-    /// A node's matrix followed by the turn into our axes.
+    /// Composes a node's matrix with the conversion to this crate's axes.
     fn similarity(&self, world: DMat4) -> Result<Similarity> {
         let linear = DMat3::from_mat4(world);
         let scale = linear.determinant().cbrt();
@@ -285,10 +286,10 @@ impl File<'_> {
             let got = format!("scale {scale}, distance from a rotation {error:.1e}");
             return Err(self.bad("nodes that rotate, move and scale uniformly", got));
         }
-        // Orthonormal to rounding, or the SH rotation would not be one.
+        // The SH rotation needs a matrix that is orthonormal to rounding.
         let rotation = DMat3::from_quat(DQuat::from_mat3(&rotation).normalize());
         Ok(Similarity {
-            // A unit scale came through a cube root.
+            // The cube root rounds a unit scale.
             scale: if (scale - 1.0).abs() < 1e-9 { 1.0 } else { scale },
             rotation: HALF_TURN_X * rotation,
             translation: HALF_TURN_X * translation,
@@ -313,10 +314,10 @@ impl File<'_> {
     }
 
     fn primitive(&self, primitive: &Primitive, budget: &mut usize) -> Result<Splats> {
-        let find = |name: &str, lanes: usize| -> Result<Column> {
+        let find = |name: &str, components: usize| -> Result<Column> {
             let i = primitive.attributes.get(name).copied();
             let i = i.ok_or_else(|| self.bad(format!("attribute {name}"), "none"))?;
-            self.column(i, name, lanes)
+            self.column(i, name, components)
         };
         let own = |n: &str| format!("{EXTENSION}:{n}");
         let position = find("POSITION", 3)?;
@@ -368,12 +369,12 @@ impl File<'_> {
         incoming.into_splats(self.path)
     }
 
-    /// An accessor whose every element lies within the binary chunk.
-    fn column(&self, accessor: usize, name: &str, lanes: usize) -> Result<Column<'_>> {
+    /// Returns an accessor after a check that every element lies within the binary chunk.
+    fn column(&self, accessor: usize, name: &str, components: usize) -> Result<Column<'_>> {
         let d = &self.document;
         let a = self.item(&d.accessors, accessor, "accessor")?;
         let at = |e: Error| e.at(format!(" attribute {name}"));
-        let kind = ["SCALAR", "VEC2", "VEC3", "VEC4"].get(lanes - 1).copied().unwrap_or("");
+        let kind = ["SCALAR", "VEC2", "VEC3", "VEC4"].get(components - 1).copied().unwrap_or("");
         if a.kind != kind || a.sparse.is_some() {
             let got = if a.sparse.is_some() { "a sparse one" } else { a.kind.as_str() };
             return Err(at(self.bad(format!("a plain accessor of {kind}"), got)));
@@ -394,7 +395,7 @@ impl File<'_> {
             let got = self.binary.len().to_string();
             return Err(at(self.bad(format!("{have} bytes in the BIN chunk"), got)));
         }
-        let element = (component.size() * lanes) as u64;
+        let element = (component.size() * components) as u64;
         let stride = view.byte_stride.unwrap_or(element);
         let start = u128::from(view.byte_offset) + u128::from(a.byte_offset);
         let last = u128::from(stride) * u128::from(a.count.saturating_sub(1));
@@ -409,54 +410,62 @@ impl File<'_> {
             bytes: &self.binary[start as usize..],
             stride: stride as usize,
             count: a.count as usize,
-            lanes,
+            components,
             component,
         })
     }
 }
 
-/// How a number is stored.
+/// Storage type of a component.
 #[derive(Clone, Copy)]
-enum Component {
+enum ComponentType {
     Float,
-    Byte(bool),
-    UnsignedByte(bool),
-    Short(bool),
-    UnsignedShort(bool),
+    Byte,
+    UnsignedByte,
+    Short,
+    UnsignedShort,
+}
+
+/// Storage type of a component, and the divisor of its values.
+#[derive(Clone, Copy)]
+struct Component {
+    kind: ComponentType,
+    /// Value of 1.0 in a normalised accessor; 1 in others.
+    one: f32,
 }
 
 impl Component {
     fn of(a: &Accessor) -> Option<Self> {
-        Some(match a.component_type {
-            FLOAT => Self::Float,
-            5120 => Self::Byte(a.normalized),
-            5121 => Self::UnsignedByte(a.normalized),
-            5122 => Self::Short(a.normalized),
-            UNSIGNED_SHORT => Self::UnsignedShort(a.normalized),
+        let (kind, one) = match a.component_type {
+            FLOAT => (ComponentType::Float, 1.0),
+            5120 => (ComponentType::Byte, 127.0),
+            5121 => (ComponentType::UnsignedByte, 255.0),
+            5122 => (ComponentType::Short, 32767.0),
+            UNSIGNED_SHORT => (ComponentType::UnsignedShort, 65535.0),
             _ => return None,
-        })
+        };
+        Some(Self { kind, one: if a.normalized { one } else { 1.0 } })
     }
 
     fn size(self) -> usize {
-        match self {
-            Self::Float => 4,
-            Self::Byte(_) | Self::UnsignedByte(_) => 1,
-            Self::Short(_) | Self::UnsignedShort(_) => 2,
+        match self.kind {
+            ComponentType::Float => 4,
+            ComponentType::Byte | ComponentType::UnsignedByte => 1,
+            ComponentType::Short | ComponentType::UnsignedShort => 2,
         }
     }
 
-    /// glTF 2.0, section 3.11: signed normalised numbers reach −1 twice.
+    /// Decodes a value. Two codes of a signed normalised type mean −1 (glTF 2.0, section
+    /// 3.11).
     fn value(self, b: &[u8]) -> f32 {
-        let scaled = |v: f32, top: f32, on: bool| if on { (v / top).max(-1.0) } else { v };
-        match self {
-            Self::Float => f32::from_le_bytes([b[0], b[1], b[2], b[3]]),
-            Self::Byte(n) => scaled(f32::from(b[0] as i8), 127.0, n),
-            Self::UnsignedByte(n) => scaled(f32::from(b[0]), 255.0, n),
-            Self::Short(n) => scaled(f32::from(i16::from_le_bytes([b[0], b[1]])), 32767.0, n),
-            Self::UnsignedShort(n) => {
-                scaled(f32::from(u16::from_le_bytes([b[0], b[1]])), 65535.0, n)
-            }
-        }
+        let v = match self.kind {
+            ComponentType::Float => return f32::from_le_bytes([b[0], b[1], b[2], b[3]]),
+            ComponentType::Byte => f32::from(b[0] as i8),
+            ComponentType::UnsignedByte => f32::from(b[0]),
+            ComponentType::Short => f32::from(i16::from_le_bytes([b[0], b[1]])),
+            ComponentType::UnsignedShort => f32::from(u16::from_le_bytes([b[0], b[1]])),
+        };
+        if self.one == 1.0 { v } else { (v / self.one).max(-1.0) }
     }
 }
 
@@ -464,23 +473,25 @@ struct Column<'a> {
     bytes: &'a [u8],
     stride: usize,
     count: usize,
-    lanes: usize,
+    /// Components per element, 1 to 4.
+    components: usize,
     component: Component,
 }
 
 impl Column<'_> {
-    /// Element `i`, zero beyond its lanes.
+    /// Decodes element `i`; further components are zero.
     fn get(&self, i: usize) -> [f32; 4] {
         let mut out = [0.0; 4];
         let at = i * self.stride;
-        for (l, v) in out.iter_mut().enumerate().take(self.lanes) {
-            *v = self.component.value(&self.bytes[at + l * self.component.size()..]);
+        for (c, v) in out.iter_mut().enumerate().take(self.components) {
+            *v = self.component.value(&self.bytes[at + c * self.component.size()..]);
         }
         out
     }
 }
 
-/// All parts as one set, at the highest degree among them.
+/// Joins all parts to one set of the highest SH degree among them.
+
 fn join(mut parts: Vec<Splats>, path: &Path) -> Result<Splats> {
     if parts.len() == 1 {
         return Ok(parts.remove(0));

@@ -1,9 +1,10 @@
-//! Pictures in (PNG, JPEG, WebP, TIFF, BMP) and out (8-bit PNG, 16-bit depth PNG).
+//! Reading of pictures (PNG, JPEG, WebP, TIFF, BMP), and writing (8-bit PNG, 16-bit depth
+//! PNG).
 //!
-//! In memory a picture is 8-bit RGB, rows from the top, as the evaluation protocol
-//! resizes it (MVSplat resizes uint8 with PIL); the network takes `[3, H, W]` floats
-//! in [0, 1]. No colour management: stored values are used as they are. EXIF
-//! orientation is reported, never applied: pose files speak of the stored pixels.
+//! In memory a picture is 8-bit RGB, rows from the top, because the evaluation protocol
+//! resizes uint8 (MVSplat, with PIL). The network reads `[3, H, W]` floats in [0, 1]. There
+//! is no colour management. EXIF orientation is reported and never applied, because pose
+//! files refer to the stored pixels.
 
 use super::{Error, Result, read, write_atomic};
 use image::{ImageDecoder, ImageReader, Limits};
@@ -11,7 +12,7 @@ use std::fs::File;
 use std::io::{BufRead, BufReader, Seek, Write};
 use std::path::Path;
 
-/// A picture with more pixels than this is refused before anything is allocated.
+/// Largest number of pixels of a picture; checked before anything is allocated.
 pub const MAX_PIXELS: u64 = 100_000_000;
 
 /// An 8-bit RGB picture.
@@ -26,13 +27,12 @@ pub struct Rgb {
 }
 
 impl Rgb {
-    /// A black picture.
+    /// Makes a black picture.
     pub fn black(width: usize, height: usize) -> Self {
         Self { width, height, data: vec![0; width * height * 3] }
     }
 
-    /// Mean colour of all pixels of `pictures`, each picture counting the same, value / 255;
-    /// black of none.
+    /// Computes the mean of the mean colours of `pictures`, value / 255; black for none.
     pub fn mean_colour<'a>(pictures: impl IntoIterator<Item = &'a Self>) -> [f32; 3] {
         let (mut sum, mut count) = ([0f64; 3], 0u32);
         for picture in pictures {
@@ -47,12 +47,12 @@ impl Rgb {
         sum.map(|v| (v / f64::from(count.max(1))) as f32)
     }
 
-    /// `[H, W, 3]` floats, value / 255.
+    /// Converts to `[H, W, 3]` floats, value / 255.
     pub fn to_unit(&self) -> Vec<f32> {
         self.data.iter().map(|&v| f32::from(v) / 255.0).collect()
     }
 
-    /// From `[H, W, 3]` floats, as [`Rgb::from_planes`] does it. `None` if `unit` is not
+    /// Converts `[H, W, 3]` floats as [`Rgb::from_planes`] does. `None` if `unit` is not
     /// 3·W·H long.
     pub fn from_unit(unit: &[f32], width: usize, height: usize) -> Option<Self> {
         let length = width.checked_mul(height)?.checked_mul(3)?;
@@ -60,7 +60,7 @@ impl Rgb {
         (unit.len() == length).then(|| Self { width, height, data: data() })
     }
 
-    /// `[3, H, W]` floats, value / 255.
+    /// Converts to `[3, H, W]` floats, value / 255.
     pub fn to_planes(&self) -> Vec<f32> {
         let mut planes = Vec::with_capacity(self.data.len());
         for c in 0..3 {
@@ -69,11 +69,11 @@ impl Rgb {
         planes
     }
 
-    /// From `[3, H, W]` floats: clamped to [0, 1] (NaN is 0), times 255, rounded to
-    /// nearest. MVSplat truncates when it saves; rounding halves the error. Metrics
-    /// are taken from the floats, never from a saved picture.
+    /// Converts `[3, H, W]` floats: clamped to [0, 1] (NaN is 0), times 255, rounded to
+    /// nearest. `None` if `planes` is not 3·W·H long.
     ///
-    /// `None` if `planes` is not 3·W·H long.
+    /// MVSplat truncates when it saves; rounding halves the error. Metrics are computed from
+    /// the floats, never from a saved picture.
     pub fn from_planes(planes: &[f32], width: usize, height: usize) -> Option<Self> {
         let area = width.checked_mul(height)?;
         if planes.len() != area.checked_mul(3)? {
@@ -86,7 +86,7 @@ impl Rgb {
         Some(Self { width, height, data })
     }
 
-    /// The window of `width` × `height` pixels at (`left`, `top`); `None` where it
+    /// Copies the window of `width` × `height` pixels at (`left`, `top`); `None` where it
     /// does not lie inside.
     pub fn window(&self, left: usize, top: usize, width: usize, height: usize) -> Option<Self> {
         if left.checked_add(width)? > self.width || top.checked_add(height)? > self.height {
@@ -102,18 +102,18 @@ impl Rgb {
 }
 
 fn quantise(v: f32) -> u8 {
-    // `as` saturates, and NaN becomes 0.
+    // `as` saturates and maps NaN to 0.
     (v * 255.0 + 0.5) as u8
 }
 
-/// What the header of a picture says.
+/// Fields of a picture's header.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Probe {
     /// Stored width, px.
     pub width: usize,
     /// Stored height, px.
     pub height: usize,
-    /// EXIF orientation 2 to 8, if one other than "as stored" is set.
+    /// EXIF orientation 2 to 8; `None` for "as stored".
     pub orientation: Option<u8>,
 }
 
@@ -124,8 +124,8 @@ fn refused(path: &Path, error: image::ImageError) -> Error {
     }
 }
 
-/// Opens the decoder of `path`, with the size already checked. The content decides
-/// which decoder, whatever the name's extension.
+/// Opens a decoder of `path` and checks the size. The content selects the decoder, not the
+/// file's extension.
 fn file_decoder(path: &Path) -> Result<impl ImageDecoder> {
     let file = File::open(path).map_err(|e| Error::io(path, e))?;
     let empty = file.metadata().is_ok_and(|m| m.len() == 0);
@@ -139,7 +139,7 @@ fn decoder<'a, R: BufRead + Seek + 'a>(
 ) -> Result<Box<dyn ImageDecoder + 'a>> {
     let mut reader = ImageReader::new(input);
     let mut limits = Limits::default();
-    // Sixteen-bit RGBA of the largest size, and as much again for the decoder.
+    // 16-bit RGBA of the largest size, and as much again for the decoder.
     limits.max_alloc = Some(MAX_PIXELS * 16);
     reader.limits(limits);
     let reader = reader.with_guessed_format().map_err(|e| Error::io(path, e))?;
@@ -156,14 +156,14 @@ fn decoder<'a, R: BufRead + Seek + 'a>(
     Ok(Box::new(decoder))
 }
 
-/// Size and orientation, from the header.
+/// Reads size and orientation from the header.
 ///
 /// # Errors
 /// Missing, not a picture, more than [`MAX_PIXELS`].
 pub fn probe(path: &Path) -> Result<Probe> {
     let mut decoder = file_decoder(path)?;
     let (w, h) = decoder.dimensions();
-    // A broken EXIF block is no reason to refuse a picture that decodes.
+    // A picture with a malformed EXIF block still decodes.
     let orientation = decoder.orientation().map_or(1, image::metadata::Orientation::to_exif);
     Ok(Probe {
         width: w as usize,
@@ -172,8 +172,8 @@ pub fn probe(path: &Path) -> Result<Probe> {
     })
 }
 
-/// Decodes a picture. Grey becomes three equal channels, 16 bits are rounded to 8,
-/// transparency is laid over black (the renderer's background).
+/// Decodes a picture. Grey becomes three equal channels, 16 bits are rounded to 8, and
+/// transparency is blended with black, the renderer's background.
 ///
 /// # Errors
 /// Missing, truncated, not a picture, more than [`MAX_PIXELS`].
@@ -181,7 +181,7 @@ pub fn load(path: &Path) -> Result<Rgb> {
     decode(file_decoder(path)?, path)
 }
 
-/// [`load`] of bytes in memory; `path` names them in errors.
+/// Decodes bytes in memory as [`load`] does; `path` is for errors.
 ///
 /// # Errors
 /// As [`load`].
@@ -225,16 +225,16 @@ fn encode(
 /// Writes an 8-bit RGB PNG.
 ///
 /// # Errors
-/// A buffer that does not fit the size; everything of [`write_atomic`].
+/// A buffer whose length does not match the size; errors of [`write_atomic`].
 pub fn save_png(path: &Path, picture: &Rgb) -> Result<()> {
     let bytes = png_bytes(picture, path)?;
     write_atomic(path, |f| f.write_all(&bytes))
 }
 
-/// The file that [`save_png`] writes; `path` names it in errors.
+/// Encodes the file of [`save_png`]; `path` is for errors.
 ///
 /// # Errors
-/// A buffer that does not fit the size.
+/// A buffer whose length does not match the size.
 pub fn png_bytes(picture: &Rgb, path: &Path) -> Result<Vec<u8>> {
     let expected = 3 * picture.width * picture.height;
     if picture.data.len() != expected || expected == 0 {
@@ -259,13 +259,14 @@ pub struct Depth {
 /// Key of the PNG text chunk that holds [`save_depth_png`]'s unit.
 const DEPTH_UNIT_KEY: &[u8] = b"depth_unit";
 
-/// Writes depth as 16-bit grey PNG and returns the unit: world units of one step.
-/// The unit is the smallest power of ten with which the greatest depth fits 65535,
-/// so metres up to 65 become millimetres; it also stands in the file as tEXt chunk
-/// `depth_unit`. 0 means no depth: for values not finite, or not above half a unit.
+/// Writes depth as a 16-bit grey PNG and returns the unit: world units per step.
+///
+/// The unit is the smallest power of ten with which the largest depth fits 65535: metres up
+/// to 65 become millimetres. A tEXt chunk `depth_unit` stores it. 0 means no depth, for
+/// values that are not finite or not above half a unit.
 ///
 /// # Errors
-/// A buffer that does not fit the size; everything of [`write_atomic`].
+/// A buffer whose length does not match the size; errors of [`write_atomic`].
 pub fn save_depth_png(path: &Path, depth: &Depth) -> Result<f32> {
     let area = depth.width * depth.height;
     if depth.data.len() != area || area == 0 {
@@ -277,7 +278,7 @@ pub fn save_depth_png(path: &Path, depth: &Depth) -> Result<f32> {
         if greatest > 0.0 { (f64::from(greatest) / 65535.0).log10().ceil() } else { -3.0 };
     let unit = 10f64.powi(exponent as i32);
     let steps = |d: f32| if d.is_finite() { (f64::from(d) / unit).round() as u16 } else { 0 };
-    // The encoder takes native-endian samples and swaps them itself.
+    // The encoder reads native-endian samples.
     let samples: Vec<u8> = depth.data.iter().flat_map(|&d| steps(d).to_ne_bytes()).collect();
     let kind = image::ExtendedColorType::L16;
     let png = encode(path, &samples, depth.width, depth.height, kind)?;
@@ -305,7 +306,7 @@ fn png_chunk(name: [u8; 4], data: &[u8]) -> Vec<u8> {
     chunk
 }
 
-/// The `depth_unit` text of a PNG, if it has one.
+/// Reads the `depth_unit` text of a PNG, if it has one.
 fn depth_unit(png: &[u8]) -> Option<f32> {
     let mut rest = png.get(8..)?;
     loop {
@@ -321,8 +322,8 @@ fn depth_unit(png: &[u8]) -> Option<f32> {
     }
 }
 
-/// Reads a 16-bit grey depth PNG. The unit is the file's own `depth_unit`, or else
-/// `unit` (0.001 for the usual millimetres).
+/// Reads a 16-bit grey depth PNG. The unit is the file's `depth_unit`, else `unit` (0.001
+/// for millimetres).
 ///
 /// # Errors
 /// Missing, truncated, not 16-bit grey, a unit that is not above zero.
@@ -330,7 +331,8 @@ pub fn load_depth_png(path: &Path, unit: f32) -> Result<Depth> {
     parse_depth_png(&read(path)?, unit, path)
 }
 
-/// [`load_depth_png`] of bytes in memory; `path` names them in errors.
+/// Decodes bytes in memory as [`load_depth_png`] does; `path` is for errors.
+
 ///
 /// # Errors
 /// As [`load_depth_png`].

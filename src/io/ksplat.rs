@@ -34,7 +34,7 @@ pub fn parse_ksplat(bytes: &[u8], name: &Path) -> Result<Splats> {
     Ok(decoded.splats)
 }
 
-/// What the file's header says of every section.
+/// The bytes of a file, and the fields of its header that concern every section.
 struct File<'a> {
     bytes: &'a [u8],
     path: &'a Path,
@@ -42,26 +42,36 @@ struct File<'a> {
     sh_range: [f32; 2],
 }
 
-/// One section header, and where its parts lie.
+/// A section header with the positions of the section's parts.
 struct Section {
     count: usize,
     sh_degree: usize,
     stride: usize,
-    /// Units per step of a quantised mean, and the step of the bucket's centre.
+    /// World units per step of a quantised mean, and the step at the bucket's centre.
     step: f32,
     middle: f32,
     bucket_capacity: usize,
     full_buckets: usize,
     partial_buckets: usize,
-    /// Byte offsets of partial lengths, centres (and how many), Gaussians, the end.
+    /// Byte offset of the lengths of partly filled buckets.
     lengths: usize,
+    /// Byte offset of the bucket centres.
     centres: usize,
     bucket_count: usize,
     bucket_bytes: usize,
+    /// Byte offset of the Gaussians.
     data: usize,
-    /// After the Gaussians that are there, and after the section's capacity.
+    /// Byte offset after the stored Gaussians.
     used: usize,
+    /// Byte offset after the section's capacity.
     end: u128,
+}
+
+/// The sections of a file that hold Gaussians.
+struct Sections {
+    all: Vec<Section>,
+    /// Valid lengths of the file: without and with the last section's unused capacity.
+    lengths: [u128; 2],
 }
 
 pub(super) fn decode(bytes: &[u8], path: &Path) -> Result<Decoded> {
@@ -80,12 +90,17 @@ pub(super) fn decode(bytes: &[u8], path: &Path) -> Result<Decoded> {
     let sh_range =
         [or(f32_at(bytes, 36, path)?, -SH_RANGE), or(f32_at(bytes, 40, path)?, SH_RANGE)];
     let file = File { bytes, path, level, sh_range };
-    let sections = file.sections()?;
+    let Sections { all: sections, lengths } = file.sections()?;
     let count: usize = sections.iter().map(|s| s.count).sum();
     let declared = u32_at(bytes, 16, path)? as usize;
     if count != declared || count == 0 {
         let expected = format!("{declared} Gaussians in the sections, and at least one");
         return Err(Error::format(path, expected, count.to_string()));
+    }
+    if !lengths.contains(&(bytes.len() as u128)) {
+        let [used, end] = lengths;
+        let expected = format!("{used} bytes, or {end} with the last section's capacity");
+        return Err(Error::format(path, expected, bytes.len().to_string()));
     }
     let sh_degree = sections.iter().map(|s| s.sh_degree).max().unwrap_or(0);
     let mut incoming = Incoming::with_capacity(count, sh_degree);
@@ -98,8 +113,8 @@ pub(super) fn decode(bytes: &[u8], path: &Path) -> Result<Decoded> {
 }
 
 impl File<'_> {
-    /// Every section header, checked against the bytes.
-    fn sections(&self) -> Result<Vec<Section>> {
+    /// Reads every section header and compares it with the bytes.
+    fn sections(&self) -> Result<Sections> {
         let declared = u32_at(self.bytes, 4, self.path)? as usize;
         let start = declared.checked_mul(SECTION_HEADER).and_then(|n| n.checked_add(HEADER));
         let Some(mut at) = start.filter(|s| *s <= self.bytes.len()) else {
@@ -107,27 +122,19 @@ impl File<'_> {
             return Err(Error::format(self.path, expected, format!("{} bytes", self.bytes.len())));
         };
         let mut sections = Vec::new();
-        // The two lengths that the file may have.
-        let mut whole = [at as u128; 2];
+        let mut lengths = [at as u128; 2];
         for i in 0..declared {
             let section = self.section(HEADER + i * SECTION_HEADER, at).map_err(|e| match e {
                 Error::Format { .. } => e.at(format!(" section {i}")),
                 Error::Io { .. } => e,
             })?;
-            // The last section may be written shorter than its capacity.
             at = section.end.min(self.bytes.len() as u128) as usize;
-            whole = [section.used as u128, section.end];
+            lengths = [section.used as u128, section.end];
             if section.count > 0 {
                 sections.push(section);
             }
         }
-        let length = self.bytes.len() as u128;
-        if !whole.contains(&length) {
-            let [used, end] = whole;
-            let expected = format!("{used} bytes, or {end} with the last section's capacity");
-            return Err(Error::format(self.path, expected, length.to_string()));
-        }
-        Ok(sections)
+        Ok(Sections { all: sections, lengths })
     }
 
     fn section(&self, header: usize, start: usize) -> Result<Section> {
@@ -184,7 +191,8 @@ impl File<'_> {
 
     fn read(&self, s: &Section, incoming: &mut Incoming) -> Result<()> {
         let full = s.full_buckets.saturating_mul(s.bucket_capacity);
-        // The partly filled bucket at hand, and the first Gaussian beyond it.
+        // The current partly filled bucket, and the index of the first Gaussian after it.
+
         let (mut partial, mut until) = (0, full);
         for i in 0..s.count {
             let at = s.data + i * s.stride;

@@ -1,9 +1,8 @@
-//! Plain matrices: `poses.txt`, one pose a line (12 or 16 numbers, row by row), and
-//! `K.txt`, the intrinsics in pixels of the stored pictures (3×3, or fx fy cx cy).
-//! Pictures are those of `images/`, sorted by name (numbers in their order), one for each
-//! line.
+//! Plain matrices: `poses.txt`, one pose per line (12 or 16 numbers, row by row), and
+//! `K.txt`, the intrinsics in pixels of the stored pictures (3×3, or fx fy cx cy). The
+//! pictures of `images/`, sorted by name with numbers in numeric order, belong to the lines.
 //!
-//! Numbers may be separated by white space, commas or brackets; `#` begins a comment.
+//! White space, commas and brackets separate numbers; `#` begins a comment.
 
 use super::assemble::{Draft, Lens, assemble, list_images};
 use super::scene::{Scene, SceneFormat};
@@ -12,7 +11,7 @@ use super::{Error, Result, read};
 use glam::{DMat4, DVec4};
 use std::path::Path;
 
-/// What a bare matrix means.
+/// Direction and axes of a pose matrix.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum PoseConvention {
     /// Camera to world, OpenCV axes (x right, y down, z forward).
@@ -25,7 +24,7 @@ pub enum PoseConvention {
 }
 
 impl PoseConvention {
-    /// The pose in this crate's convention.
+    /// Converts a pose to this crate's convention.
     pub fn to_world_from_camera(self, matrix: DMat4) -> DMat4 {
         match self {
             Self::WorldFromCameraOpenCv => matrix,
@@ -35,7 +34,7 @@ impl PoseConvention {
     }
 }
 
-/// The numbers of a text, or the first word that is none.
+/// Parses the numbers of a text; an error is the first word that is not a number.
 fn numbers(text: &str) -> std::result::Result<Vec<f64>, String> {
     let text = text.split('#').next().unwrap_or("");
     text.split(|c: char| c.is_whitespace() || ",;[]()".contains(c))
@@ -44,11 +43,11 @@ fn numbers(text: &str) -> std::result::Result<Vec<f64>, String> {
         .collect()
 }
 
-/// A matrix of 12 (3×4) or 16 (4×4) numbers, row by row, in a text such as a line of
+/// Parses a matrix of 12 (3×4) or 16 (4×4) numbers, row by row, such as a line of
 /// `poses.txt` or a command-line argument.
 ///
 /// # Errors
-/// What came instead.
+/// A description of the text found.
 pub fn parse_matrix(text: &str) -> std::result::Result<DMat4, String> {
     let v = numbers(text)?;
     if v.len() != 12 && v.len() != 16 {
@@ -58,10 +57,10 @@ pub fn parse_matrix(text: &str) -> std::result::Result<DMat4, String> {
     Ok(DMat4::from_cols(row(0), row(1), row(2), row(3)).transpose())
 }
 
-/// fx, fy, cx, cy of 9 (3×3, row by row, no skew) or 4 numbers.
+/// Parses fx, fy, cx, cy from 9 (3×3, row by row, no skew) or 4 numbers.
 ///
 /// # Errors
-/// What came instead.
+/// A description of the text found.
 pub fn parse_intrinsics(text: &str) -> std::result::Result<[f64; 4], String> {
     let lines: Vec<&str> = text.lines().map(|l| l.split('#').next().unwrap_or("")).collect();
     let v = numbers(&lines.join(" "))?;
@@ -88,8 +87,9 @@ fn text(path: &Path) -> Result<String> {
 /// Reads `poses.txt`, `K.txt` and `images/` of a folder.
 ///
 /// # Errors
-/// A file that is missing or does not parse (its line is named); a number of pictures
-/// that is not the number of poses.
+/// A file that is missing or malformed (the error names the line); a number of pictures that
+/// is not the number of poses.
+
 pub fn load(folder: &Path, convention: PoseConvention) -> Result<Scene> {
     let (poses_path, k_path) = (folder.join("poses.txt"), folder.join("K.txt"));
     let k = parse_intrinsics(&text(&k_path)?)

@@ -1,9 +1,10 @@
-//! Files of every kind, in and out. Foreign layouts end here: what leaves this
-//! room follows `camera.rs`'s conventions, whatever the file's were.
+//! Readers and writers of every file format. Readers convert to the conventions of
+//! `camera.rs`; writers convert from them.
 //!
-//! Writers write beside the final name and rename at the end ([`write_atomic`]):
-//! a reader never sees half a file. Readers trust no declared size: they check it
-//! against the bytes that are there before they allocate.
+//! Writers write a temporary file and rename it at the end ([`write_atomic`]), so that no
+//! reader sees a partial file. Readers compare every declared size with the bytes that
+//! exist before they allocate. They check the checksums of a container and refuse bytes
+//! after its end.
 
 pub mod compressed_ply;
 mod gaussians;
@@ -39,41 +40,41 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use thiserror::Error;
 
-/// Why a file was refused, or could not be written.
+/// Reason for which a file is refused or cannot be written.
 #[derive(Debug, Error)]
 pub enum Error {
-    /// The operating system's answer: missing, no permission, disk full.
+    /// The operating system reports an error: missing file, no permission, full disk.
     #[error("{}: {source}", path.display())]
     Io {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// The content is not what it claims to be.
+    /// The content is malformed.
     #[error("{}{at}: expected {expected}, got {got}", path.display())]
     Format {
         /// The file.
         path: PathBuf,
-        /// `:12` (a line), ` at byte 96`, ` frame 3`, or empty.
+        /// Place in the file: `:12` (a line), ` at byte 96`, ` frame 3`, or empty.
         at: String,
-        /// What would have been accepted.
+        /// The accepted content.
         expected: String,
-        /// What came.
+        /// The content found.
         got: String,
     },
 }
 
-/// Result of everything in this room.
+/// Result of the functions of this module.
 pub type Result<T> = std::result::Result<T, Error>;
 
 impl Error {
-    /// [`Error::Io`] for `path`.
+    /// Makes an [`Error::Io`] for `path`.
     pub fn io(path: impl Into<PathBuf>, source: std::io::Error) -> Self {
         Self::Io { path: path.into(), source }
     }
 
-    /// [`Error::Format`] for the whole of `path`.
+    /// Makes an [`Error::Format`] for the whole of `path`.
     pub fn format(
         path: impl Into<PathBuf>,
         expected: impl Into<String>,
@@ -83,7 +84,7 @@ impl Error {
         Self::Format { path: path.into(), at: String::new(), expected, got }
     }
 
-    /// The same error at a place in the file: `:12`, ` at byte 96`, ` frame 3`.
+    /// Returns the same error at a place in the file: `:12`, ` at byte 96`, ` frame 3`.
     #[must_use]
     pub fn at(mut self, place: impl Into<String>) -> Self {
         if let Self::Format { at, .. } = &mut self {
@@ -93,20 +94,20 @@ impl Error {
     }
 }
 
-/// Whole file, or [`Error::Io`] that names it.
+/// Reads a whole file.
 ///
 /// # Errors
-/// Missing, unreadable, a directory.
+/// [`Error::Io`]: missing, unreadable, a directory.
 pub fn read(path: &Path) -> Result<Vec<u8>> {
     std::fs::read(path).map_err(|e| Error::io(path, e))
 }
 
-/// Writes `path` through `body`: into a temporary file of the same folder, flushed
-/// to the disk, then renamed. On any error the temporary file is removed and
-/// whatever stood under the final name still stands there.
+/// Writes `path` through `body`: to a temporary file in the same folder, which is flushed to
+/// the disk and renamed. An error removes the temporary file and leaves the old file as it
+/// was.
 ///
 /// # Errors
-/// No such folder, no permission, disk full; or the error that `body` gives.
+/// No such folder, no permission, full disk; the error of `body`.
 pub fn write_atomic(
     path: &Path,
     body: impl FnOnce(&mut BufWriter<File>) -> std::io::Result<()>,
@@ -124,7 +125,8 @@ pub fn write_atomic(
         std::fs::rename(&temporary, path)
     };
     attempt().map_err(|e| {
-        // Best effort: the first error is the one worth telling.
+        // The first error is reported; this one is not.
+
         let _ = std::fs::remove_file(&temporary);
         Error::io(path, e)
     })

@@ -1,16 +1,17 @@
-//! The field's `.ply` (INRIA 3DGS): writer, and reader of every variant in use.
+//! The `.ply` of 3DGS (INRIA): writer, and reader of every variant in use.
 //!
 //! Layout: one element `vertex` with float properties `x y z`, `nx ny nz` (zero),
 //! `f_dc_0..2`, `f_rest_*` channel-major (all of R, then G, then B), `opacity` before
 //! the sigmoid, `scale_0..2` = ln σ, `rot_0..3` = wxyz. World frame throughout.
 //!
-//! SH degree: 3 unless the caller asks otherwise. Degree 4, which the network stores,
-//! is dropped then, since viewers expect at most 45 `f_rest`. Children's gains and
-//! residuals are folded into their coefficients (`gaussians.rs`).
+//! SH degree: 3 by default, since viewers expect at most 45 `f_rest`; the network's degree 4
+//! is dropped. Gains and residuals of children are folded into their coefficients
+//! (`gaussians.rs`).
 //!
-//! The reader takes ascii and both byte orders, any property order and number type,
-//! 0, 9, 24, 45 or 72 `f_rest`, `red green blue` in place of `f_dc` (nerfstudio), and
-//! skips whatever else is there. PlayCanvas' packed files go to `compressed_ply.rs`.
+//! The reader accepts ascii and both byte orders, any property order and number type, 0, 9,
+//! 24, 45 or 72 `f_rest`, and `red green blue` in place of `f_dc` (nerfstudio). It skips
+//! other properties and elements, and refuses bytes after the last element.
+//! `compressed_ply.rs` reads PlayCanvas' packed files.
 
 use super::gaussians::{Decoded, Incoming, Outgoing, check_finite, dc_from_colour, logit, sigmoid};
 use super::ply_container::{Element, Header, Scalar, Source};
@@ -21,10 +22,10 @@ use std::path::Path;
 
 /// Number of `f_rest` properties by SH degree.
 pub(super) const REST_COUNTS: [usize; 5] = [0, 9, 24, 45, 72];
-/// Gaussians encoded at a time: about 250 KiB at degree 3.
+/// Gaussians per write: about 250 KiB at degree 3.
 const BLOCK: usize = 1024;
 
-/// Reads a `.ply` from memory: the field's plain layout or PlayCanvas' packed one.
+/// Reads a `.ply` from memory: the plain layout of 3DGS or PlayCanvas' packed one.
 /// `name` is for errors.
 ///
 /// # Errors
@@ -37,7 +38,7 @@ pub fn parse_ply(bytes: &[u8], name: &Path) -> Result<Splats> {
     Ok(decoded.splats)
 }
 
-/// Reads `length` bytes of `reader`.
+/// Reads a file of `length` bytes from `reader`.
 pub(super) fn decode(reader: &mut dyn BufRead, length: u64, path: &Path) -> Result<Decoded> {
     let mut source = Source::new(reader, length, path);
     let header = Header::read(&mut source)?;
@@ -59,14 +60,14 @@ pub(super) fn decode(reader: &mut dyn BufRead, length: u64, path: &Path) -> Resu
     Ok(Decoded { splats, flavour, comments: header.comments })
 }
 
-/// Where a row keeps what.
+/// Indices of the properties of a row.
 struct Layout {
     mean: [usize; 3],
     scale: [usize; 3],
     quat: [usize; 4],
     opacity: usize,
     dc: [usize; 3],
-    /// `red green blue` in place of `f_dc`: what to divide by for [0, 1].
+    /// Divisor to [0, 1] where `red green blue` stand in place of `f_dc`.
     colour_range: Option<f64>,
     rest: Vec<usize>,
     sh_degree: usize,
@@ -120,7 +121,8 @@ impl Layout {
 
 fn read_vertices(header: &Header, element: &Element, source: &mut Source) -> Result<Incoming> {
     let layout = Layout::of(element, source.path)?;
-    let mut incoming = Incoming::with_capacity(header.room(element, source)?, layout.sh_degree);
+    let mut incoming =
+        Incoming::with_capacity(header.checked_count(element, source)?, layout.sh_degree);
     let mut rest = vec![0.0f32; layout.rest.len()];
     header.rows(element, source, |_, v| {
         let sh = incoming.push(
@@ -144,7 +146,8 @@ fn read_vertices(header: &Header, element: &Element, source: &mut Source) -> Res
     Ok(incoming)
 }
 
-/// Channel-major `f_rest[3, D − 1]` into a set `[D, 3]` whose constant term stands.
+/// Writes channel-major `f_rest[3, D − 1]` to a set `[D, 3]` after its constant term.
+
 pub(super) fn rest_to_set(rest: &[f32], set: &mut [f32]) {
     let per_channel = rest.len() / 3;
     for (j, h) in set[3..].chunks_exact_mut(3).enumerate() {

@@ -1,8 +1,8 @@
-//! The PLY container: header, elements, rows of numbers; ascii and binary of either
-//! byte order, read as a stream so that a file need not fit in memory twice.
+//! The PLY container: header, elements, rows of numbers; ascii and binary of either byte
+//! order. It is read as a stream, so that a file is not in memory twice.
 //!
-//! Nothing is allocated for a declared count before it was compared with the bytes
-//! that are left. Source: Turk, "The PLY Polygon File Format".
+//! Declared counts are compared with the remaining bytes before anything is allocated.
+//! Source: Turk, "The PLY Polygon File Format".
 
 use super::{Error, Result};
 use std::io::{BufRead, Read};
@@ -12,20 +12,20 @@ use std::path::Path;
 const LINE_MAX: u64 = 1 << 16;
 /// Longest header, bytes.
 const HEADER_MAX: u64 = 1 << 20;
-/// Rows decoded at a time.
+/// Rows per read.
 const BLOCK_ROWS: u64 = 1024;
 
-/// Bytes still to come, and where they come from.
+/// A stream of a known length.
 pub(super) struct Source<'a> {
     reader: &'a mut dyn BufRead,
     left: u64,
     line: usize,
-    /// For errors.
+    /// Name of the file, for errors.
     pub path: &'a Path,
 }
 
 impl<'a> Source<'a> {
-    /// A reader of exactly `length` bytes.
+    /// Makes a source of exactly `length` bytes.
     pub fn new(reader: &'a mut dyn BufRead, length: u64, path: &'a Path) -> Self {
         Self { reader, left: length, line: 0, path }
     }
@@ -131,12 +131,13 @@ impl Scalar {
         }
     }
 
-    /// Value of the first `size` bytes of `b`; every u32 and f32 fits an f64 exactly.
-    fn value(self, b: &[u8], big: bool) -> f64 {
-        fn word<const N: usize>(b: &[u8], big: bool) -> [u8; N] {
+    /// Decodes the value of the first `size` bytes of `b`; an f64 holds every u32 and f32
+    /// exactly.
+    fn value(self, b: &[u8], encoding: Encoding) -> f64 {
+        fn word<const N: usize>(b: &[u8], encoding: Encoding) -> [u8; N] {
             let mut w = [0; N];
             w.copy_from_slice(&b[..N]);
-            if big {
+            if encoding == Encoding::Big {
                 w.reverse();
             }
             w
@@ -144,23 +145,23 @@ impl Scalar {
         match self {
             Self::I8 => f64::from(b[0] as i8),
             Self::U8 => f64::from(b[0]),
-            Self::I16 => f64::from(i16::from_le_bytes(word(b, big))),
-            Self::U16 => f64::from(u16::from_le_bytes(word(b, big))),
-            Self::I32 => f64::from(i32::from_le_bytes(word(b, big))),
-            Self::U32 => f64::from(u32::from_le_bytes(word(b, big))),
-            Self::F32 => f64::from(f32::from_le_bytes(word(b, big))),
-            Self::F64 => f64::from_le_bytes(word(b, big)),
+            Self::I16 => f64::from(i16::from_le_bytes(word(b, encoding))),
+            Self::U16 => f64::from(u16::from_le_bytes(word(b, encoding))),
+            Self::I32 => f64::from(i32::from_le_bytes(word(b, encoding))),
+            Self::U32 => f64::from(u32::from_le_bytes(word(b, encoding))),
+            Self::F32 => f64::from(f32::from_le_bytes(word(b, encoding))),
+            Self::F64 => f64::from_le_bytes(word(b, encoding)),
         }
     }
 }
 
 /// A property of an element.
 pub(super) struct Property {
-    /// As the header spells it.
+    /// Name in the header.
     pub name: String,
     /// Type of the value, or of a list's items.
     pub kind: Scalar,
-    /// Type of the length where it is a list.
+    /// Type of the length of a list; `None` for a scalar.
     list: Option<Scalar>,
 }
 
@@ -168,14 +169,14 @@ pub(super) struct Property {
 pub(super) struct Element {
     /// `vertex`, `chunk`, `face`, …
     pub name: String,
-    /// Declared number of rows; not to be believed before [`Header::room`].
+    /// Declared number of rows; [`Header::checked_count`] compares it with the bytes.
     pub count: u64,
-    /// In the order of the file.
+    /// Properties in the order of the file.
     pub properties: Vec<Property>,
 }
 
 impl Element {
-    /// Index of the scalar property `name`.
+    /// Returns the index of the scalar property `name`.
     pub fn position(&self, name: &str) -> Option<usize> {
         self.properties.iter().position(|p| p.name == name && p.list.is_none())
     }
@@ -184,8 +185,8 @@ impl Element {
         self.properties.iter().any(|p| p.list.is_some())
     }
 
-    /// Least bytes of a row.
-    fn least(&self, encoding: Encoding) -> u64 {
+    /// Returns the smallest number of bytes of a row.
+    fn row_bytes_min(&self, encoding: Encoding) -> u64 {
         let least = |p: &Property| p.list.unwrap_or(p.kind).size();
         match encoding {
             // A digit and a separator.
@@ -195,7 +196,7 @@ impl Element {
     }
 }
 
-/// Byte order, or text.
+/// Encoding of the rows: text, or a byte order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Encoding {
     Ascii,
@@ -204,7 +205,7 @@ pub(super) enum Encoding {
 }
 
 impl Encoding {
-    /// As the header spells it.
+    /// Returns the header's word for the encoding.
     pub fn name(self) -> &'static str {
         match self {
             Self::Ascii => "ascii",
@@ -214,7 +215,7 @@ impl Encoding {
     }
 }
 
-/// Everything before the data.
+/// The header of a file.
 pub(super) struct Header {
     pub encoding: Encoding,
     pub elements: Vec<Element>,
@@ -271,9 +272,10 @@ impl Header {
         Ok(Self { encoding, elements, comments })
     }
 
-    /// Number of rows of `element`, if that many can follow.
-    pub fn room(&self, element: &Element, source: &Source) -> Result<usize> {
-        let needed = u128::from(element.least(self.encoding)) * u128::from(element.count);
+    /// Returns the number of rows of `element`, after a comparison with the remaining bytes.
+    pub fn checked_count(&self, element: &Element, source: &Source) -> Result<usize> {
+        let least = element.row_bytes_min(self.encoding);
+        let needed = u128::from(least) * u128::from(element.count);
         if needed > u128::from(source.left) {
             let expected = format!(
                 "{} rows of `{}`, at least {needed} bytes, as the header says",
@@ -286,14 +288,14 @@ impl Header {
         })
     }
 
-    /// Calls `each(row, values)` for every row of `element`; a list's value is NaN.
+    /// Calls `each(row, values)` for every row of `element`; the value of a list is NaN.
     pub fn rows(
         &self,
         element: &Element,
         source: &mut Source,
         mut each: impl FnMut(usize, &[f64]) -> Result<()>,
     ) -> Result<()> {
-        let count = self.room(element, source)?;
+        let count = self.checked_count(element, source)?;
         if element.properties.is_empty() {
             return Ok(());
         }
@@ -305,15 +307,14 @@ impl Header {
             }
             return Ok(());
         }
-        let big = self.encoding == Encoding::Big;
         if element.has_lists() {
             for i in 0..count {
-                list_row(element, source, big, &mut values)?;
+                list_row(element, source, self.encoding, &mut values)?;
                 each(i, &values)?;
             }
             return Ok(());
         }
-        let stride = element.least(self.encoding) as usize;
+        let stride = element.row_bytes_min(self.encoding) as usize;
         let mut block = vec![0; stride * (count as u64).min(BLOCK_ROWS) as usize];
         for first in (0..count).step_by(BLOCK_ROWS as usize) {
             let rows = (count - first).min(BLOCK_ROWS as usize);
@@ -322,7 +323,7 @@ impl Header {
             for (i, row) in bytes.chunks_exact(stride).enumerate() {
                 let mut at = 0;
                 for (v, p) in values.iter_mut().zip(&element.properties) {
-                    *v = p.kind.value(&row[at..], big);
+                    *v = p.kind.value(&row[at..], self.encoding);
                     at += p.kind.size();
                 }
                 each(first + i, &values)?;
@@ -389,7 +390,7 @@ fn ascii_row(element: &Element, source: &mut Source, values: &mut [f64]) -> Resu
     for (v, p) in values.iter_mut().zip(&element.properties) {
         *v = next(&p.name)?;
         if p.list.is_some() {
-            // The line is bounded, so a lying length runs out of words at once.
+            // The line is bounded: a wrong length runs out of words soon.
             let length = *v;
             if !(length >= 0.0 && length.fract() == 0.0) {
                 return Err(source.bad_line(format!("a length for `{}`", p.name), &line));
@@ -409,20 +410,26 @@ fn ascii_row(element: &Element, source: &mut Source, values: &mut [f64]) -> Resu
     Ok(())
 }
 
-fn list_row(element: &Element, source: &mut Source, big: bool, values: &mut [f64]) -> Result<()> {
+fn list_row(
+    element: &Element,
+    source: &mut Source,
+    encoding: Encoding,
+    values: &mut [f64],
+) -> Result<()> {
     let mut word = [0u8; 8];
     for (v, p) in values.iter_mut().zip(&element.properties) {
         let head = p.list.unwrap_or(p.kind);
         source.fill(&mut word[..head.size()])?;
-        *v = head.value(&word, big);
+        *v = head.value(&word, encoding);
         if p.list.is_some() {
             let length = std::mem::replace(v, f64::NAN);
             if length < 0.0 {
                 let got = format!("{length}");
                 return Err(Error::format(source.path, format!("a length for `{}`", p.name), got));
             }
-            // At most 2³² items of 8 bytes: no overflow.
+            // No overflow: at most 2³² items of 8 bytes.
             let mut skip = length as u64 * p.kind.size() as u64;
+
             if skip > source.left {
                 return Err(source.short(skip));
             }

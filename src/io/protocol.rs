@@ -1,10 +1,10 @@
-//! Which frames are context and which are targets: `protocol.json` of a scene folder,
-//! and the evaluation index of pixelSplat and MVSplat for a whole data set.
+//! Choice of context and target frames: `protocol.json` of a scene folder, and the
+//! evaluation index of pixelSplat and MVSplat for a data set.
 //!
 //! * `protocol.json`: `{"resolution": [W, H], "intrinsics_256": {…},
 //!   "tests": [{"context": [i, j], "target": [a, b, c], …}]}`
-//! * index: `{"scene": {"context": [i, j], "target": [a, b, c]} | null, …}`; a null
-//!   scene is one that the authors found no pair in, and is skipped.
+//! * index: `{"scene": {"context": [i, j], "target": [a, b, c]} | null, …}`; a scene of
+//!   null has no pair and is skipped.
 
 use super::cameras_json::json_error;
 use super::{Error, Result, read};
@@ -16,9 +16,9 @@ use std::path::Path;
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(expecting = "context and target")]
 pub struct Views {
-    /// Inputs, at least one.
+    /// Input frames, at least one.
     pub context: Vec<usize>,
-    /// Views to render and compare.
+    /// Frames to render and compare.
     pub target: Vec<usize>,
 }
 
@@ -26,7 +26,7 @@ impl Views {
     /// Checks the indices against a scene of `frames` frames.
     ///
     /// # Errors
-    /// The index that is out of range, named by `path`.
+    /// An index out of range; `path` is the file in the error.
     pub fn check(&self, path: &Path, frames: usize) -> Result<()> {
         match self.context.iter().chain(&self.target).find(|i| **i >= frames) {
             None => Ok(()),
@@ -55,22 +55,22 @@ pub struct ProtocolIntrinsics {
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(expecting = "an object with tests")]
 pub struct Protocol {
-    /// Width and height of input and target, px.
+    /// Width and height of inputs and targets, px.
     pub resolution: Option<[usize; 2]>,
     /// Intrinsics of every frame after resize and crop to 256×256.
     pub intrinsics_256: Option<ProtocolIntrinsics>,
-    /// Pairs with their targets.
+    /// Context frames with their targets.
     #[serde(default)]
     pub tests: Vec<Views>,
 }
 
-/// Scenes with their views; `None` where the index says null.
+/// Scenes with their frames; `None` where the index has null.
 pub type Index = BTreeMap<String, Option<Views>>;
 
 /// Reads `protocol.json`.
 ///
 /// # Errors
-/// Not JSON of this form; a test without context.
+/// JSON of another form; a test without context.
 pub fn load_protocol(path: &Path) -> Result<Protocol> {
     let protocol: Protocol = serde_json::from_slice(&read(path)?)
         .map_err(|e| json_error(path, "protocol.json (tests with context and target)", &e))?;
@@ -86,7 +86,8 @@ pub fn load_protocol(path: &Path) -> Result<Protocol> {
 /// Reads an evaluation index.
 ///
 /// # Errors
-/// Not JSON of this form; a scene without context.
+/// JSON of another form; a scene without context.
+
 pub fn load_index(path: &Path) -> Result<Index> {
     let index: Index = serde_json::from_slice(&read(path)?).map_err(|e| {
         json_error(path, "an evaluation index (scene: context and target, or null)", &e)

@@ -1,16 +1,18 @@
 //! RealEstate10K camera files with their frames.
 //!
-//! First line: the video's address. Then one line per frame of 19 columns: time stamp
-//! in microseconds; fx, fy, cx, cy divided by the frame's width and height; 0 0; the
-//! 3×4 matrix camera-from-world, row by row, OpenCV axes. The frames are whole video
-//! frames, however they were scaled: fx = fx_norm · W of the *stored* frame, fy =
-//! fy_norm · H, so a squeezed copy has fx ≠ fy.
+//! The first line is the video's address. Each further line is a frame of 19 columns: time
+//! stamp in microseconds; fx, fy, cx, cy divided by the frame's width and height; 0 0; the
+//! 3×4 matrix camera-from-world, row by row, OpenCV axes. Frames are whole video frames at
+//! any scale: fx = fx_norm · W of the *stored* frame, fy = fy_norm · H. A squeezed copy has
+//! fx ≠ fy.
 //!
-//! Frames are looked for in `images/`, `frames/`, a folder with the txt's name, and
-//! beside the txt. They are matched by time stamp where all names are time stamps of
-//! the file (as downloaders write), else by number where every name is the index of a
-//! line, from 0, else in the order of their names (numbers in theirs) where there are as
-//! many as lines, else by time stamp where some are.
+//! Frames may lie in `images/`, `frames/`, a folder with the txt's name, or beside the txt.
+//! The first rule that applies matches them with lines:
+//!
+//! 1. by time stamp, if all names are time stamps of the file (as downloaders write);
+//! 2. by number, if every name is the index of a line, from 0;
+//! 3. by order, if there are as many as lines (numbers in names in numeric order);
+//! 4. by time stamp, if some names are time stamps.
 
 use super::assemble::{Draft, Lens, assemble, list_images};
 use super::scene::{Scene, SceneFormat, Units};
@@ -26,9 +28,9 @@ const COLUMNS: usize = 19;
 pub struct Re10kCamera {
     /// Line of the file, from 1.
     pub line: usize,
-    /// Microseconds.
+    /// Time stamp, microseconds.
     pub timestamp: i64,
-    /// fx, fy, cx, cy over width and height.
+    /// fx/W, fy/H, cx/W, cy/H.
     pub normalised: [f64; 4],
     /// Inverse of the line's matrix.
     pub world_from_camera: DMat4,
@@ -46,7 +48,7 @@ pub fn parse(path: &Path, bytes: &[u8], warnings: &mut Vec<String>) -> Result<Ve
     let mut bent = 0;
     for (i, line) in text.lines().enumerate() {
         let words: Vec<&str> = line.split_ascii_whitespace().collect();
-        // The first line is an address, and is often left out.
+        // The first line is an address; some files lack it.
         let address = i == 0 && words.first().is_some_and(|w| w.parse::<f64>().is_err());
         if words.is_empty() || address {
             continue;
@@ -85,8 +87,9 @@ pub fn parse(path: &Path, bytes: &[u8], warnings: &mut Vec<String>) -> Result<Ve
     Ok(cameras)
 }
 
-/// The camera file in a folder: a `.txt` whose first line is an address, or whose first
-/// camera line has 19 columns.
+/// Finds the camera file in a folder: a `.txt` whose first line is an address or has 19
+/// columns.
+
 pub(super) fn find(folder: &Path) -> Result<Option<PathBuf>> {
     let entries = std::fs::read_dir(folder).map_err(|e| Error::io(folder, e))?;
     let mut files: Vec<PathBuf> = entries.filter_map(|e| Some(e.ok()?.path())).collect();
@@ -138,7 +141,8 @@ pub(super) fn load(path: &Path) -> Result<Scene> {
     Ok(scene)
 }
 
-/// The picture of each camera, by the module's rules.
+/// Finds the picture of each camera by the rules of the module's documentation.
+
 fn matched(
     path: &Path,
     cameras: &[Re10kCamera],

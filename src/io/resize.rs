@@ -1,13 +1,12 @@
-//! Resampling of 8-bit pictures, equal to Pillow's `Image.resize` bit for bit.
+//! Resampling of 8-bit pictures, bit for bit equal to Pillow's `Image.resize`.
 //!
-//! The published evaluation protocol resizes with PIL's LANCZOS on uint8 (MVSplat's
-//! crop shim), so a number can be compared only if the input is the same. The rules,
-//! from Pillow's `Resample.c` (8 bits per channel): a separable filter whose support
-//! grows with the reduction (antialiasing), weights normalised in f64 and then
-//! rounded to 22 fractional bits, one horizontal pass rounded to 8 bits, then one
-//! vertical pass.
+//! The published evaluation protocol resizes with PIL's LANCZOS on uint8 (MVSplat's crop
+//! shim); scores are comparable only for the same input. The algorithm is that of Pillow's
+//! `Resample.c` (8 bits per channel): a separable filter whose support grows with the
+//! reduction (antialiasing), weights normalised in f64 and rounded to 22 fractional bits, a
+//! horizontal pass rounded to 8 bits, and a vertical pass.
 //!
-//! Golden values: tests/resize.rs, made by tools/make_resize_golden.py.
+//! Tests: tests/resize.rs with tests/goldens/resize.txt (tools/make_resize_golden.py).
 
 use super::image::Rgb;
 use rayon::prelude::*;
@@ -24,13 +23,13 @@ pub enum Filter {
     Bilinear,
     /// Cubic convolution with a = −½, support 2.
     Bicubic,
-    /// Windowed sinc, support 3: the evaluation protocol's.
+    /// Windowed sinc, support 3; the filter of the evaluation protocol.
     #[default]
     Lanczos,
 }
 
 impl Filter {
-    /// Half width, in source pixels at a scale of 1.
+    /// Returns the half width in source pixels at a scale of 1.
     fn support(self) -> f64 {
         match self {
             Self::Box => 0.5,
@@ -62,14 +61,14 @@ fn sinc(x: f64) -> f64 {
     x.sin() / x
 }
 
-/// The source pixels that one output pixel sees.
+/// Source pixels and weights of one output pixel.
 struct Taps {
     first: usize,
     /// Weights, in units of 2⁻²².
     weights: Vec<i32>,
 }
 
-/// Taps of the output pixels `from .. from + count` of a line resampled from
+/// Computes the taps of the output pixels `from .. from + count` of a line resampled from
 /// `source` to `target` pixels.
 fn taps(source: usize, target: usize, from: usize, count: usize, filter: Filter) -> Vec<Taps> {
     let scale = source as f64 / target as f64;
@@ -78,7 +77,7 @@ fn taps(source: usize, target: usize, from: usize, count: usize, filter: Filter)
     (from..from + count)
         .map(|i| {
             let center = (i as f64 + 0.5) * scale;
-            // `as usize` truncates and sends negative values to 0, as Pillow does.
+            // `as usize` truncates and maps negative values to 0, as Pillow does.
             let first = (center - support + 0.5) as usize;
             let end = ((center + support + 0.5) as usize).min(source);
             let mut weights: Vec<f64> = (first..end)
@@ -90,7 +89,7 @@ fn taps(source: usize, target: usize, from: usize, count: usize, filter: Filter)
             }
             let fixed = |w: f64| {
                 let scaled = w * f64::from(1u32 << PRECISION_BITS);
-                // Half away from zero.
+                // Rounds half away from zero.
                 (scaled + if w < 0.0 { -0.5 } else { 0.5 }) as i32
             };
             Taps { first, weights: weights.into_iter().map(fixed).collect() }
@@ -102,33 +101,39 @@ fn clip(sum: i32) -> u8 {
     (sum >> PRECISION_BITS).clamp(0, 255) as u8
 }
 
-/// The picture resampled to `width` × `height`, which must not be zero.
+/// Resamples a picture to `width` × `height`, which must not be zero.
 pub fn resize(picture: &Rgb, width: usize, height: usize, filter: Filter) -> Rgb {
-    resize_window(picture, (width, height), (0, 0), (width, height), filter)
+    let size = [width, height];
+    resize_window(picture, &Window { full: size, origin: [0, 0], size }, filter)
 }
 
-/// The window of `size` pixels at `origin` (column, row) of the picture resampled to
-/// `full`: the same numbers as resampling everything and cropping, without the rest.
-///
-/// The window must lie inside `full`; an empty source gives black.
-pub fn resize_window(
-    picture: &Rgb,
-    full: (usize, usize),
-    origin: (usize, usize),
-    size: (usize, usize),
-    filter: Filter,
-) -> Rgb {
-    debug_assert!(origin.0 + size.0 <= full.0 && origin.1 + size.1 <= full.1);
-    let mut out = Rgb::black(size.0, size.1);
+/// A window of a resampled picture; (x, y), px.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Window {
+    /// Size of the whole resampled picture.
+    pub full: [usize; 2],
+    /// Corner of the window.
+    pub origin: [usize; 2],
+    /// Size of the window, which must lie inside `full`.
+    pub size: [usize; 2],
+}
+
+/// Computes a window of a resampled picture. The numbers are those of [`resize`] and a crop;
+/// pixels outside the window are not computed. An empty source gives black.
+pub fn resize_window(picture: &Rgb, window: &Window, filter: Filter) -> Rgb {
+    let Window { full, origin, size } = *window;
+    debug_assert!((0..2).all(|axis| origin[axis] + size[axis] <= full[axis]));
+    let mut out = Rgb::black(size[0], size[1]);
     if picture.data.is_empty() || out.data.is_empty() {
         return out;
     }
-    let columns = taps(picture.width, full.0, origin.0, size.0, filter);
-    let rows = taps(picture.height, full.1, origin.1, size.1, filter);
-    // Only the rows that the vertical pass reads.
+    let columns = taps(picture.width, full[0], origin[0], size[0], filter);
+    let rows = taps(picture.height, full[1], origin[1], size[1], filter);
+    // The horizontal pass computes the rows that the vertical pass reads.
     let top = rows.iter().map(|t| t.first).min().unwrap_or(0);
     let bottom = rows.iter().map(|t| t.first + t.weights.len()).max().unwrap_or(0);
-    let stride = 3 * size.0;
+    let stride = 3 * size[0];
+
     let half = 1i32 << (PRECISION_BITS - 1);
 
     let mut between = vec![0u8; stride * (bottom - top)];
@@ -187,7 +192,8 @@ mod tests {
         let p = noise(61, 47);
         for (w, h) in [(23, 19), (90, 100)] {
             let whole = resize(&p, w, h, Filter::Lanczos);
-            let window = resize_window(&p, (w, h), (5, 3), (11, 13), Filter::Lanczos);
+            let place = Window { full: [w, h], origin: [5, 3], size: [11, 13] };
+            let window = resize_window(&p, &place, Filter::Lanczos);
             assert_eq!(window, whole.window(5, 3, 11, 13).unwrap());
         }
     }

@@ -1,13 +1,12 @@
 //! Posed photographs: one type for every pose format, and the detection of formats.
 //!
-//! Whatever the file's own conventions, a [`Scene`] has OpenCV cameras
-//! (`world_from_camera`) and intrinsics in pixels of the stored picture, pixel
-//! centres at +0.5 (`camera.rs`). A folder with several pose files is read by this
-//! precedence: `cameras.json`, `transforms.json`, COLMAP, RealEstate10K txt,
-//! `poses.txt` with `K.txt`; naming the file itself chooses another.
+//! A [`Scene`] has OpenCV cameras (`world_from_camera`) and intrinsics in pixels of the
+//! stored picture, pixel centres at +0.5 (`camera.rs`), in every format. The precedence of
+//! pose files in a folder is: `cameras.json`, `transforms.json`, COLMAP, RealEstate10K txt,
+//! `poses.txt` with `K.txt`. The path of a pose file selects that file.
 //!
-//! EXIF orientation is never applied: pose files speak of the stored pixels. Where
-//! it is set, a warning says so.
+//! EXIF orientation is never applied, because pose files refer to the stored pixels. A
+//! picture with one gives a warning.
 
 use super::assemble::{Draft, Lens, assemble};
 use super::image::Rgb;
@@ -17,10 +16,10 @@ use crate::camera::Camera;
 use glam::Vec3;
 use std::path::{Path, PathBuf};
 
-/// Where a scene's cameras came from.
+/// The format of a scene's pose file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SceneFormat {
-    /// `cameras.json` as `run` writes it, or the list that 3DGS writes.
+    /// `cameras.json` of `subsplat run`, or the list of 3DGS.
     CamerasJson,
     /// nerfstudio's and instant-ngp's `transforms.json`.
     Transforms,
@@ -35,7 +34,7 @@ pub enum SceneFormat {
 }
 
 impl SceneFormat {
-    /// For messages.
+    /// Returns the format's name for messages.
     pub fn name(self) -> &'static str {
         match self {
             Self::CamerasJson => "cameras.json",
@@ -48,39 +47,39 @@ impl SceneFormat {
     }
 }
 
-/// What is known of the scene's unit of length.
+/// The scene's unit of length.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Units {
-    /// Nothing.
+    /// Not known.
     #[default]
     Unknown,
     /// Metres.
     Metres,
-    /// RealEstate10K's own scale, for which near 1 and far 100 are the field's habit.
+    /// The scale of RealEstate10K, used with near 1 and far 100 by convention.
     RealEstate10k,
 }
 
 /// One posed photograph.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
-    /// The picture's path in the pose file, without leading `images/` and extension.
+    /// Path of the picture in the pose file, without leading `images/` and extension.
     pub name: String,
-    /// The picture on disk.
+    /// Path of the picture on disk.
     pub image: PathBuf,
-    /// Camera of the stored picture, before [`Frame::distortion`].
+    /// Camera of the stored picture without [`Frame::distortion`].
     pub camera: Camera,
-    /// Lens distortion that the stored picture still has.
+    /// Lens distortion of the stored picture.
     pub distortion: Distortion,
     /// Time stamp of a video frame, microseconds (RealEstate10K).
     pub timestamp: Option<i64>,
-    /// 16-bit depth map of the stored picture, where the pose file names one.
+    /// 16-bit depth map of the stored picture, if the pose file names one.
     pub depth: Option<PathBuf>,
-    /// Indices into [`Scene::points`] of the points that this frame observed.
+    /// Indices into [`Scene::points`] of the points that this frame observes.
     pub visible: Vec<u32>,
 }
 
 impl Frame {
-    /// Camera of the picture that [`Frame::load`] gives.
+    /// Returns the camera of [`Frame::load`]'s picture.
     ///
     /// # Errors
     /// A distortion that cannot be removed.
@@ -94,7 +93,7 @@ impl Frame {
     /// Decodes the picture and removes the lens distortion.
     ///
     /// # Errors
-    /// Everything of [`super::image::load`]; a size that is not the camera's.
+    /// Errors of [`super::image::load`]; a size that is not the camera's.
     pub fn load(&self) -> Result<(Rgb, Camera)> {
         let picture = super::image::load(&self.image)?;
         let k = &self.camera.intrinsics;
@@ -113,9 +112,9 @@ impl Frame {
 /// A set of posed photographs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scene {
-    /// The folder's name.
+    /// Name of the folder.
     pub name: String,
-    /// At least one; in the pose file's order (COLMAP: by name).
+    /// At least one frame, in the pose file's order (COLMAP: by name).
     pub frames: Vec<Frame>,
     /// Sparse points of a reconstruction, world coordinates.
     pub points: Option<Vec<Vec3>>,
@@ -123,17 +122,17 @@ pub struct Scene {
     pub source: SceneFormat,
     /// Unit of length.
     pub units: Units,
-    /// Nearest and farthest depth that the pose file gives, world units of camera z.
+    /// Nearest and farthest depth of the pose file, camera z in world units.
     pub near_far: Option<(f32, f32)>,
-    /// Harmless oddities, one line each, for the user.
+    /// Warnings for the user, one line each.
     pub warnings: Vec<String>,
 }
 
 impl Scene {
-    /// Two pictures with known cameras. A camera's size must be its picture's.
+    /// Makes a scene of two pictures with known cameras of the pictures' sizes.
     ///
     /// # Errors
-    /// A picture that is missing, broken or of another size.
+    /// A picture that is missing, malformed or of another size.
     pub fn from_pair(a: &Path, b: &Path, camera_a: Camera, camera_b: Camera) -> Result<Self> {
         let draft = |path: &Path, camera: Camera| {
             let k = camera.intrinsics;
@@ -153,14 +152,14 @@ impl Scene {
     }
 }
 
-/// Where COLMAP's model is looked for in a scene's folder.
+/// Folders of a scene in which COLMAP's model may lie.
 const MODEL_FOLDERS: [&str; 4] = ["sparse/0", "sparse", "colmap/sparse/0", ""];
 
-/// Reads the scene in a folder, or behind one pose file.
+/// Reads the scene of a folder or of a pose file.
 ///
 /// # Errors
-/// No pose file; a pose file that is broken (file and line or byte are named); no
-/// picture at all; a picture whose size does not fit its camera.
+/// No pose file; a malformed pose file (the error names file and line or byte); no picture;
+/// a picture whose size does not match its camera.
 pub fn load_scene(path: &Path) -> Result<Scene> {
     let metadata = std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
     if metadata.is_file() {
@@ -192,7 +191,8 @@ pub fn load_scene(path: &Path) -> Result<Scene> {
     ))
 }
 
-/// Whether `path` is a folder with a pose file that [`load_scene`] takes.
+/// Reports whether `path` is a folder with a pose file that [`load_scene`] reads.
+
 pub fn is_scene(path: &Path) -> bool {
     let file = |name: &str| path.join(name).is_file();
     ["cameras.json", "transforms.json", "poses.txt"].into_iter().any(file)

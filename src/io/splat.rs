@@ -1,9 +1,10 @@
-//! The `.splat` file (antimatter15): 32 bytes a Gaussian and nothing else.
+//! The `.splat` file (antimatter15): 32 bytes per Gaussian, without a header.
 //!
 //! Bytes 0–11 mean, 12–23 σ (not logarithms), both f32 little-endian; 24–27 RGBA, the
 //! colour of SH degree 0 and the opacity after the sigmoid, 0 to 255; 28–31 quaternion
-//! wxyz as (byte − 128) / 128. No header, no view dependence. Sorted by volume times
-//! opacity, largest first, so that a viewer may show a prefix while it loads.
+//! wxyz as (byte − 128) / 128. No view dependence. The writer sorts by volume times
+//! opacity, largest first, so that a viewer can show a prefix while it loads. A file cut at
+//! the end of a record is indistinguishable from a shorter one.
 
 use super::gaussians::{Decoded, Incoming, Outgoing, array, check_finite, dc_from_colour, f32_at};
 use super::{Error, Result};
@@ -12,16 +13,16 @@ use crate::splats::Splats;
 use std::io::Write;
 use std::path::Path;
 
-/// Bytes a Gaussian.
+/// Bytes per Gaussian.
 const RECORD: usize = 32;
-/// Records written at a time.
+/// Records per write.
 const BLOCK: usize = 4096;
 
 /// Reads a `.splat` from memory. `name` is for errors.
 ///
 /// # Errors
-/// Not a positive multiple of 32 bytes; a mean or scale that is not finite, or a
-/// negative scale, which a file of another kind has almost surely.
+/// Not a positive multiple of 32 bytes; a mean or scale that is not finite; a negative
+/// scale, which gives most files of another format away.
 pub fn parse_splat(bytes: &[u8], name: &Path) -> Result<Splats> {
     let decoded = decode(bytes, name)?;
     check_finite(&decoded.splats, name)?;
@@ -55,7 +56,7 @@ pub(super) fn decode(bytes: &[u8], path: &Path) -> Result<Decoded> {
     Ok(Decoded { splats, flavour: "splat".to_owned(), comments: Vec::new() })
 }
 
-/// Writes every Gaussian, the most visible first.
+/// Writes every Gaussian, sorted by volume times opacity.
 pub(super) fn write(file: &mut dyn Write, out: &Outgoing) -> std::io::Result<()> {
     let mut visitor = out.visitor();
     let mut order = Vec::with_capacity(out.count);
@@ -64,7 +65,7 @@ pub(super) fn write(file: &mut dyn Write, out: &Outgoing) -> std::io::Result<()>
         let volume: f64 = g.scale.iter().map(|s| f64::from(*s)).product();
         order.push((volume * f64::from(g.opacity), i));
     }
-    // Stable: equals stay in the order of the splats.
+    // A stable sort: equal keys keep the order of the splats.
     order.sort_by(|a, b| b.0.total_cmp(&a.0));
     let mut block = Vec::with_capacity(BLOCK * RECORD);
     for (n, &(_, i)) in order.iter().enumerate() {
@@ -83,13 +84,14 @@ pub(super) fn write(file: &mut dyn Write, out: &Outgoing) -> std::io::Result<()>
     file.write_all(&block)
 }
 
-/// [0, 1] to 0..=255, clamped, to the nearest.
+/// Rounds [0, 1] to 0..=255, clamped.
 pub(super) fn unit_byte(v: f64) -> u8 {
     (v.clamp(0.0, 1.0) * 255.0).round() as u8
 }
 
-/// The code reaches −1 but not +1: of q and −q, the one whose largest component is
-/// negative is written, so that the length stays 1 (viewers do not normalise).
+/// Encodes a quaternion. The code reaches −1 but not +1: of q and −q, the one whose largest
+/// component is negative keeps length 1, and viewers do not normalise.
+
 fn quat_bytes(q: [f32; 4]) -> [u8; 4] {
     let largest = q.into_iter().max_by(|a, b| a.abs().total_cmp(&b.abs())).unwrap_or(0.0);
     let sign = if largest > 0.0 { -1.0 } else { 1.0 };

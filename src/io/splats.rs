@@ -1,4 +1,5 @@
-//! Splat files by name: which format, load, save, and what `subsplat info` tells.
+//! Splat files of every format: detection, loading, saving, and the report of
+//! `subsplat info`.
 //!
 //! | format | in | out | SH written | axes of the file |
 //! |---|---|---|---|---|
@@ -9,8 +10,8 @@
 //! | `.splat` (antimatter15) | yes | yes | 0 | ours, or as `up` says |
 //! | `.ksplat` (mkkellogg) | yes | no | | |
 //!
-//! Ours: OpenCV axes, y down, which viewers of `.ply` and `.splat` turn upright
-//! themselves. SH of degree 4 are dropped by default: viewers know 3.
+//! "ours": OpenCV axes, y down; viewers of `.ply` and `.splat` rotate the scene themselves.
+//! SH of degree 4 are dropped by default, since viewers read 3.
 
 use super::gaussians::{Decoded, HALF_TURN_X, Outgoing, check_finite};
 use super::{Error, Result, glb, glb_read, ksplat, ply, read, splat, spz, write_atomic};
@@ -39,11 +40,11 @@ pub enum SplatFormat {
     Ksplat,
 }
 
-/// What [`load_splats`] accepts, for errors.
+/// The formats of [`load_splats`], for errors.
 const KNOWN: &str = "a .ply, .glb, .spz, .splat or .ksplat file";
 
 impl SplatFormat {
-    /// By the file name's ending, whatever its case.
+    /// Detects the format by the file name's extension, in upper or lower case.
     pub fn from_name(path: &Path) -> Option<Self> {
         let extension = path.extension()?.to_string_lossy().to_ascii_lowercase();
         Some(match extension.as_str() {
@@ -56,7 +57,7 @@ impl SplatFormat {
         })
     }
 
-    /// By the first bytes, where the format has a magic.
+    /// Detects the format by the first bytes, where it has a magic number.
     pub fn from_magic(head: &[u8]) -> Option<Self> {
         if head.starts_with(b"ply\n") || head.starts_with(b"ply\r") {
             Some(Self::Ply)
@@ -70,22 +71,22 @@ impl SplatFormat {
     }
 }
 
-/// Direction that is up in a written file.
+/// The up direction of a written file.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Up {
-    /// Our world as it is: OpenCV axes, up is −y.
+    /// The world's own axes (OpenCV): up is −y.
     #[default]
     Keep,
-    /// Half a turn about x: up is +y, −z forward (OpenGL).
+    /// Rotated by 180° about x: up is +y, −z forward (OpenGL).
     Y,
-    /// A quarter turn about x: up is +z, +y forward (Blender).
+    /// Rotated by 90° about x: up is +z, +y forward (Blender).
     Z,
 }
 
 impl Up {
-    /// From our axes to the file's.
-    fn turn(self) -> Option<DMat3> {
+    /// Returns the rotation from the world's axes to the file's.
+    fn rotation(self) -> Option<DMat3> {
         match self {
             Self::Keep => None,
             Self::Y => Some(HALF_TURN_X),
@@ -107,50 +108,50 @@ impl FromStr for Up {
     }
 }
 
-/// How to write splats.
+/// Options of [`save_splats`].
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SaveOptions {
-    /// Highest SH degree written; `None` is 3. Never more than is stored, nor than the
-    /// format holds (`.ply` 4, `.glb` and `.spz` 3, `.splat` 0).
+    /// Highest SH degree written; `None` is 3. The stored degree and the format (`.ply` 4,
+    /// `.glb` and `.spz` 3, `.splat` 0) limit it.
     pub sh_degree: Option<usize>,
     /// Gaussians of a lower opacity are left out; 0 keeps all.
     pub min_opacity: f32,
-    /// Rotation of means, quaternions and SH. `.glb` takes each (its node turns back);
-    /// `.spz` is y-up by definition and refuses `z`.
+    /// Up direction: rotates means, quaternions and SH. The node of a `.glb` rotates them
+    /// back; `.spz` is y-up by definition and refuses `z`.
     pub up: Up,
     /// Lines for the header of a `.ply`, or the `asset` of a `.glb`.
     pub comments: Vec<String>,
 }
 
-/// What was written.
+/// Report of a written file.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct SaveReport {
     /// Format.
     pub format: SplatFormat,
     /// Gaussians written.
     pub count: usize,
-    /// Gaussians under the least opacity.
+    /// Gaussians below the least opacity.
     pub pruned: usize,
     /// SH degree written.
     pub sh_degree: usize,
-    /// SH degree that the splats had.
+    /// SH degree of the splats.
     pub stored_sh_degree: usize,
-    /// Gaussians of which a σ was zero or less, and was raised to 1e-12.
+    /// Gaussians with a σ that was raised to 1e-12.
     pub clamped_scales: usize,
     /// Size of the file.
     pub bytes: u64,
 }
 
-/// Reads a splat file. Its first bytes decide where they are a magic, else its name.
-/// The result: standard SH basis, K = 1, unit world quaternions, no gain.
+/// Reads a splat file. A magic number decides the format, else the file's extension. The
+/// result has the standard SH basis, K = 1, unit world quaternions and no gain.
 ///
 /// # Errors
-/// Unknown kind; whatever the format's reader says, with the file's name.
+/// An unknown format; the errors of the format's reader.
 pub fn load_splats(path: &Path) -> Result<Splats> {
     Ok(load_with_comments(path)?.0)
 }
 
-/// [`load_splats`], and the comments that the file carries ([`SaveOptions::comments`]).
+/// Reads a splat file and its comments ([`SaveOptions::comments`]).
 ///
 /// # Errors
 /// As [`load_splats`].
@@ -173,7 +174,7 @@ fn decode(path: &Path) -> Result<(SplatFormat, Decoded, u64)> {
     let format = SplatFormat::from_magic(&head)
         .or_else(|| SplatFormat::from_name(path))
         .ok_or_else(|| Error::format(path, KNOWN, format!("first bytes {head:02x?}")))?;
-    // The largest files are .ply: streamed, where the size is known beforehand.
+    // The largest files are .ply: they are streamed, where the size is known.
     if format == SplatFormat::Ply && metadata.is_file() {
         let mut reader = BufReader::with_capacity(1 << 16, File::open(path).map_err(io)?);
         let decoded = ply::decode(&mut reader, metadata.len(), path)?;
@@ -195,14 +196,14 @@ fn decode(path: &Path) -> Result<(SplatFormat, Decoded, u64)> {
     Ok((format, decoded, bytes.len() as u64))
 }
 
-/// Writes a splat file in the format of its name, whole or not at all.
+/// Writes a splat file in the format of its extension, atomically.
 ///
-/// Lossless in `.ply` and `.glb` (float) but for SH beyond the degree written; `.spz`
-/// and `.splat` quantise (their modules say how).
+/// `.ply` and `.glb` are lossless (float) but for SH above the degree written; `.spz` and
+/// `.splat` quantise ([`super::spz`], [`super::splat`]).
 ///
 /// # Errors
-/// A name of no writable format, numbers that are not finite (the first Gaussian is
-/// named), an opacity out of [0, 1], nothing left to write, the operating system's.
+/// An extension of no writable format, numbers that are not finite (the first Gaussian is
+/// named), an opacity out of [0, 1], no Gaussian left to write, system errors.
 pub fn save_splats(path: &Path, splats: &Splats, options: &SaveOptions) -> Result<SaveReport> {
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
     let format = SplatFormat::from_name(path)
@@ -210,12 +211,12 @@ pub fn save_splats(path: &Path, splats: &Splats, options: &SaveOptions) -> Resul
         .ok_or_else(|| {
             Error::format(path, "a name that ends in .ply, .glb, .spz or .splat", name.clone())
         })?;
-    let survey = |turn, limit| Outgoing::new(splats, options, turn, limit, path);
-    let turn = options.up.turn();
+    let survey = |rotation, limit| Outgoing::new(splats, options, rotation, limit, path);
+    let rotation = options.up.rotation();
     let out = match format {
-        SplatFormat::Ply => survey(turn, 4)?,
-        SplatFormat::Glb => survey(turn, glb::SH_DEGREE_MAX)?,
-        SplatFormat::Splat => survey(turn, 0)?,
+        SplatFormat::Ply => survey(rotation, 4)?,
+        SplatFormat::Glb => survey(rotation, glb::SH_DEGREE_MAX)?,
+        SplatFormat::Splat => survey(rotation, 0)?,
         SplatFormat::Spz | SplatFormat::Ksplat if options.up == Up::Z => {
             return Err(Error::format(path, "up keep or y (.spz is y-up by definition)", "z"));
         }
@@ -245,7 +246,7 @@ pub fn save_splats(path: &Path, splats: &Splats, options: &SaveOptions) -> Resul
     })
 }
 
-/// What a splat file holds.
+/// Description of a splat file.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct SplatInfo {
     /// Format.
@@ -258,11 +259,11 @@ pub struct SplatInfo {
     pub count: usize,
     /// SH degree.
     pub sh_degree: usize,
-    /// Gaussians with a number that is NaN or infinite; left out of what follows.
+    /// Gaussians with a number that is NaN or infinite; the fields below leave them out.
     pub non_finite: usize,
-    /// Gaussians too faint to be drawn anywhere (opacity below 1/255).
+    /// Gaussians that no pixel shows (opacity below 1/255).
     pub invisible: usize,
-    /// Least and largest mean, our axes; `None` without a finite Gaussian.
+    /// Smallest and largest mean, world axes; `None` without a finite Gaussian.
     pub bounds: Option<[[f32; 3]; 2]>,
     /// [`SplatInfo::QUANTILES`] of the opacity.
     pub opacity: Vec<f32>,
@@ -273,7 +274,7 @@ pub struct SplatInfo {
 }
 
 impl SplatInfo {
-    /// Which quantiles are given: least, 1 %, quartiles, 99 %, largest.
+    /// The quantiles of the report: minimum, 1 %, quartiles, 99 %, maximum.
     pub const QUANTILES: [f64; 7] = [0.0, 0.01, 0.25, 0.5, 0.75, 0.99, 1.0];
 
     fn of(format: SplatFormat, decoded: Decoded, bytes: u64) -> Self {
@@ -309,17 +310,18 @@ impl SplatInfo {
     }
 }
 
-/// The value at the nearest rank of each quantile; nothing of nothing.
+/// Returns the value at the nearest rank of each quantile; empty for no values.
 fn quantiles(mut values: Vec<f32>) -> Vec<f32> {
     values.sort_by(f32::total_cmp);
     let rank = |q: f64| (q * (values.len() as f64 - 1.0)).round() as usize;
     SplatInfo::QUANTILES.iter().filter_map(|q| values.get(rank(*q)).copied()).collect()
 }
 
-/// Reads a splat file and describes it, numbers that are not finite included.
+/// Reads a splat file and describes it. Numbers that are not finite are counted.
 ///
 /// # Errors
-/// As [`load_splats`], but for numbers that are not finite: those are counted.
+/// As [`load_splats`], except for numbers that are not finite.
+
 pub fn splat_info(path: &Path) -> Result<SplatInfo> {
     let (format, decoded, bytes) = decode(path)?;
     Ok(SplatInfo::of(format, decoded, bytes))

@@ -1,17 +1,21 @@
-//! Niantic's `.spz`: about 20 bytes a Gaussian at degree 0 and 64 at degree 3, packed
-//! by attribute and compressed. Reads versions 1 to 4, writes version 3.
+//! Niantic's `.spz`: about 20 bytes per Gaussian at degree 0 and 64 at degree 3, packed by
+//! attribute and compressed. Reads versions 1 to 4, writes version 3.
 //!
 //! Header, little-endian: magic `NGSP`, version u32, count u32, SH degree u8,
 //! fractional bits u8, flags u8, one byte (4: number of streams). Then, for all
 //! Gaussians, mean 3×24-bit fixed point (1: 3×f16), opacity u8, RGB of degree 0 u8 as
 //! 0.15·h + ½, ln σ u8 as 16·(ln σ + 10), rotation (1, 2: x y z as u8, w ≥ 0; 3, 4: the
 //! three smallest of xyzw, 9 bits and a sign each, under 2 bits of index), SH u8 as
-//! 128·h + 128, RGB innermost (|h| beyond 1 is clamped). Versions 1 to 3 are one gzip stream (a bare one is read
-//! too); 4 has a 32-byte header with the offset of a table of (compressed,
-//! uncompressed) u64 pairs, one zstd stream for each attribute.
+//! 128·h + 128, RGB innermost (|h| beyond 1 is clamped).
 //!
-//! Axes: x right, y up, z back by definition; half a turn about x from ours.
-//! Source: the README of nianticlabs/spz, splat-transform's files.
+//! Versions 1 to 3 are one gzip stream; the uncompressed form is read too. Version 4 has a
+//! 32-byte header with the offset of a table of (compressed, uncompressed) u64 pairs, one
+//! zstd stream for each attribute. Bit 1 of the flags announces extension records, after
+//! the Gaussians (1 to 3) or between header and table (4). The reader skips them. It checks
+//! every checksum, and that nothing follows the data.
+//!
+//! Axes: x right, y up, z back; half a turn about x from ours.
+//! Source: the README and extensions/README of nianticlabs/spz, splat-transform's files.
 
 use super::gaussians::{
     Decoded, HALF_TURN_X, Incoming, Outgoing, Similarity, check_finite, transform, truncated,
@@ -32,19 +36,19 @@ use std::path::Path;
 pub(super) const MAGIC: [u8; 4] = *b"NGSP";
 const HEADER: usize = 16;
 const HEADER_V4: usize = 32;
-/// Most Gaussians that a compressed file may declare (the reference reader's limit).
+/// Largest number of Gaussians that a file may declare (the limit of the reference reader).
 const COUNT_MAX: u32 = 10_000_000;
-/// Inflated size that is always taken, and the most by which more than that may have
-/// been compressed: real scenes shrink 2 to 20 times.
+/// Inflated size that is always accepted, and the largest ratio of compression beyond it.
+/// Real scenes shrink 2 to 20 times.
 const INFLATED_FREE: u64 = 64 << 20;
 const RATIO_MAX: u64 = 256;
 /// Bit of the flags that announces extension records.
 const FLAG_EXTENSIONS: u8 = 2;
-/// Constant of the colour byte.
+/// Scale of the colour byte.
 const COLOUR_SCALE: f64 = 0.15;
 /// Largest fixed-point coordinate: 24 bits with sign.
 const FIXED_MAX: f64 = 8_388_607.0;
-/// Finest fixed point that is written, bits.
+/// Largest number of fractional bits that is written.
 const FRACTION_MAX: i32 = 20;
 
 /// Reads a `.spz` from memory. `name` is for errors.
@@ -195,7 +199,7 @@ fn split(mut body: &[u8], header: &Header) -> Columns {
     })
 }
 
-/// Refuses what would inflate beyond reason, before a byte of it is.
+/// Refuses a decompression bomb by its declared size, before any byte is inflated.
 fn check_ratio(inflated: u64, compressed: u64, path: &Path) -> Result<()> {
     if inflated > INFLATED_FREE.max(RATIO_MAX.saturating_mul(compressed)) {
         let expected = format!("{inflated} bytes, as the count demands");
@@ -304,6 +308,10 @@ fn zstd(stream: &[u8], size: usize) -> std::result::Result<Vec<u8>, String> {
         return Err(format!("{} bytes or more", out.len()));
     }
     let (rest, frame) = decoder.into_parts();
+    // 0 is the size of a frame that declares none, too.
+    if ![0, size as u64].contains(&frame.content_size()) {
+        return Err(format!("a frame that declares {} bytes", frame.content_size()));
+    }
     if !rest.is_empty() {
         return Err(format!("{} bytes after the frame", rest.len()));
     }
@@ -327,7 +335,7 @@ fn gaussians(header: &Header, columns: &Columns) -> Incoming {
             if header.version == 1 {
                 f16::from_le_bytes([positions[2 * k], positions[2 * k + 1]]).to_f32()
             } else {
-                // Into the top three bytes, then down: the sign comes along.
+                // The arithmetic shift extends the sign of the upper three bytes.
                 let p = &positions[3 * k..3 * k + 3];
                 let fixed = i32::from_le_bytes([0, p[0], p[1], p[2]]) >> 8;
                 (f64::from(fixed) * unit) as f32
@@ -348,7 +356,8 @@ fn gaussians(header: &Header, columns: &Columns) -> Incoming {
     incoming
 }
 
-/// Three bytes (version 2) or the four of the smallest-three code (version 3), to wxyz.
+/// Decodes a quaternion wxyz from three bytes (version 2) or from four bytes of the
+/// smallest-three code (version 3).
 fn unpack_rotation(b: &[u8]) -> [f32; 4] {
     if let &[b0, b1, b2, b3] = b {
         let mut code = u32::from_le_bytes([b0, b1, b2, b3]);
@@ -391,10 +400,10 @@ fn pack_rotation(q: [f32; 4]) -> [u8; 4] {
     code.to_le_bytes()
 }
 
-/// Fixed-point bits such that `out` fits 24 bits with sign, at most 20.
+/// Chooses the fractional bits, at most 20, with which `out` fits 24 bits with sign.
 ///
 /// # Errors
-/// Coordinates beyond 2²³ units; more Gaussians than readers take.
+/// Coordinates beyond 2²³ units; more Gaussians than readers accept.
 pub(super) fn fraction_bits(out: &Outgoing, path: &Path) -> Result<u32> {
     if out.count > COUNT_MAX as usize {
         let expected = format!("at most {COUNT_MAX} Gaussians in .spz");
@@ -409,16 +418,17 @@ pub(super) fn fraction_bits(out: &Outgoing, path: &Path) -> Result<u32> {
     Ok(bits.clamp(0, FRACTION_MAX) as u32)
 }
 
-/// Writes version 3. One pass of `out` for each attribute: nothing is kept.
+/// Writes version 3, in one pass over `out` for each attribute.
 ///
-/// SH keep all 8 bits; the reference encoder rounds to 5 and 4 for size.
+/// SH coefficients have all 8 bits; the reference encoder rounds to 5 and 4 bits for size.
 pub(super) fn write(file: &mut dyn Write, out: &Outgoing, bits: u32) -> std::io::Result<()> {
-    // Single bytes straight into the encoder would cost more than compressing them.
+    // Buffered: calls of the encoder for single bytes cost more than their compression.
     let encoder = GzEncoder::new(file, flate2::Compression::default());
     let mut gzip = BufWriter::with_capacity(1 << 16, encoder);
     let mut head = MAGIC.to_vec();
     head.extend(3u32.to_le_bytes());
-    // `fraction_bits` has checked that it fits.
+    // `fraction_bits` has checked the count.
+
     head.extend((out.count as u32).to_le_bytes());
     head.extend([out.sh_degree as u8, bits as u8, 0, 0]);
     gzip.write_all(&head)?;

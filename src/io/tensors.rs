@@ -1,5 +1,4 @@
-//! safetensors files one tensor at a time: what converts large files, and reads or
-//! writes them without holding them whole.
+//! safetensors files one tensor at a time, for files that are larger than memory.
 
 use super::{Error, Result, write_atomic};
 use safetensors::Dtype;
@@ -10,13 +9,13 @@ use std::fs::File;
 use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
-/// Bytes of the header's length, in front of it.
+/// Bytes of the length in front of the header.
 const LENGTH_BYTES: u64 = 8;
-/// Longest header that the format allows, bytes.
+/// Longest header of the format, bytes.
 const HEADER_MAX: u64 = 100_000_000;
-/// The data begin at a multiple of this.
+/// Alignment of the data, bytes.
 const ALIGNMENT: usize = 8;
-/// The header's key of the metadata: no tensor's name.
+/// Key of the metadata in the header; no tensor has this name.
 const METADATA: &str = "__metadata__";
 
 /// Name, element type and shape of a tensor in a file.
@@ -31,19 +30,19 @@ pub struct TensorSpec {
 }
 
 impl TensorSpec {
-    /// Number of elements, `None` beyond `usize`.
+    /// Returns the number of elements, or `None` where it exceeds `usize`.
     pub fn elements(&self) -> Option<usize> {
         self.shape.iter().try_fold(1usize, |n, &d| n.checked_mul(d))
     }
 
-    /// Length in bytes, `None` beyond `usize`.
+    /// Returns the length in bytes, or `None` where it exceeds `usize`.
     pub fn bytes(&self) -> Option<usize> {
         Some(self.elements()?.checked_mul(self.dtype.bitsize())?.div_ceil(8))
     }
 }
 
-/// An open safetensors file: its header, checked against the file's length. Elements
-/// are read on demand.
+/// An open safetensors file. Its header is compared with the file's length; elements are
+/// read on demand.
 #[derive(Debug)]
 pub struct TensorFile {
     path: PathBuf,
@@ -53,10 +52,10 @@ pub struct TensorFile {
 }
 
 impl TensorFile {
-    /// Reads the header alone.
+    /// Opens a file and reads its header.
     ///
     /// # Errors
-    /// Missing, not a safetensors file, shorter or longer than its header says.
+    /// Missing, not a safetensors file, shorter or longer than the header declares.
     pub fn open(path: &Path) -> Result<Self> {
         let bad = |got: String| Error::format(path, "a safetensors file", got);
         let io = |e| Error::io(path, e);
@@ -83,7 +82,7 @@ impl TensorFile {
         Ok(Self { path: path.to_owned(), header, data_at })
     }
 
-    /// The tensors, in the order of their data.
+    /// Lists the tensors in the order of their data.
     pub fn specs(&self) -> Vec<TensorSpec> {
         let spec = |name: String| {
             let info = self.header.info(&name)?;
@@ -92,15 +91,15 @@ impl TensorFile {
         self.header.offset_keys().into_iter().filter_map(spec).collect()
     }
 
-    /// The metadata's value at `key`.
+    /// Returns the metadata's value at `key`.
     pub fn metadata(&self, key: &str) -> Option<&str> {
         self.header.metadata().as_ref()?.get(key).map(String::as_str)
     }
 
-    /// Elements of a tensor, little-endian, in the order of its shape.
+    /// Reads the elements of a tensor, little-endian, row-major.
     ///
     /// # Errors
-    /// No such tensor; the file became shorter or unreadable since it was opened.
+    /// No such tensor; the file has become shorter or unreadable since it was opened.
     pub fn read(&self, name: &str) -> Result<Vec<u8>> {
         let Some(info) = self.header.info(name) else {
             return Err(Error::format(&self.path, format!("a tensor `{name}`"), "none"));
@@ -115,13 +114,13 @@ impl TensorFile {
     }
 }
 
-/// Writes a safetensors file atomically. `data` gives the elements of the tensor at an
-/// index of `specs`, little-endian; it is called once for each, in order, so that one
+/// Writes a safetensors file atomically. `data` returns the elements of the tensor at an
+/// index of `specs`, little-endian. It is called once for each index in order, so that one
 /// tensor is in memory at a time.
 ///
 /// # Errors
-/// Two tensors of one name, data of another length than its shape says, whatever
-/// `data` says, and everything of [`write_atomic`].
+/// Two tensors of one name, data whose length does not match the shape, errors of `data`
+/// and of [`write_atomic`].
 pub fn write_tensors(
     path: &Path,
     specs: &[TensorSpec],
@@ -159,8 +158,8 @@ fn wrong_length(path: &Path, spec: &TensorSpec, got: usize) -> Error {
     Error::format(path, expected, format!("{got} bytes")).at(format!(" tensor `{}`", spec.name))
 }
 
-/// The header, padded with spaces as the format allows. The keys stand in alphabetical
-/// order: the same tensors give the same bytes.
+/// Makes the header, padded with spaces. Its keys are sorted: the same tensors give the same
+/// bytes.
 fn header(
     path: &Path,
     specs: &[TensorSpec],
@@ -248,7 +247,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = written(folder.path());
         let good = std::fs::read(&path).unwrap();
-        for cut in [0, 7, 8, 40, good.len() - 1] {
+        for cut in 0..good.len() {
             std::fs::write(&path, &good[..cut]).unwrap();
             let error = TensorFile::open(&path).unwrap_err().to_string();
             assert!(error.contains("safetensors"), "{cut}: {error}");

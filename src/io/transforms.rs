@@ -1,12 +1,11 @@
 //! `transforms.json` of nerfstudio and instant-ngp.
 //!
-//! Poses are OpenGL camera-to-world (x right, y up, −z forward); the second and third
-//! column are negated here. Intrinsics are pixels, per file or per frame: `fl_x`,
-//! `fl_y` (else `fl_x`), `cx`, `cy` (else the middle), `w`, `h` (else the stored
-//! picture's); without `fl_x`, `camera_angle_x` and `camera_angle_y` in radians.
-//! Camera models: none given, SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV,
-//! FULL_OPENCV, OPENCV_FISHEYE. Everything else in the file (`aabb_scale`,
-//! `sharpness`, …) is ignored, `ply_file_path` too.
+//! Poses are OpenGL camera-to-world (x right, y up, −z forward); the reader negates the
+//! second and third column. Intrinsics are in pixels, per file or per frame: `fl_x`, `fl_y`
+//! (else `fl_x`), `cx`, `cy` (else the middle), `w`, `h` (else the stored picture's). Files
+//! without `fl_x` have `camera_angle_x` and `camera_angle_y` in radians. Camera models: none
+//! given, SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV,
+//! OPENCV_FISHEYE. Other keys (`aabb_scale`, `sharpness`, `ply_file_path`, …) are ignored.
 
 use super::assemble::{Draft, Lens, assemble, find_image};
 use super::cameras_json::{json_error, matrix, side};
@@ -17,7 +16,7 @@ use glam::{DMat4, DVec4};
 use serde::Deserialize;
 use std::path::Path;
 
-/// Keys that stand at the top, in a frame, or in both (the frame's wins).
+/// Keys of the file, of a frame, or of both; a frame's value takes precedence.
 #[derive(Deserialize, Default, Clone)]
 #[serde(expecting = "an object")]
 struct Optics {
@@ -42,7 +41,7 @@ struct Optics {
 }
 
 impl Optics {
-    /// The frame's value where it has one, else the file's.
+    /// Takes the frame's values, and the file's where the frame has none.
     fn over(self, file: &Self) -> Self {
         Self {
             camera_model: self.camera_model.or_else(|| file.camera_model.clone()),
@@ -77,8 +76,8 @@ impl Optics {
             }
             "OPENCV_FISHEYE" => Ok(Distortion::fisheye([k[0], k[1], k[2], k[3]])),
             "SIMPLE_PINHOLE" | "PINHOLE" => Ok(Distortion::None),
-            // k4 to k6 are the denominator only where the model says so: nerfstudio
-            // writes a k4 of its own beside OPENCV.
+            // k4 to k6 are the denominator of FULL_OPENCV only: nerfstudio writes another
+            // k4 beside OPENCV.
             "" | "OPENCV" | "SIMPLE_RADIAL" | "RADIAL" => {
                 Ok(Distortion::brown([k[0], k[1], k[2], 0.0, 0.0, 0.0], p))
             }
@@ -105,12 +104,12 @@ struct FileFrame {
     optics: Optics,
 }
 
-/// OpenGL camera axes to OpenCV's.
+/// Converts OpenGL camera axes to OpenCV's.
 pub(super) fn opengl_to_opencv(pose: DMat4) -> DMat4 {
     pose * DMat4::from_diagonal(DVec4::new(1.0, -1.0, -1.0, 1.0))
 }
 
-/// Reads a scene; frames without a picture are left out with a warning.
+/// Reads a scene. Frames without a picture are left out with a warning.
 pub(super) fn load(path: &Path) -> Result<Scene> {
     let file: File = serde_json::from_slice(&read(path)?).map_err(|e| {
         json_error(path, "transforms.json (frames with file_path, transform_matrix)", &e)
@@ -138,7 +137,7 @@ pub(super) fn load(path: &Path) -> Result<Scene> {
             _ => None,
         };
         let image = find_image(&[folder], &f.file_path);
-        // Pixel intrinsics that name no size are those of the stored picture.
+        // Pixel intrinsics without a size belong to the stored picture.
         let stored = match (&image, size) {
             (_, Some(s)) => Some(s),
             (Some(image), None) => {
@@ -161,8 +160,9 @@ pub(super) fn load(path: &Path) -> Result<Scene> {
     assemble(path, SceneFormat::Transforms, drafts)
 }
 
-/// Pixel intrinsics for a picture of `size`; without a size there is no picture, and
-/// the frame is left out later, whatever is returned.
+/// Computes pixel intrinsics for a picture of `size`. A frame without a size has no picture
+/// and is left out later; its intrinsics are not used.
+
 fn lens(o: &Optics, size: Option<(usize, usize)>) -> std::result::Result<Lens, String> {
     let (w, h) = size.map_or((1.0, 1.0), |(w, h)| (w as f64, h as f64));
     let focal = |side: f64, angle: Option<f64>| match angle {

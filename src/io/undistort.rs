@@ -1,27 +1,26 @@
-//! Lens distortion: the models that pose files use, and its removal.
+//! Lens distortion: the models of pose files, and their removal.
 //!
-//! A point (x, y) at z = 1 in camera coordinates is seen at fx·x' + cx, fy·y' + cy,
-//! where (x', y') is, with r² = x² + y² (OpenCV's and COLMAP's formulas),
+//! A point (x, y) at z = 1 in camera coordinates projects to fx·x' + cx, fy·y' + cy. With
+//! r² = x² + y², (x', y') is (OpenCV's and COLMAP's formulas)
 //!
 //! * Brown: x' = x·(1 + k1 r² + k2 r⁴ + k3 r⁶)/(1 + k4 r² + k5 r⁴ + k6 r⁶)
 //!   + 2 p1 x y + p2 (r² + 2x²), and y' alike with p1, p2 exchanged;
 //! * Fisheye: (x', y') = (x, y)·θ_d/r, θ = atan r, θ_d = θ(1 + k1 θ² + … + k4 θ⁸).
 //!
-//! The straightened picture has the stored size and principal point; both focal
-//! lengths are multiplied by the smallest factor with which every pixel of it shows
-//! a place inside the photograph: no black border, as much of the view as that
-//! allows, and a picture of any distortion keeps its aspect. Sampling is bicubic
-//! (a = −½), clamped at the photograph's edge.
+//! The undistorted picture has the stored size and principal point. Both focal lengths are
+//! multiplied by the smallest factor for which every pixel lies inside the photograph: the
+//! picture has no black border and keeps its aspect. Sampling is bicubic (a = −½), clamped
+//! at the photograph's edge.
 
 use super::image::Rgb;
 use crate::camera::Intrinsics;
 use glam::{DVec2, Vec2};
 use rayon::prelude::*;
 
-/// How a lens departs from a pinhole.
+/// A model of lens distortion.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum Distortion {
-    /// Not at all.
+    /// A pinhole.
     #[default]
     None,
     /// Radial (rational) and tangential: COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV and
@@ -40,17 +39,17 @@ pub enum Distortion {
 }
 
 impl Distortion {
-    /// [`Distortion::Brown`], or `None` if every coefficient is zero.
+    /// Makes [`Distortion::Brown`], or `None` if every coefficient is zero.
     pub fn brown(k: [f64; 6], p: [f64; 2]) -> Self {
         if k == [0.0; 6] && p == [0.0; 2] { Self::None } else { Self::Brown { k, p } }
     }
 
-    /// [`Distortion::Fisheye`]: a fisheye without coefficients is still one.
+    /// Makes [`Distortion::Fisheye`], with zero coefficients too.
     pub fn fisheye(k: [f64; 4]) -> Self {
         Self::Fisheye { k }
     }
 
-    /// Whether the coefficients are finite; else which are not.
+    /// Checks that the coefficients are finite; an error lists them.
     pub(super) fn check(&self) -> Result<(), String> {
         let finite = match self {
             Self::None => true,
@@ -60,7 +59,7 @@ impl Distortion {
         if finite { Ok(()) } else { Err(format!("{self:?}")) }
     }
 
-    /// Where a ray (x, y, 1) is seen, on the plane z = 1.
+    /// Maps a ray (x, y, 1) to its distorted position on the plane z = 1.
     pub fn distort(&self, ray: Vec2) -> Vec2 {
         self.distort_f64(ray.as_dvec2()).as_vec2()
     }
@@ -82,7 +81,7 @@ impl Distortion {
         }
     }
 
-    /// r'/r of the radial part.
+    /// Returns r'/r of the radial part.
     fn radial(&self, r2: f64) -> f64 {
         match *self {
             Self::None => 1.0,
@@ -103,31 +102,31 @@ impl Distortion {
         }
     }
 
-    /// The greatest radius at z = 1, up to `limit`, before which r' only grows: beyond
-    /// it a polynomial folds back, and tells of nothing that the lens does.
+    /// Returns the largest radius at z = 1, up to `limit`, below which r' grows. Beyond it the
+    /// polynomial folds back and no longer describes the lens.
     fn monotone_radius(&self, limit: f64) -> f64 {
         const STEPS: usize = 512;
         let mut last = 0.0;
         for i in 1..=STEPS {
             let r = limit * i as f64 / STEPS as f64;
-            let bent = r * self.radial(r * r);
-            if bent.is_nan() || bent <= last {
+            let distorted = r * self.radial(r * r);
+            if distorted.is_nan() || distorted <= last {
                 return limit * (i - 1) as f64 / STEPS as f64;
             }
-            last = bent;
+            last = distorted;
         }
         limit
     }
 }
 
-/// Range of the focal factor. Below ½, the middle would be stored at a quarter of its
-/// pixels; above 4, a sixteenth of the picture would be left.
+/// Range of the focal factor. Below ½, the middle would have a quarter of its pixels; above
+/// 4, a sixteenth of the picture would remain.
 const FOCAL_FACTORS: [f64; 2] = [0.5, 4.0];
 
-/// The pinhole that the straightened picture has (see the module's text).
+/// Computes the pinhole of the undistorted picture (see the module's documentation).
 ///
 /// # Errors
-/// What is wrong, if even four times the focal length leaves a black border.
+/// The distortion, where four times the focal length still leaves a black border.
 pub fn pinhole(k: &Intrinsics, distortion: &Distortion) -> Result<Intrinsics, String> {
     if *distortion == Distortion::None {
         return Ok(*k);
@@ -141,7 +140,7 @@ pub fn pinhole(k: &Intrinsics, distortion: &Distortion) -> Result<Intrinsics, St
             let seen = distortion.distort_f64(r);
             let u = f64::from(k.fx) * seen.x + f64::from(k.cx);
             let v = f64::from(k.fy) * seen.y + f64::from(k.cy);
-            // NaN fails every comparison.
+            // A NaN fails every comparison.
             r.length() <= fold
                 && (0.0..=k.width as f64).contains(&u)
                 && (0.0..=k.height as f64).contains(&v)
@@ -153,7 +152,7 @@ pub fn pinhole(k: &Intrinsics, distortion: &Distortion) -> Result<Intrinsics, St
     if covered(low) {
         high = low;
     }
-    // 30 halvings: a millionth of a pixel.
+    // 30 bisections: a millionth of a pixel.
     for _ in 0..30 {
         let middle = 0.5 * (low + high);
         if covered(middle) {
@@ -169,7 +168,7 @@ pub fn pinhole(k: &Intrinsics, distortion: &Distortion) -> Result<Intrinsics, St
     })
 }
 
-/// Centres of the pixels along the picture's edge.
+/// Iterates over the centres of the pixels along the picture's edge.
 fn border(k: &Intrinsics) -> impl Iterator<Item = DVec2> {
     let (w, h) = (k.width, k.height);
     let rows = (0..w).flat_map(move |x| [(x, 0), (x, h - 1)]);
@@ -184,8 +183,8 @@ fn ray(k: &Intrinsics, px: DVec2) -> DVec2 {
     )
 }
 
-/// The photograph of a `distortion` lens with intrinsics `from`, resampled to the
-/// pinhole `to`.
+/// Resamples the photograph of a lens with `distortion` and intrinsics `from` to the pinhole
+/// `to`.
 pub fn undistort(photo: &Rgb, from: &Intrinsics, distortion: &Distortion, to: &Intrinsics) -> Rgb {
     let mut out = Rgb::black(to.width, to.height);
     if out.data.is_empty() || photo.data.is_empty() {
@@ -203,8 +202,8 @@ pub fn undistort(photo: &Rgb, from: &Intrinsics, distortion: &Distortion, to: &I
     out
 }
 
-/// Weights of the four neighbours at −1, 0, 1, 2 of a place `t` in [0, 1) after the
-/// second (cubic convolution, a = −½).
+/// Computes the weights of the neighbours at −1, 0, 1, 2 of a position `t` in [0, 1) (cubic
+/// convolution, a = −½).
 fn cubic(t: f32) -> [f32; 4] {
     let (t2, t3) = (t * t, t * t * t);
     [
@@ -215,12 +214,13 @@ fn cubic(t: f32) -> [f32; 4] {
     ]
 }
 
-/// Bicubic sample at pixel position (u, v), clamped at the edge.
+/// Samples bicubically at pixel position (u, v), clamped at the edge.
 fn sample(photo: &Rgb, u: f32, v: f32) -> [u8; 3] {
     let (u, v) = (u - 0.5, v - 0.5);
     let (x0, y0) = (u.floor(), v.floor());
     let (wx, wy) = (cubic(u - x0), cubic(v - y0));
-    // `as` saturates, so a wild position stays a valid index.
+    // `as` saturates: any position gives a valid index.
+
     let at = |i: f32, n: usize| (i.max(0.0) as usize).min(n - 1);
     let mut sum = [0.0f32; 3];
     for (j, wy) in wy.into_iter().enumerate() {

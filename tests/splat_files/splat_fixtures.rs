@@ -385,7 +385,7 @@ fn infinite_logits_and_zero_quaternions_have_a_meaning() {
         property float opacity\nproperty float scale_0\nproperty float scale_1\n\
         property float scale_2\nproperty float rot_0\nproperty float rot_1\n\
         property float rot_2\nproperty float rot_3\nend_header\n\
-        0 0 0 0 0 0 inf 0 0 -inf 0 0 0 0\n1 2 3 0 0 0 -inf 0 0 0 0 0 5 0";
+        0 0 0 0 0 0 inf 0 0 -inf 0 0 0 0\n1 2 3 0 0 0 -inf 0 0 0 0 0 5 0\n";
     let s = parse_ply(text.as_bytes(), Path::new("ends.ply")).unwrap();
     assert_eq!((s.opacity(0), s.opacity(1)), (1.0, 0.0));
     assert_eq!(s.scale(0), [1.0, 1.0, 0.0]);

@@ -1,5 +1,5 @@
-//! COLMAP's binary files, little-endian. No count of the file is believed before the
-//! bytes that it promises were seen to be there.
+//! COLMAP's binary files, little-endian. Every count is compared with the remaining bytes,
+//! and nothing may follow the last record.
 //!
 //! * `cameras.bin`: u64 n; n × {u32 id, i32 model, u64 width, u64 height, f64 × p}
 //! * `images.bin`: u64 n; n × {u32 id, f64 × 4 wxyz, f64 × 3, u32 camera, name\0,
@@ -14,7 +14,7 @@ use std::path::Path;
 
 /// Id of an observation without a point.
 const NO_POINT: u64 = u64::MAX;
-/// Longer names than any file system allows are a sign of a lost position.
+/// Longest name, bytes: file systems allow no longer one.
 const NAME_MAX: usize = 4096;
 
 /// A position in the bytes of a file.
@@ -68,14 +68,14 @@ impl<'a> Cursor<'a> {
         Ok(values)
     }
 
-    /// A count of records of at least `least` bytes each, all of which must fit.
+    /// Reads a count of records of at least `least` bytes each, all of which must fit.
     fn count(&mut self, least: usize, what: &str) -> Result<usize> {
         let start = self.at;
         let n = self.u64(what)?;
-        let room = self.left() / least;
-        if n > room as u64 {
+        let most = self.left() / least;
+        if n > most as u64 {
             let at = format!(" at byte {start}");
-            let expected = format!("at most {room} {what} (by the file's length)");
+            let expected = format!("at most {most} {what} (by the file's length)");
             return Err(Error::format(self.path, expected, n.to_string()).at(at));
         }
         Ok(n as usize)
@@ -111,7 +111,7 @@ impl<'a> Cursor<'a> {
 /// Truncated, a camera model that is not read, parameters that are not finite.
 pub fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Cameras> {
     let mut c = Cursor { path, bytes, at: 0 };
-    // 24 bytes and at least three parameters.
+    // A record has 24 bytes and at least three parameters.
     let n = c.count(48, "cameras")?;
     let mut cameras = Cameras::with_capacity(n);
     for _ in 0..n {
@@ -119,14 +119,14 @@ pub fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Cameras> {
         let at = |e: Error| e.at(format!(" at byte {start}"));
         let id = c.u32("a camera id")?;
         let model = c.u32("a camera model")?;
-        let size = (c.u64("a width")?, c.u64("a height")?);
+        let size = [c.u64("a width")?, c.u64("a height")?];
         let Some(&(name, count)) = MODELS.get(model as usize) else {
             return Err(at(c.error(super::MODELS_READ, format!("model number {model}"))));
         };
         let parameters =
             (0..count).map(|_| c.f64("a camera parameter")).collect::<Result<Vec<_>>>()?;
-        let camera = camera(name, size, &parameters)
-            .map_err(|(expected, got)| at(c.error(expected, got)))?;
+        let camera = camera(name, size, &parameters).map_err(|r| at(c.error(r.expected, r.got)))?;
+
         if cameras.insert(id, camera).is_some() {
             return Err(at(c.error("each camera id once", format!("{id} again"))));
         }
@@ -141,7 +141,7 @@ pub fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Cameras> {
 /// Truncated, a pose that is not finite, a name that is not UTF-8.
 pub fn parse_images(path: &Path, bytes: &[u8]) -> Result<Vec<ColmapImage>> {
     let mut c = Cursor { path, bytes, at: 0 };
-    // 64 bytes, one letter of a name and its end, and a count.
+    // A record has 64 bytes, a name of at least two bytes, and a count.
     let n = c.count(74, "images")?;
     let mut images = Vec::with_capacity(n);
     for _ in 0..n {

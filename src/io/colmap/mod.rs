@@ -37,14 +37,14 @@ pub struct ColmapCamera {
     pub height: usize,
     /// fx, fy, cx, cy, px.
     pub focal_and_center: [f64; 4],
-    /// The rest of the model.
+    /// Lens distortion.
     pub distortion: Distortion,
 }
 
 /// One picture of `images.*`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ColmapImage {
-    /// Where it stands in the file, in [`Error::at`]'s form.
+    /// Place in the file, in the form of [`Error::at`].
     pub place: String,
     /// Rotation, camera from world, unit.
     pub rotation: DQuat,
@@ -54,7 +54,7 @@ pub struct ColmapImage {
     pub camera: u32,
     /// Path below the picture folder.
     pub name: String,
-    /// Ids of the points that were matched in it.
+    /// Ids of the points that the picture observes.
     pub points: Vec<u64>,
 }
 
@@ -63,7 +63,7 @@ pub type Cameras = HashMap<u32, ColmapCamera>;
 /// Id and position of each point.
 pub type Points = Vec<(u64, Vec3)>;
 
-/// Whether `folder` holds a model.
+/// Reports whether `folder` holds a model.
 pub(super) fn is_model(folder: &Path) -> bool {
     ["bin", "txt"].iter().any(|e| {
         folder.join(format!("cameras.{e}")).is_file()
@@ -71,8 +71,8 @@ pub(super) fn is_model(folder: &Path) -> bool {
     })
 }
 
-/// COLMAP's models by number: name and how many parameters. Those that [`lens`] does
-/// not know are listed so that they are refused by name.
+/// COLMAP's camera models by number: name and number of parameters. Models that [`lens`]
+/// does not support are listed so that errors name them.
 const MODELS: [(&str, usize); 16] = [
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
@@ -97,12 +97,24 @@ const MODELS_READ: &str = "a camera model among SIMPLE_PINHOLE, PINHOLE, SIMPLE_
                            OPENCV, OPENCV_FISHEYE, FULL_OPENCV, SIMPLE_RADIAL_FISHEYE, \
                            RADIAL_FISHEYE, SIMPLE_FISHEYE, FISHEYE";
 
-/// Focal lengths, principal point and distortion of `model` with its parameters,
-/// which must be as many as [`MODELS`] says.
-fn lens(model: &str, p: &[f64]) -> Option<([f64; 4], Distortion)> {
-    let one = |k: [f64; 6]| ([p[0], p[0], p[1], p[2]], Distortion::brown(k, [0.0; 2]));
-    let one_fisheye = |k: [f64; 4]| ([p[0], p[0], p[1], p[2]], Distortion::fisheye(k));
-    let two = |distortion| ([p[0], p[1], p[2], p[3]], distortion);
+/// Focal lengths, principal point and distortion of a camera.
+struct LensParameters {
+    focal_and_center: [f64; 4],
+    distortion: Distortion,
+}
+
+/// Interprets the parameters of `model`; their number is that of [`MODELS`].
+fn lens(model: &str, p: &[f64]) -> Option<LensParameters> {
+    let one_focal = |distortion| {
+        let focal_and_center = [p[0], p[0], p[1], p[2]];
+        LensParameters { focal_and_center, distortion }
+    };
+    let one = |k: [f64; 6]| one_focal(Distortion::brown(k, [0.0; 2]));
+    let one_fisheye = |k: [f64; 4]| one_focal(Distortion::fisheye(k));
+    let two = |distortion| {
+        let focal_and_center = [p[0], p[1], p[2], p[3]];
+        LensParameters { focal_and_center, distortion }
+    };
     Some(match model {
         "SIMPLE_PINHOLE" => one([0.0; 6]),
         "PINHOLE" => two(Distortion::None),
@@ -121,36 +133,42 @@ fn lens(model: &str, p: &[f64]) -> Option<([f64; 4], Distortion)> {
     })
 }
 
-/// A camera, or what was expected and what came.
+/// An error without its place in the file.
+struct Refusal {
+    expected: String,
+    got: String,
+}
+
+/// Makes a camera of `size` (width, height), px.
 fn camera(
     model: &str,
-    size: (u64, u64),
+    size: [u64; 2],
     parameters: &[f64],
-) -> std::result::Result<ColmapCamera, (String, String)> {
+) -> std::result::Result<ColmapCamera, Refusal> {
+    let refuse = |expected: &str, got: String| Refusal { expected: expected.to_owned(), got };
     let side = |v: u64| (1..=1 << 20).contains(&v).then_some(v as usize);
-    let (Some(width), Some(height)) = (side(size.0), side(size.1)) else {
-        return Err((
-            "a picture of 1x1 to 1048576x1048576".into(),
-            format!("{}x{}", size.0, size.1),
-        ));
+    let [Some(width), Some(height)] = size.map(side) else {
+        let got = format!("{}x{}", size[0], size[1]);
+        return Err(refuse("a picture of 1x1 to 1048576x1048576", got));
     };
     if parameters.iter().any(|v| !v.is_finite()) {
-        return Err(("finite camera parameters".into(), format!("{parameters:?}")));
+        return Err(refuse("finite camera parameters", format!("{parameters:?}")));
     }
-    let (focal_and_center, distortion) =
-        lens(model, parameters).ok_or_else(|| (MODELS_READ.to_owned(), model.to_owned()))?;
+    let LensParameters { focal_and_center, distortion } =
+        lens(model, parameters).ok_or_else(|| refuse(MODELS_READ, model.to_owned()))?;
     Ok(ColmapCamera { width, height, focal_and_center, distortion })
 }
 
-/// Unit rotation of w, x, y, z as the file has it.
+/// Normalises the file's quaternion w, x, y, z.
 fn rotation(q: [f64; 4]) -> Option<DQuat> {
     let quat = DQuat::from_xyzw(q[1], q[2], q[3], q[0]);
     let length = quat.length();
     (length.is_finite() && length > 1e-6).then(|| quat * (1.0 / length))
 }
 
-/// Reads the model in `folder`; pictures are looked for beside it, in its parents, and
-/// in an `images` folder of any of them.
+/// Reads the model in `folder`. Pictures may lie beside it, in its parents, and in an
+/// `images` folder of any of them.
+
 pub(super) fn load(folder: &Path) -> Result<Scene> {
     let binary = folder.join("cameras.bin").is_file() && folder.join("images.bin").is_file();
     let extension = if binary { "bin" } else { "txt" };

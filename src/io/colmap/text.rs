@@ -42,7 +42,7 @@ impl Line<'_> {
     }
 }
 
-/// The start of a word that may be megabytes of rubbish.
+/// Returns the start of a word, which may be megabytes long.
 fn shown(word: &str) -> String {
     word.chars().take(40).collect()
 }
@@ -75,10 +75,10 @@ pub fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Cameras> {
         let Some(&(model, count)) = MODELS.iter().find(|m| m.0 == model) else {
             return Err(line.error(super::MODELS_READ, format!("`{}`", shown(model))));
         };
-        let size = (
+        let size = [
             line.number(words.next(), "a width in pixels")?,
             line.number(words.next(), "a height in pixels")?,
-        );
+        ];
         let parameters = words
             .map(|w| line.number(Some(w), "a camera parameter"))
             .collect::<Result<Vec<f64>>>()?;
@@ -86,7 +86,7 @@ pub fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Cameras> {
             let expected = format!("{count} parameters of {model}");
             return Err(line.error(expected, parameters.len().to_string()));
         }
-        let camera = camera(model, size, &parameters).map_err(|(e, got)| line.error(e, got))?;
+        let camera = camera(model, size, &parameters).map_err(|r| line.error(r.expected, r.got))?;
         if cameras.insert(id, camera).is_some() {
             return Err(line.error("each camera id once", format!("{id} again")));
         }
@@ -97,14 +97,14 @@ pub fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Cameras> {
     Ok(cameras)
 }
 
-/// The point ids of a line of X Y POINT3D_ID triples; `None` if it is no such line.
+/// Parses the point ids of a line of X Y POINT3D_ID triples; `None` for another line.
 fn observations(text: &str) -> Option<Vec<u64>> {
     let mut words = text.split_ascii_whitespace();
     let mut points = Vec::new();
     while let Some(x) = words.next() {
         x.parse::<f64>().ok()?;
         words.next()?.parse::<f64>().ok()?;
-        // −1 is "no point".
+        // −1 means no point.
         if let Ok(id) = u64::try_from(words.next()?.parse::<i64>().ok()?) {
             points.push(id);
         }
@@ -112,8 +112,8 @@ fn observations(text: &str) -> Option<Vec<u64>> {
     Some(points)
 }
 
-/// Reads `images.txt`; `path` is for messages. Where the second line of a picture is
-/// missing, a warning says so.
+/// Reads `images.txt`; `path` is for messages. A picture without its second line gives a
+/// warning.
 ///
 /// # Errors
 /// A line that does not parse, a pose that is not finite.
@@ -133,7 +133,7 @@ pub fn parse_images(
             continue;
         }
         let mut image = image(line)?;
-        // An empty line is an empty list; the end of the file is one too.
+        // An empty line or the end of the file is an empty list.
         if let Some(next) = lines.get(i) {
             match observations(next.text) {
                 Some(points) => {
@@ -162,7 +162,8 @@ fn image(line: Line<'_>) -> Result<ColmapImage> {
     let q = line.numbers::<4>(&mut words, "a quaternion QW QX QY QZ")?;
     let t = DVec3::from_array(line.numbers::<3>(&mut words, "a translation TX TY TZ")?);
     let camera = line.number(words.next(), "a camera id")?;
-    // A name may have spaces, also several in a row.
+    // A name may contain runs of spaces.
+
     let mut rest = line.text;
     for _ in 0..9 {
         rest = rest.trim_start();

@@ -1,9 +1,9 @@
-//! What a file is that is not PyTorch's, for the message.
+//! Names of other file formats, for messages.
 
-/// Bytes that [`name`] wants of the file's start.
+/// Bytes of the file's start that [`name`] reads.
 pub(super) const HEAD: u64 = 512;
 
-/// Names by the first bytes.
+/// Formats by their first bytes.
 const STARTS: &[(&[u8], &str)] = &[
     (b"\x89PNG", "a PNG picture"),
     (b"\xff\xd8\xff", "a JPEG picture"),
@@ -22,7 +22,8 @@ const STARTS: &[(&[u8], &str)] = &[
     (b"version https://git-lfs", "a Git LFS pointer, without the file that it points to"),
 ];
 
-/// What `head`, the start of a file of `length` bytes, belongs to.
+/// Names the format of a file of `length` bytes that starts with `head`.
+
 pub(super) fn name(head: &[u8], length: u64) -> String {
     if head.is_empty() {
         return "an empty file".to_owned();

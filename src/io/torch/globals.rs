@@ -1,16 +1,16 @@
-//! What the names in a pickle stand for. The list is closed: parts of tensors and plain
-//! containers. Any other name makes [`Node::Opaque`], and its arguments are forgotten.
+//! The classes and functions that a pickle may name: parts of tensors and plain containers.
+//! Any other name becomes [`Node::Opaque`], and its arguments are dropped.
 
 use super::super::Result;
-use super::pickle::{Id, Kind, Machine, Node, Rebuilt, Storage};
+use super::pickle::{Id, Kind, Machine, Node, Rebuilt, Storage, StorageView};
 use super::shown;
 use super::value::TorchDtype;
 use std::sync::Arc;
 
-/// More dimensions than a PyTorch tensor can have (64).
+/// Largest number of dimensions of a PyTorch tensor.
 const MAX_DIMENSIONS: usize = 64;
 
-/// Names that are understood beside storages and element types.
+/// Names that are interpreted, besides storages and element types.
 const UNDERSTOOD: &[&str] = &[
     "collections.OrderedDict",
     "collections.defaultdict",
@@ -32,7 +32,7 @@ const UNDERSTOOD: &[&str] = &[
     "torch._tensor._rebuild_from_type_v2",
 ];
 
-/// Python's own types, of `builtins` (and `__builtin__`, protocol 2's name for it).
+/// Types of Python's `builtins` (`__builtin__` in protocol 2).
 const BUILTINS: &[&str] = &[
     "set",
     "frozenset",
@@ -54,7 +54,7 @@ fn builtin(name: &str) -> Option<&str> {
     BUILTINS.contains(&bare).then_some(bare)
 }
 
-/// Whether a name belongs to tensors or plain containers.
+/// Reports whether a name belongs to tensors or plain containers.
 pub(super) fn understood(name: &str) -> bool {
     UNDERSTOOD.contains(&name)
         || builtin(name).is_some()
@@ -62,12 +62,13 @@ pub(super) fn understood(name: &str) -> bool {
         || matches!(kind(name), Some(Kind::Known(_) | Kind::Untyped))
 }
 
-/// `torch.float32` and its like.
+/// Parses an element type such as `torch.float32`.
 fn dtype(name: &str) -> Option<TorchDtype> {
     TorchDtype::from_name(name.strip_prefix("torch.")?)
 }
 
-/// `torch.FloatStorage`, `torch.cuda.FloatStorage`, `torch.storage.UntypedStorage`, ….
+/// Parses a storage class: `torch.FloatStorage`, `torch.cuda.FloatStorage`,
+/// `torch.storage.UntypedStorage`, ….
 fn kind(name: &str) -> Option<Kind> {
     let bare = ["torch.cuda.", "torch.storage.", "torch."]
         .iter()
@@ -94,9 +95,9 @@ fn kind(name: &str) -> Option<Kind> {
     }))
 }
 
-/// The storage that a persistent id names: `("storage", type, key, location, elements)`,
-/// and in legacy files a view, `None` or `(key, first element, elements)`. The location
-/// (`cpu`, `cuda:0`) says where it was, not what it holds.
+/// Parses a storage's persistent id, `("storage", type, key, location, elements)`, with a
+/// view in legacy files: `None` or `(key, first element, elements)`. The location (`cpu`,
+/// `cuda:0`) is not used.
 pub(super) fn storage(machine: &Machine, id: Id) -> Result<Storage> {
     let wrong = || {
         let expected = "a storage as persistent id (\"storage\", type, key, location, size)";
@@ -127,7 +128,7 @@ pub(super) fn storage(machine: &Machine, id: Id) -> Result<Storage> {
                     Some(Node::Int(n)) => u64::try_from(*n).map_err(|_| wrong()),
                     _ => Err(wrong()),
                 };
-                Some((part(1)?, part(2)?))
+                Some(StorageView { first: part(1)?, elements: part(2)? })
             }
             _ => return Err(wrong()),
         },
@@ -136,8 +137,8 @@ pub(super) fn storage(machine: &Machine, id: Id) -> Result<Storage> {
     Ok(Storage { key: key.clone(), kind, elements, view })
 }
 
-/// The class in the persistent id `("module", class, file, source)`, with which legacy
-/// files keep the source text of a saved model's classes.
+/// Returns the class of a persistent id `("module", class, file, source)`. Legacy files
+/// store the source text of a model's classes in it.
 pub(super) fn module(machine: &Machine, id: Id) -> Option<Id> {
     let Node::Tuple(parts) = machine.node(id) else { return None };
     let [tag, class, ..] = parts.as_slice() else { return None };
@@ -147,7 +148,7 @@ pub(super) fn module(machine: &Machine, id: Id) -> Option<Id> {
     }
 }
 
-/// What `callee(*arguments)` would be: data, or [`Node::Opaque`].
+/// Makes the value of `callee(*arguments)`: data, or [`Node::Opaque`].
 pub(super) fn call(machine: &mut Machine, callee: Id, arguments: Id) -> Result<Id> {
     let name = match machine.node(callee) {
         Node::Global(name) | Node::Opaque(name) => name.clone(),
@@ -160,7 +161,7 @@ pub(super) fn call(machine: &mut Machine, callee: Id, arguments: Id) -> Result<I
             arguments
         }
         Node::Tuple(arguments) => {
-            // `copyreg` makes an object of the class that it is given.
+            // A function of `copyreg` makes an object of the class in its arguments.
             let class = arguments.first().map(|class| machine.node(*class));
             let name = match class {
                 Some(Node::Global(class)) if name.starts_with("copy") => class.clone(),
@@ -200,7 +201,7 @@ pub(super) fn call(machine: &mut Machine, callee: Id, arguments: Id) -> Result<I
     }
 }
 
-/// `OrderedDict()`, `OrderedDict([[k, v], …])`, `Counter({…})`.
+/// Makes `OrderedDict()`, `OrderedDict([[k, v], …])`, `Counter({…})`.
 fn dictionary(machine: &mut Machine, name: &Arc<str>, arguments: &[Id]) -> Result<Id> {
     let pair = |id: &Id| match machine.node(*id) {
         Node::List(p) | Node::Tuple(p) => {
@@ -223,7 +224,7 @@ fn dictionary(machine: &mut Machine, name: &Arc<str>, arguments: &[Id]) -> Resul
     }
 }
 
-/// `list(x)`, `set(x)`, `tuple(x)`, `deque(x, maximum)`.
+/// Makes `list(x)`, `set(x)`, `tuple(x)`, `deque(x, maximum)`.
 fn container(machine: &mut Machine, bare: &str, name: &Arc<str>, arguments: &[Id]) -> Result<Id> {
     let items = match arguments.first().map(|a| machine.node(*a)) {
         None => Vec::new(),
@@ -238,7 +239,7 @@ fn container(machine: &mut Machine, bare: &str, name: &Arc<str>, arguments: &[Id
     })
 }
 
-/// `bytes` and `bytearray`, as protocol 2 spells them: `encode(text, "latin1")`.
+/// Makes `bytes` and `bytearray`, in protocol 2 from `encode(text, "latin1")`.
 fn encoded(machine: &mut Machine, name: &Arc<str>, arguments: &[Id]) -> Result<Id> {
     let Some(first) = arguments.first() else {
         return machine.make(Node::Bytes(Arc::from([])));
@@ -250,7 +251,7 @@ fn encoded(machine: &mut Machine, name: &Arc<str>, arguments: &[Id]) -> Result<I
     let bytes = match machine.node(*first) {
         Node::Bytes(bytes) => Some(bytes.clone()),
         Node::Str(text) if latin => {
-            // Each call makes a copy: a node's worth for 32 bytes.
+            // Each call makes a copy: one node of the budget for 32 bytes.
             let text = text.clone();
             machine.charge(text.len() / 32)?;
             let bytes: Option<Vec<u8>> = text.chars().map(|c| u8::try_from(c).ok()).collect();
@@ -264,8 +265,8 @@ fn encoded(machine: &mut Machine, name: &Arc<str>, arguments: &[Id]) -> Result<I
     }
 }
 
-/// `_rebuild_tensor(storage, offset, shape, strides)`; v2 adds `requires_grad`, hooks and
-/// metadata, v3 the element type before the metadata.
+/// Makes a tensor of `_rebuild_tensor(storage, offset, shape, strides)`. v2 adds
+/// `requires_grad`, hooks and metadata; v3 adds the element type before the metadata.
 fn tensor(machine: &mut Machine, name: &Arc<str>, arguments: &[Id]) -> Result<Id> {
     let [storage, offset, shape, strides, rest @ ..] = arguments else {
         let got = format!("{} of them", arguments.len());
@@ -279,7 +280,7 @@ fn tensor(machine: &mut Machine, name: &Arc<str>, arguments: &[Id]) -> Result<Id
         "torch._utils._rebuild_tensor_v3" => (rest.get(2), rest.get(3)),
         _ => (None, rest.get(2)),
     };
-    // Metadata say that the elements are to be negated or conjugated.
+    // The metadata hold pending negation or conjugation.
     match metadata.map(|m| machine.node(*m)) {
         None | Some(Node::None) => {}
         Some(Node::Dict(pairs)) if pairs.is_empty() => {}
@@ -329,13 +330,13 @@ fn sizes(machine: &Machine, id: Id, what: &str) -> Result<Vec<usize>> {
     }
 }
 
-/// `_rebuild_parameter(tensor, requires_grad, hooks[, state])`.
+/// Makes a parameter of `_rebuild_parameter(tensor, requires_grad, hooks[, state])`.
 fn parameter(machine: &mut Machine, name: &Arc<str>, arguments: &[Id]) -> Result<Id> {
     let Some(first) = arguments.first().copied() else {
         return machine.make(Node::Opaque(name.clone()));
     };
     let Node::Tensor(data) = machine.node(first) else {
-        // A tensor that was not understood keeps the name of why.
+        // An opaque tensor keeps its name.
         let known = matches!(machine.node(first), Node::Opaque(_));
         return if known { Ok(first) } else { machine.make(Node::Opaque(name.clone())) };
     };
@@ -346,8 +347,9 @@ fn parameter(machine: &mut Machine, name: &Arc<str>, arguments: &[Id]) -> Result
     machine.make(Node::Tensor(Arc::new(parameter)))
 }
 
-/// `_rebuild_from_type_v2(function, class, arguments, state)`: a tensor with attributes.
-/// Of a class of its own it is not plain, whatever it is made from.
+/// Makes a tensor with attributes of `_rebuild_from_type_v2(function, class, arguments,
+/// state)`. A tensor of a subclass is opaque.
+
 fn from_type(machine: &mut Machine, name: &Arc<str>, arguments: &[Id]) -> Result<Id> {
     let [function, class, inner, ..] = arguments else {
         return machine.make(Node::Opaque(name.clone()));

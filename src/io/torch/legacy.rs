@@ -1,6 +1,6 @@
-//! The form before torch 1.6, still written on demand: five pickles (magic number,
+//! The format before torch 1.6, an option of later versions: five pickles (magic number,
 //! protocol, system, object, keys of the storages), then each storage as its number of
-//! elements (int64) and its bytes.
+//! elements (int64) and its bytes. It has no checksums.
 
 use super::super::{Error, Result};
 use super::pickle::{self, MAX_PICKLE, Node, Pickle};
@@ -11,11 +11,11 @@ use std::collections::HashMap;
 use std::path::Path;
 use std::sync::Arc;
 
-/// The magic number 0x1950a86a20f9469cfc6c, as pickles write integers.
+/// The magic number 0x1950a86a20f9469cfc6c in the encoding of pickles.
 pub(super) const MAGIC: [u8; 10] = [0x6c, 0xfc, 0x9c, 0x46, 0xf9, 0x20, 0x6a, 0xa8, 0x50, 0x19];
 
-/// Whether a file that starts so is of this form: a protocol, perhaps a frame, and the
-/// magic number.
+/// Reports whether a file with this start has the format: a protocol, perhaps a frame, and
+/// the magic number.
 pub(super) fn starts(head: &[u8]) -> bool {
     let body = match head {
         [0x80, _, 0x95, rest @ ..] => rest.get(8..).unwrap_or_default(),
@@ -25,8 +25,11 @@ pub(super) fn starts(head: &[u8]) -> bool {
     body.strip_prefix(&[0x8a, 10]).is_some_and(|n| n.starts_with(&MAGIC))
 }
 
-/// The object's pickle, and where the storages lie.
-pub(super) fn open(source: &Source, path: &Path) -> Result<(Pickle, HashMap<Arc<str>, Place>)> {
+/// Positions of the storages by key.
+pub(super) type Storages = HashMap<Arc<str>, Place>;
+
+/// Reads the object's pickle and the positions of the storages.
+pub(super) fn open(source: &Source, path: &Path) -> Result<(Pickle, Storages)> {
     let end = source.len();
     let next = |at: u64| -> Result<(Pickle, u64)> {
         let mut stream = Stream::new(source, path, at, end, MAX_PICKLE);
@@ -59,14 +62,14 @@ fn root(pickle: &Pickle) -> &Node {
     pickle.nodes.get(pickle.root as usize).unwrap_or(&Node::None)
 }
 
-/// Walks the storages in the order of their keys.
+/// Reads the headers of the storages in the order of their keys.
 fn storages(
     source: &Source,
     path: &Path,
     object: &Pickle,
     keys: &Pickle,
     mut at: u64,
-) -> Result<HashMap<Arc<str>, Place>> {
+) -> Result<Storages> {
     let bad = |expected: String, got: String| Err(Error::format(path, expected, got));
     let Node::List(ids) = root(keys) else {
         return bad("a list of the storages' keys".to_owned(), "another value".to_owned());
@@ -90,10 +93,10 @@ fn storages(
         let bytes = bytes_of(&storage.kind, count);
         let end = bytes.and_then(|b| at.checked_add(b)).filter(|end| *end <= source.len());
         let (Some(bytes), Some(end)) = (bytes, end) else {
-            let got = format!("{} bytes of file behind byte {at} (truncated?)", source.len() - at);
+            let got = format!("{} bytes of file after byte {at} (truncated?)", source.len() - at);
             return bad(format!("{count} elements in storage `{name}`"), got);
         };
-        if places.insert(key.clone(), (at, bytes, None)).is_some() {
+        if places.insert(key.clone(), Place { at, bytes, crc: None }).is_some() {
             return bad("every storage once".to_owned(), format!("`{name}` twice"));
         }
         at = end;

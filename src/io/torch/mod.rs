@@ -1,21 +1,20 @@
-//! PyTorch's files (`torch.save`), read without running anything in them.
+//! Reader of PyTorch's files (`torch.save`) that executes nothing in them.
 //!
 //! A `.ckpt`, `.pt` or `.pth` file is a pickle, a program for a machine that can call any
-//! function by name, and the tensors' bytes. Here the machine is our own
-//! (`pickle.rs`) and knows data only: tensors, parameters and plain containers are
-//! understood, every other name gives [`Value::Opaque`] and what it would have been made
-//! from is forgotten. So the callbacks and optimizer states of a Lightning checkpoint do
-//! no harm, and whoever needs a tensor refuses an opaque value in its place by name.
+//! function by name, and the tensors' bytes. The machine of this module (`pickle.rs`) makes
+//! data only: tensors, parameters and plain containers. Any other name becomes
+//! [`Value::Opaque`], and its arguments are dropped. Callbacks and optimizer states of a
+//! Lightning checkpoint are therefore harmless; a caller that needs a tensor refuses an
+//! opaque value by name.
 //!
-//! Two forms, told apart by content: the zip archive of torch 1.6 (`zip.rs`; why the
-//! directory reader is our own stands there) and the older one (`legacy.rs`). A file is
-//! read by ranges: the pickle, then each tensor when it is asked for. A hostile file
-//! costs at most what the limits of a pickle allow (64 MiB, two million values: some
-//! 200 MB), and one error.
+//! The content decides between two formats: the zip archive of torch 1.6 (`zip.rs`) and the
+//! older one (`legacy.rs`). A file is read by ranges: the pickle first, each tensor on
+//! demand. The limits of a pickle (64 MiB, two million values) bound the memory of a hostile
+//! file to some 200 MB.
 //!
-//! Refused by name: big-endian files, TorchScript archives, the tar form, deflated or
-//! encrypted entries; opaque, so refused where a tensor is wanted: complex, quantized,
-//! sparse, meta and 8-bit float tensors, and views with negation or conjugation pending.
+//! Refused by name: big-endian files, TorchScript archives, the tar format, deflated or
+//! encrypted entries. Opaque values: complex, quantized, sparse, meta and 8-bit float
+//! tensors, and views with pending negation or conjugation.
 
 mod foreign;
 mod globals;
@@ -35,20 +34,20 @@ use std::collections::{BTreeSet, HashSet};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Deepest nesting of a [`Value`].
+/// Largest depth of a [`Value`].
 pub const MAX_DEPTH: usize = 64;
 
-/// How the file is laid out.
+/// The format of a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Form {
     /// A zip archive: torch 1.6 and later.
     Zip,
-    /// Pickles and storages one after the other: earlier, or
+    /// Consecutive pickles and storages: before torch 1.6, or
     /// `_use_new_zipfile_serialization=False`.
     Legacy,
 }
 
-/// An open file: its values, and where its storages lie. Elements are read on demand.
+/// An open file: its values and the positions of its storages. Elements are read on demand.
 #[derive(Debug)]
 pub struct TorchFile {
     path: PathBuf,
@@ -61,16 +60,17 @@ pub struct TorchFile {
 }
 
 impl TorchFile {
-    /// Opens a file; its content decides which form it has.
+    /// Opens a file; its content decides the format.
     ///
     /// # Errors
-    /// Missing, not a file of `torch.save` (the message says what it is instead),
-    /// truncated, a tensor that does not lie in its storage, more values than the limits.
+    /// Missing, not a file of `torch.save` (the message names the format found), truncated,
+    /// a wrong checksum, bytes outside of every entry, a tensor that does not lie in its
+    /// storage, more values than the limits.
     pub fn open(path: &Path) -> Result<Self> {
         Self::from_source(Source::open(path)?, path)
     }
 
-    /// [`TorchFile::open`] of bytes in memory; `name` stands in messages.
+    /// Opens bytes in memory as [`TorchFile::open`] does; `name` is for messages.
     ///
     /// # Errors
     /// As [`TorchFile::open`].
@@ -85,7 +85,8 @@ impl TorchFile {
             let archive = zip::Archive::open(&source, path)?;
             let pickle = archived(&archive, &source, path)?;
             let place = |key: &str| {
-                archive.get(&format!("data/{key}")).map(|e| (e.at, e.bytes, Some(e.crc)))
+                let entry = archive.get(&format!("data/{key}"))?;
+                Some(tree::Place { at: entry.at, bytes: entry.bytes, crc: Some(entry.crc) })
             };
             let root = tree::Builder::new(path, &pickle, &place).root()?;
             (Form::Zip, pickle, root)
@@ -102,23 +103,23 @@ impl TorchFile {
         Ok(Self { path, form, root, opaque, source, checked })
     }
 
-    /// Name of the file, for messages.
+    /// Returns the name of the file, for messages.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// What was saved.
+    /// Returns the saved object.
     pub fn root(&self) -> &Value {
         &self.root
     }
 
-    /// Layout of the file.
+    /// Returns the format of the file.
     pub fn form(&self) -> Form {
         self.form
     }
 
-    /// `module.name` of every class and function that the file names and that is not a
-    /// part of tensors and plain containers. Nothing of them was called.
+    /// Lists `module.name` of every class and function of the file that is not a part of
+    /// tensors and plain containers. None of them is called.
     pub fn opaque_globals(&self) -> &BTreeSet<String> {
         &self.opaque
     }
@@ -138,7 +139,7 @@ impl TorchFile {
         let known =
             |at: &u64| self.checked.lock().unwrap_or_else(PoisonError::into_inner).contains(at);
         if let Some(crc) = storage.crc.filter(|_| !bytes.is_empty() && !known(&storage.at)) {
-            let range = storage.at..storage.at + storage.bytes;
+            let range = storage.at..storage.at + storage.stored;
             let name = format!("storage `{}`", shown(&storage.key));
             check_crc(&self.source, &self.path, range, crc, &name)?;
             self.checked.lock().unwrap_or_else(PoisonError::into_inner).insert(storage.at);
@@ -198,7 +199,8 @@ fn check_crc(
     Err(Error::format(path, format!("CRC-32 {expected:08x} of {name}"), got))
 }
 
-/// A name of the file as messages show it: on one line, and cut where it is long.
+/// Escapes a name of the file for a message and cuts it after 120 characters.
+
 fn shown(text: &str) -> String {
     let mut shown: String = text.chars().take(120).flat_map(char::escape_debug).collect();
     if text.chars().nth(120).is_some() {

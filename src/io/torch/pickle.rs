@@ -1,9 +1,8 @@
-//! A pickle, protocols 2 to 5, into nodes: plain data, and names of what was not made.
+//! Interpreter of pickles, protocols 2 to 5, into nodes of plain data.
 //!
-//! The machine has a stack and a memo of node numbers; sharing and cycles stay what they
-//! are in the file and cost nothing. It has no way to call anything: `REDUCE` and its
-//! kin hand a name and arguments to [`super::globals`], which knows what tensors and
-//! plain containers are made of and answers a node.
+//! The machine has a stack and a memo of node indices; shared nodes and cycles are stored
+//! once. It cannot call functions: `REDUCE` and similar instructions pass a name and
+//! arguments to [`super::globals`], which makes a node for tensors and plain containers.
 
 use super::super::{Error, Result};
 use super::globals;
@@ -13,42 +12,42 @@ use super::value::TorchDtype;
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
-/// A pickle of more bytes than this is refused. One of a large checkpoint has a few
-/// hundred kilobytes, one of a data set's chunk a few megabytes.
+/// Largest pickle, bytes. The pickle of a large checkpoint has a few hundred kilobytes, that
+/// of a data set's chunk a few megabytes.
 pub(super) const MAX_PICKLE: u64 = 64 << 20;
 
-/// Nodes that a pickle may make, values that they may come to once what is shared is
-/// written out, and entries of the memo and the stack: each at most this.
+/// Largest number of nodes of a pickle, of values after shared nodes are copied, and of
+/// entries of the memo and the stack.
 pub(super) const MAX_VALUES: usize = 1 << 21;
 
-/// Containers that may be open at once; Python's own pickler stops near 500.
+/// Largest number of open containers; Python's pickler stops near 500.
 const MAX_MARKS: usize = 10_000;
 
-/// Instructions of one pickle.
+/// Largest number of instructions of a pickle.
 const MAX_STEPS: usize = 1 << 25;
 
-/// Bytes of a module's or a class's name.
+/// Longest name of a module or class, bytes.
 const MAX_NAME: usize = 256;
 
-/// Distinct names of classes and functions.
+/// Largest number of distinct names of classes and functions.
 const MAX_NAMES: usize = 10_000;
 
-/// Number of a node.
+/// Index of a node.
 pub(super) type Id = u32;
 
-/// Element type that a storage is tagged with.
+/// Element type of a storage.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Kind {
-    /// One that tensors can be read from.
+    /// A type that is read.
     Known(TorchDtype),
-    /// Untyped bytes; the tensor says its own element type.
+    /// Untyped bytes; the tensor has the element type.
     Untyped,
     /// `torch.ComplexFloatStorage` and others, with the bytes of an element.
     Other(Arc<str>, usize),
 }
 
 impl Kind {
-    /// Bytes of one element.
+    /// Returns the bytes of one element.
     pub(super) fn size(&self) -> usize {
         match self {
             Self::Known(dtype) => dtype.size(),
@@ -58,18 +57,26 @@ impl Kind {
     }
 }
 
+/// A part of a storage in a legacy file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct StorageView {
+    /// First element.
+    pub(super) first: u64,
+    pub(super) elements: u64,
+}
+
 /// A storage as the pickle names it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Storage {
     pub(super) key: Arc<str>,
     pub(super) kind: Kind,
-    /// Elements of the whole.
+    /// Elements of the whole storage.
     pub(super) elements: u64,
-    /// Of a legacy view of it: first element, and number of them.
-    pub(super) view: Option<(u64, u64)>,
+    /// The part that the id refers to, in legacy files.
+    pub(super) view: Option<StorageView>,
 }
 
-/// A tensor as the pickle describes it; not compared with its storage yet.
+/// A tensor as the pickle describes it, before its comparison with the storage.
 #[derive(Clone, Debug)]
 pub(super) struct Rebuilt {
     pub(super) storage: Arc<Storage>,
@@ -80,7 +87,7 @@ pub(super) struct Rebuilt {
     pub(super) requires_grad: bool,
 }
 
-/// A value whose parts are numbers of nodes.
+/// A value whose parts are indices of nodes.
 #[derive(Clone, Debug)]
 pub(super) enum Node {
     None,
@@ -94,25 +101,25 @@ pub(super) enum Node {
     Tuple(Vec<Id>),
     Set(Vec<Id>),
     Dict(Vec<(Id, Id)>),
-    /// A class, a function, or any other thing that stands under a name.
+    /// A class, a function or another named object.
     Global(Arc<str>),
     Storage(Arc<Storage>),
     Tensor(Arc<Rebuilt>),
     Opaque(Arc<str>),
 }
 
-/// All that one pickle made.
+/// The result of a pickle.
 #[derive(Debug)]
 pub(super) struct Pickle {
     pub(super) nodes: Vec<Node>,
     pub(super) root: Id,
-    /// Names that [`globals`] does not understand.
+    /// Names that [`globals`] does not interpret.
     pub(super) opaque: BTreeSet<String>,
-    /// Every storage that was named, by key.
+    /// Every named storage by key.
     pub(super) storages: HashMap<Arc<str>, Arc<Storage>>,
 }
 
-/// The machine.
+/// The interpreter's state.
 pub(super) struct Machine<'s, 'f> {
     stream: &'s mut Stream<'f>,
     nodes: Vec<Node>,
@@ -121,9 +128,9 @@ pub(super) struct Machine<'s, 'f> {
     memo: HashMap<u32, Id>,
     opaque: BTreeSet<String>,
     storages: HashMap<Arc<str>, Arc<Storage>>,
-    /// What may still be made, in nodes.
+    /// Number of nodes that may still be made.
     budget: usize,
-    /// Position in the file of the instruction at work.
+    /// Position in the file of the current instruction.
     at: u64,
 }
 
@@ -154,7 +161,7 @@ pub(super) fn run(stream: &mut Stream) -> Result<Pickle> {
 }
 
 impl Machine<'_, '_> {
-    /// An error at the instruction at work.
+    /// Makes an error at the current instruction.
     pub(super) fn bad(&self, expected: impl Into<String>, got: impl Into<String>) -> Error {
         let place = format!(" at byte {}", self.at);
         Error::format(self.stream.path, expected, got).at(place)
@@ -164,7 +171,7 @@ impl Machine<'_, '_> {
         Err(self.bad(expected, got))
     }
 
-    /// Takes `n` nodes' worth from the budget.
+    /// Subtracts `n` nodes from the budget.
     pub(super) fn charge(&mut self, n: usize) -> Result<()> {
         match self.budget.checked_sub(n) {
             Some(left) => self.budget = left,
@@ -173,12 +180,12 @@ impl Machine<'_, '_> {
         Ok(())
     }
 
-    /// The node of a number that this machine gave.
+    /// Returns the node of an index.
     pub(super) fn node(&self, id: Id) -> &Node {
         self.nodes.get(id as usize).unwrap_or(&Node::None)
     }
 
-    /// A new node.
+    /// Adds a node.
     pub(super) fn make(&mut self, node: Node) -> Result<Id> {
         self.charge(1)?;
         // MAX_VALUES is far below 2^32.
@@ -200,7 +207,7 @@ impl Machine<'_, '_> {
         self.push(id)
     }
 
-    /// Down to the innermost mark, never below it.
+    /// Pops a value above the innermost mark.
     fn pop(&mut self) -> Result<Id> {
         let floor = self.marks.last().copied().unwrap_or(0);
         match self.stack.pop() {
@@ -217,7 +224,7 @@ impl Machine<'_, '_> {
         }
     }
 
-    /// Everything above the innermost mark, and the mark.
+    /// Pops all values above the innermost mark, and the mark.
     fn pop_mark(&mut self) -> Result<Vec<Id>> {
         match self.marks.pop() {
             Some(mark) if mark <= self.stack.len() => Ok(self.stack.split_off(mark)),
@@ -234,7 +241,7 @@ impl Machine<'_, '_> {
                 }
                 Ok(())
             }
-            // FRAME: a hint about how many bytes follow. The stream has its own bounds.
+            // FRAME: the number of bytes that follow. The stream has bounds of its own.
             0x95 => self.stream.take(8).map(|_| ()),
             b'(' if self.marks.len() >= MAX_MARKS => {
                 self.refuse(format!("at most {MAX_MARKS} open containers"), "more")
@@ -243,7 +250,7 @@ impl Machine<'_, '_> {
                 self.marks.push(self.stack.len());
                 Ok(())
             }
-            // POP takes a mark where one lies on top.
+            // POP removes a mark on top of the stack.
             b'0' if self.marks.last() == Some(&self.stack.len()) => {
                 self.marks.pop();
                 Ok(())
@@ -265,7 +272,7 @@ impl Machine<'_, '_> {
         }
     }
 
-    /// BINPUT, LONG_BINPUT, MEMOIZE; BINGET, LONG_BINGET.
+    /// Executes BINPUT, LONG_BINPUT, MEMOIZE, BINGET, LONG_BINGET.
     fn memo(&mut self, op: u8) -> Result<()> {
         let index = match op {
             b'q' | b'h' => u32::from(self.stream.byte()?),
@@ -319,8 +326,8 @@ impl Machine<'_, '_> {
         Ok(pairs.iter().map(|[key, value]| (*key, *value)).collect())
     }
 
-    /// APPEND, APPENDS, SETITEM, SETITEMS, ADDITEMS: into what lies below. What is not
-    /// understood swallows them.
+    /// Executes APPEND, APPENDS, SETITEM, SETITEMS, ADDITEMS on the container below. An opaque
+    /// value drops the items.
     fn fill(&mut self, op: u8) -> Result<()> {
         let items = match op {
             b'a' => vec![self.pop()?],
@@ -350,7 +357,7 @@ impl Machine<'_, '_> {
         }
     }
 
-    /// GLOBAL, STACK_GLOBAL.
+    /// Executes GLOBAL, STACK_GLOBAL.
     fn global(&mut self, op: u8) -> Result<()> {
         let (module, name) = if op == b'c' {
             let line =
@@ -378,10 +385,10 @@ impl Machine<'_, '_> {
         self.push_new(Node::Global(full.into()))
     }
 
-    /// REDUCE, NEWOBJ, NEWOBJ_EX, BUILD, BINPERSID.
+    /// Executes REDUCE, NEWOBJ, NEWOBJ_EX, BUILD, BINPERSID.
     fn object(&mut self, op: u8) -> Result<()> {
         if op == b'b' {
-            // BUILD: attributes of an object, `_metadata` of a state_dict. All dropped.
+            // BUILD: attributes of an object, `_metadata` of a state_dict; dropped.
             self.pop()?;
             return self.top().map(|_| ());
         }
@@ -399,7 +406,7 @@ impl Machine<'_, '_> {
             self.make(Node::Storage(storage))?
         } else {
             if op == 0x92 {
-                // Keyword arguments: no container and no tensor takes any.
+                // Keyword arguments: no container and no tensor has any.
                 self.pop()?;
             }
             let (arguments, callee) = (self.pop()?, self.pop()?);
@@ -442,7 +449,8 @@ impl Machine<'_, '_> {
             _ => 4,
         })?;
         let bytes = self.stream.take(length)?;
-        // Python 2's strings may be any bytes.
+        // A string of Python 2 may be any bytes.
+
         match std::str::from_utf8(bytes) {
             Ok(text) => Ok(Node::Str(text.into())),
             Err(_) if matches!(op, b'T' | b'U') => Ok(Node::Bytes(bytes.into())),
@@ -450,7 +458,7 @@ impl Machine<'_, '_> {
         }
     }
 
-    /// A length of 1, 4 or 8 bytes. The stream refuses what it does not hold.
+    /// Reads a length of 1, 4 or 8 bytes; the stream compares it with its bounds.
     fn length(&mut self, size: usize) -> Result<usize> {
         let bytes = self.stream.take(size)?;
         let length = bytes.iter().rev().fold(0u64, |n, b| n << 8 | u64::from(*b));
@@ -460,7 +468,7 @@ impl Machine<'_, '_> {
         Ok(length as usize)
     }
 
-    /// What a node is, for messages.
+    /// Describes a node for messages.
     pub(super) fn kind(&self, id: Id) -> String {
         match self.node(id) {
             Node::None => "None".to_owned(),
@@ -481,7 +489,7 @@ impl Machine<'_, '_> {
     }
 }
 
-/// LONG1, LONG4: two's complement, little-endian.
+/// Decodes LONG1 and LONG4: two's complement, little-endian.
 fn integer(bytes: &[u8]) -> Node {
     let negative = bytes.last().is_some_and(|b| *b >= 0x80);
     let (head, rest) = bytes.split_at(bytes.len().min(8));
@@ -492,7 +500,8 @@ fn integer(bytes: &[u8]) -> Node {
     if rest.is_empty() { Node::Int(i64::from_le_bytes(word)) } else { Node::Big(bytes.into()) }
 }
 
-/// Instructions that are refused, by name where it tells something.
+/// Describes a refused instruction.
+
 fn unknown(op: u8) -> String {
     match op {
         b'P' | b'I' | b'L' | b'F' | b'S' | b'V' | b'g' | b'p' => {

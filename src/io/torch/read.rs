@@ -1,22 +1,22 @@
-//! Elements of a strided view, in order.
+//! Reads the elements of a strided view in order.
 
 use super::super::{Error, Result};
 use super::source::Source;
 use super::value::{TensorRef, extent};
 use std::path::Path;
 
-/// What an expanded tensor (stride 0) may take beyond its storage, bytes.
+/// Largest size of an expanded tensor (stride 0) beyond its storage, bytes.
 const MAX_EXPANDED: u64 = 64 << 20;
 
-/// A view that spans no more bytes than this, or than four times its elements', is read
-/// in one piece.
+/// Largest span of a view that is read in one piece, bytes; a view of up to four times its
+/// elements is too.
 const WINDOW: u64 = 16 << 20;
 
-/// What is read at a time of one that spans more: so little that jumping back and forth
-/// costs no more than the elements' number.
+/// Bytes per read of a larger span. The cost of reads in any order stays proportional to the
+/// number of elements.
 const PAGE: u64 = 4 << 10;
 
-/// Contiguous, little-endian elements of `t`.
+/// Reads the elements of `t`, contiguous and little-endian.
 pub(super) fn read(source: &Source, path: &Path, t: &TensorRef) -> Result<Vec<u8>> {
     let size = t.dtype.size();
     if t.shape.contains(&0) {
@@ -27,7 +27,7 @@ pub(super) fn read(source: &Source, path: &Path, t: &TensorRef) -> Result<Vec<u8
         let got = format!("shape {:?}, strides {:?}, offset {}", t.shape, t.strides, t.offset);
         return Err(Error::format(path, "a tensor inside its storage", got));
     };
-    // None of these overflow: `extent` took the same products.
+    // No overflow: `extent` has computed the same products.
     let total = size * t.shape.iter().product::<usize>();
     let limit = t.storage.bytes.saturating_add(MAX_EXPANDED);
     if total as u64 > limit {
@@ -53,41 +53,48 @@ pub(super) fn read(source: &Source, path: &Path, t: &TensorRef) -> Result<Vec<u8
         loop {
             let Some(d) = dimension.checked_sub(1) else { return Ok(out) };
             dimension = d;
-            let (Some(i), Some((s, stride))) = (index.get_mut(d), outer.get(d)) else {
+            let (Some(i), Some(dimension)) = (index.get_mut(d), outer.get(d)) else {
                 return Ok(out);
             };
+            let Dimension { size, stride_bytes } = *dimension;
             *i += 1;
-            at += *stride as u64;
-            if *i < *s {
+            at += stride_bytes as u64;
+            if *i < size {
                 break;
             }
-            at -= (*s * *stride) as u64;
+            at -= (size * stride_bytes) as u64;
             *i = 0;
         }
     }
 }
 
-/// The outer dimensions, (size, stride in bytes), and the bytes of the innermost run that
-/// lies in one piece.
-fn runs(t: &TensorRef) -> (Vec<(usize, usize)>, usize) {
+/// An outer dimension of a view.
+struct Dimension {
+    size: usize,
+    stride_bytes: usize,
+}
+
+/// Splits a view into its outer dimensions and the bytes of the innermost contiguous run.
+fn runs(t: &TensorRef) -> (Vec<Dimension>, usize) {
     let size = t.dtype.size();
     let mut run = size;
     let mut outer = Vec::new();
     for (s, stride) in t.shape.iter().zip(&t.strides).rev() {
-        // A dimension of one element has a stride of no meaning, and any value.
+        // The stride of a dimension of one element is arbitrary.
         if *s == 1 {
             continue;
         }
         match stride * size {
             stride if outer.is_empty() && stride == run => run *= s,
-            stride => outer.push((*s, stride)),
+            stride_bytes => outer.push(Dimension { size: *s, stride_bytes }),
         }
     }
     outer.reverse();
     (outer, run)
 }
 
-/// A window of the file that moves to where bytes are asked for.
+/// A window of the file that moves to the requested bytes.
+
 struct Gather<'a> {
     source: &'a Source,
     path: &'a Path,

@@ -1,4 +1,4 @@
-//! Bytes by range, of a file or of memory, and a forward stream over a stretch of them.
+//! Ranges of bytes of a file or of memory, and a forward stream over a range.
 
 use super::super::{Error, Result};
 use std::fs::File;
@@ -6,15 +6,15 @@ use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Bytes that a [`Stream`] asks of the file at a time.
+/// Bytes per read of a [`Stream`].
 const CHUNK: u64 = 64 << 10;
 
-/// Where the bytes are.
+/// A file, or bytes in memory.
 #[derive(Debug)]
 pub(super) enum Source {
     /// A file and its length when it was opened.
     File(Mutex<File>, u64),
-    /// All in memory.
+    /// Bytes in memory.
     Memory(Arc<[u8]>),
 }
 
@@ -36,11 +36,11 @@ impl Source {
         }
     }
 
-    /// Fills `out` from position `at`.
+    /// Reads `out.len()` bytes from position `at`.
     pub(super) fn read_at(&self, at: u64, out: &mut [u8]) -> std::io::Result<()> {
         match self {
             Self::File(file, _) => {
-                // A panic elsewhere leaves no state behind: every read seeks first.
+                // A poisoned lock is harmless: every read seeks first.
                 let mut file = file.lock().unwrap_or_else(PoisonError::into_inner);
                 file.seek(SeekFrom::Start(at))?;
                 file.read_exact(out)
@@ -57,7 +57,7 @@ impl Source {
         }
     }
 
-    /// `length` bytes from `at`, which must lie in the file: checked before allocating.
+    /// Reads `length` bytes from `at`. The range is checked before memory is allocated.
     pub(super) fn bytes(&self, at: u64, length: u64, path: &Path) -> Result<Vec<u8>> {
         let size = usize::try_from(length).ok();
         let end = at.checked_add(length).filter(|end| *end <= self.len());
@@ -71,21 +71,21 @@ impl Source {
     }
 }
 
-/// Bytes in order, from a position to an end.
+/// A forward stream from a position to an end.
 pub(super) struct Stream<'a> {
     source: &'a Source,
     pub(super) path: &'a Path,
     /// Position in the file of the byte after the buffer's last.
     next: u64,
     end: u64,
-    /// The end is a limit of ours: the file goes on behind it.
+    /// The end is the limit, and the range is longer.
     limited: bool,
     buffer: Vec<u8>,
     used: usize,
 }
 
 impl<'a> Stream<'a> {
-    /// Bytes `at..end`, at most `limit` of them.
+    /// Makes a stream of the bytes `at..end`, at most `limit` of them.
     pub(super) fn new(source: &'a Source, path: &'a Path, at: u64, end: u64, limit: u64) -> Self {
         let end = end.min(source.len());
         let stop = end.min(at.saturating_add(limit));
@@ -93,17 +93,17 @@ impl<'a> Stream<'a> {
         Self { source, path, next: at, end: stop, limited: stop < end, buffer, used: 0 }
     }
 
-    /// Position in the file of the next byte.
+    /// Returns the position in the file of the next byte.
     pub(super) fn position(&self) -> u64 {
         self.next - (self.buffer.len() - self.used) as u64
     }
 
-    /// Bytes up to the end.
+    /// Returns the number of bytes up to the end.
     pub(super) fn left(&self) -> u64 {
         self.end.saturating_sub(self.position())
     }
 
-    /// The next `n` bytes.
+    /// Takes the next `n` bytes.
     pub(super) fn take(&mut self, n: usize) -> Result<&[u8]> {
         if self.buffer.len() - self.used < n {
             self.fill(n)?;
@@ -134,25 +134,27 @@ impl<'a> Stream<'a> {
         let left = self.left();
         let got = match self.limited {
             true => format!("{left} up to the limit on the size of a pickle"),
-            false => format!("{left} (truncated, or a length that lies)"),
+            false => format!("{left} (truncated, or a wrong length)"),
         };
         Error::format(self.path, format!("{n} more bytes of pickle"), got)
             .at(format!(" at byte {position}"))
     }
 
-    /// The next byte.
+    /// Takes the next byte.
     pub(super) fn byte(&mut self) -> Result<u8> {
         self.array::<1>().map(|[b]| b)
     }
 
-    /// The next `N` bytes.
+    /// Takes the next `N` bytes.
     pub(super) fn array<const N: usize>(&mut self) -> Result<[u8; N]> {
         let mut out = [0; N];
         out.copy_from_slice(self.take(N)?);
         Ok(out)
     }
 
-    /// Bytes up to the next line feed, at most `limit`; the line feed is taken and left out.
+    /// Takes at most `limit` bytes up to the next line feed, and the line feed, which is
+    /// dropped.
+
     pub(super) fn line(&mut self, limit: usize) -> Result<Vec<u8>> {
         let mut line = Vec::new();
         loop {

@@ -1,16 +1,23 @@
-//! From nodes to a tree of values: sharing written out within a budget, cycles found by
-//! depth, and every tensor held against its storage.
+//! Conversion of nodes to a tree of values: shared nodes are copied within a budget, cycles
+//! are detected by depth, and every tensor is compared with its storage.
 
 use super::super::{Error, Result};
-use super::pickle::{Id, Kind, MAX_VALUES, Node, Pickle, Rebuilt, Storage};
+use super::pickle::{Id, Kind, MAX_VALUES, Node, Pickle, Rebuilt, Storage, StorageView};
 use super::value::{StorageRef, TensorRef, Value, extent};
 use super::{MAX_DEPTH, shown};
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
 use std::sync::Arc;
 
-/// Position, length and CRC-32 of a storage of the file.
-pub(super) type Place = (u64, u64, Option<u32>);
+/// Bytes of a storage in the file.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Place {
+    /// Position of the first byte.
+    pub(super) at: u64,
+    pub(super) bytes: u64,
+    /// The archive's CRC-32, where it has one.
+    pub(super) crc: Option<u32>,
+}
 
 /// Builds the tree of `pickle`; `place` finds storages by key.
 pub(super) struct Builder<'a> {
@@ -20,7 +27,7 @@ pub(super) struct Builder<'a> {
     tensors: HashMap<Id, Arc<TensorRef>>,
     storages: HashMap<Arc<str>, Arc<StorageRef>>,
     budget: usize,
-    /// Keys and indices from the root to the value at work.
+    /// Keys and indices from the root to the current value.
     trail: Vec<Step>,
 }
 
@@ -39,7 +46,7 @@ impl<'a> Builder<'a> {
         Self { path, pickle, place, tensors, storages, budget: MAX_VALUES, trail: Vec::new() }
     }
 
-    /// The whole tree.
+    /// Converts the whole tree.
     pub(super) fn root(mut self) -> Result<Value> {
         self.value(self.pickle.root)
     }
@@ -48,7 +55,7 @@ impl<'a> Builder<'a> {
         self.pickle.nodes.get(id as usize).unwrap_or(&Node::None)
     }
 
-    /// Keys and indices from the root, as `state_dict.encoder.weight`.
+    /// Formats the keys and indices from the root, such as `state_dict.encoder.weight`.
     fn place_in_file(&self) -> String {
         let steps = self.trail.iter().map(|step| match step {
             Step::Index(i) => format!("[{i}]"),
@@ -59,7 +66,7 @@ impl<'a> Builder<'a> {
             },
         });
         let all = steps.collect::<Vec<_>>().join(".");
-        // What nests this deep is no name of a weight.
+        // The name is cut where it is longer than any weight's.
         if all.is_empty() { " at the root".to_owned() } else { format!(" at `{}`", shown(&all)) }
     }
 
@@ -111,7 +118,7 @@ impl<'a> Builder<'a> {
         let (mut texts, mut numbers) = (HashSet::new(), HashSet::new());
         for (key, value) in pairs {
             self.trail.push(Step::Key(*key));
-            // Readers disagree about which of two counts.
+            // Other readers disagree about the value of a repeated key.
             let fresh = match self.node(*key) {
                 Node::Str(text) => texts.insert(&**text),
                 Node::Int(number) => numbers.insert(*number),
@@ -152,7 +159,7 @@ impl<'a> Builder<'a> {
         Ok(tensor)
     }
 
-    /// Where a storage lies; it must have the size that the pickle says.
+    /// Finds a storage, which must have the size that the pickle declares.
     fn storage(&mut self, storage: &Storage) -> Result<Arc<StorageRef>> {
         if let Some(known) = self.storages.get(&storage.key)
             && storage.view.is_none()
@@ -160,18 +167,18 @@ impl<'a> Builder<'a> {
             return Ok(known.clone());
         }
         let key = shown(&storage.key);
-        let Some((at, there, crc)) = (self.place)(&storage.key) else {
+        let Some(Place { at, bytes: stored, crc }) = (self.place)(&storage.key) else {
             return Err(self.bad(format!("storage `{key}` in the file"), "none"));
         };
         let size = storage.kind.size() as u64;
         let bytes = storage.elements.checked_mul(size);
-        // A storage of bytes that became one of floats may end in part of a float.
-        let Some(bytes) = bytes.filter(|b| *b <= there && there - b < size.max(2)) else {
+        // A storage of bytes that was converted to floats may end in part of a float.
+        let Some(bytes) = bytes.filter(|b| *b <= stored && stored - b < size.max(2)) else {
             let expected =
                 format!("{} elements of {size} bytes in storage `{key}`", storage.elements);
-            return Err(self.bad(expected, format!("{there} bytes")));
+            return Err(self.bad(expected, format!("{stored} bytes")));
         };
-        if let Some((first, elements)) = storage.view {
+        if let Some(StorageView { first, elements }) = storage.view {
             let range = first.checked_mul(size).zip(elements.checked_mul(size));
             let inside = range.filter(|(f, n)| f.checked_add(*n).is_some_and(|end| end <= bytes));
             let Some((first, bytes)) = inside else {
@@ -180,24 +187,25 @@ impl<'a> Builder<'a> {
                 return Err(self.bad(expected, got));
             };
             let key = storage.key.clone();
-            return Ok(Arc::new(StorageRef { key, at: at + first, bytes, crc: None }));
+            let (at, stored) = (at + first, bytes);
+            return Ok(Arc::new(StorageRef { key, at, bytes, stored, crc: None }));
         }
         let key = storage.key.clone();
-        let crc = crc.filter(|_| bytes == there);
-        let found = Arc::new(StorageRef { key: key.clone(), at, bytes, crc });
+        let found = Arc::new(StorageRef { key: key.clone(), at, bytes, stored, crc });
         self.storages.insert(key, found.clone());
         Ok(found)
     }
 }
 
-/// A shape, cut where it is longer than any of use.
+/// Formats a shape, cut after eight sizes.
 fn list(sizes: &[usize]) -> String {
     let head: Vec<String> = sizes.iter().take(8).map(usize::to_string).collect();
     let more = if sizes.len() > 8 { ", …" } else { "" };
     format!("[{}{more}]", head.join(", "))
 }
 
-/// Bytes of a legacy storage's elements, for [`super::legacy`].
+/// Returns the bytes of a legacy storage's elements, for [`super::legacy`].
+
 pub(super) fn bytes_of(kind: &Kind, elements: u64) -> Option<u64> {
     elements.checked_mul(kind.size() as u64)
 }

@@ -1,4 +1,4 @@
-//! What a pickle holds, as plain data.
+//! The content of a pickle as plain data.
 
 use std::sync::Arc;
 
@@ -28,7 +28,7 @@ pub enum TorchDtype {
 }
 
 impl TorchDtype {
-    /// Bytes of one element.
+    /// Returns the bytes of one element.
     pub fn size(self) -> usize {
         match self {
             Self::F64 | Self::I64 => 8,
@@ -38,7 +38,7 @@ impl TorchDtype {
         }
     }
 
-    /// PyTorch's name, without `torch.`.
+    /// Returns PyTorch's name without `torch.`.
     pub fn name(self) -> &'static str {
         match self {
             Self::F64 => "float64",
@@ -54,7 +54,7 @@ impl TorchDtype {
         }
     }
 
-    /// Of PyTorch's name without `torch.`, aliases (`half`, `long`, …) included.
+    /// Parses PyTorch's name without `torch.`, or an alias (`half`, `long`, …).
     pub fn from_name(name: &str) -> Option<Self> {
         Some(match name {
             "float64" | "double" => Self::F64,
@@ -72,53 +72,56 @@ impl TorchDtype {
     }
 }
 
-/// Where a tensor's elements lie in the file. Tensors that share a storage have equal ones.
+/// A storage of the file. Tensors that share a storage have equal ones.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub struct StorageRef {
-    /// The file's name for it: `0`, `1`, … in zip files, a number in legacy ones.
+    /// Key in the file: `0`, `1`, … in zip files, a number in legacy ones.
     pub key: Arc<str>,
-    /// Position of its first byte in the file.
+    /// Position of the first byte in the file.
     pub(super) at: u64,
-    /// Its length in bytes.
+    /// Length of the elements in bytes.
     pub(super) bytes: u64,
-    /// The archive's CRC-32 of those bytes, where it has one.
+    /// Length in the archive, which may end in part of an element.
+    pub(super) stored: u64,
+    /// The archive's CRC-32 of the `stored` bytes, where it has one.
     pub(super) crc: Option<u32>,
 }
 
 impl StorageRef {
-    /// Length in bytes; the file was checked to hold them.
+    /// Returns the length in bytes; the file holds them.
     pub fn bytes(&self) -> u64 {
         self.bytes
     }
 }
 
-/// A tensor of the file: a view of a storage. It was checked to lie inside it.
+/// A tensor of the file: a view that lies inside a storage.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TensorRef {
     /// Element type.
     pub dtype: TorchDtype,
-    /// Sizes, outermost first; empty for a scalar. Their product fits `usize`, even with
-    /// the zeros left out.
+    /// Sizes, outermost first; empty for a scalar. The product of the sizes above zero fits
+    /// `usize`.
     pub shape: Vec<usize>,
-    /// Elements from one index to the next, an entry for each of `shape`; 0 where expanded.
+    /// Elements from one index to the next, for each dimension; 0 where expanded.
     pub strides: Vec<usize>,
     /// Elements from the storage's start to the first one.
     pub offset: usize,
-    /// Where the elements are.
+    /// Storage of the elements.
     pub storage: Arc<StorageRef>,
-    /// `requires_grad`, or a parameter's.
+    /// `requires_grad` of the tensor or parameter.
     pub requires_grad: bool,
 }
 
 impl TensorRef {
-    /// Number of elements.
+    /// Returns the number of elements.
     pub fn elements(&self) -> usize {
         self.shape.iter().product()
     }
 }
 
-/// Bytes from a storage's start to behind the last element of a view; the offset's own
-/// where there is none. `None` past 63 bits, or where the strides are not the shape's.
+/// Returns the bytes from a storage's start to the end of a view's last element, or to the
+/// offset for an empty view. `None` above 63 bits, or where shape and strides differ in
+/// length.
 pub(super) fn extent(
     dtype: TorchDtype,
     shape: &[usize],
@@ -131,8 +134,8 @@ pub(super) fn extent(
     let last = shape.iter().zip(strides).try_fold(offset, |at, (s, stride)| {
         at.checked_add(s.saturating_sub(1).checked_mul(*stride)?)
     })?;
-    let behind = last.checked_add(usize::from(!shape.contains(&0)))?.checked_mul(size)?;
-    isize::try_from(behind).ok().map(|end| end as u64)
+    let end = last.checked_add(usize::from(!shape.contains(&0)))?.checked_mul(size)?;
+    isize::try_from(end).ok().map(|end| end as u64)
 }
 
 /// A value of the pickle. The tree is at most [`super::MAX_DEPTH`] deep.
@@ -144,7 +147,7 @@ pub enum Value {
     Bool(bool),
     /// An integer of at most 64 bits.
     Int(i64),
-    /// A longer one: two's complement, little-endian.
+    /// A longer integer: two's complement, little-endian.
     BigInt(Arc<[u8]>),
     /// A float.
     Float(f64),
@@ -158,29 +161,29 @@ pub enum Value {
     Tuple(Vec<Value>),
     /// `set`, `frozenset`, in the file's order.
     Set(Vec<Value>),
-    /// `dict`, `OrderedDict`, `defaultdict`, `Counter`, in the file's order; no text or
-    /// integer stands twice among the keys.
+    /// `dict`, `OrderedDict`, `defaultdict`, `Counter`, in the file's order; texts and
+    /// integers among the keys are unique.
     Dict(Vec<(Value, Value)>),
     /// A tensor or parameter.
     Tensor(Arc<TensorRef>),
-    /// Whatever else: `module.name` of the class or function that would have made it.
-    /// Nothing was called; what it would have been made from was dropped.
+    /// Any other object: `module.name` of the class or function that would construct it.
+    /// Nothing is called, and the arguments are dropped.
     Opaque(Arc<str>),
 }
 
 impl Value {
-    /// The value at a text key of a dictionary.
+    /// Returns the value at a text key of a dictionary.
     pub fn get(&self, key: &str) -> Option<&Value> {
         self.entries().find(|(k, _)| k.as_str() == Some(key)).map(|(_, v)| v)
     }
 
-    /// Keys and values of a dictionary, in the file's order; nothing of another value.
+    /// Iterates over the entries of a dictionary in the file's order; empty for other values.
     pub fn entries(&self) -> impl Iterator<Item = (&Value, &Value)> {
         let pairs: &[(Value, Value)] = if let Self::Dict(pairs) = self { pairs } else { &[] };
         pairs.iter().map(|(k, v)| (k, v))
     }
 
-    /// Items of a list, tuple or set.
+    /// Returns the items of a list, tuple or set.
     pub fn items(&self) -> Option<&[Value]> {
         match self {
             Self::List(items) | Self::Tuple(items) | Self::Set(items) => Some(items),
@@ -188,17 +191,17 @@ impl Value {
         }
     }
 
-    /// Text.
+    /// Returns a text.
     pub fn as_str(&self) -> Option<&str> {
         if let Self::Str(s) = self { Some(s) } else { None }
     }
 
-    /// Integer of at most 64 bits (not a bool).
+    /// Returns an integer of at most 64 bits (not a bool).
     pub fn as_int(&self) -> Option<i64> {
         if let Self::Int(i) = self { Some(*i) } else { None }
     }
 
-    /// Float, or integer as one.
+    /// Returns a float, or an integer as a float.
     pub fn as_float(&self) -> Option<f64> {
         match self {
             Self::Float(f) => Some(*f),
@@ -207,17 +210,18 @@ impl Value {
         }
     }
 
-    /// Truth value.
+    /// Returns a bool.
     pub fn as_bool(&self) -> Option<bool> {
         if let Self::Bool(b) = self { Some(*b) } else { None }
     }
 
-    /// Tensor or parameter.
+    /// Returns a tensor or parameter.
     pub fn as_tensor(&self) -> Option<&TensorRef> {
         if let Self::Tensor(t) = self { Some(t) } else { None }
     }
 
-    /// What it is, for messages: `a list of 3`, `an object of os.system`.
+    /// Describes the value for messages: `a list of 3`, `an object of os.system`.
+
     pub fn kind(&self) -> String {
         match self {
             Self::None => "None".to_owned(),

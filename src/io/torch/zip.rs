@@ -1,11 +1,10 @@
 //! The archive of torch 1.6 and later: a zip file of stored entries.
 //!
-//! A directory reader of our own rather than a zip crate, because refusing is most of
-//! the work: PyTorch stores every entry as it is, so nothing here decompresses, and an
-//! entry that is deflated or encrypted, stands twice, overlaps another one, or differs
-//! between the directory and its own header is an error that names it. A general reader
-//! answers some of those with the last of two entries, or with whichever of two headers
-//! it happens to look at. Entry names are keys of a map and never become paths.
+//! PyTorch stores every entry uncompressed. The reader refuses an entry that is deflated or
+//! encrypted, has the name of another one, overlaps it, or differs between the directory
+//! and its own header. It refuses bytes that belong to no entry, too. General zip crates
+//! accept some of these files, hence this reader. Entry names are keys of a map and never
+//! become paths.
 
 use super::super::{Error, Result};
 use super::source::Source;
@@ -14,10 +13,10 @@ use std::collections::HashMap;
 use std::ops::Range;
 use std::path::Path;
 
-/// A central directory of more bytes than this is refused.
+/// Largest central directory, bytes.
 const MAX_DIRECTORY: u64 = 64 << 20;
 
-/// Sentinel of a 32-bit field whose value stands in the zip64 extra field.
+/// Sentinel of a 32-bit field whose value is in the zip64 extra field.
 const IN_ZIP64: u64 = 0xffff_ffff;
 
 /// A stored entry.
@@ -29,21 +28,22 @@ pub(super) struct Entry {
     pub(super) at: u64,
     /// Length in bytes.
     pub(super) bytes: u64,
-    /// CRC-32 of them, as the directory says.
+    /// CRC-32 of the data in the directory.
     pub(super) crc: u32,
     flags: u16,
     method: u16,
     compressed: u64,
 }
 
-/// The entries of an archive, and the folder that `torch.save` puts them in.
+/// The entries of an archive, and their folder.
 #[derive(Debug)]
 pub(super) struct Archive {
     entries: HashMap<String, Entry>,
     folder: String,
 }
 
-/// Little-endian number of 2, 4 or 8 bytes at `at`; 0 past the end (callers check lengths).
+/// Reads a little-endian number of 2, 4 or 8 bytes at `at`; 0 past the end (callers check
+/// lengths).
 fn number(bytes: &[u8], at: usize, size: usize) -> u64 {
     let field = bytes.get(at..at + size).unwrap_or_default();
     field.iter().rev().fold(0, |n, b| n << 8 | u64::from(*b))
@@ -52,8 +52,8 @@ fn number(bytes: &[u8], at: usize, size: usize) -> u64 {
 impl Archive {
     /// Reads the directory and every local header.
     pub(super) fn open(source: &Source, path: &Path) -> Result<Self> {
-        let (at, size, count) = directory(source, path)?;
-        let bytes = source.bytes(at, size, path)?;
+        let Directory { at, bytes, count } = directory(source, path)?;
+        let bytes = source.bytes(at, bytes, path)?;
         let mut entries = listed(&bytes, count, path)?;
         let folder = saved_by_torch(&entries, path)?;
         for (name, entry) in &mut entries {
@@ -77,7 +77,7 @@ impl Archive {
         Ok(())
     }
 
-    /// The entry `name` of the saved folder.
+    /// Returns the entry `name` of the archive's folder.
     pub(super) fn get(&self, name: &str) -> Option<&Entry> {
         self.entries.get(&format!("{}/{name}", self.folder))
     }
@@ -87,8 +87,16 @@ fn refuse<T>(path: &Path, expected: &str, got: impl Into<String>) -> Result<T> {
     Err(Error::format(path, expected, got))
 }
 
-/// Position and length of the central directory, and its number of entries.
-fn directory(source: &Source, path: &Path) -> Result<(u64, u64, u64)> {
+/// The central directory.
+struct Directory {
+    at: u64,
+    bytes: u64,
+    /// Number of entries.
+    count: u64,
+}
+
+/// Finds the central directory by the end record and its zip64 form.
+fn directory(source: &Source, path: &Path) -> Result<Directory> {
     // The end record: 22 bytes and a comment of at most 65535.
     let tail_at = source.len().saturating_sub(22 + 65_535);
     let tail = source.bytes(tail_at, source.len() - tail_at, path)?;
@@ -106,15 +114,21 @@ fn directory(source: &Source, path: &Path) -> Result<(u64, u64, u64)> {
     let end_at = tail_at + end as u64;
     let (mut disks, mut count) = (number(&tail, end + 4, 4), number(&tail, end + 10, 2));
     let (mut size, mut at) = (number(&tail, end + 12, 4), number(&tail, end + 16, 4));
-    let mut behind = end_at;
+    // Position of the record that follows the directory.
+    let mut record_at = end_at;
     let locator = end.checked_sub(20).and_then(|l| tail.get(l..end));
     if let Some(locator) = locator.filter(|l| l.starts_with(b"PK\x06\x07")) {
-        behind = number(locator, 8, 8);
-        let record = source.bytes(behind, 56, path)?;
+        record_at = number(locator, 8, 8);
+        let record = source.bytes(record_at, 56, path)?;
+        let record_bytes = number(&record, 4, 8).saturating_add(12);
         if !record.starts_with(b"PK\x06\x06")
-            || behind.saturating_add(12).saturating_add(number(&record, 4, 8)) != end_at - 20
+            || record_at.saturating_add(record_bytes) != end_at - 20
         {
-            return refuse(path, "a zip64 end record before its locator", "a locator that lies");
+            return refuse(
+                path,
+                "a zip64 end record before its locator",
+                "a locator of another place",
+            );
         }
         disks = number(&record, 16, 8);
         (count, size, at) =
@@ -123,8 +137,8 @@ fn directory(source: &Source, path: &Path) -> Result<(u64, u64, u64)> {
     if disks != 0 {
         return refuse(path, "an archive in one file", "a part of a split zip archive");
     }
-    if at.checked_add(size) != Some(behind) {
-        let got = format!("{size} bytes at byte {at}, for an end record at byte {behind}");
+    if at.checked_add(size) != Some(record_at) {
+        let got = format!("{size} bytes at byte {at}, for an end record at byte {record_at}");
         return refuse(path, "a central directory that ends where the end record starts", got);
     }
     // An entry of the directory takes 46 bytes and its name.
@@ -132,10 +146,10 @@ fn directory(source: &Source, path: &Path) -> Result<(u64, u64, u64)> {
         let got = format!("{count} entries in {size} bytes");
         return refuse(path, "a central directory of at most 64 MiB that holds its entries", got);
     }
-    Ok((at, size, count))
+    Ok(Directory { at, bytes: size, count })
 }
 
-/// The directory's entries; their data is not located yet.
+/// Reads the directory's entries without the positions of their data.
 fn listed(bytes: &[u8], count: u64, path: &Path) -> Result<HashMap<String, Entry>> {
     let mut entries = HashMap::new();
     let mut rest = bytes;
@@ -169,13 +183,13 @@ fn listed(bytes: &[u8], count: u64, path: &Path) -> Result<HashMap<String, Entry
         rest = rest.get(end..).unwrap_or_default();
     }
     if !rest.is_empty() {
-        let got = format!("{} bytes behind the last of {count}", rest.len());
+        let got = format!("{} bytes after the last of {count}", rest.len());
         return refuse(path, "a central directory of its entries alone", got);
     }
     Ok(entries)
 }
 
-/// The fields that say [`IN_ZIP64`], from the zip64 extra field, in its order.
+/// Replaces the fields that hold [`IN_ZIP64`] by those of the zip64 extra field, in its order.
 fn widened(mut fields: [u64; 3], mut extra: &[u8]) -> Option<[u64; 3]> {
     if fields.iter().all(|f| *f != IN_ZIP64) {
         return Some(fields);
@@ -195,8 +209,8 @@ fn widened(mut fields: [u64; 3], mut extra: &[u8]) -> Option<[u64; 3]> {
     None
 }
 
-/// A name that stays inside the archive. Nothing is ever written under it; an archive
-/// that tries is not PyTorch's.
+/// Checks that a name stays inside the archive. No file is written under it, but PyTorch
+/// writes no such name.
 fn checked_name(bytes: &[u8], path: &Path) -> Result<String> {
     let Ok(name) = std::str::from_utf8(bytes) else {
         return refuse(path, "entry names in UTF-8", shown(&String::from_utf8_lossy(bytes)));
@@ -215,7 +229,7 @@ fn checked_name(bytes: &[u8], path: &Path) -> Result<String> {
     Ok(name.to_owned())
 }
 
-/// The folder of `data.pkl`; an error that says what other archives are.
+/// Finds the folder of `data.pkl`; an error names the kind of another archive.
 fn saved_by_torch(entries: &HashMap<String, Entry>, path: &Path) -> Result<String> {
     let inside = |wanted: &str| {
         entries.keys().any(|n| n.split_once('/').is_some_and(|(_, rest)| rest.starts_with(wanted)))
@@ -237,7 +251,7 @@ fn saved_by_torch(entries: &HashMap<String, Entry>, path: &Path) -> Result<Strin
     }
 }
 
-/// Stored, neither encrypted nor compressed.
+/// Checks that an entry is stored, neither encrypted nor compressed.
 fn plain(name: &str, entry: &Entry, path: &Path) -> Result<()> {
     let name = shown(name);
     // Bits 0, 6 and 13: encryption, strong encryption, masked headers.
@@ -257,17 +271,17 @@ fn plain(name: &str, entry: &Entry, path: &Path) -> Result<()> {
     refuse(path, "stored entries, as torch.save writes them", got)
 }
 
-/// Finds the entry's data behind its local header, which must agree with the directory.
+/// Finds the entry's data after its local header, which must agree with the directory.
 fn locate(name: &str, entry: &mut Entry, source: &Source, path: &Path) -> Result<()> {
-    let lies = || {
+    let differs = || {
         let got = format!("another header for `{}` at byte {}", shown(name), entry.header);
         Error::format(path, "a local header that agrees with the central directory", got)
     };
-    let head = source.bytes(entry.header, 30, path).map_err(|_| lies())?;
+    let head = source.bytes(entry.header, 30, path).map_err(|_| differs())?;
     let own_name = source.bytes(entry.header + 30, number(&head, 26, 2), path);
     let same_size = |at: usize, size: u64| {
         let own = number(&head, at, 4);
-        // Bit 3: the sizes follow the data instead.
+        // Bit 3: a descriptor after the data has the sizes.
         own == size || own == IN_ZIP64 || entry.flags & 8 != 0
     };
     if !head.starts_with(b"PK\x03\x04")
@@ -275,10 +289,11 @@ fn locate(name: &str, entry: &mut Entry, source: &Source, path: &Path) -> Result
         || number(&head, 8, 2) != u64::from(entry.method)
         || !same_size(18, entry.compressed)
         || !same_size(22, entry.bytes)
-        || own_name.map_err(|_| lies())? != name.as_bytes()
+        || own_name.map_err(|_| differs())? != name.as_bytes()
     {
-        return Err(lies());
+        return Err(differs());
     }
+
     entry.at = entry.header + 30 + number(&head, 26, 2) + number(&head, 28, 2);
     Ok(())
 }
