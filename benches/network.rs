@@ -25,7 +25,7 @@ use std::time::Instant;
 use subsplat::config::{Config, Mvsplat as Settings, Preset, Small};
 use subsplat::io::image::Rgb;
 use subsplat::model::Views;
-use subsplat::model::backbone::{Mvsplat, SmallBackbone};
+use subsplat::model::backbone::{DisparityMean, Mvsplat, SmallBackbone};
 use subsplat::model::trace::Trace;
 use subsplat::model::weights::Weights;
 use subsplat::pipeline::{Photo, Reconstructor, Request};
@@ -103,18 +103,18 @@ fn training_step(bench: &mut Bench) -> Result<()> {
     }
     let v = views(4, 128)?;
     let forward = || -> Result<()> {
-        std::hint::black_box(net.forward(&v, true)?);
+        std::hint::black_box(net.forward(&v, DisparityMean::AllCandidates)?);
         Ok(())
     };
     let supervised = || -> Result<()> {
-        let (_, maps) = net.forward(&v, true)?;
+        let (_, maps) = net.forward(&v, DisparityMean::AllCandidates)?;
         let loss = (maps.logits.sqr()?.mean_all()? + maps.index.sqr()?.mean_all()?)?;
         let loss = (loss + maps.confidence.sqr()?.mean_all()?)?;
         std::hint::black_box(loss.backward()?);
         Ok(())
     };
     let step = || -> Result<()> {
-        let (out, maps) = net.forward(&v, true)?;
+        let (out, maps) = net.forward(&v, DisparityMean::AllCandidates)?;
         let loss = (out.raw.sqr()?.mean_all()? + out.depths.recip()?.mean_all()?)?;
         let loss = (loss + out.densities.sqr()?.mean_all()?)?;
         let loss = (loss + (maps.logits.sqr()?.mean_all()? + maps.index.sqr()?.mean_all()?)?)?;

@@ -2,6 +2,7 @@
 //! graph of candle tensor operations.
 
 mod common;
+use subsplat_test_support::spgr_reference;
 
 use anyhow::Result;
 use candle_core::{CpuStorage, CustomOp2, Layout, Shape, Storage, Tensor, Var};
@@ -13,7 +14,6 @@ use subsplat::abi::{HEAD_STRIDE, SPLAT_STRIDE};
 use subsplat::config::{Config, Preset};
 use subsplat::cpu::{math, redistribute as shares, spgr as kernel};
 use subsplat::model::spgr::rules;
-use subsplat::model::spgr_ref;
 use subsplat::ops::redistribute::{Rule, redistribute};
 use subsplat::ops::spgr::{Spgr, spgr, spgr_into};
 
@@ -125,7 +125,7 @@ struct Case {
 }
 
 type Op = fn(&Tensor, &Tensor, &Spgr) -> candle_core::Result<(Tensor, Tensor)>;
-const GRAPH: Op = spgr_ref::spgr;
+const GRAPH: Op = spgr_reference::spgr;
 const FUSED: Op = spgr;
 
 impl Case {

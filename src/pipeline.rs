@@ -251,7 +251,7 @@ impl Reconstructor {
         let mut views = views_of(&inputs, request.near_far)?;
         if request.look {
             clock.begin("depth range");
-            views = self.model.look(&views)?;
+            views = self.model.estimate_depth_range(&views)?;
         }
         let near_far = views.near_far[0][0];
         let mut scenes = self.model.forward(&views, &mut |name| clock.begin(name))?;

@@ -1,8 +1,8 @@
-//! The backbones: which network gives the primaries, and how it is shaped.
+//! The backbones: the network that gives the primaries, and its shape.
 
 use serde::{Deserialize, Serialize};
 
-/// Which network gives the primaries.
+/// The network that gives the primaries.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
 pub enum Backbone {
@@ -56,47 +56,47 @@ pub struct Small {
     pub match_channels: usize,
     /// D: depth candidates, uniform in disparity from 1/far to 1/near (64).
     pub depth_candidates: usize,
-    /// Raw matching channels beside the learned correlation: ZNCC 6×6 at half
+    /// Adds raw matching channels to the learned correlation: ZNCC 6×6 at half
     /// resolution, RGB SAD and ZNCC 5×5 at quarter resolution, validity.
     pub raw_matching: bool,
-    /// Hidden channels of the 3-D stem shared over disparity (two 3×3×3
-    /// convolutions to one channel); 0 leaves the stem out and feeds the volume's
-    /// channels to the U-Net as they are.
+    /// Hidden channels of the 3-D stem shared over disparity (two 3×3×3 convolutions to
+    /// one channel). 0 removes the stem: the U-Net then reads the volume's channels.
     pub stem_channels: usize,
     /// Adds the stem's output, times 4 and a learned factor, to the logits.
     pub stem_skip: bool,
     /// Channels of the 2-D U-Net at 1/4, 1/8, 1/16 and 1/32 (64, 80, 96, 96).
     pub unet_channels: Vec<usize>,
-    /// Half-width, in candidates, of the window around the mode over which
-    /// disparity is averaged at inference; 0 averages over all (3).
+    /// Half-width, in candidates, of the window around the mode for the mean disparity
+    /// at inference; 0 averages over all candidates (3).
     pub mode_window: usize,
-    /// Convex ×4 upsampling with learned 3×3 masks; off is bilinear.
+    /// True: convex ×4 upsampling with learned 3×3 masks. False: bilinear.
     pub convex_upsampling: bool,
-    /// Opacity is confidence², from a head of its own; off predicts opacity
-    /// directly.
+    /// True: opacity is confidence², from a head of its own. False: a head predicts
+    /// opacity directly.
     pub confidence_opacity: bool,
-    /// Colour starts as the pixel's own and the head learns a residual.
+    /// The colour starts as the pixel's colour and the head learns a residual.
     pub pixel_colour: bool,
     /// Channels of the full-resolution feature map that the heads read (32).
     pub head_channels: usize,
-    /// Opacity is lowered where another view that sees the place sees another colour
-    /// ([`crate::cpu::small::cross_check`]).
+    /// Lowers the opacity of a point where another view that sees it has another colour
+    /// ([`crate::cpu::small::cross_check`]). Files without the key mean true.
     #[serde(default = "yes")]
     pub cross_check: bool,
-    /// Near and far are narrowed to what a first look at half the size shows
-    /// ([`crate::model::subsplat::SubSplat::look`]).
-    #[serde(default = "yes")]
-    pub first_look: bool,
+    /// Estimates near and far depth from half-size images
+    /// ([`crate::model::subsplat::SubSplat::estimate_depth_range`]). Serialised as
+    /// `first_look`; files without the key mean true.
+    #[serde(default = "yes", rename = "first_look")]
+    pub estimate_depth_range: bool,
     /// Shape, colour and frame of the primaries.
     pub primaries: Primaries,
 }
 
-/// What a file says by saying nothing.
+/// Default of keys that older files lack.
 fn yes() -> bool {
     true
 }
 
-/// From raw head outputs to world-frame Gaussians (MVS, Gaussian adapter).
+/// Conversion of raw head outputs to world-frame Gaussians (MVS, Gaussian adapter).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Primaries {
@@ -109,11 +109,11 @@ pub struct Primaries {
     /// x of the opacity mapping α = ½(1 − (1 − p)^e + p^{1/e}), e = 2^x (MVS: 0,
     /// which is α = p).
     pub opacity_exponent: f64,
-    /// What the colour coefficients mean and how they turn into world frame.
+    /// Basis of the colour coefficients and their rotation to world frame.
     pub sh_frame: ShFrame,
 }
 
-/// What the head's colour coefficients multiply, and how they are rotated.
+/// Basis of the head's colour coefficients and their rotation to world frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ShFrame {
@@ -128,7 +128,7 @@ pub enum ShFrame {
     Standard,
 }
 
-/// Which feature maps the attention reads (spec 0).
+/// A feature map that the attention can read, with its scale.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum FeatureLevel {
@@ -172,7 +172,7 @@ impl Mvsplat {
 }
 
 impl Small {
-    /// The network of ARCHITECTURE.md, "The small backbone".
+    /// The network of the weights that ship (`src/model/shipped/README.md`).
     pub fn standard() -> Self {
         Self {
             cnn_channels: [24, 48],
@@ -189,7 +189,7 @@ impl Small {
             pixel_colour: true,
             head_channels: 32,
             cross_check: true,
-            first_look: true,
+            estimate_depth_range: true,
             primaries: Primaries::with(ShFrame::Standard),
         }
     }

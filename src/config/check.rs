@@ -1,16 +1,17 @@
-//! Ranges, and keys that must fit each other.
+//! Checks of a configuration: ranges, and keys that must fit each other.
 
-use super::{AMin, Backbone, Config, ConfigError, Mvsplat, Points, Small};
+use super::{AMin, Aggregation, Backbone, Config, ConfigError, Mvsplat, Points, Small, Spgr};
 use std::ops::RangeInclusive;
 
-/// Channels and hidden widths. The published networks have 512 at most; beyond the upper
-/// end a file is damaged or means harm, and its tensors would not fit into memory.
+/// Channels and hidden widths. The published networks have at most 512. A larger value
+/// than this range allows comes from a damaged or hostile file.
 const WIDTHS: RangeInclusive<usize> = 1..=4096;
-/// Repeated parts.
+/// Numbers of repeated blocks.
 const BLOCKS: RangeInclusive<usize> = 0..=64;
-/// Depth candidates, D.
+/// D: depth candidates.
 const CANDIDATES: RangeInclusive<usize> = 2..=1024;
 
+/// Refuses `got` of `key` unless `ok`.
 fn need(
     ok: bool,
     key: &'static str,
@@ -23,14 +24,14 @@ fn need(
     Err(ConfigError::Value { key, expected: expected.to_owned(), got: format!("{got:?}") })
 }
 
-/// [`need`] of a whole number in a range.
+/// [`need`] for an integer in `range`.
 fn within(range: RangeInclusive<usize>, key: &'static str, got: usize) -> Result<(), ConfigError> {
     let (low, high) = (range.start(), range.end());
     need(range.contains(&got), key, &format!("{low} to {high}"), got)
 }
 
 impl Config {
-    /// Checks every range and every pair of keys that must fit.
+    /// Checks every range and every pair of keys that must fit each other.
     ///
     /// # Errors
     /// [`ConfigError::Value`] names the key.
@@ -54,58 +55,61 @@ impl Config {
             "a finite number",
             p.opacity_exponent,
         )?;
-        let a = self.agg.resolved();
         within(WIDTHS, "embed.dim", self.embed.dim)?;
-        need(
-            a.groups > 0 && self.embed.dim.is_multiple_of(a.groups),
-            "agg.groups",
-            "a divisor of embed.dim",
-            a.groups,
-        )?;
-        need((1..=8).contains(&a.levels.len()), "agg.levels", "1 to 8 levels", &a.levels)?;
-        need(
-            a.stages_geo <= 8 && a.stages_app <= 8,
-            "agg.stages_geo",
-            "0 to 8 stages",
-            (a.stages_geo, a.stages_app),
-        )?;
-        need(a.n_fixed <= 7, "agg.n_fixed", "0 to 7", a.n_fixed)?;
-        within(BLOCKS, "agg.n_learned", a.n_learned)?;
-        within(1..=64, "agg.gate_views", a.gate_views)?;
-        need(
-            a.points == Points::Ref || a.n_fixed + a.n_learned > 0,
-            "agg.n_learned",
-            "at least one point",
-            a.n_learned,
-        )?;
-        need((0.0..1.0).contains(&a.attn_drop), "agg.attn_drop", "in [0, 1)", a.attn_drop)?;
-        let s = &self.spgr;
-        within(WIDTHS, "spgr.hidden", s.hidden)?;
-        need(
-            s.offset_bound.is_none_or(|rho| rho > 0.0 && rho.is_finite()),
-            "spgr.offset_bound",
-            "above 0, or null",
-            s.offset_bound,
-        )?;
-        need(s.beta_z >= 0.0 && s.beta_z.is_finite(), "spgr.beta_z", "at least 0", s.beta_z)?;
-        let lambda = s.lambda_s.value(self.children());
-        need(lambda > 0.0 && lambda.is_finite(), "spgr.lambda_s", "above 0", lambda)?;
-        let least = match s.a_min {
-            AMin::TargetPx(area) | AMin::InputPx(area) => area,
-            _ => 0.0,
-        };
-        need(least >= 0.0 && least.is_finite(), "spgr.a_min", "an area of 0 or more", least)?;
-        need((0.0..=1.0).contains(&s.delta), "spgr.delta", "in [0, 1]", s.delta)?;
-        need(
-            s.dlog_clamp > 0.0 && s.dlog_clamp.is_finite(),
-            "spgr.dlog_clamp",
-            "above 0",
-            s.dlog_clamp,
-        )?;
+        check_aggregation(&self.agg.resolved(), self.embed.dim)?;
+        check_spgr(&self.spgr, self.children())?;
         let r = &self.render;
         need(r.lowpass >= 0.0 && r.lowpass.is_finite(), "render.lowpass", "at least 0", r.lowpass)?;
         need(r.sh_degree <= 4, "render.sh_degree", "0 to 4", r.sh_degree)
     }
+}
+
+/// `a`: the keys in force.
+fn check_aggregation(a: &Aggregation, dim: usize) -> Result<(), ConfigError> {
+    let x = &a.ablations;
+    need(
+        x.groups > 0 && dim.is_multiple_of(x.groups),
+        "agg.groups",
+        "a divisor of embed.dim",
+        x.groups,
+    )?;
+    need((1..=8).contains(&a.levels.len()), "agg.levels", "1 to 8 levels", &a.levels)?;
+    need(
+        a.stages_geo <= 8 && a.stages_app <= 8,
+        "agg.stages_geo",
+        "0 to 8 stages",
+        (a.stages_geo, a.stages_app),
+    )?;
+    need(x.n_fixed <= 7, "agg.n_fixed", "0 to 7", x.n_fixed)?;
+    within(BLOCKS, "agg.n_learned", x.n_learned)?;
+    within(1..=64, "agg.gate_views", a.gate_views)?;
+    need(
+        x.points == Points::Ref || x.n_fixed + x.n_learned > 0,
+        "agg.n_learned",
+        "at least one point",
+        x.n_learned,
+    )?;
+    need((0.0..1.0).contains(&x.attn_drop), "agg.attn_drop", "in [0, 1)", x.attn_drop)
+}
+
+fn check_spgr(s: &Spgr, children: usize) -> Result<(), ConfigError> {
+    within(WIDTHS, "spgr.hidden", s.hidden)?;
+    need(
+        s.offset_bound.is_none_or(|rho| rho > 0.0 && rho.is_finite()),
+        "spgr.offset_bound",
+        "above 0, or null",
+        s.offset_bound,
+    )?;
+    need(s.beta_z >= 0.0 && s.beta_z.is_finite(), "spgr.beta_z", "at least 0", s.beta_z)?;
+    let lambda = s.lambda_s.value(children);
+    need(lambda > 0.0 && lambda.is_finite(), "spgr.lambda_s", "above 0", lambda)?;
+    let area = match s.ablations.a_min {
+        AMin::TargetPx(area) | AMin::InputPx(area) => area,
+        AMin::OverK | AMin::Off => 0.0,
+    };
+    need(area >= 0.0 && area.is_finite(), "spgr.a_min", "an area of 0 or more", area)?;
+    need((0.0..=1.0).contains(&s.delta), "spgr.delta", "in [0, 1]", s.delta)?;
+    need(s.dlog_clamp > 0.0 && s.dlog_clamp.is_finite(), "spgr.dlog_clamp", "above 0", s.dlog_clamp)
 }
 
 fn check_mvsplat(b: &Mvsplat) -> Result<(), ConfigError> {

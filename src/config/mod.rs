@@ -1,11 +1,12 @@
-//! Every hyper-parameter of the method: symbol, source, default. One value of
-//! [`Config`] is one model; every ablation of the paper is a value of it.
+//! Hyper-parameters of the model: symbol, source, default. One [`Config`] describes one
+//! model. The two presets are [`Preset`]; the paper's ablations are groups of their own
+//! ([`AggregationAblations`], [`SpgrAblations`]).
 //!
 //! Sources: "paper" and "supp." are SubSplat's main text and supplement, "MVS" is
 //! MVSplat (arXiv 2403.14627) with its released `re10k` configuration.
 //!
-//! A configuration serialises to JSON and travels in the metadata of a weight
-//! file (key [`Config::METADATA_KEY`]). Unknown keys are refused by name.
+//! A configuration serialises to JSON, which a weight file holds in its metadata (key
+//! [`Config::METADATA_KEY`]). An unknown key is an error that names the key.
 
 mod aggregation;
 mod backbone;
@@ -21,7 +22,7 @@ use serde::{Deserialize, Serialize};
 use std::str::FromStr;
 use thiserror::Error;
 
-/// Why a configuration was refused.
+/// The reason that a configuration is invalid.
 #[derive(Debug, Error)]
 pub enum ConfigError {
     /// Not JSON, an unknown key, or a value of the wrong type.
@@ -32,17 +33,17 @@ pub enum ConfigError {
     Value {
         /// Dotted path of the key.
         key: &'static str,
-        /// What would be accepted.
+        /// Accepted values.
         expected: String,
-        /// What came.
+        /// The value found.
         got: String,
     },
-    /// A preset nobody defined.
+    /// An unknown preset.
     #[error("preset: expected {expected}, got `{got}`")]
     Preset {
         /// The known names.
         expected: &'static str,
-        /// What came.
+        /// The name found.
         got: String,
     },
 }
@@ -54,19 +55,20 @@ pub struct Config {
     /// r: side of the target picture over side of the input; K = r² children per
     /// primary (paper: 2 and 4).
     pub upscale: usize,
-    /// Images and cameras to depth, opacity and raw Gaussian parameters.
+    /// The network from images and cameras to depth, opacity and raw Gaussian
+    /// parameters.
     pub backbone: Backbone,
-    /// Attribute embeddings of the primaries (paper A.2).
+    /// Attribute embeddings of the primaries (SubSplat A.2).
     pub embed: Embed,
-    /// Deformable attention over the views' features (paper A.2).
+    /// Deformable attention over the views' features (SubSplat A.2).
     pub agg: Aggregation,
-    /// Sub-pixel Gaussian reparameterization (paper 3, supp. A.3).
+    /// Sub-pixel Gaussian reparameterization (SubSplat 3.2, supp. A.3).
     pub spgr: Spgr,
-    /// How the result is meant to be rendered.
+    /// Options for rendering the result.
     pub render: Render,
 }
 
-/// How the result is meant to be rendered.
+/// Options for rendering the result.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Render {
@@ -74,20 +76,20 @@ pub struct Render {
     pub convention: Convention,
     /// Low-pass, px² (3DGS: 0.3).
     pub lowpass: f32,
-    /// Of which picture's pixels.
+    /// The image whose pixels `lowpass` counts.
     pub lowpass_ref: LowpassRef,
     /// Highest SH degree evaluated (3DGS: 3).
     pub sh_degree: usize,
     /// Direction of view-dependent colour.
     pub sh_dir: ShDirection,
-    /// What shows where no Gaussian is.
+    /// Colour of pixels without a Gaussian.
     #[serde(default)]
     pub background: Background,
 }
 
 impl Render {
-    /// The low-pass in px² of a picture `ratio` times as large (side over side)
-    /// as the network's input.
+    /// Returns the low-pass, px², of an image whose side is `ratio` times the side of the
+    /// network's input.
     pub fn lowpass_px2(&self, ratio: f32) -> f32 {
         match self.lowpass_ref {
             LowpassRef::Target => self.lowpass,
@@ -96,28 +98,29 @@ impl Render {
     }
 }
 
-/// What shows where no Gaussian is.
+/// Colour of pixels without a Gaussian.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Background {
     /// Black (MVSplat).
     #[default]
     Black,
-    /// The mean colour of the pictures that the network saw.
+    /// The mean colour of the network's input images.
     Inputs,
 }
 
-/// Of which picture's pixels the low-pass is measured in.
+/// The image whose pixels the low-pass counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum LowpassRef {
-    /// The rendered picture's (3DGS).
+    /// The rendered image (3DGS).
     Target,
-    /// The input's: r² times as much, so that coverage is that of a native render.
+    /// The network's input: a low-pass r² times as large, which gives the coverage of a
+    /// render at the input's size.
     Input,
 }
 
-/// What SubSplat adds to the backbone: as written, or as recommended.
+/// SubSplat's part of the configuration: as the paper describes it, or corrected.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Preset {
@@ -166,7 +169,7 @@ impl Config {
         }
     }
 
-    /// MVSplat's `re10k` backbone with SubSplat's additions. `tuned` also turns
+    /// Returns MVSplat's `re10k` backbone with SubSplat's additions. `tuned` also rotates
     /// the colour coefficients exactly ([`ShFrame::MvsplatExact`]).
     pub fn re10k(preset: Preset, upscale: usize) -> Self {
         let mut backbone = Mvsplat::re10k();
@@ -176,13 +179,13 @@ impl Config {
         Self::preset(Backbone::Mvsplat(backbone), preset, upscale)
     }
 
-    /// The light backbone with SubSplat's additions.
+    /// Returns the small backbone with SubSplat's additions.
     pub fn small(preset: Preset, upscale: usize) -> Self {
         Self::preset(Backbone::Small(Small::standard()), preset, upscale)
     }
 
-    /// Another preset and r around the same backbone: its shape stays, its frame of SH
-    /// becomes the preset's.
+    /// Returns another preset and r for the same backbone. The backbone's shape stays; its
+    /// SH frame becomes the preset's.
     #[must_use]
     pub fn with_preset(&self, preset: Preset, upscale: usize) -> Self {
         match self.backbone.clone() {
@@ -196,19 +199,19 @@ impl Config {
         }
     }
 
-    /// The paper's ×2 model: 256 → 512, K = 4.
+    /// Returns the paper's ×2 model: 256 → 512, K = 4.
     pub fn x2() -> Self {
         Self::re10k(Preset::Paper, 2)
     }
 
-    /// The paper's ×4 model: 256 → 1024, K = 16.
+    /// Returns the paper's ×4 model: 256 → 1024, K = 16.
     pub fn x4() -> Self {
         Self::re10k(Preset::Paper, 4)
     }
 
-    /// How this model's Gaussians are rendered to a picture `ratio` times as large (side
-    /// over side) as the network's input. `near`: the nearest depth candidate, world
-    /// units; `inputs`: mean colour of the pictures that the network saw.
+    /// Returns the rasterizer's options for an image whose side is `ratio` times the side
+    /// of the network's input. `near`: the nearest depth candidate, world units; `inputs`:
+    /// mean RGB of the network's input images.
     pub fn raster_options(&self, ratio: f32, near: f32, inputs: [f32; 3]) -> RasterOptions {
         let render = &self.render;
         let mut options = RasterOptions::new(render.convention);
@@ -224,12 +227,12 @@ impl Config {
         options
     }
 
-    /// K: children per primary, r².
+    /// Returns K, the children per primary: r².
     pub fn children(&self) -> usize {
         self.upscale * self.upscale
     }
 
-    /// Shape, colour and frame of the backbone's primaries.
+    /// Returns shape, colour and frame of the backbone's primaries.
     pub fn primaries(&self) -> &Primaries {
         match &self.backbone {
             Backbone::Mvsplat(b) => &b.primaries,
@@ -237,7 +240,7 @@ impl Config {
         }
     }
 
-    /// Side lengths of the input must be multiples of this, px.
+    /// Returns the number, px, of which the input's side lengths must be multiples.
     pub fn stride(&self) -> usize {
         match &self.backbone {
             Backbone::Mvsplat(b) => Self::stride_of(b),
@@ -245,9 +248,9 @@ impl Config {
         }
     }
 
-    /// [`Config::stride`] of MVSplat: patch size 4 × downscale 4 (MVS patch shim); the
-    /// refinement U-Net halves, the windows split and the cost volume's U-Net halves
-    /// the 1/4 map.
+    /// Returns [`Config::stride`] of MVSplat: the least common multiple of patch size 4 ×
+    /// downscale 4 (MVS patch shim), the halvings of the refinement U-Net, and the windows
+    /// and the cost-volume U-Net's halvings of the 1/4 map.
     pub fn stride_of(b: &Mvsplat) -> usize {
         let common = |a: usize, b: usize| {
             let (mut x, mut y) = (a, b);
@@ -260,15 +263,15 @@ impl Config {
         common(halvings, 4 * b.window_splits)
     }
 
-    /// JSON for the metadata of a weight file.
+    /// Returns the JSON for the metadata of a weight file.
     ///
     /// # Errors
-    /// None in practice; kept because serialisation is fallible.
+    /// None in practice: every configuration can be serialised.
     pub fn to_json(&self) -> Result<String, ConfigError> {
         Ok(serde_json::to_string(self)?)
     }
 
-    /// Reads [`Config::to_json`]'s form and checks it.
+    /// Reads the form of [`Config::to_json`] and checks it.
     ///
     /// # Errors
     /// Unknown or missing keys, values of the wrong type or range.
@@ -315,8 +318,8 @@ mod tests {
         assert!(Config::from_json(&json).unwrap_err().to_string().contains("betaz"));
     }
 
-    /// What comes as JSON in weights or by `--config` never runs over, divides by zero or
-    /// asks for all memory.
+    /// JSON from a weight file or `--config` causes no overflow, no division by zero and
+    /// no huge allocation.
     #[test]
     fn numbers_beyond_all_use_are_refused_by_key() {
         let one = |config: &Config, pointer: &str, value: serde_json::Value| {
@@ -325,7 +328,7 @@ mod tests {
             let key = pointer.split('/').rfind(|k| k.parse::<usize>().is_err()).unwrap();
             let refused = Config::from_json(&json.to_string());
             let error = refused.expect_err(&format!("{pointer} {value}")).to_string();
-            // One key speaks for both lists of the small backbone.
+            // One error names both lists of the small backbone.
             let named = [key, "unet_channels"].iter().any(|k| error.contains(k));
             assert!(named, "{pointer} {value}: {error}");
         };
@@ -353,6 +356,28 @@ mod tests {
         }
         one(&mvsplat, "/agg/gate_views", 0.into());
         one(&small, "/spgr/offset_bound", (-1.0).into());
+    }
+
+    /// Serialised forms of releases before the ablations became groups of their own.
+    #[test]
+    fn keys_of_the_groups_stay_on_one_level() {
+        let mut config = Config::x2();
+        config.agg.ablations.groups = 4;
+        config.spgr.ablations.gain_space = GainSpace::Rgb;
+        let json = config.to_json().unwrap();
+        let value: serde_json::Value = serde_json::from_str(&json).unwrap();
+        let keys = |section: &str| value[section].as_object().unwrap().len();
+        assert_eq!((keys("agg"), keys("spgr"), keys("embed")), (24, 18, 7));
+        assert_eq!(value["agg"]["groups"], 4);
+        assert_eq!(value["spgr"]["gain_space"], "rgb");
+        assert_eq!(Config::from_json(&json).unwrap(), config);
+        let small = Config::small(Preset::Tuned, 2).to_json().unwrap();
+        assert!(small.contains("\"first_look\":true"), "{small}");
+        for (section, known) in [("agg", "groups"), ("spgr", "slide")] {
+            let unknown = json.replace(&format!("\"{known}\""), "\"unheard_of\"");
+            let error = Config::from_json(&unknown).unwrap_err().to_string();
+            assert!(error.contains("unheard_of"), "{section}: {error}");
+        }
     }
 
     #[test]

@@ -1,23 +1,30 @@
-//! Sub-pixel Gaussian reparameterization (paper 3.2; spec 2).
+//! Sub-pixel Gaussian reparameterization (SubSplat 3.2, supplement A.3).
+//!
+//! The presets differ in some keys of [`Spgr`]; choices that neither preset makes belong
+//! to [`SpgrAblations`].
 
 use super::Preset;
 use serde::{Deserialize, Serialize};
 
-/// Sub-pixel Gaussian reparameterization (paper 3.2; spec 2).
+/// Sub-pixel Gaussian reparameterization (SubSplat 3.2, supplement A.3).
+///
+/// The serialised form holds these keys and those of [`SpgrAblations`] side by side,
+/// without nesting.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(from = "FlatKeys", into = "FlatKeys")]
 pub struct Spgr {
-    /// Off: the primaries themselves are rendered (MVSplat).
+    /// False: the primaries themselves are rendered (MVSplat).
     pub enabled: bool,
     /// Form of the two heads.
     pub head: SpgrHead,
     /// Hidden width of the heads (128).
     pub hidden: usize,
-    /// Last layers start at zero: every child begins as the deterministic split.
+    /// The heads' last layers start at zero: every child starts as the even split of its
+    /// parent.
     pub zero_init: bool,
     /// v*: the camera in whose frame children are placed.
     pub primary_view: PrimaryView,
-    /// ρ: bound of the learned offset, in sub-pixels; `None` is unbounded (paper).
+    /// ρ: bound of the learned offset, sub-pixels; `None` is unbounded (paper).
     pub offset_bound: Option<f64>,
     /// β_z: bound of the depth residual (supp.: 0.25).
     pub beta_z: f64,
@@ -25,23 +32,31 @@ pub struct Spgr {
     pub depth_dir: DepthDir,
     /// Unit of β_z.
     pub depth_unit: DepthUnit,
-    /// How a child moves sideways.
-    pub slide: Slide,
     /// λ_s: factor of the child's σ (supp.: 0.60 for all K).
     pub lambda_s: LambdaS,
     /// Soft bound of Δlog s, c·tanh(x/c) (3).
     pub dlog_clamp: f64,
-    /// Where the footprint's Jacobian is taken (supp.: at the child).
-    pub area_at: AreaAt,
-    /// A_min: least footprint σ₁σ₂, target px² (paper: 1/K).
-    pub a_min: AMin,
-    /// How a child that is too small grows.
-    pub a_min_mode: AMinMode,
-    /// Opacity rule.
+    /// Distribution of the parent's opacity over the children.
     pub opacity: OpacityRule,
-    /// δ: colour gain lies in [1 − δ, 1 + δ] (supp.: 0.25).
+    /// δ: the colour gain lies in [1 − δ, 1 + δ] (supp.: 0.25).
     pub delta: f64,
-    /// What the gain multiplies.
+    /// Choices that neither preset makes.
+    pub ablations: SpgrAblations,
+}
+
+/// Choices of the reparameterization that neither preset makes. [`Default`] is the form
+/// of both presets.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SpgrAblations {
+    /// Sideways step of a child.
+    pub slide: Slide,
+    /// Point at which the footprint's Jacobian is taken (supp.: the child).
+    pub area_at: AreaAt,
+    /// A_min: smallest footprint σ₁σ₂, target px² (paper: 1/K).
+    pub a_min: AMin,
+    /// Growth of a child whose footprint is below A_min.
+    pub a_min_mode: AMinMode,
+    /// Operand of the colour gain.
     pub gain_space: GainSpace,
 }
 
@@ -53,19 +68,19 @@ pub enum SpgrHead {
     Mlp2,
     /// (Linear, ReLU, Linear, ReLU, LayerNorm) twice, Linear (PixelGaussian).
     Pg,
-    /// One output layer for all children, told apart by an embedding of their
+    /// One output layer for all children, which differ by an embedding of their
     /// sub-pixel coordinate: any K at inference.
     Coord,
 }
 
-/// v*: in whose frame children are placed.
+/// v*: the camera in whose frame children are placed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PrimaryView {
-    /// The least positive depth among the views that see the parent; the source
-    /// view if none does (paper).
+    /// The view with the smallest positive depth among those that see the parent; the
+    /// source view if none does (paper).
     NearestVisible,
-    /// The view that the parent came from: exact tiling of its pixel.
+    /// The parent's source view: exact tiling of its pixel.
     Source,
 }
 
@@ -73,9 +88,9 @@ pub enum PrimaryView {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum DepthDir {
-    /// The optical axis (both equations).
+    /// The optical axis (both of the paper's equations).
     Axis,
-    /// The viewing ray (the prose): the projection does not move.
+    /// The viewing ray (the paper's prose): the projection does not move.
     Ray,
 }
 
@@ -85,11 +100,11 @@ pub enum DepthDir {
 pub enum DepthUnit {
     /// World units (paper).
     World,
-    /// Of the parent's depth.
+    /// The parent's depth.
     Relative,
 }
 
-/// How a child moves sideways.
+/// Sideways step of a child.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Slide {
@@ -110,7 +125,7 @@ pub enum LambdaS {
 }
 
 impl LambdaS {
-    /// λ_s for `children` children.
+    /// Returns λ_s for `children` children.
     pub fn value(self, children: usize) -> f64 {
         match self {
             LambdaS::Value(v) => v,
@@ -119,17 +134,17 @@ impl LambdaS {
     }
 }
 
-/// Where the footprint's Jacobian is taken.
+/// Point at which the footprint's Jacobian is taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum AreaAt {
-    /// At the child's mean (supp.: "matches our implementation").
+    /// The child's mean (supp.: "matches our implementation").
     Child,
-    /// At the parent's (main text).
+    /// The parent's mean (main text).
     Parent,
 }
 
-/// A_min: least footprint σ₁σ₂.
+/// A_min: smallest footprint σ₁σ₂.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum AMin {
@@ -143,23 +158,23 @@ pub enum AMin {
     Off,
 }
 
-/// How a child that is too small grows.
+/// Growth of a child whose footprint is below A_min.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum AMinMode {
     /// All three σ by √(A_min/A), at most 50-fold.
     Iso,
-    /// The two axes that make the footprint.
+    /// The two axes that determine the footprint.
     TwoAxis,
 }
 
-/// How the parent's opacity is shared.
+/// Distribution of the parent's opacity over the children.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum OpacityRule {
     /// α_k = α_p·softmax(ℓ_k − ln A_k): sums to the parent's (paper).
     Linear,
-    /// Conserves Σ Ã_k τ_k, τ = −ln(1 − α), Ã with the low-pass (spec 2.8).
+    /// Conserves Σ Ã_k τ_k, τ = −ln(1 − α), Ã with the low-pass.
     OpticalDepth,
     /// 1 − (1 − α_p)^{w_k}: conserves transmittance through all children.
     Transmittance,
@@ -169,7 +184,7 @@ pub enum OpacityRule {
     None,
 }
 
-/// What the colour gain multiplies.
+/// Operand of the colour gain.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum GainSpace {
@@ -191,15 +206,11 @@ impl Spgr {
             beta_z: 0.25,
             depth_dir: DepthDir::Axis,
             depth_unit: DepthUnit::World,
-            slide: Slide::ZConst,
             lambda_s: LambdaS::Value(0.60),
             dlog_clamp: 3.0,
-            area_at: AreaAt::Child,
-            a_min: AMin::OverK,
-            a_min_mode: AMinMode::Iso,
             opacity: OpacityRule::Linear,
             delta: 0.25,
-            gain_space: GainSpace::Sh,
+            ablations: SpgrAblations::default(),
         };
         match preset {
             Preset::Paper => paper,
@@ -213,6 +224,96 @@ impl Spgr {
                 opacity: OpacityRule::OpticalDepth,
                 ..paper
             },
+        }
+    }
+}
+
+impl Default for SpgrAblations {
+    fn default() -> Self {
+        Self {
+            slide: Slide::ZConst,
+            area_at: AreaAt::Child,
+            a_min: AMin::OverK,
+            a_min_mode: AMinMode::Iso,
+            gain_space: GainSpace::Sh,
+        }
+    }
+}
+
+/// The serialised form of [`Spgr`]: all keys on one level. Weight files and training
+/// configurations hold it, so keys and their order stay as they are.
+#[derive(Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, rename = "Spgr")]
+struct FlatKeys {
+    enabled: bool,
+    head: SpgrHead,
+    hidden: usize,
+    zero_init: bool,
+    primary_view: PrimaryView,
+    offset_bound: Option<f64>,
+    beta_z: f64,
+    depth_dir: DepthDir,
+    depth_unit: DepthUnit,
+    slide: Slide,
+    lambda_s: LambdaS,
+    dlog_clamp: f64,
+    area_at: AreaAt,
+    a_min: AMin,
+    a_min_mode: AMinMode,
+    opacity: OpacityRule,
+    delta: f64,
+    gain_space: GainSpace,
+}
+
+impl From<FlatKeys> for Spgr {
+    fn from(k: FlatKeys) -> Self {
+        Self {
+            enabled: k.enabled,
+            head: k.head,
+            hidden: k.hidden,
+            zero_init: k.zero_init,
+            primary_view: k.primary_view,
+            offset_bound: k.offset_bound,
+            beta_z: k.beta_z,
+            depth_dir: k.depth_dir,
+            depth_unit: k.depth_unit,
+            lambda_s: k.lambda_s,
+            dlog_clamp: k.dlog_clamp,
+            opacity: k.opacity,
+            delta: k.delta,
+            ablations: SpgrAblations {
+                slide: k.slide,
+                area_at: k.area_at,
+                a_min: k.a_min,
+                a_min_mode: k.a_min_mode,
+                gain_space: k.gain_space,
+            },
+        }
+    }
+}
+
+impl From<Spgr> for FlatKeys {
+    fn from(s: Spgr) -> Self {
+        let a = s.ablations;
+        Self {
+            enabled: s.enabled,
+            head: s.head,
+            hidden: s.hidden,
+            zero_init: s.zero_init,
+            primary_view: s.primary_view,
+            offset_bound: s.offset_bound,
+            beta_z: s.beta_z,
+            depth_dir: s.depth_dir,
+            depth_unit: s.depth_unit,
+            slide: a.slide,
+            lambda_s: s.lambda_s,
+            dlog_clamp: s.dlog_clamp,
+            area_at: a.area_at,
+            a_min: a.a_min,
+            a_min_mode: a.a_min_mode,
+            opacity: s.opacity,
+            delta: s.delta,
+            gain_space: a.gain_space,
         }
     }
 }

@@ -309,7 +309,7 @@ impl<'a> Players<'a> {
             (Some(_), Some(model)) => {
                 let mut views = views_of(&prepared.inputs, near_far)?;
                 if prepared.look {
-                    views = model.look(&views).map_err(pipeline::Error::from)?;
+                    views = model.estimate_depth_range(&views).map_err(pipeline::Error::from)?;
                     near_far = views.near_far[0][0];
                 }
                 let output = model.encode(&views).map_err(pipeline::Error::from)?;

@@ -1,10 +1,9 @@
-//! What a weight file must hold: names and shapes of every tensor of a model, and how
-//! files of other programs name them. Used by `subsplat-convert`.
+//! Names and shapes of every tensor of a model, and the names of the same tensors in files
+//! of other programs. `subsplat-convert` uses them.
 //!
-//! Lightning calls MVSplat's tensors `encoder.…`; so do converted files. UniMatch's
-//! GMDepth, from which MVSplat starts its CNN and transformer, has them under
-//! `backbone.…` and `transformer.…` (MVSplat loads these two into its `backbone` and
-//! leaves the rest of GMDepth behind). LPIPS' trunk is torchvision's VGG16
+//! Lightning and converted files name MVSplat's tensors `encoder.…`. UniMatch's GMDepth
+//! names them `backbone.…` and `transformer.…`; MVSplat's CNN and transformer start from
+//! these two and use nothing else of GMDepth. LPIPS' trunk is torchvision's VGG16
 //! (`features.N`) or the `lpips` package's copy of it (`net.sliceK.N`).
 
 use super::lpips::{BLOCKS, Lpips};
@@ -22,29 +21,29 @@ pub type Shapes = BTreeMap<String, Vec<usize>>;
 
 /// Lightning's name of the encoder inside the whole module.
 const ENCODER: &str = "encoder.";
-/// Our own backbone.
+/// Prefix of the small backbone.
 const SMALL_PREFIX: &str = "small.";
-/// MVSplat's CNN and transformer, as converted files name them.
+/// Prefixes of MVSplat's CNN and transformer in converted files.
 const CNN_AND_TRANSFORMER: [&str; 2] =
     ["encoder.backbone.backbone.", "encoder.backbone.transformer."];
-/// What [`guess_config`] tries for r, in this order.
+/// Candidates of [`guess_config`] for r, in this order.
 const UPSCALES: [usize; 4] = [2, 4, 3, 1];
 
-/// What a weight file is for.
+/// Purpose of a weight file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
     /// MVSplat's encoder, whole.
     Mvsplat,
     /// A whole model with SubSplat's tensors, on MVSplat or on the small backbone.
     Subsplat,
-    /// The start of MVSplat's CNN and transformer (UniMatch's GMDepth).
+    /// The initial values of MVSplat's CNN and transformer (UniMatch's GMDepth).
     Gmdepth,
     /// The perceptual distance.
     Lpips,
 }
 
 impl Kind {
-    /// As the command line spells it.
+    /// Returns the spelling on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Self::Mvsplat => "mvsplat",
@@ -54,7 +53,7 @@ impl Kind {
         }
     }
 
-    /// The kind of a file with these names, if any name tells.
+    /// Returns the kind of a file with these names; `None` if no name is characteristic.
     pub fn recognise<'a>(names: impl IntoIterator<Item = &'a str>) -> Option<Self> {
         let (mut predictor, mut start, mut lpips) = (false, false, false);
         for name in names {
@@ -76,7 +75,7 @@ impl Kind {
         }
     }
 
-    /// The name that a converted file has for a tensor that the source calls `name`.
+    /// Returns the name in a converted file of the source's tensor `name`.
     pub fn canonical(self, name: &str) -> String {
         let plain = name.strip_prefix(ENCODER).unwrap_or(name);
         match self {
@@ -95,9 +94,9 @@ impl Kind {
         }
     }
 
-    /// Whether files of this kind usually hold `name` although no model here needs it:
-    /// what GMDepth and MVSplat do after the transformer, VGG16's classifier, the
-    /// constants and second names of the `lpips` package.
+    /// Returns true if files of this kind usually hold `name` although no model here needs
+    /// it: GMDepth's layers after the transformer, VGG16's classifier, the constants and
+    /// second names of the `lpips` package.
     pub fn leaves_out(self, name: &str) -> bool {
         let prefixes: &[&str] = match self {
             Self::Mvsplat | Self::Subsplat => &[],
@@ -123,10 +122,10 @@ fn vgg_name(name: &str) -> Option<String> {
     Some(format!("net.slice{}.{index}.{part}", block + 1))
 }
 
-/// Every tensor of a file of this kind, under its canonical name.
+/// Returns every tensor of a file of this kind, under its canonical name.
 ///
 /// # Errors
-/// A configuration out of range; one of the small backbone where MVSplat's is meant.
+/// The configuration is invalid, or has the small backbone where `kind` needs MVSplat's.
 pub fn expected(kind: Kind, config: &Config) -> Result<Shapes> {
     let mvsplat = matches!(config.backbone, Backbone::Mvsplat(_));
     if matches!(kind, Kind::Mvsplat | Kind::Gmdepth) && !mvsplat {
@@ -145,9 +144,9 @@ pub fn expected(kind: Kind, config: &Config) -> Result<Shapes> {
     Ok(all.filter(|(name, _)| wanted(name)).collect())
 }
 
-/// The configuration of a model with these tensors (canonical names), where the file
-/// does not say it: the preset and r whose tensors fit best, `tuned` and 2 first; the
-/// same without SubSplat's tensors, as [`crate::pipeline`] does.
+/// Guesses the configuration of a model with these tensors (canonical names), for a file
+/// without one: the preset and r whose tensors fit best, `tuned` and 2 first. Without
+/// SubSplat's tensors the result is `tuned` and 2, as in [`crate::pipeline`].
 ///
 /// # Errors
 /// None in practice: presets are valid.
@@ -173,27 +172,27 @@ pub fn guess_config(shapes: &Shapes) -> Result<Config> {
     Ok(best.1)
 }
 
-/// Names and shapes that `build` asks for.
+/// Names and shapes of the tensors that `build` requests.
 fn recorded(build: impl FnOnce(VarBuilder) -> Result<()>) -> Result<Shapes> {
-    let asked = Arc::new(Mutex::new(Shapes::new()));
-    let recorder = Recorder(Arc::clone(&asked));
+    let requested = Arc::new(Mutex::new(Shapes::new()));
+    let recorder = Recorder(Arc::clone(&requested));
     build(VarBuilder::from_backend(Box::new(recorder), DType::F32, Device::Cpu))?;
-    let shapes = std::mem::take(&mut *asked.lock().unwrap_or_else(PoisonError::into_inner));
+    let shapes = std::mem::take(&mut *requested.lock().unwrap_or_else(PoisonError::into_inner));
     Ok(shapes)
 }
 
-/// Hands out zeros that take no memory and writes down who asked.
+/// Records every request and answers with zeros that take no memory.
 struct Recorder(Arc<Mutex<Shapes>>);
 
 impl SimpleBackend for Recorder {
     fn get(&self, s: Shape, name: &str, _: Init, dtype: DType, device: &Device) -> Result<Tensor> {
-        let mut asked = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        asked.insert(name.to_owned(), s.dims().to_vec());
+        let mut requested = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        requested.insert(name.to_owned(), s.dims().to_vec());
         Tensor::zeros((), dtype, device)?.broadcast_as(s)
     }
 
     fn get_unchecked(&self, name: &str, _: DType, _: &Device) -> Result<Tensor> {
-        bail!("weight `{name}`: expected a model that says its shape, got one that does not")
+        bail!("cannot list weight `{name}`: it was requested without a shape")
     }
 
     fn contains_tensor(&self, _: &str) -> bool {
@@ -268,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn configurations_are_told_from_shapes() {
+    fn configurations_are_guessed_from_shapes() {
         for small in [false, true] {
             let make = if small { Config::small } else { Config::re10k };
             for (preset, upscale) in [(Preset::Tuned, 2), (Preset::Paper, 4), (Preset::Tuned, 3)] {

@@ -1,19 +1,19 @@
-//! Whether this encoder, with the weights given, computes what a reference computed:
-//! the engine of `subsplat compare`.
+//! Comparison of the encoder with a reference, tensor by tensor: the engine of
+//! `subsplat compare`.
 //!
 //! The reference file holds inputs (`in.image` `[B, V, 3, H, W]`, `in.extrinsics`
-//! `[B, V, 4, 4]` camera to world, `in.intrinsics` `[B, V, 3, 3]` over the picture's
-//! size, `in.near`, `in.far` `[B, V]`) and any stages and outputs under the names that
-//! the encoder traces (`cnn.conv1` … `out.opacities`).
+//! `[B, V, 4, 4]` camera to world, `in.intrinsics` `[B, V, 3, 3]` over the image's size,
+//! `in.near`, `in.far` `[B, V]`). It also holds stages and outputs under the names of the
+//! encoder's trace (`cnn.conv1` … `out.opacities`).
 
 use super::backbone::Mvsplat;
-use super::floors::{ALLOWANCE, floor};
+use super::noise_floors::{ALLOWANCE, noise_floor};
 use super::primaries::primaries;
 use super::trace::Trace;
 use super::weights::{Weights, read_tensors};
 use super::{Primaries, Views};
 use crate::camera::{Camera, Intrinsics};
-use crate::config::{Backbone, Mvsplat as Settings, Primaries as Ours, ShFrame};
+use crate::config::{Backbone, Mvsplat as Settings, Primaries as PrimariesSettings, ShFrame};
 use candle_core::{Error, Result, Tensor, bail};
 use glam::Mat4;
 use serde::Serialize;
@@ -23,17 +23,17 @@ use std::path::Path;
 /// One tensor of the reference file.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Row {
-    /// Its name; `1/name` where disparity is compared.
+    /// Its name; `1/name` for the disparity of a depth.
     pub tensor: String,
     /// Largest |ours − reference|.
     pub max_abs: f32,
-    /// The same over the largest |reference|.
+    /// `max_abs` over the largest |reference|.
     pub relative: f32,
     /// Largest `relative` that passes: ten times the noise floor.
     pub allowed: f32,
-    /// Whether it passes.
+    /// True if `relative` is at most `allowed`.
     pub ok: bool,
-    /// Why not, where numbers do not say it (another shape).
+    /// Reason of a failure without numbers (another shape).
     pub note: Option<String>,
 }
 
@@ -49,7 +49,7 @@ pub struct Report {
 }
 
 impl Report {
-    /// Whether something was compared and every row passes.
+    /// Returns true if there are rows and every row passes.
     pub fn ok(&self) -> bool {
         !self.rows.is_empty() && self.rows.iter().all(|r| r.ok)
     }
@@ -58,18 +58,19 @@ impl Report {
 /// Runs the encoder on the file's inputs and compares every tensor that both have.
 ///
 /// # Errors
-/// A file that cannot be read, inputs missing or malformed, weights that do not fit.
+/// The file is not readable, inputs are missing or malformed, or weights do not fit.
 pub fn compare(weights: &Weights, reference: &Path) -> Result<Report> {
     let (tensors, _) = read_tensors(reference).map_err(Error::wrap)?;
     let settings = match weights.config().map(|c| &c.backbone) {
         None => Settings::re10k(),
-        // The reference is MVSplat's, whatever frame the weights' colours are rendered in.
+        // The reference has MVSplat's SH frame; the weights may name another one.
         Some(Backbone::Mvsplat(settings)) => {
-            let primaries = Ours { sh_frame: ShFrame::Mvsplat, ..settings.primaries.clone() };
+            let primaries =
+                PrimariesSettings { sh_frame: ShFrame::Mvsplat, ..settings.primaries.clone() };
             Settings { primaries, ..settings.clone() }
         }
         Some(Backbone::Small(_)) => {
-            bail!("compare: expected weights of an MVSplat backbone, got the small one")
+            bail!("compare: expected weights of an MVSplat backbone, got the small backbone's")
         }
     };
     let encoder = Mvsplat::new(&settings, weights.builder())?;
@@ -78,10 +79,10 @@ pub fn compare(weights: &Weights, reference: &Path) -> Result<Report> {
     Ok(report)
 }
 
-/// [`compare`] with a model and tensors in memory.
+/// Does the same as [`compare`] with a model and tensors in memory.
 ///
 /// # Errors
-/// Inputs missing or malformed.
+/// Inputs are missing or malformed.
 pub fn compare_encoder(
     encoder: &Mvsplat,
     settings: &Settings,
@@ -90,7 +91,7 @@ pub fn compare_encoder(
     let views = views(reference)?;
     let mut rows = Vec::new();
     let mut seen = Vec::new();
-    let mut look = |name: &str, ours: &Tensor| -> Result<()> {
+    let mut compare_stage = |name: &str, ours: &Tensor| -> Result<()> {
         if let Some(theirs) = reference.get(name) {
             rows.push(row(name, ours, theirs)?);
             if name == "gauss.depths" {
@@ -100,7 +101,7 @@ pub fn compare_encoder(
         }
         Ok(())
     };
-    let mut trace = Trace::to(&mut look);
+    let mut trace = Trace::to(&mut compare_stage);
     let out = encoder.forward(&views, &mut trace)?;
     let p = primaries(&out, &views, &settings.primaries, &mut trace)?;
     trace_outputs(&p, &mut trace)?;
@@ -117,7 +118,7 @@ fn trace_outputs(p: &Primaries, trace: &mut Trace<'_>) -> Result<()> {
 }
 
 fn row(name: &str, ours: &Tensor, theirs: &Tensor) -> Result<Row> {
-    let allowed = ALLOWANCE * floor(name);
+    let allowed = ALLOWANCE * noise_floor(name);
     let tensor = name.to_owned();
     if ours.dims() != theirs.dims() {
         let note = format!("expected shape {:?}, got {:?}", theirs.dims(), ours.dims());
@@ -126,7 +127,7 @@ fn row(name: &str, ours: &Tensor, theirs: &Tensor) -> Result<Row> {
         return Ok(row);
     }
     let (a, b) = (ours.flatten_all()?.to_vec1::<f32>()?, theirs.flatten_all()?.to_vec1::<f32>()?);
-    // `max` would drop a NaN; `fold` with this keeps it.
+    // `f32::max` ignores NaN; this function keeps it.
     let worst = |m: f32, v: f32| if v > m || v.is_nan() { v } else { m };
     let max_abs = a.iter().zip(&b).map(|(a, b)| (a - b).abs()).fold(0.0, worst);
     let size = b.iter().map(|b| b.abs()).fold(0.0, worst);
@@ -134,10 +135,10 @@ fn row(name: &str, ours: &Tensor, theirs: &Tensor) -> Result<Row> {
     Ok(Row { tensor, max_abs, relative, allowed, ok: relative <= allowed, note: None })
 }
 
-/// The inputs of a reference file.
+/// Returns the inputs of a reference file.
 ///
 /// # Errors
-/// A tensor is missing or has another shape; a camera is refused.
+/// A tensor is missing or has another shape; a camera is invalid.
 pub fn views(tensors: &BTreeMap<String, Tensor>) -> Result<Views> {
     let input = |name: &str| match tensors.get(name) {
         Some(t) => Ok(t),
@@ -176,7 +177,7 @@ mod tests {
     use candle_core::Device;
 
     #[test]
-    fn what_is_not_a_number_never_passes() -> Result<()> {
+    fn nan_never_passes() -> Result<()> {
         let t = |v: [f32; 3]| Tensor::new(&v, &Device::Cpu);
         let fine = t([1.0, -2.0, 0.5])?;
         assert!(row("x", &fine, &fine)?.ok);

@@ -1,11 +1,12 @@
-//! Attribute embeddings of the primaries (SubSplat A.2; spec 1.1):
+//! Attribute embeddings of the primaries (SubSplat A.2):
 //! z^g = W_g(φ_x(μ) + φ_s(s) + φ_q(q) + φ_α(α)),   z^a = φ_c(vec(h)),   both `[n, E]`.
 //!
-//! `pg`: φ = (Linear, ReLU, LayerNorm) twice. `lite`: φ = Linear to 32, GELU, and
-//! W_g one matrix over the four hidden vectors side by side (which equals the sum of
-//! four linear maps), φ_c through 64, a LayerNorm at the end of each.
+//! * `pg`: φ is (Linear, ReLU, LayerNorm) twice.
+//! * `lite`: φ is Linear to 32 and GELU. W_g is one matrix over the four hidden vectors,
+//!   which equals the sum of four linear maps; φ_c has 64 hidden units. A LayerNorm follows
+//!   each.
 
-use super::geometry::{Frames, ParentChunk, canonical};
+use super::geometry::{Frames, ParentChunk};
 use super::mlp::{Block2, LayerNorm, affine, gelu, linear, xavier};
 use crate::config::{AlphaInput, AnchorFrame, Embed, EmbedMlp, MuInput, ScaleInput};
 use crate::ops::attributes::{Attributes, attributes};
@@ -19,14 +20,14 @@ const LITE_HIDDEN: usize = 32;
 const LITE_HIDDEN_COLOUR: usize = 64;
 /// Clip of the opacity logit.
 const LOGIT_MAX: f64 = 6.0;
-/// Least depth that a coordinate is divided by or a logarithm taken of, world units.
+/// Smallest divisor of a coordinate and smallest argument of ln z, world units.
 const Z_MIN: f64 = 1e-3;
-/// Bound of x/z and y/z: a parent beside a camera that is not its own.
+/// Bound of x/z and y/z: a parent can lie beside a camera that is not its source.
 const SLOPE_MAX: f64 = 100.0;
-/// Least σ of which a logarithm is taken, world units.
+/// Smallest argument of ln σ, world units.
 const SCALE_MIN: f64 = 1e-12;
 
-/// Numbers per attribute in the order x, s, q, a.
+/// Components of each attribute, in the order x, s, q, a.
 const WIDTHS: [(&str, usize); 4] = [("x", 3), ("s", 3), ("q", 4), ("a", 1)];
 
 #[derive(Clone, Debug)]
@@ -45,6 +46,16 @@ enum Mlps {
     },
 }
 
+/// One geometry and one appearance descriptor of each parent of a chunk: the embeddings
+/// z^g and z^a, or the aggregated features f^g and f^a.
+#[derive(Clone, Debug)]
+pub struct Descriptors {
+    /// `[n, E]`.
+    pub geometry: Tensor,
+    /// `[n, E]`.
+    pub appearance: Tensor,
+}
+
 /// The embeddings' parameters.
 #[derive(Clone, Debug)]
 pub struct Embeddings {
@@ -53,7 +64,10 @@ pub struct Embeddings {
 }
 
 impl Embeddings {
-    /// Parameters `x`, `s`, `q`, `a`, `c` and `w_g`; `sh` is the length of vec(h).
+    /// Reads the parameters `x`, `s`, `q`, `a`, `c` and `w_g`; `sh` is the length of vec(h).
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
     pub fn new(config: &Embed, sh: usize, vb: VarBuilder) -> Result<Self> {
         let e = config.dim;
         let relu = candle_nn::init::DEFAULT_KAIMING_UNIFORM;
@@ -85,10 +99,10 @@ impl Embeddings {
         Ok(Self { config: config.clone(), mlps })
     }
 
-    /// Conditioned attributes μ, s, q, α side by side, `[n, 11]` (spec 1.1).
+    /// Returns the conditioned attributes μ, s, q, α side by side, `[n, 11]`.
     ///
     /// # Errors
-    /// Whatever candle says.
+    /// Those of candle.
     pub fn attributes(&self, parents: &ParentChunk, frames: &Frames) -> Result<Tensor> {
         let (c, source) = (&self.config, &frames.0[parents.source]);
         let rules = Attributes {
@@ -109,49 +123,11 @@ impl Embeddings {
         attributes(&parents.rows()?, rules)
     }
 
-    /// [`Embeddings::attributes`] in tensor operations, one tensor each: their reference
-    /// in tests. μ `[n,3]`, s `[n,3]`, q `[n,4]`, α `[n,1]`.
-    pub fn inputs(&self, parents: &ParentChunk, frames: &Frames) -> Result<[Tensor; 4]> {
-        let source = &frames.0[parents.source];
-        let frame = match self.config.anchor_frame {
-            AnchorFrame::World => None,
-            AnchorFrame::SrcCam => Some(source),
-            AnchorFrame::View0 => Some(&frames.0[0]),
-        };
-        let (mean, quat) = match frame {
-            None => (parents.means.clone(), parents.quats_wxyz.clone()),
-            Some(f) => (f.to_camera(&parents.means)?, f.quat_to_camera(&parents.quats_wxyz)?),
-        };
-        let mean = match self.config.mu {
-            MuInput::Raw => mean,
-            MuInput::RayLogz => {
-                let z = mean.narrow(1, 2, 1)?.maximum(Z_MIN)?;
-                let slopes = mean.narrow(1, 0, 2)?.broadcast_div(&z)?;
-                Tensor::cat(&[&slopes.clamp(-SLOPE_MAX, SLOPE_MAX)?, &z.log()?], 1)?
-            }
-        };
-        let scale = match self.config.scale {
-            ScaleInput::Raw => parents.scales.clone(),
-            ScaleInput::LogPx => {
-                let z = source.to_camera(&parents.means)?.narrow(1, 2, 1)?.maximum(Z_MIN)?;
-                let fx = f64::from(source.camera.intrinsics.fx);
-                let log = parents.scales.maximum(SCALE_MIN)?.log()?;
-                log.broadcast_sub(&z.log()?.affine(1.0, -fx.ln())?)?
-            }
-        };
-        let alpha = match self.config.alpha {
-            AlphaInput::Raw => parents.opacities.clone(),
-            AlphaInput::Logit => {
-                let low = 1.0 / (1.0 + LOGIT_MAX.exp());
-                let p = parents.opacities.clamp(low, 1.0 - low)?;
-                (p.log()? - p.affine(-1.0, 1.0)?.log()?)?
-            }
-        };
-        Ok([mean, scale, canonical(&quat)?, alpha])
-    }
-
-    /// z^g and z^a, `[n, E]`.
-    pub fn forward(&self, parents: &ParentChunk, frames: &Frames) -> Result<(Tensor, Tensor)> {
+    /// Returns z^g and z^a, `[n, E]`.
+    ///
+    /// # Errors
+    /// Shapes do not fit.
+    pub fn forward(&self, parents: &ParentChunk, frames: &Frames) -> Result<Descriptors> {
         let all = self.attributes(parents, frames)?;
         match &self.mlps {
             Mlps::Pg { geometry, w_g, colour } => {
@@ -162,20 +138,23 @@ impl Embeddings {
                     sum = moves::sum(&sum, &next)?;
                     first += width;
                 }
-                Ok((affine(w_g, &sum)?, colour.forward(&parents.sh)?))
+                Ok(Descriptors {
+                    geometry: affine(w_g, &sum)?,
+                    appearance: colour.forward(&parents.sh)?,
+                })
             }
             Mlps::Lite { geometry, w_g, ln_g, colour, ln_c } => {
                 let hidden = affine(&side_by_side(geometry)?, &all)?;
-                let z_g = ln_g.forward(&affine(w_g, &gelu(&hidden)?)?)?;
+                let geometry = ln_g.forward(&affine(w_g, &gelu(&hidden)?)?)?;
                 let hidden = gelu(&affine(&colour[0], &parents.sh)?)?;
-                let z_a = affine(&colour[1], &hidden)?;
-                Ok((z_g, ln_c.forward(&z_a)?))
+                let appearance = ln_c.forward(&affine(&colour[1], &hidden)?)?;
+                Ok(Descriptors { geometry, appearance })
             }
         }
     }
 }
 
-/// One layer that gives the outputs of all, side by side, of their inputs side by side.
+/// One block-diagonal layer: all inputs side by side to all outputs side by side.
 fn side_by_side(layers: &[Linear]) -> Result<Linear> {
     let widths = layers.iter().map(|l| l.weight().dim(1)).collect::<Result<Vec<_>>>()?;
     let all: usize = widths.iter().sum();

@@ -1,8 +1,8 @@
-//! Cameras as tensors: frames of the context views, projection of parents into all
-//! of them, and quaternions. Scalar twin and conventions: [`crate::camera`].
+//! Cameras as tensors: context views, projection of parents into all of them, and
+//! quaternions. Scalar version and conventions: [`crate::camera`].
 //!
-//! Points are rows `[n, 3]`, so that world to camera is (p − o)·R with R the
-//! rotation of `world_from_camera`.
+//! Points are rows `[n, 3]`: world to camera is (p − o)·R, with R the rotation of
+//! `world_from_camera`.
 
 use crate::abi::VISIBLE_Z_MIN;
 use crate::camera::Camera;
@@ -12,18 +12,18 @@ use crate::ops::columns::columns;
 use crate::ops::linear::linear;
 use candle_core::{D, DType, Device, Result, Tensor, bail};
 
-/// Picture position given to points behind a camera: outside by more than any
-/// learned offset brings back.
+/// Image position of points behind a camera: farther outside than any learned offset
+/// reaches.
 const BEHIND: f64 = -1e3;
 /// Largest sampling position under [`MaskMode::PgClamp`] (PixelGaussian).
 const CLAMP_MAX: f64 = 0.9999;
 
-/// A run of parents that share their source view.
+/// Consecutive parents of one source view.
 #[derive(Clone, Debug)]
 pub struct ParentChunk {
-    /// Index of the first in the scene.
+    /// Index of the first parent in the scene.
     pub first: usize,
-    /// Index of the view that all of them come from.
+    /// Index of the source view.
     pub source: usize,
     /// `[n, 3]`, world.
     pub means: Tensor,
@@ -33,33 +33,36 @@ pub struct ParentChunk {
     pub scales: Tensor,
     /// `[n, 1]`.
     pub opacities: Tensor,
-    /// `[n, 3·D]`, colour-major, in the frame that the embedding reads.
+    /// `[n, 3·D]`, colour-major, in the frame of [`crate::config::Embed::sh`].
     pub sh: Tensor,
 }
 
 impl ParentChunk {
-    /// `[n, 11]`: packed, lanes in [`crate::abi`].
+    /// Returns the packed rows `[n, 11]`; columns as in [`crate::abi`].
+    ///
+    /// # Errors
+    /// Shapes do not fit one another.
     pub fn rows(&self) -> Result<Tensor> {
-        let most = columns(&self.means, &self.quats_wxyz, Some(&self.scales))?;
-        columns(&most, &self.opacities, None)
+        let all_but_opacity = columns(&self.means, &self.quats_wxyz, Some(&self.scales))?;
+        columns(&all_but_opacity, &self.opacities, None)
     }
 }
 
 /// One context view.
 #[derive(Clone, Debug)]
 pub struct Frame {
-    /// Its camera, pixels of the input picture.
+    /// Its camera; intrinsics in pixels of the input image.
     pub camera: Camera,
     /// `[3, 3]`: rows of R, world from camera.
     pub rotation: Tensor,
-    /// `[1, 3]`: the eye, world.
+    /// `[1, 3]`: the camera's centre, world.
     pub position: Tensor,
-    /// `[4, 4]`: q·turn = conj(q_R) ⊗ q for rows q wxyz.
-    pub turn: Tensor,
+    /// `[4, 4]`: q·M = conj(q_R) ⊗ q for rows q wxyz.
+    pub quat_from_world: Tensor,
 }
 
-/// x·m of `x` `[n, k]` and `m` `[k, k]`. f32 goes round candle's product, which asks the
-/// system for the number of processors each time.
+/// x·m of `x` `[n, k]` and `m` `[k, k]`. f32 does not use candle's product, which queries
+/// the operating system for the number of processors on every call.
 fn times(x: &Tensor, m: &Tensor) -> Result<Tensor> {
     if x.dtype() != DType::F32 {
         return x.matmul(m);
@@ -68,12 +71,15 @@ fn times(x: &Tensor, m: &Tensor) -> Result<Tensor> {
 }
 
 impl Frame {
-    /// Tensors of `camera`.
+    /// Returns the tensors of `camera`.
+    ///
+    /// # Errors
+    /// Those of candle.
     pub fn new(camera: Camera, dtype: DType, device: &Device) -> Result<Self> {
         let r = camera.rotation();
         let rows: Vec<f32> = (0..3).flat_map(|i| r.row(i).to_array()).collect();
         let q = glam::Quat::from_mat3(&r).normalize();
-        let turn: Vec<f32> = left_product([q.w, -q.x, -q.y, -q.z]).to_vec();
+        let quat_from_world = left_product([q.w, -q.x, -q.y, -q.z]).to_vec();
         let tensor = |v: Vec<f32>, shape: (usize, usize)| {
             Tensor::from_vec(v, shape, device)?.to_dtype(dtype)
         };
@@ -81,11 +87,11 @@ impl Frame {
             camera,
             rotation: tensor(rows, (3, 3))?,
             position: tensor(camera.position().to_array().to_vec(), (1, 3))?,
-            turn: tensor(turn, (4, 4))?.t()?.contiguous()?,
+            quat_from_world: tensor(quat_from_world, (4, 4))?.t()?.contiguous()?,
         })
     }
 
-    /// The same in numbers.
+    /// Returns the same numbers for the fused op of the attributes.
     pub fn numbers(&self) -> attributes::Frame {
         let r = self.camera.rotation();
         let q = glam::Quat::from_mat3(&r).normalize();
@@ -97,14 +103,20 @@ impl Frame {
         }
     }
 
-    /// World points `[n, 3]` to camera coordinates.
+    /// Maps world points `[n, 3]` to camera coordinates.
+    ///
+    /// # Errors
+    /// Another shape.
     pub fn to_camera(&self, means: &Tensor) -> Result<Tensor> {
         times(&means.broadcast_sub(&self.position)?, &self.rotation)
     }
 
-    /// World quaternions `[n, 4]` to this camera's frame.
+    /// Maps world quaternions `[n, 4]` wxyz to this camera's frame.
+    ///
+    /// # Errors
+    /// Another shape.
     pub fn quat_to_camera(&self, quats_wxyz: &Tensor) -> Result<Tensor> {
-        times(quats_wxyz, &self.turn)
+        times(quats_wxyz, &self.quat_from_world)
     }
 }
 
@@ -116,16 +128,22 @@ pub struct Frames(
 );
 
 impl Frames {
-    /// Tensors of all `cameras`.
+    /// Returns the tensors of all `cameras`.
+    ///
+    /// # Errors
+    /// Those of candle.
     pub fn new(cameras: &[Camera], dtype: DType, device: &Device) -> Result<Self> {
         let frames = cameras.iter().map(|c| Frame::new(*c, dtype, device));
         Ok(Self(frames.collect::<Result<_>>()?))
     }
 
-    /// Picture positions `[n, V, m, 2]` in units of each picture's size, and camera z
-    /// `[n, V, m]`, of world points `[n, m, 3]`. Under [`MaskMode::Renorm`] points
-    /// behind a camera lie far outside; under [`MaskMode::PgClamp`] positions are
-    /// clamped to [0, 0.9999].
+    /// Projects world points `[n, m, 3]` into every view. Returns image positions
+    /// `[n, V, m, 2]`, in units of each image's size, and camera z `[n, V, m]`. Under
+    /// [`MaskMode::Renorm`] points behind a camera lie far outside; under
+    /// [`MaskMode::PgClamp`] positions are clamped to [0, 0.9999].
+    ///
+    /// # Errors
+    /// Another shape.
     pub fn project(&self, points: &Tensor, mask: MaskMode) -> Result<(Tensor, Tensor)> {
         let (n, m, _) = points.dims3()?;
         let flat = points.reshape((n * m, 3))?;
@@ -152,8 +170,11 @@ impl Frames {
         Ok((Tensor::stack(&positions, 1)?, Tensor::stack(&depths, 1)?))
     }
 
-    /// Depth maps `[V, H, W]` made of the parents' own camera z in their source
-    /// views, `means` `[V·H·W·G, 3]`: the nearest of the G at each pixel.
+    /// Returns depth maps `[V, H, W]`: at each pixel the smallest camera z of its G
+    /// parents in their source view. `means`: `[V·H·W·G, 3]`.
+    ///
+    /// # Errors
+    /// The number of parents per view is not a multiple of H·W.
     pub fn depth_maps(&self, means: &Tensor, (height, width): (usize, usize)) -> Result<Tensor> {
         let per_view = means.dim(0)? / self.0.len().max(1);
         if height * width == 0 || !per_view.is_multiple_of(height * width) {
@@ -169,7 +190,7 @@ impl Frames {
     }
 }
 
-/// Rows of L(a) with a ⊗ b = L(a)·b, quaternions wxyz.
+/// Row-major L(a) with a ⊗ b = L(a)·b, quaternions wxyz.
 fn left_product([w, x, y, z]: [f32; 4]) -> [f32; 16] {
     [
         w, -x, -y, -z, //
@@ -179,15 +200,11 @@ fn left_product([w, x, y, z]: [f32; 4]) -> [f32; 16] {
     ]
 }
 
-/// The same rotations with w ≥ 0: `[n, 4]` wxyz.
-pub fn canonical(quats_wxyz: &Tensor) -> Result<Tensor> {
-    let w = quats_wxyz.narrow(1, 0, 1)?;
-    let sign = w.ge(0.0)?.to_dtype(w.dtype())?.affine(2.0, -1.0)?;
-    quats_wxyz.broadcast_mul(&sign)
-}
-
-/// Offsets `[n, m, 3]` turned by the unit quaternions `[n, 4]` wxyz:
+/// Rotates offsets `[n, m, 3]` by unit quaternions `[n, 4]` wxyz:
 /// v + 2·q⃗×(q⃗×v + w·v).
+///
+/// # Errors
+/// Shapes do not fit one another.
 pub fn rotate(quats_wxyz: &Tensor, offsets: &Tensor) -> Result<Tensor> {
     let q = |i: usize| quats_wxyz.narrow(1, i, 1)?.unsqueeze(2);
     let v = |i: usize| offsets.narrow(2, i, 1);
@@ -201,6 +218,6 @@ pub fn rotate(quats_wxyz: &Tensor, offsets: &Tensor) -> Result<Tensor> {
         *c = c.add(&v.broadcast_mul(&w)?)?;
     }
     let outer = cross(&inner)?;
-    let turned = v.iter().zip(&outer).map(|(v, o)| v.add(&o.affine(2.0, 0.0)?));
-    Tensor::cat(&turned.collect::<Result<Vec<_>>>()?, 2)
+    let rotated = v.iter().zip(&outer).map(|(v, o)| v.add(&o.affine(2.0, 0.0)?));
+    Tensor::cat(&rotated.collect::<Result<Vec<_>>>()?, 2)
 }

@@ -1,5 +1,5 @@
-//! Layers that both backbones and the SPGR heads use, under PyTorch's parameter
-//! names and with its initialisation. All have gradients.
+//! Layers of both backbones, with PyTorch's parameter names and initialisation. All have
+//! gradients.
 
 use crate::model::mlp::xavier;
 pub use crate::ops::activation::Activation;
@@ -9,20 +9,34 @@ use crate::ops::{self, norm};
 use candle_core::{Result, Tensor, bail};
 use candle_nn::{Init, VarBuilder};
 
-/// PyTorch's default for weights and biases of Linear and Conv: U(±1/√fan_in).
+/// Returns PyTorch's default for weights and biases of Linear and Conv: U(±1/√fan_in).
 pub fn default_init(fan_in: usize) -> Init {
     let bound = 1.0 / (fan_in.max(1) as f64).sqrt();
     Init::Uniform { lo: -bound, up: bound }
 }
 
+/// Initial values of a layer's parameters.
+#[derive(Clone, Copy, Debug)]
+pub struct LayerInit {
+    /// Of the weight.
+    pub weight: Init,
+    /// Of the bias; `None`: the layer has no bias.
+    pub bias: Option<Init>,
+}
+
+impl LayerInit {
+    /// Weight and bias start at zero.
+    pub const ZERO: Self = Self { weight: Init::Const(0.0), bias: Some(Init::Const(0.0)) };
+}
+
 /// Kernel, stride and padding of a [`Conv2d`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ConvShape {
-    /// Side of the kernel.
+    /// Side of the kernel, px.
     pub kernel: usize,
-    /// Step, both axes.
+    /// Stride of both axes, px.
     pub stride: usize,
-    /// Zeros on every side.
+    /// Zero padding on every side, px.
     pub padding: usize,
 }
 
@@ -36,14 +50,15 @@ impl ConvShape {
     /// 7×7, stride 2, half the size.
     pub const K7S2: Self = Self { kernel: 7, stride: 2, padding: 3 };
 
-    /// The same with another stride.
+    /// Returns the same shape with another stride.
     #[must_use]
     pub const fn stride(self, stride: usize) -> Self {
         Self { stride, ..self }
     }
 }
 
-/// `weight` `[O, C, k, k]`, `bias` `[O]`; `[B, C, H, W]` to `[B, O, H', W']`.
+/// Two-dimensional convolution: `weight` `[O, C, k, k]`, `bias` `[O]`; `[B, C, H, W]` to
+/// `[B, O, H', W']`.
 #[derive(Clone, Debug)]
 pub struct Conv2d {
     weight: Tensor,
@@ -52,25 +67,26 @@ pub struct Conv2d {
 }
 
 impl Conv2d {
-    /// With bias, PyTorch's default initialisation.
+    /// Builds the layer with bias and PyTorch's default initialisation.
     ///
     /// # Errors
     /// A tensor is missing or has another shape.
     pub fn new(c_in: usize, c_out: usize, shape: ConvShape, vb: VarBuilder) -> Result<Self> {
         let init = default_init(c_in * shape.kernel * shape.kernel);
-        Self::with(c_in, c_out, shape, (init, Some(init)), vb)
+        Self::with(c_in, c_out, shape, LayerInit { weight: init, bias: Some(init) }, vb)
     }
 
-    /// Without bias, Kaiming-normal over fan-out (for ReLU), as in ResNets.
+    /// Builds the layer without bias, Kaiming-normal over fan-out (for ReLU), as in ResNets.
     ///
     /// # Errors
     /// A tensor is missing or has another shape.
     pub fn new_no_bias(c_in: usize, c_out: usize, s: ConvShape, vb: VarBuilder) -> Result<Self> {
         let stdev = (2.0 / (c_out * s.kernel * s.kernel) as f64).sqrt();
-        Self::with(c_in, c_out, s, (Init::Randn { mean: 0.0, stdev }, None), vb)
+        let init = LayerInit { weight: Init::Randn { mean: 0.0, stdev }, bias: None };
+        Self::with(c_in, c_out, s, init, vb)
     }
 
-    /// With the given initialisation of weight and, if there is one, bias.
+    /// Builds the layer with the given initialisation.
     ///
     /// # Errors
     /// A tensor is missing or has another shape.
@@ -78,19 +94,19 @@ impl Conv2d {
         c_in: usize,
         c_out: usize,
         shape: ConvShape,
-        init: (Init, Option<Init>),
+        init: LayerInit,
         vb: VarBuilder,
     ) -> Result<Self> {
         let k = shape.kernel;
-        let weight = vb.get_with_hints((c_out, c_in, k, k), "weight", init.0)?;
-        let bias = match init.1 {
+        let weight = vb.get_with_hints((c_out, c_in, k, k), "weight", init.weight)?;
+        let bias = match init.bias {
             Some(init) => Some(vb.get_with_hints(c_out, "bias", init)?),
             None => None,
         };
         Ok(Self { weight, bias, shape })
     }
 
-    /// `[B, C, H, W]` to `[B, O, H', W']`.
+    /// Maps `[B, C, H, W]` to `[B, O, H', W']`.
     ///
     /// # Errors
     /// Another rank or number of channels.
@@ -99,7 +115,7 @@ impl Conv2d {
     }
 }
 
-/// `weight` `[O, C]`, `bias` `[O]`; `[…, C]` to `[…, O]`.
+/// Linear layer: `weight` `[O, C]`, `bias` `[O]`; `[…, C]` to `[…, O]`.
 #[derive(Clone, Debug)]
 pub struct Linear {
     weight: Tensor,
@@ -107,47 +123,43 @@ pub struct Linear {
 }
 
 impl Linear {
-    /// With bias, PyTorch's default initialisation.
+    /// Builds the layer with bias and PyTorch's default initialisation.
     ///
     /// # Errors
     /// A tensor is missing or has another shape.
     pub fn new(c_in: usize, c_out: usize, vb: VarBuilder) -> Result<Self> {
         let init = default_init(c_in);
-        Self::with(c_in, c_out, (init, Some(init)), vb)
+        Self::with(c_in, c_out, LayerInit { weight: init, bias: Some(init) }, vb)
     }
 
-    /// Without bias, Xavier-uniform, as in transformers.
+    /// Builds the layer without bias, Xavier-uniform, as in transformers.
     ///
     /// # Errors
     /// A tensor is missing or has another shape.
     pub fn new_no_bias(c_in: usize, c_out: usize, vb: VarBuilder) -> Result<Self> {
-        Self::with(c_in, c_out, (xavier(c_in, c_out), None), vb)
+        let init = LayerInit { weight: xavier(c_in, c_out), bias: None };
+        Self::with(c_in, c_out, init, vb)
     }
 
-    /// With the given initialisation of weight and, if there is one, bias.
+    /// Builds the layer with the given initialisation.
     ///
     /// # Errors
     /// A tensor is missing or has another shape.
-    pub fn with(
-        c_in: usize,
-        c_out: usize,
-        init: (Init, Option<Init>),
-        vb: VarBuilder,
-    ) -> Result<Self> {
-        let weight = vb.get_with_hints((c_out, c_in), "weight", init.0)?;
-        let bias = match init.1 {
+    pub fn with(c_in: usize, c_out: usize, init: LayerInit, vb: VarBuilder) -> Result<Self> {
+        let weight = vb.get_with_hints((c_out, c_in), "weight", init.weight)?;
+        let bias = match init.bias {
             Some(init) => Some(vb.get_with_hints(c_out, "bias", init)?),
             None => None,
         };
         Ok(Self { weight, bias })
     }
 
-    /// `[O, C]`.
+    /// Returns the weight, `[O, C]`.
     pub(crate) fn weight(&self) -> &Tensor {
         &self.weight
     }
 
-    /// `[…, C]` to `[…, O]`.
+    /// Maps `[…, C]` to `[…, O]`.
     ///
     /// # Errors
     /// Another last dimension.
@@ -179,7 +191,7 @@ pub struct GroupNorm {
 }
 
 impl GroupNorm {
-    /// Initialised to scale 1, shift 0.
+    /// Builds the layer with initial scale 1 and shift 0.
     ///
     /// # Errors
     /// A tensor is missing or has another shape; `groups` does not divide `channels`.
@@ -187,7 +199,8 @@ impl GroupNorm {
         Self::with(groups, channels, Init::Const(1.0), vb)
     }
 
-    /// Initialised to scale 0, shift 0: a residual branch that starts closed.
+    /// Builds the layer with initial scale 0 and shift 0, for a residual branch that
+    /// starts at zero.
     ///
     /// # Errors
     /// As [`GroupNorm::new`].
@@ -206,7 +219,7 @@ impl GroupNorm {
         })
     }
 
-    /// `[B, C, …]` to the same shape.
+    /// Normalises `[B, C, …]`.
     ///
     /// # Errors
     /// Another number of channels.
@@ -214,7 +227,7 @@ impl GroupNorm {
         norm::group_norm(x, self.groups, &self.weight, &self.bias)
     }
 
-    /// [`GroupNorm::forward`], then `activation`, in one pass.
+    /// Applies [`GroupNorm::forward`] and `activation` in one pass.
     ///
     /// # Errors
     /// As [`GroupNorm::forward`].
@@ -223,8 +236,8 @@ impl GroupNorm {
     }
 }
 
-/// Each channel of each picture to zero mean and unit variance over its pixels, no
-/// parameters; `[B, C, H, W]`.
+/// Normalises each channel of each image to zero mean and unit variance over its pixels,
+/// without parameters; `[B, C, H, W]`.
 ///
 /// # Errors
 /// Another rank.
@@ -232,7 +245,7 @@ pub fn instance_norm(x: &Tensor) -> Result<Tensor> {
     norm::instance_norm(x)
 }
 
-/// max(0, [`instance_norm`]) in one pass.
+/// Computes max(0, [`instance_norm`]) in one pass.
 ///
 /// # Errors
 /// As [`instance_norm`].
@@ -248,7 +261,7 @@ pub struct LayerNorm {
 }
 
 impl LayerNorm {
-    /// Initialised to scale 1, shift 0.
+    /// Builds the layer with initial scale 1 and shift 0.
     ///
     /// # Errors
     /// A tensor is missing or has another shape.
@@ -259,12 +272,12 @@ impl LayerNorm {
         })
     }
 
-    /// Scale and shift, `[C]` each.
+    /// Returns scale and shift, `[C]` each.
     pub(crate) fn parameters(&self) -> [&Tensor; 2] {
         [&self.weight, &self.bias]
     }
 
-    /// `[…, C]` to the same shape.
+    /// Normalises `[…, C]`.
     ///
     /// # Errors
     /// Another last dimension.
@@ -273,34 +286,34 @@ impl LayerNorm {
     }
 }
 
-/// max(0, x).
+/// Computes max(0, x).
 ///
 /// # Errors
-/// Not an f32 tensor.
+/// `x` is not f32.
 pub fn relu(x: &Tensor) -> Result<Tensor> {
     activation(x, Activation::Relu)
 }
 
-/// x·sigmoid(x).
+/// Computes x·sigmoid(x).
 ///
 /// # Errors
-/// Not an f32 tensor.
+/// `x` is not f32.
 pub fn silu(x: &Tensor) -> Result<Tensor> {
     activation(x, Activation::Silu)
 }
 
-/// x·Φ(x), the exact (erf) form.
+/// Computes x·Φ(x), the exact (erf) form.
 ///
 /// # Errors
-/// Not an f32 tensor.
+/// `x` is not f32.
 pub fn gelu(x: &Tensor) -> Result<Tensor> {
     activation(x, Activation::Gelu)
 }
 
-/// 1/(1 + e⁻ˣ).
+/// Computes 1/(1 + e⁻ˣ).
 ///
 /// # Errors
-/// Not an f32 tensor.
+/// `x` is not f32.
 pub fn sigmoid(x: &Tensor) -> Result<Tensor> {
     activation(x, Activation::Sigmoid)
 }

@@ -1,7 +1,7 @@
-//! LPIPS, version 0.1 with VGG16: a perceptual distance of pictures (Zhang et al.,
+//! LPIPS, version 0.1 with VGG16: a perceptual distance of images (Zhang et al.,
 //! "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018).
 //!
-//! Pictures in [0, 1] become x ↦ 2x − 1 and then (x − shift)/scale; VGG16's features
+//! Images in [0, 1] become x ↦ 2x − 1 and then (x − shift)/scale; VGG16's features
 //! after the last ReLU of its five blocks are divided by their length over the
 //! channels; d = Σ_blocks mean_pixels Σ_c w_c (a_c − b_c)². Parameter names are those of
 //! the `lpips` package: `net.slice{1..5}.{n}`, n being torchvision's index of the
@@ -23,17 +23,17 @@ pub(super) const BLOCKS: [(&[usize], usize); 5] = [
     (&[17, 19, 21], 512),
     (&[24, 26, 28], 512),
 ];
-/// Means and standard deviations of ImageNet's pictures in [−1, 1], as the package has
-/// them.
+/// Means and standard deviations of ImageNet's images in [−1, 1], as in the `lpips`
+/// package.
 const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
 const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
 /// Added to the length of a feature.
 const EPSILON: f64 = 1e-10;
-/// Least squared length under the root: its slope at 0 is infinite. A feature as short
-/// (10⁻¹⁵) is nothing beside [`EPSILON`].
-const LEAST_SQUARE: f64 = 1e-30;
-/// Least side of a picture, px: four times halved, one pixel is left.
-pub const LEAST_SIDE: usize = 16;
+/// Lower bound of the squared length under the root, whose slope at 0 is infinite. The
+/// root of it, 10⁻¹⁵, is negligible beside [`EPSILON`].
+const MIN_SQUARED_LENGTH: f64 = 1e-30;
+/// Smallest side of an image, px: four halvings leave one pixel.
+pub const MIN_SIDE: usize = 16;
 
 /// The distance, with its weights. Gradients flow into both pictures.
 #[derive(Clone, Debug)]
@@ -72,17 +72,18 @@ impl Lpips {
         Ok(Self { blocks, linear, shift: three(SHIFT)?, scale: three(SCALE)? })
     }
 
-    /// From a weight file (`subsplat-convert` makes one of torchvision's VGG16 and the
+    /// Reads a weight file (`subsplat-convert` makes one from torchvision's VGG16 and the
     /// `lpips` package's linear weights).
     ///
     /// # Errors
-    /// No weight file; a tensor is missing or has another shape.
+    /// The file is not a weight file; a tensor is missing or has another shape.
     pub fn load(path: &Path) -> Result<Self> {
         let weights = Weights::load(path).map_err(Error::wrap)?;
         Self::new(weights.builder()).map_err(|e| Error::msg(format!("{}: {e}", path.display())))
     }
 
-    /// Distance of two pictures `[height, width, 3]`, values as in [`Lpips::forward`].
+    /// Returns the distance of two images `[height, width, 3]`, values as in
+    /// [`Lpips::forward`].
     ///
     /// # Errors
     /// As [`Lpips::forward`].
@@ -95,16 +96,16 @@ impl Lpips {
         Ok(f64::from(self.forward(&picture(a)?, &picture(b)?)?.get(0)?.to_scalar::<f32>()?))
     }
 
-    /// Distances of the pictures `a` and `b`, `[N, 3, H, W]` in [0, 1] (values outside
-    /// are taken as they are): `[N]`.
+    /// Returns the distances `[N]` of the images `a` and `b`, `[N, 3, H, W]` in [0, 1].
+    /// Values outside [0, 1] are not clamped.
     ///
     /// # Errors
-    /// Shapes that differ or are no pictures; sides below [`LEAST_SIDE`].
+    /// Shapes differ or are not `[N, 3, H, W]`; a side is below [`MIN_SIDE`].
     pub fn forward(&self, a: &Tensor, b: &Tensor) -> Result<Tensor> {
         self.layers(a, b)?.sum(1)
     }
 
-    /// The same before the sum over blocks: `[N, 5]`.
+    /// Returns the distance of each block, `[N, 5]`; [`Lpips::forward`] is their sum.
     ///
     /// # Errors
     /// As [`Lpips::forward`].
@@ -112,10 +113,10 @@ impl Lpips {
         let (_, c, h, w) = a.dims4()?;
         if a.dims() != b.dims() || c != 3 {
             let (a, b) = (a.dims(), b.dims());
-            bail!("lpips: expected two pictures [N, 3, H, W] of one shape, got {a:?} and {b:?}");
+            bail!("lpips: expected two images [N, 3, H, W] of one shape, got {a:?} and {b:?}");
         }
-        if h.min(w) < LEAST_SIDE {
-            bail!("lpips: expected pictures of at least {LEAST_SIDE} pixels a side, got {w}x{h}");
+        if h.min(w) < MIN_SIDE {
+            bail!("lpips: expected images of at least {MIN_SIDE} pixels a side, got {w}x{h}");
         }
         let (a, b) = (self.features(a)?, self.features(b)?);
         let distance = |((a, b), weight): ((&Tensor, &Tensor), &Tensor)| {
@@ -144,8 +145,8 @@ impl Lpips {
     }
 }
 
-/// Largest of each 2×2 pixels; an odd row or column at the end is left out, as in
-/// PyTorch. (Candle's own pooling hands back a quarter of the gradient.)
+/// Maximum of each 2×2 pixels, without an odd row or column at the end, as in PyTorch.
+/// (The gradient of candle's own pooling is a quarter of the true one.)
 fn halved(x: &Tensor) -> Result<Tensor> {
     let (n, c, h, w) = x.dims4()?;
     let (h, w) = (h / 2, w / 2);
@@ -155,8 +156,8 @@ fn halved(x: &Tensor) -> Result<Tensor> {
     larger(rows.reshape((n * c * h, w, 2))?)?.reshape((n, c, h, w))
 }
 
-/// Divided by the length over the channels.
+/// `x` divided by its length over the channels.
 fn unit(x: &Tensor) -> Result<Tensor> {
-    let length = x.sqr()?.sum_keepdim(1)?.maximum(LEAST_SQUARE)?.sqrt()?;
+    let length = x.sqr()?.sum_keepdim(1)?.maximum(MIN_SQUARED_LENGTH)?.sqrt()?;
     x.broadcast_div(&(length + EPSILON)?)
 }

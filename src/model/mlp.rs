@@ -1,19 +1,19 @@
-//! Linear layers with chosen initial values, and a LayerNorm: our ops for f32, tensor
-//! operations for the f64 of oracles.
+//! Linear layers with chosen initial values, and a LayerNorm: fused ops for f32, tensor
+//! operations for f64, which the tests' references use.
 
 use crate::ops;
 use crate::ops::activation::{Activation, activation};
 use candle_core::{D, DType, Result, Tensor};
 use candle_nn::{Init, Linear, Module, VarBuilder};
 
-/// Whether a forward pass serves a picture or a gradient.
+/// Purpose of a forward pass.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Mode {
-    /// Nothing random.
+    /// Inference: nothing is random.
     Infer,
-    /// Attention drops what `seed` decides.
+    /// Training: `seed` determines the attention weights that are dropped.
     Train {
-        /// Of this step.
+        /// Seed of this step.
         seed: u64,
     },
 }
@@ -24,7 +24,7 @@ pub(crate) fn xavier(inputs: usize, outputs: usize) -> Init {
     Init::Uniform { lo: -bound, up: bound }
 }
 
-/// y = x·Wᵀ + b with `weight` initialised as said and `bias` at zero.
+/// y = x·Wᵀ + b; `weight` starts as given, `bias` at zero.
 pub(crate) fn linear(
     inputs: usize,
     outputs: usize,
@@ -36,8 +36,8 @@ pub(crate) fn linear(
     Ok(Linear::new(w, Some(b)))
 }
 
-/// x·Wᵀ + b of `x` `[n, inputs]`; f32 stays on the caller's thread ([`ops::linear`]):
-/// chunks of parents, or scenes, are the parallel tasks.
+/// x·Wᵀ + b of `x` `[n, inputs]`. f32 runs on the caller's thread ([`ops::linear`]),
+/// because chunks of parents or scenes are the parallel tasks.
 pub(crate) fn affine(layer: &Linear, x: &Tensor) -> Result<Tensor> {
     match layer.bias() {
         Some(bias) if x.dtype() == DType::F32 => ops::linear::linear(x, layer.weight(), bias),
@@ -64,7 +64,10 @@ pub struct LayerNorm {
 }
 
 impl LayerNorm {
-    /// Parameters `weight` and `bias` of `dim` numbers.
+    /// Reads the parameters `weight` and `bias`, `[dim]`.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
     pub fn new(dim: usize, vb: VarBuilder) -> Result<Self> {
         Ok(Self {
             weight: vb.get_with_hints(dim, "weight", Init::Const(1.0))?,
@@ -72,7 +75,11 @@ impl LayerNorm {
         })
     }
 
-    /// `x` `[.., dim]`. The fused kernel knows f32 only; f64 is the tests' oracle.
+    /// Normalises `x` `[.., dim]`. f64 uses tensor operations: the fused kernel has f32
+    /// only.
+    ///
+    /// # Errors
+    /// Another last dimension.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         if x.dtype() == DType::F32 {
             return ops::norm::layer_norm(x, &self.weight, &self.bias);

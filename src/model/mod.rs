@@ -1,22 +1,20 @@
-//! The network as candle modules: images and cameras to children.
+//! The network as candle modules: from images and cameras to children.
 //!
-//! Parameter names are PyTorch's, so that a converted checkpoint loads as it is.
+//! Parameter names are PyTorch's, so that a converted checkpoint loads without renaming.
 
 pub mod aggregation;
 pub mod architecture;
 pub mod backbone;
 pub mod compare;
+mod depth_range;
 pub mod embed;
-mod floors;
 pub mod geometry;
 pub mod layers;
-mod look;
 pub mod lpips;
 pub mod mlp;
+mod noise_floors;
 pub mod primaries;
-pub mod primaries_ref;
 pub mod spgr;
-pub mod spgr_ref;
 pub mod subsplat;
 pub mod trace;
 pub mod trunk;
@@ -28,31 +26,31 @@ use crate::camera::Camera;
 use crate::config::FeatureLevel;
 use candle_core::{Result, Tensor, bail};
 
-/// Gives a seeded tensor the start that an initialisation hint cannot say (an
-/// identity, a kernel that averages); `values` come as drawn from the hint.
-pub(crate) fn start_value(name: &str, shape: &[usize], values: &mut [f32]) {
-    backbone::small_start(name, shape, values);
-    if let Some(start) = trunk::initial_value(name, shape) {
-        values.copy_from_slice(&start);
+/// Overwrites the seeded `values` of tensor `name` if its initial value is one that
+/// `candle_nn::Init` cannot express (an identity, an averaging kernel).
+pub(crate) fn apply_initial_value(name: &str, shape: &[usize], values: &mut [f32]) {
+    backbone::apply_small_initial_value(name, shape, values);
+    if let Some(initial) = trunk::initial_value(name, shape) {
+        values.copy_from_slice(&initial);
     }
 }
 
-/// B scenes of V posed pictures each, as the network takes them.
+/// The network's input: B scenes of V posed images each.
 #[derive(Clone, Debug)]
 pub struct Views {
     /// `[B, V, 3, H, W]`, f32, RGB in [0, 1].
     pub images: Tensor,
     /// `[B][V]`, intrinsics in pixels of H × W.
     pub cameras: Vec<Vec<Camera>>,
-    /// `[B][V]`: nearest and farthest depth candidate, world units.
+    /// `[B][V]`: nearest and farthest depth candidate (camera z), world units.
     pub near_far: Vec<Vec<(f32, f32)>>,
 }
 
 impl Views {
-    /// Checks that pictures, cameras and depth ranges fit one another.
+    /// Checks that images, cameras and depth ranges fit one another.
     ///
     /// # Errors
-    /// Names what does not fit, what was expected and what came.
+    /// A shape, a number of cameras or depth ranges, an image size or a range is invalid.
     pub fn new(
         images: Tensor,
         cameras: Vec<Vec<Camera>>,
@@ -88,26 +86,29 @@ impl Views {
         Ok(Self { images, cameras, near_far })
     }
 
-    /// B: scenes.
+    /// Returns B, the number of scenes.
     pub fn scenes(&self) -> usize {
         self.cameras.len()
     }
 
-    /// V: views per scene.
+    /// Returns V, the number of views per scene.
     pub fn views(&self) -> usize {
         self.cameras.first().map_or(0, Vec::len)
     }
 
-    /// (H, W), px.
+    /// Returns (H, W), px.
+    ///
+    /// # Errors
+    /// None: [`Views::new`] checks the shape.
     pub fn size(&self) -> Result<(usize, usize)> {
         let (_, _, _, h, w) = self.images.dims5()?;
         Ok((h, w))
     }
 
-    /// Scene `b` alone, still batched (B = 1).
+    /// Returns scene `b` as a batch of one.
     ///
     /// # Errors
-    /// `b` out of range.
+    /// `b` is out of range.
     pub fn scene(&self, b: usize) -> Result<Self> {
         Ok(Self {
             images: self.images.narrow(0, b, 1)?,
@@ -117,25 +118,24 @@ impl Views {
     }
 }
 
-/// What any backbone hands over. N = H·W pixels in row-major order, G Gaussians
-/// per pixel.
+/// Output of a backbone. The H·W pixels are in row-major order, with G Gaussians each.
 #[derive(Clone, Debug)]
 pub struct BackboneOutput {
-    /// `[B, V, H·W, 2 + 3 + 4 + 3·D]`: sub-pixel offset (before the sigmoid), scale
-    /// (before the sigmoid), quaternion (x, y, z, w, camera frame, not unit), SH
-    /// (colour-major, before the degree mask): the raw head of MVSplat's adapter.
+    /// `[B, V, H·W, 2 + 3 + 4 + 3·D]`, the raw head of MVSplat's adapter: sub-pixel offset
+    /// and scale before the sigmoid; quaternion xyzw, camera frame, not unit; SH,
+    /// colour-major, before the degree mask.
     pub raw: Tensor,
     /// `[B, V, H·W, G]`: distance along the unit ray, world units.
     pub depths: Tensor,
     /// `[B, V, H·W, G]`: opacity in (0, 1) before the opacity mapping and the
     /// division by G.
     pub densities: Tensor,
-    /// `[B, V, C_ℓ, h_ℓ, w_ℓ]` for every level that the backbone has.
+    /// `[B, V, C_ℓ, h_ℓ, w_ℓ]` of every level.
     pub features: Vec<(FeatureLevel, Tensor)>,
 }
 
 impl BackboneOutput {
-    /// Every tensor through `f`.
+    /// Applies `f` to every tensor.
     fn map(&self, f: impl Fn(&Tensor) -> Result<Tensor>) -> Result<Self> {
         let features = self.features.iter().map(|(level, map)| Ok((*level, f(map)?)));
         Ok(Self {
@@ -146,7 +146,7 @@ impl BackboneOutput {
         })
     }
 
-    /// The same numbers, from which no gradient goes back to the backbone.
+    /// Returns the same tensors outside the backbone's graph.
     ///
     /// # Errors
     /// None in practice.
@@ -154,18 +154,18 @@ impl BackboneOutput {
         self.map(|t| Ok(t.detach()))
     }
 
-    /// Scene `b` alone.
+    /// Returns scene `b` as a batch of one.
     ///
     /// # Errors
-    /// There is none of this index.
+    /// `b` is out of range.
     pub fn scene(&self, b: usize) -> Result<Self> {
         self.map(|t| t.narrow(0, b, 1))
     }
 
-    /// The feature map of `level`.
+    /// Returns the feature map of `level`.
     ///
     /// # Errors
-    /// The backbone has no such level.
+    /// The backbone does not have `level`.
     pub fn feature(&self, level: FeatureLevel) -> Result<&Tensor> {
         match self.features.iter().find(|(l, _)| *l == level) {
             Some((_, map)) => Ok(map),
@@ -191,9 +191,9 @@ pub struct Primaries {
     pub opacities: Tensor,
     /// `[B, N, 3, D]`: colour-major SH in world frame, masked by degree.
     pub sh: Tensor,
-    /// `[B, N, 3, D]`: the same before the rotation, camera frame of the source view.
+    /// `[B, N, 3, D]`: `sh` before the rotation, in the source view's camera frame.
     pub sh_camera: Tensor,
-    /// Functions that `sh` multiplies.
+    /// Basis of `sh`.
     pub sh_basis: crate::abi::ShBasis,
     /// Gaussians per view, H·W·G: the source view of Gaussian `i` is `i / per_view`.
     pub per_view: usize,

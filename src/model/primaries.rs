@@ -1,9 +1,9 @@
-//! From raw head outputs to Gaussians in world frame: MVSplat's Gaussian adapter
-//! (spec 6), differentiable. The op: [`crate::ops::adapter`].
+//! Primaries in world frame from raw head outputs: MVSplat's Gaussian adapter (MVSplat
+//! 3.2), differentiable. The op: [`crate::ops::adapter`].
 //!
-//! Foreign layouts end here: quaternions arrive as xyzw in camera frame and leave as
-//! wxyz in world frame, unit, w ≥ 0; SH arrives colour-major in camera frame, is masked
-//! by degree and leaves in world frame.
+//! In: quaternions xyzw in camera frame; SH colour-major in camera frame. Out: quaternions
+//! wxyz in world frame, unit, w ≥ 0; SH in world frame, masked by degree. Tests:
+//! tests/primaries.rs, tests/parity.rs.
 
 use super::trace::Trace;
 use super::{BackboneOutput, Primaries, Views};
@@ -19,13 +19,13 @@ use glam::{DMat3, DQuat};
 
 /// Scales are in tenths of a pixel's extent at the Gaussian's depth, summed over both
 /// axes: a fifth of a square pixel (MVS).
-pub(super) const PIXEL_SHARE: f64 = 0.1;
+const PIXEL_SHARE: f64 = 0.1;
 /// Degree l ≥ 1 of the colour is damped by 0.1·0.25^l (MVS).
 const SH_DAMPING: (f64, f64) = (0.1, 0.25);
 /// ε of the quaternion's normalisation (MVS).
-pub(super) const QUAT_EPS: f64 = 1e-8;
+const QUAT_EPS: f64 = 1e-8;
 
-/// Factor of every SH coefficient: 1, then 0.1·0.25^l for degree l.
+/// Returns the factor of every SH coefficient: 1 for degree 0, 0.1·0.25^l for degree l.
 pub fn sh_mask(degree: usize) -> Vec<f32> {
     let factor = |l: usize| match l {
         0 => 1.0,
@@ -34,26 +34,27 @@ pub fn sh_mask(degree: usize) -> Vec<f32> {
     (0..=degree).flat_map(|l| std::iter::repeat_n(factor(l), 2 * l + 1)).collect()
 }
 
-/// All primaries of all scenes as packed rows and SH: what is rendered without a trunk.
+/// All primaries of all scenes as packed rows and SH, which the rasterizer reads directly
+/// if SPGR is off.
 pub struct Packed {
     placed: Placed,
     scenes: usize,
-    /// Functions that the SH multiplies.
+    /// Basis of the SH coefficients.
     pub sh_basis: ShBasis,
     /// Gaussians per view, H·W·G.
     pub per_view: usize,
 }
 
 impl Packed {
-    /// `[B·N, 11]`, lanes in [`crate::abi`].
+    /// Returns the packed rows `[B·N, 11]`; columns as in [`crate::abi`].
     pub fn rows(&self) -> &Tensor {
         &self.placed.rows
     }
 
-    /// `[B·N, D, 3]`: SH in world frame, RGB innermost.
+    /// Returns the SH in world frame, `[B·N, D, 3]`, RGB innermost.
     ///
     /// # Errors
-    /// Whatever candle says.
+    /// Those of candle.
     pub fn sh(&self) -> Result<Tensor> {
         self.placed.sh()
     }
@@ -63,10 +64,10 @@ impl Packed {
         t.reshape([&[self.scenes, t.dim(0)? / self.scenes], &t.dims()[1..]].concat())
     }
 
-    /// Attribute by attribute.
+    /// Returns one tensor for each attribute.
     ///
     /// # Errors
-    /// Whatever candle says.
+    /// Those of candle.
     pub fn split(&self) -> Result<Primaries> {
         let rows = self.by_scene(self.rows())?;
         Ok(Primaries {
@@ -82,10 +83,10 @@ impl Packed {
     }
 }
 
-/// All primaries of all scenes, in world frame.
+/// Computes all primaries of all scenes, in world frame.
 ///
 /// # Errors
-/// Shapes of `out` that do not fit `views` or `settings`.
+/// Shapes of `out` do not fit `views` or `settings`.
 pub fn primaries(
     out: &BackboneOutput,
     views: &Views,
@@ -97,7 +98,7 @@ pub fn primaries(
     Ok(all)
 }
 
-/// [`primaries`] as packed rows.
+/// Computes [`primaries`] as packed rows.
 ///
 /// # Errors
 /// Those of [`primaries`].
@@ -135,7 +136,7 @@ pub fn packed(out: &BackboneOutput, views: &Views, settings: &Settings) -> Resul
     })
 }
 
-/// One view's constants.
+/// Constants of one view.
 fn view(camera: &Camera, s: &Settings) -> View {
     let (k, rotation) = (camera.intrinsics, camera.rotation().as_dmat3());
     let pixel = PIXEL_SHARE * (1.0 / f64::from(k.fx) + 1.0 / f64::from(k.fy));
@@ -144,7 +145,7 @@ fn view(camera: &Camera, s: &Settings) -> View {
         ShFrame::Mvsplat => RotationBasis::E3nn,
         ShFrame::MvsplatExact | ShFrame::Standard => RotationBasis::Standard,
     };
-    let turn = product(&Rotation::new(rotation, basis).matrix(s.sh_degree), &masked(s), d);
+    let sh_to_world = product(&Rotation::new(rotation, basis).matrix(s.sh_degree), &masked(s), d);
     View {
         focal: [k.fx, k.fy].map(f64::from),
         centre: [k.cx, k.cy].map(f64::from),
@@ -152,13 +153,13 @@ fn view(camera: &Camera, s: &Settings) -> View {
         origin: camera.position().as_dvec3().to_array(),
         quat: world_quaternions(rotation),
         scale: [s.scale_min * pixel, (s.scale_max - s.scale_min) * pixel],
-        turn: Turn::new(&turn, d),
+        turn: Turn::new(&sh_to_world, d),
     }
 }
 
-/// Row i: where the i-th of x, y, z, w of a camera-frame quaternion goes, as wxyz in
-/// world frame: quat(R) ⊗ q is linear in q.
-pub(super) fn world_quaternions(rotation: DMat3) -> [[f64; 4]; 4] {
+/// The linear map q ↦ quat(R) ⊗ q. Row i is the world-frame image, wxyz, of the i-th of
+/// x, y, z, w of a camera-frame quaternion.
+fn world_quaternions(rotation: DMat3) -> [[f64; 4]; 4] {
     let a = DQuat::from_mat3(&rotation);
     let units = [
         DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0),
@@ -172,9 +173,9 @@ pub(super) fn world_quaternions(rotation: DMat3) -> [[f64; 4]; 4] {
     })
 }
 
-/// From raw SH to the camera's frame, `[D, D]` row-major: the mask by degree, and for
-/// [`ShFrame::MvsplatExact`] the map from MVSplat's basis to the standard one, to which
-/// degree 4 (which MVSplat never evaluates) is zero.
+/// Map from raw SH to camera-frame SH, `[D, D]` row-major: the mask by degree, and for
+/// [`ShFrame::MvsplatExact`] the map from MVSplat's basis to the standard one. That map is
+/// zero for degree 4, which MVSplat never evaluates.
 fn masked(s: &Settings) -> Vec<f64> {
     let d = sh_coefficients(s.sh_degree);
     let map = standard_from_mvsplat();
@@ -209,12 +210,12 @@ fn trace_parts(
         let k = camera.intrinsics;
         let size = [k.width as f32, k.height as f32];
         let at = |i: usize| [i % k.width, i / k.width].map(|p| p as f32);
-        let lanes = raw.len() / (k.width * k.height);
+        let channels = raw.len() / (k.width * k.height);
         let ray = |(i, row): (usize, &[f32])| {
             let pixel = at(i);
             [0, 1].map(|j| (pixel[j] + 1.0 / (1.0 + (-row[j]).exp())) / size[j])
         };
-        raw.chunks(lanes).enumerate().flat_map(ray).collect()
+        raw.chunks(channels).enumerate().flat_map(ray).collect()
     };
     let mut xy = Vec::new();
     for (camera, raw) in views.cameras.iter().flatten().zip(out.raw.flatten(0, 1)?.to_vec3()?) {
@@ -244,8 +245,8 @@ fn trace_parts(
     trace.put("gauss.sh_angles_abg", &Tensor::from_vec(angles, (b, v, 3), &Device::Cpu)?)
 }
 
-/// (α, β, γ) with R = Ry(α)·Rx(β)·Ry(γ), as e3nn computes them: to look at only, the
-/// rotation itself does without.
+/// (α, β, γ) with R = Ry(α)·Rx(β)·Ry(γ), as e3nn computes them. The trace alone uses them;
+/// the rotation of SH does not need angles.
 fn e3nn_angles(r: DMat3) -> [f64; 3] {
     let at = |row: usize, col: usize| r.col(col)[row];
     let beta = at(1, 1).clamp(-1.0, 1.0).acos();
@@ -255,10 +256,10 @@ fn e3nn_angles(r: DMat3) -> [f64; 3] {
 }
 
 impl Primaries {
-    /// World covariances R·diag(σ²)·Rᵀ, `[B, N, 3, 3]`.
+    /// Returns the world covariances R·diag(σ²)·Rᵀ, `[B, N, 3, 3]`.
     ///
     /// # Errors
-    /// Whatever candle says.
+    /// Those of candle.
     pub fn covariances(&self) -> Result<Tensor> {
         let (b, n, _) = self.scales.dims3()?;
         let q = |i: usize| self.quats_wxyz.narrow(2, i, 1);

@@ -1,15 +1,16 @@
-//! The two heads of SPGR and its rules in numbers (SubSplat 3.2; spec 2.1).
+//! The two heads of SPGR, and its constants (SubSplat 3.2).
 //!
 //! g_θ: f^g + z^g → K × (Δu, Δv, Δz, Δlog s, Δr);   h_φ: f^a + z^a → K × (ℓ, γ̃).
-//! Together one record `[n, K, 11]`, lanes in [`crate::abi`].
+//! Their outputs form one record `[n, K, 11]`; columns as in [`crate::abi`].
 //!
 //! * `mlp2`: `norm`, `lin0`, GELU, `lin1` to K·9 or K·2.
 //! * `pg`: (Linear, ReLU, Linear, ReLU, LayerNorm) twice, Linear: `lin0` … `lin4`,
 //!   `ln0`, `ln1`.
 //! * `coord`: hid_k = GELU(lin0·norm(x) + c_k), o_k = lin1·hid_k, with
-//!   c_k = `pos1`·GELU(`pos0`·posenc(g_k)) of the sub-pixel's place g_k: parameters
-//!   do not depend on K.
+//!   c_k = `pos1`·GELU(`pos0`·posenc(g_k)) of the sub-pixel's position g_k. The
+//!   parameters do not depend on K.
 
+use super::embed::Descriptors;
 use super::mlp::{LayerNorm, affine, gelu, linear};
 use crate::abi::{HEAD_GEOMETRY_LEN, HEAD_STRIDE};
 use crate::config::{
@@ -22,9 +23,9 @@ use crate::ops::spgr::Rules;
 use candle_core::{Result, Tensor};
 use candle_nn::{Init, Linear, VarBuilder};
 
-/// Octaves of the positional encoding of a sub-pixel's place.
+/// Octaves of the positional encoding of a sub-pixel.
 const OCTAVES: usize = 4;
-/// x, y, and their sines and cosines.
+/// Width of the positional encoding: x, y, and their sines and cosines.
 const POSENC: usize = 2 + 4 * OCTAVES;
 
 #[derive(Clone, Debug)]
@@ -34,20 +35,23 @@ enum Form {
     Coord { norm: LayerNorm, lin0: Linear, lin1: Linear, pos: [Linear; 2] },
 }
 
-/// One head, E → K × `lanes`.
+/// One head: E channels to K × `outputs` numbers.
 #[derive(Clone, Debug)]
 pub struct Head {
     form: Form,
-    lanes: usize,
+    outputs: usize,
 }
 
 impl Head {
-    /// `lanes` outputs per child.
-    pub fn new(config: &Config, lanes: usize, vb: VarBuilder) -> Result<Self> {
+    /// `outputs`: numbers per child.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
+    pub fn new(config: &Config, outputs: usize, vb: VarBuilder) -> Result<Self> {
         let (e, h) = (config.embed.dim, config.spgr.hidden);
         let kaiming = candle_nn::init::DEFAULT_KAIMING_UNIFORM;
         let last = if config.spgr.zero_init { Init::Const(0.0) } else { kaiming };
-        let all = config.children() * lanes;
+        let all = config.children() * outputs;
         let form = match config.spgr.head {
             SpgrHead::Mlp2 => Form::Mlp2 {
                 norm: LayerNorm::new(e, vb.pp("norm"))?,
@@ -68,17 +72,20 @@ impl Head {
             SpgrHead::Coord => Form::Coord {
                 norm: LayerNorm::new(e, vb.pp("norm"))?,
                 lin0: linear(e, h, kaiming, vb.pp("lin0"))?,
-                lin1: linear(h, lanes, last, vb.pp("lin1"))?,
+                lin1: linear(h, outputs, last, vb.pp("lin1"))?,
                 pos: [
                     linear(POSENC, h, kaiming, vb.pp("pos0"))?,
                     linear(h, h, kaiming, vb.pp("pos1"))?,
                 ],
             },
         };
-        Ok(Self { form, lanes })
+        Ok(Self { form, outputs })
     }
 
-    /// `x` `[n, E]` to `[n, r², lanes]`.
+    /// Maps `x` `[n, E]` to `[n, r², outputs]`, r = `side`.
+    ///
+    /// # Errors
+    /// Shapes do not fit; r differs from the configured one (every form but `coord`).
     pub fn forward(&self, x: &Tensor, side: usize) -> Result<Tensor> {
         let (n, k) = (x.dim(0)?, side * side);
         let out = match &self.form {
@@ -96,29 +103,29 @@ impl Head {
             }
             Form::Coord { norm, lin0, lin1, pos } => {
                 let x = affine(lin0, &norm.forward(x)?)?;
-                let places = gelu(&affine(&pos[0], &posenc(side, &x)?)?)?;
-                let places = affine(&pos[1], &places)?;
-                // One child at a time: [n, K, hidden] never exists.
+                let positions = gelu(&affine(&pos[0], &posenc(side, &x)?)?)?;
+                let positions = affine(&pos[1], &positions)?;
+                // One child at a time, so that no tensor [n, K, hidden] exists.
                 let child = |i: usize| {
-                    let hidden = x.broadcast_add(&places.narrow(0, i, 1)?)?;
+                    let hidden = x.broadcast_add(&positions.narrow(0, i, 1)?)?;
                     affine(lin1, &gelu(&hidden)?)
                 };
                 Tensor::cat(&(0..k).map(child).collect::<Result<Vec<_>>>()?, 1)?
             }
         };
-        out.reshape((n, k, self.lanes))
+        out.reshape((n, k, self.outputs))
     }
 }
 
-/// Places of the r² sub-pixels in input px, (−½, ½)², and their sines and cosines:
-/// `[r², 18]` of `like`'s dtype.
+/// Positions of the r² sub-pixels in input px, (−½, ½)², with their sines and cosines:
+/// `[r², 18]`, dtype of `like`.
 fn posenc(side: usize, like: &Tensor) -> Result<Tensor> {
     let mut table = Vec::with_capacity(side * side * POSENC);
     for k in 0..side * side {
-        let place = [k % side, k / side].map(|i| (i as f32 + 0.5) / side as f32 - 0.5);
-        table.extend(place);
+        let position = [k % side, k / side].map(|i| (i as f32 + 0.5) / side as f32 - 0.5);
+        table.extend(position);
         for octave in 0..OCTAVES {
-            for g in place {
+            for g in position {
                 let (sin, cos) = (std::f32::consts::PI * (1 << octave) as f32 * g).sin_cos();
                 table.extend([sin, cos]);
             }
@@ -135,7 +142,10 @@ pub struct Heads {
 }
 
 impl Heads {
-    /// Parameters `geo` and `app`.
+    /// Reads the parameters `geo` and `app`.
+    ///
+    /// # Errors
+    /// A tensor is missing or has another shape.
     pub fn new(config: &Config, vb: VarBuilder) -> Result<Self> {
         let rest = HEAD_STRIDE - HEAD_GEOMETRY_LEN;
         Ok(Self {
@@ -144,20 +154,23 @@ impl Heads {
         })
     }
 
-    /// Records `[n, r², 11]` from the heads' inputs `[n, E]`.
-    pub fn forward(&self, geo: &Tensor, app: &Tensor, side: usize) -> Result<Tensor> {
-        let geometry = self.geometry.forward(geo, side)?;
-        let appearance = self.appearance.forward(app, side)?;
+    /// Maps the heads' inputs to records `[n, r², 11]`, r = `side`.
+    ///
+    /// # Errors
+    /// Those of [`Head::forward`].
+    pub fn forward(&self, inputs: &Descriptors, side: usize) -> Result<Tensor> {
+        let geometry = self.geometry.forward(&inputs.geometry, side)?;
+        let appearance = self.appearance.forward(&inputs.appearance, side)?;
         let flat = columns(&geometry.flatten(0, 1)?, &appearance.flatten(0, 1)?, None)?;
-        flat.reshape((geo.dim(0)?, side * side, HEAD_STRIDE))
+        flat.reshape((geometry.dim(0)?, side * side, HEAD_STRIDE))
     }
 }
 
-/// The configuration's rules in numbers, for r = `side`.
+/// Returns the constants of the fused op for `config` and r = `side`.
 pub fn rules(config: &Config, side: usize) -> Rules {
-    let s = &config.spgr;
+    let (s, ablations) = (&config.spgr, &config.spgr.ablations);
     let k = side * side;
-    let a_min = match s.a_min {
+    let a_min = match ablations.a_min {
         AMin::OverK if k == 1 => 0.0,
         AMin::OverK => 1.0 / k as f64,
         AMin::TargetPx(area) => area,
@@ -171,12 +184,12 @@ pub fn rules(config: &Config, side: usize) -> Rules {
         beta_z: s.beta_z,
         ray: s.depth_dir == DepthDir::Ray,
         relative_depth: s.depth_unit == DepthUnit::Relative,
-        disc: s.slide == Slide::Disc,
+        disc: ablations.slide == Slide::Disc,
         lambda_s: s.lambda_s.value(k),
         dlog_clamp: s.dlog_clamp,
-        area_at_parent: s.area_at == AreaAt::Parent,
+        area_at_parent: ablations.area_at == AreaAt::Parent,
         a_min,
-        two_axis: s.a_min_mode == AMinMode::TwoAxis,
+        two_axis: ablations.a_min_mode == AMinMode::TwoAxis,
         opacity: match s.opacity {
             OpacityRule::Linear => Rule::Linear,
             OpacityRule::OpticalDepth => Rule::OpticalDepth,
@@ -187,6 +200,6 @@ pub fn rules(config: &Config, side: usize) -> Rules {
         lowpass_target: f64::from(config.render.lowpass_px2(side as f32)),
         lowpass_input: f64::from(config.render.lowpass),
         delta: s.delta,
-        rgb_gain: s.gain_space == GainSpace::Rgb,
+        rgb_gain: ablations.gain_space == GainSpace::Rgb,
     }
 }

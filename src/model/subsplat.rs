@@ -1,8 +1,8 @@
-//! The whole model: posed pictures to children.
+//! The whole model: from posed images to children.
 
-use super::backbone::small::DepthMaps;
+use super::backbone::small::{DepthMaps, DisparityMean};
 use super::backbone::{Mvsplat, SmallBackbone};
-use super::look;
+use super::depth_range;
 use super::primaries::primaries;
 use super::trace::Trace;
 use super::trunk::{Children, Trunk};
@@ -21,33 +21,33 @@ enum Encoder {
 
 /// SubSplat with its backbone, built from one [`Config`].
 ///
-/// Parameter names: MVSplat's own at the root (a converted checkpoint loads as it
-/// is, with or without its `encoder.` prefix), the small backbone under `small.`,
-/// everything that SubSplat adds under `subsplat.`.
+/// Parameter names: MVSplat's own at the root (a converted checkpoint loads with or
+/// without its `encoder.` prefix), the small backbone's under `small.`, SubSplat's under
+/// `subsplat.`.
 pub struct SubSplat {
     config: Config,
     encoder: Encoder,
     trunk: Trunk,
 }
 
-/// One scene out of [`SubSplat::forward`].
+/// The result of [`SubSplat::forward`] for one scene.
 pub struct SceneOutput {
-    /// The Gaussians that are rendered.
+    /// The Gaussians to render.
     pub children: Children,
-    /// Distance along the unit ray of each input pixel (its first Gaussian's),
-    /// `[V, H·W]`, world units.
+    /// `[V, H·W]`: distance of each input pixel's first Gaussian along the unit ray, world
+    /// units.
     pub depths: Vec<Vec<f32>>,
 }
 
-/// The stages that [`SubSplat::forward`] announces, in order.
+/// Names of the stages that [`SubSplat::forward`] reports, in order.
 pub const STAGES: [&str; 3] = ["backbone", "primaries", "subsplat"];
 
 impl SubSplat {
     /// Builds the model; `vb` is at the root of the names.
     ///
     /// # Errors
-    /// A configuration out of range; a tensor that is missing or has another shape,
-    /// named with both shapes.
+    /// The configuration is invalid; a tensor is missing or has another shape (the message
+    /// names it and both shapes).
     pub fn new(config: &Config, vb: VarBuilder) -> Result<Self> {
         config.check().map_err(Error::wrap)?;
         let encoder = match &config.backbone {
@@ -58,8 +58,8 @@ impl SubSplat {
         Ok(Self { config: config.clone(), encoder, trunk })
     }
 
-    /// The model with the plane sweep, the attention's gather, SPGR and the rasterizer on
-    /// `backend`, the rest in candle on the CPU as before.
+    /// Returns the model with plane sweep, attention gather, SPGR and rasterizer on
+    /// `backend`. Everything else runs on the CPU.
     pub fn with_backend(mut self, backend: &Backend) -> Self {
         match &mut self.encoder {
             Encoder::Mvsplat(encoder) => encoder.set_backend(backend),
@@ -69,20 +69,20 @@ impl SubSplat {
         self
     }
 
-    /// The configuration that the model was built from.
+    /// Returns the configuration of the model.
     pub fn config(&self) -> &Config {
         &self.config
     }
 
-    /// What turns primaries into children.
+    /// Returns the part that turns primaries into children.
     pub fn trunk(&self) -> &Trunk {
         &self.trunk
     }
 
-    /// The backbone alone, at inference.
+    /// Runs the backbone alone, at inference.
     ///
     /// # Errors
-    /// Sides that are no multiples of [`Config::stride`].
+    /// A side is not a multiple of [`Config::stride`].
     pub fn encode(&self, views: &Views) -> Result<BackboneOutput> {
         let (h, w) = views.size()?;
         let stride = self.config.stride();
@@ -91,71 +91,71 @@ impl SubSplat {
         }
         in_pool(|| match &self.encoder {
             Encoder::Mvsplat(encoder) => encoder.forward(views, &mut Trace::off()),
-            Encoder::Small(encoder) => Ok(encoder.forward(views, false)?.0),
+            Encoder::Small(encoder) => Ok(encoder.forward(views, DisparityMean::AroundMode)?.0),
         })
     }
 
-    /// `views` with near and far by what a first look at half the size shows, from half
-    /// of their near to twice their far; the same for all views of a scene. Unchanged
-    /// where the configuration looks once ([`crate::config::Small::first_look`]; MVSplat
-    /// always does: its weights know no depths but those that it was trained with).
+    /// Estimates near and far depth from half-size images.
+    ///
+    /// Returns `views` with the estimated range, one for all views of a scene; the search
+    /// covers half of `views`' near to twice their far. Returns `views` unchanged if
+    /// [`crate::config::Small::estimate_depth_range`] is off, and for MVSplat, whose weights
+    /// fit the depths of its training only.
     ///
     /// # Errors
-    /// Sides that are no multiples of [`Config::stride`].
-    pub fn look(&self, views: &Views) -> Result<Views> {
+    /// A side is not a multiple of [`Config::stride`].
+    pub fn estimate_depth_range(&self, views: &Views) -> Result<Views> {
         match (&self.encoder, &self.config.backbone) {
-            (Encoder::Small(network), Backbone::Small(c)) if c.first_look => {
-                in_pool(|| look::ranges(network, views, self.config.stride()))
+            (Encoder::Small(network), Backbone::Small(c)) if c.estimate_depth_range => {
+                in_pool(|| depth_range::estimate_depth_range(network, views, self.config.stride()))
             }
             _ => Ok(views.clone()),
         }
     }
 
-    /// The backbone for training: with every gradient, and with its depth maps where it
-    /// is the small one. `around_mode` averages disparity as inference does, else over
-    /// all candidates.
+    /// Runs the backbone for training: with every gradient, and with its depth maps if it
+    /// is the small one.
     ///
     /// # Errors
-    /// Sides that are no multiples of [`Config::stride`].
+    /// A side is not a multiple of [`Config::stride`].
     pub fn encode_for_training(
         &self,
         views: &Views,
-        around_mode: bool,
+        mean: DisparityMean,
     ) -> Result<(BackboneOutput, Option<DepthMaps>)> {
         match &self.encoder {
             Encoder::Mvsplat(encoder) => Ok((encoder.forward(views, &mut Trace::off())?, None)),
             Encoder::Small(encoder) => {
-                let (output, maps) = encoder.forward(views, !around_mode)?;
+                let (output, maps) = encoder.forward(views, mean)?;
                 Ok((output, Some(maps)))
             }
         }
     }
 
-    /// The small backbone's depth alone; `around_mode` as in
-    /// [`SubSplat::encode_for_training`].
+    /// Computes the small backbone's depth alone.
     ///
     /// # Errors
-    /// Another backbone; sides that are no multiples of [`Config::stride`].
-    pub fn depth_maps(&self, views: &Views, around_mode: bool) -> Result<DepthMaps> {
+    /// The backbone is MVSplat's; a side is not a multiple of [`Config::stride`].
+    pub fn depth_maps(&self, views: &Views, mean: DisparityMean) -> Result<DepthMaps> {
         match &self.encoder {
             Encoder::Mvsplat(_) => bail!("depth maps: expected the small backbone, got MVSplat's"),
-            Encoder::Small(encoder) => encoder.depth(views, !around_mode),
+            Encoder::Small(encoder) => encoder.depth(views, mean),
         }
     }
 
-    /// World-frame primaries of what the backbone gave.
+    /// Returns the world-frame primaries of the backbone's `output`.
     ///
     /// # Errors
-    /// Shapes that do not fit `views`.
+    /// Shapes do not fit `views`.
     pub fn primaries(&self, views: &Views, output: &BackboneOutput) -> Result<Primaries> {
         primaries(output, views, self.config.primaries(), &mut Trace::off())
     }
 
-    /// Pictures to children, one [`SceneOutput`] a scene. `stage` hears the name of
-    /// each stage ([`STAGES`]) as it begins.
+    /// Computes the children of every scene. `stage` receives the name of each stage
+    /// ([`STAGES`]) when it begins.
     ///
     /// # Errors
-    /// Whatever a stage finds wrong with its input; a result that is not finite.
+    /// Those of the stages; a result is not finite.
     pub fn forward(
         &self,
         views: &Views,
@@ -163,7 +163,7 @@ impl SubSplat {
     ) -> Result<Vec<SceneOutput>> {
         let mut scenes = Vec::with_capacity(views.scenes());
         for b in 0..views.scenes() {
-            // Scenes do not see one another; one at a time bounds the memory.
+            // Scenes are independent; one at a time bounds the memory.
             let views = views.scene(b)?;
             stage(STAGES[0]);
             let output = self.encode(&views)?;
@@ -177,8 +177,8 @@ impl SubSplat {
         Ok(scenes)
     }
 
-    /// Pictures straight to what `camera` sees of them, `[5, H, W]` a scene (R, G, B,
-    /// alpha, Σ w·z): the children are never in memory ([`Trunk::render`]).
+    /// Renders every scene from `camera` without storing its children ([`Trunk::render`]):
+    /// `[5, H, W]` a scene (R, G, B, alpha, Σ w·z).
     ///
     /// # Errors
     /// Those of [`SubSplat::forward`] and of the rasterizer.
@@ -198,13 +198,13 @@ impl SubSplat {
     }
 }
 
-/// Runs `work` on a thread of the current pool: from there a parallel call does not wait
-/// for another thread to wake up, and the network makes hundreds of them.
+/// Runs `work` on a thread of the current pool. Hundreds of parallel calls of the network
+/// then start without waking another thread first.
 fn in_pool<R: Send>(work: impl FnOnce() -> R + Send) -> R {
     rayon::scope(|_| work())
 }
 
-/// Channels of every feature level that the configuration's backbone has.
+/// Returns the feature levels of the configuration's backbone with their channels.
 pub fn feature_channels(config: &Config) -> Vec<(FeatureLevel, usize)> {
     let [quarter, cnn4, cnn2, full] = match &config.backbone {
         Backbone::Mvsplat(c) => {

@@ -1,34 +1,34 @@
-//! Intermediate tensors for whoever wants to look (`subsplat compare`, tests), at
-//! no cost where nobody does.
+//! Recording of intermediate tensors, for `subsplat compare` and tests. A trace that is
+//! off costs nothing.
 
 use candle_core::{Result, Tensor};
 
-/// Takes (name, tensor) as they arise.
+/// Receives name and tensor of each stage.
 type Observer<'a> = dyn FnMut(&str, &Tensor) -> Result<()> + 'a;
 
-/// Hands stages to an observer, or to nobody.
+/// A recorder of stages, or none.
 pub struct Trace<'a>(Option<&'a mut Observer<'a>>);
 
 impl<'a> Trace<'a> {
-    /// Nobody looks.
+    /// Returns a trace that records nothing.
     pub fn off() -> Self {
         Self(None)
     }
 
-    /// Every stage goes to `observer`, in the order of computation.
+    /// Returns a trace that passes every stage to `observer`, in the order of computation.
     pub fn to(observer: &'a mut Observer<'a>) -> Self {
         Self(Some(observer))
     }
 
-    /// Whether anybody looks.
+    /// Returns true if stages are recorded.
     pub fn is_on(&self) -> bool {
         self.0.is_some()
     }
 
-    /// Hands over a tensor that exists anyway.
+    /// Records `tensor`, which the computation needs anyway.
     ///
     /// # Errors
-    /// The observer's.
+    /// Those of the observer.
     pub fn put(&mut self, name: &str, tensor: &Tensor) -> Result<()> {
         match &mut self.0 {
             Some(observer) => observer(name, tensor),
@@ -36,10 +36,10 @@ impl<'a> Trace<'a> {
         }
     }
 
-    /// Hands over a tensor that is made only if somebody looks.
+    /// Records the tensor of `make`, which runs only if stages are recorded.
     ///
     /// # Errors
-    /// The observer's, or `make`'s.
+    /// Those of the observer and of `make`.
     pub fn put_with(&mut self, name: &str, make: impl FnOnce() -> Result<Tensor>) -> Result<()> {
         match &mut self.0 {
             Some(observer) => observer(name, &make()?),

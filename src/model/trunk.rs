@@ -1,6 +1,6 @@
-//! What SubSplat adds to the backbone, end to end: embeddings, aggregation, heads,
-//! SPGR, in chunks of parents so that no `[N, E]` tensor of all parents exists at
-//! inference.
+//! SubSplat's part of the network, end to end: embeddings, aggregation, heads and SPGR
+//! (SubSplat 3.2, A.2, A.3). It processes chunks of parents, so that no `[N, E]` tensor of
+//! all parents exists at inference.
 //!
 //! Parameters under `subsplat`: `embed`, `agg`, `geo`, `app`; none with SPGR off.
 
@@ -9,7 +9,7 @@ mod recompute;
 pub use recompute::Recomputed;
 
 use super::aggregation::{Aggregation, Prepared, ring};
-use super::embed::Embeddings;
+use super::embed::{Descriptors, Embeddings};
 use super::geometry::{Frames, ParentChunk};
 use super::mlp::Mode;
 use super::primaries::Packed;
@@ -17,9 +17,8 @@ use super::spgr::{Heads, rules};
 use super::{BackboneOutput, Primaries, Views};
 use crate::abi::{RasterOptions, SPLAT_STRIDE, ShBasis, sh_coefficients};
 use crate::camera::Camera;
-use crate::config::{Config, FeatureLevel, HeadInput, ShInput, SpgrHead};
+use crate::config::{Config, FeatureLevel, ShInput, SpgrHead};
 use crate::ops::direct::{Footprint, rasterize_footprints, spgr_footprints};
-use crate::ops::moves::sum;
 use crate::ops::spgr::{Rules, Spgr, spgr_into_on, spgr_on};
 use crate::ops::{Backend, rasterize_on};
 use crate::splats::Splats;
@@ -27,35 +26,36 @@ use candle_core::{DType, Result, Tensor, bail};
 use candle_nn::{VarBuilder, VarMap};
 use rayon::prelude::*;
 
-/// Parents per chunk at inference. A `[256, 128]` activation stays in a core's L2, and
-/// below the 65,536 elements from which candle spreads one elementwise operation over
-/// a spinning thread pool of its own, whose lock the chunks would fight for.
+/// Parents per chunk at inference. A `[256, 128]` activation fits into a core's L2 cache.
+/// It also stays below 65,536 elements, from which on candle uses a thread pool of its own
+/// for elementwise operations; parallel chunks would contend for that pool's lock.
 pub const CHUNK: usize = 256;
 
-/// Parents per chunk where a GPU gathers: every chunk brings the feature maps over anew,
-/// and one at a time is what the device takes. 16384·E floats are 8 MiB at E = 128.
+/// Parents per chunk if a GPU gathers: every chunk uploads the feature maps again, and the
+/// device takes one chunk at a time. 16384·E floats are 8 MiB at E = 128.
 const CHUNK_GPU: usize = 1 << 14;
 
 /// Gaussians of one scene that share SH by parent.
 #[derive(Clone, Debug)]
 pub struct Children {
-    /// `[N·K, 11]`, lanes in [`crate::abi`]; child k of parent n is row n·K + k.
+    /// `[N·K, 11]`, columns as in [`crate::abi`]; child k of parent n is row n·K + k.
     pub rows: Tensor,
-    /// `[N·K]`: γ; or `[N·K, 4]`: γ and the residual δ in RGB.
+    /// `[N·K]`: gain γ; or `[N·K, 4]`: γ and the residual δ in RGB.
     pub gain: Tensor,
     /// `[N, D, 3]`: the parents' SH, world frame, RGB innermost.
     pub sh: Tensor,
-    /// Functions that `sh` multiplies.
+    /// Basis of `sh`.
     pub sh_basis: ShBasis,
-    /// K.
+    /// K: children per parent.
     pub k: usize,
 }
 
 impl Children {
-    /// The primaries of one scene themselves, K = 1: what a trunk with SPGR off gives.
+    /// Returns the primaries of one scene as their own children, K = 1: the result of a
+    /// trunk with SPGR off.
     ///
     /// # Errors
-    /// Whatever candle says.
+    /// Those of candle.
     pub fn whole(parents: &Packed) -> Result<Self> {
         let rows = parents.rows().clone();
         Ok(Self {
@@ -67,13 +67,22 @@ impl Children {
         })
     }
 
-    /// Packed rows for the renderer and the writers.
+    /// Returns packed rows for the renderer and the file writers.
     ///
     /// # Errors
-    /// Tensors that are not `f32` or do not fit one another.
+    /// Tensors are not `f32` or do not fit one another.
     pub fn to_splats(&self) -> Result<Splats> {
         Splats::from_tensors(&self.rows, &self.sh, &self.gain, self.sh_basis)
     }
+}
+
+/// Chunk size and random seed of a training pass.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TrainPass {
+    /// Parents per chunk.
+    pub chunk: usize,
+    /// Seed of the attention weights that are dropped.
+    pub seed: u64,
 }
 
 #[derive(Clone, Debug)]
@@ -87,13 +96,14 @@ struct Parts {
 #[derive(Clone, Debug)]
 pub struct Trunk {
     config: Config,
-    side: usize,
-    /// `None` where SPGR is off.
+    /// Constants of SPGR for the configured r, or for that of [`Trunk::set_upscale`].
+    rules: Rules,
+    /// `None` if SPGR is off.
     parts: Option<Parts>,
     backend: Backend,
 }
 
-/// What all chunks of one scene share.
+/// Tensors that all chunks of one scene share.
 struct Scene<'a> {
     views: &'a Views,
     frames: Frames,
@@ -107,12 +117,34 @@ struct Scene<'a> {
     rules: Rules,
 }
 
+/// Consecutive parents of one view.
+#[derive(Clone, Copy, Debug)]
+struct Span {
+    first: usize,
+    len: usize,
+}
+
+/// Input of SPGR for one chunk.
+struct Records {
+    /// `[n, K, 11]`: head records.
+    head: Tensor,
+    /// `[n, 11]`: packed parents.
+    parents: Tensor,
+}
+
+/// Output buffers of one chunk.
+struct Job<'a> {
+    span: Span,
+    rows: &'a mut [f32],
+    gains: &'a mut [f32],
+}
+
 impl Trunk {
-    /// `channels` of each feature level that the backbone hands over.
+    /// Builds the trunk. `channels`: the backbone's feature levels with their channels.
     ///
     /// # Errors
-    /// A configuration that does not check, a level that the backbone lacks, tensors
-    /// missing or of another shape.
+    /// The configuration is invalid, the backbone lacks a level, or a tensor is missing or
+    /// has another shape.
     pub fn new(
         config: &Config,
         channels: &[(FeatureLevel, usize)],
@@ -134,10 +166,11 @@ impl Trunk {
         } else {
             None
         };
-        Ok(Self { config: config.clone(), side: config.upscale, parts, backend: Backend::Cpu })
+        let rules = rules(config, config.upscale);
+        Ok(Self { config: config.clone(), rules, parts, backend: Backend::Cpu })
     }
 
-    /// Where the next calls gather, make children and rasterize.
+    /// Sets the backend of the following gathers, SPGR calls and renders.
     pub fn set_backend(&mut self, backend: &Backend) {
         self.backend = backend.clone();
         if let Some(agg) = self.parts.as_mut().and_then(|p| p.aggregation.as_mut()) {
@@ -145,32 +178,33 @@ impl Trunk {
         }
     }
 
-    /// Whether SPGR is off: children are then the primaries ([`Children::whole`]).
+    /// Returns true if SPGR is off: children are then the primaries
+    /// ([`Children::whole`]).
     pub fn is_off(&self) -> bool {
         self.parts.is_none()
     }
 
-    /// r of the next calls; the `coord` head serves any, the others what they have
-    /// been made for.
+    /// Sets r of the following calls. The `coord` head accepts any r up to 8, the others
+    /// only the configured one.
     ///
     /// # Errors
-    /// Another r than configured with a head of fixed K.
+    /// `side` differs from the configured r and the head has a fixed K; `side` is not in
+    /// 1 to 8.
     pub fn set_upscale(&mut self, side: usize) -> Result<()> {
         let fixed = self.config.spgr.head != SpgrHead::Coord && self.parts.is_some();
         if !(1..=8).contains(&side) || (fixed && side != self.config.upscale) {
             let expected = if fixed { self.config.upscale.to_string() } else { "1 to 8".into() };
             bail!("upscale: expected {expected} (head {:?}), got {side}", self.config.spgr.head);
         }
-        self.side = side;
+        self.rules = rules(&self.config, side);
         Ok(())
     }
 
-    /// Children of the one scene in `views`, without gradient; chunks in parallel, or on a
-    /// GPU one after the other.
+    /// Computes the children of the one scene in `views`, without gradient. Chunks run in
+    /// parallel, or on a GPU one after the other.
     ///
     /// # Errors
-    /// Inputs that do not fit one another or the configuration, or that give numbers
-    /// that are not finite.
+    /// Inputs do not fit one another or the configuration; a result is not finite.
     pub fn forward(
         &self,
         views: &Views,
@@ -181,16 +215,18 @@ impl Trunk {
         let scene = self.scene(parts, views, backbone, primaries)?;
         let sh = interleaved(&primaries.sh)?;
         let chunk = if self.backend.is_cpu() { CHUNK } else { CHUNK_GPU };
-        self.children(parts, &scene, (sh, primaries.sh_basis), (chunk, Mode::Infer))
+        self.children(parts, &scene, sh, primaries.sh_basis, chunk, Mode::Infer)
     }
 
-    /// Children with coefficients `sh` outside any graph, `chunk` parents at a time.
+    /// Children with coefficients `sh`, outside any graph, `chunk` parents at a time.
     fn children(
         &self,
         parts: &Parts,
         scene: &Scene,
-        (sh, sh_basis): (Tensor, ShBasis),
-        (chunk, mode): (usize, Mode),
+        sh: Tensor,
+        sh_basis: ShBasis,
+        chunk: usize,
+        mode: Mode,
     ) -> Result<Children> {
         let (k, lanes) = (scene.rules.children(), scene.rules.gain_lanes());
         let n = scene.means.dim(0)?;
@@ -201,17 +237,16 @@ impl Trunk {
         let mut gains = vec![0f32; n * k * lanes];
         let mut jobs = Vec::new();
         let (mut rows_left, mut gains_left) = (&mut rows[..], &mut gains[..]);
-        for (first, len) in chunks(n, scene.per_view, chunk.max(1)) {
-            let (r, rest) = rows_left.split_at_mut(len * k * SPLAT_STRIDE);
+        for span in chunks(n, scene.per_view, chunk.max(1)) {
+            let (rows, rest) = rows_left.split_at_mut(span.len * k * SPLAT_STRIDE);
             rows_left = rest;
-            let (g, rest) = gains_left.split_at_mut(len * k * lanes);
+            let (gains, rest) = gains_left.split_at_mut(span.len * k * lanes);
             gains_left = rest;
-            jobs.push((first, len, r, g));
+            jobs.push(Job { span, rows, gains });
         }
-        type Job<'a> = (usize, usize, &'a mut [f32], &'a mut [f32]);
-        let run = |(first, len, rows, gains): Job| {
-            let (head, parents) = self.records(parts, scene, (first, len), mode)?;
-            spgr_into_on(&self.backend, &head, &parents, &scene.call(first), (rows, gains))
+        let run = |Job { span, rows, gains }: Job| {
+            let Records { head, parents } = self.records(parts, scene, span, mode)?;
+            spgr_into_on(&self.backend, &head, &parents, &scene.call(span), (rows, gains))
         };
         match self.backend.is_cpu() {
             true => jobs.into_par_iter().try_for_each(run)?,
@@ -228,10 +263,10 @@ impl Trunk {
         })
     }
 
-    /// The picture `[5, H, W]` (R, G, B, alpha, Σ w·z) that `camera` sees of the one
-    /// scene in `views`, without children in memory: head records become footprints
-    /// chunk by chunk; a GPU makes the children and rasterizes them. The basis of `options`
-    /// gives way to the primaries' own.
+    /// Renders the one scene in `views` from `camera`: `[5, H, W]` (R, G, B, alpha,
+    /// Σ w·z). On the CPU no children exist in memory, because head records become
+    /// footprints chunk by chunk; a GPU makes the children and rasterizes them. The SH basis
+    /// is that of `primaries`, not that of `options`.
     ///
     /// # Errors
     /// Those of [`Trunk::forward`] and of the rasterizer.
@@ -257,21 +292,21 @@ impl Trunk {
         let sh = primaries.sh.squeeze(0)?;
         let fill = |mut left: &mut [Footprint]| {
             let mut jobs = Vec::new();
-            for (first, len) in chunks(n, scene.per_view, CHUNK) {
-                let (own, rest) = left.split_at_mut(len * k);
+            for span in chunks(n, scene.per_view, CHUNK) {
+                let (own, rest) = left.split_at_mut(span.len * k);
                 left = rest;
-                jobs.push((first, len, own));
+                jobs.push((span, own));
             }
-            jobs.into_par_iter().try_for_each(|(first, len, own)| {
-                let (head, parents) = self.records(parts, &scene, (first, len), Mode::Infer)?;
-                let sh = sh.narrow(0, first, len)?.transpose(1, 2)?;
-                spgr_footprints((&head, &parents, &sh), &scene.call(first), camera, options, own)
+            jobs.into_par_iter().try_for_each(|(span, own)| {
+                let Records { head, parents } = self.records(parts, &scene, span, Mode::Infer)?;
+                let sh = sh.narrow(0, span.first, span.len)?.transpose(1, 2)?;
+                spgr_footprints((&head, &parents, &sh), &scene.call(span), camera, options, own)
             })
         };
         rasterize_footprints(n * k, camera, options, fill)
     }
 
-    /// [`Trunk::forward`] for every scene of a batch.
+    /// Computes [`Trunk::forward`] for every scene of a batch.
     ///
     /// # Errors
     /// Those of [`Trunk::forward`].
@@ -287,9 +322,8 @@ impl Trunk {
         (0..views.scenes()).map(scene).collect()
     }
 
-    /// Children of the one scene in `views`, differentiable in every parameter and in
-    /// the backbone's outputs, `chunk` parents at a time. `seed` decides what attention
-    /// drops.
+    /// Computes the children of the one scene in `views`, differentiable in every parameter
+    /// and in the backbone's outputs.
     ///
     /// # Errors
     /// Those of [`Trunk::forward`].
@@ -298,16 +332,17 @@ impl Trunk {
         views: &Views,
         backbone: &BackboneOutput,
         primaries: &Primaries,
-        (chunk, seed): (usize, u64),
+        TrainPass { chunk, seed }: TrainPass,
     ) -> Result<Children> {
         let Some(parts) = &self.parts else { return self.pass_through(views, primaries) };
         let scene = self.scene(parts, views, backbone, primaries)?;
         let (mut rows, mut gains) = (Vec::new(), Vec::new());
         for span in chunks(scene.means.dim(0)?, scene.per_view, chunk.max(1)) {
-            let (head, parents) = self.records(parts, &scene, span, Mode::Train { seed })?;
-            let (r, g) = spgr_on(&self.backend, &head, &parents, &scene.call(span.0))?;
-            rows.push(r);
-            gains.push(g);
+            let Records { head, parents } =
+                self.records(parts, &scene, span, Mode::Train { seed })?;
+            let (own_rows, own_gains) = spgr_on(&self.backend, &head, &parents, &scene.call(span))?;
+            rows.push(own_rows);
+            gains.push(own_gains);
         }
         Ok(Children {
             rows: Tensor::cat(&rows, 0)?,
@@ -326,7 +361,7 @@ impl Trunk {
         primaries: &Primaries,
     ) -> Result<Scene<'a>> {
         check_single(views, primaries)?;
-        // Whole rows, so that no chunk gathers its own from wider ones.
+        // Contiguous once, so that no chunk copies its rows out of wider ones.
         let own = |t: &Tensor| t.squeeze(0)?.contiguous();
         let means = own(&primaries.means)?;
         let n = means.dim(0)?;
@@ -354,19 +389,13 @@ impl Trunk {
             sh_input: sh.reshape((n, 3 * d))?,
             per_view: primaries.per_view,
             prepared,
-            rules: rules(&self.config, self.side),
+            rules: self.rules,
         })
     }
 
-    /// Head records `[n, K, 11]` and packed parents `[n, 11]` of one chunk.
-    fn records(
-        &self,
-        parts: &Parts,
-        scene: &Scene,
-        (first, len): (usize, usize),
-        mode: Mode,
-    ) -> Result<(Tensor, Tensor)> {
-        self.records_of(parts, scene, scene.chunk(first, len)?, mode)
+    /// Records of the parents in `span`.
+    fn records(&self, parts: &Parts, scene: &Scene, span: Span, mode: Mode) -> Result<Records> {
+        self.records_of(parts, scene, scene.chunk(span)?, mode)
     }
 
     fn records_of(
@@ -375,26 +404,21 @@ impl Trunk {
         scene: &Scene,
         parents: ParentChunk,
         mode: Mode,
-    ) -> Result<(Tensor, Tensor)> {
-        let (z_g, z_a) = parts.embeddings.forward(&parents, &scene.frames)?;
-        let (geo, app) = match (&parts.aggregation, &scene.prepared) {
+    ) -> Result<Records> {
+        let z: Descriptors = parts.embeddings.forward(&parents, &scene.frames)?;
+        let inputs = match (&parts.aggregation, &scene.prepared) {
             (Some(agg), Some(prepared)) => {
-                let z = (&z_g, &z_a);
-                let (f_g, f_a) = agg.forward(prepared, &parents, &scene.frames, z, mode)?;
-                match self.config.agg.resolved().head_input {
-                    HeadInput::FPlusZ => (sum(&f_g, &z_g)?, sum(&f_a, &z_a)?),
-                    HeadInput::F => (f_g, f_a),
-                }
+                let f = agg.forward(prepared, &parents, &scene.frames, &z, mode)?;
+                agg.head_inputs(f, &z)?
             }
-            // Without aggregation f = 0 and the heads read z, whatever they read else
-            // (spec 1.6).
-            _ => (z_g, z_a),
+            // f = 0 without aggregation, so that the heads read z.
+            _ => z,
         };
-        let head = parts.heads.forward(&geo, &app, self.side)?;
-        Ok((head, parents.rows()?))
+        let head = parts.heads.forward(&inputs, scene.rules.side)?;
+        Ok(Records { head, parents: parents.rows()? })
     }
 
-    /// The primaries themselves, K = 1 (SPGR off).
+    /// The primaries as their own children, K = 1 (SPGR off).
     fn pass_through(&self, views: &Views, primaries: &Primaries) -> Result<Children> {
         check_single(views, primaries)?;
         let opacities = primaries.opacities.unsqueeze(2)?;
@@ -411,7 +435,7 @@ impl Trunk {
 }
 
 impl Scene<'_> {
-    fn chunk(&self, first: usize, len: usize) -> Result<ParentChunk> {
+    fn chunk(&self, Span { first, len }: Span) -> Result<ParentChunk> {
         Ok(ParentChunk {
             first,
             source: first / self.per_view,
@@ -423,24 +447,24 @@ impl Scene<'_> {
         })
     }
 
-    fn call(&self, first: usize) -> Spgr {
+    fn call(&self, span: Span) -> Spgr {
         Spgr {
             rules: self.rules,
             cameras: self.views.cameras[0].clone(),
             near: self.views.near_far[0].iter().map(|&(near, _)| near).collect(),
             per_view: self.per_view,
-            first,
+            first: span.first,
         }
     }
 }
 
-/// Runs (first, length) of at most `size` parents that never straddle two views.
-fn chunks(n: usize, per_view: usize, size: usize) -> impl Iterator<Item = (usize, usize)> {
+/// Splits `n` parents into spans of at most `size` parents, each within one view.
+fn chunks(n: usize, per_view: usize, size: usize) -> impl Iterator<Item = Span> {
     let views = n / per_view.max(1);
     (0..views).flat_map(move |v| {
         (0..per_view.div_ceil(size)).map(move |i| {
             let first = v * per_view + i * size;
-            (first, size.min((v + 1) * per_view - first))
+            Span { first, len: size.min((v + 1) * per_view - first) }
         })
     })
 }
@@ -489,11 +513,12 @@ fn primaries_of(p: &Primaries, b: usize) -> Result<Primaries> {
     })
 }
 
-/// The initial value of a tensor of this room where `candle_nn::Init` cannot express
-/// it (spec 1.6): W_k the identity (as far as it is not square), the `cat` layer
-/// f + o, learned map offsets a ring. `None`: as hinted to the builder.
+/// Returns the initial value of a tensor that `candle_nn::Init` cannot express, `None` for
+/// every other tensor.
 ///
-/// `name` is the full tensor name, such as `subsplat.agg.g0.wk.0.weight`.
+/// W_k starts as the identity (cut or padded with zeros if it is not square), the `cat`
+/// layer as f + o, learned map offsets as a ring. `name` is the full tensor name, such as
+/// `subsplat.agg.g0.wk.0.weight`.
 pub fn initial_value(name: &str, shape: &[usize]) -> Option<Vec<f32>> {
     let parts: Vec<&str> = name.rsplit('.').collect();
     let in_stage = |depth: usize| parts.get(depth + 1) == Some(&"agg");
@@ -507,17 +532,17 @@ pub fn initial_value(name: &str, shape: &[usize]) -> Option<Vec<f32>> {
     }
 }
 
-/// Row-major 1 where the column is the row modulo `period`.
+/// Row-major matrix with 1 where the column modulo `period` equals the row.
 fn eye(rows: usize, columns: usize, period: usize) -> Vec<f32> {
     let one = |i: usize| (i % columns.max(1)) % period.max(1) == i / columns.max(1);
     (0..rows * columns).map(|i| if one(i) { 1.0 } else { 0.0 }).collect()
 }
 
-/// Sets every variable of `variables` that [`initial_value`] knows: call once after
-/// building a fresh model from a `VarMap`.
+/// Sets every variable for which [`initial_value`] has a value. Call it once after a new
+/// model is built from a `VarMap`.
 ///
 /// # Errors
-/// Whatever candle says of the assignment.
+/// Those of candle's assignment.
 pub fn set_initial_values(variables: &VarMap) -> Result<()> {
     let Ok(data) = variables.data().lock() else { bail!("variables: lock poisoned") };
     for (name, var) in data.iter() {

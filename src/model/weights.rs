@@ -1,15 +1,15 @@
-//! Weight files: safetensors in and out, and a seeded start where there are none.
+//! Weight files (safetensors), and initial values from a seed.
 //!
-//! A tensor is found under the name that the model asks for, with or without
-//! Lightning's prefix `encoder.`, so that a converted public MVSplat checkpoint
-//! loads as it is. f16 and bf16 are widened to f32. The configuration travels in
-//! the metadata under [`Config::METADATA_KEY`].
+//! A tensor is found under the model's name with or without Lightning's prefix
+//! `encoder.`, so that a converted public MVSplat checkpoint loads without renaming. f16
+//! and bf16 are widened to f32. The metadata hold the configuration under
+//! [`Config::METADATA_KEY`].
 //!
-//! Seeded start, the same on every platform: with h the FNV-1a hash of the
-//! tensor's name and mix the finaliser of SplitMix64, word i of the tensor is
-//! mix(k + (i + 1)·0x9E3779B97F4A7C15), k = h xor mix(seed). A uniform number is the
-//! top 24 bits plus ½, over 2²⁴; a normal one is the sum of the twelve 21-bit fields
-//! of four words, centred and divided by 2²¹ (Irwin–Hall: integers only, no libm).
+//! Initial values are a function of (seed, name, index), the same on every platform. With
+//! h the FNV-1a hash of the tensor's name and mix the finaliser of SplitMix64, word i of
+//! the tensor is mix(k + (i + 1)·0x9E3779B97F4A7C15), k = h xor mix(seed). A uniform number
+//! is the top 24 bits plus ½, over 2²⁴. A normal number is the sum of the twelve 21-bit
+//! fields of four words, centred and divided by 2²¹ (Irwin–Hall: integers only, no libm).
 
 use crate::config::Config;
 use crate::io;
@@ -24,36 +24,37 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// Lightning's name of the encoder inside the whole module.
 const LIGHTNING_PREFIX: &str = "encoder.";
-/// Names that a public MVSplat checkpoint cannot hold.
+/// Prefix of SubSplat's own tensors, which a public MVSplat checkpoint does not have.
 pub const SUBSPLAT_PREFIX: &str = "subsplat.";
 
-/// A weight file, or a seeded start, from which models are built.
+/// Tensors from which models are built: those of a weight file, or seeded ones.
 #[derive(Clone, Debug)]
 pub struct Weights {
     tensors: Arc<BTreeMap<String, Tensor>>,
     config: Option<Config>,
-    fresh: Fresh,
+    missing: Missing,
     trainable: bool,
-    used: Arc<Mutex<Used>>,
+    requested: Arc<Mutex<Requested>>,
 }
 
-/// What happens to a tensor that the file does not hold.
+/// Treatment of a tensor that the file lacks.
 #[derive(Clone, Debug)]
-enum Fresh {
+enum Missing {
     /// An error.
-    Never,
-    /// Drawn from the seed if its name starts with the prefix, else an error.
-    Under(String, u64),
+    Refuse,
+    /// Drawn from the seed if the name starts with the prefix, else an error.
+    DrawUnder { prefix: String, seed: u64 },
     /// Drawn from the seed.
-    Always(u64),
+    Draw { seed: u64 },
 }
 
+/// Tensors that models have requested so far.
 #[derive(Debug, Default)]
-struct Used {
-    /// Names in the file that were asked for.
-    taken: BTreeSet<String>,
-    /// Names that the file lacks and the seed gave.
-    initialised: BTreeSet<String>,
+struct Requested {
+    /// The file's names of tensors that were found.
+    found: BTreeSet<String>,
+    /// Names of tensors that were drawn from the seed.
+    drawn: BTreeSet<String>,
     /// Variables by the model's names, if trainable.
     variables: BTreeMap<String, Var>,
 }
@@ -62,19 +63,19 @@ impl Weights {
     /// Reads a safetensors file.
     ///
     /// # Errors
-    /// Not a safetensors file, a dtype other than f32, f16 and bf16, numbers that are
-    /// not finite, a configuration that does not parse.
+    /// The file is not a safetensors file, has a dtype other than f32, f16 and bf16, has
+    /// numbers that are not finite, or its configuration is invalid.
     pub fn load(path: &Path) -> io::Result<Self> {
         Self::parse(&io::read(path)?, path)
     }
 
-    /// The weights that ship in the crate, at ×`upscale`, learned from made-up rooms alone
-    /// (`src/model/shipped/README.md` is their model card): the small backbone, and SubSplat's
-    /// heads at ×2 and ×4. At another r there are no heads: children that start untrained are
-    /// the plain split of their parents.
+    /// Returns the weights that ship in the crate, for r = `upscale`: the small backbone,
+    /// and SubSplat's heads at ×2 and ×4. Another r has no trained heads; its children are
+    /// the even split of their parents. The training data are procedural rooms
+    /// (model card: `src/model/shipped/README.md`).
     ///
     /// # Errors
-    /// None that a whole build can give: those of [`Weights::load`].
+    /// Those of [`Weights::load`]; none with the embedded files intact.
     pub fn shipped(upscale: usize) -> io::Result<Self> {
         let at = |bytes: &[u8], name: &str| Self::parse(bytes, Path::new(name));
         let whole = at(include_bytes!("shipped/small.safetensors"), "shipped weights")?;
@@ -90,13 +91,13 @@ impl Weights {
         }
         if let Some(config) = &mut backbone.config {
             config.upscale = upscale;
-            // Heads that start closed ask nothing of the views.
+            // Heads that start at zero do not use the features.
             config.agg.enabled = false;
         }
         Ok(backbone)
     }
 
-    /// [`Weights::load`] of bytes in memory; `path` names them in errors.
+    /// Does the same as [`Weights::load`] with bytes in memory; errors name `path`.
     fn parse(bytes: &[u8], path: &Path) -> io::Result<Self> {
         let (tensors, metadata) = parse_tensors(bytes, path)?;
         let config = match metadata.get(Config::METADATA_KEY) {
@@ -108,38 +109,38 @@ impl Weights {
         Ok(Self { config, ..Self::from_tensors(tensors) })
     }
 
-    /// From tensors in memory, under the names that the model asks for.
+    /// Takes tensors in memory, by the model's names.
     pub fn from_tensors(tensors: BTreeMap<String, Tensor>) -> Self {
         Self {
             tensors: Arc::new(tensors),
             config: None,
-            fresh: Fresh::Never,
+            missing: Missing::Refuse,
             trainable: false,
-            used: Arc::default(),
+            requested: Arc::default(),
         }
     }
 
-    /// No file: every tensor is drawn from `seed`.
+    /// Draws every tensor from `seed`.
     pub fn seeded(seed: u64) -> Self {
-        Self { fresh: Fresh::Always(seed), ..Self::from_tensors(BTreeMap::new()) }
+        Self { missing: Missing::Draw { seed }, ..Self::from_tensors(BTreeMap::new()) }
     }
 
-    /// Tensors whose names start with `prefix` may be missing: they are drawn from
-    /// `seed`, and [`Weights::initialised`] tells which.
+    /// Draws missing tensors whose names start with `prefix` from `seed`;
+    /// [`Weights::initialised`] lists them.
     #[must_use]
     pub fn allow_missing(mut self, prefix: &str, seed: u64) -> Self {
-        self.fresh = Fresh::Under(prefix.to_owned(), seed);
+        self.missing = Missing::DrawUnder { prefix: prefix.to_owned(), seed };
         self
     }
 
-    /// Hands out variables instead of constants; [`Weights::variables`] lists them.
+    /// Gives models variables instead of constants; [`Weights::variables`] lists them.
     #[must_use]
     pub fn trainable(mut self) -> Self {
         self.trainable = true;
         self
     }
 
-    /// Without the tensors whose names start with `prefix`.
+    /// Removes the tensors whose names start with `prefix`.
     #[must_use]
     pub fn without(mut self, prefix: &str) -> Self {
         let kept = self.tensors.iter().filter(|(name, _)| !name.starts_with(prefix));
@@ -147,42 +148,43 @@ impl Weights {
         self
     }
 
-    /// The configuration that the file carries, if it does.
+    /// Returns the configuration in the file's metadata, if there is one.
     pub fn config(&self) -> Option<&Config> {
         self.config.as_ref()
     }
 
-    /// The tensors as read, by the file's names.
+    /// Returns the tensors of the file, by the file's names.
     pub fn tensors(&self) -> &BTreeMap<String, Tensor> {
         &self.tensors
     }
 
-    /// What a model's constructor takes.
+    /// Returns the builder that a model's constructor takes.
     pub fn builder(&self) -> VarBuilder<'static> {
         VarBuilder::from_backend(Box::new(self.clone()), DType::F32, Device::Cpu)
     }
 
-    /// Names in the file that no model has asked for so far.
+    /// Returns the names in the file that no model has requested so far.
     pub fn unexpected(&self) -> Vec<String> {
-        let used = self.lock();
-        self.tensors.keys().filter(|n| !used.taken.contains(*n)).cloned().collect()
+        let requested = self.lock();
+        self.tensors.keys().filter(|n| !requested.found.contains(*n)).cloned().collect()
     }
 
-    /// Names that models asked for and the seed gave.
+    /// Returns the names of tensors that were drawn from the seed.
     pub fn initialised(&self) -> Vec<String> {
-        self.lock().initialised.iter().cloned().collect()
+        self.lock().drawn.iter().cloned().collect()
     }
 
-    /// Variables handed out so far, by name (empty unless [`Weights::trainable`]).
+    /// Returns the variables requested so far, by name (empty unless
+    /// [`Weights::trainable`]).
     pub fn variables(&self) -> BTreeMap<String, Var> {
         self.lock().variables.clone()
     }
 
-    fn lock(&self) -> MutexGuard<'_, Used> {
-        self.used.lock().unwrap_or_else(PoisonError::into_inner)
+    fn lock(&self) -> MutexGuard<'_, Requested> {
+        self.requested.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The file's name for the model's `name`, if the file has it.
+    /// The file's name and tensor for the model's `name`, if the file has it.
     fn find(&self, name: &str) -> Option<(&String, &Tensor)> {
         self.tensors
             .get_key_value(name)
@@ -194,13 +196,15 @@ impl Weights {
         if let Some(var) = self.lock().variables.get(name) {
             return matching(var.as_tensor().clone(), shape, name);
         }
-        let tensor = match (self.find(name), shape, &self.fresh) {
+        let tensor = match (self.find(name), shape, &self.missing) {
             (Some((key, tensor)), _, _) => {
-                self.lock().taken.insert(key.clone());
+                self.lock().found.insert(key.clone());
                 matching(tensor.clone(), shape, name)?
             }
-            (None, Some(shape), Fresh::Always(seed)) => self.draw(*seed, name, shape, init)?,
-            (None, Some(shape), Fresh::Under(prefix, seed)) if name.starts_with(prefix) => {
+            (None, Some(shape), Missing::Draw { seed }) => self.draw(*seed, name, shape, init)?,
+            (None, Some(shape), Missing::DrawUnder { prefix, seed })
+                if name.starts_with(prefix) =>
+            {
                 self.draw(*seed, name, shape, init)?
             }
             (None, Some(shape), _) => {
@@ -218,9 +222,9 @@ impl Weights {
     }
 
     fn draw(&self, seed: u64, name: &str, shape: &Shape, init: Init) -> Result<Tensor> {
-        self.lock().initialised.insert(name.to_owned());
+        self.lock().drawn.insert(name.to_owned());
         let mut values = seeded_values(seed, name, shape, init);
-        super::start_value(name, shape.dims(), &mut values);
+        super::apply_initial_value(name, shape.dims(), &mut values);
         Tensor::from_vec(values, shape, &Device::Cpu)
     }
 }
@@ -255,18 +259,18 @@ impl SimpleBackend for Weights {
     }
 }
 
-/// All tensors of a safetensors file as f32, and its metadata.
+/// Reads all tensors of a safetensors file as f32, and its metadata.
 ///
 /// # Errors
-/// Not a safetensors file, a dtype other than f32, f16 and bf16, numbers that are not
-/// finite.
+/// The file is not a safetensors file, has a dtype other than f32, f16 and bf16, or has
+/// numbers that are not finite.
 pub fn read_tensors(
     path: &Path,
 ) -> io::Result<(BTreeMap<String, Tensor>, HashMap<String, String>)> {
     parse_tensors(&io::read(path)?, path)
 }
 
-/// [`read_tensors`] of bytes in memory; `path` names them in errors.
+/// Does the same as [`read_tensors`] with bytes in memory; errors name `path`.
 ///
 /// # Errors
 /// As [`read_tensors`].
@@ -287,7 +291,7 @@ pub fn parse_tensors(
     Ok((tensors, metadata))
 }
 
-/// One tensor of the file as f32, checked to be finite.
+/// One tensor of the file as f32; refuses numbers that are not finite.
 fn widen(path: &Path, name: &str, view: &TensorView<'_>) -> io::Result<Tensor> {
     let refuse = |expected: &str, got: String| {
         Err(io::Error::format(path, expected, got).at(format!(" tensor `{name}`")))
@@ -318,7 +322,7 @@ fn widen(path: &Path, name: &str, view: &TensorView<'_>) -> io::Result<Tensor> {
 /// Writes tensors as f32 with the configuration in the metadata, atomically.
 ///
 /// # Errors
-/// The folder is missing or full; a tensor is not a float tensor.
+/// The folder is missing, the disk is full, or a tensor is not a float tensor.
 pub fn save(path: &Path, tensors: &BTreeMap<String, Tensor>, config: &Config) -> io::Result<()> {
     let bad = |e: String| io::Error::format(path, "tensors and configuration to write", e);
     let mut bytes = Vec::with_capacity(tensors.len());
@@ -349,7 +353,7 @@ fn mix(mut z: u64) -> u64 {
     z ^ (z >> 31)
 }
 
-/// The elements of tensor `name` under `seed`; the formula is in the module's doc.
+/// The elements of tensor `name` for `seed`, by the formula of the module's doc.
 fn seeded_values(seed: u64, name: &str, shape: &Shape, init: Init) -> Vec<f32> {
     let hash = name
         .bytes()
@@ -446,7 +450,7 @@ mod tests {
     }
 
     #[test]
-    fn damaged_files_give_an_answer() {
+    fn damaged_files_cause_no_panic() {
         let (_keep, path) = file(&[("a", ones(&[30])), ("b.c", ones(&[2, 5]))]);
         let good = std::fs::read(&path).unwrap();
         let mut refused = 0;
@@ -501,15 +505,15 @@ mod tests {
         let (m, s) = moments(&u);
         assert!((m - 1.0).abs() < 0.05 && (s - 4.0 / 12f64.sqrt()).abs() < 0.05, "{m} {s}");
         assert!(u.iter().all(|v| (-1.0..3.0).contains(v)));
-        // The formula itself: a change would silently give other seeded models.
+        // Pins the formula: a change would give other seeded models without an error.
         assert_eq!(draw(0, "pin", normal)[..2], PINNED);
     }
 
-    /// From an independent implementation of the formula (Python).
+    /// Values of an independent implementation of the formula (Python).
     const PINNED: [f32; 2] = [-1.202_24, 1.322_560_3];
 
     #[test]
-    fn variables_are_handed_out_once() {
+    fn a_name_has_one_variable() {
         let w = Weights::seeded(3).trainable();
         let a = w.builder().get(4, "a").unwrap();
         let again = w.builder().get(4, "a").unwrap();

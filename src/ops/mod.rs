@@ -15,13 +15,13 @@ pub mod conv3d;
 pub mod direct;
 pub mod dssim;
 pub mod feed_forward;
-pub mod given;
 pub mod join;
 pub mod linear;
 pub mod matching;
 pub mod moves;
 pub mod norm;
 pub mod plane_sweep;
+pub mod precomputed_gradient;
 mod rasterize;
 pub mod redistribute;
 pub mod resize;
@@ -99,6 +99,3 @@ macro_rules! by_dtype {
     };
 }
 pub(crate) use by_dtype;
-
-#[cfg(test)]
-mod same;

@@ -6,7 +6,7 @@
 
 use crate::metrics::{SSIM_C1, SSIM_C2, SSIM_COVARIANCE, SSIM_WINDOW, window};
 use crate::ops::dssim;
-use crate::ops::given::given;
+use crate::ops::precomputed_gradient::precomputed_gradient;
 use candle_core::{Result, Tensor};
 use rayon::prelude::*;
 
@@ -46,7 +46,7 @@ impl Scored {
 /// # Errors
 /// A gradient of another length than `x`.
 pub fn with_gradient(x: &Tensor, scored: Scored) -> Result<Tensor> {
-    given(x, scored.value, scored.gradient)
+    precomputed_gradient(x, scored.value, scored.gradient)
 }
 
 /// Mean squared difference of `x` and `target`.

@@ -10,11 +10,11 @@ use crate::camera::Camera;
 use crate::config::{Backbone, Config};
 use crate::data::dataset::Posed;
 use crate::io::image::Rgb;
-use crate::model::backbone::small::DepthMaps;
+use crate::model::backbone::small::{DepthMaps, DisparityMean};
 use crate::model::lpips::Lpips;
 use crate::model::primaries::packed;
 use crate::model::subsplat::SubSplat;
-use crate::model::trunk::Children;
+use crate::model::trunk::{Children, TrainPass};
 use crate::model::weights::Weights;
 use crate::model::{BackboneOutput, Views};
 use crate::ops::rasterize;
@@ -261,7 +261,7 @@ impl Learner {
         seconds: &mut Seconds,
     ) -> Result<(Tensor, Terms)> {
         let start = Instant::now();
-        let maps = self.model.depth_maps(views, self.config.loss.around_mode)?;
+        let maps = self.model.depth_maps(views, self.disparity_mean())?;
         seconds.backbone += start.elapsed().as_secs_f64();
         let start = Instant::now();
         let nothing = Terms { mse: f64::NAN, dssim: f64::NAN, lpips: f64::NAN, ..Terms::default() };
@@ -327,7 +327,7 @@ impl Learner {
         seconds: &mut Seconds,
     ) -> Result<(Tensor, Terms)> {
         let start = Instant::now();
-        let (output, maps) = self.model.encode_for_training(views, self.config.loss.around_mode)?;
+        let (output, maps) = self.model.encode_for_training(views, self.disparity_mean())?;
         let frozen = self.config.optimizer.freeze_backbone;
         let output = if frozen { output.detach()? } else { output };
         seconds.backbone += start.elapsed().as_secs_f64();
@@ -386,7 +386,12 @@ impl Learner {
             return Ok(seen.terms);
         }
         let primaries = parents.split()?;
-        let pass = trunk.forward_recomputed(views, output, &primaries, (CHUNK, step))?;
+        let pass = trunk.forward_recomputed(
+            views,
+            output,
+            &primaries,
+            TrainPass { chunk: CHUNK, seed: step },
+        )?;
         seconds.trunk += start.elapsed().as_secs_f64();
         let start = Instant::now();
         let seen = self.pictures(pass.children(), example)?;
@@ -398,6 +403,13 @@ impl Learner {
         parts.extend(pass.backward([&rows.gradient, &gain.gradient], collect)?);
         seconds.backward += start.elapsed().as_secs_f64();
         Ok(seen.terms)
+    }
+
+    fn disparity_mean(&self) -> DisparityMean {
+        match self.config.loss.around_mode {
+            true => DisparityMean::AroundMode,
+            false => DisparityMean::AllCandidates,
+        }
     }
 
     /// x of the opacity mapping at `step` (MVSplat, `map_pdf_to_opacity`).

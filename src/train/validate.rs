@@ -146,7 +146,7 @@ impl Validator {
         let mut views = views_of(&[scene])?;
         // Where depth is known its error is told in candidates: those of the example.
         if scene.inverse_depth.is_empty() {
-            views = model.look(&views)?;
+            views = model.estimate_depth_range(&views)?;
         }
         let output = model.encode(&views)?;
         let parents = model.primaries(&views, &output)?;

@@ -8,9 +8,11 @@ use glam::{Quat, Vec3};
 use scenes::*;
 use subsplat::config::*;
 use subsplat::model::aggregation::Aggregation;
+use subsplat::model::embed::Descriptors;
 use subsplat::model::geometry::{Frames, ParentChunk};
 use subsplat::model::mlp::Mode;
 use subsplat::model::trunk::set_initial_values;
+use subsplat::model::weights::Weights;
 use subsplat::model::{BackboneOutput, Primaries};
 use subsplat::ops::attention_gather::{Gather, Level};
 
@@ -115,9 +117,9 @@ fn build(keys: &subsplat::config::Aggregation, seed: u64) -> (Aggregation, VarMa
 fn run(agg: &Aggregation, x: &Fixture, mode: Mode) -> [Tensor; 2] {
     let views = views(&x.cameras);
     let prepared = agg.prepare(&views, &x.frames, &x.backbone, &x.primaries).unwrap();
-    let z = (&x.z[0], &x.z[1]);
-    let (g, a) = agg.forward(&prepared, &x.parents, &x.frames, z, mode).unwrap();
-    [g, a]
+    let z = Descriptors { geometry: x.z[0].clone(), appearance: x.z[1].clone() };
+    let f = agg.forward(&prepared, &x.parents, &x.frames, &z, mode).unwrap();
+    [f.geometry, f.appearance]
 }
 
 /// Samples of one parent: per view and level, raw channels at the projected mean,
@@ -268,15 +270,14 @@ fn coordinate_maps(x: &mut Fixture) {
 
 /// One stage that averages its samples: linear weights at zero, no projection.
 fn averaging() -> subsplat::config::Aggregation {
-    subsplat::config::Aggregation {
-        stages_geo: 1,
-        stages_app: 0,
+    let ablations = AggregationAblations {
         op: AttentionOp::Linear,
         kv_proj: false,
         gate: Gate::Off,
         residual: Residual::None,
-        ..paper()
-    }
+        ..AggregationAblations::default()
+    };
+    subsplat::config::Aggregation { stages_geo: 1, stages_app: 0, ablations, ..paper() }
 }
 
 #[test]
@@ -284,12 +285,10 @@ fn key_points_lie_on_the_gaussian() {
     let mut x = fixture(0, 256, 9);
     coordinate_maps(&mut x);
     // The centre and +0.45 σ along the parent's own x axis.
-    let keys = subsplat::config::Aggregation {
-        points: Points::Pixelgaussian,
-        n_fixed: 2,
-        n_learned: 0,
-        ..averaging()
-    };
+    let mut keys = averaging();
+    keys.ablations.points = Points::Pixelgaussian;
+    keys.ablations.n_fixed = 2;
+    keys.ablations.n_learned = 0;
     let variables = VarMap::new();
     let vb = VarBuilder::from_varmap(&variables, DType::F32, &Device::Cpu);
     let agg = Aggregation::new(&keys, 32, &channels(), vb).unwrap();
@@ -321,15 +320,12 @@ fn key_points_lie_on_the_gaussian() {
 fn map_offsets_start_on_a_ring_of_one_map_pixel() {
     let mut x = fixture(0, 256, 10);
     coordinate_maps(&mut x);
-    let keys = subsplat::config::Aggregation {
-        points: Points::MapOffsets,
-        n_learned: 1,
-        levels: vec![FeatureLevel::Cnn2],
-        ..averaging()
-    };
+    let mut keys = averaging();
+    keys.ablations.points = Points::MapOffsets;
+    keys.ablations.n_learned = 1;
+    keys.levels = vec![FeatureLevel::Trans4];
     let variables = VarMap::new();
     let vb = VarBuilder::from_varmap(&variables, DType::F32, &Device::Cpu);
-    let keys = subsplat::config::Aggregation { levels: vec![FeatureLevel::Trans4], ..keys };
     let agg = Aggregation::new(&keys, 32, &channels(), vb.pp("subsplat").pp("agg")).unwrap();
     set_initial_values(&variables).unwrap();
     let got = host(&run(&agg, &x, Mode::Infer)[0]);
@@ -352,7 +348,8 @@ fn map_offsets_start_on_a_ring_of_one_map_pixel() {
 
 #[test]
 fn literal_form_has_no_parameters_but_gates() {
-    let keys = subsplat::config::Aggregation { strict_literal: true, ..paper() };
+    let mut keys = paper();
+    keys.ablations.strict_literal = true;
     let (agg, variables) = build(&keys, 11);
     let mut names: Vec<String> = variables.data().lock().unwrap().keys().cloned().collect();
     names.sort();
@@ -380,11 +377,9 @@ fn literal_form_has_no_parameters_but_gates() {
 
 #[test]
 fn initial_values_are_the_recommended_ones() {
-    let keys = subsplat::config::Aggregation {
-        levels: vec![FeatureLevel::Trans4, FeatureLevel::Cnn2],
-        residual: Residual::Cat,
-        ..paper()
-    };
+    let mut keys = paper();
+    keys.levels = vec![FeatureLevel::Trans4, FeatureLevel::Cnn2];
+    keys.ablations.residual = Residual::Cat;
     let variables = VarMap::new();
     let vb = VarBuilder::from_varmap(&variables, DType::F32, &Device::Cpu);
     Aggregation::new(&keys, 32, &channels(), vb.pp("subsplat").pp("agg")).unwrap();
@@ -423,12 +418,31 @@ fn learned_gates_have_a_limit_of_views() {
         (Gate::Off, AttentionOp::Dot, true),
         (Gate::Off, AttentionOp::Linear, false),
     ] {
-        let keys = subsplat::config::Aggregation { gate, op, gate_views: 2, ..paper() };
+        let mut keys = paper();
+        (keys.gate_views, keys.ablations.gate, keys.ablations.op) = (2, gate, op);
         let (agg, _) = build(&keys, 14);
         let got = agg.prepare(&views(&three), &frames, &backbone, &primaries);
         match got {
             Ok(_) => assert!(fits, "{gate:?} {op:?}"),
             Err(e) => assert!(!fits && e.to_string().contains("agg.gate_views"), "{e}"),
         }
+    }
+}
+
+/// The presets' stage and the general form give the same bits: `attn_drop` alone selects the
+/// general form and has no effect at inference.
+#[test]
+fn presets_equal_the_general_form() {
+    for preset in [Preset::Paper, Preset::Tuned] {
+        let x = fixture(256, 256, 15);
+        let run = |attn_drop: f64| {
+            let mut keys = Config::re10k(preset, 2).agg;
+            keys.ablations.attn_drop = attn_drop;
+            let weights = Weights::seeded(16);
+            let vb = weights.builder().pp("subsplat").pp("agg");
+            let agg = Aggregation::new(&keys, 32, &channels(), vb).unwrap();
+            run(&agg, &x, Mode::Infer).map(|t| host(&t))
+        };
+        assert_eq!(run(0.0), run(0.1), "{preset:?}");
     }
 }

@@ -5,6 +5,7 @@ mod attention_gather;
 mod backbone;
 mod encoder_gradients;
 mod end_to_end;
+mod operators;
 mod parity;
 mod plane_sweep;
 mod primaries;

@@ -1,13 +1,14 @@
 //! The Gaussian adapter: frames, colour bases, guards and gradients. Its numbers are
 //! held against the public MVSplat in `parity.rs`.
 
+use subsplat_test_support::primaries_reference;
+
 use candle_core::{DType, Device, Result, Tensor, Var};
 use glam::{DMat3, DQuat, DVec3, Mat4, Quat, Vec3};
 use subsplat::abi::ShBasis;
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::config::{Mvsplat, Primaries as Settings, ShFrame};
 use subsplat::model::primaries::{primaries, sh_mask};
-use subsplat::model::primaries_ref;
 use subsplat::model::trace::Trace;
 use subsplat::model::{BackboneOutput, Primaries, Views};
 use subsplat::ops::adapter::{Adapter, Turn, View, place};
@@ -287,7 +288,7 @@ fn the_op_agrees_with_tensor_operations_and_so_do_its_gradients() -> Result<()> 
             let mut s = settings(frame);
             (s.sh_degree, s.opacity_exponent) = (degree, exponent);
             let op = |out: &BackboneOutput| primaries(out, &views, &s, &mut Trace::off());
-            let graph = |out: &BackboneOutput| primaries_ref::primaries(out, &views, &s);
+            let graph = |out: &BackboneOutput| primaries_reference::primaries(out, &views, &s);
             let (got, want) = (with_gradients(&out, op)?, with_gradients(&out, graph)?);
             let pairs = got.0.iter().zip(&want.0).map(|p| (p, 4e-6));
             for (((name, got), (_, want)), within) in

@@ -4,7 +4,7 @@ use candle_core::{Device, Tensor};
 use subsplat::config::{Backbone, Config, Preset, Small};
 use subsplat::data::procedural::{Example, ExampleSpec};
 use subsplat::model::Views;
-use subsplat::model::backbone::SmallBackbone;
+use subsplat::model::backbone::{DisparityMean, SmallBackbone};
 use subsplat::model::subsplat::SubSplat;
 use subsplat::model::weights::Weights;
 
@@ -58,7 +58,8 @@ fn right(config: &Small, tolerance: f32) -> f32 {
     let (mut hits, mut all) = (0, 0);
     for seed in 0..4 {
         let e = example(seed);
-        let (out, _) = net.forward(&views(std::slice::from_ref(&e)), false).unwrap();
+        let (out, _) =
+            net.forward(&views(std::slice::from_ref(&e)), DisparityMean::AroundMode).unwrap();
         let got = flat(&out.depths);
         for (v, view) in e.views[..2].iter().enumerate() {
             let k = e.cameras[v].intrinsics;
@@ -113,7 +114,7 @@ fn every_part_can_be_switched() {
         let mut config = Small::standard();
         part(&mut config);
         let (net, weights) = build(&config);
-        let (out, maps) = net.forward(&v, false).unwrap();
+        let (out, maps) = net.forward(&v, DisparityMean::AroundMode).unwrap();
         assert_eq!(out.depths.dims(), [1, 2, SIDE * SIDE, 1]);
         assert_eq!(out.raw.dims(), [1, 2, SIDE * SIDE, 9 + 75]);
         let mut values = flat(&out.depths);
@@ -133,9 +134,10 @@ fn every_part_can_be_switched() {
 fn a_batch_equals_its_parts() {
     let net = lively(&Small::standard());
     let (one, two) = (example(7), example(8));
-    let both = net.forward(&views(&[one.clone(), two.clone()]), false).unwrap().0;
+    let both =
+        net.forward(&views(&[one.clone(), two.clone()]), DisparityMean::AroundMode).unwrap().0;
     for (b, e) in [one, two].into_iter().enumerate() {
-        let alone = net.forward(&views(&[e]), false).unwrap().0;
+        let alone = net.forward(&views(&[e]), DisparityMean::AroundMode).unwrap().0;
         for (x, y) in [(&both.depths, &alone.depths), (&both.raw, &alone.raw)] {
             let (x, y) = (flat(&x.get(b).unwrap()), flat(&y.get(0).unwrap()));
             let worst = x.iter().zip(&y).map(|(x, y)| (x - y).abs() / (1.0 + y.abs()));
@@ -145,20 +147,20 @@ fn a_batch_equals_its_parts() {
 }
 
 #[test]
-fn a_first_look_narrows_a_wide_range_unless_it_is_switched_off() {
+fn the_depth_range_is_narrowed_unless_the_estimate_is_off() {
     let e = example(2);
     let mut v = views(std::slice::from_ref(&e));
     v.near_far[0].fill((0.2 * e.near, 20.0 * e.far));
     let look = |config: &Config| {
         let weights = Weights::seeded(3);
-        SubSplat::new(config, weights.builder()).unwrap().look(&v).unwrap().near_far
+        SubSplat::new(config, weights.builder()).unwrap().estimate_depth_range(&v).unwrap().near_far
     };
     let mut config = Config::small(Preset::Tuned, 2);
     let (near, far) = look(&config)[0][0];
     assert_eq!(look(&config)[0], [(near, far); 2]);
     assert!(near > v.near_far[0][0].0 && far < v.near_far[0][0].1, "{near} {far}");
     let Backbone::Small(small) = &mut config.backbone else { panic!("another backbone") };
-    small.first_look = false;
+    small.estimate_depth_range = false;
     assert_eq!(look(&config), v.near_far);
     assert_eq!(look(&Config::re10k(Preset::Tuned, 2)), v.near_far);
 }
@@ -171,6 +173,6 @@ fn wrong_sizes_are_refused() {
     let images = v.images.narrow(3, 0, 96).unwrap().narrow(4, 0, 80).unwrap();
     let cameras = vec![v.cameras[0].iter().map(|c| c.resized(80, 96)).collect()];
     let narrow = Views::new(images.contiguous().unwrap(), cameras, v.near_far.clone()).unwrap();
-    let error = net.forward(&narrow, false).unwrap_err().to_string();
+    let error = net.forward(&narrow, DisparityMean::AroundMode).unwrap_err().to_string();
     assert!(error.contains("multiples of 32") && error.contains("96x80"), "{error}");
 }

@@ -10,7 +10,7 @@ use subsplat::camera::Camera;
 use subsplat::config::*;
 use subsplat::model::embed::Embeddings;
 use subsplat::model::geometry::{Frames, ParentChunk};
-use subsplat::model::trunk::{Children, Trunk, set_initial_values};
+use subsplat::model::trunk::{Children, TrainPass, Trunk, set_initial_values};
 use subsplat::model::weights::Weights;
 use subsplat::model::{BackboneOutput, Primaries, Views};
 
@@ -76,7 +76,14 @@ impl Scene {
     }
 
     fn train(&self, trunk: &Trunk, chunk: usize) -> Children {
-        trunk.forward_train(&self.views, &self.backbone, &self.primaries, (chunk, 3)).unwrap()
+        trunk
+            .forward_train(
+                &self.views,
+                &self.backbone,
+                &self.primaries,
+                TrainPass { chunk, seed: 3 },
+            )
+            .unwrap()
     }
 }
 
@@ -104,57 +111,65 @@ fn switches() -> Vec<(&'static str, Change)> {
         ("no geometry stage", |c| c.agg.stages_geo = 0),
         ("one stage", |c| c.agg.stages_geo = 1),
         ("no appearance stage", |c| c.agg.stages_app = 0),
-        ("shared weights", |c| c.agg.share_stage_weights = true),
+        ("shared weights", |c| c.agg.ablations.share_stage_weights = true),
         ("all levels", |c| c.agg.levels = vec![Trans4, Trans8, Trans16, Cnn4, Cnn2, Refine1]),
-        ("linear", |c| c.agg.op = AttentionOp::Linear),
-        ("13 points", |c| c.agg.points = Points::Pixelgaussian),
+        ("linear", |c| c.agg.ablations.op = AttentionOp::Linear),
+        ("13 points", |c| c.agg.ablations.points = Points::Pixelgaussian),
         ("PixelGaussian", |c| {
-            c.agg.op = AttentionOp::Linear;
-            c.agg.points = Points::Pixelgaussian;
-            c.agg.groups = 4;
-            c.agg.mask = MaskMode::PgClamp;
-            c.agg.attn_drop = 0.15;
-            c.agg.share_stage_weights = true;
+            c.agg.ablations.op = AttentionOp::Linear;
+            c.agg.ablations.points = Points::Pixelgaussian;
+            c.agg.ablations.groups = 4;
+            c.agg.ablations.mask = MaskMode::PgClamp;
+            c.agg.ablations.attn_drop = 0.15;
+            c.agg.ablations.share_stage_weights = true;
         }),
         ("GaussianFormer", |c| {
-            c.agg.op = AttentionOp::Linear;
-            c.agg.points = Points::Pixelgaussian;
-            c.agg.groups = 4;
-            c.agg.residual = Residual::Cat;
-            c.agg.ffn = true;
+            c.agg.ablations.op = AttentionOp::Linear;
+            c.agg.ablations.points = Points::Pixelgaussian;
+            c.agg.ablations.groups = 4;
+            c.agg.ablations.residual = Residual::Cat;
+            c.agg.ablations.ffn = true;
         }),
-        ("fixed points", |c| (c.agg.points, c.agg.n_learned) = (Points::Pixelgaussian, 0)),
-        ("learned points", |c| (c.agg.points, c.agg.n_fixed) = (Points::Pixelgaussian, 0)),
-        ("map offsets", |c| c.agg.points = Points::MapOffsets),
-        ("no offsets", |c| (c.agg.points, c.agg.n_learned) = (Points::MapOffsets, 0)),
-        ("groups", |c| c.agg.groups = 4),
-        ("groups, levels", |c| (c.agg.groups, c.agg.levels) = (2, vec![Cnn2, Refine1])),
-        ("scale 1", |c| c.agg.logit_scale = LogitScale::One),
-        ("no projection", |c| c.agg.kv_proj = false),
-        ("no projection, levels", |c| (c.agg.kv_proj, c.agg.levels) = (false, vec![Cnn2])),
-        ("softmax gate", |c| c.agg.gate = Gate::Softmax),
-        ("query gate", |c| c.agg.gate = Gate::Query),
-        ("no gate", |c| c.agg.gate = Gate::Off),
-        ("more gate views", |c| (c.agg.gate_views, c.agg.op) = (5, AttentionOp::Linear)),
-        ("residual none", |c| c.agg.residual = Residual::None),
-        ("residual cat", |c| c.agg.residual = Residual::Cat),
+        ("fixed points", |c| {
+            (c.agg.ablations.points, c.agg.ablations.n_learned) = (Points::Pixelgaussian, 0)
+        }),
+        ("learned points", |c| {
+            (c.agg.ablations.points, c.agg.ablations.n_fixed) = (Points::Pixelgaussian, 0)
+        }),
+        ("map offsets", |c| c.agg.ablations.points = Points::MapOffsets),
+        ("no offsets", |c| {
+            (c.agg.ablations.points, c.agg.ablations.n_learned) = (Points::MapOffsets, 0)
+        }),
+        ("groups", |c| c.agg.ablations.groups = 4),
+        ("groups, levels", |c| (c.agg.ablations.groups, c.agg.levels) = (2, vec![Cnn2, Refine1])),
+        ("scale 1", |c| c.agg.ablations.logit_scale = LogitScale::One),
+        ("no projection", |c| c.agg.ablations.kv_proj = false),
+        ("no projection, levels", |c| {
+            (c.agg.ablations.kv_proj, c.agg.levels) = (false, vec![Cnn2])
+        }),
+        ("softmax gate", |c| c.agg.ablations.gate = Gate::Softmax),
+        ("query gate", |c| c.agg.ablations.gate = Gate::Query),
+        ("no gate", |c| c.agg.ablations.gate = Gate::Off),
+        ("more gate views", |c| (c.agg.gate_views, c.agg.ablations.op) = (5, AttentionOp::Linear)),
+        ("residual none", |c| c.agg.ablations.residual = Residual::None),
+        ("residual cat", |c| c.agg.ablations.residual = Residual::Cat),
         ("norm none", |c| c.agg.norm = StageNorm::None),
         ("norm pre", |c| c.agg.norm = StageNorm::Pre),
-        ("ffn", |c| c.agg.ffn = true),
-        ("pg clamp", |c| c.agg.mask = MaskMode::PgClamp),
-        ("integer", |c| c.agg.sample_convention = SampleConvention::Integer),
-        ("detached points", |c| c.agg.detach_points = true),
+        ("ffn", |c| c.agg.ablations.ffn = true),
+        ("pg clamp", |c| c.agg.ablations.mask = MaskMode::PgClamp),
+        ("integer", |c| c.agg.ablations.sample_convention = SampleConvention::Integer),
+        ("detached points", |c| c.agg.ablations.detach_points = true),
         ("detached key points", |c| {
-            (c.agg.detach_points, c.agg.points) = (true, Points::Pixelgaussian)
+            (c.agg.ablations.detach_points, c.agg.ablations.points) = (true, Points::Pixelgaussian)
         }),
         ("occlusion", |c| c.agg.occlusion_gate = true),
         ("no occlusion", |c| c.agg.occlusion_gate = false),
-        ("heads read f", |c| c.agg.head_input = HeadInput::F),
-        ("literal", |c| c.agg.strict_literal = true),
+        ("heads read f", |c| c.agg.ablations.head_input = HeadInput::F),
+        ("literal", |c| c.agg.ablations.strict_literal = true),
         ("head pg", |c| c.spgr.head = SpgrHead::Pg),
         ("head coord", |c| c.spgr.head = SpgrHead::Coord),
         ("heads not zero", |c| c.spgr.zero_init = false),
-        ("rgb gain", |c| c.spgr.gain_space = GainSpace::Rgb),
+        ("rgb gain", |c| c.spgr.ablations.gain_space = GainSpace::Rgb),
         ("low-pass of the input", |c| c.render.lowpass_ref = LowpassRef::Input),
         ("no SPGR", |c| c.spgr.enabled = false),
     ]
@@ -171,7 +186,7 @@ fn every_switch_runs_and_both_paths_agree() {
             c.check().unwrap();
             let (trunk, variables) = trunk(&c, 2);
             let a = scene.infer(&trunk);
-            c.agg.attn_drop = 0.0;
+            c.agg.ablations.attn_drop = 0.0;
             let undropped = Trunk::new(
                 &c,
                 &channels(),
@@ -217,12 +232,13 @@ fn every_parameter_has_a_gradient() {
                 // Gates of views beyond the scene's, f that no head reads, key biases
                 // that shift all of a softmax's logits alike.
                 let f_unused = key.contains(".agg.a") && c.agg.stages_app == 0;
-                let z_unused = agg.head_input == HeadInput::F
+                let z_unused = agg.ablations.head_input == HeadInput::F
                     && c.agg.enabled
                     && (key.contains(".w_g") || key.contains(".embed."));
                 let shift = key.contains(".wk.") && key.ends_with("bias");
                 // f = 0 before the first stage, so its key points see a bias only.
-                let blind = key.contains("g0.key_points.weight") && !c.agg.share_stage_weights;
+                let blind =
+                    key.contains("g0.key_points.weight") && !c.agg.ablations.share_stage_weights;
                 if f_unused || z_unused || shift || blind {
                     continue;
                 }
@@ -242,7 +258,7 @@ fn gradients_reach_the_backbone_and_the_whole_chain_is_right() {
     let cams = cameras(2, SIZE, SIZE);
     let scene = Scene::new(&cams, 6);
     let mut c = config(Preset::Tuned, 2);
-    c.spgr.a_min = AMin::Off;
+    c.spgr.ablations.a_min = AMin::Off;
     c.agg.occlusion_gate = false;
     let (trunk, _) = trunk(&c, 7);
     let map = scene.backbone.feature(FeatureLevel::Trans4).unwrap();
@@ -252,7 +268,9 @@ fn gradients_reach_the_backbone_and_the_whole_chain_is_right() {
         backbone.features[0].1 = m.clone();
         let primaries =
             Primaries { means: means.clone(), sh_camera: sh.clone(), ..scene.primaries.clone() };
-        let out = trunk.forward_train(&scene.views, &backbone, &primaries, (512, 0)).unwrap();
+        let out = trunk
+            .forward_train(&scene.views, &backbone, &primaries, TrainPass { chunk: 512, seed: 0 })
+            .unwrap();
         (out.rows * &w).unwrap().sum_all().unwrap()
     };
     let p = &scene.primaries;
@@ -297,7 +315,8 @@ fn the_recomputed_pass_is_the_graphs() {
         let (at, sh_at) = (means.as_tensor().clone(), sh.as_tensor().clone());
         let primaries = Primaries { means: at, sh: sh_at, ..scene.primaries.clone() };
         let args = (&scene.views, &backbone, &primaries);
-        let graph = trunk.forward_train(args.0, args.1, args.2, (512, 3)).unwrap();
+        let graph =
+            trunk.forward_train(args.0, args.1, args.2, TrainPass { chunk: 512, seed: 3 }).unwrap();
         let w = [&graph.rows, &graph.gain, &graph.sh]
             .map(|t| Random(13).tensor(t.dims(), 1.0, DType::F32));
         let along = |t: &Tensor, w: &Tensor| (t * w).unwrap().sum_all().unwrap();
@@ -307,7 +326,9 @@ fn the_recomputed_pass_is_the_graphs() {
         vars.extend([map, means, sh]);
 
         // 100 does not divide a view's 256 parents.
-        let pass = trunk.forward_recomputed(args.0, args.1, args.2, (100, 3)).unwrap();
+        let pass = trunk
+            .forward_recomputed(args.0, args.1, args.2, TrainPass { chunk: 100, seed: 3 })
+            .unwrap();
         close(&pass.children().rows, &graph.rows, name);
         close(&pass.children().gain, &graph.gain, name);
         assert!(!pass.children().rows.track_op());
@@ -344,7 +365,13 @@ fn the_recomputed_pass_is_the_graphs() {
     off.spgr.enabled = false;
     let (off, _) = trunk(&off, 12);
     assert!(
-        off.forward_recomputed(&scene.views, &scene.backbone, &scene.primaries, (64, 0)).is_err()
+        off.forward_recomputed(
+            &scene.views,
+            &scene.backbone,
+            &scene.primaries,
+            TrainPass { chunk: 64, seed: 0 }
+        )
+        .is_err()
     );
 }
 
@@ -353,7 +380,9 @@ fn pass_error(
     (views, backbone, primaries): (&Views, &BackboneOutput, &Primaries),
     rows: &[f32],
 ) -> String {
-    let pass = trunk.forward_recomputed(views, backbone, primaries, (100, 3)).unwrap();
+    let pass = trunk
+        .forward_recomputed(views, backbone, primaries, TrainPass { chunk: 100, seed: 3 })
+        .unwrap();
     let done = pass.backward([rows, &[]], |_| Ok::<(), candle_core::Error>(()));
     done.map(|_| String::new()).unwrap_or_else(|e| e.to_string())
 }
@@ -425,7 +454,7 @@ fn views_may_come_in_any_order_with_gates_off() {
     let order = [2usize, 0, 1];
     for gate in [Gate::Off, Gate::Query, Gate::SoftmaxV] {
         let mut c = config(Preset::Tuned, 2);
-        c.agg.gate = gate;
+        c.agg.ablations.gate = gate;
         c.agg.gate_views = 3;
         let (trunk, _) = trunk(&c, 11);
         let a = Scene::new(&cams, 12);
@@ -495,9 +524,9 @@ fn pixel_unit_embeddings_transfer_to_another_resolution() {
         };
         let large: Vec<Camera> = small.iter().map(|c| c.resized(32, 32)).collect();
         let (a, b) = (run(&small, 1.0), run(&large, 0.5));
-        let (d, _) = difference(&a.0, &b.0);
+        let (d, _) = difference(&a.geometry, &b.geometry);
         assert_eq!(d < 1e-5, scale == ScaleInput::LogPx, "{scale:?} {d}");
-        assert_close(&a.1, &b.1, 0.0);
+        assert_close(&a.appearance, &b.appearance, 0.0);
     }
 }
 
@@ -660,7 +689,7 @@ fn parents_behind_every_camera_stay_finite() {
     for preset in [Preset::Paper, Preset::Tuned] {
         for mask in [MaskMode::Renorm, MaskMode::PgClamp] {
             let mut c = config(preset, 2);
-            c.agg.mask = mask;
+            c.agg.ablations.mask = mask;
             c.embed.anchor_frame = AnchorFrame::View0;
             let (trunk, _) = trunk(&c, 25);
             let mut scene = Scene::new(&cams, 26);

@@ -4,7 +4,7 @@
 use candle_core::{DType, Device, Result, Tensor, Var};
 use glam::{Mat4, Quat, Vec3};
 use subsplat::camera::{Camera, Intrinsics};
-use subsplat::config::{AnchorFrame, Config, Embed, Preset};
+use subsplat::config::{AlphaInput, AnchorFrame, Config, Embed, MuInput, Preset, ScaleInput};
 use subsplat::model::embed::Embeddings;
 use subsplat::model::geometry::{Frames, ParentChunk};
 use subsplat::model::weights::Weights;
@@ -26,6 +26,63 @@ fn parents(n: usize) -> Result<Var> {
     };
     let data: Vec<f64> = (0..n).flat_map(row).collect();
     Var::from_tensor(&Tensor::from_vec(data, (n, 11), &Device::Cpu)?)
+}
+
+/// Clip of the opacity logit.
+const LOGIT_MAX: f64 = 6.0;
+/// Smallest divisor of a coordinate and smallest argument of ln z, world units.
+const Z_MIN: f64 = 1e-3;
+/// Bound of x/z and y/z.
+const SLOPE_MAX: f64 = 100.0;
+/// Smallest argument of ln σ, world units.
+const SCALE_MIN: f64 = 1e-12;
+
+/// The same rotations with w ≥ 0: `[n, 4]` wxyz.
+fn canonical(quats_wxyz: &Tensor) -> Result<Tensor> {
+    let w = quats_wxyz.narrow(1, 0, 1)?;
+    let sign = w.ge(0.0)?.to_dtype(w.dtype())?.affine(2.0, -1.0)?;
+    quats_wxyz.broadcast_mul(&sign)
+}
+
+/// The embeddings' attributes in tensor operations: μ `[n,3]`, s `[n,3]`, q `[n,4]`,
+/// α `[n,1]`.
+fn attributes(config: &Embed, parents: &ParentChunk, frames: &Frames) -> Result<[Tensor; 4]> {
+    let source = &frames.0[parents.source];
+    let frame = match config.anchor_frame {
+        AnchorFrame::World => None,
+        AnchorFrame::SrcCam => Some(source),
+        AnchorFrame::View0 => Some(&frames.0[0]),
+    };
+    let (mean, quat) = match frame {
+        None => (parents.means.clone(), parents.quats_wxyz.clone()),
+        Some(f) => (f.to_camera(&parents.means)?, f.quat_to_camera(&parents.quats_wxyz)?),
+    };
+    let mean = match config.mu {
+        MuInput::Raw => mean,
+        MuInput::RayLogz => {
+            let z = mean.narrow(1, 2, 1)?.maximum(Z_MIN)?;
+            let slopes = mean.narrow(1, 0, 2)?.broadcast_div(&z)?;
+            Tensor::cat(&[&slopes.clamp(-SLOPE_MAX, SLOPE_MAX)?, &z.log()?], 1)?
+        }
+    };
+    let scale = match config.scale {
+        ScaleInput::Raw => parents.scales.clone(),
+        ScaleInput::LogPx => {
+            let z = source.to_camera(&parents.means)?.narrow(1, 2, 1)?.maximum(Z_MIN)?;
+            let fx = f64::from(source.camera.intrinsics.fx);
+            let log = parents.scales.maximum(SCALE_MIN)?.log()?;
+            log.broadcast_sub(&z.log()?.affine(1.0, -fx.ln())?)?
+        }
+    };
+    let alpha = match config.alpha {
+        AlphaInput::Raw => parents.opacities.clone(),
+        AlphaInput::Logit => {
+            let low = 1.0 / (1.0 + LOGIT_MAX.exp());
+            let p = parents.opacities.clamp(low, 1.0 - low)?;
+            (p.log()? - p.affine(-1.0, 1.0)?.log()?)?
+        }
+    };
+    Ok([mean, scale, canonical(&quat)?, alpha])
 }
 
 #[test]
@@ -61,7 +118,7 @@ fn attributes_are_those_of_tensor_operations_and_so_is_their_gradient() -> Resul
             };
             let all = match fused {
                 true => embeddings.attributes(&chunk, &frames)?,
-                false => Tensor::cat(&embeddings.inputs(&chunk, &frames)?, 1)?,
+                false => Tensor::cat(&attributes(&config, &chunk, &frames)?, 1)?,
             };
             let weight: Vec<f64> = (0..41 * 11).map(|i| (i as f64 * 0.61).cos()).collect();
             let weight = Tensor::from_vec(weight, (41, 11), &Device::Cpu)?;

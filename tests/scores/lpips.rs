@@ -6,7 +6,7 @@ use subsplat_test_support as common;
 use candle_core::{Device, Tensor, Var};
 use common::shared;
 use std::collections::BTreeMap;
-use subsplat::model::lpips::{LEAST_SIDE, Lpips};
+use subsplat::model::lpips::{Lpips, MIN_SIDE};
 use subsplat::model::weights::{Weights, read_tensors};
 
 /// Largest relative difference allowed. Two fp32 implementations sum 13 convolutions in
@@ -127,7 +127,7 @@ fn pictures_that_do_not_fit_are_refused() {
     let zeros = |shape: (usize, usize, usize, usize)| {
         Tensor::zeros(shape, candle_core::DType::F32, &Device::Cpu).unwrap()
     };
-    let side = LEAST_SIDE;
+    let side = MIN_SIDE;
     let good = zeros((1, 3, side, side));
     for (other, named) in [
         (zeros((1, 3, side, side + 1)), "[1, 3, 16, 17]"),

@@ -16,7 +16,7 @@ fn png(path: &std::path::Path) -> (Vec<f32>, usize, usize) {
 #[test]
 fn agrees_with_skimage_on_made_up_pictures() {
     let mut lines = 0;
-    for line in include_str!("goldens/metrics.txt").lines().filter(|l| !l.starts_with('#')) {
+    for line in include_str!("../goldens/metrics.txt").lines().filter(|l| !l.starts_with('#')) {
         let words: Vec<&str> = line.split(' ').collect();
         let [w, h, weight] = [0, 1, 2].map(|i| words[i].parse::<usize>().unwrap());
         let [want_psnr, want_ssim] = [3, 4].map(|i| words[i].parse::<f64>().unwrap());

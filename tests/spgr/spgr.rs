@@ -2,6 +2,7 @@
 
 use subsplat_test_support::scenes;
 use subsplat_test_support::spgr_calls;
+use subsplat_test_support::spgr_reference;
 
 use candle_core::{DType, Device, Tensor, Var};
 use glam::{DMat3, DVec3, Quat, Vec2, Vec3};
@@ -10,7 +11,6 @@ use spgr_calls::*;
 use subsplat::abi::HEAD_STRIDE;
 use subsplat::camera::Camera;
 use subsplat::config::*;
-use subsplat::model::spgr_ref;
 use subsplat::ops::spgr::{Rules, Spgr, spgr, spgr_into};
 
 fn cpu(v: Vec<f64>, shape: &[usize]) -> Tensor {
@@ -55,8 +55,8 @@ fn untrained_tuned_children_have_their_parents_opacity() {
         [(2, AreaAt::Parent, 1e-5), (4, AreaAt::Parent, 1e-5), (2, AreaAt::Child, 0.05)]
     {
         let mut config = Config::re10k(Preset::Tuned, side);
-        config.spgr.a_min = AMin::Off;
-        config.spgr.area_at = at;
+        config.spgr.ablations.a_min = AMin::Off;
+        config.spgr.ablations.area_at = at;
         let call = call(&config, 8);
         let mut r = Random(6);
         let p = parents(&call.cameras, &mut r);
@@ -80,7 +80,7 @@ fn fused_equals_unfused() {
                 let p = parents(&call.cameras, &mut r).to_dtype(dtype).unwrap();
                 let h = head(p.dim(0).unwrap(), side * side, 0.6, dtype, &mut r);
                 let fused = spgr(&h, &p, &call).unwrap();
-                let graph = spgr_ref::spgr(&h, &p, &call).unwrap();
+                let graph = spgr_reference::spgr(&h, &p, &call).unwrap();
                 for lane in 0..11 {
                     let one = |t: &Tensor| t.narrow(1, lane, 1).unwrap();
                     let (d, scale) = difference(&one(&fused.0), &one(&graph.0));
@@ -105,7 +105,7 @@ fn unfused_gradients_match_differences() {
         let size = if name.contains("disc") { 64 } else { 8 };
         let mut config = config;
         if !name.contains("two axis") && !name.contains("a_min") {
-            config.spgr.a_min = AMin::Off;
+            config.spgr.ablations.a_min = AMin::Off;
         } else if name.contains("px") || name.contains("in") || name.contains("two axis") {
             continue;
         }
@@ -117,7 +117,7 @@ fn unfused_gradients_match_differences() {
         let p = Tensor::cat(&[of_view(0), of_view(1)], 0).unwrap();
         let h = head(6, 4, 0.4, DType::F64, &mut r);
         let f = |x: &[Tensor]| {
-            let (rows, gain) = spgr_ref::spgr(&x[0], &x[1], &call)?;
+            let (rows, gain) = spgr_reference::spgr(&x[0], &x[1], &call)?;
             let gain = gain.reshape((24, ()))?;
             Tensor::cat(&[rows, gain], 1)
         };
@@ -134,7 +134,7 @@ fn gradient_is_finite_at_the_initial_point() {
         let p = parents(&call.cameras, &mut Random(9));
         let zero = Tensor::zeros((128, 4, HEAD_STRIDE), DType::F32, &Device::Cpu).unwrap();
         let h = Var::from_tensor(&zero).unwrap();
-        let (rows, gain) = spgr_ref::spgr(h.as_tensor(), &p, &call).unwrap();
+        let (rows, gain) = spgr_reference::spgr(h.as_tensor(), &p, &call).unwrap();
         let loss = (rows.sqr().unwrap().sum_all().unwrap() + gain.sum_all().unwrap()).unwrap();
         let g = host(loss.backward().unwrap().get(&h).unwrap());
         assert!(g.iter().all(|v| v.is_finite()));
@@ -169,7 +169,7 @@ fn cross_form_of_the_area_equals_the_determinant() {
     // The linear rule with equal logits divides by the area: α_k·A_k is the same for
     // all children of a parent, so the rule's areas can be read off the result.
     let mut config = Config::re10k(Preset::Paper, 2);
-    config.spgr.a_min = AMin::Off;
+    config.spgr.ablations.a_min = AMin::Off;
     config.spgr.primary_view = PrimaryView::Source;
     let call = call(&config, 8);
     let mut r = Random(11);
@@ -192,7 +192,7 @@ fn cross_form_of_the_area_equals_the_determinant() {
 #[test]
 fn areas_of_discs_seen_edge_on_survive_single_precision() {
     let mut config = Config::re10k(Preset::Paper, 2);
-    config.spgr.a_min = AMin::Off;
+    config.spgr.ablations.a_min = AMin::Off;
     let call = call(&config, 8);
     let mut r = Random(21);
     let camera = &call.cameras[0];
@@ -223,8 +223,8 @@ fn areas_of_discs_seen_edge_on_survive_single_precision() {
 fn footprints_are_at_least_a_min() {
     for mode in [AMinMode::Iso, AMinMode::TwoAxis] {
         let mut config = Config::re10k(Preset::Tuned, 2);
-        config.spgr.a_min = AMin::TargetPx(1.5);
-        config.spgr.a_min_mode = mode;
+        config.spgr.ablations.a_min = AMin::TargetPx(1.5);
+        config.spgr.ablations.a_min_mode = mode;
         let call = call(&config, 8);
         let mut r = Random(12);
         let p = parents(&call.cameras, &mut r).to_dtype(DType::F64).unwrap();
@@ -289,7 +289,7 @@ fn children_sit_on_the_sub_pixel_grid() {
     for side in [2, 3, 4] {
         for slide in [Slide::ZConst, Slide::Disc] {
             let mut config = Config::re10k(Preset::Tuned, side);
-            config.spgr.slide = slide;
+            config.spgr.ablations.slide = slide;
             let call = call(&config, 8);
             let p = parents(&call.cameras, &mut Random(14));
             let k = side * side;
@@ -316,9 +316,9 @@ fn children_sit_on_the_sub_pixel_grid() {
 #[test]
 fn learned_residuals_have_their_units_and_bounds() {
     let mut config = Config::re10k(Preset::Tuned, 2);
-    config.spgr.a_min = AMin::Off;
+    config.spgr.ablations.a_min = AMin::Off;
     config.spgr.beta_z = 5.0;
-    config.spgr.gain_space = GainSpace::Rgb;
+    config.spgr.ablations.gain_space = GainSpace::Rgb;
     let mut call = call(&config, 8);
     let p = parents(&call.cameras, &mut Random(22));
     let own = host(&p);
@@ -359,7 +359,7 @@ fn learned_residuals_have_their_units_and_bounds() {
 #[test]
 fn disc_steps_stay_on_the_disc_and_reduce_to_the_flat_step() {
     let mut config = Config::re10k(Preset::Tuned, 2);
-    config.spgr.slide = Slide::Disc;
+    config.spgr.ablations.slide = Slide::Disc;
     let call = call(&config, 8);
     let camera = &call.cameras[0];
     // Discs in the source view's frame: one turned 40° about its x axis, one facing
@@ -395,7 +395,7 @@ fn disc_steps_stay_on_the_disc_and_reduce_to_the_flat_step() {
 #[test]
 fn disc_steps_of_needles_survive_single_precision() {
     let mut config = Config::re10k(Preset::Tuned, 2);
-    config.spgr.slide = Slide::Disc;
+    config.spgr.ablations.slide = Slide::Disc;
     let call = call(&config, 8);
     let camera = &call.cameras[0];
     let mut r = Random(31);

@@ -3,6 +3,7 @@
 
 use subsplat_test_support::scenes;
 use subsplat_test_support::spgr_calls;
+use subsplat_test_support::spgr_reference;
 
 use candle_core::{DType, Device, Result, Tensor, Var};
 use scenes::*;
@@ -10,7 +11,6 @@ use spgr_calls::*;
 use subsplat::abi::{HEAD_GAIN_OFFSET, HEAD_STRIDE, SPLAT_STRIDE};
 use subsplat::config::*;
 use subsplat::cpu::spgr::{self as kernel, Args};
-use subsplat::model::spgr_ref;
 use subsplat::ops::spgr::{Spgr, spgr};
 
 fn host(t: &Tensor) -> Vec<f64> {
@@ -57,7 +57,7 @@ fn gradients_match_differences() {
         // Growth and the capped share of a disc step are constants of the gradient by
         // decision: no clamp, and pixels so fine that no disc step is capped.
         let size = if name.contains("disc") { 64 } else { 8 };
-        config.spgr.a_min = AMin::Off;
+        config.spgr.ablations.a_min = AMin::Off;
         let mut call = call(&config, size);
         call.per_view = 3;
         let p = parents(&call.cameras, &mut r).to_dtype(DType::F64).unwrap();
@@ -82,7 +82,7 @@ fn gradients_equal_those_of_the_unfused_graph() {
                 let p = p.to_dtype(dtype).unwrap();
                 let h = head(p.dim(0).unwrap(), side * side, 0.6, dtype, &mut r);
                 let got = gradients(spgr, &call, &h, &p, 7);
-                let want = gradients(spgr_ref::spgr, &call, &h, &p, 7);
+                let want = gradients(spgr_reference::spgr, &call, &h, &p, 7);
                 assert_lanes_close(&got[0], &want[0], tolerance, &format!("{name} {dtype:?} head"));
                 let what = format!("{name} {dtype:?} parents");
                 assert_lanes_close(&got[1], &want[1], tolerance, &what);
@@ -110,7 +110,7 @@ fn single_precision_gradients_are_as_good_as_the_unfused_graphs() {
             });
             each.fold(0.0, f64::max)
         };
-        let (fused, graph) = (error(spgr), error(spgr_ref::spgr));
+        let (fused, graph) = (error(spgr), error(spgr_reference::spgr));
         assert!(fused < 2.0 * graph.max(1e-6), "{preset:?}: {fused:e} fused, {graph:e} graph");
     }
 }
@@ -193,7 +193,7 @@ fn gradients_at_every_guard_are_finite_and_those_of_the_unfused_graph() {
                 let h = Tensor::from_vec(case.head, (1, k, HEAD_STRIDE), &Device::Cpu).unwrap();
                 let what = format!("{name}, {}", case.name);
                 let got = gradients(spgr, &call, &h, &p, 9);
-                let want = gradients(spgr_ref::spgr, &call, &h, &p, 9);
+                let want = gradients(spgr_reference::spgr, &call, &h, &p, 9);
                 // Entry by entry: lanes of one parent.
                 for (got, want) in got.iter().zip(&want) {
                     let scale = host(want).iter().fold(1e-30f64, |m, v| m.max(v.abs()));

@@ -2,6 +2,7 @@
 //! (`tools/witness/modules/subsplat_*.py`), run by onnxruntime in double precision: embeddings,
 //! attention, heads, reparameterization and the trunk that joins them.
 
+use subsplat_test_support::spgr_reference;
 use subsplat_test_support::witness as witness_common;
 
 use candle_core::{DType, Device, Result, Tensor};
@@ -14,12 +15,12 @@ use subsplat::camera::Camera;
 use subsplat::config::{self, Config, FeatureLevel, LowpassRef, Preset};
 use subsplat::cpu::{Geometry, Rasterizer, SplatSlices, sh};
 use subsplat::model::aggregation::Aggregation;
-use subsplat::model::embed::Embeddings;
+use subsplat::model::embed::{Descriptors, Embeddings};
 use subsplat::model::geometry::{Frames, ParentChunk};
 use subsplat::model::mlp::Mode;
 use subsplat::model::spgr::{Head, rules};
-use subsplat::model::trunk::{Children, Trunk};
-use subsplat::model::{BackboneOutput, Primaries, Views, spgr_ref};
+use subsplat::model::trunk::{Children, TrainPass, Trunk};
+use subsplat::model::{BackboneOutput, Primaries, Views};
 use subsplat::ops::spgr::{Spgr, spgr};
 use witness_common::{Golden, names};
 
@@ -105,10 +106,12 @@ impl Scene {
 }
 
 /// Two tensors per view, joined over the views.
-fn joined(scene: &Scene, each: impl Fn(usize) -> Result<(Tensor, Tensor)>) -> Result<[Tensor; 2]> {
-    let views = 0..scene.cameras.len();
-    let (a, b): (Vec<_>, Vec<_>) = views.map(each).collect::<Result<Vec<_>>>()?.into_iter().unzip();
-    Ok([Tensor::cat(&a, 0)?, Tensor::cat(&b, 0)?])
+fn joined(scene: &Scene, each: impl Fn(usize) -> Result<Descriptors>) -> Result<[Tensor; 2]> {
+    let views = (0..scene.cameras.len()).map(each).collect::<Result<Vec<_>>>()?;
+    let join = |part: fn(&Descriptors) -> &Tensor| {
+        Tensor::cat(&views.iter().map(part).collect::<Vec<_>>(), 0)
+    };
+    Ok([join(|d| &d.geometry)?, join(|d| &d.appearance)?])
 }
 
 /// Maps of `levels` as a backbone's, and their channels.
@@ -177,8 +180,8 @@ fn attention() -> Result<()> {
         for mode in MODES {
             let [f_g, f_a] = joined(&scene, |v| {
                 let part = |t: &Tensor| t.narrow(0, v * scene.per_view, scene.per_view);
-                let z = (&part(&z[0])?, &part(&z[1])?);
-                agg.forward(&prepared, &scene.chunk(v, &sh)?, &scene.frames, z, mode)
+                let z = Descriptors { geometry: part(&z[0])?, appearance: part(&z[1])? };
+                agg.forward(&prepared, &scene.chunk(v, &sh)?, &scene.frames, &z, mode)
             })?;
             golden.compare("f_g", &f_g);
             golden.compare("f_a", &f_a);
@@ -231,7 +234,7 @@ fn reparameterization() -> Result<()> {
                 (golden.input("record").to_dtype(dtype)?, scene.rows()?.to_dtype(dtype)?);
             for (form, (rows, gain)) in [
                 ("fused", spgr(&record, &parents, &call)?),
-                ("graph", spgr_ref::spgr(&record, &parents, &call)?),
+                ("graph", spgr_reference::spgr(&record, &parents, &call)?),
             ] {
                 let mut parts = split(&rows, &parents)?;
                 parts.insert("gain", gain);
@@ -271,7 +274,12 @@ fn trunk() -> Result<()> {
             Ok(())
         };
         compare(trunk.forward(&views, &backbone, &primaries)?)?;
-        compare(trunk.forward_train(&views, &backbone, &primaries, (16, 3))?)?;
+        compare(trunk.forward_train(
+            &views,
+            &backbone,
+            &primaries,
+            TrainPass { chunk: 16, seed: 3 },
+        )?)?;
         golden.done(&weights);
     }
     Ok(())

@@ -21,7 +21,7 @@
 //!
 //! The lanes of a vector are parents: child k of 16 parents at a time, so that sums
 //! over children are loops and any K fills the vector. Twin: ops/spgr.rs. The same in
-//! tensor operations: model/spgr_ref.rs. Tests: tests/spgr.rs, tests/spgr_backward.rs.
+//! tensor operations: tests/common/spgr_reference.rs. Tests: tests/spgr.rs, tests/spgr_backward.rs.
 
 mod backward;
 mod child;

@@ -1,14 +1,14 @@
-//! Where a stage samples the maps (spec 1.4 and 1.5).
+//! Sampling positions of an ablated attention stage.
 //!
-//! * `ref`: the parent's projected centre.
-//! * `pixelgaussian`: key points on the Gaussian, fixed ones at the centre and at
-//!   ±0.45 σ of each axis, learned ones at (sigmoid(Linear(f)) − ½) σ of all three,
-//!   turned by the parent's rotation and projected.
-//! * `map_offsets`: the centre and learned offsets in pixels of each map, Linear(q),
-//!   starting on a ring one map pixel wide (Deformable DETR).
+//! * `ref`: the parent's projected centre (SubSplat A.2).
+//! * `pixelgaussian`: key points on the Gaussian. Fixed points lie at the centre and at
+//!   ±0.45 σ of each axis, learned points at (sigmoid(Linear(f)) − ½) σ of all three. The
+//!   parent's rotation applies to both (PixelGaussian, GaussianFormer).
+//! * `map_offsets`: the centre and learned offsets in pixels of each map, Linear(q). The
+//!   offsets start on a ring of one map pixel (Deformable DETR).
 
-use super::Shared;
-use crate::config::{Aggregation as Keys, Points};
+use super::Call;
+use crate::config::{AggregationAblations as Keys, Points};
 use crate::model::geometry::rotate;
 use crate::model::mlp::linear;
 use candle_core::{Result, Tensor};
@@ -25,7 +25,7 @@ const FIXED: [[f32; 3]; 7] = [
     [0.0, 0.0, -0.45],
 ];
 
-/// The layer that gives learned points, if there is one: `key_points` or `offsets`.
+/// The layer of learned points, if there are any: `key_points` or `offsets`.
 pub(super) fn learned(
     keys: &Keys,
     dim: usize,
@@ -48,9 +48,9 @@ pub(super) fn learned(
     })
 }
 
-/// Initial bias of `offsets`, `len` numbers (u, v of one point after another): points
-/// on a circle one map pixel in radius, golden-angle steps apart, so that the run
-/// that any level takes of them goes all the way round.
+/// Returns the initial bias of `offsets`, `len` numbers (u, v of one point after
+/// another): points on a circle of one map pixel in radius, golden-angle steps apart. The
+/// points of each level then spread over the whole circle.
 pub fn ring(len: usize) -> Vec<f32> {
     let golden = std::f32::consts::PI * (3.0 - 5f32.sqrt());
     let number = |i: usize| {
@@ -60,28 +60,24 @@ pub fn ring(len: usize) -> Vec<f32> {
     (0..len).map(number).collect()
 }
 
-/// Sampling positions `[n, V, M or L·M, 2]`, given the stage's input `f` and query
+/// Returns sampling positions `[n, V, M or L·M, 2]` for the stage's input `f` and query
 /// `q`, both `[n, E]`.
 pub(super) fn sample_points(
     keys: &Keys,
-    shared: &Shared,
+    call: &Call,
     learned: Option<&Linear>,
-    (f, q): (&Tensor, &Tensor),
+    f: &Tensor,
+    q: &Tensor,
 ) -> Result<Tensor> {
     match keys.points {
-        Points::Ref => Ok(shared.centres.clone()),
-        Points::Pixelgaussian => key_points(keys, shared, learned, f),
-        Points::MapOffsets => map_offsets(keys, shared, learned, q),
+        Points::Ref => Ok(call.centres.clone()),
+        Points::Pixelgaussian => key_points(keys, call, learned, f),
+        Points::MapOffsets => map_offsets(keys, call, learned, q),
     }
 }
 
-fn key_points(
-    keys: &Keys,
-    shared: &Shared,
-    learned: Option<&Linear>,
-    f: &Tensor,
-) -> Result<Tensor> {
-    let parents = shared.parents;
+fn key_points(keys: &Keys, call: &Call, learned: Option<&Linear>, f: &Tensor) -> Result<Tensor> {
+    let parents = call.parents;
     let n = f.dim(0)?;
     let mut kappas = Vec::with_capacity(2);
     if keys.n_fixed > 0 {
@@ -96,25 +92,20 @@ fn key_points(
     let kappa = Tensor::cat(&kappas, 1)?;
     let local = kappa.broadcast_mul(&parents.scales.unsqueeze(1)?)?;
     let world = rotate(&parents.quats_wxyz, &local)?.broadcast_add(&parents.means.unsqueeze(1)?)?;
-    Ok(shared.frames.project(&world, keys.mask)?.0)
+    Ok(call.frames.project(&world, keys.mask)?.0)
 }
 
-fn map_offsets(
-    keys: &Keys,
-    shared: &Shared,
-    learned: Option<&Linear>,
-    q: &Tensor,
-) -> Result<Tensor> {
+fn map_offsets(keys: &Keys, call: &Call, learned: Option<&Linear>, q: &Tensor) -> Result<Tensor> {
     let n = q.dim(0)?;
-    let (v, levels) = (shared.frames.0.len(), shared.levels.len());
-    let centres = shared.centres.unsqueeze(2)?;
+    let (v, levels) = (call.frames.0.len(), call.levels.len());
+    let centres = call.centres.unsqueeze(2)?;
     let own = centres.broadcast_as((n, v, levels, 1, 2))?;
     let all = match learned {
         None => own,
         Some(layer) => {
             let m = keys.n_learned;
             let size =
-                shared.levels.iter().flat_map(|l| [1.0 / l.width as f32, 1.0 / l.height as f32]);
+                call.levels.iter().flat_map(|l| [1.0 / l.width as f32, 1.0 / l.height as f32]);
             let size = Tensor::from_vec(size.collect::<Vec<f32>>(), (levels, 1, 2), q.device())?;
             let offsets = layer.forward(q)?.reshape((n, levels, m, 2))?;
             let offsets = offsets.broadcast_mul(&size.to_dtype(q.dtype())?)?.unsqueeze(1)?;

@@ -1,24 +1,27 @@
-//! MVSplat's CNN (spec 1): a ResNet to 1/4 resolution, InstanceNorm without
-//! parameters. `[N, 3, H, W]` RGB in [0, 1], rows in any order.
+//! MVSplat's CNN (MVSplat 3.1, "Multi-view feature extraction"): a ResNet to 1/4
+//! resolution with parameter-free InstanceNorm.
+//!
+//! In: `[N, 3, H, W]` RGB in [0, 1], rows in any order. Out: [`CnnOutput`].
 
 use crate::model::layers::{
-    Conv2d, ConvShape, default_init, instance_norm, instance_norm_relu, relu,
+    Conv2d, ConvShape, LayerInit, default_init, instance_norm, instance_norm_relu, relu,
 };
 use crate::model::trace::Trace;
 use crate::ops::moves::sum;
 use candle_core::{Result, Tensor};
 use candle_nn::{Init, VarBuilder};
 
-/// ImageNet's statistics: only the CNN sees normalised colours.
+/// Mean and standard deviation of ImageNet's colours, with which the CNN alone normalises
+/// its input.
 const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 const STD: [f32; 3] = [0.229, 0.224, 0.225];
 
 /// Feature maps of the CNN.
 #[derive(Clone, Debug)]
 pub struct CnnOutput {
-    /// First stage, `[N, C₁, H/2, W/2]`.
+    /// `[N, C₁, H/2, W/2]`: output of the first stage.
     pub half: Tensor,
-    /// Result, `[N, C₃, H/4, W/4]`.
+    /// `[N, C₃, H/4, W/4]`: output of the CNN.
     pub quarter: Tensor,
 }
 
@@ -31,7 +34,7 @@ pub struct Cnn {
 }
 
 impl Cnn {
-    /// Channels of the three stages.
+    /// Builds the CNN; `channels` of the three stages.
     ///
     /// # Errors
     /// A tensor is missing or has another shape.
@@ -52,10 +55,10 @@ impl Cnn {
         })
     }
 
-    /// `[N, 3, H, W]` to both maps.
+    /// Maps `[N, 3, H, W]` to both feature maps.
     ///
     /// # Errors
-    /// Whatever candle says.
+    /// Those of candle.
     pub fn forward(&self, images: &Tensor, trace: &mut Trace<'_>) -> Result<CnnOutput> {
         let row = |v: [f32; 3]| Tensor::new(&v, images.device())?.reshape((1, 3, 1, 1));
         let x = images.broadcast_sub(&row(MEAN)?)?.broadcast_div(&row(STD)?)?;
@@ -75,7 +78,7 @@ impl Cnn {
     }
 }
 
-/// ReLU(skip(x) + branch(x)); the branch ends in a ReLU of its own.
+/// ReLU(skip(x) + branch(x)); the branch has a ReLU at its end, too.
 #[derive(Clone, Debug)]
 struct Residual {
     conv1: Conv2d,
@@ -88,9 +91,10 @@ impl Residual {
         let downsample = if stride == 1 && c_in == c {
             None
         } else {
-            // Its bias is cancelled by the InstanceNorm after it, but checkpoints hold it.
+            // The InstanceNorm after it cancels the bias, but checkpoints hold one.
             let stdev = (2.0 / c as f64).sqrt();
-            let init = (Init::Randn { mean: 0.0, stdev }, Some(default_init(c_in)));
+            let weight = Init::Randn { mean: 0.0, stdev };
+            let init = LayerInit { weight, bias: Some(default_init(c_in)) };
             let shape = ConvShape::K1.stride(stride);
             Some(Conv2d::with(c_in, c, shape, init, vb.pp("downsample.0"))?)
         };

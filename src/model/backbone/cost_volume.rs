@@ -1,4 +1,5 @@
-//! MVSplat's cost volume (spec 3) and its refinement (spec 4). Rows (v b).
+//! MVSplat's cost volume and its refinement (MVSplat 3.1, "Cost volume construction" and
+//! "Cost volume refinement"). Rows are (v b).
 
 use super::unet::UNet;
 use crate::camera::Camera;
@@ -13,10 +14,10 @@ use candle_core::{Device, Result, Tensor};
 use candle_nn::VarBuilder;
 use glam::Mat4;
 
-/// Least camera z that the projection divides by.
+/// Smallest camera z that the projection divides by.
 const MIN_Z: f32 = 1e-3;
 
-/// `[V·B][D]`: disparity candidates, uniform from 1/far (index 0) to 1/near.
+/// Returns the disparity candidates `[V·B][D]`, uniform from 1/far (index 0) to 1/near.
 pub fn disparities(views: &Views, candidates: usize) -> Vec<Vec<f32>> {
     let (b, v) = (views.scenes(), views.views());
     let row = |(near, far): (f32, f32)| {
@@ -27,8 +28,9 @@ pub fn disparities(views: &Views, candidates: usize) -> Vec<Vec<f32>> {
     (0..v * b).map(|r| row(views.near_far[r % b][r / b])).collect()
 }
 
-/// Pose of view i in the frame of view j, of one scene, with the original's roundings:
-/// inv(E_j) to f32, a product in f32; with two views the second is the first's inverse.
+/// Pose of view i in the frame of view j of one scene, with the roundings of MVSplat's
+/// code: inv(E_j) to f32, then a product in f32. With two views the second pose is the
+/// inverse of the first.
 fn relative_pose(cameras: &[Camera], i: usize, j: usize) -> Mat4 {
     let pose = |i: usize, j: usize| {
         cameras[j].world_from_camera.as_dmat4().inverse().as_mat4() * cameras[i].world_from_camera
@@ -39,8 +41,11 @@ fn relative_pose(cameras: &[Camera], i: usize, j: usize) -> Mat4 {
     }
 }
 
-/// What to compare with what: reference view i with views i + 1, i + 2, … modulo V,
-/// at the resolution h × w of the features, under MVSplat's conventions.
+/// Returns the plane sweep's geometry under MVSplat's conventions: reference view i against
+/// views i + 1, i + 2, … modulo V, at the features' resolution h × w.
+///
+/// # Errors
+/// A camera is not invertible.
 pub fn sweep(views: &Views, disparities: &[Vec<f32>], features: &Tensor) -> Result<Sweep> {
     let (_, channels, h, w) = features.dims4()?;
     let (b, v) = (views.scenes(), views.views());
@@ -50,7 +55,7 @@ pub fn sweep(views: &Views, disparities: &[Vec<f32>], features: &Tensor) -> Resu
         let own = (1..v).map(|offset| {
             let j = (i + offset) % v;
             let cameras = &views.cameras[scene];
-            // The reference's intrinsics on both sides, as in the original.
+            // Both sides take the reference's intrinsics, as in MVSplat's code.
             let k = cameras[i].intrinsics.resized(w, h);
             pair(&k, &k, relative_pose(cameras, i, j), j * b + scene)
         });
@@ -67,10 +72,11 @@ pub fn sweep(views: &Views, disparities: &[Vec<f32>], features: &Tensor) -> Resu
     })
 }
 
-/// Correlation `[V·B, D, h, w]` of transformer features `[V·B, C, h, w]`, on `backend`.
+/// Computes the correlation `[V·B, D, h, w]` of transformer features `[V·B, C, h, w]` on
+/// `backend`.
 ///
 /// # Errors
-/// Cameras that cannot be inverted.
+/// A camera is not invertible.
 pub fn correlation(
     backend: &Backend,
     views: &Views,
@@ -119,7 +125,7 @@ fn trace_geometry(
 }
 
 /// Stem, U-Net and last convolution over [correlation ; features], plus a pointwise
-/// skip of the same input.
+/// convolution of the same input.
 #[derive(Clone, Debug)]
 pub struct Refinement {
     stem: (Conv2d, GroupNorm),
@@ -129,7 +135,7 @@ pub struct Refinement {
 }
 
 impl Refinement {
-    /// `vb` at the depth predictor.
+    /// Builds the refinement; `vb` is at the depth predictor.
     ///
     /// # Errors
     /// A tensor is missing or has another shape.
@@ -148,10 +154,11 @@ impl Refinement {
         })
     }
 
-    /// `[V·B, D, h, w]` and `[V·B, C, h, w]` to the refined volume `[V·B, D, h, w]`.
+    /// Maps `volume` `[V·B, D, h, w]` and `features` `[V·B, C, h, w]` to the refined volume
+    /// `[V·B, D, h, w]`.
     ///
     /// # Errors
-    /// Whatever candle says.
+    /// Those of candle.
     pub fn forward(
         &self,
         volume: &Tensor,

@@ -1,8 +1,9 @@
-//! MVSplat's depth predictor (spec 4 and 5): coarse disparity from the cost volume,
-//! refinement at full resolution, and the heads. Rows (v b).
+//! MVSplat's depth predictor (MVSplat 3.1, "Depth estimation" and "Depth refinement";
+//! 3.2): coarse disparity from the cost volume, refinement at full resolution, and the
+//! heads. Rows are (v b).
 //!
-//! Full-resolution tensors arise one row at a time where the arithmetic allows, which
-//! is everywhere but in the refinement U-Net (its attention joins the views).
+//! Full-resolution tensors are computed one row at a time to bound the memory, except in
+//! the refinement U-Net, whose attention joins the views.
 
 use super::cost_volume::{Refinement, correlation, disparities};
 use super::unet::UNet;
@@ -20,10 +21,10 @@ use crate::ops::moves::{channels_last, stacked};
 use candle_core::{Device, Result, Tensor};
 use candle_nn::VarBuilder;
 
-/// Factor between feature maps and pictures.
+/// Factor between feature maps and images.
 const DOWNSCALE: usize = 4;
 
-/// What the predictor reads, all (v b).
+/// Input of the predictor; all rows are (v b).
 pub struct Input<'a> {
     /// Cameras and depth ranges.
     pub views: &'a Views,
@@ -35,13 +36,14 @@ pub struct Input<'a> {
     pub trans: Tensor,
 }
 
-/// What the predictor gives, all (v b).
+/// Output of the predictor; all rows are (v b).
 pub struct Output {
-    /// `[V·B, H·W, 2 + 7 + 3·D]`.
+    /// `[V·B, H·W, 2 + 7 + 3·D]`: raw head, as in
+    /// [`BackboneOutput`](crate::model::BackboneOutput).
     pub raw: Tensor,
-    /// `[V·B, H·W, G]`, distance along the unit ray.
+    /// `[V·B, H·W, G]`: distance along the unit ray, world units.
     pub depths: Tensor,
-    /// `[V·B, H·W, G]`, in (0, 1).
+    /// `[V·B, H·W, G]`: opacity in (0, 1).
     pub densities: Tensor,
     /// `[V·B, C_r, H, W]`: the refinement U-Net's output.
     pub refined: Tensor,
@@ -51,7 +53,7 @@ pub struct Output {
 struct Disparity {
     /// `[V·B, 1, H, W]`.
     full: Tensor,
-    /// `[V·B, 1, H, W]`: largest probability of any candidate.
+    /// `[V·B, 1, H, W]`: largest probability among the candidates.
     pdf_max: Tensor,
 }
 
@@ -85,12 +87,12 @@ pub struct DepthPredictor {
     to_disparity: Head,
     candidates: usize,
     per_pixel: usize,
-    /// Where the plane sweep runs.
+    /// Backend of the plane sweep.
     pub(super) backend: Backend,
 }
 
 impl DepthPredictor {
-    /// `vb` at `depth_predictor`.
+    /// Builds the predictor; `vb` is at `depth_predictor`.
     ///
     /// # Errors
     /// A tensor is missing or has another shape.
@@ -118,10 +120,10 @@ impl DepthPredictor {
         })
     }
 
-    /// Cost volume to heads.
+    /// Runs the predictor from cost volume to heads.
     ///
     /// # Errors
-    /// Cameras that cannot be inverted; whatever candle says.
+    /// A camera is not invertible; those of candle.
     pub fn forward(&self, input: Input<'_>, trace: &mut Trace<'_>) -> Result<Output> {
         let Input { views, images, cnn, trans } = input;
         let disparity = self.coarse(views, &trans, trace)?;
@@ -144,7 +146,7 @@ impl DepthPredictor {
         let logits = self.depth_head_lowres.forward(&volume)?;
         trace.put("depth.logits_vb", &logits)?;
         let (rows, d, h, w) = logits.dims4()?;
-        // Candidates last: a strided softmax or sum is many times slower.
+        // Candidates are the last axis: a strided softmax or sum is many times slower.
         let pdf = softmax(&channels_last(&logits)?)?;
         trace.put_with("depth.pdf_vb", || {
             pdf.transpose(1, 2)?.contiguous()?.reshape((rows, d, h, w))
@@ -227,8 +229,8 @@ impl DepthPredictor {
     }
 }
 
-/// u = GELU(bilinear ×4): 32 MiB per 256² view. Made again for each use, unless a
-/// gradient must pass through it.
+/// GELU(bilinear ×4): 32 MiB per 256² view. Each use recomputes it, unless a gradient or the
+/// trace needs it.
 struct Upsampled {
     low: Tensor,
     kept: Option<Tensor>,
@@ -251,7 +253,7 @@ impl Upsampled {
         resize_bilinear_then(low, DOWNSCALE * h, DOWNSCALE * w, Activation::Gelu)
     }
 
-    /// Row `r`, `[1, C, H, W]`.
+    /// Returns row `r`, `[1, C, H, W]`.
     fn row(&self, r: usize) -> Result<Tensor> {
         match &self.kept {
             Some(up) => up.narrow(0, r, 1),
@@ -260,7 +262,7 @@ impl Upsampled {
     }
 }
 
-/// `f` of every row index of `like`, joined along the first dimension.
+/// Joins `f` of every row index of `like` along the first dimension.
 fn each_row(like: &Tensor, f: impl Fn(usize) -> Result<Tensor>) -> Result<Tensor> {
     stacked(&(0..like.dim(0)?).map(f).collect::<Result<Vec<_>>>()?)
 }

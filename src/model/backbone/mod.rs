@@ -1,8 +1,9 @@
-//! MVSplat's encoder (arXiv 2403.14627), parameter for parameter: posed pictures to
-//! depth, opacity and raw Gaussian parameters.
+//! Backbones: from posed images to depth, opacity and raw Gaussian parameters. This file
+//! holds MVSplat's encoder (arXiv 2403.14627), parameter for parameter; [`small`] holds the
+//! small backbone.
 //!
-//! Two orders of rows coexist, as in the original: the CNN works on (b v), scene-major;
-//! transformer and depth predictor on (v b), row = v·B + b.
+//! MVSplat's code has two orders of rows, and so has this one. The CNN's rows are (b v),
+//! scene-major; those of transformer and depth predictor are (v b), row = v·B + b.
 
 pub mod cnn;
 pub mod cost_volume;
@@ -12,8 +13,8 @@ mod small_parts;
 pub mod transformer;
 pub mod unet;
 
-pub use small::SmallBackbone;
-pub(crate) use small_parts::small_start;
+pub use small::{DisparityMean, SmallBackbone};
+pub(crate) use small_parts::apply_small_initial_value;
 
 use super::trace::Trace;
 use super::{BackboneOutput, Views};
@@ -22,7 +23,7 @@ use crate::ops::Backend;
 use candle_core::{Result, Tensor, bail};
 use candle_nn::VarBuilder;
 
-/// The whole encoder.
+/// MVSplat's encoder.
 #[derive(Clone, Debug)]
 pub struct Mvsplat {
     cnn: cnn::Cnn,
@@ -32,7 +33,7 @@ pub struct Mvsplat {
 }
 
 impl Mvsplat {
-    /// `vb` at the root of the encoder (`backbone.…`, `depth_predictor.…`).
+    /// Builds the encoder; `vb` is at its root (`backbone.…`, `depth_predictor.…`).
     ///
     /// # Errors
     /// A tensor is missing or has another shape.
@@ -46,17 +47,17 @@ impl Mvsplat {
         })
     }
 
-    /// Where the plane sweep of the next calls runs.
+    /// Sets the backend of the following plane sweeps.
     pub fn set_backend(&mut self, backend: &Backend) {
         self.depth.backend = backend.clone();
     }
 
-    /// Any number of scenes and of views ≥ 2; H and W multiples of
-    /// [`Config::stride`]. Stages go to `trace` under the names of the reference
-    /// outputs (`cnn.conv1`, …, `depth.to_disparity_vb`).
+    /// Runs the encoder on any number of scenes of two or more views. `trace` records the
+    /// stages under the names of the reference outputs (`cnn.conv1`, …,
+    /// `depth.to_disparity_vb`).
     ///
     /// # Errors
-    /// A picture size that does not fit; whatever candle says.
+    /// H or W is not a multiple of [`Config::stride`]; those of candle.
     pub fn forward(&self, views: &Views, trace: &mut Trace<'_>) -> Result<BackboneOutput> {
         let (b, v, _, height, width) = views.images.dims5()?;
         let stride = Config::stride_of(&self.settings);
@@ -97,12 +98,18 @@ impl Mvsplat {
     }
 }
 
-/// `[B, V, …]` to `[V·B, …]`, view-major.
+/// Maps `[B, V, …]` to `[V·B, …]`, view-major.
+///
+/// # Errors
+/// Fewer than two dimensions.
 pub fn vb_rows(x: &Tensor) -> Result<Tensor> {
     x.transpose(0, 1)?.contiguous()?.flatten(0, 1)
 }
 
-/// `[V·B, …]` to `[B, V, …]`.
+/// Maps `[V·B, …]` to `[B, V, …]`.
+///
+/// # Errors
+/// The first dimension is not a multiple of `views`.
 pub fn bv_rows(x: &Tensor, views: usize) -> Result<Tensor> {
     let mut dims = vec![views, x.dim(0)? / views.max(1)];
     dims.extend_from_slice(&x.dims()[1..]);

@@ -1,24 +1,22 @@
 //! The small backbone: a plane sweep that a CPU trains and runs in seconds.
 //!
-//! In: [`Views`]. Out: [`BackboneOutput`], the same hand-over as MVSplat's, and the
-//! [`DepthMaps`] that depth supervision reads. Every part is a key of
-//! [`crate::config::Small`]; which of them matter, and by how much, was measured
-//! (ARCHITECTURE.md, "The small backbone").
+//! In: [`Views`]. Out: [`BackboneOutput`], as from MVSplat, and [`DepthMaps`] for depth
+//! supervision. Every part is a key of [`crate::config::Small`].
 //!
-//! CNN to 1/4 → correlation of unit-length channels beside raw matching channels →
-//! 3-D stem shared over disparity → 2-D U-Net → logits over D candidates uniform in
-//! disparity → convex ×4 upsampling → heads at full resolution.
+//! CNN to 1/4 → correlation of unit-length channels and raw matching channels → 3-D stem
+//! shared over disparity → 2-D U-Net → logits over D candidates uniform in disparity →
+//! convex ×4 upsampling → heads at full resolution.
 //!
-//! Untrained it is already a working plane sweep: the stem begins as an aggregation
-//! of the raw scores, every learned correction at zero, the colour at the pixel's
-//! own. Parameters stand under `small.*`.
+//! An untrained model is a classical plane sweep: the stem starts as an aggregation of the
+//! raw scores, every learned correction at zero, the colour at the pixel's colour.
+//! Parameters have the prefix `small.`.
 
 use super::small_parts::{ConvexUpsampling, Stem, Unet, conv_norm_gelu, local_mean};
 use crate::abi::sh_coefficients;
 use crate::camera::Camera;
 use crate::config::{FeatureLevel, Small};
 use crate::model::layers::{
-    Activation, Conv2d, ConvShape, GroupNorm, gelu, resize_bilinear, sigmoid,
+    Activation, Conv2d, ConvShape, GroupNorm, LayerInit, gelu, resize_bilinear, sigmoid,
 };
 use crate::model::{BackboneOutput, Views};
 use crate::ops::Backend;
@@ -32,18 +30,28 @@ use crate::sh::C0;
 use candle_core::{Result, Tensor, bail};
 use candle_nn::{Init, VarBuilder};
 
-/// Kernel 5×5, stride 2, half the size.
+/// 5×5, stride 2, half the size.
 const K5S2: ConvShape = ConvShape { kernel: 5, stride: 2, padding: 2 };
 /// The raw head starts at σ = 0.6 input px: 0.5 + 14.5·sigmoid(x) = 3 fifths of a
 /// pixel ([`crate::config::Primaries`]).
 const SCALE_BIAS: f32 = -1.57;
-/// Untrained confidence: logit = 6·(mass around the mode) + 1, so that a sure pixel
-/// is opaque; a flat distribution, which lies at the far plane, still covers what
-/// nothing nearer does (on photographs 1 dB better than an intercept of −1.5).
+/// Slope of the untrained confidence, logit = 6·(mass around the mode) + 1: a pixel with a
+/// clear mode is opaque.
 const CONFIDENCE_SLOPE: f64 = 6.0;
+/// Intercept of the untrained confidence. Pixels with a flat distribution, which lie at the
+/// far plane, keep some opacity and cover gaps (on photographs 1 dB better than −1.5).
 const CONFIDENCE_SHIFT: f64 = 1.0;
 
-/// What depth supervision and inspection read; all at 1/4 but the last two.
+/// Candidates over which a pixel's mean disparity is taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DisparityMean {
+    /// All candidates, for training.
+    AllCandidates,
+    /// The candidates around the mode ([`crate::config::Small::mode_window`]).
+    AroundMode,
+}
+
+/// Depth of the small backbone: logits at 1/4 resolution, the others at full resolution.
 #[derive(Clone, Debug)]
 pub struct DepthMaps {
     /// `[B·V, D, h, w]`: logits over candidates, index 0 = far.
@@ -54,7 +62,7 @@ pub struct DepthMaps {
     pub confidence: Tensor,
 }
 
-/// A residual block at 1/4: x + GN(conv(GELU(GN(conv x)))), then GELU.
+/// A residual block at 1/4 resolution: GELU(x + GN(conv(GELU(GN(conv x))))).
 #[derive(Clone, Debug)]
 struct Residual {
     conv1: Conv2d,
@@ -79,7 +87,7 @@ impl Residual {
     }
 }
 
-/// The network. Learned tensors under `small.*`.
+/// The network.
 #[derive(Clone, Debug)]
 pub struct SmallBackbone {
     config: Small,
@@ -100,13 +108,12 @@ pub struct SmallBackbone {
 }
 
 impl SmallBackbone {
-    /// Reads or initialises every tensor under `vb`'s prefix (`small`).
+    /// Builds the network; `vb` is at `small`.
     ///
     /// # Errors
     /// A tensor is missing or has another shape; the message names it.
     pub fn new(config: &Small, vb: VarBuilder) -> Result<Self> {
         let [c2, c4] = config.cnn_channels;
-        let zero = Init::Const(0.0);
         let volume = if config.raw_matching { 1 + crate::ops::matching::CHANNELS } else { 1 };
         let d = config.depth_candidates;
         let swept = if config.stem_channels > 0 { d } else { d * volume };
@@ -132,41 +139,38 @@ impl SmallBackbone {
             stem,
             stem_factor: vb.get_with_hints(1, "stem_factor", Init::Const(1.0))?,
             unet,
-            logits: Conv2d::with(top, d, ConvShape::K3, (zero, Some(zero)), vb.pp("logits"))?,
+            logits: Conv2d::with(top, d, ConvShape::K3, LayerInit::ZERO, vb.pp("logits"))?,
             confidence: (
                 Conv2d::new(top + 2, 32, ConvShape::K3, vb.pp("confidence.0"))?,
-                Conv2d::with(32, 1, ConvShape::K1, (zero, Some(zero)), vb.pp("confidence.1"))?,
+                Conv2d::with(32, 1, ConvShape::K1, LayerInit::ZERO, vb.pp("confidence.1"))?,
             ),
             upsampling,
             project: Conv2d::new(top, hidden, ConvShape::K1, vb.pp("project"))?,
             head1: Conv2d::new(hidden + 5, hidden, ConvShape::K3, vb.pp("head.0"))?,
-            head2: Conv2d::with(
-                hidden,
-                outputs,
-                ConvShape::K3,
-                (zero, Some(zero)),
-                vb.pp("head.1"),
-            )?,
+            head2: Conv2d::with(hidden, outputs, ConvShape::K3, LayerInit::ZERO, vb.pp("head.1"))?,
             config: config.clone(),
             backend: Backend::Cpu,
         })
     }
 
-    /// Where the plane sweep of the next calls runs.
+    /// Sets the backend of the following plane sweeps.
     pub fn set_backend(&mut self, backend: &Backend) {
         self.backend = backend.clone();
     }
 
-    /// Runs the network. `training` averages disparity over all candidates; else over
-    /// the window around the mode.
+    /// Runs the network.
     ///
     /// # Errors
-    /// A picture whose sides are no multiples of the configuration's stride.
-    pub fn forward(&self, views: &Views, training: bool) -> Result<(BackboneOutput, DepthMaps)> {
+    /// A side is not a multiple of the configuration's stride.
+    pub fn forward(
+        &self,
+        views: &Views,
+        mean: DisparityMean,
+    ) -> Result<(BackboneOutput, DepthMaps)> {
         let (b, v, _, h, w) = views.images.dims5()?;
-        let Seen { rgb, feat2, feat4, deep, logits, index, confidence } =
-            self.see(views, training)?;
-        let heads = self.heads(&rgb, &deep, [&index, &confidence], training)?;
+        let Matched { rgb, feat2, feat4, deep, logits, index, confidence } =
+            self.matched(views, mean)?;
+        let heads = self.heads(&rgb, &deep, [&index, &confidence], mean)?;
         let depths = self.ray_distance(views, &index)?;
         let pool = |s: usize| -> Result<Tensor> { split_views(&deep.avg_pool2d(s)?, b, v) };
         let features = vec![
@@ -190,22 +194,22 @@ impl SmallBackbone {
         Ok((output, DepthMaps { logits, index, confidence: sigmoid(&confidence)? }))
     }
 
-    /// D: depth candidates.
+    /// Returns D, the number of depth candidates.
     pub fn candidates(&self) -> usize {
         self.config.depth_candidates
     }
 
-    /// Depth alone, without the heads at full resolution: what depth supervision needs.
+    /// Computes depth alone, without the heads at full resolution.
     ///
     /// # Errors
-    /// As [`SmallBackbone::forward`].
-    pub fn depth(&self, views: &Views, training: bool) -> Result<DepthMaps> {
-        let Seen { logits, index, confidence, .. } = self.see(views, training)?;
+    /// Those of [`SmallBackbone::forward`].
+    pub fn depth(&self, views: &Views, mean: DisparityMean) -> Result<DepthMaps> {
+        let Matched { logits, index, confidence, .. } = self.matched(views, mean)?;
         Ok(DepthMaps { logits, index, confidence: sigmoid(&confidence)? })
     }
 
-    /// Everything before the heads.
-    fn see(&self, views: &Views, training: bool) -> Result<Seen> {
+    /// The network up to the heads.
+    fn matched(&self, views: &Views, mean: DisparityMean) -> Result<Matched> {
         let (b, v, _, h, w) = views.images.dims5()?;
         let stride = 4 << (self.config.unet_channels.len() - 1);
         if h % stride != 0 || w % stride != 0 {
@@ -225,7 +229,7 @@ impl SmallBackbone {
         {
             logits = lift(&logits, scores, &self.stem_factor)?;
         }
-        let (index, mass) = self.expected_index(&logits, training)?;
+        let (index, mass) = self.expected_index(&logits, mean)?;
         let rough = (&index - local_mean(&index)?)?.abs()?;
         let sides = Tensor::cat(&[&mass, &(rough / 4.0)?], 1)?;
         let hidden = gelu(&self.confidence.0.forward(&join(&deep, &sides, 1)?)?)?;
@@ -235,10 +239,10 @@ impl SmallBackbone {
             Some(convex) => convex.apply(&deep, &rgb, [&index, &confidence])?,
             None => [resize_bilinear(&index, h, w)?, resize_bilinear(&confidence, h, w)?],
         };
-        Ok(Seen { rgb, feat2, feat4, deep, logits, index, confidence })
+        Ok(Matched { rgb, feat2, feat4, deep, logits, index, confidence })
     }
 
-    /// Volume of matching scores, through the stem.
+    /// Volume of matching scores after the stem.
     fn sweep(&self, views: &Views, feat4: &Tensor) -> Result<Swept> {
         let unit = unit_channels(&self.matching.forward(feat4)?)?;
         let (rows, channels, h, w) = unit.dims4()?;
@@ -277,11 +281,11 @@ impl SmallBackbone {
         }
     }
 
-    /// Expected candidate index `[B·V, 1, h, w]`, and the probability within the
-    /// window around the mode.
-    fn expected_index(&self, logits: &Tensor, training: bool) -> Result<(Tensor, Tensor)> {
+    /// Expected candidate index, and the probability within the window around the mode:
+    /// `[B·V, 1, h, w]` each.
+    fn expected_index(&self, logits: &Tensor, mean: DisparityMean) -> Result<(Tensor, Tensor)> {
         let window = self.config.mode_window;
-        expectation(logits, window.max(1), !training && window > 0)
+        expectation(logits, window.max(1), mean == DisparityMean::AroundMode && window > 0)
     }
 
     /// `sides`: candidate index and confidence (a logit), `[B·V, 1, H, W]`.
@@ -290,14 +294,17 @@ impl SmallBackbone {
         rgb: &Tensor,
         deep: &Tensor,
         sides: [&Tensor; 2],
-        training: bool,
+        mean: DisparityMean,
     ) -> Result<Heads> {
         let views = rgb.dim(0)?;
         let share = 1.0 / (self.config.depth_candidates - 1) as f32;
         let projected = self.project.forward(deep)?;
-        // The largest tensors of the network: one view at a time, unless a gradient
-        // wants them all anyway.
-        let step = if training { views } else { 1 };
+        // These are the network's largest tensors: inference computes one view at a time,
+        // while a training graph keeps all of them anyway.
+        let step = match mean {
+            DisparityMean::AllCandidates => views,
+            DisparityMean::AroundMode => 1,
+        };
         let (mut raws, mut densities, mut hiddens) = (Vec::new(), Vec::new(), Vec::new());
         for i in (0..views).step_by(step) {
             let part = |t: &Tensor| if step == views { Ok(t.clone()) } else { t.narrow(0, i, 1) };
@@ -314,7 +321,7 @@ impl SmallBackbone {
         Ok(Heads { raw: whole(raws)?, density: whole(densities)?, hidden: whole(hiddens)? })
     }
 
-    /// What the raw head corrects: offset 0, σ of 0.6 px, no rotation, the pixel's own
+    /// Values that the raw head corrects: offset 0, σ of 0.6 px, no rotation, the pixel's
     /// colour (or mid-grey).
     fn start(&self) -> Start {
         let d = sh_coefficients(self.config.primaries.sh_degree);
@@ -333,7 +340,7 @@ impl SmallBackbone {
         }
     }
 
-    /// Candidate index to distance along the unit ray, `[B, V, H·W, 1]`.
+    /// Distance along the unit ray, `[B, V, H·W, 1]`, from candidate indices.
     fn ray_distance(&self, views: &Views, index: &Tensor) -> Result<Tensor> {
         let (b, v, _, h, w) = views.images.dims5()?;
         let steps = (self.config.depth_candidates - 1) as f32;
@@ -347,7 +354,7 @@ impl SmallBackbone {
     }
 }
 
-/// All rows as one tensor; no copy where they are one already.
+/// Joins rows; a single part is not copied.
 fn whole(mut parts: Vec<Tensor>) -> Result<Tensor> {
     match parts.len() {
         1 => Ok(parts.swap_remove(0)),
@@ -355,9 +362,9 @@ fn whole(mut parts: Vec<Tensor>) -> Result<Tensor> {
     }
 }
 
-/// What the heads and depth supervision build on. `confidence` before its sigmoid;
-/// `index` and `confidence` at full resolution.
-struct Seen {
+/// Features and depth before the heads. `confidence` is a logit; `index` and `confidence`
+/// are at full resolution.
+struct Matched {
     rgb: Tensor,
     feat2: Tensor,
     feat4: Tensor,
@@ -387,7 +394,7 @@ fn split_views(t: &Tensor, b: usize, v: usize) -> Result<Tensor> {
     t.reshape((b, v, c, h, w))
 }
 
-/// For each view, all others of its scene, at feature resolution h × w.
+/// For each view all other views of its scene, at the features' resolution h × w.
 fn pairs(views: &Views, h: usize, w: usize) -> Result<Vec<Vec<Pair>>> {
     let v = views.views();
     let mut all = Vec::new();
@@ -405,7 +412,7 @@ fn pairs(views: &Views, h: usize, w: usize) -> Result<Vec<Vec<Pair>>> {
     Ok(all)
 }
 
-/// `[B][V]` lists of D disparities (1 / camera z), index 0 = far.
+/// Disparity candidates (1 / camera z), `[B][V][D]`; index 0 is far.
 fn candidates(views: &Views, d: usize) -> Vec<Vec<Vec<f32>>> {
     let list = |&(near, far): &(f32, f32)| {
         let (lo, hi) = (1.0 / far, 1.0 / near);
@@ -414,7 +421,7 @@ fn candidates(views: &Views, d: usize) -> Vec<Vec<Vec<f32>>> {
     views.near_far.iter().map(|scene| scene.iter().map(list).collect()).collect()
 }
 
-/// Length of K⁻¹(u, v, 1) at each pixel centre: distance along the ray over camera z.
+/// Length of K⁻¹(u, v, 1) at each pixel centre: the distance along the ray over camera z.
 fn ray_lengths(camera: &Camera) -> Vec<f32> {
     let k = camera.intrinsics;
     let at = |i: usize| {

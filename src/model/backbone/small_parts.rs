@@ -1,6 +1,8 @@
 //! Parts of the small backbone: 3-D stem, U-Net, convex upsampling.
 
-use crate::model::layers::{Activation, Conv2d, ConvShape, GroupNorm, default_init, gelu};
+use crate::model::layers::{
+    Activation, Conv2d, ConvShape, GroupNorm, LayerInit, default_init, gelu,
+};
 use crate::ops::conv2d::conv2d;
 use crate::ops::conv3d::conv3d;
 use crate::ops::join::join;
@@ -13,7 +15,7 @@ pub(super) fn conv_norm_gelu(x: &Tensor, layer: &(Conv2d, GroupNorm)) -> Result<
     layer.1.forward_then(&layer.0.forward(x)?, Activation::Gelu)
 }
 
-/// Edge pixels repeated once on every side of `[B, C, h, w]`.
+/// `[B, C, h, w]` with its edge pixels repeated once on every side.
 fn pad_edge(x: &Tensor) -> Result<Tensor> {
     x.pad_with_same(2, 1, 1)?.pad_with_same(3, 1, 1)
 }
@@ -24,28 +26,27 @@ pub(super) fn local_mean(x: &Tensor) -> Result<Tensor> {
     conv2d(&pad_edge(x)?, &box3, None, 1, 0)
 }
 
-/// Two 3×3×3 convolutions over (disparity, y, x), shared over all of them:
-/// `[B, C, D, h, w]` to scores `[B, D, h, w]`. PyTorch's Conv3d layout,
-/// `0.weight` `[S, C, 3, 3, 3]`, `1.weight` `[1, S, 3, 3, 3]`.
+/// Two 3×3×3 convolutions over (disparity, y, x): `[B, C, D, h, w]` to scores
+/// `[B, D, h, w]`. PyTorch's Conv3d layout: `0.weight` `[S, C, 3, 3, 3]`, `1.weight`
+/// `[1, S, 3, 3, 3]`.
 #[derive(Clone, Debug)]
 pub(super) struct Stem {
     weights: [Tensor; 2],
     biases: [Tensor; 2],
 }
 
-/// Untrained stem, hidden channel 0: the raw scores times these (−|ΔRGB| counts
-/// fourfold, its range being a quarter; validity does not count), averaged over 3×3
-/// pixels, lifted by 4 into GELU's linear part.
+/// Untrained stem, hidden channel 0: weights of the raw scores, averaged over 3×3 pixels.
+/// −|ΔRGB| has a quarter of the range of the others, hence 4; validity has weight 0.
 const STEM_SCORES: [f32; 4] = [1.0, 4.0, 1.0, 0.0];
+/// Untrained bias of hidden channel 0, which moves the scores into GELU's linear part.
 const STEM_LIFT: f32 = 4.0;
-/// Untrained gain of the second convolution, per score: with the skip's factor 4 a
-/// clear match stands about e⁶ above its rivals.
+/// Untrained gain of the second convolution, per score. With the skip's factor 4 the
+/// probability of a clear match is about e⁶ times that of any other candidate.
 const STEM_GAIN: f32 = 1.5;
 
 impl Stem {
     pub(super) fn new(c: usize, s: usize, vb: VarBuilder) -> Result<Self> {
-        let random = |fan| default_init(fan);
-        let w0 = vb.get_with_hints((s, c, 3, 3, 3), "0.weight", random(c * 27))?;
+        let w0 = vb.get_with_hints((s, c, 3, 3, 3), "0.weight", default_init(c * 27))?;
         let w1 = vb.get_with_hints((1, s, 3, 3, 3), "1.weight", Init::Const(0.0))?;
         let b0 = vb.get_with_hints(s, "0.bias", Init::Const(0.0))?;
         let b1 = vb.get_with_hints(1, "1.bias", Init::Const(0.0))?;
@@ -58,8 +59,8 @@ impl Stem {
     }
 }
 
-/// Starts of the stem's tensors that a hint cannot say.
-pub(crate) fn small_start(name: &str, shape: &[usize], values: &mut [f32]) {
+/// Overwrites `values` with the stem's initial values that `candle_nn::Init` cannot express.
+pub(crate) fn apply_small_initial_value(name: &str, shape: &[usize], values: &mut [f32]) {
     match (name, shape) {
         ("small.stem.0.weight", &[_, c, 3, 3, 3]) if c == STEM_SCORES.len() + 1 => {
             values[..c * 27].fill(0.0);
@@ -74,7 +75,7 @@ pub(crate) fn small_start(name: &str, shape: &[usize], values: &mut [f32]) {
     }
 }
 
-/// conv, GroupNorm, GELU, twice.
+/// Convolution, GroupNorm and GELU, twice.
 #[derive(Clone, Debug)]
 struct Block([(Conv2d, GroupNorm); 2]);
 
@@ -93,7 +94,7 @@ impl Block {
     }
 }
 
-/// U-Net from 1/4 downwards, one block a level on either side.
+/// U-Net from 1/4 resolution downwards, with one block a level on either side.
 #[derive(Clone, Debug)]
 pub(super) struct Unet {
     down: Vec<Block>,
@@ -115,7 +116,7 @@ impl Unet {
         Ok(Self { down, shrink, up })
     }
 
-    /// `[B, c_in, h, w]` to `[B, channels[0], h, w]`.
+    /// Maps `[B, c_in, h, w]` to `[B, channels[0], h, w]`.
     pub(super) fn forward(&self, x: &Tensor) -> Result<Tensor> {
         let mut skips = Vec::new();
         let mut x = self.down[0].forward(x)?;
@@ -138,20 +139,19 @@ pub(super) struct ConvexUpsampling {
     mask: Conv2d,
 }
 
-/// Log of the least share that an untrained mask gives a neighbour.
-const LEAST_SHARE: f32 = 1e-3;
+/// Smallest share of a neighbour in an untrained mask, which contains the share's logarithm.
+const MIN_SHARE: f32 = 1e-3;
 
 impl ConvexUpsampling {
     pub(super) fn new(c: usize, vb: VarBuilder) -> Result<Self> {
-        let zero = Init::Const(0.0);
         Ok(Self {
             hidden: Conv2d::new(c + 48, 64, ConvShape::K3, vb.pp("0"))?,
-            mask: Conv2d::with(64, 144, ConvShape::K1, (zero, Some(zero)), vb.pp("1"))?,
+            mask: Conv2d::with(64, 144, ConvShape::K1, LayerInit::ZERO, vb.pp("1"))?,
         })
     }
 
-    /// `maps`, each `[B, 1, h, w]`, to `[B, 1, 4h, 4w]` under the mask that `deep`
-    /// `[B, C, h, w]` and the picture `rgb` `[B, 3, 4h, 4w]` give.
+    /// Upsamples `maps`, each `[B, 1, h, w]`, to `[B, 1, 4h, 4w]`. The mask comes from
+    /// `deep` `[B, C, h, w]` and the image `rgb` `[B, 3, 4h, 4w]`.
     pub(super) fn apply(
         &self,
         deep: &Tensor,
@@ -159,7 +159,7 @@ impl ConvexUpsampling {
         maps: [&Tensor; 2],
     ) -> Result<[Tensor; 2]> {
         let (b, _, h, w) = deep.dims4()?;
-        // The picture's 4×4 blocks as channels.
+        // The image's 4×4 blocks as channels.
         let blocks = rgb.reshape(&[b, 3, h, 4, w, 4][..])?.permute([0, 1, 3, 5, 2, 4])?;
         let blocks = (blocks.contiguous()?.reshape((b, 48, h, w))? - 0.5)?;
         let hidden = gelu(&self.hidden.forward(&join(deep, &blocks, 1)?)?)?;
@@ -167,8 +167,8 @@ impl ConvexUpsampling {
     }
 }
 
-/// `[16, 9]`: shares of the 3×3 coarse pixels in bilinear ×4 upsampling, at least
-/// [`LEAST_SHARE`].
+/// Shares `[16, 9]` of the 3×3 coarse pixels in bilinear ×4 upsampling, at least
+/// [`MIN_SHARE`].
 fn bilinear_shares() -> Vec<f32> {
     let axis = |i: usize| {
         let o = (i as f32 + 0.5) / 4.0 - 0.5;
@@ -177,7 +177,7 @@ fn bilinear_shares() -> Vec<f32> {
     let mut shares = Vec::with_capacity(144);
     for i in 0..16 {
         let (wy, wx) = (axis(i / 4), axis(i % 4));
-        shares.extend((0..9).map(|k| (wy[k / 3] * wx[k % 3]).max(LEAST_SHARE)));
+        shares.extend((0..9).map(|k| (wy[k / 3] * wx[k % 3]).max(MIN_SHARE)));
     }
     shares
 }

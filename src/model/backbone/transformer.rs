@@ -1,6 +1,8 @@
-//! MVSplat's multi-view transformer (spec 2): windowed self- and cross-attention on
-//! 1/4 features, after UniMatch. Rows are (v b) throughout; tokens of a layer are
-//! kept in window order between the projections, so that windows are plain rows.
+//! MVSplat's multi-view transformer (MVSplat 3.1, "Multi-view feature extraction"; after
+//! UniMatch): windowed self- and cross-attention on 1/4 features.
+//!
+//! Rows are (v b). Between the projections the tokens of a layer are in window order, so
+//! that each window is a run of consecutive rows.
 
 use super::{bv_rows, vb_rows};
 use crate::config::Mvsplat as Settings;
@@ -12,8 +14,8 @@ use crate::ops::moves::{channels_last, sum};
 use candle_core::{Result, Tensor, bail};
 use candle_nn::VarBuilder;
 
-/// Tokens that pass the feed-forward block at once where gradients are asked for: its
-/// hidden layer is 8 × as wide as the tokens, 16 MiB per block of this many.
+/// Tokens per block of the feed-forward block with gradients. Its hidden layer is 8 × as
+/// wide as the tokens: 16 MiB per block.
 const FFN_ROWS: usize = 4096;
 
 /// The network.
@@ -30,7 +32,7 @@ struct Layer {
 }
 
 impl Transformer {
-    /// Layers of self- then cross-attention.
+    /// Builds the layers, each self-attention and then cross-attention.
     ///
     /// # Errors
     /// A tensor is missing or has another shape.
@@ -50,10 +52,10 @@ impl Transformer {
         Ok(Self { layers: layers.collect::<Result<_>>()?, splits: s.window_splits })
     }
 
-    /// `[B, V, C, h, w]` to the same shape.
+    /// Maps `[B, V, C, h, w]` to the same shape.
     ///
     /// # Errors
-    /// h or w not a multiple of the window splits.
+    /// h or w is not a multiple of the window splits.
     pub fn forward(&self, cnn: &Tensor, trace: &mut Trace<'_>) -> Result<Tensor> {
         let (_, v, c, h, w) = cnn.dims5()?;
         let s = self.splits;
@@ -65,8 +67,8 @@ impl Transformer {
         let mut x = channels_last(&vb_rows(&x)?)?;
         for (i, layer) in self.layers.iter().enumerate() {
             // A single window has no seams to shift.
-            let shifted = i % 2 == 1 && s > 1;
-            let windows = Windows::new([h, w], s, shifted);
+            let roll = if i % 2 == 1 && s > 1 { Roll::Half } else { Roll::None };
+            let windows = Windows::new([h, w], s, roll);
             let order = windows.order(x.device())?;
             let input = x.index_select(&order, 1)?;
             let updated = layer.self_attn.forward(&input, &[&input], &windows)?;
@@ -85,12 +87,12 @@ impl Transformer {
 }
 
 impl Layer {
-    /// Cross-attention of every view to all others as they were at the layer's input
-    /// (`input`), all views at once.
+    /// Cross-attention of every view to the layer's input (`input`) of all other views, all
+    /// views at once.
     fn cross(&self, x: &Tensor, input: &Tensor, views: usize, w: &Windows) -> Result<Tensor> {
         let scenes = input.dim(0)? / views;
         let of_view = |v: usize| input.narrow(0, v * scenes, scenes);
-        // Others in ascending order: target t of view v is view t, or t + 1 from v on.
+        // Targets in ascending order: target t of view v is view t, or t + 1 from v on.
         let targets = (0..views - 1).map(|t| {
             let rows = (0..views).map(|v| of_view(if t < v { t } else { t + 1 }));
             Tensor::cat(&rows.collect::<Result<Vec<_>>>()?, 0)
@@ -161,7 +163,7 @@ impl SubLayer {
     }
 }
 
-/// In one pass, or in single ops where a gradient must pass.
+/// One fused pass, or single ops if a gradient is needed.
 fn feed_forward(
     (up, down, norm): &(Linear, Linear, LayerNorm),
     x: &Tensor,
@@ -183,7 +185,15 @@ fn feed_forward(
     Tensor::cat(&blocks.collect::<Result<Vec<_>>>()?, 0)
 }
 
-/// splits × splits windows of an h × w map, rolled by half a window if `shifted`.
+/// Offset of the windows, as in Swin transformers.
+#[derive(Clone, Copy)]
+enum Roll {
+    None,
+    /// Half a window on both axes.
+    Half,
+}
+
+/// splits × splits windows of an h × w map.
 struct Windows {
     size: [usize; 2],
     splits: usize,
@@ -191,8 +201,11 @@ struct Windows {
 }
 
 impl Windows {
-    fn new(size: [usize; 2], splits: usize, shifted: bool) -> Self {
-        let shift = size.map(|n| if shifted { n / splits / 2 } else { 0 });
+    fn new(size: [usize; 2], splits: usize, roll: Roll) -> Self {
+        let shift = size.map(|n| match roll {
+            Roll::None => 0,
+            Roll::Half => n / splits / 2,
+        });
         Self { size, splits, shift }
     }
 
@@ -200,8 +213,8 @@ impl Windows {
         self.splits * self.splits
     }
 
-    /// Rolled coordinates (row, column) in window order: window index row·splits + column,
-    /// row-major inside.
+    /// Rolled coordinates (row, column) in window order: windows row-major, tokens row-major
+    /// inside each.
     fn rolled(&self) -> impl Iterator<Item = [usize; 2]> + use<> {
         let (s, [wh, ww]) = (self.splits, self.size.map(|n| n / self.splits));
         (0..s * s).flat_map(move |win| {
@@ -209,7 +222,7 @@ impl Windows {
         })
     }
 
-    /// Raster index of the token that stands at each place of the window order.
+    /// Raster index of the token at each position of the window order.
     fn raster(&self) -> Vec<u32> {
         let ([h, w], [sh, sw]) = (self.size, self.shift);
         self.rolled().map(|[y, x]| ((y + sh) % h * w + (x + sw) % w) as u32).collect()
@@ -221,16 +234,16 @@ impl Windows {
 
     fn inverse(&self, device: &candle_core::Device) -> Result<Tensor> {
         let mut inverse = vec![0u32; self.size[0] * self.size[1]];
-        for (place, &token) in self.raster().iter().enumerate() {
-            inverse[token as usize] = place as u32;
+        for (position, &token) in self.raster().iter().enumerate() {
+            inverse[token as usize] = position as u32;
         }
         Tensor::new(inverse, device)
     }
 
-    /// Regions that were not neighbours before the roll must not see each other. With
-    /// `m` targets the key labels are tiled, target-major, although the keys are
-    /// target-minor: the original's mask is misaligned for three views and more, and
-    /// its weights were never trained otherwise.
+    /// Labels that exclude attention between regions that were no neighbours before the
+    /// roll. With `m` targets the key labels are target-major, although the keys are
+    /// target-minor. MVSplat's code has this misalignment for three views and more, and its
+    /// weights are trained with it.
     fn labels(&self, m: usize) -> Option<Labels> {
         if self.shift == [0, 0] {
             return None;
@@ -247,8 +260,8 @@ impl Windows {
     }
 }
 
-/// `[C, h, w]`: sine and cosine of the position inside each window (1 to n, scaled to
-/// 2π), half of the channels from y, half from x.
+/// Sine and cosine of the position inside each window (1 to n, scaled to 2π), `[C, h, w]`:
+/// half of the channels from y, half from x.
 fn position_encoding(c: usize, size: [usize; 2], splits: usize, like: &Tensor) -> Result<Tensor> {
     let [h, w] = size;
     let half = c / 2;

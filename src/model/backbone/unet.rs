@@ -1,6 +1,6 @@
-//! MVSplat's 2-D U-Net (spec 4, "U-Net"): latent-diffusion's, with the norm after each
-//! convolution, one residual block per level, and attention across the views of a
-//! scene at the lowest level. Rows (v b).
+//! MVSplat's 2-D U-Net (MVSplat 3.1, "Cost volume refinement"): that of latent diffusion,
+//! with the norm after each convolution, one residual block per level, and attention
+//! across the views of a scene at the lowest level. Rows are (v b).
 
 use crate::model::layers::{
     Activation, Conv2d, ConvShape, GroupNorm, default_init, upsample_nearest,
@@ -43,7 +43,7 @@ struct Up {
 }
 
 impl UNet {
-    /// `vb` at the U-Net (`input_blocks.…`).
+    /// Builds the network; `vb` is at the U-Net (`input_blocks.…`).
     ///
     /// # Errors
     /// A tensor is missing or has another shape.
@@ -83,10 +83,10 @@ impl UNet {
         })
     }
 
-    /// `[V·B, C, h, w]` to the same shape; stages are traced under `name`.
+    /// Maps `[V·B, C, h, w]` to the same shape; `trace` records stages under `name`.
     ///
     /// # Errors
-    /// h or w not a multiple of 2^(levels − 1).
+    /// h or w is not a multiple of 2^(levels − 1).
     pub fn forward(
         &self,
         x: &Tensor,
@@ -170,8 +170,8 @@ impl ResBlock {
     }
 }
 
-/// x + GN(proj(attention(qkv(x)))): the tokens of all views of a scene form one
-/// sequence, view-major; the projections and the norm see one view each.
+/// x + GN(proj(attention(qkv(x)))). The tokens of all views of a scene form one sequence,
+/// view-major; the projections and the norm apply to each view alone.
 #[derive(Clone, Debug)]
 struct Attention {
     /// `[3·C, C, 1, 1]`, `[3·C]`: per head q, k, v.
@@ -205,7 +205,7 @@ impl Attention {
             let x = qkv.narrow(3, i, 1)?.squeeze(3)?.permute((1, 2, 0, 4, 3))?;
             x.contiguous()?.reshape((scenes * heads, views * n, HEAD))
         };
-        // The original scales q and k by HEAD^(−1/4) each.
+        // MVSplat's code scales q and k by HEAD^(−1/4) each.
         let scale = 1.0 / (HEAD as f32).sqrt();
         let y = attention(&part(0)?, &part(1)?, &part(2)?, scale, None)?;
         let y = y.reshape((scenes, heads, views, n, HEAD))?.permute((2, 0, 1, 4, 3))?;

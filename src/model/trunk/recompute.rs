@@ -1,71 +1,74 @@
-//! The trunk's gradient without its graph. A graph over all parents would hold dozens
-//! of `[N, E]` tensors; here the children are made once, forgetting how, and when their
-//! gradient is known each chunk of parents is walked again, with a graph that is gone
-//! before the next one's. A chunk's tensors stay in a core's cache.
+//! The trunk's gradient by recomputation. A graph over all parents would hold dozens of
+//! `[N, E]` tensors. The forward pass therefore computes the children without a graph; the
+//! backward pass recomputes each chunk of parents with a graph of its own. The tensors of a
+//! chunk fit into a core's cache.
 
-use super::{Children, Parts, Scene, Trunk, chunks, interleaved};
+use super::{Children, Parts, Records, Scene, Span, TrainPass, Trunk, chunks, interleaved};
 use crate::abi::SPLAT_STRIDE;
 use crate::model::geometry::ParentChunk;
 use crate::model::mlp::Mode;
 use crate::model::{BackboneOutput, Primaries, Views};
 use crate::ops::attention_gather::Deferred;
-use crate::ops::given::given;
+use crate::ops::precomputed_gradient::precomputed_gradient;
 use crate::ops::spgr::spgr_on;
 use candle_core::backprop::GradStore;
 use candle_core::{Result, Tensor, Var, bail};
 use rayon::prelude::*;
 
-/// What [`Trunk::forward_recomputed`] keeps for the way back.
+/// State of [`Trunk::forward_recomputed`] for the backward pass.
 pub struct Recomputed<'a> {
     trunk: &'a Trunk,
     parts: &'a Parts,
-    /// With the backbone's graph.
+    /// Parents and maps, in the backbone's graph.
     scene: Scene<'a>,
     chunk: usize,
     seed: u64,
     children: Children,
 }
 
-/// What a chunk's walk found.
-struct Walked {
+/// Gradients of one chunk.
+struct ChunkGradients {
     store: GradStore,
-    /// Gradients of its parents' rows, in the order of [`inputs`]; empty where nobody asks.
+    /// Gradients of its parents' attributes, in the order of [`inputs`]; empty if none of
+    /// them is in a graph.
     inputs: Vec<Vec<f32>>,
     deferred: Vec<Deferred>,
 }
 
-/// The tensors of a scene's parents that the trunk reads.
+/// The tensors of the scene's parents that the trunk reads.
 fn inputs<'s>(scene: &'s Scene) -> [&'s Tensor; 5] {
     [&scene.means, &scene.quats_wxyz, &scene.scales, &scene.opacities, &scene.sh_input]
 }
 
 impl Trunk {
-    /// Children of the one scene in `views`, f32, whose rows and gains are outside any
-    /// graph; [`Recomputed::backward`] takes their gradient back, `chunk` parents at a
-    /// time. The coefficients `sh` are the primaries' own, in their graph. `seed` decides
-    /// what attention drops.
+    /// Computes the children of the one scene in `views`, f32. Their rows and gains are
+    /// outside any graph: [`Recomputed::backward`] propagates their gradient. The
+    /// coefficients `sh` are those of `primaries`, in their graph.
     ///
     /// # Errors
-    /// Those of [`Trunk::forward`]; SPGR off, which leaves nothing to walk.
+    /// Those of [`Trunk::forward`]; SPGR is off.
     pub fn forward_recomputed<'a>(
         &'a self,
         views: &'a Views,
         backbone: &BackboneOutput,
         primaries: &Primaries,
-        (chunk, seed): (usize, u64),
+        TrainPass { chunk, seed }: TrainPass,
     ) -> Result<Recomputed<'a>> {
-        let Some(parts) = &self.parts else { bail!("trunk: expected SPGR on, got it off") };
+        let Some(parts) = &self.parts else {
+            bail!("trunk: recomputation needs `spgr.enabled = true`, got false")
+        };
         let scene = self.scene(parts, views, backbone, primaries)?;
-        let sh = (interleaved(&primaries.sh)?, primaries.sh_basis);
+        let sh = interleaved(&primaries.sh)?;
         let outside = scene.leaves();
         let mode = Mode::Train { seed };
-        let children = self.children(parts, &outside, sh, (super::CHUNK, mode))?;
+        let children =
+            self.children(parts, &outside, sh, primaries.sh_basis, super::CHUNK, mode)?;
         Ok(Recomputed { trunk: self, parts, scene, chunk: chunk.max(1), seed, children })
     }
 }
 
 impl<'a> Scene<'a> {
-    /// The same numbers outside any graph, the maps' gradients deferred.
+    /// Returns the same tensors outside any graph, with the maps' gradients deferred.
     fn leaves(&self) -> Scene<'a> {
         Scene {
             views: self.views,
@@ -83,19 +86,21 @@ impl<'a> Scene<'a> {
 }
 
 impl Recomputed<'_> {
-    /// The children.
+    /// Returns the children.
     pub fn children(&self) -> &Children {
         &self.children
     }
 
-    /// Takes `rows` (of `[N·K, 11]`) and `gain` (of `[N·K]` or `[N·K, 4]`), the gradients
-    /// of the children, back through the trunk. `each` gets the parameters' gradients of
-    /// every chunk, in order. The scalars that are returned carry the rest, to the
-    /// backbone and to the maps' projections: their sum is to go through candle's
-    /// `backward`. The sums do not depend on the number of threads.
+    /// Propagates the gradients of the children back through the trunk: `rows` of
+    /// `[N·K, 11]` and `gain` of `[N·K]` or `[N·K, 4]`.
+    ///
+    /// `each` receives the parameters' gradients of every chunk, in order. The returned
+    /// scalars carry the gradients of the backbone and of the maps' projections: the caller
+    /// applies candle's `backward` to their sum. The order of summation does not depend on
+    /// the number of threads.
     ///
     /// # Errors
-    /// Gradients of another length; those of `each`.
+    /// Gradients have another length; those of `each`.
     pub fn backward<E: From<candle_core::Error>>(
         self,
         [rows, gain]: [&[f32]; 2],
@@ -121,20 +126,23 @@ impl Recomputed<'_> {
             self.scene.prepared.iter().flat_map(|p| p.maps()).cloned().collect();
         let mut maps_sum: Vec<Vec<f32>> = maps.iter().map(zeros).collect();
         let spans: Vec<_> = chunks(n, self.scene.per_view, self.chunk).collect();
-        // As many at a time as there are threads: results of all would be a graph again.
-        for wave in spans.chunks(rayon::current_num_threads().max(1)) {
-            let walked: Vec<Result<Walked>> =
-                wave.par_iter().map(|&span| self.walk(span, [rows, gain], wanted)).collect();
-            for (&(first, _), walked) in wave.iter().zip(walked) {
-                let walked = walked?;
-                each(&walked.store)?;
-                for (sum, own) in inputs_sum.iter_mut().zip(&walked.inputs) {
+        // One chunk a thread at a time: gradients of all chunks need as much memory as the
+        // graph.
+        for batch in spans.chunks(rayon::current_num_threads().max(1)) {
+            let gradients: Vec<Result<ChunkGradients>> = batch
+                .par_iter()
+                .map(|&span| self.chunk_gradients(span, [rows, gain], wanted))
+                .collect();
+            for (span, gradients) in batch.iter().zip(gradients) {
+                let gradients = gradients?;
+                each(&gradients.store)?;
+                for (sum, own) in inputs_sum.iter_mut().zip(&gradients.inputs) {
                     let width = sum.len() / n;
-                    sum[first * width..][..own.len()].copy_from_slice(own);
+                    sum[span.first * width..][..own.len()].copy_from_slice(own);
                 }
                 maps_sum
                     .par_iter_mut()
-                    .zip(&walked.deferred)
+                    .zip(&gradients.deferred)
                     .try_for_each(|(sum, deferred)| deferred.add_to(sum))?;
             }
         }
@@ -142,21 +150,22 @@ impl Recomputed<'_> {
         let whole = inputs(&self.scene).into_iter().zip(inputs_sum);
         for (tensor, gradient) in whole.chain(maps.iter().zip(maps_sum)) {
             if tensor.track_op() {
-                rest.push(given(tensor, 0.0, gradient)?);
+                rest.push(precomputed_gradient(tensor, 0.0, gradient)?);
             }
         }
         Ok(rest)
     }
 
-    /// One chunk, there and back.
-    fn walk(
+    /// Forward and backward pass of one chunk.
+    fn chunk_gradients(
         &self,
-        (first, len): (usize, usize),
+        span: Span,
         [rows, gain]: [&[f32]; 2],
         wanted: bool,
-    ) -> Result<Walked> {
+    ) -> Result<ChunkGradients> {
+        let Span { first, len } = span;
         let scene = self.scene.leaves();
-        let own = scene.chunk(first, len)?;
+        let own = scene.chunk(span)?;
         let leaf = |t: &Tensor| -> Result<Tensor> {
             match wanted {
                 true => Ok(Var::from_tensor(&t.contiguous()?)?.into_inner()),
@@ -174,13 +183,14 @@ impl Recomputed<'_> {
         let leaves =
             [&own.means, &own.quats_wxyz, &own.scales, &own.opacities, &own.sh].map(Tensor::clone);
         let mode = Mode::Train { seed: self.seed };
-        let (head, parents) = self.trunk.records_of(self.parts, &scene, own, mode)?;
-        let (r, g) = spgr_on(&self.trunk.backend, &head, &parents, &scene.call(first))?;
+        let Records { head, parents } = self.trunk.records_of(self.parts, &scene, own, mode)?;
+        let (r, g) = spgr_on(&self.trunk.backend, &head, &parents, &scene.call(span))?;
         let part = |all: &[f32], t: &Tensor| {
             let width = t.elem_count() / len;
             all[first * width..(first + len) * width].to_vec()
         };
-        let total = (given(&r, 0.0, part(rows, &r))? + given(&g, 0.0, part(gain, &g))?)?;
+        let total = (precomputed_gradient(&r, 0.0, part(rows, &r))?
+            + precomputed_gradient(&g, 0.0, part(gain, &g))?)?;
         let store = total.backward()?;
         let gradient = |t: &Tensor| match store.get(t) {
             Some(g) => g.flatten_all()?.to_vec1::<f32>(),
@@ -191,6 +201,6 @@ impl Recomputed<'_> {
             false => Vec::new(),
         };
         let deferred = scene.prepared.iter().flat_map(|p| p.deferred()).cloned().collect();
-        Ok(Walked { store, inputs, deferred })
+        Ok(ChunkGradients { store, inputs, deferred })
     }
 }

@@ -1,6 +1,6 @@
 //! The small backbone's own parts as candle ops with gradients. Kernels:
-//! [`crate::cpu::small`]. Tests: `tests.rs` here, against tensor operations and finite
-//! differences.
+//! [`crate::cpu::small`]. Tests: tests/ops/small.rs, against tensor operations
+//! and finite differences.
 
 mod convex;
 mod cross_check;
@@ -13,6 +13,3 @@ pub use cross_check::cross_check;
 pub use expectation::{expectation, lift};
 pub use heads::{Start, head_input, head_output, ray_distance};
 pub use unit::unit_channels;
-
-#[cfg(test)]
-mod tests;

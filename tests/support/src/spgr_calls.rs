@@ -47,19 +47,22 @@ pub fn variants(side: usize) -> Vec<(String, Config)> {
             ("ray", |s| s.depth_dir = DepthDir::Ray),
             ("world", |s| (s.depth_unit, s.beta_z) = (DepthUnit::World, 9.0)),
             ("relative", |s| (s.depth_unit, s.beta_z) = (DepthUnit::Relative, 1.0)),
-            ("disc", |s| s.slide = Slide::Disc),
+            ("disc", |s| s.ablations.slide = Slide::Disc),
             ("lambda", |s| s.lambda_s = LambdaS::OverSqrtK(1.2)),
-            ("at parent", |s| s.area_at = AreaAt::Parent),
-            ("a_min px", |s| s.a_min = AMin::TargetPx(2.0)),
-            ("a_min in", |s| s.a_min = AMin::InputPx(0.5)),
-            ("a_min off", |s| s.a_min = AMin::Off),
-            ("two axis", |s| (s.a_min, s.a_min_mode) = (AMin::TargetPx(2.0), AMinMode::TwoAxis)),
+            ("at parent", |s| s.ablations.area_at = AreaAt::Parent),
+            ("a_min px", |s| s.ablations.a_min = AMin::TargetPx(2.0)),
+            ("a_min in", |s| s.ablations.a_min = AMin::InputPx(0.5)),
+            ("a_min off", |s| s.ablations.a_min = AMin::Off),
+            ("two axis", |s| {
+                (s.ablations.a_min, s.ablations.a_min_mode) =
+                    (AMin::TargetPx(2.0), AMinMode::TwoAxis)
+            }),
             ("linear", |s| s.opacity = OpacityRule::Linear),
             ("depth", |s| s.opacity = OpacityRule::OpticalDepth),
             ("through", |s| s.opacity = OpacityRule::Transmittance),
             ("area", |s| s.opacity = OpacityRule::Area),
             ("none", |s| s.opacity = OpacityRule::None),
-            ("rgb", |s| s.gain_space = GainSpace::Rgb),
+            ("rgb", |s| s.ablations.gain_space = GainSpace::Rgb),
         ];
         for (name, change) in changes {
             let mut config = base.clone();

@@ -1,23 +1,24 @@
-//! Tests of ops: ours beside the definition in tensor operations.
+//! Comparison of a custom op with its definition in tensor operations: values and
+//! gradients.
 
 use candle_core::backprop::GradStore;
 use candle_core::{Device, Result, Tensor, Var, bail};
 
-/// Numbers in (−2, 2) by formula.
+/// Returns numbers in (−2, 2) from a formula; the same for the same `seed`.
 pub fn noise(shape: &[usize], seed: usize) -> Result<Tensor> {
     let n: usize = shape.iter().product();
     let at = |i: usize| (((i + 131 * seed) as f32 * 12.9898).sin() * 43758.547).fract();
     Tensor::from_vec((0..n).map(|i| 2.0 * at(i)).collect::<Vec<f32>>(), shape, &Device::Cpu)
 }
 
-/// Largest difference.
+/// Returns the largest absolute difference.
 pub fn far(a: &Tensor, b: &Tensor) -> Result<f32> {
     assert_eq!(a.dims(), b.dims());
     (a - b)?.abs()?.flatten_all()?.max(0)?.to_scalar()
 }
 
-/// Values and gradients of `ours` beside those of `plain`, which is made of tensor
-/// operations, for the loss Σ out·r over all outputs.
+/// Checks values and gradients of `ours` against those of `plain`, which consists of
+/// tensor operations, for the loss Σ out·r over all outputs.
 pub fn same(
     inputs: &[Tensor],
     ours: impl Fn(&[Tensor]) -> Result<Vec<Tensor>>,
@@ -40,13 +41,13 @@ pub fn same(
     for (i, var) in vars.iter().enumerate() {
         let (g, w) = (gradient(&got, var)?, gradient(&want, var)?);
         let size = w.abs()?.flatten_all()?.max(0)?.to_scalar::<f32>()?;
-        assert!(size > 0.0, "gradient {i} is nothing");
+        assert!(size > 0.0, "gradient {i} is zero");
         assert!(far(&g, &w)? < 3e-5 * (1.0 + size), "gradient {i}: {}", far(&g, &w)?);
     }
     Ok(())
 }
 
-/// The gradient that `store` holds of `x`.
+/// Returns the gradient by `x` in `store`.
 pub fn gradient(store: &GradStore, x: &Tensor) -> Result<Tensor> {
     match store.get(x) {
         Some(gradient) => Ok(gradient.clone()),

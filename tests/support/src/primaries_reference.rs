@@ -1,16 +1,21 @@
-//! From raw head outputs to Gaussians in tensor operations: what
-//! [`crate::cpu::adapter`] does in one pass, with candle's gradients. The fused op's
-//! reference in tests (spec 6).
+//! MVSplat's Gaussian adapter in tensor operations: the reference for the fused op
+//! `subsplat::ops::adapter`, with candle's gradients.
 
-use super::layers::sigmoid;
-use super::primaries::{PIXEL_SHARE, QUAT_EPS, sh_mask};
-use super::{BackboneOutput, Primaries, Views};
-use crate::abi::{ShBasis, sh_coefficients};
-use crate::camera::Camera;
-use crate::config::{Primaries as Settings, ShFrame};
-use crate::sh::{Rotation, RotationBasis, standard_from_mvsplat};
 use candle_core::{DType, Device, Result, Tensor, bail};
 use glam::{DMat3, DQuat};
+use subsplat::abi::{ShBasis, sh_coefficients};
+use subsplat::camera::Camera;
+use subsplat::config::{Primaries as Settings, ShFrame};
+use subsplat::model::layers::sigmoid;
+use subsplat::model::primaries::sh_mask;
+use subsplat::model::{BackboneOutput, Primaries, Views};
+use subsplat::sh::{Rotation, RotationBasis, standard_from_mvsplat};
+
+/// Scales are in tenths of a pixel's extent at the Gaussian's depth, summed over both
+/// axes: a fifth of a square pixel (MVSplat).
+const PIXEL_SHARE: f64 = 0.1;
+/// ε of the quaternion's normalisation (MVSplat).
+const QUAT_EPS: f64 = 1e-8;
 
 /// One view's share of the primaries, G Gaussians for each of P pixels.
 struct ViewPart {

@@ -1,65 +1,75 @@
-//! A first look: between which depths a pair of pictures has anything to show.
+//! Estimation of near and far depth from half-size images.
 //!
-//! Candidates are uniform in 1/depth between near and far, and how finely they divide
-//! what there is to see decides how good the depth is. Poses alone say little of it:
-//! RealEstate10K's habit is 1 and 100 whatever the room. So the depth network looks at
-//! the pictures at half their size with a wide range, and the range of what it saw is
-//! the one that it then works with. On the sixteen photographed pairs of the model card
-//! this is worth half a decibel; the cost is a quarter of the depth network's time.
+//! Depth candidates are uniform in 1/depth between near and far, so a range wider than the
+//! scene costs accuracy. The depth network runs once on images of half the size, with a
+//! wide range. Quantiles of the depths that it finds, with a margin, become the range of
+//! the full-size run. On the sixteen photographed pairs of the model card
+//! (`src/model/shipped/README.md`) this gains 0.5 dB for a quarter of the depth network's
+//! time.
 
 use super::Views;
 use super::backbone::SmallBackbone;
+use super::backbone::small::DisparityMean;
 use crate::camera::Camera;
 use candle_core::Result;
 
-/// The range that is looked through is wider than what was guessed by this factor on
-/// both sides: things nearer than RealEstate10K's near of 1 are common.
-const WIDER: f32 = 2.0;
+/// Factor by which the searched range extends the given one on both sides: content nearer
+/// than RealEstate10K's near of 1 is common.
+const SEARCH_FACTOR: f32 = 2.0;
 /// Share of pixels that may lie nearer than near, and farther than far.
-const OUTSIDE: f32 = 0.01;
-/// Room for what a half-sized picture does not show, as a share of near and of far.
+const OUTLIER_SHARE: f32 = 0.01;
+/// Margin for details that half-size images lack, as a share of near and of far.
 const MARGIN: f32 = 0.1;
-/// A half with fewer pixels a side shows too little: then the whole is looked at.
-const LEAST_HALF: usize = 96;
+/// Smallest side, px, of a half-size image. Smaller images stay at full size.
+const MIN_HALF_SIDE: usize = 96;
 
-/// near and far of every scene of `views` by what `network` sees at half the size.
-pub(super) fn ranges(network: &SmallBackbone, views: &Views, stride: usize) -> Result<Views> {
-    let mut found = views.clone();
+/// Returns `views` with near and far of every scene as `network` estimates them. `stride`:
+/// the number, px, of which the network's input sides are multiples.
+///
+/// # Errors
+/// Those of the network.
+pub(super) fn estimate_depth_range(
+    network: &SmallBackbone,
+    views: &Views,
+    stride: usize,
+) -> Result<Views> {
+    let mut estimated = views.clone();
     for b in 0..views.scenes() {
-        let mut wide = smaller(&views.scene(b)?, stride)?;
+        let mut wide = half_size(&views.scene(b)?, stride)?;
         for (near, far) in wide.near_far.iter_mut().flatten() {
-            (*near, *far) = (*near / WIDER, *far * WIDER);
+            (*near, *far) = (*near / SEARCH_FACTOR, *far * SEARCH_FACTOR);
         }
-        let index = network.depth(&wide, false)?.index;
+        let index = network.depth(&wide, DisparityMean::AroundMode)?.index;
         let top = (network.candidates() - 1) as f32;
         let mut depths = Vec::with_capacity(index.elem_count());
         for (v, (near, far)) in wide.near_far[0].iter().enumerate() {
-            let (least, most) = (far.recip(), near.recip());
+            let (low, high) = (far.recip(), near.recip());
             let one = index.get(v)?.flatten_all()?.to_vec1::<f32>()?;
-            depths.extend(one.iter().map(|i| (least + i / top * (most - least)).recip()));
+            depths.extend(one.iter().map(|i| (low + i / top * (high - low)).recip()));
         }
-        if let Some(range) = range(&mut depths) {
-            found.near_far[b].fill(range);
+        if let Some(range) = quantile_range(&mut depths) {
+            estimated.near_far[b].fill(range);
         }
     }
-    Ok(found)
+    Ok(estimated)
 }
 
-/// The quantiles of depth with their margins; none of depths that are no numbers.
-fn range(depths: &mut [f32]) -> Option<(f32, f32)> {
+/// Near and far from quantiles of `depths` with their margins; `None` if `depths` is empty
+/// or the quantiles are not finite.
+fn quantile_range(depths: &mut [f32]) -> Option<(f32, f32)> {
     depths.sort_unstable_by(f32::total_cmp);
     let last = depths.len().checked_sub(1)?;
-    let low = (OUTSIDE * last as f32) as usize;
+    let low = (OUTLIER_SHARE * last as f32) as usize;
     let (near, far) = (depths[low] * (1.0 - MARGIN), depths[last - low] * (1.0 + MARGIN));
     (near > 0.0 && far > near && far.is_finite()).then_some((near, far))
 }
 
-/// Half as large on both sides, with cameras to fit, and cut about the middle to
-/// multiples of `stride`; as it is where that would leave too little.
-fn smaller(views: &Views, stride: usize) -> Result<Views> {
+/// Halves the images and their cameras and crops them centrally to multiples of `stride`.
+/// Returns `views` unchanged if a side would be below [`MIN_HALF_SIDE`].
+fn half_size(views: &Views, stride: usize) -> Result<Views> {
     let (b, v, c, h, w) = views.images.dims5()?;
     let sides = [w, h].map(|side| side / 2 / stride * stride);
-    if sides.iter().any(|side| *side < LEAST_HALF) {
+    if sides.iter().any(|side| *side < MIN_HALF_SIDE) {
         return Ok(views.clone());
     }
     let [width, height] = sides;
@@ -91,9 +101,9 @@ mod tests {
     }
 
     #[test]
-    fn a_smaller_picture_shows_the_same_rays() {
+    fn a_half_size_image_has_the_same_rays() {
         let all = views(224, 288);
-        let small = smaller(&all, 32).unwrap();
+        let small = half_size(&all, 32).unwrap();
         assert_eq!(small.size().unwrap(), (128, 96));
         let (a, b) = (all.cameras[0][1].intrinsics, small.cameras[0][1].intrinsics);
         // Pixel (10, 20) of the small one covers 2×2 pixels of the large one about
@@ -110,17 +120,17 @@ mod tests {
     }
 
     #[test]
-    fn small_pictures_stay_as_they_are() {
-        assert_eq!(smaller(&views(160, 256), 32).unwrap().size().unwrap(), (256, 160));
+    fn small_images_stay_as_they_are() {
+        assert_eq!(half_size(&views(160, 256), 32).unwrap().size().unwrap(), (256, 160));
     }
 
     #[test]
-    fn strays_do_not_count() {
+    fn outliers_do_not_count() {
         let mut depths: Vec<f32> = (0..1000).map(|i| 2.0 + i as f32 * 0.006).collect();
         (depths[3], depths[500]) = (0.01, 900.0);
-        let (near, far) = range(&mut depths).unwrap();
+        let (near, far) = quantile_range(&mut depths).unwrap();
         assert!((near - 1.8).abs() < 0.1 && (far - 8.8).abs() < 0.2, "{near} {far}");
-        assert!(range(&mut []).is_none());
-        assert!(range(&mut [f32::NAN; 4]).is_none());
+        assert!(quantile_range(&mut []).is_none());
+        assert!(quantile_range(&mut [f32::NAN; 4]).is_none());
     }
 }

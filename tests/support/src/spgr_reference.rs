@@ -1,20 +1,20 @@
-//! Sub-pixel Gaussian reparameterization in tensor operations: what
-//! [`crate::cpu::spgr`] does in one pass, with candle's gradients to head records and
-//! parents. The fused op's reference in tests (spec 2.2 to 2.9, 2.12).
+//! Sub-pixel Gaussian reparameterization in tensor operations (SubSplat 3.2, A.3): the
+//! reference for the fused op `subsplat::ops::spgr`, with candle's gradients to head
+//! records and parents.
 //!
-//! No gradient passes the choice of the primary view, the growth factor c of the
-//! minimum footprint (it would cancel the scale's own) and the share of a disc step.
-//! Every 3-vector is three tensors `[n, 1]` (parent) or `[n, K]` (child).
+//! The choice of the primary view, the growth factor c of the minimum footprint (it
+//! would cancel the scale's own gradient) and the share of a disc step are constants of
+//! the graph. Every 3-vector is three tensors `[n, 1]` (parent) or `[n, K]` (child).
 
-use crate::abi::{
+use candle_core::{Result, Tensor};
+use glam::Vec3;
+use subsplat::abi::{
     AREA_SQ_EPS, DEPTH_FRACTION_MIN, FRUSTUM_MARGIN, GROWTH_MAX, HEAD_DEPTH_OFFSET,
     HEAD_GAIN_OFFSET, HEAD_LOG_SCALE_OFFSET, HEAD_LOGIT_OFFSET, HEAD_ROTATION_OFFSET,
     HEAD_UV_OFFSET, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, VISIBLE_Z_MIN,
 };
-use crate::ops::redistribute::{Rule, redistribute};
-use crate::ops::spgr::{Rules, Spgr};
-use candle_core::{Result, Tensor};
-use glam::Vec3;
+use subsplat::ops::redistribute::{Rule, redistribute};
+use subsplat::ops::spgr::{Rules, Spgr};
 
 type V3 = [Tensor; 3];
 
@@ -383,7 +383,7 @@ fn primary_views(parents: &Tensor, call: &Spgr) -> Result<Vec<u32>> {
 }
 
 /// Children `[n·K, 11]` and gains `[n·K]` or `[n·K, 4]`, as
-/// [`crate::ops::spgr::spgr`], differentiable in `head` `[n, K, 11]` and `parents`
+/// `subsplat::ops::spgr::spgr`, differentiable in `head` `[n, K, 11]` and `parents`
 /// `[n, 11]`.
 ///
 /// # Errors

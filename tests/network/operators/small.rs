@@ -1,7 +1,11 @@
-use super::*;
-use crate::ops::join::join;
-use crate::ops::same::{far, gradient, noise, same};
+//! Ops of the small backbone, against tensor operations.
+
 use candle_core::{D, Result, Tensor, Var};
+use subsplat::ops::join::join;
+use subsplat::ops::small::{
+    Start, expectation, head_input, head_output, lift, ray_distance, unit_channels, upsample_convex,
+};
+use subsplat_test_support::same::{far, gradient, noise, same};
 
 fn nearest(x: &Tensor, s: usize) -> Result<Tensor> {
     let (b, c, h, w) = x.dims4()?;
@@ -100,7 +104,7 @@ fn head_inputs_agree_with_the_definition() -> Result<()> {
         &inputs,
         |x| Ok(vec![head_input(&x[0], &rgb, &x[1], &x[2], 0.25)?]),
         |x| {
-            let up = crate::ops::resize::resize_bilinear(&x[0], 12, 20)?;
+            let up = subsplat::ops::resize::resize_bilinear(&x[0], 12, 20)?;
             Ok(vec![Tensor::cat(&[&up, &rgb, &(&x[1] * 0.25)?, &sigma(&x[2])?], 1)?])
         },
     )

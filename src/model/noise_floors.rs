@@ -1,11 +1,9 @@
-//! How far two correct f32 implementations of MVSplat lie apart, tensor by tensor:
-//! max |a − b| over max |a|, between PyTorch's two CPU back ends (oneDNN on two
-//! threads, native on one) on the reference inputs. A port may differ by ten times
-//! this ([`ALLOWANCE`]).
+//! Numerical noise of MVSplat in f32, tensor by tensor: max |a − b| over max |a| between
+//! PyTorch's two CPU back ends (oneDNN on two threads, native on one) on the reference
+//! inputs. A port may differ by ten times as much ([`ALLOWANCE`]).
 //!
-//! Depth is 1/disparity over a range of 100, so its noise, and that of everything
-//! scaled by it (means, scales, covariances), is hundreds of times that of disparity.
-//! Compare disparity where there is a choice.
+//! Depth is 1/disparity over a range of 100. Its noise, and that of means, scales and
+//! covariances, is therefore hundreds of times the noise of disparity.
 
 /// Factor on the noise floor.
 pub const ALLOWANCE: f32 = 10.0;
@@ -13,32 +11,32 @@ pub const ALLOWANCE: f32 = 10.0;
 /// Floor of tensors that are not listed: the largest of the feature maps.
 const DEFAULT: f32 = 6.3e-6;
 
-/// Noise floor of tensor `name`, relative to its largest entry.
-pub fn floor(name: &str) -> f32 {
-    let listed = FLOORS.iter().chain(EXACT).find(|(n, _)| *n == name);
+/// Returns the noise floor of tensor `name`, relative to its largest entry.
+pub fn noise_floor(name: &str) -> f32 {
+    let listed = MEASURED.iter().chain(EXACT).find(|(n, _)| *n == name);
     listed.map_or(DEFAULT, |(_, floor)| *floor)
 }
 
-/// Tensors that both back ends compute by the same code, hence without measured
-/// noise; the floors are ours, with reasons.
+/// Tensors that both back ends compute with the same code, so that no noise can be
+/// measured. The comments give the reason for each floor.
 const EXACT: &[(&str, f32)] = &[
     // Products of inputs: one rounding each.
     ("cnn.normalized_image", 1.2e-7),
     ("cv.K_px.0", 1.2e-7),
     ("cv.disp_candidates_vb", 1.2e-7),
     ("gauss.sh_mask", 1.2e-7),
-    // PyTorch inverts in f32 by elimination, we in f64.
+    // PyTorch inverts in f32 by elimination, this crate in f64.
     ("cv.pose.0", 2.4e-7),
-    // e3nn's acos loses half the digits where a camera is almost level (up to 5e-4);
-    // ours is exact.
+    // e3nn's acos loses half of the digits for a camera that is almost level (up to
+    // 5e-4); the rotation here is exact.
     ("gauss.sh_angles_abg", 5.0e-5),
     ("gauss.sh_wigner_D", 5.0e-5),
-    // Disparity of the refined depth (our derived row; spec 15).
+    // Disparity of the refined depth, a row that only this crate derives.
     ("1/gauss.depths", 5.0e-6),
 ];
 
-/// Measured.
-const FLOORS: &[(&str, f32)] = &[
+/// Measured floors.
+const MEASURED: &[(&str, f32)] = &[
     ("cnn.conv1", 4.6e-07),
     ("cnn.features", 1.9e-06),
     ("cnn.layer1", 7.5e-07),
@@ -137,9 +135,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn depth_is_wide_and_features_are_tight() {
-        assert!(floor("out.means") > 1e-4 && floor("cnn.layer3") < 3e-6);
-        assert_eq!(floor("cv.pose.0"), 2.4e-7);
-        assert_eq!(floor("no such tensor"), DEFAULT);
+    fn depth_is_noisier_than_features() {
+        assert!(noise_floor("out.means") > 1e-4 && noise_floor("cnn.layer3") < 3e-6);
+        assert_eq!(noise_floor("cv.pose.0"), 2.4e-7);
+        assert_eq!(noise_floor("no such tensor"), DEFAULT);
     }
 }
