@@ -19,28 +19,39 @@
 //! The bound holds for numbers in ±1 and n products per sum; tests check it. Winograd for
 //! images of fewer than 48 tiles is `winograd/small_images`.
 //!
-//! A tile on its way (C source channels, 8 destination channels at a time):
+//! The path of a tile, for 8 destination channels at a time:
 //!
 //! ```text
-//!  source image [C,H,W]       packed tile [C,plane,row,column]        register tile
-//!  ┌───────────────┐          ┌0─0─0─0─0─0┐                      8 channels × 48 places
-//!  │   ┌─────┐     │  pack    │0┌───────┐0│  shift by tap        ┌──────────────────────┐
-//!  │   │tile │halo │ ───────> │0│ tile  │0│ ───────────────────> │ Σ over C and taps of │
-//!  │   └─────┘     │          │0└───────┘0│     weights ───────> │ weight × shifted tile│
-//!  └───────────────┘          └0─0─0─0─0─0┘                      └──────────┬───────────┘
-//!    │                          direct: packed_tile      direct: register_tile  │ store
-//!    │                                                                          v
-//!    │                                                            destination [O,H',W']
-//!    │                                                                          ^
-//!    │ load 16 tiles           transformed tiles                 products       │ Aᵀ·m·A
-//!    │ and Bᵀ·d·B              [36 groups][C][tile]              [36][8][tile]  │
-//!    └──────────────────────>  ┌─┬─┬─┬─┐   36 matrix products    ┌─┬─┬─┬─┐      │
-//!      winograd/load_tiles     └─┴─┴─┴─┘ ─────────────────────>  └─┴─┴─┴─┘ ─────┘
-//!                              winograd/product_layout          winograd/products
-//!                                          ^ register_tile
-//!                              G·g·Gᵀ of the weights: winograd/weights
+//!  direct                           Winograd                         pointwise
 //!
-//!  pointwise: source pixels ── gemm packs panels ──> register tile of gemm ──> destination
+//!  source image [C][H][W]           source image [C][H][W]           source image [C][pixel]
+//!  ┌──────────────────┐             ┌──────────────────┐             ┌──────────────────┐
+//!  │   ┌──────┐       │             │ ┌┬┬┬┬┬┬┬┬┬┬┬┬┬┬┬┐│             │▒▒▒▒▒▒▒▒▒         │
+//!  │   │ tile │       │             │ └┴┴┴┴┴┴┴┴┴┴┴┴┴┴┴┘│             │                  │
+//!  │   └──────┘       │             │ 16 tiles         │             │ pixels           │
+//!  └──────┬───────────┘             └──────┬───────────┘             └──────┬───────────┘
+//!         │ copy with halo                 │ load with borders,             │ copy
+//!         │ (packed_tile)                  │ Bᵀ·d·B (load_tiles)            │ (gemm)
+//!         v                                v                                v
+//!  packed tile, zero padding        transformed tiles                packed panels
+//!  [C][plane][row][column]          [36 groups][C][tile]             [panel][C][64 pixels]
+//!  ┌0─0─0─0─0─0┐                    (product_layout)                        │
+//!  │0┌───────┐0│                           │                                │
+//!  │0│ tile  │0│                           │                                │
+//!  │0└───────┘0│                           │                                │
+//!  └0─0─0─0─0─0┘                           │                                │
+//!         │ shifted by each tap            │ weights G·g·Gᵀ                 │
+//!         v                                v                                v
+//!  register tile                    register tile                    register tile
+//!  8 channels × 48 places           8 channels × 48 tiles            6 channels × 64 pixels
+//!  Σ over C and taps                Σ over C, for each group         Σ over C
+//!  (register_tile)                  (register_tile)                  (gemm)
+//!         │                                v                                │
+//!         │                         products [36 groups][8][tile]           │
+//!         │                                │ Aᵀ·m·A + bias                  │
+//!         │                                │ (products)                     │
+//!         v                                v                                v
+//!  destination [O][H'][W']          destination [O][H'][W']          destination [O][pixel]
 //! ```
 //!
 //! ∂L/∂x is a convolution of ∂L/∂y and takes the same path (`plan`). ∂L/∂w multiplies the
