@@ -1,24 +1,27 @@
-//! What a feature's surroundings look like: histograms of gradient directions
-//! (Lowe 2004, sections 5 and 6) with the square-root normalisation of R.
-//! Arandjelović and A. Zisserman, "Three things everyone should know to improve
-//! object retrieval", 2012.
+//! Describes the surroundings of a feature by histograms of gradient directions.
+//!
+//! Input: features and the blurred levels of the image pyramid. Output: `[128]` floats of unit
+//! length per feature.
+//!
+//! Source: Lowe 2004, sections 5 and 6. The square-root normalisation is that of R. Arandjelović
+//! and A. Zisserman, "Three things everyone should know to improve object retrieval", 2012.
 
-use super::features::{Feature, Octave, Site};
+use super::features::{Feature, Octave, PyramidPoint};
 use super::image::GrayImage;
 use std::f32::consts::{PI, TAU};
 
-/// Floats of one descriptor: 4 × 4 cells of 8 gradient directions.
+/// Number of floats in a descriptor: 4 × 4 cells of 8 gradient directions.
 pub(super) const DESCRIPTOR: usize = 128;
 
-/// Gradient of `image` at an inner pixel: magnitude and direction.
+/// Returns the magnitude and the direction of the gradient at an inner pixel.
 fn gradient(image: &GrayImage, x: usize, y: usize) -> (f32, f32) {
     let gx = image.at(x + 1, y) - image.at(x - 1, y);
     let gy = image.at(x, y + 1) - image.at(x, y - 1);
     ((gx * gx + gy * gy).sqrt(), atan2_approx(gy, gx))
 }
 
-/// `atan2` to 2e-4 rad: rational-free polynomial on one octant, mirrored. The
-/// exact one took a third of the whole description's time.
+/// Approximates `atan2` to 2e-4 rad by a polynomial on one octant. The exact function took a third
+/// of the time of [`describe`].
 fn atan2_approx(y: f32, x: f32) -> f32 {
     let (ax, ay) = (x.abs(), y.abs());
     let (small, large) = if ax < ay { (ax, ay) } else { (ay, ax) };
@@ -37,15 +40,14 @@ fn atan2_approx(y: f32, x: f32) -> f32 {
     if y < 0.0 { -angle } else { angle }
 }
 
-/// The feature once for every strong direction of the gradients around it (Lowe,
-/// section 5).
+/// Returns one copy of the feature for every strong gradient direction around it (Lowe, section 5).
 pub(super) fn oriented(feature: &Feature, octaves: &[Octave]) -> Vec<Feature> {
     const BINS: usize = 36;
-    let site = feature.site;
-    let image = &octaves[site.octave].blurred[site.level];
-    let weight_sigma = 1.5 * site.sigma;
+    let position = feature.position;
+    let image = &octaves[position.octave].blurred[position.level];
+    let weight_sigma = 1.5 * position.sigma;
     let mut bins = [0.0f32; BINS];
-    for_window(image, &site, 3.0 * weight_sigma, |dx, dy, magnitude, angle| {
+    for_window(image, &position, 3.0 * weight_sigma, |dx, dy, magnitude, angle| {
         let weight = (-(dx * dx + dy * dy) / (2.0 * weight_sigma * weight_sigma)).exp();
         let bin = (angle.rem_euclid(TAU) / TAU * BINS as f32) as usize % BINS;
         bins[bin] += weight * magnitude;
@@ -62,19 +64,18 @@ pub(super) fn oriented(feature: &Feature, octaves: &[Octave]) -> Vec<Feature> {
             let (l, c, r) = (bins[(i + BINS - 1) % BINS], bins[i], bins[(i + 1) % BINS]);
             (c >= 0.8 * top && c > l && c > r).then(|| {
                 let peak = i as f32 + 0.5 + 0.5 * (l - r) / (l - 2.0 * c + r);
-                let mut turned = feature.clone();
-                turned.site.angle = peak / BINS as f32 * TAU;
-                turned
+                let mut copy = feature.clone();
+                copy.position.angle = peak / BINS as f32 * TAU;
+                copy
             })
         })
         .collect()
 }
 
-/// Calls `visit(dx, dy, magnitude, angle)` for the inner pixels within `radius` of
-/// the site.
+/// Calls `visit(dx, dy, magnitude, angle)` for the inner pixels within `radius` of `position`.
 fn for_window(
     image: &GrayImage,
-    site: &Site,
+    position: &PyramidPoint,
     radius: f32,
     mut visit: impl FnMut(f32, f32, f32, f32),
 ) {
@@ -83,9 +84,9 @@ fn for_window(
         let last = (at + radius).floor().min(size as f32 - 2.0).max(0.0) as usize;
         first..last + 1
     };
-    for y in range(site.y, image.height()) {
-        for x in range(site.x, image.width()) {
-            let (dx, dy) = (x as f32 - site.x, y as f32 - site.y);
+    for y in range(position.y, image.height()) {
+        for x in range(position.x, image.width()) {
+            let (dx, dy) = (x as f32 - position.x, y as f32 - position.y);
             if dx * dx + dy * dy <= radius * radius {
                 let (magnitude, angle) = gradient(image, x, y);
                 visit(dx, dy, magnitude, angle);
@@ -94,20 +95,20 @@ fn for_window(
     }
 }
 
-/// 4 × 4 cells of 3σ, 8 directions, trilinear, Gaussian of half the width (Lowe,
-/// section 6); then √(L1-normalised), which has unit length.
-pub(super) fn describe(site: &Site, octaves: &[Octave]) -> [f32; DESCRIPTOR] {
+/// Returns the descriptor of a feature: 4 × 4 cells of 3σ, 8 directions, trilinear weights, a
+/// Gaussian of half the width (Lowe, section 6). The result √(L1-normalised) has unit length.
+pub(super) fn describe(position: &PyramidPoint, octaves: &[Octave]) -> [f32; DESCRIPTOR] {
     const CELLS: usize = 4;
     const DIRECTIONS: usize = 8;
-    let image = &octaves[site.octave].blurred[site.level];
-    let cell = 3.0 * site.sigma;
+    let image = &octaves[position.octave].blurred[position.level];
+    let cell = 3.0 * position.sigma;
     let radius = cell * 0.5 * (CELLS as f32 + 1.0) * std::f32::consts::SQRT_2;
-    let (sin, cos) = site.angle.sin_cos();
-    // One ring of cells and one direction more than needed, so that the trilinear
-    // spread needs no bounds test.
+    let (sin, cos) = position.angle.sin_cos();
+    // One additional ring of cells and one additional direction: the trilinear weights then need no
+    // bounds test.
     const RING: usize = CELLS + 2;
     let mut bins = [0.0f32; RING * RING * (DIRECTIONS + 1)];
-    for_window(image, site, radius, |dx, dy, magnitude, angle| {
+    for_window(image, position, radius, |dx, dy, magnitude, angle| {
         let u = (cos * dx + sin * dy) / cell;
         let v = (cos * dy - sin * dx) / cell;
         let (cu, cv) = (u + 0.5 * CELLS as f32 + 0.5, v + 0.5 * CELLS as f32 + 0.5);
@@ -115,12 +116,12 @@ pub(super) fn describe(site: &Site, octaves: &[Octave]) -> [f32; DESCRIPTOR] {
         if !(cu > 0.0 && cv > 0.0 && cu < top && cv < top) {
             return;
         }
-        // Half the window's width, CELLS / 2 = 2 cells.
+        // The Gaussian's σ is half of the window's width: CELLS / 2 = 2 cells.
         let weight = magnitude * (-(u * u + v * v) / 8.0).exp();
-        let turn = (angle - site.angle).rem_euclid(TAU) / TAU * DIRECTIONS as f32;
+        let relative = (angle - position.angle).rem_euclid(TAU) / TAU * DIRECTIONS as f32;
         let (iu, iv) = (cu as usize, cv as usize);
-        let io = (turn as usize).min(DIRECTIONS - 1);
-        let (fu, fv, fo) = (cu - iu as f32, cv - iv as f32, turn - io as f32);
+        let io = (relative as usize).min(DIRECTIONS - 1);
+        let (fu, fv, fo) = (cu - iu as f32, cv - iv as f32, relative - io as f32);
         for (row, wv) in [(iv, 1.0 - fv), (iv + 1, fv)] {
             for (column, wu) in [(iu, 1.0 - fu), (iu + 1, fu)] {
                 let at = (row * RING + column) * (DIRECTIONS + 1) + io;

@@ -1,17 +1,31 @@
-//! Two views and their epipolar geometry, in f64: the fundamental matrix that
-//! cameras give, the distance of a match to it, and triangulation (R. Hartley and
-//! A. Zisserman, "Multiple View Geometry", sections 9.2, 11.1, 12).
+//! Epipolar geometry of two views, in f64.
 //!
-//! A match is (point in a, point in b), px of each photograph. xᵀ_b F x_a = 0.
+//! The module computes the fundamental matrix of two cameras, the distance of a match to its
+//! epipolar lines, and the triangulated depths. Points are px of their photographs, with x_bᵀ F x_a
+//! = 0.
+//!
+//! Source: R. Hartley and A. Zisserman, "Multiple View Geometry", sections 9.2, 11.1 and 12.
 
 use crate::camera::{Camera, Intrinsics};
 use glam::{DMat3, DVec2, DVec3, Mat4};
 
-/// One matched pair of points: (px of the first photograph, px of the second).
-pub(super) type Match = (DVec2, DVec2);
+/// One matched pair of points.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Match {
+    /// Point in the first photograph, px.
+    pub a: DVec2,
+    /// Point in the second photograph, px.
+    pub b: DVec2,
+}
 
-/// Two calibrated views: intrinsics, and the second camera's axes and eye as seen
-/// from the first.
+impl Match {
+    /// Returns the match with the two photographs exchanged.
+    pub(super) fn swapped(&self) -> Self {
+        Self { a: self.b, b: self.a }
+    }
+}
+
+/// Two calibrated views: intrinsics and the relative pose.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct TwoViews {
     /// Intrinsics of the first camera.
@@ -24,12 +38,12 @@ pub(super) struct TwoViews {
     pub translation: DVec3,
 }
 
-/// `k` as a matrix in f64.
+/// Returns the matrix K in f64.
 fn matrix(k: &Intrinsics) -> DMat3 {
     k.matrix().as_dmat3()
 }
 
-/// Rotation part, made orthonormal in f64: files carry few digits.
+/// Returns the rotation of a pose, made orthonormal in f64. Camera files hold few digits.
 fn rotation(pose: &Mat4) -> DMat3 {
     let m = pose.as_dmat4();
     let x = m.x_axis.truncate().normalize_or(DVec3::X);
@@ -39,7 +53,7 @@ fn rotation(pose: &Mat4) -> DMat3 {
 }
 
 impl TwoViews {
-    /// From two posed cameras.
+    /// Computes the relative pose of two cameras.
     pub(super) fn new(a: &Camera, b: &Camera) -> Self {
         let (ra, rb) = (rotation(&a.world_from_camera), rotation(&b.world_from_camera));
         let eyes = a.world_from_camera.w_axis.as_dvec4() - b.world_from_camera.w_axis.as_dvec4();
@@ -51,7 +65,7 @@ impl TwoViews {
         }
     }
 
-    /// F = K_b⁻ᵀ [t]ₓ R K_a⁻¹ with px coordinates; all zeros without a baseline.
+    /// Returns F = K_b⁻ᵀ [t]ₓ R K_a⁻¹ for px coordinates; all zeros without a baseline.
     pub(super) fn fundamental(&self) -> DMat3 {
         let t = self.translation.normalize_or_zero();
         let cross = DMat3::from_cols(
@@ -62,21 +76,21 @@ impl TwoViews {
         self.k_b.inverse().transpose() * cross * self.rotation * self.k_a.inverse()
     }
 
-    /// Where a point of the first picture lies in the second if it is infinitely
-    /// far away, or `None` behind the camera.
+    /// Projects an infinitely distant point of the first picture into the second. Returns `None`
+    /// behind the second camera.
     pub(super) fn at_infinity(&self, a: DVec2) -> Option<DVec2> {
         let p = self.k_b * (self.rotation * (self.k_a.inverse() * a.extend(1.0)));
         (p.z > 1e-9).then(|| p.truncate() / p.z)
     }
 
-    /// Depth (camera z) of the match's point in the first and in the second
-    /// camera, each where the rays come nearest, and the angle between the rays.
+    /// Triangulates a match: depths (camera z) where the two rays are closest, and the angle
+    /// between them.
     pub(super) fn triangulate(&self, m: &Match) -> Triangulated {
-        let ray_a = self.rotation * (self.k_a.inverse() * m.0.extend(1.0));
-        let ray_b = self.k_b.inverse() * m.1.extend(1.0);
+        let ray_a = self.rotation * (self.k_a.inverse() * m.a.extend(1.0));
+        let ray_b = self.k_b.inverse() * m.b.extend(1.0);
         let normal = ray_a.cross(ray_b);
         let n2 = normal.length_squared().max(1e-300);
-        // z_a·ray_a + t = z_b·ray_b, crossed with one ray and dotted with the normal.
+        // The cross product of z_a·ray_a + t = z_b·ray_b with one ray, dotted with the normal.
         Triangulated {
             z_a: -self.translation.cross(ray_b).dot(normal) / n2,
             z_b: -self.translation.cross(ray_a).dot(normal) / n2,
@@ -84,25 +98,25 @@ impl TwoViews {
         }
     }
 
-    /// Point of depth `z` at pixel `a` of the first picture, in the second
-    /// camera's axes.
+    /// Returns the point of depth `z` at pixel `a` of the first picture, in the axes of the second
+    /// camera.
     pub(super) fn in_second(&self, a: DVec2, z: f64) -> DVec3 {
         self.rotation * (self.k_a.inverse() * a.extend(1.0) * z) + self.translation
     }
 
-    /// The same two views, named the other way round.
+    /// Returns the same two views in the opposite order.
     pub(super) fn swapped(&self) -> Self {
         let r = self.rotation.transpose();
         Self { k_a: self.k_b, k_b: self.k_a, rotation: r, translation: -(r * self.translation) }
     }
 
-    /// Angle between the two cameras' axes systems, radians.
-    pub(super) fn turn(&self) -> f64 {
+    /// Returns the angle of the relative rotation, radians.
+    pub(super) fn rotation_angle(&self) -> f64 {
         let c = 0.5 * (self.rotation.col(0).x + self.rotation.col(1).y + self.rotation.col(2).z);
         (c - 0.5).clamp(-1.0, 1.0).acos()
     }
 
-    /// Radians per pixel of the coarser of both cameras.
+    /// Returns the angle of one pixel of the coarser camera, radians.
     pub(super) fn radians_per_px(&self) -> f64 {
         let f = self.k_a.x_axis.x.min(self.k_a.y_axis.y);
         1.0 / f.min(self.k_b.x_axis.x.min(self.k_b.y_axis.y)).max(1e-9)
@@ -120,10 +134,10 @@ pub(super) struct Triangulated {
     pub angle: f64,
 }
 
-/// Root mean square of the distances of both points to their epipolar lines, px;
-/// infinite where F gives no line.
+/// Returns the root mean square of the distances of both points to their epipolar lines, px. The
+/// result is infinite where F defines no line.
 pub(super) fn distance(f: &DMat3, m: &Match) -> f64 {
-    let (a, b) = (m.0.extend(1.0), m.1.extend(1.0));
+    let (a, b) = (m.a.extend(1.0), m.b.extend(1.0));
     let line_b = *f * a;
     let line_a = f.transpose() * b;
     let residual = b.dot(line_b);
@@ -134,12 +148,12 @@ pub(super) fn distance(f: &DMat3, m: &Match) -> f64 {
     (0.5 * residual * residual * (1.0 / na + 1.0 / nb)).sqrt()
 }
 
-/// Middle value, or `None` of nothing.
+/// Returns the median, or `None` without values.
 pub(super) fn median(mut values: Vec<f64>) -> Option<f64> {
     quantile(&mut values, 0.5)
 }
 
-/// Value below which the share `q` lies; sorts.
+/// Returns the value below which the share `q` lies; sorts `values`.
 pub(super) fn quantile(values: &mut [f64], q: f64) -> Option<f64> {
     values.sort_by(f64::total_cmp);
     let last = values.len().checked_sub(1)?;
@@ -165,28 +179,28 @@ mod tests {
     }
 
     #[test]
-    fn projections_of_one_point_satisfy_everything() {
+    fn projections_of_one_point_satisfy_the_epipolar_constraint() {
         let (a, b) = cameras();
         let views = TwoViews::new(&a, &b);
         let f = views.fundamental();
         for p in [Vec3::new(5.5, 0.5, 3.0), Vec3::new(6.5, 2.0, 4.0), Vec3::new(5.0, 1.0, 9.0)] {
             let (pa, pb) = (a.project(p).unwrap(), b.project(p).unwrap());
-            let m = (pa.as_dvec2(), pb.as_dvec2());
+            let m = Match { a: pa.as_dvec2(), b: pb.as_dvec2() };
             assert!(distance(&f, &m) < 1e-3);
             let t = views.triangulate(&m);
             assert!((t.z_a - f64::from(a.to_camera(p).z)).abs() < 1e-3);
             assert!((t.z_b - f64::from(b.to_camera(p).z)).abs() < 1e-3);
-            let back = views.in_second(m.0, t.z_a);
+            let back = views.in_second(m.a, t.z_a);
             assert!((back - b.to_camera(p).as_dvec3()).length() < 1e-3);
-            let shifted = (m.0, m.1 + DVec2::new(0.0, 4.0));
+            let shifted = Match { b: m.b + DVec2::new(0.0, 4.0), ..m };
             assert!(distance(&f, &shifted) > 1.0);
-            assert!((distance(&views.swapped().fundamental(), &(m.1, m.0))) < 1e-3);
+            assert!((distance(&views.swapped().fundamental(), &m.swapped())) < 1e-3);
         }
-        assert!((views.turn() - 0.3).abs() < 1e-3);
+        assert!((views.rotation_angle() - 0.3).abs() < 1e-3);
     }
 
     #[test]
-    fn far_points_lie_where_infinity_says() {
+    fn far_points_project_close_to_infinity() {
         let (a, b) = cameras();
         let views = TwoViews::new(&a, &b);
         let px = Vec2::new(300.0, 200.0);

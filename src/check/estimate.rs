@@ -1,23 +1,27 @@
-//! What epipolar geometry the matches themselves support, whatever the cameras
-//! say: RANSAC over the 7-point fundamental matrix, each new best refined by the
-//! normalised 8-point algorithm on its inliers (Hartley and Zisserman, sections
-//! 11.1, 11.2 and 11.6; local optimisation after O. Chum et al. 2003). Seeded:
-//! the same matches give the same answer.
+//! Estimates the epipolar geometry that the matches support, independently of the cameras.
+//!
+//! Input: matches, px. Output: a fundamental matrix and its inliers. The estimator is RANSAC over
+//! the 7-point algorithm. The normalised 8-point algorithm refines each new best matrix on its
+//! inliers. The random numbers are seeded, so that equal matches give equal results.
+//!
+//! Source: Hartley and Zisserman, sections 11.1, 11.2 and 11.6; local optimisation: O. Chum et al.
+//! 2003.
 
 use super::epipolar::{Match, distance};
 use glam::{DMat3, DVec2, DVec3};
 
-/// Chance that the best sample was never drawn, at which RANSAC stops.
-const MISS: f64 = 1e-3;
-/// Most samples drawn: 7 of 7 right at a right share of 0.3 needs 30 000.
-const MOST_SAMPLES: usize = 20_000;
-/// Fewest samples drawn: the stopping rule trusts the share of a first, unrefined
-/// best; a thousand samples cost a few milliseconds.
-const FEWEST_SAMPLES: usize = 1000;
-/// Rounds of refinement of a new best.
+/// RANSAC stops when the probability that no sample was free of wrong matches falls below this
+/// value.
+const MAX_MISS_PROBABILITY: f64 = 1e-3;
+/// Largest number of samples: 7 right matches of 7 at a share of 0.3 need 30 000.
+const MAX_SAMPLES: usize = 20_000;
+/// Smallest number of samples. The stopping rule relies on the inlier share of an early, unrefined
+/// matrix; 1000 samples take a few milliseconds.
+const MIN_SAMPLES: usize = 1000;
+/// Rounds of refinement of a new best matrix.
 const REFINEMENTS: usize = 4;
 
-/// A fundamental matrix and which matches agree with it.
+/// A fundamental matrix and its inliers.
 #[derive(Clone, Debug)]
 pub(super) struct Estimate {
     /// The matrix, px.
@@ -26,15 +30,15 @@ pub(super) struct Estimate {
     pub inliers: Vec<usize>,
 }
 
-/// The fundamental matrix with the largest support among `matches` (surest first)
-/// within `limit` px; `None` for fewer than 8 matches.
+/// Returns the fundamental matrix with the largest support among `matches` within `limit` px.
+/// Returns `None` for fewer than 8 matches.
 pub(super) fn fundamental(matches: &[Match], limit: f64, seed: u64) -> Option<Estimate> {
     if matches.len() < 8 {
         return None;
     }
     let mut random = SplitMix(seed);
     let mut best: Option<(f64, DMat3)> = None;
-    let mut needed = MOST_SAMPLES;
+    let mut needed = MAX_SAMPLES;
     let mut drawn = 0;
     while drawn < needed {
         let sample = random.sample(matches.len()).map(|i| matches[i]);
@@ -45,7 +49,7 @@ pub(super) fn fundamental(matches: &[Match], limit: f64, seed: u64) -> Option<Es
                 let refined = refine(f, matches, limit);
                 best = Some(refined);
                 let share = support(&refined.1, matches, limit).len() as f64 / matches.len() as f64;
-                needed = samples_for(share).clamp(FEWEST_SAMPLES, MOST_SAMPLES);
+                needed = samples_for(share).clamp(MIN_SAMPLES, MAX_SAMPLES);
             }
         }
     }
@@ -53,29 +57,33 @@ pub(super) fn fundamental(matches: &[Match], limit: f64, seed: u64) -> Option<Es
     Some(Estimate { fundamental, inliers: support(&fundamental, matches, limit) })
 }
 
-/// Samples of 7 until one of only right matches came with probability 1 − [`MISS`].
+/// Returns the number of samples after which one contains right matches only, with probability 1 −
+/// [`MAX_MISS_PROBABILITY`].
 fn samples_for(right_share: f64) -> usize {
     let all_right = right_share.powi(7).clamp(1e-12, 1.0 - 1e-9);
-    (MISS.ln() / (1.0 - all_right).ln()).ceil() as usize
+    (MAX_MISS_PROBABILITY.ln() / (1.0 - all_right).ln()).ceil() as usize
 }
 
-/// Indices of the matches within `limit` px of `f`.
+/// Returns the indices of the matches within `limit` px of `f`.
 pub(super) fn support(f: &DMat3, matches: &[Match], limit: f64) -> Vec<usize> {
     (0..matches.len()).filter(|&i| distance(f, &matches[i]) < limit).collect()
 }
 
-/// Sum of 1 − (d/limit)² over the matches within the limit (MSAC).
+/// Returns the sum of 1 − (d/limit)² over the matches within the limit (MSAC).
 fn score(f: &DMat3, matches: &[Match], limit: f64) -> f64 {
     matches.iter().map(|m| (1.0 - (distance(f, m) / limit).powi(2)).max(0.0)).sum()
 }
 
+/// Refits `start` to its inliers by the 8-point algorithm while the score rises; returns score and
+/// matrix.
 fn refine(start: DMat3, matches: &[Match], limit: f64) -> (f64, DMat3) {
     let mut best = (score(&start, matches, limit), start);
     for round in 0..REFINEMENTS {
-        // A wider net first: the sample's own noise pushes good matches out.
-        let net = limit * if round == 0 { 2.0 } else { 1.0 };
+        // The first round takes twice the limit, because the noise of the sample excludes right
+        // matches.
+        let radius = limit * if round == 0 { 2.0 } else { 1.0 };
         let chosen: Vec<Match> =
-            support(&best.1, matches, net).into_iter().map(|i| matches[i]).collect();
+            support(&best.1, matches, radius).into_iter().map(|i| matches[i]).collect();
         let Some(f) = eight_point(&chosen) else { break };
         let s = score(&f, matches, limit);
         if s > best.0 {
@@ -87,7 +95,7 @@ fn refine(start: DMat3, matches: &[Match], limit: f64) -> (f64, DMat3) {
     best
 }
 
-/// Similarity that moves points to mean 0 and mean distance √2.
+/// Returns the similarity that moves points to mean 0 and mean distance √2.
 fn normalisation(points: impl Iterator<Item = DVec2> + Clone) -> DMat3 {
     let count = points.clone().count().max(1) as f64;
     let mean = points.clone().sum::<DVec2>() / count;
@@ -100,26 +108,27 @@ fn normalisation(points: impl Iterator<Item = DVec2> + Clone) -> DMat3 {
     )
 }
 
-/// The row of xᵀ_b F x_a = 0 in the nine entries of F, row-major.
+/// Returns the row of x_bᵀ F x_a = 0 in the nine entries of F, row-major.
 fn equation(a: DVec3, b: DVec3) -> [f64; 9] {
     [b.x * a.x, b.x * a.y, b.x, b.y * a.x, b.y * a.y, b.y, a.x, a.y, 1.0]
 }
 
+/// Builds a matrix from nine row-major entries.
 fn from_rows(v: &[f64; 9]) -> DMat3 {
     DMat3::from_cols_array(v).transpose()
 }
 
-/// Least squares over eight or more matches, rank 2 enforced; `None` where the
-/// result is not finite.
+/// Solves for F by smallest squares over eight or more matches and enforces rank 2. Returns `None`
+/// where the result is not finite.
 pub(super) fn eight_point(matches: &[Match]) -> Option<DMat3> {
     if matches.len() < 8 {
         return None;
     }
-    let na = normalisation(matches.iter().map(|m| m.0));
-    let nb = normalisation(matches.iter().map(|m| m.1));
+    let na = normalisation(matches.iter().map(|m| m.a));
+    let nb = normalisation(matches.iter().map(|m| m.b));
     let mut gram = [[0.0f64; 9]; 9];
     for m in matches {
-        let row = equation(na * m.0.extend(1.0), nb * m.1.extend(1.0));
+        let row = equation(na * m.a.extend(1.0), nb * m.b.extend(1.0));
         for (i, g) in gram.iter_mut().enumerate() {
             for (j, v) in g.iter_mut().enumerate() {
                 *v += row[i] * row[j];
@@ -136,16 +145,17 @@ pub(super) fn eight_point(matches: &[Match]) -> Option<DMat3> {
     unit(nb.transpose() * rank2 * na)
 }
 
+/// Scales to Frobenius norm 1; `None` where the norm is 0 or not finite.
 fn unit(f: DMat3) -> Option<DMat3> {
     let norm = f.to_cols_array().iter().map(|v| v * v).sum::<f64>().sqrt();
     (norm.is_finite() && norm > 1e-30).then(|| f * (1.0 / norm))
 }
 
-/// One or three matrices of rank 2 through seven matches.
+/// Returns the one or three matrices of rank 2 that satisfy seven matches.
 fn seven_point(sample: &[Match; 7]) -> Vec<DMat3> {
-    let na = normalisation(sample.iter().map(|m| m.0));
-    let nb = normalisation(sample.iter().map(|m| m.1));
-    let rows = sample.map(|m| equation(na * m.0.extend(1.0), nb * m.1.extend(1.0)));
+    let na = normalisation(sample.iter().map(|m| m.a));
+    let nb = normalisation(sample.iter().map(|m| m.b));
+    let rows = sample.map(|m| equation(na * m.a.extend(1.0), nb * m.b.extend(1.0)));
     let Some([f, g]) = null_space(rows) else { return Vec::new() };
     let (f, g) = (from_rows(&f), from_rows(&g));
     // det(g + x·(f − g)) is a cubic in x; four values give its coefficients.
@@ -160,11 +170,11 @@ fn seven_point(sample: &[Match; 7]) -> Vec<DMat3> {
         .collect()
 }
 
-/// Real roots of a·x³ + b·x² + c·x + d (trigonometric and Cardano's form).
+/// Returns the real roots of a·x³ + b·x² + c·x + d (trigonometric form and Cardano's form).
 fn cubic_roots(a: f64, b: f64, c: f64, d: f64) -> Vec<f64> {
     let size = b.abs().max(c.abs()).max(d.abs());
     if a.abs() <= 1e-12 * size {
-        // Next to no cubic term: a sample that the quadratic would serve is drawn again.
+        // Without a cubic term the sample is dropped, and RANSAC draws another.
         return Vec::new();
     }
     let (b, c, d) = (b / a, c / a, d / a);
@@ -182,8 +192,8 @@ fn cubic_roots(a: f64, b: f64, c: f64, d: f64) -> Vec<f64> {
     }
 }
 
-/// Two vectors that span the null space of seven rows (Gauss-Jordan, full
-/// pivoting), or `None` where the rows are dependent.
+/// Returns two vectors that span the null space of seven rows (Gauss-Jordan, full pivoting), or
+/// `None` where the rows are dependent.
 fn null_space(mut rows: [[f64; 9]; 7]) -> Option<[[f64; 9]; 2]> {
     let mut order: [usize; 9] = std::array::from_fn(|i| i);
     for p in 0..7 {
@@ -220,9 +230,9 @@ fn null_space(mut rows: [[f64; 9]; 7]) -> Option<[[f64; 9]; 2]> {
     }))
 }
 
-/// Eigenvector of the smallest eigenvalue of a symmetric matrix (cyclic Jacobi).
+/// Returns the eigenvector of the smallest eigenvalue of a symmetric matrix (cyclic Jacobi).
 fn smallest_eigenvector<const N: usize>(mut m: [[f64; N]; N]) -> [f64; N] {
-    /// Sweeps; convergence is quadratic and takes six or so.
+    /// Maximum number of sweeps; convergence is quadratic and takes about six.
     const SWEEPS: usize = 30;
     let mut vectors = [[0.0f64; N]; N];
     (0..N).for_each(|i| vectors[i][i] = 1.0);
@@ -239,16 +249,16 @@ fn smallest_eigenvector<const N: usize>(mut m: [[f64; N]; N]) -> [f64; N] {
             }
         }
     }
-    let mut least = 0;
+    let mut smallest = 0;
     for i in 1..N {
-        if m[i][i] < m[least][least] {
-            least = i;
+        if m[i][i] < m[smallest][smallest] {
+            smallest = i;
         }
     }
-    std::array::from_fn(|i| vectors[i][least])
+    std::array::from_fn(|i| vectors[i][smallest])
 }
 
-/// One Jacobi rotation that clears entry (p, q).
+/// Applies one Jacobi rotation that clears entry (p, q).
 fn rotate<const N: usize>(m: &mut [[f64; N]; N], vectors: &mut [[f64; N]; N], p: usize, q: usize) {
     if m[p][q] == 0.0 {
         return;
@@ -272,10 +282,11 @@ fn rotate<const N: usize>(m: &mut [[f64; N]; N], vectors: &mut [[f64; N]; N], p:
     }
 }
 
-/// SplitMix64 (G. Steele et al., 2014): small, and the same on every machine.
+/// SplitMix64 (G. Steele et al., 2014): equal numbers on every machine.
 struct SplitMix(u64);
 
 impl SplitMix {
+    /// Returns 64 random bits.
     fn next(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
         let mut z = self.0;
@@ -284,7 +295,7 @@ impl SplitMix {
         z ^ (z >> 31)
     }
 
-    /// Seven different indices below `count`, which is 8 or more.
+    /// Draws seven different indices below `count`, which is 8 or more.
     fn sample(&mut self, count: usize) -> [usize; 7] {
         let mut out = [usize::MAX; 7];
         for i in 0..7 {
@@ -309,10 +320,10 @@ mod tests {
         move || (state.next() >> 11) as f64 / (1u64 << 53) as f64
     }
 
-    /// `n` matches of points in front of two cameras 1 unit and 0.2 rad apart.
+    /// Returns `n` matches of points in front of two cameras 1 unit and 0.2 rad apart.
     fn scene(n: usize, noise: f64) -> Vec<Match> {
         let k = DMat3::from_cols_array(&[500.0, 0.0, 0.0, 0.0, 510.0, 0.0, 320.0, 240.0, 1.0]);
-        let turn = DMat3::from_rotation_y(0.2);
+        let rotation = DMat3::from_rotation_y(0.2);
         let mut next = random(7);
         (0..n)
             .map(|_| {
@@ -322,13 +333,13 @@ mod tests {
                     let error = DVec2::new(next() - 0.5, next() - 0.5) * noise;
                     q.truncate() / q.z + error
                 };
-                (project(p), project(turn * p + DVec3::new(1.0, 0.1, 0.2)))
+                Match { a: project(p), b: project(rotation * p + DVec3::new(1.0, 0.1, 0.2)) }
             })
             .collect()
     }
 
     #[test]
-    fn eight_points_give_their_geometry() {
+    fn eight_points_determine_the_matrix() {
         let f = eight_point(&scene(12, 0.0)).unwrap();
         assert!(scene(40, 0.0).iter().all(|m| distance(&f, m) < 1e-6));
         assert!(f.determinant().abs() < 1e-12);
@@ -336,7 +347,7 @@ mod tests {
     }
 
     #[test]
-    fn seven_points_give_it_too() {
+    fn seven_points_determine_the_matrix() {
         let all = scene(40, 0.0);
         let sample: [Match; 7] = std::array::from_fn(|i| all[i]);
         let found = seven_point(&sample);
@@ -348,11 +359,11 @@ mod tests {
     }
 
     #[test]
-    fn wrong_matches_are_left_out() {
+    fn wrong_matches_are_outliers() {
         let mut matches = scene(120, 0.6);
         let mut next = random(3);
         for m in matches.iter_mut().step_by(2) {
-            m.1 = DVec2::new(640.0 * next(), 480.0 * next());
+            m.b = DVec2::new(640.0 * next(), 480.0 * next());
         }
         let estimate = fundamental(&matches, 1.5, 1).unwrap();
         let right = estimate.inliers.iter().filter(|&&i| i % 2 == 1).count();

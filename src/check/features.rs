@@ -1,10 +1,13 @@
-//! Scale-invariant features: extrema of the difference of Gaussians (D. Lowe, "Distinctive image features from
-//! scale-invariant keypoints", 2004; `descriptors.rs`).
+//! Detects scale-invariant features: extrema of the difference of Gaussians.
 //!
-//! Features are upright or turned with their surroundings. Hand-held photographs
-//! of one scene hardly roll against each other, and upright descriptors find more
-//! right matches; turned ones find a portrait in a landscape format.
-//! Positions are px of the given picture, pixel centres at +0.5.
+//! Input: a grey picture. Output: positions (px of the picture, pixel centres at +0.5) and
+//! descriptors. `descriptors.rs` describes the features.
+//!
+//! Descriptors are upright or oriented along the gradients around the feature. Hand-held
+//! photographs of one scene hardly roll against each other, and upright descriptors then give more
+//! right matches. Oriented descriptors match a portrait photograph with a landscape photograph.
+//!
+//! Source: D. Lowe, "Distinctive image features from scale-invariant keypoints", 2004.
 
 use super::descriptors::{describe, oriented};
 use super::image::GrayImage;
@@ -12,27 +15,36 @@ use rayon::prelude::*;
 
 /// Blur of the first level of an octave, px of the octave (Lowe, section 3.3).
 const SIGMA_BASE: f32 = 1.6;
-/// Blur that a photograph has already, px (Lowe, section 3.3).
+/// Blur of an unprocessed photograph, px (Lowe, section 3.3).
 const SIGMA_CAMERA: f32 = 0.5;
 /// Levels per doubling of the scale (Lowe, figure 3).
 const LEVELS: usize = 3;
-/// Smallest |difference of Gaussians| of a feature, for values in [0, 1]. Lowe
-/// takes 0.03; indoor walls need fainter ones, and the cap on the number keeps
-/// the strongest anyway.
-const CONTRAST: f32 = 0.004;
-/// Largest ratio of principal curvatures (Lowe, section 4.1): edges slide.
-const EDGE: f32 = 10.0;
-/// Pictures whose longer side is below this are doubled first: small pictures
-/// hold most of their detail in the finest octave, px.
+/// Smallest |difference of Gaussians| of a feature, for values in [0, 1]. Lowe takes 0.03; indoor
+/// walls need a lower threshold. The limit on the number of features keeps the strongest.
+const MIN_CONTRAST: f32 = 0.004;
+/// Largest ratio of principal curvatures (Lowe, section 4.1). Positions along an edge are not well
+/// defined.
+const MAX_CURVATURE_RATIO: f32 = 10.0;
+/// Pictures whose longer side is below this are doubled first, px. Small pictures hold most of
+/// their detail in the finest octave.
 const DOUBLE_BELOW: usize = 700;
-/// Pixels at the border of an octave without features.
+/// Width of the border of an octave that holds no features, px.
 const BORDER: usize = 4;
-/// Cells along the longer side over which features are spread.
+/// Grid cells along the longer side, over which features are spread.
 const GRID: usize = 16;
-/// A cell keeps at most this multiple of its even share.
+/// Largest number of features of a cell, in multiples of an even share.
 const CELL_SHARE: f32 = 2.5;
 
-/// A place in a picture that can be found again.
+/// Orientation of the descriptors.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Orientation {
+    /// All descriptors existing_blur the orientation of the picture.
+    Upright,
+    /// Each descriptor is rotated along the dominant gradient around its feature.
+    Gradient,
+}
+
+/// A distinct point of a picture.
 #[derive(Clone, Debug)]
 pub(super) struct Feature {
     /// Position, px of the picture.
@@ -41,13 +53,13 @@ pub(super) struct Feature {
     pub y: f32,
     /// |Difference of Gaussians|: larger is more distinct.
     pub response: f32,
-    /// Octave, level and place in it.
-    pub site: Site,
+    /// Position in the image pyramid.
+    pub position: PyramidPoint,
 }
 
-/// Where in the pyramid a feature was found.
+/// Position of a feature in the image pyramid.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Site {
+pub(super) struct PyramidPoint {
     /// Octave, 0 the finest.
     pub octave: usize,
     /// Level of the octave.
@@ -58,27 +70,29 @@ pub(super) struct Site {
     pub y: f32,
     /// Blur at which the feature was found, px of the octave.
     pub sigma: f32,
-    /// Turn of the descriptor against the picture, radians.
+    /// Rotation of the descriptor against the picture, radians.
     pub angle: f32,
 }
 
-/// Features of one picture and `[n, 128]` descriptors of unit length.
+/// Features of one picture.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Features {
+    /// n features, the strongest first.
     pub points: Vec<Feature>,
+    /// `[n, 128]`, each of unit length.
     pub descriptors: Vec<f32>,
 }
 
 /// One octave: LEVELS + 3 blurred pictures and their LEVELS + 2 differences.
 pub(super) struct Octave {
-    /// Ever more blurred, by 2^(1/LEVELS) a step.
+    /// Levels; the blur grows by 2^(1/LEVELS) per level.
     pub blurred: Vec<GrayImage>,
     differences: Vec<GrayImage>,
 }
 
-/// At most `most` features of `image`, spread over it; `upright` gives every
-/// descriptor the picture's own orientation.
-pub(super) fn detect(image: &GrayImage, most: usize, upright: bool) -> Features {
+/// Detects at most `max_features` features, spread over the picture. [`Orientation::Gradient`] may
+/// add a second copy of a feature with several strong gradient directions.
+pub(super) fn detect(image: &GrayImage, max_features: usize, orientation: Orientation) -> Features {
     let doubled = image.width().max(image.height()) < DOUBLE_BELOW;
     let octaves = pyramid(image, doubled);
     let unit = if doubled { 0.5 } else { 1.0 };
@@ -87,22 +101,24 @@ pub(super) fn detect(image: &GrayImage, most: usize, upright: bool) -> Features 
         .enumerate()
         .flat_map(|(o, octave)| extrema(octave, o, unit * (1u32 << o) as f32))
         .collect();
-    // A total order, so that the result does not depend on threads.
+    // A total order makes the result independent of the threads.
     found.sort_by(|a, b| {
         b.response.total_cmp(&a.response).then(a.y.total_cmp(&b.y)).then(a.x.total_cmp(&b.x))
     });
-    let mut points = spread(found, image, most);
-    if !upright {
+    let mut points = spread(found, image, max_features);
+    if orientation == Orientation::Gradient {
         points = points.iter().flat_map(|f| oriented(f, &octaves)).collect();
     }
-    let descriptors = points.par_iter().flat_map_iter(|f| describe(&f.site, &octaves)).collect();
+    let descriptors =
+        points.par_iter().flat_map_iter(|f| describe(&f.position, &octaves)).collect();
     Features { points, descriptors }
 }
 
+/// Builds the octaves; `doubled` starts with the picture at twice its size.
 fn pyramid(image: &GrayImage, doubled: bool) -> Vec<Octave> {
-    let (mut base, have) =
+    let (mut base, existing_blur) =
         if doubled { (image.doubled(), 2.0 * SIGMA_CAMERA) } else { (image.clone(), SIGMA_CAMERA) };
-    base = base.blurred((SIGMA_BASE * SIGMA_BASE - have * have).sqrt());
+    base = base.blurred((SIGMA_BASE * SIGMA_BASE - existing_blur * existing_blur).sqrt());
     let step = 2f32.powf(1.0 / LEVELS as f32);
     let mut octaves = Vec::new();
     while base.width().min(base.height()) >= 4 * BORDER {
@@ -119,12 +135,14 @@ fn pyramid(image: &GrayImage, doubled: bool) -> Vec<Octave> {
     octaves
 }
 
+/// Subtracts `b` from `a`.
 fn difference(a: &GrayImage, b: &GrayImage) -> Option<GrayImage> {
     let pixels = a.pixels().iter().zip(b.pixels()).map(|(a, b)| a - b).collect();
     GrayImage::new(a.width(), a.height(), pixels)
 }
 
-/// Extrema of an octave among their 26 neighbours, refined below the pixel.
+/// Finds the extrema of an octave among their 26 neighbours and refines their positions below the
+/// pixel. `unit` is the size of an octave's pixel in px of the picture.
 fn extrema(octave: &Octave, index: usize, unit: f32) -> Vec<Feature> {
     let d = &octave.differences;
     let (w, h) = (d[0].width(), d[0].height());
@@ -147,9 +165,10 @@ fn extrema(octave: &Octave, index: usize, unit: f32) -> Vec<Feature> {
         .collect()
 }
 
+/// Tests a pixel of a level against its 26 neighbours.
 fn is_extremum(d: &[GrayImage], level: usize, x: usize, y: usize) -> bool {
     let v = d[level].at(x, y);
-    if v.abs() < 0.5 * CONTRAST {
+    if v.abs() < 0.5 * MIN_CONTRAST {
         return false;
     }
     let sign = v.signum();
@@ -157,7 +176,7 @@ fn is_extremum(d: &[GrayImage], level: usize, x: usize, y: usize) -> bool {
         (y - 1..=y + 1).all(|r| {
             let row = &plane.row(r)[x - 1..=x + 1];
             row.iter().enumerate().all(|(c, &n)| {
-                // Strict against neighbours before it, so that a flat top counts once.
+                // Strict against earlier neighbours, so that a plateau counts once.
                 let before = (l, r, c) < (1, y, 1);
                 let (n, v) = (sign * n, sign * v);
                 n < v || (!before && n == v)
@@ -166,9 +185,10 @@ fn is_extremum(d: &[GrayImage], level: usize, x: usize, y: usize) -> bool {
     })
 }
 
-/// Quadratic fit to the 27 differences around an extremum (Lowe, section 4).
+/// Fits a quadratic to the 27 differences around an extremum (Lowe, section 4). Returns `None` for
+/// low contrast, edges, and fits that leave the octave.
 fn refine(d: &[GrayImage], start: [usize; 3], octave: usize, unit: f32) -> Option<Feature> {
-    /// Steps to a neighbouring pixel before the fit gives up (Lowe: "a few").
+    /// Steps to a neighbouring pixel before the fit is abandoned (Lowe: "a few").
     const STEPS: usize = 4;
     let [mut level, mut x, mut y] = start;
     let (w, h) = (d[0].width(), d[0].height());
@@ -177,18 +197,18 @@ fn refine(d: &[GrayImage], start: [usize; 3], octave: usize, unit: f32) -> Optio
         let o = fit.offset()?;
         if o.iter().all(|v| v.abs() <= 0.6) {
             let value = fit.value + 0.5 * (0..3).map(|i| fit.gradient[i] * o[i]).sum::<f32>();
-            if value.abs() < CONTRAST || fit.is_edge() {
+            if value.abs() < MIN_CONTRAST || fit.is_edge() {
                 return None;
             }
             let sigma = SIGMA_BASE * 2f32.powf((level as f32 + o[2]) / LEVELS as f32);
             let (px, py) = (x as f32 + o[0], y as f32 + o[1]);
-            // Octave pixel i has its centre where pixel i·unit of the picture has
-            // it; the half pixel is the picture's.
+            // The centre of octave pixel i is the centre of pixel i·unit of the picture; the half
+            // pixel belongs to the picture.
             return Some(Feature {
                 x: px * unit + 0.5,
                 y: py * unit + 0.5,
                 response: value.abs(),
-                site: Site { octave, level, x: px, y: py, sigma, angle: 0.0 },
+                position: PyramidPoint { octave, level, x: px, y: py, sigma, angle: 0.0 },
             });
         }
         let step = |at: usize, v: f32| (at as f32 + v.clamp(-1.0, 1.0).round()) as usize;
@@ -211,6 +231,7 @@ struct Quadratic {
 }
 
 impl Quadratic {
+    /// Computes the derivatives by central differences.
     fn at(d: &[GrayImage], level: usize, x: usize, y: usize) -> Self {
         let v = |dx: i32, dy: i32, dl: i32| {
             d[(level as i32 + dl) as usize].at((x as i32 + dx) as usize, (y as i32 + dy) as usize)
@@ -237,7 +258,7 @@ impl Quadratic {
         Self { value, gradient, hessian }
     }
 
-    /// −H⁻¹g, or `None` where H is singular.
+    /// Returns −H⁻¹g, or `None` where H is singular.
     fn offset(&self) -> Option<[f32; 3]> {
         let h = glam::Mat3::from_cols_array_2d(&self.hessian);
         let determinant = h.determinant();
@@ -247,28 +268,31 @@ impl Quadratic {
         Some((-(h.inverse() * glam::Vec3::from(self.gradient))).to_array())
     }
 
+    /// Tests the ratio of the principal curvatures against [`MAX_CURVATURE_RATIO`].
     fn is_edge(&self) -> bool {
         let h = &self.hessian;
         let trace = h[0][0] + h[1][1];
         let determinant = h[0][0] * h[1][1] - h[0][1] * h[0][1];
-        determinant <= 0.0 || trace * trace * EDGE >= (EDGE + 1.0) * (EDGE + 1.0) * determinant
+        determinant <= 0.0
+            || trace * trace * MAX_CURVATURE_RATIO
+                >= (MAX_CURVATURE_RATIO + 1.0) * (MAX_CURVATURE_RATIO + 1.0) * determinant
     }
 }
 
-/// The strongest `most` of `sorted`, at most a few times the even share from each
-/// cell of a grid: one textured carpet must not use up all features.
-fn spread(sorted: Vec<Feature>, image: &GrayImage, most: usize) -> Vec<Feature> {
+/// Returns the strongest `max_features` of `sorted`, with a limit per grid cell. The limit prevents
+/// one textured area from using up all features.
+fn spread(sorted: Vec<Feature>, image: &GrayImage, max_features: usize) -> Vec<Feature> {
     let cell = image.width().max(image.height()) as f32 / GRID as f32;
     let columns = (image.width() as f32 / cell).ceil() as usize;
     let rows = (image.height() as f32 / cell).ceil() as usize;
-    let quota = (CELL_SHARE * most as f32 / (columns * rows) as f32).ceil() as usize;
+    let quota = (CELL_SHARE * max_features as f32 / (columns * rows) as f32).ceil() as usize;
     let mut taken = vec![0usize; columns * rows];
-    let mut kept = Vec::with_capacity(most);
+    let mut kept = Vec::with_capacity(max_features);
     for f in sorted {
         let c = ((f.x / cell) as usize).min(columns - 1);
         let r = ((f.y / cell) as usize).min(rows - 1);
         let count = &mut taken[r * columns + c];
-        if *count < quota && kept.len() < most {
+        if *count < quota && kept.len() < max_features {
             *count += 1;
             kept.push(f);
         }

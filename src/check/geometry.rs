@@ -1,42 +1,44 @@
-//! What the cameras themselves say, with and without depths: baseline, angle,
-//! fields of view, how much of one photograph the other sees.
+//! Measures that follow from the cameras and from triangulated depths: baseline, angle, fields of
+//! view, parallax, depth range, overlap and coverage.
+//!
+//! Lengths are world units, angles degrees, positions px of the working size.
 
 use super::epipolar::{Match, TwoViews, median, quantile};
 use super::report::{DepthReport, PairReport};
 use crate::camera::{Camera, Intrinsics};
 use glam::DVec2;
 
-/// Points per side of the grid over which overlap is counted.
+/// Points along each side of the grid on which overlap is measured.
 const OVERLAP_GRID: usize = 24;
-/// Cells per side over which coverage is counted; a match covers its cell and the
-/// eight around it, a twelfth of the side to each direction.
+/// Cells along each side of the grid on which coverage is measured. A match covers its cell and the
+/// eight around it, a twelfth of the side in each direction.
 const COVERAGE_GRID: usize = 12;
-/// Depths, in baselines, tried for overlap where none is known; photographs for
-/// reconstruction are taken from eyes that are a twentieth to a half of the depth
-/// apart.
+/// Depths, in baselines, at which overlap is measured where no depth is known. The baseline of
+/// photographs for reconstruction is a twentieth to a half of the depth.
 const OVERLAP_DEPTHS: [f64; 6] = [1.0, 2.0, 4.0, 8.0, 16.0, 64.0];
-/// Quantiles of depth that are reported.
+/// Quantiles of the reported depths.
 const QUANTILES: [f64; 5] = [0.02, 0.25, 0.5, 0.75, 0.98];
-/// Near plane over the 2 % quantile: points are found on texture, and things
-/// without texture may stand before them. Depth candidates are even in 1/z, so
-/// that this costs their spacing directly.
-const NEAR_ROOM: f64 = 0.7;
-/// Far plane over the 98 % quantile: cheap, since candidates are even in 1/z.
-const FAR_ROOM: f64 = 2.0;
-/// Side of the network's input, px, at which parallax is told.
+/// Near plane over the 2 % quantile. Points are found on texture only, and surfaces without texture
+/// may be nearer. Depth candidates are uniform in 1/z, so this margin directly widens their
+/// spacing.
+const NEAR_MARGIN: f64 = 0.7;
+/// Far plane over the 98 % quantile. A large margin costs little, because candidates are uniform in
+/// 1/z.
+const FAR_MARGIN: f64 = 2.0;
+/// Side of the network's input, px, at which parallax is reported.
 const INPUT_SIDE: f64 = 256.0;
 
 /// Writes baseline, angle and fields of view into the report.
 pub(super) fn describe(report: &mut PairReport, cameras: &[Camera; 2]) {
     let views = TwoViews::new(&cameras[0], &cameras[1]);
     report.baseline = views.translation.length() as f32;
-    report.rotation_deg = views.turn().to_degrees() as f32;
+    report.rotation_deg = views.rotation_angle().to_degrees() as f32;
     report.fov_deg =
         cameras.map(|c| [c.intrinsics.fov_x().to_degrees(), c.intrinsics.fov_y().to_degrees()]);
 }
 
-/// Depths of `matches` (all of them right) in the first camera, or `None` where
-/// fewer than half have a parallax above the `noise` of a point, px.
+/// Returns the depths of `matches` in the first camera. All `matches` are assumed right. Returns
+/// `None` where fewer than half have a parallax above the `noise` of a point, px.
 pub(super) fn depths(views: &TwoViews, matches: &[Match], noise: f64) -> Option<Vec<Option<f64>>> {
     let parallel = noise * views.radians_per_px();
     let depths: Vec<Option<f64>> = matches
@@ -50,14 +52,14 @@ pub(super) fn depths(views: &TwoViews, matches: &[Match], noise: f64) -> Option<
     (2 * known >= matches.len() && known > 0).then_some(depths)
 }
 
-/// Median shift of the matches against infinity, px of the network's input.
+/// Returns the median shift of the matches against infinity, px of the network's input.
 pub(super) fn parallax(views: &TwoViews, matches: &[Match], longer_side: usize) -> f32 {
-    let shift = |m: &Match| views.at_infinity(m.0).map(|far| far.distance(m.1));
+    let shift = |m: &Match| views.at_infinity(m.a).map(|far| far.distance(m.b));
     let median = median(matches.iter().filter_map(shift).collect()).unwrap_or(0.0);
     (median * INPUT_SIDE / longer_side as f64) as f32
 }
 
-/// Quantiles and a depth range; `None` of no depth.
+/// Computes quantiles and a depth range; `None` without depths.
 pub(super) fn depth_report(
     views: &TwoViews,
     depths: &[Option<f64>],
@@ -70,14 +72,14 @@ pub(super) fn depth_report(
     }
     Some(DepthReport {
         quantiles: quantiles.map(|v| v as f32),
-        near: (NEAR_ROOM * quantiles[0]) as f32,
-        far: (FAR_ROOM * quantiles[4]) as f32,
+        near: (NEAR_MARGIN * quantiles[0]) as f32,
+        far: (FAR_MARGIN * quantiles[4]) as f32,
         baseline_over_depth: (views.translation.length() / quantiles[2]) as f32,
         parallax_px,
     })
 }
 
-/// Share of the first photograph that the second camera sees, each place at the
+/// Returns the share of the first photograph that the second camera sees. Each position takes the
 /// depth of the nearest matched point.
 pub(super) fn overlap(
     views: &TwoViews,
@@ -86,8 +88,8 @@ pub(super) fn overlap(
     depths: &[Option<f64>],
 ) -> f32 {
     let known: Vec<(DVec2, f64)> =
-        matches.iter().zip(depths).filter_map(|(m, d)| d.map(|z| (m.0, z))).collect();
-    seen(views, sizes, |p| {
+        matches.iter().zip(depths).filter_map(|(m, d)| d.map(|z| (m.a, z))).collect();
+    visible_share(views, sizes, |p| {
         let nearer = |a: &&(DVec2, f64), b: &&(DVec2, f64)| {
             a.0.distance_squared(p).total_cmp(&b.0.distance_squared(p))
         };
@@ -95,7 +97,7 @@ pub(super) fn overlap(
     })
 }
 
-/// Share of a picture of `size` px that lies near one of `places`.
+/// Returns the share of a picture of `size` px that lies near one of `places`.
 pub(super) fn coverage(size: &Intrinsics, places: impl Iterator<Item = DVec2>) -> f32 {
     let mut covered = [[false; COVERAGE_GRID]; COVERAGE_GRID];
     let cell = |v: f64, side: usize| {
@@ -111,16 +113,18 @@ pub(super) fn coverage(size: &Intrinsics, places: impl Iterator<Item = DVec2>) -
     count as f32 / (COVERAGE_GRID * COVERAGE_GRID) as f32
 }
 
-/// The same at the depth, one for the whole photograph, at which it is largest.
+/// Returns the largest overlap over [`OVERLAP_DEPTHS`], with one depth for the whole photograph.
 pub(super) fn overlap_at_best(views: &TwoViews, sizes: [&Intrinsics; 2]) -> f32 {
     let baseline = views.translation.length().max(1e-9);
     OVERLAP_DEPTHS
         .iter()
-        .map(|factor| seen(views, sizes, |_| factor * baseline))
+        .map(|factor| visible_share(views, sizes, |_| factor * baseline))
         .fold(0.0, f32::max)
 }
 
-fn seen(views: &TwoViews, sizes: [&Intrinsics; 2], depth: impl Fn(DVec2) -> f64) -> f32 {
+/// Returns the share of a grid on the first photograph that projects into the second, at depths
+/// `depth(px)`.
+fn visible_share(views: &TwoViews, sizes: [&Intrinsics; 2], depth: impl Fn(DVec2) -> f64) -> f32 {
     let (w, h) = (sizes[0].width as f64, sizes[0].height as f64);
     let (wb, hb) = (sizes[1].width as f64, sizes[1].height as f64);
     let step = |i: usize| (i as f64 + 0.5) / OVERLAP_GRID as f64;

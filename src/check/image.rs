@@ -1,6 +1,7 @@
-//! Grey pictures as the matcher takes them: linear access, Gaussian blur, area
-//! reduction, central differences. Values in [0, 1], row-major, pixel (i, j) has
-//! its centre at (i + 0.5, j + 0.5) as everywhere (`camera.rs`).
+//! Grey pictures for matching: access, Gaussian blur, area reduction, resampling by 2.
+//!
+//! Values are in [0, 1], row-major. The centre of pixel (i, j) is (i + 0.5, j + 0.5), as in
+//! `camera.rs`.
 
 use rayon::prelude::*;
 
@@ -16,14 +17,14 @@ pub struct GrayImage {
 const LUMA: [f32; 3] = [0.2126, 0.7152, 0.0722];
 
 impl GrayImage {
-    /// From `width × height` values, or `None` where the number of values differs,
-    /// the picture is empty, or a value is not finite.
+    /// Builds a picture of `width × height` values. Returns `None` where the number of values
+    /// differs, the picture is empty, or a value is not finite.
     pub fn new(width: usize, height: usize, pixels: Vec<f32>) -> Option<Self> {
         let fits = width.checked_mul(height) == Some(pixels.len()) && !pixels.is_empty();
         (fits && pixels.iter().all(|v| v.is_finite())).then_some(Self { width, height, pixels })
     }
 
-    /// Luma of interleaved 8-bit RGB, or `None` where the length is not 3·W·H.
+    /// Computes the luma of interleaved 8-bit RGB. Returns `None` where the length is not 3·W·H.
     pub fn from_rgb8(width: usize, height: usize, rgb: &[u8]) -> Option<Self> {
         let grey = rgb
             .chunks_exact(3)
@@ -31,44 +32,44 @@ impl GrayImage {
         rgb.len().is_multiple_of(3).then(|| Self::new(width, height, grey.collect()))?
     }
 
-    /// Luma of interleaved RGB floats in [0, 1], or `None` where the length is not
-    /// 3·W·H or a value is not finite.
+    /// Computes the luma of interleaved RGB floats in [0, 1]. Returns `None` where the length is
+    /// not 3·W·H or a value is not finite.
     pub fn from_rgb(width: usize, height: usize, rgb: &[f32]) -> Option<Self> {
         let grey = rgb.chunks_exact(3).map(|p| (0..3).map(|c| LUMA[c] * p[c]).sum::<f32>());
         rgb.len().is_multiple_of(3).then(|| Self::new(width, height, grey.collect()))?
     }
 
-    /// Width, px.
+    /// Returns the width, px.
     pub fn width(&self) -> usize {
         self.width
     }
 
-    /// Height, px.
+    /// Returns the height, px.
     pub fn height(&self) -> usize {
         self.height
     }
 
-    /// All values, row-major.
+    /// Returns all values, row-major.
     pub fn pixels(&self) -> &[f32] {
         &self.pixels
     }
 
-    /// Row `y`.
+    /// Returns row `y`.
     pub(super) fn row(&self, y: usize) -> &[f32] {
         &self.pixels[y * self.width..(y + 1) * self.width]
     }
 
-    /// Value at column `x`, row `y`.
+    /// Returns the value at column `x`, row `y`.
     pub(super) fn at(&self, x: usize, y: usize) -> f32 {
         self.pixels[y * self.width + x]
     }
 
-    /// Mean value.
+    /// Returns the mean value.
     pub(super) fn mean(&self) -> f32 {
         (self.pixels.iter().map(|&v| f64::from(v)).sum::<f64>() / self.pixels.len() as f64) as f32
     }
 
-    /// Mean over the square of `2·radius + 1` pixels around (x, y), cut at the border.
+    /// Returns the mean over the square of `2·radius + 1` pixels around (x, y), cut at the border.
     pub(super) fn mean_around(&self, x: f32, y: f32, radius: usize) -> f32 {
         let (cx, cy) =
             ((x.max(0.0) as usize).min(self.width - 1), (y.max(0.0) as usize).min(self.height - 1));
@@ -78,7 +79,8 @@ impl GrayImage {
         rows.map(|r| self.row(r)[columns.clone()].iter().sum::<f32>()).sum::<f32>() / count
     }
 
-    /// Gaussian blur of `sigma` px, borders repeated, kernel cut at 3.5σ.
+    /// Applies a Gaussian blur of `sigma` px. Border pixels are repeated; the kernel is cut at
+    /// 3.5σ.
     pub(super) fn blurred(&self, sigma: f32) -> Self {
         let radius = (3.5 * sigma).ceil() as usize;
         let kernel = gaussian(sigma, radius);
@@ -106,16 +108,17 @@ impl GrayImage {
         Self { width: w, height: h, pixels }
     }
 
-    /// Every second pixel of both directions: the next octave of a pyramid whose
-    /// level was blurred already. Pixel (i, j) of the result has its centre where
-    /// pixel (2i, 2j) had it.
+    /// Returns every second pixel of both directions. The source is already blurred for the next
+    /// octave. The centre of pixel (i, j) of the result is the centre of pixel (2i, 2j) of the
+    /// source.
     pub(super) fn decimated(&self) -> Self {
         let (width, height) = (self.width.div_ceil(2), self.height.div_ceil(2));
         let pixels = (0..height).flat_map(|y| self.row(2 * y).iter().step_by(2).copied()).collect();
         Self { width, height, pixels }
     }
 
-    /// Twice the size, bilinear; pixel (2i, 2j) has its centre where (i, j) had it.
+    /// Doubles the size by bilinear interpolation. The centre of pixel (2i, 2j) is the centre of
+    /// pixel (i, j) of the source.
     pub(super) fn doubled(&self) -> Self {
         let (w, h) = (self.width, self.height);
         let (width, height) = (2 * w, 2 * h);
@@ -130,7 +133,7 @@ impl GrayImage {
         Self { width, height, pixels }
     }
 
-    /// Area average down to `width × height`, each no larger than this picture's.
+    /// Averages areas down to `width × height`, each at most the size of this picture.
     pub(super) fn reduced(&self, width: usize, height: usize) -> Self {
         let columns = area_weights(self.width, width);
         let rows = area_weights(self.height, height);
@@ -152,7 +155,7 @@ impl GrayImage {
     }
 }
 
-/// Samples of a Gaussian at −radius..=radius, normalised to sum 1.
+/// Returns samples of a Gaussian at −radius..=radius, normalised to sum 1.
 fn gaussian(sigma: f32, radius: usize) -> Vec<f32> {
     let mut kernel: Vec<f32> = (0..=2 * radius)
         .map(|i| {
@@ -165,15 +168,15 @@ fn gaussian(sigma: f32, radius: usize) -> Vec<f32> {
     kernel
 }
 
-/// `out += weight · row`.
+/// Computes `out += weight · row`.
 fn accumulate(out: &mut [f32], row: &[f32], weight: f32) {
     for (o, &v) in out.iter_mut().zip(row) {
         *o += weight * v;
     }
 }
 
-/// For every output pixel: the first input pixel that it covers and the share of
-/// each, summing to 1.
+/// Returns, for every output pixel, the first input pixel that it covers and the weight of each
+/// covered pixel. The weights sum to 1.
 fn area_weights(from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
     let ratio = from as f64 / to as f64;
     (0..to)

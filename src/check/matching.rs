@@ -1,29 +1,33 @@
-//! Which feature of one photograph is which of the other: nearest descriptors that
-//! choose each other and are clearly nearer than the runner-up. Uses no pose.
+//! Matches the features of two photographs by their descriptors, without the poses.
+//!
+//! A match is a pair of mutual nearest neighbours whose distance is clearly below the distance of
+//! the second-nearest descriptor (Lowe, section 7.1).
 
 use super::descriptors::DESCRIPTOR;
 use super::features::Features;
 use rayon::prelude::*;
 
-/// Largest ratio of the nearest descriptor's distance to the next one's. Lowe
-/// (section 7.1) takes 0.8; demanded both ways, 0.85 keeps as few wrong ones and
-/// gives a tenth more right matches on wide pairs.
+/// Largest ratio of the nearest descriptor's distance to the second-nearest one's. Lowe (section
+/// 7.1) takes 0.8. Required in both directions, 0.85 admits as few wrong matches and finds a tenth
+/// more right ones on wide pairs.
 const RATIO: f32 = 0.85;
-/// A runner-up this near to the best, px, is the same place found twice.
-const SAME_PLACE: f32 = 3.0;
+/// A second-nearest feature within this distance of the nearest is the same point, detected twice,
+/// px.
+const SAME_PLACE_PX: f32 = 3.0;
 
-/// One pair of features.
+/// One matched pair of features.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Pair {
     /// Index into the first picture's features.
     pub a: usize,
     /// Index into the second picture's features.
     pub b: usize,
-    /// Distance of the best over the next: smaller is surer.
+    /// Distance of the nearest over the second-nearest descriptor: smaller is more certain.
     pub ratio: f32,
 }
 
-/// Mutual nearest neighbours that pass the ratio test both ways, surest first.
+/// Returns the mutual nearest neighbours that pass the ratio test in both directions, the most
+/// certain first.
 pub(super) fn pairs(a: &Features, b: &Features) -> Vec<Pair> {
     let (n, m) = (a.points.len(), b.points.len());
     if n == 0 || m == 0 {
@@ -52,8 +56,8 @@ pub(super) fn pairs(a: &Features, b: &Features) -> Vec<Pair> {
     once_per_place(pairs, a, b)
 }
 
-/// Index of the largest of `count` dot products and the ratio of its distance to
-/// the next one's at another place.
+/// Returns the index of the largest of `count` dot products, and the ratio of its distance to that
+/// of the second-nearest feature at another position.
 fn best(count: usize, dot: impl Fn(usize) -> f32, others: &Features) -> (usize, f32) {
     let mut top = 0;
     for j in 1..count {
@@ -65,7 +69,7 @@ fn best(count: usize, dot: impl Fn(usize) -> f32, others: &Features) -> (usize, 
     let mut next = -1.0f32;
     for (j, p) in others.points.iter().enumerate().take(count) {
         let d = dot(j);
-        if d > next && (p.x - place.x).hypot(p.y - place.y) > SAME_PLACE {
+        if d > next && (p.x - place.x).hypot(p.y - place.y) > SAME_PLACE_PX {
             next = d;
         }
     }
@@ -74,10 +78,11 @@ fn best(count: usize, dot: impl Fn(usize) -> f32, others: &Features) -> (usize, 
     (top, distance(dot(top)) / distance(next).max(1e-6))
 }
 
-/// Drops the less sure of two pairs that say the same (one place at two scales).
+/// Drops repeated pairs of the same two positions (one point at two scales); the more certain pair
+/// remains.
 fn once_per_place(sorted: Vec<Pair>, a: &Features, b: &Features) -> Vec<Pair> {
     let mut seen = std::collections::HashSet::new();
-    let key = |v: f32| (v / SAME_PLACE) as i32;
+    let key = |v: f32| (v / SAME_PLACE_PX) as i32;
     sorted
         .into_iter()
         .filter(|p| {
@@ -87,7 +92,7 @@ fn once_per_place(sorted: Vec<Pair>, a: &Features, b: &Features) -> Vec<Pair> {
         .collect()
 }
 
-/// Dot product in eight independent sums, which the compiler keeps in registers.
+/// Computes the dot product in eight independent sums, which the compiler keeps in registers.
 fn dot(a: &[f32], b: &[f32]) -> f32 {
     let mut sums = [0.0f32; 8];
     for (x, y) in a.chunks_exact(8).zip(b.chunks_exact(8)) {

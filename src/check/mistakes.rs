@@ -1,19 +1,20 @@
-//! The usual mistakes in camera files, undone one at a time: whichever reading of
-//! the given numbers fits the matches tells the user what to change.
+//! Candidate corrections of the usual mistakes in camera files.
 //!
-//! Two views fix the relative pose only, and not its length. Mistakes that leave
-//! it alone (OpenGL axes under a sideways move without turning, a wrong scale) are
-//! neither seen nor harmful to a reconstruction from the pair.
+//! Each *reading* undoes one mistake. The reading whose cameras fit the matches tells the user the
+//! required change.
+//!
+//! Two views determine the relative pose only, without its length. The check cannot see mistakes
+//! that leave the relative pose unchanged, such as a wrong scale or OpenGL axes under a sideways
+//! motion without rotation. Those mistakes do not harm a reconstruction from the pair.
 
 use super::epipolar::{Match, TwoViews, distance, median};
 use crate::camera::{Camera, Intrinsics};
 use glam::{Mat3, Mat4, Vec3};
 
-/// How well two cameras explain matches.
+/// Agreement of two cameras with matches.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Fit {
-    /// Median epipolar distance, px, where a point behind a camera counts as
-    /// infinitely far off.
+    /// Median epipolar distance, px. A point behind a camera counts as infinitely distant.
     pub error: f64,
     /// Median epipolar distance alone, px.
     pub distance: f64,
@@ -21,7 +22,7 @@ pub(super) struct Fit {
     pub in_front: f64,
 }
 
-/// Fit of `views` to `matches`; `noise` is the accuracy of a point, px.
+/// Measures the fit of `views` to `matches`; `noise` is the accuracy of a point, px.
 pub(super) fn fit(views: &TwoViews, matches: &[Match], noise: f64) -> Fit {
     let f = views.fundamental();
     let distances: Vec<f64> = matches.iter().map(|m| distance(&f, m)).collect();
@@ -35,26 +36,26 @@ pub(super) fn fit(views: &TwoViews, matches: &[Match], noise: f64) -> Fit {
     }
 }
 
-/// Whether a match lies in front of both cameras. Rays that are parallel within
-/// the noise meet anywhere: they count as in front.
+/// Tests whether a match lies in front of both cameras. Rays that are parallel within the noise
+/// count as in front, because their intersection is not defined.
 pub(super) fn in_front(views: &TwoViews, m: &Match, noise: f64) -> bool {
     let t = views.triangulate(m);
     (t.z_a > 0.0 && t.z_b > 0.0) || t.angle < noise * views.radians_per_px()
 }
 
-/// One other way to read the two cameras.
+/// An alternative interpretation of the two cameras.
 #[derive(Clone, Debug)]
 pub(super) struct Reading {
-    /// Short name, for programs.
+    /// Short identifier for programs.
     pub name: String,
-    /// Ends "the poses fit if …".
+    /// Completes "the poses fit if …".
     pub clause: String,
-    /// 0: a usual mistake; 1: a focal length that was searched for; 2: unusual axes.
-    /// A later rank is named only if no earlier one fits.
+    /// 0: a usual mistake; 1: a focal length from a search; 2: unusual axes. A reading is reported
+    /// only if no reading of a lower rank fits.
     pub rank: u8,
-    /// Factor of the focal length, where that is what is changed.
+    /// Factor of the focal length, for readings that change it.
     pub factor: Option<f32>,
-    /// The two cameras as this reading has them.
+    /// The two cameras of this reading.
     pub cameras: [Camera; 2],
 }
 
@@ -63,40 +64,44 @@ impl Reading {
     pub(super) const LAST_RANK: u8 = 2;
 }
 
-/// Every other reading of cameras `a` and `b` for photographs of `sizes` px.
-pub(super) fn readings(given: &[Camera; 2], sizes: [(usize, usize); 2]) -> Vec<Reading> {
-    let mut all = pose_readings(given);
-    all.extend(turned_readings(given, sizes));
-    all.extend(intrinsics_readings(given));
-    all.extend(focal_readings(given));
-    all.extend(axes_readings(given));
+/// Returns all alternative readings of two cameras for photographs of `sizes` px.
+pub(super) fn readings(cameras: &[Camera; 2], sizes: [(usize, usize); 2]) -> Vec<Reading> {
+    let mut all = pose_readings(cameras);
+    all.extend(rotated_readings(cameras, sizes));
+    all.extend(intrinsics_readings(cameras));
+    all.extend(focal_readings(cameras));
+    all.extend(axes_readings(cameras));
     all
 }
 
+/// Builds a usual mistake (rank 0) that applies `change` to both cameras.
 fn reading(
     name: impl Into<String>,
     clause: impl Into<String>,
-    given: &[Camera; 2],
+    cameras: &[Camera; 2],
     change: impl Fn(&Camera) -> Camera,
 ) -> Reading {
-    let cameras = [change(&given[0]), change(&given[1])];
+    let cameras = cameras.each_ref().map(change);
     Reading { name: name.into(), clause: clause.into(), rank: 0, factor: None, cameras }
 }
 
+/// Returns the camera with another pose.
 fn posed(camera: &Camera, world_from_camera: Mat4) -> Camera {
     Camera { world_from_camera, ..*camera }
 }
 
+/// Returns the camera-from-world matrix.
 fn inverse(camera: &Camera) -> Mat4 {
     camera.camera_from_world()
 }
 
-/// Diagonal (1, −1, −1): OpenGL's axes to OpenCV's and back.
+/// Returns diag(1, −1, −1): OpenGL's axes to OpenCV's and back.
 fn opengl() -> Mat4 {
     Mat4::from_scale(Vec3::new(1.0, -1.0, -1.0))
 }
 
-fn pose_readings(given: &[Camera; 2]) -> Vec<Reading> {
+/// Returns the readings that change the direction or the axes of the poses.
+fn pose_readings(cameras: &[Camera; 2]) -> Vec<Reading> {
     let with = |rotation: Mat3, eye: Vec3| {
         Mat4::from_cols(
             rotation.x_axis.extend(0.0),
@@ -109,37 +114,37 @@ fn pose_readings(given: &[Camera; 2]) -> Vec<Reading> {
         reading(
             "opengl",
             "their camera axes are read as OpenGL's (x right, y up, z back; nerfstudio, Blender)",
-            given,
+            cameras,
             |c| posed(c, c.world_from_camera * opengl()),
         ),
         reading(
             "world_to_camera",
             "the matrices are read as world-to-camera (COLMAP, RealEstate10K) and inverted",
-            given,
+            cameras,
             |c| posed(c, inverse(c)),
         ),
         reading(
             "world_to_camera_opengl",
             "the matrices are read as world-to-camera with OpenGL axes",
-            given,
+            cameras,
             |c| posed(c, inverse(c) * opengl()),
         ),
         reading(
             "rotation_transposed",
             "the rotations are transposed (world-to-camera rotation beside the camera's position)",
-            given,
+            cameras,
             |c| posed(c, with(c.rotation().transpose(), c.position())),
         ),
         reading(
             "translation_world_to_camera",
             "the translations are read as world-to-camera (the rotations are right)",
-            given,
+            cameras,
             |c| posed(c, with(c.rotation(), -(c.rotation() * c.position()))),
         ),
     ];
     let exchanged = [
-        posed(&given[0], given[1].world_from_camera),
-        posed(&given[1], given[0].world_from_camera),
+        posed(&cameras[0], cameras[1].world_from_camera),
+        posed(&cameras[1], cameras[0].world_from_camera),
     ];
     all.push(Reading {
         name: "exchanged".into(),
@@ -151,8 +156,9 @@ fn pose_readings(given: &[Camera; 2]) -> Vec<Reading> {
     all
 }
 
-/// Photographs turned against their cameras, as EXIF orientation does.
-fn turned_readings(given: &[Camera; 2], sizes: [(usize, usize); 2]) -> Vec<Reading> {
+/// Returns the readings for photographs that were rotated without their cameras, as EXIF
+/// orientation does.
+fn rotated_readings(cameras: &[Camera; 2], sizes: [(usize, usize); 2]) -> Vec<Reading> {
     let turns = [
         (1, "turned_clockwise", "the photographs are turned back by 90° counter-clockwise"),
         (2, "turned_half", "the photographs are turned by 180°"),
@@ -160,8 +166,8 @@ fn turned_readings(given: &[Camera; 2], sizes: [(usize, usize); 2]) -> Vec<Readi
     ];
     let build = |(quarters, name, clause): (usize, &str, &str)| {
         let turn = |i: usize| {
-            let mut camera = given[i];
-            (0..quarters).for_each(|_| camera = turned_clockwise(&camera));
+            let mut camera = cameras[i];
+            (0..quarters).for_each(|_| camera = rotated_clockwise(&camera));
             camera.resized(sizes[i].0, sizes[i].1)
         };
         let clause = format!("{clause} (EXIF orientation?)");
@@ -170,9 +176,8 @@ fn turned_readings(given: &[Camera; 2], sizes: [(usize, usize); 2]) -> Vec<Readi
     turns.into_iter().map(build).collect()
 }
 
-/// The camera of the photograph turned clockwise by 90°: new x is old −y, new y is
-/// old x.
-fn turned_clockwise(camera: &Camera) -> Camera {
+/// Returns the camera of the photograph rotated clockwise by 90°: new x is old −y, new y is old x.
+fn rotated_clockwise(camera: &Camera) -> Camera {
     let k = camera.intrinsics;
     let old_from_new = Mat4::from_mat3(Mat3::from_cols(Vec3::NEG_Y, Vec3::X, Vec3::Z));
     Camera {
@@ -188,16 +193,17 @@ fn turned_clockwise(camera: &Camera) -> Camera {
     }
 }
 
-fn intrinsics_readings(given: &[Camera; 2]) -> Vec<Reading> {
-    /// Relative difference from which a change of intrinsics is another reading.
+/// Returns the readings that change focal lengths or principal points.
+fn intrinsics_readings(cameras: &[Camera; 2]) -> Vec<Reading> {
+    /// Smallest relative difference that makes changed intrinsics a separate reading.
     const DIFFERS: f32 = 0.02;
     let change = |name: &str, clause: &str, f: &dyn Fn(Intrinsics) -> Intrinsics| {
-        reading(name, clause, given, |c| Camera { intrinsics: f(c.intrinsics), ..*c })
+        reading(name, clause, cameras, |c| Camera { intrinsics: f(c.intrinsics), ..*c })
     };
     let size = |k: &Intrinsics| (k.width as f32, k.height as f32);
     let differs = |a: f32, b: f32| (a / b - 1.0).abs() > DIFFERS;
     let mut all = Vec::new();
-    if given.iter().any(|c| differs(c.intrinsics.fx, c.intrinsics.fy)) {
+    if cameras.iter().any(|c| differs(c.intrinsics.fx, c.intrinsics.fy)) {
         all.push(change("focal_swapped", "fx and fy are exchanged", &|k| Intrinsics {
             fx: k.fy,
             fy: k.fx,
@@ -208,7 +214,7 @@ fn intrinsics_readings(given: &[Camera; 2]) -> Vec<Reading> {
         let (w, h) = size(k);
         !differs(2.0 * k.cx, w) && !differs(2.0 * k.cy, h)
     };
-    if !given.iter().all(|c| middle(&c.intrinsics)) {
+    if !cameras.iter().all(|c| middle(&c.intrinsics)) {
         all.push(change(
             "principal_point_mirrored",
             "the principal point is mirrored (width − cx, height − cy)",
@@ -230,7 +236,7 @@ fn intrinsics_readings(given: &[Camera; 2]) -> Vec<Reading> {
             },
         ));
     }
-    if given.iter().all(|c| c.intrinsics.fx < NORMALISED_FOCAL) {
+    if cameras.iter().all(|c| c.intrinsics.fx < NORMALISED_FOCAL) {
         all.push(change(
             "normalised",
             "the intrinsics are multiplied by the picture's size: they are normalised, not pixels",
@@ -240,25 +246,28 @@ fn intrinsics_readings(given: &[Camera; 2]) -> Vec<Reading> {
     all
 }
 
-/// A focal length below this many px is one divided by the picture's width: a
-/// field of view of 170° in 100 px has 4.4 px, a long lens normalised has 8.
+/// A focal length below this many px is normalised by the picture's width. A field of view of 170°
+/// in 100 px has 4.4 px; a normalised long lens has 8.
 pub(super) const NORMALISED_FOCAL: f32 = 10.0;
 
-/// Focal lengths scaled by steps of 5 %, both axes together or x alone.
-fn focal_readings(given: &[Camera; 2]) -> Vec<Reading> {
-    /// Steps of 5 % to either side: factors 0.4 to 2.5.
+/// Returns the readings with focal lengths scaled in steps of 5 %, both axes together or x alone.
+fn focal_readings(cameras: &[Camera; 2]) -> Vec<Reading> {
+    /// Steps of 5 % in each direction: factors 0.4 to 2.5.
     const STEPS: i32 = 19;
     let both = (-STEPS..=STEPS).filter(|s| *s != 0).map(|s| (s, true));
-    let alone = (-STEPS..=STEPS).filter(|s| *s != 0).map(|s| (s, false));
-    both.chain(alone)
-        .map(|(step, both)| {
+    let x_only = (-STEPS..=STEPS).filter(|s| *s != 0).map(|s| (s, false));
+    both.chain(x_only)
+        .map(|(step, scale_fy)| {
             let factor = 1.05f32.powi(step);
-            let (name, what) =
-                if both { ("focal_scaled", "fx and fy are") } else { ("fx_scaled", "fx alone is") };
+            let (name, what) = if scale_fy {
+                ("focal_scaled", "fx and fy are")
+            } else {
+                ("fx_scaled", "fx alone is")
+            };
             let clause = format!("{what} multiplied by about {factor:.2}");
-            let mut scaled = reading(name, clause, given, |c| {
+            let mut scaled = reading(name, clause, cameras, |c| {
                 let k = c.intrinsics;
-                let fy = if both { k.fy * factor } else { k.fy };
+                let fy = if scale_fy { k.fy * factor } else { k.fy };
                 Camera { intrinsics: Intrinsics { fx: k.fx * factor, fy, ..k }, ..*c }
             });
             (scaled.rank, scaled.factor) = (1, Some(factor));
@@ -267,8 +276,8 @@ fn focal_readings(given: &[Camera; 2]) -> Vec<Reading> {
         .collect()
 }
 
-/// All 24 right-handed orders of camera axes, read as either direction of matrix.
-fn axes_readings(given: &[Camera; 2]) -> Vec<Reading> {
+/// Returns all 24 right-handed orders of camera axes, for either direction of the matrices.
+fn axes_readings(cameras: &[Camera; 2]) -> Vec<Reading> {
     let units = [Vec3::X, Vec3::Y, Vec3::Z];
     let mut all = Vec::new();
     for (i, signs) in (0..3).flat_map(|i| (0..4).map(move |s| (i, s))) {
@@ -278,7 +287,8 @@ fn axes_readings(given: &[Camera; 2]) -> Vec<Reading> {
             // Rows: the file's axes in OpenCV's.
             let file_from_camera = Mat3::from_cols(x, y, x.cross(y)).transpose();
             if x == Vec3::X && y.y.abs() == 1.0 {
-                continue; // OpenCV's own and OpenGL's, tried above.
+                // `pose_readings` covers the axes of OpenCV and of OpenGL.
+                continue;
             }
             let axes = [x, y, x.cross(y)].map(direction).join(", ");
             let axes_name = axes.replace(", ", "_");
@@ -286,7 +296,7 @@ fn axes_readings(given: &[Camera; 2]) -> Vec<Reading> {
             let mut forward = reading(
                 format!("axes_{axes_name}"),
                 format!("their camera axes are read as ({axes})"),
-                given,
+                cameras,
                 |c| posed(c, c.world_from_camera * change),
             );
             // LLFF's poses_bounds.npy stores (down, right, back).
@@ -294,7 +304,7 @@ fn axes_readings(given: &[Camera; 2]) -> Vec<Reading> {
             let mut backward = reading(
                 format!("world_to_camera_axes_{axes_name}"),
                 format!("the matrices are read as world-to-camera with camera axes ({axes})"),
-                given,
+                cameras,
                 |c| posed(c, inverse(c) * change),
             );
             backward.rank = 2;
@@ -304,7 +314,7 @@ fn axes_readings(given: &[Camera; 2]) -> Vec<Reading> {
     all
 }
 
-/// OpenCV's direction of a signed unit vector.
+/// Returns OpenCV's name for the direction of a signed unit vector.
 fn direction(v: Vec3) -> &'static str {
     let names = [("right", "left"), ("down", "up"), ("forward", "back")];
     let axis = if v.x != 0.0 {
@@ -332,7 +342,7 @@ mod tests {
     }
 
     #[test]
-    fn every_order_of_axes_is_undone() {
+    fn every_order_of_axes_is_corrected() {
         let truth = cameras();
         let vector = |name: &str| match name {
             "right" => Vec3::X,
@@ -363,14 +373,14 @@ mod tests {
     }
 
     #[test]
-    fn turning_the_photograph_turns_its_points() {
+    fn rotating_the_photograph_rotates_its_points() {
         let camera = cameras()[0];
-        let turned = turned_clockwise(&camera);
+        let rotated = rotated_clockwise(&camera);
         let p = camera.world_from_camera.transform_point3(Vec3::new(0.3, -0.2, 2.0));
-        let (old, new) = (camera.project(p).unwrap(), turned.project(p).unwrap());
+        let (old, new) = (camera.project(p).unwrap(), rotated.project(p).unwrap());
         assert!((new.x - (240.0 - old.y)).abs() < 1e-3 && (new.y - old.x).abs() < 1e-3);
         let mut round = camera;
-        (0..4).for_each(|_| round = turned_clockwise(&round));
+        (0..4).for_each(|_| round = rotated_clockwise(&round));
         assert!(round.world_from_camera.abs_diff_eq(camera.world_from_camera, 1e-5));
         assert_eq!(round.intrinsics, camera.intrinsics);
     }

@@ -1,11 +1,11 @@
-//! Whether two posed photographs are what they claim to be, before anyone waits
-//! for a reconstruction: points matched between the photographs, without a look at
-//! the poses, are held against the epipolar geometry of the given cameras. Where
-//! they disagree, the usual mistakes of camera files are tried and the one that
-//! fits is named.
+//! Checks whether two posed photographs agree with their cameras, before a reconstruction.
 //!
-//! In: grey photographs and cameras. Out: [`PairReport`]. The room knows no files
-//! and prints nothing. The same input gives the same report.
+//! Points are matched between the photographs without the poses and compared with the epipolar
+//! geometry of the cameras. Where they disagree, the check tests the usual mistakes of camera files
+//! and reports the one that fits.
+//!
+//! Input: grey photographs and cameras. Output: [`PairReport`]. The module reads no files and
+//! prints nothing. Equal inputs give equal reports.
 
 mod descriptors;
 mod epipolar;
@@ -13,12 +13,12 @@ mod estimate;
 mod features;
 mod geometry;
 mod image;
-mod judge;
 mod matching;
 mod mistakes;
 mod picture;
-mod plausible;
+mod plausibility;
 mod report;
+mod verdict;
 
 pub use image::GrayImage;
 pub use picture::{RgbPicture, epipolar_picture};
@@ -28,30 +28,31 @@ pub use report::{
 
 use crate::camera::Camera;
 use epipolar::Match;
+use features::Orientation;
 use glam::DVec2;
-use judge::Evidence;
+use verdict::Evidence;
 
-/// What may be chosen about a check.
+/// Options of [`check_pair`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CheckOptions {
-    /// Photographs are reduced to this many px along the longer side first.
+    /// Photographs are first reduced to this many px along the longer side.
     pub longest_side: usize,
-    /// Most features looked for in either photograph.
+    /// Maximum number of features in each photograph.
     pub features: usize,
-    /// Seed of the random samples.
+    /// Seed of the random samples of RANSAC.
     pub seed: u64,
 }
 
 impl Default for CheckOptions {
-    /// 960 px: enough for a twentieth of a degree, and a pair stays below a second.
-    /// 2500 features: matching grows with the square of it.
+    /// 960 px resolve a twentieth of a degree, and a pair takes less than a second. 2500 features:
+    /// the time of matching grows with their square.
     fn default() -> Self {
         Self { longest_side: 960, features: 2500, seed: 0x5EED }
     }
 }
 
-/// Px along the longer side of the scale at which errors are told.
-pub(crate) const TOLD_SIDE: f64 = 640.0;
+/// Longer side of the photographs at which errors are reported, px.
+const REPORT_SIDE: f64 = 640.0;
 
 /// Checks photographs `a` and `b` against their cameras.
 pub fn check_pair(
@@ -62,66 +63,68 @@ pub fn check_pair(
     options: &CheckOptions,
 ) -> PairReport {
     let mut report = PairReport::default();
-    plausible::cameras(&mut report, [(a, camera_a), (b, camera_b)]);
-    let given = [fitted(camera_a, a), fitted(camera_b, b)];
-    geometry::describe(&mut report, &given);
-    if plausible::same_photograph(&mut report, a, b) {
+    plausibility::cameras(&mut report, [(a, camera_a), (b, camera_b)]);
+    let cameras = [fitted(camera_a, a), fitted(camera_b, b)];
+    geometry::describe(&mut report, &cameras);
+    if plausibility::same_photograph(&mut report, a, b) {
         return report;
     }
-    let work = Work::new([a, b], given, options);
-    let upright = Found::new(&work, options, true);
-    // Photographs that roll against each other need descriptors that turn along.
+    let work = WorkingPair::new([a, b], cameras, options);
+    let upright = Matched::new(&work, options, Orientation::Upright);
+    // Photographs that roll against each other need descriptors oriented along their gradients.
     let found = if upright.evidence.is_thin(upright.matches.len()) {
-        let turned = Found::new(&work, options, false);
-        if turned.evidence.strength() > upright.evidence.strength() { turned } else { upright }
+        let oriented = Matched::new(&work, options, Orientation::Gradient);
+        if oriented.evidence.strength() > upright.evidence.strength() { oriented } else { upright }
     } else {
         upright
     };
     report.features = found.features;
     report.matches = found.matches.len();
-    judge::matches(&mut report, &work, &found.matches, &found.evidence);
+    verdict::matches(&mut report, &work, &found.matches, &found.evidence);
     report
 }
 
 /// Points matched between the photographs.
-struct Found {
+struct Matched {
     features: [usize; 2],
     matches: Vec<Match>,
     evidence: Evidence,
 }
 
-impl Found {
-    fn new(work: &Work, options: &CheckOptions, upright: bool) -> Self {
+impl Matched {
+    /// Detects and matches features, then finds the consistent matches.
+    fn new(work: &WorkingPair, options: &CheckOptions, orientation: Orientation) -> Self {
         let [a, b] = [&work.images[0], &work.images[1]]
-            .map(|image| features::detect(image, options.features, upright));
+            .map(|image| features::detect(image, options.features, orientation));
         let place = |f: &features::Feature| DVec2::new(f64::from(f.x), f64::from(f.y));
         let matches: Vec<Match> = matching::pairs(&a, &b)
             .iter()
-            .map(|p| (place(&a.points[p.a]), place(&b.points[p.b])))
+            .map(|p| Match { a: place(&a.points[p.a]), b: place(&b.points[p.b]) })
             .collect();
         let evidence = Evidence::gather(work, &matches, options.seed);
         Self { features: [a.points.len(), b.points.len()], matches, evidence }
     }
 }
 
-/// The camera for the photograph's real size.
+/// Rescales the camera to the size of the photograph.
 fn fitted(camera: &Camera, image: &GrayImage) -> Camera {
     camera.resized(image.width(), image.height())
 }
 
-/// The photographs as they are worked on.
-struct Work {
-    /// Reduced to the working size.
+/// The photographs at the working size.
+struct WorkingPair {
+    /// Photographs reduced to the working size.
     images: [GrayImage; 2],
     /// Cameras of the reduced photographs.
     cameras: [Camera; 2],
     /// Working px per px of the photograph, (x, y).
     scale: [DVec2; 2],
-    /// Working px per px of the told scale.
-    unit: f64,
+    /// Working px per px of the reported scale ([`REPORT_SIDE`]).
+    px_per_report_px: f64,
 }
 
-impl Work {
+impl WorkingPair {
+    /// Reduces photographs and cameras to the working size.
     fn new(images: [&GrayImage; 2], cameras: [Camera; 2], options: &CheckOptions) -> Self {
         let target = options.longest_side.max(16);
         let reduced = images.map(|image| {
@@ -137,7 +140,7 @@ impl Work {
         });
         let cameras = [0, 1].map(|i| cameras[i].resized(size(i).0, size(i).1));
         let side = |i: usize| size(i).0.max(size(i).1) as f64;
-        let unit = 0.5 * (side(0) + side(1)) / TOLD_SIDE;
-        Self { images: reduced, cameras, scale, unit }
+        let px_per_report_px = 0.5 * (side(0) + side(1)) / REPORT_SIDE;
+        Self { images: reduced, cameras, scale, px_per_report_px }
     }
 }

@@ -1,7 +1,10 @@
-//! The epipolar picture: both photographs side by side, dimmed; a dozen matched
-//! points, each in its own colour, and through the other photograph the line on
-//! which the given cameras say that it must lie. Where lines miss their points, the
-//! cameras are wrong, and how they miss often tells what is. Text-free.
+//! Draws the epipolar picture of two photographs.
+//!
+//! Both photographs lie side by side, dimmed. A dozen matched points are drawn, each in its own
+//! colour, with their epipolar lines in the other photograph. Lines that pass beside their points
+//! show that the cameras are wrong. The picture holds no text.
+//!
+//! Input: 8-bit RGB photographs, cameras, matched points in px. Output: 8-bit RGB, 480 px high.
 
 use super::epipolar::TwoViews;
 use super::report::MatchedPoint;
@@ -10,22 +13,23 @@ use glam::{DVec2, DVec3};
 
 /// Height of the picture, px.
 const HEIGHT: usize = 480;
-/// Widest that either half becomes, px: panoramas give height for it.
-const WIDEST: usize = 960;
-/// Black between the halves, px.
+/// Largest width of either half, px; panoramas are reduced in height to fit.
+const MAX_HALF_WIDTH: usize = 960;
+/// Width of the black gap between the halves, px.
 const GAP: usize = 8;
-/// Points drawn.
+/// Number of points drawn.
 const POINTS: usize = 12;
-/// Radius of a point, px, within a ring of [`RING`] px.
+/// Radius of a point, px, inside a ring of [`RING`] px.
 const RADIUS: f64 = 4.5;
-/// Dark ring that sets a point off from its line, px.
+/// Width of the dark ring that separates a point from its line, px.
 const RING: f64 = 1.8;
 /// Half the width of a line, px.
 const HALF_LINE: f64 = 0.9;
-/// How much of its own colour and of its brightness a photograph keeps, so that the
-/// lines stand out.
-const DIM: (f64, f64) = (0.45, 0.7);
-/// Twelve colours that differ in hue, alternating in brightness.
+/// Share of its saturation that a dimmed photograph keeps.
+const DIM_SATURATION: f64 = 0.45;
+/// Share of its brightness that a dimmed photograph keeps.
+const DIM_BRIGHTNESS: f64 = 0.7;
+/// Twelve colours of different hues, alternating in brightness.
 const COLOURS: [[u8; 3]; POINTS] = [
     [255, 64, 64],
     [64, 224, 255],
@@ -52,7 +56,7 @@ pub struct RgbPicture<'a> {
     pub pixels: &'a [u8],
 }
 
-/// One half of the picture, floats 0 to 255, with its scale and place.
+/// One half of the picture, floats 0 to 255, with its scale.
 struct Half {
     width: usize,
     height: usize,
@@ -61,10 +65,10 @@ struct Half {
     scale: DVec2,
 }
 
-/// The picture of two photographs, their given cameras and the points of a
-/// [`super::PairReport`], as (width, height, RGB). Without any point a grid of
-/// places in the first photograph has its lines drawn in the second. `None` where a
-/// photograph's pixels do not fit its size.
+/// Draws two photographs with the points of a [`super::PairReport`] and their epipolar lines.
+///
+/// Returns (width, height, RGB). Without points, the second half shows the lines of a grid of
+/// positions in the first. Returns `None` where a photograph's pixels do not fit its size.
 pub fn epipolar_picture(
     photographs: [RgbPicture<'_>; 2],
     cameras: [&Camera; 2],
@@ -93,25 +97,26 @@ pub fn epipolar_picture(
     Some(join(&a, &b))
 }
 
+/// Converts a point to f64.
 fn to_f64(p: [f32; 2]) -> DVec2 {
     DVec2::new(f64::from(p[0]), f64::from(p[1]))
 }
 
-/// Up to [`POINTS`] points, each as far as possible from those taken before; only
-/// consistent ones where there are any.
+/// Selects up to [`POINTS`] points, each as far as possible from the earlier ones. Consistent
+/// points exclude all others where any exist.
 fn spread(points: &[MatchedPoint]) -> Vec<MatchedPoint> {
     let any = points.iter().any(|p| p.consistent);
     let mut left: Vec<MatchedPoint> =
         points.iter().filter(|p| p.consistent || !any).copied().collect();
     let mut taken: Vec<MatchedPoint> = Vec::new();
     while taken.len() < POINTS && !left.is_empty() {
-        let room = |p: &MatchedPoint| {
+        let clearance = |p: &MatchedPoint| {
             let from = |t: &MatchedPoint| to_f64(t.a).distance_squared(to_f64(p.a));
             taken.iter().map(from).fold(f64::INFINITY, f64::min)
         };
         let mut best = 0;
         for i in 1..left.len() {
-            if room(&left[i]) > room(&left[best]) {
+            if clearance(&left[i]) > clearance(&left[best]) {
                 best = i;
             }
         }
@@ -120,7 +125,7 @@ fn spread(points: &[MatchedPoint]) -> Vec<MatchedPoint> {
     taken
 }
 
-/// Four by three places, evenly over the photograph.
+/// Returns four by three positions, evenly over the photograph.
 fn grid(photograph: &RgbPicture<'_>) -> Vec<DVec2> {
     let size = DVec2::new(photograph.width as f64, photograph.height as f64);
     (0..POINTS)
@@ -128,6 +133,7 @@ fn grid(photograph: &RgbPicture<'_>) -> Vec<DVec2> {
         .collect()
 }
 
+/// Places the two halves side by side.
 fn join(a: &Half, b: &Half) -> (usize, usize, Vec<u8>) {
     let (width, height) = (a.width + GAP + b.width, a.height.max(b.height));
     let mut out = vec![0u8; 3 * width * height];
@@ -144,14 +150,14 @@ fn join(a: &Half, b: &Half) -> (usize, usize, Vec<u8>) {
 }
 
 impl Half {
-    /// The photograph resampled to the picture's height, and dimmed.
+    /// Resamples the photograph to the picture's height and dims it.
     fn new(photograph: &RgbPicture<'_>) -> Option<Self> {
         let (w, h) = (photograph.width, photograph.height);
         let fits = w.checked_mul(h)?.checked_mul(3)? == photograph.pixels.len();
         if !fits || w == 0 || h == 0 {
             return None;
         }
-        let factor = (HEIGHT as f64 / h as f64).min(WIDEST as f64 / w as f64);
+        let factor = (HEIGHT as f64 / h as f64).min(MAX_HALF_WIDTH as f64 / w as f64);
         let side = |v: usize| ((v as f64 * factor).round() as usize).max(1);
         let (width, height) = (side(w), side(h));
         let scale = DVec2::new(width as f64 / w as f64, height as f64 / h as f64);
@@ -172,7 +178,7 @@ impl Half {
         }
     }
 
-    /// A line l·(x, y, 1) = 0 of the photograph; nothing where it has no direction.
+    /// Draws a line l·(x, y, 1) = 0 of the photograph; a line without a direction is skipped.
     fn line(&mut self, line: DVec3, colour: [u8; 3]) {
         let line = DVec3::new(line.x / self.scale.x, line.y / self.scale.y, line.z);
         let length = line.truncate().length();
@@ -191,7 +197,7 @@ impl Half {
         }
     }
 
-    /// A disc with a dark ring at a place of the photograph.
+    /// Draws a disc with a dark ring at a position of the photograph.
     fn point(&mut self, place: DVec2, colour: [u8; 3]) {
         let centre = place * self.scale;
         let reach = RADIUS + RING + 1.0;
@@ -209,7 +215,7 @@ impl Half {
     }
 }
 
-/// Mean of bilinear samples over a box of `extent` px around `centre`.
+/// Returns the mean of bilinear samples over a box of `extent` px around `centre`.
 fn sample(photograph: &RgbPicture<'_>, centre: DVec2, extent: DVec2) -> [f64; 3] {
     let taps = |e: f64| (e.ceil() as usize).max(1);
     let (nx, ny) = (taps(extent.x), taps(extent.y));
@@ -225,6 +231,7 @@ fn sample(photograph: &RgbPicture<'_>, centre: DVec2, extent: DVec2) -> [f64; 3]
     sum
 }
 
+/// Samples the photograph at a position in px; border pixels are repeated.
 fn bilinear(photograph: &RgbPicture<'_>, at: DVec2) -> [f64; 3] {
     let (w, h) = (photograph.width, photograph.height);
     let split = |v: f64, size: usize| {
@@ -240,7 +247,8 @@ fn bilinear(photograph: &RgbPicture<'_>, at: DVec2) -> [f64; 3] {
     })
 }
 
+/// Reduces saturation and brightness, so that the lines stand out.
 fn dimmed(rgb: [f64; 3]) -> [f64; 3] {
     let grey = rgb.iter().sum::<f64>() / 3.0;
-    rgb.map(|v| DIM.1 * (DIM.0 * v + (1.0 - DIM.0) * grey))
+    rgb.map(|v| DIM_BRIGHTNESS * (DIM_SATURATION * v + (1.0 - DIM_SATURATION) * grey))
 }

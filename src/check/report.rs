@@ -1,58 +1,59 @@
-//! What [`super::check_pair`] answers: numbers for programs, sentences for people.
+//! The result of [`super::check_pair`]: numbers for programs, sentences for people.
 
 use serde::{Deserialize, Serialize};
 
-/// How much a pair of photographs promises.
+/// Overall assessment of a pair of photographs.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Verdict {
-    /// Nothing to say against it.
+    /// No finding.
     #[default]
     Ok,
-    /// It will run; the result may disappoint for the reason given.
+    /// The reconstruction runs, but its quality may suffer for the reported reason.
     Warning,
-    /// The cameras are wrong, or the pair holds no depth: do not run it.
+    /// The cameras are wrong, or the pair holds no depth. A reconstruction is not useful.
     Bad,
 }
 
-/// One thing that was found.
+/// One finding of the check.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Finding {
-    /// How bad it is.
+    /// Severity.
     pub severity: Verdict,
-    /// What it is, for programs: `poses_wrong`, `small_baseline`, ….
+    /// Identifier for programs: `poses_wrong`, `small_baseline`, ….
     pub code: String,
-    /// The same for people, one sentence, no final full stop.
+    /// Explanation for people: one sentence without a final full stop.
     pub sentence: String,
 }
 
-/// Matched points against the epipolar geometry of the given cameras. All px are
-/// of the photographs scaled to 640 px along the longer side.
+/// Agreement of the matched points with the epipolar geometry of the cameras.
+///
+/// All px are those of the photographs scaled to 640 px along the longer side.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct EpipolarReport {
-    /// Median distance of the consistent matches to the given cameras' epipolar
-    /// lines, px; `None` where those have none (no baseline).
+    /// Median distance of the consistent matches to the cameras' epipolar lines, px. `None` without
+    /// a baseline, where the lines are not defined.
     pub median_px: Option<f32>,
-    /// Share of all matches nearer than the limit to the given cameras' lines.
+    /// Share of all matches within the limit of the cameras' lines.
     pub inlier_share: f32,
-    /// Median distance to the lines that the matches themselves support, px.
+    /// Median distance to the epipolar lines estimated from the matches, px.
     pub own_median_px: f32,
-    /// Share of all matches nearer than the limit to those.
+    /// Share of all matches within the limit of the estimated lines.
     pub own_inlier_share: f32,
-    /// Share of the consistent matches that lie in front of both given cameras.
+    /// Share of the consistent matches in front of both cameras.
     pub in_front_share: f32,
-    /// The limit, px.
+    /// Limit of the distance, px.
     pub limit_px: f32,
 }
 
-/// Another way to read the camera file that fits the matches.
+/// An alternative interpretation of the camera file that fits the matches.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ReadingReport {
-    /// Short name: `opengl`, `world_to_camera`, `focal_scaled`, ….
+    /// Identifier: `opengl`, `world_to_camera`, `focal_scaled`, ….
     pub name: String,
     /// Completes "the poses fit if …".
     pub clause: String,
-    /// Median epipolar distance so read, px at 640.
+    /// Median epipolar distance of this interpretation, px at 640.
     pub error_px: f32,
 }
 
@@ -61,78 +62,77 @@ pub struct ReadingReport {
 pub struct DepthReport {
     /// Depths below which 2, 25, 50, 75 and 98 % of the points lie, world units.
     pub quantiles: [f32; 5],
-    /// A nearest depth that leaves room before the points, world units.
+    /// Suggested near plane, with a margin before the points, world units.
     pub near: f32,
-    /// A farthest depth that leaves room behind the points, world units.
+    /// Suggested far plane, with a margin behind the points, world units.
     pub far: f32,
-    /// Distance of both eyes divided by the median depth.
+    /// Baseline divided by the median depth.
     pub baseline_over_depth: f32,
     /// Median shift of a matched point against infinity, px of a picture that is
     /// 256 px along the longer side.
     pub parallax_px: f32,
 }
 
-/// A matched pair of points in px of the photographs as given.
+/// A matched pair of points, px of the photographs at their full size.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MatchedPoint {
-    /// Place in the first photograph, px.
+    /// Position in the first photograph, px.
     pub a: [f32; 2],
-    /// Place in the second photograph, px.
+    /// Position in the second photograph, px.
     pub b: [f32; 2],
-    /// Whether it agrees with the epipolar geometry that most matches support
-    /// (the given cameras' or another).
+    /// The match agrees with the epipolar geometry that most matches support: the cameras' or the
+    /// estimated one.
     pub consistent: bool,
 }
 
-/// Everything found about two posed photographs.
+/// Result of a check of two posed photographs.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct PairReport {
-    /// The worst of the findings.
+    /// Severity of the worst finding.
     pub verdict: Verdict,
-    /// All of them, worst first.
+    /// All findings, the most severe first.
     pub findings: Vec<Finding>,
-    /// Features found in either photograph.
+    /// Number of features in each photograph.
     pub features: [usize; 2],
-    /// Points matched between them.
+    /// Number of matched points.
     pub matches: usize,
-    /// Matches that agree on one epipolar geometry.
+    /// Number of matches that agree on one epipolar geometry.
     pub consistent_matches: usize,
-    /// Fit of the given cameras; `None` where there were too few matches.
+    /// Fit of the cameras; `None` with too few matches.
     pub epipolar: Option<EpipolarReport>,
-    /// Readings of the camera file that fit when the given one does not, best first.
+    /// Interpretations of the camera file that fit where the file as read does not, the best first.
     pub readings: Vec<ReadingReport>,
-    /// Distance of both eyes, world units.
+    /// Distance between the two cameras, world units.
     pub baseline: f32,
-    /// Angle by which one camera is turned against the other, degrees.
+    /// Angle of the rotation between the two cameras, degrees.
     pub rotation_deg: f32,
-    /// Horizontal and vertical field of view of either camera, degrees.
+    /// Horizontal and vertical field of view of each camera, degrees.
     pub fov_deg: [[f32; 2]; 2],
-    /// Depths; `None` where the cameras or the matches do not give any.
+    /// Depths; `None` where the cameras or the matches do not determine them.
     pub depth: Option<DepthReport>,
-    /// Share of either photograph that the other camera sees; from the matched
-    /// points' depths, or the most over all depths where those are unknown. `None`
-    /// where the cameras are wrong.
+    /// Share of each photograph that the other camera sees. It comes from the matched points'
+    /// depths; without them it is the maximum over all depths. `None` where the cameras are wrong.
     pub overlap: Option<[f32; 2]>,
-    /// Share of either photograph near a consistent match: what both photographs
-    /// are known to show. Walls without texture count as not shown.
+    /// Share of each photograph near a consistent match. Surfaces without texture count as not
+    /// covered.
     pub coverage: [f32; 2],
-    /// Brightness of the second photograph minus the first's, 0 to 1, around
-    /// matched points where there are some.
+    /// Brightness of the second photograph minus that of the first, 0 to 1. It is measured around
+    /// matched points where there are enough.
     pub brightness_difference: f32,
-    /// The matches, surest first.
+    /// The matches, the most certain first.
     #[serde(skip)]
     pub points: Vec<MatchedPoint>,
 }
 
 impl PairReport {
-    /// Adds a finding and lets the verdict follow.
-    pub(super) fn find(&mut self, severity: Verdict, code: &str, sentence: impl Into<String>) {
+    /// Adds a finding and updates the verdict.
+    pub(super) fn add(&mut self, severity: Verdict, code: &str, sentence: impl Into<String>) {
         self.verdict = self.verdict.max(severity);
         self.findings.push(Finding { severity, code: code.into(), sentence: sentence.into() });
         self.findings.sort_by_key(|f| std::cmp::Reverse(f.severity));
     }
 
-    /// Whether a finding of this code is there.
+    /// Returns true if the report holds a finding with this code.
     pub fn has(&self, code: &str) -> bool {
         self.findings.iter().any(|f| f.code == code)
     }

@@ -1,13 +1,13 @@
-//! The house rules that a compiler does not hold: which room may import which,
-//! where `unsafe`, printing and panics may stand, and what lies at the top level.
+//! Rules that a compiler does not check: the imports between modules, the places of `unsafe`,
+//! printing and panics, and the names at the top level of the repository.
 
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Room and the rooms it may import; what is absent is forbidden. The same table
-/// stands in ARCHITECTURE.md (a test below compares them).
-const ARROWS: &[(&str, &[&str])] = &[
+/// Each module with the modules that it may import; other imports are forbidden. A test
+/// below compares this table with the one in ARCHITECTURE.md.
+const IMPORTS: &[(&str, &[&str])] = &[
     ("abi", &["camera"]),
     ("metrics", &[]),
     ("camera", &[]),
@@ -82,7 +82,7 @@ fn sources(folder: &Path) -> Vec<PathBuf> {
 }
 
 /// First path component under `src/`, without `.rs`.
-fn room(path: &Path) -> String {
+fn module(path: &Path) -> String {
     let relative = path.strip_prefix(root().join("src")).unwrap();
     let first = relative.components().next().unwrap().as_os_str().to_string_lossy().into_owned();
     first.trim_end_matches(".rs").to_owned()
@@ -97,7 +97,7 @@ fn code(text: &str) -> String {
         .join("\n")
 }
 
-/// Rooms that `text` names after `crate::`, in paths and in grouped imports.
+/// Modules that `text` names after `crate::`, in paths and in grouped imports.
 fn imports(text: &str) -> BTreeSet<String> {
     let mut found = BTreeSet::new();
     let name = |s: &str| -> String {
@@ -132,30 +132,30 @@ fn imports(text: &str) -> BTreeSet<String> {
     found
 }
 
-fn breaches(room: &str, text: &str) -> Vec<String> {
-    let known: BTreeSet<&str> = ARROWS.iter().map(|(r, _)| *r).collect();
-    let Some((_, allowed)) = ARROWS.iter().find(|(r, _)| *r == room) else {
-        return vec![format!("room `{room}` is not in the table")];
+fn breaches(module: &str, text: &str) -> Vec<String> {
+    let known: BTreeSet<&str> = IMPORTS.iter().map(|(r, _)| *r).collect();
+    let Some((_, allowed)) = IMPORTS.iter().find(|(r, _)| *r == module) else {
+        return vec![format!("module `{module}` is not in the table")];
     };
     imports(&code(text))
         .into_iter()
-        .filter(|i| known.contains(i.as_str()) && i != room && !allowed.contains(&i.as_str()))
-        .map(|i| format!("`{room}` may not import `{i}`"))
+        .filter(|i| known.contains(i.as_str()) && i != module && !allowed.contains(&i.as_str()))
+        .map(|i| format!("`{module}` may not import `{i}`"))
         .collect()
 }
 
 #[test]
-fn arrows_hold() {
+fn imports_are_allowed() {
     let mut wrong = Vec::new();
     let mut seen = 0;
     for path in sources(&root().join("src")) {
-        let room = room(&path);
-        if room == "lib" {
+        let module = module(&path);
+        if module == "lib" {
             continue;
         }
         let text = fs::read_to_string(&path).unwrap();
         seen += 1;
-        let found = breaches(&room, &text);
+        let found = breaches(&module, &text);
         wrong.extend(found.into_iter().map(|b| format!("{}: {b}", path.display())));
     }
     assert!(seen > 8, "found only {seen} files of the library");
@@ -163,20 +163,20 @@ fn arrows_hold() {
 }
 
 #[test]
-fn the_arrow_check_sees_a_breach() {
+fn the_import_check_sees_a_breach() {
     assert_eq!(breaches("cpu", "use crate::model::SubSplat;").len(), 1);
     assert_eq!(breaches("cpu", "fn f() { crate::io::read(p) }").len(), 1);
     assert_eq!(breaches("cpu", "use crate::{abi::X, model::{A, B}, camera};").len(), 1);
     assert_eq!(breaches("model", "use crate::{\n    abi::X,\n    data::{A},\n};").len(), 1);
     assert!(breaches("cpu", "use crate::{abi::{MEAN_OFFSET, camera}, camera::Camera};").is_empty());
     assert!(breaches("cpu", "// crate::model is not for us").is_empty());
-    assert_eq!(breaches("attic", "").len(), 1);
+    assert_eq!(breaches("unknown", "").len(), 1);
 }
 
 #[test]
-fn candle_stays_out_of_the_kernels() {
+fn only_the_network_uses_candle() {
     for path in sources(&root().join("src")) {
-        let room = room(&path);
+        let module = module(&path);
         if [
             "abi",
             "camera",
@@ -192,26 +192,26 @@ fn candle_stays_out_of_the_kernels() {
             "data",
             "eval",
         ]
-        .contains(&room.as_str())
+        .contains(&module.as_str())
         {
             let text = code(&fs::read_to_string(&path).unwrap());
-            assert!(!text.contains("candle"), "{} names candle", path.display());
+            assert!(!text.contains("candle"), "{} uses candle", path.display());
         }
     }
 }
 
 #[test]
-fn unsafe_printing_and_panics_stay_where_they_belong() {
+fn unsafe_printing_and_panics_are_confined() {
     let mut wrong = Vec::new();
     for path in sources(&root().join("src")) {
-        let room = room(&path);
+        let module = module(&path);
         let text = code(&fs::read_to_string(&path).unwrap());
         let mut forbid = |what: &str| {
             for (i, line) in text.lines().enumerate().filter(|(_, l)| l.contains(what)) {
                 wrong.push(format!("{}:{}: {}", path.display(), i + 1, line.trim()));
             }
         };
-        if room != "cpu" {
+        if module != "cpu" {
             forbid("unsafe ");
         }
         for what in ["println!", "eprintln!", "process::exit"] {
@@ -240,12 +240,12 @@ fn unsafe_printing_and_panics_stay_where_they_belong() {
 fn files_stay_readable() {
     for path in sources(&root().join("src")) {
         let lines = fs::read_to_string(&path).unwrap().lines().count();
-        assert!(lines <= 800, "{} has {lines} lines: is it one room, or two?", path.display());
+        assert!(lines <= 800, "{} has {lines} lines: split it by meaning", path.display());
     }
 }
 
 #[test]
-fn top_level_is_what_was_agreed() {
+fn top_level_has_the_agreed_names() {
     for entry in fs::read_dir(root()).unwrap() {
         let name = entry.unwrap().file_name().to_string_lossy().into_owned();
         assert!(TOP_LEVEL.contains(&name.as_str()), "`{name}` at the top level");
@@ -253,11 +253,11 @@ fn top_level_is_what_was_agreed() {
 }
 
 #[test]
-fn architecture_states_the_same_arrows() {
+fn architecture_states_the_same_imports() {
     let text = fs::read_to_string(root().join("ARCHITECTURE.md")).unwrap();
-    for (room, allowed) in ARROWS {
+    for (module, allowed) in IMPORTS {
         let list = if allowed.is_empty() { "nothing".to_owned() } else { allowed.join(", ") };
-        let row = format!("| {room} | {list} |");
+        let row = format!("| {module} | {list} |");
         assert!(text.contains(&row), "ARCHITECTURE.md lacks the row `{row}`");
     }
 }
