@@ -35,11 +35,13 @@
 //! `gpu` the WGSL kernels ([`gpu`]). `view` adds `subsplat view`, a window.
 
 pub mod abi;
+pub mod backend;
 pub mod camera;
 pub mod check;
 pub mod config;
 pub mod cpu;
 pub mod data;
+pub mod device;
 pub mod eval;
 #[cfg(feature = "gpu")]
 pub mod gpu;
@@ -55,5 +57,7 @@ pub mod splats;
 pub mod train;
 pub mod view;
 
+pub use backend::Backend;
+pub use device::DeviceChoice;
 pub use ops::rasterize_splats as rasterize;
 pub use render::{Picture, render};

@@ -17,12 +17,14 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("view", &["abi", "camera"]),
     ("navigation", &["camera"]),
     ("cpu", &["abi", "camera", "sh", "view"]),
-    ("gpu", &["abi", "camera", "view"]),
-    ("render", &["abi", "camera", "cpu", "gpu", "splats"]),
+    ("device", &[]),
+    ("gpu", &["abi", "camera", "device", "view"]),
+    ("backend", &["device", "gpu"]),
+    ("render", &["abi", "backend", "camera", "cpu", "gpu", "splats"]),
     ("check", &["camera", "metrics"]),
     ("io", &["abi", "camera", "config", "sh", "splats"]),
     ("data", &["camera", "io", "metrics", "splats"]),
-    ("ops", &["abi", "camera", "cpu", "gpu", "splats"]),
+    ("ops", &["abi", "backend", "camera", "cpu", "gpu", "splats"]),
     ("model", &["abi", "camera", "config", "io", "ops", "sh", "splats"]),
     (
         "pipeline",
@@ -180,8 +182,10 @@ fn candle_stays_out_of_the_kernels() {
         let room = room(&path);
         if [
             "abi",
+            "backend",
             "camera",
             "config",
+            "device",
             "sh",
             "cpu",
             "gpu",

@@ -4,49 +4,10 @@
 //! emulated GPU. `gpu` takes the best adapter there is, a software one too, and a name
 //! takes the first whose name holds it.
 
+use crate::device::DeviceChoice;
 use crate::gpu::error::GpuError;
-use std::convert::Infallible;
 use std::fmt;
-use std::str::FromStr;
 use wgpu::DeviceType;
-
-/// What `--device` says.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub enum DeviceChoice {
-    /// A GPU where there is one, else the CPU kernels.
-    #[default]
-    Auto,
-    /// The CPU kernels.
-    Cpu,
-    /// The best adapter there is; an error where there is none.
-    Gpu,
-    /// The first adapter whose name holds this, in any case of letters.
-    Named(String),
-}
-
-impl FromStr for DeviceChoice {
-    type Err = Infallible;
-
-    fn from_str(text: &str) -> Result<Self, Infallible> {
-        Ok(match text.to_ascii_lowercase().as_str() {
-            "auto" => Self::Auto,
-            "cpu" => Self::Cpu,
-            "gpu" => Self::Gpu,
-            _ => Self::Named(text.to_owned()),
-        })
-    }
-}
-
-impl fmt::Display for DeviceChoice {
-    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        match self {
-            Self::Auto => f.write_str("a GPU that is no software adapter"),
-            Self::Cpu => f.write_str("the CPU"),
-            Self::Gpu => f.write_str("any adapter"),
-            Self::Named(name) => write!(f, "an adapter whose name holds \"{name}\""),
-        }
-    }
-}
 
 /// What is known of an adapter before it is opened.
 #[derive(Clone, Debug, PartialEq, Eq)]

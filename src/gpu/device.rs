@@ -5,7 +5,8 @@
 //! adapter has them ([`limits_of`]). An application hands in its own device with
 //! [`Gpu::from_device`].
 
-use crate::gpu::adapter::{AdapterSummary, DeviceChoice, find};
+use crate::device::DeviceChoice;
+use crate::gpu::adapter::{AdapterSummary, find};
 use crate::gpu::buffers::Pool;
 use crate::gpu::error::GpuError;
 use crate::gpu::pipelines::Pipelines;

@@ -79,7 +79,8 @@ mod sort;
 mod spgr;
 mod spgr_bwd;
 
-pub use adapter::{AdapterSummary, DeviceChoice, adapters, choose, find_for, instance};
+pub use crate::device::DeviceChoice;
+pub use adapter::{AdapterSummary, adapters, choose, find_for, instance};
 pub use attention_gather::AttentionGatherArgs;
 pub use attention_gather_bwd::AttentionGatherGradients;
 pub use buffers::Buffer;
