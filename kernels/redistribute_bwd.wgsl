@@ -1,7 +1,8 @@
-// Gradient of redistribute.wgsl; formulas of src/cpu/redistribute.rs (share_backward).
+// Gradients of redistribute.wgsl. CPU version and formulas: src/cpu/redistribute.rs
+// (share_backward).
 //
-// In: what redistribute.wgsl reads, and the gradient [P,K] of its result.   Out: gradients
-// of logits and areas [P,K], and of opacity and own area [P,2].   One thread per parent.
+// Input: the input of redistribute.wgsl, and the gradient [P,K] of its result. Output: gradients
+// of logits and areas [P,K], and of opacity and own area [P,2]. One thread per parent.
 
 @group(0) @binding(0) var<uniform> call: RedistributeUniform;
 @group(0) @binding(1) var<storage, read> logits: array<f32>;
@@ -13,8 +14,8 @@
 @group(0) @binding(7) var<storage, read_write> d_areas: array<f32>;
 @group(0) @binding(8) var<storage, read_write> d_parents: array<vec2<f32>>;
 
-// Every child has the parent's.
-fn same(p: u32, first: u32, past: u32) {
+// RULE_NONE: every child has the opacity of the parent.
+fn equal_opacities(p: u32, first: u32, past: u32) {
     var sum = 0.0;
     for (var i = first; i < past; i++) {
         sum += grad[i];
@@ -24,8 +25,8 @@ fn same(p: u32, first: u32, past: u32) {
     d_parents[p] = vec2<f32>(sum, 0.0);
 }
 
-// Leaves the weights, which sum to 1, in `d_logits`.
-fn weigh(first: u32, past: u32) {
+// Writes the softmax weights to `d_logits`.
+fn softmax_weights(first: u32, past: u32) {
     var top = share_log(call.rule, logits[first], areas[first]);
     for (var i = first + 1u; i < past; i++) {
         top = max(top, share_log(call.rule, logits[i], areas[i]));
@@ -41,7 +42,7 @@ fn weigh(first: u32, past: u32) {
     }
 }
 
-fn linear(p: u32, first: u32, past: u32) {
+fn linear_rule(p: u32, first: u32, past: u32) {
     var mean = 0.0;
     for (var i = first; i < past; i++) {
         mean += d_logits[i] * grad[i];
@@ -54,8 +55,8 @@ fn linear(p: u32, first: u32, past: u32) {
     d_parents[p] = vec2<f32>(mean, 0.0);
 }
 
-// The rules α_k = F(x_k), x_k = s w_k / B_k: ∂L/∂x_k times x_k is ∂L/∂ln w_k.
-fn by_depth(p: u32, first: u32, past: u32) {
+// Rules of the form α_k = F(x_k), x_k = s w_k / B_k: ∂L/∂x_k times x_k is ∂L/∂ln w_k.
+fn relative_rules(p: u32, first: u32, past: u32) {
     let alpha = opacities[p];
     let relative = rule_is_relative(call.rule);
     var per_own = 1.0;
@@ -101,22 +102,22 @@ fn by_depth(p: u32, first: u32, past: u32) {
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
-    let p = workgroup_number(workgroup, workgroups) * 64u + lane;
+    let p = workgroup_number(workgroup, workgroups) * 64u + thread;
     if p >= call.parents {
         return;
     }
     let first = p * call.children;
     let past = first + call.children;
     if call.rule == RULE_NONE {
-        same(p, first, past);
+        equal_opacities(p, first, past);
         return;
     }
-    weigh(first, past);
+    softmax_weights(first, past);
     if call.rule == RULE_LINEAR {
-        linear(p, first, past);
+        linear_rule(p, first, past);
     } else {
-        by_depth(p, first, past);
+        relative_rules(p, first, past);
     }
 }

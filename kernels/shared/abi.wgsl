@@ -1,6 +1,6 @@
-// Constants of src/abi.rs, by the same names; tests/shaders.rs compares every one.
+// Constants of src/abi.rs, under the same names; tests/gpu/shaders.rs compares the values.
 
-// Rule (how a parent's opacity is shared).
+// Redistribution rules.
 const RULE_LINEAR: u32 = 0u;
 const RULE_OPTICAL_DEPTH: u32 = 1u;
 const RULE_TRANSMITTANCE: u32 = 2u;
@@ -28,14 +28,14 @@ const PLAN_COUNT: u32 = 3u;
 const PLAN_BLOCKS: u32 = 4u;
 const PLAN_ASKED: u32 = 5u;
 const PLAN_EACH: u32 = 8u;
-// Most samples of a parent, and samples x groups, that attention_gather holds.
+// Maximum samples per parent, and samples x groups, of attention_gather.
 const GATHER_SAMPLES_MAX: u32 = 128u;
 const GATHER_WEIGHTS_MAX: u32 = 1024u;
 
-// Floats of one pair of views of a plane sweep.
+// Floats of a pair of views of a plane sweep.
 const SWEEP_PAIR_LANES: u32 = 20u;
 
-// Lanes of packed splats and of head records.
+// Strides and offsets of packed splats and of head records, floats.
 const SPLAT_LANES: u32 = 11u;
 const LANE_MEAN: u32 = 0u;
 const LANE_QUAT: u32 = 3u;
@@ -57,5 +57,5 @@ const DISC_AREA_SQ_MIN: f32 = 1e-20;
 const GROWTH_MAX: f32 = 50.0;
 const VISIBLE_Z_MIN: f32 = 1e-5;
 
-// No cell, in the lists of invert.
+// Index of no cell, in the lists of invert.
 const NONE: u32 = 0xffffffffu;

@@ -49,9 +49,9 @@ impl Renderer {
         let rasterizer = match backend {
             Backend::Cpu => Rasterizer::Cpu,
             #[cfg(feature = "gpu")]
-            Backend::Wgpu(_) => backend.gpu().map_or(Rasterizer::Cpu, |gpu| {
-                Rasterizer::Gpu(gpu::Rasterizer::new(gpu.clone()))
-            }),
+            Backend::Wgpu(_) => backend
+                .gpu()
+                .map_or(Rasterizer::Cpu, |gpu| Rasterizer::Gpu(gpu::Rasterizer::new(gpu.clone()))),
         };
         Self { cpu: cpu::Rasterizer::new(), rasterizer, warning: None }
     }

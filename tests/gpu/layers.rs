@@ -114,11 +114,11 @@ fn what_is_still_too_large_is_named() {
         scene.with_slices(|s| rasterizer.render(&s, camera, &options)).err()
     };
     let error = render(&mut rasterizer, &camera(&scene, 8, 6));
-    let named = GpuError::TooSmall { what: "splats", needed: 1200, limit: 1024 };
+    let named = GpuError::TooSmall { resource: "splats", needed: 1200, limit: 1024 };
     assert_eq!(error, Some(named));
     let error = render(&mut rasterizer, &camera(&scene, 64, 48));
     assert!(
-        matches!(error, Some(GpuError::TooSmall { what: "a row of tiles, floats", .. })),
+        matches!(error, Some(GpuError::TooSmall { resource: "a row of tiles, floats", .. })),
         "{error:?}"
     );
 }

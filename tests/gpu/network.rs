@@ -139,7 +139,7 @@ fn a_gather_that_does_not_fit_is_named() {
     let error = |g: &Gather, maps: &[f32], points: &[f32]| {
         let args = AttentionGatherArgs { gather: g, maps, query: &query, points };
         match gpu.attention_gather(&args) {
-            Err(GpuError::Argument { what, .. }) => what,
+            Err(GpuError::Argument { argument, .. }) => argument,
             other => panic!("{other:?}"),
         }
     };
@@ -218,6 +218,6 @@ fn plane_sweeps() {
         assert!(got == again, "{name}: other bytes the second time");
         let short = PlaneSweepArgs { source: &source[1..], ..args };
         let error = gpu.plane_sweep(&short).unwrap_err();
-        assert!(matches!(error, GpuError::Argument { what: "source", .. }), "{error}");
+        assert!(matches!(error, GpuError::Argument { argument: "source", .. }), "{error}");
     }
 }

@@ -177,7 +177,7 @@ fn an_empty_scene_is_background() {
     assert!(got.alpha.iter().chain(&got.depth_sum).all(|&v| v == 0.0));
     let odd = SplatSlices { gain: &[0.0; 3], ..none };
     let error = Rasterizer::new(gpu).render(&odd, &camera, &options).err();
-    assert!(matches!(error, Some(GpuError::Argument { what: "splats", .. })), "{error:?}");
+    assert!(matches!(error, Some(GpuError::Argument { argument: "splats", .. })), "{error:?}");
 }
 
 /// The sort is stable, at lengths around a thread's, a block's and many blocks'.

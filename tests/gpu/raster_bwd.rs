@@ -176,5 +176,5 @@ fn what_does_not_fit_is_named() {
     assert!(got.rows.is_empty() && got.sh.is_empty() && got.gain.is_empty());
     assert_eq!(got.background, [pixels as f32, 0.0, 0.0]);
     let error = Rasterizer::new(gpu).backward(&none, &camera, &options, &v[1..]).err();
-    assert!(matches!(error, Some(GpuError::Argument { what: "gradients", .. })), "{error:?}");
+    assert!(matches!(error, Some(GpuError::Argument { argument: "gradients", .. })), "{error:?}");
 }

@@ -243,7 +243,7 @@ fn arguments_that_do_not_fit_are_named() {
         let mut args = inputs.gpu(&rules);
         change(&mut args);
         match gpu.spgr(&args) {
-            Err(GpuError::Argument { what, .. }) => what,
+            Err(GpuError::Argument { argument, .. }) => argument,
             other => panic!("{other:?}"),
         }
     };

@@ -128,7 +128,7 @@ fn redistribute_backward() {
         own: &[],
     };
     let error = gpu.redistribute_backward(&args, &[0.0; 3]).unwrap_err();
-    assert!(matches!(error, GpuError::Argument { what: "gradient", .. }), "{error}");
+    assert!(matches!(error, GpuError::Argument { argument: "gradient", .. }), "{error}");
 }
 
 #[test]
@@ -143,7 +143,7 @@ fn arguments_that_do_not_fit_are_named() {
         own: &[1.0],
     };
     let error = gpu.redistribute(&args).unwrap_err();
-    assert!(matches!(error, GpuError::Argument { what: "own areas", .. }), "{error}");
+    assert!(matches!(error, GpuError::Argument { argument: "own areas", .. }), "{error}");
     let error = gpu.redistribute(&RedistributeArgs { k: 0, ..args }).unwrap_err();
     assert!(matches!(error, GpuError::Argument { .. }), "{error}");
 }
