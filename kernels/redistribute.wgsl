@@ -13,7 +13,7 @@
 
 // Returns the softmax argument of child i.
 fn softmax_argument(i: u32) -> f32 {
-    return share_log(call.rule, logits[i], areas[i]);
+    return rule_logit(call.rule, logits[i], areas[i]);
 }
 
 @compute @workgroup_size(64)
@@ -45,12 +45,12 @@ fn main(
         shared_out[i] = w;
         sum += w;
     }
-    var per_own = 1.0;
+    var inverse_parent_area = 1.0;
     if rule_is_relative(call.rule) {
-        per_own = 1.0 / own[p];
+        inverse_parent_area = 1.0 / own[p];
     }
-    let factor = share_whole(call.rule, alpha) / sum;
+    let factor = rule_total(call.rule, alpha) / sum;
     for (var i = first; i < past; i++) {
-        shared_out[i] = share_one(call.rule, factor * shared_out[i], areas[i], per_own);
+        shared_out[i] = rule_opacity(call.rule, factor * shared_out[i], areas[i], inverse_parent_area);
     }
 }

@@ -27,13 +27,13 @@ fn equal_opacities(p: u32, first: u32, past: u32) {
 
 // Writes the softmax weights to `d_logits`.
 fn softmax_weights(first: u32, past: u32) {
-    var top = share_log(call.rule, logits[first], areas[first]);
+    var top = rule_logit(call.rule, logits[first], areas[first]);
     for (var i = first + 1u; i < past; i++) {
-        top = max(top, share_log(call.rule, logits[i], areas[i]));
+        top = max(top, rule_logit(call.rule, logits[i], areas[i]));
     }
     var sum = 0.0;
     for (var i = first; i < past; i++) {
-        let w = exp(share_log(call.rule, logits[i], areas[i]) - top);
+        let w = exp(rule_logit(call.rule, logits[i], areas[i]) - top);
         d_logits[i] = w;
         sum += w;
     }
@@ -59,43 +59,43 @@ fn linear_rule(p: u32, first: u32, past: u32) {
 fn relative_rules(p: u32, first: u32, past: u32) {
     let alpha = opacities[p];
     let relative = rule_is_relative(call.rule);
-    var per_own = 1.0;
+    var inverse_parent_area = 1.0;
     if relative {
-        per_own = 1.0 / own[p];
+        inverse_parent_area = 1.0 / own[p];
     }
-    let whole = share_whole(call.rule, alpha);
-    var by_whole = 0.0;
+    let total = rule_total(call.rule, alpha);
+    var d_total = 0.0;
     var mean = 0.0;
-    var by_own = 0.0;
+    var d_own = 0.0;
     for (var i = first; i < past; i++) {
-        let inverse = 1.0 / share_divisor(call.rule, areas[i], per_own);
+        let inverse = 1.0 / rule_divisor(call.rule, areas[i], inverse_parent_area);
         let part = d_logits[i] * inverse;
-        let x = whole * part;
+        let x = total * part;
         var dx = grad[i] * exp(-x);
         if call.rule == RULE_AREA {
             dx = select(0.0, grad[i], x < AREA_RULE_OPACITY_MAX);
         }
-        by_whole += dx * part;
+        d_total += dx * part;
         mean += dx * x;
-        let free = relative && areas[i] * per_own > RELATIVE_AREA_MIN;
+        let free = relative && areas[i] * inverse_parent_area > RELATIVE_AREA_MIN;
         let d_b = select(0.0, -dx * x * inverse, free);
-        by_own += d_b * areas[i];
-        d_areas[i] = d_b * per_own;
+        d_own += d_b * areas[i];
+        d_areas[i] = d_b * inverse_parent_area;
     }
     for (var i = first; i < past; i++) {
         let w = d_logits[i];
-        let x = whole * w / share_divisor(call.rule, areas[i], per_own);
+        let x = total * w / rule_divisor(call.rule, areas[i], inverse_parent_area);
         var dx = grad[i] * exp(-x);
         if call.rule == RULE_AREA {
             dx = select(0.0, grad[i], x < AREA_RULE_OPACITY_MAX);
         }
         d_logits[i] = dx * x - w * mean;
     }
-    var d_alpha = by_whole;
+    var d_alpha = d_total;
     if call.rule != RULE_AREA {
-        d_alpha = select(0.0, by_whole / (1.0 - alpha), alpha < OPACITY_CEILING);
+        d_alpha = select(0.0, d_total / (1.0 - alpha), alpha < OPACITY_CEILING);
     }
-    d_parents[p] = vec2<f32>(d_alpha, -by_own * per_own * per_own);
+    d_parents[p] = vec2<f32>(d_alpha, -d_own * inverse_parent_area * inverse_parent_area);
 }
 
 @compute @workgroup_size(64)

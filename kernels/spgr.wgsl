@@ -34,7 +34,7 @@ fn store_gain(i: u32) {
 
 // Returns the softmax argument of child i, whose area is stored in its opacity.
 fn argument(i: u32) -> f32 {
-    return share_log(call.rule, head[i * HEAD_LANES + HEAD_LOGIT],
+    return rule_logit(call.rule, head[i * HEAD_LANES + HEAD_LOGIT],
         children[i * SPLAT_LANES + LANE_OPACITY]);
 }
 
@@ -69,11 +69,11 @@ fn main(
     for (var i = first; i < first + count; i++) {
         sum += exp(argument(i) - top);
     }
-    let whole = share_whole(call.rule, p.alpha) / sum;
+    let total = rule_total(call.rule, p.alpha) / sum;
     let inverse_parent_area = 1.0 / own_of(p).value;
     for (var i = first; i < first + count; i++) {
         let at = i * SPLAT_LANES + LANE_OPACITY;
-        let part = whole * exp(argument(i) - top);
-        children[at] = share_one(call.rule, part, children[at], inverse_parent_area);
+        let part = total * exp(argument(i) - top);
+        children[at] = rule_opacity(call.rule, part, children[at], inverse_parent_area);
     }
 }

@@ -283,29 +283,29 @@ fn share_bwd(p: Parent, first: u32, past: u32, g: ptr<function, ParentGradient>)
         sum += w;
     }
     let inverse_parent_area = 1.0 / own_of(p).value;
-    let whole = share_whole(call.rule, p.alpha);
+    let total = rule_total(call.rule, p.alpha);
     var mean = 0.0;
-    var by_whole = 0.0;
-    var by_own = 0.0;
+    var d_total = 0.0;
+    var d_own = 0.0;
     for (var i = first; i < past; i++) {
         let at = i * HEAD_LANES;
         let area = d_head[at + AREA];
         let w = d_head[at + WEIGHT] / sum;
-        let inverse_b = 1.0 / share_divisor(call.rule, area, inverse_parent_area);
+        let inverse_b = 1.0 / rule_divisor(call.rule, area, inverse_parent_area);
         let part = w * inverse_b;
-        let x = whole * part;
+        let x = total * part;
         var dx = grad[i * SPLAT_LANES + LANE_OPACITY];
         if call.rule == RULE_AREA {
             dx = masked(x < AREA_RULE_OPACITY_MAX, dx);
         } else if call.rule != RULE_LINEAR {
             dx *= exp(-x);
         }
-        by_whole += dx * part;
+        d_total += dx * part;
         mean += dx * x;
         var d_area = 0.0;
         if rule_is_relative(call.rule) && RELATIVE_AREA_MIN < area * inverse_parent_area {
             let d_b = -dx * x * inverse_b;
-            by_own += d_b * area;
+            d_own += d_b * area;
             d_area = d_b * inverse_parent_area;
         }
         d_head[at + WEIGHT] = w;
@@ -322,17 +322,17 @@ fn share_bwd(p: Parent, first: u32, past: u32, g: ptr<function, ParentGradient>)
             d_head[at + AREA] = -d_logit / (d_head[at + AREA] + AREA_EPS);
         }
     }
-    (*g).alpha = by_whole;
+    (*g).alpha = d_total;
     if call.rule == RULE_OPTICAL_DEPTH || call.rule == RULE_TRANSMITTANCE {
-        (*g).alpha = masked(p.alpha < OPACITY_CEILING, by_whole / (1.0 - p.alpha));
+        (*g).alpha = masked(p.alpha < OPACITY_CEILING, d_total / (1.0 - p.alpha));
     }
-    (*g).own = -by_own * inverse_parent_area * inverse_parent_area;
+    (*g).own = -d_own * inverse_parent_area * inverse_parent_area;
 }
 
 // Returns the softmax argument of child i, whose area is stored in its head gradient.
 fn argument(i: u32) -> f32 {
     let at = i * HEAD_LANES;
-    return share_log(call.rule, head[at + HEAD_LOGIT], d_head[at + AREA]);
+    return rule_logit(call.rule, head[at + HEAD_LOGIT], d_head[at + AREA]);
 }
 
 @compute @workgroup_size(64)

@@ -7,7 +7,7 @@ fn rule_is_relative(rule: u32) -> bool {
 }
 
 // Returns the argument of the softmax.
-fn share_log(rule: u32, logit: f32, area: f32) -> f32 {
+fn rule_logit(rule: u32, logit: f32, area: f32) -> f32 {
     if rule == RULE_LINEAR {
         return logit - log(area + AREA_EPS);
     }
@@ -15,7 +15,7 @@ fn share_log(rule: u32, logit: f32, area: f32) -> f32 {
 }
 
 // Returns the distributed quantity: the opacity, or its optical depth.
-fn share_whole(rule: u32, alpha: f32) -> f32 {
+fn rule_total(rule: u32, alpha: f32) -> f32 {
     if rule == RULE_OPTICAL_DEPTH || rule == RULE_TRANSMITTANCE {
         return -ln_1p(-min(alpha, OPACITY_CEILING));
     }
@@ -23,16 +23,16 @@ fn share_whole(rule: u32, alpha: f32) -> f32 {
 }
 
 // Returns the divisor of a share.
-fn share_divisor(rule: u32, area: f32, per_own: f32) -> f32 {
+fn rule_divisor(rule: u32, area: f32, inverse_parent_area: f32) -> f32 {
     if rule_is_relative(rule) {
-        return max(area * per_own, RELATIVE_AREA_MIN);
+        return max(area * inverse_parent_area, RELATIVE_AREA_MIN);
     }
     return 1.0;
 }
 
 // Returns the opacity of a child with the share `part`.
-fn share_one(rule: u32, part: f32, area: f32, per_own: f32) -> f32 {
-    let x = part / share_divisor(rule, area, per_own);
+fn rule_opacity(rule: u32, part: f32, area: f32, inverse_parent_area: f32) -> f32 {
+    let x = part / rule_divisor(rule, area, inverse_parent_area);
     if rule == RULE_LINEAR {
         return x;
     }
