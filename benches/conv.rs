@@ -17,7 +17,7 @@ use serde_json::{Value, json};
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
-use subsplat::cpu::Tier;
+use subsplat::cpu::SimdLevel;
 use subsplat::cpu::conv::{Sizes, bias_grad, forward, input_grad, weight_grad};
 use subsplat::ops::conv2d::conv2d;
 use subsplat::ops::conv3d::conv3d;
@@ -216,7 +216,7 @@ fn forth(bench: &mut Bench, name: &str, case: &Case, ort: Option<&mut Ort>) -> R
 }
 
 fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
-    let (s, tier) = (&case.sizes, Tier::best());
+    let (s, level) = (&case.sizes, SimdLevel::best());
     let (x, w, b) = (host(&case.x)?, host(&case.w)?, host(&case.b)?);
     let dy = host(&tensor(case.run()?.dims(), 1.0, 4)?)?;
     let images = x.len() / (s.in_channels * s.in_pixels());
@@ -225,11 +225,11 @@ fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
     let mut contenders = Vec::new();
     let (x, w, b, dy) = (&x, &w, &b, &dy);
     contenders.push(Contender::new("ours, forward", Threads::All, move || {
-        std::hint::black_box(forward(tier, s, images, x, w, b));
+        std::hint::black_box(forward(level, s, images, x, w, b));
         Ok(())
     }));
-    let dx = input_grad(tier, s, images, dy, w);
-    weight_grad(tier, s, x, dy, &mut dw);
+    let dx = input_grad(level, s, images, dy, w);
+    weight_grad(level, s, x, dy, &mut dw);
     if let Some(g) = case.plain() {
         plain::input_grad(&g, dy, w, &mut plain_dx);
         plain::weight_grad(&g, x, dy, &mut plain_dw);
@@ -242,8 +242,8 @@ fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
         }));
     }
     let run = move || {
-        std::hint::black_box(input_grad(tier, s, images, dy, w));
-        weight_grad(tier, s, x, dy, &mut dw);
+        std::hint::black_box(input_grad(level, s, images, dy, w));
+        weight_grad(level, s, x, dy, &mut dw);
         bias_grad(s.out_pixels(), dy, &mut db);
         Ok(())
     };

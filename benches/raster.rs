@@ -19,7 +19,7 @@ use std::collections::HashMap;
 use std::path::Path;
 use subsplat::abi::RasterOptions;
 use subsplat::camera::Camera;
-use subsplat::cpu::{Gradients, Rasterizer, Rendered, Stats, Tier};
+use subsplat::cpu::{Gradients, Rasterizer, Rendered, SimdLevel, Stats};
 #[cfg(feature = "gpu")]
 use subsplat::gpu::{DeviceChoice, Gpu, Rasterizer as GpuRasterizer};
 use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
@@ -173,14 +173,14 @@ fn forward(bench: &mut Bench, name: &str, case: &Case, stats: Stats) -> Result<(
         plain.forward(&case.plain(), &case.camera, case.plain_options(BOX));
         Ok(())
     })];
-    let one = Tier::available().iter().map(|&tier| (Threads::One, tier));
-    for (threads, tier) in one.chain([(Threads::All, Tier::best())]) {
-        let (mut ours, mut out) = (Rasterizer::new().with_tier(tier), Rendered::default());
+    let one = SimdLevel::available().iter().map(|&level| (Threads::One, level));
+    for (threads, level) in one.chain([(Threads::All, SimdLevel::best())]) {
+        let (mut ours, mut out) = (Rasterizer::new().with_simd_level(level), Rendered::default());
         let run = move || {
             ours.render_into(&slices(&case.splats), &case.camera, &case.options, &mut out);
             Ok(())
         };
-        let name = format!("subsplat, {}", tier.name());
+        let name = format!("subsplat, {}", level.name());
         let contender = Contender::new(name, threads, run);
         contenders.push(contender.with_work(case.work(stats)));
     }

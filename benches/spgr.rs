@@ -9,7 +9,7 @@ use common::conventional::redistribute as plain;
 use common::scene::{self, Spec};
 use common::{Bench, Contender, Threads, Work, agree, inputs};
 use rayon::prelude::*;
-use subsplat::abi::{HEAD_LANES, SPLAT_LANES};
+use subsplat::abi::{HEAD_STRIDE, SPLAT_STRIDE};
 use subsplat::config::{Config, Preset};
 use subsplat::cpu::{math, redistribute as shares, spgr as kernel};
 use subsplat::model::spgr::rules;
@@ -140,14 +140,14 @@ impl Case {
         let spec = Spec { name: "", grid: side, sigma_at: side, sigma_px: 1.0, side };
         let n = 2 * side * side;
         let rows = scene::shared(&spec).rows;
-        let parents = Tensor::from_vec(rows, (n, SPLAT_LANES), &candle_core::Device::Cpu)?;
+        let parents = Tensor::from_vec(rows, (n, SPLAT_STRIDE), &candle_core::Device::Cpu)?;
         let (k, lanes) = (call.rules.children(), call.rules.gain_lanes());
         let gains = if lanes == 1 { vec![n * k] } else { vec![n * k, lanes] };
         Ok(Self {
-            head: inputs::tensor(&[n, k, HEAD_LANES], 0.3, 60)?,
+            head: inputs::tensor(&[n, k, HEAD_STRIDE], 0.3, 60)?,
             parents,
             weights: [
-                inputs::tensor(&[n * k, SPLAT_LANES], 1.0, 61)?,
+                inputs::tensor(&[n * k, SPLAT_STRIDE], 1.0, 61)?,
                 inputs::tensor(&gains, 1.0, 62)?,
             ],
             call,
@@ -176,16 +176,16 @@ impl Case {
     /// gradient costs as much as two.
     fn work_both(&self) -> Work {
         let Work { bytes, flops } = self.work();
-        let head = 4.0 * self.children() as f64 * HEAD_LANES as f64;
+        let head = 4.0 * self.children() as f64 * HEAD_STRIDE as f64;
         Work { bytes: 2.0 * bytes + 3.0 * head, flops: 5.0 * flops }
     }
 
     fn work(&self) -> Work {
         let n = self.children() as f64;
-        let out = SPLAT_LANES + self.call.rules.gain_lanes();
-        let parent = SPLAT_LANES as f64 / self.call.rules.children() as f64;
+        let out = SPLAT_STRIDE + self.call.rules.gain_lanes();
+        let parent = SPLAT_STRIDE as f64 / self.call.rules.children() as f64;
         Work {
-            bytes: 4.0 * n * (HEAD_LANES as f64 + parent + out as f64),
+            bytes: 4.0 * n * (HEAD_STRIDE as f64 + parent + out as f64),
             flops: FLOPS_PER_CHILD * n,
         }
     }
@@ -206,7 +206,7 @@ fn forward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
         }));
     }
     for threads in [Threads::One, Threads::All] {
-        let mut rows = vec![0.0; case.children() * SPLAT_LANES];
+        let mut rows = vec![0.0; case.children() * SPLAT_STRIDE];
         let mut gains = vec![0.0; case.children() * case.call.rules.gain_lanes()];
         let run = move || {
             spgr_into(&case.head, &case.parents, &case.call, &mut rows, &mut gains)?;

@@ -20,8 +20,8 @@ fn main() {
     let count = min(requested, call.capacity);
     let blocks = (count + GPU_BLOCK - 1u) / GPU_BLOCK;
     spread(blocks, 0u);
-    spread((count + 255u) / 256u, PLAN_EACH);
+    spread((count + 255u) / 256u, PLAN_ELEMENT_GROUPS);
     plan[PLAN_COUNT] = count;
     plan[PLAN_BLOCKS] = blocks;
-    plan[PLAN_ASKED] = requested;
+    plan[PLAN_REQUESTED] = requested;
 }

@@ -76,9 +76,9 @@ fn geometry(i: u32, m: Moments) {
     }
     var h0: vec3<f32>;
     var h1: vec3<f32>;
-    if call.stride == SPLAT_LANES {
-        let q = vec4<f32>(rows[row + LANE_QUAT], load3(row + LANE_QUAT + 1u));
-        let scale = load3(row + LANE_SCALE);
+    if call.stride == SPLAT_STRIDE {
+        let q = vec4<f32>(rows[row + QUAT_OFFSET], load3(row + QUAT_OFFSET + 1u));
+        let scale = load3(row + SCALE_OFFSET);
         let s = 2.0 / dot(q, q);
         // Columns of R.
         let r0 = vec3<f32>(1.0 - s * (q.z * q.z + q.w * q.w), s * (q.y * q.z + q.x * q.w), s * (q.y * q.w - q.x * q.z));
@@ -98,15 +98,15 @@ fn geometry(i: u32, m: Moments) {
             g0 += area * cross(m1, n);
             g1 += area * cross(n, m0);
         }
-        store3(row + LANE_SCALE, g0 * reach0 + g1 * reach1);
+        store3(row + SCALE_OFFSET, g0 * reach0 + g1 * reach1);
         let s0 = g0 * scale;
         let s1 = g1 * scale;
         h0 = s0.x * r0 + s0.y * r1 + s0.z * r2;
         h1 = s1.x * r0 + s1.y * r1 + s1.z * r2;
         // A rotation by ω adds ω x (columns of R S), and q changes by ½ (0, ω) q.
         let t = cross(h0, j0) + cross(h1, j1);
-        d_rows[row + LANE_QUAT] = -s * dot(t, q.yzw);
-        store3(row + LANE_QUAT + 1u, s * (q.x * t + cross(t, q.yzw)));
+        d_rows[row + QUAT_OFFSET] = -s * dot(t, q.yzw);
+        store3(row + QUAT_OFFSET + 1u, s * (q.x * t + cross(t, q.yzw)));
     } else {
         let c0 = load3(row + 3u);
         let c1 = load3(row + 6u);

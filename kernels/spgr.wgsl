@@ -8,20 +8,20 @@
 @group(0) @binding(5) var<storage, read_write> gains: array<f32>;
 
 fn store_child(i: u32, c: Child) {
-    let at = i * SPLAT_LANES;
+    let at = i * SPLAT_STRIDE;
     for (var k = 0u; k < 3u; k++) {
-        children[at + LANE_MEAN + k] = c.mean[k];
-        children[at + LANE_SCALE + k] = c.scale[k];
+        children[at + MEAN_OFFSET + k] = c.mean[k];
+        children[at + SCALE_OFFSET + k] = c.scale[k];
     }
     for (var k = 0u; k < 4u; k++) {
-        children[at + LANE_QUAT + k] = c.unit.q[k];
+        children[at + QUAT_OFFSET + k] = c.unit.q[k];
     }
-    children[at + LANE_OPACITY] = c.area;
+    children[at + OPACITY_OFFSET] = c.area;
 }
 
 // Gain and residual: gain·(½ + S) = ½ + gain·S + (gain − 1)/2.
 fn store_gain(i: u32) {
-    let extra = call.delta * tanh_of(head[i * HEAD_LANES + HEAD_GAIN]);
+    let extra = call.delta * tanh_of(head[i * HEAD_STRIDE + HEAD_GAIN_OFFSET]);
     if call.rgb_gain == 0u {
         gains[i] = 1.0 + extra;
         return;
@@ -34,8 +34,8 @@ fn store_gain(i: u32) {
 
 // Returns the softmax argument of child i, whose area is stored in its opacity.
 fn argument(i: u32) -> f32 {
-    return rule_logit(call.rule, head[i * HEAD_LANES + HEAD_LOGIT],
-        children[i * SPLAT_LANES + LANE_OPACITY]);
+    return rule_logit(call.rule, head[i * HEAD_STRIDE + HEAD_LOGIT_OFFSET],
+        children[i * SPLAT_STRIDE + OPACITY_OFFSET]);
 }
 
 @compute @workgroup_size(64)
@@ -52,12 +52,12 @@ fn main(
     let first = n * count;
     let p = load_parent(n);
     for (var k = 0u; k < count; k++) {
-        store_child(first + k, child_of(p, k, (first + k) * HEAD_LANES));
+        store_child(first + k, child_of(p, k, (first + k) * HEAD_STRIDE));
         store_gain(first + k);
     }
     if call.rule == RULE_NONE {
         for (var i = first; i < first + count; i++) {
-            children[i * SPLAT_LANES + LANE_OPACITY] = p.alpha;
+            children[i * SPLAT_STRIDE + OPACITY_OFFSET] = p.alpha;
         }
         return;
     }
@@ -72,7 +72,7 @@ fn main(
     let total = rule_total(call.rule, p.alpha) / sum;
     let inverse_parent_area = 1.0 / own_of(p).value;
     for (var i = first; i < first + count; i++) {
-        let at = i * SPLAT_LANES + LANE_OPACITY;
+        let at = i * SPLAT_STRIDE + OPACITY_OFFSET;
         let part = total * exp(argument(i) - top);
         children[at] = rule_opacity(call.rule, part, children[at], inverse_parent_area);
     }

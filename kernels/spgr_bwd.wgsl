@@ -2,10 +2,10 @@
 // version: src/cpu/spgr/backward.rs. Arguments except the last three: kernels/shared/spgr.wgsl.
 //
 // Input: gradient of the children [N·K, 11]. Output: gradients of the head records [N, K, 11] (0
-// for HEAD_GAIN, which spgr_gains_bwd.wgsl computes) and of the parents [N, 11]. One thread per
+// for HEAD_GAIN_OFFSET, which spgr_gains_bwd.wgsl computes) and of the parents [N, 11]. One thread per
 // parent. The first pass over the children computes their areas, which the opacity rule couples;
 // the second pass computes the gradients. Between the passes, two elements of a child's head
-// gradient hold its area and its softmax weight, and HEAD_LOGIT holds the opacity's part.
+// gradient hold its area and its softmax weight, and HEAD_LOGIT_OFFSET holds the opacity's part.
 
 @group(0) @binding(4) var<storage, read> grad: array<f32>;
 @group(0) @binding(5) var<storage, read_write> d_head: array<f32>;
@@ -135,7 +135,7 @@ fn step_bwd(
         (*g).z += d_tanh * t.tanh_z;
         d_tanh *= p.z;
     }
-    d_head[record + HEAD_DEPTH] = d_tanh * (1.0 - t.tanh_z * t.tanh_z);
+    d_head[record + HEAD_DEPTH_OFFSET] = d_tanh * (1.0 - t.tanh_z * t.tanh_z);
     var d_offset = vec2<f32>();
     var flat = s.xy;
     if call.disc != 0u {
@@ -152,8 +152,8 @@ fn step_bwd(
     if call.bounded != 0u {
         d_offset *= call.offset_bound * (1.0 - t.bounded * t.bounded);
     }
-    d_head[record + HEAD_OFFSET] = d_offset.x;
-    d_head[record + HEAD_OFFSET + 1u] = d_offset.y;
+    d_head[record + HEAD_UV_OFFSET] = d_offset.x;
+    d_head[record + HEAD_UV_OFFSET + 1u] = d_offset.y;
 }
 
 fn grad3(i: u32) -> vec3<f32> {
@@ -163,8 +163,8 @@ fn grad3(i: u32) -> vec3<f32> {
 // Adds the gradient of child i to that of its parent, and writes the geometry part of its head
 // gradient.
 fn child_bwd(p: Parent, k: u32, i: u32, d_of_area: f32, g: ptr<function, ParentGradient>) {
-    let record = i * HEAD_LANES;
-    let from_row = i * SPLAT_LANES;
+    let record = i * HEAD_STRIDE;
+    let from_row = i * SPLAT_STRIDE;
     let c = child_of(p, k, record);
     let f = c.footprint;
     var d_clamped = d_of_area;
@@ -179,19 +179,19 @@ fn child_bwd(p: Parent, k: u32, i: u32, d_of_area: f32, g: ptr<function, ParentG
     }
     let d_area = masked(call.a_min < f.area, d_clamped);
     let by = footprint_bwd(f, c.jacobian, c.rotation, c.small, d_area, da, db);
-    let d_small = grad3(from_row + LANE_SCALE) * c.growth + by.scale;
+    let d_small = grad3(from_row + SCALE_OFFSET) * c.growth + by.scale;
     (*g).scale += d_small * c.factor;
     let log_scale = d_small * c.small * (1.0 - c.soft * c.soft);
-    let q = from_row + LANE_QUAT;
+    let q = from_row + QUAT_OFFSET;
     let d_quat = vec4<f32>(grad[q], grad[q + 1u], grad[q + 2u], grad[q + 3u]);
     let d_unit = unit_bwd(c.unit, d_quat + rotation_bwd(c.unit.q, by.rotation));
     let d_delta = delta_rotation_bwd(c.delta_rotation, quat_product(conjugate(p.quat), d_unit));
     for (var j = 0u; j < 3u; j++) {
-        d_head[record + HEAD_LOG_SCALE + j] = log_scale[j];
-        d_head[record + HEAD_ROTATION + j] = d_delta[j];
+        d_head[record + HEAD_LOG_SCALE_OFFSET + j] = log_scale[j];
+        d_head[record + HEAD_ROTATION_OFFSET + j] = d_delta[j];
     }
     (*g).quat += quat_product(d_unit, conjugate(c.delta_rotation.e));
-    let d_mean = grad3(from_row + LANE_MEAN);
+    let d_mean = grad3(from_row + MEAN_OFFSET);
     (*g).mean += d_mean;
     var d_step = p.view.rotation * d_mean;
     if call.area_at_parent != 0u {
@@ -266,9 +266,9 @@ fn disc_bwd(p: Parent, g: ptr<function, ParentGradient>) {
 fn share_bwd(p: Parent, first: u32, past: u32, g: ptr<function, ParentGradient>) {
     if call.rule == RULE_NONE {
         for (var i = first; i < past; i++) {
-            (*g).alpha += grad[i * SPLAT_LANES + LANE_OPACITY];
-            d_head[i * HEAD_LANES + AREA] = 0.0;
-            d_head[i * HEAD_LANES + HEAD_LOGIT] = 0.0;
+            (*g).alpha += grad[i * SPLAT_STRIDE + OPACITY_OFFSET];
+            d_head[i * HEAD_STRIDE + AREA] = 0.0;
+            d_head[i * HEAD_STRIDE + HEAD_LOGIT_OFFSET] = 0.0;
         }
         return;
     }
@@ -279,7 +279,7 @@ fn share_bwd(p: Parent, first: u32, past: u32, g: ptr<function, ParentGradient>)
     var sum = 0.0;
     for (var i = first; i < past; i++) {
         let w = exp(argument(i) - top);
-        d_head[i * HEAD_LANES + WEIGHT] = w;
+        d_head[i * HEAD_STRIDE + WEIGHT] = w;
         sum += w;
     }
     let inverse_parent_area = 1.0 / own_of(p).value;
@@ -288,13 +288,13 @@ fn share_bwd(p: Parent, first: u32, past: u32, g: ptr<function, ParentGradient>)
     var d_total = 0.0;
     var d_own = 0.0;
     for (var i = first; i < past; i++) {
-        let at = i * HEAD_LANES;
+        let at = i * HEAD_STRIDE;
         let area = d_head[at + AREA];
         let w = d_head[at + WEIGHT] / sum;
         let inverse_b = 1.0 / rule_divisor(call.rule, area, inverse_parent_area);
         let part = w * inverse_b;
         let x = total * part;
-        var dx = grad[i * SPLAT_LANES + LANE_OPACITY];
+        var dx = grad[i * SPLAT_STRIDE + OPACITY_OFFSET];
         if call.rule == RULE_AREA {
             dx = masked(x < AREA_RULE_OPACITY_MAX, dx);
         } else if call.rule != RULE_LINEAR {
@@ -309,15 +309,15 @@ fn share_bwd(p: Parent, first: u32, past: u32, g: ptr<function, ParentGradient>)
             d_area = d_b * inverse_parent_area;
         }
         d_head[at + WEIGHT] = w;
-        d_head[at + HEAD_LOGIT] = dx * x;
+        d_head[at + HEAD_LOGIT_OFFSET] = dx * x;
         if call.rule != RULE_LINEAR {
             d_head[at + AREA] = d_area;
         }
     }
     for (var i = first; i < past; i++) {
-        let at = i * HEAD_LANES;
-        let d_logit = d_head[at + HEAD_LOGIT] - d_head[at + WEIGHT] * mean;
-        d_head[at + HEAD_LOGIT] = d_logit;
+        let at = i * HEAD_STRIDE;
+        let d_logit = d_head[at + HEAD_LOGIT_OFFSET] - d_head[at + WEIGHT] * mean;
+        d_head[at + HEAD_LOGIT_OFFSET] = d_logit;
         if call.rule == RULE_LINEAR {
             d_head[at + AREA] = -d_logit / (d_head[at + AREA] + AREA_EPS);
         }
@@ -331,8 +331,8 @@ fn share_bwd(p: Parent, first: u32, past: u32, g: ptr<function, ParentGradient>)
 
 // Returns the softmax argument of child i, whose area is stored in its head gradient.
 fn argument(i: u32) -> f32 {
-    let at = i * HEAD_LANES;
-    return rule_logit(call.rule, head[at + HEAD_LOGIT], d_head[at + AREA]);
+    let at = i * HEAD_STRIDE;
+    return rule_logit(call.rule, head[at + HEAD_LOGIT_OFFSET], d_head[at + AREA]);
 }
 
 @compute @workgroup_size(64)
@@ -349,15 +349,15 @@ fn main(
     let first = n * count;
     let p = load_parent(n);
     for (var k = 0u; k < count; k++) {
-        let record = (first + k) * HEAD_LANES;
+        let record = (first + k) * HEAD_STRIDE;
         d_head[record + AREA] = child_of(p, k, record).area;
     }
     var g: ParentGradient;
     share_bwd(p, first, first + count, &g);
     for (var k = 0u; k < count; k++) {
-        let record = (first + k) * HEAD_LANES;
+        let record = (first + k) * HEAD_STRIDE;
         child_bwd(p, k, first + k, d_head[record + AREA], &g);
-        d_head[record + HEAD_GAIN] = 0.0;
+        d_head[record + HEAD_GAIN_OFFSET] = 0.0;
     }
     if rule_is_relative(call.rule) {
         own_bwd(p, &g);
@@ -370,13 +370,13 @@ fn main(
     }
     g.in_camera.z += masked(p.view.z_min < p.in_camera.z, g.z);
     let mean = g.mean + g.in_camera * p.view.rotation;
-    let to = n * SPLAT_LANES;
+    let to = n * SPLAT_STRIDE;
     for (var i = 0u; i < 3u; i++) {
-        d_parents[to + LANE_MEAN + i] = mean[i];
-        d_parents[to + LANE_SCALE + i] = g.scale[i];
+        d_parents[to + MEAN_OFFSET + i] = mean[i];
+        d_parents[to + SCALE_OFFSET + i] = g.scale[i];
     }
     for (var i = 0u; i < 4u; i++) {
-        d_parents[to + LANE_QUAT + i] = g.quat[i];
+        d_parents[to + QUAT_OFFSET + i] = g.quat[i];
     }
-    d_parents[to + LANE_OPACITY] = g.alpha;
+    d_parents[to + OPACITY_OFFSET] = g.alpha;
 }

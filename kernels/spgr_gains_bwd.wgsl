@@ -1,5 +1,5 @@
 // Gradient of the colour gains with respect to the head records [M, 11], M = N·K: element
-// HEAD_GAIN; the others are 0. CPU version: src/cpu/spgr/backward.rs (gains). One thread per
+// HEAD_GAIN_OFFSET; the others are 0. CPU version: src/cpu/spgr/backward.rs (gains). One thread per
 // record.
 
 struct SpgrGainsBwdUniform {
@@ -29,8 +29,8 @@ fn main(
     for (var k = 1u; k < call.lanes; k++) {
         d += 0.5 * grad[i * call.lanes + k];
     }
-    let t = tanh_of(head[i * HEAD_LANES + HEAD_GAIN]);
-    for (var k = 0u; k < HEAD_LANES; k++) {
-        d_head[i * HEAD_LANES + k] = select(0.0, d * call.delta * (1.0 - t * t), k == HEAD_GAIN);
+    let t = tanh_of(head[i * HEAD_STRIDE + HEAD_GAIN_OFFSET]);
+    for (var k = 0u; k < HEAD_STRIDE; k++) {
+        d_head[i * HEAD_STRIDE + k] = select(0.0, d * call.delta * (1.0 - t * t), k == HEAD_GAIN_OFFSET);
     }
 }

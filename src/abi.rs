@@ -11,11 +11,11 @@ mod spgr;
 mod sweep;
 mod uniforms;
 
-pub(crate) use frame::lanes_at;
+pub(crate) use frame::floats_at;
 pub use frame::{BlendRules, Geometry, Gradients, Rendered, SplatSlices};
 pub use gather::{Drop, GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, Gather, Level};
-pub use spgr::{CHILDREN_MAX, DISC_AREA_SQ_MIN, Rules, SPGR_CAMERA_LANES};
-pub use sweep::{Pair, SWEEP_PAIR_LANES, Sweep};
+pub use spgr::{CHILDREN_MAX, DISC_AREA_SQ_MIN, Rules, SPGR_CAMERA_STRIDE};
+pub use sweep::{Pair, SWEEP_PAIR_STRIDE, Sweep};
 pub use uniforms::{
     AttentionGatherUniform, InvertUniform, PlaneSweepUniform, RasterUniform, RedistributeUniform,
     ShowUniform, SortUniform, SpgrGainsBwdUniform, SpgrUniform,
@@ -24,16 +24,16 @@ pub use uniforms::{
 use serde::{Deserialize, Serialize};
 
 /// Floats of one packed splat row: mean 3, quaternion 4, scale 3, opacity 1.
-pub const SPLAT_LANES: usize = 11;
+pub const SPLAT_STRIDE: usize = 11;
 /// First lane of the mean, world units.
-pub const LANE_MEAN: usize = 0;
+pub const MEAN_OFFSET: usize = 0;
 /// First lane of the quaternion, (w, x, y, z), world frame, need not be unit.
-pub const LANE_QUAT: usize = 3;
+pub const QUAT_OFFSET: usize = 3;
 /// First lane of the scales: σ along the three axes of the quaternion's frame,
 /// world units, not logarithms.
-pub const LANE_SCALE: usize = 7;
+pub const SCALE_OFFSET: usize = 7;
 /// Lane of the opacity, after the sigmoid, in [0, 1].
-pub const LANE_OPACITY: usize = 10;
+pub const OPACITY_OFFSET: usize = 10;
 
 /// A contribution below this alpha is skipped (8-bit quantisation; 3DGS).
 pub const ALPHA_MIN: f32 = 1.0 / 255.0;
@@ -81,7 +81,7 @@ pub const OPACITY_MAX: f32 = 1e36;
 /// Side of the tiles that the GPU kernels work in, px: a thread a pixel.
 pub const TILE_GPU: usize = 16;
 /// Floats of a projected splat in the GPU kernels (kernels/shared/raster.wgsl).
-pub const FOOTPRINT_LANES: usize = 12;
+pub const FOOTPRINT_STRIDE: usize = 12;
 /// Sums over pixels that the rasterizer's backward kernels keep per (splat, tile) pair:
 /// of ∂L/∂ln α times six moments, of weights times four gradients.
 pub const PAIR_SUMS: usize = 10;
@@ -92,9 +92,9 @@ pub const PLAN_COUNT: usize = 3;
 /// Blocks of [`GPU_BLOCK`] elements.
 pub const PLAN_BLOCKS: usize = 4;
 /// Elements that were asked for, room or not.
-pub const PLAN_ASKED: usize = 5;
+pub const PLAN_REQUESTED: usize = 5;
 /// Workgroups of 256 elements along x, y and z; those of blocks stand at 0.
-pub const PLAN_EACH: usize = 8;
+pub const PLAN_ELEMENT_GROUPS: usize = 8;
 /// Words of a plan.
 pub const PLAN_WORDS: usize = 12;
 /// Side of the tiles that the kernels work in, px. Invisible in the picture.
@@ -203,21 +203,21 @@ impl Default for RasterOptions {
 
 /// Floats of one child in the heads' record: Δu, Δv, Δz, Δlog s (3), Δr (3), ℓ, γ̃
 /// (SubSplat, g_θ and h_φ).
-pub const HEAD_LANES: usize = 11;
+pub const HEAD_STRIDE: usize = 11;
 /// First lane of the learned offset (û, v̂), sub-pixels before any bound.
-pub const HEAD_OFFSET: usize = 0;
+pub const HEAD_UV_OFFSET: usize = 0;
 /// Lane of the depth residual before its tanh.
-pub const HEAD_DEPTH: usize = 2;
+pub const HEAD_DEPTH_OFFSET: usize = 2;
 /// First lane of Δlog s.
-pub const HEAD_LOG_SCALE: usize = 3;
+pub const HEAD_LOG_SCALE_OFFSET: usize = 3;
 /// First lane of Δr, a rotation vector in the parent's own axes, radians.
-pub const HEAD_ROTATION: usize = 6;
+pub const HEAD_ROTATION_OFFSET: usize = 6;
 /// Lane of the opacity logit ℓ.
-pub const HEAD_LOGIT: usize = 9;
+pub const HEAD_LOGIT_OFFSET: usize = 9;
 /// Lane of the colour gain γ̃ before its tanh.
-pub const HEAD_GAIN: usize = 10;
+pub const HEAD_GAIN_OFFSET: usize = 10;
 /// Lanes that the geometry head g_θ gives; the appearance head h_φ gives the rest.
-pub const HEAD_GEOMETRY_LANES: usize = 9;
+pub const HEAD_GEOMETRY_LEN: usize = 9;
 
 /// How a parent's opacity is shared among its children ([`crate::ops::redistribute`]).
 /// The numbers are the kernels'.

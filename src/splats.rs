@@ -5,7 +5,7 @@
 //! children of P parents (N = P·K) cost 12 to 15 floats each instead of 86.
 
 use crate::abi::{
-    LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SH_DEGREE_MAX, SPLAT_LANES, ShBasis,
+    MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SH_DEGREE_MAX, SPLAT_STRIDE, ShBasis,
 };
 use candle_core::{Device, Tensor};
 use thiserror::Error;
@@ -103,10 +103,10 @@ impl Splats {
         if sh_degree > SH_DEGREE_MAX {
             return shape("SH degree", format!("0 to {SH_DEGREE_MAX}"), sh_degree);
         }
-        if !rows.len().is_multiple_of(SPLAT_LANES) {
-            return shape("rows", format!("a multiple of {SPLAT_LANES} floats"), rows.len());
+        if !rows.len().is_multiple_of(SPLAT_STRIDE) {
+            return shape("rows", format!("a multiple of {SPLAT_STRIDE} floats"), rows.len());
         }
-        let n = rows.len() / SPLAT_LANES;
+        let n = rows.len() / SPLAT_STRIDE;
         let set = 3 * (sh_degree + 1) * (sh_degree + 1);
         let p = sh.len() / set;
         if !sh.len().is_multiple_of(set) || (n == 0) != (p == 0) || (p > 0 && !n.is_multiple_of(p))
@@ -122,7 +122,7 @@ impl Splats {
 
     /// Number of Gaussians, N.
     pub fn len(&self) -> usize {
-        self.rows.len() / SPLAT_LANES
+        self.rows.len() / SPLAT_STRIDE
     }
 
     /// Whether there is none.
@@ -152,30 +152,30 @@ impl Splats {
 
     /// Row of splat `i`.
     pub fn row(&self, i: usize) -> &[f32] {
-        &self.rows[i * SPLAT_LANES..(i + 1) * SPLAT_LANES]
+        &self.rows[i * SPLAT_STRIDE..(i + 1) * SPLAT_STRIDE]
     }
 
     /// Mean of splat `i`, world.
     pub fn mean(&self, i: usize) -> [f32; 3] {
         let r = self.row(i);
-        [r[LANE_MEAN], r[LANE_MEAN + 1], r[LANE_MEAN + 2]]
+        [r[MEAN_OFFSET], r[MEAN_OFFSET + 1], r[MEAN_OFFSET + 2]]
     }
 
     /// Quaternion of splat `i`, wxyz, as stored.
     pub fn quat_wxyz(&self, i: usize) -> [f32; 4] {
         let r = self.row(i);
-        [r[LANE_QUAT], r[LANE_QUAT + 1], r[LANE_QUAT + 2], r[LANE_QUAT + 3]]
+        [r[QUAT_OFFSET], r[QUAT_OFFSET + 1], r[QUAT_OFFSET + 2], r[QUAT_OFFSET + 3]]
     }
 
     /// σ of splat `i`, world units.
     pub fn scale(&self, i: usize) -> [f32; 3] {
         let r = self.row(i);
-        [r[LANE_SCALE], r[LANE_SCALE + 1], r[LANE_SCALE + 2]]
+        [r[SCALE_OFFSET], r[SCALE_OFFSET + 1], r[SCALE_OFFSET + 2]]
     }
 
     /// Opacity of splat `i`.
     pub fn opacity(&self, i: usize) -> f32 {
-        self.row(i)[LANE_OPACITY]
+        self.row(i)[OPACITY_OFFSET]
     }
 
     /// SH set of splat `i`, `[D, 3]`: its parent's.
@@ -204,7 +204,7 @@ impl Splats {
     /// Whatever candle says of the allocation.
     pub fn to_tensors(&self, device: &Device) -> candle_core::Result<(Tensor, Tensor, Tensor)> {
         let n = self.len();
-        let rows = Tensor::from_slice(&self.rows, (n, SPLAT_LANES), device)?;
+        let rows = Tensor::from_slice(&self.rows, (n, SPLAT_STRIDE), device)?;
         let sh = Tensor::from_slice(&self.sh, (self.parents(), self.sh_coefficients(), 3), device)?;
         let gain = match self.gain_lanes() {
             0 => Tensor::ones(n, candle_core::DType::F32, device)?,

@@ -21,36 +21,36 @@ const SUPPORT_SLACK: f32 = 1e-4;
 const SPAN_SLACK_PX: f32 = 1e-3;
 const OPACITY_MAX: f32 = 1e36;
 const TILE_GPU: u32 = 16u;
-const FOOTPRINT_LANES: u32 = 12u;
+const FOOTPRINT_STRIDE: u32 = 12u;
 const PAIR_SUMS: u32 = 10u;
 const GPU_BLOCK: u32 = 2048u;
 const PLAN_COUNT: u32 = 3u;
 const PLAN_BLOCKS: u32 = 4u;
-const PLAN_ASKED: u32 = 5u;
-const PLAN_EACH: u32 = 8u;
+const PLAN_REQUESTED: u32 = 5u;
+const PLAN_ELEMENT_GROUPS: u32 = 8u;
 // Maximum samples per parent, and samples x groups, of attention_gather.
 const GATHER_SAMPLES_MAX: u32 = 128u;
 const GATHER_WEIGHTS_MAX: u32 = 1024u;
 
 // Floats of a pair of views of a plane sweep.
-const SWEEP_PAIR_LANES: u32 = 20u;
+const SWEEP_PAIR_STRIDE: u32 = 20u;
 
 // Strides and offsets of packed splats and of head records, floats.
-const SPLAT_LANES: u32 = 11u;
-const LANE_MEAN: u32 = 0u;
-const LANE_QUAT: u32 = 3u;
-const LANE_SCALE: u32 = 7u;
-const LANE_OPACITY: u32 = 10u;
-const HEAD_LANES: u32 = 11u;
-const HEAD_OFFSET: u32 = 0u;
-const HEAD_DEPTH: u32 = 2u;
-const HEAD_LOG_SCALE: u32 = 3u;
-const HEAD_ROTATION: u32 = 6u;
-const HEAD_LOGIT: u32 = 9u;
-const HEAD_GAIN: u32 = 10u;
+const SPLAT_STRIDE: u32 = 11u;
+const MEAN_OFFSET: u32 = 0u;
+const QUAT_OFFSET: u32 = 3u;
+const SCALE_OFFSET: u32 = 7u;
+const OPACITY_OFFSET: u32 = 10u;
+const HEAD_STRIDE: u32 = 11u;
+const HEAD_UV_OFFSET: u32 = 0u;
+const HEAD_DEPTH_OFFSET: u32 = 2u;
+const HEAD_LOG_SCALE_OFFSET: u32 = 3u;
+const HEAD_ROTATION_OFFSET: u32 = 6u;
+const HEAD_LOGIT_OFFSET: u32 = 9u;
+const HEAD_GAIN_OFFSET: u32 = 10u;
 
 // SPGR.
-const SPGR_CAMERA_LANES: u32 = 23u;
+const SPGR_CAMERA_STRIDE: u32 = 23u;
 const AREA_SQ_EPS: f32 = 1e-24;
 const DEPTH_FRACTION_MIN: f32 = 0.1;
 const DISC_AREA_SQ_MIN: f32 = 1e-20;

@@ -35,7 +35,7 @@ struct SpgrUniform {
 @group(0) @binding(1) var<storage, read> head: array<f32>;
 // [N, 11].
 @group(0) @binding(2) var<storage, read> parents: array<f32>;
-// [V, SPGR_CAMERA_LANES]: R world from camera (9), position (3), focal (2), centre (2), size (2),
+// [V, SPGR_CAMERA_STRIDE]: R world from camera (9), position (3), focal (2), centre (2), size (2),
 // minimum z, lower and upper bounds of x/z and y/z (4).
 @group(0) @binding(3) var<storage, read> cameras: array<f32>;
 
@@ -59,7 +59,7 @@ fn camera2(i: u32) -> vec2<f32> {
 }
 
 fn view_number(v: u32) -> View {
-    let i = v * SPGR_CAMERA_LANES;
+    let i = v * SPGR_CAMERA_STRIDE;
     return View(
         mat3x3<f32>(camera3(i), camera3(i + 3u), camera3(i + 6u)),
         camera3(i + 9u),
@@ -284,15 +284,15 @@ fn disc_of(p: Parent) -> Disc {
 }
 
 fn load_parent(n: u32) -> Parent {
-    let i = n * SPLAT_LANES;
+    let i = n * SPLAT_STRIDE;
     var p: Parent;
-    let m = i + LANE_MEAN;
-    let q = i + LANE_QUAT;
-    let s = i + LANE_SCALE;
+    let m = i + MEAN_OFFSET;
+    let q = i + QUAT_OFFSET;
+    let s = i + SCALE_OFFSET;
     p.mean = vec3<f32>(parents[m], parents[m + 1u], parents[m + 2u]);
     p.quat = vec4<f32>(parents[q], parents[q + 1u], parents[q + 2u], parents[q + 3u]);
     p.scale = vec3<f32>(parents[s], parents[s + 1u], parents[s + 2u]);
-    p.alpha = parents[i + LANE_OPACITY];
+    p.alpha = parents[i + OPACITY_OFFSET];
     p.view = primary_view(n, p.mean);
     p.in_camera = in_camera_frame(p.view, p.mean);
     p.z = max(p.in_camera.z, p.view.z_min);
@@ -355,7 +355,7 @@ fn step_of(p: Parent, k: u32, record: u32) -> Step {
     var t: Step;
     let per_side = 1.0 / f32(call.side);
     let cell = vec2<f32>(f32(k % call.side), f32(k / call.side));
-    let learned = vec2<f32>(head[record + HEAD_OFFSET], head[record + HEAD_OFFSET + 1u]);
+    let learned = vec2<f32>(head[record + HEAD_UV_OFFSET], head[record + HEAD_UV_OFFSET + 1u]);
     t.bounded = learned;
     var per_px = per_side;
     if call.bounded != 0u {
@@ -371,7 +371,7 @@ fn step_of(p: Parent, k: u32, record: u32) -> Step {
         t.along_disc = select(0.0, slide_max / max(abs(d.z), slide_max), p.disc.solid);
         s += t.along_disc * (d - s);
     }
-    t.tanh_z = tanh_of(head[record + HEAD_DEPTH]);
+    t.tanh_z = tanh_of(head[record + HEAD_DEPTH_OFFSET]);
     var dz = call.beta_z * t.tanh_z;
     if call.relative_depth != 0u {
         dz *= p.z;
@@ -421,11 +421,11 @@ fn child_of(p: Parent, k: u32, record: u32) -> Child {
     var c: Child;
     c.step = step_of(p, k, record);
     c.mean = p.mean + c.step.out * p.view.rotation;
-    let x = head3(record + HEAD_LOG_SCALE) / call.dlog_clamp;
+    let x = head3(record + HEAD_LOG_SCALE_OFFSET) / call.dlog_clamp;
     c.soft = vec3<f32>(tanh_of(x.x), tanh_of(x.y), tanh_of(x.z));
     c.factor = call.lambda_s * exp(call.dlog_clamp * c.soft);
     c.small = c.factor * p.scale;
-    c.delta_rotation = delta_rotation_of(head3(record + HEAD_ROTATION));
+    c.delta_rotation = delta_rotation_of(head3(record + HEAD_ROTATION_OFFSET));
     c.unit = unit_of(quat_product(p.quat, c.delta_rotation.e));
     c.rotation = rotation_of(c.unit.q);
     if call.area_at_parent != 0u {

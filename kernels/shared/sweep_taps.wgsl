@@ -2,7 +2,7 @@
 
 @group(0) @binding(1) var<storage, read> reference: array<f32>;
 @group(0) @binding(2) var<storage, read> source: array<f32>;
-// SWEEP_PAIR_LANES floats of a pair: K_r^-1 (4), rotation rows (9), t (3), K (4).
+// SWEEP_PAIR_STRIDE floats of a pair: K_r^-1 (4), rotation rows (9), t (3), K (4).
 @group(0) @binding(3) var<storage, read> pairs: array<f32>;
 // Rows + 1 numbers: the pairs of row r are pair_starts[r] .. pair_starts[r + 1]. Then the source row of
 // each pair.
@@ -28,7 +28,7 @@ fn pair_factor(r: u32) -> f32 {
 
 // Returns the source index coordinates of reference pixel (x, y) at this depth.
 fn project(pair: u32, x: u32, y: u32, depth: f32) -> vec2<f32> {
-    let p = pair * SWEEP_PAIR_LANES;
+    let p = pair * SWEEP_PAIR_STRIDE;
     let ray = vec2<f32>(
         pairs[p] * (f32(x) + call.centre) + pairs[p + 2u],
         pairs[p + 1u] * (f32(y) + call.centre) + pairs[p + 3u],

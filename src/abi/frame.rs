@@ -2,7 +2,7 @@
 //! rasterizer of the crate.
 
 use super::{
-    ALPHA_MAX_MVSPLAT, ALPHA_MAX_STANDARD, Convention, DEPTH_ALPHA_MIN, LANE_MEAN, SPLAT_LANES,
+    ALPHA_MAX_MVSPLAT, ALPHA_MAX_STANDARD, Convention, DEPTH_ALPHA_MIN, MEAN_OFFSET, SPLAT_STRIDE,
     TRANSMITTANCE_MIN, sh_coefficients,
 };
 
@@ -40,7 +40,7 @@ impl SplatSlices<'_> {
     /// N.
     pub fn len(&self) -> usize {
         match self.geometry {
-            Geometry::Packed(rows) => rows.len() / SPLAT_LANES,
+            Geometry::Packed(rows) => rows.len() / SPLAT_STRIDE,
             Geometry::Cov6 { means, cov6, opacities } => {
                 (means.len() / 3).min(cov6.len() / 6).min(opacities.len())
             }
@@ -66,7 +66,7 @@ impl SplatSlices<'_> {
     pub fn is_consistent(&self) -> bool {
         let n = self.len();
         let geometry = match self.geometry {
-            Geometry::Packed(rows) => rows.len() == n * SPLAT_LANES,
+            Geometry::Packed(rows) => rows.len() == n * SPLAT_STRIDE,
             Geometry::Cov6 { means, cov6, opacities } => {
                 means.len() == 3 * n && cov6.len() == 6 * n && opacities.len() == n
             }
@@ -80,14 +80,14 @@ impl SplatSlices<'_> {
 
     pub(crate) fn mean(&self, i: usize) -> [f32; 3] {
         match self.geometry {
-            Geometry::Packed(rows) => lanes_at(rows, i * SPLAT_LANES + LANE_MEAN),
-            Geometry::Cov6 { means, .. } => lanes_at(means, 3 * i),
+            Geometry::Packed(rows) => floats_at(rows, i * SPLAT_STRIDE + MEAN_OFFSET),
+            Geometry::Cov6 { means, .. } => floats_at(means, 3 * i),
         }
     }
 }
 
 /// `L` floats from `at` on; zeros where the slice ends before.
-pub(crate) fn lanes_at<const L: usize>(from: &[f32], at: usize) -> [f32; L] {
+pub(crate) fn floats_at<const L: usize>(from: &[f32], at: usize) -> [f32; L] {
     from.get(at..at + L).and_then(|s| s.try_into().ok()).unwrap_or([0.0; L])
 }
 
@@ -120,7 +120,7 @@ impl Gradients {
         let n = splats.len();
         let packed = matches!(splats.geometry, Geometry::Packed(_));
         let (packed, cov) = if packed { (n, 0) } else { (0, n) };
-        self.rows.resize(packed * SPLAT_LANES, 0.0);
+        self.rows.resize(packed * SPLAT_STRIDE, 0.0);
         self.means.resize(3 * cov, 0.0);
         self.cov6.resize(6 * cov, 0.0);
         self.opacities.resize(cov, 0.0);

@@ -57,6 +57,6 @@ impl Rules {
 }
 
 /// Floats of one context camera in the GPU's table.
-pub const SPGR_CAMERA_LANES: usize = 23;
+pub const SPGR_CAMERA_STRIDE: usize = 23;
 /// Least squared area of a disc that children slide on, px⁴.
 pub const DISC_AREA_SQ_MIN: f64 = 1e-20;

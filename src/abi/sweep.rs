@@ -44,4 +44,4 @@ impl Sweep {
 }
 
 /// Floats of one [`Pair`] in the GPU's table: inverse, rotation, t, k.
-pub const SWEEP_PAIR_LANES: usize = 20;
+pub const SWEEP_PAIR_STRIDE: usize = 20;

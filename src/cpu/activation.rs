@@ -1,7 +1,7 @@
 //! Pointwise functions, with gradients.
 
-use super::fresh::{Block, Fresh};
 use super::math::{erf, exp, vectorised};
+use super::uninit::{UninitBuffer, UninitSlice};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
@@ -76,8 +76,8 @@ pub(super) use by_kind;
 
 /// f(x), new memory.
 pub fn forward(kind: Activation, x: &[f32]) -> Vec<f32> {
-    let mut fresh = Fresh::new(x.len());
-    fresh.blocks(CHUNK).zip(x.par_chunks(CHUNK)).for_each(|(y, x)| {
+    let mut fresh = UninitBuffer::new(x.len());
+    fresh.par_chunks_mut(CHUNK).zip(x.par_chunks(CHUNK)).for_each(|(y, x)| {
         vectorised(
             #[inline(always)]
             || {
@@ -91,11 +91,11 @@ pub fn forward(kind: Activation, x: &[f32]) -> Vec<f32> {
         );
     });
     // SAFETY: the loop above wrote every block.
-    unsafe { fresh.finish() }
+    unsafe { fresh.assume_init() }
 }
 
 #[inline(always)]
-fn map(x: &[f32], y: &mut Block<f32>, f: impl Fn(f32) -> f32) {
+fn map(x: &[f32], y: &mut UninitSlice<f32>, f: impl Fn(f32) -> f32) {
     assert_eq!(x.len(), y.len(), "activation: lengths");
     for (y, x) in y.iter_mut().zip(x) {
         *y = MaybeUninit::new(f(*x));

@@ -7,7 +7,7 @@
 
 use super::gemm::{Base, Mat, Packed, gemm, product};
 use super::math::dot;
-use super::simd::{Kernel, Simd, Tier};
+use super::simd::{Kernel, Simd, SimdLevel};
 use super::softmax::exp_row;
 use rayon::prelude::*;
 
@@ -66,7 +66,7 @@ impl Attention {
             let queries = &l.queries[w * self.queries + first..][..rows];
             (queries, &l.keys[w * m..(w + 1) * m])
         });
-        Tier::best().run(Weigh { p, keys: m, labels })
+        SimdLevel::best().run(Weigh { p, keys: m, labels })
     }
 }
 

@@ -12,7 +12,7 @@
 //! `model::embed::Embeddings::inputs`.
 
 use super::lanes::{Kernel, LaneReal, Lanes, Machine};
-use crate::abi::{LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES};
+use crate::abi::{MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE};
 use rayon::prelude::*;
 
 /// A camera's frame.
@@ -57,8 +57,8 @@ const OPACITY: usize = 10;
 
 /// μ − eye.
 #[inline(always)]
-fn centred<M: Machine>(m: M, frame: &Frame, row: &[M::V; SPLAT_LANES]) -> [M::V; 3] {
-    let mut out = [row[LANE_MEAN], row[LANE_MEAN + 1], row[LANE_MEAN + 2]];
+fn centred<M: Machine>(m: M, frame: &Frame, row: &[M::V; SPLAT_STRIDE]) -> [M::V; 3] {
+    let mut out = [row[MEAN_OFFSET], row[MEAN_OFFSET + 1], row[MEAN_OFFSET + 2]];
     for (v, o) in out.iter_mut().zip(frame.position) {
         *v = *v - m.of(o);
     }
@@ -82,9 +82,9 @@ struct Place<V> {
 
 impl Attributes {
     #[inline(always)]
-    fn place<M: Machine>(&self, m: M, row: &[M::V; SPLAT_LANES]) -> Place<M::V> {
+    fn place<M: Machine>(&self, m: M, row: &[M::V; SPLAT_STRIDE]) -> Place<M::V> {
         let own = match &self.frame {
-            None => [row[LANE_MEAN], row[LANE_MEAN + 1], row[LANE_MEAN + 2]],
+            None => [row[MEAN_OFFSET], row[MEAN_OFFSET + 1], row[MEAN_OFFSET + 2]],
             Some(frame) => {
                 let c = centred(m, frame, row);
                 [along(m, frame, c, 0), along(m, frame, c, 1), along(m, frame, c, 2)]
@@ -96,8 +96,9 @@ impl Attributes {
 
     /// Quaternion in the frame, before its sign.
     #[inline(always)]
-    fn quat<M: Machine>(&self, m: M, row: &[M::V; SPLAT_LANES]) -> [M::V; 4] {
-        let q = [row[LANE_QUAT], row[LANE_QUAT + 1], row[LANE_QUAT + 2], row[LANE_QUAT + 3]];
+    fn quat<M: Machine>(&self, m: M, row: &[M::V; SPLAT_STRIDE]) -> [M::V; 4] {
+        let q =
+            [row[QUAT_OFFSET], row[QUAT_OFFSET + 1], row[QUAT_OFFSET + 2], row[QUAT_OFFSET + 3]];
         let Some(frame) = &self.frame else { return q };
         let mut out = q;
         for (v, line) in out.iter_mut().zip(&frame.turn) {
@@ -111,13 +112,13 @@ impl Attributes {
 
     /// Camera z in the source view, not bounded.
     #[inline(always)]
-    fn depth<M: Machine>(&self, m: M, row: &[M::V; SPLAT_LANES]) -> M::V {
+    fn depth<M: Machine>(&self, m: M, row: &[M::V; SPLAT_STRIDE]) -> M::V {
         along(m, &self.source, centred(m, &self.source, row), 2)
     }
 
     #[inline(always)]
-    fn forward<M: Machine>(&self, m: M, row: &[M::V; SPLAT_LANES]) -> [M::V; SPLAT_LANES] {
-        let mut out = [m.of(0.0); SPLAT_LANES];
+    fn forward<M: Machine>(&self, m: M, row: &[M::V; SPLAT_STRIDE]) -> [M::V; SPLAT_STRIDE] {
+        let mut out = [m.of(0.0); SPLAT_STRIDE];
         let place = self.place(m, row);
         out[..3].copy_from_slice(&place.own);
         if self.ray {
@@ -127,7 +128,7 @@ impl Attributes {
             }
             out[2] = place.z.ln();
         }
-        out[SCALE..QUAT].copy_from_slice(&row[LANE_SCALE..LANE_SCALE + 3]);
+        out[SCALE..QUAT].copy_from_slice(&row[SCALE_OFFSET..SCALE_OFFSET + 3]);
         if let Some(fx) = self.log_px {
             let z = self.depth(m, row).max(m.of(self.z_min)).ln() - m.of(fx.ln());
             for v in &mut out[SCALE..QUAT] {
@@ -139,10 +140,10 @@ impl Attributes {
         for (to, q) in out[QUAT..OPACITY].iter_mut().zip(quat) {
             *to = M::V::select(negative, -q, q);
         }
-        out[OPACITY] = row[LANE_OPACITY];
+        out[OPACITY] = row[OPACITY_OFFSET];
         if let Some(most) = self.logit {
             let low = 1.0 / (1.0 + most.exp());
-            let p = row[LANE_OPACITY].max(m.of(low)).min(m.of(1.0 - low));
+            let p = row[OPACITY_OFFSET].max(m.of(low)).min(m.of(1.0 - low));
             out[OPACITY] = p.ln() - (m.of(1.0) - p).ln();
         }
         out
@@ -153,11 +154,11 @@ impl Attributes {
     fn backward<M: Machine>(
         &self,
         m: M,
-        row: &[M::V; SPLAT_LANES],
-        d: &[M::V; SPLAT_LANES],
-    ) -> [M::V; SPLAT_LANES] {
+        row: &[M::V; SPLAT_STRIDE],
+        d: &[M::V; SPLAT_STRIDE],
+    ) -> [M::V; SPLAT_STRIDE] {
         let zero = m.of(0.0);
-        let mut out = [zero; SPLAT_LANES];
+        let mut out = [zero; SPLAT_STRIDE];
         let mut d_own = [d[0], d[1], d[2]];
         if self.ray {
             let place = self.place(m, row);
@@ -172,7 +173,7 @@ impl Attributes {
             let free = m.of(self.z_min).lt(place.own[2]);
             d_own[2] = M::V::select(free, d_z / place.z, zero);
         }
-        for (i, to) in out[LANE_MEAN..LANE_MEAN + 3].iter_mut().enumerate() {
+        for (i, to) in out[MEAN_OFFSET..MEAN_OFFSET + 3].iter_mut().enumerate() {
             *to = match &self.frame {
                 None => d_own[i],
                 Some(frame) => {
@@ -181,18 +182,18 @@ impl Attributes {
                 }
             };
         }
-        out[LANE_SCALE..LANE_SCALE + 3].copy_from_slice(&d[SCALE..QUAT]);
+        out[SCALE_OFFSET..SCALE_OFFSET + 3].copy_from_slice(&d[SCALE..QUAT]);
         if self.log_px.is_some() {
             let depth = self.depth(m, row);
             let least = m.of(self.z_min);
             let d_z = -(d[SCALE] + d[SCALE + 1] + d[SCALE + 2]) / depth.max(least);
             let d_z = M::V::select(least.lt(depth), d_z, zero);
             for i in 0..3 {
-                let mean = &mut out[LANE_MEAN + i];
+                let mean = &mut out[MEAN_OFFSET + i];
                 *mean = m.of(self.source.rotation[i][2]).fma(d_z, *mean);
-                let (s, least) = (row[LANE_SCALE + i], m.of(self.scale_min));
+                let (s, least) = (row[SCALE_OFFSET + i], m.of(self.scale_min));
                 let slope = d[SCALE + i] / s.max(least);
-                out[LANE_SCALE + i] = M::V::select(least.lt(s), slope, zero);
+                out[SCALE_OFFSET + i] = M::V::select(least.lt(s), slope, zero);
             }
         }
         let negative = self.quat(m, row)[0].lt(zero);
@@ -200,7 +201,7 @@ impl Attributes {
         for v in &mut d_quat {
             *v = M::V::select(negative, -*v, *v);
         }
-        for (i, to) in out[LANE_QUAT..LANE_QUAT + 4].iter_mut().enumerate() {
+        for (i, to) in out[QUAT_OFFSET..QUAT_OFFSET + 4].iter_mut().enumerate() {
             *to = d_quat[i];
             if let Some(frame) = &self.frame {
                 *to = m.of(frame.turn[0][i]) * d_quat[0];
@@ -209,14 +210,14 @@ impl Attributes {
                 }
             }
         }
-        out[LANE_OPACITY] = d[OPACITY];
+        out[OPACITY_OFFSET] = d[OPACITY];
         if let Some(most) = self.logit {
             let low = 1.0 / (1.0 + most.exp());
-            let (p, low, high) = (row[LANE_OPACITY], m.of(low), m.of(1.0 - low));
+            let (p, low, high) = (row[OPACITY_OFFSET], m.of(low), m.of(1.0 - low));
             let held = p.max(low).min(high);
             let slope = d[OPACITY] / (held * (m.of(1.0) - held));
             let inside = M::V::select(p.lt(high), slope, zero);
-            out[LANE_OPACITY] = M::V::select(low.lt(p), inside, zero);
+            out[OPACITY_OFFSET] = M::V::select(low.lt(p), inside, zero);
         }
         out
     }
@@ -234,10 +235,10 @@ impl<T: LaneReal> Kernel<T> for Block<'_, T> {
     type Output = ();
     #[inline(always)]
     fn run<M: Machine<Scalar = T>>(self, m: M) {
-        let n = self.rows.len() / SPLAT_LANES;
+        let n = self.rows.len() / SPLAT_STRIDE;
         for first in (0..n).step_by(M::WIDTH) {
-            let span = (SPLAT_LANES, M::WIDTH.min(n - first));
-            let at = first * SPLAT_LANES;
+            let span = (SPLAT_STRIDE, M::WIDTH.min(n - first));
+            let at = first * SPLAT_STRIDE;
             let row = m.load_rows(&self.rows[at..], span);
             let out = match self.reached {
                 None => self.attributes.forward(m, &row),
@@ -250,7 +251,7 @@ impl<T: LaneReal> Kernel<T> for Block<'_, T> {
 
 /// Attributes of `rows` into `out` (module doc).
 pub fn forward<T: LaneReal>(attributes: &Attributes, rows: &[T], out: &mut [T]) {
-    let size = BLOCK * SPLAT_LANES;
+    let size = BLOCK * SPLAT_STRIDE;
     rows.par_chunks(size).zip(out.par_chunks_mut(size)).for_each(|(rows, out)| {
         T::dispatch(Block { attributes, rows, reached: None, out });
     });
@@ -258,7 +259,7 @@ pub fn forward<T: LaneReal>(attributes: &Attributes, rows: &[T], out: &mut [T]) 
 
 /// The gradient by `rows` into `out`, for `reached` `[n, 11]`.
 pub fn backward<T: LaneReal>(attributes: &Attributes, rows: &[T], reached: &[T], out: &mut [T]) {
-    let size = BLOCK * SPLAT_LANES;
+    let size = BLOCK * SPLAT_STRIDE;
     let blocks = rows.par_chunks(size).zip(reached.par_chunks(size));
     blocks.zip(out.par_chunks_mut(size)).for_each(|((rows, reached), out)| {
         T::dispatch(Block { attributes, rows, reached: Some(reached), out });

@@ -16,7 +16,7 @@ pub(crate) use crate::abi::BlendRules as Rules;
 use crate::abi::{ALPHA_MIN_LOG2, BLOCK, TILE};
 use crate::cpu::blocks::{met, transpose_bits};
 use crate::cpu::ewa::Footprint;
-use crate::cpu::simd::{self, Kernel, Simd};
+use crate::cpu::simd::{self, F32Vector, Kernel, Mask, Simd, Vector};
 use crate::cpu::tiles::Grid;
 
 /// Pixels of a block.
@@ -209,23 +209,23 @@ impl Batch {
                 bits &= bits - 1;
                 count += 1;
                 let (dx, dy) = (x - s.splat(f.u), y - s.splat(f.v));
-                let across = s.fma(s.splat(f.shear), dy, dx) * s.splat(f.sx);
+                let across = s.splat(f.shear).fma(dy, dx) * s.splat(f.sx);
                 let down = dy * s.splat(f.sy);
-                let power = s.fnma(down, down, s.fnma(across, across, s.splat(f.power)));
+                let power = down.fnma(down, across.fnma(across, s.splat(f.power)));
                 // The clamp keeps denormals away.
-                let alpha = s.min(simd::exp2(s, s.max(power, least)), cap);
-                let alpha = s.keep(s.le(least, power), alpha);
-                let rest = s.fnma(alpha, t, t);
+                let alpha = cap.min(simd::exp2(s, least.max(power)));
+                let alpha = least.le(power).select_or_zero(alpha);
+                let rest = alpha.fnma(t, t);
                 // Where blending goes on, T > stop, so an alpha of 0 changes nothing;
                 // where it has stopped, T < 0, so it stays there.
-                let goes = s.lt(stop, rest);
-                let w = s.keep(goes, alpha * t);
-                t = s.select(goes, rest, s.negative(t));
-                red = s.fma(w, s.splat(f.rgb[0]), red);
-                green = s.fma(w, s.splat(f.rgb[1]), green);
-                blue = s.fma(w, s.splat(f.rgb[2]), blue);
-                z = s.fma(w, s.splat(f.z), z);
-                if !s.any(goes) {
+                let goes = stop.lt(rest);
+                let w = goes.select_or_zero(alpha * t);
+                t = goes.select(rest, t.neg_abs());
+                red = w.fma(s.splat(f.rgb[0]), red);
+                green = w.fma(s.splat(f.rgb[1]), green);
+                blue = w.fma(s.splat(f.rgb[2]), blue);
+                z = w.fma(s.splat(f.z), z);
+                if !goes.any() {
                     goes_on = false;
                     break 'batch;
                 }

@@ -4,7 +4,7 @@
 use crate::abi::{BLOCK, SPAN_SLACK_PX};
 use crate::cpu::blend::BLOCKS;
 use crate::cpu::ewa::{FIELDS, support_lanes};
-use crate::cpu::simd::{LANES, ROUGH, Simd};
+use crate::cpu::simd::{APPROX_SQRT_ERROR, F32Vector, IntVector, LANES, Mask, Simd, Vector};
 
 /// Masks of the blocks that sixteen splats can meet in the tile whose first pixel is at
 /// `corner`: bit 8·row + column. `fields` are their footprints, field by field.
@@ -27,39 +27,39 @@ pub(crate) fn met<S: Simd>(
     let reach = support_lanes(s, power);
     let sy2 = sy * sy;
     let tip = -(shear * half_height * half_height / half_width);
-    let lowest = s.max(-half_height, whole(s, y0) - v);
-    let highest = s.min(half_height, whole(s, y1) - one - v);
+    let lowest = (whole(s, y0) - v).max(-half_height);
+    let highest = (whole(s, y1) - one - v).min(half_height);
     // Edges in blocks, the roughness of the root made up for.
-    let width = s.splat(PER_BLOCK * (1.0 + 2.0 * ROUGH)) / sx;
+    let width = s.splat(PER_BLOCK * (1.0 + 2.0 * APPROX_SQRT_ERROR)) / sx;
     let slack = s.splat(SPAN_SLACK_PX * PER_BLOCK);
     let middle = (u - left) * quarter;
     let (middle_left, middle_right) = (middle - slack, middle + slack);
     let slant = shear * quarter;
-    let first = s.max((whole(s, x0) - left) * quarter, zero);
+    let first = zero.max((whole(s, x0) - left) * quarter);
     let last = s.splat(BLOCKS as f32 - PER_BLOCK);
-    let last = s.min((whole(s, x1) - one - left) * quarter, last);
-    let mut halves = [s.splat_int(0); 2];
+    let last = last.min((whole(s, x1) - one - left) * quarter);
+    let mut halves = [S::I::splat(0); 2];
     for (half, bits) in halves.iter_mut().enumerate() {
         for r in 0..4 {
             let y = top + s.splat(((4 * half + r) * BLOCK) as f32) - v;
-            let low = s.max(y, lowest);
-            let high = s.min(y + s.splat(BLOCK as f32 - 1.0), highest);
-            let right = s.min(s.max(tip, low), high);
-            let left = s.min(s.max(-tip, low), high);
+            let low = lowest.max(y);
+            let high = highest.min(y + s.splat(BLOCK as f32 - 1.0));
+            let right = high.min(low.max(tip));
+            let left = high.min(low.max(-tip));
             let reach_left = edge(s, left, sy2, reach);
             let reach_right = edge(s, right, sy2, reach);
-            let from = s.fnma(reach_left, width, s.fnma(slant, left, middle_left));
-            let to = s.fma(reach_right, width, s.fnma(slant, right, middle_right));
-            let from = s.max(from, first);
-            let to = s.keep(s.le(low, high), s.min(to, last) + one);
+            let from = reach_left.fnma(width, slant.fnma(left, middle_left));
+            let to = reach_right.fma(width, slant.fnma(right, middle_right));
+            let from = first.max(from);
+            let to = low.le(high).select_or_zero(last.min(to) + one);
             // Truncation floors: both are positive where anything is met.
-            let row = below(s, s.max(to, from)) - below(s, from);
-            *bits = *bits | s.shift(row, s.splat_int(8 * r as i32));
+            let row = below(s, from.max(to)) - below(s, from);
+            *bits = *bits | row.shl_each(S::I::splat(8 * r as i32));
         }
     }
     let (mut a, mut b) = ([0; LANES], [0; LANES]);
-    s.store_int(halves[0], &mut a);
-    s.store_int(halves[1], &mut b);
+    halves[0].store(&mut a);
+    halves[1].store(&mut b);
     for ((mask, a), b) in masks.iter_mut().zip(a).zip(b) {
         *mask = u64::from(a as u32) | u64::from(b as u32) << 32;
     }
@@ -68,20 +68,20 @@ pub(crate) fn met<S: Simd>(
 /// The whole number whose bits a lane holds.
 #[inline(always)]
 fn whole<S: Simd>(s: S, v: S::F) -> S::F {
-    s.of_int(s.to_bits(v))
+    S::F::from_int(v.to_bits())
 }
 
 /// Distance along x of the ellipse's edge from its middle, `dy` off the mean, before
 /// the division by sx.
 #[inline(always)]
 fn edge<S: Simd>(s: S, dy: S::F, sy2: S::F, reach: S::F) -> S::F {
-    s.rough_sqrt(s.max(s.fnma(dy * dy, sy2, reach), s.splat(f32::MIN_POSITIVE)))
+    s.splat(f32::MIN_POSITIVE).max((dy * dy).fnma(sy2, reach)).approx_sqrt()
 }
 
 /// Bits of columns 0 to `past` − 1.
 #[inline(always)]
 fn below<S: Simd>(s: S, past: S::F) -> S::I {
-    s.shift(s.splat_int(1), s.to_int(past))
+    S::I::splat(1).shl_each(past.to_int())
 }
 
 /// Exchanges rows and columns of a 64×64 matrix of bits: bit c of word r becomes bit r
@@ -113,7 +113,7 @@ mod tests {
     use super::*;
     use crate::abi::{ALPHA_MIN_LOG2, TILE};
     use crate::cpu::ewa::Footprint;
-    use crate::cpu::simd::{Kernel, Tier};
+    use crate::cpu::simd::{Kernel, SimdLevel};
 
     #[test]
     fn bits_are_transposed() {
@@ -200,21 +200,21 @@ mod tests {
                 mask
             });
             needed += exact.iter().map(|m| m.count_ones()).sum::<u32>();
-            for (i, &tier) in Tier::available().iter().enumerate() {
+            for (i, &level) in SimdLevel::available().iter().enumerate() {
                 for (l, (got, exact)) in
-                    tier.run(Met(&splats, corner)).into_iter().zip(exact).enumerate()
+                    level.run(Met(&splats, corner)).into_iter().zip(exact).enumerate()
                 {
-                    assert_eq!(exact & !got, 0, "{tier:?} {:?}", splats[l]);
+                    assert_eq!(exact & !got, 0, "{level:?} {:?}", splats[l]);
                     let rectangle: u64 =
                         if splats[l].x1 == 80 { 0x0f0f_0f0f_0f0f_0f00 } else { !0xff };
-                    assert_eq!(got & !rectangle, 0, "{tier:?} {:?}: outside", splats[l]);
+                    assert_eq!(got & !rectangle, 0, "{level:?} {:?}: outside", splats[l]);
                     named[i] += got.count_ones();
                 }
             }
         }
         assert!(needed > 5000, "{needed}");
-        for (named, tier) in named.iter().zip(Tier::available()) {
-            assert!(f64::from(*named) < 1.15 * f64::from(needed), "{tier:?}: {named} of {needed}");
+        for (named, level) in named.iter().zip(SimdLevel::available()) {
+            assert!(f64::from(*named) < 1.15 * f64::from(needed), "{level:?}: {named} of {needed}");
         }
     }
 }

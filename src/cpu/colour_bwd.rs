@@ -5,7 +5,7 @@ use crate::abi::{SH_COEFFICIENTS_MAX, ShBasis, sh_coefficients};
 use crate::cpu::project::SplatSlices;
 use crate::cpu::project_bwd::{GROUP, Group, L, Part, Pass, get, put};
 use crate::cpu::sh_bwd::{used_coefficients, values_and_slope};
-use crate::cpu::simd::Simd;
+use crate::cpu::simd::{Simd, Vector};
 
 /// Coefficients per channel of the degree that goes sixteen splats at a time: 3.
 const WIDE: usize = 16;
@@ -223,7 +223,7 @@ impl Pass<'_> {
         let gains = s.load(&gain);
         let mut weighted = [[0.0; GROUP]; 3];
         for (c, weighted) in weighted.iter_mut().enumerate() {
-            let moved = s.fma(gains, s.load(&seen.slope[c]), s.load(&group.d_mean[c]));
+            let moved = gains.fma(s.load(&seen.slope[c]), s.load(&group.d_mean[c]));
             s.store(moved, &mut group.d_mean[c]);
             s.store(gains * s.load(&group.sums[6 + c]), weighted);
         }

@@ -3,7 +3,7 @@
 //! From quaternion and σ we keep M = J·W·R·S (2×3) and take det(MMᵀ) = ‖m₁ × m₂‖²
 //! (Cauchy-Binet), which no needle cancels.
 
-use crate::cpu::simd::{LANES, Simd};
+use crate::cpu::simd::{LANES, Simd, Vector};
 
 /// Sixteen splats' shapes.
 pub(crate) enum Shape<'a, S: Simd> {
@@ -29,8 +29,8 @@ pub(crate) fn covariance_quat<S: Simd>(
     [w, x, y, z]: [S::F; 4],
     scale: [S::F; 3],
 ) -> (Covariance2d<S>, S::M) {
-    let norm2 = s.fma(w, w, s.fma(x, x, s.fma(y, y, z * z)));
-    let whole = s.le(s.splat(f32::MIN_POSITIVE), norm2) & s.lt(norm2, s.splat(f32::INFINITY));
+    let norm2 = w.fma(w, x.fma(x, y.fma(y, z * z)));
+    let whole = s.splat(f32::MIN_POSITIVE).le(norm2) & norm2.lt(s.splat(f32::INFINITY));
     let t = s.splat(2.0) / norm2;
     let (one, wt, xt, yt) = (s.splat(1.0), w * t, x * t, y * t);
     let (xx, yy, zz) = (xt * x, yt * y, z * z * t);
@@ -49,11 +49,8 @@ pub(crate) fn covariance_quat<S: Simd>(
         }
     }
     let [a, b] = m;
-    let n = [
-        s.fnma(a[2], b[1], a[1] * b[2]),
-        s.fnma(a[0], b[2], a[2] * b[0]),
-        s.fnma(a[1], b[0], a[0] * b[1]),
-    ];
+    let n =
+        [a[2].fnma(b[1], a[1] * b[2]), a[0].fnma(b[2], a[2] * b[0]), a[1].fnma(b[0], a[0] * b[1])];
     let c =
         Covariance2d { xx: dot(s, a, a), xy: dot(s, a, b), yy: dot(s, b, b), det: dot(s, n, n) };
     (c, whole)
@@ -100,5 +97,5 @@ pub(crate) fn covariance_cov6<S: Simd>(
 
 #[inline(always)]
 pub(crate) fn dot<S: Simd>(s: S, a: [S::F; 3], b: [S::F; 3]) -> S::F {
-    s.fma(a[0], b[0], s.fma(a[1], b[1], a[2] * b[2]))
+    a[0].fma(b[0], a[1].fma(b[1], a[2] * b[2]))
 }

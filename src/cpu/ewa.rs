@@ -14,14 +14,14 @@
 //! zero is a point, drawn as wide as the low-pass makes it; the sign of σ does not
 //! matter; an opacity above 1 acts through the alpha cap.
 
-pub use crate::view::View;
+pub use crate::abi::View;
 
 use crate::abi::{
     ALPHA_MIN, ALPHA_MIN_LOG2, BLOCK, DISCRIMINANT_MIN_MVSPLAT, OPACITY_MAX, RADIUS_SIGMAS_MVSPLAT,
     SPAN_SLACK_PX, SUPPORT_SLACK, TILE_MVSPLAT,
 };
 use crate::cpu::covariance::{Covariance2d, Shape, covariance_cov6, covariance_quat, dot};
-use crate::cpu::simd::{LANES, Simd, log2};
+use crate::cpu::simd::{F32Vector, LANES, Mask, Simd, Vector, log2};
 use std::f32::consts::{LN_2, LOG2_E};
 
 /// Four-byte fields of a [`Footprint`].
@@ -130,7 +130,7 @@ fn support(power: f32) -> f32 {
 #[inline(always)]
 pub(crate) fn support_lanes<S: Simd>(s: S, power: S::F) -> S::F {
     let reach = power - s.splat(ALPHA_MIN_LOG2);
-    s.fma(s.splat(SUPPORT_SLACK), s.splat(1.0) + reach, reach)
+    s.splat(SUPPORT_SLACK).fma(s.splat(1.0) + reach, reach)
 }
 
 impl View {
@@ -152,10 +152,10 @@ impl View {
         let mut j = [[z; 3]; 2];
         for i in 0..2 {
             let (low, high) = self.limit[i];
-            let slope = s.min(s.max(slopes[i], s.splat(low)), s.splat(high));
+            let slope = s.splat(high).min(s.splat(low).max(slopes[i]));
             let f = s.splat(self.focal[i]) * inverse;
             for c in 0..3 {
-                j[i][c] = f * s.fnma(slope, s.splat(away[c]), s.splat(self.rows[i][c]));
+                j[i][c] = f * slope.fnma(s.splat(away[c]), s.splat(self.rows[i][c]));
             }
         }
         j
@@ -173,8 +173,8 @@ impl View {
     ) -> ([S::F; FIELDS], S::M) {
         let p = self.to_camera(s, mean);
         // So far away that the length of its direction overflows, it has no colour.
-        let within = s.lt(dot(s, p, p), s.splat(f32::INFINITY));
-        let front = s.lt(s.splat(self.near), p[2]) & within;
+        let within = dot(s, p, p).lt(s.splat(f32::INFINITY));
+        let front = s.splat(self.near).lt(p[2]) & within;
         let slopes = [p[0] / p[2], p[1] / p[2]];
         let j = self.jacobian_in_world(s, slopes, p[2]);
         let (covariance, shaped) = match shape {
@@ -196,37 +196,37 @@ impl View {
     ) -> ([S::F; FIELDS], S::M) {
         let (zero, lowpass) = (s.splat(0.0), s.splat(self.lowpass));
         let (xx, yy) = (c.xx + lowpass, c.yy + lowpass);
-        let det = s.fma(lowpass, c.xx + c.yy + lowpass, c.det);
+        let det = lowpass.fma(c.xx + c.yy + lowpass, c.det);
         let mut opacity = opacity;
         if self.antialiased {
-            opacity = opacity * s.sqrt(s.max(c.det / det, zero));
+            opacity = opacity * zero.max(c.det / det).sqrt();
         }
         let infinity = s.splat(f32::INFINITY);
         // Comparisons are false for NaN.
-        let mut kept = kept & s.le(s.splat(ALPHA_MIN), opacity) & s.lt(opacity, infinity);
-        kept = kept & s.lt(zero, det) & s.lt(det, infinity) & s.lt(zero, xx) & s.lt(zero, yy);
-        let power = log2(s, s.min(opacity, s.splat(OPACITY_MAX)));
+        let mut kept = kept & s.splat(ALPHA_MIN).le(opacity) & opacity.lt(infinity);
+        kept = kept & zero.lt(det) & det.lt(infinity) & zero.lt(xx) & zero.lt(yy);
+        let power = log2(s, s.splat(OPACITY_MAX).min(opacity));
         let reach = s.splat(2.0 * LN_2) * support_lanes(s, power);
         let [mut u, mut v] = slopes;
         if self.z_epsilon != 0.0 {
             let z = p[2] + s.splat(self.z_epsilon);
             (u, v) = (p[0] / z, p[1] / z);
         }
-        u = s.fma(s.splat(self.focal[0]), u, s.splat(self.centre[0]));
-        v = s.fma(s.splat(self.focal[1]), v, s.splat(self.centre[1]));
+        u = s.splat(self.focal[0]).fma(u, s.splat(self.centre[0]));
+        v = s.splat(self.focal[1]).fma(v, s.splat(self.centre[1]));
         let inverse = s.splat(1.0) / yy;
-        let sx = s.sqrt(s.splat(0.5 * LOG2_E) * (yy / det));
+        let sx = (s.splat(0.5 * LOG2_E) * (yy / det)).sqrt();
         let shear = -c.xy * inverse;
-        let sy = s.sqrt(s.splat(0.5 * LOG2_E) * inverse);
-        let (half_width, half_height) = (s.sqrt(reach * xx), s.sqrt(reach * yy));
+        let sy = (s.splat(0.5 * LOG2_E) * inverse).sqrt();
+        let (half_width, half_height) = ((reach * xx).sqrt(), (reach * yy).sqrt());
         // A sum is finite only if no term is NaN or infinite, bar overflow of huge
         // finite terms, which is dropped alike.
         let sum = u + v + sx + shear + sy + p[2] + half_width + half_height;
-        kept = kept & s.lt(s.abs(sum), infinity);
+        kept = kept & sum.abs().lt(infinity);
         let radius = if self.tile_cut { Some(radius_mvsplat(s, xx, yy, det)) } else { None };
         let (x0, x1) = self.extent(s, 0, u, half_width, radius);
         let (y0, y1) = self.extent(s, 1, v, half_height, radius);
-        kept = kept & s.lt(x0, x1) & s.lt(y0, y1);
+        kept = kept & x0.lt(x1) & y0.lt(y1);
         let mut fields = [
             u,
             v,
@@ -246,10 +246,10 @@ impl View {
             y1,
         ];
         for field in &mut fields[FIELDS - 4..] {
-            *field = s.of_bits(s.to_int(*field));
+            *field = S::F::from_bits(field.to_int());
         }
         for field in &mut fields {
-            *field = s.keep(kept, *field);
+            *field = kept.select_or_zero(*field);
         }
         (fields, kept)
     }
@@ -267,18 +267,18 @@ impl View {
     ) -> (S::F, S::F) {
         let (zero, side) = (s.splat(0.0), s.splat(self.size[axis] as f32));
         let half = half + s.splat(SPAN_SLACK_PX);
-        let mut first = s.max(s.ceil(mean - half), zero);
-        let mut past = s.min(s.floor(mean + half) + s.splat(1.0), side);
+        let mut first = zero.max((mean - half).ceil());
+        let mut past = side.min((mean + half).floor() + s.splat(1.0));
         if let Some(r) = radius {
             const TILE_PX: f32 = TILE_MVSPLAT as f32;
             // The original truncates towards zero; what is below 0 ends at 0 anyway.
             let tile = s.splat(1.0 / TILE_PX);
-            let from = s.floor((mean - r) * tile);
-            let to = s.floor((mean + r + s.splat(TILE_PX - 1.0)) * tile);
-            first = s.max(from * s.splat(TILE_PX), first);
-            past = s.min(to * s.splat(TILE_PX), past);
+            let from = ((mean - r) * tile).floor();
+            let to = ((mean + r + s.splat(TILE_PX - 1.0)) * tile).floor();
+            first = first.max(from * s.splat(TILE_PX));
+            past = past.min(to * s.splat(TILE_PX));
         }
-        (s.min(first, side), s.max(past, zero))
+        (side.min(first), zero.max(past))
     }
 }
 
@@ -286,8 +286,8 @@ impl View {
 #[inline(always)]
 fn radius_mvsplat<S: Simd>(s: S, xx: S::F, yy: S::F, det: S::F) -> S::F {
     let mid = s.splat(0.5) * (xx + yy);
-    let discriminant = s.max(s.fma(mid, mid, -det), s.splat(DISCRIMINANT_MIN_MVSPLAT));
-    s.ceil(s.splat(RADIUS_SIGMAS_MVSPLAT) * s.sqrt(mid + s.sqrt(discriminant)))
+    let discriminant = s.splat(DISCRIMINANT_MIN_MVSPLAT).max(mid.fma(mid, -det));
+    (s.splat(RADIUS_SIGMAS_MVSPLAT) * (mid + discriminant.sqrt()).sqrt()).ceil()
 }
 
 #[inline(always)]

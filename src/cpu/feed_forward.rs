@@ -8,10 +8,10 @@
 //! ops/feed_forward.rs compare with.
 
 use super::activation::{Activation, in_place};
-use super::fresh::{Fresh, over, start};
 use super::gemm::{Base, Mat, Packed, product};
 use super::norm::{self, Rows};
 use super::simd::LANES;
+use super::uninit::{UninitBuffer, as_uninit, zeroed};
 use rayon::prelude::*;
 
 /// Rows of a task: 96 · 1024 hidden floats are 384 KiB.
@@ -44,13 +44,13 @@ pub fn forward(f: &FeedForward<'_>, x: &[f32], message: &[f32]) -> Vec<f32> {
     let rows = Rows { len: c, run: 1, groups: 1, eps: f.eps, activation: None };
     // Off the powers of two, at which rows lie in one another's cache lines.
     let pitch = h + LANES;
-    let mut fresh = Fresh::new(x.len());
+    let mut fresh = UninitBuffer::new(x.len());
     let size = BLOCK * c.max(1);
-    let blocks = fresh.blocks(size).zip(x.par_chunks(size)).zip(message.par_chunks(size));
+    let blocks = fresh.par_chunks_mut(size).zip(x.par_chunks(size)).zip(message.par_chunks(size));
     blocks.for_each_init(
         || (Vec::new(), Vec::new()),
         |(hidden, narrow), ((block, x), message)| {
-            let (y, n) = (start(block), x.len() / c);
+            let (y, n) = (zeroed(block), x.len() / c);
             hidden.resize(n * pitch, 0.0);
             narrow.resize(n * c, 0.0);
             product((hidden, pitch), Mat::new(x, n, c, c), &up[0], 1.0, Base::Zero);
@@ -58,10 +58,10 @@ pub fn forward(f: &FeedForward<'_>, x: &[f32], message: &[f32]) -> Vec<f32> {
             in_place(Activation::Gelu, hidden);
             product((narrow, c), Mat::new(hidden, n, h, pitch), &down, 1.0, Base::Zero);
             // SAFETY: `forward_to` writes numbers.
-            norm::forward_to(&rows, narrow, f.norm[0], f.norm[1], unsafe { over(y) });
+            norm::forward_to(&rows, narrow, f.norm[0], f.norm[1], unsafe { as_uninit(y) });
             y.iter_mut().zip(x).for_each(|(y, x)| *y += x);
         },
     );
     // SAFETY: the loop above started every block.
-    unsafe { fresh.finish() }
+    unsafe { fresh.assume_init() }
 }

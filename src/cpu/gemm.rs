@@ -3,7 +3,7 @@
 //!
 //! Callers parallelise over blocks of rows themselves. A result is a sum over k in
 //! order, in parts of 128, whatever the block of rows that it is computed with:
-//! how rows are cut into tasks does not show, and fused tiers agree to the byte.
+//! how rows are cut into tasks does not show, and fused levels agree to the byte.
 //! Oracle: three loops in f64 (the tests).
 
 mod packed;
@@ -11,8 +11,8 @@ mod packed;
 mod tests;
 mod tile;
 
-use super::fresh::Fresh;
-use super::simd::{Kernel, LANES, Simd, Tier};
+use super::simd::{Kernel, LANES, Simd, SimdLevel};
+use super::uninit::UninitBuffer;
 pub(super) use packed::copy;
 pub use packed::{Mat, Packed};
 use rayon::prelude::*;
@@ -45,12 +45,12 @@ pub enum Base<'a> {
 /// Where a matrix reaches past its slice or the sizes differ: the bounds check that the
 /// kernel rests on.
 pub fn product(dst: (&mut [f32], usize), lhs: Mat<'_>, rhs: &Packed, scale: f32, base: Base<'_>) {
-    product_on(Tier::best(), dst, lhs, rhs, scale, base);
+    product_on(SimdLevel::best(), dst, lhs, rhs, scale, base);
 }
 
-/// [`product`] compiled for `tier`.
+/// [`product`] compiled for `level`.
 pub(crate) fn product_on(
-    tier: Tier,
+    level: SimdLevel,
     (dst, row_stride): (&mut [f32], usize),
     lhs: Mat<'_>,
     rhs: &Packed,
@@ -63,7 +63,7 @@ pub(crate) fn product_on(
     }
     assert!(row_stride >= n && (m - 1) * row_stride + n <= dst.len(), "gemm: destination");
     // SAFETY: the rows lie in `dst` (checked), apart from one another.
-    unsafe { product_at(tier, (dst.as_mut_ptr(), row_stride), lhs, rhs, scale, base) };
+    unsafe { product_at(level, (dst.as_mut_ptr(), row_stride), lhs, rhs, scale, base) };
 }
 
 /// [`product_on`] into memory that need hold no numbers yet, unless `base` is
@@ -73,7 +73,7 @@ pub(crate) fn product_on(
 /// `lhs.rows` rows of `rhs.cols` floats, `row_stride` apart, are there to be written
 /// (with [`Base::Own`]: are numbers) and nobody else's meanwhile.
 pub(crate) unsafe fn product_at(
-    tier: Tier,
+    level: SimdLevel,
     (dst, row_stride): (*mut f32, usize),
     lhs: Mat<'_>,
     rhs: &Packed,
@@ -91,7 +91,7 @@ pub(crate) unsafe fn product_at(
     if let Base::Row(row) = base {
         assert_eq!(row.len(), n, "gemm: row");
     }
-    tier.run(Product { dst, row_stride, lhs, rhs, scale, base });
+    level.run(Product { dst, row_stride, lhs, rhs, scale, base });
 }
 
 /// `dst = scale · lhs · rhs`, or `dst += …` with `accumulate`: [`product`] with a right
@@ -126,11 +126,11 @@ pub fn rows_product(lhs: Mat<'_>, rhs: &Packed, base: Base<'_>) -> Vec<f32> {
     let (m, n) = (lhs.rows, rhs.cols);
     lhs.check("operands");
     assert!(!matches!(base, Base::Own), "gemm: new memory holds nothing");
-    let mut fresh = Fresh::new(m * n);
+    let mut fresh = UninitBuffer::new(m * n);
     if let Some(rows) = BLOCK_FLOATS.checked_div(n) {
         let rows = rows.clamp(BLOCK_LEAST, BLOCK);
         let rows = if m <= BLOCK { BLOCK } else { rows };
-        fresh.blocks(rows * n).enumerate().for_each(|(i, block)| {
+        fresh.par_chunks_mut(rows * n).enumerate().for_each(|(i, block)| {
             let lhs = Mat {
                 data: &lhs.data[(i * rows * lhs.row_stride).min(lhs.data.len())..],
                 rows: block.len() / n,
@@ -139,11 +139,11 @@ pub fn rows_product(lhs: Mat<'_>, rhs: &Packed, base: Base<'_>) -> Vec<f32> {
             let dst = (block.as_mut_ptr().cast(), n);
             // SAFETY: the block is that many rows, this task's alone; `base` is not
             // `Own` (asserted above).
-            unsafe { product_at(Tier::best(), dst, lhs, rhs, 1.0, base) };
+            unsafe { product_at(SimdLevel::best(), dst, lhs, rhs, 1.0, base) };
         });
     }
     // SAFETY: the products above wrote every block; without columns there is none.
-    unsafe { fresh.finish() }
+    unsafe { fresh.assume_init() }
 }
 
 struct Product<'a> {

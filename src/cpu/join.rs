@@ -1,6 +1,6 @@
 //! Channels of one map beside those of a coarser one, each coarse pixel repeated.
 
-use super::fresh::{Block, Fresh, fill};
+use super::uninit::{UninitBuffer, UninitSlice, filled};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
@@ -25,27 +25,27 @@ impl Join {
 pub fn forward(j: &Join, batch: usize, fine: &[f32], coarse: &[f32]) -> Vec<f32> {
     let (n, [c1, c2], s, w) = (j.plane(), j.channels, j.repeat, j.size[1]);
     let small = n / (s * s);
-    let mut fresh = Fresh::new(batch * (c1 + c2) * n);
-    fresh.blocks(n).enumerate().for_each(|(i, y)| {
+    let mut fresh = UninitBuffer::new(batch * (c1 + c2) * n);
+    fresh.par_chunks_mut(n).enumerate().for_each(|(i, y)| {
         let (b, c) = (i / (c1 + c2), i % (c1 + c2));
         if c < c1 {
-            fill(y, &fine[(b * c1 + c) * n..][..n]);
+            filled(y, &fine[(b * c1 + c) * n..][..n]);
         } else {
             repeat(&coarse[(b * c2 + c - c1) * small..][..small], w, s, y);
         }
     });
     // SAFETY: the loop above filled every block.
-    unsafe { fresh.finish() }
+    unsafe { fresh.assume_init() }
 }
 
 /// A plane of which every pixel is repeated `s` × `s` times into one `w` wide.
 ///
 /// # Panics
 /// Where the sizes do not fit: the block is then not all written.
-pub(super) fn repeat(x: &[f32], w: usize, s: usize, y: &mut Block<f32>) {
+pub(super) fn repeat(x: &[f32], w: usize, s: usize, y: &mut UninitSlice<f32>) {
     assert!(x.len() * s * s == y.len() && y.len().is_multiple_of(w * s) && w.is_multiple_of(s));
     if s == 1 {
-        fill(y, x);
+        filled(y, x);
         return;
     }
     for (x, y) in x.chunks_exact(w / s).zip(y.chunks_exact_mut(s * w)) {
@@ -64,7 +64,7 @@ pub(super) fn repeat(x: &[f32], w: usize, s: usize, y: &mut Block<f32>) {
 }
 
 /// Each number S times; a count that is known makes it shuffles of vectors.
-fn spread<const S: usize>(x: &[f32], y: &mut Block<f32>) {
+fn spread<const S: usize>(x: &[f32], y: &mut UninitSlice<f32>) {
     for (x, y) in x.iter().zip(y.as_chunks_mut::<S>().0) {
         *y = [MaybeUninit::new(*x); S];
     }

@@ -1,9 +1,9 @@
 //! Sums and moves of whole tensors: no arithmetic to speak of, so one pass, by all
 //! threads, into memory that nothing has cleared before.
 
-use super::fresh::{Fresh, fill, start};
 use super::gemm::{Mat, copy};
-use super::simd::{Kernel, Simd, Tier};
+use super::simd::{Kernel, Simd, SimdLevel};
+use super::uninit::{UninitBuffer, filled, zeroed};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
@@ -13,34 +13,34 @@ const PART: usize = 1 << 15;
 /// a + b.
 pub fn sum(a: &[f32], b: &[f32]) -> Vec<f32> {
     assert_eq!(a.len(), b.len(), "sum: lengths");
-    let mut fresh = Fresh::new(a.len());
-    let parts = fresh.blocks(PART).zip(a.par_chunks(PART)).zip(b.par_chunks(PART));
+    let mut fresh = UninitBuffer::new(a.len());
+    let parts = fresh.par_chunks_mut(PART).zip(a.par_chunks(PART)).zip(b.par_chunks(PART));
     parts.for_each(|((block, a), b)| {
         for ((to, a), b) in block.iter_mut().zip(a).zip(b) {
             *to = MaybeUninit::new(a + b);
         }
     });
     // SAFETY: the loop above wrote every place of every block, the lengths being equal.
-    unsafe { fresh.finish() }
+    unsafe { fresh.assume_init() }
 }
 
 /// One after the other.
 pub fn stacked(parts: &[&[f32]]) -> Vec<f32> {
-    let mut fresh = Fresh::new(parts.iter().map(|p| p.len()).sum());
-    fresh.blocks(PART).enumerate().for_each(|(i, block)| {
+    let mut fresh = UninitBuffer::new(parts.iter().map(|p| p.len()).sum());
+    fresh.par_chunks_mut(PART).enumerate().for_each(|(i, block)| {
         let mut skip = i * PART;
         let mut block = block;
         for part in parts {
             let own = part.get(skip..).unwrap_or(&[]);
             skip = skip.saturating_sub(part.len());
             let (now, rest) = block.split_at_mut(own.len().min(block.len()));
-            fill(now, &own[..now.len()]);
+            filled(now, &own[..now.len()]);
             block = rest;
         }
     });
     // SAFETY: the blocks together are as long as the parts together, and block i begins
     // where i·PART of them are written.
-    unsafe { fresh.finish() }
+    unsafe { fresh.assume_init() }
 }
 
 /// Rows of the result in a task of [`transposed`].
@@ -48,29 +48,29 @@ const ROWS: usize = 256;
 
 /// `[count, rows, cols]` to `[count, cols, rows]`.
 pub fn transposed(x: &[f32], rows: usize, cols: usize) -> Vec<f32> {
-    let mut fresh = Fresh::new(x.len());
+    let mut fresh = UninitBuffer::new(x.len());
     let area = rows * cols;
     if area > PART {
         // Tasks end where a matrix does.
         let size = if cols.is_multiple_of(ROWS) { ROWS } else { cols };
-        fresh.blocks(size * rows).enumerate().for_each(|(i, block)| {
+        fresh.par_chunks_mut(size * rows).enumerate().for_each(|(i, block)| {
             let (matrix, first) = (i * size / cols, i * size % cols);
             let data = &x[matrix * area + first..(matrix + 1) * area];
             let from = Mat { data, rows: size, cols: rows, row_stride: 1, col_stride: cols };
-            Tier::best().run(Turn { from, to: start(block) });
+            SimdLevel::best().run(Turn { from, to: zeroed(block) });
         });
     } else if let Some(matrices) = PART.checked_div(area) {
         let size = matrices * area;
-        fresh.blocks(size).zip(x.par_chunks(size)).for_each(|(block, x)| {
-            let all = start(block).chunks_exact_mut(area).zip(x.chunks_exact(area));
+        fresh.par_chunks_mut(size).zip(x.par_chunks(size)).for_each(|(block, x)| {
+            let all = zeroed(block).chunks_exact_mut(area).zip(x.chunks_exact(area));
             for (to, data) in all {
                 let from = Mat::new(data, rows, cols, cols).t();
-                Tier::best().run(Turn { from, to });
+                SimdLevel::best().run(Turn { from, to });
             }
         });
     }
     // SAFETY: either loop above started every block; there is none of an empty matrix.
-    unsafe { fresh.finish() }
+    unsafe { fresh.assume_init() }
 }
 
 struct Turn<'a> {

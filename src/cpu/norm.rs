@@ -7,9 +7,9 @@ mod layer;
 mod silu;
 
 use super::activation::{Activation, by_kind};
-use super::fresh::{Block, Fresh};
 use super::math::{sum_of, sums_of, vectorised};
-use super::simd::Tier;
+use super::simd::SimdLevel;
+use super::uninit::{UninitBuffer, UninitSlice};
 use layer::Layer;
 use rayon::prelude::*;
 use silu::Silu;
@@ -59,17 +59,17 @@ impl Rows {
 
 /// f(w·(x − mean)/σ + b), new memory; `w` and `b` are `[channels]`, or empty for none.
 pub fn forward(rows: &Rows, x: &[f32], w: &[f32], b: &[f32]) -> Vec<f32> {
-    let mut fresh = Fresh::new(x.len());
-    forward_to(rows, x, w, b, fresh.whole());
+    let mut fresh = UninitBuffer::new(x.len());
+    forward_to(rows, x, w, b, fresh.as_mut_slice());
     // SAFETY: every element of every row was written.
-    unsafe { fresh.finish() }
+    unsafe { fresh.assume_init() }
 }
 
 /// [`forward`] into `y`.
 ///
 /// # Panics
 /// Where the sizes do not fit: not all of `y` is written then.
-pub(super) fn forward_to(rows: &Rows, x: &[f32], w: &[f32], b: &[f32], y: &mut Block<f32>) {
+pub(super) fn forward_to(rows: &Rows, x: &[f32], w: &[f32], b: &[f32], y: &mut UninitSlice<f32>) {
     assert!(x.len() == y.len() && x.len().is_multiple_of(rows.len), "normalisation: rows");
     assert!(rows.len.is_multiple_of(rows.run) && w.len() == b.len(), "normalisation: channels");
     assert!(w.is_empty() || w.len() == rows.groups * rows.per_row(), "normalisation: channels");
@@ -78,11 +78,17 @@ pub(super) fn forward_to(rows: &Rows, x: &[f32], w: &[f32], b: &[f32], y: &mut B
     let layer = rows.run == 1 && rows.groups == 1 && rows.activation.is_none();
     x.par_chunks(chunk).zip(y.par_chunks_mut(chunk)).enumerate().for_each(|(at, (x, y))| {
         if layer {
-            return Tier::best().run(Layer { n: rows.len, eps: rows.eps, x, y, affine: [w, b] });
+            return SimdLevel::best().run(Layer {
+                n: rows.len,
+                eps: rows.eps,
+                x,
+                y,
+                affine: [w, b],
+            });
         }
         if rows.activation == Some(Activation::Silu) {
             let (first, affine) = (at * batch, [w, b]);
-            return Tier::best().run(Silu { rows, first, x, y, affine });
+            return SimdLevel::best().run(Silu { rows, first, x, y, affine });
         }
         vectorised(
             #[inline(always)]
@@ -115,7 +121,7 @@ pub(super) fn forward_to(rows: &Rows, x: &[f32], w: &[f32], b: &[f32], y: &mut B
 fn affine_row(
     rows: &Rows,
     x: &[f32],
-    y: &mut Block<f32>,
+    y: &mut UninitSlice<f32>,
     (mean, inverse): (f32, f32),
     affine: Option<(&[f32], &[f32])>,
     f: impl Fn(f32) -> f32,

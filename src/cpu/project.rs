@@ -10,22 +10,22 @@
 
 pub use crate::abi::{Geometry, SplatSlices};
 
-pub(crate) use crate::abi::lanes_at;
+pub(crate) use crate::abi::floats_at;
 use crate::abi::{
-    LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, RasterOptions, SPLAT_LANES, ShBasis,
+    MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE, ShBasis,
     ShDirection, sh_coefficients,
 };
 use crate::cpu::covariance::Shape;
 use crate::cpu::ewa::{FIELDS, Footprint, View};
 use crate::cpu::sh::{direction_lanes, radiance_lanes};
-use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
+use crate::cpu::simd::{Kernel, LANES, Mask, Simd, SimdLevel, Vector};
 use crate::cpu::tiles::{ChunkCover, TileLists};
 use rayon::prelude::*;
 
 /// Parents per unit of parallel work.
 const PARENTS: usize = 256;
 
-const _: () = assert!(LANE_OPACITY == LANE_SCALE + 3 && LANE_QUAT == LANE_MEAN + 3);
+const _: () = assert!(OPACITY_OFFSET == SCALE_OFFSET + 3 && QUAT_OFFSET == MEAN_OFFSET + 3);
 
 /// Footprints of a frame, reused from frame to frame.
 #[derive(Debug, Default)]
@@ -59,7 +59,7 @@ impl Projection {
     /// Projects all splats and counts their entries in the lists of `lists`' tiles.
     pub(crate) fn run(
         &mut self,
-        tier: Tier,
+        level: SimdLevel,
         splats: &SplatSlices,
         view: &View,
         options: &RasterOptions,
@@ -73,7 +73,7 @@ impl Projection {
             let parents = splats.parents().max(splats.len().div_ceil(children));
             self.parents.resize(parents, [0.0; 3]);
             self.parents.par_chunks_mut(PARENTS).enumerate().for_each(|(c, out)| {
-                tier.run(Parents { splats, view, basis, first: c * PARENTS, out });
+                level.run(Parents { splats, view, basis, first: c * PARENTS, out });
             });
         }
         self.footprints.resize(splats.len(), Footprint::default());
@@ -81,7 +81,7 @@ impl Projection {
         let chunk = lists.chunk();
         let chunks = self.footprints.par_chunks_mut(chunk).zip(lists.chunks(splats.len()));
         chunks.enumerate().for_each(|(c, (footprints, cover))| {
-            tier.run(Chunk { splats, view, basis, parents, first: c * chunk, footprints, cover });
+            level.run(Chunk { splats, view, basis, parents, first: c * chunk, footprints, cover });
         });
     }
 }
@@ -228,7 +228,7 @@ impl Chunk<'_> {
         while g < past {
             let lanes = (past - g).min(LANES);
             let (fields, mask) = self.group(s, self.first + g, lanes);
-            let bits = s.bits(mask) & (u32::MAX >> (32 - lanes));
+            let bits = mask.to_bits() & (u32::MAX >> (32 - lanes));
             if bits == 0 {
                 self.footprints[g..g + lanes].fill(Footprint::default());
             } else {
@@ -257,11 +257,11 @@ impl Chunk<'_> {
         }
         match self.splats.geometry {
             Geometry::Packed(rows) => {
-                let at = index.map(|i| i * SPLAT_LANES);
-                let [x, y, z, qw] = s.load4(rows, &at, LANE_MEAN);
-                let [qx, qy, qz, _] = s.load4(rows, &at, LANE_QUAT + 1);
+                let at = index.map(|i| i * SPLAT_STRIDE);
+                let [x, y, z, qw] = s.gather4(rows, &at, MEAN_OFFSET);
+                let [qx, qy, qz, _] = s.gather4(rows, &at, QUAT_OFFSET + 1);
                 // The row's last four.
-                let [sx, sy, sz, opacity] = s.load4(rows, &at, LANE_SCALE);
+                let [sx, sy, sz, opacity] = s.gather4(rows, &at, SCALE_OFFSET);
                 let shape = Shape::Quat([qw, qx, qy, qz], [sx, sy, sz]);
                 self.view.project(s, [x, y, z], shape, opacity)
             }
@@ -273,7 +273,7 @@ impl Chunk<'_> {
                     for (column, v) in columns.iter_mut().zip([x, y, z, opacities[i]]) {
                         column[l] = v;
                     }
-                    shapes[l] = lanes_at(cov6, 6 * i);
+                    shapes[l] = floats_at(cov6, 6 * i);
                 }
                 let [x, y, z, opacity] = columns;
                 let mean = [s.load(&x), s.load(&y), s.load(&z)];
@@ -303,7 +303,8 @@ impl Chunk<'_> {
             let set = 3 * sh_coefficients(splats.sh_degree);
             let mean = match splats.geometry {
                 Geometry::Packed(rows) => {
-                    let [x, y, z, _] = s.load4(rows, &index.map(|i| i * SPLAT_LANES), LANE_MEAN);
+                    let [x, y, z, _] =
+                        s.gather4(rows, &index.map(|i| i * SPLAT_STRIDE), MEAN_OFFSET);
                     [x, y, z]
                 }
                 Geometry::Cov6 { .. } => {
@@ -323,13 +324,13 @@ impl Chunk<'_> {
         };
         let (gain, residual) = self.gain(s, &index);
         let (half, infinity) = (s.splat(0.5), s.splat(f32::INFINITY));
-        let mut good = s.lt(half, infinity);
+        let mut good = half.lt(infinity);
         for c in 0..3 {
-            let v = s.fma(gain, sum[c], half) + residual[c];
-            good = good & s.lt(s.abs(v), infinity);
-            s.store(s.max(v, s.splat(0.0)), &mut lanes[c]);
+            let v = gain.fma(sum[c], half) + residual[c];
+            good = good & v.abs().lt(infinity);
+            s.store(s.splat(0.0).max(v), &mut lanes[c]);
         }
-        let good = s.bits(good);
+        let good = good.to_bits();
         for (l, &i) in group[..count].iter().enumerate() {
             let f = &mut self.footprints[i as usize];
             if good & (1 << l) != 0 {
@@ -348,7 +349,7 @@ impl Chunk<'_> {
         if gain.is_empty() {
             (s.splat(1.0), none)
         } else if gain.len() == 4 * n {
-            let [gain, r, g, b] = s.load4(gain, &index.map(|i| 4 * i), 0);
+            let [gain, r, g, b] = s.gather4(gain, &index.map(|i| 4 * i), 0);
             (gain, [r, g, b])
         } else {
             let one = index.map(|i| gain.get(i).copied().unwrap_or(1.0));

@@ -9,15 +9,15 @@
 pub use crate::abi::Gradients;
 
 use crate::abi::{
-    LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, RasterOptions, SPLAT_LANES, ShDirection,
-    sh_coefficients,
+    MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE,
+    ShDirection, sh_coefficients,
 };
 use crate::cpu::colour_bwd::Directions;
 use crate::cpu::ewa::{Footprint, View};
 use crate::cpu::ewa_bwd::{Moments, Whitening, cov6_gradient, quat_gradient};
-use crate::cpu::project::{Geometry, SplatSlices, lanes_at};
+use crate::cpu::project::{Geometry, SplatSlices, floats_at};
 use crate::cpu::raster_bwd_tile::{PairSums, SUMS};
-use crate::cpu::simd::{Kernel, Simd, Tier};
+use crate::cpu::simd::{Kernel, Simd, SimdLevel};
 use rayon::prelude::*;
 
 /// Splats side by side.
@@ -74,7 +74,7 @@ pub(crate) struct Group {
     d_opacity: L,
 }
 
-/// One part of a pass, compiled for a tier.
+/// One part of a pass, compiled for a level.
 struct PartOf<'a, 'b>(&'a Pass<'b>, Part<'a>);
 
 impl Kernel for PartOf<'_, '_> {
@@ -88,7 +88,7 @@ impl Kernel for PartOf<'_, '_> {
 
 impl Pass<'_> {
     /// Fills `out`, the background's gradient apart.
-    pub(crate) fn run(&self, tier: Tier, out: &mut Gradients) {
+    pub(crate) fn run(&self, level: SimdLevel, out: &mut Gradients) {
         let n = self.splats.len();
         out.fit(self.splats);
         let children = self.splats.children_per_parent();
@@ -96,7 +96,7 @@ impl Pass<'_> {
         let len = families * children;
         let set = 3 * sh_coefficients(self.splats.sh_degree);
         let gain_lanes = self.splats.gain.len().checked_div(n).unwrap_or(0);
-        let mut rows = out.rows.chunks_mut(len * SPLAT_LANES);
+        let mut rows = out.rows.chunks_mut(len * SPLAT_STRIDE);
         let mut means = out.means.chunks_mut(3 * len);
         let mut cov6 = out.cov6.chunks_mut(6 * len);
         let mut opacities = out.opacities.chunks_mut(len);
@@ -116,7 +116,7 @@ impl Pass<'_> {
                 gain_lanes,
             })
             .collect();
-        parts.into_par_iter().for_each(|part| tier.run(PartOf(self, part)));
+        parts.into_par_iter().for_each(|part| level.run(PartOf(self, part)));
     }
 
     #[inline(always)]
@@ -167,13 +167,13 @@ impl Pass<'_> {
                     put(&mut group.mean, l, self.splats.mean(i));
                     match self.splats.geometry {
                         Geometry::Packed(rows) => {
-                            let row: [f32; SPLAT_LANES] = lanes_at(rows, i * SPLAT_LANES);
-                            put::<4>(&mut group.quat, l, lanes_at(&row, LANE_QUAT));
-                            put::<3>(&mut group.scale, l, lanes_at(&row, LANE_SCALE));
-                            group.opacity[l] = row[LANE_OPACITY];
+                            let row: [f32; SPLAT_STRIDE] = floats_at(rows, i * SPLAT_STRIDE);
+                            put::<4>(&mut group.quat, l, floats_at(&row, QUAT_OFFSET));
+                            put::<3>(&mut group.scale, l, floats_at(&row, SCALE_OFFSET));
+                            group.opacity[l] = row[OPACITY_OFFSET];
                         }
                         Geometry::Cov6 { cov6, opacities, .. } => {
-                            put::<6>(&mut group.cov6, l, lanes_at(cov6, 6 * i));
+                            put::<6>(&mut group.cov6, l, floats_at(cov6, 6 * i));
                             group.opacity[l] = opacities[i];
                         }
                     }
@@ -247,7 +247,7 @@ impl Part<'_> {
                 v.fill(0.0);
             }
         };
-        zero(self.rows, SPLAT_LANES);
+        zero(self.rows, SPLAT_STRIDE);
         zero(self.means, 3);
         zero(self.cov6, 6);
         zero(self.opacities, 1);
@@ -270,11 +270,11 @@ impl Part<'_> {
                 set(self.cov6, 6 * j, get::<6>(&group.d_cov6, l));
                 set(self.opacities, j, [group.d_opacity[l]]);
             } else {
-                let row = &mut self.rows[j * SPLAT_LANES..(j + 1) * SPLAT_LANES];
-                set(row, LANE_MEAN, get::<3>(&group.d_mean, l));
-                set(row, LANE_QUAT, get::<4>(&group.d_quat, l));
-                set(row, LANE_SCALE, get::<3>(&group.d_scale, l));
-                set(row, LANE_OPACITY, [group.d_opacity[l]]);
+                let row = &mut self.rows[j * SPLAT_STRIDE..(j + 1) * SPLAT_STRIDE];
+                set(row, MEAN_OFFSET, get::<3>(&group.d_mean, l));
+                set(row, QUAT_OFFSET, get::<4>(&group.d_quat, l));
+                set(row, SCALE_OFFSET, get::<3>(&group.d_scale, l));
+                set(row, OPACITY_OFFSET, [group.d_opacity[l]]);
             }
         }
     }
@@ -300,7 +300,7 @@ impl Part<'_> {
         let (values, lanes) = if self.rows.is_empty() {
             (&mut *self.means, 3)
         } else {
-            (&mut *self.rows, SPLAT_LANES)
+            (&mut *self.rows, SPLAT_STRIDE)
         };
         for (v, g) in values[j * lanes..j * lanes + 3].iter_mut().zip(g) {
             *v += g;

@@ -14,12 +14,12 @@
 use crate::abi::RasterOptions;
 use crate::camera::Camera;
 use crate::cpu::blend::Rules;
-use crate::cpu::disjoint::Disjoint;
 use crate::cpu::ewa::View;
 use crate::cpu::project::SplatSlices;
 use crate::cpu::project_bwd::{Gradients, Pass};
 use crate::cpu::raster_bwd_tile::{PairSums, SUMS, Scratch, Upstream, WalkTile};
 use crate::cpu::rasterize::{Rasterizer, since};
+use crate::cpu::shared_slice::SharedSliceMut;
 use crate::cpu::sort::depth_order;
 use crate::cpu::tiles::Grid;
 use rayon::prelude::*;
@@ -117,7 +117,7 @@ impl Rasterizer {
         let view = View::new(camera, options);
         self.grid = Grid::new(camera.intrinsics.width, camera.intrinsics.height);
         self.lists.begin(self.grid, splats.len());
-        self.projection.run(self.tier, splats, &view, options, &mut self.lists);
+        self.projection.run(self.level, splats, &view, options, &mut self.lists);
         self.lists.count();
         self.backward_of_last(splats, camera, options, gradients, out);
     }
@@ -174,7 +174,7 @@ impl Rasterizer {
             sums: &self.back.sums,
             radiance: &self.projection.parents,
         };
-        pass.run(self.tier, out);
+        pass.run(self.level, out);
         let mut background = [0.0f64; 3];
         for tile in &self.back.background {
             for (sum, v) in background.iter_mut().zip(tile) {
@@ -197,10 +197,10 @@ impl Rasterizer {
         }
         let mut queue: Vec<usize> = group.collect();
         queue.sort_unstable_by_key(|&t| (std::cmp::Reverse(self.lists.tile_len(t)), t));
-        let (grid, tier) = (self.grid, self.tier);
+        let (grid, level) = (self.grid, self.level);
         let footprints = &self.projection.footprints;
-        let (pairs, masks) = (Disjoint::new(pairs), Disjoint::new(masks));
-        let background = Disjoint::new(background);
+        let (pairs, masks) = (SharedSliceMut::new(pairs), SharedSliceMut::new(masks));
+        let background = SharedSliceMut::new(background);
         let lists = self.lists.lists();
         let threads = rayon::current_num_threads().min(queue.len());
         if scratch.len() < threads {
@@ -219,7 +219,7 @@ impl Rasterizer {
                     depth_order(list.entries, list.spare, list.order);
                 }
                 let (order, splats) = (&*list.order, list.splats);
-                let seen = tier.run(WalkTile {
+                let seen = level.run(WalkTile {
                     t,
                     grid,
                     order,

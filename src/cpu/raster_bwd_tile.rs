@@ -24,7 +24,7 @@ use crate::cpu::blend::{BLOCKS, Lanes, Rules};
 use crate::cpu::blocks::met;
 use crate::cpu::ewa::Footprint;
 use crate::cpu::ewa_bwd::Moments;
-use crate::cpu::simd::{self, Kernel, LANES, Simd};
+use crate::cpu::simd::{self, F32Vector, Kernel, LANES, Mask, Simd, Vector};
 use crate::cpu::tiles::Grid;
 
 /// Sums kept per (splat, tile): the numbers of [`Moments`].
@@ -302,8 +302,8 @@ impl Walks {
                 }
             }
             let (red, green, blue) = (s.load(&walk.g[0]), s.load(&walk.g[1]), s.load(&walk.g[2]));
-            let colour = s.fma(green, background[1], red * background[0]);
-            s.store(s.fma(blue, background[2], colour) - s.load(&alpha), &mut walk.behind);
+            let colour = green.fma(background[1], red * background[0]);
+            s.store(blue.fma(background[2], colour) - s.load(&alpha), &mut walk.behind);
         }
         (walks, live)
     }
@@ -324,9 +324,9 @@ impl Walks {
         for row in self.blocks.chunks_exact(BLOCKS) {
             let mut sums = [s.splat(0.0); 3];
             for walk in row {
-                let t = s.abs(s.load(&walk.t));
+                let t = s.load(&walk.t).abs();
                 for (sum, g) in sums.iter_mut().zip(&walk.g) {
-                    *sum = s.fma(t, s.load(g), *sum);
+                    *sum = t.fma(s.load(g), *sum);
                 }
             }
             for (total, sum) in total.iter_mut().zip(sums) {
@@ -341,7 +341,7 @@ impl Walks {
     fn whitened<S: Simd>(&self, s: S, b: usize, f: &Footprint) -> [S::F; 2] {
         let dx = s.load(&self.x[b % BLOCKS]) - s.splat(f.u);
         let dy = s.load(&self.y[b / BLOCKS % BLOCKS]) - s.splat(f.v);
-        [s.fma(s.splat(f.shear), dy, dx) * s.splat(f.sx), dy * s.splat(f.sy)]
+        [s.splat(f.shear).fma(dy, dx) * s.splat(f.sx), dy * s.splat(f.sy)]
     }
 }
 
@@ -367,20 +367,20 @@ fn step_forward<S: Simd>(
 ) -> (bool, bool) {
     let (least, zero) = (s.splat(ALPHA_MIN_LOG2), s.splat(0.0));
     let [across, down] = walks.whitened(s, b, f);
-    let power = s.fnma(down, down, s.fnma(across, across, s.splat(f.power)));
-    let alpha = s.min(simd::exp2(s, s.max(power, least)), s.splat(rules.alpha_max));
+    let power = down.fnma(down, across.fnma(across, s.splat(f.power)));
+    let alpha = s.splat(rules.alpha_max).min(simd::exp2(s, least.max(power)));
     let walk = &mut walks.blocks[b % (BLOCKS * BLOCKS)];
     let t = s.load(&walk.t);
-    let shows = s.le(least, power);
-    let rest = s.fnma(s.keep(shows, alpha), t, t);
+    let shows = least.le(power);
+    let rest = shows.select_or_zero(alpha).fnma(t, t);
     // Where blending has stopped, T < 0, and so is what is left of it.
-    let goes = s.lt(s.splat(rules.stop), rest);
+    let goes = s.splat(rules.stop).lt(rest);
     let adds = goes & shows;
-    let alpha = s.keep(adds, alpha);
+    let alpha = adds.select_or_zero(alpha);
     s.store(alpha, &mut item.alpha);
-    s.store(alpha * s.max(t, zero), &mut item.w);
-    s.store(s.select(goes, rest, s.negative(t)), &mut walk.t);
-    (s.any(adds), s.any(goes))
+    s.store(alpha * zero.max(t), &mut item.w);
+    s.store(goes.select(rest, t.neg_abs()), &mut walk.t);
+    (adds.any(), goes.any())
 }
 
 /// The same on the way back; adds to `sums`.
@@ -398,23 +398,23 @@ fn step_back<S: Simd>(
     let walk = &mut walks.blocks[b % (BLOCKS * BLOCKS)];
     let (alpha, w) = (s.load(&item.alpha), s.load(&item.w));
     let g = [s.load(&walk.g[0]), s.load(&walk.g[1]), s.load(&walk.g[2]), s.load(&walk.g[3])];
-    let q = s.fma(g[2], s.splat(f.rgb[2]), g[3] * s.splat(f.z));
-    let q = s.fma(g[0], s.splat(f.rgb[0]), s.fma(g[1], s.splat(f.rgb[1]), q));
+    let q = g[2].fma(s.splat(f.rgb[2]), g[3] * s.splat(f.z));
+    let q = g[0].fma(s.splat(f.rgb[0]), g[1].fma(s.splat(f.rgb[1]), q));
     let behind = s.load(&walk.behind);
     let more = q - behind;
-    s.store(s.fma(alpha, more, behind), &mut walk.behind);
-    let v = s.keep(s.lt(alpha, s.splat(rules.alpha_max)), w * more);
+    s.store(alpha.fma(more, behind), &mut walk.behind);
+    let v = alpha.lt(s.splat(rules.alpha_max)).select_or_zero(w * more);
     let (va, vd) = (v * across, v * down);
     [
         sums[0] + v,
         sums[1] + va,
         sums[2] + vd,
-        s.fma(va, across, sums[3]),
-        s.fma(va, down, sums[4]),
-        s.fma(vd, down, sums[5]),
-        s.fma(w, g[0], sums[6]),
-        s.fma(w, g[1], sums[7]),
-        s.fma(w, g[2], sums[8]),
-        s.fma(w, g[3], sums[9]),
+        va.fma(across, sums[3]),
+        va.fma(down, sums[4]),
+        vd.fma(down, sums[5]),
+        w.fma(g[0], sums[6]),
+        w.fma(g[1], sums[7]),
+        w.fma(g[2], sums[8]),
+        w.fma(g[3], sums[9]),
     ]
 }

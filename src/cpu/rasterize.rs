@@ -4,19 +4,19 @@
 //! In: [`SplatSlices`], a camera, [`RasterOptions`]. Out, H × W pixels row-major:
 //! RGB over the background, accumulated alpha 1 − T, and Σ w·z with z the camera z
 //! of the means in world units (in either convention). Work is spread over rayon's
-//! current pool; the same bytes come out whatever its size. Of the tiers only
-//! [`Tier::Scalar`] gives other bytes than the rest, since it rounds products.
+//! current pool; the same bytes come out whatever its size. Of the levels only
+//! [`SimdLevel::Scalar`] gives other bytes than the rest, since it rounds products.
 
 pub use crate::abi::Rendered;
 
 use crate::abi::{BLOCK, RasterOptions, TILE};
 use crate::camera::Camera;
 use crate::cpu::blend::{BLOCKS, RenderTile, Rules, Tile, Workplace};
-use crate::cpu::disjoint::Disjoint;
 use crate::cpu::ewa::{Footprint, View};
 use crate::cpu::project::{Projection, SplatSlices};
 use crate::cpu::raster_bwd::Buffers;
-use crate::cpu::simd::{Kernel, Simd, Tier};
+use crate::cpu::shared_slice::SharedSliceMut;
+use crate::cpu::simd::{Kernel, Simd, SimdLevel};
 use crate::cpu::sort::depth_order;
 use crate::cpu::tiles::{Grid, TileLists};
 use rayon::prelude::*;
@@ -66,7 +66,7 @@ struct Clocks {
 /// nothing.
 #[derive(Debug, Default)]
 pub struct Rasterizer {
-    pub(crate) tier: Tier,
+    pub(crate) level: SimdLevel,
     pub(crate) timed: bool,
     pub(crate) projection: Projection,
     pub(crate) lists: TileLists,
@@ -81,11 +81,11 @@ pub struct Rasterizer {
 /// A picture being written, tile by tile: pixel p's channel c stands at
 /// `rgb[p·step + c·channel]`.
 struct Target<'a> {
-    rgb: Disjoint<'a, f32>,
+    rgb: SharedSliceMut<'a, f32>,
     step: usize,
     channel: usize,
-    alpha: Disjoint<'a, f32>,
-    depth_sum: Disjoint<'a, f32>,
+    alpha: SharedSliceMut<'a, f32>,
+    depth_sum: SharedSliceMut<'a, f32>,
     background: [f32; 3],
 }
 
@@ -102,12 +102,12 @@ impl Rasterizer {
         self
     }
 
-    /// Uses the instructions of `tier` (default [`Tier::best`]; the scalar ones where
-    /// the processor lacks them). Tiers that fuse multiply and add give the same
+    /// Uses the instructions of `level` (default [`SimdLevel::best`]; the scalar ones where
+    /// the processor lacks them). Levels that fuse multiply and add give the same
     /// bytes; the scalar one differs in last bits (about 1e-6 of a colour, and
     /// a splat's contribution of 1/255 where that decides whether it is skipped).
-    pub fn with_tier(mut self, tier: Tier) -> Self {
-        self.tier = tier;
+    pub fn with_simd_level(mut self, level: SimdLevel) -> Self {
+        self.level = level;
         self
     }
 
@@ -143,11 +143,11 @@ impl Rasterizer {
         out.alpha.resize(width * height, 0.0);
         out.depth_sum.resize(width * height, 0.0);
         let target = Target {
-            rgb: Disjoint::new(&mut out.rgb),
+            rgb: SharedSliceMut::new(&mut out.rgb),
             step: 3,
             channel: 1,
-            alpha: Disjoint::new(&mut out.alpha),
-            depth_sum: Disjoint::new(&mut out.depth_sum),
+            alpha: SharedSliceMut::new(&mut out.alpha),
+            depth_sum: SharedSliceMut::new(&mut out.depth_sum),
             background: options.background,
         };
         self.project(splats, camera, options);
@@ -214,7 +214,7 @@ impl Rasterizer {
         let view = View::new(camera, options);
         self.grid = Grid::new(camera.intrinsics.width, camera.intrinsics.height);
         self.lists.begin(self.grid, splats.len());
-        self.projection.run(self.tier, splats, &view, options, &mut self.lists);
+        self.projection.run(self.level, splats, &view, options, &mut self.lists);
         self.times = StageTimes { project: since(start), ..StageTimes::default() };
     }
 
@@ -262,7 +262,7 @@ impl Rasterizer {
         self.queue.clear();
         self.queue.extend(group.map(|t| t as u32));
         self.queue.sort_unstable_by_key(|&t| (std::cmp::Reverse(lists.tile_len(t as usize)), t));
-        let (grid, tier, queue) = (self.grid, self.tier, &self.queue);
+        let (grid, level, queue) = (self.grid, self.level, &self.queue);
         let footprints = &self.projection.footprints;
         let lists = self.lists.lists();
         let (next, items) = (AtomicUsize::new(0), AtomicUsize::new(0));
@@ -274,15 +274,15 @@ impl Rasterizer {
                 // SAFETY: the queue names each tile once, and its counter gives each
                 // place to one thread.
                 let list = unsafe { lists.take(t) };
-                tier.run(AwaitTile { t, grid: &grid, target });
+                level.run(AwaitTile { t, grid: &grid, target });
                 depth_order(list.entries, list.spare, list.order);
                 let (order, splats) = (&*list.order, list.splats);
                 let sorted = timed.then(Instant::now);
                 let work =
                     RenderTile { place: &mut place, t, grid, order, splats, footprints, rules };
-                items.fetch_add(tier.run(work), Relaxed);
+                items.fetch_add(level.run(work), Relaxed);
                 let blended = timed.then(Instant::now);
-                tier.run(WriteTile { tile: &place.tile, t, grid: &grid, target });
+                level.run(WriteTile { tile: &place.tile, t, grid: &grid, target });
                 if let (Some(start), Some(sorted), Some(blended)) = (start, sorted, blended) {
                     let add = |clock: &AtomicU64, from: Instant, to: Instant| {
                         clock.fetch_add((to - from).as_nanos() as u64, Relaxed);
@@ -310,11 +310,11 @@ fn planes<'a>(camera: &Camera, options: &RasterOptions, out: &'a mut Vec<f32>) -
     let (rgb, rest) = out.split_at_mut(3 * plane);
     let (alpha, depth_sum) = rest.split_at_mut(plane);
     Target {
-        rgb: Disjoint::new(rgb),
+        rgb: SharedSliceMut::new(rgb),
         step: 1,
         channel: plane,
-        alpha: Disjoint::new(alpha),
-        depth_sum: Disjoint::new(depth_sum),
+        alpha: SharedSliceMut::new(alpha),
+        depth_sum: SharedSliceMut::new(depth_sum),
         background: options.background,
     }
 }

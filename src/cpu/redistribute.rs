@@ -16,9 +16,9 @@
 //! vector ([`super::lanes`]), so that a sum over children is a loop. Twins:
 //! kernels/redistribute.wgsl, src/gpu/redistribute.rs. Op: ops/redistribute.rs.
 
-use super::fresh::{Block, Fresh, start};
 use super::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};
 use super::real::Real;
+use super::uninit::{UninitBuffer, UninitSlice, zeroed};
 use crate::abi::{AREA_EPS, AREA_RULE_OPACITY_MAX, OPACITY_CEILING, RELATIVE_AREA_MIN};
 use rayon::prelude::*;
 
@@ -312,7 +312,7 @@ fn load_singles<M: Machine>(m: M, from: &[M::Scalar], count: usize) -> [M::V; 1]
 /// A block of parents forward.
 struct Forward<'a, T> {
     args: Args<'a, T>,
-    out: &'a mut Block<T>,
+    out: &'a mut UninitSlice<T>,
 }
 
 impl<T: LaneReal> Forward<'_, T> {
@@ -326,7 +326,7 @@ impl<T: LaneReal> Forward<'_, T> {
             a.load(m, &areas[at..], count);
             let (alpha, own) = (single(m, alphas, span), single(m, own, span));
             share(rule, a.as_ref(), alpha, own, o.as_mut());
-            o.store(m, start(&mut self.out[at..at + count * k]), count);
+            o.store(m, zeroed(&mut self.out[at..at + count * k]), count);
         }
     }
 }
@@ -347,12 +347,12 @@ impl<T: LaneReal> Kernel<T> for Forward<'_, T> {
 
 /// Opacities `[P, K]` of the children (module doc).
 pub fn forward<T: LaneReal>(args: Args<T>) -> Vec<T> {
-    let mut out = Fresh::new(args.alphas.len() * args.k);
-    out.blocks(args.k * BLOCK).enumerate().for_each(|(block, out)| {
+    let mut out = UninitBuffer::new(args.alphas.len() * args.k);
+    out.par_chunks_mut(args.k * BLOCK).enumerate().for_each(|(block, out)| {
         T::dispatch(Forward { args: args.parents(block * BLOCK, BLOCK), out });
     });
     // SAFETY: the loop above started every block.
-    unsafe { out.finish() }
+    unsafe { out.assume_init() }
 }
 
 /// Gradients of [`forward`].
@@ -371,10 +371,10 @@ pub struct Gradients<T> {
 struct Backward<'a, T> {
     args: Args<'a, T>,
     grad: &'a [T],
-    logits: &'a mut Block<T>,
-    areas: &'a mut Block<T>,
-    alphas: &'a mut Block<T>,
-    own: &'a mut Block<T>,
+    logits: &'a mut UninitSlice<T>,
+    areas: &'a mut UninitSlice<T>,
+    alphas: &'a mut UninitSlice<T>,
+    own: &'a mut UninitSlice<T>,
 }
 
 impl<T: LaneReal> Backward<'_, T> {
@@ -390,12 +390,12 @@ impl<T: LaneReal> Backward<'_, T> {
             let per_parent = (single(m, alphas, span), single(m, own, span));
             let (d_alpha, d_own) =
                 share_backward(rule, per_parent, g.as_mut(), l.as_mut(), a.as_mut());
-            l.store(m, start(&mut self.logits[at..at + count * k]), count);
-            a.store(m, start(&mut self.areas[at..at + count * k]), count);
+            l.store(m, zeroed(&mut self.logits[at..at + count * k]), count);
+            a.store(m, zeroed(&mut self.areas[at..at + count * k]), count);
             for (v, out) in [(d_alpha, &mut *self.alphas), (d_own, &mut *self.own)] {
                 let mut lanes = [T::default(); WIDTH_MAX];
                 m.store(v, &mut lanes);
-                start(&mut out[first..first + count]).copy_from_slice(&lanes[..count]);
+                zeroed(&mut out[first..first + count]).copy_from_slice(&lanes[..count]);
             }
         }
     }
@@ -418,27 +418,30 @@ impl<T: LaneReal> Kernel<T> for Backward<'_, T> {
 /// Gradients of [`forward`] for the gradient `grad` `[P, K]` of its result.
 pub fn backward<T: LaneReal>(args: Args<T>, grad: &[T]) -> Gradients<T> {
     let (p, k) = (args.alphas.len(), args.k);
-    let (mut logits, mut areas) = (Fresh::new(p * k), Fresh::new(p * k));
-    let (mut alphas, mut own) = (Fresh::new(p), Fresh::new(p));
-    type Own<'a, T> = ((&'a mut Block<T>, &'a mut Block<T>), (&'a mut Block<T>, &'a mut Block<T>));
+    let (mut logits, mut areas) = (UninitBuffer::new(p * k), UninitBuffer::new(p * k));
+    let (mut alphas, mut own) = (UninitBuffer::new(p), UninitBuffer::new(p));
+    type Own<'a, T> = (
+        (&'a mut UninitSlice<T>, &'a mut UninitSlice<T>),
+        (&'a mut UninitSlice<T>, &'a mut UninitSlice<T>),
+    );
     let one = |block: usize, ((logits, areas), (alphas, own)): Own<T>| {
         let args = args.parents(block * BLOCK, BLOCK);
         let grad = &grad[block * BLOCK * k..];
         T::dispatch(Backward { args, grad, logits, areas, alphas, own });
     };
     logits
-        .blocks(k * BLOCK)
-        .zip(areas.blocks(k * BLOCK))
-        .zip(alphas.blocks(BLOCK).zip(own.blocks(BLOCK)))
+        .par_chunks_mut(k * BLOCK)
+        .zip(areas.par_chunks_mut(k * BLOCK))
+        .zip(alphas.par_chunks_mut(BLOCK).zip(own.par_chunks_mut(BLOCK)))
         .enumerate()
         .for_each(|(block, own)| one(block, own));
     // SAFETY: the loop above started every block: all four have as many.
     unsafe {
         Gradients {
-            logits: logits.finish(),
-            areas: areas.finish(),
-            alphas: alphas.finish(),
-            own: own.finish(),
+            logits: logits.assume_init(),
+            areas: areas.assume_init(),
+            alphas: alphas.assume_init(),
+            own: own.assume_init(),
         }
     }
 }

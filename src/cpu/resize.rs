@@ -2,9 +2,9 @@
 //! nearest upsampling by a whole factor, with their transposes (the gradients).
 
 use super::activation::{self, Activation};
-use super::fresh::{Fresh, start};
 use super::join::repeat;
 use super::math::vectorised;
+use super::uninit::{UninitBuffer, zeroed};
 use rayon::prelude::*;
 
 /// Sizes of one resize of planes.
@@ -102,15 +102,15 @@ pub fn bilinear_then(r: &Resize, kind: Activation, x: &[f32]) -> Vec<f32> {
 fn planes(r: &Resize, x: &[f32], f: impl Fn(&mut [f32]) + Sync) -> Vec<f32> {
     let one = Bilinear::new(r);
     let (from, to) = (r.from[0] * r.from[1], r.to[0] * r.to[1]);
-    let mut fresh = Fresh::new(x.len() / from * to);
-    let planes = x.par_chunks_exact(from).zip(fresh.blocks(to));
+    let mut fresh = UninitBuffer::new(x.len() / from * to);
+    let planes = x.par_chunks_exact(from).zip(fresh.par_chunks_mut(to));
     planes.for_each_init(Vec::new, |wide, (x, y)| {
-        let y = start(y);
+        let y = zeroed(y);
         one.plane(x, y, wide);
         f(y);
     });
     // SAFETY: the loop above started every block: there is one for each plane of `x`.
-    unsafe { fresh.finish() }
+    unsafe { fresh.assume_init() }
 }
 
 /// The gradient of [`bilinear_then`], `dx` overwritten.
@@ -145,12 +145,12 @@ pub fn bilinear_transposed(r: &Resize, dy: &[f32], dx: &mut [f32]) {
 /// Every pixel repeated `s` × `s` times, new memory; `to` = `s`·`from`.
 pub fn nearest(r: &Resize, s: usize, x: &[f32]) -> Vec<f32> {
     let ([h, w], [to_h, to_w]) = (r.from, r.to);
-    let mut fresh = Fresh::new(x.len() / (h * w) * to_h * to_w);
-    let planes = x.par_chunks_exact(h * w).zip(fresh.blocks(to_h * to_w));
+    let mut fresh = UninitBuffer::new(x.len() / (h * w) * to_h * to_w);
+    let planes = x.par_chunks_exact(h * w).zip(fresh.par_chunks_mut(to_h * to_w));
     planes.for_each(|(x, y)| repeat(x, to_w, s, y));
     // SAFETY: the loop above wrote every block: there is one for each plane of `x`, and
     // `repeat` panics where it does not write all of one.
-    unsafe { fresh.finish() }
+    unsafe { fresh.assume_init() }
 }
 
 /// The transpose of [`nearest`]: sums of `s` × `s` blocks, `dx` overwritten.

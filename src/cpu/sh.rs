@@ -5,7 +5,7 @@
 //! coefficients `[D, 3]`, RGB innermost. Out: RGB before gain, offset and clamp.
 
 use crate::abi::{SH_COEFFICIENTS_MAX, ShBasis, sh_coefficients};
-use crate::cpu::simd::{LANES, Simd};
+use crate::cpu::simd::{LANES, Mask, Simd, Vector};
 use std::ops::{Add, Mul, Sub};
 
 /// Highest degree that `basis` evaluates.
@@ -152,13 +152,13 @@ pub(crate) fn radiance_lanes<S: Simd>(
     // Four coefficients are twelve floats, three transposed quads.
     let mut c = 0;
     while c + 4 <= used {
-        let [r0, g0, b0, r1] = s.load4(sh, at, 3 * c);
-        let [g1, b1, r2, g2] = s.load4(sh, at, 3 * c + 4);
-        let [b2, r3, g3, b3] = s.load4(sh, at, 3 * c + 8);
+        let [r0, g0, b0, r1] = s.gather4(sh, at, 3 * c);
+        let [g1, b1, r2, g2] = s.gather4(sh, at, 3 * c + 4);
+        let [b2, r3, g3, b3] = s.gather4(sh, at, 3 * c + 8);
         let (y0, y1, y2, y3) = (b[c], b[c + 1], b[c + 2], b[c + 3]);
-        rgb[0] = s.fma(r3, y3, s.fma(r2, y2, s.fma(r1, y1, s.fma(r0, y0, rgb[0]))));
-        rgb[1] = s.fma(g3, y3, s.fma(g2, y2, s.fma(g1, y1, s.fma(g0, y0, rgb[1]))));
-        rgb[2] = s.fma(b3, y3, s.fma(b2, y2, s.fma(b1, y1, s.fma(b0, y0, rgb[2]))));
+        rgb[0] = r3.fma(y3, r2.fma(y2, r1.fma(y1, r0.fma(y0, rgb[0]))));
+        rgb[1] = g3.fma(y3, g2.fma(y2, g1.fma(y1, g0.fma(y0, rgb[1]))));
+        rgb[2] = b3.fma(y3, b2.fma(y2, b1.fma(y1, b0.fma(y0, rgb[2]))));
         c += 4;
     }
     // (degree + 1)² leaves one or none.
@@ -170,9 +170,9 @@ pub(crate) fn radiance_lanes<S: Simd>(
                 lanes[l] = *v;
             }
         }
-        rgb[0] = s.fma(s.load(&last[0]), b[c], rgb[0]);
-        rgb[1] = s.fma(s.load(&last[1]), b[c], rgb[1]);
-        rgb[2] = s.fma(s.load(&last[2]), b[c], rgb[2]);
+        rgb[0] = s.load(&last[0]).fma(b[c], rgb[0]);
+        rgb[1] = s.load(&last[1]).fma(b[c], rgb[1]);
+        rgb[2] = s.load(&last[2]).fma(b[c], rgb[2]);
     }
     rgb
 }
@@ -180,10 +180,14 @@ pub(crate) fn radiance_lanes<S: Simd>(
 /// [`direction`] of sixteen vectors.
 #[inline(always)]
 pub(crate) fn direction_lanes<S: Simd>(s: S, v: [S::F; 3]) -> [S::F; 3] {
-    let norm = s.sqrt(s.fma(v[0], v[0], s.fma(v[1], v[1], v[2] * v[2])));
-    let good = s.lt(s.splat(0.0), norm) & s.lt(norm, s.splat(f32::INFINITY));
-    let inverse = s.keep(good, s.splat(1.0) / norm);
-    [s.keep(good, v[0] * inverse), s.keep(good, v[1] * inverse), s.keep(good, v[2] * inverse)]
+    let norm = v[0].fma(v[0], v[1].fma(v[1], v[2] * v[2])).sqrt();
+    let good = s.splat(0.0).lt(norm) & norm.lt(s.splat(f32::INFINITY));
+    let inverse = good.select_or_zero(s.splat(1.0) / norm);
+    [
+        good.select_or_zero(v[0] * inverse),
+        good.select_or_zero(v[1] * inverse),
+        good.select_or_zero(v[2] * inverse),
+    ]
 }
 
 /// `v` / ‖v‖, or the zero vector where that has no direction.
@@ -195,7 +199,7 @@ pub fn direction(v: [f32; 3]) -> [f32; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cpu::simd::{Kernel, Tier};
+    use crate::cpu::simd::{Kernel, SimdLevel};
     use glam::DVec3;
 
     fn directions() -> impl Iterator<Item = DVec3> {
@@ -267,7 +271,7 @@ mod tests {
         }
     }
 
-    /// Sixteen at a time give what one at a time does, in every tier, for sets of
+    /// Sixteen at a time give what one at a time does, in every level, for sets of
     /// any degree stored and evaluated, the last set of the slice included.
     #[test]
     fn lanes_are_the_single_one() {
@@ -282,14 +286,17 @@ mod tests {
             let at = std::array::from_fn(|l| (l * 5 % 9) * set);
             for degree in 0..=stored {
                 for kind in [ShBasis::Standard, ShBasis::Mvsplat] {
-                    for &tier in Tier::available() {
-                        let got = tier.run(Lanes(kind, degree, &vectors, &sh, &at));
+                    for &level in SimdLevel::available() {
+                        let got = level.run(Lanes(kind, degree, &vectors, &sh, &at));
                         for l in 0..LANES {
                             let set = &sh[at[l]..at[l] + set];
                             let expected = radiance(kind, degree, direction(vectors[l]), set);
                             for c in 0..3 {
                                 let (a, b) = (got[c][l], expected[c]);
-                                assert!((a - b).abs() < 2e-6, "{tier:?} {stored} {degree} {a} {b}");
+                                assert!(
+                                    (a - b).abs() < 2e-6,
+                                    "{level:?} {stored} {degree} {a} {b}"
+                                );
                             }
                         }
                     }

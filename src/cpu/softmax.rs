@@ -1,9 +1,9 @@
 //! Softmax over rows, with its gradient.
 //! Oracle: the definition in f64 (`model::layers`' tests).
 
-use super::fresh::{Block, Fresh};
 use super::math::vectorised;
-use super::simd::{Kernel, LANES, Simd, Tier, exp2_by_sums, first_lanes};
+use super::simd::{Kernel, LANES, Mask, Simd, SimdLevel, Vector, exp2_by_sums, first_lanes_bits};
+use super::uninit::{UninitBuffer, UninitSlice};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
@@ -20,7 +20,7 @@ pub(super) fn exp_row<S: Simd>(s: S, row: &mut [f32]) -> f32 {
     let mut most = [0.0; LANES];
     s.store(across(s, tops), &mut most);
     // SAFETY: a number is a place; numbers are written to each.
-    let places = unsafe { super::fresh::over(row) }.as_mut_ptr();
+    let places = unsafe { super::uninit::as_uninit(row) }.as_mut_ptr();
     // SAFETY: the row, read from where it is written.
     unsafe { exps(s, places.cast(), places, row.len(), most[0]) }
 }
@@ -33,20 +33,20 @@ fn largest<S: Simd>(s: S, row: &[f32]) -> S::F {
     let (fours, rest) = chunks.as_chunks::<4>();
     for four in fours {
         for (top, v) in tops.iter_mut().zip(four) {
-            *top = s.max(s.load(v), *top);
+            *top = top.max(s.load(v));
         }
     }
     for v in rest {
-        tops[0] = s.max(s.load(v), tops[0]);
+        tops[0] = tops[0].max(s.load(v));
     }
     if !tail.is_empty() {
-        let bits = first_lanes(tail.len());
+        let bits = first_lanes_bits(tail.len());
         // SAFETY: as many are there.
-        let v = unsafe { s.load_lanes(tail.as_ptr(), bits) };
-        let v = s.select(s.mask(u32::from(bits)), v, tops[1]);
-        tops[1] = s.max(v, tops[1]);
+        let v = unsafe { s.load_masked(tail.as_ptr(), bits) };
+        let v = s.mask_from_bits(u32::from(bits)).select(v, tops[1]);
+        tops[1] = tops[1].max(v);
     }
-    s.max(s.max(tops[0], tops[1]), s.max(tops[2], tops[3]))
+    tops[3].max(tops[2]).max(tops[1].max(tops[0]))
 }
 
 /// The largest lane of each vector.
@@ -55,7 +55,7 @@ fn across<S: Simd>(s: S, v: [S::F; LANES]) -> S::F {
     let mut v = s.transpose(v);
     for half in [8, 4, 2, 1] {
         for i in 0..half {
-            v[i] = s.max(v[i + half], v[i]);
+            v[i] = v[i].max(v[i + half]);
         }
     }
     v[0]
@@ -66,7 +66,7 @@ fn across<S: Simd>(s: S, v: [S::F; LANES]) -> S::F {
 #[inline(always)]
 fn exp_negative<S: Simd>(s: S, d: S::F) -> S::F {
     let p = d * s.splat(std::f32::consts::LOG2_E);
-    s.select(s.lt(p, s.splat(-125.0)), s.splat(0.0), exp2_by_sums(s, p))
+    p.lt(s.splat(-125.0)).select(s.splat(0.0), exp2_by_sums(s, p))
 }
 
 /// e^{x − max} of `n` numbers at `x` to `y`; returns the sum.
@@ -102,17 +102,17 @@ unsafe fn exp_part<S: Simd>(
         unsafe {
             let e = exp_negative(s, s.load(&*x.add(at).cast()) - max);
             sum = sum + e;
-            s.store_fresh(e, &mut *y.add(at).cast());
+            s.store_uninit(e, &mut *y.add(at).cast());
         }
     }
     if whole < n {
-        let bits = first_lanes(n - whole);
+        let bits = first_lanes_bits(n - whole);
         // SAFETY: the rest of both.
         unsafe {
-            let e = exp_negative(s, s.load_lanes(x.add(whole), bits) - max);
-            let e = s.keep(s.mask(u32::from(bits)), e);
+            let e = exp_negative(s, s.load_masked(x.add(whole), bits) - max);
+            let e = s.mask_from_bits(u32::from(bits)).select_or_zero(e);
             sum = sum + e;
-            s.store_lanes(e, y.add(whole), bits);
+            s.store_masked(e, y.add(whole), bits);
         }
     }
     sum
@@ -135,18 +135,18 @@ fn times<S: Simd>(s: S, row: &mut [f32], by: f32) {
 /// Softmax of every row of `x` `[rows, n]`, new memory.
 pub fn softmax(n: usize, x: &[f32]) -> Vec<f32> {
     let chunk = CHUNK.div_ceil(n.max(1)) * n.max(1);
-    let mut fresh = Fresh::new(x.len());
-    fresh.blocks(chunk).zip(x.par_chunks(chunk)).for_each(|(y, x)| {
-        Tier::best().run(Softmax { n, x, y });
+    let mut fresh = UninitBuffer::new(x.len());
+    fresh.par_chunks_mut(chunk).zip(x.par_chunks(chunk)).for_each(|(y, x)| {
+        SimdLevel::best().run(Softmax { n, x, y });
     });
     // SAFETY: the loop above wrote every block.
-    unsafe { fresh.finish() }
+    unsafe { fresh.assume_init() }
 }
 
 struct Softmax<'a> {
     n: usize,
     x: &'a [f32],
-    y: &'a mut Block<f32>,
+    y: &'a mut UninitSlice<f32>,
 }
 
 impl Kernel for Softmax<'_> {
@@ -185,7 +185,7 @@ impl Kernel for Softmax<'_> {
             s.store(s.splat(1.0) / s.load(&kept), &mut inverses);
             for (y, inverse) in y.chunks_exact_mut(n).zip(inverses) {
                 // SAFETY: written by the loops above.
-                times(s, unsafe { &mut *(y as *mut Block<f32> as *mut [f32]) }, inverse);
+                times(s, unsafe { &mut *(y as *mut UninitSlice<f32> as *mut [f32]) }, inverse);
             }
         }
     }

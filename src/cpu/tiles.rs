@@ -10,8 +10,8 @@
 //! [`PAIRS_PER_GROUP`] entries (or one tile's), however many tiles the splats cover.
 
 use crate::abi::TILE;
-use crate::cpu::disjoint::Disjoint;
 use crate::cpu::ewa::Footprint;
+use crate::cpu::shared_slice::SharedSliceMut;
 use crate::cpu::sort::entry;
 use rayon::prelude::*;
 use std::ops::Range;
@@ -185,9 +185,9 @@ pub(crate) struct TileList<'a> {
 pub(crate) struct GroupLists<'a> {
     counts: &'a [u32],
     starts: &'a [u32],
-    entries: Disjoint<'a, u64>,
-    spare: Disjoint<'a, u64>,
-    order: Disjoint<'a, u32>,
+    entries: SharedSliceMut<'a, u64>,
+    spare: SharedSliceMut<'a, u64>,
+    order: SharedSliceMut<'a, u32>,
     splats: &'a [u32],
 }
 
@@ -341,7 +341,8 @@ impl TileLists {
             self.splats.resize(total, 0);
             self.order.resize(total, 0);
         }
-        let (entries, splats) = (Disjoint::new(&mut self.entries), Disjoint::new(&mut self.splats));
+        let (entries, splats) =
+            (SharedSliceMut::new(&mut self.entries), SharedSliceMut::new(&mut self.splats));
         let (grid, starts) = (self.grid, &self.starts);
         let rows = group.start / grid.columns..group.end.div_ceil(grid.columns);
         let chunks = self.covers.par_chunks(self.chunk).zip(&self.lens);
@@ -445,9 +446,9 @@ impl TileLists {
         GroupLists {
             counts: &self.counts,
             starts: &self.starts,
-            entries: Disjoint::new(&mut self.entries),
-            spare: Disjoint::new(&mut self.spare),
-            order: Disjoint::new(&mut self.order),
+            entries: SharedSliceMut::new(&mut self.entries),
+            spare: SharedSliceMut::new(&mut self.spare),
+            order: SharedSliceMut::new(&mut self.order),
             splats: &self.splats,
         }
     }

@@ -1,9 +1,10 @@
 //! Stages of a frame as lists of calls: projection with the sort by depth, then the (splat, tile)
 //! pairs and the pixels of a picture.
 
+use crate::abi::View;
 use crate::abi::{
-    BlendRules, FOOTPRINT_LANES, GPU_BLOCK, PLAN_EACH, PLAN_WORDS, RasterOptions, RasterUniform,
-    ShBasis, ShDirection, TILE_GPU,
+    BlendRules, FOOTPRINT_STRIDE, GPU_BLOCK, PLAN_ELEMENT_GROUPS, PLAN_WORDS, RasterOptions,
+    RasterUniform, ShBasis, ShDirection, TILE_GPU,
 };
 use crate::camera::Camera;
 use crate::gpu::buffers::{Binding, Buffer};
@@ -15,7 +16,6 @@ use crate::gpu::raster_kernels::{
 };
 use crate::gpu::scene::Scene;
 use crate::gpu::sort::{Sort, plan_of};
-use crate::view::View;
 
 /// Threads of a workgroup whose threads process one splat each.
 pub(crate) const THREADS: usize = 64;
@@ -44,7 +44,7 @@ impl Store {
     pub(crate) fn new(gpu: &Gpu, first: usize, count: usize) -> Result<Self, GpuError> {
         Ok(Self {
             first,
-            footprints: gpu.empty::<f32>("footprints", FOOTPRINT_LANES * count)?,
+            footprints: gpu.empty::<f32>("footprints", FOOTPRINT_STRIDE * count)?,
             rectangles: gpu.empty::<u32>("tile rectangles", 2 * count)?,
         })
     }
@@ -222,7 +222,7 @@ pub(crate) fn composite(
     let ranges = gpu.empty::<u32>("tile ranges", 2 * (tiles + 1))?;
     commands.clear(&ranges);
     let bindings = bind([&whole, &plan, &pairs.keys[0], &ranges]);
-    let per_element = Groups::Indirect(plan.clone(), 4 * PLAN_EACH as u64);
+    let per_element = Groups::Indirect(plan.clone(), 4 * PLAN_ELEMENT_GROUPS as u64);
     commands.run(&RANGES, &[], &bindings, per_element)?;
 
     commands.stage("rasterize");

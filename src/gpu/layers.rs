@@ -7,7 +7,7 @@
 //!
 //! Two cases remain too large: 4 bytes per splat, or one row of tiles, exceed a binding.
 
-use crate::abi::{FOOTPRINT_LANES, PLAN_ASKED, PLAN_WORDS, RasterUniform, TILE_GPU};
+use crate::abi::{FOOTPRINT_STRIDE, PLAN_REQUESTED, PLAN_WORDS, RasterUniform, TILE_GPU};
 use crate::gpu::buffers::Buffer;
 use crate::gpu::commands::{Commands, Groups};
 use crate::gpu::device::Gpu;
@@ -21,7 +21,7 @@ use crate::gpu::scene::Scene;
 use std::time::Duration;
 
 /// Floats of a pixel: R, G, B, alpha, depth sum.
-pub(crate) const PICTURE_LANES: usize = 5;
+pub(crate) const PICTURE_CHANNELS: usize = 5;
 
 /// Stage times, in order.
 pub(crate) type Times = Vec<(&'static str, Duration)>;
@@ -140,14 +140,14 @@ impl Band {
         let plan = commands.read::<u32>(&plan, PLAN_WORDS)?;
         let submitted = commands.submit()?;
         let (offsets, plan) = (offsets.take(gpu)?, plan.take(gpu)?);
-        let total = plan.get(PLAN_ASKED).copied().unwrap_or(u32::MAX);
+        let total = plan.get(PLAN_REQUESTED).copied().unwrap_or(u32::MAX);
         // The prefix sums saturate at this value (kernels/shared/scan.wgsl).
         if total == u32::MAX {
             let (needed, limit) = (u64::from(total), u64::from(total - 1));
             return Err(GpuError::TooSmall { resource: "(splat, tile) pairs", needed, limit });
         }
         let limits = LayerLimits {
-            splats: gpu.rows_per_binding(FOOTPRINT_LANES),
+            splats: gpu.rows_per_binding(FOOTPRINT_STRIDE),
             pairs: gpu.rows_per_binding(words_per_pair),
         };
         let layers = cut(&offsets, total, limits)?;
@@ -219,9 +219,9 @@ impl Rasterizer {
     ) -> Result<Vec<(RasterUniform, R)>, GpuError> {
         let gpu = self.gpu().clone();
         let (mut ends, mut times, mut pairs) = (Vec::new(), Times::new(), 0);
-        for call in bands(&gpu, whole, PICTURE_LANES)? {
+        for call in bands(&gpu, whole, PICTURE_CHANNELS)? {
             let band = Band::open(&gpu, scene, call, 1, self.timed)?;
-            let picture = gpu.empty::<f32>("the picture", PICTURE_LANES * pixels(&call))?;
+            let picture = gpu.empty::<f32>("the picture", PICTURE_CHANNELS * pixels(&call))?;
             for index in 0..band.layers.len() {
                 let mut commands = gpu.commands("layer", self.timed);
                 band.draw(&gpu, &mut commands, scene, index, &picture)?;
@@ -245,11 +245,11 @@ impl Rasterizer {
         whole: &RasterUniform,
     ) -> Result<Vec<f32>, GpuError> {
         let bands = self.layered(scene, whole, |commands, call, picture| {
-            commands.read::<f32>(picture, PICTURE_LANES * pixels(call))
+            commands.read::<f32>(picture, PICTURE_CHANNELS * pixels(call))
         })?;
         let all = pixels(whole);
-        let mut out = vec![0.0; PICTURE_LANES * all];
-        let planes: &[usize] = if whole.step == 1 { &[1; PICTURE_LANES] } else { &[3, 1, 1] };
+        let mut out = vec![0.0; PICTURE_CHANNELS * all];
+        let planes: &[usize] = if whole.step == 1 { &[1; PICTURE_CHANNELS] } else { &[3, 1, 1] };
         for (call, picture) in bands {
             let (own, first) = (pixels(&call), call.top as usize * TILE_GPU * call.width as usize);
             let picture = picture.take(self.gpu())?;

@@ -3,7 +3,7 @@
 //! CPU version: [`crate::cpu::plane_sweep`]. WGSL: kernels/plane_sweep.wgsl. Tests:
 //! tests/gpu/network.rs.
 
-use crate::abi::{Pair, PlaneSweepUniform, SWEEP_PAIR_LANES, Sweep};
+use crate::abi::{Pair, PlaneSweepUniform, SWEEP_PAIR_STRIDE, Sweep};
 use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::device::Gpu;
@@ -117,7 +117,7 @@ impl<'a> PlaneSweepArgs<'a> {
 /// Returns a pair in the layout of the kernels.
 fn pair_floats(p: &Pair) -> impl Iterator<Item = f32> {
     let all = p.inverse.into_iter().chain(p.rotation).chain(p.t).chain(p.k);
-    all.take(SWEEP_PAIR_LANES)
+    all.take(SWEEP_PAIR_STRIDE)
 }
 
 impl Gpu {

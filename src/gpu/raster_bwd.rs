@@ -18,7 +18,7 @@ use crate::gpu::commands::{Commands, Groups};
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
 use crate::gpu::frame::{Channels, Depths, FrameBuffers, Store, THREADS, bind, pixels, tiles};
-use crate::gpu::layers::{Band, PICTURE_LANES, Times, add_times, bands};
+use crate::gpu::layers::{Band, PICTURE_CHANNELS, Times, add_times, bands};
 use crate::gpu::raster_kernels::{COLOUR_BWD, PAIR_SUMS as SUM_PAIRS, PROJECT_BWD, RASTERIZE_BWD};
 use crate::gpu::rasterize::Rasterizer;
 use crate::gpu::scene::{COV6_STRIDE, Part, Scene};
@@ -52,7 +52,7 @@ struct PartSums<'a> {
 
 /// Floats of a pixel's gradients in the backward pass through layers: the picture's, and the
 /// transmittance.
-const LAYER_LANES: usize = PICTURE_LANES + 1;
+const LAYER_CHANNELS: usize = PICTURE_CHANNELS + 1;
 
 /// Gradients with respect to the splats and the background, on the device.
 struct Pending {
@@ -118,7 +118,7 @@ impl Frame {
     /// [`GpuError::Argument`] for gradients of another size; [`GpuError::TooSmall`] and other
     /// errors of the device, after which the CPU rasterizer can be used.
     pub fn backward(&mut self, gradients: &[f32]) -> Result<Gradients, GpuError> {
-        let numbers = PICTURE_LANES * pixels(&self.call);
+        let numbers = PICTURE_CHANNELS * pixels(&self.call);
         let lengths = [("gradients", gradients.len(), numbers)];
         GpuError::check_lengths(RASTERIZE_BWD.name, lengths)?;
         self.times.clear();
@@ -201,7 +201,7 @@ impl Frame {
         sums.iter().for_each(|sums| commands.clear(sums));
         commands.submit()?;
         let (mut background, mut stores) = (Vec::new(), Vec::new());
-        for call in bands(&gpu, &self.call, LAYER_LANES)? {
+        for call in bands(&gpu, &self.call, LAYER_CHANNELS)? {
             let band = Band::open(&gpu, &scene, call, PAIR_SUMS, self.timed)?;
             background.push(self.backward_of_band(&band, gradients, &sums)?);
             add_times(&mut self.times, band.times);
@@ -229,7 +229,7 @@ impl Frame {
         sums: &[Buffer],
     ) -> Result<Reading<f32>, GpuError> {
         let (gpu, scene) = (self.gpu.clone(), self.scene.clone());
-        let picture = gpu.empty::<f32>("the picture", PICTURE_LANES * pixels(&band.call))?;
+        let picture = gpu.empty::<f32>("the picture", PICTURE_CHANNELS * pixels(&band.call))?;
         let mut frames = Vec::new();
         for index in 0..band.layers.len() {
             let mut commands = gpu.commands("layer", self.timed);
@@ -329,11 +329,11 @@ impl Frame {
 fn band_gradients(whole: &[f32], call: &RasterUniform) -> Vec<f32> {
     let (plane, own) = ((call.width * call.height) as usize, pixels(call));
     let first = call.top as usize * TILE_GPU * call.width as usize;
-    let mut out = Vec::with_capacity(LAYER_LANES * own);
+    let mut out = Vec::with_capacity(LAYER_CHANNELS * own);
     for plane in whole.chunks_exact(plane.max(1)) {
         out.extend_from_slice(plane.get(first..first + own).unwrap_or(&[]));
     }
-    out.resize(LAYER_LANES * own, 0.0);
+    out.resize(LAYER_CHANNELS * own, 0.0);
     out
 }
 

@@ -8,7 +8,8 @@
 //! binding are drawn in layers (src/gpu/layers.rs).
 
 use crate::abi::{
-    FOOTPRINT_LANES, PLAN_ASKED, PLAN_WORDS, RasterOptions, RasterUniform, Rendered, SplatSlices,
+    FOOTPRINT_STRIDE, PLAN_REQUESTED, PLAN_WORDS, RasterOptions, RasterUniform, Rendered,
+    SplatSlices,
 };
 use crate::camera::Camera;
 use crate::gpu::buffers::Reading;
@@ -16,7 +17,7 @@ use crate::gpu::commands::Commands;
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
 use crate::gpu::frame::{Channels, FrameBuffers, Store, composite, pixels, project, uniform};
-use crate::gpu::layers::PICTURE_LANES;
+use crate::gpu::layers::PICTURE_CHANNELS;
 use crate::gpu::scene::Scene;
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
@@ -169,7 +170,7 @@ impl Rasterizer {
             let gpu = self.gpu.clone();
             let mut commands = gpu.commands("frame", self.timed);
             let frame = self.record(&mut commands, scene, &call)?;
-            let picture = commands.read::<f32>(&frame.picture, PICTURE_LANES * pixels(&call))?;
+            let picture = commands.read::<f32>(&frame.picture, PICTURE_CHANNELS * pixels(&call))?;
             let plan = commands.read::<u32>(&frame.plan, PLAN_WORDS)?;
             let submitted = commands.submit()?;
             let plan = plan.take(&gpu)?;
@@ -185,14 +186,14 @@ impl Rasterizer {
     /// Returns whether the footprints, the pixels or the pairs exceed a binding.
     pub(crate) fn needs_layers(&self, scene: &Scene, call: &RasterUniform) -> bool {
         self.pairs_exceed_binding
-            || scene.len > self.gpu.rows_per_binding(FOOTPRINT_LANES)
-            || pixels(call) > self.gpu.rows_per_binding(PICTURE_LANES)
+            || scene.len > self.gpu.rows_per_binding(FOOTPRINT_STRIDE)
+            || pixels(call) > self.gpu.rows_per_binding(PICTURE_CHANNELS)
     }
 
     /// Records the pair count of a frame from its plan; returns whether the capacity was
     /// sufficient.
     pub(crate) fn update_capacity(&mut self, plan: &[u32]) -> bool {
-        let requested = plan.get(PLAN_ASKED).copied().unwrap_or(u32::MAX) as usize;
+        let requested = plan.get(PLAN_REQUESTED).copied().unwrap_or(u32::MAX) as usize;
         if requested <= self.capacity {
             self.pairs = requested;
             return true;
@@ -224,7 +225,7 @@ impl Rasterizer {
         let store = Store::new(gpu, 0, scene.len)?;
         let stores = vec![store.clone(); scene.parts.len()];
         let depths = project(gpu, commands, scene, call, &stores)?;
-        let picture = gpu.empty::<f32>("the picture", PICTURE_LANES * pixels(&call))?;
+        let picture = gpu.empty::<f32>("the picture", PICTURE_CHANNELS * pixels(&call))?;
         composite(gpu, commands, call, store, depths, &picture)
     }
 }

@@ -1,6 +1,6 @@
 //! Splats in device memory, divided into parts where one binding is too small.
 
-use crate::abi::{FOOTPRINT_LANES, Geometry, SPLAT_LANES, SplatSlices, sh_coefficients};
+use crate::abi::{FOOTPRINT_STRIDE, Geometry, SPLAT_STRIDE, SplatSlices, sh_coefficients};
 use crate::gpu::buffers::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
@@ -64,7 +64,7 @@ impl Gpu {
         }
         let joined_rows;
         let (rows, stride) = match splats.geometry {
-            Geometry::Packed(rows) => (rows, SPLAT_LANES),
+            Geometry::Packed(rows) => (rows, SPLAT_STRIDE),
             Geometry::Cov6 { means, cov6, opacities } => {
                 joined_rows = covariance_rows(means, cov6, opacities);
                 (&joined_rows[..], COV6_STRIDE)
@@ -74,7 +74,7 @@ impl Gpu {
         let sh_stride = 3 * sh_coefficients(splats.sh_degree);
         let gain_stride = splats.gain.len().checked_div(n).unwrap_or(0);
         // The footprints of a part fit a binding, too (src/gpu/layers.rs).
-        let max_parents = [FOOTPRINT_LANES * children, sh_stride, gain_stride * children]
+        let max_parents = [FOOTPRINT_STRIDE * children, sh_stride, gain_stride * children]
             .into_iter()
             .map(|floats| self.rows_per_binding(floats))
             .min()

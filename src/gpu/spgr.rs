@@ -3,7 +3,7 @@
 //! CPU version: [`crate::cpu::spgr`]. WGSL: kernels/spgr.wgsl. Tests: tests/gpu/spgr.rs.
 
 use crate::abi::{
-    CHILDREN_MAX, FRUSTUM_MARGIN, HEAD_LANES, Rules, SPGR_CAMERA_LANES, SPLAT_LANES, SpgrUniform,
+    CHILDREN_MAX, FRUSTUM_MARGIN, HEAD_STRIDE, Rules, SPGR_CAMERA_STRIDE, SPLAT_STRIDE, SpgrUniform,
 };
 use crate::camera::Camera;
 use crate::gpu::buffers::Binding;
@@ -59,15 +59,15 @@ pub struct SpgrArgs<'a> {
 impl<'a> SpgrArgs<'a> {
     /// Checks the arguments and returns N.
     pub(super) fn check(&self) -> Result<usize, GpuError> {
-        let n = self.parents.len() / SPLAT_LANES;
+        let n = self.parents.len() / SPLAT_STRIDE;
         let k = self.rules.children();
         let lengths = [
             ("children per parent", k, k.clamp(1, CHILDREN_MAX)),
             ("cameras", self.cameras.len(), self.cameras.len().max(1)),
             ("near planes", self.near.len(), self.cameras.len()),
             ("parents per view", self.per_view, self.per_view.max(1)),
-            ("parents", self.parents.len(), n * SPLAT_LANES),
-            ("head records", self.head.len(), n * k * HEAD_LANES),
+            ("parents", self.parents.len(), n * SPLAT_STRIDE),
+            ("head records", self.head.len(), n * k * HEAD_STRIDE),
         ];
         GpuError::check_lengths(SPGR.name, lengths).map(|()| n)
     }
@@ -114,13 +114,13 @@ impl<'a> SpgrArgs<'a> {
         let part = |of: &'a [f32], width: usize| {
             of.get(parents.start * width..parents.end * width).unwrap_or(&[])
         };
-        [part(self.head, self.rules.children() * HEAD_LANES), part(self.parents, SPLAT_LANES)]
+        [part(self.head, self.rules.children() * HEAD_STRIDE), part(self.parents, SPLAT_STRIDE)]
     }
 }
 
 /// Returns a camera in the order of kernels/shared/spgr.wgsl; bounds are computed in f64, as on
 /// the CPU.
-fn camera_floats(camera: &Camera, near: f32) -> [f32; SPGR_CAMERA_LANES] {
+fn camera_floats(camera: &Camera, near: f32) -> [f32; SPGR_CAMERA_STRIDE] {
     let k = camera.intrinsics;
     let focal = [f64::from(k.fx), f64::from(k.fy)];
     let centre = [f64::from(k.cx), f64::from(k.cy)];
@@ -137,7 +137,7 @@ fn camera_floats(camera: &Camera, near: f32) -> [f32; SPGR_CAMERA_LANES] {
     ];
     let min_z = (0.01 * f64::from(near)).max(1e-3);
     let all = rotation.chain(position).chain(focal).chain(centre).chain(size);
-    let mut floats = [0.0; SPGR_CAMERA_LANES];
+    let mut floats = [0.0; SPGR_CAMERA_STRIDE];
     for (to, v) in floats.iter_mut().zip(all.chain([min_z]).chain(bounds)) {
         *to = v as f32;
     }
@@ -154,19 +154,19 @@ impl Gpu {
         let (k, gain_stride) = (args.rules.children(), args.rules.gain_lanes());
         let cameras = self.upload("context cameras", &args.cameras())?;
         let (mut rows, mut gains) = (Vec::new(), Vec::new());
-        for parents in Self::chunks(n, self.rows_per_binding(k * HEAD_LANES.max(SPLAT_LANES))) {
+        for parents in Self::chunks(n, self.rows_per_binding(k * HEAD_STRIDE.max(SPLAT_STRIDE))) {
             let count = parents.len() * k;
             let uniform = self.uniform(&args.uniform(&parents))?;
             let [head, own] = args.rows(&parents);
             let head = self.upload("head records", head)?;
             let own = self.upload("parents", own)?;
-            let children = self.empty::<f32>("children", count * SPLAT_LANES)?;
+            let children = self.empty::<f32>("children", count * SPLAT_STRIDE)?;
             let gain = self.empty::<f32>("gains", count * gain_stride)?;
             let bindings = [&uniform, &head, &own, &cameras, &children, &gain];
             let mut commands = self.commands("spgr", false);
             let groups = Groups::of(parents.len(), THREADS);
             commands.run(&SPGR, &[], &bindings.map(Binding::from), groups)?;
-            let children = commands.read::<f32>(&children, count * SPLAT_LANES)?;
+            let children = commands.read::<f32>(&children, count * SPLAT_STRIDE)?;
             let gain = commands.read::<f32>(&gain, count * gain_stride)?;
             commands.submit()?;
             rows.extend(children.take(self)?);

@@ -3,7 +3,7 @@
 //! CPU version: [`crate::cpu::spgr`]. WGSL: kernels/spgr_bwd.wgsl, kernels/spgr_gains_bwd.wgsl.
 //! Tests: tests/gpu/spgr.rs.
 
-use crate::abi::{HEAD_LANES, Rules, SPLAT_LANES, SpgrGainsBwdUniform};
+use crate::abi::{HEAD_STRIDE, Rules, SPLAT_STRIDE, SpgrGainsBwdUniform};
 use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::device::Gpu;
@@ -56,27 +56,27 @@ impl Gpu {
     ) -> Result<(Vec<f32>, Vec<f32>), GpuError> {
         let n = args.check()?;
         let k = args.rules.children();
-        let lengths = [("gradient of the children", grad.len(), n * k * SPLAT_LANES)];
+        let lengths = [("gradient of the children", grad.len(), n * k * SPLAT_STRIDE)];
         GpuError::check_lengths(SPGR_BWD.name, lengths)?;
         let cameras = self.upload("context cameras", &args.cameras())?;
         let (mut head_gradients, mut parent_gradients) = (Vec::new(), Vec::new());
-        for parents in Self::chunks(n, self.rows_per_binding(k * HEAD_LANES.max(SPLAT_LANES))) {
+        for parents in Self::chunks(n, self.rows_per_binding(k * HEAD_STRIDE.max(SPLAT_STRIDE))) {
             let count = parents.len() * k;
-            let from = parents.start * k * SPLAT_LANES;
+            let from = parents.start * k * SPLAT_STRIDE;
             let uniform = self.uniform(&args.uniform(&parents))?;
             let [head, own] = args.rows(&parents);
             let head = self.upload("head records", head)?;
             let own = self.upload("parents", own)?;
-            let grad = grad.get(from..from + count * SPLAT_LANES).unwrap_or(&[]);
+            let grad = grad.get(from..from + count * SPLAT_STRIDE).unwrap_or(&[]);
             let grad = self.upload("gradient of the children", grad)?;
-            let d_head = self.empty::<f32>("gradient of the head", count * HEAD_LANES)?;
-            let floats = parents.len() * SPLAT_LANES;
+            let d_head = self.empty::<f32>("gradient of the head", count * HEAD_STRIDE)?;
+            let floats = parents.len() * SPLAT_STRIDE;
             let d_parents = self.empty::<f32>("gradient of the parents", floats)?;
             let bindings = [&uniform, &head, &own, &cameras, &grad, &d_head, &d_parents];
             let mut commands = self.commands("spgr_bwd", false);
             let groups = Groups::of(parents.len(), THREADS);
             commands.run(&SPGR_BWD, &[], &bindings.map(Binding::from), groups)?;
-            let d_head = commands.read::<f32>(&d_head, count * HEAD_LANES)?;
+            let d_head = commands.read::<f32>(&d_head, count * HEAD_STRIDE)?;
             let d_parents = commands.read::<f32>(&d_parents, floats)?;
             commands.submit()?;
             head_gradients.extend(d_head.take(self)?);
@@ -95,14 +95,14 @@ impl Gpu {
         head: &[f32],
         grad: &[f32],
     ) -> Result<Vec<f32>, GpuError> {
-        let (records, gain_stride) = (head.len() / HEAD_LANES, rules.gain_lanes());
+        let (records, gain_stride) = (head.len() / HEAD_STRIDE, rules.gain_lanes());
         let lengths = [
-            ("head records", head.len(), records * HEAD_LANES),
+            ("head records", head.len(), records * HEAD_STRIDE),
             ("gradient of the gains", grad.len(), records * gain_stride),
         ];
         GpuError::check_lengths(SPGR_GAINS_BWD.name, lengths)?;
         let mut out = Vec::with_capacity(head.len());
-        for part in Self::chunks(records, self.rows_per_binding(HEAD_LANES)) {
+        for part in Self::chunks(records, self.rows_per_binding(HEAD_STRIDE)) {
             let uniform = self.uniform(&SpgrGainsBwdUniform {
                 records: part.len() as u32,
                 lanes: gain_stride as u32,
@@ -112,9 +112,9 @@ impl Gpu {
             let rows = |of: &[f32], width: usize| {
                 of.get(part.start * width..part.end * width).unwrap_or(&[]).to_vec()
             };
-            let head = self.upload("head records", &rows(head, HEAD_LANES))?;
+            let head = self.upload("head records", &rows(head, HEAD_STRIDE))?;
             let grad = self.upload("gradient of the gains", &rows(grad, gain_stride))?;
-            let floats = part.len() * HEAD_LANES;
+            let floats = part.len() * HEAD_STRIDE;
             let d_head = self.empty::<f32>("gradient of the head", floats)?;
             let bindings = [&uniform, &head, &grad, &d_head].map(Binding::from);
             let mut commands = self.commands("spgr_gains_bwd", false);

@@ -6,7 +6,9 @@
 //! asked for. On the way in K = 1, no gain, standard basis, unit quaternions.
 
 use super::{Error, Result, SaveOptions};
-use crate::abi::{LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES, ShBasis, sh_coefficients};
+use crate::abi::{
+    OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE, ShBasis, sh_coefficients,
+};
 use crate::sh::{C0, Rotation, RotationBasis, standard_from_mvsplat};
 use crate::splats::Splats;
 use glam::{DMat3, DQuat, DVec3};
@@ -257,16 +259,20 @@ pub(super) fn transform(splats: &mut Splats, by: &Similarity) {
         return;
     }
     let q = DQuat::from_mat3(&by.rotation);
-    for row in splats.rows.chunks_exact_mut(SPLAT_LANES) {
+    for row in splats.rows.chunks_exact_mut(SPLAT_STRIDE) {
         let mean = DVec3::new(f64::from(row[0]), f64::from(row[1]), f64::from(row[2]));
         let moved = by.scale * (by.rotation * mean) + by.translation;
         row[..3].copy_from_slice(&moved.as_vec3().to_array());
         if turns {
-            let stored =
-                [row[LANE_QUAT], row[LANE_QUAT + 1], row[LANE_QUAT + 2], row[LANE_QUAT + 3]];
-            row[LANE_QUAT..LANE_QUAT + 4].copy_from_slice(&wxyz(q * quat(stored)));
+            let stored = [
+                row[QUAT_OFFSET],
+                row[QUAT_OFFSET + 1],
+                row[QUAT_OFFSET + 2],
+                row[QUAT_OFFSET + 3],
+            ];
+            row[QUAT_OFFSET..QUAT_OFFSET + 4].copy_from_slice(&wxyz(q * quat(stored)));
         }
-        for s in &mut row[LANE_SCALE..LANE_SCALE + 3] {
+        for s in &mut row[SCALE_OFFSET..SCALE_OFFSET + 3] {
             *s = (by.scale * f64::from(*s)) as f32;
         }
     }
@@ -331,7 +337,7 @@ impl Incoming {
     pub fn with_capacity(count: usize, sh_degree: usize) -> Self {
         let set = 3 * sh_coefficients(sh_degree);
         Self {
-            rows: Vec::with_capacity(count * SPLAT_LANES),
+            rows: Vec::with_capacity(count * SPLAT_STRIDE),
             sh: Vec::with_capacity(count * set),
             sh_degree,
         }
@@ -383,12 +389,12 @@ pub(super) fn check_finite(splats: &Splats, path: &Path) -> Result<()> {
         let got = format!("{what} {v}");
         Err(Error::format(path, "finite numbers", got).at(format!(" splat {i}")))
     };
-    for (i, row) in splats.rows.chunks_exact(SPLAT_LANES).enumerate() {
+    for (i, row) in splats.rows.chunks_exact(SPLAT_STRIDE).enumerate() {
         if let Some(lane) = row.iter().position(|v| !v.is_finite()) {
             let what = match lane {
-                0..LANE_QUAT => "mean",
-                LANE_QUAT..LANE_SCALE => "quaternion",
-                LANE_SCALE..LANE_OPACITY => "scale",
+                0..QUAT_OFFSET => "mean",
+                QUAT_OFFSET..SCALE_OFFSET => "quaternion",
+                SCALE_OFFSET..OPACITY_OFFSET => "scale",
                 _ => "opacity",
             };
             return refuse(i, what, row[lane]);

@@ -7,7 +7,9 @@
 
 use super::trace::Trace;
 use super::{BackboneOutput, Primaries, Views};
-use crate::abi::{LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, ShBasis, sh_coefficients};
+use crate::abi::{
+    MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, ShBasis, sh_coefficients,
+};
 use crate::camera::Camera;
 use crate::config::{Primaries as Settings, ShFrame};
 use crate::ops::adapter::{Adapter, Placed, Turn, View, place};
@@ -68,10 +70,10 @@ impl Packed {
     pub fn split(&self) -> Result<Primaries> {
         let rows = self.by_scene(self.rows())?;
         Ok(Primaries {
-            means: rows.narrow(2, LANE_MEAN, 3)?,
-            quats_wxyz: rows.narrow(2, LANE_QUAT, 4)?,
-            scales: rows.narrow(2, LANE_SCALE, 3)?,
-            opacities: rows.narrow(2, LANE_OPACITY, 1)?.squeeze(2)?,
+            means: rows.narrow(2, MEAN_OFFSET, 3)?,
+            quats_wxyz: rows.narrow(2, QUAT_OFFSET, 4)?,
+            scales: rows.narrow(2, SCALE_OFFSET, 3)?,
+            opacities: rows.narrow(2, OPACITY_OFFSET, 1)?.squeeze(2)?,
             sh: self.by_scene(&self.sh()?)?.transpose(2, 3)?,
             sh_camera: self.by_scene(&self.placed.sh_camera()?)?,
             sh_basis: self.sh_basis,

@@ -11,7 +11,7 @@
 //!   do not depend on K.
 
 use super::mlp::{LayerNorm, affine, gelu, linear};
-use crate::abi::{HEAD_GEOMETRY_LANES, HEAD_LANES};
+use crate::abi::{HEAD_GEOMETRY_LEN, HEAD_STRIDE};
 use crate::config::{
     AMin, AMinMode, AreaAt, Config, DepthDir, DepthUnit, GainSpace, OpacityRule, PrimaryView,
     Slide, SpgrHead,
@@ -137,9 +137,9 @@ pub struct Heads {
 impl Heads {
     /// Parameters `geo` and `app`.
     pub fn new(config: &Config, vb: VarBuilder) -> Result<Self> {
-        let rest = HEAD_LANES - HEAD_GEOMETRY_LANES;
+        let rest = HEAD_STRIDE - HEAD_GEOMETRY_LEN;
         Ok(Self {
-            geometry: Head::new(config, HEAD_GEOMETRY_LANES, vb.pp("geo"))?,
+            geometry: Head::new(config, HEAD_GEOMETRY_LEN, vb.pp("geo"))?,
             appearance: Head::new(config, rest, vb.pp("app"))?,
         })
     }
@@ -149,7 +149,7 @@ impl Heads {
         let geometry = self.geometry.forward(geo, side)?;
         let appearance = self.appearance.forward(app, side)?;
         let flat = columns(&geometry.flatten(0, 1)?, &appearance.flatten(0, 1)?, None)?;
-        flat.reshape((geo.dim(0)?, side * side, HEAD_LANES))
+        flat.reshape((geo.dim(0)?, side * side, HEAD_STRIDE))
     }
 }
 

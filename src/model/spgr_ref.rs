@@ -7,9 +7,9 @@
 //! Every 3-vector is three tensors `[n, 1]` (parent) or `[n, K]` (child).
 
 use crate::abi::{
-    AREA_SQ_EPS, DEPTH_FRACTION_MIN, FRUSTUM_MARGIN, GROWTH_MAX, HEAD_DEPTH, HEAD_GAIN,
-    HEAD_LOG_SCALE, HEAD_LOGIT, HEAD_OFFSET, HEAD_ROTATION, LANE_MEAN, LANE_OPACITY, LANE_QUAT,
-    LANE_SCALE, VISIBLE_Z_MIN,
+    AREA_SQ_EPS, DEPTH_FRACTION_MIN, FRUSTUM_MARGIN, GROWTH_MAX, HEAD_DEPTH_OFFSET,
+    HEAD_GAIN_OFFSET, HEAD_LOG_SCALE_OFFSET, HEAD_LOGIT_OFFSET, HEAD_ROTATION_OFFSET,
+    HEAD_UV_OFFSET, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, VISIBLE_Z_MIN,
 };
 use crate::ops::redistribute::{Rule, redistribute};
 use crate::ops::spgr::{Rules, Spgr};
@@ -261,16 +261,16 @@ impl Parents {
         let lane = |i: usize| parents.narrow(1, i, 1);
         let vector = |i: usize| -> Result<V3> { Ok([lane(i)?, lane(i + 1)?, lane(i + 2)?]) };
         let view = View::new(call, &primary_views(parents, call)?, parents)?;
-        let mean = vector(LANE_MEAN)?;
+        let mean = vector(MEAN_OFFSET)?;
         let p = &view.position;
         let offset = [sub(&mean[0], &p[0])?, sub(&mean[1], &p[1])?, sub(&mean[2], &p[2])?];
         let in_camera = transposed(&view.rotation, &offset)?;
         let z = in_camera[2].maximum(&view.z_min)?;
-        let q = LANE_QUAT;
+        let q = QUAT_OFFSET;
         Ok(Self {
             mean,
             quat: [lane(q)?, lane(q + 1)?, lane(q + 2)?, lane(q + 3)?],
-            scale: vector(LANE_SCALE)?,
+            scale: vector(SCALE_OFFSET)?,
             view,
             in_camera,
             z,
@@ -317,7 +317,7 @@ impl Parents {
     fn step(&self, rules: &Rules, lane: &dyn Fn(usize) -> Result<Tensor>) -> Result<V3> {
         let side = rules.side as f64;
         let offset = |i: usize| -> Result<Tensor> {
-            let learned = lane(HEAD_OFFSET + i)?;
+            let learned = lane(HEAD_UV_OFFSET + i)?;
             let learned = match rules.offset_bound {
                 Some(bound) => scaled(&learned.tanh()?, bound)?,
                 None => learned,
@@ -331,7 +331,7 @@ impl Parents {
             add(&scaled(&learned, 1.0 / side)?, &grid.to_dtype(learned.dtype())?)
         };
         let mut s = self.lateral(rules, &[offset(0)?, offset(1)?])?;
-        let mut dz = scaled(&lane(HEAD_DEPTH)?.tanh()?, rules.beta_z)?;
+        let mut dz = scaled(&lane(HEAD_DEPTH_OFFSET)?.tanh()?, rules.beta_z)?;
         if rules.relative_depth {
             dz = mul(&dz, &self.z)?;
         }
@@ -362,7 +362,7 @@ impl Parents {
 
 /// v* of each parent.
 fn primary_views(parents: &Tensor, call: &Spgr) -> Result<Vec<u32>> {
-    let means = parents.narrow(1, LANE_MEAN, 3)?.to_dtype(candle_core::DType::F32)?;
+    let means = parents.narrow(1, MEAN_OFFSET, 3)?.to_dtype(candle_core::DType::F32)?;
     let means = means.to_vec2::<f32>()?;
     let chosen = means.iter().enumerate().map(|(n, mean)| {
         let source = ((call.first + n) / call.per_view).min(call.cameras.len() - 1);
@@ -396,11 +396,15 @@ pub fn spgr(head: &Tensor, parents: &Tensor, call: &Spgr) -> Result<(Tensor, Ten
     let step = p.step(rules, &lane)?;
     let in_world = times(&p.view.rotation, &step)?;
     let scale = |i: usize| -> Result<Tensor> {
-        let soft = scaled(&lane(HEAD_LOG_SCALE + i)?, 1.0 / rules.dlog_clamp)?.tanh()?;
+        let soft = scaled(&lane(HEAD_LOG_SCALE_OFFSET + i)?, 1.0 / rules.dlog_clamp)?.tanh()?;
         mul(&scaled(&soft, rules.dlog_clamp)?.exp()?, &scaled(&p.scale[i], rules.lambda_s)?)
     };
     let scale = [scale(0)?, scale(1)?, scale(2)?];
-    let turn = [lane(HEAD_ROTATION)?, lane(HEAD_ROTATION + 1)?, lane(HEAD_ROTATION + 2)?];
+    let turn = [
+        lane(HEAD_ROTATION_OFFSET)?,
+        lane(HEAD_ROTATION_OFFSET + 1)?,
+        lane(HEAD_ROTATION_OFFSET + 2)?,
+    ];
     let quat = normalise(&multiply(&p.quat, &exponential(&turn)?)?)?;
     let at = |i: usize| match rules.area_at_parent {
         true => Ok(p.in_camera[i].clone()),
@@ -416,8 +420,9 @@ pub fn spgr(head: &Tensor, parents: &Tensor, call: &Spgr) -> Result<(Tensor, Ten
         _ => clamped,
     };
     let own = if rules.opacity.areas_are_relative() { Some(p.area(rules)?) } else { None };
-    let opacities = parents.narrow(1, LANE_OPACITY, 1)?.squeeze(1)?;
-    let alpha = redistribute(rules.opacity, &lane(HEAD_LOGIT)?, &areas, &opacities, own.as_ref())?;
+    let opacities = parents.narrow(1, OPACITY_OFFSET, 1)?.squeeze(1)?;
+    let alpha =
+        redistribute(rules.opacity, &lane(HEAD_LOGIT_OFFSET)?, &areas, &opacities, own.as_ref())?;
     let mut lanes = Vec::with_capacity(11);
     for (step, mean) in in_world.iter().zip(&p.mean) {
         lanes.push(add(step, mean)?);
@@ -428,7 +433,7 @@ pub fn spgr(head: &Tensor, parents: &Tensor, call: &Spgr) -> Result<(Tensor, Ten
     }
     lanes.push(alpha);
     let rows = Tensor::stack(&lanes, 2)?.reshape((n * k, lanes.len()))?;
-    Ok((rows, gains(rules, &lane(HEAD_GAIN)?)?))
+    Ok((rows, gains(rules, &lane(HEAD_GAIN_OFFSET)?)?))
 }
 
 /// γ, or γ and δ three times.

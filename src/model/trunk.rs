@@ -15,7 +15,7 @@ use super::mlp::Mode;
 use super::primaries::Packed;
 use super::spgr::{Heads, rules};
 use super::{BackboneOutput, Primaries, Views};
-use crate::abi::{RasterOptions, SPLAT_LANES, ShBasis, sh_coefficients};
+use crate::abi::{RasterOptions, SPLAT_STRIDE, ShBasis, sh_coefficients};
 use crate::camera::Camera;
 use crate::config::{Config, FeatureLevel, HeadInput, ShInput, SpgrHead};
 use crate::ops::direct::{Footprint, rasterize_footprints, spgr_footprints};
@@ -197,12 +197,12 @@ impl Trunk {
         if scene.means.dtype() != DType::F32 {
             bail!("primaries: expected f32, got {:?}", scene.means.dtype());
         }
-        let mut rows = vec![0f32; n * k * SPLAT_LANES];
+        let mut rows = vec![0f32; n * k * SPLAT_STRIDE];
         let mut gains = vec![0f32; n * k * lanes];
         let mut jobs = Vec::new();
         let (mut rows_left, mut gains_left) = (&mut rows[..], &mut gains[..]);
         for (first, len) in chunks(n, scene.per_view, chunk.max(1)) {
-            let (r, rest) = rows_left.split_at_mut(len * k * SPLAT_LANES);
+            let (r, rest) = rows_left.split_at_mut(len * k * SPLAT_STRIDE);
             rows_left = rest;
             let (g, rest) = gains_left.split_at_mut(len * k * lanes);
             gains_left = rest;
@@ -220,7 +220,7 @@ impl Trunk {
         let device = scene.means.device();
         let gain = Tensor::from_vec(gains, n * k * lanes, device)?;
         Ok(Children {
-            rows: Tensor::from_vec(rows, (n * k, SPLAT_LANES), device)?,
+            rows: Tensor::from_vec(rows, (n * k, SPLAT_STRIDE), device)?,
             gain: if lanes == 1 { gain } else { gain.reshape((n * k, lanes))? },
             sh,
             sh_basis,

@@ -3,7 +3,7 @@
 //! same in tensor operations: `model/primaries_ref.rs`.
 
 use super::{Number, borrowed, by_dtype, slice};
-use crate::abi::SPLAT_LANES;
+use crate::abi::SPLAT_STRIDE;
 use crate::cpu::adapter as cpu;
 use crate::cpu::adapter::colour::Frame;
 use crate::cpu::lanes::LaneReal;
@@ -127,9 +127,9 @@ fn rows<T: Number + LaneReal>(
     let depths = slice::<T>(NAME, "depths", depths.0, depths.1)?;
     let densities = slice::<T>(NAME, "densities", densities.0, densities.1)?;
     let n = depths.len();
-    let mut out = vec![T::default(); n * SPLAT_LANES];
+    let mut out = vec![T::default(); n * SPLAT_STRIDE];
     cpu::forward(adapter, [raw, depths, densities], &mut out);
-    Ok((T::to_cpu_storage_owned(out), Shape::from((n, SPLAT_LANES))))
+    Ok((T::to_cpu_storage_owned(out), Shape::from((n, SPLAT_STRIDE))))
 }
 
 type Triple = (Option<Tensor>, Option<Tensor>, Option<Tensor>);

@@ -2,7 +2,7 @@
 //! Formulas: [`crate::cpu::attributes`]. Tests: tests/trunk_parts.rs.
 
 use super::{Number, borrowed, by_dtype, slice};
-use crate::abi::SPLAT_LANES;
+use crate::abi::SPLAT_STRIDE;
 use crate::cpu::attributes as cpu;
 use crate::cpu::lanes::LaneReal;
 use candle_core::backend::BackendStorage;
@@ -17,8 +17,8 @@ const NAME: &str = "attributes";
 /// # Errors
 /// Another shape.
 pub fn attributes(rows: &Tensor, rules: Attributes) -> Result<Tensor> {
-    if rows.rank() != 2 || rows.dims()[1] != SPLAT_LANES {
-        bail!("{NAME}: expected rows [n, {SPLAT_LANES}], got {:?}", rows.dims());
+    if rows.rank() != 2 || rows.dims()[1] != SPLAT_STRIDE {
+        bail!("{NAME}: expected rows [n, {SPLAT_STRIDE}], got {:?}", rows.dims());
     }
     rows.contiguous()?.apply_op1(Op(rules))
 }

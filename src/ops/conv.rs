@@ -2,7 +2,7 @@
 //! Kernels: [`crate::cpu::conv`]; candle's own are 6 to 12 times slower.
 
 use super::{output, slice};
-use crate::cpu::Tier;
+use crate::cpu::SimdLevel;
 use crate::cpu::conv::{self as cpu, Sizes};
 use crate::cpu::zeros;
 use candle_core::{
@@ -50,7 +50,7 @@ impl Conv {
         bias: &[f32],
     ) -> Result<(CpuStorage, Shape)> {
         let shape = Self::shape(like, self.sizes.out_channels, self.sizes.out_size());
-        output(cpu::forward(Tier::best(), &self.sizes, like.dims()[0], x, w, bias), shape)
+        output(cpu::forward(SimdLevel::best(), &self.sizes, like.dims()[0], x, w, bias), shape)
     }
 
     fn grads(
@@ -156,7 +156,7 @@ impl CustomOp2 for InputGrad {
         let dy = slice::<f32>(name, "dy", s1, l1)?;
         let w = slice::<f32>(name, "weight", s2, l2)?;
         let shape = Conv::shape(l1, sizes.in_channels, sizes.size);
-        output(cpu::input_grad(Tier::best(), &sizes, l1.dims()[0], dy, w), shape)
+        output(cpu::input_grad(SimdLevel::best(), &sizes, l1.dims()[0], dy, w), shape)
     }
 }
 
@@ -183,7 +183,7 @@ impl CustomOp2 for WeightGrad {
         dims.extend(&sizes.kernel[3 - sides..]);
         let shape = Shape::from(dims);
         let mut dw = zeros(shape.elem_count());
-        cpu::weight_grad(Tier::best(), &sizes, x, dy, &mut dw);
+        cpu::weight_grad(SimdLevel::best(), &sizes, x, dy, &mut dw);
         output(dw, shape)
     }
 }

@@ -6,7 +6,7 @@
 use super::rasterize::{check_options, degree_of};
 use super::slice;
 use super::spgr::{Spgr, spgr_into};
-use crate::abi::{RasterOptions, SPLAT_LANES};
+use crate::abi::{RasterOptions, SPLAT_STRIDE};
 use crate::camera::Camera;
 use crate::cpu::Rasterizer;
 use crate::cpu::spgr as cpu;
@@ -77,7 +77,7 @@ pub fn spgr_footprints(
         return Ok(());
     }
     // The children themselves tell which of them it was.
-    let mut rows = vec![0.0; count * SPLAT_LANES];
+    let mut rows = vec![0.0; count * SPLAT_STRIDE];
     let mut gains = vec![0.0; count * call.rules.gain_lanes()];
     spgr_into(&head, &parents, call, &mut rows, &mut gains)?;
     bail!("{NAME}: expected finite footprints of children of finite parents and head records")

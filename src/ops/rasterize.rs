@@ -8,7 +8,7 @@
 //! Until its graph is dropped, an op keeps its lists (about 150 bytes a splat), so that
 //! the backward pass need not make them again.
 
-use crate::abi::{Convention, RasterOptions, SH_DEGREE_MAX, SPLAT_LANES, sh_coefficients};
+use crate::abi::{Convention, RasterOptions, SH_DEGREE_MAX, SPLAT_STRIDE, sh_coefficients};
 use crate::camera::Camera;
 use crate::cpu::{Geometry, Gradients, Rasterizer, SplatSlices};
 use crate::ops::{Backend, elements, tensor_like};
@@ -142,8 +142,8 @@ fn check_shapes(splats: &Tensor, sh: &Tensor, gain: &Tensor) -> Result<()> {
             bail!("rasterize: expected {name} on the CPU, got {:?}", t.device().location());
         }
     }
-    let &[n, SPLAT_LANES] = splats.dims() else {
-        bail!("rasterize: expected splats [N, {SPLAT_LANES}], got {:?}", splats.dims())
+    let &[n, SPLAT_STRIDE] = splats.dims() else {
+        bail!("rasterize: expected splats [N, {SPLAT_STRIDE}], got {:?}", splats.dims())
     };
     let &[p, d, 3] = sh.dims() else {
         bail!("rasterize: expected sh [P, D, 3], got {:?}", sh.dims())

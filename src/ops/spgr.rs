@@ -3,7 +3,7 @@
 //! unfused: `model/spgr_ref.rs`. Tests: tests/spgr.rs, tests/spgr_backward.rs.
 
 use super::{Backend, Number, borrowed, by_dtype, slice};
-use crate::abi::{HEAD_LANES, SPLAT_LANES};
+use crate::abi::{HEAD_STRIDE, SPLAT_STRIDE};
 use crate::camera::Camera;
 use crate::cpu::lanes::LaneReal;
 use crate::cpu::spgr as cpu;
@@ -37,9 +37,9 @@ impl Spgr {
         if k == 0 || k > CHILDREN_MAX {
             bail!("{NAME}: expected 1 to {CHILDREN_MAX} children per parent, got {k}");
         }
-        if parents.dims() != [n, SPLAT_LANES] || head.dims() != [n, k, HEAD_LANES] {
+        if parents.dims() != [n, SPLAT_STRIDE] || head.dims() != [n, k, HEAD_STRIDE] {
             bail!(
-                "{NAME}: expected parents [N, {SPLAT_LANES}] and head records [N, {k}, {HEAD_LANES}], got {:?} and {:?}",
+                "{NAME}: expected parents [N, {SPLAT_STRIDE}] and head records [N, {k}, {HEAD_STRIDE}], got {:?} and {:?}",
                 parents.dims(),
                 head.dims()
             );
@@ -124,7 +124,7 @@ pub fn spgr_into_on(
 ) -> Result<()> {
     let n = call.check(head, parents)?;
     let count = n * call.rules.children();
-    let expected = (count * SPLAT_LANES, count * call.rules.gain_lanes());
+    let expected = (count * SPLAT_STRIDE, count * call.rules.gain_lanes());
     if (rows.len(), gains.len()) != expected {
         let got = (rows.len(), gains.len());
         bail!("{NAME}: expected buffers of {expected:?} floats, got {got:?}");
@@ -176,11 +176,11 @@ fn finite<T: Number>(
     let bad =
         |data: &[T], width: usize| data.iter().position(|v| !finite_number(*v)).map(|i| i / width);
     let k = call.rules.children();
-    if let Some(n) = bad(parents, SPLAT_LANES) {
-        let row = &parents[n * SPLAT_LANES..(n + 1) * SPLAT_LANES];
+    if let Some(n) = bad(parents, SPLAT_STRIDE) {
+        let row = &parents[n * SPLAT_STRIDE..(n + 1) * SPLAT_STRIDE];
         bail!("{NAME}: expected finite parents, got parent {} = {row:?}", call.first + n);
     }
-    let (record, child) = (bad(head, HEAD_LANES), bad(rows, SPLAT_LANES));
+    let (record, child) = (bad(head, HEAD_STRIDE), bad(rows, SPLAT_STRIDE));
     let child = child.or(bad(gains, call.rules.gain_lanes()));
     let (what, at) = match (record, child) {
         (Some(i), _) => ("head records", i),
@@ -192,9 +192,9 @@ fn finite<T: Number>(
         "{NAME}: expected finite {what}, got child {} of parent {} = {:?} from parent {:?} and head record {:?}",
         at % k,
         call.first + n,
-        &rows[at * SPLAT_LANES..(at + 1) * SPLAT_LANES],
-        &parents[n * SPLAT_LANES..(n + 1) * SPLAT_LANES],
-        &head[at * HEAD_LANES..(at + 1) * HEAD_LANES]
+        &rows[at * SPLAT_STRIDE..(at + 1) * SPLAT_STRIDE],
+        &parents[n * SPLAT_STRIDE..(n + 1) * SPLAT_STRIDE],
+        &head[at * HEAD_STRIDE..(at + 1) * HEAD_STRIDE]
     )
 }
 
@@ -247,13 +247,13 @@ fn forward<T: Number + LaneReal>(
     let head = slice::<T>(NAME, "head records", s1, l1)?;
     let parents = slice::<T>(NAME, "parents", s2, l2)?;
     let count = l2.dims()[0] * call.rules.children();
-    let mut rows = vec![T::default(); count * SPLAT_LANES];
+    let mut rows = vec![T::default(); count * SPLAT_STRIDE];
     let mut gains = vec![T::default(); count * call.rules.gain_lanes()];
     run(call, head, parents, &mut rows, &mut gains)?;
     if let Ok(mut made) = made.lock() {
         *made = Some(T::to_cpu_storage_owned(gains));
     }
-    Ok((T::to_cpu_storage_owned(rows), Shape::from((count, SPLAT_LANES))))
+    Ok((T::to_cpu_storage_owned(rows), Shape::from((count, SPLAT_STRIDE))))
 }
 
 fn backward<T: Number + LaneReal>(
@@ -304,7 +304,7 @@ fn on_gpu(
         *made = Some(CpuStorage::F32(gains));
     }
     let count = l2.dims()[0] * call.rules.children();
-    Ok(Some((CpuStorage::F32(rows), Shape::from((count, SPLAT_LANES)))))
+    Ok(Some((CpuStorage::F32(rows), Shape::from((count, SPLAT_STRIDE)))))
 }
 
 /// [`backward`] on the GPU; `None` where the CPU is to do it.

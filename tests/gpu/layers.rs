@@ -8,7 +8,7 @@ use adapter::{gpu, limited};
 use raster_scene::{Kind, Random, Scene};
 use std::sync::Arc;
 use subsplat::abi::{
-    Convention, FOOTPRINT_LANES, PAIR_SUMS, RasterOptions, ShDirection, SplatSlices,
+    Convention, FOOTPRINT_STRIDE, PAIR_SUMS, RasterOptions, ShDirection, SplatSlices,
 };
 use subsplat::camera::Camera;
 use subsplat::gpu::{Gpu, GpuError, Rasterizer};
@@ -69,7 +69,7 @@ fn layers_render_the_same_bytes() {
     for (seed, kind) in [(1, Kind::Plain), (2, Kind::Behind)] {
         let scene = Scene::new(kind, seed, 1500, 1, 4);
         let scene = if seed == 2 { scene.with_covariances() } else { scene };
-        assert!(scene.len() * 4 * FOOTPRINT_LANES > 4 * BINDING as usize);
+        assert!(scene.len() * 4 * FOOTPRINT_STRIDE > 4 * BINDING as usize);
         let options = RasterOptions {
             background: [0.2, 0.5, 0.7],
             sh_direction: [ShDirection::Child, ShDirection::Parent][seed as usize - 1],
@@ -97,7 +97,7 @@ fn pairs_that_do_not_fit_take_layers() {
         let options = RasterOptions::default();
         let (pairs, in_layers) = scene.with_slices(|s| check(&small, &s, &camera, &options));
         let fits = |words: usize| pairs * words * 4 <= BINDING as usize;
-        assert!(scene.len() * 4 * FOOTPRINT_LANES < BINDING as usize);
+        assert!(scene.len() * 4 * FOOTPRINT_STRIDE < BINDING as usize);
         eprintln!("{} splats, {pairs} pairs", scene.len());
         assert_eq!([!fits(1), !fits(PAIR_SUMS)], layers, "{pairs} pairs");
         for (in_layers, expected) in in_layers.into_iter().zip(layers) {

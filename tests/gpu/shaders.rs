@@ -62,13 +62,13 @@ fn constants() -> BTreeMap<&'static str, f64> {
         SPAN_SLACK_PX,
         OPACITY_MAX,
         TILE_GPU,
-        FOOTPRINT_LANES,
+        FOOTPRINT_STRIDE,
         PAIR_SUMS,
         GPU_BLOCK,
         PLAN_COUNT,
         PLAN_BLOCKS,
-        PLAN_ASKED,
-        PLAN_EACH,
+        PLAN_REQUESTED,
+        PLAN_ELEMENT_GROUPS,
     ));
     let rules = [
         ("RULE_LINEAR", Rule::Linear),
@@ -77,10 +77,23 @@ fn constants() -> BTreeMap<&'static str, f64> {
         ("RULE_AREA", Rule::Area),
         ("RULE_NONE", Rule::None),
     ];
-    all.extend(same!(GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, SWEEP_PAIR_LANES));
-    all.extend(same!(SPLAT_LANES, LANE_MEAN, LANE_QUAT, LANE_SCALE, LANE_OPACITY));
-    all.extend(same!(HEAD_LANES, HEAD_OFFSET, HEAD_DEPTH, HEAD_LOG_SCALE, HEAD_ROTATION));
-    all.extend(same!(HEAD_LOGIT, HEAD_GAIN, NONE, SPGR_CAMERA_LANES, AREA_SQ_EPS, GROWTH_MAX));
+    all.extend(same!(GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, SWEEP_PAIR_STRIDE));
+    all.extend(same!(SPLAT_STRIDE, MEAN_OFFSET, QUAT_OFFSET, SCALE_OFFSET, OPACITY_OFFSET));
+    all.extend(same!(
+        HEAD_STRIDE,
+        HEAD_UV_OFFSET,
+        HEAD_DEPTH_OFFSET,
+        HEAD_LOG_SCALE_OFFSET,
+        HEAD_ROTATION_OFFSET
+    ));
+    all.extend(same!(
+        HEAD_LOGIT_OFFSET,
+        HEAD_GAIN_OFFSET,
+        NONE,
+        SPGR_CAMERA_STRIDE,
+        AREA_SQ_EPS,
+        GROWTH_MAX
+    ));
     all.extend(same!(DEPTH_FRACTION_MIN, DISC_AREA_SQ_MIN, VISIBLE_Z_MIN));
     all.extend(rules.map(|(name, rule)| (name, f64::from(rule as u32))));
     all

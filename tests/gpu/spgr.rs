@@ -6,7 +6,7 @@ use subsplat_test_support::twins;
 use adapter::gpu;
 use glam::{EulerRot, Mat4, Quat, Vec3};
 use subsplat::abi::{
-    HEAD_LANES, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, Rule, Rules, SPLAT_LANES,
+    HEAD_STRIDE, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, Rule, Rules, SCALE_OFFSET, SPLAT_STRIDE,
 };
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::cpu::spgr as cpu;
@@ -132,8 +132,8 @@ impl Inputs {
     fn new(side: usize, r: &mut Random) -> Self {
         let cameras = cameras(12);
         let parents = parents(&cameras, r);
-        let n = parents.len() / SPLAT_LANES;
-        let head = r.many(n * side * side * HEAD_LANES, -1.5, 1.5);
+        let n = parents.len() / SPLAT_STRIDE;
+        let head = r.many(n * side * side * HEAD_STRIDE, -1.5, 1.5);
         Self { cameras, near: vec![1.0; 2], parents, head }
     }
 
@@ -146,8 +146,8 @@ impl Inputs {
 fn on_cpu(inputs: &Inputs, rules: &Rules) -> (Vec<f32>, Vec<f32>) {
     let Inputs { cameras, near, parents, head } = inputs;
     let source = cpu::Source { cameras, near, per_view: 144, first: 0 };
-    let count = parents.len() / SPLAT_LANES * rules.children();
-    let mut rows = vec![0.0; count * SPLAT_LANES];
+    let count = parents.len() / SPLAT_STRIDE * rules.children();
+    let mut rows = vec![0.0; count * SPLAT_STRIDE];
     let mut gains = vec![0.0; count * rules.gain_lanes()];
     assert!(cpu::forward(cpu::Args { rules, source, head, parents }, &mut rows, &mut gains));
     (rows, gains)
@@ -155,14 +155,14 @@ fn on_cpu(inputs: &Inputs, rules: &Rules) -> (Vec<f32>, Vec<f32>) {
 
 /// Returns `count` columns of all rows, from column `first` on.
 fn columns(rows: &[f32], first: usize, count: usize) -> Vec<f32> {
-    rows.chunks_exact(SPLAT_LANES).flat_map(|r| r[first..first + count].to_vec()).collect()
+    rows.chunks_exact(SPLAT_STRIDE).flat_map(|r| r[first..first + count].to_vec()).collect()
 }
 
 const PARTS: [(&str, usize, usize); 4] = [
-    ("mean", LANE_MEAN, 3),
-    ("quaternion", LANE_QUAT, 4),
-    ("scale", LANE_SCALE, 3),
-    ("opacity", LANE_OPACITY, 1),
+    ("mean", MEAN_OFFSET, 3),
+    ("quaternion", QUAT_OFFSET, 4),
+    ("scale", SCALE_OFFSET, 3),
+    ("opacity", OPACITY_OFFSET, 1),
 ];
 
 #[test]
@@ -213,14 +213,14 @@ fn gradients_of_children() {
     for side in [1, 2, 3] {
         let inputs = Inputs::new(side, &mut r);
         for (name, rules) in variants(side) {
-            let count = inputs.parents.len() / SPLAT_LANES * rules.children();
-            let grad = r.many(count * SPLAT_LANES, -1.0, 1.0);
+            let count = inputs.parents.len() / SPLAT_STRIDE * rules.children();
+            let grad = r.many(count * SPLAT_STRIDE, -1.0, 1.0);
             let by_gain = r.many(count * rules.gain_lanes(), -1.0, 1.0);
             let [head, parents, gain] = gradients::<f32>(&inputs, &rules, &grad, &by_gain);
             let exact = gradients::<f64>(&inputs, &rules, &grad, &by_gain);
             let got = gpu.spgr_backward(&inputs.gpu(&rules), &grad).unwrap();
             let got_gain = gpu.spgr_gains_backward(&rules, &inputs.head, &by_gain).unwrap();
-            for column in 0..SPLAT_LANES {
+            for column in 0..SPLAT_STRIDE {
                 let of = |rows: &[f32]| columns(rows, column, 1);
                 let all =
                     [("head", &got.0, &head, &exact[0]), ("parents", &got.1, &parents, &exact[1])];

@@ -6,7 +6,7 @@ use subsplat_test_support::whole;
 use candle_core::{Device, Tensor};
 use glam::Vec3;
 use subsplat::abi::{
-    Convention, LANE_QUAT, LANE_SCALE, RasterOptions, SPLAT_LANES, ShBasis, ShDirection,
+    Convention, QUAT_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE, ShBasis, ShDirection,
 };
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::config::{Backbone, Config, Preset, ShFrame};
@@ -234,11 +234,11 @@ fn the_only_child_is_its_parent() {
         let (c, p) = (&child.splats, &parent.splats);
         assert_eq!((c.len(), &c.sh), (p.len(), &p.sh));
         assert!(c.gain.iter().all(|g| *g == 1.0));
-        for (a, b) in c.rows.chunks_exact(SPLAT_LANES).zip(p.rows.chunks_exact(SPLAT_LANES)) {
+        for (a, b) in c.rows.chunks_exact(SPLAT_STRIDE).zip(p.rows.chunks_exact(SPLAT_STRIDE)) {
             // Mean and scales are copied; quaternion and opacity are normalised and sent
             // through a logarithm, which rounds.
-            assert_eq!(a[..LANE_QUAT], b[..LANE_QUAT]);
-            assert_eq!(a[LANE_SCALE..LANE_SCALE + 3], b[LANE_SCALE..LANE_SCALE + 3]);
+            assert_eq!(a[..QUAT_OFFSET], b[..QUAT_OFFSET]);
+            assert_eq!(a[SCALE_OFFSET..SCALE_OFFSET + 3], b[SCALE_OFFSET..SCALE_OFFSET + 3]);
             for (a, b) in a.iter().zip(b) {
                 assert!((a - b).abs() < 2e-6, "{a} {b}");
             }

@@ -11,7 +11,7 @@ use raster_case::{File, rows};
 use std::path::Path;
 use subsplat::abi::{Convention, RasterOptions, ShBasis};
 use subsplat::camera::{Camera, Intrinsics};
-use subsplat::cpu::{Geometry, Rasterizer, SplatSlices, Tier};
+use subsplat::cpu::{Geometry, Rasterizer, SimdLevel, SplatSlices};
 use subsplat::splats::Splats;
 
 /// Largest |got − expected| over pixels that are no boundary; `lanes` per pixel.
@@ -31,20 +31,20 @@ fn worst(got: &[f32], expected: &[f32], boundary: &[f32], relative: Option<f32>)
     worst
 }
 
-/// Every case in every tier that the processor has.
+/// Every case in every level that the processor has.
 fn check_case(name: &str) {
-    for &tier in Tier::available() {
-        check_case_in(name, tier);
+    for &level in SimdLevel::available() {
+        check_case_in(name, level);
     }
 }
 
-fn check_case_in(name: &str, tier: Tier) {
+fn check_case_in(name: &str, level: SimdLevel) {
     let Some(path) = shared(&format!("fixtures/raster/{name}.safetensors")) else { return };
     let file = File::read(&path);
     let (camera, options) = (file.camera(), file.options());
     let mvsplat = options.convention == Convention::Mvsplat;
     let n = file.get("opacities").len();
-    let mut rasterizer = Rasterizer::new().with_tier(tier);
+    let mut rasterizer = Rasterizer::new().with_simd_level(level);
     let got = file.with_splats(|splats| {
         assert_eq!(splats.children_per_parent(), file.meta::<usize>("children"));
         rasterizer.render(splats, &camera, &options)
@@ -61,10 +61,10 @@ fn check_case_in(name: &str, tier: Tier) {
     let sum = worst(&got.depth_sum, file.get("depth_sum"), boundary, Some(0.1));
     let depth = worst(&got.depth(), file.get("depth"), boundary, Some(1e-3));
     eprintln!(
-        "{name} {tier:?}: rgb {rgb:.1e} alpha {alpha:.1e} depth_sum {sum:.1e} depth {depth:.1e}"
+        "{name} {level:?}: rgb {rgb:.1e} alpha {alpha:.1e} depth_sum {sum:.1e} depth {depth:.1e}"
     );
-    assert!(rgb < tolerance && alpha < tolerance, "{name} {tier:?}: rgb {rgb} alpha {alpha}");
-    assert!(sum < 1e-4 && depth < 1e-4, "{name} {tier:?}: depth_sum {sum} depth {depth}");
+    assert!(rgb < tolerance && alpha < tolerance, "{name} {level:?}: rgb {rgb} alpha {alpha}");
+    assert!(sum < 1e-4 && depth < 1e-4, "{name} {level:?}: depth_sum {sum} depth {depth}");
     check_intermediates(name, &file, &rasterizer, mvsplat);
     assert_eq!(rasterizer.footprints().len(), n);
 }

@@ -9,7 +9,7 @@ use common::shared;
 use glam::{DVec3, Mat4, Vec3};
 use raster_case::{File, rows};
 use raster_gradients::{check, part, planes, worst_row};
-use subsplat::abi::{RasterOptions, SPLAT_LANES};
+use subsplat::abi::{RasterOptions, SPLAT_STRIDE};
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::cpu::{Geometry, Gradients, Rasterizer, SplatSlices};
 
@@ -107,7 +107,7 @@ fn brush_tiny() {
 }
 
 fn splat_mean(packed: &[f32], i: usize) -> [f64; 3] {
-    std::array::from_fn(|c| f64::from(packed[SPLAT_LANES * i + c]))
+    std::array::from_fn(|c| f64::from(packed[SPLAT_STRIDE * i + c]))
 }
 
 #[test]

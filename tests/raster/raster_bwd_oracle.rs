@@ -8,11 +8,11 @@ use subsplat_test_support::raster_scene;
 use glam::Vec3;
 use raster_scene::{KINDS, Kind, Random, SIZE, Scene};
 use subsplat::abi::{
-    Convention, LANE_OPACITY, LANE_QUAT, LANE_SCALE, RasterOptions, SPLAT_LANES, ShBasis,
+    Convention, OPACITY_OFFSET, QUAT_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE, ShBasis,
     ShDirection, sh_coefficients,
 };
 use subsplat::camera::{Camera, Intrinsics};
-use subsplat::cpu::{Gradients, Rasterizer, Tier};
+use subsplat::cpu::{Gradients, Rasterizer, SimdLevel};
 
 /// Central difference of the loss in one number, which `of` finds. Steps are such that
 /// no alpha moves by more than the oracle's boundary is wide, and count as `f32` took
@@ -58,7 +58,7 @@ fn check(scene: &Scene, o: &RasterOptions, tolerance: f64, what: &str) -> f64 {
     let with = (o, &v[..]);
     let px = 3.0 / SIZE.0 as f32;
     let lane = |lane: usize, step: &dyn Fn(f32) -> f32| -> Vec<f64> {
-        let of = |i: usize| i * SPLAT_LANES + lane;
+        let of = |i: usize| i * SPLAT_STRIDE + lane;
         (0..scene.len())
             .map(|i| slope(scene, with, step(scene.rows[of(i)]), |s| &mut s.rows[of(i)]))
             .collect()
@@ -68,7 +68,7 @@ fn check(scene: &Scene, o: &RasterOptions, tolerance: f64, what: &str) -> f64 {
         (0..scene.len()).flat_map(|i| columns.iter().map(move |c| c[i])).collect()
     };
     let part = |from: usize, n: usize| -> Vec<f32> {
-        got.rows.chunks(SPLAT_LANES).flat_map(|r| r[from..from + n].to_vec()).collect()
+        got.rows.chunks(SPLAT_STRIDE).flat_map(|r| r[from..from + n].to_vec()).collect()
     };
     let cov = !scene.cov6.is_empty();
     let mut worst = 0.0f64;
@@ -79,7 +79,7 @@ fn check(scene: &Scene, o: &RasterOptions, tolerance: f64, what: &str) -> f64 {
         worst = worst.max(e);
     };
     let means = lanes(0, 3, &|_| 1e-4 * px);
-    let opacities = lanes(LANE_OPACITY, 1, &|x| 5e-5 * x);
+    let opacities = lanes(OPACITY_OFFSET, 1, &|x| 5e-5 * x);
     if cov {
         let expected: Vec<f64> = (0..scene.cov6.len())
             .map(|i| {
@@ -92,10 +92,10 @@ fn check(scene: &Scene, o: &RasterOptions, tolerance: f64, what: &str) -> f64 {
         hold("opacities", &got.opacities, &opacities, 1);
     } else {
         hold("means", &part(0, 3), &means, 3);
-        hold("quats", &part(LANE_QUAT, 4), &lanes(LANE_QUAT, 4, &|_| 3e-7), 4);
+        hold("quats", &part(QUAT_OFFSET, 4), &lanes(QUAT_OFFSET, 4, &|_| 3e-7), 4);
         let step = |x: f32| if x == 0.0 { 1e-4 * px } else { 3e-5 * x };
-        hold("scales", &part(LANE_SCALE, 3), &lanes(LANE_SCALE, 3, &step), 3);
-        hold("opacities", &part(LANE_OPACITY, 1), &opacities, 1);
+        hold("scales", &part(SCALE_OFFSET, 3), &lanes(SCALE_OFFSET, 3, &step), 3);
+        hold("opacities", &part(OPACITY_OFFSET, 1), &opacities, 1);
     }
     let all = |n: usize, of: fn(&mut Scene) -> &mut Vec<f32>| -> Vec<f64> {
         (0..n).map(|i| slope(scene, with, 1e-5, |s| &mut of(s)[i])).collect()
@@ -182,20 +182,20 @@ fn a_list_longer_than_what_is_kept() {
         let at = Vec3::new(row[0], row[1], row[2]);
         camera.world_from_camera.inverse().transform_point3(at).z
     };
-    for row in scene.rows.chunks_mut(SPLAT_LANES) {
+    for row in scene.rows.chunks_mut(SPLAT_STRIDE) {
         let px = depth(row, &scene.camera) / SIZE.0 as f32;
-        row[LANE_SCALE..LANE_SCALE + 3]
+        row[SCALE_OFFSET..SCALE_OFFSET + 3]
             .copy_from_slice(&r.array::<3>(60.0, 80.0).map(|s: f32| s * px));
-        row[LANE_OPACITY] = r.range(0.008, 0.01);
+        row[OPACITY_OFFSET] = r.range(0.008, 0.01);
     }
     let o = options(Convention::Standard);
     let v = scene.upstream(&o, 77);
     assert!(v.iter().filter(|v| **v != 0.0).count() > v.len() / 2);
     let got = scene.gradients(&o, &v);
-    let opacity = |i: usize| got.rows[i * SPLAT_LANES + LANE_OPACITY];
+    let opacity = |i: usize| got.rows[i * SPLAT_STRIDE + OPACITY_OFFSET];
     let most = (0..scene.len()).fold(0f32, |m, i| m.max(opacity(i).abs()));
     for i in (0..scene.len()).step_by(23) {
-        let at = i * SPLAT_LANES + LANE_OPACITY;
+        let at = i * SPLAT_STRIDE + OPACITY_OFFSET;
         let want = slope(&scene, (&o, &v), 5e-5 * scene.rows[at], |s| &mut s.rows[at]);
         let error = (f64::from(opacity(i)) - want).abs() / f64::from(most);
         assert!(error < 1e-4, "splat {i}: {} for {want}", opacity(i));
@@ -213,23 +213,23 @@ fn bad_numbers_get_zeros_and_poison_nothing() {
     for convention in [Convention::Standard, Convention::Mvsplat] {
         let o = options(convention);
         let v = good.upstream(&o, 3);
-        for lane in 0..SPLAT_LANES {
+        for lane in 0..SPLAT_STRIDE {
             for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e38] {
                 // Opaque is not bad, and a point at 1e38 may well be seen.
-                if bad == 1e38 && (lane == LANE_OPACITY || lane < LANE_QUAT) {
+                if bad == 1e38 && (lane == OPACITY_OFFSET || lane < QUAT_OFFSET) {
                     continue;
                 }
                 let (mut broken, mut without) = (good.clone(), good.clone());
                 let hit: Vec<usize> = (lane % 3..good.len()).step_by(5).collect();
                 for &i in &hit {
-                    broken.rows[i * SPLAT_LANES + lane] = bad;
-                    without.rows[i * SPLAT_LANES + LANE_OPACITY] = 0.0;
+                    broken.rows[i * SPLAT_STRIDE + lane] = bad;
+                    without.rows[i * SPLAT_STRIDE + OPACITY_OFFSET] = 0.0;
                 }
                 let (got, expected) = (broken.gradients(&o, &v), without.gradients(&o, &v));
                 assert!(got == expected, "lane {lane} = {bad} {convention:?}");
                 assert!(got.rows.iter().any(|&g| g != 0.0));
                 for i in hit {
-                    assert!(got.rows[i * SPLAT_LANES..][..SPLAT_LANES].iter().all(|&g| g == 0.0));
+                    assert!(got.rows[i * SPLAT_STRIDE..][..SPLAT_STRIDE].iter().all(|&g| g == 0.0));
                     assert!(got.gain[4 * i..4 * i + 4].iter().all(|&g| g == 0.0));
                 }
             }
@@ -242,10 +242,10 @@ fn bad_numbers_get_zeros_and_poison_nothing() {
         assert!(got.sh[48 * 3..48 * 4].iter().all(|&g| g == 0.0), "{convention:?}");
         let shared = RasterOptions { sh_direction: ShDirection::Parent, ..o };
         let mut broken = good.clone();
-        broken.rows[8 * SPLAT_LANES] = f32::NAN;
+        broken.rows[8 * SPLAT_STRIDE] = f32::NAN;
         let got = broken.gradients(&shared, &v);
         assert!(got.rows.iter().chain(&got.sh).all(|g| g.is_finite()));
-        assert!(got.rows[8 * SPLAT_LANES..][..SPLAT_LANES].iter().all(|&g| g == 0.0));
+        assert!(got.rows[8 * SPLAT_STRIDE..][..SPLAT_STRIDE].iter().all(|&g| g == 0.0));
     }
 }
 
@@ -258,7 +258,7 @@ fn crowd() -> Scene {
     for (seed, kind) in KINDS.into_iter().enumerate().skip(1) {
         let more = Scene::new(kind, 100 + seed as u64, 300, 3, 1);
         let move_back = from * more.camera.camera_from_world();
-        for row in more.rows.chunks_exact(SPLAT_LANES) {
+        for row in more.rows.chunks_exact(SPLAT_STRIDE) {
             all.rows.extend(move_back.transform_point3(Vec3::from_slice(&row[..3])).to_array());
             all.rows.extend_from_slice(&row[3..]);
         }
@@ -311,30 +311,30 @@ fn any_number_of_threads_and_any_memory_gives_the_same_bytes() {
 
 /// Every instruction set gives the gradients, and those that fuse the same bytes.
 #[test]
-fn tiers_agree() {
+fn levels_agree() {
     let scene = Scene::new(Kind::Plain, 21, 12, 3, 4);
     let o = options(Convention::Standard);
     let v = scene.upstream(&o, 3);
-    let run = |tier: Tier| {
+    let run = |level: SimdLevel| {
         let mut out = Gradients::default();
-        let mut rasterizer = Rasterizer::new().with_tier(tier);
+        let mut rasterizer = Rasterizer::new().with_simd_level(level);
         scene.with_slices(|s| rasterizer.backward(&s, &scene.camera, &o, &v, &mut out));
         out
     };
-    let best = run(Tier::best());
-    for &tier in Tier::available() {
-        let got = run(tier);
-        if tier != Tier::Scalar && Tier::best() != Tier::Scalar {
-            assert!(bytes(&got) == bytes(&best), "{tier:?}");
+    let best = run(SimdLevel::best());
+    for &level in SimdLevel::available() {
+        let got = run(level);
+        if level != SimdLevel::Scalar && SimdLevel::best() != SimdLevel::Scalar {
+            assert!(bytes(&got) == bytes(&best), "{level:?}");
         }
         for (what, got, best, lanes) in [
-            ("rows", &got.rows, &best.rows, SPLAT_LANES),
+            ("rows", &got.rows, &best.rows, SPLAT_STRIDE),
             ("sh", &got.sh, &best.sh, 48),
             ("gain", &got.gain, &best.gain, 4),
         ] {
             let best: Vec<f64> = best.iter().map(|&v| f64::from(v)).collect();
             let e = worst_row(got, &best, lanes, what);
-            assert!(e < 2e-4, "{tier:?} {what}: {e:.1e}");
+            assert!(e < 2e-4, "{level:?} {what}: {e:.1e}");
         }
     }
 }

@@ -7,10 +7,10 @@ use subsplat_test_support::oracle;
 use glam::{EulerRot, Mat4, Quat, Vec3};
 use oracle::{Shape, Splat};
 use subsplat::abi::{
-    ALPHA_MIN, Convention, LANE_OPACITY, RasterOptions, SPLAT_LANES, ShBasis, ShDirection,
+    ALPHA_MIN, Convention, OPACITY_OFFSET, RasterOptions, SPLAT_STRIDE, ShBasis, ShDirection,
 };
 use subsplat::camera::{Camera, Intrinsics};
-use subsplat::cpu::{Geometry, Rasterizer, Rendered, SplatSlices, Tier};
+use subsplat::cpu::{Geometry, Rasterizer, Rendered, SimdLevel, SplatSlices};
 use subsplat::splats::Splats;
 
 /// xorshift64*.
@@ -200,10 +200,10 @@ fn random_scenes_agree() {
                 for (v, o) in variants.into_iter().enumerate() {
                     let what = format!("{kind:?} {size:?} {convention:?} variant {v}");
                     let expected = oracle::render(&splats, &scene.camera, &o);
-                    for &tier in Tier::available() {
-                        let mut rasterizer = Rasterizer::new().with_tier(tier);
+                    for &level in SimdLevel::available() {
+                        let mut rasterizer = Rasterizer::new().with_simd_level(level);
                         let got = rasterizer.render(&slices(&scene.splats), &scene.camera, &o);
-                        let what = format!("{what} {tier:?}");
+                        let what = format!("{what} {level:?}");
                         let (d, b) = compare(&got, &expected, &what, 5e-5);
                         worst = worst.max(d);
                         boundary += b;
@@ -218,7 +218,7 @@ fn random_scenes_agree() {
         }
     }
     eprintln!("oracle: worst {worst:.1e}, boundary {boundary} of {pixels} pixels");
-    let pixels = pixels * Tier::available().len();
+    let pixels = pixels * SimdLevel::available().len();
     assert!(boundary * 200 < pixels, "boundary: {boundary} of {pixels} pixels");
 }
 
@@ -265,7 +265,7 @@ fn mvsplat_lengths_are_in_units_of_near() {
     let base = Rasterizer::new().render(&slices(&scene.splats), &scene.camera, &o);
     // A power of two scales f32 exactly.
     let mut scaled = scene.splats.clone();
-    for row in scaled.rows.chunks_exact_mut(SPLAT_LANES) {
+    for row in scaled.rows.chunks_exact_mut(SPLAT_STRIDE) {
         for lane in [0, 1, 2, 7, 8, 9] {
             row[lane] *= 4.0;
         }
@@ -309,7 +309,7 @@ fn any_number_of_threads_and_any_memory_gives_the_same_bytes() {
         }
         let more = scene(kind, seed as u64, (150, 97), 4);
         let move_back = camera.world_from_camera * more.camera.camera_from_world();
-        for row in more.splats.rows.chunks_exact(SPLAT_LANES) {
+        for row in more.splats.rows.chunks_exact(SPLAT_STRIDE) {
             let at = move_back.transform_point3(Vec3::from_slice(&row[..3]));
             all.splats.rows.extend(at.to_array());
             all.splats.rows.extend_from_slice(&row[3..]);
@@ -318,10 +318,10 @@ fn any_number_of_threads_and_any_memory_gives_the_same_bytes() {
         all.splats.gain.extend_from_slice(&more.splats.gain);
     }
     assert!(all.splats.len() > 10_000);
-    let tiers = Tier::available().iter().map(|&tier| (Convention::Standard, tier));
-    for (convention, tier) in tiers.chain([(Convention::Mvsplat, Tier::best())]) {
+    let levels = SimdLevel::available().iter().map(|&level| (Convention::Standard, level));
+    for (convention, level) in levels.chain([(Convention::Mvsplat, SimdLevel::best())]) {
         let o = options(convention);
-        let new = || Rasterizer::new().with_tier(tier);
+        let new = || Rasterizer::new().with_simd_level(level);
         let run = |threads: usize, mut rasterizer: Rasterizer| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             pool.install(|| {
@@ -339,14 +339,14 @@ fn any_number_of_threads_and_any_memory_gives_the_same_bytes() {
         let (three, stats3) = run(3, new());
         assert!(
             bytes(&one) == bytes(&three),
-            "{convention:?} {tier:?}: threads change the picture"
+            "{convention:?} {level:?}: threads change the picture"
         );
         assert_eq!((stats.pairs, stats.items), (stats3.pairs, stats3.items));
         for limit in [0, stats.pairs / 7] {
             let (few, _) = run(2, new().with_pairs_per_group(limit));
             assert!(
                 bytes(&one) == bytes(&few),
-                "{convention:?} {tier:?}: the limit changes the picture"
+                "{convention:?} {level:?}: the limit changes the picture"
             );
         }
         let mut planes = Vec::new();
@@ -360,21 +360,25 @@ fn any_number_of_threads_and_any_memory_gives_the_same_bytes() {
     }
 }
 
-/// Tiers with fused products agree to the byte, however wide their registers; the
+/// Levels with fused products agree to the byte, however wide their registers; the
 /// scalar one, which rounds products as well, to 1e-5 but for pixels where that flips
 /// a decision.
 #[test]
-fn tiers_agree() {
+fn levels_agree() {
     let (mut flipped, mut pixels) = (0, 0);
     for (i, kind) in KINDS.into_iter().enumerate() {
         let scene = scene(kind, 40 + i as u64, (100, 75), [0, 1, 4][i % 3]);
         for convention in [Convention::Standard, Convention::Mvsplat] {
             let o = options(convention);
-            let render = |tier| {
-                Rasterizer::new().with_tier(tier).render(&slices(&scene.splats), &scene.camera, &o)
+            let render = |level| {
+                Rasterizer::new().with_simd_level(level).render(
+                    &slices(&scene.splats),
+                    &scene.camera,
+                    &o,
+                )
             };
-            let scalar = render(Tier::Scalar);
-            let fused = Tier::available().iter().filter(|&&t| t != Tier::Scalar);
+            let scalar = render(SimdLevel::Scalar);
+            let fused = SimdLevel::available().iter().filter(|&&t| t != SimdLevel::Scalar);
             let fused: Vec<Rendered> = fused.map(|&t| render(t)).collect();
             for other in fused.windows(2) {
                 assert!(bytes(&other[0]) == bytes(&other[1]), "{kind:?} {convention:?}");
@@ -388,22 +392,24 @@ fn tiers_agree() {
             }
         }
     }
-    eprintln!("{flipped} of {pixels} pixels differ between scalar and fused tiers");
+    eprintln!("{flipped} of {pixels} pixels differ between scalar and fused levels");
     assert!(flipped * 100 <= pixels, "{flipped} of {pixels} pixels");
 }
 
-/// A context that was told no tier takes the best; one that is told a tier which the
+/// A context that was told no level takes the best; one that is told a level which the
 /// processor lacks still draws.
 #[test]
 fn foreign_tiers_draw_as_the_scalar_one() {
     let scene = scene(Kind::Plain, 11, (64, 48), 0);
     let o = options(Convention::Standard);
     let render = |r: Rasterizer| bytes(&{ r }.render(&slices(&scene.splats), &scene.camera, &o));
-    assert!(render(Rasterizer::new()) == render(Rasterizer::new().with_tier(Tier::best())));
-    for tier in [Tier::Avx2, Tier::Avx512, Tier::Neon] {
-        if !tier.is_available() {
-            let scalar = Rasterizer::new().with_tier(Tier::Scalar);
-            assert!(render(Rasterizer::new().with_tier(tier)) == render(scalar));
+    assert!(
+        render(Rasterizer::new()) == render(Rasterizer::new().with_simd_level(SimdLevel::best()))
+    );
+    for level in [SimdLevel::Avx2, SimdLevel::Avx512, SimdLevel::Neon] {
+        if !level.is_available() {
+            let scalar = Rasterizer::new().with_simd_level(SimdLevel::Scalar);
+            assert!(render(Rasterizer::new().with_simd_level(level)) == render(scalar));
         }
     }
 }
@@ -415,7 +421,7 @@ fn crowds_and_giants_are_drawn() {
     let camera = Camera::new(k, Mat4::IDENTITY).unwrap();
     let mut r = Random(77);
     let n = 1 << 20;
-    let mut rows = Vec::with_capacity(SPLAT_LANES * n);
+    let mut rows = Vec::with_capacity(SPLAT_STRIDE * n);
     for i in 0..n {
         let z = 2.0 + 3.0 * r.unit();
         let giant = i % 50_000 == 0;
@@ -473,20 +479,20 @@ fn bad_numbers_drop_their_splat_and_nothing_else() {
         let without = |dropped: &[usize]| {
             let mut s = good.splats.clone();
             for &i in dropped {
-                s.rows[i * SPLAT_LANES + LANE_OPACITY] = 0.0;
+                s.rows[i * SPLAT_STRIDE + OPACITY_OFFSET] = 0.0;
             }
             rasterize(&s, &o)
         };
         assert!(without(&[]) != without(&(0..n).collect::<Vec<_>>()));
-        for lane in 0..SPLAT_LANES {
+        for lane in 0..SPLAT_STRIDE {
             for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e38] {
-                if lane == LANE_OPACITY && bad == 1e38 {
+                if lane == OPACITY_OFFSET && bad == 1e38 {
                     continue; // Opaque, not bad: the cap deals with it.
                 }
                 let mut s = good.splats.clone();
                 let hit: Vec<usize> = (lane..n).step_by(9).collect();
                 for &i in &hit {
-                    s.rows[i * SPLAT_LANES + lane] = bad;
+                    s.rows[i * SPLAT_STRIDE + lane] = bad;
                 }
                 let got = rasterize(&s, &o);
                 assert!(got == without(&hit), "lane {lane} = {bad} {convention:?}");
@@ -495,7 +501,7 @@ fn bad_numbers_drop_their_splat_and_nothing_else() {
         let mut s = good.splats.clone();
         let zero: Vec<usize> = (0..n).step_by(5).collect();
         for &i in &zero {
-            s.rows[i * SPLAT_LANES + 3..i * SPLAT_LANES + 7].fill(0.0);
+            s.rows[i * SPLAT_STRIDE + 3..i * SPLAT_STRIDE + 7].fill(0.0);
         }
         assert!(rasterize(&s, &o) == without(&zero), "zero quaternions {convention:?}");
         let mut s = good.splats.clone();
@@ -509,7 +515,7 @@ fn bad_numbers_drop_their_splat_and_nothing_else() {
         // A lost child does not blind its siblings under the parent's direction.
         let shared = RasterOptions { sh_direction: ShDirection::Parent, ..o };
         let mut s = good.splats.clone();
-        s.rows[8 * SPLAT_LANES] = f32::NAN;
+        s.rows[8 * SPLAT_STRIDE] = f32::NAN;
         let got = rasterize(&s, &shared);
         assert!(got.rgb.iter().all(|v| v.is_finite()));
         let all_gone = rasterize(&poisoned(&good.splats), &o);
@@ -584,7 +590,7 @@ fn opaque_layers_end_the_work() {
     let k = Intrinsics { cx: 0.5, cy: 0.5, width: 1, height: 1, ..k };
     let camera = Camera::new(k, Mat4::IDENTITY).unwrap();
     let mut points = splats.clone();
-    for row in points.rows.chunks_exact_mut(SPLAT_LANES) {
+    for row in points.rows.chunks_exact_mut(SPLAT_STRIDE) {
         row[7..10].fill(0.0);
     }
     rasterizer.render(&slices(&points), &camera, &RasterOptions::default());

@@ -7,7 +7,7 @@ use candle_core::{DType, Device, Tensor, Var};
 use glam::{DMat3, DVec3, Quat, Vec2, Vec3};
 use scenes::*;
 use spgr_calls::*;
-use subsplat::abi::HEAD_LANES;
+use subsplat::abi::HEAD_STRIDE;
 use subsplat::camera::Camera;
 use subsplat::config::*;
 use subsplat::model::spgr_ref;
@@ -36,7 +36,7 @@ fn one_child_is_its_parent() {
     let mut r = Random(5);
     let p = parents(&call.cameras, &mut r);
     let n = p.dim(0).unwrap();
-    let zero = Tensor::zeros((n, 1, HEAD_LANES), DType::F32, &Device::Cpu).unwrap();
+    let zero = Tensor::zeros((n, 1, HEAD_STRIDE), DType::F32, &Device::Cpu).unwrap();
     let (rows, gain) = spgr(&zero, &p, &call).unwrap();
     for lanes in [0..3, 7..10] {
         for i in lanes {
@@ -61,7 +61,7 @@ fn untrained_tuned_children_have_their_parents_opacity() {
         let mut r = Random(6);
         let p = parents(&call.cameras, &mut r);
         let (n, k) = (p.dim(0).unwrap(), side * side);
-        let zero = Tensor::zeros((n, k, HEAD_LANES), DType::F32, &Device::Cpu).unwrap();
+        let zero = Tensor::zeros((n, k, HEAD_STRIDE), DType::F32, &Device::Cpu).unwrap();
         let (rows, _) = spgr(&zero, &p, &call).unwrap();
         let (alpha, own) = (column(&rows, 10), column(&p, 10));
         for (i, a) in alpha.iter().enumerate() {
@@ -132,15 +132,15 @@ fn gradient_is_finite_at_the_initial_point() {
         let config = Config::re10k(preset, 2);
         let call = call(&config, 8);
         let p = parents(&call.cameras, &mut Random(9));
-        let zero = Tensor::zeros((128, 4, HEAD_LANES), DType::F32, &Device::Cpu).unwrap();
+        let zero = Tensor::zeros((128, 4, HEAD_STRIDE), DType::F32, &Device::Cpu).unwrap();
         let h = Var::from_tensor(&zero).unwrap();
         let (rows, gain) = spgr_ref::spgr(h.as_tensor(), &p, &call).unwrap();
         let loss = (rows.sqr().unwrap().sum_all().unwrap() + gain.sum_all().unwrap()).unwrap();
         let g = host(loss.backward().unwrap().get(&h).unwrap());
         assert!(g.iter().all(|v| v.is_finite()));
-        for lane in 0..HEAD_LANES {
+        for lane in 0..HEAD_STRIDE {
             // ∂‖q‖² = 0 along a rotation: only that triple may vanish.
-            let any = g.iter().skip(lane).step_by(HEAD_LANES).any(|v| *v != 0.0);
+            let any = g.iter().skip(lane).step_by(HEAD_STRIDE).any(|v| *v != 0.0);
             assert!(any || (6..9).contains(&lane), "lane {lane} has no gradient");
         }
     }
@@ -175,8 +175,8 @@ fn cross_form_of_the_area_equals_the_determinant() {
     let mut r = Random(11);
     let p = parents(&call.cameras, &mut r).to_dtype(DType::F64).unwrap();
     let mut h = host(&head(128, 4, 0.3, DType::F64, &mut r));
-    h.chunks_mut(HEAD_LANES).for_each(|c| c[9] = 0.0);
-    let (rows, _) = spgr(&cpu(h, &[128, 4, HEAD_LANES]), &p, &call).unwrap();
+    h.chunks_mut(HEAD_STRIDE).for_each(|c| c[9] = 0.0);
+    let (rows, _) = spgr(&cpu(h, &[128, 4, HEAD_STRIDE]), &p, &call).unwrap();
     let rows = host(&rows);
     for (n, children) in rows.chunks(44).enumerate() {
         let camera = &call.cameras[n / 64];
@@ -293,7 +293,7 @@ fn children_sit_on_the_sub_pixel_grid() {
             let call = call(&config, 8);
             let p = parents(&call.cameras, &mut Random(14));
             let k = side * side;
-            let zero = Tensor::zeros((128, k, HEAD_LANES), DType::F32, &Device::Cpu).unwrap();
+            let zero = Tensor::zeros((128, k, HEAD_STRIDE), DType::F32, &Device::Cpu).unwrap();
             let rows = host(&spgr(&zero, &p, &call).unwrap().0);
             let own = host(&p);
             for (i, row) in rows.chunks(11).enumerate() {
@@ -323,9 +323,9 @@ fn learned_residuals_have_their_units_and_bounds() {
     let p = parents(&call.cameras, &mut Random(22));
     let own = host(&p);
     let run = |call: &Spgr, lane: usize, value: f32| {
-        let mut h = vec![0f32; 128 * 4 * HEAD_LANES];
-        h.chunks_mut(HEAD_LANES).for_each(|c| c[lane] = value);
-        let h = Tensor::from_vec(h, (128, 4, HEAD_LANES), &Device::Cpu).unwrap();
+        let mut h = vec![0f32; 128 * 4 * HEAD_STRIDE];
+        h.chunks_mut(HEAD_STRIDE).for_each(|c| c[lane] = value);
+        let h = Tensor::from_vec(h, (128, 4, HEAD_STRIDE), &Device::Cpu).unwrap();
         let (rows, gain) = spgr(&h, &p, call).unwrap();
         (host(&rows), host(&gain))
     };
@@ -373,7 +373,7 @@ fn disc_steps_stay_on_the_disc_and_reduce_to_the_flat_step() {
             .map(|&v| f64::from(v))
             .collect();
         let p = cpu(row, &[1, 11]);
-        let zero = Tensor::zeros((1, 4, HEAD_LANES), DType::F64, &Device::Cpu).unwrap();
+        let zero = Tensor::zeros((1, 4, HEAD_STRIDE), DType::F64, &Device::Cpu).unwrap();
         let disc = host(&spgr(&zero, &p, &call).unwrap().0);
         let normal = q * Vec3::Z;
         for row in disc.chunks(11) {
@@ -407,7 +407,7 @@ fn disc_steps_of_needles_survive_single_precision() {
         // A needle a thousand times as long as thick.
         let row = [at.x, at.y, at.z, q.w, q.x, q.y, q.z, 0.5, 5e-4, 5e-4, 0.8];
         let p = cpu(row.iter().map(|&v| f64::from(v)).collect(), &[1, 11]);
-        let zero = Tensor::zeros((1, 4, HEAD_LANES), DType::F64, &Device::Cpu).unwrap();
+        let zero = Tensor::zeros((1, 4, HEAD_STRIDE), DType::F64, &Device::Cpu).unwrap();
         let single = |t: &Tensor| t.to_dtype(DType::F32).unwrap();
         let exact = host(&spgr(&zero, &p, &call).unwrap().0);
         let got = host(&spgr(&single(&zero), &single(&p), &call).unwrap().0);
@@ -427,12 +427,12 @@ fn rotations_compose_in_the_parents_axes() {
     let p = parents(&call.cameras, &mut r).to_dtype(DType::F64).unwrap();
     // From rotations of radians down to where θ underflows in f32.
     for scale in [1.0, 1e-2, 1e-3, 1e-4, 1e-8, 0.0] {
-        let mut h = vec![0.0; 128 * HEAD_LANES];
-        for c in h.chunks_mut(HEAD_LANES) {
+        let mut h = vec![0.0; 128 * HEAD_STRIDE];
+        for c in h.chunks_mut(HEAD_STRIDE) {
             c[6..9].copy_from_slice(&r.normals(3, scale));
         }
         for dtype in [DType::F64, DType::F32] {
-            let t = cpu(h.clone(), &[128, 1, HEAD_LANES]).to_dtype(dtype).unwrap();
+            let t = cpu(h.clone(), &[128, 1, HEAD_STRIDE]).to_dtype(dtype).unwrap();
             let (rows, _) = spgr(&t, &p.to_dtype(dtype).unwrap(), &call).unwrap();
             let (rows, own) = (host(&rows), host(&p));
             for ((row, own), h) in rows.chunks(11).zip(own.chunks(11)).zip(h.chunks(11)) {
@@ -462,7 +462,7 @@ fn nearest_visible_view_places_the_children() {
     let pitch = |call: &Spgr, at: [f64; 3]| {
         let row = [at[0], at[1], at[2], 1.0, 0.0, 0.0, 0.0, 0.1, 0.1, 0.1, 0.5];
         let p = cpu(row.to_vec(), &[1, 11]);
-        let zero = Tensor::zeros((1, 4, HEAD_LANES), DType::F64, &Device::Cpu).unwrap();
+        let zero = Tensor::zeros((1, 4, HEAD_STRIDE), DType::F64, &Device::Cpu).unwrap();
         let rows = host(&spgr(&zero, &p, call).unwrap().0);
         (rows[11] - rows[0]) * f64::from(call.cameras[0].intrinsics.fx)
     };
@@ -519,13 +519,13 @@ fn hostile_parents_give_finite_children_or_an_error() {
 fn misfits_are_refused_by_name() {
     let call = call(&Config::x2(), 8);
     let p = parents(&call.cameras, &mut Random(17));
-    let h = Tensor::zeros((128, 9, HEAD_LANES), DType::F32, &Device::Cpu).unwrap();
+    let h = Tensor::zeros((128, 9, HEAD_STRIDE), DType::F32, &Device::Cpu).unwrap();
     let error = spgr(&h, &p, &call).unwrap_err().to_string();
     assert!(error.contains("[N, 4, 11]"), "{error}");
     let big = Spgr { rules: Rules { side: 9, ..call.rules }, ..call.clone() };
-    let h = Tensor::zeros((128, 81, HEAD_LANES), DType::F32, &Device::Cpu).unwrap();
+    let h = Tensor::zeros((128, 81, HEAD_STRIDE), DType::F32, &Device::Cpu).unwrap();
     assert!(spgr(&h, &p, &big).unwrap_err().to_string().contains("64"));
-    let h = Tensor::zeros((128, 4, HEAD_LANES), DType::F32, &Device::Cpu).unwrap();
+    let h = Tensor::zeros((128, 4, HEAD_STRIDE), DType::F32, &Device::Cpu).unwrap();
     let error = spgr_into(&h, &p, &call, &mut [0.0; 3], &mut []).unwrap_err().to_string();
     assert!(error.contains("buffers"), "{error}");
 }

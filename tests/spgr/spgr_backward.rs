@@ -7,7 +7,7 @@ use subsplat_test_support::spgr_calls;
 use candle_core::{DType, Device, Result, Tensor, Var};
 use scenes::*;
 use spgr_calls::*;
-use subsplat::abi::{HEAD_GAIN, HEAD_LANES, SPLAT_LANES};
+use subsplat::abi::{HEAD_GAIN_OFFSET, HEAD_STRIDE, SPLAT_STRIDE};
 use subsplat::config::*;
 use subsplat::cpu::spgr::{self as kernel, Args};
 use subsplat::model::spgr_ref;
@@ -118,7 +118,7 @@ fn single_precision_gradients_are_as_good_as_the_unfused_graphs() {
 /// One parent in front of view 0 of `call` and one head record for its children, f64.
 struct Nasty {
     name: &'static str,
-    row: [f64; SPLAT_LANES],
+    row: [f64; SPLAT_STRIDE],
     head: Vec<f64>,
 }
 
@@ -126,7 +126,7 @@ fn nasty(call: &Spgr, children: usize, r: &mut Random) -> Vec<Nasty> {
     let camera = &call.cameras[0];
     let middle = camera.intrinsics.height / 2 * camera.intrinsics.width + 3;
     let base: Vec<f64> = host(&parents(&call.cameras, r).narrow(0, middle, 1).unwrap());
-    let base: [f64; SPLAT_LANES] = base.try_into().unwrap();
+    let base: [f64; SPLAT_STRIDE] = base.try_into().unwrap();
     let at = |x: f32, y: f32, z: f32| {
         let p = camera.position() + camera.rotation() * glam::Vec3::new(x, y, z);
         p.to_array().map(f64::from)
@@ -156,8 +156,8 @@ fn nasty(call: &Spgr, children: usize, r: &mut Random) -> Vec<Nasty> {
     };
     let mut all = Vec::new();
     let mut push = |name, row, change: &dyn Fn(&mut [f64])| {
-        let mut head = r.normals(children * HEAD_LANES, 0.5);
-        head.chunks_mut(HEAD_LANES).for_each(change);
+        let mut head = r.normals(children * HEAD_STRIDE, 0.5);
+        head.chunks_mut(HEAD_STRIDE).for_each(change);
         all.push(Nasty { name, row, head });
     };
     push("zero record", base, &|c| c.fill(0.0));
@@ -189,8 +189,8 @@ fn gradients_at_every_guard_are_finite_and_those_of_the_unfused_graph() {
             call.per_view = 1;
             let k = side * side;
             for case in nasty(&call, k, &mut r) {
-                let p = Tensor::from_slice(&case.row, (1, SPLAT_LANES), &Device::Cpu).unwrap();
-                let h = Tensor::from_vec(case.head, (1, k, HEAD_LANES), &Device::Cpu).unwrap();
+                let p = Tensor::from_slice(&case.row, (1, SPLAT_STRIDE), &Device::Cpu).unwrap();
+                let h = Tensor::from_vec(case.head, (1, k, HEAD_STRIDE), &Device::Cpu).unwrap();
                 let what = format!("{name}, {}", case.name);
                 let got = gradients(spgr, &call, &h, &p, 9);
                 let want = gradients(spgr_ref::spgr, &call, &h, &p, 9);
@@ -236,8 +236,8 @@ impl Plain {
 
     /// Children, gains, and gradients of head and parents.
     fn run(&self) -> (bool, [Vec<f32>; 4]) {
-        let (n, rules) = (self.parents.len() / SPLAT_LANES, &self.call.rules);
-        let mut rows = vec![0f32; n * rules.children() * SPLAT_LANES];
+        let (n, rules) = (self.parents.len() / SPLAT_STRIDE, &self.call.rules);
+        let mut rows = vec![0f32; n * rules.children() * SPLAT_STRIDE];
         let mut gains = vec![0f32; n * rules.children() * rules.gain_lanes()];
         let finite = kernel::forward(self.args(), &mut rows, &mut gains);
         let weights = |n: usize| -> Vec<f32> { (0..n).map(|i| (i as f32 * 0.37).sin()).collect() };
@@ -271,24 +271,25 @@ fn gains_alone_have_a_gradient() {
     // γ = 1 + δ·tanh γ̃ and, in RGB, three times δ/2·tanh γ̃.
     for (name, config) in variants(2) {
         let plain = Plain::new(&config, 38);
-        let (n, k) = (plain.parents.len() / SPLAT_LANES, 4);
+        let (n, k) = (plain.parents.len() / SPLAT_STRIDE, 4);
         let of = |v: &[f32], s: &[usize]| Var::from_slice(v, s, &Device::Cpu).unwrap();
-        let (h, p) = (of(&plain.head, &[n, k, HEAD_LANES]), of(&plain.parents, &[n, SPLAT_LANES]));
+        let (h, p) =
+            (of(&plain.head, &[n, k, HEAD_STRIDE]), of(&plain.parents, &[n, SPLAT_STRIDE]));
         let (rows, gains) = spgr(&h, &p, &plain.call).unwrap();
         let grads = gains.sum_all().unwrap().backward().unwrap();
         let got = grads.get(&h).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
         let rules = &plain.call.rules;
         let factor = rules.delta * if rules.rgb_gain { 2.5 } else { 1.0 };
-        for (record, d) in plain.head.chunks(HEAD_LANES).zip(got.chunks(HEAD_LANES)) {
-            let t = f64::from(record[HEAD_GAIN]).tanh();
+        for (record, d) in plain.head.chunks(HEAD_STRIDE).zip(got.chunks(HEAD_STRIDE)) {
+            let t = f64::from(record[HEAD_GAIN_OFFSET]).tanh();
             let want = factor * (1.0 - t * t);
-            assert!((f64::from(d[HEAD_GAIN]) - want).abs() < 1e-6, "{name}: {d:?} {want}");
-            assert!(d[..HEAD_GAIN].iter().all(|v| *v == 0.0), "{name}: {d:?}");
+            assert!((f64::from(d[HEAD_GAIN_OFFSET]) - want).abs() < 1e-6, "{name}: {d:?} {want}");
+            assert!(d[..HEAD_GAIN_OFFSET].iter().all(|v| *v == 0.0), "{name}: {d:?}");
         }
         // Children alone leave that lane without one.
         let grads = rows.sum_all().unwrap().backward().unwrap();
         let got = grads.get(&h).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
-        assert!(got.chunks(HEAD_LANES).all(|d| d[HEAD_GAIN] == 0.0), "{name}");
+        assert!(got.chunks(HEAD_STRIDE).all(|d| d[HEAD_GAIN_OFFSET] == 0.0), "{name}");
         assert!(got.iter().any(|v| *v != 0.0), "{name}");
     }
 }
@@ -317,8 +318,8 @@ fn a_record_that_is_not_a_number_stays_with_its_parent() {
         let (finite, clean) = plain.run();
         assert!(finite, "{name}");
         let victim = 21;
-        for lane in 0..HEAD_LANES {
-            let at = (victim * 4 + 2) * HEAD_LANES + lane;
+        for lane in 0..HEAD_STRIDE {
+            let at = (victim * 4 + 2) * HEAD_STRIDE + lane;
             let was = std::mem::replace(&mut plain.head[at], f32::NAN);
             let (finite, got) = plain.run();
             plain.head[at] = was;

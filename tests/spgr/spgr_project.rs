@@ -9,7 +9,7 @@ use glam::{Mat4, Quat, Vec3};
 use scenes::*;
 use spgr_calls::*;
 use subsplat::abi::{
-    Convention, RasterOptions, SPLAT_LANES, ShBasis, ShDirection, sh_coefficients,
+    Convention, RasterOptions, SPLAT_STRIDE, ShBasis, ShDirection, sh_coefficients,
 };
 use subsplat::camera::Camera;
 use subsplat::config::*;
@@ -46,7 +46,7 @@ impl Scene {
     }
 
     fn len(&self) -> usize {
-        self.parents.len() / SPLAT_LANES * self.call.rules.children()
+        self.parents.len() / SPLAT_STRIDE * self.call.rules.children()
     }
 
     fn direct(&self, camera: &Camera, options: &RasterOptions) -> (bool, Vec<Footprint>) {
@@ -58,7 +58,7 @@ impl Scene {
 
     /// Through children in memory.
     fn by_rows(&self, camera: &Camera, options: &RasterOptions) -> Vec<Footprint> {
-        let mut rows = vec![0f32; self.len() * SPLAT_LANES];
+        let mut rows = vec![0f32; self.len() * SPLAT_STRIDE];
         let mut gain = vec![0f32; self.len() * self.call.rules.gain_lanes()];
         assert!(kernel::forward(self.args(), &mut rows, &mut gain));
         let splats = SplatSlices {

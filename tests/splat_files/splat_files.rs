@@ -5,7 +5,7 @@ use subsplat_test_support::splat_scene;
 use glam::{DMat3, DVec3};
 use splat_scene::*;
 use std::path::{Path, PathBuf};
-use subsplat::abi::{SPLAT_LANES, ShBasis};
+use subsplat::abi::{SPLAT_STRIDE, ShBasis};
 use subsplat::io::{SaveOptions, SplatFormat, Up, load_splats, save_splats, splat_info};
 use subsplat::splats::Splats;
 
@@ -189,8 +189,8 @@ fn spz_round_trips_within_its_steps() {
             let again = reload("b.spz", &after, &options);
             assert_eq!(after.sh, again.sh);
             assert_eq!(
-                after.rows.chunks(SPLAT_LANES).map(|r| &r[..3]).collect::<Vec<_>>(),
-                again.rows.chunks(SPLAT_LANES).map(|r| &r[..3]).collect::<Vec<_>>()
+                after.rows.chunks(SPLAT_STRIDE).map(|r| &r[..3]).collect::<Vec<_>>(),
+                again.rows.chunks(SPLAT_STRIDE).map(|r| &r[..3]).collect::<Vec<_>>()
             );
         }
         let z = SaveOptions { up: Up::Z, ..Default::default() };
@@ -231,7 +231,7 @@ fn splat_quaternion_bytes_reach_their_ends() {
     let kind = Kind { parents: 4, children: 1, degree: 0, gain_lanes: 0, basis: ShBasis::Standard };
     let mut s = scene(16, kind);
     for i in 0..4 {
-        let row = &mut s.rows[i * SPLAT_LANES..(i + 1) * SPLAT_LANES];
+        let row = &mut s.rows[i * SPLAT_STRIDE..(i + 1) * SPLAT_STRIDE];
         row[3..7].fill(0.0);
         row[3 + i] = if i % 2 == 0 { 3.0 } else { -0.5 };
         row[7..].fill(1.0 / (1.0 + i as f32));
@@ -313,7 +313,7 @@ fn numbers_that_are_not_finite_are_refused_by_index() {
         for (lane, what) in [(1, "mean"), (5, "quaternion"), (8, "scale"), (10, "opacity")] {
             for value in [f32::NAN, f32::INFINITY] {
                 let mut s = good.clone();
-                s.rows[7 * SPLAT_LANES + lane] = value;
+                s.rows[7 * SPLAT_STRIDE + lane] = value;
                 refused(&s, "splat 7", what);
             }
         }
@@ -324,7 +324,7 @@ fn numbers_that_are_not_finite_are_refused_by_index() {
         s.gain[4 * 9 + 2] = f32::INFINITY;
         refused(&s, "splat 9", "gain");
         let mut s = good.clone();
-        s.rows[3 * SPLAT_LANES + 10] = 1.5;
+        s.rows[3 * SPLAT_STRIDE + 10] = 1.5;
         refused(&s, "splat 3", "opacity in [0, 1]");
         let mut s = good.clone();
         (s.gain[4 * 4], s.sh[2 * 12]) = (3e38, 3e38);
@@ -369,7 +369,7 @@ fn info_describes_what_is_there() {
         Kind { parents: 101, children: 1, degree: 2, gain_lanes: 0, basis: ShBasis::Standard };
     let mut s = scene(11, kind);
     for i in 0..101 {
-        s.rows[i * SPLAT_LANES + 10] = i as f32 / 100.0;
+        s.rows[i * SPLAT_STRIDE + 10] = i as f32 / 100.0;
     }
     let (folder, path) = save("a.ply", &s, &SaveOptions::default());
     let info = splat_info(&path).unwrap();
@@ -411,7 +411,7 @@ fn glb_structure_is_what_gltf_asks_for() {
         Kind { parents: 20_000, children: 1, degree: 3, gain_lanes: 0, basis: ShBasis::Standard };
     let mut s = scene(12, kind);
     // Mid-grey, fully opaque, at the identity.
-    s.rows[..SPLAT_LANES].copy_from_slice(&[9., 8., 7., 2., 0., 0., 0., 0.1, 0.2, 0.3, 1.0]);
+    s.rows[..SPLAT_STRIDE].copy_from_slice(&[9., 8., 7., 2., 0., 0., 0., 0.1, 0.2, 0.3, 1.0]);
     s.sh[..3].fill(0.0);
     let (_folder, path) = save("a.glb", &s, &SaveOptions::default());
     let bytes = std::fs::read(path).unwrap();
@@ -509,7 +509,7 @@ fn glb_nodes_move_turn_and_scale_splats() {
         // glTF (x, −y, −z), doubled, turned to (−y, x, z), shifted, and back to ours.
         let g = [2.0 * m[0], -2.0 * m[1], -2.0 * m[2]];
         let g = [1.0 - g[1], 2.0 + g[0], 3.0 + g[2]];
-        let row = &mut expected.rows[i * SPLAT_LANES..];
+        let row = &mut expected.rows[i * SPLAT_STRIDE..];
         // `assert_same` turns the mean: give it the one before the turn.
         row[..3].copy_from_slice(&[g[1], g[0], -g[2]]);
         row[7..10].iter_mut().for_each(|v| *v *= 2.0);

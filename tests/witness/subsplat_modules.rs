@@ -8,7 +8,7 @@ use candle_core::{DType, Device, Result, Tensor};
 use glam::{DMat3, DQuat, DVec3};
 use std::collections::BTreeMap;
 use subsplat::abi::{
-    Convention, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, RasterOptions, ShBasis,
+    Convention, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, RasterOptions, SCALE_OFFSET, ShBasis,
 };
 use subsplat::camera::Camera;
 use subsplat::config::{self, Config, FeatureLevel, LowpassRef, Preset};
@@ -134,13 +134,13 @@ fn backbone(
 fn split(rows: &Tensor, parents: &Tensor) -> Result<BTreeMap<&'static str, Tensor>> {
     let (count, n) = (rows.dim(0)?, parents.dim(0)?);
     let (rows, parents) = (rows.to_dtype(DType::F64)?, parents.to_dtype(DType::F64)?);
-    let means = rows.narrow(1, LANE_MEAN, 3)?.reshape((n, count / n, 3))?;
-    let steps = means.broadcast_sub(&parents.narrow(1, LANE_MEAN, 3)?.unsqueeze(1)?)?;
+    let means = rows.narrow(1, MEAN_OFFSET, 3)?.reshape((n, count / n, 3))?;
+    let steps = means.broadcast_sub(&parents.narrow(1, MEAN_OFFSET, 3)?.unsqueeze(1)?)?;
     Ok(BTreeMap::from([
         ("steps", steps.reshape((count, 3))?),
-        ("quats", rows.narrow(1, LANE_QUAT, 4)?),
-        ("log_scales", rows.narrow(1, LANE_SCALE, 3)?.log()?),
-        ("opacities", rows.narrow(1, LANE_OPACITY, 1)?.squeeze(1)?),
+        ("quats", rows.narrow(1, QUAT_OFFSET, 4)?),
+        ("log_scales", rows.narrow(1, SCALE_OFFSET, 3)?.log()?),
+        ("opacities", rows.narrow(1, OPACITY_OFFSET, 1)?.squeeze(1)?),
     ]))
 }
 
@@ -318,12 +318,17 @@ fn projection() -> Result<()> {
         let mut rows = scene.rows()?.to_vec2::<f32>()?;
         let (mut means, mut cov6, mut opacities) = (Vec::new(), Vec::new(), Vec::new());
         for row in &mut rows {
-            row[LANE_SCALE..LANE_SCALE + 3].iter_mut().for_each(|s| *s *= size);
+            row[SCALE_OFFSET..SCALE_OFFSET + 3].iter_mut().for_each(|s| *s *= size);
             let part = |at: usize| [row[at], row[at + 1], row[at + 2]];
-            let quat = [row[LANE_QUAT], row[LANE_QUAT + 1], row[LANE_QUAT + 2], row[LANE_QUAT + 3]];
-            means.extend(part(LANE_MEAN));
-            cov6.extend(covariance(quat, part(LANE_SCALE)));
-            opacities.push(row[LANE_OPACITY]);
+            let quat = [
+                row[QUAT_OFFSET],
+                row[QUAT_OFFSET + 1],
+                row[QUAT_OFFSET + 2],
+                row[QUAT_OFFSET + 3],
+            ];
+            means.extend(part(MEAN_OFFSET));
+            cov6.extend(covariance(quat, part(SCALE_OFFSET)));
+            opacities.push(row[OPACITY_OFFSET]);
         }
         let packed = rows.concat();
         let forms = [

@@ -2,7 +2,7 @@
 
 use super::colour::{self, Frame};
 use super::{Adapter, GEOMETRY, Pixel, QUAT_EPS, View, columns, dot, opacity, strided};
-use crate::abi::{LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES};
+use crate::abi::{MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE};
 use crate::cpu::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};
 use rayon::prelude::*;
 
@@ -63,19 +63,19 @@ impl<T: LaneReal> Backward<'_, T> {
         for k in 0..g {
             let t = strided(m, depths, (first * g + k, g));
             let p = strided(m, densities, (first * g + k, g));
-            let from = &self.reached.rows[(first * g + k) * SPLAT_LANES..];
-            let d: [M::V; SPLAT_LANES] = m.load_rows(from, (g * SPLAT_LANES, count));
+            let from = &self.reached.rows[(first * g + k) * SPLAT_STRIDE..];
+            let d: [M::V; SPLAT_STRIDE] = m.load_rows(from, (g * SPLAT_STRIDE, count));
             let mut d_t = zero;
             for i in 0..3 {
-                let (mean, scale) = (d[LANE_MEAN + i], d[LANE_SCALE + i]);
+                let (mean, scale) = (d[MEAN_OFFSET + i], d[SCALE_OFFSET + i]);
                 d_towards[i] = t.fma(mean, d_towards[i]);
                 d_scale[i] = t.fma(scale, d_scale[i]);
                 d_t = mean.fma(pixel.towards[i], scale.fma(pixel.scale[i], d_t));
             }
-            for (sum, d) in d_quat.iter_mut().zip(&d[LANE_QUAT..LANE_QUAT + 4]) {
+            for (sum, d) in d_quat.iter_mut().zip(&d[QUAT_OFFSET..QUAT_OFFSET + 4]) {
                 *sum = *sum + *d;
             }
-            let d_p = d[LANE_OPACITY] * opacity(m, self.adapter, p).1;
+            let d_p = d[OPACITY_OFFSET] * opacity(m, self.adapter, p).1;
             put(m, d_t, (first * g + k, g, count), self.d_depths);
             put(m, d_p, (first * g + k, g, count), self.d_densities);
         }
@@ -175,7 +175,7 @@ pub fn backward<T: LaneReal>(
         .zip(d_depths.par_chunks_mut(width * g).zip(d_densities.par_chunks_mut(width * g)))
         .enumerate()
         .for_each(|(i, (d_raw, (d_depths, d_densities)))| {
-            let rows = &reached.rows[i * width * g * SPLAT_LANES..][..width * g * SPLAT_LANES];
+            let rows = &reached.rows[i * width * g * SPLAT_STRIDE..][..width * g * SPLAT_STRIDE];
             let colours = reached.colours.map(|c| c.map(|c| &c[i * set..][..set]));
             T::dispatch(Backward {
                 adapter: a,

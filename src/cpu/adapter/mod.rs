@@ -20,7 +20,7 @@ pub mod colour;
 pub use backward::{Gradients, Reached, backward};
 
 use super::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};
-use crate::abi::{LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES};
+use crate::abi::{MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE};
 use colour::Turn;
 use rayon::prelude::*;
 
@@ -225,15 +225,15 @@ impl<T: LaneReal> Kernel<T> for Forward<'_, T> {
             for k in 0..g {
                 let t = strided(m, self.depths, (first * g + k, g));
                 let p = strided(m, self.densities, (first * g + k, g));
-                let mut row = [m.of(0.0); SPLAT_LANES];
+                let mut row = [m.of(0.0); SPLAT_STRIDE];
                 for i in 0..3 {
-                    row[LANE_MEAN + i] = pixel.towards[i].fma(t, m.of(self.view.origin[i]));
-                    row[LANE_SCALE + i] = pixel.scale[i] * t;
+                    row[MEAN_OFFSET + i] = pixel.towards[i].fma(t, m.of(self.view.origin[i]));
+                    row[SCALE_OFFSET + i] = pixel.scale[i] * t;
                 }
-                row[LANE_QUAT..LANE_QUAT + 4].copy_from_slice(&pixel.quat);
-                row[LANE_OPACITY] = opacity(m, self.adapter, p).0;
-                let out = &mut self.out[(first * g + k) * SPLAT_LANES..];
-                m.store_rows(&row, (g * SPLAT_LANES, count), out);
+                row[QUAT_OFFSET..QUAT_OFFSET + 4].copy_from_slice(&pixel.quat);
+                row[OPACITY_OFFSET] = opacity(m, self.adapter, p).0;
+                let out = &mut self.out[(first * g + k) * SPLAT_STRIDE..];
+                m.store_rows(&row, (g * SPLAT_STRIDE, count), out);
             }
         }
     }
@@ -242,7 +242,7 @@ impl<T: LaneReal> Kernel<T> for Forward<'_, T> {
 /// Packed rows of all views' Gaussians into `out` `[views·H·W·G, 11]` (module doc).
 pub fn forward<T: LaneReal>(a: &Adapter, [raw, depths, densities]: [&[T]; 3], out: &mut [T]) {
     let ([height, width], g, lanes) = (a.size, a.per_pixel, a.raw_lanes());
-    out.par_chunks_mut(width * g * SPLAT_LANES).enumerate().for_each(|(i, out)| {
+    out.par_chunks_mut(width * g * SPLAT_STRIDE).enumerate().for_each(|(i, out)| {
         T::dispatch(Forward {
             adapter: a,
             view: &a.views[i / height],

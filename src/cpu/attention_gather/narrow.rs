@@ -10,7 +10,7 @@
 
 use super::{BLOCK, Gather};
 use crate::cpu::math::exp;
-use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
+use crate::cpu::simd::{Kernel, LANES, Simd, SimdLevel, Vector};
 use rayon::prelude::*;
 
 /// Most samples of a parent, and four times as many taps.
@@ -39,7 +39,7 @@ pub(super) fn forward(g: &Gather, maps: &[f32], query: &[f32], points: &[f32], o
     let blocks = out.par_chunks_mut(BLOCK * g.dim);
     let blocks = blocks.zip(query.par_chunks(BLOCK * q_width));
     blocks.zip(points.par_chunks(BLOCK * p_width)).for_each(|((out, query), points)| {
-        Tier::best().run(Block { g, key, maps, query, points, out });
+        SimdLevel::best().run(Block { g, key, maps, query, points, out });
     });
 }
 
@@ -172,7 +172,7 @@ unsafe fn products<S: Simd>(
             unsafe {
                 let q = lanes(s, q.as_ptr().add(c));
                 for t in 0..WIDE {
-                    sums[t] = s.fma(q, lanes(s, rows[t].add(c)), sums[t]);
+                    sums[t] = q.fma(lanes(s, rows[t].add(c)), sums[t]);
                 }
             }
         }
@@ -192,7 +192,7 @@ unsafe fn blend<S: Simd>(s: S, values: *const f32, taps: &Taps, out: &mut [f32])
             let (row, weight) = (values.wrapping_add(at + c), s.splat(*weight));
             for i in 0..WIDE {
                 // SAFETY: the caller's.
-                sums[i] = s.fma(weight, unsafe { lanes(s, row.add(i * LANES)) }, sums[i]);
+                sums[i] = weight.fma(unsafe { lanes(s, row.add(i * LANES)) }, sums[i]);
             }
         }
         for i in 0..WIDE {

@@ -11,7 +11,7 @@
 //! weight: nine for four outputs where the definition needs twelve, 81 and not 144 in two
 //! dimensions. ∂L/∂x is the same algorithm turned over.
 
-use crate::cpu::simd::{LANES, Simd};
+use crate::cpu::simd::{LANES, Simd, Vector};
 use std::f32::consts::{FRAC_1_SQRT_2, SQRT_2};
 
 /// Grid positions of a tile along an axis: outputs, or pairs of outputs.
@@ -61,14 +61,14 @@ impl Form<6, 6, 4> for Unit {
     fn points<S: Simd>(s: S, x: [S::F; 6]) -> [S::F; 6] {
         let (half, two) = (s.splat(0.5), s.splat(2.0));
         let both = s.splat(2.5);
-        let first = s.fnma(both, x[2], x[0] + x[4]);
-        let last = s.fnma(both, x[3], x[1] + x[5]);
-        let (even, odd) = (s.fnma(two, x[2], x[4]), s.fnma(two, x[1], x[3]));
+        let first = both.fnma(x[2], x[0] + x[4]);
+        let last = both.fnma(x[3], x[1] + x[5]);
+        let (even, odd) = (two.fnma(x[2], x[4]), two.fnma(x[1], x[3]));
         let root = s.splat(FRAC_1_SQRT_2);
-        let (a, b) = (s.fma(root, odd, even), s.fnma(root, odd, even));
-        let (even, odd) = (s.fnma(half, x[2], x[4]), s.fnma(half, x[1], x[3]));
+        let (a, b) = (root.fma(odd, even), root.fnma(odd, even));
+        let (even, odd) = (half.fnma(x[2], x[4]), half.fnma(x[1], x[3]));
         let root = s.splat(SQRT_2);
-        [first, a, b, s.fma(root, odd, even), s.fnma(root, odd, even), last]
+        [first, a, b, root.fma(odd, even), root.fnma(odd, even), last]
     }
 
     #[inline(always)]
@@ -81,8 +81,8 @@ impl Form<6, 6, 4> for Unit {
         [
             y[0] + near + far,
             near_odd + far_odd,
-            s.fma(half, near, two * far),
-            s.fma(half, near_odd, s.fma(two, far_odd, y[5])),
+            half.fma(near, two * far),
+            half.fma(near_odd, two.fma(far_odd, y[5])),
         ]
     }
 
@@ -91,10 +91,10 @@ impl Form<6, 6, 4> for Unit {
     #[inline(always)]
     fn weights<S: Simd>(s: S, [g0, g1, g2]: [S::F; 3]) -> [S::F; WEIGHTS] {
         // 2·½·(½ − 2) = −3/2 and 2·2·(2 − ½) = 6.
-        let even = s.fma(s.splat(0.5), g2, g0) * s.splat(-2.0 / 3.0);
+        let even = s.splat(0.5).fma(g2, g0) * s.splat(-2.0 / 3.0);
         let odd = g1 * s.splat(-2.0 / 3.0 * FRAC_1_SQRT_2);
         let (a, b) = (even + odd, even - odd);
-        let even = s.fma(s.splat(2.0), g2, g0) * s.splat(1.0 / 6.0);
+        let even = s.splat(2.0).fma(g2, g0) * s.splat(1.0 / 6.0);
         let odd = g1 * s.splat(1.0 / 6.0 * SQRT_2);
         [g0, a, b, even + odd, even - odd, g2]
     }
@@ -104,12 +104,12 @@ impl Adjoint<6> for Unit {
     #[inline(always)]
     fn spread<S: Simd>(s: S, d: [S::F; TILE]) -> [S::F; 6] {
         let (half, two) = (s.splat(0.5), s.splat(2.0));
-        let (even, odd) = (s.fma(half, d[2], d[0]), s.fma(half, d[3], d[1]));
+        let (even, odd) = (half.fma(d[2], d[0]), half.fma(d[3], d[1]));
         let root = s.splat(FRAC_1_SQRT_2);
-        let (a, b) = (s.fma(root, odd, even), s.fnma(root, odd, even));
-        let (even, odd) = (s.fma(two, d[2], d[0]), s.fma(two, d[3], d[1]));
+        let (a, b) = (root.fma(odd, even), root.fnma(odd, even));
+        let (even, odd) = (two.fma(d[2], d[0]), two.fma(d[3], d[1]));
         let root = s.splat(SQRT_2);
-        [d[0], a, b, s.fma(root, odd, even), s.fnma(root, odd, even), d[3]]
+        [d[0], a, b, root.fma(odd, even), root.fnma(odd, even), d[3]]
     }
 
     #[inline(always)]
@@ -119,13 +119,10 @@ impl Adjoint<6> for Unit {
         let (two_thirds, sixth, third) =
             (s.splat(2.0 / 3.0), s.splat(1.0 / 6.0), s.splat(1.0 / 3.0));
         [
-            s.fma(sixth, far, s.fnma(two_thirds, near, q[0])),
-            s.fnma(
-                s.splat(2.0 / 3.0 * FRAC_1_SQRT_2),
-                near_odd,
-                s.splat(1.0 / 6.0 * SQRT_2) * far_odd,
-            ),
-            s.fma(third, far - near, q[5]),
+            sixth.fma(far, two_thirds.fnma(near, q[0])),
+            s.splat(2.0 / 3.0 * FRAC_1_SQRT_2)
+                .fnma(near_odd, s.splat(1.0 / 6.0 * SQRT_2) * far_odd),
+            third.fma(far - near, q[5]),
         ]
     }
 }
@@ -150,13 +147,13 @@ const AT_B: f32 = 2.0 * B * (B * B - A * A);
 #[inline(always)]
 fn pair_points<S: Simd>(s: S, x: [S::F; 5]) -> [S::F; 5] {
     let (a2, b2) = (s.splat(A * A), s.splat(B * B));
-    let (even, odd) = (s.fnma(b2, x[1], x[3]), s.fnma(b2, x[0], x[2]));
+    let (even, odd) = (b2.fnma(x[1], x[3]), b2.fnma(x[0], x[2]));
     let a = s.splat(A);
-    let (p, q) = (s.fma(a, odd, even), s.fnma(a, odd, even));
-    let (even, odd) = (s.fnma(a2, x[1], x[3]), s.fnma(a2, x[0], x[2]));
+    let (p, q) = (a.fma(odd, even), a.fnma(odd, even));
+    let (even, odd) = (a2.fnma(x[1], x[3]), a2.fnma(x[0], x[2]));
     let b = s.splat(B);
-    let last = s.fma(s.splat(A * A * B * B), x[0], s.fnma(s.splat(A * A + B * B), x[2], x[4]));
-    [p, q, s.fma(b, odd, even), s.fnma(b, odd, even), last]
+    let last = s.splat(A * A * B * B).fma(x[0], s.splat(A * A + B * B).fnma(x[2], x[4]));
+    [p, q, b.fma(odd, even), b.fnma(odd, even), last]
 }
 
 #[inline(always)]
@@ -168,8 +165,8 @@ fn pair_outputs<S: Simd>(s: S, y: [S::F; 5]) -> [S::F; 4] {
     [
         near + far,
         near_odd + far_odd,
-        s.fma(a2, near, b2 * far),
-        s.fma(a2, near_odd, s.fma(b2, far_odd, y[4])),
+        a2.fma(near, b2 * far),
+        a2.fma(near_odd, b2.fma(far_odd, y[4])),
     ]
 }
 
@@ -211,20 +208,20 @@ impl Adjoint<9> for Down {
     #[inline(always)]
     fn spread<S: Simd>(s: S, d: [S::F; TILE]) -> [S::F; 9] {
         let (a2, b2) = (s.splat(A * A), s.splat(B * B));
-        let (even, odd) = (s.fma(a2, d[2], d[0]), s.fma(a2, d[3], d[1]));
+        let (even, odd) = (a2.fma(d[2], d[0]), a2.fma(d[3], d[1]));
         let a = s.splat(A);
-        let (p, q) = (s.fma(a, odd, even), s.fnma(a, odd, even));
-        let (even, odd) = (s.fma(b2, d[2], d[0]), s.fma(b2, d[3], d[1]));
+        let (p, q) = (a.fma(odd, even), a.fnma(odd, even));
+        let (even, odd) = (b2.fma(d[2], d[0]), b2.fma(d[3], d[1]));
         let b = s.splat(B);
-        let (r, t) = (s.fma(b, odd, even), s.fnma(b, odd, even));
+        let (r, t) = (b.fma(odd, even), b.fnma(odd, even));
         [p, q, r, t, d[3], d[0], d[1], d[2], d[3]]
     }
 
     #[inline(always)]
     fn taps<S: Simd>(s: S, q: [S::F; WEIGHTS]) -> [S::F; 3] {
-        let first = s.fma(s.splat(1.0 / AT_A), q[0] - q[1], s.splat(1.0 / AT_B) * (q[2] - q[3]));
-        let last = s.fma(s.splat(B / AT_B), q[2] + q[3], q[4]);
-        [first, q[5], s.fma(s.splat(A / AT_A), q[0] + q[1], last)]
+        let first = s.splat(1.0 / AT_A).fma(q[0] - q[1], s.splat(1.0 / AT_B) * (q[2] - q[3]));
+        let last = s.splat(B / AT_B).fma(q[2] + q[3], q[4]);
+        [first, q[5], s.splat(A / AT_A).fma(q[0] + q[1], last)]
     }
 }
 

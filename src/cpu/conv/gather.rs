@@ -2,13 +2,13 @@
 //!
 //! Where the tiles of a row make whole vectors, rows of pictures are read as they lie and
 //! turned in registers; what lies beyond a border is masked. Other rows are packed first,
-//! and each tile is read for itself. The tiles of a vector lie in the order of [`square`],
+//! and each tile is read for itself. The tiles of a vector lie in the order of [`transpose4x4_index`],
 //! which costs the fewest turns.
 
 use super::Buffer;
 use super::forms::{Form, Places, TILE, put};
 use super::plan::{Axes, Layout, Pack, Plan};
-use crate::cpu::simd::{Kernel, LANES, Simd, square};
+use crate::cpu::simd::{Kernel, LANES, Mask, Simd, transpose4x4_index};
 use std::array::from_fn;
 
 /// The tiles of a block, row by row, of one picture after the other.
@@ -27,7 +27,7 @@ impl Tiles {
         self.count.next_multiple_of(LANES)
     }
 
-    /// Whether their vectors are in the order of [`square`]: a few tiles come first in
+    /// Whether their vectors are in the order of [`transpose4x4_index`]: a few tiles come first in
     /// their only vector.
     fn squared(&self) -> bool {
         self.count >= LANES
@@ -35,7 +35,7 @@ impl Tiles {
 
     /// The lane of tile `t`.
     pub fn lane(&self, t: usize) -> usize {
-        if self.squared() { t / LANES * LANES + square(t % LANES) } else { t }
+        if self.squared() { t / LANES * LANES + transpose4x4_index(t % LANES) } else { t }
     }
 
     /// Lanes up to the last that holds a tile, others between them perhaps.
@@ -149,7 +149,7 @@ impl<'a> Gather<'a> {
         let has = |column: isize| (0..width as isize).contains(&column);
         let end = |i: usize, t: usize, column: isize| {
             let (at, left, rows) = place(t, column);
-            let mut end = End { lane: 1 << square(i), at, has: [false; ROWS] };
+            let mut end = End { lane: 1 << transpose4x4_index(i), at, has: [false; ROWS] };
             end.has[rows].fill(has(left));
             end
         };
@@ -218,7 +218,7 @@ impl<'a> Gather<'a> {
             for r in 0..IN {
                 let mut row = [s.splat(0.0); IN];
                 for part in 0..IN.div_ceil(4) {
-                    let four = s.load4(patch, at, r * self.pitch + part * 4);
+                    let four = s.gather4(patch, at, r * self.pitch + part * 4);
                     for j in 0..4 {
                         if part * 4 + j < IN {
                             row[part * 4 + j] = four[j];
@@ -249,24 +249,26 @@ impl<'a> Gather<'a> {
         for k in 0..F::READ {
             let from = x.as_ptr().wrapping_offset(at[k] + down);
             // The next channel's, which the cache may not have.
-            s.prefetch_early(from.wrapping_add(self.floats));
+            s.prefetch_l2(from.wrapping_add(self.floats));
             // SAFETY: `new` sets the lanes that the picture has, and the channel all
             // `floats` of it.
-            v[k] = unsafe { s.load_lanes(from, lanes[r][k]) };
+            v[k] = unsafe { s.load_masked(from, lanes[r][k]) };
         }
         let own = match F::READ {
-            8 => s.columns8(v),
+            8 => s.columns_of_8(v),
             _ => {
-                let [a, b, c, d] = s.transpose4([v[0], v[1], v[2], v[3]]);
+                let [a, b, c, d] = s.transpose_quarters([v[0], v[1], v[2], v[3]]);
                 [a, b, c, d, v[4], v[5], v[6], v[7]]
             }
         };
         let mut row = [s.splat(0.0); IN];
         for j in 0..IN {
             row[j] = match j {
-                _ if j < F::BEFORE => with_ends(s, s.before(own[F::READ - 1]), firsts, x, r, down),
+                _ if j < F::BEFORE => {
+                    with_ends(s, s.rotate_right(own[F::READ - 1]), firsts, x, r, down)
+                }
                 _ if j < F::BEFORE + F::READ => own[j - F::BEFORE],
-                _ => with_ends(s, s.after(own[0]), lasts, x, r, down),
+                _ => with_ends(s, s.rotate_left(own[0]), lasts, x, r, down),
             };
         }
         row
@@ -278,10 +280,10 @@ impl<'a> Gather<'a> {
 fn with_ends<S: Simd>(s: S, mut row: S::F, ends: &[End], x: &[f32], r: usize, down: isize) -> S::F {
     for end in ends {
         let from = x.as_ptr().wrapping_offset(end.at + down);
-        s.prefetch_early(from.wrapping_add(x.len()));
+        s.prefetch_l2(from.wrapping_add(x.len()));
         // SAFETY: `new` sets whether the picture has it, and the channel all of the picture.
         let v = if end.has[r] { unsafe { *from } } else { 0.0 };
-        row = s.select(s.mask(end.lane), s.splat(v), row);
+        row = s.mask_from_bits(end.lane).select(s.splat(v), row);
     }
     row
 }

@@ -22,8 +22,8 @@ mod winograd;
 mod winograd_few;
 mod winograd_weights;
 
-use super::fresh::{Block, Fresh};
-use super::simd::{Kernel, LANES, Simd, Tier};
+use super::simd::{Kernel, LANES, Simd, SimdLevel};
+use super::uninit::{UninitBuffer, UninitSlice};
 use plan::Plan;
 use rayon::prelude::*;
 use std::cell::{Cell, RefCell};
@@ -33,51 +33,65 @@ pub use weights::weight_grad;
 
 /// y = x ∗ w + bias of `images` pictures; `bias` is empty or `[O]`.
 pub fn forward(
-    tier: Tier,
+    level: SimdLevel,
     s: &Sizes,
     images: usize,
     x: &[f32],
     w: &[f32],
     bias: &[f32],
 ) -> Vec<f32> {
-    fresh(tier, &Plan::forward(s), images, x, w, bias)
+    fresh(level, &Plan::forward(s), images, x, w, bias)
 }
 
 /// ∂L/∂x from ∂L/∂y of `images` pictures.
-pub fn input_grad(tier: Tier, s: &Sizes, images: usize, dy: &[f32], w: &[f32]) -> Vec<f32> {
-    fresh(tier, &Plan::input_grad(s), images, dy, w, &[])
+pub fn input_grad(level: SimdLevel, s: &Sizes, images: usize, dy: &[f32], w: &[f32]) -> Vec<f32> {
+    fresh(level, &Plan::input_grad(s), images, dy, w, &[])
 }
 
 /// [`run`] into new memory.
-fn fresh(tier: Tier, plan: &Plan, images: usize, x: &[f32], w: &[f32], bias: &[f32]) -> Vec<f32> {
+fn fresh(
+    level: SimdLevel,
+    plan: &Plan,
+    images: usize,
+    x: &[f32],
+    w: &[f32],
+    bias: &[f32],
+) -> Vec<f32> {
     let pixels: usize = plan.dst_size.iter().product();
-    let mut y = Fresh::new(images * plan.dst_channels * pixels);
-    run(tier, plan, x, w, bias, y.whole());
+    let mut y = UninitBuffer::new(images * plan.dst_channels * pixels);
+    run(level, plan, x, w, bias, y.as_mut_slice());
     // SAFETY: each of the three ways writes every channel of every picture in tiles that
     // cover it (the tests run them over memory full of NaN).
-    unsafe { y.finish() }
+    unsafe { y.assume_init() }
 }
 
 /// The fastest of the three ways. For numbers in ±1 and n products a sum, [`winograd`] is
 /// within 3e-6·√n of the exact sum, [`shift`] and [`pointwise`] within 1.5e-6·√n (the
 /// tests hold them).
-fn run(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32], y: &mut Block<f32>) {
+fn run(
+    level: SimdLevel,
+    plan: &Plan,
+    x: &[f32],
+    w: &[f32],
+    bias: &[f32],
+    y: &mut UninitSlice<f32>,
+) {
     if y.is_empty() {
         return;
     }
     if pointwise::suits(plan) {
-        pointwise::run(tier, plan, x, w, bias, y);
+        pointwise::run(level, plan, x, w, bias, y);
     } else if let Some(way) = winograd::Way::of(plan) {
         if winograd::Way::few(plan) {
-            winograd_few::run(tier, plan, way, x, w, bias, y);
+            winograd_few::run(level, plan, way, x, w, bias, y);
             return;
         }
-        let w = winograd::Weights::new(tier, plan, way, w, WEIGHTS.take());
-        winograd::run(tier, plan, way, x, &w, bias, y);
+        let w = winograd::Weights::new(level, plan, way, w, WEIGHTS.take());
+        winograd::run(level, plan, way, x, &w, bias, y);
         keep(w.into_memory());
     } else {
         let w = shift::Weights::new(plan, w, WEIGHTS.take());
-        shift::run(tier, plan, x, &w, bias, y);
+        shift::run(level, plan, x, &w, bias, y);
         keep(w.into_memory());
     }
 }
@@ -156,7 +170,7 @@ pub fn bias_grad(pixels: usize, dy: &[f32], db: &mut [f32]) {
     let channels = db.len();
     db.par_iter_mut().enumerate().for_each(|(o, sum)| {
         let rows = dy.chunks_exact(pixels.max(1)).skip(o).step_by(channels);
-        *sum = Tier::best().run(Sum(rows)) as f32;
+        *sum = SimdLevel::best().run(Sum(rows)) as f32;
     });
 }
 

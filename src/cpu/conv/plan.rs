@@ -434,7 +434,7 @@ pub(super) fn pick<S: Simd>(s: S, from: &[f32], step: usize, to: &mut [f32]) {
     let (vectors, rest) = to.split_at_mut(whole);
     for (to, pair) in vectors.as_chunks_mut().0.iter_mut().zip(pairs) {
         if let [a, b] = pair.as_chunks().0 {
-            s.store(s.unzip(s.load(a), s.load(b))[0], to);
+            s.store(s.deinterleave(s.load(a), s.load(b))[0], to);
         }
     }
     let picks = from[whole * step..].iter().step_by(step);

@@ -5,10 +5,10 @@
 use super::Buffers;
 use super::plan::{Plan, pick};
 use super::shift::zip;
-use crate::cpu::disjoint::Disjoint;
-use crate::cpu::fresh;
 use crate::cpu::gemm::{Base, Mat, PANEL, Packed, product_at, product_on};
-use crate::cpu::simd::{Kernel, Simd, Tier};
+use crate::cpu::shared_slice::SharedSliceMut;
+use crate::cpu::simd::{Kernel, Simd, SimdLevel};
+use crate::cpu::uninit;
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 use std::ops::Range;
@@ -36,12 +36,12 @@ pub(super) fn suits(plan: &Plan) -> bool {
 
 /// As [`super::shift::run`].
 pub(super) fn run(
-    tier: Tier,
+    level: SimdLevel,
     plan: &Plan,
     x: &[f32],
     w: &[f32],
     bias: &[f32],
-    y: &mut fresh::Block<f32>,
+    y: &mut uninit::UninitSlice<f32>,
 ) {
     let (c, o) = (plan.src_channels, plan.dst_channels);
     let weights = match plan.transposed {
@@ -53,8 +53,8 @@ pub(super) fn run(
     let images = y.len() / (o * pixels);
     assert!(y.len() == images * o * pixels && (bias.is_empty() || bias.len() == o));
     assert!(bias.is_empty() || plan.dst_step == [1; 3], "conv: a gradient has no bias");
-    let y = &Disjoint::new(y);
-    let call = Call { tier, plan, x, weights, bias, y };
+    let y = &SharedSliceMut::new(y);
+    let call = Call { level, plan, x, weights, bias, y };
     if plan.src_step == [1; 3] && plan.dst_step == [1; 3] {
         let spans = pixels.div_ceil(span);
         (0..images * spans).into_par_iter().for_each(|job| {
@@ -80,7 +80,7 @@ const JOBS: usize = 16;
 const ADDED: usize = 4096;
 
 /// ∂L/∂w, overwritten, where [`suits`] says so of the convolution itself.
-pub(super) fn weight_grad(tier: Tier, plan: &Plan, x: &[f32], dy: &[f32], dw: &mut [f32]) {
+pub(super) fn weight_grad(level: SimdLevel, plan: &Plan, x: &[f32], dy: &[f32], dw: &mut [f32]) {
     let (c, o) = (plan.src_channels, plan.dst_channels);
     let pixels: usize = plan.src_size.iter().product();
     let [depth, height, width] = plan.grid();
@@ -92,7 +92,7 @@ pub(super) fn weight_grad(tier: Tier, plan: &Plan, x: &[f32], dy: &[f32], dw: &m
     let spans = lines.div_ceil(each);
     let units = images * spans;
     let jobs = units.min(JOBS);
-    let mut sums = fresh::zeros(jobs * o * c);
+    let mut sums = uninit::zeros(jobs * o * c);
     sums.par_chunks_exact_mut(o * c).enumerate().for_each(|(job, sums)| {
         for unit in units * job / jobs..units * (job + 1) / jobs {
             let (image, first) = (unit / spans, unit % spans * each);
@@ -101,7 +101,7 @@ pub(super) fn weight_grad(tier: Tier, plan: &Plan, x: &[f32], dy: &[f32], dw: &m
             let dy = Mat::new(dy, o, cols, lines * width);
             let x = &x[image * c * pixels..][..c * pixels];
             let mut product = |x: Mat<'_>| {
-                Packed::kept(x.t(), |x| product_on(tier, (&mut *sums, c), dy, x, 1.0, Base::Own));
+                Packed::kept(x.t(), |x| product_on(level, (&mut *sums, c), dy, x, 1.0, Base::Own));
             };
             if plan.src_step == [1; 3] {
                 product(Mat::new(&x[first * width..], c, cols, pixels));
@@ -109,7 +109,7 @@ pub(super) fn weight_grad(tier: Tier, plan: &Plan, x: &[f32], dy: &[f32], dw: &m
             }
             Buffers::with(|buffers| {
                 let picked = buffers.x.room(c * cols);
-                tier.run(Pick { plan, x, first, cols, panel: cols, to: &mut *picked });
+                level.run(Pick { plan, x, first, cols, panel: cols, to: &mut *picked });
                 product(Mat::new(picked, c, cols, cols));
             });
         }
@@ -124,13 +124,13 @@ pub(super) fn weight_grad(tier: Tier, plan: &Plan, x: &[f32], dy: &[f32], dw: &m
 }
 
 struct Call<'a> {
-    tier: Tier,
+    level: SimdLevel,
     plan: &'a Plan,
     x: &'a [f32],
     /// `[channels written, channels read]`.
     weights: Mat<'a>,
     bias: &'a [f32],
-    y: &'a Disjoint<'a, MaybeUninit<f32>>,
+    y: &'a SharedSliceMut<'a, MaybeUninit<f32>>,
 }
 
 impl Call<'_> {
@@ -144,13 +144,13 @@ impl Call<'_> {
 
     /// Some lines of a picture's grid, any stride.
     fn sparse(&self, image: usize, lines: Range<usize>) {
-        let Self { tier, plan, y, .. } = *self;
+        let Self { level, plan, y, .. } = *self;
         let (c, across) = (plan.src_channels, plan.grid()[2]);
         let cols = lines.len() * across;
         let pixels: usize = plan.src_size.iter().product();
         let x = &self.x[image * c * pixels..][..c * pixels];
         let pick = |to: &mut [f32]| {
-            tier.run(Pick { plan, x, first: lines.start, cols, panel: PANEL, to });
+            level.run(Pick { plan, x, first: lines.start, cols, panel: PANEL, to });
         };
         Packed::kept_by([c, cols], pick, |x| {
             if plan.dst_step == [1; 3] {
@@ -160,8 +160,8 @@ impl Call<'_> {
                 let floats = plan.dst_channels * cols;
                 let (sums, zeros) = buffers.y.room(floats + across).split_at_mut(floats);
                 zeros.fill(0.0);
-                product_on(tier, (&mut *sums, cols), self.weights, x, 1.0, Base::Zero);
-                tier.run(Scatter { plan, image, lines: lines.clone(), sums, zeros, y });
+                product_on(level, (&mut *sums, cols), self.weights, x, 1.0, Base::Zero);
+                level.run(Scatter { plan, image, lines: lines.clone(), sums, zeros, y });
             });
         });
     }
@@ -180,7 +180,7 @@ impl Call<'_> {
         let dst = (self.y.address(image * o * pixels + first).cast_mut().cast(), pixels);
         // SAFETY: the same pixels of all channels of one picture, this job's alone, inside
         // `y` (asserted by `run`); numbers where there is a bias.
-        unsafe { product_at(self.tier, dst, self.weights, x, 1.0, base) };
+        unsafe { product_at(self.level, dst, self.weights, x, 1.0, base) };
     }
 }
 
@@ -232,7 +232,7 @@ struct Scatter<'a> {
     sums: &'a [f32],
     /// Zeros, as many as a line has pixels.
     zeros: &'a [f32],
-    y: &'a Disjoint<'a, MaybeUninit<f32>>,
+    y: &'a SharedSliceMut<'a, MaybeUninit<f32>>,
 }
 
 impl Kernel for Scatter<'_> {

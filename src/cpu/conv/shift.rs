@@ -3,9 +3,9 @@
 
 use super::Buffers;
 use super::plan::{Axes, Layout, Pack, Plan, starts};
-use crate::cpu::disjoint::Disjoint;
-use crate::cpu::fresh::{self, fill, room};
-use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
+use crate::cpu::shared_slice::SharedSliceMut;
+use crate::cpu::simd::{Kernel, LANES, Simd, SimdLevel, Vector};
+use crate::cpu::uninit::{self, filled, grown};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
@@ -45,7 +45,7 @@ impl Weights {
         let depth = plan.src_channels * plan.all_taps();
         let blocks = blocks(plan.dst_channels);
         let floats = blocks.iter().map(|b| b.rows * depth).sum();
-        let panels = room(&mut data, floats).par_chunks_mut((ROWS * depth).max(1));
+        let panels = grown(&mut data, floats).par_chunks_mut((ROWS * depth).max(1));
         panels.zip(&blocks).for_each(|(panel, block)| {
             let mut panel = panel;
             for pass in &plan.passes {
@@ -81,12 +81,12 @@ impl Weights {
 /// Runs `plan` on pictures `x` into `y`, which is overwritten; `bias` is empty or one
 /// value a channel written.
 pub(crate) fn run(
-    tier: Tier,
+    level: SimdLevel,
     plan: &Plan,
     x: &[f32],
     w: &Weights,
     bias: &[f32],
-    y: &mut fresh::Block<f32>,
+    y: &mut uninit::UninitSlice<f32>,
 ) {
     let src: usize = plan.src_size.iter().product();
     let dst: usize = plan.dst_size.iter().product();
@@ -101,7 +101,7 @@ pub(crate) fn run(
     let tiles = images * starts.len();
     let parts = JOBS.div_ceil(tiles).min(w.blocks.len());
     let share = w.blocks.len().div_ceil(parts);
-    let y = Disjoint::new(y);
+    let y = SharedSliceMut::new(y);
     (0..tiles * parts).into_par_iter().for_each(|job| {
         let (image, start) = (job / parts / starts.len(), starts[job / parts % starts.len()]);
         let first = (job % parts * share).min(w.blocks.len());
@@ -114,8 +114,8 @@ pub(crate) fn run(
             let Buffers { x: packed, y: sums, .. } = buffers;
             let packed = packed.room(plan.src_channels * layout.channel + SLACK);
             let sums = sums.room(plan.passes.len() * ROWS * layout.flat().next_multiple_of(LANES));
-            tier.run(Pack { plan, layout: &layout, x, start, out: packed });
-            tier.run(Job { plan, layout, packed, sums, w, blocks, bias, image, start, y: &y });
+            level.run(Pack { plan, layout: &layout, x, start, out: packed });
+            level.run(Job { plan, layout, packed, sums, w, blocks, bias, image, start, y: &y });
         });
     });
 }
@@ -131,7 +131,7 @@ struct Job<'a> {
     bias: &'a [f32],
     image: usize,
     start: Axes,
-    y: &'a Disjoint<'a, MaybeUninit<f32>>,
+    y: &'a SharedSliceMut<'a, MaybeUninit<f32>>,
 }
 
 impl Kernel for Job<'_> {
@@ -238,7 +238,7 @@ impl Job<'_> {
                     &self.sums[first..first + layout.tile[2]]
                 };
                 match step[2] {
-                    1 => drop(fill(to, &source(0)[..columns])),
+                    1 => drop(filled(to, &source(0)[..columns])),
                     2 => zip(s, source(0), source(1), to),
                     n => {
                         for p in 0..n {
@@ -259,9 +259,9 @@ pub(super) fn zip<S: Simd>(s: S, even: &[f32], odd: &[f32], to: &mut [MaybeUnini
     let (vectors, rest) = to.split_at_mut(2 * whole);
     let pairs = even.as_chunks().0.iter().zip(odd.as_chunks().0);
     for (to, (even, odd)) in vectors.chunks_exact_mut(2 * LANES).zip(pairs) {
-        let pair = s.zip(s.load(even), s.load(odd));
+        let pair = s.interleave(s.load(even), s.load(odd));
         for (to, v) in to.as_chunks_mut().0.iter_mut().zip(pair) {
-            s.store_fresh(v, to);
+            s.store_uninit(v, to);
         }
     }
     for (i, to) in rest.iter_mut().enumerate() {
@@ -398,7 +398,7 @@ impl Strip<'_> {
                     // (asserted by `run`), first + M ≤ P.
                     let weight = s.splat(unsafe { *w.wrapping_add(m) });
                     for n in 0..N {
-                        acc[m][n] = s.fma(weight, v[n], acc[m][n]);
+                        acc[m][n] = weight.fma(v[n], acc[m][n]);
                     }
                 }
                 w = w.wrapping_add(P);

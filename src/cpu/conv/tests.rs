@@ -1,8 +1,8 @@
-//! Against the definition in f64, in every tier.
+//! Against the definition in f64, in every level.
 
 use super::*;
-use crate::cpu::fresh::over;
-use crate::cpu::simd::Tier;
+use crate::cpu::simd::SimdLevel;
+use crate::cpu::uninit::as_uninit;
 
 /// y in f64: nine loops.
 fn definition(s: &Sizes, x: &[f32], w: &[f32], bias: &[f32]) -> Vec<f64> {
@@ -139,12 +139,12 @@ fn worst(got: &[f32], want: &[f64], scale: f64) -> f64 {
 }
 
 /// [`run`] into memory full of NaN: what it leaves out shows.
-fn over_nan(tier: Tier, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32]) -> Vec<f32> {
+fn over_nan(level: SimdLevel, plan: &Plan, x: &[f32], w: &[f32], bias: &[f32]) -> Vec<f32> {
     let count = |channels: usize, size: Axes| channels * size.iter().product::<usize>();
     let images = x.len() / count(plan.src_channels, plan.src_size);
     let mut y = vec![f32::NAN; images * count(plan.dst_channels, plan.dst_size)];
     // SAFETY: `run` writes numbers.
-    run(tier, plan, x, w, bias, unsafe { over(&mut y) });
+    run(level, plan, x, w, bias, unsafe { as_uninit(&mut y) });
     y
 }
 
@@ -156,10 +156,10 @@ fn forward_agrees_with_the_definition() {
         let scale = ((s.in_channels * s.taps()) as f64).sqrt();
         for bias in [vec![], noise(s.out_channels, 3)] {
             let want = definition(&s, &x, &w, &bias);
-            for &tier in Tier::available() {
-                let y = over_nan(tier, &Plan::forward(&s), &x, &w, &bias);
+            for &level in SimdLevel::available() {
+                let y = over_nan(level, &Plan::forward(&s), &x, &w, &bias);
                 let worst = worst(&y, &want, scale);
-                assert!(worst < bound(&Plan::forward(&s)), "{tier:?} {s:?}: {worst:e}");
+                assert!(worst < bound(&Plan::forward(&s)), "{level:?} {s:?}: {worst:e}");
             }
         }
     }
@@ -204,14 +204,14 @@ fn gradients_agree_with_the_definition() {
         let w = noise(s.out_channels * s.in_channels * s.taps(), 5);
         let dy = noise(2 * s.out_channels * s.out_pixels(), 6);
         let [want_x, want_w] = gradients(&s, &x, &w, &dy);
-        for &tier in Tier::available() {
+        for &level in SimdLevel::available() {
             let mut dw = vec![f32::NAN; w.len()];
-            let dx = over_nan(tier, &Plan::input_grad(&s), &dy, &w, &[]);
-            weight_grad(tier, &s, &x, &dy, &mut dw);
+            let dx = over_nan(level, &Plan::input_grad(&s), &dy, &w, &[]);
+            weight_grad(level, &s, &x, &dy, &mut dw);
             let worst_x = worst(&dx, &want_x, ((s.out_channels * s.taps()) as f64).sqrt());
             let worst_w = worst(&dw, &want_w, ((2 * s.out_pixels()) as f64).sqrt());
-            assert!(worst_x < bound(&Plan::input_grad(&s)), "{tier:?} {s:?}: dx {worst_x:e}");
-            assert!(worst_w < bound(&Plan::forward(&s)), "{tier:?} {s:?}: dw {worst_w:e}");
+            assert!(worst_x < bound(&Plan::input_grad(&s)), "{level:?} {s:?}: dx {worst_x:e}");
+            assert!(worst_w < bound(&Plan::forward(&s)), "{level:?} {s:?}: dw {worst_w:e}");
         }
     }
 }
@@ -252,9 +252,9 @@ fn check_threads(s: &Sizes) {
         pool.map(|pool| {
             pool.install(|| {
                 let mut dw = w.clone();
-                let y = forward(Tier::best(), s, 2, &x, &w, &[]);
-                let dx = input_grad(Tier::best(), s, 2, &dy, &w);
-                weight_grad(Tier::best(), s, &x, &dy, &mut dw);
+                let y = forward(SimdLevel::best(), s, 2, &x, &w, &[]);
+                let dx = input_grad(SimdLevel::best(), s, 2, &dy, &w);
+                weight_grad(SimdLevel::best(), s, &x, &dy, &mut dw);
                 [y, dx, dw].concat().iter().map(|v| v.to_bits()).collect::<Vec<_>>()
             })
         })
@@ -269,9 +269,9 @@ fn pictures_do_not_mix() {
     for s in [flat(24, 30, [3, 3], 1, 1, [16, 20]), flat(24, 30, [3, 3], 2, 1, [32, 32])] {
         let w = noise(s.out_channels * s.in_channels * s.taps(), 11);
         let x = noise(3 * s.in_channels * s.in_pixels(), 12);
-        let together = forward(Tier::best(), &s, 3, &x, &w, &[]);
+        let together = forward(SimdLevel::best(), &s, 3, &x, &w, &[]);
         let one = s.in_channels * s.in_pixels();
-        let apart = x.chunks(one).flat_map(|x| forward(Tier::best(), &s, 1, x, &w, &[]));
+        let apart = x.chunks(one).flat_map(|x| forward(SimdLevel::best(), &s, 1, x, &w, &[]));
         assert!(together.iter().map(|v| v.to_bits()).eq(apart.map(f32::to_bits)), "{s:?}");
     }
 }
@@ -289,11 +289,11 @@ fn gradients_of_pictures_add_up() {
         let [one, out] = [s.in_channels * s.in_pixels(), s.out_channels * s.out_pixels()];
         let [x, dy] = [noise(17 * one, 13), noise(17 * out, 14)];
         let mut together = vec![f32::NAN; s.out_channels * s.in_channels * s.taps()];
-        weight_grad(Tier::best(), &s, &x, &dy, &mut together);
+        weight_grad(SimdLevel::best(), &s, &x, &dy, &mut together);
         let mut sum = vec![0.0; together.len()];
         for (x, dy) in x.chunks(one).zip(dy.chunks(out)) {
             let mut dw = together.clone();
-            weight_grad(Tier::best(), &s, x, dy, &mut dw);
+            weight_grad(SimdLevel::best(), &s, x, dy, &mut dw);
             sum.iter_mut().zip(dw).for_each(|(sum, v)| *sum += f64::from(v));
         }
         let worst = worst(&together, &sum, ((17 * s.out_pixels()) as f64).sqrt());
@@ -304,11 +304,11 @@ fn gradients_of_pictures_add_up() {
 #[test]
 fn empty_calls_are_harmless() {
     let s = flat(0, 3, [3, 3], 1, 1, [4, 4]);
-    let y = forward(Tier::best(), &s, 1, &[], &[], &[1.0, 2.0, 3.0]);
+    let y = forward(SimdLevel::best(), &s, 1, &[], &[], &[1.0, 2.0, 3.0]);
     assert_eq!(y.len(), 3 * 16);
     assert!(y.chunks(16).zip([1.0, 2.0, 3.0]).all(|(row, b)| row.iter().all(|v| *v == b)));
-    weight_grad(Tier::best(), &s, &[], &y, &mut []);
-    assert!(input_grad(Tier::best(), &s, 1, &y, &[]).is_empty());
+    weight_grad(SimdLevel::best(), &s, &[], &y, &mut []);
+    assert!(input_grad(SimdLevel::best(), &s, 1, &y, &[]).is_empty());
     let s = flat(2, 0, [3, 3], 1, 1, [4, 4]);
-    assert_eq!(input_grad(Tier::best(), &s, 1, &[], &[]), [0.0; 32]);
+    assert_eq!(input_grad(SimdLevel::best(), &s, 1, &[], &[]), [0.0; 32]);
 }

@@ -11,9 +11,9 @@ use super::pointwise;
 use super::winograd;
 use super::winograd_weights::{self, Finish, Products};
 use super::{Buffer, Buffers};
-use crate::cpu::disjoint::Disjoint;
-use crate::cpu::fresh;
-use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
+use crate::cpu::shared_slice::SharedSliceMut;
+use crate::cpu::simd::{Kernel, LANES, Simd, SimdLevel, Vector};
+use crate::cpu::uninit;
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -37,7 +37,7 @@ const NARROW_FLOATS: usize = 8192;
 const SLACK: usize = 2 * LANES;
 
 /// ∂L/∂w from x and ∂L/∂y, `dw` overwritten.
-pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32]) {
+pub fn weight_grad(level: SimdLevel, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32]) {
     let (c, o, taps) = (s.in_channels, s.out_channels, s.taps());
     let (in_image, out_image) = (c * s.in_pixels(), o * s.out_pixels());
     if dw.is_empty() || x.is_empty() || dy.is_empty() {
@@ -47,7 +47,7 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
     let images = x.len() / in_image;
     let plan = Plan::forward(s);
     if pointwise::suits(&plan) && o > NARROW {
-        return pointwise::weight_grad(tier, &plan, x, dy, dw);
+        return pointwise::weight_grad(level, &plan, x, dy, dw);
     }
     let tiles = images * winograd::tiles_of(&plan);
     let way = Way::of(&plan, o, tiles);
@@ -90,7 +90,7 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
     assert!(groups <= units, "conv: no group of tiles is empty");
     // The first part is the largest.
     let floats = work(parts[0]).floats();
-    let mut sums = fresh::zeros(parts.len() * groups * floats);
+    let mut sums = uninit::zeros(parts.len() * groups * floats);
     sums.par_chunks_exact_mut(floats).enumerate().for_each(|(job, sums)| {
         let (part, group) = (job / groups, job % groups);
         let (first, channel) = parts[part];
@@ -103,9 +103,9 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
             (x, &dy[first * out_image..][..count * out_image], start)
         };
         let units = (units * group / groups..units * (group + 1) / groups).map(unit);
-        Buffers::with(|buffers| way.sums(tier, &work, units, buffers, sums));
+        Buffers::with(|buffers| way.sums(level, &work, units, buffers, sums));
     });
-    let dw = Disjoint::new(dw);
+    let dw = SharedSliceMut::new(dw);
     sums.par_chunks_exact(groups * floats).zip(&parts).for_each(|(sums, &(first, channel))| {
         let rows = channels.min(c - channel) * taps;
         let outputs = first..(first + outputs).min(o);
@@ -118,7 +118,7 @@ pub fn weight_grad(tier: Tier, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut [f32])
                 unsafe { dw.part(at..at + rows) }
             };
             let to = lanes.clone().map(part).collect();
-            tier.run(Add { sums, floats, pitch, first: lanes.start, to });
+            level.run(Add { sums, floats, pitch, first: lanes.start, to });
         });
     });
 }
@@ -207,7 +207,7 @@ impl Way {
     /// channels on, ∂L/∂y of the same pictures, and the first output of a tile.
     fn sums<'a>(
         self,
-        tier: Tier,
+        level: SimdLevel,
         work: &Work<'_>,
         units: impl Iterator<Item = (&'a [f32], &'a [f32], Axes)>,
         buffers: &mut Buffers,
@@ -221,9 +221,9 @@ impl Way {
             let reader = &way.reader(work.plan);
             for (i, (x, dy, start)) in units.enumerate() {
                 let first = i == 0;
-                tier.run(Products { work, way, reader, x, dy, start, first, buffers, products });
+                level.run(Products { work, way, reader, x, dy, start, first, buffers, products });
             }
-            tier.run(Finish { work, way, products, sums });
+            level.run(Finish { work, way, products, sums });
             buffers.products = own;
             return;
         }
@@ -233,12 +233,12 @@ impl Way {
             let x_packed = buffers.x.room(floats + SLACK);
             // Multiplied by zeros: it must be no NaN.
             x_packed[floats..].fill(0.0);
-            tier.run(Pack { plan: work.plan, layout: &work.layout, x, start, out: x_packed });
+            level.run(Pack { plan: work.plan, layout: &work.layout, x, start, out: x_packed });
             let (x, turned) = (&*x_packed, &mut buffers.y);
             let sums = &mut *sums;
             match self {
-                Self::Narrow => tier.run(Narrow { work, x, dy, start, turned, sums }),
-                _ => tier.run(Wide { work, x, dy, start, turned, sums }),
+                Self::Narrow => level.run(Narrow { work, x, dy, start, turned, sums }),
+                _ => level.run(Wide { work, x, dy, start, turned, sums }),
             }
         }
     }
@@ -358,7 +358,7 @@ fn turn<S: Simd>(
                         && let Some(from) = dy[places[i] + p..].first_chunk()
                     {
                         // The next columns, in whose lines nothing else is near.
-                        s.prefetch_early(from.as_ptr().wrapping_add(LANES));
+                        s.prefetch_l2(from.as_ptr().wrapping_add(LANES));
                         m[i] = s.load(from);
                     }
                 }
@@ -449,7 +449,7 @@ impl Tile<'_> {
                     // SAFETY: the farthest row ends inside x (asserted by `rows`).
                     let x = s.splat(unsafe { *x[m].wrapping_add(i) });
                     for n in 0..N {
-                        acc[m][n] = s.fma(x, v[n], acc[m][n]);
+                        acc[m][n] = x.fma(v[n], acc[m][n]);
                     }
                 }
                 dy = dy.wrapping_add(self.pitch);
@@ -575,7 +575,7 @@ impl Dots<'_> {
                         // SAFETY: as many outputs (asserted above) of whole vectors.
                         let v = s.load(unsafe { &*from.cast() });
                         for t in 0..T {
-                            acc[t][m] = s.fma(x[t], v, acc[t][m]);
+                            acc[t][m] = x[t].fma(v, acc[t][m]);
                         }
                     }
                     dy = dy.wrapping_add(LANES);

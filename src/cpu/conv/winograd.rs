@@ -9,9 +9,9 @@ use super::gather::{Gather, Tiles};
 use super::plan::{Axes, Plan, Sizes};
 use super::shift::{Block, ROWS, Strip, blocks};
 use super::{Buffer, Buffers};
-use crate::cpu::disjoint::Disjoint;
-use crate::cpu::fresh::{self, room};
-use crate::cpu::simd::{Kernel, LANES, Simd, Tier, square};
+use crate::cpu::shared_slice::SharedSliceMut;
+use crate::cpu::simd::{Kernel, LANES, Simd, SimdLevel, transpose4x4_index};
+use crate::cpu::uninit::{self, grown};
 use rayon::prelude::*;
 use std::array::from_fn;
 use std::marker::PhantomData;
@@ -121,13 +121,13 @@ pub(crate) struct Weights {
 
 impl Weights {
     /// Of `w` as the caller stores them, in the memory of `data`.
-    pub fn new(tier: Tier, plan: &Plan, way: Way, w: &[f32], mut data: Vec<f32>) -> Self {
+    pub fn new(level: SimdLevel, plan: &Plan, way: Way, w: &[f32], mut data: Vec<f32>) -> Self {
         let blocks = blocks(plan.dst_channels);
         let floats = GROUPS * group_step(plan.src_channels);
-        room(&mut data, blocks.len() * floats)
+        grown(&mut data, blocks.len() * floats)
             .par_chunks_exact_mut(floats)
             .zip(&blocks)
-            .for_each(|(panel, block)| tier.run(Transform { plan, way, w, block, panel }));
+            .for_each(|(panel, block)| level.run(Transform { plan, way, w, block, panel }));
         Self { data, blocks }
     }
 
@@ -184,7 +184,7 @@ impl<S: Simd> Formed for Lanes<S, Transform<'_>> {
                 let taps = &w[row * 9..][..9];
                 s.prefetch(taps.as_ptr().wrapping_add(ahead));
                 // SAFETY: nine are there.
-                kernels[lane] = unsafe { s.load_lanes(taps.as_ptr(), 0x1ff) };
+                kernels[lane] = unsafe { s.load_masked(taps.as_ptr(), 0x1ff) };
             }
             let taps = s.transpose(kernels);
             let mut half = [[s.splat(0.0); 3]; WEIGHTS];
@@ -226,20 +226,20 @@ impl<S: Simd> Formed for Lanes<S, Transform<'_>> {
 /// Runs `plan` on pictures `x` into `y`, which is overwritten; `bias` is empty or one
 /// value a channel written.
 pub(crate) fn run(
-    tier: Tier,
+    level: SimdLevel,
     plan: &Plan,
     way: Way,
     x: &[f32],
     w: &Weights,
     bias: &[f32],
-    y: &mut fresh::Block<f32>,
+    y: &mut uninit::UninitSlice<f32>,
 ) {
-    way.give(&Call::new(tier, plan, way, x, w, bias, y));
+    way.give(&Call::new(level, plan, way, x, w, bias, y));
 }
 
 /// What all jobs have in common.
 pub(super) struct Call<'a, W: ?Sized> {
-    pub tier: Tier,
+    pub level: SimdLevel,
     pub plan: &'a Plan,
     pub way: Way,
     pub reader: Plan,
@@ -247,23 +247,23 @@ pub(super) struct Call<'a, W: ?Sized> {
     pub w: &'a W,
     pub bias: &'a [f32],
     pub images: usize,
-    pub y: Disjoint<'a, MaybeUninit<f32>>,
+    pub y: SharedSliceMut<'a, MaybeUninit<f32>>,
 }
 
 impl<'a, W: ?Sized> Call<'a, W> {
     pub fn new(
-        tier: Tier,
+        level: SimdLevel,
         plan: &'a Plan,
         way: Way,
         x: &'a [f32],
         w: &'a W,
         bias: &'a [f32],
-        y: &'a mut fresh::Block<f32>,
+        y: &'a mut uninit::UninitSlice<f32>,
     ) -> Self {
         let pixels: usize = plan.dst_size.iter().product();
         let images = y.len() / (plan.dst_channels * pixels);
-        let (reader, y) = (way.reader(plan), Disjoint::new(y));
-        Self { tier, plan, way, reader, x, w, bias, images, y }
+        let (reader, y) = (way.reader(plan), SharedSliceMut::new(y));
+        Self { level, plan, way, reader, x, w, bias, images, y }
     }
 }
 
@@ -284,7 +284,7 @@ impl Formed for &Call<'_, Weights> {
             Buffers::with(|buffers| {
                 let (tiles, form) = ([down, across], PhantomData::<F>);
                 let job = Job { call: self, tiles, image, start, buffers, form };
-                self.tier.run::<Job<'_, F, IN, POINTS, OUT>>(job);
+                self.level.run::<Job<'_, F, IN, POINTS, OUT>>(job);
             });
         });
     }
@@ -433,7 +433,7 @@ fn columns<S, F, const IN: usize, const POINTS: usize, const OUT: usize>(
 /// Where a block's outputs go, the same in every channel.
 pub(super) struct Outputs<'a> {
     plan: &'a Plan,
-    y: &'a Disjoint<'a, MaybeUninit<f32>>,
+    y: &'a SharedSliceMut<'a, MaybeUninit<f32>>,
     /// For each vector of tiles.
     places: Vec<Pieces>,
 }
@@ -458,7 +458,7 @@ impl<'a> Outputs<'a> {
     /// Of `tiles`, the first of which has the grid position `start` in picture `image`.
     pub fn new<const OUT: usize>(
         plan: &'a Plan,
-        y: &'a Disjoint<'a, MaybeUninit<f32>>,
+        y: &'a SharedSliceMut<'a, MaybeUninit<f32>>,
         tiles: Tiles,
         image: usize,
         [depth, top, left]: Axes,
@@ -467,7 +467,7 @@ impl<'a> Outputs<'a> {
         let [slices, height, width] = plan.dst_size;
         let piece = |t: usize| {
             // The tile's place among those of its vector, once they are in order.
-            let lane = square(tiles.lane(t) % LANES);
+            let lane = transpose4x4_index(tiles.lane(t) % LANES);
             let (image, t) = (image + t / picture, t % picture);
             let row = top * OUT / TILE + t / across * OUT;
             let column = left * OUT / TILE + t % across * OUT;
@@ -507,9 +507,18 @@ impl<'a> Outputs<'a> {
         let [slices, height, width] = self.plan.dst_size;
         let down = channel * slices * height * width + r * width;
         let rows = match OUT {
-            8 => s.rows8([v[0], v[1], v[2], v[3], v[OUT - 4], v[OUT - 3], v[OUT - 2], v[OUT - 1]]),
+            8 => s.rows_of_8([
+                v[0],
+                v[1],
+                v[2],
+                v[3],
+                v[OUT - 4],
+                v[OUT - 3],
+                v[OUT - 2],
+                v[OUT - 1],
+            ]),
             _ => {
-                let [a, b, c, d] = s.transpose4([v[0], v[1], v[2], v[3]]);
+                let [a, b, c, d] = s.transpose_quarters([v[0], v[1], v[2], v[3]]);
                 [a, b, c, d, a, b, c, d]
             }
         };
@@ -521,7 +530,7 @@ impl<'a> Outputs<'a> {
                     // SAFETY: no two jobs, and no two tiles of a job, hold the same outputs.
                     let to = unsafe { self.y.part(at..at + LANES) };
                     if let Some(to) = to.first_chunk_mut() {
-                        s.store_fresh(rows[k], to);
+                        s.store_uninit(rows[k], to);
                     }
                 }
                 return;

@@ -9,8 +9,8 @@ use super::gather::{Gather, Tiles};
 use super::plan::Plan;
 use super::shift::{Block, ROWS, blocks};
 use super::winograd::{Call, Formed, Outputs, Product, Transform, Way, group_step};
-use crate::cpu::fresh;
-use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
+use crate::cpu::simd::{Kernel, LANES, Simd, SimdLevel};
+use crate::cpu::uninit;
 use rayon::prelude::*;
 use std::marker::PhantomData;
 use std::mem::take;
@@ -21,15 +21,15 @@ const LEAST: usize = 8;
 /// Runs `plan` on pictures `x` of one slice into `y`, which is overwritten; `bias` is empty
 /// or one value a channel written.
 pub(super) fn run(
-    tier: Tier,
+    level: SimdLevel,
     plan: &Plan,
     way: Way,
     x: &[f32],
     w: &[f32],
     bias: &[f32],
-    y: &mut fresh::Block<f32>,
+    y: &mut uninit::UninitSlice<f32>,
 ) {
-    way.give(&Call::new(tier, plan, way, x, w, bias, y));
+    way.give(&Call::new(level, plan, way, x, w, bias, y));
 }
 
 impl Formed for &Call<'_, [f32]> {
@@ -57,7 +57,7 @@ impl Formed for &Call<'_, [f32]> {
             let (x, form) = (&self.x[channel * pixels..], PhantomData::<F>);
             Buffers::with(|buffers| {
                 let job = Read { gather, own, x, buffers, tiles, form };
-                self.tier.run::<Read<'_, F, IN, POINTS, OUT>>(job);
+                self.level.run::<Read<'_, F, IN, POINTS, OUT>>(job);
             });
         });
         let sums = &Places::new(POINTS, ROWS, length, 0);
@@ -66,7 +66,7 @@ impl Formed for &Call<'_, [f32]> {
             let (x, form) = (&*all, PhantomData::<F>);
             Buffers::with(|buffers| {
                 let job = Multiply { call: self, x, stride, own, sums, to, block, buffers, form };
-                self.tier.run::<Multiply<'_, F, IN, POINTS, OUT>>(job);
+                self.level.run::<Multiply<'_, F, IN, POINTS, OUT>>(job);
             });
         });
         Buffers::with(|buffers| buffers.tiles = transformed);

@@ -10,7 +10,7 @@ use super::gather::{Gather, Tiles};
 use super::plan::{Axes, Plan};
 use super::weights::{LANES_WIDE, ROWS, Tile, Work};
 use super::winograd::{self, Way};
-use crate::cpu::simd::{Kernel, LANES, Simd, first_lanes};
+use crate::cpu::simd::{Kernel, LANES, Simd, first_lanes_bits};
 use std::ops::Range;
 
 /// Input channels of a job: at most, and at least for the sake of more jobs.
@@ -213,7 +213,7 @@ impl Spread<'_, '_> {
             let lanes = LANES.min(outputs.len().saturating_sub(v));
             for left in (0..width).step_by(LANES) {
                 let columns = LANES.min(width - left);
-                let bits = first_lanes(columns);
+                let bits = first_lanes_bits(columns);
                 // To what is read next, in whose lines nothing else is near.
                 let next = if left + LANES < width {
                     LANES
@@ -232,9 +232,9 @@ impl Spread<'_, '_> {
                             + (row * TILE + r) * plan.dst_size[2]
                             + left;
                         let from = &self.dy[at..][..columns];
-                        s.prefetch_early(from.as_ptr().wrapping_add(next));
+                        s.prefetch_l2(from.as_ptr().wrapping_add(next));
                         // SAFETY: as many are there.
-                        m[i] = unsafe { s.load_lanes(from.as_ptr(), bits) };
+                        m[i] = unsafe { s.load_masked(from.as_ptr(), bits) };
                     }
                     put(&mut d[r], s.transpose(m));
                 }

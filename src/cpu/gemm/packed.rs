@@ -1,8 +1,8 @@
 //! Factors of a product as slices, and the right one as the register tiles read it.
 
 use super::PANEL;
-use crate::cpu::fresh::room;
-use crate::cpu::simd::{Kernel, LANES, Simd, Tier};
+use crate::cpu::simd::{Kernel, LANES, Simd, SimdLevel};
+use crate::cpu::uninit::grown;
 use std::cell::Cell;
 
 /// A matrix inside a slice, any strides.
@@ -81,9 +81,9 @@ impl Packed {
         rhs.check("operands");
         self.depth = rhs.rows;
         self.cols = rhs.cols;
-        let to = room(&mut self.data, rhs.rows * rhs.cols.next_multiple_of(LANES));
+        let to = grown(&mut self.data, rhs.rows * rhs.cols.next_multiple_of(LANES));
         if !to.is_empty() {
-            Tier::best().run(Pack { rhs, to });
+            SimdLevel::best().run(Pack { rhs, to });
         }
     }
 
@@ -107,7 +107,7 @@ impl Packed {
     ) -> R {
         Self::in_kept(|packed| {
             (packed.depth, packed.cols) = (depth, cols);
-            fill(room(&mut packed.data, depth * cols.next_multiple_of(LANES)));
+            fill(grown(&mut packed.data, depth * cols.next_multiple_of(LANES)));
             f(packed)
         })
     }

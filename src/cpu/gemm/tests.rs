@@ -1,4 +1,4 @@
-//! Against three loops in f64, in every tier.
+//! Against three loops in f64, in every level.
 
 use super::*;
 
@@ -58,26 +58,26 @@ fn every_tier_agrees_and_rows_may_be_cut_anywhere() {
     let (m, k, n) = (31, 200, 100);
     let (a, b) = (numbers(m * k, 0.7), numbers(k * n, 0.3));
     let rhs = Packed::new(Mat::new(&b, k, n, n));
-    let run = |tier: Tier, cut: usize| {
+    let run = |level: SimdLevel, cut: usize| {
         let mut dst = vec![0.0; m * n];
         for (first, dst) in (0..m).step_by(cut).zip(dst.chunks_mut(cut * n)) {
             let lhs = Mat::new(&a[first * k..], dst.len() / n, k, k);
             let (row_stride, rhs, base) = (n, &rhs, Base::Zero);
             let dst = dst.as_mut_ptr();
-            tier.run(Product { dst, row_stride, lhs, rhs, scale: 1.0, base });
+            level.run(Product { dst, row_stride, lhs, rhs, scale: 1.0, base });
         }
         dst
     };
     let mut fused = None;
-    for &tier in Tier::available() {
-        let whole = run(tier, m);
+    for &level in SimdLevel::available() {
+        let whole = run(level, m);
         for cut in [1, 5, 8] {
-            assert_eq!(run(tier, cut), whole, "{tier:?} in blocks of {cut}");
+            assert_eq!(run(level, cut), whole, "{level:?} in blocks of {cut}");
         }
-        if tier == Tier::Scalar {
+        if level == SimdLevel::Scalar {
             continue;
         }
-        assert_eq!(fused.get_or_insert_with(|| whole.clone()), &whole, "{tier:?}");
+        assert_eq!(fused.get_or_insert_with(|| whole.clone()), &whole, "{level:?}");
     }
 }
 

@@ -4,7 +4,7 @@
     reason = "counted loops over register tiles unroll, iterators over them need not"
 )]
 
-use crate::cpu::simd::{LANES, Simd};
+use crate::cpu::simd::{LANES, Simd, Vector};
 
 /// Rows of a register tile.
 const ROWS: usize = 6;
@@ -111,7 +111,7 @@ unsafe fn tile<S: Simd, const R: usize, const V: usize>(s: S, part: Part, width:
             for r in 0..R {
                 let x = s.splat(*a.add(r * part.a_stride));
                 for v in 0..V {
-                    sums[r][v] = s.fma(x, columns[v], sums[r][v]);
+                    sums[r][v] = x.fma(columns[v], sums[r][v]);
                 }
             }
             a = a.add(1);
@@ -141,7 +141,7 @@ unsafe fn finish<S: Simd, const R: usize, const V: usize>(s: S, part: Part, sums
             }
             for r in 0..R {
                 for v in 0..V {
-                    let sum = s.fma(scale, sums[r][v], s.load(&edge[r][v]));
+                    let sum = scale.fma(sums[r][v], s.load(&edge[r][v]));
                     s.store(sum, &mut edge[r][v]);
                 }
             }
@@ -159,7 +159,7 @@ unsafe fn finish<S: Simd, const R: usize, const V: usize>(s: S, part: Part, sums
         for r in 0..R {
             for v in 0..V {
                 let base = vector(s, base.add(r * base_stride + v * LANES));
-                let sum = s.fma(scale, sums[r][v], base);
+                let sum = scale.fma(sums[r][v], base);
                 let to = part.dst.add(r * part.dst_stride + v * LANES);
                 s.store(sum, &mut *to.cast::<[f32; LANES]>());
             }

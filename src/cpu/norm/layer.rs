@@ -1,8 +1,8 @@
 //! LayerNorm: passes over several rows together, since within one each step waits for
 //! the last.
 
-use crate::cpu::fresh::Block;
-use crate::cpu::simd::{Kernel, LANES, Simd};
+use crate::cpu::simd::{Kernel, LANES, Mask, Simd};
+use crate::cpu::uninit::UninitSlice;
 use std::array::from_fn;
 use std::mem::MaybeUninit;
 
@@ -17,7 +17,7 @@ pub(super) struct Layer<'a> {
     pub n: usize,
     pub eps: f32,
     pub x: &'a [f32],
-    pub y: &'a mut Block<f32>,
+    pub y: &'a mut UninitSlice<f32>,
     pub affine: [&'a [f32]; 2],
 }
 
@@ -58,7 +58,7 @@ impl Kernel for Layer<'_> {
                         v = v * part(s, w, at) + part(s, b, at);
                     }
                     match y.first_chunk_mut() {
-                        Some(y) => s.store_fresh(v, y),
+                        Some(y) => s.store_uninit(v, y),
                         None => {
                             let mut lanes = [0.0; LANES];
                             s.store(v, &mut lanes);
@@ -91,7 +91,11 @@ fn total<S: Simd>(s: S, x: &[f32], f: impl Fn(S::F) -> S::F) -> f64 {
             let inside = (x.len() - at).min(LANES);
             let v = f(part(s, x, at));
             // What f makes of the zeros past the end does not count.
-            let v = if inside < LANES { s.keep(s.mask((1 << inside) - 1), v) } else { v };
+            let v = if inside < LANES {
+                s.mask_from_bits((1 << inside) - 1).select_or_zero(v)
+            } else {
+                v
+            };
             sum = sum + v;
         }
         total += f64::from(s.sum(sum));

@@ -1,15 +1,15 @@
 //! Normalised rows through SiLU: v / (1 + e^{−v}) in vectors, with fused products.
 
 use super::Rows;
-use crate::cpu::fresh::Block;
-use crate::cpu::simd::{Kernel, LANES, Simd, exp2_by_sums, first_lanes};
+use crate::cpu::simd::{Kernel, LANES, Simd, Vector, exp2_by_sums, first_lanes_bits};
+use crate::cpu::uninit::UninitSlice;
 
 /// Rows from number `first` on.
 pub(super) struct Silu<'a> {
     pub rows: &'a Rows,
     pub first: usize,
     pub x: &'a [f32],
-    pub y: &'a mut Block<f32>,
+    pub y: &'a mut UninitSlice<f32>,
     /// Scales and shifts `[channels]`, or empty.
     pub affine: [&'a [f32]; 2],
 }
@@ -44,28 +44,28 @@ struct Line {
 
 impl Line {
     #[inline(always)]
-    fn run<S: Simd>(&self, s: S, x: &[f32], y: &mut Block<f32>) {
+    fn run<S: Simd>(&self, s: S, x: &[f32], y: &mut UninitSlice<f32>) {
         let (sources, last) = x.as_chunks::<LANES>();
         let (places, rest) = y.as_chunks_mut::<LANES>();
         for (y, x) in places.iter_mut().zip(sources) {
-            s.store_fresh(self.of(s, s.load(x)), y);
+            s.store_uninit(self.of(s, s.load(x)), y);
         }
         assert_eq!(last.len(), rest.len(), "normalisation: lengths");
         if last.is_empty() {
             return;
         }
-        let bits = first_lanes(last.len());
+        let bits = first_lanes_bits(last.len());
         // SAFETY: as many numbers and places.
         unsafe {
-            s.store_lanes(self.of(s, s.load_lanes(last.as_ptr(), bits)), rest.as_mut_ptr(), bits)
+            s.store_masked(self.of(s, s.load_masked(last.as_ptr(), bits)), rest.as_mut_ptr(), bits)
         };
     }
 
     #[inline(always)]
     fn of<S: Simd>(&self, s: S, x: S::F) -> S::F {
-        let v = s.fma(x - s.splat(self.mean), s.splat(self.scale), s.splat(self.shift));
+        let v = (x - s.splat(self.mean)).fma(s.splat(self.scale), s.splat(self.shift));
         // The second operand is what comes out of comparisons with NaN.
-        let p = s.max(s.splat(-125.0), v * s.splat(-std::f32::consts::LOG2_E));
-        v / (s.splat(1.0) + exp2_by_sums(s, s.min(s.splat(126.0), p)))
+        let p = (v * s.splat(-std::f32::consts::LOG2_E)).max(s.splat(-125.0));
+        v / (s.splat(1.0) + exp2_by_sums(s, p.min(s.splat(126.0))))
     }
 }

@@ -8,7 +8,8 @@ use super::parent::{Parent, ParentGradient};
 use super::view::Table;
 use super::{Args, BLOCK, Rules, records};
 use crate::abi::{
-    HEAD_GAIN, HEAD_LANES, HEAD_LOGIT, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES,
+    HEAD_GAIN_OFFSET, HEAD_LOGIT_OFFSET, HEAD_STRIDE, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET,
+    SCALE_OFFSET, SPLAT_STRIDE,
 };
 use crate::cpu::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};
 use crate::cpu::redistribute::share_backward;
@@ -54,7 +55,7 @@ impl<T: LaneReal> Backward<'_, T> {
         for k in 0..children {
             let head = records(m, &self.args, span, k);
             let child = Child::new(rules, &parent, k, &head);
-            (s.areas[k], s.logits[k]) = (child.area, head[HEAD_LOGIT]);
+            (s.areas[k], s.logits[k]) = (child.area, head[HEAD_LOGIT_OFFSET]);
             s.alphas[k] = self.opacity(m, span, k);
         }
         let mut d = ParentGradient::zero(m.of(0.0));
@@ -65,15 +66,15 @@ impl<T: LaneReal> Backward<'_, T> {
         for k in 0..children {
             let head = records(m, &self.args, span, k);
             let child = Child::new(rules, &parent, k, &head);
-            let mut d_head = [m.of(0.0); HEAD_LANES];
-            d_head[HEAD_LOGIT] = s.logits[k];
+            let mut d_head = [m.of(0.0); HEAD_STRIDE];
+            d_head[HEAD_LOGIT_OFFSET] = s.logits[k];
             let g = self.cotangents(m, span, k, s.areas[k]);
             child.backward((rules, &parent), g, &mut d_head, &mut d);
-            let to = &mut self.head[(at * children + k) * HEAD_LANES..];
-            m.store_rows(&d_head, (children * HEAD_LANES, span.1), to);
+            let to = &mut self.head[(at * children + k) * HEAD_STRIDE..];
+            m.store_rows(&d_head, (children * HEAD_STRIDE, span.1), to);
         }
         let d_parents = parent.backward(rules, d);
-        m.store_rows(&d_parents, (SPLAT_LANES, span.1), &mut self.parents[at * SPLAT_LANES..]);
+        m.store_rows(&d_parents, (SPLAT_STRIDE, span.1), &mut self.parents[at * SPLAT_STRIDE..]);
     }
 
     /// Gradients of the opacity of child `k`.
@@ -85,10 +86,10 @@ impl<T: LaneReal> Backward<'_, T> {
         k: usize,
     ) -> M::V {
         let children = self.args.rules.children();
-        let from = &self.grad[(first * children + k) * SPLAT_LANES + LANE_OPACITY..];
+        let from = &self.grad[(first * children + k) * SPLAT_STRIDE + OPACITY_OFFSET..];
         let mut lanes = [T::default(); WIDTH_MAX];
         for (lane, out) in lanes[..M::WIDTH].iter_mut().enumerate() {
-            *out = from[lane.min(count - 1) * children * SPLAT_LANES];
+            *out = from[lane.min(count - 1) * children * SPLAT_STRIDE];
         }
         m.load(&lanes)
     }
@@ -103,14 +104,14 @@ impl<T: LaneReal> Backward<'_, T> {
         area: M::V,
     ) -> ChildGradient<M::V> {
         let children = self.args.rules.children();
-        let from = &self.grad[(first * children + k) * SPLAT_LANES..];
-        let g: [M::V; SPLAT_LANES] = m.load_rows(from, (children * SPLAT_LANES, count));
+        let from = &self.grad[(first * children + k) * SPLAT_STRIDE..];
+        let g: [M::V; SPLAT_STRIDE] = m.load_rows(from, (children * SPLAT_STRIDE, count));
         let vector = |i: usize| [g[i], g[i + 1], g[i + 2]];
-        let q = LANE_QUAT;
+        let q = QUAT_OFFSET;
         ChildGradient {
-            mean: vector(LANE_MEAN),
+            mean: vector(MEAN_OFFSET),
             quat: [g[q], g[q + 1], g[q + 2], g[q + 3]],
-            scale: vector(LANE_SCALE),
+            scale: vector(SCALE_OFFSET),
             area,
         }
     }
@@ -121,8 +122,8 @@ impl<T: LaneReal> Backward<'_, T> {
 /// gives the same bytes.
 pub fn backward<T: LaneReal>(args: Args<T>, grad: &[T], head: &mut [T], parents: &mut [T]) {
     let table = Table::new(&args.source);
-    head.par_chunks_mut(BLOCK * args.rules.children() * HEAD_LANES)
-        .zip(parents.par_chunks_mut(BLOCK * SPLAT_LANES))
+    head.par_chunks_mut(BLOCK * args.rules.children() * HEAD_STRIDE)
+        .zip(parents.par_chunks_mut(BLOCK * SPLAT_STRIDE))
         .enumerate()
         .for_each(|(block, (head, parents))| {
             let range = args.block(block);
@@ -146,12 +147,12 @@ impl<T: LaneReal> Kernel<T> for GainsBackward<'_, T> {
     #[inline(always)]
     fn run<M: Machine<Scalar = T>>(self, m: M) {
         let lanes = self.rules.gain_lanes();
-        let count = self.head.len() / HEAD_LANES;
+        let count = self.head.len() / HEAD_STRIDE;
         for first in (0..count).step_by(M::WIDTH) {
             let width = M::WIDTH.min(count - first);
             let (mut raw, mut by_gain) = ([T::default(); WIDTH_MAX], [T::default(); WIDTH_MAX]);
             for lane in 0..width {
-                raw[lane] = self.head[(first + lane) * HEAD_LANES + HEAD_GAIN];
+                raw[lane] = self.head[(first + lane) * HEAD_STRIDE + HEAD_GAIN_OFFSET];
                 let grad = &self.grad[(first + lane) * lanes..][..lanes];
                 let residual: T = grad[1..].iter().copied().sum();
                 by_gain[lane] = grad[0] + T::of(0.5) * residual;
@@ -159,17 +160,17 @@ impl<T: LaneReal> Kernel<T> for GainsBackward<'_, T> {
             let t = m.load(&raw).tanh();
             m.store(m.load(&by_gain) * m.of(self.rules.delta) * (m.of(1.0) - t * t), &mut raw);
             for (lane, &d) in raw[..width].iter().enumerate() {
-                self.out[(first + lane) * HEAD_LANES + HEAD_GAIN] = d;
+                self.out[(first + lane) * HEAD_STRIDE + HEAD_GAIN_OFFSET] = d;
             }
         }
     }
 }
 
-/// Gradients into lane [`HEAD_GAIN`] of `out` `[N, K, 11]`, for those of the gains,
+/// Gradients into lane [`HEAD_GAIN_OFFSET`] of `out` `[N, K, 11]`, for those of the gains,
 /// `grad` `[N·K]` or `[N·K, 4]`; nothing else is written.
 pub fn gains_backward<T: LaneReal>(rules: &Rules, head: &[T], grad: &[T], out: &mut [T]) {
-    out.par_chunks_mut(GAIN_BLOCK * HEAD_LANES)
-        .zip(head.par_chunks(GAIN_BLOCK * HEAD_LANES))
+    out.par_chunks_mut(GAIN_BLOCK * HEAD_STRIDE)
+        .zip(head.par_chunks(GAIN_BLOCK * HEAD_STRIDE))
         .zip(grad.par_chunks(GAIN_BLOCK * rules.gain_lanes()))
         .for_each(|((out, head), grad)| T::dispatch(GainsBackward { rules, head, grad, out }));
 }

@@ -8,7 +8,8 @@ use super::view::{
     Jacobian, M3, V3, add, add4, axpy, dot, kept, product, scaled, times, transposed,
 };
 use crate::abi::{
-    DEPTH_FRACTION_MIN, HEAD_DEPTH, HEAD_LANES, HEAD_LOG_SCALE, HEAD_OFFSET, HEAD_ROTATION,
+    DEPTH_FRACTION_MIN, HEAD_DEPTH_OFFSET, HEAD_LOG_SCALE_OFFSET, HEAD_ROTATION_OFFSET,
+    HEAD_STRIDE, HEAD_UV_OFFSET,
 };
 use crate::cpu::lanes::Lanes;
 use crate::cpu::redistribute::Rule;
@@ -31,12 +32,12 @@ struct Step<V: Lanes> {
 
 impl<V: Lanes> Step<V> {
     #[inline(always)]
-    fn new(rules: &Rules, parent: &Parent<V>, k: usize, head: &[V; HEAD_LANES]) -> Self {
+    fn new(rules: &Rules, parent: &Parent<V>, k: usize, head: &[V; HEAD_STRIDE]) -> Self {
         let z = parent.z;
         let of = |v: f64| z.of(v);
         let per_side = 1.0 / rules.side as f64;
         let cell = [k % rules.side, k / rules.side];
-        let learned = [head[HEAD_OFFSET], head[HEAD_OFFSET + 1]];
+        let learned = [head[HEAD_UV_OFFSET], head[HEAD_UV_OFFSET + 1]];
         let (bounded, per_px) = match rules.offset_bound {
             Some(bound) => ([learned[0].tanh(), learned[1].tanh()], bound * per_side),
             None => (learned, per_side),
@@ -55,7 +56,7 @@ impl<V: Lanes> Step<V> {
             along_disc = kept(disc.solid, tenth / d[2].abs().max(tenth));
             s = axpy(along_disc, [d[0] - s[0], d[1] - s[1], d[2] - s[2]], s);
         }
-        let tanh_z = head[HEAD_DEPTH].tanh();
+        let tanh_z = head[HEAD_DEPTH_OFFSET].tanh();
         let mut dz = of(rules.beta_z) * tanh_z;
         if rules.relative_depth {
             dz = dz * z;
@@ -84,7 +85,7 @@ impl<V: Lanes> Step<V> {
         &self,
         (rules, parent): (&Rules, &Parent<V>),
         mut d_s: V3<V>,
-        d_head: &mut [V; HEAD_LANES],
+        d_head: &mut [V; HEAD_STRIDE],
         d: &mut ParentGradient<V>,
     ) {
         let z = parent.z;
@@ -116,7 +117,7 @@ impl<V: Lanes> Step<V> {
             d.z = d_tanh.fma(self.tanh_z, d.z);
             d_tanh = d_tanh * z;
         }
-        d_head[HEAD_DEPTH] = d_tanh * (of(1.0) - self.tanh_z * self.tanh_z);
+        d_head[HEAD_DEPTH_OFFSET] = d_tanh * (of(1.0) - self.tanh_z * self.tanh_z);
         let mut d_offset = [of(0.0); 2];
         let mut d_flat = d_s;
         if let Some(disc) = &parent.disc {
@@ -133,7 +134,7 @@ impl<V: Lanes> Step<V> {
             d_offset[i] = per.fma(z, d_offset[i]);
             d.z = per.fma(self.offset[i], d.z);
             let t = self.bounded[i];
-            d_head[HEAD_OFFSET + i] = match rules.offset_bound {
+            d_head[HEAD_UV_OFFSET + i] = match rules.offset_bound {
                 Some(bound) => d_offset[i] * of(bound * per_side) * (of(1.0) - t * t),
                 None => d_offset[i] * of(per_side),
             };
@@ -174,19 +175,24 @@ pub(super) struct ChildGradient<V> {
 
 impl<V: Lanes> Child<V> {
     #[inline(always)]
-    pub(super) fn new(rules: &Rules, parent: &Parent<V>, k: usize, head: &[V; HEAD_LANES]) -> Self {
+    pub(super) fn new(
+        rules: &Rules,
+        parent: &Parent<V>,
+        k: usize,
+        head: &[V; HEAD_STRIDE],
+    ) -> Self {
         let step = Step::new(rules, parent, k, head);
         let of = |v: f64| parent.z.of(v);
         let mean = add(parent.mean, times(&parent.view.rotation, step.out));
         let c = of(rules.dlog_clamp);
         let per_c = of(1.0 / rules.dlog_clamp);
-        let l = HEAD_LOG_SCALE;
+        let l = HEAD_LOG_SCALE_OFFSET;
         let [x, y, z] = scaled([head[l], head[l + 1], head[l + 2]], per_c);
         let soft = [x.tanh(), y.tanh(), z.tanh()];
         let [x, y, z] = scaled(soft, c);
         let factor = scaled([x.exp(), y.exp(), z.exp()], of(rules.lambda_s));
         let small = product(factor, parent.scale);
-        let r = HEAD_ROTATION;
+        let r = HEAD_ROTATION_OFFSET;
         let turn = Turn::new([head[r], head[r + 1], head[r + 2]]);
         let unit = Unit::new(multiply(parent.quat, turn.e));
         let rotation = matrix(unit.q);
@@ -245,7 +251,7 @@ impl<V: Lanes> Child<V> {
         &self,
         (rules, parent): (&Rules, &Parent<V>),
         g: ChildGradient<V>,
-        d_head: &mut [V; HEAD_LANES],
+        d_head: &mut [V; HEAD_STRIDE],
         d: &mut ParentGradient<V>,
     ) {
         let of = |v: f64| parent.z.of(v);
@@ -269,12 +275,12 @@ impl<V: Lanes> Child<V> {
             let d_small = g.scale[i].fma(self.growth[i], by_area[i]);
             d.scale[i] = d_small.fma(self.factor[i], d.scale[i]);
             let t = self.soft[i];
-            d_head[HEAD_LOG_SCALE + i] = d_small * self.small[i] * (c - t * t);
+            d_head[HEAD_LOG_SCALE_OFFSET + i] = d_small * self.small[i] * (c - t * t);
         }
         let by_rotation = matrix_backward(self.unit.q, &d_rotation);
         let d_unit = self.unit.backward(add4(g.quat, by_rotation));
         let d_turn = self.turn.backward(multiply(conjugate(parent.quat), d_unit));
-        d_head[HEAD_ROTATION..HEAD_ROTATION + 3].copy_from_slice(&d_turn);
+        d_head[HEAD_ROTATION_OFFSET..HEAD_ROTATION_OFFSET + 3].copy_from_slice(&d_turn);
         let by_parent = multiply(d_unit, conjugate(self.turn.e));
         d.quat = add4(d.quat, by_parent);
         d.mean = add(d.mean, g.mean);

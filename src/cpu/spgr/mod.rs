@@ -38,7 +38,8 @@ pub use project::{Target, project};
 use super::lanes::{Kernel, LaneReal, Lanes, Machine, WIDTH_MAX};
 use super::redistribute::share;
 use crate::abi::{
-    HEAD_GAIN, HEAD_LANES, HEAD_LOGIT, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES,
+    HEAD_GAIN_OFFSET, HEAD_LOGIT_OFFSET, HEAD_STRIDE, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET,
+    SCALE_OFFSET, SPLAT_STRIDE,
 };
 use crate::camera::Camera;
 use child::Child;
@@ -78,7 +79,7 @@ pub struct Args<'a, T> {
 impl<T> Args<'_, T> {
     /// N.
     fn count(&self) -> usize {
-        self.parents.len() / SPLAT_LANES
+        self.parents.len() / SPLAT_STRIDE
     }
 
     /// The parents of block number `block`.
@@ -94,10 +95,10 @@ fn records<M: Machine>(
     args: &Args<M::Scalar>,
     (first, count): (usize, usize),
     k: usize,
-) -> [M::V; HEAD_LANES] {
+) -> [M::V; HEAD_STRIDE] {
     let children = args.rules.children();
-    let from = &args.head[(first * children + k) * HEAD_LANES..];
-    m.load_rows(from, (children * HEAD_LANES, count))
+    let from = &args.head[(first * children + k) * HEAD_STRIDE..];
+    m.load_rows(from, (children * HEAD_STRIDE, count))
 }
 
 /// One block of parents forward; `rows` and `gains` are the block's own.
@@ -157,18 +158,18 @@ impl<T: LaneReal> Forward<'_, T> {
             let head = records(m, &self.args, (first, count), k);
             bad = not_finite(&head, bad);
             let child = Child::new(rules, &parent, k, &head);
-            (areas[k], alphas[k]) = (child.area, head[HEAD_LOGIT]);
-            let mut row = [m.of(0.0); SPLAT_LANES];
-            let shape = [(LANE_MEAN, child.mean), (LANE_SCALE, child.scale)];
+            (areas[k], alphas[k]) = (child.area, head[HEAD_LOGIT_OFFSET]);
+            let mut row = [m.of(0.0); SPLAT_STRIDE];
+            let shape = [(MEAN_OFFSET, child.mean), (SCALE_OFFSET, child.scale)];
             for (lane, v) in shape {
                 row[lane..lane + 3].copy_from_slice(&v);
                 bad = not_finite(&v, bad);
             }
-            row[LANE_QUAT..LANE_QUAT + 4].copy_from_slice(&child.quat());
+            row[QUAT_OFFSET..QUAT_OFFSET + 4].copy_from_slice(&child.quat());
             bad = not_finite(&child.quat(), bad);
-            let rows = &mut self.rows[(at * children + k) * SPLAT_LANES..];
-            m.store_rows(&row, (children * SPLAT_LANES, count), rows);
-            let gain = gain(m, rules, head[HEAD_GAIN]);
+            let rows = &mut self.rows[(at * children + k) * SPLAT_STRIDE..];
+            m.store_rows(&row, (children * SPLAT_STRIDE, count), rows);
+            let gain = gain(m, rules, head[HEAD_GAIN_OFFSET]);
             let mut tile = [[T::default(); WIDTH_MAX]; 4];
             for (gain, tile) in gain.into_iter().zip(&mut tile) {
                 m.store(gain, tile);
@@ -187,7 +188,7 @@ impl<T: LaneReal> Forward<'_, T> {
             m.store(alpha, &mut tile);
             for (lane, &alpha) in tile[..count].iter().enumerate() {
                 let row = (at + lane) * children + k;
-                self.rows[row * SPLAT_LANES + LANE_OPACITY] = alpha;
+                self.rows[row * SPLAT_STRIDE + OPACITY_OFFSET] = alpha;
             }
         }
         bad
@@ -208,7 +209,7 @@ fn gain<M: Machine>(m: M, rules: &Rules, raw: M::V) -> [M::V; 4] {
 pub fn forward<T: LaneReal>(args: Args<T>, rows: &mut [T], gains: &mut [T]) -> bool {
     let table = Table::new(&args.source);
     let per_block = BLOCK * args.rules.children();
-    rows.par_chunks_mut(per_block * SPLAT_LANES)
+    rows.par_chunks_mut(per_block * SPLAT_STRIDE)
         .zip(gains.par_chunks_mut(per_block * args.rules.gain_lanes()))
         .enumerate()
         .map(|(block, (rows, gains))| {

@@ -7,7 +7,9 @@ use super::view::{
     scaled, times, transposed,
 };
 use super::{Rules, Source};
-use crate::abi::{DISC_AREA_SQ_MIN, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES};
+use crate::abi::{
+    DISC_AREA_SQ_MIN, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE,
+};
 use crate::cpu::lanes::{Lanes, Machine, WIDTH_MAX};
 use crate::cpu::redistribute::Rule;
 
@@ -69,18 +71,19 @@ impl<V: Lanes> Parent<V> {
         rows: &[M::Scalar],
         (first, count): (usize, usize),
     ) -> Self {
-        let row: [V; SPLAT_LANES] = m.load_rows(&rows[first * SPLAT_LANES..], (SPLAT_LANES, count));
+        let row: [V; SPLAT_STRIDE] =
+            m.load_rows(&rows[first * SPLAT_STRIDE..], (SPLAT_STRIDE, count));
         let mut index = [0; WIDTH_MAX];
         for (lane, index) in index[..M::WIDTH].iter_mut().enumerate() {
             let n = source.first + first + lane.min(count - 1);
             *index = (n / source.per_view).min(table.len() - 1);
         }
         let vector = |i: usize| [row[i], row[i + 1], row[i + 2]];
-        let mean = vector(LANE_MEAN);
-        let q = LANE_QUAT;
+        let mean = vector(MEAN_OFFSET);
+        let q = QUAT_OFFSET;
         let quat = [row[q], row[q + 1], row[q + 2], row[q + 3]];
         let view = table.primary(m, rules, mean, index);
-        Self::new(rules, view, (mean, quat, vector(LANE_SCALE), row[LANE_OPACITY]))
+        Self::new(rules, view, (mean, quat, vector(SCALE_OFFSET), row[OPACITY_OFFSET]))
     }
 
     #[inline(always)]
@@ -119,7 +122,7 @@ impl<V: Lanes> Parent<V> {
 
     /// Gradients `[11]` of the rows, from those of what children share.
     #[inline(always)]
-    pub(super) fn backward(&self, rules: &Rules, mut d: ParentGradient<V>) -> [V; SPLAT_LANES] {
+    pub(super) fn backward(&self, rules: &Rules, mut d: ParentGradient<V>) -> [V; SPLAT_STRIDE] {
         if rules.opacity.areas_are_relative() {
             Own::new(self, rules).backward(self, rules, &mut d);
         }

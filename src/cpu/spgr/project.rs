@@ -12,7 +12,7 @@ use super::parent::Parent;
 use super::view::{V3, axpy, cross, dot, each, kept, product, scaled, splat, times, transposed};
 use super::{Args, BLOCK, gain, not_finite, records};
 use crate::abi::{
-    ALPHA_MIN, ALPHA_MIN_LOG2, DISCRIMINANT_MIN_MVSPLAT, HEAD_GAIN, HEAD_LOGIT,
+    ALPHA_MIN, ALPHA_MIN_LOG2, DISCRIMINANT_MIN_MVSPLAT, HEAD_GAIN_OFFSET, HEAD_LOGIT_OFFSET,
     RADIUS_SIGMAS_MVSPLAT, RasterOptions, ShDirection, TILE_MVSPLAT, sh_coefficients,
 };
 use crate::camera::Camera;
@@ -238,11 +238,11 @@ impl Project<'_> {
             let head = records(m, &self.args, span, k);
             bad = not_finite(&head, bad);
             let child = Child::new(rules, &parent, k, &head);
-            (areas[k], alphas[k]) = (child.area, head[HEAD_LOGIT]);
+            (areas[k], alphas[k]) = (child.area, head[HEAD_LOGIT_OFFSET]);
             bad = not_finite(&child.mean, not_finite(&child.scale, bad));
             let d = axpy(m.of(-1.0), eye, child.mean);
             *seen = Seen::new(m, self.view, d, &child);
-            let [gamma, residual, ..] = gain(m, rules, head[HEAD_GAIN]);
+            let [gamma, residual, ..] = gain(m, rules, head[HEAD_GAIN_OFFSET]);
             seen.gain = [gamma, residual];
             if shared {
                 towards = axpy(m.of(1.0), d, towards);

@@ -4,7 +4,7 @@
 //! before the next one's. A chunk's tensors stay in a core's cache.
 
 use super::{Children, Parts, Scene, Trunk, chunks, interleaved};
-use crate::abi::SPLAT_LANES;
+use crate::abi::SPLAT_STRIDE;
 use crate::model::geometry::ParentChunk;
 use crate::model::mlp::Mode;
 use crate::model::{BackboneOutput, Primaries, Views};
@@ -103,7 +103,7 @@ impl Recomputed<'_> {
     ) -> std::result::Result<Vec<Tensor>, E> {
         let n = self.scene.means.dim(0)?;
         let expected = (
-            n * self.children.k * SPLAT_LANES,
+            n * self.children.k * SPLAT_STRIDE,
             n * self.children.k * self.scene.rules.gain_lanes(),
         );
         if (rows.len(), gain.len()) != expected {

@@ -2,7 +2,7 @@
 //! them.
 
 use crate::raster_case::File;
-use subsplat::abi::{LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES};
+use subsplat::abi::{MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE};
 use subsplat::cpu::Gradients;
 
 /// `[5, H, W]` from the gradients of rgb `[H, W, 3]` and alpha `[H, W]`; depth gets none.
@@ -40,7 +40,7 @@ pub fn worst_row(got: &[f32], expected: &[f32], lanes: usize) -> f32 {
 
 /// Numbers `from..from + N` of every packed row.
 pub fn part(rows: &[f32], from: usize, lanes: usize) -> Vec<f32> {
-    rows.chunks_exact(SPLAT_LANES).flat_map(|r| r[from..from + lanes].to_vec()).collect()
+    rows.chunks_exact(SPLAT_STRIDE).flat_map(|r| r[from..from + lanes].to_vec()).collect()
 }
 
 /// Name, numbers and numbers a row of every gradient of `g`, of P parents.
@@ -53,10 +53,10 @@ pub fn named(g: &Gradients, parents: usize) -> Vec<(&'static str, Vec<f32>, usiz
         ]
     } else {
         vec![
-            ("means", part(&g.rows, LANE_MEAN, 3), 3),
-            ("quats", part(&g.rows, LANE_QUAT, 4), 4),
-            ("scales", part(&g.rows, LANE_SCALE, 3), 3),
-            ("opacities", part(&g.rows, LANE_OPACITY, 1), 1),
+            ("means", part(&g.rows, MEAN_OFFSET, 3), 3),
+            ("quats", part(&g.rows, QUAT_OFFSET, 4), 4),
+            ("scales", part(&g.rows, SCALE_OFFSET, 3), 3),
+            ("opacities", part(&g.rows, OPACITY_OFFSET, 1), 1),
         ]
     };
     all.push(("sh", g.sh.clone(), g.sh.len() / parents));

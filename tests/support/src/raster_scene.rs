@@ -4,7 +4,7 @@
 use crate::oracle::{self, Shape, Splat};
 use glam::{EulerRot, Mat4, Quat, Vec3};
 use subsplat::abi::{
-    Convention, LANE_OPACITY, LANE_QUAT, LANE_SCALE, RasterOptions, SPLAT_LANES, ShBasis,
+    Convention, OPACITY_OFFSET, QUAT_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE, ShBasis,
     ShDirection, sh_coefficients,
 };
 use subsplat::camera::{Camera, Intrinsics};
@@ -139,17 +139,17 @@ impl Scene {
     }
 
     pub fn len(&self) -> usize {
-        self.rows.len() / SPLAT_LANES
+        self.rows.len() / SPLAT_STRIDE
     }
 
     /// The same splats by covariance.
     pub fn with_covariances(mut self) -> Self {
         self.cov6 = (0..self.len())
             .flat_map(|i| {
-                let row = &self.rows[i * SPLAT_LANES..(i + 1) * SPLAT_LANES];
-                let [w, x, y, z]: [f32; 4] = row[LANE_QUAT..LANE_SCALE].try_into().unwrap();
+                let row = &self.rows[i * SPLAT_STRIDE..(i + 1) * SPLAT_STRIDE];
+                let [w, x, y, z]: [f32; 4] = row[QUAT_OFFSET..SCALE_OFFSET].try_into().unwrap();
                 let r = glam::Mat3::from_quat(Quat::from_xyzw(x, y, z, w).normalize());
-                let s = Vec3::from_slice(&row[LANE_SCALE..]);
+                let s = Vec3::from_slice(&row[SCALE_OFFSET..]);
                 let c = r * glam::Mat3::from_diagonal(s * s) * r.transpose();
                 let e = |i: usize, j: usize| c.col(j)[i];
                 [e(0, 0), e(0, 1), e(0, 2), e(1, 1), e(1, 2), e(2, 2)]
@@ -161,9 +161,9 @@ impl Scene {
     /// Runs `f` on the kernels' view of the scene.
     pub fn with_slices<R>(&self, f: impl FnOnce(SplatSlices) -> R) -> R {
         let pick = |from: usize, n: usize| -> Vec<f32> {
-            self.rows.chunks(SPLAT_LANES).flat_map(|r| r[from..from + n].to_vec()).collect()
+            self.rows.chunks(SPLAT_STRIDE).flat_map(|r| r[from..from + n].to_vec()).collect()
         };
-        let (means, opacities) = (pick(0, 3), pick(LANE_OPACITY, 1));
+        let (means, opacities) = (pick(0, 3), pick(OPACITY_OFFSET, 1));
         let geometry = if self.cov6.is_empty() {
             Geometry::Packed(&self.rows)
         } else {
@@ -181,7 +181,7 @@ impl Scene {
     pub fn for_oracle(&self) -> Vec<Splat> {
         let set = 3 * sh_coefficients(self.degree);
         let lanes = self.gain.len() / self.len();
-        let row = |i: usize| &self.rows[i * SPLAT_LANES..(i + 1) * SPLAT_LANES];
+        let row = |i: usize| &self.rows[i * SPLAT_STRIDE..(i + 1) * SPLAT_STRIDE];
         let one = |i: usize| {
             let family = i / CHILDREN * CHILDREN..(i / CHILDREN + 1) * CHILDREN;
             let parent_mean = std::array::from_fn(|c| {
@@ -189,8 +189,8 @@ impl Scene {
             });
             let r = row(i);
             let shape = if self.cov6.is_empty() {
-                let scale = r[LANE_SCALE..LANE_OPACITY].try_into().unwrap();
-                Shape::Quat(r[LANE_QUAT..LANE_SCALE].try_into().unwrap(), scale)
+                let scale = r[SCALE_OFFSET..OPACITY_OFFSET].try_into().unwrap();
+                Shape::Quat(r[QUAT_OFFSET..SCALE_OFFSET].try_into().unwrap(), scale)
             } else {
                 Shape::Cov6(self.cov6[6 * i..6 * i + 6].try_into().unwrap())
             };
@@ -198,7 +198,7 @@ impl Scene {
             Splat {
                 mean: r[..3].try_into().unwrap(),
                 shape,
-                opacity: r[LANE_OPACITY],
+                opacity: r[OPACITY_OFFSET],
                 sh: self.sh[i / CHILDREN * set..][..set]
                     .chunks_exact(3)
                     .map(|c| c.try_into().unwrap())

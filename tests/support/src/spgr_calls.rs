@@ -3,7 +3,7 @@
 
 use crate::scenes::{LocalPrimaries, Random, cameras};
 use candle_core::{DType, Tensor};
-use subsplat::abi::HEAD_LANES;
+use subsplat::abi::HEAD_STRIDE;
 use subsplat::camera::Camera;
 use subsplat::config::{self, *};
 use subsplat::model::spgr::rules;
@@ -28,7 +28,7 @@ pub fn parents(cameras: &[Camera], r: &mut Random) -> Tensor {
 }
 
 pub fn head(n: usize, k: usize, scale: f64, dtype: DType, r: &mut Random) -> Tensor {
-    r.tensor(&[n, k, HEAD_LANES], scale, dtype)
+    r.tensor(&[n, k, HEAD_STRIDE], scale, dtype)
 }
 
 /// Every rule of the configuration, one at a time and in mixture.

@@ -1,7 +1,7 @@
 //! Random Gaussians, and what two sets of them must have in common.
 
 use glam::{DMat3, DQuat, DVec3};
-use subsplat::abi::{SPLAT_LANES, ShBasis};
+use subsplat::abi::{SPLAT_STRIDE, ShBasis};
 use subsplat::sh;
 use subsplat::splats::Splats;
 
@@ -51,7 +51,7 @@ pub fn scene(seed: u64, kind: Kind) -> Splats {
     let mut r = Random(seed);
     let n = kind.parents * kind.children;
     let d = (kind.degree + 1) * (kind.degree + 1);
-    let mut rows = Vec::with_capacity(n * SPLAT_LANES);
+    let mut rows = Vec::with_capacity(n * SPLAT_STRIDE);
     for _ in 0..n {
         rows.extend([(); 3].map(|()| r.within(-4.0, 4.0) as f32));
         // Not unit, of either sign: writers must normalise.

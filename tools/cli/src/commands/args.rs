@@ -391,7 +391,7 @@ pub enum SimdArg {
     Neon,
 }
 
-impl From<SimdArg> for subsplat::cpu::Tier {
+impl From<SimdArg> for subsplat::cpu::SimdLevel {
     fn from(arg: SimdArg) -> Self {
         match arg {
             SimdArg::Scalar => Self::Scalar,

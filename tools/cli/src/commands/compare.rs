@@ -7,7 +7,7 @@ use crate::report::{Answer, Progress, peak_memory_bytes, warn};
 use anyhow::{Context, Result, bail, ensure};
 use serde_json::{Value, json};
 use std::path::Path;
-use subsplat::cpu::Tier;
+use subsplat::cpu::SimdLevel;
 use subsplat::model::compare::{self, Row};
 use subsplat::model::weights::Weights;
 use subsplat::render::Renderer;
@@ -17,11 +17,11 @@ pub fn compare(args: &CompareArgs, answer: Answer) -> Result<bool> {
     match &args.weights {
         Some(weights) => encoder(weights, &args.reference, answer),
         None if args.device.eq_ignore_ascii_case("cpu") => {
-            let tier = tier(args.simd)?;
-            let compare = |case: &Case| compare_raster::compare(case, tier);
+            let level = level(args.simd)?;
+            let compare = |case: &Case| compare_raster::compare(case, level);
             rasterizer(
                 &args.reference,
-                &format!("instruction set: {}", tier.name()),
+                &format!("instruction set: {}", level.name()),
                 compare,
                 answer,
             )
@@ -50,16 +50,16 @@ fn encoder(weights: &Path, reference: &Path, answer: Answer) -> Result<bool> {
 }
 
 /// The instruction set that is asked for, or the best one.
-fn tier(asked: Option<SimdArg>) -> Result<Tier> {
-    let tier = asked.map_or_else(Tier::best, Tier::from);
-    let here: Vec<&str> = Tier::available().iter().map(|t| t.name()).collect();
+fn level(asked: Option<SimdArg>) -> Result<SimdLevel> {
+    let level = asked.map_or_else(SimdLevel::best, SimdLevel::from);
+    let here: Vec<&str> = SimdLevel::available().iter().map(|t| t.name()).collect();
     ensure!(
-        tier.is_available(),
+        level.is_available(),
         "--simd: expected one that this processor runs ({}), got {}",
         here.join(", "),
-        tier.name()
+        level.name()
     );
-    Ok(tier)
+    Ok(level)
 }
 
 fn rasterizer(

@@ -6,8 +6,10 @@
 
 use super::raster_case::Case;
 use anyhow::{Result, ensure};
-use subsplat::abi::{Convention, LANE_MEAN, LANE_OPACITY, LANE_QUAT, LANE_SCALE, SPLAT_LANES};
-use subsplat::cpu::{Gradients, Rasterizer, Rendered, Tier};
+use subsplat::abi::{
+    Convention, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE,
+};
+use subsplat::cpu::{Gradients, Rasterizer, Rendered, SimdLevel};
 use subsplat::model::compare::Row;
 use subsplat::render::Renderer;
 
@@ -33,13 +35,13 @@ const NEEDLES: &str = "needles";
 /// Name, what came, its shape, what is allowed, and from which size on errors are relative.
 type Output<'a> = (&'static str, &'a [f32], &'a [usize], f32, Option<f32>);
 
-/// Renders the case with the instructions of `tier` and compares every output that the file holds. `relative` of a row
+/// Renders the case with the instructions of `level` and compares every output that the file holds. `relative` of a row
 /// is the difference in the tensor's own measure: absolute for colours and alpha.
 ///
 /// # Errors
 /// A tensor is missing or has another shape; every pixel is marked as boundary.
-pub fn compare(case: &Case, tier: Tier) -> Result<Vec<Row>> {
-    let mut rasterizer = Rasterizer::new().with_tier(tier);
+pub fn compare(case: &Case, level: SimdLevel) -> Result<Vec<Row>> {
+    let mut rasterizer = Rasterizer::new().with_simd_level(level);
     let got = rasterizer.render(&case.splats(), &case.camera, &case.options);
     let mut rows = picture(case, &got)?;
     if case.has("v_rgb") {
@@ -119,7 +121,7 @@ fn gradients(case: &Case, got: &Gradients, rows: &mut Vec<Row>) -> Result<()> {
     let allowed = if case.name == NEEDLES { GRADIENT_NEEDLES } else { GRADIENT };
     let lanes = |from: usize, count: usize| -> Vec<f32> {
         got.rows
-            .chunks_exact(SPLAT_LANES)
+            .chunks_exact(SPLAT_STRIDE)
             .flat_map(|r| r.iter().skip(from).take(count))
             .copied()
             .collect()
@@ -128,10 +130,10 @@ fn gradients(case: &Case, got: &Gradients, rows: &mut Vec<Row>) -> Result<()> {
     let coefficients = got.sh.len() / (3 * p.max(1));
     let mut all: Vec<(&str, Vec<f32>, Vec<usize>)> = match case.options.convention {
         Convention::Standard => vec![
-            ("grad.means", lanes(LANE_MEAN, 3), vec![n, 3]),
-            ("grad.quats", lanes(LANE_QUAT, 4), vec![n, 4]),
-            ("grad.scales", lanes(LANE_SCALE, 3), vec![n, 3]),
-            ("grad.opacities", lanes(LANE_OPACITY, 1), vec![n]),
+            ("grad.means", lanes(MEAN_OFFSET, 3), vec![n, 3]),
+            ("grad.quats", lanes(QUAT_OFFSET, 4), vec![n, 4]),
+            ("grad.scales", lanes(SCALE_OFFSET, 3), vec![n, 3]),
+            ("grad.opacities", lanes(OPACITY_OFFSET, 1), vec![n]),
         ],
         Convention::Mvsplat => vec![
             ("grad.means", got.means.clone(), vec![n, 3]),

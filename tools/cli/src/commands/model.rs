@@ -4,7 +4,7 @@ use super::args::{BackboneArg, ModelArgs, SourceArgs};
 use crate::report::{say, warn};
 use anyhow::{Context, Result, bail, ensure};
 use std::path::Path;
-use subsplat::abi::HEAD_GEOMETRY_LANES;
+use subsplat::abi::HEAD_GEOMETRY_LEN;
 use subsplat::config::{Config, Preset, SpgrHead};
 use subsplat::model::weights::{SUBSPLAT_PREFIX, Weights};
 use subsplat::pipeline::{self, Reconstructor};
@@ -136,7 +136,7 @@ impl Holds {
                 .and_then(|(_, t)| t.dims().first().copied())
         };
         let fixed = !any("subsplat.geo.pos0.");
-        let children = rows("lin4").or_else(|| rows("lin1")).map(|r| r / HEAD_GEOMETRY_LANES);
+        let children = rows("lin4").or_else(|| rows("lin1")).map(|r| r / HEAD_GEOMETRY_LEN);
         Self {
             mvsplat: any("backbone.") || any("depth_predictor."),
             small: any("small."),

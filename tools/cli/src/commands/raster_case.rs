@@ -12,7 +12,7 @@ use std::path::Path;
 use std::str::FromStr;
 use subsplat::abi::{
     ALPHA_MAX_MVSPLAT, ALPHA_MAX_STANDARD, ALPHA_MIN, Convention, NEAR_MVSPLAT, RasterOptions,
-    SH_DEGREE_MAX, SPLAT_LANES, ShBasis, TRANSMITTANCE_MIN, sh_coefficients,
+    SH_DEGREE_MAX, SPLAT_STRIDE, ShBasis, TRANSMITTANCE_MIN, sh_coefficients,
 };
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::cpu::{Geometry, SplatSlices};
@@ -236,7 +236,7 @@ fn pack(tensors: &BTreeMap<String, Array>, n: usize) -> Result<Vec<f32>> {
     let quats = array(tensors, "quats", &[n, 4])?.chunks_exact(4);
     let scales = array(tensors, "scales", &[n, 3])?.chunks_exact(3);
     let opacities = array(tensors, "opacities", &[n])?;
-    let mut rows = Vec::with_capacity(n * SPLAT_LANES);
+    let mut rows = Vec::with_capacity(n * SPLAT_STRIDE);
     for (((mean, quat), scale), opacity) in means.zip(quats).zip(scales).zip(opacities) {
         rows.extend(mean.iter().chain(quat).chain(scale).chain([opacity]));
     }

@@ -12,7 +12,7 @@ use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
-use subsplat::cpu::Tier;
+use subsplat::cpu::SimdLevel;
 
 /// Not ours: it holds no camera and no metadata (tests/raster.rs has its test).
 const FOREIGN: &str = "brush_tiny";
@@ -35,8 +35,8 @@ fn compare(reference: &Path, more: &[&str]) -> Called {
 #[test]
 fn every_case_passes() {
     for path in cases().iter().filter(|p| p.file_stem().unwrap() != FOREIGN) {
-        for (tier, threads) in Tier::available().iter().zip(["1", "2", "3", "4"]) {
-            let called = compare(path, &["--threads", threads, "--simd", tier.name()]);
+        for (level, threads) in SimdLevel::available().iter().zip(["1", "2", "3", "4"]) {
+            let called = compare(path, &["--threads", threads, "--simd", level.name()]);
             assert_eq!(called.code, 0, "{}: {} {}", path.display(), called.stdout, called.stderr);
             let report = called.json();
             assert_eq!(report["ok"], true);
@@ -232,12 +232,12 @@ fn malformed_cases_are_refused_by_name() {
 #[test]
 fn an_instruction_set_that_is_not_here_is_refused() {
     let Some(path) = shared("fixtures/raster/sh1.safetensors") else { return };
-    let all = [Tier::Scalar, Tier::Avx2, Tier::Avx512, Tier::Neon];
+    let all = [SimdLevel::Scalar, SimdLevel::Avx2, SimdLevel::Avx512, SimdLevel::Neon];
     let absent: Vec<_> = all.into_iter().filter(|t| !t.is_available()).collect();
     assert!(!absent.is_empty());
-    for tier in absent {
-        let called = compare(&path, &["--simd", tier.name()]);
+    for level in absent {
+        let called = compare(&path, &["--simd", level.name()]);
         assert_eq!(called.code, 1);
-        assert!(called.error().contains("--simd") && called.error().contains(tier.name()));
+        assert!(called.error().contains("--simd") && called.error().contains(level.name()));
     }
 }

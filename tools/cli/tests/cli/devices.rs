@@ -7,7 +7,7 @@ use crate::program;
 
 use glam::Mat4;
 use program::{call_in, workplace};
-use subsplat::abi::{RasterOptions, SPLAT_LANES, ShBasis};
+use subsplat::abi::{RasterOptions, SPLAT_STRIDE, ShBasis};
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::render::{Renderer, render};
 use subsplat::splats::Splats;
@@ -19,7 +19,7 @@ fn scene() -> (Splats, Camera) {
         rows.extend([t.sin(), (1.7 * t).cos() * 0.7, 3.0 + (2.3 * t).sin()]);
         rows.extend([1.0, 0.3 * t.sin(), 0.2, -0.1 * t.cos(), 0.1, 0.15, 0.05, 0.7]);
     }
-    let n = rows.len() / SPLAT_LANES;
+    let n = rows.len() / SPLAT_STRIDE;
     let sh = (0..3 * n).map(|i| (i as f32 * 0.9).sin()).collect();
     let splats = Splats { rows, sh, gain: Vec::new(), sh_degree: 0, sh_basis: ShBasis::Standard };
     let k = Intrinsics::from_fov_x(0.9, 64, 48);

@@ -4,27 +4,30 @@ use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
 /// `n` numbers that are yet to be written.
-pub(crate) struct Fresh<T> {
+pub(crate) struct UninitBuffer<T> {
     data: Vec<T>,
     n: usize,
 }
 
-/// A part of a [`Fresh`].
-pub(crate) type Block<T> = [MaybeUninit<T>];
+/// A part of a [`UninitBuffer`].
+pub(crate) type UninitSlice<T> = [MaybeUninit<T>];
 
-impl<T: Copy + Default + Send> Fresh<T> {
+impl<T: Copy + Default + Send> UninitBuffer<T> {
     /// Room for `n`.
     pub(crate) fn new(n: usize) -> Self {
         Self { data: Vec::with_capacity(n), n }
     }
 
     /// Blocks of `size` ≥ 1, the last one maybe shorter.
-    pub(crate) fn blocks(&mut self, size: usize) -> rayon::slice::ChunksMut<'_, MaybeUninit<T>> {
-        self.whole().par_chunks_mut(size)
+    pub(crate) fn par_chunks_mut(
+        &mut self,
+        size: usize,
+    ) -> rayon::slice::ChunksMut<'_, MaybeUninit<T>> {
+        self.as_mut_slice().par_chunks_mut(size)
     }
 
     /// All places at once.
-    pub(crate) fn whole(&mut self) -> &mut Block<T> {
+    pub(crate) fn as_mut_slice(&mut self) -> &mut UninitSlice<T> {
         let room = self.data.spare_capacity_mut();
         let n = self.n.min(room.len());
         &mut room[..n]
@@ -34,7 +37,7 @@ impl<T: Copy + Default + Send> Fresh<T> {
     ///
     /// # Safety
     /// Every place was written.
-    pub(crate) unsafe fn finish(mut self) -> Vec<T> {
+    pub(crate) unsafe fn assume_init(mut self) -> Vec<T> {
         // SAFETY: within the capacity, and written (the caller's promise).
         unsafe { self.data.set_len(self.n) };
         self.data
@@ -44,10 +47,10 @@ impl<T: Copy + Default + Send> Fresh<T> {
 /// A block filled with zeros, while it lies in the cache of the thread that goes on
 /// with it. First writes, and so page faults, fall on all threads.
 #[inline]
-pub(crate) fn start<T: Copy + Default>(block: &mut Block<T>) -> &mut [T] {
+pub(crate) fn zeroed<T: Copy + Default>(block: &mut UninitSlice<T>) -> &mut [T] {
     block.fill(MaybeUninit::new(T::default()));
     // SAFETY: every place was just written.
-    unsafe { &mut *(block as *mut Block<T> as *mut [T]) }
+    unsafe { &mut *(block as *mut UninitSlice<T> as *mut [T]) }
 }
 
 /// A block with the numbers of `from`, which is as long.
@@ -55,13 +58,13 @@ pub(crate) fn start<T: Copy + Default>(block: &mut Block<T>) -> &mut [T] {
 /// # Panics
 /// Where it is not.
 #[inline]
-pub(crate) fn fill<'a, T: Copy>(block: &'a mut Block<T>, from: &[T]) -> &'a mut [T] {
+pub(crate) fn filled<'a, T: Copy>(block: &'a mut UninitSlice<T>, from: &[T]) -> &'a mut [T] {
     assert_eq!(block.len(), from.len(), "fresh block: lengths");
     for (to, from) in block.iter_mut().zip(from) {
         *to = MaybeUninit::new(*from);
     }
     // SAFETY: every place was just written.
-    unsafe { &mut *(block as *mut Block<T> as *mut [T]) }
+    unsafe { &mut *(block as *mut UninitSlice<T> as *mut [T]) }
 }
 
 /// Numbers that are there already, to be written over.
@@ -69,9 +72,9 @@ pub(crate) fn fill<'a, T: Copy>(block: &'a mut Block<T>, from: &[T]) -> &'a mut 
 /// # Safety
 /// What is written are numbers, never memory that nobody wrote.
 #[inline(always)]
-pub(crate) unsafe fn over<T>(numbers: &mut [T]) -> &mut Block<T> {
+pub(crate) unsafe fn as_uninit<T>(numbers: &mut [T]) -> &mut UninitSlice<T> {
     // SAFETY: the same layout; every place stays written (the caller's promise).
-    unsafe { &mut *(numbers as *mut [T] as *mut Block<T>) }
+    unsafe { &mut *(numbers as *mut [T] as *mut UninitSlice<T>) }
 }
 
 /// Numbers below which [`zeros`] is not worth several threads.
@@ -81,7 +84,7 @@ const PART: usize = 1 << 16;
 
 /// The first `n` of what `kept` holds, with what the last use left there: it never
 /// shrinks, so that no use fills again what another one has made.
-pub(crate) fn room(kept: &mut Vec<f32>, n: usize) -> &mut [f32] {
+pub(crate) fn grown(kept: &mut Vec<f32>, n: usize) -> &mut [f32] {
     if kept.len() < n {
         kept.resize(n, 0.0);
     }
@@ -94,12 +97,12 @@ pub fn zeros(n: usize) -> Vec<f32> {
     if n < SMALL {
         return vec![0.0; n];
     }
-    let mut fresh = Fresh::new(n);
-    fresh.blocks(PART).for_each(|block| {
-        start::<f32>(block);
+    let mut buffer = UninitBuffer::new(n);
+    buffer.par_chunks_mut(PART).for_each(|block| {
+        zeroed::<f32>(block);
     });
     // SAFETY: the line above started every block.
-    unsafe { fresh.finish() }
+    unsafe { buffer.assume_init() }
 }
 
 #[cfg(test)]
@@ -117,14 +120,14 @@ mod tests {
     #[test]
     fn blocks_make_the_whole() {
         for n in [0, 1, 7, 64, 65] {
-            let mut fresh = Fresh::<f32>::new(n);
-            fresh.blocks(8).enumerate().for_each(|(i, block)| {
-                let block = start(block);
+            let mut buffer = UninitBuffer::<f32>::new(n);
+            buffer.par_chunks_mut(8).enumerate().for_each(|(i, block)| {
+                let block = zeroed(block);
                 assert!(block.iter().all(|v| *v == 0.0));
                 block.iter_mut().enumerate().for_each(|(j, v)| *v = (8 * i + j) as f32);
             });
             // SAFETY: the loop above started every block.
-            let all = unsafe { fresh.finish() };
+            let all = unsafe { buffer.assume_init() };
             assert_eq!(all, (0..n).map(|i| i as f32).collect::<Vec<_>>());
         }
     }

@@ -4,7 +4,7 @@ use std::marker::PhantomData;
 use std::ops::Range;
 
 /// A borrowed slice without the borrow checker's watch over who writes where.
-pub(crate) struct Disjoint<'a, T> {
+pub(crate) struct SharedSliceMut<'a, T> {
     start: *mut T,
     len: usize,
     slice: PhantomData<&'a mut [T]>,
@@ -12,11 +12,11 @@ pub(crate) struct Disjoint<'a, T> {
 
 // SAFETY: a thread that holds it can do no more than with a part of the `&mut [T]` it
 // was made of; who takes which part is the callers' promise in the methods below.
-unsafe impl<T: Send> Sync for Disjoint<'_, T> {}
+unsafe impl<T: Send> Sync for SharedSliceMut<'_, T> {}
 // SAFETY: as above.
-unsafe impl<T: Send> Send for Disjoint<'_, T> {}
+unsafe impl<T: Send> Send for SharedSliceMut<'_, T> {}
 
-impl<'a, T> Disjoint<'a, T> {
+impl<'a, T> SharedSliceMut<'a, T> {
     /// Shares `slice`.
     pub(crate) fn new(slice: &'a mut [T]) -> Self {
         Self { start: slice.as_mut_ptr(), len: slice.len(), slice: PhantomData }
@@ -61,7 +61,7 @@ mod tests {
     #[test]
     fn parts_are_those_of_the_slice() {
         let mut v: Vec<u32> = (0..10).collect();
-        let shared = Disjoint::new(&mut v);
+        let shared = SharedSliceMut::new(&mut v);
         // SAFETY: one thread, and no two parts alive at once.
         unsafe {
             shared.write(3, 30);
