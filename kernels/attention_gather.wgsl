@@ -1,8 +1,9 @@
-// Attention of parents over bilinear samples of the views' feature maps (SubSplat A.2):
-// twin of src/cpu/attention_gather. Arguments but the last: kernels/shared/gather_samples.wgsl.
+// Attention of parents over bilinear samples of the views' feature maps (SubSplat, supplement
+// A.2). CPU version: src/cpu/attention_gather. Arguments except the last:
+// kernels/shared/gather_samples.wgsl.
 //
-// Out: [N, E].   One workgroup per parent: threads are samples, then weights, then
-// channels; nothing of it leaves workgroup memory but the output.
+// Output: [N, E]. One workgroup per parent; its threads process the samples, then the weights,
+// then the channels. Only the output leaves workgroup memory.
 
 @group(0) @binding(5) var<storage, read_write> attended: array<f32>;
 
@@ -10,27 +11,27 @@
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
     let n = workgroup_number(workgroup, workgroups);
     if n >= call.parents {
         return;
     }
-    attend(n, lane);
+    attention_weights(n, thread);
     workgroupBarrier();
     let samples = sample_count();
-    for (var i = lane; i < samples * call.groups; i += GATHER_THREADS) {
-        weights[i] *= gate(n, i / call.groups) * kept(n, i);
+    for (var i = thread; i < samples * call.groups; i += GATHER_THREADS) {
+        weights[i] *= gate(n, i / call.groups) * dropout_factor(n, i);
     }
     workgroupBarrier();
-    let wide = call.dim / call.groups;
-    for (var c = lane; c < call.dim; c += GATHER_THREADS) {
+    let group_dim = call.dim / call.groups;
+    for (var c = thread; c < call.dim; c += GATHER_THREADS) {
         var sum = 0.0;
         for (var j = 0u; j < samples; j++) {
-            if states[j] == LIVE {
+            if states[j] == SAMPLED {
                 let row = cells[j] * call.stride + call.value + c;
                 let u = vec4<f32>(maps[row.x], maps[row.y], maps[row.z], maps[row.w]);
-                sum += weights[j * call.groups + c / wide] * dot(corners[j], u);
+                sum += weights[j * call.groups + c / group_dim] * dot(corners[j], u);
             }
         }
         attended[n * call.dim + c] = sum;

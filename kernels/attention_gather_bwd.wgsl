@@ -1,36 +1,36 @@
-// Gradients of the attention gather with respect to query and points, and what the maps'
-// gradient is summed from. Twin of src/cpu/attention_gather/backward.rs. Arguments but
-// the last four: kernels/shared/gather_samples.wgsl.
+// Gradients of the attention gather with respect to query and points, and the factors of the
+// gradient of the maps. CPU version: src/cpu/attention_gather/backward.rs. Arguments except the
+// last four: kernels/shared/gather_samples.wgsl.
 //
-// In: gradient of the output [N, E].   Out: rows [N, Q + P] of query and points; the cell
-// of each corner of each sample [N, S, 4], or NONE; factors [N, S, 4 + 2G]: the corners'
-// weights, then of each group those of q in the key channels and of the gradient in the
-// value channels.   One workgroup per parent.
+// Input: gradient of the output [N, E]. Output: rows [N, Q + P] of query and points; the cell of
+// each corner of each sample [N, S, 4], or NONE; factors [N, S, 4 + 2G]: the weights of the
+// corners, then per group the factors of q in the key channels and of the gradient in the value
+// channels. One workgroup per parent.
 
 @group(0) @binding(5) var<storage, read> grad: array<f32>;
 @group(0) @binding(6) var<storage, read_write> d_rows: array<f32>;
 @group(0) @binding(7) var<storage, read_write> cells_of: array<u32>;
 @group(0) @binding(8) var<storage, read_write> factors: array<f32>;
 
-// [samples, G]: the gradient along the sampled value, then of the logit.
+// [samples, G]: the product of gradient and sampled value, then the gradient of the logit.
 var<workgroup> along: array<f32, GATHER_WEIGHTS_MAX>;
 
 fn corners_of(row: vec4<u32>) -> vec4<f32> {
     return vec4<f32>(maps[row.x], maps[row.y], maps[row.z], maps[row.w]);
 }
 
-// Gradient · value of sample j in group g.
-fn along_value(n: u32, j: u32, g: u32) -> f32 {
-    let wide = call.dim / call.groups;
-    let row = cells[j] * call.stride + call.value + g * wide;
+// Returns gradient · value of sample j in group g.
+fn value_dot(n: u32, j: u32, g: u32) -> f32 {
+    let group_dim = call.dim / call.groups;
+    let row = cells[j] * call.stride + call.value + g * group_dim;
     var sum = 0.0;
-    for (var c = 0u; c < wide; c++) {
-        sum += grad[n * call.dim + g * wide + c] * dot(corners[j], corners_of(row + c));
+    for (var c = 0u; c < group_dim; c++) {
+        sum += grad[n * call.dim + g * group_dim + c] * dot(corners[j], corners_of(row + c));
     }
     return sum;
 }
 
-// Gradients of the gates, from the weights and `along` before it becomes that of logits.
+// Returns the gradient of the gate of view v, before logits_bwd replaces `along`.
 fn gates_bwd(n: u32, v: u32) -> f32 {
     let per_view = call.levels * call.points * call.groups;
     var sum = 0.0;
@@ -40,6 +40,7 @@ fn gates_bwd(n: u32, v: u32) -> f32 {
     return sum;
 }
 
+// Replaces `along` by the gradients of the logits of group g.
 fn logits_bwd(n: u32, g: u32) {
     var mean = 0.0;
     for (var j = 0u; j < sample_count(); j++) {
@@ -53,13 +54,13 @@ fn logits_bwd(n: u32, g: u32) {
     }
 }
 
-// Gradient of the corners' weights of sample j; call after logits_bwd.
+// Returns the gradient of the corner weights of sample j; logits_bwd must run before.
 fn corners_bwd(n: u32, j: u32) -> vec4<f32> {
-    let wide = call.dim / call.groups;
+    let group_dim = call.dim / call.groups;
     var sum = vec4<f32>();
     for (var c = 0u; c < call.dim; c++) {
-        let i = j * call.groups + c / wide;
-        let by = weights[i] * gate(n, j) * kept(n, i) * grad[n * call.dim + c];
+        let i = j * call.groups + c / group_dim;
+        let by = weights[i] * gate(n, j) * dropout_factor(n, i) * grad[n * call.dim + c];
         sum += by * corners_of(cells[j] * call.stride + call.value + c);
         if call.has_key != 0u {
             let by = along[i] * call.logit_scale * query[n * query_width() + c];
@@ -69,9 +70,9 @@ fn corners_bwd(n: u32, j: u32) -> vec4<f32> {
     return sum;
 }
 
-// Gradient of the point of sample j through the bilinear weights.
+// Returns the gradient of the point of sample j through the bilinear weights.
 fn point_bwd(n: u32, j: u32) -> vec2<f32> {
-    if states[j] != LIVE {
+    if states[j] != SAMPLED {
         return vec2<f32>();
     }
     let p = position(n, j);
@@ -91,7 +92,7 @@ fn point_bwd(n: u32, j: u32) -> vec2<f32> {
     return sum * size;
 }
 
-// Gradient of point q, V·(M or L·M) of them, over the levels that share it.
+// Returns the gradient of point q of V·(M or L·M), summed over the levels that share the point.
 fn points_bwd(n: u32, q: u32) -> vec2<f32> {
     let per_view = call.points_width / 2u;
     let v = q / per_view;
@@ -110,7 +111,7 @@ fn query_bwd(c: u32) -> f32 {
     let g = c / (call.dim / call.groups);
     var sum = 0.0;
     for (var j = 0u; j < sample_count(); j++) {
-        if states[j] == LIVE {
+        if states[j] == SAMPLED {
             let k = corners_of(cells[j] * call.stride + call.key + c);
             sum += along[j * call.groups + g] * call.logit_scale * dot(corners[j], k);
         }
@@ -118,20 +119,20 @@ fn query_bwd(c: u32) -> f32 {
     return sum;
 }
 
-fn store_factors(n: u32, lane: u32) {
-    let wide = 4u + 2u * call.groups;
-    for (var i = lane; i < 4u * sample_count(); i += GATHER_THREADS) {
+fn store_factors(n: u32, thread: u32) {
+    let stride = 4u + 2u * call.groups;
+    for (var i = thread; i < 4u * sample_count(); i += GATHER_THREADS) {
         let at = n * sample_count() + i / 4u;
         let w = corners[i / 4u][i % 4u];
-        let used = states[i / 4u] == LIVE && w != 0.0;
-        factors[at * wide + i % 4u] = w;
+        let used = states[i / 4u] == SAMPLED && w != 0.0;
+        factors[at * stride + i % 4u] = w;
         cells_of[4u * at + i % 4u] = select(NONE, cells[i / 4u][i % 4u], used);
     }
-    for (var i = lane; i < sample_count() * call.groups; i += GATHER_THREADS) {
+    for (var i = thread; i < sample_count() * call.groups; i += GATHER_THREADS) {
         let j = i / call.groups;
-        let at = (n * sample_count() + j) * wide + 4u + 2u * (i % call.groups);
+        let at = (n * sample_count() + j) * stride + 4u + 2u * (i % call.groups);
         factors[at] = along[i] * call.logit_scale;
-        factors[at + 1u] = weights[i] * gate(n, j) * kept(n, i);
+        factors[at + 1u] = weights[i] * gate(n, j) * dropout_factor(n, i);
     }
 }
 
@@ -139,40 +140,40 @@ fn store_factors(n: u32, lane: u32) {
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
     let n = workgroup_number(workgroup, workgroups);
     if n >= call.parents {
         return;
     }
-    attend(n, lane);
+    attention_weights(n, thread);
     workgroupBarrier();
     let logits = sample_count() * call.groups;
-    for (var i = lane; i < logits; i += GATHER_THREADS) {
+    for (var i = thread; i < logits; i += GATHER_THREADS) {
         var v = 0.0;
-        if states[i / call.groups] == LIVE {
-            v = kept(n, i) * along_value(n, i / call.groups, i % call.groups);
+        if states[i / call.groups] == SAMPLED {
+            v = dropout_factor(n, i) * value_dot(n, i / call.groups, i % call.groups);
         }
         along[i] = v;
     }
     workgroupBarrier();
     let points_floats = call.views * call.points_width;
     let to = n * (query_width() + points_floats);
-    for (var v = lane; v < call.views; v += GATHER_THREADS) {
+    for (var v = thread; v < call.views; v += GATHER_THREADS) {
         d_rows[to + query_width() - call.views + v] = gates_bwd(n, v);
     }
     workgroupBarrier();
-    for (var g = lane; g < call.groups; g += GATHER_THREADS) {
+    for (var g = thread; g < call.groups; g += GATHER_THREADS) {
         logits_bwd(n, g);
     }
     workgroupBarrier();
-    for (var i = lane; i < logits; i += GATHER_THREADS) {
+    for (var i = thread; i < logits; i += GATHER_THREADS) {
         d_rows[to + query_channels() + i] = along[i];
     }
-    for (var c = lane; c < query_channels(); c += GATHER_THREADS) {
+    for (var c = thread; c < query_channels(); c += GATHER_THREADS) {
         d_rows[to + c] = query_bwd(c);
     }
-    for (var q = lane; q < points_floats / 2u; q += GATHER_THREADS) {
+    for (var q = thread; q < points_floats / 2u; q += GATHER_THREADS) {
         var d = vec2<f32>();
         if call.point_gradient != 0u {
             d = points_bwd(n, q);
@@ -180,5 +181,5 @@ fn main(
         d_rows[to + query_width() + 2u * q] = d.x;
         d_rows[to + query_width() + 2u * q + 1u] = d.y;
     }
-    store_factors(n, lane);
+    store_factors(n, thread);
 }

@@ -1,9 +1,10 @@
-// From the pixels' sums to SH, gain, and the mean's share of the direction. Twin:
-// src/cpu/colour_bwd.rs. A parent's SH gradient is summed over its children in their order.
+// Gradients of SH and gain, and the part of the mean's gradient through the view direction. CPU
+// version: src/cpu/colour_bwd.rs. The gradient of a parent's SH is summed over its children in
+// their order.
 //
-// In: rows, sh, gain as project.wgsl has them, sums [N, 10] from splat `own` on.  Out:
-// gradients of sh and gain; the mean's share is added to `d_rows`, which project_bwd.wgsl
-// has filled.   One thread per parent.
+// Input: rows, sh, gain as in project.wgsl; sums [N, 10] from splat `own` on. Output: gradients
+// of sh and gain; the mean's part is added to `d_rows`, which project_bwd.wgsl has written. One
+// thread per parent.
 
 @group(0) @binding(0) var<uniform> call: RasterUniform;
 @group(0) @binding(1) var<storage, read> rows: array<f32>;
@@ -14,8 +15,8 @@
 @group(0) @binding(6) var<storage, read_write> d_sh: array<f32>;
 @group(0) @binding(7) var<storage, read_write> d_gain: array<f32>;
 
-// From the eye to splat i.
-fn away(i: u32) -> vec3<f32> {
+// Returns the vector from the eye to splat i.
+fn from_eye(i: u32) -> vec3<f32> {
     let row = i * call.stride;
     let eye = vec3<f32>(call.right.w, call.down.w, call.ahead.w);
     return vec3<f32>(rows[row], rows[row + 1u], rows[row + 2u]) - eye;
@@ -39,7 +40,7 @@ fn add_to_mean(i: u32, g: vec3<f32>) {
     d_rows[row + 2u] += g.z;
 }
 
-fn put_gain(i: u32, g: f32, rgb: vec3<f32>) {
+fn store_gain(i: u32, g: f32, rgb: vec3<f32>) {
     let at = i * call.gain_lanes;
     if call.gain_lanes > 0u {
         d_gain[at] = g;
@@ -51,28 +52,28 @@ fn put_gain(i: u32, g: f32, rgb: vec3<f32>) {
     }
 }
 
-// Every child looks along its own mean.
-fn each_for_itself(own_sh: u32, first: u32, past: u32) {
+// Adds the gradients for children with a direction each.
+fn children_by_direction(own_sh: u32, first: u32, past: u32) {
     for (var i = first; i < past; i++) {
         let m = moments(call.own + i);
-        if !seen(m) {
-            put_gain(i, 0.0, vec3<f32>(0.0));
+        if !has_gradient(m) {
+            store_gain(i, 0.0, vec3<f32>(0.0));
             continue;
         }
         let own = gain_of(i);
-        radiance_gradient(own_sh, call.sh_degree, call.sh_mvsplat != 0u, away(i), m.rgb, own * m.rgb);
-        add_to_mean(i, own * seen_from.slope);
-        put_gain(i, seen_from.value, m.rgb);
+        radiance_gradient(own_sh, call.sh_degree, call.sh_mvsplat != 0u, from_eye(i), m.rgb, own * m.rgb);
+        add_to_mean(i, own * direction_sums.slope);
+        store_gain(i, direction_sums.value, m.rgb);
     }
 }
 
-// All look along the mean of those means that are finite.
-fn together(own_sh: u32, first: u32, past: u32) {
+// Adds the gradients for children that share one direction: the mean of their finite means.
+fn children_of_one_direction(own_sh: u32, first: u32, past: u32) {
     var sum = vec3<f32>(0.0);
     var count = 0.0;
     var weighted = vec3<f32>(0.0);
     for (var i = first; i < past; i++) {
-        let d = away(i);
+        let d = from_eye(i);
         if is_finite(d) {
             sum += d;
             count += 1.0;
@@ -92,16 +93,16 @@ fn together(own_sh: u32, first: u32, past: u32) {
     let radiated = radiance(own_sh, call.sh_degree, mvsplat, direction);
     for (var i = first; i < past; i++) {
         let rgb = moments(call.own + i).rgb;
-        let alive = any(rgb != vec3<f32>(0.0));
-        put_gain(i, select(0.0, dot(rgb, radiated), alive), rgb);
+        let visible = any(rgb != vec3<f32>(0.0));
+        store_gain(i, select(0.0, dot(rgb, radiated), visible), rgb);
     }
     if all(weighted == vec3<f32>(0.0)) {
         return;
     }
     radiance_gradient(own_sh, call.sh_degree, mvsplat, towards, weighted, weighted);
-    let share = seen_from.slope / max(count, 1.0);
+    let share = direction_sums.slope / max(count, 1.0);
     for (var i = first; i < past; i++) {
-        if is_finite(away(i)) {
+        if is_finite(from_eye(i)) {
             add_to_mean(i, share);
         }
     }
@@ -111,9 +112,9 @@ fn together(own_sh: u32, first: u32, past: u32) {
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
-    let p = workgroup_number(workgroup, workgroups) * 64u + lane;
+    let p = workgroup_number(workgroup, workgroups) * 64u + thread;
     let first = p * call.children;
     if first >= call.count {
         return;
@@ -124,8 +125,8 @@ fn main(
         d_sh[k] = 0.0;
     }
     if call.sh_shared != 0u {
-        together(own_sh, first, past);
+        children_of_one_direction(own_sh, first, past);
     } else {
-        each_for_itself(own_sh, first, past);
+        children_by_direction(own_sh, first, past);
     }
 }

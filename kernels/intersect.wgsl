@@ -1,9 +1,9 @@
-// (splat, tile) pairs in order of depth: which splats touch which tile, exactly. Twin:
-// src/cpu/tiles.rs.
+// Exact list of (splat, tile) pairs in order of depth. CPU version: src/cpu/tiles.rs.
 //
-// In: splats by depth, the place of each one's first pair.  Out: tile and splat (owner) of
-// every pair. Exactly as many pairs as were counted, whatever a compiler made of the arithmetic
-// there and here: what lacks goes to the tile behind the last, which is not drawn.
+// Input: splats in order of depth, index of each splat's first pair. Output: tile and splat
+// (owner) of every pair. The number of pairs equals the count of project.wgsl, even where a
+// compiler rounds the two computations differently: missing pairs are assigned to the surplus
+// tile after the last one, which is not drawn. One thread per splat.
 
 @group(0) @binding(0) var<uniform> call: RasterUniform;
 @group(0) @binding(1) var<storage, read> footprints: array<vec4<f32>>;
@@ -18,9 +18,9 @@
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
-    let place = workgroup_number(workgroup, workgroups) * 64u + lane;
+    let place = workgroup_number(workgroup, workgroups) * 64u + thread;
     if place >= call.count {
         return;
     }
@@ -34,13 +34,13 @@ fn main(
     let rectangle = rectangles[i];
     let columns = unpack(rectangle.x);
     let lines = unpack(rectangle.y);
-    let whole = small(columns, lines);
+    let whole = is_small(columns, lines);
     let a = footprints[3u * i];
     let b = footprints[3u * i + 1u];
     let half_height = footprints[3u * i + 2u].w;
     let f = Footprint(a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w, half_height);
-    let met = lines_of_call(lines);
-    for (var line = met.x; line < met.y; line++) {
+    let band_lines = rows_in_band(lines);
+    for (var line = band_lines.x; line < band_lines.y; line++) {
         var span = columns;
         if !whole {
             span = tiles_of_row(f, line, columns);

@@ -1,11 +1,10 @@
-// Lists of the entries that fall on each cell, in entry order: what lets a sum over
-// entries be taken cell by cell, without float atomics and with the same bytes each time
-// (the counting sort of src/cpu/plane_sweep/backward.rs).
+// Lists of the entries of each cell, in ascending order. A sum over entries can then be computed
+// per cell, reproducibly and without float atomics (the counting sort of
+// src/cpu/plane_sweep/backward.rs).
 //
-// In: cell of each entry, or NONE.   Out: starts [cells + 1] and list: the entries of cell
-// c are list[starts[c] .. starts[c + 1]].
-// Entry points in order: count, scan (one workgroup), fill, order (a workgroup per cell).
-// `starts` begins as zeros.
+// Input: cell of each entry, or NONE. Output: starts [cells + 1] and list; the entries of cell c
+// are list[starts[c] .. starts[c + 1]]. Entry points in order: count, scan (one workgroup), fill,
+// order (one workgroup per cell). `starts` is zero before `count`.
 
 struct InvertUniform {
     entries: u32,
@@ -24,9 +23,9 @@ struct InvertUniform {
 fn count(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
-    let e = workgroup_number(workgroup, workgroups) * 64u + lane;
+    let e = workgroup_number(workgroup, workgroups) * 64u + thread;
     if e < call.entries && cells_of[e] != NONE {
         atomicAdd(&starts[cells_of[e]], 1u);
     }
@@ -35,18 +34,18 @@ fn count(
 var<workgroup> sums: array<u32, 256>;
 
 @compute @workgroup_size(256)
-fn scan(@builtin(local_invocation_index) lane: u32) {
+fn scan(@builtin(local_invocation_index) thread: u32) {
     let each = (call.cells + 255u) / 256u;
-    let first = min(lane * each, call.cells);
+    let first = min(thread * each, call.cells);
     let past = min(first + each, call.cells);
     var sum = 0u;
     for (var c = first; c < past; c++) {
         sum += atomicLoad(&starts[c]);
     }
-    sums[lane] = sum;
+    sums[thread] = sum;
     workgroupBarrier();
     var before = 0u;
-    for (var i = 0u; i < lane; i++) {
+    for (var i = 0u; i < thread; i++) {
         before += sums[i];
     }
     for (var c = first; c < past; c++) {
@@ -55,7 +54,7 @@ fn scan(@builtin(local_invocation_index) lane: u32) {
         atomicStore(&cursors[c], before);
         before += own;
     }
-    if lane == 255u {
+    if thread == 255u {
         atomicStore(&starts[call.cells], before);
     }
 }
@@ -64,9 +63,9 @@ fn scan(@builtin(local_invocation_index) lane: u32) {
 fn fill(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
-    let e = workgroup_number(workgroup, workgroups) * 64u + lane;
+    let e = workgroup_number(workgroup, workgroups) * 64u + thread;
     if e < call.entries && cells_of[e] != NONE {
         list[atomicAdd(&cursors[cells_of[e]], 1u)] = e;
     }
@@ -82,33 +81,33 @@ fn exchange(first: u32, count: u32, a: u32, b: u32) {
     }
 }
 
-// Bitonic sort whose comparators all point upward, so that what lies beyond the list's end
-// may be left out.
+// Bitonic sort whose comparators all have the same direction, so that comparators beyond the end
+// of the list can be skipped.
 @compute @workgroup_size(64)
 fn order(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
     let c = workgroup_number(workgroup, workgroups);
     if c >= call.cells {
         return;
     }
-    if lane == 0u {
+    if thread == 0u {
         span = vec2<u32>(atomicLoad(&starts[c]), atomicLoad(&starts[c + 1u]));
     }
     let ends = workgroupUniformLoad(&span);
     let length = ends.y - ends.x;
     for (var size = 2u; size < 2u * length; size *= 2u) {
         let pairs = (length + size - 1u) / size * (size / 2u);
-        for (var i = lane; i < pairs; i += 64u) {
+        for (var i = thread; i < pairs; i += 64u) {
             let at = i / (size / 2u) * size;
             let within = i % (size / 2u);
             exchange(ends.x, length, at + within, at + size - 1u - within);
         }
         storageBarrier();
         for (var stride = size / 4u; stride > 0u; stride /= 2u) {
-            for (var i = lane; i < pairs; i += 64u) {
+            for (var i = thread; i < pairs; i += 64u) {
                 let a = i / stride * 2u * stride + i % stride;
                 exchange(ends.x, length, a, a + stride);
             }

@@ -1,10 +1,10 @@
-// Adds up each splat's (splat, tile) pairs, in the order of its tiles: the same bytes each
-// time. Twin: the gather of src/cpu/raster_bwd.rs.
+// Sums over each splat's (splat, tile) pairs, in the order of its tiles, which makes the results
+// reproducible. CPU version: the gather of src/cpu/raster_bwd.rs.
 //
-// In: splats by depth, the place of each one's first pair, ten sums a pair.  Out: ten sums
-// a splat [N, 10] from splat `own` on, zeros for dropped ones; a colour channel that is
-// clamped has no gradient. A call that resumes adds to what is there, and leaves alone
-// what is not of splats `first` to `first` + `count`.   One thread per place.
+// Input: splats in order of depth, index of each splat's first pair, ten sums per pair. Output:
+// ten sums per splat [N, 10] from splat `own` on, zeros for dropped splats; a clamped colour
+// channel has no gradient. A call that resumes adds to the existing sums. Only the splats `first`
+// to `first` + `count` are written. One thread per place in the order by depth.
 
 @group(0) @binding(0) var<uniform> call: RasterUniform;
 @group(0) @binding(1) var<storage, read> footprints: array<vec4<f32>>;
@@ -18,14 +18,14 @@
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
-    let place = workgroup_number(workgroup, workgroups) * 64u + lane;
+    let place = workgroup_number(workgroup, workgroups) * 64u + thread;
     if place >= call.places {
         return;
     }
     let i = order[call.place + place];
-    // Wraps for a splat before the first.
+    // Wraps around for a splat before the first.
     if i - call.first >= call.count {
         return;
     }

@@ -1,9 +1,9 @@
-// The splats of some places in the order by depth, one behind the other: where one binding
-// does not hold all footprints, or all pairs of a picture, it is drawn layer by layer.
+// Copies the splats of one layer, consecutive in order of depth. Pictures whose footprints or
+// pairs exceed a binding are drawn in layers (src/gpu/layers.rs).
 //
-// In: splats by depth, counts of tiles [N]; footprints and rectangles of splats `first` to
-// `first` + `count`.  Out, by place: those of them that the layer has, their counts, and
-// an order that leaves them as they are.   One thread per place.
+// Input: splats in order of depth, tile counts [N]; footprints and rectangles of splats `first`
+// to `first` + `count`. Output, by place in the layer: footprints, rectangles and counts of those
+// splats, and the identity as their order. One thread per place.
 
 @group(0) @binding(0) var<uniform> call: RasterUniform;
 @group(0) @binding(1) var<storage, read> order: array<u32>;
@@ -19,14 +19,14 @@
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
-    let place = workgroup_number(workgroup, workgroups) * 64u + lane;
+    let place = workgroup_number(workgroup, workgroups) * 64u + thread;
     if place >= call.places {
         return;
     }
     let i = order[call.place + place];
-    // Wraps for a splat before the first.
+    // Wraps around for a splat before the first.
     let own = i - call.first;
     if own >= call.count {
         return;

@@ -1,12 +1,12 @@
-// How many workgroups the sort of the (splat, tile) pairs takes, from their number, which
-// only the device knows: `sums` holds it behind the sums of its blocks.
+// Number of workgroups for the sort of the (splat, tile) pairs, from the number of pairs, which
+// only the device knows. `sums` holds that number after the sums of its blocks.
 
 @group(0) @binding(0) var<uniform> call: RasterUniform;
 @group(0) @binding(1) var<storage, read> splats: array<u32>;
 @group(0) @binding(2) var<storage, read> sums: array<u32>;
 @group(0) @binding(3) var<storage, read_write> plan: array<u32>;
 
-// Workgroups for `groups` of them, within what one dimension takes.
+// Writes the x, y and z counts for `groups` workgroups, within the limit of one dimension.
 fn spread(groups: u32, at: u32) {
     let y = max((groups + 65534u) / 65535u, 1u);
     plan[at] = (groups + y - 1u) / y;
@@ -16,12 +16,12 @@ fn spread(groups: u32, at: u32) {
 
 @compute @workgroup_size(1)
 fn main() {
-    let asked = sums[splats[PLAN_BLOCKS]];
-    let count = min(asked, call.capacity);
+    let requested = sums[splats[PLAN_BLOCKS]];
+    let count = min(requested, call.capacity);
     let blocks = (count + GPU_BLOCK - 1u) / GPU_BLOCK;
     spread(blocks, 0u);
     spread((count + 255u) / 256u, PLAN_ELEMENT_GROUPS);
     plan[PLAN_COUNT] = count;
     plan[PLAN_BLOCKS] = blocks;
-    plan[PLAN_REQUESTED] = asked;
+    plan[PLAN_REQUESTED] = requested;
 }

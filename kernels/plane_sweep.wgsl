@@ -1,8 +1,8 @@
-// Correlation of every reference pixel with the source pixels that it would fall on at
-// each candidate depth; the warped features never exist. Twin of src/cpu/plane_sweep.
-// Arguments but the last: kernels/shared/sweep_taps.wgsl.
+// Correlation of every reference pixel with its projection into the source views at each
+// candidate depth (MVSplat, cost volume). The warped features are not stored. CPU version:
+// src/cpu/plane_sweep. Arguments except the last: kernels/shared/sweep_taps.wgsl.
 //
-// reference [R,C,h,w], source [S,C,h,w]   Out: [R,D,h,w].   One thread per number.
+// Input: reference [R,C,h,w], source [S,C,h,w]. Output: [R,D,h,w]. One thread per element.
 
 @group(0) @binding(6) var<storage, read_write> correlation: array<f32>;
 
@@ -10,9 +10,9 @@
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
-    let i = workgroup_number(workgroup, workgroups) * 64u + lane;
+    let i = workgroup_number(workgroup, workgroups) * 64u + thread;
     let plane = call.height * call.width;
     if i >= call.rows * call.candidates * plane {
         return;
@@ -23,8 +23,8 @@ fn main(
     let depth = depths[r * call.candidates + k];
     let own = r * call.channels * plane + pixel;
     var sum = 0.0;
-    for (var pair = heads[r]; pair < heads[r + 1u]; pair++) {
-        let t = taps(fall(pair, pixel % call.width, pixel / call.width, depth));
+    for (var pair = pair_starts[r]; pair < pair_starts[r + 1u]; pair++) {
+        let t = taps(project(pair, pixel % call.width, pixel / call.width, depth));
         if all(t.weights == vec4<f32>()) {
             continue;
         }
@@ -37,5 +37,5 @@ fn main(
         }
         sum += product;
     }
-    correlation[i] = share(r) * sum;
+    correlation[i] = pair_factor(r) * sum;
 }

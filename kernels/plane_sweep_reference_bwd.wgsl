@@ -1,8 +1,8 @@
-// Gradient [R, C, h, w] of the plane sweep's reference, from the taps of plane_sweep_taps.
-// One thread per number. Twin of src/cpu/plane_sweep/backward.rs.
+// Gradient [R, C, h, w] of the reference of the plane sweep, from the taps of plane_sweep_taps.
+// CPU version: src/cpu/plane_sweep/backward.rs. One thread per element.
 
 @group(0) @binding(1) var<storage, read> source: array<f32>;
-@group(0) @binding(2) var<storage, read> heads: array<u32>;
+@group(0) @binding(2) var<storage, read> pair_starts: array<u32>;
 @group(0) @binding(3) var<storage, read> cells_of: array<u32>;
 @group(0) @binding(4) var<storage, read> factors: array<f32>;
 @group(0) @binding(5) var<storage, read_write> d_reference: array<f32>;
@@ -11,9 +11,9 @@
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
-    let i = workgroup_number(workgroup, workgroups) * 64u + lane;
+    let i = workgroup_number(workgroup, workgroups) * 64u + thread;
     let plane = call.height * call.width;
     if i >= call.rows * call.channels * plane {
         return;
@@ -22,7 +22,7 @@ fn main(
     let c = i / plane % call.channels;
     let r = i / plane / call.channels;
     var sum = 0.0;
-    for (var k = heads[r] * call.candidates; k < heads[r + 1u] * call.candidates; k++) {
+    for (var k = pair_starts[r] * call.candidates; k < pair_starts[r + 1u] * call.candidates; k++) {
         let entry = 4u * (k * plane + pixel);
         for (var j = entry; j < entry + 4u; j++) {
             let cell = cells_of[j];

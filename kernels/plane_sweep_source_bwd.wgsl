@@ -1,9 +1,9 @@
-// Gradient [S, C, h, w] of the plane sweep's source, from the taps of plane_sweep_taps and
-// the lists of invert. One thread per number; taps are summed in order of pair, candidate
-// and pixel. Twin of src/cpu/plane_sweep/backward.rs.
+// Gradient [S, C, h, w] of the source of the plane sweep, from the taps of plane_sweep_taps and
+// the lists of invert. Taps are summed in order of pair, candidate and pixel. CPU version:
+// src/cpu/plane_sweep/backward.rs. One thread per element.
 
 @group(0) @binding(1) var<storage, read> reference: array<f32>;
-@group(0) @binding(2) var<storage, read> heads: array<u32>;
+@group(0) @binding(2) var<storage, read> pair_starts: array<u32>;
 @group(0) @binding(3) var<storage, read> factors: array<f32>;
 @group(0) @binding(4) var<storage, read> starts: array<u32>;
 @group(0) @binding(5) var<storage, read> list: array<u32>;
@@ -13,9 +13,9 @@
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
-    let i = workgroup_number(workgroup, workgroups) * 64u + lane;
+    let i = workgroup_number(workgroup, workgroups) * 64u + thread;
     let plane = call.height * call.width;
     if i >= call.sources * call.channels * plane {
         return;

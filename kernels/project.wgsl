@@ -1,10 +1,10 @@
-// Projection: geometry to footprint, SH to colour, and how many tiles each splat meets.
-// Twin: src/cpu/project.rs (and ewa, covariance, sh, tiles there).
+// Projection: footprint, colour and number of intersected tiles of each splat (3DGS, section 4).
+// CPU version: src/cpu/project.rs, with ewa, covariance, sh and tiles.
 //
-// In: rows [N, 11] (mean, quat wxyz, σ, opacity) or [N, 10] (mean, covariance 6, opacity);
-// sh [P, D, 3]; gain [], [N] or [N, 4].  Out, from splat `own` on: footprints [N, 12],
-// rectangles of tiles [N, 2] (packed); from splat `first` on: depth keys [N] (all ones
-// where dropped), counts [N] of the call's tiles.   One thread per splat.
+// Input: rows [N, 11] (mean, quat wxyz, σ, opacity) or [N, 10] (mean, covariance 6, opacity); sh
+// [P, D, 3]; gain [], [N] or [N, 4]. Output, from splat `own` on: footprints [N, 12], packed
+// rectangles of tiles [N, 2]; from splat `first` on: depth keys [N] (all bits set for dropped
+// splats), counts [N] of intersected tiles of the call's band. One thread per splat.
 
 @group(0) @binding(0) var<uniform> call: RasterUniform;
 @group(0) @binding(1) var<storage, read> rows: array<f32>;
@@ -15,21 +15,21 @@
 @group(0) @binding(6) var<storage, read_write> keys: array<u32>;
 @group(0) @binding(7) var<storage, read_write> counts: array<u32>;
 
-fn three(at: u32) -> vec3<f32> {
+fn load3(at: u32) -> vec3<f32> {
     return vec3<f32>(rows[at], rows[at + 1u], rows[at + 2u]);
 }
 
-// From the eye to splat i of the call, or to the mean of its siblings that are finite.
-fn away(i: u32) -> vec3<f32> {
+// Returns the vector from the eye to splat i of the call, or to the mean of its finite siblings.
+fn from_eye(i: u32) -> vec3<f32> {
     let eye = vec3<f32>(call.right.w, call.down.w, call.ahead.w);
     if call.sh_shared == 0u {
-        return three(i * call.stride) - eye;
+        return load3(i * call.stride) - eye;
     }
     let first = i / call.children * call.children;
     var sum = vec3<f32>(0.0);
     var count = 0.0;
     for (var c = first; c < min(first + call.children, call.count); c++) {
-        let d = three(c * call.stride) - eye;
+        let d = load3(c * call.stride) - eye;
         if finite(d.x) && finite(d.y) && finite(d.z) {
             sum += d;
             count += 1.0;
@@ -38,9 +38,9 @@ fn away(i: u32) -> vec3<f32> {
     return sum / max(count, 1.0);
 }
 
-// max(0, ½ + γ S + δ); w = 0 where that is no number.
+// Returns max(0, ½ + γ S + δ); w = 0 where the colour is not finite.
 fn colour(i: u32) -> vec4<f32> {
-    let d = away(i);
+    let d = from_eye(i);
     let norm = length(d);
     var direction = vec3<f32>(0.0);
     if norm > 0.0 && finite(norm) {
@@ -55,14 +55,14 @@ fn colour(i: u32) -> vec4<f32> {
         let at = 4u * i;
         v = gain[at] * sum + 0.5 + vec3<f32>(gain[at + 1u], gain[at + 2u], gain[at + 3u]);
     }
-    let good = finite(v.x) && finite(v.y) && finite(v.z);
-    return vec4<f32>(max(v, vec3<f32>(0.0)), select(0.0, 1.0, good));
+    let is_finite = finite(v.x) && finite(v.y) && finite(v.z);
+    return vec4<f32>(max(v, vec3<f32>(0.0)), select(0.0, 1.0, is_finite));
 }
 
-// Writes the splat; false where it is dropped.
+// Projects splat i and writes the results; returns false for a dropped splat.
 fn project(i: u32) -> bool {
     let row = i * call.stride;
-    let d = three(row) - vec3<f32>(call.right.w, call.down.w, call.ahead.w);
+    let d = load3(row) - vec3<f32>(call.right.w, call.down.w, call.ahead.w);
     let p = vec3<f32>(dot(call.right.xyz, d), dot(call.down.xyz, d), dot(call.ahead.xyz, d));
     if !(p.z > call.near && finite(dot(p, p))) {
         return false;
@@ -74,15 +74,15 @@ fn project(i: u32) -> bool {
     var opacity = rows[row + call.stride - 1u];
     var c: Covariance;
     if call.stride == 11u {
-        let q = vec4<f32>(rows[row + 3u], three(row + 4u));
+        let q = vec4<f32>(rows[row + 3u], load3(row + 4u));
         let norm2 = dot(q, q);
-        // The smallest normal number.
+        // Smallest normal f32.
         if !(norm2 >= 1.1754944e-38 && finite(norm2)) {
             return false;
         }
-        c = covariance_quat(j0, j1, q, three(row + 7u));
+        c = covariance_quat(j0, j1, q, load3(row + 7u));
     } else {
-        c = covariance_cov6(j0, j1, three(row + 3u), three(row + 6u));
+        c = covariance_cov6(j0, j1, load3(row + 3u), load3(row + 6u));
     }
     let xx = c.xx + call.lowpass;
     let yy = c.yy + call.lowpass;
@@ -121,13 +121,13 @@ fn project(i: u32) -> bool {
     }
     let columns = vec2<u32>(u32(across.x) / TILE_GPU, (u32(across.y) + TILE_GPU - 1u) / TILE_GPU);
     let lines = vec2<u32>(u32(down.x) / TILE_GPU, (u32(down.y) + TILE_GPU - 1u) / TILE_GPU);
-    let found = Footprint(mean.x, mean.y, sx, shear, sy, power, p.z, half.x, half.y);
-    let met = lines_of_call(lines);
-    var tiles = (columns.y - columns.x) * (met.y - met.x);
-    if !small(columns, lines) {
+    let footprint = Footprint(mean.x, mean.y, sx, shear, sy, power, p.z, half.x, half.y);
+    let band_lines = rows_in_band(lines);
+    var tiles = (columns.y - columns.x) * (band_lines.y - band_lines.x);
+    if !is_small(columns, lines) {
         tiles = 0u;
-        for (var line = met.x; line < met.y; line++) {
-            let span = tiles_of_row(found, line, columns);
+        for (var line = band_lines.x; line < band_lines.y; line++) {
+            let span = tiles_of_row(footprint, line, columns);
             tiles += span.y - span.x;
         }
     }
@@ -145,9 +145,9 @@ fn project(i: u32) -> bool {
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
-    let i = workgroup_number(workgroup, workgroups) * 64u + lane;
+    let i = workgroup_number(workgroup, workgroups) * 64u + thread;
     if i >= call.count {
         return;
     }

@@ -1,6 +1,5 @@
-// First and past-the-last pair of every tile, and of the place behind the last tile, from
-// pairs sorted by tile; tiles without pairs keep what the buffer was cleared to. One thread
-// per pair.
+// Half-open range of pairs of every tile, and of the surplus tile after the last one, from pairs
+// sorted by tile. Tiles without pairs keep the cleared value. One thread per pair.
 
 @group(0) @binding(0) var<uniform> call: RasterUniform;
 @group(0) @binding(1) var<storage, read> plan: array<u32>;
@@ -11,9 +10,9 @@
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
-    let i = workgroup_number(workgroup, workgroups) * 256u + lane;
+    let i = workgroup_number(workgroup, workgroups) * 256u + thread;
     let count = plan[PLAN_COUNT];
     if i >= count {
         return;

@@ -1,14 +1,14 @@
-// Front-to-back compositing, a workgroup a tile, a thread a pixel (3DGS section 6, eq. 3).
-// Twin: src/cpu/rasterize.rs (blend there). Per pixel: α = min(cap, o·e^(−σ)), skipped
-// below 1/255; blending stops before the splat that would take T to `stop` or below.
+// Front-to-back compositing (3DGS, section 6 and equation 3). CPU version: src/cpu/rasterize.rs
+// (blend). Per pixel α = min(cap, o·e^(−σ)); values below 1/255 are skipped. Blending stops
+// before the splat that would reduce T to `stop` or less. One workgroup per tile, one thread per
+// pixel.
 //
-// Out: RGB over the background, 1 − T, Σ w·z: channel c of pixel p at p·step + c·channel,
-// then H·W alphas and H·W depth sums; H the rows of the call's band. For the way back, per
-// pixel: the bits of T, and the place in the sorted pairs behind the last splat that was
-// blended.
+// Output: RGB over the background, 1 − T, Σ w·z. Channel c of pixel p is at p·step + c·channel,
+// followed by H·W alphas and H·W depth sums; H is the number of rows of the call's band. For the
+// backward pass, per pixel: the bits of T, and the end of the blended part of the sorted pairs.
 //
-// Splats may come in several calls, nearest first: one that carries leaves sums without
-// background and T in place of alpha, below 0 where blending has stopped.
+// Splats may be divided into several calls, nearest first. A call that carries writes sums
+// without background, and T in place of alpha, negative where blending has stopped.
 
 @group(0) @binding(0) var<uniform> call: RasterUniform;
 @group(0) @binding(1) var<storage, read> footprints: array<vec4<f32>>;
@@ -21,24 +21,24 @@
 var<workgroup> batch_a: array<vec4<f32>, 256>;
 var<workgroup> batch_b: array<vec4<f32>, 256>;
 var<workgroup> batch_c: array<vec4<f32>, 256>;
-var<workgroup> live: atomic<u32>;
-var<workgroup> live_seen: u32;
+var<workgroup> blending_count: atomic<u32>;
+var<workgroup> blending_count_read: u32;
 
 @compute @workgroup_size(256)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
     let tile = workgroup_number(workgroup, workgroups);
     if tile >= call.columns * call.rows {
         return;
     }
-    let x = tile % call.columns * TILE_GPU + lane % TILE_GPU;
-    let y = (call.top + tile / call.columns) * TILE_GPU + lane / TILE_GPU;
+    let x = tile % call.columns * TILE_GPU + thread % TILE_GPU;
+    let y = (call.top + tile / call.columns) * TILE_GPU + thread / TILE_GPU;
     let pixel = vec2<f32>(f32(x), f32(y));
-    var goes = x < call.width && y < call.height;
-    let inside = goes;
+    var is_blending = x < call.width && y < call.height;
+    let inside = is_blending;
     let rows = band();
     let p = (y - rows.x) * call.width + x;
     let plane = call.width * rows.y;
@@ -48,34 +48,34 @@ fn main(
     if inside && call.resumes != 0u {
         sum = vec4<f32>(picture[at], picture[at + call.channel], picture[at + 2u * call.channel], picture[4u * plane + p]);
         t = abs(picture[3u * plane + p]);
-        goes = picture[3u * plane + p] > 0.0;
+        is_blending = picture[3u * plane + p] > 0.0;
     }
-    if lane == 0u {
-        atomicStore(&live, 256u);
+    if thread == 0u {
+        atomicStore(&blending_count, 256u);
     }
     workgroupBarrier();
-    if !goes {
-        atomicSub(&live, 1u);
+    if !is_blending {
+        atomicSub(&blending_count, 1u);
     }
     let first = ranges[2u * tile];
     let past = ranges[2u * tile + 1u];
     var end = first;
     for (var base = first; base < past; base += 256u) {
         workgroupBarrier();
-        if lane == 0u {
-            live_seen = atomicLoad(&live);
+        if thread == 0u {
+            blending_count_read = atomicLoad(&blending_count);
         }
-        if workgroupUniformLoad(&live_seen) == 0u {
+        if workgroupUniformLoad(&blending_count_read) == 0u {
             break;
         }
-        if base + lane < past {
-            let i = owners[pairs[base + lane]];
-            batch_a[lane] = footprints[3u * i];
-            batch_b[lane] = footprints[3u * i + 1u];
-            batch_c[lane] = footprints[3u * i + 2u];
+        if base + thread < past {
+            let i = owners[pairs[base + thread]];
+            batch_a[thread] = footprints[3u * i];
+            batch_b[thread] = footprints[3u * i + 1u];
+            batch_c[thread] = footprints[3u * i + 2u];
         }
         workgroupBarrier();
-        if goes {
+        if is_blending {
             let count = min(256u, past - base);
             for (var s = 0u; s < count; s++) {
                 let b = batch_b[s];
@@ -86,8 +86,8 @@ fn main(
                 let alpha = min(exp2(power), call.alpha_max);
                 let rest = t * (1.0 - alpha);
                 if rest <= call.stop {
-                    goes = false;
-                    atomicSub(&live, 1u);
+                    is_blending = false;
+                    atomicSub(&blending_count, 1u);
                     break;
                 }
                 sum += alpha * t * vec4<f32>(batch_c[s].xyz, b.z);
@@ -100,7 +100,7 @@ fn main(
         return;
     }
     var rgb = sum.xyz;
-    var alpha = select(-t, t, goes);
+    var alpha = select(-t, t, is_blending);
     if call.carries == 0u {
         rgb += t * call.background.xyz;
         alpha = 1.0 - t;

@@ -1,8 +1,8 @@
-// How a parent's opacity is shared among its children (SubSplat, "Opacity allocation";
-// supp. A.3): the rules and formulas of src/cpu/redistribute.rs, its twin.
+// Opacity redistribution (SubSplat, "Opacity allocation"; supplement A.3). CPU version and
+// formulas: src/cpu/redistribute.rs.
 //
-// In: logits [P,K]; areas [P,K], px²; opacities [P]; own areas [P] (read by the rules
-// whose areas are relative).   Out: [P,K].   One thread per parent.
+// Input: logits [P,K]; areas [P,K], px²; opacities [P] in [0,1]; areas of the parents [P], px²
+// (read by the rules whose areas are relative). Output: [P,K]. One thread per parent.
 
 @group(0) @binding(0) var<uniform> call: RedistributeUniform;
 @group(0) @binding(1) var<storage, read> logits: array<f32>;
@@ -11,18 +11,18 @@
 @group(0) @binding(4) var<storage, read> own: array<f32>;
 @group(0) @binding(5) var<storage, read_write> shared_out: array<f32>;
 
-// Softmax argument of child i.
-fn weight_log(i: u32) -> f32 {
-    return share_log(call.rule, logits[i], areas[i]);
+// Returns the softmax argument of child i.
+fn softmax_argument(i: u32) -> f32 {
+    return rule_logit(call.rule, logits[i], areas[i]);
 }
 
 @compute @workgroup_size(64)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
-    let p = workgroup_number(workgroup, workgroups) * 64u + lane;
+    let p = workgroup_number(workgroup, workgroups) * 64u + thread;
     if p >= call.parents {
         return;
     }
@@ -35,22 +35,22 @@ fn main(
         }
         return;
     }
-    var top = weight_log(first);
+    var top = softmax_argument(first);
     for (var i = first + 1u; i < past; i++) {
-        top = max(top, weight_log(i));
+        top = max(top, softmax_argument(i));
     }
     var sum = 0.0;
     for (var i = first; i < past; i++) {
-        let w = exp(weight_log(i) - top);
+        let w = exp(softmax_argument(i) - top);
         shared_out[i] = w;
         sum += w;
     }
-    var per_own = 1.0;
+    var inverse_parent_area = 1.0;
     if rule_is_relative(call.rule) {
-        per_own = 1.0 / own[p];
+        inverse_parent_area = 1.0 / own[p];
     }
-    let factor = share_whole(call.rule, alpha) / sum;
+    let factor = rule_total(call.rule, alpha) / sum;
     for (var i = first; i < past; i++) {
-        shared_out[i] = share_one(call.rule, factor * shared_out[i], areas[i], per_own);
+        shared_out[i] = rule_opacity(call.rule, factor * shared_out[i], areas[i], inverse_parent_area);
     }
 }

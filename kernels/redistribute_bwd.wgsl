@@ -1,7 +1,8 @@
-// Gradient of redistribute.wgsl; formulas of src/cpu/redistribute.rs (share_backward).
+// Gradients of redistribute.wgsl. CPU version and formulas: src/cpu/redistribute.rs
+// (share_backward).
 //
-// In: what redistribute.wgsl reads, and the gradient [P,K] of its result.   Out: gradients
-// of logits and areas [P,K], and of opacity and own area [P,2].   One thread per parent.
+// Input: the input of redistribute.wgsl, and the gradient [P,K] of its result. Output: gradients
+// of logits and areas [P,K], and of opacity and own area [P,2]. One thread per parent.
 
 @group(0) @binding(0) var<uniform> call: RedistributeUniform;
 @group(0) @binding(1) var<storage, read> logits: array<f32>;
@@ -13,8 +14,8 @@
 @group(0) @binding(7) var<storage, read_write> d_areas: array<f32>;
 @group(0) @binding(8) var<storage, read_write> d_parents: array<vec2<f32>>;
 
-// Every child has the parent's.
-fn same(p: u32, first: u32, past: u32) {
+// RULE_NONE: every child has the opacity of the parent.
+fn equal_opacities(p: u32, first: u32, past: u32) {
     var sum = 0.0;
     for (var i = first; i < past; i++) {
         sum += grad[i];
@@ -24,15 +25,15 @@ fn same(p: u32, first: u32, past: u32) {
     d_parents[p] = vec2<f32>(sum, 0.0);
 }
 
-// Leaves the weights, which sum to 1, in `d_logits`.
-fn weigh(first: u32, past: u32) {
-    var top = share_log(call.rule, logits[first], areas[first]);
+// Writes the softmax weights to `d_logits`.
+fn softmax_weights(first: u32, past: u32) {
+    var top = rule_logit(call.rule, logits[first], areas[first]);
     for (var i = first + 1u; i < past; i++) {
-        top = max(top, share_log(call.rule, logits[i], areas[i]));
+        top = max(top, rule_logit(call.rule, logits[i], areas[i]));
     }
     var sum = 0.0;
     for (var i = first; i < past; i++) {
-        let w = exp(share_log(call.rule, logits[i], areas[i]) - top);
+        let w = exp(rule_logit(call.rule, logits[i], areas[i]) - top);
         d_logits[i] = w;
         sum += w;
     }
@@ -41,7 +42,7 @@ fn weigh(first: u32, past: u32) {
     }
 }
 
-fn linear(p: u32, first: u32, past: u32) {
+fn linear_rule(p: u32, first: u32, past: u32) {
     var mean = 0.0;
     for (var i = first; i < past; i++) {
         mean += d_logits[i] * grad[i];
@@ -54,69 +55,69 @@ fn linear(p: u32, first: u32, past: u32) {
     d_parents[p] = vec2<f32>(mean, 0.0);
 }
 
-// The rules α_k = F(x_k), x_k = s w_k / B_k: ∂L/∂x_k times x_k is ∂L/∂ln w_k.
-fn by_depth(p: u32, first: u32, past: u32) {
+// Rules of the form α_k = F(x_k), x_k = s w_k / B_k: ∂L/∂x_k times x_k is ∂L/∂ln w_k.
+fn relative_rules(p: u32, first: u32, past: u32) {
     let alpha = opacities[p];
     let relative = rule_is_relative(call.rule);
-    var per_own = 1.0;
+    var inverse_parent_area = 1.0;
     if relative {
-        per_own = 1.0 / own[p];
+        inverse_parent_area = 1.0 / own[p];
     }
-    let whole = share_whole(call.rule, alpha);
-    var by_whole = 0.0;
+    let total = rule_total(call.rule, alpha);
+    var d_total = 0.0;
     var mean = 0.0;
-    var by_own = 0.0;
+    var d_own = 0.0;
     for (var i = first; i < past; i++) {
-        let inverse = 1.0 / share_divisor(call.rule, areas[i], per_own);
+        let inverse = 1.0 / rule_divisor(call.rule, areas[i], inverse_parent_area);
         let part = d_logits[i] * inverse;
-        let x = whole * part;
+        let x = total * part;
         var dx = grad[i] * exp(-x);
         if call.rule == RULE_AREA {
             dx = select(0.0, grad[i], x < AREA_RULE_OPACITY_MAX);
         }
-        by_whole += dx * part;
+        d_total += dx * part;
         mean += dx * x;
-        let free = relative && areas[i] * per_own > RELATIVE_AREA_MIN;
+        let free = relative && areas[i] * inverse_parent_area > RELATIVE_AREA_MIN;
         let d_b = select(0.0, -dx * x * inverse, free);
-        by_own += d_b * areas[i];
-        d_areas[i] = d_b * per_own;
+        d_own += d_b * areas[i];
+        d_areas[i] = d_b * inverse_parent_area;
     }
     for (var i = first; i < past; i++) {
         let w = d_logits[i];
-        let x = whole * w / share_divisor(call.rule, areas[i], per_own);
+        let x = total * w / rule_divisor(call.rule, areas[i], inverse_parent_area);
         var dx = grad[i] * exp(-x);
         if call.rule == RULE_AREA {
             dx = select(0.0, grad[i], x < AREA_RULE_OPACITY_MAX);
         }
         d_logits[i] = dx * x - w * mean;
     }
-    var d_alpha = by_whole;
+    var d_alpha = d_total;
     if call.rule != RULE_AREA {
-        d_alpha = select(0.0, by_whole / (1.0 - alpha), alpha < OPACITY_CEILING);
+        d_alpha = select(0.0, d_total / (1.0 - alpha), alpha < OPACITY_CEILING);
     }
-    d_parents[p] = vec2<f32>(d_alpha, -by_own * per_own * per_own);
+    d_parents[p] = vec2<f32>(d_alpha, -d_own * inverse_parent_area * inverse_parent_area);
 }
 
 @compute @workgroup_size(64)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
-    let p = workgroup_number(workgroup, workgroups) * 64u + lane;
+    let p = workgroup_number(workgroup, workgroups) * 64u + thread;
     if p >= call.parents {
         return;
     }
     let first = p * call.children;
     let past = first + call.children;
     if call.rule == RULE_NONE {
-        same(p, first, past);
+        equal_opacities(p, first, past);
         return;
     }
-    weigh(first, past);
+    softmax_weights(first, past);
     if call.rule == RULE_LINEAR {
-        linear(p, first, past);
+        linear_rule(p, first, past);
     } else {
-        by_depth(p, first, past);
+        relative_rules(p, first, past);
     }
 }

@@ -1,4 +1,6 @@
-// Last of three kernels of the prefix sum: places within blocks, on top of the blocks' own.
+// Third of three kernels of the prefix sum: adds the prefix sums within the blocks to those of
+// the blocks. Output: index of each splat's first (splat, tile) pair, in order of depth. One
+// workgroup per block.
 
 @group(0) @binding(0) var<storage, read> plan: array<u32>;
 @group(0) @binding(1) var<storage, read> order: array<u32>;
@@ -10,18 +12,18 @@
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
     let block = workgroup_number(workgroup, workgroups);
-    let first = block * GPU_BLOCK + 8u * lane;
+    let first = block * GPU_BLOCK + 8u * thread;
     let past = min(first + 8u, plan[PLAN_COUNT]);
     var sum = 0u;
     for (var i = first; i < past; i++) {
-        sum = saturating(sum, counts[order[i]]);
+        sum = saturating_add(sum, counts[order[i]]);
     }
-    var before = saturating(sums[block], scan_threads(lane, sum));
+    var before = saturating_add(sums[block], scan_threads(thread, sum));
     for (var i = first; i < past; i++) {
         offsets[i] = before;
-        before = saturating(before, counts[order[i]]);
+        before = saturating_add(before, counts[order[i]]);
     }
 }

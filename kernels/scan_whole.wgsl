@@ -1,5 +1,5 @@
-// Exclusive prefix sum in place, by one workgroup: of an array of blocks, so short. The sum
-// over all follows the last. Length: a multiple of the plan's blocks.
+// Exclusive prefix sum in place, by one workgroup, of an array with PER_BLOCK elements per block
+// of the plan. The total follows the last element.
 
 override PER_BLOCK: u32 = 1u;
 
@@ -7,26 +7,26 @@ override PER_BLOCK: u32 = 1u;
 @group(0) @binding(1) var<storage, read_write> data: array<u32>;
 
 @compute @workgroup_size(256)
-fn main(@builtin(local_invocation_index) lane: u32) {
+fn main(@builtin(local_invocation_index) thread: u32) {
     let length = PER_BLOCK * plan[PLAN_BLOCKS];
     var carry = 0u;
     for (var base = 0u; base < length; base += GPU_BLOCK) {
-        let first = base + 8u * lane;
+        let first = base + 8u * thread;
         let past = min(first + 8u, length);
         var sum = 0u;
         for (var i = first; i < past; i++) {
-            sum = saturating(sum, data[i]);
+            sum = saturating_add(sum, data[i]);
         }
-        var before = saturating(carry, scan_threads(lane, sum));
+        var before = saturating_add(carry, scan_threads(thread, sum));
         for (var i = first; i < past; i++) {
             let v = data[i];
             data[i] = before;
-            before = saturating(before, v);
+            before = saturating_add(before, v);
         }
-        carry = saturating(carry, scan_heads[16]);
+        carry = saturating_add(carry, scan_totals[16]);
         workgroupBarrier();
     }
-    if lane == 0u {
+    if thread == 0u {
         data[length] = carry;
     }
 }

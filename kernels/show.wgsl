@@ -1,6 +1,6 @@
-// A band of a rendered picture onto a texture of the application's: one triangle over all of
-// it, cut to the band.
-// Colours are display values; a texture that encodes sRGB itself is given the linear ones.
+// Draws a band of a rendered picture to a texture of the application: one triangle that covers
+// the texture, clipped to the band.
+// Colours are display values (sRGB). A texture that encodes sRGB itself receives linear values.
 
 struct ShowUniform {
     width: u32,

@@ -1,4 +1,4 @@
-// How often each digit occurs in each block: histogram [16, blocks], digits first.
+// Counts each digit in each block. Output: histogram [16, blocks]. One workgroup per block.
 
 @group(0) @binding(0) var<uniform> call: SortUniform;
 @group(0) @binding(1) var<storage, read> plan: array<u32>;
@@ -9,22 +9,22 @@
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
     let block = workgroup_number(workgroup, workgroups);
-    let first = block * GPU_BLOCK + 8u * lane;
+    let first = block * GPU_BLOCK + 8u * thread;
     var counters = vec2<u32>(0u);
     for (var i = first; i < min(first + 8u, plan[PLAN_COUNT]); i++) {
         counters = tally_add(counters, (keys[i] >> call.shift) & 15u);
     }
-    sum_segments(lane, counters);
+    sum_segments(thread, counters);
     let blocks = plan[PLAN_BLOCKS];
-    if lane < 8u && block < blocks {
+    if thread < 8u && block < blocks {
         var sum = 0u;
-        for (var i = 32u * lane; i < 32u * lane + 32u; i++) {
+        for (var i = 32u * thread; i < 32u * thread + 32u; i++) {
             sum += sort_segments[i];
         }
-        histogram[lane * blocks + block] = sum & 0xffffu;
-        histogram[(lane + 8u) * blocks + block] = sum >> 16u;
+        histogram[thread * blocks + block] = sum & 0xffffu;
+        histogram[(thread + 8u) * blocks + block] = sum >> 16u;
     }
 }

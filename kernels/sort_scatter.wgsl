@@ -1,8 +1,8 @@
-// Moves every element to its place by one digit; equal digits keep their order. `places`
-// holds the prefix sums of the histogram. Values are their own places where there are none
-// yet (FRESH).
+// Moves every element to its position by one digit; equal digits keep their order. `places` holds
+// the prefix sums of the histogram. With IDENTITY_VALUES the values are the indices of the keys.
+// One workgroup per block.
 
-override FRESH: bool = false;
+override IDENTITY_VALUES: bool = false;
 
 @group(0) @binding(0) var<uniform> call: SortUniform;
 @group(0) @binding(1) var<storage, read> plan: array<u32>;
@@ -16,20 +16,20 @@ override FRESH: bool = false;
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
     let block = workgroup_number(workgroup, workgroups);
-    let first = block * GPU_BLOCK + 8u * lane;
+    let first = block * GPU_BLOCK + 8u * thread;
     let past = min(first + 8u, plan[PLAN_COUNT]);
     let blocks = plan[PLAN_BLOCKS];
     var counters = vec2<u32>(0u);
     for (var i = first; i < past; i++) {
         counters = tally_add(counters, (keys[i] >> call.shift) & 15u);
     }
-    sum_segments(lane, counters);
-    if lane < 8u {
+    sum_segments(thread, counters);
+    if thread < 8u {
         var sum = 0u;
-        for (var i = 32u * lane; i < 32u * lane + 32u; i++) {
+        for (var i = 32u * thread; i < 32u * thread + 32u; i++) {
             let v = sort_segments[i];
             sort_segments[i] = sum;
             sum += v;
@@ -41,11 +41,11 @@ fn main(
         let key = keys[i];
         let digit = (key >> call.shift) & 15u;
         let row = digit & 7u;
-        let before = sort_table[row * 256u + lane] + sort_segments[row * 32u + lane / 8u];
+        let before = sort_table[row * 256u + thread] + sort_segments[row * 32u + thread / 8u];
         let place = places[digit * blocks + block] + half_of(before, digit) + tally_get(counters, digit);
         counters = tally_add(counters, digit);
         keys_out[place] = key;
-        if FRESH {
+        if IDENTITY_VALUES {
             values_out[place] = i;
         } else {
             values_out[place] = values[i];

@@ -1,8 +1,8 @@
-// Children of parents with head records (SubSplat 3.2, supp. A.3): twin of src/cpu/spgr.
-// Arguments but the last two: kernels/shared/spgr.wgsl.
+// Children of parents from head records (SubSplat, section 3.2; supplement A.3). CPU version:
+// src/cpu/spgr. Arguments except the last two: kernels/shared/spgr.wgsl.
 //
-// Out: children [N·K, 11]; colour gains [N·K] or, in RGB, [N·K, 4].   One thread per
-// parent. The opacity lane holds the child's area until all of them are known.
+// Output: children [N·K, 11]; colour gains [N·K] or, in RGB, [N·K, 4]. One thread per parent. The
+// opacity of a child holds its area until the areas of all children are known.
 
 @group(0) @binding(4) var<storage, read_write> children: array<f32>;
 @group(0) @binding(5) var<storage, read_write> gains: array<f32>;
@@ -32,9 +32,9 @@ fn store_gain(i: u32) {
     }
 }
 
-// Softmax argument of child i, from the area in its opacity lane.
+// Returns the softmax argument of child i, whose area is stored in its opacity.
 fn argument(i: u32) -> f32 {
-    return share_log(call.rule, head[i * HEAD_STRIDE + HEAD_LOGIT_OFFSET],
+    return rule_logit(call.rule, head[i * HEAD_STRIDE + HEAD_LOGIT_OFFSET],
         children[i * SPLAT_STRIDE + OPACITY_OFFSET]);
 }
 
@@ -42,9 +42,9 @@ fn argument(i: u32) -> f32 {
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
-    let n = workgroup_number(workgroup, workgroups) * 64u + lane;
+    let n = workgroup_number(workgroup, workgroups) * 64u + thread;
     if n >= call.parents {
         return;
     }
@@ -69,11 +69,11 @@ fn main(
     for (var i = first; i < first + count; i++) {
         sum += exp(argument(i) - top);
     }
-    let whole = share_whole(call.rule, p.alpha) / sum;
-    let per_own = 1.0 / own_of(p).value;
+    let total = rule_total(call.rule, p.alpha) / sum;
+    let inverse_parent_area = 1.0 / own_of(p).value;
     for (var i = first; i < first + count; i++) {
         let at = i * SPLAT_STRIDE + OPACITY_OFFSET;
-        let part = whole * exp(argument(i) - top);
-        children[at] = share_one(call.rule, part, children[at], per_own);
+        let part = total * exp(argument(i) - top);
+        children[at] = rule_opacity(call.rule, part, children[at], inverse_parent_area);
     }
 }

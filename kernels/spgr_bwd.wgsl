@@ -1,11 +1,11 @@
-// Gradients of the children with respect to head records and parents (spec 2.12): twin of
-// src/cpu/spgr/backward.rs. Arguments but the last three: kernels/shared/spgr.wgsl.
+// Gradients of the children with respect to head records and parents (SubSplat, section 3.2). CPU
+// version: src/cpu/spgr/backward.rs. Arguments except the last three: kernels/shared/spgr.wgsl.
 //
-// In: gradient of the children [N·K, 11].   Out: of the head records [N, K, 11] (lane
-// HEAD_GAIN_OFFSET is 0: gains have a kernel of their own), of the parents [N, 11].
-// One thread per parent: a first walk over its children for their areas, which the opacity
-// rule couples, then the rest. Until the second walk, lanes of a child's own head gradient
-// hold its area, its softmax weight and its opacity's part.
+// Input: gradient of the children [N·K, 11]. Output: gradients of the head records [N, K, 11] (0
+// for HEAD_GAIN_OFFSET, which spgr_gains_bwd.wgsl computes) and of the parents [N, 11]. One thread per
+// parent. The first pass over the children computes their areas, which the opacity rule couples;
+// the second pass computes the gradients. Between the passes, two elements of a child's head
+// gradient hold its area and its softmax weight, and HEAD_LOGIT_OFFSET holds the opacity's part.
 
 @group(0) @binding(4) var<storage, read> grad: array<f32>;
 @group(0) @binding(5) var<storage, read_write> d_head: array<f32>;
@@ -29,7 +29,7 @@ struct ParentGradient {
     own: f32,
 }
 
-fn kept(mask: bool, v: f32) -> f32 {
+fn masked(mask: bool, v: f32) -> f32 {
     return select(0.0, v, mask);
 }
 
@@ -38,11 +38,11 @@ fn conjugate(q: vec4<f32>) -> vec4<f32> {
 }
 
 fn unit_bwd(u: Unit, d: vec4<f32>) -> vec4<f32> {
-    return (d - u.q * kept(u.free, dot(u.q, d))) * u.inverse;
+    return (d - u.q * masked(u.free, dot(u.q, d))) * u.inverse;
 }
 
 fn rotation_bwd(q: vec4<f32>, g: mat3x3<f32>) -> vec4<f32> {
-    let turn = vec3<f32>(g[2][1] - g[1][2], g[0][2] - g[2][0], g[1][0] - g[0][1]);
+    let skew = vec3<f32>(g[2][1] - g[1][2], g[0][2] - g[2][0], g[1][0] - g[0][1]);
     let xy = g[0][1] + g[1][0];
     let xz = g[0][2] + g[2][0];
     let yz = g[1][2] + g[2][1];
@@ -50,15 +50,15 @@ fn rotation_bwd(q: vec4<f32>, g: mat3x3<f32>) -> vec4<f32> {
     let y = q.z;
     let z = q.w;
     return 2.0 * vec4<f32>(
-        dot(turn, q.yzw),
-        dot(vec3<f32>(y, z, q.x), vec3<f32>(xy, xz, turn.x)) - x * 2.0 * (g[1][1] + g[2][2]),
-        dot(vec3<f32>(x, z, q.x), vec3<f32>(xy, yz, turn.y)) - y * 2.0 * (g[0][0] + g[2][2]),
-        dot(vec3<f32>(x, y, q.x), vec3<f32>(xz, yz, turn.z)) - z * 2.0 * (g[0][0] + g[1][1]),
+        dot(skew, q.yzw),
+        dot(vec3<f32>(y, z, q.x), vec3<f32>(xy, xz, skew.x)) - x * 2.0 * (g[1][1] + g[2][2]),
+        dot(vec3<f32>(x, z, q.x), vec3<f32>(xy, yz, skew.y)) - y * 2.0 * (g[0][0] + g[2][2]),
+        dot(vec3<f32>(x, y, q.x), vec3<f32>(xz, yz, skew.z)) - z * 2.0 * (g[0][0] + g[1][1]),
     );
 }
 
-fn turn_bwd(t: Turn, d: vec4<f32>) -> vec3<f32> {
-    // (cos(t/2)/2 - sinc)/t², below 1 radian by its series.
+fn delta_rotation_bwd(t: DeltaRotation, d: vec4<f32>) -> vec3<f32> {
+    // (cos(t/2)/2 - sinc)/t², below 1 radian by its Taylor series.
     let s = t.squared;
     let series = -2.0 / 48.0 + s * (4.0 / 3840.0 + s * (-6.0 / 645120.0
         + s * (8.0 / 185794560.0 - s * (10.0 / 81749606400.0))));
@@ -71,10 +71,10 @@ fn jacobian_bwd(j: Jacobian, du: vec3<f32>, dv: vec3<f32>) -> vec3<f32> {
     let along = -j.focal * vec2<f32>(dot(du, j.axis), dot(dv, j.axis));
     let slope = select(vec2<f32>(), along, j.free);
     let z = -dot(du, j.u) - dot(dv, j.v) - dot(slope, j.raw);
-    return vec3<f32>(slope * j.inverse_z, kept(j.free_z, z * j.inverse_z));
+    return vec3<f32>(slope * j.inverse_z, masked(j.free_z, z * j.inverse_z));
 }
 
-// Of J·R_w2c, R(q) and the sigmas.
+// Gradients of J·R_w2c, R(q) and the sigmas.
 struct FootprintGradient {
     ju: vec3<f32>,
     jv: vec3<f32>,
@@ -82,7 +82,8 @@ struct FootprintGradient {
     scale: vec3<f32>,
 }
 
-// For the gradients of the area and of M's rows (the latter beside the area's own).
+// Returns the gradients of a footprint, from those of its area and of the rows of M. `da` and
+// `db` exclude the contribution of the area.
 fn footprint_bwd(
     f: Footprint,
     j: Jacobian,
@@ -101,11 +102,11 @@ fn footprint_bwd(
         ta * rotation,
         tb * rotation,
         mat3x3<f32>(j.u.x * ta + j.v.x * tb, j.u.y * ta + j.v.y * tb, j.u.z * ta + j.v.z * tb),
-        a * f.turned_a + b * f.turned_b,
+        a * f.rotated_a + b * f.rotated_b,
     );
 }
 
-// Adds what comes through the step of a child: `d` is the gradient of the step.
+// Adds the gradient through the step of a child; `d` is the gradient of the step.
 fn step_bwd(
     p: Parent,
     t: Step,
@@ -121,11 +122,11 @@ fn step_bwd(
         s = vec3<f32>(s.xy + t.share * s.xy, s.z);
         let each = d_share * t.inverse;
         d_dz += each;
-        let d_ahead = kept(t.free_ahead, -each * t.share);
+        let d_ahead = masked(t.free_depth, -each * t.share);
         (*g).in_camera.z += d_ahead;
         s.z += d_ahead;
     }
-    let free_dz = kept(t.free_z, d_dz);
+    let free_dz = masked(t.free_z, d_dz);
     let bound_dz = d_dz - free_dz;
     (*g).z += bound_dz * (DEPTH_FRACTION_MIN - 1.0);
     s.z -= bound_dz;
@@ -159,7 +160,8 @@ fn grad3(i: u32) -> vec3<f32> {
     return vec3<f32>(grad[i], grad[i + 1u], grad[i + 2u]);
 }
 
-// Adds child i's part to its parent's gradient and writes its record's geometry lanes.
+// Adds the gradient of child i to that of its parent, and writes the geometry part of its head
+// gradient.
 fn child_bwd(p: Parent, k: u32, i: u32, d_of_area: f32, g: ptr<function, ParentGradient>) {
     let record = i * HEAD_STRIDE;
     let from_row = i * SPLAT_STRIDE;
@@ -175,7 +177,7 @@ fn child_bwd(p: Parent, k: u32, i: u32, d_of_area: f32, g: ptr<function, ParentG
         da = by * f.a;
         db = by * f.b;
     }
-    let d_area = kept(call.a_min < f.area, d_clamped);
+    let d_area = masked(call.a_min < f.area, d_clamped);
     let by = footprint_bwd(f, c.jacobian, c.rotation, c.small, d_area, da, db);
     let d_small = grad3(from_row + SCALE_OFFSET) * c.growth + by.scale;
     (*g).scale += d_small * c.factor;
@@ -183,12 +185,12 @@ fn child_bwd(p: Parent, k: u32, i: u32, d_of_area: f32, g: ptr<function, ParentG
     let q = from_row + QUAT_OFFSET;
     let d_quat = vec4<f32>(grad[q], grad[q + 1u], grad[q + 2u], grad[q + 3u]);
     let d_unit = unit_bwd(c.unit, d_quat + rotation_bwd(c.unit.q, by.rotation));
-    let turn = turn_bwd(c.turn, quat_product(conjugate(p.quat), d_unit));
+    let d_delta = delta_rotation_bwd(c.delta_rotation, quat_product(conjugate(p.quat), d_unit));
     for (var j = 0u; j < 3u; j++) {
         d_head[record + HEAD_LOG_SCALE_OFFSET + j] = log_scale[j];
-        d_head[record + HEAD_ROTATION_OFFSET + j] = turn[j];
+        d_head[record + HEAD_ROTATION_OFFSET + j] = d_delta[j];
     }
-    (*g).quat += quat_product(d_unit, conjugate(c.turn.e));
+    (*g).quat += quat_product(d_unit, conjugate(c.delta_rotation.e));
     let d_mean = grad3(from_row + MEAN_OFFSET);
     (*g).mean += d_mean;
     var d_step = p.view.rotation * d_mean;
@@ -211,7 +213,7 @@ fn own_bwd(p: Parent, g: ptr<function, ParentGradient>) {
     var da = vec3<f32>();
     var db = vec3<f32>();
     if call.rule == RULE_OPTICAL_DEPTH {
-        let per = each / o.blurred;
+        let per = each / o.lowpassed_area;
         d_area = per * f.area;
         da = per * call.lowpass_input * f.a;
         db = per * call.lowpass_input * f.b;
@@ -249,18 +251,18 @@ fn disc_bwd(p: Parent, g: ptr<function, ParentGradient>) {
     (*g).in_camera -= vec3<f32>(d_x * per, 0.0);
     (*g).z -= dot(d_f, per) + 2.0 * (d_x.x * c.ju.z + d_x.y * c.jv.z) / p.z;
     // G = R_w2c·R·S.
-    var turned: mat3x3<f32>;
+    var d_rotation: mat3x3<f32>;
     for (var i = 0u; i < 3u; i++) {
-        (*g).scale += dg[i] * c.turned[i];
-        turned[i] = dg[i] * p.scale;
+        (*g).scale += dg[i] * c.rotation[i];
+        d_rotation[i] = dg[i] * p.scale;
     }
     let r = p.view.rotation;
-    let rotation = mat3x3<f32>(turned * r[0], turned * r[1], turned * r[2]);
+    let rotation = mat3x3<f32>(d_rotation * r[0], d_rotation * r[1], d_rotation * r[2]);
     (*g).quat += unit_bwd(c.unit, rotation_bwd(c.unit.q, rotation));
 }
 
-// Gradients of the opacity rule of parent p, children first .. past: leaves those of areas
-// and logits in the children's lanes.
+// Computes the gradients of the opacity rule for children first .. past of parent p. Areas and
+// logits of the children receive their gradients in the head gradient.
 fn share_bwd(p: Parent, first: u32, past: u32, g: ptr<function, ParentGradient>) {
     if call.rule == RULE_NONE {
         for (var i = first; i < past; i++) {
@@ -280,31 +282,31 @@ fn share_bwd(p: Parent, first: u32, past: u32, g: ptr<function, ParentGradient>)
         d_head[i * HEAD_STRIDE + WEIGHT] = w;
         sum += w;
     }
-    let per_own = 1.0 / own_of(p).value;
-    let whole = share_whole(call.rule, p.alpha);
+    let inverse_parent_area = 1.0 / own_of(p).value;
+    let total = rule_total(call.rule, p.alpha);
     var mean = 0.0;
-    var by_whole = 0.0;
-    var by_own = 0.0;
+    var d_total = 0.0;
+    var d_own = 0.0;
     for (var i = first; i < past; i++) {
         let at = i * HEAD_STRIDE;
         let area = d_head[at + AREA];
         let w = d_head[at + WEIGHT] / sum;
-        let inverse_b = 1.0 / share_divisor(call.rule, area, per_own);
+        let inverse_b = 1.0 / rule_divisor(call.rule, area, inverse_parent_area);
         let part = w * inverse_b;
-        let x = whole * part;
+        let x = total * part;
         var dx = grad[i * SPLAT_STRIDE + OPACITY_OFFSET];
         if call.rule == RULE_AREA {
-            dx = kept(x < AREA_RULE_OPACITY_MAX, dx);
+            dx = masked(x < AREA_RULE_OPACITY_MAX, dx);
         } else if call.rule != RULE_LINEAR {
             dx *= exp(-x);
         }
-        by_whole += dx * part;
+        d_total += dx * part;
         mean += dx * x;
         var d_area = 0.0;
-        if rule_is_relative(call.rule) && RELATIVE_AREA_MIN < area * per_own {
+        if rule_is_relative(call.rule) && RELATIVE_AREA_MIN < area * inverse_parent_area {
             let d_b = -dx * x * inverse_b;
-            by_own += d_b * area;
-            d_area = d_b * per_own;
+            d_own += d_b * area;
+            d_area = d_b * inverse_parent_area;
         }
         d_head[at + WEIGHT] = w;
         d_head[at + HEAD_LOGIT_OFFSET] = dx * x;
@@ -320,26 +322,26 @@ fn share_bwd(p: Parent, first: u32, past: u32, g: ptr<function, ParentGradient>)
             d_head[at + AREA] = -d_logit / (d_head[at + AREA] + AREA_EPS);
         }
     }
-    (*g).alpha = by_whole;
+    (*g).alpha = d_total;
     if call.rule == RULE_OPTICAL_DEPTH || call.rule == RULE_TRANSMITTANCE {
-        (*g).alpha = kept(p.alpha < OPACITY_CEILING, by_whole / (1.0 - p.alpha));
+        (*g).alpha = masked(p.alpha < OPACITY_CEILING, d_total / (1.0 - p.alpha));
     }
-    (*g).own = -by_own * per_own * per_own;
+    (*g).own = -d_own * inverse_parent_area * inverse_parent_area;
 }
 
-// Softmax argument of child i, its area in its lane.
+// Returns the softmax argument of child i, whose area is stored in its head gradient.
 fn argument(i: u32) -> f32 {
     let at = i * HEAD_STRIDE;
-    return share_log(call.rule, head[at + HEAD_LOGIT_OFFSET], d_head[at + AREA]);
+    return rule_logit(call.rule, head[at + HEAD_LOGIT_OFFSET], d_head[at + AREA]);
 }
 
 @compute @workgroup_size(64)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
-    let n = workgroup_number(workgroup, workgroups) * 64u + lane;
+    let n = workgroup_number(workgroup, workgroups) * 64u + thread;
     if n >= call.parents {
         return;
     }
@@ -366,7 +368,7 @@ fn main(
     if call.disc != 0u {
         disc_bwd(p, &g);
     }
-    g.in_camera.z += kept(p.view.z_min < p.in_camera.z, g.z);
+    g.in_camera.z += masked(p.view.z_min < p.in_camera.z, g.z);
     let mean = g.mean + g.in_camera * p.view.rotation;
     let to = n * SPLAT_STRIDE;
     for (var i = 0u; i < 3u; i++) {

@@ -1,9 +1,10 @@
-// Gradient of the colour gains: lane HEAD_GAIN_OFFSET of the head records [M, 11], M = N·K, the
-// other lanes 0. Twin of src/cpu/spgr/backward.rs (gains).   One thread per record.
+// Gradient of the colour gains with respect to the head records [M, 11], M = N·K: element
+// HEAD_GAIN_OFFSET; the others are 0. CPU version: src/cpu/spgr/backward.rs (gains). One thread per
+// record.
 
 struct SpgrGainsBwdUniform {
     records: u32,
-    // 1 or 4 a record.
+    // Gains per record: 1 or 4.
     lanes: u32,
     delta: f32,
     pad: u32,
@@ -18,9 +19,9 @@ struct SpgrGainsBwdUniform {
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    @builtin(local_invocation_index) thread: u32,
 ) {
-    let i = workgroup_number(workgroup, workgroups) * 64u + lane;
+    let i = workgroup_number(workgroup, workgroups) * 64u + thread;
     if i >= call.records {
         return;
     }

@@ -46,6 +46,8 @@
 #[cfg(feature = "internals")]
 pub mod abi;
 #[cfg(feature = "internals")]
+pub mod backend;
+#[cfg(feature = "internals")]
 pub mod camera;
 #[cfg(feature = "internals")]
 pub mod check;
@@ -55,6 +57,8 @@ pub mod config;
 pub mod cpu;
 #[cfg(feature = "internals")]
 pub mod data;
+#[cfg(feature = "internals")]
+pub mod device;
 #[cfg(all(feature = "internals", feature = "network"))]
 pub mod eval;
 #[cfg(all(feature = "internals", feature = "gpu"))]
@@ -83,6 +87,8 @@ pub mod train;
 #[cfg(not(feature = "internals"))]
 mod abi;
 #[cfg(not(feature = "internals"))]
+mod backend;
+#[cfg(not(feature = "internals"))]
 mod camera;
 #[cfg(not(feature = "internals"))]
 mod check;
@@ -92,6 +98,8 @@ mod config;
 mod cpu;
 #[cfg(not(feature = "internals"))]
 mod data;
+#[cfg(not(feature = "internals"))]
+mod device;
 #[cfg(all(not(feature = "internals"), feature = "network"))]
 mod eval;
 #[cfg(all(not(feature = "internals"), feature = "gpu"))]
@@ -122,8 +130,10 @@ pub use candle_core;
 pub use glam;
 
 pub use abi::{Convention, RasterOptions, ShBasis};
+pub use backend::{Backend, DeviceError};
 pub use camera::{Camera, CameraError, Intrinsics};
 pub use check::{CheckOptions, GrayImage, PairReport, Verdict, check_pair};
+pub use device::DeviceChoice;
 #[cfg(feature = "gpu")]
 pub use gpu::Gpu;
 pub use io::cameras_json::{CameraFile, NamedCamera, load_cameras_json, save_cameras_json};

@@ -1,44 +1,45 @@
-//! A camera that is moved by hand: around a point (orbit) or through the scene (fly).
-//! No window and no events here; an application says what was dragged and for how long.
+//! An interactive camera: around a point (orbit) or through the scene (fly).
 //!
-//! Both modes move the same pose, so that changing the mode never jumps. Turning goes about
-//! the world's up and the camera's own x axis, which keeps the horizon as it was.
+//! This module handles no windows and no events; the application passes pixels and seconds.
+//!
+//! Both modes move the same pose, so a change of mode moves nothing. Rotations are about the
+//! world's up vector and the camera's x axis, which keeps the horizon level.
 
 use crate::camera::{Camera, Intrinsics};
 use glam::{Mat4, Quat, Vec2, Vec3};
 use std::f32::consts::PI;
 
-/// Share of points beyond each end of [`Bounds`], along each axis.
-const OUTLIERS: f32 = 0.02;
-/// Smallest extent of a scene, world units: a single point has one, too.
+/// Fraction of points outside each end of [`Bounds`], along each axis.
+const OUTLIER_FRACTION: f32 = 0.02;
+/// Minimum extent of a scene, world units, for scenes of a single point.
 const EXTENT_MIN: f32 = 1e-3;
-/// Angle of a drag over the picture's whole height, radians.
-const TURN: f32 = PI;
-/// Steepest look up or down that turning reaches, radians: beyond, left and right would
-/// change places.
+/// Rotation of a drag over the whole height of the picture, radians.
+const DRAG_ANGLE: f32 = PI;
+/// Maximum elevation, radians. Beyond 90°, left and right would be exchanged.
 const ELEVATION_MAX: f32 = 89.0 * PI / 180.0;
-/// Distance to the pivot after one step of the wheel forward, over that before.
-const DOLLY: f32 = 0.9;
-/// Speed after one step of the wheel forward, over that before.
-const FASTER: f32 = 1.25;
-/// Scene radii a second at first.
+/// Factor of the distance to the pivot for one step of the wheel forward.
+const WHEEL_DISTANCE: f32 = 0.9;
+/// Factor of the speed for one step of the wheel forward.
+const WHEEL_SPEED: f32 = 1.25;
+/// Initial speed, scene radii per second.
 const SPEED: f32 = 0.4;
-/// How much faster in haste.
-const HASTE: f32 = 4.0;
-/// Nearest and farthest pivot, and slowest and fastest flight a second, in scene radii.
+/// Factor of the speed at [`Pace::Fast`].
+const FAST_FACTOR: f32 = 4.0;
+/// Limits of the distance to the pivot and of the speed per second, scene radii.
 const RANGE: (f32, f32) = (1e-3, 1e3);
 
 /// The box that holds the middle 96 % of points along each axis, world units.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bounds {
-    /// Least coordinates.
+    /// Minimum coordinates.
     pub low: Vec3,
-    /// Greatest coordinates.
+    /// Maximum coordinates.
     pub high: Vec3,
 }
 
 impl Bounds {
-    /// Of `points`, those that are not finite left out; `None` where none is left.
+    /// Computes the bounds of `points` without those that are not finite; `None` where no point
+    /// is left.
     pub fn of(points: impl Iterator<Item = [f32; 3]>) -> Option<Self> {
         let mut axes: [Vec<f32>; 3] = Default::default();
         for p in points.filter(|p| p.iter().all(|v| v.is_finite())) {
@@ -46,77 +47,88 @@ impl Bounds {
         }
         let mut ends = [Vec3::ZERO; 2];
         for (a, axis) in axes.iter_mut().enumerate() {
-            for (end, q) in ends.iter_mut().zip([OUTLIERS, 1.0 - OUTLIERS]) {
-                let place = (q * axis.len().checked_sub(1)? as f32) as usize;
-                end[a] = *axis.select_nth_unstable_by(place, f32::total_cmp).1;
+            for (end, q) in ends.iter_mut().zip([OUTLIER_FRACTION, 1.0 - OUTLIER_FRACTION]) {
+                let index = (q * axis.len().checked_sub(1)? as f32) as usize;
+                end[a] = *axis.select_nth_unstable_by(index, f32::total_cmp).1;
             }
         }
         Some(Self { low: ends[0], high: ends[1] })
     }
 
-    /// Half way between the ends.
+    /// Returns the centre.
     pub fn middle(&self) -> Vec3 {
         0.5 * (self.low + self.high)
     }
 
-    /// Half the diagonal, world units.
+    /// Returns half the diagonal, world units.
     pub fn radius(&self) -> f32 {
         (0.5 * (self.high - self.low).length()).max(EXTENT_MIN)
     }
 
-    /// A camera that looks along +z at all of it: `fov_x` radians from left to right,
+    /// Returns a camera along +z that sees the whole box: `fov_x` radians horizontally,
     /// `side`×`side` pixels.
     pub fn camera(&self, fov_x: f32, side: usize) -> Camera {
         let extent = self.high - self.low;
-        let wide = extent.truncate().max_element().max(EXTENT_MIN);
-        let away = 0.5 * wide / (0.5 * fov_x).tan() + 0.5 * extent.z;
+        let width = extent.truncate().max_element().max(EXTENT_MIN);
+        let distance = 0.5 * width / (0.5 * fov_x).tan() + 0.5 * extent.z;
         Camera {
             intrinsics: Intrinsics::from_fov_x(fov_x, side, side),
-            world_from_camera: Mat4::from_translation(self.middle() - away * Vec3::Z),
+            world_from_camera: Mat4::from_translation(self.middle() - distance * Vec3::Z),
         }
     }
 }
 
-/// The direction that `cameras` hold upwards on average: their mean −y, world frame, unit
-/// length. −y of the world where there is none, or where they cancel.
+/// Returns the mean up direction (−y) of `cameras`, world frame, unit length; −y of the world for
+/// no cameras or for a mean of zero.
 pub fn up_of<'a>(cameras: impl Iterator<Item = &'a Camera>) -> Vec3 {
     cameras.map(|c| -c.rotation().y_axis).sum::<Vec3>().try_normalize().unwrap_or(Vec3::NEG_Y)
 }
 
-/// `k` for a picture of `width`×`height` px: square pixels stay square and all that was
-/// in the picture stays in it, so that a picture of another shape shows more at two sides.
+/// Returns `k` adapted to a picture of `width`×`height` px. Square pixels stay square and the
+/// whole former picture stays visible, so a picture of another aspect ratio shows more at two
+/// sides.
 pub fn fitted(k: &Intrinsics, width: usize, height: usize) -> Intrinsics {
     let sides = Vec2::new(width as f32, height as f32);
-    let before = Vec2::new(k.width as f32, k.height as f32);
-    let scale = (sides / before).min_element();
-    let principal = 0.5 * sides + scale * (Vec2::new(k.cx, k.cy) - 0.5 * before);
+    let old_sides = Vec2::new(k.width as f32, k.height as f32);
+    let scale = (sides / old_sides).min_element();
+    let principal = 0.5 * sides + scale * (Vec2::new(k.cx, k.cy) - 0.5 * old_sides);
     let (cx, cy) = (principal.x, principal.y);
     Intrinsics { fx: scale * k.fx, fy: scale * k.fy, cx, cy, width, height }
 }
 
-/// How a drag and the wheel are taken.
+/// Meaning of drags and of the wheel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Mode {
-    /// Around a point in front of the camera.
+    /// Drags rotate around a point in front of the camera; the wheel changes the distance to it.
     Orbit,
-    /// The eye stays where it is, and keys move it.
+    /// Drags rotate about the eye; the wheel changes the speed of [`Navigator::fly`].
     Fly,
 }
 
-/// What a navigation starts from.
+/// Speed of [`Navigator::fly`].
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Pace {
+    /// The speed set by the wheel.
+    #[default]
+    Normal,
+    /// Four times the speed set by the wheel.
+    Fast,
+}
+
+/// Initial state of a [`Navigator`].
 #[derive(Clone, Copy, Debug)]
 pub struct Start {
-    /// Camera to begin with and to come back to.
+    /// Initial camera, and the camera after [`Navigator::reset`].
     pub home: Camera,
-    /// The world's up; of any length.
+    /// Up vector of the world, of any length.
     pub up: Vec3,
-    /// From the eye of `home` to the point that it turns around, world units.
+    /// Distance from the eye of `home` to the pivot, world units.
     pub distance: f32,
-    /// Half the scene's size, world units: steps go by it.
+    /// Half the scene's size, world units. Speeds are proportional to it.
     pub radius: f32,
 }
 
-/// A camera that is moved by hand.
+/// An interactive camera.
 #[derive(Clone, Debug)]
 pub struct Navigator {
     start: Start,
@@ -124,22 +136,23 @@ pub struct Navigator {
     eye: Vec3,
     /// From camera to world, unit length.
     rotation: Quat,
-    /// From the eye to the pivot, which lies on the optical axis, world units.
+    /// Distance from the eye to the pivot, which lies on the optical axis, world units.
     distance: f32,
-    /// World units a second.
+    /// World units per second.
     speed: f32,
     /// Width and height of the picture, px.
     window: (usize, usize),
 }
 
-fn positive(v: f32, otherwise: f32) -> f32 {
-    if v > 0.0 && v.is_finite() { v } else { otherwise }
+/// Returns `v` where it is positive and finite, else `default`.
+fn positive(v: f32, default: f32) -> f32 {
+    if v > 0.0 && v.is_finite() { v } else { default }
 }
 
 impl Navigator {
-    /// In orbit, at home, for a picture of home's size. A `radius` or `distance` that is
-    /// not above 0 and finite counts as 1 and as the radius, an `up` without direction as
-    /// home's −y.
+    /// Starts in orbit mode at `home`, for a picture of home's size. A `radius` that is not
+    /// positive and finite is replaced by 1, a `distance` by the radius, and an `up` without
+    /// direction by home's −y.
     pub fn new(start: Start) -> Self {
         let radius = positive(start.radius, 1.0);
         let distance = positive(start.distance, radius);
@@ -158,12 +171,12 @@ impl Navigator {
         new
     }
 
-    /// How drags and the wheel are taken.
+    /// Returns the mode.
     pub fn mode(&self) -> Mode {
         self.mode
     }
 
-    /// The other mode, from the same place.
+    /// Switches to the other mode at the same pose.
     pub fn toggle(&mut self) {
         self.mode = match self.mode {
             Mode::Orbit => Mode::Fly,
@@ -171,7 +184,7 @@ impl Navigator {
         };
     }
 
-    /// Home, at the first speed; the mode stays.
+    /// Returns to `home` and to the initial speed. The mode is kept.
     pub fn reset(&mut self) {
         let home = &self.start.home;
         self.eye = home.position();
@@ -180,14 +193,14 @@ impl Navigator {
         self.speed = SPEED * self.start.radius;
     }
 
-    /// For a picture of `width`×`height` px; one without pixels changes nothing.
+    /// Sets the size of the picture, px. A size of zero is ignored.
     pub fn resize(&mut self, width: usize, height: usize) {
         if width > 0 && height > 0 {
             self.window = (width, height);
         }
     }
 
-    /// The camera as it stands, for a picture of the size that was said last.
+    /// Returns the current camera, for a picture of the last size set.
     pub fn camera(&self) -> Camera {
         let (width, height) = self.window;
         Camera {
@@ -196,7 +209,7 @@ impl Navigator {
         }
     }
 
-    /// The point that orbit turns around, world.
+    /// Returns the pivot of orbit mode, world frame.
     pub fn pivot(&self) -> Vec3 {
         self.eye + self.distance * self.forward()
     }
@@ -205,13 +218,13 @@ impl Navigator {
         self.rotation * Vec3::Z
     }
 
-    /// A drag of `px` (x right, y down) turns: in orbit what lies before the pivot goes
-    /// with the cursor, in flight the look does.
-    pub fn turn(&mut self, px: Vec2) {
+    /// Rotates the camera by a drag of `px` (x right, y down). In orbit mode the scene in front
+    /// of the pivot follows the cursor; in fly mode the view direction does.
+    pub fn rotate(&mut self, px: Vec2) {
         let pivot = self.pivot();
-        let angle = px * (TURN / self.window.1 as f32);
+        let angle = px * (DRAG_ANGLE / self.window.1 as f32);
         let elevation = self.forward().dot(self.start.up).clamp(-1.0, 1.0).asin();
-        // A home that looks steeper than the limit may go back, and no farther.
+        // A home that is steeper than the limit keeps its elevation as the limit.
         let limit = ELEVATION_MAX.max(elevation.abs());
         let raise = (elevation - angle.y).clamp(-limit, limit) - elevation;
         let about_up = Quat::from_axis_angle(self.start.up, -angle.x);
@@ -221,32 +234,37 @@ impl Navigator {
         }
     }
 
-    /// A drag of `px` (x right, y down) shifts the camera so that what is as far as the
-    /// pivot goes with the cursor.
+    /// Shifts the camera by a drag of `px` (x right, y down). Points at the distance of the pivot
+    /// follow the cursor.
     pub fn pan(&mut self, px: Vec2) {
         let k = self.camera().intrinsics;
         let shift = Vec3::new(px.x / k.fx, px.y / k.fy, 0.0) * self.distance;
         self.eye -= self.rotation * shift;
     }
 
-    /// The wheel, in steps forward: towards the pivot in orbit, faster in flight.
+    /// Applies steps of the wheel, positive forward: nearer to the pivot in orbit mode, faster in
+    /// fly mode.
     pub fn wheel(&mut self, steps: f32) {
         let within = |v: f32| v.clamp(RANGE.0 * self.start.radius, RANGE.1 * self.start.radius);
         match self.mode {
             Mode::Orbit => {
                 let pivot = self.pivot();
-                self.distance = within(self.distance * DOLLY.powf(steps));
+                self.distance = within(self.distance * WHEEL_DISTANCE.powf(steps));
                 self.eye = pivot - self.distance * self.forward();
             }
-            Mode::Fly => self.speed = within(self.speed * FASTER.powf(steps)),
+            Mode::Fly => self.speed = within(self.speed * WHEEL_SPEED.powf(steps)),
         }
     }
 
-    /// Moves for `seconds` towards `right`, `up` (the world's) and `forward`, each −1 to 1,
-    /// the pivot too; no faster aslant. `haste` is four times as fast.
-    pub fn fly(&mut self, [right, up, forward]: [f32; 3], seconds: f32, haste: bool) {
+    /// Moves the camera and the pivot for `seconds` along `direction`: right, up (of the world)
+    /// and forward, each −1 to 1. The speed is the same in diagonal directions.
+    pub fn fly(&mut self, direction: [f32; 3], seconds: f32, pace: Pace) {
+        let [right, up, forward] = direction;
         let along = self.rotation * Vec3::new(right, 0.0, forward) + up * self.start.up;
-        let pace = if haste { HASTE * self.speed } else { self.speed };
-        self.eye += along.clamp_length_max(1.0) * (pace * seconds);
+        let speed = match pace {
+            Pace::Normal => self.speed,
+            Pace::Fast => FAST_FACTOR * self.speed,
+        };
+        self.eye += along.clamp_length_max(1.0) * (speed * seconds);
     }
 }

@@ -1,4 +1,4 @@
-//! Splats to a picture in one call: on the CPU, or on the device that is asked for.
+//! Rendering of splats to a picture, on the CPU or on a chosen device.
 
 mod device;
 
@@ -16,24 +16,24 @@ pub struct Picture {
     pub width: usize,
     /// H, px.
     pub height: usize,
-    /// `[H, W, 3]`: colour over the background; may exceed 1, never below 0 unless
-    /// the background is.
+    /// `[H, W, 3]`: colour over the background. Values may exceed 1; none is below 0 unless the
+    /// background is.
     pub rgb: Vec<f32>,
     /// `[H, W]`: accumulated opacity, 1 − T.
     pub alpha: Vec<f32>,
-    /// `[H, W]`: expected camera z, Σ w·z / alpha, world units; 0 where nothing is.
+    /// `[H, W]`: expected camera z, Σ w·z / alpha, world units; 0 where alpha is 0.
     pub depth: Vec<f32>,
 }
 
-/// Renders `splats` seen by `camera`.
+/// Renders `splats` as seen by `camera`, on the CPU.
 ///
-/// The SH basis is the splats' own; `options.sh_basis` is not read. To render many
-/// views, keep a [`Rasterizer`] and use [`render_with`], or a [`Renderer`] for a GPU.
+/// The SH basis of the splats replaces `options.sh_basis`. To render many views, keep a
+/// [`Rasterizer`] and call [`render_with`], or open a [`Renderer`] for a GPU.
 pub fn render(splats: &Splats, camera: &Camera, options: &RasterOptions) -> Picture {
     render_with(&mut Rasterizer::new(), splats, camera, options)
 }
 
-/// [`render`] with buffers kept from view to view.
+/// Renders as [`render`] does, with buffers that are reused from view to view.
 pub fn render_with(
     rasterizer: &mut Rasterizer,
     splats: &Splats,
@@ -52,7 +52,7 @@ impl From<Rendered> for Picture {
     }
 }
 
-/// `splats` as the kernels read them.
+/// Returns the slices of `splats` that the kernels read.
 pub fn slices(splats: &Splats) -> SplatSlices<'_> {
     SplatSlices {
         geometry: Geometry::Packed(&splats.rows),

@@ -1,6 +1,6 @@
-// Constants of src/abi.rs under the same names; tests/shaders.rs compares them.
+// Constants of src/abi.rs, under the same names; tests/gpu/shaders.rs compares the values.
 
-// Rule by which a parent's opacity is shared.
+// Redistribution rules.
 const RULE_LINEAR: u32 = 0u;
 const RULE_OPTICAL_DEPTH: u32 = 1u;
 const RULE_TRANSMITTANCE: u32 = 2u;
@@ -28,14 +28,14 @@ const PLAN_COUNT: u32 = 3u;
 const PLAN_BLOCKS: u32 = 4u;
 const PLAN_REQUESTED: u32 = 5u;
 const PLAN_ELEMENT_GROUPS: u32 = 8u;
-// Largest number of samples of a parent, and of samples x groups, in attention_gather.
+// Maximum samples per parent, and samples x groups, of attention_gather.
 const GATHER_SAMPLES_MAX: u32 = 128u;
 const GATHER_WEIGHTS_MAX: u32 = 1024u;
 
-// Floats of one pair of views of a plane sweep.
+// Floats of a pair of views of a plane sweep.
 const SWEEP_PAIR_STRIDE: u32 = 20u;
 
-// Strides and offsets of packed splats and of head records.
+// Strides and offsets of packed splats and of head records, floats.
 const SPLAT_STRIDE: u32 = 11u;
 const MEAN_OFFSET: u32 = 0u;
 const QUAT_OFFSET: u32 = 3u;

@@ -1,5 +1,5 @@
-// Elliptical weighted average of one splat: src/cpu/ewa.rs and covariance.rs, whose rules
-// of what is dropped hold here too.
+// Elliptical weighted average of one splat (EWA splatting; 3DGS, section 4). Formulas and
+// conditions for dropped splats: src/cpu/ewa.rs and src/cpu/covariance.rs.
 
 // cov2d before the low-pass: xx, xy, yy, determinant.
 struct Covariance {
@@ -9,7 +9,7 @@ struct Covariance {
     det: f32,
 }
 
-// M Mᵗ with M = J W R S: the determinant as |m1 x m2|², which no needle cancels.
+// Returns M Mᵗ for M = J W R S. The determinant is |m1 x m2|², without cancellation for needles.
 fn covariance_quat(j0: vec3<f32>, j1: vec3<f32>, q: vec4<f32>, scale: vec3<f32>) -> Covariance {
     let w = q.x;
     let t = 2.0 / dot(q, q);
@@ -31,7 +31,7 @@ fn covariance_quat(j0: vec3<f32>, j1: vec3<f32>, q: vec4<f32>, scale: vec3<f32>)
     return Covariance(dot(a, a), dot(a, b), dot(b, b), dot(n, n));
 }
 
-// J Σ Jᵗ of a world covariance 00, 01, 02, 11, 12, 22.
+// Returns J Σ Jᵗ for a world covariance 00, 01, 02, 11, 12, 22.
 fn covariance_cov6(j0: vec3<f32>, j1: vec3<f32>, a: vec3<f32>, b: vec3<f32>) -> Covariance {
     let sigma = mat3x3<f32>(a.x, a.y, a.z, a.y, b.x, b.y, a.z, b.y, b.z);
     let s0 = sigma * j0;
@@ -42,21 +42,21 @@ fn covariance_cov6(j0: vec3<f32>, j1: vec3<f32>, a: vec3<f32>, b: vec3<f32>) -> 
     return Covariance(xx, xy, yy, xx * yy - xy * xy);
 }
 
-// Rows of J W, px per world unit.
+// Returns one row of J W, px per world unit.
 fn jacobian(slope: f32, limits: vec2<f32>, f: f32, row: vec3<f32>) -> vec3<f32> {
     return f * (row - clamp(slope, limits.x, limits.y) * call.ahead.xyz);
 }
 
-// Pixels [x, y) along one axis that the support meets and the tile cut leaves.
+// Returns the pixels [x, y) along one axis inside the support and inside the tile cut.
 fn extent(mean: f32, half: f32, side: u32, cut: bool, radius: f32) -> vec2<f32> {
-    let wide = half + SPAN_SLACK_PX;
-    let most = f32(side);
-    var first = max(ceil(mean - wide), 0.0);
-    var past = min(floor(mean + wide) + 1.0, most);
+    let reach = half + SPAN_SLACK_PX;
+    let size = f32(side);
+    var first = max(ceil(mean - reach), 0.0);
+    var past = min(floor(mean + reach) + 1.0, size);
     if cut {
         let tile = f32(TILE_GPU);
         first = max(floor((mean - radius) / tile) * tile, first);
         past = min(floor((mean + radius + tile - 1.0) / tile) * tile, past);
     }
-    return vec2<f32>(min(first, most), max(past, 0.0));
+    return vec2<f32>(min(first, size), max(past, 0.0));
 }

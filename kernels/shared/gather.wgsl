@@ -1,5 +1,4 @@
-// What the attention gather's kernels are told. Formulas and layouts:
-// src/cpu/attention_gather.
+// Uniform and sizes of the attention gather. Formulas and layouts: src/cpu/attention_gather.
 
 struct AttentionGatherUniform {
     parents: u32,
@@ -24,10 +23,11 @@ struct AttentionGatherUniform {
     first_parent: u32,
     seed_low: u32,
     seed_high: u32,
-    // p * 2^53, rounded up: a weight whose 53 random bits are below it is dropped.
+    // p * 2^53, rounded up, in two words: a weight is dropped where its 53 random bits are below
+    // it.
     dropped_low: u32,
     dropped_high: u32,
-    // Of the maps.
+    // Cells of the maps.
     cells: u32,
     point_gradient: u32,
 }

@@ -1,5 +1,5 @@
-// Numbering of workgroups that one dimension of a dispatch cannot hold
-// (src/gpu/commands.rs spreads them over x and y).
+// Index of a workgroup. Counts that exceed one dimension of a dispatch are spread over x and y
+// (src/gpu/commands.rs).
 
 fn workgroup_number(id: vec3<u32>, groups: vec3<u32>) -> u32 {
     return id.y * groups.x + id.x;

@@ -1,16 +1,16 @@
-// What the pixels say of one splat, the ten sums of kernels/pair_sums.wgsl
-// (src/cpu/ewa_bwd.rs). Reads the binding `sums`.
+// Sums over the pixels of one splat: the ten sums of kernels/pair_sums.wgsl (src/cpu/ewa_bwd.rs).
+// Reads the binding `sums`.
 
 struct Moments {
-    // Of v = ∂L/∂ln α.
+    // Sum of v = ∂L/∂ln α.
     one: f32,
-    // Of v times (d, s), the whitened distance.
+    // Sum of v times (d, s), the whitened distance.
     first: vec2<f32>,
-    // Of v times d², d·s, s².
+    // Sum of v times d², d·s, s².
     second: vec3<f32>,
-    // Of the weight times ∂L/∂(R, G, B).
+    // Sum of the weight times ∂L/∂(R, G, B).
     rgb: vec3<f32>,
-    // Of the weight times ∂L/∂(Σ w·z).
+    // Sum of the weight times ∂L/∂(Σ w·z).
     z: f32,
 }
 
@@ -25,8 +25,8 @@ fn moments(i: u32) -> Moments {
     );
 }
 
-// Whether a pixel saw the splat; NaN counts.
-fn seen(m: Moments) -> bool {
+// Returns whether any sum is nonzero or NaN.
+fn has_gradient(m: Moments) -> bool {
     return m.one != 0.0 || any(m.first != vec2<f32>(0.0)) || any(m.second != vec3<f32>(0.0))
         || any(m.rgb != vec3<f32>(0.0)) || m.z != 0.0;
 }

@@ -1,5 +1,4 @@
-// What the rasterizer's kernels share: the uniform (binding `call`), a projected splat, its
-// tiles.
+// Uniform (binding `call`), projected splat and tiles of the rasterizer's kernels.
 
 struct RasterUniform {
     right: vec4<f32>,
@@ -42,23 +41,23 @@ struct RasterUniform {
     pad_c: u32,
 }
 
-// The call's band of the picture: its first row of pixels, and how many there are.
+// Returns the first row of pixels of the call's band, and its number of rows.
 fn band() -> vec2<u32> {
     let first = call.top * TILE_GPU;
     return vec2<u32>(first, min(call.height, first + call.rows * TILE_GPU) - first);
 }
 
-// Of rows of tiles [x, y), those of the call.
-fn lines_of_call(lines: vec2<u32>) -> vec2<u32> {
-    let past = call.top + call.rows;
-    let first = clamp(lines.x, call.top, past);
-    return vec2<u32>(first, clamp(lines.y, first, past));
+// Returns the rows of tiles of [x, y) inside the call's band.
+fn rows_in_band(lines: vec2<u32>) -> vec2<u32> {
+    let end = call.top + call.rows;
+    let first = clamp(lines.x, call.top, end);
+    return vec2<u32>(first, clamp(lines.y, first, end));
 }
 
-// A projected splat, as src/cpu/ewa.rs has it: mean u, v (px, pixel centres at integers),
-// Cholesky factor of the conic sx, shear, sy in units of log2, log2 of the opacity, camera
-// z, half-width and half-height of the support, px. In memory three vec4 a splat:
-// (u, v, sx, shear), (sy, power, z, half_width), (r, g, b, half_height).
+// A projected splat (src/cpu/ewa.rs): mean u, v (px, pixel centres at integers); Cholesky factor
+// sx, shear, sy of the conic in units of log2; log2 of the opacity; camera z; half-width and
+// half-height of the support, px. In memory three vec4 per splat: (u, v, sx, shear), (sy, power,
+// z, half_width), (r, g, b, half_height).
 struct Footprint {
     u: f32,
     v: f32,
@@ -71,26 +70,26 @@ struct Footprint {
     half_height: f32,
 }
 
-// Distance of a pixel from a splat's mean in coordinates in which the splat is round;
-// `a` and `b` are the first two vec4 of its footprint.
+// Returns the distance of a pixel from the mean of a splat, in coordinates where the splat is
+// isotropic. `a` and `b` are the first two vec4 of the footprint.
 fn whitened(a: vec4<f32>, b: vec4<f32>, pixel: vec2<f32>) -> vec2<f32> {
     let d = pixel - a.xy;
     return vec2<f32>((d.x + a.w * d.y) * a.z, d.y * b.x);
 }
 
-// log2 of alpha there, before the cap.
+// Returns log2 of alpha at the whitened distance `d`, before the cap.
 fn exponent(b: vec4<f32>, d: vec2<f32>) -> f32 {
     return b.y - d.x * d.x - d.y * d.y;
 }
 
-// Where exponents have fallen by this much, alpha is below 1/255; with slack.
+// Returns the decrease of the exponent to alpha = 1/255, plus slack.
 fn support(power: f32) -> f32 {
     let reach = power - ALPHA_MIN_LOG2;
     return reach + SUPPORT_SLACK * (1.0 + reach);
 }
 
-// Tile columns [x, y) of tile row `row` that the ellipse can meet, within `columns`
-// (Footprint::span of src/cpu/ewa.rs).
+// Returns the tile columns [x, y) of tile row `row` that the ellipse can intersect, within
+// `columns` (Footprint::span of src/cpu/ewa.rs).
 fn tiles_of_row(f: Footprint, row: u32, columns: vec2<u32>) -> vec2<u32> {
     let top = f32(row * TILE_GPU);
     let low = max(top - f.v, -f.half_height);
@@ -99,8 +98,8 @@ fn tiles_of_row(f: Footprint, row: u32, columns: vec2<u32>) -> vec2<u32> {
         return vec2<u32>(0u);
     }
     let reach = support(f.power);
-    // The ellipse is convex: its right edge over the rows is farthest at the rightmost
-    // point's row, or at the end nearest to it; the left mirrors it.
+    // The ellipse is convex. Its right edge over the rows is farthest at the row of the rightmost
+    // point, or at the nearest end of the rows; the left edge mirrors it.
     let tip = -f.shear * f.half_height * f.half_height / f.half_width;
     let right_dy = clamp(tip, low, high);
     let left_dy = clamp(-tip, low, high);
@@ -109,19 +108,19 @@ fn tiles_of_row(f: Footprint, row: u32, columns: vec2<u32>) -> vec2<u32> {
     let right = f.u - f.shear * right_dy + right_edge + SPAN_SLACK_PX;
     let left = f.u - f.shear * left_dy - left_edge - SPAN_SLACK_PX;
     let side = f32(TILE_GPU);
-    let most = f32(columns.y);
-    // Beyond the picture on the left is column 0; a NaN gives all columns.
-    let start = u32(clamp(floor(left / side), f32(columns.x), most));
-    let past = u32(clamp(floor(right / side) + 1.0, f32(columns.x), most));
-    return vec2<u32>(start, max(start, past));
+    let last_column = f32(columns.y);
+    // Columns left of the picture are clamped to column 0; a NaN gives all columns.
+    let start = u32(clamp(floor(left / side), f32(columns.x), last_column));
+    let end = u32(clamp(floor(right / side) + 1.0, f32(columns.x), last_column));
+    return vec2<u32>(start, max(start, end));
 }
 
-// Whether a rectangle of tiles is so small that it is taken as it is.
-fn small(x: vec2<u32>, y: vec2<u32>) -> bool {
+// Returns whether a rectangle of tiles is so is_small that all its tiles count as intersected.
+fn is_small(x: vec2<u32>, y: vec2<u32>) -> bool {
     return x.y - x.x <= 2u && y.y - y.x <= 2u && (x.y - x.x) * (y.y - y.x) <= 2u;
 }
 
-// Two numbers below 2^16 in one word, and back.
+// Packs two numbers below 2^16 into one word.
 fn pack(v: vec2<u32>) -> u32 {
     return v.x | (v.y << 16u);
 }
@@ -130,7 +129,8 @@ fn unpack(v: u32) -> vec2<u32> {
     return vec2<u32>(v & 0xffffu, v >> 16u);
 }
 
-// Neither infinite nor NaN, told by the bits: a compiler may assume that there are none.
+// Returns whether v is neither infinite nor NaN. The test uses the bits, because compilers may
+// assume that neither occurs.
 fn finite(v: f32) -> bool {
     return (bitcast<u32>(v) & 0x7f800000u) != 0x7f800000u;
 }

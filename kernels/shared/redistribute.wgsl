@@ -1,4 +1,4 @@
-// What the kernels of a parent's opacity are told (src/cpu/redistribute.rs).
+// Uniform of opacity redistribution (src/cpu/redistribute.rs).
 
 struct RedistributeUniform {
     parents: u32,

@@ -1,5 +1,5 @@
-// Colour of a splat seen from one direction, sum of sh_k Y_k(d): src/cpu/sh.rs. Reads the
-// binding `sh`; coefficients [D, 3] of a set lie at `at`.
+// Colour of a splat from one direction, Σ sh_k Y_k(d): src/cpu/sh.rs. Reads the binding `sh`; the
+// coefficients [D, 3] of a set begin at `at`.
 
 fn coefficient(at: u32, k: u32) -> vec3<f32> {
     let i = at + 3u * k;
@@ -41,9 +41,8 @@ fn radiance(at: u32, degree: u32, mvsplat: bool, direction: vec3<f32>) -> vec3<f
     sum -= 0.4570458 * y * (4.0 * zz - xx - yy) * coefficient(at, 11u);
     sum += 0.37317634 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * coefficient(at, 12u);
     sum -= 0.4570458 * x * (4.0 * zz - xx - yy) * coefficient(at, 13u);
-    // MVSplat's function 14 is z (z² - x²) of the unpermuted direction.
-    let own = direction;
-    let f14 = select(z * (xx - yy), own.z * (own.z * own.z - own.x * own.x), mvsplat);
+    // MVSplat's function 14 is z (z² - x²) of the direction before the permutation.
+        let f14 = select(z * (xx - yy), direction.z * (direction.z * direction.z - direction.x * direction.x), mvsplat);
     sum += 1.4453057 * f14 * coefficient(at, 14u);
     sum -= 0.5900436 * x * (xx - 3.0 * yy) * coefficient(at, 15u);
     if degree == 3u || mvsplat {

@@ -1,38 +1,38 @@
-// How a parent's opacity is shared among its children, number by number: the rules and
-// formulas of src/cpu/redistribute.rs.
+// Redistribution of a parent's opacity among its children (SubSplat, "Opacity allocation";
+// supplement A.3). Rules and formulas: src/cpu/redistribute.rs.
 
-// Whether areas count in units of the parent's own.
+// Returns whether areas are relative to the area of the parent.
 fn rule_is_relative(rule: u32) -> bool {
     return rule == RULE_OPTICAL_DEPTH || rule == RULE_AREA;
 }
 
-// Argument of the softmax.
-fn share_log(rule: u32, logit: f32, area: f32) -> f32 {
+// Returns the argument of the softmax.
+fn rule_logit(rule: u32, logit: f32, area: f32) -> f32 {
     if rule == RULE_LINEAR {
         return logit - log(area + AREA_EPS);
     }
     return logit;
 }
 
-// What the weights share: the opacity, or its optical depth.
-fn share_whole(rule: u32, alpha: f32) -> f32 {
+// Returns the distributed quantity: the opacity, or its optical depth.
+fn rule_total(rule: u32, alpha: f32) -> f32 {
     if rule == RULE_OPTICAL_DEPTH || rule == RULE_TRANSMITTANCE {
         return -ln_1p(-min(alpha, OPACITY_CEILING));
     }
     return alpha;
 }
 
-// What a share is divided by.
-fn share_divisor(rule: u32, area: f32, per_own: f32) -> f32 {
+// Returns the divisor of a share.
+fn rule_divisor(rule: u32, area: f32, inverse_parent_area: f32) -> f32 {
     if rule_is_relative(rule) {
-        return max(area * per_own, RELATIVE_AREA_MIN);
+        return max(area * inverse_parent_area, RELATIVE_AREA_MIN);
     }
     return 1.0;
 }
 
-// Opacity of a child whose part of the whole is `part`.
-fn share_one(rule: u32, part: f32, area: f32, per_own: f32) -> f32 {
-    let x = part / share_divisor(rule, area, per_own);
+// Returns the opacity of a child with the share `part`.
+fn rule_opacity(rule: u32, part: f32, area: f32, inverse_parent_area: f32) -> f32 {
+    let x = part / rule_divisor(rule, area, inverse_parent_area);
     if rule == RULE_LINEAR {
         return x;
     }

@@ -1,6 +1,6 @@
-// A digit of a stable radix sort: 4 bits, blocks of GPU_BLOCK elements, 8 consecutive ones
-// a thread. Separate dispatches count, sum and scatter: no workgroup waits for another, as
-// WebGPU promises none progress (src/cpu/sort.rs has the same order).
+// One digit of a stable radix sort: 4 bits, blocks of GPU_BLOCK elements, 8 consecutive elements
+// per thread. Counting, prefix sum and scatter are separate dispatches, because WebGPU guarantees
+// no progress between workgroups. The order is that of src/cpu/sort.rs.
 
 struct SortUniform {
     shift: u32,
@@ -9,13 +9,13 @@ struct SortUniform {
     pad_c: u32,
 }
 
-// Row r of 256 threads: how many of a thread's elements have digit r (low half) and digit
-// r + 8 (high half); at most 2048 in all, so that sums of packed halves do not carry.
+// Row r, 256 threads: counts of digit r (low half) and of digit r + 8 (high half) among a
+// thread's elements. The total is at most 2048, so sums of packed halves do not carry.
 var<workgroup> sort_table: array<u32, 2048>;
-// Sums of 8 threads, 32 to a row.
+// Sums over segments of 8 threads, 32 segments per row.
 var<workgroup> sort_segments: array<u32, 256>;
 
-// Counters of 16 digits, 4 bits each: a thread has 8 elements.
+// Increments one of 16 counters of 4 bits each; a thread has 8 elements.
 fn tally_add(counters: vec2<u32>, digit: u32) -> vec2<u32> {
     let one = 1u << ((digit & 7u) * 4u);
     return counters + select(vec2<u32>(0u, one), vec2<u32>(one, 0u), digit < 8u);
@@ -25,26 +25,26 @@ fn tally_get(counters: vec2<u32>, digit: u32) -> u32 {
     return (select(counters.y, counters.x, digit < 8u) >> ((digit & 7u) * 4u)) & 15u;
 }
 
-// Half of a packed pair that belongs to `digit`.
+// Returns the half of a packed pair that belongs to `digit`.
 fn half_of(pair: u32, digit: u32) -> u32 {
     return select(pair >> 16u, pair & 0xffffu, digit < 8u);
 }
 
-// Turns the table into sums over the threads of the same segment before, and fills in the
-// segments' sums. Ends with a barrier.
-fn sum_segments(lane: u32, counters: vec2<u32>) {
+// Replaces the counts in the table by sums over the preceding threads of the segment, and
+// computes the sums of the segments. Ends with a barrier.
+fn sum_segments(thread: u32, counters: vec2<u32>) {
     for (var row = 0u; row < 8u; row++) {
         let low = (counters.x >> (4u * row)) & 15u;
         let high = (counters.y >> (4u * row)) & 15u;
-        sort_table[row * 256u + lane] = low | (high << 16u);
+        sort_table[row * 256u + thread] = low | (high << 16u);
     }
     workgroupBarrier();
     var sum = 0u;
-    for (var i = 8u * lane; i < 8u * lane + 8u; i++) {
+    for (var i = 8u * thread; i < 8u * thread + 8u; i++) {
         let v = sort_table[i];
         sort_table[i] = sum;
         sum += v;
     }
-    sort_segments[lane] = sum;
+    sort_segments[thread] = sum;
     workgroupBarrier();
 }

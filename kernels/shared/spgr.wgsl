@@ -1,7 +1,7 @@
-// Sub-pixel Gaussian reparameterization of one parent and one child (SubSplat 3.2), for
-// the forward and the backward kernel. Formulas, in the same order: src/cpu/spgr.
+// Sub-pixel Gaussian reparameterization of one parent and one child (SubSplat, section 3.2), for
+// the forward and the backward kernel. The order of the formulas is that of src/cpu/spgr.
 //
-// A matrix holds its rows as WGSL columns: m[i] is row i, v * m is M·v, m * v is Mᵀ·v.
+// Matrices store their rows as WGSL columns: m[i] is row i, v * m is M·v, m * v is Mᵀ·v.
 
 struct SpgrUniform {
     parents: u32,
@@ -35,8 +35,8 @@ struct SpgrUniform {
 @group(0) @binding(1) var<storage, read> head: array<f32>;
 // [N, 11].
 @group(0) @binding(2) var<storage, read> parents: array<f32>;
-// [V, SPGR_CAMERA_STRIDE]: R world from camera (9), position (3), focal (2), centre (2),
-// size (2), least z, low and high bounds of x/z and y/z (4).
+// [V, SPGR_CAMERA_STRIDE]: R world from camera (9), position (3), focal (2), centre (2), size (2),
+// minimum z, lower and upper bounds of x/z and y/z (4).
 @group(0) @binding(3) var<storage, read> cameras: array<f32>;
 
 struct View {
@@ -72,18 +72,18 @@ fn view_number(v: u32) -> View {
     );
 }
 
-fn seen_from(view: View, p: vec3<f32>) -> vec3<f32> {
+fn in_camera_frame(view: View, p: vec3<f32>) -> vec3<f32> {
     return view.rotation * (p - view.position);
 }
 
-// The view in whose pixels the children of parent n are made.
+// Returns the primary view of parent n (SubSplat, supplement A.3).
 fn primary_view(n: u32, mean: vec3<f32>) -> View {
     var chosen = min((call.first + n) / call.per_view, call.views - 1u);
     if call.nearest_visible != 0u && call.views > 1u {
         var nearest = 3.4e38;
         for (var v = 0u; v < call.views; v++) {
             let view = view_number(v);
-            let p = seen_from(view, mean);
+            let p = in_camera_frame(view, mean);
             let u = view.focal * p.xy / p.z + view.centre;
             let inside = all(vec2<f32>() < u) && all(u < view.size);
             if p.z > VISIBLE_Z_MIN && p.z < nearest && inside {
@@ -95,7 +95,7 @@ fn primary_view(n: u32, mean: vec3<f32>) -> View {
     return view_number(chosen);
 }
 
-// J·R_w2c, J the guarded Jacobian of the projection, px per world unit.
+// J·R_w2c with the guarded Jacobian J of the projection, px per world unit.
 struct Jacobian {
     u: vec3<f32>,
     v: vec3<f32>,
@@ -125,13 +125,13 @@ fn jacobian(view: View, p: vec3<f32>, zoom: f32) -> Jacobian {
     );
 }
 
-// Quaternions are wxyz: .x is w.
+// Returns the product of two quaternions, wxyz: .x is w.
 fn quat_product(a: vec4<f32>, b: vec4<f32>) -> vec4<f32> {
     let w = (a.x * b.x - a.y * b.y) - (a.z * b.z + a.w * b.w);
     return vec4<f32>(w, a.x * b.yzw + b.x * a.yzw + cross(a.yzw, b.yzw));
 }
 
-// A quaternion divided by its length; zero stays zero.
+// A normalised quaternion; zero kept_axis zero.
 struct Unit {
     q: vec4<f32>,
     inverse: f32,
@@ -155,7 +155,7 @@ fn rotation_of(q: vec4<f32>) -> mat3x3<f32> {
 }
 
 // Quaternion of a rotation vector, radians.
-struct Turn {
+struct DeltaRotation {
     e: vec4<f32>,
     r: vec3<f32>,
     squared: f32,
@@ -163,21 +163,21 @@ struct Turn {
     sinc: f32,
 }
 
-fn turn_of(r: vec3<f32>) -> Turn {
+fn delta_rotation_of(r: vec3<f32>) -> DeltaRotation {
     let squared = dot(r, r);
     let small = squared < 1e-6;
     let theta = sqrt(max(squared, 1e-6));
     let sc = sin_cos(0.5 * theta);
     let sinc = select(sc.x / theta, 0.5 - squared * (0.5 / 24.0), small);
     let w = select(sc.y, 1.0 - 0.125 * squared, small);
-    return Turn(vec4<f32>(w, sinc * r), r, squared, sinc);
+    return DeltaRotation(vec4<f32>(w, sinc * r), r, squared, sinc);
 }
 
 // M = J·R_w2c·R(q)·diag(s), two rows a and b; M·Mᵀ is the projected covariance.
 struct Footprint {
     // J·R_w2c·R(q).
-    turned_a: vec3<f32>,
-    turned_b: vec3<f32>,
+    rotated_a: vec3<f32>,
+    rotated_b: vec3<f32>,
     a: vec3<f32>,
     b: vec3<f32>,
     normal: vec3<f32>,
@@ -194,14 +194,15 @@ fn footprint(j: Jacobian, rotation: mat3x3<f32>, scale: vec3<f32>) -> Footprint 
     return Footprint(ta, tb, a, b, normal, sqrt(dot(normal, normal) + AREA_SQ_EPS));
 }
 
-// Area with the low-pass, for M's columns times `growth` and the area with it.
-fn blurred(f: Footprint, growth: vec3<f32>, area: f32, lowpass: f32) -> f32 {
+// Returns the area with the low-pass. The columns of M are multiplied by `growth`, and `area`
+// includes the growth.
+fn lowpassed_area(f: Footprint, growth: vec3<f32>, area: f32, lowpass: f32) -> f32 {
     let columns = growth * growth * (f.a * f.a + f.b * f.b);
     let trace = columns.x + columns.y + columns.z;
     return sqrt(area * area + (lowpass * trace + lowpass * lowpass));
 }
 
-// Factors of the three sigmas that raise the area to A_min where it is below.
+// Returns the factors of the three sigmas that raise the area to A_min.
 fn growth_of(f: Footprint) -> vec3<f32> {
     if call.a_min <= 0.0 || f.area >= call.a_min {
         return vec3<f32>(1.0);
@@ -210,31 +211,31 @@ fn growth_of(f: Footprint) -> vec3<f32> {
         return vec3<f32>(min(sqrt(call.a_min / f.area), GROWTH_MAX));
     }
     let l = f.a * f.a + f.b * f.b;
-    // The axis that stays is the first of the shortest columns.
-    var stays = 0u;
+    // The first of the shortest columns keeps its length.
+    var kept_axis = 0u;
     if min(l.y, l.z) < l.x {
-        stays = select(1u, 2u, l.z < l.y);
+        kept_axis = select(1u, 2u, l.z < l.y);
     }
     let s = f.normal * f.normal;
-    // c^4·p + c²·q = A_min², the root without cancellation.
-    let p = s[stays];
-    let q = s[(stays + 1u) % 3u] + s[(stays + 2u) % 3u];
+    // Root c² of c^4·p + c²·q = A_min², in the form without cancellation.
+    let p = s[kept_axis];
+    let q = s[(kept_axis + 1u) % 3u] + s[(kept_axis + 2u) % 3u];
     let target_sq = call.a_min * call.a_min;
     let root = sqrt(q * q + 4.0 * p * target_sq);
     let c = min(sqrt(2.0 * target_sq / (q + root)), GROWTH_MAX);
     var growth = vec3<f32>(c);
-    growth[stays] = 1.0;
+    growth[kept_axis] = 1.0;
     return growth;
 }
 
-// Steps along the parent's disc of least Mahalanobis length that project to one pixel.
+// Steps along the parent's disc that project to one pixel, of minimum Mahalanobis length.
 struct Disc {
     u: vec3<f32>,
     v: vec3<f32>,
     solid: bool,
     unit: Unit,
-    // R_w2c·R(q), and the same with scales.
-    turned: mat3x3<f32>,
+    // R_w2c·R(q), without and with the scales.
+    rotation: mat3x3<f32>,
     g: mat3x3<f32>,
     ju: vec3<f32>,
     jv: vec3<f32>,
@@ -246,7 +247,7 @@ struct Disc {
     weight_v: vec3<f32>,
 }
 
-// What all children of a parent share.
+// Quantities that all children of a parent share.
 struct Parent {
     view: View,
     mean: vec3<f32>,
@@ -254,7 +255,7 @@ struct Parent {
     scale: vec3<f32>,
     alpha: f32,
     in_camera: vec3<f32>,
-    // Depth of the pitch, at least the view's least.
+    // Depth for the pixel pitch, at least the minimum z of the view.
     z: f32,
     disc: Disc,
     jacobian: Jacobian,
@@ -265,9 +266,9 @@ fn disc_of(p: Parent) -> Disc {
     let unit = unit_of(p.quat);
     let rotation = rotation_of(unit.q);
     let columns = transpose(p.view.rotation);
-    let turned =
+    let rotation_in_camera =
         mat3x3<f32>(rotation * columns[0], rotation * columns[1], rotation * columns[2]);
-    let g = mat3x3<f32>(turned[0] * s, turned[1] * s, turned[2] * s);
+    let g = mat3x3<f32>(rotation_in_camera[0] * s, rotation_in_camera[1] * s, rotation_in_camera[2] * s);
     let f = p.view.focal / p.z;
     let ju = vec3<f32>(f.x, 0.0, -f.x * p.in_camera.x / p.z);
     let jv = vec3<f32>(0.0, f.y, -f.y * p.in_camera.y / p.z);
@@ -279,7 +280,7 @@ fn disc_of(p: Parent) -> Disc {
     let inverse_det = 1.0 / select(1.0, det, solid);
     let wu = cross(b, normal) * inverse_det;
     let wv = cross(normal, a) * inverse_det;
-    return Disc(wu * g, wv * g, solid, unit, turned, g, ju, jv, a, b, normal, inverse_det, wu, wv);
+    return Disc(wu * g, wv * g, solid, unit, rotation_in_camera, g, ju, jv, a, b, normal, inverse_det, wu, wv);
 }
 
 fn load_parent(n: u32) -> Parent {
@@ -293,7 +294,7 @@ fn load_parent(n: u32) -> Parent {
     p.scale = vec3<f32>(parents[s], parents[s + 1u], parents[s + 2u]);
     p.alpha = parents[i + OPACITY_OFFSET];
     p.view = primary_view(n, p.mean);
-    p.in_camera = seen_from(p.view, p.mean);
+    p.in_camera = in_camera_frame(p.view, p.mean);
     p.z = max(p.in_camera.z, p.view.z_min);
     if call.disc != 0u {
         p.disc = disc_of(p);
@@ -310,8 +311,8 @@ struct Own {
     rotation: mat3x3<f32>,
     jacobian: Jacobian,
     footprint: Footprint,
-    blurred: f32,
-    // In target px²; 1 for the rules that do not ask.
+    lowpassed_area: f32,
+    // Area in target px²; 1 for the rules that do not use it.
     value: f32,
 }
 
@@ -323,20 +324,20 @@ fn own_of(p: Parent) -> Own {
         o.rotation = rotation_of(o.unit.q);
         o.jacobian = jacobian(p.view, p.in_camera, 1.0);
         o.footprint = footprint(o.jacobian, o.rotation, p.scale);
-        o.blurred = o.footprint.area;
+        o.lowpassed_area = o.footprint.area;
         if call.rule == RULE_OPTICAL_DEPTH {
-            o.blurred =
-                blurred(o.footprint, vec3<f32>(1.0), o.footprint.area, call.lowpass_input);
+            o.lowpassed_area =
+                lowpassed_area(o.footprint, vec3<f32>(1.0), o.footprint.area, call.lowpass_input);
         }
-        o.value = f32(call.side * call.side) * o.blurred;
+        o.value = f32(call.side * call.side) * o.lowpassed_area;
     }
     return o;
 }
 
-// The camera-frame step of a child, and what its gradient needs.
+// Step of a child in the camera frame, and intermediate values of its gradient.
 struct Step {
     out: vec3<f32>,
-    // tanh of the learned offset, where it is bounded.
+    // tanh of the learned offset, or the offset itself where it is unbounded.
     bounded: vec2<f32>,
     // Input px.
     offset: vec2<f32>,
@@ -347,7 +348,7 @@ struct Step {
     side: vec2<f32>,
     share: f32,
     inverse: f32,
-    free_ahead: bool,
+    free_depth: bool,
 }
 
 fn step_of(p: Parent, k: u32, record: u32) -> Step {
@@ -365,9 +366,9 @@ fn step_of(p: Parent, k: u32, record: u32) -> Step {
     var s = vec3<f32>(p.z * t.offset / p.view.focal, 0.0);
     if call.disc != 0u {
         let d = t.offset.x * p.disc.u + t.offset.y * p.disc.v;
-        // An edge-on disc slides at most a tenth of its depth.
-        let tenth = DEPTH_FRACTION_MIN * p.z;
-        t.along_disc = select(0.0, tenth / max(abs(d.z), tenth), p.disc.solid);
+        // The step along an edge-on disc is limited to a slide_max of the depth.
+        let slide_max = DEPTH_FRACTION_MIN * p.z;
+        t.along_disc = select(0.0, slide_max / max(abs(d.z), slide_max), p.disc.solid);
         s += t.along_disc * (d - s);
     }
     t.tanh_z = tanh_of(head[record + HEAD_DEPTH_OFFSET]);
@@ -375,15 +376,15 @@ fn step_of(p: Parent, k: u32, record: u32) -> Step {
     if call.relative_depth != 0u {
         dz *= p.z;
     }
-    let least = (DEPTH_FRACTION_MIN - 1.0) * p.z - s.z;
-    t.free_z = least < dz;
-    dz = max(dz, least);
+    let dz_min = (DEPTH_FRACTION_MIN - 1.0) * p.z - s.z;
+    t.free_z = dz_min < dz;
+    dz = max(dz, dz_min);
     t.side = s.xy;
     if call.ray != 0u {
-        let ahead = p.in_camera.z + s.z;
-        t.inverse = 1.0 / max(ahead, p.view.z_min);
+        let depth = p.in_camera.z + s.z;
+        t.inverse = 1.0 / max(depth, p.view.z_min);
         t.share = dz * t.inverse;
-        t.free_ahead = p.view.z_min < ahead;
+        t.free_depth = p.view.z_min < depth;
         let moved = s.xy + t.share * (p.in_camera.xy + s.xy);
         s = vec3<f32>(moved, s.z);
     }
@@ -393,7 +394,7 @@ fn step_of(p: Parent, k: u32, record: u32) -> Step {
 
 struct Child {
     step: Step,
-    turn: Turn,
+    delta_rotation: DeltaRotation,
     unit: Unit,
     rotation: mat3x3<f32>,
     jacobian: Jacobian,
@@ -401,13 +402,13 @@ struct Child {
     // tanh(dlog s / c), and lambda_s·e^…
     soft: vec3<f32>,
     factor: vec3<f32>,
-    // Before the growth to the least footprint.
+    // Scales before the growth to the minimum footprint.
     small: vec3<f32>,
     growth: vec3<f32>,
     clamped: f32,
     mean: vec3<f32>,
     scale: vec3<f32>,
-    // What the opacity rule divides by, target px².
+    // Area for the opacity rule, target px².
     area: f32,
 }
 
@@ -415,7 +416,7 @@ fn head3(i: u32) -> vec3<f32> {
     return vec3<f32>(head[i], head[i + 1u], head[i + 2u]);
 }
 
-// Child k of parent p; its record begins at `record`.
+// Returns child k of parent p; its head record begins at `record`.
 fn child_of(p: Parent, k: u32, record: u32) -> Child {
     var c: Child;
     c.step = step_of(p, k, record);
@@ -424,8 +425,8 @@ fn child_of(p: Parent, k: u32, record: u32) -> Child {
     c.soft = vec3<f32>(tanh_of(x.x), tanh_of(x.y), tanh_of(x.z));
     c.factor = call.lambda_s * exp(call.dlog_clamp * c.soft);
     c.small = c.factor * p.scale;
-    c.turn = turn_of(head3(record + HEAD_ROTATION_OFFSET));
-    c.unit = unit_of(quat_product(p.quat, c.turn.e));
+    c.delta_rotation = delta_rotation_of(head3(record + HEAD_ROTATION_OFFSET));
+    c.unit = unit_of(quat_product(p.quat, c.delta_rotation.e));
     c.rotation = rotation_of(c.unit.q);
     if call.area_at_parent != 0u {
         c.jacobian = p.jacobian;
@@ -437,7 +438,7 @@ fn child_of(p: Parent, k: u32, record: u32) -> Child {
     c.clamped = max(c.footprint.area, call.a_min);
     c.area = c.clamped;
     if call.rule == RULE_OPTICAL_DEPTH {
-        c.area = blurred(c.footprint, c.growth, c.clamped, call.lowpass_target);
+        c.area = lowpassed_area(c.footprint, c.growth, c.clamped, call.lowpass_target);
     }
     c.scale = c.small * c.growth;
     return c;

@@ -1,7 +1,7 @@
-// What the plane sweep's kernels are told. Formulas: src/cpu/plane_sweep.
+// Uniform of the plane sweep. Formulas: src/cpu/plane_sweep.
 
 struct PlaneSweepUniform {
-    // R, C, D of this call, and h, w of the feature maps.
+    // R, C and D of this call; h and w of the feature maps.
     rows: u32,
     channels: u32,
     candidates: u32,

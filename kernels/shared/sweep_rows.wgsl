@@ -1,8 +1,8 @@
-// Reference row of a pair of the plane sweep.
+// Returns the reference row of a pair of the plane sweep.
 
 fn row_of(pair: u32) -> u32 {
     var r = 0u;
-    while heads[r + 1u] <= pair {
+    while pair_starts[r + 1u] <= pair {
         r++;
     }
     return r;

@@ -1,32 +1,33 @@
-// Where a candidate of the plane sweep falls, and the taps there.
+// Projection of a candidate of the plane sweep into the source view, and its bilinear taps.
 
 @group(0) @binding(1) var<storage, read> reference: array<f32>;
 @group(0) @binding(2) var<storage, read> source: array<f32>;
 // SWEEP_PAIR_STRIDE floats of a pair: K_r^-1 (4), rotation rows (9), t (3), K (4).
 @group(0) @binding(3) var<storage, read> pairs: array<f32>;
-// Rows + 1 numbers: pairs of row r are heads[r] .. heads[r + 1]; then each pair's row of
-// the source.
-@group(0) @binding(4) var<storage, read> heads: array<u32>;
+// Rows + 1 numbers: the pairs of row r are pair_starts[r] .. pair_starts[r + 1]. Then the source row of
+// each pair.
+@group(0) @binding(4) var<storage, read> pair_starts: array<u32>;
 // [R, D].
 @group(0) @binding(5) var<storage, read> depths: array<f32>;
 
-// Where a sample falls: cells of the four taps (x fastest) and their weights, 0 outside.
+// Cells of the four taps of a sample (x fastest) and their weights, 0 outside the map.
 struct Taps {
     cells: vec4<u32>,
     weights: vec4<f32>,
 }
 
+// Returns the source row of a pair.
 fn source_row(pair: u32) -> u32 {
-    return heads[call.rows + 1u + pair];
+    return pair_starts[call.rows + 1u + pair];
 }
 
-// Factor of each pair's part in the correlation of row r.
-fn share(r: u32) -> f32 {
-    return call.scale / f32(max(heads[r + 1u] - heads[r], 1u));
+// Returns the factor of each pair's term in the correlation of row r.
+fn pair_factor(r: u32) -> f32 {
+    return call.scale / f32(max(pair_starts[r + 1u] - pair_starts[r], 1u));
 }
 
-// Source index coordinates of reference pixel (x, y) at this depth.
-fn fall(pair: u32, x: u32, y: u32, depth: f32) -> vec2<f32> {
+// Returns the source index coordinates of reference pixel (x, y) at this depth.
+fn project(pair: u32, x: u32, y: u32, depth: f32) -> vec2<f32> {
     let p = pair * SWEEP_PAIR_STRIDE;
     let ray = vec2<f32>(
         pairs[p] * (f32(x) + call.centre) + pairs[p + 2u],
@@ -47,11 +48,11 @@ fn fall(pair: u32, x: u32, y: u32, depth: f32) -> vec2<f32> {
     return at / z - call.centre;
 }
 
-// Bilinear taps at `at`; all weights 0 where the four lie outside.
+// Returns the bilinear taps at `at`; all weights are 0 where the four cells lie outside.
 fn taps(at: vec2<f32>) -> Taps {
     var t = Taps(vec4<u32>(), vec4<f32>());
     let size = vec2<f32>(f32(call.width), f32(call.height));
-    // Also refuses what is no number.
+    // NaN is outside, too.
     if !(at.x > -1.0 && at.y > -1.0 && at.x < size.x && at.y < size.y) {
         return t;
     }

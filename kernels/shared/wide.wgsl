@@ -1,12 +1,12 @@
-// 64-bit whole numbers as (low, high) words, and SplitMix64's finaliser on them: the
-// dropping of attention weights is the CPU's to the bit.
+// 64-bit integers as (low, high) words, and the finaliser of SplitMix64. The dropped attention
+// weights equal those of the CPU exactly.
 
 fn wide_add(a: vec2<u32>, b: vec2<u32>) -> vec2<u32> {
     let low = a.x + b.x;
     return vec2<u32>(low, a.y + b.y + select(0u, 1u, low < a.x));
 }
 
-// a·b of two words, by halves.
+// Returns a·b of two words, from 16-bit halves.
 fn wide_product(a: u32, b: u32) -> vec2<u32> {
     let a0 = a & 0xffffu;
     let a1 = a >> 16u;
@@ -18,13 +18,13 @@ fn wide_product(a: u32, b: u32) -> vec2<u32> {
     return vec2<u32>((cross << 16u) | (low & 0xffffu), a1 * b1 + (mid >> 16u) + (cross >> 16u));
 }
 
-// a·b modulo 2^64.
+// Returns a·b modulo 2^64.
 fn wide_times(a: vec2<u32>, b: vec2<u32>) -> vec2<u32> {
     let low = wide_product(a.x, b.x);
     return vec2<u32>(low.x, low.y + a.x * b.y + a.y * b.x);
 }
 
-// a >> n, 0 < n < 32.
+// Returns a >> n, 0 < n < 32.
 fn wide_shift(a: vec2<u32>, n: u32) -> vec2<u32> {
     return vec2<u32>((a.x >> n) | (a.y << (32u - n)), a.y >> n);
 }

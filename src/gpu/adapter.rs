@@ -1,63 +1,21 @@
-//! Which adapter does the work.
+//! Listing and choice of wgpu adapters ([`DeviceChoice`]).
 //!
-//! `auto` takes a GPU and never a software adapter: the CPU kernels are faster than an
-//! emulated GPU. `gpu` takes the best adapter there is, a software one too, and a name
-//! takes the first whose name holds it.
 
+use crate::device::DeviceChoice;
 use crate::gpu::error::GpuError;
-use std::convert::Infallible;
 use std::fmt;
-use std::str::FromStr;
 use wgpu::DeviceType;
 
-/// What `--device` says.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub enum DeviceChoice {
-    /// A GPU where there is one, else the CPU kernels.
-    #[default]
-    Auto,
-    /// The CPU kernels.
-    Cpu,
-    /// The best adapter there is; an error where there is none.
-    Gpu,
-    /// The first adapter whose name holds this, in any case of letters.
-    Named(String),
-}
-
-impl FromStr for DeviceChoice {
-    type Err = Infallible;
-
-    fn from_str(text: &str) -> Result<Self, Infallible> {
-        Ok(match text.to_ascii_lowercase().as_str() {
-            "auto" => Self::Auto,
-            "cpu" => Self::Cpu,
-            "gpu" => Self::Gpu,
-            _ => Self::Named(text.to_owned()),
-        })
-    }
-}
-
-impl fmt::Display for DeviceChoice {
-    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        match self {
-            Self::Auto => f.write_str("a GPU that is no software adapter"),
-            Self::Cpu => f.write_str("the CPU"),
-            Self::Gpu => f.write_str("any adapter"),
-            Self::Named(name) => write!(f, "an adapter whose name holds \"{name}\""),
-        }
-    }
-}
-
-/// What is known of an adapter before it is opened.
+/// Properties of an adapter that is not opened yet.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct AdapterSummary {
-    /// The driver's name for it.
+    /// Name that the driver reports.
     pub name: String,
-    /// Vulkan, Metal, Dx12.
+    /// Graphics API: Vulkan, Metal or Dx12.
     pub backend: String,
-    /// Driver and its version.
+    /// Driver name and version.
     pub driver: String,
-    /// Whether it is a CPU that plays a GPU (lavapipe, WARP).
+    /// Whether the adapter emulates a GPU on the CPU (lavapipe, WARP).
     pub software: bool,
 }
 
@@ -79,19 +37,20 @@ impl fmt::Display for AdapterSummary {
     }
 }
 
-/// All adapters, best first: discrete, integrated, virtual, unknown, software; in the
-/// platform's own order within a kind.
+/// Lists all adapters, best first: discrete, integrated, virtual, unknown, software. Adapters of
+/// one kind keep the order of the platform.
 pub fn adapters() -> Vec<AdapterSummary> {
     let all = enumerate(&instance());
     all.iter().map(|a| AdapterSummary::of(&a.get_info())).collect()
 }
 
-/// Where adapters are looked for: the platform's own back-ends. A surface made from it
-/// brings its display with it.
+/// Creates the wgpu instance that lists adapters, for the platform's primary graphics APIs. A
+/// surface of this instance supplies its own display handle.
 pub fn instance() -> wgpu::Instance {
     let mut descriptor = wgpu::InstanceDescriptor::new_without_display_handle();
     descriptor.backends = wgpu::Backends::PRIMARY;
-    // Our indirect counts are written by our own kernels within limits.
+    // wgpu's validation of indirect counts is off: the kernels keep their counts within the
+    // limits.
     descriptor.flags = wgpu::InstanceFlags::empty();
     wgpu::Instance::new(descriptor)
 }
@@ -112,12 +71,11 @@ fn rank(kind: DeviceType) -> u8 {
     }
 }
 
-/// Place in `found` of the adapter that `choice` means; `None` for the CPU kernels.
+/// Returns the index in `found` of the adapter that `choice` selects; `None` for the CPU kernels.
 ///
-/// # Errors
-/// [`GpuError::NoAdapter`] where a GPU was asked for and none answers.
+/// [`GpuError::NoAdapter`] where `choice` requires a GPU and no adapter matches.
 pub fn choose(choice: &DeviceChoice, found: &[AdapterSummary]) -> Result<Option<usize>, GpuError> {
-    let place = match choice {
+    let index = match choice {
         DeviceChoice::Cpu => return Ok(None),
         DeviceChoice::Auto => return Ok(found.iter().position(|a| !a.software)),
         DeviceChoice::Gpu => (!found.is_empty()).then_some(0),
@@ -126,23 +84,23 @@ pub fn choose(choice: &DeviceChoice, found: &[AdapterSummary]) -> Result<Option<
             found.iter().position(|a| a.name.to_lowercase().contains(&name))
         }
     };
-    let names = || match found {
+    let listed = || match found {
         [] => "no adapter (is a Vulkan, Metal or DX12 driver installed?)".to_owned(),
         _ => found.iter().map(AdapterSummary::to_string).collect::<Vec<_>>().join("; "),
     };
-    match place {
-        Some(place) => Ok(Some(place)),
-        None => Err(GpuError::NoAdapter { asked: choice.to_string(), found: names() }),
+    match index {
+        Some(index) => Ok(Some(index)),
+        None => Err(GpuError::NoAdapter { requested: choice.to_string(), found: listed() }),
     }
 }
 
-/// The adapter that `choice` means; `None` for the CPU kernels.
+/// Returns the adapter that `choice` selects; `None` for the CPU kernels.
 pub(crate) fn find(choice: &DeviceChoice) -> Result<Option<wgpu::Adapter>, GpuError> {
     find_for(&instance(), choice, None)
 }
 
-/// The adapter of `instance` that `choice` means, among those that can show pictures on
-/// `surface` where there is one; `None` for the CPU kernels.
+/// Returns the adapter of `instance` that `choice` selects; `None` for the CPU kernels. With a
+/// `surface`, only adapters that can present to it are considered.
 ///
 /// # Errors
 /// As [`choose`].

@@ -1,5 +1,7 @@
-//! Attention over bilinear samples of feature maps: twin of
-//! [`crate::cpu::attention_gather`]. Kernel: kernels/attention_gather.wgsl.
+//! Attention over bilinear samples of feature maps (SubSplat, supplement A.2).
+//!
+//! CPU version: [`crate::cpu::attention_gather`]. WGSL: kernels/attention_gather.wgsl. Tests:
+//! tests/gpu/network.rs.
 
 use crate::abi::{AttentionGatherUniform, GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, Gather};
 use crate::gpu::buffers::Binding;
@@ -30,10 +32,10 @@ pub(crate) static ATTENTION_GATHER: Kernel = Kernel {
     ],
 };
 
-/// Arguments of one call, laid out as [`crate::cpu::attention_gather`] says.
+/// Arguments of one call, in the layout of [`crate::cpu::attention_gather`].
 #[derive(Clone, Copy, Debug)]
 pub struct AttentionGatherArgs<'a> {
-    /// Sizes and rules; at most [`GATHER_SAMPLES_MAX`] samples a parent and
+    /// Sizes and options; at most [`GATHER_SAMPLES_MAX`] samples per parent and
     /// [`GATHER_WEIGHTS_MAX`] samples × groups.
     pub gather: &'a Gather,
     /// `[cells, stride]`.
@@ -45,12 +47,12 @@ pub struct AttentionGatherArgs<'a> {
 }
 
 impl<'a> AttentionGatherArgs<'a> {
-    /// Floats of one parent's points.
+    /// Returns the floats of one parent's points.
     pub(super) fn points_row(&self) -> usize {
         2 * self.gather.views * self.gather.points_width()
     }
 
-    /// N, where all fits together.
+    /// Checks the arguments and returns N.
     pub(super) fn check(&self) -> Result<usize, GpuError> {
         let g = self.gather;
         let n = self.query.len() / g.query_width().max(1);
@@ -58,55 +60,60 @@ impl<'a> AttentionGatherArgs<'a> {
         let channels = g.dim + g.value.max(g.key.unwrap_or(0));
         let end = |l: &crate::abi::Level| l.first_cell + g.views * l.height * l.width;
         let cells = g.levels.iter().map(end).max().unwrap_or(0);
-        let wrong = |what, expected: String, got: String| {
-            Err(GpuError::Argument { kernel: ATTENTION_GATHER.name, what, expected, got })
+        let refuse = |argument, expected: String, got: String| {
+            Err(GpuError::Argument { kernel: ATTENTION_GATHER.name, argument, expected, got })
         };
         if g.samples() == 0 || g.samples() > GATHER_SAMPLES_MAX {
             let expected = format!("1 to {GATHER_SAMPLES_MAX}");
-            return wrong("samples per parent", expected, g.samples().to_string());
+            return refuse("samples per parent", expected, g.samples().to_string());
         }
         if !divides || g.samples() * g.groups > GATHER_WEIGHTS_MAX {
             let expected = format!("a divisor of E, at most {}", GATHER_WEIGHTS_MAX / g.samples());
-            return wrong("groups", expected, g.groups.to_string());
+            return refuse("groups", expected, g.groups.to_string());
         }
         if g.stride < channels {
-            return wrong("row of the maps", format!("{channels} floats"), g.stride.to_string());
+            return refuse(
+                "stride of the maps",
+                format!("{channels} floats"),
+                g.stride.to_string(),
+            );
         }
         let lengths = [
             ("query", self.query.len(), n * g.query_width()),
             ("points", self.points.len(), n * self.points_row()),
             ("maps", self.maps.len().min(cells * g.stride), cells * g.stride),
         ];
-        GpuError::unless_fitting(ATTENTION_GATHER.name, lengths).map(|()| n)
+        GpuError::check_lengths(ATTENTION_GATHER.name, lengths).map(|()| n)
     }
 
-    /// Parents of one call: what one binding holds of the widest of their rows.
+    /// Returns how many parents one call takes: the rows of the widest argument that one binding
+    /// holds.
     pub(super) fn parents_per_call(&self, gpu: &Gpu, floats: usize) -> usize {
         let widest = self.gather.query_width().max(self.points_row()).max(floats);
         gpu.rows_per_binding(widest)
     }
 
-    /// What the kernels are told of `parents`.
+    /// Returns the uniform for `parents`.
     pub(super) fn uniform(&self, parents: &Range<usize>) -> AttentionGatherUniform {
         let g = self.gather;
-        let number = |v: usize| v as u32;
+        let word = |v: usize| v as u32;
         let mut u = AttentionGatherUniform {
-            parents: number(parents.len()),
-            views: number(g.views),
-            levels: number(g.levels.len()),
-            points: number(g.points),
-            points_width: number(2 * g.points_width()),
-            dim: number(g.dim),
-            groups: number(g.groups),
-            stride: number(g.stride),
-            key: number(g.key.unwrap_or(0)),
+            parents: word(parents.len()),
+            views: word(g.views),
+            levels: word(g.levels.len()),
+            points: word(g.points),
+            points_width: word(2 * g.points_width()),
+            dim: word(g.dim),
+            groups: word(g.groups),
+            stride: word(g.stride),
+            key: word(g.key.unwrap_or(0)),
             has_key: u32::from(g.key.is_some()),
-            value: number(g.value),
+            value: word(g.value),
             renormalise: u32::from(g.renormalise),
             points_per_level: u32::from(g.points_per_level),
             half_pixel: if g.half_pixel { 0.5 } else { 0.0 },
             logit_scale: g.logit_scale as f32,
-            cells: number(self.maps.len() / g.stride.max(1)),
+            cells: word(self.maps.len() / g.stride.max(1)),
             point_gradient: u32::from(g.point_gradient),
             ..Default::default()
         };
@@ -114,20 +121,20 @@ impl<'a> AttentionGatherArgs<'a> {
             let dropped = (drop.probability * (1u64 << 53) as f64).ceil() as u64;
             u.drops = 1;
             u.kept_factor = (1.0 / (1.0 - drop.probability)) as f32;
-            u.first_parent = number(drop.first_parent + parents.start);
+            u.first_parent = word(drop.first_parent + parents.start);
             (u.seed_low, u.seed_high) = (drop.seed as u32, (drop.seed >> 32) as u32);
             (u.dropped_low, u.dropped_high) = (dropped as u32, (dropped >> 32) as u32);
         }
         u
     }
 
-    /// Height, width and first cell of each level.
+    /// Returns height, width and first cell of each level.
     pub(super) fn levels(&self) -> Vec<u32> {
         let levels = self.gather.levels.iter();
         levels.flat_map(|l| [l.height, l.width, l.first_cell].map(|v| v as u32)).collect()
     }
 
-    /// Query and points of `parents`.
+    /// Returns the query and points of `parents`.
     pub(super) fn rows(&self, parents: &Range<usize>) -> [&'a [f32]; 2] {
         let part = |of: &'a [f32], width: usize| {
             of.get(parents.start * width..parents.end * width).unwrap_or(&[])
@@ -137,11 +144,10 @@ impl<'a> AttentionGatherArgs<'a> {
 }
 
 impl Gpu {
-    /// Attention output `[N, E]`.
+    /// Computes the attention output `[N, E]`.
     ///
-    /// # Errors
-    /// Lengths that do not fit, more samples or groups than the kernel holds; anything
-    /// the device refuses.
+    /// [`GpuError::Argument`] for inconsistent lengths, or for more samples or groups than the
+    /// kernel supports; errors of the device.
     pub fn attention_gather(&self, args: &AttentionGatherArgs) -> Result<Vec<f32>, GpuError> {
         let n = args.check()?;
         let dim = args.gather.dim;

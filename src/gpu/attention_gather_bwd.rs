@@ -1,6 +1,7 @@
-//! Gradients of the attention gather: twin of the backward half of
-//! [`crate::cpu::attention_gather`]. Kernels: kernels/attention_gather_bwd.wgsl, invert and
-//! kernels/attention_gather_scatter.wgsl.
+//! Gradients of the attention gather.
+//!
+//! CPU version: [`crate::cpu::attention_gather`]. WGSL: kernels/attention_gather_bwd.wgsl,
+//! kernels/invert.wgsl and kernels/attention_gather_scatter.wgsl. Tests: tests/gpu/network.rs.
 
 use crate::gpu::attention_gather::AttentionGatherArgs;
 use crate::gpu::buffers::{Binding, Buffer};
@@ -49,7 +50,7 @@ pub(crate) static ATTENTION_GATHER_SCATTER: Kernel = Kernel {
     ],
 };
 
-/// Threads of a workgroup of the scatter.
+/// Threads of a workgroup of the scatter kernel.
 const THREADS: usize = 64;
 
 /// Gradients of the attention gather.
@@ -64,10 +65,9 @@ pub struct AttentionGatherGradients {
 }
 
 impl Gpu {
-    /// Gradients for the gradient `grad` `[N, E]` of the output.
+    /// Computes the gradients for `grad` `[N, E]`, the gradient of the output.
     ///
-    /// # Errors
-    /// Those of [`Gpu::attention_gather`]; another length of `grad`.
+    /// As [`Gpu::attention_gather`]; [`GpuError::Argument`] for another length of `grad`.
     pub fn attention_gather_backward(
         &self,
         args: &AttentionGatherArgs,
@@ -76,7 +76,7 @@ impl Gpu {
         let n = args.check()?;
         let g = args.gather;
         let lengths = [("gradient of the output", grad.len(), n * g.dim)];
-        GpuError::unless_fitting(ATTENTION_GATHER_BWD.name, lengths)?;
+        GpuError::check_lengths(ATTENTION_GATHER_BWD.name, lengths)?;
         let maps = self.upload("feature maps", args.maps)?;
         let levels = self.upload("feature levels", &args.levels())?;
         let mut sum =
@@ -85,7 +85,7 @@ impl Gpu {
         let widest = row.max(g.samples() * (4 + 2 * g.groups)).max(g.dim);
         for parents in Self::chunks(n, args.parents_per_call(self, widest)) {
             let grad = grad.get(parents.start * g.dim..parents.end * g.dim).unwrap_or(&[]);
-            let (d_maps, rows) = self.gather_bwd(args, (&maps, &levels), &parents, grad)?;
+            let (d_maps, rows) = self.gather_bwd(args, &maps, &levels, &parents, grad)?;
             for row in rows.chunks_exact(row) {
                 let (query, points) = row.split_at(g.query_width());
                 sum.query.extend_from_slice(query);
@@ -96,11 +96,13 @@ impl Gpu {
         Ok(sum)
     }
 
-    /// What some parents add to the maps' gradient, and their rows of query and points.
+    /// Computes the contribution of some parents to the gradient of the maps, and the gradients
+    /// of their rows of query and points.
     fn gather_bwd(
         &self,
         args: &AttentionGatherArgs,
-        (maps, levels): (&Buffer, &Buffer),
+        maps: &Buffer,
+        levels: &Buffer,
         parents: &Range<usize>,
         grad: &[f32],
     ) -> Result<(Vec<f32>, Vec<f32>), GpuError> {

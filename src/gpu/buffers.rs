@@ -1,8 +1,8 @@
-//! Device memory: a pool of buffers, uploads, read-back, and cutting what exceeds a
+//! Device memory: a pool of buffers, uploads, read-back, and division of arrays that exceed a
 //! binding.
 //!
-//! A [`Buffer`] goes back to its pool when its last owner drops it, and its bytes stay as
-//! they are: a kernel that needs zeros clears them ([`super::Commands::clear`]).
+//! A dropped [`Buffer`] returns to its pool with its bytes unchanged. A kernel that needs zeros
+//! clears the buffer first ([`super::Commands::clear`]).
 
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
@@ -15,12 +15,12 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use wgpu::BufferUsages;
 
-/// What a buffer of the pool is for.
+/// Purpose of a buffer of the pool.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Use {
-    /// Kernels read and write it.
+    /// Kernels read and write the buffer.
     Work,
-    /// The CPU reads it.
+    /// The CPU reads the buffer.
     Staging,
 }
 
@@ -39,19 +39,19 @@ impl Use {
     }
 }
 
-/// Bytes are a multiple of this: no binding and no copy is empty or odd.
-const GRAIN: u64 = 256;
-/// Bytes of a kernel's smallest argument, an array of one vec4.
-const LEAST: u64 = 16;
-/// How long a thread whose poll found the device idle waits for another thread, whose
-/// poll took the mapping's answer, to hand it over.
-const HANDOVER: Duration = Duration::from_secs(60);
+/// Granularity of allocations, bytes: no binding and no copy is empty or unaligned.
+const SIZE_GRANULARITY: u64 = 256;
+/// Minimum size of a kernel's argument, bytes: an array of one vec4.
+const BINDING_BYTES_MIN: u64 = 16;
+/// Maximum wait for the result of a mapping. Another thread's poll may have completed the mapping
+/// and still be delivering its result.
+const MAPPING_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Buffers that wait for their next use.
+/// Free buffers, and the amount of memory allocated.
 #[derive(Debug)]
 pub(crate) struct Pool {
     free: Mutex<Vec<(Use, wgpu::Buffer)>>,
-    held: AtomicU64,
+    allocated: AtomicU64,
     buffer_max: u64,
     binding_max: u64,
 }
@@ -60,24 +60,24 @@ impl Pool {
     pub(crate) fn new(limits: &wgpu::Limits) -> Arc<Self> {
         Arc::new(Self {
             free: Mutex::default(),
-            held: AtomicU64::new(0),
+            allocated: AtomicU64::new(0),
             buffer_max: limits.max_buffer_size,
             binding_max: limits.max_storage_buffer_binding_size,
         })
     }
 
-    /// Bytes that are allocated for `bytes`: few sizes, so that frames of slightly
-    /// different sizes share buffers.
+    /// Returns the allocation size for `bytes`. Few distinct sizes exist, so that frames of
+    /// slightly different sizes share buffers.
     fn size_class(&self, bytes: u64) -> u64 {
-        let bytes = bytes.max(1).next_multiple_of(GRAIN);
-        let step = (bytes.next_power_of_two() / 8).max(GRAIN);
+        let bytes = bytes.max(1).next_multiple_of(SIZE_GRANULARITY);
+        let step = (bytes.next_power_of_two() / 8).max(SIZE_GRANULARITY);
         bytes.next_multiple_of(step).min(self.buffer_max.max(bytes))
     }
 
     fn take(&self, purpose: Use, size: u64) -> Option<wgpu::Buffer> {
         let mut free = self.free.lock().unwrap_or_else(PoisonError::into_inner);
-        let place = free.iter().position(|(u, b)| *u == purpose && b.size() == size)?;
-        Some(free.swap_remove(place).1)
+        let index = free.iter().position(|(u, b)| *u == purpose && b.size() == size)?;
+        Some(free.swap_remove(index).1)
     }
 }
 
@@ -87,14 +87,14 @@ struct Inner {
     purpose: Use,
     bytes: u64,
     pool: Arc<Pool>,
-    /// Its mapping failed, so no one can say what state it is in.
-    spoilt: AtomicBool,
+    /// Whether a mapping failed: the state of the buffer is then unknown.
+    mapping_failed: AtomicBool,
 }
 
 impl Drop for Inner {
     fn drop(&mut self) {
-        if self.spoilt.load(Relaxed) {
-            self.pool.held.fetch_sub(self.raw.size(), Relaxed);
+        if self.mapping_failed.load(Relaxed) {
+            self.pool.allocated.fetch_sub(self.raw.size(), Relaxed);
             self.raw.destroy();
             return;
         }
@@ -103,12 +103,12 @@ impl Drop for Inner {
     }
 }
 
-/// Device memory on loan from the pool. Clones are the same memory.
+/// Device memory of the pool. Clones share the same memory.
 #[derive(Clone, Debug)]
 pub struct Buffer(Arc<Inner>);
 
 impl Buffer {
-    /// Bytes asked for (the allocation may be larger).
+    /// Returns the requested size, bytes. The allocation may be larger.
     pub fn bytes(&self) -> u64 {
         self.0.bytes
     }
@@ -117,13 +117,13 @@ impl Buffer {
         &self.0.raw
     }
 
-    /// The part that holds `range` (bytes; starts at a multiple of 256).
+    /// Returns the binding of `range`, bytes, which starts at a multiple of 256.
     pub(crate) fn part(&self, range: Range<u64>) -> Binding {
         Binding { buffer: self.clone(), offset: range.start, bytes: range.end - range.start }
     }
 }
 
-/// A buffer, or a part of it, as a kernel's argument.
+/// A buffer, or a part of one, as a kernel's argument.
 #[derive(Clone, Debug)]
 pub(crate) struct Binding {
     pub(crate) buffer: Buffer,
@@ -148,58 +148,62 @@ impl Binding {
 }
 
 impl Gpu {
-    /// Memory for `count` values of `T`, whatever it held before.
+    /// Allocates uninitialised memory for `count` values of `T`.
     ///
     /// # Errors
     /// [`GpuError::TooSmall`] above the binding limit, [`GpuError::OutOfMemory`].
     pub(crate) fn empty<T: Pod>(
         &self,
-        what: &'static str,
+        label: &'static str,
         count: usize,
     ) -> Result<Buffer, GpuError> {
         let bytes = size_of::<T>() as u64 * count as u64;
-        self.fits(what, bytes)?;
-        self.allocate(what, Use::Work, bytes)
+        self.check_binding(label, bytes)?;
+        self.allocate(label, Use::Work, bytes)
     }
 
-    fn fits(&self, what: &'static str, needed: u64) -> Result<(), GpuError> {
+    fn check_binding(&self, resource: &'static str, needed: u64) -> Result<(), GpuError> {
         let limit = self.pool.binding_max.min(self.pool.buffer_max);
         if needed > limit {
-            return Err(GpuError::TooSmall { what, needed, limit });
+            return Err(GpuError::TooSmall { resource, needed, limit });
         }
         Ok(())
     }
 
-    fn allocate(&self, what: &'static str, purpose: Use, bytes: u64) -> Result<Buffer, GpuError> {
+    fn allocate(&self, label: &'static str, purpose: Use, bytes: u64) -> Result<Buffer, GpuError> {
         let size = self.pool.size_class(bytes);
         let raw = match self.pool.take(purpose, size) {
             Some(raw) => raw,
             None => {
                 let usage = purpose.usages();
-                let label = Some(what);
-                let new = wgpu::BufferDescriptor { label, size, usage, mapped_at_creation: false };
-                let raw = self.checked(what, || Ok(self.device.create_buffer(&new)))?;
-                self.pool.held.fetch_add(size, Relaxed);
+                let new = wgpu::BufferDescriptor {
+                    label: Some(label),
+                    size,
+                    usage,
+                    mapped_at_creation: false,
+                };
+                let raw = self.checked(label, || Ok(self.device.create_buffer(&new)))?;
+                self.pool.allocated.fetch_add(size, Relaxed);
                 raw
             }
         };
-        let bytes = bytes.max(LEAST).next_multiple_of(4);
-        let (pool, spoilt) = (self.pool.clone(), AtomicBool::new(false));
-        Ok(Buffer(Arc::new(Inner { raw, purpose, bytes, pool, spoilt })))
+        let bytes = bytes.max(BINDING_BYTES_MIN).next_multiple_of(4);
+        let (pool, mapping_failed) = (self.pool.clone(), AtomicBool::new(false));
+        Ok(Buffer(Arc::new(Inner { raw, purpose, bytes, pool, mapping_failed })))
     }
 
-    /// `data` in device memory.
+    /// Copies `data` to device memory.
     ///
     /// # Errors
     /// As [`Gpu::empty`].
     pub(crate) fn upload<T: Pod>(
         &self,
-        what: &'static str,
+        label: &'static str,
         data: &[T],
     ) -> Result<Buffer, GpuError> {
-        let buffer = self.empty::<T>(what, data.len())?;
+        let buffer = self.empty::<T>(label, data.len())?;
         if !data.is_empty() {
-            self.checked(what, || {
+            self.checked(label, || {
                 self.queue.write_buffer(buffer.raw(), 0, bytemuck::cast_slice(data));
                 Ok(())
             })?;
@@ -207,7 +211,7 @@ impl Gpu {
         Ok(buffer)
     }
 
-    /// A kernel's uniform.
+    /// Copies a kernel's uniform to device memory.
     ///
     /// # Errors
     /// As [`Gpu::empty`].
@@ -215,28 +219,28 @@ impl Gpu {
         self.upload("uniform", std::slice::from_ref(value))
     }
 
-    /// How many rows of `floats` numbers fit one binding.
+    /// Returns how many rows of `floats` numbers one binding holds.
     pub(crate) fn rows_per_binding(&self, floats: usize) -> usize {
         let limit = self.pool.binding_max.min(self.pool.buffer_max);
         (limit / (4 * floats.max(1)) as u64) as usize
     }
 
-    /// Row ranges of at most `most` rows that together are `rows`.
-    pub(crate) fn chunks(rows: usize, most: usize) -> impl Iterator<Item = Range<usize>> {
-        let most = most.max(1);
-        (0..rows.div_ceil(most)).map(move |i| i * most..((i + 1) * most).min(rows))
+    /// Divides `0..rows` into ranges of at most `max_rows` rows.
+    pub(crate) fn chunks(rows: usize, max_rows: usize) -> impl Iterator<Item = Range<usize>> {
+        let max_rows = max_rows.max(1);
+        (0..rows.div_ceil(max_rows)).map(move |i| i * max_rows..((i + 1) * max_rows).min(rows))
     }
 
-    /// Bytes of device memory that are allocated, in use or waiting.
-    pub fn held_bytes(&self) -> u64 {
-        self.pool.held.load(Relaxed)
+    /// Returns the allocated device memory, bytes, free buffers included.
+    pub fn allocated_bytes(&self) -> u64 {
+        self.pool.allocated.load(Relaxed)
     }
 
-    /// Gives the memory that no one uses back to the driver.
+    /// Returns the free buffers to the driver.
     pub fn trim(&self) {
         let mut free = self.pool.free.lock().unwrap_or_else(PoisonError::into_inner);
         for (_, buffer) in free.drain(..) {
-            self.pool.held.fetch_sub(buffer.size(), Relaxed);
+            self.pool.allocated.fetch_sub(buffer.size(), Relaxed);
             buffer.destroy();
         }
     }
@@ -246,7 +250,7 @@ impl Gpu {
     }
 }
 
-/// Values on their way back; taken after the commands that copy them were submitted.
+/// A pending read-back; its values are available after the submit of the commands that copy them.
 #[derive(Debug)]
 pub(crate) struct Reading<T> {
     pub(crate) staging: Buffer,
@@ -257,15 +261,14 @@ pub(crate) struct Reading<T> {
 impl<T: Pod> Reading<T> {
     /// Waits for the device and returns the values.
     ///
-    /// # Errors
-    /// [`GpuError::Lost`], or what the driver had against the mapping.
+    /// [`GpuError::Lost`]; [`GpuError::Refused`] where the driver rejects the mapping.
     pub(crate) fn take(self, gpu: &Gpu) -> Result<Vec<T>, GpuError> {
         let mut out = vec![T::zeroed(); self.count];
         self.take_into(gpu, &mut out)?;
         Ok(out)
     }
 
-    /// [`Reading::take`] into `out`, which is as long.
+    /// Waits as [`Reading::take`] does and copies the values to `out`, whose length is the same.
     ///
     /// # Errors
     /// As [`Reading::take`].
@@ -274,20 +277,20 @@ impl<T: Pod> Reading<T> {
             return Ok(());
         }
         let refused =
-            |reason: String| GpuError::Refused { what: "the read-back".to_owned(), reason };
+            |reason: String| GpuError::Refused { operation: "the read-back".to_owned(), reason };
         let read = gpu.checked("the read-back", || {
             let slice = self.staging.raw().slice(..self.staging.bytes());
-            let (answer, answered) = channel();
+            let (sender, receiver) = channel();
             slice.map_async(wgpu::MapMode::Read, move |done| {
-                // The receiver is gone only where this read-back was given up.
-                answer.send(done).ok();
+                // Sending fails only after this read-back was abandoned.
+                sender.send(done).ok();
             });
-            let waited = gpu.device.poll(wgpu::PollType::wait_indefinitely());
-            waited.map_err(|e| refused(e.to_string()))?;
-            match answered.recv_timeout(HANDOVER) {
+            let polled = gpu.device.poll(wgpu::PollType::wait_indefinitely());
+            polled.map_err(|e| refused(e.to_string()))?;
+            match receiver.recv_timeout(MAPPING_TIMEOUT) {
                 Ok(done) => done.map_err(|e| refused(e.to_string()))?,
                 Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => {
-                    return Err(refused("the device did not answer".to_owned()));
+                    return Err(refused("the device did not complete the mapping".to_owned()));
                 }
             }
             let view = slice.get_mapped_range().map_err(|e| refused(e.to_string()))?;
@@ -300,7 +303,7 @@ impl<T: Pod> Reading<T> {
             Ok(())
         });
         if read.is_err() {
-            self.staging.0.spoilt.store(true, Relaxed);
+            self.staging.0.mapping_failed.store(true, Relaxed);
         }
         read
     }

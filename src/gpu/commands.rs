@@ -1,4 +1,4 @@
-//! A list of kernel calls that goes to the device in one submit, timed by stage.
+//! A list of kernel calls that is submitted at once and timed by stage.
 
 use crate::gpu::buffers::{Binding, Buffer, Reading};
 use crate::gpu::device::Gpu;
@@ -9,18 +9,18 @@ use std::marker::PhantomData;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// How many workgroups a call takes.
+/// Number of workgroups of a dispatch.
 #[derive(Clone, Debug)]
 pub(crate) enum Groups {
-    /// Along x, y and z.
+    /// Counts along x, y and z.
     Of([u32; 3]),
-    /// Three u32 of a buffer, at this byte: a kernel before it says how many.
+    /// Three u32 of a buffer at this byte offset, written by an earlier kernel.
     Indirect(Buffer, u64),
 }
 
 impl Groups {
-    /// Enough workgroups of `size` threads for `count` threads, spread over x and y where
-    /// one dimension does not hold them (WebGPU: 65,535); kernels number them with
+    /// Returns workgroups of `size` threads for at least `count` threads. Counts above the limit
+    /// of one dimension (WebGPU: 65,535) are spread over x and y; kernels compute the index with
     /// `workgroup_number` of kernels/shared/grid.wgsl.
     pub(crate) fn of(count: usize, size: usize) -> Self {
         Self::Of(spread(count.div_ceil(size.max(1))))
@@ -34,16 +34,16 @@ impl Groups {
     }
 }
 
-/// Most workgroups along one dimension of a dispatch (WebGPU's default limit).
+/// Maximum number of workgroups along one dimension of a dispatch (WebGPU's default limit).
 pub(crate) const GROUPS_MAX: usize = 65_535;
 
-/// `groups` workgroups as x × y, with as few to spare as whole rows allow.
+/// Divides `groups` workgroups into x × y, with fewer than y surplus workgroups.
 fn spread(groups: usize) -> [u32; 3] {
     let y = groups.div_ceil(GROUPS_MAX).max(1);
     [groups.div_ceil(y) as u32, y as u32, 1]
 }
 
-/// Encodes something that reads these.
+/// Encodes commands that read the bindings.
 type Draw = Box<dyn FnOnce(&mut wgpu::CommandEncoder, &[Binding])>;
 
 enum Step {
@@ -54,7 +54,7 @@ enum Step {
     Draw(Vec<Binding>, Draw),
 }
 
-/// Kernel calls in order; nothing reaches the device before [`Commands::submit`].
+/// Kernel calls in order; [`Commands::submit`] sends them to the device.
 pub(crate) struct Commands<'g> {
     gpu: &'g Gpu,
     name: &'static str,
@@ -62,12 +62,12 @@ pub(crate) struct Commands<'g> {
     steps: Vec<Step>,
 }
 
-/// Stages whose time is taken, in one submit.
+/// Maximum number of timed passes in one submit.
 const STAGES_MAX: u32 = 64;
 
 impl Gpu {
-    /// An empty list of calls; with `timed`, each stage's time is taken where the device
-    /// has timestamps.
+    /// Creates an empty list of calls. With `timed`, each stage is timed where the device has
+    /// timestamps.
     pub(crate) fn commands(&self, name: &'static str, timed: bool) -> Commands<'_> {
         let timed = timed && self.has_timestamps();
         Commands { gpu: self, name, timed, steps: Vec::new() }
@@ -75,16 +75,15 @@ impl Gpu {
 }
 
 impl Commands<'_> {
-    /// What follows is timed under `name`.
+    /// Times the following calls under `name`.
     pub(crate) fn stage(&mut self, name: &'static str) {
         self.steps.push(Step::Stage(name));
     }
 
-    /// Calls `kernel`.
+    /// Appends a call of `kernel`.
     ///
-    /// # Errors
-    /// The kernel does not compile, or takes another number of arguments; an argument is
-    /// above the binding limit.
+    /// The kernel does not compile, has another number of arguments, or a count exceeds the
+    /// dispatch limit.
     pub(crate) fn run(
         &mut self,
         kernel: &'static Kernel,
@@ -95,7 +94,7 @@ impl Commands<'_> {
         if bindings.len() != kernel.bindings.len() {
             return Err(GpuError::Argument {
                 kernel: kernel.name,
-                what: "arguments",
+                argument: "arguments",
                 expected: kernel.bindings.len().to_string(),
                 got: bindings.len().to_string(),
             });
@@ -104,19 +103,19 @@ impl Commands<'_> {
             && x.max(y).max(z) as usize > GROUPS_MAX
         {
             let (needed, limit) = (u64::from(x.max(y).max(z)), GROUPS_MAX as u64);
-            return Err(GpuError::TooSmall { what: "a dispatch, workgroups", needed, limit });
+            return Err(GpuError::TooSmall { resource: "a dispatch, workgroups", needed, limit });
         }
         let pipeline = self.gpu.pipeline(kernel, constants)?;
         self.steps.push(Step::Run { pipeline, bindings: bindings.to_vec(), groups });
         Ok(())
     }
 
-    /// Fills `buffer` with zeros.
+    /// Appends a command that fills `buffer` with zeros.
     pub(crate) fn clear(&mut self, buffer: &Buffer) {
         self.steps.push(Step::Clear(buffer.clone()));
     }
 
-    /// The first `count` values of `buffer`, as they are at this point.
+    /// Appends a copy of the first `count` values of `buffer` to host-readable memory.
     ///
     /// # Errors
     /// Out of memory.
@@ -134,7 +133,7 @@ impl Commands<'_> {
         Ok(Reading { staging, count, kind: PhantomData })
     }
 
-    /// Something else than a kernel call, a render pass say, that reads `bindings`.
+    /// Appends other commands, such as a render pass, that read `bindings`.
     pub(crate) fn draw(
         &mut self,
         bindings: Vec<Binding>,
@@ -143,10 +142,9 @@ impl Commands<'_> {
         self.steps.push(Step::Draw(bindings, Box::new(f)));
     }
 
-    /// Hands all to the device in one submit, and does not wait for it.
+    /// Submits all calls to the device at once, without waiting for them.
     ///
-    /// # Errors
-    /// What the device refuses; the device lost.
+    /// Errors of the device, such as [`GpuError::Refused`] and [`GpuError::Lost`].
     pub(crate) fn submit(self) -> Result<Submitted, GpuError> {
         let Self { gpu, name, timed, steps } = self;
         gpu.checked(name, || {
@@ -155,24 +153,24 @@ impl Commands<'_> {
             let mut encoder =
                 gpu.device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label });
             let mut stage = name;
-            // Held until the submit: a buffer that went back to the pool earlier could be
-            // overwritten by an upload that comes before it.
-            let mut held: Vec<Binding> = Vec::new();
+            // Buffers stay referenced until the submit. An upload that comes before the submit
+            // could otherwise overwrite a buffer that has returned to the pool.
+            let mut referenced: Vec<Binding> = Vec::new();
             let mut steps = steps.into_iter().peekable();
             while let Some(step) = steps.next() {
                 match step {
                     Step::Stage(name) => stage = name,
                     Step::Clear(buffer) => {
                         encoder.clear_buffer(buffer.raw(), 0, None);
-                        held.push(Binding::from(&buffer));
+                        referenced.push(Binding::from(&buffer));
                     }
                     Step::Copy { from, to, bytes } => {
                         encoder.copy_buffer_to_buffer(from.raw(), 0, to.raw(), 0, bytes);
-                        held.extend([&from, &to].map(Binding::from));
+                        referenced.extend([&from, &to].map(Binding::from));
                     }
                     Step::Draw(bindings, draw) => {
                         draw(&mut encoder, &bindings);
-                        held.extend(bindings);
+                        referenced.extend(bindings);
                     }
                     Step::Run { pipeline, bindings, groups } => {
                         let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
@@ -180,13 +178,13 @@ impl Commands<'_> {
                             timestamp_writes: clock.as_mut().and_then(|c| c.next(stage)),
                         });
                         encode(gpu, &mut pass, &pipeline, &bindings, &groups);
-                        held.extend(bindings);
-                        held.extend(groups.buffer());
+                        referenced.extend(bindings);
+                        referenced.extend(groups.buffer());
                         while let Some(Step::Run { .. }) = steps.peek() {
                             if let Some(Step::Run { pipeline, bindings, groups }) = steps.next() {
                                 encode(gpu, &mut pass, &pipeline, &bindings, &groups);
-                                held.extend(bindings);
-                                held.extend(groups.buffer());
+                                referenced.extend(bindings);
+                                referenced.extend(groups.buffer());
                             }
                         }
                     }
@@ -194,7 +192,7 @@ impl Commands<'_> {
             }
             let clock = clock.map(|c| c.finish(gpu, &mut encoder)).transpose()?;
             gpu.queue.submit([encoder.finish()]);
-            drop(held);
+            drop(referenced);
             Ok(Submitted { clock })
         })
     }
@@ -227,7 +225,7 @@ fn encode(
     }
 }
 
-/// Timestamps at the beginning and end of each pass.
+/// Timestamp queries at the beginning and end of each pass.
 struct Clock {
     queries: wgpu::QuerySet,
     stages: Vec<&'static str>,
@@ -244,15 +242,15 @@ impl Clock {
     }
 
     fn next(&mut self, stage: &'static str) -> Option<wgpu::ComputePassTimestampWrites<'_>> {
-        let place = 2 * self.stages.len() as u32;
-        if place >= 2 * STAGES_MAX {
+        let index = 2 * self.stages.len() as u32;
+        if index >= 2 * STAGES_MAX {
             return None;
         }
         self.stages.push(stage);
         Some(wgpu::ComputePassTimestampWrites {
             query_set: &self.queries,
-            beginning_of_pass_write_index: Some(place),
-            end_of_pass_write_index: Some(place + 1),
+            beginning_of_pass_write_index: Some(index),
+            end_of_pass_write_index: Some(index + 1),
         })
     }
 
@@ -278,13 +276,14 @@ impl Clock {
     }
 }
 
-/// Calls that are with the device.
+/// Calls that the device executes.
 pub(crate) struct Submitted {
     clock: Option<(Vec<&'static str>, Reading<u64>)>,
 }
 
 impl Submitted {
-    /// Time on the device by stage, in order; empty where it was not taken. Waits.
+    /// Waits and returns the time of each stage on the device, in order; empty for untimed
+    /// commands.
     ///
     /// # Errors
     /// The device lost.

@@ -1,11 +1,11 @@
-//! One opened GPU: device, queue, limits, and what has gone wrong with it.
+//! One opened GPU: device, queue, limits, and the errors that its driver reports.
 //!
-//! A [`Gpu`] opened here asks for WebGPU's default limits, so that what runs on it runs
-//! in a browser too, but for sizes: bindings, buffers and textures are as large as the
-//! adapter has them ([`limits_of`]). An application hands in its own device with
-//! [`Gpu::from_device`].
+//! [`Gpu::open`] requests WebGPU's default limits, so that the kernels also run in a browser.
+//! Only the sizes of bindings, buffers and textures are those of the adapter ([`limits_of`]).
+//! [`Gpu::from_device`] takes an application's own device.
 
-use crate::gpu::adapter::{AdapterSummary, DeviceChoice, find};
+use crate::device::DeviceChoice;
+use crate::gpu::adapter::{AdapterSummary, find};
 use crate::gpu::buffers::Pool;
 use crate::gpu::error::GpuError;
 use crate::gpu::pipelines::Pipelines;
@@ -13,42 +13,42 @@ use std::fmt;
 use std::sync::atomic::AtomicUsize;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
-/// Most bytes of a binding or buffer, where the adapter has more: kernels count words in 32
-/// bits, and some drivers bytes in 31.
+/// Maximum size of a binding or buffer, bytes: kernels count words in 32 bits, and some drivers
+/// count bytes in 31.
 const BINDING_MAX: u64 = 1 << 30;
 
-/// What devices are asked for: WebGPU's default limits, and the adapter's own sizes.
+/// Returns the limits that [`Gpu::open`] requests: WebGPU's defaults with the adapter's own
+/// sizes.
 pub fn limits_of(adapter: &wgpu::Adapter) -> wgpu::Limits {
-    let (own, usual) = (adapter.limits(), wgpu::Limits::default());
+    let (own, default) = (adapter.limits(), wgpu::Limits::default());
     let binding = own.max_storage_buffer_binding_size.min(BINDING_MAX);
     wgpu::Limits {
-        max_storage_buffer_binding_size: binding.max(usual.max_storage_buffer_binding_size),
-        max_buffer_size: own.max_buffer_size.min(BINDING_MAX).max(usual.max_buffer_size),
+        max_storage_buffer_binding_size: binding.max(default.max_storage_buffer_binding_size),
+        max_buffer_size: own.max_buffer_size.min(BINDING_MAX).max(default.max_buffer_size),
         max_texture_dimension_2d: own.max_texture_dimension_2d,
-        ..usual
+        ..default
     }
 }
 
-/// An opened GPU with its buffers and compiled kernels. Share it in an [`Arc`].
+/// An opened GPU with its buffers and compiled kernels. Threads share it in an [`Arc`].
 pub struct Gpu {
     pub(crate) device: wgpu::Device,
     pub(crate) queue: wgpu::Queue,
     pub(crate) limits: wgpu::Limits,
     pub(crate) pool: Arc<Pool>,
     pub(crate) pipelines: Pipelines,
-    /// (splat, tile) pairs that frames have needed room for: where the next rasterizer
-    /// begins.
+    /// Largest capacity for (splat, tile) pairs of any frame: the start value of new rasterizers.
     pub(crate) pairs: AtomicUsize,
     summary: AdapterSummary,
     timestamps: bool,
     health: Arc<Health>,
 }
 
-/// What the driver reported out of turn.
+/// Errors that the driver reports asynchronously.
 #[derive(Debug, Default)]
 struct Health {
     lost: OnceLock<String>,
-    /// An error outside any scope.
+    /// The last error outside every error scope.
     stray: Mutex<Option<String>>,
 }
 
@@ -63,11 +63,10 @@ impl fmt::Debug for Gpu {
 }
 
 impl Gpu {
-    /// Opens what `choice` means; `None` for the CPU kernels.
+    /// Opens the device that `choice` selects; `None` for the CPU kernels.
     ///
-    /// # Errors
-    /// [`GpuError::NoAdapter`] where a GPU was asked for and none answers;
-    /// [`GpuError::Device`] where its driver gives no device.
+    /// [`GpuError::NoAdapter`] where `choice` requires a GPU and no adapter matches;
+    /// [`GpuError::Device`] where the driver opens no device.
     pub fn open(choice: &DeviceChoice) -> Result<Option<Arc<Self>>, GpuError> {
         match find(choice)? {
             Some(adapter) => Self::from_adapter(&adapter).map(|gpu| Some(Arc::new(gpu))),
@@ -77,10 +76,10 @@ impl Gpu {
 
     fn from_adapter(adapter: &wgpu::Adapter) -> Result<Self, GpuError> {
         let summary = AdapterSummary::of(&adapter.get_info());
-        let wanted = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
+        let timestamps = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("subsplat"),
-            required_features: wanted,
+            required_features: timestamps,
             required_limits: limits_of(adapter),
             ..wgpu::DeviceDescriptor::default()
         };
@@ -92,13 +91,13 @@ impl Gpu {
         let stray = health.clone();
         // wgpu's own handler panics.
         device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| {
-            stray.stray.lock().unwrap_or_else(PoisonError::into_inner).replace(in_one_line(&e));
+            stray.stray.lock().unwrap_or_else(PoisonError::into_inner).replace(single_line(&e));
         }));
         Ok(Self::assemble(device, queue, summary, health))
     }
 
-    /// A device that belongs to the application, which keeps its own error handler.
-    /// Pictures can then be drawn to the application's textures.
+    /// Wraps a device of the application, which keeps its own error handler. Frames can be drawn
+    /// to textures of that device.
     pub fn from_device(device: wgpu::Device, queue: wgpu::Queue) -> Arc<Self> {
         let summary = AdapterSummary::of(&device.adapter_info());
         Arc::new(Self::assemble(device, queue, summary, Arc::default()))
@@ -131,69 +130,70 @@ impl Gpu {
         }
     }
 
-    /// The adapter behind it.
+    /// Returns the adapter of the device.
     pub fn adapter(&self) -> &AdapterSummary {
         &self.summary
     }
 
-    /// The wgpu device, for an application that draws beside us.
+    /// Returns the wgpu device, for an application's own commands.
     pub fn device(&self) -> &wgpu::Device {
         &self.device
     }
 
-    /// The wgpu queue of [`Gpu::device`].
+    /// Returns the wgpu queue of [`Gpu::device`].
     pub fn queue(&self) -> &wgpu::Queue {
         &self.queue
     }
 
-    /// Limits of the device: [`limits_of`] its adapter unless the application opened it.
+    /// Returns the limits of the device: [`limits_of`] its adapter, unless the application opened
+    /// it.
     pub fn limits(&self) -> &wgpu::Limits {
         &self.limits
     }
 
-    /// Whether stages can be timed on the device itself.
+    /// Returns whether the device supports timestamps.
     pub fn has_timestamps(&self) -> bool {
         self.timestamps
     }
 
-    /// Whether the device still answers.
+    /// Checks that the device is usable.
     ///
-    /// # Errors
-    /// [`GpuError::Lost`] once the driver has said so; [`GpuError::Refused`] for an
-    /// error that no call has returned, once.
+    /// [`GpuError::Lost`] after the driver reported the loss; [`GpuError::Refused`] for an error
+    /// that no call has returned yet, once.
     pub fn check(&self) -> Result<(), GpuError> {
         if let Some(reason) = self.health.lost.get() {
             return Err(GpuError::Lost { reason: reason.clone() });
         }
         let stray = self.health.stray.lock().unwrap_or_else(PoisonError::into_inner).take();
         match stray {
-            Some(reason) => Err(GpuError::Refused { what: "a command".to_owned(), reason }),
+            Some(reason) => Err(GpuError::Refused { operation: "a command".to_owned(), reason }),
             None => Ok(()),
         }
     }
 
-    /// Runs `f`, which talks to the device, and returns what the device had against it.
+    /// Runs `f`, which sends commands to the device, and returns the errors of the device.
     pub(crate) fn checked<T>(
         &self,
-        what: &str,
+        operation: &str,
         f: impl FnOnce() -> Result<T, GpuError>,
     ) -> Result<T, GpuError> {
         self.check()?;
         let scopes = Scopes::open(&self.device);
-        let done = f();
-        let found = scopes.close(what);
-        if found.is_err() {
-            // A device that is gone tells so when it is polled, and refuses all before.
+        let result = f();
+        let errors = scopes.close(operation);
+        if errors.is_err() {
+            // A lost device reports its loss only when it is polled; until then it rejects every
+            // command.
             self.device.poll(wgpu::PollType::Poll).ok();
         }
         self.check()?;
-        found?;
-        done
+        errors?;
+        result
     }
 }
 
-/// wgpu's words and their causes, which it puts on lines of their own.
-fn in_one_line(error: &wgpu::Error) -> String {
+/// Joins the lines of wgpu's message and its causes.
+fn single_line(error: &wgpu::Error) -> String {
     let text = error.to_string();
     let lines = text.lines().map(str::trim).filter(|l| !l.is_empty() && *l != "Caused by:");
     lines.collect::<Vec<_>>().join(": ")
@@ -208,16 +208,16 @@ impl Scopes {
         Self([Internal, Validation, OutOfMemory].map(|filter| device.push_error_scope(filter)))
     }
 
-    pub(crate) fn close(self, what: &str) -> Result<(), GpuError> {
-        let what = what.to_owned();
+    pub(crate) fn close(self, operation: &str) -> Result<(), GpuError> {
+        let operation = operation.to_owned();
         let [internal, validation, memory] = self.0;
-        // The last opened goes first.
+        // Scopes form a stack: the last one opened is popped first.
         let memory = pollster::block_on(memory.pop());
         let validation = pollster::block_on(validation.pop());
         let internal = pollster::block_on(internal.pop());
         match (memory, validation.or(internal)) {
-            (Some(_), _) => Err(GpuError::OutOfMemory { what }),
-            (None, Some(e)) => Err(GpuError::Refused { what, reason: in_one_line(&e) }),
+            (Some(_), _) => Err(GpuError::OutOfMemory { allocation: operation }),
+            (None, Some(e)) => Err(GpuError::Refused { operation, reason: single_line(&e) }),
             (None, None) => Ok(()),
         }
     }

@@ -1,85 +1,83 @@
-//! What can go wrong on a GPU, each case one that a caller can act upon: all of them
-//! leave the CPU kernels to fall back on.
+//! Errors of the GPU. After each of them the caller can use the CPU kernels instead.
 
 use thiserror::Error;
 
-/// Why work was not done on a GPU.
+/// An error of a GPU call. The call has no result.
 #[derive(Clone, Debug, Error, PartialEq)]
 pub enum GpuError {
-    /// No adapter answers to what was asked for.
-    #[error("no GPU: expected {asked}, found {found}")]
+    /// No adapter matches the requested device.
+    #[error("no GPU: expected {requested}, found {found}")]
     NoAdapter {
-        /// What was asked for.
-        asked: String,
-        /// What there is.
+        /// The requested device, or the size of the requested memory.
+        requested: String,
+        /// The adapters of this machine.
         found: String,
     },
-    /// The adapter gave no device.
+    /// The adapter opened no device.
     #[error("GPU {adapter}: no device: {reason}")]
     Device {
-        /// The adapter's own name.
+        /// Name of the adapter.
         adapter: String,
-        /// What the driver said.
+        /// Message of the driver.
         reason: String,
     },
-    /// Something is larger than the device takes.
-    #[error("GPU too small for {what}: expected at most {limit}, got {needed}")]
+    /// A call exceeds a limit of the device.
+    #[error("GPU too small for {resource}: expected at most {limit}, got {needed}")]
     TooSmall {
-        /// What, with its unit.
-        what: &'static str,
-        /// How much.
+        /// Resource and unit.
+        resource: &'static str,
+        /// Required amount.
         needed: u64,
         /// The device's limit.
         limit: u64,
     },
-    /// The device's memory is full.
-    #[error("GPU out of memory: {what}")]
+    /// The device has too little free memory.
+    #[error("GPU out of memory: {allocation}")]
     OutOfMemory {
-        /// What was asked for.
-        what: String,
+        /// The requested device, or the size of the requested memory.
+        allocation: String,
     },
-    /// The device went away: a reset, an unplugged or a destroyed device.
+    /// The device is lost: it was reset, unplugged or destroyed.
     #[error("GPU lost: {reason}")]
     Lost {
-        /// What the driver said.
+        /// Message of the driver.
         reason: String,
     },
-    /// The device refused a kernel or a command.
-    #[error("GPU refused {what}: {reason}")]
+    /// The device rejected a kernel or a command.
+    #[error("GPU refused {operation}: {reason}")]
     Refused {
-        /// Kernel or command.
-        what: String,
-        /// What wgpu said.
+        /// Rejected kernel or command.
+        operation: String,
+        /// Message of wgpu.
         reason: String,
     },
-    /// Arguments that do not fit one another.
-    #[error("GPU {kernel}: {what}: expected {expected}, got {got}")]
+    /// Arguments have inconsistent lengths or unsupported values.
+    #[error("GPU {kernel}: {argument}: expected {expected}, got {got}")]
     Argument {
         /// Kernel or stage.
         kernel: &'static str,
-        /// Argument.
-        what: &'static str,
-        /// What would fit.
+        /// Name of the argument.
+        argument: &'static str,
+        /// Expected length or value.
         expected: String,
-        /// What came.
+        /// Length or value found.
         got: String,
     },
 }
 
 impl GpuError {
-    /// Whether arguments of `kernel` fit one another: each with what came and what would fit.
+    /// Compares the lengths of arguments of `kernel`: name, length found, length expected.
     ///
-    /// # Errors
-    /// [`GpuError::Argument`] of the first that does not.
-    pub(crate) fn unless_fitting<const N: usize>(
+    /// [`GpuError::Argument`] for the first mismatch.
+    pub(crate) fn check_lengths<const N: usize>(
         kernel: &'static str,
         lengths: [(&'static str, usize, usize); N],
     ) -> Result<(), Self> {
         match lengths.into_iter().find(|(_, got, expected)| got != expected) {
             None => Ok(()),
-            Some((what, got, expected)) => {
+            Some((argument, got, expected)) => {
                 let (expected, got) = (expected.to_string(), got.to_string());
-                Err(Self::Argument { kernel, what, expected, got })
+                Err(Self::Argument { kernel, argument, expected, got })
             }
         }
     }

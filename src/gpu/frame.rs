@@ -1,5 +1,5 @@
-//! The parts of a frame as lists of calls: projection with the sort by depth, then a
-//! picture's (splat, tile) pairs and its pixels.
+//! Stages of a frame as lists of calls: projection with the sort by depth, then the (splat, tile)
+//! pairs and the pixels of a picture.
 
 use crate::abi::View;
 use crate::abi::{
@@ -17,26 +17,26 @@ use crate::gpu::raster_kernels::{
 use crate::gpu::scene::Scene;
 use crate::gpu::sort::{Sort, plan_of};
 
-/// Threads of a workgroup that takes one splat a thread.
+/// Threads of a workgroup whose threads process one splat each.
 pub(crate) const THREADS: usize = 64;
 
-/// How a picture's channels lie in memory.
+/// Memory layout of a picture's channels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Channels {
-    /// RGB pixel by pixel, then alpha, then depth sums.
+    /// RGB per pixel, then the plane of alpha, then the plane of depth sums.
     Interleaved,
     /// Five planes.
     Planes,
 }
 
-/// What projection writes of a part of the scene.
+/// Projected splats of a part of the scene.
 #[derive(Clone, Debug)]
 pub(crate) struct Store {
-    /// Splat of the scene that stands first.
+    /// Index in the scene of the first splat.
     pub(crate) first: usize,
     /// `[n, 12]`.
     pub(crate) footprints: Buffer,
-    /// `[n, 2]`: rectangles of tiles.
+    /// `[n, 2]`: packed rectangles of tiles.
     pub(crate) rectangles: Buffer,
 }
 
@@ -50,55 +50,57 @@ impl Store {
     }
 }
 
-/// The order of a scene's splats, and how many tiles each meets.
+/// Order of a scene's splats by depth, and their tile counts.
 #[derive(Debug)]
 pub(crate) struct Depths {
-    /// `[N]`: splats by depth.
+    /// `[N]`: indices of the splats in order of depth.
     pub(crate) order: Buffer,
-    /// `[N]`: tiles that a splat meets.
+    /// `[N]`: number of tiles that each splat intersects.
     pub(crate) counts: Buffer,
 }
 
-/// Where a frame's results lie on the device, and what its backward pass needs.
+/// Results of a frame on the device, and the inputs of its backward pass.
 #[derive(Debug)]
 pub(crate) struct FrameBuffers {
-    /// Of all splats.
+    /// Uniform of all splats.
     pub(crate) call: RasterUniform,
     /// `[5·H·W]`, see [`RasterUniform::step`].
     pub(crate) picture: Buffer,
-    /// Of the pairs.
+    /// Plan of the pairs.
     pub(crate) plan: Buffer,
     /// `[N, 12]`.
     pub(crate) footprints: Buffer,
     pub(crate) depths: Depths,
-    /// Place of the first pair of every splat, in the splats' order by depth.
+    /// Index of the first pair of every splat, in the splats' order by depth.
     pub(crate) offsets: Buffer,
-    /// Splat of every pair, as they were made.
+    /// Splat of every pair, in the order of `intersect`.
     pub(crate) owners: Buffer,
-    /// Places of the pairs, by tile.
+    /// Indices of the pairs, sorted by tile.
     pub(crate) pairs: Buffer,
-    /// First and past-the-last of `pairs` of every tile, and of those behind the last.
+    /// Half-open ranges of `pairs` per tile, and the range of the surplus pairs after the last
+    /// tile.
     pub(crate) ranges: Buffer,
-    /// `[H, W, 2]`: see kernels/rasterize.wgsl.
+    /// `[H, W, 2]`: final transmittance and end of the list (kernels/rasterize.wgsl).
     pub(crate) finals: Buffer,
 }
 
+/// Returns the bindings of whole buffers.
 pub(crate) fn bind<const N: usize>(buffers: [&Buffer; N]) -> [Binding; N] {
     buffers.map(Binding::from)
 }
 
-/// Pixels of a call's band.
+/// Returns the number of pixels of a call's band.
 pub(crate) fn pixels(call: &RasterUniform) -> usize {
     let [top, rows] = [call.top, call.rows].map(|t| t as usize * TILE_GPU);
     call.width as usize * rows.min((call.height as usize).saturating_sub(top))
 }
 
-/// Tiles of a call's band.
+/// Returns the number of tiles of a call's band.
 pub(crate) fn tiles(call: &RasterUniform) -> usize {
     call.columns as usize * call.rows as usize
 }
 
-/// Projects `scene` into `stores`, one for each of its parts, and sorts it by depth.
+/// Appends the projection of `scene` into `stores`, one for each part, and the sort by depth.
 pub(crate) fn project(
     gpu: &Gpu,
     commands: &mut Commands,
@@ -109,7 +111,7 @@ pub(crate) fn project(
     let n = scene.len;
     let counts = gpu.empty::<u32>("tile counts", n)?;
     let plan = gpu.upload("plan", &plan_of(n))?;
-    let mut depth = Sort::new(gpu, plan, Groups::of(n, GPU_BLOCK), n, true)?;
+    let mut depth = Sort::new(gpu, plan, Groups::of(n, GPU_BLOCK), n)?;
     commands.stage("project");
     for (part, store) in scene.parts.iter().zip(stores) {
         (call.first, call.count) = (part.first as u32, part.count as u32);
@@ -133,18 +135,18 @@ pub(crate) fn project(
     Ok(Depths { order, counts })
 }
 
-/// Where pairs begin: per splat by depth, and `sums`, behind whose blocks stands how many
-/// pairs there are.
+/// Indices of the first pairs.
 pub(crate) struct Offsets {
-    /// A plan of the splats.
+    /// Plan of the splats.
     splats: Buffer,
+    /// Sums of the blocks, then the number of pairs.
     sums: Buffer,
     /// `[N]`.
     pub(crate) offsets: Buffer,
 }
 
 impl Offsets {
-    /// Sums up the counts of `n` splats in their order by depth.
+    /// Appends the prefix sum of the tile counts of `n` splats, in their order by depth.
     pub(crate) fn record(
         gpu: &Gpu,
         commands: &mut Commands,
@@ -165,7 +167,7 @@ impl Offsets {
         Ok(Self { splats, sums, offsets })
     }
 
-    /// The pairs' own plan, within the call's room for them.
+    /// Appends the computation of the pairs' plan, limited to the call's capacity.
     pub(crate) fn plan(
         &self,
         gpu: &Gpu,
@@ -179,12 +181,14 @@ impl Offsets {
     }
 }
 
-/// Lists the pairs of a call's splats, which `store` holds, and draws them to `picture`.
+/// Appends the listing of the pairs of the call's splats, which `store` holds, and their
+/// rasterization to `picture`.
 pub(crate) fn composite(
     gpu: &Gpu,
     commands: &mut Commands,
     call: RasterUniform,
-    (store, depths): (Store, Depths),
+    store: Store,
+    depths: Depths,
     picture: &Buffer,
 ) -> Result<FrameBuffers, GpuError> {
     let (n, capacity) = (call.count as usize, call.capacity as usize);
@@ -196,7 +200,7 @@ pub(crate) fn composite(
     commands.stage("intersect");
     let groups = Groups::Indirect(plan.clone(), 0);
     let owners = gpu.empty::<u32>("owners of pairs", capacity)?;
-    let mut pairs = Sort::new(gpu, plan.clone(), groups, capacity, true)?;
+    let mut pairs = Sort::new(gpu, plan.clone(), groups, capacity)?;
     let bindings = bind([
         &whole,
         &store.footprints,
@@ -210,7 +214,7 @@ pub(crate) fn composite(
     commands.run(&INTERSECT, &[], &bindings, Groups::of(n, THREADS))?;
 
     commands.stage("sort by tile");
-    // The tile behind the last is one too.
+    // The surplus tile after the last one has a key, too.
     let tiles = tiles(&call);
     pairs.record(commands, u32::BITS - (tiles as u32).leading_zeros())?;
 
@@ -218,11 +222,11 @@ pub(crate) fn composite(
     let ranges = gpu.empty::<u32>("tile ranges", 2 * (tiles + 1))?;
     commands.clear(&ranges);
     let bindings = bind([&whole, &plan, &pairs.keys[0], &ranges]);
-    let each = Groups::Indirect(plan.clone(), 4 * PLAN_ELEMENT_GROUPS as u64);
-    commands.run(&RANGES, &[], &bindings, each)?;
+    let per_element = Groups::Indirect(plan.clone(), 4 * PLAN_ELEMENT_GROUPS as u64);
+    commands.run(&RANGES, &[], &bindings, per_element)?;
 
     commands.stage("rasterize");
-    let finals = gpu.empty::<u32>("ends of pixels", 2 * pixels(&call))?;
+    let finals = gpu.empty::<u32>("final states of pixels", 2 * pixels(&call))?;
     let [pairs, _] = pairs.values;
     let footprints = store.footprints;
     let bindings = bind([&whole, &footprints, &ranges, &pairs, &owners, picture, &finals]);
@@ -242,7 +246,7 @@ pub(crate) fn composite(
     })
 }
 
-/// The uniform of a call for all splats and the whole picture; capacity left out.
+/// Returns the uniform for all splats and the whole picture, without a capacity.
 pub(crate) fn uniform(
     scene: &Scene,
     camera: &Camera,
@@ -289,7 +293,7 @@ pub(crate) fn uniform(
         sh_degree: options.sh_degree.min(scene.sh_degree) as u32,
         sh_mvsplat: flag(options.sh_basis == ShBasis::Mvsplat),
         sh_shared: flag(options.sh_direction == ShDirection::Parent),
-        gain_lanes: scene.gain_lanes as u32,
+        gain_lanes: scene.gain_stride as u32,
         step,
         channel,
         ..RasterUniform::default()

@@ -1,6 +1,7 @@
-//! Lists of the entries that fall on each cell, so that gradients of cells are sums in a
-//! fixed order: what [`crate::cpu::plane_sweep`] and [`crate::cpu::attention_gather`] do
-//! by counting sorts and blocks. Kernel: kernels/invert.wgsl.
+//! Lists of the entries of each cell, so that gradients of cells are sums in a fixed order.
+//!
+//! The CPU kernels use counting sorts and blocks instead ([`crate::cpu::plane_sweep`],
+//! [`crate::cpu::attention_gather`]). WGSL: kernels/invert.wgsl.
 
 use crate::abi::InvertUniform;
 use crate::gpu::buffers::{Binding, Buffer};
@@ -26,7 +27,7 @@ pub(crate) static ORDER: Kernel = entry("order");
 /// Threads of a workgroup of `count` and `fill`.
 const THREADS: usize = 64;
 
-/// `starts` `[cells + 1]` and `list`: entries of cell c, in order, are
+/// Arrays `starts` `[cells + 1]` and `list`. The entries of cell c, in ascending order, are
 /// `list[starts[c]..starts[c + 1]]`.
 pub(crate) struct Lists {
     pub(crate) starts: Buffer,
@@ -34,11 +35,10 @@ pub(crate) struct Lists {
 }
 
 impl Gpu {
-    /// Adds to `commands` what makes the lists of `cells_of` `[entries]`, whose numbers
-    /// are below `cells` or [`crate::abi::NONE`].
+    /// Appends the construction of the lists of `cells_of` `[entries]`. Each element is below
+    /// `cells` or [`crate::abi::NONE`].
     ///
-    /// # Errors
-    /// Whatever the device refuses.
+    /// Errors of the device.
     pub(crate) fn invert(
         &self,
         commands: &mut Commands,

@@ -1,10 +1,11 @@
-//! Frames of more footprints, pairs or pixels than a binding holds: a picture in bands of
-//! rows of tiles, and each band in layers, runs of the splats' order by depth. A layer goes
-//! on from the pixels that the nearer ones left, so that the bytes are those of a frame
-//! drawn at once. Several submits, and one read-back a band to see where to cut.
+//! Frames with more footprints, pairs or pixels than a binding holds.
 //!
-//! What remains too small: a device on which 4 bytes of every splat, or one row of tiles,
-//! do not fit a binding.
+//! The picture is divided into bands of rows of tiles, and each band into layers: consecutive
+//! splats in order of depth. A layer continues from the pixels of the nearer layers, so the bytes
+//! equal those of a frame drawn at once. The frame takes several submits, and one read-back per
+//! band for the division into layers.
+//!
+//! Two cases remain too large: 4 bytes per splat, or one row of tiles, exceed a binding.
 
 use crate::abi::{FOOTPRINT_STRIDE, PLAN_REQUESTED, PLAN_WORDS, RasterUniform, TILE_GPU};
 use crate::gpu::buffers::Buffer;
@@ -22,7 +23,7 @@ use std::time::Duration;
 /// Floats of a pixel: R, G, B, alpha, depth sum.
 pub(crate) const PICTURE_CHANNELS: usize = 5;
 
-/// Time of stages, in order.
+/// Stage times, in order.
 pub(crate) type Times = Vec<(&'static str, Duration)>;
 
 /// Adds `more` to the times of the same stages.
@@ -35,25 +36,35 @@ pub(crate) fn add_times(times: &mut Times, more: Times) {
     }
 }
 
-/// A run of the order by depth.
+/// Consecutive splats in order of depth.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Layer {
+    /// Position of the first splat in the order by depth.
     pub(crate) place: usize,
+    /// Number of splats.
     pub(crate) places: usize,
+    /// Number of pairs.
     pub(crate) pairs: usize,
 }
 
-/// `whole` in bands of which a binding holds `lanes` floats a pixel.
+/// Maximum size of a layer.
+#[derive(Clone, Copy, Debug)]
+struct LayerLimits {
+    splats: usize,
+    pairs: usize,
+}
+
+/// Divides `whole` into bands; `floats_per_pixel` floats of every pixel of a band fit a binding.
 pub(crate) fn bands(
     gpu: &Gpu,
     whole: &RasterUniform,
-    lanes: usize,
+    floats_per_pixel: usize,
 ) -> Result<Vec<RasterUniform>, GpuError> {
-    let row = lanes * TILE_GPU * whole.width as usize;
-    let most = gpu.rows_per_binding(row);
-    if most == 0 {
+    let row = floats_per_pixel * TILE_GPU * whole.width as usize;
+    let max_rows = gpu.rows_per_binding(row);
+    if max_rows == 0 {
         let (needed, limit) = (row as u64, gpu.rows_per_binding(1) as u64);
-        return Err(GpuError::TooSmall { what: "a row of tiles, floats", needed, limit });
+        return Err(GpuError::TooSmall { resource: "a row of tiles, floats", needed, limit });
     }
     let band = |rows: std::ops::Range<usize>| {
         let mut call = RasterUniform { top: rows.start as u32, ..*whole };
@@ -63,33 +74,28 @@ pub(crate) fn bands(
         }
         call
     };
-    Ok(Gpu::chunks(whole.rows as usize, most).map(band).collect())
+    Ok(Gpu::chunks(whole.rows as usize, max_rows).map(band).collect())
 }
 
-/// Layers of at most `places` splats with `pairs` pairs; `offsets` says where each one's
-/// begin, `total` how many there are. At least one layer.
+/// Divides splats into layers within `limits`. `offsets` holds the index of each splat's first
+/// pair, `total` the number of pairs. There is at least one layer.
 ///
-/// # Errors
-/// One splat has more.
-fn cut(
-    offsets: &[u32],
-    total: u32,
-    (places, pairs): (usize, usize),
-) -> Result<Vec<Layer>, GpuError> {
-    // Splats behind the last pair meet no tile.
+/// [`GpuError::TooSmall`] where one splat has more pairs than a layer may have.
+fn cut(offsets: &[u32], total: u32, limits: LayerLimits) -> Result<Vec<Layer>, GpuError> {
+    // Splats after the last pair intersect no tile.
     let drawn = offsets.partition_point(|&o| o < total);
     let ends: Vec<u32> = offsets.iter().take(drawn).skip(1).copied().chain([total]).collect();
     let (mut layers, mut place, mut first) = (Vec::new(), 0, 0);
     while place < drawn {
-        let room = ends.get(place..(place + places).min(drawn)).unwrap_or(&[]);
-        let fits = room.partition_point(|&end| (end - first) as usize <= pairs);
-        let Some(&end) = room.get(..fits).and_then(<[u32]>::last) else {
-            let needed = u64::from(room.first().map_or(0, |end| end - first));
-            let what = "(splat, tile) pairs of a splat";
-            return Err(GpuError::TooSmall { what, needed, limit: pairs as u64 });
+        let candidates = ends.get(place..(place + limits.splats).min(drawn)).unwrap_or(&[]);
+        let count = candidates.partition_point(|&end| (end - first) as usize <= limits.pairs);
+        let Some(&end) = candidates.get(..count).and_then(<[u32]>::last) else {
+            let needed = u64::from(candidates.first().map_or(0, |end| end - first));
+            let resource = "(splat, tile) pairs of a splat";
+            return Err(GpuError::TooSmall { resource, needed, limit: limits.pairs as u64 });
         };
-        layers.push(Layer { place, places: fits, pairs: (end - first) as usize });
-        (place, first) = (place + fits, end);
+        layers.push(Layer { place, places: count, pairs: (end - first) as usize });
+        (place, first) = (place + count, end);
     }
     if layers.is_empty() {
         layers.push(Layer { place: 0, places: 0, pairs: 0 });
@@ -97,7 +103,7 @@ fn cut(
     Ok(layers)
 }
 
-/// A band whose splats are projected, sorted and cut into layers.
+/// A band whose splats are projected, sorted and divided into layers.
 pub(crate) struct Band {
     pub(crate) call: RasterUniform,
     pub(crate) stores: Vec<Store>,
@@ -109,18 +115,19 @@ pub(crate) struct Band {
 }
 
 impl Band {
-    /// Cuts the band of `call` into layers of which a binding holds `lanes` words a pair.
+    /// Projects and sorts the splats of the band of `call`, and divides it into layers;
+    /// `words_per_pair` words of every pair of a layer fit a binding.
     pub(crate) fn open(
         gpu: &Gpu,
         scene: &Scene,
         call: RasterUniform,
-        lanes: usize,
+        words_per_pair: usize,
         timed: bool,
     ) -> Result<Self, GpuError> {
         let (n, limit) = (scene.len, gpu.rows_per_binding(1));
         if n > limit {
             let (needed, limit) = (n as u64, limit as u64);
-            return Err(GpuError::TooSmall { what: "splats", needed, limit });
+            return Err(GpuError::TooSmall { resource: "splats", needed, limit });
         }
         let stores = scene.parts.iter().map(|part| Store::new(gpu, part.first, part.count));
         let stores = stores.collect::<Result<Vec<_>, _>>()?;
@@ -134,27 +141,30 @@ impl Band {
         let submitted = commands.submit()?;
         let (offsets, plan) = (offsets.take(gpu)?, plan.take(gpu)?);
         let total = plan.get(PLAN_REQUESTED).copied().unwrap_or(u32::MAX);
-        // Sums stop there (kernels/shared/scan.wgsl).
+        // The prefix sums saturate at this value (kernels/shared/scan.wgsl).
         if total == u32::MAX {
             let (needed, limit) = (u64::from(total), u64::from(total - 1));
-            return Err(GpuError::TooSmall { what: "(splat, tile) pairs", needed, limit });
+            return Err(GpuError::TooSmall { resource: "(splat, tile) pairs", needed, limit });
         }
-        let most = (gpu.rows_per_binding(FOOTPRINT_STRIDE), gpu.rows_per_binding(lanes));
-        let layers = cut(&offsets, total, most)?;
+        let limits = LayerLimits {
+            splats: gpu.rows_per_binding(FOOTPRINT_STRIDE),
+            pairs: gpu.rows_per_binding(words_per_pair),
+        };
+        let layers = cut(&offsets, total, limits)?;
         let times = submitted.times(gpu)?;
         Ok(Self { call, stores, depths, layers, pairs: total as usize, times })
     }
 
-    /// Adds layer `at` to `commands`, drawn over those before it.
+    /// Appends layer `index`, drawn over the layers before it.
     pub(crate) fn draw(
         &self,
         gpu: &Gpu,
         commands: &mut Commands,
         scene: &Scene,
-        at: usize,
+        index: usize,
         picture: &Buffer,
     ) -> Result<FrameBuffers, GpuError> {
-        let layer = self.layers[at];
+        let layer = self.layers[index];
         let n = layer.places;
         let own = Store::new(gpu, 0, n)?;
         let order = gpu.empty::<u32>("a layer's order", n)?;
@@ -178,14 +188,14 @@ impl Band {
         let call = RasterUniform {
             count: n as u32,
             capacity: layer.pairs as u32,
-            resumes: u32::from(at > 0),
-            carries: u32::from(at + 1 < self.layers.len()),
+            resumes: u32::from(index > 0),
+            carries: u32::from(index + 1 < self.layers.len()),
             ..self.call
         };
-        composite(gpu, commands, call, (own, Depths { order, counts }), picture)
+        composite(gpu, commands, call, own, Depths { order, counts }, picture)
     }
 
-    /// What kernels are told that take places of a layer and splats of a part.
+    /// Returns the uniform for the splats of a layer that lie in one part of the scene.
     pub(crate) fn of_part(&self, layer: Layer, first: usize, count: usize) -> RasterUniform {
         RasterUniform {
             first: first as u32,
@@ -199,7 +209,8 @@ impl Band {
 }
 
 impl Rasterizer {
-    /// A frame in layers. `end` is called with each band's last commands, call and picture.
+    /// Draws a frame in layers. `end` is called with the last commands, the uniform and the
+    /// picture of each band.
     pub(crate) fn layered<R>(
         &mut self,
         scene: &Scene,
@@ -211,10 +222,10 @@ impl Rasterizer {
         for call in bands(&gpu, whole, PICTURE_CHANNELS)? {
             let band = Band::open(&gpu, scene, call, 1, self.timed)?;
             let picture = gpu.empty::<f32>("the picture", PICTURE_CHANNELS * pixels(&call))?;
-            for at in 0..band.layers.len() {
+            for index in 0..band.layers.len() {
                 let mut commands = gpu.commands("layer", self.timed);
-                band.draw(&gpu, &mut commands, scene, at, &picture)?;
-                if at + 1 == band.layers.len() {
+                band.draw(&gpu, &mut commands, scene, index, &picture)?;
+                if index + 1 == band.layers.len() {
                     ends.push((call, end(&mut commands, &call, &picture)?));
                 }
                 add_times(&mut times, commands.submit()?.times(&gpu)?);
@@ -222,12 +233,12 @@ impl Rasterizer {
             add_times(&mut times, band.times);
             pairs += band.pairs;
         }
-        self.counted(pairs);
+        self.set_pair_count(pairs);
         self.times = times;
         Ok(ends)
     }
 
-    /// The picture of a frame in layers.
+    /// Returns the picture of a frame in layers.
     pub(crate) fn layered_picture(
         &mut self,
         scene: &Scene,
@@ -243,14 +254,14 @@ impl Rasterizer {
             let (own, first) = (pixels(&call), call.top as usize * TILE_GPU * call.width as usize);
             let picture = picture.take(self.gpu())?;
             let mut rest = &picture[..];
-            let mut lane = 0;
-            for &lanes in planes {
-                let (from, behind) = rest.split_at((lanes * own).min(rest.len()));
-                let to = lane * all + lanes * first;
+            let mut channel = 0;
+            for &channels in planes {
+                let (from, remaining) = rest.split_at((channels * own).min(rest.len()));
+                let to = channel * all + channels * first;
                 if let Some(to) = out.get_mut(to..to + from.len()) {
                     to.copy_from_slice(from);
                 }
-                (rest, lane) = (behind, lane + lanes);
+                (rest, channel) = (remaining, channel + channels);
             }
         }
         Ok(out)
@@ -262,18 +273,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn layers_are_as_long_as_fits() {
+    fn layers_have_the_maximum_size() {
+        let limits = |splats, pairs| LayerLimits { splats, pairs };
         let layer = |place, places, pairs| Layer { place, places, pairs };
-        // Counts 2 0 3 1 4 and two splats that meet nothing.
+        // Counts 2 0 3 1 4, and two splats that intersect no tile.
         let offsets = [0, 2, 2, 5, 6, 10, 10];
-        assert_eq!(cut(&offsets, 10, (9, 99)), Ok(vec![layer(0, 5, 10)]));
+        assert_eq!(cut(&offsets, 10, limits(9, 99)), Ok(vec![layer(0, 5, 10)]));
         let expected = vec![layer(0, 3, 5), layer(3, 2, 5)];
-        assert_eq!(cut(&offsets, 10, (9, 5)), Ok(expected));
+        assert_eq!(cut(&offsets, 10, limits(9, 5)), Ok(expected));
         let expected = vec![layer(0, 2, 2), layer(2, 2, 4), layer(4, 1, 4)];
-        assert_eq!(cut(&offsets, 10, (2, 5)), Ok(expected));
-        assert_eq!(cut(&[], 0, (2, 5)), Ok(vec![layer(0, 0, 0)]));
-        assert_eq!(cut(&[0, 0], 0, (2, 5)), Ok(vec![layer(0, 0, 0)]));
-        let error = cut(&offsets, 10, (9, 3));
+        assert_eq!(cut(&offsets, 10, limits(2, 5)), Ok(expected));
+        assert_eq!(cut(&[], 0, limits(2, 5)), Ok(vec![layer(0, 0, 0)]));
+        assert_eq!(cut(&[0, 0], 0, limits(2, 5)), Ok(vec![layer(0, 0, 0)]));
+        let error = cut(&offsets, 10, limits(9, 3));
         assert!(matches!(error, Err(GpuError::TooSmall { needed: 4, limit: 3, .. })), "{error:?}");
     }
 }

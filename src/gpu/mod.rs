@@ -1,19 +1,20 @@
-//! The kernels as WGSL compute, on any adapter that wgpu finds (Vulkan, Metal, DX12).
+//! The kernels as WGSL compute shaders, on every adapter that wgpu supports (Vulkan, Metal,
+//! DX12).
 //!
-//! Same stems and arguments as [`crate::cpu`], same results within the tolerances that
-//! `tests/gpu_twins.rs` states. [`Gpu::open`] chooses the adapter; every error leaves the
-//! caller the CPU kernels. Nothing here needs more than WebGPU's default limits: 8 storage
-//! buffers a stage, 256 threads and 16 KiB a workgroup, 128 MiB a binding.
+//! Files have the stems and arguments of [`crate::cpu`]; results agree within the tolerances of
+//! tests/gpu. [`Gpu::open`] opens an adapter. After an error the caller can use the CPU kernels.
+//! WebGPU's default limits suffice: 8 storage buffers per stage, 256 threads and 16 KiB per
+//! workgroup, 128 MiB per binding.
 //!
-//! A kernel x is `kernels/x.wgsl`, a [`Kernel`] and a method of [`Gpu`] in `x.rs`, and
-//! has a CPU twin of the same stem; `tests/shaders.rs` holds its text against
-//! [`crate::abi`] and this table.
+//! Kernel x consists of `kernels/x.wgsl`, a [`Kernel`] and a method of [`Gpu`] in `x.rs`, and a
+//! CPU version of the same stem. tests/gpu/shaders.rs compares the WGSL source with
+//! [`crate::abi`] and with this table.
 //!
-//! A frame of N splats with P (splat, tile) pairs on T tiles and px pixels, stage by stage;
-//! bytes are those that kernels read and write, SH, gain and caches left out. A device runs
-//! as many workgroups of a stage side by side on a core as its threads and its workgroup
-//! memory hold: "at once" is said of a core of 1,024 threads and 32 KiB, and of one of
-//! 2,048 and 100 KiB.
+//! The table lists the stages of a frame of N splats with P (splat, tile) pairs on T tiles and px
+//! pixels. "Bytes" counts the reads and writes of the kernels without SH, gain and caches. "At
+//! once" is the number of workgroups that one core executes concurrently, limited by threads and
+//! workgroup memory: for a core with 1,024 threads and 32 KiB, and for one with 2,048 threads and
+//! 100 KiB.
 //!
 //! | stage | dispatches | threads | workgroup bytes | at once | bytes |
 //! |---|---|---|---|---|---|
@@ -28,8 +29,8 @@
 //! | sum pairs | 1 | 64 | 0 | 16, 32 | 40 P + 68 N |
 //! | project backward | 2 a part | 64 | 0 | 16, 32 | 236 N |
 //!
-//! What to expect of a device where memory is the limit: the benches' scene of 524,288
-//! splats at 512², which has 817,775 pairs on 1,024 tiles; 41 dispatches forward, 4 back.
+//! Expected times on a device that memory bandwidth limits, for the benchmark scene: 524,288
+//! splats at 512², 817,775 pairs on 1,024 tiles; 41 dispatches forward, 4 backward.
 //!
 //! | stage | MB | ms at 300 GB/s | ms at 1 TB/s |
 //! |---|---|---|---|
@@ -46,15 +47,15 @@
 //! | project backward | 124 | 0.41 | 0.12 |
 //! | backward | 278 | 0.93 | 0.28 |
 //!
-//! Not memory but arithmetic limits the two `rasterize` on most devices: at most P · 256
-//! pixels, 209 M here, of 35 and 60 flops: 7 and 13 Gflop, 0.7 and 1.3 ms at 10 Tflop/s.
-//! A dispatch costs some 5 µs: 0.2 ms.
+//! On most devices arithmetic limits the two `rasterize` kernels instead: at most P · 256 pixels,
+//! here 209 M, of 35 and 60 flops each. That is 7 and 13 Gflop, or 0.7 and 1.3 ms at 10 Tflop/s.
+//! A dispatch takes about 5 µs, together 0.2 ms.
 //!
-//! A binding of 128 MiB, WebGPU's default, holds 2.79 M footprints, 33 M pairs forward and
-//! 3.35 M back, and 6.7 Mpx; devices are opened with what their adapter has ([`limits_of`]).
-//! Splats and their gradients are cut into parts; beyond the rest a frame is drawn in bands
-//! and layers (`layers`). Where 4 bytes of every splat or one row of tiles do not fit, a call
-//! is refused, and the caller's CPU does it.
+//! A binding of 128 MiB, WebGPU's default, holds 2.79 M footprints, 33 M pairs forward, 3.35 M
+//! pairs backward, and 6.7 Mpx. Devices are opened with the sizes of their adapter
+//! ([`limits_of`]). Splats and their gradients are divided into parts; frames with more
+//! footprints, pairs or pixels are drawn in bands and layers (`layers`). A call is refused where
+//! 4 bytes per splat or one row of tiles exceed a binding; the CPU kernels can be used instead.
 
 mod adapter;
 mod attention_gather;
@@ -79,7 +80,8 @@ mod sort;
 mod spgr;
 mod spgr_bwd;
 
-pub use adapter::{AdapterSummary, DeviceChoice, adapters, choose, find_for, instance};
+pub use crate::device::DeviceChoice;
+pub use adapter::{AdapterSummary, adapters, choose, find_for, instance};
 pub use attention_gather::AttentionGatherArgs;
 pub use attention_gather_bwd::AttentionGatherGradients;
 pub use buffers::Buffer;
@@ -92,10 +94,10 @@ pub use rasterize::Rasterizer;
 pub use redistribute::{RedistributeArgs, RedistributeGradients};
 pub use scene::Scene;
 pub use spgr::SpgrArgs;
-/// The wgpu that devices and textures belong to.
+/// The version of wgpu whose devices and textures [`Gpu`] uses.
 pub use wgpu;
 
-/// Every kernel of the room.
+/// All kernels of this module.
 pub const KERNELS: &[&Kernel] = &[
     &raster_kernels::PROJECT,
     &raster_kernels::SORT_COUNT,

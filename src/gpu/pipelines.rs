@@ -1,7 +1,7 @@
-//! Kernels: WGSL text, its arguments, and its compiled form, built once per device.
+//! Kernels: WGSL source, arguments, and compiled pipelines, built once per device.
 //!
-//! A kernel's text is `concat!` of files under `kernels/`: what several share
-//! (`kernels/shared`) first, then its own. No preprocessor. Binding i of group 0 is
+//! The source of a kernel is the concatenation of files under `kernels/`: shared files
+//! (`kernels/shared`) first, then its own file. There is no preprocessor. Binding i of group 0 is
 //! argument i.
 
 use crate::gpu::device::Gpu;
@@ -9,7 +9,7 @@ use crate::gpu::error::GpuError;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Files under kernels/, joined.
+/// Concatenates files under `kernels/`.
 macro_rules! wgsl {
     ($($file:literal),+ $(,)?) => {
         concat!($(include_str!(concat!("../../kernels/", $file, ".wgsl"))),+)
@@ -17,7 +17,7 @@ macro_rules! wgsl {
 }
 pub(crate) use wgsl;
 
-/// How a kernel uses an argument.
+/// Access of a kernel to an argument.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Access {
     /// `var<uniform>`.
@@ -31,25 +31,25 @@ pub enum Access {
 /// One entry point of one file under `kernels/`.
 #[derive(Debug)]
 pub struct Kernel {
-    /// Stem of its file.
+    /// Stem of the kernel's file.
     pub name: &'static str,
-    /// Its entry point.
+    /// Entry point.
     pub entry: &'static str,
-    /// Its whole text.
+    /// WGSL source, shared files included.
     pub source: &'static str,
-    /// Its arguments, in the order of their bindings. At most 8 are storage buffers
-    /// (WebGPU's default limit).
+    /// Arguments in the order of their bindings. At most 8 are storage buffers (WebGPU's default
+    /// limit).
     pub bindings: &'static [Access],
 }
 
 impl Kernel {
-    /// Name and entry point.
+    /// Returns name and entry point.
     pub(crate) fn label(&self) -> String {
         format!("{}::{}", self.name, self.entry)
     }
 }
 
-/// Values of a kernel's `override` constants.
+/// Values of the kernel's `override` constants.
 pub(crate) type Constants<'a> = &'a [(&'static str, f64)];
 
 #[derive(Debug)]
@@ -62,19 +62,18 @@ pub(crate) struct Pipeline {
 /// Kernel, entry point, and the bits of its constants.
 type Key = (&'static str, &'static str, Vec<(&'static str, u64)>);
 
-/// What is compiled on one device.
+/// Modules and pipelines that are compiled for one device.
 #[derive(Debug, Default)]
 pub(crate) struct Pipelines {
     modules: Mutex<HashMap<&'static str, wgpu::ShaderModule>>,
     built: Mutex<HashMap<Key, Arc<Pipeline>>>,
-    pub(crate) shows: Mutex<HashMap<wgpu::TextureFormat, wgpu::RenderPipeline>>,
+    pub(crate) show_pipelines: Mutex<HashMap<wgpu::TextureFormat, wgpu::RenderPipeline>>,
 }
 
 impl Gpu {
-    /// `kernel` with `constants`, compiled at its first use.
+    /// Returns the pipeline of `kernel` with `constants`, compiled at its first use.
     ///
-    /// # Errors
-    /// [`GpuError::Refused`] with the compiler's own message.
+    /// [`GpuError::Refused`] with the message of the compiler.
     pub(crate) fn pipeline(
         &self,
         kernel: &'static Kernel,
@@ -93,7 +92,7 @@ impl Gpu {
         Ok(new)
     }
 
-    /// The compiled text of a kernel's file; errors go to the open scope.
+    /// Returns the compiled module of a kernel's file. Errors go to the open error scope.
     pub(crate) fn module(&self, name: &'static str, source: &'static str) -> wgpu::ShaderModule {
         let mut modules = self.pipelines.modules.lock().unwrap_or_else(PoisonError::into_inner);
         let compile = || {
@@ -130,7 +129,7 @@ impl Gpu {
     }
 }
 
-/// Layout of a kernel's arguments.
+/// Returns the bind group layout of a kernel's arguments.
 pub(crate) fn layout(
     device: &wgpu::Device,
     kernel: &Kernel,

@@ -1,5 +1,7 @@
-//! Plane sweep, warp and correlation in one: twin of [`crate::cpu::plane_sweep`].
-//! Kernel: kernels/plane_sweep.wgsl.
+//! Plane sweep with fused warp and correlation (MVSplat, cost volume).
+//!
+//! CPU version: [`crate::cpu::plane_sweep`]. WGSL: kernels/plane_sweep.wgsl. Tests:
+//! tests/gpu/network.rs.
 
 use crate::abi::{Pair, PlaneSweepUniform, SWEEP_PAIR_STRIDE, Sweep};
 use crate::gpu::buffers::Binding;
@@ -39,17 +41,17 @@ pub struct PlaneSweepArgs<'a> {
 }
 
 impl<'a> PlaneSweepArgs<'a> {
-    /// h·w.
+    /// Returns h·w.
     pub(super) fn plane(&self) -> usize {
         self.sweep.size[0] * self.sweep.size[1]
     }
 
-    /// Floats of one row of features.
+    /// Returns the floats of one row of features, C·h·w.
     pub(super) fn features(&self) -> usize {
         self.sweep.channels * self.plane()
     }
 
-    /// R, where all fits together.
+    /// Checks the arguments and returns R.
     pub(super) fn check(&self) -> Result<usize, GpuError> {
         let (s, features) = (self.sweep, self.features());
         let rows = s.pairs.len();
@@ -61,10 +63,10 @@ impl<'a> PlaneSweepArgs<'a> {
             ("rows of depths", s.depths.len(), rows),
             ("depths of a row", ragged.map_or(s.candidates(), Vec::len), s.candidates()),
         ];
-        GpuError::unless_fitting(PLANE_SWEEP.name, lengths).map(|()| rows)
+        GpuError::check_lengths(PLANE_SWEEP.name, lengths).map(|()| rows)
     }
 
-    /// What the kernels are told of `rows`.
+    /// Returns the uniform for `rows`.
     pub(super) fn uniform(&self, rows: &Range<usize>) -> PlaneSweepUniform {
         let s = self.sweep;
         PlaneSweepUniform {
@@ -83,61 +85,61 @@ impl<'a> PlaneSweepArgs<'a> {
         }
     }
 
-    /// Pairs of `rows` in floats; where each row's begin, and the pairs' source rows.
+    /// Returns the pairs of `rows` as floats; then the first pair of each row and the source row
+    /// of each pair.
     pub(super) fn tables(&self, rows: &Range<usize>) -> (Vec<f32>, Vec<u32>) {
         let of_rows = self.sweep.pairs.get(rows.clone()).unwrap_or(&[]);
         let mut floats = Vec::new();
-        let (mut heads, mut end) = (vec![0], 0);
+        let (mut starts, mut end) = (vec![0], 0);
         for pairs in of_rows {
             end += pairs.len() as u32;
-            heads.push(end);
+            starts.push(end);
         }
         for pair in of_rows.iter().flatten() {
-            floats.extend(lanes(pair));
-            heads.push(pair.source as u32);
+            floats.extend(pair_floats(pair));
+            starts.push(pair.source as u32);
         }
-        (floats, heads)
+        (floats, starts)
     }
 
-    /// Candidate depths of `rows`.
+    /// Returns the candidate depths of `rows`.
     pub(super) fn depths(&self, rows: &Range<usize>) -> Vec<f32> {
         self.sweep.depths.get(rows.clone()).unwrap_or(&[]).concat()
     }
 
-    /// Reference features of `rows`.
+    /// Returns the reference features of `rows`.
     pub(super) fn own(&self, rows: &Range<usize>) -> &'a [f32] {
         let f = self.features();
         self.reference.get(rows.start * f..rows.end * f).unwrap_or(&[])
     }
 }
 
-/// A pair as the kernels read it.
-fn lanes(p: &Pair) -> impl Iterator<Item = f32> {
+/// Returns a pair in the layout of the kernels.
+fn pair_floats(p: &Pair) -> impl Iterator<Item = f32> {
     let all = p.inverse.into_iter().chain(p.rotation).chain(p.t).chain(p.k);
     all.take(SWEEP_PAIR_STRIDE)
 }
 
 impl Gpu {
-    /// Correlation `[R, D, h, w]`.
+    /// Computes the correlation `[R, D, h, w]`.
     ///
-    /// # Errors
-    /// Lengths that do not fit; anything the device refuses.
+    /// [`GpuError::Argument`] for inconsistent lengths; errors of the device.
     pub fn plane_sweep(&self, args: &PlaneSweepArgs) -> Result<Vec<f32>, GpuError> {
         let rows = args.check()?;
         let volume = args.sweep.candidates() * args.plane();
         let source = self.upload("source features", args.source)?;
         let mut out = Vec::with_capacity(rows * volume);
-        let most = self.rows_per_binding(volume.max(args.features()));
-        for rows in Self::chunks(rows, most) {
-            let (pairs, heads) = args.tables(&rows);
+        let max_rows = self.rows_per_binding(volume.max(args.features()));
+        for rows in Self::chunks(rows, max_rows) {
+            let (pairs, starts) = args.tables(&rows);
             let count = rows.len() * volume;
             let uniform = self.uniform(&args.uniform(&rows))?;
             let reference = self.upload("reference features", args.own(&rows))?;
             let pairs = self.upload("pairs of views", &pairs)?;
-            let heads = self.upload("rows of pairs", &heads)?;
+            let starts = self.upload("starts of pairs", &starts)?;
             let depths = self.upload("candidate depths", &args.depths(&rows))?;
             let correlation = self.empty::<f32>("correlation", count)?;
-            let bindings = [&uniform, &reference, &source, &pairs, &heads, &depths, &correlation];
+            let bindings = [&uniform, &reference, &source, &pairs, &starts, &depths, &correlation];
             let mut commands = self.commands("plane_sweep", false);
             let groups = Groups::of(count, THREADS);
             commands.run(&PLANE_SWEEP, &[], &bindings.map(Binding::from), groups)?;

@@ -1,6 +1,8 @@
-//! Gradients of the plane sweep: twin of the backward half of [`crate::cpu::plane_sweep`].
-//! Kernels: kernels/plane_sweep_taps.wgsl, then kernels/plane_sweep_reference_bwd.wgsl, and
-//! invert and kernels/plane_sweep_source_bwd.wgsl.
+//! Gradients of the plane sweep.
+//!
+//! CPU version: [`crate::cpu::plane_sweep`]. WGSL: kernels/plane_sweep_taps.wgsl, then
+//! kernels/plane_sweep_reference_bwd.wgsl, kernels/invert.wgsl and
+//! kernels/plane_sweep_source_bwd.wgsl. Tests: tests/gpu/network.rs.
 
 use crate::gpu::buffers::{Binding, Buffer};
 use crate::gpu::commands::Groups;
@@ -73,11 +75,10 @@ pub(crate) static PLANE_SWEEP_SOURCE_BWD: Kernel = Kernel {
 const THREADS: usize = 64;
 
 impl Gpu {
-    /// Gradients `([R, C, h, w], [S, C, h, w])` for that of the correlation, `grad`
-    /// `[R, D, h, w]`.
+    /// Computes the gradients of reference `[R, C, h, w]` and source `[S, C, h, w]` for `grad`
+    /// `[R, D, h, w]`, the gradient of the correlation.
     ///
-    /// # Errors
-    /// Those of [`Gpu::plane_sweep`]; another length of `grad`.
+    /// As [`Gpu::plane_sweep`]; [`GpuError::Argument`] for another length of `grad`.
     pub fn plane_sweep_backward(
         &self,
         args: &PlaneSweepArgs,
@@ -86,13 +87,13 @@ impl Gpu {
         let rows = args.check()?;
         let volume = args.sweep.candidates() * args.plane();
         let lengths = [("gradient of the correlation", grad.len(), rows * volume)];
-        GpuError::unless_fitting(PLANE_SWEEP_TAPS.name, lengths)?;
+        GpuError::check_lengths(PLANE_SWEEP_TAPS.name, lengths)?;
         let source = self.upload("source features", args.source)?;
         let mut d_reference = Vec::with_capacity(args.reference.len());
         let mut d_source = vec![0.0; args.source.len()];
         let pairs = args.sweep.pairs.iter().map(Vec::len).max().unwrap_or(0);
-        let most = self.rows_per_binding((4 * pairs.max(1) * volume).max(args.features()));
-        for rows in Self::chunks(rows, most) {
+        let max_rows = self.rows_per_binding((4 * pairs.max(1) * volume).max(args.features()));
+        for rows in Self::chunks(rows, max_rows) {
             let grad = grad.get(rows.start * volume..rows.end * volume).unwrap_or(&[]);
             let (reference, part) = self.sweep_bwd(args, &source, &rows, grad)?;
             d_reference.extend(reference);
@@ -101,7 +102,8 @@ impl Gpu {
         Ok((d_reference, d_source))
     }
 
-    /// Gradients of some rows of the reference, and what they add to the source's.
+    /// Computes the gradients of some rows of the reference, and their contribution to the
+    /// gradient of the source.
     fn sweep_bwd(
         &self,
         args: &PlaneSweepArgs,
@@ -109,13 +111,13 @@ impl Gpu {
         rows: &Range<usize>,
         grad: &[f32],
     ) -> Result<(Vec<f32>, Vec<f32>), GpuError> {
-        let (pairs, heads) = args.tables(rows);
-        let told = args.uniform(rows);
-        let taps = told.pairs as usize * args.sweep.candidates() * args.plane();
-        let uniform = self.uniform(&told)?;
+        let (pairs, starts) = args.tables(rows);
+        let call = args.uniform(rows);
+        let taps = call.pairs as usize * args.sweep.candidates() * args.plane();
+        let uniform = self.uniform(&call)?;
         let reference = self.upload("reference features", args.own(rows))?;
         let pairs = self.upload("pairs of views", &pairs)?;
-        let heads = self.upload("rows of pairs", &heads)?;
+        let starts = self.upload("starts of pairs", &starts)?;
         let depths = self.upload("candidate depths", &args.depths(rows))?;
         let grad = self.upload("gradient of the correlation", grad)?;
         let cells_of = self.empty::<u32>("cells of taps", 4 * taps)?;
@@ -125,15 +127,15 @@ impl Gpu {
         let d_source = self.empty::<f32>("gradient of the source", args.source.len())?;
         let mut commands = self.commands("plane_sweep_bwd", false);
         let all =
-            [&uniform, &reference, source, &pairs, &heads, &depths, &grad, &cells_of, &factors];
+            [&uniform, &reference, source, &pairs, &starts, &depths, &grad, &cells_of, &factors];
         let groups = Groups::of(taps, THREADS);
         commands.run(&PLANE_SWEEP_TAPS, &[], &all.map(Binding::from), groups)?;
-        let all = [&uniform, source, &heads, &cells_of, &factors, &d_reference];
+        let all = [&uniform, source, &starts, &cells_of, &factors, &d_reference];
         let groups = Groups::of(own, THREADS);
         commands.run(&PLANE_SWEEP_REFERENCE_BWD, &[], &all.map(Binding::from), groups)?;
-        let cells = told.sources as usize * args.plane();
+        let cells = call.sources as usize * args.plane();
         let lists = self.invert(&mut commands, &cells_of, 4 * taps, cells)?;
-        let all = [&uniform, &reference, &heads, &factors, &lists.starts, &lists.list, &d_source];
+        let all = [&uniform, &reference, &starts, &factors, &lists.starts, &lists.list, &d_source];
         let groups = Groups::of(args.source.len(), THREADS);
         commands.run(&PLANE_SWEEP_SOURCE_BWD, &[], &all.map(Binding::from), groups)?;
         let d_reference = commands.read::<f32>(&d_reference, own)?;

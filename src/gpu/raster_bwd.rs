@@ -1,11 +1,15 @@
-//! The way back of a frame: tiles, then a sum over each splat's tiles, then one pass over
-//! all splats and one over all parents; one submit. Twin: src/cpu/raster_bwd.rs, same
-//! meaning and order of sums; no float atomics, so the same bytes each time.
+//! Backward pass of a frame: per tile, then a sum over each splat's tiles, then one pass over all
+//! splats and one over all parents.
 //!
-//! Memory beyond the forward's: 40 bytes a (splat, tile) pair and a splat, and the
-//! gradients. Where a binding does not hold the pairs' sums, or the frame itself was drawn
-//! in layers, each band is drawn again in layers small enough (src/gpu/layers.rs) and goes
-//! back farthest layer first, T and what lies behind carried from one to the next.
+//! One submit. The order of summation is fixed and there are no float atomics, so results are
+//! reproducible. CPU version, with the same order of summation: src/cpu/raster_bwd.rs. Tests:
+//! tests/gpu/raster_bwd.rs.
+//!
+//! Memory in addition to the forward pass: 40 bytes per (splat, tile) pair and per splat, and the
+//! gradients. Where the sums of the pairs exceed a binding, or the frame was rendered in layers,
+//! each band is rendered again in smaller layers (src/gpu/layers.rs). The backward pass then
+//! processes the farthest layer first; transmittance and the colour behind a layer are carried
+//! from one layer to the next.
 
 use crate::abi::{Gradients, PAIR_SUMS, RasterOptions, RasterUniform, SplatSlices, TILE_GPU};
 use crate::camera::Camera;
@@ -17,12 +21,12 @@ use crate::gpu::frame::{Channels, Depths, FrameBuffers, Store, THREADS, bind, pi
 use crate::gpu::layers::{Band, PICTURE_CHANNELS, Times, add_times, bands};
 use crate::gpu::raster_kernels::{COLOUR_BWD, PAIR_SUMS as SUM_PAIRS, PROJECT_BWD, RASTERIZE_BWD};
 use crate::gpu::rasterize::Rasterizer;
-use crate::gpu::scene::{COV6_LANES, Part, Scene};
+use crate::gpu::scene::{COV6_STRIDE, Part, Scene};
 use std::sync::Arc;
 use std::time::Duration;
 
-/// A rendered frame, on the device where it was drawn at once. Made by
-/// [`Rasterizer::frame`].
+/// A rendered frame, made by [`Rasterizer::frame`]. Its buffers stay on the device unless it was
+/// rendered in layers.
 #[derive(Debug)]
 pub struct Frame {
     gpu: Arc<Gpu>,
@@ -35,21 +39,36 @@ pub struct Frame {
     times: Times,
 }
 
-/// What the pixels say of a part's splats.
+/// Sums over the pixels for the splats of a part of the scene.
 struct PartSums<'a> {
     part: &'a Part,
-    /// Of the part or, with `own`, of more.
+    /// `[n, 12]`: footprints of the part, or of more splats.
     footprints: Buffer,
-    /// `[n, 10]`, beside `footprints`.
+    /// `[n, 10]`: sums of the splats of `footprints`.
     sums: Buffer,
-    /// Where the part's first splat stands in both.
+    /// Index of the part's first splat in both buffers.
     own: usize,
 }
 
-/// Floats of a pixel's gradients on the way back through layers: the picture's, and T.
+/// Floats of a pixel's gradients in the backward pass through layers: the picture's, and the
+/// transmittance.
 const LAYER_CHANNELS: usize = PICTURE_CHANNELS + 1;
 
-/// Gradients of a part of the scene on their way.
+/// Gradients with respect to the splats and the background, on the device.
+struct Pending {
+    parts: Vec<PartReading>,
+    /// `[tiles, 4]` per band.
+    background: Vec<Reading<f32>>,
+}
+
+/// Buffers that locate the pairs of splats.
+struct SplatBuffers<'a> {
+    footprints: &'a Buffer,
+    depths: &'a Depths,
+    offsets: &'a Buffer,
+}
+
+/// Pending read-back of the gradients of a part of the scene.
 struct PartReading {
     rows: Reading<f32>,
     sh: Reading<f32>,
@@ -57,8 +76,8 @@ struct PartReading {
 }
 
 impl Rasterizer {
-    /// Renders into planes `[5, H, W]` as [`Rasterizer::render_planes`] does, and keeps
-    /// what [`Frame::backward`] needs.
+    /// Renders into planes `[5, H, W]` as [`Rasterizer::render_planes`] does, and keeps the
+    /// inputs of [`Frame::backward`].
     ///
     /// # Errors
     /// As [`Rasterizer::render`].
@@ -69,14 +88,14 @@ impl Rasterizer {
         options: &RasterOptions,
     ) -> Result<(Vec<f32>, Frame), GpuError> {
         let scene = self.gpu().upload_splats(splats)?;
-        let drawn = self.drawn(&scene, camera, options, Channels::Planes)?;
+        let rendered = self.render_frame(&scene, camera, options, Channels::Planes)?;
         let (gpu, pairs, timed) = (self.gpu().clone(), self.pairs(), self.timed);
-        let (call, buffers, times) = (drawn.call, drawn.buffers, Times::new());
-        Ok((drawn.picture, Frame { gpu, scene, call, buffers, pairs, timed, times }))
+        let (call, buffers, times) = (rendered.call, rendered.buffers, Times::new());
+        Ok((rendered.picture, Frame { gpu, scene, call, buffers, pairs, timed, times }))
     }
 
-    /// Forward and backward: gradients of a loss whose gradient with respect to the planes
-    /// `[5, H, W]` of this view (R, G, B, alpha, Σ w·z) is `gradients`.
+    /// Renders a frame and computes the gradients of a loss. `gradients` `[5, H, W]` is the
+    /// gradient of the loss with respect to R, G, B, alpha and Σ w·z.
     ///
     /// # Errors
     /// As [`Rasterizer::frame`] and [`Frame::backward`].
@@ -92,35 +111,35 @@ impl Rasterizer {
 }
 
 impl Frame {
-    /// Gradients of a loss whose gradient with respect to the frame's planes `[5, H, W]`
-    /// (R, G, B, alpha, Σ w·z) is `gradients`: those of [`crate::cpu::Frame::backward`].
+    /// Computes the gradients of a loss, as [`crate::cpu::Frame::backward`] does. `gradients`
+    /// `[5, H, W]` is the gradient of the loss with respect to R, G, B, alpha and Σ w·z of the
+    /// frame.
     ///
-    /// # Errors
-    /// Gradients of another size; what the device refuses, or is too small for: the
-    /// CPU's rasterizer takes it.
+    /// [`GpuError::Argument`] for gradients of another size; [`GpuError::TooSmall`] and other
+    /// errors of the device, after which the CPU rasterizer can be used.
     pub fn backward(&mut self, gradients: &[f32]) -> Result<Gradients, GpuError> {
         let numbers = PICTURE_CHANNELS * pixels(&self.call);
         let lengths = [("gradients", gradients.len(), numbers)];
-        GpuError::unless_fitting(RASTERIZE_BWD.name, lengths)?;
+        GpuError::check_lengths(RASTERIZE_BWD.name, lengths)?;
         self.times.clear();
-        let (parts, behind) = match self.buffers.take() {
+        let pending = match self.buffers.take() {
             Some(frame) if self.pairs <= self.gpu.rows_per_binding(PAIR_SUMS) => {
-                let found = self.at_once(&frame, gradients);
+                let pending = self.at_once(&frame, gradients);
                 self.buffers = Some(frame);
-                found?
+                pending?
             }
             _ => self.in_layers(gradients)?,
         };
         let mut out = Gradients::default();
         let mut rows = Vec::new();
-        for part in parts {
+        for part in pending.parts {
             rows.extend(part.rows.take(&self.gpu)?);
             out.sh.extend(part.sh.take(&self.gpu)?);
             out.gain.extend(part.gain.take(&self.gpu)?);
         }
         self.put_rows(rows, &mut out);
         let mut background = [0.0f64; 3];
-        for band in behind {
+        for band in pending.background {
             for tile in band.take(&self.gpu)?.chunks_exact(4) {
                 for (sum, v) in background.iter_mut().zip(tile) {
                     *sum += f64::from(*v);
@@ -131,8 +150,8 @@ impl Frame {
         Ok(out)
     }
 
-    /// Time of each stage of the last backward on the device, in order; empty where
-    /// [`Rasterizer::stage_times`] is.
+    /// Returns the time of each stage of the last backward pass on the device, in order; empty
+    /// where [`Rasterizer::stage_times`] is.
     pub fn stage_times(&self) -> &[(&'static str, Duration)] {
         &self.times
     }
@@ -143,38 +162,35 @@ impl Frame {
         Ok(())
     }
 
-    /// Gradients of the parts, and `[tiles, 4]` of the background, in one submit.
-    fn at_once(
-        &mut self,
-        frame: &FrameBuffers,
-        gradients: &[f32],
-    ) -> Result<(Vec<PartReading>, Vec<Reading<f32>>), GpuError> {
+    /// Computes the gradients in one submit.
+    fn at_once(&mut self, frame: &FrameBuffers, gradients: &[f32]) -> Result<Pending, GpuError> {
         let gpu = self.gpu.clone();
         let mut commands = gpu.commands("backward", self.timed);
         let upstream = gpu.upload("gradients of the picture", gradients)?;
         let call = frame.call;
-        let (pairs, behind) =
-            tiles_back(&mut commands, &gpu, frame, (&call, self.pairs), &upstream)?;
-        let behind = commands.read::<f32>(&behind, 4 * tiles(&call))?;
+        let (pairs, background) =
+            record_tiles(&mut commands, &gpu, frame, &call, self.pairs, &upstream)?;
+        let background = commands.read::<f32>(&background, 4 * tiles(&call))?;
         let sums = gpu.empty::<f32>("sums of splats", PAIR_SUMS * self.scene.len)?;
-        let at = (&frame.footprints, &frame.depths, &frame.offsets);
-        sum_pairs(&mut commands, &gpu, &call, at, (&pairs, &sums))?;
+        let splats = SplatBuffers {
+            footprints: &frame.footprints,
+            depths: &frame.depths,
+            offsets: &frame.offsets,
+        };
+        sum_pairs(&mut commands, &gpu, &call, &splats, &pairs, &sums)?;
         let parts = self.scene.parts.iter().map(|part| PartSums {
             part,
             footprints: frame.footprints.clone(),
             sums: sums.clone(),
             own: part.first,
         });
-        let parts = self.splats_back(&mut commands, parts)?;
+        let parts = self.record_splats(&mut commands, parts)?;
         self.submit(commands)?;
-        Ok((parts, vec![behind]))
+        Ok(Pending { parts, background: vec![background] })
     }
 
-    /// The same by several submits, whatever the sizes.
-    fn in_layers(
-        &mut self,
-        gradients: &[f32],
-    ) -> Result<(Vec<PartReading>, Vec<Reading<f32>>), GpuError> {
+    /// Computes the gradients in several submits, for frames of any size.
+    fn in_layers(&mut self, gradients: &[f32]) -> Result<Pending, GpuError> {
         let (gpu, scene) = (self.gpu.clone(), self.scene.clone());
         let sums = scene
             .parts
@@ -184,10 +200,10 @@ impl Frame {
         let mut commands = gpu.commands("backward", false);
         sums.iter().for_each(|sums| commands.clear(sums));
         commands.submit()?;
-        let (mut behind, mut stores) = (Vec::new(), Vec::new());
+        let (mut background, mut stores) = (Vec::new(), Vec::new());
         for call in bands(&gpu, &self.call, LAYER_CHANNELS)? {
             let band = Band::open(&gpu, &scene, call, PAIR_SUMS, self.timed)?;
-            behind.push(self.band_back(&band, gradients, &sums)?);
+            background.push(self.backward_of_band(&band, gradients, &sums)?);
             add_times(&mut self.times, band.times);
             stores = band.stores;
         }
@@ -199,13 +215,14 @@ impl Frame {
             sums,
             own: 0,
         });
-        let parts = self.splats_back(&mut commands, parts)?;
+        let parts = self.record_splats(&mut commands, parts)?;
         self.submit(commands)?;
-        Ok((parts, behind))
+        Ok(Pending { parts, background })
     }
 
-    /// Adds a band to the `sums` of the parts' splats; `[tiles, 4]` of its background.
-    fn band_back(
+    /// Adds a band's contribution to the `sums` of the parts' splats; returns `[tiles, 4]`, the
+    /// gradient of its background.
+    fn backward_of_band(
         &mut self,
         band: &Band,
         gradients: &[f32],
@@ -214,38 +231,43 @@ impl Frame {
         let (gpu, scene) = (self.gpu.clone(), self.scene.clone());
         let picture = gpu.empty::<f32>("the picture", PICTURE_CHANNELS * pixels(&band.call))?;
         let mut frames = Vec::new();
-        for at in 0..band.layers.len() {
+        for index in 0..band.layers.len() {
             let mut commands = gpu.commands("layer", self.timed);
-            frames.push(band.draw(&gpu, &mut commands, &scene, at, &picture)?);
+            frames.push(band.draw(&gpu, &mut commands, &scene, index, &picture)?);
             self.submit(commands)?;
         }
-        let upstream = gpu.upload("gradients of the picture", &of_band(gradients, &band.call))?;
+        let upstream =
+            gpu.upload("gradients of the picture", &band_gradients(gradients, &band.call))?;
         let mut background = None;
-        for ((at, layer), frame) in band.layers.iter().enumerate().zip(&frames).rev() {
+        for ((index, layer), frame) in band.layers.iter().enumerate().zip(&frames).rev() {
             let mut commands = gpu.commands("backward", self.timed);
             let call = RasterUniform {
-                resumes: u32::from(at + 1 < frames.len()),
-                carries: u32::from(at > 0),
+                resumes: u32::from(index + 1 < frames.len()),
+                carries: u32::from(index > 0),
                 ..frame.call
             };
             let (pairs, behind) =
-                tiles_back(&mut commands, &gpu, frame, (&call, layer.pairs), &upstream)?;
-            // Those nearer know nothing of the background.
+                record_tiles(&mut commands, &gpu, frame, &call, layer.pairs, &upstream)?;
+            // Only the farthest layer has a gradient of the background.
             if background.is_none() {
                 background = Some(commands.read::<f32>(&behind, 4 * tiles(&call))?);
             }
             for ((part, store), sums) in scene.parts.iter().zip(&band.stores).zip(sums) {
                 let call =
                     RasterUniform { resumes: 1, ..band.of_part(*layer, part.first, part.count) };
-                let at = (&store.footprints, &band.depths, &frame.offsets);
-                sum_pairs(&mut commands, &gpu, &call, at, (&pairs, sums))?;
+                let splats = SplatBuffers {
+                    footprints: &store.footprints,
+                    depths: &band.depths,
+                    offsets: &frame.offsets,
+                };
+                sum_pairs(&mut commands, &gpu, &call, &splats, &pairs, sums)?;
             }
             self.submit(commands)?;
         }
-        background.ok_or(GpuError::TooSmall { what: "layers of a band", needed: 1, limit: 0 })
+        background.ok_or(GpuError::TooSmall { resource: "layers of a band", needed: 1, limit: 0 })
     }
 
-    fn splats_back<'a>(
+    fn record_splats<'a>(
         &self,
         commands: &mut Commands,
         parts: impl Iterator<Item = PartSums<'a>>,
@@ -268,8 +290,11 @@ impl Frame {
         };
         let own = gpu.uniform(&call)?;
         let parents = part.count.div_ceil(scene.children);
-        let lengths =
-            [scene.stride * part.count, scene.sh_stride() * parents, scene.gain_lanes * part.count];
+        let lengths = [
+            scene.stride * part.count,
+            scene.sh_stride() * parents,
+            scene.gain_stride * part.count,
+        ];
         let [rows, sh, gain] = lengths.map(|n| gpu.empty::<f32>("gradients of splats", n));
         let (rows, sh, gain) = (rows?, sh?, gain?);
         let bindings = bind([&own, &part.rows, footprints, sums, &rows]);
@@ -285,11 +310,11 @@ impl Frame {
     }
 
     fn put_rows(&self, rows: Vec<f32>, out: &mut Gradients) {
-        if self.scene.stride != COV6_LANES {
+        if self.scene.stride != COV6_STRIDE {
             out.rows = rows;
             return;
         }
-        for row in rows.chunks_exact(COV6_LANES) {
+        for row in rows.chunks_exact(COV6_STRIDE) {
             let (mean, rest) = row.split_at(3);
             let (cov6, opacity) = rest.split_at(6);
             out.means.extend_from_slice(mean);
@@ -299,9 +324,9 @@ impl Frame {
     }
 }
 
-/// Gradients of a band's pixels `[6, rows, W]`: of its rows of `whole` `[5, H, W]`, and room
-/// for T.
-fn of_band(whole: &[f32], call: &RasterUniform) -> Vec<f32> {
+/// Returns the gradients of a band's pixels `[6, rows, W]`: its rows of `whole` `[5, H, W]`, and
+/// space for the transmittance.
+fn band_gradients(whole: &[f32], call: &RasterUniform) -> Vec<f32> {
     let (plane, own) = ((call.width * call.height) as usize, pixels(call));
     let first = call.top as usize * TILE_GPU * call.width as usize;
     let mut out = Vec::with_capacity(LAYER_CHANNELS * own);
@@ -312,13 +337,15 @@ fn of_band(whole: &[f32], call: &RasterUniform) -> Vec<f32> {
     out
 }
 
-/// Adds what gives ten sums for each of `pairs` pairs of a frame, `[tiles, 4]` of the
-/// background, and, where `call` carries, `upstream` for the layer before.
-fn tiles_back(
+/// Appends the backward pass of the tiles. Returns ten sums for each of `pairs` pairs, and
+/// `[tiles, 4]`, the gradients of the background. Where `call` carries, `upstream` receives the
+/// input of the nearer layer.
+fn record_tiles(
     commands: &mut Commands,
     gpu: &Gpu,
     frame: &FrameBuffers,
-    (call, pairs): (&RasterUniform, usize),
+    call: &RasterUniform,
+    pairs: usize,
     upstream: &Buffer,
 ) -> Result<(Buffer, Buffer), GpuError> {
     let tiles = tiles(call);
@@ -341,17 +368,18 @@ fn tiles_back(
     Ok((sums, behind))
 }
 
-/// Adds what sums up the pairs of the call's places for its splats.
+/// Appends the sums over the pairs of the call's splats.
 fn sum_pairs(
     commands: &mut Commands,
     gpu: &Gpu,
     call: &RasterUniform,
-    (footprints, depths, offsets): (&Buffer, &Depths, &Buffer),
-    (pairs, sums): (&Buffer, &Buffer),
+    splats: &SplatBuffers,
+    pairs: &Buffer,
+    sums: &Buffer,
 ) -> Result<(), GpuError> {
     commands.stage("sum pairs");
     let own = gpu.uniform(call)?;
-    let Depths { order, counts } = depths;
+    let SplatBuffers { footprints, depths: Depths { order, counts }, offsets } = splats;
     let bindings = bind([&own, footprints, order, counts, offsets, pairs, sums]);
     commands.run(&SUM_PAIRS, &[], &bindings, Groups::of(call.places as usize, THREADS))
 }

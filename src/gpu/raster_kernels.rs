@@ -1,4 +1,4 @@
-//! Texts and arguments of the rasterizer's kernels, in the order of a frame.
+//! Sources and arguments of the rasterizer's kernels, in the order of a frame.
 
 use crate::gpu::pipelines::Access::{Read, Uniform, Write};
 use crate::gpu::pipelines::{Kernel, wgsl};

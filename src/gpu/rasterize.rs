@@ -1,9 +1,11 @@
-//! A frame on the GPU: project, sort by depth, count and list (splat, tile) pairs, sort by
-//! tile, composite; one submit, whatever the counts are. Twin: src/cpu/rasterize.rs.
+//! The rasterizer on the GPU: project, sort by depth, count and list (splat, tile) pairs, sort by
+//! tile, composite (3DGS, section 6).
 //!
-//! The number of pairs is known to the device alone: kernels take it from a buffer, and
-//! the room for pairs grows when a frame's read-back says that it was too small. What no
-//! binding holds is drawn in layers (src/gpu/layers.rs).
+//! One submit per frame. CPU version: src/cpu/rasterize.rs. Tests: tests/gpu/raster.rs.
+//!
+//! Only the device knows the number of pairs; kernels read it from a buffer. The capacity for
+//! pairs grows when the read-back of a frame reports that it was too small. Frames that exceed a
+//! binding are drawn in layers (src/gpu/layers.rs).
 
 use crate::abi::{
     FOOTPRINT_STRIDE, PLAN_REQUESTED, PLAN_WORDS, RasterOptions, RasterUniform, Rendered,
@@ -21,38 +23,38 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 
-/// Room for pairs at the first frame, unless the GPU has seen more.
+/// Capacity for pairs at the first frame of a GPU.
 const CAPACITY_START: usize = 1 << 16;
 
-/// The rasterizer with what it learnt about frames: same meaning as
+/// The rasterizer on a GPU, with the capacity that earlier frames required. Same results as
 /// [`crate::cpu::Rasterizer`].
 #[derive(Debug)]
 pub struct Rasterizer {
     gpu: Arc<Gpu>,
     pub(crate) timed: bool,
-    /// Room for (splat, tile) pairs.
+    /// Capacity for (splat, tile) pairs.
     capacity: usize,
     pub(crate) pairs: usize,
-    /// The last frame had more pairs than a binding holds.
-    crowded: bool,
-    /// Counts of the last frame that was drawn to a texture, on their way.
+    /// Whether the last frame had more pairs than a binding holds.
+    pairs_exceed_binding: bool,
+    /// Pending read-back of the plan of the last frame that was drawn to a texture.
     pub(crate) pending: Option<Reading<u32>>,
-    /// Whether a frame has told how much room it takes.
-    pub(crate) seen: bool,
+    /// Whether the pair count of a drawn frame has been read back.
+    pub(crate) pairs_known: bool,
     pub(crate) times: Vec<(&'static str, Duration)>,
 }
 
-/// A frame's picture, and the frame.
-pub(crate) struct Drawn {
+/// A rendered frame.
+pub(crate) struct RenderedFrame {
     pub(crate) picture: Vec<f32>,
-    /// Of all splats and the whole picture.
+    /// Uniform of all splats and the whole picture.
     pub(crate) call: RasterUniform,
-    /// What the frame left on the device, where it was drawn at once.
+    /// Buffers of the frame; `None` for a frame in layers.
     pub(crate) buffers: Option<FrameBuffers>,
 }
 
 impl Rasterizer {
-    /// A rasterizer on `gpu`.
+    /// Creates a rasterizer on `gpu`.
     pub fn new(gpu: Arc<Gpu>) -> Self {
         let capacity = gpu.pairs.load(Relaxed).max(CAPACITY_START);
         let capacity = capacity.min(gpu.rows_per_binding(1));
@@ -61,46 +63,45 @@ impl Rasterizer {
             timed: false,
             capacity,
             pairs: 0,
-            crowded: false,
+            pairs_exceed_binding: false,
             pending: None,
-            seen: false,
+            pairs_known: false,
             times: Vec::new(),
         }
     }
 
-    /// Measures what [`Rasterizer::stage_times`] tells, where the adapter can.
+    /// Measures [`Rasterizer::stage_times`] where the device has timestamps.
     pub fn with_stage_times(mut self) -> Self {
         self.timed = true;
         self
     }
 
-    /// Room for `pairs` (splat, tile) pairs at the first frame, 16 bytes each; it grows.
-    /// The picture does not depend on it.
+    /// Sets the initial capacity for (splat, tile) pairs, 16 bytes each. The capacity grows, and
+    /// the picture does not depend on it.
     pub fn with_capacity(mut self, pairs: usize) -> Self {
         self.capacity = pairs.clamp(1, self.gpu.rows_per_binding(1));
         self
     }
 
-    /// The GPU that it works on.
+    /// Returns the GPU.
     pub fn gpu(&self) -> &Arc<Gpu> {
         &self.gpu
     }
 
-    /// (splat, tile) pairs of the last frame, tiles of 16×16 pixels.
+    /// Returns the number of (splat, tile) pairs of the last frame, for tiles of 16×16 pixels.
     pub fn pairs(&self) -> usize {
         self.pairs
     }
 
-    /// Time of each stage of the last frame on the device, in order; empty without
+    /// Returns the time of each stage of the last frame on the device, in order; empty without
     /// [`Rasterizer::with_stage_times`] or timestamps.
     pub fn stage_times(&self) -> &[(&'static str, Duration)] {
         &self.times
     }
 
-    /// Renders `splats` seen by `camera`.
+    /// Renders `splats` as pairs_known by `camera`.
     ///
-    /// # Errors
-    /// What the device refuses, or is too small for: the CPU's rasterizer takes it.
+    /// Errors of the device, or [`GpuError::TooSmall`]; the CPU rasterizer can be used instead.
     pub fn render(
         &mut self,
         splats: &SplatSlices,
@@ -111,7 +112,7 @@ impl Rasterizer {
         self.render_scene(&scene, camera, options)
     }
 
-    /// Renders splats that are on the device.
+    /// Renders splats of device memory.
     ///
     /// # Errors
     /// As [`Rasterizer::render`].
@@ -149,22 +150,22 @@ impl Rasterizer {
         options: &RasterOptions,
         channels: Channels,
     ) -> Result<Vec<f32>, GpuError> {
-        self.drawn(scene, camera, options, channels).map(|drawn| drawn.picture)
+        self.render_frame(scene, camera, options, channels).map(|frame| frame.picture)
     }
 
-    /// A frame, drawn.
-    pub(crate) fn drawn(
+    /// Renders a frame and reads its picture back.
+    pub(crate) fn render_frame(
         &mut self,
         scene: &Scene,
         camera: &Camera,
         options: &RasterOptions,
         channels: Channels,
-    ) -> Result<Drawn, GpuError> {
+    ) -> Result<RenderedFrame, GpuError> {
         let call = uniform(scene, camera, options, channels);
         loop {
             if self.needs_layers(scene, &call) {
                 let picture = self.layered_picture(scene, &call)?;
-                return Ok(Drawn { picture, call, buffers: None });
+                return Ok(RenderedFrame { picture, call, buffers: None });
             }
             let gpu = self.gpu.clone();
             let mut commands = gpu.commands("frame", self.timed);
@@ -173,45 +174,46 @@ impl Rasterizer {
             let plan = commands.read::<u32>(&frame.plan, PLAN_WORDS)?;
             let submitted = commands.submit()?;
             let plan = plan.take(&gpu)?;
-            if !self.learn(&plan) {
+            if !self.update_capacity(&plan) {
                 continue;
             }
             self.times = submitted.times(&gpu)?;
             let picture = picture.take(&gpu)?;
-            return Ok(Drawn { picture, call, buffers: Some(frame) });
+            return Ok(RenderedFrame { picture, call, buffers: Some(frame) });
         }
     }
 
-    /// Whether no binding holds all footprints, all pixels or all pairs.
+    /// Returns whether the footprints, the pixels or the pairs exceed a binding.
     pub(crate) fn needs_layers(&self, scene: &Scene, call: &RasterUniform) -> bool {
-        self.crowded
+        self.pairs_exceed_binding
             || scene.len > self.gpu.rows_per_binding(FOOTPRINT_STRIDE)
             || pixels(call) > self.gpu.rows_per_binding(PICTURE_CHANNELS)
     }
 
-    /// Takes in what a frame asked for; whether there was room for it.
-    pub(crate) fn learn(&mut self, plan: &[u32]) -> bool {
-        let asked = plan.get(PLAN_REQUESTED).copied().unwrap_or(u32::MAX) as usize;
-        if asked <= self.capacity {
-            self.pairs = asked;
+    /// Records the pair count of a frame from its plan; returns whether the capacity was
+    /// sufficient.
+    pub(crate) fn update_capacity(&mut self, plan: &[u32]) -> bool {
+        let requested = plan.get(PLAN_REQUESTED).copied().unwrap_or(u32::MAX) as usize;
+        if requested <= self.capacity {
+            self.pairs = requested;
             return true;
         }
-        self.counted(asked);
+        self.set_pair_count(requested);
         false
     }
 
-    /// Takes in how many pairs a frame has.
-    pub(crate) fn counted(&mut self, pairs: usize) {
-        let most = self.gpu.rows_per_binding(1);
+    /// Records the pair count of a frame and enlarges the capacity where necessary.
+    pub(crate) fn set_pair_count(&mut self, pairs: usize) {
+        let max_pairs = self.gpu.rows_per_binding(1);
         self.pairs = pairs;
-        self.crowded = pairs > most;
-        if pairs > self.capacity && !self.crowded {
-            self.capacity = pairs.next_power_of_two().min(most);
+        self.pairs_exceed_binding = pairs > max_pairs;
+        if pairs > self.capacity && !self.pairs_exceed_binding {
+            self.capacity = pairs.next_power_of_two().min(max_pairs);
             self.gpu.pairs.fetch_max(self.capacity, Relaxed);
         }
     }
 
-    /// Adds a frame to `commands`.
+    /// Appends a frame to `commands`.
     pub(crate) fn record(
         &self,
         commands: &mut Commands,
@@ -224,6 +226,6 @@ impl Rasterizer {
         let stores = vec![store.clone(); scene.parts.len()];
         let depths = project(gpu, commands, scene, call, &stores)?;
         let picture = gpu.empty::<f32>("the picture", PICTURE_CHANNELS * pixels(&call))?;
-        composite(gpu, commands, call, (store, depths), &picture)
+        composite(gpu, commands, call, store, depths, &picture)
     }
 }

@@ -1,5 +1,7 @@
-//! How a parent's opacity is shared among its children: twin of
-//! [`crate::cpu::redistribute`]. Kernel: kernels/redistribute.wgsl.
+//! Opacity redistribution (SubSplat, "Opacity allocation"; supplement A.3).
+//!
+//! CPU version: [`crate::cpu::redistribute`]. WGSL: kernels/redistribute.wgsl,
+//! kernels/redistribute_bwd.wgsl. Tests: tests/gpu/twins.rs.
 
 use crate::abi::{RedistributeUniform, Rule};
 use crate::gpu::buffers::Binding;
@@ -57,10 +59,10 @@ pub(crate) static REDISTRIBUTE_BWD: Kernel = Kernel {
 /// Threads of a workgroup.
 const THREADS: usize = 64;
 
-/// Arguments of the whole rule, K = `k` children for each of P parents.
+/// Arguments of a call with K = `k` children for each of P parents.
 #[derive(Clone, Copy, Debug)]
 pub struct RedistributeArgs<'a> {
-    /// How.
+    /// Redistribution rule.
     pub rule: Rule,
     /// K, at least 1.
     pub k: usize,
@@ -70,11 +72,12 @@ pub struct RedistributeArgs<'a> {
     pub areas: &'a [f32],
     /// α, `[P]`.
     pub alphas: &'a [f32],
-    /// `[P]` for the rules whose areas are relative; else not read.
+    /// `[P]`, px²: areas of the parents. Read only by the rules whose areas are relative.
     pub own: &'a [f32],
 }
 
 impl RedistributeArgs<'_> {
+    /// Checks the lengths.
     fn check(&self) -> Result<(), GpuError> {
         let (p, k) = (self.alphas.len(), self.k);
         let own = if self.rule.areas_are_relative() { p } else { self.own.len() };
@@ -84,11 +87,11 @@ impl RedistributeArgs<'_> {
             ("own areas", self.own.len(), own),
             ("children", k.min(1), 1),
         ];
-        GpuError::unless_fitting(REDISTRIBUTE.name, lengths)
+        GpuError::check_lengths(REDISTRIBUTE.name, lengths)
     }
 }
 
-/// `of[range]`; empty where the kernel reads none of it.
+/// Returns `of[range]`; empty for an argument that the kernel does not read.
 fn part<'a>(of: &'a [f32], range: &Range<usize>) -> &'a [f32] {
     of.get(range.clone()).unwrap_or(&[])
 }
@@ -102,12 +105,12 @@ pub struct RedistributeGradients {
     pub areas: Vec<f32>,
     /// `[P]`.
     pub alphas: Vec<f32>,
-    /// `[P]`; zeros for the rules that do not read it.
+    /// `[P]`; zeros for the rules that do not read the parents' areas.
     pub own: Vec<f32>,
 }
 
 impl RedistributeArgs<'_> {
-    /// Uniform and inputs of some parents.
+    /// Uploads the uniform and the inputs of some parents.
     fn upload(&self, gpu: &Gpu, parents: &Range<usize>) -> Result<Vec<Binding>, GpuError> {
         let children = parents.start * self.k..parents.end * self.k;
         let uniform = gpu.uniform(&RedistributeUniform {
@@ -128,10 +131,9 @@ impl RedistributeArgs<'_> {
 }
 
 impl Gpu {
-    /// Opacities `[P, K]` of the children.
+    /// Computes the opacities `[P, K]` of the children.
     ///
-    /// # Errors
-    /// Lengths that do not fit one another; anything the device refuses.
+    /// [`GpuError::Argument`] for inconsistent lengths; errors of the device.
     pub fn redistribute(&self, args: &RedistributeArgs) -> Result<Vec<f32>, GpuError> {
         args.check()?;
         let mut out = Vec::with_capacity(args.logits.len());
@@ -149,7 +151,8 @@ impl Gpu {
         Ok(out)
     }
 
-    /// Gradients of [`Gpu::redistribute`] for the gradient `grad` `[P, K]` of its result.
+    /// Computes the gradients of [`Gpu::redistribute`] for `grad` `[P, K]`, the gradient of its
+    /// result.
     ///
     /// # Errors
     /// As [`Gpu::redistribute`].
@@ -160,7 +163,7 @@ impl Gpu {
     ) -> Result<RedistributeGradients, GpuError> {
         args.check()?;
         let lengths = [("gradient", grad.len(), args.logits.len())];
-        GpuError::unless_fitting(REDISTRIBUTE_BWD.name, lengths)?;
+        GpuError::check_lengths(REDISTRIBUTE_BWD.name, lengths)?;
         let mut out = RedistributeGradients::default();
         for parents in Self::chunks(args.alphas.len(), self.rows_per_binding(args.k.max(2))) {
             let mut bindings = args.upload(self, &parents)?;

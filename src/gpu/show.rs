@@ -1,5 +1,4 @@
-//! A frame onto a texture of the application's, on its device: the picture does not pass
-//! through host memory. Kernel: kernels/show.wgsl.
+//! Drawing of a frame to a texture of the application, without a copy through host memory.
 
 use crate::abi::{PLAN_WORDS, RasterOptions, RasterUniform, ShowUniform, TILE_GPU};
 use crate::camera::Camera;
@@ -21,16 +20,16 @@ pub(crate) static SHOW: Kernel = Kernel {
 };
 
 impl Rasterizer {
-    /// Renders splats to `target`, a texture view of this rasterizer's device that may be
-    /// rendered to: RGB over the background, accumulated alpha. One submit; it does not wait
-    /// for the device but for the last frame's counts.
+    /// Renders splats to `target`, a renderable texture view of this rasterizer's device: RGB
+    /// over the background, and accumulated alpha.
     ///
-    /// The first frame is always whole. A later one that needs more room for (splat, tile)
-    /// pairs than any before lacks its farthest splats, and the next has the room. A frame of
-    /// more than a binding holds takes several submits, and waits.
+    /// One submit, without waiting for it; only the pair count of the previous frame is waited
+    /// for. The first frame is always complete. A later frame with more (splat, tile) pairs than
+    /// the capacity lacks its farthest splats; the capacity of the next frame is sufficient. A
+    /// frame that exceeds a binding takes several submits and waits for them.
     ///
-    /// # Errors
-    /// A target of another size than the camera's picture; as [`Rasterizer::render`].
+    /// [`GpuError::Argument`] for a target of another size than the camera's picture; otherwise
+    /// as [`Rasterizer::render`].
     pub fn draw(
         &mut self,
         scene: &Scene,
@@ -43,14 +42,14 @@ impl Rasterizer {
         if (size.width as usize, size.height as usize) != (k.width, k.height) {
             return Err(GpuError::Argument {
                 kernel: SHOW.name,
-                what: "the texture, px",
+                argument: "the texture, px",
                 expected: format!("{}x{}", k.width, k.height),
                 got: format!("{}x{}", size.width, size.height),
             });
         }
         let gpu = self.gpu().clone();
         if let Some(plan) = self.pending.take() {
-            self.learn(&plan.take(&gpu)?);
+            self.update_capacity(&plan.take(&gpu)?);
         }
         let call = uniform(scene, camera, options, Channels::Interleaved);
         loop {
@@ -65,25 +64,26 @@ impl Rasterizer {
             let plan = commands.read::<u32>(&frame.plan, PLAN_WORDS)?;
             gpu.show(&mut commands, &call, &frame.picture, target)?;
             commands.submit()?;
-            if self.seen {
+            if self.pairs_known {
                 self.pending = Some(plan);
                 return Ok(());
             }
-            // Nothing is known of the scene yet.
-            self.seen = self.learn(&plan.take(&gpu)?);
-            if self.seen {
+            // The number of pairs is unknown before the first frame.
+            self.pairs_known = self.update_capacity(&plan.take(&gpu)?);
+            if self.pairs_known {
                 return Ok(());
             }
         }
     }
 }
 
-fn show(
+fn draw_band(
     device: &wgpu::Device,
     encoder: &mut wgpu::CommandEncoder,
     pipeline: &wgpu::RenderPipeline,
     bindings: &[Binding],
-    (target, band): (&wgpu::TextureView, &ShowUniform),
+    target: &wgpu::TextureView,
+    band: &ShowUniform,
 ) {
     let entries: Vec<_> = (0..)
         .zip(bindings)
@@ -113,7 +113,7 @@ fn show(
 }
 
 impl Gpu {
-    /// Adds to `commands` what shows a call's band, drawn to `picture`, on `target`.
+    /// Appends the drawing of the call's band of `picture` to `target`.
     fn show(
         &self,
         commands: &mut Commands,
@@ -132,14 +132,15 @@ impl Gpu {
         let pipeline = self.show_pipeline(format)?;
         let (device, target) = (self.device.clone(), target.clone());
         commands.draw(bindings, move |encoder, bindings| {
-            show(&device, encoder, &pipeline, bindings, (&target, &band));
+            draw_band(&device, encoder, &pipeline, bindings, &target, &band);
         });
         Ok(())
     }
 
-    /// The render pipeline of [`SHOW`] for a texture format, built at its first use.
+    /// Returns the render pipeline of [`SHOW`] for a texture format, built at its first use.
     fn show_pipeline(&self, format: wgpu::TextureFormat) -> Result<wgpu::RenderPipeline, GpuError> {
-        let mut built = self.pipelines.shows.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut built =
+            self.pipelines.show_pipelines.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(found) = built.get(&format) {
             return Ok(found.clone());
         }

@@ -1,7 +1,8 @@
-//! A stable radix sort of 32-bit keys, 4 bits a pass: count, sum, scatter as dispatches of
-//! their own, so that no workgroup waits for another. Equal keys keep their order.
-//! Twin: src/cpu/sort.rs. Kernels: kernels/sort_count.wgsl, scan_whole.wgsl,
-//! sort_scatter.wgsl.
+//! A stable radix sort of 32-bit keys, 4 bits per pass.
+//!
+//! Counting, prefix sum and scatter are separate dispatches, so that no workgroup waits for
+//! another. CPU version: src/cpu/sort.rs. WGSL: kernels/sort_count.wgsl, kernels/scan_whole.wgsl,
+//! kernels/sort_scatter.wgsl. Tests: tests/gpu/raster.rs.
 
 use crate::abi::{GPU_BLOCK, PLAN_BLOCKS, PLAN_COUNT, PLAN_WORDS, SortUniform};
 use crate::gpu::buffers::{Binding, Buffer};
@@ -12,26 +13,25 @@ use crate::gpu::raster_kernels::{SCAN_WHOLE, SORT_COUNT, SORT_SCATTER};
 
 /// Bits of a digit.
 const DIGIT_BITS: u32 = 4;
-/// Bytes from one uniform to the next in one buffer (WebGPU's alignment).
+/// Distance of uniforms in one buffer, bytes (WebGPU's alignment).
 const UNIFORM_STRIDE: usize = 256;
 
-/// What a sort works with. Keys and values change sides with every pass.
+/// Buffers of a sort. Every pass swaps the input and output buffers of keys and values. The
+/// initial values are the indices 0, 1, …
 pub(crate) struct Sort {
-    /// How many elements there are ([`plan_of`], or kernels/plan.wgsl).
+    /// Number of elements ([`plan_of`], or kernels/plan.wgsl).
     pub(crate) plan: Buffer,
     /// Workgroups of [`GPU_BLOCK`] elements.
     pub(crate) groups: Groups,
     pub(crate) keys: [Buffer; 2],
     pub(crate) values: [Buffer; 2],
-    /// Values are their own places; `values[0]` need not be filled.
-    pub(crate) fresh: bool,
-    /// `[16, blocks]`, and one more.
+    /// `[16, blocks]`, and the total.
     histogram: Buffer,
     /// One [`SortUniform`] per pass.
     passes: Buffer,
 }
 
-/// A plan of `count` elements, known beforehand.
+/// Returns the plan of `count` elements.
 pub(crate) fn plan_of(count: usize) -> [u32; PLAN_WORDS] {
     let mut plan = [0; PLAN_WORDS];
     plan[PLAN_COUNT] = count as u32;
@@ -40,13 +40,12 @@ pub(crate) fn plan_of(count: usize) -> [u32; PLAN_WORDS] {
 }
 
 impl Sort {
-    /// Room to sort `room` elements.
+    /// Allocates the buffers to sort at most `capacity` elements.
     pub(crate) fn new(
         gpu: &Gpu,
         plan: Buffer,
         groups: Groups,
-        room: usize,
-        fresh: bool,
+        capacity: usize,
     ) -> Result<Self, GpuError> {
         let mut passes = [0u32; (u32::BITS / DIGIT_BITS) as usize * UNIFORM_STRIDE / 4];
         for (pass, words) in (0..).zip(passes.chunks_mut(UNIFORM_STRIDE / 4)) {
@@ -56,19 +55,18 @@ impl Sort {
                 *to = *from;
             }
         }
-        let array = |what| gpu.empty::<u32>(what, room);
+        let array = |label| gpu.empty::<u32>(label, capacity);
         Ok(Self {
             plan,
             groups,
             keys: [array("sort keys")?, array("sort keys")?],
             values: [array("sort values")?, array("sort values")?],
-            fresh,
-            histogram: gpu.empty::<u32>("sort histogram", 16 * room.div_ceil(GPU_BLOCK) + 1)?,
+            histogram: gpu.empty::<u32>("sort histogram", 16 * capacity.div_ceil(GPU_BLOCK) + 1)?,
             passes: gpu.upload("sort passes", &passes)?,
         })
     }
 
-    /// Sorts by the lowest `bits` bits; the result is `keys[0]` and `values[0]`.
+    /// Appends a sort by the lowest `bits` bits; the result is in `keys[0]` and `values[0]`.
     pub(crate) fn record(&mut self, commands: &mut Commands, bits: u32) -> Result<(), GpuError> {
         for pass in 0..bits.div_ceil(DIGIT_BITS) {
             let at = u64::from(pass) * UNIFORM_STRIDE as u64;
@@ -81,10 +79,10 @@ impl Sort {
             commands.run(&SORT_COUNT, &[], &count, self.groups.clone())?;
             let sums = [plan.clone(), histogram.clone()];
             commands.run(&SCAN_WHOLE, &[("PER_BLOCK", 16.0)], &sums, Groups::Of([1; 3]))?;
-            let fresh = self.fresh && pass == 0;
-            let constants = [("FRESH", f64::from(u8::from(fresh)))];
-            // A fresh pass does not read the values.
-            let values = if fresh { keys.clone() } else { values };
+            let identity = pass == 0;
+            let constants = [("IDENTITY_VALUES", f64::from(u8::from(identity)))];
+            // The first pass does not read the values.
+            let values = if identity { keys.clone() } else { values };
             let scatter = [uniform, plan, keys, values, histogram, keys_out, values_out];
             commands.run(&SORT_SCATTER, &constants, &scatter, self.groups.clone())?;
             self.keys.swap(0, 1);
@@ -95,14 +93,13 @@ impl Sort {
 }
 
 impl Gpu {
-    /// Places of `keys` in ascending order, equal keys in their own order.
+    /// Returns the indices of `keys` in ascending order; equal keys keep their order.
     ///
-    /// # Errors
-    /// More keys than a binding holds; anything the device refuses.
+    /// [`GpuError::TooSmall`] for more keys than a binding holds; errors of the device.
     pub fn sort_order(&self, keys: &[u32]) -> Result<Vec<u32>, GpuError> {
         let count = keys.len();
         let plan = self.upload("sort plan", &plan_of(count))?;
-        let mut sort = Sort::new(self, plan, Groups::of(count, GPU_BLOCK), count, true)?;
+        let mut sort = Sort::new(self, plan, Groups::of(count, GPU_BLOCK), count)?;
         sort.keys[0] = self.upload("sort keys", keys)?;
         let mut commands = self.commands("sort", false);
         sort.record(&mut commands, u32::BITS)?;

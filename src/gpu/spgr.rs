@@ -1,5 +1,6 @@
-//! Sub-pixel Gaussian reparameterization: twin of [`crate::cpu::spgr`]. Kernels:
-//! kernels/spgr.wgsl.
+//! Sub-pixel Gaussian reparameterization (SubSplat, section 3.2; supplement A.3).
+//!
+//! CPU version: [`crate::cpu::spgr`]. WGSL: kernels/spgr.wgsl. Tests: tests/gpu/spgr.rs.
 
 use crate::abi::{
     CHILDREN_MAX, FRUSTUM_MARGIN, HEAD_STRIDE, Rules, SPGR_CAMERA_STRIDE, SPLAT_STRIDE, SpgrUniform,
@@ -39,15 +40,15 @@ const THREADS: usize = 64;
 /// Arguments of one call.
 #[derive(Clone, Copy, Debug)]
 pub struct SpgrArgs<'a> {
-    /// How children are made; K ≤ [`CHILDREN_MAX`].
+    /// Rules for the children; K ≤ [`CHILDREN_MAX`].
     pub rules: &'a Rules,
-    /// Context views, pixels of the input pictures.
+    /// Cameras of the context views; intrinsics in pixels of the input pictures.
     pub cameras: &'a [Camera],
     /// Near plane of each view, world units.
     pub near: &'a [f32],
     /// Parents per view.
     pub per_view: usize,
-    /// Index of parent 0 of this call in the scene.
+    /// Index in the scene of the call's first parent.
     pub first: usize,
     /// Head records `[N, K, 11]`.
     pub head: &'a [f32],
@@ -56,7 +57,7 @@ pub struct SpgrArgs<'a> {
 }
 
 impl<'a> SpgrArgs<'a> {
-    /// N, where all fits together.
+    /// Checks the arguments and returns N.
     pub(super) fn check(&self) -> Result<usize, GpuError> {
         let n = self.parents.len() / SPLAT_STRIDE;
         let k = self.rules.children();
@@ -68,10 +69,10 @@ impl<'a> SpgrArgs<'a> {
             ("parents", self.parents.len(), n * SPLAT_STRIDE),
             ("head records", self.head.len(), n * k * HEAD_STRIDE),
         ];
-        GpuError::unless_fitting(SPGR.name, lengths).map(|()| n)
+        GpuError::check_lengths(SPGR.name, lengths).map(|()| n)
     }
 
-    /// What the kernels are told of `parents`.
+    /// Returns the uniform for `parents`.
     pub(super) fn uniform(&self, parents: &Range<usize>) -> SpgrUniform {
         let r = self.rules;
         SpgrUniform {
@@ -102,13 +103,13 @@ impl<'a> SpgrArgs<'a> {
         }
     }
 
-    /// The context cameras as the kernels read them.
+    /// Returns the context cameras in the layout of the kernels.
     pub(super) fn cameras(&self) -> Vec<f32> {
         let rows = self.cameras.iter().zip(self.near);
-        rows.flat_map(|(camera, &near)| camera_lanes(camera, near)).collect()
+        rows.flat_map(|(camera, &near)| camera_floats(camera, near)).collect()
     }
 
-    /// Head records and rows of `parents`.
+    /// Returns the head records and rows of `parents`.
     pub(super) fn rows(&self, parents: &Range<usize>) -> [&'a [f32]; 2] {
         let part = |of: &'a [f32], width: usize| {
             of.get(parents.start * width..parents.end * width).unwrap_or(&[])
@@ -117,8 +118,9 @@ impl<'a> SpgrArgs<'a> {
     }
 }
 
-/// In the order of kernels/shared/spgr.wgsl; bounds in f64, as the CPU takes them.
-fn camera_lanes(camera: &Camera, near: f32) -> [f32; SPGR_CAMERA_STRIDE] {
+/// Returns a camera in the order of kernels/shared/spgr.wgsl; bounds are computed in f64, as on
+/// the CPU.
+fn camera_floats(camera: &Camera, near: f32) -> [f32; SPGR_CAMERA_STRIDE] {
     let k = camera.intrinsics;
     let focal = [f64::from(k.fx), f64::from(k.fy)];
     let centre = [f64::from(k.cx), f64::from(k.cy)];
@@ -133,24 +135,23 @@ fn camera_lanes(camera: &Camera, near: f32) -> [f32; SPGR_CAMERA_STRIDE] {
         (size[0] - centre[0]) / focal[0] + margin(0),
         (size[1] - centre[1]) / focal[1] + margin(1),
     ];
-    let least = (0.01 * f64::from(near)).max(1e-3);
+    let min_z = (0.01 * f64::from(near)).max(1e-3);
     let all = rotation.chain(position).chain(focal).chain(centre).chain(size);
-    let mut lanes = [0.0; SPGR_CAMERA_STRIDE];
-    for (lane, v) in lanes.iter_mut().zip(all.chain([least]).chain(bounds)) {
-        *lane = v as f32;
+    let mut floats = [0.0; SPGR_CAMERA_STRIDE];
+    for (to, v) in floats.iter_mut().zip(all.chain([min_z]).chain(bounds)) {
+        *to = v as f32;
     }
-    lanes
+    floats
 }
 
 impl Gpu {
-    /// Children `[N·K, 11]` and gains `[N·K]` or `[N·K, 4]`. Numbers that are not finite
-    /// are the caller's to look for, in what comes and in what goes.
+    /// Computes the children `[N·K, 11]` and the gains `[N·K]` or `[N·K, 4]`. The caller checks
+    /// inputs and outputs for numbers that are not finite.
     ///
-    /// # Errors
-    /// Lengths that do not fit; anything the device refuses.
+    /// [`GpuError::Argument`] for inconsistent lengths; errors of the device.
     pub fn spgr(&self, args: &SpgrArgs) -> Result<(Vec<f32>, Vec<f32>), GpuError> {
         let n = args.check()?;
-        let (k, lanes) = (args.rules.children(), args.rules.gain_lanes());
+        let (k, gain_stride) = (args.rules.children(), args.rules.gain_lanes());
         let cameras = self.upload("context cameras", &args.cameras())?;
         let (mut rows, mut gains) = (Vec::new(), Vec::new());
         for parents in Self::chunks(n, self.rows_per_binding(k * HEAD_STRIDE.max(SPLAT_STRIDE))) {
@@ -160,13 +161,13 @@ impl Gpu {
             let head = self.upload("head records", head)?;
             let own = self.upload("parents", own)?;
             let children = self.empty::<f32>("children", count * SPLAT_STRIDE)?;
-            let gain = self.empty::<f32>("gains", count * lanes)?;
+            let gain = self.empty::<f32>("gains", count * gain_stride)?;
             let bindings = [&uniform, &head, &own, &cameras, &children, &gain];
             let mut commands = self.commands("spgr", false);
             let groups = Groups::of(parents.len(), THREADS);
             commands.run(&SPGR, &[], &bindings.map(Binding::from), groups)?;
             let children = commands.read::<f32>(&children, count * SPLAT_STRIDE)?;
-            let gain = commands.read::<f32>(&gain, count * lanes)?;
+            let gain = commands.read::<f32>(&gain, count * gain_stride)?;
             commands.submit()?;
             rows.extend(children.take(self)?);
             gains.extend(gain.take(self)?);

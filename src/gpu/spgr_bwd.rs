@@ -1,5 +1,7 @@
-//! Gradients of SPGR: twin of the backward half of [`crate::cpu::spgr`]. Kernels:
-//! kernels/spgr_bwd.wgsl, kernels/spgr_gains_bwd.wgsl.
+//! Gradients of sub-pixel Gaussian reparameterization.
+//!
+//! CPU version: [`crate::cpu::spgr`]. WGSL: kernels/spgr_bwd.wgsl, kernels/spgr_gains_bwd.wgsl.
+//! Tests: tests/gpu/spgr.rs.
 
 use crate::abi::{HEAD_STRIDE, Rules, SPLAT_STRIDE, SpgrGainsBwdUniform};
 use crate::gpu::buffers::Binding;
@@ -42,11 +44,11 @@ pub(crate) static SPGR_GAINS_BWD: Kernel = Kernel {
 const THREADS: usize = 64;
 
 impl Gpu {
-    /// Gradients of head records `[N, K, 11]` and parents `[N, 11]` for those of the
-    /// children, `grad` `[N·K, 11]`. The gains' lane of the former is 0.
+    /// Computes the gradients of head records `[N, K, 11]` and parents `[N, 11]` for `grad`
+    /// `[N·K, 11]`, the gradient of the children. The gain of each head record has gradient 0
+    /// here.
     ///
-    /// # Errors
-    /// Lengths that do not fit; anything the device refuses.
+    /// [`GpuError::Argument`] for inconsistent lengths; errors of the device.
     pub fn spgr_backward(
         &self,
         args: &SpgrArgs,
@@ -55,9 +57,9 @@ impl Gpu {
         let n = args.check()?;
         let k = args.rules.children();
         let lengths = [("gradient of the children", grad.len(), n * k * SPLAT_STRIDE)];
-        GpuError::unless_fitting(SPGR_BWD.name, lengths)?;
+        GpuError::check_lengths(SPGR_BWD.name, lengths)?;
         let cameras = self.upload("context cameras", &args.cameras())?;
-        let (mut of_head, mut of_parents) = (Vec::new(), Vec::new());
+        let (mut head_gradients, mut parent_gradients) = (Vec::new(), Vec::new());
         for parents in Self::chunks(n, self.rows_per_binding(k * HEAD_STRIDE.max(SPLAT_STRIDE))) {
             let count = parents.len() * k;
             let from = parents.start * k * SPLAT_STRIDE;
@@ -77,34 +79,33 @@ impl Gpu {
             let d_head = commands.read::<f32>(&d_head, count * HEAD_STRIDE)?;
             let d_parents = commands.read::<f32>(&d_parents, floats)?;
             commands.submit()?;
-            of_head.extend(d_head.take(self)?);
-            of_parents.extend(d_parents.take(self)?);
+            head_gradients.extend(d_head.take(self)?);
+            parent_gradients.extend(d_parents.take(self)?);
         }
-        Ok((of_head, of_parents))
+        Ok((head_gradients, parent_gradients))
     }
 
-    /// Gradient `[N, K, 11]` of head records, zero but for the gains' lane, for that of the
-    /// gains, `grad` `[N·K]` or `[N·K, 4]`.
+    /// Computes the gradient `[N, K, 11]` of the head records for `grad` `[N·K]` or `[N·K, 4]`,
+    /// the gradient of the gains. It is zero except for the gain of each record.
     ///
-    /// # Errors
-    /// Lengths that do not fit; anything the device refuses.
+    /// [`GpuError::Argument`] for inconsistent lengths; errors of the device.
     pub fn spgr_gains_backward(
         &self,
         rules: &Rules,
         head: &[f32],
         grad: &[f32],
     ) -> Result<Vec<f32>, GpuError> {
-        let (records, lanes) = (head.len() / HEAD_STRIDE, rules.gain_lanes());
+        let (records, gain_stride) = (head.len() / HEAD_STRIDE, rules.gain_lanes());
         let lengths = [
             ("head records", head.len(), records * HEAD_STRIDE),
-            ("gradient of the gains", grad.len(), records * lanes),
+            ("gradient of the gains", grad.len(), records * gain_stride),
         ];
-        GpuError::unless_fitting(SPGR_GAINS_BWD.name, lengths)?;
+        GpuError::check_lengths(SPGR_GAINS_BWD.name, lengths)?;
         let mut out = Vec::with_capacity(head.len());
         for part in Self::chunks(records, self.rows_per_binding(HEAD_STRIDE)) {
             let uniform = self.uniform(&SpgrGainsBwdUniform {
                 records: part.len() as u32,
-                lanes: lanes as u32,
+                lanes: gain_stride as u32,
                 delta: rules.delta as f32,
                 pad: 0,
             })?;
@@ -112,7 +113,7 @@ impl Gpu {
                 of.get(part.start * width..part.end * width).unwrap_or(&[]).to_vec()
             };
             let head = self.upload("head records", &rows(head, HEAD_STRIDE))?;
-            let grad = self.upload("gradient of the gains", &rows(grad, lanes))?;
+            let grad = self.upload("gradient of the gains", &rows(grad, gain_stride))?;
             let floats = part.len() * HEAD_STRIDE;
             let d_head = self.empty::<f32>("gradient of the head", floats)?;
             let bindings = [&uniform, &head, &grad, &d_head].map(Binding::from);

@@ -1,59 +1,69 @@
-//! One renderer for any device: the CPU's kernels, or a GPU's with the CPU's behind them.
+//! One renderer for every device: the CPU rasterizer, or a GPU's with the CPU as fallback.
 
 use super::{Picture, slices};
 use crate::abi::{Gradients, RasterOptions, Rendered, SplatSlices};
+use crate::backend::Backend;
 use crate::camera::Camera;
 use crate::cpu;
 #[cfg(feature = "gpu")]
 use crate::gpu;
 use crate::splats::Splats;
-use thiserror::Error;
 
-/// Why a device does not render.
-#[derive(Clone, Debug, Error, PartialEq, Eq)]
-#[error("{0}")]
-pub struct DeviceError(String);
+pub use crate::backend::DeviceError;
 
-/// Renders splats on the device that was asked for, and on the CPU where that fails.
+/// Renders splats on the chosen device, and on the CPU after an error of that device.
 #[derive(Debug)]
 pub struct Renderer {
     cpu: cpu::Rasterizer,
-    backend: Backend,
+    rasterizer: Rasterizer,
     warning: Option<String>,
 }
 
+/// The rasterizer that renders now.
 #[derive(Debug)]
-enum Backend {
+enum Rasterizer {
     Cpu,
     #[cfg(feature = "gpu")]
     Gpu(gpu::Rasterizer),
 }
 
 impl Default for Renderer {
-    /// The CPU's.
+    /// Renders on the CPU.
     fn default() -> Self {
-        Self { cpu: cpu::Rasterizer::new(), backend: Backend::Cpu, warning: None }
+        Self::new(&Backend::Cpu)
     }
 }
 
 impl Renderer {
-    /// The renderer of `device`: `cpu`; `auto`, a GPU where there is one that is no
-    /// software adapter; `gpu`, any adapter; else an adapter by a part of its name.
+    /// Opens `device`: `cpu`, `auto`, `gpu`, or a part of an adapter's name
+    /// ([`crate::device::DeviceChoice`]).
     ///
     /// # Errors
-    /// A GPU was asked for and none answers, or the library was built without one.
+    /// As [`Backend::open`].
     pub fn open(device: &str) -> Result<Self, DeviceError> {
-        let backend = Backend::open(device)?;
-        Ok(Self { backend, ..Self::default() })
+        Backend::open(device).map(|backend| Self::new(&backend))
     }
 
-    /// The renderer of a GPU that is open already.
+    /// Renders on the device of `backend`.
+    pub fn new(backend: &Backend) -> Self {
+        let rasterizer = match backend {
+            Backend::Cpu => Rasterizer::Cpu,
+            #[cfg(feature = "gpu")]
+            Backend::Wgpu(_) => backend
+                .gpu()
+                .map_or(Rasterizer::Cpu, |gpu| Rasterizer::Gpu(gpu::Rasterizer::new(gpu.clone()))),
+        };
+        Self { cpu: cpu::Rasterizer::new(), rasterizer, warning: None }
+    }
+
+    /// Renders on an opened GPU.
     #[cfg(feature = "gpu")]
     pub fn with_gpu(gpu: std::sync::Arc<gpu::Gpu>) -> Self {
-        Self { backend: Backend::Gpu(gpu::Rasterizer::new(gpu)), ..Self::default() }
+        Self::new(&Backend::from(gpu))
     }
 
-    /// [`Renderer::open`], but the CPU's with a warning where that fails.
+    /// Opens `device` as [`Renderer::open`] does; on an error, renders on the CPU and keeps the
+    /// error as a warning.
     pub fn open_or_cpu(device: &str) -> Self {
         Self::open(device).unwrap_or_else(|e| Self {
             warning: Some(format!("{e}; rendering on the CPU")),
@@ -61,58 +71,59 @@ impl Renderer {
         })
     }
 
-    /// What renders now: `CPU`, or the adapter.
+    /// Returns the name of the device that renders now: `CPU`, or the adapter.
     pub fn device(&self) -> String {
-        match &self.backend {
-            Backend::Cpu => "CPU".to_owned(),
+        match &self.rasterizer {
+            Rasterizer::Cpu => "CPU".to_owned(),
             #[cfg(feature = "gpu")]
-            Backend::Gpu(rasterizer) => rasterizer.gpu().adapter().to_string(),
+            Rasterizer::Gpu(rasterizer) => rasterizer.gpu().adapter().to_string(),
         }
     }
 
-    /// What the caller should tell, once.
+    /// Returns and clears the pending warning.
     pub fn take_warning(&mut self) -> Option<String> {
         self.warning.take()
     }
 
-    /// Renders `splats` seen by `camera`, in the splats' own SH basis. Where a GPU fails,
-    /// the CPU takes over for good, and there is a warning to take.
+    /// Renders `splats` as seen by `camera`, in the SH basis of the splats.
+    ///
+    /// After an error of the GPU, this call and all later ones render on the CPU, and
+    /// [`Renderer::take_warning`] returns the error.
     pub fn render(&mut self, splats: &Splats, camera: &Camera, options: &RasterOptions) -> Picture {
         let options = RasterOptions { sh_basis: splats.sh_basis, ..*options };
         let rendered = match self.render_slices(&slices(splats), camera, &options) {
             Ok(rendered) => rendered,
             Err(e) => {
                 self.warning = Some(format!("{e}; rendering on the CPU"));
-                self.backend = Backend::Cpu;
+                self.rasterizer = Rasterizer::Cpu;
                 self.cpu.render(&slices(splats), camera, &options)
             }
         };
         Picture::from(rendered)
     }
 
-    /// Renders on the device itself, without another behind it.
+    /// Renders on the current device, without the CPU as fallback.
     ///
     /// # Errors
-    /// The GPU refuses, is lost or is too small.
+    /// [`DeviceError::Gpu`] where the GPU is too small, lost, or rejects a command.
     pub fn render_slices(
         &mut self,
         splats: &SplatSlices,
         camera: &Camera,
         options: &RasterOptions,
     ) -> Result<Rendered, DeviceError> {
-        match &mut self.backend {
-            Backend::Cpu => Ok(self.cpu.render(splats, camera, options)),
+        match &mut self.rasterizer {
+            Rasterizer::Cpu => Ok(self.cpu.render(splats, camera, options)),
             #[cfg(feature = "gpu")]
-            Backend::Gpu(rasterizer) => {
-                rasterizer.render(splats, camera, options).map_err(|e| DeviceError(e.to_string()))
-            }
+            Rasterizer::Gpu(rasterizer) => Ok(rasterizer.render(splats, camera, options)?),
         }
     }
-}
 
-impl Renderer {
-    /// Gradients of a loss whose gradient with respect to the planes `[5, H, W]` of this
-    /// view (R, G, B, alpha, Σ w·z) is `gradients`, by the device itself.
+    /// Computes the gradients of a loss with respect to the splats, on the current device and
+    /// without the CPU as fallback.
+    ///
+    /// `gradients` `[5, H, W]`: gradient of the loss with respect to R, G, B, alpha and Σ w·z of
+    /// this view.
     ///
     /// # Errors
     /// As [`Renderer::render_slices`].
@@ -123,37 +134,16 @@ impl Renderer {
         options: &RasterOptions,
         gradients: &[f32],
     ) -> Result<Gradients, DeviceError> {
-        match &mut self.backend {
-            Backend::Cpu => {
+        match &mut self.rasterizer {
+            Rasterizer::Cpu => {
                 let mut out = Gradients::default();
                 self.cpu.backward(splats, camera, options, gradients, &mut out);
                 Ok(out)
             }
             #[cfg(feature = "gpu")]
-            Backend::Gpu(rasterizer) => rasterizer
-                .backward(splats, camera, options, gradients)
-                .map_err(|e| DeviceError(e.to_string())),
-        }
-    }
-}
-
-impl Backend {
-    #[cfg(feature = "gpu")]
-    fn open(device: &str) -> Result<Self, DeviceError> {
-        let choice = device.parse::<gpu::DeviceChoice>().unwrap_or_default();
-        match gpu::Gpu::open(&choice).map_err(|e| DeviceError(e.to_string()))? {
-            Some(gpu) => Ok(Self::Gpu(gpu::Rasterizer::new(gpu))),
-            None => Ok(Self::Cpu),
-        }
-    }
-
-    #[cfg(not(feature = "gpu"))]
-    fn open(device: &str) -> Result<Self, DeviceError> {
-        match device.to_ascii_lowercase().as_str() {
-            "cpu" | "auto" => Ok(Self::Cpu),
-            _ => Err(DeviceError(format!(
-                "device {device}: expected cpu, as this build has no feature `gpu`"
-            ))),
+            Rasterizer::Gpu(rasterizer) => {
+                Ok(rasterizer.backward(splats, camera, options, gradients)?)
+            }
         }
     }
 }

@@ -1,5 +1,5 @@
-//! Frames of more splats, pairs or pixels than a binding holds, in bands and layers: on a
-//! device that binds little, the bytes of one that binds enough.
+//! Frames with more splats, pairs or pixels than a binding holds, in bands and layers. The bytes
+//! equal those of a device with large bindings.
 
 use subsplat_test_support::gpu as adapter;
 use subsplat_test_support::raster_scene;
@@ -13,8 +13,8 @@ use subsplat::abi::{
 use subsplat::camera::Camera;
 use subsplat::gpu::{Gpu, GpuError, Rasterizer};
 
-/// Bytes of a binding: 1,365 footprints, 16,384 pairs forward and 1,638 back, and one row
-/// of tiles of [`WIDTH`] pixels.
+/// Size of a binding, bytes: 1,365 footprints, 16,384 pairs forward and 1,638 backward, and one
+/// row of tiles of [`WIDTH`] pixels.
 const BINDING: u64 = 64 << 10;
 const WIDTH: usize = 160;
 const HEIGHT: usize = 105;
@@ -23,8 +23,9 @@ fn camera(scene: &Scene, width: usize, height: usize) -> Camera {
     Camera { intrinsics: scene.camera.intrinsics.resized(width, height), ..scene.camera }
 }
 
-/// Picture, planes and gradients on `small` are those on any GPU; the number of pairs, and
-/// whether the last forward and backward took layers (`None` where no one can tell).
+/// Checks that picture, planes and gradients on `small` equal those on any GPU. Returns the
+/// number of pairs, and whether the last forward and backward pass in_layers layers (`None` without
+/// timestamps).
 fn check(
     small: &Arc<Gpu>,
     splats: &SplatSlices,
@@ -38,32 +39,32 @@ fn check(
     let mut layered = Rasterizer::new(small.clone()).with_stage_times();
     let expected = whole.render(splats, camera, options).unwrap();
     assert!(expected.alpha.iter().any(|&a| a > 0.5));
-    // Twice: the second frame knows of the first.
+    // Two frames: the second one starts with the capacity of the first.
     for _ in 0..2 {
         let got = layered.render(splats, camera, options).unwrap();
-        assert!(got == expected, "other bytes in layers");
+        assert!(got == expected, "layers change the bytes");
         assert!(layered.pairs() >= whole.pairs());
     }
     let expected = whole.render_planes(splats, camera, options).unwrap();
     let (planes, mut frame) = layered.frame(splats, camera, options).unwrap();
-    assert!(planes == expected, "other planes in layers");
+    assert!(planes == expected, "layers change the planes");
     let expected = whole.backward(splats, camera, options, &upstream).unwrap();
     let sound = expected.rows.iter().chain(&expected.cov6).any(|&v| v != 0.0);
     assert!(sound && expected.background.iter().any(|&v| v != 0.0));
-    let took = |times: &[(&str, std::time::Duration)]| {
+    let in_layers = |times: &[(&str, std::time::Duration)]| {
         small.has_timestamps().then(|| times.iter().any(|(stage, _)| *stage == "pick"))
     };
     for _ in 0..2 {
         let got = frame.backward(&upstream).unwrap();
-        assert!(got == expected, "other gradients in layers");
+        assert!(got == expected, "layers change the gradients");
     }
-    (whole.pairs(), [took(layered.stage_times()), took(frame.stage_times())])
+    (whole.pairs(), [in_layers(layered.stage_times()), in_layers(frame.stage_times())])
 }
 
-/// More splats, pixels and pairs than a binding holds; by covariances too, a third behind
-/// the camera, and a convention that cuts splats at tiles.
+/// More splats, pixels and pairs than a binding holds; also with covariances, with a third of the
+/// splats behind the camera, and with a convention that cuts splats at tiles.
 #[test]
-fn a_crowd_in_layers_is_the_crowd_at_once() {
+fn layers_render_the_same_bytes() {
     let Some(small) = limited(BINDING) else { return };
     for (seed, kind) in [(1, Kind::Plain), (2, Kind::Behind)] {
         let scene = Scene::new(kind, seed, 1500, 1, 4);
@@ -76,36 +77,38 @@ fn a_crowd_in_layers_is_the_crowd_at_once() {
             ..RasterOptions::new([Convention::Standard, Convention::Mvsplat][seed as usize - 1])
         };
         let camera = camera(&scene, WIDTH, HEIGHT);
-        let (pairs, took) = scene.with_slices(|s| check(&small, &s, &camera, &options));
+        let (pairs, in_layers) = scene.with_slices(|s| check(&small, &s, &camera, &options));
         eprintln!("{kind:?}: {} splats, {pairs} pairs", scene.len());
-        assert!(took.iter().all(|t| *t != Some(false)), "{took:?}");
+        assert!(in_layers.iter().all(|t| *t != Some(false)), "{in_layers:?}");
     }
 }
 
-/// Splats and pixels fit a binding, pairs do not: on the way back alone, then both ways.
+/// Splats and pixels fit a binding, pairs do not: first only in the backward pass, then in both
+/// passes.
 #[test]
 fn pairs_that_do_not_fit_take_layers() {
     const BINDING: u64 = 128 << 10;
     let Some(small) = limited(BINDING) else { return };
     for (parents, layers) in [(100, [false, true]), (650, [true, true])] {
         let scene = Scene::new(Kind::Saturated, 7, parents, 0, 0);
-        // Saturated pixels stop early: in layers, some go on and some have stopped.
+        // Saturated pixels stop early, so that blending has stopped in some pixels of a layer and
+        // not in others.
         let camera = camera(&scene, WIDTH, 32);
         let options = RasterOptions::default();
-        let (pairs, took) = scene.with_slices(|s| check(&small, &s, &camera, &options));
-        let fits = |lanes: usize| pairs * lanes * 4 <= BINDING as usize;
+        let (pairs, in_layers) = scene.with_slices(|s| check(&small, &s, &camera, &options));
+        let fits = |words: usize| pairs * words * 4 <= BINDING as usize;
         assert!(scene.len() * 4 * FOOTPRINT_STRIDE < BINDING as usize);
         eprintln!("{} splats, {pairs} pairs", scene.len());
         assert_eq!([!fits(1), !fits(PAIR_SUMS)], layers, "{pairs} pairs");
-        for (took, expected) in took.into_iter().zip(layers) {
-            assert!(took.is_none_or(|t| t == expected), "{parents}: {took:?}");
+        for (in_layers, expected) in in_layers.into_iter().zip(layers) {
+            assert!(in_layers.is_none_or(|t| t == expected), "{parents}: {in_layers:?}");
         }
     }
 }
 
-/// What no cutting makes fit is named, with the limit.
+/// Errors name the sizes that division cannot reduce, with the limit.
 #[test]
-fn what_is_still_too_large_is_named() {
+fn errors_name_the_exceeded_limit() {
     let Some(small) = limited(4 << 10) else { return };
     let scene = Scene::new(Kind::Plain, 3, 300, 0, 0);
     let mut rasterizer = Rasterizer::new(small);
@@ -114,18 +117,18 @@ fn what_is_still_too_large_is_named() {
         scene.with_slices(|s| rasterizer.render(&s, camera, &options)).err()
     };
     let error = render(&mut rasterizer, &camera(&scene, 8, 6));
-    let named = GpuError::TooSmall { what: "splats", needed: 1200, limit: 1024 };
+    let named = GpuError::TooSmall { resource: "splats", needed: 1200, limit: 1024 };
     assert_eq!(error, Some(named));
     let error = render(&mut rasterizer, &camera(&scene, 64, 48));
     assert!(
-        matches!(error, Some(GpuError::TooSmall { what: "a row of tiles, floats", .. })),
+        matches!(error, Some(GpuError::TooSmall { resource: "a row of tiles, floats", .. })),
         "{error:?}"
     );
 }
 
-/// Sizes are asked of the adapter; all else is what every WebGPU device has.
+/// Sizes are those of the adapter; all other limits are WebGPU's defaults.
 #[test]
-fn devices_have_their_adapters_sizes_and_webgpus_limits() {
+fn devices_have_the_sizes_of_their_adapter() {
     use subsplat::gpu::{DeviceChoice, find_for, instance, wgpu::Limits};
     let Some(gpu) = gpu() else { return };
     let adapter = find_for(&instance(), &DeviceChoice::Gpu, None).unwrap().unwrap();

@@ -1,4 +1,4 @@
-//! The WGSL kernels against their CPU versions.
+//! The WGSL kernels against the CPU versions.
 #![cfg(feature = "gpu")]
 
 mod layers;

@@ -1,4 +1,4 @@
-//! The network's WGSL kernels against their CPU twins: attention gather, plane sweep.
+//! Attention gather and plane sweep on the GPU against the CPU versions.
 
 use subsplat_test_support::gpu as adapter;
 use subsplat_test_support::twins;
@@ -9,12 +9,13 @@ use subsplat::cpu::{attention_gather as cpu, plane_sweep};
 use subsplat::gpu::{AttentionGatherArgs, GpuError, PlaneSweepArgs};
 use twins::{Random, assert_twins};
 
-/// Sums of at most 64 products in another order, samples placed within an f32's rounding
-/// of 14 columns (1e-6 of a pixel), and softmax weights whose exponent carries 3 + 2|x|
-/// units in the last place: 1e-6 each, times the handful of samples that meet.
+/// Tolerance: sums of at most 64 products in another order; sample positions within the f32
+/// rounding of 14 columns (1e-6 px); softmax weights whose exponential has an error of 3 + 2|x|
+/// units in the last place. Each is about 1e-6, times a few samples.
 const GATHER: f32 = 4e-6;
 
-/// The same, and differences of such sums: logits' gradients cancel, points' times 14.
+/// Tolerance of gradients: in addition, gradients of logits cancel and gradients of points are
+/// multiplied by 14.
 const GATHER_BWD: f32 = 1e-5;
 
 fn base() -> Gather {
@@ -36,8 +37,8 @@ fn base() -> Gather {
     }
 }
 
-/// Every option of a gather, and a paper-sized one.
-fn forms() -> Vec<(&'static str, Gather)> {
+/// Every option of a gather, and one with the sizes of the paper.
+fn gathers() -> Vec<(&'static str, Gather)> {
     let levels = || {
         let fine = Level { height: 10, width: 14, first_cell: 70 };
         vec![Level { height: 5, width: 7, first_cell: 0 }, fine]
@@ -70,7 +71,8 @@ fn forms() -> Vec<(&'static str, Gather)> {
     ]
 }
 
-/// Maps, query, points; points of one parent clustered, some outside, one no number.
+/// Random maps, query and points. The points of a parent are clustered; some are outside and one
+/// is NaN.
 fn inputs(g: &Gather, n: usize, r: &mut Random) -> [Vec<f32>; 3] {
     let ends = g.levels.iter().map(|l| l.first_cell + g.views * l.height * l.width);
     let maps = r.many(ends.max().unwrap() * g.stride, -1.0, 1.0);
@@ -83,7 +85,7 @@ fn inputs(g: &Gather, n: usize, r: &mut Random) -> [Vec<f32>; 3] {
         }
     }
     points[0] = f32::NAN;
-    // The second parent sees nothing.
+    // All points of the second parent are outside.
     let row = points.len() / n;
     points[row..2 * row].fill(1.25);
     [maps, query, points]
@@ -93,7 +95,7 @@ fn inputs(g: &Gather, n: usize, r: &mut Random) -> [Vec<f32>; 3] {
 fn attention_gather() {
     let Some(gpu) = gpu() else { return };
     let mut r = Random(1);
-    for (name, g) in forms() {
+    for (name, g) in gathers() {
         let n = 150;
         let [maps, query, points] = inputs(&g, n, &mut r);
         let mut expected = vec![0.0; n * g.dim];
@@ -111,7 +113,7 @@ fn attention_gather() {
 fn attention_gather_gradients() {
     let Some(gpu) = gpu() else { return };
     let mut r = Random(5);
-    for (name, g) in forms() {
+    for (name, g) in gathers() {
         let n = 150;
         let [maps, query, points] = inputs(&g, n, &mut r);
         let grad = r.many(n * g.dim, -1.0, 1.0);
@@ -123,7 +125,7 @@ fn attention_gather_gradients() {
         assert_twins(&format!("{name} query"), &got.query, &expected.query, GATHER_BWD);
         assert_twins(&format!("{name} points"), &got.points, &expected.points, GATHER_BWD);
         let again = gpu.attention_gather_backward(&args, &grad).unwrap();
-        assert!(got == again, "{name}: other bytes the second time");
+        assert!(got == again, "{name}: results are not reproducible");
         let fixed = Gather { point_gradient: false, ..g.clone() };
         let fixed = AttentionGatherArgs { gather: &fixed, ..args };
         let got = gpu.attention_gather_backward(&fixed, &grad).unwrap();
@@ -132,14 +134,14 @@ fn attention_gather_gradients() {
 }
 
 #[test]
-fn a_gather_that_does_not_fit_is_named() {
+fn inconsistent_arguments_are_named() {
     let Some(gpu) = gpu() else { return };
     let g = base();
     let [maps, query, points] = inputs(&g, 3, &mut Random(2));
     let error = |g: &Gather, maps: &[f32], points: &[f32]| {
         let args = AttentionGatherArgs { gather: g, maps, query: &query, points };
         match gpu.attention_gather(&args) {
-            Err(GpuError::Argument { what, .. }) => what,
+            Err(GpuError::Argument { argument, .. }) => argument,
             other => panic!("{other:?}"),
         }
     };
@@ -150,15 +152,15 @@ fn a_gather_that_does_not_fit_is_named() {
     assert_eq!(error(&many, &maps, &points), "samples per parent");
 }
 
-/// Sample positions of up to 40 px, rounded in another order (fused or not): 1e-5 px times
-/// slopes of at most 2 a px; the correlation sums 40 products.
+/// Tolerance: sample positions of up to 40 px, rounded in another order (fused or not): 1e-5 px
+/// times slopes of at most 2 per px; the correlation sums 40 products.
 const SWEEP: f32 = 2e-5;
 
-/// A source camera turned by `turn` about y and moved along x.
-fn pair(size: [usize; 2], x: f32, turn: f32, source: usize) -> Pair {
+/// A source camera rotated by `angle` about y and moved along x.
+fn pair(size: [usize; 2], x: f32, angle: f32, source: usize) -> Pair {
     let [h, w] = size.map(|v| v as f32);
     let (f, cx, cy) = (0.9 * w, 0.51 * w, 0.48 * h);
-    let (sin, cos) = turn.sin_cos();
+    let (sin, cos) = angle.sin_cos();
     Pair {
         source,
         inverse: [1.0 / f, 1.0 / f, -cx / f, -cy / f],
@@ -168,10 +170,10 @@ fn pair(size: [usize; 2], x: f32, turn: f32, source: usize) -> Pair {
     }
 }
 
-/// Reference rows with two pairs, with one whose camera has turned away (most samples are
-/// behind it or outside), with a depth at the camera itself, and with no pair.
+/// A sweep whose reference rows have two pairs; a pair with a camera that is rotated away (most
+/// samples are behind it or outside); no pair; and one pair. One depth is 0.
 fn sweep(centre: f32, size: [usize; 2], channels: usize) -> Sweep {
-    let to = |x: f32, turn: f32, row: usize| pair(size, x, turn, row);
+    let to = |x: f32, angle: f32, row: usize| pair(size, x, angle, row);
     Sweep {
         pairs: vec![
             vec![to(0.4, 0.1, 1), to(-0.3, -0.2, 0)],
@@ -215,9 +217,9 @@ fn plane_sweeps() {
         assert_twins(&format!("{name} reference"), &got.0, &expected.0, SWEEP);
         assert_twins(&format!("{name} source"), &got.1, &expected.1, SWEEP);
         let again = gpu.plane_sweep_backward(&args, &grad).unwrap();
-        assert!(got == again, "{name}: other bytes the second time");
+        assert!(got == again, "{name}: results are not reproducible");
         let short = PlaneSweepArgs { source: &source[1..], ..args };
         let error = gpu.plane_sweep(&short).unwrap_err();
-        assert!(matches!(error, GpuError::Argument { what: "source", .. }), "{error}");
+        assert!(matches!(error, GpuError::Argument { argument: "source", .. }), "{error}");
     }
 }

@@ -1,5 +1,5 @@
-//! Ops on a GPU against the same ops on the CPU, values and gradients, under every rule of
-//! SPGR's configuration; and what happens to a call that a GPU cannot take.
+//! Ops on a GPU against the same ops on the CPU: values and gradients under every rule of SPGR,
+//! and calls that the GPU cannot execute.
 
 use subsplat_test_support::gpu as adapter;
 use subsplat_test_support::scenes;
@@ -17,16 +17,17 @@ use subsplat::ops::redistribute::redistribute_on;
 use subsplat::ops::spgr::spgr_on;
 use subsplat::ops::{Backend, rasterize_on};
 
-/// Of the largest number. Kernels agree to 4e-5 (tests/gpu_spgr.rs, tests/gpu_network.rs);
-/// needles in random parents, whose CPU gradients in f32 are themselves 3e-5 off, the rest.
+/// Tolerance, relative to the largest number. Kernels agree to 4e-5 (tests/gpu/spgr.rs,
+/// tests/gpu/network.rs); random parents contain needles, whose f32 gradients on the CPU have
+/// errors of 3e-5.
 const ALLOWED: f64 = 2e-4;
 
 fn host(t: &Tensor) -> Vec<f64> {
     t.to_dtype(DType::F64).unwrap().flatten_all().unwrap().to_vec1().unwrap()
 }
 
-/// Results of `f` on `backend`, then the gradients of Σ w·result in its inputs, for weights
-/// that are all different.
+/// Returns the results of `f` on `backend`, then the gradients of Σ w·result with respect to its
+/// inputs, with distinct weights w.
 fn run(
     backend: &Backend,
     inputs: &[&Tensor],
@@ -46,7 +47,7 @@ fn run(
     results.iter().map(host).chain(variables.iter().map(of)).collect()
 }
 
-/// `f` on the GPU against the CPU; the GPU refuses nothing.
+/// Compares `f` on the GPU with `f` on the CPU; the GPU must execute every call.
 fn agrees(
     name: &str,
     backend: &Backend,
@@ -64,8 +65,8 @@ fn agrees(
         }
         same &= got == expected;
     }
-    // Other machines round otherwise: equal bytes would mean that one of them did both.
-    assert!(!same, "{name}: the GPU's result is the CPU's to the bit");
+    // Devices round differently, so equal bytes mean that one device computed both results.
+    assert!(!same, "{name}: the results have equal bytes");
 }
 
 #[test]
@@ -166,7 +167,7 @@ fn sweep() {
     });
 }
 
-/// 60 splats in front of a camera, and the SH of their 15 parents.
+/// Returns 60 splats in front of a camera, and the SH of their 15 parents.
 fn splats(r: &mut Random) -> (Camera, Tensor, Tensor) {
     let camera = scenes::cameras(2, 40, 30)[0];
     let n = 60;
@@ -184,20 +185,20 @@ fn splats(r: &mut Random) -> (Camera, Tensor, Tensor) {
     (camera, Tensor::cat(&rows, 1).unwrap(), r.tensor(&[n / 4, 9, 3], 0.4, DType::F32))
 }
 
-/// The rasterizer's op with every gradient, gains of one lane and of four.
+/// The rasterizer's op with every gradient, for gains of one and of four floats.
 #[test]
 fn rasterization() {
     let Some(gpu) = gpu() else { return };
     let backend = Backend::from(gpu);
     let mut r = Random(25);
     let (camera, rows, sh) = splats(&mut r);
-    for (lanes, convention, sh_direction) in [
+    for (gain_stride, convention, sh_direction) in [
         (1, Convention::Standard, ShDirection::Child),
         (4, Convention::Mvsplat, ShDirection::Parent),
     ] {
         let options = RasterOptions { sh_direction, ..RasterOptions::new(convention) };
-        let gain = (r.tensor(&[60, lanes], 0.2, DType::F32) + 1.0).unwrap();
-        let gain = if lanes == 1 { gain.flatten_all().unwrap() } else { gain };
+        let gain = (r.tensor(&[60, gain_stride], 0.2, DType::F32) + 1.0).unwrap();
+        let gain = if gain_stride == 1 { gain.flatten_all().unwrap() } else { gain };
         let inputs = [&rows, &sh, &gain];
         agrees(&format!("{convention:?}"), &backend, &inputs, |backend, x| {
             Ok(vec![rasterize_on(backend, &x[0], &x[1], &x[2], &camera, &options)?])
@@ -205,10 +206,10 @@ fn rasterization() {
     }
 }
 
-/// A device that binds less than a row of tiles, and one that goes away between the two passes:
-/// the CPU's numbers, and a word.
+/// A device whose bindings hold less than a row of tiles, and a device that is lost between the
+/// two passes: the CPU computes the result and a warning is set.
 #[test]
-fn a_rasterizer_that_fails_leaves_the_cpu() {
+fn the_cpu_takes_over_from_a_failed_rasterizer() {
     let Some(small) = limited(2 << 10) else { return };
     let mut r = Random(26);
     let (camera, rows, sh) = splats(&mut r);
@@ -236,14 +237,15 @@ fn a_rasterizer_that_fails_leaves_the_cpu() {
         Ok(vec![planes])
     });
     let expected = of(&Backend::Cpu, &camera);
-    assert!(got[0] != expected[0], "the GPU did not draw");
-    assert!(got[1..] == expected[1..], "the CPU did not go back");
+    assert!(got[0] != expected[0], "the GPU did not render");
+    assert!(got[1..] == expected[1..], "the CPU did not compute the backward pass");
     assert!(backend.warning().is_some_and(|w| w.contains("GPU lost")), "{:?}", backend.warning());
 }
 
-/// More samples than the kernel holds, or double precision: the CPU's result, and a word.
+/// More samples than the kernel supports, and double precision: the CPU computes the result. Only
+/// the former sets a warning.
 #[test]
-fn what_a_gpu_cannot_do_the_cpu_does() {
+fn the_cpu_computes_unsupported_calls() {
     let Some(gpu) = gpu() else { return };
     for (points, dtype, warns) in [(65, DType::F32, true), (4, DType::F64, false)] {
         let backend = Backend::from(gpu.clone());

@@ -1,5 +1,5 @@
-//! The GPU's rasterizer: the conformance cases of `shared/fixtures/raster`, random scenes
-//! plain and nasty beside the CPU's, and its parts.
+//! The rasterizer on the GPU: the conformance cases of `shared/fixtures/raster`, random scenes
+//! against the CPU, and the sort.
 
 use subsplat_test_support as common;
 use subsplat_test_support::gpu as adapter;
@@ -15,28 +15,28 @@ use subsplat::abi::{Convention, RasterOptions, Rendered};
 use subsplat::cpu::{self, Geometry, SplatSlices};
 use subsplat::gpu::{GpuError, Rasterizer};
 
-/// Largest |difference| of colours and alphas between GPU and CPU off the boundary: ten
-/// times what f32 leaves (2e-6), and WGSL allows exp2 and log2 a few units more.
+/// Largest |difference| of colours and alphas between GPU and CPU outside the boundary: ten times
+/// the f32 error of 2e-6, because WGSL allows larger errors in exp2 and log2.
 const COLOUR: f32 = 3e-5;
-/// The same for `mvsplat`, whose splats come as near as z = 0.2 and whose covariances
-/// come as six numbers, with f32 determinants on the GPU.
+/// The same for `mvsplat`, whose splats are as near as z = 0.2 and whose covariances are six
+/// numbers, with f32 determinants on the GPU.
 const COLOUR_MVSPLAT: f32 = 1e-4;
 /// Largest relative difference of depths.
 const DEPTH: f32 = 1e-4;
-/// The same for needles whose covariance comes as six numbers: the GPU has no f64 for the
-/// determinant that cancels.
+/// The same for needles whose covariance is six numbers: the GPU has no f64 for the determinant,
+/// which cancels.
 const DEPTH_COV6: f32 = 5e-4;
 
-/// Largest differences off the boundary: colour and alpha, depth sums (relative to them or
-/// to 0.1, since 1 − T has few digits where almost nothing covers a pixel).
+/// Returns the largest differences outside the boundary: of colour and alpha, and of depth sums
+/// relative to them or to 0.1 (1 − T has few digits where almost nothing covers a pixel).
 fn differences(got: &Rendered, expected: &Rendered, boundary: &[bool]) -> [f32; 2] {
     assert_eq!((got.width, got.height), (expected.width, expected.height));
-    let worst = |got: &[f32], expected: &[f32], lanes: usize, floor: Option<f32>| {
+    let worst = |got: &[f32], expected: &[f32], channels: usize, floor: Option<f32>| {
         assert_eq!(got.len(), expected.len());
-        assert_eq!(got.len(), lanes * boundary.len());
+        assert_eq!(got.len(), channels * boundary.len());
         let mut worst = 0.0f32;
         for (i, (g, e)) in got.iter().zip(expected).enumerate() {
-            if !boundary[i / lanes] {
+            if !boundary[i / channels] {
                 let d = (g - e).abs() / floor.map_or(1.0, |f| e.abs().max(f));
                 worst = if d > worst || d.is_nan() { d } else { worst };
             }
@@ -68,7 +68,7 @@ fn check_case(name: &str) {
     eprintln!("{name}: colour {colour:.1e} depth_sum {depth:.1e} pairs {}", rasterizer.pairs());
     let allowed = if mvsplat { COLOUR_MVSPLAT } else { COLOUR };
     assert!(colour < allowed && depth < DEPTH, "{name}: colour {colour} depth {depth}");
-    // A splat's thousandth is seen.
+    // A difference of twice the tolerance is detected.
     let mut off = got.clone();
     let pixel = boundary.iter().position(|b| !b).unwrap();
     off.rgb[3 * pixel] += 2.0 * allowed;
@@ -97,9 +97,9 @@ cases!(
     sh4,
 );
 
-/// Every kind of scene with every option that projection knows.
+/// Every kind of scene with every option of projection.
 #[test]
-fn random_scenes_are_those_of_the_cpu() {
+fn random_scenes_match_the_cpu() {
     let Some(gpu) = gpu() else { return };
     let mut rasterizer = Rasterizer::new(gpu);
     let mut worst_seen = [0.0f32; 2];
@@ -114,7 +114,7 @@ fn random_scenes_are_those_of_the_cpu() {
                 differences(&got, &expected, &boundary)
             });
             worst_seen = [worst_seen[0].max(found[0]), worst_seen[1].max(found[1])];
-            // Needles whose covariance comes as six numbers: their f32 determinant.
+            // Needles whose covariance is six numbers have an f32 determinant.
             let [colour, depth] = match scene.cov6.is_empty() {
                 true => [COLOUR, DEPTH],
                 false => [COLOUR_MVSPLAT, DEPTH_COV6],
@@ -125,10 +125,10 @@ fn random_scenes_are_those_of_the_cpu() {
     eprintln!("largest: colour {:.1e}, depth {:.1e}", worst_seen[0], worst_seen[1]);
 }
 
-/// Several blocks of the prefix sum: pixels of a crowded picture, where a threshold may
-/// flip, so a few may be off by a splat's least contribution.
+/// Several blocks of the prefix sum. In a crowded picture thresholds may flip, so a few pixels
+/// may differ by a splat's least contribution.
 #[test]
-fn a_crowd_is_that_of_the_cpu() {
+fn a_crowded_scene_matches_the_cpu() {
     let Some(gpu) = gpu() else { return };
     let scene = Scene::new(Kind::Plain, 11, 3000, 1, 1);
     assert!(scene.len() > 4 * 2048);
@@ -143,20 +143,20 @@ fn a_crowd_is_that_of_the_cpu() {
     });
 }
 
-/// Room for pairs grows when it is too small, and no pixel depends on it.
+/// The capacity for pairs grows where it is too small, and no pixel depends on it.
 #[test]
-fn room_for_pairs_grows() {
+fn the_capacity_for_pairs_grows() {
     let Some(gpu) = gpu() else { return };
     let scene = Scene::new(Kind::Plain, 5, 40, 1, 1);
     let options = RasterOptions::default();
     scene.with_slices(|splats| {
-        let mut roomy = Rasterizer::new(gpu.clone());
-        let expected = roomy.render(&splats, &scene.camera, &options).unwrap();
-        assert!(roomy.pairs() > 100, "{} pairs", roomy.pairs());
-        let mut cramped = Rasterizer::new(gpu.clone()).with_capacity(3);
-        let got = cramped.render(&splats, &scene.camera, &options).unwrap();
-        assert!(got == expected, "the picture depends on the room for pairs");
-        let planes = cramped.render_planes(&splats, &scene.camera, &options).unwrap();
+        let mut large = Rasterizer::new(gpu.clone());
+        let expected = large.render(&splats, &scene.camera, &options).unwrap();
+        assert!(large.pairs() > 100, "{} pairs", large.pairs());
+        let mut small = Rasterizer::new(gpu.clone()).with_capacity(3);
+        let got = small.render(&splats, &scene.camera, &options).unwrap();
+        assert!(got == expected, "the picture depends on the capacity");
+        let planes = small.render_planes(&splats, &scene.camera, &options).unwrap();
         let n = expected.alpha.len();
         for (p, rgb) in expected.rgb.chunks(3).enumerate() {
             assert_eq!([0, 1, 2].map(|c| planes[c * n + p]), [rgb[0], rgb[1], rgb[2]]);
@@ -165,7 +165,7 @@ fn room_for_pairs_grows() {
     });
 }
 
-/// No splat at all: the background.
+/// A scene without splats renders as background.
 #[test]
 fn an_empty_scene_is_background() {
     let Some(gpu) = gpu() else { return };
@@ -177,15 +177,15 @@ fn an_empty_scene_is_background() {
     assert!(got.alpha.iter().chain(&got.depth_sum).all(|&v| v == 0.0));
     let odd = SplatSlices { gain: &[0.0; 3], ..none };
     let error = Rasterizer::new(gpu).render(&odd, &camera, &options).err();
-    assert!(matches!(error, Some(GpuError::Argument { what: "splats", .. })), "{error:?}");
+    assert!(matches!(error, Some(GpuError::Argument { argument: "splats", .. })), "{error:?}");
 }
 
 /// The sort is stable, at lengths around a thread's, a block's and many blocks'.
 #[test]
-fn order_is_that_of_a_stable_sort() {
+fn the_order_is_that_of_a_stable_sort() {
     let Some(gpu) = gpu() else { return };
     let mut random = Random(3);
-    // The last has more counters than one workgroup sums at a time: 16 per 2048 keys.
+    // The last length has more counters than one workgroup sums at a time: 16 per 2048 keys.
     for count in [0, 1, 7, 8, 9, 255, 2047, 2048, 2049, 70_001, 300_000] {
         let kinds: [fn(f32) -> u32; 3] = [
             |r| r.to_bits(),
@@ -201,7 +201,7 @@ fn order_is_that_of_a_stable_sort() {
     }
 }
 
-/// An application's own device and texture: the bytes of the picture that is read back.
+/// A texture on an application's own device holds the bytes of the picture that is read back.
 #[test]
 fn a_texture_of_another_device_shows_the_picture() {
     if gpu().is_some() {
@@ -209,7 +209,7 @@ fn a_texture_of_another_device_shows_the_picture() {
     }
 }
 
-/// The same where a binding holds one row of tiles of the picture, three of which there are.
+/// The same where a binding holds one of the picture's three rows of tiles.
 #[test]
 fn a_texture_is_drawn_in_bands() {
     if gpu().is_some() {
@@ -252,7 +252,7 @@ fn draw_to_texture(binding: u64) {
     let target = texture(64, 48);
     let view = target.create_view(&wgpu::TextureViewDescriptor::default());
     let uploaded = scene.with_slices(|s| gpu.upload_splats(&s)).unwrap();
-    // So little room that the first frame has to be drawn twice.
+    // The capacity is so small that the first frame is drawn twice.
     let mut rasterizer = Rasterizer::new(gpu.clone()).with_capacity(3);
     for _ in 0..3 {
         rasterizer.draw(&uploaded, &camera, &options, &view).unwrap();
@@ -278,7 +278,7 @@ fn draw_to_texture(binding: u64) {
         let want = [0, 1, 2].map(|c| expected.rgb[3 * p + c]);
         for (got, want) in rgba.iter().zip(want.iter().chain([&expected.alpha[p]])) {
             let want = want.clamp(0.0, 1.0) * 255.0;
-            // Half a step of rounding, and what a tie may go to.
+            // Half a step of rounding, and a tie may be rounded either way.
             assert!((f32::from(*got) - want).abs() < 0.51, "pixel {p}: {got} {want}");
         }
     }
@@ -287,8 +287,8 @@ fn draw_to_texture(binding: u64) {
     assert!(matches!(error, Some(GpuError::Argument { .. })), "{error:?}");
 }
 
-/// A device that goes away gives one clear error, and no panic: to who reads pictures, to
-/// who draws to a texture, to who uploads, and on the way back of a frame that it drew.
+/// A lost device returns one error, without a panic: for rendering, for drawing to a texture, for
+/// uploads, and in the backward pass of an earlier frame.
 #[test]
 fn a_lost_device_is_an_error() {
     use subsplat::gpu::{DeviceChoice, Gpu, wgpu};
@@ -319,7 +319,7 @@ fn a_lost_device_is_an_error() {
     rasterizer.draw(&uploaded, &camera, &options, &target).unwrap();
     let frame = scene.with_slices(|s| rasterizer.frame(&s, &camera, &options));
     let (_, mut frame) = frame.unwrap();
-    // A frame's counts are on their way.
+    // A read-back of the pair count is pending.
     rasterizer.draw(&uploaded, &camera, &options, &target).unwrap();
     own.device().destroy();
     own.device().poll(wgpu::PollType::Poll).ok();

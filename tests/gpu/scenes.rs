@@ -1,5 +1,5 @@
-//! Scenes as users have them on a GPU, beside the CPU: the example room by the weights that
-//! ship, and a real .ply of 16,384 Gaussians; pictures and gradients.
+//! Scenes of users on the GPU against the CPU, pictures and gradients: the example room with the
+//! shipped weights, and a .ply of 16,384 Gaussians.
 
 use subsplat_test_support as common;
 use subsplat_test_support::gpu as adapter;
@@ -18,23 +18,24 @@ use subsplat::pipeline::{Photo, Reconstruction, Reconstructor, Request};
 use subsplat::render::slices;
 use subsplat::splats::Splats;
 
-/// Numbers of a picture further off than tests/gpu_raster.rs allows where no threshold is
-/// near: one alpha in many falls on the other side of 1/255, and then weighs as much.
+/// Fraction of the numbers of a picture whose error may exceed that of tests/gpu/raster.rs: where
+/// an alpha falls on the other side of 1/255.
 const COLOUR: f32 = 3e-5;
 const FLIPPED: f64 = 2e-3;
 const FLIP: f32 = 0.02;
-/// A gradient off by this share of the largest of its kind, and the share of rows that may
-/// be: those of splats at such thresholds.
+/// Tolerance of a gradient relative to the largest of its kind, and the fraction of rows that may
+/// exceed it: rows of splats at such thresholds.
 const GRADIENT: f32 = 1e-3;
 const GRADIENTS_OFF: f64 = 3e-3;
-/// Rows of a reconstruction that may be elsewhere (a depth whose window around the mode
-/// begins one candidate farther), and how far the others' numbers are off beside the
-/// largest of their lane.
+/// Fraction of the rows of a reconstruction that may differ (a depth whose window around the mode
+/// begins one candidate farther), and the tolerance of the others relative to the largest number
+/// of the column.
 const MOVED: f64 = 2e-3;
-const LANE: f32 = 2e-3;
+const COLUMN: f32 = 2e-3;
 
-/// Share of the numbers that are off by more than rounding, and the largest difference.
-fn apart(got: &[f32], expected: &[f32]) -> (f64, f32) {
+/// Returns the fraction of the numbers that differ by more than rounding, and the largest
+/// difference.
+fn differences(got: &[f32], expected: &[f32]) -> (f64, f32) {
     assert_eq!(got.len(), expected.len());
     let difference = |(g, e): (&f32, &f32)| (g - e).abs();
     let off = got.iter().zip(expected).map(difference).filter(|d| !(*d < COLOUR)).count();
@@ -43,38 +44,39 @@ fn apart(got: &[f32], expected: &[f32]) -> (f64, f32) {
     (off as f64 / got.len() as f64, worst)
 }
 
-/// Share of the rows with a number off by [`GRADIENT`] of the largest.
-fn rows_off(got: &[f32], expected: &[f32], lanes: usize) -> f64 {
+/// Returns the fraction of rows with an error above [`GRADIENT`] of the largest number of the
+/// column.
+fn rows_off(got: &[f32], expected: &[f32], columns: usize) -> f64 {
     assert_eq!(got.len(), expected.len());
-    let mut largest = vec![0f32; lanes];
+    let mut largest = vec![0f32; columns];
     for (i, v) in expected.iter().enumerate() {
-        largest[i % lanes] = largest[i % lanes].max(v.abs());
+        largest[i % columns] = largest[i % columns].max(v.abs());
     }
     assert!(largest.iter().any(|&v| v > 0.0), "no gradient to compare");
-    let rows = got.chunks(lanes).zip(expected.chunks(lanes));
+    let rows = got.chunks(columns).zip(expected.chunks(columns));
     let off = rows
-        .filter(|(g, e)| (0..lanes).any(|k| !((g[k] - e[k]).abs() <= GRADIENT * largest[k])))
+        .filter(|(g, e)| (0..columns).any(|k| !((g[k] - e[k]).abs() <= GRADIENT * largest[k])))
         .count();
-    off as f64 / (expected.len() / lanes) as f64
+    off as f64 / (expected.len() / columns) as f64
 }
 
-/// Picture and gradients of `splats` on the GPU are those of the CPU.
+/// Checks that picture and gradients of `splats` on the GPU equal those of the CPU.
 fn check(name: &str, splats: &Splats, camera: &Camera, options: &RasterOptions) {
-    let options = RasterOptions { sh_basis: splats.sh_basis(), ..*options };
+    let options = RasterOptions { sh_basis: splats.sh_basis, ..*options };
     let (all, mut on_gpu) = (slices(splats), Rasterizer::new(gpu().unwrap()));
     let got = on_gpu.render(&all, camera, &options).unwrap();
     let expected = cpu::Rasterizer::new().render(&all, camera, &options);
     let covered = expected.alpha.iter().filter(|&&a| a > 0.5).count();
     assert!(2 * covered > expected.alpha.len(), "{name}: little to see");
-    let (off, worst) = apart(&got.rgb, &expected.rgb);
-    let (alphas_off, _) = apart(&got.alpha, &expected.alpha);
+    let (off, worst) = differences(&got.rgb, &expected.rgb);
+    let (alphas_off, _) = differences(&got.alpha, &expected.alpha);
     eprintln!("{name}: {off:.1e} of colours, {alphas_off:.1e} of alphas off, at most {worst:.1e}");
     assert!(off < FLIPPED && alphas_off < FLIPPED && worst < FLIP, "{name}: {off} {worst}");
-    // What is asked of the picture is seen to fail: one splat in a thousand a little off.
+    // The check fails for one changed splat in a thousand.
     let mut moved = splats.clone();
-    moved.rows_mut().chunks_mut(11 * 1000).for_each(|rows| rows[10] *= 0.5);
+    moved.rows.chunks_mut(11 * 1000).for_each(|rows| rows[10] *= 0.5);
     let (off, worst) =
-        apart(&on_gpu.render(&slices(&moved), camera, &options).unwrap().rgb, &expected.rgb);
+        differences(&on_gpu.render(&slices(&moved), camera, &options).unwrap().rgb, &expected.rgb);
     assert!(off > FLIPPED || worst > FLIP, "{name}: halved opacities pass: {off} {worst}");
 
     let upstream: Vec<f32> =
@@ -82,7 +84,7 @@ fn check(name: &str, splats: &Splats, camera: &Camera, options: &RasterOptions) 
     let got = on_gpu.backward(&all, camera, &options, &upstream).unwrap();
     let mut expected = Gradients::default();
     cpu::Rasterizer::new().backward(&all, camera, &options, &upstream, &mut expected);
-    let set = splats.sh().len() / all.parents();
+    let set = splats.sh.len() / all.parents();
     for (what, got, expected, lanes) in
         [("rows", &got.rows, &expected.rows, 11), ("sh", &got.sh, &expected.sh, set)]
     {
@@ -102,14 +104,14 @@ fn a_real_ply() {
     }
     let Some(folder) = common::shared("photos/re10k_5aca87f95a9412c6") else { return };
     let splats = load_splats(&folder.join("5aca87f95a9412c6.globalsplat16k.ply")).unwrap();
-    assert_eq!((splats.len(), splats.sh_degree()), (16_384, 3));
+    assert_eq!((splats.len(), splats.sh_degree), (16_384, 3));
     let camera = load_scene(&folder).unwrap().frames[4].pinhole().unwrap();
     for convention in [Convention::Standard, Convention::Mvsplat] {
         check(&format!("{convention:?}"), &splats, &camera, &RasterOptions::new(convention));
     }
 }
 
-/// The example's photographs, as `subsplat run examples/room` takes them.
+/// Returns the example's photographs, with the request of `subsplat run examples/room`.
 fn room() -> (Scene, Vec<Photo>, Request) {
     let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("examples/room");
     let scene = load_scene(Path::new(&folder)).unwrap();
@@ -118,25 +120,22 @@ fn room() -> (Scene, Vec<Photo>, Request) {
     (scene, photos, Request { input_size: (256, 256), near_far, detail: true, look: false })
 }
 
-/// Share of the rows of a reconstruction that are elsewhere.
+/// Returns the fraction of the rows of a reconstruction that differ.
 fn moved(got: &Splats, expected: &Splats) -> f64 {
-    assert_eq!(
-        (got.rows().len(), got.gain().len()),
-        (expected.rows().len(), expected.gain().len())
-    );
+    assert_eq!((got.rows.len(), got.gain.len()), (expected.rows.len(), expected.gain.len()));
     let mut largest = [0f32; 11];
-    for (i, v) in expected.rows().iter().enumerate() {
+    for (i, v) in expected.rows.iter().enumerate() {
         largest[i % 11] = largest[i % 11].max(v.abs());
     }
-    let rows = got.rows().chunks(11).zip(expected.rows().chunks(11));
-    let off = rows.filter(|(g, e)| (0..11).any(|k| !((g[k] - e[k]).abs() <= LANE * largest[k])));
+    let rows = got.rows.chunks(11).zip(expected.rows.chunks(11));
+    let off = rows.filter(|(g, e)| (0..11).any(|k| !((g[k] - e[k]).abs() <= COLUMN * largest[k])));
     off.count() as f64 / expected.len() as f64
 }
 
-/// Plane sweep, SPGR and rasterizer by the weights that ship (whose configuration has no
-/// attention gather; tests/gpu_model.rs has it).
+/// Plane sweep, SPGR and rasterizer with the shipped weights, whose configuration has no
+/// attention gather (tests/gpu/model.rs covers it).
 #[test]
-fn the_room_by_the_weights_that_ship() {
+fn the_example_room_with_the_shipped_weights() {
     let Some(gpu) = gpu() else { return };
     let (scene, photos, request) = room();
     let model = Reconstructor::shipped(2).unwrap();
@@ -147,28 +146,29 @@ fn the_room_by_the_weights_that_ship() {
     let model = model.with_backend(&backend);
     let got = model.reconstruct(&photos, &request).unwrap().splats;
     assert_eq!(backend.warning(), None);
-    // Other machines round otherwise: equal bytes would mean that the GPU did nothing.
-    assert!(got.rows() != expected.rows(), "the GPU's result is the CPU's to the bit");
+    // Devices round differently, so equal bytes mean that the GPU computed nothing.
+    assert!(got.rows != expected.rows, "the results have equal bytes");
     let share = moved(&got, &expected);
     eprintln!("{} Gaussians, {share:.1e} of them moved", got.len());
     assert!(share < MOVED, "{share} of the rows moved");
     let mut other = got.clone();
-    other.rows_mut().chunks_mut(11 * 40).for_each(|rows| rows[0] += 0.1);
+    other.rows.chunks_mut(11 * 40).for_each(|rows| rows[0] += 0.1);
     assert!(moved(&other, &expected) > MOVED, "moved rows pass");
 
     let target = &scene.frames[2];
     let camera = target.pinhole().unwrap();
     assert_eq!((camera.intrinsics.width, camera.intrinsics.height), (512, 512));
     check("the room", &expected, &camera, &options);
-    // All of the GPU beside all of the CPU, against the photograph that neither has seen.
+    // Reconstruction and rendering on the GPU against both on the CPU, scored with a photograph
+    // that is not an input.
     let photograph = target.load().unwrap().0.to_unit();
     let score = |rgb: &[f32]| psnr(rgb, &photograph, 512, 512).unwrap();
-    let ours = RasterOptions { sh_basis: got.sh_basis(), ..options };
+    let ours = RasterOptions { sh_basis: got.sh_basis, ..options };
     let by_gpu = Rasterizer::new(gpu).render(&slices(&got), &camera, &ours).unwrap().rgb;
     let by_cpu = cpu::Rasterizer::new().render(&slices(&expected), &camera, &ours).rgb;
     let [on_gpu, on_cpu] = [score(&by_gpu), score(&by_cpu)];
     let between = psnr(&by_gpu, &by_cpu, 512, 512).unwrap();
-    eprintln!("{on_gpu:.2} dB on the GPU, {on_cpu:.2} dB on the CPU, {between:.1} dB apart");
+    eprintln!("{on_gpu:.2} dB on the GPU, {on_cpu:.2} dB on the CPU, {between:.1} dB differences");
     assert!(on_cpu > 20.0 && (on_gpu - on_cpu).abs() < 0.05, "{on_gpu} and {on_cpu} dB");
     assert!(between > 60.0, "{between} dB");
 }

@@ -1,6 +1,6 @@
-//! The WGSL kernels without a GPU: naga takes every one, their constants, uniforms and
-//! arguments are those of the Rust side, they stay within WebGPU's default limits, and
-//! none stands without a CPU twin.
+//! Checks of the WGSL kernels without a GPU. naga validates every kernel; constants, uniforms and
+//! arguments equal those of the Rust side; kernels respect WebGPU's default limits; every kernel
+//! has a CPU version.
 
 use naga::proc::Layouter;
 use naga::valid::{Capabilities, ValidationFlags, Validator};
@@ -14,13 +14,13 @@ use subsplat::abi::{
 };
 use subsplat::gpu::{Access, KERNELS, Kernel};
 
-/// Storage buffers of a stage, threads and bytes of a workgroup: WebGPU's defaults.
+/// WebGPU's default limits: storage buffers per stage, threads and bytes per workgroup.
 const STORAGE_MAX: usize = 8;
 const THREADS_MAX: u32 = 256;
 const WORKGROUP_BYTES_MAX: u32 = 16 << 10;
 
-/// Kernels whose CPU twin has another stem.
-const TWINS: &[(&str, &str)] = &[
+/// Kernels whose CPU version has another stem.
+const CPU_STEMS: &[(&str, &str)] = &[
     ("sort_count", "sort"),
     ("sort_scatter", "sort"),
     ("scan_reduce", "tiles"),
@@ -44,7 +44,7 @@ const TWINS: &[(&str, &str)] = &[
     ("plane_sweep_source_bwd", "plane_sweep"),
 ];
 
-/// Name and value of everything in kernels/shared/abi.wgsl.
+/// Returns name and value of every constant of kernels/shared/abi.wgsl.
 fn constants() -> BTreeMap<&'static str, f64> {
     macro_rules! same {
         ($($name:ident),* $(,)?) => { [$((stringify!($name), f64::from(abi::$name as f32))),*] };
@@ -99,7 +99,7 @@ fn constants() -> BTreeMap<&'static str, f64> {
     all
 }
 
-/// Name, size, and fields with offsets of every uniform.
+/// Name, size, and fields with offsets of a uniform.
 type Uniform = (&'static str, usize, &'static [(&'static str, usize)]);
 
 macro_rules! uniforms {
@@ -140,12 +140,12 @@ fn value(module: &Module, init: Handle<Expression>) -> f64 {
         Expression::Literal(Literal::I32(v)) => f64::from(v),
         Expression::Literal(Literal::AbstractInt(v)) => v as f64,
         Expression::Literal(Literal::AbstractFloat(v)) => v,
-        ref other => panic!("a constant that is no number: {other:?}"),
+        ref other => panic!("a constant that is not a number: {other:?}"),
     }
 }
 
-/// Differences between the constants of `module` and ours.
-fn constants_off(module: &Module) -> Vec<String> {
+/// Returns the differences between the constants of `module` and those of `abi`.
+fn constant_differences(module: &Module) -> Vec<String> {
     let mut ours = constants();
     let mut wrong = Vec::new();
     for (_, c) in module.constants.iter() {
@@ -162,17 +162,22 @@ fn constants_off(module: &Module) -> Vec<String> {
 }
 
 #[test]
-fn constants_are_those_of_abi() {
+fn constants_match_abi() {
     let text = fs::read_to_string(root().join("kernels/shared/abi.wgsl")).unwrap();
-    assert_eq!(constants_off(&parse(&text).unwrap()), Vec::<String>::new());
+    assert_eq!(constant_differences(&parse(&text).unwrap()), Vec::<String>::new());
     let changed = text.replace("0.9999;", "0.999;");
-    assert_eq!(constants_off(&parse(&changed).unwrap()).len(), 1, "a changed constant passes");
+    assert_eq!(
+        constant_differences(&parse(&changed).unwrap()).len(),
+        1,
+        "a changed constant passes"
+    );
     let named = text.replace("const AREA_EPS", "const AREA_EPSILON");
-    assert_eq!(constants_off(&parse(&named).unwrap()).len(), 2, "a renamed constant passes");
+    assert_eq!(constant_differences(&parse(&named).unwrap()).len(), 2, "a renamed constant passes");
 }
 
-/// Differences between the uniform structs of `module` and ours; the names compared.
-fn uniforms_off(module: &Module) -> (Vec<String>, BTreeSet<String>) {
+/// Returns the differences between the uniforms of `module` and those of `abi`, and the names
+/// compared.
+fn uniform_differences(module: &Module) -> (Vec<String>, BTreeSet<String>) {
     let (mut wrong, mut seen) = (Vec::new(), BTreeSet::new());
     for (_, variable) in module.global_variables.iter() {
         if variable.space != AddressSpace::Uniform {
@@ -181,7 +186,7 @@ fn uniforms_off(module: &Module) -> (Vec<String>, BTreeSet<String>) {
         let ty = &module.types[variable.ty];
         let name = ty.name.clone().unwrap_or_default();
         let TypeInner::Struct { members, span } = &ty.inner else {
-            wrong.push(format!("uniform {:?} is no struct", variable.name));
+            wrong.push(format!("uniform {:?} is not a struct", variable.name));
             continue;
         };
         let Some((_, size, fields)) = UNIFORMS.iter().find(|(n, ..)| *n == name) else {
@@ -199,10 +204,10 @@ fn uniforms_off(module: &Module) -> (Vec<String>, BTreeSet<String>) {
 }
 
 #[test]
-fn uniforms_have_the_fields_of_abi() {
+fn uniforms_match_abi() {
     let mut seen = BTreeSet::new();
     for kernel in KERNELS {
-        let (wrong, names) = uniforms_off(&parse(kernel.source).unwrap());
+        let (wrong, names) = uniform_differences(&parse(kernel.source).unwrap());
         assert_eq!(wrong, Vec::<String>::new(), "{}", kernel.name);
         seen.extend(names);
     }
@@ -213,10 +218,10 @@ fn uniforms_have_the_fields_of_abi() {
         .source
         .replace("parents: u32,\n    children: u32,", "children: u32, parents: u32,");
     assert_ne!(swapped, redistribute.source);
-    assert_eq!(uniforms_off(&parse(&swapped).unwrap()).0.len(), 1, "swapped fields pass");
+    assert_eq!(uniform_differences(&parse(&swapped).unwrap()).0.len(), 1, "swapped fields pass");
 }
 
-/// How the arguments of an entry point are used, by binding.
+/// Returns the access of a module's arguments, by binding.
 fn arguments(module: &Module) -> BTreeMap<u32, Access> {
     let variables = module.global_variables.iter();
     variables
@@ -236,7 +241,7 @@ fn arguments(module: &Module) -> BTreeMap<u32, Access> {
         .collect()
 }
 
-/// Threads and bytes of a kernel's workgroup.
+/// Returns the threads and the bytes of a kernel's workgroup.
 fn workgroup(kernel: &Kernel, module: &Module) -> (u32, u32) {
     let entry = module.entry_points.iter().find(|e| e.name == kernel.entry);
     let entry = entry.unwrap_or_else(|| panic!("{}: no entry {}", kernel.name, kernel.entry));
@@ -259,7 +264,7 @@ fn check_kernel(kernel: &Kernel) {
     assert!(bytes <= WORKGROUP_BYTES_MAX, "{name}: {bytes} bytes of workgroup memory");
 }
 
-/// What a stage's largest kernel is called.
+/// Stages of the table in src/gpu/mod.rs, and their largest kernel.
 const STAGES: &[(&str, &str)] = &[
     ("project", "project"),
     ("sort by depth", "sort_scatter"),
@@ -273,19 +278,19 @@ const STAGES: &[(&str, &str)] = &[
     ("project backward", "project_bwd"),
 ];
 
-/// Stages of the table in `docs` whose threads, bytes, or workgroups at once on two kinds
-/// of core are other than their kernels'.
-fn stages_off(docs: &str) -> Vec<&'static str> {
+/// Returns the stages of the table in `docs` whose threads, bytes, or concurrent workgroups on
+/// two kinds of core differ from those of the kernel.
+fn stage_differences(docs: &str) -> Vec<&'static str> {
     let cells = |line: &str| line.split('|').map(|c| c.trim().to_owned()).collect::<Vec<_>>();
     let rows: Vec<_> = docs.lines().map(cells).filter(|c| c.len() == 8).collect();
     let wrong = |(stage, name): &(&str, &str)| {
         let kernel = KERNELS.iter().find(|k| k.name == *name).unwrap();
         let (threads, bytes) = workgroup(kernel, &parse(kernel.source).unwrap());
-        let at_once = |most: u32, memory: u32| (most / threads).min(memory / bytes.max(1));
+        let concurrent = |most: u32, memory: u32| (most / threads).min(memory / bytes.max(1));
         let expected = [
             threads.to_string(),
             bytes.to_string(),
-            format!("{}, {}", at_once(1024, 32 << 10), at_once(2048, 100 << 10)),
+            format!("{}, {}", concurrent(1024, 32 << 10), concurrent(2048, 100 << 10)),
         ];
         let found = rows.iter().find(|row| row[1] == *stage);
         !found.is_some_and(|row| {
@@ -296,11 +301,14 @@ fn stages_off(docs: &str) -> Vec<&'static str> {
 }
 
 #[test]
-fn the_table_of_stages_is_that_of_the_kernels() {
+fn the_table_of_stages_matches_the_kernels() {
     let docs = fs::read_to_string(root().join("src/gpu/mod.rs")).unwrap();
-    assert_eq!(stages_off(&docs), Vec::<&str>::new());
-    assert_eq!(stages_off(&docs.replace("15,368", "15,372")), ["rasterize backward"]);
-    assert_eq!(stages_off(&docs.replace("| 3, 8 | 160 N", "| 4, 8 | 160 N")), ["sort by depth"]);
+    assert_eq!(stage_differences(&docs), Vec::<&str>::new());
+    assert_eq!(stage_differences(&docs.replace("15,368", "15,372")), ["rasterize backward"]);
+    assert_eq!(
+        stage_differences(&docs.replace("| 3, 8 | 160 N", "| 4, 8 | 160 N")),
+        ["sort by depth"]
+    );
 }
 
 #[test]
@@ -309,10 +317,10 @@ fn every_kernel_is_valid_and_within_the_default_limits() {
     for kernel in KERNELS {
         check_kernel(kernel);
     }
-    assert!(validate("fn f() -> f32 { return 1u; }").is_err(), "naga takes anything");
+    assert!(validate("fn f() -> f32 { return 1u; }").is_err(), "naga accepts invalid WGSL");
 }
 
-/// Stems of the `.wgsl` or `.rs` files of a folder.
+/// Returns the stems of the files of a folder with this extension.
 fn stems(folder: &str, extension: &str) -> BTreeSet<String> {
     let files = fs::read_dir(root().join(folder)).unwrap().map(|e| e.unwrap().path());
     files
@@ -321,7 +329,7 @@ fn stems(folder: &str, extension: &str) -> BTreeSet<String> {
         .collect()
 }
 
-/// Kernels without a Rust side or without a CPU twin.
+/// Returns the kernels without a Rust side or without a CPU version.
 fn orphans(kernels: &BTreeSet<String>) -> Vec<String> {
     let used: BTreeSet<&str> = KERNELS.iter().map(|k| k.name).collect();
     let mut cpu = stems("src/cpu", "rs");
@@ -331,25 +339,25 @@ fn orphans(kernels: &BTreeSet<String>) -> Vec<String> {
             .filter(|p| p.is_dir())
             .map(|p| p.file_name().unwrap().to_string_lossy().into_owned()),
     );
-    let twin = |stem: &str| {
-        let other = TWINS.iter().find(|(kernel, _)| *kernel == stem);
-        cpu.contains(other.map_or(stem, |(_, twin)| *twin))
+    let has_cpu_version = |stem: &str| {
+        let other = CPU_STEMS.iter().find(|(kernel, _)| *kernel == stem);
+        cpu.contains(other.map_or(stem, |(_, cpu_stem)| *cpu_stem))
     };
-    kernels.iter().filter(|k| !used.contains(k.as_str()) || !twin(k)).cloned().collect()
+    kernels.iter().filter(|k| !used.contains(k.as_str()) || !has_cpu_version(k)).cloned().collect()
 }
 
 #[test]
-fn no_kernel_is_an_orphan() {
+fn every_kernel_has_a_cpu_version() {
     let mut kernels = stems("kernels", "wgsl");
     assert_eq!(orphans(&kernels), Vec::<String>::new());
     for kernel in KERNELS {
-        assert!(kernels.contains(kernel.name), "kernels/{}.wgsl is not there", kernel.name);
+        assert!(kernels.contains(kernel.name), "kernels/{}.wgsl is missing", kernel.name);
     }
     kernels.insert("stray".to_owned());
     assert_eq!(orphans(&kernels), ["stray"]);
 }
 
-/// A kernel's text is whole files: each file under kernels/shared is in some kernel.
+/// Kernels contain whole files: each file of kernels/shared is part of some kernel.
 #[test]
 fn shared_files_are_used() {
     for stem in stems("kernels/shared", "wgsl") {

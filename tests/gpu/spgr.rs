@@ -1,4 +1,4 @@
-//! SPGR's WGSL kernels against their CPU twins, under every rule.
+//! SPGR on the GPU against the CPU version, under every rule.
 
 use subsplat_test_support::gpu as adapter;
 use subsplat_test_support::twins;
@@ -13,32 +13,32 @@ use subsplat::cpu::spgr as cpu;
 use subsplat::gpu::{GpuError, SpgrArgs};
 use twins::{Random, assert_twins};
 
-/// A few hundred roundings of 6e-8, WGSL's looser ones (division 2.5 units in the last
-/// place, exponential 3 + 2|x|) included; the growth of two axes divides by what a cross
-/// product leaves.
+/// Tolerance: a few hundred roundings of 6e-8, including WGSL's larger errors (division 2.5 units
+/// in the last place, exponential 3 + 2|x|). The growth along two axes divides by a cross
+/// product.
 const SPGR: f32 = 3e-5;
 
-/// Of the gradients, in units of the lane's largest: needles and edge-on discs divide by
-/// areas that cancel, 1e-5 of the double kernel on either side; the CPU's single one is up
-/// to 3e-5 away from it.
-const OF_DOUBLE: f32 = 4e-5;
-const OF_SINGLE: f32 = 1e-4;
+/// Tolerance of gradients, relative to the largest number of the column. Needles and edge-on
+/// discs divide by areas that cancel: both GPU and CPU differ by about 1e-5 from the f64 kernel,
+/// the f32 CPU kernel by up to 3e-5.
+const TOLERANCE_F64: f32 = 4e-5;
+const TOLERANCE_F32: f32 = 1e-4;
 
-/// Two looks at one place, turned a little.
+/// Two views of one place, with slightly different rotations.
 fn cameras(size: usize) -> Vec<Camera> {
     let each = |v: usize| {
         let s = size as f32;
         let (fx, fy, cx, cy) = (0.9 * s, 0.95 * s, 0.51 * s, 0.48 * s);
         let k = Intrinsics { fx, fy, cx, cy, width: size, height: size };
-        let turn = v as f32 - 0.5;
-        let q = Quat::from_euler(EulerRot::XYZ, 0.05 * turn, -0.12 * turn, 0.08 * turn);
-        let at = Vec3::new(0.3 * turn, 0.05 * turn, 0.1 * v as f32);
+        let side = v as f32 - 0.5;
+        let q = Quat::from_euler(EulerRot::XYZ, 0.05 * side, -0.12 * side, 0.08 * side);
+        let at = Vec3::new(0.3 * side, 0.05 * side, 0.1 * v as f32);
         Camera::new(k, Mat4::from_rotation_translation(q, at)).unwrap()
     };
     (0..2).map(each).collect()
 }
 
-/// One parent per pixel and view, from a hundredth of a pixel to several, flat and round.
+/// One parent per pixel and view, from a hundredth of a pixel to several pixels, flat and round.
 fn parents(cameras: &[Camera], r: &mut Random) -> Vec<f32> {
     let mut rows = Vec::new();
     for camera in cameras {
@@ -58,7 +58,7 @@ fn parents(cameras: &[Camera], r: &mut Random) -> Vec<f32> {
     rows
 }
 
-/// The presets' numbers at K = r².
+/// The rules of the presets at K = r².
 fn base(tuned: bool, side: usize) -> Rules {
     let k = (side * side) as f64;
     Rules {
@@ -82,7 +82,7 @@ fn base(tuned: bool, side: usize) -> Rules {
     }
 }
 
-/// Every rule, one at a time on top of either preset.
+/// Every rule, applied one at a time to each preset.
 fn variants(side: usize) -> Vec<(String, Rules)> {
     type Change = (&'static str, fn(&mut Rules));
     let changes: [Change; 22] = [
@@ -153,8 +153,8 @@ fn on_cpu(inputs: &Inputs, rules: &Rules) -> (Vec<f32>, Vec<f32>) {
     (rows, gains)
 }
 
-/// One kind of lanes of all rows.
-fn lanes(rows: &[f32], first: usize, count: usize) -> Vec<f32> {
+/// Returns `count` columns of all rows, from column `first` on.
+fn columns(rows: &[f32], first: usize, count: usize) -> Vec<f32> {
     rows.chunks_exact(SPLAT_STRIDE).flat_map(|r| r[first..first + count].to_vec()).collect()
 }
 
@@ -175,7 +175,7 @@ fn children() {
             let expected = on_cpu(&inputs, &rules);
             let got = gpu.spgr(&inputs.gpu(&rules)).unwrap();
             for (part, first, count) in PARTS {
-                let of = |rows: &[f32]| lanes(rows, first, count);
+                let of = |rows: &[f32]| columns(rows, first, count);
                 let (got, expected) = (of(&got.0), of(&expected.0));
                 assert_twins(&format!("{name} {part}"), &got, &expected, SPGR);
             }
@@ -184,14 +184,15 @@ fn children() {
     }
 }
 
-/// Gradients on the CPU: head records, parents, and head records by the gains.
+/// Returns the gradients on the CPU: of the head records, of the parents, and of the head records
+/// by the gains.
 fn gradients<T: subsplat::cpu::simd::Real>(
     inputs: &Inputs,
     rules: &Rules,
     grad: &[f32],
     by_gain: &[f32],
 ) -> [Vec<f32>; 3] {
-    let wide = |v: &[f32]| v.iter().map(|&v| T::constant(f64::from(v))).collect::<Vec<T>>();
+    let wide = |v: &[f32]| v.iter().map(|&v| T::of(f64::from(v))).collect::<Vec<T>>();
     let narrow = |v: Vec<T>| v.into_iter().map(|v| v.to_f64() as f32).collect::<Vec<f32>>();
     let (head, parents) = (wide(&inputs.head), wide(&inputs.parents));
     let source =
@@ -219,14 +220,14 @@ fn gradients_of_children() {
             let exact = gradients::<f64>(&inputs, &rules, &grad, &by_gain);
             let got = gpu.spgr_backward(&inputs.gpu(&rules), &grad).unwrap();
             let got_gain = gpu.spgr_gains_backward(&rules, &inputs.head, &by_gain).unwrap();
-            for lane in 0..SPLAT_STRIDE {
-                let of = |rows: &[f32]| lanes(rows, lane, 1);
+            for column in 0..SPLAT_STRIDE {
+                let of = |rows: &[f32]| columns(rows, column, 1);
                 let all =
                     [("head", &got.0, &head, &exact[0]), ("parents", &got.1, &parents, &exact[1])];
                 for (what, got, twin, exact) in all {
-                    let name = format!("{name} {what} {lane}");
-                    assert_twins(&name, &of(got), &of(exact), OF_DOUBLE);
-                    assert_twins(&name, &of(got), &of(twin), OF_SINGLE);
+                    let name = format!("{name} {what} {column}");
+                    assert_twins(&name, &of(got), &of(exact), TOLERANCE_F64);
+                    assert_twins(&name, &of(got), &of(twin), TOLERANCE_F32);
                 }
             }
             assert_twins(&format!("{name} gain"), &got_gain, &gain, SPGR);
@@ -235,7 +236,7 @@ fn gradients_of_children() {
 }
 
 #[test]
-fn arguments_that_do_not_fit_are_named() {
+fn inconsistent_arguments_are_named() {
     let Some(gpu) = gpu() else { return };
     let inputs = Inputs::new(2, &mut Random(3));
     let error = |change: &dyn Fn(&mut SpgrArgs)| {
@@ -243,7 +244,7 @@ fn arguments_that_do_not_fit_are_named() {
         let mut args = inputs.gpu(&rules);
         change(&mut args);
         match gpu.spgr(&args) {
-            Err(GpuError::Argument { what, .. }) => what,
+            Err(GpuError::Argument { argument, .. }) => argument,
             other => panic!("{other:?}"),
         }
     };

@@ -1,5 +1,5 @@
-//! Every WGSL kernel against its CPU twin. Tolerances have their reasons beside them, and
-//! each comparison is seen to fail on a perturbed side.
+//! Redistribution on the GPU against the CPU version. Every comparison is also checked to fail
+//! for a perturbed result.
 
 use subsplat_test_support::gpu as adapter;
 
@@ -8,11 +8,11 @@ use subsplat::abi::Rule;
 use subsplat::cpu::redistribute as cpu;
 use subsplat::gpu::{GpuError, RedistributeArgs};
 
-/// WGSL allows exp and log 3 + 2|x| units in the last place, |x| up to 20 here: 3e-6 of
-/// the result, in numerator and sum.
+/// Relative tolerance. WGSL allows errors of 3 + 2|x| units in the last place in exp and log,
+/// with |x| up to 20 here: 3e-6 of the result, in numerator and sum.
 const REDISTRIBUTE: f32 = 1e-5;
 
-/// The same of gradients, of the largest.
+/// Tolerance of gradients, relative to the largest.
 const REDISTRIBUTE_BACKWARD: f32 = 1e-5;
 
 const RULES: [Rule; 5] =
@@ -35,7 +35,7 @@ impl Random {
     }
 }
 
-/// Largest |got − expected| / |expected|; NaN where one is.
+/// Returns the largest |got − expected| / |expected|; NaN where one is.
 fn relative(got: &[f32], expected: &[f32]) -> f32 {
     assert_eq!(got.len(), expected.len());
     let pairs = got.iter().zip(expected);
@@ -50,7 +50,7 @@ fn redistribute() {
     let mut random = Random(7);
     for (p, k) in [(1, 1), (3, 4), (1000, 4), (777, 9), (513, 16), (70, 5)] {
         let logits = random.many(p * k, -10.0, 10.0);
-        // From far below a pixel to many pixels.
+        // Areas from far below a pixel to many pixels.
         let areas: Vec<f32> = random.many(p * k, -12.0, 6.0).iter().map(|e| e.exp2()).collect();
         let mut alphas = random.many(p, 0.0, 1.0);
         for (a, special) in alphas.iter_mut().zip([1e-7, 1.0, 0.9999, 1e-3]) {
@@ -64,7 +64,7 @@ fn redistribute() {
             let got = gpu.redistribute(&args).unwrap();
             let off = relative(&got, &expected);
             assert!(off < REDISTRIBUTE, "{rule:?} {p}x{k}: {off:e}");
-            // 0.1 % on one number is seen.
+            // A change of 0.1 % in one number is detected.
             let mut perturbed = got;
             perturbed[p * k / 2] *= 1.001;
             assert!(relative(&perturbed, &expected) > REDISTRIBUTE);
@@ -72,9 +72,9 @@ fn redistribute() {
     }
 }
 
-/// The largest difference beside the largest number (or 1e-3 of the gradient that comes
-/// in): gradients of the softmax are differences of near-equal numbers.
-fn of_largest(got: &[f32], expected: &[f32]) -> f32 {
+/// Returns the largest difference relative to the largest number, or to 1e-3 of the upstream
+/// gradient: gradients of the softmax are differences of near-equal numbers.
+fn relative_to_largest(got: &[f32], expected: &[f32]) -> f32 {
     assert_eq!(got.len(), expected.len());
     let largest = expected.iter().fold(1e-3f32, |m, v| m.max(v.abs()));
     let pairs = got.iter().zip(expected);
@@ -109,12 +109,12 @@ fn redistribute_backward() {
                 ("own", got.own, expected.own),
             ];
             for (what, mut got, expected) in all {
-                let off = of_largest(&got, &expected);
+                let off = relative_to_largest(&got, &expected);
                 assert!(off < REDISTRIBUTE_BACKWARD, "{rule:?} {p}x{k} {what}: {off:e}");
                 if expected.iter().any(|&v| v != 0.0) {
                     let largest = expected.iter().fold(1e-3f32, |m, v| m.max(v.abs()));
                     got[expected.len() / 2] += 2.0 * REDISTRIBUTE_BACKWARD * largest;
-                    assert!(of_largest(&got, &expected) > REDISTRIBUTE_BACKWARD, "{what}");
+                    assert!(relative_to_largest(&got, &expected) > REDISTRIBUTE_BACKWARD, "{what}");
                 }
             }
         }
@@ -128,11 +128,11 @@ fn redistribute_backward() {
         own: &[],
     };
     let error = gpu.redistribute_backward(&args, &[0.0; 3]).unwrap_err();
-    assert!(matches!(error, GpuError::Argument { what: "gradient", .. }), "{error}");
+    assert!(matches!(error, GpuError::Argument { argument: "gradient", .. }), "{error}");
 }
 
 #[test]
-fn arguments_that_do_not_fit_are_named() {
+fn inconsistent_arguments_are_named() {
     let Some(gpu) = gpu() else { return };
     let args = RedistributeArgs {
         rule: Rule::OpticalDepth,
@@ -143,22 +143,22 @@ fn arguments_that_do_not_fit_are_named() {
         own: &[1.0],
     };
     let error = gpu.redistribute(&args).unwrap_err();
-    assert!(matches!(error, GpuError::Argument { what: "own areas", .. }), "{error}");
+    assert!(matches!(error, GpuError::Argument { argument: "own areas", .. }), "{error}");
     let error = gpu.redistribute(&RedistributeArgs { k: 0, ..args }).unwrap_err();
     assert!(matches!(error, GpuError::Argument { .. }), "{error}");
 }
 
-/// Threads that read back at the same time each get their own answer, though one thread's
-/// poll may finish another's mapping.
+/// Concurrent read-backs return each thread's own values, although one thread's poll may complete
+/// another's mapping.
 #[test]
-fn threads_get_their_own_answers() {
+fn threads_read_back_their_own_values() {
     let Some(gpu) = gpu() else { return };
     let gpu = &gpu;
     std::thread::scope(|scope| {
         for thread in 0..16u32 {
             scope.spawn(move || {
                 for round in 0..40u32 {
-                    // Descending keys of another length in every thread and round.
+                    // Descending keys whose number depends on thread and round.
                     let count = 1 + (37 * thread + 11 * round) % 300;
                     let keys: Vec<u32> = (0..count).map(|i| 7 * (count - i) + thread).collect();
                     let expected: Vec<u32> = (0..count).rev().collect();

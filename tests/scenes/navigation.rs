@@ -4,7 +4,7 @@
 use glam::{Mat4, Quat, Vec2, Vec3};
 use std::f32::consts::PI;
 use subsplat::camera::{Camera, Intrinsics};
-use subsplat::navigation::{Bounds, Mode, Navigator, Start, fitted, up_of};
+use subsplat::navigation::{Bounds, Mode, Navigator, Pace, Start, fitted, up_of};
 
 const UP: Vec3 = Vec3::NEG_Y;
 
@@ -53,7 +53,7 @@ fn orbit_turns_around_the_pivot_and_keeps_the_horizon() {
     let mut n = Navigator::new(start());
     let pivot = n.pivot();
     for px in [Vec2::new(37.0, -20.0), Vec2::new(-260.0, 41.0), Vec2::new(5.0, 90.0)] {
-        n.turn(px);
+        n.rotate(px);
         let c = n.camera();
         let k = c.intrinsics;
         assert!((seen(&n, pivot) - Vec2::new(k.cx, k.cy)).length() < 0.01);
@@ -62,7 +62,7 @@ fn orbit_turns_around_the_pivot_and_keeps_the_horizon() {
     }
     // The whole height of the picture is half a turn.
     let mut n = Navigator::new(start());
-    n.turn(Vec2::new(480.0, 0.0));
+    n.rotate(Vec2::new(480.0, 0.0));
     let (from, to) = (home().position() - pivot, n.camera().position() - pivot);
     assert!(close(from - from.dot(UP) * UP, -(to - to.dot(UP) * UP)));
     assert!((from.dot(UP) - to.dot(UP)).abs() < 1e-4);
@@ -74,12 +74,12 @@ fn what_lies_near_goes_with_the_cursor_and_a_look_does_too() {
     for (px, axis) in [(Vec2::new(20.0, 0.0), Vec2::X), (Vec2::new(0.0, 20.0), Vec2::Y)] {
         let mut n = Navigator::new(start());
         let before = seen(&n, near);
-        n.turn(px);
+        n.rotate(px);
         assert!((seen(&n, near) - before).dot(axis) > 3.0, "orbit, {px}");
         assert!((seen(&n, far) - before).dot(axis) < -3.0, "orbit, {px}");
         let mut n = Navigator::new(start());
         n.toggle();
-        n.turn(px);
+        n.rotate(px);
         assert!((seen(&n, near) - before).dot(axis) < -3.0, "fly, {px}");
         assert!(close(n.camera().position(), home().position()));
     }
@@ -94,14 +94,14 @@ fn nobody_is_turned_upside_down() {
                 n.toggle();
             }
             for _ in 0..40 {
-                n.turn(Vec2::new(3.0, sign * 100.0));
+                n.rotate(Vec2::new(3.0, sign * 100.0));
             }
             let r = n.camera().rotation();
             assert!(r.y_axis.dot(UP) < 0.0, "head up");
             let elevation = r.z_axis.dot(UP).asin();
             assert!((elevation + sign * 89.0 * PI / 180.0).abs() < 0.01, "{elevation}");
             // And there is a way back.
-            n.turn(Vec2::new(0.0, -sign * 240.0));
+            n.rotate(Vec2::new(0.0, -sign * 240.0));
             let elevation = n.camera().rotation().z_axis.dot(UP).asin();
             assert!((elevation - sign * 1.0 * PI / 180.0).abs() < 0.01, "{elevation}");
         }
@@ -110,9 +110,9 @@ fn nobody_is_turned_upside_down() {
     let down = Mat4::from_rotation_translation(Quat::from_rotation_x(-0.5 * PI), Vec3::ZERO);
     let mut n =
         Navigator::new(Start { home: Camera { world_from_camera: down, ..home() }, ..start() });
-    n.turn(Vec2::new(0.0, 50.0));
+    n.rotate(Vec2::new(0.0, 50.0));
     assert!(n.camera().rotation().z_axis.dot(Vec3::Y) > 0.9999);
-    n.turn(Vec2::new(0.0, -480.0 / 6.0));
+    n.rotate(Vec2::new(0.0, -480.0 / 6.0));
     assert!((n.camera().rotation().z_axis.dot(Vec3::Y).asin() - PI / 3.0).abs() < 0.01);
 }
 
@@ -147,46 +147,49 @@ fn the_wheel_goes_to_the_pivot_and_never_through_it() {
 
 #[test]
 fn flight_goes_by_time_and_not_by_frames() {
-    let fly = |n: &mut Navigator, along: [f32; 3], seconds: f32, haste| {
+    let fly = |n: &mut Navigator, along: [f32; 3], seconds: f32, pace| {
         let from = n.camera().position();
-        n.fly(along, seconds, haste);
+        n.fly(along, seconds, pace);
         n.camera().position() - from
     };
     let axes = home().rotation();
     let mut n = Navigator::new(start());
-    let ahead = fly(&mut n, [0.0, 0.0, 1.0], 0.5, false);
+    let ahead = fly(&mut n, [0.0, 0.0, 1.0], 0.5, Pace::Normal);
     // 0.4 radii a second.
     assert!(close(ahead, 0.4 * axes.z_axis), "{ahead}");
-    let twice =
-        fly(&mut n, [0.0, 0.0, 1.0], 0.25, false) + fly(&mut n, [0.0, 0.0, 1.0], 0.25, false);
+    let twice = fly(&mut n, [0.0, 0.0, 1.0], 0.25, Pace::Normal)
+        + fly(&mut n, [0.0, 0.0, 1.0], 0.25, Pace::Normal);
     assert!(close(twice, ahead));
-    assert!(close(fly(&mut n, [0.0, 0.0, -1.0], 0.5, true), -4.0 * ahead));
-    assert!(close(fly(&mut n, [1.0, 0.0, 0.0], 0.5, false), 0.4 * axes.x_axis));
-    assert!(close(fly(&mut n, [0.0, 1.0, 0.0], 0.5, false), 0.4 * UP));
-    assert!((fly(&mut n, [1.0, 0.0, 1.0], 0.5, false).length() - 0.4).abs() < 1e-5, "aslant");
-    assert_eq!(fly(&mut n, [0.0; 3], 9.0, true), Vec3::ZERO);
+    assert!(close(fly(&mut n, [0.0, 0.0, -1.0], 0.5, Pace::Fast), -4.0 * ahead));
+    assert!(close(fly(&mut n, [1.0, 0.0, 0.0], 0.5, Pace::Normal), 0.4 * axes.x_axis));
+    assert!(close(fly(&mut n, [0.0, 1.0, 0.0], 0.5, Pace::Normal), 0.4 * UP));
+    assert!(
+        (fly(&mut n, [1.0, 0.0, 1.0], 0.5, Pace::Normal).length() - 0.4).abs() < 1e-5,
+        "aslant"
+    );
+    assert_eq!(fly(&mut n, [0.0; 3], 9.0, Pace::Fast), Vec3::ZERO);
     // The wheel is the throttle, and home has the first speed again.
     n.toggle();
     let eye = n.camera().position();
     n.wheel(2.0);
     assert_eq!(n.camera().position(), eye);
-    let faster = fly(&mut n, [0.0, 0.0, 1.0], 0.5, false);
+    let faster = fly(&mut n, [0.0, 0.0, 1.0], 0.5, Pace::Normal);
     assert!((faster.length() / 0.4 - 1.25 * 1.25).abs() < 1e-4);
     n.reset();
-    assert!(close(fly(&mut n, [0.0, 0.0, 1.0], 0.5, false), ahead));
+    assert!(close(fly(&mut n, [0.0, 0.0, 1.0], 0.5, Pace::Normal), ahead));
 }
 
 #[test]
 fn the_mode_changes_without_a_jump_and_home_is_home() {
     let mut n = Navigator::new(start());
-    n.turn(Vec2::new(50.0, 30.0));
+    n.rotate(Vec2::new(50.0, 30.0));
     n.wheel(3.0);
     n.pan(Vec2::new(7.0, 9.0));
     let before = n.camera();
     n.toggle();
     assert_eq!((n.camera(), n.mode()), (before, Mode::Fly));
-    n.turn(Vec2::new(-20.0, 10.0));
-    n.fly([0.3, 0.2, 1.0], 1.0, false);
+    n.rotate(Vec2::new(-20.0, 10.0));
+    n.fly([0.3, 0.2, 1.0], 1.0, Pace::Normal);
     let before = n.camera();
     n.toggle();
     assert_eq!((n.camera(), n.mode()), (before, Mode::Orbit));
@@ -278,9 +281,9 @@ fn no_input_makes_it_anything_but_a_camera() {
         (Vec3::new(0.0, -7.0, 0.0), 1e-30, 1e-30),
     ] {
         let mut n = Navigator::new(Start { home: home(), up, distance, radius });
-        n.turn(Vec2::new(10.0, 20.0));
+        n.rotate(Vec2::new(10.0, 20.0));
         n.wheel(2.0);
-        n.fly([1.0, 1.0, 1.0], 0.1, true);
+        n.fly([1.0, 1.0, 1.0], 0.1, Pace::Fast);
         let c = n.camera();
         assert!(Camera::new(c.intrinsics, c.world_from_camera).is_ok(), "{up} {distance} {radius}");
         assert!((c.rotation().transpose() * c.rotation()).abs_diff_eq(glam::Mat3::IDENTITY, 1e-5));
@@ -293,10 +296,10 @@ fn no_input_makes_it_anything_but_a_camera() {
         (seed >> 8) as f32 / (1 << 24) as f32 - 0.5
     };
     for i in 0..20_000 {
-        n.turn(Vec2::new(200.0 * draw(), 200.0 * draw()));
+        n.rotate(Vec2::new(200.0 * draw(), 200.0 * draw()));
         n.pan(Vec2::new(20.0 * draw(), 20.0 * draw()));
         n.wheel(draw());
-        n.fly([draw(), draw(), draw()], 0.01, false);
+        n.fly([draw(), draw(), draw()], 0.01, Pace::Normal);
         if i % 100 == 0 {
             n.toggle();
         }

@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 use subsplat::abi::RasterOptions;
 use subsplat::gpu::{Gpu, Scene};
 use subsplat::io::image::{Rgb, save_png};
-use subsplat::navigation::{Mode, Navigator};
+use subsplat::navigation::{Mode, Navigator, Pace};
 use subsplat::render::slices;
 use winit::application::ApplicationHandler;
 use winit::dpi::PhysicalSize;
@@ -215,7 +215,8 @@ impl Viewer {
         let seconds = self.rate.begin(Instant::now(), self.running);
         if self.controls.moving() {
             let (along, haste) = self.controls.motion();
-            self.navigator.fly(along, seconds, haste);
+            let pace = if haste { Pace::Fast } else { Pace::Normal };
+            self.navigator.fly(along, seconds, pace);
             self.due = SETTLE;
         }
         let last = self.plan.frames.is_some_and(|n| self.drawn + 1 >= n);
@@ -372,7 +373,7 @@ impl Viewer {
             WindowEvent::CursorMoved { position, .. } => {
                 let at = Vec2::new(position.x as f32, position.y as f32);
                 match self.controls.cursor(at) {
-                    Some(Drag::Turn(px)) => self.navigator.turn(px),
+                    Some(Drag::Turn(px)) => self.navigator.rotate(px),
                     Some(Drag::Pan(px)) => self.navigator.pan(px),
                     None => return Ok(()),
                 }
