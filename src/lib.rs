@@ -5,22 +5,21 @@
 //! Reparameterization* on its MVSplat backbone.
 //!
 //! ```
-//! use subsplat::io::{save_splats, scene::load_scene};
-//! use subsplat::pipeline::{Photo, Reconstructor, Request};
+//! use subsplat::io::scene::load_scene;
+//! use subsplat::{DepthBounds, Options, Photo, Reconstructor};
 //!
-//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! # fn main() -> subsplat::Result<()> {
 //! let scene = load_scene("examples/room".as_ref())?;
 //! let photos = [Photo::from_frame(&scene.frames[0])?, Photo::from_frame(&scene.frames[1])?];
+//! let options = Options::default().with_depth_prior(DepthBounds::of_scene(&scene, &[0, 1])?);
 //! let model = Reconstructor::shipped(2)?; // or ::load(weights)
-//! let room = model.reconstruct(&photos, &Request::default())?;
-//! let camera = room.inputs[0].target_camera; // any camera
-//! let options = model.raster_options(room.near_far.0, &room.inputs);
-//! let picture = subsplat::render(&room.splats, &camera, &options);
-//! assert_eq!((picture.width, picture.height, room.splats.len()), (512, 512, 524_288));
+//! let room = model.run(&photos, &options)?;
+//! let picture = room.render(&scene.frames[2].camera); // any camera
+//! assert_eq!((picture.width, picture.height, room.splats().len()), (512, 512, 524_288));
 //! # let out = std::env::temp_dir().join(format!("subsplat-doc-{}.ply", std::process::id()));
 //! # let room_ply = out.as_path();
-//! save_splats(room_ply, &room.splats, &Default::default())?;
-//! # std::fs::remove_file(out)?;
+//! room.save(room_ply)?;
+//! # std::fs::remove_file(room_ply).map_err(|e| subsplat::io::Error::io(room_ply, e))?;
 //! # Ok(())
 //! # }
 //! ```
@@ -56,4 +55,8 @@ pub mod train;
 pub mod view;
 
 pub use ops::rasterize_splats as rasterize;
+pub use pipeline::{
+    Check, DepthBounds, DepthRange, DepthSource, Detail, Error, Options, Photo, PoseError,
+    Prepared, Progress, Reconstruction, Reconstructor, Result, Stage, StageTime, Warning,
+};
 pub use render::{Picture, render};

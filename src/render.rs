@@ -1,7 +1,10 @@
 //! Splats to a picture in one call: on the CPU, or on the device that is asked for.
 
+mod comment;
 mod device;
+mod image;
 
+pub use comment::{comment_of_options, options_of_comments};
 pub use device::{DeviceError, Renderer};
 
 use crate::abi::{RasterOptions, Rendered};
