@@ -65,6 +65,7 @@ impl Prepared<'_> {
         if options.depth_range == DepthRange::Auto {
             tracker.begin(Stage::DepthRange, progress)?;
         }
+        let initial_bounds = bounds.clone();
         let (views, bounds) = model.views(&inputs, bounds, options.depth_range)?;
         let network = model.model();
         tracker.begin(Stage::Backbone, progress)?;
@@ -97,6 +98,7 @@ impl Prepared<'_> {
             inputs,
             depths,
             bounds,
+            initial_bounds,
             raster_options,
             detail,
             reports,

@@ -19,6 +19,7 @@ pub struct Reconstruction {
     pub(super) inputs: Vec<Cropped>,
     pub(super) depths: Vec<Depth>,
     pub(super) bounds: DepthBounds,
+    pub(super) initial_bounds: DepthBounds,
     pub(super) raster_options: RasterOptions,
     pub(super) detail: Detail,
     pub(super) reports: Vec<PairReport>,
@@ -70,6 +71,13 @@ impl Reconstruction {
     /// The depth range of the network's candidates.
     pub fn depth_range(&self) -> &DepthBounds {
         &self.bounds
+    }
+
+    /// The depth range before the network estimated its own. As a prior
+    /// ([`Options::depth_prior`](super::Options::depth_prior)) of another call on the same
+    /// photographs it makes another check unnecessary.
+    pub fn initial_depth_range(&self) -> &DepthBounds {
+        &self.initial_bounds
     }
 
     /// The rules to render the Gaussians at target resolution.

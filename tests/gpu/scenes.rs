@@ -14,7 +14,7 @@ use subsplat::io::load_splats;
 use subsplat::io::scene::{Scene, load_scene};
 use subsplat::metrics::psnr;
 use subsplat::model::Backend;
-use subsplat::pipeline::{Photo, Reconstruction, Reconstructor, Request};
+use subsplat::pipeline::{Check, DepthRange, Options, Photo, Reconstructor};
 use subsplat::render::slices;
 use subsplat::splats::Splats;
 
@@ -110,12 +110,13 @@ fn a_real_ply() {
 }
 
 /// The example's photographs, as `subsplat run examples/room` takes them.
-fn room() -> (Scene, Vec<Photo>, Request) {
+fn room() -> (Scene, Vec<Photo>, Options) {
     let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("examples/room");
     let scene = load_scene(Path::new(&folder)).unwrap();
     let photos = scene.frames[..2].iter().map(|f| Photo::from_frame(f).unwrap()).collect();
-    let near_far = scene.near_far.unwrap();
-    (scene, photos, Request { input_size: (256, 256), near_far, detail: true, look: false })
+    let (near, far) = scene.near_far.unwrap();
+    let options = Options::default().with_depth_range(DepthRange::Fixed { near, far });
+    (scene, photos, options.with_check(Check::Off))
 }
 
 /// Share of the rows of a reconstruction that are elsewhere.
@@ -135,14 +136,14 @@ fn moved(got: &Splats, expected: &Splats) -> f64 {
 #[test]
 fn the_room_by_the_weights_that_ship() {
     let Some(gpu) = gpu() else { return };
-    let (scene, photos, request) = room();
+    let (scene, photos, run) = room();
     let model = Reconstructor::shipped(2).unwrap();
-    let Reconstruction { splats: expected, inputs, .. } =
-        model.reconstruct(&photos, &request).unwrap();
-    let options = model.raster_options(request.near_far.0, &inputs);
+    let expected = model.run(&photos, &run).unwrap();
+    let options = *expected.raster_options();
+    let expected = expected.into_splats();
     let backend = Backend::from(gpu.clone());
     let model = model.with_backend(&backend);
-    let got = model.reconstruct(&photos, &request).unwrap().splats;
+    let got = model.run(&photos, &run).unwrap().into_splats();
     assert_eq!(backend.warning(), None);
     // Other machines round otherwise: equal bytes would mean that the GPU did nothing.
     assert!(got.rows != expected.rows, "the GPU's result is the CPU's to the bit");

@@ -8,6 +8,7 @@ mod end_to_end;
 mod parity;
 mod plane_sweep;
 mod primaries;
+mod reconstruction;
 mod shipped_weights;
 mod small;
 mod trunk;

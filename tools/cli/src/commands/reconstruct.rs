@@ -35,12 +35,6 @@ pub fn options(args: &SourceArgs, scene: &Scene, context: &[usize]) -> Result<Op
     Ok(options)
 }
 
-/// A reconstruction, and the depth range before the network estimated its own.
-pub struct Reconstructed {
-    pub scene: Reconstruction,
-    pub prior: DepthBounds,
-}
-
 /// Reconstructs `photos` under a progress bar, and prints warnings and depth ranges. Photographs
 /// that are passed by value are freed before the network runs.
 pub fn reconstruct(
@@ -48,19 +42,19 @@ pub fn reconstruct(
     photos: impl Borrow<[Photo]>,
     options: &Options,
     progress: &mut Progress,
-) -> Result<Reconstructed> {
-    let done = progress.fraction("reconstruction", |bar| -> Result<_> {
+) -> Result<Reconstruction> {
+    let result = progress.fraction("reconstruction", |bar| -> Result<_> {
         let mut show = |progress| show_fraction(bar, progress);
         let prepared = model.prepare_with(photos.borrow(), options, &mut show)?;
         drop(photos);
         bar.suspend(|| print_prepared(&prepared));
-        let (printed, prior) = (prepared.warnings().len(), prepared.depth_range().clone());
-        let scene = prepared.reconstruct_with(&mut show)?;
-        bar.suspend(|| print_reconstruction(&scene, printed, &prior));
-        Ok(Reconstructed { scene, prior })
+        let printed = prepared.warnings().len();
+        let result = prepared.reconstruct_with(&mut show)?;
+        bar.suspend(|| print_reconstruction(&result, printed));
+        Ok(result)
     })?;
-    progress.split_last(done.scene.stage_times());
-    Ok(done)
+    progress.split_last(result.stage_times());
+    Ok(result)
 }
 
 fn print_prepared(prepared: &Prepared<'_>) {
@@ -71,14 +65,14 @@ fn print_prepared(prepared: &Prepared<'_>) {
     print_depth_range(prepared.depth_range());
 }
 
-/// Prints the network's depth range where it differs from `prior`, and the warnings after the
-/// first `printed` ones.
-fn print_reconstruction(scene: &Reconstruction, printed: usize, prior: &DepthBounds) {
-    if scene.depth_range() != prior {
-        print_depth_range(scene.depth_range());
+/// Prints the network's depth range where it estimated one, and the warnings after the first
+/// `printed` ones.
+fn print_reconstruction(result: &Reconstruction, printed: usize) {
+    if result.depth_range() != result.initial_depth_range() {
+        print_depth_range(result.depth_range());
     }
-    scene.warnings().iter().skip(printed).for_each(print_warning);
-    if scene.detail() == Detail::Photographs {
+    result.warnings().iter().skip(printed).for_each(print_warning);
+    if result.detail() == Detail::Photographs {
         print_line("the photographs add detail to colours (--detail off: the network alone)");
     }
 }

@@ -44,7 +44,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let targets = targets(args, &plan, (w * r, h * r))?;
     output::prepare(&args.out, &args.input[0], &plan.scene)?;
     let photos = photographs(&plan.scene, &plan.context, &mut progress)?;
-    let result = reconstruct(&model, photos, &plan.options, &mut progress)?.scene;
+    let result = reconstruct(&model, photos, &plan.options, &mut progress)?;
     check_opacity(result.splats(), args.min_opacity)?;
     let options = raster_options(&args.rendering, model.config(), &result);
     let views = views(args, &targets, &result)?;

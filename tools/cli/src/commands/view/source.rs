@@ -2,7 +2,7 @@
 //! reconstructed again with another number of children.
 
 use crate::commands::args_view::ViewArgs;
-use crate::commands::reconstruct::{self, Reconstructed, reconstruct};
+use crate::commands::reconstruct::{self, reconstruct};
 use crate::commands::{info, model, pair, render, run};
 use crate::report::{Progress, print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
@@ -103,9 +103,9 @@ fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     let model = progress.stage("model", |_| load_model(args, args.source.upscale))?;
     run::check_size(&model, context.len(), options.input_size)?;
     let photos = run::photographs(&scene, &context, progress)?;
-    let Reconstructed { scene: result, prior } =
-        reconstruct(&model, photos.as_slice(), &options, progress)?;
+    let result = reconstruct(&model, photos.as_slice(), &options, progress)?;
     // Later calls use the depth range of this check.
+    let prior = result.initial_depth_range().clone();
     let options = options.with_depth_prior(prior).with_check(Check::Off);
     let photographs = Photographs { args: args.clone(), photos, options };
     let cameras: Vec<_> = scene.frames.iter().map(|f| f.camera).collect();
