@@ -28,8 +28,7 @@ use subsplat::model::Views;
 use subsplat::model::backbone::{DisparityMean, Mvsplat, SmallBackbone};
 use subsplat::model::trace::Trace;
 use subsplat::model::weights::Weights;
-use subsplat::pipeline::{Photo, Reconstructor, Request};
-use subsplat::render::render;
+use subsplat::pipeline::{Check, DepthBounds, Detail, Options, Photo, Reconstructor};
 
 /// As in the program.
 #[path = "../tools/cli/src/pages.rs"]
@@ -145,7 +144,7 @@ fn photo(side: usize, view: usize) -> Result<Photo> {
     let rows = planes.squeeze(0)?.permute((1, 2, 0))?.flatten_all()?.to_vec1::<f32>()?;
     let data = rows.iter().map(|v| (255.0 * (v + 0.5).clamp(0.0, 1.0)) as u8).collect();
     let camera = scene::views(side)[view];
-    Ok(Photo { image: Rgb { width: side, height: side, data }, camera })
+    Ok(Photo::new(Rgb { width: side, height: side, data }, camera)?)
 }
 
 type Run = Box<dyn FnMut() -> Result<f64> + Send>;
@@ -170,12 +169,14 @@ fn whole(case: &str) -> Result<Run> {
     config.spgr.enabled = to > from;
     let model = Reconstructor::untrained(&config, 3)?;
     let photos = [photo(to, 0)?, photo(to, 1)?];
-    let request = Request { input_size: (from, from), ..Request::default() };
+    let options = Options::default()
+        .with_input_size(from, from)
+        .with_depth_prior(DepthBounds::re10k())
+        .with_check(Check::Off)
+        .with_detail(Detail::Off);
     let camera = scene::camera(to);
     Ok(Box::new(move || {
-        let out = model.reconstruct(&photos, &request)?;
-        let options = model.raster_options(1.0, &out.inputs);
-        let picture = render(&out.splats, &camera, &options);
+        let picture = model.run(&photos, &options)?.render(&camera);
         Ok(f64::from(picture.rgb.iter().sum::<f32>()))
     }))
 }

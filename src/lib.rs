@@ -1,38 +1,44 @@
-//! Two posed photographs in, 3D Gaussians dense enough for a screen two to four
-//! times sharper out, and new views of them: on any CPU, with no Python and no CUDA.
+//! `subsplat` turns two posed photographs into 3D Gaussians dense enough for views two to four
+//! times sharper than the network's input, on any CPU or GPU, without Python and CUDA.
 //!
 //! The method is *SubSplat: High-Resolution Pixel-aligned 3DGS via Sub-pixel Gaussian
 //! Reparameterization* on its MVSplat backbone.
 //!
-//! ```
-//! use subsplat::io::{save_splats, scene::load_scene};
-//! use subsplat::pipeline::{Photo, Reconstructor, Request};
+#![cfg_attr(feature = "network", doc = "```")]
+#![cfg_attr(not(feature = "network"), doc = "```ignore")]
+//! use subsplat::{DepthBounds, Options, Photo, Reconstructor, load_scene};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let scene = load_scene("examples/room".as_ref())?;
 //! let photos = [Photo::from_frame(&scene.frames[0])?, Photo::from_frame(&scene.frames[1])?];
+//! let options = Options::default().with_depth_prior(DepthBounds::of_scene(&scene, &[0, 1])?);
 //! let model = Reconstructor::shipped(2)?; // or ::load(weights)
-//! let room = model.reconstruct(&photos, &Request::default())?;
-//! let camera = room.inputs[0].target_camera; // any camera
-//! let options = model.raster_options(room.near_far.0, &room.inputs);
-//! let picture = subsplat::render(&room.splats, &camera, &options);
-//! assert_eq!((picture.width, picture.height, room.splats.len()), (512, 512, 524_288));
+//! let room = model.run(&photos, &options)?;
+//! let picture = room.render(&scene.frames[2].camera); // any camera
+//! assert_eq!((picture.width, picture.height, room.splats().len()), (512, 512, 524_288));
 //! # let out = std::env::temp_dir().join(format!("subsplat-doc-{}.ply", std::process::id()));
 //! # let room_ply = out.as_path();
-//! save_splats(room_ply, &room.splats, &Default::default())?;
-//! # std::fs::remove_file(out)?;
+//! room.save(room_ply)?;
+//! # std::fs::remove_file(room_ply)?;
 //! # Ok(())
 //! # }
 //! ```
 //!
-//! Where to look: [`pipeline`] is the whole path in one call; [`render()`] draws any
-//! [`splats::Splats`], [`rasterize`] does so with gradients; [`io`] reads and writes files; [`check`] judges poses; [`eval`] scores methods;
-//! [`model`] is the network, its parts usable one by one, configured by
-//! [`config::Config`]; [`ops`] are the same kernels as candle ops. Every geometric
-//! convention is said once, in [`camera`]; [`navigation`] moves one by hand.
+//! * `Reconstructor` runs the network: photographs and cameras to a `Reconstruction`.
+//! * [`render()`] and [`Renderer`] draw any [`Splats`]; `rasterize` draws `SplatTensors` with
+//!   gradients.
+//! * [`load_scene`], [`load_splats`] and [`save_splats`] read and write files.
+//! * [`check_pair`] compares poses with matched points.
+//! * [`Camera`] and [`Intrinsics`] define all geometric conventions: OpenCV axes, pixel centres
+//!   at +0.5, `world_from_camera`.
 //!
-//! Features, both default: `cli` builds the programs `subsplat` and `subsplat-convert`;
-//! `gpu` the WGSL kernels ([`gpu`]). `view` adds `subsplat view`, a window.
+//! # Features
+//!
+//! * `network` (default): the network, its training and its scores, on candle. Without it the
+//!   crate has cameras, splats, their files and the rasterizer.
+//! * `gpu` (default): the kernels as WGSL compute, through wgpu.
+//! * `internals`: makes the modules with kernels, ops and network parts public. No version
+//!   promises anything about them.
 
 #![cfg_attr(
     not(feature = "internals"),
@@ -145,6 +151,9 @@ pub use navigation::{Bounds, Navigator, Start};
 #[cfg(feature = "network")]
 pub use ops::{SplatTensors, rasterize_splats as rasterize};
 #[cfg(feature = "network")]
-pub use pipeline::{Photo, Reconstruction, Reconstructor, Request};
+pub use pipeline::{
+    Check, DepthBounds, DepthRange, DepthSource, Detail, Error, Options, Photo, PoseError,
+    Prepared, Progress, Reconstruction, Reconstructor, Result, Stage, StageTime, Warning,
+};
 pub use render::{Picture, Renderer, render};
 pub use splats::{SplatParts, Splats, SplatsError};

@@ -1,7 +1,10 @@
 //! Rendering of splats to a picture, on the CPU or on a chosen device.
 
+mod comment;
 mod device;
+mod image;
 
+pub use comment::{comment_of_options, options_of_comments};
 pub use device::{DeviceError, Renderer};
 
 use crate::abi::{RasterOptions, Rendered};

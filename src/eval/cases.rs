@@ -1,12 +1,13 @@
-//! Which views of which scenes are inputs, and which are compared with.
+//! Cases of a data set: the views that are inputs, and those that are ground truth.
 
-use super::{Result, bad};
-use crate::data::chunks::{Chunk, Example, NEAR_FAR, load_index as chunk_index};
+use crate::camera::Camera;
+use crate::data::chunks::{Chunk, Example, load_index as chunk_index};
 use crate::data::dataset::{chunk_folder, scene_paths};
-use crate::data::depth::{DepthRange, depth_range};
 use crate::io::protocol::{Index, Views, load_index, load_protocol};
 use crate::io::scene::{Scene, load_scene};
-use crate::pipeline::{Photo, check_photos, refine_range};
+use crate::pipeline::{
+    DepthBounds, DepthRange, Error, Photo, Result, check_pairs, initial_bounds, refined_bounds,
+};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
@@ -20,15 +21,15 @@ pub struct Case {
     /// Width and height of the inputs that the protocol names, px.
     pub resolution: Option<[usize; 2]>,
     place: Place,
-    range: OnceLock<DepthRange>,
+    bounds: OnceLock<DepthBounds>,
 }
 
 impl Case {
     fn new(scene: &str, views: Views, resolution: Option<[usize; 2]>, place: Place) -> Self {
-        Self { scene: scene.to_owned(), views, resolution, place, range: OnceLock::new() }
+        Self { scene: scene.to_owned(), views, resolution, place, bounds: OnceLock::new() }
     }
 
-    /// The inputs' frames as a name: `0_8`.
+    /// Joins the inputs' frames to a name: `0_8`.
     pub fn pair(&self) -> String {
         self.views.context.iter().map(usize::to_string).collect::<Vec<_>>().join("_")
     }
@@ -50,12 +51,10 @@ pub struct Loaded {
     pub targets: Vec<Photo>,
     /// Names of the targets' frames.
     pub names: Vec<String>,
-    /// Depth candidates.
-    pub range: DepthRange,
-    /// Nobody said what `range` is: the model may look ([`SubSplat::look`]).
-    ///
-    /// [`SubSplat::look`]: crate::model::subsplat::SubSplat::look
-    pub look: bool,
+    /// Depth range, before the network estimates its own.
+    pub bounds: DepthBounds,
+    /// Ends of the depth range that the user fixed.
+    pub depth_range: DepthRange,
 }
 
 /// Cases of a data set.
@@ -63,53 +62,52 @@ pub struct Loaded {
 pub struct Benchmark {
     cases: Vec<Case>,
     scenes: Vec<Scene>,
-    /// Nearest and farthest depth, where the user gave them.
-    given: (Option<f32>, Option<f32>),
-    /// Chunks, and not scenes.
+    /// Ends of the depth range that the user fixed.
+    depth_range: DepthRange,
+    /// Whether the data are chunks; otherwise they are scenes.
     chunks: bool,
-    /// The chunk opened last.
+    /// The chunk that was opened last.
     open: Mutex<Option<(PathBuf, Arc<Chunk>)>>,
     notes: Vec<String>,
 }
 
 impl Benchmark {
-    /// Opens pixelSplat's chunks (`data` or `data/test` has an `index.json`; `index` is
-    /// then required), a scene, or a folder of scenes. Without an `index` (scene: context
-    /// and target, or null) scenes need a `protocol.json`; those without one, or without
-    /// tests in it, are passed over, and so is what the index names and the data lacks:
-    /// [`Benchmark::notes`] says how many.
+    /// Opens pixelSplat's chunks, a scene, or a folder of scenes. Chunks have an `index.json` in
+    /// `data` or `data/test`, and need an `index` (scene: context and target, or null). Scenes
+    /// need an `index` or a `protocol.json`. Scenes without tests are skipped, as are entries of
+    /// the index that the data lacks; [`Benchmark::notes`] counts them.
     ///
     /// # Errors
-    /// Files that are missing or broken; an index out of a scene's range; no case at all.
+    /// Files that are missing or broken; a frame that a scene does not have; no case at all.
     pub fn open(data: &Path, index: Option<&Path>) -> Result<Self> {
         let listed = index.map(load_index).transpose()?;
         let mut all = Self {
             cases: Vec::new(),
             scenes: Vec::new(),
-            given: (None, None),
+            depth_range: DepthRange::Auto,
             chunks: false,
             open: Mutex::default(),
             notes: Vec::new(),
         };
         match (chunk_folder(data, "test"), listed, index) {
-            (Some(folder), Some(listed), _) => all.of_chunks(&folder, listed)?,
+            (Some(folder), Some(listed), _) => all.add_chunks(&folder, listed)?,
             (Some(_), None, _) => {
                 let expected = "an evaluation index for a data set of chunks (--index)";
-                return bad(data.display().to_string(), expected, "none");
+                return Err(Error::argument(data.display().to_string(), expected, "none"));
             }
-            (None, listed, index) => all.of_scenes(data, listed.as_ref().zip(index))?,
+            (None, listed, index) => all.add_scenes(data, listed.as_ref().zip(index))?,
         }
         if all.cases.is_empty() {
             let expected = match index {
                 Some(index) => format!("scenes that {} names", index.display()),
                 None => "scenes with a protocol.json that has tests".to_owned(),
             };
-            return bad(data.display().to_string(), expected, "none");
+            return Err(Error::argument(data.display().to_string(), expected, "none"));
         }
         Ok(all)
     }
 
-    fn of_chunks(&mut self, folder: &Path, listed: Index) -> Result<()> {
+    fn add_chunks(&mut self, folder: &Path, listed: Index) -> Result<()> {
         self.chunks = true;
         let files = chunk_index(folder)?;
         let total = listed.len();
@@ -123,7 +121,7 @@ impl Benchmark {
                 }
             }
         }
-        // A chunk is opened once.
+        // Sorted by file, so that each chunk is opened once.
         let file = |c: &Case| match &c.place {
             Place::Chunk(file) => file.clone(),
             Place::Scene(_) => PathBuf::new(),
@@ -139,7 +137,7 @@ impl Benchmark {
         Ok(())
     }
 
-    fn of_scenes(&mut self, data: &Path, listed: Option<(&Index, &Path)>) -> Result<()> {
+    fn add_scenes(&mut self, data: &Path, listed: Option<(&Index, &Path)>) -> Result<()> {
         let paths = scene_paths(data)?;
         let mut without = Vec::new();
         for path in &paths {
@@ -168,17 +166,17 @@ impl Benchmark {
             self.scenes.push(scene);
         }
         if !without.is_empty() && !self.cases.is_empty() {
-            self.notes.push(format!("passed over, without tests: {}", without.join(", ")));
+            self.notes.push(format!("skipped, without tests: {}", without.join(", ")));
         }
         Ok(())
     }
 
-    /// Depth candidates for every scene (world units); what is not given is derived:
-    /// chunks 1 and 100, scenes by [`depth_range`] and, where that is but a guess, by
-    /// points matched between the inputs, as `run` does it.
-    pub fn set_near_far(&mut self, near: Option<f32>, far: Option<f32>) {
-        self.given = (near, far);
-        self.cases.iter_mut().for_each(|c| c.range = OnceLock::new());
+    /// Fixes ends of the depth range of every scene. Open ends are 1 and 100 for chunks. For
+    /// scenes they come from the pose file, sparse points, or points that are matched between
+    /// the inputs, as in [`Reconstructor::run`](crate::pipeline::Reconstructor::run).
+    pub fn set_depth_range(&mut self, range: DepthRange) {
+        self.depth_range = range;
+        self.cases.iter_mut().for_each(|c| c.bounds = OnceLock::new());
     }
 
     /// Keeps the cases of the first `scenes` scenes.
@@ -192,7 +190,7 @@ impl Benchmark {
         });
     }
 
-    /// The cases, scene by scene.
+    /// The cases, in the order of the scenes.
     pub fn cases(&self) -> &[Case] {
         &self.cases
     }
@@ -202,7 +200,7 @@ impl Benchmark {
         self.chunks
     }
 
-    /// What was passed over, and warnings of the readers, one line each.
+    /// Counts of skipped scenes and warnings of the readers, one line each.
     pub fn notes(&self) -> Vec<String> {
         let warnings = self.scenes.iter().flat_map(|s| s.warnings.clone());
         self.notes.iter().cloned().chain(warnings).collect()
@@ -218,60 +216,64 @@ impl Benchmark {
         if views.target.is_empty() || views.context.len() < 2 {
             let got = format!("{} and {}", views.context.len(), views.target.len());
             let what = format!("scene {} ({})", case.scene, case.pair());
-            return bad(what, "at least 2 context frames and a target", got);
+            return Err(Error::argument(what, "at least 2 context frames and a target", got));
         }
         match &case.place {
-            Place::Chunk(file) => self.of_video(case, file),
+            Place::Chunk(file) => self.load_from_chunk(case, file),
             Place::Scene(i) => match self.scenes.get(*i) {
-                Some(scene) => self.of_scene(case, scene),
-                None => bad(&case.scene, "a scene of this data set", "another"),
+                Some(scene) => self.load_from_scene(case, scene),
+                None => Err(Error::argument(&case.scene, "a scene of this data set", "another")),
             },
         }
     }
 
-    fn of_video(&self, case: &Case, file: &Path) -> Result<Loaded> {
+    fn load_from_chunk(&self, case: &Case, file: &Path) -> Result<Loaded> {
         let chunk = self.chunk(file)?;
         let Some(video) = chunk.find(&case.scene) else {
             let what = file.display().to_string();
-            return bad(what, format!("an example `{}`", case.scene.escape_debug()), "none");
+            let expected = format!("an example `{}`", case.scene.escape_debug());
+            return Err(Error::argument(what, expected, "none"));
         };
         let photos = |frames: &[usize]| -> Result<Vec<Photo>> {
             frames.iter().map(|&f| photo(&chunk, video, f)).collect()
         };
         let names = case.views.target.iter().map(|f| format!("{f:06}")).collect();
-        let (near, far) = (self.given.0.unwrap_or(NEAR_FAR.0), self.given.1.unwrap_or(NEAR_FAR.1));
-        if !(near > 0.0 && far > near && far.is_finite()) {
-            return bad("near and far", "0 < near < far", format!("{near} and {far}"));
-        }
-        let reason = "RealEstate10K's habit".to_owned();
-        let range = DepthRange { near, far, reason, guessed: false };
+        let bounds = initial_bounds(&[], self.depth_range, Some(&DepthBounds::re10k()))?;
         let (context, targets) = (photos(&case.views.context)?, photos(&case.views.target)?);
-        Ok(Loaded { context, targets, names, range, look: self.given == (None, None) })
+        Ok(Loaded { context, targets, names, bounds, depth_range: self.depth_range })
     }
 
-    fn of_scene(&self, case: &Case, scene: &Scene) -> Result<Loaded> {
+    fn load_from_scene(&self, case: &Case, scene: &Scene) -> Result<Loaded> {
         let frames = |list: &[usize]| {
             let frame = |&i: &usize| match scene.frames.get(i) {
                 Some(frame) => Ok(Photo::from_frame(frame)?),
-                None => bad(&scene.name, "a frame of the scene", i.to_string()),
+                None => Err(Error::argument(&scene.name, "a frame of the scene", i.to_string())),
             };
             list.iter().map(frame).collect::<Result<Vec<_>>>()
         };
         let (context, targets) = (frames(&case.views.context)?, frames(&case.views.target)?);
         let name = |&i: &usize| scene.frames.get(i).map_or_else(String::new, |f| f.name.clone());
         let names = case.views.target.iter().map(name).collect();
-        let range = match case.range.get() {
-            Some(range) => range.clone(),
+        let bounds = match case.bounds.get() {
+            Some(bounds) => bounds.clone(),
             None => {
-                let guess = depth_range(scene, &case.views.context, self.given)?;
-                let range = match guess.guessed {
-                    true => refine_range(guess, self.given, &check_photos(&context)?),
-                    false => guess,
-                };
-                case.range.get_or_init(|| range).clone()
+                let bounds = self.bounds_of_scene(case, scene, &context)?;
+                case.bounds.get_or_init(|| bounds).clone()
             }
         };
-        Ok(Loaded { context, targets, names, range, look: self.given == (None, None) })
+        Ok(Loaded { context, targets, names, bounds, depth_range: self.depth_range })
+    }
+
+    /// The depth range of a scene's case. Points are matched only where it would be a guess.
+    fn bounds_of_scene(&self, case: &Case, scene: &Scene, photos: &[Photo]) -> Result<DepthBounds> {
+        let prior = DepthBounds::of_scene(scene, &case.views.context)?;
+        let cameras: Vec<Camera> = photos.iter().map(|p| *p.camera()).collect();
+        let guess = initial_bounds(&cameras, self.depth_range, prior.as_ref())?;
+        if !guess.source.is_guess() {
+            return Ok(guess);
+        }
+        let reports = check_pairs(photos, |_| Ok(()))?;
+        Ok(refined_bounds(guess, self.depth_range, &reports))
     }
 
     fn chunk(&self, file: &Path) -> Result<Arc<Chunk>> {
@@ -289,5 +291,5 @@ impl Benchmark {
 
 fn photo(chunk: &Chunk, video: &Example, frame: usize) -> Result<Photo> {
     let (image, camera) = chunk.load(video, frame)?;
-    Ok(Photo { image, camera })
+    Photo::new(image, camera)
 }

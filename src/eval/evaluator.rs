@@ -1,9 +1,7 @@
-//! Pictures of every method, and their scores.
+//! Renders the targets of a case by every method, and scores the pictures.
 
 use super::methods::{enlarged, mean, nearest};
-use super::{
-    Benchmark, Case, CaseScores, Error, Loaded, Method, Result, Score, Scores, TargetScores, bad,
-};
+use super::{Benchmark, Case, CaseScores, Loaded, Method, Score, Scores, TargetScores};
 use crate::camera::Camera;
 use crate::config::LowpassRef;
 use crate::cpu::Rasterizer;
@@ -11,29 +9,29 @@ use crate::data::crop::{CropOptions, CropRule, Cropped, LrFrom};
 use crate::io::image::Rgb;
 use crate::metrics::{mean_gradient, psnr, ssim};
 use crate::model::lpips::Lpips;
-use crate::model::subsplat::{SubSplat, feature_channels};
+use crate::model::subsplat::feature_channels;
 use crate::model::trunk::Trunk;
 use crate::model::weights::Weights;
-use crate::pipeline::{self, Photo, add_detail, views_of};
+use crate::pipeline::{DepthBounds, DepthRange, Error, Photo, Reconstructor, Result, add_detail};
 use crate::render::render_with;
 use crate::splats::Splats;
 use std::path::Path;
 
-/// Input side where neither the caller nor the protocol says one, px.
+/// Default side of the inputs, px.
 const SIDE: usize = 256;
 
-/// What is evaluated.
+/// Options of an evaluation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Options {
     /// r: target side over input side.
     pub upscale: usize,
-    /// Width and height of the inputs, px; else the protocol's, else 256×256.
+    /// Width and height of the inputs, px. Default: the protocol's, else 256×256.
     pub input_size: Option<(usize, usize)>,
     /// Methods, in the order of the tables.
     pub methods: Vec<Method>,
     /// Principal points after the crop.
     pub rule: CropRule,
-    /// From what the inputs are made.
+    /// Source of the inputs' pixels.
     pub lr_from: LrFrom,
 }
 
@@ -58,14 +56,14 @@ pub struct TargetPictures {
     pub methods: Vec<Rgb>,
 }
 
-/// What came out of one case.
+/// Scores and pictures of one case.
 #[derive(Clone, Debug)]
 pub struct CaseResult {
     /// The scores.
     pub scores: CaseScores,
-    /// The inputs as the network saw them.
+    /// The inputs at the network's size.
     pub inputs: Vec<Rgb>,
-    /// Pictures, one set a target.
+    /// One set of pictures for each target.
     pub pictures: Vec<TargetPictures>,
 }
 
@@ -75,12 +73,12 @@ pub struct Evaluator {
     lpips: Option<Lpips>,
 }
 
-/// Inputs and truth at their sizes.
-struct Prepared {
+/// Cropped inputs and targets of a case.
+struct Crops {
     inputs: Vec<Cropped>,
     targets: Vec<Cropped>,
-    near_far: (f32, f32),
-    look: bool,
+    bounds: DepthBounds,
+    depth_range: DepthRange,
 }
 
 impl Evaluator {
@@ -89,16 +87,16 @@ impl Evaluator {
         Self { options, lpips: None }
     }
 
-    /// With LPIPS from a weight file ([`Lpips::load`]).
+    /// Adds LPIPS with a weight file ([`Lpips::load`]).
     ///
     /// # Errors
     /// A file that holds no such weights.
     pub fn with_lpips(mut self, path: &Path) -> Result<Self> {
-        self.lpips = Some(Lpips::load(path).map_err(pipeline::Error::from)?);
+        self.lpips = Some(Lpips::load(path)?);
         Ok(self)
     }
 
-    /// What is evaluated.
+    /// The options.
     pub fn options(&self) -> &Options {
         &self.options
     }
@@ -108,35 +106,35 @@ impl Evaluator {
         self.options.methods.iter().map(|m| m.name().to_owned()).collect()
     }
 
-    /// All cases of `benchmark`, without keeping a picture.
+    /// Scores all cases of `benchmark`, and keeps no picture.
     ///
     /// # Errors
     /// As [`Evaluator::case`].
-    pub fn run(&self, model: Option<&SubSplat>, benchmark: &Benchmark) -> Result<Scores> {
+    pub fn run(&self, model: Option<&Reconstructor>, benchmark: &Benchmark) -> Result<Scores> {
         let one = |case: &Case| Ok(self.case(model, case, benchmark.load(case)?)?.scores);
         let cases = benchmark.cases().iter().map(one).collect::<Result<_>>()?;
         Ok(Scores { methods: self.methods(), cases })
     }
 
-    /// One case, with its pictures.
+    /// Scores one case, and keeps its pictures.
     ///
     /// # Errors
-    /// A method that needs a model, without one; a crop or the network refuses what came;
-    /// a picture of another program that is missing; a picture that is not finite.
+    /// No model for a method that needs one; an error of the crop or of the network; a missing
+    /// picture of another program; a picture that is not finite.
     pub fn case(
         &self,
-        model: Option<&SubSplat>,
+        model: Option<&Reconstructor>,
         case: &Case,
         loaded: Loaded,
     ) -> Result<CaseResult> {
         let names = loaded.names.clone();
-        let prepared = self.prepare(model, case, loaded)?;
+        let crops = self.crop(model, case, loaded)?;
         let place = format!("{} ({})", case.scene, case.pair());
-        let mut players = Players::new(self, model, &prepared)?;
-        let mut result = self.empty(case, (&prepared, players.near_far), &names);
+        let mut pictures = PictureMaker::new(self, model, &crops)?;
+        let mut result = self.empty(case, (&crops, &pictures.bounds), &names);
         for (m, method) in self.options.methods.iter().enumerate() {
-            players.change_to(method, &prepared)?;
-            for (t, target) in prepared.targets.iter().enumerate() {
+            pictures.select(method, &crops)?;
+            for (t, target) in crops.targets.iter().enumerate() {
                 let (w, h) = (target.target.width, target.target.height);
                 let rgb = match method {
                     Method::Other { folder, .. } => {
@@ -145,13 +143,14 @@ impl Evaluator {
                         let scene = (case.scene.as_str(), pair.as_str());
                         Method::other_picture(folder, scene, frame, (w, h))?.to_unit()
                     }
-                    _ => players.picture(method, &prepared, target),
+                    _ => pictures.picture(method, &crops, target),
                 };
                 let place = format!("{place} target {} {}", names[t], method.name());
                 let score = self.score(&rgb, &target.target, &place)?;
                 result.scores.targets[t].scores.push(score);
                 let Some(picture) = Rgb::from_unit(&rgb, w, h) else {
-                    return bad(place, format!("a picture of {w}x{h}"), rgb.len().to_string());
+                    let expected = format!("a picture of {w}x{h}");
+                    return Err(Error::argument(place, expected, rgb.len().to_string()));
                 };
                 debug_assert_eq!(result.pictures[t].methods.len(), m);
                 result.pictures[t].methods.push(picture);
@@ -163,11 +162,11 @@ impl Evaluator {
     fn empty(
         &self,
         case: &Case,
-        (prepared, near_far): (&Prepared, (f32, f32)),
+        (crops, bounds): (&Crops, &DepthBounds),
         names: &[String],
     ) -> CaseResult {
         let size = |p: Option<&Rgb>| p.map_or((0, 0), |p| (p.width, p.height));
-        let Prepared { inputs, targets, .. } = prepared;
+        let Crops { inputs, targets, .. } = crops;
         let target = |(&frame, name): (&usize, &String)| TargetScores {
             frame,
             name: name.clone(),
@@ -184,7 +183,7 @@ impl Evaluator {
                     size(inputs.first().map(|c| &c.input)),
                     size(targets.first().map(|c| &c.target)),
                 ],
-                near_far,
+                near_far: (bounds.near, bounds.far),
                 enlarged: targets.iter().any(|c| c.window.scale.min_element() < 1.0),
                 targets: case.views.target.iter().zip(names).map(target).collect(),
             },
@@ -193,50 +192,47 @@ impl Evaluator {
         }
     }
 
-    fn prepare(&self, model: Option<&SubSplat>, case: &Case, loaded: Loaded) -> Result<Prepared> {
+    fn crop(&self, model: Option<&Reconstructor>, case: &Case, loaded: Loaded) -> Result<Crops> {
         let Options { upscale, rule, lr_from, .. } = self.options;
         let stride = model.map_or(1, |m| m.config().stride());
         let nominal = self.options.input_size;
         let nominal = nominal.or(case.resolution.map(|[w, h]| (w, h))).unwrap_or((SIDE, SIDE));
         let photos = || loaded.context.iter().chain(&loaded.targets);
         let least = |side: fn(&Photo) -> usize| photos().map(side).min().unwrap_or(0);
-        let least = (least(|p| p.image.width), least(|p| p.image.height));
+        let least = (least(|p| p.image().width), least(|p| p.image().height));
         let input_size = fitting(nominal, upscale, stride, least);
         let options = CropOptions { input_size, upscale, stride, rule, lr_from };
-        let cropped = |photos: &[Photo]| {
-            photos.iter().map(|p| p.crop(&options)).collect::<pipeline::Result<Vec<_>>>()
-        };
-        Ok(Prepared {
+        let cropped =
+            |photos: &[Photo]| photos.iter().map(|p| p.crop(&options)).collect::<Result<Vec<_>>>();
+        Ok(Crops {
             inputs: cropped(&loaded.context)?,
             targets: cropped(&loaded.targets)?,
-            near_far: (loaded.range.near, loaded.range.far),
-            look: loaded.look,
+            bounds: loaded.bounds,
+            depth_range: loaded.depth_range,
         })
     }
 
     fn score(&self, picture: &[f32], truth: &Rgb, place: &str) -> Result<Score> {
         let (w, h) = (truth.width, truth.height);
         let truth = truth.to_unit();
-        let measured = |e| Error::Metrics { place: place.to_owned(), source: e };
+        let unscored = |e| Error::Score { place: place.to_owned(), source: e };
         let lpips = match &self.lpips {
-            Some(lpips) => {
-                Some(lpips.distance(picture, &truth, w, h).map_err(pipeline::Error::from)?)
-            }
+            Some(lpips) => Some(lpips.distance(picture, &truth, w, h)?),
             None => None,
         };
-        let own = mean_gradient(picture, w, h).map_err(measured)?;
-        let theirs = mean_gradient(&truth, w, h).map_err(measured)?;
+        let own = mean_gradient(picture, w, h).map_err(unscored)?;
+        let theirs = mean_gradient(&truth, w, h).map_err(unscored)?;
         Ok(Score {
-            psnr: psnr(picture, &truth, w, h).map_err(measured)?,
-            ssim: ssim(picture, &truth, w, h).map_err(measured)?,
+            psnr: psnr(picture, &truth, w, h).map_err(unscored)?,
+            ssim: ssim(picture, &truth, w, h).map_err(unscored)?,
             lpips,
             sharpness: (theirs > 0.0).then(|| own / theirs),
         })
     }
 }
 
-/// The input size of a case: `nominal`, halved while the smallest photograph (`least`)
-/// does not cover the target and the target stays no smaller than `nominal`.
+/// The input size of a case. `nominal` is halved while the smallest photograph (`least`) does
+/// not cover the target, and the target stays no smaller than `nominal`.
 fn fitting(
     nominal: (usize, usize),
     upscale: usize,
@@ -252,29 +248,29 @@ fn fitting(
     size
 }
 
-/// The Gaussians of one case, one set in memory at a time.
-struct Players<'a> {
+/// Makes the pictures of one case. One set of Gaussians is in memory at a time.
+struct PictureMaker<'a> {
     r: usize,
-    /// Depth candidates.
-    near_far: (f32, f32),
+    /// Depth range of the network's candidates.
+    bounds: DepthBounds,
     /// Mean colour of the inputs.
     colour: [f32; 3],
     network: Option<Network<'a>>,
-    /// Whose Gaussians `splats` are.
+    /// The set that `splats` holds.
     current: Option<Set>,
     splats: Option<Splats>,
     rasterizer: Rasterizer,
 }
 
-/// The backbone's outputs of one case, and what may follow it.
+/// The backbone's outputs of one case, and the model.
 struct Network<'a> {
-    model: &'a SubSplat,
+    model: &'a Reconstructor,
     views: crate::model::Views,
     output: crate::model::BackboneOutput,
     parents: crate::model::Primaries,
 }
 
-/// Gaussians that methods share.
+/// A set of Gaussians that methods share.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Set {
     Children,
@@ -295,32 +291,25 @@ impl Set {
     }
 }
 
-impl<'a> Players<'a> {
-    fn new(
-        evaluator: &Evaluator,
-        model: Option<&'a SubSplat>,
-        prepared: &Prepared,
-    ) -> Result<Self> {
+impl<'a> PictureMaker<'a> {
+    fn new(evaluator: &Evaluator, model: Option<&'a Reconstructor>, crops: &Crops) -> Result<Self> {
         let needed = evaluator.options.methods.iter().find(|m| m.needs_model());
-        let mut near_far = prepared.near_far;
+        let mut bounds = crops.bounds.clone();
         let network = match (needed, model) {
             (None, _) => None,
-            (Some(method), None) => return bad(method.name(), "a model", "none"),
+            (Some(method), None) => return Err(Error::argument(method.name(), "a model", "none")),
             (Some(_), Some(model)) => {
-                let mut views = views_of(&prepared.inputs, near_far)?;
-                if prepared.look {
-                    views = model.estimate_depth_range(&views).map_err(pipeline::Error::from)?;
-                    near_far = views.near_far[0][0];
-                }
-                let output = model.encode(&views).map_err(pipeline::Error::from)?;
-                let parents = model.primaries(&views, &output).map_err(pipeline::Error::from)?;
+                let (views, found) = model.views(&crops.inputs, bounds, crops.depth_range)?;
+                bounds = found;
+                let output = model.model().encode(&views)?;
+                let parents = model.model().primaries(&views, &output)?;
                 Some(Network { model, views, output, parents })
             }
         };
         Ok(Self {
             r: evaluator.options.upscale,
-            near_far,
-            colour: Rgb::mean_colour(prepared.inputs.iter().map(|c| &c.input)),
+            bounds,
+            colour: Rgb::mean_colour(crops.inputs.iter().map(|c| &c.input)),
             network,
             current: None,
             splats: None,
@@ -328,8 +317,8 @@ impl<'a> Players<'a> {
         })
     }
 
-    /// Makes the Gaussians of `method`, unless they are there.
-    fn change_to(&mut self, method: &Method, prepared: &Prepared) -> Result<()> {
+    /// Makes the Gaussians of `method`, unless they are in memory.
+    fn select(&mut self, method: &Method, crops: &Crops) -> Result<()> {
         let (Some(set), Some(network)) = (Set::of(method), &self.network) else { return Ok(()) };
         if self.current == Some(set) {
             return Ok(());
@@ -340,40 +329,35 @@ impl<'a> Players<'a> {
         };
         let mut splats = children;
         if set == Set::Detailed {
-            add_detail(&mut splats, &prepared.inputs, network.model.config().upscale)?;
+            add_detail(&mut splats, &crops.inputs, network.model.config().upscale)?;
         }
         (self.current, self.splats) = (Some(set), Some(splats));
         Ok(())
     }
 
-    fn picture(&mut self, method: &Method, prepared: &Prepared, target: &Cropped) -> Vec<f32> {
+    fn picture(&mut self, method: &Method, crops: &Crops, target: &Cropped) -> Vec<f32> {
         let (r, camera) = (self.r, &target.target_camera);
         match method {
-            Method::Copy => nearest(&prepared.inputs, camera, r),
-            Method::Mean => mean(&prepared.inputs, r),
-            Method::Lowpass => self.rendered(camera, r, Some(LowpassRef::Input)),
-            Method::Backbone => self.rendered(camera, r, Some(LowpassRef::Target)),
+            Method::Copy => nearest(&crops.inputs, camera, r),
+            Method::Mean => mean(&crops.inputs, r),
+            Method::Lowpass => self.render(camera, r, Some(LowpassRef::Input)),
+            Method::Backbone => self.render(camera, r, Some(LowpassRef::Target)),
             Method::Bilinear => {
-                let small = self.rendered(&target.input_camera, 1, None);
+                let small = self.render(&target.input_camera, 1, None);
                 enlarged(&small, (target.input.width, target.input.height), r)
             }
-            _ => self.rendered(camera, r, None),
+            _ => self.render(camera, r, None),
         }
     }
 
-    /// The current Gaussians seen by `camera`, whose pixels are 1/`ratio` input pixels.
-    fn rendered(
-        &mut self,
-        camera: &Camera,
-        ratio: usize,
-        reference: Option<LowpassRef>,
-    ) -> Vec<f32> {
+    /// Renders the current Gaussians from `camera`, whose pixels are 1/`ratio` input pixels.
+    fn render(&mut self, camera: &Camera, ratio: usize, reference: Option<LowpassRef>) -> Vec<f32> {
         let (Some(network), Some(splats)) = (&self.network, &self.splats) else {
             return Vec::new();
         };
         let mut config = network.model.config().clone();
         config.render.lowpass_ref = reference.unwrap_or(config.render.lowpass_ref);
-        let options = config.raster_options(ratio as f32, self.near_far.0, self.colour);
+        let options = config.raster_options(ratio as f32, self.bounds.near, self.colour);
         render_with(&mut self.rasterizer, splats, camera, &options).rgb
     }
 }
@@ -383,22 +367,20 @@ impl Network<'_> {
         let mut config = self.model.config().clone();
         let own;
         let trunk = match set {
-            Set::Children | Set::Detailed => self.model.trunk(),
+            Set::Children | Set::Detailed => self.model.model().trunk(),
             Set::Parents | Set::Uniform => {
                 config.upscale = r;
                 config.spgr.enabled = set == Set::Uniform;
-                // With closed last layers the heads' inputs count for nothing.
+                // Heads whose last layers are zero do not depend on their inputs.
                 config.spgr.zero_init = true;
                 config.agg.enabled = false;
                 let start = Weights::seeded(0).builder();
-                own = Trunk::new(&config, &feature_channels(&config), start)
-                    .map_err(pipeline::Error::from)?;
+                own = Trunk::new(&config, &feature_channels(&config), start)?;
                 &own
             }
         };
         let children = trunk.forward(&self.views, &self.output, &self.parents);
-        let splats = children.and_then(|c| c.to_splats());
-        Ok(splats.map_err(pipeline::Error::from)?)
+        Ok(children.and_then(|c| c.to_splats())?)
     }
 }
 

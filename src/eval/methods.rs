@@ -1,13 +1,13 @@
-//! What is compared: the model, its parts, and ways that need no model.
+//! The methods that are compared: the model, its parts, and baselines without a model.
 
-use super::{Result, bad};
 use crate::camera::Camera;
 use crate::data::crop::Cropped;
 use crate::io::image::{Rgb, load};
+use crate::pipeline::{Error, Result};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-/// A way to a picture of a target view.
+/// A method that gives a picture of a target view.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Method {
     /// The model.
@@ -21,19 +21,19 @@ pub enum Method {
     /// The backbone's Gaussians rendered at the input's size, then enlarged bilinearly.
     Bilinear,
     /// K = r² equal children of each of the backbone's Gaussians, evenly over its pixel:
-    /// SubSplat's split without anything learned. (The paper's Table D trains a backbone
-    /// with K Gaussians a pixel instead: `gaussians_per_pixel` of its configuration;
-    /// score its weights with [`Method::Backbone`].)
+    /// SubSplat's split with untrained heads. The paper's Table D trains a backbone with K
+    /// Gaussians a pixel instead (`gaussians_per_pixel` of its configuration); score its weights
+    /// by [`Method::Backbone`].
     Uniform,
-    /// The input whose eye is nearest to the target's, enlarged bilinearly.
+    /// The input whose camera is nearest to the target's, enlarged bilinearly.
     Copy,
     /// Mean of the inputs, enlarged bilinearly.
     Mean,
-    /// PNGs that another program made.
+    /// PNG pictures of another program.
     Other {
-        /// Its name in the tables.
+        /// Name in the tables.
         name: String,
-        /// Where they are: see [`Method::other_picture`].
+        /// Their folder; [`Method::other_picture`] states the layouts.
         folder: PathBuf,
     },
 }
@@ -53,14 +53,14 @@ pub(crate) const NAMED: [(&str, Method); 8] = [
 impl FromStr for Method {
     type Err = String;
 
-    /// A name, or `NAME=DIR` for [`Method::Other`].
+    /// Parses a name, or `NAME=DIR` as [`Method::Other`].
     fn from_str(text: &str) -> std::result::Result<Self, String> {
         if let Some((_, method)) = NAMED.iter().find(|(name, _)| *name == text) {
             return Ok(method.clone());
         }
         let names = NAMED.map(|(name, _)| name).join(", ");
         match text.split_once('=') {
-            Some((name, folder)) if plain(name) && !folder.is_empty() => {
+            Some((name, folder)) if is_folder_name(name) && !folder.is_empty() => {
                 if NAMED.iter().any(|(n, _)| *n == name) {
                     return Err(format!("expected a name other than {names}, got `{name}`"));
                 }
@@ -74,14 +74,14 @@ impl FromStr for Method {
     }
 }
 
-/// Whether a name may be a folder's.
-fn plain(name: &str) -> bool {
+/// Whether a name may be that of a folder.
+fn is_folder_name(name: &str) -> bool {
     let letter = |c: char| c.is_alphanumeric() || "-_.+".contains(c);
     !name.is_empty() && name.chars().all(letter) && !name.starts_with('.')
 }
 
 impl Method {
-    /// In the tables, and as the folder of its pictures.
+    /// The name in the tables, and of the folder of its pictures.
     pub fn name(&self) -> &str {
         match self {
             Self::Other { name, .. } => name,
@@ -94,13 +94,13 @@ impl Method {
         !matches!(self, Self::Copy | Self::Mean | Self::Other { .. })
     }
 
-    /// The picture that another program made of a target: the first that exists of
+    /// Reads another program's picture of a target. The first that exists is read:
     /// `SCENE/PAIR/NNNNNN.png` (this program's own layout), `SCENE/color/NNNNNN.png`
-    /// (MVSplat's), `SCENE/NNNNNN.png` and `SCENE/NAME.png`, PAIR being the inputs'
-    /// frames (`0_8`), NNNNNN the target's frame and NAME its name.
+    /// (MVSplat's), `SCENE/NNNNNN.png` or `SCENE/NAME.png`. PAIR are the inputs' frames (`0_8`),
+    /// NNNNNN is the target's frame and NAME its name.
     ///
     /// # Errors
-    /// None of them; a broken picture; another size than `size`.
+    /// No such picture; a broken one; another size than `size`.
     pub fn other_picture(
         folder: &Path,
         (scene, pair): (&str, &str),
@@ -117,26 +117,28 @@ impl Method {
         ];
         let Some(file) = places.iter().find(|p| p.is_file()) else {
             let first = places[0].display().to_string();
-            return bad(first, "a picture (or color/, or beside, or by name)", "none");
+            let expected = "a picture (or color/, or beside, or by name)";
+            return Err(Error::argument(first, expected, "none"));
         };
         let picture = load(file)?;
         if (picture.width, picture.height) != size {
             let got = format!("{}x{}", picture.width, picture.height);
-            return bad(file.display().to_string(), format!("{}x{}", size.0, size.1), got);
+            let expected = format!("{}x{}", size.0, size.1);
+            return Err(Error::argument(file.display().to_string(), expected, got));
         }
         Ok(picture)
     }
 }
 
-/// The input whose eye is nearest to `target`'s, enlarged to r times its size.
+/// Enlarges the input whose camera is nearest to `target` to r times its size.
 pub(crate) fn nearest(inputs: &[Cropped], target: &Camera, r: usize) -> Vec<f32> {
-    let apart = |c: &&Cropped| c.input_camera.position().distance(target.position());
-    let nearest = inputs.iter().min_by(|a, b| apart(a).total_cmp(&apart(b)));
+    let distance = |c: &&Cropped| c.input_camera.position().distance(target.position());
+    let nearest = inputs.iter().min_by(|a, b| distance(a).total_cmp(&distance(b)));
     nearest
         .map_or_else(Vec::new, |c| enlarged(&c.input.to_unit(), (c.input.width, c.input.height), r))
 }
 
-/// Mean of the inputs, enlarged to r times their size.
+/// Averages the inputs, and enlarges the mean to r times their size.
 pub(crate) fn mean(inputs: &[Cropped], r: usize) -> Vec<f32> {
     let Some(first) = inputs.first() else { return Vec::new() };
     let mut sum = vec![0.0f32; first.input.data.len()];
@@ -147,7 +149,7 @@ pub(crate) fn mean(inputs: &[Cropped], r: usize) -> Vec<f32> {
     enlarged(&sum, (first.input.width, first.input.height), r)
 }
 
-/// `[h, w, 3]` to `[r·h, r·w, 3]`, bilinear, pixel centres at +0.5, borders repeated
+/// Enlarges `[h, w, 3]` to `[r·h, r·w, 3]` bilinearly: pixel centres at +0.5, borders repeated
 /// (PyTorch's `interpolate` with `align_corners=False`).
 pub(crate) fn enlarged(picture: &[f32], (w, h): (usize, usize), r: usize) -> Vec<f32> {
     let taps = |side: usize| -> Vec<(usize, usize, f32)> {

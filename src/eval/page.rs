@@ -1,5 +1,5 @@
-//! One HTML page with every picture inside: tables of scores, and the same window of
-//! each method's picture side by side.
+//! One HTML page that contains all pictures: tables of scores, and one window of each method's
+//! picture side by side.
 
 use super::{CaseResult, Score, Scores};
 use crate::io::Result;
@@ -10,10 +10,10 @@ use std::path::Path;
 
 /// Side of the windows, target px.
 const WINDOW: usize = 128;
-/// Windows tried along each side of a target.
-const TRIED: usize = 7;
+/// Candidate windows along each side of a target.
+const CANDIDATES: usize = 7;
 
-/// One case on the page: a window of one of its targets.
+/// A row of pictures on the page: one window of one target of a case.
 #[derive(Clone, Debug)]
 pub struct Sheet {
     title: String,
@@ -22,8 +22,7 @@ pub struct Sheet {
 }
 
 impl Sheet {
-    /// The target in the middle of a case's list, and the window where its photograph has
-    /// the most detail.
+    /// Chooses the middle target of a case, and the window with the largest mean gradient.
     ///
     /// # Errors
     /// A picture that cannot be encoded.
@@ -63,13 +62,14 @@ impl Sheet {
     }
 }
 
-/// The window (left, top, width, height) with the largest mean gradient.
+/// Finds the window (left, top, width, height) with the largest mean gradient.
 fn busiest(truth: &Rgb) -> (usize, usize, usize, usize) {
     let (w, h) = (WINDOW.min(truth.width), WINDOW.min(truth.height));
     let mut best = (-1.0, (0, 0, w, h));
-    for i in 0..TRIED * TRIED {
-        let at = |room: usize, k: usize| room * k / (TRIED - 1);
-        let (left, top) = (at(truth.width - w, i % TRIED), at(truth.height - h, i / TRIED));
+    for i in 0..CANDIDATES * CANDIDATES {
+        let at = |space: usize, k: usize| space * k / (CANDIDATES - 1);
+        let (left, top) =
+            (at(truth.width - w, i % CANDIDATES), at(truth.height - h, i / CANDIDATES));
         let Some(window) = truth.window(left, top, w, h) else { continue };
         let detail = mean_gradient(&window.to_unit(), w, h).unwrap_or(0.0);
         if detail > best.0 {
@@ -86,7 +86,7 @@ border-bottom:1px solid #ddd}td:first-child,th:first-child{text-align:left}\
 img{width:256px;image-rendering:pixelated;background:#eee;display:block}\
 h2{font-size:15px;margin:1.6em 0 .4em}p{max-width:60em}";
 
-/// The page. `notes` say, one paragraph each, how it was made.
+/// Formats the page. Each of `notes` becomes a paragraph.
 pub fn page(title: &str, notes: &[String], scores: &Scores, sheets: &[Sheet]) -> String {
     let mut html = format!(
         "<!DOCTYPE html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><title>{0}</title>\
@@ -146,7 +146,7 @@ fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 
-/// RFC 4648, with padding.
+/// Encodes bytes by RFC 4648, with padding.
 fn base64(bytes: &[u8]) -> String {
     const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     let mut out = String::with_capacity(bytes.len().div_ceil(3) * 4);

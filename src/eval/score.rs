@@ -1,8 +1,8 @@
-//! Figures of merit, and their means.
+//! Scores of pictures, and their means.
 
 use serde::Serialize;
 
-/// How near a picture is to the photograph.
+/// Similarity of a picture to the photograph.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Score {
     /// Peak signal-to-noise ratio, dB; infinite for the same picture (JSON: null).
@@ -16,7 +16,7 @@ pub struct Score {
 }
 
 impl Score {
-    /// Means of each figure; of an optional one over the scores that have it.
+    /// Averages each figure; an optional one over the scores that have it.
     pub fn mean<'a>(scores: impl IntoIterator<Item = &'a Score>) -> Option<Score> {
         let all: Vec<&Score> = scores.into_iter().collect();
         let mean = |values: Vec<f64>| {
@@ -53,14 +53,14 @@ pub struct CaseScores {
     pub sizes: [(usize, usize); 2],
     /// Nearest and farthest depth candidate, world units.
     pub near_far: (f32, f32),
-    /// A photograph had to be enlarged to the target's size.
+    /// Whether a photograph was enlarged to the target's size.
     pub enlarged: bool,
     /// One for each target.
     pub targets: Vec<TargetScores>,
 }
 
 impl CaseScores {
-    /// Mean of a method (by its place) over the targets.
+    /// Averages the scores of the method with this index over the targets.
     pub fn mean(&self, method: usize) -> Option<Score> {
         Score::mean(self.targets.iter().filter_map(|t| t.scores.get(method)))
     }
@@ -76,12 +76,12 @@ pub struct Scores {
 }
 
 impl Scores {
-    /// Mean over cases of each case's mean over its targets.
+    /// Averages each case's mean over all cases.
     pub fn mean(&self, method: &str) -> Option<Score> {
         self.mean_of(self.cases.iter(), method)
     }
 
-    /// The same over one scene's cases.
+    /// Averages each case's mean over the cases of one scene.
     pub fn scene_mean(&self, scene: &str, method: &str) -> Option<Score> {
         self.mean_of(self.cases.iter().filter(|c| c.scene == scene), method)
     }

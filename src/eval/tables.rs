@@ -4,9 +4,9 @@ use super::{Score, Scores};
 use serde_json::{Map, Value, json};
 use std::fmt::Write;
 
-/// `{"methods": {NAME: {psnr, ssim, lpips, sharpness}}, "scenes": {SCENE: {"methods": …,
-/// "cases": [{"context": …, "targets": [{"frame": …, "methods": …}]}]}}}`. What has no
-/// value, and an infinite PSNR, is null.
+/// Formats scores as JSON: `{"methods": {NAME: {psnr, ssim, lpips, sharpness}}, "scenes": {SCENE: {"methods": …,
+/// "cases": [{"context": …, "targets": [{"frame": …, "methods": …}]}]}}}`. Missing
+/// figures and infinite PSNR are null.
 pub fn report(scores: &Scores) -> Value {
     let methods = |of: &dyn Fn(&str) -> Option<Score>| -> Map<String, Value> {
         scores.methods.iter().map(|m| (m.clone(), json!(of(m)))).collect()
@@ -44,7 +44,7 @@ pub fn report(scores: &Scores) -> Value {
     })
 }
 
-/// Columns of the figures.
+/// Names of the figures' columns.
 const COLUMNS: &str = "psnr,ssim,lpips,sharpness";
 
 fn figures(score: &Score) -> String {
@@ -53,7 +53,7 @@ fn figures(score: &Score) -> String {
     format!("{psnr:.6},{ssim:.6},{},{}", cell(*lpips), cell(*sharpness))
 }
 
-/// A cell of a CSV file, quoted where it must be (RFC 4180).
+/// Quotes a cell of a CSV file where necessary (RFC 4180).
 fn quoted(text: &str) -> String {
     match text.contains([',', '"', '\n', '\r']) {
         true => format!("\"{}\"", text.replace('"', "\"\"")),
@@ -61,7 +61,7 @@ fn quoted(text: &str) -> String {
     }
 }
 
-/// One line for each target and method.
+/// Formats scores as CSV: one line for each target and method.
 pub fn targets_csv(scores: &Scores) -> String {
     let mut text = format!("scene,context,target,frame,method,{COLUMNS}\n");
     for case in &scores.cases {
@@ -78,7 +78,8 @@ pub fn targets_csv(scores: &Scores) -> String {
     text
 }
 
-/// One line for each method and scene, and for each method over all (scene `*`).
+/// Formats means as CSV: one line for each method and scene, and one for each method over all
+/// scenes (scene `*`).
 pub fn means_csv(scores: &Scores) -> String {
     let mut text = format!("scene,method,{COLUMNS}\n");
     let mut line = |scene: &str, method: &str, mean: Option<Score>| {

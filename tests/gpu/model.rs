@@ -20,24 +20,28 @@ fn check(mvsplat: bool) {
     let shoot = shoot(5, 2, 96, 96);
     let model = lively(&config);
     let first = run(&model, &shoot.photos, (64, 64), false);
-    let (expected, inputs) = (first.splats, first.inputs);
+    let options = *first.raster_options();
+    let expected = first.into_splats();
     let backend = Backend::from(gpu);
     let model = model.with_backend(&backend);
-    let got = run(&model, &shoot.photos, (64, 64), false).splats;
+    let got = run(&model, &shoot.photos, (64, 64), false).into_splats();
     assert_eq!(backend.warning(), None);
-    assert_eq!((got.rows.len(), got.gain.len()), (expected.rows.len(), expected.gain.len()));
+    assert_eq!(
+        (got.rows().len(), got.gain().len()),
+        (expected.rows().len(), expected.gain().len())
+    );
     // Devices round differently, so equal bytes mean that the GPU computed nothing.
-    assert!(got.rows != expected.rows, "the results have equal bytes");
+    assert!(got.rows() != expected.rows(), "the results have equal bytes");
     let mut largest = [0f32; 11];
-    for (i, v) in expected.rows.iter().enumerate() {
+    for (i, v) in expected.rows().iter().enumerate() {
         largest[i % 11] = largest[i % 11].max(v.abs());
     }
-    let rows = got.rows.chunks(11).zip(expected.rows.chunks(11));
+    let rows = got.rows().chunks(11).zip(expected.rows().chunks(11));
     let off =
         rows.filter(|(g, e)| (0..11).any(|k| !((g[k] - e[k]).abs() <= TOLERANCE * largest[k])));
     let share = off.count() as f64 / expected.len() as f64;
-    let camera = &shoot.photos[0].camera;
-    let decibels = compare(&expected, &got, camera, &model.raster_options(0.4, &inputs));
+    let camera = shoot.photos[0].camera();
+    let decibels = compare(&expected, &got, camera, &options);
     eprintln!("mvsplat {mvsplat}: {share:.4} of the rows moved, {decibels:.1} dB");
     assert!(share < MOVED_MAX, "{share} of the rows moved");
     assert!(decibels > 45.0, "{decibels} dB");

@@ -14,7 +14,7 @@ use subsplat::io::load_splats;
 use subsplat::io::scene::{Scene, load_scene};
 use subsplat::metrics::psnr;
 use subsplat::model::Backend;
-use subsplat::pipeline::{Photo, Reconstruction, Reconstructor, Request};
+use subsplat::pipeline::{Check, DepthRange, Options, Photo, Reconstructor};
 use subsplat::render::slices;
 use subsplat::splats::Splats;
 
@@ -62,7 +62,7 @@ fn rows_off(got: &[f32], expected: &[f32], columns: usize) -> f64 {
 
 /// Checks that picture and gradients of `splats` on the GPU equal those of the CPU.
 fn check(name: &str, splats: &Splats, camera: &Camera, options: &RasterOptions) {
-    let options = RasterOptions { sh_basis: splats.sh_basis, ..*options };
+    let options = RasterOptions { sh_basis: splats.sh_basis(), ..*options };
     let (all, mut on_gpu) = (slices(splats), Rasterizer::new(gpu().unwrap()));
     let got = on_gpu.render(&all, camera, &options).unwrap();
     let expected = cpu::Rasterizer::new().render(&all, camera, &options);
@@ -74,7 +74,7 @@ fn check(name: &str, splats: &Splats, camera: &Camera, options: &RasterOptions) 
     assert!(off < FLIPPED && alphas_off < FLIPPED && worst < FLIP, "{name}: {off} {worst}");
     // The check fails for one changed splat in a thousand.
     let mut moved = splats.clone();
-    moved.rows.chunks_mut(11 * 1000).for_each(|rows| rows[10] *= 0.5);
+    moved.rows_mut().chunks_mut(11 * 1000).for_each(|rows| rows[10] *= 0.5);
     let (off, worst) =
         differences(&on_gpu.render(&slices(&moved), camera, &options).unwrap().rgb, &expected.rgb);
     assert!(off > FLIPPED || worst > FLIP, "{name}: halved opacities pass: {off} {worst}");
@@ -84,7 +84,7 @@ fn check(name: &str, splats: &Splats, camera: &Camera, options: &RasterOptions) 
     let got = on_gpu.backward(&all, camera, &options, &upstream).unwrap();
     let mut expected = Gradients::default();
     cpu::Rasterizer::new().backward(&all, camera, &options, &upstream, &mut expected);
-    let set = splats.sh.len() / all.parents();
+    let set = splats.sh().len() / all.parents();
     for (what, got, expected, lanes) in
         [("rows", &got.rows, &expected.rows, 11), ("sh", &got.sh, &expected.sh, set)]
     {
@@ -104,30 +104,34 @@ fn a_real_ply() {
     }
     let Some(folder) = common::shared("photos/re10k_5aca87f95a9412c6") else { return };
     let splats = load_splats(&folder.join("5aca87f95a9412c6.globalsplat16k.ply")).unwrap();
-    assert_eq!((splats.len(), splats.sh_degree), (16_384, 3));
+    assert_eq!((splats.len(), splats.sh_degree()), (16_384, 3));
     let camera = load_scene(&folder).unwrap().frames[4].pinhole().unwrap();
     for convention in [Convention::Standard, Convention::Mvsplat] {
         check(&format!("{convention:?}"), &splats, &camera, &RasterOptions::new(convention));
     }
 }
 
-/// Returns the example's photographs, with the request of `subsplat run examples/room`.
-fn room() -> (Scene, Vec<Photo>, Request) {
+/// Returns the example's photographs, with the options of `subsplat run examples/room`.
+fn room() -> (Scene, Vec<Photo>, Options) {
     let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("examples/room");
     let scene = load_scene(Path::new(&folder)).unwrap();
     let photos = scene.frames[..2].iter().map(|f| Photo::from_frame(f).unwrap()).collect();
-    let near_far = scene.near_far.unwrap();
-    (scene, photos, Request { input_size: (256, 256), near_far, detail: true, look: false })
+    let (near, far) = scene.near_far.unwrap();
+    let options = Options::default().with_depth_range(DepthRange::Fixed { near, far });
+    (scene, photos, options.with_check(Check::Off))
 }
 
 /// Returns the fraction of the rows of a reconstruction that differ.
 fn moved(got: &Splats, expected: &Splats) -> f64 {
-    assert_eq!((got.rows.len(), got.gain.len()), (expected.rows.len(), expected.gain.len()));
+    assert_eq!(
+        (got.rows().len(), got.gain().len()),
+        (expected.rows().len(), expected.gain().len())
+    );
     let mut largest = [0f32; 11];
-    for (i, v) in expected.rows.iter().enumerate() {
+    for (i, v) in expected.rows().iter().enumerate() {
         largest[i % 11] = largest[i % 11].max(v.abs());
     }
-    let rows = got.rows.chunks(11).zip(expected.rows.chunks(11));
+    let rows = got.rows().chunks(11).zip(expected.rows().chunks(11));
     let off = rows.filter(|(g, e)| (0..11).any(|k| !((g[k] - e[k]).abs() <= COLUMN * largest[k])));
     off.count() as f64 / expected.len() as f64
 }
@@ -137,22 +141,22 @@ fn moved(got: &Splats, expected: &Splats) -> f64 {
 #[test]
 fn the_example_room_with_the_shipped_weights() {
     let Some(gpu) = gpu() else { return };
-    let (scene, photos, request) = room();
+    let (scene, photos, run) = room();
     let model = Reconstructor::shipped(2).unwrap();
-    let Reconstruction { splats: expected, inputs, .. } =
-        model.reconstruct(&photos, &request).unwrap();
-    let options = model.raster_options(request.near_far.0, &inputs);
+    let expected = model.run(&photos, &run).unwrap();
+    let options = *expected.raster_options();
+    let expected = expected.into_splats();
     let backend = Backend::from(gpu.clone());
     let model = model.with_backend(&backend);
-    let got = model.reconstruct(&photos, &request).unwrap().splats;
+    let got = model.run(&photos, &run).unwrap().into_splats();
     assert_eq!(backend.warning(), None);
     // Devices round differently, so equal bytes mean that the GPU computed nothing.
-    assert!(got.rows != expected.rows, "the results have equal bytes");
+    assert!(got.rows() != expected.rows(), "the results have equal bytes");
     let share = moved(&got, &expected);
     eprintln!("{} Gaussians, {share:.1e} of them moved", got.len());
     assert!(share < MOVED, "{share} of the rows moved");
     let mut other = got.clone();
-    other.rows.chunks_mut(11 * 40).for_each(|rows| rows[0] += 0.1);
+    other.rows_mut().chunks_mut(11 * 40).for_each(|rows| rows[0] += 0.1);
     assert!(moved(&other, &expected) > MOVED, "moved rows pass");
 
     let target = &scene.frames[2];
@@ -163,7 +167,7 @@ fn the_example_room_with_the_shipped_weights() {
     // that is not an input.
     let photograph = target.load().unwrap().0.to_unit();
     let score = |rgb: &[f32]| psnr(rgb, &photograph, 512, 512).unwrap();
-    let ours = RasterOptions { sh_basis: got.sh_basis, ..options };
+    let ours = RasterOptions { sh_basis: got.sh_basis(), ..options };
     let by_gpu = Rasterizer::new(gpu).render(&slices(&got), &camera, &ours).unwrap().rgb;
     let by_cpu = cpu::Rasterizer::new().render(&slices(&expected), &camera, &ours).rgb;
     let [on_gpu, on_cpu] = [score(&by_gpu), score(&by_cpu)];

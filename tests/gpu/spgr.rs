@@ -192,7 +192,7 @@ fn gradients<T: subsplat::cpu::simd::Real>(
     grad: &[f32],
     by_gain: &[f32],
 ) -> [Vec<f32>; 3] {
-    let wide = |v: &[f32]| v.iter().map(|&v| T::of(f64::from(v))).collect::<Vec<T>>();
+    let wide = |v: &[f32]| v.iter().map(|&v| T::constant(f64::from(v))).collect::<Vec<T>>();
     let narrow = |v: Vec<T>| v.into_iter().map(|v| v.to_f64() as f32).collect::<Vec<f32>>();
     let (head, parents) = (wide(&inputs.head), wide(&inputs.parents));
     let source =

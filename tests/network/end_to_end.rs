@@ -14,21 +14,27 @@ use subsplat::io::image::Rgb;
 use subsplat::io::{SaveOptions, load_splats, save_splats};
 use subsplat::metrics::psnr;
 use subsplat::model::Views;
-use subsplat::pipeline::{Photo, Reconstructor, Request};
+use subsplat::pipeline::{Photo, Reconstructor};
 use subsplat::render;
 use subsplat::splats::Splats;
-use whole::*;
+use whole::{options as options_of, *};
 
 /// Sides of inputs, px: the smallest that both networks take and windows split.
 const SIZE: (usize, usize) = (64, 64);
 
 /// Rendering as the model asks for it, SH up to degree 3, which is what files hold.
 fn options(model: &Reconstructor) -> RasterOptions {
-    RasterOptions { sh_degree: 3, ..model.raster_options(NEAR_FAR.0, &[]) }
+    RasterOptions { sh_degree: 3, ..rules(model, NEAR_FAR.0) }
+}
+
+/// The model's rules to render at target resolution.
+fn rules(model: &Reconstructor, near: f32) -> RasterOptions {
+    let config = model.config();
+    config.raster_options(config.upscale as f32, near, [0.0; 3])
 }
 
 fn cameras(result: &subsplat::pipeline::Reconstruction) -> Vec<Camera> {
-    result.inputs.iter().map(|c| c.target_camera).collect()
+    result.inputs().iter().map(|c| c.target_camera).collect()
 }
 
 /// The networks and conventions that a file has to carry over: MVSplat's colours in
@@ -53,8 +59,8 @@ fn files_render_as_the_splats_they_were_made_from() {
         let world = shoot.moved(motion(i));
         let model = lively(&config);
         let mut result = run(&model, &world.photos, SIZE, true);
-        amplify_view_dependence(&mut result.splats, 4.0);
-        let splats = &result.splats;
+        amplify_view_dependence(result.splats_mut(), 4.0);
+        let splats = result.splats();
         assert_eq!((splats.children_per_parent(), splats.gain_lanes()), (4, 4));
         assert_eq!(splats.sh_basis() == ShBasis::Mvsplat, i == 0);
         let mut views = cameras(&result);
@@ -139,12 +145,12 @@ fn tuned_pictures_do_not_depend_on_the_world_frame() {
             let mut a = run(&model, &shoot.photos, SIZE, false);
             let mut b = run(&model, &shoot.moved(m).photos, SIZE, false);
             // Linear in the coefficients, so that it does not matter who turns first.
-            amplify_view_dependence(&mut a.splats, 8.0);
-            amplify_view_dependence(&mut b.splats, 8.0);
-            let shift = mean_shift(&a.splats, &b.splats, m, shoot.photos[0].camera.position());
+            amplify_view_dependence(a.splats_mut(), 8.0);
+            amplify_view_dependence(b.splats_mut(), 8.0);
+            let shift = mean_shift(a.splats(), b.splats(), m, shoot.photos[0].camera().position());
             let options = options(&model);
             let worst = cameras(&a).into_iter().zip(cameras(&b)).map(|(ca, cb)| {
-                decibels(&render(&a.splats, &ca, &options), &render(&b.splats, &cb, &options))
+                decibels(&render(a.splats(), &ca, &options), &render(b.splats(), &cb, &options))
             });
             results.push((shift, worst.fold(f64::INFINITY, f64::min)));
         }
@@ -165,12 +171,12 @@ fn paper_pictures_turn_with_the_world_but_for_mvsplats_colour_quirk() {
         let model = Reconstructor::untrained(&config, 7).unwrap();
         let mut a = run(&model, &shoot.photos, SIZE, false);
         let mut b = run(&model, &shoot.moved(m).photos, SIZE, false);
-        amplify_view_dependence(&mut a.splats, 8.0);
-        amplify_view_dependence(&mut b.splats, 8.0);
+        amplify_view_dependence(a.splats_mut(), 8.0);
+        amplify_view_dependence(b.splats_mut(), 8.0);
         let full = options(&model);
         let constant = RasterOptions { sh_degree: 0, ..full };
         for (ca, cb) in cameras(&a).into_iter().zip(cameras(&b)) {
-            let pair = |o: &RasterOptions| (render(&a.splats, &ca, o), render(&b.splats, &cb, o));
+            let pair = |o: &RasterOptions| (render(a.splats(), &ca, o), render(b.splats(), &cb, o));
             let (flat_a, flat_b) = pair(&constant);
             let (full_a, full_b) = pair(&full);
             let alpha = mean_difference(&flat_a.alpha, &flat_b.alpha);
@@ -207,17 +213,18 @@ fn untrained_children_of_mvsplat_keep_the_native_coverage() {
             config
         });
         let (model, parents) = reconstruct(&native(&configs[0]), &shoot.photos, SIZE, false);
-        let views: Vec<Camera> = parents.inputs.iter().map(|c| c.input_camera).collect();
+        let views: Vec<Camera> = parents.inputs().iter().map(|c| c.input_camera).collect();
         let options = options(&model);
         for config in &configs[1..] {
             let upscale = config.upscale;
             let (_, children) = reconstruct(config, &shoot.photos, SIZE, false);
-            assert_eq!(children.splats.len(), parents.splats.len() * upscale * upscale);
+            assert_eq!(children.splats().len(), parents.splats().len() * upscale * upscale);
             for camera in &views {
                 let large = camera.resized(upscale * SIZE.0, upscale * SIZE.1);
                 let alpha = |s: &Splats, c: &Camera| mean(&render(s, c, &options).alpha);
-                let (want, got) = (alpha(&parents.splats, camera), alpha(&children.splats, &large));
-                let bare = alpha(&parents.splats, &large);
+                let (want, got) =
+                    (alpha(parents.splats(), camera), alpha(children.splats(), &large));
+                let bare = alpha(parents.splats(), &large);
                 eprintln!("x{upscale}: alpha {got:.4}, native {want:.4}, bare parents {bare:.4}");
                 assert!((got - want).abs() < 0.01, "x{upscale}: {got:.4} against {want:.4}");
                 assert_eq!(bare < want - 0.1, scale_max < 15.0, "{bare:.4} {want:.4}");
@@ -233,8 +240,8 @@ fn the_only_child_is_its_parent() {
         let config = light(plain(mvsplat, Preset::Tuned, 1));
         let (model, child) = reconstruct(&config, &shoot.photos, SIZE, false);
         let (_, parent) = reconstruct(&native(&config), &shoot.photos, SIZE, false);
-        let (c, p) = (&child.splats, &parent.splats);
-        assert_eq!((c.len(), &c.sh()), (p.len(), &p.sh()));
+        let (c, p) = (child.splats(), parent.splats());
+        assert_eq!((c.len(), c.sh()), (p.len(), p.sh()));
         assert!(c.gain().iter().all(|g| *g == 1.0));
         for (a, b) in c.rows().chunks_exact(SPLAT_STRIDE).zip(p.rows().chunks_exact(SPLAT_STRIDE)) {
             // Mean and scales are copied; quaternion and opacity are normalised and sent
@@ -298,8 +305,8 @@ fn shared_coefficients_render_as_separate_ones() {
     let shoot = shoot(4, 2, 160, 160);
     let model = lively(&plain(false, Preset::Tuned, 2));
     let mut result = run(&model, &shoot.photos, SIZE, true);
-    amplify_view_dependence(&mut result.splats, 4.0);
-    let (compact, own) = (&result.splats, materialised(&result.splats));
+    amplify_view_dependence(result.splats_mut(), 4.0);
+    let (compact, own) = (result.splats(), materialised(result.splats()));
     let options = options(&model);
     for (v, camera) in cameras(&result).into_iter().enumerate() {
         let exact = render(compact, &camera, &options);
@@ -325,8 +332,8 @@ fn shared_coefficients_render_as_separate_ones() {
     // Children of the plain split lie √2/4 input pixels from their parent: 1.6e-3 rad
     // for 256 pixels over 60°.
     let (_, plain) = reconstruct(&plain(false, Preset::Tuned, 2), &shoot.photos, SIZE, false);
-    let camera = plain.inputs[0].input_camera;
-    let angles = sibling_angles(&plain.splats, camera.position());
+    let camera = plain.inputs()[0].input_camera;
+    let angles = sibling_angles(plain.splats(), camera.position());
     let angle = angles[..angles.len() / 2].iter().fold(0f32, |m, a| m.max(*a));
     assert!(angle < 0.36 / camera.intrinsics.fx, "{angle:.2e} rad");
 }
@@ -367,7 +374,7 @@ fn a_batch_equals_its_scenes() {
         let mut depths = Vec::new();
         for (b, (shoot, scene)) in shoots.iter().zip(&scenes).enumerate() {
             let one = run(&model, &shoot.photos, SIZE, false);
-            assert_eq!(scene.children.to_splats().unwrap(), one.splats);
+            assert_eq!(scene.children.to_splats().unwrap(), *one.splats());
             // The encoder itself takes both at once, in other blocks of its products.
             let alone = model.model().encode(&views.scene(b).unwrap()).unwrap();
             for (name, both, alone) in [
@@ -395,7 +402,7 @@ fn straight_to_the_picture_is_the_same_picture() {
         for config in [native(&config), config] {
             let model = lively(&config);
             let views = batch(&model, &shoots, SIZE);
-            let options = model.raster_options(NEAR_FAR.0, &[]);
+            let options = rules(&model, NEAR_FAR.0);
             let camera = views.cameras[0][0].resized(2 * SIZE.0, 2 * SIZE.1);
             let direct = model.model().render(&views, &camera, &options).unwrap();
             let scenes = model.model().forward(&views, &mut |_| {}).unwrap();
@@ -435,21 +442,20 @@ fn any_number_of_views_any_shape_any_depth_range() {
         let size = if mvsplat { (96, 64) } else { (128, 64) };
         for (views, near_far) in [(3, NEAR_FAR), (2, (0.05, 3.0)), (3, (5.0, 400.0))] {
             let shoot = shoot(9, views, 2 * size.0, 2 * size.1);
-            let request = Request { input_size: size, near_far, detail: false, look: false };
-            let result = model.reconstruct(&shoot.photos, &request).unwrap();
-            assert_eq!(result.splats.len(), 4 * views * size.0 * size.1);
-            assert!(result.splats.rows().iter().all(|v| v.is_finite()));
+            let result = model.run(&shoot.photos, &options_of(size, near_far, false)).unwrap();
+            assert_eq!(result.splats().len(), 4 * views * size.0 * size.1);
+            assert!(result.splats().rows().iter().all(|v| v.is_finite()));
             // Candidates are distances along the unit ray; camera z is shorter by its
             // slope.
-            let slope = shoot.photos[0].camera.intrinsics.unproject(glam::Vec2::ZERO).length();
-            for depth in &result.depths {
+            let slope = shoot.photos[0].camera().intrinsics.unproject(glam::Vec2::ZERO).length();
+            for depth in result.depths() {
                 assert_eq!((depth.width, depth.height), size);
                 let range = near_far.0 / slope * 0.99..near_far.1 * 1.01;
                 assert!(depth.data.iter().all(|z| range.contains(z)), "{near_far:?}");
             }
-            let options = model.raster_options(near_far.0, &[]);
-            for c in &result.inputs {
-                let picture = render(&result.splats, &c.target_camera, &options);
+            let options = rules(&model, near_far.0);
+            for c in result.inputs() {
+                let picture = render(result.splats(), &c.target_camera, &options);
                 assert_eq!((picture.width, picture.height), (2 * size.0, 2 * size.1));
                 assert!(mean(&picture.alpha) > 0.3, "{}", mean(&picture.alpha));
             }
@@ -509,7 +515,7 @@ fn wall(side: usize) -> Shoot {
             wave(at.x, at.y)
         };
         let data = (0..side * side).flat_map(pixel).collect();
-        Photo { image: Rgb { width: side, height: side, data }, camera }
+        Photo::new(Rgb { width: side, height: side, data }, camera).unwrap()
     });
     Shoot { photos: photos.to_vec(), targets: Vec::new() }
 }
@@ -523,8 +529,8 @@ fn detail_from_the_photograph_sharpens_the_view_it_came_from() {
         let each = [false, true].map(|detail| {
             let (model, result) = reconstruct(&config, &shoot.photos, (side, side), detail);
             let options = options(&model);
-            let c = &result.inputs[0];
-            let picture = render(&result.splats, &c.target_camera, &options);
+            let c = &result.inputs()[0];
+            let picture = render(result.splats(), &c.target_camera, &options);
             let truth: Vec<f32> = c.target.data.iter().map(|&v| f32::from(v) / 255.0).collect();
             let db = psnr(&picture.rgb, &truth, picture.width, picture.height).unwrap();
             (db, mean(&picture.alpha), picture)

@@ -9,6 +9,7 @@ mod operators;
 mod parity;
 mod plane_sweep;
 mod primaries;
+mod reconstruction;
 mod shipped_weights;
 mod small;
 mod trunk;

@@ -16,7 +16,7 @@ use subsplat::io::scene::load_scene;
 use subsplat::metrics::psnr;
 use subsplat::model::lpips::Lpips;
 use subsplat::model::weights::read_tensors;
-use subsplat::pipeline::{Photo, Reconstructor, Request, raster_options};
+use subsplat::pipeline::{self, Check, DepthBounds, DepthRange, Detail, Photo, Reconstructor};
 use subsplat::render;
 
 fn untrained(upscale: usize) -> Reconstructor {
@@ -25,6 +25,11 @@ fn untrained(upscale: usize) -> Reconstructor {
 
 fn options(upscale: usize, methods: &[Method]) -> Options {
     Options { methods: methods.to_vec(), input_size: None, ..Options::new(upscale) }
+}
+
+/// Mean colour of a reconstruction's inputs.
+fn colour(made: &pipeline::Reconstruction) -> [f32; 3] {
+    Rgb::mean_colour(made.inputs().iter().map(|c| &c.input))
 }
 
 /// The made-up room of the program's tests, with a protocol: inputs 0 and 2, target 1.
@@ -94,7 +99,7 @@ fn methods_are_what_they_say() {
     let model = untrained(2);
     let evaluator = Evaluator::new(options(2, &methods));
     let case = &data.cases()[0];
-    let result = evaluator.case(Some(model.model()), case, data.load(case).unwrap()).unwrap();
+    let result = evaluator.case(Some(&model), case, data.load(case).unwrap()).unwrap();
     assert_eq!(result.scores.sizes, [(64, 64), (128, 128)]);
     let got: Vec<f64> = result.scores.targets[0].scores.iter().map(|s| s.psnr).collect();
     println!("{got:?}");
@@ -103,36 +108,40 @@ fn methods_are_what_they_say() {
     let photo = |i: usize| Photo::from_frame(&scene.frames[i]).unwrap();
     let crop = CropOptions::square(64, 2, 32);
     let truth = photo(1).crop(&crop).unwrap();
-    let near_far = scene.near_far.unwrap();
-    let request = |detail| Request { input_size: (64, 64), near_far, detail, look: true };
+    let near = scene.near_far.unwrap().0;
+    let request = |detail| {
+        pipeline::Options::default()
+            .with_input_size(64, 64)
+            .with_depth_prior(DepthBounds::of_scene(&scene, &[0, 2]).unwrap())
+            .with_check(Check::Off)
+            .with_detail(detail)
+    };
     let photos = [photo(0), photo(2)];
-    let seen = |model: &Reconstructor, detail: bool, lowpass: LowpassRef| {
-        let made = model.reconstruct(&photos, &request(detail)).unwrap();
+    let seen = |model: &Reconstructor, detail: Detail, lowpass: LowpassRef| {
+        let made = model.run(&photos, &request(detail)).unwrap();
         let mut config = model.config().clone();
         config.upscale = 2;
         config.render.lowpass_ref = lowpass;
-        let options = raster_options(&config, near_far.0, &made.inputs);
-        let picture = render(&made.splats, &truth.target_camera, &options);
+        let options = config.raster_options(2.0, near, colour(&made));
+        let picture = render(made.splats(), &truth.target_camera, &options);
         psnr(&picture.rgb, &truth.target.to_unit(), 128, 128).unwrap()
     };
     let mut alone = Config::small(Preset::Tuned, 2);
     alone.spgr.enabled = false;
     let alone = Reconstructor::untrained(&alone, 0).unwrap();
     let expected = [
-        seen(&model, false, LowpassRef::Target),
-        seen(&model, true, LowpassRef::Target),
-        seen(&alone, false, LowpassRef::Target),
-        seen(&alone, false, LowpassRef::Input),
+        seen(&model, Detail::Off, LowpassRef::Target),
+        seen(&model, Detail::Photographs, LowpassRef::Target),
+        seen(&alone, Detail::Off, LowpassRef::Target),
+        seen(&alone, Detail::Off, LowpassRef::Input),
     ];
     for (i, want) in expected.iter().enumerate() {
         assert!((got[i] - want).abs() < 1e-6, "{}: {} {want}", methods[i].name(), got[i]);
     }
     // Four times a pixel's middle is ¾ of it and ¼ of the neighbour's, each way.
-    let made = alone.reconstruct(&photos, &request(false)).unwrap();
-    let mut config = alone.config().clone();
-    config.upscale = 1;
-    let rules = raster_options(&config, near_far.0, &made.inputs);
-    let small = render(&made.splats, &truth.input_camera, &rules).rgb;
+    let made = alone.run(&photos, &request(Detail::Off)).unwrap();
+    let rules = alone.config().raster_options(1.0, near, colour(&made));
+    let small = render(made.splats(), &truth.input_camera, &rules).rgb;
     let mut large = Vec::new();
     for i in 0..128usize * 128 {
         let (x, y) = (i % 128, i / 128);
@@ -164,14 +173,13 @@ fn methods_are_what_they_say() {
     // At ×1 one Gaussian a pixel is all there is.
     let one =
         [Method::Subsplat, Method::Backbone, Method::Lowpass, Method::Bilinear, Method::Uniform];
-    let scores = Evaluator::new(options(1, &one)).run(Some(untrained(1).model()), &data).unwrap();
+    let scores = Evaluator::new(options(1, &one)).run(Some(&untrained(1)), &data).unwrap();
     let first = scores.mean("backbone").unwrap().psnr;
     assert!(one.iter().all(|m| (scores.mean(m.name()).unwrap().psnr - first).abs() < 1e-3));
     // A model for ×2 serves a target of the input's size, and one four times as large.
     for (r, side) in [(1, 64), (4, 128)] {
-        let scores = Evaluator::new(options(r, &[Method::Subsplat]))
-            .run(Some(model.model()), &data)
-            .unwrap();
+        let scores =
+            Evaluator::new(options(r, &[Method::Subsplat])).run(Some(&model), &data).unwrap();
         assert_eq!(scores.cases[0].sizes[1], (side, side));
         assert!(scores.mean("subsplat").unwrap().psnr > 8.0);
     }
@@ -271,11 +279,11 @@ fn chunks_with_an_index_are_cases() {
         ["of 4 entries of the index 1 have no views and 1 are not in the data; 2 are evaluated"]
     );
     let loaded = data.load(&data.cases()[0]).unwrap();
-    assert_eq!((loaded.range.near, loaded.range.far), (1.0, 100.0));
-    assert_eq!(loaded.targets[1].image, frame(&video("m", 6), 5));
-    data.set_near_far(Some(0.5), None);
-    assert_eq!(data.load(&data.cases()[1]).unwrap().range.near, 0.5);
-    data.set_near_far(Some(500.0), None);
+    assert_eq!((loaded.bounds.near, loaded.bounds.far), (1.0, 100.0));
+    assert_eq!(*loaded.targets[1].image(), frame(&video("m", 6), 5));
+    data.set_depth_range(DepthRange::Near(0.5));
+    assert_eq!(data.load(&data.cases()[1]).unwrap().bounds.near, 0.5);
+    data.set_depth_range(DepthRange::Near(500.0));
     assert!(data.load(&data.cases()[1]).err().unwrap().to_string().contains("near < far"));
     data.limit(1);
     assert_eq!(names(&data), ["m"]);

@@ -10,7 +10,9 @@ use subsplat::io::image::Rgb;
 use subsplat::metrics::psnr;
 use subsplat::model::subsplat::SubSplat;
 use subsplat::model::weights::{Weights, save};
-use subsplat::pipeline::{Photo, Reconstruction, Reconstructor, Request};
+use subsplat::pipeline::{
+    Check, DepthRange, Detail, Options, Photo, Reconstruction, Reconstructor,
+};
 use subsplat::splats::Splats;
 use subsplat::{Picture, render};
 
@@ -32,7 +34,7 @@ pub fn shoot(seed: u64, views: usize, width: usize, height: usize) -> Shoot {
         let view = room.render(camera, &Quality::clean(1));
         let byte = |v: &f32| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
         let image = Rgb { width, height, data: view.rgb.iter().map(byte).collect() };
-        Photo { image, camera: *camera }
+        Photo::new(image, *camera).unwrap()
     };
     let photos = rig.cameras[..views].iter().map(photo).collect();
     Shoot { photos, targets: rig.cameras[2..].to_vec() }
@@ -53,7 +55,7 @@ pub fn moved(camera: &Camera, motion: Mat4) -> Camera {
 impl Shoot {
     /// The same photographs in a moved world.
     pub fn moved(&self, motion: Mat4) -> Self {
-        let photo = |p: &Photo| Photo { camera: moved(&p.camera, motion), ..p.clone() };
+        let photo = |p: &Photo| Photo::new(p.image().clone(), moved(p.camera(), motion)).unwrap();
         Self {
             photos: self.photos.iter().map(photo).collect(),
             targets: self.targets.iter().map(|c| moved(c, motion)).collect(),
@@ -63,7 +65,10 @@ impl Shoot {
 
 /// MVSplat's or the small network with one of the presets.
 pub fn plain(mvsplat: bool, preset: Preset, upscale: usize) -> Config {
-    subsplat::pipeline::preset(mvsplat, preset, upscale)
+    match mvsplat {
+        true => Config::re10k(preset, upscale),
+        false => Config::small(preset, upscale),
+    }
 }
 
 /// Fewer layers where a test needs no particular network: a third of the time.
@@ -93,8 +98,16 @@ pub fn run(
     size: (usize, usize),
     detail: bool,
 ) -> Reconstruction {
-    let request = Request { input_size: size, near_far: NEAR_FAR, detail, look: false };
-    model.reconstruct(photos, &request).unwrap()
+    model.run(photos, &options(size, NEAR_FAR, detail)).unwrap()
+}
+
+/// A fixed depth range and no check.
+pub fn options((width, height): (usize, usize), (near, far): (f32, f32), detail: bool) -> Options {
+    Options::default()
+        .with_input_size(width, height)
+        .with_depth_range(DepthRange::Fixed { near, far })
+        .with_check(Check::Off)
+        .with_detail(if detail { Detail::Photographs } else { Detail::Off })
 }
 
 /// A seeded model in which nothing is zero any more, out of a weight file: children

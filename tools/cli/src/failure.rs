@@ -1,25 +1,25 @@
-//! How a program says that it cannot do what it was asked for: one line on stderr, the
-//! same in the one object of `--json`, and an exit code.
+//! Errors of the programs: one line on stderr, the same line in the object of `--json`, and an
+//! exit code.
 
-use super::report::{Answer, say};
+use super::report::{Answer, print_line};
 use serde_json::json;
 use std::process::ExitCode;
 
 /// Exit code of wrong usage.
 const USAGE: u8 = 2;
 
-/// Tells an error and gives its exit code.
-pub fn tell(error: &anyhow::Error, answer: Answer) -> ExitCode {
-    let line = told(error);
-    say(format!("error: {line}"));
-    // The exit code tells of the error; a closed pipe here adds nothing to it.
+/// Prints an error and returns its exit code.
+pub fn report_error(error: &anyhow::Error, answer: Answer) -> ExitCode {
+    let line = error_line(error);
+    print_line(format!("error: {line}"));
+    // The exit code reports the error already; a closed pipe changes nothing.
     let _ = answer.finish(&json!({ "error": line }));
     ExitCode::FAILURE
 }
 
-/// Help, version, or wrong usage.
-pub fn refuse(error: &clap::Error) -> ExitCode {
-    // A closed pipe is no reason for another exit code.
+/// Prints help, version, or an error of usage, and returns the exit code.
+pub fn report_usage(error: &clap::Error) -> ExitCode {
+    // A closed pipe does not change the exit code.
     let _ = error.print();
     if !error.use_stderr() {
         return ExitCode::SUCCESS;
@@ -33,9 +33,8 @@ pub fn refuse(error: &clap::Error) -> ExitCode {
     ExitCode::from(USAGE)
 }
 
-/// The error and its causes in one line. A cause that the error's own words repeat is
-/// left out.
-fn told(error: &anyhow::Error) -> String {
+/// Joins the error and its causes to one line, without causes that the line already contains.
+fn error_line(error: &anyhow::Error) -> String {
     error.chain().map(|cause| one_line(&cause.to_string())).fold(String::new(), |all, cause| {
         match all.as_str() {
             "" => cause,
@@ -45,8 +44,8 @@ fn told(error: &anyhow::Error) -> String {
     })
 }
 
-/// `text` without line breaks, and without the backtrace that candle appends to its
-/// messages where RUST_BACKTRACE is set.
+/// Removes line breaks, and the backtrace that candle appends to its messages where
+/// RUST_BACKTRACE is set.
 fn one_line(text: &str) -> String {
     let is_frame = |line: &&str| {
         let line = line.trim_start();

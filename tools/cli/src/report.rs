@@ -1,24 +1,29 @@
-//! What the user sees while the program works, and at the end.
+//! Output for the user: progress bars, lines, and the answer of a command.
 
 use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 use std::io::Write;
+use std::ops::ControlFlow;
 use std::time::{Duration, Instant};
+use subsplat::pipeline::StageTime;
 
-/// Times stages, shows a bar for the ones that take a while, on stderr only.
+/// Steps of a bar that shows a fraction.
+const FRACTION_STEPS: u64 = 1000;
+
+/// Measures the stages of a command, and shows a bar for each on stderr.
 pub struct Progress {
     started: Instant,
     stages: Vec<(String, f64)>,
 }
 
 impl Progress {
-    /// Starts the clock.
+    /// Starts the measurement.
     pub fn new() -> Self {
         Self { started: Instant::now(), stages: Vec::new() }
     }
 
-    /// Runs `work` under a spinner named `name` and books its time.
+    /// Runs `work` under a spinner named `name`, and records its time.
     pub fn stage<T, E>(
         &mut self,
         name: &str,
@@ -33,7 +38,7 @@ impl Progress {
         self.timed(name, &bar, work)
     }
 
-    /// The same with a bar of `total` steps.
+    /// Runs `work` under a bar of `total` steps, and records its time.
     pub fn steps<T, E>(
         &mut self,
         name: &str,
@@ -42,6 +47,21 @@ impl Progress {
     ) -> Result<T, E> {
         let bar = ProgressBar::new(total as u64);
         let template = "{prefix} {wide_bar} {pos}/{len} [{elapsed} < {eta}]";
+        if let Ok(style) = ProgressStyle::with_template(template) {
+            bar.set_style(style);
+        }
+        bar.set_prefix(name.to_owned());
+        self.timed(name, &bar, work)
+    }
+
+    /// Runs `work` under a bar that [`show_fraction`] moves, and records its time.
+    pub fn fraction<T, E>(
+        &mut self,
+        name: &str,
+        work: impl FnOnce(&ProgressBar) -> Result<T, E>,
+    ) -> Result<T, E> {
+        let bar = ProgressBar::new(FRACTION_STEPS);
+        let template = "{prefix}: {msg} {wide_bar} {percent} % [{elapsed}]";
         if let Ok(style) = ProgressStyle::with_template(template) {
             bar.set_style(style);
         }
@@ -58,22 +78,21 @@ impl Progress {
         let start = Instant::now();
         let result = work(bar);
         bar.finish_and_clear();
-        self.book(name, start.elapsed().as_secs_f64());
+        self.record(name, start.elapsed().as_secs_f64());
         result
     }
 
-    /// Replaces the stage booked last by its `parts`.
-    pub fn split_last(&mut self, parts: &[(&'static str, f64)]) {
+    /// Replaces the last stage by its `parts`.
+    pub fn split_last(&mut self, parts: &[StageTime]) {
         self.stages.pop();
-        parts.iter().for_each(|(name, seconds)| self.book(name, *seconds));
+        parts.iter().for_each(|part| self.record(part.stage.name(), part.seconds));
     }
 
-    /// Books `seconds` under `name`.
-    fn book(&mut self, name: &str, seconds: f64) {
+    fn record(&mut self, name: &str, seconds: f64) {
         self.stages.push((name.to_owned(), seconds));
     }
 
-    /// `{stage: seconds, …, "total": seconds}`.
+    /// The times as `{stage: seconds, …, "total": seconds}`.
     pub fn seconds(&self) -> serde_json::Map<String, serde_json::Value> {
         let mut map = serde_json::Map::new();
         for (name, seconds) in &self.stages {
@@ -85,12 +104,18 @@ impl Progress {
     }
 }
 
+/// Moves the bar of [`Progress::fraction`] to a state of the library.
+pub fn show_fraction(bar: &ProgressBar, progress: subsplat::Progress) -> ControlFlow<()> {
+    bar.set_message(progress.stage.name());
+    bar.set_position((progress.fraction * FRACTION_STEPS as f32) as u64);
+    ControlFlow::Continue(())
+}
+
 fn round(seconds: f64) -> f64 {
     (seconds * 1e3).round() / 1e3
 }
 
-/// Largest resident set so far, bytes; `None` where the system does not say
-/// (anything but Linux).
+/// Reads the largest resident set so far, bytes; `None` elsewhere than on Linux.
 pub fn peak_memory_bytes() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find(|l| l.starts_with("VmHWM:"))?;
@@ -98,39 +123,39 @@ pub fn peak_memory_bytes() -> Option<u64> {
     Some(kib * 1024)
 }
 
-/// A line for people, on stderr.
-pub fn say(line: impl AsRef<str>) {
-    // Nobody listening is no error.
-    let _ = writeln!(std::io::stderr(), "{}", line.as_ref());
+/// Prints a line on stderr.
+pub fn print_line(line: impl std::fmt::Display) {
+    // A closed stderr is no error.
+    let _ = writeln!(std::io::stderr(), "{line}");
 }
 
-/// A warning for people, on stderr.
-pub fn warn(line: impl AsRef<str>) {
-    say(format!("warning: {}", line.as_ref()));
+/// Prints a warning on stderr.
+pub fn print_warning(line: impl std::fmt::Display) {
+    print_line(format!("warning: {line}"));
 }
 
-/// Where a command's answer goes: lines for people, or one JSON object, on stdout.
+/// The answer of a command on stdout: lines, or one JSON object.
 #[derive(Clone, Copy, Debug)]
 pub struct Answer {
     json: bool,
 }
 
 impl Answer {
-    /// `json`: the object is asked for, and lines go to stderr.
+    /// `json`: the answer is one object on stdout, and lines go to stderr.
     pub fn new(json: bool) -> Self {
         Self { json }
     }
 
-    /// A line of the answer.
-    pub fn line(self, line: impl AsRef<str>) {
+    /// Prints a line of the answer.
+    pub fn line(self, line: impl std::fmt::Display) {
         if self.json {
-            return say(line);
+            return print_line(line);
         }
-        // `subsplat info … | head` closes the pipe early and means it.
-        let _ = writeln!(std::io::stdout(), "{}", line.as_ref());
+        // A closed pipe is no error: `subsplat info … | head` closes it early.
+        let _ = writeln!(std::io::stdout(), "{line}");
     }
 
-    /// The whole answer; the last thing that a command does.
+    /// Prints the object. A command calls this at its end.
     ///
     /// # Errors
     /// Stdout is closed or full.
@@ -143,7 +168,7 @@ impl Answer {
     }
 }
 
-/// Bytes as people read them.
+/// Formats bytes as MiB.
 pub fn mebibytes(bytes: u64) -> String {
     format!("{:.0} MiB", bytes as f64 / f64::from(1 << 20))
 }

@@ -1,4 +1,4 @@
-//! Command-line arguments. The texts here are the program's manual.
+//! Command-line arguments. Their documentation is the program's manual.
 
 use super::args_eval::EvalArgs;
 #[cfg(feature = "view")]
@@ -6,14 +6,14 @@ use super::args_view::{KEYS, ViewArgs};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
-/// What scripts may rely on; `super` keeps to it.
+/// Exit codes, which scripts rely on.
 const EXIT_CODES: &str = "\
-Exit codes: 0 done; 1 an error, told on stderr in one line; 2 wrong usage; 3 done, and the answer
-is no (check: bad poses; compare: a tensor out of tolerance).
+Exit codes: 0 success; 1 an error, one line on stderr; 2 wrong usage; 3 a negative answer (check:
+bad poses; compare: a tensor out of tolerance).
 
---json: one object on stdout, nothing else there; {\"error\": ...} with exit codes 1 and 2.";
+--json: one object and nothing else on stdout; {\"error\": ...} with exit codes 1 and 2.";
 
-/// Three numbers, separated by commas or white space.
+/// Parses three numbers, separated by commas or white space.
 pub fn triple(text: &str) -> Result<[f32; 3], String> {
     let numbers: Result<Vec<f32>, _> = text
         .split(|c: char| c == ',' || c.is_whitespace())
@@ -34,7 +34,7 @@ pub fn triple(text: &str) -> Result<[f32; 3], String> {
 #[derive(Debug, Parser)]
 #[command(name = "subsplat", version, max_term_width = 100, after_help = EXIT_CODES)]
 pub struct Cli {
-    /// What to do.
+    /// The command.
     #[command(subcommand)]
     pub command: Command,
     /// Print one JSON object on stdout; everything else goes to stderr.
@@ -53,24 +53,24 @@ pub enum Command {
     Run(Box<RunArgs>),
     /// Render a finished scene (.ply, .splat, .spz, .ksplat, .glb).
     Render(RenderArgs),
-    /// Look at a scene in a window: a finished one, or photographs.
+    /// Show a scene in a window: a finished one, or photographs.
     #[cfg(feature = "view")]
     #[command(after_help = KEYS)]
     View(Box<ViewArgs>),
-    /// Judge poses and intrinsics before anyone wastes an hour on wrong ones.
+    /// Check poses and intrinsics by points matched between the photographs.
     Check(CheckArgs),
-    /// Say what a file or a scene folder holds.
+    /// Describe a file or a scene folder.
     Info(InfoArgs),
-    /// Score a model, and baselines beside it, on photographs that it was not shown.
+    /// Score a model and baselines on photographs that it was not trained on.
     Eval(Box<EvalArgs>),
-    /// Run the encoder, or the rasterizer, on a reference file's inputs and compare every
-    /// tensor in it.
+    /// Run the encoder, or the rasterizer, on the inputs of a reference file, and compare every
+    /// tensor in the file.
     Compare(CompareArgs),
-    /// Learn weights; the same command goes on where it was stopped.
+    /// Train weights; the same command continues a training that was stopped.
     Train(TrainArgs),
 }
 
-/// Which rasterizer's rules a render follows.
+/// The rules of a rasterizer.
 #[derive(Clone, Copy, Debug, ValueEnum)]
 pub enum ConventionArg {
     /// 3DGS and gsplat.
@@ -93,8 +93,8 @@ impl From<ConventionArg> for subsplat::abi::Convention {
 pub enum PresetArg {
     /// The paper's equations as written.
     Paper,
-    /// The same with the corrections listed in ARCHITECTURE.md; the sane choice for
-    /// weights that were never trained together with SubSplat.
+    /// The same with the corrections listed in ARCHITECTURE.md: for weights that were not
+    /// trained together with SubSplat.
     Tuned,
 }
 
@@ -107,26 +107,25 @@ impl From<PresetArg> for subsplat::config::Preset {
     }
 }
 
-/// Which network gives the primary Gaussians.
+/// The network that predicts the primary Gaussians.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum BackboneArg {
     /// MVSplat (12 M parameters).
     Re10k,
-    /// Our own light network.
+    /// This project's own light network.
     Small,
 }
 
-/// Off, or from the photograph.
+/// Source of colour detail.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum DetailArg {
     /// Colours from the network alone.
     Off,
-    /// Each child adds what the photograph shows at its place beyond its parent's
-    /// pixel.
+    /// Photographs that are larger than the input add detail to each child's colour.
     Photo,
 }
 
-/// Of which picture's pixels the low-pass is measured in.
+/// The picture whose pixels are the unit of the low-pass.
 #[derive(Clone, Copy, Debug, ValueEnum)]
 pub enum LowpassArg {
     /// The rendered picture's (3DGS).
@@ -135,7 +134,7 @@ pub enum LowpassArg {
     Input,
 }
 
-/// Frames to render besides photographs' own.
+/// Cameras to render.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum PathArg {
     /// The target frames (of `--target`, protocol.json, or between the contexts).
@@ -166,10 +165,10 @@ pub struct RunArgs {
     /// RealEstate10K txt), or two photographs.
     #[arg(required = true, num_args = 1..=2, value_name = "SCENE | IMG IMG")]
     pub input: Vec<PathBuf>,
-    /// Folder for everything that is written; not one that holds a scene's poses.
+    /// Output folder; it must not hold the poses of a scene.
     #[arg(short, long, default_value = "out", value_name = "DIR")]
     pub out: PathBuf,
-    /// How photographs become a scene.
+    /// Options of the reconstruction.
     #[command(flatten)]
     pub source: SourceArgs,
     /// Frames to render and to score against their photographs (default: protocol.json's,
@@ -188,12 +187,12 @@ pub struct RunArgs {
     /// Leave Gaussians of less opacity out of the scene files.
     #[arg(long, default_value_t = 0.0, value_name = "ALPHA")]
     pub min_opacity: f32,
-    /// How it is rendered.
+    /// Options of the rendering.
     #[command(flatten)]
-    pub look: LookArgs,
+    pub rendering: RenderingArgs,
 }
 
-/// How photographs become a scene: of `run` and `view`.
+/// Options of a reconstruction: of `run` and `view`.
 #[derive(Clone, Debug, Args)]
 pub struct SourceArgs {
     /// Context frames: indices into the scene's frames, or file names.
@@ -206,40 +205,39 @@ pub struct SourceArgs {
     /// Default: the weights' own, else 2.
     #[arg(long, value_name = "R")]
     pub upscale: Option<usize>,
-    /// Weights (.safetensors). Default: those that ship with the program.
+    /// Weights (.safetensors). Default: the shipped ones.
     #[arg(long, value_name = "FILE")]
     pub weights: Option<PathBuf>,
     /// Untrained weights, drawn from this seed.
     #[arg(long, value_name = "N", conflicts_with = "weights")]
     pub seed: Option<u64>,
-    /// Nearest depth candidate, world units (default: the pose file's, RealEstate10K's 1,
-    /// or from sparse points, matched points or the baseline; the small backbone then
-    /// replaces both by what it sees in a first look at half size). To `view` a finished
-    /// scene: the near plane.
+    /// Nearest depth candidate, world units. Default: the pose file's, RealEstate10K's 1, or
+    /// from sparse points, matched points or the baseline; without --near and --far the small
+    /// backbone then estimates both at half size. To `view` a finished scene: the near plane.
     #[arg(long, allow_negative_numbers = true)]
     pub near: Option<f32>,
-    /// Farthest depth candidate, world units (default: likewise; RealEstate10K's 100).
+    /// Farthest depth candidate, world units. Default: likewise; RealEstate10K's 100.
     #[arg(long, allow_negative_numbers = true)]
     pub far: Option<f32>,
-    /// Do not match points between the context photographs to check their poses first.
+    /// Do not match points between the context photographs (check of poses, depth range).
     #[arg(long)]
     pub no_check: bool,
-    /// Detail from photographs that are larger than the network's input.
+    /// Colour detail from photographs that are larger than the network's input.
     #[arg(long, value_enum, default_value = "photo")]
     pub detail: DetailArg,
-    /// What the model is.
+    /// The model.
     #[command(flatten)]
     pub model: ModelArgs,
-    /// Cameras of two loose photographs.
+    /// Cameras of two photographs.
     #[command(flatten)]
     pub pair: PairArgs,
 }
 
-/// The model, where weights do not say it.
+/// The model, where the weights do not state it.
 #[derive(Clone, Debug, Args)]
 pub struct ModelArgs {
-    /// Network that gives the primary Gaussians. Default: the weights' own, `re10k`
-    /// for a bare MVSplat checkpoint; `re10k` without weights is untrained.
+    /// Network that predicts the primary Gaussians. Default: the weights' own, `re10k` for a
+    /// bare MVSplat checkpoint; `re10k` without weights is untrained.
     #[arg(long, value_enum)]
     pub backbone: Option<BackboneArg>,
     /// SubSplat's equations. Default: the weights' own, `tuned` for weights without
@@ -253,22 +251,21 @@ pub struct ModelArgs {
 
 /// Rendering options.
 #[derive(Debug, Args)]
-pub struct LookArgs {
-    /// Rasterizer rules. Default: the model's own; for scene files what `run` noted in
-    /// them (.ply, .glb), else `standard`.
+pub struct RenderingArgs {
+    /// Rules of the rasterizer. Default: the model's own; for scene files those that `run` wrote
+    /// into them (.ply, .glb), else `standard`.
     #[arg(long, value_enum)]
     pub convention: Option<ConventionArg>,
-    /// Of which picture's pixels the 0.3 px² low-pass is measured in.
+    /// The picture whose pixels are the unit of the 0.3 px² low-pass.
     #[arg(long, value_enum)]
     pub lowpass_ref: Option<LowpassArg>,
     /// Background colour, R,G,B in [0, 1]. Default: the model's own (the inputs' mean
-    /// colour, or black); for scene files what `run` noted in them, else black.
+    /// colour, or black); for scene files the one that `run` wrote into them, else black.
     #[arg(long, value_parser = triple, value_name = "R,G,B")]
     pub background: Option<[f32; 3]>,
-    /// What renders, and with `run` sweeps depths, gathers features and makes children:
-    /// cpu; auto (a GPU where there is one that is no software adapter); gpu
-    /// (any adapter); or an adapter by a part of its name. The CPU takes over, with a
-    /// warning, where that fails.
+    /// Device for rendering, and with `run` for plane sweep, attention gather and children: cpu;
+    /// auto (a GPU, but no software adapter); gpu (any adapter); or an adapter by a part of its
+    /// name. Where it fails, the CPU does the work, with a warning.
     #[arg(long, default_value = "cpu", value_name = "auto|cpu|gpu|NAME")]
     pub device: String,
 }
@@ -283,12 +280,11 @@ pub struct PairArgs {
     /// Intrinsics of both photographs, px: FX,FY,CX,CY, or 9 numbers of a 3x3 matrix.
     #[arg(long, value_name = "K")]
     pub intrinsics: Option<String>,
-    /// Where the second camera stands in the first one's frame (x right, y down,
-    /// z forward), world units.
+    /// Position of the second camera in the first one's frame (x right, y down, z forward),
+    /// world units.
     #[arg(long = "move", value_parser = triple, allow_hyphen_values = true, value_name = "X,Y,Z")]
     pub translation: Option<[f32; 3]>,
-    /// How the second camera is turned in the first one's frame: degrees about x,
-    /// then y, then z.
+    /// Rotation of the second camera in the first one's frame: degrees about x, then y, then z.
     #[arg(long, value_parser = triple, allow_hyphen_values = true, value_name = "RX,RY,RZ")]
     pub turn: Option<[f32; 3]>,
     /// Pose of the first photograph: 12 or 16 numbers, row by row.
@@ -297,8 +293,7 @@ pub struct PairArgs {
     /// Pose of the second photograph: 12 or 16 numbers, row by row.
     #[arg(long, allow_hyphen_values = true, value_name = "M", conflicts_with_all = ["translation", "turn"])]
     pub pose_b: Option<String>,
-    /// What --pose-a and --pose-b are, or the lines of a scene's poses.txt. Default:
-    /// opencv-c2w.
+    /// Convention of --pose-a and --pose-b, or of a scene's poses.txt. Default: opencv-c2w.
     #[arg(long, value_enum)]
     pub pose_convention: Option<PoseConventionArg>,
 }
@@ -344,9 +339,9 @@ pub struct RenderArgs {
     /// Write 16-bit depth pictures too, in depth/ of that folder.
     #[arg(long)]
     pub depth: bool,
-    /// How it is rendered.
+    /// Options of the rendering.
     #[command(flatten)]
-    pub look: LookArgs,
+    pub rendering: RenderingArgs,
     /// Near plane of the `mvsplat` convention, whose 0.2-fold is the nearest depth
     /// drawn; nearest depth itself under `standard`.
     #[arg(long, allow_negative_numbers = true)]
@@ -359,8 +354,8 @@ pub struct CheckArgs {
     /// A scene folder or pose file, or two photographs.
     #[arg(required = true, num_args = 1..=2, value_name = "SCENE | IMG IMG")]
     pub input: Vec<PathBuf>,
-    /// Frames to judge, each with the next (default: protocol.json's contexts, else the
-    /// pair that `run` would choose).
+    /// Frames to check, each with the next (default: protocol.json's contexts, else the pair
+    /// that `run` would choose).
     #[arg(long, value_delimiter = ',', value_name = "I,J")]
     pub context: Vec<String>,
     /// Folder for the epipolar pictures.
@@ -417,8 +412,8 @@ pub struct CompareArgs {
     /// Instruction set of the rasterizer (default: SUBSPLAT_SIMD, else the widest here).
     #[arg(long, value_enum, conflicts_with = "weights")]
     pub simd: Option<SimdArg>,
-    /// What renders the case and makes its gradients: as of `render --device`, but an error
-    /// where that fails.
+    /// Device for the picture and its gradients: as of `render --device`, but an error where it
+    /// fails.
     #[arg(
         long,
         default_value = "cpu",
@@ -431,20 +426,19 @@ pub struct CompareArgs {
 /// Arguments of `train`.
 #[derive(Debug, Args)]
 pub struct TrainArgs {
-    /// What to learn from and how: TOML or JSON (examples: tools/train).
+    /// Configuration of the training: TOML or JSON (examples: tools/train).
     pub config: PathBuf,
-    /// Folder of checkpoints, weights, logs and sheets. Checkpoints in it are gone on
-    /// from.
+    /// Folder of checkpoints, weights, logs and sheets. The training continues from a
+    /// checkpoint in it.
     #[arg(short, long, default_value = "out", value_name = "DIR")]
     pub out: PathBuf,
-    /// Photographs to score from time to time, never to learn from: scenes with a
-    /// protocol.json, or one.
+    /// Photographs for validation only: scenes with a protocol.json, or one.
     #[arg(long, value_name = "DIR")]
     pub validate: Option<PathBuf>,
-    /// Stop after so many minutes, with a checkpoint.
+    /// Stop after this many minutes, with a checkpoint.
     #[arg(long, value_name = "M")]
     pub minutes: Option<f64>,
-    /// Stop after so many steps, with a checkpoint.
+    /// Stop after this many steps, with a checkpoint.
     #[arg(long, value_name = "N")]
     pub steps: Option<u64>,
 }

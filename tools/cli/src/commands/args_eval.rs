@@ -1,4 +1,4 @@
-//! Arguments of `eval`. The texts here are the program's manual.
+//! Arguments of `eval`. Their documentation is the program's manual.
 
 use super::args::{DetailArg, ModelArgs};
 use clap::{Args, ValueEnum};
@@ -9,7 +9,7 @@ const NOTES: &str = "\
 Methods: subsplat (the model), detail (the model with detail from the photographs), backbone (its \
 backbone's Gaussians alone, rendered at the target's size: spgr=off), lowpass (the same, low-pass \
 scaled to the input), bilinear (the same rendered at the input's size and enlarged), uniform (K \
-equal Gaussians a pixel, nothing learned), copy (the input nearest to the target), mean (of the \
+equal Gaussians a pixel, untrained), copy (the input nearest to the target), mean (of the \
 inputs).
 
 Figures: PSNR (dB), SSIM, LPIPS (VGG16; needs --lpips), sharpness (mean absolute gradient over the \
@@ -26,12 +26,12 @@ pub struct EvalArgs {
     /// test/index.json), a scene, or a folder of scenes with protocol.json.
     #[arg(value_name = "DATA")]
     pub data: PathBuf,
-    /// Evaluation index of MVSplat's form, {scene: {context, target} or null}. Scenes need
-    /// none: without, their protocol.json says it.
+    /// Evaluation index of MVSplat's form, {scene: {context, target} or null}. Scenes have a
+    /// protocol.json instead.
     #[arg(long, value_name = "FILE")]
     pub index: Option<PathBuf>,
     /// Folder for eval.json, targets.csv, means.csv, index.html and the pictures
-    /// (pictures/METHOD/SCENE/INPUTS/FRAME.png). Without: nothing is written.
+    /// (pictures/METHOD/SCENE/INPUTS/FRAME.png). Default: no files are written.
     #[arg(short, long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// Target over input, side over side. Default: the weights' own, else 2.
@@ -40,11 +40,11 @@ pub struct EvalArgs {
     /// Side of the network's input, px: N, or WxH (default: protocol.json's, else 256).
     #[arg(long, value_name = "N | WxH")]
     pub input_size: Option<String>,
-    /// What is compared, in this order (default: all but detail that differ at this
-    /// --upscale).
+    /// Methods to compare, in this order (default: all that differ at this --upscale, without
+    /// detail).
     #[arg(long, value_delimiter = ',', value_name = "M,…")]
     pub methods: Vec<Method>,
-    /// Score PNGs of another program too: DIR/SCENE/INPUTS/NNNNNN.png, or
+    /// Score also PNG pictures of another program: DIR/SCENE/INPUTS/NNNNNN.png, or
     /// SCENE/color/NNNNNN.png, SCENE/NNNNNN.png, SCENE/FRAMENAME.png.
     #[arg(long, value_name = "NAME=DIR")]
     pub pred: Vec<Method>,
@@ -54,7 +54,7 @@ pub struct EvalArgs {
     /// VGG16 and LPIPS weights (.safetensors, made by subsplat-convert).
     #[arg(long, value_name = "FILE")]
     pub lpips: Option<PathBuf>,
-    /// Weights (.safetensors). Default: those that ship with the program.
+    /// Weights (.safetensors). Default: the shipped ones.
     #[arg(long, value_name = "FILE")]
     pub weights: Option<PathBuf>,
     /// Untrained weights, drawn from this seed.
@@ -69,14 +69,14 @@ pub struct EvalArgs {
     /// Only the first N scenes.
     #[arg(long, value_name = "N")]
     pub limit: Option<usize>,
-    /// What a crop does to the principal point (default: mvsplat for chunks under the
-    /// re10k backbone, else exact).
+    /// Principal point after a crop (default: mvsplat for chunks with the re10k backbone, else
+    /// exact).
     #[arg(long, value_enum)]
     pub crop: Option<CropArg>,
-    /// From what the network's input is made.
+    /// Source of the network's input.
     #[arg(long, value_enum, default_value = "hr-crop")]
     pub lr_from: LrFromArg,
-    /// What the model is.
+    /// The model.
     #[command(flatten)]
     pub model: ModelArgs,
 }
@@ -95,6 +95,6 @@ pub enum CropArg {
 pub enum LrFromArg {
     /// The target's crop, reduced: aligned with it to the pixel.
     HrCrop,
-    /// The photograph, resized and cropped on its own, as MVSplat does it.
+    /// The photograph, resized and cropped independently, as in MVSplat.
     Independent,
 }

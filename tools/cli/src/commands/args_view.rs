@@ -1,10 +1,10 @@
 //! Arguments of `view`, and its keys.
 
-use super::args::{ConventionArg, DetailArg, LookArgs, SourceArgs, triple};
+use super::args::{ConventionArg, DetailArg, RenderingArgs, SourceArgs, triple};
 use clap::Args;
 use std::path::PathBuf;
 
-/// What the window listens to: `--help` and the H key show it.
+/// The window's keys, which `--help` and the H key show.
 pub const KEYS: &str = "\
 In the window:
   left drag                turn around the scene (orbit), look around (fly)
@@ -21,48 +21,48 @@ In the window:
 /// Arguments of `view`.
 #[derive(Clone, Debug, Args)]
 pub struct ViewArgs {
-    /// A finished scene (.ply, .compressed.ply, .splat, .spz, .ksplat, .glb); or what `run`
-    /// takes, which is reconstructed first: a scene folder, a pose file, two photographs.
+    /// A finished scene (.ply, .compressed.ply, .splat, .spz, .ksplat, .glb); or a scene folder,
+    /// a pose file or two photographs, which are reconstructed first.
     #[arg(required = true, num_args = 1..=2, value_name = "SPLATS | SCENE | IMG IMG")]
     pub input: Vec<PathBuf>,
-    /// Size of the window at first, px: N, or WxH (default: the first camera's picture, at
-    /// most 1280x960).
+    /// Initial size of the window, px: N, or WxH (default: the first camera's picture, at most
+    /// 1280x960).
     #[arg(long, value_name = "N | WxH")]
     pub size: Option<String>,
-    /// What renders: gpu (any adapter), auto (one that is no software adapter), or an
-    /// adapter by a part of its name.
+    /// Device for rendering: gpu (any adapter), auto (no software adapter), or an adapter by a
+    /// part of its name.
     #[arg(long, default_value = "gpu", value_name = "auto|gpu|NAME")]
     pub device: String,
-    /// Draw so many frames, one after another, and quit.
+    /// Draw this many frames and quit.
     #[arg(long, value_name = "N")]
     pub frames: Option<usize>,
-    /// Save what the window shows in the last of `--frames` (PNG).
+    /// Save the last of `--frames` (PNG).
     #[arg(long, value_name = "FILE", requires = "frames")]
     pub save: Option<PathBuf>,
     /// Folder for the pictures that P saves, as NAME-0001.png and so on.
     #[arg(short, long, default_value = ".", value_name = "DIR")]
     pub out: PathBuf,
-    /// Cameras of a finished scene: any pose file or scene folder; the first is where the
-    /// window begins. Default: cameras.json beside the scene, else a view of the whole.
+    /// Cameras of a finished scene: any pose file or scene folder; the first one is the initial
+    /// view. Default: cameras.json beside the scene, else a view of the whole.
     #[arg(long, value_name = "SCENE")]
     pub cameras: Option<PathBuf>,
-    /// How photographs become a scene.
+    /// Options of the reconstruction.
     #[command(flatten)]
     pub source: SourceArgs,
-    /// Rasterizer rules. Default: the model's own; for scene files what `run` noted in
-    /// them (.ply, .glb), else `standard`.
+    /// Rules of the rasterizer. Default: the model's own; for scene files those that `run` wrote
+    /// into them (.ply, .glb), else `standard`.
     #[arg(long, value_enum)]
     pub convention: Option<ConventionArg>,
     /// Background colour, R,G,B in [0, 1]. Default: the model's own (the inputs' mean
-    /// colour, or black); for scene files what `run` noted in them, else black.
+    /// colour, or black); for scene files the one that `run` wrote into them, else black.
     #[arg(long, value_parser = triple, value_name = "R,G,B")]
     pub background: Option<[f32; 3]>,
 }
 
 impl ViewArgs {
-    /// How it is rendered, as the other commands say it.
-    pub fn look(&self) -> LookArgs {
-        LookArgs {
+    /// Options of the rendering, in the form of the other commands.
+    pub fn rendering(&self) -> RenderingArgs {
+        RenderingArgs {
             convention: self.convention,
             lowpass_ref: None,
             background: self.background,
@@ -70,8 +70,8 @@ impl ViewArgs {
         }
     }
 
-    /// A flag that only photographs have a use for and that was given.
-    pub fn for_photographs(&self) -> Option<&'static str> {
+    /// The first flag on the command line that applies to photographs only.
+    pub fn photograph_flag(&self) -> Option<&'static str> {
         let source = &self.source;
         let flags = [
             (!source.context.is_empty(), "--context"),
@@ -86,6 +86,6 @@ impl ViewArgs {
             (source.no_check, "--no-check"),
             (source.pair.pose_convention.is_some(), "--pose-convention"),
         ];
-        flags.into_iter().find(|f| f.0).map(|f| f.1).or(source.pair.given())
+        flags.into_iter().find(|f| f.0).map(|f| f.1).or(source.pair.first_flag())
     }
 }

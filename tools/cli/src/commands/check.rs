@@ -1,26 +1,25 @@
-//! `subsplat check`: are these poses right?
+//! `subsplat check`: checks poses by points matched between the photographs.
 
 use super::args::CheckArgs;
-use super::range::grey;
 use super::{frames, pair};
-use crate::report::{Answer, Progress, peak_memory_bytes, say, warn};
+use crate::report::{Answer, Progress, peak_memory_bytes, print_line, print_warning};
 use anyhow::{Context, Result, ensure};
 use serde_json::json;
 use subsplat::check::{
-    CheckOptions, PairReport, RgbPicture, Verdict, check_pair, epipolar_picture,
+    CheckOptions, GrayImage, PairReport, RgbPicture, Verdict, check_pair, epipolar_picture,
 };
 use subsplat::data::pair::choose_pair;
 use subsplat::io::image::{Rgb, save_png};
 use subsplat::io::scene::Scene;
 
-/// Runs the command; `false` where the poses are judged bad.
+/// Runs the command; returns `false` where the poses are judged bad.
 pub fn check(args: &CheckArgs, answer: Answer) -> Result<bool> {
     let mut progress = Progress::new();
     let scene = progress.stage("scene", |_| pair::load(&args.input, &args.pair))?;
-    scene.warnings.iter().for_each(warn);
+    scene.warnings.iter().for_each(print_warning);
     let pairs = pairs(args, &scene)?;
-    say(format!(
-        "{}: {} frames ({}), {} pair(s) to judge",
+    print_line(format!(
+        "{}: {} frames ({}), {} pair(s) to check",
         scene.name,
         scene.frames.len(),
         scene.source.name(),
@@ -38,8 +37,8 @@ pub fn check(args: &CheckArgs, answer: Answer) -> Result<bool> {
             if let Some(picture) = &picture {
                 save_png(&file, picture)?;
             }
-            bar.suspend(|| tell(answer, &scene, [i, j], &report));
-            // Without the hundreds of matched points: the picture shows them.
+            bar.suspend(|| print_report(answer, &scene, [i, j], &report));
+            // The report leaves out the matched points; the picture shows them.
             let mut value = serde_json::to_value(&report)?;
             value["frames"] = json!([scene.frames[i].name, scene.frames[j].name]);
             value["epipolar_picture"] = json!(picture.map(|_| file.display().to_string()));
@@ -48,7 +47,7 @@ pub fn check(args: &CheckArgs, answer: Answer) -> Result<bool> {
         }
         anyhow::Ok(())
     })?;
-    say(format!("epipolar pictures in {}", args.out.display()));
+    print_line(format!("epipolar pictures in {}", args.out.display()));
     answer.finish(&json!({
         "scene": scene.name,
         "ok": good,
@@ -96,7 +95,13 @@ fn judge(scene: &Scene, i: usize, j: usize) -> Result<(PairReport, Option<Rgb>)>
     Ok((report, drawn))
 }
 
-fn word(verdict: Verdict) -> &'static str {
+/// Grey copy of a photograph.
+fn grey(photo: &Rgb) -> Result<GrayImage> {
+    GrayImage::from_rgb8(photo.width, photo.height, &photo.data)
+        .with_context(|| format!("picture of {}x{} pixels", photo.width, photo.height))
+}
+
+fn verdict_name(verdict: Verdict) -> &'static str {
     match verdict {
         Verdict::Ok => "ok",
         Verdict::Warning => "warning",
@@ -104,13 +109,13 @@ fn word(verdict: Verdict) -> &'static str {
     }
 }
 
-fn tell(answer: Answer, scene: &Scene, [i, j]: [usize; 2], report: &PairReport) {
+fn print_report(answer: Answer, scene: &Scene, [i, j]: [usize; 2], report: &PairReport) {
     let names = [&scene.frames[i].name, &scene.frames[j].name];
     answer.line(format!(
         "frames {i} ({}) and {j} ({}): {}",
         names[0],
         names[1],
-        word(report.verdict)
+        verdict_name(report.verdict)
     ));
     let median = report.epipolar.as_ref().and_then(|e| e.median_px);
     answer.line(format!(
@@ -126,6 +131,6 @@ fn tell(answer: Answer, scene: &Scene, [i, j]: [usize; 2], report: &PairReport) 
             .map_or(String::new(), |o| format!(", overlap {:.0} %", 100.0 * o[0].min(o[1])))
     ));
     for finding in &report.findings {
-        answer.line(format!("  {}: {}", word(finding.severity), finding.sentence));
+        answer.line(format!("  {}: {}", verdict_name(finding.severity), finding.sentence));
     }
 }

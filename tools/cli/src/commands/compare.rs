@@ -3,7 +3,7 @@
 use super::args::{CompareArgs, SimdArg};
 use super::compare_raster::{self, Comparison};
 use super::raster_case::Case;
-use crate::report::{Answer, Progress, peak_memory_bytes, warn};
+use crate::report::{Answer, Progress, peak_memory_bytes, print_warning};
 use anyhow::{Context, Result, bail, ensure};
 use serde_json::{Value, json};
 use std::path::Path;
@@ -43,7 +43,7 @@ fn encoder(weights: &Path, reference: &Path, answer: Answer) -> Result<bool> {
     })?;
     table(&report.rows, answer);
     for name in &report.not_produced {
-        warn(format!("the reference holds `{name}`, which the encoder does not produce"));
+        print_warning(format!("the reference holds `{name}`, which the encoder does not produce"));
     }
     let ok = report.ok();
     let extra = json!({ "not_produced": report.not_produced });

@@ -1,9 +1,9 @@
-//! `subsplat eval`: methods on photographs, scored.
+//! `subsplat eval`: scores methods on photographs.
 
 use super::args::DetailArg;
 use super::args_eval::{CropArg, EvalArgs, LrFromArg};
 use super::{frames, memory, model};
-use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, say, warn};
+use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, print_line, print_warning};
 use anyhow::{Context, Result, ensure};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
@@ -16,13 +16,13 @@ use subsplat::eval::{
 };
 use subsplat::io::image::save_png;
 use subsplat::io::write_atomic;
-use subsplat::pipeline::{Reconstructor, is_mvsplat};
+use subsplat::pipeline::{DepthRange, Reconstructor, is_mvsplat};
 
-/// r where neither the arguments nor weights say one.
+/// r without arguments or weights that state one.
 const UPSCALE: usize = 2;
-/// Most cases on the page: each is some hundred kilobytes of pictures.
+/// Largest number of cases on the page; each takes some hundred kilobytes.
 const SHEETS: usize = 60;
-/// Why the LPIPS column is empty.
+/// Reason for an empty LPIPS column.
 const NO_LPIPS: &str = "not measured: VGG16's weights were not given (--lpips FILE)";
 
 /// Runs the command.
@@ -33,10 +33,10 @@ pub fn eval(args: &EvalArgs, answer: Answer) -> Result<()> {
     ensure!(args.limit != Some(0), "--limit: expected at least 1, got 0");
     let mut data = progress.stage("data", |_| -> Result<_> {
         let mut data = Benchmark::open(&args.data, args.index.as_deref())?;
-        data.set_near_far(args.near, args.far);
+        data.set_depth_range(DepthRange::from_ends(args.near, args.far));
         Ok(data)
     })?;
-    data.notes().iter().for_each(|n| say(format!("note: {n}")));
+    data.notes().iter().for_each(|n| print_line(format!("note: {n}")));
     if let Some(limit) = args.limit {
         data.limit(limit);
     }
@@ -57,7 +57,7 @@ pub fn eval(args: &EvalArgs, answer: Answer) -> Result<()> {
         ..Options::new(upscale)
     };
     if let Some(model) = &model {
-        fits(model, &data, &options)?;
+        check_memory(model, &data, &options)?;
     }
     let mut evaluator = Evaluator::new(options);
     if let Some(path) = &args.lpips {
@@ -68,7 +68,7 @@ pub fn eval(args: &EvalArgs, answer: Answer) -> Result<()> {
         std::fs::create_dir_all(out).with_context(|| format!("output folder {}", out.display()))?;
     }
     let (scores, sheets) = run(&mut progress, &evaluator, model.as_ref(), &data, out)?;
-    tell(&scores, evaluator.options().upscale, answer);
+    print_scores(&scores, evaluator.options().upscale, answer);
     if args.lpips.is_none() {
         answer.line(format!("LPIPS {NO_LPIPS}"));
     }
@@ -89,7 +89,7 @@ pub fn eval(args: &EvalArgs, answer: Answer) -> Result<()> {
 }
 
 fn load(args: &EvalArgs, ratio: Option<usize>) -> Result<Reconstructor> {
-    model::load(&model::Asked {
+    model::load(&model::ModelRequest {
         weights: args.weights.as_deref(),
         seed: args.seed,
         upscale: None,
@@ -98,7 +98,7 @@ fn load(args: &EvalArgs, ratio: Option<usize>) -> Result<Reconstructor> {
     })
 }
 
-/// The methods that the arguments ask for at `upscale`; no name twice.
+/// The methods of the arguments at `upscale`, checked: no name twice.
 fn methods(args: &EvalArgs, upscale: usize) -> Result<Vec<Method>> {
     let mut all = match args.methods.is_empty() {
         true => Options::new(upscale).methods,
@@ -138,8 +138,8 @@ fn rule(args: &EvalArgs, data: &Benchmark, model: Option<&Reconstructor>) -> Cro
     }
 }
 
-/// Refuses what memory cannot hold before the first second of work.
-fn fits(model: &Reconstructor, data: &Benchmark, options: &Options) -> Result<()> {
+/// Rejects sizes that exceed the memory, before any work.
+fn check_memory(model: &Reconstructor, data: &Benchmark, options: &Options) -> Result<()> {
     let mut config = model.config().clone();
     config.upscale = config.upscale.max(options.upscale);
     for case in data.cases() {
@@ -150,7 +150,7 @@ fn fits(model: &Reconstructor, data: &Benchmark, options: &Options) -> Result<()
     Ok(())
 }
 
-/// All cases, one after the other; pictures are written as they come.
+/// Evaluates all cases in order, and writes their pictures.
 fn run(
     progress: &mut Progress,
     evaluator: &Evaluator,
@@ -164,11 +164,13 @@ fn run(
         for case in data.cases() {
             let result = data
                 .load(case)
-                .and_then(|loaded| evaluator.case(model.map(Reconstructor::model), case, loaded))
+                .and_then(|loaded| evaluator.case(model, case, loaded))
                 .with_context(|| format!("scene {} ({})", case.scene, case.pair()))?;
             if result.scores.enlarged {
                 let scene = &case.scene;
-                bar.suspend(|| warn(format!("{scene}: photographs smaller than the target")));
+                bar.suspend(|| {
+                    print_warning(format!("{scene}: photographs smaller than the target"))
+                });
             }
             if let Some(out) = out {
                 pictures(out, &case.pair(), &scores.methods, &result)?;
@@ -184,7 +186,7 @@ fn run(
     Ok((scores, sheets))
 }
 
-/// `pictures/METHOD/SCENE/INPUTS/FRAME.png`, as `--pred` reads them; `truth` too.
+/// Writes `pictures/METHOD/SCENE/INPUTS/FRAME.png`, as `--pred` reads them; `truth` too.
 fn pictures(out: &Path, pair: &str, methods: &[String], result: &CaseResult) -> Result<()> {
     let scene = result.scores.scene.replace(['/', '\\', ':'], "_");
     let folder = |method: &str| out.join("pictures").join(method).join(&scene).join(pair);
@@ -204,7 +206,7 @@ fn pictures(out: &Path, pair: &str, methods: &[String], result: &CaseResult) -> 
     Ok(())
 }
 
-fn tell(scores: &Scores, upscale: usize, answer: Answer) {
+fn print_scores(scores: &Scores, upscale: usize, answer: Answer) {
     let line = |name: &str, mean: Option<Score>| {
         let cell = |v: Option<f64>, digits: usize| {
             v.map_or_else(|| format!("{:>7}", "-"), |v| format!("{v:7.digits$}"))
@@ -242,7 +244,7 @@ fn tell(scores: &Scores, upscale: usize, answer: Answer) {
     }
 }
 
-/// Sizes of inputs and targets: `128x128 to 256x256 (14 cases), …`.
+/// Formats the sizes of inputs and targets: `128x128 to 256x256 (14 cases), …`.
 fn sizes(scores: &Scores) -> String {
     let mut counts: BTreeMap<[(usize, usize); 2], usize> = BTreeMap::new();
     scores.cases.iter().for_each(|c| *counts.entry(c.sizes).or_default() += 1);
@@ -273,7 +275,7 @@ fn protocol(args: &EvalArgs, options: &Options, model: Option<&Reconstructor>) -
     })
 }
 
-/// Tables and page; each under its name only when whole.
+/// Writes tables and page, each atomically.
 fn write(
     out: &Path,
     args: &EvalArgs,

@@ -1,4 +1,4 @@
-//! Which frames and cameras a command means.
+//! Frames and cameras of the arguments.
 
 use super::pair::folder_of;
 use anyhow::{Context, Result, bail, ensure};
@@ -8,7 +8,7 @@ use subsplat::camera::{Camera, Intrinsics};
 use subsplat::io::protocol::{Views, load_protocol};
 use subsplat::io::scene::{Scene, SceneFormat};
 
-/// Width and height of `N` or `WxH`, px.
+/// Parses width and height of `N` or `WxH`, px.
 pub fn size(text: &str) -> Result<(usize, usize)> {
     let side = |s: &str| -> Result<usize> {
         let n: usize = s
@@ -27,10 +27,10 @@ pub fn size(text: &str) -> Result<(usize, usize)> {
     }
 }
 
-/// Most views of a path.
+/// Largest number of views of a path.
 const PATH_MAX: usize = 100_000;
 
-/// `--frames`, checked.
+/// Checks `--frames`.
 pub fn count(frames: usize) -> Result<usize> {
     ensure!((1..=PATH_MAX).contains(&frames), "--frames: expected 1 to {PATH_MAX}, got {frames}");
     Ok(frames)
@@ -40,8 +40,8 @@ fn stem(file: &str) -> String {
     Path::new(file).file_stem().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-/// Which of `frames` the words of `flag` mean: an index, or a frame's name with or
-/// without folder and extension. Digits with leading zeros are a name.
+/// Finds the frames that the words of `flag` name: by index, or by name with or without folder
+/// and extension. Digits with leading zeros are a name.
 pub fn pick(frames: &[&str], wanted: &[String], flag: &str) -> Result<Vec<usize>> {
     let one = |word: &String| -> Result<usize> {
         if let Ok(i) = word.parse::<usize>()
@@ -72,13 +72,13 @@ pub fn pick(frames: &[&str], wanted: &[String], flag: &str) -> Result<Vec<usize>
     wanted.iter().map(one).collect()
 }
 
-/// [`pick`] among a scene's frames.
+/// Finds frames of a scene by [`pick`].
 pub fn indices(scene: &Scene, wanted: &[String], flag: &str) -> Result<Vec<usize>> {
     let names: Vec<&str> = scene.frames.iter().map(|f| f.name.as_str()).collect();
     pick(&names, wanted, flag)
 }
 
-/// File stems for pictures of `names`, no two alike.
+/// Distinct file stems for pictures of `names`.
 pub fn file_stems(names: &[String]) -> Vec<String> {
     let plain = |n: &String| n.replace(['/', '\\', ':'], "_");
     let mut taken = std::collections::BTreeSet::new();
@@ -92,8 +92,8 @@ pub fn file_stems(names: &[String]) -> Vec<String> {
     names.iter().enumerate().map(unique).collect()
 }
 
-/// The scene's protocol.json, if it has one: its tests. What lies beside two loose
-/// photographs speaks of another scene's frames.
+/// Reads the tests of the scene's protocol.json, if it has one. A protocol.json beside two loose
+/// photographs belongs to another scene.
 pub fn protocol(path: &Path, scene: &Scene) -> Result<Vec<Views>> {
     let file = folder_of(path).join("protocol.json");
     if scene.source == SceneFormat::Pair || !file.is_file() {

@@ -1,8 +1,8 @@
 //! The commands, one file each.
 //!
-//! Exit codes: 0 done; 1 an error, told on stderr; 2 wrong usage; 3 the answer is no
-//! (`check`: bad poses; `compare`: a tensor out of tolerance). With `--json` stdout
-//! holds one object whatever the code is: the report, or `{"error": …}`.
+//! Exit codes: 0 success; 1 an error, reported on stderr; 2 wrong usage; 3 a negative answer
+//! (`check`: bad poses; `compare`: a tensor out of tolerance). With `--json` stdout always holds
+//! one object: the report, or `{"error": …}`.
 
 pub mod args;
 mod args_eval;
@@ -18,8 +18,8 @@ mod memory;
 mod model;
 mod output;
 mod pair;
-mod range;
 mod raster_case;
+mod reconstruct;
 mod render;
 mod run;
 mod tensorboard;
@@ -34,22 +34,22 @@ use args::{Cli, Command};
 use clap::Parser;
 use std::process::ExitCode;
 
-/// Exit code where the command worked and its answer is no.
+/// Exit code of a negative answer.
 const ANSWER_NO: u8 = 3;
-/// More threads than any machine that this is meant for; starting millions would hang.
+/// Largest number of threads; to start millions would hang the machine.
 const THREADS_MAX: usize = 1024;
 
-/// Runs the command of the process's arguments; its result as an exit code.
+/// Runs the command of the process's arguments and returns the exit code.
 pub fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
-        Err(error) => return failure::refuse(&error),
+        Err(error) => return failure::report_usage(&error),
     };
     let answer = Answer::new(cli.json);
     match dispatch(&cli, answer) {
         Ok(true) => ExitCode::SUCCESS,
         Ok(false) => ExitCode::from(ANSWER_NO),
-        Err(error) => failure::tell(&error, answer),
+        Err(error) => failure::report_error(&error, answer),
     }
 }
 

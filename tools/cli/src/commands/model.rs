@@ -1,19 +1,19 @@
-//! Which model the arguments, and the weight file, ask for.
+//! The model of the arguments and of the weight file.
 
 use super::args::{BackboneArg, ModelArgs, SourceArgs};
-use crate::report::{say, warn};
+use crate::report::print_warning;
 use anyhow::{Context, Result, bail, ensure};
 use std::path::Path;
 use subsplat::abi::HEAD_GEOMETRY_LEN;
 use subsplat::config::{Config, Preset, SpgrHead};
 use subsplat::model::weights::{SUBSPLAT_PREFIX, Weights};
-use subsplat::pipeline::{self, Reconstructor};
+use subsplat::pipeline::{Reconstructor, is_mvsplat};
 
-/// Target over input where nothing says otherwise.
+/// Default ratio of target to input.
 const UPSCALE: usize = 2;
 
-/// What a command's arguments say of the model.
-pub struct Asked<'a> {
+/// A command's arguments about the model.
+pub struct ModelRequest<'a> {
     /// `--weights`.
     pub weights: Option<&'a Path>,
     /// `--seed`: untrained weights.
@@ -26,9 +26,9 @@ pub struct Asked<'a> {
     pub model: &'a ModelArgs,
 }
 
-impl<'a> Asked<'a> {
-    /// What `run` and `view` are told.
-    pub fn of(source: &'a SourceArgs) -> Self {
+impl<'a> ModelRequest<'a> {
+    /// The arguments of `run` and `view`.
+    pub fn from_source(source: &'a SourceArgs) -> Self {
         Self {
             weights: source.weights.as_deref(),
             seed: source.seed,
@@ -39,28 +39,18 @@ impl<'a> Asked<'a> {
     }
 }
 
-/// The model that the arguments ask for.
-pub fn load(args: &Asked) -> Result<Reconstructor> {
-    let Some(path) = args.weights else { return unasked(args) };
+/// Loads the model of the arguments.
+pub fn load(args: &ModelRequest) -> Result<Reconstructor> {
+    let Some(path) = args.weights else { return load_default(args) };
     let weights = Weights::load(path)?;
-    let holds = Holds::of(&weights);
-    let config = config(args, Some((&weights, &holds)))?;
-    holds.check(path, &config)?;
+    let contents = Contents::of(&weights);
+    let config = config(args, Some((&weights, &contents)))?;
+    contents.check(path, &config)?;
     let model = Reconstructor::from_weights(weights, Some(&config))
         .with_context(|| format!("{}: does not fit the model", path.display()))?;
-    let untrained = model.untrained_tensors().len();
-    if untrained > 0 && !holds.subsplat {
-        say(format!(
-            "{}: holds a backbone alone; SubSplat's {untrained} tensors start untrained: children \
-             are the plain split of their parents",
-            path.display()
-        ));
-    } else if untrained > 0 {
-        warn(format!("{}: {untrained} of SubSplat's tensors are missing", path.display()));
-    }
     let unexpected = model.unexpected_tensors();
     if let Some(first) = unexpected.first() {
-        warn(format!(
+        print_warning(format!(
             "{}: {} tensors are not part of this model, first `{first}`",
             path.display(),
             unexpected.len()
@@ -69,39 +59,30 @@ pub fn load(args: &Asked) -> Result<Reconstructor> {
     Ok(model)
 }
 
-/// Without `--weights`: those that ship, or untrained ones where the arguments ask for a
-/// model or a start of their own.
-fn unasked(args: &Asked) -> Result<Reconstructor> {
+/// Loads the model without `--weights`: the shipped one, or an untrained one where the arguments
+/// name a seed, a backbone or a configuration.
+fn load_default(args: &ModelRequest) -> Result<Reconstructor> {
     let mvsplat = args.model.backbone == Some(BackboneArg::Re10k);
     if args.seed.is_none() && !mvsplat && args.model.config.is_none() {
-        let model = shipped(args)?;
-        if !model.untrained_tensors().is_empty() {
-            say(
-                "SubSplat's heads of the weights that ship start untrained for this --upscale and \
-                 preset: children are the plain split of their parents",
-            );
-        }
-        return Ok(model);
+        return shipped(args);
     }
     let (config, seed) = (config(args, None)?, args.seed.unwrap_or(0));
-    let what = match pipeline::is_mvsplat(&config) {
-        true => "MVSplat's network gives noise with them",
-        false => "the small network is then a plain plane sweep, without anything learned",
+    let effect = match is_mvsplat(&config) {
+        true => "MVSplat's network gives noise",
+        false => "the small network is a plain plane sweep",
     };
-    warn(format!("no --weights: using seeded random weights (seed {seed}); {what}"));
+    print_warning(format!("no --weights: random weights of seed {seed}; {effect}"));
     Ok(Reconstructor::untrained(&config, seed)?)
 }
 
-/// The shipped backbone, with SubSplat's heads where the arguments leave them their own
-/// preset and r.
-fn shipped(args: &Asked) -> Result<Reconstructor> {
-    // Children finer than the target's pixels do it no harm, so heads that were trained
-    // serve a lower ratio too.
+/// Loads the shipped backbone; with SubSplat's heads unless the arguments name another preset.
+fn shipped(args: &ModelRequest) -> Result<Reconstructor> {
+    // Children may be finer than the target's pixels, so trained heads serve a lower ratio too.
     let least = args.ratio.map(|r| r.max(UPSCALE));
     let upscale = args.upscale.or(least).unwrap_or(UPSCALE);
-    let asked = || format!("--upscale {upscale}");
+    let flag = || format!("--upscale {upscale}");
     let Some(preset) = args.model.preset else {
-        return Reconstructor::shipped(upscale).with_context(asked);
+        return Reconstructor::shipped(upscale).with_context(flag);
     };
     let weights = Weights::shipped(upscale)?.without(SUBSPLAT_PREFIX);
     let preset = Preset::from(preset);
@@ -109,25 +90,24 @@ fn shipped(args: &Asked) -> Result<Reconstructor> {
         Some(own) => own.with_preset(preset, upscale),
         None => Config::small(preset, upscale),
     };
-    Reconstructor::from_weights(weights, Some(&config)).with_context(asked)
+    Reconstructor::from_weights(weights, Some(&config)).with_context(flag)
 }
 
-/// What a weight file holds, by its names.
-struct Holds {
+/// Contents of a weight file, by its names.
+struct Contents {
     mvsplat: bool,
     small: bool,
-    subsplat: bool,
     /// K of a head that serves one K only.
     children: Option<usize>,
 }
 
-impl Holds {
+impl Contents {
     fn of(weights: &Weights) -> Self {
         let names = weights.tensors();
         let plain = |n: &'_ String| n.strip_prefix("encoder.").unwrap_or(n).to_owned();
         let any = |prefix: &str| names.keys().any(|n| plain(n).starts_with(prefix));
-        // Rows of the geometry head's last layer: K times its lanes. The `coord` head
-        // has one lane set for any K, and a layer for places besides.
+        // The geometry head's last layer has K times as many rows as a record. The `coord` head
+        // has one set of rows for any K, and a layer for positions besides.
         let rows = |layer: &str| {
             let name = format!("subsplat.geo.{layer}.weight");
             names
@@ -140,25 +120,24 @@ impl Holds {
         Self {
             mvsplat: any("backbone.") || any("depth_predictor."),
             small: any("small."),
-            subsplat: any("subsplat."),
             children: children.filter(|_| fixed),
         }
     }
 
-    /// Refuses what cannot fit `config`, in the user's words.
+    /// Rejects contents that cannot fit `config`, in terms of the flags.
     fn check(&self, path: &Path, config: &Config) -> Result<()> {
         let path = path.display();
-        let wants = pipeline::is_mvsplat(config);
+        let mvsplat = is_mvsplat(config);
         ensure!(
             self.mvsplat || self.small,
             "{path}: expected the weights of a backbone (re10k or small), got a file without one"
         );
-        if !(if wants { self.mvsplat } else { self.small }) {
+        if !(if mvsplat { self.mvsplat } else { self.small }) {
             let name = |mvsplat| if mvsplat { "re10k" } else { "small" };
             bail!(
                 "{path}: expected weights of the {} backbone, got the {} one",
-                name(wants),
-                name(!wants)
+                name(mvsplat),
+                name(!mvsplat)
             );
         }
         let Some(children) = self.children.filter(|_| config.spgr.enabled) else { return Ok(()) };
@@ -175,8 +154,8 @@ impl Holds {
     }
 }
 
-fn config(args: &Asked, file: Option<(&Weights, &Holds)>) -> Result<Config> {
-    let open = file.is_none_or(|(_, holds)| holds.children.is_none());
+fn config(args: &ModelRequest, file: Option<(&Weights, &Contents)>) -> Result<Config> {
+    let open = file.is_none_or(|(_, contents)| contents.children.is_none());
     let upscale = args.upscale.or(args.ratio.filter(|_| open));
     if let Some(path) = &args.model.config {
         let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
@@ -188,21 +167,22 @@ fn config(args: &Asked, file: Option<(&Weights, &Holds)>) -> Result<Config> {
     let stored = file.and_then(|(weights, _)| weights.config());
     let mvsplat = match (args.model.backbone, stored, file) {
         (Some(backbone), ..) => backbone == BackboneArg::Re10k,
-        (None, Some(config), _) => pipeline::is_mvsplat(config),
-        (None, None, Some((_, holds))) => !holds.small,
+        (None, Some(config), _) => is_mvsplat(config),
+        (None, None, Some((_, contents))) => !contents.small,
         (None, None, None) => false,
     };
-    // What the weights were made for, even where a preset replaces the rest.
+    // The ratio of the weights holds even where a preset replaces the rest.
     let known =
-        stored.map(|c| c.upscale).or_else(|| file.and_then(|(_, h)| h.children).map(usize::isqrt));
+        stored.map(|c| c.upscale).or_else(|| file.and_then(|(_, c)| c.children).map(usize::isqrt));
     let wanted = upscale.or(known).unwrap_or(UPSCALE);
     let mut config = match (stored, args.model.preset) {
-        (Some(config), None) if pipeline::is_mvsplat(config) == mvsplat => config.clone(),
+        (Some(config), None) if is_mvsplat(config) == mvsplat => config.clone(),
         (stored, preset) => {
             let preset = preset.map_or(Preset::Tuned, Preset::from);
-            match stored.filter(|c| pipeline::is_mvsplat(c) == mvsplat) {
+            match stored.filter(|c| is_mvsplat(c) == mvsplat) {
                 Some(stored) => stored.with_preset(preset, wanted),
-                None => pipeline::preset(mvsplat, preset, wanted),
+                None if mvsplat => Config::re10k(preset, wanted),
+                None => Config::small(preset, wanted),
             }
         }
     };

@@ -1,18 +1,18 @@
-//! What `run` writes: pictures, depth, cameras, the scene in any format.
+//! The output folder of `run`: pictures, depth, cameras, and the scene in any format.
 //!
-//! `images/` holds the rendered views, `depth/` their depth, `inputs/` what the network
-//! saw and its depth of it, `config.json` the model. With `cameras.json` the folder is a scene that every
-//! command reads.
+//! `images/` holds the rendered views and `depth/` their depth. `inputs/` holds the network's
+//! inputs with their depth, and `config.json` the model. `cameras.json` makes the folder a scene
+//! that every command reads.
 
 use super::args::SceneFormatArg;
 use super::frames;
 use super::pair::folder_of;
-use crate::report::warn;
+use crate::report::print_warning;
 use anyhow::{Context, Result, bail};
 use indicatif::ProgressBar;
 use serde_json::{Value, json};
 use std::path::Path;
-use subsplat::abi::{Convention, RasterOptions};
+use subsplat::abi::RasterOptions;
 use subsplat::camera::Camera;
 use subsplat::config::Config;
 use subsplat::data::crop::CropOptions;
@@ -23,6 +23,7 @@ use subsplat::io::{SaveOptions, save_splats};
 use subsplat::metrics::{psnr, ssim};
 use subsplat::pipeline::{Photo, Reconstruction};
 use subsplat::render::Renderer;
+use subsplat::splats::Splats;
 
 /// Folders inside the output folder.
 const FOLDERS: [&str; 3] = ["images", "depth", "inputs"];
@@ -31,11 +32,11 @@ const FOLDERS: [&str; 3] = ["images", "depth", "inputs"];
 pub enum View {
     /// A camera of a path.
     Path(Camera),
-    /// A frame of the scene, to be compared with its photograph.
+    /// A frame of the scene, which is compared with its photograph.
     Frame(usize),
 }
 
-/// One rendered view, and its scores where there is a photograph.
+/// One rendered view, with scores where a photograph exists.
 pub struct Scored {
     /// Name of the frame, or of the view.
     pub name: String,
@@ -45,16 +46,16 @@ pub struct Scored {
     pub frame: Option<usize>,
     camera: Camera,
     depth_unit: f32,
-    /// dB; infinite where the pictures are the same.
+    /// PSNR, dB; infinite for equal pictures.
     pub psnr: Option<f64>,
-    /// `None` also for pictures smaller than the measure's window.
+    /// SSIM; `None` also for pictures that are smaller than its window.
     pub ssim: Option<f64>,
-    /// The photograph was smaller than the target and had to be enlarged.
+    /// Whether the photograph was smaller than the target, and was enlarged.
     pub enlarged: bool,
 }
 
 impl Scored {
-    /// For programs.
+    /// Formats the view as JSON.
     pub fn json(&self) -> Value {
         json!({
             "frame": self.name,
@@ -62,7 +63,7 @@ impl Scored {
             "image": format!("images/{}.png", self.stem),
             "depth": format!("depth/{}.png", self.stem),
             "depth_unit": self.depth_unit,
-            // JSON knows no infinity: null, as for a view without photograph.
+            // JSON has no infinity: null, as for a view without a photograph.
             "psnr": self.psnr.filter(|v| v.is_finite()),
             "ssim": self.ssim,
             "photograph_enlarged": self.enlarged,
@@ -70,12 +71,11 @@ impl Scored {
     }
 }
 
-/// Makes the output folder; before the network runs, so that nobody waits for nothing.
-/// `input`: what the scene was read from.
+/// Creates the output folder before the network runs. `input` is the path of the scene.
 ///
 /// # Errors
-/// It cannot be made; it holds the very scene that is read, or poses of another one, which
-/// would be overwritten or hidden by the new cameras.json.
+/// The folder cannot be created. It holds the scene that is read, or the poses of another one,
+/// which the new cameras.json would overwrite or hide.
 pub fn prepare(out: &Path, input: &Path, scene: &Scene) -> Result<()> {
     let make = |folder: &Path| {
         std::fs::create_dir_all(folder)
@@ -95,7 +95,7 @@ pub fn prepare(out: &Path, input: &Path, scene: &Scene) -> Result<()> {
     }
     let own = scene.source != SceneFormat::Pair
         && std::fs::canonicalize(folder_of(input)).is_ok_and(|folder| folder == real);
-    // Where cameras.json is read already, an earlier run's may lie.
+    // A cameras.json may be that of an earlier run, which is replaced.
     if own || (is_scene(&real) && !real.join("cameras.json").is_file()) {
         bail!(
             "output folder {}: holds the poses of a scene, which the cameras.json that is written \
@@ -110,16 +110,16 @@ pub fn prepare(out: &Path, input: &Path, scene: &Scene) -> Result<()> {
 pub struct Views<'a> {
     /// Output folder.
     pub out: &'a Path,
-    /// Where frames come from.
+    /// The scene of the frames.
     pub scene: &'a Scene,
     /// Crop of a frame's photograph.
     pub crop: CropOptions,
-    /// How to render.
+    /// Rules to render.
     pub options: RasterOptions,
 }
 
 impl Views<'_> {
-    /// All of `views`; one step of `bar` each.
+    /// Renders all of `views`, with one step of `bar` each.
     pub fn render(
         &self,
         renderer: &mut Renderer,
@@ -127,7 +127,7 @@ impl Views<'_> {
         views: &[View],
         bar: &ProgressBar,
     ) -> Result<Vec<Scored>> {
-        for (i, (input, depth)) in result.inputs.iter().zip(&result.depths).enumerate() {
+        for (i, (input, depth)) in result.inputs().iter().zip(result.depths()).enumerate() {
             save_png(&self.out.join(format!("inputs/{i}.png")), &input.input)?;
             save_depth_png(&self.out.join(format!("inputs/{i}_depth.png")), depth)?;
         }
@@ -139,13 +139,13 @@ impl Views<'_> {
         let stems = frames::file_stems(&names);
         let mut scored = Vec::with_capacity(views.len());
         for (view, (name, stem)) in views.iter().zip(names.into_iter().zip(stems)) {
-            scored.push(self.one(renderer, result, view, (name, stem))?);
+            scored.push(self.render_one(renderer, result, view, (name, stem))?);
             bar.inc(1);
         }
         Ok(scored)
     }
 
-    fn one(
+    fn render_one(
         &self,
         renderer: &mut Renderer,
         result: &Reconstruction,
@@ -160,11 +160,11 @@ impl Views<'_> {
                 (cropped.target_camera, Some((*i, cropped.target, enlarged)))
             }
         };
-        let picture = renderer.render(&result.splats, &camera, &self.options);
-        renderer.take_warning().iter().for_each(warn);
+        let picture = renderer.render(result.splats(), &camera, &self.options);
+        renderer.take_warning().iter().for_each(print_warning);
         let (width, height) = (picture.width, picture.height);
         let file = self.out.join(format!("images/{stem}.png"));
-        save_png(&file, &to_rgb8(&picture.rgb, width, height))?;
+        save_png(&file, &Rgb::from(&picture))?;
         let depth = Depth { width, height, data: picture.depth };
         let depth_unit = save_depth_png(&self.out.join(format!("depth/{stem}.png")), &depth)?;
         let mut scored = Scored {
@@ -188,13 +188,7 @@ impl Views<'_> {
     }
 }
 
-/// Linear values to 8 bits, rounded.
-pub fn to_rgb8(rgb: &[f32], width: usize, height: usize) -> Rgb {
-    let byte = |v: &f32| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
-    Rgb { width, height, data: rgb.iter().map(byte).collect() }
-}
-
-/// `cameras.json` of the rendered views, in the scene's unit, with near and far.
+/// Writes `cameras.json` of the rendered views, in the scene's unit, with near and far.
 pub fn write_cameras(
     out: &Path,
     views: &[Scored],
@@ -212,7 +206,7 @@ pub fn write_cameras(
     Ok(save_cameras_json(&out.join("cameras.json"), &content)?)
 }
 
-/// `config.json`, which `--config` takes.
+/// Writes `config.json`, which `--config` reads.
 pub fn write_config(out: &Path, config: &Config) -> Result<()> {
     let text = serde_json::to_string_pretty(config)?;
     let write =
@@ -220,10 +214,10 @@ pub fn write_config(out: &Path, config: &Config) -> Result<()> {
     Ok(subsplat::io::write_atomic(&out.join("config.json"), write)?)
 }
 
-/// The scene in each of `formats`; one report each.
+/// Writes the Gaussians in each of `formats`, and returns one report each.
 pub fn write_scene(
     out: &Path,
-    result: &Reconstruction,
+    splats: &Splats,
     formats: &[SceneFormatArg],
     options: &SaveOptions,
 ) -> Result<Vec<Value>> {
@@ -241,77 +235,10 @@ pub fn write_scene(
     }
     let one = |name: &&str| {
         let path = out.join(name);
-        let saved = save_splats(&path, &result.splats, options)?;
+        let saved = save_splats(&path, splats, options)?;
         let mut value = serde_json::to_value(&saved)?;
         value["file"] = json!(path.display().to_string());
         Ok(value)
     };
     names.iter().map(one).collect()
-}
-
-/// First words of the comment that carries how a scene is meant to be rendered.
-const NOTE: &str = "subsplat render:";
-
-/// `options` as a comment for a scene file; [`rendering`] reads it.
-pub fn note(options: &RasterOptions) -> String {
-    let convention = match options.convention {
-        Convention::Standard => "standard",
-        Convention::Mvsplat => "mvsplat",
-    };
-    let [r, g, b] = options.background;
-    format!(
-        "{NOTE} convention={convention} near={} lowpass={} background={r},{g},{b}",
-        options.near, options.lowpass
-    )
-}
-
-/// Convention, near plane, low-pass and background that [`note`] left among a file's
-/// comments.
-pub fn rendering(comments: &[String]) -> Option<RasterOptions> {
-    let text = comments.iter().find_map(|c| c.trim().strip_prefix(NOTE))?;
-    let value = |key: &str| text.split_whitespace().find_map(|w| w.strip_prefix(key));
-    let number = |key: &str| value(key)?.parse::<f32>().ok().filter(|v| v.is_finite());
-    let convention = match value("convention=")? {
-        "standard" => Convention::Standard,
-        "mvsplat" => Convention::Mvsplat,
-        _ => return None,
-    };
-    let near = number("near=").filter(|v| *v > 0.0)?;
-    let lowpass = number("lowpass=").filter(|v| *v >= 0.0)?;
-    let mut options = RasterOptions { near, lowpass, ..RasterOptions::new(convention) };
-    // Not in files of earlier versions.
-    let channels = value("background=").map(|v| v.split(',').map(str::parse::<f32>));
-    if let Some(Ok(rgb)) = channels.map(|all| all.collect::<Result<Vec<_>, _>>())
-        && let Ok(rgb) = <[f32; 3]>::try_from(rgb)
-        && rgb.iter().all(|v| (0.0..=1.0).contains(v))
-    {
-        options.background = rgb;
-    }
-    Some(options)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_scene_file_remembers_how_it_is_rendered() {
-        for (convention, near, lowpass) in
-            [(Convention::Standard, 0.01f32, 0.3f32), (Convention::Mvsplat, 1.25, 1.2)]
-        {
-            let background = [near.min(1.0), 0.25, 0.0];
-            let plain = RasterOptions::new(convention);
-            let options = RasterOptions { near, lowpass, background, ..plain };
-            assert_eq!(rendering(&["up is -y".to_owned(), note(&options)]), Some(options));
-        }
-        for bad in [
-            "",
-            "convention=gsplat near=1 lowpass=0.3",
-            "convention=standard near=-1 lowpass=0.3",
-            "convention=standard near=1 lowpass=nan",
-            "near=1 lowpass=0.3",
-        ] {
-            assert_eq!(rendering(&[format!("{NOTE} {bad}")]), None, "{bad}");
-        }
-    }
 }

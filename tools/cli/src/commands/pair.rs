@@ -1,4 +1,4 @@
-//! Two loose photographs and cameras from the command line.
+//! Two photographs with cameras from the command line.
 
 use super::args::{PairArgs, PoseConventionArg};
 use anyhow::{Context, Result, bail, ensure};
@@ -9,13 +9,12 @@ use subsplat::io::image::probe;
 use subsplat::io::matrices::{self, PoseConvention, parse_intrinsics, parse_matrix};
 use subsplat::io::scene::{Scene, SceneFormat, load_scene};
 
-/// The scene that `input` names: a scene's path, or two photographs with the cameras
-/// of `args`.
+/// Loads a scene, or makes one of two photographs with the cameras of `args`.
 pub fn load(input: &[PathBuf], args: &PairArgs) -> Result<Scene> {
     match input {
         [a, b] => of_photographs(a, b, args),
         [one] => {
-            if let Some(flag) = args.given() {
+            if let Some(flag) = args.first_flag() {
                 bail!("{flag}: only with two photographs; {} has its own cameras", one.display());
             }
             let is_picture = one.is_file() && probe(one).is_ok();
@@ -25,20 +24,20 @@ pub fn load(input: &[PathBuf], args: &PairArgs) -> Result<Scene> {
                 one.display()
             );
             let scene = load_scene(one)?;
-            let Some(asked) = args.pose_convention else { return Ok(scene) };
+            let Some(convention) = args.pose_convention else { return Ok(scene) };
             ensure!(
                 scene.source == SceneFormat::Matrices,
                 "--pose-convention: expected two photographs or a scene with poses.txt, got {} ({})",
                 one.display(),
                 scene.source.name()
             );
-            Ok(matrices::load(folder_of(one), asked.into())?)
+            Ok(matrices::load(folder_of(one), convention.into())?)
         }
         _ => bail!("expected a scene or two photographs, got {} paths", input.len()),
     }
 }
 
-/// The folder of a scene that is named by it or by its pose file.
+/// The folder of a scene, given the folder or its pose file.
 pub fn folder_of(scene: &Path) -> &Path {
     let parent = || scene.parent().filter(|p| !p.as_os_str().is_empty());
     if scene.is_dir() { scene } else { parent().unwrap_or(Path::new(".")) }
@@ -55,8 +54,8 @@ impl From<PoseConventionArg> for PoseConvention {
 }
 
 impl PairArgs {
-    /// A flag of these that was given and that only photographs have a use for.
-    pub(super) fn given(&self) -> Option<&'static str> {
+    /// The first of these flags on the command line; each applies to photographs only.
+    pub(super) fn first_flag(&self) -> Option<&'static str> {
         let flags = [
             (self.fov.is_some(), "--fov"),
             (self.intrinsics.is_some(), "--intrinsics"),
@@ -69,7 +68,7 @@ impl PairArgs {
     }
 }
 
-/// The scene of photographs `a` and `b`.
+/// Makes a scene of photographs `a` and `b`.
 fn of_photographs(a: &Path, b: &Path, args: &PairArgs) -> Result<Scene> {
     ensure!(
         args.pose_convention.is_none() || args.pose_a.is_some() || args.pose_b.is_some(),
@@ -84,8 +83,8 @@ fn of_photographs(a: &Path, b: &Path, args: &PairArgs) -> Result<Scene> {
     let pose_b = match &args.pose_b {
         Some(text) => pose(text, "--pose-b", convention)?,
         None if args.translation.is_none() => bail!(
-            "two photographs need to know where the second camera stands: give --move X,Y,Z (and \
-             --turn RX,RY,RZ) in the first camera's frame, or --pose-b, or a scene with a pose file"
+            "two photographs need the pose of the second camera: give --move X,Y,Z (and --turn \
+             RX,RY,RZ) in the first camera's frame, or --pose-b, or a scene with a pose file"
         ),
         None => {
             pose_a * relative(args.translation.unwrap_or_default(), args.turn.unwrap_or_default())
@@ -105,7 +104,7 @@ fn pose(text: &str, flag: &str, convention: PoseConvention) -> Result<Mat4> {
     Ok(convention.to_world_from_camera(matrix).as_mat4())
 }
 
-/// Pose of the second camera in the first one's frame.
+/// Computes the pose of the second camera in the first one's frame.
 fn relative(translation: [f32; 3], turn: [f32; 3]) -> Mat4 {
     let [x, y, z] = turn.map(f32::to_radians);
     let rotation = Quat::from_euler(EulerRot::XYZ, x, y, z);

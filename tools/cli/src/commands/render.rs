@@ -1,41 +1,40 @@
-//! `subsplat render`: a finished scene to pictures.
+//! `subsplat render`: renders pictures of a finished scene.
 
-use super::args::{LookArgs, LowpassArg, PathArg, RenderArgs};
+use super::args::{LowpassArg, PathArg, RenderArgs, RenderingArgs};
 use super::frames;
 use super::memory;
-use super::output::{self, to_rgb8};
-use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, say, warn};
+use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, print_line, print_warning};
 use anyhow::{Context, Result, ensure};
 use serde_json::json;
 use std::path::Path;
 use subsplat::abi::{Convention, RasterOptions};
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::io::cameras_json::{is_cameras_json, load_cameras_json};
-use subsplat::io::image::{Depth, save_depth_png, save_png};
+use subsplat::io::image::{Depth, Rgb, save_depth_png, save_png};
 use subsplat::io::load_with_comments;
 use subsplat::io::scene::load_scene;
 use subsplat::navigation::Bounds;
-use subsplat::render::Renderer;
+use subsplat::render::{Renderer, options_of_comments};
 use subsplat::splats::Splats;
 
-/// Side of a picture where no camera says otherwise, px.
+/// Side of a picture without a camera, px.
 const DEFAULT_SIDE: usize = 512;
-/// Horizontal field of view of the view that is made up where there is no camera.
+/// Horizontal field of view of a picture without a camera.
 const DEFAULT_FOV_X: f32 = 0.9;
 
 /// `--background`, checked.
-pub fn background(look: &LookArgs) -> Result<Option<[f32; 3]>> {
-    if let Some([r, g, b]) = look.background {
+pub fn background(args: &RenderingArgs) -> Result<Option<[f32; 3]>> {
+    if let Some([r, g, b]) = args.background {
         let ok = [r, g, b].iter().all(|v| (0.0..=1.0).contains(v));
         ensure!(ok, "--background: expected three numbers in [0, 1], got {r},{g},{b}");
     }
-    Ok(look.background)
+    Ok(args.background)
 }
 
-/// The renderer that is asked for, or the CPU's with a warning.
-pub fn open(look: &LookArgs) -> Renderer {
-    let mut renderer = Renderer::open_or_cpu(&look.device);
-    renderer.take_warning().iter().for_each(warn);
+/// Opens the renderer of `--device`; where that fails, prints a warning and uses the CPU.
+pub fn open(args: &RenderingArgs) -> Renderer {
+    let mut renderer = Renderer::open_or_cpu(&args.device);
+    renderer.take_warning().iter().for_each(print_warning);
     renderer
 }
 
@@ -46,19 +45,19 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
     let (splats, comments) = progress.stage("scene", |_| load_with_comments(&args.scene))?;
     let cameras = cameras(args, &splats)?;
     check_sizes(&cameras)?;
-    let options = options(&args.look, args.near, args.sh_degree, &comments)?;
+    let options = options(&args.rendering, args.near, args.sh_degree, &comments)?;
     let folder = if args.depth { args.out.join("depth") } else { args.out.clone() };
     std::fs::create_dir_all(&folder)
         .with_context(|| format!("output folder {}", folder.display()))?;
     let mut views = Vec::new();
-    let mut renderer = open(&args.look);
+    let mut renderer = open(&args.rendering);
     progress.steps("rendering", cameras.len(), |bar| {
         for (name, camera) in &cameras {
             let picture = renderer.render(&splats, camera, &options);
-            renderer.take_warning().iter().for_each(warn);
+            renderer.take_warning().iter().for_each(print_warning);
             let (width, height) = (picture.width, picture.height);
             let file = args.out.join(format!("{name}.png"));
-            save_png(&file, &to_rgb8(&picture.rgb, width, height))?;
+            save_png(&file, &Rgb::from(&picture))?;
             let file = file.display().to_string();
             let mut view = json!({ "file": file, "width": width, "height": height });
             if args.depth {
@@ -94,21 +93,21 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
     }))
 }
 
-/// What is wrong with the arguments themselves, before a large file is read.
+/// Checks the arguments before a large file is read.
 fn check(args: &RenderArgs) -> Result<()> {
-    background(&args.look)?;
+    background(&args.rendering)?;
     ensure!(args.sh_degree <= 4, "--sh-degree: expected 0 to 4, got {}", args.sh_degree);
     check_near(args.near)?;
     frames::count(args.frames)?;
     args.size.as_deref().map_or(Ok(()), |text| memory::check_picture("--size", frames::size(text)?))
 }
 
-/// Refuses cameras of a file whose pictures the machine cannot hold, by the frame's name.
+/// Rejects cameras whose pictures exceed the memory, with the frame's name.
 fn check_sizes(cameras: &[(String, Camera)]) -> Result<()> {
     let mut fits = None;
     for (name, camera) in cameras {
         let size = (camera.intrinsics.width, camera.intrinsics.height);
-        // A path has thousands of one size.
+        // A path has thousands of cameras of one size.
         if fits != Some(size) {
             memory::check_picture(&format!("frame {name}:"), size)?;
             fits = Some(size);
@@ -124,25 +123,28 @@ pub fn check_near(near: Option<f32>) -> Result<()> {
     Ok(())
 }
 
-/// The arguments', else what `run` noted in the file, else the standard.
+/// Rules to render a scene file: the arguments, then the comment that `run` wrote, then the
+/// standard.
 pub fn options(
-    look: &LookArgs,
+    args: &RenderingArgs,
     near: Option<f32>,
     sh_degree: usize,
     comments: &[String],
 ) -> Result<RasterOptions> {
-    let noted = output::rendering(comments);
-    let asked = look.convention.map(Convention::from);
-    // What was noted for one convention says nothing about the other.
-    let mut options = match noted.filter(|n| asked.is_none_or(|a| a == n.convention)) {
-        Some(noted) => noted,
-        None => RasterOptions::new(asked.unwrap_or(Convention::Standard)),
+    let stored = options_of_comments(comments);
+    let wanted = args.convention.map(Convention::from);
+    // Options of one convention do not apply to the other.
+    let mut options = match stored.filter(|s| wanted.is_none_or(|w| w == s.convention)) {
+        Some(stored) => stored,
+        None => RasterOptions::new(wanted.unwrap_or(Convention::Standard)),
     };
     options.near = near.unwrap_or(options.near);
     options.sh_degree = sh_degree;
-    options.background = background(look)?.unwrap_or(options.background);
-    if matches!(look.lowpass_ref, Some(LowpassArg::Input)) {
-        warn("--lowpass-ref input: a scene file does not know its input's size; ignored");
+    options.background = background(args)?.unwrap_or(options.background);
+    if matches!(args.lowpass_ref, Some(LowpassArg::Input)) {
+        print_warning(
+            "--lowpass-ref input: ignored, since a scene file does not state its input's size",
+        );
     }
     Ok(options)
 }
@@ -191,7 +193,9 @@ fn named_cameras(args: &RenderArgs, splats: &Splats) -> Result<Vec<(String, Came
                 args.target.is_empty(),
                 "--target: expected --cameras or cameras.json beside the scene"
             );
-            say("no cameras given and no cameras.json beside the scene: a view of the whole");
+            print_line(
+                "no cameras given and no cameras.json beside the scene: a view of the whole",
+            );
             return Ok(vec![("view".to_owned(), whole(splats)?)]);
         }
     };
@@ -221,11 +225,11 @@ pub fn read_cameras(source: &Path) -> Result<Vec<(String, Camera)>> {
         return Ok(content.cameras.iter().map(|c| (name(&c.file), c.camera)).collect());
     }
     let scene = load_scene(source)?;
-    scene.warnings.iter().for_each(warn);
+    scene.warnings.iter().for_each(print_warning);
     scene.frames.iter().map(|f| Ok((f.name.clone(), f.pinhole()?))).collect()
 }
 
-/// Of the splats in front of `camera`, camera z; 1 where there is none.
+/// Median camera z of the splats in front of `camera`; 1 without any.
 pub fn median_depth(splats: &Splats, camera: &Camera) -> f32 {
     let mut z: Vec<f32> = (0..splats.len())
         .map(|i| camera.to_camera(splats.mean(i).into()).z)
@@ -235,12 +239,12 @@ pub fn median_depth(splats: &Splats, camera: &Camera) -> f32 {
     z.get(z.len() / 2).copied().unwrap_or(1.0)
 }
 
-/// The middle of a scene's splats.
+/// Bounds of a scene's splats without outliers.
 pub fn bounds(splats: &Splats) -> Result<Bounds> {
     Bounds::of((0..splats.len()).map(|i| splats.mean(i))).context("the scene holds no Gaussian")
 }
 
-/// A camera that looks along +z at the middle 96 % of the means.
+/// A camera along +z that shows the central 96 % of the means.
 pub fn whole(splats: &Splats) -> Result<Camera> {
     let Camera { intrinsics, world_from_camera } =
         bounds(splats)?.camera(DEFAULT_FOV_X, DEFAULT_SIDE);

@@ -1,105 +1,78 @@
 //! `subsplat run`: photographs to Gaussians, views and files.
 
-use super::args::{DetailArg, LookArgs, LowpassArg, PathArg, RunArgs};
+use super::args::{LowpassArg, PathArg, RenderingArgs, RunArgs};
 use super::output::{self, Scored, View, Views};
-use super::{frames, memory, model, pair, range, render};
-use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, say, warn};
+use super::reconstruct::{self, reconstruct};
+use super::{frames, memory, model, pair, render};
+use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, print_line, print_warning};
 use anyhow::{Result, bail, ensure};
-use indicatif::ProgressBar;
 use serde_json::{Value, json};
 use std::path::Path;
 use subsplat::abi::{Convention, RasterOptions};
 use subsplat::camera::Camera;
-use subsplat::check::PairReport;
 use subsplat::config::{Config, LowpassRef};
-use subsplat::data::crop::Cropped;
-use subsplat::data::depth::{DepthRange, depth_range};
 use subsplat::data::pair::choose_pair;
 use subsplat::io::SaveOptions;
+use subsplat::io::image::Rgb;
 use subsplat::io::scene::Scene;
-use subsplat::ops::Backend;
-use subsplat::pipeline::{self, Photo, Reconstruction, Reconstructor, Request};
+use subsplat::pipeline::Backend;
+use subsplat::pipeline::is_mvsplat;
+use subsplat::render::comment_of_options;
 use subsplat::splats::Splats;
+use subsplat::{Detail, Options, Photo, Reconstruction, Reconstructor, Warning};
 
-/// Most targets that are chosen without being asked for.
+/// Largest number of targets by default.
 const DEFAULT_TARGETS: usize = 30;
 
-/// What to do, settled before the first second of work.
+/// Checked arguments.
 struct Plan {
     scene: Scene,
     context: Vec<usize>,
-    input_size: (usize, usize),
+    options: Options,
 }
 
 /// Runs the command.
 pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
     let plan = plan(args, &mut progress)?;
-    let given = (args.source.near, args.source.far);
-    // Refuses early what was given; its guesses may give way to matched points below.
-    let guess = depth_range(&plan.scene, &plan.context, given)?;
-    let backend = backend(&args.look.device);
-    let model = progress
-        .stage("model", |_| model::load(&model::Asked::of(&args.source)))?
-        .with_backend(&backend);
-    let (w, h) = plan.input_size;
+    let backend = backend(&args.rendering.device);
+    let request = model::ModelRequest::from_source(&args.source);
+    let model = progress.stage("model", |_| model::load(&request))?.with_backend(&backend);
+    let (w, h) = plan.options.input_size;
     check_size(&model, plan.context.len(), (w, h))?;
     let r = model.config().upscale;
     let targets = targets(args, &plan, (w * r, h * r))?;
     output::prepare(&args.out, &args.input[0], &plan.scene)?;
     let photos = photographs(&plan.scene, &plan.context, &mut progress)?;
-    let reports = match args.source.no_check {
-        true => Vec::new(),
-        false => progress.stage("check", |_| pipeline::check_photos(&photos))?,
-    };
-    let range = range::refine(guess, given, &reports);
-    let request = Request {
-        input_size: plan.input_size,
-        near_far: (range.near, range.far),
-        detail: args.source.detail == DetailArg::Photo,
-        look: given == (None, None),
-    };
-    let mut result = progress.stage("network", |bar: &ProgressBar| {
-        model.reconstruct_with(&photos, &request, &mut |name| bar.set_message(name))
-    })?;
-    drop(photos);
-    keeps_some(&result.splats, args.min_opacity)?;
-    let range = range::looked(range, &result);
-    progress.split_last(&result.seconds);
-    result.warnings.extend(backend.warning());
-    result.warnings.iter().for_each(warn);
-    let detailed = request.detail && result.inputs.iter().any(pipeline::has_detail);
-    if detailed {
-        say("children take detail from the photographs (--detail off: from the network alone)");
-    }
-    let options = raster_options(&args.look, model.config(), (range.near, &result.inputs));
+    let result = reconstruct(&model, photos, &plan.options, &mut progress)?;
+    check_opacity(result.splats(), args.min_opacity)?;
+    let options = raster_options(&args.rendering, model.config(), &result);
     let views = views(args, &targets, &result)?;
     let job = Views {
         out: &args.out,
         scene: &plan.scene,
-        crop: model.crop_options(plan.input_size),
+        crop: model.crop_options(plan.options.input_size),
         options,
     };
-    let mut renderer = render::open(&args.look);
+    let mut renderer = render::open(&args.rendering);
     let scored = progress
         .steps("rendering", views.len(), |bar| job.render(&mut renderer, &result, &views, bar))?;
     let files = progress.stage("writing", |_| {
-        let near_far = (range.near, range.far);
+        let bounds = result.depth_range();
         output::write_config(&args.out, model.config())?;
-        output::write_cameras(&args.out, &scored, plan.scene.units, near_far)?;
+        output::write_cameras(&args.out, &scored, plan.scene.units, (bounds.near, bounds.far))?;
         let save = SaveOptions {
             min_opacity: args.min_opacity,
-            comments: vec![output::note(&options)],
+            comments: vec![comment_of_options(&options)],
             ..SaveOptions::default()
         };
-        output::write_scene(&args.out, &result, &args.save, &save)
+        output::write_scene(&args.out, result.splats(), &args.save, &save)
     })?;
-    let done = Done { range, reports, model, result, detailed, options, scored, files };
-    done.finish(args, &plan, progress, answer)
+    Done { model, result, options, scored, files }.finish(args, &plan, progress, answer)
 }
 
-/// Refuses a least opacity that leaves nothing to save, before any picture is rendered.
-fn keeps_some(splats: &Splats, least: f32) -> Result<()> {
+/// Rejects a least opacity that leaves nothing to save, before any picture is rendered.
+fn check_opacity(splats: &Splats, least: f32) -> Result<()> {
     let opacities = (0..splats.len()).map(|i| splats.opacity(i));
     let most = opacities.fold(0.0f32, f32::max);
     ensure!(
@@ -110,18 +83,18 @@ fn keeps_some(splats: &Splats, least: f32) -> Result<()> {
     Ok(())
 }
 
-/// The kernels of `device`, or the CPU's with a warning where that fails.
+/// Opens `device`; where that fails, prints a warning and returns the CPU.
 fn backend(device: &str) -> Backend {
     Backend::open(device).unwrap_or_else(|e| {
-        warn(format!("{e}; reconstructing on the CPU"));
+        print_warning(format!("{e}; reconstructing on the CPU"));
         Backend::Cpu
     })
 }
 
-/// Everything that can be wrong with the arguments and the scene is found here.
+/// Checks the arguments and reads the scene.
 fn plan(args: &RunArgs, progress: &mut Progress) -> Result<Plan> {
-    let input_size = frames::size(&args.source.input_size)?;
-    render::background(&args.look)?;
+    frames::size(&args.source.input_size)?;
+    render::background(&args.rendering)?;
     frames::count(args.frames)?;
     ensure!(
         (0.0..1.0).contains(&args.min_opacity),
@@ -129,22 +102,23 @@ fn plan(args: &RunArgs, progress: &mut Progress) -> Result<Plan> {
         args.min_opacity
     );
     let scene = progress.stage("scene", |_| pair::load(&args.input, &args.source.pair))?;
-    scene.warnings.iter().for_each(warn);
-    let (context, why) = context(&args.source.context, &args.input[0], &scene)?;
+    scene.warnings.iter().for_each(print_warning);
+    let (context, reason) = context(&args.source.context, &args.input[0], &scene)?;
     ensure!(
         args.path == PathArg::Targets || args.target.is_empty(),
         "--target: only with --path targets"
     );
-    say(format!(
-        "{}: {} frames ({}); context {why}",
+    print_line(format!(
+        "{}: {} frames ({}); context {reason}",
         scene.name,
         scene.frames.len(),
         scene.source.name(),
     ));
-    Ok(Plan { scene, context, input_size })
+    let options = reconstruct::options(&args.source, &scene, &context)?;
+    Ok(Plan { scene, context, options })
 }
 
-/// The model's network takes inputs of this size, and the machine holds so many.
+/// Rejects inputs that are too small for the network or too large for the memory.
 pub fn check_size(model: &Reconstructor, views: usize, (w, h): (usize, usize)) -> Result<()> {
     let stride = model.config().stride();
     ensure!(
@@ -154,7 +128,7 @@ pub fn check_size(model: &Reconstructor, views: usize, (w, h): (usize, usize)) -
     memory::check_run(model.config(), views, (w, h))
 }
 
-/// The photographs of a scene's `context` frames.
+/// Loads the photographs of a scene's `context` frames.
 pub fn photographs(
     scene: &Scene,
     context: &[usize],
@@ -169,12 +143,12 @@ pub fn photographs(
     })
 }
 
-/// Context frames of the scene at `input`, `asked` where that is not empty, and how they
-/// were chosen.
-pub fn context(asked: &[String], input: &Path, scene: &Scene) -> Result<(Vec<usize>, String)> {
+/// Chooses the context frames of the scene at `input`: those of `named`, or a default. Returns
+/// the reason for the choice too.
+pub fn context(named: &[String], input: &Path, scene: &Scene) -> Result<(Vec<usize>, String)> {
     let list = |frames: &[usize]| frames.iter().map(usize::to_string).collect::<Vec<_>>().join(",");
-    if !asked.is_empty() {
-        let chosen = frames::indices(scene, asked, "--context")?;
+    if !named.is_empty() {
+        let chosen = frames::indices(scene, named, "--context")?;
         ensure!(chosen.len() >= 2, "--context: expected at least 2 frames, got {}", chosen.len());
         for (n, i) in chosen.iter().enumerate() {
             let name = &scene.frames[*i].name;
@@ -206,7 +180,7 @@ pub fn context(asked: &[String], input: &Path, scene: &Scene) -> Result<(Vec<usi
     Ok((pair.frames.to_vec(), text))
 }
 
-/// Frames to render, given the size of the pictures; empty for a path.
+/// Frames to render as pictures of `size`; empty for a path.
 fn targets(args: &RunArgs, plan: &Plan, size: (usize, usize)) -> Result<Vec<usize>> {
     if args.path != PathArg::Targets {
         return Ok(Vec::new());
@@ -216,14 +190,17 @@ fn targets(args: &RunArgs, plan: &Plan, size: (usize, usize)) -> Result<Vec<usiz
         true => default_targets(&args.input[0], plan, size)?,
     };
     if chosen.is_empty() {
-        say(format!("no target frames: {} views from the first context to the last", args.frames));
+        print_line(format!(
+            "no target frames: {} views from the first context to the last",
+            args.frames
+        ));
     }
     Ok(chosen)
 }
 
-/// The protocol's targets for these contexts, else frames between them, spread evenly
-/// where they are many. A protocol may have targets of several sizes: the
-/// smallest photographs that are no smaller than `size`, else the largest.
+/// The protocol's targets for these contexts; without any, frames between the contexts, spread
+/// evenly. Among a protocol's targets of several sizes, the smallest photographs that are no
+/// smaller than `size` are chosen, or else the largest.
 fn default_targets(input: &Path, plan: &Plan, size: (usize, usize)) -> Result<Vec<usize>> {
     let Plan { scene, context, .. } = plan;
     let misfit = |targets: &[usize]| {
@@ -244,9 +221,9 @@ fn default_targets(input: &Path, plan: &Plan, size: (usize, usize)) -> Result<Ve
 }
 
 fn views(args: &RunArgs, targets: &[usize], result: &Reconstruction) -> Result<Vec<View>> {
-    let inputs: Vec<Camera> = result.inputs.iter().map(|c| c.target_camera).collect();
+    let inputs: Vec<Camera> = result.inputs().iter().map(|c| c.target_camera).collect();
     let path = match args.path {
-        PathArg::Orbit => frames::orbit(&inputs, median(&result.depths[0].data), args.frames)?,
+        PathArg::Orbit => frames::orbit(&inputs, median(&result.depths()[0].data), args.frames)?,
         PathArg::Targets if !targets.is_empty() => {
             return Ok(targets.iter().map(|&i| View::Frame(i)).collect());
         }
@@ -255,43 +232,41 @@ fn views(args: &RunArgs, targets: &[usize], result: &Reconstruction) -> Result<V
     Ok(path.into_iter().map(View::Path).collect())
 }
 
-/// The middle value; 1 where there is none.
+/// The median; 1 without any value.
 pub fn median(values: &[f32]) -> f32 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f32::total_cmp);
     sorted.get(sorted.len() / 2).copied().unwrap_or(1.0)
 }
 
-/// How Gaussians of a model with `config` are rendered, by the arguments and else as the
-/// model and its inputs say.
+/// Rules to render a reconstruction of a model with `config`, with the arguments in place of the
+/// model's own.
 pub fn raster_options(
-    look: &LookArgs,
+    args: &RenderingArgs,
     config: &Config,
-    (near, inputs): (f32, &[Cropped]),
+    result: &Reconstruction,
 ) -> RasterOptions {
     let mut config = config.clone();
-    if let Some(convention) = look.convention {
+    if let Some(convention) = args.convention {
         config.render.convention = convention.into();
     }
-    if let Some(reference) = look.lowpass_ref {
+    if let Some(reference) = args.lowpass_ref {
         config.render.lowpass_ref = match reference {
             LowpassArg::Target => LowpassRef::Target,
             LowpassArg::Input => LowpassRef::Input,
         };
     }
-    let mut options = pipeline::raster_options(&config, near, inputs);
-    options.background = look.background.unwrap_or(options.background);
+    let colour = Rgb::mean_colour(result.inputs().iter().map(|c| &c.input));
+    let near = result.depth_range().near;
+    let mut options = config.raster_options(config.upscale as f32, near, colour);
+    options.background = args.background.unwrap_or(options.background);
     options
 }
 
-/// Everything that the report names.
+/// The results of a run.
 struct Done {
-    range: DepthRange,
-    reports: Vec<PairReport>,
     model: Reconstructor,
     result: Reconstruction,
-    /// Whether photographs added detail.
-    detailed: bool,
     options: RasterOptions,
     scored: Vec<Scored>,
     files: Vec<Value>,
@@ -310,30 +285,31 @@ impl Done {
             let k = c.intrinsics;
             json!({ "width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy })
         };
-        let inputs = &self.result.inputs;
+        let result = &self.result;
+        let bounds = result.depth_range();
         let name = |i: &usize| plan.scene.frames[*i].name.clone();
         let config = self.model.config();
         let mvsplat_rules = self.options.convention == Convention::Mvsplat;
         json!({
             "scene": plan.scene.name,
             "context": plan.context.iter().map(name).collect::<Vec<_>>(),
-            "near": self.range.near,
-            "far": self.range.far,
-            "near_far_from": self.range.reason,
-            "check": range::report(&self.reports),
-            "input_intrinsics": inputs.iter().map(|c| camera(&c.input_camera)).collect::<Vec<_>>(),
-            "backbone": if pipeline::is_mvsplat(config) { "re10k" } else { "small" },
+            "near": bounds.near,
+            "far": bounds.far,
+            "near_far_from": bounds.source.to_string(),
+            "check": reconstruct::report(result.reports()),
+            "input_intrinsics": result.inputs().iter().map(|c| camera(&c.input_camera)).collect::<Vec<_>>(),
+            "backbone": if is_mvsplat(config) { "re10k" } else { "small" },
             "upscale": config.upscale,
             "convention": if mvsplat_rules { "mvsplat" } else { "standard" },
             "weights": args.source.weights.as_ref().map(|p| p.display().to_string()),
             "seed": args.source.seed,
             "untrained_tensors": self.model.untrained_tensors().len(),
-            "detail": self.detailed,
-            "gaussians": self.result.splats.len(),
+            "detail": result.detail() == Detail::Photographs,
+            "gaussians": result.splats().len(),
             "targets": self.scored.iter().map(Scored::json).collect::<Vec<_>>(),
             "psnr": self.mean(|s| s.psnr),
             "ssim": self.mean(|s| s.ssim),
-            "warnings": self.result.warnings,
+            "warnings": result.warnings().iter().map(Warning::to_string).collect::<Vec<_>>(),
             "files": self.files,
         })
     }
@@ -348,10 +324,10 @@ impl Done {
         let path = args.out.join("metrics.json");
         let text = serde_json::to_string_pretty(&report)?;
         subsplat::io::write_atomic(&path, |f| std::io::Write::write_all(f, text.as_bytes()))?;
-        self.scores(answer);
+        self.print_scores(answer);
         answer.line(format!(
             "{} Gaussians, {} views in {}; {total:.1} s{}",
-            self.result.splats.len(),
+            self.result.splats().len(),
             self.scored.len(),
             args.out.display(),
             peak.map_or(String::new(), |p| format!(", peak memory {}", mebibytes(p)))
@@ -359,7 +335,7 @@ impl Done {
         answer.finish(&report)
     }
 
-    fn scores(&self, answer: Answer) {
+    fn print_scores(&self, answer: Answer) {
         let cell = |v: Option<f64>, digits: usize| {
             v.map_or_else(|| format!("{:>6}", "-"), |v| format!("{v:6.digits$}"))
         };

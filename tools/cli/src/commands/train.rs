@@ -2,7 +2,7 @@
 
 use super::args::TrainArgs;
 use super::tensorboard::Board;
-use crate::report::{Answer, mebibytes, say, warn};
+use crate::report::{Answer, mebibytes, print_line, print_warning};
 use anyhow::{Result, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
@@ -65,14 +65,14 @@ pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
     watch.bar.finish_and_clear();
     outcome?;
     if let Some(e) = unwritten {
-        warn(format!("{e:#}: TensorBoard's file ends there"));
+        print_warning(format!("{e:#}: TensorBoard's file ends there"));
     }
     let progress = training.progress();
     // None before the first checkpoint.
     let weights = Some(args.out.join("weights.safetensors")).filter(|file| file.is_file());
     let place = weights.as_ref().map(|file| format!("; weights in {}", file.display()));
     let (done, steps) = (progress.step, config.steps);
-    say(format!("{done} of {steps} steps done{}", place.unwrap_or_default()));
+    print_line(format!("{done} of {steps} steps done{}", place.unwrap_or_default()));
     answer.finish(&json!({
         "step": progress.step,
         "steps": config.steps,
@@ -125,7 +125,7 @@ impl Watch {
     fn hear(&mut self, event: &Event) {
         match event {
             Event::Begin { step, parameters, resumed, untrained, warnings } => {
-                warnings.iter().for_each(warn);
+                warnings.iter().for_each(print_warning);
                 self.first = *step;
                 self.started = Instant::now();
                 match resumed {
@@ -139,7 +139,7 @@ impl Watch {
             }
             Event::Step(report) => self.step(report),
             Event::Skipped { step } => {
-                warn(format!("step {step}: loss or gradient not finite, skipped"));
+                print_warning(format!("step {step}: loss or gradient not finite, skipped"));
             }
             Event::Saved(path) => self.tell(&format!("saved {}", path.display())),
             Event::Validated { step, rooms, photos } => {
@@ -153,7 +153,7 @@ impl Watch {
     }
 
     fn tell(&self, line: &str) {
-        self.bar.suspend(|| say(line));
+        self.bar.suspend(|| print_line(line));
     }
 
     fn step(&mut self, report: &StepReport) {
@@ -172,7 +172,7 @@ impl Watch {
             return;
         }
         self.shown = Instant::now();
-        say(format!("step {} {}", report.step, self.line(report)));
+        print_line(format!("step {} {}", report.step, self.line(report)));
         self.lines += 1;
         if self.lines.is_multiple_of(PROFILE_EVERY) {
             self.show_profile();
@@ -206,7 +206,7 @@ impl Watch {
         let share = |s: f64| s / steps.max(1) as f64;
         let list: Vec<String> =
             parts.iter().map(|(name, s)| format!("{name} {:.3}", share(*s))).collect();
-        say(format!("  seconds a step: {}", list.join(", ")));
+        print_line(format!("  seconds a step: {}", list.join(", ")));
     }
 }
 

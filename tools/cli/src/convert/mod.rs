@@ -7,7 +7,7 @@ mod plan;
 mod source;
 
 use crate::failure;
-use crate::report::{Answer, mebibytes, peak_memory_bytes, warn};
+use crate::report::{Answer, mebibytes, peak_memory_bytes, print_warning};
 use anyhow::{Context, Result, ensure};
 use args::Args;
 use clap::Parser;
@@ -22,19 +22,19 @@ use subsplat::config::Config;
 use subsplat::io;
 use subsplat::io::tensors::{TensorSpec, write_tensors};
 
-/// Names told of each list; `--json` has them all.
-const NAMES_TOLD: usize = 3;
+/// Names that are printed of each list; `--json` has all of them.
+const NAMES_PRINTED: usize = 3;
 
 /// Runs the program with the process's arguments and returns its exit code.
 pub fn main() -> ExitCode {
     let args = match Args::try_parse() {
         Ok(args) => args,
-        Err(error) => return failure::refuse(&error),
+        Err(error) => return failure::report_usage(&error),
     };
     let answer = Answer::new(args.json);
     match run(&args, answer) {
         Ok(()) => ExitCode::SUCCESS,
-        Err(error) => failure::tell(&error, answer),
+        Err(error) => failure::report_error(&error, answer),
     }
 }
 
@@ -46,11 +46,11 @@ fn run(args: &Args, answer: Answer) -> Result<()> {
     let plan = plan::plan(args, &sources)?;
     let to = Float::from(args.dtype);
     let done = write(&args.output, &plan, &sources, to)?;
-    tell(answer, args, &plan, &sources, &done);
+    print_summary(answer, args, &plan, &sources, &done);
     answer.finish(&report(args, &plan, &sources, &done))
 }
 
-/// Refuses, before any work, an output that would replace something.
+/// Rejects, before any work, an output that would replace a file.
 fn check_output(output: &Path, inputs: &[&Path], force: bool) -> Result<()> {
     let shown = output.display();
     let named = output.extension().is_some_and(|e| e.eq_ignore_ascii_case("safetensors"));
@@ -62,7 +62,7 @@ fn check_output(output: &Path, inputs: &[&Path], force: bool) -> Result<()> {
     Ok(())
 }
 
-/// What was written.
+/// Statistics of the file that was written.
 struct Done {
     parameters: usize,
     /// Tensors of each type in the inputs.
@@ -96,7 +96,7 @@ fn write(output: &Path, plan: &Plan, sources: &[Source], to: Float) -> Result<Do
     Ok(Done { parameters, dtypes_in, bytes })
 }
 
-/// Where the weights come from and what they are for, for whoever finds the file later.
+/// Metadata of the file: kind, source and configuration of the weights.
 fn metadata(plan: &Plan, sources: &[Source]) -> Result<BTreeMap<String, String>> {
     let join = |of: &dyn Fn(&Source) -> String| -> String {
         sources.iter().map(of).collect::<Vec<_>>().join(", ")
@@ -116,7 +116,7 @@ fn metadata(plan: &Plan, sources: &[Source]) -> Result<BTreeMap<String, String>>
     Ok(metadata)
 }
 
-/// The lists that people and programs are told of.
+/// The lists of names in both reports, with their descriptions.
 fn lists(plan: &Plan) -> [(&'static str, &[String], &'static str); 4] {
     [
         ("missing", &plan.missing, "of the architecture are missing"),
@@ -126,7 +126,7 @@ fn lists(plan: &Plan) -> [(&'static str, &[String], &'static str); 4] {
     ]
 }
 
-fn tell(answer: Answer, args: &Args, plan: &Plan, sources: &[Source], done: &Done) {
+fn print_summary(answer: Answer, args: &Args, plan: &Plan, sources: &[Source], done: &Done) {
     for source in sources {
         let inside = source.inside.map_or_else(String::new, |key| format!(", weights at `{key}`"));
         answer.line(format!(
@@ -149,11 +149,12 @@ fn tell(answer: Answer, args: &Args, plan: &Plan, sources: &[Source], done: &Don
         }
     }
     for (key, names, what) in lists(plan).into_iter().filter(|(_, names, _)| !names.is_empty()) {
-        let told: Vec<String> = names.iter().take(NAMES_TOLD).map(|n| format!("`{n}`")).collect();
-        let dots = if names.len() > NAMES_TOLD { ", …" } else { "" };
-        let line = format!("{} tensors {what}: {}{dots}", names.len(), told.join(", "));
+        let first: Vec<String> =
+            names.iter().take(NAMES_PRINTED).map(|n| format!("`{n}`")).collect();
+        let dots = if names.len() > NAMES_PRINTED { ", …" } else { "" };
+        let line = format!("{} tensors {what}: {}{dots}", names.len(), first.join(", "));
         match key {
-            "missing" | "unexpected" => warn(line),
+            "missing" | "unexpected" => print_warning(line),
             _ => answer.line(format!("  {line}")),
         }
     }

@@ -8,6 +8,8 @@ mod convert;
 mod devices;
 mod eval_cli;
 mod program;
+mod readme;
+mod readme_snippet;
 mod train;
 #[cfg(feature = "view")]
 mod view;

@@ -1,4 +1,4 @@
-//! A window's surface, and the GPU that draws on it.
+//! The surface of a window, and the GPU that draws on it.
 
 use anyhow::{Context, Result, anyhow, ensure};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -9,29 +9,29 @@ use subsplat::io::image::Rgb;
 use wgpu::CurrentSurfaceTexture as Current;
 use winit::window::Window;
 
-/// Formats that frames are drawn in and read back from, best first; the others of a surface
-/// are deep or wide colour.
+/// Formats for drawing and reading back, best first. A surface's other formats have deep or wide
+/// colour.
 const FORMATS: [wgpu::TextureFormat; 4] = [
     wgpu::TextureFormat::Bgra8Unorm,
     wgpu::TextureFormat::Rgba8Unorm,
     wgpu::TextureFormat::Bgra8UnormSrgb,
     wgpu::TextureFormat::Rgba8UnormSrgb,
 ];
-/// Bytes to which rows of a texture are padded in a copy.
+/// Alignment of a texture's rows in a copy, bytes.
 const ROW: u32 = wgpu::COPY_BYTES_PER_ROW_ALIGNMENT;
 
-/// What became of a frame.
+/// Result of a frame.
 pub enum Frame {
-    /// It is on the window; what it shows, if that was asked for.
+    /// The window shows it; with its pixels where they were requested.
     Shown(Option<Rgb>),
-    /// The window has no place for it now (hidden, being resized): try again.
+    /// The window has no texture now (hidden, being resized).
     Skipped,
 }
 
-/// What the driver said outside of any call.
+/// Error that the driver reported outside of a call.
 type Fault = Arc<Mutex<Option<String>>>;
 
-/// A window that is drawn on.
+/// A window with its GPU.
 pub struct Canvas {
     window: Arc<Window>,
     instance: wgpu::Instance,
@@ -50,7 +50,7 @@ fn surface_of(
     instance.create_surface(target)
 }
 
-/// What a surface on this adapter is set to.
+/// Configuration of a surface on this adapter.
 fn configuration(
     caps: &wgpu::SurfaceCapabilities,
     (width, height): (u32, u32),
@@ -58,7 +58,7 @@ fn configuration(
     let format = FORMATS.into_iter().find(|f| caps.formats.contains(f)).with_context(|| {
         format!("window: expected a surface of one of {FORMATS:?}, got {:?}", caps.formats)
     })?;
-    // Alpha is how much of the scene covers a pixel, not of the window.
+    // Alpha is the scene's coverage of a pixel; the window itself is opaque.
     let opaque = wgpu::CompositeAlphaMode::Opaque;
     let alpha_mode = match caps.alpha_modes.contains(&opaque) {
         true => opaque,
@@ -78,7 +78,7 @@ fn configuration(
     })
 }
 
-/// A device of `adapter` that holds as much as it can, and where it puts its complaints.
+/// Opens a device of `adapter` with the adapter's own limits, and a place for its errors.
 fn device_of(adapter: &wgpu::Adapter) -> Result<(Arc<Gpu>, Fault)> {
     let descriptor = wgpu::DeviceDescriptor {
         label: Some("subsplat view"),
@@ -88,17 +88,17 @@ fn device_of(adapter: &wgpu::Adapter) -> Result<(Arc<Gpu>, Fault)> {
     let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))
         .with_context(|| format!("GPU {}: no device", adapter.get_info().name))?;
     let fault = Fault::default();
-    let heard = fault.clone();
-    // wgpu's own handler panics.
+    let target = fault.clone();
+    // The default handler of wgpu panics.
     device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| {
-        let mut fault = heard.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut fault = target.lock().unwrap_or_else(PoisonError::into_inner);
         fault.get_or_insert_with(|| e.to_string());
     }));
     Ok((Gpu::from_device(device, queue), fault))
 }
 
 impl Canvas {
-    /// Opens the adapter that `choice` means for `window`.
+    /// Opens the adapter of `choice` for `window`.
     ///
     /// # Errors
     /// No adapter that can show pictures there, no device, no format that fits.
@@ -116,7 +116,7 @@ impl Canvas {
         Ok(new)
     }
 
-    /// The GPU, for uploads.
+    /// The GPU.
     pub fn gpu(&self) -> &Arc<Gpu> {
         &self.gpu
     }
@@ -131,7 +131,7 @@ impl Canvas {
         (self.config.width as usize, self.config.height as usize)
     }
 
-    /// The window's new size, px; one without pixels (minimised) changes nothing.
+    /// Sets the window's size, px. A size without pixels (minimised) has no effect.
     ///
     /// # Errors
     /// More pixels a side than the adapter draws.
@@ -153,20 +153,20 @@ impl Canvas {
         self.check()
     }
 
-    /// What went wrong with the device since the last call.
+    /// Returns an error of the device since the last call.
     fn check(&self) -> Result<()> {
         self.gpu.check()?;
         let fault = self.fault.lock().unwrap_or_else(PoisonError::into_inner).take();
         fault.map_or(Ok(()), |reason| Err(anyhow!("GPU refused a frame: {reason}")))
     }
 
-    /// Whether the device is gone, so that no other frame can be drawn.
+    /// Whether the device is lost; no other frame can then be drawn.
     pub fn is_lost(&self) -> bool {
         self.gpu.check().is_err()
     }
 
-    /// The texture that the window shows next. A surface that is out of date is set up
-    /// again, one that is lost made anew.
+    /// Returns the texture that the window shows next. An outdated surface is configured again; a
+    /// lost one is created again.
     fn next(&mut self) -> Result<Option<wgpu::SurfaceTexture>> {
         for _ in 0..2 {
             match self.surface.get_current_texture() {
@@ -192,11 +192,11 @@ impl Canvas {
         Ok(None)
     }
 
-    /// Draws a frame and shows it; `camera` is asked for the frame's width and height, and
-    /// `capture` wants the pixels.
+    /// Draws and shows a frame. `camera` receives the frame's width and height. `capture` requests
+    /// the pixels.
     ///
     /// # Errors
-    /// The scene is too large for the device, the device is lost or refuses.
+    /// The scene is too large for the device; the device is lost or rejects a call.
     pub fn draw(
         &mut self,
         scene: &Scene,
@@ -226,7 +226,7 @@ impl Canvas {
         Ok(Frame::Shown(picture))
     }
 
-    /// A texture like the window's that can be read.
+    /// Creates a texture of the window's format and size that can be read.
     fn texture(&self) -> wgpu::Texture {
         let (width, height) = (self.config.width, self.config.height);
         self.gpu.device().create_texture(&wgpu::TextureDescriptor {
@@ -241,7 +241,7 @@ impl Canvas {
         })
     }
 
-    /// The pixels of a texture of the window's format.
+    /// Reads the pixels of a texture of the window's format.
     fn read(&self, texture: &wgpu::Texture) -> Result<Rgb> {
         let (device, size) = (self.gpu.device(), texture.size());
         let row = (4 * size.width).next_multiple_of(ROW);
@@ -262,7 +262,7 @@ impl Canvas {
         self.gpu.queue().submit([encoder.finish()]);
         let (answer, answered) = std::sync::mpsc::channel();
         buffer.slice(..).map_async(wgpu::MapMode::Read, move |done| {
-            // The receiver is gone only where the picture was given up.
+            // The receiver is gone only after an error.
             answer.send(done).ok();
         });
         device.poll(wgpu::PollType::wait_indefinitely()).context("reading the picture")?;
@@ -278,7 +278,7 @@ impl Canvas {
     }
 }
 
-/// Rows of `row` bytes that begin with `width` pixels of four bytes, as a picture.
+/// Makes a picture of rows of `row` bytes that begin with `width` pixels of four bytes.
 fn rgb(bytes: &[u8], row: usize, (width, height): (usize, usize), bgra: bool) -> Rgb {
     let mut data = Vec::with_capacity(3 * width * height);
     for line in bytes.chunks_exact(row).take(height) {
@@ -295,12 +295,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn padding_goes_and_channels_come_in_order() {
+    fn padding_is_removed_and_channels_are_ordered() {
         let bytes = [1, 2, 3, 9, 4, 5, 6, 9, 0, 0, 7, 8, 9, 9, 10, 11, 12, 9, 0, 0];
         let as_is = rgb(&bytes, 10, (2, 2), false);
         assert_eq!(as_is.data, [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12]);
-        let turned = rgb(&bytes, 10, (1, 2), true);
-        assert_eq!((turned.width, turned.height, turned.data), (1, 2, vec![3, 2, 1, 9, 8, 7]));
+        let swapped = rgb(&bytes, 10, (1, 2), true);
+        assert_eq!((swapped.width, swapped.height, swapped.data), (1, 2, vec![3, 2, 1, 9, 8, 7]));
     }
 
     #[test]

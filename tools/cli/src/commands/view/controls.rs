@@ -1,4 +1,5 @@
-//! What keys, buttons and the wheel mean. No window and no camera: events in, wishes out.
+//! Interpretation of keys, buttons and the wheel: maps input events to actions, without window
+//! or camera.
 
 use glam::Vec2;
 use std::collections::BTreeSet;
@@ -8,33 +9,33 @@ use winit::keyboard::KeyCode;
 /// Pixels of a touchpad's scrolling that count as one step of a wheel.
 const STEP_PX: f32 = 50.0;
 
-/// What a key asks for, once.
+/// A single action of a key.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Wish {
-    /// Orbit or fly.
+pub enum KeyAction {
+    /// Toggles orbit and fly.
     Toggle,
-    /// Back to the first camera.
+    /// Returns to the first camera.
     Reset,
-    /// So many children a side of a pixel.
+    /// Sets r of r×r children per pixel.
     Upscale(usize),
-    /// A picture of the window.
+    /// Saves a picture of the window.
     Save,
-    /// The list of keys.
+    /// Prints the list of keys.
     Help,
-    /// The end.
+    /// Quits.
     Quit,
 }
 
-/// What a movement of the cursor drags, px, x right and y down.
+/// Effect of a cursor movement, px, x right and y down.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Drag {
-    /// The camera's direction.
+    /// Turns the camera.
     Turn(Vec2),
-    /// The camera's place.
+    /// Moves the camera.
     Pan(Vec2),
 }
 
-/// An axis of movement.
+/// A direction of movement.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Step {
     Right,
@@ -45,12 +46,12 @@ enum Step {
     Back,
 }
 
-/// Which keys and buttons are down, and where the cursor is.
+/// State of keys, buttons and cursor.
 #[derive(Debug, Default)]
 pub struct Controls {
     held: BTreeSet<Step>,
-    /// Pressed since the last [`Controls::motion`]: a key that came and went between two
-    /// frames moves in one of them.
+    /// Pressed since the last [`Controls::motion`]. A key that is pressed and released between two
+    /// frames moves the camera in one of them.
     tapped: BTreeSet<Step>,
     shift: bool,
     left: bool,
@@ -70,24 +71,24 @@ fn step(key: KeyCode) -> Option<Step> {
     })
 }
 
-fn wish(key: KeyCode) -> Option<Wish> {
+fn key_action(key: KeyCode) -> Option<KeyAction> {
     Some(match key {
-        KeyCode::KeyF => Wish::Toggle,
-        KeyCode::KeyR => Wish::Reset,
-        KeyCode::Digit1 | KeyCode::Numpad1 => Wish::Upscale(1),
-        KeyCode::Digit2 | KeyCode::Numpad2 => Wish::Upscale(2),
-        KeyCode::Digit4 | KeyCode::Numpad4 => Wish::Upscale(4),
-        KeyCode::KeyP => Wish::Save,
-        KeyCode::KeyH => Wish::Help,
-        KeyCode::Escape => Wish::Quit,
+        KeyCode::KeyF => KeyAction::Toggle,
+        KeyCode::KeyR => KeyAction::Reset,
+        KeyCode::Digit1 | KeyCode::Numpad1 => KeyAction::Upscale(1),
+        KeyCode::Digit2 | KeyCode::Numpad2 => KeyAction::Upscale(2),
+        KeyCode::Digit4 | KeyCode::Numpad4 => KeyAction::Upscale(4),
+        KeyCode::KeyP => KeyAction::Save,
+        KeyCode::KeyH => KeyAction::Help,
+        KeyCode::Escape => KeyAction::Quit,
         _ => return None,
     })
 }
 
 impl Controls {
-    /// A key by its place on the keyboard, so that movement lies under the same fingers in
-    /// every layout. `repeat`: the system says again what was said.
-    pub fn key(&mut self, key: KeyCode, state: ElementState, repeat: bool) -> Option<Wish> {
+    /// Handles a key, by its position on the keyboard, so that movement uses the same fingers in
+    /// every layout. `repeat` marks the system's automatic repetition.
+    pub fn key(&mut self, key: KeyCode, state: ElementState, repeat: bool) -> Option<KeyAction> {
         let down = state.is_pressed();
         if let Some(step) = step(key) {
             match down {
@@ -101,15 +102,15 @@ impl Controls {
             }
             return None;
         }
-        wish(key).filter(|_| down && !repeat)
+        key_action(key).filter(|_| down && !repeat)
     }
 
-    /// Whether a shift key is down.
+    /// Sets whether a shift key is down.
     pub fn shift(&mut self, down: bool) {
         self.shift = down;
     }
 
-    /// A button of the mouse.
+    /// Handles a button of the mouse.
     pub fn button(&mut self, button: MouseButton, state: ElementState) {
         match button {
             MouseButton::Left => self.left = state.is_pressed(),
@@ -118,7 +119,7 @@ impl Controls {
         }
     }
 
-    /// The cursor's place, px; what it drags, if anything.
+    /// Handles the cursor's position, px; returns the drag, if a button is down.
     pub fn cursor(&mut self, at: Vec2) -> Option<Drag> {
         let by = at - self.cursor.replace(at)?;
         match (self.left, self.right) {
@@ -130,7 +131,7 @@ impl Controls {
         }
     }
 
-    /// Steps forward of the wheel.
+    /// Converts the wheel's movement to steps forward.
     pub fn wheel(delta: MouseScrollDelta) -> f32 {
         match delta {
             MouseScrollDelta::LineDelta(_, y) => y,
@@ -138,13 +139,13 @@ impl Controls {
         }
     }
 
-    /// Whether there is something to move for.
+    /// Whether a movement key is down.
     pub fn moving(&self) -> bool {
         !self.held.is_empty() || !self.tapped.is_empty()
     }
 
-    /// Towards right, up and forward, each −1 to 1, and whether in haste: what the keys ask
-    /// of the frame that is about to be drawn.
+    /// Movement in the next frame: towards right, up and forward, each −1 to 1, and whether it is
+    /// fast.
     pub fn motion(&mut self) -> ([f32; 3], bool) {
         let tapped = std::mem::take(&mut self.tapped);
         let on = |step: Step| f32::from(self.held.contains(&step) || tapped.contains(&step));
@@ -157,7 +158,7 @@ impl Controls {
         (along, self.shift)
     }
 
-    /// The window lost the keyboard: no release will be heard.
+    /// Releases all keys, when the window loses the keyboard.
     pub fn release(&mut self) {
         *self = Self::default();
     }
@@ -190,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn keys_move_while_they_are_held_and_once_where_they_were_tapped() {
+    fn keys_move_while_they_are_held_and_once_when_they_were_tapped() {
         let mut c = Controls::default();
         c.key(KeyCode::KeyW, Pressed, false);
         c.key(KeyCode::KeyQ, Pressed, false);
@@ -213,12 +214,12 @@ mod tests {
     }
 
     #[test]
-    fn wishes_come_once() {
+    fn actions_happen_once() {
         let mut c = Controls::default();
-        assert_eq!(c.key(KeyCode::Digit4, Pressed, false), Some(Wish::Upscale(4)));
+        assert_eq!(c.key(KeyCode::Digit4, Pressed, false), Some(KeyAction::Upscale(4)));
         assert_eq!(c.key(KeyCode::Digit4, Pressed, true), None);
         assert_eq!(c.key(KeyCode::Digit4, Released, false), None);
-        assert_eq!(c.key(KeyCode::Escape, Pressed, false), Some(Wish::Quit));
+        assert_eq!(c.key(KeyCode::Escape, Pressed, false), Some(KeyAction::Quit));
         assert_eq!(c.key(KeyCode::KeyS, Pressed, false), None);
         assert_eq!(c.key(KeyCode::F12, Pressed, false), None);
     }

@@ -1,6 +1,6 @@
-//! `subsplat view`: a window to look at a scene. `source` finds the splats, `canvas` draws
-//! them, `controls` understands keys and mouse, `window` holds them together; the camera's
-//! movements are [`subsplat::navigation`].
+//! `subsplat view`: a window that shows a scene. `source` provides the splats, `canvas` draws
+//! them, `controls` interprets keys and mouse, and `window` joins the three. The camera moves by
+//! [`subsplat::navigation`].
 
 mod canvas;
 mod controls;
@@ -10,7 +10,7 @@ mod window;
 
 use super::args_view::ViewArgs;
 use super::{frames, memory, render};
-use crate::report::{Answer, Progress, say};
+use crate::report::{Answer, Progress, print_line};
 use anyhow::{Context, Result, bail};
 use serde_json::json;
 use std::convert::Infallible;
@@ -18,16 +18,16 @@ use std::path::PathBuf;
 use subsplat::gpu::{self, DeviceChoice};
 use winit::event_loop::EventLoop;
 
-/// What the arguments say of the window.
+/// The arguments of the window, checked.
 pub struct Plan {
-    /// At first, px; without, the first camera's.
+    /// Initial size, px; `None` for the first camera's.
     size: Option<(usize, usize)>,
     device: DeviceChoice,
-    /// To draw before the end; without, until the user closes the window.
+    /// Number of frames to draw; `None` until the user closes the window.
     frames: Option<usize>,
-    /// Where the last of `frames` goes.
+    /// File for the last of `frames`.
     save: Option<PathBuf>,
-    /// Folder of pictures.
+    /// Folder for pictures.
     out: PathBuf,
 }
 
@@ -35,12 +35,12 @@ pub struct Plan {
 pub fn view(args: &ViewArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
     let plan = plan(args)?;
-    // What a window needs is looked for before minutes of work.
+    // Display and adapter are checked before minutes of work.
     let events = EventLoop::with_user_event().build().map_err(no_display)?;
     adapter(&plan.device)?;
     let source = source::open(args, &mut progress)?;
     if plan.frames.is_none() {
-        say("H shows the keys");
+        print_line("H shows the keys");
     }
     let done = window::run(events, plan, source)?;
     let saved: Vec<String> = done.saved.iter().map(|p| p.display().to_string()).collect();
@@ -65,9 +65,9 @@ pub fn view(args: &ViewArgs, answer: Answer) -> Result<()> {
     }))
 }
 
-/// What is wrong with the arguments themselves.
+/// Checks the arguments.
 fn plan(args: &ViewArgs) -> Result<Plan> {
-    render::background(&args.look())?;
+    render::background(&args.rendering())?;
     render::check_near(args.source.near)?;
     let size = args.size.as_deref().map(frames::size).transpose()?;
     size.map_or(Ok(()), |size| memory::check_picture("--size", size))?;
@@ -81,13 +81,13 @@ fn plan(args: &ViewArgs) -> Result<Plan> {
     Ok(Plan { size, device, frames, save, out })
 }
 
-/// Refuses a choice that no adapter answers to.
+/// Rejects a choice without an adapter.
 fn adapter(choice: &DeviceChoice) -> Result<()> {
     let found = gpu::choose(choice, &gpu::adapters())?;
     found.map(|_| ()).with_context(|| format!("no GPU: expected {choice}, found none"))
 }
 
-/// The system's own words, without the place in winit's source that stands in front.
+/// Extracts the system's message, without the position in winit's source before it.
 fn no_display(error: winit::error::EventLoopError) -> anyhow::Error {
     let text = error.to_string();
     let words = match text.strip_prefix("os error at ") {

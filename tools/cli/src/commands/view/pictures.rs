@@ -1,4 +1,4 @@
-//! Pictures of the window as files.
+//! Files of pictures of the window.
 
 use anyhow::{Context, Result, bail};
 use std::fs::OpenOptions;
@@ -6,32 +6,32 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use subsplat::io::image::{Rgb, save_png};
 
-/// Most pictures of one name in a folder.
-const MOST: usize = 9999;
+/// Largest number of pictures of one name in a folder.
+const NUMBER_MAX: usize = 9999;
 
-/// Writes `picture` as the first NAME-0001.png, NAME-0002.png … that is free.
+/// Writes `picture` to the first free file of NAME-0001.png, NAME-0002.png, ….
 ///
 /// # Errors
-/// The folder cannot be made or written to; it holds all the numbers.
+/// The folder cannot be created or written; it holds all numbers.
 pub fn save_next(folder: &Path, name: &str, picture: &Rgb) -> Result<PathBuf> {
     std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
     let name = name.replace(['/', '\\', ':'], "_");
-    for number in 1..=MOST {
+    for number in 1..=NUMBER_MAX {
         let path = folder.join(format!("{name}-{number:04}.png"));
-        // An empty file holds the name until the picture is whole.
+        // An empty file reserves the name until the picture is complete.
         match OpenOptions::new().write(true).create_new(true).open(&path) {
             Ok(_) => {}
             Err(e) if e.kind() == ErrorKind::AlreadyExists => continue,
             Err(e) => return Err(e).with_context(|| path.display().to_string()),
         }
         if let Err(e) = save_png(&path, picture) {
-            // Best effort: the first error is the one worth telling.
+            // The first error is reported; removal may fail.
             let _ = std::fs::remove_file(&path);
             return Err(e.into());
         }
         return Ok(path);
     }
-    bail!("{}: holds {MOST} pictures {name}-*.png already", folder.display())
+    bail!("{}: holds {NUMBER_MAX} pictures {name}-*.png already", folder.display())
 }
 
 #[cfg(test)]

@@ -1,48 +1,48 @@
-//! Where the splats in the window come from: a finished scene, or photographs, which can
-//! be taken again with another number of children.
+//! Source of the splats in the window: a finished scene, or photographs, which can be
+//! reconstructed again with another number of children.
 
-use crate::commands::args::DetailArg;
 use crate::commands::args_view::ViewArgs;
-use crate::commands::{frames, info, model, pair, range, render, run};
-use crate::report::{Progress, say, warn};
+use crate::commands::reconstruct::{self, reconstruct};
+use crate::commands::{info, model, pair, render, run};
+use crate::report::{Progress, print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
+use std::ops::ControlFlow;
 use std::path::Path;
 use subsplat::abi::RasterOptions;
-use subsplat::data::depth::depth_range;
 use subsplat::io::{SplatFormat, load_with_comments};
 use subsplat::navigation::{Start, up_of};
-use subsplat::pipeline::{self, Photo, Reconstruction, Reconstructor, Request};
 use subsplat::splats::Splats;
+use subsplat::{Check, Options, Photo, Reconstruction, Reconstructor};
 
 /// Highest SH degree of a finished scene.
 const SH_DEGREE: usize = 4;
 
-/// Splats, and how they are drawn.
+/// Splats with the rules to render them.
 pub struct Made {
     pub splats: Splats,
     pub options: RasterOptions,
-    /// r, the children's grid being r×r; a finished scene has none.
+    /// r of r×r children per pixel; `None` for a finished scene.
     pub upscale: Option<usize>,
 }
 
-/// All that a window begins with.
+/// The initial content of a window.
 pub struct Source {
-    /// For the title and for pictures' names.
+    /// Used in the title and in names of pictures.
     pub name: String,
     pub start: Start,
     pub made: Made,
-    /// Where the splats can be made again.
+    /// `None` for a finished scene.
     pub photographs: Option<Photographs>,
 }
 
-/// Photographs that are ready for the network.
+/// Photographs and options, for further reconstructions.
 pub struct Photographs {
     args: ViewArgs,
     photos: Vec<Photo>,
-    request: Request,
+    options: Options,
 }
 
-/// What the arguments name.
+/// Loads or reconstructs the scene of the arguments.
 pub fn open(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     match args.input.as_slice() {
         [one] if is_splats(one)? => finished(args, one, progress),
@@ -50,9 +50,9 @@ pub fn open(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     }
 }
 
-/// Refuses what photographs alone have a use for where a finished scene is named.
+/// Rejects flags for photographs where the scene is finished.
 pub fn check(args: &ViewArgs) -> Result<()> {
-    if let ([one], Some(flag)) = (args.input.as_slice(), args.for_photographs())
+    if let ([one], Some(flag)) = (args.input.as_slice(), args.photograph_flag())
         && is_splats(one)?
     {
         bail!("{flag}: only with photographs; {} is a finished scene", one.display());
@@ -70,7 +70,7 @@ fn is_splats(path: &Path) -> Result<bool> {
 
 fn finished(args: &ViewArgs, path: &Path, progress: &mut Progress) -> Result<Source> {
     let (splats, comments) = progress.stage("scene", |_| load_with_comments(path))?;
-    let options = render::options(&args.look(), args.source.near, SH_DEGREE, &comments)?;
+    let options = render::options(&args.rendering(), args.source.near, SH_DEGREE, &comments)?;
     let beside = path.parent().unwrap_or(Path::new("")).join("cameras.json");
     let cameras = match &args.cameras {
         Some(source) => render::read_cameras(source)?,
@@ -94,73 +94,57 @@ fn finished(args: &ViewArgs, path: &Path, progress: &mut Progress) -> Result<Sou
 
 fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     ensure!(args.cameras.is_none(), "--cameras: only with a finished scene");
-    let input_size = frames::size(&args.source.input_size)?;
     let scene = progress.stage("scene", |_| pair::load(&args.input, &args.source.pair))?;
-    scene.warnings.iter().for_each(warn);
+    scene.warnings.iter().for_each(print_warning);
     let first = args.input.first().context("no input")?;
-    let (context, why) = run::context(&args.source.context, first, &scene)?;
-    say(format!("{}: {} frames; context {why}", scene.name, scene.frames.len()));
-    let given = (args.source.near, args.source.far);
-    let guess = depth_range(&scene, &context, given)?;
+    let (context, reason) = run::context(&args.source.context, first, &scene)?;
+    print_line(format!("{}: {} frames; context {reason}", scene.name, scene.frames.len()));
+    let options = reconstruct::options(&args.source, &scene, &context)?;
     let model = progress.stage("model", |_| load_model(args, args.source.upscale))?;
-    run::check_size(&model, context.len(), input_size)?;
+    run::check_size(&model, context.len(), options.input_size)?;
     let photos = run::photographs(&scene, &context, progress)?;
-    let reports = match args.source.no_check {
-        true => Vec::new(),
-        false => progress.stage("check", |_| pipeline::check_photos(&photos))?,
-    };
-    let range = range::refine(guess, given, &reports);
-    let request = Request {
-        input_size,
-        near_far: (range.near, range.far),
-        detail: args.source.detail == DetailArg::Photo,
-        look: given == (None, None),
-    };
-    let photographs = Photographs { args: args.clone(), photos, request };
-    let result = progress.stage("network", |bar| {
-        photographs.reconstruct(&model, &mut |name| bar.set_message(name))
-    })?;
-    result.warnings.iter().for_each(warn);
+    let result = reconstruct(&model, photos.as_slice(), &options, progress)?;
+    // Later calls use the depth range of this check.
+    let prior = result.initial_depth_range().clone();
+    let options = options.with_depth_prior(prior).with_check(Check::Off);
+    let photographs = Photographs { args: args.clone(), photos, options };
     let cameras: Vec<_> = scene.frames.iter().map(|f| f.camera).collect();
-    let (Some(input), Some(depth)) = (result.inputs.first(), result.depths.first()) else {
+    let (Some(input), Some(depth)) = (result.inputs().first(), result.depths().first()) else {
         bail!("{}: expected photographs, got none", scene.name)
     };
     let start = Start {
         home: input.target_camera,
         up: up_of(cameras.iter()),
         distance: run::median(&depth.data),
-        radius: render::bounds(&result.splats)?.radius(),
+        radius: render::bounds(result.splats())?.radius(),
     };
     let made = photographs.made(&model, result);
     Ok(Source { name: scene.name, start, made, photographs: Some(photographs) })
 }
 
 fn load_model(args: &ViewArgs, upscale: Option<usize>) -> Result<Reconstructor> {
-    model::load(&model::Asked { upscale, ..model::Asked::of(&args.source) })
+    let source = model::ModelRequest::from_source(&args.source);
+    model::load(&model::ModelRequest { upscale, ..source })
 }
 
 impl Photographs {
-    /// The same scene with r×r children to a pixel; `stage` hears what is being done.
-    pub fn make(&self, upscale: usize, stage: &mut dyn FnMut(&'static str)) -> Result<Made> {
-        stage("model");
+    /// Reconstructs the same scene with r×r children per pixel. `begin` receives the name of
+    /// each stage.
+    pub fn make(&self, upscale: usize, begin: &mut dyn FnMut(&'static str)) -> Result<Made> {
+        begin("model");
         let model = load_model(&self.args, Some(upscale))?;
-        run::check_size(&model, self.photos.len(), self.request.input_size)?;
-        let result = self.reconstruct(&model, stage)?;
+        run::check_size(&model, self.photos.len(), self.options.input_size)?;
+        let mut progress = |progress: subsplat::Progress| {
+            begin(progress.stage.name());
+            ControlFlow::Continue(())
+        };
+        let result = model.run_with(&self.photos, &self.options, &mut progress)?;
         Ok(self.made(&model, result))
     }
 
-    fn reconstruct(
-        &self,
-        model: &Reconstructor,
-        stage: &mut dyn FnMut(&'static str),
-    ) -> Result<Reconstruction> {
-        Ok(model.reconstruct_with(&self.photos, &self.request, stage)?)
-    }
-
     fn made(&self, model: &Reconstructor, result: Reconstruction) -> Made {
-        let (near, _) = result.near_far;
         let config = model.config();
-        let options = run::raster_options(&self.args.look(), config, (near, &result.inputs));
-        Made { splats: result.splats, options, upscale: Some(config.upscale) }
+        let options = run::raster_options(&self.args.rendering(), config, &result);
+        Made { splats: result.into_splats(), options, upscale: Some(config.upscale) }
     }
 }

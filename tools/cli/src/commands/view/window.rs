@@ -1,13 +1,13 @@
-//! The window: events to the navigator, frames to the canvas, and children that are made
-//! in the background.
+//! The window: it passes events to the navigator and frames to the canvas, and makes children in
+//! the background.
 
 use super::Plan;
 use super::canvas::{Canvas, Frame};
-use super::controls::{Controls, Drag, Wish};
+use super::controls::{Controls, Drag, KeyAction};
 use super::pictures::save_next;
 use super::source::{Made, Photographs, Source};
 use crate::commands::args_view::KEYS;
-use crate::report::{say, warn};
+use crate::report::{print_line, print_warning};
 use anyhow::{Context, Result};
 use glam::Vec2;
 use std::collections::BTreeMap;
@@ -26,21 +26,23 @@ use winit::event_loop::{ActiveEventLoop, ControlFlow, EventLoop, EventLoopProxy}
 use winit::keyboard::PhysicalKey;
 use winit::window::{Window, WindowId};
 
-/// Largest window that is opened without being asked for, px.
+/// Largest default size of the window, px.
 const SIZE_MAX: (usize, usize) = (1280, 960);
-/// Frames that a change takes: one to show it, and one that has the room for all splats
-/// that the first asked for.
+/// Frames after a change: the first one shows it. The second one has buffers for all splats,
+/// which the first one requested.
 const SETTLE: u32 = 2;
-/// Until a window without a place for a frame is asked again.
+/// Delay before the next attempt where the window has no texture for a frame.
 const RETRY: Duration = Duration::from_millis(50);
-/// Least time between two titles while frames follow one another.
+/// Shortest time between two titles during an animation.
 const TITLE_EVERY: Duration = Duration::from_millis(250);
-/// What a frame that follows none moves for, and the most that any does, seconds.
-const STEP: (f32, f32) = (1.0 / 60.0, 0.25);
+/// Duration of a movement in the first frame of an animation, seconds.
+const STEP_DEFAULT: f32 = 1.0 / 60.0;
+/// Longest duration of a movement in one frame, seconds.
+const STEP_MAX: f32 = 0.25;
 /// Weight of a new frame's time in the mean.
-const FRESH: f32 = 0.1;
+const NEW_WEIGHT: f32 = 0.1;
 
-/// What the window did.
+/// Statistics of the window.
 pub struct Done {
     pub name: String,
     pub gaussians: usize,
@@ -52,11 +54,11 @@ pub struct Done {
     pub saved: Vec<PathBuf>,
 }
 
-/// What the background says.
+/// A message of the background thread.
 pub enum Message {
-    /// A stage of the work begins.
+    /// A stage begins.
     Stage(&'static str),
-    /// r×r children to a pixel are ready, or not to be had.
+    /// r×r children per pixel are ready, or failed.
     Made(usize, Result<Ready, String>),
 }
 
@@ -66,7 +68,7 @@ pub struct Ready {
     options: RasterOptions,
 }
 
-/// Opens a window and shows `source` until the user, or the plan, ends it.
+/// Opens a window and shows `source` until the user or the plan ends it.
 pub fn run(events: EventLoop<Message>, plan: Plan, source: Source) -> Result<Done> {
     let mut viewer = Viewer::new(plan, source, events.create_proxy());
     events.set_control_flow(ControlFlow::Wait);
@@ -86,24 +88,27 @@ pub fn run(events: EventLoop<Message>, plan: Plan, source: Source) -> Result<Don
     })
 }
 
-/// Time between frames that follow one another.
+/// Mean time between frames of an animation.
 #[derive(Default)]
 struct Rate {
     last: Option<Instant>,
-    /// Whether the first time is over, in which kernels are compiled.
+    /// Whether the first frame is over, in which kernels are compiled.
     warm: bool,
     mean: Option<f32>,
 }
 
 impl Rate {
-    /// A frame begins, which `follows` the last without a rest; seconds to move for.
+    /// Begins a frame, which `follows` the last one in an animation; returns the duration of its
+    /// movement, seconds.
     fn begin(&mut self, now: Instant, follows: bool) -> f32 {
         let since = self.last.replace(now).filter(|_| follows);
-        let Some(seconds) = since.map(|last| (now - last).as_secs_f32()) else { return STEP.0 };
+        let Some(seconds) = since.map(|last| (now - last).as_secs_f32()) else {
+            return STEP_DEFAULT;
+        };
         if std::mem::replace(&mut self.warm, true) {
-            self.mean = Some(self.mean.map_or(seconds, |m| m + FRESH * (seconds - m)));
+            self.mean = Some(self.mean.map_or(seconds, |m| m + NEW_WEIGHT * (seconds - m)));
         }
-        seconds.min(STEP.1)
+        seconds.min(STEP_MAX)
     }
 
     fn fps(&self) -> Option<f32> {
@@ -116,24 +121,26 @@ struct Viewer {
     name: String,
     photographs: Option<Arc<Photographs>>,
     proxy: EventLoopProxy<Message>,
-    /// Of the source, until there is a device to put it on.
+    /// The source's splats, before the device is open.
     first: Option<Made>,
     canvas: Option<Canvas>,
     navigator: Navigator,
     controls: Controls,
-    /// By r; a finished scene's is 0.
+    /// By r; the key of a finished scene is 0.
     ready: BTreeMap<usize, Ready>,
-    /// What is shown, what was before it, and what was asked for last.
+    /// r of the splats that are shown.
     current: usize,
+    /// r of the splats that were shown before.
     before: usize,
-    wish: usize,
-    /// What is being made, and which stage of it.
+    /// r that the user requested last.
+    requested: usize,
+    /// r that the background thread works on, and its stage.
     busy: Option<(usize, &'static str)>,
-    /// Frames to draw, though nothing changes.
+    /// Frames to draw without a further change.
     due: u32,
-    /// Whether the last frame asked for the next.
+    /// Whether an animation runs.
     running: bool,
-    /// Whether P waits for a frame.
+    /// Whether the next frame is to be saved.
     picture: bool,
     drawn: usize,
     rate: Rate,
@@ -157,7 +164,7 @@ impl Viewer {
             ready: BTreeMap::new(),
             current,
             before: current,
-            wish: current,
+            requested: current,
             busy: None,
             due: SETTLE,
             running: false,
@@ -183,7 +190,7 @@ impl Viewer {
         let attributes = Window::default_attributes().with_title(&self.name).with_inner_size(size);
         let window = events.create_window(attributes).context("window")?;
         let canvas = Canvas::open(Arc::new(window), &self.plan.device)?;
-        say(format!("drawing on {}", canvas.gpu().adapter()));
+        print_line(format!("drawing on {}", canvas.gpu().adapter()));
         if let Some(made) = self.first.take() {
             self.ready.insert(self.current, upload(canvas.gpu(), &made)?);
         }
@@ -192,7 +199,7 @@ impl Viewer {
         Ok(())
     }
 
-    /// Something is to be seen that was not.
+    /// Draws the frames after a change.
     fn change(&mut self) {
         self.due = SETTLE;
         self.redraw();
@@ -204,7 +211,7 @@ impl Viewer {
         }
     }
 
-    /// Whether frames follow one another by themselves.
+    /// Whether another frame follows without an event.
     fn goes_on(&self) -> bool {
         self.due > 0 || self.picture || self.controls.moving() || self.plan.frames.is_some()
     }
@@ -214,9 +221,8 @@ impl Viewer {
         let Some(ready) = self.ready.get(&self.current) else { return Ok(()) };
         let seconds = self.rate.begin(Instant::now(), self.running);
         if self.controls.moving() {
-            let (along, haste) = self.controls.motion();
-            let pace = if haste { Pace::Fast } else { Pace::Normal };
-            self.navigator.fly(along, seconds, pace);
+            let (along, fast) = self.controls.motion();
+            self.navigator.fly(along, seconds, if fast { Pace::Fast } else { Pace::Normal });
             self.due = SETTLE;
         }
         let last = self.plan.frames.is_some_and(|n| self.drawn + 1 >= n);
@@ -229,9 +235,9 @@ impl Viewer {
         let frame = match canvas.draw(&ready.scene, &ready.options, camera, capture) {
             Ok(frame) => frame,
             Err(e) if self.before != self.current && !canvas.is_lost() => {
-                warn(format!("x{}: {e:#}; back to x{}", self.current, self.before));
+                print_warning(format!("x{}: {e:#}; back to x{}", self.current, self.before));
                 self.ready.remove(&self.current);
-                (self.current, self.wish) = (self.before, self.before);
+                (self.current, self.requested) = (self.before, self.before);
                 self.change();
                 return Ok(());
             }
@@ -254,20 +260,20 @@ impl Viewer {
         if self.running {
             self.redraw();
         }
-        self.tell();
+        self.update_title();
         Ok(())
     }
 
-    /// Writes what a frame showed where it was asked for.
+    /// Saves a frame where it was requested.
     fn keep(&mut self, picture: Option<Rgb>, last: bool) -> Result<()> {
         let Some(picture) = picture else { return Ok(()) };
         if std::mem::take(&mut self.picture) {
             match save_next(&self.plan.out, &self.name, &picture) {
                 Ok(path) => {
-                    say(format!("saved {}", path.display()));
+                    print_line(format!("saved {}", path.display()));
                     self.saved.push(path);
                 }
-                Err(e) => warn(format!("{e:#}")),
+                Err(e) => print_warning(format!("{e:#}")),
             }
         }
         if let Some(path) = self.plan.save.clone().filter(|_| last) {
@@ -277,8 +283,8 @@ impl Viewer {
         Ok(())
     }
 
-    /// The title says how things are; not more often than one can read.
-    fn tell(&mut self) {
+    /// Updates the title, at most once per [`TITLE_EVERY`] during an animation.
+    fn update_title(&mut self) {
         let Some(canvas) = &self.canvas else { return };
         let splats = self.ready.get(&self.current).map_or(0, |r| r.scene.len());
         let fps = self.rate.fps().map_or(String::new(), |fps| {
@@ -300,35 +306,38 @@ impl Viewer {
         }
     }
 
-    fn grant(&mut self, wish: Wish, events: &ActiveEventLoop) {
-        match wish {
-            Wish::Toggle => self.navigator.toggle(),
-            Wish::Reset => {
+    fn perform(&mut self, action: KeyAction, events: &ActiveEventLoop) {
+        match action {
+            KeyAction::Toggle => self.navigator.toggle(),
+            KeyAction::Reset => {
                 self.navigator.reset();
                 self.change();
             }
-            Wish::Upscale(r) if self.photographs.is_none() => {
-                say(format!("x{r}: {} is a finished scene and has one resolution", self.name));
+            KeyAction::Upscale(r) if self.photographs.is_none() => {
+                print_line(format!(
+                    "x{r}: {} is a finished scene and has one resolution",
+                    self.name
+                ));
             }
-            Wish::Upscale(r) => {
-                self.wish = r;
-                self.follow_wish();
+            KeyAction::Upscale(r) => {
+                self.requested = r;
+                self.show_requested();
             }
-            Wish::Save => {
+            KeyAction::Save => {
                 self.picture = true;
                 self.redraw();
             }
-            Wish::Help => say(KEYS),
-            Wish::Quit => events.exit(),
+            KeyAction::Help => print_line(KEYS),
+            KeyAction::Quit => events.exit(),
         }
-        self.tell();
+        self.update_title();
     }
 
-    /// Shows what was asked for last, or has it made; one is made at a time.
-    fn follow_wish(&mut self) {
-        if self.ready.contains_key(&self.wish) {
-            if self.current != self.wish {
-                self.current = self.wish;
+    /// Shows the requested splats, or starts to make them; one background thread runs at a time.
+    fn show_requested(&mut self) {
+        if self.ready.contains_key(&self.requested) {
+            if self.current != self.requested {
+                self.current = self.requested;
                 self.change();
             }
             return;
@@ -338,17 +347,17 @@ impl Viewer {
         else {
             return;
         };
-        let (r, gpu, proxy) = (self.wish, canvas.gpu().clone(), self.proxy.clone());
+        let (r, gpu, proxy) = (self.requested, canvas.gpu().clone(), self.proxy.clone());
         self.busy = Some((r, "begins"));
-        // An event loop that is gone needs no answer.
+        // A closed event loop needs no message.
         let work = move || {
             let mut stage = |name| drop(proxy.send_event(Message::Stage(name)));
             let made = photographs.make(r, &mut stage).and_then(|made| upload(&gpu, &made));
             drop(proxy.send_event(Message::Made(r, made.map_err(|e| format!("{e:#}")))));
         };
         if let Err(e) = std::thread::Builder::new().name(format!("x{r}")).spawn(work) {
-            warn(format!("x{r}: no thread to make it: {e}"));
-            (self.busy, self.wish) = (None, self.current);
+            print_warning(format!("x{r}: no thread to make it: {e}"));
+            (self.busy, self.requested) = (None, self.current);
         }
     }
 
@@ -386,14 +395,14 @@ impl Viewer {
 
     fn key(&mut self, event: &KeyEvent, events: &ActiveEventLoop) {
         let PhysicalKey::Code(code) = event.physical_key else { return };
-        if let Some(wish) = self.controls.key(code, event.state, event.repeat) {
-            self.grant(wish, events);
+        if let Some(action) = self.controls.key(code, event.state, event.repeat) {
+            self.perform(action, events);
         } else if self.controls.moving() && !self.running {
             self.redraw();
         }
     }
 
-    /// Ends with `error`, where there is one.
+    /// Ends the window at an error.
     fn or_end(&mut self, done: Result<()>, events: &ActiveEventLoop) {
         if let Err(e) = done {
             self.outcome = Err(e);
@@ -436,15 +445,15 @@ impl ApplicationHandler<Message> for Viewer {
                 match made {
                     Ok(ready) => drop(self.ready.insert(r, ready)),
                     Err(e) => {
-                        warn(format!("x{r}: {e}"));
-                        if self.wish == r {
-                            self.wish = self.current;
+                        print_warning(format!("x{r}: {e}"));
+                        if self.requested == r {
+                            self.requested = self.current;
                         }
                     }
                 }
-                self.follow_wish();
+                self.show_requested();
             }
         }
-        self.tell();
+        self.update_title();
     }
 }

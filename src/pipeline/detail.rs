@@ -1,0 +1,41 @@
+//! Colour detail from photographs that are larger than the network's input.
+
+use super::{Error, Result};
+use crate::cpu::detail::{Photograph, SourceView, residuals, with_residuals};
+use crate::data::crop::Cropped;
+use crate::splats::Splats;
+
+/// Whether a photograph has more than one pixel for each of the input's pixels.
+fn has_detail(c: &Cropped) -> bool {
+    let ratio = c.target.width as f32 / c.input.width.max(1) as f32;
+    (c.window.scale * ratio).min_element() > 1.0
+}
+
+/// Adds to children's colours the detail of the photographs ([`crate::cpu::detail`]). Returns
+/// whether any photograph has detail. `upscale` is the children's r, K = r².
+///
+/// # Errors
+/// A photograph without pixels.
+pub(crate) fn add_detail(splats: &mut Splats, inputs: &[Cropped], upscale: usize) -> Result<bool> {
+    if !inputs.iter().any(has_detail) {
+        return Ok(false);
+    }
+    let pixels: Vec<Vec<f32>> = inputs.iter().map(|c| c.target.to_unit()).collect();
+    let mut sources = Vec::with_capacity(inputs.len());
+    for (c, pixels) in inputs.iter().zip(&pixels) {
+        let (w, h) = (c.target.width, c.target.height);
+        let photograph = match has_detail(c) {
+            true => Some(Photograph::new(pixels, w, h).ok_or_else(|| {
+                Error::argument("photograph", format!("{w}x{h} pixels"), pixels.len().to_string())
+            })?),
+            false => None,
+        };
+        sources.push(SourceView { photograph, camera: c.input_camera });
+    }
+    let means: Vec<f32> = (0..splats.len()).flat_map(|i| splats.mean(i)).collect();
+    let per_view = splats.parents() / inputs.len().max(1);
+    let children = splats.children_per_parent();
+    let delta = residuals(&sources, &means, per_view, children, upscale);
+    splats.gain = with_residuals(&splats.gain, &delta);
+    Ok(true)
+}

@@ -1,0 +1,68 @@
+//! Conversions between the crate's pictures and `image::RgbImage`.
+
+use super::Error;
+use crate::io::image::Rgb;
+use crate::render::Picture;
+use image::RgbImage;
+
+impl From<RgbImage> for Rgb {
+    /// Takes the pixels over without a copy.
+    fn from(image: RgbImage) -> Self {
+        let (width, height) = (image.width() as usize, image.height() as usize);
+        Self { width, height, data: image.into_raw() }
+    }
+}
+
+impl TryFrom<Rgb> for RgbImage {
+    type Error = Error;
+
+    /// Takes the pixels over without a copy.
+    ///
+    /// # Errors
+    /// The buffer does not hold 3·W·H bytes, or a side exceeds `u32`.
+    fn try_from(picture: Rgb) -> Result<Self, Error> {
+        let Rgb { width, height, data } = picture;
+        let bytes = data.len();
+        let sides = (u32::try_from(width), u32::try_from(height));
+        let image = match sides {
+            (Ok(w), Ok(h)) if width.checked_mul(3 * height) == Some(bytes) => {
+                RgbImage::from_raw(w, h, data)
+            }
+            _ => None,
+        };
+        image.ok_or_else(|| {
+            let expected = format!("3 bytes for each of {width}x{height} pixels");
+            Error::argument("picture", expected, format!("{bytes} bytes"))
+        })
+    }
+}
+
+impl From<&Picture> for Rgb {
+    /// Clamps colours to [0, 1] and rounds them to 8 bits; NaN becomes 0.
+    fn from(picture: &Picture) -> Self {
+        RgbImage::from(picture).into()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pictures_convert_both_ways() {
+        let rgb = Rgb { width: 2, height: 1, data: vec![1, 2, 3, 4, 5, 6] };
+        let image = RgbImage::try_from(rgb.clone()).unwrap();
+        assert_eq!((image.dimensions(), image.get_pixel(1, 0).0), ((2, 1), [4, 5, 6]));
+        assert_eq!(Rgb::from(image), rgb);
+        let cut = Rgb { width: 2, height: 2, ..rgb };
+        assert!(RgbImage::try_from(cut).unwrap_err().to_string().contains("2x2"));
+        let nan = f32::NAN;
+        let picture = Picture {
+            width: 1,
+            height: 2,
+            rgb: vec![-0.5, 0.5, 1.5, nan, 0.2 / 255.0, 0.6 / 255.0],
+            ..Picture::default()
+        };
+        assert_eq!(Rgb::from(&picture).data, [0, 128, 255, 0, 0, 1]);
+    }
+}

@@ -1,0 +1,68 @@
+//! From photographs to a rendered scene in one call. Applications and programs use this module.
+//!
+//! ```no_run
+//! use std::ops::ControlFlow;
+//! use subsplat::pipeline::{DepthBounds, Options, Photo, Reconstructor};
+//! # fn main() -> subsplat::Result<()> {
+//! let scene = subsplat::io::scene::load_scene("scene".as_ref())?;
+//! let photos = [Photo::from_frame(&scene.frames[0])?, Photo::from_frame(&scene.frames[1])?];
+//! let options = Options::default().with_depth_prior(DepthBounds::of_scene(&scene, &[0, 1])?);
+//! let model = Reconstructor::load("weights.safetensors".as_ref(), None)?;
+//! let result = model.run_with(&photos, &options, &mut |progress| {
+//!     println!("{:3.0} % {}", 100.0 * progress.fraction, progress.stage);
+//!     ControlFlow::Continue(())
+//! })?;
+//! result.save("scene.ply".as_ref())?;
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! The stages ([`Stage`]), in order:
+//!
+//! 1. The initial depth range comes from [`Options::depth_range`], then from
+//!    [`Options::depth_prior`], then from the distance between the cameras.
+//! 2. Each photograph is cropped to the network's input and to the target size.
+//! 3. Points are matched between consecutive photographs. They check the poses ([`Check`]),
+//!    and their depths replace a range that was only guessed.
+//! 4. The small backbone estimates near and far at half size, unless the caller fixed one.
+//! 5. The network predicts one primary Gaussian per input pixel, then its children.
+//! 6. The photographs add detail to the children's colours ([`Detail`]).
+//!
+//! [`Reconstructor::run`] executes all of them. [`Reconstructor::prepare`] executes steps 1 to 3;
+//! the caller can then free large photographs before the network runs.
+
+mod depth_range;
+mod detail;
+mod error;
+mod images;
+mod options;
+mod photo;
+mod poses;
+mod prepared;
+mod progress;
+mod reconstruction;
+mod reconstructor;
+mod warning;
+
+pub use crate::model::Backend;
+pub use depth_range::{DepthBounds, DepthRange, DepthSource};
+pub use error::{Error, Result};
+pub use options::{Check, Detail, Options};
+pub use photo::Photo;
+pub use poses::PoseError;
+pub use prepared::Prepared;
+pub use progress::{Progress, Stage, StageTime};
+pub use reconstruction::Reconstruction;
+pub use reconstructor::Reconstructor;
+pub use warning::Warning;
+
+pub(crate) use depth_range::{initial_bounds, refined_bounds};
+pub(crate) use detail::add_detail;
+pub(crate) use poses::check_pairs;
+
+use crate::config::{Backbone, Config};
+
+/// Whether a configuration's backbone is MVSplat.
+pub fn is_mvsplat(config: &Config) -> bool {
+    matches!(config.backbone, Backbone::Mvsplat(_))
+}

@@ -1,0 +1,121 @@
+//! Options of a reconstruction.
+
+use super::{DepthBounds, DepthRange, Error, Result, initial_bounds};
+use crate::camera::Camera;
+
+/// Options of [`Reconstructor::run`](super::Reconstructor::run). The defaults are those of the
+/// program `subsplat run`.
+///
+/// ```
+/// use subsplat::pipeline::{Check, DepthRange, Options};
+/// let options = Options::default()
+///     .with_input_size(320, 192)
+///     .with_depth_range(DepthRange::Fixed { near: 0.5, far: 20.0 })
+///     .with_check(Check::Refuse);
+/// assert_eq!(options.input_size, (320, 192));
+/// ```
+#[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
+pub struct Options {
+    /// Width and height of the network's input, px; cut to multiples of the model's stride.
+    /// Default: 256×256.
+    pub input_size: (usize, usize),
+    /// Depth candidates that the caller fixes. Default: [`DepthRange::Auto`].
+    pub depth_range: DepthRange,
+    /// Depth range that a file suggests, used for the ends that `depth_range` leaves open.
+    /// Default: none.
+    pub depth_prior: Option<DepthBounds>,
+    /// Check of the poses by matched points. Default: [`Check::Warn`].
+    pub check: Check,
+    /// Source of colour detail. Default: [`Detail::Photographs`].
+    pub detail: Detail,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            input_size: (256, 256),
+            depth_range: DepthRange::default(),
+            depth_prior: None,
+            check: Check::default(),
+            detail: Detail::default(),
+        }
+    }
+}
+
+impl Options {
+    /// Sets [`Options::input_size`].
+    #[must_use]
+    pub fn with_input_size(mut self, width: usize, height: usize) -> Self {
+        self.input_size = (width, height);
+        self
+    }
+
+    /// Sets [`Options::depth_range`].
+    #[must_use]
+    pub fn with_depth_range(mut self, range: DepthRange) -> Self {
+        self.depth_range = range;
+        self
+    }
+
+    /// Sets [`Options::depth_prior`].
+    #[must_use]
+    pub fn with_depth_prior(mut self, prior: impl Into<Option<DepthBounds>>) -> Self {
+        self.depth_prior = prior.into();
+        self
+    }
+
+    /// Sets [`Options::check`].
+    #[must_use]
+    pub fn with_check(mut self, check: Check) -> Self {
+        self.check = check;
+        self
+    }
+
+    /// Sets [`Options::detail`].
+    #[must_use]
+    pub fn with_detail(mut self, detail: Detail) -> Self {
+        self.detail = detail;
+        self
+    }
+
+    /// The depth range before any photograph is read: [`Options::depth_range`], then
+    /// [`Options::depth_prior`], then a guess from the distances between the cameras. A program
+    /// can reject wrong options early by this call.
+    ///
+    /// # Errors
+    /// Fewer than two cameras; not 0 < near < far; cameras at one place and no other source.
+    pub fn initial_depth_range(&self, cameras: &[Camera]) -> Result<DepthBounds> {
+        if cameras.len() < 2 {
+            let got = cameras.len().to_string();
+            return Err(Error::argument("photographs", "at least 2", got));
+        }
+        initial_bounds(cameras, self.depth_range, self.depth_prior.as_ref())
+    }
+}
+
+/// Check of the poses by points matched between consecutive photographs ([`crate::check`]).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Check {
+    /// No points are matched, neither for the check nor for the depth range.
+    Off,
+    /// Every finding becomes a [`Warning::Poses`](super::Warning::Poses).
+    #[default]
+    Warn,
+    /// Poses that are judged bad give [`Error::Poses`](super::Error::Poses); other findings
+    /// become warnings.
+    Refuse,
+}
+
+/// Source of colour detail below the size of an input pixel.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Detail {
+    /// Photographs that are larger than the network's input add, at each child, their
+    /// difference from the mean of the parent's pixel.
+    #[default]
+    Photographs,
+    /// Colours come from the network alone.
+    Off,
+}

@@ -1,0 +1,93 @@
+//! A photograph with its camera.
+
+use super::{Error, Result};
+use crate::camera::Camera;
+use crate::data::crop::{CropOptions, Cropped, crop};
+use crate::io::image::Rgb;
+use crate::io::scene::Frame;
+
+/// A photograph without lens distortion, and its pinhole camera.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Photo {
+    image: Rgb,
+    camera: Camera,
+}
+
+impl Photo {
+    /// Combines pixels (an [`Rgb`] or an `image::RgbImage`) with their camera.
+    ///
+    /// # Errors
+    /// The buffer does not hold 3·W·H bytes; the camera is invalid or has another picture size.
+    pub fn new(image: impl Into<Rgb>, camera: Camera) -> Result<Self> {
+        let image = image.into();
+        let camera = Camera::new(camera.intrinsics, camera.world_from_camera)?;
+        let Rgb { width, height, data } = &image;
+        let bytes = width.checked_mul(*height).and_then(|n| n.checked_mul(3));
+        if bytes != Some(data.len()) {
+            let expected = format!("3 bytes for each of {width}x{height} pixels");
+            return Err(Error::argument("photograph", expected, format!("{} bytes", data.len())));
+        }
+        let k = camera.intrinsics;
+        if (k.width, k.height) != (*width, *height) {
+            let expected = format!("a camera of {width}x{height} pixels");
+            let got = format!("one of {}x{}", k.width, k.height);
+            return Err(Error::argument("photograph", expected, got));
+        }
+        Ok(Self { image, camera })
+    }
+
+    /// Decodes a frame's picture and removes its lens distortion.
+    ///
+    /// # Errors
+    /// Those of [`Frame::load`].
+    pub fn from_frame(frame: &Frame) -> Result<Self> {
+        let (image, camera) = frame.load()?;
+        Ok(Self { image, camera })
+    }
+
+    /// The pixels.
+    pub fn image(&self) -> &Rgb {
+        &self.image
+    }
+
+    /// Pinhole camera of these pixels.
+    pub fn camera(&self) -> &Camera {
+        &self.camera
+    }
+
+    /// Crops and resizes the photograph to the network's input and to the target picture.
+    ///
+    /// # Errors
+    /// Those of [`crop`].
+    pub fn crop(&self, options: &CropOptions) -> Result<Cropped> {
+        Ok(crop(&self.image, &self.camera, options)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::Intrinsics;
+    use glam::Mat4;
+
+    #[test]
+    fn pixels_and_camera_must_fit() {
+        let camera =
+            Camera::new(Intrinsics::from_fov_x(1.0, 4, 3), Mat4::IDENTITY).expect("a valid camera");
+        assert!(Photo::new(Rgb::black(4, 3), camera).is_ok());
+        assert!(Photo::new(image::RgbImage::new(4, 3), camera).is_ok());
+        let cut = Rgb { data: vec![0; 35], ..Rgb::black(4, 3) };
+        let flipped = Camera { world_from_camera: Mat4::from_scale(-glam::Vec3::ONE), ..camera };
+        for (photo, words) in [
+            (
+                Photo::new(Rgb::black(3, 4), camera),
+                "expected a camera of 3x4 pixels, got one of 4x3",
+            ),
+            (Photo::new(cut, camera), "4x3 pixels, got 35 bytes"),
+            (Photo::new(Rgb::black(4, 3), flipped), "pose"),
+        ] {
+            let error = photo.unwrap_err().to_string();
+            assert!(error.contains(words), "{error}");
+        }
+    }
+}

@@ -1,0 +1,120 @@
+//! Photographs that are cropped and checked, and the network's run on them.
+
+use super::progress::Tracker;
+use super::{
+    DepthBounds, DepthRange, Detail, Options, Progress, Reconstruction, Reconstructor, Result,
+    Stage, Warning, add_detail,
+};
+use crate::camera::Camera;
+use crate::check::PairReport;
+use crate::data::crop::Cropped;
+use crate::io::image::{Depth, Rgb};
+use std::ops::ControlFlow;
+
+/// Cropped photographs with a depth range, from [`Reconstructor::prepare`]. It holds nothing of
+/// the photographs' full size.
+pub struct Prepared<'a> {
+    pub(super) model: &'a Reconstructor,
+    pub(super) options: Options,
+    pub(super) inputs: Vec<Cropped>,
+    pub(super) bounds: DepthBounds,
+    pub(super) reports: Vec<PairReport>,
+    pub(super) warnings: Vec<Warning>,
+    pub(super) tracker: Tracker,
+}
+
+impl Prepared<'_> {
+    /// The photographs at the sizes of the network's input and of the target.
+    pub fn inputs(&self) -> &[Cropped] {
+        &self.inputs
+    }
+
+    /// The depth range before the network estimates its own.
+    pub fn depth_range(&self) -> &DepthBounds {
+        &self.bounds
+    }
+
+    /// Reports of the check, one for each pair of consecutive photographs; empty without one.
+    pub fn reports(&self) -> &[PairReport] {
+        &self.reports
+    }
+
+    /// Warnings so far.
+    pub fn warnings(&self) -> &[Warning] {
+        &self.warnings
+    }
+
+    /// Runs the network.
+    ///
+    /// # Errors
+    /// An error of the network.
+    pub fn reconstruct(self) -> Result<Reconstruction> {
+        self.reconstruct_with(&mut |_| ControlFlow::Continue(()))
+    }
+
+    /// [`Prepared::reconstruct`] with a callback for progress, whose fractions continue those of
+    /// [`Reconstructor::prepare_with`].
+    ///
+    /// # Errors
+    /// Those of [`Prepared::reconstruct`]; [`Error::Cancelled`](super::Error::Cancelled).
+    pub fn reconstruct_with(
+        self,
+        progress: &mut dyn FnMut(Progress) -> ControlFlow<()>,
+    ) -> Result<Reconstruction> {
+        let Self { model, options, inputs, bounds, reports, mut warnings, mut tracker } = self;
+        if options.depth_range == DepthRange::Auto {
+            tracker.begin(Stage::DepthRange, progress)?;
+        }
+        let initial_bounds = bounds.clone();
+        let (views, bounds) = model.views(&inputs, bounds, options.depth_range)?;
+        let network = model.model();
+        tracker.begin(Stage::Backbone, progress)?;
+        let output = network.encode(&views)?;
+        tracker.begin(Stage::Primaries, progress)?;
+        let primaries = network.primaries(&views, &output)?;
+        tracker.begin(Stage::Subsplat, progress)?;
+        // On a thread of the pool: parallel calls from there start without a wake-up.
+        let children = rayon::scope(|_| network.trunk().forward(&views, &output, &primaries))?;
+        let distances = output.depths.narrow(3, 0, 1)?.squeeze(3)?.squeeze(0)?.to_vec2()?;
+        drop((views, output, primaries));
+        let mut splats = children.to_splats()?;
+        drop(children);
+        let config = model.config();
+        let mut detail = Detail::Off;
+        if options.detail == Detail::Photographs {
+            tracker.begin(Stage::Detail, progress)?;
+            if add_detail(&mut splats, &inputs, config.upscale)? {
+                detail = Detail::Photographs;
+            }
+        }
+        let depths = inputs.iter().zip(distances);
+        let depths = depths.map(|(c, d)| camera_depth(&c.input_camera, d)).collect();
+        warnings.extend(Warning::of_bounds(&bounds));
+        warnings.extend(model.backend_warning());
+        let colour = Rgb::mean_colour(inputs.iter().map(|c| &c.input));
+        let raster_options = config.raster_options(config.upscale as f32, bounds.near, colour);
+        Ok(Reconstruction {
+            splats,
+            inputs,
+            depths,
+            bounds,
+            initial_bounds,
+            raster_options,
+            detail,
+            reports,
+            warnings,
+            stage_times: tracker.finish(progress)?,
+        })
+    }
+}
+
+/// Converts distances along the unit ray to camera z.
+fn camera_depth(camera: &Camera, distances: Vec<f32>) -> Depth {
+    let k = camera.intrinsics;
+    let mut data = distances;
+    for (i, d) in data.iter_mut().enumerate() {
+        let px = glam::Vec2::new((i % k.width) as f32 + 0.5, (i / k.width) as f32 + 0.5);
+        *d /= k.unproject(px).length();
+    }
+    Depth { width: k.width, height: k.height, data }
+}

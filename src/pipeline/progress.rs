@@ -1,0 +1,191 @@
+//! Progress of a reconstruction: stages, fractions, times, cancellation.
+
+use super::{Error, Result};
+use std::fmt;
+use std::ops::ControlFlow;
+use std::time::Instant;
+
+/// A stage of a reconstruction, in the order of execution. [`fmt::Display`] gives its name.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[non_exhaustive]
+pub enum Stage {
+    /// Photographs are cropped and resized.
+    Crop,
+    /// Points are matched between photographs.
+    Check,
+    /// The small backbone estimates near and far.
+    DepthRange,
+    /// The backbone predicts depth, density and features.
+    Backbone,
+    /// Primary Gaussians are made of the backbone's outputs.
+    Primaries,
+    /// SubSplat divides the primaries into children.
+    Subsplat,
+    /// Photographs add detail to colours.
+    Detail,
+}
+
+impl Stage {
+    /// The name in reports: `crop`, `depth range`, ….
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Crop => "crop",
+            Self::Check => "check",
+            Self::DepthRange => "depth range",
+            Self::Backbone => "backbone",
+            Self::Primaries => "primaries",
+            Self::Subsplat => "subsplat",
+            Self::Detail => "detail",
+        }
+    }
+}
+
+impl fmt::Display for Stage {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// State of a reconstruction, as the callback of
+/// [`Reconstructor::run_with`](super::Reconstructor::run_with) receives it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
+pub struct Progress {
+    /// The stage that runs now.
+    pub stage: Stage,
+    /// Estimated share of the time that has passed, 0 to 1; never decreases.
+    pub fraction: f32,
+}
+
+/// Duration of one stage.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
+pub struct StageTime {
+    /// The stage.
+    pub stage: Stage,
+    /// Wall-clock time, seconds.
+    pub seconds: f64,
+}
+
+/// The caller's callback.
+pub(super) type Callback<'a> = dyn FnMut(Progress) -> ControlFlow<()> + 'a;
+
+/// Share of one stage in the whole.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct StageCost {
+    pub(super) stage: Stage,
+    /// Relative duration, any unit.
+    pub(super) cost: f32,
+}
+
+/// Measures stages, and reports them to the caller.
+#[derive(Debug)]
+pub(super) struct Tracker {
+    costs: Vec<StageCost>,
+    current: Option<(Stage, Instant)>,
+    times: Vec<StageTime>,
+    fraction: f32,
+}
+
+impl Tracker {
+    /// A tracker of the stages in `costs`, which are in order of execution.
+    pub(super) fn new(costs: Vec<StageCost>) -> Self {
+        Self { costs, current: None, times: Vec::new(), fraction: 0.0 }
+    }
+
+    /// Ends the current stage.
+    pub(super) fn close(&mut self) {
+        if let Some((stage, start)) = self.current.take() {
+            self.times.push(StageTime { stage, seconds: start.elapsed().as_secs_f64() });
+        }
+    }
+
+    /// Ends the current stage and begins `stage`.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`].
+    pub(super) fn begin(&mut self, stage: Stage, callback: &mut Callback<'_>) -> Result<()> {
+        self.close();
+        self.current = Some((stage, Instant::now()));
+        self.advance(0.0, callback)
+    }
+
+    /// Reports that `part` of the current stage is done, 0 to 1.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`].
+    pub(super) fn advance(&mut self, part: f32, callback: &mut Callback<'_>) -> Result<()> {
+        let Some((stage, _)) = self.current else { return Ok(()) };
+        let total: f32 = self.costs.iter().map(|c| c.cost).sum();
+        let before: f32 = self.costs.iter().filter(|c| c.stage < stage).map(|c| c.cost).sum();
+        let own = self.costs.iter().find(|c| c.stage == stage).map_or(0.0, |c| c.cost);
+        if total > 0.0 {
+            let fraction = ((before + part * own) / total).clamp(0.0, 1.0);
+            self.fraction = self.fraction.max(fraction);
+        }
+        report(Progress { stage, fraction: self.fraction }, callback)
+    }
+
+    /// Ends the last stage, reports fraction 1 and returns the times.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`].
+    pub(super) fn finish(mut self, callback: &mut Callback<'_>) -> Result<Vec<StageTime>> {
+        let last = self.current.map(|(stage, _)| stage);
+        self.close();
+        if let Some(stage) = last {
+            report(Progress { stage, fraction: 1.0 }, callback)?;
+        }
+        Ok(self.times)
+    }
+}
+
+fn report(progress: Progress, callback: &mut Callback<'_>) -> Result<()> {
+    match callback(progress) {
+        ControlFlow::Continue(()) => Ok(()),
+        ControlFlow::Break(()) => Err(Error::Cancelled),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn tracker() -> Tracker {
+        let costs = [(Stage::Crop, 1.0), (Stage::Check, 2.0), (Stage::Backbone, 5.0)];
+        Tracker::new(costs.map(|(stage, cost)| StageCost { stage, cost }).to_vec())
+    }
+
+    #[test]
+    fn fractions_rise_from_zero_to_one() {
+        let (mut tracker, mut seen) = (tracker(), Vec::new());
+        let mut callback = |p: Progress| {
+            seen.push((p.stage, p.fraction));
+            ControlFlow::Continue(())
+        };
+        tracker.begin(Stage::Crop, &mut callback).unwrap();
+        tracker.begin(Stage::Check, &mut callback).unwrap();
+        tracker.advance(0.5, &mut callback).unwrap();
+        tracker.advance(0.25, &mut callback).unwrap();
+        tracker.begin(Stage::Backbone, &mut callback).unwrap();
+        let times = tracker.finish(&mut callback).unwrap();
+        let expected = [
+            (Stage::Crop, 0.0),
+            (Stage::Check, 0.125),
+            (Stage::Check, 0.25),
+            (Stage::Check, 0.25),
+            (Stage::Backbone, 0.375),
+            (Stage::Backbone, 1.0),
+        ];
+        assert_eq!(seen, expected);
+        let stages: Vec<Stage> = times.iter().map(|t| t.stage).collect();
+        assert_eq!(stages, [Stage::Crop, Stage::Check, Stage::Backbone]);
+    }
+
+    #[test]
+    fn a_break_cancels() {
+        let mut stop = |_: Progress| ControlFlow::Break(());
+        assert!(matches!(tracker().begin(Stage::Crop, &mut stop), Err(Error::Cancelled)));
+        assert_eq!(Stage::DepthRange.to_string(), "depth range");
+    }
+}

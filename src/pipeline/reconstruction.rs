@@ -1,0 +1,108 @@
+//! A reconstructed scene.
+
+use super::{DepthBounds, Detail, Result, StageTime, Warning};
+use crate::abi::RasterOptions;
+use crate::camera::Camera;
+use crate::check::PairReport;
+use crate::data::crop::Cropped;
+use crate::io::image::Depth;
+use crate::io::{SaveOptions, SaveReport, save_splats};
+use crate::render::{Picture, comment_of_options, render};
+use crate::splats::Splats;
+use std::path::Path;
+
+/// A reconstructed scene: Gaussians, the rules to render them, and a record of how they were
+/// made.
+#[derive(Clone, Debug)]
+pub struct Reconstruction {
+    pub(super) splats: Splats,
+    pub(super) inputs: Vec<Cropped>,
+    pub(super) depths: Vec<Depth>,
+    pub(super) bounds: DepthBounds,
+    pub(super) initial_bounds: DepthBounds,
+    pub(super) raster_options: RasterOptions,
+    pub(super) detail: Detail,
+    pub(super) reports: Vec<PairReport>,
+    pub(super) warnings: Vec<Warning>,
+    pub(super) stage_times: Vec<StageTime>,
+}
+
+impl Reconstruction {
+    /// Renders the scene from `camera` on the CPU, at target resolution or any other.
+    pub fn render(&self, camera: &Camera) -> Picture {
+        render(&self.splats, camera, &self.raster_options)
+    }
+
+    /// Writes the Gaussians to a .ply, .glb, .spz or .splat file. A comment in .ply and .glb
+    /// states the rules to render them.
+    ///
+    /// # Errors
+    /// Those of [`save_splats`].
+    pub fn save(&self, path: &Path) -> Result<SaveReport> {
+        let comments = vec![comment_of_options(&self.raster_options)];
+        Ok(save_splats(path, &self.splats, &SaveOptions { comments, ..SaveOptions::default() })?)
+    }
+
+    /// The Gaussians.
+    pub fn splats(&self) -> &Splats {
+        &self.splats
+    }
+
+    /// The Gaussians, to be edited in place.
+    pub fn splats_mut(&mut self) -> &mut Splats {
+        &mut self.splats
+    }
+
+    /// The Gaussians alone.
+    pub fn into_splats(self) -> Splats {
+        self.splats
+    }
+
+    /// The photographs at the sizes of the network's input and of the target.
+    pub fn inputs(&self) -> &[Cropped] {
+        &self.inputs
+    }
+
+    /// Predicted depth of each input, camera z, world units.
+    pub fn depths(&self) -> &[Depth] {
+        &self.depths
+    }
+
+    /// The depth range of the network's candidates.
+    pub fn depth_range(&self) -> &DepthBounds {
+        &self.bounds
+    }
+
+    /// The depth range before the network estimated its own. As a prior
+    /// ([`Options::depth_prior`](super::Options::depth_prior)) of another call on the same
+    /// photographs it makes another check unnecessary.
+    pub fn initial_depth_range(&self) -> &DepthBounds {
+        &self.initial_bounds
+    }
+
+    /// The rules to render the Gaussians at target resolution.
+    pub fn raster_options(&self) -> &RasterOptions {
+        &self.raster_options
+    }
+
+    /// Source of detail that was used: [`Detail::Off`] also where no photograph is larger than
+    /// the network's input.
+    pub fn detail(&self) -> Detail {
+        self.detail
+    }
+
+    /// Reports of the check, one for each pair of consecutive photographs; empty without one.
+    pub fn reports(&self) -> &[PairReport] {
+        &self.reports
+    }
+
+    /// All warnings.
+    pub fn warnings(&self) -> &[Warning] {
+        &self.warnings
+    }
+
+    /// Duration of each stage, in order of execution.
+    pub fn stage_times(&self) -> &[StageTime] {
+        &self.stage_times
+    }
+}

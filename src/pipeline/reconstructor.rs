@@ -1,0 +1,257 @@
+//! The model that reconstructs scenes.
+
+use super::progress::{Callback, StageCost, Tracker};
+use super::warning::Warning;
+use super::{
+    Check, DepthBounds, DepthRange, DepthSource, Detail, Options, Photo, Prepared, Progress,
+    Reconstruction, Result, Stage, check_pairs, is_mvsplat, poses, refined_bounds,
+};
+use crate::camera::Camera;
+use crate::config::{Config, Preset};
+use crate::data::crop::{CropOptions, Cropped};
+use crate::model::subsplat::SubSplat;
+use crate::model::weights::{SUBSPLAT_PREFIX, Weights};
+use crate::model::{Backend, Views};
+use candle_core::{Device, Tensor};
+use std::ops::ControlFlow;
+use std::path::Path;
+
+/// A network with weights, ready to reconstruct scenes.
+pub struct Reconstructor {
+    model: SubSplat,
+    weights: Weights,
+    backend: Backend,
+    /// SubSplat's tensors that the weight file lacks.
+    missing: usize,
+}
+
+impl Reconstructor {
+    /// Builds a model with seeded, untrained weights. The small backbone is then a plain plane
+    /// sweep and gives a usable scene; MVSplat's gives noise.
+    ///
+    /// # Errors
+    /// A configuration out of range.
+    pub fn untrained(config: &Config, seed: u64) -> Result<Self> {
+        Self::build(config, Weights::seeded(seed))
+    }
+
+    /// Builds the model that ships, [`Weights::shipped`], at ×`upscale`. SubSplat's heads are
+    /// trained at ×2 and ×4. At another r pixels are split evenly, with a
+    /// [`Warning::UntrainedTensors`].
+    ///
+    /// # Errors
+    /// An `upscale` out of range.
+    pub fn shipped(upscale: usize) -> Result<Self> {
+        Self::from_weights(Weights::shipped(upscale)?, None)
+    }
+
+    /// Builds a model from a weight file. `config` replaces the file's own configuration. A
+    /// file without one must fit `config`, by default MVSplat with the `tuned` preset and ×2.
+    /// SubSplat's tensors may be missing (a converted MVSplat checkpoint): they start untrained,
+    /// with a [`Warning::UntrainedTensors`].
+    ///
+    /// # Errors
+    /// A file that holds no weights; a tensor that is missing or has another shape, named with
+    /// both shapes; a configuration out of range.
+    pub fn load(path: &Path, config: Option<&Config>) -> Result<Self> {
+        Self::from_weights(Weights::load(path)?, config)
+    }
+
+    /// [`Reconstructor::load`] from weights in memory.
+    ///
+    /// # Errors
+    /// Those of [`Reconstructor::load`].
+    pub fn from_weights(weights: Weights, config: Option<&Config>) -> Result<Self> {
+        let weights = weights.allow_missing(SUBSPLAT_PREFIX, 0);
+        let config = match (config, weights.config()) {
+            (Some(config), _) | (None, Some(config)) => config.clone(),
+            (None, None) => Config::re10k(Preset::Tuned, 2),
+        };
+        let mut built = Self::build(&config, weights)?;
+        built.missing = built.untrained_tensors().len();
+        Ok(built)
+    }
+
+    fn build(config: &Config, weights: Weights) -> Result<Self> {
+        let model = SubSplat::new(config, weights.builder())?;
+        Ok(Self { model, weights, backend: Backend::Cpu, missing: 0 })
+    }
+
+    /// The same model on another backend ([`SubSplat::with_backend`]). Where a GPU fails, the CPU
+    /// does the work, with a [`Warning::CpuInsteadOfGpu`].
+    #[must_use]
+    pub fn with_backend(self, backend: &Backend) -> Self {
+        let model = self.model.with_backend(backend);
+        Self { model, backend: backend.clone(), ..self }
+    }
+
+    /// The model's configuration.
+    pub fn config(&self) -> &Config {
+        self.model.config()
+    }
+
+    /// The network.
+    pub fn model(&self) -> &SubSplat {
+        &self.model
+    }
+
+    /// Names of the tensors that no file gave.
+    pub fn untrained_tensors(&self) -> Vec<String> {
+        self.weights.initialised()
+    }
+
+    /// Names in the weight file that the model does not have.
+    pub fn unexpected_tensors(&self) -> Vec<String> {
+        self.weights.unexpected()
+    }
+
+    /// Crop of a photograph for inputs of `input_size` (width, height), px.
+    pub fn crop_options(&self, input_size: (usize, usize)) -> CropOptions {
+        let config = self.config();
+        CropOptions { input_size, ..CropOptions::square(0, config.upscale, config.stride()) }
+    }
+
+    /// Reconstructs the scene of two or more photographs.
+    ///
+    /// # Errors
+    /// Fewer than two photographs; options out of range; poses that [`Check::Refuse`] rejects;
+    /// an error of the network.
+    pub fn run(&self, photos: &[Photo], options: &Options) -> Result<Reconstruction> {
+        self.run_with(photos, options, &mut |_| ControlFlow::Continue(()))
+    }
+
+    /// [`Reconstructor::run`] with a callback for progress. The callback runs at the start of
+    /// each stage, and after each photograph and pair. [`ControlFlow::Break`] cancels.
+    ///
+    /// # Errors
+    /// Those of [`Reconstructor::run`]; [`Error::Cancelled`](super::Error::Cancelled).
+    pub fn run_with(
+        &self,
+        photos: &[Photo],
+        options: &Options,
+        progress: &mut dyn FnMut(Progress) -> ControlFlow<()>,
+    ) -> Result<Reconstruction> {
+        self.prepare_with(photos, options, progress)?.reconstruct_with(progress)
+    }
+
+    /// Crops the photographs, checks their poses and determines the depth range. The result
+    /// holds no photograph at full size, so that the caller can free them before
+    /// [`Prepared::reconstruct`].
+    ///
+    /// # Errors
+    /// Those of [`Reconstructor::run`], but for the network's.
+    pub fn prepare(&self, photos: &[Photo], options: &Options) -> Result<Prepared<'_>> {
+        self.prepare_with(photos, options, &mut |_| ControlFlow::Continue(()))
+    }
+
+    /// [`Reconstructor::prepare`] with a callback for progress.
+    ///
+    /// # Errors
+    /// Those of [`Reconstructor::prepare`]; [`Error::Cancelled`](super::Error::Cancelled).
+    pub fn prepare_with(
+        &self,
+        photos: &[Photo],
+        options: &Options,
+        progress: &mut dyn FnMut(Progress) -> ControlFlow<()>,
+    ) -> Result<Prepared<'_>> {
+        let cameras: Vec<Camera> = photos.iter().map(|p| *p.camera()).collect();
+        let guess = options.initial_depth_range(&cameras)?;
+        let mut tracker = Tracker::new(self.stage_costs(photos.len(), options));
+        let crop = self.crop_options(options.input_size);
+        let inputs = crop_all(photos, &crop, &mut tracker, progress)?;
+        let reports = match options.check {
+            Check::Off => Vec::new(),
+            Check::Warn | Check::Refuse => {
+                tracker.begin(Stage::Check, progress)?;
+                check_pairs(photos, |part| tracker.advance(part, progress))?
+            }
+        };
+        tracker.close();
+        if options.check == Check::Refuse {
+            poses::refuse_bad(&reports)?;
+        }
+        let mut warnings = Warning::of_reports(&reports);
+        warnings.extend(Warning::of_crops(photos, &inputs, &crop));
+        if self.missing > 0 {
+            let upscale = self.config().upscale;
+            warnings.push(Warning::UntrainedTensors { count: self.missing, upscale });
+        }
+        let bounds = refined_bounds(guess, options.depth_range, &reports);
+        let options = options.clone();
+        Ok(Prepared { model: self, options, inputs, bounds, reports, warnings, tracker })
+    }
+
+    /// The network's input of cropped photographs, and its depth range. The network estimates
+    /// the range anew where `range` fixes no end.
+    ///
+    /// # Errors
+    /// No photograph, or photographs of several sizes; an error of the network.
+    pub(crate) fn views(
+        &self,
+        inputs: &[Cropped],
+        bounds: DepthBounds,
+        range: DepthRange,
+    ) -> Result<(Views, DepthBounds)> {
+        let views = views_of(inputs, (bounds.near, bounds.far))?;
+        if range != DepthRange::Auto {
+            return Ok((views, bounds));
+        }
+        let views = self.model.estimate_depth_range(&views)?;
+        let (near, far) = views.near_far[0][0];
+        if (near, far) == (bounds.near, bounds.far) {
+            return Ok((views, bounds));
+        }
+        let source = DepthSource::Estimated { from: Box::new(bounds.source) };
+        Ok((views, DepthBounds { near, far, source }))
+    }
+
+    /// A warning where the GPU did not do all of its work.
+    pub(super) fn backend_warning(&self) -> Option<Warning> {
+        self.backend.warning().map(|reason| Warning::CpuInsteadOfGpu { reason })
+    }
+
+    /// Rough durations, seconds on two cores (two photographs, 256² to 512²); the check and the
+    /// crop depend on the photographs, the rest on the input's pixels.
+    fn stage_costs(&self, photos: usize, options: &Options) -> Vec<StageCost> {
+        let (w, h) = options.input_size;
+        let n = photos as f32;
+        let pixels = n * w as f32 * h as f32 / (2.0 * 256.0 * 256.0);
+        let mvsplat = is_mvsplat(self.config());
+        let estimates = options.depth_range == DepthRange::Auto && !mvsplat;
+        let aggregates = self.config().agg.enabled;
+        let costs = [
+            (Stage::Crop, 0.015 * n),
+            (Stage::Check, if options.check == Check::Off { 0.0 } else { 0.15 * (n - 1.0) }),
+            (Stage::DepthRange, if estimates { 0.03 * pixels } else { 0.0 }),
+            (Stage::Backbone, if mvsplat { 0.8 } else { 0.12 } * pixels),
+            (Stage::Primaries, 0.01 * pixels),
+            (Stage::Subsplat, if aggregates { 0.25 } else { 0.06 } * pixels),
+            (Stage::Detail, if options.detail == Detail::Off { 0.0 } else { 0.01 * pixels }),
+        ];
+        costs.map(|(stage, cost)| StageCost { stage, cost }).to_vec()
+    }
+}
+
+fn crop_all(
+    photos: &[Photo],
+    options: &CropOptions,
+    tracker: &mut Tracker,
+    progress: &mut Callback<'_>,
+) -> Result<Vec<Cropped>> {
+    tracker.begin(Stage::Crop, progress)?;
+    let mut inputs = Vec::with_capacity(photos.len());
+    for photo in photos {
+        inputs.push(photo.crop(options)?);
+        tracker.advance(inputs.len() as f32 / photos.len() as f32, progress)?;
+    }
+    Ok(inputs)
+}
+
+/// Cropped photographs of one scene as the network's input.
+fn views_of(inputs: &[Cropped], near_far: (f32, f32)) -> Result<Views> {
+    let (w, h) = inputs.first().map_or((0, 0), |c| (c.input.width, c.input.height));
+    let pixels: Vec<f32> = inputs.iter().flat_map(|c| c.input.to_planes()).collect();
+    let images = Tensor::from_vec(pixels, (1, inputs.len(), 3, h, w), &Device::Cpu)?;
+    let cameras = inputs.iter().map(|c| c.input_camera).collect();
+    Ok(Views::new(images, vec![cameras], vec![vec![near_far; inputs.len()]])?)
+}

@@ -1,0 +1,136 @@
+//! Warnings of a reconstruction.
+
+use super::{DepthBounds, Photo};
+use crate::check::{Finding, PairReport};
+use crate::data::crop::{CropOptions, Cropped};
+use std::fmt;
+
+/// A circumstance that may spoil the result. [`fmt::Display`] gives one sentence without a final
+/// full stop.
+#[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
+pub enum Warning {
+    /// The check of the poses found something.
+    #[non_exhaustive]
+    Poses {
+        /// Index of the first photograph of the pair; the second one follows it.
+        first: usize,
+        /// The finding.
+        finding: Finding,
+    },
+    /// Nothing but the distance between the cameras determined near or far.
+    #[non_exhaustive]
+    DepthRangeGuessed {
+        /// Nearest depth candidate, world units.
+        near: f32,
+        /// Farthest depth candidate, world units.
+        far: f32,
+    },
+    /// The input size was cut to multiples of the model's stride.
+    #[non_exhaustive]
+    InputSizeCut {
+        /// Width and height that were requested, px.
+        requested: (usize, usize),
+        /// Width and height that are used, px.
+        used: (usize, usize),
+        /// The model's stride, px.
+        stride: usize,
+    },
+    /// A photograph is smaller than the target picture, and was enlarged.
+    #[non_exhaustive]
+    PhotographEnlarged {
+        /// Width and height of the photograph, px.
+        size: (usize, usize),
+        /// Width and height after resizing, px.
+        resized: (usize, usize),
+    },
+    /// The weight file lacks some of SubSplat's tensors.
+    #[non_exhaustive]
+    UntrainedTensors {
+        /// Number of missing tensors.
+        count: usize,
+        /// r: side of the children's grid.
+        upscale: usize,
+    },
+    /// The GPU failed or refused a call, and the CPU did the work.
+    #[non_exhaustive]
+    CpuInsteadOfGpu {
+        /// The GPU's error.
+        reason: String,
+    },
+}
+
+impl fmt::Display for Warning {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Poses { finding, .. } => f.write_str(&finding.sentence),
+            Self::DepthRangeGuessed { near, far } => write!(
+                f,
+                "near {near:.4} and far {far:.4} are guesses from the distance between the \
+                 cameras; fix the depth range if you know it"
+            ),
+            Self::InputSizeCut { requested: (w, h), used: (cut_w, cut_h), stride } => {
+                write!(f, "input size {w}x{h} is cut to {cut_w}x{cut_h}, multiples of {stride}")
+            }
+            Self::PhotographEnlarged { size: (w, h), resized: (to_w, to_h) } => write!(
+                f,
+                "the photograph of {w}x{h} is smaller than its resized {to_w}x{to_h}: the target \
+                 shows no more detail than the photograph has"
+            ),
+            Self::UntrainedTensors { count, upscale } => write!(
+                f,
+                "the weights lack {count} of SubSplat's tensors for upscale {upscale}: pixels are \
+                 split evenly where heads are missing"
+            ),
+            Self::CpuInsteadOfGpu { reason } => f.write_str(reason),
+        }
+    }
+}
+
+impl Warning {
+    /// All findings of the checked pairs.
+    pub(super) fn of_reports(reports: &[PairReport]) -> Vec<Self> {
+        let pair = |(first, report): (usize, &PairReport)| {
+            let warning = move |finding: &Finding| Self::Poses { first, finding: finding.clone() };
+            report.findings.iter().map(warning).collect::<Vec<_>>()
+        };
+        reports.iter().enumerate().flat_map(pair).collect()
+    }
+
+    /// Sizes that were cut, and photographs that were enlarged; each warning once.
+    pub(super) fn of_crops(
+        photos: &[Photo],
+        inputs: &[Cropped],
+        options: &CropOptions,
+    ) -> Vec<Self> {
+        let mut warnings = Vec::new();
+        let mut add = |warning: Self| {
+            if !warnings.contains(&warning) {
+                warnings.push(warning);
+            }
+        };
+        let (requested, stride) = (options.input_size, options.stride);
+        for c in inputs {
+            let used = (c.input.width, c.input.height);
+            if used != requested {
+                add(Self::InputSizeCut { requested, used, stride });
+            }
+        }
+        for (photo, c) in photos.iter().zip(inputs) {
+            let scale = c.window.scale;
+            if scale.min_element() < 1.0 {
+                let size = (photo.image().width, photo.image().height);
+                let side = |side: usize, scale: f32| (side as f32 / scale).round() as usize;
+                let resized = (side(size.0, scale.x), side(size.1, scale.y));
+                add(Self::PhotographEnlarged { size, resized });
+            }
+        }
+        warnings
+    }
+
+    /// A warning where nothing but the baseline determined an end of `bounds`.
+    pub(super) fn of_bounds(bounds: &DepthBounds) -> Option<Self> {
+        let DepthBounds { near, far, source } = bounds;
+        source.is_guess().then_some(Self::DepthRangeGuessed { near: *near, far: *far })
+    }
+}

@@ -1,0 +1,118 @@
+//! The library's main call: progress, cancellation, check, warnings.
+
+use subsplat_test_support::whole;
+
+use std::ops::ControlFlow;
+use subsplat::check::Verdict;
+use subsplat::config::{Config, Preset};
+use subsplat::{
+    Check, DepthSource, Detail, Error, Options, Photo, Progress, Reconstructor, Stage, Warning,
+};
+
+fn photos() -> Vec<Photo> {
+    whole::shoot(3, 2, 160, 144).photos
+}
+
+fn untrained() -> Reconstructor {
+    Reconstructor::untrained(&Config::small(Preset::Tuned, 2), 7).unwrap()
+}
+
+/// 96 px and not 64: smaller inputs are not halved for the estimate of the depth range.
+fn quick() -> Options {
+    Options::default().with_input_size(96, 96)
+}
+
+const STAGES: [Stage; 7] = [
+    Stage::Crop,
+    Stage::Check,
+    Stage::DepthRange,
+    Stage::Backbone,
+    Stage::Primaries,
+    Stage::Subsplat,
+    Stage::Detail,
+];
+
+#[test]
+fn progress_rises_through_all_stages_and_a_break_cancels() {
+    let (model, photos) = (untrained(), photos());
+    let mut seen: Vec<Progress> = Vec::new();
+    let mut record = |progress| {
+        seen.push(progress);
+        ControlFlow::Continue(())
+    };
+    let result = model.run_with(&photos, &quick(), &mut record).unwrap();
+    let mut stages: Vec<Stage> = seen.iter().map(|p| p.stage).collect();
+    stages.dedup();
+    assert_eq!(stages, STAGES);
+    let times: Vec<Stage> = result.stage_times().iter().map(|t| t.stage).collect();
+    assert_eq!(times, STAGES);
+    assert!(seen.windows(2).all(|w| w[0].fraction <= w[1].fraction), "{seen:?}");
+    let ends = [seen[0].fraction, seen.last().unwrap().fraction];
+    assert_eq!(ends, [0.0, 1.0]);
+    for stage in STAGES {
+        let mut calls = 0;
+        let mut stop = |progress: Progress| {
+            assert!(progress.stage <= stage, "{progress:?} after {stage} was cancelled");
+            if progress.stage < stage {
+                return ControlFlow::Continue(());
+            }
+            calls += 1;
+            ControlFlow::Break(())
+        };
+        let error = model.run_with(&photos, &quick(), &mut stop).unwrap_err();
+        assert!(matches!(error, Error::Cancelled) && calls == 1, "{stage}: {error}");
+    }
+}
+
+#[test]
+fn a_prepared_scene_reconstructs_after_its_photographs_are_freed() {
+    let (model, photos) = (untrained(), photos());
+    let whole = model.run(&photos, &quick()).unwrap();
+    let prepared = model.prepare(&photos, &quick()).unwrap();
+    drop(photos);
+    assert_eq!(prepared.reports(), whole.reports());
+    let DepthSource::Estimated { from } = &whole.depth_range().source else {
+        panic!("{:?}", whole.depth_range())
+    };
+    assert_eq!(**from, prepared.depth_range().source);
+    let parts = prepared.reconstruct().unwrap();
+    assert_eq!(parts.splats(), whole.splats());
+    assert_eq!(parts.raster_options(), whole.raster_options());
+    let camera = parts.inputs()[0].target_camera;
+    assert_eq!(parts.render(&camera), whole.render(&camera));
+    // A photograph of 160 px is larger than the input of 96, and smaller than the target of 192.
+    assert_eq!(parts.detail(), Detail::Photographs);
+    let enlarged = |w: &Warning| matches!(w, Warning::PhotographEnlarged { .. });
+    assert!(parts.warnings().iter().any(enlarged), "{:?}", parts.warnings());
+}
+
+/// The second photograph shows the same picture as the first, from another camera.
+#[test]
+fn bad_poses_are_warnings_or_an_error() {
+    let (model, photos) = (untrained(), photos());
+    let twice =
+        [photos[0].clone(), Photo::new(photos[0].image().clone(), *photos[1].camera()).unwrap()];
+    let result = model.run(&twice, &quick()).unwrap();
+    assert_eq!(result.reports()[0].verdict, Verdict::Bad);
+    let sentence = match &result.warnings()[0] {
+        Warning::Poses { first: 0, finding, .. } => finding.sentence.clone(),
+        other => panic!("{other:?}"),
+    };
+    let error = model.run(&twice, &quick().with_check(Check::Refuse)).unwrap_err();
+    assert!(matches!(error, Error::Poses(_)) && error.to_string().contains(&sentence), "{error}");
+    let unchecked = model.run(&twice, &quick().with_check(Check::Off)).unwrap();
+    assert!(unchecked.reports().is_empty());
+    assert_eq!(unchecked.stage_times()[1].stage, Stage::DepthRange);
+    let error = model.run(&photos[..1], &quick()).unwrap_err().to_string();
+    assert_eq!(error, "photographs: expected at least 2, got 1");
+}
+
+#[test]
+fn untrained_heads_are_a_warning() {
+    for (upscale, expected) in [(2, false), (3, true)] {
+        let model = Reconstructor::shipped(upscale).unwrap();
+        let prepared = model.prepare(&photos(), &quick().with_check(Check::Off)).unwrap();
+        let untrained = |w: &Warning| matches!(w, Warning::UntrainedTensors { .. });
+        assert_eq!(prepared.warnings().iter().any(untrained), expected, "x{upscale}");
+    }
+}
