@@ -48,7 +48,7 @@ pub enum Event {
     Saved(PathBuf),
     /// The model was evaluated on held-out scenes.
     Validated {
-        /// Steps done.
+        /// Completed steps.
         step: u64,
         /// Scores on procedural scenes.
         rooms: Option<Found>,

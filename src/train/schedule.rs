@@ -34,7 +34,7 @@ pub enum Schedule {
 }
 
 /// The two versions of MVSplat's warm-up. Its configuration says 2,000 steps; its released code
-/// ignores that number and takes 1 % of the training's steps plus ten.
+/// ignores that number and takes 1 % of (steps of the training + 10).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum Warmup {
@@ -48,7 +48,7 @@ pub enum Warmup {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum NamedWarmup {
-    /// 1 % of the training's steps plus ten.
+    /// 1 % of (steps of the training + 10).
     Released,
 }
 

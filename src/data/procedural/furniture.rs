@@ -97,7 +97,7 @@ impl Layout {
         let share = if upright { half.x } else { half.y } / count as f32;
         for i in 0..count {
             let offset = (2 * i + 1) as f32 * share;
-            let (place, panel) = if upright {
+            let (position, panel) = if upright {
                 (
                     Vec3::new(offset - half.x, 0.0, half.z),
                     Vec3::new(share - 0.012, half.y - 0.02, 0.008),
@@ -108,7 +108,7 @@ impl Layout {
                     Vec3::new(half.x - 0.02, share - 0.012, 0.008),
                 )
             };
-            self.add(Form::Block, centre + axes * place, axes, panel, material);
+            self.add(Form::Block, centre + axes * position, axes, panel, material);
         }
     }
 

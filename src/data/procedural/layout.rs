@@ -145,9 +145,9 @@ impl Layout {
                 0.006,
                 self.size.z * self.rng.range(0.12, 0.3),
             );
-            let place = Vec3::new(0.2 * self.rng.normal(), -half.y, 0.5 * self.rng.normal());
+            let position = Vec3::new(0.2 * self.rng.normal(), -half.y, 0.5 * self.rng.normal());
             let axes = yaw(0.1 * self.rng.normal());
-            self.add(Form::Block, place, axes, half, material);
+            self.add(Form::Block, position, axes, half, material);
         }
     }
 
@@ -266,8 +266,8 @@ impl Layout {
         self.mount(wall, at - Vec2::Y * 0.03, (half - Vec2::splat(0.06)).extend(0.026), 0.0, leaf);
         if self.accepts_extras() {
             let handle = self.material(Role::Object);
-            let place = at + Vec2::new((half.x - 0.13) * self.rng.sign(), 1.02 - half.y);
-            self.mount(wall, place, Vec3::new(0.06, 0.012, 0.012), 0.09, handle);
+            let position = at + Vec2::new((half.x - 0.13) * self.rng.sign(), 1.02 - half.y);
+            self.mount(wall, position, Vec3::new(0.06, 0.012, 0.012), 0.09, handle);
         }
     }
 
@@ -303,17 +303,17 @@ impl Layout {
     }
 
     /// Adds an emissive globe on a cord at the lamp's position, in half of the rooms.
-    pub(super) fn add_lamp(&mut self, place: Vec3) {
+    pub(super) fn add_lamp(&mut self, position: Vec3) {
         let mut rng = self.rng.fork(3);
         let (shown, radius) = (rng.chance(0.5), rng.range(0.07, 0.13));
-        if !shown || self.primitives.iter().any(|p| p.distance(place) < radius) {
+        if !shown || self.primitives.iter().any(|p| p.distance(position) < radius) {
             return;
         }
         let globe = Material::new(Role::Ceiling, &self.palette, &mut rng).into_emissive(4.0);
         let (globe, cord) = (self.add_material(globe), self.material(Role::Furniture));
-        let half = Vec3::new(0.006, 0.5 * (self.size.y + place.y), 0.006);
-        let middle = place - Vec3::Y * half.y;
-        self.add(Form::Ellipsoid, place, Mat3::IDENTITY, Vec3::splat(radius), globe);
+        let half = Vec3::new(0.006, 0.5 * (self.size.y + position.y), 0.006);
+        let middle = position - Vec3::Y * half.y;
+        self.add(Form::Ellipsoid, position, Mat3::IDENTITY, Vec3::splat(radius), globe);
         self.add(Form::Cylinder, middle, Mat3::IDENTITY, half, cord);
         for part in self.primitives.iter_mut().rev().take(2) {
             part.casts_shadow = false;

@@ -42,12 +42,12 @@ impl Lighting {
         let mut lamp = |casts_shadow: bool, share: f32| {
             let warm = 0.12 * rng.normal();
             let tint = Vec3::new(1.0 + warm, 1.0, 1.0 - warm);
-            let place = Vec3::new(
+            let position = Vec3::new(
                 rng.range(-0.4, 0.4) * size.x,
                 -rng.range(0.6, 0.93) * size.y,
                 rng.range(-0.4, 0.4) * size.z,
             );
-            Lamp { position: place, power: tint * share * rng.range(1.0, 3.0), casts_shadow }
+            Lamp { position, power: tint * share * rng.range(1.0, 3.0), casts_shadow }
         };
         let (first, second) = (lamp(true, 1.0), lamp(false, 0.6));
         let casts_shadow = rng.chance(0.5);
@@ -113,10 +113,10 @@ impl Room {
             let direction = path / distance2.sqrt().max(1e-6);
             let slope = surface.normal.dot(direction);
             // The extent of a lamp affects its shadow only, which limits the noise to shadows.
-            let place = lamp.position + shading.lamp_shift.unwrap_or(Vec3::ZERO) * LAMP_RADIUS;
+            let position = lamp.position + shading.lamp_shift.unwrap_or(Vec3::ZERO) * LAMP_RADIUS;
             let casts_shadow = lamp.casts_shadow || shading.lamp_shift.is_some();
             let from = point + surface.normal * 1e-3;
-            if slope <= 0.0 || (casts_shadow && self.shadowed(from, place)) {
+            if slope <= 0.0 || (casts_shadow && self.shadowed(from, position)) {
                 continue;
             }
             // 0.3 m² limit the irradiance of a wall beside a lamp.

@@ -132,7 +132,7 @@ class Spgr:
         learned = record[..., :2]
         if keys["offset_bound"] is not None:
             learned = g.tanh(learned) * keys["offset_bound"]
-        delta = learned / self.side + places(self.side)
+        delta = learned / self.side + subpixel_centres(self.side)
         lateral = delta / self.view.focal[:, None] * z
         flat = g.concat([c[..., :2] + lateral, g.broadcast(c[..., 2:], (self.n, self.k, 1))], 2)
         moved = self.slide_on_disc(flat, delta) if keys["slide"] == "disc" else flat
