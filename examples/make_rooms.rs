@@ -17,7 +17,7 @@ use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
 use subsplat::io::image::save_png;
 use subsplat::train::TrainConfig;
 use subsplat::train::source::Source;
-use subsplat::train::validate::rooms;
+use subsplat::train::validate::{Split, rooms};
 
 /// Side of every picture, px.
 const SIDE: usize = 256;
@@ -38,7 +38,7 @@ fn main() -> Result<()> {
     config.data.target_samples = 2;
     config.data.seed = seed;
     config.data.foreground = foreground;
-    let source = rooms(&config, true)?;
+    let source = rooms(&config, Split::HeldOut)?;
     for i in 0..count {
         let example = source.example(i)?;
         let place = folder.join(format!("room_{i:03}"));

@@ -97,16 +97,16 @@ pub(super) fn overlap(
     })
 }
 
-/// Returns the share of a picture of `size` px that lies near one of `places`.
-pub(super) fn coverage(size: &Intrinsics, places: impl Iterator<Item = DVec2>) -> f32 {
+/// Returns the share of a picture of `size` px that lies near one of `positions`.
+pub(super) fn coverage(size: &Intrinsics, positions: impl Iterator<Item = DVec2>) -> f32 {
     let mut covered = [[false; COVERAGE_GRID]; COVERAGE_GRID];
     let cell = |v: f64, side: usize| {
         ((v * COVERAGE_GRID as f64 / side as f64).max(0.0) as usize).min(COVERAGE_GRID - 1)
     };
     let around = |c: usize| c.saturating_sub(1)..=(c + 1).min(COVERAGE_GRID - 1);
-    for place in places {
-        for row in &mut covered[around(cell(place.y, size.height))] {
-            row[around(cell(place.x, size.width))].fill(true);
+    for position in positions {
+        for row in &mut covered[around(cell(position.y, size.height))] {
+            row[around(cell(position.x, size.width))].fill(true);
         }
     }
     let count = covered.iter().flatten().filter(|&&c| c).count();
@@ -133,7 +133,7 @@ fn visible_share(views: &TwoViews, sizes: [&Intrinsics; 2], depth: impl Fn(DVec2
         let px = q.truncate() / q.z;
         q.z > 0.0 && px.x >= 0.0 && px.y >= 0.0 && px.x <= wb && px.y <= hb
     };
-    let places = (0..OVERLAP_GRID * OVERLAP_GRID)
+    let positions = (0..OVERLAP_GRID * OVERLAP_GRID)
         .map(|i| DVec2::new(step(i % OVERLAP_GRID) * w, step(i / OVERLAP_GRID) * h));
-    places.filter(|&p| inside(p)).count() as f32 / (OVERLAP_GRID * OVERLAP_GRID) as f32
+    positions.filter(|&p| inside(p)).count() as f32 / (OVERLAP_GRID * OVERLAP_GRID) as f32
 }

@@ -1,6 +1,6 @@
 //! Candidate corrections of the usual mistakes in camera files.
 //!
-//! Each *reading* undoes one mistake. The reading whose cameras fit the matches tells the user the
+//! Each *reading* undoes one mistake. The reading whose cameras fit the matches shows the
 //! required change.
 //!
 //! Two views determine the relative pose only, without its length. The check cannot see mistakes

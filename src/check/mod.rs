@@ -72,9 +72,9 @@ pub fn check_pair(
     let work = WorkingPair::new([a, b], cameras, options);
     let upright = Matched::new(&work, options, Orientation::Upright);
     // Photographs that roll against each other need descriptors oriented along their gradients.
-    let found = if upright.evidence.is_thin(upright.matches.len()) {
+    let found = if upright.evidence.is_insufficient(upright.matches.len()) {
         let oriented = Matched::new(&work, options, Orientation::Gradient);
-        if oriented.evidence.strength() > upright.evidence.strength() { oriented } else { upright }
+        if oriented.evidence.count() > upright.evidence.count() { oriented } else { upright }
     } else {
         upright
     };
@@ -96,10 +96,10 @@ impl Matched {
     fn new(work: &WorkingPair, options: &CheckOptions, orientation: Orientation) -> Self {
         let [a, b] = [&work.images[0], &work.images[1]]
             .map(|image| features::detect(image, options.features, orientation));
-        let place = |f: &features::Feature| DVec2::new(f64::from(f.x), f64::from(f.y));
+        let position = |f: &features::Feature| DVec2::new(f64::from(f.x), f64::from(f.y));
         let matches: Vec<Match> = matching::pairs(&a, &b)
             .iter()
-            .map(|p| Match { a: place(&a.points[p.a]), b: place(&b.points[p.b]) })
+            .map(|p| Match { a: position(&a.points[p.a]), b: position(&b.points[p.b]) })
             .collect();
         let evidence = Evidence::gather(work, &matches, options.seed);
         Self { features: [a.points.len(), b.points.len()], matches, evidence }

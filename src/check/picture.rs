@@ -80,9 +80,9 @@ pub fn epipolar_picture(
     let f = views.fundamental();
     let chosen = spread(points);
     if chosen.is_empty() {
-        for (place, colour) in grid(&photographs[0]).into_iter().zip(COLOURS) {
-            b.line(f * place.extend(1.0), colour);
-            a.point(place, colour);
+        for (position, colour) in grid(&photographs[0]).into_iter().zip(COLOURS) {
+            b.line(f * position.extend(1.0), colour);
+            a.point(position, colour);
         }
         return Some(join(&a, &b));
     }
@@ -198,8 +198,8 @@ impl Half {
     }
 
     /// Draws a disc with a dark ring at a position of the photograph.
-    fn point(&mut self, place: DVec2, colour: [u8; 3]) {
-        let centre = place * self.scale;
+    fn point(&mut self, position: DVec2, colour: [u8; 3]) {
+        let centre = position * self.scale;
         let reach = RADIUS + RING + 1.0;
         let range = |c: f64, size: usize| {
             let first = (c - reach).floor().clamp(0.0, size as f64) as usize;

@@ -64,7 +64,7 @@ pub(super) fn matches(
         geometry::coverage(&k[0], evidence.consistent.iter().map(|&i| all[i].a)),
         geometry::coverage(&k[1], evidence.consistent.iter().map(|&i| all[i].b)),
     ];
-    if evidence.is_thin(all.len()) {
+    if evidence.is_insufficient(all.len()) {
         report_few_matches(report, work, &views);
     } else {
         report_agreement(report, work, &views, all, evidence);
@@ -140,12 +140,12 @@ impl Evidence {
     }
 
     /// Returns the number of consistent matches.
-    pub(super) fn strength(&self) -> usize {
+    pub(super) fn count(&self) -> usize {
         self.consistent.len()
     }
 
-    /// Tests whether too few of `matches` agree for a verdict on the poses.
-    pub(super) fn is_thin(&self, matches: usize) -> bool {
+    /// Tests whether too few of `matches` agree for an assessment of the poses.
+    pub(super) fn is_insufficient(&self, matches: usize) -> bool {
         let n = self.consistent.len();
         n < MIN_EVIDENCE || (n as f64) < MIN_EVIDENCE_SHARE * matches as f64
     }
@@ -195,7 +195,7 @@ fn epipolar_report(
 fn report_few_matches(report: &mut PairReport, work: &WorkingPair, views: &TwoViews) {
     let (n, m) = (report.consistent_matches, report.matches);
     let sentence = format!(
-        "only {n} of {m} matched points agree with one another: too few to verdict the poses \
+        "only {n} of {m} matched points agree with one another: too few to assess the poses \
          (little overlap, little texture, or photographs of different places)"
     );
     report.add(Verdict::Warning, "few_matches", sentence);
@@ -227,7 +227,7 @@ fn report_poses(
     let wrong = behind || error_px > WRONG_PX || fitting.first().is_some_and(|f| mistaken(&f.1));
     let error = if error_px.is_finite() && error_px > LIMIT_PX {
         format!(
-            "matched points lie {error_px:.1} px (of {} px) from where the poses put them",
+            "matched points lie {error_px:.1} px (of {} px) from the lines that the poses predict",
             super::REPORT_SIDE
         )
     } else {

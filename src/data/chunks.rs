@@ -1,15 +1,16 @@
-//! pixelSplat's data sets, which MVSplat and its descendants train and measure with:
-//! `{root}/{train,test}/NNNNNN.torch`, each a list of examples, and `index.json` from
-//! keys to files.
+//! Reads pixelSplat's data sets, which MVSplat and its successors use for training and evaluation.
 //!
-//! An example is a video: `key`, `url`, `timestamps` int64 `[N]`, `cameras` float32
-//! `[N, 18]` and `images`, N encoded pictures as 1-D uint8 tensors (JPEG; PNG for DTU).
-//! A row of `cameras` is fx, fy, cx, cy over the picture's width and height, two numbers
-//! that pixelSplat ignores, and the 3×4 matrix camera-from-world, row by row, OpenCV
-//! axes. Here it becomes the crate's `world_from_camera`.
+//! A data set is `{root}/{train,test}/NNNNNN.torch`, each a list of examples, and `index.json`,
+//! which maps keys to files.
 //!
-//! Nothing in a chunk is executed ([`crate::io::torch`]), and pictures are read one at a
-//! time: a chunk of 100 MB costs what its list of frames does.
+//! An example is a video: `key`, `url`, `timestamps` int64 `[N]`, `cameras` float32 `[N, 18]` and
+//! `images`, N encoded pictures as 1-D uint8 tensors (JPEG; PNG for DTU). A row of `cameras` holds
+//! fx, fy, cx, cy over the picture's width and height, two numbers that pixelSplat ignores, and the
+//! row-major 3×4 matrix camera-from-world with OpenCV axes. The reader converts it to the crate's
+//! `world_from_camera`.
+//!
+//! The reader executes nothing in a chunk ([`crate::io::torch`]). Pictures are read one at a time,
+//! so that opening a chunk of 100 MB needs memory for its list of frames only.
 
 use crate::camera::{Camera, Intrinsics};
 use crate::io::image::{Rgb, parse_picture};
@@ -20,29 +21,29 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// Numbers in a row of `cameras`.
+/// Number of columns of `cameras`.
 const COLUMNS: usize = 18;
 
-/// near and far that pixelSplat and MVSplat give every RealEstate10K view, world units.
+/// near and far of every RealEstate10K view in pixelSplat and MVSplat, world units.
 pub const NEAR_FAR: (f32, f32) = (1.0, 100.0);
 
-/// A frame's camera, whatever the size of its picture.
+/// The camera of a frame, independent of the picture's size.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ChunkCamera {
     /// fx, fy, cx, cy over the picture's width and height.
     pub normalised: [f32; 4],
-    /// Camera to world, rigid: the inverse of the row's matrix.
+    /// Rigid pose: the inverse of the row's matrix.
     pub world_from_camera: Mat4,
 }
 
 impl ChunkCamera {
-    /// The camera of the frame's picture of `width` × `height` pixels.
+    /// Returns the camera of a picture of `width` × `height` pixels.
     pub fn camera(&self, width: usize, height: usize) -> Camera {
         let intrinsics = Intrinsics::from_normalised(self.normalised, width, height);
         Camera { intrinsics, world_from_camera: self.world_from_camera }
     }
 
-    /// From a row; `Err` says what is wrong with it.
+    /// Converts a row of `cameras`; `Err` holds the reason of a refusal.
     fn from_row(row: &[f32; COLUMNS]) -> std::result::Result<Self, String> {
         let [fx, fy, cx, cy, _, _, m @ ..] = row.map(f64::from);
         let [a, b, c, d, e, f, g, h, i, j, k, l] = m;
@@ -52,7 +53,7 @@ impl ChunkCamera {
             DVec4::new(i, j, k, l),
             DVec4::W,
         );
-        // NaN and infinity are left for `Camera::new` to name.
+        // `Camera::new` reports NaN and infinity.
         let pose = rows.transpose().inverse().as_mat4();
         let normalised = [fx, fy, cx, cy].map(|v| v as f32);
         let unit = Intrinsics::from_normalised(normalised, 1, 1);
@@ -61,22 +62,22 @@ impl ChunkCamera {
     }
 }
 
-/// A video of a chunk.
+/// One video of a chunk.
 #[derive(Clone, Debug)]
 pub struct Example {
-    /// Its name in the data set.
+    /// Key in the data set.
     pub key: String,
-    /// The video's address; empty where there is none.
+    /// Address of the video; may be empty.
     pub url: String,
-    /// Microseconds, one a frame.
+    /// One timestamp per frame, microseconds.
     pub timestamps: Vec<i64>,
-    /// One a frame.
+    /// One camera per frame.
     pub cameras: Vec<ChunkCamera>,
     images: Vec<Arc<TensorRef>>,
 }
 
 impl Example {
-    /// Number of frames.
+    /// Returns the number of frames.
     pub fn frames(&self) -> usize {
         self.cameras.len()
     }
@@ -90,16 +91,16 @@ pub struct Chunk {
 }
 
 impl Chunk {
-    /// Opens `NNNNNN.torch`; reads everything but the pictures.
+    /// Opens `NNNNNN.torch` and reads everything except the pictures.
     ///
     /// # Errors
-    /// What [`TorchFile::open`] refuses; an example that lacks a part, or whose parts
-    /// disagree about the number of frames; a camera that is none.
+    /// Files that [`TorchFile::open`] refuses; an example without one of its parts; parts of
+    /// different numbers of frames; an invalid camera.
     pub fn open(path: &Path) -> Result<Self> {
         Self::from_file(TorchFile::open(path)?)
     }
 
-    /// [`Chunk::open`] of bytes in memory; `name` stands in messages.
+    /// Parses a chunk from memory; messages contain `name`.
     ///
     /// # Errors
     /// As [`Chunk::open`].
@@ -107,6 +108,7 @@ impl Chunk {
         Self::from_file(TorchFile::parse(bytes, name)?)
     }
 
+    /// Reads the list of examples.
     fn from_file(file: TorchFile) -> Result<Self> {
         let Value::List(rows) = file.root() else {
             let got = file.root().kind();
@@ -117,20 +119,20 @@ impl Chunk {
         Ok(Self { file, examples })
     }
 
-    /// The examples, in the file's order.
+    /// Returns the examples in the file's order.
     pub fn examples(&self) -> &[Example] {
         &self.examples
     }
 
-    /// The example of a key.
+    /// Finds the example of a key.
     pub fn find(&self, key: &str) -> Option<&Example> {
         self.examples.iter().find(|e| e.key == key)
     }
 
-    /// Encoded picture of a frame of an example of this chunk, as the file has it.
+    /// Reads the encoded picture of one frame of an example of this chunk.
     ///
     /// # Errors
-    /// No such frame; the file has changed.
+    /// A frame out of range; a file that has changed since it was opened.
     pub fn encoded(&self, example: &Example, frame: usize) -> Result<Vec<u8>> {
         let Some(image) = example.images.get(frame) else {
             let expected = format!("a frame below {}", example.images.len());
@@ -140,10 +142,10 @@ impl Chunk {
         self.file.read(image)
     }
 
-    /// Decoded picture of a frame with its camera.
+    /// Reads and decodes the picture of one frame and returns it with its camera.
     ///
     /// # Errors
-    /// As [`Chunk::encoded`]; no picture, or a damaged one.
+    /// As [`Chunk::encoded`]; a damaged picture.
     pub fn load(&self, example: &Example, frame: usize) -> Result<(Rgb, Camera)> {
         let bytes = self.encoded(example, frame)?;
         let picture = parse_picture(&bytes, self.file.path())
@@ -156,7 +158,7 @@ impl Chunk {
     }
 }
 
-/// Example `i` of the file.
+/// Reads example `i` of the file.
 fn example(file: &TorchFile, i: usize, row: &Value) -> Result<Example> {
     let key = row.get("key").and_then(Value::as_str);
     let place = match key {
@@ -214,7 +216,7 @@ fn example(file: &TorchFile, i: usize, row: &Value) -> Result<Example> {
     Ok(Example { key: key.to_owned(), url, timestamps, cameras, images })
 }
 
-/// The pictures' tensors, or what came instead.
+/// Returns the tensors of the pictures; `Err` holds the kind of the invalid value.
 fn pictures(value: &Value) -> std::result::Result<Vec<Arc<TensorRef>>, String> {
     let Value::List(items) = value else { return Err(value.kind()) };
     let picture = |(i, item): (usize, &Value)| match item {
@@ -224,10 +226,10 @@ fn pictures(value: &Value) -> std::result::Result<Vec<Arc<TensorRef>>, String> {
     items.iter().enumerate().map(picture).collect()
 }
 
-/// `index.json` of a folder of chunks: the file of each key.
+/// Reads `index.json` of a folder of chunks: the file of each key.
 ///
 /// # Errors
-/// Missing, not an object of texts, a file name that leaves the folder.
+/// A missing file; content other than an object of strings; a file name outside the folder.
 pub fn load_index(folder: &Path) -> Result<BTreeMap<String, PathBuf>> {
     let path = folder.join("index.json");
     let names: BTreeMap<String, String> = serde_json::from_slice(&read(&path)?).map_err(|e| {

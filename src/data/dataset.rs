@@ -1,24 +1,22 @@
-//! Training examples from data sets on disk, as a stream that a seed and an index
-//! decide: pixelSplat's chunks (RealEstate10K, ACID) and folders of scenes in any
-//! format of [`crate::io::scene`].
+//! Training examples from data sets on disk: pixelSplat's chunks (RealEstate10K, ACID) and folders
+//! of scenes in any format of [`crate::io::scene`].
 //!
-//! One round (epoch) visits every scene once; chunks are shuffled, and scenes within
-//! their chunk, as the reference loader does, so that consecutive examples come from
-//! one file. Example `index` of seed `seed` is the same on every machine, for any
-//! number of threads, and whatever was read before: a run that stops at an index goes on
-//! from it.
+//! The examples form a stream. One round (epoch) visits every scene once. Chunks are shuffled, and
+//! scenes are shuffled within their chunk, as in the reference loader, so that consecutive examples
+//! come from one file. Example `index` of seed `seed` is the same on every machine, for any number
+//! of threads, and for any order of reading. A run that stopped at an index continues from it.
 //!
-//! What the reference passes over is passed over here too: videos shorter than the gap
-//! between the contexts, and videos with a frame wider than 100 degrees. The reference
-//! also drops pictures that are not 360×640; here those are dropped that are smaller
-//! than the target, which a crop could only enlarge, and pairs of a scene's frames that
-//! nothing says near and far of because the camera stood still between them.
+//! The stream skips the videos that the reference skips: videos shorter than the gap between the
+//! context frames, and videos with a frame wider than 100 degrees. The reference also drops
+//! pictures that are not 360×640. This stream instead drops pictures smaller than the target, which
+//! a crop would have to enlarge. It also skips pairs without a baseline whose near and far are
+//! unknown.
 
 use super::chunks::{Chunk, NEAR_FAR, load_index};
 use super::crop::{CropOptions, crop};
 use super::depth::depth_range;
 use super::procedural::rng::Rng;
-use super::sampler::{Drawn, ViewSampler};
+use super::sampler::{SampledFrames, ViewSampler};
 use crate::camera::{Camera, Intrinsics};
 use crate::io::image::Rgb;
 use crate::io::scene::{Scene, is_scene, load_scene};
@@ -28,31 +26,33 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Widest field of view that an example may have, degrees (pixelSplat's `max_fov`).
+/// Widest field of view of an example, degrees (pixelSplat's `max_fov`).
 const FOV_MAX: f32 = 100.0;
-/// Chunks kept open: enough for loaders that work on neighbouring indices.
+/// Number of chunks that stay open. Loaders work on neighbouring indices and need few.
 const OPEN_CHUNKS: usize = 3;
-/// Examples looked at beyond two rounds: what is passed over for the pair that was drawn
-/// may serve with another.
-const STILL_PAIRS: u64 = 64;
-/// Keys that split the random numbers of one seed.
+/// Indices tried beyond two rounds. A scene that is skipped for one pair of frames may be usable
+/// with another.
+const EXTRA_ATTEMPTS: u64 = 64;
+/// Key of the random numbers that order the scenes.
 const KEY_ORDER: u64 = 1;
+/// Key of the random numbers that select frames and mirroring.
 const KEY_EXAMPLE: u64 = 2;
 
 /// A picture and its camera.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Posed {
-    /// Display values.
+    /// Picture, display values.
     pub image: Rgb,
-    /// Pinhole camera of these pixels.
+    /// Pinhole camera of this picture.
     pub camera: Camera,
 }
 
 impl Posed {
-    /// The view in a mirror: picture left to right, world and camera x negated, so that
-    /// the mirrored world seen by the mirrored camera is the mirrored picture. The pose
-    /// is S·E·S with S = diag(−1, 1, 1, 1) (MVSplat's augmentation); the principal point
-    /// moves with the pixels (MVSplat leaves it, which is the same where it is centred).
+    /// Mirrors the picture left to right, together with camera and world, so that the mirrored
+    /// camera sees the mirrored picture in the mirrored world.
+    ///
+    /// The pose becomes S·E·S with S = diag(−1, 1, 1, 1) (MVSplat's augmentation). The principal
+    /// point moves with the pixels; MVSplat leaves it, which is equal for a centred one.
     #[must_use]
     pub fn flipped(&self) -> Self {
         let k = self.camera.intrinsics;
@@ -70,25 +70,25 @@ impl Posed {
     }
 }
 
-/// What one step learns from: two inputs and the pictures to be predicted.
+/// Data of one training step: two inputs and the pictures to predict.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TrainingExample {
     /// Name of the video or the scene.
     pub name: String,
-    /// Which of its frames these are.
-    pub frames: Drawn,
+    /// Indices of the frames.
+    pub frames: SampledFrames,
     /// The network's inputs, all of one size.
     pub context: Vec<Posed>,
-    /// What the renders are compared with, r times the inputs' size.
+    /// Pictures to predict, r times the inputs' size.
     pub targets: Vec<Posed>,
     /// Nearest and farthest depth candidate, world units.
     pub near_far: (f32, f32),
-    /// Whether pictures and poses were mirrored.
+    /// True if pictures and poses are mirrored.
     pub flipped: bool,
 }
 
 impl TrainingExample {
-    /// All views in a mirror ([`Posed::flipped`]).
+    /// Mirrors all views ([`Posed::flipped`]).
     #[must_use]
     pub fn flipped(&self) -> Self {
         let all = |views: &[Posed]| views.iter().map(Posed::flipped).collect();
@@ -101,50 +101,77 @@ impl TrainingExample {
     }
 }
 
-/// How examples are made.
+/// Options of the examples.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExampleOptions {
-    /// Choice of frames.
+    /// Selection of frames.
     pub sampler: ViewSampler,
-    /// Sizes, and the reference crop or ours.
+    /// Sizes and the rule of the crop.
     pub crop: CropOptions,
-    /// Mirror half of the examples.
+    /// Mirrors half of the examples.
     pub flip: bool,
-    /// Nearest and farthest depth candidate; without: chunks 1 and 100, scenes by
-    /// [`depth_range`].
+    /// Nearest and farthest depth candidate. The default is 1 and 100 for chunks and
+    /// [`depth_range`] for scenes.
     pub near_far: Option<(f32, f32)>,
 }
 
+/// Storage of the scenes.
 enum Source {
-    /// Files in order, with the keys that they hold.
+    /// Chunk files in order, with their keys.
     Chunks(Vec<(PathBuf, Vec<String>)>),
+    /// Folders of scenes.
     Scenes(Vec<Scene>),
 }
 
-/// Order of one round: pairs (file, scene in it).
-type Order = Arc<Vec<(u32, u32)>>;
+/// Position of a scene in the data set.
+#[derive(Clone, Copy, Debug, Default)]
+struct ScenePosition {
+    /// Index of the file; 0 for folders of scenes.
+    file: u32,
+    /// Index of the scene in its file.
+    scene: u32,
+}
+
+/// The order of one round, with the seed and the round that determine it.
+#[derive(Clone)]
+struct RoundOrder {
+    seed: u64,
+    round: u64,
+    order: Arc<Vec<ScenePosition>>,
+}
+
+/// Arguments of the sampler for one example.
+#[derive(Clone, Copy)]
+struct FrameDraw {
+    /// Training step.
+    step: usize,
+    /// Seed of the frames.
+    seed: u64,
+}
 
 /// A data set on disk.
 pub struct Dataset {
     root: PathBuf,
     source: Source,
     options: ExampleOptions,
-    /// The order used last, with its seed and round.
-    order: Mutex<Option<(u64, u64, Order)>>,
+    /// The order used last.
+    order: Mutex<Option<RoundOrder>>,
+    /// Open chunks with their file indices, the most recent first.
     open: Mutex<Vec<(usize, Arc<Chunk>)>>,
 }
 
-/// The folder of chunks that `path` means: itself, or its part `split` (`train`,
-/// `test`); `None` where there is no `index.json`.
+/// Returns the folder of chunks at `path` or at `path/split` (`train`, `test`). Returns `None`
+/// where neither has an `index.json`.
 pub fn chunk_folder(path: &Path, split: &str) -> Option<PathBuf> {
     let folders = [path.to_owned(), path.join(split)];
     folders.into_iter().find(|f| f.join("index.json").is_file())
 }
 
-/// What [`load_scene`] takes of `path`: itself, or its folders that are scenes, by name.
+/// Returns the paths for [`load_scene`]: `path` itself, or its folders that are scenes, sorted by
+/// name.
 ///
 /// # Errors
-/// No scene at all; a folder that cannot be listed.
+/// A folder without any scene; a folder that cannot be listed.
 pub fn scene_paths(path: &Path) -> Result<Vec<PathBuf>> {
     if path.is_file() || is_scene(path) {
         return Ok(vec![path.to_owned()]);
@@ -161,11 +188,10 @@ pub fn scene_paths(path: &Path) -> Result<Vec<PathBuf>> {
 }
 
 impl Dataset {
-    /// Opens chunks (`path` or `path/train` has an `index.json`), a scene, or a folder of
-    /// scenes.
+    /// Opens chunks (`path` or `path/train` has an `index.json`), a scene, or a folder of scenes.
     ///
     /// # Errors
-    /// None of these; an index or a scene that is broken.
+    /// None of these; an index or a scene that cannot be parsed.
     pub fn open(path: &Path, options: ExampleOptions) -> Result<Self> {
         let source = match chunk_folder(path, "train") {
             Some(folder) => {
@@ -193,7 +219,7 @@ impl Dataset {
         })
     }
 
-    /// Number of scenes: the length of a round.
+    /// Returns the number of scenes, which is the length of a round.
     pub fn len(&self) -> usize {
         match &self.source {
             Source::Chunks(files) => files.iter().map(|(_, keys)| keys.len()).sum(),
@@ -201,12 +227,12 @@ impl Dataset {
         }
     }
 
-    /// Never: a data set without scenes is refused when it is opened.
+    /// Returns false: `open` refuses a data set without scenes.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Warnings of the scenes' readers, one line each.
+    /// Returns the warnings of the scenes' readers, one line each.
     pub fn warnings(&self) -> Vec<String> {
         match &self.source {
             Source::Chunks(_) => Vec::new(),
@@ -214,22 +240,23 @@ impl Dataset {
         }
     }
 
-    /// Which file, and which of its scenes, position `at` of round `round` visits.
-    fn visited(&self, seed: u64, round: u64, at: usize) -> (usize, usize) {
-        let mut kept = self.order.lock().unwrap_or_else(PoisonError::into_inner);
-        let order = match &*kept {
-            Some((s, r, order)) if (*s, *r) == (seed, round) => Arc::clone(order),
+    /// Returns the scene at `index` of round `round`.
+    fn scene_at(&self, seed: u64, round: u64, index: usize) -> ScenePosition {
+        let mut cached = self.order.lock().unwrap_or_else(PoisonError::into_inner);
+        let order = match &*cached {
+            Some(o) if (o.seed, o.round) == (seed, round) => Arc::clone(&o.order),
             _ => {
                 let order = Arc::new(self.order(seed, round));
-                *kept = Some((seed, round, Arc::clone(&order)));
+                *cached = Some(RoundOrder { seed, round, order: Arc::clone(&order) });
                 order
             }
         };
-        drop(kept);
-        order.get(at).map_or((0, 0), |(file, scene)| (*file as usize, *scene as usize))
+        drop(cached);
+        order.get(index).copied().unwrap_or_default()
     }
 
-    fn order(&self, seed: u64, round: u64) -> Vec<(u32, u32)> {
+    /// Computes the order of a round.
+    fn order(&self, seed: u64, round: u64) -> Vec<ScenePosition> {
         let mut rng = Rng::new(seed).fork(KEY_ORDER).fork(round);
         let shuffled = |n: usize, rng: &mut Rng| {
             let mut all: Vec<u32> = (0..n as u32).collect();
@@ -237,30 +264,32 @@ impl Dataset {
             all
         };
         let Source::Chunks(files) = &self.source else {
-            return shuffled(self.len(), &mut rng).into_iter().map(|i| (0, i)).collect();
+            let scenes = shuffled(self.len(), &mut rng).into_iter();
+            return scenes.map(|scene| ScenePosition { file: 0, scene }).collect();
         };
         let mut order = Vec::with_capacity(self.len());
         for file in shuffled(files.len(), &mut rng) {
             let keys = files.get(file as usize).map_or(0, |(_, keys)| keys.len());
-            order.extend(shuffled(keys, &mut rng).into_iter().map(|scene| (file, scene)));
+            let scenes = shuffled(keys, &mut rng).into_iter();
+            order.extend(scenes.map(|scene| ScenePosition { file, scene }));
         }
         order
     }
 
-    /// Example `index` of the stream of `seed`, with the sampler at training step
-    /// `step`; `None` where the stream passes over the scene (see the module's text).
+    /// Returns example `index` of the stream of `seed`, with the sampler at training step `step`.
+    /// Returns `None` where the stream skips the scene.
     ///
     /// # Errors
-    /// A file that is missing or broken; a key that its chunk does not hold.
+    /// A file that is missing or cannot be parsed; a key that its chunk does not hold.
     pub fn example(&self, seed: u64, index: u64, step: usize) -> Result<Option<TrainingExample>> {
         let scenes = self.len().max(1) as u64;
-        let place = self.visited(seed, index / scenes, (index % scenes) as usize);
+        let position = self.scene_at(seed, index / scenes, (index % scenes) as usize);
         let mut rng = Rng::new(seed).fork(KEY_EXAMPLE).fork(index);
-        let frames_seed = rng.bits();
+        let draw = FrameDraw { step, seed: rng.bits() };
         let example = match &self.source {
-            Source::Chunks(files) => self.of_chunk(files, place, (step, frames_seed))?,
-            Source::Scenes(scenes) => match scenes.get(place.1) {
-                Some(scene) => self.of_scene(scene, (step, frames_seed))?,
+            Source::Chunks(files) => self.chunk_example(files, position, draw)?,
+            Source::Scenes(scenes) => match scenes.get(position.scene as usize) {
+                Some(scene) => self.scene_example(scene, draw)?,
                 None => None,
             },
         };
@@ -268,15 +297,19 @@ impl Dataset {
         Ok(example.map(|e| if flip { e.flipped() } else { e }))
     }
 
-    /// The example of `index` or, where the stream passes over it, the first after it, and
-    /// its index.
+    /// Returns the first example at or after `index` that the stream does not skip, with its index.
     ///
     /// # Errors
-    /// Those of [`Dataset::example`]; none in a whole round.
-    pub fn serve(&self, seed: u64, index: u64, step: usize) -> Result<(u64, TrainingExample)> {
-        // The one usable scene may be the first of a round and the last of the next, and
-        // its first pairs may be taken where the camera stood still.
-        for at in index..index + 2 * self.len() as u64 + STILL_PAIRS {
+    /// As [`Dataset::example`]; no usable example within two rounds.
+    pub fn example_from(
+        &self,
+        seed: u64,
+        index: u64,
+        step: usize,
+    ) -> Result<(u64, TrainingExample)> {
+        // A single usable scene may be the first of a round and the last of the next. Its first
+        // pairs may lack a baseline.
+        for at in index..index + 2 * self.len() as u64 + EXTRA_ATTEMPTS {
             if let Some(example) = self.example(seed, at, step)? {
                 return Ok((at, example));
             }
@@ -285,7 +318,7 @@ impl Dataset {
         let ((w, h), r) = (crop.input_size, crop.upscale);
         let expected = format!(
             "a scene of more than {} frames of at least {}x{} pixels, none wider than {FOV_MAX} \
-             degrees, with a camera that moves or near and far given",
+             degrees, with a camera that moves or with near and far",
             sampler.bounds(step).0,
             w * r,
             h * r
@@ -294,19 +327,21 @@ impl Dataset {
         Err(Error::format(&self.root, expected, got))
     }
 
-    /// The stream of `seed` from `index` on.
+    /// Returns the stream of `seed`, starting at `index`.
     pub fn stream(&self, seed: u64, index: u64) -> Stream<'_> {
         Stream { dataset: self, seed, index }
     }
 
-    fn of_chunk(
+    /// Reads an example of a video; `None` where the stream skips the video.
+    fn chunk_example(
         &self,
         files: &[(PathBuf, Vec<String>)],
-        (file, scene): (usize, usize),
-        (step, seed): (usize, u64),
+        position: ScenePosition,
+        draw: FrameDraw,
     ) -> Result<Option<TrainingExample>> {
+        let file = position.file as usize;
         let Some((path, keys)) = files.get(file) else { return Ok(None) };
-        let Some(key) = keys.get(scene) else { return Ok(None) };
+        let Some(key) = keys.get(position.scene as usize) else { return Ok(None) };
         let chunk = self.chunk(file, path)?;
         let Some(video) = chunk.find(key) else {
             let expected = format!("an example `{}`, as index.json says", key.escape_debug());
@@ -317,25 +352,24 @@ impl Dataset {
         if units.any(|k| wide(&k)) {
             return Ok(None);
         }
-        let Some(drawn) = self.options.sampler.draw(video.frames(), step, seed) else {
+        let sampler = &self.options.sampler;
+        let Some(frames) = sampler.sample(video.frames(), draw.step, draw.seed) else {
             return Ok(None);
         };
         let near_far = self.options.near_far.unwrap_or(NEAR_FAR);
-        self.cropped(key, drawn, near_far, &|frame| chunk.load(video, frame))
+        self.cropped(key, frames, near_far, &|frame| chunk.load(video, frame))
     }
 
-    fn of_scene(
-        &self,
-        scene: &Scene,
-        (step, seed): (usize, u64),
-    ) -> Result<Option<TrainingExample>> {
-        let Some(drawn) = self.options.sampler.draw(scene.frames.len(), step, seed) else {
+    /// Reads an example of a scene; `None` where the stream skips the pair of frames.
+    fn scene_example(&self, scene: &Scene, draw: FrameDraw) -> Result<Option<TrainingExample>> {
+        let sampler = &self.options.sampler;
+        let Some(frames) = sampler.sample(scene.frames.len(), draw.step, draw.seed) else {
             return Ok(None);
         };
         let near_far = match self.options.near_far {
-            Some(given) => given,
-            // Its frames and near_far are checked, so that this says: the camera stood still.
-            None => match depth_range(scene, &drawn.context, (None, None)) {
+            Some(range) => range,
+            // Frames and near_far are already validated: the error means a zero baseline.
+            None => match depth_range(scene, &frames.context, (None, None)) {
                 Ok(range) => (range.near, range.far),
                 Err(_) => return Ok(None),
             },
@@ -344,23 +378,24 @@ impl Dataset {
             Some(frame) => frame.load(),
             None => Err(Error::format(&scene.name, "a frame of the scene", frame.to_string())),
         };
-        self.cropped(&scene.name, drawn, near_far, &load)
+        self.cropped(&scene.name, frames, near_far, &load)
     }
 
+    /// Loads and crops the frames; `None` for pictures smaller than the target.
     fn cropped(
         &self,
         name: &str,
-        frames: Drawn,
+        frames: SampledFrames,
         near_far: (f32, f32),
         load: &dyn Fn(usize) -> Result<(Rgb, Camera)>,
     ) -> Result<Option<TrainingExample>> {
         let options = &self.options.crop;
         let (w, h) = options.input_size;
-        let least = (w.saturating_mul(options.upscale), h.saturating_mul(options.upscale));
+        let min_size = (w.saturating_mul(options.upscale), h.saturating_mul(options.upscale));
         let (mut context, mut targets) = (Vec::new(), Vec::new());
         for (i, &frame) in frames.context.iter().chain(&frames.targets).enumerate() {
             let (photo, camera) = load(frame)?;
-            if photo.width < least.0 || photo.height < least.1 {
+            if photo.width < min_size.0 || photo.height < min_size.1 {
                 return Ok(None);
             }
             let c = crop(&photo, &camera, options)?;
@@ -374,12 +409,13 @@ impl Dataset {
         Ok(Some(TrainingExample { name, frames, context, targets, near_far, flipped: false }))
     }
 
+    /// Returns an open chunk, from the cache where possible.
     fn chunk(&self, file: usize, path: &Path) -> Result<Arc<Chunk>> {
         let lock = || self.open.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((_, chunk)) = lock().iter().find(|(f, _)| *f == file) {
             return Ok(Arc::clone(chunk));
         }
-        // Read outside the lock: another loader may read another chunk meanwhile.
+        // The chunk is opened outside the lock, so that other loaders can open theirs.
         let chunk = Arc::new(Chunk::open(path)?);
         let mut open = lock();
         open.insert(0, (file, Arc::clone(&chunk)));
@@ -388,7 +424,7 @@ impl Dataset {
     }
 }
 
-/// Examples one after the other.
+/// A sequence of examples.
 pub struct Stream<'a> {
     dataset: &'a Dataset,
     seed: u64,
@@ -396,17 +432,17 @@ pub struct Stream<'a> {
 }
 
 impl Stream<'_> {
-    /// Index of the next example: where a stopped run goes on.
+    /// Returns the index of the next example, from which a stopped run continues.
     pub fn index(&self) -> u64 {
         self.index
     }
 
-    /// The next example, passing over what [`Dataset::example`] passes over.
+    /// Returns the next example that the stream does not skip.
     ///
     /// # Errors
-    /// Those of [`Dataset::serve`].
+    /// As [`Dataset::example_from`].
     pub fn next_example(&mut self, step: usize) -> Result<TrainingExample> {
-        let (at, example) = self.dataset.serve(self.seed, self.index, step)?;
+        let (at, example) = self.dataset.example_from(self.seed, self.index, step)?;
         self.index = at + 1;
         Ok(example)
     }

@@ -1,5 +1,5 @@
-//! From scenes to what the network takes: crops, depth ranges, context pairs, chunks of
-//! pixelSplat's data sets, training examples, and procedural rooms.
+//! Prepares network inputs from scenes: crops, depth ranges, context pairs, chunks of pixelSplat's
+//! data sets, training examples, and procedural rooms.
 
 pub mod chunks;
 pub mod crop;

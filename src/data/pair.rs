@@ -1,55 +1,57 @@
-//! How two cameras lie to each other, and which two of many to reconstruct from.
+//! Measures the geometry of two views and selects the context pair of a scene.
 //!
-//! Feed-forward reconstruction wants two views that share 40 to 60 % of what they see
-//! (the advice that MVSplat's users are given) and yet lie apart, as depth comes from
-//! parallax alone.
+//! Feed-forward reconstruction needs two views that share 40 to 60 % of their content (MVSplat's
+//! advice to its users). Their baseline must be large enough for parallax, the only source of
+//! depth.
+//!
+//! Lengths are world units, angles degrees.
 
 use crate::camera::Camera;
 use crate::io::scene::{Scene, Units};
 use glam::{Mat3, Vec2, Vec3};
 use rayon::prelude::*;
 
-/// Two cameras, compared.
+/// Relative geometry of two cameras.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ViewGeometry {
-    /// Distance of the eyes, world units.
+    /// Distance between the cameras, world units.
     pub baseline: f32,
-    /// Angle of the rotation from one to the other, degrees.
+    /// Angle of the rotation between the cameras, degrees.
     pub rotation_deg: f32,
-    /// Share of each picture that the other sees too, mean of both, in [0, 1], by
-    /// geometry alone: nothing is known of what hides what.
+    /// Share of each picture that lies inside the other, mean of both, in [0, 1]. Occlusion is not
+    /// considered.
     pub overlap: f32,
 }
 
-/// Depths tried, spread evenly in their logarithm.
+/// Number of depths sampled, uniform in their logarithm.
 const DEPTHS: usize = 8;
-/// Pixels tried along each side.
+/// Number of pixels sampled along each side.
 const GRID: usize = 12;
 
-/// Compares two cameras for a scene that lies between `near` and `far` (world units
-/// of camera z; taken as evenly spread in the logarithm).
+/// Compares two cameras for a scene between `near` and `far` (camera z, world units; uniform in the
+/// logarithm).
 pub fn view_geometry(a: &Camera, b: &Camera, near: f32, far: f32) -> ViewGeometry {
     let between = a.rotation().transpose() * b.rotation();
     ViewGeometry {
         baseline: a.position().distance(b.position()),
         rotation_deg: angle(&between).to_degrees(),
-        overlap: 0.5 * (seen_by(a, b, near, far) + seen_by(b, a, near, far)),
+        overlap: 0.5 * (overlap_in(a, b, near, far) + overlap_in(b, a, near, far)),
     }
 }
 
-/// Angle of a rotation matrix, radians. From its sine as well as its cosine: acos alone
-/// loses everything below a thousandth of a degree.
+/// Returns the angle of a rotation matrix, radians. It uses the sine and the cosine, because acos
+/// alone loses angles below a thousandth of a degree.
 fn angle(r: &Mat3) -> f32 {
     let axis = Vec3::new(r.y_axis.z - r.z_axis.y, r.z_axis.x - r.x_axis.z, r.x_axis.y - r.y_axis.x);
     let trace = r.x_axis.x + r.y_axis.y + r.z_axis.z;
     axis.length().atan2(trace - 1.0)
 }
 
-/// Share of `a`'s picture that lies inside `b`'s.
-fn seen_by(a: &Camera, b: &Camera, near: f32, far: f32) -> f32 {
+/// Returns the share of `a`'s picture that lies inside `b`'s.
+fn overlap_in(a: &Camera, b: &Camera, near: f32, far: f32) -> f32 {
     let (from, to) = (&a.intrinsics, &b.intrinsics);
     let size = Vec2::new(from.width as f32, from.height as f32);
-    let mut seen = 0;
+    let mut inside_count = 0;
     for d in 0..DEPTHS {
         let depth = near * (far / near).powf((d as f32 + 0.5) / DEPTHS as f32);
         for i in 0..GRID * GRID {
@@ -58,37 +60,38 @@ fn seen_by(a: &Camera, b: &Camera, near: f32, far: f32) -> f32 {
             let inside = b.project(point).is_some_and(|p| {
                 p.x >= 0.0 && p.y >= 0.0 && p.x <= to.width as f32 && p.y <= to.height as f32
             });
-            seen += usize::from(inside);
+            inside_count += usize::from(inside);
         }
     }
-    seen as f32 / (DEPTHS * GRID * GRID) as f32
+    inside_count as f32 / (DEPTHS * GRID * GRID) as f32
 }
 
-/// A chosen pair.
+/// A selected pair of frames.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Pair {
     /// Indices of the frames, the smaller first.
     pub frames: [usize; 2],
-    /// The two cameras, compared.
+    /// Relative geometry of the two cameras.
     pub geometry: ViewGeometry,
-    /// Depth range that the overlap was taken for, world units.
+    /// Depth range for which the overlap was computed, world units.
     pub depths: [f32; 2],
-    /// One sentence for the user.
+    /// Explanation for the user, one sentence.
     pub reason: String,
 }
 
-/// Overlap that is wanted.
+/// Bounds of the desired overlap.
 const OVERLAP: [f32; 2] = [0.4, 0.6];
-/// More frames than this are thinned evenly before all pairs are compared.
+/// Largest number of frames whose pairs are all compared. More frames are subsampled evenly.
 const FRAMES_MAX: usize = 128;
 
-/// The pair of frames to reconstruct from: of all pairs, the one with the best balance
-/// of parallax, an overlap of 40 to 60 %, and little rotation (weights in the source).
-/// `None` if the scene has no two frames at different places.
+/// Selects the pair of frames with the best balance of parallax, an overlap of 40 to 60 %, and
+/// little rotation (weights: see `score`).
+///
+/// Returns `None` if the scene has no two frames at different positions.
 pub fn choose_pair(scene: &Scene) -> Option<Pair> {
     let step = scene.frames.len().div_ceil(FRAMES_MAX).max(1);
     let candidates: Vec<usize> = (0..scene.frames.len()).step_by(step).collect();
-    let (depth, why) = typical_depth(scene)?;
+    let (depth, origin) = typical_depth(scene)?;
     let depths = [0.5 * depth, 2.0 * depth];
     let pairs: Vec<(usize, usize)> = candidates
         .iter()
@@ -103,7 +106,7 @@ pub fn choose_pair(scene: &Scene) -> Option<Pair> {
             let score = score(&geometry, depth)?;
             let reason = format!(
                 "frames {i} and {j}: about {:.0} % overlap, {:.1} degrees apart, baseline {:.3} \
-                 (depth taken as {depth:.3}, {why})",
+                 (assumed depth {depth:.3}: {origin})",
                 100.0 * geometry.overlap,
                 geometry.rotation_deg,
                 geometry.baseline,
@@ -111,18 +114,18 @@ pub fn choose_pair(scene: &Scene) -> Option<Pair> {
             Some((score, Pair { frames: [i, j], geometry, depths, reason }))
         })
         .collect();
-    // The first of equals, so that the choice does not hang on threads.
+    // The first of equal scores, so that the result does not depend on the threads.
     scored.into_iter().reduce(|a, b| if b.0 > a.0 { b } else { a }).map(|(_, pair)| pair)
 }
 
-/// Higher is better; `None` for no baseline at all. In units of parallax (baseline over
-/// depth):
+/// Returns the score of a pair in units of parallax (baseline over depth), or `None` without a
+/// baseline. A higher score is better.
 ///
-/// * parallax counts up to 0.4 and against the pair beyond: matching gets harder, and
-///   the backbones were trained at 0.05 to 0.38;
-/// * an overlap below 40 % costs 5 per unit; one above 60 % only 0.5, as pairs around an
-///   object stay above it whatever their distance (geometry does not see the far side);
-/// * rotation costs little up to 25 degrees and much beyond: surfaces turn away.
+/// * Parallax counts up to 0.4 and reduces the score beyond: matching gets harder, and the
+///   backbones were trained at 0.05 to 0.38.
+/// * An overlap below 40 % costs 5 per unit. One above 60 % costs only 0.5: pairs around an object
+///   stay above it at any distance, because the geometry ignores its far side.
+/// * Rotation costs little up to 25 degrees and more beyond, where surfaces become oblique.
 fn score(g: &ViewGeometry, depth: f32) -> Option<f32> {
     let parallax = g.baseline / depth;
     if parallax.is_nan() || parallax <= 1e-4 {
@@ -135,7 +138,7 @@ fn score(g: &ViewGeometry, depth: f32) -> Option<f32> {
     Some(parallax.min(0.4) - too_far - 5.0 * too_little - 0.5 * too_much - turned)
 }
 
-/// A depth at which the scene may be thought to lie, and where it comes from.
+/// Estimates the depth of the scene and names the source of the estimate.
 fn typical_depth(scene: &Scene) -> Option<(f32, &'static str)> {
     let cameras: Vec<&Camera> = scene.frames.iter().map(|f| &f.camera).collect();
     if let Some(points) = &scene.points {
@@ -148,11 +151,11 @@ fn typical_depth(scene: &Scene) -> Option<(f32, &'static str)> {
         }
     }
     if scene.units == Units::RealEstate10k {
-        // Rooms are a few units deep where near is 1.
+        // Rooms are a few units deep at the scale where near is 1.
         return Some((3.0, "RealEstate10K's scale"));
     }
-    if let Some(depth) = look_at_depth(&cameras) {
-        return Some((depth, "where the optical axes meet"));
+    if let Some(depth) = convergence_depth(&cameras) {
+        return Some((depth, "the distance at which the optical axes meet"));
     }
     let eyes = || cameras.iter().map(|c| c.position());
     let low = eyes().fold(Vec3::INFINITY, Vec3::min);
@@ -161,9 +164,9 @@ fn typical_depth(scene: &Scene) -> Option<(f32, &'static str)> {
     (extent > 0.0 && extent.is_finite()).then_some((1.5 * extent, "1.5 times the cameras' extent"))
 }
 
-/// Distance of the eyes to the point closest to all optical axes, if those axes do turn
-/// around a point in front of the cameras.
-fn look_at_depth(cameras: &[&Camera]) -> Option<f32> {
+/// Returns the median distance of the cameras to the point closest to all optical axes. Returns
+/// `None` where the axes do not converge in front of the cameras.
+fn convergence_depth(cameras: &[&Camera]) -> Option<f32> {
     // Least squares: Σ(I − d dᵀ)·x = Σ(I − d dᵀ)·p.
     let (mut a, mut b) = (Mat3::ZERO, Vec3::ZERO);
     for c in cameras {
@@ -173,8 +176,8 @@ fn look_at_depth(cameras: &[&Camera]) -> Option<f32> {
         b += across * c.position();
     }
     let n = cameras.len() as f32;
-    // The determinant of the mean projector is 0 for parallel axes; 0.01 is an average
-    // spread of some six degrees.
+    // The determinant of the mean projector is 0 for parallel axes; 0.01 is an average spread of
+    // about six degrees.
     if (a * (1.0 / n)).determinant() < 0.01 {
         return None;
     }
@@ -185,7 +188,7 @@ fn look_at_depth(cameras: &[&Camera]) -> Option<f32> {
     (in_front * 10 >= cameras.len() * 9 && depth.is_finite()).then_some(depth)
 }
 
-/// Camera z of the points that project into the picture.
+/// Returns the camera z of the points that project into the picture.
 pub(super) fn points_in_view(camera: &Camera, points: &[Vec3]) -> Vec<f32> {
     let k = &camera.intrinsics;
     let depth = |p: &Vec3| {
@@ -198,7 +201,7 @@ pub(super) fn points_in_view(camera: &Camera, points: &[Vec3]) -> Vec<f32> {
     points.iter().filter_map(depth).collect()
 }
 
-/// The `q` quantile of values that are not empty (nearest rank).
+/// Returns the `q` quantile by nearest rank, or NaN without values; sorts `values`.
 pub(crate) fn quantile(values: &mut [f32], q: f32) -> f32 {
     values.sort_by(f32::total_cmp);
     let rank = (q * (values.len().max(1) - 1) as f32).round() as usize;
@@ -259,7 +262,8 @@ mod tests {
 
     #[test]
     fn the_pair_of_an_orbit_is_apart_and_overlaps() {
-        // Eyes on a circle of radius 4 around the origin, 5 degrees apart, looking in.
+        // Cameras on a circle of radius 4 around the origin, 5 degrees apart, directed at the
+        // centre.
         let orbit = |i: usize| {
             let a = (5.0 * i as f32).to_radians();
             camera(a, Quat::from_rotation_y(a) * Vec3::new(0.0, 0.0, -4.0))
@@ -274,7 +278,7 @@ mod tests {
 
     #[test]
     fn the_pair_of_a_walk_overlaps_by_half() {
-        // Sideways in steps of 0.1 at RealEstate10K's scale: depth is taken as 3.
+        // Sideways in steps of 0.1 at RealEstate10K's scale: the assumed depth is 3.
         let mut walk = scene((0..40).map(|i| camera(0.0, Vec3::X * 0.1 * i as f32)).collect());
         walk.units = Units::RealEstate10k;
         let g = choose_pair(&walk).unwrap().geometry;
@@ -282,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn turning_on_the_spot_gives_no_pair() {
+    fn rotation_without_translation_gives_no_pair() {
         let cameras = (0..5).map(|i| camera(0.1 * i as f32, Vec3::ONE)).collect();
         assert!(choose_pair(&scene(cameras)).is_none());
         assert!(choose_pair(&scene(vec![camera(0.0, Vec3::ZERO)])).is_none());

@@ -1,5 +1,6 @@
-//! Files to go on from: one safetensors file with weights, moments, moving average and
-//! the number of the step, written atomically, the newest few kept.
+//! Checkpoints: one safetensors file with weights, moments, moving average and the step.
+//!
+//! Files are written atomically, and the newest few are kept.
 
 use super::config::TrainConfig;
 use super::optimizer::State;
@@ -11,49 +12,51 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Key of [`Progress`] in the metadata.
+/// Metadata key of [`Progress`].
 const PROGRESS_KEY: &str = "subsplat.train";
-/// Key of the configuration in the metadata.
+/// Metadata key of the configuration.
 const CONFIG_KEY: &str = "subsplat.train.config";
-/// Name of a checkpoint around its step.
-const NAME: (&str, &str) = ("step-", ".safetensors");
+/// Start of a checkpoint's file name, before the step.
+const NAME_PREFIX: &str = "step-";
+/// End of a checkpoint's file name, after the step.
+const NAME_SUFFIX: &str = ".safetensors";
 
-/// How far a training is. With the configuration's seeds this is all of the random
-/// state: everything random is a function of seed and place.
+/// Progress of a training. With the configuration's seeds it is the complete random state, because
+/// all random values are functions of seed and position.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Progress {
-    /// Steps done.
+    /// Completed steps.
     pub step: u64,
-    /// Examples taken.
+    /// Consumed examples.
     pub examples: u64,
-    /// Steps in a row that were not finite.
+    /// Consecutive steps with a loss or gradient that was not finite.
     pub bad: usize,
     /// Seconds of training so far.
     pub seconds: f64,
 }
 
-/// A checkpoint as read.
+/// Contents of a checkpoint.
 pub struct Checkpoint {
-    /// How far it is.
+    /// Progress of the training.
     pub progress: Progress,
-    /// What it was told.
+    /// Configuration of the training.
     pub config: TrainConfig,
-    /// The optimizer.
+    /// State of the optimizer.
     pub state: State,
 }
 
-/// Path of the checkpoint after `step` steps.
+/// Returns the path of the checkpoint after `step` steps.
 pub fn path(folder: &Path, step: u64) -> PathBuf {
-    folder.join(format!("{}{step:08}{}", NAME.0, NAME.1))
+    folder.join(format!("{}{step:08}{}", NAME_PREFIX, NAME_SUFFIX))
 }
 
-/// Steps of the checkpoints in `folder`, oldest first; none where there is no folder.
+/// Returns the steps of the checkpoints in `folder`, oldest first; empty for a missing folder.
 pub fn steps(folder: &Path) -> Vec<u64> {
     let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
     let step = |entry: std::io::Result<std::fs::DirEntry>| -> Option<u64> {
         let name = entry.ok()?.file_name().into_string().ok()?;
-        name.strip_prefix(NAME.0)?.strip_suffix(NAME.1)?.parse().ok()
+        name.strip_prefix(NAME_PREFIX)?.strip_suffix(NAME_SUFFIX)?.parse().ok()
     };
     let mut steps: Vec<u64> = entries.filter_map(step).collect();
     steps.sort_unstable();
@@ -63,7 +66,7 @@ pub fn steps(folder: &Path) -> Vec<u64> {
 /// Writes a checkpoint and removes all but the newest `keep`.
 ///
 /// # Errors
-/// The folder is missing or full.
+/// A file that cannot be written.
 pub fn save(
     folder: &Path,
     (progress, config): (&Progress, &TrainConfig),
@@ -87,7 +90,7 @@ pub fn save(
     })?;
     let all = steps(folder);
     for step in all.iter().rev().skip(keep.max(1)) {
-        // An old file that stays does no harm.
+        // A file that cannot be removed does no harm.
         let _ = std::fs::remove_file(self::path(folder, *step));
     }
     Ok(path)
@@ -96,7 +99,7 @@ pub fn save(
 /// Reads a checkpoint.
 ///
 /// # Errors
-/// Not a checkpoint, or not whole.
+/// A file that is not a checkpoint, or is incomplete.
 pub fn load(path: &Path) -> Result<Checkpoint> {
     let (state, metadata) = read_tensors(path)?;
     let text = |key: &str| {

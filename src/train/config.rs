@@ -1,5 +1,5 @@
-//! What a training is told: one TOML or JSON file, every key with a default, unknown
-//! keys refused.
+//! The configuration of a training: one TOML or JSON file. Every key has a default, and unknown
+//! keys are refused.
 
 use super::files::Files;
 use super::optimizer::Settings;
@@ -12,58 +12,58 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
-/// A whole training.
+/// Configuration of a training.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrainConfig {
-    /// What is learnt.
+    /// Objective of the training.
     pub phase: Phase,
-    /// Seed of the weights' start, of augmentation and of what attention drops.
+    /// Seed of the initial weights, of augmentation and of dropout in attention.
     pub seed: u64,
-    /// Steps in all.
+    /// Total number of steps.
     pub steps: u64,
-    /// Scenes whose gradients make one step, `accumulate` times.
+    /// Scenes of a batch.
     pub batch: usize,
-    /// Batches whose gradients make one step.
+    /// Batches whose gradients form one step.
     pub accumulate: usize,
-    /// Scenes that pass through the backbone together: memory against calls. The
-    /// rendering phase holds the graphs of so many scenes' backbones.
+    /// Scenes that pass through the backbone together. More scenes need fewer calls and more
+    /// memory; the rendering phase holds the graphs of that many backbones.
     pub together: usize,
-    /// Groups of `together` scenes that are worked on at the same time, each with its
-    /// share of the threads and a graph of its own; 0: one for each thread. The result
-    /// does not depend on it.
-    pub lanes: usize,
-    /// The network.
+    /// Groups of `together` scenes that are processed in parallel, each with its share of the
+    /// threads and a separate graph; 0: one group per thread. The result does not depend on it.
+    #[serde(rename = "lanes")]
+    pub parallel_groups: usize,
+    /// Configuration of the network.
     pub model: Model,
-    /// Weights to begin with.
+    /// Initial weights.
     pub init: Start,
-    /// Examples.
+    /// Training examples.
     pub data: Data,
-    /// What counts how much.
+    /// Weights of the loss terms.
     pub loss: Weights,
-    /// Adam.
+    /// Options of Adam.
     pub optimizer: Settings,
     /// Learning rate.
     pub schedule: Schedule,
-    /// Files to go on from.
+    /// Options of the checkpoints.
     pub checkpoint: Checkpoints,
-    /// Looks at held-out scenes.
+    /// Options of the validation.
     pub validate: Validation,
 }
 
-/// What is learnt.
+/// Objective of a training.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Phase {
-    /// Depth and confidence of the small backbone, from the generator's own; nothing is
+    /// Depth and confidence of the small backbone, supervised by the generator's depth. Nothing is
     /// rendered.
     Depth,
-    /// Pictures at target size, with depth beside them where it is known.
+    /// Pictures at target size, with depth losses where depth is known.
     #[default]
     Render,
 }
 
-/// The network.
+/// Configuration of the network.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Model {
@@ -71,18 +71,18 @@ pub struct Model {
     pub backbone: BackboneName,
     /// `paper` or `tuned`.
     pub preset: Preset,
-    /// r: target over input, side over side.
+    /// Upscale factor r: side of the target over side of the input.
     pub upscale: usize,
-    /// Keys of [`Config`] that differ from the preset's, in its JSON's nesting, for
-    /// instance `{ embed = { mlp = "lite" } }`.
+    /// Keys of [`Config`] that differ from the preset, nested as in its JSON, for instance `{ embed
+    /// = { mlp = "lite" } }`.
     pub set: Value,
 }
 
-/// Which backbone.
+/// Name of a backbone.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum BackboneName {
-    /// Our own light network.
+    /// The small backbone of this crate.
     Small,
     /// MVSplat.
     Re10k,
@@ -99,65 +99,63 @@ impl Default for Model {
     }
 }
 
-/// Weights to begin with.
+/// Initial weights.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Start {
-    /// Drawn from the seed.
+    /// Random weights from the seed.
     #[default]
     Scratch,
-    /// A weight file of this crate or converted: `weights.safetensors` of another run,
-    /// MVSplat's checkpoint, or GMDepth's. Tensors that it lacks are drawn from the
-    /// seed.
+    /// A weight file of this crate or a converted one: `weights.safetensors` of another training,
+    /// MVSplat's checkpoint, or GMDepth's. Missing tensors take random values from the seed.
     Weights {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Added to the logit of the small backbone's opacities at the start. After the
-        /// depth phase opacity is an honest confidence, squared, and so a picture dark
-        /// with what shines through; 2 makes it cover.
+        /// Offset of the small backbone's opacity logits at the start. After the depth phase the
+        /// opacity is the squared confidence, and rendered pictures are dark and transparent. An
+        /// offset of 2 makes surfaces opaque.
         #[serde(default)]
         opacity: f32,
     },
 }
 
-/// Examples. Defaults: `learning.md`'s recipe.
+/// Training examples. The defaults are those of the training recipe.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Data {
-    /// Which rooms: the training set is this number.
+    /// Seed of the rooms, which determines the training set.
     pub seed: u64,
-    /// Distinct scenes, repeated in order; 0 for endlessly many.
+    /// Number of distinct scenes, which repeat in order; 0 for unlimited.
     pub scenes: u64,
     /// Width and height of the network's input, px.
     pub input: [usize; 2],
-    /// Views to predict, per scene.
+    /// Views to predict per scene.
     pub targets: usize,
     /// Samples along each side of a pixel of the context views.
     pub samples: usize,
     /// Samples along each side of a pixel of the targets.
     pub target_samples: usize,
-    /// Share of scenes that are windows of pictures twice as large.
+    /// Share of scenes whose pictures are windows of pictures twice as large.
     pub crop: f32,
-    /// Exposure, softness and noise of cameras on the context views.
+    /// Applies exposure, softness and noise of cameras to the context views.
     pub photographic: bool,
-    /// Share of scenes with things close before the cameras, half out of the picture.
+    /// Share of scenes with objects close to the cameras, partly outside the picture.
     pub foreground: f32,
-    /// Share of scenes whose near and far are what can be seen
+    /// Share of scenes whose near and far are the visible depth range
     /// ([`super::source::Rooms::seen_range`]).
     pub seen_range: f32,
-    /// Pictures on disk in place of made-up rooms: then `scenes`, `samples`,
-    /// `target_samples`, `crop`, `photographic`, `foreground` and `seen_range` mean nothing,
-    /// and depth is unknown.
+    /// Pictures on disk instead of procedural rooms. `scenes`, `samples`, `target_samples`, `crop`,
+    /// `photographic`, `foreground` and `seen_range` are then ignored, and depth is unknown.
     pub files: Option<Files>,
-    /// Scenes that are shown in turns before the next ones are made.
+    /// Scenes that are repeated before the next ones are made.
     pub window: u64,
-    /// How often each is shown in its window.
+    /// Repetitions of each scene of a window.
     pub replay: u64,
     /// Threads that make examples.
     pub workers: usize,
-    /// Examples that they make ahead.
+    /// Examples made ahead.
     pub ahead: usize,
-    /// Mirror images and the like.
+    /// Mirroring and other augmentation.
     pub augment: Augmentation,
 }
 
@@ -184,7 +182,7 @@ impl Default for Data {
     }
 }
 
-/// What counts how much.
+/// Weights of the loss terms.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Weights {
@@ -192,23 +190,22 @@ pub struct Weights {
     pub mse: f64,
     /// (1 − SSIM)/2.
     pub dssim: f64,
-    /// LPIPS with VGG16 (paper: 0.05); needs `lpips_weights`.
+    /// LPIPS with VGG16 (SubSplat: 0.05); needs `lpips_weights`.
     pub lpips: f64,
     /// VGG16 and LPIPS's linear layers, converted by `subsplat-convert`.
     pub lpips_weights: Option<PathBuf>,
-    /// Cross-entropy of the depth candidates to the true one.
+    /// Cross-entropy of the depth candidates.
     pub cross_entropy: f64,
     /// Smooth L1 of full-resolution disparity, in candidates.
     pub disparity: f64,
     /// Cross-entropy of confidence to exp(−error/1.5 candidates).
     pub confidence: f64,
-    /// Disparity averaged around the mode, as at inference, rather than over all
-    /// candidates.
+    /// Averages disparity around the mode, as at inference, instead of over all candidates.
     pub around_mode: bool,
-    /// x of the opacity mapping (MVSplat's `opacity_mapping`) at the first step; it runs
-    /// to the model's own over `opacity_steps`.
+    /// Exponent x of the opacity mapping (MVSplat's `opacity_mapping`) at the first step. It
+    /// changes linearly to the model's own value over `opacity_steps`.
     pub opacity_start: f64,
-    /// Steps of that; 0 for the model's own from the beginning.
+    /// Steps of that change; with 0 the model's own value applies from the start.
     pub opacity_steps: u64,
 }
 
@@ -229,15 +226,15 @@ impl Default for Weights {
     }
 }
 
-/// Files to go on from.
+/// Options of the checkpoints.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Checkpoints {
-    /// Minutes between two.
+    /// Minutes between two checkpoints or validations.
     pub minutes: f64,
-    /// Newest ones that stay.
+    /// Number of newest checkpoints to keep.
     pub keep: usize,
-    /// Steps in a row whose loss or gradient is not finite before the run gives up.
+    /// Consecutive steps with a loss or gradient that is not finite before the training stops.
     pub bad_steps: usize,
 }
 
@@ -247,13 +244,13 @@ impl Default for Checkpoints {
     }
 }
 
-/// Looks at held-out scenes.
+/// Options of the validation on held-out scenes.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Validation {
-    /// Minutes between two.
+    /// Minutes between two checkpoints or validations.
     pub minutes: f64,
-    /// Made-up scenes, from another seed than any that is trained on.
+    /// Number of procedural scenes, from a seed that training does not use.
     pub scenes: usize,
 }
 
@@ -272,7 +269,7 @@ impl Default for TrainConfig {
             batch: 4,
             accumulate: 1,
             together: 1,
-            lanes: 0,
+            parallel_groups: 0,
             model: Model::default(),
             init: Start::Scratch,
             data: Data::default(),
@@ -285,10 +282,10 @@ impl Default for TrainConfig {
     }
 }
 
-/// Longest side of a training's input, px.
+/// Largest side of the network's input in a training, px.
 const INPUT_MAX: usize = 4096;
 
-/// Puts the keys of `change` into `base`, tables into tables.
+/// Merges the keys of `change` into `base`, recursively for tables.
 fn merge(base: &mut Value, change: &Value) {
     match (base, change) {
         (Value::Object(base), Value::Object(change)) => {
@@ -301,11 +298,11 @@ fn merge(base: &mut Value, change: &Value) {
 }
 
 impl TrainConfig {
-    /// Reads a file: JSON by its extension, else TOML. A relative path in it is taken
-    /// from the file's folder.
+    /// Reads a file: JSON by its extension, otherwise TOML. Relative paths in it are relative to
+    /// the file's folder.
     ///
     /// # Errors
-    /// Missing; not of this form; an unknown key; a value out of range.
+    /// A missing file; another format; an unknown key; a value out of range.
     pub fn load(path: &Path) -> Result<Self> {
         let bytes = io::read(path)?;
         let text = String::from_utf8(bytes)
@@ -329,7 +326,7 @@ impl TrainConfig {
         Ok(config)
     }
 
-    /// From TOML, checked.
+    /// Parses and validates TOML.
     ///
     /// # Errors
     /// As [`TrainConfig::load`].
@@ -342,7 +339,7 @@ impl TrainConfig {
         Ok(config)
     }
 
-    /// From JSON, checked.
+    /// Parses and validates JSON.
     ///
     /// # Errors
     /// As [`TrainConfig::load`].
@@ -352,7 +349,7 @@ impl TrainConfig {
         Ok(config)
     }
 
-    /// JSON, for the metadata of a checkpoint.
+    /// Serialises to JSON, for the metadata of a checkpoint.
     ///
     /// # Errors
     /// None in practice.
@@ -360,10 +357,10 @@ impl TrainConfig {
         serde_json::to_string(self).map_err(|e| Error::Parse(e.to_string()))
     }
 
-    /// The model's configuration: the preset with `model.set` put in.
+    /// Returns the model's configuration: the preset with the keys of `model.set`.
     ///
     /// # Errors
-    /// Keys that [`Config`] lacks, values out of range.
+    /// Unknown keys of [`Config`]; values out of range.
     pub fn model_config(&self) -> Result<Config> {
         let m = &self.model;
         let preset = match m.backbone {
@@ -375,15 +372,15 @@ impl TrainConfig {
         Ok(Config::from_json(&json.to_string())?)
     }
 
-    /// Examples of one step.
+    /// Returns the number of examples of one step.
     pub fn examples_per_step(&self) -> u64 {
         (self.batch * self.accumulate) as u64
     }
 
-    /// Checks ranges, and that the parts fit one another.
+    /// Validates the ranges, and the combinations of options.
     ///
     /// # Errors
-    /// The first key that does not.
+    /// The first invalid key.
     pub fn check(&self) -> Result<()> {
         self.check_counts()?;
         let o = &self.optimizer;
@@ -408,7 +405,7 @@ impl TrainConfig {
             }
         }
         for beta in o.betas {
-            // 1 would never take a gradient in, and divides by 1 - 1.
+            // 1 would ignore all gradients and divide by 0.
             if !(0.0..1.0).contains(&beta) {
                 return Err(Error::value("optimizer.betas", "two numbers in [0, 1)", beta));
             }
@@ -439,11 +436,11 @@ impl TrainConfig {
                 return Err(Error::value(key, "0 to 1", value));
             }
         }
-        self.check_together()
+        self.check_combinations()
     }
 
-    /// Whole numbers. The upper ends are far beyond use; they keep products from running
-    /// over, and a slip of the pen from asking for more memory or threads than there are.
+    /// Validates the whole numbers. The upper bounds are far beyond practical values. They prevent
+    /// overflow of products, and a mistyped number from requesting excessive memory or threads.
     fn check_counts(&self) -> Result<()> {
         let d = &self.data;
         let counts = [
@@ -451,7 +448,7 @@ impl TrainConfig {
             ("batch", self.batch as u64, 1, 1 << 16),
             ("accumulate", self.accumulate as u64, 1, 1 << 16),
             ("together", self.together as u64, 1, 1 << 16),
-            ("lanes", self.lanes as u64, 0, 1 << 10),
+            ("lanes", self.parallel_groups as u64, 0, 1 << 10),
             ("data.targets", d.targets as u64, 1, 1 << 10),
             ("data.samples", d.samples as u64, 1, 1 << 6),
             ("data.target_samples", d.target_samples as u64, 1, 1 << 6),
@@ -471,7 +468,8 @@ impl TrainConfig {
         }
     }
 
-    fn check_together(&self) -> Result<()> {
+    /// Validates options that depend on one another.
+    fn check_combinations(&self) -> Result<()> {
         let config = self.model_config()?;
         let small = matches!(config.backbone, Backbone::Small(_));
         let stride = config.stride();
@@ -484,7 +482,7 @@ impl TrainConfig {
         if let Start::Weights { opacity, .. } = &self.init
             && (!opacity.is_finite() || (!small && *opacity != 0.0))
         {
-            let expected = "a finite number, and 0 but for the small backbone";
+            let expected = "a finite number; 0 for MVSplat's backbone";
             return Err(Error::value("init.opacity", expected, opacity));
         }
         if self.loss.lpips > 0.0 && self.loss.lpips_weights.is_none() {
@@ -497,13 +495,13 @@ impl TrainConfig {
         if let Some(files) = &self.data.files {
             files.check()?;
             if self.phase == Phase::Depth {
-                let expected = "none in the depth phase, which needs the generator's own depth";
+                let expected = "no files in the depth phase, which needs the generator's depth";
                 return Err(Error::value("data.files", expected, files.path.display()));
             }
         }
-        let learns_more = self.phase == Phase::Render && config.spgr.enabled;
-        if self.optimizer.freeze_backbone && !learns_more {
-            let expected = "false where nothing but the backbone is learnt";
+        let updates_heads = self.phase == Phase::Render && config.spgr.enabled;
+        if self.optimizer.freeze_backbone && !updates_heads {
+            let expected = "false, since this training updates the backbone only";
             return Err(Error::value("optimizer.freeze_backbone", expected, true));
         }
         if self.phase == Phase::Depth && !small {

@@ -1,4 +1,4 @@
-//! Examples from pictures on disk ([`Dataset`]): chunks of videos, folders of scenes.
+//! Training examples from pictures on disk ([`Dataset`]): chunks of videos, folders of scenes.
 
 use super::config::TrainConfig;
 use super::source::{Example, Source};
@@ -10,13 +10,13 @@ use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 use std::sync::Arc;
 
-/// A data set, and how its frames are chosen. Defaults: MVSplat's `re10k`.
+/// A data set and its selection of frames. The defaults are MVSplat's `re10k`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Files {
     /// Chunks (`index.json`, or `train/index.json`), a scene, or a folder of scenes.
     pub path: PathBuf,
-    /// Reading of the gap between the context frames.
+    /// Interpretation of the gap between the context frames.
     #[serde(default)]
     pub mode: GapMode,
     /// Bounds of the gap at step 0, frames.
@@ -28,12 +28,12 @@ pub struct Files {
     /// Steps over which the bounds grow.
     #[serde(default = "gap_steps")]
     pub gap_steps: usize,
-    /// Keep the principal point's fraction of width and height, as the reference's crop
-    /// does; else it moves with the pixels.
+    /// Keeps the principal point's fraction of width and height, as the reference's crop does. If
+    /// false, the principal point moves with the pixels.
     #[serde(default)]
     pub reference_crop: bool,
-    /// Nearest and farthest depth candidate; without: chunks 1 and 100, scenes by their
-    /// points or their cameras.
+    /// Nearest and farthest depth candidate. The default is 1 and 100 for chunks; for scenes it
+    /// derives from their points or cameras.
     #[serde(default)]
     pub near_far: Option<[f32; 2]>,
 }
@@ -52,14 +52,14 @@ fn gap_steps() -> usize {
     ViewSampler::re10k(GapMode::Mvs).steps
 }
 
-/// More frames than any video has.
+/// Exclusive upper bound of a gap: more frames than any video has.
 const FRAMES_END: usize = 1 << 31;
 
 impl Files {
-    /// Checks ranges.
+    /// Validates the ranges.
     ///
     /// # Errors
-    /// The first key that is out of range.
+    /// The first key out of range.
     pub fn check(&self) -> Result<()> {
         for (key, [low, high]) in [("data.files.first", self.first), ("data.files.last", self.last)]
         {
@@ -78,14 +78,14 @@ impl Files {
     }
 }
 
-/// The stream of a [`Dataset`]. An example that the data set passes over is replaced by
-/// the next one that it does not.
+/// The stream of a [`Dataset`]. An example that the data set skips is replaced by the next usable
+/// example.
 pub struct Pictures {
     dataset: Dataset,
     seed: u64,
-    /// Examples of one step, and how often each of this stream is shown: from them an index
-    /// tells its step.
+    /// Examples of one step.
     per_step: u64,
+    /// Number of times that each example is used.
     replay: u64,
 }
 
@@ -93,7 +93,7 @@ impl Pictures {
     /// Opens the data set of `files` for the training of `config`.
     ///
     /// # Errors
-    /// No data set there; an index or a scene that is broken.
+    /// A missing data set; an index or a scene that cannot be parsed.
     pub fn open(files: &Files, config: &TrainConfig) -> Result<Self> {
         let model = config.model_config()?;
         let pair = |[low, high]: [usize; 2]| (low, high);
@@ -110,7 +110,7 @@ impl Pictures {
         let options = ExampleOptions {
             sampler,
             crop: CropOptions { input_size: (w, h), rule, ..square },
-            // Mirror images are the loader's to make, as of every source.
+            // The loader mirrors the examples of every source.
             flip: false,
             near_far: files.near_far.map(|[near, far]| (near, far)),
         };
@@ -128,12 +128,12 @@ impl Source for Pictures {
     fn example(&self, index: u64) -> Result<Arc<Example>> {
         let step = index.saturating_mul(self.replay) / self.per_step;
         let step = usize::try_from(step).unwrap_or(usize::MAX);
-        let (_, one) = self.dataset.serve(self.seed, index, step)?;
+        let (_, example) = self.dataset.example_from(self.seed, index, step)?;
         Ok(Arc::new(Example {
-            context: one.context,
-            targets: one.targets,
+            context: example.context,
+            targets: example.targets,
             inverse_depth: Vec::new(),
-            near_far: one.near_far,
+            near_far: example.near_far,
         }))
     }
 

@@ -1,4 +1,4 @@
-//! Threads that make examples ahead of the step.
+//! Threads that make examples ahead of the training step.
 
 use super::source::{Augmentation, Example, Source};
 use super::{Error, Result};
@@ -8,56 +8,75 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// How long the step waits before it looks whether anyone still works for it.
-const PATIENCE: Duration = Duration::from_secs(2);
+/// Interval at which [`Loader::take`] checks that a loading thread still runs.
+const POLL_INTERVAL: Duration = Duration::from_secs(2);
 
-/// Examples in the order of their indices, made by threads of their own, at most
-/// `ahead` of them waiting.
+/// Options of a [`Loader`].
+#[derive(Clone, Copy, Debug)]
+pub struct LoaderOptions {
+    /// Augmentation of the examples.
+    pub augmentation: Augmentation,
+    /// Seed of the augmentation.
+    pub seed: u64,
+    /// Number of threads.
+    pub workers: usize,
+    /// Number of examples made ahead.
+    pub ahead: usize,
+}
+
+/// A queue of examples in the order of their indices, filled by separate threads.
 pub struct Loader {
     shared: Arc<Shared>,
     threads: Vec<JoinHandle<()>>,
     next: u64,
 }
 
+/// State shared by the loader and its threads.
 struct Shared {
     source: Arc<dyn Source>,
-    augmentation: (Augmentation, u64),
-    ahead: u64,
+    options: LoaderOptions,
     stop: AtomicBool,
     queue: Mutex<Queue>,
     changed: Condvar,
 }
 
+/// Examples between their start and their use.
 struct Queue {
-    /// First index that nobody has begun.
-    begun: u64,
-    /// First index that the step has not taken.
-    taken: u64,
+    /// First index that no thread has started.
+    next_to_start: u64,
+    /// First index that the training step has not taken.
+    next_to_take: u64,
+    /// Finished examples by index.
     done: BTreeMap<u64, Result<Example>>,
 }
 
 impl Shared {
+    /// Locks the queue.
     fn lock(&self) -> MutexGuard<'_, Queue> {
         self.queue.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Waits for a change of the queue.
     fn wait<'a>(&self, queue: MutexGuard<'a, Queue>) -> MutexGuard<'a, Queue> {
         self.changed.wait(queue).unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Makes examples until the loader stops.
     fn work(&self) {
         loop {
             let mut queue = self.lock();
-            while queue.begun >= queue.taken + self.ahead && !self.stop.load(Ordering::Relaxed) {
+            while queue.next_to_start >= queue.next_to_take + self.options.ahead.max(1) as u64
+                && !self.stop.load(Ordering::Relaxed)
+            {
                 queue = self.wait(queue);
             }
             if self.stop.load(Ordering::Relaxed) {
                 return;
             }
-            let index = queue.begun;
-            queue.begun += 1;
+            let index = queue.next_to_start;
+            queue.next_to_start += 1;
             drop(queue);
-            let (augmentation, seed) = &self.augmentation;
+            let LoaderOptions { augmentation, seed, .. } = &self.options;
             let made = self.source.example(index).map(|e| augmentation.apply(&e, *seed, index));
             self.lock().done.insert(index, made);
             self.changed.notify_all();
@@ -66,28 +85,22 @@ impl Shared {
 }
 
 impl Loader {
-    /// Starts `workers` threads at example `first`. Each has a pool of one thread for
-    /// itself, so that making pictures does not queue up before the step's own work.
+    /// Starts the threads at example `first`. Each has a pool of one thread, so that rendering does
+    /// not queue before the step's own work.
     ///
     /// # Errors
-    /// The system gives no thread.
-    pub fn start(
-        source: Arc<dyn Source>,
-        augmentation: (Augmentation, u64),
-        (workers, ahead): (usize, usize),
-        first: u64,
-    ) -> Result<Self> {
-        let queue = Queue { begun: first, taken: first, done: BTreeMap::new() };
+    /// A thread that cannot be started.
+    pub fn start(source: Arc<dyn Source>, options: LoaderOptions, first: u64) -> Result<Self> {
+        let queue = Queue { next_to_start: first, next_to_take: first, done: BTreeMap::new() };
         let shared = Arc::new(Shared {
             source,
-            augmentation,
-            ahead: ahead.max(1) as u64,
+            options,
             stop: AtomicBool::new(false),
             queue: Mutex::new(queue),
             changed: Condvar::new(),
         });
         let mut threads = Vec::new();
-        for i in 0..workers.max(1) {
+        for i in 0..options.workers.max(1) {
             let shared = shared.clone();
             let body = move || {
                 let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build();
@@ -97,34 +110,34 @@ impl Loader {
                 }
             };
             let thread = std::thread::Builder::new().name(format!("load-{i}")).spawn(body);
-            threads.push(thread.map_err(|e| Error::value("threads", "one to load with", e))?);
+            threads.push(thread.map_err(|e| Error::value("threads", "a loading thread", e))?);
         }
         Ok(Self { shared, threads, next: first })
     }
 
-    /// Index of the next example.
+    /// Returns the index of the next example.
     pub fn position(&self) -> u64 {
         self.next
     }
 
-    /// The next example; waits for it.
+    /// Waits for the next example and returns it.
     ///
     /// # Errors
-    /// What the source said.
+    /// An error of the source; loading threads that have ended.
     pub fn take(&mut self) -> Result<Example> {
         let mut queue = self.shared.lock();
         loop {
             if let Some(example) = queue.done.remove(&self.next) {
                 self.next += 1;
-                queue.taken = self.next;
+                queue.next_to_take = self.next;
                 drop(queue);
                 self.shared.changed.notify_all();
                 return example;
             }
             if self.threads.iter().all(JoinHandle::is_finished) {
-                return Err(Error::value("loading", "threads that make examples", "none left"));
+                return Err(Error::value("loading", "a running loading thread", "none"));
             }
-            let waited = self.shared.changed.wait_timeout(queue, PATIENCE);
+            let waited = self.shared.changed.wait_timeout(queue, POLL_INTERVAL);
             queue = waited.unwrap_or_else(PoisonError::into_inner).0;
         }
     }
@@ -133,13 +146,14 @@ impl Loader {
 impl Drop for Loader {
     fn drop(&mut self) {
         {
-            // Under the lock, so that no thread misses it between its look and its wait.
+            // The flag changes under the lock, so that no thread misses it between its test and its
+            // wait.
             let _queue = self.shared.lock();
             self.shared.stop.store(true, Ordering::Relaxed);
         }
         self.shared.changed.notify_all();
         for thread in self.threads.drain(..) {
-            // A thread that panicked has said so already.
+            // The panic of a thread is already reported.
             let _ = thread.join();
         }
     }

@@ -1,8 +1,8 @@
-//! Losses as plain functions of slices: a value, and its gradient written by hand.
-//! [`with_gradient`] hangs them into candle's graph.
+//! Losses as functions of slices: a value, and its analytic gradient.
 //!
-//! No graph of small tensor operations stands between a prediction and its loss, so a
-//! loss costs about one pass over the prediction.
+//! [`with_gradient`] inserts a loss into candle's graph as one scalar. No graph of small tensor
+//! operations exists between a prediction and its loss, so that a loss costs about one pass over
+//! the prediction.
 
 use crate::metrics::{SSIM_C1, SSIM_C2, SSIM_COVARIANCE, SSIM_WINDOW, window};
 use crate::ops::dssim;
@@ -10,22 +10,22 @@ use crate::ops::precomputed_gradient::precomputed_gradient;
 use candle_core::{Result, Tensor};
 use rayon::prelude::*;
 
-/// A loss and its gradient by one of its arguments.
+/// A loss and its gradient with respect to one of its arguments.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scored {
-    /// The loss.
+    /// Value of the loss.
     pub value: f64,
-    /// Its derivative by each element.
+    /// Derivative with respect to each element.
     pub gradient: Vec<f32>,
 }
 
 impl Scored {
-    /// 0, without an influence, on `n` elements.
+    /// Returns a loss of 0 with zero gradients for `n` elements.
     pub fn zero(n: usize) -> Self {
         Self { value: 0.0, gradient: vec![0.0; n] }
     }
 
-    /// This, times `factor`.
+    /// Multiplies value and gradient by `factor`.
     #[must_use]
     pub fn scaled(mut self, factor: f64) -> Self {
         self.value *= factor;
@@ -33,7 +33,7 @@ impl Scored {
         self
     }
 
-    /// Adds `factor` times `other`, of the same argument.
+    /// Adds `factor` times `other`, a loss of the same argument.
     pub fn add(&mut self, other: &Self, factor: f64) {
         self.value += factor * other.value;
         let pairs = self.gradient.par_iter_mut().zip(&other.gradient);
@@ -41,15 +41,16 @@ impl Scored {
     }
 }
 
-/// The scalar `scored.value` whose derivative by `x` is `scored.gradient`.
+/// Returns a scalar of value `scored.value` whose derivative with respect to `x` is
+/// `scored.gradient`.
 ///
 /// # Errors
-/// A gradient of another length than `x`.
+/// A gradient whose length differs from that of `x`.
 pub fn with_gradient(x: &Tensor, scored: Scored) -> Result<Tensor> {
     precomputed_gradient(x, scored.value, scored.gradient)
 }
 
-/// Mean squared difference of `x` and `target`.
+/// Returns the mean squared difference of `x` and `target`.
 pub fn mse(x: &[f32], target: &[f32]) -> Scored {
     let n = x.len().max(1) as f64;
     let sums: Vec<f64> = x
@@ -62,12 +63,15 @@ pub fn mse(x: &[f32], target: &[f32]) -> Scored {
     Scored { value: sums.iter().sum::<f64>() / n, gradient }
 }
 
-/// Elements whose terms are summed together: the same sums for any number of threads.
+/// Number of elements summed together. The fixed size makes the sums independent of the number of
+/// threads.
 const CHUNK: usize = 4096;
 
-/// Structural dissimilarity (1 − SSIM)/2 of planes `[C, height, width]` in [0, 1], by
-/// `x`. SSIM is that of [`crate::metrics::ssim`]: 11×11 Gaussian windows of σ = 1.5
-/// that lie inside the picture, sample covariance.
+/// Returns the structural dissimilarity (1 − SSIM)/2 of planes `[C, height, width]` in [0, 1], with
+/// its gradient by `x`.
+///
+/// SSIM is that of [`crate::metrics::ssim`]: 11×11 Gaussian windows of σ = 1.5 inside the picture,
+/// sample covariance.
 pub fn dssim(x: &[f32], target: &[f32], width: usize, height: usize) -> Scored {
     if width < SSIM_WINDOW || height < SSIM_WINDOW {
         return Scored::zero(x.len());
@@ -90,9 +94,11 @@ pub fn dssim(x: &[f32], target: &[f32], width: usize, height: usize) -> Scored {
     Scored { value: 0.5 * (1.0 - sums.iter().sum::<f64>() / windows as f64), gradient }
 }
 
-/// Cross-entropy of logits `[B, D, n]` to the two candidates around `target` `[B, n]`
-/// (a candidate index, shared between them by its fraction), mean over the pixels whose
-/// target lies in [0, D − 1]; NaN is unknown. By the logits.
+/// Returns the cross-entropy of logits `[B, D, n]` to the two candidates around `target` `[B, n]`,
+/// with its gradient by the logits.
+///
+/// A target is a candidate index; its fraction distributes the weight between the two candidates.
+/// The mean is over pixels with a target in [0, D − 1]; NaN marks an unknown target.
 pub fn two_hot_cross_entropy(logits: &[f32], target: &[f32], [d, n]: [usize; 2]) -> Scored {
     let mut gradient = vec![0.0; logits.len()];
     let top = d.saturating_sub(1) as f32;
@@ -105,7 +111,7 @@ pub fn two_hot_cross_entropy(logits: &[f32], target: &[f32], [d, n]: [usize; 2])
     Scored { value: sums.iter().sum::<f64>() / f64::from(count), gradient }
 }
 
-/// One item: its sum, and in `g` the derivatives over `count`.
+/// Returns the sum of one item, and writes the derivatives over `count` to `g`.
 fn cross_entropy_item(logits: &[f32], target: &[f32], count: f32, g: &mut [f32]) -> f64 {
     let n = target.len();
     let mut largest = vec![f32::NEG_INFINITY; n];
@@ -125,19 +131,19 @@ fn cross_entropy_item(logits: &[f32], target: &[f32], count: f32, g: &mut [f32])
     let mut sum = 0.0;
     for (k, (g, row)) in g.chunks_mut(n).zip(logits.chunks(n)).enumerate() {
         for (p, (g, v)) in g.iter_mut().zip(row).enumerate() {
-            // Two neighbours of the target share it by distance; NaN shares nothing.
-            let wanted = (1.0 - (k as f32 - target[p]).abs()).max(0.0);
-            if wanted > 0.0 && known[p] > 0.0 {
-                sum += f64::from(wanted * (total[p].ln() - (v - largest[p])));
+            // Linear weights of the two candidates around the target; NaN gives 0.
+            let expected = (1.0 - (k as f32 - target[p]).abs()).max(0.0);
+            if expected > 0.0 && known[p] > 0.0 {
+                sum += f64::from(expected * (total[p].ln() - (v - largest[p])));
             }
-            *g = known[p] * (*g / total[p] - wanted);
+            *g = known[p] * (*g / total[p] - expected);
         }
     }
     sum
 }
 
-/// Smooth L1 (half the square below 1, the size less ½ above) of `x` to `target`, mean
-/// over the pixels with a known target; NaN is unknown. By `x`.
+/// Returns the smooth L1 distance of `x` to `target` (e²/2 below 1, |e| − ½ above), with its
+/// gradient by `x`. The mean is over pixels with a known target; NaN marks an unknown one.
 pub fn smooth_l1(x: &[f32], target: &[f32]) -> Scored {
     let count = target.iter().filter(|t| t.is_finite()).count().max(1) as f64;
     let difference = |(x, t): (&f32, &f32)| if t.is_finite() { x - t } else { 0.0 };
@@ -158,24 +164,24 @@ pub fn smooth_l1(x: &[f32], target: &[f32]) -> Scored {
     Scored { value: sums.iter().sum::<f64>() / count, gradient }
 }
 
-/// Error, in candidates, at which the wanted confidence is 1/e.
+/// Error, in candidates, at which the target confidence is 1/e.
 const CONFIDENCE_SCALE: f32 = 1.5;
-/// Least distance of a confidence from 0 and 1 under the logarithm and in the slope.
-const CONFIDENCE_EDGE: f32 = 1e-6;
+/// Smallest distance of a confidence from 0 and 1 in the logarithm and the derivative.
+const CONFIDENCE_MARGIN: f32 = 1e-6;
 
-/// Binary cross-entropy of `confidence` in (0, 1) to exp(−|index − target|/1.5
-/// candidates), mean over the pixels with a known target. By the confidence: the error
-/// itself is taken as it is.
+/// Returns the binary cross-entropy of `confidence` in (0, 1) to exp(−|index − target|/1.5
+/// candidates), with its gradient by the confidence. The error counts as constant. The mean is over
+/// pixels with a known target.
 pub fn confidence(confidence: &[f32], index: &[f32], target: &[f32]) -> Scored {
     let count = target.iter().filter(|t| t.is_finite()).count().max(1) as f64;
     let term = |((p, x), t): ((&f32, &f32), &f32)| -> (f64, f32) {
         if !t.is_finite() {
             return (0.0, 0.0);
         }
-        let wanted = (-(x - t).abs() / CONFIDENCE_SCALE).exp();
-        let p = p.clamp(CONFIDENCE_EDGE, 1.0 - CONFIDENCE_EDGE);
-        let value = -(wanted * p.ln() + (1.0 - wanted) * (1.0 - p).ln());
-        (f64::from(value), ((f64::from(p - wanted) / f64::from(p * (1.0 - p))) / count) as f32)
+        let expected = (-(x - t).abs() / CONFIDENCE_SCALE).exp();
+        let p = p.clamp(CONFIDENCE_MARGIN, 1.0 - CONFIDENCE_MARGIN);
+        let value = -(expected * p.ln() + (1.0 - expected) * (1.0 - p).ln());
+        (f64::from(value), ((f64::from(p - expected) / f64::from(p * (1.0 - p))) / count) as f32)
     };
     let mut gradient = vec![0.0; confidence.len()];
     let sums: Vec<f64> = gradient
@@ -196,8 +202,8 @@ pub fn confidence(confidence: &[f32], index: &[f32], target: &[f32]) -> Scored {
     Scored { value: sums.iter().sum::<f64>() / count, gradient }
 }
 
-/// Candidate index of inverse depths (1 / camera z), NaN where there is no surface or
-/// it lies outside near and far by more than half a candidate.
+/// Converts inverse depths (1 / camera z) to candidate indices. The result is NaN without a
+/// surface, or where the surface lies outside near and far by more than half a candidate.
 pub fn candidate_index(inverse: &[f32], (near, far): (f32, f32), candidates: usize) -> Vec<f32> {
     let (lo, hi) = (1.0 / far, 1.0 / near);
     let top = candidates.saturating_sub(1) as f32;
@@ -209,8 +215,8 @@ pub fn candidate_index(inverse: &[f32], (near, far): (f32, f32), candidates: usi
     inverse.iter().map(index).collect()
 }
 
-/// Median of each 4×4 block of `[height, width]`, unknown pixels left out; NaN where
-/// fewer than half are known. Sides are multiples of 4.
+/// Returns the median of each 4×4 block of `[height, width]` over its known pixels; NaN where fewer
+/// than half are known. Both sides are multiples of 4.
 pub fn block_median(index: &[f32], width: usize) -> Vec<f32> {
     let (w, h) = (width / 4, index.len() / width.max(1) / 4);
     let mut out = Vec::with_capacity(w * h);
@@ -218,7 +224,7 @@ pub fn block_median(index: &[f32], width: usize) -> Vec<f32> {
         let rows = (0..4).flat_map(|r| &index[(4 * y + r) * width + 4 * x..][..4]);
         let mut known: Vec<f32> = rows.copied().filter(|v| v.is_finite()).collect();
         known.sort_by(f32::total_cmp);
-        // The lower of the two middle values: one that occurs.
+        // The lower of the two middle values, which is one of the inputs.
         out.push(if known.len() < 8 { f32::NAN } else { known[(known.len() - 1) / 2] });
     }
     out

@@ -1,11 +1,9 @@
-//! Training: examples, losses, the optimizer, and a loop that can be stopped at any
-//! moment.
+//! Training: examples, losses, the optimizer, and a loop that can stop and resume at any step.
 //!
-//! A training is a function of its configuration ([`TrainConfig`]): the weights' start,
-//! the examples and their order come from seeds, and every kernel gives the same bytes
-//! for any number of threads. So a checkpoint is the parameters, the optimizer's rows
-//! and the number of the step; resuming gives the step that not stopping would have
-//! given (`tests/train.rs`).
+//! A training is a function of its configuration ([`TrainConfig`]). The initial weights, the
+//! examples and their order derive from seeds, and every kernel gives the same bytes for any number
+//! of threads. A checkpoint therefore holds the parameters, the optimizer's state and the step. A
+//! resumed training takes the same steps as an uninterrupted one (`tools/cli/tests/cli/train.rs`).
 
 pub mod checkpoint;
 pub mod config;
@@ -24,48 +22,49 @@ pub use config::TrainConfig;
 
 use thiserror::Error as ThisError;
 
-/// Why a training could not begin or go on.
+/// Reasons for which a training cannot begin or continue.
 #[derive(Debug, ThisError)]
 pub enum Error {
-    /// A file.
+    /// Reading or writing a file failed.
     #[error(transparent)]
     Io(#[from] crate::io::Error),
-    /// The network: shapes, weights.
+    /// The network failed: shapes or weights.
     #[error(transparent)]
     Model(#[from] candle_core::Error),
-    /// The model's configuration.
+    /// The model's configuration is invalid.
     #[error(transparent)]
     Config(#[from] crate::config::ConfigError),
-    /// Text that is no training configuration.
+    /// A text is not a training configuration.
     #[error("training configuration: {0}")]
     Parse(String),
-    /// A value that cannot be.
-    #[error("{what}: expected {expected}, got {got}")]
+    /// A value is out of its range.
+    #[error("{key}: expected {expected}, got {got}")]
     Value {
-        /// Key or thing.
-        what: String,
-        /// What would be accepted.
+        /// Configuration key, or the name of the input.
+        key: String,
+        /// Accepted values.
         expected: String,
-        /// What came.
+        /// Value found.
         got: String,
     },
-    /// Loss or gradient were not finite several times in a row.
+    /// Loss or gradient were not finite in several consecutive steps.
     #[error(
-        "step {step}: loss or gradient not finite in {times} steps in a row; the last checkpoint stands"
+        "step {step}: loss or gradient were not finite in {times} steps in a row; the last checkpoint is kept"
     )]
     Diverged {
-        /// The last of them.
+        /// Number of the last step.
         step: u64,
-        /// How many.
+        /// Number of consecutive steps.
         times: usize,
     },
 }
 
 impl Error {
-    fn value(what: impl ToString, expected: impl ToString, got: impl ToString) -> Self {
-        Self::Value { what: what.to_string(), expected: expected.to_string(), got: got.to_string() }
+    /// Builds an [`Error::Value`].
+    fn value(key: impl ToString, expected: impl ToString, got: impl ToString) -> Self {
+        Self::Value { key: key.to_string(), expected: expected.to_string(), got: got.to_string() }
     }
 }
 
-/// Result of everything in this room.
+/// Result of this module's functions.
 pub type Result<T> = std::result::Result<T, Error>;

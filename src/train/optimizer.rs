@@ -1,5 +1,7 @@
-//! Adam and AdamW over all parameters as one row of numbers: one pass a step for clip,
+//! Adam and AdamW over all parameters in one contiguous array: one pass per step for clipping,
 //! moments, weights and their moving average.
+//!
+//! Sources: Kingma and Ba 2015, algorithm 1; Loshchilov and Hutter 2019.
 
 use candle_core::backprop::GradStore;
 use candle_core::{Device, Result, Tensor, Var, bail};
@@ -8,26 +10,24 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::ops::Range;
 
-/// What the optimizer is told. Defaults: PyTorch's AdamW, clip at 1, moving average
-/// 0.997.
+/// Options of the optimizer. Defaults: PyTorch's AdamW, clipping at 1, moving average 0.997.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
     /// Decay of the first and of the second moment.
     pub betas: [f64; 2],
-    /// Added to the root of the second moment.
+    /// Term added to the root of the second moment.
     pub epsilon: f64,
     /// Decoupled decay of weights with two or more axes (AdamW); 0 is Adam.
     pub weight_decay: f64,
-    /// Largest norm of all gradients together; 0 for any.
+    /// Largest norm of all gradients together; 0 disables clipping.
     pub clip: f64,
-    /// Decay of the moving average of the weights, which is what is shipped; 0 keeps the
-    /// weights themselves. It rises to this as (1 + step)/(10 + step).
+    /// Decay of the moving average of the weights, which is the shipped result; 0 keeps the weights
+    /// themselves. The decay rises to this value as (1 + step)/(10 + step).
     pub average: f64,
     /// Factor on the learning rate of the backbone.
     pub backbone_rate: f64,
-    /// The backbone stays as it is: no gradient is sent through it, and its depth losses,
-    /// which could change nothing, are left out.
+    /// Keeps the backbone constant. No gradient flows through it, and its depth losses are omitted.
     pub freeze_backbone: bool,
 }
 
@@ -45,7 +45,7 @@ impl Default for Settings {
     }
 }
 
-/// One parameter's place in the row.
+/// One parameter and its range in the array.
 #[derive(Clone, Debug)]
 struct Slot {
     name: String,
@@ -64,20 +64,22 @@ pub struct Optimizer {
     first: Vec<f32>,
     second: Vec<f32>,
     average: Vec<f32>,
-    /// Updates of each parameter so far: a parameter that no loss has reached stands
-    /// still, and its bias correction with it.
+    /// Number of updates of each parameter, for its bias correction. A parameter without a gradient
+    /// is not updated.
     updates: Vec<u64>,
 }
 
 /// Sum of the gradients of several backward passes.
 #[derive(Clone, Debug)]
 pub struct Gradients {
+    /// Summed gradients of all parameters.
     sum: Vec<f32>,
+    /// True for each parameter that received a gradient.
     touched: Vec<bool>,
 }
 
 impl Gradients {
-    /// Norm of all gradients together.
+    /// Returns the norm of all gradients together.
     pub fn norm(&self) -> f64 {
         let sums: Vec<f64> = self
             .sum
@@ -93,24 +95,24 @@ impl Gradients {
         self.touched.iter_mut().zip(&other.touched).for_each(|(a, b)| *a |= b);
     }
 
-    /// All to zero.
+    /// Sets all gradients to zero.
     pub fn clear(&mut self) {
         self.sum.fill(0.0);
         self.touched.fill(false);
     }
 }
 
-/// The optimizer's state under names, for a checkpoint.
+/// The optimizer's state by tensor name, for a checkpoint.
 pub type State = BTreeMap<String, Tensor>;
 
 /// Prefixes of the state's tensors.
 const ROWS: [&str; 4] = ["weights/", "first/", "second/", "average/"];
-/// Name of the numbers of updates, exact in f32 up to 2²⁴.
+/// Tensor name of the numbers of updates, exact in f32 up to 2²⁴.
 const UPDATES: &str = "updates";
 
 impl Optimizer {
-    /// Over `variables`, by name. Backbone parameters are those whose names do not start
-    /// with `subsplat.`.
+    /// Creates an optimizer of `variables`, by name. Backbone parameters are those whose names do
+    /// not start with `subsplat.`.
     ///
     /// # Errors
     /// A variable that is not f32.
@@ -139,17 +141,17 @@ impl Optimizer {
         })
     }
 
-    /// Number of parameters.
+    /// Returns the number of parameters.
     pub fn parameters(&self) -> usize {
         self.values.len()
     }
 
-    /// Zeros, to add gradients to.
+    /// Returns zero gradients.
     pub fn gradients(&self) -> Gradients {
         Gradients { sum: vec![0.0; self.values.len()], touched: vec![false; self.slots.len()] }
     }
 
-    /// Adds what a backward pass found.
+    /// Adds the gradients of a backward pass.
     ///
     /// # Errors
     /// A gradient that is not f32.
@@ -170,11 +172,11 @@ impl Optimizer {
         Ok(())
     }
 
-    /// One step with learning rate `rate`, number `step` of the training. The norm of
-    /// `gradients` is given, since the caller has looked at it.
+    /// Takes step number `step` with learning rate `rate`. `norm` is the norm of `gradients`, which
+    /// the caller has already computed.
     ///
     /// # Errors
-    /// Whatever candle says of the assignment.
+    /// A tensor operation that fails.
     pub fn step(&mut self, gradients: &Gradients, norm: f64, rate: f64, step: u64) -> Result<()> {
         let s = self.settings;
         let clip = if s.clip > 0.0 && norm > s.clip { s.clip / norm } else { 1.0 };
@@ -190,7 +192,7 @@ impl Optimizer {
             let update = Update {
                 clip: clip as f32,
                 betas: s.betas.map(|b| b as f32),
-                // Both bias corrections folded into rate and ε's scale.
+                // Both bias corrections are folded into the rate and the scale of ε.
                 rate: (rate / (1.0 - s.betas[0].powi(t))) as f32,
                 root: (1.0 / (1.0 - s.betas[1].powi(t)).sqrt()) as f32,
                 epsilon: s.epsilon as f32,
@@ -213,14 +215,15 @@ impl Optimizer {
         Ok(())
     }
 
-    /// The moving average of the weights, by the model's names.
+    /// Returns the moving average of the weights, by the model's names.
     ///
     /// # Errors
-    /// Whatever candle says of the allocation.
+    /// A tensor operation that fails.
     pub fn averaged(&self) -> Result<BTreeMap<String, Tensor>> {
         self.named("", &self.average)
     }
 
+    /// Splits an array into tensors by name.
     fn named(&self, prefix: &str, row: &[f32]) -> Result<BTreeMap<String, Tensor>> {
         let tensor = |s: &Slot| -> Result<(String, Tensor)> {
             let t = Tensor::from_slice(&row[s.span.clone()], s.var.shape(), &Device::Cpu)?;
@@ -229,10 +232,10 @@ impl Optimizer {
         self.slots.iter().map(tensor).collect()
     }
 
-    /// Everything that the next step depends on.
+    /// Returns the complete state, from which the next step follows.
     ///
     /// # Errors
-    /// Whatever candle says of the allocation.
+    /// A tensor operation that fails.
     pub fn state(&self) -> Result<State> {
         let mut state = State::new();
         for (prefix, row) in
@@ -245,31 +248,32 @@ impl Optimizer {
         Ok(state)
     }
 
-    /// Takes [`Optimizer::state`] back.
+    /// Restores the result of [`Optimizer::state`].
     ///
     /// # Errors
-    /// A tensor that is missing, of another shape, or of no parameter.
+    /// A tensor that is missing, has another shape, or belongs to no parameter.
     pub fn restore(&mut self, mut state: State) -> Result<()> {
         for slot in &self.slots {
             let rows = [&mut self.values, &mut self.first, &mut self.second, &mut self.average];
             for (prefix, row) in ROWS.into_iter().zip(rows) {
                 let name = format!("{prefix}{}", slot.name);
-                let tensor = taken(&mut state, &name, slot.var.dims())?;
+                let tensor = take_tensor(&mut state, &name, slot.var.dims())?;
                 row[slot.span.clone()].copy_from_slice(&tensor.flatten_all()?.to_vec1::<f32>()?);
             }
             let value = &self.values[slot.span.clone()];
             slot.var.set(&Tensor::from_slice(value, slot.var.shape(), &Device::Cpu)?)?;
         }
-        let updates = taken(&mut state, UPDATES, &[self.slots.len()])?.to_vec1::<f32>()?;
+        let updates = take_tensor(&mut state, UPDATES, &[self.slots.len()])?.to_vec1::<f32>()?;
         self.updates = updates.into_iter().map(|u| u as u64).collect();
         match state.keys().next() {
-            Some(name) => bail!("checkpoint: `{name}` is no part of this model"),
+            Some(name) => bail!("checkpoint: tensor `{name}` does not belong to this model"),
             None => Ok(()),
         }
     }
 }
 
-fn taken(state: &mut State, name: &str, dims: &[usize]) -> Result<Tensor> {
+/// Removes a tensor of shape `dims` from the state.
+fn take_tensor(state: &mut State, name: &str, dims: &[usize]) -> Result<Tensor> {
     match state.remove(name) {
         Some(t) if t.dims() == dims => Ok(t),
         Some(t) => bail!("checkpoint tensor `{name}`: expected {dims:?}, got {:?}", t.dims()),
@@ -277,7 +281,7 @@ fn taken(state: &mut State, name: &str, dims: &[usize]) -> Result<Tensor> {
     }
 }
 
-/// One parameter's step (Kingma and Ba 2015, algorithm 1; Loshchilov and Hutter 2019).
+/// Constants of one parameter's step.
 struct Update {
     clip: f32,
     betas: [f32; 2],
@@ -289,11 +293,13 @@ struct Update {
 }
 
 impl Update {
+    /// Updates values, moments and average in place.
     fn run(&self, g: &[f32], value: &mut [f32], [m, v]: [&mut [f32]; 2], average: &mut [f32]) {
-        const SHARE: usize = 1 << 14;
-        g.par_chunks(SHARE)
-            .zip(value.par_chunks_mut(SHARE).zip(average.par_chunks_mut(SHARE)))
-            .zip(m.par_chunks_mut(SHARE).zip(v.par_chunks_mut(SHARE)))
+        /// Elements of one parallel task.
+        const TASK: usize = 1 << 14;
+        g.par_chunks(TASK)
+            .zip(value.par_chunks_mut(TASK).zip(average.par_chunks_mut(TASK)))
+            .zip(m.par_chunks_mut(TASK).zip(v.par_chunks_mut(TASK)))
             .for_each(|((g, (value, average)), (m, v))| {
                 let [b1, b2] = self.betas;
                 for i in 0..g.len() {

@@ -1,5 +1,5 @@
-//! Photographs to look at while training: scenes with a `protocol.json`. Nothing is
-//! ever learnt from them.
+//! Photographs for the evaluation during a training: scenes with a `protocol.json`. They are never
+//! used for training.
 
 use super::Result;
 use super::source::Example;
@@ -11,15 +11,14 @@ use crate::io::scene::{Scene, load_scene};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// Side of input and of target, px: the protocol's.
+/// Side of input and target, px, as in the protocol.
 const SIDE: usize = 256;
 
-/// The pairs of all scenes in `folder` (or of the one scene that it is), in the order
-/// of their names; targets at the input's size.
+/// Loads the pairs of all scenes in `folder` (or of `folder` itself), in the order of their names,
+/// with targets at the input's size.
 ///
 /// # Errors
-/// No scene with a `protocol.json`; a scene, a protocol or a photograph that cannot be
-/// read.
+/// No scene with a `protocol.json`; a scene, a protocol or a photograph that cannot be read.
 pub fn pairs(folder: &Path, stride: usize) -> Result<Vec<Arc<Example>>> {
     let entries = std::fs::read_dir(folder).map_err(|e| crate::io::Error::io(folder, e))?;
     let mut scenes: Vec<PathBuf> = entries.filter_map(|e| Some(e.ok()?.path())).collect();
@@ -47,6 +46,7 @@ pub fn pairs(folder: &Path, stride: usize) -> Result<Vec<Arc<Example>>> {
     Ok(found)
 }
 
+/// Loads one test of a protocol as an example without depth.
 fn pair(scene: &Scene, test: &Views, stride: usize) -> Result<Example> {
     let options = CropOptions::square(SIDE, 1, stride);
     let load = |&i: &usize| -> Result<Posed> {

@@ -1,13 +1,13 @@
-//! The loop.
+//! The training loop: steps, checkpoints, validation and logs.
 
 use super::checkpoint::{self, Progress};
 use super::config::{Start, TrainConfig};
 use super::files::Pictures;
-use super::loading::Loader;
+use super::loading::{Loader, LoaderOptions};
 use super::optimizer::Optimizer;
 use super::source::{Replay, Source};
-use super::step::{Learner, Seconds, Terms};
-use super::validate::{self, Found, Validator};
+use super::step::{Learner, Seconds, StepScale, Terms};
+use super::validate::{self, Found, Split, Validator};
 use super::{Error, Result};
 use crate::io;
 use crate::model::weights::{self, Weights};
@@ -18,70 +18,70 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Steps whose means are one line of the log.
+/// Number of steps averaged in one line of the log.
 const LOG_EVERY: u64 = 10;
 
-/// What happens, for whoever shows it.
+/// Progress event of a training.
 #[derive(Clone, Debug)]
 pub enum Event {
-    /// Before the first step.
+    /// Emitted before the first step.
     Begin {
-        /// Steps done so far.
+        /// Completed steps.
         step: u64,
-        /// Numbers that are learnt.
+        /// Number of parameters.
         parameters: usize,
-        /// The checkpoint that it goes on from.
+        /// Checkpoint from which the training continues.
         resumed: Option<PathBuf>,
-        /// Tensors that the initial weights lack.
+        /// Number of tensors without initial weights.
         untrained: usize,
-        /// Harmless oddities of the data set, one line each.
+        /// Warnings of the data set, one line each.
         warnings: Vec<String>,
     },
-    /// After each step.
+    /// Emitted after each step.
     Step(StepReport),
-    /// Loss or gradient of a step were not finite; nothing was changed.
+    /// Loss or gradient of a step were not finite; the weights are unchanged.
     Skipped {
-        /// Its number.
+        /// Number of the step.
         step: u64,
     },
     /// A checkpoint was written.
     Saved(PathBuf),
-    /// Held-out scenes were looked at.
+    /// The model was evaluated on held-out scenes.
     Validated {
-        /// Steps done.
+        /// Completed steps.
         step: u64,
-        /// Of made-up scenes.
+        /// Scores on procedural scenes.
         rooms: Option<Found>,
-        /// Of photographs.
+        /// Scores on photographs.
         photos: Option<Found>,
     },
 }
 
-/// One step.
+/// Measures of one step.
 #[derive(Clone, Copy, Debug)]
 pub struct StepReport {
-    /// Steps done, this one included.
+    /// Completed steps, this one included.
     pub step: u64,
-    /// Means over its examples.
+    /// Loss terms, means over the examples of the step.
     pub terms: Terms,
-    /// Norm of the gradient before the clip.
+    /// Norm of the gradient before clipping.
     pub norm: f64,
     /// Learning rate.
     pub rate: f64,
-    /// By part.
+    /// Seconds of each part.
     pub seconds: Seconds,
 }
 
-/// When to stop before the last step.
+/// Limits of one call of [`Training::run`].
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Limits {
-    /// Minutes of this call.
+    /// Maximum duration, minutes.
     pub minutes: Option<f64>,
-    /// Steps of this call.
+    /// Maximum number of steps.
     pub steps: Option<u64>,
 }
 
-/// A training that can take steps.
+/// A training at a certain step.
 pub struct Training {
     config: TrainConfig,
     folder: PathBuf,
@@ -92,40 +92,40 @@ pub struct Training {
     resumed: Option<PathBuf>,
     untrained: usize,
     warnings: Vec<String>,
-    /// Held so that no other process trains in the folder.
+    /// Lock of the folder against other trainings.
     _lock: File,
 }
 
-/// The source that `config` asks for.
+/// Opens the source of examples that `config` specifies.
 fn source(config: &TrainConfig) -> Result<Arc<dyn Source>> {
     let (window, times) = (config.data.window, config.data.replay);
     Ok(match &config.data.files {
         Some(files) => Arc::new(Replay::new(Pictures::open(files, config)?, window, times)),
-        None => Arc::new(Replay::new(validate::rooms(config, false)?, window, times)),
+        None => Arc::new(Replay::new(validate::rooms(config, Split::Training)?, window, times)),
     })
 }
 
-/// The folder's lock, for as long as the file is open.
-fn locked(folder: &Path) -> Result<File> {
+/// Locks the folder while the returned file is open.
+fn lock_folder(folder: &Path) -> Result<File> {
     let path = folder.join("lock");
     let file = File::options().create(true).append(true).open(&path);
     let file = file.map_err(|e| io::Error::io(&path, e))?;
     match file.try_lock() {
         Ok(()) => Ok(file),
         Err(TryLockError::WouldBlock) => {
-            Err(Error::value(folder.display(), "a folder that nothing trains in", "one in use"))
+            Err(Error::value(folder.display(), "a folder without another training", "one in use"))
         }
-        // A file system without locks: nothing to go by.
+        // The file system has no locks.
         Err(TryLockError::Error(e)) if e.kind() == ErrorKind::Unsupported => Ok(file),
         Err(TryLockError::Error(e)) => Err(io::Error::io(&path, e).into()),
     }
 }
 
-/// Its last element is the small backbone's correction of the opacity logit.
+/// Tensor whose last element is the small backbone's offset of the opacity logit.
 const OPACITY_BIAS: &str = "small.head.1.bias";
 
-/// The weights that `config` begins with, trainable.
-fn start(config: &TrainConfig) -> Result<Weights> {
+/// Returns the initial weights of `config`, trainable.
+fn initial_weights(config: &TrainConfig) -> Result<Weights> {
     Ok(match &config.init {
         Start::Scratch => Weights::seeded(config.seed),
         Start::Weights { path, opacity } => {
@@ -142,17 +142,17 @@ fn start(config: &TrainConfig) -> Result<Weights> {
 }
 
 impl Training {
-    /// Begins in `folder`, or goes on from its newest checkpoint, with the examples that
-    /// `config` asks for.
+    /// Starts a training in `folder`, or continues from its newest checkpoint, with the examples of
+    /// `config`.
     ///
     /// # Errors
-    /// A configuration that does not check; weights or a checkpoint that do not fit; a
-    /// folder that cannot be made.
+    /// An invalid configuration; weights or a checkpoint that do not fit; a folder that cannot be
+    /// created or is in use.
     pub fn open(config: &TrainConfig, folder: &Path) -> Result<Self> {
         Self::with_source(config, folder, source(config)?)
     }
 
-    /// [`Training::open`] with examples of another source.
+    /// Starts or continues a training with the examples of `source`.
     ///
     /// # Errors
     /// As [`Training::open`].
@@ -163,13 +163,13 @@ impl Training {
     ) -> Result<Self> {
         config.check()?;
         std::fs::create_dir_all(folder).map_err(|e| io::Error::io(folder, e))?;
-        let lock = locked(folder)?;
+        let lock = lock_folder(folder)?;
         let warnings = source.warnings();
         let newest = checkpoint::steps(folder).last().map(|s| checkpoint::path(folder, *s));
         let weights = match newest {
             // The checkpoint holds every tensor.
             Some(_) => Weights::seeded(config.seed).trainable(),
-            None => start(config)?,
+            None => initial_weights(config)?,
         };
         let learner = Learner::new(config, &weights)?;
         let untrained = weights.initialised().len();
@@ -184,12 +184,13 @@ impl Training {
             progress = old.progress;
         }
         let data = &config.data;
-        let loader = Loader::start(
-            source,
-            (data.augment, config.seed),
-            (data.workers, data.ahead),
-            progress.examples,
-        )?;
+        let options = LoaderOptions {
+            augmentation: data.augment,
+            seed: config.seed,
+            workers: data.workers,
+            ahead: data.ahead,
+        };
+        let loader = Loader::start(source, options, progress.examples)?;
         Ok(Self {
             config: config.clone(),
             folder: folder.to_owned(),
@@ -204,21 +205,22 @@ impl Training {
         })
     }
 
-    /// How far it is.
+    /// Returns the progress.
     pub fn progress(&self) -> &Progress {
         &self.progress
     }
 
-    /// The optimizer, with all weights.
+    /// Returns the optimizer, which holds all weights.
     pub fn optimizer(&self) -> &Optimizer {
         &self.optimizer
     }
 
-    /// One step: gradients of `batch` × `accumulate` examples, then the optimizer.
-    /// `None`: loss or gradient were not finite and nothing was changed.
+    /// Takes one step: gradients of `batch` × `accumulate` examples, then the optimizer.
+    ///
+    /// Returns `None` if loss or gradient were not finite; the weights are then unchanged.
     ///
     /// # Errors
-    /// A source or the network fails; too many steps in a row were not finite.
+    /// An error of the source or the network; too many consecutive steps that were not finite.
     pub fn step(&mut self) -> Result<Option<StepReport>> {
         let begin = Instant::now();
         let config = &self.config;
@@ -234,7 +236,7 @@ impl Training {
             seconds.data += start.elapsed().as_secs_f64();
             let found = self.learner.accumulate(
                 &examples,
-                (share, step),
+                StepScale { share, step },
                 &self.optimizer,
                 &mut gradients,
                 &mut seconds,
@@ -263,22 +265,24 @@ impl Training {
     /// Writes a checkpoint, and the averaged weights as `weights.safetensors`.
     ///
     /// # Errors
-    /// The folder is missing or full.
+    /// A file that cannot be written.
     pub fn save(&self) -> Result<PathBuf> {
         let state = self.optimizer.state()?;
-        let about = (&self.progress, &self.config);
-        let path = checkpoint::save(&self.folder, about, &state, self.config.checkpoint.keep)?;
+        let metadata = (&self.progress, &self.config);
+        let path = checkpoint::save(&self.folder, metadata, &state, self.config.checkpoint.keep)?;
         self.save_weights()?;
         Ok(path)
     }
 
+    /// Writes the averaged weights.
     fn save_weights(&self) -> Result<()> {
         let file = self.folder.join("weights.safetensors");
         Ok(weights::save(&file, &self.optimizer.averaged()?, &self.config.model_config()?)?)
     }
 
-    /// Steps until the configuration's last one or a limit, with checkpoints, looks at
-    /// what `validator` holds, and `log.csv`.
+    /// Takes steps until the last step of the configuration or a limit. It writes checkpoints,
+    /// `log.csv` and `validation.csv`, evaluates the scenes of `validator`, and calls `report_event` with
+    /// each event.
     ///
     /// # Errors
     /// As [`Training::step`] and [`Training::save`].
@@ -286,9 +290,9 @@ impl Training {
         &mut self,
         limits: Limits,
         validator: &Validator,
-        tell: &mut dyn FnMut(&Event),
+        report_event: &mut dyn FnMut(&Event),
     ) -> Result<()> {
-        tell(&Event::Begin {
+        report_event(&Event::Begin {
             step: self.progress.step,
             parameters: self.optimizer.parameters(),
             resumed: self.resumed.clone(),
@@ -298,7 +302,7 @@ impl Training {
         let mut log = Log::open(&self.folder, self.progress.step)?;
         let begin = Instant::now();
         let minutes = |since: Instant| since.elapsed().as_secs_f64() / 60.0;
-        let (mut saved, mut looked) = (Instant::now(), Instant::now());
+        let (mut saved, mut validated) = (Instant::now(), Instant::now());
         let mut done = 0;
         while self.progress.step < self.config.steps
             && limits.steps.is_none_or(|n| done < n)
@@ -307,63 +311,65 @@ impl Training {
             match self.step()? {
                 Some(report) => {
                     log.step(&report, self.progress.seconds)?;
-                    tell(&Event::Step(report));
+                    report_event(&Event::Step(report));
                 }
-                None => tell(&Event::Skipped { step: self.progress.step }),
+                None => report_event(&Event::Skipped { step: self.progress.step }),
             }
             done += 1;
             if minutes(saved) >= self.config.checkpoint.minutes {
-                tell(&Event::Saved(self.save()?));
+                report_event(&Event::Saved(self.save()?));
                 saved = Instant::now();
             }
-            if minutes(looked) >= self.config.validate.minutes {
-                self.look(validator, &mut log, tell)?;
-                looked = Instant::now();
+            if minutes(validated) >= self.config.validate.minutes {
+                self.validate(validator, &mut log, report_event)?;
+                validated = Instant::now();
             }
         }
         if done > 0 {
-            tell(&Event::Saved(self.save()?));
-            self.look(validator, &mut log, tell)?;
+            report_event(&Event::Saved(self.save()?));
+            self.validate(validator, &mut log, report_event)?;
         } else if self.resumed.is_some() {
-            // What was stopped after its checkpoint has older ones, or none.
+            // The training may have stopped between its checkpoint and its weights.
             self.save_weights()?;
         }
         Ok(())
     }
 
-    fn look(
+    /// Evaluates the averaged weights and logs the scores.
+    fn validate(
         &self,
         validator: &Validator,
         log: &mut Log,
-        tell: &mut dyn FnMut(&Event),
+        report_event: &mut dyn FnMut(&Event),
     ) -> Result<()> {
         let step = self.progress.step;
         let sheet = self.folder.join(format!("sheet-{step:08}"));
-        let [rooms, photos] = validator.look(self.optimizer.averaged()?, Some(&sheet))?;
-        for (what, found) in [("rooms", &rooms), ("photos", &photos)] {
+        let [rooms, photos] = validator.evaluate(self.optimizer.averaged()?, Some(&sheet))?;
+        for (name, found) in [("rooms", &rooms), ("photos", &photos)] {
             if let Some(found) = found {
-                log.validated((step, what), self.progress.seconds, found)?;
+                log.validation(step, name, self.progress.seconds, found)?;
             }
         }
-        tell(&Event::Validated { step, rooms, photos });
+        report_event(&Event::Validated { step, rooms, photos });
         Ok(())
     }
 }
 
-/// `log.csv` and `validation.csv`: appended to, one line at a time.
+/// The files `log.csv` and `validation.csv`, to which lines are appended.
 struct Log {
     steps: File,
-    looks: File,
+    validations: File,
     folder: PathBuf,
     terms: Terms,
     seconds: Seconds,
     count: u64,
 }
 
-/// A file to append to, with `header` where it is new. Rows of steps after `step`, which
-/// were lost with the process that took them and will be taken again, are removed, and so
-/// is a row that was cut off.
-fn appended(path: &Path, header: &str, step: u64) -> Result<File> {
+/// Opens a CSV file for appending and writes `header` to a new one.
+///
+/// Rows of steps after `step` are removed: a killed process wrote them, and the training repeats
+/// those steps. An incomplete last row is also removed.
+fn open_csv(path: &Path, header: &str, step: u64) -> Result<File> {
     let old = match std::fs::read_to_string(path) {
         Ok(text) => text,
         Err(e) if e.kind() == ErrorKind::NotFound => String::new(),
@@ -383,7 +389,7 @@ fn appended(path: &Path, header: &str, step: u64) -> Result<File> {
 }
 
 impl Log {
-    /// Of a training that has done `step` steps.
+    /// Opens the logs of a training with `step` completed steps.
     fn open(folder: &Path, step: u64) -> Result<Self> {
         let parts: Vec<&str> = Seconds::default().parts().map(|p| p.0).to_vec();
         let header = format!(
@@ -391,8 +397,8 @@ impl Log {
             parts.join(",")
         );
         Ok(Self {
-            steps: appended(&folder.join("log.csv"), &header, step)?,
-            looks: appended(
+            steps: open_csv(&folder.join("log.csv"), &header, step)?,
+            validations: open_csv(
                 &folder.join("validation.csv"),
                 "step,seconds,what,psnr,ssim,disparity,within_one,copy_psnr",
                 step,
@@ -404,6 +410,7 @@ impl Log {
         })
     }
 
+    /// Adds a step, and writes a line of means every [`LOG_EVERY`] steps.
     fn step(&mut self, report: &StepReport, seconds: f64) -> Result<()> {
         self.terms.add(&report.terms, 1.0);
         self.seconds.add(&report.seconds);
@@ -426,11 +433,12 @@ impl Log {
         writeln!(self.steps, "{line}").map_err(|e| io::Error::io(&self.folder, e).into())
     }
 
-    fn validated(&mut self, (step, what): (u64, &str), seconds: f64, f: &Found) -> Result<()> {
+    /// Writes the scores on the scenes called `name`.
+    fn validation(&mut self, step: u64, name: &str, seconds: f64, f: &Found) -> Result<()> {
         let line = format!(
-            "{step},{seconds:.1},{what},{:.3},{:.4},{:.3},{:.4},{:.3}",
+            "{step},{seconds:.1},{name},{:.3},{:.4},{:.3},{:.4},{:.3}",
             f.psnr, f.ssim, f.disparity, f.within_one, f.copy_psnr
         );
-        writeln!(self.looks, "{line}").map_err(|e| io::Error::io(&self.folder, e).into())
+        writeln!(self.validations, "{line}").map_err(|e| io::Error::io(&self.folder, e).into())
     }
 }

@@ -1,21 +1,21 @@
-//! Learning rates as functions of the step, so that resuming needs no state and a
-//! longer schedule is another number.
+//! Learning rates as functions of the step. Resuming needs no state, and a longer schedule needs
+//! only another number of steps.
 
 use serde::{Deserialize, Serialize};
 
-/// How the learning rate runs over a training. Steps count from 0.
+/// Learning rate over a training. Steps count from 0.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Schedule {
-    /// Linear from 0 over `warmup` steps, level for `hold` more, then half a cosine
-    /// down to `floor` times the rate at the last step.
+    /// Linear from 0 over `warmup` steps, constant for `hold` more, then half a cosine down to
+    /// `floor` times the rate at the last step.
     Cosine {
         /// Largest rate.
         rate: f64,
-        /// Steps of the rise.
+        /// Steps of the linear increase.
         #[serde(default)]
         warmup: u64,
-        /// Steps on the level before the fall.
+        /// Steps of constant rate before the decrease.
         #[serde(default)]
         hold: u64,
         /// Last rate over the largest, 0 to 1.
@@ -27,28 +27,28 @@ pub enum Schedule {
     OneCycle {
         /// Largest rate.
         rate: f64,
-        /// Which reading of MVSplat's warm-up.
+        /// Warm-up of MVSplat.
         #[serde(default)]
         warmup: Warmup,
     },
 }
 
-/// Two readings of MVSplat's warm-up: its configuration says 2,000 steps, its released
-/// code rises over 1 % of ten steps more than the training has, and ignores the number.
+/// The two versions of MVSplat's warm-up. Its configuration says 2,000 steps; its released code
+/// ignores that number and takes 1 % of (steps of the training + 10).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum Warmup {
-    /// This many steps of the training's own length.
+    /// Number of steps.
     Steps(u64),
-    /// As released.
+    /// The warm-up of the released code.
     Named(NamedWarmup),
 }
 
-/// Warm-up readings that have a name.
+/// Named versions of the warm-up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum NamedWarmup {
-    /// 1 % of the training's steps plus ten.
+    /// 1 % of (steps of the training + 10).
     Released,
 }
 
@@ -60,27 +60,27 @@ impl Default for Warmup {
 
 /// Steps that MVSplat's released trainer adds to the schedule's length.
 const RELEASED_EXTRA: u64 = 10;
-/// Share of the schedule over which it rises.
+/// Share of the schedule with increasing rate.
 const RELEASED_RISE: f64 = 0.01;
-/// OneCycle starts at the rate over this (PyTorch's default).
+/// Ratio of the largest to the first rate (PyTorch's default).
 const START_DIVISOR: f64 = 25.0;
-/// It ends at the start over this (PyTorch's default).
+/// Ratio of the first to the last rate (PyTorch's default).
 const END_DIVISOR: f64 = 1e4;
 
-/// Half a cosine from `from` (share 0) to `to` (share 1).
+/// Returns half a cosine from `from` (share 0) to `to` (share 1).
 fn anneal(from: f64, to: f64, share: f64) -> f64 {
     to + (from - to) / 2.0 * (1.0 + (std::f64::consts::PI * share).cos())
 }
 
 impl Schedule {
-    /// The largest rate.
+    /// Returns the largest rate.
     pub fn peak(&self) -> f64 {
         match self {
             Self::Cosine { rate, .. } | Self::OneCycle { rate, .. } => *rate,
         }
     }
 
-    /// Learning rate of step `step` of a training of `steps`.
+    /// Returns the learning rate of step `step` of a training of `steps`.
     pub fn rate(&self, step: u64, steps: u64) -> f64 {
         match *self {
             Self::Cosine { rate, warmup, hold, floor } => {
@@ -106,8 +106,8 @@ impl Schedule {
     }
 }
 
-/// PyTorch counts both phases from step 0 and ends them one step early, the first at
-/// `rise` − 1, a number that need not be whole.
+/// Returns the rate of PyTorch's OneCycleLR, which counts both phases from step 0 and ends them one
+/// step early: the first at `rise` − 1, which need not be whole.
 fn one_cycle(rate: f64, step: f64, total: f64, rise: f64) -> f64 {
     let start = rate / START_DIVISOR;
     let (top, last) = (rise - 1.0, total - 1.0);
@@ -124,14 +124,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn cosine_rises_holds_and_falls() {
+    fn cosine_increases_holds_and_decreases() {
         let s = Schedule::Cosine { rate: 2.0, warmup: 4, hold: 3, floor: 0.1 };
         let at = |i| s.rate(i, 20);
         assert_eq!([at(0), at(3), at(4), at(7)], [0.5, 2.0, 2.0, 2.0]);
         assert!((at(13) - 1.1).abs() < 1e-12, "{}", at(13));
         assert!((at(19) - 0.2).abs() < 1e-12 && (at(50) - 0.2).abs() < 1e-12);
         assert!((7..19).all(|i| at(i + 1) < at(i)));
-        // Held for good, and no overflow on the way.
+        // The hold never ends, and no addition overflows.
         let s = Schedule::Cosine { rate: 2.0, warmup: 4, hold: u64::MAX, floor: 0.1 };
         assert_eq!(s.rate(19, 20), 2.0);
     }

@@ -1,4 +1,4 @@
-//! One step's gradients: examples through the network, losses, and back.
+//! Computes the gradients of one step: network, losses and the backward pass.
 
 use super::config::{Phase, TrainConfig};
 use super::loss::{self, Scored, with_gradient};
@@ -24,14 +24,14 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
-/// Parents that the trunk takes back at once: a `[2048, 128]` activation is 1 MiB, a part
-/// of a core's L2 or L3.
+/// Parents per chunk of the trunk's backward pass. A `[2048, 128]` activation takes 1 MiB, a part
+/// of a core's L2 or L3 cache.
 const CHUNK: usize = 2048;
 
-/// Means over the examples of a step; NaN where a step has no such term.
+/// Loss terms, means over the examples of a step; NaN for terms that a step does not have.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Terms {
-    /// What is made small.
+    /// Total loss.
     pub loss: f64,
     /// Mean squared difference of the pictures.
     pub mse: f64,
@@ -48,12 +48,12 @@ pub struct Terms {
 }
 
 impl Terms {
-    /// −10·log₁₀ of the mean squared difference, dB.
+    /// Returns −10·log₁₀ of the mean squared difference, dB.
     pub fn psnr(&self) -> f64 {
         -10.0 * self.mse.log10()
     }
 
-    /// Adds `share` of another's.
+    /// Adds `share` times the terms of `other`.
     pub fn add(&mut self, other: &Self, share: f64) {
         self.loss += share * other.loss;
         self.mse += share * other.mse;
@@ -65,7 +65,7 @@ impl Terms {
     }
 }
 
-/// Seconds by part, for the profile; those of lanes side by side are added up.
+/// Seconds of each part of a step. The seconds of parallel groups are added.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Seconds {
     /// Waiting for examples.
@@ -74,18 +74,18 @@ pub struct Seconds {
     pub backbone: f64,
     /// Primaries and trunk, forward.
     pub trunk: f64,
-    /// Rasterizer and picture losses, there and back.
+    /// Rasterizer and picture losses, forward and backward.
     pub raster: f64,
     /// Depth losses.
     pub loss: f64,
-    /// Everything else backward.
+    /// Remaining backward pass.
     pub backward: f64,
-    /// Gathering gradients, norm, optimizer.
+    /// Summation of gradients, norm, optimizer.
     pub optimizer: f64,
 }
 
 impl Seconds {
-    /// By name.
+    /// Returns name and seconds of each part.
     pub fn parts(&self) -> [(&'static str, f64); 7] {
         [
             ("data", self.data),
@@ -98,7 +98,7 @@ impl Seconds {
         ]
     }
 
-    /// Adds another's.
+    /// Adds the seconds of `other`.
     pub fn add(&mut self, other: &Self) {
         self.data += other.data;
         self.backbone += other.backbone;
@@ -110,23 +110,45 @@ impl Seconds {
     }
 }
 
-/// The model with everything that its loss needs.
+/// The model and the data that its loss needs.
 pub struct Learner {
     model: SubSplat,
     config: TrainConfig,
     lpips: Option<Lpips>,
-    /// Groups of scenes are worked on side by side, each in its share of the threads: a
-    /// step then waits for its threads once, not at every operation.
-    lanes: Vec<rayon::ThreadPool>,
+    /// One thread pool per parallel group. Groups run in parallel, each in its share of the
+    /// threads, so that threads synchronise once per step instead of once per operation.
+    pools: Vec<rayon::ThreadPool>,
 }
 
-/// What one group of scenes gave.
-type Found = Result<(Gradients, Terms, Seconds)>;
+/// Weight of an example, and the step that seeds random values.
+#[derive(Clone, Copy, Debug)]
+pub struct StepScale {
+    /// Weight of one example in the mean loss of the step.
+    pub share: f64,
+    /// Number of the step.
+    pub step: u64,
+}
 
-/// Context views of `examples` as the network takes them.
+/// The optimizer and the sum to which it adds gradients.
+struct GradientSink<'a> {
+    optimizer: &'a Optimizer,
+    gradients: &'a mut Gradients,
+}
+
+/// One scene of a group after the backbone.
+struct EncodedScene<'a> {
+    views: Views,
+    output: BackboneOutput,
+    example: &'a Example,
+}
+
+/// Results of one group of scenes.
+type GroupResult = Result<(Gradients, Terms, Seconds)>;
+
+/// Stacks the context views of `examples` as the network's input.
 ///
 /// # Errors
-/// Views of several sizes, or fewer than two.
+/// Views of different sizes, or fewer than two.
 pub fn views_of(examples: &[&Example]) -> Result<Views> {
     let first = examples.iter().flat_map(|e| &e.context).next();
     let Some(first) = first else { return Err(Error::value("examples", "at least one", "none")) };
@@ -141,7 +163,7 @@ pub fn views_of(examples: &[&Example]) -> Result<Views> {
     Ok(Views::new(images, cameras, planes)?)
 }
 
-/// How `example`'s target `camera` is rendered by a model with `config`.
+/// Returns the rasterizer options for target `camera` of `example` and a model with `config`.
 pub fn raster_options(config: &Config, example: &Example, camera: &Camera) -> RasterOptions {
     let width = example.context.first().map_or(1, |p| p.image.width.max(1));
     let ratio = camera.intrinsics.width as f32 / width as f32;
@@ -149,11 +171,12 @@ pub fn raster_options(config: &Config, example: &Example, camera: &Camera) -> Ra
     config.raster_options(ratio, example.near_far.0, inputs)
 }
 
-/// A detached copy with a gradient of its own.
+/// Returns a detached copy that collects its own gradient.
 fn leaf(t: &Tensor) -> Result<Var> {
     Ok(Var::from_tensor(&t.detach())?)
 }
 
+/// Returns the elements of a tensor.
 fn flat(t: &Tensor) -> Result<Vec<f32>> {
     Ok(t.flatten_all()?.to_vec1::<f32>()?)
 }
@@ -162,7 +185,7 @@ impl Learner {
     /// Builds the model from `weights`, which must be trainable.
     ///
     /// # Errors
-    /// Weights that do not fit; LPIPS's file.
+    /// Weights that do not fit; a weight file of LPIPS that cannot be read.
     pub fn new(config: &TrainConfig, weights: &Weights) -> Result<Self> {
         let model = SubSplat::new(&config.model_config()?, weights.builder())?;
         let lpips = match &config.loss.lpips_weights {
@@ -172,30 +195,30 @@ impl Learner {
             _ => None,
         };
         let threads = rayon::current_num_threads();
-        let count = if config.lanes == 0 { threads } else { config.lanes };
+        let count = if config.parallel_groups == 0 { threads } else { config.parallel_groups };
         let pool = |i: usize| {
             let share = (threads + count - 1 - i) / count;
             let built = rayon::ThreadPoolBuilder::new().num_threads(share.max(1)).build();
-            built.map_err(|e| Error::value("threads", "a pool of them", e))
+            built.map_err(|e| Error::value("threads", "a thread pool", e))
         };
-        let lanes = (0..count).map(pool).collect::<Result<_>>()?;
-        Ok(Self { model, config: config.clone(), lpips, lanes })
+        let pools = (0..count).map(pool).collect::<Result<_>>()?;
+        Ok(Self { model, config: config.clone(), lpips, pools })
     }
 
-    /// The model.
+    /// Returns the model.
     pub fn model(&self) -> &SubSplat {
         &self.model
     }
 
-    /// Adds the gradients of the mean loss of `examples`, each counting `share`, and
-    /// gives the mean terms. `step` seeds what is random.
+    /// Adds the gradients of the loss of `examples` and returns the mean terms. Each example counts
+    /// `scale.share`, and `scale.step` seeds random values.
     ///
     /// # Errors
-    /// Whatever the network finds wrong with its input.
+    /// An invalid input of the network.
     pub fn accumulate(
         &self,
         examples: &[Example],
-        (share, step): (f64, u64),
+        scale: StepScale,
         optimizer: &Optimizer,
         gradients: &mut Gradients,
         seconds: &mut Seconds,
@@ -203,26 +226,27 @@ impl Learner {
         let groups: Vec<Vec<&Example>> =
             examples.chunks(self.config.together.max(1)).map(|g| g.iter().collect()).collect();
         let next = AtomicUsize::new(0);
-        let found: Vec<Mutex<Option<Found>>> = groups.iter().map(|_| Mutex::new(None)).collect();
+        let found: Vec<Mutex<Option<GroupResult>>> =
+            groups.iter().map(|_| Mutex::new(None)).collect();
         let work = || {
             while let Some(i) =
                 Some(next.fetch_add(1, Ordering::Relaxed)).filter(|i| *i < groups.len())
             {
-                let one = self.group(&groups[i], (share, step), optimizer);
+                let one = self.group(&groups[i], scale, optimizer);
                 *found[i].lock().unwrap_or_else(PoisonError::into_inner) = Some(one);
             }
         };
         std::thread::scope(|scope| {
-            for pool in self.lanes.iter().take(groups.len()) {
+            for pool in self.pools.iter().take(groups.len()) {
                 scope.spawn(|| pool.install(work));
             }
         });
-        // In the order of the groups: the same sums for any number of lanes.
+        // In the order of the groups: the sums do not depend on the number of groups in parallel.
         let mut terms = Terms::default();
         for (group, one) in groups.iter().zip(found) {
             let one = one.into_inner().unwrap_or_else(PoisonError::into_inner);
-            let nothing = || Error::value("step", "a result of every scene", "none");
-            let (found, group_terms, group_seconds) = one.ok_or_else(nothing)??;
+            let missing = || Error::value("step", "a result of every scene", "none");
+            let (found, group_terms, group_seconds) = one.ok_or_else(missing)??;
             let start = Instant::now();
             gradients.add(&found);
             seconds.add(&group_seconds);
@@ -232,16 +256,16 @@ impl Learner {
         Ok(terms)
     }
 
-    /// Gradients and terms of scenes that pass through the backbone together.
-    fn group(&self, group: &[&Example], (share, step): (f64, u64), optimizer: &Optimizer) -> Found {
+    /// Computes gradients and terms of scenes that pass through the backbone together.
+    fn group(&self, group: &[&Example], scale: StepScale, optimizer: &Optimizer) -> GroupResult {
         let mut seconds = Seconds::default();
         let mut gradients = optimizer.gradients();
         let views = views_of(group)?;
         let (total, terms) = match self.config.phase {
-            Phase::Depth => self.depth_group(group, &views, share, &mut seconds)?,
+            Phase::Depth => self.depth_group(group, &views, scale.share, &mut seconds)?,
             Phase::Render => {
-                let into = (optimizer, &mut gradients);
-                self.render_group(group, &views, (share, step), into, &mut seconds)?
+                let sink = GradientSink { optimizer, gradients: &mut gradients };
+                self.render_group(group, &views, scale, sink, &mut seconds)?
             }
         };
         let start = Instant::now();
@@ -253,6 +277,7 @@ impl Learner {
         Ok((gradients, terms, seconds))
     }
 
+    /// Computes the loss of the depth phase.
     fn depth_group(
         &self,
         group: &[&Example],
@@ -264,15 +289,16 @@ impl Learner {
         let maps = self.model.depth_maps(views, self.disparity_mean())?;
         seconds.backbone += start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let nothing = Terms { mse: f64::NAN, dssim: f64::NAN, lpips: f64::NAN, ..Terms::default() };
-        let (mut parts, mut terms) = (Vec::new(), nothing);
+        let unmeasured =
+            Terms { mse: f64::NAN, dssim: f64::NAN, lpips: f64::NAN, ..Terms::default() };
+        let (mut parts, mut terms) = (Vec::new(), unmeasured);
         let weight = share * group.len() as f64;
         self.depth_losses(group, &maps, weight, &mut parts, &mut terms)?;
         seconds.loss += start.elapsed().as_secs_f64();
         Ok((sum(parts)?, terms))
     }
 
-    /// Scalars whose sum is `weight` times the mean depth loss of `group`.
+    /// Adds to `parts` scalars whose sum is `weight` times the mean depth loss of `group`.
     fn depth_losses(
         &self,
         group: &[&Example],
@@ -318,12 +344,13 @@ impl Learner {
         Ok(())
     }
 
+    /// Computes the loss of the rendering phase. The trunk's gradients go to `sink`.
     fn render_group(
         &self,
         group: &[&Example],
         views: &Views,
-        (share, step): (f64, u64),
-        (optimizer, gradients): (&Optimizer, &mut Gradients),
+        scale: StepScale,
+        mut sink: GradientSink<'_>,
         seconds: &mut Seconds,
     ) -> Result<(Tensor, Terms)> {
         let start = Instant::now();
@@ -335,7 +362,7 @@ impl Learner {
         match &maps {
             Some(maps) if !frozen => {
                 let start = Instant::now();
-                let weight = share * group.len() as f64;
+                let weight = scale.share * group.len() as f64;
                 self.depth_losses(group, maps, weight, &mut parts, &mut terms)?;
                 seconds.loss += start.elapsed().as_secs_f64();
             }
@@ -345,29 +372,25 @@ impl Learner {
             }
         }
         for (b, example) in group.iter().enumerate() {
-            let scene = (&views.scene(b)?, &output.scene(b)?, *example);
-            let seen = self.render_scene(
-                scene,
-                (share, step),
-                (optimizer, gradients),
-                &mut parts,
-                seconds,
-            )?;
-            terms.add(&seen, 1.0 / group.len() as f64);
+            let scene = EncodedScene { views: views.scene(b)?, output: output.scene(b)?, example };
+            let scene_terms = self.render_scene(&scene, scale, &mut sink, &mut parts, seconds)?;
+            terms.add(&scene_terms, 1.0 / group.len() as f64);
         }
         Ok((sum(parts)?, terms))
     }
 
-    /// Renders one scene and takes its loss back as far as the backbone: the trunk's
-    /// gradients go `into` the optimizer's row, what is left of the way to `parts`.
+    /// Renders one scene and propagates its loss back to the backbone's output. The trunk's
+    /// gradients go to `sink`; scalars for the remaining backward pass go to `parts`.
     fn render_scene(
         &self,
-        (views, output, example): (&Views, &BackboneOutput, &Example),
-        (share, step): (f64, u64),
-        (optimizer, gradients): (&Optimizer, &mut Gradients),
+        scene: &EncodedScene<'_>,
+        scale: StepScale,
+        sink: &mut GradientSink<'_>,
         parts: &mut Vec<Tensor>,
         seconds: &mut Seconds,
     ) -> Result<Terms> {
+        let EncodedScene { views, output, example } = scene;
+        let StepScale { share, step } = scale;
         let start = Instant::now();
         let mut settings = self.model.config().primaries().clone();
         settings.opacity_exponent = self.opacity_exponent(step, settings.opacity_exponent);
@@ -377,13 +400,13 @@ impl Learner {
             let children = Children::whole(&parents)?;
             seconds.trunk += start.elapsed().as_secs_f64();
             let start = Instant::now();
-            let seen = self.pictures(&children, example)?;
-            let [rows, sh, gain] = seen.gradients;
+            let rendered = self.pictures(&children, example)?;
+            let [rows, sh, gain] = rendered.gradients;
             parts.push(with_gradient(&children.rows, rows.scaled(share))?);
             parts.push(with_gradient(&children.sh, sh.scaled(share))?);
             parts.push(with_gradient(&children.gain, gain.scaled(share))?);
             seconds.raster += start.elapsed().as_secs_f64();
-            return Ok(seen.terms);
+            return Ok(rendered.terms);
         }
         let primaries = parents.split()?;
         let pass = trunk.forward_recomputed(
@@ -394,15 +417,15 @@ impl Learner {
         )?;
         seconds.trunk += start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let seen = self.pictures(pass.children(), example)?;
-        let [rows, sh, gain] = seen.gradients.map(|g| g.scaled(share));
+        let rendered = self.pictures(pass.children(), example)?;
+        let [rows, sh, gain] = rendered.gradients.map(|g| g.scaled(share));
         parts.push(with_gradient(&pass.children().sh, sh)?);
         seconds.raster += start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let collect = |store: &GradStore| optimizer.collect(store, gradients);
+        let collect = |store: &GradStore| sink.optimizer.collect(store, sink.gradients);
         parts.extend(pass.backward([&rows.gradient, &gain.gradient], collect)?);
         seconds.backward += start.elapsed().as_secs_f64();
-        Ok(seen.terms)
+        Ok(rendered.terms)
     }
 
     fn disparity_mean(&self) -> DisparityMean {
@@ -412,7 +435,7 @@ impl Learner {
         }
     }
 
-    /// x of the opacity mapping at `step` (MVSplat, `map_pdf_to_opacity`).
+    /// Returns the exponent x of the opacity mapping at `step` (MVSplat, `map_pdf_to_opacity`).
     fn opacity_exponent(&self, step: u64, last: f64) -> f64 {
         let l = &self.config.loss;
         if l.opacity_steps == 0 {
@@ -422,9 +445,9 @@ impl Learner {
         l.opacity_start + share * (last - l.opacity_start)
     }
 
-    /// Renders every target of `example` and takes the loss back to the children at
-    /// once, so that one picture's graph is held at a time.
-    fn pictures(&self, children: &Children, example: &Example) -> Result<Seen> {
+    /// Renders every target of `example` and propagates the loss back to the children immediately,
+    /// so that one picture's graph exists at a time.
+    fn pictures(&self, children: &Children, example: &Example) -> Result<RenderedLoss> {
         let leaves = [leaf(&children.rows)?, leaf(&children.sh)?, leaf(&children.gain)?];
         let mut gradients =
             [&children.rows, &children.sh, &children.gain].map(|t| Scored::zero(t.elem_count()));
@@ -446,9 +469,10 @@ impl Learner {
             }
         }
         gradients[0].value = terms.loss;
-        Ok(Seen { gradients, terms })
+        Ok(RenderedLoss { gradients, terms })
     }
 
+    /// Returns the loss of one picture as a scalar of candle's graph, and its terms.
     fn picture_loss(&self, rgb: &Tensor, target: &Posed) -> Result<(Tensor, Terms)> {
         let w = &self.config.loss;
         let (_, height, width) = rgb.dims3()?;
@@ -481,11 +505,13 @@ impl Learner {
     }
 }
 
-struct Seen {
+/// Loss of a scene's pictures: gradients of rows, SH and gain, and the terms.
+struct RenderedLoss {
     gradients: [Scored; 3],
     terms: Terms,
 }
 
+/// Adds scalars.
 fn sum(parts: Vec<Tensor>) -> Result<Tensor> {
     let mut parts = parts.into_iter();
     let Some(mut total) = parts.next() else {

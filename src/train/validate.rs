@@ -1,10 +1,10 @@
-//! Looks at scenes that are never trained on, through the inference path and with the
-//! averaged weights: what would be shipped now.
+//! Evaluates the averaged weights on held-out scenes through the inference path: the scores of the
+//! weights that would ship.
 
 use super::Result;
 use super::config::{Phase, TrainConfig};
 use super::loss::{block_median, candidate_index};
-use super::source::{Example, Rooms, Source, word};
+use super::source::{Example, Rooms, Source, hash};
 use super::step::{raster_options, views_of};
 use crate::config::{Backbone, Config};
 use crate::data::dataset::Posed;
@@ -17,39 +17,52 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// Mixed into the data's seed: held-out scenes are other scenes.
+/// Key mixed into the data's seed, which gives other scenes than those of the training.
 const HELD_OUT: u64 = 0x48_45_4C_44;
-/// Scenes on the sheet.
+/// Number of scenes on the contact sheet.
 const SHEET_SCENES: usize = 4;
 
-/// Means over the held-out scenes.
+/// Scores, means over the held-out scenes.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Found {
-    /// Of the targets, dB.
+    /// PSNR of the targets, dB.
     pub psnr: f64,
-    /// Of the targets.
+    /// SSIM of the targets.
     pub ssim: f64,
     /// Error of disparity, candidates (small backbone only).
     pub disparity: f64,
-    /// Share of pixels within one candidate.
+    /// Share of pixels with an error of at most one candidate.
     pub within_one: f64,
-    /// PSNR of the nearer input copied, dB: what any model must beat.
+    /// PSNR of a copy of the nearer input, dB: a lower bound for a useful model.
     pub copy_psnr: f64,
 }
 
-/// Held-out scenes, made once, and photographs.
+/// Held-out scenes and photographs.
 pub struct Validator {
     model: Config,
     scenes: Vec<Arc<Example>>,
     photos: Vec<Arc<Example>>,
 }
 
-/// The generator that `config` asks for, with another seed mixed in.
-pub fn rooms(config: &TrainConfig, held_out: bool) -> Result<Rooms> {
+/// Part of the procedural rooms.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Split {
+    /// Rooms for training.
+    Training,
+    /// Rooms for validation, which training never uses.
+    HeldOut,
+}
+
+/// Returns the generator of `config` for one part of the rooms.
+///
+/// # Errors
+/// An invalid model configuration.
+pub fn rooms(config: &TrainConfig, split: Split) -> Result<Rooms> {
+    let held_out = split == Split::HeldOut;
     let data = &config.data;
     let ratio = config.model_config()?.upscale;
     let [w, h] = data.input;
-    // Nothing is rendered in the depth phase but to look.
+    // The depth phase renders targets for validation only.
     let count = if config.phase == Phase::Depth && !held_out { 0 } else { data.targets };
     let mut spec = crate::data::procedural::ExampleSpec::new(w, h, count);
     spec.cameras.crop = data.crop;
@@ -58,19 +71,18 @@ pub fn rooms(config: &TrainConfig, held_out: bool) -> Result<Rooms> {
     spec.samples = data.samples;
     let targets =
         crate::data::procedural::TargetSpec { ratio, samples: data.target_samples, clean: true };
-    let seed = if held_out { word(data.seed, HELD_OUT) } else { data.seed };
+    let seed = if held_out { hash(data.seed, HELD_OUT) } else { data.seed };
     let scenes = if held_out { 0 } else { data.scenes };
     Ok(Rooms { seed, scenes, spec, targets, seen_range: data.seen_range })
 }
 
 impl Validator {
-    /// Makes the scenes, and reads the photographs in `photos`, which are looked at
-    /// only.
+    /// Makes the scenes, and reads the photographs in `photos`, which are evaluated only.
     ///
     /// # Errors
-    /// A configuration out of range; photographs that cannot be read.
+    /// An invalid configuration; photographs that cannot be read.
     pub fn new(config: &TrainConfig, photos: Option<&Path>) -> Result<Self> {
-        let mut rooms = rooms(config, true)?;
+        let mut rooms = rooms(config, Split::HeldOut)?;
         rooms.targets.samples = rooms.targets.samples.max(2);
         rooms.spec.cameras.targets = 1;
         let scenes = (0..config.validate.scenes as u64)
@@ -84,19 +96,19 @@ impl Validator {
         Ok(Self { model, scenes, photos })
     }
 
-    /// Scores `weights` on made-up scenes and on photographs (`None` where there are
-    /// none) and, with a path, writes a sheet a piece of inputs, prediction, truth and
-    /// depth: `path` with `-rooms.png` and `-photos.png`.
+    /// Scores `weights` on procedural scenes and on photographs (`None` where there are none).
+    ///
+    /// With a path, it also writes a contact sheet for each: inputs, prediction, target and depth,
+    /// at `path` with `-rooms.png` and `-photos.png`.
     ///
     /// # Errors
-    /// Weights that do not fit, or give numbers that are not finite; a sheet that
-    /// cannot be written.
-    pub fn look(
+    /// Weights that do not fit or give values that are not finite; a sheet that cannot be written.
+    pub fn evaluate(
         &self,
         weights: BTreeMap<String, Tensor>,
         sheet: Option<&Path>,
     ) -> Result<[Option<Found>; 2]> {
-        // As in `pipeline`: heads that no file gave start closed.
+        // As in `pipeline`: heads without weights split each pixel evenly.
         let weights = Weights::from_tensors(weights).allow_missing(SUBSPLAT_PREFIX, 0);
         let model = SubSplat::new(&self.model, weights.builder())?;
         let path = |end: &str| {
@@ -106,12 +118,13 @@ impl Validator {
             Some(path.with_file_name(name))
         };
         Ok([
-            self.look_all(&model, &self.scenes, path("-rooms.png"))?,
-            self.look_all(&model, &self.photos, path("-photos.png"))?,
+            self.evaluate_scenes(&model, &self.scenes, path("-rooms.png"))?,
+            self.evaluate_scenes(&model, &self.photos, path("-photos.png"))?,
         ])
     }
 
-    fn look_all(
+    /// Scores the model on `scenes` and writes their contact sheet.
+    fn evaluate_scenes(
         &self,
         model: &SubSplat,
         scenes: &[Arc<Example>],
@@ -122,10 +135,10 @@ impl Validator {
         }
         let mut found = Found::default();
         let mut rows = Vec::new();
-        // One row of every few scenes, so that the sheet shows different ones.
+        // Rows at regular intervals, so that the sheet shows different scenes.
         let stride = scenes.len().div_ceil(SHEET_SCENES);
         for (i, scene) in scenes.iter().enumerate() {
-            let one = self.look_at(model, scene)?;
+            let one = self.evaluate_scene(model, scene)?;
             let share = 1.0 / scenes.len() as f64;
             found.psnr += share * one.found.psnr;
             found.ssim += share * one.found.ssim;
@@ -142,9 +155,11 @@ impl Validator {
         Ok(Some(found))
     }
 
-    fn look_at(&self, model: &SubSplat, scene: &Example) -> Result<One> {
+    /// Scores the model on one scene.
+    fn evaluate_scene(&self, model: &SubSplat, scene: &Example) -> Result<SceneResult> {
         let mut views = views_of(&[scene])?;
-        // Where depth is known its error is told in candidates: those of the example.
+        // Known depth is compared in candidates of the example's range. Without it the model
+        // estimates the range.
         if scene.inverse_depth.is_empty() {
             views = model.estimate_depth_range(&views)?;
         }
@@ -164,10 +179,10 @@ impl Validator {
             let Some(picture) = Rgb::from_planes(&rgb, k.width, k.height) else { continue };
             let share = 1.0 / scene.targets.len() as f64;
             let truth = values(&target.image);
-            let seen = interleaved(&rgb);
-            // Both pictures are this function's own: of one size, and finite.
-            found.psnr += share * psnr(&seen, &truth, k.width, k.height).unwrap_or(f64::NAN);
-            found.ssim += share * ssim(&seen, &truth, k.width, k.height).unwrap_or(f64::NAN);
+            let rendered = interleaved(&rgb);
+            // Both pictures are finite and of one size.
+            found.psnr += share * psnr(&rendered, &truth, k.width, k.height).unwrap_or(f64::NAN);
+            found.ssim += share * ssim(&rendered, &truth, k.width, k.height).unwrap_or(f64::NAN);
             let copy = enlarged(nearer(scene, target), k.width, k.height);
             found.copy_psnr +=
                 share * psnr(&values(&copy), &truth, k.width, k.height).unwrap_or(f64::NAN);
@@ -177,10 +192,10 @@ impl Validator {
             }
         }
         pictures.extend(depth);
-        Ok(One { found, pictures })
+        Ok(SceneResult { found, pictures })
     }
 
-    /// Depth against the generator's, and both as pictures.
+    /// Compares depth with the generator's, and returns both as pictures.
     fn depth_scores(&self, scene: &Example, distances: &[f32], found: &mut Found) -> Vec<Rgb> {
         let Some(view) = scene.context.first() else { return Vec::new() };
         let (w, h) = (view.image.width, view.image.height);
@@ -196,20 +211,22 @@ impl Validator {
                 let at = glam::Vec2::new((i % w) as f32 + 0.5, (i / w) as f32 + 0.5);
                 k.unproject(at).length() / distances.get(v * w * h + i).unwrap_or(&1.0)
             });
-            let seen = candidate_index(&inverse.collect::<Vec<_>>(), scene.near_far, d);
+            let predicted = candidate_index(&inverse.collect::<Vec<_>>(), scene.near_far, d);
             let truth: Vec<f32> =
                 scene.inverse_depth.get(v).into_iter().flatten().map(|x| x.to_f32()).collect();
             let truth = candidate_index(&truth, scene.near_far, d);
-            for (s, t) in seen.iter().zip(&truth).filter(|(s, t)| s.is_finite() && t.is_finite()) {
+            for (s, t) in
+                predicted.iter().zip(&truth).filter(|(s, t)| s.is_finite() && t.is_finite())
+            {
                 sum += f64::from((s - t).abs());
                 near += usize::from((s - t).abs() <= 1.0);
                 count += 1;
             }
             if v == 0 {
-                let known = if truth.is_empty() { &seen } else { &truth };
+                let known = if truth.is_empty() { &predicted } else { &truth };
                 let top = block_median(known, w).into_iter().filter(|v| v.is_finite());
                 let top = top.fold(1.0, f32::max);
-                let both = [seen, truth].into_iter().filter(|index| !index.is_empty());
+                let both = [predicted, truth].into_iter().filter(|index| !index.is_empty());
                 pictures = both.map(|index| grey(&index, w, h, top)).collect();
             }
         }
@@ -219,34 +236,37 @@ impl Validator {
     }
 }
 
-struct One {
+/// Scores of a scene and its row of the contact sheet.
+struct SceneResult {
     found: Found,
     pictures: Vec<Rgb>,
 }
 
-/// The context view whose eye is nearer to the target's.
+/// Returns the context view whose camera is nearer to the target's.
 fn nearer<'a>(scene: &'a Example, target: &'a Posed) -> &'a Rgb {
     let distance = |p: &Posed| p.camera.position().distance(target.camera.position());
     let best = scene.context.iter().min_by(|a, b| distance(a).total_cmp(&distance(b)));
     best.map_or(&target.image, |p| &p.image)
 }
 
+/// Returns the picture's values in [0, 1].
 fn values(picture: &Rgb) -> Vec<f32> {
     picture.data.iter().map(|v| f32::from(*v) / 255.0).collect()
 }
 
-/// `[3, H, W]` to `[H, W, 3]`.
+/// Converts `[3, H, W]` to `[H, W, 3]`.
 fn interleaved(planes: &[f32]) -> Vec<f32> {
     let n = planes.len() / 3;
     (0..n).flat_map(|i| [planes[i], planes[n + i], planes[2 * n + i]]).collect()
 }
 
+/// Converts candidate indices to a grey picture; `top` is white, unknown is black.
 fn grey(index: &[f32], w: usize, h: usize, top: f32) -> Rgb {
     let value = |v: &f32| if v.is_finite() { (255.0 * (v / top).clamp(0.0, 1.0)) as u8 } else { 0 };
     Rgb { width: w, height: h, data: index.iter().flat_map(|v| [value(v); 3]).collect() }
 }
 
-/// Each pixel repeated: for looking, and for a copied input.
+/// Enlarges a picture by repeating its pixels.
 fn enlarged(picture: &Rgb, w: usize, h: usize) -> Rgb {
     let mut data = Vec::with_capacity(3 * w * h);
     for (y, x) in (0..h).flat_map(|y| (0..w).map(move |x| (y, x))) {
@@ -256,7 +276,7 @@ fn enlarged(picture: &Rgb, w: usize, h: usize) -> Rgb {
     Rgb { width: w, height: h, data }
 }
 
-/// Pictures in rows and columns, all as large as the largest.
+/// Arranges pictures in rows and columns, all at the size of the largest.
 fn tiled(rows: &[Vec<Rgb>]) -> Rgb {
     let all = || rows.iter().flatten();
     let (w, h) =

@@ -1,5 +1,5 @@
-//! pixelSplat's chunks: a made-up data set in its real format against what its own loader
-//! gives, and rows that are malformed.
+//! Tests of pixelSplat's chunks: a synthetic data set in the original format against the output of
+//! pixelSplat's loader, and malformed rows.
 
 use subsplat_test_support as common;
 use subsplat_test_support::torch_writer as writer;
@@ -10,11 +10,12 @@ use subsplat::data::chunks::{Chunk, NEAR_FAR, load_index};
 use subsplat::data::crop::{CropOptions, CropRule, crop};
 use writer::*;
 
-/// Greatest difference between two JPEG decoders, grey levels: the inverse transform, the
-/// chroma's upsampling and the colour transform round apart by one or two each, and the
-/// blue channel multiplies the chroma's by 1.77. Seen: 5.
-const MOST: u8 = 8;
+/// Largest difference between two JPEG decoders, grey levels. The inverse transform, the upsampling
+/// of the chroma and the colour transform differ by one or two each, and the blue channel
+/// multiplies the chroma's by 1.77. Measured: 5.
+const MAX_JPEG_DIFFERENCE: u8 = 8;
 
+/// A safetensors file of expected values.
 struct Expected(Vec<u8>);
 
 impl Expected {
@@ -35,18 +36,18 @@ impl Expected {
     }
 }
 
-fn near(got: &[f32], want: &[f32], tolerance: f32, what: &str) {
-    assert_eq!(got.len(), want.len(), "{what}");
+fn assert_near(got: &[f32], want: &[f32], tolerance: f32, name: &str) {
+    assert_eq!(got.len(), want.len(), "{name}");
     for (i, (g, w)) in got.iter().zip(want).enumerate() {
-        assert!((g - w).abs() <= tolerance, "{what}[{i}]: {g} {w}");
+        assert!((g - w).abs() <= tolerance, "{name}[{i}]: {g} {w}");
     }
 }
 
-/// Everything in the file of expected tensors, by way of the index. Cameras are exact.
-/// Pictures: JPEG leaves the inverse transform's and the chroma upsampling's last bit to
-/// the decoder, so single values differ by a few grey levels, and the mean hardly at all.
+/// Reads a chunk by the index and compares everything with the expected tensors. Cameras are exact.
+/// Pictures differ by a few grey levels in single values, because JPEG leaves the last bit of the
+/// inverse transform and of the chroma upsampling to the decoder.
 #[test]
-fn a_chunk_gives_what_pixelsplats_loader_gives() {
+fn a_chunk_equals_the_output_of_pixelsplats_loader() {
     let Some(folder) = shared("golden/re10k_synth/test") else { return };
     let Some(expected) = shared("golden/re10k_synth_expected.safetensors") else { return };
     let expected = Expected(std::fs::read(expected).unwrap());
@@ -63,36 +64,40 @@ fn a_chunk_gives_what_pixelsplats_loader_gives() {
     for (row, camera) in expected.floats("cameras").chunks_exact(18).zip(&example.cameras) {
         assert_eq!(camera.normalised, row[..4]);
         let back = camera.world_from_camera.inverse().transpose().to_cols_array();
-        near(&back[..12], &row[6..], 1e-5, "camera from world");
+        assert_near(&back[..12], &row[6..], 1e-5, "camera from world");
     }
     for frame in [1, 9] {
         let file = expected.file();
         let want = file.tensor(&format!("decoded_u8_hwc.{frame}")).unwrap();
         let (got, camera) = chunk.load(example, frame).unwrap();
         assert_eq!((got.height, got.width), (360, 640));
-        near(
+        assert_near(
             &camera.intrinsics.normalised(),
             &example.cameras[frame].normalised,
             1e-6,
             "fractions",
         );
         let differences = got.data.iter().zip(want.data()).map(|(g, w)| g.abs_diff(*w));
-        let (most, sum) = differences.fold((0, 0u64), |(m, s), d| (m.max(d), s + u64::from(d)));
+        let (largest, sum) = differences.fold((0, 0u64), |(m, s), d| (m.max(d), s + u64::from(d)));
         let mean = sum as f64 / got.data.len() as f64;
-        println!("frame {frame}: most {most}, mean {mean:.4} grey levels");
-        assert!(most <= MOST && mean < 0.5, "frame {frame}: most {most}, mean {mean}");
+        println!("frame {frame}: largest {largest}, mean {mean:.4} grey levels");
+        assert!(
+            largest <= MAX_JPEG_DIFFERENCE && mean < 0.5,
+            "frame {frame}: largest {largest}, mean {mean}"
+        );
     }
     for side in ["context", "target"] {
         check_views(&chunk, key, &expected, side);
     }
-    // The training's augmentation mirrors pictures left to right, camera and world with them.
+    // The augmentation of the training mirrors pictures left to right, together with camera and
+    // world.
     let poses = expected.ints("context.index").into_iter().flat_map(|frame| {
         let mirror = glam::Mat4::from_scale(glam::Vec3::new(-1.0, 1.0, 1.0));
         let pose = mirror * example.cameras[frame].world_from_camera * mirror;
         pose.transpose().to_cols_array()
     });
     let poses: Vec<f32> = poses.collect();
-    near(&poses, &expected.floats("reflected.extrinsics"), 1e-5, "reflected poses");
+    assert_near(&poses, &expected.floats("reflected.extrinsics"), 1e-5, "reflected poses");
 }
 
 fn check_views(chunk: &Chunk, key: &str, expected: &Expected, side: &str) {
@@ -106,14 +111,14 @@ fn check_views(chunk: &Chunk, key: &str, expected: &Expected, side: &str) {
         let c = crop(&photo, &camera, &options).unwrap();
         let [fx, fy, cx, cy] = c.input_camera.intrinsics.normalised();
         let k = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0];
-        near(&k, &ks[9 * view..][..9], 1e-6, "intrinsics");
+        assert_near(&k, &ks[9 * view..][..9], 1e-6, "intrinsics");
         let pose = c.input_camera.world_from_camera.transpose().to_cols_array();
-        near(&pose, &poses[16 * view..][..16], 1e-5, "pose");
-        // From the decoder; the resampling takes their mean.
-        near(
+        assert_near(&pose, &poses[16 * view..][..16], 1e-5, "pose");
+        // The differences of the decoders; resampling averages them.
+        assert_near(
             &c.input.to_planes(),
             &images[area * view..][..area],
-            (f32::from(MOST) + 0.01) / 255.0,
+            (f32::from(MAX_JPEG_DIFFERENCE) + 0.01) / 255.0,
             "image",
         );
     }
@@ -121,7 +126,7 @@ fn check_views(chunk: &Chunk, key: &str, expected: &Expected, side: &str) {
     assert!(get("far").iter().all(|f| *f == NEAR_FAR.1));
 }
 
-/// A chunk of one example of one frame; `change` replaces a part of it.
+/// Writes a chunk of one example of one frame; `part` replaces the part `change`.
 fn chunk_with(change: &str, part: Py) -> Vec<u8> {
     let mut file = Checkpoint::default();
     let camera: [f32; 18] =
@@ -133,7 +138,7 @@ fn chunk_with(change: &str, part: Py) -> Vec<u8> {
         ("cameras", file.floats(&camera, &[1, 18])),
         ("images", Py::List(vec![file.tensor("torch ByteStorage", b"no picture", &[10])])),
     ];
-    // Storages 3 and 4: cameras that are none, too many columns.
+    // Storages 3 and 4: invalid cameras, too many columns.
     let mut bent = camera;
     bent[6] = 2.0;
     let bent = file.floats(&bent, &[1, 18]);
@@ -205,19 +210,16 @@ fn malformed_rows_are_named() {
 #[test]
 fn an_index_stays_in_its_folder() {
     let folder = tempfile::tempdir().unwrap();
-    let answer = |text: &str| {
+    let load = |text: &str| {
         std::fs::write(folder.path().join("index.json"), text).unwrap();
         load_index(folder.path()).map_err(|e| e.to_string())
     };
-    assert_eq!(
-        answer(r#"{"a": "000000.torch"}"#).unwrap()["a"],
-        folder.path().join("000000.torch")
-    );
+    assert_eq!(load(r#"{"a": "000000.torch"}"#).unwrap()["a"], folder.path().join("000000.torch"));
     for name in ["../a.torch", "/a.torch", "x/a.torch", "", "..", ".", "a/"] {
-        let e = answer(&format!(r#"{{"a": "{name}"}}"#)).unwrap_err();
+        let e = load(&format!(r#"{{"a": "{name}"}}"#)).unwrap_err();
         assert!(e.contains("names of files in the index's folder"), "{name}: {e}");
     }
     for text in ["[]", "{\"a\": 1}", "{", ""] {
-        assert!(answer(text).unwrap_err().contains("an object from keys"), "{text}");
+        assert!(load(text).unwrap_err().contains("an object from keys"), "{text}");
     }
 }

@@ -1,4 +1,4 @@
-//! Training examples from disk: which, in which order, and what is in them.
+//! Tests of training examples from disk: their order, their contents, mirroring, and errors.
 
 use subsplat_test_support as common;
 use subsplat_test_support::chunk_files;
@@ -25,7 +25,7 @@ fn options(flip: bool) -> ExampleOptions {
     ExampleOptions { sampler: ViewSampler::constant(2, 4, 3), crop, flip, near_far: None }
 }
 
-/// Two chunks of three and four videos.
+/// Writes two chunks of three and four videos.
 fn seven() -> (tempfile::TempDir, [Vec<Video>; 2]) {
     let folder = tempfile::tempdir().unwrap();
     let videos = |keys: &[&str], frames| keys.iter().map(|k| video(k, frames)).collect();
@@ -39,14 +39,14 @@ fn open(path: &Path, options: ExampleOptions) -> Dataset {
 }
 
 #[test]
-fn a_seed_and_an_index_decide_the_example() {
+fn a_seed_and_an_index_determine_the_example() {
     let (folder, _) = seven();
     let data = open(folder.path(), options(true));
     assert_eq!(data.len(), 7);
     let mut stream = data.stream(5, 0);
     let first: Vec<TrainingExample> = (0..16).map(|_| stream.next_example(0).unwrap()).collect();
     assert_eq!(stream.index(), 16);
-    // From any index, in any order, by another reader: the same.
+    // Equal from any index, in any order, in another data set object.
     let again = open(&folder.path().join("train"), options(true));
     for i in [11u64, 3, 15, 0, 8] {
         assert_eq!(again.example(5, i, 0).unwrap().unwrap(), first[i as usize], "{i}");
@@ -54,8 +54,8 @@ fn a_seed_and_an_index_decide_the_example() {
     let mut restarted = again.stream(5, 9);
     assert_eq!(restarted.next_example(0).unwrap(), first[9]);
     assert_eq!(restarted.next_example(0).unwrap(), first[10]);
-    // A round visits every video once, chunk by chunk; the next in another order, with
-    // other frames.
+    // A round visits every video once, chunk by chunk. The next round has another order and other
+    // frames.
     let names = |e: &[TrainingExample]| e.iter().map(|e| e.name.clone()).collect::<Vec<_>>();
     let rounds = [names(&first[..7]), names(&first[7..14])];
     for round in &rounds {
@@ -83,7 +83,7 @@ fn a_seed_and_an_index_decide_the_example() {
     );
 }
 
-/// Inputs and targets are the crops of the frames that the example names.
+/// Inputs and targets are the crops of the example's frames.
 #[test]
 fn views_are_the_crops_of_their_frames() {
     let (folder, chunks) = seven();
@@ -122,21 +122,21 @@ fn views_are_the_crops_of_their_frames() {
 }
 
 #[test]
-fn what_cannot_serve_is_passed_over() {
+fn unusable_videos_are_skipped() {
     let folder = tempfile::tempdir().unwrap();
     let wide = Video { fx: 0.4, ..video("wide", 9) };
     let small = Video { size: (40, 30), ..video("small", 9) };
-    let usable = [video("short", 2), wide, small, video("good", 5)];
-    write(folder.path(), &[&usable]);
+    let videos = [video("short", 2), wide, small, video("good", 5)];
+    write(folder.path(), &[&videos]);
     let data = open(folder.path(), options(false));
     let mut stream = data.stream(0, 0);
     for round in 1..4 {
         assert_eq!(stream.next_example(0).unwrap().name, "good");
         assert!(stream.index() <= 4 * round && stream.index() > 4 * (round - 1));
     }
-    let seen: Vec<bool> = (0..4).map(|i| data.example(0, i, 0).unwrap().is_some()).collect();
-    assert_eq!(seen.iter().filter(|s| **s).count(), 1);
-    // A step that wants longer gaps than any video has.
+    let usable: Vec<bool> = (0..4).map(|i| data.example(0, i, 0).unwrap().is_some()).collect();
+    assert_eq!(usable.iter().filter(|u| **u).count(), 1);
+    // A step whose gap is longer than every video.
     let mut long = options(false);
     long.sampler = ViewSampler::re10k(GapMode::Mvs);
     let data = open(folder.path(), long);
@@ -147,7 +147,7 @@ fn what_cannot_serve_is_passed_over() {
 }
 
 #[test]
-fn what_is_broken_is_named() {
+fn broken_data_sets_are_refused_with_a_reason() {
     let folder = tempfile::tempdir().unwrap();
     let refused = |words: &[&str]| {
         let e = match Dataset::open(folder.path(), options(false)) {
@@ -203,15 +203,15 @@ fn folders_of_scenes_are_data_sets() {
         names.insert(e.name);
     }
     assert_eq!(names.len(), 3);
-    let given = ExampleOptions { near_far: Some((2.0, 3.0)), ..options(false) };
-    let one = open(&folder.path().join("one"), given);
+    let fixed_range = ExampleOptions { near_far: Some((2.0, 3.0)), ..options(false) };
+    let one = open(&folder.path().join("one"), fixed_range);
     assert_eq!((one.len(), one.stream(0, 0).next_example(0).unwrap().near_far), (1, (2.0, 3.0)));
 }
 
-/// A camera that stands still for a while says nothing of depth there, and is no end of a
-/// training.
+/// A constant camera position determines no depth. Such pairs are skipped, and the stream
+/// continues.
 #[test]
-fn pairs_without_a_baseline_are_passed_over() {
+fn pairs_without_a_baseline_are_skipped() {
     let folder = tempfile::tempdir().unwrap();
     let still = |name: &str, moves: usize| {
         let path = folder.path().join(name);
@@ -230,13 +230,13 @@ fn pairs_without_a_baseline_are_passed_over() {
     let data = open(&half, options(false));
     assert!((0..40).any(|i| data.example(1, i, 0).unwrap().is_none()));
     for i in 0..40 {
-        let e = data.serve(1, i, 0).unwrap().1;
+        let e = data.example_from(1, i, 0).unwrap().1;
         assert!(e.context[0].camera.position() != e.context[1].camera.position());
     }
-    let e = open(&all, options(false)).serve(1, 0, 0).unwrap_err().to_string();
-    assert!(e.contains("a camera that moves or near and far given"), "{e}");
-    let given = ExampleOptions { near_far: Some((2.0, 3.0)), ..options(false) };
-    assert_eq!(open(&all, given).serve(1, 0, 0).unwrap().1.near_far, (2.0, 3.0));
+    let e = open(&all, options(false)).example_from(1, 0, 0).unwrap_err().to_string();
+    assert!(e.contains("a camera that moves or with near and far"), "{e}");
+    let fixed_range = ExampleOptions { near_far: Some((2.0, 3.0)), ..options(false) };
+    assert_eq!(open(&all, fixed_range).example_from(1, 0, 0).unwrap().1.near_far, (2.0, 3.0));
 }
 
 fn posed() -> Posed {
@@ -248,16 +248,19 @@ fn posed() -> Posed {
 }
 
 #[test]
-fn a_mirror_twice_is_no_mirror() {
+fn mirroring_twice_restores_the_view() {
     let view = posed();
-    let there = view.flipped();
-    assert_ne!(there, view);
-    assert!(Camera::new(there.camera.intrinsics, there.camera.world_from_camera).is_ok());
+    let mirrored_view = view.flipped();
+    assert_ne!(mirrored_view, view);
+    assert!(
+        Camera::new(mirrored_view.camera.intrinsics, mirrored_view.camera.world_from_camera)
+            .is_ok()
+    );
     for c in 0..3 {
         let at = |p: &Posed, x: usize, y: usize| p.image.data[3 * (y * 48 + x) + c];
-        assert_eq!(at(&there, 5, 7), at(&view, 42, 7));
+        assert_eq!(at(&mirrored_view, 5, 7), at(&view, 42, 7));
     }
-    let back = there.flipped();
+    let back = mirrored_view.flipped();
     assert_eq!(back.image, view.image);
     assert_eq!(back.camera.world_from_camera, view.camera.world_from_camera);
     assert!((back.camera.intrinsics.cx - view.camera.intrinsics.cx).abs() < 1e-5);
@@ -267,7 +270,7 @@ fn a_mirror_twice_is_no_mirror() {
     assert_ne!(e.flipped().targets[0].image, e.targets[0].image);
 }
 
-/// Mirrored Gaussians before the mirrored camera are the mirrored picture.
+/// Mirrored Gaussians, seen by the mirrored camera, give the mirrored picture.
 #[test]
 fn a_mirrored_scene_renders_to_the_mirrored_picture() {
     let mut state = 9u32;
@@ -281,7 +284,7 @@ fn a_mirrored_scene_renders_to_the_mirrored_picture() {
         let q = [number(0.2, 1.0), number(-1.0, 1.0), number(-1.0, 1.0), number(-1.0, 1.0)];
         let rest = [number(0.05, 0.4), number(0.05, 0.4), number(0.05, 0.4), number(0.2, 0.9)];
         rows.extend(mean.into_iter().chain(q).chain(rest));
-        // S·R·S with S = diag(−1, 1, 1): turns about y and z change sense.
+        // S·R·S with S = diag(−1, 1, 1): rotations about y and z change their sign.
         let (m, r) = ([-mean[0], mean[1], mean[2]], [q[0], q[1], -q[2], -q[3]]);
         mirrored.extend(m.into_iter().chain(r).chain(rest));
         sh.extend([number(-1.0, 1.0), number(-1.0, 1.0), number(-1.0, 1.0)]);
@@ -300,11 +303,11 @@ fn a_mirrored_scene_renders_to_the_mirrored_picture() {
     let expected = Posed { image, ..view }.flipped();
     let got = picture(&splats(mirrored), &expected.camera);
     let apart = got.data.iter().zip(&expected.image.data).map(|(g, w)| g.abs_diff(*w));
-    // A last digit of a float may round the other way.
+    // The last digit of a float may round differently.
     assert!(apart.max() <= Some(1));
 }
 
-/// The reference loader's own data set, its frames and its mirrored poses.
+/// The synthetic data set of the reference loader.
 #[test]
 fn the_synthetic_re10k_streams() {
     let Some(folder) = common::shared("golden/re10k_synth") else { return };

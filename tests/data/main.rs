@@ -1,4 +1,5 @@
-//! Data sets, generated scenes, the example scene.
+//! Tests of data sets, procedural rooms, the shipped example scene, and training on pictures from
+//! disk.
 
 mod chunks;
 mod dataset;

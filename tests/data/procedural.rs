@@ -1,4 +1,5 @@
-//! Procedural rooms seen from outside: determinism, geometry, photometry, statistics.
+//! Tests of the procedural rooms through their public interface: determinism, geometry, photometry,
+//! statistics.
 
 use glam::{EulerRot, Quat, Vec2};
 use subsplat::camera::{Camera, Intrinsics};
@@ -16,7 +17,7 @@ fn rig(seed: u64, spec: &CameraSpec) -> (Room, Rig) {
     (room, rig)
 }
 
-/// Hard shadows, no highlights: colours that do not depend on the view.
+/// Hard shadows and no highlights: colours are independent of the view.
 fn diffuse(samples: usize) -> Quality {
     Quality { soft_shadows: false, view_dependent: false, ..Quality::clean(samples) }
 }
@@ -35,8 +36,8 @@ fn the_same_bits_for_any_number_of_threads() {
     assert_ne!(one.views[0].rgb, other.views[0].rgb);
 }
 
-/// Where pixel (x, y) of view `a` falls in camera `b`: position and camera z.
-fn carried(a: &View, ca: &Camera, x: usize, y: usize, cb: &Camera) -> Option<(Vec2, f32)> {
+/// Projects pixel (x, y) of view `a` into camera `b`: position and camera z.
+fn reprojected(a: &View, ca: &Camera, x: usize, y: usize, cb: &Camera) -> Option<(Vec2, f32)> {
     let px = Vec2::new(x as f32 + 0.5, y as f32 + 0.5);
     let point = ca.intrinsics.unproject(px) * a.depth[y * a.width + x];
     let world = ca.world_from_camera.transform_point3(point);
@@ -45,7 +46,7 @@ fn carried(a: &View, ca: &Camera, x: usize, y: usize, cb: &Camera) -> Option<(Ve
     (px.x > 1.5 && px.y > 1.5 && px.x < w - 1.5 && px.y < h - 1.5).then_some((px, z))
 }
 
-/// Smallest and largest depth in the 3×3 pixels around a position.
+/// Returns the smallest and the largest depth in the 3×3 pixels around a position.
 fn depth_around(view: &View, px: Vec2) -> (f32, f32) {
     let (x, y) = (px.x as usize, px.y as usize);
     let around = (y - 1..=y + 1).flat_map(|j| (x - 1..=x + 1).map(move |i| j * view.width + i));
@@ -63,12 +64,12 @@ fn depth_of_one_view_predicts_the_other() {
         let [ca, cb] = &example.cameras[..] else { panic!("two cameras") };
         let (mut inside, mut agree, mut in_front) = (0, 0, 0);
         for (x, y) in (0..h).flat_map(|y| (0..w).map(move |x| (x, y))) {
-            let Some((px, z)) = carried(a, ca, x, y, cb) else { continue };
+            let Some((px, z)) = reprojected(a, ca, x, y, cb) else { continue };
             let (low, high) = depth_around(b, px);
             inside += 1;
             agree += usize::from(z > 0.99 * low && z < 1.01 * high);
-            // A surface that `a` sees cannot hide what `b` sees, except a solid thinner
-            // than a pixel.
+            // A surface visible in `a` cannot occlude a point visible in `b`, except a solid
+            // thinner than a pixel.
             in_front += usize::from(z < 0.98 * low);
         }
         let share = agree as f32 / (w * h) as f32;
@@ -103,24 +104,24 @@ fn colour_at(view: &View, px: Vec2, channel: usize) -> f32 {
 }
 
 #[test]
-fn diffuse_surfaces_look_alike_from_both_views() {
+fn diffuse_surfaces_have_equal_colours_in_both_views() {
     let (mut total, mut shifted, mut count) = (0.0f64, 0.0f64, 0u32);
     for seed in 20..26 {
         let (room, rig) = rig(seed, &spec(160, 120));
         let [ca, cb] = [rig.cameras[0], rig.cameras[1]];
         let (a, b) = (room.render(&ca, &diffuse(4)), room.render(&cb, &diffuse(4)));
         for (x, y) in (2..118).flat_map(|y| (2..150).map(move |x| (x, y))) {
-            let Some((px, z)) = carried(&a, &ca, x, y, &cb) else { continue };
+            let Some((px, z)) = reprojected(&a, &ca, x, y, &cb) else { continue };
             let (low, high) = depth_around(&b, px);
             let (own_low, own_high) = depth_around(&a, Vec2::new(x as f32, y as f32));
-            // Away from edges of depth, and visible.
+            // Only visible points away from depth edges.
             if high > 1.04 * low || own_high > 1.04 * own_low || z > 1.01 * high {
                 continue;
             }
             for c in 0..3 {
-                let seen = colour_at(&b, px, c);
-                total += f64::from((seen - a.rgb[(y * 160 + x) * 3 + c]).abs());
-                shifted += f64::from((seen - a.rgb[(y * 160 + x + 6) * 3 + c]).abs());
+                let colour = colour_at(&b, px, c);
+                total += f64::from((colour - a.rgb[(y * 160 + x) * 3 + c]).abs());
+                shifted += f64::from((colour - a.rgb[(y * 160 + x + 6) * 3 + c]).abs());
                 count += 1;
             }
         }
@@ -132,7 +133,7 @@ fn diffuse_surfaces_look_alike_from_both_views() {
 }
 
 #[test]
-fn sampled_cameras_keep_their_promises() {
+fn sampled_cameras_satisfy_the_documented_conditions() {
     let n = 60;
     let (mut forward, mut orbit, mut sum) = (0, 0, 0.0);
     for seed in 100..100 + n {
@@ -160,20 +161,20 @@ fn sampled_cameras_keep_their_promises() {
         orbit += usize::from(rig.orbit);
         sum += rig.overlap;
     }
-    // Half and 35 % of the proposals; what cramped rooms refuse shifts both a little.
+    // Half and 35 % of the proposals; rejections in small rooms change both shares slightly.
     assert!((18..44).contains(&forward) && (10..36).contains(&orbit), "{forward} {orbit}");
     assert!((0.5..0.8).contains(&(sum / n as f32)), "mean overlap {}", sum / n as f32);
 }
 
 #[test]
-fn overlap_is_what_the_depth_maps_say() {
+fn overlap_agrees_with_the_depth_maps() {
     for seed in 200..206 {
         let (room, rig) = rig(seed, &spec(80, 80));
         let views: Vec<View> =
             rig.cameras[..2].iter().map(|c| room.render(c, &diffuse(1))).collect();
         let share = |i: usize, j: usize| {
             let sees = |k: usize| {
-                carried(&views[i], &rig.cameras[i], k % 80, k / 80, &rig.cameras[j])
+                reprojected(&views[i], &rig.cameras[i], k % 80, k / 80, &rig.cameras[j])
                     .is_some_and(|(px, z)| z < 1.02 * depth_around(&views[j], px).1)
             };
             (0..6400).filter(|k| sees(*k)).count() as f32 / 6400.0
@@ -198,12 +199,12 @@ fn a_larger_picture_reduces_to_the_smaller() {
         worst.push((mean - v).abs());
     }
     worst.sort_by(f32::total_cmp);
-    // Rounding may send a ray to the other side of an edge: one sample in 64, rarely.
+    // Rounding may move a ray across an edge: rarely, one sample of 64.
     assert!(worst[worst.len() * 995 / 1000] < 1e-4, "{}", worst[worst.len() * 995 / 1000]);
     assert!(worst[worst.len() - 1] < 2.0 / 64.0, "{}", worst[worst.len() - 1]);
     let spread = one.rgb.iter().fold(0.0f32, |m, v| m.max(*v))
         - one.rgb.iter().fold(1.0f32, |m, v| m.min(*v));
-    assert!(spread > 0.2, "a blank picture proves nothing: {spread}");
+    assert!(spread > 0.2, "the picture is uniform: {spread}");
 }
 
 #[test]
@@ -230,12 +231,12 @@ fn pictures_of_any_shape_are_finite_and_full() {
 }
 
 #[test]
-fn what_stands_before_the_cameras_changes_nothing_else() {
+fn foreground_objects_change_nothing_else() {
     let plain = ExampleSpec::new(40, 30, 1);
-    let crowded = ExampleSpec { foreground: 1.0, ..plain };
+    let with_foreground = ExampleSpec { foreground: 1.0, ..plain };
     let mut closer = 0;
     for seed in 0..12 {
-        let [a, b] = [plain, crowded].map(|spec| Example::new(seed, &spec));
+        let [a, b] = [plain, with_foreground].map(|spec| Example::new(seed, &spec));
         assert_eq!(a.seed, b.seed);
         // The same poses in another unit of length.
         let rotations = |e: &Example| e.cameras.iter().map(|c| c.rotation()).collect::<Vec<_>>();
@@ -254,7 +255,7 @@ fn what_stands_before_the_cameras_changes_nothing_else() {
 }
 
 #[test]
-fn rooms_have_the_size_and_number_of_things_that_rooms_have() {
+fn rooms_have_realistic_sizes_and_numbers_of_solids() {
     let n = 200;
     let mut solids = 0;
     for seed in 0..n {
@@ -277,7 +278,7 @@ fn examples_have_the_scale_and_planes_of_data_sets() {
         let example = Example::new(seed, &ExampleSpec::new(24, 24, 0));
         let mut depth: Vec<f32> = example.views.iter().flat_map(|v| v.depth.clone()).collect();
         depth.sort_by(f32::total_cmp);
-        // The quantile was taken on another grid of the same views.
+        // The generator takes the quantile on another grid of the same views.
         let quantile = depth[depth.len() / 50];
         assert!((0.7..3.2).contains(&quantile), "seed {seed}: {quantile}");
         let baseline = example.cameras[0].position().distance(example.cameras[1].position());
@@ -296,7 +297,7 @@ fn examples_have_the_scale_and_planes_of_data_sets() {
 }
 
 #[test]
-fn each_part_of_the_sensor_can_be_switched() {
+fn each_effect_of_the_sensor_is_optional() {
     let (room, rig) = rig(12, &spec(40, 40));
     let camera = &rig.cameras[0];
     let clean = Quality { soft_shadows: false, ..Quality::clean(2) };
@@ -307,7 +308,7 @@ fn each_part_of_the_sensor_can_be_switched() {
         room.render(camera, &quality)
     };
     let mean = |v: &View| v.rgb.iter().map(|v| f64::from(*v)).sum::<f64>() / v.rgb.len() as f64;
-    let rough = |v: &View| {
+    let roughness = |v: &View| {
         let steps = v.rgb.windows(4).map(|w| f64::from((w[3] - w[0]).abs()));
         steps.sum::<f64>() / v.rgb.len() as f64
     };
@@ -315,7 +316,7 @@ fn each_part_of_the_sensor_can_be_switched() {
     assert!(mean(&with(&|q| q.grade.gain = [1.3; 3])) > mean(&base) + 0.02);
     assert!(mean(&with(&|q| q.grade.gamma = 2.6)) > mean(&base) + 0.02);
     let soft = with(&|q| q.grade.softness = 0.9);
-    assert!(rough(&soft) < 0.9 * rough(&base) && (mean(&soft) - mean(&base)).abs() < 0.01);
+    assert!(roughness(&soft) < 0.9 * roughness(&base) && (mean(&soft) - mean(&base)).abs() < 0.01);
     let noisy = with(&|q| (q.grade.noise, q.grade.seed) = (0.02, 1));
     let difference = noisy.rgb.iter().zip(&base.rgb).map(|(a, b)| f64::from(a - b).powi(2));
     let sigma = (difference.sum::<f64>() / base.rgb.len() as f64).sqrt();

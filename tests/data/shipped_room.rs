@@ -1,4 +1,4 @@
-//! `examples/room/` is what `examples/make_room.rs` makes.
+//! Tests that `examples/room/` equals the output of `examples/make_room.rs`.
 
 #[path = "../../examples/make_room.rs"]
 #[allow(dead_code, reason = "its main belongs to the example")]
@@ -18,13 +18,13 @@ fn json(name: &str) -> Value {
 }
 
 #[test]
-fn an_input_picture_comes_out_again() {
+fn an_input_picture_is_reproduced() {
     let frame = &make_room::frames()[0];
     let committed = image::open(folder().join(&frame.file)).unwrap().to_rgb8();
     let made = make_room::bytes(&make_room::render(&make_room::room(), &frame.camera));
     assert_eq!(committed.as_raw().len(), made.len());
     let worst = committed.as_raw().iter().zip(&made).map(|(a, b)| a.abs_diff(*b)).max();
-    // One level: another platform's `pow` may round otherwise.
+    // One level: `pow` may round differently on another platform.
     assert!(worst <= Some(1), "{worst:?}");
 }
 
@@ -52,8 +52,8 @@ fn cameras_and_planes_are_those_of_the_pictures() {
         let view = room.render(&frame.camera, &quick);
         let picture = image::open(folder().join(&frame.file)).unwrap().to_rgb8();
         let picture: Vec<f32> = picture.into_raw().iter().map(|v| f32::from(*v) / 255.0).collect();
-        // One sample a pixel against many, and JPEG: far above what another view or
-        // another camera reaches.
+        // One sample per pixel against many, and JPEG: far above the agreement with another view or
+        // another camera.
         let agreement = psnr(&picture, &view.rgb, k.width, k.height).unwrap();
         assert!(agreement > 26.0, "frame {i}: {agreement} dB");
         if i < 2 {
@@ -82,7 +82,7 @@ fn the_protocol_names_targets_at_twice_and_four_times_the_input() {
 }
 
 #[test]
-fn it_stays_small() {
+fn the_pictures_are_small() {
     let files = std::fs::read_dir(folder().join("images")).unwrap();
     let bytes: u64 = files.map(|f| f.unwrap().metadata().unwrap().len()).sum();
     assert!(bytes < 2_000_000, "{bytes}");

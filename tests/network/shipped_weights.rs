@@ -40,7 +40,7 @@ fn look(
     config.data.input = [256 / model.upscale; 2];
     config.data.seed = 77;
     config.validate.scenes = 6;
-    Validator::new(&config, photos).unwrap().look(tensors, None).unwrap()
+    Validator::new(&config, photos).unwrap().evaluate(tensors, None).unwrap()
 }
 
 fn learnt(upscale: usize) -> BTreeMap<String, Tensor> {

@@ -1,4 +1,4 @@
-//! `check_pair` on real photographs with right and with spoiled cameras.
+//! Tests of `check_pair` on photographs with correct and with corrupted cameras.
 
 use subsplat_test_support as common;
 
@@ -9,10 +9,9 @@ use subsplat::check::{
     CheckOptions, GrayImage, PairReport, RgbPicture, Verdict, check_pair, epipolar_picture,
 };
 
-/// Scenes, context pairs of their protocols, and the findings that are justified:
-/// a tiny baseline and focal lengths divided by the wrong side (pair_bananas),
-/// automatic exposure, video poses that are off by 2 to 3 px at 640 (the first of
-/// them seen through a doorway).
+/// Scenes, context pairs of their protocols, and their justified findings: a very small baseline
+/// and focal lengths divided by the wrong side (pair_bananas), automatic exposure, and video poses
+/// with errors of 2 to 3 px at 640 (the first of them seen through a doorway).
 const PAIRS: [(&str, usize, usize, &[&str]); 17] = [
     ("fox", 0, 8, &[]),
     ("fox", 10, 16, &[]),
@@ -80,8 +79,8 @@ fn with_pose(camera: &Camera, world_from_camera: Mat4) -> Camera {
     Camera { world_from_camera, ..*camera }
 }
 
-/// The camera as a file of that mistake would have it.
-fn spoiled(camera: &Camera, mistake: &str) -> Camera {
+/// Returns the camera with the given mistake applied.
+fn corrupted(camera: &Camera, mistake: &str) -> Camera {
     let pose = camera.world_from_camera;
     let opengl = Mat4::from_scale(Vec3::new(1.0, -1.0, -1.0));
     let k = camera.intrinsics;
@@ -109,12 +108,12 @@ fn spoiled(camera: &Camera, mistake: &str) -> Camera {
         "focal_scaled" => scaled(1.3, 1.3, 1.0),
         "fx_scaled" => scaled(1.3, 1.0, 1.0),
         "other_size" => scaled(0.5, 0.5, 0.5),
-        other => panic!("no such mistake: {other}"),
+        other => panic!("unknown mistake: {other}"),
     }
 }
 
 #[test]
-fn every_scene_is_judged_as_it_deserves() {
+fn every_scene_has_its_justified_findings() {
     for (scene, i, j, expected) in PAIRS {
         let Some(folder) = common::shared(&format!("photos/{scene}")) else { return };
         let f = frames(&folder, &[i, j]);
@@ -143,9 +142,9 @@ fn every_scene_is_judged_as_it_deserves() {
 }
 
 #[test]
-fn wrong_axes_and_inverted_poses_are_named() {
+fn wrong_axes_and_inverted_poses_are_reported() {
     for scene in PAIRS.map(|p| p.0).iter().collect::<std::collections::BTreeSet<_>>() {
-        // Depth does not show in a 1.7 cm baseline, nor therefore do most mistakes.
+        // A baseline of 1.7 cm determines no depth and therefore reveals few mistakes.
         if *scene == "pair_bananas" {
             continue;
         }
@@ -153,7 +152,7 @@ fn wrong_axes_and_inverted_poses_are_named() {
         let pair = PAIRS.iter().find(|p| p.0 == *scene).unwrap();
         let f = frames(&folder, &[pair.1, pair.2]);
         for mistake in ["opengl", "world_to_camera"] {
-            let [a, b] = [0, 1].map(|i| spoiled(&f[i].camera, mistake));
+            let [a, b] = [0, 1].map(|i| corrupted(&f[i].camera, mistake));
             let report = check(&f[0], &a, &f[1], &b);
             assert_eq!(report.verdict, Verdict::Bad, "{scene} {mistake}");
             assert!(report.has("poses_wrong"), "{scene} {mistake}: {:?}", report.findings);
@@ -166,7 +165,7 @@ fn wrong_axes_and_inverted_poses_are_named() {
 }
 
 #[test]
-fn other_mistakes_are_named() {
+fn other_mistakes_are_reported() {
     let mistakes = [
         "world_to_camera_opengl",
         "rotation_transposed",
@@ -176,20 +175,20 @@ fn other_mistakes_are_named() {
         "fx_scaled",
         "other_size",
     ];
-    // Pairs that turn by 21° and 31°: pure translation hides a focal length.
+    // Pairs with rotations of 21° and 31°: pure translation does not determine the focal length.
     let all = [("re10k_0f68374b76390082", 12, 22, &mistakes[..]), ("fox", 10, 16, &mistakes[4..])];
     for (scene, i, j, mistakes) in all {
         let Some(folder) = common::shared(&format!("photos/{scene}")) else { return };
         let f = frames(&folder, &[i, j]);
         for &mistake in mistakes {
-            let [a, b] = [0, 1].map(|i| spoiled(&f[i].camera, mistake));
+            let [a, b] = [0, 1].map(|i| corrupted(&f[i].camera, mistake));
             let report = check(&f[0], &a, &f[1], &b);
             let names: Vec<&str> = report.readings.iter().map(|r| r.name.as_str()).collect();
             assert_eq!(report.verdict, Verdict::Bad, "{scene} {mistake}: {names:?}");
             // fx and fy 30 % apart are also explained by scaling both.
-            let named = names.contains(&mistake)
+            let reported = names.contains(&mistake)
                 || (mistake == "fx_scaled" && names.iter().any(|n| n.contains("focal")));
-            assert!(named, "{scene} {mistake}: {names:?}");
+            assert!(reported, "{scene} {mistake}: {names:?}");
         }
         let report = check(&f[0], &f[1].camera, &f[1], &f[0].camera);
         assert_eq!((report.verdict, report.readings[0].name.as_str()), (Verdict::Bad, "exchanged"));
@@ -210,17 +209,17 @@ fn cameras_of_other_frames_are_wrong() {
 }
 
 #[test]
-fn turned_photographs_are_named() {
+fn rotated_photographs_are_reported() {
     let Some(folder) = common::shared("photos/fox") else { return };
     let f = frames(&folder, &[0, 8]);
-    // Photographs turned after the poses were found, cameras left as they were: 90°
-    // clockwise, as an image library does for EXIF orientation 6.
-    let turned = |f: &Frame| {
+    // Photographs rotated after the estimation of the poses, with unchanged cameras: 90° clockwise,
+    // as an image library does for EXIF orientation 6.
+    let rotated = |f: &Frame| {
         let rgb = image::imageops::rotate90(&f.rgb);
         let (w, h) = (rgb.width() as usize, rgb.height() as usize);
         GrayImage::from_rgb8(w, h, rgb.as_raw()).unwrap()
     };
-    let [a, b] = [turned(&f[0]), turned(&f[1])];
+    let [a, b] = [rotated(&f[0]), rotated(&f[1])];
     let report = check_pair(&a, &f[0].camera, &b, &f[1].camera, &CheckOptions::default());
     assert_eq!(report.verdict, Verdict::Bad);
     assert!(report.has("size_differs") && report.has("poses_wrong"), "{:?}", report.findings);
@@ -228,7 +227,7 @@ fn turned_photographs_are_named() {
 }
 
 #[test]
-fn photographs_of_different_places_are_too_few_matches() {
+fn photographs_of_different_places_give_too_few_matches() {
     let Some(fox) = common::shared("photos/fox") else { return };
     let Some(table) = common::shared("photos/hololens_table") else { return };
     let (f, t) = (frames(&fox, &[0]).remove(0), frames(&table, &[6]).remove(0));
@@ -238,7 +237,7 @@ fn photographs_of_different_places_are_too_few_matches() {
 }
 
 #[test]
-fn the_report_travels_as_json_and_is_the_same_each_time() {
+fn the_report_survives_json_and_is_reproducible() {
     let Some(folder) = common::shared("photos/re10k_5aca87f95a9412c6") else { return };
     let f = frames(&folder, &[2, 6]);
     let report = check(&f[0], &f[0].camera, &f[1], &f[1].camera);
@@ -264,8 +263,8 @@ fn the_epipolar_picture_shows_lines_through_their_points() {
     let (w, h, rgb) = epipolar_picture(photographs, cameras, &report.points).unwrap();
     assert_eq!(rgb.len(), 3 * w * h);
     assert_eq!((w, h), (2 * 864 + 8, 480));
-    // Undimmed, saturated colours are the drawing's alone. The surest match is drawn
-    // in the first colour: around its point, in either half, the line must pass.
+    // Only the drawing has saturated colours. The most certain match has the first colour, and its
+    // line must pass around its point in both halves.
     let passes = |rgb: &[u8], centre: [f32; 2]| {
         let near = |i: usize| {
             let (x, y) = ((i % w) as f32 + 0.5, (i / w) as f32 + 0.5);
@@ -273,8 +272,11 @@ fn the_epipolar_picture_shows_lines_through_their_points() {
         };
         (0..w * h).filter(|&i| near(i) && rgb[3 * i..3 * i + 3] == [255, 64, 64]).count()
     };
-    let surest = report.points.iter().find(|p| p.consistent).unwrap();
-    let places = [surest.a.map(|v| 1.5 * v), [1.5 * surest.b[0] + 872.0, 1.5 * surest.b[1]]];
+    let most_certain = report.points.iter().find(|p| p.consistent).unwrap();
+    let places = [
+        most_certain.a.map(|v| 1.5 * v),
+        [1.5 * most_certain.b[0] + 872.0, 1.5 * most_certain.b[1]],
+    ];
     for place in places {
         assert!(passes(&rgb, place) >= 3, "{place:?} {}", passes(&rgb, place));
     }

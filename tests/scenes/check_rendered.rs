@@ -1,4 +1,4 @@
-//! `check_pair` on rendered rooms whose geometry is known exactly.
+//! Tests of `check_pair` on ray-traced scenes of exactly known geometry.
 
 use glam::{Mat4, Quat, Vec3};
 use subsplat::camera::{Camera, Intrinsics};
@@ -16,7 +16,7 @@ fn posed(yaw: f32, pitch: f32, eye: Vec3) -> Camera {
     Camera::new(intrinsics(), Mat4::from_rotation_translation(turn, eye)).unwrap()
 }
 
-/// Smooth noise of four octaves from a hash of the lattice, about 0 to 1.
+/// Returns smooth noise of four octaves from a hash of the lattice, about 0 to 1.
 fn texture(u: f32, v: f32, seed: u32) -> f32 {
     let lattice = |x: i32, y: i32| {
         let mut h = (x as u32).wrapping_mul(0x9E37_79B1) ^ (y as u32).wrapping_mul(0x85EB_CA77);
@@ -37,23 +37,24 @@ fn texture(u: f32, v: f32, seed: u32) -> f32 {
     0.4 * octave(3.0) + 0.3 * octave(7.0) + 0.2 * octave(15.0) + 0.1 * octave(29.0)
 }
 
-/// What a ray meets: a wall at z = 6, a floor at y = 1.5, a box's front at z = 4.
+/// Returns the colour at the first hit of a ray: a wall at z = 6, a floor at y = 1.5, a box's front
+/// at z = 4.
 fn trace(eye: Vec3, ray: Vec3) -> f32 {
     let mut nearest = (f32::INFINITY, 0.5);
-    let mut meet = |t: f32, inside: bool, value: f32| {
+    let mut hit = |t: f32, inside: bool, value: f32| {
         if t > 0.0 && inside && t < nearest.0 {
             nearest = (t, value);
         }
     };
     let t = (6.0 - eye.z) / ray.z;
     let p = eye + ray * t;
-    meet(t, true, texture(p.x, p.y, 1));
+    hit(t, true, texture(p.x, p.y, 1));
     let t = (1.5 - eye.y) / ray.y;
     let p = eye + ray * t;
-    meet(t, true, texture(p.x, p.z, 2));
+    hit(t, true, texture(p.x, p.z, 2));
     let t = (4.0 - eye.z) / ray.z;
     let p = eye + ray * t;
-    meet(t, p.x.abs() < 1.0 && p.y.abs() < 0.8, texture(p.x, p.y, 3));
+    hit(t, p.x.abs() < 1.0 && p.y.abs() < 0.8, texture(p.x, p.y, 3));
     nearest.1
 }
 
@@ -88,10 +89,10 @@ fn known_geometry_is_measured() {
     assert!((report.baseline - a.position().distance(b.position())).abs() < 1e-4);
     assert!((report.rotation_deg - 8.7).abs() < 0.1, "{}", report.rotation_deg);
     let depth = report.depth.unwrap();
-    // The floor begins at z = 3.3 at the picture's lower edge, the wall ends at 6.
+    // The floor begins at z = 3.3 at the lower edge of the picture; the wall is at 6.
     assert!((3.0..4.5).contains(&depth.quantiles[0]), "{depth:?}");
     assert!((5.6..6.5).contains(&depth.quantiles[4]), "{depth:?}");
-    // Share of the first picture's rays whose true point the second camera sees.
+    // Share of the first picture's rays whose surface point the second camera sees.
     let [first, second] = report.overlap.unwrap();
     for (measured, from, to) in [(first, &a, &b), (second, &b, &a)] {
         let truth = true_overlap(from, to);
@@ -100,9 +101,9 @@ fn known_geometry_is_measured() {
     assert!(report.points.iter().filter(|p| p.consistent).all(|p| p.a[0] < W as f32));
 }
 
-/// Overlap by tracing, without regard to occlusion.
+/// Computes the overlap by ray tracing, without occlusion.
 fn true_overlap(from: &Camera, to: &Camera) -> f32 {
-    let mut seen = 0;
+    let mut visible = 0;
     for i in 0..(W / 4) * (H / 4) {
         let px = glam::Vec2::new((i % (W / 4) * 4) as f32, (i / (W / 4) * 4) as f32);
         let ray = from.rotation() * from.intrinsics.unproject(px);
@@ -117,9 +118,9 @@ fn true_overlap(from: &Camera, to: &Camera) -> f32 {
         let inside = to
             .project(eye + ray * t)
             .is_some_and(|p| p.x >= 0.0 && p.y >= 0.0 && p.x <= W as f32 && p.y <= H as f32);
-        seen += usize::from(inside);
+        visible += usize::from(inside);
     }
-    seen as f32 / ((W / 4) * (H / 4)) as f32
+    visible as f32 / ((W / 4) * (H / 4)) as f32
 }
 
 #[test]
@@ -144,13 +145,13 @@ fn pairs_without_depth_are_refused() {
 }
 
 #[test]
-fn cameras_that_look_elsewhere_are_refused() {
+fn cameras_without_common_content_are_refused() {
     let a = posed(0.0, 0.0, Vec3::ZERO);
     let away = posed(std::f32::consts::PI, 0.0, Vec3::new(0.5, 0.0, 0.0));
     let wall = GrayImage::new(W, H, vec![0.5; W * H]).unwrap();
     let report = check_pair(&render(&a), &a, &wall, &away, &CheckOptions::default());
     assert!(report.has("no_overlap") && report.verdict == Verdict::Bad, "{:?}", report.findings);
-    // Half a field of view apart, both on texture: there is some overlap, but little.
+    // Half a field of view apart, both directed at texture: a small overlap.
     let aside = posed(0.68, 0.0, Vec3::new(0.3, 0.0, 0.0));
     let report = check_rendered(&a, &aside);
     assert!(report.has("little_overlap"), "{:?} {:?}", report.overlap, report.findings);
@@ -158,7 +159,7 @@ fn cameras_that_look_elsewhere_are_refused() {
 }
 
 #[test]
-fn strange_sizes_intrinsics_and_exposures_are_said() {
+fn implausible_sizes_intrinsics_and_exposures_are_reported() {
     let a = posed(0.0, 0.0, Vec3::ZERO);
     let b = posed(0.03, 0.0, Vec3::new(0.5, 0.0, 0.0));
     let (first, second) = (render(&a), render(&b));
@@ -202,7 +203,7 @@ fn strange_sizes_intrinsics_and_exposures_are_said() {
 }
 
 #[test]
-fn a_photograph_turned_with_its_camera_is_found() {
+fn a_photograph_rolled_with_its_camera_is_matched() {
     let a = posed(0.0, 0.0, Vec3::ZERO);
     let mut b = posed(-0.05, 0.0, Vec3::new(0.6, 0.0, 0.0));
     b.world_from_camera *= Mat4::from_rotation_z(1.4);

@@ -1,5 +1,5 @@
-//! Bad scenes, pose files and pictures: each gives one clear error that names the file
-//! and what was expected, and nothing panics or takes unbounded memory.
+//! Tests of invalid scenes, pose files and pictures: each gives one error that names the file and
+//! the expected content, without a panic and without unbounded memory.
 
 use subsplat_test_support::colmap_files;
 use subsplat_test_support::made_up;
@@ -17,21 +17,21 @@ use subsplat::io::protocol::{load_index, load_protocol};
 use subsplat::io::scene::{Units, load_scene};
 use subsplat::io::{image, re10k};
 
-/// The error, which must be one line and hold all of `words`.
-fn check(what: &str, result: Result<(), subsplat::io::Error>, words: &[&str]) {
+/// Asserts an error of one line that contains all of `words`.
+fn check(case: &str, result: Result<(), subsplat::io::Error>, words: &[&str]) {
     let error = match result {
-        Ok(()) => panic!("{what}: was accepted"),
+        Ok(()) => panic!("{case}: was accepted"),
         Err(e) => e.to_string(),
     };
-    eprintln!("{what}: {error}");
-    assert_eq!(error.lines().count(), 1, "{what}: {error}");
-    assert!(error.len() < 700, "{what}: {error}");
+    eprintln!("{case}: {error}");
+    assert_eq!(error.lines().count(), 1, "{case}: {error}");
+    assert!(error.len() < 700, "{case}: {error}");
     for word in words {
-        assert!(error.contains(word), "{what}: `{word}` is not in `{error}`");
+        assert!(error.contains(word), "{case}: `{word}` is not in `{error}`");
     }
 }
 
-/// A good scene with `file` holding `bytes` on top, loaded.
+/// Loads a valid scene with `file` replaced by `bytes`.
 fn with(file: &str, bytes: &[u8]) -> Result<(), subsplat::io::Error> {
     let (folder, _) = made_up(3);
     let path = folder.path().join(file);
@@ -40,7 +40,7 @@ fn with(file: &str, bytes: &[u8]) -> Result<(), subsplat::io::Error> {
     load_scene(folder.path()).map(|_| ())
 }
 
-/// A valid `transforms.json` of the made-up pictures, changed by `change`.
+/// Returns a valid `transforms.json` of the synthetic pictures, modified by `change`.
 fn transforms(change: impl Fn(&mut Value)) -> Vec<u8> {
     let eye = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]];
     let frame =
@@ -50,7 +50,7 @@ fn transforms(change: impl Fn(&mut Value)) -> Vec<u8> {
     value.to_string().into_bytes()
 }
 
-/// A valid `cameras.json` of the made-up pictures, changed by `change`.
+/// Returns a valid `cameras.json` of the synthetic pictures, modified by `change`.
 fn cameras_json(change: impl Fn(&mut Value)) -> Vec<u8> {
     let (folder, cameras) = made_up(3);
     let path = folder.path().join("cameras.json");
@@ -183,16 +183,16 @@ fn bad_transforms_json() {
             &["pictures on disk"],
         ),
     ];
-    for (what, bytes, words) in cases {
-        if what == "huge distortion" {
-            // Loads; the lens is refused where it is to be undone.
+    for (case, bytes, words) in cases {
+        if case == "huge distortion" {
+            // The scene loads; undoing the distortion fails.
             let (folder, _) = made_up(3);
             std::fs::write(folder.path().join("transforms.json"), bytes).unwrap();
             let scene = load_scene(folder.path()).unwrap();
-            check(what, scene.frames[0].load().map(|_| ()), &["000.png", "distortion", "1e308"]);
+            check(case, scene.frames[0].load().map(|_| ()), &["000.png", "distortion", "1e308"]);
             continue;
         }
-        check(what, with("transforms.json", &bytes), words);
+        check(case, with("transforms.json", &bytes), words);
     }
 }
 
@@ -230,8 +230,8 @@ fn bad_cameras_json() {
             &["frame 0", "rigid"],
         ),
     ];
-    for (what, bytes, words) in cases {
-        check(what, with("cameras.json", &bytes), words);
+    for (case, bytes, words) in cases {
+        check(case, with("cameras.json", &bytes), words);
     }
 }
 
@@ -268,11 +268,11 @@ fn bad_re10k_txt() {
         ("address alone", "https://a.b/c\n".into(), &["at least one camera"]),
         ("empty", String::new(), &["at least one camera"]),
     ];
-    for (what, text, words) in cases {
+    for (case, text, words) in cases {
         let (folder, _) = made_up(3);
         let path = folder.path().join("a.txt");
         std::fs::write(&path, text).unwrap();
-        check(what, load_scene(&path).map(|_| ()), words);
+        check(case, load_scene(&path).map(|_| ()), words);
     }
     let (folder, _) = made_up(3);
     let path = folder.path().join("a.txt");
@@ -307,11 +307,11 @@ fn bad_matrices() {
         ),
         ("empty", k, String::new(), &["poses.txt", "0 pictures"]),
     ];
-    for (what, k, poses, words) in cases {
+    for (case, k, poses, words) in cases {
         let (folder, _) = made_up(3);
         std::fs::write(folder.path().join("K.txt"), k).unwrap();
         std::fs::write(folder.path().join("poses.txt"), poses).unwrap();
-        check(what, load_scene(folder.path()).map(|_| ()), words);
+        check(case, load_scene(folder.path()).map(|_| ()), words);
     }
     let (folder, _) = made_up(3);
     std::fs::write(folder.path().join("poses.txt"), poses).unwrap();
@@ -327,7 +327,7 @@ fn bad_pictures() {
     let picture = folder.path().join("images/001.png");
     let good = std::fs::read(&picture).unwrap();
 
-    // Headers that promise 60000 × 60000 pixels.
+    // Headers that declare 60000 × 60000 pixels.
     let mut png = good[..33].to_vec();
     png[16..24].copy_from_slice(&[0, 0, 0xea, 0x60, 0, 0, 0xea, 0x60]);
     let mut crc = flate2::Crc::new();
@@ -343,7 +343,7 @@ fn bad_pictures() {
     jpeg.extend([
         1, 0x11, 0, 2, 0x11, 0, 3, 0x11, 0, 0xff, 0xda, 0, 12, 3, 1, 0, 2, 0, 3, 0, 0, 63, 0,
     ]);
-    for (what, bytes, words) in [
+    for (case, bytes, words) in [
         ("PNG bomb", png, &["001.png", "megapixels"][..]),
         ("BMP bomb", bmp, &["001.png", "megapixels"]),
         ("JPEG bomb", jpeg, &["001.png"]),
@@ -352,14 +352,14 @@ fn bad_pictures() {
         ("header alone", good[..20].to_vec(), &["001.png"]),
     ] {
         std::fs::write(&picture, bytes).unwrap();
-        check(what, load_scene(folder.path()).map(|_| ()), words);
-        check(what, image::load(&picture).map(|_| ()), words);
+        check(case, load_scene(folder.path()).map(|_| ()), words);
+        check(case, image::load(&picture).map(|_| ()), words);
     }
-    // The header is whole, the pixels are not: found when the frame is loaded.
+    // The header is complete, the pixels are not: loading the frame fails.
     std::fs::write(&picture, &good[..good.len() / 2]).unwrap();
     let scene = load_scene(folder.path()).unwrap();
     check("half a PNG", scene.frames[1].load().map(|_| ()), &["001.png"]);
-    // Another size since the scene was loaded.
+    // The size has changed since the scene was loaded.
     image::save_png(&picture, &noise::noise(48, 64)).unwrap();
     check("changed size", scene.frames[1].load().map(|_| ()), &["001.png", "64x48", "48x64"]);
     std::fs::remove_file(&picture).unwrap();
@@ -396,7 +396,7 @@ fn bad_paths() {
 fn bad_protocols() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("p.json");
-    for (what, text, words) in [
+    for (case, text, words) in [
         ("empty", "", &["p.json", "EOF"][..]),
         ("list", "[1]", &["p.json:1"]),
         ("negative", r#"{"tests": [{"context": [-1], "target": []}]}"#, &["-1"]),
@@ -405,11 +405,11 @@ fn bad_protocols() {
         ("no context", r#"{"tests": [{"context": [], "target": [1]}]}"#, &["test 0", "context"]),
     ] {
         std::fs::write(&path, text).unwrap();
-        check(what, load_protocol(&path).map(|_| ()), words);
+        check(case, load_protocol(&path).map(|_| ()), words);
         let index = text.replace(r#""tests": ["#, r#""scene": "#).replace("}]}", "}}");
         std::fs::write(&path, index).unwrap();
         let words: Vec<&str> = words.iter().copied().filter(|w| *w != "test 0").collect();
-        check(what, load_index(&path).map(|_| ()), &words);
+        check(case, load_index(&path).map(|_| ()), &words);
     }
     std::fs::write(&path, r#"{"tests": [{"context": [0, 9], "target": [1]}]}"#).unwrap();
     let test = &load_protocol(&path).unwrap().tests[0];
@@ -428,14 +428,14 @@ const BINARY: [(&str, Parser); 3] = [
 #[test]
 fn colmap_binary_cut_at_every_byte() {
     let (_folder, cameras) = made_up(3);
-    for ((what, parse), bytes) in BINARY.iter().zip(colmap_files::binary(&cameras)) {
+    for ((case, parse), bytes) in BINARY.iter().zip(colmap_files::binary(&cameras)) {
         parse(&bytes).unwrap();
         for cut in 0..bytes.len() {
             let error = match parse(&bytes[..cut]) {
                 Err(e) => e.to_string(),
-                Ok(()) => panic!("{what}.bin cut at {cut} of {} was accepted", bytes.len()),
+                Ok(()) => panic!("{case}.bin cut at {cut} of {} was accepted", bytes.len()),
             };
-            assert!(error.contains(".bin at byte"), "{what} {cut}: {error}");
+            assert!(error.contains(".bin at byte"), "{case} {cut}: {error}");
         }
         let longer = [&bytes[..], &[0]].concat();
         check("one byte more", parse(&longer), &["at byte", "1 more bytes"]);
@@ -453,8 +453,8 @@ fn colmap_binary_with_hostile_fields() {
     };
     let trillion = 1_000_000_000_000u64.to_le_bytes();
     let nan = f64::NAN.to_le_bytes();
-    // Offsets by the layouts in src/io/colmap/binary.rs; a picture's name here has seven
-    // letters and its end.
+    // Offsets follow the layouts in src/io/colmap/binary.rs. The name of a picture has seven
+    // letters and a terminator here.
     let observations = 8 + 4 + 56 + 4 + 8;
     let cases: Vec<(&str, usize, Vec<u8>, &[&str])> = vec![
         ("10^12 cameras", 0, put(0, 0, &trillion), &["at byte 0", "cameras", "1000000000000"]),
@@ -476,14 +476,14 @@ fn colmap_binary_with_hostile_fields() {
         ("NaN position", 2, put(2, 16, &nan), &["at byte 8", "finite position"]),
         ("10^12 track", 2, put(2, 8 + 8 + 24 + 3 + 8, &trillion), &["at byte 51", "track"]),
     ];
-    for (what, file, bytes, words) in cases {
-        check(what, BINARY[file].1(&bytes), words);
+    for (case, file, bytes, words) in cases {
+        check(case, BINARY[file].1(&bytes), words);
     }
     let fov = put(0, 12, &7i32.to_le_bytes());
     let mut fov = fov[..32 + 40].to_vec();
     fov[..8].copy_from_slice(&1u64.to_le_bytes());
     check("FOV model", BINARY[0].1(&fov), &["SIMPLE_RADIAL", "got FOV"]);
-    // A camera that the cameras file does not have.
+    // A camera that is missing in the cameras file.
     let (folder, _) = made_up(3);
     let images = put(1, 68, &55u32.to_le_bytes());
     let model = folder.path().join("sparse/0");
@@ -523,14 +523,14 @@ fn bad_colmap_text() {
         ("short point", points("1 2 3"), &["x.txt:1", "position"]),
         ("NaN point", points("1 2 3 inf 0 0 0 0"), &["finite position"]),
     ];
-    for (what, result, words) in cases {
-        check(what, result, words);
+    for (case, result, words) in cases {
+        check(case, result, words);
     }
     let bytes = b"# a\n# b\n1 PINHOLE \xff";
     check("not UTF-8", parse_cameras_txt(path, bytes).map(|_| ()), &["x.txt:3", "UTF-8"]);
 }
 
-/// Numbers for the mutations; SplitMix64.
+/// Random numbers for the mutations; SplitMix64.
 struct Random(u64);
 
 impl Random {
@@ -542,8 +542,8 @@ impl Random {
         ((z ^ (z >> 31)) % n as u64) as usize
     }
 
-    /// One to four changes: a flipped bit, another byte, eight bytes of ones, a piece
-    /// cut out, a piece doubled.
+    /// Applies one to four changes: a flipped bit, another byte, a run of ones, a removed piece, a
+    /// repeated piece.
     fn mutate(&mut self, bytes: &[u8]) -> Vec<u8> {
         let mut out = bytes.to_vec();
         for _ in 0..=self.below(4) {
@@ -568,7 +568,7 @@ impl Random {
 }
 
 #[test]
-fn mutated_parsers_answer_or_refuse() {
+fn parsers_accept_or_refuse_mutated_files() {
     let (_folder, cameras) = made_up(3);
     let mut random = Random(1);
     let (mut refused, mut accepted) = (0, 0);
@@ -587,12 +587,12 @@ fn mutated_parsers_answer_or_refuse() {
         count(parse_points_txt(path, &random.mutate(text[2].as_bytes())).is_ok());
         count(re10k::parse(path, &random.mutate(RE10K.as_bytes()), &mut Vec::new()).is_ok());
     }
-    // Both happen, or the mutations are not worth the name.
+    // The mutations must cause both outcomes.
     assert!(refused > 10_000 && accepted > 10_000, "{refused} {accepted}");
 }
 
 #[test]
-fn mutated_scenes_answer_or_refuse() {
+fn mutated_scenes_are_accepted_or_refused() {
     let (folder, cameras) = made_up(2);
     let mut random = Random(2);
     let files = colmap_files::binary(&cameras);
@@ -637,7 +637,7 @@ fn mutated_scenes_answer_or_refuse() {
             let _ = load_index(&path);
         }
     }
-    // Pictures too: the decoders are others' code, but the limits are ours.
+    // Pictures too: the decoders are external, but the size limits belong to this crate.
     let picture = folder.path().join("images/000.png");
     let bytes = std::fs::read(&picture).unwrap();
     for _ in 0..200 {

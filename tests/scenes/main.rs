@@ -1,4 +1,4 @@
-//! Scenes: pose formats, pictures, the check of poses, navigation.
+//! Tests of scenes: pose formats, pictures, the check of poses, navigation.
 
 mod check;
 mod check_rendered;

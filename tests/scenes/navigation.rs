@@ -1,5 +1,5 @@
-//! The camera that is moved by hand: what goes with the cursor, what stays, and that no
-//! input makes it anything but a camera.
+//! Tests of the interactive camera: motion under the cursor, invariants, and validity for any
+//! input.
 
 use glam::{Mat4, Quat, Vec2, Vec3};
 use std::f32::consts::PI;
@@ -10,7 +10,7 @@ const UP: Vec3 = Vec3::NEG_Y;
 
 fn home() -> Camera {
     let k = Intrinsics { fx: 500.0, fy: 520.0, cx: 330.0, cy: 235.0, width: 640, height: 480 };
-    // Looks down a little, without roll: x stays at right angles to up.
+    // Pitched down slightly, without roll: x remains perpendicular to up.
     let turn = Quat::from_rotation_y(0.4) * Quat::from_rotation_x(-0.2);
     Camera::new(k, Mat4::from_rotation_translation(turn, Vec3::new(1.0, -2.0, 3.0))).unwrap()
 }
@@ -19,12 +19,12 @@ fn start() -> Start {
     Start { home: home(), up: UP, distance: 5.0, radius: 2.0 }
 }
 
-/// Where the navigator's camera sees a point of the world, px.
-fn seen(n: &Navigator, world: Vec3) -> Vec2 {
+/// Projects a world point into the navigator's camera, px.
+fn projected(n: &Navigator, world: Vec3) -> Vec2 {
     n.camera().project(world).unwrap()
 }
 
-/// A point on home's optical axis.
+/// Returns a point on the optical axis of the home camera.
 fn on_axis(depth: f32) -> Vec3 {
     home().world_from_camera.transform_point3(Vec3::new(0.0, 0.0, depth))
 }
@@ -34,7 +34,7 @@ fn close(a: Vec3, b: Vec3) -> bool {
 }
 
 #[test]
-fn at_home_it_is_the_first_camera() {
+fn at_home_the_camera_is_the_first_camera() {
     let n = Navigator::new(start());
     let (got, want) = (n.camera(), home());
     assert_eq!(got.intrinsics, want.intrinsics);
@@ -49,18 +49,18 @@ fn at_home_it_is_the_first_camera() {
 }
 
 #[test]
-fn orbit_turns_around_the_pivot_and_keeps_the_horizon() {
+fn orbit_rotates_around_the_pivot_and_keeps_the_horizon() {
     let mut n = Navigator::new(start());
     let pivot = n.pivot();
     for px in [Vec2::new(37.0, -20.0), Vec2::new(-260.0, 41.0), Vec2::new(5.0, 90.0)] {
         n.rotate(px);
         let c = n.camera();
         let k = c.intrinsics;
-        assert!((seen(&n, pivot) - Vec2::new(k.cx, k.cy)).length() < 0.01);
+        assert!((projected(&n, pivot) - Vec2::new(k.cx, k.cy)).length() < 0.01);
         assert!((c.position().distance(pivot) - 5.0).abs() < 1e-4);
         assert!(c.rotation().x_axis.dot(UP).abs() < 1e-5, "roll");
     }
-    // The whole height of the picture is half a turn.
+    // A drag over the height of the picture rotates by 180°.
     let mut n = Navigator::new(start());
     n.rotate(Vec2::new(480.0, 0.0));
     let (from, to) = (home().position() - pivot, n.camera().position() - pivot);
@@ -69,24 +69,24 @@ fn orbit_turns_around_the_pivot_and_keeps_the_horizon() {
 }
 
 #[test]
-fn what_lies_near_goes_with_the_cursor_and_a_look_does_too() {
+fn near_points_follow_the_cursor_in_orbit_and_the_view_in_flight() {
     let (near, far) = (on_axis(3.0), on_axis(9.0));
     for (px, axis) in [(Vec2::new(20.0, 0.0), Vec2::X), (Vec2::new(0.0, 20.0), Vec2::Y)] {
         let mut n = Navigator::new(start());
-        let before = seen(&n, near);
+        let before = projected(&n, near);
         n.rotate(px);
-        assert!((seen(&n, near) - before).dot(axis) > 3.0, "orbit, {px}");
-        assert!((seen(&n, far) - before).dot(axis) < -3.0, "orbit, {px}");
+        assert!((projected(&n, near) - before).dot(axis) > 3.0, "orbit, {px}");
+        assert!((projected(&n, far) - before).dot(axis) < -3.0, "orbit, {px}");
         let mut n = Navigator::new(start());
         n.toggle();
         n.rotate(px);
-        assert!((seen(&n, near) - before).dot(axis) < -3.0, "fly, {px}");
+        assert!((projected(&n, near) - before).dot(axis) < -3.0, "fly, {px}");
         assert!(close(n.camera().position(), home().position()));
     }
 }
 
 #[test]
-fn nobody_is_turned_upside_down() {
+fn the_camera_is_never_upside_down() {
     for mode in [Mode::Orbit, Mode::Fly] {
         for sign in [1.0, -1.0] {
             let mut n = Navigator::new(start());
@@ -100,13 +100,13 @@ fn nobody_is_turned_upside_down() {
             assert!(r.y_axis.dot(UP) < 0.0, "head up");
             let elevation = r.z_axis.dot(UP).asin();
             assert!((elevation + sign * 89.0 * PI / 180.0).abs() < 0.01, "{elevation}");
-            // And there is a way back.
+            // The limit is reversible.
             n.rotate(Vec2::new(0.0, -sign * 240.0));
             let elevation = n.camera().rotation().z_axis.dot(UP).asin();
             assert!((elevation - sign * 1.0 * PI / 180.0).abs() < 0.01, "{elevation}");
         }
     }
-    // A home that looks down more steeply than that stays as it is.
+    // A home camera pitched beyond the limit is unchanged.
     let down = Mat4::from_rotation_translation(Quat::from_rotation_x(-0.5 * PI), Vec3::ZERO);
     let mut n =
         Navigator::new(Start { home: Camera { world_from_camera: down, ..home() }, ..start() });
@@ -117,19 +117,19 @@ fn nobody_is_turned_upside_down() {
 }
 
 #[test]
-fn a_pan_takes_what_is_as_far_as_the_pivot_along() {
+fn a_pan_moves_points_at_the_pivots_depth_with_the_cursor() {
     let mut n = Navigator::new(start());
     let (point, other) = (n.pivot() + 0.3 * home().rotation().x_axis, n.pivot());
     let px = Vec2::new(41.0, -17.0);
-    let (before, middle) = (seen(&n, point), seen(&n, other));
+    let (before, middle) = (projected(&n, point), projected(&n, other));
     n.pan(px);
-    assert!((seen(&n, point) - before - px).length() < 0.01);
-    assert!((seen(&n, other) - middle - px).length() < 0.01);
+    assert!((projected(&n, point) - before - px).length() < 0.01);
+    assert!((projected(&n, other) - middle - px).length() < 0.01);
     assert!(close(n.camera().rotation().z_axis, home().rotation().z_axis));
 }
 
 #[test]
-fn the_wheel_goes_to_the_pivot_and_never_through_it() {
+fn the_wheel_approaches_the_pivot_without_passing_it() {
     let mut n = Navigator::new(start());
     let pivot = n.pivot();
     n.wheel(1.0);
@@ -146,10 +146,10 @@ fn the_wheel_goes_to_the_pivot_and_never_through_it() {
 }
 
 #[test]
-fn flight_goes_by_time_and_not_by_frames() {
-    let fly = |n: &mut Navigator, along: [f32; 3], seconds: f32, pace| {
+fn flight_depends_on_time_and_not_on_frames() {
+    let fly = |n: &mut Navigator, along: [f32; 3], seconds: f32, fast| {
         let from = n.camera().position();
-        n.fly(along, seconds, pace);
+        n.fly(along, seconds, fast);
         n.camera().position() - from
     };
     let axes = home().rotation();
@@ -160,15 +160,12 @@ fn flight_goes_by_time_and_not_by_frames() {
     let twice = fly(&mut n, [0.0, 0.0, 1.0], 0.25, Pace::Normal)
         + fly(&mut n, [0.0, 0.0, 1.0], 0.25, Pace::Normal);
     assert!(close(twice, ahead));
-    assert!(close(fly(&mut n, [0.0, 0.0, -1.0], 0.5, Pace::Fast), -4.0 * ahead));
-    assert!(close(fly(&mut n, [1.0, 0.0, 0.0], 0.5, Pace::Normal), 0.4 * axes.x_axis));
-    assert!(close(fly(&mut n, [0.0, 1.0, 0.0], 0.5, Pace::Normal), 0.4 * UP));
-    assert!(
-        (fly(&mut n, [1.0, 0.0, 1.0], 0.5, Pace::Normal).length() - 0.4).abs() < 1e-5,
-        "aslant"
-    );
-    assert_eq!(fly(&mut n, [0.0; 3], 9.0, Pace::Fast), Vec3::ZERO);
-    // The wheel is the throttle, and home has the first speed again.
+    assert!(close(fly(&mut n, [0.0, 0.0, -1.0], 0.5, true), -4.0 * ahead));
+    assert!(close(fly(&mut n, [1.0, 0.0, 0.0], 0.5, false), 0.4 * axes.x_axis));
+    assert!(close(fly(&mut n, [0.0, 1.0, 0.0], 0.5, false), 0.4 * UP));
+    assert!((fly(&mut n, [1.0, 0.0, 1.0], 0.5, false).length() - 0.4).abs() < 1e-5, "aslant");
+    assert_eq!(fly(&mut n, [0.0; 3], 9.0, true), Vec3::ZERO);
+    // The wheel changes the speed, and home restores the initial speed.
     n.toggle();
     let eye = n.camera().position();
     n.wheel(2.0);
@@ -180,7 +177,7 @@ fn flight_goes_by_time_and_not_by_frames() {
 }
 
 #[test]
-fn the_mode_changes_without_a_jump_and_home_is_home() {
+fn the_mode_changes_without_a_jump_and_reset_restores_home() {
     let mut n = Navigator::new(start());
     n.rotate(Vec2::new(50.0, 30.0));
     n.wheel(3.0);
@@ -199,7 +196,7 @@ fn the_mode_changes_without_a_jump_and_home_is_home() {
 }
 
 #[test]
-fn a_window_of_any_shape_shows_all_of_the_picture() {
+fn a_window_of_any_shape_contains_the_whole_picture() {
     let k = home().intrinsics;
     let corners = [(0.0, 0.0), (640.0, 0.0), (0.0, 480.0), (640.0, 480.0)];
     for (width, height) in [(640, 480), (1920, 480), (300, 1000), (64, 48), (1, 1)] {
@@ -217,7 +214,7 @@ fn a_window_of_any_shape_shows_all_of_the_picture() {
             assert!(at.y > -1e-3 * h && at.y < 1.001 * h, "{width}x{height}: {at}");
             touched |= at.x.abs() < 1e-3 * w || at.y.abs() < 1e-3 * h;
         }
-        assert!(touched, "{width}x{height}: smaller than it could be");
+        assert!(touched, "{width}x{height}: smaller than necessary");
         // A minimised window has no pixels.
         n.resize(0, 7);
         assert_eq!(n.camera(), c);
@@ -226,7 +223,7 @@ fn a_window_of_any_shape_shows_all_of_the_picture() {
 }
 
 #[test]
-fn bounds_leave_strays_out_and_fit_the_view() {
+fn bounds_exclude_outliers_and_fit_the_view() {
     let mut points: Vec<[f32; 3]> = (0..1000)
         .map(|i| {
             let t = i as f32 / 999.0;
@@ -260,8 +257,8 @@ fn bounds_leave_strays_out_and_fit_the_view() {
 }
 
 #[test]
-fn up_is_what_the_cameras_agree_on() {
-    // Both look down by 0.3, from opposite sides: what is left is the vertical.
+fn up_is_the_common_vertical_of_the_cameras() {
+    // Both are pitched down by 0.3 from opposite sides; their mean is the vertical.
     let camera = |about: f32| {
         let turn = Quat::from_rotation_y(about) * Quat::from_rotation_x(-0.3);
         Camera { world_from_camera: Mat4::from_quat(turn), ..home() }
@@ -273,7 +270,7 @@ fn up_is_what_the_cameras_agree_on() {
 }
 
 #[test]
-fn no_input_makes_it_anything_but_a_camera() {
+fn any_input_gives_a_valid_camera() {
     for (up, distance, radius) in [
         (Vec3::ZERO, f32::NAN, f32::NAN),
         (Vec3::NAN, -1.0, 0.0),
@@ -288,7 +285,7 @@ fn no_input_makes_it_anything_but_a_camera() {
         assert!(Camera::new(c.intrinsics, c.world_from_camera).is_ok(), "{up} {distance} {radius}");
         assert!((c.rotation().transpose() * c.rotation()).abs_diff_eq(glam::Mat3::IDENTITY, 1e-5));
     }
-    // Long use: still rigid, and still without roll.
+    // After many inputs the pose is still rigid and without roll.
     let mut n = Navigator::new(start());
     let mut seed = 1u32;
     let mut draw = || {

@@ -1,4 +1,4 @@
-//! Pictures are resampled as Pillow does, bit for bit.
+//! Tests that pictures are resampled as by Pillow, bit for bit.
 
 use subsplat_test_support::noise;
 
@@ -6,7 +6,7 @@ use noise::noise;
 use subsplat::io::resize::{Filter, resize};
 
 #[test]
-fn resampling_is_pillows() {
+fn resampling_equals_pillow() {
     let size = |s: &str| -> (usize, usize) {
         let (w, h) = s.split_once('x').unwrap();
         (w.parse().unwrap(), h.parse().unwrap())

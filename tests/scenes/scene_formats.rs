@@ -1,4 +1,4 @@
-//! Every pose format, from files that the test writes.
+//! Tests of every pose format, on files that the tests write.
 
 use subsplat_test_support::colmap_files;
 use subsplat_test_support::made_up;
@@ -17,7 +17,7 @@ use subsplat::io::scene::{Scene, SceneFormat, Units, load_scene};
 use subsplat::io::undistort::Distortion;
 
 #[test]
-fn cameras_json_reads_back_what_was_written() {
+fn cameras_json_round_trips() {
     let (folder, mut cameras) = made_up(5);
     cameras[3].depth = Some("depth/003.png".to_owned());
     for units in [Units::Unknown, Units::Metres, Units::RealEstate10k] {
@@ -36,10 +36,10 @@ fn cameras_json_reads_back_what_was_written() {
     }
 }
 
-/// Cameras alone and the scene with its pictures are the same, where the file's rotations
-/// have few digits too.
+/// A camera list and the scene with its pictures are equal, also where the rotations in the file
+/// have few digits.
 #[test]
-fn a_camera_list_is_straightened_as_a_scene_is() {
+fn a_camera_list_is_orthonormalised_as_a_scene_is() {
     let (folder, cameras) = made_up(2);
     let path = folder.path().join("cameras.json");
     let content = CameraFile { cameras, units: Units::Unknown, near_far: None };
@@ -103,10 +103,10 @@ fn check_colmap(scene: &Scene, cameras: &[NamedCamera]) {
 }
 
 #[test]
-fn colmap_binary_and_text_agree_wherever_the_model_lies() {
-    for place in ["sparse/0", "sparse", "colmap/sparse/0", "."] {
+fn colmap_binary_and_text_agree_in_every_folder() {
+    for subfolder in ["sparse/0", "sparse", "colmap/sparse/0", "."] {
         let (folder, cameras) = made_up(4);
-        let model = folder.path().join(place);
+        let model = folder.path().join(subfolder);
         let files = colmap_files::binary(&cameras);
         colmap_files::write(&model, "bin", [&files[0], &files[1], &files[2]]);
         // COLMAP 4's extra files.
@@ -117,7 +117,7 @@ fn colmap_binary_and_text_agree_wherever_the_model_lies() {
         assert_eq!(load_scene(&model.join("images.bin")).unwrap().name, name);
 
         let (folder, cameras) = made_up(4);
-        let model = folder.path().join(place);
+        let model = folder.path().join(subfolder);
         let files = colmap_files::text(&cameras);
         let files = [files[0].as_bytes(), files[1].as_bytes(), files[2].as_bytes()];
         colmap_files::write(&model, "txt", files);
@@ -157,14 +157,14 @@ fn colmap_points_give_the_depth_range() {
     let files = colmap_files::binary(&cameras);
     colmap_files::write(&folder.path().join("sparse"), "bin", [&files[0], &files[1], &files[2]]);
     let mut scene = load_scene(folder.path()).unwrap();
-    // Replace pose and points: a wall at depths 2 to 4 in front of the camera.
+    // Other pose and points: a wall at depths 2 to 4 in front of the camera.
     scene.frames[0].camera.world_from_camera = Mat4::IDENTITY;
     scene.points = Some((0..101).map(|i| Vec3::new(0.0, 0.0, 2.0 + 0.02 * i as f32)).collect());
     let range = depth_range(&scene, &[0], (None, None)).unwrap();
     assert!((range.near - 2.04 / 1.5).abs() < 1e-4 && (range.far - 2.0 * 3.96).abs() < 1e-4);
     assert!(range.reason.contains("101"), "{}", range.reason);
-    let given = depth_range(&scene, &[0], (Some(0.5), None)).unwrap();
-    assert_eq!((given.near, given.far), (0.5, range.far));
+    let fixed_near = depth_range(&scene, &[0], (Some(0.5), None)).unwrap();
+    assert_eq!((fixed_near.near, fixed_near.far), (0.5, range.far));
     assert!(depth_range(&scene, &[0], (Some(50.0), None)).is_err());
     assert!(depth_range(&scene, &[0], (Some(f32::NAN), Some(2.0))).is_err());
     assert!(depth_range(&scene, &[7], (None, None)).is_err());
@@ -173,7 +173,7 @@ fn colmap_points_give_the_depth_range() {
 }
 
 #[test]
-fn transforms_json_in_its_many_forms() {
+fn transforms_json_variants_are_read() {
     let (folder, cameras) = made_up(3);
     let gl = |c: &Camera| {
         let m = c.world_from_camera * Mat4::from_diagonal(glam::Vec4::new(1.0, -1.0, -1.0, 1.0));
@@ -190,7 +190,7 @@ fn transforms_json_in_its_many_forms() {
         std::fs::write(folder.path().join("transforms.json"), json.to_string()).unwrap();
         load_scene(folder.path()).unwrap()
     };
-    // NeRF's blender scenes: an angle, no size, names without extension.
+    // NeRF's Blender scenes: a field of view, no size, names without extension.
     let bare = |f: &str| format!("./{}", f.trim_end_matches(".png"));
     let scene = load(serde_json::json!({"camera_angle_x": 0.8, "frames": frames(&bare)}));
     let f = 32.0 / (0.4f32).tan();
@@ -200,7 +200,7 @@ fn transforms_json_in_its_many_forms() {
         assert!((k.fx - f).abs() < 1e-4 && k.fy == k.fx && (k.cx, k.cy) == (32.0, 24.0), "{k:?}");
         assert_eq!(frame.name, c.file[7..].trim_end_matches(".png"));
     }
-    // Per-frame intrinsics win; Windows separators; a model; half-size pictures.
+    // Per-frame intrinsics have precedence; Windows separators; a camera model; half-size pictures.
     let mut with_own = frames(&|f: &str| f.replace('/', "\\"));
     with_own[1]["fl_x"] = 200.0.into();
     with_own[1]["cx"] = 60.0.into();
@@ -215,14 +215,14 @@ fn transforms_json_in_its_many_forms() {
         scene.frames[0].distortion,
         Distortion::Brown { k: [0.01, 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] }
     );
-    // PINHOLE, and a frame that is listed but not there.
+    // PINHOLE, and a listed frame without a picture.
     let mut list = frames(&str::to_owned);
     list[2]["file_path"] = "images/nowhere.png".into();
     let scene = load(serde_json::json!({"camera_model": "PINHOLE", "fl_x": 70, "frames": list}));
     assert_eq!(scene.frames.len(), 2);
     assert_eq!(scene.warnings.len(), 1);
     assert!(scene.warnings[0].contains("images/nowhere.png"));
-    // Fisheye by both spellings.
+    // Both spellings of fisheye.
     for (key, value) in
         [("camera_model", serde_json::json!("OPENCV_FISHEYE")), ("is_fisheye", true.into())]
     {
@@ -269,7 +269,7 @@ fn precedence_of_pose_files() {
     )
     .unwrap();
     assert_eq!(source(), SceneFormat::CamerasJson);
-    // All five say the same, and any can be asked for by name.
+    // All five formats agree, and each can be selected by its file.
     let reference = load_scene(folder.path()).unwrap();
     for (file, format) in [
         ("transforms.json", SceneFormat::Transforms),
@@ -286,7 +286,7 @@ fn precedence_of_pose_files() {
         }
     }
     assert_eq!(load_scene(&at("sparse/0")).unwrap().source, SceneFormat::Colmap);
-    // Matrices by any convention, from the same numbers.
+    // Other matrix conventions, from the same numbers.
     for (convention, want) in [
         (PoseConvention::WorldFromCameraOpenGl, cameras[0].camera.world_from_camera * gl),
         (PoseConvention::CameraFromWorldOpenCv, cameras[0].camera.camera_from_world()),
@@ -326,7 +326,7 @@ fn re10k_frames_are_matched_by_time_order_or_number() {
     put(&["01.png", "02.png"]);
     let scene = load_scene(folder.path()).unwrap();
     assert_eq!(x(&scene), [1.0, 2.0]);
-    // Intrinsics are those of the stored size.
+    // The intrinsics refer to the stored size.
     let k = scene.frames[0].camera.intrinsics;
     assert_eq!((k.fx, k.fy, k.cx, k.cy), (12.0, 12.0, 6.0, 4.0));
     put(&["p.png", "q.png"]);
@@ -334,9 +334,9 @@ fn re10k_frames_are_matched_by_time_order_or_number() {
     assert!(e.contains("4 pictures"), "{e}");
 }
 
-/// Ten pictures and more without leading zeros: `10.png` is not the third of them.
+/// Ten or more pictures without leading zeros: `10.png` is not the third.
 #[test]
-fn names_are_sorted_as_people_count() {
+fn names_are_sorted_by_their_numbers() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let line = |i: usize| format!("{} 1 1.5 .5 .5 0 0 1 0 0 {i} 0 1 0 0 0 0 1 0", 1000 * i + 500);
@@ -364,7 +364,7 @@ fn names_are_sorted_as_people_count() {
             }
         }
     }
-    // Fewer pictures than lines, the first of which is a time stamp too: still indices.
+    // Fewer pictures than lines, and the first name is also a time stamp: names are still indices.
     let text = format!("url://x\n{}\n", lines.join("\n")).replace("\n500 ", "\n0 ");
     std::fs::write(at("a.txt"), text).unwrap();
     std::fs::remove_dir_all(at("images")).unwrap();

@@ -1,5 +1,5 @@
-//! Posed photographs: every format of the same folder agrees, the protocol's numbers
-//! come out, and pictures are resampled as Pillow does.
+//! Tests on photographs: all formats of one folder agree, the protocols' numbers are reproduced,
+//! and MVSplat's crop is exact.
 
 use subsplat_test_support as common;
 
@@ -27,7 +27,8 @@ const SCENES: [&str; 9] = [
     "re10k_5aca87f95a9412c6",
 ];
 
-/// Largest difference of two scenes' cameras: focal and centre in px, pose entries.
+/// Returns the largest differences of two scenes' cameras: focal length and centre in px, pose
+/// entries.
 fn difference(a: &Scene, b: &Scene) -> (f32, f32) {
     assert_eq!(a.frames.len(), b.frames.len());
     let mut worst = (0.0f32, 0.0f32);
@@ -103,7 +104,7 @@ fn formats_of_one_folder_agree() {
 }
 
 #[test]
-fn protocol_intrinsics_are_the_exact_rule() {
+fn protocol_intrinsics_follow_the_exact_rule() {
     let Some(photos) = shared("photos") else { return };
     for name in SCENES {
         let folder = photos.join(name);
@@ -123,7 +124,7 @@ fn protocol_intrinsics_are_the_exact_rule() {
 }
 
 #[test]
-fn protocol_geometry_is_ours() {
+fn protocol_geometry_is_reproduced() {
     let Some(photos) = shared("photos") else { return };
     #[derive(serde::Deserialize)]
     struct Test {
@@ -188,51 +189,51 @@ fn evaluation_indexes_have_the_published_counts() {
 }
 
 #[test]
-fn distorted_fox_is_straightened() {
+fn the_distortion_of_the_fox_is_removed() {
     let Some(fox) = shared("photos/fox") else { return };
-    // This file lists all 67 frames of the source, 20 of which are here, with the lens
-    // of the unprocessed photographs.
-    let bent = load_scene(&fox.join("transforms_original_distorted_1080x1920.json")).unwrap();
-    let straight = load_scene(&fox).unwrap();
-    assert_eq!(bent.frames.len(), straight.frames.len());
-    assert!(bent.warnings.iter().any(|w| w.contains("of 67 frames have no picture")));
-    assert_eq!(difference(&bent, &straight).1, 0.0);
-    let frame = &bent.frames[0];
+    // This file lists all 67 frames of the source, 20 of which are stored, with the lens of the
+    // unprocessed photographs.
+    let distorted = load_scene(&fox.join("transforms_original_distorted_1080x1920.json")).unwrap();
+    let undistorted = load_scene(&fox).unwrap();
+    assert_eq!(distorted.frames.len(), undistorted.frames.len());
+    assert!(distorted.warnings.iter().any(|w| w.contains("of 67 frames have no picture")));
+    assert_eq!(difference(&distorted, &undistorted).1, 0.0);
+    let frame = &distorted.frames[0];
     let Distortion::Brown { k, p } = frame.distortion else { panic!("{:?}", frame.distortion) };
     assert_eq!((k[0], k[1], p), (0.0578421, -0.0805099, [-0.000980296, 0.00015575]));
 
-    // The stored pictures are straight already; their distorted originals are not here.
-    // So bend a stored picture with this lens, straighten it again, and compare.
+    // The stored pictures have no distortion, and their distorted originals are not stored. The
+    // test distorts a stored picture with this lens, removes the distortion again, and compares.
     let lens = &frame.distortion;
     let photo = image::load(&frame.image).unwrap();
     let k = frame.camera.intrinsics;
-    let bend = Bend { lens, k };
-    let bent_photo = bend.apply(&photo);
+    let distorter = Distorter { lens, k };
+    let distorted_photo = distorter.apply(&photo);
     let new = frame.pinhole().unwrap().intrinsics;
     assert!(new.fx / k.fx > 0.95 && new.fx / k.fx < 1.05, "{new:?}");
-    let back = undistort(&bent_photo, &k, lens, &k);
-    let untouched = psnr_inside(&bent_photo, &photo, 60);
+    let back = undistort(&distorted_photo, &k, lens, &k);
+    let untouched = psnr_inside(&distorted_photo, &photo, 60);
     let restored = psnr_inside(&back, &photo, 60);
-    eprintln!("fox: bent {untouched:.1} dB, straightened {restored:.1} dB");
+    eprintln!("fox: distorted {untouched:.1} dB, undistorted {restored:.1} dB");
     assert!(restored > 33.0 && untouched < restored - 8.0, "{untouched} {restored}");
 }
 
-/// A picture as the lens would have shown it: the inverse of the straightening, by
-/// iteration and bilinear sampling.
-struct Bend<'a> {
+/// Applies a lens to a picture: the inverse of `undistort`, by iteration and bilinear sampling.
+struct Distorter<'a> {
     lens: &'a Distortion,
     k: Intrinsics,
 }
 
-impl Bend<'_> {
+impl Distorter<'_> {
     fn apply(&self, photo: &Rgb) -> Rgb {
         let mut out = Rgb::black(photo.width, photo.height);
         for y in 0..photo.height {
             for x in 0..photo.width {
-                let seen = self.k.unproject(Vec2::new(x as f32 + 0.5, y as f32 + 0.5)).truncate();
-                let mut ray = seen;
+                let distorted =
+                    self.k.unproject(Vec2::new(x as f32 + 0.5, y as f32 + 0.5)).truncate();
+                let mut ray = distorted;
                 for _ in 0..8 {
-                    ray += seen - self.lens.distort(ray);
+                    ray += distorted - self.lens.distort(ray);
                 }
                 let px = self.k.project(ray.extend(1.0)) - 0.5;
                 let p = 3 * (y * photo.width + x);
@@ -274,7 +275,7 @@ fn psnr_inside(a: &Rgb, b: &Rgb, border: usize) -> f64 {
 }
 
 #[test]
-fn mvsplat_rule_on_real_estate_is_its_published_crop() {
+fn mvsplat_rule_on_real_estate_gives_its_published_crop() {
     let Some(photos) = shared("photos") else { return };
     let scene = load_scene(&photos.join("re10k_0bf152ef84195293")).unwrap();
     let (picture, camera) = scene.frames[0].load().unwrap();
@@ -287,10 +288,10 @@ fn mvsplat_rule_on_real_estate_is_its_published_crop() {
     assert_eq!((cx, cy), (0.5, 0.5));
 }
 
-/// The tensors that MVSplat's own loader and crop shim give for a made-up scene, from
-/// pictures that the file holds decoded: the crop is the same to the last bit.
+/// The crop equals the tensors of MVSplat's loader and crop shim for a synthetic scene, to the last
+/// bit. The file holds the decoded pictures.
 #[test]
-fn the_crop_shim_gives_mvsplats_tensors() {
+fn the_mvsplat_crop_equals_the_crop_shim() {
     let Some(path) = shared("golden/re10k_synth_expected.safetensors") else { return };
     let bytes = std::fs::read(path).unwrap();
     let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();

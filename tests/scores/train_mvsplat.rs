@@ -1,5 +1,5 @@
-//! The paper's own training, as small as it goes: MVSplat's backbone from GMDepth's
-//! tensors, SubSplat's heads from nothing, L2 and LPIPS, OneCycle.
+//! Tests MVSplat's training recipe at its smallest size: the backbone from GMDepth's tensors,
+//! random heads, L2 and LPIPS, OneCycle.
 
 use candle_core::Tensor;
 use candle_nn::init::DEFAULT_KAIMING_NORMAL;
@@ -12,7 +12,7 @@ use subsplat::model::weights::{Weights, save};
 use subsplat::train::TrainConfig;
 use subsplat::train::run::Training;
 
-/// Two views of 64² (the least that the transformer's windows allow), a target of 128².
+/// Two views of 64² (the smallest size that the transformer's windows allow), a target of 128².
 const PAPER: &str = r#"
 phase = "render"
 seed = 5
@@ -53,8 +53,11 @@ rate = 2e-4
 warmup = 2
 "#;
 
-/// Tensors drawn from `seed`.
-fn drawn(seed: u64, names: impl Iterator<Item = (String, Vec<usize>)>) -> BTreeMap<String, Tensor> {
+/// Returns random tensors from `seed`.
+fn random_tensors(
+    seed: u64,
+    names: impl Iterator<Item = (String, Vec<usize>)>,
+) -> BTreeMap<String, Tensor> {
     let weights = Weights::seeded(seed);
     let builder = weights.builder();
     names
@@ -65,11 +68,11 @@ fn drawn(seed: u64, names: impl Iterator<Item = (String, Vec<usize>)>) -> BTreeM
         .collect()
 }
 
-/// Writes both weight files into `folder`; returns what GMDepth's holds.
+/// Writes both weight files into `folder` and returns the tensors of GMDepth's file.
 fn weights(folder: &Path) -> BTreeMap<String, Tensor> {
     let config = Config::re10k(Preset::Paper, 2);
     let shapes = expected(Kind::Gmdepth, &config).unwrap();
-    let start = drawn(77, shapes.into_iter());
+    let start = random_tensors(77, shapes.into_iter());
     save(&folder.join("gmdepth.safetensors"), &start, &config).unwrap();
     let vgg = Weights::seeded(9).trainable();
     Lpips::new(vgg.builder()).unwrap();
@@ -88,7 +91,7 @@ fn bits(t: &Tensor) -> Vec<u32> {
     t.flatten_all().unwrap().to_vec1::<f32>().unwrap().into_iter().map(f32::to_bits).collect()
 }
 
-/// Parameters by name, as the optimizer keeps them.
+/// Returns the parameters by name, as the optimizer stores them.
 fn parameters(training: &Training) -> BTreeMap<String, Vec<u32>> {
     let state = training.optimizer().state().unwrap();
     state.iter().map(|(name, t)| (name.clone(), bits(t))).collect()
@@ -113,7 +116,7 @@ fn mvsplat_learns_from_gmdepth_with_lpips() {
     let loss = first.mse + 0.05 * first.lpips;
     assert!((first.loss / loss - 1.0).abs() < 1e-4, "{first:?}");
     assert!(steps[5].terms.loss < first.loss, "{:?}", steps[5].terms);
-    // Every part learns, the file's tensors too.
+    // Every part changes, the tensors of the file included.
     let after = parameters(&training);
     for part in ["backbone.backbone.", "backbone.transformer.", "depth_predictor.", "subsplat."] {
         let own = before.iter().filter(|(name, _)| name.contains(part));

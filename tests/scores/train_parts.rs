@@ -1,6 +1,5 @@
-//! Parts of training, each against its formula: losses by finite differences, the
-//! optimizer and the schedule against other writings of them, sources and augmentation
-//! by what must stay true.
+//! Tests of the parts of training: losses by finite differences, optimizer and schedule against
+//! independent implementations, sources and augmentation by their invariants.
 
 use subsplat_test_support as common;
 
@@ -12,13 +11,13 @@ use subsplat::data::dataset::Posed;
 use subsplat::data::procedural::{ExampleSpec, TargetSpec};
 use subsplat::io::image::Rgb;
 use subsplat::metrics;
-use subsplat::train::loading::Loader;
+use subsplat::train::loading::{Loader, LoaderOptions};
 use subsplat::train::loss::{self, Scored, with_gradient};
 use subsplat::train::optimizer::{Optimizer, Settings};
 use subsplat::train::schedule::{NamedWarmup, Schedule, Warmup};
 use subsplat::train::source::{Augmentation, Example, Replay, Rooms, Source};
 
-/// In [0, 1), the same every time.
+/// Returns reproducible numbers in [0, 1).
 fn noise(n: usize, seed: u32) -> Vec<f32> {
     let mut s = seed.wrapping_mul(747_796_405).wrapping_add(1);
     let mut next = || {
@@ -28,7 +27,7 @@ fn noise(n: usize, seed: u32) -> Vec<f32> {
     (0..n).map(|_| next()).collect()
 }
 
-/// The gradient of `f` at `x` against central differences of its value, which is f64.
+/// Compares the gradient of `f` at `x` with central differences of its value, which is f64.
 fn check_gradient(x: &[f32], h: f32, tolerance: f64, f: impl Fn(&[f32]) -> Scored) {
     let gradient = f(x).gradient;
     let largest = gradient.iter().fold(0f32, |a, g| a.max(g.abs()));
@@ -47,7 +46,7 @@ fn check_gradient(x: &[f32], h: f32, tolerance: f64, f: impl Fn(&[f32]) -> Score
 }
 
 #[test]
-fn mse_is_its_formula() {
+fn mse_follows_its_formula() {
     let (x, t) = (noise(300, 1), noise(300, 2));
     let want: f64 = x.iter().zip(&t).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>() / 300.0;
     assert!((loss::mse(&x, &t).value - want).abs() < 1e-9);
@@ -55,10 +54,10 @@ fn mse_is_its_formula() {
 }
 
 #[test]
-fn dssim_is_the_metric_and_has_its_gradient() {
+fn dssim_equals_the_metric_and_has_its_gradient() {
     let (w, h) = (23, 17);
     let (x, t) = (noise(3 * w * h, 3), noise(3 * w * h, 4));
-    // The truth and a disturbed truth: SSIM far from 0.
+    // A target and a perturbed copy: SSIM far from 0.
     let x: Vec<f32> = x.iter().zip(&t).map(|(x, t)| 0.3 * x + 0.7 * t).collect();
     let inner = |p: &[f32]| -> Vec<f32> {
         (0..w * h)
@@ -75,13 +74,13 @@ fn dssim_is_the_metric_and_has_its_gradient() {
 }
 
 #[test]
-fn cross_entropy_shares_by_distance() {
+fn cross_entropy_weights_candidates_by_distance() {
     let (d, n) = (7, 5);
     let logits: Vec<f32> = noise(2 * d * n, 5).iter().map(|v| 4.0 * v - 2.0).collect();
     let mut target: Vec<f32> = noise(2 * n, 6).iter().map(|v| v * (d - 1) as f32).collect();
     (target[1], target[2], target[3], target[8]) = (f32::NAN, 6.0, 0.0, 6.5);
     let found = loss::two_hot_cross_entropy(&logits, &target, [d, n]);
-    // Straight from the definition.
+    // The definition.
     let (mut sum, mut count) = (0.0, 0.0);
     for (i, t) in target.iter().enumerate() {
         if !(0.0..=6.0).contains(t) {
@@ -112,16 +111,18 @@ fn disparity_and_confidence_losses() {
     assert!((one.value - (0.125 + 2.5) / 2.0).abs() < 1e-9, "{}", one.value);
     let p: Vec<f32> = noise(60, 9).iter().map(|v| 0.1 + 0.8 * v).collect();
     check_gradient(&p, 1e-3, 1e-2, |p| loss::confidence(p, &x, &with_gaps));
-    // Least where the confidence is what it should be.
-    let wanted = (-1.0f32).exp();
+    // The minimum is at the target confidence.
+    let target_confidence = (-1.0f32).exp();
     let at = |p: f32| loss::confidence(&[p], &[1.5], &[0.0]);
-    assert!(at(wanted).gradient[0].abs() < 1e-5);
-    assert!(at(wanted).value < at(0.3).value && at(wanted).value < at(0.5).value);
+    assert!(at(target_confidence).gradient[0].abs() < 1e-5);
+    assert!(
+        at(target_confidence).value < at(0.3).value && at(target_confidence).value < at(0.5).value
+    );
 }
 
 #[test]
 fn candidates_and_blocks() {
-    // D = 5 between 1/4 and 1: index 0 is far.
+    // D = 5 between 1/4 and 1; index 0 is far.
     let inverse = [0.25, 1.0, 0.625, 0.0, 0.2, 0.1, 1.2];
     let index = loss::candidate_index(&inverse, (1.0, 4.0), 5);
     assert_eq!(index[..3], [0.0, 4.0, 2.0]);
@@ -135,7 +136,7 @@ fn candidates_and_blocks() {
 }
 
 #[test]
-fn a_given_gradient_reaches_the_variable() {
+fn a_precomputed_gradient_reaches_the_variable() {
     let x = Var::new(&[[1f32, 2.0], [3.0, 4.0]], &Device::Cpu).unwrap();
     let y = (x.as_tensor() * 3.0).unwrap();
     let scored = Scored { value: 7.5, gradient: vec![1.0, 2.0, 3.0, 4.0] };
@@ -166,7 +167,7 @@ fn one_cycle_equals_pytorch() {
     assert!(schedule.rate(1990, 300_000) < 2e-4 && schedule.rate(2010, 300_000) < 2e-4);
 }
 
-/// A loss of three variables, one of them a matrix.
+/// Returns a loss of two variables, one of them a matrix.
 fn quadratic(vars: &BTreeMap<String, Var>) -> Tensor {
     let term = |name: &str, to: f64| {
         ((vars[name].as_tensor() - to).unwrap().sqr().unwrap().sum_all().unwrap() * 0.5).unwrap()
@@ -185,9 +186,9 @@ fn variables() -> BTreeMap<String, Var> {
     ])
 }
 
-/// AdamW as its paper writes it, in f64.
+/// AdamW as in its paper, in f64.
 #[test]
-fn the_optimizer_is_adamw() {
+fn the_optimizer_follows_adamw() {
     let settings = Settings { clip: 3.0, average: 0.9, weight_decay: 0.1, ..Settings::default() };
     let vars = variables();
     let mut optimizer = Optimizer::new(settings, vars.clone()).unwrap();
@@ -226,12 +227,12 @@ fn the_optimizer_is_adamw() {
         assert!((f64::from(got[i]) - value[i]).abs() < 1e-5, "{i}: {} {}", got[i], value[i]);
         assert!((f64::from(got_average[i]) - average[i]).abs() < 1e-5);
     }
-    // No loss reached it: not even decayed.
+    // Without a gradient, not even the weight decay applies.
     assert_eq!(flat(&vars["small.unused"]), [5.0]);
 }
 
 #[test]
-fn a_frozen_backbone_stands_still_and_state_comes_back() {
+fn a_frozen_backbone_is_constant_and_the_state_is_restored() {
     let settings = Settings { freeze_backbone: true, ..Settings::default() };
     let vars = variables();
     let mut optimizer = Optimizer::new(settings, vars.clone()).unwrap();
@@ -275,7 +276,7 @@ fn rooms() -> Rooms {
 }
 
 #[test]
-fn rooms_are_a_number() {
+fn rooms_are_determined_by_their_seed() {
     let one = rooms().example(3).unwrap();
     assert_eq!(one, rooms().example(3).unwrap());
     assert_ne!(one, rooms().example(4).unwrap());
@@ -288,27 +289,27 @@ fn rooms_are_a_number() {
 }
 
 #[test]
-fn a_seen_range_is_a_little_wider_than_what_is_seen() {
+fn a_visible_range_is_slightly_wider_than_the_depths() {
     let all = Rooms { seen_range: 1.0, ..rooms() };
     for i in 0..6 {
-        let (own, seen) = (rooms().example(i).unwrap(), all.example(i).unwrap());
-        assert_eq!((&own.context, &own.inverse_depth), (&seen.context, &seen.inverse_depth));
+        let (own, visible) = (rooms().example(i).unwrap(), all.example(i).unwrap());
+        assert_eq!((&own.context, &own.inverse_depth), (&visible.context, &visible.inverse_depth));
         let mut depths: Vec<f32> =
-            seen.inverse_depth.iter().flatten().map(|d| d.to_f32().recip()).collect();
+            visible.inverse_depth.iter().flatten().map(|d| d.to_f32().recip()).collect();
         depths.sort_by(f32::total_cmp);
         let last = depths.len() - 1;
         let (low, high) = (depths[last / 100], depths[last - last / 100]);
-        let (near, far) = seen.near_far;
+        let (near, far) = visible.near_far;
         assert!((0.74 * low..=1.01 * low).contains(&near), "{near} {low}");
         assert!((0.99 * high..=1.41 * high).contains(&far), "{far} {high}");
-        assert_eq!(seen, all.example(i).unwrap());
+        assert_eq!(visible, all.example(i).unwrap());
     }
 }
 
 #[test]
-fn replay_shows_each_scene_so_often_and_no_other() {
+fn replay_repeats_each_scene_of_a_window_equally() {
     let replay = Replay::new(rooms(), 7, 3);
-    let places: Vec<u64> = (0..42).map(|i| replay.place(i)).collect();
+    let places: Vec<u64> = (0..42).map(|i| replay.source_index(i)).collect();
     for block in 0..2u64 {
         for pass in 0..3 {
             let start = (block * 21 + pass * 7) as usize;
@@ -318,15 +319,15 @@ fn replay_shows_each_scene_so_often_and_no_other() {
         }
     }
     assert_ne!(places[..7], places[7..14], "the same order again");
-    // A window and a number of times whose product no number holds.
-    assert!(Replay::new(rooms(), 1 << 32, 1 << 32).place(5) < 1 << 32);
+    // The product of this window and this number of repetitions overflows.
+    assert!(Replay::new(rooms(), 1 << 32, 1 << 32).source_index(5) < 1 << 32);
     assert_eq!(replay.example(9).unwrap(), rooms().example(places[9]).unwrap());
     assert_eq!(replay.example(9).unwrap(), replay.example(9).unwrap());
 }
 
-/// A point of the world, its picture and the mirror's must agree.
+/// A world point projects to mirrored positions in the picture and in its mirror image.
 #[test]
-fn the_mirror_keeps_the_geometry() {
+fn mirroring_keeps_the_geometry() {
     let k = Intrinsics { fx: 30.0, fy: 31.0, cx: 13.0, cy: 9.0, width: 32, height: 24 };
     let pose = glam::Mat4::from_rotation_translation(
         glam::Quat::from_euler(glam::EulerRot::YXZ, 0.3, -0.2, 0.1),
@@ -349,12 +350,12 @@ fn the_mirror_keeps_the_geometry() {
 }
 
 #[test]
-fn augmentation_is_a_function_of_the_place() {
+fn augmentation_is_a_function_of_the_position() {
     let example = rooms().example(0).unwrap();
     let all = Augmentation { flip: 0.5, permute: 0.5, swap: 0.5 };
-    let shown: Vec<Example> = (0..24).map(|i| all.apply(&example, 1, i)).collect();
-    assert_eq!(shown[5], all.apply(&example, 1, 5));
-    let different = shown.iter().filter(|e| **e != *example).count();
+    let augmented: Vec<Example> = (0..24).map(|i| all.apply(&example, 1, i)).collect();
+    assert_eq!(augmented[5], all.apply(&example, 1, 5));
+    let different = augmented.iter().filter(|e| **e != *example).count();
     assert!((12..24).contains(&different), "{different}");
     let off = Augmentation { flip: 0.0, permute: 0.0, swap: 0.0 };
     assert_eq!(off.apply(&example, 1, 5), *example);
@@ -370,7 +371,8 @@ fn augmentation_is_a_function_of_the_place() {
 fn loading_gives_the_sequence_for_any_number_of_threads() {
     let off = Augmentation { flip: 0.0, permute: 0.0, swap: 0.0 };
     for workers in [1, 3] {
-        let mut loader = Loader::start(Arc::new(rooms()), (off, 0), (workers, 4), 2).unwrap();
+        let options = LoaderOptions { augmentation: off, seed: 0, workers, ahead: 4 };
+        let mut loader = Loader::start(Arc::new(rooms()), options, 2).unwrap();
         for i in 2..8 {
             assert_eq!(loader.position(), i);
             assert_eq!(loader.take().unwrap(), *rooms().example(i).unwrap());

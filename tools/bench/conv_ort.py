@@ -1,10 +1,10 @@
-"""One convolution at a time in onnxruntime, for benches/conv.rs.
+"""Runs single convolutions in onnxruntime, for benches/conv.rs.
 
-Commands come as JSON lines, answers go back as JSON lines:
+Commands and answers are JSON lines on stdin and stdout:
   {"x": [path, dims], "w": …, "b": …, "y": …, "stride": s, "padding": p, "threads": n}
-      builds the graph and answers {"error": largest difference from y over its largest value}
-  {}  runs it for WARM_S and once more, and answers {"seconds": t} of that
-Files hold little-endian f32. Run it with the environment of tools/witness/setup.sh.
+      builds the graph and returns {"error": largest difference from y over its largest value}
+  {}  runs it for WARM_S and once more, and returns {"seconds": t} of the last run
+Files hold little-endian f32. Needs the environment of tools/witness/setup.sh.
 """
 
 import json
@@ -15,18 +15,20 @@ import numpy as np
 import onnxruntime as ort
 from onnx import TensorProto, helper, numpy_helper
 
-# Between runs: the threads of onnxruntime spin for a while after each.
+# Pause between runs, s: onnxruntime's threads spin for a while after each run.
 PAUSE_S = 0.02
-# Runs that do not count, as benches/common has them.
+# Duration of the warm-up, s, as in benches/common.
 WARM_S = 0.03
 
 
 def tensor(entry):
+    """Reads a tensor from its path and dimensions."""
     path, dims = entry
     return np.fromfile(path, dtype="<f4").reshape(dims)
 
 
 def build(command):
+    """Builds session, inputs and expected output of a command."""
     x, w, b = (tensor(command[name]) for name in "xwb")
     rank = w.ndim - 2
     node = helper.make_node(

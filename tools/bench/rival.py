@@ -1,17 +1,19 @@
-"""onnxruntime's side of `cargo bench --bench network -- --onnxruntime` (benches/network.rs calls this):
+"""Times onnxruntime for `cargo bench --bench network -- --onnxruntime` (benches/network.rs calls this
+script).
 
     python tools/bench/rival.py network SIDE FOLDER RUNS THREADS
     python tools/bench/rival.py ops FOLDER RUNS THREADS
 
-`network`: MVSplat's backbone of the released size for two SIDE x SIDE pictures, in f32, from the witness's modules with
-the operators that an exporter would write (LayerNormalization, InstanceNormalization) and weights as constants, so that
-onnxruntime may fold and pack them. Writes FOLDER/SIDE.safetensors: inputs, weights (w.NAME), outputs (out.NAME).
+`network`: MVSplat's backbone of the released size for two SIDE x SIDE pictures, in f32. The graph comes from
+the witness's modules, with the operators of an exporter (LayerNormalization, InstanceNormalization) and
+constant weights, so that onnxruntime may fold and pack them. Writes FOLDER/SIDE.safetensors: inputs, weights
+(w.NAME), outputs (out.NAME).
 
-`ops`: single operators on the inputs in FOLDER/ops.safetensors (NAME.INPUT); writes their results to
+`ops`: single operators on the inputs in FOLDER/ops.safetensors (NAME.INPUT). Writes their results to
 FOLDER/ops_out.safetensors.
 
-Prints one line of JSON: times of RUNS runs in seconds (of 50 where they are short) after two that are not counted, by
-name, and the process's peak memory in bytes. CPU provider, all optimisations."""
+Prints one line of JSON: by name, the times of RUNS runs in seconds (of 50 where they are short) after two
+warm-up runs, and the process's peak memory in bytes. CPU provider, all optimisations."""
 
 import json
 import pathlib
@@ -41,7 +43,7 @@ RELEASED = {"depth_candidates": 128, "costvolume_channels": 128, "costvolume_lev
 
 
 class Exported(G):
-    """Norms as single operators."""
+    """Graph builder with normalisations as single operators."""
 
     def instance_norm(self, x, eps=1e-5):
         c = x.shape[1]
@@ -51,26 +53,28 @@ class Exported(G):
         n, c = x.shape[:2]
         y = self.op("InstanceNormalization", [x.reshape(n, groups, -1), np.ones(groups), np.zeros(groups)],
                     (n, groups, int(np.prod(x.shape[1:])) // groups), epsilon=eps).reshape(x.shape)
-        row = lambda what: self.weight(f"{name}.{what}", (c,)).reshape((1, c) + (1,) * (len(x.shape) - 2))
+        row = lambda part: self.weight(f"{name}.{part}", (c,)).reshape((1, c) + (1,) * (len(x.shape) - 2))
         return y * row("weight") + row("bias")
 
     def layer_norm(self, x, name, eps=1e-5):
-        sides = [self.weight(f"{name}.{what}", (x.shape[-1],)) for what in ("weight", "bias")]
+        sides = [self.weight(f"{name}.{part}", (x.shape[-1],)) for part in ("weight", "bias")]
         return self.op("LayerNormalization", [x, *sides], x.shape, epsilon=eps)
 
 
 def session(model, threads):
+    """Creates an optimised session."""
     options = onnxruntime.SessionOptions()
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_ALL
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     return onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
 
 
-# Seconds below which more runs are timed than asked for, and how many.
+# A run shorter than QUICK seconds is repeated MANY times.
 QUICK, MANY = 0.02, 50
 
 
-def timed(run, runs):
+def time_runs(run, runs):
+    """Returns the result of a run and the seconds of `runs` further runs."""
     result = run()
     start = time.perf_counter()
     run()
@@ -85,17 +89,18 @@ def timed(run, runs):
 
 
 def network(side, folder, runs, threads):
+    """Times the backbone and writes its tensors."""
     case = Case(f"bench{side}", 0)
     g = case.g = Exported(case.name)
     geo = geometry(case, 2, side, side, near=1.2, far=60.0)
-    images = case.drawn("images", (2, 3, side, side), 0.0, 1.0)
+    images = case.random_input("images", (2, 3, side, side), 0.0, 1.0)
     half, quarter = cnn(g, images, (64, 96, 128))
     out = predict(g, images, quarter, transformer(g, quarter, 6), geo, RELEASED)
     names = ("raw", "disparity", "densities")
     for name in names:
         g.output(name, out[name])
     weights = {n: formula.weight(0, n, v.shape) for n, v in g.weights.items()}
-    feeds = dict(case.stored) | {n: formula.drawn(0, n, s, low, high) for n, s, low, high in case.specs}
+    feeds = dict(case.stored) | {n: formula.uniform_input(0, n, s, low, high) for n, s, low, high in case.specs}
     feeds = {n: a for n, a in feeds.items() if n in g.inputs}
     model = g.model()
     keep = [i for i in model.graph.input if i.name not in weights]
@@ -105,15 +110,15 @@ def network(side, folder, runs, threads):
     run = session(model, threads)
     used = {i.name for i in run.get_inputs()}
     feeds = {n: a for n, a in feeds.items() if n in used}
-    result, seconds = timed(lambda: run.run(list(names), feeds), runs)
+    result, seconds = time_runs(lambda: run.run(list(names), feeds), runs)
     tensors = {f"w.{n}": a for n, a in weights.items()} | {f"out.{n}": a for n, a in zip(names, result)}
-    tensors |= {"images": feeds["images"]} | case.asides
+    tensors |= {"images": feeds["images"]} | case.auxiliaries
     save_file({n: np.ascontiguousarray(a) for n, a in tensors.items()}, folder / f"{side}.safetensors")
     return {f"backbone{side}": seconds}
 
 
 def operators(inputs):
-    """{name: (graph, feeds)}; a name's first word is the operator."""
+    """Returns {name: (graph, feeds)}; the first word of a name is the operator."""
     cases = {}
     for key, array in inputs.items():
         name, which = key.rsplit(".", 1)
@@ -153,27 +158,28 @@ def operators(inputs):
         elif kind == "cat":
             y = g.concat([x, v["y"]], 1)
         else:
-            raise SystemExit(f"ops: no operator {kind}")
+            raise SystemExit(f"ops: unknown operator {kind}")
         g.output("out", y)
         made[name] = (g.model(), feeds)
     return made
 
 
 def ops(folder, runs, threads):
+    """Times the operators and writes their results."""
     results, seconds = {}, {}
     for name, (model, feeds) in operators(load_file(folder / "ops.safetensors")).items():
         run = session(model, threads)
-        result, seconds[name] = timed(lambda: run.run(["out"], feeds), runs)
+        result, seconds[name] = time_runs(lambda: run.run(["out"], feeds), runs)
         results[name] = result[0]
     save_file({n: np.ascontiguousarray(a) for n, a in results.items()}, folder / "ops_out.safetensors")
     return seconds
 
 
-def main(words):
-    if words[:1] == ["network"] and len(words) == 5:
-        seconds = network(int(words[1]), pathlib.Path(words[2]), int(words[3]), int(words[4]))
-    elif words[:1] == ["ops"] and len(words) == 4:
-        seconds = ops(pathlib.Path(words[1]), int(words[2]), int(words[3]))
+def main(arguments):
+    if arguments[:1] == ["network"] and len(arguments) == 5:
+        seconds = network(int(arguments[1]), pathlib.Path(arguments[2]), int(arguments[3]), int(arguments[4]))
+    elif arguments[:1] == ["ops"] and len(arguments) == 4:
+        seconds = ops(pathlib.Path(arguments[1]), int(arguments[2]), int(arguments[3]))
     else:
         raise SystemExit(__doc__)
     peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -1,4 +1,4 @@
-"""Loss and PSNR of trainings as one SVG, nothing but the standard library:
+"""Plots loss and PSNR of trainings as one SVG. Needs the standard library only.
 
     python3 tools/train/curves.py OUT.svg NAME=out/run/log.csv ...
 """
@@ -14,17 +14,19 @@ PANELS = (("loss", "loss"), ("psnr", "PSNR of the training views, dB"))
 
 
 def read(path):
+    """Reads step, loss and PSNR of a log."""
     with open(path, newline="") as file:
         return [{key: float(row[key]) for key in ("step", "loss", "psnr")} for row in csv.DictReader(file)]
 
 
 def smoothed(values, half=3):
-    """Means of up to 2 * half + 1 neighbours."""
+    """Returns means of up to 2 * half + 1 neighbours."""
     parts = (values[max(0, i - half) : i + half + 1] for i in range(len(values)))
     return [sum(part) / len(part) for part in parts]
 
 
 def panel(left, key, title, runs):
+    """Draws one quantity of all runs as SVG elements."""
     curves = {name: ([r["step"] for r in rows], smoothed([r[key] for r in rows])) for name, rows in runs.items()}
     last = max(max(steps) for steps, _ in curves.values())
     low = min(min(values) for _, values in curves.values())
@@ -43,10 +45,10 @@ def panel(left, key, title, runs):
     return out
 
 
-def main(words):
-    if len(words) < 2 or len(words) > 1 + len(COLOURS) or not all("=" in word for word in words[1:]):
+def main(arguments):
+    if len(arguments) < 2 or len(arguments) > 1 + len(COLOURS) or not all("=" in argument for argument in arguments[1:]):
         raise SystemExit(__doc__)
-    runs = {name: read(path) for name, path in (word.split("=", 1) for word in words[1:])}
+    runs = {name: read(path) for name, path in (argument.split("=", 1) for argument in arguments[1:])}
     if not all(runs.values()):
         raise SystemExit("curves: expected rows in every log, got an empty one")
     width, height = 2 * (LEFT + WIDTH) + GAP, TOP + HEIGHT + 48
@@ -58,7 +60,7 @@ def main(words):
         at = LEFT + 110 * i
         out.append(f'<path d="M{at} {height - 10}h18" stroke="{colour}" stroke-width="2"/>')
         out.append(f'<text x="{at + 24}" y="{height - 6}">{escape(name)}</text>')
-    pathlib.Path(words[0]).write_text("\n".join([*out, "</svg>"]) + "\n")
+    pathlib.Path(arguments[0]).write_text("\n".join([*out, "</svg>"]) + "\n")
 
 
 main(sys.argv[1:])

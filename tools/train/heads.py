@@ -1,9 +1,10 @@
-"""SubSplat's heads of a weight file without the backbone, or the backbone without the heads.
+"""Extracts SubSplat's heads or the backbone from a weight file.
 
     python3 tools/train/heads.py heads WHOLE.safetensors HEADS.safetensors
     python3 tools/train/heads.py backbone WHOLE.safetensors BACKBONE.safetensors
 
-Tensors stay as they are. Heads keep the metadata, a backbone does not: its configuration is another.
+Tensors are copied unchanged. The heads keep the metadata. The backbone does not, because its configuration
+differs.
 """
 
 import json

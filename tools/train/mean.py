@@ -1,9 +1,9 @@
-"""Weighted mean of weight files: what a shipped backbone is made of.
+"""Computes the weighted mean of weight files, as used for a shipped backbone.
 
     python3 tools/train/mean.py OUT.safetensors FIRST.safetensors=0.3333 SECOND.safetensors=0.6667
 
-Names, shapes and configuration are the first file's; where another lacks a tensor, the first's
-counts in its place. Needs numpy (`tools/witness/setup.sh` makes an environment with it).
+Names, shapes and configuration are the first file's. A tensor that another file lacks is taken from the first
+file. Needs numpy (`tools/witness/setup.sh` makes an environment with it).
 """
 
 import json
@@ -53,9 +53,9 @@ def main(out, *terms):
     first, meta = load(shares[0][0])
     total = {name: np.zeros_like(values) for name, values in first.items()}
     for path, share in shares:
-        own, _ = load(path)
+        tensors, _ = load(path)
         for name in total:
-            values = own.get(name, first[name])
+            values = tensors.get(name, first[name])
             if values.shape != total[name].shape:
                 sys.exit(f"{path}: {name}: expected {total[name].shape}, got {values.shape}")
             total[name] += np.float32(share) * values

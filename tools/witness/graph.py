@@ -1,4 +1,4 @@
-"""A small builder of ONNX graphs (opset 18), for writing reference networks by hand.
+"""A small builder of ONNX graphs (opset 18), for reference networks.
 
     g = G("name")
     x = g.input("x", (2, 3, 8, 8))
@@ -6,10 +6,9 @@
     g.output("y", y[:, :4] * 2.0)
     g.save(path)
 
-Every value knows its shape; a node whose shape is not plain arithmetic takes it from
-the caller (`g.op`). Weights are graph inputs, named as in PyTorch's state_dict and
-laid out as there ([out, in, ...]), so a graph holds no large data. The same calls give
-the same bytes. Float tensors are f32; indices are int64.
+Every value has a static shape. The caller states the shape of a node that plain arithmetic does not give
+(`g.op`). Weights are graph inputs, with the names and layout of PyTorch's state_dict ([out, in, ...]), so
+that a graph holds no large data. Equal calls give equal bytes. Float tensors are f32; indices are int64.
 """
 
 import numpy as np
@@ -17,7 +16,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 OPSET = 18
-# onnxruntime 1.31 reads it; written out so that another onnx release writes the same bytes.
+# Supported by onnxruntime 1.31. A fixed version gives the same bytes with other onnx releases.
 IR_VERSION = 10
 KINDS = {"float32": TensorProto.FLOAT, "int64": TensorProto.INT64, "bool": TensorProto.BOOL}
 
@@ -57,6 +56,7 @@ class Value:
 
 
 class G:
+    """A graph under construction."""
     def __init__(self, name):
         self.name = name
         self.nodes, self.constants, self.outputs = [], {}, {}
@@ -70,7 +70,7 @@ class G:
         return self.inputs[name]
 
     def weight(self, name, shape):
-        """A parameter; asked for again, the same one."""
+        """Returns the parameter of a name; repeated calls return the same value."""
         shape = tuple(shape)
         have = self.weights.setdefault(name, Value(self, name, shape))
         assert have.shape == shape and name not in self.inputs, (name, have.shape, shape)
@@ -95,7 +95,7 @@ class G:
         return x if isinstance(x, Value) else self.const(x)
 
     def op(self, kind, inputs, shape, dtype="float32", out=None, **attributes):
-        """Any ONNX operator with one output; `shape` is the caller's word."""
+        """Adds any ONNX operator with one output. The caller states `shape`, which `bytes` verifies."""
         out = out or f"v{len(self.nodes)}"
         names = ["" if i is None else self.value(i).name for i in inputs]
         self.nodes.append(helper.make_node(kind, names, [out], **attributes))
@@ -140,7 +140,7 @@ class G:
         return self.op("Where", [condition, a, b], shape, a.dtype)
 
     def cast(self, x, dtype):
-        """To "float32", "int64" or "bool"."""
+        """Casts to "float32", "int64" or "bool"."""
         return self.op("Cast", [x], x.shape, dtype, to=KINDS[dtype])
 
     def reduce(self, kind, x, axes, keep=False):
@@ -177,7 +177,7 @@ class G:
         return self.concat([v.reshape(v.shape[:axis] + (1,) + v.shape[axis:]) for v in values], axis)
 
     def slice(self, x, key):
-        """numpy's basic slicing: integers, slices, `...`, None."""
+        """Applies numpy's basic slicing: integers, slices, `...`, None."""
         key = key if isinstance(key, tuple) else (key,)
         real = sum(k is not None and k is not Ellipsis for k in key)
         if Ellipsis not in key:
@@ -208,14 +208,14 @@ class G:
         return x if x.shape == tuple(final) else x.reshape(tuple(final))
 
     def gather(self, x, index, axis=0):
-        """numpy.take: `index` int64, a value or an array."""
+        """Applies numpy.take: `index` is int64, a value or an array."""
         index = index if isinstance(index, Value) else self.const(index, np.int64)
         axis %= len(x.shape)
         shape = x.shape[:axis] + index.shape + x.shape[axis + 1:]
         return self.op("Gather", [x, index], shape, x.dtype, axis=axis)
 
     def gather_elements(self, x, index, axis):
-        """torch.gather."""
+        """Applies torch.gather."""
         return self.op("GatherElements", [x, index], index.shape, x.dtype, axis=axis)
 
     def matmul(self, a, b):
@@ -225,7 +225,7 @@ class G:
         return self.op("MatMul", [a, b], batch + (a.shape[-2], b.shape[-1]))
 
     def roll(self, x, shift, axis):
-        """torch.roll: what stood at i stands at (i + shift) mod n."""
+        """Applies torch.roll: element i moves to (i + shift) mod n."""
         n = x.shape[axis]
         k = -shift % n
         if k == 0:
@@ -236,13 +236,13 @@ class G:
     # --- layers ---------------------------------------------------------------------
 
     def linear(self, x, name, c_out, bias=True):
-        """x @ W^T + b over the last axis; W = NAME.weight [out, in]."""
+        """Returns x @ W^T + b over the last axis; W = NAME.weight [out, in]."""
         w = self.weight(f"{name}.weight", (c_out, x.shape[-1]))
         y = x @ w.transpose(1, 0)
         return y + self.weight(f"{name}.bias", (c_out,)) if bias else y
 
     def conv(self, x, name, c_out, kernel=3, stride=1, pad=None, bias=True):
-        """Zero-padded NCHW convolution; pad = kernel // 2 unless told."""
+        """Zero-padded NCHW convolution; the default of pad is kernel // 2."""
         pad = kernel // 2 if pad is None else pad
         n, c, h, w = x.shape
         weights = [self.weight(f"{name}.weight", (c_out, c, kernel, kernel))]
@@ -253,7 +253,7 @@ class G:
                        strides=[stride] * 2, pads=[pad] * 4)
 
     def normalised(self, x, axes, eps=1e-5):
-        """(x - mean) / sqrt(var + eps) over `axes`, biased variance, in two passes."""
+        """Returns (x - mean) / sqrt(var + eps) over `axes`, with biased variance, in two passes."""
         centred = x - x.mean(axes, keep=True)
         return centred / self.sqrt((centred * centred).mean(axes, keep=True) + eps)
 
@@ -264,7 +264,7 @@ class G:
         """[N, C, ...]; weight and bias [C]."""
         n, c = x.shape[:2]
         y = self.normalised(x.reshape(n, groups, -1), 2, eps).reshape(x.shape)
-        row = lambda what: self.weight(f"{name}.{what}", (c,)).reshape((1, c) + (1,) * (len(x.shape) - 2))
+        row = lambda part: self.weight(f"{name}.{part}", (c,)).reshape((1, c) + (1,) * (len(x.shape) - 2))
         return y * row("weight") + row("bias")
 
     def layer_norm(self, x, name, eps=1e-5):
@@ -297,6 +297,7 @@ class G:
     # --- files ----------------------------------------------------------------------
 
     def model(self):
+        """Returns the graph as an ONNX model."""
         info = lambda v: helper.make_tensor_value_info(v.name, KINDS[v.dtype], v.shape)
         graph = helper.make_graph(
             self.nodes, self.name, [info(v) for v in [*self.inputs.values(), *self.weights.values()]],
@@ -306,8 +307,9 @@ class G:
                                  producer_name="subsplat tools/witness")
 
     def bytes(self):
+        """Checks and serialises the graph."""
         model = self.model()
-        # Strict: the shapes that the builder states must be those that ONNX infers.
+        # Strict: the shapes of the builder must equal those that ONNX infers.
         onnx.checker.check_model(onnx.shape_inference.infer_shapes(model, check_type=True, strict_mode=True))
         return model.SerializeToString(deterministic=True)
 

@@ -1,4 +1,4 @@
-"""Writes the graphs and goldens of all cases, or of those named:
+"""Writes the graphs and goldens of all cases, or of the named ones.
 
     python tools/witness/make.py [NAMES...]
 """
@@ -13,7 +13,7 @@ def main(names):
     FOLDER.mkdir(parents=True, exist_ok=True)
     unknown = [n for n in names if n not in CASES]
     if unknown:
-        raise SystemExit(f"no such case: {unknown}; there are {list(CASES)}")
+        raise SystemExit(f"unknown cases: {unknown}; expected some of {list(CASES)}")
     for name in names or CASES:
         case = Case(name)
         CASES[name](case)

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Makes the virtual environment of tools/witness in out/witness-venv (git-ignored), from
-# the wheels pinned in requirements.txt; does nothing where it stands already.
-# PYTHON names the interpreter (python3; 3.11 to 3.13).
+# Creates the virtual environment of tools/witness in out/witness-venv (git-ignored) from the wheels
+# pinned in requirements.txt. An up-to-date environment is kept. PYTHON names the interpreter
+# (python3; 3.11 to 3.13).
 set -euo pipefail
 here="$(cd "$(dirname "$0")" && pwd)"
 venv="$here/../../out/witness-venv"

@@ -1,10 +1,10 @@
-//! Pairs of cameras as hand-held footage of rooms has them, and further cameras
-//! between the two as targets.
+//! Samples pairs of cameras with the statistics of hand-held footage of rooms, and target cameras
+//! between the two.
 //!
-//! Field of view 40° to 80°; baseline 0.05 to 0.38 of the median depth; half of the
-//! pairs move forward or back, a quarter sideways, a quarter anyhow; 35 % turn towards
-//! the scene as on an orbit; at most 28° of rotation about an axis; either view sees
-//! at least 40 % of the other; no eye within 0.1 m of a surface.
+//! Field of view 40° to 80°. Baseline 0.05 to 0.38 of the median depth. Half of the pairs move
+//! forward or back, a quarter sideways, a quarter in any direction. 35 % rotate towards the scene
+//! as on an orbit. The rotation about each axis is at most 28°. Each view sees at least 40 % of the
+//! other. No camera is within 0.1 m of a surface.
 
 use super::Room;
 use super::rng::Rng;
@@ -12,32 +12,32 @@ use super::shape::Ray;
 use crate::camera::{Camera, Intrinsics};
 use glam::{EulerRot, Mat3, Mat4, Quat, Vec2, Vec3};
 
-/// Smallest distance of an eye from any surface, m.
+/// Smallest distance of a camera from any surface, m.
 pub(super) const CLEARANCE: f32 = 0.1;
-/// Smallest share of either context view that the other sees.
-const OVERLAP: f32 = 0.4;
+/// Smallest share of each context view that the other sees.
+const MIN_OVERLAP: f32 = 0.4;
 /// Largest rotation between the context views about each axis, radians.
 const ROTATION: f32 = 28.0 * std::f32::consts::PI / 180.0;
-/// A view is probed on this many points along each side.
+/// Number of probe rays along each side of a view.
 const PROBE: usize = 20;
-/// Proposals before a room counts as too cramped.
+/// Number of proposals before a room is rejected as too small.
 const TRIES: u64 = 300;
 
-/// What [`sample_cameras`] is asked for.
+/// Parameters of [`sample_cameras`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CameraSpec {
     /// Width of every picture, px; at least 1.
     pub width: usize,
     /// Height of every picture, px; at least 1.
     pub height: usize,
-    /// Cameras between the two context cameras.
+    /// Number of cameras between the two context cameras.
     pub targets: usize,
-    /// Chance that the pictures are windows, off centre, of pictures twice as large:
-    /// half the field of view, the pixel statistics of larger photographs.
+    /// Probability that the pictures are off-centre windows of pictures twice as large: half the
+    /// field of view, with the pixel statistics of larger photographs.
     pub crop: f32,
 }
 
-/// How the second eye lies to the first.
+/// Direction of the second camera's position relative to the first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Motion {
     /// Along the line of sight, forward or back.
@@ -48,45 +48,55 @@ pub enum Motion {
     Free,
 }
 
-/// Cameras in a room, world units metres.
+/// Context and target cameras in a room, world units metres.
 #[derive(Clone, Debug)]
 pub struct Rig {
     /// The two context cameras, then the targets.
     pub cameras: Vec<Camera>,
-    /// Distance of the two context eyes, m.
+    /// Distance between the two context cameras, m.
     pub baseline: f32,
-    /// Depth below which 2 % of both context views lie, m.
+    /// 2 % quantile of the depth of both context views, m.
     pub near_depth: f32,
     /// Median depth of the first context view, m.
     pub median_depth: f32,
-    /// Largest depth found in both context views, m.
+    /// Largest depth of both context views, m.
     pub far_depth: f32,
     /// Share of a context view that the other sees, the smaller of the two.
     pub overlap: f32,
     /// Direction of the motion.
     pub motion: Motion,
-    /// The second camera turned towards what the first looks at.
+    /// True if the second camera rotates towards the point that the first one faces.
     pub orbit: bool,
-    /// The pictures are windows of larger ones.
+    /// True if the pictures are windows of larger ones.
     pub cropped: bool,
 }
 
-/// Cameras for `room`; the same for the same seed. `None` where the room leaves no
-/// place for them (a few rooms in a thousand).
+/// Point of a surface that a camera sees.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct SurfacePoint {
+    /// Position, world.
+    pub(super) in_world: Vec3,
+    /// Camera z, m.
+    pub(super) depth: f32,
+}
+
+/// Samples cameras for `room`; equal seeds give equal cameras. Returns `None` where the room has no
+/// space for them (a few rooms in a thousand).
 pub fn sample_cameras(room: &Room, seed: u64, spec: &CameraSpec) -> Option<Rig> {
     let stream = Rng::new(seed);
     (0..TRIES).find_map(|attempt| propose(room, &mut stream.fork(attempt), spec))
 }
 
+/// Samples one set of cameras; `None` where it violates a condition.
 fn propose(room: &Room, rng: &mut Rng, spec: &CameraSpec) -> Option<Rig> {
     let cropped = rng.chance(spec.crop);
     let intrinsics = intrinsics(spec, cropped, rng);
     let first = first_camera(room, intrinsics, rng)?;
-    let seen = probe(room, &first);
-    let mut depths: Vec<f32> = seen.iter().map(|p| p.1).collect();
+    let first_points = probe(room, &first);
+    let mut depths: Vec<f32> = first_points.iter().map(|p| p.depth).collect();
     depths.sort_by(f32::total_cmp);
     let median_depth = *depths.get(depths.len() / 2)?;
-    // A wall at arm's length is no view of a room.
+    // A view of a near wall holds no geometry of the room.
     if median_depth < 0.8 {
         return None;
     }
@@ -99,16 +109,16 @@ fn propose(room: &Room, rng: &mut Rng, spec: &CameraSpec) -> Option<Rig> {
     if room.clearance(second.position()) < CLEARANCE {
         return None;
     }
-    let seen_by_second = probe(room, &second);
-    let overlap = overlap(room, [&first, &second], [&seen, &seen_by_second]);
-    if overlap < OVERLAP {
+    let second_points = probe(room, &second);
+    let overlap = overlap(room, [&first, &second], [&first_points, &second_points]);
+    if overlap < MIN_OVERLAP {
         return None;
     }
     let mut cameras = vec![first, second];
     for _ in 0..spec.targets {
         cameras.push(between(room, &first, &second, rng)?);
     }
-    let (near_depth, far_depth) = extent(seen.iter().chain(&seen_by_second))?;
+    let (near_depth, far_depth) = extent(first_points.iter().chain(&second_points))?;
     Some(Rig {
         baseline: first.position().distance(second.position()),
         near_depth,
@@ -122,7 +132,8 @@ fn propose(room: &Room, rng: &mut Rng, spec: &CameraSpec) -> Option<Rig> {
     })
 }
 
-/// 40° to 80° along the longer side, of the picture or of the one that it is cut from.
+/// Samples a field of view of 40° to 80° along the longer side of the picture, or of the larger
+/// picture that it is a window of.
 fn intrinsics(spec: &CameraSpec, cropped: bool, rng: &mut Rng) -> Intrinsics {
     let (width, height) = (spec.width.max(1), spec.height.max(1));
     let fov = rng.range(40.0, 80.0).to_radians();
@@ -134,13 +145,14 @@ fn intrinsics(spec: &CameraSpec, cropped: bool, rng: &mut Rng) -> Intrinsics {
     Intrinsics { fx: f, fy: f, cx, cy, width, height }
 }
 
-/// Camera axes that look along `forward` with the picture's rows level.
+/// Returns the axes of a camera that faces `forward` with level picture rows.
 fn level(forward: Vec3) -> Mat3 {
     let z = forward.normalize_or(Vec3::Z);
     let x = Vec3::Y.cross(z).normalize_or(Vec3::X);
     Mat3::from_cols(x, z.cross(x), z)
 }
 
+/// Builds a camera from its intrinsics, rotation and position.
 fn posed(intrinsics: Intrinsics, rotation: Mat3, eye: Vec3) -> Camera {
     let pose = Mat4::from_cols(
         rotation.x_axis.extend(0.0),
@@ -151,7 +163,7 @@ fn posed(intrinsics: Intrinsics, rotation: Mat3, eye: Vec3) -> Camera {
     Camera { intrinsics, world_from_camera: pose }
 }
 
-/// A camera at the height of a hand or an eye that looks across the room.
+/// Samples a camera at hand or eye height that faces across the room.
 fn first_camera(room: &Room, intrinsics: Intrinsics, rng: &mut Rng) -> Option<Camera> {
     let size = room.size();
     let floor = |rng: &mut Rng| {
@@ -168,7 +180,7 @@ fn first_camera(room: &Room, intrinsics: Intrinsics, rng: &mut Rng) -> Option<Ca
     Some(posed(intrinsics, level(ahead) * roll, eye))
 }
 
-/// The second camera, and whether it turns towards the scene.
+/// Samples the second camera; the flag is true if it rotates towards the scene.
 fn second_camera(first: &Camera, median: f32, motion: Motion, rng: &mut Rng) -> (Camera, bool) {
     let baseline = rng.range(0.05, 0.38) * median;
     let shake = 0.15 * Vec3::new(rng.normal(), rng.normal(), rng.normal());
@@ -195,7 +207,7 @@ fn second_camera(first: &Camera, median: f32, motion: Motion, rng: &mut Rng) -> 
     (posed(first.intrinsics, rotation, eye), orbit)
 }
 
-/// A camera on the way from the first to the second, a little off it.
+/// Samples a target camera near the path from the first to the second camera.
 fn between(room: &Room, first: &Camera, second: &Camera, rng: &mut Rng) -> Option<Camera> {
     let (a, b) = (first.position(), second.position());
     let t = rng.range(0.1, 0.9);
@@ -206,22 +218,23 @@ fn between(room: &Room, first: &Camera, second: &Camera, rng: &mut Rng) -> Optio
     clear.then(|| posed(first.intrinsics, Mat3::from_quat(rotation), eye))
 }
 
-/// Depth below which 2 % of the points lie, and the largest.
-pub(super) fn extent<'a>(seen: impl Iterator<Item = &'a (Vec3, f32)>) -> Option<(f32, f32)> {
-    let mut depths: Vec<f32> = seen.map(|p| p.1).collect();
+/// Returns the 2 % quantile of depth and the largest depth, or `None` without points.
+pub(super) fn extent<'a>(points: impl Iterator<Item = &'a SurfacePoint>) -> Option<(f32, f32)> {
+    let mut depths: Vec<f32> = points.map(|p| p.depth).collect();
     depths.sort_by(f32::total_cmp);
     Some((*depths.get(depths.len() / 50)?, *depths.last()?))
 }
 
-/// Share of what either of two cameras sees that the other sees too, the smaller one.
-pub(super) fn overlap(room: &Room, [a, b]: [&Camera; 2], seen: [&[(Vec3, f32)]; 2]) -> f32 {
-    visible(room, seen[0], b).min(visible(room, seen[1], a))
+/// Returns the smaller share of either camera's view that the other camera sees; `points` are the
+/// probes of the two.
+pub(super) fn overlap(room: &Room, [a, b]: [&Camera; 2], points: [&[SurfacePoint]; 2]) -> f32 {
+    visible_share(room, points[0], b).min(visible_share(room, points[1], a))
 }
 
-/// World points and depths that a camera sees, on a grid.
-pub(super) fn probe(room: &Room, camera: &Camera) -> Vec<(Vec3, f32)> {
+/// Returns the surface points that a camera sees through a regular grid of rays.
+pub(super) fn probe(room: &Room, camera: &Camera) -> Vec<SurfacePoint> {
     let k = &camera.intrinsics;
-    let mut seen = Vec::with_capacity(PROBE * PROBE);
+    let mut points = Vec::with_capacity(PROBE * PROBE);
     for j in 0..PROBE {
         for i in 0..PROBE {
             let share = Vec2::new(i as f32 + 0.5, j as f32 + 0.5) / PROBE as f32;
@@ -229,15 +242,16 @@ pub(super) fn probe(room: &Room, camera: &Camera) -> Vec<(Vec3, f32)> {
             let direction = camera.rotation() * k.unproject(px);
             let ray = Ray { origin: camera.position(), direction };
             if let Some((_, t)) = room.nearest(&ray) {
-                seen.push((ray.at(t), t));
+                points.push(SurfacePoint { in_world: ray.at(t), depth: t });
             }
         }
     }
-    seen
+    points
 }
 
-/// Share of the points that `camera` sees: in front, inside the picture and not hidden.
-fn visible(room: &Room, points: &[(Vec3, f32)], camera: &Camera) -> f32 {
+/// Returns the share of the points that `camera` sees: in front, inside the picture and not
+/// occluded.
+fn visible_share(room: &Room, points: &[SurfacePoint], camera: &Camera) -> f32 {
     let (w, h) = (camera.intrinsics.width as f32, camera.intrinsics.height as f32);
     let sees = |point: Vec3| {
         let inside = camera
@@ -246,5 +260,5 @@ fn visible(room: &Room, points: &[(Vec3, f32)], camera: &Camera) -> f32 {
         let ray = Ray { origin: camera.position(), direction: point - camera.position() };
         inside && room.nearest(&ray).is_none_or(|hit| hit.1 > 0.99)
     };
-    points.iter().filter(|p| sees(p.0)).count() as f32 / points.len().max(1) as f32
+    points.iter().filter(|p| sees(p.in_world)).count() as f32 / points.len().max(1) as f32
 }

@@ -1,5 +1,7 @@
-//! One example to learn from: two views of a room, targets between them, depth of all,
-//! in the units and with the near and far planes that data sets use.
+//! Builds one training example from a procedural room: two context views, targets between them, and
+//! the depth of all.
+//!
+//! The example has the units of length and the near and far planes of common data sets.
 
 use super::Room;
 use super::cameras::{CameraSpec, Rig, sample_cameras};
@@ -7,115 +9,128 @@ use super::render::{Grade, Quality, View};
 use super::rng::Rng;
 use crate::camera::Camera;
 
-/// What an example holds.
+/// Contents of an example.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ExampleSpec {
-    /// Sizes, number of targets, chance of cropping.
+    /// Sizes, number of targets, probability of cropping.
     pub cameras: CameraSpec,
-    /// Gain and gamma per scene; exposure, white balance, softness and noise per view.
-    /// Off: [`Quality::clean`]'s grade in all views.
+    /// Applies gain and gamma per scene, and exposure, white balance, softness and noise per view.
+    /// If false, all views have the grade of [`Quality::clean`].
     pub photographic: bool,
-    /// Share of examples with things close before the cameras, half out of the picture:
-    /// chairs, plants, the edge of a door.
+    /// Share of examples with objects close to the cameras, partly outside the picture: chairs,
+    /// plants, the edge of a door.
     pub foreground: f32,
     /// Samples along each side of a pixel.
     pub samples: usize,
 }
 
 impl ExampleSpec {
-    /// Two context views and `targets` more, 4 samples a pixel, half of the examples
-    /// cropped from pictures twice as large, photographic, nothing close before the cameras.
+    /// Returns two context views and `targets` more, 4 samples per pixel, half of the examples
+    /// cropped from pictures twice as large, photographic, without foreground.
     pub fn new(width: usize, height: usize, targets: usize) -> Self {
         let cameras = CameraSpec { width, height, targets, crop: 0.5 };
         Self { cameras, photographic: true, foreground: 0.0, samples: 2 }
     }
 }
 
-/// How the targets of an example differ from its context views.
+/// Differences between the targets of an example and its context views.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TargetSpec {
-    /// Side of a target over side of a context view; at least 1.
+    /// Side of a target over the side of a context view; at least 1.
     pub ratio: usize,
     /// Samples along each side of a target's pixel; at least 1.
     pub samples: usize,
-    /// The scene's gain and gamma alone: no exposure of its own, softness or noise, which
-    /// nothing could predict.
+    /// Applies the scene's gain and gamma only. Exposure, softness and noise of a target could not
+    /// be predicted.
     pub clean: bool,
 }
 
 /// Views, cameras, near and far of one scene, in the example's unit of length.
 #[derive(Clone, Debug)]
 pub struct Example {
-    /// Seed of the room that was used.
+    /// Seed of the room.
     pub seed: u64,
-    /// Two context views, then the targets. Depth in the example's unit.
+    /// Two context views, then the targets; depth in the example's unit.
     pub views: Vec<View>,
-    /// Their cameras, in the example's unit.
+    /// Cameras of the views, in the example's unit.
     pub cameras: Vec<Camera>,
-    /// Nearest depth that the network is told.
+    /// Near plane for the network.
     pub near: f32,
-    /// Farthest depth that the network is told.
+    /// Far plane for the network.
     pub far: f32,
 }
 
-/// Context views of an example.
+/// Number of context views of an example.
 pub(super) const CONTEXT: usize = 2;
-/// Depth that both rules put the 2 % quantile of depth at, units.
+/// Range of the 2 % quantile of depth, units.
 const NEAR_DEPTH: [f32; 2] = [0.9, 2.4];
-/// Share of examples with near 1 and far 100, RealEstate10K's habit.
+/// Share of examples with near 1 and far 100, the planes of RealEstate10K.
 const FIXED_PLANES: f32 = 0.7;
 
-/// Key of the draws for what stands before the cameras.
+/// Key of the random numbers for the foreground.
 const FOREGROUND: u64 = 12;
 
-/// Unit of length (units per metre), near and far for a rig.
-fn planes(rig: &Rig, rng: &mut Rng) -> (f32, f32, f32) {
+/// Unit of length and depth planes of an example.
+struct Planes {
+    /// Units per metre.
+    scale: f32,
+    /// Near plane, units.
+    near: f32,
+    /// Far plane, units.
+    far: f32,
+}
+
+/// Samples the unit of length, near and far for a rig.
+fn planes(rig: &Rig, rng: &mut Rng) -> Planes {
     let scale = rng.log_range(NEAR_DEPTH[0], NEAR_DEPTH[1]) / rig.near_depth.max(1e-3);
     if rng.chance(FIXED_PLANES) {
-        return (scale, 1.0, 100.0);
+        return Planes { scale, near: 1.0, far: 100.0 };
     }
-    // Half the baseline, or nearer to what there is to see; 30 baselines, and at least
-    // all there is to see.
+    // near lies between half the baseline and the nearest visible depth. far is 30 baselines, and
+    // at least the farthest visible depth.
     let baseline = rig.baseline * scale;
-    let seen = 0.9 * rig.near_depth * scale;
-    let near = 0.5 * baseline + rng.unit() * (seen - 0.5 * baseline).max(0.0);
-    (scale, near, (30.0 * baseline).max(rig.far_depth * scale))
+    let nearest = 0.9 * rig.near_depth * scale;
+    let near = 0.5 * baseline + rng.unit() * (nearest - 0.5 * baseline).max(0.0);
+    Planes { scale, near, far: (30.0 * baseline).max(rig.far_depth * scale) }
 }
 
 impl Example {
-    /// The example of `seed`. A room without a place for cameras is replaced by the
-    /// next of a fixed sequence: every seed gives an example.
+    /// Builds the example of `seed`. A room without space for cameras is replaced by the next of a
+    /// fixed sequence, so that every seed gives an example.
     pub fn new(seed: u64, spec: &ExampleSpec) -> Self {
         let targets = TargetSpec { ratio: 1, samples: spec.samples, clean: false };
         Self::with_targets(seed, spec, &targets)
     }
 
-    /// [`Example::new`] with targets of another size or grade: the same rooms and cameras.
+    /// Builds an example with targets of another size or grade; rooms and cameras are those of
+    /// [`Example::new`].
     pub fn with_targets(seed: u64, spec: &ExampleSpec, targets: &TargetSpec) -> Self {
         let mut rng = Rng::new(seed).fork(11);
         loop {
             let seed = rng.bits();
             let mut room = Room::new(seed);
             if let Some(mut rig) = sample_cameras(&room, seed, &spec.cameras) {
-                // A stream of its own: without these things the example stays what it was.
+                // A separate stream: the example without foreground is unchanged.
                 let mut extra = Rng::new(seed).fork(FOREGROUND);
                 if extra.chance(spec.foreground) {
-                    room.crowd(&mut rig, &mut extra);
+                    room.add_foreground(&mut rig, &mut extra);
                 }
-                return Self::of(seed, &room, &rig, (spec, targets), &mut rng);
+                return Self::rendered(seed, &room, &rig, spec, targets, &mut rng);
             }
         }
     }
 
-    fn of(
+    /// Renders the views of a rig.
+    fn rendered(
         seed: u64,
         room: &Room,
         rig: &Rig,
-        (spec, targets): (&ExampleSpec, &TargetSpec),
+        spec: &ExampleSpec,
+        targets: &TargetSpec,
         rng: &mut Rng,
     ) -> Self {
-        let (scale, near, far) = planes(rig, rng);
-        let scene = Grade::of_scene(rng);
+        let Planes { scale, near, far } = planes(rig, rng);
+        let scene = Grade::sample_scene(rng);
         let soft = rng.chance(0.3);
         let mut cameras = rig.cameras.clone();
         for camera in cameras.iter_mut().skip(CONTEXT) {
@@ -126,7 +141,7 @@ impl Example {
             let target = i >= CONTEXT;
             let grade = match spec.photographic {
                 true if target && targets.clean => scene,
-                true => scene.of_view(soft, rng),
+                true => scene.sample_view(soft, rng),
                 false => Grade::default(),
             };
             let samples = if target { targets.samples } else { spec.samples };

@@ -1,4 +1,4 @@
-//! What stands on the floor, and the small things on top of it.
+//! Places furniture on the floor, and small objects on top of it.
 
 use super::layout::{Layout, Top, yaw};
 use super::material::{Material, Role};
@@ -6,7 +6,8 @@ use super::shape::Form;
 use glam::{EulerRot, Mat3, Quat, Vec2, Vec3};
 
 impl Layout {
-    /// Everything large: 3 to 13 boxes, tables, partitions, poles, boards, a plant.
+    /// Places all large objects: 3 to 13 cabinets, tables, partitions, poles, boards, a plant,
+    /// balls.
     pub(super) fn furnish(&mut self) {
         for _ in 0..self.rng.count(0, 2) {
             self.table();
@@ -31,7 +32,7 @@ impl Layout {
         }
     }
 
-    /// A free circle of the floor, or `None` after some tries.
+    /// Reserves a free circle of the floor. Returns `None` after 12 failed attempts.
     fn free_floor(&mut self, radius: f32) -> Option<Vec2> {
         let reach = Vec2::new(0.5 * self.size.x, 0.5 * self.size.z) - Vec2::splat(radius);
         if reach.min_element() <= 0.0 {
@@ -41,19 +42,20 @@ impl Layout {
             let at =
                 Vec2::new(self.rng.range(-reach.x, reach.x), self.rng.range(-reach.y, reach.y));
             if self.is_clear(at, radius) {
-                self.taken.push((at, radius));
+                self.occupied_floor.push((at, radius));
                 return Some(at);
             }
         }
         None
     }
 
-    /// Neighbours may overlap by a fifth: circles around boxes are generous.
+    /// Tests a circle against the occupied floor. Neighbours may overlap by a fifth, because
+    /// circles around boxes are larger than the boxes.
     fn is_clear(&self, at: Vec2, radius: f32) -> bool {
-        self.taken.iter().all(|(p, r)| p.distance(at) > 0.8 * (r + radius))
+        self.occupied_floor.iter().all(|(p, r)| p.distance(at) > 0.8 * (r + radius))
     }
 
-    /// A box on the floor, six in ten along a wall, with doors where it is tall.
+    /// Adds a box on the floor, in six of ten cases along a wall, with doors where it is tall.
     fn cabinet(&mut self) {
         let half = Vec3::new(
             self.rng.log_range(0.15, 0.9),
@@ -70,7 +72,7 @@ impl Layout {
             if reach <= 0.0 || !self.is_clear(at, radius) {
                 return;
             }
-            self.taken.push((at, radius));
+            self.occupied_floor.push((at, radius));
             (centre, wall.axes)
         } else {
             let Some(at) = self.free_floor(radius) else { return };
@@ -82,12 +84,12 @@ impl Layout {
             let top = centre - Vec3::Y * half.y;
             self.tops.push(Top { centre: top, axes, half: Vec2::new(half.x, half.z) });
         }
-        if half.y > 0.3 && self.has_room() && self.rng.chance(0.5) {
+        if half.y > 0.3 && self.accepts_extras() && self.rng.chance(0.5) {
             self.doors(centre, axes, half);
         }
     }
 
-    /// One to three panels on the front of a cabinet.
+    /// Adds one to three panels to the front of a cabinet.
     fn doors(&mut self, centre: Vec3, axes: Mat3, half: Vec3) {
         let count = self.rng.count(1, 3);
         let material = self.material(Role::Furniture);
@@ -95,7 +97,7 @@ impl Layout {
         let share = if upright { half.x } else { half.y } / count as f32;
         for i in 0..count {
             let offset = (2 * i + 1) as f32 * share;
-            let (place, panel) = if upright {
+            let (position, panel) = if upright {
                 (
                     Vec3::new(offset - half.x, 0.0, half.z),
                     Vec3::new(share - 0.012, half.y - 0.02, 0.008),
@@ -106,11 +108,11 @@ impl Layout {
                     Vec3::new(half.x - 0.02, share - 0.012, 0.008),
                 )
             };
-            self.add(Form::Block, centre + axes * place, axes, panel, material);
+            self.add(Form::Block, centre + axes * position, axes, panel, material);
         }
     }
 
-    /// A plate on four legs.
+    /// Adds a table: a plate on four legs.
     fn table(&mut self) {
         let plate = Vec3::new(
             self.rng.range(0.3, 0.9),
@@ -135,7 +137,7 @@ impl Layout {
         self.tops.push(Top { centre: top, axes, half: Vec2::new(plate.x, plate.z) });
     }
 
-    /// A thin wall that stands out from one of the four.
+    /// Adds a thin wall that extends from one of the four walls.
     fn partition(&mut self) {
         let wall = self.walls()[self.rng.count(0, 3)];
         let half = Vec3::new(
@@ -147,10 +149,10 @@ impl Layout {
         let material = self.material(Role::Wall);
         let centre = wall.foot + wall.axes * Vec3::new(along, -half.y, half.z);
         self.add(Form::Block, centre, wall.axes, half, material);
-        self.taken.push((Vec2::new(centre.x, centre.z), 0.8 * half.z));
+        self.occupied_floor.push((Vec2::new(centre.x, centre.z), 0.8 * half.z));
     }
 
-    /// A rod of 8 mm to 12 cm: from floor to ceiling, or leaning, or level.
+    /// Adds a rod of 8 mm to 12 cm diameter: from floor to ceiling, inclined, or level.
     fn pole(&mut self) {
         let radius = 0.5 * self.rng.log_range(0.008, 0.12);
         let material = self.material(Role::Furniture);
@@ -170,7 +172,7 @@ impl Layout {
         self.add(Form::Cylinder, Vec3::new(at.x, -up, at.y), axes, half, material);
     }
 
-    /// A slanted board.
+    /// Adds an inclined board.
     fn board(&mut self) {
         let half = Vec3::new(self.rng.range(0.2, 0.6), self.rng.range(0.2, 0.7), 0.012);
         let Some(at) = self.free_floor(half.x) else { return };
@@ -181,10 +183,10 @@ impl Layout {
         self.add(Form::Block, centre, axes, half, material);
     }
 
-    /// A pot, a stem and leaves of flat ellipsoids.
+    /// Adds a plant: a pot, a stem and leaves of flat ellipsoids.
     fn plant(&mut self) {
         let Some(at) = self.free_floor(0.3) else { return };
-        let (pot, green) = (self.material(Role::Thing), self.material(Role::Leaf));
+        let (pot, green) = (self.material(Role::Object), self.material(Role::Leaf));
         let foot = Vec3::new(at.x, 0.0, at.y);
         let (radius, height) = (self.rng.range(0.1, 0.2), self.rng.range(0.2, 0.4));
         let half = Vec3::new(radius, 0.5 * height, radius);
@@ -206,16 +208,17 @@ impl Layout {
         }
     }
 
+    /// Adds a ball on the floor.
     fn ball(&mut self) {
         let radius = self.rng.log_range(0.08, 0.4);
         let Some(at) = self.free_floor(radius) else { return };
-        let material = self.material(Role::Thing);
+        let material = self.material(Role::Object);
         let centre = Vec3::new(at.x, -radius, at.y);
         self.add(Form::Ellipsoid, centre, Mat3::IDENTITY, Vec3::splat(radius), material);
     }
 
-    /// 2 to 15 small things on tops; on the floor where there is no top.
-    pub(super) fn strew(&mut self) {
+    /// Places 2 to 15 small objects on tops, or on the floor where there is no top.
+    pub(super) fn place_objects(&mut self) {
         for _ in 0..self.rng.count(2, 15) {
             let top = if self.tops.is_empty() {
                 let Some(at) = self.free_floor(0.1) else { continue };
@@ -234,15 +237,15 @@ impl Layout {
                 0.0,
                 self.rng.range(-reach.y, reach.y),
             );
-            self.thing(top.centre + top.axes * offset, top.axes);
+            self.object(top.centre + top.axes * offset, top.axes);
         }
     }
 
-    /// A box, a can, a round thing or a standing picture, with its lowest point at `foot`.
-    fn thing(&mut self, foot: Vec3, axes: Mat3) {
+    /// Adds a box, a can, an ellipsoid or a standing picture with its lowest point at `foot`.
+    fn object(&mut self, foot: Vec3, axes: Mat3) {
         let dice = self.rng.unit();
-        let material = Material::new(Role::Thing, &self.palette, &mut self.rng);
-        let (form, half, turned) = if dice < 0.4 {
+        let material = Material::new(Role::Object, &self.palette, &mut self.rng);
+        let (form, half, rotation) = if dice < 0.4 {
             let half = Vec3::new(
                 self.rng.log_range(0.03, 0.14),
                 self.rng.log_range(0.02, 0.18),
@@ -260,7 +263,7 @@ impl Layout {
             let lean = Quat::from_euler(EulerRot::YXZ, 0.6 * self.rng.normal(), -0.22, 0.0);
             (Form::Block, half, Mat3::from_quat(lean))
         };
-        let material = self.keep(material.spread_over(2.2 * half.max_element()));
-        self.add(form, foot - Vec3::Y * half.y, axes * turned, half, material);
+        let material = self.add_material(material.spread_over(2.2 * half.max_element()));
+        self.add(form, foot - Vec3::Y * half.y, axes * rotation, half, material);
     }
 }

@@ -1,11 +1,13 @@
-//! What surfaces look like: a texture, the colours that its two fields stand for, and
-//! how light leaves.
+//! Materials: a texture, the colours of its two fields, and the reflection model.
+//!
+//! Colours are linear RGB reflectances; lengths are metres.
 
 use super::rng::Rng;
 use super::texture::{BANK, Kind, TextureBank};
 use glam::{Vec2, Vec3};
 
-/// Where a material is used: decides how often it is near flat, and what it shows.
+/// Use of a material. It determines the textures, the colours and the share of nearly flat
+/// materials.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Role {
     Wall,
@@ -13,33 +15,38 @@ pub(super) enum Role {
     Floor,
     Furniture,
     Picture,
-    Thing,
+    Object,
     Leaf,
 }
 
-/// A surface's look. Colours are linear reflectances, RGB.
+/// A material. Colours are linear reflectances, RGB.
 #[derive(Clone, Debug)]
 pub(super) struct Material {
+    /// Index in the texture bank.
     texture: usize,
-    /// Colour where both fields are 0, and what each adds at 1.
+    /// Colour where both fields are 0.
     base: Vec3,
-    by_a: Vec3,
-    by_b: Vec3,
+    /// Change of colour where the first field is 1.
+    delta_a: Vec3,
+    /// Change of colour where the second field is 1.
+    delta_b: Vec3,
     /// Periods of the texture per metre.
     frequency: f32,
     /// Rotation of the texture, (cos, sin).
-    turn: Vec2,
+    rotation: Vec2,
+    /// Offset of the texture, periods.
     offset: Vec2,
-    /// Weight of the highlight, and its exponent (Blinn-Phong).
+    /// Weight of the highlight.
     pub(super) specular: f32,
+    /// Exponent of the highlight (Blinn-Phong).
     pub(super) gloss: f32,
-    /// Part of the light that is reflected as by a mirror.
+    /// Share of the light that is reflected as by a mirror.
     pub(super) mirror: f32,
-    /// Radiance that it sends out by itself, in units of its colour.
-    pub(super) glow: f32,
+    /// Emitted radiance, in units of the colour.
+    pub(super) emission: f32,
 }
 
-/// A linear colour of the given hue (turns), saturation and value.
+/// Returns a linear colour of the given hue (full turns), saturation and value.
 pub(super) fn colour(hue: f32, saturation: f32, value: f32) -> Vec3 {
     let channel = |shift: f32| {
         let t = ((hue + shift).rem_euclid(1.0) * 6.0 - 3.0).abs() - 1.0;
@@ -48,20 +55,24 @@ pub(super) fn colour(hue: f32, saturation: f32, value: f32) -> Vec3 {
     value * Vec3::new(channel(0.0), channel(2.0 / 3.0), channel(1.0 / 3.0))
 }
 
-/// The hues of one room: most things take one of three, as furnished rooms do.
+/// The hues of one room. Most objects have one of three, as in furnished rooms.
 #[derive(Clone, Debug)]
 pub(super) struct Palette {
+    /// The three hues, full turns.
     hues: [f32; 3],
+    /// Factor on all saturations.
     vivid: f32,
 }
 
 impl Palette {
+    /// Samples a palette.
     pub(super) fn new(rng: &mut Rng) -> Self {
-        // Indoor colours gather around orange (0.08 turns).
+        // Indoor colours cluster around orange (0.08 turns).
         let warm = 0.08 + 0.05 * rng.normal();
         Self { hues: [warm, warm + 0.08 * rng.normal(), rng.unit()], vivid: rng.range(0.5, 1.0) }
     }
 
+    /// Samples a colour of the palette.
     fn pick(&self, rng: &mut Rng, saturation: f32, value: [f32; 2]) -> Vec3 {
         let hue = if rng.chance(0.8) { self.hues[rng.count(0, 2)] } else { rng.unit() };
         let hue = hue + 0.02 * rng.normal();
@@ -70,7 +81,7 @@ impl Palette {
 }
 
 impl Role {
-    /// Chance of a near flat material: two thirds of walls, a third overall.
+    /// Returns the probability of a nearly flat material: two thirds of walls, a third overall.
     fn flat(self) -> f32 {
         match self {
             Self::Wall => 0.67,
@@ -78,10 +89,11 @@ impl Role {
             Self::Floor => 0.15,
             Self::Furniture => 0.35,
             Self::Picture | Self::Leaf => 0.0,
-            Self::Thing => 0.3,
+            Self::Object => 0.3,
         }
     }
 
+    /// Samples the index of a texture.
     fn texture(self, rng: &mut Rng) -> usize {
         let from = |kind: Kind, rng: &mut Rng| {
             let range = kind.indices();
@@ -94,36 +106,36 @@ impl Role {
             Self::Furniture if dice < 0.35 => from(Kind::Grain, rng),
             Self::Picture if dice < 0.5 => from(Kind::Leaves, rng),
             Self::Picture if dice < 0.65 => from(Kind::Text, rng),
-            Self::Thing if dice < 0.2 => from(Kind::Text, rng),
+            Self::Object if dice < 0.2 => from(Kind::Text, rng),
             Self::Leaf => from(if dice < 0.7 { Kind::Leaves } else { Kind::Blobs }, rng),
             _ => rng.count(0, BANK - 1),
         }
     }
 
-    /// Lightest and darkest reflectance, and the largest saturation.
+    /// Returns the range of reflectance, and the largest saturation.
     fn tones(self) -> ([f32; 2], f32) {
         match self {
             Self::Wall => ([0.25, 0.8], 0.45),
             Self::Ceiling => ([0.55, 0.85], 0.12),
             Self::Floor => ([0.06, 0.45], 0.75),
             Self::Furniture => ([0.03, 0.65], 0.9),
-            Self::Picture | Self::Thing => ([0.03, 0.85], 1.0),
+            Self::Picture | Self::Object => ([0.03, 0.85], 1.0),
             Self::Leaf => ([0.05, 0.35], 1.0),
         }
     }
 
-    /// Metres per period of the texture.
+    /// Samples the period of the texture, metres.
     fn period(self, rng: &mut Rng) -> f32 {
         match self {
             Self::Wall | Self::Ceiling | Self::Floor => rng.log_range(0.6, 2.5),
             Self::Furniture | Self::Picture => rng.log_range(0.4, 1.4),
-            Self::Thing | Self::Leaf => rng.log_range(0.15, 0.6),
+            Self::Object | Self::Leaf => rng.log_range(0.15, 0.6),
         }
     }
 }
 
 impl Material {
-    /// A random material for `role`.
+    /// Samples a material for `role`.
     pub(super) fn new(role: Role, palette: &Palette, rng: &mut Rng) -> Self {
         let (values, saturation) = role.tones();
         let pick = |rng: &mut Rng| palette.pick(rng, saturation, values);
@@ -141,7 +153,7 @@ impl Material {
         } else {
             role.texture(rng)
         };
-        // Wood, tiles and writing follow the edges of what they cover.
+        // Wood, tiles and text are parallel to the edges of their surfaces.
         let straight = matches!(Kind::of(texture), Kind::Text | Kind::Tiles | Kind::Grain);
         let quarter = std::f32::consts::FRAC_PI_2;
         let angle = match Kind::of(texture) {
@@ -157,47 +169,48 @@ impl Material {
         Self {
             texture,
             base,
-            by_a: contrast * (one - base),
-            by_b: contrast * rng.unit() * (two - base),
+            delta_a: contrast * (one - base),
+            delta_b: contrast * rng.unit() * (two - base),
             frequency: 1.0 / role.period(rng),
-            turn: Vec2::from_angle(angle),
+            rotation: Vec2::from_angle(angle),
             offset: Vec2::new(rng.unit(), rng.unit()),
             specular,
             gloss,
             mirror: 0.0,
-            glow: 0.0,
+            emission: 0.0,
         }
     }
 
-    /// The texture stretched to about one period over `extent` metres.
+    /// Stretches the texture to about one period over `extent` metres.
     pub(super) fn spread_over(mut self, extent: f32) -> Self {
         self.frequency = 1.0 / extent.max(0.05);
         self
     }
 
-    /// A mirror with a faint tint.
+    /// Turns the material into a mirror with a faint tint.
     pub(super) fn into_mirror(mut self) -> Self {
-        (self.mirror, self.by_a, self.by_b) = (0.85, Vec3::ZERO, Vec3::ZERO);
+        (self.mirror, self.delta_a, self.delta_b) = (0.85, Vec3::ZERO, Vec3::ZERO);
         self
     }
 
-    /// The same look, but sending out light.
-    pub(super) fn into_glowing(mut self, radiance: f32) -> Self {
-        (self.specular, self.glow) = (0.0, radiance);
+    /// Makes the material emit light of its own colour.
+    pub(super) fn into_emissive(mut self, radiance: f32) -> Self {
+        (self.specular, self.emission) = (0.0, radiance);
         self
     }
 
-    /// Range of the first field's colour relative to the base.
+    /// Returns the range of the first field's colour relative to the base.
     #[cfg(test)]
     pub(super) fn contrast(&self) -> f32 {
-        self.by_a.length() / self.base.length()
+        self.delta_a.length() / self.base.length()
     }
 
-    /// Reflectance at `uv` metres on a surface, averaged over `footprint` metres.
+    /// Returns the reflectance at `uv` metres on a surface, averaged over `footprint` metres.
     pub(super) fn colour(&self, bank: &TextureBank, uv: Vec2, footprint: f32) -> Vec3 {
-        let p = self.turn.rotate(uv) * self.frequency + self.offset;
+        let p = self.rotation.rotate(uv) * self.frequency + self.offset;
         let [a, b] = bank.get(self.texture).sample(p.x, p.y, footprint * self.frequency);
-        (self.base + self.by_a * a + self.by_b * b).clamp(Vec3::splat(0.01), Vec3::splat(0.95))
+        (self.base + self.delta_a * a + self.delta_b * b)
+            .clamp(Vec3::splat(0.01), Vec3::splat(0.95))
     }
 }
 

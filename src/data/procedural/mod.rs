@@ -1,17 +1,17 @@
-//! Procedural rooms: textured, furnished, lit, ray traced from any pinhole camera at
-//! any resolution, with depth; all of it from one 64-bit seed.
+//! Procedural indoor scenes (*rooms*) for training and for the shipped example: textured,
+//! furnished, lit and ray traced.
 //!
-//! Scenes for training and the scene that ships with the crate both come from here.
-//! The statistics (sizes, counts, texture shares, camera motion) are those of a
-//! prototype generator whose rooms alone taught a small two-view network depth that
-//! held on real photographs.
+//! Input: a 64-bit seed, pinhole cameras, a resolution. Output: pictures `[H, W, 3]` as display
+//! values in [0, 1], and depth `[H, W]` as camera z of the ray through the pixel's centre, metres.
+//! World: metres, y down, floor at y = 0.
 //!
-//! World: metres, y down, floor at y = 0. Pictures are `[H, W, 3]` display values in
-//! [0, 1]; depth is `[H, W]` camera z of the pixel centre's ray, metres.
+//! The statistics (sizes, counts, texture shares, camera motion) are those of a prototype
+//! generator. A small two-view network trained on its rooms alone estimated depth on real
+//! photographs.
 //!
-//! A seed gives the same scene and pictures for any number of threads. Integers and
-//! draws are the same on every platform; colours may differ in the last bit where the
-//! platform's `sin` or `pow` does.
+//! A seed gives the same scene and pictures for any number of threads. Integers and random numbers
+//! are equal on every platform. Colours may differ in the last bit where the platform's `sin` or
+//! `pow` differs.
 
 mod cameras;
 mod example;
@@ -33,41 +33,41 @@ pub use texture::TextureBank;
 
 use glam::Vec3;
 use layout::Layout;
-use light::{Lighting, Look};
+use light::{Lighting, Shading};
 use material::Material;
 use rng::Rng;
 use shape::{Form, Primitive, Ray, Surface};
 use std::sync::Arc;
 
-/// A furnished room. Cheap to make (microseconds): textures are synthesised once per
-/// [`TextureBank`], when first seen.
+/// A furnished room. Construction takes microseconds, because textures are synthesised once per
+/// [`TextureBank`], on their first use.
 #[derive(Clone, Debug)]
 pub struct Room {
     size: Vec3,
-    /// The first is the shell.
+    /// All solids; the first is the shell.
     primitives: Vec<Primitive>,
     materials: Vec<Material>,
     lighting: Lighting,
-    /// Brings the mean radiance to a middle grey.
+    /// Gain that maps the mean radiance to a middle grey.
     exposure: f32,
     bank: Arc<TextureBank>,
 }
 
-/// Linear value that the mean radiance of a room is exposed to: with the shoulder and
-/// a gamma of 2.2 this is displayed a little under ½.
+/// Linear value of a room's mean radiance after exposure. With the tone curve and a gamma of 2.2
+/// its display value is slightly below ½.
 const MIDDLE_GREY: f32 = 0.2;
 
 impl Room {
-    /// The room of `seed`, with the shared bank of 256² textures.
+    /// Builds the room of `seed` with the shared bank of 256² textures.
     pub fn new(seed: u64) -> Self {
         Self::with_bank(seed, TextureBank::shared())
     }
 
-    /// The same room with the textures of `bank`, for instance larger ones.
+    /// Builds the room of `seed` with the textures of `bank`, for instance larger ones.
     pub fn with_bank(seed: u64, bank: Arc<TextureBank>) -> Self {
         let mut layout = Layout::furnished(seed);
         let lighting = Lighting::new(layout.size, &mut layout.rng.fork(1));
-        layout.hang_lamp(lighting.main_lamp());
+        layout.add_lamp(lighting.main_lamp());
         let mut room = Self {
             size: layout.size,
             primitives: layout.primitives,
@@ -76,31 +76,31 @@ impl Room {
             exposure: 1.0,
             bank,
         };
-        room.exposure = MIDDLE_GREY / room.mean_radiance(&mut layout.rng.fork(2)).max(1e-3);
+        room.exposure = MIDDLE_GREY / room.log_mean_luminance(&mut layout.rng.fork(2)).max(1e-3);
         room
     }
 
-    /// Width (x), height (y) and length (z) of the room, metres; the floor lies at
-    /// y = 0, the ceiling at −height.
+    /// Returns width (x), height (y) and length (z) of the room, metres. The floor lies at y = 0,
+    /// the ceiling at −height.
     pub fn size(&self) -> Vec3 {
         self.size
     }
 
-    /// Number of solids, the shell included.
+    /// Returns the number of solids, the shell included.
     pub fn solids(&self) -> usize {
         self.primitives.len()
     }
 
-    /// Distance from a world point to the nearest surface, metres; negative inside a
-    /// solid or outside the room.
+    /// Returns the distance from a world point to the nearest surface, metres. It is negative
+    /// inside a solid or outside the room.
     pub fn clearance(&self, in_world: Vec3) -> f32 {
         self.primitives.iter().map(|p| p.distance(in_world)).fold(f32::INFINITY, f32::min)
     }
 
-    /// Geometric mean luminance over rays from the room's middle.
-    fn mean_radiance(&self, rng: &mut Rng) -> f32 {
+    /// Returns the geometric mean luminance over rays from the middle of the room.
+    fn log_mean_luminance(&self, rng: &mut Rng) -> f32 {
         const RAYS: usize = 96;
-        let look = Look { spread: 0.1, view_dependent: false, lamp_shift: None };
+        let shading = Shading { spread: 0.1, view_dependent: false, lamp_shift: None };
         let mut sum = 0.0;
         for _ in 0..RAYS {
             let origin = Vec3::new(
@@ -111,14 +111,14 @@ impl Room {
             let direction = Vec3::new(rng.normal(), 0.5 * rng.normal(), rng.normal());
             let ray = Ray { origin, direction };
             if let Some((solid, t)) = self.nearest(&ray) {
-                let c = self.radiance(solid, &ray, t, &look);
+                let c = self.radiance(solid, &ray, t, &shading);
                 sum += c.dot(Vec3::new(0.2126, 0.7152, 0.0722)).max(1e-3).ln();
             }
         }
         (sum / RAYS as f32).exp()
     }
 
-    /// First solid along a ray, and the parameter of the hit.
+    /// Returns the first solid along a ray, and the parameter of the hit.
     fn nearest(&self, ray: &Ray) -> Option<(&Primitive, f32)> {
         let mut best: Option<(&Primitive, f32)> = None;
         for p in &self.primitives {

@@ -1,41 +1,44 @@
-//! Random numbers that are the same on every platform and for any number of
-//! threads: SplitMix64 (Steele, Lea and Flood, OOPSLA 2014) as a counter. A stream
-//! is a 64-bit state; [`Rng::fork`] opens an independent one, so that drawing one
-//! more number here moves nothing there.
+//! Random numbers that are equal on every platform and for any number of threads: SplitMix64 as a
+//! counter.
+//!
+//! A stream is a 64-bit state. [`Rng::fork`] opens an independent stream, so that an additional
+//! number in one stream leaves all others unchanged.
+//!
+//! Source: Steele, Lea and Flood, OOPSLA 2014.
 
 /// Weyl increment of SplitMix64: 2⁶⁴ over the golden ratio, odd.
 const GOLDEN: u64 = 0x9E37_79B9_7F4A_7C15;
 
-/// SplitMix64's finaliser: every input bit reaches every output bit.
+/// Applies SplitMix64's finaliser: every input bit affects every output bit.
 fn mix(mut z: u64) -> u64 {
     z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
     z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
     z ^ (z >> 31)
 }
 
-/// 64 random bits that belong to a place, for jitter and noise that must not depend
-/// on the order of drawing.
+/// Returns 64 random bits for a position. Jitter and noise use them, because those must not depend
+/// on the order of evaluation.
 pub(in crate::data) fn hash(seed: u64, x: u64, y: u64) -> u64 {
     let row = mix(seed.wrapping_add(GOLDEN.wrapping_mul(y.wrapping_add(1))));
     mix(row.wrapping_add(GOLDEN.wrapping_mul(x.wrapping_add(1))))
 }
 
-/// The upper 24 of `bits` as a number in [0, 1): exact in f32.
+/// Returns the upper 24 of `bits` as a number in [0, 1), exact in f32.
 pub(in crate::data) fn unit(bits: u64) -> f32 {
     (bits >> 40) as f32 * (1.0 / (1 << 24) as f32)
 }
 
-/// Two numbers in [0, 1) from one hash.
+/// Returns two numbers in [0, 1) from one hash.
 pub(in crate::data) fn unit_pair(bits: u64) -> (f32, f32) {
     (unit(bits), unit(bits << 24))
 }
 
-/// A nearly normal number, mean 0, variance 1, from the four 16-bit quarters of
-/// `bits` (Irwin-Hall of order 4: tails end at ±3.46): no logarithm, so the same
-/// digits everywhere.
+/// Returns an approximately normal number of mean 0 and variance 1 from the four 16-bit quarters of
+/// `bits` (Irwin-Hall of order 4, within ±3.46). It needs no logarithm and therefore has the same
+/// digits on every platform.
 pub(in crate::data) fn normal(bits: u64) -> f32 {
     let sum = (0..4).map(|i| (bits >> (16 * i)) & 0xFFFF).sum::<u64>();
-    // Four quarters of mean 32767.5 and variance (2³² − 1)/12.
+    // The sum of four quarters with mean 32767.5 and variance (2³² − 1)/12.
     (sum as f32 - 131_070.0) * (1.732_050_8 / 65_536.0)
 }
 
@@ -46,51 +49,53 @@ pub(in crate::data) struct Rng {
 }
 
 impl Rng {
+    /// Opens the stream of a seed.
     pub(in crate::data) fn new(seed: u64) -> Self {
         Self { state: mix(seed ^ 0x5355_4253_504C_4154) }
     }
 
-    /// An independent stream for `key`; this one does not move.
+    /// Opens an independent stream for `key`; the state of `self` does not change.
     pub(in crate::data) fn fork(&self, key: u64) -> Self {
         Self { state: hash(self.state, key, 0x0F0F) }
     }
 
+    /// Returns 64 random bits.
     pub(in crate::data) fn bits(&mut self) -> u64 {
         self.state = self.state.wrapping_add(GOLDEN);
         mix(self.state)
     }
 
-    /// In [0, 1).
+    /// Returns a number in [0, 1).
     pub(in crate::data) fn unit(&mut self) -> f32 {
         unit(self.bits())
     }
 
-    /// In [low, high).
+    /// Returns a number in [low, high).
     pub(in crate::data) fn range(&mut self, low: f32, high: f32) -> f32 {
         low + (high - low) * self.unit()
     }
 
-    /// In [low, high), uniform in the logarithm. Both positive.
+    /// Returns a number in [low, high), uniform in the logarithm. Both bounds are positive.
     pub(in crate::data) fn log_range(&mut self, low: f32, high: f32) -> f32 {
         low * (high / low).powf(self.unit())
     }
 
-    /// low, low + 1, …, high, each alike.
+    /// Returns one of low, low + 1, …, high with equal probability.
     pub(in crate::data) fn count(&mut self, low: usize, high: usize) -> usize {
         low + (self.bits() >> 32) as usize % (high - low + 1)
     }
 
-    /// True with probability `p`.
+    /// Returns true with probability `p`.
     pub(in crate::data) fn chance(&mut self, p: f32) -> bool {
         self.unit() < p
     }
 
-    /// Mean 0, variance 1, within ±3.46.
+    /// Returns a number of mean 0 and variance 1, within ±3.46.
     pub(in crate::data) fn normal(&mut self) -> f32 {
         normal(self.bits())
     }
 
-    /// −1 or 1.
+    /// Returns −1 or 1.
     pub(in crate::data) fn sign(&mut self) -> f32 {
         if self.chance(0.5) { 1.0 } else { -1.0 }
     }
@@ -102,7 +107,7 @@ mod tests {
 
     #[test]
     fn the_stream_is_splitmix64() {
-        // First outputs for state 0, as Vigna's reference C program prints them.
+        // First outputs for state 0 of Vigna's reference C program.
         let mut rng = Rng { state: 0 };
         assert_eq!(rng.bits(), 0xE220_A839_7B1D_CDAF);
         assert_eq!(rng.bits(), 0x6E78_9E6A_A1B9_65F4);

@@ -1,45 +1,46 @@
-//! The four solids that rooms are made of, and where rays meet them. World units are
-//! metres; a solid's own frame has its axes along x, y, z and its centre at the origin.
+//! The four solids of a room and their intersections with rays.
+//!
+//! World units are metres. The local frame of a solid has its axes along x, y, z and its centre at
+//! the origin.
 
 use glam::{Mat3, Vec2, Vec3};
 
-/// Nearest ray parameter that counts as a hit: keeps a reflected or shadow ray off
-/// the surface that it leaves.
+/// Smallest ray parameter of a hit. It excludes the surface at the origin of a reflected or shadow
+/// ray.
 const T_MIN: f32 = 1e-4;
 
-/// The solids.
+/// Kind of a solid.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Form {
-    /// A box seen from inside: the shell of the room. Six materials, one per face.
+    /// A box seen from inside: the shell of the room, with six materials, one per face.
     Shell,
     /// A box.
     Block,
     /// An ellipsoid.
     Ellipsoid,
-    /// A capped cylinder along its own y, elliptic in x and z.
+    /// A capped cylinder along its local y, elliptic in x and z.
     Cylinder,
 }
 
-/// One placed solid.
+/// A placed solid.
 #[derive(Clone, Debug)]
 pub(super) struct Primitive {
     pub(super) form: Form,
     pub(super) centre: Vec3,
-    /// Own axes as columns, world frame.
-    pub(super) world_from_own: Mat3,
-    own_from_world: Mat3,
-    /// Half sizes along the own axes, m.
+    /// Local axes as columns, world frame.
+    pub(super) world_from_local: Mat3,
+    local_from_world: Mat3,
+    /// Half sizes along the local axes, m.
     pub(super) half: Vec3,
-    /// Radius of the sphere around the centre that holds it, m.
+    /// Radius of the bounding sphere around the centre, m.
     pub(super) radius: f32,
-    /// Index of its material; of the first of six for [`Form::Shell`].
+    /// Index of the material; of the first of six for [`Form::Shell`].
     pub(super) material: usize,
-    /// False for what glows.
+    /// False for emissive solids.
     pub(super) casts_shadow: bool,
 }
 
-/// A ray; the direction need not have unit length, and the parameter of a hit is in
-/// units of it.
+/// A ray. The direction may have any length, and the parameter of a hit is in units of that length.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Ray {
     pub(super) origin: Vec3,
@@ -47,15 +48,16 @@ pub(super) struct Ray {
 }
 
 impl Ray {
+    /// Returns the point at parameter `t`.
     pub(super) fn at(&self, t: f32) -> Vec3 {
         self.origin + self.direction * t
     }
 }
 
-/// The surface at a hit.
+/// Surface properties at a hit.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Surface {
-    /// Unit normal, world frame, out of the solid (into the room for the shell).
+    /// Unit normal, world frame, directed out of the solid (into the room for the shell).
     pub(super) normal: Vec3,
     /// Position on the surface, m.
     pub(super) uv: Vec2,
@@ -64,7 +66,8 @@ pub(super) struct Surface {
 }
 
 impl Primitive {
-    pub(super) fn new(form: Form, centre: Vec3, world_from_own: Mat3, half: Vec3) -> Self {
+    /// Places a solid with material 0.
+    pub(super) fn new(form: Form, centre: Vec3, world_from_local: Mat3, half: Vec3) -> Self {
         let radius = match form {
             Form::Shell | Form::Block => half.length(),
             Form::Ellipsoid => half.max_element(),
@@ -73,8 +76,8 @@ impl Primitive {
         Self {
             form,
             centre,
-            world_from_own,
-            own_from_world: world_from_own.transpose(),
+            world_from_local,
+            local_from_world: world_from_local.transpose(),
             half,
             radius,
             material: 0,
@@ -82,16 +85,18 @@ impl Primitive {
         }
     }
 
+    /// Returns true for the shell of the room.
     pub(super) fn is_shell(&self) -> bool {
         self.form == Form::Shell
     }
 
-    fn own(&self, in_world: Vec3) -> Vec3 {
-        self.own_from_world * (in_world - self.centre)
+    /// Transforms a world point to the local frame.
+    fn to_local(&self, in_world: Vec3) -> Vec3 {
+        self.local_from_world * (in_world - self.centre)
     }
 
-    /// Nearest parameter in (T_MIN, `t_max`) at which the ray enters the solid (leaves
-    /// it, for the shell). A ray that starts inside a solid does not see it.
+    /// Returns the smallest parameter in (T_MIN, `t_max`) at which the ray enters the solid (leaves
+    /// it, for the shell). A ray that starts inside a solid does not hit it.
     pub(super) fn intersect(&self, ray: &Ray, t_max: f32) -> Option<f32> {
         let offset = ray.origin - self.centre;
         if self.form != Form::Shell {
@@ -103,7 +108,7 @@ impl Primitive {
                 return None;
             }
         }
-        let (o, d) = (self.own_from_world * offset, self.own_from_world * ray.direction);
+        let (o, d) = (self.local_from_world * offset, self.local_from_world * ray.direction);
         let t = match self.form {
             Form::Shell => slabs(o, d, self.half).1,
             Form::Block => {
@@ -119,9 +124,9 @@ impl Primitive {
         (t > T_MIN && t < t_max).then_some(t)
     }
 
-    /// The surface near `in_world`, a point on it up to rounding.
+    /// Returns the surface properties near `in_world`, a point on the surface up to rounding.
     pub(super) fn surface(&self, in_world: Vec3) -> Surface {
-        let p = self.own(in_world);
+        let p = self.to_local(in_world);
         let (normal, uv, face) = match self.form {
             Form::Shell | Form::Block => {
                 let depth = p.abs() - self.half;
@@ -150,13 +155,13 @@ impl Primitive {
                 }
             }
         };
-        Surface { normal: (self.world_from_own * normal).normalize_or(Vec3::NEG_Y), uv, face }
+        Surface { normal: (self.world_from_local * normal).normalize_or(Vec3::NEG_Y), uv, face }
     }
 
-    /// Distance from `in_world` to the solid, m, negative inside (outside, for the
-    /// shell); exact for boxes, first-order for the others.
+    /// Returns the distance from `in_world` to the solid, m; negative inside (outside, for the
+    /// shell). It is exact for boxes and first-order for the others.
     pub(super) fn distance(&self, in_world: Vec3) -> f32 {
-        let p = self.own(in_world);
+        let p = self.to_local(in_world);
         match self.form {
             Form::Shell => (self.half - p.abs()).min_element(),
             Form::Block => box_distance(p.abs() - self.half),
@@ -180,17 +185,18 @@ impl Primitive {
     }
 }
 
-/// First-order distance to an ellipse or ellipsoid from `k` = |p/h| and `slope` =
+/// Returns the first-order distance to an ellipse or ellipsoid from `k` = |p/h| and `slope` =
 /// |p/h²|: (k − 1) over the length of its gradient.
-fn implicit_distance(k: f32, slope: f32, least: f32) -> f32 {
-    if k < 1e-3 { -least } else { k * (k - 1.0) / slope }
+fn implicit_distance(k: f32, slope: f32, smallest_half: f32) -> f32 {
+    if k < 1e-3 { -smallest_half } else { k * (k - 1.0) / slope }
 }
 
+/// Returns the distance to a box from the signed distances to its slabs.
 fn box_distance(out: Vec3) -> f32 {
     out.max(Vec3::ZERO).length() + out.max_element().min(0.0)
 }
 
-/// Axis of the largest entry of `size`, and whether `p` is positive there.
+/// Returns the axis of the largest entry of `size`, and true if `p` is positive there.
 fn largest(size: Vec3, p: Vec3) -> (usize, bool) {
     let axis = if size.x >= size.y && size.x >= size.z {
         0
@@ -202,8 +208,8 @@ fn largest(size: Vec3, p: Vec3) -> (usize, bool) {
     (axis, p[axis] >= 0.0)
 }
 
-/// Horizontal and vertical position on a face across `axis`, m: v is the own y on
-/// upright faces.
+/// Returns horizontal and vertical position on a face perpendicular to `axis`, m. v is the local y
+/// on upright faces.
 fn face_uv(p: Vec3, axis: usize) -> Vec2 {
     match axis {
         0 => Vec2::new(p.z, p.y),
@@ -212,8 +218,8 @@ fn face_uv(p: Vec3, axis: usize) -> Vec2 {
     }
 }
 
-/// Parameters at which a line enters and leaves a box of half size `half`. `f32::min`
-/// and `max` drop the NaN of 0 · ∞, a line within a face.
+/// Returns the parameters at which a line enters and leaves a box of half size `half`. `f32::min`
+/// and `max` discard the NaN of 0 · ∞ for a line within a face.
 fn slabs(o: Vec3, d: Vec3, half: Vec3) -> (f32, f32) {
     let (mut enter, mut leave) = (f32::NEG_INFINITY, f32::INFINITY);
     for axis in 0..3 {
@@ -226,17 +232,16 @@ fn slabs(o: Vec3, d: Vec3, half: Vec3) -> (f32, f32) {
     (enter, leave)
 }
 
-/// First parameter on the unit sphere.
+/// Returns the first parameter on the unit sphere.
 fn ellipsoid(o: Vec3, d: Vec3) -> Option<f32> {
     let (a, b) = (d.length_squared(), o.dot(d));
-    // |o|² − b²/a as the squared distance of line and centre: less cancellation than
-    // b² − a·c for a small sphere far away.
+    // |o|² − b²/a is the squared distance of line and centre. It has less cancellation than b² − a·c for a small, distant sphere.
     let nearest = o - d * (b / a);
     let inside = 1.0 - nearest.length_squared();
     (inside > 0.0).then(|| -b / a - (inside / a).sqrt())
 }
 
-/// First parameter on the unit cylinder |x, z| ≤ 1, |y| ≤ 1.
+/// Returns the first parameter on the unit cylinder |x, z| ≤ 1, |y| ≤ 1.
 fn cylinder(o: Vec3, d: Vec3) -> Option<f32> {
     let (o2, d2) = (Vec2::new(o.x, o.z), Vec2::new(d.x, d.z));
     let (mut enter, mut leave) = (f32::NEG_INFINITY, f32::INFINITY);
@@ -280,11 +285,11 @@ mod tests {
         Primitive::new(form, vector(rng, 1.0), Mat3::from_quat(q), half)
     }
 
-    /// Steps along the ray by a hundredth of the smallest size until the sign of the
-    /// solid's own inequality changes.
+    /// Advances along the ray by a hundredth of the smallest size until the sign of the solid's
+    /// implicit function changes.
     fn marched(p: &Primitive, ray: &Ray) -> Option<f32> {
         let inside = |t: f32| {
-            let q = p.own(ray.at(t)) / p.half;
+            let q = p.to_local(ray.at(t)) / p.half;
             match p.form {
                 Form::Shell | Form::Block => q.abs().max_element() < 1.0,
                 Form::Ellipsoid => q.length() < 1.0,
@@ -303,7 +308,7 @@ mod tests {
             for _ in 0..300 {
                 let p = placed(form, &mut rng);
                 let origin = if form == Form::Shell {
-                    p.centre + p.world_from_own * (p.half * vector(&mut rng, 0.9))
+                    p.centre + p.world_from_local * (p.half * vector(&mut rng, 0.9))
                 } else {
                     p.centre + vector(&mut rng, 1.0).normalize() * 3.0
                 };
@@ -318,7 +323,7 @@ mod tests {
                         hits += 1;
                     }
                     (None, None) => misses += 1,
-                    // A graze shorter than a step.
+                    // A grazing hit shorter than a step.
                     (Some(t), None) => {
                         assert!(p.distance(ray.at(t + 1e-3)).abs() < 2e-3);
                     }
@@ -343,7 +348,7 @@ mod tests {
                 let Some(t) = p.intersect(&ray, 1e9) else { continue };
                 let (point, h) = (ray.at(t), 2e-3);
                 let normal = p.surface(point).normal;
-                // Distance grows along the normal, and not across it.
+                // The distance increases along the normal with slope 1.
                 let step = |v: Vec3| (p.distance(point + v * h) - p.distance(point)) / h;
                 assert!((step(normal) - 1.0).abs() < 0.05, "{form:?} {}", step(normal));
             }

@@ -1,14 +1,14 @@
-//! Periodic fields with the statistics of natural pictures: scale-free noise, dead
-//! leaves, stripes, strokes, tiles, grain and level sets.
+//! Synthesises periodic fields with the statistics of natural pictures: scale-free noise, dead
+//! leaves, stripes, text-like strokes, tiles, grain and level sets.
 //!
-//! Spectra: the amplitude of pictures falls about as 1/f (Field 1987; Ruderman 1994),
-//! and opaque shapes whose radii follow an inverse cube law give the same slope with
-//! real edges (dead leaves: Lee, Mumford and Huang 2001). Everything wraps around.
+//! The amplitude spectrum of pictures falls about as 1/f (Field 1987; Ruderman 1994). Opaque shapes
+//! whose radii follow an inverse cube law have the same slope and real edges (dead leaves: Lee,
+//! Mumford and Huang 2001). All fields are periodic in both directions.
 
 use super::rng::Rng;
 use super::texture::Kind;
 
-/// Two square fields, row-major, values meant for [0, 1].
+/// Two square fields, row-major, with values intended for [0, 1].
 #[derive(Clone)]
 pub(super) struct Fields {
     /// Side, px; a power of two.
@@ -18,10 +18,12 @@ pub(super) struct Fields {
 }
 
 impl Fields {
+    /// Returns constant fields.
     pub(super) fn filled(size: usize, a: f32, b: f32) -> Self {
         Self { size, a: vec![a; size * size], b: vec![b; size * size] }
     }
 
+    /// Evaluates `f(x, y)` for every texel.
     fn from_fn(size: usize, f: impl Fn(usize, usize) -> [f32; 2]) -> Self {
         let mut fields = Self::filled(size, 0.0, 0.0);
         for y in 0..size {
@@ -34,33 +36,32 @@ impl Fields {
         fields
     }
 
-    /// Blends a shape over what is there, wrapped around. `shape` gets the offset of
-    /// a texel centre from (`cx`, `cy`), px, at most `reach` away, and gives coverage
-    /// and value.
-    fn stamp(&mut self, [cx, cy]: [f32; 2], reach: f32, shape: impl Fn(f32, f32) -> Dab) {
+    /// Blends a shape over the fields, periodically. `shape` receives the offset of a texel centre
+    /// from (`cx`, `cy`), px, at most `reach`, and returns coverage and value.
+    fn stamp(&mut self, [cx, cy]: [f32; 2], reach: f32, shape: impl Fn(f32, f32) -> Stamp) {
         let n = self.size as i64;
         let rows = (cy - reach).floor() as i64..=(cy + reach).ceil() as i64;
         for y in rows {
             let row = (y.rem_euclid(n) * n) as usize;
             for x in (cx - reach).floor() as i64..=(cx + reach).ceil() as i64 {
-                let dab = shape(x as f32 + 0.5 - cx, y as f32 + 0.5 - cy);
-                if dab.cover > 0.0 {
+                let stamp = shape(x as f32 + 0.5 - cx, y as f32 + 0.5 - cy);
+                if stamp.coverage > 0.0 {
                     let i = row + x.rem_euclid(n) as usize;
-                    self.a[i] += dab.cover * (dab.value[0] - self.a[i]);
-                    self.b[i] += dab.cover * (dab.value[1] - self.b[i]);
+                    self.a[i] += stamp.coverage * (stamp.value[0] - self.a[i]);
+                    self.b[i] += stamp.coverage * (stamp.value[1] - self.b[i]);
                 }
             }
         }
     }
 }
 
-/// What a stamped shape does to one texel.
-struct Dab {
-    cover: f32,
+/// Effect of a stamped shape on one texel.
+struct Stamp {
+    coverage: f32,
     value: [f32; 2],
 }
 
-/// The fields of one texture of `kind`.
+/// Synthesises one texture of `kind`.
 pub(super) fn fields(kind: Kind, size: usize, rng: &mut Rng) -> Fields {
     match kind {
         Kind::Noise => noise(size, rng),
@@ -68,20 +69,20 @@ pub(super) fn fields(kind: Kind, size: usize, rng: &mut Rng) -> Fields {
         Kind::Stripes => stripes(size, rng),
         Kind::Text => text(size, rng),
         Kind::Tiles => tiles(size, rng),
-        Kind::Grain if rng.chance(0.5) => levelled(planks(size, rng)),
-        Kind::Grain => levelled(weave(size, rng)),
+        Kind::Grain if rng.chance(0.5) => normalised(planks(size, rng)),
+        Kind::Grain => normalised(weave(size, rng)),
         Kind::Blobs => blobs(size, rng),
     }
 }
 
-/// The first field brought to mean ½ and deviation [`SIGMA`].
-fn levelled(mut fields: Fields) -> Fields {
+/// Scales the first field to mean ½ and deviation [`SIGMA`].
+fn normalised(mut fields: Fields) -> Fields {
     standardised(&mut fields.a);
     fields.a.iter_mut().for_each(|v| *v = 0.5 + SIGMA * *v);
     fields
 }
 
-/// To mean 0 and variance 1.
+/// Scales a field to mean 0 and variance 1.
 fn standardised(field: &mut [f32]) {
     let n = field.len().max(1) as f64;
     let mean = field.iter().map(|v| f64::from(*v)).sum::<f64>() / n;
@@ -90,8 +91,8 @@ fn standardised(field: &mut [f32]) {
     field.iter_mut().for_each(|v| *v = ((f64::from(*v) - mean) * scale) as f32);
 }
 
-/// Twice the size along the inner axis, periodic; two passes of it and further octaves
-/// interpolate by a quadratic B-spline.
+/// Doubles the size along the inner axis, periodically. Two passes with further octaves interpolate
+/// by a quadratic B-spline.
 fn doubled(row: &[f32], out: &mut Vec<f32>) {
     let n = row.len();
     for i in 0..n {
@@ -101,6 +102,7 @@ fn doubled(row: &[f32], out: &mut Vec<f32>) {
     }
 }
 
+/// Doubles the size along the outer axis, periodically.
 fn doubled_rows(field: &[f32], width: usize) -> Vec<f32> {
     let height = field.len() / width;
     let mut out = Vec::with_capacity(2 * field.len());
@@ -114,16 +116,17 @@ fn doubled_rows(field: &[f32], width: usize) -> Vec<f32> {
     out
 }
 
-/// Noise of mean 0 and variance 1 whose amplitude spectrum falls as 1/f^`exponent`:
-/// white noise on every octave's lattice, each with 2^(1 − exponent) times the
-/// amplitude of the coarser one (an octave of twice the frequency has four times the
-/// area to spread its power over). `stretch` octaves longer along x than along y.
+/// Returns noise of mean 0 and variance 1 whose amplitude spectrum falls as 1/f^`exponent`.
+///
+/// Every octave adds white noise on its lattice. Its amplitude is 2^(1 − exponent) times that of
+/// the next coarser octave, because an octave of twice the frequency has four times the area for
+/// its power. The field is `stretch` octaves longer along x than along y.
 pub(super) fn scale_free(size: usize, exponent: f32, stretch: usize, rng: &mut Rng) -> Vec<f32> {
     let (mut width, mut height) = (2, (2 << stretch).min(size));
     let mut field: Vec<f32> = (0..width * height).map(|_| rng.normal()).collect();
     let mut amplitude = 1.0;
     while width < size || height < size {
-        let fresh = height < size;
+        let adds_octave = height < size;
         if height < size {
             field = doubled_rows(&field, width);
             height *= 2;
@@ -134,7 +137,7 @@ pub(super) fn scale_free(size: usize, exponent: f32, stretch: usize, rng: &mut R
             field = out;
             width *= 2;
         }
-        if fresh {
+        if adds_octave {
             amplitude *= (1.0 - exponent).exp2();
             field.iter_mut().for_each(|v| *v += amplitude * rng.normal());
         }
@@ -143,9 +146,10 @@ pub(super) fn scale_free(size: usize, exponent: f32, stretch: usize, rng: &mut R
     field
 }
 
-/// Standard deviation of noise around ½ in a field: 2.8σ fit before the clip.
+/// Standard deviation of noise around ½ in a field: the range [0, 1] covers ±2.8σ.
 const SIGMA: f32 = 0.18;
 
+/// Synthesises isotropic noise.
 fn noise(size: usize, rng: &mut Rng) -> Fields {
     let exponent = rng.range(0.8, 1.7);
     let field = |rng: &mut Rng| -> Vec<f32> {
@@ -154,19 +158,20 @@ fn noise(size: usize, rng: &mut Rng) -> Fields {
     Fields { size, a: field(rng), b: field(rng) }
 }
 
-/// Radius, px, with density ∝ r⁻³ from `low` to `high`.
+/// Samples a radius, px, with density ∝ r⁻³ from `low` to `high`.
 fn leaf_radius(low: f32, high: f32, rng: &mut Rng) -> f32 {
     let (a, b) = (1.0 / (low * low), 1.0 / (high * high));
     1.0 / (a + (b - a) * rng.unit()).sqrt()
 }
 
+/// Synthesises dead leaves: opaque ellipses and rectangles.
 fn leaves(size: usize, rng: &mut Rng) -> Fields {
     let mut fields = Fields::filled(size, rng.unit(), rng.unit());
     let grain = scale_free(size, 1.1, 0, rng);
     let grain_amplitude = rng.range(0.0, 0.08);
     let boxes = rng.unit();
     let (low, high) = (rng.log_range(1.5, 5.0), size as f32 * rng.range(0.08, 0.25));
-    // Shapes of three times the area in all leave 5 % of the ground bare.
+    // Shapes of three times the total area leave 5 % of the background uncovered.
     let mut area = 3.0 * (size * size) as f32;
     while area > 0.0 {
         let r = leaf_radius(low, high, rng);
@@ -182,7 +187,10 @@ fn leaves(size: usize, rng: &mut Rng) -> Fields {
             } else {
                 ((x / half[0]).hypot(y / half[1]) - 1.0) * half[1]
             };
-            Dab { cover: (0.5 - distance).clamp(0.0, 1.0), value: [value[0] + slope * x, value[1]] }
+            Stamp {
+                coverage: (0.5 - distance).clamp(0.0, 1.0),
+                value: [value[0] + slope * x, value[1]],
+            }
         });
         area -= std::f32::consts::PI * half[0] * half[1];
     }
@@ -192,8 +200,9 @@ fn leaves(size: usize, rng: &mut Rng) -> Fields {
     fields
 }
 
+/// Synthesises parallel bands.
 fn stripes(size: usize, rng: &mut Rng) -> Fields {
-    // Widths at four times the resolution, then averaged: soft edges of one texel.
+    // Widths at four times the resolution, then averaged: edges have a width of one texel.
     const FINE: usize = 4;
     let colours: Vec<[f32; 2]> = (0..rng.count(2, 5)).map(|_| [rng.unit(), rng.unit()]).collect();
     let mean_width = rng.log_range(0.012, 0.12) * (size * FINE) as f32;
@@ -215,6 +224,7 @@ fn stripes(size: usize, rng: &mut Rng) -> Fields {
     Fields::from_fn(size, |x, y| [column[x][0] + amount * wear[y * size + x], column[x][1]])
 }
 
+/// Synthesises lines of glyph-like strokes.
 fn text(size: usize, rng: &mut Rng) -> Fields {
     let mut fields = Fields::filled(size, 0.0, 0.0);
     let side = size as f32;
@@ -238,13 +248,13 @@ fn text(size: usize, rng: &mut Rng) -> Fields {
     }
     let paper = scale_free(size, 1.2, 0, rng);
     for (a, p) in fields.a.iter_mut().zip(&paper) {
-        // Paper at 0.05, so that its grain does not clip.
+        // A background of 0.05 keeps its noise above the clip.
         *a = 0.05 + 0.9 * *a + 0.015 * p;
     }
     fields
 }
 
-/// Two to four strokes between the points of a 3×4 grid in a cell of the line's height.
+/// Draws two to four strokes between the points of a 3×4 grid in a cell of the line's height.
 fn glyph(fields: &mut Fields, [left, top]: [f32; 2], line: f32, tint: f32, rng: &mut Rng) {
     let thickness = line * rng.range(0.07, 0.12);
     let point = |rng: &mut Rng| {
@@ -260,12 +270,13 @@ fn glyph(fields: &mut Fields, [left, top]: [f32; 2], line: f32, tint: f32, rng: 
         fields.stamp(centre, square.sqrt() + thickness + 1.0, |dx, dy| {
             let t = ((dx * ex + dy * ey) / square).clamp(-1.0, 1.0);
             let distance = (dx - t * ex).hypot(dy - t * ey) - 0.5 * thickness;
-            Dab { cover: (0.5 - distance).clamp(0.0, 1.0), value: [1.0, tint] }
+            Stamp { coverage: (0.5 - distance).clamp(0.0, 1.0), value: [1.0, tint] }
         });
         from = to;
     }
 }
 
+/// Synthesises tiles or bricks with grout.
 fn tiles(size: usize, rng: &mut Rng) -> Fields {
     let bond = rng.chance(0.5);
     let rows = [2, 4, 6, 8, 10][rng.count(0, 4)];
@@ -291,6 +302,7 @@ fn tiles(size: usize, rng: &mut Rng) -> Fields {
     })
 }
 
+/// Synthesises wooden boards.
 fn planks(size: usize, rng: &mut Rng) -> Fields {
     let rows = [1, 2, 4, 8][rng.count(0, 3)];
     let (fine, rings) =
@@ -310,8 +322,9 @@ fn planks(size: usize, rng: &mut Rng) -> Fields {
     })
 }
 
+/// Synthesises woven cloth.
 fn weave(size: usize, rng: &mut Rng) -> Fields {
-    // Whole threads around the period; at least eight texels each.
+    // A whole number of threads per period; at least eight texels each.
     let threads = rng.count(size / 64, size / 8) as f32;
     let (along, across) = (scale_free(size, 1.0, 4, rng), scale_free(size, 1.0, 4, rng));
     let soft = scale_free(size, 1.5, 0, rng);
@@ -325,6 +338,7 @@ fn weave(size: usize, rng: &mut Rng) -> Fields {
     })
 }
 
+/// Synthesises smoothed level sets of noise.
 fn blobs(size: usize, rng: &mut Rng) -> Fields {
     let exponent = rng.range(1.0, 1.8);
     let (noise, other) = (scale_free(size, exponent, 0, rng), scale_free(size, exponent, 0, rng));
@@ -344,7 +358,7 @@ mod tests {
     use super::super::texture::BANK;
     use super::*;
 
-    /// Power |F(u, v)|² of a square field by the definition, rows then columns.
+    /// Returns the power |F(u, v)|² of a square field by the definition, rows then columns.
     fn power(field: &[f32], n: usize) -> Vec<f64> {
         let wave: Vec<(f64, f64)> =
             (0..n).map(|k| (std::f64::consts::TAU * k as f64 / n as f64).sin_cos()).collect();
@@ -369,7 +383,7 @@ mod tests {
         pass(&pass(&start)).iter().map(|(re, im)| re * re + im * im).collect()
     }
 
-    /// Slope of log power over log frequency, from 3 cycles to a quarter of the side.
+    /// Returns the slope of log power over log frequency, from 3 cycles to a quarter of the side.
     fn slope(field: &[f32], n: usize) -> f64 {
         let power = power(field, n);
         let mut rings = vec![(0.0, 0u32); n];
@@ -383,7 +397,7 @@ mod tests {
         }
         let points: Vec<(f64, f64)> = (3..=n / 4)
             .map(|f| ((f as f64).ln(), (rings[f].0 / f64::from(rings[f].1)).ln()))
-            // As many points per octave low and high: weight by thinning.
+            // Subsampling gives low and high octaves the same number of points.
             .enumerate()
             .filter(|(i, _)| (*i).is_power_of_two() || *i % 5 == 0)
             .map(|(_, p)| p)
@@ -400,7 +414,7 @@ mod tests {
     const N: usize = 128;
 
     #[test]
-    fn noise_has_the_spectrum_that_it_was_asked_for() {
+    fn noise_has_the_requested_spectrum() {
         let mut rng = Rng::new(1);
         for exponent in [0.8, 1.2, 1.7] {
             let slopes = (0..4).map(|_| slope(&scale_free(N, exponent, 0, &mut rng), N));
@@ -412,7 +426,7 @@ mod tests {
     }
 
     #[test]
-    fn dead_leaves_fall_as_pictures_do() {
+    fn dead_leaves_have_the_spectrum_of_pictures() {
         let mut rng = Rng::new(2);
         let slopes = (0..6).map(|_| slope(&fields(Kind::Leaves, N, &mut rng).b, N));
         let mean = slopes.sum::<f64>() / 6.0;
@@ -432,7 +446,7 @@ mod tests {
     }
 
     #[test]
-    fn all_textures_of_the_bank_show_something_and_wrap() {
+    fn all_textures_of_the_bank_vary_and_are_periodic() {
         for index in 0..BANK {
             let mut rng = Rng::new(0).fork(index as u64);
             let f = fields(Kind::of(index), 64, &mut rng);
@@ -445,7 +459,7 @@ mod tests {
                 (f.a.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / f.a.len() as f32).sqrt();
             assert!(deviation > 0.02, "texture {index} {:?}: {deviation}", Kind::of(index));
         }
-        // The step over the seam is like the steps within.
+        // The step across the period's border is like the steps within.
         let mut rng = Rng::new(9);
         for kind in [Kind::Noise, Kind::Leaves, Kind::Blobs, Kind::Text] {
             let (mut seam, mut within) = (0.0, 0.0);

@@ -1,17 +1,17 @@
-//! Periodic textures with mipmaps, and the bank of 144 that every room draws from.
+//! Periodic textures with mipmaps, and the bank of 144 textures that all rooms share.
 //!
-//! A texture is two fields in [0, 1], never a colour: a material maps them to colour
-//! linearly, which commutes with the box filter of the mip levels, so one texture
-//! serves any palette without aliasing. `synthesis.rs` makes the fields.
+//! A texture is two fields in [0, 1] without colour. A material maps the fields to colour linearly.
+//! A linear map commutes with the box filter of the mip levels, so that one texture serves any
+//! palette without aliasing. `synthesis.rs` computes the fields.
 
 use super::rng::Rng;
 use super::synthesis::{self, Fields};
 use std::sync::{Arc, LazyLock, OnceLock};
 
-/// Number of textures in a bank, in the proportions of [`Kind::of`].
+/// Number of textures in a bank, in the proportions of [`SHARES`].
 pub(super) const BANK: usize = 144;
 
-/// What a texture shows.
+/// Kind of a texture.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Kind {
     /// Isotropic noise with amplitude spectrum 1/f^0.8 to 1/f^1.7.
@@ -20,17 +20,17 @@ pub(super) enum Kind {
     Leaves,
     /// Parallel bands.
     Stripes,
-    /// Lines of strokes that look like writing.
+    /// Lines of glyph-like strokes.
     Text,
     /// Tiles and bricks with grout.
     Tiles,
-    /// Wood and cloth: noise far longer along than across.
+    /// Wood and cloth: noise with a much larger scale along than across.
     Grain,
     /// Level sets of noise.
     Blobs,
 }
 
-/// Kinds and how many of the bank are of each: 22, 26, 8, 8, 10, 14, 12 %.
+/// Number of textures of each kind: 22, 26, 8, 8, 10, 14, 12 %.
 const SHARES: [(Kind, usize); 7] = [
     (Kind::Noise, 32),
     (Kind::Leaves, 37),
@@ -42,7 +42,7 @@ const SHARES: [(Kind, usize); 7] = [
 ];
 
 impl Kind {
-    /// The kind of the bank's texture `index`.
+    /// Returns the kind of the bank's texture `index`.
     pub(super) fn of(index: usize) -> Self {
         let mut first = 0;
         for (kind, count) in SHARES {
@@ -54,7 +54,7 @@ impl Kind {
         Self::Noise
     }
 
-    /// The bank's indices of this kind.
+    /// Returns the bank's indices of this kind.
     pub(super) fn indices(self) -> std::ops::Range<usize> {
         let mut first = 0;
         for (kind, count) in SHARES {
@@ -69,13 +69,13 @@ impl Kind {
 
 /// A square periodic texture of two fields and its mip levels, down to 1×1.
 pub(super) struct Texture {
-    /// Level l: `[size >> l]²` texels, both fields, 65535 is 1.
+    /// Level l: `[size >> l]²` texels, both fields; 65535 is 1.
     levels: Vec<Vec<[u16; 2]>>,
     size: usize,
 }
 
 impl Texture {
-    /// `fields` has a power of two as its side. Values are clipped to [0, 1].
+    /// Builds the mip levels. The side of `fields` is a power of two; values are clipped to [0, 1].
     pub(super) fn new(fields: &Fields) -> Self {
         let size = fields.size;
         let quantised = |v: f32| (v.clamp(0.0, 1.0) * 65_535.0 + 0.5) as u16;
@@ -102,14 +102,15 @@ impl Texture {
         Self { levels, size }
     }
 
-    /// Bilinear value at (u, v), in periods, on one level.
+    /// Returns the bilinear value at (u, v), in periods, on one level.
     fn bilinear(&self, level: usize, u: f32, v: f32) -> [f32; 2] {
         let side = self.size >> level;
         let mask = side - 1;
         let (x, y) = (u * side as f32 - 0.5, v * side as f32 - 0.5);
         let (x0, y0) = (x.floor(), y.floor());
         let (fx, fy) = (x - x0, y - y0);
-        // Negative positions wrap as two's complement does, since the side is a power of two.
+        // The mask wraps negative positions correctly in two's complement, because the side is a
+        // power of two.
         let (x0, y0) = (x0 as i64 as usize, y0 as i64 as usize);
         let (left, right) = (x0 & mask, x0.wrapping_add(1) & mask);
         let (top, bottom) = ((y0 & mask) * side, (y0.wrapping_add(1) & mask) * side);
@@ -123,8 +124,9 @@ impl Texture {
         [blend(0), blend(1)]
     }
 
-    /// Both fields at (u, v), in periods, averaged over about `footprint` periods:
-    /// linear between the two mip levels whose texels are nearest to it in size.
+    /// Returns both fields at (u, v), in periods, averaged over about `footprint` periods. The
+    /// value is linear between the two mip levels whose texels are closest to the footprint in
+    /// size.
     pub(super) fn sample(&self, u: f32, v: f32, footprint: f32) -> [f32; 2] {
         let last = self.levels.len() - 1;
         let lod = (footprint * self.size as f32).max(1.0).log2().min(last as f32);
@@ -139,7 +141,7 @@ impl Texture {
     }
 }
 
-/// The textures of one seed and size, each made when first asked for.
+/// The textures of one seed and size. Each is synthesised on its first use.
 pub struct TextureBank {
     seed: u64,
     size: usize,
@@ -155,26 +157,27 @@ impl std::fmt::Debug for TextureBank {
 
 /// Side of the shared bank's textures, px.
 const SHARED_SIZE: usize = 256;
-/// Seed of the shared bank: rooms of the same seed look alike in every process.
+/// Seed of the shared bank: rooms of the same seed are equal in every process.
 const SHARED_SEED: u64 = 0;
 
 static SHARED: LazyLock<Arc<TextureBank>> =
     LazyLock::new(|| Arc::new(TextureBank::new(SHARED_SEED, SHARED_SIZE)));
 
 impl TextureBank {
-    /// A bank of 144 textures, none made yet. `size` (px) is rounded up to a power of
-    /// two from 64 to 2048; 4 bytes × 4/3 × size² each once made.
+    /// Creates a bank of 144 textures without synthesising them. `size` (px) is rounded up to a
+    /// power of two from 64 to 2048. A synthesised texture takes 4 bytes × 4/3 × size².
     pub fn new(seed: u64, size: usize) -> Self {
         let size = size.clamp(64, 2048).next_power_of_two();
         Self { seed, size, slots: (0..BANK).map(|_| OnceLock::new()).collect() }
     }
 
-    /// The bank of 256² textures that [`super::Room::new`] uses: 50 MB when all are made.
+    /// Returns the bank of 256² textures that [`super::Room::new`] uses: 50 MB when all are
+    /// synthesised.
     pub fn shared() -> Arc<Self> {
         Arc::clone(&SHARED)
     }
 
-    /// Texture `index`, modulo the bank's size.
+    /// Returns texture `index`, modulo the bank's size.
     pub(super) fn get(&self, index: usize) -> &Texture {
         let index = index % BANK;
         self.slots[index].get_or_init(|| {

@@ -1,5 +1,4 @@
-"""Cases by name. A file of this folder with a dictionary CASES {name: function(case)}
-is found by itself."""
+"""All cases by name. Every file of this folder with a dictionary CASES {name: function(case)} is included."""
 
 import importlib
 import pkgutil

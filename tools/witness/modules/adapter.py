@@ -1,6 +1,5 @@
-"""MVSplat's Gaussian adapter (mvsplat.md, 6): raw heads to Gaussians in the world, with
-world quaternions wxyz, w >= 0. No weights; rotations of SH and quaternions come as
-inputs computed in f64."""
+"""MVSplat's Gaussian adapter: raw head outputs to Gaussians in the world frame, with world quaternions wxyz,
+w >= 0. It has no weights. Rotations of SH and quaternions are inputs, computed in f64."""
 
 import math
 
@@ -8,8 +7,8 @@ import numpy as np
 
 
 def real_sh(degree, directions):
-    """[n, (degree + 1)^2]: real spherical harmonics without Condon-Shortley sign, order
-    m = -l..l, polar axis y: (x_s, y_s, z_s) = (z, x, y)."""
+    """Returns [n, (degree + 1)^2]: real spherical harmonics without the Condon-Shortley sign, order m =
+    -l..l, polar axis y: (x_s, y_s, z_s) = (z, x, y)."""
     x, y, z = directions.T
     phi, columns = np.arctan2(x, z), []
     s = np.sqrt(np.maximum(0.0, 1 - y * y))
@@ -28,8 +27,8 @@ def real_sh(degree, directions):
     return np.stack(columns, 1)
 
 
-def sh_turn(degree, rotation):
-    """D with Y(R d) = D Y(d), block by degree: least squares over many directions."""
+def sh_rotation(degree, rotation):
+    """Returns D with Y(R d) = D Y(d), block by degree, by least squares over many directions."""
     i = np.arange(400) + 0.5
     polar, phi = np.arccos(1 - 2 * i / 400), np.pi * (1 + 5**0.5) * i
     d = np.stack([np.sin(polar) * np.cos(phi), np.sin(polar) * np.sin(phi), np.cos(polar)], 1)
@@ -42,7 +41,7 @@ def sh_turn(degree, rotation):
 
 
 def quaternion(r):
-    """wxyz of a rotation matrix: the eigenvector of the largest eigenvalue (Bar-Itzhack)."""
+    """Returns wxyz of a rotation matrix: the eigenvector of the largest eigenvalue (Bar-Itzhack)."""
     (a, b, c), (d, e, f), (g, h, i) = r
     k = np.array([[a + e + i, h - f, c - g, d - b], [h - f, a - e - i, b + d, c + g],
                   [c - g, b + d, e - a - i, f + h], [d - b, c + g, f + h, i - a - e]])
@@ -51,28 +50,29 @@ def quaternion(r):
 
 
 def mask(degree):
+    """Returns MVSplat's factors on the SH coefficients."""
     return np.concatenate([[1.0] if l == 0 else [0.1 * 0.25**l] * (2 * l + 1) for l in range(degree + 1)])
 
 
 def frames(c, poses, intrinsics, degree=4):
-    """Graph inputs of the views: rotation [V, 3, 3], origin [V, 3], intrinsics [V, 4] px,
+    """Declares the graph inputs of the views: rotation [V, 3, 3], origin [V, 3], intrinsics [V, 4] px,
     quaternion [V, 4] of the camera, sh_turn [V, 25, 25]."""
     r = poses[:, :3, :3]
-    return {"rotation": c.given("rotation", r), "origin": c.given("origin", poses[:, :3, 3]),
-            "intrinsics": c.given("intrinsics", intrinsics),
-            "quaternion": c.given("quaternion", [quaternion(m) for m in r]),
-            "sh_turn": c.given("sh_turn", [sh_turn(degree, m) for m in r])}
+    return {"rotation": c.stored_input("rotation", r), "origin": c.stored_input("origin", poses[:, :3, 3]),
+            "intrinsics": c.stored_input("intrinsics", intrinsics),
+            "quaternion": c.stored_input("quaternion", [quaternion(m) for m in r]),
+            "sh_turn": c.stored_input("sh_turn", [sh_rotation(degree, m) for m in r])}
 
 
 def product(g, a, b):
-    """Hamilton product a * b of wxyz, a [..., 4], b [..., 4]."""
+    """Returns the Hamilton product a * b of wxyz, a [..., 4], b [..., 4]."""
     (aw, ax, ay, az), (bw, bx, by, bz) = ([q[..., i:i + 1] for i in range(4)] for q in (a, b))
     return g.concat([aw * bw - ax * bx - ay * by - az * bz, aw * bx + ax * bw + ay * bz - az * by,
                      aw * by - ax * bz + ay * bw + az * bx, aw * bz + ax * by - ay * bx + az * bw], -1)
 
 
 def adapt(g, raw, depths, densities, frames, height, width, exponent=0.0):
-    """raw [V, P, 84], depths and densities [V, P, G]: tensors [V * P * G, ...]."""
+    """Converts raw [V, P, 84], depths and densities [V, P, G] to tensors [V * P * G, ...]."""
     v, p, channels = raw.shape
     n, gpp = (channels - 9) // 3, depths.shape[2]
     norm = lambda x: g.sqrt((x * x).sum(-1, keep=True))
@@ -96,7 +96,7 @@ def adapt(g, raw, depths, densities, frames, height, width, exponent=0.0):
     world = world / norm(world)
     world = g.where(world[..., 0:1] < 0.0, -world, world)
     camera = sh.reshape(v, p * 3, n) * g.const(mask(4))
-    turned = camera @ frames["sh_turn"].transpose(0, 2, 1)
+    rotated = camera @ frames["sh_turn"].transpose(0, 2, 1)
     alpha = densities
     if exponent:
         e = 2.0**exponent
@@ -104,7 +104,7 @@ def adapt(g, raw, depths, densities, frames, height, width, exponent=0.0):
     shared = lambda x, dims: g.broadcast(x.reshape((v, p, 1) + dims), (v, p, gpp) + dims).reshape((v * p * gpp,) + dims)
     count = v * p * gpp
     return {"means": means.reshape(count, 3), "quats": shared(world, (4,)), "scales": scales.reshape(count, 3),
-            "opacities": (alpha * (1 / gpp)).reshape(count), "sh": shared(turned, (3, n)),
+            "opacities": (alpha * (1 / gpp)).reshape(count), "sh": shared(rotated, (3, n)),
             "sh_camera": shared(camera, (3, n))}
 
 
@@ -112,13 +112,13 @@ STRIDES = {"sh": 37, "sh_camera": 37, "means": 2, "scales": 2, "quats": 3, "opac
 
 
 def case(c):
-    """Two Gaussians a pixel and an opacity mapping that is not the identity."""
+    """Two Gaussians per pixel and an opacity mapping that is not the identity."""
     v, height, width, gpp = 2, 12, 20, 2
     poses, intrinsics, _ = (a.astype(np.float64) for a in c.cameras(v, height, width))
     f = frames(c, poses, intrinsics)
-    raw = c.drawn("raw", (v, height * width, 84), -2.0, 2.0)
-    depths = c.drawn("depths", (v, height * width, gpp), 1.0, 9.0)
-    densities = c.drawn("densities", (v, height * width, gpp), 0.01, 0.99)
+    raw = c.random_input("raw", (v, height * width, 84), -2.0, 2.0)
+    depths = c.random_input("depths", (v, height * width, gpp), 1.0, 9.0)
+    densities = c.random_input("densities", (v, height * width, gpp), 0.01, 0.99)
     for name, value in adapt(c.g, raw, depths, densities, f, height, width, exponent=0.7).items():
         c.output(name, value, stride=STRIDES[name])
 

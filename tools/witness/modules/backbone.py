@@ -1,5 +1,5 @@
-"""MVSplat's encoder in one graph: images and cameras of one scene to raw heads, feature
-maps and primaries."""
+"""MVSplat's encoder in one graph: images and cameras of one scene to raw head outputs, feature maps and
+primaries."""
 
 from .adapter import adapt, frames
 from .adapter import STRIDES as ADAPTER_STRIDES
@@ -12,10 +12,10 @@ CHANNELS, LAYERS = (8, 12, 16), 2
 
 
 def encode(c, views, height, width, far=20.0):
-    """Inputs, then (encoder's stages and feature maps, primaries, frames)."""
+    """Declares the inputs and returns (encoder's stages and feature maps, primaries, frames)."""
     g = c.g
     geo = geometry(c, views, height, width, far=far)
-    images = c.drawn("images", (views, 3, height, width), 0.0, 1.0)
+    images = c.random_input("images", (views, 3, height, width), 0.0, 1.0)
     half, quarter = cnn(g, images, CHANNELS)
     trans = transformer(g, quarter, LAYERS)
     out = predict(g, images, quarter, trans, geo, SMALL)

@@ -1,4 +1,4 @@
-"""MVSplat's CNN (mvsplat.md, 1): images [N, 3, H, W] in [0, 1] to maps at 1/2 and 1/4."""
+"""MVSplat's CNN: images [N, 3, H, W] in [0, 1] to maps at 1/2 and 1/4."""
 
 import numpy as np
 
@@ -27,16 +27,16 @@ def cnn(g, images, channels, name="backbone.backbone"):
 
 
 def case(c):
-    half, quarter = cnn(c.g, c.drawn("images", (2, 3, 32, 48), 0.0, 1.0), (8, 12, 16))
+    half, quarter = cnn(c.g, c.random_input("images", (2, 3, 32, 48), 0.0, 1.0), (8, 12, 16))
     c.output("half", half, stride=3)
     c.output("quarter", quarter)
 
 
 def dim_case(c):
-    """A picture of hardly any contrast about the colour that normalises to 0 (so that the
-    zero padding makes none either): the first layer's variance is near eps."""
-    noise = formula.drawn(c.seed, "noise", (1, 3, 32, 32), -0.003, 0.003)
-    images = c.given("images", np.array(MEAN, np.float32).reshape(1, 3, 1, 1) + noise)
+    """A picture of very low contrast around the colour that normalises to 0, so that the zero padding adds no
+    contrast either. The first layer's variance is close to eps."""
+    noise = formula.uniform_input(c.seed, "noise", (1, 3, 32, 32), -0.003, 0.003)
+    images = c.stored_input("images", np.array(MEAN, np.float32).reshape(1, 3, 1, 1) + noise)
     half, quarter = cnn(c.g, images, (8, 12, 16))
     c.output("half", half, stride=3)
     c.output("quarter", quarter)

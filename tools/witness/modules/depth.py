@@ -1,4 +1,4 @@
-"""MVSplat's depth predictor (mvsplat.md, 4 and 5) of one scene, one Gaussian a pixel."""
+"""MVSplat's depth predictor of one scene, one Gaussian per pixel."""
 
 from .sweep import candidates, correlation, geometry
 from .unet import unet
@@ -19,7 +19,7 @@ def refined_volume(g, volume, features, s):
 
 
 def predict(g, images, cnn, trans, geo, s):
-    """images [V, 3, H, W]; cnn, trans [V, C, H/4, W/4]. Every stage by name."""
+    """images [V, 3, H, W]; cnn, trans [V, C, H/4, W/4]. Returns every stage by name."""
     v, _, height, width = images.shape
     _, c, h, w = trans.shape
     d, r = s["depth_candidates"], s["refine_channels"]
@@ -50,7 +50,7 @@ def predict(g, images, cnn, trans, geo, s):
             "densities": g.sigmoid(delta[:, 1:2]).reshape(v, height * width, 1)}
 
 
-# Channels of narrow layers; the structure is the released one.
+# Reduced numbers of channels; the structure is that of the released network.
 SMALL = {"depth_candidates": 24, "costvolume_channels": 32, "costvolume_levels": 3, "refine_channels": 32,
          "refine_levels": 5}
 STRIDES = {"correlation": 7, "refined_volume": 7, "pdf": 7, "fullres_disp": 7, "upsampled": 53, "projected": 101,
@@ -60,8 +60,8 @@ STRIDES = {"correlation": 7, "refined_volume": 7, "pdf": 7, "fullres_disp": 7, "
 def case(c):
     v, height, width = 2, 32, 48
     geo = geometry(c, v, height, width)
-    images = c.drawn("images", (v, 3, height, width), 0.0, 1.0)
-    cnn, trans = (c.drawn(n, (v, 16, height // 4, width // 4), -2.0, 2.0) for n in ("cnn", "trans"))
+    images = c.random_input("images", (v, 3, height, width), 0.0, 1.0)
+    cnn, trans = (c.random_input(n, (v, 16, height // 4, width // 4), -2.0, 2.0) for n in ("cnn", "trans"))
     for name, value in predict(c.g, images, cnn, trans, geo, SMALL).items():
         c.output(name, value, stride=STRIDES.get(name, 1))
 

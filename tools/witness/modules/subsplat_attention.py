@@ -1,15 +1,15 @@
-"""Feature aggregation (paper A.2; spec 1.2 to 1.6): every sample is a GridSample of its own, every softmax is over the
-samples of all views, levels and points laid side by side."""
+"""Feature aggregation (SubSplat, supplement A.2): one GridSample per sample, and a softmax over the samples
+of all views, levels and points together."""
 
 import numpy as np
 from . import subsplat_geometry as geo
 
-# kappa of the fixed key points: the centre and +-0.45 on each axis (spec 1.4).
+# kappa of the fixed key points: the centre and +-0.45 on each axis (PixelGaussian).
 FIXED = np.array([[0, 0, 0]] + [[s * 0.45 * (i == j) for j in range(3)] for i in range(3) for s in (1, -1)])
 
 
 def resolved(keys):
-    """`strict_literal` spelled out: the bare equation (spec 1.6, last lines)."""
+    """Replaces `strict_literal` by the settings of the bare equation of A.2."""
     if not keys["strict_literal"]:
         return keys
     return {**keys, "levels": ["trans4"], "op": "dot", "points": "ref", "groups": 1, "logit_scale": "one",
@@ -20,18 +20,18 @@ def resolved(keys):
 class Attention:
     """Attention of N parents over the maps of V views.
 
-    maps: {level: [V, C, h, w]}; parents: means, quats, scales of all N, in view and pixel order; size: (W, H) of the
-    pictures."""
+    maps: {level: [V, C, h, w]}; parents: means, quats, scales of all N, in view and pixel order; size: (W, H)
+    of the pictures."""
 
     def __init__(self, g, keys, dim, maps, views, parents, per_view, name="subsplat.agg"):
         self.g, self.keys, self.dim, self.name = g, resolved(keys), dim, name
         self.views, self.parents, self.per_view = views, parents, per_view
         self.n = parents["means"].shape[0]
-        self.maps = [self.widened(i, maps[level]) for i, level in enumerate(self.keys["levels"])]
+        self.maps = [self.with_embedding_width(i, maps[level]) for i, level in enumerate(self.keys["levels"])]
         self.occlusion = self.occlusion_gates() if self.keys["occlusion_gate"] else None
 
     def forward(self, z_g, z_a):
-        """f^g, f^a [N, E]."""
+        """Returns f^g, f^a [N, E]."""
         f = z_g * 0.0
         for t in range(self.keys["stages_geo"]):
             shared = self.keys["share_stage_weights"]
@@ -47,37 +47,38 @@ class Attention:
 
     # --- maps and positions ---------------------------------------------------------
 
-    def widened(self, i, chw):
-        """[V, h, w, C], of E channels where no W_v makes them so."""
+    def with_embedding_width(self, i, chw):
+        """Returns a map as [V, h, w, C], projected to E channels where no W_v does so."""
         x = chw.transpose(0, 2, 3, 1)
         projected = self.keys["kv_proj"] and self.keys["groups"] == 1
         if x.shape[-1] == self.dim or projected:
             return x
         return self.g.linear(x, f"{self.name}.in.{i}", self.dim, bias=False)
 
-    def sample(self, map_hwc, v, at, held=False):
-        """Bilinear samples [N, M, C] of view v's [V, h, w, C] at picture positions `at` [N, M, 2]."""
+    def sample(self, map_hwc, v, at, clamped=False):
+        """Returns bilinear samples [N, M, C] of view v's [V, h, w, C] at picture positions `at` [N, M, 2]."""
         height, width = map_hwc.shape[1:3]
         chw = map_hwc[v:v + 1].transpose(0, 3, 1, 2)
-        corners = self.keys["sample_convention"] == "integer" and not held
+        corners = self.keys["sample_convention"] == "integer" and not clamped
         # integer: x = R W = (grid + 1)/2 (W - 1); half_pixel: x = R W - 1/2 = ((grid + 1) W - 1)/2.
         factor = np.array([2.0 * s / (s - 1.0) for s in (width, height)]) if corners else np.array([2.0, 2.0])
         out_shape = (1, chw.shape[1], *at.shape[:2])
         grid = (at * factor - 1.0)[None]
-        if held:
+        if clamped:
             got = self.g.op("GridSample", [chw, grid], out_shape, mode="bilinear", padding_mode="border", align_corners=0)
         else:
             got = self.g.grid_sample(chw, grid, corners)
         return got[0].transpose(1, 2, 0)
 
     def project(self, view, points):
-        """Positions [N, M, 2] and visibility [N, M] of world points [N, M, 3]."""
+        """Returns positions [N, M, 2] and camera z [N, M] of world points [N, M, 3]."""
         p = view.to_camera(points)
         at = view.positions(p)
         return self.g.clamp(at, 0.0, 0.9999) if self.keys["mask"] == "pg_clamp" else at, p[..., 2]
 
     def points(self, name, f, q, v, level):
-        """Positions [N, M, 2] in view v on one level, and the camera z [N, M] that decides which side it is on."""
+        """Returns positions [N, M, 2] in view v on one level, and the camera z [N, M] that determines their
+        visibility."""
         g, keys, view, means = self.g, self.keys, self.views[v], self.parents["means"]
         centre, z = self.project(view, means[:, None])
         if keys["points"] == "ref":
@@ -100,22 +101,22 @@ class Attention:
         return g.concat([centre, centre + offsets], 1), g.broadcast(z, (self.n, m + 1))
 
     def occlusion_gates(self):
-        """exp(-max(0, z - D(R) - t)/t), t = 2 % of z, per view [N, 1]; 1 outside the picture (spec 5.3)."""
+        """Returns exp(-max(0, z - D(R) - t)/t), t = 2 % of z, per view [N, 1]; 1 outside the picture."""
         gates = []
         for v, view in enumerate(self.views):
             own = view.to_camera(self.parents["means"][v * self.per_view:(v + 1) * self.per_view])[:, 2]
             depth = own.reshape(1, view.height, view.width, 1)
             in_camera = view.to_camera(self.parents["means"])
             at, z = view.positions(in_camera), in_camera[:, 2:]
-            hidden_by = self.sample(depth, 0, at[:, None], held=True)[:, 0]
+            hidden_by = self.sample(depth, 0, at[:, None], clamped=True)[:, 0]
             gate = self.g.exp(-(self.g.maximum(z - hidden_by - 0.02 * z, 0.0) / (0.02 * z)))
-            gates.append(self.g.where(geo.seen(z[:, 0], at)[:, None], gate, 1.0))
+            gates.append(self.g.where(geo.is_visible(z[:, 0], at)[:, None], gate, 1.0))
         return gates
 
     # --- a stage --------------------------------------------------------------------
 
     def gates(self, name, q):
-        """alpha_v [N or 1, 1] of every view."""
+        """Returns alpha_v [N or 1, 1] of every view."""
         g, kind, v = self.g, self.keys["gate"], len(self.views)
         if kind in ("softmaxV", "softmax"):
             p = g.softmax(g.weight(f"{name}.gate", (self.keys["gate_views"],))[:v])
@@ -129,7 +130,7 @@ class Attention:
         return gates
 
     def logits(self, name, q, key, v, level, m):
-        """[N, M, G]."""
+        """Returns [N, M, G]."""
         g, keys, groups = self.g, self.keys, self.keys["groups"]
         if keys["op"] == "linear":
             shape = (keys["gate_views"], len(self.maps), m, groups)
@@ -141,14 +142,14 @@ class Attention:
             dots = dots + g.weight(f"{name}.level_bias", (len(self.maps),))[level]
         return dots
 
-    def projected(self, name, what, wanted, level):
-        """A level's map through W_k or W_v."""
-        if not (wanted and self.keys["kv_proj"]):
+    def projected(self, name, part, enabled, level):
+        """Projects a level's map by W_k or W_v."""
+        if not (enabled and self.keys["kv_proj"]):
             return self.maps[level]
-        return self.g.linear(self.maps[level], f"{name}.{what}.{level}", self.dim)
+        return self.g.linear(self.maps[level], f"{name}.{part}.{level}", self.dim)
 
     def attend(self, name, f, q):
-        """o [N, E]."""
+        """Returns o [N, E]."""
         g, keys, groups = self.g, self.keys, self.keys["groups"]
         gates = self.gates(name, q)
         logits, values, factors, visible = [], [], [], []
@@ -159,9 +160,10 @@ class Attention:
                 at, z = self.points(name, f, q, v, level)
                 m = at.shape[1]
                 if keys["mask"] == "renorm":
-                    inside = geo.seen(z, at)
+                    inside = geo.is_visible(z, at)
                 else:
-                    # Clamped to 0: the kernel skips the sample, and nothing else changes.
+                    # A position clamped to 0: PixelGaussian's kernel skips the sample and changes
+                    # nothing else.
                     inside = (at[..., 0] > 0.0) & (at[..., 1] > 0.0)
                 live = g.where(inside[..., None], 1.0, 0.0)
                 k = self.sample(key, v, at) * live

@@ -1,4 +1,4 @@
-"""Cases of SubSplat's own modules. `notes` hold the configuration in the crate's JSON."""
+"""Cases of SubSplat's modules. `notes` holds the configuration in the crate's JSON."""
 
 from .subsplat_attention import Attention
 from .subsplat_embed import embed
@@ -7,7 +7,7 @@ from .subsplat_scene import AGG, EMBED, SPGR, Scene
 from .subsplat_spgr import Spgr, head
 
 E = 16
-# Channels and size (h, w) of every map that a case may name.
+# Channels and size (h, w) of the maps of the cases.
 MAPS = {"trans4": (16, 4, 6), "cnn2": (10, 7, 9), "cnn4": (16, 5, 5)}
 
 
@@ -15,7 +15,7 @@ def embed_case(keys):
     def case(c):
         scene = Scene(c, 2, 5, 4)
         c.notes["embed"] = {**keys, "dim": E}
-        sh = c.drawn("sh", (2 * scene.per_view, 75), -0.6, 0.6)
+        sh = c.random_input("sh", (2 * scene.per_view, 75), -0.6, 0.6)
         z_g, z_a = embed(c.g, c.notes["embed"], scene.views, scene.parents, sh, scene.per_view)
         c.output("z_g", z_g)
         c.output("z_a", z_a)
@@ -27,8 +27,8 @@ def agg_case(keys, views=2, contrast=1.7):
         scene = Scene(c, views, 6, 4, lost=("outside", "behind"))
         c.notes["agg"] = keys
         n = views * scene.per_view
-        maps = {level: c.drawn(f"map.{level}", (views, *MAPS[level]), -2.0, 2.0) for level in keys["levels"]}
-        z = [c.drawn(name, (n, E), -contrast, contrast) for name in ("z_g", "z_a")]
+        maps = {level: c.random_input(f"map.{level}", (views, *MAPS[level]), -2.0, 2.0) for level in keys["levels"]}
+        z = [c.random_input(name, (n, E), -contrast, contrast) for name in ("z_g", "z_a")]
         attention = Attention(c.g, keys, E, maps, scene.views, scene.parents, scene.per_view)
         f_g, f_a = attention.forward(*z)
         c.output("f_g", f_g)
@@ -36,12 +36,12 @@ def agg_case(keys, views=2, contrast=1.7):
     return case
 
 
-def head_case(form, side, lanes):
+def head_case(form, side, channels):
     def case(c):
         c.g = Precise(c.name)
         keys = {**SPGR["paper"], "head": form, "hidden": 12}
-        c.notes = {"spgr": keys, "side": side, "dim": E, "lanes": lanes}
-        c.output("record", head(c.g, keys, c.drawn("x", (10, E), -1.7, 1.7), "subsplat.geo", side, lanes))
+        c.notes = {"spgr": keys, "side": side, "dim": E, "lanes": channels}
+        c.output("record", head(c.g, keys, c.random_input("x", (10, E), -1.7, 1.7), "subsplat.geo", side, channels))
     return case
 
 
@@ -50,7 +50,7 @@ def spgr_case(keys, side, lowpass=[0.3, 0.3]):
         scene = Scene(c, 2, 4, 3 if side == 2 else 2, lost=("outside",))
         c.notes |= {"spgr": keys, "side": side, "lowpass": lowpass}
         n = 2 * scene.per_view
-        record = c.drawn("record", (n, side * side, 11), -1.2, 1.2)
+        record = c.random_input("record", (n, side * side, 11), -1.2, 1.2)
         spgr = Spgr(c.g, keys, side, scene.views, scene.near, scene.parents, scene.per_view, lowpass)
         for name, value in spgr.forward(record).items():
             c.output(name, value)
@@ -84,7 +84,7 @@ P, T = SPGR["paper"], SPGR["tuned"]
 SPGRS = {
     "paper": P,
     "tuned": T,
-    # One or two switches of each preset at a time, so that every value of every key is met.
+    # One or two changes of each preset, so that the cases cover every value of every key.
     "transmittance": P | {"opacity": "transmittance", "primary_view": "source", "gain_space": "rgb"},
     "area": P | {"opacity": "area", "offset_bound": 0.7, "depth_dir": "ray"},
     "none": T | {"opacity": "none", "primary_view": "nearest_visible", "depth_dir": "axis"},
@@ -104,7 +104,7 @@ CASES["sub_embed_view0"] = embed_case({**EMBED["tuned"], "mlp": "pg", "anchor_fr
 CASES["sub_embed_lite_raw"] = embed_case({**EMBED["paper"], "mlp": "lite", "scale": "log_px"})
 CASES |= {f"sub_agg_{name}": agg_case(keys) for name, keys in AGGREGATIONS.items()}
 CASES["sub_agg_three_views"] = agg_case(AGG["paper"] | ONE | {"op": "linear", "levels": ["cnn2", "trans4"]}, 3)
-# Queries so faint that the LayerNorm's epsilon counts.
+# Queries so small that the LayerNorm's epsilon affects the result.
 CASES["sub_agg_faint"] = agg_case(AGG["tuned"] | ONE | {"residual": "none", "occlusion_gate": False}, 2, 0.005)
 CASES |= {f"sub_head_{form}": head_case(form, 2, 9) for form in ("mlp2", "pg", "coord")}
 CASES |= {"sub_head_coord_4": head_case("coord", 4, 2), "sub_head_mlp2_3": head_case("mlp2", 3, 2)}

@@ -1,4 +1,4 @@
-"""Attribute embeddings of the primaries (paper A.2; spec 1.1)."""
+"""Attribute embeddings of the primaries (SubSplat, supplement A.2)."""
 
 import numpy as np
 from . import subsplat_geometry as geo
@@ -6,22 +6,22 @@ from . import subsplat_geometry as geo
 NAMES = ["x", "s", "q", "a"]
 
 
-def in_source(g, views, x, per_view, turn):
-    """turn(view, rows of that view) for parents in view order, joined again."""
-    rows = [turn(view, x[v * per_view:(v + 1) * per_view]) for v, view in enumerate(views)]
+def in_source(g, views, x, per_view, transform):
+    """Applies transform(view, rows of that view) to parents in view order and joins the results."""
+    rows = [transform(view, x[v * per_view:(v + 1) * per_view]) for v, view in enumerate(views)]
     return g.concat(rows, 0)
 
 
 def conditioned(g, keys, views, parents, per_view):
-    """mu [N, 3], s [N, 3], q [N, 4], alpha [N, 1] as the switches of spec 1.1 say."""
+    """Returns mu [N, 3], s [N, 3], q [N, 4], alpha [N, 1] in the representation that `keys` selects."""
     frame = keys["anchor_frame"]
     to_source = lambda x: in_source(g, views, x, per_view, lambda view, rows: view.to_camera(rows))
-    turn_back = lambda view, q: geo.product(g, geo.conjugate(g, view.quat().reshape(1, 4)), q)
+    to_view_frame = lambda view, q: geo.product(g, geo.conjugate(g, view.quat().reshape(1, 4)), q)
     means, quats = parents["means"], parents["quats"]
     if frame == "src_cam":
-        means, quats = to_source(means), in_source(g, views, quats, per_view, turn_back)
+        means, quats = to_source(means), in_source(g, views, quats, per_view, to_view_frame)
     elif frame == "view0":
-        means, quats = views[0].to_camera(means), turn_back(views[0], quats)
+        means, quats = views[0].to_camera(means), to_view_frame(views[0], quats)
     if keys["mu"] == "ray_logz":
         z = means[:, 2:]
         means = g.concat([means[:, :2] / z, g.log(z)], 1)
@@ -37,14 +37,14 @@ def conditioned(g, keys, views, parents, per_view):
 
 
 def block(g, x, name, dim):
-    """Linear, ReLU, LayerNorm, twice."""
+    """Applies Linear, ReLU and LayerNorm twice."""
     for i in range(2):
         x = g.layer_norm(g.relu(g.linear(x, f"{name}.lin{i}", dim)), f"{name}.ln{i}")
     return x
 
 
 def embed(g, keys, views, parents, sh, per_view, name="subsplat.embed"):
-    """z^g and z^a [N, E]; sh [N, 3 D], colour after colour."""
+    """Returns z^g and z^a [N, E]; sh [N, 3 D], colour by colour."""
     dim = keys["dim"]
     x = conditioned(g, keys, views, parents, per_view)
     if keys["mlp"] == "pg":

@@ -1,16 +1,18 @@
-"""The builder in double precision: same calls, f32 inputs and weights, f64 between, f32 outputs."""
+"""The graph builder in double precision: the same calls, f32 inputs and weights, f64 intermediate values, f32
+outputs."""
 
 import numpy as np
 from onnx import TensorProto
 
 from graph import G, Value
 
-# Operators of opset 18 that onnxruntime's CPU has in f32 alone.
+# Operators of opset 18 that onnxruntime's CPU provider implements in f32 only.
 F32_ONLY = ("AveragePool", "Conv", "ConvTranspose", "Erf", "GridSample", "Resize")
 
 
 class Precise(G):
-    """Values are called "float32" and are f64. What onnxruntime has in f32 alone is cast."""
+    """A graph whose values have the label "float32" and the type f64. Inputs of f32-only operators are
+    cast."""
 
     def cast_to(self, x, kind):
         return self.op("Cast", [x], x.shape, to=kind)

@@ -1,5 +1,5 @@
-"""Spherical harmonics and the projection of a Gaussian (rasterizer.md 1; mvsplat.md 7), by definition: harmonics from
-Legendre recurrences, covariances as J W Sigma W^T J^T."""
+"""Spherical harmonics and the projection of a Gaussian, by their definitions: harmonics from Legendre
+recurrences, covariances as J W Sigma W^T J^T."""
 
 import math
 
@@ -11,7 +11,8 @@ from .subsplat_scene import Scene
 
 
 def harmonics(g, d, degree):
-    """Real spherical harmonics with the Condon-Shortley sign at unit vectors d [N, 3], index l^2 + l + m: [N, D]."""
+    """Returns real spherical harmonics with the Condon-Shortley sign at unit vectors d [N, 3], index l^2 + l
+    + m: [N, D]."""
     x, y, z = d[:, 0], d[:, 1], d[:, 2]
     # cos m phi and sin m phi times sin^m theta: powers of x + i y.
     waves = [(z * 0.0 + 1.0, z * 0.0)]
@@ -36,8 +37,9 @@ def harmonics(g, d, degree):
 
 
 def radiance(g, basis, degree, d, sh):
-    """Sum over k of sh [N, 25, 3] times the basis at d [N, 3]: [N, 3]. `mvsplat`: degree <= 3, the polar axis is y,
-    x_std = z, y_std = x, and function 14 is written with a wrong factor z."""
+    """Returns the sum over k of sh [N, 25, 3] times the basis at d [N, 3]: [N, 3]. In `mvsplat` the degree is
+    at most 3, the polar axis is y (x_std = z, y_std = x), and function 14 has an additional factor z, as in
+    its rasterizer."""
     if basis == "mvsplat":
         degree = min(degree, 3)
         x, z = d[:, 0], d[:, 2]
@@ -52,23 +54,23 @@ def radiance(g, basis, degree, d, sh):
 
 def sh_case(c):
     c.g = Precise(c.name)
-    d = c.drawn("direction", (24, 3))
+    d = c.random_input("direction", (24, 3))
     d = d / c.g.sqrt((d * d).sum(1, keep=True))
-    sh = c.drawn("sh", (24, 25, 3))
+    sh = c.random_input("sh", (24, 25, 3))
     for basis, degrees in (("standard", 5), ("mvsplat", 5)):
         for degree in range(degrees):
             c.output(f"{basis}_{degree}", radiance(c.g, basis, degree, d, sh))
 
 
 def tangents(g, lens):
-    """tan of half the angle between the rays through the middles of opposite edges, [2] (mvsplat.md 7)."""
+    """Returns the tangent of half the angle between the rays through the middles of opposite edges, [2]."""
     out = []
     for axis in (0, 1):
         rays = []
         for at in (0.0, 1.0):
-            place = [0.5, 0.5]
-            place[axis] = at
-            slope = (g.const(place) - lens[2:]) / lens[:2]
+            position = [0.5, 0.5]
+            position[axis] = at
+            slope = (g.const(position) - lens[2:]) / lens[:2]
             ray = g.concat([slope, g.const([1.0])], 0)
             rays.append(ray / g.sqrt((ray * ray).sum(0, keep=True)))
         cos = (rays[0] * rays[1]).sum(0, keep=True)
@@ -77,9 +79,10 @@ def tangents(g, lens):
 
 
 def project(g, view, near, splats, convention, lowpass, antialiased):
-    """What of a frame depends on one splat alone; zeros for a splat that is not drawn. means2d: px, pixel centres at
-    integers; conic A, B, C; depth; half: half-widths of where alpha may reach 1/255, px; opacity; pixels: first column
-    and row and one past the last; wide: the same with 0.02 px more on each side."""
+    """Returns the values of a frame that depend on one splat alone; zeros for a splat that is not drawn.
+    means2d: px, pixel centres at integers; conic A, B, C; depth; half: half-widths of the area where alpha
+    may reach 1/255, px; opacity; pixels: first column and row and one past the last; wide: the same with 0.02
+    px more on each side."""
     standard = convention == "standard"
     p = view.to_camera(splats["means"])
     z = p[:, 2:]
@@ -109,7 +112,8 @@ def project(g, view, near, splats, convention, lowpass, antialiased):
         mid = (a + d) * 0.5
         radius = g.sqrt(mid + g.sqrt(g.maximum(mid * mid - det, 0.1))) * 3.0
         radius = -g.floor(-radius[:, None])
-        # [trunc((u - r)/16), trunc((u + r + 15)/16)); what truncation changes lies left of the picture.
+        # [trunc((u - r)/16), trunc((u + r + 15)/16)): truncation changes only positions left of or
+        # above the picture.
         tiles = [g.floor((means2d - radius) / 16.0) * 16.0, g.floor((means2d + radius + 15.0) / 16.0) * 16.0]
     pixels = rectangle(g, view, means2d, half, tiles)
     wide = rectangle(g, view, means2d, half + 0.02, tiles)
@@ -121,7 +125,8 @@ def project(g, view, near, splats, convention, lowpass, antialiased):
 
 
 def rectangle(g, view, means2d, half, tiles):
-    """Pixels whose centres lie within `half` of the mean, inside the picture and the tiles: x0, y0, x1, y1."""
+    """Returns the pixels whose centres are within `half` of the mean, inside the picture and the tiles: x0,
+    y0, x1, y1."""
     first = g.maximum(-g.floor(half - means2d), 0.0)
     past = g.minimum(g.floor(means2d + half) + 1.0, view.size)
     if tiles:
@@ -131,13 +136,14 @@ def rectangle(g, view, means2d, half, tiles):
 
 def ewa_case(convention, lowpass=0.3, antialiased=False, size=0.25):
     def case(c):
-        # Parents of two views of 6 x 5 px, seen by view 0 as a picture of 72 x 60 px, `size` times as large.
+        # Parents of two views of 6 x 5 px, rendered in view 0 as a picture of 72 x 60 px with
+        # `size` times their scales.
         scene = Scene(c, 2, 6, 5, lost=("outside", "behind", "round"))
         c.notes |= {"convention": convention, "lowpass": lowpass, "antialiased": antialiased, "picture": [72, 60]}
         c.notes["scale"] = size
         view = geo.View(c.g, scene.poses[0], scene.lenses[0], (72, 60))
         splats = scene.parents | {"scales": scene.parents["scales"] * size}
-        # Some parents stand nearer than 2 near planes (`standard`), or a fifth of 10 (`mvsplat`).
+        # Some parents are nearer than 2 near planes (`standard`), or a fifth of 10 (`mvsplat`).
         near = scene.near[:1] * (10.0 if convention == "mvsplat" else 2.0)
         for name, value in project(c.g, view, near[0], splats, convention, lowpass, antialiased).items():
             c.output(name, value)

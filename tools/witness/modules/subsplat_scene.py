@@ -1,4 +1,4 @@
-"""Scenes of the SubSplat cases: cameras, parents like a backbone's, and the presets of spec 7."""
+"""Scenes of the SubSplat cases: cameras, parents similar to a backbone's, and the presets."""
 
 import numpy as np
 
@@ -29,11 +29,11 @@ SPGR = {"paper": _SPGR, "tuned": _SPGR | {"primary_view": "source", "offset_boun
 
 
 class Scene:
-    """V views of width x height px, one parent per pixel, built in double precision into the case.
+    """V views of width x height px with one parent per pixel, in double precision.
 
-    `lost` lists what goes astray: "outside" puts parent 1 outside every picture, "behind" parent 2 behind every
-    camera, "round" makes parents 8 to 23 round, opaque and
-    0.24 px wide, and puts 24 to 29 a little outside the picture."""
+    `lost` lists special parents: "outside" moves parent 1 outside every picture, "behind" moves parent 2
+    behind every camera, "round" makes parents 8 to 23 round, opaque and 0.24 px wide, and moves 24 to 29
+    slightly outside the picture."""
 
     def __init__(self, c, views=2, width=6, height=4, lost=()):
         c.g = Precise(c.name)
@@ -41,26 +41,28 @@ class Scene:
         self.size, self.per_view = (width, height), width * height
         poses, intrinsics, near_far = c.cameras(views, height, width)
         lenses = intrinsics / np.array([width, height] * 2, np.float32)
-        self.poses, self.lenses = c.given("poses", poses), c.given("lenses", lenses)
-        self.near = c.given("near", near_far[:, 0])
+        self.poses, self.lenses = c.stored_input("poses", poses), c.stored_input("lenses", lenses)
+        self.near = c.stored_input("near", near_far[:, 0])
         self.views = [View(c.g, self.poses[i], self.lenses[i], self.size) for i in range(views)]
         numbers = parents(c.seed, poses.astype(np.float64), intrinsics.astype(np.float64), width, height, lost)
-        self.parents = {name: c.given(f"parent.{name}", a) for name, a in numbers.items()}
+        self.parents = {name: c.stored_input(f"parent.{name}", a) for name, a in numbers.items()}
 
 
 def quat_of(r):
+    """Returns the quaternion of a rotation matrix."""
     w = 0.5 * np.sqrt(1.0 + np.trace(r))
     return np.array([w, *(np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]) / (4 * w))])
 
 
 def product(a, b):
+    """Returns the Hamilton product."""
     w, v, s, u = a[0], a[1:], b[0], b[1:]
     return np.array([w * s - v @ u, *(w * u + s * v + np.cross(v, u))])
 
 
 def parents(seed, poses, intrinsics, width, height, lost):
-    """means [N, 3], quats [N, 4] wxyz with w >= 0, scales [N, 3], opacities [N, 1], in world frame. Parent 3 is nearly
-    opaque, 4 hardly there, 5 tiny, 6 a needle."""
+    """Returns means [N, 3], quats [N, 4] wxyz with w >= 0, scales [N, 3], opacities [N, 1], in the world
+    frame. Parent 3 is nearly opaque, 4 nearly transparent, 5 very small, 6 very elongated."""
     n = len(poses) * width * height
     u = formula.uniform(seed, "parents", 14 * n).reshape(n, 14)
     out = {"means": [], "quats": [], "scales": [], "opacities": []}

@@ -1,5 +1,5 @@
-"""Heads and sub-pixel reparameterization (paper 3.2, supp. A.3; spec 2), every quantity by its definition: positions
-by un-projection, areas as sqrt det(J Sigma J^T), opacities from softmax weights."""
+"""Heads and sub-pixel reparameterization (SubSplat, section 3.2; supplement A.3), by their definitions:
+positions by unprojection, areas as sqrt det(J Sigma J^T), opacities from softmax weights."""
 
 import numpy as np
 from . import subsplat_geometry as geo
@@ -8,42 +8,42 @@ GROWTH_MAX = 50.0
 ALPHA_MAX = 0.9999
 
 
-def head(g, keys, x, name, side, lanes):
-    """[N, K, lanes] from [N, E] (spec 2.1)."""
+def head(g, keys, x, name, side, channels):
+    """Returns [N, K, channels] from [N, E]."""
     n, k, hidden = x.shape[0], side * side, keys["hidden"]
     if keys["head"] == "mlp2":
         h = g.gelu(g.linear(g.layer_norm(x, f"{name}.norm"), f"{name}.lin0", hidden))
-        return g.linear(h, f"{name}.lin1", k * lanes).reshape(n, k, lanes)
+        return g.linear(h, f"{name}.lin1", k * channels).reshape(n, k, channels)
     if keys["head"] == "pg":
         for i in range(2):
             x = g.relu(g.linear(x, f"{name}.lin{2 * i}", hidden))
             x = g.layer_norm(g.relu(g.linear(x, f"{name}.lin{2 * i + 1}", hidden)), f"{name}.ln{i}")
-        return g.linear(x, f"{name}.lin4", k * lanes).reshape(n, k, lanes)
+        return g.linear(x, f"{name}.lin4", k * channels).reshape(n, k, channels)
     # coord: hid_k = GELU(W x + c_k), o_k = W' hid_k, c_k = MLP(posenc(g_k)).
     x = g.linear(g.layer_norm(x, f"{name}.norm"), f"{name}.lin0", hidden)
     c = g.linear(g.gelu(g.linear(g.const(posenc(side)), f"{name}.pos0", hidden)), f"{name}.pos1", hidden)
-    return g.linear(g.gelu(x[:, None] + c), f"{name}.lin1", lanes)
+    return g.linear(g.gelu(x[:, None] + c), f"{name}.lin1", channels)
 
 
-def places(side):
-    """[K, 2]: centres of the sub-pixels in input px from the pixel's centre, row-major (spec 2.2)."""
+def subpixel_centres(side):
+    """Returns [K, 2]: centres of the sub-pixels in input px from the pixel's centre, row-major."""
     return np.array([[(j + 0.5) / side - 0.5, (i + 0.5) / side - 0.5] for i in range(side) for j in range(side)])
 
 
 def posenc(side):
-    """[K, 18]: x, y, then per octave 2^o pi: sin x, cos x, sin y, cos y."""
-    p = places(side)
+    """Returns [K, 18]: x, y, then per octave 2^o pi: sin x, cos x, sin y, cos y."""
+    p = subpixel_centres(side)
     waves = [f(np.pi * 2.0**o * p[:, i]) for o in range(4) for i in range(2) for f in (np.sin, np.cos)]
     return np.stack([p[:, 0], p[:, 1]] + waves, 1)
 
 
 def heads(g, keys, geo_in, app_in, side, name="subsplat"):
-    """Records [N, K, 11]: (du, dv, dz, dlog s (3), dr (3), l, gamma~)."""
+    """Returns records [N, K, 11]: (du, dv, dz, dlog s (3), dr (3), l, gamma~)."""
     return g.concat([head(g, keys, geo_in, f"{name}.geo", side, 9), head(g, keys, app_in, f"{name}.app", side, 2)], 2)
 
 
 def a_min(keys, side):
-    """Target px^2 (spec 2.6): a number, or one of over_k, off, {target_px: a}, {input_px: a}."""
+    """Returns the minimum area, target px^2; the key is one of over_k, off, {target_px: a}, {input_px: a}."""
     rule, k = keys["a_min"], side * side
     if rule == "over_k":
         return 1.0 / k if k > 1 else 0.0
@@ -54,12 +54,13 @@ def a_min(keys, side):
 
 
 def lambda_s(keys, side):
+    """Returns the initial scale factor of a child."""
     (rule, value), = keys["lambda_s"].items()
     return value / side if rule == "over_sqrt_k" else value
 
 
 class Primary:
-    """Every parent's primary view v*, looked up: rotation [N, 3, 3], camera point [N, 3] and so on."""
+    """The primary view v* of every parent: rotation [N, 3, 3], camera point [N, 3], and its projection."""
 
     def __init__(self, g, keys, views, near, parents, per_view):
         n, means = parents["means"].shape[0], parents["means"]
@@ -68,7 +69,7 @@ class Primary:
             costs = []
             for view in views:
                 p = view.to_camera(means)
-                costs.append(g.where(geo.seen(p[:, 2], view.positions(p)), p[:, 2], 1e30))
+                costs.append(g.where(geo.is_visible(p[:, 2], view.positions(p)), p[:, 2], 1e30))
             cost = g.stack(costs, 1)
             best = g.op("ArgMin", [cost], (n,), "int64", axis=1, keepdims=0)
             index = g.where(cost.min(1) < 1e29, best, index)
@@ -89,7 +90,7 @@ class Primary:
 
 
 class Spgr:
-    """keys: the `spgr` section; near: [V]; lowpass: (target px^2, input px^2)."""
+    """The reparameterization. keys: the `spgr` section; near: [V]; lowpass: (target px^2, input px^2)."""
 
     def __init__(self, g, keys, side, views, near, parents, per_view, lowpass=(0.3, 0.3)):
         self.g, self.keys, self.side, self.k = g, keys, side, side * side
@@ -98,10 +99,11 @@ class Spgr:
         self.z = g.maximum(self.view.in_camera[:, 2:], self.view.z_min)
 
     def forward(self, record):
-        """Children of records [N, K, 11], child k of parent n in row n K + k: `steps` [N K, 3] from the parent's mean,
-        `quats` [N K, 4] wxyz, `log_scales` [N K, 3], `opacities` [N K], `gain` [N K] or [N K, 4]."""
+        """Returns the children of records [N, K, 11], child k of parent n in row n K + k: `steps` [N K, 3]
+        from the parent's mean, `quats` [N K, 4] wxyz, `log_scales` [N K, 3], `opacities` [N K], `gain` [N K]
+        or [N K, 4]."""
         g, keys = self.g, self.keys
-        in_camera = self.place(record)
+        in_camera = self.positions(record)
         steps = (in_camera - self.view.in_camera[:, None]) @ self.view.w2c()
         clamp = keys["dlog_clamp"]
         growth = g.exp(g.tanh(record[..., 3:6] / clamp) * clamp)
@@ -109,11 +111,11 @@ class Spgr:
         quats = geo.unit(g, geo.product(g, self.parents["quats"][:, None], geo.exponential(g, record[..., 6:9])))
         at = self.view.in_camera[:, None] if keys["area_at"] == "parent" else in_camera
         m = self.footprint(at, quats, scales, self.side)
-        area, least = geo.area(g, m), a_min(keys, self.side)
-        factors = self.grow(m, area, least)
+        area, min_area = geo.area(g, m), a_min(keys, self.side)
+        factors = self.growth_factors(m, area, min_area)
         scales = scales * factors
         grown = self.footprint(at, quats, scales, self.side)
-        alpha = self.opacity(record[..., 9], g.maximum(area, least), grown)
+        alpha = self.opacity(record[..., 9], g.maximum(area, min_area), grown)
         flat = lambda x: x.reshape(self.n * self.k, x.shape[-1])
         extra = g.tanh(record[..., 10:]) * keys["delta"]
         gain = (extra + 1.0).reshape(self.n * self.k)
@@ -124,16 +126,16 @@ class Spgr:
         return {"steps": flat(steps), "quats": flat(quats), "log_scales": g.log(flat(scales)),
                 "opacities": alpha.reshape(self.n * self.k), "gain": gain}
 
-    def place(self, record):
-        """Camera points of the children [N, K, 3] (spec 2.4)."""
+    def positions(self, record):
+        """Returns the camera points of the children [N, K, 3]."""
         g, keys, c, z = self.g, self.keys, self.view.in_camera[:, None], self.z[:, None]
         learned = record[..., :2]
         if keys["offset_bound"] is not None:
             learned = g.tanh(learned) * keys["offset_bound"]
-        delta = learned / self.side + places(self.side)
+        delta = learned / self.side + subpixel_centres(self.side)
         lateral = delta / self.view.focal[:, None] * z
         flat = g.concat([c[..., :2] + lateral, g.broadcast(c[..., 2:], (self.n, self.k, 1))], 2)
-        moved = self.slid(flat, delta) if keys["slide"] == "disc" else flat
+        moved = self.slide_on_disc(flat, delta) if keys["slide"] == "disc" else flat
         depth = g.tanh(record[..., 2:3]) * keys["beta_z"]
         if keys["depth_unit"] == "relative":
             depth = depth * z
@@ -143,8 +145,9 @@ class Spgr:
             return moved / moved[..., 2:] * target
         return g.concat([moved[..., :2], target], 2)
 
-    def slid(self, flat, delta):
-        """Along the disc: Sigma J^T (J Sigma J^T)^-1 delta; mixed with the flat step so that z moves at most a tenth."""
+    def slide_on_disc(self, flat, delta):
+        """Returns the camera points of steps along the disc, Sigma J^T (J Sigma J^T)^-1 delta, mixed with the
+        steps at constant z so that z changes by at most a tenth."""
         g, c = self.g, self.view.in_camera
         rotation = geo.matrix(g, geo.unit(g, self.parents["quats"]))
         axes = self.view.w2c() @ rotation * self.parents["scales"][:, None]
@@ -161,40 +164,41 @@ class Spgr:
         return flat * (1.0 - share) + along * share
 
     def footprint(self, at, quats, scales, zoom):
-        """M = J R_w2c R(q) S [.., 2, 3] at camera points `at`, px of a picture `zoom` times the input."""
+        """Returns M = J R_w2c R(q) S [.., 2, 3] at camera points `at`, px of a picture `zoom` times the
+        input."""
         g, view = self.g, self.view
         low, high, z_min = view.low[:, None], view.high[:, None], view.z_min[:, None]
         j = geo.jacobian(g, at, view.focal[:, None] * float(zoom), z_min, low, high)
         return j @ view.w2c()[:, None] @ geo.matrix(g, quats) * scales[..., None, :]
 
-    def grow(self, m, area, least):
-        """Factors [N, K, 3] of sigma (spec 2.6)."""
+    def growth_factors(self, m, area, min_area):
+        """Returns the factors [N, K, 3] of sigma that enforce the minimum area."""
         g = self.g
-        small = area[..., None] < least
+        small = area[..., None] < min_area
         if self.keys["a_min_mode"] == "iso":
-            c = g.minimum(g.sqrt(least / area[..., None]), GROWTH_MAX)
+            c = g.minimum(g.sqrt(min_area / area[..., None]), GROWTH_MAX)
             return g.broadcast(g.where(small, c, 1.0), (self.n, self.k, 3))
         lengths = (m * m).sum(2)
         still = g.op("ArgMin", [lengths], (self.n, self.k), "int64", axis=2, keepdims=0)
         still = g.gather(g.const(np.eye(3)), still)
-        # |m_a x m_b|^2 per pair, named by the axis left out.
+        # |m_a x m_b|^2 per pair; the index is the remaining axis.
         u, v = m[:, :, 0], m[:, :, 1]
         pairs = [(1, 2), (2, 0), (0, 1)]
         squares = g.stack([(u[..., i] * v[..., j] - u[..., j] * v[..., i]) ** 2.0 for i, j in pairs], 2)
         p = (squares * still).sum(2, keep=True)
         q = (squares * (1.0 - still)).sum(2, keep=True)
         # c^4 p + c^2 q = A_min^2.
-        c2 = (g.sqrt(q * q + 4.0 * least**2 * p) - q) / (2.0 * p)
+        c2 = (g.sqrt(q * q + 4.0 * min_area**2 * p) - q) / (2.0 * p)
         c = g.minimum(g.sqrt(c2), GROWTH_MAX)
         return g.where(small, still + (1.0 - still) * c, 1.0)
 
-    def own(self):
-        """M of the parents, input px: [N, 1, 2, 3]."""
+    def parent_footprint(self):
+        """Returns M of the parents, input px: [N, 1, 2, 3]."""
         quats = geo.unit(self.g, self.parents["quats"])[:, None]
         return self.footprint(self.view.in_camera[:, None], quats, self.parents["scales"][:, None], 1)
 
     def opacity(self, logits, area, grown):
-        """[N, K] (spec 2.7, 2.8); area: after the clamp."""
+        """Returns the opacities [N, K]; `area` is the area after the clamp."""
         g, rule, alpha = self.g, self.keys["opacity"], self.parents["opacities"]
         w = g.softmax(logits, axis=1)
         if rule == "none":
@@ -206,11 +210,11 @@ class Spgr:
         if rule == "transmittance":
             return 1.0 - (1.0 - capped) ** w
         if rule == "area":
-            own = geo.area(g, self.own()) * float(self.k)
+            own = geo.area(g, self.parent_footprint()) * float(self.k)
             return g.minimum(alpha * own * w / area, 0.99)
         tau = -g.log(1.0 - capped)
-        own = geo.blurred(g, self.own(), self.lowpass[1]) * float(self.k)
-        # A child whose growth meets GROWTH_MAX counts with A_min all the same ("A from 2.6 after the adjustment").
+        own = geo.blurred(g, self.parent_footprint(), self.lowpass[1]) * float(self.k)
+        # A child whose growth reaches GROWTH_MAX still counts with the minimum area.
         blurred, bare = geo.blurred(g, grown, self.lowpass[0]), geo.area(g, grown)
         blurred = g.sqrt(blurred * blurred + area * area - bare * bare)
         return 1.0 - g.exp(-(tau * w * own / blurred))

@@ -1,5 +1,4 @@
-"""MVSplat's multi-view transformer (mvsplat.md, 2) of one scene: features [V, C, h, w]
-to the same shape."""
+"""MVSplat's multi-view transformer of one scene: features [V, C, h, w] to the same shape."""
 
 import numpy as np
 
@@ -7,7 +6,7 @@ SPLITS = 2
 
 
 def position_encoding(c, h, w):
-    """[C, h, w]: restarts in each window; C/2 channels from y, then C/2 from x."""
+    """Returns [C, h, w], restarting in each window: C/2 channels from y, then C/2 from x."""
     def axis(n):
         p = (np.arange(n * SPLITS) % n + 1) / (n + 1e-6) * 2 * np.pi
         k = np.arange(c // 2)
@@ -18,7 +17,7 @@ def position_encoding(c, h, w):
 
 
 def windows(x, h, w):
-    """[..., h, w, C] to [..., 4, L, C]; window = row * 2 + column."""
+    """Splits [..., h, w, C] into [..., 4, L, C]; window = row * 2 + column."""
     lead, c, wh, ww = x.shape[:-3], x.shape[-1], h // SPLITS, w // SPLITS
     n = len(lead)
     x = x.reshape(lead + (SPLITS, wh, SPLITS, ww, c))
@@ -27,7 +26,7 @@ def windows(x, h, w):
 
 
 def merged(x, h, w):
-    """windows, undone."""
+    """Inverts `windows`."""
     lead, c, wh, ww = x.shape[:-3], x.shape[-1], h // SPLITS, w // SPLITS
     n = len(lead)
     x = x.reshape(lead + (SPLITS, SPLITS, wh, ww, c))
@@ -35,7 +34,7 @@ def merged(x, h, w):
 
 
 def shift_mask(h, w, shift):
-    """[4, L, L]: 0, or -100 between rolled pixels of different regions."""
+    """Returns [4, L, L]: 0, or -100 between rolled pixels of different regions."""
     def region(n, s):
         i = np.arange(n)
         return np.where(i < n - n // SPLITS, 0, np.where(i < n - s, 1, 2))
@@ -46,7 +45,7 @@ def shift_mask(h, w, shift):
 
 
 def sublayer(g, source, targets, name, shift, expansion):
-    """source [V, h, w, C]; targets [V, m, h, w, C], m other views each."""
+    """Attention of source [V, h, w, C] to targets [V, m, h, w, C], m other views each."""
     v, h, w, c = source.shape
     m = targets.shape[1]
     q = g.linear(source, f"{name}.q_proj", c, bias=False)
@@ -58,7 +57,7 @@ def sublayer(g, source, targets, name, shift, expansion):
     keys = lambda x: windows(x, h, w).transpose(0, 2, 3, 1, 4).reshape(v, SPLITS**2, -1, c)
     logits = windows(q, h, w) @ keys(k).transpose(0, 1, 3, 2) * (1 / np.sqrt(c))
     if shift != (0, 0):
-        # Tiled view-major: misaligned with the keys for m > 1, as in the original.
+        # Tiled view-major: as in MVSplat, misaligned with the keys for m > 1.
         logits = logits + g.const(np.concatenate([shift_mask(h, w, shift)] * m, 2)[None])
     message = merged(g.softmax(logits) @ keys(value), h, w)
     message = g.linear(message, f"{name}.merge", c, bias=False)
@@ -79,7 +78,7 @@ def transformer(g, features, layers, expansion=4, name="backbone.transformer", s
         shift = (h // SPLITS // 2, w // SPLITS // 2) if i % 2 else (0, 0)
         at = f"{name}.layers.{i}"
         own = sublayer(g, x, x.reshape(v, 1, h, w, c), f"{at}.self_attn", shift, None)
-        # The others as they were at this layer's input.
+        # The other views at this layer's input.
         others = [g.stack([x[j] for j in range(v) if j != i], 0) for i in range(v)]
         x = sublayer(g, own, g.stack(others, 0), f"{at}.cross_attn_ffn", shift, expansion)
         if stages is not None:
@@ -90,7 +89,7 @@ def transformer(g, features, layers, expansion=4, name="backbone.transformer", s
 def case(views, h, w):
     def build(c):
         stages, rows = [], (views, h * w, 16)
-        out = transformer(c.g, c.drawn("features", (views, 16, h, w), -2.0, 2.0), 2, stages=stages)
+        out = transformer(c.g, c.random_input("features", (views, 16, h, w), -2.0, 2.0), 2, stages=stages)
         for i, (own, x) in enumerate(stages):
             c.output(f"self{i}", own.reshape(rows), stride=3)
             c.output(f"layer{i}", x.reshape(rows), stride=3)

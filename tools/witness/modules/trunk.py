@@ -1,5 +1,6 @@
-"""What SubSplat adds to a backbone, end to end: embeddings, attention, heads, reparameterization (paper 3.2, A.2, A.3;
-spec 1 and 2). Build it with subsplat_precise.Precise as the case's graph: areas are determinants here."""
+"""SubSplat's modules after the backbone: embeddings, attention, heads, reparameterization (SubSplat, section
+3.2; supplement A.2, A.3). The case's graph must be a subsplat_precise.Precise, because areas are determinants
+here."""
 
 from .subsplat_attention import Attention
 from .subsplat_embed import embed
@@ -8,18 +9,21 @@ from .subsplat_spgr import Spgr, heads
 
 
 def preset(name, **sections):
-    """{"embed", "agg", "spgr"} of a preset, sections changed by keyword: preset("tuned", spgr={"hidden": 24})."""
+    """Returns {"embed", "agg", "spgr"} of a preset with the given changes: preset("tuned", spgr={"hidden":
+    24})."""
     base = {"embed": EMBED[name], "agg": AGG[name], "spgr": SPGR[name]}
     return {section: {**keys, **sections.get(section, {})} for section, keys in base.items()}
 
 
 def trunk(g, config, side, views, near, parents, sh, maps, per_view):
-    """Children of N = V per_view parents: `steps`, `quats`, `log_scales`, `opacities`, `gain` (subsplat_spgr.Spgr).
+    """Returns the children of N = V per_view parents: `steps`, `quats`, `log_scales`, `opacities`, `gain`
+    (subsplat_spgr.Spgr).
 
-    config: `preset`'s. views: subsplat_geometry.View per view, pixels of the input. near: [V]. parents, in view and
-    pixel order, world frame: means [N, 3], quats [N, 4] wxyz with w >= 0, scales [N, 3] sigma, opacities [N, 1].
-    sh: [N, 3 D], colour after colour, in the frame that config["embed"]["sh"] names (world: after the rotation,
-    camera: before it). maps: {level: [V, C, h, w]} for config["agg"]["levels"]. Weights: subsplat.*."""
+    config: result of `preset`. views: subsplat_geometry.View per view, pixels of the input. near: [V].
+    parents, in view and pixel order, world frame: means [N, 3], quats [N, 4] wxyz with w >= 0, scales [N, 3]
+    sigma, opacities [N, 1]. sh: [N, 3 D], colour by colour, in the frame of config["embed"]["sh"] (world:
+    after the rotation, camera: before it). maps: {level: [V, C, h, w]} for config["agg"]["levels"]. Weights:
+    subsplat.*."""
     z_g, z_a = embed(g, config["embed"], views, parents, sh, per_view)
     inputs = (z_g, z_a)
     if config["agg"]["enabled"]:
@@ -37,8 +41,8 @@ def case(config, side):
     def build(c):
         scene = Scene(c, 2, 7, 5)
         c.notes |= {**config, "upscale": side}
-        sh = c.drawn("sh", (2 * scene.per_view, 75), -0.6, 0.6)
-        maps = {level: c.drawn(f"map.{level}", (2, *MAPS[level]), -2.0, 2.0) for level in config["agg"]["levels"]}
+        sh = c.random_input("sh", (2 * scene.per_view, 75), -0.6, 0.6)
+        maps = {level: c.random_input(f"map.{level}", (2, *MAPS[level]), -2.0, 2.0) for level in config["agg"]["levels"]}
         out = trunk(c.g, config, side, scene.views, scene.near, scene.parents, sh, maps, scene.per_view)
         for name, value in out.items():
             c.output(name, value)

@@ -1,4 +1,4 @@
-"""MVSplat's 2-D U-Net (mvsplat.md, 4): [V, C, h, w] of one scene to the same shape."""
+"""MVSplat's 2-D U-Net: [V, C, h, w] of one scene to the same shape."""
 
 HEAD = 32
 
@@ -10,7 +10,7 @@ def resblock(g, x, name, c):
 
 
 def conv1d(g, x, name, c_out):
-    """x [V, C, n], kernel 1."""
+    """Convolution of x [V, C, n] with kernel 1."""
     w = g.weight(f"{name}.weight", (c_out, x.shape[1], 1)).reshape(c_out, x.shape[1])
     return w @ x + g.weight(f"{name}.bias", (c_out,)).reshape(c_out, 1)
 
@@ -56,9 +56,10 @@ def unet(g, x, name, levels):
 
 def case(shape, levels, high, stride):
     def build(c):
-        c.output("out", unet(c.g, c.drawn("x", shape, -high, high), "net", levels), stride)
+        c.output("out", unet(c.g, c.random_input("x", shape, -high, high), "net", levels), stride)
     return build
 
 
-# In unet_dim the variance within a group of the first norms comes from the biases alone, and eps is seen.
+# In unet_dim the variance within a group of the first norms comes from the biases alone, so that
+# eps affects the result.
 CASES = {"unet": case((2, 64, 12, 8), 3, 1.5, 5), "unet_dim": case((2, 32, 4, 6), 2, 0.01, 1)}

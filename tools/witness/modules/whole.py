@@ -1,5 +1,5 @@
-"""The whole network in one graph: pictures and cameras of one scene to children. MVSplat's encoder (backbone.py), its
-primaries (adapter.py), then what SubSplat adds (trunk.py)."""
+"""The whole network in one graph: pictures and cameras of one scene to children. It consists of MVSplat's
+encoder (backbone.py), its primaries (adapter.py), and SubSplat's modules (trunk.py)."""
 
 import numpy as np
 
@@ -9,8 +9,8 @@ from .subsplat_precise import Precise
 from .trunk import preset, trunk
 
 E, SIDE = 32, 2
-# Near enough that f32 noise of disparity (3e-6) stays small in depth, whose differences the occlusion gate of `tuned`
-# multiplies by fifty.
+# A small far plane: f32 noise of disparity (3e-6) then stays small in depth, whose differences the
+# occlusion gate of `tuned` multiplies by fifty.
 FAR = 5.0
 STRIDES = {"depths": 5, "sh": 367, "gain": 5, "means": 11, "steps": 11, "quats": 17, "log_scales": 11, "opacities": 5}
 
@@ -24,12 +24,12 @@ def case(name, views, height, width):
         n, k = views * height * width, SIDE * SIDE
         lenses = frames["intrinsics"] / np.array([width, height] * 2)
         poses = [g.concat([frames["rotation"][v], frames["origin"][v].reshape(3, 1)], 1) for v in range(views)]
-        seen_by = [View(g, poses[v], lenses[v], (width, height)) for v in range(views)]
-        near = c.given("near", c.asides["near_far"][:, 0])
+        view_cameras = [View(g, poses[v], lenses[v], (width, height)) for v in range(views)]
+        near = c.stored_input("near", c.auxiliaries["near_far"][:, 0])
         parents = {key: primaries[key] for key in ("means", "quats", "scales")}
         parents["opacities"] = primaries["opacities"].reshape(n, 1)
         sh = primaries["sh_camera" if config["embed"]["sh"] == "camera" else "sh"].reshape(n, 75)
-        children = trunk(g, config, SIDE, seen_by, near, parents, sh, out, height * width)
+        children = trunk(g, config, SIDE, view_cameras, near, parents, sh, out, height * width)
         owners = g.broadcast(parents["means"].reshape(n, 1, 3), (n, k, 3)).reshape(n * k, 3)
         children |= {"means": owners + children["steps"], "sh": primaries["sh"].transpose(0, 2, 1),
                      "depths": out["depths"].reshape(views, height * width)}

@@ -104,7 +104,7 @@ fn a_resumed_run_equals_an_unstopped_one_bit_for_bit() {
 fn the_number_of_lanes_changes_nothing() {
     for phase in ["depth", "render"] {
         let run = |lanes: usize| {
-            let config = TrainConfig { lanes, batch: 3, ..tiny(phase) };
+            let config = TrainConfig { parallel_groups: lanes, batch: 3, ..tiny(phase) };
             let folder = tempfile::tempdir().unwrap();
             let mut training = Training::open(&config, folder.path()).unwrap();
             (steps(&mut training, 2), state(&training))
