@@ -1,21 +1,21 @@
-//! An allocator for programs that run the network: large blocks lie on huge pages and
-//! are used again.
+//! An allocator for programs that run the network. It places large blocks on huge pages and
+//! reuses them.
 //!
-//! Tensors of megabytes come and go by the hundred. The system's allocator asks the
-//! kernel for each, which clears it in pages of 4 KiB, a fault each: a seventh of the
-//! time of two photographs to a picture. Here a block that is freed waits, one piece
-//! with its neighbours, and the shortest piece that is long enough gives its front to
-//! the next request: a call after the first hardly asks the kernel. What waits never
-//! makes the process larger than its largest set of living blocks: a request that
-//! finds nothing fitting first returns to the kernel as much as it asks for, as far as
-//! there is any.
+//! The network allocates and frees hundreds of tensors of megabytes. The system's allocator
+//! maps each of them anew. The kernel then clears it in pages of 4 KiB with one fault each, which
+//! takes a seventh of the time from two photographs to a picture. Here freed blocks go to a free
+//! list, where adjacent blocks are merged. A request takes the front of the shortest free block
+//! that is long enough. After the first call of the network, few requests reach the kernel.
 //!
-//! A program declares it; a library must not:
+//! The free list never makes the process larger than its largest set of live blocks: a request
+//! without a fitting free block first returns as many bytes to the kernel as it needs.
+//!
+//! A program declares the allocator; a library must not:
 //! ```ignore
 //! #[global_allocator]
 //! static PAGES: subsplat_cli::pages::Pages = subsplat_cli::pages::Pages;
 //! ```
-//! Elsewhere than on Linux on x86-64 and AArch64 it is the system's allocator.
+//! On other systems than Linux on x86-64 and AArch64 it is the system's allocator.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 
@@ -23,43 +23,43 @@ use std::alloc::{GlobalAlloc, Layout, System};
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Pages;
 
-/// Least bytes of a block that is kept: what a huge page holds on x86-64 and most
-/// AArch64 kernels.
+/// Size of a huge page on x86-64 and on most AArch64 kernels, bytes. Smaller blocks go to the
+/// system's allocator.
 const HUGE: usize = 2 << 20;
 
-/// Whether a block of this layout is ours.
-fn ours(layout: &Layout) -> bool {
+/// Whether this allocator manages blocks of this layout.
+fn is_large(layout: &Layout) -> bool {
     cfg!(all(target_os = "linux", any(target_arch = "x86_64", target_arch = "aarch64")))
         && layout.size() >= HUGE
         && layout.align() <= 4096
 }
 
-// SAFETY: small blocks are the system's. A large one is a mapping of its own, as long
-// as the layout in whole pages, so its length is known when it comes back; it is
-// handed out again, whole or in parts, only after that.
+// SAFETY: small blocks are the system's. A large block has the length of its layout in whole
+// pages, so its length is known when it is freed. It is reused, whole or in parts, only after
+// that.
 unsafe impl GlobalAlloc for Pages {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        match ours(&layout) {
-            true => large::take(layout.size()).0,
+        match is_large(&layout) {
+            true => large::allocate(layout.size()).0,
             // SAFETY: the caller's.
             false => unsafe { System.alloc(layout) },
         }
     }
 
     unsafe fn dealloc(&self, at: *mut u8, layout: Layout) {
-        match ours(&layout) {
-            true => large::give(at, layout.size()),
+        match is_large(&layout) {
+            true => large::free(at, layout.size()),
             // SAFETY: the caller's; small blocks came from there.
             false => unsafe { System.dealloc(at, layout) },
         }
     }
 
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
-        if !ours(&layout) {
+        if !is_large(&layout) {
             // SAFETY: the caller's.
             return unsafe { System.alloc_zeroed(layout) };
         }
-        let (at, used) = large::take(layout.size());
+        let (at, used) = large::allocate(layout.size());
         if used && !at.is_null() {
             // SAFETY: a block of this size.
             unsafe { at.write_bytes(0, layout.size()) };
@@ -70,7 +70,7 @@ unsafe impl GlobalAlloc for Pages {
     unsafe fn realloc(&self, at: *mut u8, layout: Layout, size: usize) -> *mut u8 {
         // SAFETY: the caller's: `size` fits a layout of this alignment.
         let wanted = unsafe { Layout::from_size_align_unchecked(size, layout.align()) };
-        match ours(&layout) || ours(&wanted) {
+        match is_large(&layout) || is_large(&wanted) {
             // SAFETY: the caller's; both are small.
             false => unsafe { System.realloc(at, layout, size) },
             // SAFETY: the new block holds the lesser of both sizes, and the old one
@@ -89,15 +89,15 @@ unsafe impl GlobalAlloc for Pages {
 
 #[cfg(not(all(target_os = "linux", any(target_arch = "x86_64", target_arch = "aarch64"))))]
 mod large {
-    /// Never called: no block is ours.
-    pub(super) fn take(_: usize) -> (*mut u8, bool) {
+    /// Never called: no block is large here.
+    pub(super) fn allocate(_: usize) -> (*mut u8, bool) {
         (std::ptr::null_mut(), false)
     }
 
-    pub(super) fn give(_: *mut u8, _: usize) {}
+    pub(super) fn free(_: *mut u8, _: usize) {}
 
     #[cfg(test)]
-    pub(super) fn forget() {}
+    pub(super) fn clear() {}
 }
 
 #[cfg(all(target_os = "linux", any(target_arch = "x86_64", target_arch = "aarch64")))]
@@ -124,71 +124,71 @@ mod large {
         fn madvise(at: *mut c_void, length: usize, advice: c_int) -> c_int;
     }
 
-    /// Most pieces that wait.
+    /// Largest number of free blocks.
     const SLOTS: usize = 128;
     /// Lengths are multiples of the largest page size that these kernels have.
     const PAGE: usize = 1 << 16;
 
-    /// Memory that waits, resident for the most part.
+    /// A free block of memory, mostly resident.
     #[derive(Clone, Copy)]
-    struct Piece {
+    struct Block {
         at: usize,
         length: usize,
-        /// When it came: the least goes first.
+        /// Number of the call that freed it; the lowest is unmapped first.
         stamp: u64,
     }
 
-    /// What waits, by address; neighbours are one piece, whatever mappings they came from.
-    struct Waiting {
-        pieces: [Piece; SLOTS],
+    /// Free blocks by address. Adjacent blocks are merged, also those of different mappings.
+    struct FreeList {
+        blocks: [Block; SLOTS],
         n: usize,
         stamp: u64,
     }
 
-    static WAITING: Mutex<Waiting> = Mutex::new(Waiting {
-        pieces: [Piece { at: 0, length: 0, stamp: 0 }; SLOTS],
+    static FREE: Mutex<FreeList> = Mutex::new(FreeList {
+        blocks: [Block { at: 0, length: 0, stamp: 0 }; SLOTS],
         n: 0,
         stamp: 0,
     });
 
-    impl Waiting {
-        fn remove(&mut self, i: usize) -> Piece {
-            let piece = self.pieces[i];
-            self.pieces.copy_within(i + 1..self.n, i);
+    impl FreeList {
+        fn remove(&mut self, i: usize) -> Block {
+            let block = self.blocks[i];
+            self.blocks.copy_within(i + 1..self.n, i);
             self.n -= 1;
-            piece
+            block
         }
 
         fn oldest(&self) -> Option<usize> {
-            (0..self.n).min_by_key(|&i| self.pieces[i].stamp)
+            (0..self.n).min_by_key(|&i| self.blocks[i].stamp)
         }
 
-        /// The front of the shortest piece that is long enough.
+        /// Removes the front of the shortest block that is long enough.
         fn take(&mut self, length: usize) -> Option<usize> {
-            let fits = |&i: &usize| self.pieces[i].length >= length;
-            let i = (0..self.n).filter(fits).min_by_key(|&i| self.pieces[i].length)?;
-            let piece = &mut self.pieces[i];
-            let at = piece.at;
-            piece.at += length;
-            piece.length -= length;
-            if piece.length == 0 {
+            let fits = |&i: &usize| self.blocks[i].length >= length;
+            let i = (0..self.n).filter(fits).min_by_key(|&i| self.blocks[i].length)?;
+            let block = &mut self.blocks[i];
+            let at = block.at;
+            block.at += length;
+            block.length -= length;
+            if block.length == 0 {
                 self.remove(i);
             }
             Some(at)
         }
 
-        /// Takes a block back; what has no room is for the caller to unmap.
-        fn give(&mut self, at: usize, length: usize) -> Option<Piece> {
+        /// Inserts a block. Returns the oldest block where the list is full; the caller unmaps it.
+        fn insert(&mut self, at: usize, length: usize) -> Option<Block> {
             self.stamp += 1;
-            let mut new = Piece { at, length, stamp: self.stamp };
-            let mut i = self.pieces[..self.n].partition_point(|p| p.at < at);
-            if i < self.n && self.pieces[i].at == at + length {
+            let mut new = Block { at, length, stamp: self.stamp };
+            let mut i = self.blocks[..self.n].partition_point(|p| p.at < at);
+            if i < self.n && self.blocks[i].at == at + length {
                 new.length += self.remove(i).length;
             }
-            if i > 0 && self.pieces[i - 1].at + self.pieces[i - 1].length == at {
+            if i > 0 && self.blocks[i - 1].at + self.blocks[i - 1].length == at {
                 i -= 1;
                 let before = self.remove(i);
-                new = Piece { at: before.at, length: before.length + new.length, ..new };
+                new = Block { at: before.at, length: before.length + new.length, ..new };
             }
             let out = match self.n == SLOTS {
                 true => self.oldest().map(|oldest| {
@@ -197,67 +197,68 @@ mod large {
                 }),
                 false => None,
             };
-            self.pieces.copy_within(i..self.n, i + 1);
-            self.pieces[i] = new;
+            self.blocks.copy_within(i..self.n, i + 1);
+            self.blocks[i] = new;
             self.n += 1;
             out
         }
 
-        /// Up to `length` bytes of what waits, the oldest piece's.
-        fn part(&mut self, length: usize) -> Option<Piece> {
+        /// Removes up to `length` bytes of the oldest block.
+        fn take_oldest(&mut self, length: usize) -> Option<Block> {
             let i = self.oldest()?;
-            let piece = &mut self.pieces[i];
-            if piece.length <= length {
+            let block = &mut self.blocks[i];
+            if block.length <= length {
                 return Some(self.remove(i));
             }
-            piece.length -= length;
-            Some(Piece { at: piece.at + piece.length, length, ..*piece })
+            block.length -= length;
+            Some(Block { at: block.at + block.length, length, ..*block })
         }
     }
 
-    fn waiting() -> MutexGuard<'static, Waiting> {
-        WAITING.lock().unwrap_or_else(PoisonError::into_inner)
+    fn free_list() -> MutexGuard<'static, FreeList> {
+        FREE.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// A block of `size` bytes, and whether it was used before (else it is zero). Null if
-    /// there is no memory.
-    pub(super) fn take(size: usize) -> (*mut u8, bool) {
+    /// Allocates a block of `size` bytes. Returns also whether it was used before; otherwise it is
+    /// zero. The pointer is null without memory.
+    pub(super) fn allocate(size: usize) -> (*mut u8, bool) {
         let Some(length) = size.checked_next_multiple_of(PAGE) else {
             return (std::ptr::null_mut(), false);
         };
-        if let Some(at) = waiting().take(length) {
+        if let Some(at) = free_list().take(length) {
             return (at as *mut u8, true);
         }
         let mut left = length;
         while left > 0 {
-            let Some(piece) = waiting().part(left) else { break };
-            left -= piece.length;
-            unmap(piece.at, piece.length);
+            let Some(block) = free_list().take_oldest(left) else { break };
+            left -= block.length;
+            unmap(block.at, block.length);
         }
         (map(length), false)
     }
 
-    /// Takes a block back.
-    pub(super) fn give(at: *mut u8, size: usize) {
-        let out = waiting().give(at as usize, size.next_multiple_of(PAGE));
-        if let Some(piece) = out {
-            unmap(piece.at, piece.length);
+    /// Frees a block.
+    pub(super) fn free(at: *mut u8, size: usize) {
+        let out = free_list().insert(at as usize, size.next_multiple_of(PAGE));
+        if let Some(block) = out {
+            unmap(block.at, block.length);
         }
     }
 
-    /// Sends all that waits back to the kernel.
+    /// Unmaps all free blocks.
     #[cfg(test)]
-    pub(super) fn forget() {
-        while let Some(piece) = waiting().part(usize::MAX) {
-            unmap(piece.at, piece.length);
+    pub(super) fn clear() {
+        while let Some(block) = free_list().take_oldest(usize::MAX) {
+            unmap(block.at, block.length);
         }
     }
 
-    /// New pages at a multiple of [`HUGE`]; null if there are none.
+    /// Maps new pages at a multiple of [`HUGE`]; returns null without memory.
     fn map(length: usize) -> *mut u8 {
-        let Some(room) = length.checked_add(HUGE) else { return std::ptr::null_mut() };
-        // SAFETY: a new mapping, at no address asked for.
-        let all = unsafe { mmap(std::ptr::null_mut(), room, READ_WRITE, PRIVATE_ANONYMOUS, -1, 0) };
+        let Some(reserved) = length.checked_add(HUGE) else { return std::ptr::null_mut() };
+        // SAFETY: a new mapping at an address of the kernel's choice.
+        let all =
+            unsafe { mmap(std::ptr::null_mut(), reserved, READ_WRITE, PRIVATE_ANONYMOUS, -1, 0) };
         // MAP_FAILED.
         if all as isize == -1 {
             return std::ptr::null_mut();
@@ -266,16 +267,16 @@ mod large {
         let at = first.next_multiple_of(HUGE);
         // The parts before and after the block.
         unmap(first, at - first);
-        unmap(at + length, first + room - at - length);
-        // SAFETY: advice about the mapping just made, whole huge pages of it, so that
-        // the end does not hold more than it must. A refusal changes nothing.
+        unmap(at + length, first + reserved - at - length);
+        // SAFETY: advice on whole huge pages of the new mapping. The end keeps small pages, so
+        // that it holds no more than necessary. A failure has no effect.
         unsafe { madvise(at as *mut c_void, length / HUGE * HUGE, HUGE_PAGES) };
         at as *mut u8
     }
 
     fn unmap(at: usize, length: usize) {
         if length > 0 {
-            // SAFETY: pages of a mapping of ours that nobody holds any more.
+            // SAFETY: pages of a mapping of this module that no block uses.
             unsafe { munmap(at as *mut c_void, length) };
         }
     }
@@ -285,13 +286,12 @@ mod large {
 mod tests {
     use super::*;
 
-    /// Blocks that wait are one list for the process: what one test takes may send
-    /// another's away.
+    /// The free list belongs to the process, so tests run one after another.
     static ALONE: std::sync::Mutex<()> = std::sync::Mutex::new(());
 
     fn alone() -> std::sync::MutexGuard<'static, ()> {
         let guard = ALONE.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        large::forget();
+        large::clear();
         guard
     }
 
@@ -306,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn blocks_are_used_again_and_zeroed_when_asked() {
+    fn blocks_are_reused_and_zeroed_on_request() {
         let _alone = alone();
         let layout = Layout::from_size_align(3 * HUGE + 12_345, 64).unwrap();
         let first = filled(layout, 7);
@@ -314,8 +314,8 @@ mod tests {
         unsafe {
             Pages.dealloc(first, layout);
             let again = Pages.alloc_zeroed(layout);
-            if ours(&layout) {
-                assert_eq!(again, first, "the block that waits is the one that is given");
+            if is_large(&layout) {
+                assert_eq!(again, first, "the free block is reused");
             }
             let all = std::slice::from_raw_parts(again, layout.size());
             assert!(all.iter().all(|v| *v == 0));
@@ -324,44 +324,44 @@ mod tests {
     }
 
     #[test]
-    fn pieces_are_cut_and_joined() {
+    fn blocks_are_split_and_merged() {
         let _alone = alone();
         let layout = |huge: usize| Layout::from_size_align(huge * HUGE, 8).unwrap();
         let long = filled(layout(6), 1);
-        // SAFETY: each block comes back with the layout that it was asked for with.
+        // SAFETY: each block is freed with the layout of its allocation.
         unsafe {
             Pages.dealloc(long, layout(6));
             let parts = [filled(layout(2), 2), filled(layout(3), 3)];
-            if ours(&layout(1)) {
-                assert_eq!(parts[0], long, "the front of the piece that waits");
-                assert_eq!(parts[1], long.add(2 * HUGE), "then what is left of it");
+            if is_large(&layout(1)) {
+                assert_eq!(parts[0], long, "the front of the free block");
+                assert_eq!(parts[1], long.add(2 * HUGE), "then the rest of it");
             }
             let all = std::slice::from_raw_parts(parts[0], 2 * HUGE);
             assert!(all.iter().all(|v| *v == 2));
-            // The one before joins what waits behind it, or the other way round.
+            // The lower block is freed first, then the upper one.
             for first in [0, 1] {
                 let lengths = [2, 3];
                 Pages.dealloc(parts[first], layout(lengths[first]));
                 Pages.dealloc(parts[1 - first], layout(lengths[1 - first]));
-                if ours(&layout(1)) {
-                    assert_eq!(large::take(6 * HUGE), (long, true), "one piece again");
-                    large::give(long, 6 * HUGE);
+                if is_large(&layout(1)) {
+                    assert_eq!(large::allocate(6 * HUGE), (long, true), "one block again");
+                    large::free(long, 6 * HUGE);
                 }
                 if first == 0 {
                     let parts = [filled(layout(2), 2), filled(layout(3), 3)];
-                    assert!(!ours(&layout(1)) || parts == [long, long.add(2 * HUGE)]);
+                    assert!(!is_large(&layout(1)) || parts == [long, long.add(2 * HUGE)]);
                 }
             }
         }
     }
 
     #[test]
-    fn growing_and_shrinking_keep_what_is_there() {
+    fn growing_and_shrinking_keep_the_contents() {
         let _alone = alone();
         let (small, large) = (1 << 10, HUGE + 1);
         let layout = |size| Layout::from_size_align(size, 8).unwrap();
         let at = filled(layout(small), 9);
-        // SAFETY: each call names the layout that the block has.
+        // SAFETY: each call passes the block's layout.
         unsafe {
             let at = Pages.realloc(at, layout(small), large);
             at.add(small).write_bytes(3, large - small);
@@ -382,7 +382,7 @@ mod tests {
                 let value = (16 * seed + i) as u8;
                 let at = filled(layout, value);
                 std::thread::yield_now();
-                // SAFETY: as long as it is read, then given back with its layout.
+                // SAFETY: the block is as long as it is read, and is freed with its layout.
                 unsafe {
                     let all = std::slice::from_raw_parts(at, layout.size());
                     assert!(all.iter().all(|v| *v == value));

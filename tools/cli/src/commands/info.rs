@@ -1,4 +1,4 @@
-//! `subsplat info`: what a file or a scene holds.
+//! `subsplat info`: describes a file or a scene.
 
 use super::args::InfoArgs;
 use crate::report::Answer;
@@ -37,7 +37,7 @@ fn file(path: &Path, answer: Answer) -> Result<Value> {
     }
 }
 
-/// The first 64 bytes of a file.
+/// Reads the first 64 bytes of a file.
 pub fn head(path: &Path) -> Result<Vec<u8>> {
     use std::io::Read;
     let mut head = Vec::new();
@@ -96,7 +96,7 @@ fn picture(path: &Path, answer: Answer) -> Result<Value> {
     answer.line(format!("{}: {}x{} pixels", path.display(), p.width, p.height));
     if let Some(orientation) = p.orientation.filter(|o| *o != 1) {
         answer.line(format!(
-            "  EXIF orientation {orientation}, which pose files do not know: ignored"
+            "  EXIF orientation {orientation} is ignored: pose files describe the stored pixels"
         ));
     }
     Ok(json!({

@@ -1,5 +1,5 @@
-//! TensorBoard event files: what a training measures, and its sheets, as the records that
-//! TensorFlow's `event.proto` and `summary.proto` lay down (the few fields that are used).
+//! TensorBoard event files of a training: scalars and sheets. The messages are those of
+//! TensorFlow's `event.proto` and `summary.proto`, with the fields that are used.
 //!
 //! A record is its length (u64), a masked CRC-32C of the length, the message, and a masked
 //! CRC-32C of the message, little-endian (TensorFlow, `record_writer.h`).
@@ -13,7 +13,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use subsplat::train::run::{Event, StepReport};
 use subsplat::train::validate::Found;
 
-/// What a reader looks for in the first record.
+/// Content of the first record.
 const FILE_VERSION: &str = "brain.Event:2";
 /// TensorFlow's mask of a checksum.
 const MASK: u32 = 0xA282_EAD8;
@@ -26,12 +26,12 @@ struct Record {
     wall_time: f64,
     #[prost(int64, tag = "2")]
     step: i64,
-    #[prost(oneof = "What", tags = "3, 5")]
-    what: Option<What>,
+    #[prost(oneof = "Content", tags = "3, 5")]
+    content: Option<Content>,
 }
 
 #[derive(Clone, PartialEq, prost::Oneof)]
-enum What {
+enum Content {
     #[prost(string, tag = "3")]
     FileVersion(String),
     #[prost(message, tag = "5")]
@@ -80,7 +80,7 @@ pub struct Board {
 }
 
 impl Board {
-    /// A new file in the run's folder.
+    /// Creates a file in the run's folder.
     ///
     /// # Errors
     /// The folder is missing or full.
@@ -90,20 +90,20 @@ impl Board {
         let path = folder.join(name);
         let file = File::create(&path).with_context(|| path.display().to_string())?;
         let mut board = Self { file, path, folder: folder.to_owned() };
-        board.write(0, What::FileVersion(FILE_VERSION.to_owned()))?;
+        board.write(0, Content::FileVersion(FILE_VERSION.to_owned()))?;
         Ok(board)
     }
 
-    /// Writes what `event` tells.
+    /// Writes the figures of `event`.
     ///
     /// # Errors
     /// The disk is full.
-    pub fn hear(&mut self, event: &Event) -> Result<()> {
+    pub fn record(&mut self, event: &Event) -> Result<()> {
         match event {
             Event::Step(report) => self.step(report),
             Event::Validated { step, rooms, photos } => {
-                self.looked(*step, "rooms", rooms.as_ref())?;
-                self.looked(*step, "photos", photos.as_ref())
+                self.validation(*step, "rooms", rooms.as_ref())?;
+                self.validation(*step, "photos", photos.as_ref())
             }
             Event::Begin { .. } | Event::Skipped { .. } | Event::Saved(_) => Ok(()),
         }
@@ -125,7 +125,7 @@ impl Board {
         self.scalars(report.step, all.map(|(tag, v)| (tag.to_owned(), v)))
     }
 
-    fn looked(&mut self, step: u64, what: &str, found: Option<&Found>) -> Result<()> {
+    fn validation(&mut self, step: u64, set: &str, found: Option<&Found>) -> Result<()> {
         let Some(found) = found else { return Ok(()) };
         let all = [
             ("psnr", found.psnr),
@@ -133,8 +133,8 @@ impl Board {
             ("disparity", found.disparity),
             ("within_one", found.within_one),
         ];
-        self.scalars(step, all.map(|(tag, v)| (format!("{what}/{tag}"), v)))?;
-        let sheet = self.folder.join(format!("sheet-{step:08}-{what}.png"));
+        self.scalars(step, all.map(|(tag, v)| (format!("{set}/{tag}"), v)))?;
+        let sheet = self.folder.join(format!("sheet-{step:08}-{set}.png"));
         let Ok(encoded) = std::fs::read(&sheet) else { return Ok(()) };
         // IHDR: width and height are the big-endian words at 16 and 20 (PNG, 11.2.2).
         let word = |at: usize| {
@@ -143,27 +143,27 @@ impl Board {
         };
         let (width, height) = (word(16), word(20));
         let image = Image { height, width, colorspace: RGB, encoded };
-        let tagged = Tagged { tag: format!("{what}/sheet"), value: Some(Value::Image(image)) };
-        self.write(step, What::Summary(Summary { value: vec![tagged] }))
+        let tagged = Tagged { tag: format!("{set}/sheet"), value: Some(Value::Image(image)) };
+        self.write(step, Content::Summary(Summary { value: vec![tagged] }))
     }
 
     fn scalars(&mut self, step: u64, all: impl IntoIterator<Item = (String, f64)>) -> Result<()> {
         let finite = all.into_iter().filter(|(_, v)| v.is_finite());
         let tagged = |(tag, v)| Tagged { tag, value: Some(Value::Scalar(v as f32)) };
         let value = finite.map(tagged).collect();
-        self.write(step, What::Summary(Summary { value }))
+        self.write(step, Content::Summary(Summary { value }))
     }
 
-    fn write(&mut self, step: u64, what: What) -> Result<()> {
+    fn write(&mut self, step: u64, content: Content) -> Result<()> {
         let step = i64::try_from(step).unwrap_or(i64::MAX);
-        let message = Record { wall_time: now(), step, what: Some(what) }.encode_to_vec();
+        let message = Record { wall_time: now(), step, content: Some(content) }.encode_to_vec();
         let length = (message.len() as u64).to_le_bytes();
         let mut bytes = Vec::with_capacity(message.len() + 16);
         bytes.extend(length);
         bytes.extend(masked(&length).to_le_bytes());
         bytes.extend(&message);
         bytes.extend(masked(&message).to_le_bytes());
-        // Whole records only: one call each.
+        // One call per record, so that the file holds complete records.
         self.file.write_all(&bytes).with_context(|| self.path.display().to_string())
     }
 }

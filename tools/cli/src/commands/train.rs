@@ -1,4 +1,4 @@
-//! `subsplat train`: a training from its configuration, with what a person watches.
+//! `subsplat train`: trains a model by its configuration, with progress for the user.
 
 use super::args::TrainArgs;
 use super::tensorboard::Board;
@@ -13,21 +13,20 @@ use subsplat::train::run::{Event, Limits, StepReport, Training};
 use subsplat::train::step::Seconds;
 use subsplat::train::validate::{Found, Validator};
 
-/// Between two lines where stderr is no terminal.
+/// Time between two lines where stderr is no terminal.
 const LINE_EVERY: Duration = Duration::from_secs(20);
-/// Lines between two profiles.
+/// Number of lines between two profiles.
 const PROFILE_EVERY: usize = 15;
-/// Share of the newest step in the shown means.
-const FRESH: f64 = 0.05;
+/// Weight of the newest step in the printed means.
+const NEW_WEIGHT: f64 = 0.05;
 
-/// Starts this very program anew with one thread for candle, unless the user says how many.
+/// Restarts the program with one thread for candle, unless the environment states a number.
 ///
-/// Candle gives operations on large tensors to a thread pool of its own, whose threads spin
-/// while they wait and take the cores from our lanes: 40 steps took 28.8 s with it and
-/// 20.7 s without. The number is read from the environment, which a running process cannot
-/// change for itself without `unsafe`.
+/// Candle runs operations on large tensors in its own thread pool. Its idle threads spin, and
+/// take the cores from this crate's: 40 steps took 28.8 s with the pool and 20.7 s without.
+/// Candle reads the number from the environment, which a process cannot change without `unsafe`.
 #[cfg(unix)]
-fn leave_the_cores_to_us() {
+fn restart_with_one_candle_thread() {
     use std::os::unix::process::CommandExt;
     const CANDLE_THREADS: &str = "CANDLE_NUM_THREADS";
     if std::env::var_os(CANDLE_THREADS).is_some() {
@@ -35,7 +34,7 @@ fn leave_the_cores_to_us() {
     }
     if let Ok(program) = std::env::current_exe() {
         let mut again = std::process::Command::new(program);
-        // Comes back only where it fails; training is then slower, and no less right.
+        // Returns only on failure; the training is then slower, with the same result.
         let _ = again.args(std::env::args_os().skip(1)).env(CANDLE_THREADS, "1").exec();
     }
 }
@@ -43,7 +42,7 @@ fn leave_the_cores_to_us() {
 /// Runs the command.
 pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
     #[cfg(unix)]
-    leave_the_cores_to_us();
+    restart_with_one_candle_thread();
     let config = TrainConfig::load(&args.config)?;
     ensure!(
         args.minutes.is_none_or(|m| m > 0.0),
@@ -57,22 +56,22 @@ pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
     let mut unwritten = None;
     let validator = Validator::new(&config, args.validate.as_deref())?;
     let outcome = training.run(limits, &validator, &mut |event| {
-        watch.hear(event);
+        watch.handle(event);
         if unwritten.is_none() {
-            unwritten = board.hear(event).err();
+            unwritten = board.record(event).err();
         }
     });
     watch.bar.finish_and_clear();
     outcome?;
     if let Some(e) = unwritten {
-        print_warning(format!("{e:#}: TensorBoard's file ends there"));
+        print_warning(format!("{e:#}: TensorBoard's file ends here"));
     }
     let progress = training.progress();
-    // None before the first checkpoint.
+    // The file is absent before the first checkpoint.
     let weights = Some(args.out.join("weights.safetensors")).filter(|file| file.is_file());
-    let place = weights.as_ref().map(|file| format!("; weights in {}", file.display()));
+    let saved = weights.as_ref().map(|file| format!("; weights in {}", file.display()));
     let (done, steps) = (progress.step, config.steps);
-    print_line(format!("{done} of {steps} steps done{}", place.unwrap_or_default()));
+    print_line(format!("{done} of {steps} steps done{}", saved.unwrap_or_default()));
     answer.finish(&json!({
         "step": progress.step,
         "steps": config.steps,
@@ -83,7 +82,7 @@ pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
     }))
 }
 
-/// What is shown: a bar on a terminal, else a line from time to time.
+/// Progress for the user: a bar on a terminal, else a line from time to time.
 struct Watch {
     bar: ProgressBar,
     terminal: bool,
@@ -98,7 +97,7 @@ struct Watch {
 }
 
 fn mean(old: f64, new: f64) -> f64 {
-    if old.is_finite() { old + FRESH * (new - old) } else { new }
+    if old.is_finite() { old + NEW_WEIGHT * (new - old) } else { new }
 }
 
 impl Watch {
@@ -122,37 +121,39 @@ impl Watch {
         }
     }
 
-    fn hear(&mut self, event: &Event) {
+    fn handle(&mut self, event: &Event) {
         match event {
             Event::Begin { step, parameters, resumed, untrained, warnings } => {
                 warnings.iter().for_each(print_warning);
                 self.first = *step;
                 self.started = Instant::now();
                 match resumed {
-                    Some(path) => self.tell(&format!("going on from {}", path.display())),
+                    Some(path) => self.print(&format!("continuing from {}", path.display())),
                     None if *untrained > 0 => {
-                        self.tell(&format!("{untrained} tensors start from the seed"));
+                        self.print(&format!(
+                            "{untrained} tensors start with random values of the seed"
+                        ));
                     }
                     None => {}
                 }
-                self.tell(&format!("{parameters} parameters, step {step} of {}", self.steps));
+                self.print(&format!("{parameters} parameters, step {step} of {}", self.steps));
             }
             Event::Step(report) => self.step(report),
             Event::Skipped { step } => {
                 print_warning(format!("step {step}: loss or gradient not finite, skipped"));
             }
-            Event::Saved(path) => self.tell(&format!("saved {}", path.display())),
+            Event::Saved(path) => self.print(&format!("saved {}", path.display())),
             Event::Validated { step, rooms, photos } => {
-                for (what, found) in [("held-out rooms", rooms), ("photographs", photos)] {
+                for (set, found) in [("held-out rooms", rooms), ("photographs", photos)] {
                     if let Some(found) = found {
-                        self.tell(&looked(*step, what, found));
+                        self.print(&validation_line(*step, set, found));
                     }
                 }
             }
         }
     }
 
-    fn tell(&self, line: &str) {
+    fn print(&self, line: &str) {
         self.bar.suspend(|| print_line(line));
     }
 
@@ -175,11 +176,11 @@ impl Watch {
         print_line(format!("step {} {}", report.step, self.line(report)));
         self.lines += 1;
         if self.lines.is_multiple_of(PROFILE_EVERY) {
-            self.show_profile();
+            self.print_profile();
         }
     }
 
-    /// Loss, PSNR, rate, speed, memory, time left.
+    /// Formats loss, PSNR, learning rate, speed, memory and remaining time.
     fn line(&self, report: &StepReport) -> String {
         let done = (report.step - self.first).max(1) as f64;
         let each = self.started.elapsed().as_secs_f64() / done;
@@ -199,8 +200,8 @@ impl Watch {
         line + &format!(" left {}", duration(left))
     }
 
-    /// Mean seconds of each part of a step since the last profile.
-    fn show_profile(&mut self) {
+    /// Prints the mean time of each part of a step since the last profile.
+    fn print_profile(&mut self) {
         let (seconds, steps) = std::mem::take(&mut self.profile);
         let parts = seconds.parts();
         let share = |s: f64| s / steps.max(1) as f64;
@@ -210,9 +211,9 @@ impl Watch {
     }
 }
 
-fn looked(step: u64, what: &str, found: &Found) -> String {
+fn validation_line(step: u64, set: &str, found: &Found) -> String {
     let mut line = format!(
-        "step {step}, {what}: PSNR {:.2} dB (nearer input {:.2}), SSIM {:.4}",
+        "step {step}, {set}: PSNR {:.2} dB (nearer input {:.2}), SSIM {:.4}",
         found.psnr, found.copy_psnr, found.ssim
     );
     if found.within_one > 0.0 {
@@ -230,7 +231,7 @@ fn duration(seconds: f64) -> String {
     format!("{}:{:02}", minutes / 60, minutes % 60)
 }
 
-/// Memory of this process, bytes; `None` where the system does not say.
+/// Reads the resident memory of this process, bytes; `None` elsewhere than on Linux.
 fn resident_bytes() -> Option<u64> {
     let text = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = text.lines().find(|l| l.starts_with("VmRSS:"))?;

@@ -1,4 +1,4 @@
-//! Command-line arguments. The texts here are the program's manual.
+//! Command-line arguments. Their documentation is the program's manual.
 
 use crate::convert::numbers::Float;
 use clap::{Parser, ValueEnum};
@@ -6,18 +6,18 @@ use std::path::PathBuf;
 use subsplat::config::Preset;
 use subsplat::model::architecture::Kind;
 
-/// What scripts may rely on.
+/// Exit codes, which scripts rely on.
 const EXIT_CODES: &str = "\
-Exit codes: 0 done; 1 an error, told on stderr in one line, and nothing written; 2 wrong usage.
+Exit codes: 0 success; 1 an error, one line on stderr and no file; 2 wrong usage.
 
---json: one object on stdout, nothing else there; {\"error\": ...} with exit codes 1 and 2.";
+--json: one object and nothing else on stdout; {\"error\": ...} with exit codes 1 and 2.";
 
 /// PyTorch checkpoints to .safetensors weights of subsplat.
 ///
-/// Reads what torch.save writes without running anything in it, and .safetensors: Lightning
-/// checkpoints, state dicts, {"model": ...}. Every tensor is held against the architecture
-/// by name and shape; what the model does not need (optimizer state, classifiers) is left
-/// out and counted.
+/// Reads files of torch.save without executing anything in them, and .safetensors: Lightning
+/// checkpoints, state dicts, {"model": ...}. Checks every tensor against the architecture by
+/// name and shape. Leaves out and counts tensors that the model does not have (optimizer state,
+/// classifiers).
 #[derive(Debug, Parser)]
 #[command(name = "subsplat-convert", version, max_term_width = 100, after_help = EXIT_CODES)]
 pub struct Args {
@@ -27,32 +27,31 @@ pub struct Args {
     /// Weights to write (.safetensors).
     #[arg(value_name = "OUT")]
     pub output: PathBuf,
-    /// What the weights are.
+    /// Kind of the weights.
     #[arg(long, value_enum, default_value = "auto")]
     pub kind: KindArg,
-    /// Element type to write. Numbers that it cannot hold are refused.
+    /// Element type to write. Numbers out of its range are rejected.
     #[arg(long, value_enum, default_value = "f32")]
     pub dtype: DtypeArg,
-    /// Take only tensors whose names begin like this, and remove it (`module.`). `encoder.`
-    /// needs no mention.
+    /// Take only tensors whose names begin with this prefix, and remove it (`module.`).
+    /// `encoder.` is removed in any case.
     #[arg(long, default_value = "", hide_default_value = true, value_name = "PREFIX")]
     pub prefix: String,
     /// LPIPS' linear weights (the lpips package's weights/v0.1/vgg.pth), where IN is the
     /// VGG16 trunk alone.
     #[arg(long, value_name = "FILE")]
     pub lpips_linear: Option<PathBuf>,
-    /// Write what is there although the architecture has more tensors. An MVSplat
-    /// checkpoint needs it for `--kind subsplat`.
+    /// Write incomplete weights too. An MVSplat checkpoint needs this for `--kind subsplat`.
     #[arg(long)]
     pub allow_missing: bool,
-    /// Refuse names that the architecture does not have, instead of leaving them out.
+    /// Reject names that the architecture does not have, instead of leaving them out.
     #[arg(long)]
     pub strict: bool,
     /// Replace OUT if it exists.
     #[arg(long)]
     pub force: bool,
-    /// SubSplat's equations, for the configuration in OUT (mvsplat, subsplat). Default: what
-    /// IN says or its tensors fit, else `tuned`.
+    /// SubSplat's equations, for the configuration in OUT (mvsplat, subsplat). Default: those of
+    /// IN's configuration or tensors, else `tuned`.
     #[arg(long, value_name = "paper | tuned")]
     pub preset: Option<Preset>,
     /// Target over input, side over side, for the configuration in OUT. Default: likewise,
@@ -67,10 +66,10 @@ pub struct Args {
     pub json: bool,
 }
 
-/// What the weights are.
+/// Kind of the weights.
 #[derive(Clone, Copy, Debug, ValueEnum)]
 pub enum KindArg {
-    /// What the names tell.
+    /// Recognised by the names.
     Auto,
     /// MVSplat's encoder (471 tensors in the re10k configuration).
     Mvsplat,

@@ -86,8 +86,8 @@ fn write(output: &Path, plan: &Plan, sources: &[Source], to: Float) -> Result<Do
     }
     write_tensors(output, &specs, &metadata(plan, sources)?, |i| {
         let Some((source, entry, from)) = items.get(i) else { return Ok(Vec::new()) };
-        numbers::convert(source.read(entry)?, *from, to).map_err(|refused| {
-            io::Error::format(&source.path, refused.expected, refused.got)
+        numbers::convert(source.read(entry)?, *from, to).map_err(|rejected| {
+            io::Error::format(&source.path, rejected.expected, rejected.got)
                 .at(format!(" tensor `{}`", entry.name))
         })
     })?;

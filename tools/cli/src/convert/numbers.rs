@@ -1,4 +1,4 @@
-//! Elements of weights from one float type to another.
+//! Conversion of weights from one float type to another.
 
 use half::{bf16, f16};
 use safetensors::Dtype;
@@ -13,7 +13,7 @@ pub enum Float {
 }
 
 impl Float {
-    /// As the command line and the report spell it.
+    /// The name on the command line and in the report.
     pub fn name(self) -> &'static str {
         match self {
             Self::F64 => "f64",
@@ -23,7 +23,7 @@ impl Float {
         }
     }
 
-    /// The same in a safetensors file.
+    /// The type in a safetensors file.
     pub fn dtype(self) -> Dtype {
         match self {
             Self::F64 => Dtype::F64,
@@ -33,7 +33,7 @@ impl Float {
         }
     }
 
-    /// Of a safetensors file's type; `None` for what is no float of these.
+    /// Converts a safetensors file's type; `None` for other types than these.
     pub fn from_dtype(dtype: Dtype) -> Option<Self> {
         [Self::F64, Self::F32, Self::F16, Self::Bf16].into_iter().find(|f| f.dtype() == dtype)
     }
@@ -46,7 +46,7 @@ impl Float {
         }
     }
 
-    /// Exact.
+    /// Decodes one element exactly.
     fn decode(self, b: &[u8]) -> f64 {
         match (self, b) {
             (Self::F64, &[a, b, c, d, e, f, g, h]) => f64::from_le_bytes([a, b, c, d, e, f, g, h]),
@@ -57,8 +57,8 @@ impl Float {
         }
     }
 
-    /// Appends `v` rounded to the nearest, ties to even; f64 becomes f16 and bf16 by way
-    /// of f32, as in PyTorch. `false` where a finite `v` becomes infinite.
+    /// Appends `v`, rounded to nearest, ties to even. f64 becomes f16 and bf16 through f32, as in
+    /// PyTorch. Returns `false` where a finite `v` becomes infinite.
     fn encode(self, v: f64, out: &mut Vec<u8>) -> bool {
         match self {
             Self::F64 => {
@@ -83,16 +83,15 @@ impl Float {
     }
 }
 
-/// Why elements were refused.
+/// Reason for the rejection of an element.
 #[derive(Debug, PartialEq, Eq)]
-pub struct Refused {
+pub struct Rejected {
     pub expected: String,
     pub got: String,
 }
 
-/// `bytes`, little-endian elements of type `from`, as elements of type `to`. The same
-/// type keeps every bit.
-pub fn convert(bytes: Vec<u8>, from: Float, to: Float) -> Result<Vec<u8>, Refused> {
+/// Converts little-endian elements of type `from` to type `to`. The same type keeps every bit.
+pub fn convert(bytes: Vec<u8>, from: Float, to: Float) -> Result<Vec<u8>, Rejected> {
     let same = from == to;
     let elements = bytes.chunks_exact(from.size());
     let mut out = Vec::with_capacity(if same { 0 } else { elements.len() * to.size() });
@@ -100,11 +99,11 @@ pub fn convert(bytes: Vec<u8>, from: Float, to: Float) -> Result<Vec<u8>, Refuse
         let v = from.decode(element);
         if !v.is_finite() {
             let (expected, got) = ("finite numbers".to_owned(), format!("{v} at element {i}"));
-            return Err(Refused { expected, got });
+            return Err(Rejected { expected, got });
         }
         if !same && !to.encode(v, &mut out) {
             let expected = format!("numbers within the range of {}", to.name());
-            return Err(Refused { expected, got: format!("{v:e} at element {i}") });
+            return Err(Rejected { expected, got: format!("{v:e} at element {i}") });
         }
     }
     Ok(if same { bytes } else { out })
@@ -114,7 +113,7 @@ pub fn convert(bytes: Vec<u8>, from: Float, to: Float) -> Result<Vec<u8>, Refuse
 mod tests {
     use super::*;
 
-    fn through(values: &[f64], from: Float, to: Float) -> Result<Vec<f64>, Refused> {
+    fn through(values: &[f64], from: Float, to: Float) -> Result<Vec<f64>, Rejected> {
         let mut bytes = Vec::new();
         for v in values {
             from.encode(*v, &mut bytes);
@@ -148,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn what_has_no_place_is_refused() {
+    fn numbers_out_of_range_are_rejected() {
         let e = through(&[1.0, 65520.0], Float::F32, Float::F16).unwrap_err();
         assert_eq!(
             (&*e.expected, &*e.got),

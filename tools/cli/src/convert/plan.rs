@@ -1,4 +1,4 @@
-//! What is taken from the inputs, under which names, and what is not.
+//! Selection of tensors from the inputs, with the names to write.
 
 use crate::convert::args::Args;
 use crate::convert::source::{Content, Entry, Source};
@@ -7,20 +7,20 @@ use std::collections::BTreeMap;
 use subsplat::config::{Config, Preset};
 use subsplat::model::architecture::{Kind, Shapes, expected, guess_config};
 
-/// The outcome of holding names and shapes against the architecture.
+/// Result of the comparison of names and shapes with the architecture.
 pub struct Plan {
     pub kind: Kind,
-    /// The names told the kind, not the user.
+    /// Whether the names determined the kind, and not the user.
     pub recognised: bool,
-    /// What the metadata will say (`mvsplat`, `subsplat`).
+    /// Configuration for the metadata (`mvsplat`, `subsplat`).
     pub config: Option<Config>,
     /// Index of the source and of its entry, by the name to write.
     pub taken: BTreeMap<String, (usize, usize)>,
-    /// Of the architecture, in no input.
+    /// Names of the architecture that no input has.
     pub missing: Vec<String>,
     /// Float tensors and other values that the architecture does not have.
     pub unexpected: Vec<String>,
-    /// Known parts of such files that no model here needs, and names without the prefix.
+    /// Known names that no model here has, and names without the prefix.
     pub not_needed: Vec<String>,
     /// Integer tensors.
     pub integers: Vec<String>,
@@ -33,7 +33,7 @@ struct Named<'a> {
     entry: &'a Entry,
 }
 
-/// Settles everything but the elements.
+/// Decides everything but the elements.
 pub fn plan(args: &Args, sources: &[Source]) -> Result<Plan> {
     let (entries, outside) = named(sources, &args.prefix);
     let file = files(sources);
@@ -70,11 +70,11 @@ pub fn plan(args: &Args, sources: &[Source]) -> Result<Plan> {
     Ok(plan)
 }
 
-/// Entries whose names begin with `prefix`, and the other names.
+/// Separates entries whose names begin with `prefix` from the other names.
 fn named<'a>(sources: &'a [Source], prefix: &str) -> (Vec<Named<'a>>, Vec<String>) {
     let (mut entries, mut outside) = (Vec::new(), Vec::new());
     for (s, source) in sources.iter().enumerate() {
-        // The prefix is the first input's; linear weights come as the package has them.
+        // The prefix applies to the first input; linear weights have the package's own names.
         let prefix = if s == 0 { prefix } else { "" };
         for (e, entry) in source.entries.iter().enumerate() {
             match entry.name.strip_prefix(prefix) {
@@ -92,7 +92,7 @@ fn files(sources: &[Source]) -> String {
     paths.join(" and ")
 }
 
-/// The configuration that goes into the metadata; none for parts of a model.
+/// Determines the configuration for the metadata; `None` for parts of a model.
 fn config(
     args: &Args,
     kind: Kind,
@@ -131,8 +131,8 @@ fn config(
 }
 
 impl Plan {
-    /// Puts every entry into one of the lists. Names that fit with a wrong content or
-    /// shape are errors.
+    /// Puts every entry into one of the lists. A known name with a wrong content or shape is an
+    /// error.
     fn sort_out(&mut self, entries: &[Named], wanted: &Shapes, file: &str) -> Result<()> {
         let mut misshaped = Vec::new();
         for Named { name, at, entry } in entries {
@@ -166,7 +166,7 @@ impl Plan {
         Ok(())
     }
 
-    /// Refuses an outcome that the arguments do not allow.
+    /// Rejects a result that the arguments do not allow.
     fn judge(
         &self,
         args: &Args,

@@ -1,5 +1,5 @@
-//! Where weights come from: a file of `torch.save` or a safetensors file, as a list of
-//! names. Elements are read later, one tensor at a time.
+//! An input file with weights: of `torch.save` or safetensors, as a list of names. Elements are
+//! read later, one tensor at a time.
 
 use crate::convert::numbers::Float;
 use anyhow::{Context, Result, bail};
@@ -14,9 +14,9 @@ use subsplat::io;
 use subsplat::io::tensors::{TensorFile, TensorSpec};
 use subsplat::io::torch::{Form, TensorRef, TorchDtype, TorchFile, Value};
 
-/// Keys under which a state dict stands inside a checkpoint: Lightning's and UniMatch's.
+/// Keys of the state dict inside a checkpoint: Lightning's and UniMatch's.
 const WRAPPERS: [&str; 2] = ["state_dict", "model"];
-/// Bytes hashed at a time.
+/// Bytes per call of the hash.
 const CHUNK: usize = 1 << 16;
 
 /// An input file.
@@ -24,12 +24,12 @@ pub struct Source {
     pub path: PathBuf,
     /// `safetensors`, `torch zip` or `torch legacy`.
     pub format: &'static str,
-    /// Where in the file the state dict stands: `state_dict`, `model`, or nothing.
+    /// Key of the state dict in the file: `state_dict`, `model`, or `None`.
     pub inside: Option<&'static str>,
     pub entries: Vec<Entry>,
     /// Tensors beside the state dict (optimizer state), and their bytes.
     pub beside: (usize, u64),
-    /// Classes and functions that the file names, none of which was called.
+    /// Classes and functions that the file names; none of them was called.
     pub opaque: BTreeSet<String>,
     /// The configuration in the metadata, if there is one.
     pub config: Option<Config>,
@@ -44,17 +44,17 @@ pub struct Entry {
     pub content: Content,
 }
 
-/// What stands under a name.
+/// Content of an entry.
 pub enum Content {
     /// A tensor of floats.
     Floats { dtype: Float, shape: Vec<usize>, place: Place },
-    /// A tensor of integers or bools (counters of layers): in words.
+    /// A tensor of integers or bools (counters of layers), with a description.
     Integers(String),
-    /// Anything else, in words.
+    /// Anything else, with a description.
     Other(String),
 }
 
-/// Where elements are read from.
+/// Location of the elements.
 pub enum Place {
     /// A view of a storage of the torch file.
     Torch(Arc<TensorRef>),
@@ -68,7 +68,7 @@ enum Reader {
 }
 
 impl Source {
-    /// Opens a file; its content decides what it is.
+    /// Opens a file; its content determines the format.
     pub fn open(path: &Path) -> Result<Self> {
         let mut source = match is_safetensors(path)? {
             true => Self::safetensors(path)?,
@@ -83,7 +83,7 @@ impl Source {
         self.path.file_name().unwrap_or_default().to_string_lossy().into_owned()
     }
 
-    /// Elements of one of the entries, little-endian.
+    /// Reads the elements of one of the entries, little-endian.
     pub fn read(&self, entry: &Entry) -> io::Result<Vec<u8>> {
         match (&self.reader, &entry.content) {
             (Reader::Torch(file), Content::Floats { place: Place::Torch(t), .. }) => file.read(t),
@@ -186,7 +186,7 @@ fn float(dtype: TorchDtype) -> Option<Float> {
     }
 }
 
-/// Number and bytes of the tensors in `value`. (The reader bounds its depth.)
+/// Counts the tensors in `value` and their bytes. (The reader limits the depth.)
 fn tensors(value: &Value) -> (usize, u64) {
     let add = |(n, b): (usize, u64), v: &Value| {
         let (more, bytes) = tensors(v);
@@ -199,9 +199,8 @@ fn tensors(value: &Value) -> (usize, u64) {
     }
 }
 
-/// Whether the file is meant as safetensors: by its name, or by the JSON object behind
-/// a header length of at most five bytes. Neither form of `torch.save` has zeros and `{`
-/// there.
+/// Whether the file is safetensors: by its name, or by the JSON object after a header length of
+/// at most five bytes. No file of `torch.save` has zeros and `{` there.
 fn is_safetensors(path: &Path) -> Result<bool> {
     let mut head = Vec::new();
     let file = std::fs::File::open(path).with_context(|| path.display().to_string())?;
@@ -210,7 +209,7 @@ fn is_safetensors(path: &Path) -> Result<bool> {
     Ok(named || head.get(5..) == Some(&[0, 0, 0, b'{']))
 }
 
-/// Length and SHA-256 of a file, in lower-case hexadecimal.
+/// Computes length and SHA-256 of a file, in lower-case hexadecimal.
 fn hash(path: &Path) -> Result<(u64, String)> {
     let mut file = std::fs::File::open(path).with_context(|| path.display().to_string())?;
     let (mut hasher, mut total, mut chunk) = (Sha256::new(), 0, vec![0; CHUNK]);

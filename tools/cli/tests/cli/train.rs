@@ -438,7 +438,7 @@ fn the_program_trains_and_goes_on() {
     assert_eq!(step(&stdout), 2);
     let (_, stdout, stderr) = call(folder.path(), "--json train t.toml --out run --steps 1");
     assert_eq!(step(&stdout), 3);
-    assert!(stderr.contains("going on from"), "{stderr}");
+    assert!(stderr.contains("continuing from"), "{stderr}");
     for name in ["weights.safetensors", "validation.csv", "sheet-00000003-rooms.png", "log.csv"] {
         assert!(folder.path().join("run").join(name).is_file(), "{name}");
     }
