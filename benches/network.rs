@@ -192,13 +192,13 @@ fn stages() -> Result<()> {
     for _ in 0..2 {
         table.clear();
         let mut last = Instant::now();
-        let mut look = |name: &str, _: &Tensor| {
+        let mut observe = |name: &str, _: &Tensor| {
             let parts: Vec<&str> = name.split('.').take(2).collect();
             *table.entry(parts.join(".")).or_default() += last.elapsed().as_secs_f64();
             last = Instant::now();
             Ok(())
         };
-        net.forward(&v, &mut Trace::to(&mut look))?;
+        net.forward(&v, &mut Trace::to(&mut observe))?;
     }
     let total: f64 = table.values().sum();
     println!("\nstages of MVSplat's backbone, 256² (observed, so a little slower than alone)");

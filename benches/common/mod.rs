@@ -239,8 +239,8 @@ impl Bench {
                     }
                     let cpu = cpu_seconds();
                     let start = Instant::now();
-                    let told = run()?;
-                    let wall = told.unwrap_or(start.elapsed().as_secs_f64());
+                    let reported = run()?;
+                    let wall = reported.unwrap_or(start.elapsed().as_secs_f64());
                     anyhow::Ok((wall, cpu_seconds().zip(cpu).map(|(after, before)| after - before)))
                 };
                 let (wall, used) = pool.install(timed).with_context(|| contender.name.clone())?;
