@@ -208,6 +208,7 @@ impl Bench {
 
     /// Times `contenders` alternately and prints a table; ratios are relative to the first one.
     ///
+    /// # Errors
     /// Errors of the contenders.
     pub fn group(&mut self, name: &str, mut contenders: Vec<Contender>, note: &str) -> Result<()> {
         if self.machine.is_none() {
@@ -310,6 +311,7 @@ impl Bench {
 
     /// Writes `--json`.
     ///
+    /// # Errors
     /// The file cannot be written; no group has the requested names.
     pub fn finish(self) -> Result<()> {
         ensure!(!self.groups.is_empty(), "no group has all of {:?} in its name", self.args.names);
@@ -340,6 +342,7 @@ fn cpu_seconds() -> Option<f64> {
 /// and none by more than `loose`, relative to the largest number expected. A `share` above 0 is
 /// for decisions that depend on rounding (alpha below 1/255, the end of blending).
 ///
+/// # Errors
 /// Names the number with the largest difference.
 pub fn agree(
     what: &str,

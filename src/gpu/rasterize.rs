@@ -100,6 +100,7 @@ impl Rasterizer {
 
     /// Renders `splats` as pairs_known by `camera`.
     ///
+    /// # Errors
     /// Errors of the device, or [`GpuError::TooSmall`]; the CPU rasterizer can be used instead.
     pub fn render(
         &mut self,
