@@ -31,8 +31,11 @@
 //! [`config::Config`]; [`ops`] are the same kernels as candle ops. Every geometric
 //! convention is said once, in [`camera`]; [`navigation`] moves one by hand.
 //!
-//! Features, both default: `cli` builds the programs `subsplat` and `subsplat-convert`;
-//! `gpu` the WGSL kernels ([`gpu`]). `view` adds `subsplat view`, a window.
+//! Devices: [`device`] parses the choice of a device, [`backend`] opens it for the ops and the
+//! renderer.
+//!
+//! Features, both default: `cli` builds the programs `subsplat` and `subsplat-convert`; `gpu` the
+//! WGSL kernels ([`gpu`]). `view` adds `subsplat view`, a window.
 
 pub mod abi;
 pub mod backend;
