@@ -1,5 +1,5 @@
-//! The fused attention gather beside a composition of `index_select`, weighted sums and
-//! softmax in candle.
+//! The fused attention gather against a composition of `index_select`, weighted sums and softmax
+//! in candle.
 
 mod common;
 
@@ -10,16 +10,16 @@ use common::inputs::Attention;
 use common::{Bench, Contender, Threads, Work, agree};
 use subsplat::ops::attention_gather::attention_gather;
 
-/// E of the paper.
+/// The paper's E.
 const DIM: usize = 128;
-/// Side of the two input pictures, px. The composition keeps some 40 tensors of
-/// N·2·2E floats for its backward pass, hence the smaller picture there.
+/// Side of the two input pictures, px: forward, backward. The composition keeps about 40 tensors
+/// of N·2·2E floats for its backward pass, so the backward picture is smaller.
 const SIDES: [usize; 2] = [256, 128];
 /// The same with `--quick`.
 const SIDES_QUICK: [usize; 2] = [64, 32];
-/// Queries per call of the composition's forward pass: its tensors stay near the caches.
+/// Queries per call of the composition's forward pass: its tensors fit the caches.
 const CHUNK: usize = 4096;
-/// f32 rounding of sums over 128 channels.
+/// Tolerance: f32 rounding of sums over 128 channels.
 const TIGHT: [f32; 3] = [2e-5, 1e-4, 1e-4];
 
 fn main() -> Result<()> {
@@ -27,7 +27,7 @@ fn main() -> Result<()> {
     let sides = if bench.args.quick { SIDES_QUICK } else { SIDES };
     for (pass, side) in [("forward", sides[0]), ("backward", sides[1])] {
         let name = format!("attention {pass} {side}");
-        if bench.wants(&name) {
+        if bench.selects(&name) {
             let case = Attention::new(side, DIM)?;
             match pass {
                 "forward" => forward(&mut bench, &name, &case)?,

@@ -1,10 +1,9 @@
-//! Every convolution of MVSplat (two 256² views) and of `small` (four pairs of 128²
-//! views), forward and backward, beside blocked im2col with the `gemm` crate.
+//! Every convolution of MVSplat (two 256² views) and of `small` (four pairs of 128² views),
+//! forward and backward, against blocked im2col with the `gemm` crate.
 //!
-//! With `SUBSPLAT_ORT=out/witness-venv/bin/python` (tools/witness/setup.sh makes it)
-//! also beside onnxruntime: same shapes, inputs and threads, in turns with ours, each
-//! result compared first. onnxruntime has packed its weights beforehand; ours does so in
-//! every call.
+//! With `SUBSPLAT_ORT=out/witness-venv/bin/python` (made by tools/witness/setup.sh) also against
+//! onnxruntime, with the same shapes, inputs and threads. The runs alternate, and results are
+//! compared first. onnxruntime packs its weights beforehand; this crate packs them in every call.
 
 mod common;
 
@@ -22,7 +21,7 @@ use subsplat::cpu::conv::{Sizes, bias_grad, forward, input_grad, weight_grad};
 use subsplat::ops::conv2d::conv2d;
 use subsplat::ops::conv3d::conv3d;
 
-/// As in the program.
+/// The allocator of the programs.
 #[path = "../tools/cli/src/pages.rs"]
 #[allow(dead_code, reason = "its unit tests run with the programs")]
 mod pages;
@@ -84,7 +83,7 @@ const SMALL: &[Row] = &[
 /// 3-D stem of `small`: channels in and out; eight volumes of 64 candidates at 32².
 const STEM: &[(&str, usize, usize)] = &[("stem.0", 5, 8), ("stem.1", 8, 1)];
 
-/// (‖·‖ as `agree` takes it.) Winograd against sums in another order.
+/// Tolerance of `agree`: Winograd against sums in another order.
 const CLOSE: [f32; 3] = [1e-5, 1e-4, 1e-4];
 
 /// One convolution with inputs.
@@ -131,7 +130,7 @@ impl Case {
         })
     }
 
-    /// The baseline knows pictures only.
+    /// Returns the baseline's geometry; `None` for volumes, which it does not support.
     fn plain(&self) -> Option<plain::Geometry> {
         let s = &self.sizes;
         (!self.volume()).then_some(plain::Geometry {
@@ -171,7 +170,7 @@ fn main() -> Result<()> {
         let case = case?;
         for (pass, backward) in [("forward", false), ("backward", true)] {
             let name = format!("{pass} {}", case.name);
-            if !bench.wants(&name) {
+            if !bench.selects(&name) {
                 continue;
             }
             match backward {
@@ -206,7 +205,7 @@ fn forth(bench: &mut Bench, name: &str, case: &Case, ort: Option<&mut Ort>) -> R
     if let Some(ort) = ort {
         let error = ort.load(case, &y, threads)?;
         ensure!(error < 2e-5, "{name}: onnxruntime differs by {error:e}");
-        contenders.insert(0, Contender::elsewhere("onnxruntime", move || ort.run()));
+        contenders.insert(0, Contender::in_other_process("onnxruntime", move || ort.run()));
     }
     for threads in [Threads::One, Threads::All] {
         let run = || case.run().map(drop);
@@ -252,7 +251,7 @@ fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
     bench.group(name, contenders, "input, weight and bias; ratios to the forward pass")
 }
 
-/// A Python with onnxruntime that runs one convolution at a time.
+/// A Python process with onnxruntime that runs one convolution at a time.
 struct Ort {
     child: Child,
     to: ChildStdin,
@@ -272,15 +271,15 @@ impl Ort {
         Ok(Self { child, to, from: BufReader::new(from), folder: tempfile::tempdir()? })
     }
 
-    fn ask(&mut self, command: &Value, answer: &str) -> Result<f64> {
+    fn request(&mut self, command: &Value, answer: &str) -> Result<f64> {
         writeln!(self.to, "{command}")?;
         let mut line = String::new();
         self.from.read_line(&mut line)?;
-        let reply: Value = serde_json::from_str(&line).context("onnxruntime gave no answer")?;
-        reply[answer].as_f64().with_context(|| format!("onnxruntime answered {line}"))
+        let reply: Value = serde_json::from_str(&line).context("onnxruntime sent no reply")?;
+        reply[answer].as_f64().with_context(|| format!("onnxruntime replied {line}"))
     }
 
-    /// Loads a case; its largest difference from `y`, over y's largest value.
+    /// Loads a case; returns the largest difference from `y`, relative to the largest value of y.
     fn load(&mut self, case: &Case, y: &Tensor, threads: usize) -> Result<f64> {
         let mut files = serde_json::Map::new();
         for (name, tensor) in [("x", &case.x), ("w", &case.w), ("b", &case.b), ("y", y)] {
@@ -292,11 +291,11 @@ impl Ort {
         files.insert("stride".into(), json!(case.sizes.stride[2]));
         files.insert("padding".into(), json!(case.sizes.padding[2]));
         files.insert("threads".into(), json!(threads));
-        self.ask(&Value::Object(files), "error")
+        self.request(&Value::Object(files), "error")
     }
 
     fn run(&mut self) -> Result<f64> {
-        self.ask(&json!({}), "seconds")
+        self.request(&json!({}), "seconds")
     }
 }
 

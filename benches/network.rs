@@ -1,14 +1,13 @@
-//! The whole network: a training step of the small backbone, photographs to a picture
-//! with either backbone, where MVSplat's time goes (`-- stages`), what more threads do
-//! not shorten (`-- serial`), and with `--onnxruntime` the same backbone and the same
-//! operators in onnxruntime, in the same run:
+//! The whole network: a training step of the small backbone; photographs to a picture with either
+//! backbone; the time of MVSplat's stages (`-- stages`); the serial fraction (`-- serial`). With
+//! `--onnxruntime` also the same backbone and operators in onnxruntime, in the same run:
 //!
 //! ```text
 //! tools/witness/setup.sh
 //! cargo bench --bench network -- --onnxruntime
 //! ```
 //!
-//! `SUBSPLAT_PYTHON` names another interpreter than `out/witness-venv/bin/python`.
+//! `SUBSPLAT_PYTHON` selects another interpreter than `out/witness-venv/bin/python`.
 
 mod common;
 #[path = "network/ops.rs"]
@@ -30,7 +29,7 @@ use subsplat::model::trace::Trace;
 use subsplat::model::weights::Weights;
 use subsplat::pipeline::{Check, DepthBounds, Detail, Options, Photo, Reconstructor};
 
-/// As in the program.
+/// The allocator of the programs.
 #[path = "../tools/cli/src/pages.rs"]
 #[allow(dead_code, reason = "its unit tests run with the programs")]
 mod pages;
@@ -47,7 +46,7 @@ fn main() -> Result<()> {
     training_step(&mut bench)?;
     for case in CASES {
         let name = format!("photographs to picture, {case}");
-        if bench.wants(&name) {
+        if bench.selects(&name) {
             let mut run = whole(case)?;
             bench.group(
                 &name,
@@ -56,7 +55,7 @@ fn main() -> Result<()> {
             )?;
         }
     }
-    let tables = ["stages", "serial"].map(|name| bench.wants(name));
+    let tables = ["stages", "serial"].map(|name| bench.selects(name));
     if tables[0] {
         bench.on_all(stages)?;
     }
@@ -65,22 +64,22 @@ fn main() -> Result<()> {
     }
     if bench.args.onnxruntime {
         let rival = Rival::find(bench.threads(), bench.args.quick)?;
-        if bench.wants("operators") {
+        if bench.selects("operators") {
             ops::compare(&mut bench, &rival)?;
         }
-        if bench.wants("backbones") {
+        if bench.selects("backbones") {
             rival::compare(&bench, &rival)?;
         }
         return Ok(());
     }
-    // Tables of their own are no groups.
+    // Tables that are not groups.
     if tables.contains(&true) && !bench.args.names.is_empty() {
         return Ok(());
     }
     bench.finish()
 }
 
-/// `batch` scenes of two pictures.
+/// Returns `batch` scenes of two pictures.
 fn views(batch: usize, side: usize) -> Result<Views> {
     let cameras = scene::views(side).to_vec();
     let images = (inputs::tensor(&[batch, 2, 3, side, side], 0.2, 7)? + 0.5)?.clamp(0.0, 1.0)?;
@@ -90,12 +89,12 @@ fn views(batch: usize, side: usize) -> Result<Views> {
 /// Forward, a loss of every output, backward: 128², batch 4, without rendering.
 fn training_step(bench: &mut Bench) -> Result<()> {
     let name = "small training step 128 batch 4";
-    if !bench.wants(name) {
+    if !bench.selects(name) {
         return Ok(());
     }
     let weights = Weights::seeded(3).trainable();
     let net = SmallBackbone::new(&Small::standard(), weights.builder().pp("small"))?;
-    // The untrained start closes most branches.
+    // Most branches are zero before training.
     for (n, var) in weights.variables().values().enumerate() {
         let nudge = inputs::tensor(var.dims(), 0.02, n as u64)?;
         var.set(&(var.as_tensor() + nudge)?)?;
@@ -149,7 +148,7 @@ fn photo(side: usize, view: usize) -> Result<Photo> {
 
 type Run = Box<dyn FnMut() -> Result<f64> + Send>;
 
-/// What one of [`CASES`] does, decoding aside.
+/// Returns one of [`CASES`] as a function, without decoding.
 fn whole(case: &str) -> Result<Run> {
     let words: Vec<&str> = case.split(' ').collect();
     if let ["mvsplat", "backbone", side] = words[..] {
@@ -165,7 +164,7 @@ fn whole(case: &str) -> Result<Run> {
         "small" => Config::small(Preset::Tuned, to / from),
         _ => Config::re10k(Preset::Tuned, to / from),
     };
-    // MVSplat itself: one Gaussian a pixel.
+    // MVSplat alone: one Gaussian per pixel.
     config.spgr.enabled = to > from;
     let model = Reconstructor::untrained(&config, 3)?;
     let photos = [photo(to, 0)?, photo(to, 1)?];
@@ -181,12 +180,12 @@ fn whole(case: &str) -> Result<Run> {
     }))
 }
 
-/// MVSplat of the released size, seeded.
+/// MVSplat of the released size, with seeded weights.
 fn backbone() -> Result<Mvsplat> {
     Ok(Mvsplat::new(&Settings::re10k(), Weights::seeded(3).builder())?)
 }
 
-/// Seconds between the stages that MVSplat's backbone announces, summed by the first two
+/// Prints the seconds between the stages that MVSplat's backbone reports, summed by the first two
 /// parts of their names; second of two runs.
 fn stages() -> Result<()> {
     let (net, v) = (backbone()?, views(1, 256)?);
@@ -194,13 +193,13 @@ fn stages() -> Result<()> {
     for _ in 0..2 {
         table.clear();
         let mut last = Instant::now();
-        let mut look = |name: &str, _: &Tensor| {
+        let mut observe = |name: &str, _: &Tensor| {
             let parts: Vec<&str> = name.split('.').take(2).collect();
             *table.entry(parts.join(".")).or_default() += last.elapsed().as_secs_f64();
             last = Instant::now();
             Ok(())
         };
-        net.forward(&v, &mut Trace::to(&mut look))?;
+        net.forward(&v, &mut Trace::to(&mut observe))?;
     }
     let total: f64 = table.values().sum();
     println!("\nstages of MVSplat's backbone, 256² (observed, so a little slower than alone)");
@@ -211,9 +210,8 @@ fn stages() -> Result<()> {
     Ok(())
 }
 
-/// The share of the time that does not get shorter with more threads, by Amdahl's law
-/// from one thread and all: what is serial, and what waits for the memory that all
-/// threads share.
+/// Prints the fraction of the time that more threads do not shorten, by Amdahl's law from one
+/// thread and all. It includes serial code and waits for shared memory bandwidth.
 fn serial(bench: &Bench) -> Result<()> {
     let threads = bench.threads();
     anyhow::ensure!(threads > 1, "serial share: expected 2 threads or more, got {threads}");
@@ -230,7 +228,7 @@ fn serial(bench: &Bench) -> Result<()> {
     Ok(())
 }
 
-/// One of [`CASES`], or the backbone at 256², once, in this process; prints its peak
+/// Runs one of [`CASES`], or the backbone at 256², once in this process, and prints the peak
 /// memory in bytes.
 fn peak_of(case: &str) -> Result<()> {
     let sum = whole(case)?()?;
@@ -241,11 +239,11 @@ fn peak_of(case: &str) -> Result<()> {
     Ok(())
 }
 
-/// Peak memory of `case` in a process of its own, bytes.
+/// Returns the peak memory of `case` in a separate process, bytes.
 fn peak(case: &str) -> Result<f64> {
     let out =
         std::process::Command::new(std::env::current_exe()?).args(["--peak", case]).output()?;
-    let said = String::from_utf8_lossy(&out.stdout);
-    let bytes = said.split_whitespace().next().context("the child said nothing")?;
+    let output = String::from_utf8_lossy(&out.stdout);
+    let bytes = output.split_whitespace().next().context("the child process printed nothing")?;
     bytes.parse().with_context(|| format!("{case}: {}", String::from_utf8_lossy(&out.stderr)))
 }

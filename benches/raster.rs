@@ -1,10 +1,9 @@
-//! The rasterizer beside a conventional one (`common/conventional/raster.rs`) on scenes
-//! of a pixel-aligned network (`common/scene.rs`): forward, and the full backward pass.
+//! The rasterizer against a conventional one (`common/conventional/raster.rs`) on scenes of a
+//! pixel-aligned network (`common/scene.rs`): forward, and the full backward pass.
 //!
 //! `-- --write DIR` writes the scenes for other programs instead: `NAME.ply`,
-//! `NAME.cameras.json`, and `NAME.safetensors` (one SH set a splat) and
-//! `NAME.shared.safetensors` (one a parent of four) with the camera in tensors and
-//! metadata.
+//! `NAME.cameras.json`, `NAME.safetensors` (one SH set per splat) and `NAME.shared.safetensors`
+//! (one per parent of four). Tensors and metadata contain the camera.
 
 mod common;
 
@@ -29,23 +28,22 @@ use subsplat::render::slices;
 use subsplat::splats::Splats;
 use subsplat_test_support::oracle;
 
-/// Side of a splat's box in σ: what most programs take, and what the baseline is timed
-/// with.
+/// Half side of a splat's box in σ, for timing the baseline: the value of most programs.
 const BOX: f32 = 3.0;
-/// A box that cuts no pixel of alpha ≥ 1/255: what the baseline is checked with.
+/// Half side of a box that cuts no pixel of alpha ≥ 1/255, for checking the baseline.
 const EXACT_BOX: f32 = 3.34;
-/// Least multiplications and additions of one splat at one pixel: exponent 9, 2^x 13,
-/// alpha and transmittance 4, four sums 9.
+/// Minimum multiplications and additions of one splat at one pixel: exponent 9, 2^x 13, alpha and
+/// transmittance 4, four sums 9.
 const FLOPS_PER_PIXEL: f64 = 35.0;
-/// The same of one projection: camera 15, J·W 12, rotation 30, M 36, covariance 15,
-/// conic and extent 40.
+/// The same for one projection: camera 15, J·W 12, rotation 30, M 36, covariance 15, conic and
+/// extent 40.
 const FLOPS_PER_SPLAT: f64 = 150.0;
-/// Differences of pictures: all but three thousandths of the numbers within 5e-5;
-/// elsewhere a splat's 1/255 may flip, and the more splats a pixel sees the more often.
+/// Tolerance of pictures: all but three thousandths of the numbers within 5e-5. Elsewhere a
+/// splat's threshold of 1/255 may flip, more often the more splats a pixel has.
 const PICTURE: [f32; 3] = [5e-5, 0.2, 3e-3];
-/// The same of gradients, of which f32 sums over many pixels cancel.
+/// Tolerance of gradients: their f32 sums over many pixels cancel.
 const GRADIENT: [f32; 3] = [2e-4, 0.2, 1e-3];
-/// Picture for which the naive oracle takes seconds rather than minutes.
+/// Side of a picture that the naive oracle renders in seconds, px.
 const NAIVE_SIDE: usize = 128;
 
 fn main() -> Result<()> {
@@ -62,17 +60,17 @@ fn main() -> Result<()> {
             [("shared", &shared), ("own", &|| scene::unshared(&shared()))];
         for (form, splats) in forms {
             let names = ["forward", "backward"].map(|p| format!("{p} {} {form}", spec.name));
-            // One SH set a splat says more about memory than about rasterizing.
+            // One SH set per splat measures memory rather than rasterization.
             let extra = form == "own" && spec.name != "131k-512" && spec.name != "524k-512";
-            if extra || !names.iter().any(|n| bench.wants(n)) {
+            if extra || !names.iter().any(|n| bench.selects(n)) {
                 continue;
             }
             let case = Case::new(spec, splats());
             let stats = case.check(&bench)?;
-            if bench.wants(&names[0]) {
+            if bench.selects(&names[0]) {
                 forward(&mut bench, &names[0], &case, stats)?;
             }
-            if bench.wants(&names[1]) {
+            if bench.selects(&names[1]) {
                 backward(&mut bench, &names[1], &case)?;
             }
         }
@@ -110,14 +108,14 @@ impl Case {
         }
     }
 
-    /// Gradient of the picture that backward passes start from.
+    /// Returns the gradients of picture and alpha for the backward passes.
     fn seeds(&self) -> (Vec<f32>, Vec<f32>) {
         let pixels = (self.camera.intrinsics.width * self.camera.intrinsics.height) as u64;
         let seeds = |stream: u64, n: u64| (0..n).map(|i| scene::normal(stream, i)).collect();
         (seeds(50, 3 * pixels), seeds(51, pixels))
     }
 
-    /// Our picture against the baseline's, and in small against the naive oracle's.
+    /// Compares the picture with the baseline's, and a small one with the naive oracle's.
     fn check(&self, bench: &Bench) -> Result<Stats> {
         let mut ours = Rasterizer::new();
         let got = bench.on_all(|| ours.render(&slices(&self.splats), &self.camera, &self.options));
@@ -152,14 +150,14 @@ impl Case {
         oracle::render(&splats, &self.camera, &self.options)
     }
 
-    /// What a forward pass must move and compute by the rasterizer's own counts.
+    /// Returns the minimum work of a forward pass, from the rasterizer's counts.
     fn work(&self, stats: Stats) -> Work {
         let s = &self.splats;
         let (n, pairs) = (s.len() as f64, stats.pairs as f64);
         let pixels = (self.camera.intrinsics.width * self.camera.intrinsics.height) as f64;
         let input = 4.0 * (s.rows().len() + s.sh().len() + s.gain().len()) as f64;
-        // A 64-byte record a splat, written and read per tile; sort keys and values,
-        // written and read thrice; lists, written and read; RGB, alpha, depth.
+        // A 64-byte record per splat, written and read per tile; sort keys and values, written
+        // and read three times; lists, written and read; RGB, alpha, depth.
         let bytes = input + 64.0 * (n + pairs) + 48.0 * n + 8.0 * pairs + 20.0 * pixels;
         let sh = 2.0 * s.sh().len() as f64 + 40.0 * s.parents() as f64;
         let flops = 16.0 * FLOPS_PER_PIXEL * stats.items as f64 + FLOPS_PER_SPLAT * n + sh;
@@ -215,7 +213,7 @@ fn forward(bench: &mut Bench, name: &str, case: &Case, stats: Stats) -> Result<(
     bench.group(name, contenders, &note)
 }
 
-/// Time of each stage on the device, for a group's note.
+/// Formats the time of each stage on the device for a group's note.
 #[cfg(feature = "gpu")]
 fn stages_of(pairs: usize, times: &[(&'static str, std::time::Duration)]) -> String {
     let each = |(stage, time): &(&str, std::time::Duration)| {
@@ -236,18 +234,18 @@ fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
     };
     let mut plain = [false, true].map(Conventional::new);
     plain.iter_mut().for_each(forward);
-    let [walks, keeps] = &plain;
+    let [recomputes, stores] = &plain;
     let mut both = Conventional::default();
     let planes = &planes(&seeds);
     let mut kept: [(Frames, Vec<f32>); 2] = Default::default();
     let (mut one, mut all) = (Frames::default(), Frames::default());
     let mut contenders = vec![
         Contender::new("conventional, backward alone", Threads::One, || {
-            backward(walks);
+            backward(recomputes);
             Ok(())
         }),
-        Contender::new("conventional, keeps what it blended", Threads::One, || {
-            backward(keeps);
+        Contender::new("conventional, stores the blended splats", Threads::One, || {
+            backward(stores);
             Ok(())
         }),
         Contender::new("conventional, both passes", Threads::One, || {
@@ -273,7 +271,7 @@ fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
             Ok(())
         }));
     }
-    let mut note = "gradients of everything; compare like with like".to_owned();
+    let mut note = "gradients of all inputs".to_owned();
     #[cfg(feature = "gpu")]
     if let Ok(Some(gpu)) = Gpu::open(&DeviceChoice::Gpu) {
         let name = format!("subsplat, {}, both passes", gpu.adapter().name);
@@ -298,14 +296,14 @@ fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
     bench.group(name, contenders, &note)
 }
 
-/// Our rasterizer with its results' buffers.
+/// A rasterizer with the buffers of its results.
 #[derive(Default)]
 struct Frames {
     rasterizer: Rasterizer,
     gradients: Gradients,
 }
 
-/// `[5, H, W]` of the gradients of RGB `[H, W, 3]` and alpha `[H, W]`.
+/// Returns `[5, H, W]` from the gradients of RGB `[H, W, 3]` and alpha `[H, W]`.
 fn planes((v_rgb, v_alpha): &(Vec<f32>, Vec<f32>)) -> Vec<f32> {
     let mut planes: Vec<f32> = Vec::with_capacity(5 * v_alpha.len());
     for c in 0..3 {
@@ -316,7 +314,7 @@ fn planes((v_rgb, v_alpha): &(Vec<f32>, Vec<f32>)) -> Vec<f32> {
     planes
 }
 
-/// Our gradients against the baseline's, each lane for itself.
+/// Compares the gradients with the baseline's, column by column.
 fn check_gradients(bench: &Bench, case: &Case, seeds: &(Vec<f32>, Vec<f32>)) -> Result<()> {
     let mut plain = Conventional::default();
     let options = case.plain_options(EXACT_BOX);
@@ -333,11 +331,11 @@ fn check_gradients(bench: &Bench, case: &Case, seeds: &(Vec<f32>, Vec<f32>)) -> 
     agree_all("", &ours.gradients, [&e.rows, &e.sh, &e.gain, &e.background])
 }
 
-/// Gradients against those of rows, SH, gain and background.
+/// Compares gradients with those of rows, SH, gain and background.
 fn agree_all(whose: &str, got: &Gradients, [rows, sh, gain, back]: [&[f32]; 4]) -> Result<()> {
     for lane in 0..11 {
         let column = |rows: &[f32]| rows.iter().skip(lane).step_by(11).copied().collect::<Vec<_>>();
-        let what = format!("{whose}gradient of lane {lane}");
+        let what = format!("{whose}gradient of column {lane}");
         agree(&what, &column(&got.rows), &column(rows), GRADIENT)?;
     }
     agree(&format!("{whose}gradient of sh"), &got.sh, sh, GRADIENT)?;
@@ -351,7 +349,7 @@ fn agree_all(whose: &str, got: &Gradients, [rows, sh, gain, back]: [&[f32]; 4]) 
 fn write(folder: &Path, bench: &Bench) -> Result<()> {
     std::fs::create_dir_all(folder)?;
     let mut written = Vec::new();
-    for spec in SCENES.iter().filter(|s| bench.wants(s.name)) {
+    for spec in SCENES.iter().filter(|s| bench.selects(s.name)) {
         let at = |ending: &str| folder.join(format!("{}.{ending}", spec.name));
         let (splats, camera) = (scene::shared(spec), scene::camera(spec.side));
         save_splats(&at("ply"), &splats, &Default::default())?;

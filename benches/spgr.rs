@@ -1,5 +1,5 @@
-//! Sub-pixel reparameterization and opacity redistribution, fused, beside the same as a
-//! graph of candle tensor operations.
+//! Sub-pixel reparameterization and opacity redistribution, fused, against a graph of candle
+//! tensor operations.
 
 mod common;
 use subsplat_test_support::spgr_reference;
@@ -17,7 +17,7 @@ use subsplat::model::spgr::rules;
 use subsplat::ops::redistribute::{Rule, redistribute};
 use subsplat::ops::spgr::{Spgr, spgr, spgr_into};
 
-/// As in the program.
+/// The allocator of the programs.
 #[path = "../tools/cli/src/pages.rs"]
 #[allow(dead_code, reason = "its unit tests run with the programs")]
 mod pages;
@@ -25,16 +25,16 @@ mod pages;
 #[global_allocator]
 static PAGES: pages::Pages = pages::Pages;
 
-/// Side of the two input pictures, px: 131,072 parents, as MVSplat's 256² gives them.
+/// Side of the two input pictures, px: 131,072 parents, as for MVSplat at 256².
 const SIDE: usize = 256;
 /// The same with `--quick`.
 const SIDE_QUICK: usize = 64;
-/// Multiplications and additions of one child, an elementary function counted as 18:
-/// eleven of them, quaternions 40, rotation 30, M 48, area and growth 35, opacity 20.
+/// Multiplications and additions of one child, 18 per elementary function: eleven functions,
+/// quaternions 40, rotation 30, M 48, area and growth 35, opacity 20.
 const FLOPS_PER_CHILD: f64 = 370.0;
-/// The same of redistribution alone: two elementary functions and eight more.
+/// The same for redistribution alone: two elementary functions and eight operations.
 const FLOPS_PER_SHARE: f64 = 44.0;
-/// f32 rounding through two chains of some 40 operations.
+/// Tolerance: f32 rounding through two chains of about 40 operations.
 const TIGHT: [f32; 3] = [1e-4, 1e-2, 1e-4];
 
 fn main() -> Result<()> {
@@ -43,14 +43,14 @@ fn main() -> Result<()> {
     for (preset, name) in [(Preset::Tuned, "tuned"), (Preset::Paper, "paper")] {
         for upscale in [2, 4] {
             let names = ["forward", "backward"].map(|p| format!("spgr {p} {name} x{upscale}"));
-            if !names.iter().any(|n| bench.wants(n)) {
+            if !names.iter().any(|n| bench.selects(n)) {
                 continue;
             }
             let case = Case::new(side, preset, upscale)?;
-            if bench.wants(&names[0]) {
+            if bench.selects(&names[0]) {
                 forward(&mut bench, &names[0], &case)?;
             }
-            if bench.wants(&names[1]) {
+            if bench.selects(&names[1]) {
                 backward(&mut bench, &names[1], &case)?;
             }
         }
@@ -59,7 +59,7 @@ fn main() -> Result<()> {
         for children in [4, 16] {
             for (pass, pass_name) in [(Pass::Forward, "forward"), (Pass::Both, "backward")] {
                 let name = format!("redistribute {pass_name} {name} K={children}");
-                if bench.wants(&name) {
+                if bench.selects(&name) {
                     redistribution(&mut bench, &name, rule, (2 * side * side, children), pass)?;
                 }
             }
@@ -72,8 +72,8 @@ fn host(t: &Tensor) -> Result<Vec<f32>> {
     Ok(t.flatten_all()?.to_vec1()?)
 }
 
-/// Σ wᵢxᵢ over two tensors as one op, whose gradients are the weights as they lie: a
-/// loss that costs next to nothing beside what it measures.
+/// Σ wᵢxᵢ over two tensors as one op, whose gradients are the weights. The cost of this loss is
+/// negligible.
 struct Dot([Tensor; 2]);
 
 impl CustomOp2 for Dot {
@@ -109,7 +109,7 @@ impl CustomOp2 for Dot {
         _: &Tensor,
         _: &Tensor,
     ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>)> {
-        // The loss is the end of the graph: its own gradient is 1.
+        // The loss is the root of the graph: its own gradient is 1.
         let [a, b] = &self.0;
         Ok((Some(a.clone()), Some(b.clone())))
     }
@@ -120,7 +120,7 @@ struct Case {
     call: Spgr,
     head: Tensor,
     parents: Tensor,
-    /// Weights of the loss that backward passes start from.
+    /// Weights of the loss of the backward passes.
     weights: [Tensor; 2],
 }
 
@@ -158,7 +158,7 @@ impl Case {
         self.call.per_view * 2 * self.call.rules.children()
     }
 
-    /// Gradients by head records and parents.
+    /// Returns the gradients of head records and parents.
     fn gradients(&self, op: Op) -> Result<[Tensor; 2]> {
         let (head, parents) = (Var::from_tensor(&self.head)?, Var::from_tensor(&self.parents)?);
         let (rows, gains) = op(&head, &parents, &self.call)?;
@@ -170,10 +170,10 @@ impl Case {
         Ok([get(&head)?, get(&parents)?])
     }
 
-    /// Of forward and backward: the inputs are read twice more (each lane of the head
-    /// records, and the cache line of the gain once again), results' gradients are read
-    /// and inputs' gradients written; children are calculated three times, and their
-    /// gradient costs as much as two.
+    /// Returns the minimum work of forward and backward. The inputs are read twice more (each
+    /// column of the head records, and the cache line of the gain once again). Gradients of the
+    /// results are read and gradients of the inputs written. Children are computed three times,
+    /// and their gradient costs as much as two.
     fn work_both(&self) -> Work {
         let Work { bytes, flops } = self.work();
         let head = 4.0 * self.children() as f64 * HEAD_STRIDE as f64;
@@ -248,8 +248,7 @@ fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
     bench.group(name, contenders, &note)
 }
 
-/// Both passes of the op on buffers that are there already, without candle's sums of
-/// gradients.
+/// Both passes of the op on existing buffers, without candle's sums of gradients.
 struct Kernels {
     head: Vec<f32>,
     parents: Vec<f32>,
@@ -287,10 +286,10 @@ enum Pass {
     Both,
 }
 
-/// Least work of redistribution.
+/// Returns the minimum work of redistribution.
 fn share_work(rule: Rule, (parents, children): (usize, usize), pass: Pass) -> Work {
-    // Forward: logits, areas and per-parent numbers in, opacities out. Backward: the same
-    // and the gradient in, gradients of all inputs out.
+    // Forward: logits, areas and per-parent numbers are read, opacities written. Backward: the
+    // gradient is read in addition, and the gradients of all inputs are written.
     let (pc, per_parent) = ((parents * children) as f64, parents as f64);
     let singles = if rule.areas_are_relative() { 2.0 } else { 1.0 };
     let (bytes, flops) = match pass {
@@ -313,7 +312,7 @@ fn redistribution(
     let alpha: Vec<f32> = (0..parents as u64).map(|i| scene::unit(73, i)).collect();
     let alpha = Var::from_vec(alpha, parents, &candle_core::Device::Cpu)?;
     let weights = inputs::tensor(&[parents, children], 1.0, 74)?;
-    // Leaves without gradients do not keep the graph's parts.
+    // Leaves without gradients keep no intermediate results.
     let leaf = |v: &Var| if pass == Pass::Both { v.as_tensor().clone() } else { v.detach() };
     let (l, a, o) = (leaf(&logits), leaf(&areas), leaf(&alpha));
     let run = |fused: bool, weighted: bool| -> Result<Vec<Tensor>> {
@@ -325,7 +324,7 @@ fn redistribution(
         if pass == Pass::Forward {
             return Ok(vec![y]);
         }
-        // Timed is the gradient of Σy, which candle seeds with ones and no other work.
+        // The timed loss is Σy: candle starts with a gradient of ones and no other work.
         let grads = if weighted { y.mul(&weights)?.sum_all()?.backward()? } else { y.backward()? };
         Ok([&logits, &areas, &alpha].into_iter().filter_map(|v| grads.get(v).cloned()).collect())
     };

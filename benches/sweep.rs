@@ -1,4 +1,4 @@
-//! The fused plane sweep beside a warp of all features to all depths and a dot product
+//! The fused plane sweep against a warp of all features to all depths and a dot product
 //! (`common/conventional/sweep.rs`), at MVSplat's sizes.
 
 mod common;
@@ -9,11 +9,11 @@ use common::conventional::sweep as plain;
 use common::{Bench, Contender, Threads, Work, agree, inputs, scene};
 use subsplat::ops::plane_sweep::{Sweep, plane_sweep};
 
-/// Two 256² pictures, features a quarter as wide: (side, channels, candidates).
+/// Two 256² pictures with features at a quarter of the resolution: (side, channels, candidates).
 const SIZE: (usize, usize, usize) = (64, 128, 128);
 /// The same with `--quick`.
 const SIZE_QUICK: (usize, usize, usize) = (32, 32, 32);
-/// f32 rounding of sums over 128 channels.
+/// Tolerance: f32 rounding of sums over 128 channels.
 const TIGHT: [f32; 3] = [2e-5, 1e-4, 1e-4];
 
 fn main() -> Result<()> {
@@ -25,10 +25,10 @@ fn main() -> Result<()> {
         weights: inputs::tensor(&[2, depths, side, side], 1.0, 91)?,
     };
     let name = |pass: &str| format!("sweep {pass} {side}x{side} C={channels} D={depths}");
-    if bench.wants(&name("forward")) {
+    if bench.selects(&name("forward")) {
         forward(&mut bench, &name("forward"), &case)?;
     }
-    if bench.wants(&name("backward")) {
+    if bench.selects(&name("backward")) {
         backward(&mut bench, &name("backward"), &case)?;
     }
     bench.finish()
@@ -38,7 +38,7 @@ struct Case {
     sweep: Sweep,
     /// `[2, C, h, w]`.
     features: Tensor,
-    /// `[2, D, h, w]`: of the loss that backward passes start from.
+    /// `[2, D, h, w]`: gradient of the loss for the backward passes.
     weights: Tensor,
 }
 
@@ -60,7 +60,7 @@ impl Case {
 
     fn work(&self) -> Work {
         let (features, out) = (self.features.elem_count(), self.weights.elem_count());
-        // Reference and source are one tensor here; four taps of C multiply-adds each.
+        // Reference and source are one tensor; four taps of C multiply-adds each.
         let flops = 8.0 * (out * self.sweep.channels) as f64;
         Work { bytes: 4.0 * (2 * features + out) as f64, flops }
     }
@@ -88,7 +88,7 @@ fn backward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
     let (features, weights) = (host(&case.features)?, host(&case.weights)?);
     let warped = || {
         let (reference, source) = plain::backward(&case.sweep, &features, &features, &weights);
-        // The features are both.
+        // The features are reference and source.
         reference.iter().zip(&source).map(|(a, b)| a + b).collect::<Vec<f32>>()
     };
     let fused = case.fused_gradient();

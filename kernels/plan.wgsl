@@ -1,5 +1,5 @@
-// Number of workgroups for the sort of the (splat, tile) pairs, from the number of pairs, which
-// only the device knows. `sums` holds that number after the sums of its blocks.
+// Number of workgroups for the sort of the (splat, tile) pairs, from the number of pairs. `sums`
+// holds that number after the sums of its blocks; it exists on the device only.
 
 @group(0) @binding(0) var<uniform> call: RasterUniform;
 @group(0) @binding(1) var<storage, read> splats: array<u32>;

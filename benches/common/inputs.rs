@@ -1,4 +1,4 @@
-//! Inputs of the benches that are no scenes: random maps, queries, head records.
+//! Inputs of the benches other than scenes: random maps, queries, head records.
 
 use super::scene::{normal, unit};
 use candle_core::{Device, Result, Tensor};
@@ -6,15 +6,15 @@ use subsplat::camera::Camera;
 use subsplat::ops::attention_gather::{Gather, Level};
 use subsplat::ops::plane_sweep::{Sweep, pair, relative_pose};
 
-/// Normal numbers of a given shape.
+/// Returns normally distributed numbers of a given shape.
 pub fn tensor(shape: &[usize], scale: f32, stream: u64) -> Result<Tensor> {
     let n: usize = shape.iter().product();
     let data: Vec<f32> = (0..n as u64).map(|i| scale * normal(stream, i)).collect();
     Tensor::from_vec(data, shape, &Device::Cpu)
 }
 
-/// A call of the attention gather as the reference form makes it: one sample in each of
-/// two views, one level, keys and values of E channels.
+/// A call of the attention gather in the reference configuration: one sample in each of two
+/// views, one level, keys and values of E channels.
 pub struct Attention {
     pub gather: Gather,
     /// `[2·h·w, 2E]`.
@@ -30,8 +30,8 @@ pub struct Attention {
 }
 
 impl Attention {
-    /// One query per pixel of two pictures `side` px wide, maps a quarter as wide. In
-    /// each view a query looks where it stands itself, plus a parallax.
+    /// One query per pixel of two pictures `side` px wide; maps at a quarter of the resolution.
+    /// The sample of a query in each view lies at its own pixel plus a parallax.
     pub fn new(side: usize, dim: usize) -> Result<Self> {
         let map = side / 4;
         let n = 2 * side * side;
@@ -71,14 +71,14 @@ impl Attention {
         })
     }
 
-    /// The op's query rows: (query, bias, gate).
+    /// Returns the query rows of the op: (query, bias, gate).
     pub fn packed_query(&self) -> Result<Tensor> {
         Tensor::cat(&[&self.query, &self.bias, &self.gate], 1)
     }
 }
 
-/// A sweep between two `views`, whose features are `side` px wide: every view is the
-/// other's source. Depths evenly spaced in disparity from 1.5 to 12.
+/// Returns a sweep between two `views` with features `side` px wide. Each view is the source of
+/// the other. Depths are evenly spaced in disparity from 1.5 to 12.
 pub fn sweep(views: &[Camera; 2], side: usize, channels: usize, depths: usize) -> Result<Sweep> {
     let cameras = views.map(|c| c.resized(side, side));
     let to = |i: usize, j: usize| {

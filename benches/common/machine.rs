@@ -1,4 +1,4 @@
-//! What this machine can do, measured: copied bytes and multiply-adds per second.
+//! Measured rates of this machine: copied bytes and multiply-adds per second.
 
 use rayon::ThreadPool;
 use rayon::prelude::*;
@@ -11,19 +11,19 @@ const COPY: usize = 32 << 20;
 /// Steps of each chain.
 const STEPS: usize = 4 << 20;
 
-/// Rates on one thread and on all.
+/// Rates on one thread and on all threads.
 pub struct Machine {
-    /// GB/s, read and written bytes together.
+    /// GB/s, read and written bytes counted together.
     pub copy: [f64; 2],
-    /// GFLOP/s of `f32`, a multiply-add being two.
+    /// GFLOP/s of `f32`; a multiply-add counts as two.
     pub fma: [f64; 2],
 }
 
 struct Chains(usize);
 
 impl Chains {
-    /// `N` independent chains of multiply-adds: how many were done, and a sum that depends
-    /// on all of them.
+    /// Runs `N` independent chains of multiply-adds. Returns their number, and a sum that
+    /// depends on all of them.
     #[inline(always)]
     fn chains<V: Vector<Element = f32>, const N: usize>(self) -> (usize, f32) {
         let (factor, term) = (V::splat(black_box(0.999)), V::splat(black_box(0.001)));
@@ -55,7 +55,7 @@ impl VectorKernel<f32> for Chains {
 }
 
 impl Machine {
-    /// Measures for a second or so, and prints.
+    /// Measures for about a second and prints the rates.
     pub fn measure(one: &ThreadPool, all: &ThreadPool, quick: bool) -> Self {
         let turns = if quick { 3 } else { 7 };
         let from = vec![1.0f32; COPY];
@@ -74,8 +74,8 @@ impl Machine {
             (0..turns).map(|_| once(&mut to)).fold(0.0, f64::max)
         };
         let copy = [copy(one), copy(all)];
-        // The same where the target's pages are touched for the first time, as those of
-        // every tensor that an op returns.
+        // The copy to pages that are touched for the first time, like those of every tensor that
+        // an op returns.
         let copy_new = |pool: &ThreadPool| {
             let once = || {
                 let start = Instant::now();

@@ -1,8 +1,8 @@
-//! A small harness: contenders for one job, checked before they are timed, take turns in
-//! one process, so that other load on the machine falls on all of them alike. Reported
-//! are medians and minima, ratios to the group's first contender, and, where a job says
-//! what it must move and compute at least, bandwidth beside that of a plain copy and
-//! arithmetic beside a loop of multiply-adds, both measured in the same run.
+//! A small benchmark harness. Contenders for one task are checked and then timed alternately in
+//! one process, so that other load on the machine affects all of them. The report has medians,
+//! minima, and ratios to the group's first contender. Where the minimum work is known, it also
+//! has the bandwidth relative to a plain copy and the arithmetic rate relative to a loop of
+//! multiply-adds, both measured in the same run.
 //!
 //! `cargo bench --bench raster -- [NAME …] [--quick] [--seconds S] [--threads N]
 //! [--json FILE] [--write DIR] [--onnxruntime]`; a group runs where its name contains every NAME.
@@ -22,15 +22,15 @@ use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-/// Fewest and most turns of a contender.
-const TURNS: (usize, usize) = (3, 200);
-/// Seconds below which runs before each turn do not count.
-const QUICK_S: f64 = 0.05;
-/// Seconds of such runs: the system spreads threads that have slept over the cores only
-/// after some milliseconds, and on two cores a call of one millisecond never saw the second.
-const WARM_S: f64 = 0.03;
+/// Minimum and maximum number of runs of a contender.
+const RUNS: (usize, usize) = (3, 200);
+/// Duration of a run, seconds, below which it is preceded by untimed runs.
+const SHORT_RUN_S: f64 = 0.05;
+/// Total duration of the untimed runs, seconds. The system distributes waking threads over the
+/// cores only after some milliseconds; on two cores a call of one millisecond used one core only.
+const WARM_UP_S: f64 = 0.03;
 
-/// What the command line says.
+/// Command line arguments.
 #[derive(Default)]
 pub struct Args {
     pub names: Vec<String>,
@@ -42,7 +42,7 @@ pub struct Args {
     /// Folder to write scenes to, instead of timing.
     #[allow(dead_code, reason = "only scenes are written")]
     pub write: Option<PathBuf>,
-    /// Run onnxruntime beside ours.
+    /// Also run onnxruntime.
     #[allow(dead_code, reason = "only the network has such a rival")]
     pub onnxruntime: bool,
 }
@@ -54,7 +54,7 @@ impl Args {
         while let Some(word) = words.next() {
             let mut value = || words.next().with_context(|| format!("{word}: expected a value"));
             match word.as_str() {
-                // What `cargo bench` itself adds.
+                // Arguments that `cargo bench` adds.
                 "--bench" => {}
                 "--quick" => out.quick = true,
                 "--onnxruntime" => out.onnxruntime = true,
@@ -70,17 +70,17 @@ impl Args {
     }
 }
 
-/// On how many threads a contender runs.
+/// Number of threads of a contender.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Threads {
     /// One.
     #[allow(dead_code, reason = "each bench uses a part")]
     One,
-    /// All that the machine has, or `--threads`.
+    /// All threads of the machine, or `--threads`.
     All,
 }
 
-/// What one call must at least move between memory and caches, and compute.
+/// Minimum work of one call.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Work {
     /// Bytes read and written.
@@ -89,38 +89,38 @@ pub struct Work {
     pub flops: f64,
 }
 
-/// One way to do a group's job.
+/// One implementation of a group's task.
 pub struct Contender<'a> {
     name: String,
     threads: Threads,
-    /// Seconds, where it measures them itself.
+    /// Runs once; returns seconds where it measures them itself.
     run: Box<dyn FnMut() -> Result<Option<f64>> + Send + 'a>,
-    elsewhere: bool,
+    in_other_process: bool,
     work: Option<Work>,
 }
 
 impl<'a> Contender<'a> {
-    /// A contender named `name`.
+    /// Creates a contender.
     pub fn new(
         name: impl Into<String>,
         threads: Threads,
         mut run: impl FnMut() -> Result<()> + Send + 'a,
     ) -> Self {
         let run = Box::new(move || run().map(|()| None));
-        Self { name: name.into(), threads, run, elsewhere: false, work: None }
+        Self { name: name.into(), threads, run, in_other_process: false, work: None }
     }
 
-    /// A contender in another process, which says how many seconds it took.
+    /// Creates a contender in another process, which reports its seconds.
     #[allow(dead_code, reason = "each bench uses a part")]
-    pub fn elsewhere(
+    pub fn in_other_process(
         name: impl Into<String>,
         mut run: impl FnMut() -> Result<f64> + Send + 'a,
     ) -> Self {
         let run = Box::new(move || run().map(Some));
-        Self { name: name.into(), threads: Threads::All, run, elsewhere: true, work: None }
+        Self { name: name.into(), threads: Threads::All, run, in_other_process: true, work: None }
     }
 
-    /// With its least work.
+    /// Adds the minimum work.
     #[allow(dead_code, reason = "each bench uses a part")]
     pub fn with_work(mut self, work: Work) -> Self {
         self.work = Some(work);
@@ -132,7 +132,7 @@ impl<'a> Contender<'a> {
 #[derive(Default)]
 struct Times {
     wall: Vec<f64>,
-    /// CPU time of the whole process over all turns, where the system tells.
+    /// CPU time of the whole process over all runs, where the system reports it.
     cpu: Option<f64>,
 }
 
@@ -143,7 +143,7 @@ impl Times {
         sorted.get(sorted.len() / 2).copied().unwrap_or(f64::NAN)
     }
 
-    fn least(&self) -> f64 {
+    fn minimum(&self) -> f64 {
         self.wall.iter().copied().fold(f64::INFINITY, f64::min)
     }
 }
@@ -176,14 +176,14 @@ impl Bench {
         Ok(Self { args, name, one, all, machine: None, groups: Vec::new() })
     }
 
-    /// Threads of [`Threads::All`].
+    /// Returns the number of threads of [`Threads::All`].
     #[allow(dead_code, reason = "each bench uses a part")]
     pub fn threads(&self) -> usize {
         self.all.current_num_threads()
     }
 
-    /// Whether the command line asks for a group of this name.
-    pub fn wants(&self, group: &str) -> bool {
+    /// Returns whether the command line selects a group of this name.
+    pub fn selects(&self, group: &str) -> bool {
         self.args.names.iter().all(|n| group.contains(n.as_str()))
     }
 
@@ -193,7 +193,7 @@ impl Bench {
         self.all.install(work)
     }
 
-    /// `work` on the pool of one thread.
+    /// Runs `work` on the pool of one thread.
     #[allow(dead_code, reason = "each bench uses a part")]
     pub fn on_one<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
         self.one.install(work)
@@ -206,10 +206,10 @@ impl Bench {
         }
     }
 
-    /// Times `contenders` in turns and prints a table; ratios are to the first one.
+    /// Times `contenders` alternately and prints a table; ratios are relative to the first one.
     ///
     /// # Errors
-    /// Those of the contenders.
+    /// Errors of the contenders.
     pub fn group(&mut self, name: &str, mut contenders: Vec<Contender>, note: &str) -> Result<()> {
         if self.machine.is_none() {
             self.machine = Some(Machine::measure(&self.one, &self.all, self.args.quick));
@@ -223,16 +223,16 @@ impl Bench {
             for (contender, times) in contenders.iter_mut().zip(&mut times) {
                 let spent: f64 = times.wall.iter().sum();
                 let turns = times.wall.len();
-                if turns >= TURNS.0 && (spent > share || turns >= TURNS.1) {
+                if turns >= RUNS.0 && (spent > share || turns >= RUNS.1) {
                     continue;
                 }
                 busy = true;
                 let pool = self.pool(contender.threads);
                 let run = &mut contender.run;
-                // What is quick is timed as within a longer computation: its data in the
-                // caches, its threads awake.
-                let quick = times.wall.last().is_none_or(|t| *t < QUICK_S);
-                let warm = if quick && !contender.elsewhere { WARM_S } else { 0.0 };
+                // Short runs are timed as within a longer computation: with data in the caches
+                // and running threads.
+                let quick = times.wall.last().is_none_or(|t| *t < SHORT_RUN_S);
+                let warm = if quick && !contender.in_other_process { WARM_UP_S } else { 0.0 };
                 let timed = || {
                     let start = Instant::now();
                     while start.elapsed().as_secs_f64() < warm {
@@ -240,8 +240,8 @@ impl Bench {
                     }
                     let cpu = cpu_seconds();
                     let start = Instant::now();
-                    let told = run()?;
-                    let wall = told.unwrap_or(start.elapsed().as_secs_f64());
+                    let reported = run()?;
+                    let wall = reported.unwrap_or(start.elapsed().as_secs_f64());
                     anyhow::Ok((wall, cpu_seconds().zip(cpu).map(|(after, before)| after - before)))
                 };
                 let (wall, used) = pool.install(timed).with_context(|| contender.name.clone())?;
@@ -261,7 +261,7 @@ impl Bench {
             "contender",
             "threads",
             "median ms",
-            "least ms",
+            "minimum ms",
             "cpu ms",
             "speed",
             "GB/s",
@@ -274,9 +274,9 @@ impl Bench {
         for (contender, times) in contenders.iter().zip(times) {
             let all = contender.threads == Threads::All;
             let threads = self.pool(contender.threads).current_num_threads();
-            let (median, least) = (times.median(), times.least());
+            let (median, minimum) = (times.median(), times.minimum());
             let cpu = times.cpu.map(|cpu| 1e3 * cpu / times.wall.len() as f64);
-            let rate = contender.work.map(|w| [1e-9 * w.bytes / least, 1e-9 * w.flops / least]);
+            let rate = contender.work.map(|w| [1e-9 * w.bytes / minimum, 1e-9 * w.flops / minimum]);
             let most = [machine.copy[usize::from(all)], machine.fma[usize::from(all)]];
             let part = |i: usize| match rate {
                 Some(rate) if rate[i] > 0.0 => {
@@ -288,7 +288,7 @@ impl Bench {
                 "  {:<30} {threads:>7} {:>10.3} {:>10.3} {:>9} {:>7.2}x {} {}",
                 contender.name,
                 1e3 * median,
-                1e3 * least,
+                1e3 * minimum,
                 cpu.map_or(String::new(), |cpu| format!("{cpu:.0}")),
                 base / median,
                 part(0),
@@ -298,7 +298,7 @@ impl Bench {
                 "contender": contender.name,
                 "threads": threads,
                 "median_ms": 1e3 * median,
-                "least_ms": 1e3 * least,
+                "least_ms": 1e3 * minimum,
                 "cpu_ms": cpu,
                 "turns": times.wall.len(),
                 "speed_to_first": base / median,
@@ -312,7 +312,7 @@ impl Bench {
     /// Writes `--json`.
     ///
     /// # Errors
-    /// The file cannot be written; no group had the names that were asked for.
+    /// The file cannot be written; no group has the requested names.
     pub fn finish(self) -> Result<()> {
         ensure!(!self.groups.is_empty(), "no group has all of {:?} in its name", self.args.names);
         let Some(path) = &self.args.json else { return Ok(()) };
@@ -328,23 +328,22 @@ impl Bench {
     }
 }
 
-/// CPU time of this process so far; `None` where the system does not say (anything
-/// but Linux). Ticks of 10 ms.
+/// Returns the CPU time of this process in steps of 10 ms; `None` except on Linux.
 fn cpu_seconds() -> Option<f64> {
     let stat = std::fs::read_to_string("/proc/self/stat").ok()?;
-    // The second field is a name in parentheses that may hold blanks.
+    // The second field is a name in parentheses that may contain spaces.
     let after = stat.rsplit_once(')')?.1;
     let ticks: Vec<f64> =
         after.split_whitespace().skip(11).take(2).filter_map(|t| t.parse().ok()).collect();
     Some(Duration::from_millis(10).as_secs_f64() * ticks.iter().sum::<f64>())
 }
 
-/// Refuses results that differ: more than `share` of the numbers by more than `tight`,
-/// or any by more than `loose`, all relative to the largest number expected. A share
-/// above 0 is for decisions (alpha below 1/255, the stop) that hang on rounding.
+/// Compares results: at most a fraction `share` of the numbers may differ by more than `tight`,
+/// and none by more than `loose`, relative to the largest number expected. A `share` above 0 is
+/// for decisions that depend on rounding (alpha below 1/255, the end of blending).
 ///
 /// # Errors
-/// Says which number differs most.
+/// Names the number with the largest difference.
 pub fn agree(
     what: &str,
     got: &[f32],

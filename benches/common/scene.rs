@@ -1,12 +1,12 @@
-//! Scenes for timing rasterizers, from a fixed formula and seed: the pixel grids of two
-//! views on a depth map with steps, as a pixel-aligned network puts them out.
+//! Scenes for timing rasterizers, from a fixed formula and seed: the pixel grids of two views on
+//! a depth map with steps, like the output of a pixel-aligned network.
 //!
-//! Grid pixel (i, j) of a view gives one splat where its ray meets a made-up room (a
-//! slanted back wall with waves, a floor, boards that stand before them), with σ of a
-//! fixed number of pixels of the rendered picture, up to a random factor; opacities
-//! like a trained model's (40 % near 0, 50 % above ½); a texture of squares in SH
-//! degree 0 and small higher degrees. Splats of the shared form come in twos by twos:
-//! four children of a parent that holds the SH set, each with a gain.
+//! Grid pixel (i, j) of a view gives one splat at the intersection of its ray with a synthetic
+//! room (a slanted back wall with waves, a floor, boards in front of them). σ is a fixed number
+//! of pixels of the rendered picture, times a random factor. Opacities are distributed as in a
+//! trained model (40 % near 0, 50 % above ½). SH degree 0 is a texture of squares; higher degrees
+//! are small. Splats of the shared form are groups of 2×2: four children of a parent that has the
+//! SH set, each child with a gain.
 
 use glam::{Mat4, Quat, Vec3};
 use subsplat::abi::ShBasis;
@@ -17,7 +17,7 @@ use subsplat::splats::Splats;
 pub const DEGREE: usize = 3;
 /// SplitMix64's increment.
 const GOLDEN: u64 = 0x9E37_79B9_7F4A_7C15;
-/// Focal length over the picture's side: a field of view of 58°.
+/// Focal length relative to the picture's side: a field of view of 58°.
 const FOCAL: f32 = 0.9;
 
 /// One scene at one picture size.
@@ -46,7 +46,7 @@ pub const SCENES: [Spec; 7] = [
     Spec { name: "2m-1024", grid: 1024, sigma_at: 1024, sigma_px: 0.9, side: 1024 },
 ];
 
-/// Numbers in [0, 1) that depend on (stream, index) alone.
+/// Returns a number in [0, 1) that depends on (stream, index) only.
 pub fn unit(stream: u64, index: u64) -> f32 {
     let mut z = (stream << 40 ^ index).wrapping_add(1).wrapping_mul(GOLDEN);
     z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
@@ -54,32 +54,32 @@ pub fn unit(stream: u64, index: u64) -> f32 {
     ((z ^ (z >> 31)) >> 40) as f32 / (1u64 << 24) as f32
 }
 
-/// Nearly normal: mean 0, variance 1 (a sum of four uniform numbers).
+/// Returns an approximately normal number: mean 0, variance 1 (a sum of four uniform numbers).
 pub fn normal(stream: u64, index: u64) -> f32 {
     let sum: f32 = (0..4).map(|k| unit(stream, 4 * index + k)).sum();
     (sum - 2.0) * 3f32.sqrt()
 }
 
-/// The camera that renders, between the two views.
+/// Returns the rendering camera, between the two views.
 pub fn camera(side: usize) -> Camera {
     posed(Vec3::new(0.04, -0.02, 0.03), 0.01, side)
 }
 
-fn posed(at: Vec3, turn: f32, side: usize) -> Camera {
+fn posed(at: Vec3, angle: f32, side: usize) -> Camera {
     let f = FOCAL * side as f32;
     let c = 0.5 * side as f32;
     let intrinsics = Intrinsics { fx: f, fy: f, cx: c, cy: c, width: side, height: side };
-    let pose = Mat4::from_rotation_translation(Quat::from_rotation_y(turn), at);
+    let pose = Mat4::from_rotation_translation(Quat::from_rotation_y(angle), at);
     Camera { intrinsics, world_from_camera: pose }
 }
 
-/// The two views whose pixels the splats are.
+/// Returns the two views whose pixels are the splats.
 pub fn views(grid: usize) -> [Camera; 2] {
     [posed(Vec3::new(-0.3, 0.0, 0.0), 0.06, grid), posed(Vec3::new(0.3, 0.03, 0.05), -0.06, grid)]
 }
 
-/// Where a ray from `eye` meets the room: its camera-independent length along `ray`.
-fn hit(eye: Vec3, ray: Vec3) -> f32 {
+/// Returns the distance along `ray` at which a ray from `eye` intersects the room.
+fn room_distance(eye: Vec3, ray: Vec3) -> f32 {
     let plane = |n: Vec3, d: f32| (d - n.dot(eye)) / n.dot(ray);
     let wall = plane(Vec3::new(0.15, -0.05, 1.0), 7.0);
     let at = eye + wall * ray;
@@ -102,7 +102,7 @@ fn hit(eye: Vec3, ray: Vec3) -> f32 {
     nearest
 }
 
-/// `spec`'s splats in the shared form: P = N / 4 SH sets, one gain per child.
+/// Returns the splats of `spec` in the shared form: P = N / 4 SH sets, one gain per child.
 pub fn shared(spec: &Spec) -> Splats {
     let half = spec.grid / 2;
     let n = 2 * spec.grid * spec.grid;
@@ -127,12 +127,12 @@ pub fn shared(spec: &Spec) -> Splats {
     Splats::new(rows, sh, gain, DEGREE, ShBasis::Standard).expect("buffers of one length")
 }
 
-/// One splat of grid pixel `at`, with σ of about `px` times its depth; its mean.
+/// Appends the splat of grid pixel `at`, with σ of about `px` times its depth; returns its mean.
 fn row(view: &Camera, at: [usize; 2], px: f32, index: u64, rows: &mut Vec<f32>) -> Vec3 {
     let pixel = glam::Vec2::new(at[0] as f32 + 0.5, at[1] as f32 + 0.5);
     let ray = view.rotation() * view.intrinsics.unproject(pixel);
-    // A network's depths are a little rough.
-    let depth = hit(view.position(), ray) * (1.0 + 0.004 * normal(2, index));
+    // Depths of a network are slightly rough.
+    let depth = room_distance(view.position(), ray) * (1.0 + 0.004 * normal(2, index));
     let mean = view.position() + depth * ray;
     rows.extend(mean.to_array());
     let quat = [0, 1, 2, 3].map(|k| normal(3, 4 * index + k));
@@ -148,7 +148,7 @@ fn row(view: &Camera, at: [usize; 2], px: f32, index: u64, rows: &mut Vec<f32>) 
     mean
 }
 
-/// One SH set: squares of 0.4 world units in degree 0, noise above.
+/// Appends one SH set: squares of 0.4 world units in degree 0, noise above.
 fn harmonics(at: Vec3, index: u64, sh: &mut Vec<f32>) {
     let cell = (at / 0.4).floor();
     let square = (cell.x + 7.0 * cell.y + 13.0 * cell.z).rem_euclid(64.0) as u64;
@@ -160,8 +160,8 @@ fn harmonics(at: Vec3, index: u64, sh: &mut Vec<f32>) {
     sh.extend((0..rest).map(|k| 0.05 * normal(10, rest * index + k)));
 }
 
-/// The same splats without sharing: child i's own SH set is γ_i times its parent's, so
-/// that both forms give one picture.
+/// Returns the same splats with one SH set each: γ_i times the set of the parent, so that both
+/// forms give the same picture.
 pub fn unshared(shared: &Splats) -> Splats {
     let mut sh = Vec::with_capacity(shared.len() * 3 * shared.sh_coefficients());
     for i in 0..shared.len() {

@@ -1,4 +1,4 @@
-//! Single operators at MVSplat's sizes for two 256² pictures, ours beside onnxruntime's.
+//! Single operators at MVSplat's sizes for two 256² pictures, against onnxruntime.
 
 use super::rival::{Rival, median, timed};
 use crate::common::{Bench, agree, inputs};
@@ -12,12 +12,12 @@ type Run = fn(&HashMap<String, Tensor>) -> candle_core::Result<Tensor>;
 
 struct Case {
     name: &'static str,
-    /// (name, shape, spread).
+    /// (name, shape, standard deviation).
     inputs: &'static [(&'static str, &'static [usize])],
     run: Run,
 }
 
-/// Every operator but convolutions, at its largest and at its most frequent size.
+/// Every operator except convolutions, at its largest and at its most frequent size.
 const CASES: [Case; 15] = [
     Case {
         name: "instance_norm_relu 2x64x128x128",
@@ -110,13 +110,13 @@ pub fn compare(bench: &mut Bench, rival: &Rival) -> Result<()> {
     let folder = rival.folder.path();
     candle_core::safetensors::save(&files, folder.join("ops.safetensors"))?;
     drop(files);
-    let said = rival.run(&["ops"])?;
+    let reply = rival.run(&["ops"])?;
     let theirs = candle_core::safetensors::load(folder.join("ops_out.safetensors"), &Device::Cpu)?;
     println!("\noperators, {} threads, median of {}", rival.threads, rival.runs);
     println!("  {:<36} {:>10} {:>10} {:>8}", "", "ours ms", "ort ms", "ratio");
     for (case, tensors) in &cases {
         let want = theirs.get(case.name).with_context(|| format!("rival: no {}", case.name))?;
-        let seconds = said.seconds.get(case.name).context("rival: no times")?;
+        let seconds = reply.seconds.get(case.name).context("rival: no times")?;
         let got = bench.on_all(|| (case.run)(tensors))?;
         let list = |t: &Tensor| t.flatten_all()?.to_vec1::<f32>();
         agree(case.name, &list(&got)?, &list(want)?, [2e-5, 2e-4, 1e-4])?;

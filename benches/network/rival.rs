@@ -1,4 +1,4 @@
-//! onnxruntime, in a process of its own (`tools/bench/rival.py`).
+//! onnxruntime in a separate process (`tools/bench/rival.py`).
 
 use super::{peak, whole};
 use crate::common::{Bench, agree};
@@ -17,19 +17,19 @@ use subsplat::model::backbone::Mvsplat;
 use subsplat::model::trace::Trace;
 use subsplat::model::weights::Weights;
 
-/// f32 noise of a network this deep: where a clamp or an epipolar border falls the other
-/// way, single pixels differ by more.
+/// Tolerance: f32 noise of a deep network. Single pixels differ by more where a clamp or an
+/// epipolar border flips.
 const NETWORK: [f32; 3] = [5e-4, 5e-2, 2e-3];
 
-/// What the script prints.
+/// Output of the script.
 #[derive(Deserialize)]
-pub struct Said {
+pub struct Reply {
     pub seconds: BTreeMap<String, Vec<f64>>,
     pub peak_bytes: f64,
     pub onnxruntime: String,
 }
 
-/// Where Python is, and a folder to exchange tensors in.
+/// The Python interpreter, and a folder for exchanged tensors.
 pub struct Rival {
     python: PathBuf,
     pub folder: tempfile::TempDir,
@@ -43,12 +43,12 @@ impl Rival {
         let root = Path::new(env!("CARGO_MANIFEST_DIR"));
         let python = std::env::var_os("SUBSPLAT_PYTHON")
             .map_or_else(|| root.join("out/witness-venv/bin/python"), PathBuf::from);
-        ensure!(python.exists(), "{}: not there; run tools/witness/setup.sh", python.display());
+        ensure!(python.exists(), "{}: not found; run tools/witness/setup.sh", python.display());
         let folder = tempfile::tempdir()?;
         Ok(Self { python, folder, threads, runs: if quick { 1 } else { 5 }, quick })
     }
 
-    pub fn run(&self, words: &[&str]) -> Result<Said> {
+    pub fn run(&self, words: &[&str]) -> Result<Reply> {
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tools/bench/rival.py");
         let folder = self.folder.path().as_os_str();
         let out = Command::new(&self.python)
@@ -57,9 +57,9 @@ impl Rival {
             .arg(folder)
             .args([self.runs.to_string(), self.threads.to_string()])
             .output()?;
-        let said = String::from_utf8_lossy(&out.stderr);
-        ensure!(out.status.success(), "onnxruntime: {said}");
-        serde_json::from_slice(&out.stdout).context("what rival.py printed")
+        let errors = String::from_utf8_lossy(&out.stderr);
+        ensure!(out.status.success(), "onnxruntime: {errors}");
+        serde_json::from_slice(&out.stdout).context("the output of rival.py")
     }
 }
 
@@ -69,10 +69,10 @@ pub fn median(seconds: &[f64]) -> f64 {
     sorted.get(sorted.len() / 2).copied().unwrap_or(f64::NAN)
 }
 
-/// Seconds below which more runs are timed than asked for, and how many.
+/// Duration of a run, seconds, below which this many runs are timed.
 const QUICK: (f64, usize) = (0.02, 50);
 
-/// Seconds of `runs` runs after two that do not count; of more where they are short.
+/// Returns the seconds of `runs` runs after two untimed ones; of more runs where they are short.
 pub fn timed(runs: usize, mut run: impl FnMut() -> Result<()>) -> Result<Vec<f64>> {
     run()?;
     let start = Instant::now();
@@ -87,7 +87,7 @@ pub fn timed(runs: usize, mut run: impl FnMut() -> Result<()>) -> Result<Vec<f64
         .collect()
 }
 
-/// Cameras and pictures that the script drew.
+/// Returns the cameras and pictures that the script generated.
 fn views(tensors: &HashMap<String, Tensor>, side: usize) -> Result<Views> {
     let list = |name: &str| -> Result<Vec<f32>> {
         let t = tensors.get(name).with_context(|| format!("rival: no {name}"))?;
@@ -106,7 +106,7 @@ fn views(tensors: &HashMap<String, Tensor>, side: usize) -> Result<Views> {
     Ok(Views::new(images, vec![cameras.collect::<Result<_>>()?], vec![near_far])?)
 }
 
-/// MVSplat's backbone with the script's weights: results compared, then times of ours.
+/// Compares MVSplat's backbone with the script's weights, then returns the times of this crate.
 fn backbone(rival: &Rival, side: usize) -> Result<Vec<f64>> {
     let path = rival.folder.path().join(format!("{side}.safetensors"));
     let tensors = candle_core::safetensors::load(path, &Device::Cpu)?;
@@ -130,19 +130,19 @@ fn backbone(rival: &Rival, side: usize) -> Result<Vec<f64>> {
     })
 }
 
-/// The table of whole networks.
+/// Prints the table of whole networks.
 pub fn compare(bench: &Bench, rival: &Rival) -> Result<()> {
     let sides: &[usize] = if rival.quick { &[256] } else { &[256, 512] };
     let mut rows: Vec<(String, f64, f64)> = Vec::new();
     let mut version = String::new();
     for &side in sides {
-        let said = rival.run(&["network", &side.to_string()])?;
-        let seconds = said.seconds.values().next().context("rival: no times")?;
-        version = said.onnxruntime;
+        let reply = rival.run(&["network", &side.to_string()])?;
+        let seconds = reply.seconds.values().next().context("rival: no times")?;
+        version = reply.onnxruntime;
         rows.push((
             format!("onnxruntime: MVSplat backbone {side}²"),
             median(seconds),
-            said.peak_bytes,
+            reply.peak_bytes,
         ));
         let ours = bench.on_all(|| backbone(rival, side))?;
         let peak = peak(&format!("mvsplat backbone {side}"))?;

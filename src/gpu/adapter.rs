@@ -73,6 +73,7 @@ fn rank(kind: DeviceType) -> u8 {
 
 /// Returns the index in `found` of the adapter that `choice` selects; `None` for the CPU kernels.
 ///
+/// # Errors
 /// [`GpuError::NoAdapter`] where `choice` requires a GPU and no adapter matches.
 pub fn choose(choice: &DeviceChoice, found: &[AdapterSummary]) -> Result<Option<usize>, GpuError> {
     let index = match choice {

@@ -146,6 +146,7 @@ impl<'a> AttentionGatherArgs<'a> {
 impl Gpu {
     /// Computes the attention output `[N, E]`.
     ///
+    /// # Errors
     /// [`GpuError::Argument`] for inconsistent lengths, or for more samples or groups than the
     /// kernel supports; errors of the device.
     pub fn attention_gather(&self, args: &AttentionGatherArgs) -> Result<Vec<f32>, GpuError> {

@@ -67,6 +67,7 @@ pub struct AttentionGatherGradients {
 impl Gpu {
     /// Computes the gradients for `grad` `[N, E]`, the gradient of the output.
     ///
+    /// # Errors
     /// As [`Gpu::attention_gather`]; [`GpuError::Argument`] for another length of `grad`.
     pub fn attention_gather_backward(
         &self,

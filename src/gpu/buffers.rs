@@ -261,6 +261,7 @@ pub(crate) struct Reading<T> {
 impl<T: Pod> Reading<T> {
     /// Waits for the device and returns the values.
     ///
+    /// # Errors
     /// [`GpuError::Lost`]; [`GpuError::Refused`] where the driver rejects the mapping.
     pub(crate) fn take(self, gpu: &Gpu) -> Result<Vec<T>, GpuError> {
         let mut out = vec![T::zeroed(); self.count];

@@ -82,6 +82,7 @@ impl Commands<'_> {
 
     /// Appends a call of `kernel`.
     ///
+    /// # Errors
     /// The kernel does not compile, has another number of arguments, or a count exceeds the
     /// dispatch limit.
     pub(crate) fn run(
@@ -144,6 +145,7 @@ impl Commands<'_> {
 
     /// Submits all calls to the device at once, without waiting for them.
     ///
+    /// # Errors
     /// Errors of the device, such as [`GpuError::Refused`] and [`GpuError::Lost`].
     pub(crate) fn submit(self) -> Result<Submitted, GpuError> {
         let Self { gpu, name, timed, steps } = self;

@@ -65,6 +65,7 @@ impl fmt::Debug for Gpu {
 impl Gpu {
     /// Opens the device that `choice` selects; `None` for the CPU kernels.
     ///
+    /// # Errors
     /// [`GpuError::NoAdapter`] where `choice` requires a GPU and no adapter matches;
     /// [`GpuError::Device`] where the driver opens no device.
     pub fn open(choice: &DeviceChoice) -> Result<Option<Arc<Self>>, GpuError> {
@@ -158,6 +159,7 @@ impl Gpu {
 
     /// Checks that the device is usable.
     ///
+    /// # Errors
     /// [`GpuError::Lost`] after the driver reported the loss; [`GpuError::Refused`] for an error
     /// that no call has returned yet, once.
     pub fn check(&self) -> Result<(), GpuError> {

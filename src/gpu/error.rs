@@ -68,6 +68,7 @@ pub enum GpuError {
 impl GpuError {
     /// Compares the lengths of arguments of `kernel`: name, length found, length expected.
     ///
+    /// # Errors
     /// [`GpuError::Argument`] for the first mismatch.
     pub(crate) fn check_lengths<const N: usize>(
         kernel: &'static str,

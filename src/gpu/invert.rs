@@ -38,6 +38,7 @@ impl Gpu {
     /// Appends the construction of the lists of `cells_of` `[entries]`. Each element is below
     /// `cells` or [`crate::abi::NONE`].
     ///
+    /// # Errors
     /// Errors of the device.
     pub(crate) fn invert(
         &self,

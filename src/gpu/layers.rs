@@ -80,6 +80,7 @@ pub(crate) fn bands(
 /// Divides splats into layers within `limits`. `offsets` holds the index of each splat's first
 /// pair, `total` the number of pairs. There is at least one layer.
 ///
+/// # Errors
 /// [`GpuError::TooSmall`] where one splat has more pairs than a layer may have.
 fn cut(offsets: &[u32], total: u32, limits: LayerLimits) -> Result<Vec<Layer>, GpuError> {
     // Splats after the last pair intersect no tile.

@@ -73,6 +73,7 @@ pub(crate) struct Pipelines {
 impl Gpu {
     /// Returns the pipeline of `kernel` with `constants`, compiled at its first use.
     ///
+    /// # Errors
     /// [`GpuError::Refused`] with the message of the compiler.
     pub(crate) fn pipeline(
         &self,

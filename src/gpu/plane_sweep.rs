@@ -123,6 +123,7 @@ fn pair_floats(p: &Pair) -> impl Iterator<Item = f32> {
 impl Gpu {
     /// Computes the correlation `[R, D, h, w]`.
     ///
+    /// # Errors
     /// [`GpuError::Argument`] for inconsistent lengths; errors of the device.
     pub fn plane_sweep(&self, args: &PlaneSweepArgs) -> Result<Vec<f32>, GpuError> {
         let rows = args.check()?;

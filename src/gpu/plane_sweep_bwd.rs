@@ -78,6 +78,7 @@ impl Gpu {
     /// Computes the gradients of reference `[R, C, h, w]` and source `[S, C, h, w]` for `grad`
     /// `[R, D, h, w]`, the gradient of the correlation.
     ///
+    /// # Errors
     /// As [`Gpu::plane_sweep`]; [`GpuError::Argument`] for another length of `grad`.
     pub fn plane_sweep_backward(
         &self,

@@ -115,6 +115,7 @@ impl Frame {
     /// `[5, H, W]` is the gradient of the loss with respect to R, G, B, alpha and Σ w·z of the
     /// frame.
     ///
+    /// # Errors
     /// [`GpuError::Argument`] for gradients of another size; [`GpuError::TooSmall`] and other
     /// errors of the device, after which the CPU rasterizer can be used.
     pub fn backward(&mut self, gradients: &[f32]) -> Result<Gradients, GpuError> {

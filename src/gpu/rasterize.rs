@@ -3,7 +3,7 @@
 //!
 //! One submit per frame. CPU version: src/cpu/rasterize.rs. Tests: tests/gpu/raster.rs.
 //!
-//! Only the device knows the number of pairs; kernels read it from a buffer. The capacity for
+//! The number of pairs exists on the device only; kernels read it from a buffer. The capacity for
 //! pairs grows when the read-back of a frame reports that it was too small. Frames that exceed a
 //! binding are drawn in layers (src/gpu/layers.rs).
 
@@ -101,6 +101,7 @@ impl Rasterizer {
 
     /// Renders `splats` as pairs_known by `camera`.
     ///
+    /// # Errors
     /// Errors of the device, or [`GpuError::TooSmall`]; the CPU rasterizer can be used instead.
     pub fn render(
         &mut self,

@@ -133,6 +133,7 @@ impl RedistributeArgs<'_> {
 impl Gpu {
     /// Computes the opacities `[P, K]` of the children.
     ///
+    /// # Errors
     /// [`GpuError::Argument`] for inconsistent lengths; errors of the device.
     pub fn redistribute(&self, args: &RedistributeArgs) -> Result<Vec<f32>, GpuError> {
         args.check()?;

@@ -51,6 +51,7 @@ impl Scene {
 impl Gpu {
     /// Copies splats to the device.
     ///
+    /// # Errors
     /// [`GpuError::Argument`] for inconsistent lengths; [`GpuError::OutOfMemory`].
     pub fn upload_splats(&self, splats: &SplatSlices) -> Result<Scene, GpuError> {
         let n = splats.len();

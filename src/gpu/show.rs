@@ -28,6 +28,7 @@ impl Rasterizer {
     /// the capacity lacks its farthest splats; the capacity of the next frame is sufficient. A
     /// frame that exceeds a binding takes several submits and waits for them.
     ///
+    /// # Errors
     /// [`GpuError::Argument`] for a target of another size than the camera's picture; otherwise
     /// as [`Rasterizer::render`].
     pub fn draw(

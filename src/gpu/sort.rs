@@ -95,6 +95,7 @@ impl Sort {
 impl Gpu {
     /// Returns the indices of `keys` in ascending order; equal keys keep their order.
     ///
+    /// # Errors
     /// [`GpuError::TooSmall`] for more keys than a binding holds; errors of the device.
     pub fn sort_order(&self, keys: &[u32]) -> Result<Vec<u32>, GpuError> {
         let count = keys.len();

@@ -148,6 +148,7 @@ impl Gpu {
     /// Computes the children `[N·K, 11]` and the gains `[N·K]` or `[N·K, 4]`. The caller checks
     /// inputs and outputs for numbers that are not finite.
     ///
+    /// # Errors
     /// [`GpuError::Argument`] for inconsistent lengths; errors of the device.
     pub fn spgr(&self, args: &SpgrArgs) -> Result<(Vec<f32>, Vec<f32>), GpuError> {
         let n = args.check()?;

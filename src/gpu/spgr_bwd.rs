@@ -48,6 +48,7 @@ impl Gpu {
     /// `[N·K, 11]`, the gradient of the children. The gain of each head record has gradient 0
     /// here.
     ///
+    /// # Errors
     /// [`GpuError::Argument`] for inconsistent lengths; errors of the device.
     pub fn spgr_backward(
         &self,
@@ -88,6 +89,7 @@ impl Gpu {
     /// Computes the gradient `[N, K, 11]` of the head records for `grad` `[N·K]` or `[N·K, 4]`,
     /// the gradient of the gains. It is zero except for the gain of each record.
     ///
+    /// # Errors
     /// [`GpuError::Argument`] for inconsistent lengths; errors of the device.
     pub fn spgr_gains_backward(
         &self,

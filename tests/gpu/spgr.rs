@@ -224,10 +224,10 @@ fn gradients_of_children() {
                 let of = |rows: &[f32]| columns(rows, column, 1);
                 let all =
                     [("head", &got.0, &head, &exact[0]), ("parents", &got.1, &parents, &exact[1])];
-                for (what, got, twin, exact) in all {
+                for (what, got, cpu, exact) in all {
                     let name = format!("{name} {what} {column}");
                     assert_twins(&name, &of(got), &of(exact), TOLERANCE_F64);
-                    assert_twins(&name, &of(got), &of(twin), TOLERANCE_F32);
+                    assert_twins(&name, &of(got), &of(cpu), TOLERANCE_F32);
                 }
             }
             assert_twins(&format!("{name} gain"), &got_gain, &gain, SPGR);

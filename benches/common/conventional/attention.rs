@@ -11,14 +11,15 @@ pub struct Size {
     pub views: usize,
     /// Rows and columns of each view's map.
     pub map: [usize; 2],
-    /// E: keys are channels 0..E of a cell, values E..2E.
+    /// E; keys are channels 0..E of a cell, values E..2E.
     pub dim: usize,
     /// Factor of the dot product.
     pub scale: f64,
 }
 
-/// `[N, E]` of maps `[V·h·w, 2E]`, query `[N, E]`, bias `[N, V]`, gate `[N, V]` and points
-/// `[N, V, 1, 2]` in (0, 1)², one sample a view, half-pixel centres, zeros outside.
+/// Returns the attention `[N, E]` of maps `[V·h·w, 2E]`, query `[N, E]`, bias `[N, V]`, gate `[N,
+/// V]` and points `[N, V, 1, 2]` in (0, 1)²: one sample per view, half-pixel centres, zeros
+/// outside.
 pub fn gather(
     maps: &Tensor,
     query: &Tensor,

@@ -1,5 +1,5 @@
-//! 2-D convolution, forward and both gradients, as im2col in cache-sized blocks and
-//! products by the `gemm` crate: what a careful program does without kernels of its own.
+//! 2-D convolution, forward and both gradients, as im2col in cache-sized blocks and products of
+//! the `gemm` crate: a careful implementation without kernels of its own.
 //!
 //! x `[B, C, H, W]`, w `[O, C, kh, kw]`, y `[B, O, H', W']`, zero padding, one
 //! stride for both axes.
@@ -52,24 +52,24 @@ impl Geometry {
         h * w
     }
 
-    /// Whether im2col of a channel is the channel itself.
+    /// Returns whether im2col of a channel equals the channel.
     fn pointwise(&self) -> bool {
         self.kernel == [1, 1] && self.stride == 1 && self.padding == 0
     }
 
-    /// Channels of one block.
+    /// Returns the channels of one block.
     fn block(&self) -> usize {
         (BLOCK_ROWS / self.taps()).clamp(1, self.in_channels.max(1))
     }
 
-    /// Pixels of one tile: small maps are cut too, so that every thread has work;
-    /// independent of the number of threads, so that sums never depend on it.
+    /// Returns the pixels of one tile. Small maps are divided, too, so that every thread has
+    /// work. The size does not depend on the number of threads, so neither do the sums.
     fn tile(&self) -> usize {
         self.out_pixels().div_ceil(4).next_multiple_of(16).clamp(16, TILE)
     }
 
-    /// Walks the segments of output pixels `start..start + len` that lie in one
-    /// output row: calls `f(offset in the range, row, first column, length)`.
+    /// Calls `f(offset in the range, row, first column, length)` for the segments of output
+    /// pixels `start..start + len` that lie in one output row.
     fn segments(&self, start: usize, len: usize, mut f: impl FnMut(usize, usize, usize, usize)) {
         let width = self.out_size()[1];
         let mut done = 0;
@@ -81,7 +81,7 @@ impl Geometry {
         }
     }
 
-    /// Output columns of `col..col + n` whose tap `kx` lies inside the picture, as
+    /// Returns the output columns of `col..col + n` whose tap `kx` lies inside the picture, as
     /// offsets from `col`, and the input column of the first.
     fn inside(&self, kx: usize, col: usize, n: usize) -> (usize, usize, usize) {
         let (s, p, w) = (self.stride, self.padding, self.size[1]);
@@ -92,15 +92,14 @@ impl Geometry {
         (first, past.max(first), ix)
     }
 
-    /// Input row of output row `row` and tap `ky`, if inside the picture.
+    /// Returns the input row of output row `row` and tap `ky`, if inside the picture.
     fn in_row(&self, row: usize, ky: usize) -> Option<usize> {
         (row * self.stride + ky).checked_sub(self.padding).filter(|&y| y < self.size[0])
     }
 }
 
-/// Output pixels `start..start + len` of a channel range, as rows of
-/// (channel, ky, kx): `out` is `[channels · taps, len]`, `x` those channels of one
-/// picture.
+/// Writes output pixels `start..start + len` of a channel range as rows of (channel, ky, kx):
+/// `out` is `[channels · taps, len]`, `x` those channels of one picture.
 fn im2col(g: &Geometry, x: &[f32], start: usize, len: usize, out: &mut [f32]) {
     let [kh, kw] = g.kernel;
     let width = g.size[1];
@@ -154,7 +153,7 @@ fn col2im(g: &Geometry, cols: &[f32], start: usize, len: usize, x: &mut [f32]) {
 /// One tile of the output: picture, first pixel, and a piece of every channel's row.
 type Tile<'a> = (usize, usize, Vec<&'a mut [f32]>);
 
-/// Cuts `[B, rows, pixels]` into tiles of `tile` pixels across all rows.
+/// Divides `[B, rows, pixels]` into tiles of `tile` pixels across all rows.
 fn tiles(y: &mut [f32], rows: usize, pixels: usize, tile: usize) -> Vec<Tile<'_>> {
     let mut out: Vec<Tile<'_>> = Vec::new();
     for (image, plane) in y.chunks_exact_mut(rows * pixels).enumerate() {
@@ -209,7 +208,8 @@ pub fn forward(g: &Geometry, x: &[f32], w: &[f32], bias: &[f32], y: &mut [f32]) 
     );
 }
 
-/// ∂L/∂x from ∂L/∂y, `dx` overwritten. Threads share out pictures and channel blocks.
+/// Computes ∂L/∂x from ∂L/∂y; `dx` is overwritten. Pictures and channel blocks are divided among
+/// the threads.
 pub fn input_grad(g: &Geometry, dy: &[f32], w: &[f32], dx: &mut [f32]) {
     let (o, k, pixels, taps) = (g.out_channels, g.in_channels * g.taps(), g.out_pixels(), g.taps());
     let (block, tile) = (g.block(), g.tile());
@@ -241,7 +241,8 @@ pub fn input_grad(g: &Geometry, dy: &[f32], w: &[f32], dx: &mut [f32]) {
     });
 }
 
-/// ∂L/∂w from x and ∂L/∂y, `dw` overwritten. Threads share out channel blocks.
+/// Computes ∂L/∂w from x and ∂L/∂y; `dw` is overwritten. Channel blocks are divided among the
+/// threads.
 pub fn weight_grad(g: &Geometry, x: &[f32], dy: &[f32], dw: &mut [f32]) {
     let (o, k, pixels, taps) = (g.out_channels, g.in_channels * g.taps(), g.out_pixels(), g.taps());
     let (block, tile) = (g.block(), g.tile());

@@ -1,6 +1,5 @@
-//! Baselines: each job written the plain way that most programs do it, so that a
-//! ratio has something under it. They use nothing of the crate's kernels, and
-//! tests/conventional.rs holds them to the same references.
+//! Baselines: each task as most programs implement it, without the kernels of this crate.
+//! tests/raster/conventional.rs checks them against the same references.
 
 pub mod attention;
 pub mod conv;

@@ -1,5 +1,5 @@
-//! One splat to the picture and back, in scalar `f32`: EWA projection (3DGS section 4,
-//! gsplat's limits of the Jacobian), colour by SH, and the gradient of both.
+//! Projection of one splat and its gradient in scalar `f32`: EWA projection (3DGS, section 4;
+//! gsplat's limits of the Jacobian) and colour by SH.
 
 #![expect(clippy::needless_range_loop, reason = "plain loops, as such programs have them")]
 
@@ -8,7 +8,7 @@ use subsplat::camera::Camera;
 
 type V3 = [f32; 3];
 
-/// What is rendered. Splat i uses SH set i / (N / P).
+/// Rendered splats. Splat i uses SH set i / (N / P).
 #[derive(Clone, Copy)]
 pub struct Splats<'a> {
     /// `[N, 11]`: mean, quaternion wxyz, σ, opacity.
@@ -22,7 +22,7 @@ pub struct Splats<'a> {
 }
 
 impl Splats<'_> {
-    /// N.
+    /// Returns N.
     pub fn len(&self) -> usize {
         self.rows.len() / 11
     }
@@ -31,7 +31,7 @@ impl Splats<'_> {
         3 * (self.sh_degree + 1) * (self.sh_degree + 1)
     }
 
-    /// First number of the SH set of splat `i`.
+    /// Returns the offset of the SH set of splat `i`.
     pub fn sh_at(&self, i: usize) -> usize {
         let children = self.len() / (self.sh.len() / self.set());
         i / children * self.set()
@@ -42,19 +42,19 @@ impl Splats<'_> {
     }
 }
 
-/// Rules of one call.
+/// Options of one call.
 #[derive(Clone, Copy)]
 pub struct Options {
-    /// Nearest camera z drawn.
+    /// Minimum camera z.
     pub near: f32,
     /// Low-pass, px².
     pub lowpass: f32,
-    /// Opacity scaled by √(det Σ / det(Σ + low-pass)).
+    /// Whether opacities are scaled by √(det Σ / det(Σ + low-pass)).
     pub antialiased: bool,
     /// RGB.
     pub background: V3,
-    /// Half side of a splat's box in σ of its longer axis. Most programs take 3; from
-    /// √(2·ln 255) = 3.33 on no pixel of alpha ≥ 1/255 is cut.
+    /// Half side of a splat's box in σ of its longer axis. Most programs use 3; from √(2·ln 255)
+    /// = 3.33 on, no pixel of alpha ≥ 1/255 is cut.
     pub box_sigmas: f32,
 }
 
@@ -113,7 +113,7 @@ fn rotation_backward([w, x, y, z]: [f32; 4], g: &[V3; 3]) -> [f32; 4] {
     ]
 }
 
-/// A camera in the form that the loops use.
+/// A camera in the form of the loops below.
 pub struct View {
     /// Rows of the rotation from world to camera.
     rows: [V3; 3],
@@ -125,7 +125,7 @@ pub struct View {
     pub size: [usize; 2],
 }
 
-/// What projection and its gradient both need of one splat.
+/// Intermediate values of one splat for projection and gradient.
 struct Shape {
     p: V3,
     slope: [f32; 2],
@@ -199,7 +199,7 @@ impl View {
         Some(Shape { p, slope, clamped, unit, norm, rotation: r, scale, a, m, cov })
     }
 
-    fn blurred(&self, cov: V3) -> V3 {
+    fn lowpassed(&self, cov: V3) -> V3 {
         [cov[0] + self.options.lowpass, cov[1], cov[2] + self.options.lowpass]
     }
 
@@ -209,11 +209,11 @@ impl View {
         (d.map(|v| v / length), length)
     }
 
-    /// Splat `i` in the picture.
+    /// Projects splat `i`.
     pub fn project(&self, splats: &Splats, i: usize) -> Projected {
         let row = &splats.rows[11 * i..11 * i + 11];
         let Some(s) = self.shape(row) else { return Projected::default() };
-        let cov = self.blurred(s.cov);
+        let cov = self.lowpassed(s.cov);
         let area = det(cov);
         if !(area > 0.0 && area.is_finite()) {
             return Projected::default();
@@ -248,7 +248,7 @@ impl View {
         }
     }
 
-    /// Adds splat `i`'s share to `out`.
+    /// Adds the gradients of splat `i` to `out`.
     pub fn backward(&self, splats: &Splats, i: usize, g: &ProjectedGrad, out: &mut Gradients) {
         let row = &splats.rows[11 * i..11 * i + 11];
         let Some(s) = self.shape(row) else { return };
@@ -256,7 +256,7 @@ impl View {
         let (v_cov, v_opacity) = self.covariance_backward(&s, row[10], g);
         let v_row = &mut out.rows[11 * i..11 * i + 11];
         v_row[10] += v_opacity;
-        // M·Mᵀ: the gradient by M is 2·G·M, G the full symmetric matrix.
+        // M·Mᵀ: the gradient of M is 2·G·M, G the full symmetric matrix.
         let (mut v_m, mut v_a) = ([[0.0; 3]; 2], [[0.0; 3]; 2]);
         for c in 0..3 {
             v_m[0][c] = 2.0 * (v_cov[0] * s.m[0][c] + v_cov[1] * s.m[1][c]);
@@ -284,10 +284,10 @@ impl View {
         }
     }
 
-    /// Gradients by the covariance without the low-pass (xx, half of xy, yy: the
-    /// full symmetric matrix) and by the opacity.
+    /// Returns the gradients of the covariance without the low-pass (xx, half of xy, yy: the full
+    /// symmetric matrix) and of the opacity.
     fn covariance_backward(&self, s: &Shape, opacity: f32, g: &ProjectedGrad) -> (V3, f32) {
-        let cov = self.blurred(s.cov);
+        let cov = self.lowpassed(s.cov);
         let area = det(cov);
         let [a, b, c] = [cov[2] / area, -cov[1] / area, cov[0] / area];
         let [va, vb, vc] = [g.conic[0], 0.5 * g.conic[1], g.conic[2]];
@@ -310,7 +310,7 @@ impl View {
         (v, v_opacity)
     }
 
-    /// Gradient by the mean in camera coordinates, from J·W and the pixel position.
+    /// Returns the gradient of the mean in camera coordinates, from J·W and the pixel position.
     fn position_backward(&self, s: &Shape, v_a: &[V3; 2], v_uv: [f32; 2]) -> V3 {
         let mut v_p = [0.0; 3];
         for i in 0..2 {
@@ -328,7 +328,7 @@ impl View {
         v_p
     }
 
-    /// Adds the gradients by SH and gain; gives that by the mean, through the direction.
+    /// Adds the gradients of SH and gain; returns the gradient of the mean through the direction.
     fn colour_backward(&self, splats: &Splats, i: usize, v_rgb: V3, out: &mut Gradients) -> V3 {
         let row = &splats.rows[11 * i..11 * i + 11];
         let (direction, length) = self.direction(row);

@@ -1,8 +1,8 @@
-//! A rasterizer as most of them are written (3DGS' algorithm on one CPU thread):
-//! 16×16 tiles, a square box of some σ around each splat, one sort of (tile, depth)
-//! pairs, each pixel walks its tile's list front to back; backward walks it back to
-//! front from a stored last place and recovers T by division. Some programs keep what
-//! each pixel blended instead (`keeps`): a faster backward for much memory.
+//! A conventional rasterizer (the algorithm of 3DGS on one CPU thread): 16×16 tiles, a square box
+//! of some σ around each splat, one sort of (tile, depth) pairs. Each pixel processes its tile's
+//! list front to back. The backward pass processes it back to front from a stored last position
+//! and recovers T by division. With `keeps`, the splats that each pixel blended are stored
+//! instead, as some programs do: a faster backward pass that needs much memory.
 
 #![expect(clippy::needless_range_loop, reason = "plain loops, as such programs have them")]
 
@@ -14,7 +14,7 @@ const ALPHA_MIN: f32 = 1.0 / 255.0;
 const ALPHA_MAX: f32 = 0.999;
 const T_MIN: f32 = 1e-4;
 
-/// A picture and what backward needs of it.
+/// A picture and the inputs of the backward pass.
 #[derive(Default)]
 pub struct Frame {
     /// `[H, W, 3]`.
@@ -25,10 +25,9 @@ pub struct Frame {
     pub depth_sum: Vec<f32>,
     /// `[H, W]`: T behind the last splat.
     transmittance: Vec<f32>,
-    /// Splats that pixels blended, front to back, one pixel after the other, if kept.
+    /// Blended splats, front to back, pixel after pixel, if stored.
     blended: Vec<u32>,
-    /// `[H, W]`: first and one past the last of a pixel's in `blended`, else in the
-    /// pairs.
+    /// `[H, W]`: half-open range of a pixel's splats in `blended`, else in the pairs.
     spans: Vec<(usize, usize)>,
 }
 
@@ -38,14 +37,14 @@ pub struct Rasterizer {
     projected: Vec<Projected>,
     /// (tile, depth bits) above, splat below, sorted.
     pairs: Vec<(u64, u32)>,
-    /// First and one past the last pair of each tile.
+    /// Half-open range of pairs of each tile.
     ranges: Vec<(u32, u32)>,
-    /// Whether a pixel's splats are kept for backward.
+    /// Whether the blended splats are stored for the backward pass.
     keeps: bool,
     pub frame: Frame,
 }
 
-/// Alpha at (dx, dy) from the mean before the cap, with its Gaussian factor.
+/// Returns alpha at (dx, dy) from the mean before the cap, with its Gaussian factor.
 #[inline]
 fn alpha_at(s: &Projected, dx: f32, dy: f32) -> Option<(f32, f32)> {
     let [a, b, c] = s.conic;
@@ -59,7 +58,7 @@ fn alpha_at(s: &Projected, dx: f32, dy: f32) -> Option<(f32, f32)> {
 }
 
 impl Rasterizer {
-    /// Without buffers. `keeps`: backward reads what each pixel blended.
+    /// Creates a rasterizer; with `keeps`, blended splats are stored for the backward pass.
     pub fn new(keeps: bool) -> Self {
         Self { keeps, ..Self::default() }
     }
@@ -89,7 +88,7 @@ impl Rasterizer {
         }
     }
 
-    /// Pairs and ranges.
+    /// Computes pairs and ranges.
     fn list(&mut self, [width, height]: [usize; 2]) {
         let (columns, rows) = (width.div_ceil(TILE), height.div_ceil(TILE));
         self.pairs.clear();
@@ -105,7 +104,7 @@ impl Rasterizer {
                 }
             }
         }
-        // The index settles ties of depth.
+        // The index orders equal depths.
         self.pairs.sort_unstable();
         self.ranges.clear();
         self.ranges.resize(columns * rows, (0, 0));
@@ -156,8 +155,8 @@ impl Rasterizer {
         self.frame.spans[at] = (first, past);
     }
 
-    /// Gradients of Σ rgb·v_rgb + Σ alpha·v_alpha of the last [`Rasterizer::forward`],
-    /// which had the same arguments.
+    /// Computes the gradients of Σ rgb·v_rgb + Σ alpha·v_alpha of the last
+    /// [`Rasterizer::forward`], which had the same arguments.
     pub fn backward(
         &self,
         splats: &Splats,
@@ -211,7 +210,7 @@ impl Rasterizer {
         let (px, py) = (x as f32 + 0.5, y as f32 + 0.5);
         let last = self.frame.transmittance[at];
         let mut t = last;
-        // Σ over the splats behind of w·(c·v).
+        // Σ w·(c·v) over the farther splats.
         let mut behind = 0.0;
         let (first, past) = self.frame.spans[at];
         for k in (first..past).rev() {

@@ -9,7 +9,7 @@ pub fn linear(logits: &Tensor, areas: &Tensor, opacities: &Tensor) -> Result<Ten
     weights.broadcast_mul(&opacities.unsqueeze(1)?)
 }
 
-/// 1 − exp(−τ·softmax(ℓ)/B) with τ = −ln(1 − α) and B = A / the parent's own area.
+/// 1 − exp(−τ·softmax(ℓ)/B) with τ = −ln(1 − α) and B = A / the area of the parent.
 pub fn optical_depth(
     logits: &Tensor,
     areas: &Tensor,

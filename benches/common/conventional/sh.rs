@@ -6,7 +6,7 @@ const C3: [f32; 5] = [0.590_043_6, 2.890_611_4, 0.457_045_8, 0.373_176_34, 1.445
 const C4: [f32; 6] = [2.503_343, 1.770_130_8, 0.946_174_7, 0.669_046_5, 0.105_785_55, 0.473_087_34];
 const C44: f32 = 0.625_835_7;
 
-/// Functions at the unit vector `d`; those above `degree` are 0.
+/// Returns the functions at the unit vector `d`; those above `degree` are 0.
 pub fn basis(degree: usize, [x, y, z]: [f32; 3]) -> [f32; 25] {
     let mut b = [0.0; 25];
     b[0] = 0.282_094_8;
@@ -48,7 +48,7 @@ pub fn basis(degree: usize, [x, y, z]: [f32; 3]) -> [f32; 25] {
     b
 }
 
-/// Derivatives of [`basis`].
+/// Returns the derivatives of [`basis`].
 pub fn derivatives(degree: usize, [x, y, z]: [f32; 3]) -> [[f32; 3]; 25] {
     let mut d = [[0.0; 3]; 25];
     if degree == 0 {

@@ -1,6 +1,6 @@
-//! Plane sweep in two steps: warp all source features to every candidate depth, then
-//! multiply by the reference and sum over channels. The warped volume is `[C, D, h, w]`
-//! per pair, as `grid_sample` makes it; planes are spread over rayon's current pool.
+//! Plane sweep in two steps: all source features are warped to every candidate depth, then
+//! multiplied by the reference and summed over channels. The warped volume is `[C, D, h, w]` per
+//! pair, as from `grid_sample`; planes are distributed over rayon's current pool.
 
 use rayon::prelude::*;
 use subsplat::ops::plane_sweep::{Pair, Sweep};
@@ -32,8 +32,8 @@ pub fn correlation(s: &Sweep, reference: &[f32], source: &[f32]) -> Vec<f32> {
     out
 }
 
-/// Gradients by reference and source for `grad` `[R, D, h, w]`. The volume is warped
-/// again, then its own gradient takes its place and is scattered back.
+/// Returns the gradients of reference and source for `grad` `[R, D, h, w]`. The volume is warped
+/// again, overwritten by its own gradient, and scattered back.
 pub fn backward(
     s: &Sweep,
     reference: &[f32],
@@ -70,7 +70,7 @@ pub fn backward(
     (by_reference, by_source)
 }
 
-/// Adds `warped` `[D, h, w]` to the taps that it came from.
+/// Adds `warped` `[D, h, w]` to its taps.
 fn scatter([h, w]: [usize; 2], warped: &[f32], grid: &[[f32; 2]], plane: &mut [f32]) {
     for (g, &[u, v]) in warped.iter().zip(grid) {
         let (left, top) = (u.floor(), v.floor());
@@ -89,7 +89,7 @@ fn scatter([h, w]: [usize; 2], warped: &[f32], grid: &[[f32; 2]], plane: &mut [f
     }
 }
 
-/// Source columns and rows (0 = centre of the first pixel) `[D, h, w]`.
+/// Returns source columns and rows (0 = centre of the first pixel) `[D, h, w]`.
 fn grid(s: &Sweep, p: &Pair, depths: &[f32]) -> Vec<[f32; 2]> {
     let [h, w] = s.size;
     let r = &p.rotation;
@@ -111,7 +111,7 @@ fn grid(s: &Sweep, p: &Pair, depths: &[f32]) -> Vec<[f32; 2]> {
     grid
 }
 
-/// `planes` `[C, h, w]` at `grid` `[D, h, w]` into `volume` `[C, D, h, w]`; bilinear,
+/// Samples `planes` `[C, h, w]` at `grid` `[D, h, w]` into `volume` `[C, D, h, w]`; bilinear,
 /// zeros outside.
 fn warp([h, w]: [usize; 2], planes: &[f32], grid: &[[f32; 2]], volume: &mut [f32]) {
     let planes = planes.par_chunks_exact(h * w);
