@@ -95,7 +95,7 @@ impl Case {
 
     fn plain(&self) -> Plain<'_> {
         let s = &self.splats;
-        Plain { rows: &s.rows(), sh: &s.sh(), gain: &s.gain(), sh_degree: s.sh_degree() }
+        Plain { rows: s.rows(), sh: s.sh(), gain: s.gain(), sh_degree: s.sh_degree() }
     }
 
     fn plain_options(&self, box_sigmas: f32) -> Options {

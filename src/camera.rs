@@ -245,7 +245,6 @@ impl Camera {
     }
 
     /// Returns the same pose with the intrinsics of a picture resampled to `width` × `height`.
-
     pub fn resized(&self, width: usize, height: usize) -> Self {
         Self { intrinsics: self.intrinsics.resized(width, height), ..*self }
     }

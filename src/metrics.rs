@@ -192,7 +192,6 @@ pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize) -> Result<f64, Me
 ///
 /// # Errors
 /// A length that does not match `width`×`height`, a side below 2, NaN or infinite values.
-
 pub fn mean_gradient(picture: &[f32], width: usize, height: usize) -> Result<f64, MetricsError> {
     check(picture, picture, width, height, 2)?;
     let stride = width * 3;

@@ -213,7 +213,6 @@ fn transpose(m: &[f64], n: usize) -> Vec<f64> {
 }
 
 /// Solves A·X = B for A `[n, n]` and B `[n, k]` by Gaussian elimination with row pivots.
-
 fn solve(mut a: Vec<f64>, mut b: Vec<f64>, n: usize, k: usize) -> Vec<f64> {
     for col in 0..n {
         let pivot = (col..n)

@@ -168,7 +168,6 @@ pub struct BlendRules {
 
 impl BlendRules {
     /// Returns the constants of `convention`.
-
     pub fn new(convention: Convention) -> Self {
         match convention {
             Convention::Standard => Self { alpha_max: ALPHA_MAX_STANDARD, stop: TRANSMITTANCE_MIN },

@@ -39,7 +39,6 @@ pub struct Sweep {
 
 impl Sweep {
     /// Returns D, the number of depth candidates.
-
     pub fn candidates(&self) -> usize {
         self.depths.first().map_or(0, Vec::len)
     }

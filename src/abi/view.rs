@@ -77,7 +77,6 @@ impl View {
 
 /// Returns tan of half the angle between the rays through the middles of opposite picture
 /// edges, horizontally and vertically: MVSplat's frustum.
-
 fn tan_half_fov(k: &Intrinsics) -> [f32; 2] {
     let (w, h) = (k.width as f64, k.height as f64);
     let ray = |u: f64, v: f64| {

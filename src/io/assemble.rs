@@ -330,7 +330,6 @@ impl Notes {
 }
 
 /// Derives the scene's name from the nearest folder that is not part of a format's layout.
-
 fn scene_name(pose_file: &Path) -> String {
     let absolute = std::fs::canonicalize(pose_file).unwrap_or_else(|_| pose_file.to_owned());
     let mut folder = if absolute.is_dir() { Some(absolute.as_path()) } else { absolute.parent() };

@@ -299,7 +299,6 @@ pub fn save_cameras_json(path: &Path, content: &CameraFile) -> Result<()> {
 
 impl NamedCamera {
     /// Makes a named camera of a frame's camera and the new path `file` of its picture.
-
     pub fn of_frame(frame: &Frame, file: impl Into<String>) -> Self {
         Self { file: file.into(), camera: frame.camera, timestamp: frame.timestamp, depth: None }
     }

@@ -444,7 +444,6 @@ pub(super) fn f32_at(bytes: &[u8], at: usize, path: &Path) -> Result<f32> {
 }
 
 /// Makes the error for a truncated file.
-
 pub(super) fn truncated(path: &Path, expected: u64, got: u64) -> Error {
     Error::format(
         path,

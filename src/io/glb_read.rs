@@ -491,7 +491,6 @@ impl Column<'_> {
 }
 
 /// Joins all parts to one set of the highest SH degree among them.
-
 fn join(mut parts: Vec<Splats>, path: &Path) -> Result<Splats> {
     if parts.len() == 1 {
         return Ok(parts.remove(0));

@@ -332,7 +332,6 @@ pub fn load_depth_png(path: &Path, unit: f32) -> Result<Depth> {
 }
 
 /// Decodes bytes in memory as [`load_depth_png`] does; `path` is for errors.
-
 ///
 /// # Errors
 /// As [`load_depth_png`].

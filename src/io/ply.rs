@@ -147,7 +147,6 @@ fn read_vertices(header: &Header, element: &Element, source: &mut Source) -> Res
 }
 
 /// Writes channel-major `f_rest[3, D − 1]` to a set `[D, 3]` after its constant term.
-
 pub(super) fn rest_to_set(rest: &[f32], set: &mut [f32]) {
     let per_channel = rest.len() / 3;
     for (j, h) in set[3..].chunks_exact_mut(3).enumerate() {

@@ -87,7 +87,6 @@ pub fn load_protocol(path: &Path) -> Result<Protocol> {
 ///
 /// # Errors
 /// JSON of another form; a scene without context.
-
 pub fn load_index(path: &Path) -> Result<Index> {
     let index: Index = serde_json::from_slice(&read(path)?).map_err(|e| {
         json_error(path, "an evaluation index (scene: context and target, or null)", &e)

@@ -89,7 +89,6 @@ pub fn parse(path: &Path, bytes: &[u8], warnings: &mut Vec<String>) -> Result<Ve
 
 /// Finds the camera file in a folder: a `.txt` whose first line is an address or has 19
 /// columns.
-
 pub(super) fn find(folder: &Path) -> Result<Option<PathBuf>> {
     let entries = std::fs::read_dir(folder).map_err(|e| Error::io(folder, e))?;
     let mut files: Vec<PathBuf> = entries.filter_map(|e| Some(e.ok()?.path())).collect();
@@ -142,7 +141,6 @@ pub(super) fn load(path: &Path) -> Result<Scene> {
 }
 
 /// Finds the picture of each camera by the rules of the module's documentation.
-
 fn matched(
     path: &Path,
     cameras: &[Re10kCamera],

@@ -192,7 +192,6 @@ pub fn load_scene(path: &Path) -> Result<Scene> {
 }
 
 /// Reports whether `path` is a folder with a pose file that [`load_scene`] reads.
-
 pub fn is_scene(path: &Path) -> bool {
     let file = |name: &str| path.join(name).is_file();
     ["cameras.json", "transforms.json", "poses.txt"].into_iter().any(file)

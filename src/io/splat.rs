@@ -91,7 +91,6 @@ pub(super) fn unit_byte(v: f64) -> u8 {
 
 /// Encodes a quaternion. The code reaches −1 but not +1: of q and −q, the one whose largest
 /// component is negative keeps length 1, and viewers do not normalise.
-
 fn quat_bytes(q: [f32; 4]) -> [u8; 4] {
     let largest = q.into_iter().max_by(|a, b| a.abs().total_cmp(&b.abs())).unwrap_or(0.0);
     let sign = if largest > 0.0 { -1.0 } else { 1.0 };

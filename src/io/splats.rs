@@ -321,7 +321,6 @@ fn quantiles(mut values: Vec<f32>) -> Vec<f32> {
 ///
 /// # Errors
 /// As [`load_splats`], except for numbers that are not finite.
-
 pub fn splat_info(path: &Path) -> Result<SplatInfo> {
     let (format, decoded, bytes) = decode(path)?;
     Ok(SplatInfo::of(format, decoded, bytes))

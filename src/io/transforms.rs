@@ -162,7 +162,6 @@ pub(super) fn load(path: &Path) -> Result<Scene> {
 
 /// Computes pixel intrinsics for a picture of `size`. A frame without a size has no picture
 /// and is left out later; its intrinsics are not used.
-
 fn lens(o: &Optics, size: Option<(usize, usize)>) -> std::result::Result<Lens, String> {
     let (w, h) = size.map_or((1.0, 1.0), |(w, h)| (w as f64, h as f64));
     let focal = |side: f64, angle: Option<f64>| match angle {

@@ -68,7 +68,6 @@ impl Splats {
     ///
     /// # Errors
     /// A tensor of another rank or dtype, or shapes that do not match.
-
     pub fn from_tensors(
         rows: &Tensor,
         sh: &Tensor,

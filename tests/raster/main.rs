@@ -1,6 +1,6 @@
 //! The rasterizer: pictures and gradients against oracles, fixtures and a conventional one.
 
-mod conventional;
+mod baseline;
 mod coverage;
 mod raster;
 mod raster_bwd;

@@ -314,8 +314,8 @@ fn any_number_of_threads_and_any_memory_gives_the_same_bytes() {
             all.splats.rows_mut().extend(at.to_array());
             all.splats.rows_mut().extend_from_slice(&row[3..]);
         }
-        all.splats.sh_mut().extend_from_slice(&more.splats.sh());
-        all.splats.gain_mut().extend_from_slice(&more.splats.gain());
+        all.splats.sh_mut().extend_from_slice(more.splats.sh());
+        all.splats.gain_mut().extend_from_slice(more.splats.gain());
     }
     assert!(all.splats.len() > 10_000);
     let levels = SimdLevel::available().iter().map(|&level| (Convention::Standard, level));

@@ -163,7 +163,10 @@ fn flight_depends_on_time_and_not_on_frames() {
     assert!(close(fly(&mut n, [0.0, 0.0, -1.0], 0.5, Pace::Fast), -4.0 * ahead));
     assert!(close(fly(&mut n, [1.0, 0.0, 0.0], 0.5, Pace::Normal), 0.4 * axes.x_axis));
     assert!(close(fly(&mut n, [0.0, 1.0, 0.0], 0.5, Pace::Normal), 0.4 * UP));
-    assert!((fly(&mut n, [1.0, 0.0, 1.0], 0.5, Pace::Normal).length() - 0.4).abs() < 1e-5, "aslant");
+    assert!(
+        (fly(&mut n, [1.0, 0.0, 1.0], 0.5, Pace::Normal).length() - 0.4).abs() < 1e-5,
+        "aslant"
+    );
     assert_eq!(fly(&mut n, [0.0; 3], 9.0, Pace::Fast), Vec3::ZERO);
     // The wheel changes the speed, and home restores the initial speed.
     n.toggle();

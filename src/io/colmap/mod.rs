@@ -168,7 +168,6 @@ fn rotation(q: [f64; 4]) -> Option<DQuat> {
 
 /// Reads the model in `folder`. Pictures may lie beside it, in its parents, and in an
 /// `images` folder of any of them.
-
 pub(super) fn load(folder: &Path) -> Result<Scene> {
     let binary = folder.join("cameras.bin").is_file() && folder.join("images.bin").is_file();
     let extension = if binary { "bin" } else { "txt" };

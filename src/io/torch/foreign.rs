@@ -23,7 +23,6 @@ const STARTS: &[(&[u8], &str)] = &[
 ];
 
 /// Names the format of a file of `length` bytes that starts with `head`.
-
 pub(super) fn name(head: &[u8], length: u64) -> String {
     if head.is_empty() {
         return "an empty file".to_owned();

@@ -349,7 +349,6 @@ fn parameter(machine: &mut Machine, name: &Arc<str>, arguments: &[Id]) -> Result
 
 /// Makes a tensor with attributes of `_rebuild_from_type_v2(function, class, arguments,
 /// state)`. A tensor of a subclass is opaque.
-
 fn from_type(machine: &mut Machine, name: &Arc<str>, arguments: &[Id]) -> Result<Id> {
     let [function, class, inner, ..] = arguments else {
         return machine.make(Node::Opaque(name.clone()));

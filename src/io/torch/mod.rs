@@ -200,7 +200,6 @@ fn check_crc(
 }
 
 /// Escapes a name of the file for a message and cuts it after 120 characters.
-
 fn shown(text: &str) -> String {
     let mut shown: String = text.chars().take(120).flat_map(char::escape_debug).collect();
     if text.chars().nth(120).is_some() {

@@ -501,7 +501,6 @@ fn integer(bytes: &[u8]) -> Node {
 }
 
 /// Describes a refused instruction.
-
 fn unknown(op: u8) -> String {
     match op {
         b'P' | b'I' | b'L' | b'F' | b'S' | b'V' | b'g' | b'p' => {

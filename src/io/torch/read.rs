@@ -94,7 +94,6 @@ fn runs(t: &TensorRef) -> (Vec<Dimension>, usize) {
 }
 
 /// A window of the file that moves to the requested bytes.
-
 struct Gather<'a> {
     source: &'a Source,
     path: &'a Path,

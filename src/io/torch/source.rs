@@ -154,7 +154,6 @@ impl<'a> Stream<'a> {
 
     /// Takes at most `limit` bytes up to the next line feed, and the line feed, which is
     /// dropped.
-
     pub(super) fn line(&mut self, limit: usize) -> Result<Vec<u8>> {
         let mut line = Vec::new();
         loop {

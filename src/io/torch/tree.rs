@@ -205,7 +205,6 @@ fn list(sizes: &[usize]) -> String {
 }
 
 /// Returns the bytes of a legacy storage's elements, for [`super::legacy`].
-
 pub(super) fn bytes_of(kind: &Kind, elements: u64) -> Option<u64> {
     elements.checked_mul(kind.size() as u64)
 }

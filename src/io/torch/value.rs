@@ -221,7 +221,6 @@ impl Value {
     }
 
     /// Describes the value for messages: `a list of 3`, `an object of os.system`.
-
     pub fn kind(&self) -> String {
         match self {
             Self::None => "None".to_owned(),
