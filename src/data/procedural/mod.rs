@@ -76,7 +76,8 @@ impl Room {
             exposure: 1.0,
             bank,
         };
-        room.exposure = MIDDLE_GREY / room.log_mean_luminance(&mut layout.rng.fork(2)).max(1e-3);
+        room.exposure =
+            MIDDLE_GREY / room.geometric_mean_luminance(&mut layout.rng.fork(2)).max(1e-3);
         room
     }
 
@@ -98,7 +99,7 @@ impl Room {
     }
 
     /// Returns the geometric mean luminance over rays from the middle of the room.
-    fn log_mean_luminance(&self, rng: &mut Rng) -> f32 {
+    fn geometric_mean_luminance(&self, rng: &mut Rng) -> f32 {
         const RAYS: usize = 96;
         let shading = Shading { spread: 0.1, view_dependent: false, lamp_shift: None };
         let mut sum = 0.0;
