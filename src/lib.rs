@@ -45,6 +45,7 @@
     allow(
         dead_code,
         unused_imports,
+        rustdoc::private_intra_doc_links,
         reason = "programs, tests and benches use more of the crate than its public items do"
     )
 )]
@@ -138,16 +139,24 @@ pub use glam;
 pub use abi::{Convention, RasterOptions, ShBasis};
 pub use backend::{Backend, DeviceError};
 pub use camera::{Camera, CameraError, Intrinsics};
-pub use check::{CheckOptions, GrayImage, PairReport, Verdict, check_pair};
+pub use check::{
+    CheckOptions, DepthReport, EpipolarReport, Finding, GrayImage, PairReport, Verdict, check_pair,
+};
+#[cfg(feature = "network")]
+pub use config::{Config, ConfigError, Preset};
+#[cfg(feature = "network")]
+pub use data::crop::{CropOptions, Cropped};
 pub use device::DeviceChoice;
 #[cfg(feature = "gpu")]
-pub use gpu::Gpu;
+pub use gpu::{Gpu, GpuError, Rasterizer as GpuRasterizer};
 pub use io::cameras_json::{CameraFile, NamedCamera, load_cameras_json, save_cameras_json};
 pub use io::image::{Depth, Rgb, save_depth_png, save_png};
 pub use io::scene::{Frame, Scene, SceneFormat, Units, load_scene};
-pub use io::{SaveOptions, SaveReport, SplatFormat, Up, load_splats, save_splats};
+pub use io::{
+    Error as FileError, SaveOptions, SaveReport, SplatFormat, Up, load_splats, save_splats,
+};
 pub use metrics::{MetricsError, psnr, ssim};
-pub use navigation::{Bounds, Navigator, Start};
+pub use navigation::{Bounds, Mode, Navigator, Pace, Start};
 #[cfg(feature = "network")]
 pub use ops::{SplatTensors, rasterize_splats as rasterize};
 #[cfg(feature = "network")]

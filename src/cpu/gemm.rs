@@ -1,6 +1,8 @@
 //! Matrix product on slices.
 //!
+//! ```text
 //! dst[i][j] = base[i][j] + scale · Σ_k lhs[i][k] · rhs[k][j]
+//! ```
 //!
 //! Input: lhs `[m, k]` of any strides; rhs `[k, n]`, packed once into panels of 64 columns
 //! ([`Packed`], `packing`) and shared by any number of calls; base zero, dst itself or a row

@@ -80,7 +80,7 @@ pub struct PhotoWindow {
 
 impl PhotoWindow {
     /// Position in the picture to position in the photograph, px (centres at +0.5).
-    pub fn to_photo(&self, px: Vec2) -> Vec2 {
+    pub fn to_photo(self, px: Vec2) -> Vec2 {
         self.origin + self.scale * px
     }
 }

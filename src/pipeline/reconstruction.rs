@@ -49,6 +49,7 @@ impl Reconstruction {
     }
 
     /// The Gaussians, to be edited in place.
+    #[cfg_attr(not(feature = "internals"), doc(hidden))]
     pub fn splats_mut(&mut self) -> &mut Splats {
         &mut self.splats
     }

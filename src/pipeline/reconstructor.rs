@@ -61,6 +61,7 @@ impl Reconstructor {
     ///
     /// # Errors
     /// Those of [`Reconstructor::load`].
+    #[cfg_attr(not(feature = "internals"), doc(hidden))]
     pub fn from_weights(weights: Weights, config: Option<&Config>) -> Result<Self> {
         let weights = weights.allow_missing(SUBSPLAT_PREFIX, 0);
         let config = match (config, weights.config()) {
@@ -91,6 +92,7 @@ impl Reconstructor {
     }
 
     /// The network.
+    #[cfg_attr(not(feature = "internals"), doc(hidden))]
     pub fn model(&self) -> &SubSplat {
         &self.model
     }

@@ -106,6 +106,7 @@ impl Renderer {
     ///
     /// # Errors
     /// [`DeviceError::Gpu`] where the GPU is too small, lost, or rejects a command.
+    #[cfg_attr(not(feature = "internals"), doc(hidden))]
     pub fn render_slices(
         &mut self,
         splats: &SplatSlices,
@@ -127,6 +128,7 @@ impl Renderer {
     ///
     /// # Errors
     /// As [`Renderer::render_slices`].
+    #[cfg_attr(not(feature = "internals"), doc(hidden))]
     pub fn backward(
         &mut self,
         splats: &SplatSlices,

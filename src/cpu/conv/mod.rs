@@ -1,7 +1,9 @@
 //! Convolutions (cross-correlations, as in PyTorch) over two or three axes: forward and both
 //! gradients, any kernel, stride and zero padding, without an im2col matrix.
 //!
+//! ```text
 //! y[b][o][p] = bias[o] + Σ_c Σ_tap w[o][c][tap] · x[b][c][stride·p + tap − padding]
+//! ```
 //!
 //! Input: x `[B, C, D, H, W]`, w `[O, C, kd, kh, kw]`, bias `[O]` or empty. Output:
 //! y `[B, O, D', H', W']`. In two dimensions D = 1 and kd = 1.

@@ -7,7 +7,7 @@ use std::ops::{AddAssign, MulAssign};
 
 /// `f32` (inference and training) or `f64` (oracles and finite differences).
 ///
-/// The elementary functions of `f32` are those of [`elementary`], so that loops over them
+/// The elementary functions of `f32` are those of `simd::elementary`, so that loops over them
 /// vectorize; those of `f64` are the standard library's.
 pub trait Real:
     Vector<Element = Self, Mask = bool>

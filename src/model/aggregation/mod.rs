@@ -10,7 +10,7 @@
 //! Three geometry stages give f^g from z^g; one appearance stage gives f^a from f^g and
 //! z^a. Parameters: `g0`, `g1`, …, `a0`, each `{norm, wk.L, wv.L, level_bias, gate}`.
 //!
-//! [`preset`] is this form, which both presets use. [`ablated`] is the general form behind
+//! `preset` is this form, which both presets use. `ablated` is the general form behind
 //! [`crate::config::AggregationAblations`]; [`Aggregation::new`] chooses between them.
 //! Differs from the paper, which leaves them open: factor 1/√E, projections of keys and
 //! values, residual, LayerNorm and occlusion gate (`tuned`).
