@@ -26,7 +26,7 @@ pub struct Pages;
 /// Returns the system allocator's free memory to the kernel.
 ///
 /// The matching of points frees hundreds of buffers of one to two megabytes, which glibc keeps:
-/// 26 MiB after two photographs of 1080x1920. The network would not use them again.
+/// 26 MiB after two photographs of 1080x1920. The network allocates other sizes.
 pub fn trim_small_blocks() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
     {
