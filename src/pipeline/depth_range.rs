@@ -143,7 +143,7 @@ impl fmt::Display for DepthSource {
                 "{NEAR_BASELINES} and {FAR_BASELINES} times the baseline of {distance:.4}"
             ),
             Self::Estimated { from } => {
-                write!(f, "estimated by the network at half size, after {from}")
+                write!(f, "estimated by the network at half size (initial range: {from})")
             }
         }
     }

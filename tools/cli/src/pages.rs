@@ -23,6 +23,21 @@ use std::alloc::{GlobalAlloc, Layout, System};
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Pages;
 
+/// Returns the system allocator's free memory to the kernel.
+///
+/// The matching of points frees hundreds of buffers of one to two megabytes, which glibc keeps:
+/// 26 MiB after two photographs of 1080x1920. The network allocates other sizes.
+pub fn trim_small_blocks() {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    {
+        unsafe extern "C" {
+            fn malloc_trim(pad: usize) -> std::ffi::c_int;
+        }
+        // SAFETY: the function of glibc has no precondition, and is safe on any thread.
+        unsafe { malloc_trim(0) };
+    }
+}
+
 /// Size of a huge page on x86-64 and on most AArch64 kernels, bytes. Smaller blocks go to the
 /// system's allocator.
 const HUGE: usize = 2 << 20;

@@ -2,6 +2,7 @@
 
 use super::args::{DetailArg, SourceArgs};
 use super::frames;
+use crate::pages;
 use crate::report::{Progress, print_line, print_warning, show_fraction};
 use anyhow::Result;
 use serde_json::{Value, json};
@@ -47,6 +48,7 @@ pub fn reconstruct(
         let mut show = |progress| show_fraction(bar, progress);
         let prepared = model.prepare_with(photos.borrow(), options, &mut show)?;
         drop(photos);
+        pages::trim_small_blocks();
         bar.suspend(|| print_prepared(&prepared));
         let printed = prepared.warnings().len();
         let result = prepared.reconstruct_with(&mut show)?;
