@@ -141,7 +141,7 @@ impl Case {
         let n = 2 * side * side;
         let rows = scene::shared(&spec).into_parts().rows;
         let parents = Tensor::from_vec(rows, (n, SPLAT_STRIDE), &candle_core::Device::Cpu)?;
-        let (k, lanes) = (call.rules.children(), call.rules.gain_lanes());
+        let (k, lanes) = (call.rules.children(), call.rules.gain_channels());
         let gains = if lanes == 1 { vec![n * k] } else { vec![n * k, lanes] };
         Ok(Self {
             head: inputs::tensor(&[n, k, HEAD_STRIDE], 0.3, 60)?,
@@ -182,7 +182,7 @@ impl Case {
 
     fn work(&self) -> Work {
         let n = self.children() as f64;
-        let out = SPLAT_STRIDE + self.call.rules.gain_lanes();
+        let out = SPLAT_STRIDE + self.call.rules.gain_channels();
         let parent = SPLAT_STRIDE as f64 / self.call.rules.children() as f64;
         Work {
             bytes: 4.0 * n * (HEAD_STRIDE as f64 + parent + out as f64),
@@ -207,7 +207,7 @@ fn forward(bench: &mut Bench, name: &str, case: &Case) -> Result<()> {
     }
     for threads in [Threads::One, Threads::All] {
         let mut rows = vec![0.0; case.children() * SPLAT_STRIDE];
-        let mut gains = vec![0.0; case.children() * case.call.rules.gain_lanes()];
+        let mut gains = vec![0.0; case.children() * case.call.rules.gain_channels()];
         let run = move || {
             spgr_into(&case.head, &case.parents, &case.call, &mut rows, &mut gains)?;
             Ok(())

@@ -27,10 +27,10 @@ fn is_finite(d: vec3<f32>) -> bool {
 }
 
 fn gain_of(i: u32) -> f32 {
-    if call.gain_lanes == 0u {
+    if call.gain_channels == 0u {
         return 1.0;
     }
-    return gain[i * call.gain_lanes];
+    return gain[i * call.gain_channels];
 }
 
 fn add_to_mean(i: u32, g: vec3<f32>) {
@@ -41,11 +41,11 @@ fn add_to_mean(i: u32, g: vec3<f32>) {
 }
 
 fn store_gain(i: u32, g: f32, rgb: vec3<f32>) {
-    let at = i * call.gain_lanes;
-    if call.gain_lanes > 0u {
+    let at = i * call.gain_channels;
+    if call.gain_channels > 0u {
         d_gain[at] = g;
     }
-    if call.gain_lanes == 4u {
+    if call.gain_channels == 4u {
         d_gain[at + 1u] = rgb.x;
         d_gain[at + 2u] = rgb.y;
         d_gain[at + 3u] = rgb.z;

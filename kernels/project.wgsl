@@ -49,9 +49,9 @@ fn colour(i: u32) -> vec4<f32> {
     let own_sh = i / call.children * call.sh_stride;
     let sum = radiance(own_sh, call.sh_degree, call.sh_mvsplat != 0u, direction);
     var v = sum + 0.5;
-    if call.gain_lanes == 1u {
+    if call.gain_channels == 1u {
         v = gain[i] * sum + 0.5;
-    } else if call.gain_lanes == 4u {
+    } else if call.gain_channels == 4u {
         let at = 4u * i;
         v = gain[at] * sum + 0.5 + vec3<f32>(gain[at + 1u], gain[at + 2u], gain[at + 3u]);
     }

@@ -135,6 +135,7 @@ mod train;
 #[cfg(feature = "network")]
 pub use candle_core;
 pub use glam;
+pub use image;
 
 pub use abi::{Convention, RasterOptions, ShBasis};
 pub use backend::{Backend, DeviceError};

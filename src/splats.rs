@@ -182,7 +182,7 @@ impl Splats {
     }
 
     /// Returns the floats of `gain` per splat: 0, 1 or 4.
-    pub fn gain_lanes(&self) -> usize {
+    pub fn gain_channels(&self) -> usize {
         self.gain.len().checked_div(self.len()).unwrap_or(0)
     }
 
@@ -223,7 +223,7 @@ impl Splats {
 
     /// Returns γ and δ of splat `i`.
     pub fn gain_of(&self, i: usize) -> (f32, [f32; 3]) {
-        match self.gain_lanes() {
+        match self.gain_channels() {
             0 => (1.0, [0.0; 3]),
             1 => (self.gain[i], [0.0; 3]),
             _ => {

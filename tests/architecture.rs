@@ -19,7 +19,7 @@ const IMPORTS: &[(&str, &[&str])] = &[
     ("device", &[]),
     ("gpu", &["abi", "camera", "device"]),
     ("backend", &["device", "gpu"]),
-    ("render", &["abi", "backend", "camera", "cpu", "gpu", "splats"]),
+    ("render", &["abi", "backend", "camera", "cpu", "gpu", "io", "splats"]),
     ("check", &["camera", "metrics"]),
     ("io", &["abi", "camera", "config", "sh", "splats"]),
     ("data", &["camera", "io", "metrics", "splats"]),

@@ -26,7 +26,7 @@ struct RasterUniform {
     sh_degree: u32,
     sh_mvsplat: u32,
     sh_shared: u32,
-    gain_lanes: u32,
+    gain_channels: u32,
     capacity: u32,
     step: u32,
     channel: u32,

@@ -51,7 +51,7 @@ impl Rules {
     }
 
     /// Returns the floats of gain per child, 1 or 4.
-    pub fn gain_lanes(&self) -> usize {
+    pub fn gain_channels(&self) -> usize {
         if self.rgb_gain { 4 } else { 1 }
     }
 }

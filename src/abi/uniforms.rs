@@ -89,7 +89,7 @@ uniform! {
         /// 1: one direction per parent.
         sh_shared: u32,
         /// Floats of a splat's gain: 0, 1 or 4.
-        gain_lanes: u32,
+        gain_channels: u32,
         /// Largest number of (splat, tile) pairs that the buffers hold.
         capacity: u32,
         /// Channel c of pixel p is at p·`step` + c·`channel` of the picture.

@@ -52,7 +52,7 @@ pub(crate) struct Part<'a> {
     pub(crate) sh: &'a mut [f32],
     gain: &'a mut [f32],
     /// Numbers of [`SplatSlices::gain`] per splat.
-    gain_lanes: usize,
+    gain_channels: usize,
 }
 
 /// Sixteen splats in structure of arrays.
@@ -94,13 +94,13 @@ impl Pass<'_> {
         let families = (PART / children).max(1);
         let len = families * children;
         let set = 3 * sh_coefficients(self.splats.sh_degree);
-        let gain_lanes = self.splats.gain.len().checked_div(n).unwrap_or(0);
+        let gain_channels = self.splats.gain.len().checked_div(n).unwrap_or(0);
         let mut rows = out.rows.chunks_mut(len * SPLAT_STRIDE);
         let mut means = out.means.chunks_mut(3 * len);
         let mut cov6 = out.cov6.chunks_mut(6 * len);
         let mut opacities = out.opacities.chunks_mut(len);
         let mut sh = out.sh.chunks_mut(families * set);
-        let mut gain = out.gain.chunks_mut((len * gain_lanes).max(1));
+        let mut gain = out.gain.chunks_mut((len * gain_channels).max(1));
         let parts: Vec<Part> = (0..n)
             .step_by(len)
             .map(|first| Part {
@@ -112,7 +112,7 @@ impl Pass<'_> {
                 opacities: opacities.next().unwrap_or_default(),
                 sh: sh.next().unwrap_or_default(),
                 gain: gain.next().unwrap_or_default(),
-                gain_lanes,
+                gain_channels,
             })
             .collect();
         parts.into_par_iter().for_each(|part| level.run(PartOf(self, part)));
@@ -250,7 +250,7 @@ impl Part<'_> {
         zero(self.means, 3);
         zero(self.cov6, 6);
         zero(self.opacities, 1);
-        zero(self.gain, self.gain_lanes);
+        zero(self.gain, self.gain_channels);
         if let Some(children) = children {
             let set = self.sh.len() / self.len.div_ceil(children);
             let sets = at.div_ceil(children) * set..(at + count).div_ceil(children) * set;
@@ -281,14 +281,14 @@ impl Part<'_> {
     /// γ of splat `j` of the part.
     #[inline(always)]
     pub(crate) fn gain_of(&self, splats: &SplatSlices, j: usize) -> f32 {
-        let at = (self.first + j) * self.gain_lanes;
-        splats.gain.get(at).copied().filter(|_| self.gain_lanes > 0).unwrap_or(1.0)
+        let at = (self.first + j) * self.gain_channels;
+        splats.gain.get(at).copied().filter(|_| self.gain_channels > 0).unwrap_or(1.0)
     }
 
     /// Writes ∂L/∂γ and, with four lanes, ∂L/∂δ of splat `j` of the part.
     #[inline(always)]
     pub(crate) fn put_gain(&mut self, j: usize, gain: f32, [r, g, b]: [f32; 3]) {
-        match self.gain_lanes {
+        match self.gain_channels {
             1 => self.gain[j] = gain,
             4 => set(self.gain, 4 * j, [gain, r, g, b]),
             _ => {}

@@ -293,7 +293,7 @@ pub(crate) fn uniform(
         sh_degree: options.sh_degree.min(scene.sh_degree) as u32,
         sh_mvsplat: flag(options.sh_basis == ShBasis::Mvsplat),
         sh_shared: flag(options.sh_direction == ShDirection::Parent),
-        gain_lanes: scene.gain_stride as u32,
+        gain_channels: scene.gain_stride as u32,
         step,
         channel,
         ..RasterUniform::default()

@@ -152,7 +152,7 @@ impl Gpu {
     /// [`GpuError::Argument`] for inconsistent lengths; errors of the device.
     pub fn spgr(&self, args: &SpgrArgs) -> Result<(Vec<f32>, Vec<f32>), GpuError> {
         let n = args.check()?;
-        let (k, gain_stride) = (args.rules.children(), args.rules.gain_lanes());
+        let (k, gain_stride) = (args.rules.children(), args.rules.gain_channels());
         let cameras = self.upload("context cameras", &args.cameras())?;
         let (mut rows, mut gains) = (Vec::new(), Vec::new());
         for parents in Self::chunks(n, self.rows_per_binding(k * HEAD_STRIDE.max(SPLAT_STRIDE))) {

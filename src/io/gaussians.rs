@@ -420,7 +420,7 @@ pub(super) fn check_finite(splats: &Splats, path: &Path) -> Result<()> {
         return refuse(parent * splats.children_per_parent(), "SH coefficient", splats.sh[at]);
     }
     if let Some(at) = splats.gain.iter().position(|v| !v.is_finite()) {
-        return refuse(at / splats.gain_lanes().max(1), "gain", splats.gain[at]);
+        return refuse(at / splats.gain_channels().max(1), "gain", splats.gain[at]);
     }
     Ok(())
 }

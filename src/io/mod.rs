@@ -29,6 +29,7 @@ pub mod matrices;
 pub mod protocol;
 pub mod re10k;
 pub mod resize;
+mod rgb_image;
 pub mod scene;
 pub mod tensors;
 pub mod torch;

@@ -228,7 +228,7 @@ impl Trunk {
         chunk: usize,
         mode: Mode,
     ) -> Result<Children> {
-        let (k, lanes) = (scene.rules.children(), scene.rules.gain_lanes());
+        let (k, lanes) = (scene.rules.children(), scene.rules.gain_channels());
         let n = scene.means.dim(0)?;
         if scene.means.dtype() != DType::F32 {
             bail!("primaries: expected f32, got {:?}", scene.means.dtype());

@@ -78,7 +78,7 @@ pub fn spgr_footprints(
     }
     // The children themselves tell which of them it was.
     let mut rows = vec![0.0; count * SPLAT_STRIDE];
-    let mut gains = vec![0.0; count * call.rules.gain_lanes()];
+    let mut gains = vec![0.0; count * call.rules.gain_channels()];
     spgr_into(&head, &parents, call, &mut rows, &mut gains)?;
     bail!("{NAME}: expected finite footprints of children of finite parents and head records")
 }

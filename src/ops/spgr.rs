@@ -123,7 +123,7 @@ pub fn spgr_into_on(
 ) -> Result<()> {
     let n = call.check(head, parents)?;
     let count = n * call.rules.children();
-    let expected = (count * SPLAT_STRIDE, count * call.rules.gain_lanes());
+    let expected = (count * SPLAT_STRIDE, count * call.rules.gain_channels());
     if (rows.len(), gains.len()) != expected {
         let got = (rows.len(), gains.len());
         bail!("{NAME}: expected buffers of {expected:?} floats, got {got:?}");
@@ -180,7 +180,7 @@ fn finite<T: Number>(
         bail!("{NAME}: expected finite parents, got parent {} = {row:?}", call.first + n);
     }
     let (record, child) = (bad(head, HEAD_STRIDE), bad(rows, SPLAT_STRIDE));
-    let child = child.or(bad(gains, call.rules.gain_lanes()));
+    let child = child.or(bad(gains, call.rules.gain_channels()));
     let (what, at) = match (record, child) {
         (Some(i), _) => ("head records", i),
         (None, Some(i)) => ("children", i),
@@ -247,7 +247,7 @@ fn forward<T: Number>(
     let parents = slice::<T>(NAME, "parents", s2, l2)?;
     let count = l2.dims()[0] * call.rules.children();
     let mut rows = vec![T::default(); count * SPLAT_STRIDE];
-    let mut gains = vec![T::default(); count * call.rules.gain_lanes()];
+    let mut gains = vec![T::default(); count * call.rules.gain_channels()];
     run(call, head, parents, &mut rows, &mut gains)?;
     if let Ok(mut made) = made.lock() {
         *made = Some(T::to_cpu_storage_owned(gains));
@@ -360,7 +360,7 @@ impl CustomOp1 for Gains {
     fn cpu_fwd(&self, _: &CpuStorage, _: &Layout) -> Result<(CpuStorage, Shape)> {
         let made = self.made.lock().ok().and_then(|mut made| made.take());
         let Some(gains) = made else { bail!("{NAME}: expected the gains of this call, got none") };
-        let shape = match self.rules.gain_lanes() {
+        let shape = match self.rules.gain_channels() {
             1 => Shape::from(self.count),
             lanes => Shape::from((self.count, lanes)),
         };

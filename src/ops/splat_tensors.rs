@@ -41,7 +41,7 @@ impl SplatTensors {
     /// Errors of candle's allocation.
     pub fn new(splats: &Splats, device: &Device) -> candle_core::Result<Self> {
         let (rows, sh, gain) = splats.to_tensors(device)?;
-        let gain = (splats.gain_lanes() > 0).then_some(gain);
+        let gain = (splats.gain_channels() > 0).then_some(gain);
         Ok(Self { rows, sh, gain, sh_basis: splats.sh_basis })
     }
 }
@@ -56,7 +56,7 @@ impl Splats {
         let n = self.len();
         let rows = Tensor::from_slice(&self.rows, (n, SPLAT_STRIDE), device)?;
         let sh = Tensor::from_slice(&self.sh, (self.parents(), self.sh_coefficients(), 3), device)?;
-        let gain = match self.gain_lanes() {
+        let gain = match self.gain_channels() {
             0 => Tensor::ones(n, candle_core::DType::F32, device)?,
             1 => Tensor::from_slice(&self.gain, n, device)?,
             _ => Tensor::from_slice(&self.gain, (n, 4), device)?,

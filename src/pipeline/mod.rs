@@ -34,7 +34,6 @@
 mod depth_range;
 mod detail;
 mod error;
-mod images;
 mod options;
 mod photo;
 mod poses;

@@ -148,7 +148,7 @@ fn on_cpu(inputs: &Inputs, rules: &Rules) -> (Vec<f32>, Vec<f32>) {
     let source = cpu::Source { cameras, near, per_view: 144, first: 0 };
     let count = parents.len() / SPLAT_STRIDE * rules.children();
     let mut rows = vec![0.0; count * SPLAT_STRIDE];
-    let mut gains = vec![0.0; count * rules.gain_lanes()];
+    let mut gains = vec![0.0; count * rules.gain_channels()];
     assert!(cpu::forward(cpu::Args { rules, source, head, parents }, &mut rows, &mut gains));
     (rows, gains)
 }
@@ -215,7 +215,7 @@ fn gradients_of_children() {
         for (name, rules) in variants(side) {
             let count = inputs.parents.len() / SPLAT_STRIDE * rules.children();
             let grad = r.many(count * SPLAT_STRIDE, -1.0, 1.0);
-            let by_gain = r.many(count * rules.gain_lanes(), -1.0, 1.0);
+            let by_gain = r.many(count * rules.gain_channels(), -1.0, 1.0);
             let [head, parents, gain] = gradients::<f32>(&inputs, &rules, &grad, &by_gain);
             let exact = gradients::<f64>(&inputs, &rules, &grad, &by_gain);
             let got = gpu.spgr_backward(&inputs.gpu(&rules), &grad).unwrap();

@@ -61,7 +61,7 @@ fn files_render_as_the_splats_they_were_made_from() {
         let mut result = run(&model, &world.photos, SIZE, true);
         amplify_view_dependence(result.splats_mut(), 4.0);
         let splats = result.splats();
-        assert_eq!((splats.children_per_parent(), splats.gain_lanes()), (4, 4));
+        assert_eq!((splats.children_per_parent(), splats.gain_channels()), (4, 4));
         assert_eq!(splats.sh_basis() == ShBasis::Mvsplat, i == 0);
         let mut views = cameras(&result);
         views.push(world.targets[0].resized(128, 128));

@@ -205,7 +205,7 @@ fn every_switch_runs_and_both_paths_agree() {
             assert_close(&a.gain, &b.gain, 1e-4);
             let splats = a.to_splats().unwrap();
             assert_eq!((splats.len(), splats.parents()), (512 * k, 512));
-            assert_eq!(splats.gain_lanes(), if name == "rgb gain" { 4 } else { 1 });
+            assert_eq!(splats.gain_channels(), if name == "rgb gain" { 4 } else { 1 });
         }
     }
 }

@@ -61,7 +61,7 @@ struct Scene {
 
 const CHILDREN: usize = 4;
 
-fn scene(kind: Kind, seed: u64, size: (usize, usize), gain_lanes: usize) -> Scene {
+fn scene(kind: Kind, seed: u64, size: (usize, usize), gain_channels: usize) -> Scene {
     let mut r = Random(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1);
     let camera = camera(&mut r, size, matches!(kind, Kind::NearPlane));
     let parents = 40;
@@ -98,7 +98,7 @@ fn scene(kind: Kind, seed: u64, size: (usize, usize), gain_lanes: usize) -> Scen
             rows.extend(r.array::<4>(-1.0, 1.0));
             rows.extend(scale);
             rows.push(opacity);
-            match gain_lanes {
+            match gain_channels {
                 1 => gain.push(r.range(-0.5, 1.5)),
                 4 => gain.extend([r.range(0.5, 1.5), r.range(-0.2, 0.2), 0.1, -0.9]),
                 _ => {}

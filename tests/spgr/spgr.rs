@@ -508,7 +508,7 @@ fn hostile_parents_give_finite_children_or_an_error() {
                     assert!(e.to_string().contains("parent 0"), "{name}: {e}");
                 }
             }
-            let mut buffers = (vec![0f32; 44], vec![0f32; 4 * call.rules.gain_lanes()]);
+            let mut buffers = (vec![0f32; 44], vec![0f32; 4 * call.rules.gain_channels()]);
             let _ = spgr_into(&h, &p, &call, &mut buffers.0, &mut buffers.1);
         }
         assert!(finite > 20 && refused > 5, "{name}: {finite} finite, {refused} refused");

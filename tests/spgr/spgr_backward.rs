@@ -238,7 +238,7 @@ impl Plain {
     fn run(&self) -> (bool, [Vec<f32>; 4]) {
         let (n, rules) = (self.parents.len() / SPLAT_STRIDE, &self.call.rules);
         let mut rows = vec![0f32; n * rules.children() * SPLAT_STRIDE];
-        let mut gains = vec![0f32; n * rules.children() * rules.gain_lanes()];
+        let mut gains = vec![0f32; n * rules.children() * rules.gain_channels()];
         let finite = kernel::forward(self.args(), &mut rows, &mut gains);
         let weights = |n: usize| -> Vec<f32> { (0..n).map(|i| (i as f32 * 0.37).sin()).collect() };
         let (g_rows, g_gains) = (weights(rows.len()), weights(gains.len()));
@@ -324,7 +324,7 @@ fn a_record_that_is_not_a_number_stays_with_its_parent() {
             let (finite, got) = plain.run();
             plain.head[at] = was;
             assert!(!finite, "{name} lane {lane} went unseen");
-            let lanes = plain.call.rules.gain_lanes();
+            let lanes = plain.call.rules.gain_channels();
             for (i, per) in [44, 4 * lanes, 44, 11].into_iter().enumerate() {
                 let span = victim * per..(victim + 1) * per;
                 let without = |v: &[f32]| [bits(&v[..span.start]), bits(&v[span.end..])].concat();

@@ -59,7 +59,7 @@ impl Scene {
     /// Through children in memory.
     fn by_rows(&self, camera: &Camera, options: &RasterOptions) -> Vec<Footprint> {
         let mut rows = vec![0f32; self.len() * SPLAT_STRIDE];
-        let mut gain = vec![0f32; self.len() * self.call.rules.gain_lanes()];
+        let mut gain = vec![0f32; self.len() * self.call.rules.gain_channels()];
         assert!(kernel::forward(self.args(), &mut rows, &mut gain));
         let splats = SplatSlices {
             geometry: Geometry::Packed(&rows),

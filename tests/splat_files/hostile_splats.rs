@@ -57,7 +57,7 @@ fn refused(ending: &str, bytes: &[u8], what: &str) {
 
 fn small(degree: usize) -> Splats {
     let basis = ShBasis::Standard;
-    scene(1, Kind { parents: 9, children: 1, degree, gain_lanes: 0, basis })
+    scene(1, Kind { parents: 9, children: 1, degree, gain_channels: 0, basis })
 }
 
 fn written(name: &str, splats: &Splats) -> Vec<u8> {

@@ -25,8 +25,8 @@ fn kinds() -> Vec<Kind> {
     let mut kinds = Vec::new();
     for basis in [ShBasis::Standard, ShBasis::Mvsplat] {
         for degree in 0..=4 {
-            for (children, gain_lanes) in [(1, 0), (4, 1), (9, 4)] {
-                kinds.push(Kind { parents: 23, children, degree, gain_lanes, basis });
+            for (children, gain_channels) in [(1, 0), (4, 1), (9, 4)] {
+                kinds.push(Kind { parents: 23, children, degree, gain_channels, basis });
             }
         }
     }
@@ -58,7 +58,7 @@ fn ply_and_glb_round_trips_are_exact() {
 #[test]
 fn standard_coefficients_pass_a_ply_bit_by_bit() {
     let kind =
-        Kind { parents: 300, children: 1, degree: 3, gain_lanes: 0, basis: ShBasis::Standard };
+        Kind { parents: 300, children: 1, degree: 3, gain_channels: 0, basis: ShBasis::Standard };
     let before = scene(5, kind);
     let after = reload("a.ply", &before, &SaveOptions::default());
     assert_eq!(before.sh(), after.sh());
@@ -68,7 +68,8 @@ fn standard_coefficients_pass_a_ply_bit_by_bit() {
 
 #[test]
 fn lower_degrees_are_cut_after_the_change_of_basis() {
-    let kind = Kind { parents: 40, children: 4, degree: 3, gain_lanes: 4, basis: ShBasis::Mvsplat };
+    let kind =
+        Kind { parents: 40, children: 4, degree: 3, gain_channels: 4, basis: ShBasis::Mvsplat };
     let before = scene(6, kind);
     let full = reload("a.ply", &before, &SaveOptions::default());
     for degree in 0..3 {
@@ -85,7 +86,8 @@ fn lower_degrees_are_cut_after_the_change_of_basis() {
 /// Field by field at computed offsets: an independent reading of the one layout.
 #[test]
 fn ply_layout_is_inrias() {
-    let kind = Kind { parents: 7, children: 2, degree: 3, gain_lanes: 4, basis: ShBasis::Standard };
+    let kind =
+        Kind { parents: 7, children: 2, degree: 3, gain_channels: 4, basis: ShBasis::Standard };
     let s = scene(7, kind);
     let comments = vec!["two\nlines".to_owned()];
     let (_folder, path) = save("a.ply", &s, &SaveOptions { comments, ..Default::default() });
@@ -228,7 +230,8 @@ fn splat_round_trips_sorted_at_degree_zero() {
 /// Viewers do not normalise these bytes: a quaternion along an axis keeps its length.
 #[test]
 fn splat_quaternion_bytes_reach_their_ends() {
-    let kind = Kind { parents: 4, children: 1, degree: 0, gain_lanes: 0, basis: ShBasis::Standard };
+    let kind =
+        Kind { parents: 4, children: 1, degree: 0, gain_channels: 0, basis: ShBasis::Standard };
     let mut s = scene(16, kind);
     for i in 0..4 {
         let row = &mut s.rows_mut()[i * SPLAT_STRIDE..(i + 1) * SPLAT_STRIDE];
@@ -276,7 +279,7 @@ fn opacities_and_scales_at_their_ends_stay_finite() {
 #[test]
 fn pruning_counts_and_an_empty_result_is_refused() {
     let kind =
-        Kind { parents: 50, children: 4, degree: 1, gain_lanes: 1, basis: ShBasis::Standard };
+        Kind { parents: 50, children: 4, degree: 1, gain_channels: 1, basis: ShBasis::Standard };
     let s = scene(8, kind);
     let folder = tempfile::tempdir().unwrap();
     let order: Vec<usize> = (0..s.len()).filter(|&i| s.opacity(i) >= 0.4).collect();
@@ -300,7 +303,8 @@ fn pruning_counts_and_an_empty_result_is_refused() {
 
 #[test]
 fn numbers_that_are_not_finite_are_refused_by_index() {
-    let kind = Kind { parents: 5, children: 2, degree: 1, gain_lanes: 4, basis: ShBasis::Standard };
+    let kind =
+        Kind { parents: 5, children: 2, degree: 1, gain_channels: 4, basis: ShBasis::Standard };
     let good = scene(9, kind);
     let folder = tempfile::tempdir().unwrap();
     for name in ["a.ply", "a.glb", "a.spz", "a.splat"] {
@@ -334,7 +338,8 @@ fn numbers_that_are_not_finite_are_refused_by_index() {
 
 #[test]
 fn names_and_magics_choose_the_format() {
-    let kind = Kind { parents: 3, children: 1, degree: 0, gain_lanes: 0, basis: ShBasis::Standard };
+    let kind =
+        Kind { parents: 3, children: 1, degree: 0, gain_channels: 0, basis: ShBasis::Standard };
     let s = scene(10, kind);
     let folder = tempfile::tempdir().unwrap();
     for (name, format) in [
@@ -366,7 +371,7 @@ fn names_and_magics_choose_the_format() {
 #[test]
 fn info_describes_what_is_there() {
     let kind =
-        Kind { parents: 101, children: 1, degree: 2, gain_lanes: 0, basis: ShBasis::Standard };
+        Kind { parents: 101, children: 1, degree: 2, gain_channels: 0, basis: ShBasis::Standard };
     let mut s = scene(11, kind);
     for i in 0..101 {
         s.rows_mut()[i * SPLAT_STRIDE + 10] = i as f32 / 100.0;
@@ -407,8 +412,13 @@ fn info_describes_what_is_there() {
 /// A .glb taken apart by hand: what viewers rely on.
 #[test]
 fn glb_structure_is_what_gltf_asks_for() {
-    let kind =
-        Kind { parents: 20_000, children: 1, degree: 3, gain_lanes: 0, basis: ShBasis::Standard };
+    let kind = Kind {
+        parents: 20_000,
+        children: 1,
+        degree: 3,
+        gain_channels: 0,
+        basis: ShBasis::Standard,
+    };
     let mut s = scene(12, kind);
     // Mid-grey, fully opaque, at the identity.
     s.rows_mut()[..SPLAT_STRIDE].copy_from_slice(&[9., 8., 7., 2., 0., 0., 0., 0.1, 0.2, 0.3, 1.0]);
@@ -489,7 +499,7 @@ fn edit_glb(path: &Path, edit: impl FnOnce(&mut serde_json::Value)) {
 #[test]
 fn glb_nodes_move_turn_and_scale_splats() {
     let kind =
-        Kind { parents: 30, children: 1, degree: 3, gain_lanes: 0, basis: ShBasis::Standard };
+        Kind { parents: 30, children: 1, degree: 3, gain_channels: 0, basis: ShBasis::Standard };
     let s = scene(13, kind);
     let (_folder, path) = save("a.glb", &s, &SaveOptions { up: Up::Y, ..Default::default() });
     // Parent: a quarter turn about z and a shift; child: doubled. Both in glTF's axes.
@@ -532,7 +542,7 @@ fn glb_nodes_move_turn_and_scale_splats() {
 #[test]
 fn glb_quantised_attributes_are_read() {
     let kind =
-        Kind { parents: 16, children: 1, degree: 0, gain_lanes: 0, basis: ShBasis::Standard };
+        Kind { parents: 16, children: 1, degree: 0, gain_channels: 0, basis: ShBasis::Standard };
     let s = scene(14, kind);
     let (_folder, path) = save("a.glb", &s, &SaveOptions::default());
     // COLOR_0's alpha holds the opacity as normalised shorts: read it through a stride.
@@ -561,7 +571,7 @@ fn khronos_validator_accepts_our_glbs() {
         let mut files = Vec::new();
         for (k, up) in [Up::Keep, Up::Y, Up::Z, Up::Keep].into_iter().enumerate() {
             let basis = ShBasis::Mvsplat;
-            let kind = Kind { parents: 30, children: 4, degree: k, gain_lanes: 4, basis };
+            let kind = Kind { parents: 30, children: 4, degree: k, gain_channels: 4, basis };
             let path = folder.path().join(format!("degree{k}.glb"));
             let comments = vec!["a comment".to_owned()];
             let options = SaveOptions { up, comments, ..Default::default() };

@@ -146,7 +146,7 @@ impl<T: Real> VectorKernel<T> for GainsBackward<'_, T> {
     type Output = ();
     #[inline(always)]
     fn run<V: Vector<Element = T>>(self) {
-        let lanes = self.rules.gain_lanes();
+        let lanes = self.rules.gain_channels();
         let count = self.head.len() / HEAD_STRIDE;
         for first in (0..count).step_by(V::LANES) {
             let width = V::LANES.min(count - first);
@@ -172,6 +172,6 @@ impl<T: Real> VectorKernel<T> for GainsBackward<'_, T> {
 pub fn gains_backward<T: Real>(rules: &Rules, head: &[T], grad: &[T], out: &mut [T]) {
     out.par_chunks_mut(GAIN_BLOCK * HEAD_STRIDE)
         .zip(head.par_chunks(GAIN_BLOCK * HEAD_STRIDE))
-        .zip(grad.par_chunks(GAIN_BLOCK * rules.gain_lanes()))
+        .zip(grad.par_chunks(GAIN_BLOCK * rules.gain_channels()))
         .for_each(|((out, head), grad)| T::dispatch(GainsBackward { rules, head, grad, out }));
 }

@@ -149,7 +149,7 @@ impl<T: Real> Forward<'_, T> {
         alphas: &mut [V],
     ) -> V {
         let Args { rules, source, parents, .. } = self.args;
-        let (children, lanes) = (rules.children(), rules.gain_lanes());
+        let (children, lanes) = (rules.children(), rules.gain_channels());
         let parent = Parent::load((rules, self.table, &source), parents, (first, count));
         let mut bad = not_finite(&[parent.alpha, parent.z], V::constant(0.0));
         let at = first - self.parents.start;
@@ -209,7 +209,7 @@ pub fn forward<T: Real>(args: Args<T>, rows: &mut [T], gains: &mut [T]) -> bool 
     let table = Table::new(&args.source);
     let per_block = BLOCK * args.rules.children();
     rows.par_chunks_mut(per_block * SPLAT_STRIDE)
-        .zip(gains.par_chunks_mut(per_block * args.rules.gain_lanes()))
+        .zip(gains.par_chunks_mut(per_block * args.rules.gain_channels()))
         .enumerate()
         .map(|(block, (rows, gains))| {
             let parents = args.block(block);

@@ -109,7 +109,7 @@ impl Recomputed<'_> {
         let n = self.scene.means.dim(0)?;
         let expected = (
             n * self.children.k * SPLAT_STRIDE,
-            n * self.children.k * self.scene.rules.gain_lanes(),
+            n * self.children.k * self.scene.rules.gain_channels(),
         );
         if (rows.len(), gain.len()) != expected {
             let got = (rows.len(), gain.len());

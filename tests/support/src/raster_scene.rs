@@ -61,7 +61,7 @@ pub struct Scene {
 }
 
 impl Scene {
-    pub fn new(kind: Kind, seed: u64, parents: usize, degree: usize, gain_lanes: usize) -> Self {
+    pub fn new(kind: Kind, seed: u64, parents: usize, degree: usize, gain_channels: usize) -> Self {
         let mut r = Random(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1);
         let (width, height) = SIZE;
         let (w, h) = (width as f32, height as f32);
@@ -108,7 +108,7 @@ impl Scene {
                 rows.extend(r.array::<4>(-1.0, 1.0));
                 rows.extend(scale);
                 rows.push(opacity);
-                match gain_lanes {
+                match gain_channels {
                     1 => gain.push(r.range(-0.5, 1.5)),
                     4 => gain.extend([r.range(0.5, 1.5), r.range(-0.2, 0.2), 0.1, -0.3]),
                     _ => {}

@@ -42,7 +42,7 @@ pub struct Kind {
     pub parents: usize,
     pub children: usize,
     pub degree: usize,
-    pub gain_lanes: usize,
+    pub gain_channels: usize,
     pub basis: ShBasis,
 }
 
@@ -61,8 +61,8 @@ pub fn scene(seed: u64, kind: Kind) -> Splats {
         rows.push(r.within(0.0, 1.0) as f32);
     }
     let sh = (0..kind.parents * d * 3).map(|_| r.within(-0.4, 0.4) as f32).collect();
-    let gain = (0..n * kind.gain_lanes)
-        .map(|i| match kind.gain_lanes == 1 || i % 4 == 0 {
+    let gain = (0..n * kind.gain_channels)
+        .map(|i| match kind.gain_channels == 1 || i % 4 == 0 {
             true => r.within(0.5, 1.5) as f32,
             false => r.within(-0.1, 0.1) as f32,
         })
@@ -122,7 +122,7 @@ pub fn assert_same(
     allowed: Tolerance,
 ) {
     assert_eq!(after.len(), order.len(), "number of Gaussians");
-    assert_eq!((after.sh_basis(), after.gain_lanes()), (ShBasis::Standard, 0));
+    assert_eq!((after.sh_basis(), after.gain_channels()), (ShBasis::Standard, 0));
     let mut random = Random(99);
     for (j, &i) in order.iter().enumerate() {
         let m = turn * DVec3::from_array(before.mean(i).map(f64::from));

@@ -1,8 +1,7 @@
-//! Conversions between the crate's pictures and `image::RgbImage`.
+//! Conversions between [`Rgb`] and `image::RgbImage`.
 
-use super::Error;
-use crate::io::image::Rgb;
-use crate::render::Picture;
+use super::image::Rgb;
+use super::{Error, Result};
 use image::RgbImage;
 
 impl From<RgbImage> for Rgb {
@@ -20,7 +19,7 @@ impl TryFrom<Rgb> for RgbImage {
     ///
     /// # Errors
     /// The buffer does not hold 3·W·H bytes, or a side exceeds `u32`.
-    fn try_from(picture: Rgb) -> Result<Self, Error> {
+    fn try_from(picture: Rgb) -> Result<Self> {
         let Rgb { width, height, data } = picture;
         let bytes = data.len();
         let sides = (u32::try_from(width), u32::try_from(height));
@@ -32,15 +31,8 @@ impl TryFrom<Rgb> for RgbImage {
         };
         image.ok_or_else(|| {
             let expected = format!("3 bytes for each of {width}x{height} pixels");
-            Error::argument("picture", expected, format!("{bytes} bytes"))
+            Error::format("picture", expected, format!("{bytes} bytes"))
         })
-    }
-}
-
-impl From<&Picture> for Rgb {
-    /// Clamps colours to [0, 1] and rounds them to 8 bits; NaN becomes 0.
-    fn from(picture: &Picture) -> Self {
-        RgbImage::from(picture).into()
     }
 }
 
@@ -56,13 +48,5 @@ mod tests {
         assert_eq!(Rgb::from(image), rgb);
         let cut = Rgb { width: 2, height: 2, ..rgb };
         assert!(RgbImage::try_from(cut).unwrap_err().to_string().contains("2x2"));
-        let nan = f32::NAN;
-        let picture = Picture {
-            width: 1,
-            height: 2,
-            rgb: vec![-0.5, 0.5, 1.5, nan, 0.2 / 255.0, 0.6 / 255.0],
-            ..Picture::default()
-        };
-        assert_eq!(Rgb::from(&picture).data, [0, 128, 255, 0, 0, 1]);
     }
 }
