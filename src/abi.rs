@@ -3,7 +3,7 @@
 //! a rasterizer call, and the uniforms of the WGSL kernels. Imports `camera` alone.
 //!
 //! Every constant of a kernel is defined here and nowhere else. `kernels/shared/abi.wgsl`
-//! repeats them for the GPU; `tests/shaders.rs` compares the two.
+//! repeats them for the GPU; `tests/gpu/shaders.rs` compares the two.
 
 mod frame;
 mod gather;

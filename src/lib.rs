@@ -1,5 +1,5 @@
 //! `subsplat` turns two posed photographs into 3D Gaussians dense enough for views two to four
-//! times sharper than the network's input, on any CPU or GPU, without Python and CUDA.
+//! times sharper than the network's input, on any CPU or GPU, without Python or CUDA.
 //!
 //! The method is *SubSplat: High-Resolution Pixel-aligned 3DGS via Sub-pixel Gaussian
 //! Reparameterization* on its MVSplat backbone.

@@ -1,7 +1,7 @@
 //! PSNR and SSIM of two pictures by the protocol of MVSplat's and SubSplat's tables.
 //!
 //! Pictures are `[H, W, 3]`, row-major, RGB innermost, display values with 1 as white. Sums
-//! are in f64. `tests/metrics.rs` compares with scikit-image. Imports nothing of the crate.
+//! are in f64. `tests/scores/metrics.rs` compares with scikit-image. Imports nothing of the crate.
 
 use rayon::prelude::*;
 use thiserror::Error;

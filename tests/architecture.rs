@@ -254,6 +254,40 @@ fn top_level_has_the_agreed_names() {
     }
 }
 
+/// Paths of this repository that a text names, such as `tests/raster/raster.rs`.
+fn named_paths(text: &str) -> Vec<&str> {
+    let is_path = |c: char| c.is_ascii_alphanumeric() || "_/.".contains(c);
+    let folders = ["benches/", "examples/", "kernels/", "src/", "tests/", "tools/"];
+    let words = text.split(|c: char| !is_path(c)).map(|w| w.trim_end_matches('.'));
+    words
+        .filter(|w| folders.iter().any(|f| w.starts_with(f)))
+        .filter(|w| [".rs", ".wgsl", ".py"].iter().any(|e| w.ends_with(e)))
+        .collect()
+}
+
+#[test]
+fn comments_name_files_that_exist() {
+    let mut wrong = Vec::new();
+    let mut seen = 0;
+    for folder in ["src", "benches", "tests"] {
+        for path in sources(&root().join(folder)) {
+            let text = fs::read_to_string(&path).unwrap();
+            let comments: Vec<&str> =
+                text.lines().filter(|l| l.trim_start().starts_with("//")).collect();
+            for named in comments.iter().flat_map(|l| named_paths(l)) {
+                seen += 1;
+                // `x.wgsl` and `NAME.rs` stand for any name.
+                if !named.contains("/x.") && !named.contains("NAME") && !root().join(named).exists()
+                {
+                    wrong.push(format!("{}: {named}", path.display()));
+                }
+            }
+        }
+    }
+    assert!(seen > 20, "found only {seen} paths");
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
 #[test]
 fn architecture_states_the_same_imports() {
     let text = fs::read_to_string(root().join("ARCHITECTURE.md")).unwrap();

@@ -1,5 +1,5 @@
 """Makes tests/goldens/metrics.txt: PSNR and SSIM of made-up pictures by scikit-image, as
-MVSplat computes them. Checked by tests/metrics.rs.
+MVSplat computes them. Checked by tests/scores/metrics.rs.
 
     pip install scikit-image==0.26.0 && python tools/make_metrics_golden.py
 """
@@ -12,7 +12,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 
 def noise(width, height):
-    """Bytes of a linear congruential generator, as tests/common/noise.rs has them."""
+    """Bytes of a linear congruential generator, as tests/support/src/noise.rs has them."""
     state, data = 12345, bytearray()
     for i in range(width * height * 3):
         state = (state * 1664525 + 1013904223) & 0xFFFFFFFF
@@ -26,7 +26,7 @@ def pair(width, height, weight):
     y, x, c = np.meshgrid(np.arange(height), np.arange(width), np.arange(3), indexing="ij")
     ramp = (3 * x + 5 * y + 40 * c) % 256
     mixed = (ramp * (256 - weight) + noise(width, height).astype(int) * weight) // 256
-    # float32 divided by 255, as tests/metrics.rs does; the sums are in float64.
+    # float32 divided by 255, as tests/scores/metrics.rs does; the sums are in float64.
     return [(p.astype(np.float32) / np.float32(255)).astype(np.float64) for p in (ramp, mixed)]
 
 

@@ -1,5 +1,5 @@
 """Makes tests/goldens/resize.txt: what Pillow's Image.resize gives for pictures of
-noise, in hex where small and as CRC-32 where not. Checked by tests/resize.rs.
+noise, in hex where small and as CRC-32 where not. Checked by tests/scenes/resize.rs.
 
     pip install pillow==13.0.0 && python tools/make_resize_golden.py
 """

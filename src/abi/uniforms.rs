@@ -1,7 +1,7 @@
 //! Uniforms of the WGSL kernels: the parameters of a call beside its arrays.
 //!
 //! Fields have the order, the types and the offsets of the WGSL struct of the same name
-//! (`tests/shaders.rs` compares them). bytemuck refuses hidden padding.
+//! (`tests/gpu/shaders.rs` compares them). bytemuck refuses hidden padding.
 
 /// A uniform struct and the table of its fields' offsets.
 macro_rules! uniform {

@@ -14,7 +14,7 @@
 pub(crate) use crate::abi::BlendRules as Rules;
 
 use crate::abi::{ALPHA_MIN_LOG2, BLOCK, TILE};
-use crate::cpu::blocks::{met, transpose_bits};
+use crate::cpu::blocks::{intersected, transpose_bits};
 use crate::cpu::ewa::Footprint;
 use crate::cpu::simd::elementary::exp2;
 use crate::cpu::simd::{self, F32Vector, Kernel, Mask, Simd, Vector};
@@ -169,7 +169,7 @@ impl Batch {
                 rows[l] = s.load(footprints[splats[place as usize] as usize].fields());
                 s.store(rows[l], to[l].fields_mut());
             }
-            met(s, s.transpose(rows), corner, masks);
+            intersected(s, s.transpose(rows), corner, masks);
             masks[places.len()..].fill(0);
         }
         for (words, masks) in self.words.iter_mut().zip(masks.chunks_exact(4)) {

@@ -13,7 +13,7 @@ use crate::cpu::simd::{APPROX_SQRT_ERROR, F32Vector, IntVector, LANES, Mask, Sim
 /// blocks, the ellipse spans the columns between its left edge at one row and its right
 /// edge at another.
 #[inline(always)]
-pub(crate) fn met<S: Simd>(
+pub(crate) fn intersected<S: Simd>(
     s: S,
     fields: [S::F; FIELDS],
     corner: [f32; 2],
@@ -143,7 +143,7 @@ mod tests {
                 *row = s.load(f.fields());
             }
             let mut masks = [0; LANES];
-            met(s, s.transpose(rows), self.1, &mut masks);
+            intersected(s, s.transpose(rows), self.1, &mut masks);
             masks
         }
     }

@@ -33,7 +33,8 @@ const _: () = assert!(TILE_MVSPLAT.is_multiple_of(BLOCK), "the tile cut falls on
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 #[repr(C, align(64))]
 pub struct Footprint {
-    /// Mean, px, where pixel *centres* are integers: column 0 is at u = 0.
+    /// Mean, px, with pixel centres at integers (the camera's convention minus 0.5): column 0 is
+    /// at u = 0.
     pub u: f32,
     /// Mean, px, row 0 at v = 0.
     pub v: f32,

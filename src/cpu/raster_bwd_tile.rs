@@ -21,7 +21,7 @@
 
 use crate::abi::{ALPHA_MIN_LOG2, BLOCK, TILE};
 use crate::cpu::blend::{BLOCKS, Lanes, Rules};
-use crate::cpu::blocks::met;
+use crate::cpu::blocks::intersected;
 use crate::cpu::ewa::Footprint;
 use crate::cpu::ewa_bwd::Moments;
 use crate::cpu::simd::elementary::exp2;
@@ -203,7 +203,7 @@ impl WalkTile<'_> {
                 // Spare lanes repeat the last splat; the loop below skips them.
                 *field = s.load(self.footprint((from + l).min(past - 1)).fields());
             }
-            met(s, s.transpose(fields), corner, &mut masks);
+            intersected(s, s.transpose(fields), corner, &mut masks);
             for i in from..past {
                 let f = &self.footprints[self.splats[self.order[i] as usize] as usize];
                 let mut mask = masks[i - from] & *live;

@@ -1,10 +1,9 @@
-//! Which splats touch which tile: per-tile lists.
+//! Lists of the splats that touch each tile.
 //!
-//! Projection leaves, chunk by chunk of splats, the tiles that each visible splat can
-//! touch and how many entries every tile gets; a prefix sum over (tile, chunk) gives
-//! every chunk its slots, and each chunk writes, reading nothing but what projection
-//! left. Lists come out in the splats' order, the same for any number of threads; each
-//! is sorted by depth where it is used.
+//! Projection writes, for each chunk of splats, the tiles that each visible splat can
+//! touch and the number of entries of every tile. A prefix sum over (tile, chunk) gives
+//! every chunk its slots; each chunk then writes its entries. The lists are in the splats'
+//! order for any number of threads; each is sorted by depth where it is used.
 //!
 //! Memory is bounded: tiles are taken in groups whose lists together stay within
 //! [`PAIRS_PER_GROUP`] entries (or one tile's), however many tiles the splats cover.
@@ -19,7 +18,7 @@ use std::ops::Range;
 /// Most (splat, tile) pairs listed at a time, 24 bytes each: 384 MiB.
 pub(crate) const PAIRS_PER_GROUP: usize = 1 << 24;
 
-/// Least splats of a chunk.
+/// Minimum number of splats in a chunk.
 const CHUNK_MIN: usize = 1024;
 
 /// Splats per chunk, a unit of parallel work: enough chunks to keep every thread busy,
@@ -80,7 +79,7 @@ struct Cover {
     /// Bits of the camera z.
     z: u32,
     splat: u32,
-    /// Tile columns [from, to); to = 0: ask the footprint.
+    /// Tile columns [from, to); to = 0: computed from the footprint.
     columns: [u16; 2],
     /// Tile rows.
     rows: [u16; 2],
@@ -147,7 +146,7 @@ pub(crate) struct TileLists {
     grid: Grid,
     /// Splats per chunk.
     chunk: usize,
-    /// `[chunks, chunk]`: each chunk's first `lens` are meant.
+    /// `[chunks, chunk]`: each chunk's first `lens` entries are valid.
     covers: Vec<Cover>,
     /// `[chunks]`: visible splats.
     lens: Vec<u32>,

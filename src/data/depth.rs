@@ -1,9 +1,9 @@
-//! near and far of a reconstruction, in this order of trust: given by the user;
-//! RealEstate10K's 1 and 100 (the habit of pixelSplat and MVSplat, whose weights know
-//! no other); the scene's sparse points; the baseline of the context views.
+//! near and far that a scene itself gives: its pose file; 1 and 100 for RealEstate10K, as
+//! pixelSplat and MVSplat use them; quantiles of its sparse points; else the baseline of the
+//! context views. `src/pipeline/depth_range.rs` has the whole order of sources.
 //!
-//! Depth candidates are uniform in 1/depth between the two, so a far that is too far
-//! costs little, and a near that is too near costs resolution everywhere.
+//! Depth candidates are uniform in 1/depth between the two. A far end that is too far costs
+//! little; a near end that is too near costs resolution everywhere.
 
 use super::pair::{points_in_view, quantile};
 use crate::io::scene::{Scene, Units};
@@ -68,7 +68,7 @@ fn derive(scene: &Scene, context: &[usize]) -> Result<DepthRange> {
         });
     }
     if scene.units == Units::RealEstate10k {
-        let reason = "RealEstate10K's habit".to_owned();
+        let reason = "RealEstate10K's usual range".to_owned();
         return Ok(DepthRange { near: 1.0, far: 100.0, reason, guessed: false });
     }
     let mut cameras = Vec::with_capacity(context.len());

@@ -6,7 +6,7 @@
 //! reduction (antialiasing), weights normalised in f64 and rounded to 22 fractional bits, a
 //! horizontal pass rounded to 8 bits, and a vertical pass.
 //!
-//! Tests: tests/resize.rs with tests/goldens/resize.txt (tools/make_resize_golden.py).
+//! Tests: tests/scenes/resize.rs with tests/goldens/resize.txt (tools/make_resize_golden.py).
 
 use super::image::Rgb;
 use rayon::prelude::*;

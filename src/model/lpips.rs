@@ -6,7 +6,7 @@
 //! channels; d = Σ_blocks mean_pixels Σ_c w_c (a_c − b_c)². Parameter names are those of
 //! the `lpips` package: `net.slice{1..5}.{n}`, n being torchvision's index of the
 //! convolution, and `lin{0..4}.model.1.weight`. The package's dropout before the linear
-//! weights is inactive outside its own training and absent here. Tests: `tests/lpips.rs`.
+//! weights is inactive outside its own training and absent here. Tests: `tests/scores/lpips.rs`.
 
 use super::layers::{Conv2d, ConvShape};
 use super::weights::Weights;

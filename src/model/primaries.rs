@@ -3,7 +3,7 @@
 //!
 //! In: quaternions xyzw in camera frame; SH colour-major in camera frame. Out: quaternions
 //! wxyz in world frame, unit, w ≥ 0; SH in world frame, masked by degree. Tests:
-//! tests/primaries.rs, tests/parity.rs.
+//! tests/network/primaries.rs, tests/network/parity.rs.
 
 use super::trace::Trace;
 use super::{BackboneOutput, Primaries, Views};

@@ -1,6 +1,6 @@
 //! The Gaussian adapter as candle ops with gradients: raw head rows, distances and
 //! densities to packed rows and SH. Formulas and layouts: [`crate::cpu::adapter`]. The
-//! same in tensor operations: `tests/common/primaries_reference.rs`.
+//! same in tensor operations: `tests/support/src/primaries_reference.rs`.
 
 use super::{Number, borrowed, by_dtype, slice};
 use crate::abi::SPLAT_STRIDE;

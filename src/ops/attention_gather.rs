@@ -1,6 +1,6 @@
 //! Fused attention over bilinear samples of feature maps as one candle op, with
 //! gradients for maps, query and points (SubSplat A.2; spec 1.6). Formulas and
-//! layouts: [`crate::cpu::attention_gather`]. Tests: tests/attention_gather.rs.
+//! layouts: [`crate::cpu::attention_gather`]. Tests: tests/network/attention_gather.rs.
 
 use super::{Backend, Number, borrowed, by_dtype, slice};
 use crate::cpu::attention_gather as cpu;

@@ -1,5 +1,5 @@
 //! Attributes of parents as the embeddings read them, as a candle op with its gradient.
-//! Formulas: [`crate::cpu::attributes`]. Tests: tests/trunk_parts.rs.
+//! Formulas: [`crate::cpu::attributes`]. Tests: tests/network/trunk_parts.rs.
 
 use super::{Number, borrowed, by_dtype, slice};
 use crate::abi::SPLAT_STRIDE;

@@ -1,6 +1,6 @@
 //! Up to three matrices' columns beside one another as a candle op with gradients;
 //! candle's `cat` takes its gradient apart element by element. Tests:
-//! tests/trunk_parts.rs.
+//! tests/network/trunk_parts.rs.
 
 use super::{Number, borrowed, by_dtype, slice};
 use candle_core::backend::BackendStorage;

@@ -4,7 +4,7 @@
 //! caller ([`DepthRange`]), from a file ([`DepthBounds::of_scene`]), or from the distance
 //! between the cameras. Points matched between the photographs replace the last kind. The
 //! small backbone then estimates both ends, unless the caller fixed one
-//! ([`SubSplat::look`](crate::model::subsplat::SubSplat::look)).
+//! ([`SubSplat::estimate_depth_range`](crate::model::subsplat::SubSplat::look)).
 
 use super::{Error, Result};
 use crate::camera::Camera;
@@ -135,7 +135,7 @@ impl fmt::Display for DepthSource {
             Self::FixedNear { far } => write!(f, "near as given, far {far}"),
             Self::FixedFar { near } => write!(f, "far as given, near {near}"),
             Self::PoseFile => f.write_str("from the pose file"),
-            Self::RealEstate10k => f.write_str("RealEstate10K's custom"),
+            Self::RealEstate10k => f.write_str("RealEstate10K's usual range"),
             Self::SparsePoints => f.write_str("from sparse points"),
             Self::MatchedPoints { points } => write!(f, "from {points} matched points"),
             Self::Baseline { distance } => write!(
@@ -288,7 +288,7 @@ mod tests {
     fn matched_points_replace_only_a_guess() {
         let reports = [matched(0.6, 9.0), matched(0.7, 12.0)];
         let refined = |range: DepthRange, reports: &[PairReport]| {
-            let guess = initial_bounds(&cameras(0.02), range, None).unwrap();
+            let guess = initial_bounds(&cameras(0.125), range, None).unwrap();
             refined_bounds(guess, range, reports)
         };
         let auto = refined(DepthRange::Auto, &reports);
@@ -299,14 +299,14 @@ mod tests {
         assert_eq!(near.source.to_string(), "near as given, far from 80 matched points");
         assert_eq!(ends(&refined(DepthRange::Far(20.0), &reports)), (0.6, 20.0));
         // Points beyond the fixed far end leave the guess.
-        assert_eq!(ends(&refined(DepthRange::Far(0.5), &reports)), (0.01, 0.5));
+        assert_eq!(ends(&refined(DepthRange::Far(0.5), &reports)), (0.0625, 0.5));
         let prior = DepthBounds::new(0.01, 0.5, DepthSource::PoseFile);
         let known = initial_bounds(&cameras(1.0), DepthRange::Auto, Some(&prior)).unwrap();
         assert_eq!(refined_bounds(known.clone(), DepthRange::Auto, &reports), known);
         let bad = PairReport { verdict: Verdict::Bad, ..matched(0.6, 9.0) };
         for reports in [&[][..], &[bad]] {
             let guess = refined(DepthRange::Auto, reports);
-            assert_eq!(ends(&guess), (0.01, 0.6));
+            assert_eq!(ends(&guess), (0.0625, 3.75));
             assert!(guess.source.is_guess());
         }
     }
@@ -322,7 +322,7 @@ mod tests {
         assert_eq!((both, text.as_str()), ((3.0, 4.0), "as given"));
         let (near, text) = initial(DepthRange::Near(3.0), Some(&prior)).unwrap();
         assert_eq!(near, (3.0, 100.0));
-        assert_eq!(text, "near as given, far RealEstate10K's custom");
+        assert_eq!(text, "near as given, far RealEstate10K's usual range");
         assert_eq!(initial(DepthRange::Auto, Some(&prior)).unwrap().0, (1.0, 100.0));
         let (guess, text) = initial(DepthRange::Far(9.0), None).unwrap();
         assert_eq!(guess, (1.0, 9.0));

@@ -12,7 +12,7 @@ fn has_detail(c: &Cropped) -> bool {
 }
 
 /// Adds to children's colours the detail of the photographs ([`crate::cpu::detail`]). Returns
-/// whether any photograph has detail. `upscale` is the children's r, K = r².
+/// whether any photograph has detail. `upscale` is r; each parent has r² children.
 ///
 /// # Errors
 /// A photograph without pixels.

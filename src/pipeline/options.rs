@@ -20,7 +20,7 @@ pub struct Options {
     /// Width and height of the network's input, px; cut to multiples of the model's stride.
     /// Default: 256×256.
     pub input_size: (usize, usize),
-    /// Depth candidates that the caller fixes. Default: [`DepthRange::Auto`].
+    /// Ends of the depth range that the caller fixes. Default: [`DepthRange::Auto`].
     pub depth_range: DepthRange,
     /// Depth range that a file suggests, used for the ends that `depth_range` leaves open.
     /// Default: none.

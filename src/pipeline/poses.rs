@@ -19,7 +19,7 @@ impl fmt::Display for PoseError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (i, j) = (self.first, self.first + 1);
         let finding = self.findings.first().map_or("they do not fit", |f| f.sentence.as_str());
-        write!(f, "poses of photographs {i} and {j}: {finding}")
+        write!(f, "poses of photographs {i} and {j} (counted from 0): {finding}")
     }
 }
 

@@ -62,7 +62,7 @@ impl Prepared<'_> {
         progress: &mut dyn FnMut(Progress) -> ControlFlow<()>,
     ) -> Result<Reconstruction> {
         let Self { model, options, inputs, bounds, reports, mut warnings, mut tracker } = self;
-        if options.depth_range == DepthRange::Auto {
+        if model.estimates_depth_range(&options) {
             tracker.begin(Stage::DepthRange, progress)?;
         }
         let initial_bounds = bounds.clone();

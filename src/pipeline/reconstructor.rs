@@ -36,7 +36,7 @@ impl Reconstructor {
     }
 
     /// Builds the model that ships, [`Weights::shipped`], at ×`upscale`. SubSplat's heads are
-    /// trained at ×2 and ×4. At another r pixels are split evenly, with a
+    /// trained at ×2 and ×4. At other upscales each pixel is split evenly, with a
     /// [`Warning::UntrainedTensors`].
     ///
     /// # Errors
@@ -207,6 +207,11 @@ impl Reconstructor {
         Ok((views, DepthBounds { near, far, source }))
     }
 
+    /// Reports whether the small backbone estimates near and far: MVSplat has no such stage.
+    pub(super) fn estimates_depth_range(&self, options: &Options) -> bool {
+        options.depth_range == DepthRange::Auto && !is_mvsplat(self.config())
+    }
+
     /// A warning where the GPU did not do all of its work.
     pub(super) fn backend_warning(&self) -> Option<Warning> {
         self.backend.warning().map(|reason| Warning::CpuInsteadOfGpu { reason })
@@ -219,7 +224,7 @@ impl Reconstructor {
         let n = photos as f32;
         let pixels = n * w as f32 * h as f32 / (2.0 * 256.0 * 256.0);
         let mvsplat = is_mvsplat(self.config());
-        let estimates = options.depth_range == DepthRange::Auto && !mvsplat;
+        let estimates = self.estimates_depth_range(options);
         let aggregates = self.config().agg.enabled;
         let costs = [
             (Stage::Crop, 0.015 * n),

@@ -74,8 +74,8 @@ impl fmt::Display for Warning {
             }
             Self::PhotographEnlarged { size: (w, h), resized: (to_w, to_h) } => write!(
                 f,
-                "the photograph of {w}x{h} is smaller than its resized {to_w}x{to_h}: the target \
-                 shows no more detail than the photograph has"
+                "the photograph of {w}x{h} is enlarged to {to_w}x{to_h}: the target shows no more \
+                 detail than the photograph has"
             ),
             Self::UntrainedTensors { count, upscale } => write!(
                 f,

@@ -1,5 +1,5 @@
 //! Baselines: each task as most programs implement it, without the kernels of this crate.
-//! tests/raster/conventional.rs checks them against the same references.
+//! tests/raster/baseline.rs checks them against the same references.
 
 pub mod attention;
 pub mod conv;

@@ -2,7 +2,7 @@
 //! preset has it: a parent's taps fit in registers and on the stack.
 //!
 //! The same formulas as [`super::forward`], which is its oracle in
-//! tests/attention_gather.rs.
+//! tests/network/attention_gather.rs.
 #![expect(
     clippy::needless_range_loop,
     reason = "counted loops over registers unroll, iterators over them need not"

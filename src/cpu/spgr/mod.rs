@@ -21,7 +21,7 @@
 //!
 //! Each lane of a vector is a parent: child k of 16 parents at a time, so that sums over
 //! children are loops and any K fills the vector. Op: ops/spgr.rs. Reference in tensor
-//! operations: model/spgr_ref.rs. Tests: tests/spgr.rs, tests/spgr_backward.rs.
+//! operations: tests/support/src/spgr_reference.rs. Tests: tests/spgr/spgr.rs, tests/spgr/spgr_backward.rs.
 
 mod backward;
 mod child;

@@ -3,7 +3,7 @@
 //!
 //! Input: that of [`super::forward`], the parents' SH `[N, D, 3]`, a target camera.
 //! Output: one [`Footprint`] per child, empty for a dropped one, by the rules of
-//! [`crate::cpu::ewa`] and of the frame's projection (tests/spgr_project.rs compares them).
+//! [`crate::cpu::ewa`] and of the frame's projection (tests/spgr/spgr_project.rs compares them).
 //! [`ShDirection::Parent`] evaluates SH once per parent.
 
 use super::child::Child;

@@ -1,5 +1,5 @@
 //! The small backbone's own parts as candle ops with gradients. Kernels:
-//! [`crate::cpu::small`]. Tests: tests/ops/small.rs, against tensor operations
+//! [`crate::cpu::small`]. Tests: tests/network/operators/small.rs, against tensor operations
 //! and finite differences.
 
 mod convex;

@@ -301,7 +301,7 @@ fn weights_say_what_they_are_for() {
     );
     let called = call_in(place.path(), &format!("{run} --backbone re10k"));
     assert_eq!(called.code, 1);
-    assert!(called.error().contains("got the small backbone's"), "{}", called.error());
+    assert!(called.error().contains("got the small one"), "{}", called.error());
 
     let called = call_in(place.path(), &format!("{run} --upscale 2"));
     match config.spgr.head {

@@ -14,7 +14,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 use subsplat::cpu::SimdLevel;
 
-/// Not ours: it holds no camera and no metadata (tests/raster.rs has its test).
+/// Not ours: it holds no camera and no metadata (tests/raster/raster.rs has its test).
 const FOREIGN: &str = "brush_tiny";
 
 fn compare(reference: &Path, more: &[&str]) -> Called {

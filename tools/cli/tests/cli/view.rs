@@ -1,5 +1,5 @@
 //! `subsplat view` where there is no window to be had: each case one clear line, at once.
-//! The camera's part is tests/navigation.rs; keys and pictures are tested beside them.
+//! The camera's part is tests/scenes/navigation.rs; keys and pictures are tested beside them.
 
 use crate::program;
 use subsplat_test_support::one_splat;
