@@ -11,13 +11,14 @@ use subsplat::ops::{attention::attention, join::join, linear::linear_no_bias, no
 type Run = fn(&HashMap<String, Tensor>) -> candle_core::Result<Tensor>;
 
 struct Case {
+    /// The first word is the operator, which `tools/bench/rival.py` builds in onnxruntime.
     name: &'static str,
-    /// (name, shape, standard deviation).
+    /// (name, shape).
     inputs: &'static [(&'static str, &'static [usize])],
     run: Run,
 }
 
-/// Every operator except convolutions, at its largest and at its most frequent size.
+/// Every operator of MVSplat except convolutions, at its largest and at its most frequent size.
 const CASES: [Case; 15] = [
     Case {
         name: "instance_norm_relu 2x64x128x128",

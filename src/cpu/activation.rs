@@ -9,7 +9,9 @@ use std::mem::MaybeUninit;
 /// Elements per task: a compromise between overhead and balance.
 const CHUNK: usize = 16_384;
 
-/// A function of one number.
+/// A function of one number. NaN gives NaN; ±∞ gives what the formula's terms give.
+///
+/// `cpu/norm/silu.rs` joins SiLU to GroupNorm in one pass; other functions need no such file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Activation {
     /// max(0, x).
@@ -33,7 +35,8 @@ pub(super) fn normal_cdf(x: f32) -> f32 {
 }
 
 /// Calls `$run!(value, slope)` with f and f′ of `$kind` as closures, so that the loop in
-/// `$run` is compiled for each function.
+/// `$run` is compiled for each function. Paths are absolute, because other modules use the macro;
+/// a `$run` that needs values alone ignores the slope.
 macro_rules! by_kind {
     ($kind:expr, $run:ident) => {
         match $kind {

@@ -1,6 +1,6 @@
 //! Pointwise functions and softmax over the last dimension as candle ops with
 //! gradients. Kernels: [`crate::cpu::activation`], [`crate::cpu::softmax`]. Tests:
-//! `model::layers`.
+//! `model::layers` (values, gradients), tests/network/operators/norm.rs (behind a norm).
 
 use super::{borrowed, output, slice, tensor_like};
 use crate::cpu::activation as cpu;
