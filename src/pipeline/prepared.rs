@@ -2,8 +2,8 @@
 
 use super::progress::Tracker;
 use super::{
-    DepthBounds, DepthRange, Detail, Options, Progress, Reconstruction, Reconstructor, Result,
-    Stage, Warning, add_detail,
+    DepthBounds, Detail, Options, Progress, Reconstruction, Reconstructor, Result, Stage, Warning,
+    add_detail,
 };
 use crate::camera::Camera;
 use crate::check::PairReport;
