@@ -73,7 +73,8 @@ mod tests {
         let bad =
             PairReport { verdict: Verdict::Bad, findings: vec![finding], ..PairReport::default() };
         let error = refuse_bad(&[PairReport::default(), bad]).unwrap_err();
-        let text = "poses of photographs 1 and 2: the poses fit if they are read as OpenGL's";
+        let text = "poses of photographs 1 and 2 (counted from 0): the poses fit if they are read as \
+                    OpenGL's";
         assert_eq!(error.to_string(), text);
         assert!(refuse_bad(&[PairReport::default()]).is_ok());
     }
