@@ -6,6 +6,8 @@
 //! ```
 //! Twin: the same in single ops, `model::backbone::transformer`, which the tests of
 //! ops/feed_forward.rs compare with.
+//!
+//! Calls with gradients run the block as single ops instead.
 
 use super::activation::{Activation, in_place};
 use super::gemm::{Base, Mat, Packed, product};

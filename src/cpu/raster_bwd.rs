@@ -10,6 +10,9 @@
 //!
 //! Memory beyond the forward's: 48 bytes a pair, at most [`PAIRS_PER_GROUP`] at a time
 //! (or one tile's), 40 bytes a splat and a few MiB a thread.
+//!
+//! The moments of a splat are in whitened coordinates, so that the sums of needle-shaped splats do
+//! not cancel.
 
 use crate::abi::RasterOptions;
 use crate::camera::Camera;

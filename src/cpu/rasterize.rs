@@ -6,6 +6,9 @@
 //! of the means in world units (in either convention). Tiles run in rayon's current pool;
 //! the bytes do not depend on its size. All SIMD levels give the same bytes except
 //! [`SimdLevel::Scalar`], which rounds products.
+//!
+//! A splat is one 64-byte record, not an entry in a structure of arrays, because tiles gather
+//! splats by index.
 
 pub use crate::abi::Rendered;
 

@@ -1,5 +1,7 @@
 //! Spherical harmonics of a vector of parents: the functions of [`crate::cpu::sh`] at a
 //! vector of directions, and the parents' coefficients as vectors.
+//!
+//! The direction of an evaluation is never detached from the graph.
 
 use super::view::{V3, dot, scaled};
 use crate::abi::{SH_COEFFICIENTS_MAX, ShBasis, sh_coefficients};
