@@ -221,7 +221,7 @@ pub fn add_raw_matching(
     });
 }
 
-/// What one thread works in.
+/// Scratch memory of one thread.
 #[derive(Default)]
 struct Work {
     line: Line,

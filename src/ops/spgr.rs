@@ -164,7 +164,7 @@ fn run<T: Number>(
 }
 
 /// Refuses numbers that are not finite, on the way in (an infinite opacity would be
-/// capped, an infinite gain squashed: wrong answers in silence) and on the way out.
+/// capped, an infinite gain squashed: wrong results without an error) and on the way out.
 fn finite<T: Number>(
     call: &Spgr,
     head: &[T],

@@ -16,7 +16,7 @@ pub(super) struct Coefficients<T> {
 }
 
 impl<T: Real> Coefficients<T> {
-    /// Makes room for functions up to `degree`, as far as `basis` has them.
+    /// Allocates functions up to `degree`, as far as `basis` has them.
     pub(super) fn new(basis: ShBasis, degree: usize) -> Self {
         let tile = Box::new([[T::default(); LANES]; 3 * SH_COEFFICIENTS_MAX]);
         Self { tile, basis, degree: degree.min(degree_max(basis)) }

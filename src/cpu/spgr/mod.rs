@@ -70,7 +70,7 @@ const BLOCK: usize = 64;
 /// Inputs of the kernels.
 #[derive(Clone, Copy, Debug)]
 pub struct Args<'a, T> {
-    /// How children are made; K ≤ [`CHILDREN_MAX`].
+    /// Rules for the children; K ≤ [`CHILDREN_MAX`].
     pub rules: &'a Rules,
     /// Origin of the parents.
     pub source: Source<'a>,

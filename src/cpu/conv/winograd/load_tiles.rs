@@ -369,7 +369,7 @@ fn insert_neighbours<S: Simd>(
     for neighbour in neighbours {
         let from = x.as_ptr().wrapping_offset(neighbour.start + down);
         s.prefetch_l2(from.wrapping_add(x.len()));
-        // SAFETY: `valid` says that the image has this place, and `x` holds the whole
+        // SAFETY: by `valid` the image has this place, and `x` holds the whole
         // channel of the image.
         let v = if neighbour.valid[r] { unsafe { *from } } else { 0.0 };
         column = s.mask_from_bits(neighbour.lane).select(s.splat(v), column);
