@@ -1,6 +1,6 @@
 //! From head records to one camera's picture without children in memory: no child
-//! mean, quaternion, covariance or SH exists, only 2-D footprints. For inference; no gradient. Kernels: [`crate::cpu::spgr::project`] and
-//! [`crate::cpu::Rasterizer::render_footprints`].
+//! mean, quaternion, covariance or SH exists, only 2-D footprints. For inference; no gradient.
+//! Kernels: [`crate::cpu::spgr::project`] and [`crate::cpu::Rasterizer::render_footprints`].
 
 use super::rasterize::{check_options, degree_of};
 use super::slice;

@@ -1,6 +1,7 @@
 //! Sub-pixel Gaussian reparameterization as a candle op with its gradient, and into
 //! buffers of the caller's. Formulas and layouts: [`crate::cpu::spgr`]; the same
-//! unfused: `tests/support/src/spgr_reference.rs`. Tests: tests/spgr/spgr.rs, tests/spgr/spgr_backward.rs.
+//! unfused: `tests/support/src/spgr_reference.rs`. Tests: tests/spgr/spgr.rs,
+//! tests/spgr/spgr_backward.rs.
 
 use super::{Backend, Number, borrowed, by_dtype, slice};
 use crate::abi::{HEAD_STRIDE, SPLAT_STRIDE};

@@ -429,7 +429,8 @@ fn end_records_that_lie() {
     refused("one entry fewer", fewer, &["a central directory of its entries alone"]);
 }
 
-/// Every prefix of a good file of each form, and every byte of it changed: a result or an error each.
+/// Every prefix of a good file of each form, and every byte of it changed: each gives a
+/// result or an error.
 #[test]
 fn truncated_and_damaged_files_are_answered() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/goldens/torch");

@@ -21,7 +21,8 @@
 //!
 //! Each lane of a vector is a parent: child k of 16 parents at a time, so that sums over
 //! children are loops and any K fills the vector. Op: ops/spgr.rs. Reference in tensor
-//! operations: tests/support/src/spgr_reference.rs. Tests: tests/spgr/spgr.rs, tests/spgr/spgr_backward.rs.
+//! operations: tests/support/src/spgr_reference.rs. Tests: tests/spgr/spgr.rs,
+//! tests/spgr/spgr_backward.rs.
 //!
 //! The rule of equal optical depth uses the low-pass of the render for children and that of the
 //! input for parents. With `slide = disc` a child moves at most a tenth of its depth, since an
