@@ -1,4 +1,5 @@
-//! Sub-pixel reparameterization: identities, invariances, gradients, and the fused kernel against the unfused graph.
+//! Sub-pixel reparameterization: identities, invariances, gradients, and the fused kernel
+//! against the unfused graph.
 
 use subsplat_test_support::scenes;
 use subsplat_test_support::spgr_calls;
