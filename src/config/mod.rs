@@ -105,7 +105,8 @@ pub enum Background {
     /// Black (MVSplat).
     #[default]
     Black,
-    /// The mean colour of the network's input images.
+    /// The mean colour of the network's input images, since a black hole costs more than a grey
+    /// one. Not for MVSplat, whose weights were trained over black.
     Inputs,
 }
 

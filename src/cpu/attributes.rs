@@ -24,7 +24,7 @@ pub struct Frame {
     pub turn: [[f64; 4]; 4],
 }
 
-/// How rows become attributes.
+/// Conversion of rows to attributes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Attributes {
     /// Frame of positions and quaternions; `None`: the world.
@@ -33,7 +33,7 @@ pub struct Attributes {
     pub source: Frame,
     /// f_x of the source view, px: scales become logarithms of pixels. `None`: unchanged.
     pub log_px: Option<f64>,
-    /// Whether positions become slopes and ln z.
+    /// True if positions become slopes and ln z.
     pub ray: bool,
     /// Opacities become logits, clipped to ± this. `None`: unchanged.
     pub logit: Option<f64>,

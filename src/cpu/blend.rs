@@ -99,7 +99,7 @@ pub(crate) struct RenderTile<'a> {
 }
 
 impl Kernel for RenderTile<'_> {
-    /// How many (splat, block) items were blended.
+    /// Number of (splat, block) items that were blended.
     type Output = usize;
 
     #[inline(always)]

@@ -186,7 +186,7 @@ impl Pass<'_> {
         }
     }
 
-    /// Whether [`WIDE`] coefficients of each SH set are used.
+    /// Returns whether [`WIDE`] coefficients of each SH set are used.
     pub(crate) fn wide(&self) -> bool {
         self.used() == WIDE
     }

@@ -1,6 +1,6 @@
-//! Detail from the photograph (ours, not the paper's): what the full-resolution
-//! photograph of a child's source view shows at the child's place, beyond what its
-//! parent's input pixel shows.
+//! Detail from the photograph (ours, not the paper's): the colour of the full-resolution
+//! photograph of a child's source view at the child's place, minus the colour of its parent's
+//! input pixel.
 //!
 //! δ_k = I_r(π(μ_k)) − mean of I_r over the parent's pixel, per colour channel; the
 //! renderer adds it: colour = max(0, ½ + γ·S_p + δ). I_r is the photograph at the

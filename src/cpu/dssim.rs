@@ -1,5 +1,5 @@
 //! SSIM of one plane over windows inside the picture, and its derivative (Wang et al.
-//! 2004). Twin and conventions: train/loss.rs, [`crate::metrics::ssim`].
+//! 2004). Reference and conventions: train/loss.rs, [`crate::metrics::ssim`].
 //!
 //! Windowed means are two passes of N taps, each with a block of results in registers.
 //! The transpose of a windowed mean is a windowed mean with reversed taps of the map with
@@ -45,7 +45,7 @@ fn pass<const N: usize>(taps: &[f32; N], from: &[f32], step: usize, out: &mut [f
     }
 }
 
-/// A map with room for N − 1 rows and columns of zeros on every side.
+/// A map with N − 1 rows and columns of zeros on every side.
 struct Padded {
     data: Vec<f32>,
     width: usize,

@@ -80,7 +80,7 @@ impl Footprint {
         unsafe { &mut *std::ptr::from_mut(self).cast() }
     }
 
-    /// Tells whether the splat is kept.
+    /// Returns whether the splat is kept.
     pub fn visible(&self) -> bool {
         self.x1 > self.x0
     }

@@ -1,7 +1,7 @@
-//! Backward of [`crate::cpu::ewa`]: from what the pixels say of one footprint to
+//! Backward of [`crate::cpu::ewa`]: from the pixels' moments of one footprint to
 //! mean, shape and opacity (EWA splatting; 3DGS appendix A for the shape's part).
 //!
-//! The pixels report [`Moments`] in the footprint's own whitened coordinates
+//! The pixels' sums are [`Moments`] in the footprint's own whitened coordinates
 //! (d, s) = W·δ, W = [[sx, sx·shear], [0, sy]], in which a needle is round: nothing
 //! cancels on the way back. With Σ⁻¹ = 2 ln 2·WᵀW,
 //! ∂L/∂Σ = 2 ln²2·Wᵀ [[dd, ds], [ds, ss]] W.
@@ -12,7 +12,7 @@
 use crate::cpu::ewa::View;
 use std::f32::consts::LN_2;
 
-/// What the pixels say of one splat: sums over pixels of v = ∂L/∂ln α (zero where α is
+/// Sums over the pixels of one splat: of v = ∂L/∂ln α (zero where α is
 /// capped, skipped or past the stop) and of the weights w = α·T.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Moments {
@@ -56,7 +56,7 @@ struct Jacobian {
     p: [f32; 3],
     /// p / z clamped.
     slope: [f32; 2],
-    /// Whether the clamp lets the slope move.
+    /// True where the clamp does not limit the slope.
     free: [bool; 2],
     /// Rows of J·W, px per world unit.
     rows: [[f32; 3]; 2],

@@ -4,8 +4,8 @@
 //! ```text
 //! y = x + LayerNorm(GELU([x ; m]·W₁ᵀ)·W₂ᵀ)
 //! ```
-//! Twin: the same in single ops, `model::backbone::transformer`, which the tests of
-//! ops/feed_forward.rs compare with.
+//! Calls with gradients run the block as single ops, `model::backbone::transformer`. The tests of
+//! ops/feed_forward.rs compare the two.
 
 use super::activation::{Activation, in_place};
 use super::gemm::{Base, Mat, Packed, product};

@@ -12,6 +12,9 @@
 //! Invariant: each element is summed over k in order, in parts of 128. Cutting the rows into
 //! tasks therefore changes no byte, and SIMD levels with fused multiply-add agree bit for bit.
 //! WGSL: none. Oracle and tests: gemm/tests.rs (three loops in f64).
+//!
+//! 1×1 convolutions of any stride, their weight gradients and the feed-forward block are such
+//! products.
 
 mod packing;
 mod register_tile;

@@ -11,7 +11,7 @@ pub struct Join {
     pub channels: [usize; 2],
     /// h, w.
     pub size: [usize; 2],
-    /// s: how often a coarse pixel is repeated along either side.
+    /// s: number of repetitions of a coarse pixel along either side.
     pub repeat: usize,
 }
 

@@ -1,7 +1,7 @@
-//! Raw matching channels of a plane sweep: how well two photographs agree at each
+//! Raw matching channels of a plane sweep: the agreement of two photographs at each
 //! pixel of the reference view for each depth candidate, without any learning.
-//! They stand beside the learned correlation of the small backbone
-//! (ARCHITECTURE.md, "The small backbone").
+//! The small backbone uses them beside its learned correlation
+//! (src/model/shipped/README.md, "The small backbone").
 //!
 //! In: both photographs as area means at half resolution (grey) and at quarter
 //! resolution (RGB), cameras, candidates. Out: `[4, D, h, w]` at quarter resolution:
@@ -221,7 +221,7 @@ pub fn add_raw_matching(
     });
 }
 
-/// What one thread works in.
+/// Scratch memory of one thread.
 #[derive(Default)]
 struct Work {
     line: Line,

@@ -1,7 +1,7 @@
 //! CPU kernels: plain `f32` slices in and out, rayon for threads, no tensors.
 //!
 //! Kernels trust their callers ([`crate::ops`] checks shapes and dtypes) and do not
-//! fail. This is the only room where `unsafe` may appear.
+//! fail. This is the only module where `unsafe` may appear.
 //!
 //! The rasterizer's stages, one file each: [`ewa`] (one splat), `project` (all
 //! splats), `tiles` (lists), `sort` (depth order in a tile), `blocks` and `blend` (one

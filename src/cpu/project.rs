@@ -2,8 +2,8 @@
 //! chunks of splats.
 //!
 //! In: [`SplatSlices`] in world frame. Out: one [`Footprint`] per splat (empty where
-//! dropped, see [`crate::cpu::ewa`]), and what [`crate::cpu::tiles`] needs to list
-//! them. Each lane is a splat. The kernel computes the geometry of all splats, then the colour
+//! dropped, see [`crate::cpu::ewa`]), and the input of [`crate::cpu::tiles`] for their
+//! lists. Each lane is a splat. The kernel computes the geometry of all splats, then the colour
 //! of the kept ones, and reads no other coefficients.
 //! Colour of child i of parent p: max(0, ½ + γ_i·Σ_k sh_{p,k} Y_k(d) + δ_i)
 //! (SubSplat, colour gain; 3DGS for γ = 1, δ = 0).

@@ -26,7 +26,7 @@ const PART: usize = 2048;
 
 pub(crate) type L = [f32; GROUP];
 
-/// What the pass over all splats reads.
+/// Inputs of the pass over all splats.
 #[derive(Clone, Copy)]
 pub(crate) struct Pass<'a> {
     pub(crate) splats: &'a SplatSlices<'a>,
@@ -285,7 +285,7 @@ impl Part<'_> {
         splats.gain.get(at).copied().filter(|_| self.gain_channels > 0).unwrap_or(1.0)
     }
 
-    /// Writes ∂L/∂γ and, with four lanes, ∂L/∂δ of splat `j` of the part.
+    /// Writes ∂L/∂γ and, with four channels, ∂L/∂δ of splat `j` of the part.
     #[inline(always)]
     pub(crate) fn put_gain(&mut self, j: usize, gain: f32, [r, g, b]: [f32; 3]) {
         match self.gain_channels {

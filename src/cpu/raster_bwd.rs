@@ -10,6 +10,9 @@
 //!
 //! Memory beyond the forward's: 48 bytes a pair, at most [`PAIRS_PER_GROUP`] at a time
 //! (or one tile's), 40 bytes a splat and a few MiB a thread.
+//!
+//! The moments of a splat are in whitened coordinates, so that the sums of needle-shaped splats do
+//! not cancel.
 
 use crate::abi::RasterOptions;
 use crate::camera::Camera;
@@ -31,7 +34,7 @@ use std::time::Duration;
 /// Most (splat, tile) pairs whose sums are held at a time: 192 MiB.
 const PAIRS_PER_GROUP: usize = 1 << 22;
 
-/// Where the last backward's time went; zeros unless asked for.
+/// Times of the last backward pass by stage; zeros unless enabled.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct BackwardTimes {
     /// Walking the tiles (and listing them again, where they did not fit one group).
@@ -68,8 +71,8 @@ impl Buffers {
     }
 }
 
-/// A rendered frame that still knows its splats, so that its backward pass can use what
-/// the forward left. Made by [`Rasterizer::frame`].
+/// A rendered frame with its splats; its backward pass uses the results of the forward
+/// pass. Made by [`Rasterizer::frame`].
 #[derive(Debug)]
 pub struct Frame<'r, 's> {
     rasterizer: &'r mut Rasterizer,

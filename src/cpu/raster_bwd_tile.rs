@@ -1,14 +1,14 @@
 //! Backward of [`crate::cpu::blend`] for one 32×32 tile: once forward, once back.
 //!
 //! With q_i = c_i·∂L/∂rgb + z_i·∂L/∂depth of splat i at a pixel, b the same of the
-//! background (bg·∂L/∂rgb − ∂L/∂alpha) and w_i = α_i T_i, the loss sees of a pixel
-//! Σ w_i q_i + T b, whence (3DGS appendix)
+//! background (bg·∂L/∂rgb − ∂L/∂alpha) and w_i = α_i T_i, the loss depends on a pixel
+//! by Σ w_i q_i + T b, whence (3DGS appendix)
 //!
 //! ∂L/∂ln α_i = w_i q_i − α_i/(1 − α_i)·(Σ_{j>i} w_j q_j + T b) = w_i (q_i − B_i),
 //!
-//! B_i = (Σ_{j>i} w_j q_j + T b) / T_{i+1} being what is seen of q behind splat i, were
-//! nothing before it: B_{i−1} = B_i + α_i (q_i − B_i), b behind the last. Neither a
-//! division nor a difference of sums; what opaque splats hide keeps its digits.
+//! where B_i = (Σ_{j>i} w_j q_j + T b) / T_{i+1} is q composited behind splat i, as if nothing
+//! were before it: B_{i−1} = B_i + α_i (q_i − B_i), b behind the last. The recursion has
+//! neither a division nor a difference of sums, so hidden splats keep their digits.
 //!
 //! The first pass repeats the forward's decisions by the forward's own operations. It stores
 //! the mask of changed blocks per (splat, tile), and an [`Item`] per (splat, block) of those.
@@ -121,7 +121,7 @@ pub(crate) struct WalkTile<'a> {
     pub(crate) footprints: &'a [Footprint],
     pub(crate) rules: Rules,
     pub(crate) upstream: Upstream<'a>,
-    /// Room for a mask per splat of the list.
+    /// A mask per splat of the list.
     pub(crate) masks: &'a mut [u64],
     /// A row for every splat of the list.
     pub(crate) rows: &'a mut [PairSums],

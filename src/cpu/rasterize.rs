@@ -6,6 +6,9 @@
 //! of the means in world units (in either convention). Tiles run in rayon's current pool;
 //! the bytes do not depend on its size. All SIMD levels give the same bytes except
 //! [`SimdLevel::Scalar`], which rounds products.
+//!
+//! A splat is one 64-byte record, not an entry in a structure of arrays, because tiles gather
+//! splats by index.
 
 pub use crate::abi::Rendered;
 
@@ -24,7 +27,7 @@ use std::ops::Range;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
-/// What the last frame cost.
+/// Counts and times of the last frame.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Stats {
     /// Splats that can touch the picture.
@@ -111,7 +114,7 @@ impl Rasterizer {
         self
     }
 
-    /// Measures what [`Rasterizer::stage_times`] tells.
+    /// Enables the measurement of [`Rasterizer::stage_times`].
     pub fn with_stage_times(mut self) -> Self {
         self.timed = true;
         self
@@ -171,7 +174,7 @@ impl Rasterizer {
     /// head records). Planes `[5, H, W]` as of [`Rasterizer::render_planes`].
     ///
     /// # Errors
-    /// What `fill` returns; `out` is then as it was.
+    /// The error of `fill`; `out` is then unchanged.
     pub fn render_footprints<E>(
         &mut self,
         count: usize,
@@ -196,7 +199,7 @@ impl Rasterizer {
         &self.projection.footprints
     }
 
-    /// What the last frame cost.
+    /// Returns the counts and times of the last frame.
     pub fn stats(&self) -> Stats {
         self.stats
     }
@@ -323,8 +326,8 @@ pub(crate) fn since(start: Option<Instant>) -> Duration {
     start.map_or(Duration::ZERO, |s| s.elapsed())
 }
 
-/// Asks for the cache lines of tile `t`'s pixels, which are to be here when it is
-/// written: its rows lie far apart, where no processor foresees them.
+/// Prefetches the cache lines of tile `t`'s pixels before they are written. The rows lie too
+/// far apart for hardware prefetchers.
 struct AwaitTile<'a> {
     t: usize,
     grid: &'a Grid,
@@ -427,7 +430,7 @@ fn unfold(tile: &Tile, y: usize, background: [f32; 3]) -> [[f32; TILE]; 5] {
     row
 }
 
-/// Copies as much of `from` as `to` takes; a whole row without asking how much.
+/// Copies as much of `from` as `to` takes; a whole row without a test of its length.
 #[inline(always)]
 fn copy<const L: usize>(to: &mut [f32], from: &[f32; L]) {
     if let Ok(to) = <&mut [f32; L]>::try_from(&mut *to) {

@@ -54,7 +54,7 @@ fn radix<const PASSES: usize>(
         (((e >> 32) as u32 - least) >> (pass as u32 * DIGIT_BITS)) as usize & (DIGITS - 1)
     };
     // Neighbours in a list lie side by side in space and share digits: two tables, so
-    // that a count need not wait for the last one.
+    // that a count does not depend on the previous one.
     let mut tables = [[[0u32; DIGITS]; PASSES]; 2];
     let pairs = entries.chunks_exact(2);
     for &e in pairs.remainder() {

@@ -85,7 +85,7 @@ struct Cover {
     rows: [u16; 2],
 }
 
-/// What projection leaves of one chunk of splats.
+/// Results of projection for one chunk of splats.
 pub(crate) struct ChunkCover<'a> {
     grid: Grid,
     covers: &'a mut [Cover],
@@ -95,7 +95,7 @@ pub(crate) struct ChunkCover<'a> {
 }
 
 impl ChunkCover<'_> {
-    /// Forgets the last frame.
+    /// Clears the lists of the last frame.
     pub(crate) fn clear(&mut self) {
         *self.len = 0;
         self.counts.fill(0);
@@ -172,7 +172,7 @@ pub(crate) struct TileLists {
 pub(crate) struct TileList<'a> {
     /// Depth and place; as long as the list.
     pub(crate) entries: &'a mut [u64],
-    /// Room for the sort.
+    /// Scratch memory of the sort.
     pub(crate) spare: &'a mut [u64],
     /// Places, nearest first, once sorted.
     pub(crate) order: &'a mut [u32],
@@ -200,7 +200,7 @@ impl GroupLists<'_> {
     /// The lists of tile `t`.
     ///
     /// # Safety
-    /// Every tile is asked for once.
+    /// Each tile is taken at most once.
     pub(crate) unsafe fn take(&self, t: usize) -> TileList<'_> {
         let start = self.starts[t] as usize;
         let range = start..start + self.counts[t] as usize;
@@ -218,7 +218,7 @@ impl GroupLists<'_> {
 }
 
 impl TileLists {
-    /// Makes room for a frame of `n` splats.
+    /// Resizes the buffers for a frame of `n` splats.
     pub(crate) fn begin(&mut self, grid: Grid, n: usize) {
         self.grid = grid;
         self.filled = 0..0;
@@ -236,7 +236,7 @@ impl TileLists {
         self.chunk
     }
 
-    /// What each chunk of `n` splats has to fill in.
+    /// Returns the parts that each chunk of `n` splats fills in.
     pub(crate) fn chunks(
         &mut self,
         n: usize,

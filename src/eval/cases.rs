@@ -64,7 +64,7 @@ pub struct Benchmark {
     scenes: Vec<Scene>,
     /// Ends of the depth range that the user fixed.
     depth_range: DepthRange,
-    /// Whether the data are chunks; otherwise they are scenes.
+    /// True if the data are chunks; otherwise they are scenes.
     chunks: bool,
     /// The chunk that was opened last.
     open: Mutex<Option<(PathBuf, Arc<Chunk>)>>,
@@ -195,7 +195,7 @@ impl Benchmark {
         &self.cases
     }
 
-    /// Whether the data are pixelSplat's chunks.
+    /// Returns whether the data are pixelSplat's chunks.
     pub fn is_chunks(&self) -> bool {
         self.chunks
     }

@@ -74,7 +74,7 @@ impl FromStr for Method {
     }
 }
 
-/// Whether a name may be that of a folder.
+/// Returns whether a name may be that of a folder.
 fn is_folder_name(name: &str) -> bool {
     let letter = |c: char| c.is_alphanumeric() || "-_.+".contains(c);
     !name.is_empty() && name.chars().all(letter) && !name.starts_with('.')
@@ -89,7 +89,7 @@ impl Method {
         }
     }
 
-    /// Whether it needs the model.
+    /// Returns whether it needs the model.
     pub fn needs_model(&self) -> bool {
         !matches!(self, Self::Copy | Self::Mean | Self::Other { .. })
     }

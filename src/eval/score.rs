@@ -53,7 +53,7 @@ pub struct CaseScores {
     pub sizes: [(usize, usize); 2],
     /// Nearest and farthest depth candidate, world units.
     pub near_far: (f32, f32),
-    /// Whether a photograph was enlarged to the target's size.
+    /// True if a photograph was enlarged to the target's size.
     pub enlarged: bool,
     /// One for each target.
     pub targets: Vec<TargetScores>,

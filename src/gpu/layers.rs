@@ -6,6 +6,9 @@
 //! band for the division into layers.
 //!
 //! Two cases remain too large: 4 bytes per splat, or one row of tiles, exceed a binding.
+//!
+//! A pixel with T < 0 in place of alpha is finished. In the backward pass a layer continues from
+//! the pixels of the farther layers. Tests reduce the size of a binding to reach this path.
 
 use crate::abi::{FOOTPRINT_STRIDE, PLAN_REQUESTED, PLAN_WORDS, RasterUniform, TILE_GPU};
 use crate::gpu::buffers::Buffer;

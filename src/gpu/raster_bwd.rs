@@ -10,6 +10,15 @@
 //! each band is rendered again in smaller layers (src/gpu/layers.rs). The backward pass then
 //! processes the farthest layer first; transmittance and the colour behind a layer are carried
 //! from one layer to the next.
+//!
+//! A thread has eight pixels of a tile, one above the other. The sums of a pair are stored where
+//! the pair was made: those of one splat are contiguous, and are added in order.
+//!
+//! Some adapters have float atomics. Ten atomic additions per pair would read and write 80 bytes;
+//! a store, a load and an ordered sum move as much. For 524,288 splats and 818 thousand pairs,
+//! atomics would save the splats' indices: 15 of the 278 MB of the backward pass (0.05 ms at
+//! 300 GB/s) and one dispatch of 45. Results would not be reproducible, and a second path would
+//! need tests.
 
 use crate::abi::{Gradients, PAIR_SUMS, RasterOptions, RasterUniform, SplatSlices, TILE_GPU};
 use crate::camera::Camera;

@@ -6,6 +6,8 @@
 //! The number of pairs exists on the device only; kernels read it from a buffer. The capacity for
 //! pairs grows when the read-back of a frame reports that it was too small. Frames that exceed a
 //! binding are drawn in layers (src/gpu/layers.rs).
+//!
+//! Commands are lists of calls, encoded and submitted at once inside error scopes.
 
 use crate::abi::{
     FOOTPRINT_STRIDE, PLAN_REQUESTED, PLAN_WORDS, RasterOptions, RasterUniform, Rendered,

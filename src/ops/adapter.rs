@@ -15,9 +15,9 @@ pub use cpu::{Adapter, View};
 
 const NAME: &str = "adapter";
 
-/// Packed rows of all Gaussians, and what their SH is made of on demand.
+/// Packed rows of all Gaussians, and the sources of their SH, which are made on demand.
 pub struct Placed {
-    /// `[views·H·W·G, 11]`, lanes in [`crate::abi`].
+    /// `[views·H·W·G, 11]`, offsets in [`crate::abi`].
     pub rows: Tensor,
     raw: Tensor,
     adapter: Arc<Adapter>,
@@ -62,7 +62,7 @@ impl Placed {
     /// SH in world frame, `[views·H·W·G, D, 3]`.
     ///
     /// # Errors
-    /// Whatever candle says.
+    /// Errors of candle.
     pub fn sh(&self) -> Result<Tensor> {
         self.colours(Frame::World)
     }
@@ -70,7 +70,7 @@ impl Placed {
     /// SH in the source view's frame, `[views·H·W·G, 3, D]`.
     ///
     /// # Errors
-    /// Whatever candle says.
+    /// Errors of candle.
     pub fn sh_camera(&self) -> Result<Tensor> {
         self.colours(Frame::Camera)
     }
@@ -178,7 +178,7 @@ impl CustomOp1 for Colours {
             Frame::World => &mut slots[0],
             Frame::Camera => &mut slots[1],
         };
-        // Asked for twice, the same SH has two parts of its gradient.
+        // The gradient of SH that were requested twice has two parts.
         *slot = Some(match slot.take() {
             Some(before) => (before + dy)?,
             None => dy.contiguous()?,

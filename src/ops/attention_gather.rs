@@ -1,5 +1,5 @@
 //! Fused attention over bilinear samples of feature maps as one candle op, with
-//! gradients for maps, query and points (SubSplat A.2; spec 1.6). Formulas and
+//! gradients for maps, query and points (SubSplat A.2). Formulas and
 //! layouts: [`crate::cpu::attention_gather`]. Tests: tests/network/attention_gather.rs.
 
 use super::{Backend, Number, borrowed, by_dtype, slice};
@@ -41,9 +41,9 @@ pub fn attention_gather_on(
     attention_gather_deferred(backend, maps, query, points, gather, None)
 }
 
-/// The maps' gradient of calls of [`attention_gather_deferred`], as what each parent adds
-/// to which cells: a chunk of parents sees few of the cells, so that a dense gradient for
-/// every chunk is mostly zeros that are made, added and thrown away.
+/// The maps' gradient of calls of [`attention_gather_deferred`], as the factors that each
+/// parent adds to its cells. A chunk of parents samples few of the cells; a dense gradient of
+/// every chunk would be mostly zeros.
 #[derive(Clone, Debug, Default)]
 pub struct Deferred(Arc<Mutex<Vec<Part>>>);
 
@@ -57,8 +57,8 @@ struct Part {
 }
 
 impl Deferred {
-    /// Adds what the backward passes since the last call found to `maps`
-    /// `[cells, stride]`, and forgets it.
+    /// Adds the results of the backward passes since the last call to `maps`
+    /// `[cells, stride]`, and clears them.
     ///
     /// # Errors
     /// `maps` of another length than the maps had.
@@ -273,7 +273,7 @@ fn backward<T: Number>(g: &Gather, [maps, query, points, grad]: [&Tensor; 4]) ->
 }
 
 /// Visibility `[N, V]` in [0, 1] of N points in V views by the views' own depth
-/// maps (spec 5.3): `points` `[N, V, 2]` in [0, 1]², their camera z `[N, V]`,
+/// maps: `points` `[N, V, 2]` in [0, 1]², their camera z `[N, V]`,
 /// `depths` `[V, H, W]` camera z. A constant of the graph: no gradient passes.
 ///
 /// # Errors

@@ -1,7 +1,6 @@
 //! From head records to one camera's picture without children in memory: no child
-//! mean, quaternion, covariance or SH exists, only 2-D footprints (spec 6, first
-//! fusion). For inference; no gradient. Kernels: [`crate::cpu::spgr::project`] and
-//! [`crate::cpu::Rasterizer::render_footprints`].
+//! mean, quaternion, covariance or SH exists, only 2-D footprints. For inference; no gradient.
+//! Kernels: [`crate::cpu::spgr::project`] and [`crate::cpu::Rasterizer::render_footprints`].
 
 use super::rasterize::{check_options, degree_of};
 use super::slice;
@@ -20,7 +19,7 @@ const NAME: &str = "direct rendering";
 /// this camera and these options `fill` writes.
 ///
 /// # Errors
-/// A camera or an option outside its range; what `fill` returns.
+/// A camera or an option outside its range; the error of `fill`.
 pub fn rasterize_footprints(
     count: usize,
     camera: &Camera,
@@ -76,7 +75,7 @@ pub fn spgr_footprints(
     if finite {
         return Ok(());
     }
-    // The children themselves tell which of them it was.
+    // The rows of the children identify the faulty one.
     let mut rows = vec![0.0; count * SPLAT_STRIDE];
     let mut gains = vec![0.0; count * call.rules.gain_channels()];
     spgr_into(&head, &parents, call, &mut rows, &mut gains)?;

@@ -1,5 +1,5 @@
 //! Raw matching channels as a tensor. They are fixed functions of the photographs:
-//! nothing learned stands before them, so no gradient is owed.
+//! no learned parameter precedes them, so they have no gradient.
 
 use crate::camera::Camera;
 use crate::cpu::matching::{self, Pyramid};

@@ -1,6 +1,6 @@
 //! Custom candle ops over the kernels of [`crate::cpu`]: shape, dtype and layout
-//! checks live here, the arithmetic there. Every op either has a gradient or says
-//! plainly that it has none; none drops it silently.
+//! checks live here, the arithmetic there. Every op either has a gradient or is
+//! documented to have none; no op drops a gradient silently.
 
 pub mod activation;
 pub mod adapter;
@@ -36,7 +36,7 @@ pub use splat_tensors::SplatTensors;
 use crate::cpu::simd::Real;
 use candle_core::{CpuStorage, Layout, Result, Shape, Storage, Tensor, WithDType, bail};
 
-/// A number that both candle and the kernels know: `f32` or `f64`.
+/// A number type of both candle and the kernels: `f32` or `f64`.
 pub(crate) trait Number: Real + WithDType {}
 impl Number for f32 {}
 impl Number for f64 {}
@@ -90,7 +90,7 @@ pub(crate) fn tensor_like(data: Vec<f32>, like: &Tensor) -> Result<Tensor> {
     Tensor::from_vec(data, like.shape(), like.device())
 }
 
-/// Runs `$run::<T>($($arg),*)` for the `f32` or `f64` that `$dtype` says.
+/// Runs `$run::<T>($($arg),*)` for the `f32` or `f64` of `$dtype`.
 macro_rules! by_dtype {
     ($op:expr, $dtype:expr, $run:ident ( $($arg:expr),* )) => {
         match $dtype {

@@ -95,7 +95,7 @@ pub fn plane_sweep_on(
 /// source picture, `[R, D, h, w]`. Constant: no gradient flows to cameras.
 ///
 /// # Errors
-/// Whatever candle says of the allocation.
+/// candle's error of the allocation.
 pub fn validity(sweep: &Sweep) -> Result<Tensor> {
     let ([h, w], r, d) = (sweep.size, sweep.pairs.len(), sweep.candidates());
     let mut out = zeros(r * d * h * w);
@@ -104,7 +104,7 @@ pub fn validity(sweep: &Sweep) -> Result<Tensor> {
 }
 
 /// The warped source features of some candidates, `[R, C, candidates, h, w]`: for
-/// looking at, the sweep itself never makes them.
+/// inspection; the sweep itself never makes them.
 ///
 /// # Errors
 /// A candidate or pair out of range.

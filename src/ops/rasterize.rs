@@ -24,7 +24,7 @@ struct Rasterize {
     left: Mutex<Left>,
 }
 
-/// What the forward left.
+/// Results of the forward pass.
 #[derive(Default)]
 struct Left {
     rasterizer: Rasterizer,

@@ -1,5 +1,5 @@
 //! Opacity redistribution as a candle op, with its gradient (SubSplat, "Opacity
-//! allocation"; supp. A.3; spec 2.7 and 2.8). Formulas: [`crate::cpu::redistribute`].
+//! allocation"; supp. A.3). Formulas: [`crate::cpu::redistribute`].
 //! Tests: tests/spgr/redistribute.rs (identities, finite differences in `f64`).
 
 use super::{Backend, Number, borrowed, by_dtype, slice};

@@ -1,6 +1,7 @@
 //! Sub-pixel Gaussian reparameterization as a candle op with its gradient, and into
 //! buffers of the caller's. Formulas and layouts: [`crate::cpu::spgr`]; the same
-//! unfused: `tests/support/src/spgr_reference.rs`. Tests: tests/spgr/spgr.rs, tests/spgr/spgr_backward.rs.
+//! unfused: `tests/support/src/spgr_reference.rs`. Tests: tests/spgr/spgr.rs,
+//! tests/spgr/spgr_backward.rs.
 
 use super::{Backend, Number, borrowed, by_dtype, slice};
 use crate::abi::{HEAD_STRIDE, SPLAT_STRIDE};
@@ -164,7 +165,7 @@ fn run<T: Number>(
 }
 
 /// Refuses numbers that are not finite, on the way in (an infinite opacity would be
-/// capped, an infinite gain squashed: wrong answers in silence) and on the way out.
+/// capped, an infinite gain squashed: wrong results without an error) and on the way out.
 fn finite<T: Number>(
     call: &Spgr,
     head: &[T],

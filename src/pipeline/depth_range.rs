@@ -4,7 +4,7 @@
 //! caller ([`DepthRange`]), from a file ([`DepthBounds::of_scene`]), or from the distance
 //! between the cameras. Points matched between the photographs replace the last kind. The
 //! small backbone then estimates both ends, unless the caller fixed one
-//! ([`SubSplat::estimate_depth_range`](crate::model::subsplat::SubSplat::look)).
+//! ([`SubSplat::estimate_depth_range`](crate::model::subsplat::SubSplat::estimate_depth_range)).
 
 use super::{Error, Result};
 use crate::camera::Camera;
@@ -118,7 +118,7 @@ pub enum DepthSource {
 }
 
 impl DepthSource {
-    /// Whether nothing but the distance between the cameras determined an end.
+    /// Returns whether nothing but the distance between the cameras determined an end.
     pub fn is_guess(&self) -> bool {
         match self {
             Self::Baseline { .. } => true,
@@ -184,7 +184,7 @@ impl DepthBounds {
         Ok(points.map(|range| Self { near: range.near, far: range.far, source }))
     }
 
-    /// Whether 0 < near < far, both finite.
+    /// Returns whether 0 < near < far, both finite.
     fn is_valid(&self) -> bool {
         self.near > 0.0 && self.far > self.near && self.far.is_finite()
     }

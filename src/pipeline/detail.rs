@@ -5,7 +5,7 @@ use crate::cpu::detail::{Photograph, SourceView, residuals, with_residuals};
 use crate::data::crop::Cropped;
 use crate::splats::Splats;
 
-/// Whether a photograph has more than one pixel for each of the input's pixels.
+/// Returns whether a photograph has more than one pixel for each of the input's pixels.
 fn has_detail(c: &Cropped) -> bool {
     let ratio = c.target.width as f32 / c.input.width.max(1) as f32;
     (c.window.scale * ratio).min_element() > 1.0

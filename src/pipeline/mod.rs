@@ -61,7 +61,7 @@ pub(crate) use poses::check_pairs;
 
 use crate::config::{Backbone, Config};
 
-/// Whether a configuration's backbone is MVSplat.
+/// Returns whether a configuration's backbone is MVSplat.
 pub fn is_mvsplat(config: &Config) -> bool {
     matches!(config.backbone, Backbone::Mvsplat(_))
 }

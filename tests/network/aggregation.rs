@@ -184,8 +184,8 @@ impl Layers<'_> {
 
 #[test]
 fn stages_equal_the_equations_written_out() {
-    // Sample the raw map first and project the sample after: what the fused form
-    // turns round. Biases of W_k, W_v count only where a sample's weights sum to one,
+    // The raw map is sampled first and the sample projected after; the fused form has the
+    // opposite order. Biases of W_k, W_v count only where a sample's weights sum to one,
     // so only parents whose samples lie inside the coarsest map are compared.
     for (name, tuned) in [("paper", false), ("two levels, norm", true)] {
         let mut keys = paper();

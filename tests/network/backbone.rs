@@ -403,8 +403,8 @@ fn unet() -> (UNet, Tensor) {
     (net, Tensor::from_vec(wave, (3, 32, 6, 8), &Device::Cpu).unwrap())
 }
 
-/// Attention joins the views of a scene, knows no order among them, and a view that
-/// is there twice weighs twice: what the definition implies for any V.
+/// Attention joins the views of a scene and ignores their order; a view that is given twice has
+/// twice the weight. The definition implies both for any V.
 #[test]
 fn the_unet_treats_views_as_a_set() -> Result<()> {
     let (net, x) = unet();
@@ -418,7 +418,7 @@ fn the_unet_treats_views_as_a_set() -> Result<()> {
     for (i, j) in [(0, 1), (1, 2), (2, 0)] {
         assert!(far(&flat(&y.get(i)?), &flat(&turned.get(j)?)) < 1e-5);
     }
-    // Copies of one view see nothing that it does not see alone.
+    // Copies of one view have the features of the view alone.
     let alone = run(&rows(&[0])?, 1)?;
     let copies = run(&rows(&[0, 0, 0])?, 3)?;
     for i in 0..3 {

@@ -22,7 +22,7 @@ use whole::{options as options_of, *};
 /// Sides of inputs, px: the smallest that both networks take and windows split.
 const SIZE: (usize, usize) = (64, 64);
 
-/// Rendering as the model asks for it, SH up to degree 3, which is what files hold.
+/// The model's options of rendering, with SH up to degree 3, the most that files hold.
 fn options(model: &Reconstructor) -> RasterOptions {
     RasterOptions { sh_degree: 3, ..rules(model, NEAR_FAR.0) }
 }
@@ -80,10 +80,10 @@ fn files_render_as_the_splats_they_were_made_from() {
                     .map(|c| compare(splats, &back, c, &options))
                     .fold(f64::INFINITY, f64::min);
                 eprintln!("{name}, {convention:?}, .{extension}: {worst:.1} dB");
-                // 50 dB is asked for; nothing but rounding may differ.
+                // 50 dB is required; only rounding may differ.
                 assert!(worst >= 100.0, "{name} {convention:?} {extension}: {worst:.1} dB");
             }
-            // What a writer may forget: each must be seen by the comparison.
+            // Possible omissions of a writer: the comparison must detect each.
             for (what, wrong) in forgetful(splats) {
                 let worst = views
                     .iter()
@@ -137,7 +137,7 @@ fn tuned_pictures_do_not_depend_on_the_world_frame() {
         let mut results = Vec::new();
         for preset in ["tuned", "world coordinates"] {
             if preset == "world coordinates" {
-                // What `paper` embeds: the test must see it.
+                // The embeddings of `paper`: the test must detect them.
                 config.embed = plain(mvsplat, Preset::Paper, 2).embed;
             }
             let model = lively(&config);

@@ -137,7 +137,7 @@ fn a_batch_equals_its_parts() {
         assert!(relative(&part(&p.sh), &q.sh) < 1e-5);
         alone.push(one);
     }
-    // The scenes differ, so that the equalities above say something.
+    // The scenes differ, so that the equalities above are not trivial.
     assert!(relative(&alone[0].raw, &alone[1].raw) > 1e-2);
 }
 

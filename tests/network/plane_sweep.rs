@@ -139,8 +139,8 @@ fn gradients_are_finite_differences_in_double_precision() -> Result<()> {
     Ok(())
 }
 
-/// The op's own value against the same definition: the sum with random weights sees
-/// every output.
+/// The op's own value against the same definition: the sum with random weights
+/// depends on every output.
 #[test]
 fn values_are_the_definition() -> Result<()> {
     let (f, g, grad) = case();

@@ -1,5 +1,5 @@
-//! The weights that ship: what is in the file, and what they show that no plain plane
-//! sweep and no copy of an input does.
+//! The weights that ship: the contents of the file, and scores that neither a plain plane sweep
+//! nor a copy of an input reaches.
 
 use subsplat_test_support as common;
 
@@ -26,8 +26,8 @@ fn untrained() -> BTreeMap<String, Tensor> {
     weights.variables().into_iter().map(|(name, v)| (name, v.as_tensor().clone())).collect()
 }
 
-/// Looks at a model as training does: at held-out rooms of a seed that no training used,
-/// and at photographs.
+/// Scores a model as training does: on held-out rooms of a seed that no training used, and on
+/// photographs.
 fn look(
     tensors: BTreeMap<String, Tensor>,
     model: &Config,
@@ -82,7 +82,7 @@ fn rooms_that_were_never_trained_on_are_reconstructed() {
     assert!(rooms.disparity < 0.5 * plain.disparity, "{rooms:?} {plain:?}");
 }
 
-/// Sixteen children that were trained show more of a room than sixteen equal ones.
+/// Sixteen trained children render a room better than sixteen equal ones.
 #[test]
 fn heads_for_four_times_the_size_beat_the_plain_split() {
     let backbone = || learnt(4).into_iter().filter(|(n, _)| !n.starts_with(SUBSPLAT_PREFIX));

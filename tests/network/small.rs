@@ -1,4 +1,4 @@
-//! The small backbone: what its untrained start sees, and its switches.
+//! The small backbone: results of its untrained start, and its switches.
 
 use candle_core::{Device, Tensor};
 use subsplat::config::{Backbone, Config, Preset, Small};

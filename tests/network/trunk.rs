@@ -236,7 +236,7 @@ fn every_parameter_has_a_gradient() {
                     && c.agg.enabled
                     && (key.contains(".w_g") || key.contains(".embed."));
                 let shift = key.contains(".wk.") && key.ends_with("bias");
-                // f = 0 before the first stage, so its key points see a bias only.
+                // f = 0 before the first stage, so its key points depend on a bias only.
                 let blind =
                     key.contains("g0.key_points.weight") && !c.agg.ablations.share_stage_weights;
                 if f_unused || z_unused || shift || blind {
@@ -491,7 +491,7 @@ fn views_may_come_in_any_order_with_gates_off() {
         let rows = |s: &Scene| s.infer(&trunk).rows.reshape((3, 1024, 11)).unwrap();
         let want = rows(&a).index_select(&index, 0).unwrap();
         let (d, _) = difference(&rows(&b), &want);
-        // Gates by index are the one thing that knows the order.
+        // Only gates by index depend on the order.
         assert_eq!(d < 1e-4, gate != Gate::SoftmaxV, "{gate:?} {d}");
     }
 }
@@ -499,7 +499,7 @@ fn views_may_come_in_any_order_with_gates_off() {
 #[test]
 fn pixel_unit_embeddings_transfer_to_another_resolution() {
     // The same rays, depths and sizes in pixels seen by a 16 px and a 32 px camera:
-    // world scales halve, and only `log_px` does not see it.
+    // world scales halve, and only `log_px` is unchanged.
     for scale in [ScaleInput::LogPx, ScaleInput::Raw] {
         let mut c = config(Preset::Tuned, 2).embed;
         c.scale = scale;
@@ -609,7 +609,7 @@ fn batches_equal_their_scenes() {
 
 #[test]
 fn several_gaussians_per_pixel() {
-    // G = 2: parents 2i and 2i + 1 share a pixel; twins give twin children.
+    // G = 2: parents 2i and 2i + 1 share a pixel; equal parents give equal children.
     let cams = cameras(2, SIZE, SIZE);
     let a = Scene::new(&cams, 21);
     let twice = |t: &Tensor| {

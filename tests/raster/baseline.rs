@@ -1,6 +1,6 @@
 //! The benches' baselines compute what they claim to: the rasterizer's picture and all
-//! its gradients against the conformance cases, the others against our own ops. And
-//! the benches' scenes are what they say.
+//! its gradients against the conformance cases, the others against our own ops. The
+//! benches' scenes have the stated properties.
 
 use subsplat_test_support as common;
 #[path = "../../benches/common/conventional/mod.rs"]

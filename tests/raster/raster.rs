@@ -106,12 +106,12 @@ fn check_intermediates(name: &str, file: &File, rasterizer: &Rasterizer, mvsplat
         }
     }
     eprintln!("{name}: {compared} footprints compared, {dropped} dropped as invisible");
-    // Camera 2 of the decoder's three looks past nearly all splats.
+    // Camera 2 of the decoder's three has nearly all splats outside its picture.
     let least = if name == "mvsplat_dgr_cam2" { 5 } else { file.get("opacities").len() / 3 };
     assert!(compared >= least, "{name}: only {compared} compared");
 }
 
-/// Whether splat `i` of `file` clearly shows at some pixel, by its stored conic.
+/// Returns whether splat `i` of `file` clearly shows at some pixel, by its stored conic.
 fn contributes(file: &File, i: usize, uv: [f32; 2], conic: &[f32], mvsplat: bool) -> bool {
     let size: [usize; 2] = [file.meta("width"), file.meta("height")];
     let det = conic[0] * conic[2] - conic[1] * conic[1];
@@ -264,7 +264,7 @@ fn psnr(a: impl Iterator<Item = f32>, b: impl Iterator<Item = f32>) -> f64 {
 
 /// A real scene, rendered by an independent program (classic EWA, alpha cap 0.99,
 /// 3-σ radius, Jacobian clamp ±1.3 tan). Both our conventions, with the standard SH
-/// basis, agree to more than the 60 dB asked for: `standard` to 84 dB, `mvsplat`,
+/// basis, agree to more than the required 60 dB: `standard` to 84 dB, `mvsplat`,
 /// which differs by the visible tile cut, to 75 dB.
 #[test]
 fn ref_render() {

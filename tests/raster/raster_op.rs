@@ -52,7 +52,7 @@ fn forward_is_the_kernels() {
     let second = twice.narrow(0, 12, 12).unwrap();
     let again = rasterize(&second, &sh, &gain, &camera, &o).unwrap();
     assert_eq!(again.flatten_all().unwrap().to_vec1::<f32>().unwrap(), out);
-    // Gain of one lane.
+    // Gain of one channel.
     let one = gain.narrow(1, 0, 1).unwrap().flatten_all().unwrap().contiguous().unwrap();
     let mut single = s.clone();
     *single.gain_mut() = one.to_vec1().unwrap();
@@ -144,7 +144,7 @@ fn gradients_are_the_kernels_and_those_of_the_loss() {
     let [a, b, c] = variables.each_ref().map(|v| v.as_tensor().clone());
     let planes = rasterize(&a, &b, &c, &camera, &o).unwrap();
     let loss = (&planes * weights()).unwrap().sum_all().unwrap();
-    // Twice: what the forward left serves any number of backward passes.
+    // Twice: any number of backward passes can use the forward pass's results.
     let store = loss.backward().unwrap();
     let again = loss.backward().unwrap();
     let mut kernel = Gradients::default();

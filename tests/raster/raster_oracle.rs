@@ -34,7 +34,7 @@ impl Random {
     }
 }
 
-/// What a random scene is made of.
+/// Parameters of a random scene.
 #[derive(Clone, Copy, Debug)]
 enum Kind {
     /// Splats of a few pixels, some off the picture.
@@ -396,7 +396,7 @@ fn levels_agree() {
     assert!(flipped * 100 <= pixels, "{flipped} of {pixels} pixels");
 }
 
-/// A context that was told no level takes the best; one that is told a level which the
+/// A context without a requested level uses the best one. A context with a level that the
 /// processor lacks still draws.
 #[test]
 fn foreign_tiers_draw_as_the_scalar_one() {
@@ -449,7 +449,7 @@ fn crowds_and_giants_are_drawn() {
     }
 }
 
-/// Stage times are zeros unless asked for.
+/// Stage times are zeros unless enabled.
 #[test]
 fn stage_times_are_asked_for() {
     let scene = scene(Kind::Plain, 2, (64, 48), 0);

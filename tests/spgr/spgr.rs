@@ -1,4 +1,5 @@
-//! Sub-pixel reparameterization: identities, invariances, gradients, and the fused kernel against the unfused graph.
+//! Sub-pixel reparameterization: identities, invariances, gradients, and the fused kernel
+//! against the unfused graph.
 
 use subsplat_test_support::scenes;
 use subsplat_test_support::spgr_calls;
@@ -453,11 +454,11 @@ fn nearest_visible_view_places_the_children() {
     let mut config = Config::re10k(Preset::Paper, 2);
     config.spgr.beta_z = 0.0;
     let mut call = call(&config, 8);
-    // View 1 stands one unit closer to whatever both see.
+    // View 1 is one unit closer to points in both pictures.
     call.cameras[1].world_from_camera = glam::Mat4::from_translation(Vec3::new(0.0, 0.0, 1.0));
     call.cameras[0].world_from_camera = glam::Mat4::IDENTITY;
     call.per_view = 1;
-    // A point that both see, one that only view 0 sees, one that none does.
+    // A point in both pictures, one in that of view 0 only, one in neither.
     let points = [[0.0, 0.0, 3.0], [1.0, 0.0, 2.2], [0.0, 0.0, -2.0]];
     let pitch = |call: &Spgr, at: [f64; 3]| {
         let row = [at[0], at[1], at[2], 1.0, 0.0, 0.0, 0.0, 0.1, 0.1, 0.1, 0.5];

@@ -34,7 +34,7 @@ fn gradients(op: Op, call: &Spgr, h: &Tensor, p: &Tensor, seed: u64) -> [Tensor;
     [grads.get(&h).unwrap().clone(), grads.get(&p).unwrap().clone()]
 }
 
-/// Largest error of each lane, relative to its largest entry.
+/// Largest error of each column, relative to its largest entry.
 #[track_caller]
 fn assert_lanes_close(got: &Tensor, want: &Tensor, tolerance: f64, what: &str) {
     let lanes = *got.dims().last().unwrap();
@@ -194,7 +194,7 @@ fn gradients_at_every_guard_are_finite_and_those_of_the_unfused_graph() {
                 let what = format!("{name}, {}", case.name);
                 let got = gradients(spgr, &call, &h, &p, 9);
                 let want = gradients(spgr_reference::spgr, &call, &h, &p, 9);
-                // Entry by entry: lanes of one parent.
+                // Entry by entry: columns of one parent.
                 for (got, want) in got.iter().zip(&want) {
                     let scale = host(want).iter().fold(1e-30f64, |m, v| m.max(v.abs()));
                     for (g, w) in host(got).iter().zip(host(want)) {
@@ -286,7 +286,7 @@ fn gains_alone_have_a_gradient() {
             assert!((f64::from(d[HEAD_GAIN_OFFSET]) - want).abs() < 1e-6, "{name}: {d:?} {want}");
             assert!(d[..HEAD_GAIN_OFFSET].iter().all(|v| *v == 0.0), "{name}: {d:?}");
         }
-        // Children alone leave that lane without one.
+        // Children alone leave that column without one.
         let grads = rows.sum_all().unwrap().backward().unwrap();
         let got = grads.get(&h).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
         assert!(got.chunks(HEAD_STRIDE).all(|d| d[HEAD_GAIN_OFFSET] == 0.0), "{name}");

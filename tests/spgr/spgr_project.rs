@@ -73,7 +73,7 @@ impl Scene {
     }
 }
 
-/// A camera beside the context views that sees a part of the scene, with pixels
+/// A camera beside the context views, with a part of the scene in its picture and pixels
 /// `zoom` times finer.
 fn beside(scene: &Scene, zoom: f32) -> Camera {
     let mut camera = scene.call.cameras[0];
@@ -120,7 +120,7 @@ fn assert_same(got: &[Footprint], want: &[Footprint], what: &str) {
     }
     assert!(visible > got.len() / 10, "{what}: only {visible} visible");
     assert!(differ <= 2 + visible / 500, "{what}: {differ} extents of {visible} differ");
-    // What is dropped is dropped whole.
+    // Dropped splats have no field set.
     assert!(got.iter().filter(|f| !f.visible()).all(|f| *f == Footprint::default()));
 }
 

@@ -1,6 +1,6 @@
-//! What SPGR's zero-initialised split keeps of its parents: the coverage of an opaque
-//! plane under every opacity rule (the measured table of SubSplat's physical remark,
-//! spec 2.8, last five columns), and, under `tuned`, the native render itself.
+//! Invariants of SPGR's zero-initialised split: the coverage of an opaque plane under every
+//! opacity rule (the measured table of SubSplat's physical remark, last five columns), and, under
+//! `tuned`, the native render itself.
 
 use subsplat_test_support::scenes;
 
@@ -222,7 +222,7 @@ fn tuned_children_reduced_are_their_parents_native_render() {
             let (most, spread) = if upscale == 2 { (0.003, 0.012) } else { (0.008, 0.03) };
             assert!(bias.abs() < most && noise < spread, "{bias:+.4} {noise:.4}");
             assert!(colour < 0.08, "{colour:.4}");
-            // The paper's rules do not keep it: the comparison sees the difference.
+            // The paper's rules do not keep it: the comparison detects the difference.
             let mut paper = Config::small(Preset::Paper, upscale);
             paper.agg.enabled = false;
             let (bias, ..) = score(&paper);

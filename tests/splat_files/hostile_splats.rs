@@ -26,7 +26,7 @@ const READERS: [(&str, Parse); 5] = [
     ("glb", parse_glb),
 ];
 
-/// The answer to `bytes`, within bounds of time; the message names the file.
+/// The reader's result for `bytes`, within bounds of time; the message names the file.
 fn answer(ending: &str, parse: Parse, bytes: &[u8]) -> std::result::Result<Splats, String> {
     let name = format!("hostile.{ending}");
     let start = Instant::now();
@@ -34,7 +34,7 @@ fn answer(ending: &str, parse: Parse, bytes: &[u8]) -> std::result::Result<Splat
     assert!(start.elapsed() < Duration::from_secs(5), "{name} took {:?}", start.elapsed());
     match result {
         Ok(s) => {
-            // What is accepted must be usable.
+            // Accepted splats must be finite.
             assert!(s.rows().iter().chain(s.sh()).all(|v| v.is_finite()));
             Ok(s)
         }
@@ -275,7 +275,7 @@ fn wrong_checksums_are_an_error() {
     }
 }
 
-/// Versions 1 to 3 end where the count says, or carry extension records that the flags
+/// Versions 1 to 3 end as the count requires, or carry extension records that the flags
 /// announce (nianticlabs/spz, extensions/README.md).
 #[test]
 fn extensions_of_spz_are_announced_and_whole() {
@@ -573,7 +573,7 @@ fn lying_spz_files() {
         b[at..at + bytes.len()].copy_from_slice(bytes);
         refused("spz", &b, what);
     }
-    // A frame that says less, one that says more, and a dictionary that nobody has.
+    // A frame with a smaller size, one with a larger size, and an unknown dictionary.
     let mut b = good.clone();
     b[8] = 10;
     refused("spz", &b, "as the count demands");
@@ -760,7 +760,7 @@ fn lying_glbs() {
 }
 
 /// Some thousand damaged copies of each seed through the entries that the fuzz targets
-/// use: whatever comes back comes back, quickly.
+/// use: each returns quickly, with a result or an error.
 #[test]
 fn damaged_files_never_panic() {
     let mut accepted = [0usize; 2];
@@ -783,7 +783,7 @@ fn damage(b: &mut Vec<u8>, random: &mut Random) {
     if b.is_empty() {
         return;
     }
-    // Headers are where the lies are told: half of all damage goes there.
+    // Half of all damage goes to the headers, which state sizes and counts.
     let reach = if random.below(2) == 0 { b.len() } else { b.len().min(400) };
     let at = random.below(reach);
     match random.below(7) {

@@ -156,7 +156,7 @@ fn up_axes_turn_means_shapes_and_colours_together() {
             let degree = kept(kind, 3);
             let after = reload("a.ply", &before, &options);
             assert_same(&before, &after, &order, turn, degree, EXACT);
-            // A .glb says which way is up: the reader turns it back.
+            // A .glb defines the up axis: the reader rotates it back.
             let after = reload("a.glb", &before, &options);
             assert_same(&before, &after, &order, DMat3::IDENTITY, degree, EXACT);
         }
@@ -165,7 +165,7 @@ fn up_axes_turn_means_shapes_and_colours_together() {
     assert!("x".parse::<Up>().unwrap_err().contains("keep, y or z"));
 }
 
-/// Half a quantisation step of each .spz field, with room for rounding.
+/// Half a quantisation step of each .spz field, with a margin for rounding.
 const SPZ: Tolerance = Tolerance {
     mean: 0.51 / (1u32 << 20) as f64 + 1e-6,
     // ln σ to 1/32: σ² to 6.5 %; rotation to 1/700.
@@ -187,7 +187,7 @@ fn spz_round_trips_within_its_steps() {
             let after = reload("a.spz", &before, &options);
             assert_eq!(after.sh_degree(), kind.degree);
             assert_same(&before, &after, &in_order(&before), DMat3::IDENTITY, kind.degree, SPZ);
-            // What was quantised once stays.
+            // Quantised values stay the same.
             let again = reload("b.spz", &after, &options);
             assert_eq!(after.sh(), again.sh());
             assert_eq!(
@@ -213,7 +213,7 @@ fn splat_round_trips_sorted_at_degree_zero() {
         };
         let mut order = in_order(&before);
         order.sort_by(|&a, &b| weight(b).total_cmp(&weight(a)));
-        // What degree 0 of the standard basis says, clamped to a picture's range.
+        // The colour of degree 0 of the standard basis, clamped to a picture's range.
         let options = SaveOptions { sh_degree: Some(0), ..Default::default() };
         let flat = reload("a.ply", &before, &options);
         let allowed = Tolerance {
@@ -409,7 +409,7 @@ fn info_describes_what_is_there() {
     assert!(e.contains("nan.ply splat 5") && e.contains("mean NaN"), "{e}");
 }
 
-/// A .glb taken apart by hand: what viewers rely on.
+/// A .glb parsed by hand: the fields that viewers rely on.
 #[test]
 fn glb_structure_is_what_gltf_asks_for() {
     let kind = Kind {
@@ -563,7 +563,7 @@ fn glb_quantised_attributes_are_read() {
 }
 
 /// The Khronos validator over files of every degree. It comes from the npm registry,
-/// so it runs where `SUBSPLAT_GLB_CHECK=require` asks for it (CI).
+/// so it runs with `SUBSPLAT_GLB_CHECK=require` only (CI).
 #[test]
 fn khronos_validator_accepts_our_glbs() {
     if std::env::var("SUBSPLAT_GLB_CHECK").is_ok_and(|v| v == "require") {
@@ -588,7 +588,7 @@ fn khronos_validator_accepts_our_glbs() {
         };
         assert_eq!(good.status.code(), Some(0), "{}", text(&good));
         assert!(text(&good).contains("120 splats of degree 3"), "{}", text(&good));
-        // It must be able to say no: to the container's mistakes and to the extension's.
+        // It must reject files: for mistakes of the container and of the extension.
         let edits: [fn(&mut serde_json::Value); 4] = [
             |j| j["accessors"][0]["max"][0] = 99.0.into(),
             |j| j["bufferViews"][0]["byteOffset"] = 2.into(),

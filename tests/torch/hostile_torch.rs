@@ -274,7 +274,7 @@ fn pickles_that_are_none() {
     }
 }
 
-/// What is done to the entries of a good file.
+/// A change to the entries of a good file.
 type Change = Box<dyn FnOnce(&mut Vec<Entry>)>;
 
 fn changed(change: impl FnOnce(&mut Vec<Entry>)) -> Vec<u8> {
@@ -429,7 +429,8 @@ fn end_records_that_lie() {
     refused("one entry fewer", fewer, &["a central directory of its entries alone"]);
 }
 
-/// Every prefix of a good file of each form, and every byte of it changed: an answer each.
+/// Every prefix of a good file of each form, and every byte of it changed: each gives a
+/// result or an error.
 #[test]
 fn truncated_and_damaged_files_are_answered() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/goldens/torch");

@@ -1,5 +1,5 @@
-//! PyTorch's files: what PyTorch itself wrote (tests/goldens/torch, made by
-//! tools/make_torch_fixtures.py) and what the writer of these tests does.
+//! PyTorch's files: those of PyTorch itself (tests/goldens/torch, made by
+//! tools/make_torch_fixtures.py) and those of these tests' own writer.
 
 use subsplat_test_support as common;
 use subsplat_test_support::torch_writer as writer;
@@ -44,7 +44,7 @@ fn at<'a>(value: &'a Value, path: &str) -> Option<&'a Value> {
     })
 }
 
-/// Everything that PyTorch said it wrote is read: elements, shapes, plain values.
+/// The reader returns everything that PyTorch lists: elements, shapes, plain values.
 #[test]
 fn what_pytorch_wrote_is_what_is_read() {
     let text = std::fs::read_to_string(goldens().join("expected.json")).unwrap();
@@ -213,7 +213,7 @@ fn a_tensor_beyond_four_gibibytes_is_found() {
 }
 
 /// A view whose elements lie far apart in a storage too large to take whole: an
-/// independent sum of index times stride says what stands there.
+/// independent sum of index times stride gives the expected elements.
 #[test]
 fn wide_views_are_gathered_in_pages() {
     let count = 6 << 20;
@@ -246,7 +246,7 @@ fn wide_views_are_gathered_in_pages() {
     assert!(file.read(t).unwrap() == bytes);
 }
 
-/// What is wrong in a caller's own view is an error too.
+/// A fault in a caller's own view is an error too.
 #[test]
 fn a_view_that_a_caller_changed_is_checked_again() {
     let file = golden("views.pt");

@@ -47,7 +47,7 @@ fn narrow() -> Settings {
     }
 }
 
-/// What `run` traces, by name.
+/// Tensors that `run` traces, by name.
 fn traced(run: impl FnOnce(&mut Trace<'_>) -> Result<()>) -> Result<BTreeMap<String, Tensor>> {
     let mut seen = BTreeMap::new();
     let mut look = |name: &str, t: &Tensor| {

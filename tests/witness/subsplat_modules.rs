@@ -390,7 +390,7 @@ fn projection() -> Result<()> {
     Ok(())
 }
 
-/// How many pixels `a` reaches farther out than `b` at each edge (x0, y0, x1, y1).
+/// Pixels by which `a` reaches farther out than `b` at each edge (x0, y0, x1, y1).
 fn outward(a: &Tensor, b: &Tensor) -> Result<Tensor> {
     let signs = Tensor::new(&[[-1f32, -1.0, 1.0, 1.0]], &Device::Cpu)?;
     (a - b)?.broadcast_mul(&signs)

@@ -20,7 +20,7 @@ pub struct Gradients<T> {
     pub points: Vec<T>,
 }
 
-/// The maps' gradient as factors of a block of parents: what is added where.
+/// The maps' gradient as factors of a block of parents: products and their cells.
 #[derive(Clone, Debug, Default)]
 pub struct Scatter<T> {
     /// Parent and cell of each tap.
@@ -32,7 +32,7 @@ pub struct Scatter<T> {
 }
 
 impl<T> Scatter<T> {
-    /// Cells that are added to, each as often as a parent sees it.
+    /// Cells that are added to, each once for every parent that samples it.
     pub fn cells(&self) -> impl Iterator<Item = usize> {
         self.taps.iter().map(|&(_, cell)| cell)
     }
@@ -95,9 +95,9 @@ pub fn factors<T: Real>(
     (scatters, d_query, d_points)
 }
 
-/// Adds what `scatters` of the call with `query` and `grad` say to `maps`
-/// `[cells, stride]`, on the caller's thread, in the order of parents. Cells that no
-/// parent sees are not touched: of a few parents among many cells, most.
+/// Adds `scatters` of the call with `query` and `grad` to `maps` `[cells, stride]`, on the
+/// caller's thread, in the order of parents. Cells that no parent samples are not touched: with
+/// few parents and many cells, most of them.
 pub fn scatter_into<T: Real>(
     g: &Gather,
     scatters: &[Scatter<T>],
@@ -303,8 +303,8 @@ impl<T: Real> Args<'_, T> {
 }
 
 /// Adds factor · source to the rows of the cells in `sums` `[cells, lanes]`, where
-/// `(first, start, lanes)` says which channels of a map's row `sums` holds and where
-/// the source's channel 0 lies in it.
+/// `(first, start, lanes)` gives the channels of a map's row that `sums` holds, and the
+/// place of the source's channel 0 in it.
 fn add<'a, T: Real>(
     sums: &mut [T],
     scatters: &'a [Scatter<T>],

@@ -15,7 +15,7 @@
 //! after level, view after view within a level, row-major; query
 //! `[N, Q]` = (q `[E]` where keys are used, bias `[V,L,M,G]`, gate `[V]`); points
 //! `[N, V, M or L·M, 2]` in [0, 1]² of the picture.   Out: `[N, E]`.
-//! Twin: ops/attention_gather.rs. Tests: tests/network/attention_gather.rs.
+//! Op: ops/attention_gather.rs. Tests: tests/network/attention_gather.rs.
 
 mod backward;
 mod narrow;

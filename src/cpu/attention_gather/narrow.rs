@@ -20,7 +20,7 @@ const TAPS: usize = 4 * SAMPLES;
 /// chains as hide a product's latency.
 const WIDE: usize = 8;
 
-/// Whether [`forward`] can do `g`.
+/// Returns whether [`forward`] supports `g`.
 pub(super) fn suits(g: &Gather) -> bool {
     g.groups == 1
         && g.points == 1
@@ -61,7 +61,7 @@ struct Taps {
     /// Sample of the tap.
     sample: [usize; TAPS],
     count: usize,
-    /// Whether a sample is in the softmax.
+    /// True where a sample is in the softmax.
     live: [bool; SAMPLES],
 }
 
@@ -224,7 +224,7 @@ impl Kernel for Block<'_> {
             let (q, rest) = query.split_at(g.dim);
             let last = taps.at[..taps.count].iter().fold(0, |a, &b| a.max(b));
             assert!(last + g.stride <= maps.len(), "attention gather: a tap past the maps");
-            // SAFETY: rows of `stride` floats lie inside the maps, as just asked; keys and
+            // SAFETY: rows of `stride` floats lie inside the maps, as checked above; keys and
             // values inside a row ([`forward`]); `dim` is in whole vectors ([`suits`]).
             unsafe { products(s, q, maps.as_ptr().add(key), &taps, &mut dots) };
             if !taps.attend(g, &dots, &rest[..samples], &rest[samples..]) {

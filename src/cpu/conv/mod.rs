@@ -59,6 +59,12 @@
 //! ∂L/∂x is a convolution of ∂L/∂y and takes the same path (`plan`). ∂L/∂w multiplies the
 //! packed or transformed tiles of x with those of ∂L/∂y and sums over all tiles
 //! (`weight_grad_jobs`, `weight_grad_tile`).
+//!
+//! Vectors of a tile are written one by one. An array of vectors that is assigned as a whole is
+//! copied through memory; without those copies a convolution took two thirds of the time.
+//! Scratch memory that is used once per channel is cleared once per channel. Weights are
+//! transformed or packed per call, for a few hundredths of the time: MVSplat's 8.3 M 3×3 weights,
+//! kept in Winograd's form, would occupy 126 MiB, a quarter of the peak at 256 → 512.
 #![expect(
     clippy::needless_range_loop,
     reason = "counted loops over register tiles unroll, iterators over them need not"

@@ -42,7 +42,7 @@ pub(super) trait TiledWeightGrad: Sync {
     );
 }
 
-/// How ∂L/∂w is cut into jobs.
+/// Division of ∂L/∂w into jobs.
 pub(super) struct Partition {
     /// Output channels of a part.
     pub output_channels: usize,

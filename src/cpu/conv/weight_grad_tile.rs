@@ -13,7 +13,7 @@ pub(super) const TILE_ROWS: usize = 8;
 /// Maximum output channels of a register tile.
 pub(super) const MAX_TILE_CHANNELS: usize = 3 * LANES;
 
-/// What happens to numbers that are already in the destination.
+/// Treatment of numbers that are already in the destination.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Store {
     /// They are overwritten.

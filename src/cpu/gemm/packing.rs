@@ -116,8 +116,8 @@ impl Packed {
         thread_local! {
             static KEPT: Cell<Packed> = Cell::default();
         }
-        // Taken rather than borrowed: while a task waits for rayon, its thread may run another
-        // one that packs.
+        // Taken rather than borrowed: while a task is blocked in rayon, its thread may run
+        // another one that packs.
         let mut packed = KEPT.take();
         let result = f(&mut packed);
         KEPT.set(packed);

@@ -59,7 +59,7 @@ impl Sparse {
     }
 }
 
-/// One line of pixels: how many entries each pixel has, and the entries.
+/// One line of pixels: the number of entries of each pixel, and the entries.
 type Line = (Vec<usize>, Vec<(u32, f32)>);
 
 /// c_ij of reference row `r` and one of its pairs, by reference pixel.

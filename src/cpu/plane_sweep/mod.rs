@@ -61,7 +61,7 @@ impl Sweep {
         Some(s)
     }
 
-    /// Whether the sample lies inside the source picture and in front of it.
+    /// Returns whether the sample lies inside the source picture and in front of it.
     #[inline(always)]
     fn valid(&self, (u, v, z): (f32, f32, f32)) -> bool {
         let [h, w] = self.size;
@@ -144,7 +144,7 @@ pub fn correlation(s: &Sweep, reference: &[f32], source: &[f32], out: &mut [f32]
     let n = h * w;
     let reference = channels_last(c, n, reference);
     let source = channels_last(c, n, source);
-    // `[R, h, D, w]`: what one task makes is contiguous.
+    // `[R, h, D, w]`: the results of one task are contiguous.
     let mut rows = vec![0f32; out.len()];
     rows.par_chunks_exact_mut(d * w).enumerate().for_each_init(
         || Walk::new(s),

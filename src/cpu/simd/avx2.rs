@@ -28,7 +28,7 @@ pub(super) struct M(__m256, __m256);
 #[derive(Clone, Copy)]
 pub(super) struct I(__m256i, __m256i);
 
-/// Tells whether the processor has the features that [`run`] needs.
+/// Returns whether the processor has the features that [`run`] needs.
 pub(super) fn detected() -> bool {
     is_x86_feature_detected!("avx2")
         && is_x86_feature_detected!("fma")

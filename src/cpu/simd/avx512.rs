@@ -30,7 +30,7 @@ pub(super) struct M(__mmask16);
 #[repr(transparent)]
 pub(super) struct I(__m512i);
 
-/// Tells whether the processor has the features that [`run`] needs.
+/// Returns whether the processor has the features that [`run`] needs.
 pub(super) fn detected() -> bool {
     super::avx2::detected()
         && is_x86_feature_detected!("avx512f")

@@ -79,7 +79,7 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     /// Sixteen integers.
     type I: IntVector;
 
-    /// Vectors that the registers hold at once: how large a register tile may be.
+    /// Vectors that the registers hold at once: the limit of a register tile.
     const REGISTERS: usize = <Self::F as Vector>::REGISTERS;
 
     /// Puts `v` into every lane.
@@ -178,7 +178,7 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     }
 }
 
-/// Tells whether four floats from `offset` past each place of `at` lie inside `len`.
+/// Returns whether four floats from `offset` past each place of `at` lie inside `len`.
 #[inline(always)]
 pub(crate) fn all_inside(len: usize, at: &[usize; LANES], offset: usize) -> bool {
     let most = at.iter().fold(0, |m, &a| if a > m { a } else { m });

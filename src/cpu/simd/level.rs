@@ -76,7 +76,7 @@ impl SimdLevel {
         }
     }
 
-    /// Tells whether this processor supports the level.
+    /// Returns whether this processor supports the level.
     pub fn is_available(self) -> bool {
         Self::available().contains(&self)
     }

@@ -23,7 +23,7 @@ pub trait Real:
 {
     /// Widens to double precision.
     fn to_f64(self) -> f64;
-    /// Tells whether the number is neither NaN nor infinite.
+    /// Returns whether the number is neither NaN nor infinite.
     fn is_finite(self) -> bool;
     /// Runs `kernel` on the best vectors for this type: those of [`SimdLevel::best`] for
     /// `f32`, single numbers for `f64`.

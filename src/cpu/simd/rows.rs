@@ -18,7 +18,7 @@ impl RowLayout {
         lane.min(self.count - 1) * self.stride
     }
 
-    /// Whether `length` elements of every row lie inside a slice of `len` elements.
+    /// Returns whether `length` elements of every row lie inside a slice of `len` elements.
     #[inline(always)]
     pub(super) fn fits(self, length: usize, len: usize) -> bool {
         self.count > 0 && self.start(LANES - 1) + length <= len

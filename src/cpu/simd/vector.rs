@@ -11,7 +11,7 @@ pub trait Mask<V>:
     fn select(self, a: V, b: V) -> V;
     /// Takes `v` where the mask holds, 0 elsewhere.
     fn select_or_zero(self, v: V) -> V;
-    /// Tells whether any lane holds.
+    /// Returns whether any lane holds.
     fn any(self) -> bool;
     /// Returns lane i as bit i.
     fn to_bits(self) -> u32;

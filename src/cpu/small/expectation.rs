@@ -20,7 +20,7 @@ pub struct Expectation {
     pub pixels: usize,
     /// Half-width of the window around the mode, in candidates.
     pub window: usize,
-    /// Whether the mean is over the window alone.
+    /// True if the mean is over the window alone.
     pub windowed: bool,
 }
 

@@ -1,6 +1,6 @@
-//! Kernels of the small backbone's own parts (ARCHITECTURE.md, "The small backbone"),
-//! each with its gradient where one is owed: what in tensor operations would be dozens of passes over
-//! memory is one.
+//! Kernels of the small backbone's own parts (src/model/shipped/README.md, "The small
+//! backbone"), with gradients where training needs them. Each kernel is one pass over memory;
+//! tensor operations would take dozens.
 
 pub mod convex;
 pub mod cross_check;

@@ -1,5 +1,7 @@
 //! Spherical harmonics of a vector of parents: the functions of [`crate::cpu::sh`] at a
 //! vector of directions, and the parents' coefficients as vectors.
+//!
+//! The direction of an evaluation is never detached from the graph.
 
 use super::view::{V3, dot, scaled};
 use crate::abi::{SH_COEFFICIENTS_MAX, ShBasis, sh_coefficients};
@@ -14,7 +16,7 @@ pub(super) struct Coefficients<T> {
 }
 
 impl<T: Real> Coefficients<T> {
-    /// Makes room for functions up to `degree`, as far as `basis` has them.
+    /// Allocates functions up to `degree`, as far as `basis` has them.
     pub(super) fn new(basis: ShBasis, degree: usize) -> Self {
         let tile = Box::new([[T::default(); LANES]; 3 * SH_COEFFICIENTS_MAX]);
         Self { tile, basis, degree: degree.min(degree_max(basis)) }

@@ -21,7 +21,12 @@
 //!
 //! Each lane of a vector is a parent: child k of 16 parents at a time, so that sums over
 //! children are loops and any K fills the vector. Op: ops/spgr.rs. Reference in tensor
-//! operations: tests/support/src/spgr_reference.rs. Tests: tests/spgr/spgr.rs, tests/spgr/spgr_backward.rs.
+//! operations: tests/support/src/spgr_reference.rs. Tests: tests/spgr/spgr.rs,
+//! tests/spgr/spgr_backward.rs.
+//!
+//! The rule of equal optical depth uses the low-pass of the render for children and that of the
+//! input for parents. With `slide = disc` a child moves at most a tenth of its depth, since an
+//! edge-on disc would move it without bound.
 
 mod backward;
 mod child;
@@ -66,7 +71,7 @@ const BLOCK: usize = 64;
 /// Inputs of the kernels.
 #[derive(Clone, Copy, Debug)]
 pub struct Args<'a, T> {
-    /// How children are made; K ≤ [`CHILDREN_MAX`].
+    /// Rules for the children; K ≤ [`CHILDREN_MAX`].
     pub rules: &'a Rules,
     /// Origin of the parents.
     pub source: Source<'a>,

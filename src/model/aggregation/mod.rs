@@ -14,6 +14,8 @@
 //! [`crate::config::AggregationAblations`]; [`Aggregation::new`] chooses between them.
 //! Differs from the paper, which leaves them open: factor 1/√E, projections of keys and
 //! values, residual, LayerNorm and occlusion gate (`tuned`).
+//!
+//! The occlusion gate weighs views after the softmax and is constant to gradients.
 
 mod ablated;
 mod points;

@@ -1,7 +1,8 @@
 //! The small backbone: a plane sweep that a CPU trains and runs in seconds.
 //!
 //! In: [`Views`]. Out: [`BackboneOutput`], as from MVSplat, and [`DepthMaps`] for depth
-//! supervision. Every part is a key of [`crate::config::Small`].
+//! supervision. Every part is a key of [`crate::config::Small`]
+//! (src/model/shipped/README.md, "The small backbone").
 //!
 //! CNN to 1/4 → correlation of unit-length channels and raw matching channels → 3-D stem
 //! shared over disparity → 2-D U-Net → logits over D candidates uniform in disparity →

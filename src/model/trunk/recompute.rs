@@ -2,6 +2,9 @@
 //! `[N, E]` tensors. The forward pass therefore computes the children without a graph; the
 //! backward pass recomputes each chunk of parents with a graph of its own. The tensors of a
 //! chunk fit into a core's cache.
+//!
+//! The maps' gradient is kept as factors ([`Deferred`]) and added where parents sampled the maps;
+//! a dense gradient of a chunk would be mostly zeros.
 
 use super::{Children, Parts, Records, Scene, Span, TrainPass, Trunk, chunks, interleaved};
 use crate::abi::SPLAT_STRIDE;

@@ -4,8 +4,8 @@ use crate::camera::Camera;
 use crate::cpu::small::cross_check::{Seen, cross_check as kernel};
 use candle_core::{Result, Tensor, bail};
 
-/// `[B, V, H·W, 1]`: a factor for the opacity of each pixel's Gaussian by what the other
-/// views of its scene see at its place. Without gradient.
+/// `[B, V, H·W, 1]`: a factor for the opacity of each pixel's Gaussian by the colours
+/// of the other views of its scene at its place. Without gradient.
 ///
 /// `images` `[B, V, 3, H, W]`, `cameras` `[B][V]`, `distances` `[B, V, H·W, 1]` along the
 /// unit ray, all f32.

@@ -1,4 +1,4 @@
-//! Direct weight gradient: how it is cut into jobs, and the job's loop over tiles.
+//! Direct weight gradient: its division into jobs, and the job's loop over tiles.
 //!
 //! Each tile of x is packed with its halo. Then one of two kernels adds its products with
 //! ∂L/∂y: [`WideKernel`] has output channels in its lanes, [`NarrowKernel`] neighbouring

@@ -3,8 +3,8 @@
 //! The lanes of a vector are tiles. Where the tiles of a row fill whole spans of a vector,
 //! rows of the image are loaded where they lie and transposed in registers; masks replace
 //! places beyond the border by zeros. Otherwise the channel is packed first and each tile is
-//! loaded by itself. The tiles of a vector lie in the lane order of [`transpose4x4_index`], which needs
-//! the fewest shuffles.
+//! loaded by itself. The tiles of a vector lie in the lane order of [`transpose4x4_index`],
+//! which needs the fewest shuffles.
 
 use super::product_layout::{ProductLayout, ProductVectors};
 use super::transforms::{TILE, Transform, copy_vectors};
@@ -32,8 +32,8 @@ impl TileBlock {
         self.count.next_multiple_of(LANES)
     }
 
-    /// Returns whether vectors are in the order of [`transpose4x4_index`]. A block that does not fill
-    /// its only vector has its tiles in the first lanes instead.
+    /// Returns whether vectors are in the order of [`transpose4x4_index`]. A block that does not
+    /// fill its only vector has its tiles in the first lanes instead.
     fn squared(&self) -> bool {
         self.count >= LANES
     }
@@ -369,7 +369,7 @@ fn insert_neighbours<S: Simd>(
     for neighbour in neighbours {
         let from = x.as_ptr().wrapping_offset(neighbour.start + down);
         s.prefetch_l2(from.wrapping_add(x.len()));
-        // SAFETY: `valid` says that the image has this place, and `x` holds the whole
+        // SAFETY: by `valid` the image has this place, and `x` holds the whole
         // channel of the image.
         let v = if neighbour.valid[r] { unsafe { *from } } else { 0.0 };
         column = s.mask_from_bits(neighbour.lane).select(s.splat(v), column);

@@ -9,7 +9,7 @@
 //! instead of 144 (stride 2).
 //!
 //! * `transforms` holds Bᵀ, G and Aᵀ along one axis, for each [`Kind`].
-//! * `product_layout` says where the transformed tiles lie in memory.
+//! * `product_layout` defines the places of the transformed tiles in memory.
 //! * `load_tiles` reads the tiles of one channel and transforms them: Bᵀ·d·B.
 //! * `weights` transforms the kernels: G·g·Gᵀ.
 //! * `products` multiplies, transforms back and writes: Aᵀ·[…]·A.
@@ -17,6 +17,9 @@
 //!
 //! For inputs in ±1 and n products per sum, results are within 3e-6·√n of the exact ones
 //! (conv/tests.rs).
+//!
+//! Rows and channels are prefetched explicitly, because hardware prefetchers do not follow steps
+//! of this size.
 
 mod forward;
 mod kind;

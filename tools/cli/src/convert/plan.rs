@@ -1,4 +1,6 @@
 //! Selection of tensors from the inputs, with the names to write.
+//!
+//! Converted MVSplat weights carry the `tuned` ×2 configuration, which `run` assumes in any case.
 
 use crate::convert::args::Args;
 use crate::convert::source::{Content, Entry, Source};

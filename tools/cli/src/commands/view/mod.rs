@@ -1,6 +1,10 @@
 //! `subsplat view`: a window that shows a scene. `source` provides the splats, `canvas` draws
 //! them, `controls` interprets keys and mouse, and `window` joins the three. The camera moves by
 //! [`subsplat::navigation`].
+//!
+//! A change draws two frames: the first measures the number of pairs, and the second has buffers
+//! for them. A background thread makes and uploads the children for another r. The device has the
+//! adapter's binding limits, not WebGPU's defaults.
 
 mod canvas;
 mod controls;
