@@ -15,7 +15,7 @@ pub struct AdapterSummary {
     pub backend: String,
     /// Driver name and version.
     pub driver: String,
-    /// Whether the adapter emulates a GPU on the CPU (lavapipe, WARP).
+    /// True if the adapter emulates a GPU on the CPU (lavapipe, WARP).
     pub software: bool,
 }
 

@@ -87,7 +87,7 @@ struct Inner {
     purpose: Use,
     bytes: u64,
     pool: Arc<Pool>,
-    /// Whether a mapping failed: the state of the buffer is then unknown.
+    /// True if a mapping failed: the state of the buffer is then unknown.
     mapping_failed: AtomicBool,
 }
 

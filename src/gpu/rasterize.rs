@@ -37,11 +37,11 @@ pub struct Rasterizer {
     /// Capacity for (splat, tile) pairs.
     capacity: usize,
     pub(crate) pairs: usize,
-    /// Whether the last frame had more pairs than a binding holds.
+    /// True if the last frame had more pairs than a binding holds.
     pairs_exceed_binding: bool,
     /// Pending read-back of the plan of the last frame that was drawn to a texture.
     pub(crate) pending: Option<Reading<u32>>,
-    /// Whether the pair count of a drawn frame has been read back.
+    /// True if the pair count of a drawn frame has been read back.
     pub(crate) pairs_known: bool,
     pub(crate) times: Vec<(&'static str, Duration)>,
 }

@@ -2,7 +2,7 @@
 
 use super::{LANES, Simd, Vector, first_lanes_bits};
 
-/// Where rows of a slice lie.
+/// Layout of rows in a slice.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RowLayout {
     /// Elements from the start of one row to the start of the next.

@@ -42,7 +42,7 @@ pub fn trim_small_blocks() {
 /// system's allocator.
 const HUGE: usize = 2 << 20;
 
-/// Whether this allocator manages blocks of this layout.
+/// True if this allocator manages blocks of this layout.
 fn is_large(layout: &Layout) -> bool {
     cfg!(all(target_os = "linux", any(target_arch = "x86_64", target_arch = "aarch64")))
         && layout.size() >= HUGE

@@ -58,7 +58,7 @@ pub(super) struct TileLoader<'a> {
     source: Source<'a>,
 }
 
-/// Where a [`TileLoader`] reads.
+/// Source positions that a [`TileLoader`] reads.
 enum Source<'a> {
     /// In the images; one entry per vector of tiles.
     InPlace(Vec<Spans>),
@@ -76,7 +76,7 @@ const MAX_ROWS: usize = 9;
 /// spans as a tile has own columns (`INPUT_STEP`). A tile's further columns are own columns
 /// of its neighbours.
 struct Spans {
-    /// Where the first tile's own columns of each span begin; before the image's first float
+    /// Start of the first tile's own columns of each span; before the image's first float
     /// where the image has a border there.
     starts: [isize; 8],
     /// For each row of the tile and each span, the lanes that lie inside the image.
@@ -91,7 +91,7 @@ struct Spans {
 struct NeighbourColumn {
     /// The tile's lane as a bit.
     lane: u32,
-    /// Where the column begins.
+    /// Start of the column.
     start: isize,
     /// For each row of the tile, whether the column lies inside the image.
     valid: [bool; MAX_ROWS],
@@ -106,7 +106,7 @@ struct PackedChannel<'a> {
     start: Axes,
     /// Floats from image to image in the source.
     image_stride: usize,
-    /// Where each tile begins, by vectors.
+    /// Start of each tile, by vectors.
     tile_starts: Vec<[usize; LANES]>,
 }
 
@@ -174,7 +174,7 @@ struct Places<'a> {
 
 /// One column of a tile.
 struct Column {
-    /// Where it begins in the channel; may lie outside.
+    /// Start in the channel; may lie outside.
     start: isize,
     /// Its place in the image's rows; may lie outside.
     x: isize,

@@ -124,7 +124,7 @@ pub(super) struct OutputWriter<'a> {
     places: Vec<OutputPlaces>,
 }
 
-/// Where the outputs of sixteen tiles go, in channel 0.
+/// Positions of the outputs of sixteen tiles, in channel 0.
 enum OutputPlaces {
     /// A row of outputs of neighbouring tiles fills whole vectors, which begin here.
     Vectors([usize; 8]),
@@ -132,7 +132,7 @@ enum OutputPlaces {
     Tiles(Vec<OutputTile>),
 }
 
-/// Where the outputs of one tile go.
+/// Positions of the outputs of one tile.
 struct OutputTile {
     /// The tile's lane, after rows have been transposed to image order.
     lane: usize,

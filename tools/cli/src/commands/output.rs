@@ -50,7 +50,7 @@ pub struct Scored {
     pub psnr: Option<f64>,
     /// SSIM; `None` also for pictures that are smaller than its window.
     pub ssim: Option<f64>,
-    /// Whether the photograph was smaller than the target, and was enlarged.
+    /// True if the photograph was smaller than the target, and was enlarged.
     pub enlarged: bool,
 }
 

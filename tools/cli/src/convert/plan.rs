@@ -12,7 +12,7 @@ use subsplat::model::architecture::{Kind, Shapes, expected, guess_config};
 /// Result of the comparison of names and shapes with the architecture.
 pub struct Plan {
     pub kind: Kind,
-    /// Whether the names determined the kind, and not the user.
+    /// True if the names, not the user, determined the kind.
     pub recognised: bool,
     /// Configuration for the metadata (`mvsplat`, `subsplat`).
     pub config: Option<Config>,

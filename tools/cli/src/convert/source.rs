@@ -199,7 +199,7 @@ fn tensors(value: &Value) -> (usize, u64) {
     }
 }
 
-/// Whether the file is safetensors: by its name, or by the JSON object after a header length of
+/// True if the file is safetensors: by its name, or by the JSON object after a header length of
 /// at most five bytes. No file of `torch.save` has zeros and `{` there.
 fn is_safetensors(path: &Path) -> Result<bool> {
     let mut head = Vec::new();

@@ -160,7 +160,7 @@ impl Canvas {
         fault.map_or(Ok(()), |reason| Err(anyhow!("GPU refused a frame: {reason}")))
     }
 
-    /// Whether the device is lost; no other frame can then be drawn.
+    /// True if the device is lost; no other frame can then be drawn.
     pub fn is_lost(&self) -> bool {
         self.gpu.check().is_err()
     }

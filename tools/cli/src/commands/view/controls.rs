@@ -139,7 +139,7 @@ impl Controls {
         }
     }
 
-    /// Whether a movement key is down.
+    /// True if a movement key is down.
     pub fn moving(&self) -> bool {
         !self.held.is_empty() || !self.tapped.is_empty()
     }

@@ -92,7 +92,7 @@ pub fn run(events: EventLoop<Message>, plan: Plan, source: Source) -> Result<Don
 #[derive(Default)]
 struct Rate {
     last: Option<Instant>,
-    /// Whether the first frame is over, in which kernels are compiled.
+    /// True if the first frame is over, in which kernels are compiled.
     warm: bool,
     mean: Option<f32>,
 }
@@ -138,9 +138,9 @@ struct Viewer {
     busy: Option<(usize, &'static str)>,
     /// Frames to draw without a further change.
     due: u32,
-    /// Whether an animation runs.
+    /// True if an animation runs.
     running: bool,
-    /// Whether the next frame is to be saved.
+    /// True if the next frame is to be saved.
     picture: bool,
     drawn: usize,
     rate: Rate,
@@ -211,7 +211,7 @@ impl Viewer {
         }
     }
 
-    /// Whether another frame follows without an event.
+    /// True if another frame follows without an event.
     fn goes_on(&self) -> bool {
         self.due > 0 || self.picture || self.controls.moving() || self.plan.frames.is_some()
     }
