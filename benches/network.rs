@@ -21,6 +21,8 @@ use common::{Bench, Contender, Threads, inputs, scene};
 use rival::{Rival, median, timed};
 use std::collections::BTreeMap;
 use std::time::Instant;
+use subsplat::FitOptions;
+use subsplat::camera::NearFar;
 use subsplat::config::{Config, Mvsplat as Settings, Preset, Small};
 use subsplat::io::image::Rgb;
 use subsplat::model::Views;
@@ -83,7 +85,7 @@ fn main() -> Result<()> {
 fn views(batch: usize, side: usize) -> Result<Views> {
     let cameras = scene::views(side).to_vec();
     let images = (inputs::tensor(&[batch, 2, 3, side, side], 0.2, 7)? + 0.5)?.clamp(0.0, 1.0)?;
-    Ok(Views::new(images, vec![cameras; batch], vec![vec![(1.0, 100.0); 2]; batch])?)
+    Ok(Views::new(images, vec![cameras; batch], vec![vec![NearFar::RE10K; 2]; batch])?)
 }
 
 /// Forward, a loss of every output, backward: 128², batch 4, without rendering.
@@ -172,7 +174,8 @@ fn whole(case: &str) -> Result<Run> {
         .with_input_size(from, from)
         .with_depth_prior(DepthBounds::re10k())
         .with_check(Check::Off)
-        .with_detail(Detail::Off);
+        .with_detail(Detail::Off)
+        .with_fit(FitOptions::off());
     let camera = scene::camera(to);
     Ok(Box::new(move || {
         let picture = model.run(&photos, &options)?.render(&camera);

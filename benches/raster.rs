@@ -110,7 +110,7 @@ impl Case {
 
     /// Returns the gradients of picture and alpha for the backward passes.
     fn seeds(&self) -> (Vec<f32>, Vec<f32>) {
-        let pixels = (self.camera.intrinsics.width * self.camera.intrinsics.height) as u64;
+        let pixels = (self.camera.intrinsics().width * self.camera.intrinsics().height) as u64;
         let seeds = |stream: u64, n: u64| (0..n).map(|i| scene::normal(stream, i)).collect();
         (seeds(50, 3 * pixels), seeds(51, pixels))
     }
@@ -154,7 +154,7 @@ impl Case {
     fn work(&self, stats: Stats) -> Work {
         let s = &self.splats;
         let (n, pairs) = (s.len() as f64, stats.pairs as f64);
-        let pixels = (self.camera.intrinsics.width * self.camera.intrinsics.height) as f64;
+        let pixels = (self.camera.intrinsics().width * self.camera.intrinsics().height) as f64;
         let input = 4.0 * (s.rows().len() + s.sh().len() + s.gain().len()) as f64;
         // A 64-byte record per splat, written and read per tile; sort keys and values, written
         // and read three times; lists, written and read; RGB, alpha, depth.
@@ -372,8 +372,8 @@ fn write_tensors(path: &Path, splats: &Splats, camera: &Camera) -> Result<()> {
     let column = |from: usize, lanes: usize| -> Vec<f32> {
         splats.rows().chunks_exact(11).flat_map(|r| r[from..from + lanes].iter().copied()).collect()
     };
-    let k = camera.intrinsics;
-    let pose = camera.world_from_camera.transpose().to_cols_array().to_vec();
+    let k = camera.intrinsics();
+    let pose = camera.world_from_camera().transpose().to_cols_array().to_vec();
     let mut tensors = vec![
         ("means", vec![n, 3], column(0, 3)),
         ("quats", vec![n, 4], column(3, 4)),

@@ -63,10 +63,7 @@ fn camera(offset: Vec3, side: usize) -> Camera {
     };
     let eye = EYE + axes(AIM - EYE) * offset;
     let pose = Mat4::from_translation(eye) * Mat4::from_mat3(axes(AIM - eye));
-    Camera {
-        intrinsics: Intrinsics::from_fov_x(FOV.to_radians(), side, side),
-        world_from_camera: pose,
-    }
+    Camera::new(Intrinsics::from_fov_x(FOV.to_radians(), side, side), pose).expect("a valid camera")
 }
 
 /// All frames in the order of `cameras.json`.
@@ -92,7 +89,7 @@ pub fn room() -> Room {
 /// The view of one frame.
 pub fn render(room: &Room, camera: &Camera) -> View {
     let grade = Grade { gain: [GAIN; 3], ..Grade::default() };
-    room.render(camera, &Quality { grade, ..Quality::clean(LATTICE / camera.intrinsics.width) })
+    room.render(camera, &Quality { grade, ..Quality::clean(LATTICE / camera.intrinsics().width) })
 }
 
 /// Display values to bytes, rounded.
@@ -121,8 +118,8 @@ pub fn near_far(views: &[View]) -> (f64, f64) {
 }
 
 fn frame_json(frame: &Frame) -> Value {
-    let k = &frame.camera.intrinsics;
-    let rows = frame.camera.world_from_camera.transpose().to_cols_array_2d();
+    let k = &frame.camera.intrinsics();
+    let rows = frame.camera.world_from_camera().transpose().to_cols_array_2d();
     json!({
         "file": frame.file, "width": k.width, "height": k.height,
         "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy, "c2w": rows,
@@ -141,7 +138,7 @@ fn cameras_json(frames: &[Frame], near: f64, far: f64) -> Value {
 }
 
 fn protocol_json(frames: &[Frame]) -> Value {
-    let k = &frames[0].camera.intrinsics;
+    let k = &frames[0].camera.intrinsics();
     let tests = TARGET_SIDES.iter().enumerate().map(|(i, side)| {
         let first = CONTEXT.len() + i * TARGET.len();
         json!({

@@ -14,8 +14,11 @@ mod view;
 
 pub(crate) use frame::floats_at;
 pub use frame::{BlendRules, Geometry, Gradients, Rendered, SplatSlices};
-pub use gather::{Drop, GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, Gather, Level};
-pub use spgr::{CHILDREN_MAX, DISC_AREA_SQ_MIN, Rules, SPGR_CAMERA_STRIDE};
+pub use gather::{Drop, GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, Gather, Level, SampleConvention};
+pub use spgr::{
+    AMinMode, AreaAt, CHILDREN_MAX, DISC_AREA_SQ_MIN, DepthDir, DepthUnit, GainSpace, PrimaryView,
+    Rules, SPGR_CAMERA_STRIDE, Slide,
+};
 pub use sweep::{Pair, SWEEP_PAIR_STRIDE, Sweep};
 pub use uniforms::{
     AttentionGatherUniform, InvertUniform, PlaneSweepUniform, RasterUniform, RedistributeUniform,

@@ -160,24 +160,50 @@ impl Intrinsics {
         if k.iter().any(|v| !v.is_finite()) {
             return Err(CameraError::NotFinite { what: "intrinsics", got: format!("{k:?}") });
         }
-        if self.fx <= 0.0 || self.fy <= 0.0 {
-            return Err(CameraError::Focal { fx: self.fx, fy: self.fy });
-        }
+        // A side of 0 makes the focal length of a resized picture 0: the size is the cause.
         let side = 1..=Self::SIDE_MAX;
         if !side.contains(&self.width) || !side.contains(&self.height) {
             return Err(CameraError::Size { width: self.width, height: self.height });
+        }
+        if self.fx <= 0.0 || self.fy <= 0.0 {
+            return Err(CameraError::Focal { fx: self.fx, fy: self.fy });
         }
         Ok(())
     }
 }
 
-/// A posed pinhole camera.
+/// Nearest and farthest depth: camera z, world units.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct NearFar {
+    /// Nearest depth.
+    pub near: f32,
+    /// Farthest depth.
+    pub far: f32,
+}
+
+impl NearFar {
+    /// Depth range of every RealEstate10K view in pixelSplat and MVSplat.
+    pub const RE10K: Self = Self::new(1.0, 100.0);
+
+    /// Combines two depths, which may be invalid ([`NearFar::is_valid`]).
+    pub const fn new(near: f32, far: f32) -> Self {
+        Self { near, far }
+    }
+
+    /// Reports whether 0 < near < far, both finite.
+    pub fn is_valid(self) -> bool {
+        self.near > 0.0 && self.far > self.near && self.far.is_finite()
+    }
+}
+
+/// A posed pinhole camera. [`Camera::new`] checks its numbers, and no later change of a camera
+/// omits the check.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Camera {
     /// Intrinsics, px.
-    pub intrinsics: Intrinsics,
+    pub(crate) intrinsics: Intrinsics,
     /// Camera to world, rigid.
-    pub world_from_camera: Mat4,
+    pub(crate) world_from_camera: Mat4,
 }
 
 impl Camera {
@@ -208,6 +234,25 @@ impl Camera {
             return Err(CameraError::NotRigid { determinant, error });
         }
         Ok(Self { intrinsics, world_from_camera })
+    }
+
+    /// Returns the intrinsics, px.
+    pub fn intrinsics(&self) -> Intrinsics {
+        self.intrinsics
+    }
+
+    /// Returns the pose, camera to world.
+    pub fn world_from_camera(&self) -> Mat4 {
+        self.world_from_camera
+    }
+
+    /// Returns the same pose with other intrinsics.
+    ///
+    /// # Errors
+    /// Those of [`Intrinsics::check`].
+    pub fn with_intrinsics(&self, intrinsics: Intrinsics) -> Result<Self, CameraError> {
+        intrinsics.check()?;
+        Ok(Self { intrinsics, ..*self })
     }
 
     /// Returns the inverse of the pose, (Rᵀ, −Rᵀt): world to camera.
@@ -245,7 +290,16 @@ impl Camera {
     }
 
     /// Returns the same pose with the intrinsics of a picture resampled to `width` × `height`.
-    pub fn resized(&self, width: usize, height: usize) -> Self {
+    ///
+    /// # Errors
+    /// A side outside 1 to [`Intrinsics::SIDE_MAX`]; a focal length that overflows or becomes 0.
+    pub fn resized(&self, width: usize, height: usize) -> Result<Self, CameraError> {
+        self.with_intrinsics(self.intrinsics.resized(width, height))
+    }
+
+    /// Returns the same as [`Camera::resized`] without the check, for the size of a picture that
+    /// exists.
+    pub(crate) fn resized_unchecked(&self, width: usize, height: usize) -> Self {
         Self { intrinsics: self.intrinsics.resized(width, height), ..*self }
     }
 }
@@ -310,6 +364,30 @@ mod tests {
         assert!(matches!(Camera::new(good.intrinsics, flipped), Err(CameraError::NotRigid { .. })));
         let scaled = good.world_from_camera * Mat4::from_scale(Vec3::splat(2.0));
         assert!(matches!(Camera::new(good.intrinsics, scaled), Err(CameraError::NotRigid { .. })));
+        for bad in [f32::NAN, f32::INFINITY] {
+            let mut pose = good.world_from_camera;
+            pose.w_axis.y = bad;
+            let error = Camera::new(good.intrinsics, pose).unwrap_err();
+            assert!(matches!(error, CameraError::NotFinite { what: "pose", .. }), "{error}");
+        }
+    }
+
+    #[test]
+    fn changed_intrinsics_are_checked() {
+        let good = camera();
+        let k = good.intrinsics();
+        let larger = good.resized(512, 480).unwrap();
+        assert_eq!(larger.intrinsics(), k.resized(512, 480));
+        assert_eq!(larger.world_from_camera(), good.world_from_camera());
+        assert_eq!(larger.with_intrinsics(k), Ok(good));
+        for (width, height) in [(0, 48), (64, 0), (1_000_000, 1_000_000)] {
+            let message = good.resized(width, height).unwrap_err().to_string();
+            assert!(message.contains("1 to 32768 pixels"), "{message}");
+            assert!(message.contains(&format!("{width}x{height}")), "{message}");
+        }
+        for fy in [0.0, -1.0, f32::NAN, f32::INFINITY] {
+            assert!(good.with_intrinsics(Intrinsics { fy, ..k }).is_err(), "{fy}");
+        }
     }
 
     #[test]

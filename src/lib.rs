@@ -68,10 +68,14 @@ pub mod data;
 pub mod device;
 #[cfg(all(feature = "internals", feature = "network"))]
 pub mod eval;
+#[cfg(feature = "internals")]
+pub mod fit;
 #[cfg(all(feature = "internals", feature = "gpu"))]
 pub mod gpu;
 #[cfg(feature = "internals")]
 pub mod io;
+#[cfg(feature = "internals")]
+pub mod loss;
 #[cfg(feature = "internals")]
 pub mod metrics;
 #[cfg(all(feature = "internals", feature = "network"))]
@@ -109,10 +113,14 @@ mod data;
 mod device;
 #[cfg(all(not(feature = "internals"), feature = "network"))]
 mod eval;
+#[cfg(not(feature = "internals"))]
+mod fit;
 #[cfg(all(not(feature = "internals"), feature = "gpu"))]
 mod gpu;
 #[cfg(not(feature = "internals"))]
 mod io;
+#[cfg(not(feature = "internals"))]
+mod loss;
 #[cfg(not(feature = "internals"))]
 mod metrics;
 #[cfg(all(not(feature = "internals"), feature = "network"))]
@@ -139,7 +147,7 @@ pub use image;
 
 pub use abi::{Convention, RasterOptions, ShBasis};
 pub use backend::{Backend, DeviceError};
-pub use camera::{Camera, CameraError, Intrinsics};
+pub use camera::{Camera, CameraError, Intrinsics, NearFar};
 pub use check::{
     CheckOptions, DepthReport, EpipolarReport, Finding, GrayImage, PairReport, Verdict, check_pair,
 };
@@ -148,6 +156,7 @@ pub use config::{Config, ConfigError, Preset};
 #[cfg(feature = "network")]
 pub use data::crop::{CropOptions, Cropped};
 pub use device::DeviceChoice;
+pub use fit::{FitError, FitOptions, FitReport, FitView, fit};
 #[cfg(feature = "gpu")]
 pub use gpu::{Gpu, GpuError, Rasterizer as GpuRasterizer};
 pub use io::cameras_json::{CameraFile, NamedCamera, load_cameras_json, save_cameras_json};

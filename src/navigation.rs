@@ -5,7 +5,7 @@
 //! Both modes move the same pose, so a change of mode moves nothing. Rotations are about the
 //! world's up vector and the camera's x axis, which keeps the horizon level.
 
-use crate::camera::{Camera, Intrinsics};
+use crate::camera::{Camera, CameraError, Intrinsics};
 use glam::{Mat4, Quat, Vec2, Vec3};
 use std::f32::consts::PI;
 
@@ -67,14 +67,17 @@ impl Bounds {
 
     /// Returns a camera along +z that sees the whole box: `fov_x` radians horizontally,
     /// `side`×`side` pixels.
-    pub fn camera(&self, fov_x: f32, side: usize) -> Camera {
+    ///
+    /// # Errors
+    /// A field of view, a side or a box without a valid camera.
+    pub fn camera(&self, fov_x: f32, side: usize) -> Result<Camera, CameraError> {
         let extent = self.high - self.low;
         let width = extent.truncate().max_element().max(EXTENT_MIN);
         let distance = 0.5 * width / (0.5 * fov_x).tan() + 0.5 * extent.z;
-        Camera {
-            intrinsics: Intrinsics::from_fov_x(fov_x, side, side),
-            world_from_camera: Mat4::from_translation(self.middle() - distance * Vec3::Z),
-        }
+        Camera::new(
+            Intrinsics::from_fov_x(fov_x, side, side),
+            Mat4::from_translation(self.middle() - distance * Vec3::Z),
+        )
     }
 }
 
@@ -128,7 +131,7 @@ pub struct Start {
     pub radius: f32,
 }
 
-/// An interactive camera.
+/// An interactive camera. Inputs that would make its pose infinite or NaN are ignored.
 #[derive(Clone, Debug)]
 pub struct Navigator {
     start: Start,
@@ -193,9 +196,10 @@ impl Navigator {
         self.speed = SPEED * self.start.radius;
     }
 
-    /// Sets the size of the picture, px. A size of zero is ignored.
+    /// Sets the size of the picture, px. A side outside 1 to [`Intrinsics::SIDE_MAX`] is ignored.
     pub fn resize(&mut self, width: usize, height: usize) {
-        if width > 0 && height > 0 {
+        let sides = 1..=Intrinsics::SIDE_MAX;
+        if sides.contains(&width) && sides.contains(&height) {
             self.window = (width, height);
         }
     }
@@ -218,6 +222,13 @@ impl Navigator {
         self.rotation * Vec3::Z
     }
 
+    /// Changes the pose, unless the new one is not finite.
+    fn set_pose(&mut self, rotation: Quat, eye: Vec3) {
+        if rotation.is_finite() && eye.is_finite() {
+            (self.rotation, self.eye) = (rotation, eye);
+        }
+    }
+
     /// Rotates the camera by a drag of `px` (x right, y down). In orbit mode the scene in front
     /// of the pivot follows the cursor; in fly mode the view direction does.
     pub fn rotate(&mut self, px: Vec2) {
@@ -228,10 +239,12 @@ impl Navigator {
         let limit = ELEVATION_MAX.max(elevation.abs());
         let raise = (elevation - angle.y).clamp(-limit, limit) - elevation;
         let about_up = Quat::from_axis_angle(self.start.up, -angle.x);
-        self.rotation = (about_up * self.rotation * Quat::from_rotation_x(raise)).normalize();
-        if self.mode == Mode::Orbit {
-            self.eye = pivot - self.distance * self.forward();
-        }
+        let rotation = (about_up * self.rotation * Quat::from_rotation_x(raise)).normalize();
+        let eye = match self.mode {
+            Mode::Orbit => pivot - self.distance * (rotation * Vec3::Z),
+            Mode::Fly => self.eye,
+        };
+        self.set_pose(rotation, eye);
     }
 
     /// Shifts the camera by a drag of `px` (x right, y down). Points at the distance of the pivot
@@ -239,18 +252,21 @@ impl Navigator {
     pub fn pan(&mut self, px: Vec2) {
         let k = self.camera().intrinsics;
         let shift = Vec3::new(px.x / k.fx, px.y / k.fy, 0.0) * self.distance;
-        self.eye -= self.rotation * shift;
+        self.set_pose(self.rotation, self.eye - self.rotation * shift);
     }
 
     /// Applies steps of the wheel, positive forward: nearer to the pivot in orbit mode, faster in
     /// fly mode.
     pub fn wheel(&mut self, steps: f32) {
+        if steps.is_nan() {
+            return;
+        }
         let within = |v: f32| v.clamp(RANGE.0 * self.start.radius, RANGE.1 * self.start.radius);
         match self.mode {
             Mode::Orbit => {
                 let pivot = self.pivot();
                 self.distance = within(self.distance * WHEEL_DISTANCE.powf(steps));
-                self.eye = pivot - self.distance * self.forward();
+                self.set_pose(self.rotation, pivot - self.distance * self.forward());
             }
             Mode::Fly => self.speed = within(self.speed * WHEEL_SPEED.powf(steps)),
         }
@@ -265,6 +281,7 @@ impl Navigator {
             Pace::Normal => self.speed,
             Pace::Fast => FAST_FACTOR * self.speed,
         };
-        self.eye += along.clamp_length_max(1.0) * (speed * seconds);
+        let step = along.clamp_length_max(1.0) * (speed * seconds);
+        self.set_pose(self.rotation, self.eye + step);
     }
 }

@@ -6,6 +6,7 @@
 use crate::abi::{
     MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SH_DEGREE_MAX, SPLAT_STRIDE, ShBasis,
 };
+use rayon::prelude::*;
 use thiserror::Error;
 
 /// Reason for which packed splats are refused.
@@ -21,6 +22,33 @@ pub enum SplatsError {
         /// The length found.
         got: String,
     },
+    /// A number is NaN or infinite.
+    #[error("splats {what}: expected finite numbers, got {got} at splat {splat}")]
+    NotFinite {
+        /// The buffer.
+        what: &'static str,
+        /// Index of the first such splat. For SH coefficients it is the parent's first child.
+        splat: usize,
+        /// The number found.
+        got: String,
+    },
+}
+
+/// Floats per task of a parallel check.
+const CHECK_CHUNK: usize = 1 << 16;
+
+/// Returns the index of the first number that is NaN or infinite.
+fn first_not_finite(values: &[f32]) -> Option<usize> {
+    let in_chunk = |(c, chunk): (usize, &[f32])| {
+        // The maximum of integers has a SIMD form, a search that stops early has none.
+        let magnitude = |v: &f32| v.to_bits() & !(1 << 31);
+        let largest = chunk.iter().map(magnitude).fold(0, u32::max);
+        if largest < f32::INFINITY.to_bits() {
+            return None;
+        }
+        chunk.iter().position(|v| !v.is_finite()).map(|i| c * CHECK_CHUNK + i)
+    };
+    values.par_chunks(CHECK_CHUNK).enumerate().find_map_first(in_chunk)
 }
 
 /// A set of Gaussians in the world frame.
@@ -97,11 +125,40 @@ impl Splats {
         SplatParts { rows, sh, gain, sh_degree, sh_basis }
     }
 
-    /// Checks that the lengths of the three buffers match.
+    /// Checks that the lengths of the three buffers match and that their numbers are finite.
+    ///
+    /// Other properties are not checked. The rasterizer drops splats with a quaternion of zero
+    /// or an opacity below 1/255, ignores the sign of σ, and limits alpha where the opacity
+    /// exceeds 1. The file writers refuse opacities outside [0, 1], replace a σ below 1e-12 by
+    /// 1e-12 and write the identity for a quaternion of zero.
+    ///
+    /// # Errors
+    /// [`SplatsError`] names the buffer.
+    pub fn new(
+        rows: Vec<f32>,
+        sh: Vec<f32>,
+        gain: Vec<f32>,
+        sh_degree: usize,
+        sh_basis: ShBasis,
+    ) -> Result<Self, SplatsError> {
+        let new = Self::new_with_unchecked_numbers(rows, sh, gain, sh_degree, sh_basis)?;
+        let check = |what, values: &[f32], floats_per_set: usize, splats_per_set: usize| {
+            let Some(at) = first_not_finite(values) else { return Ok(()) };
+            let splat = at / floats_per_set * splats_per_set;
+            Err(SplatsError::NotFinite { what, splat, got: values[at].to_string() })
+        };
+        check("rows", &new.rows, SPLAT_STRIDE, 1)?;
+        check("SH coefficients", &new.sh, 3 * new.sh_coefficients(), new.children_per_parent())?;
+        check("gain", &new.gain, new.gain_channels().max(1), 1)?;
+        Ok(new)
+    }
+
+    /// Checks the lengths of the buffers only. The file readers check the numbers themselves,
+    /// because their errors name the file.
     ///
     /// # Errors
     /// [`SplatsError::Shape`] names the buffer.
-    pub fn new(
+    pub(crate) fn new_with_unchecked_numbers(
         rows: Vec<f32>,
         sh: Vec<f32>,
         gain: Vec<f32>,

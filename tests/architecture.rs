@@ -20,6 +20,8 @@ const IMPORTS: &[(&str, &[&str])] = &[
     ("gpu", &["abi", "camera", "device"]),
     ("backend", &["device", "gpu"]),
     ("render", &["abi", "backend", "camera", "cpu", "gpu", "io", "splats"]),
+    ("loss", &["cpu", "metrics"]),
+    ("fit", &["abi", "camera", "io", "loss", "render", "splats"]),
     ("check", &["camera", "metrics"]),
     ("io", &["abi", "camera", "config", "sh", "splats"]),
     ("data", &["camera", "io", "metrics", "splats"]),
@@ -28,18 +30,18 @@ const IMPORTS: &[(&str, &[&str])] = &[
     (
         "pipeline",
         &[
-            "abi", "camera", "check", "config", "cpu", "data", "io", "metrics", "model", "render",
-            "sh", "splats",
+            "abi", "camera", "check", "config", "cpu", "data", "fit", "io", "metrics", "model",
+            "render", "sh", "splats",
         ],
     ),
     (
         "eval",
         &[
-            "abi", "camera", "config", "cpu", "data", "io", "metrics", "model", "pipeline",
+            "abi", "camera", "config", "cpu", "data", "fit", "io", "metrics", "model", "pipeline",
             "render", "splats",
         ],
     ),
-    ("train", &["abi", "camera", "config", "data", "io", "metrics", "model", "ops"]),
+    ("train", &["abi", "camera", "config", "data", "io", "loss", "metrics", "model", "ops"]),
 ];
 
 const TOP_LEVEL: &[&str] = &[
@@ -192,6 +194,8 @@ fn only_the_network_uses_candle() {
             "check",
             "io",
             "data",
+            "loss",
+            "fit",
             "eval",
         ]
         .contains(&module.as_str())

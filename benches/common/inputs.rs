@@ -2,6 +2,7 @@
 
 use super::scene::{normal, unit};
 use candle_core::{Device, Result, Tensor};
+use subsplat::abi::SampleConvention;
 use subsplat::camera::Camera;
 use subsplat::ops::attention_gather::{Gather, Level};
 use subsplat::ops::plane_sweep::{Sweep, pair, relative_pose};
@@ -57,7 +58,7 @@ impl Attention {
             value: dim,
             logit_scale: (dim as f64).sqrt().recip(),
             renormalise: true,
-            half_pixel: true,
+            sample_convention: SampleConvention::HalfPixel,
             drop: None,
             point_gradient: true,
         };
@@ -80,10 +81,10 @@ impl Attention {
 /// Returns a sweep between two `views` with features `side` px wide. Each view is the source of
 /// the other. Depths are evenly spaced in disparity from 1.5 to 12.
 pub fn sweep(views: &[Camera; 2], side: usize, channels: usize, depths: usize) -> Result<Sweep> {
-    let cameras = views.map(|c| c.resized(side, side));
+    let cameras = views.map(|c| c.resized(side, side).expect("a valid size"));
     let to = |i: usize, j: usize| {
         let pose = relative_pose(&cameras[i], &cameras[j]);
-        pair(&cameras[i].intrinsics, &cameras[j].intrinsics, pose, j)
+        pair(&cameras[i].intrinsics(), &cameras[j].intrinsics(), pose, j)
     };
     let disparity = |k: usize| {
         let share = k as f32 / (depths - 1).max(1) as f32;

@@ -70,7 +70,7 @@ fn posed(at: Vec3, angle: f32, side: usize) -> Camera {
     let c = 0.5 * side as f32;
     let intrinsics = Intrinsics { fx: f, fy: f, cx: c, cy: c, width: side, height: side };
     let pose = Mat4::from_rotation_translation(Quat::from_rotation_y(angle), at);
-    Camera { intrinsics, world_from_camera: pose }
+    Camera::new(intrinsics, pose).expect("a valid camera")
 }
 
 /// Returns the two views whose pixels are the splats.
@@ -130,7 +130,7 @@ pub fn shared(spec: &Spec) -> Splats {
 /// Appends the splat of grid pixel `at`, with σ of about `px` times its depth; returns its mean.
 fn row(view: &Camera, at: [usize; 2], px: f32, index: u64, rows: &mut Vec<f32>) -> Vec3 {
     let pixel = glam::Vec2::new(at[0] as f32 + 0.5, at[1] as f32 + 0.5);
-    let ray = view.rotation() * view.intrinsics.unproject(pixel);
+    let ray = view.rotation() * view.intrinsics().unproject(pixel);
     // Depths of a network are slightly rough.
     let depth = room_distance(view.position(), ray) * (1.0 + 0.004 * normal(2, index));
     let mean = view.position() + depth * ray;

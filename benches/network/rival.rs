@@ -10,7 +10,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Instant;
-use subsplat::camera::{Camera, Intrinsics};
+use subsplat::camera::{Camera, Intrinsics, NearFar};
 use subsplat::config::Mvsplat as Settings;
 use subsplat::model::Views;
 use subsplat::model::backbone::Mvsplat;
@@ -98,10 +98,10 @@ fn views(tensors: &HashMap<String, Tensor>, side: usize) -> Result<Views> {
         let pose = Mat4::from_cols_array(pose.try_into()?).transpose();
         let [fx, fy, cx, cy]: [f32; 4] = k.try_into()?;
         let intrinsics = Intrinsics { fx, fy, cx, cy, width: side, height: side };
-        Ok(Camera { intrinsics, world_from_camera: pose })
+        Ok(Camera::new(intrinsics, pose)?)
     };
     let cameras = poses.chunks_exact(16).zip(lenses.chunks_exact(4)).map(camera);
-    let near_far = planes.chunks_exact(2).map(|p| (p[0], p[1])).collect();
+    let near_far = planes.chunks_exact(2).map(|p| NearFar::new(p[0], p[1])).collect();
     let images = tensors["images"].unsqueeze(0)?;
     Ok(Views::new(images, vec![cameras.collect::<Result<_>>()?], vec![near_far])?)
 }

@@ -1,5 +1,7 @@
 //! Sizes and options of an attention gather ([`crate::cpu::attention_gather`]).
 
+use serde::{Deserialize, Serialize};
+
 /// One feature level of the packed maps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Level {
@@ -20,6 +22,16 @@ pub struct Drop {
     pub seed: u64,
     /// Index in the scene of the call's first parent.
     pub first_parent: usize,
+}
+
+/// Pixel grid of the feature maps.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SampleConvention {
+    /// x_ℓ = R·W_ℓ − ½ (`grid_sample`, `align_corners = false`).
+    HalfPixel,
+    /// x_ℓ = R·W_ℓ (MVSplat's cost volume).
+    Integer,
 }
 
 /// Sizes and options of one call.
@@ -47,12 +59,22 @@ pub struct Gather {
     pub logit_scale: f64,
     /// Leaves samples outside (0, 1)² out of the softmax; else they are zeros in it.
     pub renormalise: bool,
-    /// Reads column R·W − ½ of a map at the normalised coordinate R, rather than R·W.
-    pub half_pixel: bool,
+    /// Column of a map at a normalised coordinate.
+    pub sample_convention: SampleConvention,
     /// Dropout, in training.
     pub drop: Option<Drop>,
     /// The backward pass computes the gradient with respect to the points.
     pub point_gradient: bool,
+}
+
+impl SampleConvention {
+    /// Returns the px subtracted from R·W, where R is a normalised coordinate.
+    pub fn shift(self) -> f64 {
+        match self {
+            Self::HalfPixel => 0.5,
+            Self::Integer => 0.0,
+        }
+    }
 }
 
 impl Gather {

@@ -168,7 +168,7 @@ fn rotated_readings(cameras: &[Camera; 2], sizes: [(usize, usize); 2]) -> Vec<Re
         let turn = |i: usize| {
             let mut camera = cameras[i];
             (0..quarters).for_each(|_| camera = rotated_clockwise(&camera));
-            camera.resized(sizes[i].0, sizes[i].1)
+            camera.resized_unchecked(sizes[i].0, sizes[i].1)
         };
         let clause = format!("{clause} (EXIF orientation?)");
         Reading { name: name.into(), clause, rank: 0, factor: None, cameras: [turn(0), turn(1)] }

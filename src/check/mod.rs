@@ -108,7 +108,7 @@ impl Matched {
 
 /// Rescales the camera to the size of the photograph.
 fn fitted(camera: &Camera, image: &GrayImage) -> Camera {
-    camera.resized(image.width(), image.height())
+    camera.resized_unchecked(image.width(), image.height())
 }
 
 /// The photographs at the working size.
@@ -138,7 +138,7 @@ impl WorkingPair {
             let (w, h) = size(i);
             DVec2::new(w as f64 / images[i].width() as f64, h as f64 / images[i].height() as f64)
         });
-        let cameras = [0, 1].map(|i| cameras[i].resized(size(i).0, size(i).1));
+        let cameras = [0, 1].map(|i| cameras[i].resized_unchecked(size(i).0, size(i).1));
         let side = |i: usize| size(i).0.max(size(i).1) as f64;
         let px_per_report_px = 0.5 * (side(0) + side(1)) / REPORT_SIDE;
         Self { images: reduced, cameras, scale, px_per_report_px }

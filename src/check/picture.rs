@@ -75,7 +75,8 @@ pub fn epipolar_picture(
     points: &[MatchedPoint],
 ) -> Option<(usize, usize, Vec<u8>)> {
     let [mut a, mut b] = [Half::new(&photographs[0])?, Half::new(&photographs[1])?];
-    let fitted = |i: usize| cameras[i].resized(photographs[i].width, photographs[i].height);
+    let fitted =
+        |i: usize| cameras[i].resized_unchecked(photographs[i].width, photographs[i].height);
     let views = TwoViews::new(&fitted(0), &fitted(1));
     let f = views.fundamental();
     let chosen = spread(points);

@@ -3,6 +3,8 @@
 //! Both presets use one form of the attention; they differ in `levels`, `norm` and
 //! `occlusion_gate` only. Every other choice belongs to [`AggregationAblations`].
 
+pub use crate::abi::SampleConvention;
+
 use super::{FeatureLevel, Preset};
 use serde::{Deserialize, Serialize};
 
@@ -236,16 +238,6 @@ pub enum MaskMode {
     Renorm,
     /// Positions are clamped to [0, 0.9999], without renormalisation (PixelGaussian).
     PgClamp,
-}
-
-/// Pixel grid of the feature maps.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum SampleConvention {
-    /// x_ℓ = R·W_ℓ − ½ (`grid_sample`, `align_corners = false`).
-    HalfPixel,
-    /// x_ℓ = R·W_ℓ (MVSplat's cost volume).
-    Integer,
 }
 
 /// Input of the heads.

@@ -3,6 +3,8 @@
 //! The presets differ in some keys of [`Spgr`]; choices that neither preset makes belong
 //! to [`SpgrAblations`].
 
+pub use crate::abi::{AMinMode, AreaAt, DepthDir, DepthUnit, GainSpace, PrimaryView, Slide};
+
 use super::Preset;
 use serde::{Deserialize, Serialize};
 
@@ -73,47 +75,6 @@ pub enum SpgrHead {
     Coord,
 }
 
-/// v*: the camera in whose frame children are placed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum PrimaryView {
-    /// The view with the smallest positive depth among those that see the parent; the
-    /// source view if none does (paper).
-    NearestVisible,
-    /// The parent's source view: exact tiling of its pixel.
-    Source,
-}
-
-/// Direction of the depth residual.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum DepthDir {
-    /// The optical axis (both of the paper's equations).
-    Axis,
-    /// The viewing ray (the paper's prose): the projection does not move.
-    Ray,
-}
-
-/// Unit of β_z.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum DepthUnit {
-    /// World units (paper).
-    World,
-    /// The parent's depth.
-    Relative,
-}
-
-/// Sideways step of a child.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Slide {
-    /// At constant camera z (paper).
-    ZConst,
-    /// Along the parent's own disc: Σ Jᵀ (J Σ Jᵀ)⁻¹ Δu.
-    Disc,
-}
-
 /// λ_s: factor of the child's σ.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -134,16 +95,6 @@ impl LambdaS {
     }
 }
 
-/// Point at which the footprint's Jacobian is taken.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum AreaAt {
-    /// The child's mean (supp.: "matches our implementation").
-    Child,
-    /// The parent's mean (main text).
-    Parent,
-}
-
 /// A_min: smallest footprint σ₁σ₂.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -156,16 +107,6 @@ pub enum AMin {
     InputPx(f64),
     /// No clamp.
     Off,
-}
-
-/// Growth of a child whose footprint is below A_min.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum AMinMode {
-    /// All three σ by √(A_min/A), at most 50-fold.
-    Iso,
-    /// The two axes that determine the footprint.
-    TwoAxis,
 }
 
 /// Distribution of the parent's opacity over the children.
@@ -182,16 +123,6 @@ pub enum OpacityRule {
     Area,
     /// α_p.
     None,
-}
-
-/// Operand of the colour gain.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum GainSpace {
-    /// The SH sum: contrast about mid-grey (paper).
-    Sh,
-    /// The colour ½ + Σ: intensity.
-    Rgb,
 }
 
 impl Spgr {

@@ -277,7 +277,7 @@ impl Rasterizer {
                 // SAFETY: the queue names each tile once, and its counter gives each
                 // place to one thread.
                 let list = unsafe { lists.take(t) };
-                level.run(AwaitTile { t, grid: &grid, target });
+                level.run(PrefetchTile { t, grid: &grid, target });
                 depth_order(list.entries, list.spare, list.order);
                 let (order, splats) = (&*list.order, list.splats);
                 let sorted = timed.then(Instant::now);
@@ -328,13 +328,13 @@ pub(crate) fn since(start: Option<Instant>) -> Duration {
 
 /// Prefetches the cache lines of tile `t`'s pixels before they are written. The rows lie too
 /// far apart for hardware prefetchers.
-struct AwaitTile<'a> {
+struct PrefetchTile<'a> {
     t: usize,
     grid: &'a Grid,
     target: &'a Target<'a>,
 }
 
-impl Kernel for AwaitTile<'_> {
+impl Kernel for PrefetchTile<'_> {
     type Output = ();
 
     #[inline(always)]

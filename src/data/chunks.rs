@@ -12,7 +12,7 @@
 //! The reader executes nothing in a chunk ([`crate::io::torch`]). Pictures are read one at a time,
 //! so that opening a chunk of 100 MB needs memory for its list of frames only.
 
-use crate::camera::{Camera, Intrinsics};
+use crate::camera::{Camera, CameraError, Intrinsics};
 use crate::io::image::{Rgb, parse_picture};
 use crate::io::torch::{TensorRef, TorchDtype, TorchFile, Value};
 use crate::io::{Error, Result, read};
@@ -23,9 +23,6 @@ use std::sync::Arc;
 
 /// Number of columns of `cameras`.
 const COLUMNS: usize = 18;
-
-/// near and far of every RealEstate10K view in pixelSplat and MVSplat, world units.
-pub const NEAR_FAR: (f32, f32) = (1.0, 100.0);
 
 /// The camera of a frame, independent of the picture's size.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -38,9 +35,12 @@ pub struct ChunkCamera {
 
 impl ChunkCamera {
     /// Returns the camera of a picture of `width` × `height` pixels.
-    pub fn camera(&self, width: usize, height: usize) -> Camera {
+    ///
+    /// # Errors
+    /// Those of [`Camera::new`].
+    pub fn camera(&self, width: usize, height: usize) -> std::result::Result<Camera, CameraError> {
         let intrinsics = Intrinsics::from_normalised(self.normalised, width, height);
-        Camera { intrinsics, world_from_camera: self.world_from_camera }
+        Camera::new(intrinsics, self.world_from_camera)
     }
 
     /// Converts a row of `cameras`; `Err` holds the reason of a refusal.
@@ -153,7 +153,10 @@ impl Chunk {
         let Some(camera) = example.cameras.get(frame) else {
             return Err(Error::format(self.file.path(), "a camera for each picture", "none"));
         };
-        let camera = camera.camera(picture.width, picture.height);
+        let camera = camera.camera(picture.width, picture.height).map_err(|e| {
+            Error::format(self.file.path(), "a valid camera", e.to_string())
+                .at(format!(" example `{}` frame {frame}", example.key))
+        })?;
         Ok((picture, camera))
     }
 }

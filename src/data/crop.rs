@@ -11,13 +11,13 @@
 //! the height: the rounding makes them differ slightly). [`CropRule`] says what becomes
 //! of the principal point.
 
-use crate::camera::{Camera, Intrinsics};
+use crate::camera::{Camera, CameraError, Intrinsics};
 use crate::io::image::Rgb;
 use crate::io::resize::{Filter, Window, resize, resize_window};
 use crate::io::{Error, Result};
 use glam::Vec2;
 
-/// What a crop does to the principal point.
+/// Rule for the principal point of a crop.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum CropRule {
     /// It moves with the pixels: exact for any camera.
@@ -98,8 +98,6 @@ pub struct Cropped {
     pub target_camera: Camera,
     /// Where `target` lies in the photograph.
     pub window: PhotoWindow,
-    /// What the user should know: sizes cut, photographs enlarged.
-    pub warnings: Vec<String>,
 }
 
 /// Resize and crop of one picture: the resampled size, the window's corner in it, and
@@ -171,7 +169,7 @@ impl Plan {
 ///
 /// # Errors
 /// A size below one stride or above what a picture may have; an upscale of 0; a camera
-/// that is not the photograph's.
+/// that is not the photograph's, or whose focal lengths leave the range of f32.
 pub fn crop(photo: &Rgb, camera: &Camera, options: &CropOptions) -> Result<Cropped> {
     let k = &camera.intrinsics;
     let bad = |expected: String, got: String| Err(Error::format("crop", expected, got));
@@ -189,23 +187,10 @@ pub fn crop(photo: &Rgb, camera: &Camera, options: &CropOptions) -> Result<Cropp
             format!("an upscale above 0 and input sides of {stride} to {largest} pixels");
         return bad(expected, format!("upscale {r}, {w}x{h}"));
     }
-    let mut warnings = Vec::new();
     let input_size = (w - w % stride, h - h % stride);
-    if input_size != (w, h) {
-        let (cut_w, cut_h) = input_size;
-        warnings
-            .push(format!("input size {w}x{h} is cut to {cut_w}x{cut_h}, multiples of {stride}"));
-    }
     let size = (photo.width, photo.height);
     let times_r = |(w, h): (usize, usize)| (w * r, h * r);
     let plan = Plan::new(size, times_r((w, h)), times_r(input_size), r);
-    if plan.full.0 > photo.width || plan.full.1 > photo.height {
-        warnings.push(format!(
-            "the photograph of {}x{} is smaller than its resized {}x{}: the target shows no more \
-             detail than the photograph has",
-            photo.width, photo.height, plan.full.0, plan.full.1
-        ));
-    }
     let target = plan.picture(photo);
     let target_k = plan.intrinsics(k, options.rule);
     let (input, input_k) = match options.lr_from {
@@ -218,13 +203,17 @@ pub fn crop(photo: &Rgb, camera: &Camera, options: &CropOptions) -> Result<Cropp
             (plan.picture(photo), plan.intrinsics(k, options.rule))
         }
     };
+    let with = |k: Intrinsics| {
+        let refused =
+            |e: CameraError| Error::format("crop", "a valid resized camera", e.to_string());
+        camera.with_intrinsics(k).map_err(refused)
+    };
     Ok(Cropped {
         input,
-        input_camera: Camera { intrinsics: input_k, ..*camera },
+        input_camera: with(input_k)?,
         target,
-        target_camera: Camera { intrinsics: target_k, ..*camera },
+        target_camera: with(target_k)?,
         window: plan.window(size),
-        warnings,
     })
 }
 
@@ -268,7 +257,7 @@ mod tests {
                     assert!((f32::from(*g) - w).abs() < 2.5, "{g} {w} at r {r}");
                 }
                 let enlarged = (64 * r) as f32 / w as f32 > 1.0 || (48 * r) as f32 / h as f32 > 1.0;
-                assert_eq!(!c.warnings.is_empty(), enlarged, "{:?}", c.warnings);
+                assert_eq!(c.window.scale.min_element() < 1.0, enlarged, "{:?}", c.window);
             }
         }
     }
@@ -279,7 +268,6 @@ mod tests {
         let options = CropOptions { input_size: (100, 75), ..CropOptions::square(0, 2, 16) };
         let c = crop(&picture, &camera, &options).unwrap();
         assert_eq!((c.input.width, c.input.height), (96, 64));
-        assert!(c.warnings[0].contains("96x64"), "{:?}", c.warnings);
         let middle = c.window.to_photo(Vec2::new(96.0, 64.0));
         assert!((middle - Vec2::new(320.0, 240.0)).length() < 4.0, "{middle}");
     }
@@ -322,7 +310,7 @@ mod tests {
             let e = crop(&picture, &camera, &CropOptions::square(side, r, 16)).unwrap_err();
             assert!(e.to_string().contains("upscale"), "{e}");
         }
-        let other = camera.resized(32, 32);
+        let other = camera.resized(32, 32).unwrap();
         assert!(crop(&picture, &other, &CropOptions::square(16, 1, 16)).is_err());
     }
 }

@@ -12,12 +12,12 @@
 //! a crop would have to enlarge. It also skips pairs without a baseline whose near and far are
 //! unknown.
 
-use super::chunks::{Chunk, NEAR_FAR, load_index};
+use super::chunks::{Chunk, ChunkCamera, load_index};
 use super::crop::{CropOptions, crop};
 use super::depth::depth_range;
 use super::procedural::rng::Rng;
 use super::sampler::{SampledFrames, ViewSampler};
-use crate::camera::{Camera, Intrinsics};
+use crate::camera::{Camera, Intrinsics, NearFar};
 use crate::io::image::Rgb;
 use crate::io::scene::{Scene, is_scene, load_scene};
 use crate::io::{Error, Result};
@@ -82,7 +82,7 @@ pub struct TrainingExample {
     /// Pictures to predict, r times the inputs' size.
     pub targets: Vec<Posed>,
     /// Nearest and farthest depth candidate, world units.
-    pub near_far: (f32, f32),
+    pub near_far: NearFar,
     /// True if pictures and poses are mirrored.
     pub flipped: bool,
 }
@@ -112,7 +112,7 @@ pub struct ExampleOptions {
     pub flip: bool,
     /// Nearest and farthest depth candidate. The default is 1 and 100 for chunks and
     /// [`depth_range`] for scenes.
-    pub near_far: Option<(f32, f32)>,
+    pub near_far: Option<NearFar>,
 }
 
 /// Storage of the scenes.
@@ -348,7 +348,8 @@ impl Dataset {
             return Err(Error::format(path, expected, "none"));
         };
         let wide = |k: &Intrinsics| k.fov_x().max(k.fov_y()).to_degrees() > FOV_MAX;
-        let mut units = video.cameras.iter().map(|c| c.camera(1, 1).intrinsics);
+        let unit = |c: &ChunkCamera| Intrinsics::from_normalised(c.normalised, 1, 1);
+        let mut units = video.cameras.iter().map(unit);
         if units.any(|k| wide(&k)) {
             return Ok(None);
         }
@@ -356,7 +357,7 @@ impl Dataset {
         let Some(frames) = sampler.sample(video.frames(), draw.step, draw.seed) else {
             return Ok(None);
         };
-        let near_far = self.options.near_far.unwrap_or(NEAR_FAR);
+        let near_far = self.options.near_far.unwrap_or(NearFar::RE10K);
         self.cropped(key, frames, near_far, &|frame| chunk.load(video, frame))
     }
 
@@ -369,8 +370,8 @@ impl Dataset {
         let near_far = match self.options.near_far {
             Some(range) => range,
             // Frames and near_far are already validated: the error means a zero baseline.
-            None => match depth_range(scene, &frames.context, (None, None)) {
-                Ok(range) => (range.near, range.far),
+            None => match depth_range(scene, &frames.context, None, None) {
+                Ok(range) => NearFar::new(range.near, range.far),
                 Err(_) => return Ok(None),
             },
         };
@@ -386,7 +387,7 @@ impl Dataset {
         &self,
         name: &str,
         frames: SampledFrames,
-        near_far: (f32, f32),
+        near_far: NearFar,
         load: &dyn Fn(usize) -> Result<(Rgb, Camera)>,
     ) -> Result<Option<TrainingExample>> {
         let options = &self.options.crop;

@@ -6,12 +6,13 @@
 //! little; a near end that is too near costs resolution everywhere.
 
 use super::pair::{points_in_view, quantile};
+use crate::camera::NearFar;
 use crate::io::scene::{Scene, Units};
 use crate::io::{Error, Result};
 
-/// A depth range with its origin.
+/// The depth range that a scene's files and cameras give, with its origin.
 #[derive(Clone, Debug, PartialEq)]
-pub struct DepthRange {
+pub struct SceneDepthRange {
     /// Nearest depth, world units of camera z.
     pub near: f32,
     /// Farthest depth.
@@ -25,7 +26,8 @@ pub struct DepthRange {
 /// Fewer sparse points than this in the context views say nothing.
 const POINTS_MIN: usize = 20;
 
-/// near and far for the context frames `context` of `scene`; `given` are the user's.
+/// Determines near and far for the context frames `context` of `scene`. The caller may fix
+/// either end.
 ///
 /// # Errors
 /// A given value that is not above 0, or near not below far; a frame that the scene
@@ -33,34 +35,35 @@ const POINTS_MIN: usize = 20;
 pub fn depth_range(
     scene: &Scene,
     context: &[usize],
-    given: (Option<f32>, Option<f32>),
-) -> Result<DepthRange> {
-    let derived = match given {
+    near: Option<f32>,
+    far: Option<f32>,
+) -> Result<SceneDepthRange> {
+    let derived = match (near, far) {
         (Some(near), Some(far)) => {
-            DepthRange { near, far, reason: "as given".to_owned(), guessed: false }
+            SceneDepthRange { near, far, reason: "as given".to_owned(), guessed: false }
         }
         _ => {
             let d = derive(scene, context)?;
-            let (near, far) = (given.0.unwrap_or(d.near), given.1.unwrap_or(d.far));
-            let reason = match given {
+            let reason = match (near, far) {
                 (Some(_), _) => format!("near as given, far {}", d.reason),
                 (_, Some(_)) => format!("far as given, near {}", d.reason),
                 _ => d.reason,
             };
-            DepthRange { near, far, reason, guessed: d.guessed }
+            let (near, far) = (near.unwrap_or(d.near), far.unwrap_or(d.far));
+            SceneDepthRange { near, far, reason, guessed: d.guessed }
         }
     };
-    let DepthRange { near, far, .. } = derived;
-    if !(near > 0.0 && far > near && far.is_finite()) {
+    let SceneDepthRange { near, far, .. } = derived;
+    if !NearFar::new(near, far).is_valid() {
         let got = format!("near {near}, far {far} ({})", derived.reason);
         return Err(Error::format(&scene.name, "0 < near < far", got));
     }
     Ok(derived)
 }
 
-fn derive(scene: &Scene, context: &[usize]) -> Result<DepthRange> {
-    if let Some((near, far)) = scene.near_far {
-        return Ok(DepthRange {
+fn derive(scene: &Scene, context: &[usize]) -> Result<SceneDepthRange> {
+    if let Some(NearFar { near, far }) = scene.near_far {
+        return Ok(SceneDepthRange {
             near,
             far,
             reason: "from the pose file".to_owned(),
@@ -69,7 +72,8 @@ fn derive(scene: &Scene, context: &[usize]) -> Result<DepthRange> {
     }
     if scene.units == Units::RealEstate10k {
         let reason = "RealEstate10K's usual range".to_owned();
-        return Ok(DepthRange { near: 1.0, far: 100.0, reason, guessed: false });
+        let NearFar { near, far } = NearFar::RE10K;
+        return Ok(SceneDepthRange { near, far, reason, guessed: false });
     }
     let mut cameras = Vec::with_capacity(context.len());
     for &i in context {
@@ -87,7 +91,7 @@ fn derive(scene: &Scene, context: &[usize]) -> Result<DepthRange> {
             let near = quantile(&mut depths, 0.02) / 1.5;
             let far = quantile(&mut depths, 0.98) * 2.0;
             let reason = format!("from {} depths of sparse points", depths.len());
-            return Ok(DepthRange { near, far, reason, guessed: false });
+            return Ok(SceneDepthRange { near, far, reason, guessed: false });
         }
     }
     let mut baseline = 0.0f32;
@@ -104,5 +108,5 @@ fn derive(scene: &Scene, context: &[usize]) -> Result<DepthRange> {
         ));
     }
     let reason = format!("half and 30 times the baseline of {baseline:.4}");
-    Ok(DepthRange { near: 0.5 * baseline, far: 30.0 * baseline, reason, guessed: true })
+    Ok(SceneDepthRange { near: 0.5 * baseline, far: 30.0 * baseline, reason, guessed: true })
 }

@@ -2,19 +2,24 @@
 
 use super::methods::{enlarged, mean, nearest};
 use super::{Benchmark, Case, CaseScores, Loaded, Method, Score, Scores, TargetScores};
+use crate::abi::RasterOptions;
 use crate::camera::Camera;
 use crate::config::LowpassRef;
 use crate::cpu::Rasterizer;
 use crate::data::crop::{CropOptions, CropRule, Cropped, LrFrom};
+use crate::fit::FitOptions;
 use crate::io::image::Rgb;
 use crate::metrics::{mean_gradient, psnr, ssim};
 use crate::model::lpips::Lpips;
 use crate::model::subsplat::feature_channels;
 use crate::model::trunk::Trunk;
 use crate::model::weights::Weights;
-use crate::pipeline::{DepthBounds, DepthRange, Error, Photo, Reconstructor, Result, add_detail};
-use crate::render::render_with;
+use crate::pipeline::{
+    DepthBounds, DepthRange, Error, Photo, Reconstructor, Result, add_detail, fit_to_inputs,
+};
+use crate::render::{Renderer, render_with};
 use crate::splats::Splats;
+use std::ops::ControlFlow;
 use std::path::Path;
 
 /// Default side of the inputs, px.
@@ -38,10 +43,10 @@ pub struct Options {
 impl Options {
     /// The model and every baseline that differs from the others at this `upscale`.
     pub fn new(upscale: usize) -> Self {
-        use Method::{Backbone, Bilinear, Copy, Lowpass, Mean, Subsplat, Uniform};
+        use Method::{Backbone, Bilinear, Copy, Fit, Lowpass, Mean, Subsplat, Uniform};
         let methods = match upscale {
-            1 => vec![Subsplat, Backbone, Copy, Mean],
-            _ => vec![Subsplat, Backbone, Lowpass, Bilinear, Uniform, Copy, Mean],
+            1 => vec![Subsplat, Fit, Backbone, Copy, Mean],
+            _ => vec![Subsplat, Fit, Backbone, Lowpass, Bilinear, Uniform, Copy, Mean],
         };
         Self { upscale, input_size: None, methods, rule: CropRule::Exact, lr_from: LrFrom::HrCrop }
     }
@@ -183,7 +188,7 @@ impl Evaluator {
                     size(inputs.first().map(|c| &c.input)),
                     size(targets.first().map(|c| &c.target)),
                 ],
-                near_far: (bounds.near, bounds.far),
+                near_far: bounds.near_far(),
                 enlarged: targets.iter().any(|c| c.window.scale.min_element() < 1.0),
                 targets: case.views.target.iter().zip(names).map(target).collect(),
             },
@@ -275,6 +280,7 @@ struct Network<'a> {
 enum Set {
     Children,
     Detailed,
+    Fitted,
     Parents,
     Uniform,
 }
@@ -284,6 +290,7 @@ impl Set {
         match method {
             Method::Subsplat => Some(Self::Children),
             Method::Detail => Some(Self::Detailed),
+            Method::Fit => Some(Self::Fitted),
             Method::Backbone | Method::Lowpass | Method::Bilinear => Some(Self::Parents),
             Method::Uniform => Some(Self::Uniform),
             Method::Copy | Method::Mean | Method::Other { .. } => None,
@@ -324,12 +331,28 @@ impl<'a> PictureMaker<'a> {
             return Ok(());
         }
         let children = match (self.current, set, self.splats.take()) {
-            (Some(Set::Children), Set::Detailed, Some(splats)) => splats,
+            (Some(Set::Children), Set::Detailed | Set::Fitted, Some(splats)) => splats,
+            (Some(Set::Detailed), Set::Fitted, Some(splats)) => splats,
             _ => network.splats(set, self.r)?,
         };
         let mut splats = children;
-        if set == Set::Detailed {
+        let detailed = self.current == Some(Set::Detailed);
+        if matches!(set, Set::Detailed | Set::Fitted) && !detailed {
             add_detail(&mut splats, &crops.inputs, network.model.config().upscale)?;
+        }
+        if set == Set::Fitted {
+            let raster = self.raster_options(network, self.r, None);
+            let mut renderer = Renderer::default();
+            let mut go_on = |_: usize| ControlFlow::Continue(());
+            let options = FitOptions::default();
+            fit_to_inputs(
+                &mut splats,
+                &crops.inputs,
+                &raster,
+                &options,
+                &mut renderer,
+                &mut go_on,
+            )?;
         }
         (self.current, self.splats) = (Some(set), Some(splats));
         Ok(())
@@ -350,14 +373,24 @@ impl<'a> PictureMaker<'a> {
         }
     }
 
+    /// The model's rules of rendering pictures whose pixels are 1/`ratio` input pixels.
+    fn raster_options(
+        &self,
+        network: &Network<'_>,
+        ratio: usize,
+        reference: Option<LowpassRef>,
+    ) -> RasterOptions {
+        let mut config = network.model.config().clone();
+        config.render.lowpass_ref = reference.unwrap_or(config.render.lowpass_ref);
+        config.raster_options(ratio as f32, self.bounds.near, self.colour)
+    }
+
     /// Renders the current Gaussians from `camera`, whose pixels are 1/`ratio` input pixels.
     fn render(&mut self, camera: &Camera, ratio: usize, reference: Option<LowpassRef>) -> Vec<f32> {
         let (Some(network), Some(splats)) = (&self.network, &self.splats) else {
             return Vec::new();
         };
-        let mut config = network.model.config().clone();
-        config.render.lowpass_ref = reference.unwrap_or(config.render.lowpass_ref);
-        let options = config.raster_options(ratio as f32, self.bounds.near, self.colour);
+        let options = self.raster_options(network, ratio, reference);
         render_with(&mut self.rasterizer, splats, camera, &options).rgb
     }
 }
@@ -367,7 +400,7 @@ impl Network<'_> {
         let mut config = self.model.config().clone();
         let own;
         let trunk = match set {
-            Set::Children | Set::Detailed => self.model.model().trunk(),
+            Set::Children | Set::Detailed | Set::Fitted => self.model.model().trunk(),
             Set::Parents | Set::Uniform => {
                 config.upscale = r;
                 config.spgr.enabled = set == Set::Uniform;

@@ -14,6 +14,9 @@ pub enum Method {
     Subsplat,
     /// The model with detail from the photographs ([`crate::cpu::detail`]).
     Detail,
+    /// The model with detail, fitted to the photographs ([`crate::fit()`]): what `subsplat run`
+    /// gives.
+    Fit,
     /// Its backbone's Gaussians, one a pixel, rendered at the target's size.
     Backbone,
     /// The same with the low-pass scaled to the input: r² times as many target px².
@@ -39,9 +42,10 @@ pub enum Method {
 }
 
 /// Names of the methods that need no files, in the order of the tables.
-pub(crate) const NAMED: [(&str, Method); 8] = [
+pub(crate) const NAMED: [(&str, Method); 9] = [
     ("subsplat", Method::Subsplat),
     ("detail", Method::Detail),
+    ("fit", Method::Fit),
     ("backbone", Method::Backbone),
     ("lowpass", Method::Lowpass),
     ("bilinear", Method::Bilinear),

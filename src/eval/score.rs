@@ -1,5 +1,6 @@
 //! Scores of pictures, and their means.
 
+use crate::camera::NearFar;
 use serde::Serialize;
 
 /// Similarity of a picture to the photograph.
@@ -52,7 +53,7 @@ pub struct CaseScores {
     /// Width and height of the inputs and of the targets, px.
     pub sizes: [(usize, usize); 2],
     /// Nearest and farthest depth candidate, world units.
-    pub near_far: (f32, f32),
+    pub near_far: NearFar,
     /// True if a photograph was enlarged to the target's size.
     pub enlarged: bool,
     /// One for each target.
@@ -124,7 +125,7 @@ mod tests {
             scene: scene.to_owned(),
             context: vec![0, 1],
             sizes: [(1, 1); 2],
-            near_far: (1.0, 2.0),
+            near_far: NearFar::new(1.0, 2.0),
             enlarged: false,
             targets: values.iter().map(|v| target(*v)).collect(),
         };

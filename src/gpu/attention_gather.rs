@@ -111,7 +111,7 @@ impl<'a> AttentionGatherArgs<'a> {
             value: word(g.value),
             renormalise: u32::from(g.renormalise),
             points_per_level: u32::from(g.points_per_level),
-            half_pixel: if g.half_pixel { 0.5 } else { 0.0 },
+            half_pixel: g.sample_convention.shift() as f32,
             logit_scale: g.logit_scale as f32,
             cells: word(self.maps.len() / g.stride.max(1)),
             point_gradient: u32::from(g.point_gradient),

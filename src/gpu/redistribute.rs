@@ -1,7 +1,7 @@
 //! Opacity redistribution (SubSplat, "Opacity allocation"; supplement A.3).
 //!
 //! CPU version: [`crate::cpu::redistribute`]. WGSL: kernels/redistribute.wgsl,
-//! kernels/redistribute_bwd.wgsl. Tests: tests/gpu/twins.rs.
+//! kernels/redistribute_bwd.wgsl. Tests: tests/gpu/redistribute.rs.
 
 use crate::abi::{RedistributeUniform, Rule};
 use crate::gpu::buffers::Binding;

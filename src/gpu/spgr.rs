@@ -3,7 +3,8 @@
 //! CPU version: [`crate::cpu::spgr`]. WGSL: kernels/spgr.wgsl. Tests: tests/gpu/spgr.rs.
 
 use crate::abi::{
-    CHILDREN_MAX, FRUSTUM_MARGIN, HEAD_STRIDE, Rules, SPGR_CAMERA_STRIDE, SPLAT_STRIDE, SpgrUniform,
+    AMinMode, AreaAt, CHILDREN_MAX, DepthDir, DepthUnit, FRUSTUM_MARGIN, GainSpace, HEAD_STRIDE,
+    PrimaryView, Rules, SPGR_CAMERA_STRIDE, SPLAT_STRIDE, Slide, SpgrUniform,
 };
 use crate::camera::Camera;
 use crate::gpu::buffers::Binding;
@@ -82,14 +83,14 @@ impl<'a> SpgrArgs<'a> {
             first: (self.first + parents.start) as u32,
             views: self.cameras.len() as u32,
             rule: r.opacity as u32,
-            nearest_visible: u32::from(r.nearest_visible),
+            nearest_visible: u32::from(r.primary_view == PrimaryView::NearestVisible),
             bounded: u32::from(r.offset_bound.is_some()),
-            ray: u32::from(r.ray),
-            relative_depth: u32::from(r.relative_depth),
-            disc: u32::from(r.disc),
-            area_at_parent: u32::from(r.area_at_parent),
-            two_axis: u32::from(r.two_axis),
-            rgb_gain: u32::from(r.rgb_gain),
+            ray: u32::from(r.depth_dir == DepthDir::Ray),
+            relative_depth: u32::from(r.depth_unit == DepthUnit::Relative),
+            disc: u32::from(r.slide == Slide::Disc),
+            area_at_parent: u32::from(r.area_at == AreaAt::Parent),
+            two_axis: u32::from(r.a_min_mode == AMinMode::TwoAxis),
+            rgb_gain: u32::from(r.gain_space == GainSpace::Rgb),
             pad0: 0,
             pad1: 0,
             offset_bound: r.offset_bound.unwrap_or(0.0) as f32,

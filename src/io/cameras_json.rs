@@ -19,7 +19,7 @@
 use super::assemble::{Draft, Lens, assemble, camera_error, find_image, orthonormal};
 use super::scene::{Frame, Scene, SceneFormat, Units};
 use super::{Error, Result, read, write_atomic};
-use crate::camera::{Camera, Intrinsics};
+use crate::camera::{Camera, Intrinsics, NearFar};
 use glam::{DMat4, DVec4};
 use serde::{Deserialize, Serialize};
 use std::io::Write;
@@ -49,14 +49,14 @@ pub struct CameraFile {
     /// Unit of length.
     pub units: Units,
     /// Nearest and farthest depth of the scene, camera z in world units.
-    pub near_far: Option<(f32, f32)>,
+    pub near_far: Option<NearFar>,
 }
 
 /// Fields of the file that concern all frames.
 #[derive(Clone, Copy, Default)]
 struct FileInfo {
     units: Units,
-    near_far: Option<(f32, f32)>,
+    near_far: Option<NearFar>,
 }
 
 #[derive(Deserialize)]
@@ -188,7 +188,9 @@ fn drafts(path: &Path) -> Result<(Vec<Draft>, FileInfo)> {
         _ => Units::Unknown,
     };
     let near_far = match (file.near, file.far) {
-        (Some(near), Some(far)) if near > 0.0 && far > near && far.is_finite() => Some((near, far)),
+        (Some(near), Some(far)) if NearFar::new(near, far).is_valid() => {
+            Some(NearFar::new(near, far))
+        }
         (None, None) => None,
         (near, far) => {
             let got = format!("near {near:?}, far {far:?}");
@@ -290,7 +292,7 @@ pub fn save_cameras_json(path: &Path, content: &CameraFile) -> Result<()> {
         Units::Metres => Some("metres"),
         Units::RealEstate10k => Some("re10k"),
     };
-    let (near, far) = content.near_far.unzip();
+    let (near, far) = content.near_far.map(|range| (range.near, range.far)).unzip();
     let out = OutFile { convention: CONVENTION, units, near, far, frames: frames.collect() };
     let text = serde_json::to_string_pretty(&out)
         .map_err(|e| Error::io(path, std::io::Error::other(e)))?;

@@ -381,9 +381,10 @@ impl Incoming {
         self.sh.get_mut(i * set..(i + 1) * set)
     }
 
-    /// Makes a set of all Gaussians.
+    /// Makes a set of all Gaussians. Their numbers may be NaN or infinite.
     pub fn into_splats(self, path: &Path) -> Result<Splats> {
-        Splats::new(self.rows, self.sh, Vec::new(), self.sh_degree, ShBasis::Standard)
+        let Self { rows, sh, sh_degree } = self;
+        Splats::new_with_unchecked_numbers(rows, sh, Vec::new(), sh_degree, ShBasis::Standard)
             .map_err(|e| Error::format(path, "Gaussians of one shape", e.to_string()))
     }
 }

@@ -12,7 +12,7 @@ use super::assemble::{Draft, Lens, assemble};
 use super::image::Rgb;
 use super::undistort::{Distortion, pinhole, undistort};
 use super::{Error, Result, cameras_json, colmap, matrices, re10k, transforms};
-use crate::camera::Camera;
+use crate::camera::{Camera, NearFar};
 use glam::Vec3;
 use std::path::{Path, PathBuf};
 
@@ -87,7 +87,9 @@ impl Frame {
         let intrinsics = pinhole(&self.camera.intrinsics, &self.distortion).map_err(|got| {
             Error::format(&self.image, "a lens distortion that can be undone", got)
         })?;
-        Ok(Camera { intrinsics, ..self.camera })
+        self.camera
+            .with_intrinsics(intrinsics)
+            .map_err(|e| Error::format(&self.image, "a valid camera", e.to_string()))
     }
 
     /// Decodes the picture and removes the lens distortion.
@@ -123,7 +125,7 @@ pub struct Scene {
     /// Unit of length.
     pub units: Units,
     /// Nearest and farthest depth of the pose file, camera z in world units.
-    pub near_far: Option<(f32, f32)>,
+    pub near_far: Option<NearFar>,
     /// Warnings for the user, one line each.
     pub warnings: Vec<String>,
 }

@@ -12,7 +12,7 @@ use super::primaries::primaries;
 use super::trace::Trace;
 use super::weights::{Weights, read_tensors};
 use super::{Primaries, Views};
-use crate::camera::{Camera, Intrinsics};
+use crate::camera::{Camera, Intrinsics, NearFar};
 use crate::config::{Backbone, Mvsplat as Settings, Primaries as PrimariesSettings, ShFrame};
 use candle_core::{Error, Result, Tensor, bail};
 use glam::Mat4;
@@ -155,7 +155,7 @@ pub fn views(tensors: &BTreeMap<String, Tensor>) -> Result<Views> {
     };
     let (poses, k) = (numbers("in.extrinsics", &[4, 4])?, numbers("in.intrinsics", &[3, 3])?);
     let (near, far) = (numbers("in.near", &[])?, numbers("in.far", &[])?);
-    let (mut cameras, mut near_far) = (Vec::new(), Vec::new());
+    let mut cameras = Vec::new();
     for (pose, k) in poses.chunks_exact(16).zip(k.chunks_exact(9)) {
         let intrinsics = Intrinsics::from_normalised([k[0], k[4], k[2], k[5]], w, h);
         let mut m = [0f32; 16];
@@ -163,7 +163,8 @@ pub fn views(tensors: &BTreeMap<String, Tensor>) -> Result<Views> {
         let pose = Mat4::from_cols_array(&m).transpose();
         cameras.push(Camera::new(intrinsics, pose).map_err(Error::wrap)?);
     }
-    near_far.extend(near.into_iter().zip(far));
+    let range = |(near, far)| NearFar { near, far };
+    let near_far: Vec<NearFar> = near.into_iter().zip(far).map(range).collect();
     Views::new(
         images.clone(),
         cameras.chunks(v).map(<[_]>::to_vec).collect(),

@@ -10,7 +10,7 @@
 use super::Views;
 use super::backbone::SmallBackbone;
 use super::backbone::small::DisparityMean;
-use crate::camera::Camera;
+use crate::camera::{Camera, NearFar};
 use candle_core::Result;
 
 /// Factor by which the searched range extends the given one on both sides: content nearer
@@ -36,13 +36,13 @@ pub(super) fn estimate_depth_range(
     let mut estimated = views.clone();
     for b in 0..views.scenes() {
         let mut wide = half_size(&views.scene(b)?, stride)?;
-        for (near, far) in wide.near_far.iter_mut().flatten() {
-            (*near, *far) = (*near / SEARCH_FACTOR, *far * SEARCH_FACTOR);
+        for range in wide.near_far.iter_mut().flatten() {
+            *range = NearFar::new(range.near / SEARCH_FACTOR, range.far * SEARCH_FACTOR);
         }
         let index = network.depth(&wide, DisparityMean::AroundMode)?.index;
         let top = (network.candidates() - 1) as f32;
         let mut depths = Vec::with_capacity(index.elem_count());
-        for (v, (near, far)) in wide.near_far[0].iter().enumerate() {
+        for (v, NearFar { near, far }) in wide.near_far[0].iter().enumerate() {
             let (low, high) = (far.recip(), near.recip());
             let one = index.get(v)?.flatten_all()?.to_vec1::<f32>()?;
             depths.extend(one.iter().map(|i| (low + i / top * (high - low)).recip()));
@@ -56,12 +56,12 @@ pub(super) fn estimate_depth_range(
 
 /// Near and far from quantiles of `depths` with their margins; `None` if `depths` is empty
 /// or the quantiles are not finite.
-fn quantile_range(depths: &mut [f32]) -> Option<(f32, f32)> {
+fn quantile_range(depths: &mut [f32]) -> Option<NearFar> {
     depths.sort_unstable_by(f32::total_cmp);
     let last = depths.len().checked_sub(1)?;
     let low = (OUTLIER_SHARE * last as f32) as usize;
     let (near, far) = (depths[low] * (1.0 - MARGIN), depths[last - low] * (1.0 + MARGIN));
-    (near > 0.0 && far > near && far.is_finite()).then_some((near, far))
+    Some(NearFar { near, far }).filter(|range| range.is_valid())
 }
 
 /// Halves the images and their cameras and crops them centrally to multiples of `stride`.
@@ -77,7 +77,7 @@ fn half_size(views: &Views, stride: usize) -> Result<Views> {
     let images = views.images.reshape((b * v, c, h, w))?.avg_pool2d(2)?;
     let images = images.narrow(2, top, height)?.narrow(3, left, width)?.contiguous()?;
     let camera = |camera: &Camera| {
-        let half = camera.resized(w / 2, h / 2);
+        let half = camera.resized_unchecked(w / 2, h / 2);
         let k = half.intrinsics.cropped(left as f32, top as f32, width, height);
         Camera { intrinsics: k, ..half }
     };
@@ -97,7 +97,7 @@ mod tests {
         let pose = |x: f32| Mat4::from_translation(Vec3::new(x, 0.0, 0.0));
         let cameras = [0.0, 0.3].map(|x| Camera::new(k, pose(x)).unwrap()).to_vec();
         let images = Tensor::rand(0.0f32, 1.0, (1, 2, 3, h, w), &Device::Cpu).unwrap();
-        Views::new(images, vec![cameras], vec![vec![(1.0, 100.0); 2]]).unwrap()
+        Views::new(images, vec![cameras], vec![vec![NearFar::RE10K; 2]]).unwrap()
     }
 
     #[test]
@@ -128,7 +128,7 @@ mod tests {
     fn outliers_do_not_count() {
         let mut depths: Vec<f32> = (0..1000).map(|i| 2.0 + i as f32 * 0.006).collect();
         (depths[3], depths[500]) = (0.01, 900.0);
-        let (near, far) = quantile_range(&mut depths).unwrap();
+        let NearFar { near, far } = quantile_range(&mut depths).unwrap();
         assert!((near - 1.8).abs() < 0.1 && (far - 8.8).abs() < 0.2, "{near} {far}");
         assert!(quantile_range(&mut []).is_none());
         assert!(quantile_range(&mut [f32::NAN; 4]).is_none());

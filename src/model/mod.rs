@@ -22,7 +22,7 @@ pub mod weights;
 
 pub use crate::ops::Backend;
 
-use crate::camera::Camera;
+use crate::camera::{Camera, NearFar};
 use crate::config::FeatureLevel;
 use candle_core::{Result, Tensor, bail};
 
@@ -43,7 +43,7 @@ pub struct Views {
     /// `[B][V]`, intrinsics in pixels of H × W.
     pub cameras: Vec<Vec<Camera>>,
     /// `[B][V]`: nearest and farthest depth candidate (camera z), world units.
-    pub near_far: Vec<Vec<(f32, f32)>>,
+    pub near_far: Vec<Vec<NearFar>>,
 }
 
 impl Views {
@@ -54,7 +54,7 @@ impl Views {
     pub fn new(
         images: Tensor,
         cameras: Vec<Vec<Camera>>,
-        near_far: Vec<Vec<(f32, f32)>>,
+        near_far: Vec<Vec<NearFar>>,
     ) -> Result<Self> {
         let (b, v, c, h, w) = images.dims5()?;
         if c != 3 {
@@ -69,7 +69,7 @@ impl Views {
         }
         if near_far.len() != b || near_far.iter().any(|s| s.len() != v) {
             let got: Vec<_> = near_far.iter().map(Vec::len).collect();
-            bail!("views: expected {v} (near, far) pairs for each of {b} scenes, got {got:?}");
+            bail!("views: expected {v} depth ranges for each of {b} scenes, got {got:?}");
         }
         for camera in cameras.iter().flatten() {
             let k = camera.intrinsics;
@@ -78,8 +78,9 @@ impl Views {
                 bail!("views: expected cameras of {w}x{h} pixels like the images, got {got:?}");
             }
         }
-        for &(near, far) in near_far.iter().flatten() {
-            if !(near > 0.0 && far > near && far.is_finite()) {
+        for &range in near_far.iter().flatten() {
+            if !range.is_valid() {
+                let NearFar { near, far } = range;
                 bail!("views: expected 0 < near < far, got near = {near}, far = {far}");
             }
         }

@@ -13,10 +13,7 @@
 use super::embed::Descriptors;
 use super::mlp::{LayerNorm, affine, gelu, linear};
 use crate::abi::{HEAD_GEOMETRY_LEN, HEAD_STRIDE};
-use crate::config::{
-    AMin, AMinMode, AreaAt, Config, DepthDir, DepthUnit, GainSpace, OpacityRule, PrimaryView,
-    Slide, SpgrHead,
-};
+use crate::config::{AMin, Config, OpacityRule, SpgrHead};
 use crate::ops::columns::columns;
 use crate::ops::redistribute::Rule;
 use crate::ops::spgr::Rules;
@@ -179,17 +176,17 @@ pub fn rules(config: &Config, side: usize) -> Rules {
     };
     Rules {
         side,
-        nearest_visible: s.primary_view == PrimaryView::NearestVisible,
+        primary_view: s.primary_view,
         offset_bound: s.offset_bound,
         beta_z: s.beta_z,
-        ray: s.depth_dir == DepthDir::Ray,
-        relative_depth: s.depth_unit == DepthUnit::Relative,
-        disc: ablations.slide == Slide::Disc,
+        depth_dir: s.depth_dir,
+        depth_unit: s.depth_unit,
+        slide: ablations.slide,
         lambda_s: s.lambda_s.value(k),
         dlog_clamp: s.dlog_clamp,
-        area_at_parent: ablations.area_at == AreaAt::Parent,
+        area_at: ablations.area_at,
         a_min,
-        two_axis: ablations.a_min_mode == AMinMode::TwoAxis,
+        a_min_mode: ablations.a_min_mode,
         opacity: match s.opacity {
             OpacityRule::Linear => Rule::Linear,
             OpacityRule::OpticalDepth => Rule::OpticalDepth,
@@ -200,6 +197,6 @@ pub fn rules(config: &Config, side: usize) -> Rules {
         lowpass_target: f64::from(config.render.lowpass_px2(side as f32)),
         lowpass_input: f64::from(config.render.lowpass),
         delta: s.delta,
-        rgb_gain: ablations.gain_space == GainSpace::Rgb,
+        gain_space: ablations.gain_space,
     }
 }

@@ -70,7 +70,7 @@ impl Children {
     /// Returns packed rows for the renderer and the file writers.
     ///
     /// # Errors
-    /// Tensors are not `f32` or do not fit one another.
+    /// Tensors are not `f32`, do not fit one another, or hold a number that is not finite.
     pub fn to_splats(&self) -> Result<Splats> {
         Splats::from_tensors(&self.rows, &self.sh, &self.gain, self.sh_basis)
     }
@@ -451,7 +451,7 @@ impl Scene<'_> {
         Spgr {
             rules: self.rules,
             cameras: self.views.cameras[0].clone(),
-            near: self.views.near_far[0].iter().map(|&(near, _)| near).collect(),
+            near: self.views.near_far[0].iter().map(|range| range.near).collect(),
             per_view: self.per_view,
             first: span.first,
         }

@@ -283,7 +283,8 @@ pub fn occlusion_gate(points: &Tensor, z: &Tensor, depths: &Tensor) -> Result<Te
     let (views, height, width) = depths.dims3()?;
     if two != 2 || z.dims() != [n, v] || views != v {
         bail!(
-            "occlusion gate: expected points [N, V, 2], z [N, V] and depths [V, H, W], got {:?}, {:?} and {:?}",
+            "occlusion gate: expected points [N, V, 2], z [N, V] and depths [V, H, W], got {:?}, \
+             {:?} and {:?}",
             points.dims(),
             z.dims(),
             depths.dims()

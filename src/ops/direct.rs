@@ -19,14 +19,14 @@ const NAME: &str = "direct rendering";
 /// this camera and these options `fill` writes.
 ///
 /// # Errors
-/// A camera or an option outside its range; the error of `fill`.
+/// An option outside its range; the error of `fill`.
 pub fn rasterize_footprints(
     count: usize,
     camera: &Camera,
     options: &RasterOptions,
     fill: impl FnOnce(&mut [Footprint]) -> Result<()>,
 ) -> Result<Tensor> {
-    check_options(camera, options)?;
+    check_options(options)?;
     let mut out = Vec::new();
     Rasterizer::new().render_footprints(count, camera, options, fill, &mut out)?;
     let k = camera.intrinsics;
@@ -51,7 +51,8 @@ pub fn spgr_footprints(
     let Some(sh_degree) = degree_of(d).filter(|_| rows == n && rgb == 3 && out.len() == count)
     else {
         bail!(
-            "{NAME}: expected sh [{n}, 1, 4, 9, 16 or 25, 3] and {count} footprints, got {:?} and {}",
+            "{NAME}: expected sh [{n}, 1, 4, 9, 16 or 25, 3] and {count} footprints, got {:?} \
+             and {}",
             sh.dims(),
             out.len()
         );

@@ -13,7 +13,6 @@ mod conv;
 pub mod conv2d;
 pub mod conv3d;
 pub mod direct;
-pub mod dssim;
 pub mod feed_forward;
 pub mod join;
 pub mod linear;

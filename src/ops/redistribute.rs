@@ -42,7 +42,8 @@ pub fn redistribute_on(
     let (p, k) = logits.dims2()?;
     if areas.dims() != [p, k] || opacities.dims() != [p] {
         bail!(
-            "redistribute: expected areas [{p}, {k}] and opacities [{p}] like logits, got {:?} and {:?}",
+            "redistribute: expected areas [{p}, {k}] and opacities [{p}] like logits, got {:?} \
+             and {:?}",
             areas.dims(),
             opacities.dims()
         );

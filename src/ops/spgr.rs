@@ -39,14 +39,16 @@ impl Spgr {
         }
         if parents.dims() != [n, SPLAT_STRIDE] || head.dims() != [n, k, HEAD_STRIDE] {
             bail!(
-                "{NAME}: expected parents [N, {SPLAT_STRIDE}] and head records [N, {k}, {HEAD_STRIDE}], got {:?} and {:?}",
+                "{NAME}: expected parents [N, {SPLAT_STRIDE}] and head records \
+                 [N, {k}, {HEAD_STRIDE}], got {:?} and {:?}",
                 parents.dims(),
                 head.dims()
             );
         }
         if self.cameras.is_empty() || self.near.len() != self.cameras.len() || self.per_view == 0 {
             bail!(
-                "{NAME}: expected one near plane per camera and parents in every view, got {} cameras, {} near planes, {} parents per view",
+                "{NAME}: expected one near plane per camera and parents in every view, got {} \
+                 cameras, {} near planes, {} parents per view",
                 self.cameras.len(),
                 self.near.len(),
                 self.per_view
@@ -189,7 +191,8 @@ fn finite<T: Number>(
     };
     let n = at / k;
     bail!(
-        "{NAME}: expected finite {what}, got child {} of parent {} = {:?} from parent {:?} and head record {:?}",
+        "{NAME}: expected finite {what}, got child {} of parent {} = {:?} from parent {:?} and \
+         head record {:?}",
         at % k,
         call.first + n,
         &rows[at * SPLAT_STRIDE..(at + 1) * SPLAT_STRIDE],

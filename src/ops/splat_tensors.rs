@@ -67,7 +67,8 @@ impl Splats {
     /// Copies tensors of [`Splats::to_tensors`]'s shapes back.
     ///
     /// # Errors
-    /// A tensor of another rank or dtype, or shapes that do not match.
+    /// A tensor of another rank or dtype, shapes that do not match, or a number that is not
+    /// finite.
     pub fn from_tensors(
         rows: &Tensor,
         sh: &Tensor,

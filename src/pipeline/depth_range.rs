@@ -7,7 +7,7 @@
 //! ([`SubSplat::estimate_depth_range`](crate::model::subsplat::SubSplat::estimate_depth_range)).
 
 use super::{Error, Result};
-use crate::camera::Camera;
+use crate::camera::{Camera, NearFar};
 use crate::check::{PairReport, Verdict};
 use crate::data::depth::depth_range;
 use crate::io::scene::{Scene, Units};
@@ -17,8 +17,6 @@ use std::fmt;
 const NEAR_BASELINES: f32 = 0.5;
 /// Farthest depth of a guess, in the same unit.
 const FAR_BASELINES: f32 = 30.0;
-/// Near and far of every RealEstate10K scene (pixelSplat, MVSplat), world units.
-const NEAR_FAR_RE10K: (f32, f32) = (1.0, 100.0);
 
 /// Ends of the depth range that the caller fixes, world units of camera z.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -157,7 +155,7 @@ impl DepthBounds {
 
     /// RealEstate10K's near 1 and far 100.
     pub fn re10k() -> Self {
-        let (near, far) = NEAR_FAR_RE10K;
+        let NearFar { near, far } = NearFar::RE10K;
         Self { near, far, source: DepthSource::RealEstate10k }
     }
 
@@ -172,21 +170,26 @@ impl DepthBounds {
             let expected = format!("frames below {}", scene.frames.len());
             return Err(Error::argument(&scene.name, expected, i.to_string()));
         }
-        if let Some((near, far)) = scene.near_far {
+        if let Some(NearFar { near, far }) = scene.near_far {
             return Ok(Some(Self { near, far, source: DepthSource::PoseFile }));
         }
         if scene.units == Units::RealEstate10k {
             return Ok(Some(Self::re10k()));
         }
         // An error means cameras at one place: `initial_bounds` reports it where it matters.
-        let points = depth_range(scene, context, (None, None)).ok().filter(|r| !r.guessed);
+        let points = depth_range(scene, context, None, None).ok().filter(|r| !r.guessed);
         let source = DepthSource::SparsePoints;
         Ok(points.map(|range| Self { near: range.near, far: range.far, source }))
     }
 
+    /// Returns the two ends.
+    pub(crate) fn near_far(&self) -> NearFar {
+        NearFar { near: self.near, far: self.far }
+    }
+
     /// Returns whether 0 < near < far, both finite.
     fn is_valid(&self) -> bool {
-        self.near > 0.0 && self.far > self.near && self.far.is_finite()
+        self.near_far().is_valid()
     }
 }
 

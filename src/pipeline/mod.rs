@@ -27,6 +27,7 @@
 //! 4. The small backbone estimates near and far at half size, unless the caller fixed one.
 //! 5. The network predicts one primary Gaussian per input pixel, then its children.
 //! 6. The photographs add detail to the children's colours ([`Detail`]).
+//! 7. Sizes, opacities and colours are fitted to the photographs ([`crate::fit()`]).
 //!
 //! [`Reconstructor::run`] executes all of them. [`Reconstructor::prepare`] executes steps 1 to 3;
 //! the caller can then free large photographs before the network runs.
@@ -34,6 +35,7 @@
 mod depth_range;
 mod detail;
 mod error;
+mod fit;
 mod options;
 mod photo;
 mod poses;
@@ -57,6 +59,7 @@ pub use warning::Warning;
 
 pub(crate) use depth_range::{initial_bounds, refined_bounds};
 pub(crate) use detail::add_detail;
+pub(crate) use fit::fit_to_inputs;
 pub(crate) use poses::check_pairs;
 
 use crate::config::{Backbone, Config};

@@ -2,6 +2,7 @@
 
 use super::{DepthBounds, DepthRange, Error, Result, initial_bounds};
 use crate::camera::Camera;
+use crate::fit::FitOptions;
 
 /// Options of [`Reconstructor::run`](super::Reconstructor::run). The defaults are those of the
 /// program `subsplat run`.
@@ -29,6 +30,8 @@ pub struct Options {
     pub check: Check,
     /// Source of colour detail. Default: [`Detail::Photographs`].
     pub detail: Detail,
+    /// Fit of the Gaussians to the photographs ([`crate::fit()`]). Default: four steps.
+    pub fit: FitOptions,
 }
 
 impl Default for Options {
@@ -39,6 +42,7 @@ impl Default for Options {
             depth_prior: None,
             check: Check::default(),
             detail: Detail::default(),
+            fit: FitOptions::default(),
         }
     }
 }
@@ -76,6 +80,13 @@ impl Options {
     #[must_use]
     pub fn with_detail(mut self, detail: Detail) -> Self {
         self.detail = detail;
+        self
+    }
+
+    /// Sets [`Options::fit`]; [`FitOptions::off`] keeps the network's Gaussians.
+    #[must_use]
+    pub fn with_fit(mut self, fit: FitOptions) -> Self {
+        self.fit = fit;
         self
     }
 

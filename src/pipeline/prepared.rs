@@ -3,12 +3,13 @@
 use super::progress::Tracker;
 use super::{
     DepthBounds, Detail, Options, Progress, Reconstruction, Reconstructor, Result, Stage, Warning,
-    add_detail,
+    add_detail, fit_to_inputs,
 };
 use crate::camera::Camera;
 use crate::check::PairReport;
 use crate::data::crop::Cropped;
 use crate::io::image::{Depth, Rgb};
+use crate::render::Renderer;
 use std::ops::ControlFlow;
 
 /// Cropped photographs with a depth range, from [`Reconstructor::prepare`]. It holds nothing of
@@ -87,12 +88,28 @@ impl Prepared<'_> {
                 detail = Detail::Photographs;
             }
         }
+        let colour = Rgb::mean_colour(inputs.iter().map(|c| &c.input));
+        let raster_options = config.raster_options(config.upscale as f32, bounds.near, colour);
+        let mut fit = None;
+        if options.fit.steps > 0 {
+            tracker.begin(Stage::Fit, progress)?;
+            let steps = options.fit.steps as f32;
+            let mut stepped = |step: usize| match tracker.advance(step as f32 / steps, progress) {
+                Ok(()) => ControlFlow::Continue(()),
+                Err(_) => ControlFlow::Break(()),
+            };
+            let mut renderer = Renderer::new(model.backend());
+            let (raster, how) = (&raster_options, &options.fit);
+            let done =
+                fit_to_inputs(&mut splats, &inputs, raster, how, &mut renderer, &mut stepped)?;
+            warnings
+                .extend(renderer.take_warning().map(|reason| Warning::CpuInsteadOfGpu { reason }));
+            fit = Some(done);
+        }
         let depths = inputs.iter().zip(distances);
         let depths = depths.map(|(c, d)| camera_depth(&c.input_camera, d)).collect();
         warnings.extend(Warning::of_bounds(&bounds));
         warnings.extend(model.backend_warning());
-        let colour = Rgb::mean_colour(inputs.iter().map(|c| &c.input));
-        let raster_options = config.raster_options(config.upscale as f32, bounds.near, colour);
         Ok(Reconstruction {
             splats,
             inputs,
@@ -101,6 +118,7 @@ impl Prepared<'_> {
             initial_bounds,
             raster_options,
             detail,
+            fit,
             reports,
             warnings,
             stage_times: tracker.finish(progress)?,

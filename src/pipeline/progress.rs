@@ -23,6 +23,8 @@ pub enum Stage {
     Subsplat,
     /// Photographs add detail to colours.
     Detail,
+    /// Sizes, opacities and colours are fitted to the photographs.
+    Fit,
 }
 
 impl Stage {
@@ -36,6 +38,7 @@ impl Stage {
             Self::Primaries => "primaries",
             Self::Subsplat => "subsplat",
             Self::Detail => "detail",
+            Self::Fit => "fit",
         }
     }
 }

@@ -5,6 +5,7 @@ use crate::abi::RasterOptions;
 use crate::camera::Camera;
 use crate::check::PairReport;
 use crate::data::crop::Cropped;
+use crate::fit::FitReport;
 use crate::io::image::Depth;
 use crate::io::{SaveOptions, SaveReport, save_splats};
 use crate::render::{Picture, comment_of_options, render};
@@ -22,6 +23,7 @@ pub struct Reconstruction {
     pub(super) initial_bounds: DepthBounds,
     pub(super) raster_options: RasterOptions,
     pub(super) detail: Detail,
+    pub(super) fit: Option<FitReport>,
     pub(super) reports: Vec<PairReport>,
     pub(super) warnings: Vec<Warning>,
     pub(super) stage_times: Vec<StageTime>,
@@ -90,6 +92,11 @@ impl Reconstruction {
     /// the network's input.
     pub fn detail(&self) -> Detail {
         self.detail
+    }
+
+    /// Losses before and after the fit to the photographs; `None` without one.
+    pub fn fit(&self) -> Option<&FitReport> {
+        self.fit.as_ref()
     }
 
     /// Reports of the check, one for each pair of consecutive photographs; empty without one.

@@ -6,7 +6,7 @@ use super::{
     Check, DepthBounds, DepthRange, DepthSource, Detail, Options, Photo, Prepared, Progress,
     Reconstruction, Result, Stage, check_pairs, is_mvsplat, poses, refined_bounds,
 };
-use crate::camera::Camera;
+use crate::camera::{Camera, NearFar};
 use crate::config::{Config, Preset};
 use crate::data::crop::{CropOptions, Cropped};
 use crate::model::subsplat::SubSplat;
@@ -194,22 +194,27 @@ impl Reconstructor {
         bounds: DepthBounds,
         range: DepthRange,
     ) -> Result<(Views, DepthBounds)> {
-        let views = views_of(inputs, (bounds.near, bounds.far))?;
+        let views = views_of(inputs, bounds.near_far())?;
         if range != DepthRange::Auto {
             return Ok((views, bounds));
         }
         let views = self.model.estimate_depth_range(&views)?;
-        let (near, far) = views.near_far[0][0];
-        if (near, far) == (bounds.near, bounds.far) {
+        let estimate = views.near_far[0][0];
+        if estimate == bounds.near_far() {
             return Ok((views, bounds));
         }
         let source = DepthSource::Estimated { from: Box::new(bounds.source) };
-        Ok((views, DepthBounds { near, far, source }))
+        Ok((views, DepthBounds::new(estimate.near, estimate.far, source)))
     }
 
     /// Reports whether the small backbone estimates near and far: MVSplat has no such stage.
     pub(super) fn estimates_depth_range(&self, options: &Options) -> bool {
         options.depth_range == DepthRange::Auto && !is_mvsplat(self.config())
+    }
+
+    /// The device of the network and the renderer.
+    pub(super) fn backend(&self) -> &Backend {
+        &self.backend
     }
 
     /// A warning where the GPU did not do all of its work.
@@ -225,6 +230,7 @@ impl Reconstructor {
         let pixels = n * w as f32 * h as f32 / (2.0 * 256.0 * 256.0);
         let mvsplat = is_mvsplat(self.config());
         let estimates = self.estimates_depth_range(options);
+        let children = (self.config().upscale * self.config().upscale) as f32 / 4.0;
         let aggregates = self.config().agg.enabled;
         let costs = [
             (Stage::Crop, 0.015 * n),
@@ -234,10 +240,14 @@ impl Reconstructor {
             (Stage::Primaries, 0.01 * pixels),
             (Stage::Subsplat, if aggregates { 0.25 } else { 0.06 } * pixels),
             (Stage::Detail, if options.detail == Detail::Off { 0.0 } else { 0.01 * pixels }),
+            (Stage::Fit, FIT_STEP * options.fit.steps as f32 * pixels * children),
         ];
         costs.map(|(stage, cost)| StageCost { stage, cost }).to_vec()
     }
 }
+
+/// Duration of one step of the fit, in the unit of [`Reconstructor::stage_costs`].
+const FIT_STEP: f32 = 0.2;
 
 fn crop_all(
     photos: &[Photo],
@@ -255,7 +265,7 @@ fn crop_all(
 }
 
 /// Cropped photographs of one scene as the network's input.
-fn views_of(inputs: &[Cropped], near_far: (f32, f32)) -> Result<Views> {
+fn views_of(inputs: &[Cropped], near_far: NearFar) -> Result<Views> {
     let (w, h) = inputs.first().map_or((0, 0), |c| (c.input.width, c.input.height));
     let pixels: Vec<f32> = inputs.iter().flat_map(|c| c.input.to_planes()).collect();
     let images = Tensor::from_vec(pixels, (1, inputs.len(), 3, h, w), &Device::Cpu)?;

@@ -94,8 +94,7 @@ impl Renderer {
         let rendered = match self.render_slices(&slices(splats), camera, &options) {
             Ok(rendered) => rendered,
             Err(e) => {
-                self.warning = Some(format!("{e}; rendering on the CPU"));
-                self.rasterizer = Rasterizer::Cpu;
+                self.use_cpu(&e);
                 self.cpu.render(&slices(splats), camera, &options)
             }
         };
@@ -118,6 +117,59 @@ impl Renderer {
             #[cfg(feature = "gpu")]
             Rasterizer::Gpu(rasterizer) => Ok(rasterizer.render(splats, camera, options)?),
         }
+    }
+
+    /// Renders planes `[5, H, W]`: R, G, B, alpha, Σ w·z. After an error of the GPU, this call
+    /// and all later ones use the CPU.
+    pub(crate) fn render_planes(
+        &mut self,
+        splats: &SplatSlices,
+        camera: &Camera,
+        options: &RasterOptions,
+    ) -> Vec<f32> {
+        #[cfg(feature = "gpu")]
+        if let Rasterizer::Gpu(rasterizer) = &mut self.rasterizer {
+            match rasterizer.render_planes(splats, camera, options) {
+                Ok(planes) => return planes,
+                Err(e) => self.use_cpu(&e),
+            }
+        }
+        let mut planes = Vec::new();
+        self.cpu.render_planes(splats, camera, options, &mut planes);
+        planes
+    }
+
+    /// Renders planes as [`Renderer::render_planes`] does, passes them to `loss`, which returns
+    /// the gradient by each of their elements, and writes the gradients by the splats to `out`.
+    /// `loss` is called again where a GPU fails.
+    pub(crate) fn gradients_of(
+        &mut self,
+        splats: &SplatSlices,
+        camera: &Camera,
+        options: &RasterOptions,
+        out: &mut Gradients,
+        loss: &mut dyn FnMut(&[f32]) -> Vec<f32>,
+    ) {
+        #[cfg(feature = "gpu")]
+        if let Rasterizer::Gpu(rasterizer) = &mut self.rasterizer {
+            let frame = rasterizer.frame(splats, camera, options);
+            match frame.and_then(|(planes, mut frame)| frame.backward(&loss(&planes))) {
+                Ok(gradients) => {
+                    *out = gradients;
+                    return;
+                }
+                Err(e) => self.use_cpu(&e),
+            }
+        }
+        let mut planes = Vec::new();
+        let mut frame = self.cpu.frame(*splats, camera, options, &mut planes);
+        frame.backward(&loss(&planes), out);
+    }
+
+    /// Renders on the CPU from now on, and keeps the reason as a warning.
+    fn use_cpu(&mut self, reason: &dyn std::fmt::Display) {
+        self.warning = Some(format!("{reason}; rendering on the CPU"));
+        self.rasterizer = Rasterizer::Cpu;
     }
 
     /// Computes the gradients of a loss with respect to the splats, on the current device and

@@ -3,6 +3,7 @@
 use super::config::TrainConfig;
 use super::source::{Example, Source};
 use super::{Error, Result};
+use crate::camera::NearFar;
 use crate::data::crop::{CropOptions, CropRule};
 use crate::data::dataset::{Dataset, ExampleOptions};
 use crate::data::sampler::{GapMode, ViewSampler};
@@ -69,7 +70,7 @@ impl Files {
             }
         }
         match self.near_far {
-            Some([near, far]) if !(near > 0.0 && far > near && far.is_finite()) => {
+            Some([near, far]) if !NearFar::new(near, far).is_valid() => {
                 let got = format!("[{near}, {far}]");
                 Err(Error::value("data.files.near_far", "[near, far] with 0 < near < far", got))
             }
@@ -112,7 +113,7 @@ impl Pictures {
             crop: CropOptions { input_size: (w, h), rule, ..square },
             // The loader mirrors the examples of every source.
             flip: false,
-            near_far: files.near_far.map(|[near, far]| (near, far)),
+            near_far: files.near_far.map(|[near, far]| NearFar { near, far }),
         };
         let dataset = Dataset::open(&files.path, options)?;
         Ok(Self {

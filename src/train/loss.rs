@@ -1,45 +1,15 @@
-//! Losses as functions of slices: a value, and its analytic gradient.
+//! Losses of the network's outputs as functions of slices: a value, and its analytic gradient.
+//! Those of pictures are in [`crate::loss`].
 //!
 //! [`with_gradient`] inserts a loss into candle's graph as one scalar. No graph of small tensor
 //! operations exists between a prediction and its loss, so that a loss costs about one pass over
 //! the prediction.
 
-use crate::metrics::{SSIM_C1, SSIM_C2, SSIM_COVARIANCE, SSIM_WINDOW, window};
-use crate::ops::dssim;
+use crate::camera::NearFar;
+pub use crate::loss::{Scored, dssim, mse};
 use crate::ops::precomputed_gradient::precomputed_gradient;
 use candle_core::{Result, Tensor};
 use rayon::prelude::*;
-
-/// A loss and its gradient with respect to one of its arguments.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Scored {
-    /// Value of the loss.
-    pub value: f64,
-    /// Derivative with respect to each element.
-    pub gradient: Vec<f32>,
-}
-
-impl Scored {
-    /// Returns a loss of 0 with zero gradients for `n` elements.
-    pub fn zero(n: usize) -> Self {
-        Self { value: 0.0, gradient: vec![0.0; n] }
-    }
-
-    /// Multiplies value and gradient by `factor`.
-    #[must_use]
-    pub fn scaled(mut self, factor: f64) -> Self {
-        self.value *= factor;
-        self.gradient.par_iter_mut().for_each(|g| *g *= factor as f32);
-        self
-    }
-
-    /// Adds `factor` times `other`, a loss of the same argument.
-    pub fn add(&mut self, other: &Self, factor: f64) {
-        self.value += factor * other.value;
-        let pairs = self.gradient.par_iter_mut().zip(&other.gradient);
-        pairs.for_each(|(a, b)| *a += factor as f32 * b);
-    }
-}
 
 /// Returns a scalar of value `scored.value` whose derivative with respect to `x` is
 /// `scored.gradient`.
@@ -50,49 +20,9 @@ pub fn with_gradient(x: &Tensor, scored: Scored) -> Result<Tensor> {
     precomputed_gradient(x, scored.value, scored.gradient)
 }
 
-/// Returns the mean squared difference of `x` and `target`.
-pub fn mse(x: &[f32], target: &[f32]) -> Scored {
-    let n = x.len().max(1) as f64;
-    let sums: Vec<f64> = x
-        .par_chunks(CHUNK)
-        .zip(target.par_chunks(CHUNK))
-        .map(|(x, t)| x.iter().zip(t).map(|(x, t)| f64::from(x - t).powi(2)).sum())
-        .collect();
-    let factor = (2.0 / n) as f32;
-    let gradient = x.par_iter().zip(target).map(|(x, t)| factor * (x - t)).collect();
-    Scored { value: sums.iter().sum::<f64>() / n, gradient }
-}
-
 /// Number of elements summed together. The fixed size makes the sums independent of the number of
 /// threads.
 const CHUNK: usize = 4096;
-
-/// Returns the structural dissimilarity (1 − SSIM)/2 of planes `[C, height, width]` in [0, 1], with
-/// its gradient by `x`.
-///
-/// SSIM is that of [`crate::metrics::ssim`]: 11×11 Gaussian windows of σ = 1.5 inside the picture,
-/// sample covariance.
-pub fn dssim(x: &[f32], target: &[f32], width: usize, height: usize) -> Scored {
-    if width < SSIM_WINDOW || height < SSIM_WINDOW {
-        return Scored::zero(x.len());
-    }
-    let plane = width * height;
-    let channels = (x.len() / plane).max(1);
-    let windows = (width - SSIM_WINDOW + 1) * (height - SSIM_WINDOW + 1) * channels;
-    let shape = dssim::Window {
-        taps: window().map(|t| t as f32),
-        c: [SSIM_C1 as f32, SSIM_C2 as f32],
-        covariance: SSIM_COVARIANCE as f32,
-    };
-    let factor = (-0.5 / windows as f64) as f32;
-    let mut gradient = vec![0.0; x.len()];
-    let sums: Vec<f64> = gradient
-        .par_chunks_mut(plane)
-        .zip(x.par_chunks(plane).zip(target.par_chunks(plane)))
-        .map(|(g, (x, t))| dssim::plane(&shape, [x, t], width, factor, g))
-        .collect();
-    Scored { value: 0.5 * (1.0 - sums.iter().sum::<f64>() / windows as f64), gradient }
-}
 
 /// Returns the cross-entropy of logits `[B, D, n]` to the two candidates around `target` `[B, n]`,
 /// with its gradient by the logits.
@@ -204,8 +134,8 @@ pub fn confidence(confidence: &[f32], index: &[f32], target: &[f32]) -> Scored {
 
 /// Converts inverse depths (1 / camera z) to candidate indices. The result is NaN without a
 /// surface, or where the surface lies outside near and far by more than half a candidate.
-pub fn candidate_index(inverse: &[f32], (near, far): (f32, f32), candidates: usize) -> Vec<f32> {
-    let (lo, hi) = (1.0 / far, 1.0 / near);
+pub fn candidate_index(inverse: &[f32], range: NearFar, candidates: usize) -> Vec<f32> {
+    let (lo, hi) = (1.0 / range.far, 1.0 / range.near);
     let top = candidates.saturating_sub(1) as f32;
     let scale = top / (hi - lo);
     let index = |&i: &f32| {

@@ -3,6 +3,7 @@
 
 use super::Result;
 use super::source::Example;
+use crate::camera::NearFar;
 use crate::data::crop::{CropOptions, crop};
 use crate::data::dataset::Posed;
 use crate::data::depth::depth_range;
@@ -54,11 +55,11 @@ fn pair(scene: &Scene, test: &Views, stride: usize) -> Result<Example> {
         let cropped = crop(&photo, &camera, &options)?;
         Ok(Posed { image: cropped.input, camera: cropped.input_camera })
     };
-    let range = depth_range(scene, &test.context, (None, None))?;
+    let range = depth_range(scene, &test.context, None, None)?;
     Ok(Example {
         context: test.context.iter().map(load).collect::<Result<_>>()?,
         targets: test.target.iter().map(load).collect::<Result<_>>()?,
         inverse_depth: Vec::new(),
-        near_far: (range.near, range.far),
+        near_far: NearFar::new(range.near, range.far),
     })
 }

@@ -2,6 +2,7 @@
 //! resumes from an index.
 
 use super::Result;
+use crate::camera::NearFar;
 use crate::data::dataset::Posed;
 use crate::data::pair::quantile;
 use crate::data::procedural::{self, ExampleSpec, TargetSpec};
@@ -22,7 +23,7 @@ pub struct Example {
     /// unknown.
     pub inverse_depth: Vec<Vec<f16>>,
     /// Nearest and farthest depth candidate, world units.
-    pub near_far: (f32, f32),
+    pub near_far: NearFar,
 }
 
 /// An infinite sequence of examples. Equal indices give equal examples on any thread.
@@ -74,16 +75,16 @@ pub struct Rooms {
 impl Rooms {
     /// Returns near and far of an example whose context views have these depths. Returns
     /// `None` for the share of examples that keep the generator's range.
-    fn visible_range(&self, key: u64, depths: impl Iterator<Item = f32>) -> Option<(f32, f32)> {
+    fn visible_range(&self, key: u64, depths: impl Iterator<Item = f32>) -> Option<NearFar> {
         if uniform(key, 1) >= f64::from(self.seen_range) {
             return None;
         }
         let mut depths: Vec<f32> = depths.filter(|z| *z > 0.0).collect();
         let [near, far] = [RANGE_QUANTILE, 1.0 - RANGE_QUANTILE].map(|q| quantile(&mut depths, q));
         let between = |low: f32, high: f32, k: u64| low + (high - low) * uniform(key, k) as f32;
-        let range =
-            (near * between(NEAR_FACTOR_MIN, 1.0, 2), far * between(1.0, FAR_FACTOR_MAX, 3));
-        (range.0 > 0.0 && range.1 > range.0).then_some(range)
+        let near = near * between(NEAR_FACTOR_MIN, 1.0, 2);
+        let far = far * between(1.0, FAR_FACTOR_MAX, 3);
+        (near > 0.0 && far > near).then_some(NearFar { near, far })
     }
 }
 
@@ -113,7 +114,7 @@ impl Source for Rooms {
         let targets = pictures.split_off(2.min(pictures.len()));
         let depths = made.views.iter().take(inverse_depth.len()).flat_map(|v| &v.depth);
         let near_far = self.visible_range(hash(made.seed, 0x5EE), depths.copied());
-        let near_far = near_far.unwrap_or((made.near, made.far));
+        let near_far = near_far.unwrap_or(NearFar::new(made.near, made.far));
         Ok(Arc::new(Example { context: pictures, targets, inverse_depth, near_far }))
     }
 }

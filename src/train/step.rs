@@ -168,7 +168,7 @@ pub fn raster_options(config: &Config, example: &Example, camera: &Camera) -> Ra
     let width = example.context.first().map_or(1, |p| p.image.width.max(1));
     let ratio = camera.intrinsics.width as f32 / width as f32;
     let inputs = Rgb::mean_colour(example.context.iter().map(|p| &p.image));
-    config.raster_options(ratio, example.near_far.0, inputs)
+    config.raster_options(ratio, example.near_far.near, inputs)
 }
 
 /// Returns a detached copy that collects its own gradient.

@@ -6,7 +6,8 @@ use subsplat_test_support::torch_writer as writer;
 
 use common::shared;
 use std::path::Path;
-use subsplat::data::chunks::{Chunk, NEAR_FAR, load_index};
+use subsplat::camera::NearFar;
+use subsplat::data::chunks::{Chunk, load_index};
 use subsplat::data::crop::{CropOptions, CropRule, crop};
 use writer::*;
 
@@ -72,7 +73,7 @@ fn a_chunk_equals_the_output_of_pixelsplats_loader() {
         let (got, camera) = chunk.load(example, frame).unwrap();
         assert_eq!((got.height, got.width), (360, 640));
         assert_near(
-            &camera.intrinsics.normalised(),
+            &camera.intrinsics().normalised(),
             &example.cameras[frame].normalised,
             1e-6,
             "fractions",
@@ -109,10 +110,10 @@ fn check_views(chunk: &Chunk, key: &str, expected: &Expected, side: &str) {
         let (photo, camera) = chunk.load(example, frame).unwrap();
         let options = CropOptions { rule: CropRule::Mvsplat, ..CropOptions::square(256, 1, 16) };
         let c = crop(&photo, &camera, &options).unwrap();
-        let [fx, fy, cx, cy] = c.input_camera.intrinsics.normalised();
+        let [fx, fy, cx, cy] = c.input_camera.intrinsics().normalised();
         let k = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0];
         assert_near(&k, &ks[9 * view..][..9], 1e-6, "intrinsics");
-        let pose = c.input_camera.world_from_camera.transpose().to_cols_array();
+        let pose = c.input_camera.world_from_camera().transpose().to_cols_array();
         assert_near(&pose, &poses[16 * view..][..16], 1e-5, "pose");
         // The differences of the decoders; resampling averages them.
         assert_near(
@@ -122,8 +123,8 @@ fn check_views(chunk: &Chunk, key: &str, expected: &Expected, side: &str) {
             "image",
         );
     }
-    assert!(get("near").iter().all(|n| *n == NEAR_FAR.0));
-    assert!(get("far").iter().all(|f| *f == NEAR_FAR.1));
+    assert!(get("near").iter().all(|n| *n == NearFar::RE10K.near));
+    assert!(get("far").iter().all(|f| *f == NearFar::RE10K.far));
 }
 
 /// Writes a chunk of one example of one frame; `part` replaces the part `change`.

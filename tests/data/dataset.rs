@@ -10,7 +10,7 @@ use glam::{Mat4, Quat, Vec3};
 use std::collections::BTreeSet;
 use std::path::Path;
 use subsplat::abi::{Convention, RasterOptions, ShBasis};
-use subsplat::camera::{Camera, Intrinsics};
+use subsplat::camera::{Camera, Intrinsics, NearFar};
 use subsplat::data::chunks::Chunk;
 use subsplat::data::crop::{CropOptions, CropRule, LrFrom, crop};
 use subsplat::data::dataset::{Dataset, ExampleOptions, Posed, TrainingExample};
@@ -102,7 +102,7 @@ fn views_are_the_crops_of_their_frames() {
             let [left, right] = e.frames.context;
             assert!((2..=4).contains(&(right - left)) && right < made.frames);
             assert_eq!((e.context.len(), e.targets.len()), (2, 3));
-            assert_eq!(e.near_far, (1.0, 100.0));
+            assert_eq!(e.near_far, NearFar::RE10K);
             for (view, i) in e.context.iter().zip(e.frames.context) {
                 let (photo, camera) = chunk.load(example, i).unwrap();
                 assert_eq!(photo, frame(made, i));
@@ -170,7 +170,7 @@ fn broken_data_sets_are_refused_with_a_reason() {
     assert!(missing.err().unwrap().to_string().contains("none"));
 }
 
-fn scene_folder(folder: &Path, frames: usize, units: Units, near_far: Option<(f32, f32)>) {
+fn scene_folder(folder: &Path, frames: usize, units: Units, near_far: Option<NearFar>) {
     std::fs::create_dir_all(folder).unwrap();
     let (made, cameras) = made_up::made_up(frames);
     std::fs::rename(made.path().join("images"), folder.join("images")).unwrap();
@@ -182,7 +182,7 @@ fn scene_folder(folder: &Path, frames: usize, units: Units, near_far: Option<(f3
 fn folders_of_scenes_are_data_sets() {
     let folder = tempfile::tempdir().unwrap();
     scene_folder(&folder.path().join("one"), 4, Units::RealEstate10k, None);
-    scene_folder(&folder.path().join("two"), 5, Units::Unknown, Some((0.5, 7.0)));
+    scene_folder(&folder.path().join("two"), 5, Units::Unknown, Some(NearFar::new(0.5, 7.0)));
     scene_folder(&folder.path().join("three"), 5, Units::Unknown, None);
     std::fs::create_dir(folder.path().join("notes")).unwrap();
     assert!(is_scene(&folder.path().join("one")) && !is_scene(&folder.path().join("notes")));
@@ -198,14 +198,18 @@ fn folders_of_scenes_are_data_sets() {
             _ => (0.5 * baseline, 30.0 * baseline),
         };
         assert!(
-            (e.near_far.0 - expected.0).abs() < 1e-4 && (e.near_far.1 - expected.1).abs() < 1e-3
+            (e.near_far.near - expected.0).abs() < 1e-4
+                && (e.near_far.far - expected.1).abs() < 1e-3
         );
         names.insert(e.name);
     }
     assert_eq!(names.len(), 3);
-    let fixed_range = ExampleOptions { near_far: Some((2.0, 3.0)), ..options(false) };
+    let fixed_range = ExampleOptions { near_far: Some(NearFar::new(2.0, 3.0)), ..options(false) };
     let one = open(&folder.path().join("one"), fixed_range);
-    assert_eq!((one.len(), one.stream(0, 0).next_example(0).unwrap().near_far), (1, (2.0, 3.0)));
+    assert_eq!(
+        (one.len(), one.stream(0, 0).next_example(0).unwrap().near_far),
+        (1, NearFar::new(2.0, 3.0))
+    );
 }
 
 /// A constant camera position determines no depth. Such pairs are skipped, and the stream
@@ -235,8 +239,11 @@ fn pairs_without_a_baseline_are_skipped() {
     }
     let e = open(&all, options(false)).example_from(1, 0, 0).unwrap_err().to_string();
     assert!(e.contains("a camera that moves or with near and far"), "{e}");
-    let fixed_range = ExampleOptions { near_far: Some((2.0, 3.0)), ..options(false) };
-    assert_eq!(open(&all, fixed_range).example_from(1, 0, 0).unwrap().1.near_far, (2.0, 3.0));
+    let fixed_range = ExampleOptions { near_far: Some(NearFar::new(2.0, 3.0)), ..options(false) };
+    assert_eq!(
+        open(&all, fixed_range).example_from(1, 0, 0).unwrap().1.near_far,
+        NearFar::new(2.0, 3.0)
+    );
 }
 
 fn posed() -> Posed {
@@ -253,7 +260,7 @@ fn mirroring_twice_restores_the_view() {
     let mirrored_view = view.flipped();
     assert_ne!(mirrored_view, view);
     assert!(
-        Camera::new(mirrored_view.camera.intrinsics, mirrored_view.camera.world_from_camera)
+        Camera::new(mirrored_view.camera.intrinsics(), mirrored_view.camera.world_from_camera())
             .is_ok()
     );
     for c in 0..3 {
@@ -262,8 +269,8 @@ fn mirroring_twice_restores_the_view() {
     }
     let back = mirrored_view.flipped();
     assert_eq!(back.image, view.image);
-    assert_eq!(back.camera.world_from_camera, view.camera.world_from_camera);
-    assert!((back.camera.intrinsics.cx - view.camera.intrinsics.cx).abs() < 1e-5);
+    assert_eq!(back.camera.world_from_camera(), view.camera.world_from_camera());
+    assert!((back.camera.intrinsics().cx - view.camera.intrinsics().cx).abs() < 1e-5);
     let (folder, _) = seven();
     let e = open(folder.path(), options(false)).example(0, 0, 0).unwrap().unwrap();
     assert_eq!(e.flipped().flipped(), e);

@@ -39,10 +39,10 @@ fn the_same_bits_for_any_number_of_threads() {
 /// Projects pixel (x, y) of view `a` into camera `b`: position and camera z.
 fn reprojected(a: &View, ca: &Camera, x: usize, y: usize, cb: &Camera) -> Option<(Vec2, f32)> {
     let px = Vec2::new(x as f32 + 0.5, y as f32 + 0.5);
-    let point = ca.intrinsics.unproject(px) * a.depth[y * a.width + x];
-    let world = ca.world_from_camera.transform_point3(point);
+    let point = ca.intrinsics().unproject(px) * a.depth[y * a.width + x];
+    let world = ca.world_from_camera().transform_point3(point);
     let (px, z) = (cb.project(world)?, cb.to_camera(world).z);
-    let (w, h) = (cb.intrinsics.width as f32, cb.intrinsics.height as f32);
+    let (w, h) = (cb.intrinsics().width as f32, cb.intrinsics().height as f32);
     (px.x > 1.5 && px.y > 1.5 && px.x < w - 1.5 && px.y < h - 1.5).then_some((px, z))
 }
 
@@ -86,8 +86,8 @@ fn depth_is_that_of_the_pixel_centre() {
         let view = room.render(camera, &diffuse(1));
         for (i, depth) in view.depth.iter().enumerate() {
             let px = Vec2::new((i % 40) as f32 + 0.5, (i / 40) as f32 + 0.5);
-            let point = camera.intrinsics.unproject(px) * *depth;
-            let gap = room.clearance(camera.world_from_camera.transform_point3(point));
+            let point = camera.intrinsics().unproject(px) * *depth;
+            let gap = room.clearance(camera.world_from_camera().transform_point3(point));
             assert!(gap.abs() < 1e-4, "seed {seed}, pixel {i}: {gap} m from a surface");
         }
     }
@@ -142,12 +142,12 @@ fn sampled_cameras_satisfy_the_documented_conditions() {
         let (room, rig) = rig(seed, &spec);
         assert_eq!(rig.cameras.len(), 4);
         for camera in &rig.cameras {
-            Camera::new(camera.intrinsics, camera.world_from_camera).unwrap();
+            Camera::new(camera.intrinsics(), camera.world_from_camera()).unwrap();
             assert!(room.clearance(camera.position()) >= 0.1);
         }
         let [a, b] = [&rig.cameras[0], &rig.cameras[1]];
         let full = if rig.cropped { 2.0 } else { 1.0 };
-        let fov = 2.0 * (0.5 * full * 96.0 / a.intrinsics.fx).atan().to_degrees();
+        let fov = 2.0 * (0.5 * full * 96.0 / a.intrinsics().fx).atan().to_degrees();
         assert!((40.0..80.0).contains(&fov), "{fov}");
         let ratio = rig.baseline / rig.median_depth;
         assert!((0.0499..0.3801).contains(&ratio), "{ratio}");
@@ -188,7 +188,7 @@ fn overlap_agrees_with_the_depth_maps() {
 fn a_larger_picture_reduces_to_the_smaller() {
     let (room, rig) = rig(3, &spec(48, 40));
     let small = rig.cameras[0];
-    let large = small.resized(192, 160);
+    let large = small.resized(192, 160).unwrap();
     let one = room.render(&small, &Quality::clean(8));
     let four = room.render(&large, &Quality::clean(2));
     let mut worst = Vec::new();
@@ -222,12 +222,9 @@ fn pictures_of_any_shape_are_finite_and_full() {
     // A principal point far outside, and pixels that are not square.
     let (room, rig) = rig(9, &spec(32, 32));
     let k = Intrinsics { fx: 40.0, fy: 25.0, cx: -30.0, cy: 50.0, width: 33, height: 21 };
-    let camera = Camera::new(k, rig.cameras[0].world_from_camera).unwrap();
+    let camera = Camera::new(k, rig.cameras[0].world_from_camera()).unwrap();
     let view = room.render(&camera, &Quality::clean(1));
     assert!(view.depth.iter().all(|d| d.is_finite() && *d > 0.0));
-    let none = Intrinsics { width: 0, height: 0, ..k };
-    let empty = room.render(&Camera { intrinsics: none, ..camera }, &Quality::clean(1));
-    assert!(empty.rgb.is_empty() && empty.depth.is_empty());
 }
 
 #[test]

@@ -40,10 +40,10 @@ fn cameras_and_planes_are_those_of_the_pictures() {
     };
     let mut context = Vec::new();
     for (i, (frame, entry)) in frames.iter().zip(listed).enumerate() {
-        let k = &frame.camera.intrinsics;
+        let k = &frame.camera.intrinsics();
         assert_eq!(entry["file"], frame.file.as_str());
         assert_eq!((&entry["width"], &entry["height"]), (&k.width.into(), &k.height.into()));
-        let rows = frame.camera.world_from_camera.transpose().to_cols_array();
+        let rows = frame.camera.world_from_camera().transpose().to_cols_array();
         let c2w = entry["c2w"].as_array().unwrap().iter().flat_map(|r| r.as_array().unwrap());
         let values = ["fx", "fy", "cx", "cy"].into_iter().map(|n| &entry[n]).chain(c2w);
         for (value, want) in values.zip([k.fx, k.fy, k.cx, k.cy].into_iter().chain(rows)) {
@@ -75,7 +75,7 @@ fn the_protocol_names_targets_at_twice_and_four_times_the_input() {
         let targets = test["target"].as_array().unwrap();
         assert_eq!(targets.len(), 3);
         for target in targets {
-            let k = &frames[target.as_u64().unwrap() as usize].camera.intrinsics;
+            let k = &frames[target.as_u64().unwrap() as usize].camera.intrinsics();
             assert_eq!((k.width, k.height), (256 * factor, 256 * factor));
         }
     }

@@ -4,6 +4,7 @@ use subsplat_test_support::chunk_files;
 
 use chunk_files::{video, write};
 use std::path::Path;
+use subsplat::camera::NearFar;
 use subsplat::data::crop::CropOptions;
 use subsplat::data::dataset::{Dataset, ExampleOptions};
 use subsplat::data::sampler::ViewSampler;
@@ -83,7 +84,7 @@ fn a_data_set_is_streamed_into_the_step() {
         let want = data.example_from(5, index, index as usize / 2).unwrap().1;
         let got = source.example(index).unwrap();
         assert_eq!((&got.context, &got.targets), (&want.context, &want.targets), "{index}");
-        assert_eq!((got.near_far, got.targets.len()), ((1.0, 100.0), 3));
+        assert_eq!((got.near_far, got.targets.len()), (NearFar::RE10K, 3));
         assert!(got.inverse_depth.is_empty());
     }
     // With three repetitions an index belongs to a step three times as late.

@@ -20,7 +20,7 @@ const WIDTH: usize = 160;
 const HEIGHT: usize = 105;
 
 fn camera(scene: &Scene, width: usize, height: usize) -> Camera {
-    Camera { intrinsics: scene.camera.intrinsics.resized(width, height), ..scene.camera }
+    scene.camera.resized(width, height).unwrap()
 }
 
 /// Checks that picture, planes and gradients on `small` equal those on any GPU. Returns the
@@ -32,7 +32,7 @@ fn check(
     camera: &Camera,
     options: &RasterOptions,
 ) -> (usize, [Option<bool>; 2]) {
-    let pixels = camera.intrinsics.width * camera.intrinsics.height;
+    let pixels = camera.intrinsics().width * camera.intrinsics().height;
     let mut random = Random(99);
     let upstream: Vec<f32> = (0..5 * pixels).map(|_| random.range(-1.0, 1.0)).collect();
     let mut whole = Rasterizer::new(gpu().unwrap());

@@ -1,13 +1,14 @@
 //! The WGSL kernels against the CPU versions.
 #![cfg(feature = "gpu")]
 
+mod fit;
 mod layers;
 mod model;
 mod network;
 mod ops;
 mod raster;
 mod raster_bwd;
+mod redistribute;
 mod scenes;
 mod shaders;
 mod spgr;
-mod twins;

@@ -1,13 +1,13 @@
 //! Attention gather and plane sweep on the GPU against the CPU versions.
 
+use subsplat_test_support::cpu_against_gpu;
 use subsplat_test_support::gpu as adapter;
-use subsplat_test_support::twins;
 
 use adapter::gpu;
-use subsplat::abi::{Drop, Gather, Level, Pair, Sweep};
+use cpu_against_gpu::{Random, assert_matches_cpu};
+use subsplat::abi::{Drop, Gather, Level, Pair, SampleConvention, Sweep};
 use subsplat::cpu::{attention_gather as cpu, plane_sweep};
 use subsplat::gpu::{AttentionGatherArgs, GpuError, PlaneSweepArgs};
-use twins::{Random, assert_twins};
 
 /// Tolerance: sums of at most 64 products in another order; sample positions within the f32
 /// rounding of 14 columns (1e-6 px); softmax weights whose exponential has an error of 3 + 2|x|
@@ -31,7 +31,7 @@ fn base() -> Gather {
         value: 8,
         logit_scale: 0.4,
         renormalise: true,
-        half_pixel: true,
+        sample_convention: SampleConvention::HalfPixel,
         drop: None,
         point_gradient: true,
     }
@@ -52,7 +52,7 @@ fn gathers() -> Vec<(&'static str, Gather)> {
         |probability| Some(Drop { probability, seed: 0xDEAD_BEEF_1234_5678, first_parent: 7 });
     vec![
         ("ref", base()),
-        ("integer", Gather { half_pixel: false, ..base() }),
+        ("integer", Gather { sample_convention: SampleConvention::Integer, ..base() }),
         ("clamp", Gather { renormalise: false, ..base() }),
         ("two levels", Gather { levels: two(), ..base() }),
         ("three views", Gather { views: 3, levels: three, ..base() }),
@@ -103,7 +103,7 @@ fn attention_gather() {
         let (maps, query, points) = (&maps[..], &query[..], &points[..]);
         let args = AttentionGatherArgs { gather: &g, maps, query, points };
         let got = gpu.attention_gather(&args).unwrap();
-        assert_twins(name, &got, &expected, GATHER);
+        assert_matches_cpu(name, &got, &expected, GATHER);
         let nothing = expected.iter().all(|v| *v == 0.0);
         assert_eq!(nothing, name == "all dropped", "{name}: nothing to compare");
     }
@@ -121,9 +121,9 @@ fn attention_gather_gradients() {
         let (maps, query, points) = (&maps[..], &query[..], &points[..]);
         let args = AttentionGatherArgs { gather: &g, maps, query, points };
         let got = gpu.attention_gather_backward(&args, &grad).unwrap();
-        assert_twins(&format!("{name} maps"), &got.maps, &expected.maps, GATHER_BWD);
-        assert_twins(&format!("{name} query"), &got.query, &expected.query, GATHER_BWD);
-        assert_twins(&format!("{name} points"), &got.points, &expected.points, GATHER_BWD);
+        assert_matches_cpu(&format!("{name} maps"), &got.maps, &expected.maps, GATHER_BWD);
+        assert_matches_cpu(&format!("{name} query"), &got.query, &expected.query, GATHER_BWD);
+        assert_matches_cpu(&format!("{name} points"), &got.points, &expected.points, GATHER_BWD);
         let again = gpu.attention_gather_backward(&args, &grad).unwrap();
         assert!(got == again, "{name}: results are not reproducible");
         let fixed = Gather { point_gradient: false, ..g.clone() };
@@ -210,12 +210,12 @@ fn plane_sweeps() {
         plane_sweep::correlation(&s, &reference, &source, &mut expected);
         let (reference, source) = (&reference[..], &source[..]);
         let args = PlaneSweepArgs { sweep: &s, reference, source };
-        assert_twins(&name, &gpu.plane_sweep(&args).unwrap(), &expected, SWEEP);
+        assert_matches_cpu(&name, &gpu.plane_sweep(&args).unwrap(), &expected, SWEEP);
         let grad = r.many(expected.len(), -1.0, 1.0);
         let expected = plane_sweep::backward(&s, reference, source, &grad);
         let got = gpu.plane_sweep_backward(&args, &grad).unwrap();
-        assert_twins(&format!("{name} reference"), &got.0, &expected.0, SWEEP);
-        assert_twins(&format!("{name} source"), &got.1, &expected.1, SWEEP);
+        assert_matches_cpu(&format!("{name} reference"), &got.0, &expected.0, SWEEP);
+        assert_matches_cpu(&format!("{name} source"), &got.1, &expected.1, SWEEP);
         let again = gpu.plane_sweep_backward(&args, &grad).unwrap();
         assert!(got == again, "{name}: results are not reproducible");
         let short = PlaneSweepArgs { source: &source[1..], ..args };

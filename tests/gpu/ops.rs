@@ -8,7 +8,9 @@ use subsplat_test_support::spgr_calls;
 use adapter::{gpu, limited};
 use candle_core::{DType, Result, Tensor, Var};
 use scenes::Random;
-use subsplat::abi::{Convention, Gather, Level, RasterOptions, Rule, ShDirection};
+use subsplat::abi::{
+    Convention, Gather, Level, RasterOptions, Rule, SampleConvention, ShDirection,
+};
 use subsplat::camera::Camera;
 use subsplat::gpu::{DeviceChoice, Gpu};
 use subsplat::ops::attention_gather::attention_gather_on;
@@ -118,7 +120,7 @@ fn gather(points: usize) -> Gather {
         value: 8,
         logit_scale: 0.4,
         renormalise: true,
-        half_pixel: true,
+        sample_convention: SampleConvention::HalfPixel,
         drop: None,
         point_gradient: true,
     }
@@ -147,7 +149,7 @@ fn sweep() {
     let Some(gpu) = gpu() else { return };
     let backend = Backend::from(gpu);
     let cameras = scenes::cameras(2, 12, 9);
-    let k = cameras[0].intrinsics;
+    let k = cameras[0].intrinsics();
     let to = |a: usize, b: usize| {
         let pose = subsplat::ops::plane_sweep::relative_pose(&cameras[a], &cameras[b]);
         pair(&k, &k, pose, b).unwrap()
@@ -174,7 +176,7 @@ fn splats(r: &mut Random) -> (Camera, Tensor, Tensor) {
     let place = |r: &mut Random| {
         let z = r.uniform(2.0, 6.0);
         let at = [r.uniform(-0.3, 0.3) * z, r.uniform(-0.3, 0.3) * z, z].map(|v| v as f32);
-        camera.world_from_camera.transform_point3(at.into()).to_array()
+        camera.world_from_camera().transform_point3(at.into()).to_array()
     };
     let means: Vec<f32> = (0..n).flat_map(|_| place(r)).collect();
     let means = Tensor::from_vec(means, (n, 3), &candle_core::Device::Cpu).unwrap();

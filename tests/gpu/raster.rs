@@ -233,8 +233,7 @@ fn draw_to_texture(binding: u64) {
     .unwrap();
     let gpu = Gpu::from_device(device.clone(), queue.clone());
     let scene = Scene::new(Kind::Plain, 9, 30, 2, 4);
-    let k = scene.camera.intrinsics.resized(64, 48);
-    let camera = subsplat::camera::Camera { intrinsics: k, ..scene.camera };
+    let camera = scene.camera.resized(64, 48).unwrap();
     let options = RasterOptions { background: [0.3, 0.2, 0.1], ..RasterOptions::default() };
     let format = wgpu::TextureFormat::Rgba8Unorm;
     let texture = |width, height| {
@@ -299,7 +298,7 @@ fn a_lost_device_is_an_error() {
     let scene = Scene::new(Kind::Plain, 9, 30, 2, 4);
     let mut rasterizer = Rasterizer::new(own.clone());
     let (camera, options) = (scene.camera, RasterOptions::default());
-    let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
+    let (width, height) = (camera.intrinsics().width, camera.intrinsics().height);
     let target = own.device().create_texture(&wgpu::TextureDescriptor {
         label: None,
         size: wgpu::Extent3d {

@@ -118,7 +118,7 @@ fn broken_splats_have_no_gradient() {
     scene.gain[4 * 13] = f32::NAN;
     for direction in [ShDirection::Child, ShDirection::Parent] {
         let options = RasterOptions { sh_direction: direction, ..RasterOptions::default() };
-        let pixels = scene.camera.intrinsics.width * scene.camera.intrinsics.height;
+        let pixels = scene.camera.intrinsics().width * scene.camera.intrinsics().height;
         let mut r = Random(5);
         let v: Vec<f32> = (0..5 * pixels).map(|_| r.range(-1.0, 1.0)).collect();
         let expected = scene.gradients(&options, &v);
@@ -140,7 +140,7 @@ fn a_crowded_scene_matches_the_cpu_and_is_reproducible() {
     let Some(gpu) = gpu() else { return };
     let scene = Scene::new(Kind::Plain, 11, 3000, 1, 1);
     let options = RasterOptions::default();
-    let pixels = scene.camera.intrinsics.width * scene.camera.intrinsics.height;
+    let pixels = scene.camera.intrinsics().width * scene.camera.intrinsics().height;
     let mut r = Random(6);
     let v: Vec<f32> = (0..5 * pixels).map(|_| r.range(-1.0, 1.0)).collect();
     let expected = scene.gradients(&options, &v);
@@ -171,7 +171,7 @@ fn inconsistent_gradients_are_named() {
     let Some(gpu) = gpu() else { return };
     let scene = Scene::new(Kind::Plain, 1, 1, 0, 0);
     let (camera, options) = (scene.camera, RasterOptions::default());
-    let pixels = camera.intrinsics.width * camera.intrinsics.height;
+    let pixels = camera.intrinsics().width * camera.intrinsics().height;
     let mut v = vec![0.0; 5 * pixels];
     v[..pixels].fill(1.0);
     let none = SplatSlices { geometry: Geometry::Packed(&[]), sh: &[], gain: &[], sh_degree: 0 };

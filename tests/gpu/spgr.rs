@@ -1,17 +1,18 @@
 //! SPGR on the GPU against the CPU version, under every rule.
 
+use subsplat_test_support::cpu_against_gpu;
 use subsplat_test_support::gpu as adapter;
-use subsplat_test_support::twins;
 
 use adapter::gpu;
+use cpu_against_gpu::{Random, assert_matches_cpu};
 use glam::{EulerRot, Mat4, Quat, Vec3};
 use subsplat::abi::{
-    HEAD_STRIDE, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, Rule, Rules, SCALE_OFFSET, SPLAT_STRIDE,
+    AMinMode, AreaAt, DepthDir, DepthUnit, GainSpace, HEAD_STRIDE, MEAN_OFFSET, OPACITY_OFFSET,
+    PrimaryView, QUAT_OFFSET, Rule, Rules, SCALE_OFFSET, SPLAT_STRIDE, Slide,
 };
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::cpu::spgr as cpu;
 use subsplat::gpu::{GpuError, SpgrArgs};
-use twins::{Random, assert_twins};
 
 /// Tolerance: a few hundred roundings of 6e-8, including WGSL's larger errors (division 2.5 units
 /// in the last place, exponential 3 + 2|x|). The growth along two axes divides by a cross
@@ -42,7 +43,7 @@ fn cameras(size: usize) -> Vec<Camera> {
 fn parents(cameras: &[Camera], r: &mut Random) -> Vec<f32> {
     let mut rows = Vec::new();
     for camera in cameras {
-        let k = camera.intrinsics;
+        let k = camera.intrinsics();
         for i in 0..k.width * k.height {
             let z = r.range(1.5, 12.0);
             let (x, y) = ((i % k.width) as f32 + 0.5, (i / k.width) as f32 + 0.5);
@@ -63,22 +64,22 @@ fn base(tuned: bool, side: usize) -> Rules {
     let k = (side * side) as f64;
     Rules {
         side,
-        nearest_visible: !tuned,
+        primary_view: if tuned { PrimaryView::Source } else { PrimaryView::NearestVisible },
         offset_bound: tuned.then_some(0.5),
         beta_z: if tuned { 0.1 } else { 0.25 },
-        ray: tuned,
-        relative_depth: tuned,
-        disc: false,
+        depth_dir: if tuned { DepthDir::Ray } else { DepthDir::Axis },
+        depth_unit: if tuned { DepthUnit::Relative } else { DepthUnit::World },
+        slide: Slide::ZConst,
         lambda_s: if tuned { 1.0 / k.sqrt() } else { 0.6 },
         dlog_clamp: 2.0,
-        area_at_parent: false,
+        area_at: AreaAt::Child,
         a_min: if side == 1 { 0.0 } else { 1.0 / k },
-        two_axis: false,
+        a_min_mode: AMinMode::Iso,
         opacity: if tuned { Rule::OpticalDepth } else { Rule::Linear },
         lowpass_target: 0.3,
         lowpass_input: 0.3,
         delta: 0.5,
-        rgb_gain: false,
+        gain_space: GainSpace::Sh,
     }
 }
 
@@ -87,27 +88,27 @@ fn variants(side: usize) -> Vec<(String, Rules)> {
     type Change = (&'static str, fn(&mut Rules));
     let changes: [Change; 22] = [
         ("as is", |_| {}),
-        ("nearest", |s| s.nearest_visible = true),
-        ("source", |s| s.nearest_visible = false),
+        ("nearest", |s| s.primary_view = PrimaryView::NearestVisible),
+        ("source", |s| s.primary_view = PrimaryView::Source),
         ("unbounded", |s| s.offset_bound = None),
         ("bounded", |s| s.offset_bound = Some(0.5)),
-        ("axis", |s| s.ray = false),
-        ("ray", |s| s.ray = true),
-        ("world", |s| (s.relative_depth, s.beta_z) = (false, 9.0)),
-        ("relative", |s| (s.relative_depth, s.beta_z) = (true, 1.0)),
-        ("disc", |s| s.disc = true),
+        ("axis", |s| s.depth_dir = DepthDir::Axis),
+        ("ray", |s| s.depth_dir = DepthDir::Ray),
+        ("world", |s| (s.depth_unit, s.beta_z) = (DepthUnit::World, 9.0)),
+        ("relative", |s| (s.depth_unit, s.beta_z) = (DepthUnit::Relative, 1.0)),
+        ("disc", |s| s.slide = Slide::Disc),
         ("lambda", |s| s.lambda_s = 1.2 / s.side as f64),
-        ("at parent", |s| s.area_at_parent = true),
+        ("at parent", |s| s.area_at = AreaAt::Parent),
         ("a_min px", |s| s.a_min = 2.0),
         ("a_min in", |s| s.a_min = 0.5 * (s.side * s.side) as f64),
         ("a_min off", |s| s.a_min = 0.0),
-        ("two axis", |s| (s.a_min, s.two_axis) = (2.0, true)),
+        ("two axis", |s| (s.a_min, s.a_min_mode) = (2.0, AMinMode::TwoAxis)),
         ("linear", |s| s.opacity = Rule::Linear),
         ("depth", |s| s.opacity = Rule::OpticalDepth),
         ("through", |s| s.opacity = Rule::Transmittance),
         ("area", |s| s.opacity = Rule::Area),
         ("none", |s| s.opacity = Rule::None),
-        ("rgb", |s| s.rgb_gain = true),
+        ("rgb", |s| s.gain_space = GainSpace::Rgb),
     ];
     let mut all = Vec::new();
     for tuned in [false, true] {
@@ -177,9 +178,9 @@ fn children() {
             for (part, first, count) in PARTS {
                 let of = |rows: &[f32]| columns(rows, first, count);
                 let (got, expected) = (of(&got.0), of(&expected.0));
-                assert_twins(&format!("{name} {part}"), &got, &expected, SPGR);
+                assert_matches_cpu(&format!("{name} {part}"), &got, &expected, SPGR);
             }
-            assert_twins(&format!("{name} gain"), &got.1, &expected.1, SPGR);
+            assert_matches_cpu(&format!("{name} gain"), &got.1, &expected.1, SPGR);
         }
     }
 }
@@ -226,11 +227,11 @@ fn gradients_of_children() {
                     [("head", &got.0, &head, &exact[0]), ("parents", &got.1, &parents, &exact[1])];
                 for (what, got, cpu, exact) in all {
                     let name = format!("{name} {what} {column}");
-                    assert_twins(&name, &of(got), &of(exact), TOLERANCE_F64);
-                    assert_twins(&name, &of(got), &of(cpu), TOLERANCE_F32);
+                    assert_matches_cpu(&name, &of(got), &of(exact), TOLERANCE_F64);
+                    assert_matches_cpu(&name, &of(got), &of(cpu), TOLERANCE_F32);
                 }
             }
-            assert_twins(&format!("{name} gain"), &got_gain, &gain, SPGR);
+            assert_matches_cpu(&format!("{name} gain"), &got_gain, &gain, SPGR);
         }
     }
 }

@@ -6,6 +6,7 @@ use candle_core::{DType, Device, Tensor};
 use candle_nn::{VarBuilder, VarMap};
 use glam::{Quat, Vec3};
 use scenes::*;
+use subsplat::abi::SampleConvention;
 use subsplat::config::*;
 use subsplat::model::aggregation::Aggregation;
 use subsplat::model::embed::Descriptors;
@@ -24,7 +25,7 @@ fn host(t: &Tensor) -> Vec<f64> {
 /// of `stride` channels at R in [0, 1]², all channels.
 fn grid_sample(maps: &[f64], g: &Gather, l: usize, v: usize, at: [f64; 2]) -> Vec<f64> {
     let level = g.levels[l];
-    let shift = if g.half_pixel { 0.5 } else { 0.0 };
+    let shift = g.sample_convention.shift();
     let (x, y) = (at[0] * level.width as f64 - shift, at[1] * level.height as f64 - shift);
     let mut out = vec![0.0; g.stride];
     for row in 0..level.height {
@@ -54,7 +55,7 @@ fn base() -> Gather {
         value: 8,
         logit_scale: 0.4,
         renormalise: true,
-        half_pixel: true,
+        sample_convention: SampleConvention::HalfPixel,
         drop: None,
         point_gradient: true,
     }

@@ -4,6 +4,7 @@ use subsplat_test_support::scenes;
 
 use candle_core::{DType, Device, Tensor};
 use scenes::*;
+use subsplat::abi::SampleConvention;
 use subsplat::ops::attention_gather::{Drop, Gather, Level, attention_gather, occlusion_gate};
 
 fn host(t: &Tensor) -> Vec<f64> {
@@ -14,7 +15,7 @@ fn host(t: &Tensor) -> Vec<f64> {
 /// of `stride` channels at R in [0, 1]², all channels.
 fn grid_sample(maps: &[f64], g: &Gather, l: usize, v: usize, at: [f64; 2]) -> Vec<f64> {
     let level = g.levels[l];
-    let shift = if g.half_pixel { 0.5 } else { 0.0 };
+    let shift = g.sample_convention.shift();
     let (x, y) = (at[0] * level.width as f64 - shift, at[1] * level.height as f64 - shift);
     let mut out = vec![0.0; g.stride];
     for row in 0..level.height {
@@ -97,7 +98,7 @@ fn base() -> Gather {
         value: 8,
         logit_scale: 0.4,
         renormalise: true,
-        half_pixel: true,
+        sample_convention: SampleConvention::HalfPixel,
         drop: None,
         point_gradient: true,
     }
@@ -110,7 +111,7 @@ fn forms() -> Vec<(&'static str, Gather)> {
     ];
     vec![
         ("ref", base()),
-        ("integer", Gather { half_pixel: false, ..base() }),
+        ("integer", Gather { sample_convention: SampleConvention::Integer, ..base() }),
         ("clamp", Gather { renormalise: false, ..base() }),
         ("two levels", Gather { levels: two.clone(), ..base() }),
         ("three views", Gather { views: 3, ..base() }),

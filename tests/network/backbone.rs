@@ -5,7 +5,7 @@
 use candle_core::{Device, Result, Tensor};
 use glam::{Mat4, Quat, Vec3};
 use std::collections::BTreeMap;
-use subsplat::camera::{Camera, Intrinsics};
+use subsplat::camera::{Camera, Intrinsics, NearFar};
 use subsplat::config::Mvsplat as Settings;
 use subsplat::model::Views;
 use subsplat::model::backbone::Mvsplat;
@@ -68,7 +68,7 @@ fn posed(views: usize, h: usize, w: usize) -> Views {
         let at = Vec3::new(0.3 * f, -0.1 * f * f, 0.15 * f);
         Camera::new(k, Mat4::from_rotation_translation(turn, at)).unwrap()
     };
-    let near_far = (0..views).map(|i| (0.8 + 0.1 * i as f32, 40.0)).collect();
+    let near_far = (0..views).map(|i| NearFar::new(0.8 + 0.1 * i as f32, 40.0)).collect();
     Views::new(pictures(views, h, w), vec![(0..views).map(camera).collect()], vec![near_far])
         .unwrap()
 }
@@ -296,8 +296,8 @@ fn naive_sweep(views: &Views, maps: &Maps, h: usize, w: usize, d: usize) -> Vec<
     let c = maps[0][0].len();
     let mut out = Vec::new();
     for i in 0..v {
-        let (near, far) = views.near_far[0][i];
-        let k = views.cameras[0][i].resized(w, h).intrinsics.matrix().as_dmat3();
+        let NearFar { near, far } = views.near_far[0][i];
+        let k = views.cameras[0][i].resized(w, h).unwrap().intrinsics().matrix().as_dmat3();
         for candidate in 0..d {
             let (low, high) = (1.0 / f64::from(far), 1.0 / f64::from(near));
             let disparity = low + candidate as f64 / (d - 1) as f64 * (high - low);
@@ -305,7 +305,7 @@ fn naive_sweep(views: &Views, maps: &Maps, h: usize, w: usize, d: usize) -> Vec<
                 let mut mean = 0.0;
                 for offset in 1..v {
                     let j = (i + offset) % v;
-                    let e = |n: usize| views.cameras[0][n].world_from_camera.as_dmat4();
+                    let e = |n: usize| views.cameras[0][n].world_from_camera().as_dmat4();
                     let pose = e(j).inverse() * e(i);
                     let at = glam::DVec3::new((pixel % w) as f64, (pixel / w) as f64, 1.0);
                     let x = pose.transform_point3(k.inverse() * at / disparity);
@@ -356,7 +356,7 @@ fn coarse_and_full_disparity_follow_from_the_logits() {
     let (h, w, d) = (8, 12, settings.depth_candidates);
     let mut coarse = Vec::new();
     for view in 0..3 {
-        let (near, far) = views.near_far[0][view];
+        let NearFar { near, far } = views.near_far[0][view];
         let (low, high) = (1.0 / f64::from(far), 1.0 / f64::from(near));
         for pixel in 0..h * w {
             let at = |k: usize| logits[(view * d + k) * h * w + pixel].exp();
@@ -477,10 +477,10 @@ fn the_sweep_samples_where_cameras_project() -> Result<()> {
     use subsplat::ops::plane_sweep::{Sweep, pair, plane_sweep, relative_pose, validity, warped};
     let (h, w) = (8, 12);
     let views = posed(2, 32, 48);
-    let cameras: Vec<Camera> = views.cameras[0].iter().map(|c| c.resized(w, h)).collect();
+    let cameras: Vec<Camera> = views.cameras[0].iter().map(|c| c.resized(w, h).unwrap()).collect();
     let pose = relative_pose(&cameras[0], &cameras[1]);
     let sweep = Sweep {
-        pairs: vec![vec![pair(&cameras[0].intrinsics, &cameras[1].intrinsics, pose, 0)?]],
+        pairs: vec![vec![pair(&cameras[0].intrinsics(), &cameras[1].intrinsics(), pose, 0)?]],
         depths: vec![vec![1.2, 3.0, 30.0]],
         centre: 0.5,
         min_z: 1e-3,
@@ -499,8 +499,8 @@ fn the_sweep_samples_where_cameras_project() -> Result<()> {
     for (k, depth) in [1.2f32, 3.0, 30.0].into_iter().enumerate() {
         for i in 0..h * w {
             let px = glam::Vec2::new((i % w) as f32 + 0.5, (i / w) as f32 + 0.5);
-            let at = cameras[0].intrinsics.unproject(px) * depth;
-            let world = cameras[0].world_from_camera.transform_point3(at);
+            let at = cameras[0].intrinsics().unproject(px) * depth;
+            let world = cameras[0].world_from_camera().transform_point3(at);
             let want = cameras[1].project(world).filter(|p| {
                 p.x >= 0.5 && p.y >= 0.5 && p.x <= w as f32 - 0.5 && p.y <= h as f32 - 0.5
             });

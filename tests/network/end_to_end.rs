@@ -8,7 +8,7 @@ use glam::Vec3;
 use subsplat::abi::{
     Convention, QUAT_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE, ShBasis, ShDirection,
 };
-use subsplat::camera::{Camera, Intrinsics};
+use subsplat::camera::{Camera, Intrinsics, NearFar};
 use subsplat::config::{Backbone, Config, Preset, ShFrame};
 use subsplat::io::image::Rgb;
 use subsplat::io::{SaveOptions, load_splats, save_splats};
@@ -24,7 +24,7 @@ const SIZE: (usize, usize) = (64, 64);
 
 /// The model's options of rendering, with SH up to degree 3, the most that files hold.
 fn options(model: &Reconstructor) -> RasterOptions {
-    RasterOptions { sh_degree: 3, ..rules(model, NEAR_FAR.0) }
+    RasterOptions { sh_degree: 3, ..rules(model, NEAR_FAR.near) }
 }
 
 /// The model's rules to render at target resolution.
@@ -64,11 +64,11 @@ fn files_render_as_the_splats_they_were_made_from() {
         assert_eq!((splats.children_per_parent(), splats.gain_channels()), (4, 4));
         assert_eq!(splats.sh_basis() == ShBasis::Mvsplat, i == 0);
         let mut views = cameras(&result);
-        views.push(world.targets[0].resized(128, 128));
+        views.push(world.targets[0].resized(128, 128).unwrap());
         for convention in [Convention::Standard, Convention::Mvsplat] {
             let near = match convention {
                 Convention::Standard => RasterOptions::new(convention).near,
-                Convention::Mvsplat => NEAR_FAR.0,
+                Convention::Mvsplat => NEAR_FAR.near,
             };
             let options = RasterOptions { convention, near, ..options(&model) };
             for extension in ["ply", "glb"] {
@@ -220,7 +220,7 @@ fn untrained_children_of_mvsplat_keep_the_native_coverage() {
             let (_, children) = reconstruct(config, &shoot.photos, SIZE, false);
             assert_eq!(children.splats().len(), parents.splats().len() * upscale * upscale);
             for camera in &views {
-                let large = camera.resized(upscale * SIZE.0, upscale * SIZE.1);
+                let large = camera.resized(upscale * SIZE.0, upscale * SIZE.1).unwrap();
                 let alpha = |s: &Splats, c: &Camera| mean(&render(s, c, &options).alpha);
                 let (want, got) =
                     (alpha(parents.splats(), camera), alpha(children.splats(), &large));
@@ -324,7 +324,7 @@ fn shared_coefficients_render_as_separate_ones() {
         // diagonal is √2 input pixels.
         let half = angles.len() / 2;
         let angle = angles[v * half..(v + 1) * half].iter().fold(0f32, |m, a| m.max(*a));
-        let pixel = 2.0 / camera.intrinsics.fx;
+        let pixel = 2.0 / camera.intrinsics().fx;
         eprintln!("{db:.0} dB; {:.2} pixels, colour {worst:.1e} of {bound:.1e}", angle / pixel);
         assert!(worst > 0.0 && worst <= bound + 1e-5, "{worst:.2e}, at most {bound:.2e}");
         assert!(angle < pixel * 2f32.sqrt(), "{angle:.2e} rad, an input pixel is {pixel:.2e}");
@@ -335,7 +335,7 @@ fn shared_coefficients_render_as_separate_ones() {
     let camera = plain.inputs()[0].input_camera;
     let angles = sibling_angles(plain.splats(), camera.position());
     let angle = angles[..angles.len() / 2].iter().fold(0f32, |m, a| m.max(*a));
-    assert!(angle < 0.36 / camera.intrinsics.fx, "{angle:.2e} rad");
+    assert!(angle < 0.36 / camera.intrinsics().fx, "{angle:.2e} rad");
 }
 
 /// Pictures and cameras as the network takes them, one scene after another.
@@ -402,8 +402,8 @@ fn straight_to_the_picture_is_the_same_picture() {
         for config in [native(&config), config] {
             let model = lively(&config);
             let views = batch(&model, &shoots, SIZE);
-            let options = rules(&model, NEAR_FAR.0);
-            let camera = views.cameras[0][0].resized(2 * SIZE.0, 2 * SIZE.1);
+            let options = rules(&model, NEAR_FAR.near);
+            let camera = views.cameras[0][0].resized(2 * SIZE.0, 2 * SIZE.1).unwrap();
             let direct = model.model().render(&views, &camera, &options).unwrap();
             let scenes = model.model().forward(&views, &mut |_| {}).unwrap();
             assert_eq!(direct.len(), scenes.len());
@@ -440,20 +440,22 @@ fn any_number_of_views_any_shape_any_depth_range() {
         let config = light(plain(mvsplat, Preset::Tuned, 2));
         let model = lively(&config);
         let size = if mvsplat { (96, 64) } else { (128, 64) };
-        for (views, near_far) in [(3, NEAR_FAR), (2, (0.05, 3.0)), (3, (5.0, 400.0))] {
+        for (views, near_far) in
+            [(3, NEAR_FAR), (2, NearFar::new(0.05, 3.0)), (3, NearFar::new(5.0, 400.0))]
+        {
             let shoot = shoot(9, views, 2 * size.0, 2 * size.1);
             let result = model.run(&shoot.photos, &options_of(size, near_far, false)).unwrap();
             assert_eq!(result.splats().len(), 4 * views * size.0 * size.1);
             assert!(result.splats().rows().iter().all(|v| v.is_finite()));
             // Candidates are distances along the unit ray; camera z is shorter by its
             // slope.
-            let slope = shoot.photos[0].camera().intrinsics.unproject(glam::Vec2::ZERO).length();
+            let slope = shoot.photos[0].camera().intrinsics().unproject(glam::Vec2::ZERO).length();
             for depth in result.depths() {
                 assert_eq!((depth.width, depth.height), size);
-                let range = near_far.0 / slope * 0.99..near_far.1 * 1.01;
+                let range = near_far.near / slope * 0.99..near_far.far * 1.01;
                 assert!(depth.data.iter().all(|z| range.contains(z)), "{near_far:?}");
             }
-            let options = rules(&model, near_far.0);
+            let options = rules(&model, near_far.near);
             for c in result.inputs() {
                 let picture = render(result.splats(), &c.target_camera, &options);
                 assert_eq!((picture.width, picture.height), (2 * size.0, 2 * size.1));

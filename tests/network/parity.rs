@@ -7,6 +7,7 @@ use candle_core::{DType, Device, Tensor};
 use common::shared;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
+use subsplat::camera::NearFar;
 use subsplat::config::Mvsplat as Settings;
 use subsplat::model::Views;
 use subsplat::model::backbone::Mvsplat;
@@ -105,7 +106,8 @@ fn two_scenes(tensors: &BTreeMap<String, Tensor>) -> Views {
     let mut turned = one.cameras[0].clone();
     turned.reverse();
     cameras.push(turned);
-    let near_far = vec![one.near_far[0].clone(), vec![(0.8, 60.0), (1.2, 80.0)]];
+    let near_far =
+        vec![one.near_far[0].clone(), vec![NearFar::new(0.8, 60.0), NearFar::new(1.2, 80.0)]];
     Views::new(images, cameras, near_far).unwrap()
 }
 
@@ -148,7 +150,8 @@ fn sizes_that_do_not_fit_are_refused() {
     let image = Tensor::zeros((1, 2, 3, 64, 72), DType::F32, &Device::Cpu).unwrap();
     let k = subsplat::camera::Intrinsics::from_fov_x(1.0, 72, 64);
     let camera = subsplat::camera::Camera::new(k, glam::Mat4::IDENTITY).unwrap();
-    let views = Views::new(image, vec![vec![camera; 2]], vec![vec![(1.0, 10.0); 2]]).unwrap();
+    let views =
+        Views::new(image, vec![vec![camera; 2]], vec![vec![NearFar::new(1.0, 10.0); 2]]).unwrap();
     let e = encoder.forward(&views, &mut Trace::off()).unwrap_err().to_string();
     assert!(e.contains("multiples of 16") && e.contains("64x72"), "{e}");
 }

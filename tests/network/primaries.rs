@@ -6,7 +6,7 @@ use subsplat_test_support::primaries_reference;
 use candle_core::{DType, Device, Result, Tensor, Var};
 use glam::{DMat3, DQuat, DVec3, Mat4, Quat, Vec3};
 use subsplat::abi::ShBasis;
-use subsplat::camera::{Camera, Intrinsics};
+use subsplat::camera::{Camera, Intrinsics, NearFar};
 use subsplat::config::{Mvsplat, Primaries as Settings, ShFrame};
 use subsplat::model::primaries::{primaries, sh_mask};
 use subsplat::model::trace::Trace;
@@ -29,7 +29,7 @@ fn views(world: Mat4) -> Views {
         Camera::new(k, world * local).unwrap()
     };
     let images = Tensor::zeros((1, 2, 3, h, w), DType::F32, &Device::Cpu).unwrap();
-    Views::new(images, vec![vec![pose(0.0), pose(1.0)]], vec![vec![(1.0, 100.0); 2]]).unwrap()
+    Views::new(images, vec![vec![pose(0.0), pose(1.0)]], vec![vec![NearFar::RE10K; 2]]).unwrap()
 }
 
 fn wave(n: usize, step: f32) -> Vec<f32> {
@@ -228,8 +228,9 @@ fn gradients_reach_every_input() -> Result<()> {
 fn larger((h, w): (usize, usize), g: usize, degree: usize) -> (BackboneOutput, Views) {
     let mut views = views(Mat4::from_rotation_y(0.4));
     for camera in views.cameras[0].iter_mut() {
-        let k = &mut camera.intrinsics;
-        (k.width, k.height, k.cx) = (w, h, 0.4 * w as f32);
+        let k = camera.intrinsics();
+        let k = Intrinsics { width: w, height: h, cx: 0.4 * w as f32, ..k };
+        *camera = camera.with_intrinsics(k).unwrap();
     }
     views.images = Tensor::zeros((1, 2, 3, h, w), DType::F32, &Device::Cpu).unwrap();
     let (n, lanes) = (h * w, 9 + 3 * (degree + 1) * (degree + 1));

@@ -22,7 +22,7 @@ fn quick() -> Options {
     Options::default().with_input_size(96, 96)
 }
 
-const STAGES: [Stage; 7] = [
+const STAGES: [Stage; 8] = [
     Stage::Crop,
     Stage::Check,
     Stage::DepthRange,
@@ -30,6 +30,7 @@ const STAGES: [Stage; 7] = [
     Stage::Primaries,
     Stage::Subsplat,
     Stage::Detail,
+    Stage::Fit,
 ];
 
 #[test]

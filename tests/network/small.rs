@@ -1,6 +1,7 @@
 //! The small backbone: results of its untrained start, and its switches.
 
 use candle_core::{Device, Tensor};
+use subsplat::camera::NearFar;
 use subsplat::config::{Backbone, Config, Preset, Small};
 use subsplat::data::procedural::{Example, ExampleSpec};
 use subsplat::model::Views;
@@ -27,7 +28,7 @@ fn views(examples: &[Example]) -> Views {
     let shape = (examples.len(), 2, 3, SIDE, SIDE);
     let images = Tensor::from_vec(pixels, shape, &Device::Cpu).unwrap();
     let cameras = examples.iter().map(|e| e.cameras[..2].to_vec()).collect();
-    let planes = examples.iter().map(|e| vec![(e.near, e.far); 2]).collect();
+    let planes = examples.iter().map(|e| vec![NearFar::new(e.near, e.far); 2]).collect();
     Views::new(images, cameras, planes).unwrap()
 }
 
@@ -62,7 +63,7 @@ fn right(config: &Small, tolerance: f32) -> f32 {
             net.forward(&views(std::slice::from_ref(&e)), DisparityMean::AroundMode).unwrap();
         let got = flat(&out.depths);
         for (v, view) in e.views[..2].iter().enumerate() {
-            let k = e.cameras[v].intrinsics;
+            let k = e.cameras[v].intrinsics();
             for (i, z) in view.depth.iter().enumerate() {
                 let px = glam::Vec2::new((i % SIDE) as f32 + 0.5, (i / SIDE) as f32 + 0.5);
                 let distance = z * k.unproject(px).length();
@@ -150,15 +151,16 @@ fn a_batch_equals_its_parts() {
 fn the_depth_range_is_narrowed_unless_the_estimate_is_off() {
     let e = example(2);
     let mut v = views(std::slice::from_ref(&e));
-    v.near_far[0].fill((0.2 * e.near, 20.0 * e.far));
+    v.near_far[0].fill(NearFar::new(0.2 * e.near, 20.0 * e.far));
     let look = |config: &Config| {
         let weights = Weights::seeded(3);
         SubSplat::new(config, weights.builder()).unwrap().estimate_depth_range(&v).unwrap().near_far
     };
     let mut config = Config::small(Preset::Tuned, 2);
-    let (near, far) = look(&config)[0][0];
-    assert_eq!(look(&config)[0], [(near, far); 2]);
-    assert!(near > v.near_far[0][0].0 && far < v.near_far[0][0].1, "{near} {far}");
+    let found = look(&config)[0][0];
+    assert_eq!(look(&config)[0], [found; 2]);
+    let wide = v.near_far[0][0];
+    assert!(found.near > wide.near && found.far < wide.far, "{found:?}");
     let Backbone::Small(small) = &mut config.backbone else { panic!("another backbone") };
     small.estimate_depth_range = false;
     assert_eq!(look(&config), v.near_far);
@@ -171,7 +173,7 @@ fn wrong_sizes_are_refused() {
     let e = example(9);
     let v = views(&[e]);
     let images = v.images.narrow(3, 0, 96).unwrap().narrow(4, 0, 80).unwrap();
-    let cameras = vec![v.cameras[0].iter().map(|c| c.resized(80, 96)).collect()];
+    let cameras = vec![v.cameras[0].iter().map(|c| c.resized(80, 96).unwrap()).collect()];
     let narrow = Views::new(images.contiguous().unwrap(), cameras, v.near_far.clone()).unwrap();
     let error = net.forward(&narrow, DisparityMean::AroundMode).unwrap_err().to_string();
     assert!(error.contains("multiples of 32") && error.contains("96x80"), "{error}");

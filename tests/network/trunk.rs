@@ -399,7 +399,7 @@ fn close(got: &Tensor, expected: &Tensor, name: &str) {
 
 fn moved(cameras: &[Camera]) -> Vec<Camera> {
     let m = motion();
-    let each = |c: &Camera| Camera::new(c.intrinsics, m * c.world_from_camera).unwrap();
+    let each = |c: &Camera| Camera::new(c.intrinsics(), m * c.world_from_camera()).unwrap();
     cameras.iter().map(each).collect()
 }
 
@@ -522,7 +522,7 @@ fn pixel_unit_embeddings_transfer_to_another_resolution() {
             let frames = Frames::new(cams, DType::F32, &Device::Cpu).unwrap();
             embeddings.forward(&parents, &frames).unwrap()
         };
-        let large: Vec<Camera> = small.iter().map(|c| c.resized(32, 32)).collect();
+        let large: Vec<Camera> = small.iter().map(|c| c.resized(32, 32).unwrap()).collect();
         let (a, b) = (run(&small, 1.0), run(&large, 0.5));
         let (d, _) = difference(&a.geometry, &b.geometry);
         assert_eq!(d < 1e-5, scale == ScaleInput::LogPx, "{scale:?} {d}");
@@ -639,9 +639,9 @@ fn several_gaussians_per_pixel() {
     let (one, two) = (a.infer(&trunk).rows, b.infer(&trunk).rows);
     let two = two.reshape((512, 2, 44)).unwrap();
     let one = one.reshape((512, 44)).unwrap();
-    for twin in 0..2 {
-        let twin = two.narrow(1, twin, 1).unwrap().squeeze(1).unwrap().contiguous().unwrap();
-        assert_close(&twin, &one, 1e-5);
+    for copy in 0..2 {
+        let rows = two.narrow(1, copy, 1).unwrap().squeeze(1).unwrap().contiguous().unwrap();
+        assert_close(&rows, &one, 1e-5);
     }
 }
 

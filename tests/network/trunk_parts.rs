@@ -69,7 +69,7 @@ fn attributes(config: &Embed, parents: &ParentChunk, frames: &Frames) -> Result<
         ScaleInput::Raw => parents.scales.clone(),
         ScaleInput::LogPx => {
             let z = source.to_camera(&parents.means)?.narrow(1, 2, 1)?.maximum(Z_MIN)?;
-            let fx = f64::from(source.camera.intrinsics.fx);
+            let fx = f64::from(source.camera.intrinsics().fx);
             let log = parents.scales.maximum(SCALE_MIN)?.log()?;
             log.broadcast_sub(&z.log()?.affine(1.0, -fx.ln())?)?
         }

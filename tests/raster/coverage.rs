@@ -28,10 +28,10 @@ fn plane(sigma_px: f32, eyes: [[f32; 2]; 2]) -> Splats {
         let camera = camera(eye, SIDE);
         for i in 0..SIDE * SIDE {
             let px = Vec2::new((i % SIDE) as f32 + 0.5, (i / SIDE) as f32 + 0.5);
-            let at = camera.intrinsics.unproject(px) * DEPTH;
-            rows.extend(camera.world_from_camera.transform_point3(at).to_array());
+            let at = camera.intrinsics().unproject(px) * DEPTH;
+            rows.extend(camera.world_from_camera().transform_point3(at).to_array());
             rows.extend([1.0, 0.0, 0.0, 0.0]);
-            rows.extend([sigma_px * DEPTH / camera.intrinsics.fx; 3]);
+            rows.extend([sigma_px * DEPTH / camera.intrinsics().fx; 3]);
             rows.push(0.9);
         }
     }

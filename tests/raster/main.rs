@@ -2,6 +2,7 @@
 
 mod baseline;
 mod coverage;
+mod fit;
 mod raster;
 mod raster_bwd;
 mod raster_bwd_oracle;

@@ -180,7 +180,7 @@ fn a_list_longer_than_what_is_kept() {
     let mut r = Random(11);
     let depth = |row: &[f32], camera: &Camera| {
         let at = Vec3::new(row[0], row[1], row[2]);
-        camera.world_from_camera.inverse().transform_point3(at).z
+        camera.world_from_camera().inverse().transform_point3(at).z
     };
     for row in scene.rows.chunks_mut(SPLAT_STRIDE) {
         let px = depth(row, &scene.camera) / SIZE.0 as f32;
@@ -253,7 +253,7 @@ fn bad_numbers_get_zeros_and_poison_nothing() {
 fn crowd() -> Scene {
     let mut all = Scene::new(Kind::Plain, 0, 700, 3, 1);
     let k = Intrinsics { fx: 150.0, fy: 150.0, cx: 75.0, cy: 50.0, width: 151, height: 99 };
-    let from = all.camera.world_from_camera;
+    let from = all.camera.world_from_camera();
     all.camera = Camera::new(k, from).unwrap();
     for (seed, kind) in KINDS.into_iter().enumerate().skip(1) {
         let more = Scene::new(kind, 100 + seed as u64, 300, 3, 1);

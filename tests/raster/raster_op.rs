@@ -106,12 +106,6 @@ fn misfits_are_refused_by_name() {
     refused(with(RasterOptions { antialiased: true, ..mvsplat }), &["antialiased", "mvsplat"]);
     let black_hole = [0.0, f32::INFINITY, 0.0];
     refused(with(RasterOptions { background: black_hole, ..o }), &["background", "inf"]);
-    let mut empty = camera;
-    empty.intrinsics.width = 0;
-    refused(rasterize(&rows, &sh, &gain, &empty, &o), &["1 to 32768 pixels", "0x21"]);
-    let mut vast = camera;
-    (vast.intrinsics.width, vast.intrinsics.height) = (1_000_000, 1_000_000);
-    refused(rasterize(&rows, &sh, &gain, &vast, &o), &["1 to 32768 pixels", "1000000x1000000"]);
 }
 
 trait First {

@@ -76,17 +76,17 @@ fn check(a: &Frame, ca: &Camera, b: &Frame, cb: &Camera) -> PairReport {
 }
 
 fn with_pose(camera: &Camera, world_from_camera: Mat4) -> Camera {
-    Camera { world_from_camera, ..*camera }
+    Camera::new(camera.intrinsics(), world_from_camera).unwrap()
 }
 
 /// Returns the camera with the given mistake applied.
 fn corrupted(camera: &Camera, mistake: &str) -> Camera {
-    let pose = camera.world_from_camera;
+    let pose = camera.world_from_camera();
     let opengl = Mat4::from_scale(Vec3::new(1.0, -1.0, -1.0));
-    let k = camera.intrinsics;
-    let scaled = |fx: f32, fy: f32, c: f32| Camera {
-        intrinsics: Intrinsics { fx: k.fx * fx, fy: k.fy * fy, cx: k.cx * c, cy: k.cy * c, ..k },
-        ..*camera
+    let k = camera.intrinsics();
+    let scaled = |fx: f32, fy: f32, c: f32| {
+        let k = Intrinsics { fx: k.fx * fx, fy: k.fy * fy, cx: k.cx * c, cy: k.cy * c, ..k };
+        camera.with_intrinsics(k).unwrap()
     };
     match mistake {
         "opengl" => with_pose(camera, pose * opengl),
@@ -280,7 +280,7 @@ fn the_epipolar_picture_shows_lines_through_their_points() {
     for place in places {
         assert!(passes(&rgb, place) >= 3, "{place:?} {}", passes(&rgb, place));
     }
-    let turned = f[1].camera.world_from_camera * Mat4::from_rotation_x(0.2);
+    let turned = f[1].camera.world_from_camera() * Mat4::from_rotation_x(0.2);
     let wrong = [&f[0].camera, &with_pose(&f[1].camera, turned)];
     let missed = epipolar_picture(photographs, wrong, &report.points).unwrap().2;
     for place in places {

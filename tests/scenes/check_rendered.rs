@@ -63,7 +63,7 @@ fn render(camera: &Camera) -> GrayImage {
         let taps = (0..9).map(|s| {
             let x = (i % W) as f32 + ((s % 3) as f32 + 0.5) / 3.0;
             let y = (i / W) as f32 + ((s / 3) as f32 + 0.5) / 3.0;
-            let ray = camera.rotation() * camera.intrinsics.unproject(glam::Vec2::new(x, y));
+            let ray = camera.rotation() * camera.intrinsics().unproject(glam::Vec2::new(x, y));
             trace(camera.position(), ray)
         });
         taps.sum::<f32>() / 9.0
@@ -106,7 +106,7 @@ fn true_overlap(from: &Camera, to: &Camera) -> f32 {
     let mut visible = 0;
     for i in 0..(W / 4) * (H / 4) {
         let px = glam::Vec2::new((i % (W / 4) * 4) as f32, (i / (W / 4) * 4) as f32);
-        let ray = from.rotation() * from.intrinsics.unproject(px);
+        let ray = from.rotation() * from.intrinsics().unproject(px);
         let eye = from.position();
         let mut t = (6.0 - eye.z) / ray.z;
         let floor = (1.5 - eye.y) / ray.y;
@@ -166,23 +166,23 @@ fn implausible_sizes_intrinsics_and_exposures_are_reported() {
     let options = CheckOptions::default();
 
     // Intrinsics of twice the size fit after scaling; of another aspect they do not.
-    let report = check_pair(&first, &a.resized(2 * W, 2 * H), &second, &b, &options);
+    let report = check_pair(&first, &a.resized(2 * W, 2 * H).unwrap(), &second, &b, &options);
     assert_eq!((report.verdict, report.has("size_differs")), (Verdict::Warning, true));
-    let report = check_pair(&first, &a.resized(W, W), &second, &b, &options);
+    let report = check_pair(&first, &a.resized(W, W).unwrap(), &second, &b, &options);
     assert_eq!((report.verdict, report.has("size_differs")), (Verdict::Bad, true));
 
     let normalised = |c: &Camera| {
-        let [fx, fy, cx, cy] = c.intrinsics.normalised();
-        Camera { intrinsics: Intrinsics { fx, fy, cx, cy, ..c.intrinsics }, ..*c }
+        let [fx, fy, cx, cy] = c.intrinsics().normalised();
+        c.with_intrinsics(Intrinsics { fx, fy, cx, cy, ..c.intrinsics() }).unwrap()
     };
     let report = check_pair(&first, &normalised(&a), &second, &normalised(&b), &options);
     assert!(report.has("intrinsics_normalised") && report.verdict == Verdict::Bad);
     assert_eq!(report.readings.first().map(|r| r.name.as_str()), Some("normalised"));
 
     let odd = |f: f32, c: f32| {
-        let k = a.intrinsics;
+        let k = a.intrinsics();
         let k = Intrinsics { fx: f * k.fx, fy: f * k.fy, cx: c * k.cx, cy: c * k.cy, ..k };
-        check_pair(&first, &Camera { intrinsics: k, ..a }, &second, &b, &options)
+        check_pair(&first, &a.with_intrinsics(k).unwrap(), &second, &b, &options)
     };
     assert!(odd(10.0, 1.0).has("field_of_view") && odd(0.2, 1.0).has("field_of_view"));
     assert!(odd(0.5, 0.5).has("principal_point"));
@@ -206,7 +206,7 @@ fn implausible_sizes_intrinsics_and_exposures_are_reported() {
 fn a_photograph_rolled_with_its_camera_is_matched() {
     let a = posed(0.0, 0.0, Vec3::ZERO);
     let mut b = posed(-0.05, 0.0, Vec3::new(0.6, 0.0, 0.0));
-    b.world_from_camera *= Mat4::from_rotation_z(1.4);
+    b = Camera::new(b.intrinsics(), b.world_from_camera() * Mat4::from_rotation_z(1.4)).unwrap();
     let report = check_rendered(&a, &b);
     println!("rolled: {} of {} matches", report.consistent_matches, report.matches);
     assert!(report.consistent_matches > 100, "{:?}", report.findings);

@@ -614,9 +614,9 @@ fn mutated_scenes_are_accepted_or_refused() {
                 Ok(scene) => {
                     accepted += 1;
                     for f in &scene.frames {
-                        let k = f.camera.intrinsics;
+                        let k = f.camera.intrinsics();
                         assert_eq!(
-                            subsplat::camera::Camera::new(k, f.camera.world_from_camera),
+                            subsplat::camera::Camera::new(k, f.camera.world_from_camera()),
                             Ok(f.camera)
                         );
                         let _ = f.pinhole();

@@ -8,7 +8,7 @@ use glam::{Mat4, Vec3};
 use made_up::made_up;
 use noise::noise;
 use std::path::PathBuf;
-use subsplat::camera::Camera;
+use subsplat::camera::{Camera, Intrinsics, NearFar};
 use subsplat::data::depth::depth_range;
 use subsplat::io::cameras_json::{CameraFile, NamedCamera, load_cameras_json, save_cameras_json};
 use subsplat::io::image;
@@ -22,7 +22,8 @@ fn cameras_json_round_trips() {
     cameras[3].depth = Some("depth/003.png".to_owned());
     for units in [Units::Unknown, Units::Metres, Units::RealEstate10k] {
         let path = folder.path().join("cameras.json");
-        let content = CameraFile { cameras: cameras.clone(), units, near_far: Some((0.5, 8.0)) };
+        let content =
+            CameraFile { cameras: cameras.clone(), units, near_far: Some(NearFar::new(0.5, 8.0)) };
         save_cameras_json(&path, &content).unwrap();
         assert_eq!(load_cameras_json(&path).unwrap(), content);
         let scene = load_scene(folder.path()).unwrap();
@@ -67,7 +68,7 @@ fn three_dgs_camera_lists_are_read() {
         .iter()
         .map(|c| {
             let rows = c.camera.rotation().transpose().to_cols_array_2d();
-            let k = c.camera.intrinsics;
+            let k = c.camera.intrinsics();
             serde_json::json!({
                 "id": 0, "img_name": c.file.trim_start_matches("images/").trim_end_matches(".png"),
                 "width": 64, "height": 48, "fx": k.fx, "fy": k.fy,
@@ -78,8 +79,8 @@ fn three_dgs_camera_lists_are_read() {
     std::fs::write(folder.path().join("cameras.json"), serde_json::to_vec(&list).unwrap()).unwrap();
     let scene = load_scene(folder.path()).unwrap();
     for (frame, c) in scene.frames.iter().zip(&cameras) {
-        assert_eq!(frame.camera.world_from_camera, c.camera.world_from_camera);
-        assert_eq!((frame.camera.intrinsics.cx, frame.camera.intrinsics.cy), (32.0, 24.0));
+        assert_eq!(frame.camera.world_from_camera(), c.camera.world_from_camera());
+        assert_eq!((frame.camera.intrinsics().cx, frame.camera.intrinsics().cy), (32.0, 24.0));
     }
 }
 
@@ -90,15 +91,15 @@ fn check_colmap(scene: &Scene, cameras: &[NamedCamera]) {
     assert_eq!(points.len(), 40);
     assert_eq!(points[0], Vec3::new(0.0, 0.2, 3.0));
     for (i, (f, c)) in scene.frames.iter().zip(cameras).enumerate() {
-        let error = f.camera.world_from_camera - c.camera.world_from_camera;
+        let error = f.camera.world_from_camera() - c.camera.world_from_camera();
         assert!(error.to_cols_array().iter().all(|v| v.abs() < 1e-5), "{error}");
-        assert_eq!(f.camera.intrinsics, c.camera.intrinsics);
+        assert_eq!(f.camera.intrinsics(), c.camera.intrinsics());
         assert_eq!(f.visible, [0, 1 + i as u32]);
         let Distortion::Brown { k, p } = f.distortion else { panic!() };
         assert_eq!((k[0], k[1], p), (0.01, -0.02, [0.001, 0.002]));
         let (picture, camera) = f.load().unwrap();
         assert_eq!((picture.width, picture.height), (64, 48));
-        assert_ne!(camera.intrinsics.fx, f.camera.intrinsics.fx);
+        assert_ne!(camera.intrinsics().fx, f.camera.intrinsics().fx);
     }
 }
 
@@ -158,25 +159,26 @@ fn colmap_points_give_the_depth_range() {
     colmap_files::write(&folder.path().join("sparse"), "bin", [&files[0], &files[1], &files[2]]);
     let mut scene = load_scene(folder.path()).unwrap();
     // Other pose and points: a wall at depths 2 to 4 in front of the camera.
-    scene.frames[0].camera.world_from_camera = Mat4::IDENTITY;
+    let camera = &mut scene.frames[0].camera;
+    *camera = Camera::new(camera.intrinsics(), Mat4::IDENTITY).unwrap();
     scene.points = Some((0..101).map(|i| Vec3::new(0.0, 0.0, 2.0 + 0.02 * i as f32)).collect());
-    let range = depth_range(&scene, &[0], (None, None)).unwrap();
+    let range = depth_range(&scene, &[0], None, None).unwrap();
     assert!((range.near - 2.04 / 1.5).abs() < 1e-4 && (range.far - 2.0 * 3.96).abs() < 1e-4);
     assert!(range.reason.contains("101"), "{}", range.reason);
-    let fixed_near = depth_range(&scene, &[0], (Some(0.5), None)).unwrap();
+    let fixed_near = depth_range(&scene, &[0], Some(0.5), None).unwrap();
     assert_eq!((fixed_near.near, fixed_near.far), (0.5, range.far));
-    assert!(depth_range(&scene, &[0], (Some(50.0), None)).is_err());
-    assert!(depth_range(&scene, &[0], (Some(f32::NAN), Some(2.0))).is_err());
-    assert!(depth_range(&scene, &[7], (None, None)).is_err());
+    assert!(depth_range(&scene, &[0], Some(50.0), None).is_err());
+    assert!(depth_range(&scene, &[0], Some(f32::NAN), Some(2.0)).is_err());
+    assert!(depth_range(&scene, &[7], None, None).is_err());
     scene.points = None;
-    assert!(depth_range(&scene, &[0], (None, None)).unwrap_err().to_string().contains("baseline"));
+    assert!(depth_range(&scene, &[0], None, None).unwrap_err().to_string().contains("baseline"));
 }
 
 #[test]
 fn transforms_json_variants_are_read() {
     let (folder, cameras) = made_up(3);
     let gl = |c: &Camera| {
-        let m = c.world_from_camera * Mat4::from_diagonal(glam::Vec4::new(1.0, -1.0, -1.0, 1.0));
+        let m = c.world_from_camera() * Mat4::from_diagonal(glam::Vec4::new(1.0, -1.0, -1.0, 1.0));
         m.transpose().to_cols_array_2d()
     };
     let frames = |name: &dyn Fn(&str) -> String| -> Vec<serde_json::Value> {
@@ -195,8 +197,8 @@ fn transforms_json_variants_are_read() {
     let scene = load(serde_json::json!({"camera_angle_x": 0.8, "frames": frames(&bare)}));
     let f = 32.0 / (0.4f32).tan();
     for (frame, c) in scene.frames.iter().zip(&cameras) {
-        assert_eq!(frame.camera.world_from_camera, c.camera.world_from_camera);
-        let k = frame.camera.intrinsics;
+        assert_eq!(frame.camera.world_from_camera(), c.camera.world_from_camera());
+        let k = frame.camera.intrinsics();
         assert!((k.fx - f).abs() < 1e-4 && k.fy == k.fx && (k.cx, k.cy) == (32.0, 24.0), "{k:?}");
         assert_eq!(frame.name, c.file[7..].trim_end_matches(".png"));
     }
@@ -207,7 +209,7 @@ fn transforms_json_variants_are_read() {
     let scene = load(serde_json::json!({
         "fl_x": 140.0, "fl_y": 142.0, "cx": 64.0, "cy": 48.0, "w": 128.0, "h": 96,
         "camera_model": "OPENCV", "k1": 0.01, "aabb_scale": 16, "frames": with_own}));
-    let k = |i: usize| scene.frames[i].camera.intrinsics;
+    let k = |i: usize| scene.frames[i].camera.intrinsics();
     assert_eq!((k(0).fx, k(0).fy, k(0).cx), (70.0, 71.0, 32.0));
     assert_eq!((k(1).fx, k(1).fy, k(1).cx), (100.0, 71.0, 30.0));
     assert!(scene.warnings.iter().any(|w| w.contains("another size")), "{:?}", scene.warnings);
@@ -238,7 +240,7 @@ fn precedence_of_pose_files() {
     let (folder, cameras) = made_up(2);
     let at = |name: &str| folder.path().join(name);
     let line = |v: &[f32]| v.iter().map(f32::to_string).collect::<Vec<_>>().join(" ");
-    let pose = |c: &NamedCamera| c.camera.world_from_camera.transpose().to_cols_array();
+    let pose = |c: &NamedCamera| c.camera.world_from_camera().transpose().to_cols_array();
     let poses: Vec<String> = cameras.iter().map(|c| line(&pose(c))).collect();
     std::fs::write(at("poses.txt"), poses.join("\n")).unwrap();
     std::fs::write(at("K.txt"), "70 0 32\n0 71 24\n0 0 1\n").unwrap();
@@ -256,7 +258,7 @@ fn precedence_of_pose_files() {
     let frames: Vec<_> = cameras
         .iter()
         .map(|c| {
-            let m = (c.camera.world_from_camera * gl).transpose().to_cols_array_2d();
+            let m = (c.camera.world_from_camera() * gl).transpose().to_cols_array_2d();
             serde_json::json!({"file_path": c.file, "transform_matrix": m})
         })
         .collect();
@@ -281,18 +283,18 @@ fn precedence_of_pose_files() {
         assert_eq!(scene.source, format);
         for (a, b) in scene.frames.iter().zip(&reference.frames) {
             assert_eq!((&a.name, &a.image), (&b.name, &b.image));
-            let e = a.camera.world_from_camera - b.camera.world_from_camera;
+            let e = a.camera.world_from_camera() - b.camera.world_from_camera();
             assert!(e.to_cols_array().iter().all(|v| v.abs() < 1e-5), "{file} {e}");
         }
     }
     assert_eq!(load_scene(&at("sparse/0")).unwrap().source, SceneFormat::Colmap);
     // Other matrix conventions, from the same numbers.
     for (convention, want) in [
-        (PoseConvention::WorldFromCameraOpenGl, cameras[0].camera.world_from_camera * gl),
+        (PoseConvention::WorldFromCameraOpenGl, cameras[0].camera.world_from_camera() * gl),
         (PoseConvention::CameraFromWorldOpenCv, cameras[0].camera.camera_from_world()),
     ] {
         let scene = matrices::load(folder.path(), convention).unwrap();
-        let e = scene.frames[0].camera.world_from_camera - want;
+        let e = scene.frames[0].camera.world_from_camera() - want;
         assert!(e.to_cols_array().iter().all(|v| v.abs() < 1e-5), "{convention:?} {e}");
     }
 }
@@ -327,7 +329,7 @@ fn re10k_frames_are_matched_by_time_order_or_number() {
     let scene = load_scene(folder.path()).unwrap();
     assert_eq!(x(&scene), [1.0, 2.0]);
     // The intrinsics refer to the stored size.
-    let k = scene.frames[0].camera.intrinsics;
+    let k = scene.frames[0].camera.intrinsics();
     assert_eq!((k.fx, k.fy, k.cx, k.cy), (12.0, 12.0, 6.0, 4.0));
     put(&["p.png", "q.png"]);
     let e = load_scene(folder.path()).unwrap_err().to_string();
@@ -384,9 +386,9 @@ fn pairs_and_exif() {
     let scene = Scene::from_pair(&path(0), &path(1), cameras[0].camera, cameras[1].camera).unwrap();
     assert_eq!(scene.frames[1].camera, cameras[1].camera);
     assert!(scene.warnings.is_empty());
-    let mut wrong = cameras[0].camera;
-    wrong.intrinsics.width = 48;
-    wrong.intrinsics.height = 64;
+    let camera = cameras[0].camera;
+    let wrong = Intrinsics { width: 48, height: 64, ..camera.intrinsics() };
+    let wrong = camera.with_intrinsics(wrong).unwrap();
     let e = Scene::from_pair(&path(0), &path(1), wrong, cameras[1].camera).unwrap_err();
     assert!(e.to_string().contains("48x64"), "{e}");
 

@@ -35,10 +35,10 @@ fn difference(a: &Scene, b: &Scene) -> (f32, f32) {
     for (a, b) in a.frames.iter().zip(&b.frames) {
         assert_eq!(a.image.file_name(), b.image.file_name());
         assert_eq!(a.name, b.name);
-        let (ka, kb) = (a.camera.intrinsics, b.camera.intrinsics);
+        let (ka, kb) = (a.camera.intrinsics(), b.camera.intrinsics());
         assert_eq!((ka.width, ka.height), (kb.width, kb.height));
         let k = [ka.fx - kb.fx, ka.fy - kb.fy, ka.cx - kb.cx, ka.cy - kb.cy];
-        let pose = a.camera.world_from_camera - b.camera.world_from_camera;
+        let pose = a.camera.world_from_camera() - b.camera.world_from_camera();
         worst.0 = k.iter().fold(worst.0, |m, v| m.max(v.abs()));
         worst.1 = pose.to_cols_array().iter().fold(worst.1, |m, v| m.max(v.abs()));
     }
@@ -60,7 +60,7 @@ fn every_scene_loads() {
         };
         assert_eq!(scene.units, units, "{name}");
         let (picture, camera) = scene.frames[0].load().unwrap();
-        assert_eq!(picture.width, camera.intrinsics.width);
+        assert_eq!(picture.width, camera.intrinsics().width);
         let depth = scene.frames[0].depth.is_some();
         assert_eq!(depth, name.starts_with("hololens"));
     }
@@ -116,7 +116,7 @@ fn protocol_intrinsics_follow_the_exact_rule() {
         let (picture, camera) = scene.frames[0].load().unwrap();
         let c = crop(&picture, &camera, &CropOptions::square(256, 1, 16)).unwrap();
         let want = protocol.intrinsics_256.unwrap();
-        let got = c.input_camera.intrinsics;
+        let got = c.input_camera.intrinsics();
         for (g, w) in [(got.fx, want.fx), (got.fy, want.fy), (got.cx, want.cx), (got.cy, want.cy)] {
             assert!((f64::from(g) - w).abs() < 1e-3, "{name}: {got:?} {want:?}");
         }
@@ -151,7 +151,7 @@ fn protocol_geometry_is_reproduced() {
         }
         let pair = choose_pair(&scene).unwrap();
         eprintln!("{name}: {}", pair.reason);
-        let range = depth_range(&scene, &pair.frames, (None, None)).unwrap();
+        let range = depth_range(&scene, &pair.frames, None, None).unwrap();
         assert_eq!(name.starts_with("re10k"), range.near == 1.0 && range.far == 100.0, "{range:?}");
     }
     assert!(compared >= 13, "{compared}");
@@ -206,10 +206,10 @@ fn the_distortion_of_the_fox_is_removed() {
     // test distorts a stored picture with this lens, removes the distortion again, and compares.
     let lens = &frame.distortion;
     let photo = image::load(&frame.image).unwrap();
-    let k = frame.camera.intrinsics;
+    let k = frame.camera.intrinsics();
     let distorter = Distorter { lens, k };
     let distorted_photo = distorter.apply(&photo);
-    let new = frame.pinhole().unwrap().intrinsics;
+    let new = frame.pinhole().unwrap().intrinsics();
     assert!(new.fx / k.fx > 0.95 && new.fx / k.fx < 1.05, "{new:?}");
     let back = undistort(&distorted_photo, &k, lens, &k);
     let untouched = psnr_inside(&distorted_photo, &photo, 60);
@@ -281,8 +281,8 @@ fn mvsplat_rule_on_real_estate_gives_its_published_crop() {
     let (picture, camera) = scene.frames[0].load().unwrap();
     let options = CropOptions { rule: CropRule::Mvsplat, ..CropOptions::square(256, 1, 16) };
     let c = crop(&picture, &camera, &options).unwrap();
-    let [fx, fy, cx, cy] = c.input_camera.intrinsics.normalised();
-    let [fx_photo, fy_photo, ..] = camera.intrinsics.normalised();
+    let [fx, fy, cx, cy] = c.input_camera.intrinsics().normalised();
+    let [fx_photo, fy_photo, ..] = camera.intrinsics().normalised();
     // 576x320 covers 256x256 at 461x256.
     assert!((fx - fx_photo * 461.0 / 256.0).abs() < 1e-6 && (fy - fy_photo).abs() < 1e-6);
     assert_eq!((cx, cy), (0.5, 0.5));
@@ -317,12 +317,12 @@ fn the_mvsplat_crop_equals_the_crop_shim() {
 
         let area = 3 * 256 * 256;
         assert_eq!(c.input.to_planes(), images[area * view..area * (view + 1)]);
-        let [fx, fy, cx, cy] = c.input_camera.intrinsics.normalised();
+        let [fx, fy, cx, cy] = c.input_camera.intrinsics().normalised();
         let want = &ks[9 * view..];
         for (got, want) in [(fx, want[0]), (fy, want[4]), (cx, want[2]), (cy, want[5])] {
             assert!((got - want).abs() < 1e-6, "{got} {want}");
         }
-        let pose = c.input_camera.world_from_camera.transpose().to_cols_array();
+        let pose = c.input_camera.world_from_camera().transpose().to_cols_array();
         for (got, want) in pose.iter().zip(&poses[16 * view..]) {
             assert!((got - want).abs() < 1e-5, "{got} {want}");
         }

@@ -1,5 +1,5 @@
-//! What `eval` measures: baselines against outside figures, methods against the pipeline
-//! by hand, and what it refuses.
+//! Scores of `eval`: baselines against published figures, methods against the same steps of
+//! the pipeline, and errors for invalid requests.
 
 use subsplat_test_support as common;
 use subsplat_test_support::chunk_files;
@@ -8,6 +8,7 @@ use subsplat_test_support::scene_folder as program;
 use chunk_files::{frame, video, write};
 use std::collections::BTreeMap;
 use std::path::Path;
+use subsplat::FitOptions;
 use subsplat::config::{Config, LowpassRef, Preset};
 use subsplat::data::crop::CropOptions;
 use subsplat::eval::{Benchmark, Evaluator, Method, Options, Scores};
@@ -40,8 +41,8 @@ fn room() -> tempfile::TempDir {
     place
 }
 
-/// Whoever made the photographs' protocol scored the trivial baselines with another
-/// program: two decimals of PSNR, four of SSIM.
+/// The photographs' protocol holds scores of the trivial baselines from another program: two
+/// decimals of PSNR, four of SSIM.
 #[test]
 fn trivial_baselines_are_the_protocols() {
     let Some(photos) = common::shared("photos") else { return };
@@ -108,13 +109,14 @@ fn methods_are_what_they_say() {
     let photo = |i: usize| Photo::from_frame(&scene.frames[i]).unwrap();
     let crop = CropOptions::square(64, 2, 32);
     let truth = photo(1).crop(&crop).unwrap();
-    let near = scene.near_far.unwrap().0;
+    let near = scene.near_far.unwrap().near;
     let request = |detail| {
         pipeline::Options::default()
             .with_input_size(64, 64)
             .with_depth_prior(DepthBounds::of_scene(&scene, &[0, 2]).unwrap())
             .with_check(Check::Off)
             .with_detail(detail)
+            .with_fit(FitOptions::off())
     };
     let photos = [photo(0), photo(2)];
     let seen = |model: &Reconstructor, detail: Detail, lowpass: LowpassRef| {

@@ -6,7 +6,7 @@ use subsplat_test_support as common;
 use candle_core::{Device, Tensor, Var};
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use subsplat::camera::{Camera, Intrinsics};
+use subsplat::camera::{Camera, Intrinsics, NearFar};
 use subsplat::data::dataset::Posed;
 use subsplat::data::procedural::{ExampleSpec, TargetSpec};
 use subsplat::io::image::Rgb;
@@ -124,7 +124,7 @@ fn disparity_and_confidence_losses() {
 fn candidates_and_blocks() {
     // D = 5 between 1/4 and 1; index 0 is far.
     let inverse = [0.25, 1.0, 0.625, 0.0, 0.2, 0.1, 1.2];
-    let index = loss::candidate_index(&inverse, (1.0, 4.0), 5);
+    let index = loss::candidate_index(&inverse, NearFar::new(1.0, 4.0), 5);
     assert_eq!(index[..3], [0.0, 4.0, 2.0]);
     assert!(index[3].is_nan() && index[5].is_nan() && index[6].is_nan());
     assert_eq!(index[4], 0.0);
@@ -282,7 +282,7 @@ fn rooms_are_determined_by_their_seed() {
     assert_ne!(one, rooms().example(4).unwrap());
     assert_eq!(one.context.len(), 2);
     assert_eq!((one.targets[0].image.width, one.targets[0].image.height), (64, 48));
-    assert_eq!(one.targets[0].camera.intrinsics.width, 64);
+    assert_eq!(one.targets[0].camera.intrinsics().width, 64);
     assert_eq!(one.inverse_depth[1].len(), 32 * 24);
     let finite = Rooms { scenes: 3, ..rooms() };
     assert_eq!(finite.example(4).unwrap(), rooms().example(1).unwrap());
@@ -299,7 +299,7 @@ fn a_visible_range_is_slightly_wider_than_the_depths() {
         depths.sort_by(f32::total_cmp);
         let last = depths.len() - 1;
         let (low, high) = (depths[last / 100], depths[last - last / 100]);
-        let (near, far) = visible.near_far;
+        let NearFar { near, far } = visible.near_far;
         assert!((0.74 * low..=1.01 * low).contains(&near), "{near} {low}");
         assert!((0.99 * high..=1.41 * high).contains(&far), "{far} {high}");
         assert_eq!(visible, all.example(i).unwrap());

@@ -155,7 +155,7 @@ fn area_by_determinant(row: &[f64], camera: &Camera, zoom: f64) -> f64 {
     let sigma = r * s * s * r.transpose();
     let p = camera.rotation().as_dmat3().transpose()
         * (DVec3::new(row[0], row[1], row[2]) - camera.position().as_dvec3());
-    let k = camera.intrinsics;
+    let k = camera.intrinsics();
     let (fx, fy) = (zoom * f64::from(k.fx), zoom * f64::from(k.fy));
     let j = [
         DVec3::new(fx / p.z, 0.0, -fx * p.x / (p.z * p.z)),
@@ -271,7 +271,7 @@ fn ray_residuals_do_not_move_the_projection_and_axis_ones_drift() {
         for (i, (a, b)) in with.chunks(11).zip(without.chunks(11)).enumerate() {
             let camera = &call.cameras[i / 256];
             let (a, b) = (camera.to_camera(mean(a)), camera.to_camera(mean(b)));
-            let k = camera.intrinsics;
+            let k = camera.intrinsics();
             let moved = k.project(a) - k.project(b);
             let dz = residuals[i] as f32;
             assert!((a.z - b.z - dz).abs() < 1e-5);
@@ -383,7 +383,7 @@ fn disc_steps_stay_on_the_disc_and_reduce_to_the_flat_step() {
             assert!(step.dot(normal).abs() < 1e-5 * step.length(), "{angle} {}", step.dot(normal));
         }
         let mut flat = call.clone();
-        flat.rules.disc = false;
+        flat.rules.slide = Slide::ZConst;
         let flat = host(&spgr(&zero, &p, &flat).unwrap().0);
         let far = disc
             .chunks(11)
@@ -455,8 +455,10 @@ fn nearest_visible_view_places_the_children() {
     config.spgr.beta_z = 0.0;
     let mut call = call(&config, 8);
     // View 1 is one unit closer to points in both pictures.
-    call.cameras[1].world_from_camera = glam::Mat4::from_translation(Vec3::new(0.0, 0.0, 1.0));
-    call.cameras[0].world_from_camera = glam::Mat4::IDENTITY;
+    let posed = |c: &Camera, pose| Camera::new(c.intrinsics(), pose).unwrap();
+    let forward = glam::Mat4::from_translation(Vec3::new(0.0, 0.0, 1.0));
+    call.cameras[1] = posed(&call.cameras[1], forward);
+    call.cameras[0] = posed(&call.cameras[0], glam::Mat4::IDENTITY);
     call.per_view = 1;
     // A point in both pictures, one in that of view 0 only, one in neither.
     let points = [[0.0, 0.0, 3.0], [1.0, 0.0, 2.2], [0.0, 0.0, -2.0]];
@@ -465,7 +467,7 @@ fn nearest_visible_view_places_the_children() {
         let p = cpu(row.to_vec(), &[1, 11]);
         let zero = Tensor::zeros((1, 4, HEAD_STRIDE), DType::F64, &Device::Cpu).unwrap();
         let rows = host(&spgr(&zero, &p, call).unwrap().0);
-        (rows[11] - rows[0]) * f64::from(call.cameras[0].intrinsics.fx)
+        (rows[11] - rows[0]) * f64::from(call.cameras[0].intrinsics().fx)
     };
     for first in [0, 1] {
         call.first = first;
@@ -473,7 +475,7 @@ fn nearest_visible_view_places_the_children() {
         assert!((pitch(&call, points[1]) - 0.5 * 2.2).abs() < 1e-6, "only view 0 sees it");
         assert!((pitch(&call, points[2]) - 0.5 * 0.01).abs() < 1e-6, "guarded source view");
     }
-    call.rules.nearest_visible = false;
+    call.rules.primary_view = PrimaryView::Source;
     call.first = 0;
     assert!((pitch(&call, points[0]) - 0.5 * 3.0).abs() < 1e-6, "source view 0");
 }

@@ -124,7 +124,7 @@ struct Nasty {
 
 fn nasty(call: &Spgr, children: usize, r: &mut Random) -> Vec<Nasty> {
     let camera = &call.cameras[0];
-    let middle = camera.intrinsics.height / 2 * camera.intrinsics.width + 3;
+    let middle = camera.intrinsics().height / 2 * camera.intrinsics().width + 3;
     let base: Vec<f64> = host(&parents(&call.cameras, r).narrow(0, middle, 1).unwrap());
     let base: [f64; SPLAT_STRIDE] = base.try_into().unwrap();
     let at = |x: f32, y: f32, z: f32| {
@@ -279,7 +279,7 @@ fn gains_alone_have_a_gradient() {
         let grads = gains.sum_all().unwrap().backward().unwrap();
         let got = grads.get(&h).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
         let rules = &plain.call.rules;
-        let factor = rules.delta * if rules.rgb_gain { 2.5 } else { 1.0 };
+        let factor = rules.delta * if rules.gain_space == GainSpace::Rgb { 2.5 } else { 1.0 };
         for (record, d) in plain.head.chunks(HEAD_STRIDE).zip(got.chunks(HEAD_STRIDE)) {
             let t = f64::from(record[HEAD_GAIN_OFFSET]).tanh();
             let want = factor * (1.0 - t * t);

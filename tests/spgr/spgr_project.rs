@@ -76,13 +76,13 @@ impl Scene {
 /// A camera beside the context views, with a part of the scene in its picture and pixels
 /// `zoom` times finer.
 fn beside(scene: &Scene, zoom: f32) -> Camera {
-    let mut camera = scene.call.cameras[0];
+    let camera = scene.call.cameras[0];
     let turn = Quat::from_euler(glam::EulerRot::XYZ, 0.1, -0.25, 0.3);
-    camera.world_from_camera *= Mat4::from_rotation_translation(turn, Vec3::new(0.4, 0.1, 1.5));
-    let k = &mut camera.intrinsics;
+    let step = Mat4::from_rotation_translation(turn, Vec3::new(0.4, 0.1, 1.5));
+    let mut k = camera.intrinsics();
     (k.fx, k.fy, k.cx, k.cy) = (k.fx * zoom, k.fy * zoom, k.cx * zoom, k.cy * zoom);
     (k.width, k.height) = ((k.width as f32 * zoom) as usize, (k.height as f32 * zoom) as usize);
-    camera
+    Camera::new(k, camera.world_from_camera() * step).unwrap()
 }
 
 fn numbers(f: &Footprint) -> [f32; 12] {

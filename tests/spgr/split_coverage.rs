@@ -50,7 +50,7 @@ type Draw<'a> = dyn FnMut(&Camera, Vec2) -> ([f32; 11], [f32; 3]) + 'a;
 
 impl Parents {
     fn new(cameras: &[Camera], parent: &mut Draw<'_>) -> Self {
-        let k = cameras[0].intrinsics;
+        let k = cameras[0].intrinsics();
         let (mut rows, mut sh) = (Vec::new(), Vec::new());
         for camera in cameras {
             for i in 0..k.width * k.height {
@@ -88,7 +88,7 @@ impl Parents {
         native.spgr.enabled = false;
         let config = config.unwrap_or(&native);
         let trunk = Trunk::new(config, &channels(), Weights::seeded(1).builder()).unwrap();
-        let k = self.views.cameras[0][0].intrinsics;
+        let k = self.views.cameras[0][0].intrinsics();
         let features = backbone(self.views.views(), k.width, k.height, &mut Random(1));
         trunk.forward(&self.views, &features, &self.primaries).unwrap().to_splats().unwrap()
     }
@@ -101,9 +101,10 @@ fn coverage(config: &Config, sigma_px: f32, alpha: f32, draws: usize) -> f32 {
     let draw = |d: usize| {
         let cameras = eyes(d, side).map(|eye| camera(eye, side));
         let parents = Parents::new(&cameras, &mut |camera, px| {
-            let at =
-                camera.world_from_camera.transform_point3(camera.intrinsics.unproject(px) * DEPTH);
-            let s = sigma_px * DEPTH / camera.intrinsics.fx;
+            let at = camera
+                .world_from_camera()
+                .transform_point3(camera.intrinsics().unproject(px) * DEPTH);
+            let s = sigma_px * DEPTH / camera.intrinsics().fx;
             ([at.x, at.y, at.z, 1.0, 0.0, 0.0, 0.0, s, s, s, alpha], [1.0; 3])
         });
         let large = side * config.upscale;
@@ -160,10 +161,11 @@ fn random_parents(side: usize, rough: bool, seed: u64) -> (Parents, Camera) {
         // Hills between 1.5 and 3.5 and 2 % of noise.
         let hills = (0.15 * px.x).sin() * (0.11 * px.y).cos() + uniform(-0.05, 0.05);
         let z = if rough { 2.5 + hills } else { DEPTH };
-        let at =
-            camera.world_from_camera.transform_point3(camera.intrinsics.unproject(px_moved) * z);
+        let at = camera
+            .world_from_camera()
+            .transform_point3(camera.intrinsics().unproject(px_moved) * z);
         let scale: [f32; 3] =
-            std::array::from_fn(|_| uniform(0.35, 1.55) * z / camera.intrinsics.fx);
+            std::array::from_fn(|_| uniform(0.35, 1.55) * z / camera.intrinsics().fx);
         let q: [f32; 4] = std::array::from_fn(|_| uniform(-1.0, 1.0));
         let q = Quat::from_array(q).normalize();
         // Colours as pictures have them: smooth, with some noise.
@@ -202,7 +204,7 @@ fn tuned_children_reduced_are_their_parents_native_render() {
         let native = render(&parents.splats(None), &camera, &options);
         for upscale in [2, 4] {
             let score = |config: &Config| {
-                let large = camera.resized(side * upscale, side * upscale);
+                let large = camera.resized(side * upscale, side * upscale).unwrap();
                 let picture = render(&parents.splats(Some(config)), &large, &options);
                 let alpha = reduced(&picture.alpha, side, upscale, 1);
                 let rgb = reduced(&picture.rgb, side, upscale, 3);

@@ -7,7 +7,7 @@ use splat_scene::*;
 use std::path::{Path, PathBuf};
 use subsplat::abi::{SPLAT_STRIDE, ShBasis};
 use subsplat::io::{SaveOptions, SplatFormat, Up, load_splats, save_splats, splat_info};
-use subsplat::splats::Splats;
+use subsplat::splats::{SplatParts, Splats};
 
 fn save(name: &str, splats: &Splats, options: &SaveOptions) -> (tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
@@ -31,6 +31,51 @@ fn kinds() -> Vec<Kind> {
         }
     }
     kinds
+}
+
+/// Names of the buffer and of the splat are part of every error.
+#[test]
+fn numbers_that_are_not_finite_are_refused_by_name() {
+    let kind =
+        Kind { parents: 9, children: 4, degree: 1, gain_channels: 4, basis: ShBasis::Standard };
+    let good = scene(3, kind).into_parts();
+    assert!(Splats::try_from(good.clone()).is_ok());
+    for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        let refused = |change: &dyn Fn(&mut SplatParts), what: &str, splat: usize| {
+            let mut parts = good.clone();
+            change(&mut parts);
+            let e = Splats::try_from(parts).unwrap_err();
+            let expected =
+                format!("splats {what}: expected finite numbers, got {bad} at splat {splat}");
+            assert_eq!(e.to_string(), expected);
+        };
+        for offset in 0..SPLAT_STRIDE {
+            refused(&|p| p.rows[7 * SPLAT_STRIDE + offset] = bad, "rows", 7);
+        }
+        // Four coefficients of three channels per parent; the first child of parent 5 is 20.
+        refused(&|p| p.sh[5 * 12] = bad, "SH coefficients", 20);
+        refused(&|p| p.sh[5 * 12 + 11] = bad, "SH coefficients", 20);
+        refused(&|p| p.gain[4 * 11 + 3] = bad, "gain", 11);
+        // The first of two is named.
+        let two = |p: &mut SplatParts| (p.rows[30 * SPLAT_STRIDE], p.rows[8]) = (bad, bad);
+        refused(&two, "rows", 0);
+    }
+    // One gain per splat, and more rows than one task of the parallel check holds.
+    let one = SplatParts { gain: vec![1.0; 36], ..good.clone() };
+    let mut parts = one.clone();
+    parts.gain[35] = f32::NAN;
+    let e = Splats::try_from(parts).unwrap_err().to_string();
+    assert!(e.contains("gain") && e.contains("splat 35"), "{e}");
+    let mut rows = good.rows[..SPLAT_STRIDE].repeat(20_000);
+    rows[19_998 * SPLAT_STRIDE + 4] = f32::INFINITY;
+    rows[19_999 * SPLAT_STRIDE] = f32::NAN;
+    let e = Splats::new(rows, vec![0.0; 3], Vec::new(), 0, ShBasis::Standard).unwrap_err();
+    assert!(e.to_string().contains("rows") && e.to_string().contains("splat 19998"), "{e}");
+    // The largest finite numbers and zeros are accepted.
+    let mut parts = one;
+    parts.rows[..SPLAT_STRIDE].fill(f32::MAX);
+    parts.rows[SPLAT_STRIDE..2 * SPLAT_STRIDE].fill(0.0);
+    assert!(Splats::try_from(parts).is_ok());
 }
 
 /// Degree that a file of at most `limit` keeps, as `splat_scene::colour` counts it.

@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 use subsplat::abi::{
     Convention, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, RasterOptions, SCALE_OFFSET, ShBasis,
 };
-use subsplat::camera::Camera;
+use subsplat::camera::{Camera, NearFar};
 use subsplat::config::{self, Config, FeatureLevel, LowpassRef, Preset};
 use subsplat::cpu::{Geometry, Rasterizer, SplatSlices, sh};
 use subsplat::model::aggregation::Aggregation;
@@ -46,7 +46,7 @@ impl Scene {
         let (cameras, near_far) = golden.cameras(width, height);
         let parent = |name: &str| golden.input(&format!("parent.{name}"));
         Ok(Self {
-            near: near_far.iter().map(|n| n.0).collect(),
+            near: near_far.iter().map(|n| n.near).collect(),
             frames: Frames::new(&cameras, DType::F32, &Device::Cpu)?,
             cameras,
             per_view: width * height,
@@ -77,9 +77,9 @@ impl Scene {
     }
 
     fn views(&self) -> Result<Views> {
-        let k = self.cameras[0].intrinsics;
+        let k = self.cameras[0].intrinsics();
         let shape = (1, self.cameras.len(), 3, k.height, k.width);
-        let near_far = self.near.iter().map(|&near| (near, 100.0)).collect();
+        let near_far = self.near.iter().map(|&near| NearFar::new(near, 100.0)).collect();
         let images = Tensor::zeros(shape, DType::F32, &Device::Cpu)?;
         Views::new(images, vec![self.cameras.clone()], vec![near_far])
     }
@@ -314,8 +314,8 @@ fn projection() -> Result<()> {
         let convention: Convention = golden.note("convention");
         let [width, height] = golden.note("picture");
         let size: f32 = golden.note("scale");
-        let intrinsics = scene.cameras[0].intrinsics.resized(width, height);
-        let camera = Camera::new(intrinsics, scene.cameras[0].world_from_camera).unwrap();
+        let intrinsics = scene.cameras[0].intrinsics().resized(width, height);
+        let camera = Camera::new(intrinsics, scene.cameras[0].world_from_camera()).unwrap();
         let options = RasterOptions {
             lowpass: golden.note("lowpass"),
             antialiased: golden.note("antialiased"),

@@ -149,7 +149,7 @@ fn det([xx, xy, yy]: V3) -> f32 {
 
 impl View {
     pub fn new(camera: &Camera, options: Options) -> Self {
-        let k = camera.intrinsics;
+        let k = camera.intrinsics();
         let r = camera.rotation();
         let limit = |side: usize, f: f32, c: f32| {
             let margin = 0.3 * 0.5 * side as f32 / f;

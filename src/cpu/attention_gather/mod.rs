@@ -132,7 +132,7 @@ impl<T: Real> Scratch<T> {
             s.state = if g.renormalise { State::Masked } else { State::Blank };
             return s;
         }
-        let shift = T::constant(if g.half_pixel { 0.5 } else { 0.0 });
+        let shift = T::constant(g.sample_convention.shift());
         let x = rx * T::constant(level.width as f64) - shift;
         let y = ry * T::constant(level.height as f64) - shift;
         let (x0, y0) = (x.floor(), y.floor());

@@ -70,7 +70,7 @@ impl Taps {
     fn place(&mut self, g: &Gather, points: &[f32]) {
         self.count = 0;
         let levels = g.levels.len();
-        let shift = if g.half_pixel { 0.5 } else { 0.0 };
+        let shift = g.sample_convention.shift() as f32;
         for (v, at) in points.chunks_exact(2).enumerate() {
             let (rx, ry) = (at[0], at[1]);
             let inside = rx > 0.0 && rx < 1.0 && ry > 0.0 && ry < 1.0;

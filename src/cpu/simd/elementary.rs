@@ -69,7 +69,12 @@ fn polynomial<V: F32Vector, const N: usize>(x: V, coefficients: [f32; N]) -> V {
 /// (p, 2ⁿ) with eˣ = 2ⁿ(1 + p), |p| < 0.42, for x clamped to [`EXP_MIN`], [`EXP_MAX`].
 #[inline(always)]
 fn exp_parts<V: F32Vector>(x: V) -> (V, V) {
-    let x = x.max(V::splat(EXP_MIN)).min(V::splat(EXP_MAX));
+    exp_parts_in_range(x.max(V::splat(EXP_MIN)).min(V::splat(EXP_MAX)))
+}
+
+/// [`exp_parts`] of [`EXP_MIN`] ≤ x ≤ [`EXP_MAX`].
+#[inline(always)]
+fn exp_parts_in_range<V: F32Vector>(x: V) -> (V, V) {
     let shifted = x.fma(V::splat(LOG2_E), V::splat(ROUND));
     let n = shifted - V::splat(ROUND);
     let r = n.fma(V::splat(-LN_2[0]), x);
@@ -87,8 +92,10 @@ fn exp_parts<V: F32Vector>(x: V) -> (V, V) {
 #[inline(always)]
 pub(crate) fn exp<V: F32Vector>(x: V) -> V {
     let (p, scale) = exp_parts(x);
+    // A factor of 0, while the polynomial is computed: no selection follows the product.
+    let scale = x.lt(V::splat(EXP_MIN)).select(V::splat(0.0), scale);
     // The sum first: p·2ⁿ alone may be denormal.
-    x.lt(V::splat(EXP_MIN)).select(V::splat(0.0), (p + V::splat(1.0)) * scale)
+    (p + V::splat(1.0)) * scale
 }
 
 /// eˣ − 1 to 4 ulp; −1 below −87.3, e⁸⁸ above 88, NaN for NaN.
@@ -101,7 +108,8 @@ pub(crate) fn exp_m1<V: F32Vector>(x: V) -> V {
 /// tanh x to 4 ulp.
 #[inline(always)]
 pub(crate) fn tanh<V: F32Vector>(x: V) -> V {
-    let e = exp_m1((x + x).min(V::splat(30.0)));
+    let (p, scale) = exp_parts_in_range((x + x).max(V::splat(EXP_MIN)).min(V::splat(30.0)));
+    let e = p.fma(scale, scale - V::splat(1.0));
     e / (e + V::splat(2.0))
 }
 

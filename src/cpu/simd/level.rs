@@ -1,9 +1,10 @@
 //! Instruction sets: detection, names, and the calls that enter them.
 
 use super::Simd;
+#[cfg(not(target_arch = "x86_64"))]
 use super::array::Array;
 #[cfg(target_arch = "x86_64")]
-use super::{avx2, avx512};
+use super::{avx2, avx512, sse2};
 use std::sync::OnceLock;
 
 /// An instruction set that kernels are compiled for.
@@ -101,6 +102,9 @@ impl SimdLevel {
             }
             #[cfg(target_arch = "aarch64")]
             SimdLevel::Neon => kernel.run(Array::<true>),
+            #[cfg(target_arch = "x86_64")]
+            _ => kernel.run(sse2::Token),
+            #[cfg(not(target_arch = "x86_64"))]
             _ => kernel.run(Array::<false>),
         }
     }

@@ -7,25 +7,25 @@
 //! (src/model/shipped/README.md, "The small backbone").
 //!
 //! In: pictures, cameras, distance along the unit ray of each pixel. Out: `[V, H·W]`,
-//! factors from [`LEAST`] (another colour in all views that show it) to 1 (the same
+//! factors from [`MIN_FACTOR`] (another colour in all views that show it) to 1 (the same
 //! colour, or hidden in all views). No gradient: pictures are inputs, and the step of a point
 //! across a silhouette has no derivative. Oracle: the same in f64 by matrices (the tests).
 
 use crate::camera::Camera;
 use rayon::prelude::*;
 
-/// Factor of a pixel that is doubted altogether.
-pub const LEAST: f32 = 0.1;
+/// Factor of a pixel whose inconsistency is 1 in every view that shows its point.
+pub const MIN_FACTOR: f32 = 0.1;
 /// Σ|ΔRGB| of display values from which inconsistency is 1.
 const COLOUR: f32 = 1.0;
 /// A point is hidden where it lies behind the other view's surface by more than this
 /// share of that surface's z.
 const BEHIND: f32 = 0.05;
 
-/// One view.
+/// A view with colours and depth.
 #[derive(Clone, Copy, Debug)]
-pub struct Seen<'a> {
-    /// Of pictures of H × W pixels.
+pub struct RgbdView<'a> {
+    /// Camera of H × W pixels.
     pub camera: &'a Camera,
     /// `[3, H, W]`, display values.
     pub rgb: &'a [f32],
@@ -35,13 +35,13 @@ pub struct Seen<'a> {
 
 /// Position and colour of a view's surface.
 struct Surface<'a> {
-    view: Seen<'a>,
+    view: RgbdView<'a>,
     /// `[H·W]`: camera z.
     z: Vec<f32>,
 }
 
 impl<'a> Surface<'a> {
-    fn new(view: Seen<'a>) -> Self {
+    fn new(view: RgbdView<'a>) -> Self {
         let z = (0..view.distances.len()).into_par_iter();
         let z = z.map(|i| view.distances[i] / ray(view.camera, i).length()).collect();
         Self { view, z }
@@ -54,7 +54,7 @@ impl<'a> Surface<'a> {
 
     /// Returns the inconsistency of a `point` (world) of `colour` with this view, 0 to 1; none
     /// where the view does not show the point.
-    fn doubt(&self, point: glam::Vec3, colour: [f32; 3]) -> Option<f32> {
+    fn inconsistency(&self, point: glam::Vec3, colour: [f32; 3]) -> Option<f32> {
         let k = self.view.camera.intrinsics;
         let p = self.view.camera.to_camera(point);
         let at = k.project(p);
@@ -82,7 +82,7 @@ fn ray(camera: &Camera, i: usize) -> glam::Vec3 {
 
 /// The factors of all views' pixels, `[V, H·W]`: 1 minus the mean inconsistency of
 /// the other views that show the pixel's point.
-pub fn cross_check(views: &[Seen<'_>]) -> Vec<f32> {
+pub fn cross_check(views: &[RgbdView<'_>]) -> Vec<f32> {
     let surfaces: Vec<Surface> = views.iter().map(|v| Surface::new(*v)).collect();
     let mut out: Vec<f32> = Vec::with_capacity(views.iter().map(|v| v.distances.len()).sum());
     for (v, own) in surfaces.iter().enumerate() {
@@ -91,9 +91,9 @@ pub fn cross_check(views: &[Seen<'_>]) -> Vec<f32> {
             let in_camera = ray(camera, i) * own.z[i];
             let point = camera.rotation() * in_camera + camera.position();
             let others = surfaces.iter().enumerate().filter(|(u, _)| *u != v);
-            let doubts = others.filter_map(|(_, u)| u.doubt(point, own.colour(i)));
-            let (sum, count) = doubts.fold((0.0, 0u32), |(s, n), d| (s + d, n + 1));
-            1.0 - (1.0 - LEAST) * sum / count.max(1) as f32
+            let inconsistencies = others.filter_map(|(_, u)| u.inconsistency(point, own.colour(i)));
+            let (sum, count) = inconsistencies.fold((0.0, 0u32), |(s, n), d| (s + d, n + 1));
+            1.0 - (1.0 - MIN_FACTOR) * sum / count.max(1) as f32
         };
         let factors = (0..own.z.len()).into_par_iter().with_min_len(1024).map(factor);
         out.par_extend(factors);
@@ -132,62 +132,63 @@ mod tests {
         let mut distances = a.1;
         change(&mut distances);
         cross_check(&[
-            Seen { camera: &cameras[0], rgb: &a.0, distances: &distances },
-            Seen { camera: &cameras[1], rgb: &b.0, distances: &b.1 },
+            RgbdView { camera: &cameras[0], rgb: &a.0, distances: &distances },
+            RgbdView { camera: &cameras[1], rgb: &b.0, distances: &b.1 },
         ])
     }
 
     #[test]
-    fn what_agrees_stays() {
+    fn consistent_pixels_keep_their_opacity() {
         assert!(factors(|_| ()).iter().all(|f| *f == 1.0));
     }
 
     #[test]
-    fn a_bright_point_before_the_dark_half_is_doubted() {
+    fn a_bright_point_before_the_dark_half_is_inconsistent() {
         // Pixel (17, 16) of the first view shows the bright half, 1.5 px right of the
         // edge at x = 0. At z = 1 its point lies at x = 0.047, which the second view
         // (8 px of parallax at z = 2, 16 at z = 1) shows 7 px left of the edge.
         let at = 16 * SIDE + 17;
         let all = factors(|d| d[at] *= 0.5);
-        let expected = 1.0 - (1.0 - LEAST) * 1.0;
+        let expected = 1.0 - (1.0 - MIN_FACTOR) * 1.0;
         assert!((all[at] - expected).abs() < 1e-6, "{}", all[at]);
         // No other pixel of the first view; the second view has its own points before them.
         assert!(all[..SIDE * SIDE].iter().enumerate().all(|(i, f)| i == at || *f == 1.0));
     }
 
     #[test]
-    fn what_is_hidden_or_outside_is_not_doubted() {
+    fn hidden_points_and_points_outside_are_not_compared() {
         let at = 16 * SIDE + 17;
         // Behind the second view's wall by half; beyond its border (64 px of parallax).
         assert_eq!(factors(|d| d[at] *= 1.5)[at], 1.0);
         assert_eq!(factors(|d| d[at] *= 0.125)[at], 1.0);
-        // No number, no verdict.
+        // A distance that is NaN has no point.
         assert_eq!(factors(|d| d[at] = f32::NAN)[at], 1.0);
     }
 
     /// The same in f64 by 4×4 matrices, one pixel after the other.
-    fn oracle(views: &[Seen<'_>]) -> Vec<f64> {
+    fn oracle(views: &[RgbdView<'_>]) -> Vec<f64> {
         let mut out = Vec::new();
         for (v, own) in views.iter().enumerate() {
             for i in 0..own.distances.len() {
                 let point = place(own, i);
-                let doubts: Vec<f64> = (0..views.len())
+                let inconsistencies: Vec<f64> = (0..views.len())
                     .filter(|u| *u != v)
-                    .filter_map(|u| doubt(&views[u], point, colour(own, i)))
+                    .filter_map(|u| inconsistency(&views[u], point, colour(own, i)))
                     .collect();
-                let mean = doubts.iter().sum::<f64>() / doubts.len().max(1) as f64;
-                out.push(1.0 - (1.0 - f64::from(LEAST)) * mean);
+                let mean =
+                    inconsistencies.iter().sum::<f64>() / inconsistencies.len().max(1) as f64;
+                out.push(1.0 - (1.0 - f64::from(MIN_FACTOR)) * mean);
             }
         }
         out
     }
 
-    fn colour(view: &Seen<'_>, i: usize) -> [f64; 3] {
+    fn colour(view: &RgbdView<'_>, i: usize) -> [f64; 3] {
         [0, 1, 2].map(|c| f64::from(view.rgb[c * view.distances.len() + i]))
     }
 
     /// World point of a pixel.
-    fn place(view: &Seen<'_>, i: usize) -> DVec3 {
+    fn place(view: &RgbdView<'_>, i: usize) -> DVec3 {
         let k = view.camera.intrinsics;
         let x = ((i % k.width) as f64 + 0.5 - f64::from(k.cx)) / f64::from(k.fx);
         let y = ((i / k.width) as f64 + 0.5 - f64::from(k.cy)) / f64::from(k.fy);
@@ -196,7 +197,7 @@ mod tests {
         view.camera.world_from_camera.as_dmat4().transform_point3(in_camera)
     }
 
-    fn doubt(view: &Seen<'_>, point: DVec3, wanted: [f64; 3]) -> Option<f64> {
+    fn inconsistency(view: &RgbdView<'_>, point: DVec3, wanted: [f64; 3]) -> Option<f64> {
         let (k, world) = (view.camera.intrinsics, view.camera.world_from_camera.as_dmat4());
         let p = world.inverse().transform_point3(point);
         let x = f64::from(k.fx) * p.x / p.z + f64::from(k.cx);
@@ -248,8 +249,8 @@ mod tests {
         let depths: Vec<Vec<f32>> = (0..3u8)
             .map(|v| noise(n, 100.0 + f32::from(v)).iter().map(|d| 1.5 + 0.5 * d).collect())
             .collect();
-        let views: Vec<Seen> = (0..3)
-            .map(|v| Seen { camera: &cameras[v], rgb: &pictures[v], distances: &depths[v] })
+        let views: Vec<RgbdView> = (0..3)
+            .map(|v| RgbdView { camera: &cameras[v], rgb: &pictures[v], distances: &depths[v] })
             .collect();
         let (got, want) = (cross_check(&views), oracle(&views));
         assert_eq!(got.len(), want.len());

@@ -217,12 +217,21 @@ fn transpose(rows: &[f32], r: usize, first: usize, planes: &mut [f32], n: usize)
     }
 }
 
+/// Depth candidates, uniform in disparity (1 / camera z).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Candidates {
+    /// Disparity of candidate 0, the farthest.
+    pub low: f32,
+    /// Difference between successive candidates.
+    pub step: f32,
+}
+
 /// Distance along the unit ray of candidate indices: length / (low + step·index), for
-/// each of `ranges` (low, step) one map of `n` pixels.
-pub fn distance(ranges: &[(f32, f32)], lengths: &[f32], index: &[f32], out: &mut [f32]) {
+/// each of `ranges` one map of `n` pixels.
+pub fn distance(ranges: &[Candidates], lengths: &[f32], index: &[f32], out: &mut [f32]) {
     let n = index.len() / ranges.len().max(1);
     let maps = out.par_chunks_exact_mut(n.max(1)).zip(ranges).enumerate();
-    maps.for_each(|(b, (out, &(low, step)))| {
+    maps.for_each(|(b, (out, &Candidates { low, step }))| {
         let (lengths, index) = (&lengths[b * n..][..n], &index[b * n..][..n]);
         for ((out, length), i) in out.iter_mut().zip(lengths).zip(index) {
             *out = length / (low + step * i);
@@ -232,7 +241,7 @@ pub fn distance(ranges: &[(f32, f32)], lengths: &[f32], index: &[f32], out: &mut
 
 /// Gradient of [`distance`] with respect to `index`.
 pub fn distance_backward(
-    ranges: &[(f32, f32)],
+    ranges: &[Candidates],
     lengths: &[f32],
     index: &[f32],
     grad: &[f32],
@@ -240,7 +249,7 @@ pub fn distance_backward(
     let n = index.len() / ranges.len().max(1);
     let mut out = vec![0f32; index.len()];
     let maps = out.par_chunks_exact_mut(n.max(1)).zip(ranges).enumerate();
-    maps.for_each(|(b, (out, &(low, step)))| {
+    maps.for_each(|(b, (out, &Candidates { low, step }))| {
         let (lengths, index) = (&lengths[b * n..][..n], &index[b * n..][..n]);
         let values = lengths.iter().zip(index).zip(&grad[b * n..][..n]);
         for (out, ((length, i), g)) in out.iter_mut().zip(values) {

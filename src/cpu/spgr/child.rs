@@ -6,8 +6,8 @@ use super::parent::{Parent, ParentGradient};
 use super::shape::{Footprint, Turn, Unit, conjugate, matrix, matrix_backward, multiply};
 use super::view::{Jacobian, M3, V3, add, add4, axpy, dot, product, scaled, times, transposed};
 use crate::abi::{
-    DEPTH_FRACTION_MIN, HEAD_DEPTH_OFFSET, HEAD_LOG_SCALE_OFFSET, HEAD_ROTATION_OFFSET,
-    HEAD_STRIDE, HEAD_UV_OFFSET,
+    DEPTH_FRACTION_MIN, DepthDir, DepthUnit, HEAD_DEPTH_OFFSET, HEAD_LOG_SCALE_OFFSET,
+    HEAD_ROTATION_OFFSET, HEAD_STRIDE, HEAD_UV_OFFSET,
 };
 use crate::cpu::redistribute::Rule;
 use crate::cpu::simd::{Mask, Vector};
@@ -58,7 +58,7 @@ impl<V: Vector> Step<V> {
         }
         let tanh_z = head[HEAD_DEPTH_OFFSET].tanh();
         let mut dz = V::constant(rules.beta_z) * tanh_z;
-        if rules.relative_depth {
+        if rules.depth_unit == DepthUnit::Relative {
             dz = dz * z;
         }
         let least = V::constant(DEPTH_FRACTION_MIN - 1.0) * z - s[2];
@@ -66,7 +66,7 @@ impl<V: Vector> Step<V> {
         let dz = dz.max(least);
         let side = [s[0], s[1]];
         let mut ray = None;
-        if rules.ray {
+        if rules.depth_dir == DepthDir::Ray {
             let ahead = parent.in_camera[2] + s[2];
             let inverse = V::constant(1.0) / ahead.max(parent.view.z_min);
             let share = dz * inverse;
@@ -112,7 +112,7 @@ impl<V: Vector> Step<V> {
         d.z = bound_dz.fma(V::constant(DEPTH_FRACTION_MIN - 1.0), d.z);
         d_s[2] = d_s[2] - bound_dz;
         let mut d_tanh = free_dz * V::constant(rules.beta_z);
-        if rules.relative_depth {
+        if rules.depth_unit == DepthUnit::Relative {
             d.z = d_tanh.fma(self.tanh_z, d.z);
             d_tanh = d_tanh * z;
         }

@@ -43,8 +43,8 @@ pub use project::{Target, project};
 use super::redistribute::share;
 use super::simd::{LANES, Real, RowLayout, Vector, VectorKernel};
 use crate::abi::{
-    HEAD_GAIN_OFFSET, HEAD_LOGIT_OFFSET, HEAD_STRIDE, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET,
-    SCALE_OFFSET, SPLAT_STRIDE,
+    GainSpace, HEAD_GAIN_OFFSET, HEAD_LOGIT_OFFSET, HEAD_STRIDE, MEAN_OFFSET, OPACITY_OFFSET,
+    QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE,
 };
 use crate::camera::Camera;
 use child::Child;
@@ -203,7 +203,11 @@ impl<T: Real> Forward<'_, T> {
 #[inline(always)]
 fn gain<V: Vector>(rules: &Rules, raw: V) -> [V; 4] {
     let extra = V::constant(rules.delta) * raw.tanh();
-    let residual = if rules.rgb_gain { V::constant(0.5) * extra } else { V::constant(0.0) };
+    let residual = if rules.gain_space == GainSpace::Rgb {
+        V::constant(0.5) * extra
+    } else {
+        V::constant(0.0)
+    };
     [V::constant(1.0) + extra, residual, residual, residual]
 }
 

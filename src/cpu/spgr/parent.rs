@@ -8,7 +8,8 @@ use super::view::{
 };
 use super::{Rules, Source};
 use crate::abi::{
-    DISC_AREA_SQ_MIN, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE,
+    AreaAt, DISC_AREA_SQ_MIN, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE,
+    Slide,
 };
 use crate::cpu::redistribute::Rule;
 use crate::cpu::simd::{LANES, Mask, RowLayout, Vector};
@@ -106,10 +107,10 @@ impl<V: Vector> Parent<V> {
             jacobian: None,
             own: one,
         };
-        if rules.disc {
+        if rules.slide == Slide::Disc {
             parent.disc = Some(Disc::new(&parent));
         }
-        if rules.area_at_parent {
+        if rules.area_at == AreaAt::Parent {
             let zoom = V::constant(rules.side as f64);
             parent.jacobian = Some(Jacobian::new(&view, in_camera, zoom));
         }

@@ -2,7 +2,7 @@
 
 use super::Rules;
 use super::view::{M3, V3, add, axpy, cross, dot, indexed, product, scaled, times, transposed};
-use crate::abi::{AREA_SQ_EPS, GROWTH_MAX};
+use crate::abi::{AMinMode, AREA_SQ_EPS, GROWTH_MAX};
 use crate::cpu::simd::{Mask, Vector};
 
 /// θ² below which the derivative of sin(θ/2)/θ comes from its series, radians².
@@ -211,7 +211,7 @@ impl<V: Vector> Footprint<V> {
         }
         let a_min = V::constant(rules.a_min);
         let small = area.lt(a_min);
-        if !rules.two_axis {
+        if rules.a_min_mode == AMinMode::Iso {
             let c = small.select((a_min / area).sqrt().min(most), one);
             return [c; 3];
         }

@@ -1,7 +1,7 @@
 //! 3-D vector algebra in lanes, the primary view, and the guarded Jacobian with its gradient.
 
 use super::{Rules, Source};
-use crate::abi::{FRUSTUM_MARGIN, VISIBLE_Z_MIN};
+use crate::abi::{FRUSTUM_MARGIN, PrimaryView, VISIBLE_Z_MIN};
 use crate::camera::Camera;
 use crate::cpu::simd::{LANES, Mask, Real, Vector};
 
@@ -163,7 +163,7 @@ impl<T: Real> Table<T> {
         mean: V3<V>,
         source: [usize; LANES],
     ) -> View<V> {
-        if !rules.nearest_visible || self.len() == 1 {
+        if rules.primary_view == PrimaryView::Source || self.len() == 1 {
             return self.views(&source);
         }
         let (mut nearest, mut best) = (V::constant(f64::INFINITY), V::constant(-1.0));

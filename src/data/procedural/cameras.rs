@@ -9,7 +9,7 @@
 use super::Room;
 use super::rng::Rng;
 use super::shape::Ray;
-use crate::camera::{Camera, Intrinsics};
+use crate::camera::{Camera, Intrinsics, NearFar};
 use glam::{EulerRot, Mat3, Mat4, Quat, Vec2, Vec3};
 
 /// Smallest distance of a camera from any surface, m.
@@ -118,12 +118,12 @@ fn propose(room: &Room, rng: &mut Rng, spec: &CameraSpec) -> Option<Rig> {
     for _ in 0..spec.targets {
         cameras.push(between(room, &first, &second, rng)?);
     }
-    let (near_depth, far_depth) = extent(first_points.iter().chain(&second_points))?;
+    let depths = extent(first_points.iter().chain(&second_points))?;
     Some(Rig {
         baseline: first.position().distance(second.position()),
-        near_depth,
+        near_depth: depths.near,
         median_depth,
-        far_depth,
+        far_depth: depths.far,
         overlap,
         motion,
         orbit,
@@ -219,10 +219,10 @@ fn between(room: &Room, first: &Camera, second: &Camera, rng: &mut Rng) -> Optio
 }
 
 /// Returns the 2 % quantile of depth and the largest depth, or `None` without points.
-pub(super) fn extent<'a>(points: impl Iterator<Item = &'a SurfacePoint>) -> Option<(f32, f32)> {
+pub(super) fn extent<'a>(points: impl Iterator<Item = &'a SurfacePoint>) -> Option<NearFar> {
     let mut depths: Vec<f32> = points.map(|p| p.depth).collect();
     depths.sort_by(f32::total_cmp);
-    Some((*depths.get(depths.len() / 50)?, *depths.last()?))
+    Some(NearFar { near: *depths.get(depths.len() / 50)?, far: *depths.last()? })
 }
 
 /// Returns the smaller share of either camera's view that the other camera sees; `points` are the

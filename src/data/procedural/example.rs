@@ -135,7 +135,7 @@ impl Example {
         let mut cameras = rig.cameras.clone();
         for camera in cameras.iter_mut().skip(CONTEXT) {
             let (w, h) = (camera.intrinsics.width, camera.intrinsics.height);
-            *camera = camera.resized(w * targets.ratio.max(1), h * targets.ratio.max(1));
+            *camera = camera.resized_unchecked(w * targets.ratio.max(1), h * targets.ratio.max(1));
         }
         let render = |(i, camera): (usize, &Camera)| {
             let target = i >= CONTEXT;

@@ -11,7 +11,7 @@ use super::layout::yaw;
 use super::material::{Material, Palette, Role};
 use super::rng::Rng;
 use super::shape::{Form, Primitive};
-use crate::camera::Camera;
+use crate::camera::{Camera, NearFar};
 use glam::{EulerRot, Mat3, Quat, Vec2, Vec3};
 use std::f32::consts::TAU;
 
@@ -33,7 +33,7 @@ impl Room {
             let (solids, materials) = (self.primitives.len(), self.materials.len());
             ForegroundBuilder { room: self, palette: &palette, rng }.place(&eye, rig.median_depth);
             match self.valid_depths(rig) {
-                Some(extent) => (rig.near_depth, rig.far_depth) = extent,
+                Some(depths) => (rig.near_depth, rig.far_depth) = (depths.near, depths.far),
                 None => {
                     self.primitives.truncate(solids);
                     self.materials.truncate(materials);
@@ -44,7 +44,7 @@ impl Room {
 
     /// Returns nearest and farthest depth, or `None` if a camera touches a surface or the overlap
     /// is too small.
-    fn valid_depths(&self, rig: &Rig) -> Option<(f32, f32)> {
+    fn valid_depths(&self, rig: &Rig) -> Option<NearFar> {
         if rig.cameras.iter().any(|c| self.clearance(c.position()) < CLEARANCE) {
             return None;
         }

@@ -182,8 +182,7 @@ fn display(linear: Vec3, grade: &Grade) -> Vec3 {
 }
 
 impl Room {
-    /// Renders picture and depth of `camera`, which [`Camera::new`] must accept. A solid that
-    /// contains the camera is not visible.
+    /// Renders picture and depth of `camera`. A solid that contains the camera is not visible.
     pub fn render(&self, camera: &Camera, quality: &Quality) -> View {
         let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
         let mut rgb = vec![0.0; width * height * 3];

@@ -10,7 +10,7 @@ use super::preset::{joined, per_level, view_shares, visible};
 use super::{Call, Prepared, StageInput, Stages, visibility};
 use crate::config::{
     Aggregation as Keys, AggregationAblations, AttentionOp, Gate, HeadInput, LogitScale, MaskMode,
-    Points, Residual, SampleConvention, StageNorm,
+    Points, Residual, StageNorm,
 };
 use crate::model::embed::Descriptors;
 use crate::model::geometry::{Frames, ParentChunk};
@@ -298,7 +298,7 @@ impl Stage {
                 LogitScale::One => 1.0,
             },
             renormalise: keys.mask == MaskMode::Renorm,
-            half_pixel: keys.sample_convention == SampleConvention::HalfPixel,
+            sample_convention: keys.sample_convention,
             drop,
             point_gradient: !keys.detach_points || self.learned.is_some(),
         }

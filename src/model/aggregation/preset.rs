@@ -2,6 +2,7 @@
 //! projected centre, one softmax over views and levels, view gates V·softmax(β).
 
 use super::{Call, StageInput};
+use crate::abi::SampleConvention;
 use crate::config::{Aggregation as Keys, StageNorm};
 use crate::model::mlp::{LayerNorm, affine, linear, xavier};
 use crate::ops::attention_gather::{Gather, attention_gather_deferred};
@@ -94,7 +95,7 @@ fn gather(call: &Call, dim: usize) -> Gather {
         value: dim,
         logit_scale: (dim as f64).sqrt().recip(),
         renormalise: true,
-        half_pixel: true,
+        sample_convention: SampleConvention::HalfPixel,
         drop: None,
         point_gradient: true,
     }

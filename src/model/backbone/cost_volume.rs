@@ -2,7 +2,7 @@
 //! "Cost volume refinement"). Rows are (v b).
 
 use super::unet::UNet;
-use crate::camera::Camera;
+use crate::camera::{Camera, NearFar};
 use crate::config::Mvsplat as Settings;
 use crate::model::Views;
 use crate::model::layers::{Conv2d, ConvShape, GroupNorm, gelu};
@@ -20,7 +20,7 @@ const MIN_Z: f32 = 1e-3;
 /// Returns the disparity candidates `[V·B][D]`, uniform from 1/far (index 0) to 1/near.
 pub fn disparities(views: &Views, candidates: usize) -> Vec<Vec<f32>> {
     let (b, v) = (views.scenes(), views.views());
-    let row = |(near, far): (f32, f32)| {
+    let row = |NearFar { near, far }| {
         let (low, high) = (1.0 / f64::from(far), 1.0 / f64::from(near));
         let step = (high - low) / (candidates - 1) as f64;
         (0..candidates).map(|k| (low + k as f64 * step) as f32).collect()
@@ -109,7 +109,7 @@ fn trace_geometry(
         for row in 0..v * b {
             let (i, scene) = (row / b, row % b);
             let cameras = &views.cameras[scene];
-            let own = cameras[i].resized(w, h).intrinsics.matrix().transpose();
+            let own = cameras[i].intrinsics.resized(w, h).matrix().transpose();
             k.extend_from_slice(&own.to_cols_array());
             let pose = relative_pose(cameras, i, (i + offset) % v).transpose();
             poses.extend(pose.to_cols_array());

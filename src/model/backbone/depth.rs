@@ -8,6 +8,7 @@
 use super::cost_volume::{Refinement, correlation, disparities};
 use super::unet::UNet;
 use crate::abi::sh_coefficients;
+use crate::camera::NearFar;
 use crate::config::Mvsplat as Settings;
 use crate::model::Views;
 use crate::model::layers::{
@@ -222,7 +223,7 @@ impl DepthPredictor {
         let last = |x: Tensor| channels_last(&x);
         let full = last(disparity.full.broadcast_add(&out.narrow(1, 0, g)?)?)?;
         let depths = each_row(&full, |r| {
-            let (near, far) = views.near_far[r % b][r / b];
+            let NearFar { near, far } = views.near_far[r % b][r / b];
             full.narrow(0, r, 1)?.clamp(1.0 / far, 1.0 / near)?.recip()
         })?;
         Ok((depths, sigmoid(&last(out.narrow(1, g, g)?)?)?))

@@ -14,7 +14,7 @@
 
 use super::small_parts::{ConvexUpsampling, Stem, Unet, conv_norm_gelu, local_mean};
 use crate::abi::sh_coefficients;
-use crate::camera::Camera;
+use crate::camera::{Camera, NearFar};
 use crate::config::{FeatureLevel, Small};
 use crate::model::layers::{
     Activation, Conv2d, ConvShape, GroupNorm, LayerInit, gelu, resize_bilinear, sigmoid,
@@ -25,7 +25,8 @@ use crate::ops::join::join;
 use crate::ops::matching::raw_matching;
 use crate::ops::plane_sweep::{Pair, Sweep, pair, plane_sweep_on, relative_pose};
 use crate::ops::small::{
-    Start, cross_check, expectation, head_input, head_output, lift, ray_distance, unit_channels,
+    Candidates, Start, cross_check, expectation, head_input, head_output, lift, ray_distance,
+    unit_channels,
 };
 use crate::sh::C0;
 use candle_core::{Result, Tensor, bail};
@@ -345,9 +346,9 @@ impl SmallBackbone {
     fn ray_distance(&self, views: &Views, index: &Tensor) -> Result<Tensor> {
         let (b, v, _, h, w) = views.images.dims5()?;
         let steps = (self.config.depth_candidates - 1) as f32;
-        let range = |&(near, far): &(f32, f32)| {
+        let range = |&NearFar { near, far }: &NearFar| {
             let (low, high) = (1.0 / far, 1.0 / near);
-            (low, (high - low) / steps)
+            Candidates { low, step: (high - low) / steps }
         };
         let ranges = views.near_far.iter().flatten().map(range).collect();
         let lengths = views.cameras.iter().flatten().flat_map(ray_lengths).collect();
@@ -400,7 +401,7 @@ fn pairs(views: &Views, h: usize, w: usize) -> Result<Vec<Vec<Pair>>> {
     let v = views.views();
     let mut all = Vec::new();
     for (b, scene) in views.cameras.iter().enumerate() {
-        let cameras: Vec<Camera> = scene.iter().map(|c| c.resized(w, h)).collect();
+        let cameras: Vec<Camera> = scene.iter().map(|c| c.resized_unchecked(w, h)).collect();
         for i in 0..v {
             let others = (0..v).filter(|&j| j != i);
             let row = |j: usize| {
@@ -415,7 +416,7 @@ fn pairs(views: &Views, h: usize, w: usize) -> Result<Vec<Vec<Pair>>> {
 
 /// Disparity candidates (1 / camera z), `[B][V][D]`; index 0 is far.
 fn candidates(views: &Views, d: usize) -> Vec<Vec<Vec<f32>>> {
-    let list = |&(near, far): &(f32, f32)| {
+    let list = |&NearFar { near, far }: &NearFar| {
         let (lo, hi) = (1.0 / far, 1.0 / near);
         (0..d).map(|k| lo + (hi - lo) * k as f32 / (d - 1) as f32).collect()
     };

@@ -1,11 +1,11 @@
-//! Doubts of the views in one another, as a tensor. Kernel: cpu/small/cross_check.rs.
+//! Consistency between views, as a tensor. Kernel: cpu/small/cross_check.rs.
 
 use crate::camera::Camera;
-use crate::cpu::small::cross_check::{Seen, cross_check as kernel};
+use crate::cpu::small::cross_check::{RgbdView, cross_check as kernel};
 use candle_core::{Result, Tensor, bail};
 
-/// `[B, V, H·W, 1]`: a factor for the opacity of each pixel's Gaussian by the colours
-/// of the other views of its scene at its place. Without gradient.
+/// Compares each pixel's point with the other views of its scene. Returns a factor of its opacity,
+/// `[B, V, H·W, 1]`, without a gradient.
 ///
 /// `images` `[B, V, 3, H, W]`, `cameras` `[B][V]`, `distances` `[B, V, H·W, 1]` along the
 /// unit ray, all f32.
@@ -17,7 +17,8 @@ pub fn cross_check(images: &Tensor, cameras: &[Vec<Camera>], distances: &Tensor)
     if c != 3 || distances.dims() != [b, v, h * w, 1] {
         let (images, distances) = (images.dims(), distances.dims());
         bail!(
-            "cross-check: expected images [B, V, 3, H, W] and distances [B, V, H·W, 1], got {images:?} and {distances:?}"
+            "cross-check: expected images [B, V, 3, H, W] and distances [B, V, H·W, 1], got \
+             {images:?} and {distances:?}"
         );
     }
     let misfit = |k: &Camera| (k.intrinsics.width, k.intrinsics.height) != (w, h);
@@ -29,12 +30,12 @@ pub fn cross_check(images: &Tensor, cameras: &[Vec<Camera>], distances: &Tensor)
     let pixels = h * w;
     let mut out = Vec::with_capacity(z.len());
     for (s, all) in cameras.iter().enumerate() {
-        let seen = |(i, camera)| {
+        let view = |(i, camera)| {
             let at = (s * v + i) * pixels;
             let rgb = &rgb[3 * at..3 * (at + pixels)];
-            Seen { camera, rgb, distances: &z[at..at + pixels] }
+            RgbdView { camera, rgb, distances: &z[at..at + pixels] }
         };
-        out.extend(kernel(&all.iter().enumerate().map(seen).collect::<Vec<_>>()));
+        out.extend(kernel(&all.iter().enumerate().map(view).collect::<Vec<_>>()));
     }
     Tensor::from_vec(out, (b, v, pixels, 1), images.device())
 }

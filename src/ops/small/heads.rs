@@ -1,5 +1,5 @@
 use crate::cpu::resize::Resize;
-use crate::cpu::small::heads::{self as cpu, BESIDE, Input, Output};
+use crate::cpu::small::heads::{self as cpu, BESIDE, Candidates, Input, Output};
 use crate::ops::{borrowed, output, slice, tensor_like};
 use candle_core::{
     CpuStorage, CustomOp1, CustomOp2, CustomOp3, Layout, Result, Shape, Tensor, bail,
@@ -215,12 +215,12 @@ impl CustomOp1 for Raw {
 }
 
 /// Distance along the unit ray of candidate indices `[B, 1, H, W]`:
-/// length / (low + step·index), `ranges` (low, step) of 1 / camera z for each of B and
-/// `lengths` `[B, H, W]` of the rays at camera z = 1.
+/// length / (low + step·index), with `ranges` for each of B and `lengths` `[B, H, W]` of the
+/// rays at camera z = 1.
 ///
 /// # Errors
 /// Lengths that do not fit; a dtype other than f32.
-pub fn ray_distance(index: &Tensor, ranges: Vec<(f32, f32)>, lengths: Vec<f32>) -> Result<Tensor> {
+pub fn ray_distance(index: &Tensor, ranges: Vec<Candidates>, lengths: Vec<f32>) -> Result<Tensor> {
     if index.dims().first() != Some(&ranges.len()) || lengths.len() != index.elem_count() {
         bail!(
             "{DISTANCE}: expected a range for each of {:?} and a length for each pixel, got {} and \
@@ -234,7 +234,7 @@ pub fn ray_distance(index: &Tensor, ranges: Vec<(f32, f32)>, lengths: Vec<f32>) 
 }
 
 struct Distance {
-    ranges: Vec<(f32, f32)>,
+    ranges: Vec<Candidates>,
     lengths: Vec<f32>,
 }
 

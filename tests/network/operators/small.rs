@@ -3,7 +3,8 @@
 use candle_core::{D, Result, Tensor, Var};
 use subsplat::ops::join::join;
 use subsplat::ops::small::{
-    Start, expectation, head_input, head_output, lift, ray_distance, unit_channels, upsample_convex,
+    Candidates, Start, expectation, head_input, head_output, lift, ray_distance, unit_channels,
+    upsample_convex,
 };
 use subsplat_test_support::same::{far, gradient, noise, same};
 
@@ -161,13 +162,14 @@ fn head_outputs_agree_with_the_definition() -> Result<()> {
 
 #[test]
 fn distances_agree_with_the_definition() -> Result<()> {
-    let (ranges, n) = (vec![(0.01f32, 0.02f32), (0.1, 0.03)], 3 * 7);
+    let candidates = |low, step| Candidates { low, step };
+    let (ranges, n) = (vec![candidates(0.01, 0.02), candidates(0.1, 0.03)], 3 * 7);
     let lengths: Vec<f32> = (0..2 * n).map(|i| 1.0 + i as f32 / 50.0).collect();
     let plain = |x: &Tensor| -> Result<Tensor> {
         let all = (0..2).map(|b| {
             let at =
                 Tensor::from_vec(lengths[b * n..(b + 1) * n].to_vec(), (1, 1, 3, 7), x.device())?;
-            at / x.narrow(0, b, 1)?.affine(f64::from(ranges[b].1), f64::from(ranges[b].0))?
+            at / x.narrow(0, b, 1)?.affine(f64::from(ranges[b].step), f64::from(ranges[b].low))?
         });
         Tensor::cat(&all.collect::<Result<Vec<_>>>()?, 0)
     };

@@ -4,7 +4,7 @@
 
 use crate::torch_writer::{Checkpoint, Py, dict, text};
 
-/// What can be saved.
+/// A value in a checkpoint.
 pub enum Item {
     None,
     Int(i64),

@@ -15,7 +15,7 @@ pub fn model(k: &Intrinsics) -> Model {
 
 /// Quaternion wxyz and translation, camera from world.
 fn pose(c: &Camera) -> ([f64; 4], [f64; 3]) {
-    let m = c.world_from_camera.as_dmat4().inverse();
+    let m = c.world_from_camera().as_dmat4().inverse();
     let q = DQuat::from_mat4(&m);
     ([q.w, q.x, q.y, q.z], m.w_axis.truncate().to_array())
 }
@@ -29,7 +29,7 @@ pub fn binary(cameras: &[NamedCamera]) -> [Vec<u8>; 3] {
     let (mut cams, mut images, mut pts) =
         (count(cameras.len()), count(cameras.len()), count(points().len()));
     for (i, c) in cameras.iter().enumerate() {
-        let (number, _, parameters) = model(&c.camera.intrinsics);
+        let (number, _, parameters) = model(&c.camera.intrinsics());
         cams.extend((i as u32 + 7).to_le_bytes());
         cams.extend(number.to_le_bytes());
         cams.extend(64u64.to_le_bytes());
@@ -63,7 +63,7 @@ pub fn binary(cameras: &[NamedCamera]) -> [Vec<u8>; 3] {
 pub fn text(cameras: &[NamedCamera]) -> [String; 3] {
     let mut out = [(); 3].map(|()| "# comment\n".to_owned());
     for (i, c) in cameras.iter().enumerate() {
-        let (_, name, parameters) = model(&c.camera.intrinsics);
+        let (_, name, parameters) = model(&c.camera.intrinsics());
         let join = |v: &[f64]| v.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
         out[0] += &format!("{} {name} 64 48 {}\n", i + 7, join(&parameters));
         let (q, t) = pose(&c.camera);

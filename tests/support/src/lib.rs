@@ -3,6 +3,8 @@
 pub mod checkpoints;
 pub mod chunk_files;
 pub mod colmap_files;
+pub mod cpu_against_gpu;
+pub mod fit_scene;
 pub mod gpu;
 pub mod made_up;
 pub mod noise;
@@ -19,7 +21,6 @@ pub mod spgr_calls;
 pub mod spgr_reference;
 pub mod splat_scene;
 pub mod torch_writer;
-pub mod twins;
 pub mod whole;
 pub mod witness;
 

@@ -31,12 +31,12 @@ pub struct Splat {
     pub parent_mean: [f64; 3],
 }
 
-/// What the oracle says of a view.
+/// A view that the oracle renders.
 pub struct Picture {
     pub rgb: Vec<f64>,
     pub alpha: Vec<f64>,
     pub depth_sum: Vec<f64>,
-    /// A decision at this pixel hangs on less than [`BAND`].
+    /// True where a threshold at this pixel is nearer than [`BAND`].
     pub boundary: Vec<bool>,
 }
 
@@ -151,9 +151,9 @@ fn colour(splat: &Splat, eye: [f64; 3], options: &RasterOptions) -> [f64; 3] {
 }
 
 fn flatten(splat: &Splat, camera: &Camera, options: &RasterOptions) -> Option<Flat> {
-    let k = camera.intrinsics;
+    let k = camera.intrinsics();
     let (w, h) = (k.width as f64, k.height as f64);
-    let pose = camera.world_from_camera.as_dmat4();
+    let pose = camera.world_from_camera().as_dmat4();
     let r: M3 = std::array::from_fn(|i| std::array::from_fn(|j| pose.col(j)[i]));
     let eye = [pose.w_axis.x, pose.w_axis.y, pose.w_axis.z];
     let m = splat.mean.map(f64::from);
@@ -236,7 +236,7 @@ fn cut(uv: [f64; 2], size: [f64; 2], xx: f64, yy: f64, det: f64) -> (Option<[i64
 pub fn render(splats: &[Splat], camera: &Camera, options: &RasterOptions) -> Picture {
     let mut flat: Vec<Flat> = splats.iter().filter_map(|s| flatten(s, camera, options)).collect();
     flat.sort_by(|a, b| a.z.total_cmp(&b.z));
-    let (w, h) = (camera.intrinsics.width, camera.intrinsics.height);
+    let (w, h) = (camera.intrinsics().width, camera.intrinsics().height);
     let mvsplat = options.convention == Convention::Mvsplat;
     let cap = if mvsplat { 0.99 } else { 0.999 };
     let mut out = Picture {

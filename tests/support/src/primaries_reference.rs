@@ -76,7 +76,7 @@ pub fn primaries(out: &BackboneOutput, views: &Views, settings: &Settings) -> Re
 
 fn view_part(raw: &Tensor, depths: &Tensor, camera: &Camera, s: &Settings) -> Result<ViewPart> {
     let (pixels, g) = depths.dims2()?;
-    let k = camera.intrinsics;
+    let k = camera.intrinsics();
     let n = pixels * g;
     let ray = ray_positions(&raw.narrow(1, 0, 2)?, k.width, k.height)?;
     let depth = depths.reshape((pixels, g, 1))?;

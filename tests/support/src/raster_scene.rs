@@ -26,9 +26,13 @@ impl Random {
     pub fn array<const N: usize>(&mut self, from: f32, to: f32) -> [f32; N] {
         std::array::from_fn(|_| self.range(from, to))
     }
+
+    pub fn many(&mut self, count: usize, from: f32, to: f32) -> Vec<f32> {
+        (0..count).map(|_| self.range(from, to)).collect()
+    }
 }
 
-/// What a random scene is made of.
+/// Splats of a random scene.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Kind {
     Plain,
@@ -104,7 +108,7 @@ impl Scene {
                     (Kind::Flat, i) => scale[..=i].fill(0.0),
                     _ => {}
                 }
-                rows.extend(camera.world_from_camera.transform_point3(at).to_array());
+                rows.extend(camera.world_from_camera().transform_point3(at).to_array());
                 rows.extend(r.array::<4>(-1.0, 1.0));
                 rows.extend(scale);
                 rows.push(opacity);

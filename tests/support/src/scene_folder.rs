@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
-use subsplat::camera::Camera;
+use subsplat::camera::{Camera, NearFar};
 use subsplat::data::procedural::CameraSpec;
 use subsplat::data::procedural::{Example, ExampleSpec};
 use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
@@ -29,7 +29,7 @@ pub fn workplace() -> tempfile::TempDir {
         save_png(&scene.join(&file), &picture).unwrap();
         cameras.push(named(file, example.cameras[from]));
     }
-    let near_far = Some((example.near, example.far));
+    let near_far = Some(NearFar::new(example.near, example.far));
     let content = CameraFile { cameras, units: Units::Unknown, near_far };
     save_cameras_json(&scene.join("cameras.json"), &content).unwrap();
     folder

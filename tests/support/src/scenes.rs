@@ -3,7 +3,7 @@
 use candle_core::{DType, Device, Result, Tensor};
 use glam::{EulerRot, Mat4, Quat, Vec3};
 use subsplat::abi::ShBasis;
-use subsplat::camera::{Camera, Intrinsics};
+use subsplat::camera::{Camera, Intrinsics, NearFar};
 use subsplat::config::FeatureLevel;
 use subsplat::model::{BackboneOutput, Primaries, Views};
 
@@ -69,10 +69,10 @@ pub fn motion() -> Mat4 {
 }
 
 pub fn views(cameras: &[Camera]) -> Views {
-    let k = cameras[0].intrinsics;
+    let k = cameras[0].intrinsics();
     let images =
         Tensor::zeros((1, cameras.len(), 3, k.height, k.width), DType::F32, &Device::Cpu).unwrap();
-    Views::new(images, vec![cameras.to_vec()], vec![vec![(1.0, 100.0); cameras.len()]]).unwrap()
+    Views::new(images, vec![cameras.to_vec()], vec![vec![NearFar::RE10K; cameras.len()]]).unwrap()
 }
 
 /// Primaries in camera frame of their source views, as a backbone gives them: one
@@ -90,7 +90,7 @@ pub struct LocalPrimaries {
 
 impl LocalPrimaries {
     pub fn random(cameras: &[Camera], coefficients: usize, r: &mut Random) -> Self {
-        let k = cameras[0].intrinsics;
+        let k = cameras[0].intrinsics();
         let per_view = k.width * k.height;
         let mut out = Self {
             rays: Vec::new(),
@@ -109,7 +109,7 @@ impl LocalPrimaries {
                     (i / k.width) as f32 + 0.5 + r.uniform(-0.4, 0.4) as f32,
                 );
                 let z = r.uniform(2.0, 5.0) as f32;
-                out.rays.push(camera.intrinsics.unproject(px));
+                out.rays.push(camera.intrinsics().unproject(px));
                 out.depths.push(z);
                 let q = Quat::from_xyzw(
                     r.normal() as f32,
@@ -118,7 +118,7 @@ impl LocalPrimaries {
                     r.normal() as f32,
                 );
                 out.quats.push(q.normalize());
-                let px = z / camera.intrinsics.fx;
+                let px = z / camera.intrinsics().fx;
                 out.scales.push(std::array::from_fn(|_| r.uniform(0.2, 2.5) as f32 * px));
                 out.opacities.push(r.uniform(0.02, 0.98) as f32);
                 out.sh.extend(r.normals(3 * coefficients, 0.3).iter().map(|&v| v as f32));

@@ -9,9 +9,10 @@
 use candle_core::{Result, Tensor};
 use glam::Vec3;
 use subsplat::abi::{
-    AREA_SQ_EPS, DEPTH_FRACTION_MIN, FRUSTUM_MARGIN, GROWTH_MAX, HEAD_DEPTH_OFFSET,
-    HEAD_GAIN_OFFSET, HEAD_LOG_SCALE_OFFSET, HEAD_LOGIT_OFFSET, HEAD_ROTATION_OFFSET,
-    HEAD_UV_OFFSET, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, VISIBLE_Z_MIN,
+    AMinMode, AREA_SQ_EPS, AreaAt, DEPTH_FRACTION_MIN, DepthDir, DepthUnit, FRUSTUM_MARGIN,
+    GROWTH_MAX, GainSpace, HEAD_DEPTH_OFFSET, HEAD_GAIN_OFFSET, HEAD_LOG_SCALE_OFFSET,
+    HEAD_LOGIT_OFFSET, HEAD_ROTATION_OFFSET, HEAD_UV_OFFSET, MEAN_OFFSET, OPACITY_OFFSET,
+    PrimaryView, QUAT_OFFSET, SCALE_OFFSET, Slide, VISIBLE_Z_MIN,
 };
 use subsplat::ops::redistribute::{Rule, redistribute};
 use subsplat::ops::spgr::{Rules, Spgr};
@@ -63,7 +64,7 @@ impl View {
     fn new(call: &Spgr, chosen: &[u32], like: &Tensor) -> Result<Self> {
         let mut table = Vec::new();
         for (camera, &near) in call.cameras.iter().zip(&call.near) {
-            let k = camera.intrinsics;
+            let k = camera.intrinsics();
             let r = camera.rotation();
             for i in 0..3 {
                 table.extend(r.row(i).to_array().map(f64::from));
@@ -215,7 +216,7 @@ impl Footprint {
         let one = area.ones_like()?;
         let small = area.lt(rules.a_min)?;
         let bounded = |c: Tensor| small.where_cond(&c.minimum(GROWTH_MAX)?, &one);
-        if !rules.two_axis {
+        if rules.a_min_mode == AMinMode::Iso {
             let c = bounded(area.recip()?.affine(rules.a_min, 0.0)?.sqrt()?)?;
             return Ok([c.clone(), c.clone(), c]);
         }
@@ -287,7 +288,7 @@ impl Parents {
         let (x, y) = (flat(0)?, flat(1)?);
         let zero = x.zeros_like()?;
         let flat = [x, y, zero];
-        if !rules.disc {
+        if rules.slide == Slide::ZConst {
             return Ok(flat);
         }
         let g = self.ellipsoid()?;
@@ -332,12 +333,12 @@ impl Parents {
         };
         let mut s = self.lateral(rules, &[offset(0)?, offset(1)?])?;
         let mut dz = scaled(&lane(HEAD_DEPTH_OFFSET)?.tanh()?, rules.beta_z)?;
-        if rules.relative_depth {
+        if rules.depth_unit == DepthUnit::Relative {
             dz = mul(&dz, &self.z)?;
         }
         let least = sub(&scaled(&self.z, DEPTH_FRACTION_MIN - 1.0)?, &s[2])?;
         let dz = dz.broadcast_maximum(&least)?;
-        if rules.ray {
+        if rules.depth_dir == DepthDir::Ray {
             let depth = add(&self.in_camera[2], &s[2])?.broadcast_maximum(&self.view.z_min)?;
             let share = dz.div(&depth)?;
             for (i, s) in s.iter_mut().enumerate().take(2) {
@@ -366,12 +367,12 @@ fn primary_views(parents: &Tensor, call: &Spgr) -> Result<Vec<u32>> {
     let means = means.to_vec2::<f32>()?;
     let chosen = means.iter().enumerate().map(|(n, mean)| {
         let source = ((call.first + n) / call.per_view).min(call.cameras.len() - 1);
-        if !call.rules.nearest_visible {
+        if call.rules.primary_view == PrimaryView::Source {
             return source as u32;
         }
         let seen = call.cameras.iter().enumerate().filter_map(|(v, camera)| {
             let p = camera.to_camera(Vec3::new(mean[0], mean[1], mean[2]));
-            let (k, at) = (camera.intrinsics, camera.intrinsics.project(p));
+            let (k, at) = (camera.intrinsics(), camera.intrinsics().project(p));
             let inside =
                 at.x > 0.0 && at.y > 0.0 && at.x < k.width as f32 && at.y < k.height as f32;
             (inside && p.z > VISIBLE_Z_MIN as f32).then_some((v, p.z))
@@ -406,9 +407,9 @@ pub fn spgr(head: &Tensor, parents: &Tensor, call: &Spgr) -> Result<(Tensor, Ten
         lane(HEAD_ROTATION_OFFSET + 2)?,
     ];
     let quat = normalise(&multiply(&p.quat, &exponential(&turn)?)?)?;
-    let at = |i: usize| match rules.area_at_parent {
-        true => Ok(p.in_camera[i].clone()),
-        false => add(&p.in_camera[i], &step[i]),
+    let at = |i: usize| match rules.area_at {
+        AreaAt::Parent => Ok(p.in_camera[i].clone()),
+        AreaAt::Child => add(&p.in_camera[i], &step[i]),
     };
     let j = p.view.jacobian(&[at(0)?, at(1)?, at(2)?], rules.side as f64)?;
     let m = Footprint::new(&j, &p.view.ellipsoid(&quat, &scale)?)?;
@@ -440,7 +441,7 @@ pub fn spgr(head: &Tensor, parents: &Tensor, call: &Spgr) -> Result<(Tensor, Ten
 fn gains(rules: &Rules, raw: &Tensor) -> Result<Tensor> {
     let extra = scaled(&raw.tanh()?, rules.delta)?.flatten_all()?;
     let gamma = extra.affine(1.0, 1.0)?;
-    if !rules.rgb_gain {
+    if rules.gain_space == GainSpace::Sh {
         return Ok(gamma);
     }
     let residual = scaled(&extra, 0.5)?;

@@ -36,7 +36,7 @@ impl Random {
     }
 }
 
-/// What a random scene is made of.
+/// Sizes and colour format of a random scene.
 #[derive(Clone, Copy, Debug)]
 pub struct Kind {
     pub parents: usize,

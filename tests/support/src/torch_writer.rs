@@ -2,7 +2,7 @@
 
 use std::io::{Seek, SeekFrom, Write};
 
-/// What a pickle says, in the words of protocol 2.
+/// A value that a pickle of protocol 2 can hold.
 #[derive(Clone)]
 pub enum Py {
     None,

@@ -2,8 +2,9 @@
 
 use candle_core::{Device, Tensor};
 use glam::{EulerRot, Mat4, Quat, Vec3};
+use subsplat::FitOptions;
 use subsplat::abi::RasterOptions;
-use subsplat::camera::Camera;
+use subsplat::camera::{Camera, NearFar};
 use subsplat::config::{Backbone, Config, Preset};
 use subsplat::data::procedural::{CameraSpec, Quality, Room, sample_cameras};
 use subsplat::io::image::Rgb;
@@ -17,7 +18,7 @@ use subsplat::splats::Splats;
 use subsplat::{Picture, render};
 
 /// The depth range that the rooms are reconstructed with, metres.
-pub const NEAR_FAR: (f32, f32) = (0.4, 12.0);
+pub const NEAR_FAR: NearFar = NearFar::new(0.4, 12.0);
 
 /// A furnished room seen by two cameras and `targets` between them.
 pub struct Shoot {
@@ -49,7 +50,7 @@ pub fn motion(i: usize) -> Mat4 {
 
 /// The same camera in the moved world.
 pub fn moved(camera: &Camera, motion: Mat4) -> Camera {
-    Camera::new(camera.intrinsics, motion * camera.world_from_camera).unwrap()
+    Camera::new(camera.intrinsics(), motion * camera.world_from_camera()).unwrap()
 }
 
 impl Shoot {
@@ -101,13 +102,18 @@ pub fn run(
     model.run(photos, &options(size, NEAR_FAR, detail)).unwrap()
 }
 
-/// A fixed depth range and no check.
-pub fn options((width, height): (usize, usize), (near, far): (f32, f32), detail: bool) -> Options {
+/// A fixed depth range, no check, and no fit: the network's Gaussians.
+pub fn options(
+    (width, height): (usize, usize),
+    NearFar { near, far }: NearFar,
+    detail: bool,
+) -> Options {
     Options::default()
         .with_input_size(width, height)
         .with_depth_range(DepthRange::Fixed { near, far })
         .with_check(Check::Off)
         .with_detail(if detail { Detail::Photographs } else { Detail::Off })
+        .with_fit(FitOptions::off())
 }
 
 /// A seeded model in which nothing is zero any more, out of a weight file: children

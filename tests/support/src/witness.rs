@@ -11,7 +11,7 @@ use serde::Deserialize;
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
-use subsplat::camera::{Camera, Intrinsics};
+use subsplat::camera::{Camera, Intrinsics, NearFar};
 use subsplat::model::Views;
 use subsplat::model::weights::Weights;
 
@@ -105,7 +105,7 @@ impl Golden {
         Tensor::from_vec(values, shape.as_slice(), &Device::Cpu).unwrap()
     }
 
-    /// What the golden holds of an output, in the output's shape (of stride 1).
+    /// Returns the golden's values of an output, in the output's shape (of stride 1).
     pub fn output(&self, name: &str) -> Tensor {
         let held = &self.about.outputs[name];
         self.tensors[&format!("out.{name}")].reshape(held.shape.as_slice()).unwrap()
@@ -119,7 +119,7 @@ impl Golden {
 
     /// The cameras of `Case.cameras`, for pictures of `width` × `height`, and their
     /// (near, far).
-    pub fn cameras(&self, width: usize, height: usize) -> (Vec<Camera>, Vec<(f32, f32)>) {
+    pub fn cameras(&self, width: usize, height: usize) -> (Vec<Camera>, Vec<NearFar>) {
         let rows = |t: Tensor| t.flatten_from(1).unwrap().to_vec2::<f32>().unwrap();
         let (poses, k) = (rows(self.aside("poses")), rows(self.aside("intrinsics")));
         let camera = |(pose, k): (&Vec<f32>, &Vec<f32>)| {
@@ -127,7 +127,8 @@ impl Golden {
             let pose = Mat4::from_cols_slice(pose).transpose();
             Camera::new(intrinsics, pose).unwrap()
         };
-        let near_far = rows(self.aside("near_far")).iter().map(|r| (r[0], r[1])).collect();
+        let near_far =
+            rows(self.aside("near_far")).iter().map(|r| NearFar::new(r[0], r[1])).collect();
         (poses.iter().zip(&k).map(camera).collect(), near_far)
     }
 

@@ -1,4 +1,4 @@
-//! The Rust twin of `tools/witness/formula.py`, where the formula is written down.
+//! The formula of `tools/witness/formula.py` in Rust. The Python file states it.
 
 fn mix(mut z: u64) -> u64 {
     z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);

@@ -90,7 +90,7 @@ const NEEDLE: &str =
 const SUPPORT: &str = "supports are widened by 1e-4 in log2 of alpha";
 const PIXELS: &str = "3 px; the test bounds them on either side to the pixel";
 
-/// What SubSplat adds, and the projection of splats.
+/// Tolerances of SubSplat's modules and of the projection of splats.
 const SUBSPLAT: &[Row] = &[
     ("sub_agg_add_ffn.f_g f_a", 6e-6, ATTENTION),
     ("sub_agg_bare_maps.f_g f_a", 6e-6, ATTENTION),

@@ -5,6 +5,7 @@ use super::args_eval::EvalArgs;
 use super::args_view::{KEYS, ViewArgs};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
+use subsplat::FitOptions;
 
 /// Exit codes, which scripts rely on.
 const EXIT_CODES: &str = "\
@@ -88,7 +89,7 @@ impl From<ConventionArg> for subsplat::abi::Convention {
     }
 }
 
-/// What SubSplat adds to the backbone.
+/// Form of the modules that SubSplat adds to the backbone.
 #[derive(Clone, Copy, Debug, ValueEnum)]
 pub enum PresetArg {
     /// The paper's equations as written.
@@ -225,6 +226,10 @@ pub struct SourceArgs {
     /// Colour detail from photographs that are larger than the network's input.
     #[arg(long, value_enum, default_value = "photo")]
     pub detail: DetailArg,
+    /// Steps of the fit to the photographs: sizes, opacities and colours of the Gaussians are
+    /// changed so that they give the photographs back. 0: the network's Gaussians.
+    #[arg(long, value_name = "STEPS", default_value_t = FitOptions::default().steps)]
+    pub fit: usize,
     /// The model.
     #[command(flatten)]
     pub model: ModelArgs,
@@ -376,7 +381,7 @@ pub struct InfoArgs {
 /// An instruction set that kernels are compiled for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum SimdArg {
-    /// What every processor of the kind has; products and sums round separately.
+    /// Instructions of every processor of the kind; products and sums round separately.
     Scalar,
     /// x86-64-v3.
     Avx2,

@@ -6,11 +6,11 @@ use std::path::PathBuf;
 use subsplat::eval::Method;
 
 const NOTES: &str = "\
-Methods: subsplat (the model), detail (the model with detail from the photographs), backbone (its \
-backbone's Gaussians alone, rendered at the target's size: spgr=off), lowpass (the same, low-pass \
-scaled to the input), bilinear (the same rendered at the input's size and enlarged), uniform (K \
-equal Gaussians a pixel, untrained), copy (the input nearest to the target), mean (of the \
-inputs).
+Methods: subsplat (the model), detail (the model with detail from the photographs), fit (the same, \
+fitted to the photographs: what `run` gives), backbone (its backbone's Gaussians alone, rendered \
+at the target's size: spgr=off), lowpass (the same, low-pass scaled to the input), bilinear (the \
+same rendered at the input's size and enlarged), uniform (K equal Gaussians a pixel, untrained), \
+copy (the input nearest to the target), mean (of the inputs).
 
 Figures: PSNR (dB), SSIM, LPIPS (VGG16; needs --lpips), sharpness (mean absolute gradient over the \
 photograph's). Means are over a case's targets first, then over cases; a case is one set of inputs.

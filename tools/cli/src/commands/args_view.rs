@@ -3,6 +3,7 @@
 use super::args::{ConventionArg, DetailArg, RenderingArgs, SourceArgs, triple};
 use clap::Args;
 use std::path::PathBuf;
+use subsplat::FitOptions;
 
 /// The window's keys, which `--help` and the H key show.
 pub const KEYS: &str = "\
@@ -80,6 +81,7 @@ impl ViewArgs {
             (source.seed.is_some(), "--seed"),
             (source.far.is_some(), "--far"),
             (source.detail != DetailArg::Photo, "--detail"),
+            (source.fit != FitOptions::default().steps, "--fit"),
             (source.model.backbone.is_some(), "--backbone"),
             (source.model.preset.is_some(), "--preset"),
             (source.model.config.is_some(), "--config"),

@@ -116,7 +116,7 @@ fn finished(comparison: Comparison) -> Result<Comparison> {
 
 /// Compares the outputs of the forward pass.
 fn picture(case: &Case, got: &Rendered) -> Result<Comparison> {
-    let k = case.camera.intrinsics;
+    let k = case.camera.intrinsics();
     let pixels = [k.height, k.width];
     let mut comparison = Comparison::default();
     let boundary = comparison.take(case, "boundary", &pixels)?;
@@ -212,7 +212,7 @@ fn gradient_references<'a>(
             gradients.push(GradientReference { name, values, width });
         }
     }
-    let k = case.camera.intrinsics;
+    let k = case.camera.intrinsics();
     let pixels = k.height * k.width;
     let v_rgb = comparison.take(case, "v_rgb", &[k.height, k.width, 3])?;
     let v_alpha = comparison.take(case, "v_alpha", &[k.height, k.width])?;

@@ -131,19 +131,16 @@ pub fn interpolate(through: &[Camera], frames: usize) -> Result<Vec<Camera>> {
             catmull_rom([p(k_signed - 1), p(k_signed), p(k_signed + 1), p(k_signed + 2)], f);
         let turn = |i: usize| Quat::from_mat3(&through[i].rotation());
         let rotation = turn(k).slerp(turn(k + 1), f);
-        let (a, b) = (through[k].intrinsics, through[k + 1].intrinsics);
+        let (a, b) = (through[k].intrinsics(), through[k + 1].intrinsics());
         let mut intrinsics = a;
         let b = b.resized(a.width, a.height);
         intrinsics.fx += f * (b.fx - a.fx);
         intrinsics.fy += f * (b.fy - a.fy);
         intrinsics.cx += f * (b.cx - a.cx);
         intrinsics.cy += f * (b.cy - a.cy);
-        Camera {
-            intrinsics,
-            world_from_camera: Mat4::from_rotation_translation(rotation, position),
-        }
+        Ok(Camera::new(intrinsics, Mat4::from_rotation_translation(rotation, position))?)
     };
-    Ok((0..frames).map(at).collect())
+    (0..frames).map(at).collect()
 }
 
 fn catmull_rom(p: [Vec3; 4], t: f32) -> Vec3 {
@@ -181,9 +178,9 @@ pub fn orbit(cameras: &[Camera], depth: f32, frames: usize) -> Result<Vec<Camera
             forward.extend(0.0),
             eye.extend(1.0),
         );
-        Camera { intrinsics: first.intrinsics, world_from_camera: pose }
+        Ok(Camera::new(first.intrinsics(), pose)?)
     };
-    Ok((0..frames).map(at).collect())
+    (0..frames).map(at).collect()
 }
 
 #[cfg(test)]
@@ -206,7 +203,7 @@ mod tests {
         let path = interpolate(&through, 5).unwrap();
         for (i, expected) in [(0, &through[0]), (2, &through[1]), (4, &through[2])] {
             assert!(path[i].position().distance(expected.position()) < 1e-5);
-            assert!(Camera::new(path[i].intrinsics, path[i].world_from_camera).is_ok());
+            assert!(Camera::new(path[i].intrinsics(), path[i].world_from_camera()).is_ok());
         }
         assert!(interpolate(&through[..1], 5).is_err());
     }
@@ -217,7 +214,7 @@ mod tests {
         for c in orbit(&cameras, 4.0, 8).unwrap() {
             let px = c.project(Vec3::new(0.0, 0.0, 4.0)).unwrap();
             assert!((px.x - 32.0).abs() < 1e-3 && (px.y - 24.0).abs() < 1e-3, "{px}");
-            assert!(Camera::new(c.intrinsics, c.world_from_camera).is_ok());
+            assert!(Camera::new(c.intrinsics(), c.world_from_camera()).is_ok());
         }
     }
 

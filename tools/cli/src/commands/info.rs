@@ -119,7 +119,7 @@ fn scene(path: &Path, answer: Answer) -> Result<Value> {
     ));
     scene.warnings.iter().for_each(|w| answer.line(format!("  warning: {w}")));
     let frame = |(i, f): (usize, &subsplat::io::scene::Frame)| {
-        let k = f.camera.intrinsics;
+        let k = f.camera.intrinsics();
         let p = f.camera.position();
         answer.line(format!(
             "  {i:>3} {:<12} {}x{} fx {:.1} fy {:.1} fov {:.1}°×{:.1}° at ({:.3}, {:.3}, {:.3})",
@@ -140,7 +140,7 @@ fn scene(path: &Path, answer: Answer) -> Result<Value> {
             "width": k.width,
             "height": k.height,
             "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy,
-            "world_from_camera": f.camera.world_from_camera.transpose().to_cols_array_2d(),
+            "world_from_camera": f.camera.world_from_camera().transpose().to_cols_array_2d(),
         })
     };
     let frames: Vec<Value> = scene.frames.iter().enumerate().map(frame).collect();
@@ -150,7 +150,7 @@ fn scene(path: &Path, answer: Answer) -> Result<Value> {
         "name": scene.name,
         "format": scene.source.name(),
         "frames": frames,
-        "near_far": scene.near_far,
+        "near_far": scene.near_far.map(|range| [range.near, range.far]),
         "sparse_points": scene.points.as_ref().map_or(0, Vec::len),
         "warnings": scene.warnings,
     }))

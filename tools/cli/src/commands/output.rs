@@ -13,7 +13,7 @@ use indicatif::ProgressBar;
 use serde_json::{Value, json};
 use std::path::Path;
 use subsplat::abi::RasterOptions;
-use subsplat::camera::Camera;
+use subsplat::camera::{Camera, NearFar};
 use subsplat::config::Config;
 use subsplat::data::crop::CropOptions;
 use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
@@ -189,12 +189,7 @@ impl Views<'_> {
 }
 
 /// Writes `cameras.json` of the rendered views, in the scene's unit, with near and far.
-pub fn write_cameras(
-    out: &Path,
-    views: &[Scored],
-    units: Units,
-    near_far: (f32, f32),
-) -> Result<()> {
+pub fn write_cameras(out: &Path, views: &[Scored], units: Units, near_far: NearFar) -> Result<()> {
     let camera = |v: &Scored| NamedCamera {
         file: format!("images/{}.png", v.stem),
         camera: v.camera,

@@ -10,7 +10,8 @@ use std::borrow::Borrow;
 use subsplat::check::{PairReport, Verdict};
 use subsplat::io::scene::Scene;
 use subsplat::{
-    Check, DepthBounds, DepthRange, Detail, Options, Photo, Prepared, Reconstruction, Reconstructor,
+    Check, DepthBounds, DepthRange, Detail, FitOptions, FitReport, Options, Photo, Prepared,
+    Reconstruction, Reconstructor,
 };
 
 /// The library's options of the arguments, for photographs of frames `context`.
@@ -30,7 +31,8 @@ pub fn options(args: &SourceArgs, scene: &Scene, context: &[usize]) -> Result<Op
         .with_depth_range(DepthRange::from_ends(args.near, args.far))
         .with_depth_prior(DepthBounds::of_scene(scene, context)?)
         .with_check(check)
-        .with_detail(detail);
+        .with_detail(detail)
+        .with_fit(FitOptions::default().with_steps(args.fit));
     let cameras: Vec<_> = context.iter().map(|&i| scene.frames[i].camera).collect();
     options.initial_depth_range(&cameras)?;
     Ok(options)
@@ -76,6 +78,13 @@ fn print_reconstruction(result: &Reconstruction, printed: usize) {
     result.warnings().iter().skip(printed).for_each(print_warning);
     if result.detail() == Detail::Photographs {
         print_line("the photographs add detail to colours (--detail off: the network alone)");
+    }
+    if let Some(fit) = result.fit() {
+        let FitReport { before, after, .. } = fit;
+        print_line(format!(
+            "the fit to the photographs changed their loss from {before:.5} to {after:.5} (--fit 0: \
+             the network's Gaussians)"
+        ));
     }
 }
 

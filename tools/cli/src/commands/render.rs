@@ -106,7 +106,7 @@ fn check(args: &RenderArgs) -> Result<()> {
 fn check_sizes(cameras: &[(String, Camera)]) -> Result<()> {
     let mut fits = None;
     for (name, camera) in cameras {
-        let size = (camera.intrinsics.width, camera.intrinsics.height);
+        let size = (camera.intrinsics().width, camera.intrinsics().height);
         // A path has thousands of cameras of one size.
         if fits != Some(size) {
             memory::check_picture(&format!("frame {name}:"), size)?;
@@ -155,7 +155,7 @@ fn cameras(args: &RenderArgs, splats: &Splats) -> Result<Vec<(String, Camera)>> 
     let sized = |camera: Camera| -> Result<Camera> {
         let Some(text) = &args.size else { return Ok(camera) };
         let (w, h) = frames::size(text)?;
-        let k = camera.intrinsics;
+        let k = camera.intrinsics();
         // Square pixels stay square: the picture is fitted, then widened or cropped.
         let scale = (w as f32 / k.width as f32).max(h as f32 / k.height as f32);
         let intrinsics = Intrinsics {
@@ -166,7 +166,7 @@ fn cameras(args: &RenderArgs, splats: &Splats) -> Result<Vec<(String, Camera)>> 
             width: w,
             height: h,
         };
-        Ok(Camera { intrinsics, ..camera })
+        Ok(camera.with_intrinsics(intrinsics)?)
     };
     let path = |cameras: Vec<Camera>| -> Result<Vec<(String, Camera)>> {
         let name = |i| format!("path_{i:04}");
@@ -246,7 +246,5 @@ pub fn bounds(splats: &Splats) -> Result<Bounds> {
 
 /// A camera along +z that shows the central 96 % of the means.
 pub fn whole(splats: &Splats) -> Result<Camera> {
-    let Camera { intrinsics, world_from_camera } =
-        bounds(splats)?.camera(DEFAULT_FOV_X, DEFAULT_SIDE);
-    Ok(Camera::new(intrinsics, world_from_camera)?)
+    Ok(bounds(splats)?.camera(DEFAULT_FOV_X, DEFAULT_SIDE)?)
 }

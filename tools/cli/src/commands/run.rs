@@ -9,7 +9,7 @@ use anyhow::{Result, bail, ensure};
 use serde_json::{Value, json};
 use std::path::Path;
 use subsplat::abi::{Convention, RasterOptions};
-use subsplat::camera::Camera;
+use subsplat::camera::{Camera, NearFar};
 use subsplat::config::{Config, LowpassRef};
 use subsplat::data::pair::choose_pair;
 use subsplat::io::SaveOptions;
@@ -60,7 +60,12 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let files = progress.stage("writing", |_| {
         let bounds = result.depth_range();
         output::write_config(&args.out, model.config())?;
-        output::write_cameras(&args.out, &scored, plan.scene.units, (bounds.near, bounds.far))?;
+        output::write_cameras(
+            &args.out,
+            &scored,
+            plan.scene.units,
+            NearFar::new(bounds.near, bounds.far),
+        )?;
         let save = SaveOptions {
             min_opacity: args.min_opacity,
             comments: vec![comment_of_options(&options)],
@@ -204,7 +209,7 @@ fn targets(args: &RunArgs, plan: &Plan, size: (usize, usize)) -> Result<Vec<usiz
 fn default_targets(input: &Path, plan: &Plan, size: (usize, usize)) -> Result<Vec<usize>> {
     let Plan { scene, context, .. } = plan;
     let misfit = |targets: &[usize]| {
-        let k = targets.first().map(|&i| scene.frames[i].camera.intrinsics);
+        let k = targets.first().map(|&i| scene.frames[i].camera.intrinsics());
         let area = k.map_or(0, |k| k.width * k.height);
         let small = k.is_none_or(|k| k.width < size.0 || k.height < size.1);
         (small, if small { usize::MAX - area } else { area })
@@ -282,7 +287,7 @@ impl Done {
 
     fn report(&self, args: &RunArgs, plan: &Plan) -> Value {
         let camera = |c: &Camera| {
-            let k = c.intrinsics;
+            let k = c.intrinsics();
             json!({ "width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy })
         };
         let result = &self.result;
@@ -305,6 +310,7 @@ impl Done {
             "seed": args.source.seed,
             "untrained_tensors": self.model.untrained_tensors().len(),
             "detail": result.detail() == Detail::Photographs,
+            "fit": result.fit().map(|f| json!({ "loss_before": f.before, "loss_after": f.after })),
             "gaussians": result.splats().len(),
             "targets": self.scored.iter().map(Scored::json).collect::<Vec<_>>(),
             "psnr": self.mean(|s| s.psnr),

@@ -1,6 +1,5 @@
-//! What the program says to what it cannot do: exit code 1, one line that starts with
-//! `error:` and names the thing, the same in the one object of `--json`, and nothing
-//! half written.
+//! Errors of the program: exit code 1, one line that starts with `error:` and names the cause,
+//! the same text in the one object of `--json`, and no partly written file.
 
 use crate::program;
 use subsplat_test_support::one_splat;
@@ -128,8 +127,8 @@ fn broken_files() {
     refused(place.path(), &rows);
 }
 
-/// What is wrong with a camera list is told, though another reader might get through, and
-/// so is a picture that no memory holds.
+/// Errors name the fault of a camera list, though another reader might accept the file, and a
+/// picture that exceeds the memory.
 #[test]
 fn cameras_of_a_finished_scene() {
     let place = workplace();

@@ -397,7 +397,7 @@ fn plain_matrices_take_a_convention() {
     };
     let poses: Vec<String> = scene.frames.iter().map(pose).collect();
     std::fs::write(at("poses.txt"), poses.join("\n")).unwrap();
-    let k = scene.frames[0].camera.intrinsics;
+    let k = scene.frames[0].camera.intrinsics();
     std::fs::write(at("K.txt"), format!("{} {} {} {}", k.fx, k.fy, k.cx, k.cy)).unwrap();
     let baseline = |words: &str| {
         let called = call_in(place.path(), &format!("--json check {words} --context 0,2"));

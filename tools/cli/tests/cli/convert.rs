@@ -56,7 +56,7 @@ fn items<'a>(
     tensors.into_iter().map(item).collect()
 }
 
-/// What Lightning saves around a state dict; optimizer states for the first `states`.
+/// A checkpoint of Lightning around a state dict, with optimizer states for the first `states`.
 fn lightning(weights: Vec<(String, Item)>, states: usize) -> Item {
     let moments = |i: usize| {
         let zeros = || floats(&[2, 2], &[0.0; 4]);

@@ -69,7 +69,7 @@ fn a_gpu_renders_a_picture_larger_than_a_binding() {
         return;
     }
     let (splats, camera) = scene();
-    let camera = Camera { intrinsics: camera.intrinsics.resized(3200, 2400), ..camera };
+    let camera = camera.resized(3200, 2400).unwrap();
     let options = RasterOptions::default();
     let mut renderer = Renderer::with_gpu(adapter::limited(128 << 20).unwrap());
     let got = renderer.render(&splats, &camera, &options);
@@ -80,8 +80,8 @@ fn a_gpu_renders_a_picture_larger_than_a_binding() {
     assert!(got.rgb.iter().zip(&expected.rgb).all(|(a, b)| (a - b).abs() < 0.02));
 }
 
-/// What no band and no layer makes fit, and a device that is gone: the CPU takes over, for
-/// good, with one warning.
+/// The CPU takes over for the rest of the program, with one warning, where a scene does not fit
+/// in bands and layers and where the device is lost.
 #[cfg(feature = "gpu")]
 #[test]
 fn what_a_gpu_cannot_do_the_cpu_does() {

@@ -30,7 +30,7 @@ fn eval_scores_writes_and_reads_its_own_pictures() {
     let out = place.path().join("out");
     let report = done(&call_in(place.path(), "--json eval scene --detail photo -o out"));
     let names =
-        ["subsplat", "detail", "backbone", "lowpass", "bilinear", "uniform", "copy", "mean"];
+        ["subsplat", "detail", "fit", "backbone", "lowpass", "bilinear", "uniform", "copy", "mean"];
     let methods = report["methods"].as_object().unwrap();
     assert_eq!(methods.len(), names.len());
     for name in names {
@@ -53,20 +53,20 @@ fn eval_scores_writes_and_reads_its_own_pictures() {
     let mean = 0.5 * (psnr(&scene["cases"][0]) + psnr(case));
     assert!((psnr(scene) - mean).abs() < 1e-9 && (psnr(&report) - mean).abs() < 1e-9);
 
-    // 3 targets of 8 methods and the truth; four tables; nothing else.
+    // 3 targets of 9 methods and the truth; four tables; nothing else.
     let written = files(&out);
-    assert_eq!(written.len(), 3 * 9 + 4, "{written:?}");
+    assert_eq!(written.len(), 3 * 10 + 4, "{written:?}");
     let saved: Value = serde_json::from_str(&text(&out.join("eval.json"))).unwrap();
     assert_eq!((&saved["methods"], &saved["scenes"]), (&report["methods"], &report["scenes"]));
     let csv = text(&out.join("targets.csv"));
-    assert_eq!(csv.lines().count(), 1 + 3 * 8);
+    assert_eq!(csv.lines().count(), 1 + 3 * 9);
     assert!(csv.starts_with("scene,context,target,frame,method,psnr,ssim,lpips,sharpness\n"));
     assert!(csv.lines().all(|l| l.matches(',').count() == 8), "{csv}");
-    assert_eq!(text(&out.join("means.csv")).lines().count(), 1 + 2 * 8);
+    assert_eq!(text(&out.join("means.csv")).lines().count(), 1 + 2 * 9);
     let page = text(&out.join("index.html"));
-    // Two inputs, the photograph and eight methods, twice; nothing from elsewhere.
-    assert_eq!(page.matches("<img ").count(), 22);
-    assert_eq!(page.matches("src=\"data:image/png;base64,").count(), 22);
+    // Two inputs, the photograph and nine methods, twice; nothing from elsewhere.
+    assert_eq!(page.matches("<img ").count(), 24);
+    assert_eq!(page.matches("src=\"data:image/png;base64,").count(), 24);
     assert!(!page.contains("http") && page.contains("the weights that ship"));
 
     // Its own pictures, read back as another program's: 8 bits apart.

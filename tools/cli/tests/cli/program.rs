@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::Command;
 pub use subsplat_test_support::scene_folder::{SIDE, files, named, workplace};
 
-/// What a call of the program left.
+/// Exit code and output of one call of the program.
 pub struct Called {
     /// Exit code; −1 where a signal ended it.
     pub code: i32,
@@ -44,7 +44,7 @@ pub fn call_with(folder: &Path, arguments: &[&str], environment: &[(&str, &str)]
     called(&mut command)
 }
 
-/// What `command` left.
+/// Runs `command` and returns its exit code and output.
 pub fn called(command: &mut Command) -> Called {
     let output = command.output().unwrap();
     let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();

@@ -4,6 +4,7 @@
 use subsplat_test_support::made_up;
 
 use std::path::Path;
+use subsplat::camera::NearFar;
 use subsplat::io::cameras_json::{CameraFile, save_cameras_json};
 use subsplat::io::scene::Units;
 use subsplat::train::TrainConfig;
@@ -186,7 +187,7 @@ fn a_step_that_is_not_finite_changes_nothing() {
     assert_ne!(state(&training), before);
 }
 
-/// What a process that was killed left: rows of lost steps, half a row, no weights.
+/// A killed process leaves rows of lost steps, half a row and no weights.
 #[test]
 fn a_killed_run_leaves_no_row_twice_and_gets_its_weights() {
     let config = tiny("depth");
@@ -238,7 +239,8 @@ fn terms_that_are_not_measured_are_not_numbers() {
 #[test]
 fn photographs_without_targets_are_refused() {
     let (made, cameras) = made_up::made_up(3);
-    let content = CameraFile { cameras, units: Units::Unknown, near_far: Some((1.0, 9.0)) };
+    let content =
+        CameraFile { cameras, units: Units::Unknown, near_far: Some(NearFar::new(1.0, 9.0)) };
     save_cameras_json(&made.path().join("cameras.json"), &content).unwrap();
     let refused = |tests: &str| {
         let file = made.path().join("protocol.json");
@@ -279,7 +281,7 @@ fn checkpoints_are_whole_and_few() {
     }
     assert_eq!(checkpoint::steps(folder.path()), [3, 4, 5]);
     drop(training);
-    // What an interrupted write leaves is not a checkpoint.
+    // The file of an interrupted write is not a checkpoint.
     std::fs::write(folder.path().join("step-00000009.safetensors.1.part"), "half").unwrap();
     assert_eq!(Training::open(&config, folder.path()).unwrap().progress().step, 5);
     let newest = checkpoint::path(folder.path(), 5);

@@ -179,7 +179,7 @@ impl Viewer {
 
     fn open(&mut self, events: &ActiveEventLoop) -> Result<()> {
         let (width, height) = self.plan.size.unwrap_or_else(|| {
-            let k = self.navigator.camera().intrinsics;
+            let k = self.navigator.camera().intrinsics();
             let sides = [(SIZE_MAX.0, k.width), (SIZE_MAX.1, k.height)];
             let scale = sides.map(|(most, side)| most as f32 / side as f32);
             let scale = scale.into_iter().fold(1.0, f32::min);

@@ -1,21 +1,6 @@
-//! Numbers and comparisons for tests that hold a WGSL kernel to its CPU twin.
+//! Inputs and comparisons for tests of WGSL kernels against their CPU versions.
 
-/// xorshift64*: uniform in [from, to).
-pub struct Random(pub u64);
-
-impl Random {
-    pub fn range(&mut self, from: f32, to: f32) -> f32 {
-        self.0 ^= self.0 >> 12;
-        self.0 ^= self.0 << 25;
-        self.0 ^= self.0 >> 27;
-        let unit = (self.0.wrapping_mul(0x2545_F491_4F6C_DD1D) >> 40) as f32 / (1u64 << 24) as f32;
-        from + (to - from) * unit
-    }
-
-    pub fn many(&mut self, count: usize, from: f32, to: f32) -> Vec<f32> {
-        (0..count).map(|_| self.range(from, to)).collect()
-    }
-}
+pub use crate::raster_scene::Random;
 
 /// Largest |got − expected| in units of the largest |expected|; NaN where one is.
 pub fn of_largest(got: &[f32], expected: &[f32]) -> f32 {
@@ -29,7 +14,7 @@ pub fn of_largest(got: &[f32], expected: &[f32]) -> f32 {
 /// [`of_largest`] is below `allowed`, and is not once one number in the middle is off by
 /// twice that.
 #[track_caller]
-pub fn assert_twins(name: &str, got: &[f32], expected: &[f32], allowed: f32) {
+pub fn assert_matches_cpu(name: &str, got: &[f32], expected: &[f32], allowed: f32) {
     let off = of_largest(got, expected);
     if std::env::var_os("SUBSPLAT_SHOW").is_some() {
         eprintln!("{name}: {off:e}");

@@ -1,6 +1,7 @@
 //! Redistribution on the GPU against the CPU version. Every comparison is also checked to fail
 //! for a perturbed result.
 
+use subsplat_test_support::cpu_against_gpu::Random;
 use subsplat_test_support::gpu as adapter;
 
 use adapter::gpu;
@@ -17,23 +18,6 @@ const REDISTRIBUTE_BACKWARD: f32 = 1e-5;
 
 const RULES: [Rule; 5] =
     [Rule::Linear, Rule::OpticalDepth, Rule::Transmittance, Rule::Area, Rule::None];
-
-/// xorshift64*: uniform in [from, to).
-struct Random(u64);
-
-impl Random {
-    fn range(&mut self, from: f32, to: f32) -> f32 {
-        self.0 ^= self.0 >> 12;
-        self.0 ^= self.0 << 25;
-        self.0 ^= self.0 >> 27;
-        let unit = (self.0.wrapping_mul(0x2545_F491_4F6C_DD1D) >> 40) as f32 / (1u64 << 24) as f32;
-        from + (to - from) * unit
-    }
-
-    fn many(&mut self, count: usize, from: f32, to: f32) -> Vec<f32> {
-        (0..count).map(|_| self.range(from, to)).collect()
-    }
-}
 
 /// Returns the largest |got − expected| / |expected|; NaN where one is.
 fn relative(got: &[f32], expected: &[f32]) -> f32 {

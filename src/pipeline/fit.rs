@@ -1,0 +1,48 @@
+//! Fit of a reconstructed scene to its photographs.
+
+use super::{Error, Result};
+use crate::abi::RasterOptions;
+use crate::camera::Camera;
+use crate::data::crop::Cropped;
+use crate::fit::{FitError, FitOptions, FitReport, FitView, fit};
+use crate::io::image::Rgb;
+use crate::render::Renderer;
+use crate::splats::Splats;
+use std::ops::ControlFlow;
+
+/// The largest picture of `c` that is no enlargement of the photograph, with its camera: the
+/// target's size, else the input's.
+fn sharp_picture(c: &Cropped) -> (&Camera, &Rgb) {
+    match c.window.scale.min_element() < 1.0 {
+        true => (&c.input_camera, &c.input),
+        false => (&c.target_camera, &c.target),
+    }
+}
+
+/// Fits the Gaussians of `inputs` to their photographs. `progress` receives the number of steps
+/// done.
+///
+/// # Errors
+/// [`Error::Cancelled`]; a picture of another size than its camera.
+pub(crate) fn fit_to_inputs(
+    splats: &mut Splats,
+    inputs: &[Cropped],
+    raster: &RasterOptions,
+    options: &FitOptions,
+    renderer: &mut Renderer,
+    progress: &mut dyn FnMut(usize) -> ControlFlow<()>,
+) -> Result<FitReport> {
+    let views: Vec<FitView<'_>> = inputs
+        .iter()
+        .map(|c| {
+            let (camera, image) = sharp_picture(c);
+            FitView { camera, image }
+        })
+        .collect();
+    fit(splats, &views, raster, options, renderer, progress).map_err(|e| match e {
+        FitError::Cancelled => Error::Cancelled,
+        FitError::Size { view, expected, got } => {
+            Error::argument(format!("photograph {view}"), expected, got)
+        }
+    })
+}
