@@ -2,7 +2,8 @@
 //!
 //! ```text
 //! cargo run --release --example make_rooms -- out/rooms 24 77   # folder, rooms, seed (and
-//!     # the share of rooms with things close before the cameras: 0)
+//!     # the share of rooms with things close before the cameras: 0; the share of scenes of
+//!     # shapes at random places, with cameras of a wide range: 0)
 //! subsplat eval out/rooms --upscale 2
 //! ```
 //!
@@ -30,7 +31,8 @@ fn main() -> Result<()> {
         arguments.next().map_or(Ok(default), |text| text.parse().context("a number"))
     };
     let (count, seed) = (number(24)?, number(77)?);
-    let foreground = arguments.next().map_or(Ok(0.0), |text| text.parse().context("a share"))?;
+    let mut share = || arguments.next().map_or(Ok(0.0), |text| text.parse().context("a share"));
+    let (foreground, scattered) = (share()?, share()?);
     let mut config = TrainConfig::default();
     config.model.upscale = 1;
     config.data.input = [SIDE, SIDE];
@@ -38,6 +40,7 @@ fn main() -> Result<()> {
     config.data.target_samples = 2;
     config.data.seed = seed;
     config.data.foreground = foreground;
+    (config.data.scattered, config.data.wide) = (scattered, scattered);
     let source = rooms(&config, Split::HeldOut)?;
     for i in 0..count {
         let example = source.example(i)?;

@@ -1,10 +1,10 @@
 //! The configuration of a training: one TOML or JSON file. Every key has a default, and unknown
 //! keys are refused.
 
+use super::augment::Augmentation;
 use super::files::Files;
 use super::optimizer::Settings;
 use super::schedule::Schedule;
-use super::source::Augmentation;
 use super::{Error, Result};
 use crate::config::{Backbone, Config, Preset};
 use crate::io;
@@ -141,11 +141,23 @@ pub struct Data {
     pub photographic: bool,
     /// Share of scenes with objects close to the cameras, partly outside the picture.
     pub foreground: f32,
+    /// Share of scenes that show shapes at random places, indoors or outdoors, instead of a
+    /// furnished room.
+    pub scattered: f32,
+    /// Share of scenes with a wide range of fields of view, baselines and rotations
+    /// ([`crate::data::procedural::CameraRange::Wide`]).
+    pub wide: f32,
+    /// Adds the context views, at the targets' size, to the targets. The render phase only.
+    pub input_targets: bool,
+    /// Share of the scenes with `input_targets` whose children take the detail of these pictures, as
+    /// `subsplat run` does with photographs larger than the input.
+    pub detail: f32,
     /// Share of scenes whose near and far are the visible depth range
     /// ([`super::source::Rooms::seen_range`]).
     pub seen_range: f32,
     /// Pictures on disk instead of procedural rooms. `scenes`, `samples`, `target_samples`, `crop`,
-    /// `photographic`, `foreground` and `seen_range` are then ignored, and depth is unknown.
+    /// `photographic`, `foreground`, `scattered`, `wide`, `input_targets`, `detail` and
+    /// `seen_range` are then ignored, and depth is unknown.
     pub files: Option<Files>,
     /// Scenes that are repeated before the next ones are made.
     pub window: u64,
@@ -171,6 +183,10 @@ impl Default for Data {
             crop: 0.5,
             photographic: true,
             foreground: 0.0,
+            scattered: 0.0,
+            wide: 0.0,
+            input_targets: false,
+            detail: 0.0,
             seen_range: 0.0,
             files: None,
             window: 256,
@@ -398,6 +414,7 @@ impl TrainConfig {
             ("loss.confidence", l.confidence),
             ("checkpoint.minutes", self.checkpoint.minutes),
             ("validate.minutes", self.validate.minutes),
+            ("data.augment.rotation_error", self.data.augment.rotation_error),
         ];
         for (key, value) in not_negative {
             if !(value >= 0.0 && value.is_finite()) {
@@ -427,9 +444,14 @@ impl TrainConfig {
             ("data.crop", f64::from(self.data.crop)),
             ("data.seen_range", f64::from(self.data.seen_range)),
             ("data.foreground", f64::from(self.data.foreground)),
+            ("data.scattered", f64::from(self.data.scattered)),
+            ("data.wide", f64::from(self.data.wide)),
+            ("data.detail", f64::from(self.data.detail)),
             ("data.augment.flip", a.flip),
             ("data.augment.permute", a.permute),
             ("data.augment.swap", a.swap),
+            ("data.augment.photographic", a.photographic),
+            ("data.augment.focal_error", a.focal_error),
         ];
         for (key, value) in shares {
             if !(0.0..=1.0).contains(&value) {

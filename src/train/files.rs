@@ -1,7 +1,7 @@
 //! Training examples from pictures on disk ([`Dataset`]): chunks of videos, folders of scenes.
 
 use super::config::TrainConfig;
-use super::source::{Example, Source};
+use super::source::{Example, InputTargets, Source};
 use super::{Error, Result};
 use crate::camera::NearFar;
 use crate::data::crop::{CropOptions, CropRule};
@@ -135,6 +135,7 @@ impl Source for Pictures {
             targets: example.targets,
             inverse_depth: Vec::new(),
             near_far: example.near_far,
+            input_targets: InputTargets::Absent,
         }))
     }
 

@@ -1,6 +1,7 @@
 //! Threads that make examples ahead of the training step.
 
-use super::source::{Augmentation, Example, Source};
+use super::augment::Augmentation;
+use super::source::{Example, Source};
 use super::{Error, Result};
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -5,6 +5,7 @@
 //! of threads. A checkpoint therefore holds the parameters, the optimizer's state and the step. A
 //! resumed training takes the same steps as an uninterrupted one (`tools/cli/tests/cli/train.rs`).
 
+pub mod augment;
 pub mod checkpoint;
 pub mod config;
 pub mod files;

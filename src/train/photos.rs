@@ -2,7 +2,7 @@
 //! used for training.
 
 use super::Result;
-use super::source::Example;
+use super::source::{Example, InputTargets};
 use crate::camera::NearFar;
 use crate::data::crop::{CropOptions, crop};
 use crate::data::dataset::Posed;
@@ -61,5 +61,6 @@ fn pair(scene: &Scene, test: &Views, stride: usize) -> Result<Example> {
         targets: test.target.iter().map(load).collect::<Result<_>>()?,
         inverse_depth: Vec::new(),
         near_far: NearFar::new(range.near, range.far),
+        input_targets: InputTargets::Absent,
     })
 }

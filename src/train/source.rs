@@ -8,7 +8,6 @@ use crate::data::pair::quantile;
 use crate::data::procedural::{self, ExampleSpec, TargetSpec};
 use crate::io::image::Rgb;
 use half::f16;
-use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -24,6 +23,20 @@ pub struct Example {
     pub inverse_depth: Vec<Vec<f16>>,
     /// Nearest and farthest depth candidate, world units.
     pub near_far: NearFar,
+    /// Context views that are targets too. They are the last of `targets`, in order.
+    pub input_targets: InputTargets,
+}
+
+/// Context views among the targets.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum InputTargets {
+    /// None.
+    #[default]
+    Absent,
+    /// All of them.
+    Plain,
+    /// All of them, and the children take the detail of these pictures ([`crate::cpu::detail`]).
+    WithDetail,
 }
 
 /// An infinite sequence of examples. Equal indices give equal examples on any thread.
@@ -52,7 +65,7 @@ pub(super) fn hash(seed: u64, key: u64) -> u64 {
 }
 
 /// Returns a pseudo-random number in [0, 1).
-fn uniform(seed: u64, key: u64) -> f64 {
+pub(super) fn uniform(seed: u64, key: u64) -> f64 {
     (hash(seed, key) >> 11) as f64 / (1u64 << 53) as f64
 }
 
@@ -70,6 +83,8 @@ pub struct Rooms {
     /// Share of the examples whose near and far are the visible depth range, slightly widened, as
     /// the depth estimate at inference gives it. The others keep the generator's near and far.
     pub seen_range: f32,
+    /// Share of the examples with the context views as targets whose children take their detail.
+    pub detail: f32,
 }
 
 impl Rooms {
@@ -115,7 +130,15 @@ impl Source for Rooms {
         let depths = made.views.iter().take(inverse_depth.len()).flat_map(|v| &v.depth);
         let near_far = self.visible_range(hash(made.seed, 0x5EE), depths.copied());
         let near_far = near_far.unwrap_or(NearFar::new(made.near, made.far));
-        Ok(Arc::new(Example { context: pictures, targets, inverse_depth, near_far }))
+        let input_targets = match self.targets.inputs {
+            false => InputTargets::Absent,
+            true if uniform(hash(made.seed, 0xDE_7A), 0) < f64::from(self.detail) => {
+                InputTargets::WithDetail
+            }
+            true => InputTargets::Plain,
+        };
+        let context = pictures;
+        Ok(Arc::new(Example { context, targets, inverse_depth, near_far, input_targets }))
     }
 }
 
@@ -186,56 +209,5 @@ impl<S: Source> Source for Replay<S> {
         *kept = kept.split_off(&oldest);
         kept.insert(position, example.clone());
         Ok(example)
-    }
-}
-
-/// Transformations that leave an example valid. The defaults are those of the training recipe.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Augmentation {
-    /// Probability of mirrored views and poses.
-    pub flip: f64,
-    /// Probability of permuted colour channels.
-    pub permute: f64,
-    /// Probability of exchanged context views.
-    pub swap: f64,
-}
-
-impl Default for Augmentation {
-    fn default() -> Self {
-        Self { flip: 0.5, permute: 0.5, swap: 0.5 }
-    }
-}
-
-/// The six orders of three channels.
-const ORDERS: [[usize; 3]; 6] = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
-
-impl Augmentation {
-    /// Returns `example` as transformed at position `index` of the sequence of `seed`.
-    pub fn apply(&self, example: &Example, seed: u64, index: u64) -> Example {
-        let draw = |key: u64| uniform(hash(seed, 0xA0_6E), index * 8 + key);
-        let mut out = example.clone();
-        if draw(0) < self.flip {
-            for view in out.context.iter_mut().chain(&mut out.targets) {
-                *view = view.flipped();
-            }
-            for (map, view) in out.inverse_depth.iter_mut().zip(&out.context) {
-                map.chunks_mut(view.image.width.max(1)).for_each(<[f16]>::reverse);
-            }
-        }
-        if draw(1) < self.permute {
-            let order = ORDERS[(draw(2) * 6.0) as usize % 6];
-            for picture in out.context.iter_mut().chain(&mut out.targets) {
-                for px in picture.image.data.chunks_exact_mut(3) {
-                    let old = [px[0], px[1], px[2]];
-                    px.copy_from_slice(&order.map(|c| old[c]));
-                }
-            }
-        }
-        if draw(3) < self.swap {
-            out.context.reverse();
-            out.inverse_depth.reverse();
-        }
-        out
     }
 }

@@ -3,11 +3,12 @@
 use super::config::{Phase, TrainConfig};
 use super::loss::{self, Scored, with_gradient};
 use super::optimizer::{Gradients, Optimizer};
-use super::source::Example;
+use super::source::{Example, InputTargets};
 use super::{Error, Result};
 use crate::abi::RasterOptions;
 use crate::camera::Camera;
 use crate::config::{Backbone, Config};
+use crate::cpu::detail::{Photograph, SourceView, residuals, with_residuals};
 use crate::data::dataset::Posed;
 use crate::io::image::Rgb;
 use crate::model::backbone::small::{DepthMaps, DisparityMean};
@@ -448,9 +449,11 @@ impl Learner {
     /// Renders every target of `example` and propagates the loss back to the children immediately,
     /// so that one picture's graph exists at a time.
     fn pictures(&self, children: &Children, example: &Example) -> Result<RenderedLoss> {
-        let leaves = [leaf(&children.rows)?, leaf(&children.sh)?, leaf(&children.gain)?];
+        let gain = self.detailed_gain(children, example)?;
+        let gain = gain.as_ref().unwrap_or(&children.gain);
+        let leaves = [leaf(&children.rows)?, leaf(&children.sh)?, leaf(gain)?];
         let mut gradients =
-            [&children.rows, &children.sh, &children.gain].map(|t| Scored::zero(t.elem_count()));
+            [&children.rows, &children.sh, gain].map(|t| Scored::zero(t.elem_count()));
         let mut terms = Terms::default();
         let share = 1.0 / example.targets.len().max(1) as f64;
         for target in &example.targets {
@@ -469,7 +472,37 @@ impl Learner {
             }
         }
         gradients[0].value = terms.loss;
+        let channels = children.gain.elem_count() / children.rows.dim(0)?.max(1);
+        if channels == 1 && gain.rank() == 2 {
+            // δ is data: only the column of γ has a parameter.
+            let of_gain = &mut gradients[2].gradient;
+            *of_gain = of_gain.iter().step_by(4).copied().collect();
+        }
         Ok(RenderedLoss { gradients, terms })
+    }
+
+    /// Returns γ and δ `[N·K, 4]` with the detail of the example's photographs, or `None` where it
+    /// takes none.
+    fn detailed_gain(&self, children: &Children, example: &Example) -> Result<Option<Tensor>> {
+        if example.input_targets != InputTargets::WithDetail {
+            return Ok(None);
+        }
+        let context = &example.context;
+        let first = example.targets.len().saturating_sub(context.len());
+        let photographs = &example.targets[first..];
+        let pixels: Vec<Vec<f32>> = photographs.iter().map(|t| t.image.to_unit()).collect();
+        let views = context.iter().zip(photographs).zip(&pixels).map(|((view, photo), pixels)| {
+            let (w, h) = (photo.image.width, photo.image.height);
+            SourceView { photograph: Photograph::new(pixels, w, h), camera: view.camera }
+        });
+        let views: Vec<SourceView<'_>> = views.collect();
+        let means = children.rows.narrow(1, 0, 3)?.contiguous()?;
+        let count = children.rows.dim(0)?;
+        let per_view = count / (children.k * views.len()).max(1);
+        let upscale = self.model.config().upscale;
+        let delta = residuals(&views, &flat(&means)?, per_view, children.k, upscale);
+        let gain = with_residuals(&flat(&children.gain)?, &delta);
+        Ok(Some(Tensor::from_vec(gain, (count, 4), &Device::Cpu)?))
     }
 
     /// Returns the loss of one picture as a scalar of candle's graph, and its terms.

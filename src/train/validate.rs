@@ -68,12 +68,18 @@ pub fn rooms(config: &TrainConfig, split: Split) -> Result<Rooms> {
     spec.cameras.crop = data.crop;
     spec.photographic = data.photographic;
     spec.foreground = data.foreground;
+    spec.scattered = data.scattered;
+    spec.wide = data.wide;
     spec.samples = data.samples;
-    let targets =
-        crate::data::procedural::TargetSpec { ratio, samples: data.target_samples, clean: true };
+    let targets = crate::data::procedural::TargetSpec {
+        ratio,
+        samples: data.target_samples,
+        clean: true,
+        inputs: data.input_targets && config.phase == Phase::Render && !held_out,
+    };
     let seed = if held_out { hash(data.seed, HELD_OUT) } else { data.seed };
     let scenes = if held_out { 0 } else { data.scenes };
-    Ok(Rooms { seed, scenes, spec, targets, seen_range: data.seen_range })
+    Ok(Rooms { seed, scenes, spec, targets, seen_range: data.seen_range, detail: data.detail })
 }
 
 impl Validator {

@@ -8,7 +8,7 @@ use subsplat::data::procedural::{
 };
 
 fn spec(width: usize, height: usize) -> CameraSpec {
-    CameraSpec { width, height, targets: 1, crop: 0.0 }
+    CameraSpec { width, height, targets: 1, crop: 0.0, range: Default::default() }
 }
 
 fn rig(seed: u64, spec: &CameraSpec) -> (Room, Rig) {
@@ -249,6 +249,28 @@ fn foreground_objects_change_nothing_else() {
         assert!(same(&a) || same(&b), "seed {seed}: neither with nor without");
     }
     assert!(closer >= 4, "{closer} of 12");
+}
+
+#[test]
+fn scattered_scenes_and_wide_cameras_are_shares() {
+    let plain = ExampleSpec::new(24, 24, 1);
+    let [scattered, wide] =
+        [ExampleSpec { scattered: 1.0, ..plain }, ExampleSpec { wide: 1.0, ..plain }];
+    let mut focal = Vec::new();
+    for seed in 0..20 {
+        let of = |spec: &ExampleSpec| Example::new(seed, spec);
+        let own = of(&plain);
+        assert_ne!(own.views[0].rgb, of(&scattered).views[0].rgb);
+        let wide_example = of(&wide);
+        let k = wide_example.cameras[0].intrinsics();
+        focal.push(k.fx / k.width as f32);
+        let half = of(&ExampleSpec { wide: 0.5, ..plain });
+        let same = |x: &Example| x.views[0].rgb == half.views[0].rgb;
+        assert!(same(&own) || same(&wide_example), "seed {seed}: neither range of cameras");
+    }
+    focal.sort_by(f32::total_cmp);
+    // 80 degrees are 0.6 widths; windows of larger pictures have up to 4 widths.
+    assert!(focal[0] < 0.58 && focal[19] > 1.5, "{focal:?}");
 }
 
 #[test]

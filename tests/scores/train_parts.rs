@@ -11,11 +11,12 @@ use subsplat::data::dataset::Posed;
 use subsplat::data::procedural::{ExampleSpec, TargetSpec};
 use subsplat::io::image::Rgb;
 use subsplat::metrics;
+use subsplat::train::augment::Augmentation;
 use subsplat::train::loading::{Loader, LoaderOptions};
 use subsplat::train::loss::{self, Scored, with_gradient};
 use subsplat::train::optimizer::{Optimizer, Settings};
 use subsplat::train::schedule::{NamedWarmup, Schedule, Warmup};
-use subsplat::train::source::{Augmentation, Example, Replay, Rooms, Source};
+use subsplat::train::source::{Example, InputTargets, Replay, Rooms, Source};
 
 /// Returns reproducible numbers in [0, 1).
 fn noise(n: usize, seed: u32) -> Vec<f32> {
@@ -270,8 +271,9 @@ fn rooms() -> Rooms {
         seed: 4,
         scenes: 0,
         spec,
-        targets: TargetSpec { ratio: 2, samples: 1, clean: true },
+        targets: TargetSpec { ratio: 2, samples: 1, clean: true, inputs: false },
         seen_range: 0.0,
+        detail: 0.0,
     }
 }
 
@@ -352,12 +354,12 @@ fn mirroring_keeps_the_geometry() {
 #[test]
 fn augmentation_is_a_function_of_the_position() {
     let example = rooms().example(0).unwrap();
-    let all = Augmentation { flip: 0.5, permute: 0.5, swap: 0.5 };
+    let all = Augmentation::default();
     let augmented: Vec<Example> = (0..24).map(|i| all.apply(&example, 1, i)).collect();
     assert_eq!(augmented[5], all.apply(&example, 1, 5));
     let different = augmented.iter().filter(|e| **e != *example).count();
     assert!((12..24).contains(&different), "{different}");
-    let off = Augmentation { flip: 0.0, permute: 0.0, swap: 0.0 };
+    let off = Augmentation { flip: 0.0, permute: 0.0, swap: 0.0, ..Default::default() };
     assert_eq!(off.apply(&example, 1, 5), *example);
     let swap = Augmentation { swap: 1.0, ..off }.apply(&example, 1, 5);
     assert_eq!(swap.context[0], example.context[1]);
@@ -368,8 +370,88 @@ fn augmentation_is_a_function_of_the_position() {
 }
 
 #[test]
+fn views_differ_as_photographs_do() {
+    let example = rooms().example(0).unwrap();
+    let off = Augmentation { flip: 0.0, permute: 0.0, swap: 0.0, ..Default::default() };
+    let photographic = Augmentation { photographic: 0.5, ..off };
+    let (mut changed, mut one_alone, mut distance) = (0, 0, 0.0);
+    for i in 0..40 {
+        let out = photographic.apply(&example, 1, i);
+        assert_eq!(out, photographic.apply(&example, 1, i));
+        // Pictures of the targets, poses and depth stay.
+        assert_eq!((&out.targets, &out.inverse_depth), (&example.targets, &example.inverse_depth));
+        let differs = [0, 1].map(|v| {
+            assert_eq!(out.context[v].camera, example.context[v].camera);
+            let pairs = out.context[v].image.data.iter().zip(&example.context[v].image.data);
+            let sum: f64 = pairs.map(|(a, b)| f64::from(a.abs_diff(*b))).sum();
+            distance += sum / example.context[v].image.data.len() as f64;
+            sum > 0.0
+        });
+        changed += usize::from(differs[0]) + usize::from(differs[1]);
+        one_alone += usize::from(differs[0] != differs[1]);
+    }
+    assert!((25..55).contains(&changed) && one_alone > 10, "{changed} {one_alone}");
+    // Display values of 255: visible, and still the same scene.
+    let mean = distance / changed as f64;
+    assert!((4.0..40.0).contains(&mean), "{mean}");
+}
+
+#[test]
+fn errors_of_poses_have_their_size() {
+    let example = rooms().example(0).unwrap();
+    let off = Augmentation { flip: 0.0, permute: 0.0, swap: 0.0, ..Default::default() };
+    let errors = Augmentation { rotation_error: 0.5, focal_error: 0.01, ..off };
+    let (mut squares, mut focal) = (0.0, 0.0);
+    let n = 200;
+    for i in 0..n {
+        let out = errors.apply(&example, 1, i);
+        assert_eq!(out.context[0].camera.rotation(), example.context[0].camera.rotation());
+        assert_eq!(out.context[1].camera.position(), example.context[1].camera.position());
+        assert_eq!(out.targets, example.targets);
+        let relative =
+            example.context[1].camera.rotation().transpose() * out.context[1].camera.rotation();
+        squares += glam::Quat::from_mat3(&relative).to_scaled_axis().length_squared().to_degrees();
+        let [a, b] = [&out, &example].map(|e| e.context[0].camera.intrinsics().fx);
+        focal += (a / b).ln().powi(2);
+    }
+    // Three axes of 0.5 degrees each; degrees times radians.
+    let sigma = (squares / n as f32 * 57.29578 / 3.0).sqrt();
+    assert!((0.4..0.6).contains(&sigma), "{sigma} degrees");
+    let focal = (focal / n as f32).sqrt();
+    assert!((0.008..0.012).contains(&focal), "{focal}");
+}
+
+#[test]
+fn inputs_can_be_targets() {
+    let mut source = rooms();
+    let plain = source.example(2).unwrap();
+    source.targets.inputs = true;
+    source.detail = 0.5;
+    let mut with_detail = 0;
+    for i in 0..20 {
+        let example = source.example(i).unwrap();
+        assert_eq!(example.targets.len(), 3);
+        for (input, target) in example.context.iter().zip(&example.targets[1..]) {
+            assert_eq!(target.camera.resized(32, 24).unwrap(), input.camera);
+            assert_eq!((target.image.width, target.image.height), (64, 48));
+        }
+        with_detail += usize::from(example.input_targets == InputTargets::WithDetail);
+        assert_ne!(example.input_targets, InputTargets::Absent);
+    }
+    assert!((4..17).contains(&with_detail), "{with_detail}");
+    let example = source.example(2).unwrap();
+    assert_eq!((&example.context, &example.targets[0]), (&plain.context, &plain.targets[0]));
+    // Exchanged views exchange their targets.
+    let off = Augmentation { flip: 0.0, permute: 0.0, swap: 0.0, ..Default::default() };
+    let swapped = Augmentation { swap: 1.0, ..off }.apply(&example, 1, 5);
+    assert_eq!(swapped.targets[0], example.targets[0]);
+    assert_eq!(swapped.targets[1], example.targets[2]);
+    assert_eq!(swapped.targets[2], example.targets[1]);
+}
+
+#[test]
 fn loading_gives_the_sequence_for_any_number_of_threads() {
-    let off = Augmentation { flip: 0.0, permute: 0.0, swap: 0.0 };
+    let off = Augmentation { flip: 0.0, permute: 0.0, swap: 0.0, ..Default::default() };
     for workers in [1, 3] {
         let options = LoaderOptions { augmentation: off, seed: 0, workers, ahead: 4 };
         let mut loader = Loader::start(Arc::new(rooms()), options, 2).unwrap();

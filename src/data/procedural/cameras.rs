@@ -1,10 +1,9 @@
 //! Samples pairs of cameras with the statistics of hand-held footage of rooms, and target cameras
 //! between the two.
 //!
-//! Field of view 40° to 80°. Baseline 0.05 to 0.38 of the median depth. Half of the pairs move
-//! forward or back, a quarter sideways, a quarter in any direction. 35 % rotate towards the scene
-//! as on an orbit. The rotation about each axis is at most 28°. Each view sees at least 40 % of the
-//! other. No camera is within 0.1 m of a surface.
+//! Half of the pairs move forward or back, a quarter sideways, a quarter in any direction. 35 %
+//! rotate towards the scene as on an orbit. No camera is within 0.1 m of a surface. A
+//! [`CameraRange`] gives the field of view, the baseline, the rotation and the overlap.
 
 use super::Room;
 use super::rng::Rng;
@@ -14,10 +13,6 @@ use glam::{EulerRot, Mat3, Mat4, Quat, Vec2, Vec3};
 
 /// Smallest distance of a camera from any surface, m.
 pub(super) const CLEARANCE: f32 = 0.1;
-/// Smallest share of each context view that the other sees.
-const MIN_OVERLAP: f32 = 0.4;
-/// Largest rotation between the context views about each axis, radians.
-const ROTATION: f32 = 28.0 * std::f32::consts::PI / 180.0;
 /// Number of probe rays along each side of a view.
 const PROBE: usize = 20;
 /// Number of proposals before a room is rejected as too small.
@@ -35,6 +30,65 @@ pub struct CameraSpec {
     /// Probability that the pictures are off-centre windows of pictures twice as large: half the
     /// field of view, with the pixel statistics of larger photographs.
     pub crop: f32,
+    /// Field of view, baseline and rotation.
+    pub range: CameraRange,
+}
+
+/// Range of the field of view, the baseline and the rotation of context cameras.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum CameraRange {
+    /// Hand-held footage of rooms: field of view 40° to 80°, baseline 0.05 to 0.38 of the median
+    /// depth, at most 28° about each axis. Each view sees at least 40 % of the other.
+    #[default]
+    HandHeld,
+    /// Pairs of photographs of any kind: field of view 28° to 96° (focal lengths 2 to 0.45
+    /// widths), baseline 0.02 to 0.6 of the median depth with uniform logarithm, at most 40° about
+    /// each axis. Each view sees at least 30 % of the other.
+    Wide,
+}
+
+impl CameraRange {
+    /// Samples a field of view, degrees.
+    fn field_of_view(self, rng: &mut Rng) -> f32 {
+        match self {
+            Self::HandHeld => rng.range(40.0, 80.0),
+            Self::Wide => rng.range(28.0, 96.0),
+        }
+    }
+
+    /// Samples a baseline, in units of the median depth.
+    fn baseline(self, rng: &mut Rng) -> f32 {
+        match self {
+            Self::HandHeld => rng.range(0.05, 0.38),
+            Self::Wide => rng.log_range(0.02, 0.6),
+        }
+    }
+
+    /// Largest rotation between the context views about each axis, degrees.
+    fn max_rotation(self) -> f32 {
+        match self {
+            Self::HandHeld => 28.0,
+            Self::Wide => 40.0,
+        }
+    }
+
+    /// Standard deviations of pitch, yaw and roll of the second view, degrees.
+    fn rotation_spread(self, orbit: bool) -> [f32; 3] {
+        match (self, orbit) {
+            (Self::HandHeld, true) => [1.5, 1.5, 1.0],
+            (Self::HandHeld, false) => [3.0, 7.0, 1.5],
+            (Self::Wide, true) => [3.0, 4.0, 3.0],
+            (Self::Wide, false) => [6.0, 12.0, 4.0],
+        }
+    }
+
+    /// Smallest share of each context view that the other sees.
+    fn min_overlap(self) -> f32 {
+        match self {
+            Self::HandHeld => 0.4,
+            Self::Wide => 0.3,
+        }
+    }
 }
 
 /// Direction of the second camera's position relative to the first.
@@ -105,13 +159,13 @@ fn propose(room: &Room, rng: &mut Rng, spec: &CameraSpec) -> Option<Rig> {
         v if v < 0.75 => Motion::Sideways,
         _ => Motion::Free,
     };
-    let (second, orbit) = second_camera(&first, median_depth, motion, rng);
+    let (second, orbit) = second_camera(&first, median_depth, motion, spec.range, rng);
     if room.clearance(second.position()) < CLEARANCE {
         return None;
     }
     let second_points = probe(room, &second);
     let overlap = overlap(room, [&first, &second], [&first_points, &second_points]);
-    if overlap < MIN_OVERLAP {
+    if overlap < spec.range.min_overlap() {
         return None;
     }
     let mut cameras = vec![first, second];
@@ -132,11 +186,11 @@ fn propose(room: &Room, rng: &mut Rng, spec: &CameraSpec) -> Option<Rig> {
     })
 }
 
-/// Samples a field of view of 40° to 80° along the longer side of the picture, or of the larger
-/// picture that it is a window of.
+/// Samples a field of view along the longer side of the picture, or of the larger picture that it
+/// is a window of.
 fn intrinsics(spec: &CameraSpec, cropped: bool, rng: &mut Rng) -> Intrinsics {
     let (width, height) = (spec.width.max(1), spec.height.max(1));
-    let fov = rng.range(40.0, 80.0).to_radians();
+    let fov = spec.range.field_of_view(rng).to_radians();
     let full = if cropped { 2 } else { 1 };
     let (w, h) = ((width * full) as f32, (height * full) as f32);
     let f = 0.5 * w.max(h) / (0.5 * fov).tan();
@@ -181,8 +235,14 @@ fn first_camera(room: &Room, intrinsics: Intrinsics, rng: &mut Rng) -> Option<Ca
 }
 
 /// Samples the second camera; the flag is true if it rotates towards the scene.
-fn second_camera(first: &Camera, median: f32, motion: Motion, rng: &mut Rng) -> (Camera, bool) {
-    let baseline = rng.range(0.05, 0.38) * median;
+fn second_camera(
+    first: &Camera,
+    median: f32,
+    motion: Motion,
+    range: CameraRange,
+    rng: &mut Rng,
+) -> (Camera, bool) {
+    let baseline = range.baseline(rng) * median;
     let shake = 0.15 * Vec3::new(rng.normal(), rng.normal(), rng.normal());
     let along = match motion {
         Motion::Forward => Vec3::Z * rng.sign() + shake,
@@ -197,11 +257,11 @@ fn second_camera(first: &Camera, median: f32, motion: Motion, rng: &mut Rng) -> 
         let towards = (pivot - step).normalize_or(Vec3::Z);
         turn = Quat::from_rotation_arc(Vec3::Z, towards);
     }
-    let degrees = if orbit { [1.5, 1.5, 1.0] } else { [3.0, 7.0, 1.5] };
-    let [pitch, yaw, roll] = degrees.map(|d: f32| d.to_radians() * rng.normal());
+    let [pitch, yaw, roll] = range.rotation_spread(orbit).map(|d| d.to_radians() * rng.normal());
     let (y, x, z) =
         (turn * Quat::from_euler(EulerRot::YXZ, yaw, pitch, roll)).to_euler(EulerRot::YXZ);
-    let [y, x, z] = [y, x, z].map(|a| a.clamp(-ROTATION, ROTATION));
+    let limit = range.max_rotation().to_radians();
+    let [y, x, z] = [y, x, z].map(|a| a.clamp(-limit, limit));
     let rotation = first.rotation() * Mat3::from_quat(Quat::from_euler(EulerRot::YXZ, y, x, z));
     let eye = first.position() + first.rotation() * step;
     (posed(first.intrinsics, rotation, eye), orbit)

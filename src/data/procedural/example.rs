@@ -4,7 +4,7 @@
 //! The example has the units of length and the near and far planes of common data sets.
 
 use super::Room;
-use super::cameras::{CameraSpec, Rig, sample_cameras};
+use super::cameras::{CameraRange, CameraSpec, Rig, sample_cameras};
 use super::render::{Grade, Quality, View};
 use super::rng::Rng;
 use crate::camera::Camera;
@@ -20,16 +20,23 @@ pub struct ExampleSpec {
     /// Share of examples with objects close to the cameras, partly outside the picture: chairs,
     /// plants, the edge of a door.
     pub foreground: f32,
+    /// Share of examples that show shapes at random places, indoors or outdoors, instead of a
+    /// furnished room ([`Room::scattered`]).
+    pub scattered: f32,
+    /// Share of examples with cameras of [`CameraRange::Wide`].
+    pub wide: f32,
     /// Samples along each side of a pixel.
     pub samples: usize,
 }
 
 impl ExampleSpec {
     /// Returns two context views and `targets` more, 4 samples per pixel, half of the examples
-    /// cropped from pictures twice as large, photographic, without foreground.
+    /// cropped from pictures twice as large, photographic, furnished rooms without foreground.
     pub fn new(width: usize, height: usize, targets: usize) -> Self {
-        let cameras = CameraSpec { width, height, targets, crop: 0.5 };
-        Self { cameras, photographic: true, foreground: 0.0, samples: 2 }
+        let range = CameraRange::HandHeld;
+        let cameras = CameraSpec { width, height, targets, crop: 0.5, range };
+        let (foreground, scattered, wide) = (0.0, 0.0, 0.0);
+        Self { cameras, photographic: true, foreground, scattered, wide, samples: 2 }
     }
 }
 
@@ -43,6 +50,9 @@ pub struct TargetSpec {
     /// Applies the scene's gain and gamma only. Exposure, softness and noise of a target could not
     /// be predicted.
     pub clean: bool,
+    /// Adds the context views to the targets: their cameras at the targets' size, with the views'
+    /// own exposure but without softness and noise.
+    pub inputs: bool,
 }
 
 /// Views, cameras, near and far of one scene, in the example's unit of length.
@@ -50,7 +60,8 @@ pub struct TargetSpec {
 pub struct Example {
     /// Seed of the room.
     pub seed: u64,
-    /// Two context views, then the targets; depth in the example's unit.
+    /// Two context views, then the targets, then the context views at the targets' size if they
+    /// are targets; depth in the example's unit.
     pub views: Vec<View>,
     /// Cameras of the views, in the example's unit.
     pub cameras: Vec<Camera>,
@@ -69,6 +80,8 @@ const FIXED_PLANES: f32 = 0.7;
 
 /// Key of the random numbers for the foreground.
 const FOREGROUND: u64 = 12;
+/// Key of the random numbers that choose the kind of scene and of cameras.
+const VARIETY: u64 = 13;
 
 /// Unit of length and depth planes of an example.
 struct Planes {
@@ -98,7 +111,7 @@ impl Example {
     /// Builds the example of `seed`. A room without space for cameras is replaced by the next of a
     /// fixed sequence, so that every seed gives an example.
     pub fn new(seed: u64, spec: &ExampleSpec) -> Self {
-        let targets = TargetSpec { ratio: 1, samples: spec.samples, clean: false };
+        let targets = TargetSpec { ratio: 1, samples: spec.samples, clean: false, inputs: false };
         Self::with_targets(seed, spec, &targets)
     }
 
@@ -108,9 +121,18 @@ impl Example {
         let mut rng = Rng::new(seed).fork(11);
         loop {
             let seed = rng.bits();
-            let mut room = Room::new(seed);
-            if let Some(mut rig) = sample_cameras(&room, seed, &spec.cameras) {
-                // A separate stream: the example without foreground is unchanged.
+            // Separate streams: the example of a furnished room is unchanged.
+            let mut variety = Rng::new(seed).fork(VARIETY);
+            let scattered = variety.chance(spec.scattered);
+            let wide = variety.chance(spec.wide);
+            let range = if wide { CameraRange::Wide } else { spec.cameras.range };
+            let mut room = if scattered { Room::scattered(seed) } else { Room::new(seed) };
+            if let Some(mut rig) =
+                sample_cameras(&room, seed, &CameraSpec { range, ..spec.cameras })
+            {
+                if scattered {
+                    room.scatter_objects(&mut rig, &mut variety);
+                }
                 let mut extra = Rng::new(seed).fork(FOREGROUND);
                 if extra.chance(spec.foreground) {
                     room.add_foreground(&mut rig, &mut extra);
@@ -133,17 +155,29 @@ impl Example {
         let scene = Grade::sample_scene(rng);
         let soft = rng.chance(0.3);
         let mut cameras = rig.cameras.clone();
+        if targets.inputs {
+            cameras.extend_from_within(..CONTEXT);
+        }
         for camera in cameras.iter_mut().skip(CONTEXT) {
             let (w, h) = (camera.intrinsics.width, camera.intrinsics.height);
             *camera = camera.resized_unchecked(w * targets.ratio.max(1), h * targets.ratio.max(1));
         }
+        let first_input_target = rig.cameras.len();
+        let mut context_grades = Vec::with_capacity(CONTEXT);
         let render = |(i, camera): (usize, &Camera)| {
             let target = i >= CONTEXT;
             let grade = match spec.photographic {
+                true if i >= first_input_target => {
+                    let grade: Grade = context_grades[i - first_input_target];
+                    Grade { softness: 0.0, noise: 0.0, ..grade }
+                }
                 true if target && targets.clean => scene,
                 true => scene.sample_view(soft, rng),
                 false => Grade::default(),
             };
+            if !target {
+                context_grades.push(grade);
+            }
             let samples = if target { targets.samples } else { spec.samples };
             let quality = Quality { samples, ..Quality::training(grade) };
             let mut view = room.render(camera, &quality);

@@ -31,13 +31,19 @@ impl Room {
         for _ in 0..rng.count(1, 3) {
             let eye = rig.cameras[rng.count(0, CONTEXT - 1)];
             let (solids, materials) = (self.primitives.len(), self.materials.len());
-            ForegroundBuilder { room: self, palette: &palette, rng }.place(&eye, rig.median_depth);
-            match self.valid_depths(rig) {
-                Some(depths) => (rig.near_depth, rig.far_depth) = (depths.near, depths.far),
-                None => {
-                    self.primitives.truncate(solids);
-                    self.materials.truncate(materials);
-                }
+            ObjectBuilder { room: self, palette: &palette, rng }.place(&eye, rig.median_depth);
+            self.keep_valid_objects(rig, solids, materials);
+        }
+    }
+
+    /// Updates the depths of `rig` after new objects; removes the objects, which follow the first
+    /// `solids` and `materials`, if the cameras are no longer valid.
+    pub(super) fn keep_valid_objects(&mut self, rig: &mut Rig, solids: usize, materials: usize) {
+        match self.valid_depths(rig) {
+            Some(depths) => (rig.near_depth, rig.far_depth) = (depths.near, depths.far),
+            None => {
+                self.primitives.truncate(solids);
+                self.materials.truncate(materials);
             }
         }
     }
@@ -55,14 +61,14 @@ impl Room {
     }
 }
 
-/// Builder of one foreground object.
-struct ForegroundBuilder<'a> {
-    room: &'a mut Room,
-    palette: &'a Palette,
-    rng: &'a mut Rng,
+/// Builder of one object.
+pub(super) struct ObjectBuilder<'a> {
+    pub(super) room: &'a mut Room,
+    pub(super) palette: &'a Palette,
+    pub(super) rng: &'a mut Rng,
 }
 
-impl ForegroundBuilder<'_> {
+impl ObjectBuilder<'_> {
     /// Places a random object away from the middle of the picture of `camera`, partly beyond its
     /// border.
     fn place(&mut self, camera: &Camera, median: f32) {
@@ -85,12 +91,25 @@ impl ForegroundBuilder<'_> {
 
     /// Adds a random material and returns its index.
     fn material(&mut self, role: Role) -> usize {
-        self.room.materials.push(Material::new(role, self.palette, self.rng));
+        let material = Material::new(role, self.palette, self.rng);
+        self.add_material(material)
+    }
+
+    /// Adds a material and returns its index.
+    pub(super) fn add_material(&mut self, material: Material) -> usize {
+        self.room.materials.push(material);
         self.room.materials.len() - 1
     }
 
     /// Adds a solid.
-    fn add(&mut self, form: Form, centre: Vec3, axes: Mat3, half: Vec3, material: usize) {
+    pub(super) fn add(
+        &mut self,
+        form: Form,
+        centre: Vec3,
+        axes: Mat3,
+        half: Vec3,
+        material: usize,
+    ) {
         let mut primitive = Primitive::new(form, centre, axes, half);
         primitive.material = material;
         self.room.primitives.push(primitive);
@@ -191,7 +210,8 @@ mod tests {
 
     #[test]
     fn foreground_objects_are_close_and_clear_of_the_cameras() {
-        let spec = CameraSpec { width: 64, height: 48, targets: 2, crop: 0.3 };
+        let spec =
+            CameraSpec { width: 64, height: 48, targets: 2, crop: 0.3, range: Default::default() };
         let (mut crowded, mut nearer) = (0, 0);
         for seed in 0..60 {
             let mut room = Room::new(seed);

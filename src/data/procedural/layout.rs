@@ -68,8 +68,18 @@ impl Layout {
     pub(super) fn furnished(seed: u64) -> Self {
         let mut rng = Rng::new(seed);
         let size = Vec3::new(rng.range(2.2, 7.0), rng.range(2.3, 3.4), rng.range(3.0, 11.0));
+        let mut layout = Self::empty(rng, size);
+        layout.shell();
+        layout.furnish();
+        layout.furnish_walls();
+        layout.place_objects();
+        layout
+    }
+
+    /// Returns a layout without solids.
+    pub(super) fn empty(mut rng: Rng, size: Vec3) -> Self {
         let palette = Palette::new(&mut rng);
-        let mut layout = Self {
+        Self {
             rng,
             palette,
             size,
@@ -78,12 +88,7 @@ impl Layout {
             tops: Vec::new(),
             occupied_floor: Vec::new(),
             occupied_walls: Vec::new(),
-        };
-        layout.shell();
-        layout.furnish();
-        layout.furnish_walls();
-        layout.place_objects();
-        layout
+        }
     }
 
     /// Adds a random material for `role` and returns its index.

@@ -22,11 +22,12 @@ mod light;
 mod material;
 mod render;
 pub(in crate::data) mod rng;
+mod scatter;
 mod shape;
 mod synthesis;
 mod texture;
 
-pub use cameras::{CameraSpec, Motion, Rig, sample_cameras};
+pub use cameras::{CameraRange, CameraSpec, Motion, Rig, sample_cameras};
 pub use example::{Example, ExampleSpec, TargetSpec};
 pub use render::{Grade, Quality, View};
 pub use texture::TextureBank;
@@ -68,6 +69,11 @@ impl Room {
         let mut layout = Layout::furnished(seed);
         let lighting = Lighting::new(layout.size, &mut layout.rng.fork(1));
         layout.add_lamp(lighting.main_lamp());
+        Self::lit(layout, lighting, bank)
+    }
+
+    /// Builds a room from a layout, with an exposure that gives a middle grey.
+    fn lit(layout: Layout, lighting: Lighting, bank: Arc<TextureBank>) -> Self {
         let mut room = Self {
             size: layout.size,
             primitives: layout.primitives,

@@ -29,7 +29,7 @@ pub struct Shoot {
 /// Photographs of `width` × `height` pixels of room `seed`, `views` of them.
 pub fn shoot(seed: u64, views: usize, width: usize, height: usize) -> Shoot {
     let room = Room::new(seed);
-    let spec = CameraSpec { width, height, targets: views, crop: 0.0 };
+    let spec = CameraSpec { width, height, targets: views, crop: 0.0, range: Default::default() };
     let rig = sample_cameras(&room, seed, &spec).unwrap();
     let photo = |camera: &Camera| {
         let view = room.render(camera, &Quality::clean(1));
