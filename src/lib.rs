@@ -175,4 +175,4 @@ pub use pipeline::{
     Prepared, Progress, Reconstruction, Reconstructor, Result, Stage, StageTime, Warning,
 };
 pub use render::{Picture, Renderer, render};
-pub use splats::{SplatParts, Splats, SplatsError};
+pub use splats::{Quantiles, SplatParts, SplatStatistics, Splats, SplatsError};

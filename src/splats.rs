@@ -3,6 +3,10 @@
 //! A child stores no SH of its own (SubSplat, h_{p,k} = γ_k · h_p). N children of P parents
 //! (N = P·K) take 12 to 15 floats each instead of 86.
 
+mod statistics;
+
+pub use statistics::{Quantiles, SplatStatistics};
+
 use crate::abi::{
     MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SH_DEGREE_MAX, SPLAT_STRIDE, ShBasis,
 };

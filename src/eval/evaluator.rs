@@ -1,7 +1,10 @@
 //! Renders the targets of a case by every method, and scores the pictures.
 
 use super::methods::{enlarged, mean, nearest};
-use super::{Benchmark, Case, CaseScores, Loaded, Method, Score, Scores, TargetScores};
+use super::{
+    Benchmark, Case, CaseScores, GaussianReport, InputReport, Loaded, Method, Score, Scores,
+    TargetScores,
+};
 use crate::abi::RasterOptions;
 use crate::camera::Camera;
 use crate::config::LowpassRef;
@@ -9,7 +12,6 @@ use crate::cpu::Rasterizer;
 use crate::data::crop::{CropOptions, CropRule, Cropped, LrFrom};
 use crate::fit::FitOptions;
 use crate::io::image::Rgb;
-use crate::metrics::{mean_gradient, psnr, ssim};
 use crate::model::lpips::Lpips;
 use crate::model::subsplat::feature_channels;
 use crate::model::trunk::Trunk;
@@ -18,7 +20,7 @@ use crate::pipeline::{
     DepthBounds, DepthRange, Error, Photo, Reconstructor, Result, add_detail, fit_to_inputs,
 };
 use crate::render::{Renderer, render_with};
-use crate::splats::Splats;
+use crate::splats::{SplatStatistics, Splats};
 use std::ops::ControlFlow;
 use std::path::Path;
 
@@ -160,8 +162,35 @@ impl Evaluator {
                 debug_assert_eq!(result.pictures[t].methods.len(), m);
                 result.pictures[t].methods.push(picture);
             }
+            result.scores.inputs.push(self.input_report(&mut pictures, method, &crops, &place)?);
         }
         Ok(result)
+    }
+
+    /// Scores the pictures of `method` at the inputs' own cameras, and describes its Gaussians.
+    fn input_report(
+        &self,
+        pictures: &mut PictureMaker<'_>,
+        method: &Method,
+        crops: &Crops,
+        place: &str,
+    ) -> Result<InputReport> {
+        if !method.needs_model() {
+            return Ok(InputReport::default());
+        }
+        let (mut scores, mut coverage) = (Vec::new(), 0.0);
+        for (i, input) in crops.inputs.iter().enumerate() {
+            let place = format!("{place} input {i} {}", method.name());
+            let rgb = pictures.picture(method, crops, input);
+            scores.push(self.score(&rgb, &input.target, &place)?);
+            coverage += pictures.coverage / crops.inputs.len() as f64;
+        }
+        let cameras: Vec<Camera> = crops.inputs.iter().map(|c| c.target_camera).collect();
+        let statistics = pictures.splats.as_ref().and_then(|s| SplatStatistics::new(s, &cameras));
+        Ok(InputReport {
+            inputs: Score::mean(&scores),
+            gaussians: statistics.map(|s| GaussianReport::new(&s, coverage)),
+        })
     }
 
     fn empty(
@@ -191,6 +220,7 @@ impl Evaluator {
                 near_far: bounds.near_far(),
                 enlarged: targets.iter().any(|c| c.window.scale.min_element() < 1.0),
                 targets: case.views.target.iter().zip(names).map(target).collect(),
+                inputs: Vec::new(),
             },
             inputs: inputs.iter().map(|c| c.input.clone()).collect(),
             pictures: pictures.collect(),
@@ -218,21 +248,13 @@ impl Evaluator {
     }
 
     fn score(&self, picture: &[f32], truth: &Rgb, place: &str) -> Result<Score> {
-        let (w, h) = (truth.width, truth.height);
-        let truth = truth.to_unit();
         let unscored = |e| Error::Score { place: place.to_owned(), source: e };
-        let lpips = match &self.lpips {
-            Some(lpips) => Some(lpips.distance(picture, &truth, w, h)?),
-            None => None,
-        };
-        let own = mean_gradient(picture, w, h).map_err(unscored)?;
-        let theirs = mean_gradient(&truth, w, h).map_err(unscored)?;
-        Ok(Score {
-            psnr: psnr(picture, &truth, w, h).map_err(unscored)?,
-            ssim: ssim(picture, &truth, w, h).map_err(unscored)?,
-            lpips,
-            sharpness: (theirs > 0.0).then(|| own / theirs),
-        })
+        let mut score = Score::of(picture, truth).map_err(unscored)?;
+        if let Some(lpips) = &self.lpips {
+            let (w, h) = (truth.width, truth.height);
+            score.lpips = Some(lpips.distance(picture, &truth.to_unit(), w, h)?);
+        }
+        Ok(score)
     }
 }
 
@@ -265,6 +287,8 @@ struct PictureMaker<'a> {
     current: Option<Set>,
     splats: Option<Splats>,
     rasterizer: Rasterizer,
+    /// Mean alpha of the last rendered picture.
+    coverage: f64,
 }
 
 /// The backbone's outputs of one case, and the model.
@@ -321,6 +345,7 @@ impl<'a> PictureMaker<'a> {
             current: None,
             splats: None,
             rasterizer: Rasterizer::new(),
+            coverage: 0.0,
         })
     }
 
@@ -391,7 +416,10 @@ impl<'a> PictureMaker<'a> {
             return Vec::new();
         };
         let options = self.raster_options(network, ratio, reference);
-        render_with(&mut self.rasterizer, splats, camera, &options).rgb
+        let picture = render_with(&mut self.rasterizer, splats, camera, &options);
+        let alpha: f64 = picture.alpha.iter().copied().map(f64::from).sum();
+        self.coverage = alpha / picture.alpha.len().max(1) as f64;
+        picture.rgb
     }
 }
 

@@ -1,5 +1,6 @@
-//! Scores of a model on photographs that it was not trained on: PSNR, SSIM, LPIPS and sharpness
-//! by the protocol of MVSplat's and SubSplat's tables, with baselines in the same run.
+//! Scores of a model on photographs that it was not trained on: PSNR, SSIM and LPIPS by the
+//! protocol of MVSplat's and SubSplat's tables, sharpness and GMSD, with baselines in the same run.
+//! [`InputReport`] scores the pictures at the inputs' own cameras and describes the Gaussians.
 //!
 //! ```no_run
 //! use subsplat::config::{Config, Preset};
@@ -38,5 +39,5 @@ pub use cases::{Benchmark, Case, Loaded};
 pub use evaluator::{CaseResult, Evaluator, Options, TargetPictures};
 pub use methods::Method;
 pub use page::{Sheet, page};
-pub use score::{CaseScores, Score, Scores, TargetScores};
+pub use score::{CaseScores, GaussianReport, InputReport, Score, Scores, TargetScores};
 pub use tables::{means_csv, report, targets_csv};

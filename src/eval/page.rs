@@ -1,7 +1,7 @@
 //! One HTML page that contains all pictures: tables of scores, and one window of each method's
 //! picture side by side.
 
-use super::{CaseResult, Score, Scores};
+use super::{CaseResult, InputReport, Score, Scores};
 use crate::io::Result;
 use crate::io::image::{Rgb, png_bytes};
 use crate::metrics::mean_gradient;
@@ -101,6 +101,14 @@ pub fn page(title: &str, notes: &[String], scores: &Scores, sheets: &[Sheet]) ->
     for method in &scores.methods {
         let _ = writeln!(html, "<tr><td>{}</td>{}</tr>", escaped(method), row(scores.mean(method)));
     }
+    let _ =
+        writeln!(html, "</table>\n<table><tr><th>at the inputs' cameras</th>{INPUT_HEADER}</tr>");
+    for method in &scores.methods {
+        let report = scores.input_mean(None, method);
+        if report.inputs.is_some() {
+            let _ = writeln!(html, "<tr><td>{}</td>{}</tr>", escaped(method), input_row(&report));
+        }
+    }
     let _ = writeln!(html, "</table>\n<table><tr><th>scene</th><th>method</th>{HEADER}</tr>");
     for scene in scores.scenes() {
         for method in &scores.methods {
@@ -127,7 +135,31 @@ pub fn page(title: &str, notes: &[String], scores: &Scores, sheets: &[Sheet]) ->
     html
 }
 
-const HEADER: &str = "<th>PSNR, dB</th><th>SSIM</th><th>LPIPS</th><th>sharpness</th>";
+const HEADER: &str = "<th>PSNR, dB</th><th>SSIM</th><th>LPIPS</th><th>sharpness</th><th>GMSD</th>";
+const INPUT_HEADER: &str = "<th>PSNR, dB</th><th>SSIM</th><th>sharpness</th><th>Gaussians</th>\
+    <th>σ, target px</th><th>opacity</th><th>coverage</th>";
+
+/// Formats the figures of the inputs' own cameras.
+fn input_row(report: &InputReport) -> String {
+    let number = |v: Option<f64>, digits: usize| {
+        v.map_or_else(|| "–".to_owned(), |v| format!("{v:.digits$}"))
+    };
+    let three = |v: Option<[f64; 3]>| {
+        v.map_or_else(|| "–".to_owned(), |v| v.map(|v| format!("{v:.2}")).join(" / "))
+    };
+    let (score, gaussians) = (report.inputs, report.gaussians);
+    [
+        number(score.map(|s| s.psnr), 2),
+        number(score.map(|s| s.ssim), 4),
+        number(score.and_then(|s| s.sharpness), 3),
+        number(gaussians.map(|g| g.count), 0),
+        three(gaussians.map(|g| g.sigma_px)),
+        three(gaussians.map(|g| g.opacity)),
+        number(gaussians.map(|g| g.coverage), 3),
+    ]
+    .map(|cell| format!("<td>{cell}</td>"))
+    .concat()
+}
 
 fn row(mean: Option<Score>) -> String {
     let cell = |v: Option<f64>, digits: usize| {
@@ -138,6 +170,7 @@ fn row(mean: Option<Score>) -> String {
         cell(mean.map(|s| s.ssim), 4),
         cell(mean.and_then(|s| s.lpips), 4),
         cell(mean.and_then(|s| s.sharpness), 3),
+        cell(mean.map(|s| s.gmsd), 4),
     ]
     .concat()
 }

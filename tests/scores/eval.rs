@@ -11,7 +11,7 @@ use std::path::Path;
 use subsplat::FitOptions;
 use subsplat::config::{Config, LowpassRef, Preset};
 use subsplat::data::crop::CropOptions;
-use subsplat::eval::{Benchmark, Evaluator, Method, Options, Scores};
+use subsplat::eval::{Benchmark, Evaluator, InputReport, Method, Options, Scores};
 use subsplat::io::image::{Rgb, save_png};
 use subsplat::io::scene::load_scene;
 use subsplat::metrics::psnr;
@@ -170,6 +170,24 @@ fn methods_are_what_they_say() {
     let sharp: Vec<f64> =
         result.scores.targets[0].scores.iter().map(|s| s.sharpness.unwrap()).collect();
     println!("sharpness {sharp:?}");
+    // The inputs' own cameras, by hand.
+    let made = model.run(&photos, &request(Detail::Photographs)).unwrap();
+    let rules = model.config().raster_options(2.0, near, colour(&made));
+    let (mut want, mut alpha) = (0.0, 0.0);
+    for input in made.inputs() {
+        let picture = render(made.splats(), &input.target_camera, &rules);
+        want += psnr(&picture.rgb, &input.target.to_unit(), 128, 128).unwrap() / 2.0;
+        alpha += picture.alpha.iter().sum::<f32>() / (2.0 * 128.0 * 128.0);
+    }
+    let reports = &result.scores.inputs;
+    assert!((reports[1].inputs.unwrap().psnr - want).abs() < 1e-6);
+    let [children, parents] = [1, 2].map(|m| reports[m].gaussians.unwrap());
+    assert!((children.coverage - f64::from(alpha)).abs() < 1e-5, "{children:?} {alpha}");
+    assert_eq!((children.count, parents.count), (4.0 * 2.0 * 4096.0, 2.0 * 4096.0));
+    // Children of the even split have half the size of their parents.
+    let ratio = parents.sigma_px[1] / children.sigma_px[1];
+    assert!((1.9..2.1).contains(&ratio), "{ratio}");
+    assert_eq!(reports[6], InputReport::default());
     assert!(sharp[1] > sharp[0] && sharp[4] < 1.0, "{sharp:?}");
 
     // At ×1 one Gaussian a pixel is all there is.

@@ -212,14 +212,18 @@ fn print_scores(scores: &Scores, upscale: usize, answer: Answer) {
             v.map_or_else(|| format!("{:>7}", "-"), |v| format!("{v:7.digits$}"))
         };
         format!(
-            "  {name:<12} {} {} {} {}",
+            "  {name:<12} {} {} {} {} {}",
             cell(mean.map(|s| s.psnr), 2),
             cell(mean.map(|s| s.ssim), 4),
             cell(mean.and_then(|s| s.lpips), 4),
             cell(mean.and_then(|s| s.sharpness), 3),
+            cell(mean.map(|s| s.gmsd), 4),
         )
     };
-    let head = format!("  {:<12} {:>7} {:>7} {:>7} {:>7}", "", "PSNR", "SSIM", "LPIPS", "sharp");
+    let head = format!(
+        "  {:<12} {:>7} {:>7} {:>7} {:>7} {:>7}",
+        "", "PSNR", "SSIM", "LPIPS", "sharp", "GMSD"
+    );
     let scenes = scores.scenes();
     if scenes.len() > 1 && scenes.len() <= 20 {
         for scene in &scenes {
@@ -241,6 +245,33 @@ fn print_scores(scores: &Scores, upscale: usize, answer: Answer) {
     answer.line(&head);
     for method in &scores.methods {
         answer.line(line(method, scores.mean(method)));
+    }
+    print_inputs(scores, answer);
+}
+
+/// Prints the scores at the inputs' own cameras and the distribution of the Gaussians.
+fn print_inputs(scores: &Scores, answer: Answer) {
+    let three = |v: [f64; 3]| v.map(|v| format!("{v:.2}")).join(" / ");
+    let mut head = Some(format!(
+        "at the inputs' own cameras\n  {:<12} {:>7} {:>7} {:>7} {:>10} {:>20} {:>20} {:>8}",
+        "", "PSNR", "SSIM", "sharp", "Gaussians", "sigma, target px", "opacity", "coverage"
+    ));
+    for method in &scores.methods {
+        let report = scores.input_mean(None, method);
+        let (Some(score), Some(g)) = (report.inputs, report.gaussians) else { continue };
+        if let Some(head) = head.take() {
+            answer.line(head);
+        }
+        let sharpness = score.sharpness.map_or_else(|| "-".to_owned(), |s| format!("{s:.3}"));
+        answer.line(format!(
+            "  {method:<12} {:7.2} {:7.4} {sharpness:>7} {:10.0} {:>20} {:>20} {:8.3}",
+            score.psnr,
+            score.ssim,
+            g.count,
+            three(g.sigma_px),
+            three(g.opacity),
+            g.coverage
+        ));
     }
 }
 
@@ -304,7 +335,8 @@ fn write(
             text("lpips")
         ),
         "Means are over a case's targets first, then over cases. Sharpness is the mean absolute \
-         gradient over the photograph's. Windows show the photograph's busiest part of the \
+         gradient over the photograph's; GMSD is the gradient magnitude similarity deviation, 0 for \
+         equal pictures. Sigma and opacity: quantiles of 10, 50 and 90 %. Windows show the photograph's busiest part of the \
          case's middle target."
             .to_owned(),
     ];

@@ -12,13 +12,14 @@ use subsplat::abi::{Convention, RasterOptions};
 use subsplat::camera::{Camera, NearFar};
 use subsplat::config::{Config, LowpassRef};
 use subsplat::data::pair::choose_pair;
+use subsplat::eval::{GaussianReport, InputReport, Score};
 use subsplat::io::SaveOptions;
 use subsplat::io::image::Rgb;
 use subsplat::io::scene::Scene;
 use subsplat::pipeline::Backend;
 use subsplat::pipeline::is_mvsplat;
 use subsplat::render::comment_of_options;
-use subsplat::splats::Splats;
+use subsplat::splats::{SplatStatistics, Splats};
 use subsplat::{Detail, Options, Photo, Reconstruction, Reconstructor, Warning};
 
 /// Largest number of targets by default.
@@ -73,7 +74,25 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
         };
         output::write_scene(&args.out, result.splats(), &args.save, &save)
     })?;
-    Done { model, result, options, scored, files }.finish(args, &plan, progress, answer)
+    let inputs = progress.stage("inputs", |_| input_report(&result, &options))?;
+    Done { model, result, options, scored, inputs, files }.finish(args, &plan, progress, answer)
+}
+
+/// Scores the scene at its inputs' own cameras, and describes its Gaussians.
+fn input_report(result: &Reconstruction, options: &RasterOptions) -> Result<InputReport> {
+    let (mut scores, mut coverage) = (Vec::new(), 0.0);
+    for input in result.inputs() {
+        let picture = subsplat::render(result.splats(), &input.target_camera, options);
+        scores.push(Score::of(&picture.rgb, &input.target)?);
+        let alpha: f64 = picture.alpha.iter().copied().map(f64::from).sum();
+        coverage += alpha / (picture.alpha.len() * result.inputs().len()) as f64;
+    }
+    let cameras: Vec<Camera> = result.inputs().iter().map(|c| c.target_camera).collect();
+    let statistics = SplatStatistics::new(result.splats(), &cameras);
+    Ok(InputReport {
+        inputs: Score::mean(&scores),
+        gaussians: statistics.map(|s| GaussianReport::new(&s, coverage)),
+    })
 }
 
 /// Rejects a least opacity that leaves nothing to save, before any picture is rendered.
@@ -274,6 +293,7 @@ struct Done {
     result: Reconstruction,
     options: RasterOptions,
     scored: Vec<Scored>,
+    inputs: InputReport,
     files: Vec<Value>,
 }
 
@@ -312,6 +332,8 @@ impl Done {
             "detail": result.detail() == Detail::Photographs,
             "fit": result.fit().map(|f| json!({ "loss_before": f.before, "loss_after": f.after })),
             "gaussians": result.splats().len(),
+            "inputs": self.inputs.inputs,
+            "distribution": self.inputs.gaussians,
             "targets": self.scored.iter().map(Scored::json).collect::<Vec<_>>(),
             "psnr": self.mean(|s| s.psnr),
             "ssim": self.mean(|s| s.ssim),

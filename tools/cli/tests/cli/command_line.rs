@@ -77,6 +77,13 @@ fn run_reports_and_writes_what_every_command_reads() {
     assert_eq!(target["frame"], "view1");
     assert!(target["psnr"].as_f64().unwrap() > 5.0 && target["ssim"].as_f64().unwrap() < 1.0);
     assert_eq!(report["targets"].as_array().unwrap().len(), 1);
+    assert!(report["inputs"]["psnr"].as_f64().unwrap() > 10.0);
+    let distribution = &report["distribution"];
+    assert_eq!(distribution["count"], f64::from(gaussians));
+    let sigma = distribution["sigma_px"].as_array().unwrap();
+    assert!(sigma[0].as_f64().unwrap() > 0.0 && sigma[2].as_f64() > sigma[0].as_f64());
+    let coverage = distribution["coverage"].as_f64().unwrap();
+    assert!((0.1..=1.0).contains(&coverage), "{coverage}");
 
     let out = place.path().join("out");
     let written: Vec<String> = files(&out).iter().map(|p| p.to_string_lossy().into()).collect();

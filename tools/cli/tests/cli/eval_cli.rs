@@ -39,6 +39,7 @@ fn eval_scores_writes_and_reads_its_own_pictures() {
         assert!((6.0..60.0).contains(&psnr), "{name}: {scores}");
         assert!(scores["ssim"].as_f64().unwrap() < 1.0 && scores["lpips"].is_null());
         assert!(scores["sharpness"].as_f64().unwrap() > 0.0);
+        assert!((0.0..1.0).contains(&scores["gmsd"].as_f64().unwrap()));
     }
     assert!(report["protocol"]["lpips"].as_str().unwrap().contains("--lpips"));
     let scene = &report["scenes"]["scene"];
@@ -60,9 +61,11 @@ fn eval_scores_writes_and_reads_its_own_pictures() {
     assert_eq!((&saved["methods"], &saved["scenes"]), (&report["methods"], &report["scenes"]));
     let csv = text(&out.join("targets.csv"));
     assert_eq!(csv.lines().count(), 1 + 3 * 9);
-    assert!(csv.starts_with("scene,context,target,frame,method,psnr,ssim,lpips,sharpness\n"));
-    assert!(csv.lines().all(|l| l.matches(',').count() == 8), "{csv}");
-    assert_eq!(text(&out.join("means.csv")).lines().count(), 1 + 2 * 9);
+    assert!(csv.starts_with("scene,context,target,frame,method,psnr,ssim,lpips,sharpness,gmsd\n"));
+    assert!(csv.lines().all(|l| l.matches(',').count() == 9), "{csv}");
+    let means = text(&out.join("means.csv"));
+    assert_eq!(means.lines().count(), 1 + 2 * 9);
+    assert!(means.lines().all(|l| l.matches(',').count() == 17), "{means}");
     let page = text(&out.join("index.html"));
     // Two inputs, the photograph and nine methods, twice; nothing from elsewhere.
     assert_eq!(page.matches("<img ").count(), 24);
