@@ -267,3 +267,14 @@ pub const DEPTH_FRACTION_MIN: f64 = 0.1;
 pub const FRUSTUM_MARGIN: f64 = 0.3;
 /// Smallest camera z at which a point is projected for sampling (GaussianFormer).
 pub const VISIBLE_Z_MIN: f64 = 1e-5;
+
+/// Returns γ and δ of `n` Gaussians, `[N, 4]`, from a gain of 0 (γ = 1), N (γ) or 4·N floats. δ is 0
+/// where the gain has none.
+pub fn gain_with_offsets(gain: &[f32], n: usize) -> Vec<f32> {
+    debug_assert!([0, n, 4 * n].contains(&gain.len()), "gain of {} floats", gain.len());
+    match gain.len().checked_div(n) {
+        Some(4) => gain.to_vec(),
+        Some(1) => gain.iter().flat_map(|&g| [g, 0.0, 0.0, 0.0]).collect(),
+        _ => [1.0, 0.0, 0.0, 0.0].repeat(n),
+    }
+}

@@ -12,6 +12,7 @@
 
 use crate::abi::{
     Geometry, Gradients, OPACITY_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE, SplatSlices,
+    gain_with_offsets,
 };
 use crate::camera::Camera;
 use crate::io::image::Rgb;
@@ -148,7 +149,7 @@ struct Fitted {
 
 impl Fitted {
     fn new(splats: &Splats) -> Self {
-        Self { rows: splats.rows.clone(), gain: with_offsets(&splats.gain, splats.len()) }
+        Self { rows: splats.rows.clone(), gain: gain_with_offsets(&splats.gain, splats.len()) }
     }
 
     fn slices<'a>(&'a self, splats: &'a Splats) -> SplatSlices<'a> {
@@ -296,7 +297,7 @@ impl<'a> Target<'a> {
     }
 }
 
-/// What stays the same from step to step.
+/// Gaussians, views and rules of a fit, which no step changes, and the renderer.
 struct Scene<'a> {
     splats: &'a Splats,
     targets: &'a [Target<'a>],
@@ -333,15 +334,6 @@ impl State {
     fn of(opacity: f32) -> Self {
         let logit = (opacity / (1.0 - opacity)).ln();
         Self { value: [logit, 0.0, 0.0, 0.0, 0.0], ..Self::default() }
-    }
-}
-
-/// Gains of 0, 1 or 4 floats a Gaussian as γ and δ, `[N, 4]`.
-fn with_offsets(gain: &[f32], n: usize) -> Vec<f32> {
-    match gain.len().checked_div(n) {
-        Some(4) => gain.to_vec(),
-        Some(1) => gain.iter().flat_map(|&g| [g, 0.0, 0.0, 0.0]).collect(),
-        _ => [1.0, 0.0, 0.0, 0.0].repeat(n),
     }
 }
 

@@ -16,6 +16,7 @@
 //! the parent. δ = 0 where the photograph is not larger than the input, for
 //! children behind their source camera and for means that are not finite.
 
+use crate::abi::gain_with_offsets;
 use crate::camera::Camera;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -188,17 +189,9 @@ pub fn residuals(
 /// `[N, 4]` of γ and δ as the renderer takes it: `gain` of 0 (γ = 1), N or 4·N floats
 /// with `delta` `[N, 3]` added to whatever residual is there.
 pub fn with_residuals(gain: &[f32], delta: &[f32]) -> Vec<f32> {
-    let n = delta.len() / 3;
-    let lanes = gain.len().checked_div(n).unwrap_or(0);
-    debug_assert!(gain.len() == lanes * n && [0, 1, 4].contains(&lanes));
-    let mut out = Vec::with_capacity(4 * n);
-    for (i, d) in delta.chunks_exact(3).enumerate() {
-        let before = match lanes {
-            0 => [1.0, 0.0, 0.0, 0.0],
-            1 => [gain[i], 0.0, 0.0, 0.0],
-            _ => std::array::from_fn(|lane| gain[lanes * i + lane]),
-        };
-        out.extend([before[0], before[1] + d[0], before[2] + d[1], before[3] + d[2]]);
+    let mut out = gain_with_offsets(gain, delta.len() / 3);
+    for (row, d) in out.chunks_exact_mut(4).zip(delta.chunks_exact(3)) {
+        row[1..].iter_mut().zip(d).for_each(|(o, d)| *o += d);
     }
     out
 }

@@ -61,6 +61,24 @@ pub(super) fn store<V: Vector, const L: usize>(
     }
 }
 
+/// [`Vector::store_rows`] by a transpose and copies of whole rows: masked stores take dozens of
+/// cycles on AMD's processors.
+#[inline(always)]
+pub(super) fn store_transposed<S: Simd, const L: usize>(
+    s: S,
+    from: &[S::F; L],
+    layout: RowLayout,
+    rows: &mut [f32],
+) {
+    let lines = transposed(s, from);
+    for (lane, line) in lines.iter().enumerate().take(layout.count) {
+        let mut row = [0.0; LANES];
+        line.store(&mut row);
+        let start = lane * layout.stride;
+        rows[start..start + L].copy_from_slice(&row[..L]);
+    }
+}
+
 /// [`Vector::load_rows`] by masked loads and a transpose.
 #[inline(always)]
 pub(super) fn load_transposed<S: Simd, const L: usize>(

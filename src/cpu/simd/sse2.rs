@@ -144,13 +144,7 @@ impl Vector for F {
     }
     #[inline(always)]
     fn store_rows<const L: usize>(from: &[F; L], layout: RowLayout, rows: &mut [f32]) {
-        let lines = rows::transposed(Token, from);
-        for (lane, line) in lines.iter().enumerate().take(layout.count) {
-            let mut row = [0.0; LANES];
-            line.store(&mut row);
-            let start = lane * layout.stride;
-            rows[start..start + L].copy_from_slice(&row[..L]);
-        }
+        rows::store_transposed(Token, from, layout, rows);
     }
     #[inline(always)]
     fn fma(self, b: F, c: F) -> F {
