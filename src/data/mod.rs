@@ -6,5 +6,6 @@ pub mod crop;
 pub mod dataset;
 pub mod depth;
 pub mod pair;
+pub(crate) mod photographic;
 pub mod procedural;
 pub mod sampler;

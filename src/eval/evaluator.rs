@@ -2,8 +2,8 @@
 
 use super::methods::{enlarged, mean, nearest};
 use super::{
-    Benchmark, Case, CaseScores, GaussianReport, InputReport, Loaded, Method, Score, Scores,
-    TargetScores,
+    Benchmark, Case, CaseScores, Disturbance, GaussianReport, InputReport, Loaded, Method, Score,
+    Scores, TargetScores,
 };
 use crate::abi::RasterOptions;
 use crate::camera::Camera;
@@ -40,6 +40,8 @@ pub struct Options {
     pub rule: CropRule,
     /// Source of the inputs' pixels.
     pub lr_from: LrFrom,
+    /// Disturbances of the inputs, in order.
+    pub disturbances: Vec<Disturbance>,
 }
 
 impl Options {
@@ -50,7 +52,14 @@ impl Options {
             1 => vec![Subsplat, Fit, Backbone, Copy, Mean],
             _ => vec![Subsplat, Fit, Backbone, Lowpass, Bilinear, Uniform, Copy, Mean],
         };
-        Self { upscale, input_size: None, methods, rule: CropRule::Exact, lr_from: LrFrom::HrCrop }
+        Self {
+            upscale,
+            input_size: None,
+            methods,
+            rule: CropRule::Exact,
+            lr_from: LrFrom::HrCrop,
+            disturbances: Vec::new(),
+        }
     }
 }
 
@@ -135,7 +144,8 @@ impl Evaluator {
         loaded: Loaded,
     ) -> Result<CaseResult> {
         let names = loaded.names.clone();
-        let crops = self.crop(model, case, loaded)?;
+        let mut crops = self.crop(model, case, loaded)?;
+        self.options.disturbances.iter().for_each(|d| d.apply(&mut crops.inputs));
         let place = format!("{} ({})", case.scene, case.pair());
         let mut pictures = PictureMaker::new(self, model, &crops)?;
         let mut result = self.empty(case, (&crops, &pictures.bounds), &names);

@@ -29,6 +29,7 @@
 //! nominal input size. No score is therefore taken against enlarged pixels.
 
 mod cases;
+mod disturbance;
 mod evaluator;
 mod methods;
 mod page;
@@ -36,6 +37,7 @@ mod score;
 mod tables;
 
 pub use cases::{Benchmark, Case, Loaded};
+pub use disturbance::Disturbance;
 pub use evaluator::{CaseResult, Evaluator, Options, TargetPictures};
 pub use methods::Method;
 pub use page::{Sheet, page};

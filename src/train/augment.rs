@@ -6,11 +6,10 @@
 
 use super::source::{Example, InputTargets, hash, uniform};
 use crate::data::dataset::Posed;
+use crate::data::photographic::{blurred, compress};
 use crate::io::image::Rgb;
 use glam::{Mat4, Quat, Vec3};
 use half::f16;
-use image::codecs::jpeg::JpegEncoder;
-use image::{ExtendedColorType, ImageFormat};
 use serde::{Deserialize, Serialize};
 
 /// Transformations of an example. The defaults are those of the training recipe.
@@ -154,10 +153,10 @@ fn rephotograph(picture: &mut Rgb, random: &mut Random) {
     }
     let sharpness = random.unit();
     if sharpness < 0.35 {
-        unit = blurred(&unit, width, height, random.range(0.3, 1.2));
+        unit = blurred(&unit, width, random.range(0.3, 1.2));
     } else if sharpness < 0.55 {
         let amount = random.range(0.2, 1.0);
-        let soft = blurred(&unit, width, height, 1.0);
+        let soft = blurred(&unit, width, 1.0);
         unit.iter_mut().zip(soft).for_each(|(v, s)| *v += amount * (*v - s));
     }
     if random.unit() < 0.6 {
@@ -189,47 +188,4 @@ fn cover_patch(unit: &mut [f32], width: usize, height: usize, random: &mut Rando
             }
         }
     }
-}
-
-/// Compresses a picture as JPEG and reads it again.
-fn compress(picture: &mut Rgb, quality: u8) {
-    let (Ok(width), Ok(height)) = (u32::try_from(picture.width), u32::try_from(picture.height))
-    else {
-        return;
-    };
-    let mut bytes = Vec::new();
-    let encoded = JpegEncoder::new_with_quality(&mut bytes, quality).encode(
-        &picture.data,
-        width,
-        height,
-        ExtendedColorType::Rgb8,
-    );
-    // A picture beyond the limits of JPEG (65535 px) stays as it is.
-    if encoded.is_err() {
-        return;
-    }
-    if let Ok(read) = image::load_from_memory_with_format(&bytes, ImageFormat::Jpeg) {
-        picture.data = read.into_rgb8().into_raw();
-    }
-}
-
-/// Applies a Gaussian blur to `[H, W, 3]`, 3σ wide, with the border repeated.
-fn blurred(unit: &[f32], width: usize, height: usize, sigma: f32) -> Vec<f32> {
-    let radius = (3.0 * sigma).ceil() as usize;
-    let tap = |i: usize| (-0.5 * ((i as f32 - radius as f32) / sigma).powi(2)).exp();
-    let taps: Vec<f32> = (0..=2 * radius).map(tap).collect();
-    let sum: f32 = taps.iter().sum();
-    let shifted = |at: usize, k: usize, n: usize| (at + k).saturating_sub(radius).min(n - 1);
-    let pass = |source: &[f32], index: &dyn Fn(usize, usize, usize) -> usize| -> Vec<f32> {
-        let mut out = vec![0.0; source.len()];
-        for (i, px) in out.chunks_exact_mut(3).enumerate() {
-            for (k, t) in taps.iter().enumerate() {
-                let from = 3 * index(i % width, i / width, k);
-                px.iter_mut().zip(&source[from..from + 3]).for_each(|(o, s)| *o += t / sum * s);
-            }
-        }
-        out
-    };
-    let across = pass(unit, &|x, y, k| y * width + shifted(x, k, width));
-    pass(&across, &|x, y, k| shifted(y, k, height) * width + x)
 }

@@ -11,7 +11,9 @@ use std::path::Path;
 use subsplat::FitOptions;
 use subsplat::config::{Config, LowpassRef, Preset};
 use subsplat::data::crop::CropOptions;
-use subsplat::eval::{Benchmark, Evaluator, InputReport, Method, Options, Scores};
+use subsplat::eval::{
+    Benchmark, CaseResult, Disturbance, Evaluator, InputReport, Method, Options, Scores,
+};
 use subsplat::io::image::{Rgb, save_png};
 use subsplat::io::scene::load_scene;
 use subsplat::metrics::psnr;
@@ -81,6 +83,40 @@ fn trivial_baselines_are_the_protocols() {
     println!("better of both: {mean:.2} dB");
     // The prototype's report says 13.8.
     assert!((mean - 13.8).abs() < 0.05, "{mean}");
+}
+
+/// Disturbances change what their names say, and leave the rest.
+#[test]
+fn disturbed_inputs_differ_by_name() {
+    let place = room();
+    let data = Benchmark::open(place.path(), None).unwrap();
+    let model = untrained(2);
+    let case = &data.cases()[0];
+    let run = |disturbances: Vec<Disturbance>| {
+        let options = Options { disturbances, ..options(2, &[Method::Backbone, Method::Mean]) };
+        Evaluator::new(options).case(Some(&model), case, data.load(case).unwrap()).unwrap()
+    };
+    let psnr = |r: &CaseResult, m: usize| r.scores.targets[0].scores[m].psnr;
+    let plain = run(Vec::new());
+    for (name, disturbance) in Disturbance::NAMED {
+        assert_eq!(disturbance.name(), name);
+        let found = run(vec![disturbance]);
+        assert_eq!(found.pictures[0].truth, plain.pictures[0].truth, "{name}");
+        assert!((psnr(&found, 0) - psnr(&plain, 0)).abs() > 1e-3, "{name}: the Gaussians");
+        let changed = [0, 1].map(|i| found.inputs[i] != plain.inputs[i]);
+        let expected = match disturbance {
+            Disturbance::Rotation | Disturbance::Focal => [false, false],
+            Disturbance::Jpeg => [true, true],
+            _ => [false, true],
+        };
+        assert_eq!(changed, expected, "{name}");
+        assert_eq!((psnr(&found, 1) - psnr(&plain, 1)).abs() > 1e-9, expected[1], "{name}");
+    }
+    let mean = |p: &Rgb| p.data.iter().map(|v| f64::from(*v)).sum::<f64>();
+    let dark = run(vec![Disturbance::Dark]);
+    let ratio = mean(&dark.inputs[1]) / mean(&plain.inputs[1]);
+    // Half the light at exponent 2.2.
+    assert!((ratio - 0.7297).abs() < 0.01, "{ratio}");
 }
 
 /// Every method that renders, against the pipeline's own functions by hand.

@@ -10,6 +10,7 @@ use super::rng::{hash, normal, unit_pair};
 use super::shape::{Primitive, Ray};
 use super::{Form, Rng, Room};
 use crate::camera::Camera;
+use crate::data::photographic::blurred;
 use glam::{Mat3, Vec2, Vec3};
 use rayon::prelude::*;
 
@@ -282,29 +283,6 @@ fn lamp_shift(cx: usize, cy: usize) -> Vec3 {
     let r = (1.0 - y * y).max(0.0).sqrt();
     let (sin, cos) = (std::f32::consts::TAU * b).sin_cos();
     Vec3::new(r * cos, y, r * sin)
-}
-
-/// Applies a Gaussian blur, 3σ wide, with the border repeated.
-fn blurred(rgb: &[f32], width: usize, sigma: f32) -> Vec<f32> {
-    let radius = (3.0 * sigma).ceil() as usize;
-    let tap = |i: usize| (-0.5 * ((i as f32 - radius as f32) / sigma).powi(2)).exp();
-    let mut taps: Vec<f32> = (0..=2 * radius).map(tap).collect();
-    let sum: f32 = taps.iter().sum();
-    taps.iter_mut().for_each(|t| *t /= sum);
-    let height = rgb.len() / (3 * width.max(1));
-    // Position `at` shifted by tap k, clamped to 0..n.
-    let clamped = |at: usize, k: usize, n: usize| (at + k).saturating_sub(radius).min(n - 1);
-    let pass =
-        |source: &[f32], index: &(dyn Fn(usize, usize, usize) -> usize + Sync)| -> Vec<f32> {
-            let value = |i: usize| {
-                let (pixel, c) = (i / 3, i % 3);
-                let (x, y) = (pixel % width, pixel / width);
-                taps.iter().enumerate().map(|(k, t)| t * source[index(x, y, k) * 3 + c]).sum()
-            };
-            (0..source.len()).into_par_iter().map(value).collect()
-        };
-    let across = pass(rgb, &|x, y, k| y * width + clamped(x, k, width));
-    pass(&across, &|x, y, k| clamped(y, k, height) * width + x)
 }
 
 /// Adds Gaussian noise to the display values.

@@ -3,7 +3,7 @@
 use super::args::{DetailArg, ModelArgs};
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
-use subsplat::eval::Method;
+use subsplat::eval::{Disturbance, Method};
 
 const NOTES: &str = "\
 Methods: subsplat (the model), detail (the model with detail from the photographs), fit (the same, \
@@ -13,7 +13,10 @@ same rendered at the input's size and enlarged), uniform (K equal Gaussians a pi
 copy (the input nearest to the target), mean (of the inputs).
 
 Figures: PSNR (dB), SSIM, LPIPS (VGG16; needs --lpips), sharpness (mean absolute gradient over the \
-photograph's). Means are over a case's targets first, then over cases; a case is one set of inputs.
+photograph's), GMSD (gradient magnitude similarity deviation; 0 is best). Means are over a case's \
+targets first, then over cases; a case is one set of inputs. At the inputs' own cameras: the same \
+figures of the inputs, the number of Gaussians, the 10, 50 and 90 % quantiles of sigma (target px) \
+and opacity, and the coverage (mean alpha).
 
 Photographs too small for a target of R times --input-size: that case's input is halved until they \
 are large enough.";
@@ -51,6 +54,12 @@ pub struct EvalArgs {
     /// `photo` adds the method detail after subsplat.
     #[arg(long, value_enum, default_value = "off")]
     pub detail: DetailArg,
+    /// Disturb the inputs before the model receives them: rotation (0.5 degrees, all but the
+    /// first), focal (3 % too large), dark (one stop, all but the first), blur (1.5 target px, all
+    /// but the first), jpeg (quality 30). Scores at the inputs' cameras are then those of the
+    /// disturbed inputs.
+    #[arg(long, value_delimiter = ',', value_name = "D,…", value_parser = disturbance)]
+    pub disturb: Vec<Disturbance>,
     /// VGG16 and LPIPS weights (.safetensors, made by subsplat-convert).
     #[arg(long, value_name = "FILE")]
     pub lpips: Option<PathBuf>,
@@ -97,4 +106,13 @@ pub enum LrFromArg {
     HrCrop,
     /// The photograph, resized and cropped independently, as in MVSplat.
     Independent,
+}
+
+/// Parses the name of a disturbance.
+fn disturbance(text: &str) -> Result<Disturbance, String> {
+    let found = Disturbance::NAMED.iter().find(|(name, _)| *name == text);
+    found.map(|(_, d)| *d).ok_or_else(|| {
+        let names = Disturbance::NAMED.map(|(name, _)| name).join(", ");
+        format!("expected one of {names}, got `{text}`")
+    })
 }

@@ -54,6 +54,7 @@ pub fn eval(args: &EvalArgs, answer: Answer) -> Result<()> {
             LrFromArg::HrCrop => LrFrom::HrCrop,
             LrFromArg::Independent => LrFrom::Independent,
         },
+        disturbances: args.disturb.clone(),
         ..Options::new(upscale)
     };
     if let Some(model) = &model {
@@ -294,6 +295,7 @@ fn protocol(args: &EvalArgs, options: &Options, model: Option<&Reconstructor>) -
         "upscale": options.upscale,
         "crop": if options.rule == CropRule::Mvsplat { "mvsplat" } else { "exact" },
         "lr_from": if options.lr_from == LrFrom::HrCrop { "hr_crop" } else { "independent" },
+        "disturbances": args.disturb.iter().map(|d| d.name()).collect::<Vec<_>>(),
         "weights": args.weights.as_ref().map(|p| p.display().to_string()),
         "seed": args.seed,
         "untrained_tensors": model.map(|m| m.untrained_tensors().len()),
