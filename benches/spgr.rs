@@ -14,7 +14,7 @@ use subsplat::abi::{HEAD_STRIDE, SPLAT_STRIDE};
 use subsplat::config::{Config, Preset};
 use subsplat::cpu::{redistribute as shares, spgr as kernel, sums};
 use subsplat::model::spgr::rules;
-use subsplat::ops::redistribute::{Rule, redistribute};
+use subsplat::ops::redistribute::{OpacityRule, redistribute};
 use subsplat::ops::spgr::{Spgr, spgr, spgr_into};
 
 /// The allocator of the programs.
@@ -55,7 +55,9 @@ fn main() -> Result<()> {
             }
         }
     }
-    for (rule, name) in [(Rule::Linear, "linear"), (Rule::OpticalDepth, "optical-depth")] {
+    for (rule, name) in
+        [(OpacityRule::Linear, "linear"), (OpacityRule::OpticalDepth, "optical-depth")]
+    {
         for children in [4, 16] {
             for (pass, pass_name) in [(Pass::Forward, "forward"), (Pass::Both, "backward")] {
                 let name = format!("redistribute {pass_name} {name} K={children}");
@@ -287,7 +289,7 @@ enum Pass {
 }
 
 /// Returns the minimum work of redistribution.
-fn share_work(rule: Rule, (parents, children): (usize, usize), pass: Pass) -> Work {
+fn share_work(rule: OpacityRule, (parents, children): (usize, usize), pass: Pass) -> Work {
     // Forward: logits, areas and per-parent numbers are read, opacities written. Backward: the
     // gradient is read in addition, and the gradients of all inputs are written.
     let (pc, per_parent) = ((parents * children) as f64, parents as f64);
@@ -302,7 +304,7 @@ fn share_work(rule: Rule, (parents, children): (usize, usize), pass: Pass) -> Wo
 fn redistribution(
     bench: &mut Bench,
     name: &str,
-    rule: Rule,
+    rule: OpacityRule,
     (parents, children): (usize, usize),
     pass: Pass,
 ) -> Result<()> {
@@ -318,7 +320,7 @@ fn redistribution(
     let run = |fused: bool, weighted: bool| -> Result<Vec<Tensor>> {
         let y = match (fused, rule) {
             (true, _) => redistribute(rule, &l, &a, &o, Some(&own))?,
-            (false, Rule::Linear) => plain::linear(&l, &a, &o)?,
+            (false, OpacityRule::Linear) => plain::linear(&l, &a, &o)?,
             (false, _) => plain::optical_depth(&l, &a, &o, &own)?,
         };
         if pass == Pass::Forward {

@@ -221,28 +221,40 @@ pub const HEAD_GAIN_OFFSET: usize = 10;
 /// Floats of a record from the geometry head g_θ; the appearance head h_φ gives the rest.
 pub const HEAD_GEOMETRY_LEN: usize = 9;
 
-/// Rule by which a parent's opacity is shared among its children
-/// ([`crate::ops::redistribute`]). Kernels read the discriminant.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// Distribution of a parent's opacity over its children ([`crate::ops::redistribute`]). Kernels
+/// read the discriminant.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 #[repr(u32)]
-pub enum Rule {
-    /// The children's opacities sum to the parent's.
+pub enum OpacityRule {
+    /// α_k = α_p·softmax(ℓ_k − ln A_k): the opacities sum to the parent's (paper).
     Linear = 0,
-    /// Conserves footprint-weighted optical depth.
+    /// Conserves Σ Ã_k τ_k, the footprint-weighted optical depth: τ = −ln(1 − α), Ã with the
+    /// low-pass.
     OpticalDepth = 1,
-    /// Conserves transmittance through all children.
+    /// 1 − (1 − α_p)^{w_k}: conserves transmittance through all children.
     Transmittance = 2,
-    /// Conserves integrated opacity.
+    /// min(0.99, α_p·A_p·w_k/A_k): conserves integrated opacity.
     Area = 3,
-    /// Every child has the parent's opacity.
+    /// α_p for every child.
     None = 4,
 }
 
-impl Rule {
+impl OpacityRule {
     /// Reports whether areas are measured in units of the parent's own.
     pub fn areas_are_relative(self) -> bool {
-        matches!(self, Rule::OpticalDepth | Rule::Area)
+        matches!(self, OpacityRule::OpticalDepth | OpacityRule::Area)
     }
+}
+
+/// Form of the mean in the embedding.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum MuInput {
+    /// x, y, z.
+    Raw,
+    /// x/z, y/z, ln z.
+    RayLogz,
 }
 
 /// Index of no cell, in the inverted lists by which gradients are summed.

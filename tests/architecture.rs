@@ -41,7 +41,7 @@ const IMPORTS: &[(&str, &[&str])] = &[
             "render", "splats",
         ],
     ),
-    ("train", &["abi", "camera", "config", "data", "io", "loss", "metrics", "model", "ops"]),
+    ("train", &["abi", "camera", "config", "cpu", "data", "io", "loss", "metrics", "model", "ops"]),
 ];
 
 const TOP_LEVEL: &[&str] = &[

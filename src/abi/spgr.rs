@@ -1,6 +1,6 @@
 //! Options of an SPGR call ([`crate::cpu::spgr`]).
 
-use super::Rule;
+use super::OpacityRule;
 use serde::{Deserialize, Serialize};
 
 /// Largest number of children per parent; they are kept on the stack.
@@ -105,7 +105,7 @@ pub struct Rules {
     /// Growth of a child whose footprint is below A_min.
     pub a_min_mode: AMinMode,
     /// Opacity rule.
-    pub opacity: Rule,
+    pub opacity: OpacityRule,
     /// Low-pass of the target picture, target px².
     pub lowpass_target: f64,
     /// Low-pass of a native render of the parents, input px².

@@ -28,7 +28,7 @@ uniform! {
         parents: u32,
         /// K.
         children: u32,
-        /// [`super::Rule`] as a number.
+        /// [`super::OpacityRule`] as a number.
         rule: u32,
         /// Unused.
         pad: u32,
@@ -242,7 +242,7 @@ uniform! {
         first: u32,
         /// V.
         views: u32,
-        /// [`super::Rule`] as a number.
+        /// [`super::OpacityRule`] as a number.
         rule: u32,
         /// 1: v* is the nearest of the views in whose picture the parent lies.
         nearest_visible: u32,

@@ -3,7 +3,7 @@
 //! Both presets use one form of the attention; they differ in `levels`, `norm` and
 //! `occlusion_gate` only. Every other choice belongs to [`AggregationAblations`].
 
-pub use crate::abi::SampleConvention;
+pub use crate::abi::{MuInput, SampleConvention};
 
 use super::{FeatureLevel, Preset};
 use serde::{Deserialize, Serialize};
@@ -49,16 +49,6 @@ pub enum AnchorFrame {
     SrcCam,
     /// The first context camera.
     View0,
-}
-
-/// Form of the mean in the embedding.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum MuInput {
-    /// x, y, z.
-    Raw,
-    /// x/z, y/z, ln z.
-    RayLogz,
 }
 
 /// Form of the scales in the embedding.

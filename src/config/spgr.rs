@@ -3,7 +3,9 @@
 //! The presets differ in some keys of [`Spgr`]; choices that neither preset makes belong
 //! to [`SpgrAblations`].
 
-pub use crate::abi::{AMinMode, AreaAt, DepthDir, DepthUnit, GainSpace, PrimaryView, Slide};
+pub use crate::abi::{
+    AMinMode, AreaAt, DepthDir, DepthUnit, GainSpace, OpacityRule, PrimaryView, Slide,
+};
 
 use super::Preset;
 use serde::{Deserialize, Serialize};
@@ -107,22 +109,6 @@ pub enum AMin {
     InputPx(f64),
     /// No clamp.
     Off,
-}
-
-/// Distribution of the parent's opacity over the children.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum OpacityRule {
-    /// α_k = α_p·softmax(ℓ_k − ln A_k): sums to the parent's (paper).
-    Linear,
-    /// Conserves Σ Ã_k τ_k, τ = −ln(1 − α), Ã with the low-pass.
-    OpticalDepth,
-    /// 1 − (1 − α_p)^{w_k}: conserves transmittance through all children.
-    Transmittance,
-    /// min(0.99, α_p·A_p·w_k/A_k): conserves integrated opacity.
-    Area,
-    /// α_p.
-    None,
 }
 
 impl Spgr {

@@ -10,7 +10,7 @@
 //! Op: ops/attributes.rs. Reference in tensor operations: `model::embed::Embeddings::inputs`.
 
 use super::simd::{Mask, Real, RowLayout, Vector, VectorKernel};
-use crate::abi::{MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE};
+use crate::abi::{MEAN_OFFSET, MuInput, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE};
 use rayon::prelude::*;
 
 /// A camera's frame.
@@ -33,8 +33,8 @@ pub struct Attributes {
     pub source: Frame,
     /// f_x of the source view, px: scales become logarithms of pixels. `None`: unchanged.
     pub log_px: Option<f64>,
-    /// True if positions become slopes and ln z.
-    pub ray: bool,
+    /// Form of positions.
+    pub position: MuInput,
     /// Opacities become logits, clipped to ± this. `None`: unchanged.
     pub logit: Option<f64>,
     /// Lower clamp of z in divisions and logarithms, world units.
@@ -119,7 +119,7 @@ impl Attributes {
         let mut out = [V::constant(0.0); SPLAT_STRIDE];
         let place = self.place(row);
         out[..3].copy_from_slice(&place.own);
-        if self.ray {
+        if self.position == MuInput::RayLogz {
             let most = V::constant(self.slope_max);
             for (to, slope) in out.iter_mut().zip(place.slopes) {
                 *to = slope.max(-most).min(most);
@@ -157,7 +157,7 @@ impl Attributes {
         let zero = V::constant(0.0);
         let mut out = [zero; SPLAT_STRIDE];
         let mut d_own = [d[0], d[1], d[2]];
-        if self.ray {
+        if self.position == MuInput::RayLogz {
             let place = self.place(row);
             let most = V::constant(self.slope_max);
             let mut d_z = d[2];

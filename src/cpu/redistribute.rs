@@ -21,7 +21,7 @@ use super::uninit::{UninitBuffer, UninitSlice, zeroed};
 use crate::abi::{AREA_EPS, AREA_RULE_OPACITY_MAX, OPACITY_CEILING, RELATIVE_AREA_MIN};
 use rayon::prelude::*;
 
-pub use crate::abi::Rule;
+pub use crate::abi::OpacityRule;
 
 /// Parents per rayon task: its data fits the caches of a core.
 const BLOCK: usize = 512;
@@ -81,9 +81,9 @@ fn divisor<V: Vector>(area: V, per_own: V) -> V {
 
 /// Evaluates F of the rules α_k = F(x_k).
 #[inline(always)]
-fn opacity_of<V: Vector>(rule: Rule, x: V) -> V {
+fn opacity_of<V: Vector>(rule: OpacityRule, x: V) -> V {
     match rule {
-        Rule::Area => x.min(V::constant(AREA_RULE_OPACITY_MAX)),
+        OpacityRule::Area => x.min(V::constant(AREA_RULE_OPACITY_MAX)),
         _ => -(-x).exp_m1(),
     }
 }
@@ -91,12 +91,12 @@ fn opacity_of<V: Vector>(rule: Rule, x: V) -> V {
 /// Computes α_k of K children in the lanes of their parents. Relative rules alone read
 /// `own`. K = `areas.len()` ≥ 1; `alphas` holds the logits on entry.
 #[inline(always)]
-pub(super) fn share<V: Vector>(rule: Rule, areas: &[V], alpha: V, own: V, alphas: &mut [V]) {
-    if rule == Rule::None {
+pub(super) fn share<V: Vector>(rule: OpacityRule, areas: &[V], alpha: V, own: V, alphas: &mut [V]) {
+    if rule == OpacityRule::None {
         alphas.fill(alpha);
         return;
     }
-    if rule == Rule::Linear {
+    if rule == OpacityRule::Linear {
         let factor = alpha / per_area(areas, alphas);
         alphas.iter_mut().for_each(|o| *o = *o * factor);
         return;
@@ -104,9 +104,9 @@ pub(super) fn share<V: Vector>(rule: Rule, areas: &[V], alpha: V, own: V, alphas
     let one = V::constant(1.0);
     let inverse = exponentials(alphas);
     let per_own = if rule.areas_are_relative() { one / own } else { one };
-    let whole = if rule == Rule::Area { alpha } else { optical_depth(alpha) };
+    let whole = if rule == OpacityRule::Area { alpha } else { optical_depth(alpha) };
     let factor = whole * inverse;
-    if rule == Rule::Transmittance {
+    if rule == OpacityRule::Transmittance {
         alphas.iter_mut().for_each(|o| *o = opacity_of(rule, factor * *o));
         return;
     }
@@ -127,7 +127,7 @@ pub(super) fn share<V: Vector>(rule: Rule, areas: &[V], alpha: V, own: V, alphas
 /// overwritten.
 #[inline(always)]
 pub(super) fn share_backward<V: Vector>(
-    rule: Rule,
+    rule: OpacityRule,
     (alpha, own): (V, V),
     grads: &mut [V],
     logits: &mut [V],
@@ -135,12 +135,12 @@ pub(super) fn share_backward<V: Vector>(
 ) -> (V, V) {
     let zero = V::constant(0.0);
     match rule {
-        Rule::None => {
+        OpacityRule::None => {
             logits.fill(zero);
             areas.fill(zero);
             (grads.iter().fold(zero, |sum, &g| sum + g), zero)
         }
-        Rule::Linear => {
+        OpacityRule::Linear => {
             let eps = V::constant(AREA_EPS);
             let inverse = V::constant(1.0) / per_area(areas, logits);
             let weighted = logits.iter().zip(&*grads).fold(zero, |sum, (&w, &g)| w.fma(g, sum));
@@ -159,7 +159,7 @@ pub(super) fn share_backward<V: Vector>(
 /// [`share_backward`] of the rules α_k = F(x_k), x_k = s·w_k / B_k, with s = τ(α) or α.
 #[inline(always)]
 fn weighted_backward<V: Vector>(
-    rule: Rule,
+    rule: OpacityRule,
     (alpha, own): (V, V),
     grads: &mut [V],
     logits: &mut [V],
@@ -168,25 +168,25 @@ fn weighted_backward<V: Vector>(
     let (zero, one) = (V::constant(0.0), V::constant(1.0));
     let inverse = exponentials(logits);
     let per_own = if rule.areas_are_relative() { one / own } else { one };
-    let s = if rule == Rule::Area { alpha } else { optical_depth(alpha) };
+    let s = if rule == OpacityRule::Area { alpha } else { optical_depth(alpha) };
     let (mut by_s, mut mean, mut by_own) = (zero, zero, zero);
     for ((l, a), g) in logits.iter_mut().zip(areas.iter_mut()).zip(grads.iter_mut()) {
         let inverse_b = match rule {
-            Rule::Transmittance => one,
+            OpacityRule::Transmittance => one,
             _ => one / divisor(*a, per_own),
         };
         *l = *l * inverse;
         let share = *l * inverse_b;
         let x = s * share;
         let dx = match rule {
-            Rule::Area => x.lt(V::constant(AREA_RULE_OPACITY_MAX)).select_or_zero(*g),
+            OpacityRule::Area => x.lt(V::constant(AREA_RULE_OPACITY_MAX)).select_or_zero(*g),
             _ => *g * (-x).exp(),
         };
         by_s = dx.fma(share, by_s);
         *g = dx * x;
         mean = mean + *g;
         let d_b = match rule {
-            Rule::Transmittance => zero,
+            OpacityRule::Transmittance => zero,
             _ => {
                 let free = V::constant(RELATIVE_AREA_MIN).lt(*a * per_own);
                 free.select_or_zero(-*g * inverse_b)
@@ -200,7 +200,7 @@ fn weighted_backward<V: Vector>(
         *l = g - *l * mean;
     }
     let d_alpha = match rule {
-        Rule::Area => by_s,
+        OpacityRule::Area => by_s,
         _ => {
             let free = alpha.lt(V::constant(OPACITY_CEILING));
             by_s * free.select_or_zero(one / (one - alpha))
@@ -213,7 +213,7 @@ fn weighted_backward<V: Vector>(
 #[derive(Clone, Copy, Debug)]
 pub struct Args<'a, T> {
     /// Rule of redistribution.
-    pub rule: Rule,
+    pub rule: OpacityRule,
     /// K, at least 1.
     pub k: usize,
     /// ℓ, `[P, K]`.

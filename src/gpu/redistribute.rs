@@ -3,7 +3,7 @@
 //! CPU version: [`crate::cpu::redistribute`]. WGSL: kernels/redistribute.wgsl,
 //! kernels/redistribute_bwd.wgsl. Tests: tests/gpu/redistribute.rs.
 
-use crate::abi::{RedistributeUniform, Rule};
+use crate::abi::{OpacityRule, RedistributeUniform};
 use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::device::Gpu;
@@ -63,7 +63,7 @@ const THREADS: usize = 64;
 #[derive(Clone, Copy, Debug)]
 pub struct RedistributeArgs<'a> {
     /// Redistribution rule.
-    pub rule: Rule,
+    pub rule: OpacityRule,
     /// K, at least 1.
     pub k: usize,
     /// ℓ, `[P, K]`.

@@ -8,7 +8,7 @@
 
 use super::geometry::{Frames, ParentChunk};
 use super::mlp::{Block2, LayerNorm, affine, gelu, linear, xavier};
-use crate::config::{AlphaInput, AnchorFrame, Embed, EmbedMlp, MuInput, ScaleInput};
+use crate::config::{AlphaInput, AnchorFrame, Embed, EmbedMlp, ScaleInput};
 use crate::ops::attributes::{Attributes, attributes};
 use crate::ops::moves;
 use candle_core::{Result, Tensor};
@@ -114,7 +114,7 @@ impl Embeddings {
             source: source.numbers(),
             log_px: (c.scale == ScaleInput::LogPx)
                 .then_some(f64::from(source.camera.intrinsics.fx)),
-            ray: c.mu == MuInput::RayLogz,
+            position: c.mu,
             logit: (c.alpha == AlphaInput::Logit).then_some(LOGIT_MAX),
             z_min: Z_MIN,
             slope_max: SLOPE_MAX,

@@ -13,9 +13,8 @@
 use super::embed::Descriptors;
 use super::mlp::{LayerNorm, affine, gelu, linear};
 use crate::abi::{HEAD_GEOMETRY_LEN, HEAD_STRIDE};
-use crate::config::{AMin, Config, OpacityRule, SpgrHead};
+use crate::config::{AMin, Config, SpgrHead};
 use crate::ops::columns::columns;
-use crate::ops::redistribute::Rule;
 use crate::ops::spgr::Rules;
 use candle_core::{Result, Tensor};
 use candle_nn::{Init, Linear, VarBuilder};
@@ -187,13 +186,7 @@ pub fn rules(config: &Config, side: usize) -> Rules {
         area_at: ablations.area_at,
         a_min,
         a_min_mode: ablations.a_min_mode,
-        opacity: match s.opacity {
-            OpacityRule::Linear => Rule::Linear,
-            OpacityRule::OpticalDepth => Rule::OpticalDepth,
-            OpacityRule::Transmittance => Rule::Transmittance,
-            OpacityRule::Area => Rule::Area,
-            OpacityRule::None => Rule::None,
-        },
+        opacity: s.opacity,
         lowpass_target: f64::from(config.render.lowpass_px2(side as f32)),
         lowpass_input: f64::from(config.render.lowpass),
         delta: s.delta,

@@ -7,18 +7,18 @@ use crate::cpu::redistribute as cpu;
 use candle_core::backend::BackendStorage;
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
 
-pub use cpu::Rule;
+pub use cpu::OpacityRule;
 
 /// Opacities `[P, K]` of the children of P parents. `logits` `[P, K]`; `areas`
 /// `[P, K]`, target px², with the rasterizer's low-pass for
-/// [`Rule::OpticalDepth`]; `opacities` `[P]` in [0, 1]; `parent_areas` `[P]`, the
-/// parents' own footprints in the same unit, for [`Rule::OpticalDepth`] and
-/// [`Rule::Area`] only. Differentiable in all four; `f32` or `f64`.
+/// [`OpacityRule::OpticalDepth`]; `opacities` `[P]` in [0, 1]; `parent_areas` `[P]`, the
+/// parents' own footprints in the same unit, for [`OpacityRule::OpticalDepth`] and
+/// [`OpacityRule::Area`] only. Differentiable in all four; `f32` or `f64`.
 ///
 /// # Errors
 /// Shapes or dtypes that do not fit one another; parent areas missing.
 pub fn redistribute(
-    rule: Rule,
+    rule: OpacityRule,
     logits: &Tensor,
     areas: &Tensor,
     opacities: &Tensor,
@@ -33,7 +33,7 @@ pub fn redistribute(
 /// Those of [`redistribute`].
 pub fn redistribute_on(
     backend: &Backend,
-    rule: Rule,
+    rule: OpacityRule,
     logits: &Tensor,
     areas: &Tensor,
     opacities: &Tensor,
@@ -69,7 +69,7 @@ pub fn redistribute_on(
 
 /// On logits `[P, K]`, areas `[P, K]` and, `[1, P]` or `[2, P]`, the parents'
 /// opacities and own areas.
-struct Redistribute(Rule, Backend);
+struct Redistribute(OpacityRule, Backend);
 
 const NAME: &str = "redistribute";
 
@@ -113,7 +113,7 @@ impl CustomOp3 for Redistribute {
 }
 
 fn arguments<'a, T: Number>(
-    rule: Rule,
+    rule: OpacityRule,
     logits: &Tensor2<'a, T>,
     areas: &'a [T],
     per_parent: &'a [T],
@@ -130,7 +130,7 @@ struct Tensor2<'a, T> {
 }
 
 fn forward<T: Number>(
-    rule: Rule,
+    rule: OpacityRule,
     [logits, areas, per_parent]: [(&CpuStorage, &Layout); 3],
 ) -> Result<(CpuStorage, Shape)> {
     let shape = logits.1.shape().clone();
@@ -165,7 +165,7 @@ fn on_gpu(
 type Triple = (Option<Tensor>, Option<Tensor>, Option<Tensor>);
 
 fn backward<T: Number>(
-    rule: Rule,
+    rule: OpacityRule,
     [logits, areas, per_parent, grad]: [&Tensor; 4],
 ) -> Result<Triple> {
     let (parents, k) = logits.dims2()?;

@@ -9,7 +9,7 @@ use adapter::{gpu, limited};
 use candle_core::{DType, Result, Tensor, Var};
 use scenes::Random;
 use subsplat::abi::{
-    Convention, Gather, Level, RasterOptions, Rule, SampleConvention, ShDirection,
+    Convention, Gather, Level, OpacityRule, RasterOptions, SampleConvention, ShDirection,
 };
 use subsplat::camera::Camera;
 use subsplat::gpu::{DeviceChoice, Gpu};
@@ -99,7 +99,12 @@ fn redistribution() {
     let alphas = (r.tensor(&[300], 0.4, DType::F32) + 0.5).unwrap();
     let alphas = alphas.clamp(0.01, 0.99).unwrap();
     let own = r.tensor(&[300], 1.0, DType::F32).exp().unwrap();
-    for rule in [Rule::Linear, Rule::OpticalDepth, Rule::Transmittance, Rule::Area] {
+    for rule in [
+        OpacityRule::Linear,
+        OpacityRule::OpticalDepth,
+        OpacityRule::Transmittance,
+        OpacityRule::Area,
+    ] {
         let inputs = [&logits, &areas, &alphas, &own];
         agrees(&format!("{rule:?}"), &backend, &inputs, |backend, x| {
             Ok(vec![redistribute_on(backend, rule, &x[0], &x[1], &x[2], Some(&x[3]))?])

@@ -5,7 +5,7 @@ use subsplat_test_support::cpu_against_gpu::Random;
 use subsplat_test_support::gpu as adapter;
 
 use adapter::gpu;
-use subsplat::abi::Rule;
+use subsplat::abi::OpacityRule;
 use subsplat::cpu::redistribute as cpu;
 use subsplat::gpu::{GpuError, RedistributeArgs};
 
@@ -16,8 +16,13 @@ const REDISTRIBUTE: f32 = 1e-5;
 /// Tolerance of gradients, relative to the largest.
 const REDISTRIBUTE_BACKWARD: f32 = 1e-5;
 
-const RULES: [Rule; 5] =
-    [Rule::Linear, Rule::OpticalDepth, Rule::Transmittance, Rule::Area, Rule::None];
+const RULES: [OpacityRule; 5] = [
+    OpacityRule::Linear,
+    OpacityRule::OpticalDepth,
+    OpacityRule::Transmittance,
+    OpacityRule::Area,
+    OpacityRule::None,
+];
 
 /// Returns the largest |got − expected| / |expected|; NaN where one is.
 fn relative(got: &[f32], expected: &[f32]) -> f32 {
@@ -104,7 +109,7 @@ fn redistribute_backward() {
         }
     }
     let args = RedistributeArgs {
-        rule: Rule::Linear,
+        rule: OpacityRule::Linear,
         k: 2,
         logits: &[0.0; 4],
         areas: &[1.0; 4],
@@ -119,7 +124,7 @@ fn redistribute_backward() {
 fn inconsistent_arguments_are_named() {
     let Some(gpu) = gpu() else { return };
     let args = RedistributeArgs {
-        rule: Rule::OpticalDepth,
+        rule: OpacityRule::OpticalDepth,
         k: 2,
         logits: &[0.0; 4],
         areas: &[1.0; 4],

@@ -9,8 +9,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::PathBuf;
 use subsplat::abi::{
-    self, AttentionGatherUniform, InvertUniform, PlaneSweepUniform, RasterUniform,
-    RedistributeUniform, Rule, ShowUniform, SortUniform, SpgrGainsBwdUniform, SpgrUniform,
+    self, AttentionGatherUniform, InvertUniform, OpacityRule, PlaneSweepUniform, RasterUniform,
+    RedistributeUniform, ShowUniform, SortUniform, SpgrGainsBwdUniform, SpgrUniform,
 };
 use subsplat::gpu::{Access, KERNELS, Kernel};
 
@@ -71,11 +71,11 @@ fn constants() -> BTreeMap<&'static str, f64> {
         PLAN_ELEMENT_GROUPS,
     ));
     let rules = [
-        ("RULE_LINEAR", Rule::Linear),
-        ("RULE_OPTICAL_DEPTH", Rule::OpticalDepth),
-        ("RULE_TRANSMITTANCE", Rule::Transmittance),
-        ("RULE_AREA", Rule::Area),
-        ("RULE_NONE", Rule::None),
+        ("RULE_LINEAR", OpacityRule::Linear),
+        ("RULE_OPTICAL_DEPTH", OpacityRule::OpticalDepth),
+        ("RULE_TRANSMITTANCE", OpacityRule::Transmittance),
+        ("RULE_AREA", OpacityRule::Area),
+        ("RULE_NONE", OpacityRule::None),
     ];
     all.extend(same!(GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, SWEEP_PAIR_STRIDE));
     all.extend(same!(SPLAT_STRIDE, MEAN_OFFSET, QUAT_OFFSET, SCALE_OFFSET, OPACITY_OFFSET));

@@ -8,7 +8,7 @@ use cpu_against_gpu::{Random, assert_matches_cpu};
 use glam::{EulerRot, Mat4, Quat, Vec3};
 use subsplat::abi::{
     AMinMode, AreaAt, DepthDir, DepthUnit, GainSpace, HEAD_STRIDE, MEAN_OFFSET, OPACITY_OFFSET,
-    PrimaryView, QUAT_OFFSET, Rule, Rules, SCALE_OFFSET, SPLAT_STRIDE, Slide,
+    OpacityRule, PrimaryView, QUAT_OFFSET, Rules, SCALE_OFFSET, SPLAT_STRIDE, Slide,
 };
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::cpu::spgr as cpu;
@@ -75,7 +75,7 @@ fn base(tuned: bool, side: usize) -> Rules {
         area_at: AreaAt::Child,
         a_min: if side == 1 { 0.0 } else { 1.0 / k },
         a_min_mode: AMinMode::Iso,
-        opacity: if tuned { Rule::OpticalDepth } else { Rule::Linear },
+        opacity: if tuned { OpacityRule::OpticalDepth } else { OpacityRule::Linear },
         lowpass_target: 0.3,
         lowpass_input: 0.3,
         delta: 0.5,
@@ -103,11 +103,11 @@ fn variants(side: usize) -> Vec<(String, Rules)> {
         ("a_min in", |s| s.a_min = 0.5 * (s.side * s.side) as f64),
         ("a_min off", |s| s.a_min = 0.0),
         ("two axis", |s| (s.a_min, s.a_min_mode) = (2.0, AMinMode::TwoAxis)),
-        ("linear", |s| s.opacity = Rule::Linear),
-        ("depth", |s| s.opacity = Rule::OpticalDepth),
-        ("through", |s| s.opacity = Rule::Transmittance),
-        ("area", |s| s.opacity = Rule::Area),
-        ("none", |s| s.opacity = Rule::None),
+        ("linear", |s| s.opacity = OpacityRule::Linear),
+        ("depth", |s| s.opacity = OpacityRule::OpticalDepth),
+        ("through", |s| s.opacity = OpacityRule::Transmittance),
+        ("area", |s| s.opacity = OpacityRule::Area),
+        ("none", |s| s.opacity = OpacityRule::None),
         ("rgb", |s| s.gain_space = GainSpace::Rgb),
     ];
     let mut all = Vec::new();

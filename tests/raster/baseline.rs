@@ -23,7 +23,7 @@ use std::collections::HashMap;
 use subsplat::abi::{ALPHA_MIN, RasterOptions};
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::ops;
-use subsplat::ops::redistribute::Rule;
+use subsplat::ops::redistribute::OpacityRule;
 
 /// No pixel of alpha ≥ 1/255 lies outside such a box.
 const EXACT_BOX: f32 = 3.34;
@@ -234,7 +234,7 @@ fn redistribution_is_the_ops() {
     let alpha = Tensor::from_vec(alpha, 50, &Device::Cpu).unwrap();
     let linear = redistribute::linear(&logits, &areas, &alpha).unwrap();
     let depth = redistribute::optical_depth(&logits, &areas, &alpha, &own).unwrap();
-    for (got, rule) in [(linear, Rule::Linear), (depth, Rule::OpticalDepth)] {
+    for (got, rule) in [(linear, OpacityRule::Linear), (depth, OpacityRule::OpticalDepth)] {
         let op = ops::redistribute::redistribute(rule, &logits, &areas, &alpha, Some(&own));
         assert_close(&host(&got), &host(&op.unwrap()), 1e-5);
     }

@@ -209,16 +209,17 @@ fn methods_are_what_they_say() {
     // The inputs' own cameras, by hand.
     let made = model.run(&photos, &request(Detail::Photographs)).unwrap();
     let rules = model.config().raster_options(2.0, near, colour(&made));
-    let (mut want, mut alpha) = (0.0, 0.0);
+    let (mut want, mut alpha) = (0.0, 0.0f64);
     for input in made.inputs() {
         let picture = render(made.splats(), &input.target_camera, &rules);
         want += psnr(&picture.rgb, &input.target.to_unit(), 128, 128).unwrap() / 2.0;
-        alpha += picture.alpha.iter().sum::<f32>() / (2.0 * 128.0 * 128.0);
+        let sum: f64 = picture.alpha.iter().copied().map(f64::from).sum();
+        alpha += sum / (2.0 * 128.0 * 128.0);
     }
     let reports = &result.scores.inputs;
     assert!((reports[1].inputs.unwrap().psnr - want).abs() < 1e-6);
     let [children, parents] = [1, 2].map(|m| reports[m].gaussians.unwrap());
-    assert!((children.coverage - f64::from(alpha)).abs() < 1e-5, "{children:?} {alpha}");
+    assert!((children.coverage - alpha).abs() < 1e-9, "{children:?} {alpha}");
     assert_eq!((children.count, parents.count), (4.0 * 2.0 * 4096.0, 2.0 * 4096.0));
     // Children of the even split have half the size of their parents.
     let ratio = parents.sigma_px[1] / children.sigma_px[1];

@@ -432,7 +432,10 @@ fn inputs_can_be_targets() {
         let example = source.example(i).unwrap();
         assert_eq!(example.targets.len(), 3);
         for (input, target) in example.context.iter().zip(&example.targets[1..]) {
-            assert_eq!(target.camera.resized(32, 24).unwrap(), input.camera);
+            let [small, own] = [target.camera.resized(32, 24).unwrap(), input.camera];
+            assert_eq!(small.world_from_camera(), own.world_from_camera());
+            assert!((small.intrinsics().fy - own.intrinsics().fy).abs() < 1e-4);
+            assert!((small.intrinsics().cx - own.intrinsics().cx).abs() < 1e-4);
             assert_eq!((target.image.width, target.image.height), (64, 48));
         }
         with_detail += usize::from(example.input_targets == InputTargets::WithDetail);

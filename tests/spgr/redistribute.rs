@@ -4,7 +4,7 @@ use subsplat_test_support::scenes;
 
 use candle_core::{DType, Device, Tensor, Var};
 use scenes::*;
-use subsplat::ops::redistribute::{Rule, redistribute};
+use subsplat::ops::redistribute::{OpacityRule, redistribute};
 
 fn cpu(v: Vec<f64>, shape: &[usize]) -> Tensor {
     Tensor::from_vec(v, shape, &Device::Cpu).unwrap()
@@ -14,8 +14,13 @@ fn host(t: &Tensor) -> Vec<f64> {
     t.to_dtype(DType::F64).unwrap().flatten_all().unwrap().to_vec1().unwrap()
 }
 
-const RULES: [Rule; 5] =
-    [Rule::Linear, Rule::OpticalDepth, Rule::Transmittance, Rule::Area, Rule::None];
+const RULES: [OpacityRule; 5] = [
+    OpacityRule::Linear,
+    OpacityRule::OpticalDepth,
+    OpacityRule::Transmittance,
+    OpacityRule::Area,
+    OpacityRule::None,
+];
 
 /// Logits, areas, opacities, parent areas of p parents with k children, f64.
 fn shares(p: usize, k: usize, r: &mut Random) -> [Tensor; 4] {
@@ -30,7 +35,7 @@ fn shares(p: usize, k: usize, r: &mut Random) -> [Tensor; 4] {
 fn linear_rule_is_the_papers_and_sums_to_the_parent() {
     let mut r = Random(1);
     let [l, a, o, _] = shares(9, 4, &mut r);
-    let got = redistribute(Rule::Linear, &l, &a, &o, None).unwrap();
+    let got = redistribute(OpacityRule::Linear, &l, &a, &o, None).unwrap();
     // w̃ = softmax(ℓ)/(A + ε), α·w̃/Σw̃ as written.
     let w = candle_nn::ops::softmax(&l, 1).unwrap().div(&(a + 1e-8).unwrap()).unwrap();
     let w = w.broadcast_div(&w.sum_keepdim(1).unwrap()).unwrap();
@@ -45,20 +50,20 @@ fn rules_conserve_what_they_promise() {
         let [l, a, o, own] = shares(7, k, &mut r);
         let run = |rule| redistribute(rule, &l, &a, &o, Some(&own)).unwrap();
         let tau = |alpha: &Tensor| alpha.affine(-1.0, 1.0).unwrap().log().unwrap().neg().unwrap();
-        let depth = (tau(&run(Rule::OpticalDepth)) * &a).unwrap().sum(1).unwrap();
+        let depth = (tau(&run(OpacityRule::OpticalDepth)) * &a).unwrap().sum(1).unwrap();
         assert_close(&depth, &(tau(&o) * &own).unwrap(), 1e-12);
-        let through = tau(&run(Rule::Transmittance)).sum(1).unwrap();
+        let through = tau(&run(OpacityRule::Transmittance)).sum(1).unwrap();
         assert_close(&through, &tau(&o), 1e-12);
-        let integrated = (run(Rule::Area) * &a).unwrap().sum(1).unwrap();
+        let integrated = (run(OpacityRule::Area) * &a).unwrap().sum(1).unwrap();
         let whole = (&o * &own).unwrap();
         let capped =
-            host(&run(Rule::Area)).chunks(k).map(|c| c.contains(&0.99)).collect::<Vec<_>>();
+            host(&run(OpacityRule::Area)).chunks(k).map(|c| c.contains(&0.99)).collect::<Vec<_>>();
         for (i, (got, want)) in host(&integrated).iter().zip(host(&whole)).enumerate() {
             assert!(if capped[i] { *got < want } else { (got - want).abs() < 1e-12 * want });
         }
         assert!(capped.iter().any(|c| !c) || k == 1, "every parent was capped");
         assert_close(
-            &run(Rule::None),
+            &run(OpacityRule::None),
             &o.unsqueeze(1).unwrap().broadcast_as((7, k)).unwrap().contiguous().unwrap(),
             0.0,
         );
@@ -72,7 +77,7 @@ fn optical_depth_with_equal_relative_areas_keeps_the_opacity() {
     let [l, _, o, own] = shares(5, 4, &mut r);
     let areas = own.unsqueeze(1).unwrap().broadcast_as((5, 4)).unwrap().affine(0.25, 0.0).unwrap();
     let l = l.zeros_like().unwrap();
-    let got = redistribute(Rule::OpticalDepth, &l, &areas, &o, Some(&own)).unwrap();
+    let got = redistribute(OpacityRule::OpticalDepth, &l, &areas, &o, Some(&own)).unwrap();
     let want = o.unsqueeze(1).unwrap().broadcast_as((5, 4)).unwrap().contiguous().unwrap();
     assert_close(&got, &want, 1e-13);
 }
@@ -142,17 +147,24 @@ fn redistribution_survives_extremes_and_refuses_misfits() {
     // A child that covers the sky takes nothing from its sibling's share.
     let (l, o) = (t(&[0.0; 2], &[1, 2]), t(&[0.75], &[1]));
     let beside = |sky: f32| {
-        redistribute(Rule::OpticalDepth, &l, &t(&[sky, 1.0], &[1, 2]), &o, Some(&t(&[1.0], &[1])))
+        redistribute(
+            OpacityRule::OpticalDepth,
+            &l,
+            &t(&[sky, 1.0], &[1, 2]),
+            &o,
+            Some(&t(&[1.0], &[1])),
+        )
     };
     for sky in [1e30, f32::MAX, f32::INFINITY] {
         let got = host(&beside(sky).unwrap());
         assert!(got[0].abs() < 1e-12 && (got[1] - 0.5).abs() < 1e-6, "{sky}: {got:?}");
     }
     let o = t(&[0.5, 0.5], &[2]);
-    let error = redistribute(Rule::Area, &logits, &areas, &o, None).unwrap_err().to_string();
+    let error = redistribute(OpacityRule::Area, &logits, &areas, &o, None).unwrap_err().to_string();
     assert!(error.contains("parents' areas"), "{error}");
-    let error = redistribute(Rule::Linear, &logits, &areas, &t(&[0.5], &[1]), None).unwrap_err();
+    let error =
+        redistribute(OpacityRule::Linear, &logits, &areas, &t(&[0.5], &[1]), None).unwrap_err();
     assert!(error.to_string().contains("opacities [2]"), "{error}");
     let f64s = areas.to_dtype(DType::F64).unwrap();
-    assert!(redistribute(Rule::Linear, &logits, &f64s, &o, None).is_err());
+    assert!(redistribute(OpacityRule::Linear, &logits, &f64s, &o, None).is_err());
 }

@@ -9,7 +9,7 @@ use crate::abi::{
     DEPTH_FRACTION_MIN, DepthDir, DepthUnit, HEAD_DEPTH_OFFSET, HEAD_LOG_SCALE_OFFSET,
     HEAD_ROTATION_OFFSET, HEAD_STRIDE, HEAD_UV_OFFSET,
 };
-use crate::cpu::redistribute::Rule;
+use crate::cpu::redistribute::OpacityRule;
 use crate::cpu::simd::{Mask, Vector};
 
 /// The camera-frame step from parent to child, and the values that its gradient needs.
@@ -211,7 +211,7 @@ impl<V: Vector> Child<V> {
         let growth = footprint.growth(rules);
         let clamped = footprint.area.max(V::constant(rules.a_min));
         let area = match rules.opacity {
-            Rule::OpticalDepth => footprint.blurred(growth, clamped, rules.lowpass_target),
+            OpacityRule::OpticalDepth => footprint.blurred(growth, clamped, rules.lowpass_target),
             _ => clamped,
         };
         let scale = product(small, growth);
@@ -257,7 +257,7 @@ impl<V: Vector> Child<V> {
         let zero = V::constant(0.0);
         let f = &self.footprint;
         let (d_clamped, d_m) = match rules.opacity {
-            Rule::OpticalDepth => {
+            OpacityRule::OpticalDepth => {
                 let at = (self.growth, self.clamped, self.area);
                 f.blurred_backward(at, rules.lowpass_target, g.area)
             }

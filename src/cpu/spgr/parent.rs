@@ -11,7 +11,7 @@ use crate::abi::{
     AreaAt, DISC_AREA_SQ_MIN, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE,
     Slide,
 };
-use crate::cpu::redistribute::Rule;
+use crate::cpu::redistribute::OpacityRule;
 use crate::cpu::simd::{LANES, Mask, RowLayout, Vector};
 
 pub(super) struct Parent<V: Vector> {
@@ -159,7 +159,9 @@ impl<V: Vector> Own<V> {
         let jacobian = Jacobian::new(&parent.view, parent.in_camera, one);
         let footprint = Footprint::new(&jacobian.jw, &rotation, parent.scale);
         let blurred = match rules.opacity {
-            Rule::OpticalDepth => footprint.blurred([one; 3], footprint.area, rules.lowpass_input),
+            OpacityRule::OpticalDepth => {
+                footprint.blurred([one; 3], footprint.area, rules.lowpass_input)
+            }
             _ => footprint.area,
         };
         let value = V::constant(rules.children() as f64) * blurred;
@@ -173,7 +175,7 @@ impl<V: Vector> Own<V> {
         let zero = [V::constant(0.0); 3];
         let f = &self.footprint;
         let (d_area, d_m) = match rules.opacity {
-            Rule::OpticalDepth => {
+            OpacityRule::OpticalDepth => {
                 let at = ([one; 3], f.area, self.blurred);
                 f.blurred_backward(at, rules.lowpass_input, each)
             }

@@ -14,7 +14,7 @@ use subsplat::abi::{
     HEAD_LOGIT_OFFSET, HEAD_ROTATION_OFFSET, HEAD_UV_OFFSET, MEAN_OFFSET, OPACITY_OFFSET,
     PrimaryView, QUAT_OFFSET, SCALE_OFFSET, Slide, VISIBLE_Z_MIN,
 };
-use subsplat::ops::redistribute::{Rule, redistribute};
+use subsplat::ops::redistribute::{OpacityRule, redistribute};
 use subsplat::ops::spgr::{Rules, Spgr};
 
 type V3 = [Tensor; 3];
@@ -354,7 +354,7 @@ impl Parents {
         let m = Footprint::new(&self.view.jacobian(&self.in_camera, 1.0)?, &self.ellipsoid()?)?;
         let area = m.area()?;
         let area = match rules.opacity {
-            Rule::OpticalDepth => m.blurred(&area, rules.lowpass_input)?,
+            OpacityRule::OpticalDepth => m.blurred(&area, rules.lowpass_input)?,
             _ => area,
         };
         scaled(&area, rules.children() as f64)?.squeeze(1)
@@ -417,7 +417,7 @@ pub fn spgr(head: &Tensor, parents: &Tensor, call: &Spgr) -> Result<(Tensor, Ten
     let growth = m.growth(&area, rules)?;
     let clamped = area.maximum(rules.a_min)?;
     let areas = match rules.opacity {
-        Rule::OpticalDepth => m.grown(&growth)?.blurred(&clamped, rules.lowpass_target)?,
+        OpacityRule::OpticalDepth => m.grown(&growth)?.blurred(&clamped, rules.lowpass_target)?,
         _ => clamped,
     };
     let own = if rules.opacity.areas_are_relative() { Some(p.area(rules)?) } else { None };
