@@ -6,17 +6,21 @@ use subsplat_test_support as common;
 use candle_core::{Device, Tensor, Var};
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use subsplat::abi::{HEAD_GEOMETRY_LEN, HEAD_LOG_SCALE_OFFSET};
 use subsplat::camera::{Camera, Intrinsics, NearFar};
 use subsplat::data::dataset::Posed;
 use subsplat::data::procedural::{ExampleSpec, TargetSpec};
 use subsplat::io::image::Rgb;
 use subsplat::metrics;
+use subsplat::model::weights::Weights;
+use subsplat::train::TrainConfig;
 use subsplat::train::augment::Augmentation;
 use subsplat::train::loading::{Loader, LoaderOptions};
 use subsplat::train::loss::{self, Scored, with_gradient};
 use subsplat::train::optimizer::{Optimizer, Settings};
 use subsplat::train::schedule::{NamedWarmup, Schedule, Warmup};
 use subsplat::train::source::{Example, InputTargets, Replay, Rooms, Source};
+use subsplat::train::step::{Learner, Seconds, StepScale};
 
 /// Returns reproducible numbers in [0, 1).
 fn noise(n: usize, seed: u32) -> Vec<f32> {
@@ -450,6 +454,66 @@ fn inputs_can_be_targets() {
     assert_eq!(swapped.targets[0], example.targets[0]);
     assert_eq!(swapped.targets[1], example.targets[2]);
     assert_eq!(swapped.targets[2], example.targets[1]);
+}
+
+/// The step's gradient with the detail of the inputs' pictures, by differences of the loss.
+#[test]
+fn a_step_with_detail_has_the_gradient_of_its_loss() {
+    const BIAS: &str = "subsplat.app.lin1.bias";
+    let set = r#"{ agg = { enabled = false }, embed = { mlp = "lite" },
+        backbone = { primaries = { sh_degree = 1 } } }"#
+        .replace('\n', "");
+    let text = format!("[model]\nset = {set}\n[loss]\ncross_entropy = 0.0\ndisparity = 0.0\n");
+    let config =
+        TrainConfig::from_toml(&format!("{text}confidence = 0.0\ndssim = 0.15\n")).unwrap();
+    let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
+    let weights = Weights::load(&root.join("src/model/shipped/small.safetensors")).unwrap();
+    let weights = weights.trainable();
+    let learner = Learner::new(&config, &weights).unwrap();
+    let bias = weights.variables()[BIAS].clone();
+    let variables = BTreeMap::from([(BIAS.to_owned(), bias.clone())]);
+    let optimizer = Optimizer::new(Settings::default(), variables).unwrap();
+    let mut source = rooms();
+    source.spec = ExampleSpec::new(64, 64, 1);
+    source.targets.inputs = true;
+    source.targets.samples = 4;
+    source.detail = 1.0;
+    let example = Example::clone(&source.example(1).unwrap());
+    let step = |example: &Example| {
+        let mut gradients = optimizer.gradients();
+        let (scale, mut seconds) = (StepScale { share: 1.0, step: 0 }, Seconds::default());
+        let examples = [example.clone()];
+        let terms =
+            learner.accumulate(&examples, scale, &optimizer, &mut gradients, &mut seconds).unwrap();
+        (terms, gradients.norm())
+    };
+    // Children of 0.6 of their σ: detail of wide, transparent children averages out.
+    let geometry = weights.variables()["subsplat.geo.lin1.bias"].clone();
+    let mut values = geometry.as_tensor().to_vec1::<f32>().unwrap();
+    for record in values.chunks_exact_mut(HEAD_GEOMETRY_LEN) {
+        record[HEAD_LOG_SCALE_OFFSET..][..3].iter_mut().for_each(|v| *v -= 0.5);
+    }
+    geometry.set(&Tensor::new(values, &Device::Cpu).unwrap()).unwrap();
+    let (terms, norm) = step(&example);
+    let plain = Example { input_targets: InputTargets::Plain, ..example.clone() };
+    assert!(step(&plain).0.mse > terms.mse, "detail brings the pictures nearer to the inputs");
+    let before = bias.as_tensor().to_vec1::<f32>().unwrap();
+    for (example, norm) in [(&plain, step(&plain).1), (&example, norm)] {
+        let slope = |i: usize| {
+            let loss = |h: f32| {
+                let mut values = before.clone();
+                values[i] += h;
+                bias.set(&Tensor::new(values, &Device::Cpu).unwrap()).unwrap();
+                step(example).0.loss
+            };
+            (loss(0.005) - loss(-0.005)) / 0.01
+        };
+        let slopes: Vec<f64> = (0..before.len()).map(slope).collect();
+        bias.set(&Tensor::new(before.clone(), &Device::Cpu).unwrap()).unwrap();
+        let expected = slopes.iter().map(|v| v * v).sum::<f64>().sqrt();
+        // The loss jumps where a splat's alpha passes 1/255; the gradient does not contain the jumps.
+        assert!((norm / expected - 1.0).abs() < 0.04, "{norm:e} {expected:e}");
+    }
 }
 
 #[test]
