@@ -34,11 +34,11 @@ pub struct FitOptions {
     pub opacity_rate: f32,
     /// Step of ln σ, one for the three axes of a Gaussian. Default: 0.25.
     pub scale_rate: f32,
-    /// Step of the colour offsets δ, display values. Default: 0.015.
+    /// Step of the colour offsets δ, display values. Default: 0.018.
     pub colour_rate: f32,
     /// Largest |Δ ln σ|. Default: 0.5.
     pub scale_limit: f32,
-    /// Weight of (1 − SSIM)/2 beside the mean squared difference. Default: 0.1.
+    /// Weight of (1 − SSIM)/2 beside the mean squared difference. Default: 0.2.
     pub dssim: f64,
 }
 
@@ -48,9 +48,9 @@ impl Default for FitOptions {
             steps: 4,
             opacity_rate: 0.3,
             scale_rate: 0.25,
-            colour_rate: 0.015,
+            colour_rate: 0.018,
             scale_limit: 0.5,
-            dssim: 0.1,
+            dssim: 0.2,
         }
     }
 }
