@@ -89,7 +89,7 @@ impl GaussianReport {
     }
 }
 
-/// What a method makes of the inputs themselves.
+/// A method's pictures at the inputs' own cameras, and its Gaussians.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct InputReport {
     /// Score of the pictures at the inputs' own cameras, at the targets' size; none for methods

@@ -21,7 +21,7 @@ pub struct ExampleSpec {
     /// plants, the edge of a door.
     pub foreground: f32,
     /// Share of examples that show shapes at random places, indoors or outdoors, instead of a
-    /// furnished room ([`Room::scattered`]).
+    /// furnished room.
     pub scattered: f32,
     /// Share of examples with cameras of [`CameraRange::Wide`].
     pub wide: f32,
