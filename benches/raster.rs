@@ -354,7 +354,7 @@ fn write(folder: &Path, bench: &Bench) -> Result<()> {
         let (splats, camera) = (scene::shared(spec), scene::camera(spec.side));
         save_splats(&at("ply"), &splats, &Default::default())?;
         let file = format!("{}.png", spec.name);
-        let camera_only = NamedCamera { file, camera, timestamp: None, depth: None };
+        let camera_only = NamedCamera::new(file, camera);
         let cameras =
             CameraFile { cameras: vec![camera_only], units: Units::Unknown, near_far: None };
         save_cameras_json(&at("cameras.json"), &cameras)?;

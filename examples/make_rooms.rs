@@ -49,7 +49,7 @@ fn main() -> Result<()> {
         let save = |(v, view): (usize, &Posed)| -> Result<NamedCamera> {
             let file = format!("images/{v}.png");
             save_png(&place.join(&file), &view.image)?;
-            Ok(NamedCamera { file, camera: view.camera, timestamp: None, depth: None })
+            Ok(NamedCamera::new(file, view.camera))
         };
         let views = example.context.iter().chain(&example.targets).enumerate();
         let cameras = views.map(save).collect::<Result<Vec<_>>>()?;

@@ -1,4 +1,4 @@
-//! `subsplat` turns two posed photographs into 3D Gaussians dense enough for views two to four
+//! `subsplat` turns two or more photographs into 3D Gaussians dense enough for views two to four
 //! times sharper than the network's input, on any CPU or GPU, without Python or CUDA.
 //!
 //! The method is *SubSplat: High-Resolution Pixel-aligned 3DGS via Sub-pixel Gaussian
@@ -29,6 +29,8 @@
 //!   gradients.
 //! * [`load_scene`], [`load_splats`] and [`save_splats`] read and write files.
 //! * [`check_pair`] compares poses with matched points.
+//! * [`estimate_poses`] finds cameras of photographs in memory that have none; `loose_scene` makes
+//!   a [`Scene`] of their files.
 //! * [`Camera`] and [`Intrinsics`] define all geometric conventions: OpenCV axes, pixel centres
 //!   at +0.5, `world_from_camera`.
 //!
@@ -37,6 +39,7 @@
 //! * `network` (default): the network, its training and its scores, on candle. Without it the
 //!   crate has cameras, splats, their files and the rasterizer.
 //! * `gpu` (default): the kernels as WGSL compute, through wgpu.
+//! * `heic`: reads HEIC pictures, the default format of iPhones, in pure Rust.
 //! * `internals`: makes the modules with kernels, ops and network parts public. No version
 //!   promises anything about them.
 
@@ -77,6 +80,8 @@ pub mod io;
 #[cfg(feature = "internals")]
 pub mod loss;
 #[cfg(feature = "internals")]
+pub mod matches;
+#[cfg(feature = "internals")]
 pub mod metrics;
 #[cfg(all(feature = "internals", feature = "network"))]
 pub mod model;
@@ -86,6 +91,8 @@ pub mod navigation;
 pub mod ops;
 #[cfg(all(feature = "internals", feature = "network"))]
 pub mod pipeline;
+#[cfg(feature = "internals")]
+pub mod poses;
 #[cfg(feature = "internals")]
 pub mod render;
 #[cfg(feature = "internals")]
@@ -122,6 +129,8 @@ mod io;
 #[cfg(not(feature = "internals"))]
 mod loss;
 #[cfg(not(feature = "internals"))]
+mod matches;
+#[cfg(not(feature = "internals"))]
 mod metrics;
 #[cfg(all(not(feature = "internals"), feature = "network"))]
 mod model;
@@ -131,6 +140,8 @@ mod navigation;
 mod ops;
 #[cfg(all(not(feature = "internals"), feature = "network"))]
 mod pipeline;
+#[cfg(not(feature = "internals"))]
+mod poses;
 #[cfg(not(feature = "internals"))]
 mod render;
 #[cfg(not(feature = "internals"))]
@@ -155,13 +166,18 @@ pub use check::{
 pub use config::{Config, ConfigError, Preset};
 #[cfg(feature = "network")]
 pub use data::crop::{CropOptions, Cropped};
+pub use data::exposure::{Exposure, ExposureError, PointPair, estimate_exposure};
 pub use device::DeviceChoice;
 pub use fit::{FitError, FitOptions, FitReport, FitView, fit};
 #[cfg(feature = "gpu")]
 pub use gpu::{Gpu, GpuError, Rasterizer as GpuRasterizer};
 pub use io::cameras_json::{CameraFile, NamedCamera, load_cameras_json, save_cameras_json};
-pub use io::image::{Depth, Rgb, save_depth_png, save_png};
-pub use io::scene::{Frame, Scene, SceneFormat, Units, load_scene};
+pub use io::exif::{ExifCamera, ExifReport, FocalLength, FocalSource, parse_exif};
+pub use io::image::{Depth, LoadOptions, Rgb, Truncated, save_depth_png, save_png};
+pub use io::photograph::{
+    Photograph, PhotographHeader, load_photograph, parse_photograph, probe_photograph,
+};
+pub use io::scene::{Frame, LoadedFrame, Pixels, Scene, SceneFormat, Units, load_scene};
 pub use io::{
     Error as FileError, SaveOptions, SaveReport, SplatFormat, Up, load_splats, save_splats,
 };
@@ -171,8 +187,13 @@ pub use navigation::{Bounds, Mode, Navigator, Pace, Start};
 pub use ops::{SplatTensors, rasterize_splats as rasterize};
 #[cfg(feature = "network")]
 pub use pipeline::{
-    Check, DepthBounds, DepthRange, DepthSource, Detail, Error, Options, Photo, PoseError,
-    Prepared, Progress, Reconstruction, Reconstructor, Result, Stage, StageTime, Warning,
+    Check, DepthBounds, DepthRange, DepthSource, Detail, Error, InputSize, KnownLens, LensSource,
+    LooseOptions, LooseScene, Options, Photo, PoseError, Prepared, Progress, Reconstruction,
+    Reconstructor, Result, Stage, StageTime, Warning, loose_scene,
+};
+pub use poses::{
+    Confidence, FocalEstimate, LeftOut, Lens, PoseEstimate, PoseOptions, PosePhoto, PosePoint,
+    PoseRefusal, PoseWarning, estimate_poses,
 };
 pub use render::{Picture, Renderer, render};
 pub use splats::{Quantiles, SplatParts, SplatStatistics, Splats, SplatsError};

@@ -22,7 +22,9 @@ const IMPORTS: &[(&str, &[&str])] = &[
     ("render", &["abi", "backend", "camera", "cpu", "gpu", "io", "splats"]),
     ("loss", &["cpu", "metrics"]),
     ("fit", &["abi", "camera", "io", "loss", "render", "splats"]),
-    ("check", &["camera", "metrics"]),
+    ("matches", &["cpu"]),
+    ("check", &["camera", "matches", "metrics"]),
+    ("poses", &["camera", "matches"]),
     ("io", &["abi", "camera", "config", "sh", "splats"]),
     ("data", &["camera", "io", "metrics", "splats"]),
     ("ops", &["abi", "backend", "camera", "cpu", "gpu", "splats"]),
@@ -31,7 +33,7 @@ const IMPORTS: &[(&str, &[&str])] = &[
         "pipeline",
         &[
             "abi", "camera", "check", "config", "cpu", "data", "fit", "io", "metrics", "model",
-            "render", "sh", "splats",
+            "poses", "render", "sh", "splats",
         ],
     ),
     (

@@ -8,6 +8,7 @@
 //! 2003.
 
 use super::epipolar::{Match, distance};
+use crate::matches::random::SplitMix;
 use glam::{DMat3, DVec2, DVec3};
 
 /// RANSAC stops when the probability that no sample was free of wrong matches falls below this
@@ -41,7 +42,7 @@ pub(super) fn fundamental(matches: &[Match], limit: f64, seed: u64) -> Option<Es
     let mut needed = MAX_SAMPLES;
     let mut drawn = 0;
     while drawn < needed {
-        let sample = random.sample(matches.len()).map(|i| matches[i]);
+        let sample = random.sample::<7>(matches.len()).map(|i| matches[i]);
         drawn += 1;
         for f in seven_point(&sample) {
             let s = score(&f, matches, limit);
@@ -279,35 +280,6 @@ fn rotate<const N: usize>(m: &mut [[f64; N]; N], vectors: &mut [[f64; N]; N], p:
     for row in vectors.iter_mut() {
         let (a, b) = (row[p], row[q]);
         (row[p], row[q]) = (c * a - s * b, s * a + c * b);
-    }
-}
-
-/// SplitMix64 (G. Steele et al., 2014): equal numbers on every machine.
-struct SplitMix(u64);
-
-impl SplitMix {
-    /// Returns 64 random bits.
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        z ^ (z >> 31)
-    }
-
-    /// Draws seven different indices below `count`, which is 8 or more.
-    fn sample(&mut self, count: usize) -> [usize; 7] {
-        let mut out = [usize::MAX; 7];
-        for i in 0..7 {
-            loop {
-                let candidate = (self.next() % count as u64) as usize;
-                if !out[..i].contains(&candidate) {
-                    out[i] = candidate;
-                    break;
-                }
-            }
-        }
-        out
     }
 }
 

@@ -7,28 +7,25 @@
 //! Input: grey photographs and cameras. Output: [`PairReport`]. The module reads no files and
 //! prints nothing. Equal inputs give equal reports.
 
-mod descriptors;
 mod epipolar;
 mod estimate;
-mod features;
 mod geometry;
-mod image;
-mod matching;
 mod mistakes;
 mod picture;
 mod plausibility;
 mod report;
 mod verdict;
 
-pub use image::GrayImage;
+pub use crate::matches::GrayImage;
 pub use picture::{RgbPicture, epipolar_picture};
 pub use report::{
     DepthReport, EpipolarReport, Finding, MatchedPoint, PairReport, ReadingReport, Verdict,
 };
 
 use crate::camera::Camera;
+use crate::matches::features::{self, Orientation};
+use crate::matches::pairs;
 use epipolar::Match;
-use features::Orientation;
 use glam::DVec2;
 use verdict::Evidence;
 
@@ -97,7 +94,7 @@ impl Matched {
         let [a, b] = [&work.images[0], &work.images[1]]
             .map(|image| features::detect(image, options.features, orientation));
         let position = |f: &features::Feature| DVec2::new(f64::from(f.x), f64::from(f.y));
-        let matches: Vec<Match> = matching::pairs(&a, &b)
+        let matches: Vec<Match> = pairs::pairs(&a, &b)
             .iter()
             .map(|p| Match { a: position(&a.points[p.a]), b: position(&b.points[p.b]) })
             .collect();

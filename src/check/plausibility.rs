@@ -2,10 +2,10 @@
 //!
 //! Input: grey photographs and cameras. Output: findings in the [`PairReport`].
 
-use super::image::GrayImage;
 use super::mistakes::NORMALISED_FOCAL;
 use super::report::{PairReport, Verdict};
 use crate::camera::{Camera, Intrinsics};
+use crate::matches::GrayImage;
 
 /// Largest mean difference of two copies of one photograph, 0 to 1: below the error of
 /// recompression.

@@ -5,6 +5,7 @@ pub mod chunks;
 pub mod crop;
 pub mod dataset;
 pub mod depth;
+pub mod exposure;
 pub mod pair;
 pub(crate) mod photographic;
 pub mod procedural;

@@ -2,7 +2,7 @@
 //! conversion of a file's entries to checked [`Frame`]s.
 
 use super::image::{Probe, probe};
-use super::scene::{Frame, Scene, SceneFormat, Units};
+use super::scene::{Frame, Pixels, Scene, SceneFormat, Units};
 use super::undistort::Distortion;
 use super::{Error, Result};
 use crate::camera::{Camera, CameraError, Intrinsics};
@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 pub(super) enum Lens {
     /// fx, fy, cx, cy in pixels of the pose file's size.
     Pixels([f64; 4]),
-    /// fx, fy, cx, cy divided by width and height of the stored picture.
+    /// fx, fy, cx, cy divided by width and height of the picture.
     Normalised([f64; 4]),
 }
 
@@ -28,6 +28,8 @@ pub(super) struct Draft {
     pub file: String,
     /// Path of the picture on disk, `None` if there is none.
     pub image: Option<PathBuf>,
+    /// Pixels to which the intrinsics refer.
+    pub pixels: Pixels,
     /// Intrinsics.
     pub lens: Lens,
     /// Picture size to which the intrinsics belong, if the file has it.
@@ -50,6 +52,7 @@ impl Draft {
             place,
             file,
             image: None,
+            pixels: Pixels::Stored,
             lens,
             size: None,
             world_from_camera,
@@ -63,8 +66,10 @@ impl Draft {
 
 /// Extensions tried where a pose file names a picture without one (NeRF's blender
 /// scenes, some nerfstudio exports).
-pub(super) const EXTENSIONS: [&str; 12] =
-    ["png", "jpg", "jpeg", "PNG", "JPG", "JPEG", "webp", "tif", "tiff", "TIF", "bmp", "BMP"];
+pub(super) const EXTENSIONS: [&str; 14] = [
+    "png", "jpg", "jpeg", "PNG", "JPG", "JPEG", "webp", "tif", "tiff", "TIF", "bmp", "BMP", "heic",
+    "HEIC",
+];
 
 /// Searches for a picture below `roots`, with and without `images/` between.
 pub(super) fn find_image(roots: &[&Path], name: &str) -> Option<PathBuf> {
@@ -172,14 +177,14 @@ pub(super) fn orthonormal(pose: DMat4) -> OrthonormalPose {
     OrthonormalPose { pose, error }
 }
 
-/// Intrinsics of a stored picture.
+/// Intrinsics in pixels of a picture on disk.
 struct StoredIntrinsics {
     intrinsics: Intrinsics,
     /// They were scaled from the pose file's size.
     rescaled: bool,
 }
 
-/// Computes the intrinsics of the stored picture; an error is the picture's size.
+/// Computes the intrinsics of the picture on disk; an error is the picture's size.
 fn stored_intrinsics(
     draft: &Draft,
     stored: &Probe,
@@ -226,7 +231,7 @@ pub(super) fn assemble(path: &Path, source: SceneFormat, drafts: Vec<Draft>) -> 
         return Err(Error::format(path, "at least one frame", "none"));
     }
     let probes: Vec<Option<Result<Probe>>> =
-        drafts.par_iter().map(|d| d.image.as_deref().map(probe)).collect();
+        drafts.par_iter().map(|d| d.image.as_deref().map(|image| size(image, d.pixels))).collect();
     let count = drafts.len();
     let mut notes = Notes::default();
     let mut frames = Vec::with_capacity(count);
@@ -250,6 +255,15 @@ pub(super) fn assemble(path: &Path, source: SceneFormat, drafts: Vec<Draft>) -> 
         units: Units::Unknown,
         near_far: None,
         warnings: notes.lines(count),
+    })
+}
+
+/// Reads the size of the pixels to which a camera refers.
+fn size(image: &Path, pixels: Pixels) -> Result<Probe> {
+    let stored = probe(image)?;
+    Ok(match pixels {
+        Pixels::Stored => stored,
+        Pixels::Upright => stored.upright(),
     })
 }
 
@@ -292,6 +306,7 @@ fn frame(
     Ok(Frame {
         name: Path::new(name).with_extension("").to_string_lossy().into_owned(),
         image,
+        pixels: draft.pixels,
         camera,
         distortion: draft.distortion,
         timestamp: draft.timestamp,

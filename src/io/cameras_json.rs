@@ -9,18 +9,20 @@
 //! ```
 //!
 //! `c2w` is OpenCV camera-to-world; intrinsics are in pixels of the stored picture, without
-//! distortion. Optional keys of a frame are `timestamp_us` and `depth`. Optional keys of the
-//! file are `units` (`metres`, `re10k`) or `metric: true`, and `near` and `far` (camera z in
-//! world units, for all frames). Unknown keys are ignored.
+//! distortion. Optional keys of a frame are `timestamp_us`, `depth`, and `pixels`: `"upright"`
+//! if the camera refers to the picture with its EXIF orientation applied (default: `"stored"`).
+//! Optional keys of the file are `units` (`metres`, `re10k`) or `metric: true`, `near` and `far` (camera z in
+//! world units, for all frames), and `points`, a list of `[x, y, z]` of sparse points. Unknown
+//! keys are ignored.
 //!
 //! The list of 3DGS has `img_name, width, height, fx, fy, rotation` (camera to world),
 //! `position` (of the camera): the same axes, principal point in the middle.
 
 use super::assemble::{Draft, Lens, assemble, camera_error, find_image, orthonormal};
-use super::scene::{Frame, Scene, SceneFormat, Units};
+use super::scene::{Frame, Pixels, Scene, SceneFormat, Units};
 use super::{Error, Result, read, write_atomic};
 use crate::camera::{Camera, Intrinsics, NearFar};
-use glam::{DMat4, DVec4};
+use glam::{DMat4, DVec4, Vec3};
 use serde::{Deserialize, Serialize};
 use std::io::Write;
 use std::path::Path;
@@ -28,11 +30,16 @@ use std::path::Path;
 const CONVENTION: &str = "OpenCV camera-to-world (x right, y down, z forward); pixel intrinsics at \
                           the stored resolution; pinhole";
 
+/// Value of the key `pixels` for [`Pixels::Upright`].
+const UPRIGHT: &str = "upright";
+
 /// A camera with the name of its picture, which need not exist.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NamedCamera {
     /// Path of the picture, relative to the folder of the file.
     pub file: String,
+    /// Pixels to which the camera refers.
+    pub pixels: Pixels,
     /// The camera.
     pub camera: Camera,
     /// Time stamp, microseconds.
@@ -53,10 +60,11 @@ pub struct CameraFile {
 }
 
 /// Fields of the file that concern all frames.
-#[derive(Clone, Copy, Default)]
+#[derive(Clone, Default)]
 struct FileInfo {
     units: Units,
     near_far: Option<NearFar>,
+    points: Option<Vec<Vec3>>,
 }
 
 #[derive(Deserialize)]
@@ -67,6 +75,7 @@ struct InFile {
     metric: bool,
     near: Option<f32>,
     far: Option<f32>,
+    points: Option<Vec<[f32; 3]>>,
     frames: Vec<InFrame>,
 }
 
@@ -84,6 +93,7 @@ struct InFrame {
     timestamp_us: Option<i64>,
     re10k_frame: Option<i64>,
     depth: Option<String>,
+    pixels: Option<String>,
 }
 
 #[derive(Deserialize)]
@@ -108,11 +118,15 @@ struct OutFile<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
     far: Option<f32>,
     frames: Vec<OutFrame<'a>>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    points: Vec<[f32; 3]>,
 }
 
 #[derive(Serialize)]
 struct OutFrame<'a> {
     file: &'a str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pixels: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
     depth: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -197,8 +211,12 @@ fn drafts(path: &Path) -> Result<(Vec<Draft>, FileInfo)> {
             return Err(Error::format(path, "both near and far, 0 < near < far", got));
         }
     };
+    let points = file.points.map(|p| p.into_iter().map(Vec3::from).collect::<Vec<_>>());
+    if let Some(bad) = points.iter().flatten().find(|p| !p.is_finite()) {
+        return Err(Error::format(path, "finite points", format!("{bad}")));
+    }
     let drafts = file.frames.into_iter().enumerate().map(|(i, f)| draft(path, i, f));
-    Ok((drafts.collect::<Result<_>>()?, FileInfo { units, near_far }))
+    Ok((drafts.collect::<Result<_>>()?, FileInfo { units, near_far, points }))
 }
 
 fn size(path: &Path, place: &str, width: f64, height: f64) -> Result<Option<(usize, usize)>> {
@@ -217,8 +235,17 @@ fn draft(path: &Path, index: usize, f: InFrame) -> Result<Draft> {
         matrix(&f.c2w).map_err(|got| Error::format(path, "c2w of 4x4 numbers", got).at(&place))?;
     let size = size(path, &place, f.width, f.height)?;
     let lens = Lens::Pixels([f.fx, f.fy, f.cx, f.cy]);
+    let pixels = match f.pixels.as_deref() {
+        None | Some("stored") => Pixels::Stored,
+        Some(UPRIGHT) => Pixels::Upright,
+        Some(other) => {
+            let expected = "pixels `stored` or `upright`";
+            return Err(Error::format(path, expected, format!("`{other}`")).at(place));
+        }
+    };
     let depth = f.depth.map(|d| folder(path).join(d));
-    Ok(Draft { size, timestamp: f.timestamp_us, depth, ..Draft::new(place, f.file, lens, pose) })
+    let draft = Draft::new(place, f.file, lens, pose);
+    Ok(Draft { size, pixels, timestamp: f.timestamp_us, depth, ..draft })
 }
 
 fn splat_draft(path: &Path, index: usize, f: SplatFrame) -> Result<Draft> {
@@ -245,6 +272,7 @@ pub(super) fn load(path: &Path) -> Result<Scene> {
     let mut scene = assemble(path, SceneFormat::CamerasJson, drafts)?;
     scene.units = info.units;
     scene.near_far = info.near_far;
+    scene.points = info.points;
     Ok(scene)
 }
 
@@ -267,7 +295,8 @@ pub fn load_cameras_json(path: &Path) -> Result<CameraFile> {
             .depth
             .as_deref()
             .map(|p| p.strip_prefix(folder(path)).unwrap_or(p).to_string_lossy().into_owned());
-        cameras.push(NamedCamera { file: d.file, camera, timestamp: d.timestamp, depth });
+        let (file, pixels, timestamp) = (d.file, d.pixels, d.timestamp);
+        cameras.push(NamedCamera { file, pixels, camera, timestamp, depth });
     }
     Ok(CameraFile { cameras, units: info.units, near_far: info.near_far })
 }
@@ -277,6 +306,15 @@ pub fn load_cameras_json(path: &Path) -> Result<CameraFile> {
 /// # Errors
 /// Errors of [`write_atomic`].
 pub fn save_cameras_json(path: &Path, content: &CameraFile) -> Result<()> {
+    save_cameras_and_points(path, content, &[])
+}
+
+/// Writes this layout with sparse points, world units, from which [`super::scene::load_scene`]'s
+/// callers take near and far.
+///
+/// # Errors
+/// Errors of [`write_atomic`].
+pub fn save_cameras_and_points(path: &Path, content: &CameraFile, points: &[Vec3]) -> Result<()> {
     let frame = |c: &'_ NamedCamera| {
         let Intrinsics { fx, fy, cx, cy, width, height } = c.camera.intrinsics;
         let c2w = c.camera.world_from_camera.transpose().to_cols_array_2d();
@@ -284,8 +322,9 @@ pub fn save_cameras_json(path: &Path, content: &CameraFile) -> Result<()> {
     };
     let frames = content.cameras.iter().map(|c| {
         let (fx, fy, cx, cy, width, height, c2w) = frame(c);
-        let (file, depth) = (c.file.as_str(), c.depth.as_deref());
-        OutFrame { file, depth, timestamp_us: c.timestamp, width, height, fx, fy, cx, cy, c2w }
+        let (file, depth, timestamp_us) = (c.file.as_str(), c.depth.as_deref(), c.timestamp);
+        let pixels = (c.pixels == Pixels::Upright).then_some(UPRIGHT);
+        OutFrame { file, pixels, depth, timestamp_us, width, height, fx, fy, cx, cy, c2w }
     });
     let units = match content.units {
         Units::Unknown => None,
@@ -293,15 +332,24 @@ pub fn save_cameras_json(path: &Path, content: &CameraFile) -> Result<()> {
         Units::RealEstate10k => Some("re10k"),
     };
     let (near, far) = content.near_far.map(|range| (range.near, range.far)).unzip();
-    let out = OutFile { convention: CONVENTION, units, near, far, frames: frames.collect() };
+    let (frames, points) = (frames.collect(), points.iter().map(Vec3::to_array).collect());
+    let out = OutFile { convention: CONVENTION, units, near, far, frames, points };
     let text = serde_json::to_string_pretty(&out)
         .map_err(|e| Error::io(path, std::io::Error::other(e)))?;
     write_atomic(path, |f| writeln!(f, "{text}"))
 }
 
 impl NamedCamera {
-    /// Makes a named camera of a frame's camera and the new path `file` of its picture.
+    /// Makes a named camera of a stored picture at the path `file`, without time stamp and
+    /// depth map.
+    pub fn new(file: impl Into<String>, camera: Camera) -> Self {
+        Self { file: file.into(), pixels: Pixels::Stored, camera, timestamp: None, depth: None }
+    }
+
+    /// Makes a named camera of a frame's camera and the new path `file` of its picture. A file
+    /// that is written anew has upright pixels, for which both values of [`Pixels`] agree.
     pub fn of_frame(frame: &Frame, file: impl Into<String>) -> Self {
-        Self { file: file.into(), camera: frame.camera, timestamp: frame.timestamp, depth: None }
+        let (pixels, timestamp) = (frame.pixels, frame.timestamp);
+        Self { pixels, timestamp, ..Self::new(file, frame.camera) }
     }
 }

@@ -1,15 +1,16 @@
-//! Reading of pictures (PNG, JPEG, WebP, TIFF, BMP), and writing (8-bit PNG, 16-bit depth
-//! PNG).
+//! Reading of pictures (PNG, JPEG, WebP, TIFF, BMP; HEIC with feature `heic`), and writing
+//! (8-bit PNG, 16-bit depth PNG).
 //!
-//! In memory a picture is 8-bit RGB, rows from the top, because the evaluation protocol
-//! resizes uint8 (MVSplat, with PIL). The network reads `[3, H, W]` floats in [0, 1]. There
-//! is no colour management. EXIF orientation is reported and never applied, because pose
-//! files refer to the stored pixels.
+//! In memory a picture is 8-bit sRGB, rows from the top, because the evaluation protocol
+//! resizes uint8 (MVSplat, with PIL). The network reads `[3, H, W]` floats in [0, 1]. A
+//! picture with an ICC profile of another colour space is converted to sRGB (`icc.rs`).
+//!
+//! EXIF orientation is reported here and never applied, because pose files refer to the
+//! stored pixels. `photograph.rs` applies it.
 
+use super::decode::{self, decode, decoder};
 use super::{Error, Result, read, write_atomic};
-use image::{ImageDecoder, ImageReader, Limits};
-use std::fs::File;
-use std::io::{BufRead, BufReader, Seek, Write};
+use std::io::Write;
 use std::path::Path;
 
 /// Largest number of pixels of a picture; checked before anything is allocated.
@@ -117,43 +118,44 @@ pub struct Probe {
     pub orientation: Option<u8>,
 }
 
-fn refused(path: &Path, error: image::ImageError) -> Error {
-    match error {
-        image::ImageError::IoError(e) if e.raw_os_error().is_some() => Error::io(path, e),
-        e => Error::format(path, "a PNG, JPEG, WebP, TIFF or BMP picture", e.to_string()),
+impl Probe {
+    /// Returns the size after [`Probe::orientation`] is applied: orientations 5 to 8 exchange
+    /// width and height.
+    #[must_use]
+    pub fn upright(self) -> Self {
+        let Self { width, height, orientation } = self;
+        match orientation {
+            Some(5..=8) => Self { width: height, height: width, orientation: None },
+            _ => Self { width, height, orientation: None },
+        }
     }
 }
 
-/// Opens a decoder of `path` and checks the size. The content selects the decoder, not the
-/// file's extension.
-fn file_decoder(path: &Path) -> Result<impl ImageDecoder> {
-    let file = File::open(path).map_err(|e| Error::io(path, e))?;
-    let empty = file.metadata().is_ok_and(|m| m.len() == 0);
-    decoder(BufReader::new(file), empty, path)
+/// Treatment of a JPEG that ends before its end-of-image marker.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Truncated {
+    /// The file is an error.
+    #[default]
+    Refuse,
+    /// The file gives a warning. Pixels without data are grey or coarse.
+    Accept,
 }
 
-fn decoder<'a, R: BufRead + Seek + 'a>(
-    input: R,
-    empty: bool,
-    path: &Path,
-) -> Result<Box<dyn ImageDecoder + 'a>> {
-    let mut reader = ImageReader::new(input);
-    let mut limits = Limits::default();
-    // 16-bit RGBA of the largest size, and as much again for the decoder.
-    limits.max_alloc = Some(MAX_PIXELS * 16);
-    reader.limits(limits);
-    let reader = reader.with_guessed_format().map_err(|e| Error::io(path, e))?;
-    if reader.format().is_none() {
-        let got = if empty { "an empty file" } else { "bytes of no known picture format" };
-        return Err(Error::format(path, "a PNG, JPEG, WebP, TIFF or BMP picture", got));
-    }
-    let decoder = reader.into_decoder().map_err(|e| refused(path, e))?;
-    let (w, h) = decoder.dimensions();
-    if w == 0 || h == 0 || u64::from(w) * u64::from(h) > MAX_PIXELS {
-        let expected = format!("1 to {} megapixels", MAX_PIXELS / 1_000_000);
-        return Err(Error::format(path, expected, format!("{w}x{h} pixels")));
-    }
-    Ok(Box::new(decoder))
+/// Options of [`load_with`] and of the photographs' loader.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct LoadOptions {
+    /// Treatment of truncated JPEG files. A truncated file of another format is always an
+    /// error.
+    pub truncated: Truncated,
+}
+
+/// A decoded picture and the warnings about its file.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LoadedPicture {
+    /// Stored pixels, sRGB.
+    pub picture: Rgb,
+    /// Warnings for the user, one line each, with the file's path.
+    pub warnings: Vec<String>,
 }
 
 /// Reads size and orientation from the header.
@@ -161,24 +163,29 @@ fn decoder<'a, R: BufRead + Seek + 'a>(
 /// # Errors
 /// Missing, not a picture, more than [`MAX_PIXELS`].
 pub fn probe(path: &Path) -> Result<Probe> {
-    let mut decoder = file_decoder(path)?;
-    let (w, h) = decoder.dimensions();
-    // A picture with a malformed EXIF block still decodes.
-    let orientation = decoder.orientation().map_or(1, image::metadata::Orientation::to_exif);
-    Ok(Probe {
-        width: w as usize,
-        height: h as usize,
-        orientation: (orientation > 1).then_some(orientation),
-    })
+    Ok(decode::header(path)?.probe)
 }
 
 /// Decodes a picture. Grey becomes three equal channels, 16 bits are rounded to 8, and
-/// transparency is blended with black, the renderer's background.
+/// transparency is blended with black, the renderer's background. An ICC profile other than
+/// sRGB's is applied. The rotation and the mirroring of a HEIC file belong to its format and
+/// are applied as well.
 ///
 /// # Errors
-/// Missing, truncated, not a picture, more than [`MAX_PIXELS`].
+/// Missing, truncated, not a picture, more than [`MAX_PIXELS`]; CMYK without Adobe's marker;
+/// HEIC without feature `heic`.
 pub fn load(path: &Path) -> Result<Rgb> {
-    decode(file_decoder(path)?, path)
+    Ok(load_with(path, &LoadOptions::default())?.picture)
+}
+
+/// Decodes a picture as [`load`] does, with options, and returns the warnings.
+///
+/// # Errors
+/// As [`load`]; with [`Truncated::Accept`] only a truncated JPEG without any decodable pixel.
+pub fn load_with(path: &Path, options: &LoadOptions) -> Result<LoadedPicture> {
+    let bytes = read(path)?;
+    let decoded = decode(&bytes, options, path)?;
+    Ok(LoadedPicture { picture: decoded.picture, warnings: decoded.warnings })
 }
 
 /// Decodes bytes in memory as [`load`] does; `path` is for errors.
@@ -186,22 +193,7 @@ pub fn load(path: &Path) -> Result<Rgb> {
 /// # Errors
 /// As [`load`].
 pub fn parse_picture(bytes: &[u8], path: &Path) -> Result<Rgb> {
-    decode(decoder(std::io::Cursor::new(bytes), bytes.is_empty(), path)?, path)
-}
-
-fn decode(decoder: impl ImageDecoder, path: &Path) -> Result<Rgb> {
-    let decoded = image::DynamicImage::from_decoder(decoder).map_err(|e| refused(path, e))?;
-    let (width, height) = (decoded.width() as usize, decoded.height() as usize);
-    let data = if decoded.color().has_alpha() {
-        let rgba = decoded.into_rgba8().into_raw();
-        let over_black = |v: u8, a: u8| ((u32::from(v) * u32::from(a) + 127) / 255) as u8;
-        rgba.chunks_exact(4)
-            .flat_map(|p| [over_black(p[0], p[3]), over_black(p[1], p[3]), over_black(p[2], p[3])])
-            .collect()
-    } else {
-        decoded.into_rgb8().into_raw()
-    };
-    Ok(Rgb { width, height, data })
+    Ok(decode(bytes, &LoadOptions::default(), path)?.picture)
 }
 
 fn encode(
@@ -336,8 +328,9 @@ pub fn load_depth_png(path: &Path, unit: f32) -> Result<Depth> {
 /// # Errors
 /// As [`load_depth_png`].
 pub fn parse_depth_png(bytes: &[u8], unit: f32, path: &Path) -> Result<Depth> {
-    let decoder = decoder(std::io::Cursor::new(bytes), bytes.is_empty(), path)?;
-    let decoded = image::DynamicImage::from_decoder(decoder).map_err(|e| refused(path, e))?;
+    let decoder = decoder(std::io::Cursor::new(bytes), path)?.decoder;
+    let decoded =
+        image::DynamicImage::from_decoder(decoder).map_err(|e| decode::refused(path, e))?;
     let image::DynamicImage::ImageLuma16(grey) = decoded else {
         let got = format!("{:?}", decoded.color());
         return Err(Error::format(path, "16-bit grey depth", got));

@@ -24,8 +24,14 @@ pub use splats::{
 mod assemble;
 pub mod cameras_json;
 pub mod colmap;
+mod decode;
+pub mod exif;
+mod heic;
+mod icc;
 pub mod image;
+mod jpeg;
 pub mod matrices;
+pub mod photograph;
 pub mod protocol;
 pub mod re10k;
 pub mod resize;

@@ -5,11 +5,13 @@
 //! pose files in a folder is: `cameras.json`, `transforms.json`, COLMAP, RealEstate10K txt,
 //! `poses.txt` with `K.txt`. The path of a pose file selects that file.
 //!
-//! EXIF orientation is never applied, because pose files refer to the stored pixels. A
-//! picture with one gives a warning.
+//! Pose files refer to the stored pixels ([`Pixels::Stored`]): EXIF orientation is not applied,
+//! and a picture with one gives a warning. Cameras of loose photographs refer to the upright
+//! pixels ([`Pixels::Upright`]).
 
 use super::assemble::{Draft, Lens, assemble};
-use super::image::Rgb;
+use super::image::{LoadOptions, LoadedPicture, Rgb, load_with};
+use super::photograph::load_photograph;
 use super::undistort::{Distortion, pinhole, undistort};
 use super::{Error, Result, cameras_json, colmap, matrices, re10k, transforms};
 use crate::camera::{Camera, NearFar};
@@ -31,6 +33,8 @@ pub enum SceneFormat {
     Matrices,
     /// Two pictures with cameras from the command line.
     Pair,
+    /// Photographs whose cameras were estimated from the photographs alone.
+    Photographs,
 }
 
 impl SceneFormat {
@@ -43,7 +47,13 @@ impl SceneFormat {
             Self::RealEstate10k => "RealEstate10K txt",
             Self::Matrices => "poses.txt with K.txt",
             Self::Pair => "two pictures with given cameras",
+            Self::Photographs => "photographs with estimated cameras",
         }
+    }
+
+    /// Returns whether the cameras come from a file.
+    pub fn has_file(self) -> bool {
+        !matches!(self, Self::Pair | Self::Photographs)
     }
 }
 
@@ -59,6 +69,16 @@ pub enum Units {
     RealEstate10k,
 }
 
+/// The pixels to which a camera refers.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Pixels {
+    /// The file's pixels as they are stored. Pose files refer to these.
+    #[default]
+    Stored,
+    /// The pixels after the EXIF orientation is applied.
+    Upright,
+}
+
 /// One posed photograph.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
@@ -66,16 +86,29 @@ pub struct Frame {
     pub name: String,
     /// Path of the picture on disk.
     pub image: PathBuf,
-    /// Camera of the stored picture without [`Frame::distortion`].
+    /// Pixels to which camera, distortion and depth map refer.
+    pub pixels: Pixels,
+    /// Camera of the picture without [`Frame::distortion`].
     pub camera: Camera,
-    /// Lens distortion of the stored picture.
+    /// Lens distortion of the picture.
     pub distortion: Distortion,
     /// Time stamp of a video frame, microseconds (RealEstate10K).
     pub timestamp: Option<i64>,
-    /// 16-bit depth map of the stored picture, if the pose file names one.
+    /// 16-bit depth map of the picture, if the pose file names one.
     pub depth: Option<PathBuf>,
     /// Indices into [`Scene::points`] of the points that this frame observes.
     pub visible: Vec<u32>,
+}
+
+/// Picture, camera and warnings of a [`Frame`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct LoadedFrame {
+    /// The picture without lens distortion.
+    pub picture: Rgb,
+    /// Pinhole camera of the picture.
+    pub camera: Camera,
+    /// Warnings about the file, one line each, with its path.
+    pub warnings: Vec<String>,
 }
 
 impl Frame {
@@ -92,22 +125,40 @@ impl Frame {
             .map_err(|e| Error::format(&self.image, "a valid camera", e.to_string()))
     }
 
-    /// Decodes the picture and removes the lens distortion.
+    /// Decodes the picture, turns it upright if [`Frame::pixels`] says so, and removes the lens
+    /// distortion.
     ///
     /// # Errors
     /// Errors of [`super::image::load`]; a size that is not the camera's.
     pub fn load(&self) -> Result<(Rgb, Camera)> {
-        let picture = super::image::load(&self.image)?;
+        let LoadedFrame { picture, camera, .. } = self.load_with(&LoadOptions::default())?;
+        Ok((picture, camera))
+    }
+
+    /// Loads the frame as [`Frame::load`] does, with options, and returns the warnings.
+    ///
+    /// # Errors
+    /// Errors of [`super::image::load_with`]; a size that is not the camera's.
+    pub fn load_with(&self, options: &LoadOptions) -> Result<LoadedFrame> {
+        let LoadedPicture { picture, warnings } = match self.pixels {
+            Pixels::Stored => load_with(&self.image, options)?,
+            Pixels::Upright => {
+                let photograph = load_photograph(&self.image, options)?;
+                let (picture, warnings) = (photograph.image, photograph.warnings);
+                LoadedPicture { picture, warnings }
+            }
+        };
         let k = &self.camera.intrinsics;
         if (picture.width, picture.height) != (k.width, k.height) {
             let got = format!("{}x{}", picture.width, picture.height);
             return Err(Error::format(&self.image, format!("{}x{}", k.width, k.height), got));
         }
         let camera = self.pinhole()?;
-        if self.distortion == Distortion::None {
-            return Ok((picture, camera));
-        }
-        Ok((undistort(&picture, k, &self.distortion, &camera.intrinsics), camera))
+        let picture = match self.distortion {
+            Distortion::None => picture,
+            _ => undistort(&picture, k, &self.distortion, &camera.intrinsics),
+        };
+        Ok(LoadedFrame { picture, camera, warnings })
     }
 }
 
@@ -131,16 +182,32 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// Makes a scene of two pictures with known cameras of the pictures' sizes.
+    /// Makes a scene of two loose photographs with known cameras. The cameras refer to the
+    /// upright pixels ([`Pixels::Upright`]) and have the upright pictures' sizes.
     ///
     /// # Errors
     /// A picture that is missing, malformed or of another size.
     pub fn from_pair(a: &Path, b: &Path, camera_a: Camera, camera_b: Camera) -> Result<Self> {
-        let draft = |path: &Path, camera: Camera| {
+        let photographs = [(a.to_owned(), camera_a), (b.to_owned(), camera_b)];
+        Self::from_photographs(SceneFormat::Pair, a, &photographs)
+    }
+
+    /// Makes a scene of loose photographs with cameras of their upright pixels. `path` names the
+    /// scene in messages.
+    ///
+    /// # Errors
+    /// As [`Scene::from_pair`].
+    pub fn from_photographs(
+        source: SceneFormat,
+        path: &Path,
+        photographs: &[(PathBuf, Camera)],
+    ) -> Result<Self> {
+        let draft = |(path, camera): &(PathBuf, Camera)| {
             let k = camera.intrinsics;
             Draft {
                 size: Some((k.width, k.height)),
-                image: Some(path.to_owned()),
+                pixels: Pixels::Upright,
+                image: Some(path.clone()),
                 ..Draft::new(
                     String::new(),
                     path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
@@ -149,8 +216,7 @@ impl Scene {
                 )
             }
         };
-        let drafts = vec![draft(a, camera_a), draft(b, camera_b)];
-        assemble(a, SceneFormat::Pair, drafts)
+        assemble(path, source, photographs.iter().map(draft).collect())
     }
 }
 

@@ -69,6 +69,9 @@ impl Weights {
         Self::parse(&io::read(path)?, path)
     }
 
+    /// The r for which SubSplat's heads ship.
+    pub const SHIPPED_UPSCALES: [usize; 2] = [2, 4];
+
     /// Returns the weights that ship in the crate, for r = `upscale`: the small backbone,
     /// and SubSplat's heads at ×2 and ×4. Another r has no trained heads; its children are
     /// the even split of their parents. The training data are procedural rooms

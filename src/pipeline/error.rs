@@ -5,6 +5,7 @@ use crate::camera::CameraError;
 use crate::config::ConfigError;
 use crate::io;
 use crate::metrics::MetricsError;
+use crate::poses::PoseRefusal;
 use crate::render::DeviceError;
 use crate::splats::SplatsError;
 use thiserror::Error;
@@ -36,6 +37,14 @@ pub enum Error {
     /// The poses do not fit the photographs, and [`Check::Refuse`](super::Check::Refuse) was set.
     #[error(transparent)]
     Poses(#[from] PoseError),
+    /// The photographs alone do not determine their cameras.
+    #[error("{photographs}: {reason}")]
+    NoPoses {
+        /// The photographs.
+        photographs: String,
+        /// The reason.
+        reason: PoseRefusal,
+    },
     /// A picture cannot be scored.
     #[error("{place}: {source}")]
     Score {

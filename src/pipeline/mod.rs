@@ -21,9 +21,11 @@
 //!
 //! 1. The initial depth range comes from [`Options::depth_range`], then from
 //!    [`Options::depth_prior`], then from the distance between the cameras.
-//! 2. Each photograph is cropped to the network's input and to the target size.
+//! 2. The size of the network's input follows from the photographs' shapes ([`InputSize`]). Each
+//!    photograph is cropped to it and to the target size.
 //! 3. Points are matched between consecutive photographs. They check the poses ([`Check`]),
-//!    and their depths replace a range that was only guessed.
+//!    their depths replace a range that was only guessed, and their colours bring the
+//!    photographs to the exposure of the first.
 //! 4. The small backbone estimates near and far at half size, unless the caller fixed one.
 //! 5. The network predicts one primary Gaussian per input pixel, then its children.
 //! 6. The photographs add detail to the children's colours ([`Detail`]).
@@ -35,7 +37,10 @@
 mod depth_range;
 mod detail;
 mod error;
+mod exposure;
 mod fit;
+mod input_size;
+mod loose;
 mod options;
 mod photo;
 mod poses;
@@ -48,6 +53,8 @@ mod warning;
 pub use crate::model::Backend;
 pub use depth_range::{DepthBounds, DepthRange, DepthSource};
 pub use error::{Error, Result};
+pub use input_size::InputSize;
+pub use loose::{KnownLens, LensSource, LooseOptions, LooseScene, loose_scene};
 pub use options::{Check, Detail, Options};
 pub use photo::Photo;
 pub use poses::PoseError;

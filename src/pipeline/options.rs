@@ -1,6 +1,6 @@
 //! Options of a reconstruction.
 
-use super::{DepthBounds, DepthRange, Error, Result, initial_bounds};
+use super::{DepthBounds, DepthRange, Error, InputSize, Result, initial_bounds};
 use crate::camera::Camera;
 use crate::fit::FitOptions;
 
@@ -8,19 +8,18 @@ use crate::fit::FitOptions;
 /// program `subsplat run`.
 ///
 /// ```
-/// use subsplat::pipeline::{Check, DepthRange, Options};
+/// use subsplat::pipeline::{Check, DepthRange, InputSize, Options};
 /// let options = Options::default()
 ///     .with_input_size(320, 192)
 ///     .with_depth_range(DepthRange::Fixed { near: 0.5, far: 20.0 })
 ///     .with_check(Check::Refuse);
-/// assert_eq!(options.input_size, (320, 192));
+/// assert_eq!(options.input_size, InputSize::exact(320, 192));
 /// ```
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 #[non_exhaustive]
 pub struct Options {
-    /// Width and height of the network's input, px; cut to multiples of the model's stride.
-    /// Default: 256×256.
-    pub input_size: (usize, usize),
+    /// Size of the network's input. Default: the area of 256×256 in the photographs' shape.
+    pub input_size: InputSize,
     /// Ends of the depth range that the caller fixes. Default: [`DepthRange::Auto`].
     pub depth_range: DepthRange,
     /// Depth range that a file suggests, used for the ends that `depth_range` leaves open.
@@ -34,25 +33,18 @@ pub struct Options {
     pub fit: FitOptions,
 }
 
-impl Default for Options {
-    fn default() -> Self {
-        Self {
-            input_size: (256, 256),
-            depth_range: DepthRange::default(),
-            depth_prior: None,
-            check: Check::default(),
-            detail: Detail::default(),
-            fit: FitOptions::default(),
-        }
-    }
-}
-
 impl Options {
-    /// Sets [`Options::input_size`].
+    /// Sets [`Options::input_size`] to these sides, px. Photographs of another shape lose what
+    /// lies outside the middle.
     #[must_use]
-    pub fn with_input_size(mut self, width: usize, height: usize) -> Self {
-        self.input_size = (width, height);
-        self
+    pub fn with_input_size(self, width: usize, height: usize) -> Self {
+        Self { input_size: InputSize::exact(width, height), ..self }
+    }
+
+    /// Sets [`Options::input_size`] to about `pixels` in the photographs' shape.
+    #[must_use]
+    pub fn with_input_area(self, pixels: usize) -> Self {
+        Self { input_size: InputSize::Area(pixels), ..self }
     }
 
     /// Sets [`Options::depth_range`].

@@ -3,8 +3,8 @@
 use super::{Error, Result};
 use crate::camera::Camera;
 use crate::data::crop::{CropOptions, Cropped, crop};
-use crate::io::image::Rgb;
-use crate::io::scene::Frame;
+use crate::io::image::{LoadOptions, Rgb};
+use crate::io::scene::{Frame, LoadedFrame};
 
 /// A photograph without lens distortion, and its pinhole camera.
 #[derive(Clone, Debug, PartialEq)]
@@ -40,8 +40,16 @@ impl Photo {
     /// # Errors
     /// Those of [`Frame::load`].
     pub fn from_frame(frame: &Frame) -> Result<Self> {
-        let (image, camera) = frame.load()?;
-        Ok(Self { image, camera })
+        Self::from_frame_with(frame, &LoadOptions::default())
+    }
+
+    /// [`Photo::from_frame`] with options of the decoding.
+    ///
+    /// # Errors
+    /// Those of [`Frame::load_with`].
+    pub fn from_frame_with(frame: &Frame, options: &LoadOptions) -> Result<Self> {
+        let LoadedFrame { picture, camera, .. } = frame.load_with(options)?;
+        Ok(Self { image: picture, camera })
     }
 
     /// The pixels.

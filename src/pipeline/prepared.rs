@@ -18,6 +18,7 @@ pub struct Prepared<'a> {
     pub(super) model: &'a Reconstructor,
     pub(super) options: Options,
     pub(super) inputs: Vec<Cropped>,
+    pub(super) cut_shares: Vec<f32>,
     pub(super) bounds: DepthBounds,
     pub(super) reports: Vec<PairReport>,
     pub(super) warnings: Vec<Warning>,
@@ -28,6 +29,11 @@ impl Prepared<'_> {
     /// The photographs at the sizes of the network's input and of the target.
     pub fn inputs(&self) -> &[Cropped] {
         &self.inputs
+    }
+
+    /// Share of each photograph that its crop does not show, 0 to 1.
+    pub fn cut_shares(&self) -> &[f32] {
+        &self.cut_shares
     }
 
     /// The depth range before the network estimates its own.
@@ -62,7 +68,8 @@ impl Prepared<'_> {
         self,
         progress: &mut dyn FnMut(Progress) -> ControlFlow<()>,
     ) -> Result<Reconstruction> {
-        let Self { model, options, inputs, bounds, reports, mut warnings, mut tracker } = self;
+        let Self { model, options, inputs, cut_shares, bounds, reports, mut warnings, mut tracker } =
+            self;
         if model.estimates_depth_range(&options) {
             tracker.begin(Stage::DepthRange, progress)?;
         }
@@ -113,6 +120,7 @@ impl Prepared<'_> {
         Ok(Reconstruction {
             splats,
             inputs,
+            cut_shares,
             depths,
             bounds,
             initial_bounds,

@@ -18,6 +18,7 @@ use std::path::Path;
 pub struct Reconstruction {
     pub(super) splats: Splats,
     pub(super) inputs: Vec<Cropped>,
+    pub(super) cut_shares: Vec<f32>,
     pub(super) depths: Vec<Depth>,
     pub(super) bounds: DepthBounds,
     pub(super) initial_bounds: DepthBounds,
@@ -64,6 +65,11 @@ impl Reconstruction {
     /// The photographs at the sizes of the network's input and of the target.
     pub fn inputs(&self) -> &[Cropped] {
         &self.inputs
+    }
+
+    /// Share of each photograph that its crop does not show, 0 to 1.
+    pub fn cut_shares(&self) -> &[f32] {
+        &self.cut_shares
     }
 
     /// Predicted depth of each input, camera z, world units.

@@ -4,7 +4,7 @@ use super::progress::{Callback, StageCost, Tracker};
 use super::warning::Warning;
 use super::{
     Check, DepthBounds, DepthRange, DepthSource, Detail, Options, Photo, Prepared, Progress,
-    Reconstruction, Result, Stage, check_pairs, is_mvsplat, poses, refined_bounds,
+    Reconstruction, Result, Stage, check_pairs, exposure, is_mvsplat, poses, refined_bounds,
 };
 use crate::camera::{Camera, NearFar};
 use crate::config::{Config, Preset};
@@ -23,6 +23,8 @@ pub struct Reconstructor {
     backend: Backend,
     /// SubSplat's tensors that the weight file lacks.
     missing: usize,
+    /// The r for which the weights have trained heads; empty where unknown.
+    trained: Vec<usize>,
 }
 
 impl Reconstructor {
@@ -42,7 +44,8 @@ impl Reconstructor {
     /// # Errors
     /// An `upscale` out of range.
     pub fn shipped(upscale: usize) -> Result<Self> {
-        Self::from_weights(Weights::shipped(upscale)?, None)
+        let built = Self::from_weights(Weights::shipped(upscale)?, None)?;
+        Ok(Self { trained: Weights::SHIPPED_UPSCALES.to_vec(), ..built })
     }
 
     /// Builds a model from a weight file. `config` replaces the file's own configuration. A
@@ -75,7 +78,7 @@ impl Reconstructor {
 
     fn build(config: &Config, weights: Weights) -> Result<Self> {
         let model = SubSplat::new(config, weights.builder())?;
-        Ok(Self { model, weights, backend: Backend::Cpu, missing: 0 })
+        Ok(Self { model, weights, backend: Backend::Cpu, missing: 0, trained: Vec::new() })
     }
 
     /// The same model on another backend ([`SubSplat::with_backend`]). Where a GPU fails, the CPU
@@ -158,9 +161,10 @@ impl Reconstructor {
     ) -> Result<Prepared<'_>> {
         let cameras: Vec<Camera> = photos.iter().map(|p| *p.camera()).collect();
         let guess = options.initial_depth_range(&cameras)?;
-        let mut tracker = Tracker::new(self.stage_costs(photos.len(), options));
-        let crop = self.crop_options(options.input_size);
-        let inputs = crop_all(photos, &crop, &mut tracker, progress)?;
+        let sizes: Vec<_> = photos.iter().map(|p| (p.image().width, p.image().height)).collect();
+        let crop = self.crop_options(options.input_size.resolve(&sizes, self.config().stride()));
+        let mut tracker = Tracker::new(self.stage_costs(photos.len(), crop.input_size, options));
+        let mut inputs = crop_all(photos, &crop, &mut tracker, progress)?;
         let reports = match options.check {
             Check::Off => Vec::new(),
             Check::Warn | Check::Refuse => {
@@ -168,19 +172,32 @@ impl Reconstructor {
                 check_pairs(photos, |part| tracker.advance(part, progress))?
             }
         };
+        let corrected = exposure::equalise(photos, &mut inputs, &reports);
         tracker.close();
         if options.check == Check::Refuse {
             poses::refuse_bad(&reports)?;
         }
         let mut warnings = Warning::of_reports(&reports);
         warnings.extend(Warning::of_crops(photos, &inputs, &crop));
+        warnings.extend(corrected);
         if self.missing > 0 {
             let upscale = self.config().upscale;
-            warnings.push(Warning::UntrainedTensors { count: self.missing, upscale });
+            let (count, trained) = (self.missing, self.trained.clone());
+            warnings.push(Warning::UntrainedTensors { count, upscale, trained });
         }
         let bounds = refined_bounds(guess, options.depth_range, &reports);
         let options = options.clone();
-        Ok(Prepared { model: self, options, inputs, bounds, reports, warnings, tracker })
+        let cut_shares = inputs.iter().zip(sizes).map(|(c, size)| cut_share(c, size)).collect();
+        Ok(Prepared {
+            model: self,
+            options,
+            inputs,
+            cut_shares,
+            bounds,
+            reports,
+            warnings,
+            tracker,
+        })
     }
 
     /// The network's input of cropped photographs, and its depth range. The network estimates
@@ -224,8 +241,12 @@ impl Reconstructor {
 
     /// Rough durations, seconds on two cores (two photographs, 256² to 512²); the check and the
     /// crop depend on the photographs, the rest on the input's pixels.
-    fn stage_costs(&self, photos: usize, options: &Options) -> Vec<StageCost> {
-        let (w, h) = options.input_size;
+    fn stage_costs(
+        &self,
+        photos: usize,
+        (w, h): (usize, usize),
+        options: &Options,
+    ) -> Vec<StageCost> {
         let n = photos as f32;
         let pixels = n * w as f32 * h as f32 / (2.0 * 256.0 * 256.0);
         let mvsplat = is_mvsplat(self.config());
@@ -262,6 +283,15 @@ fn crop_all(
         tracker.advance(inputs.len() as f32 / photos.len() as f32, progress)?;
     }
     Ok(inputs)
+}
+
+/// Share of a photograph of `size` px that its crop does not show, 0 to 1.
+fn cut_share(crop: &Cropped, size: (usize, usize)) -> f32 {
+    let shown = crop.window.scale.x
+        * crop.target.width as f32
+        * crop.window.scale.y
+        * crop.target.height as f32;
+    (1.0 - shown / (size.0 as f32 * size.1 as f32)).clamp(0.0, 1.0)
 }
 
 /// Cropped photographs of one scene as the network's input.

@@ -44,13 +44,25 @@ pub enum Warning {
         /// Width and height after resizing, px.
         resized: (usize, usize),
     },
-    /// The weight file lacks some of SubSplat's tensors.
+    /// The weights lack some or all of SubSplat's tensors, the heads that place children.
     #[non_exhaustive]
     UntrainedTensors {
         /// Number of missing tensors.
         count: usize,
         /// r: side of the children's grid.
         upscale: usize,
+        /// The r that these weights have trained heads for; empty where unknown.
+        trained: Vec<usize>,
+    },
+    /// A photograph was brought to the exposure and white balance of the first one.
+    #[non_exhaustive]
+    ExposureCorrected {
+        /// Index of the photograph.
+        photo: usize,
+        /// Factor on each channel, red first.
+        gain: [f32; 3],
+        /// Offset of each channel, 8-bit levels.
+        offset: [f32; 3],
     },
     /// The GPU failed or refused a call, and the CPU did the work.
     #[non_exhaustive]
@@ -77,10 +89,33 @@ impl fmt::Display for Warning {
                 "the photograph of {w}x{h} is enlarged to {to_w}x{to_h}: the target shows no more \
                  detail than the photograph has"
             ),
-            Self::UntrainedTensors { count, upscale } => write!(
+            Self::UntrainedTensors { count, upscale, trained } => {
+                let children = upscale * upscale;
+                let known: Vec<String> = trained.iter().map(usize::to_string).collect();
+                match known.as_slice() {
+                    [] => write!(
+                        f,
+                        "the weights lack {count} tensors of the heads for upscale {upscale}"
+                    )?,
+                    _ => write!(
+                        f,
+                        "no trained heads exist for upscale {upscale}, only for {}",
+                        known.join(" and ")
+                    )?,
+                }
+                match children {
+                    1 => f.write_str(": each pixel gives the backbone's one Gaussian"),
+                    _ => write!(
+                        f,
+                        ": each pixel is split evenly into {children} Gaussians, which adds no \
+                         learned detail"
+                    ),
+                }
+            }
+            Self::ExposureCorrected { photo, gain: [r, g, b], offset: [x, y, z] } => write!(
                 f,
-                "the weights lack {count} of SubSplat's tensors for upscale {upscale}: pixels are \
-                 split evenly where heads are missing"
+                "photograph {photo} (counted from 0) is brought to the first one's exposure: gain \
+                 {r:.2} {g:.2} {b:.2}, offset {x:+.0} {y:+.0} {z:+.0} of 255"
             ),
             Self::CpuInsteadOfGpu { reason } => f.write_str(reason),
         }

@@ -108,12 +108,45 @@ fn bad_poses_are_warnings_or_an_error() {
     assert_eq!(error, "photographs: expected at least 2, got 1");
 }
 
+/// Photographs keep their shape and are never stretched; the cut share is the truth.
+#[test]
+fn the_input_has_the_shape_of_the_photographs() {
+    let model = untrained();
+    let options = Options::default().with_input_area(128 * 128).with_check(Check::Off);
+    for ((w, h), expected, cut) in
+        [((160, 96), (160, 96), 0.0), ((96, 160), (96, 160), 0.0), ((160, 144), (128, 128), 0.1)]
+    {
+        let photos = whole::shoot(3, 2, w, h).photos;
+        let prepared = model.prepare(&photos, &options).unwrap();
+        for (crop, share) in prepared.inputs().iter().zip(prepared.cut_shares()) {
+            assert_eq!((crop.input.width, crop.input.height), expected);
+            assert!((crop.window.scale.x / crop.window.scale.y - 1.0).abs() < 0.01, "{w}x{h}");
+            assert!((share - cut).abs() < 0.01, "{w}x{h}: {share}");
+        }
+        assert!(!prepared.warnings().iter().any(|w| matches!(w, Warning::InputSizeCut { .. })));
+    }
+    // Two shapes share one input.
+    let mut mixed = whole::shoot(3, 2, 160, 96).photos;
+    mixed[1] = whole::shoot(3, 2, 96, 160).photos.remove(1);
+    let prepared = model.prepare(&mixed, &options).unwrap();
+    assert!(prepared.inputs().iter().all(|c| (c.input.width, c.input.height) == (128, 128)));
+    assert!(prepared.cut_shares().iter().all(|s| (s - 0.4).abs() < 0.01));
+}
+
 #[test]
 fn untrained_heads_are_a_warning() {
-    for (upscale, expected) in [(2, false), (3, true)] {
+    let rows = [
+        (1, Some("only for 2 and 4: each pixel gives the backbone's one Gaussian")),
+        (2, None),
+        (3, Some("only for 2 and 4: each pixel is split evenly into 9 Gaussians")),
+        (4, None),
+    ];
+    for (upscale, expected) in rows {
         let model = Reconstructor::shipped(upscale).unwrap();
         let prepared = model.prepare(&photos(), &quick().with_check(Check::Off)).unwrap();
-        let untrained = |w: &Warning| matches!(w, Warning::UntrainedTensors { .. });
-        assert_eq!(prepared.warnings().iter().any(untrained), expected, "x{upscale}");
+        let untrained = |w: &&Warning| matches!(w, Warning::UntrainedTensors { .. });
+        let told = prepared.warnings().iter().find(untrained).map(Warning::to_string);
+        assert_eq!(told.is_some(), expected.is_some(), "x{upscale}: {told:?}");
+        assert!(told.unwrap_or_default().contains(expected.unwrap_or("")), "x{upscale}");
     }
 }

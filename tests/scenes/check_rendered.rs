@@ -144,6 +144,28 @@ fn pairs_without_depth_are_refused() {
     assert_eq!(report.verdict, Verdict::Warning);
 }
 
+/// A wrong rotation can cancel the parallax of most points. The baseline is then not the fault.
+#[test]
+fn a_wrong_rotation_is_no_small_baseline() {
+    let a = posed(0.0, 0.0, Vec3::ZERO);
+    let eye = Vec3::new(0.3, 0.0, 0.0);
+    let (first, second) = (render(&a), render(&posed(0.0, 0.0, eye)));
+    let options = CheckOptions::default();
+    let mut doubtful = 0;
+    for i in 0..12 {
+        let turned = posed(0.01 * i as f32, 0.0, eye);
+        let report = check_pair(&first, &a, &second, &turned, &options);
+        println!("{i} {:?} {:?}", report.depth, report.findings);
+        assert!(!report.has("small_baseline"), "{:?}", report.findings);
+        doubtful += usize::from(report.has("rotation_doubtful"));
+        if report.has("rotation_doubtful") {
+            assert_eq!(report.verdict, Verdict::Warning);
+            assert!(!report.has("poses_imprecise") && !report.has("poses_wrong"));
+        }
+    }
+    assert!(doubtful > 0);
+}
+
 #[test]
 fn cameras_without_common_content_are_refused() {
     let a = posed(0.0, 0.0, Vec3::ZERO);

@@ -4,6 +4,7 @@ mod check;
 mod check_rendered;
 mod hostile_scenes;
 mod navigation;
+mod photographs;
 mod resize;
 mod scene_formats;
 mod scenes;

@@ -407,8 +407,17 @@ fn pairs_and_exif() {
     assert_eq!(image::probe(&path(0)).unwrap().orientation, Some(6));
     let before = image::load(&path(1)).unwrap();
     assert_eq!(image::load(&path(0)).unwrap(), before, "the orientation is not applied");
-    let scene = Scene::from_pair(&path(0), &path(1), cameras[0].camera, cameras[1].camera).unwrap();
+    // A pose file's cameras describe the stored pixels.
+    let pose_file = folder.path().join("cameras.json");
+    let save = |camera| {
+        let cameras = vec![NamedCamera::new(cameras[0].file.as_str(), camera)];
+        let content = CameraFile { cameras, units: Units::Unknown, near_far: None };
+        save_cameras_json(&pose_file, &content).unwrap();
+    };
+    save(camera);
+    let scene = load_scene(&pose_file).unwrap();
     assert!(scene.warnings[0].contains("EXIF"), "{:?}", scene.warnings);
-    let e = Scene::from_pair(&path(0), &path(1), wrong, cameras[1].camera).unwrap_err();
+    save(wrong);
+    let e = load_scene(&pose_file).unwrap_err();
     assert!(e.to_string().contains("EXIF orientation 6"), "{e}");
 }

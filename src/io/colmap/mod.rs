@@ -14,6 +14,7 @@
 
 mod binary;
 mod text;
+mod write;
 
 use super::assemble::{Draft, Lens, assemble, find_image};
 use super::scene::{Scene, SceneFormat};
@@ -25,6 +26,8 @@ use std::path::{Path, PathBuf};
 
 pub use binary::parse_points as parse_points_bin;
 pub use binary::{parse_cameras as parse_cameras_bin, parse_images as parse_images_bin};
+pub use write::{SparsePoint, save_colmap};
+
 pub use text::parse_points as parse_points_txt;
 pub use text::{parse_cameras as parse_cameras_txt, parse_images as parse_images_txt};
 

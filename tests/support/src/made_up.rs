@@ -25,7 +25,8 @@ pub fn made_up(n: usize) -> (tempfile::TempDir, Vec<NamedCamera>) {
         let rotation = Quat::from_euler(glam::EulerRot::XYZ, 0.1 * t, 0.7 - 0.2 * t, 0.3 + t);
         let pose = Mat4::from_rotation_translation(rotation, Vec3::new(t, 0.3, -0.7 * t));
         let camera = Camera::new(k, pose).unwrap();
-        NamedCamera { file, camera, timestamp: (i % 2 == 0).then_some(i as i64), depth: None }
+        let timestamp = (i % 2 == 0).then_some(i as i64);
+        NamedCamera { timestamp, ..NamedCamera::new(file, camera) }
     });
     let cameras = cameras.collect();
     (folder, cameras)

@@ -37,7 +37,7 @@ pub fn workplace() -> tempfile::TempDir {
 
 /// A camera of cameras.json.
 pub fn named(file: String, camera: Camera) -> NamedCamera {
-    NamedCamera { file, camera, timestamp: None, depth: None }
+    NamedCamera::new(file, camera)
 }
 
 fn example() -> &'static Example {

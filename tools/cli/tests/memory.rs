@@ -17,7 +17,7 @@ fn scene(folder: &Path, width: usize, height: usize) {
     let frame = |(i, photo): (usize, &subsplat::pipeline::Photo)| {
         let file = format!("images/{i}.png");
         save_png(&folder.join(&file), photo.image()).unwrap();
-        NamedCamera { file, camera: *photo.camera(), timestamp: None, depth: None }
+        NamedCamera::new(file, *photo.camera())
     };
     let cameras = shoot.photos.iter().enumerate().map(frame).collect();
     save_cameras_json(

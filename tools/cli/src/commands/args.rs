@@ -3,31 +3,19 @@
 use super::args_eval::EvalArgs;
 #[cfg(feature = "view")]
 use super::args_view::{KEYS, ViewArgs};
+use super::values;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
-use subsplat::FitOptions;
+use subsplat::{FitOptions, InputSize};
 
 /// Exit codes, which scripts rely on.
 const EXIT_CODES: &str = "\
 Exit codes: 0 success; 1 an error, one line on stderr; 2 wrong usage; 3 a negative answer (check:
-bad poses; compare: a tensor out of tolerance).
+bad poses; compare: a tensor out of tolerance; photographs that do not determine their cameras).
 
 --json: one object and nothing else on stdout; {\"error\": ...} with exit codes 1 and 2.";
 
-/// Parses three numbers, separated by commas or white space.
-pub fn triple(text: &str) -> Result<[f32; 3], String> {
-    let numbers: Result<Vec<f32>, _> = text
-        .split(|c: char| c == ',' || c.is_whitespace())
-        .filter(|w| !w.is_empty())
-        .map(str::parse)
-        .collect();
-    numbers
-        .ok()
-        .and_then(|v| v.try_into().ok())
-        .ok_or_else(|| "expected three numbers with commas between them".to_owned())
-}
-
-/// Two posed photographs in, 3D Gaussians and sharper new views out.
+/// Photographs in, 3D Gaussians and sharper new views out.
 ///
 /// Conventions everywhere: camera axes are OpenCV's (+x right, +y down, +z
 /// forward), poses are camera-to-world, pixel centres lie at +0.5. Readers convert
@@ -43,7 +31,7 @@ pub struct Cli {
     pub json: bool,
     /// Worker threads (default: RAYON_NUM_THREADS, else one per core). The result does not
     /// depend on it.
-    #[arg(long, global = true, value_name = "N")]
+    #[arg(long, global = true, value_name = "N", value_parser = values::threads)]
     pub threads: Option<usize>,
 }
 
@@ -58,6 +46,8 @@ pub enum Command {
     #[cfg(feature = "view")]
     #[command(after_help = KEYS)]
     View(Box<ViewArgs>),
+    /// Estimate the cameras of photographs: poses, focal length, sparse points.
+    Poses(PosesArgs),
     /// Check poses and intrinsics by points matched between the photographs.
     Check(CheckArgs),
     /// Describe a file or a scene folder.
@@ -69,6 +59,25 @@ pub enum Command {
     Compare(CompareArgs),
     /// Train weights; the same command continues a training that was stopped.
     Train(TrainArgs),
+}
+
+impl Command {
+    /// The conflict between two arguments that need no file, if there is one.
+    pub fn conflict(&self) -> Option<String> {
+        match self {
+            Self::Run(args) => {
+                let targets = args.path == PathArg::Targets || args.target.is_empty();
+                let conflict = || Some("--target: only with --path targets".to_owned());
+                let source = &args.source;
+                values::depth_conflict(source.near, source.far)
+                    .or_else(|| if targets { None } else { conflict() })
+            }
+            #[cfg(feature = "view")]
+            Self::View(args) => args.conflict(),
+            Self::Eval(args) => values::depth_conflict(args.near, args.far),
+            _ => None,
+        }
+    }
 }
 
 /// The rules of a rasterizer.
@@ -126,6 +135,60 @@ pub enum DetailArg {
     Photo,
 }
 
+/// Part of the photographs that the network reads.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum CropShapeArg {
+    /// The photographs' own shape, but for the rounding of the input's sides.
+    Whole,
+    /// The middle square, as in the evaluation protocol and in `eval`.
+    Square,
+}
+
+/// Size of the network's input, by purpose. Times and memory are relative to `normal`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum QualityArg {
+    /// As --input-size 192: half of the time.
+    Fast,
+    /// As --input-size 256: the default.
+    Normal,
+    /// Up to --input-size 512, less where the photographs or the memory are smaller: four times
+    /// the time, three times the memory. Sharper, and 1 to 3 dB better at the photographs' own
+    /// cameras; new views gain up to 1 dB where the photographs overlap well and lose up to 2.5 dB
+    /// where they do not.
+    High,
+}
+
+impl QualityArg {
+    /// Pixels of the input, as many as the network can use.
+    pub fn area(self) -> usize {
+        match self {
+            Self::Fast => 192 * 192,
+            Self::Normal => 256 * 256,
+            Self::High => 512 * 512,
+        }
+    }
+}
+
+/// Size of the network's input.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum InputSizeArg {
+    /// Side of the square of the same area, px.
+    Side(usize),
+    /// Width and height, px.
+    Sides(usize, usize),
+}
+
+impl SourceArgs {
+    /// Size of the network's input that --input-size and --crop name.
+    pub fn input_size(&self) -> InputSize {
+        match (self.input_size, self.crop) {
+            (InputSizeArg::Side(side), CropShapeArg::Whole) => InputSize::Area(side * side),
+            (InputSizeArg::Side(side), CropShapeArg::Square) => InputSize::exact(side, side),
+            (InputSizeArg::Sides(width, height), _) => InputSize::exact(width, height),
+        }
+    }
+}
+
 /// The picture whose pixels are the unit of the low-pass.
 #[derive(Clone, Copy, Debug, ValueEnum)]
 pub enum LowpassArg {
@@ -159,12 +222,24 @@ pub enum SceneFormatArg {
     Spz,
 }
 
+impl SceneFormatArg {
+    /// Name of the file in the output folder of `run`.
+    pub fn file_name(self) -> &'static str {
+        match self {
+            Self::Ply => "scene.ply",
+            Self::Glb => "scene.glb",
+            Self::Splat => "scene.splat",
+            Self::Spz => "scene.spz",
+        }
+    }
+}
+
 /// Arguments of `run`.
 #[derive(Debug, Args)]
 pub struct RunArgs {
-    /// A scene (folder or pose file: cameras.json, transforms.json, COLMAP,
-    /// RealEstate10K txt), or two photographs.
-    #[arg(required = true, num_args = 1..=2, value_name = "SCENE | IMG IMG")]
+    /// Photographs or a folder of them, whose cameras are estimated; or a scene with cameras
+    /// (folder or pose file: cameras.json, transforms.json, COLMAP, RealEstate10K txt).
+    #[arg(required = true, num_args = 1.., value_name = "IMG… | DIR | SCENE")]
     pub input: Vec<PathBuf>,
     /// Output folder; it must not hold the poses of a scene.
     #[arg(short, long, default_value = "out", value_name = "DIR")]
@@ -180,13 +255,19 @@ pub struct RunArgs {
     #[arg(long, value_enum, default_value = "targets")]
     pub path: PathArg,
     /// Number of views of `--path interpolate` and `orbit`.
-    #[arg(long, default_value_t = 30, value_name = "N")]
+    #[arg(long, default_value_t = 30, value_name = "N", value_parser = values::frames)]
     pub frames: usize,
     /// Formats of the scene, written as scene.ply and so on.
     #[arg(long, value_enum, value_delimiter = ',', default_value = "ply", value_name = "F,…")]
     pub save: Vec<SceneFormatArg>,
     /// Leave Gaussians of less opacity out of the scene files.
-    #[arg(long, default_value_t = 0.0, value_name = "ALPHA")]
+    #[arg(
+        long,
+        default_value_t = 0.0,
+        value_name = "ALPHA",
+        allow_negative_numbers = true,
+        value_parser = values::opacity
+    )]
     pub min_opacity: f32,
     /// Options of the rendering.
     #[command(flatten)]
@@ -199,12 +280,19 @@ pub struct SourceArgs {
     /// Context frames: indices into the scene's frames, or file names.
     #[arg(long, value_delimiter = ',', value_name = "I,J")]
     pub context: Vec<String>,
-    /// Side of the network's input, px: N, or WxH.
-    #[arg(long, default_value = "256", value_name = "N | WxH")]
-    pub input_size: String,
+    /// Size of the network's input, px. N: as many pixels as a square of side N, in the
+    /// photographs' shape; with `--crop square` that square. WxH: these sides.
+    #[arg(long, default_value = "256", value_name = "N | WxH", value_parser = values::input_size)]
+    pub input_size: InputSizeArg,
+    /// Size of the network's input by purpose. The size that is used is printed.
+    #[arg(long, value_enum, conflicts_with = "input_size")]
+    pub quality: Option<QualityArg>,
+    /// Part of the photographs that is used, where --input-size is not WxH.
+    #[arg(long, value_enum, default_value = "whole")]
+    pub crop: CropShapeArg,
     /// Target over input, side over side: 2 gives 4 children per pixel, 4 gives 16.
     /// Default: the weights' own, else 2.
-    #[arg(long, value_name = "R")]
+    #[arg(long, value_name = "R", value_parser = values::upscale)]
     pub upscale: Option<usize>,
     /// Weights (.safetensors). Default: the shipped ones.
     #[arg(long, value_name = "FILE")]
@@ -215,10 +303,10 @@ pub struct SourceArgs {
     /// Nearest depth candidate, world units. Default: the pose file's, RealEstate10K's 1, or
     /// from sparse points, matched points or the baseline; without --near and --far the small
     /// backbone then estimates both at half size. To `view` a finished scene: the near plane.
-    #[arg(long, allow_negative_numbers = true)]
+    #[arg(long, allow_negative_numbers = true, value_parser = values::positive)]
     pub near: Option<f32>,
     /// Farthest depth candidate, world units. Default: likewise; RealEstate10K's 100.
-    #[arg(long, allow_negative_numbers = true)]
+    #[arg(long, allow_negative_numbers = true, value_parser = values::positive)]
     pub far: Option<f32>,
     /// Do not match points between the context photographs (check of poses, depth range).
     #[arg(long)]
@@ -266,7 +354,12 @@ pub struct RenderingArgs {
     pub lowpass_ref: Option<LowpassArg>,
     /// Background colour, R,G,B in [0, 1]. Default: the model's own (the inputs' mean
     /// colour, or black); for scene files the one that `run` wrote into them, else black.
-    #[arg(long, value_parser = triple, value_name = "R,G,B")]
+    #[arg(
+        long,
+        value_parser = values::colour,
+        allow_hyphen_values = true,
+        value_name = "R,G,B"
+    )]
     pub background: Option<[f32; 3]>,
     /// Device for rendering, and with `run` for plane sweep, attention gather and children: cpu;
     /// auto (a GPU, but no software adapter); gpu (any adapter); or an adapter by a part of its
@@ -275,22 +368,30 @@ pub struct RenderingArgs {
     pub device: String,
 }
 
-/// Cameras of two photographs that come without a pose file. The first camera is
-/// the world unless --pose-a is given.
+/// Cameras of photographs that come without a pose file. Without --move and --pose-b the poses
+/// are estimated; without --fov and --intrinsics the focal length comes from EXIF, else it is
+/// estimated too. With a pose of the second of two, the first camera is the world unless --pose-a
+/// is given.
 #[derive(Clone, Debug, Args)]
 pub struct PairArgs {
-    /// Horizontal field of view of both photographs, degrees.
-    #[arg(long, value_name = "DEG", conflicts_with = "intrinsics")]
+    /// Horizontal field of view of all photographs, degrees.
+    #[arg(
+        long,
+        value_name = "DEG",
+        conflicts_with = "intrinsics",
+        allow_negative_numbers = true,
+        value_parser = values::fov
+    )]
     pub fov: Option<f32>,
-    /// Intrinsics of both photographs, px: FX,FY,CX,CY, or 9 numbers of a 3x3 matrix.
+    /// Intrinsics of all photographs, px: FX,FY,CX,CY, or 9 numbers of a 3x3 matrix.
     #[arg(long, value_name = "K")]
     pub intrinsics: Option<String>,
     /// Position of the second camera in the first one's frame (x right, y down, z forward),
     /// world units.
-    #[arg(long = "move", value_parser = triple, allow_hyphen_values = true, value_name = "X,Y,Z")]
+    #[arg(long = "move", value_parser = values::triple, allow_hyphen_values = true, value_name = "X,Y,Z")]
     pub translation: Option<[f32; 3]>,
     /// Rotation of the second camera in the first one's frame: degrees about x, then y, then z.
-    #[arg(long, value_parser = triple, allow_hyphen_values = true, value_name = "RX,RY,RZ")]
+    #[arg(long, value_parser = values::triple, allow_hyphen_values = true, value_name = "RX,RY,RZ")]
     pub turn: Option<[f32; 3]>,
     /// Pose of the first photograph: 12 or 16 numbers, row by row.
     #[arg(long, allow_hyphen_values = true, value_name = "M")]
@@ -301,6 +402,9 @@ pub struct PairArgs {
     /// Convention of --pose-a and --pose-b, or of a scene's poses.txt. Default: opencv-c2w.
     #[arg(long, value_enum)]
     pub pose_convention: Option<PoseConventionArg>,
+    /// Use estimated cameras that would be refused, and truncated JPEG files.
+    #[arg(long)]
+    pub force: bool,
 }
 
 /// Axes and direction of a pose matrix.
@@ -314,10 +418,33 @@ pub enum PoseConventionArg {
     OpenglC2w,
 }
 
+/// Arguments of `poses`.
+#[derive(Debug, Args)]
+pub struct PosesArgs {
+    /// Photographs of one scene in any order, or a folder of them.
+    #[arg(required = true, num_args = 1.., value_name = "IMG… | DIR")]
+    pub input: Vec<PathBuf>,
+    /// A .json file for the cameras; or a folder, which gets cameras.json and COLMAP's text model
+    /// in sparse/0.
+    #[arg(short, long, default_value = "poses", value_name = "FILE | DIR")]
+    pub out: PathBuf,
+    /// Horizontal field of view of all photographs, degrees.
+    #[arg(long, value_name = "DEG", conflicts_with = "intrinsics", value_parser = values::fov)]
+    pub fov: Option<f32>,
+    /// Intrinsics of all photographs, px: FX,FY,CX,CY, or 9 numbers of a 3x3 matrix.
+    #[arg(long, value_name = "K")]
+    pub intrinsics: Option<String>,
+    /// Write estimates that would be refused, and read truncated JPEG files.
+    #[arg(long)]
+    pub force: bool,
+}
+
 /// Arguments of `render`.
 #[derive(Debug, Args)]
 pub struct RenderArgs {
-    /// The scene: .ply, .compressed.ply, .splat, .spz, .ksplat or .glb.
+    /// The scene: .ply, .compressed.ply, .splat, .spz, .ksplat or .glb; or a folder that `run`
+    /// wrote.
+    #[arg(value_name = "SPLATS | DIR")]
     pub scene: PathBuf,
     /// Folder for the pictures.
     #[arg(short, long, default_value = "out", value_name = "DIR")]
@@ -333,13 +460,13 @@ pub struct RenderArgs {
     #[arg(long, value_enum, default_value = "targets")]
     pub path: PathArg,
     /// Number of views of `--path interpolate` and `orbit`.
-    #[arg(long, default_value_t = 30, value_name = "N")]
+    #[arg(long, default_value_t = 30, value_name = "N", value_parser = values::frames)]
     pub frames: usize,
     /// Picture size, px: N, or WxH (default: the cameras' own).
-    #[arg(long, value_name = "N | WxH")]
-    pub size: Option<String>,
+    #[arg(long, value_name = "N | WxH", value_parser = values::size)]
+    pub size: Option<(usize, usize)>,
     /// Highest SH degree evaluated.
-    #[arg(long, default_value_t = 4, value_name = "0…4")]
+    #[arg(long, default_value_t = 4, value_name = "0…4", value_parser = values::sh_degree)]
     pub sh_degree: usize,
     /// Write 16-bit depth pictures too, in depth/ of that folder.
     #[arg(long)]
@@ -349,15 +476,15 @@ pub struct RenderArgs {
     pub rendering: RenderingArgs,
     /// Near plane of the `mvsplat` convention, whose 0.2-fold is the nearest depth
     /// drawn; nearest depth itself under `standard`.
-    #[arg(long, allow_negative_numbers = true)]
+    #[arg(long, allow_negative_numbers = true, value_parser = values::positive)]
     pub near: Option<f32>,
 }
 
 /// Arguments of `check`.
 #[derive(Debug, Args)]
 pub struct CheckArgs {
-    /// A scene folder or pose file, or two photographs.
-    #[arg(required = true, num_args = 1..=2, value_name = "SCENE | IMG IMG")]
+    /// A scene folder or pose file; or photographs, or a folder of them.
+    #[arg(required = true, num_args = 1.., value_name = "SCENE | IMG… | DIR")]
     pub input: Vec<PathBuf>,
     /// Frames to check, each with the next (default: protocol.json's contexts, else the pair
     /// that `run` would choose).
@@ -441,7 +568,7 @@ pub struct TrainArgs {
     #[arg(long, value_name = "DIR")]
     pub validate: Option<PathBuf>,
     /// Stop after this many minutes, with a checkpoint.
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", value_parser = values::minutes)]
     pub minutes: Option<f64>,
     /// Stop after this many steps, with a checkpoint.
     #[arg(long, value_name = "N")]

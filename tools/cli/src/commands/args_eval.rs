@@ -1,6 +1,7 @@
 //! Arguments of `eval`. Their documentation is the program's manual.
 
 use super::args::{DetailArg, ModelArgs};
+use super::values;
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
 use subsplat::eval::{Disturbance, Method};
@@ -41,8 +42,8 @@ pub struct EvalArgs {
     #[arg(long, value_name = "R", value_parser = ["1", "2", "4"])]
     pub upscale: Option<String>,
     /// Side of the network's input, px: N, or WxH (default: protocol.json's, else 256).
-    #[arg(long, value_name = "N | WxH")]
-    pub input_size: Option<String>,
+    #[arg(long, value_name = "N | WxH", value_parser = values::size)]
+    pub input_size: Option<(usize, usize)>,
     /// Methods to compare, in this order (default: all that differ at this --upscale, without
     /// detail).
     #[arg(long, value_delimiter = ',', value_name = "M,…")]
@@ -70,13 +71,13 @@ pub struct EvalArgs {
     #[arg(long, value_name = "N", conflicts_with = "weights")]
     pub seed: Option<u64>,
     /// Nearest depth candidate, world units (default: as `run`; chunks 1).
-    #[arg(long, allow_negative_numbers = true)]
+    #[arg(long, allow_negative_numbers = true, value_parser = values::positive)]
     pub near: Option<f32>,
     /// Farthest depth candidate, world units (default: as `run`; chunks 100).
-    #[arg(long, allow_negative_numbers = true)]
+    #[arg(long, allow_negative_numbers = true, value_parser = values::positive)]
     pub far: Option<f32>,
     /// Only the first N scenes.
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = values::at_least_one)]
     pub limit: Option<usize>,
     /// Principal point after a crop (default: mvsplat for chunks with the re10k backbone, else
     /// exact).

@@ -1,9 +1,11 @@
 //! Arguments of `view`, and its keys.
 
-use super::args::{ConventionArg, DetailArg, RenderingArgs, SourceArgs, triple};
+use super::args::{ConventionArg, CropShapeArg, DetailArg, RenderingArgs, SourceArgs};
+use super::values;
 use clap::Args;
 use std::path::PathBuf;
 use subsplat::FitOptions;
+use subsplat::gpu::DeviceChoice;
 
 /// The window's keys, which `--help` and the H key show.
 pub const KEYS: &str = "\
@@ -23,19 +25,19 @@ In the window:
 #[derive(Clone, Debug, Args)]
 pub struct ViewArgs {
     /// A finished scene (.ply, .compressed.ply, .splat, .spz, .ksplat, .glb); or a scene folder,
-    /// a pose file or two photographs, which are reconstructed first.
-    #[arg(required = true, num_args = 1..=2, value_name = "SPLATS | SCENE | IMG IMG")]
+    /// a pose file, photographs or a folder of them, which are reconstructed first.
+    #[arg(required = true, num_args = 1.., value_name = "SPLATS | SCENE | IMG… | DIR")]
     pub input: Vec<PathBuf>,
     /// Initial size of the window, px: N, or WxH (default: the first camera's picture, at most
     /// 1280x960).
-    #[arg(long, value_name = "N | WxH")]
-    pub size: Option<String>,
+    #[arg(long, value_name = "N | WxH", value_parser = values::size)]
+    pub size: Option<(usize, usize)>,
     /// Device for rendering: gpu (any adapter), auto (no software adapter), or an adapter by a
     /// part of its name.
     #[arg(long, default_value = "gpu", value_name = "auto|gpu|NAME")]
     pub device: String,
     /// Draw this many frames and quit.
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = values::frames)]
     pub frames: Option<usize>,
     /// Save the last of `--frames` (PNG).
     #[arg(long, value_name = "FILE", requires = "frames")]
@@ -56,7 +58,12 @@ pub struct ViewArgs {
     pub convention: Option<ConventionArg>,
     /// Background colour, R,G,B in [0, 1]. Default: the model's own (the inputs' mean
     /// colour, or black); for scene files the one that `run` wrote into them, else black.
-    #[arg(long, value_parser = triple, value_name = "R,G,B")]
+    #[arg(
+        long,
+        value_parser = values::colour,
+        allow_hyphen_values = true,
+        value_name = "R,G,B"
+    )]
     pub background: Option<[f32; 3]>,
 }
 
@@ -71,6 +78,15 @@ impl ViewArgs {
         }
     }
 
+    /// The conflict between arguments that need no file, if there is one.
+    pub fn conflict(&self) -> Option<String> {
+        let cpu = self.device.parse() == Ok(DeviceChoice::Cpu);
+        let device =
+            || "--device: expected auto, gpu or an adapter's name, as a window needs one; got cpu";
+        values::depth_conflict(self.source.near, self.source.far)
+            .or_else(|| cpu.then(|| device().to_owned()))
+    }
+
     /// The first flag on the command line that applies to photographs only.
     pub fn photograph_flag(&self) -> Option<&'static str> {
         let source = &self.source;
@@ -80,6 +96,8 @@ impl ViewArgs {
             (source.weights.is_some(), "--weights"),
             (source.seed.is_some(), "--seed"),
             (source.far.is_some(), "--far"),
+            (source.quality.is_some(), "--quality"),
+            (source.crop != CropShapeArg::Whole, "--crop"),
             (source.detail != DetailArg::Photo, "--detail"),
             (source.fit != FitOptions::default().steps, "--fit"),
             (source.model.backbone.is_some(), "--backbone"),

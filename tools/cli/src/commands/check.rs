@@ -15,7 +15,7 @@ use subsplat::io::scene::Scene;
 /// Runs the command; returns `false` where the poses are judged bad.
 pub fn check(args: &CheckArgs, answer: Answer) -> Result<bool> {
     let mut progress = Progress::new();
-    let scene = progress.stage("scene", |_| pair::load(&args.input, &args.pair))?;
+    let scene = progress.stage("scene", |bar| pair::load(&args.input, &args.pair, bar))?;
     scene.warnings.iter().for_each(print_warning);
     let pairs = pairs(args, &scene)?;
     print_line(format!(

@@ -2,7 +2,7 @@
 
 use super::args::DetailArg;
 use super::args_eval::{CropArg, EvalArgs, LrFromArg};
-use super::{frames, memory, model};
+use super::{memory, model};
 use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, print_line, print_warning};
 use anyhow::{Context, Result, ensure};
 use serde_json::{Value, json};
@@ -28,9 +28,7 @@ const NO_LPIPS: &str = "not measured: VGG16's weights were not given (--lpips FI
 /// Runs the command.
 pub fn eval(args: &EvalArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
-    let input_size = args.input_size.as_deref().map(frames::size).transpose()?;
     let ratio = args.upscale.as_deref().map(str::parse).transpose()?;
-    ensure!(args.limit != Some(0), "--limit: expected at least 1, got 0");
     let mut data = progress.stage("data", |_| -> Result<_> {
         let mut data = Benchmark::open(&args.data, args.index.as_deref())?;
         data.set_depth_range(DepthRange::from_ends(args.near, args.far));
@@ -47,7 +45,7 @@ pub fn eval(args: &EvalArgs, answer: Answer) -> Result<()> {
     };
     let upscale = ratio.or(model.as_ref().map(|m| m.config().upscale)).unwrap_or(UPSCALE);
     let options = Options {
-        input_size,
+        input_size: args.input_size,
         methods: methods(args, upscale)?,
         rule: rule(args, &data, model.as_ref()),
         lr_from: match args.lr_from {

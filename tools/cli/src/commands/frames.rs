@@ -4,37 +4,9 @@ use super::pair::folder_of;
 use anyhow::{Context, Result, bail, ensure};
 use glam::{Mat4, Quat, Vec3};
 use std::path::Path;
-use subsplat::camera::{Camera, Intrinsics};
+use subsplat::camera::Camera;
 use subsplat::io::protocol::{Views, load_protocol};
-use subsplat::io::scene::{Scene, SceneFormat};
-
-/// Parses width and height of `N` or `WxH`, px.
-pub fn size(text: &str) -> Result<(usize, usize)> {
-    let side = |s: &str| -> Result<usize> {
-        let n: usize = s
-            .trim()
-            .parse()
-            .ok()
-            .filter(|n| (1..=Intrinsics::SIDE_MAX).contains(n))
-            .with_context(|| {
-                format!("picture size: expected N or WxH, 1 to 32768 pixels a side, got `{text}`")
-            })?;
-        Ok(n)
-    };
-    match text.split_once(['x', 'X', '×']) {
-        Some((w, h)) => Ok((side(w)?, side(h)?)),
-        None => side(text).map(|n| (n, n)),
-    }
-}
-
-/// Largest number of views of a path.
-const PATH_MAX: usize = 100_000;
-
-/// Checks `--frames`.
-pub fn count(frames: usize) -> Result<usize> {
-    ensure!((1..=PATH_MAX).contains(&frames), "--frames: expected 1 to {PATH_MAX}, got {frames}");
-    Ok(frames)
-}
+use subsplat::io::scene::Scene;
 
 fn stem(file: &str) -> String {
     Path::new(file).file_stem().unwrap_or_default().to_string_lossy().into_owned()
@@ -96,7 +68,7 @@ pub fn file_stems(names: &[String]) -> Vec<String> {
 /// photographs belongs to another scene.
 pub fn protocol(path: &Path, scene: &Scene) -> Result<Vec<Views>> {
     let file = folder_of(path).join("protocol.json");
-    if scene.source == SceneFormat::Pair || !file.is_file() {
+    if !scene.source.has_file() || !file.is_file() {
         return Ok(Vec::new());
     }
     let tests = load_protocol(&file)?.tests;
@@ -110,7 +82,6 @@ pub fn protocol(path: &Path, scene: &Scene) -> Result<Vec<Views>> {
 /// Catmull-Rom curve, rotations by slerp, focal lengths in proportion.
 pub fn interpolate(through: &[Camera], frames: usize) -> Result<Vec<Camera>> {
     ensure!(through.len() >= 2, "a path needs at least 2 cameras, got {}", through.len());
-    let frames = count(frames)?;
     let last = through.len() - 1;
     let at = |i: usize| {
         let t = i as f32 / (frames - 1).max(1) as f32 * last as f32;
@@ -153,7 +124,6 @@ fn catmull_rom(p: [Vec3; 4], t: f32) -> Vec3 {
 /// `frames` cameras on a small circle around the middle of `cameras`, looking at what
 /// lies `depth` in front of it. Radius: half the cameras' spread, or 5 % of `depth`.
 pub fn orbit(cameras: &[Camera], depth: f32, frames: usize) -> Result<Vec<Camera>> {
-    let frames = count(frames)?;
     let Some(first) = cameras.first() else { bail!("an orbit needs at least 1 camera, got none") };
     let count = cameras.len() as f32;
     let middle = cameras.iter().map(Camera::position).sum::<Vec3>() / count;
@@ -248,14 +218,5 @@ mod tests {
         stems.sort();
         stems.dedup();
         assert_eq!(stems.len(), 4);
-    }
-
-    #[test]
-    fn sizes() {
-        assert_eq!(size("256").unwrap(), (256, 256));
-        assert_eq!(size("320x192").unwrap(), (320, 192));
-        for bad in ["", "0", "12x", "-3", "1e9", "99999999999999999999"] {
-            assert!(size(bad).unwrap_err().to_string().contains("picture size"), "{bad}");
-        }
     }
 }

@@ -7,6 +7,7 @@ use serde_json::{Value, json};
 use std::path::Path;
 use subsplat::config::Config;
 use subsplat::io::image::probe;
+use subsplat::io::photograph::probe_photograph;
 use subsplat::io::scene::{Scene, load_scene};
 use subsplat::io::{SplatFormat, SplatInfo, splat_info};
 use subsplat::model::weights::Weights;
@@ -94,17 +95,37 @@ fn weights(path: &Path, answer: Answer) -> Result<Value> {
 fn picture(path: &Path, answer: Answer) -> Result<Value> {
     let p = probe(path)?;
     answer.line(format!("{}: {}x{} pixels", path.display(), p.width, p.height));
-    if let Some(orientation) = p.orientation.filter(|o| *o != 1) {
+    let header = probe_photograph(path)?;
+    if let Some(orientation) = header.orientation {
         answer.line(format!(
-            "  EXIF orientation {orientation} is ignored: pose files describe the stored pixels"
+            "  EXIF orientation {orientation}: a loose photograph is turned upright, {}x{}; a \
+             pose file describes the stored pixels",
+            header.width, header.height
         ));
     }
+    let camera = &header.camera;
+    let names: Vec<&str> =
+        [&camera.make, &camera.model].into_iter().flatten().map(String::as_str).collect();
+    if !names.is_empty() {
+        answer.line(format!("  camera: {}", names.join(" ")));
+    }
+    if let (Some(focal), Some(k)) = (camera.focal, header.intrinsics()) {
+        answer.line(format!(
+            "  focal length: {:.0} px, {:.1} degrees across ({})",
+            focal.px,
+            k.fov_x().to_degrees(),
+            focal.source
+        ));
+    }
+    header.warnings.iter().for_each(|w| answer.line(format!("  warning: {w}")));
     Ok(json!({
         "kind": "picture",
         "file": path.display().to_string(),
         "width": p.width,
         "height": p.height,
         "exif_orientation": p.orientation,
+        "camera": names.join(" "),
+        "focal_px": camera.focal.map(|f| f.px),
     }))
 }
 

@@ -1,7 +1,8 @@
 //! The commands, one file each.
 //!
 //! Exit codes: 0 success; 1 an error, reported on stderr; 2 wrong usage; 3 a negative answer
-//! (`check`: bad poses; `compare`: a tensor out of tolerance). With `--json` stdout always holds
+//! (`check`: bad poses; `compare`: a tensor out of tolerance; photographs that do not determine
+//! their cameras). With `--json` stdout always holds
 //! one object: the report, or `{"error": …}`.
 
 pub mod args;
@@ -18,26 +19,27 @@ mod memory;
 mod model;
 mod output;
 mod pair;
+mod poses;
 mod raster_case;
 mod reconstruct;
 mod render;
 mod run;
 mod tensorboard;
 mod train;
+mod values;
 #[cfg(feature = "view")]
 mod view;
 
 use crate::failure;
 use crate::report::Answer;
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result};
 use args::{Cli, Command};
-use clap::Parser;
+use clap::error::ErrorKind;
+use clap::{CommandFactory, Parser};
 use std::process::ExitCode;
 
 /// Exit code of a negative answer.
 const ANSWER_NO: u8 = 3;
-/// Largest number of threads; to start millions would hang the machine.
-const THREADS_MAX: usize = 1024;
 
 /// Runs the command of the process's arguments and returns the exit code.
 pub fn main() -> ExitCode {
@@ -45,20 +47,27 @@ pub fn main() -> ExitCode {
         Ok(cli) => cli,
         Err(error) => return failure::report_usage(&error),
     };
+    if let Some(conflict) = cli.command.conflict() {
+        let error = Cli::command().error(ErrorKind::ArgumentConflict, conflict);
+        return failure::report_usage(&error);
+    }
     let answer = Answer::new(cli.json);
     match dispatch(&cli, answer) {
         Ok(true) => ExitCode::SUCCESS,
         Ok(false) => ExitCode::from(ANSWER_NO),
-        Err(error) => failure::report_error(&error, answer),
+        Err(error) => {
+            let code = failure::report_error(&error, answer);
+            let refused = error.downcast_ref::<subsplat::Error>();
+            match refused {
+                Some(subsplat::Error::NoPoses { .. }) => ExitCode::from(ANSWER_NO),
+                _ => code,
+            }
+        }
     }
 }
 
 fn dispatch(cli: &Cli, answer: Answer) -> Result<bool> {
     if let Some(threads) = cli.threads {
-        ensure!(
-            (1..=THREADS_MAX).contains(&threads),
-            "--threads: expected 1 to {THREADS_MAX}, got {threads}"
-        );
         rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().context("--threads")?;
     }
     match &cli.command {
@@ -66,6 +75,7 @@ fn dispatch(cli: &Cli, answer: Answer) -> Result<bool> {
         Command::Render(args) => render::render(args, answer).map(|()| true),
         #[cfg(feature = "view")]
         Command::View(args) => view::view(args, answer).map(|()| true),
+        Command::Poses(args) => poses::poses(args, answer).map(|()| true),
         Command::Check(args) => check::check(args, answer),
         Command::Info(args) => info::info(args, answer).map(|()| true),
         Command::Eval(args) => eval::eval(args, answer).map(|()| true),
@@ -77,7 +87,6 @@ fn dispatch(cli: &Cli, answer: Answer) -> Result<bool> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clap::CommandFactory;
 
     #[test]
     fn the_arguments_are_consistent() {

@@ -18,7 +18,7 @@ use subsplat::config::Config;
 use subsplat::data::crop::CropOptions;
 use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
 use subsplat::io::image::{Depth, Rgb, save_depth_png, save_png};
-use subsplat::io::scene::{Scene, SceneFormat, Units, is_scene};
+use subsplat::io::scene::{Scene, Units, is_scene};
 use subsplat::io::{SaveOptions, save_splats};
 use subsplat::metrics::{psnr, ssim};
 use subsplat::pipeline::{Photo, Reconstruction};
@@ -93,7 +93,7 @@ pub fn prepare(out: &Path, input: &Path, scene: &Scene) -> Result<()> {
             );
         }
     }
-    let own = scene.source != SceneFormat::Pair
+    let own = scene.source.has_file()
         && std::fs::canonicalize(folder_of(input)).is_ok_and(|folder| folder == real);
     // A cameras.json may be that of an earlier run, which is replaced.
     if own || (is_scene(&real) && !real.join("cameras.json").is_file()) {
@@ -191,10 +191,8 @@ impl Views<'_> {
 /// Writes `cameras.json` of the rendered views, in the scene's unit, with near and far.
 pub fn write_cameras(out: &Path, views: &[Scored], units: Units, near_far: NearFar) -> Result<()> {
     let camera = |v: &Scored| NamedCamera {
-        file: format!("images/{}.png", v.stem),
-        camera: v.camera,
-        timestamp: None,
         depth: Some(format!("depth/{}.png", v.stem)),
+        ..NamedCamera::new(format!("images/{}.png", v.stem), v.camera)
     };
     let cameras = views.iter().map(camera).collect();
     let content = CameraFile { cameras, units, near_far: Some(near_far) };
@@ -218,12 +216,7 @@ pub fn write_scene(
 ) -> Result<Vec<Value>> {
     let mut names: Vec<&str> = Vec::new();
     for format in formats {
-        let name = match format {
-            SceneFormatArg::Ply => "scene.ply",
-            SceneFormatArg::Glb => "scene.glb",
-            SceneFormatArg::Splat => "scene.splat",
-            SceneFormatArg::Spz => "scene.spz",
-        };
+        let name = format.file_name();
         if !names.contains(&name) {
             names.push(name);
         }

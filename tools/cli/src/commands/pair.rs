@@ -1,39 +1,153 @@
-//! Two photographs with cameras from the command line.
+//! The scene of the command line: a scene's path, or photographs with given or estimated cameras.
 
 use super::args::{PairArgs, PoseConventionArg};
+use crate::report::print_line;
 use anyhow::{Context, Result, bail, ensure};
 use glam::{EulerRot, Mat4, Quat, Vec3};
+use indicatif::ProgressBar;
 use std::path::{Path, PathBuf};
 use subsplat::camera::{Camera, Intrinsics};
-use subsplat::io::image::probe;
+use subsplat::io::image::{LoadOptions, Truncated, probe};
 use subsplat::io::matrices::{self, PoseConvention, parse_intrinsics, parse_matrix};
-use subsplat::io::scene::{Scene, SceneFormat, load_scene};
+use subsplat::io::photograph::{PhotographHeader, list_photographs, probe_photograph};
+use subsplat::io::scene::{Scene, SceneFormat, is_scene, load_scene};
+use subsplat::{Confidence, KnownLens, LooseOptions, LooseScene, PoseOptions, loose_scene};
 
-/// Loads a scene, or makes one of two photographs with the cameras of `args`.
-pub fn load(input: &[PathBuf], args: &PairArgs) -> Result<Scene> {
-    match input {
-        [a, b] => of_photographs(a, b, args),
-        [one] => {
-            if let Some(flag) = args.first_flag() {
-                bail!("{flag}: only with two photographs; {} has its own cameras", one.display());
-            }
-            let is_picture = one.is_file() && probe(one).is_ok();
-            ensure!(
-                !is_picture,
-                "{}: expected a scene or two photographs, got one photograph",
-                one.display()
-            );
-            let scene = load_scene(one)?;
-            let Some(convention) = args.pose_convention else { return Ok(scene) };
-            ensure!(
-                scene.source == SceneFormat::Matrices,
-                "--pose-convention: expected two photographs or a scene with poses.txt, got {} ({})",
-                one.display(),
-                scene.source.name()
-            );
-            Ok(matrices::load(folder_of(one), convention.into())?)
+/// Loads a scene; or makes one of photographs, with the cameras of `args` or estimated ones.
+pub fn load(input: &[PathBuf], args: &PairArgs, bar: &ProgressBar) -> Result<Scene> {
+    if let ([a, b], true) = (input, args.has_pose()) {
+        return of_photographs(a, b, args);
+    }
+    if let Some(photographs) = photographs(input)? {
+        if let Some(flag) = args.first_pose_flag() {
+            bail!("{flag}: expected two photographs with --move or --pose-b, got neither flag");
         }
-        _ => bail!("expected a scene or two photographs, got {} paths", input.len()),
+        let options = LooseRequest {
+            fov: args.fov,
+            intrinsics: args.intrinsics.as_deref(),
+            force: args.force,
+        };
+        let loose = estimate(&input[0], &photographs, &options, bar)?;
+        bar.suspend(|| print_estimate(&loose));
+        return Ok(loose.scene);
+    }
+    let [one] = input else {
+        bail!("expected photographs or one scene, got {} paths", input.len())
+    };
+    if let Some(flag) = args.first_flag() {
+        bail!("{flag}: only with photographs; {} has its own cameras", one.display());
+    }
+    let scene = load_scene(one)?;
+    let Some(convention) = args.pose_convention else { return Ok(scene) };
+    ensure!(
+        scene.source == SceneFormat::Matrices,
+        "--pose-convention: expected two photographs or a scene with poses.txt, got {} ({})",
+        one.display(),
+        scene.source.name()
+    );
+    Ok(matrices::load(folder_of(one), convention.into())?)
+}
+
+/// The photographs that `input` names: two or more files, or a folder without cameras. `None` for
+/// a scene.
+///
+/// # Errors
+/// One photograph; a file among several that is no picture.
+pub fn photographs(input: &[PathBuf]) -> Result<Option<Vec<PathBuf>>> {
+    if let [one] = input {
+        if one.is_dir() && !is_scene(one) {
+            let found = list_photographs(one);
+            ensure!(
+                found.len() >= 2,
+                "{}: expected a scene (cameras.json, transforms.json, a COLMAP model, a \
+                 RealEstate10K txt, or poses.txt with K.txt) or a folder of at least 2 photographs, \
+                 got {} photograph(s) and no cameras",
+                one.display(),
+                found.len()
+            );
+            return Ok(Some(found));
+        }
+        let is_picture = one.is_file() && probe(one).is_ok();
+        ensure!(
+            !is_picture,
+            "{}: expected a scene or at least two photographs, got one photograph",
+            one.display()
+        );
+        return Ok(None);
+    }
+    for path in input {
+        probe(path)?;
+    }
+    Ok(Some(input.to_vec()))
+}
+
+/// Arguments of an estimation of cameras.
+pub struct LooseRequest<'a> {
+    /// Horizontal field of view, degrees.
+    pub fov: Option<f32>,
+    /// Text of `--intrinsics`.
+    pub intrinsics: Option<&'a str>,
+    /// Accept what would be refused.
+    pub force: bool,
+}
+
+/// Estimates the cameras of photographs; `bar` shows the photograph that is read.
+pub fn estimate(
+    name: &Path,
+    photographs: &[PathBuf],
+    request: &LooseRequest<'_>,
+    bar: &ProgressBar,
+) -> Result<LooseScene> {
+    let lens = match request.intrinsics {
+        Some(text) => Some(KnownLens::Pixels(four(text)?)),
+        None => request.fov.map(|fov| KnownLens::FovX(fov.to_radians())),
+    };
+    let truncated = if request.force { Truncated::Accept } else { Truncated::Refuse };
+    let options = LooseOptions {
+        lens,
+        poses: PoseOptions::default().with_force(request.force),
+        load: LoadOptions { truncated },
+    };
+    let mut show = |i: usize| {
+        bar.set_message(format!("photograph {} of {}", i + 1, photographs.len()));
+        Ok(())
+    };
+    let loose = loose_scene(name, photographs, &options, &mut show)?;
+    bar.set_message("");
+    Ok(loose)
+}
+
+/// Prints what was estimated.
+pub fn print_estimate(loose: &LooseScene) {
+    let estimate = &loose.estimate;
+    let placed = estimate.cameras.iter().flatten().count();
+    let certain = match estimate.confidence {
+        Confidence::High => "high confidence",
+        Confidence::Low => "LOW confidence",
+    };
+    print_line(format!(
+        "cameras of {placed} of {} photographs estimated from {} points: {certain} (standard \
+         deviation {:.2}° of rotations, {:.2}° of directions); unit: the points' median depth",
+        estimate.cameras.len(),
+        estimate.points.len(),
+        estimate.rotation_error_deg,
+        estimate.direction_error_deg,
+    ));
+    if let Some((camera, source)) =
+        estimate.cameras.iter().zip(&loose.lenses).find_map(|(c, s)| Some(((*c)?, s)))
+    {
+        let k = camera.intrinsics();
+        print_line(format!(
+            "focal length {:.1} px at {}x{} ({:.1}° wide), {source}{}",
+            k.fx,
+            k.width,
+            k.height,
+            k.fov_x().to_degrees(),
+            match estimate.focal.deviation {
+                0.0 => String::new(),
+                d => format!(", then estimated to ±{:.1} %", 100.0 * d),
+            }
+        ));
     }
 }
 
@@ -54,6 +168,23 @@ impl From<PoseConventionArg> for PoseConvention {
 }
 
 impl PairArgs {
+    /// Whether the command line gives the pose of the second of two photographs.
+    fn has_pose(&self) -> bool {
+        self.translation.is_some() || self.pose_b.is_some()
+    }
+
+    /// The first flag that describes a pose.
+    fn first_pose_flag(&self) -> Option<&'static str> {
+        let flags = [
+            (self.translation.is_some(), "--move"),
+            (self.turn.is_some(), "--turn"),
+            (self.pose_a.is_some(), "--pose-a"),
+            (self.pose_b.is_some(), "--pose-b"),
+            (self.pose_convention.is_some(), "--pose-convention"),
+        ];
+        flags.into_iter().find(|f| f.0).map(|f| f.1)
+    }
+
     /// The first of these flags on the command line; each applies to photographs only.
     pub(super) fn first_flag(&self) -> Option<&'static str> {
         let flags = [
@@ -82,17 +213,14 @@ fn of_photographs(a: &Path, b: &Path, args: &PairArgs) -> Result<Scene> {
     };
     let pose_b = match &args.pose_b {
         Some(text) => pose(text, "--pose-b", convention)?,
-        None if args.translation.is_none() => bail!(
-            "two photographs need the pose of the second camera: give --move X,Y,Z (and --turn \
-             RX,RY,RZ) in the first camera's frame, or --pose-b, or a scene with a pose file"
-        ),
         None => {
             pose_a * relative(args.translation.unwrap_or_default(), args.turn.unwrap_or_default())
         }
     };
     let camera = |path: &Path, pose: Mat4| -> Result<Camera> {
-        let size = probe(path)?;
-        let k = intrinsics(args, size.width, size.height)?;
+        // The size of the upright picture: loose photographs are turned upright.
+        let header = probe_photograph(path)?;
+        let k = intrinsics(args, path, &header)?;
         Camera::new(k, pose).with_context(|| format!("camera of {}", path.display()))
     };
     Ok(Scene::from_pair(a, b, camera(a, pose_a)?, camera(b, pose_b)?)?)
@@ -111,24 +239,63 @@ fn relative(translation: [f32; 3], turn: [f32; 3]) -> Mat4 {
     Mat4::from_rotation_translation(rotation, Vec3::from(translation))
 }
 
-fn intrinsics(args: &PairArgs, width: usize, height: usize) -> Result<Intrinsics> {
+/// Intrinsics of a photograph by the flags, else by EXIF.
+fn intrinsics(args: &PairArgs, path: &Path, header: &PhotographHeader) -> Result<Intrinsics> {
+    let PhotographHeader { width, height, .. } = *header;
     if let Some(text) = &args.intrinsics {
-        let k = parse_intrinsics(text).map_err(|got| {
-            anyhow::anyhow!(
-                "--intrinsics: expected FX,FY,CX,CY in pixels or a 3x3 matrix, got {got}"
-            )
-        })?;
-        let [fx, fy, cx, cy] = k.map(|v| v as f32);
+        let [fx, fy, cx, cy] = four(text)?;
         return Ok(Intrinsics { fx, fy, cx, cy, width, height });
     }
     match args.fov {
-        Some(fov) if fov > 0.0 && fov < 180.0 => {
-            Ok(Intrinsics::from_fov_x(fov.to_radians(), width, height))
-        }
-        Some(fov) => bail!("--fov: expected above 0 and below 180 degrees, got {fov}"),
-        None => bail!(
-            "two photographs need their field of view: give --fov DEGREES or --intrinsics \
-             FX,FY,CX,CY, or a scene with a pose file"
-        ),
+        Some(fov) => Ok(Intrinsics::from_fov_x(fov.to_radians(), width, height)),
+        None => header.intrinsics().with_context(|| {
+            format!(
+                "{}: EXIF states no focal length: give --fov DEGREES or --intrinsics FX,FY,CX,CY, or \
+                 leave out --move and --pose-b to have the cameras estimated",
+                path.display()
+            )
+        }),
+    }
+}
+
+/// fx, fy, cx, cy of `--intrinsics`, px.
+fn four(text: &str) -> Result<[f32; 4]> {
+    let k = parse_intrinsics(text).map_err(|got| {
+        anyhow::anyhow!("--intrinsics: expected FX,FY,CX,CY in pixels or a 3x3 matrix, got {got}")
+    })?;
+    Ok(k.map(|v| v as f32))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+    use subsplat::image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
+
+    #[derive(Parser)]
+    struct Flags {
+        #[command(flatten)]
+        pair: PairArgs,
+    }
+
+    #[test]
+    fn portraits_are_upright() {
+        // EXIF orientation 6, big-endian TIFF: the stored picture lies on its side.
+        let mut exif = b"MM\0\x2a\0\0\0\x08\0\x01".to_vec();
+        exif.extend([0x01, 0x12, 0, 3, 0, 0, 0, 1, 0, 6, 0, 0, 0, 0, 0, 0]);
+        let mut png = Vec::new();
+        let mut encoder = PngEncoder::new(&mut png);
+        encoder.set_exif_metadata(exif).unwrap();
+        encoder.write_image(&[9; 8 * 6 * 3], 8, 6, ExtendedColorType::Rgb8).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let paths = ["a.png", "b.png"].map(|n| folder.path().join(n));
+        paths.iter().for_each(|p| std::fs::write(p, &png).unwrap());
+        let flags = Flags::parse_from(["pair", "--fov", "60", "--move", "1,0,0"]);
+        let scene = load(&paths, &flags.pair, &ProgressBar::hidden()).unwrap();
+        let (picture, camera) = scene.frames[0].load().unwrap();
+        assert_eq!((picture.width, picture.height), (6, 8));
+        let k = camera.intrinsics();
+        assert_eq!((k.width, k.height, k.cx, k.cy), (6, 8, 3.0, 4.0));
+        assert!((k.fov_x().to_degrees() - 60.0).abs() < 1e-3, "{k:?}");
     }
 }

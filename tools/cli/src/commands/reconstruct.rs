@@ -1,17 +1,19 @@
 //! The library's call with a progress bar and lines for the user: for `run` and `view`.
 
-use super::args::{DetailArg, SourceArgs};
-use super::frames;
+use super::args::{CropShapeArg, DetailArg, QualityArg, SourceArgs};
+use super::memory;
 use crate::pages;
 use crate::report::{Progress, print_line, print_warning, show_fraction};
-use anyhow::Result;
+use anyhow::{Result, ensure};
 use serde_json::{Value, json};
 use std::borrow::Borrow;
 use subsplat::check::{PairReport, Verdict};
+use subsplat::config::Config;
+use subsplat::data::crop::Cropped;
 use subsplat::io::scene::Scene;
 use subsplat::{
-    Check, DepthBounds, DepthRange, Detail, FitOptions, FitReport, Options, Photo, Prepared,
-    Reconstruction, Reconstructor,
+    Check, DepthBounds, DepthRange, Detail, FitOptions, FitReport, InputSize, Options, Photo,
+    Prepared, Reconstruction, Reconstructor,
 };
 
 /// The library's options of the arguments, for photographs of frames `context`.
@@ -20,14 +22,12 @@ use subsplat::{
 /// An input size or a depth range out of range; cameras at one place where a guess from their
 /// distance is necessary.
 pub fn options(args: &SourceArgs, scene: &Scene, context: &[usize]) -> Result<Options> {
-    let (width, height) = frames::size(&args.input_size)?;
     let check = if args.no_check { Check::Off } else { Check::Warn };
     let detail = match args.detail {
         DetailArg::Photo => Detail::Photographs,
         DetailArg::Off => Detail::Off,
     };
     let options = Options::default()
-        .with_input_size(width, height)
         .with_depth_range(DepthRange::from_ends(args.near, args.far))
         .with_depth_prior(DepthBounds::of_scene(scene, context)?)
         .with_check(check)
@@ -36,6 +36,74 @@ pub fn options(args: &SourceArgs, scene: &Scene, context: &[usize]) -> Result<Op
     let cameras: Vec<_> = context.iter().map(|&i| scene.frames[i].camera).collect();
     options.initial_depth_range(&cameras)?;
     Ok(options)
+}
+
+/// Chooses the size of the network's input for frames `context`: `--quality`, else `--input-size`.
+/// Returns the width and height that it gives, px, too.
+///
+/// # Errors
+/// A size that is too small for the network or too large for the memory.
+pub fn input_size(
+    args: &SourceArgs,
+    model: &Reconstructor,
+    scene: &Scene,
+    context: &[usize],
+) -> Result<(InputSize, (usize, usize))> {
+    let size = |&i: &usize| {
+        let k = scene.frames[i].camera.intrinsics();
+        (k.width, k.height)
+    };
+    let photos: Vec<_> = context.iter().map(size).collect();
+    let config = model.config();
+    let ample = |size: (usize, usize)| memory::is_ample(config, context.len(), size);
+    let chosen = match args.quality {
+        Some(quality) => quality_size(quality, args.crop, &photos, config, ample),
+        None => args.input_size(),
+    };
+    let (w, h) = chosen.resolve(&photos, config.stride());
+    let stride = config.stride();
+    // An area below one cell of the stride gives one cell; the user asked for less.
+    let asked = match chosen {
+        InputSize::Area(area) => (area.isqrt(), area.isqrt()),
+        _ => (w, h),
+    };
+    ensure!(
+        asked.0 >= stride && asked.1 >= stride,
+        "--input-size: expected at least {stride} pixels a side, got {}x{}",
+        asked.0,
+        asked.1
+    );
+    memory::check_run(config, context.len(), (w, h))?;
+    Ok((chosen, (w, h)))
+}
+
+/// The size of `quality` for `photos` (width and height, px). `High` is limited by the
+/// photographs, whose pixels a target need not exceed, and by the memory.
+fn quality_size(
+    quality: QualityArg,
+    crop: CropShapeArg,
+    photos: &[(usize, usize)],
+    config: &Config,
+    ample: impl Fn((usize, usize)) -> bool,
+) -> InputSize {
+    let of_area = |area: usize| match crop {
+        CropShapeArg::Whole => InputSize::Area(area),
+        CropShapeArg::Square => InputSize::exact(area.isqrt(), area.isqrt()),
+    };
+    let normal = QualityArg::Normal.area();
+    if quality != QualityArg::High {
+        return of_area(quality.area());
+    }
+    let pixels = |&(w, h): &(usize, usize)| match crop {
+        CropShapeArg::Whole => w * h,
+        CropShapeArg::Square => w.min(h) * w.min(h),
+    };
+    let photo = photos.iter().map(pixels).min().unwrap_or(0) / config.children();
+    let mut area = quality.area().min(photo).max(normal);
+    while area > normal && !ample(of_area(area).resolve(photos, config.stride())) {
+        area = (area / 2).max(normal);
+    }
+    of_area(area)
 }
 
 /// Reconstructs `photos` under a progress bar, and prints warnings and depth ranges. Photographs
@@ -62,6 +130,7 @@ pub fn reconstruct(
 }
 
 fn print_prepared(prepared: &Prepared<'_>) {
+    print_line(crop_line(prepared.inputs(), prepared.cut_shares()));
     prepared.warnings().iter().for_each(print_warning);
     if prepared.reports().iter().any(|r| r.verdict == Verdict::Bad) {
         print_warning("these poses look wrong, and so will the result; `subsplat check` says more");
@@ -88,6 +157,24 @@ fn print_reconstruction(result: &Reconstruction, printed: usize) {
     }
 }
 
+/// Describes the network's input and what the crop leaves out of the photographs.
+fn crop_line(inputs: &[Cropped], cut_shares: &[f32]) -> String {
+    let (w, h) = inputs.first().map_or((0, 0), |c| (c.input.width, c.input.height));
+    let percent = |share: f32| format!("{:.0} %", 100.0 * share);
+    let most = cut_shares.iter().copied().fold(0.0f32, f32::max);
+    let least = cut_shares.iter().copied().fold(most, f32::min);
+    let cut = match (percent(least), percent(most)) {
+        _ if most < 0.005 => "the whole photographs".to_owned(),
+        (least, most) if least == most => format!("{most} of each photograph is cut at its edges"),
+        (least, most) => {
+            format!(
+                "the photographs differ in shape: {least} to {most} of each is cut at its edges"
+            )
+        }
+    };
+    format!("input {w}x{h}: {cut}")
+}
+
 fn print_depth_range(bounds: &DepthBounds) {
     let DepthBounds { near, far, source } = bounds;
     print_line(format!("near {near:.4}, far {far:.4}: {source}"));
@@ -104,4 +191,48 @@ pub fn report(reports: &[PairReport]) -> Vec<Value> {
         })
     };
     reports.iter().map(one).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Mat4;
+    use subsplat::camera::{Camera, Intrinsics};
+    use subsplat::data::crop::{CropOptions, crop};
+    use subsplat::io::image::Rgb;
+
+    #[test]
+    fn high_quality_is_limited_by_photographs_and_memory() {
+        let config = Config::small(subsplat::config::Preset::Tuned, 2);
+        let size = |quality, crop, photo, ample: bool| {
+            let chosen = quality_size(quality, crop, &[photo, photo], &config, |_| ample);
+            chosen.resolve(&[photo, photo], 32)
+        };
+        use CropShapeArg::{Square, Whole};
+        use QualityArg::{Fast, High, Normal};
+        assert_eq!(size(Fast, Whole, (4000, 4000), true), (192, 192));
+        assert_eq!(size(Normal, Whole, (4000, 4000), true), (256, 256));
+        assert_eq!(size(High, Whole, (4000, 4000), true), (512, 512));
+        assert_eq!(size(High, Whole, (4000, 4000), false), (256, 256));
+        assert_eq!(size(High, Whole, (800, 800), true), (416, 416));
+        assert_eq!(size(High, Whole, (300, 300), true), (256, 256));
+        assert_eq!(size(High, Square, (4000, 800), true), (400, 400));
+    }
+
+    #[test]
+    fn the_line_says_what_is_cut() {
+        let camera = Camera::new(Intrinsics::from_fov_x(1.0, 64, 48), Mat4::IDENTITY).unwrap();
+        let inputs = [crop(&Rgb::black(64, 48), &camera, &CropOptions::square(32, 1, 32)).unwrap()];
+        for (shares, expected) in [
+            ([0.0, 0.004], "input 32x32: the whole photographs"),
+            ([0.25, 0.25], "input 32x32: 25 % of each photograph is cut at its edges"),
+            (
+                [0.1, 0.33],
+                "input 32x32: the photographs differ in shape: 10 % to 33 % of each is cut at its \
+                 edges",
+            ),
+        ] {
+            assert_eq!(crop_line(&inputs, &shares), expected);
+        }
+    }
 }

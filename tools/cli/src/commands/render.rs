@@ -1,18 +1,19 @@
 //! `subsplat render`: renders pictures of a finished scene.
 
-use super::args::{LowpassArg, PathArg, RenderArgs, RenderingArgs};
+use super::args::{LowpassArg, PathArg, RenderArgs, RenderingArgs, SceneFormatArg};
 use super::frames;
 use super::memory;
 use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, print_line, print_warning};
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail, ensure};
+use clap::ValueEnum;
 use serde_json::json;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use subsplat::abi::{Convention, RasterOptions};
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::io::cameras_json::{is_cameras_json, load_cameras_json};
 use subsplat::io::image::{Depth, Rgb, save_depth_png, save_png};
 use subsplat::io::load_with_comments;
-use subsplat::io::scene::load_scene;
+use subsplat::io::scene::{is_scene, load_scene};
 use subsplat::navigation::Bounds;
 use subsplat::render::{Renderer, options_of_comments};
 use subsplat::splats::Splats;
@@ -21,15 +22,6 @@ use subsplat::splats::Splats;
 const DEFAULT_SIDE: usize = 512;
 /// Horizontal field of view of a picture without a camera.
 const DEFAULT_FOV_X: f32 = 0.9;
-
-/// `--background`, checked.
-pub fn background(args: &RenderingArgs) -> Result<Option<[f32; 3]>> {
-    if let Some([r, g, b]) = args.background {
-        let ok = [r, g, b].iter().all(|v| (0.0..=1.0).contains(v));
-        ensure!(ok, "--background: expected three numbers in [0, 1], got {r},{g},{b}");
-    }
-    Ok(args.background)
-}
 
 /// Opens the renderer of `--device`; where that fails, prints a warning and uses the CPU.
 pub fn open(args: &RenderingArgs) -> Renderer {
@@ -41,9 +33,10 @@ pub fn open(args: &RenderingArgs) -> Renderer {
 /// Runs the command.
 pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
-    check(args)?;
-    let (splats, comments) = progress.stage("scene", |_| load_with_comments(&args.scene))?;
-    let cameras = cameras(args, &splats)?;
+    args.size.map_or(Ok(()), |size| memory::check_picture("--size", size))?;
+    let file = scene_file(&args.scene)?;
+    let (splats, comments) = progress.stage("scene", |_| load_with_comments(&file))?;
+    let cameras = cameras(args, &file, &splats)?;
     check_sizes(&cameras)?;
     let options = options(&args.rendering, args.near, args.sh_degree, &comments)?;
     let folder = if args.depth { args.out.join("depth") } else { args.out.clone() };
@@ -83,7 +76,7 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
     ));
     let mvsplat_rules = options.convention == Convention::Mvsplat;
     answer.finish(&json!({
-        "scene": args.scene.display().to_string(),
+        "scene": file.display().to_string(),
         "gaussians": splats.len(),
         "device": renderer.device(),
         "convention": if mvsplat_rules { "mvsplat" } else { "standard" },
@@ -93,13 +86,24 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
     }))
 }
 
-/// Checks the arguments before a large file is read.
-fn check(args: &RenderArgs) -> Result<()> {
-    background(&args.rendering)?;
-    ensure!(args.sh_degree <= 4, "--sh-degree: expected 0 to 4, got {}", args.sh_degree);
-    check_near(args.near)?;
-    frames::count(args.frames)?;
-    args.size.as_deref().map_or(Ok(()), |text| memory::check_picture("--size", frames::size(text)?))
+/// Finds the scene file of `path`: the path itself, or the file in a folder that `run` wrote.
+fn scene_file(path: &Path) -> Result<PathBuf> {
+    if !path.is_dir() {
+        return Ok(path.to_owned());
+    }
+    let files = SceneFormatArg::value_variants().iter().map(|f| path.join(f.file_name()));
+    if let Some(file) = files.into_iter().find(|f| f.is_file()) {
+        return Ok(file);
+    }
+    let name = path.display();
+    let hint = match is_scene(path) {
+        true => format!("; it holds photographs: reconstruct them by `subsplat run {name}`"),
+        false => String::new(),
+    };
+    bail!(
+        "{name}: expected a scene file, or a folder with scene.ply as `subsplat run` writes it, \
+         got a folder without one{hint}"
+    )
 }
 
 /// Rejects cameras whose pictures exceed the memory, with the frame's name.
@@ -113,13 +117,6 @@ fn check_sizes(cameras: &[(String, Camera)]) -> Result<()> {
             fits = Some(size);
         }
     }
-    Ok(())
-}
-
-/// `--near`, checked.
-pub fn check_near(near: Option<f32>) -> Result<()> {
-    let Some(near) = near else { return Ok(()) };
-    ensure!(near > 0.0 && near.is_finite(), "--near: expected above 0, got {near}");
     Ok(())
 }
 
@@ -140,7 +137,7 @@ pub fn options(
     };
     options.near = near.unwrap_or(options.near);
     options.sh_degree = sh_degree;
-    options.background = background(args)?.unwrap_or(options.background);
+    options.background = args.background.unwrap_or(options.background);
     if matches!(args.lowpass_ref, Some(LowpassArg::Input)) {
         print_warning(
             "--lowpass-ref input: ignored, since a scene file does not state its input's size",
@@ -150,11 +147,10 @@ pub fn options(
 }
 
 /// File stems and cameras.
-fn cameras(args: &RenderArgs, splats: &Splats) -> Result<Vec<(String, Camera)>> {
-    let named = named_cameras(args, splats)?;
+fn cameras(args: &RenderArgs, file: &Path, splats: &Splats) -> Result<Vec<(String, Camera)>> {
+    let named = named_cameras(args, file, splats)?;
     let sized = |camera: Camera| -> Result<Camera> {
-        let Some(text) = &args.size else { return Ok(camera) };
-        let (w, h) = frames::size(text)?;
+        let Some((w, h)) = args.size else { return Ok(camera) };
         let k = camera.intrinsics();
         // Square pixels stay square: the picture is fitted, then widened or cropped.
         let scale = (w as f32 / k.width as f32).max(h as f32 / k.height as f32);
@@ -183,8 +179,8 @@ fn cameras(args: &RenderArgs, splats: &Splats) -> Result<Vec<(String, Camera)>> 
     }
 }
 
-fn named_cameras(args: &RenderArgs, splats: &Splats) -> Result<Vec<(String, Camera)>> {
-    let beside = args.scene.parent().unwrap_or(Path::new("")).join("cameras.json");
+fn named_cameras(args: &RenderArgs, file: &Path, splats: &Splats) -> Result<Vec<(String, Camera)>> {
+    let beside = file.parent().unwrap_or(Path::new("")).join("cameras.json");
     let source = match &args.cameras {
         Some(path) => path.clone(),
         None if beside.is_file() => beside,

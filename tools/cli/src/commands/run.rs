@@ -3,7 +3,7 @@
 use super::args::{LowpassArg, PathArg, RenderingArgs, RunArgs};
 use super::output::{self, Scored, View, Views};
 use super::reconstruct::{self, reconstruct};
-use super::{frames, memory, model, pair, render};
+use super::{frames, model, pair, render};
 use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, print_line, print_warning};
 use anyhow::{Result, bail, ensure};
 use serde_json::{Value, json};
@@ -14,7 +14,7 @@ use subsplat::config::{Config, LowpassRef};
 use subsplat::data::pair::choose_pair;
 use subsplat::eval::{GaussianReport, InputReport, Score};
 use subsplat::io::SaveOptions;
-use subsplat::io::image::Rgb;
+use subsplat::io::image::{LoadOptions, Rgb, Truncated};
 use subsplat::io::scene::Scene;
 use subsplat::pipeline::Backend;
 use subsplat::pipeline::is_mvsplat;
@@ -35,16 +35,16 @@ struct Plan {
 /// Runs the command.
 pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
-    let plan = plan(args, &mut progress)?;
+    let mut plan = plan(args, &mut progress)?;
     let backend = backend(&args.rendering.device);
     let request = model::ModelRequest::from_source(&args.source);
     let model = progress.stage("model", |_| model::load(&request))?.with_backend(&backend);
-    let (w, h) = plan.options.input_size;
-    check_size(&model, plan.context.len(), (w, h))?;
+    let (size, (w, h)) = reconstruct::input_size(&args.source, &model, &plan.scene, &plan.context)?;
+    plan.options.input_size = size;
     let r = model.config().upscale;
     let targets = targets(args, &plan, (w * r, h * r))?;
     output::prepare(&args.out, &args.input[0], &plan.scene)?;
-    let photos = photographs(&plan.scene, &plan.context, &mut progress)?;
+    let photos = photographs(&plan.scene, &plan.context, args.source.pair.force, &mut progress)?;
     let result = reconstruct(&model, photos, &plan.options, &mut progress)?;
     check_opacity(result.splats(), args.min_opacity)?;
     let options = raster_options(&args.rendering, model.config(), &result);
@@ -52,7 +52,10 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let job = Views {
         out: &args.out,
         scene: &plan.scene,
-        crop: model.crop_options(plan.options.input_size),
+        // All inputs have one size.
+        crop: model.crop_options(
+            result.inputs().first().map_or((w, h), |c| (c.input.width, c.input.height)),
+        ),
         options,
     };
     let mut renderer = render::open(&args.rendering);
@@ -117,21 +120,9 @@ fn backend(device: &str) -> Backend {
 
 /// Checks the arguments and reads the scene.
 fn plan(args: &RunArgs, progress: &mut Progress) -> Result<Plan> {
-    frames::size(&args.source.input_size)?;
-    render::background(&args.rendering)?;
-    frames::count(args.frames)?;
-    ensure!(
-        (0.0..1.0).contains(&args.min_opacity),
-        "--min-opacity: expected 0 to below 1, got {}",
-        args.min_opacity
-    );
-    let scene = progress.stage("scene", |_| pair::load(&args.input, &args.source.pair))?;
+    let scene = progress.stage("scene", |bar| pair::load(&args.input, &args.source.pair, bar))?;
     scene.warnings.iter().for_each(print_warning);
     let (context, reason) = context(&args.source.context, &args.input[0], &scene)?;
-    ensure!(
-        args.path == PathArg::Targets || args.target.is_empty(),
-        "--target: only with --path targets"
-    );
     print_line(format!(
         "{}: {} frames ({}); context {reason}",
         scene.name,
@@ -142,26 +133,19 @@ fn plan(args: &RunArgs, progress: &mut Progress) -> Result<Plan> {
     Ok(Plan { scene, context, options })
 }
 
-/// Rejects inputs that are too small for the network or too large for the memory.
-pub fn check_size(model: &Reconstructor, views: usize, (w, h): (usize, usize)) -> Result<()> {
-    let stride = model.config().stride();
-    ensure!(
-        w >= stride && h >= stride,
-        "--input-size: expected at least {stride} pixels a side, got {w}x{h}"
-    );
-    memory::check_run(model.config(), views, (w, h))
-}
-
-/// Loads the photographs of a scene's `context` frames.
+/// Loads the photographs of a scene's `context` frames; `force` accepts truncated files.
 pub fn photographs(
     scene: &Scene,
     context: &[usize],
+    force: bool,
     progress: &mut Progress,
 ) -> Result<Vec<Photo>> {
+    let truncated = if force { Truncated::Accept } else { Truncated::Refuse };
+    let options = LoadOptions { truncated };
     progress.steps("photographs", context.len(), |bar| {
         let photo = |&i: &usize| {
             bar.inc(1);
-            Ok(Photo::from_frame(&scene.frames[i])?)
+            Ok(Photo::from_frame_with(&scene.frames[i], &options)?)
         };
         context.iter().map(photo).collect()
     })
@@ -322,6 +306,7 @@ impl Done {
             "far": bounds.far,
             "near_far_from": bounds.source.to_string(),
             "check": reconstruct::report(result.reports()),
+            "cut_shares": result.cut_shares(),
             "input_intrinsics": result.inputs().iter().map(|c| camera(&c.input_camera)).collect::<Vec<_>>(),
             "backbone": if is_mvsplat(config) { "re10k" } else { "small" },
             "upscale": config.upscale,

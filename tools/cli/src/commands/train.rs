@@ -3,7 +3,7 @@
 use super::args::TrainArgs;
 use super::tensorboard::Board;
 use crate::report::{Answer, mebibytes, print_line, print_warning};
-use anyhow::{Result, ensure};
+use anyhow::Result;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
 use std::io::IsTerminal;
@@ -44,11 +44,6 @@ pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
     #[cfg(unix)]
     restart_with_one_candle_thread();
     let config = TrainConfig::load(&args.config)?;
-    ensure!(
-        args.minutes.is_none_or(|m| m > 0.0),
-        "--minutes: expected more than 0, got {}",
-        args.minutes.unwrap_or(0.0)
-    );
     let limits = Limits { minutes: args.minutes, steps: args.steps };
     let mut training = Training::open(&config, &args.out)?;
     let mut watch = Watch::new(&config);

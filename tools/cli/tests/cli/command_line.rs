@@ -13,7 +13,7 @@ use std::path::Path;
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::config::{Config, Preset, SpgrHead};
 use subsplat::io::cameras_json::{CameraFile, save_cameras_json};
-use subsplat::io::image::load;
+use subsplat::io::image::{Rgb, load, save_png};
 use subsplat::io::scene::{Frame, Units, load_scene};
 use subsplat::metrics::psnr;
 use subsplat::model::subsplat::SubSplat;
@@ -205,6 +205,41 @@ fn paths_sizes_and_detail() {
     assert_eq!(report["views"].as_array().unwrap().len(), 2);
     let picture = load(&place.path().join("b/path_0001.png")).unwrap();
     assert_eq!((picture.width, picture.height), (40, 24));
+}
+
+/// Photographs of any shape: the whole of them by default, their square on demand.
+#[test]
+fn the_shape_of_photographs_is_kept() {
+    let place = tempfile::tempdir().unwrap();
+    let picture = |name: &str, width: usize, height: usize| {
+        let data = (0..3 * width * height).map(|i| (i * i / 7 % 251) as u8).collect();
+        save_png(&place.path().join(name), &Rgb { width, height, data }).unwrap();
+    };
+    picture("wide.png", 320, 192);
+    picture("wide2.png", 320, 192);
+    picture("tall.png", 192, 320);
+    let run = |inputs: &str, more: &str| {
+        let quick = "--fov 60 --move 0.2,0,0 --no-check --fit 0 --near 1 --far 9 --frames 1";
+        let called = call_in(place.path(), &format!("--json run {inputs} {quick} {more}"));
+        let report = done(&called);
+        let k = &report["input_intrinsics"][0];
+        let cut = report["cut_shares"][1].as_f64().unwrap();
+        let size = [&k["width"], &k["height"]].map(|v| v.as_u64().unwrap());
+        (size, (100.0 * cut).round() as i64, called.stderr)
+    };
+    for (inputs, more, size, cut, line) in [
+        ("wide.png wide2.png", "--input-size 128", [160, 96], 0, "the whole photographs"),
+        ("wide.png wide2.png", "--input-size 128 --crop square", [128, 128], 40, "40 % of each"),
+        ("wide.png wide2.png", "--input-size 64x96", [64, 96], 60, "60 % of each"),
+        ("wide.png wide2.png", "--quality fast", [256, 160], 4, "4 % of each"),
+        ("tall.png tall.png", "--input-size 128", [96, 160], 0, "the whole photographs"),
+        ("wide.png tall.png", "--input-size 128", [128, 128], 40, "40 % of each"),
+    ] {
+        let got = run(inputs, more);
+        assert_eq!((got.0, got.1), (size, cut), "{inputs} {more}");
+        let told = format!("input {}x{}: {line}", size[0], size[1]);
+        assert!(got.2.contains(&told), "{inputs} {more}: {}", got.2);
+    }
 }
 
 /// The same two cameras three ways: matrices in two conventions, and a move.

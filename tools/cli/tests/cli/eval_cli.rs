@@ -137,8 +137,6 @@ fn refusals_are_one_line_and_leave_no_tables() {
         ("eval scene --methods copy --pred x=nowhere", &["nowhere", "a folder of pictures"]),
         ("eval scene --methods copy,copy", &["--methods", "`copy` twice"]),
         ("eval scene --methods copy --pred mean", &["--pred", "NAME=DIR"]),
-        ("eval scene --near 9 --far 2 --methods copy", &["near"]),
-        ("eval scene --limit 0", &["--limit"]),
         ("eval scene --input-size 8", &["input", "32"]),
         ("eval scene --lpips scene/cameras.json --methods copy", &["cameras.json"]),
         ("eval scene --weights none.safetensors", &["none.safetensors"]),
@@ -154,6 +152,8 @@ fn refusals_are_one_line_and_leave_no_tables() {
     for (arguments, words) in [
         ("eval scene --methods best", "expected one of subsplat, detail"),
         ("eval scene --upscale 3", "--upscale"),
+        ("eval scene --near 9 --far 2 --methods copy", "--near 9"),
+        ("eval scene --limit 0", "--limit"),
         ("eval", "DATA"),
     ] {
         let called = call_in(place.path(), arguments);

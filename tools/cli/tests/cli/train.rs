@@ -462,5 +462,5 @@ fn the_program_trains_and_goes_on() {
     let report = serde_json::from_str::<serde_json::Value>(&stdout).unwrap();
     assert!(report["weights"].is_null() && !stderr.contains("weights.safe"), "{report} {stderr}");
     let (code, _, stderr) = call(folder.path(), "train t.toml --out run --minutes 0");
-    assert!(code == 1 && stderr.contains("--minutes"), "{stderr}");
+    assert!(code == 2 && stderr.contains("--minutes"), "{stderr}");
 }

@@ -24,11 +24,11 @@ fn view(folder: &Path, arguments: &str, display: Option<&str>) -> Called {
 fn wrong_arguments_are_told_before_a_window_is_looked_for() {
     let folder = tempfile::tempdir().unwrap();
     for (arguments, code, hint) in [
-        ("a.ply --device cpu", 1, "--device: expected auto, gpu or an adapter's name"),
-        ("a.ply --size 0x5", 1, "picture size"),
-        ("a.ply --frames 0", 1, "--frames: expected 1 to"),
-        ("a.ply --near -1", 1, "--near: expected above 0"),
-        ("a.ply --background 2,0,0", 1, "--background"),
+        ("a.ply --device cpu", 2, "--device: expected auto, gpu or an adapter's name"),
+        ("a.ply --size 0x5", 2, "N or WxH"),
+        ("a.ply --frames 0", 2, "expected a whole number from 1 to 100000"),
+        ("a.ply --near -1", 2, "expected a finite number above 0"),
+        ("a.ply --background 2,0,0", 2, "--background"),
         ("a.ply --save b.png", 2, "--frames"),
         ("", 2, "SPLATS | SCENE | IMG IMG"),
     ] {

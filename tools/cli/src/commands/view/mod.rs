@@ -13,7 +13,7 @@ mod source;
 mod window;
 
 use super::args_view::ViewArgs;
-use super::{frames, memory, render};
+use super::memory;
 use crate::report::{Answer, Progress, print_line};
 use anyhow::{Context, Result, bail};
 use serde_json::json;
@@ -71,15 +71,13 @@ pub fn view(args: &ViewArgs, answer: Answer) -> Result<()> {
 
 /// Checks the arguments.
 fn plan(args: &ViewArgs) -> Result<Plan> {
-    render::background(&args.rendering())?;
-    render::check_near(args.source.near)?;
-    let size = args.size.as_deref().map(frames::size).transpose()?;
+    let size = args.size;
     size.map_or(Ok(()), |size| memory::check_picture("--size", size))?;
-    args.frames.map_or(Ok(0), frames::count)?;
     source::check(args)?;
     let device = args.device.parse().unwrap_or_else(|e: Infallible| match e {});
     if device == DeviceChoice::Cpu {
-        bail!("--device: expected auto, gpu or an adapter's name, as a window needs one; got cpu");
+        // `ViewArgs::conflict` reports it first.
+        bail!("--device: expected auto, gpu or an adapter's name, got cpu");
     }
     let (frames, save, out) = (args.frames, args.save.clone(), args.out.clone());
     Ok(Plan { size, device, frames, save, out })

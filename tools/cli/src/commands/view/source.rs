@@ -3,7 +3,7 @@
 
 use crate::commands::args_view::ViewArgs;
 use crate::commands::reconstruct::{self, reconstruct};
-use crate::commands::{info, model, pair, render, run};
+use crate::commands::{info, memory, model, pair, render, run};
 use crate::report::{Progress, print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
 use std::ops::ControlFlow;
@@ -40,6 +40,8 @@ pub struct Photographs {
     args: ViewArgs,
     photos: Vec<Photo>,
     options: Options,
+    /// Width and height of the network's input, px.
+    input_size: (usize, usize),
 }
 
 /// Loads or reconstructs the scene of the arguments.
@@ -94,20 +96,21 @@ fn finished(args: &ViewArgs, path: &Path, progress: &mut Progress) -> Result<Sou
 
 fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     ensure!(args.cameras.is_none(), "--cameras: only with a finished scene");
-    let scene = progress.stage("scene", |_| pair::load(&args.input, &args.source.pair))?;
+    let scene = progress.stage("scene", |bar| pair::load(&args.input, &args.source.pair, bar))?;
     scene.warnings.iter().for_each(print_warning);
     let first = args.input.first().context("no input")?;
     let (context, reason) = run::context(&args.source.context, first, &scene)?;
     print_line(format!("{}: {} frames; context {reason}", scene.name, scene.frames.len()));
-    let options = reconstruct::options(&args.source, &scene, &context)?;
+    let mut options = reconstruct::options(&args.source, &scene, &context)?;
     let model = progress.stage("model", |_| load_model(args, args.source.upscale))?;
-    run::check_size(&model, context.len(), options.input_size)?;
-    let photos = run::photographs(&scene, &context, progress)?;
+    let (size, sides) = reconstruct::input_size(&args.source, &model, &scene, &context)?;
+    options.input_size = size;
+    let photos = run::photographs(&scene, &context, args.source.pair.force, progress)?;
     let result = reconstruct(&model, photos.as_slice(), &options, progress)?;
     // Later calls use the depth range of this check.
     let prior = result.initial_depth_range().clone();
     let options = options.with_depth_prior(prior).with_check(Check::Off);
-    let photographs = Photographs { args: args.clone(), photos, options };
+    let photographs = Photographs { args: args.clone(), photos, options, input_size: sides };
     let cameras: Vec<_> = scene.frames.iter().map(|f| f.camera).collect();
     let (Some(input), Some(depth)) = (result.inputs().first(), result.depths().first()) else {
         bail!("{}: expected photographs, got none", scene.name)
@@ -133,7 +136,7 @@ impl Photographs {
     pub fn make(&self, upscale: usize, begin: &mut dyn FnMut(&'static str)) -> Result<Made> {
         begin("model");
         let model = load_model(&self.args, Some(upscale))?;
-        run::check_size(&model, self.photos.len(), self.options.input_size)?;
+        memory::check_run(model.config(), self.photos.len(), self.input_size)?;
         let mut progress = |progress: subsplat::Progress| {
             begin(progress.stage.name());
             ControlFlow::Continue(())

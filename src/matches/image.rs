@@ -55,22 +55,22 @@ impl GrayImage {
     }
 
     /// Returns row `y`.
-    pub(super) fn row(&self, y: usize) -> &[f32] {
+    pub(crate) fn row(&self, y: usize) -> &[f32] {
         &self.pixels[y * self.width..(y + 1) * self.width]
     }
 
     /// Returns the value at column `x`, row `y`.
-    pub(super) fn at(&self, x: usize, y: usize) -> f32 {
+    pub(crate) fn at(&self, x: usize, y: usize) -> f32 {
         self.pixels[y * self.width + x]
     }
 
     /// Returns the mean value.
-    pub(super) fn mean(&self) -> f32 {
+    pub(crate) fn mean(&self) -> f32 {
         (self.pixels.iter().map(|&v| f64::from(v)).sum::<f64>() / self.pixels.len() as f64) as f32
     }
 
     /// Returns the mean over the square of `2·radius + 1` pixels around (x, y), cut at the border.
-    pub(super) fn mean_around(&self, x: f32, y: f32, radius: usize) -> f32 {
+    pub(crate) fn mean_around(&self, x: f32, y: f32, radius: usize) -> f32 {
         let (cx, cy) =
             ((x.max(0.0) as usize).min(self.width - 1), (y.max(0.0) as usize).min(self.height - 1));
         let columns = cx.saturating_sub(radius)..(cx + radius + 1).min(self.width);
@@ -81,7 +81,7 @@ impl GrayImage {
 
     /// Applies a Gaussian blur of `sigma` px. Border pixels are repeated; the kernel is cut at
     /// 3.5σ.
-    pub(super) fn blurred(&self, sigma: f32) -> Self {
+    pub(crate) fn blurred(&self, sigma: f32) -> Self {
         let radius = (3.5 * sigma).ceil() as usize;
         let kernel = gaussian(sigma, radius);
         let (w, h) = (self.width, self.height);
@@ -111,7 +111,7 @@ impl GrayImage {
     /// Returns every second pixel of both directions. The source is already blurred for the next
     /// octave. The centre of pixel (i, j) of the result is the centre of pixel (2i, 2j) of the
     /// source.
-    pub(super) fn decimated(&self) -> Self {
+    pub(crate) fn decimated(&self) -> Self {
         let (width, height) = (self.width.div_ceil(2), self.height.div_ceil(2));
         let pixels = (0..height).flat_map(|y| self.row(2 * y).iter().step_by(2).copied()).collect();
         Self { width, height, pixels }
@@ -119,7 +119,7 @@ impl GrayImage {
 
     /// Doubles the size by bilinear interpolation. The centre of pixel (2i, 2j) is the centre of
     /// pixel (i, j) of the source.
-    pub(super) fn doubled(&self) -> Self {
+    pub(crate) fn doubled(&self) -> Self {
         let (w, h) = (self.width, self.height);
         let (width, height) = (2 * w, 2 * h);
         let mut pixels = vec![0.0f32; width * height];
@@ -134,7 +134,7 @@ impl GrayImage {
     }
 
     /// Averages areas down to `width × height`, each at most the size of this picture.
-    pub(super) fn reduced(&self, width: usize, height: usize) -> Self {
+    pub(crate) fn reduced(&self, width: usize, height: usize) -> Self {
         let columns = area_weights(self.width, width);
         let rows = area_weights(self.height, height);
         let mut across = vec![0.0f32; width * self.height];

@@ -9,8 +9,8 @@
 //!
 //! Source: D. Lowe, "Distinctive image features from scale-invariant keypoints", 2004.
 
+use super::GrayImage;
 use super::descriptors::{describe, oriented};
-use super::image::GrayImage;
 use rayon::prelude::*;
 
 /// Blur of the first level of an octave, px of the octave (Lowe, section 3.3).
@@ -37,7 +37,7 @@ const CELL_SHARE: f32 = 2.5;
 
 /// Orientation of the descriptors.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Orientation {
+pub(crate) enum Orientation {
     /// All descriptors existing_blur the orientation of the picture.
     Upright,
     /// Each descriptor is rotated along the dominant gradient around its feature.
@@ -46,11 +46,13 @@ pub(super) enum Orientation {
 
 /// A distinct point of a picture.
 #[derive(Clone, Debug)]
-pub(super) struct Feature {
+pub(crate) struct Feature {
     /// Position, px of the picture.
     pub x: f32,
     /// Position, px of the picture.
     pub y: f32,
+    /// Blur at which the feature was found, px of the picture: its size.
+    pub size: f32,
     /// |Difference of Gaussians|: larger is more distinct.
     pub response: f32,
     /// Position in the image pyramid.
@@ -59,7 +61,7 @@ pub(super) struct Feature {
 
 /// Position of a feature in the image pyramid.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct PyramidPoint {
+pub(crate) struct PyramidPoint {
     /// Octave, 0 the finest.
     pub octave: usize,
     /// Level of the octave.
@@ -76,15 +78,26 @@ pub(super) struct PyramidPoint {
 
 /// Features of one picture.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Features {
+pub(crate) struct Features {
     /// n features, the strongest first.
     pub points: Vec<Feature>,
     /// `[n, 128]`, each of unit length.
     pub descriptors: Vec<f32>,
 }
 
+impl Features {
+    /// Returns the `count` strongest features.
+    pub(crate) fn strongest(&self, count: usize) -> Self {
+        let n = count.min(self.points.len());
+        Self {
+            points: self.points[..n].to_vec(),
+            descriptors: self.descriptors[..n * super::descriptors::DESCRIPTOR].to_vec(),
+        }
+    }
+}
+
 /// One octave: LEVELS + 3 blurred pictures and their LEVELS + 2 differences.
-pub(super) struct Octave {
+pub(crate) struct Octave {
     /// Levels; the blur grows by 2^(1/LEVELS) per level.
     pub blurred: Vec<GrayImage>,
     differences: Vec<GrayImage>,
@@ -92,7 +105,7 @@ pub(super) struct Octave {
 
 /// Detects at most `max_features` features, spread over the picture. [`Orientation::Gradient`] may
 /// add a second copy of a feature with several strong gradient directions.
-pub(super) fn detect(image: &GrayImage, max_features: usize, orientation: Orientation) -> Features {
+pub(crate) fn detect(image: &GrayImage, max_features: usize, orientation: Orientation) -> Features {
     let doubled = image.width().max(image.height()) < DOUBLE_BELOW;
     let octaves = pyramid(image, doubled);
     let unit = if doubled { 0.5 } else { 1.0 };
@@ -207,6 +220,7 @@ fn refine(d: &[GrayImage], start: [usize; 3], octave: usize, unit: f32) -> Optio
             return Some(Feature {
                 x: px * unit + 0.5,
                 y: py * unit + 0.5,
+                size: sigma * unit,
                 response: value.abs(),
                 position: PyramidPoint { octave, level, x: px, y: py, sigma, angle: 0.0 },
             });

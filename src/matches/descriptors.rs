@@ -6,12 +6,12 @@
 //! Source: Lowe 2004, sections 5 and 6. The square-root normalisation is that of R. Arandjelović
 //! and A. Zisserman, "Three things everyone should know to improve object retrieval", 2012.
 
+use super::GrayImage;
 use super::features::{Feature, Octave, PyramidPoint};
-use super::image::GrayImage;
 use std::f32::consts::{PI, TAU};
 
 /// Number of floats in a descriptor: 4 × 4 cells of 8 gradient directions.
-pub(super) const DESCRIPTOR: usize = 128;
+pub(crate) const DESCRIPTOR: usize = 128;
 
 /// Returns the magnitude and the direction of the gradient at an inner pixel.
 fn gradient(image: &GrayImage, x: usize, y: usize) -> (f32, f32) {
@@ -41,7 +41,7 @@ fn atan2_approx(y: f32, x: f32) -> f32 {
 }
 
 /// Returns one copy of the feature for every strong gradient direction around it (Lowe, section 5).
-pub(super) fn oriented(feature: &Feature, octaves: &[Octave]) -> Vec<Feature> {
+pub(crate) fn oriented(feature: &Feature, octaves: &[Octave]) -> Vec<Feature> {
     const BINS: usize = 36;
     let position = feature.position;
     let image = &octaves[position.octave].blurred[position.level];
@@ -97,7 +97,7 @@ fn for_window(
 
 /// Returns the descriptor of a feature: 4 × 4 cells of 3σ, 8 directions, trilinear weights, a
 /// Gaussian of half the width (Lowe, section 6). The result √(L1-normalised) has unit length.
-pub(super) fn describe(position: &PyramidPoint, octaves: &[Octave]) -> [f32; DESCRIPTOR] {
+pub(crate) fn describe(position: &PyramidPoint, octaves: &[Octave]) -> [f32; DESCRIPTOR] {
     const CELLS: usize = 4;
     const DIRECTIONS: usize = 8;
     let image = &octaves[position.octave].blurred[position.level];

@@ -1,0 +1,29 @@
+//! Cameras of photographs that come without any: poses, a shared focal length and sparse points.
+//!
+//! Input: photographs with what is known of their lenses ([`PosePhoto`], [`Lens`]). Output:
+//! [`PoseEstimate`], or the reason why there is none ([`PoseRefusal`]). The module reads no files.
+//! Equal photographs give equal estimates.
+//!
+//! Two photographs: points are matched, an essential matrix is estimated and refined
+//! (`pair.rs`). Three and more: pairs are joined one by one (`reconstruct.rs`) and adjusted
+//! together (`bundle.rs`). The world's +y axis points down as far as the cameras' horizon says
+//! (`world.rs`); its unit is the median depth of the points.
+
+mod absolute;
+mod bundle;
+mod estimate;
+mod five_point;
+mod pair;
+mod photo;
+mod ransac;
+mod reconstruct;
+mod refine;
+mod tracks;
+mod two_view;
+mod world;
+
+pub use estimate::{
+    Confidence, FocalEstimate, LeftOut, PoseEstimate, PoseOptions, PosePoint, PoseRefusal,
+    PoseWarning, estimate_poses,
+};
+pub use photo::{Lens, PosePhoto};

@@ -1,0 +1,148 @@
+//! Parsers of argument values that need no file. clap reports their errors as wrong usage.
+
+use super::args::InputSizeArg;
+use subsplat::camera::Intrinsics;
+
+/// Largest number of views of a path.
+const PATH_MAX: usize = 100_000;
+/// Largest number of threads; to start millions would hang the machine.
+const THREADS_MAX: usize = 1024;
+/// Largest r of `--upscale`, as of the configuration.
+const UPSCALE_MAX: usize = 8;
+
+/// Parses a whole number from `least` to `most`.
+fn whole(text: &str, least: usize, most: usize) -> Result<usize, String> {
+    let number = text.trim().parse().ok().filter(|n| (least..=most).contains(n));
+    number.ok_or_else(|| match most {
+        usize::MAX => format!("expected a whole number of at least {least}"),
+        _ => format!("expected a whole number from {least} to {most}"),
+    })
+}
+
+/// Parses a number of views.
+pub fn frames(text: &str) -> Result<usize, String> {
+    whole(text, 1, PATH_MAX)
+}
+
+/// Parses a number of threads.
+pub fn threads(text: &str) -> Result<usize, String> {
+    whole(text, 1, THREADS_MAX)
+}
+
+/// Parses r, the target's side over the input's.
+pub fn upscale(text: &str) -> Result<usize, String> {
+    whole(text, 1, UPSCALE_MAX)
+}
+
+/// Parses an SH degree.
+pub fn sh_degree(text: &str) -> Result<usize, String> {
+    whole(text, 0, 4)
+}
+
+/// Parses a number above 0.
+pub fn at_least_one(text: &str) -> Result<usize, String> {
+    whole(text, 1, usize::MAX)
+}
+
+/// Parses a finite number within `range`, which `expected` describes.
+fn real(text: &str, range: impl Fn(f32) -> bool, expected: &str) -> Result<f32, String> {
+    let number: Option<f32> = text.trim().parse().ok();
+    number.filter(|v| v.is_finite() && range(*v)).ok_or_else(|| format!("expected {expected}"))
+}
+
+/// Parses a finite number above 0.
+pub fn positive(text: &str) -> Result<f32, String> {
+    real(text, |v| v > 0.0, "a finite number above 0")
+}
+
+/// Parses a number of minutes above 0.
+pub fn minutes(text: &str) -> Result<f64, String> {
+    positive(text).map(f64::from)
+}
+
+/// Parses a field of view, degrees.
+pub fn fov(text: &str) -> Result<f32, String> {
+    real(text, |v| v > 0.0 && v < 180.0, "degrees above 0 and below 180")
+}
+
+/// Parses a least opacity.
+pub fn opacity(text: &str) -> Result<f32, String> {
+    real(text, |v| (0.0..1.0).contains(&v), "0 to below 1")
+}
+
+/// Parses three numbers, separated by commas or white space.
+pub fn triple(text: &str) -> Result<[f32; 3], String> {
+    let numbers: Result<Vec<f32>, _> = text
+        .split(|c: char| c == ',' || c.is_whitespace())
+        .filter(|w| !w.is_empty())
+        .map(str::parse)
+        .collect();
+    let three = numbers.ok().and_then(|v| <[f32; 3]>::try_from(v).ok());
+    three
+        .filter(|v| v.iter().all(|v| v.is_finite()))
+        .ok_or_else(|| "expected three numbers with commas between them".to_owned())
+}
+
+/// Parses a colour of three numbers in [0, 1].
+pub fn colour(text: &str) -> Result<[f32; 3], String> {
+    let colour = triple(text)?;
+    let inside = colour.iter().all(|v| (0.0..=1.0).contains(v));
+    inside.then_some(colour).ok_or_else(|| "expected three numbers in [0, 1]".to_owned())
+}
+
+/// Parses the size of the network's input, `N` or `WxH`, px.
+pub fn input_size(text: &str) -> Result<InputSizeArg, String> {
+    let (width, height) = size(text)?;
+    let side = !text.contains(['x', 'X', '×']);
+    Ok(if side { InputSizeArg::Side(width) } else { InputSizeArg::Sides(width, height) })
+}
+
+/// Parses width and height of `N` or `WxH`, px.
+pub fn size(text: &str) -> Result<(usize, usize), String> {
+    let side = |s: &str| whole(s, 1, Intrinsics::SIDE_MAX);
+    let sides = match text.split_once(['x', 'X', '×']) {
+        Some((w, h)) => side(w).and_then(|w| Ok((w, side(h)?))),
+        None => side(text).map(|n| (n, n)),
+    };
+    let most = Intrinsics::SIDE_MAX;
+    sides.map_err(|_| format!("expected N or WxH, 1 to {most} pixels a side"))
+}
+
+/// The conflict of a near and a far end, if there is one.
+pub fn depth_conflict(near: Option<f32>, far: Option<f32>) -> Option<String> {
+    let (near, far) = near.zip(far)?;
+    (near >= far).then(|| format!("--near {near}: expected less than --far {far}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes() {
+        assert_eq!(size("256"), Ok((256, 256)));
+        assert_eq!(size("320x192"), Ok((320, 192)));
+        assert_eq!(input_size("256"), Ok(InputSizeArg::Side(256)));
+        assert_eq!(input_size("256x256"), Ok(InputSizeArg::Sides(256, 256)));
+        for bad in ["", "0", "12x", "x12", "3x0", "-3", "1e9", "99999999999999999999", "32769"] {
+            assert!(size(bad).unwrap_err().contains("N or WxH"), "{bad}");
+        }
+    }
+
+    #[test]
+    fn numbers_have_their_bounds() {
+        assert_eq!((upscale("1"), upscale("8"), sh_degree("0")), (Ok(1), Ok(8), Ok(0)));
+        assert!(upscale("0").is_err() && upscale("9").is_err() && sh_degree("5").is_err());
+        assert!(frames("0").is_err() && frames("100000").is_ok() && frames("100001").is_err());
+        assert!(at_least_one("0").is_err() && at_least_one("7").is_ok());
+        assert_eq!((fov("179.9"), opacity("0")), (Ok(179.9), Ok(0.0)));
+        assert!(["0", "180", "nan", "x"].iter().all(|t| fov(t).is_err()));
+        assert!(["-0.1", "1", "nan"].iter().all(|t| opacity(t).is_err()));
+        assert!(["0", "-1", "nan", "inf"].iter().all(|t| positive(t).is_err()));
+        assert_eq!(colour("0,0.5 1"), Ok([0.0, 0.5, 1.0]));
+        assert!(colour("0,1.1,0").is_err() && colour("0,1").is_err());
+        assert!(triple("nan,0,0").is_err() && triple("-3,0,7").is_ok());
+        assert!(depth_conflict(Some(2.0), Some(2.0)).is_some());
+        assert!(depth_conflict(Some(1.0), Some(2.0)).or(depth_conflict(Some(1.0), None)).is_none());
+    }
+}

@@ -1,0 +1,102 @@
+//! Photographs without cameras: `subsplat poses`, and `run` of photographs and folders.
+
+use crate::program::{call_in, call_with};
+use std::fs;
+use std::path::{Path, PathBuf};
+use subsplat::Camera;
+use subsplat::io::scene::load_scene;
+
+/// The example's folder, whose two inputs have known cameras.
+fn room() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/room")
+}
+
+/// Focal length and centre of the example's inputs, px.
+const INTRINSICS: &str = "189.767822,189.767822,128,128";
+
+/// A folder `photos` with the example's two inputs and no cameras.
+fn folder() -> tempfile::TempDir {
+    let place = tempfile::tempdir().unwrap();
+    fs::create_dir(place.path().join("photos")).unwrap();
+    for name in ["input_0.png", "input_1.png"] {
+        fs::copy(room().join("images").join(name), place.path().join("photos").join(name)).unwrap();
+    }
+    place
+}
+
+/// Rotation and direction errors of the second camera in the first one's frame, degrees.
+fn errors(found: [Camera; 2], truth: [Camera; 2]) -> [f32; 2] {
+    let relative = |[a, b]: [Camera; 2]| a.camera_from_world() * b.world_from_camera();
+    let (f, t) = (relative(found), relative(truth));
+    let turn = glam::Quat::from_mat4(&f).angle_between(glam::Quat::from_mat4(&t));
+    let direction = f.w_axis.truncate().angle_between(t.w_axis.truncate());
+    [turn.to_degrees(), direction.to_degrees()]
+}
+
+#[test]
+fn poses_of_two_photographs_are_those_of_the_scene() {
+    let place = folder();
+    let called =
+        call_in(place.path(), &format!("--json poses photos --intrinsics {INTRINSICS} -o photos"));
+    assert_eq!(called.code, 0, "{}", called.stderr);
+    let report = called.json();
+    assert_eq!(report["confidence"], "high", "{report}");
+    assert!(report["points"].as_u64().unwrap() > 50, "{report}");
+    let truth = load_scene(&room()).unwrap();
+    let truth = [truth.frames[0].camera, truth.frames[1].camera];
+    for file in ["photos", "photos/cameras.json", "photos/sparse/0"] {
+        let found = load_scene(&place.path().join(file)).unwrap();
+        assert!(found.points.is_some_and(|p| p.len() > 50), "{file}");
+        let found = [found.frames[0].camera, found.frames[1].camera];
+        let [turn, direction] = errors(found, truth);
+        assert!(turn < 0.5 && direction < 1.5, "{file}: {turn} {direction}");
+    }
+}
+
+#[test]
+fn a_folder_of_photographs_becomes_a_scene() {
+    let place = folder();
+    let arguments =
+        format!("--json run photos --intrinsics {INTRINSICS} --fit 0 --frames 1 -o out");
+    let called = call_in(place.path(), &arguments);
+    assert_eq!(called.code, 0, "{}", called.stderr);
+    let report = called.json();
+    assert_eq!(report["context"], serde_json::json!(["input_0", "input_1"]));
+    assert_eq!(report["near_far_from"].as_str().unwrap().matches("sparse points").count(), 1);
+    // The photographs give themselves back: the cameras fit.
+    assert!(report["inputs"]["psnr"].as_f64().unwrap() > 20.0, "{}", report["inputs"]);
+    assert!(place.path().join("out/scene.ply").is_file());
+}
+
+#[test]
+fn photographs_that_determine_no_cameras_are_refused_with_exit_code_3() {
+    let place = folder();
+    let same = "photos/input_0.png photos/input_0.png";
+    for command in ["poses", "run", "check"] {
+        let called = call_in(place.path(), &format!("--json {command} {same} --fov 60 -o new"));
+        assert_eq!(called.code, 3, "{command}: {}", called.stderr);
+        assert!(called.error().contains("input_0.png"), "{}", called.stderr);
+        assert!(called.json()["error"].as_str().unwrap().contains("photographs"));
+    }
+    assert!(!place.path().join("new/cameras.json").exists());
+    fs::create_dir(place.path().join("one")).unwrap();
+    fs::copy(place.path().join("photos/input_0.png"), place.path().join("one/a.png")).unwrap();
+    for (arguments, words) in [
+        ("poses one", "at least 2 photographs, got 1"),
+        ("poses photos/input_0.png", "got one photograph"),
+        ("run one", "at least 2 photographs, got 1"),
+        ("poses photos missing.png", "photos"),
+        ("poses photos --intrinsics 1,2", "--intrinsics"),
+    ] {
+        let called = call_in(place.path(), arguments);
+        assert_eq!(called.code, 1, "{arguments}: {}", called.stderr);
+        assert!(called.error().contains(words), "{arguments}: {}", called.error());
+    }
+    let scene = room();
+    let called = call_with(place.path(), &["poses", scene.to_str().unwrap()], &[]);
+    assert!(
+        called.code == 1 && called.error().contains("a scene with cameras"),
+        "{}",
+        called.stderr
+    );
+}
