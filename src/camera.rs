@@ -16,7 +16,7 @@ use glam::{Mat3, Mat4, Vec2, Vec3};
 use thiserror::Error;
 
 /// Reason for which a camera is refused.
-#[derive(Debug, Error, PartialEq)]
+#[derive(Clone, Debug, Error, PartialEq)]
 pub enum CameraError {
     /// A number is NaN or infinite.
     #[error("camera {what}: expected finite numbers, got {got}")]

@@ -192,8 +192,8 @@ pub use pipeline::{
     Reconstructor, Result, Stage, StageTime, Warning, loose_scene,
 };
 pub use poses::{
-    Confidence, FocalEstimate, LeftOut, Lens, PoseEstimate, PoseOptions, PosePhoto, PosePoint,
-    PoseRefusal, PoseWarning, estimate_poses,
+    Confidence, FocalEstimate, LeftOut, Lens, PoseEstimate, PoseOptions, PosePhoto, PosePhotoError,
+    PosePoint, PoseRefusal, PoseWarning, estimate_poses,
 };
 pub use render::{Picture, Renderer, render};
 pub use splats::{Quantiles, SplatParts, SplatStatistics, Splats, SplatsError};

@@ -96,7 +96,9 @@ fn module(path: &Path) -> String {
 
 /// Lines of code: comments, and unit tests at the end of a file, left out.
 fn code(text: &str) -> String {
-    let body = text.split("#[cfg(test)]\nmod ").next().unwrap_or(text);
+    let tests = ["#[cfg(test)]\nmod ", "#[cfg(test)]\npub(super) mod "];
+    let end = tests.iter().filter_map(|t| text.find(t)).min().unwrap_or(text.len());
+    let body = &text[..end];
     body.lines()
         .map(|l| if l.trim_start().starts_with("//") { "" } else { l })
         .collect::<Vec<_>>()

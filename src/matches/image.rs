@@ -117,6 +117,13 @@ impl GrayImage {
         Self { width, height, pixels }
     }
 
+    /// Returns the picture mirrored left to right.
+    pub(crate) fn flipped(&self) -> Self {
+        let rows = self.pixels.chunks_exact(self.width);
+        let pixels = rows.flat_map(|row| row.iter().rev().copied()).collect();
+        Self { pixels, ..*self }
+    }
+
     /// Doubles the size by bilinear interpolation. The centre of pixel (2i, 2j) is the centre of
     /// pixel (i, j) of the source.
     pub(crate) fn doubled(&self) -> Self {

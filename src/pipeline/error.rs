@@ -5,7 +5,7 @@ use crate::camera::CameraError;
 use crate::config::ConfigError;
 use crate::io;
 use crate::metrics::MetricsError;
-use crate::poses::PoseRefusal;
+use crate::poses::{PosePhotoError, PoseRefusal};
 use crate::render::DeviceError;
 use crate::splats::SplatsError;
 use thiserror::Error;
@@ -37,6 +37,9 @@ pub enum Error {
     /// The poses do not fit the photographs, and [`Check::Refuse`](super::Check::Refuse) was set.
     #[error(transparent)]
     Poses(#[from] PoseError),
+    /// A photograph is no input of the estimation of poses.
+    #[error(transparent)]
+    PosePhoto(#[from] PosePhotoError),
     /// The photographs alone do not determine their cameras.
     #[error("{photographs}: {reason}")]
     NoPoses {

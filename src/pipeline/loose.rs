@@ -97,14 +97,9 @@ pub fn loose_scene(
         let loaded = load_photograph(path, &options.load)?;
         warnings.extend(loaded.warnings.iter().cloned());
         let (lens, source) = lens(&loaded, options.lens);
-        lens.intrinsics.check()?;
         lenses.push(source);
         let image = loaded.image;
-        let photo = PosePhoto::from_rgb8(&image.data, lens, features).ok_or_else(|| {
-            let expected = format!("3 bytes for each of {}x{} pixels", image.width, image.height);
-            Error::argument("photograph", expected, format!("{} bytes", image.data.len()))
-        })?;
-        photos.push(photo);
+        photos.push(PosePhoto::from_rgb8(&image.data, lens, features)?);
     }
     let estimate = estimate_poses(&photos, &options.poses).map_err(|reason| Error::NoPoses {
         photographs: photographs_of(name, photographs),

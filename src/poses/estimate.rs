@@ -164,6 +164,15 @@ pub enum PoseRefusal {
         /// Number that is needed.
         needed: usize,
     },
+    /// One of two photographs is mirrored.
+    #[error(
+        "one of the photographs is mirrored: {consistent} matched points agree with one position of \
+         the cameras once the second one is flipped left to right; flip one of them"
+    )]
+    Mirrored {
+        /// Number of matches that agree.
+        consistent: usize,
+    },
     /// Several cameras explain the matches equally well.
     #[error(
         "two different positions of the cameras explain the matched points equally well ({percent:.0} \
@@ -247,27 +256,46 @@ pub fn estimate_poses(
 /// Two photographs, with rotated descriptors where upright ones find too little.
 fn two(a: &PosePhoto, b: &PosePhoto, options: &PoseOptions) -> Result<PoseEstimate, PoseRefusal> {
     let upright = pair::estimate(a, b, true, options.seed);
-    let supported = |e: &Option<PairEstimate>| e.as_ref().map_or(0, |e| e.consistent);
-    if supported(&upright) >= FEW_CONSISTENT {
+    if supported(&upright) >= FEW_CONSISTENT && !is_upside_down(&upright) {
         return judged(a, b, upright, options);
     }
     let turned = [a, b].map(PosePhoto::with_rotated_features);
     let rotated = pair::estimate(&turned[0], &turned[1], true, options.seed);
-    if supported(&rotated) > supported(&upright) + supported(&upright) / 2 {
-        return judged(&turned[0], &turned[1], rotated, options);
+    let better = supported(&rotated) > supported(&upright) + supported(&upright) / 2;
+    let (best, [first, second]) = match better {
+        true => (rotated, [&turned[0], &turned[1]]),
+        false => (upright, [a, b]),
+    };
+    // Symmetric things in a mirrored photograph agree with a camera upside down behind a plane.
+    if !options.force
+        && (supported(&best) < FEW_CONSISTENT || is_upside_down(&best))
+        && let Some(refusal) = mirrored(a, b, supported(&best), options)
+    {
+        return Err(refusal);
     }
-    judged(a, b, upright, options)
+    judged(first, second, best, options)
+}
+
+/// Returns whether one of the cameras looks back, or lies on its side and beyond, as the other
+/// sees it.
+fn is_upside_down(e: &Result<PairEstimate, Vec<Bearings>>) -> bool {
+    let turn = |e: &PairEstimate| super::two_view::rotation_angle(&e.refined.relative.rotation);
+    e.as_ref().is_ok_and(|e| turn(e) > std::f64::consts::FRAC_PI_2)
+}
+
+/// Number of matches that were found without a geometry and agree with the pose.
+fn supported(e: &Result<PairEstimate, Vec<Bearings>>) -> usize {
+    e.as_ref().map_or(0, |e| e.consistent)
 }
 
 /// Refuses an estimate, or turns it into cameras and points.
 fn judged(
     a: &PosePhoto,
     b: &PosePhoto,
-    estimate: Option<PairEstimate>,
+    estimate: Result<PairEstimate, Vec<Bearings>>,
     options: &PoseOptions,
 ) -> Result<PoseEstimate, PoseRefusal> {
-    let few = PoseRefusal::FewMatches { consistent: 0, matches: 0, needed: MIN_CONSISTENT };
-    let estimate = estimate.ok_or(few)?;
+    let estimate = estimate.map_err(|matches| unexplained(a, &matches))?;
     let refusal = refusal(a, &estimate);
     if let (Some(refusal), false) = (&refusal, options.force) {
         return Err(refusal.clone());
@@ -323,30 +351,63 @@ fn pair_deviations(estimate: &PairEstimate) -> [f64; 3] {
 fn refusal(a: &PosePhoto, estimate: &PairEstimate) -> Option<PoseRefusal> {
     let scale = estimate.refined.focal_scale;
     let points: Vec<Bearings> = estimate.points.iter().map(|m| m.rescaled(scale)).collect();
-    let side = a.lens.intrinsics.width.max(a.lens.intrinsics.height) as f64;
-    let focal = f64::from(a.lens.intrinsics.fx.min(a.lens.intrinsics.fy)) * scale;
-    let px = focal * REPORT_SIDE / side;
-    let shift_px = px * median(points.iter().map(|m| m.a.distance(m.b)).collect());
     let (consistent, matches) = (estimate.consistent, estimate.matches);
     if consistent < MIN_CONSISTENT || (consistent as f64) < MIN_SHARE * matches as f64 {
-        let needed = MIN_CONSISTENT.max((MIN_SHARE * matches as f64).ceil() as usize);
-        return Some(PoseRefusal::FewMatches { consistent, matches, needed });
+        return Some(few_matches(consistent, matches));
     }
+    let percent = 100.0 * estimate.rival;
+    let ambiguous = (estimate.rival > AMBIGUOUS).then_some(PoseRefusal::Ambiguous { percent });
+    still(a, &points, scale).or(ambiguous)
+}
+
+/// Returns the refusal of matches that no pose explains.
+fn unexplained(a: &PosePhoto, matches: &[Bearings]) -> PoseRefusal {
+    let enough = matches.len() >= MIN_CONSISTENT;
+    enough.then(|| still(a, matches, 1.0)).flatten().unwrap_or(few_matches(0, matches.len()))
+}
+
+fn few_matches(consistent: usize, matches: usize) -> PoseRefusal {
+    let needed = MIN_CONSISTENT.max((MIN_SHARE * matches as f64).ceil() as usize);
+    PoseRefusal::FewMatches { consistent, matches, needed }
+}
+
+/// Returns the refusal of points that a camera sees which did not move. `points` belong to a focal
+/// length `scale` times that of the lens of `a`.
+fn still(a: &PosePhoto, points: &[Bearings], scale: f64) -> Option<PoseRefusal> {
+    let k = &a.lens.intrinsics;
+    let px = f64::from(k.fx.min(k.fy)) * scale * REPORT_SIDE / k.width.max(k.height) as f64;
+    let shift_px = px * median(points.iter().map(|m| m.a.distance(m.b)).collect());
     if shift_px < SAME_VIEW_PX {
         return Some(PoseRefusal::SameView { shift_px });
     }
-    let turn = best_rotation(&points);
+    let turn = best_rotation(points);
     let parallax = |m: &Bearings| {
         let p = turn * m.a.extend(1.0);
         (p.truncate() / p.z).distance(m.b)
     };
     let parallax_px = px * median(points.iter().map(parallax).collect());
-    if parallax_px < MIN_PARALLAX_PX {
-        let degrees = super::two_view::rotation_angle(&turn).to_degrees();
-        return Some(PoseRefusal::PureRotation { degrees, parallax_px });
-    }
-    let percent = 100.0 * estimate.rival;
-    (estimate.rival > AMBIGUOUS).then_some(PoseRefusal::Ambiguous { percent })
+    let degrees = super::two_view::rotation_angle(&turn).to_degrees();
+    (parallax_px < MIN_PARALLAX_PX).then_some(PoseRefusal::PureRotation { degrees, parallax_px })
+}
+
+/// Returns the refusal of two photographs of which one is mirrored: at least twice as many matches
+/// as `consistent` agree with a pose, or with no motion, once the second is flipped.
+fn mirrored(
+    a: &PosePhoto,
+    b: &PosePhoto,
+    consistent: usize,
+    options: &PoseOptions,
+) -> Option<PoseRefusal> {
+    let flipped = pair::estimate(a, &b.flipped(), false, options.seed);
+    let agreeing = match &flipped {
+        Ok(estimate) => estimate.consistent,
+        Err(matches) if matches.len() >= MIN_CONSISTENT && still(a, matches, 1.0).is_some() => {
+            matches.len()
+        }
+        Err(_) => 0,
+    };
+    let enough = agreeing >= FEW_CONSISTENT && agreeing >= 2 * consistent;
+    enough.then_some(PoseRefusal::Mirrored { consistent: agreeing })
 }
 
 /// The rotation that moves the first bearings closest to the second ones: least squares on unit
@@ -388,8 +449,8 @@ fn many(photos: &[PosePhoto], options: &PoseOptions) -> Result<PoseEstimate, Pos
         if deviation > STATED { reconstruct::focal_scale(photos, options.seed) } else { 1.0 };
     let exact: Vec<PosePhoto> = photos.par_iter().map(|p| p.with_focal(first)).collect();
     let edges = reconstruct::edges(&exact, options.seed);
-    let usable: Vec<Edge> =
-        edges.into_iter().filter(|e| refusal(&exact[e.photos[0]], &e.estimate).is_none()).collect();
+    let sound = |e: &Edge| options.force || refusal(&exact[e.photos[0]], &e.estimate).is_none();
+    let usable: Vec<Edge> = edges.into_iter().filter(sound).collect();
     let prior = (deviation > 0.0).then_some(FocalPrior { mean: -first.ln(), deviation });
     let mut model =
         reconstruct::build(&exact, &usable, prior, options.seed).ok_or(PoseRefusal::NoPair)?;

@@ -26,4 +26,4 @@ pub use estimate::{
     Confidence, FocalEstimate, LeftOut, PoseEstimate, PoseOptions, PosePoint, PoseRefusal,
     PoseWarning, estimate_poses,
 };
-pub use photo::{Lens, PosePhoto};
+pub use photo::{Lens, PosePhoto, PosePhotoError};

@@ -62,14 +62,17 @@ fn support(r: &Refined, points: &[Bearings], prior: Option<FocalPrior>) -> f64 {
     inside - prior.map_or(0.0, |p| (p.distance(s.ln()) / LIMIT).powi(2))
 }
 
-/// Estimates the relative pose of `a` and `b`; `None` without any consistent matches. `precise`
-/// aligns the matches below the pixel, which takes half of the time.
+/// Estimates the relative pose of `a` and `b`. `precise` aligns the matches below the pixel, which
+/// takes half of the time.
+///
+/// # Errors
+/// The matches, where no pose explains any of them: equal photographs, for example.
 pub(super) fn estimate(
     a: &PosePhoto,
     b: &PosePhoto,
     precise: bool,
     seed: u64,
-) -> Option<PairEstimate> {
+) -> Result<PairEstimate, Vec<Bearings>> {
     let exact = if precise { aligned } else { detected };
     let found = pairs::pairs(&a.features, &b.features);
     let prior = prior(a, b);
@@ -86,7 +89,7 @@ pub(super) fn estimate(
         .collect();
     completed.sort_by(|x, y| y.0.total_cmp(&x.0));
     let rival = rival(&completed, &exact(a, b, &found), prior);
-    let (_, coarse, more) = completed.into_iter().next()?;
+    let Some((_, coarse, more)) = completed.into_iter().next() else { return Err(first) };
     let points = exact(a, b, &more);
     let mut refined = refine(&coarse.relative, coarse.focal_scale, &points, prior, 30);
     let mut inliers = within(&refined, &points);
@@ -101,14 +104,13 @@ pub(super) fn estimate(
     let consistent = within(&refined, &first).len();
     let inlier_pairs = inliers.iter().map(|&i| more[i]).collect();
     let points = inliers.iter().map(|&i| points[i]).collect();
-    let (matches, free_focal) = (found.len(), prior.is_some());
-    Some(PairEstimate {
+    Ok(PairEstimate {
         refined,
         inliers: inlier_pairs,
         points,
-        matches,
+        matches: found.len(),
         consistent,
-        free_focal,
+        free_focal: prior.is_some(),
         rival,
     })
 }

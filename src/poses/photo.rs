@@ -1,7 +1,7 @@
 //! A photograph for pose estimation: its features and what is known of its lens.
 
 use super::two_view::Bearings;
-use crate::camera::Intrinsics;
+use crate::camera::{CameraError, Intrinsics};
 use crate::matches::features::{self, Features, Orientation};
 use crate::matches::pairs::Pair;
 use crate::matches::{GrayImage, align};
@@ -53,6 +53,31 @@ impl Lens {
     }
 }
 
+/// Why a photograph cannot be used.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum PosePhotoError {
+    /// The lens is no camera.
+    #[error(transparent)]
+    Lens(#[from] CameraError),
+    /// The uncertainty of the focal length is no number, infinite or negative.
+    #[error("standard deviation of the focal length: expected a number from 0, got {found}")]
+    Deviation {
+        /// The value.
+        found: f64,
+    },
+    /// The pixels do not have the lens's size.
+    #[error("photograph: expected 3 bytes for each of {width}x{height} pixels, got {found} bytes")]
+    Length {
+        /// Width of the lens's picture, px.
+        width: usize,
+        /// Height of the lens's picture, px.
+        height: usize,
+        /// Number of bytes.
+        found: usize,
+    },
+}
+
 /// A photograph's features with its lens.
 #[derive(Clone, Debug)]
 pub struct PosePhoto {
@@ -74,16 +99,24 @@ const WORKING_SIDE: usize = 1600;
 
 impl PosePhoto {
     /// Detects at most `max_features` features of a photograph of interleaved 8-bit RGB. `lens` is
-    /// in px of the photograph. `None` where `rgb` does not hold 3·W·H bytes of the lens's size.
-    pub fn from_rgb8(rgb: &[u8], lens: Lens, max_features: usize) -> Option<Self> {
+    /// in px of the photograph.
+    ///
+    /// # Errors
+    /// A lens that is no camera; `rgb` of another length than 3·W·H of the lens's size.
+    pub fn from_rgb8(rgb: &[u8], lens: Lens, max_features: usize) -> Result<Self, PosePhotoError> {
+        lens.intrinsics.check()?;
+        if !(lens.deviation >= 0.0 && lens.deviation.is_finite()) {
+            return Err(PosePhotoError::Deviation { found: lens.deviation });
+        }
         let (w, h) = (lens.intrinsics.width, lens.intrinsics.height);
-        let image = GrayImage::from_rgb8(w, h, rgb)?;
+        let length = PosePhotoError::Length { width: w, height: h, found: rgb.len() };
+        let image = GrayImage::from_rgb8(w, h, rgb).ok_or(length)?;
         let mut photo = Self::new(image, lens, max_features, Orientation::Upright);
         photo.sample_colours(|x, y| {
             let at = 3 * (y * w + x);
             [rgb[at], rgb[at + 1], rgb[at + 2]]
         });
-        Some(photo)
+        Ok(photo)
     }
 
     fn new(image: GrayImage, lens: Lens, count: usize, orientation: Orientation) -> Self {
@@ -127,6 +160,16 @@ impl PosePhoto {
         };
         photo.colours =
             (0..photo.features.points.len()).map(|i| nearest(photo.position(i))).collect();
+        photo
+    }
+
+    /// The photograph mirrored left to right, without colours.
+    pub(super) fn flipped(&self) -> Self {
+        let mut lens = self.lens;
+        lens.intrinsics.cx = lens.intrinsics.width as f32 - lens.intrinsics.cx;
+        let count = self.features.points.len();
+        let mut photo = Self::new(self.image.flipped(), lens, count, Orientation::Upright);
+        photo.colours = vec![[0; 3]; photo.features.points.len()];
         photo
     }
 

@@ -18,6 +18,8 @@ use rayon::prelude::*;
 
 /// Smallest number of matches of a verified pair.
 const MIN_PAIR_INLIERS: usize = 20;
+/// Smallest number of its matches that were found without a geometry.
+const MIN_PAIR_CONSISTENT: usize = 16;
 /// Smallest number of points by which a photograph is located.
 const MIN_SIGHTS: usize = 12;
 /// Smallest share of the points that agree with a located photograph.
@@ -96,8 +98,8 @@ pub(super) fn edges(photos: &[PosePhoto], seed: u64) -> Vec<Edge> {
     compared(photos)
         .into_par_iter()
         .filter_map(|[i, j]| {
-            let estimate = pair::estimate(&photos[i], &photos[j], false, seed)?;
-            let enough = estimate.consistent >= MIN_PAIR_INLIERS.min(16)
+            let estimate = pair::estimate(&photos[i], &photos[j], false, seed).ok()?;
+            let enough = estimate.consistent >= MIN_PAIR_CONSISTENT
                 && estimate.inliers.len() >= MIN_PAIR_INLIERS;
             enough.then_some(Edge { photos: [i, j], estimate })
         })
@@ -124,7 +126,7 @@ pub(super) fn focal_scale(photos: &[PosePhoto], seed: u64) -> f64 {
         .collect::<Vec<_>>()
         .into_par_iter()
         .filter_map(|(_, [i, j])| {
-            let e = pair::estimate(&photos[*i], &photos[*j], false, seed)?;
+            let e = pair::estimate(&photos[*i], &photos[*j], false, seed).ok()?;
             let weight =
                 e.refined.information.try_inverse().map_or(0.0, |c| 1.0 / c[(5, 5)].max(1e-6));
             (e.consistent >= MIN_PAIR_INLIERS).then_some((e.refined.focal_scale, weight.sqrt()))

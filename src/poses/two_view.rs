@@ -132,7 +132,7 @@ pub(super) fn sampson(e: &DMat3, m: &Bearings) -> f64 {
 }
 
 #[cfg(test)]
-pub mod tests {
+pub(super) mod tests {
     use super::*;
     use crate::matches::random::SplitMix;
 

@@ -5,7 +5,7 @@ use glam::{DMat3, DVec3};
 
 /// Weight of the cameras' own vertical axes against their horizontal axes. Photographs are seldom
 /// rolled, but often pitched: the horizontal axes decide unless all of them are parallel.
-const VERTICAL_WEIGHT: f64 = 0.02;
+const VERTICAL_WEIGHT: f64 = 0.01;
 
 /// Returns the direction of gravity in the world of `cameras`: the direction that is perpendicular
 /// to the cameras' x axes in the sense of least squares, towards their y axes.

@@ -10,6 +10,8 @@ pub mod made_up;
 pub mod noise;
 pub mod one_splat;
 pub mod oracle;
+pub mod pose_errors;
+pub mod posed_photos;
 pub mod primaries_reference;
 pub mod raster_case;
 pub mod raster_gradients;

@@ -1,0 +1,5 @@
+//! Tests of poses from photographs alone: pairs, many photographs, and what must be refused.
+
+mod many;
+mod pairs;
+mod refused;
