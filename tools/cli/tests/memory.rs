@@ -82,7 +82,7 @@ fn large_photographs_are_freed_before_the_network() {
         let folder = folder.path().join(width.to_string());
         scene(&folder, width, height);
         // The fit of large photographs has larger pictures than the fit of small ones.
-        peak(&folder, &["--backbone", "re10k", "--detail", "off", "--fit", "0"])
+        peak(&folder, &["--backbone", "re10k", "--crop", "square", "--detail", "off", "--fit", "0"])
     });
     let [small, large] = peaks;
     assert!(large - small <= LARGE_PHOTOGRAPHS, "{large:.0} MiB instead of {small:.0}");

@@ -94,11 +94,9 @@ fn broken_files() {
     edit("unclosed", "}", "");
     std::fs::write(at("scene.ply"), "ply\nformat binary_little_endian 1.0\n").unwrap();
     std::fs::write(at("empty.spz"), "").unwrap();
-    let rows: [Row; 12] = [
+    let rows: [Row; 10] = [
         ("run cut --context 0,2", "view2.png"),
         ("check cut --context 0,2", "view2.png"),
-        ("run poseless", "cameras.json"),
-        ("check poseless", "cameras.json"),
         ("info poseless", "cameras.json"),
         ("run sizes --context 0,2", "128x128"),
         ("run nan --context 0,2", "cameras.json"),
@@ -154,7 +152,6 @@ fn wrong_usage_is_exit_code_2() {
         "walk",
         "run",
         "run scene --walk",
-        "run a b c",
         "run a b --move 1,2",
         "run scene --upscale two",
         "run scene --preset paper --config x",

@@ -30,7 +30,7 @@ fn wrong_arguments_are_told_before_a_window_is_looked_for() {
         ("a.ply --near -1", 2, "expected a finite number above 0"),
         ("a.ply --background 2,0,0", 2, "--background"),
         ("a.ply --save b.png", 2, "--frames"),
-        ("", 2, "SPLATS | SCENE | IMG IMG"),
+        ("", 2, "SPLATS | SCENE | IMG… | DIR"),
     ] {
         let got = view(folder.path(), arguments, None);
         assert_eq!(got.code, code, "{arguments}: {}", got.stderr);
