@@ -7,12 +7,11 @@
 //! `cargo bench --bench raster -- [NAME …] [--quick] [--seconds S] [--threads N]
 //! [--json FILE] [--write DIR] [--onnxruntime]`; a group runs where its name contains every NAME.
 
-#[allow(dead_code, reason = "each bench uses a part")]
+#![allow(dead_code, reason = "each bench uses a part")]
+
 pub mod conventional;
-#[allow(dead_code, reason = "each bench uses a part")]
 pub mod inputs;
 mod machine;
-#[allow(dead_code, reason = "each bench uses a part")]
 pub mod scene;
 
 use anyhow::{Context, Result, bail, ensure};
@@ -40,10 +39,8 @@ pub struct Args {
     threads: Option<usize>,
     json: Option<PathBuf>,
     /// Folder to write scenes to, instead of timing.
-    #[allow(dead_code, reason = "only scenes are written")]
     pub write: Option<PathBuf>,
     /// Also run onnxruntime.
-    #[allow(dead_code, reason = "only the network has such a rival")]
     pub onnxruntime: bool,
 }
 
@@ -74,7 +71,6 @@ impl Args {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Threads {
     /// One.
-    #[allow(dead_code, reason = "each bench uses a part")]
     One,
     /// All threads of the machine, or `--threads`.
     All,
@@ -111,7 +107,6 @@ impl<'a> Contender<'a> {
     }
 
     /// Creates a contender in another process, which reports its seconds.
-    #[allow(dead_code, reason = "each bench uses a part")]
     pub fn in_other_process(
         name: impl Into<String>,
         mut run: impl FnMut() -> Result<f64> + Send + 'a,
@@ -121,7 +116,6 @@ impl<'a> Contender<'a> {
     }
 
     /// Adds the minimum work.
-    #[allow(dead_code, reason = "each bench uses a part")]
     pub fn with_work(mut self, work: Work) -> Self {
         self.work = Some(work);
         self
@@ -177,7 +171,6 @@ impl Bench {
     }
 
     /// Returns the number of threads of [`Threads::All`].
-    #[allow(dead_code, reason = "each bench uses a part")]
     pub fn threads(&self) -> usize {
         self.all.current_num_threads()
     }
@@ -188,13 +181,11 @@ impl Bench {
     }
 
     /// Runs `work` on all threads.
-    #[allow(dead_code, reason = "each bench uses a part")]
     pub fn on_all<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
         self.all.install(work)
     }
 
     /// Runs `work` on the pool of one thread.
-    #[allow(dead_code, reason = "each bench uses a part")]
     pub fn on_one<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
         self.one.install(work)
     }
@@ -310,7 +301,6 @@ impl Bench {
     }
 
     /// Adds a group whose rows the bench program measured and printed itself.
-    #[allow(dead_code, reason = "each bench uses a part")]
     pub fn add_group(&mut self, name: &str, rows: Vec<Value>) {
         self.groups.push(json!({ "group": name, "rows": rows }));
     }
