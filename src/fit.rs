@@ -267,15 +267,15 @@ fn has_sharper_start(splats: &Splats, views: &[FitView<'_>]) -> bool {
 }
 
 /// A view with its truth as planes.
-struct Target<'a> {
-    camera: &'a Camera,
+pub(crate) struct Target<'a> {
+    pub(crate) camera: &'a Camera,
     /// `[3, H, W]`.
-    truth: Vec<f32>,
+    pub(crate) truth: Vec<f32>,
     dssim: f64,
 }
 
 impl<'a> Target<'a> {
-    fn new(view: usize, v: &FitView<'a>, dssim: f64) -> Result<Self, FitError> {
+    pub(crate) fn new(view: usize, v: &FitView<'a>, dssim: f64) -> Result<Self, FitError> {
         let k = v.camera.intrinsics;
         if (k.width, k.height) != (v.image.width, v.image.height) {
             let expected = format!("{}x{}", k.width, k.height);
@@ -287,11 +287,16 @@ impl<'a> Target<'a> {
 
     /// The loss of rendered planes `[5, H, W]`, with its gradient by R, G and B.
     fn loss(&self, planes: &[f32]) -> Scored {
+        self.loss_to(planes, &self.truth)
+    }
+
+    /// [`Target::loss`] with another `truth`.
+    pub(crate) fn loss_to(&self, planes: &[f32], truth: &[f32]) -> Scored {
         let k = self.camera.intrinsics;
-        let rgb = &planes[..self.truth.len()];
-        let mut loss = loss::mse(rgb, &self.truth);
+        let rgb = &planes[..truth.len()];
+        let mut loss = loss::mse(rgb, truth);
         if self.dssim > 0.0 {
-            loss.add(&loss::dssim(rgb, &self.truth, k.width, k.height), self.dssim);
+            loss.add(&loss::dssim(rgb, truth, k.width, k.height), self.dssim);
         }
         loss
     }

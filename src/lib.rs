@@ -94,6 +94,8 @@ pub mod pipeline;
 #[cfg(feature = "internals")]
 pub mod poses;
 #[cfg(feature = "internals")]
+pub mod refine;
+#[cfg(feature = "internals")]
 pub mod render;
 #[cfg(feature = "internals")]
 pub mod sh;
@@ -143,6 +145,8 @@ mod pipeline;
 #[cfg(not(feature = "internals"))]
 mod poses;
 #[cfg(not(feature = "internals"))]
+mod refine;
+#[cfg(not(feature = "internals"))]
 mod render;
 #[cfg(not(feature = "internals"))]
 mod sh;
@@ -189,11 +193,12 @@ pub use ops::{SplatTensors, rasterize_splats as rasterize};
 pub use pipeline::{
     Check, DepthBounds, DepthRange, DepthSource, Detail, Error, InputSize, KnownLens, LensSource,
     LooseOptions, LooseScene, Options, Photo, PoseError, Prepared, Progress, Reconstruction,
-    Reconstructor, Result, Stage, StageTime, Warning, loose_scene,
+    Reconstructor, Refine, Result, Stage, StageTime, Warning, loose_scene,
 };
 pub use poses::{
     Confidence, FocalEstimate, LeftOut, Lens, PoseEstimate, PoseOptions, PosePhoto, PosePhotoError,
     PosePoint, PoseRefusal, PoseWarning, estimate_poses,
 };
+pub use refine::{RefineOptions, RefineReport, Refiner, refine};
 pub use render::{Picture, Renderer, render};
 pub use splats::{Quantiles, SplatParts, SplatStatistics, Splats, SplatsError};

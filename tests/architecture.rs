@@ -22,6 +22,7 @@ const IMPORTS: &[(&str, &[&str])] = &[
     ("render", &["abi", "backend", "camera", "cpu", "gpu", "io", "splats"]),
     ("loss", &["cpu", "metrics"]),
     ("fit", &["abi", "camera", "io", "loss", "render", "splats"]),
+    ("refine", &["abi", "camera", "fit", "io", "loss", "render", "splats"]),
     ("matches", &["cpu"]),
     ("check", &["camera", "matches", "metrics"]),
     ("poses", &["camera", "matches"]),
@@ -33,7 +34,7 @@ const IMPORTS: &[(&str, &[&str])] = &[
         "pipeline",
         &[
             "abi", "camera", "check", "config", "cpu", "data", "fit", "io", "metrics", "model",
-            "poses", "render", "sh", "splats",
+            "poses", "refine", "render", "sh", "splats",
         ],
     ),
     (
@@ -200,6 +201,7 @@ fn only_the_network_uses_candle() {
             "data",
             "loss",
             "fit",
+            "refine",
             "eval",
         ]
         .contains(&module.as_str())

@@ -183,16 +183,15 @@ pub fn raw_matching(
 ) -> Vec<f32> {
     let plane = reference.0.height * reference.0.width;
     let mut out = vec![0.0; CHANNELS * disparities.len() * plane];
-    add_raw_matching(reference, source, disparities, 1.0, &mut out);
+    write_raw_matching(reference, source, disparities, &mut out);
     out
 }
 
-/// Adds `share` times [`raw_matching`] to `out`.
-pub fn add_raw_matching(
+/// Writes [`raw_matching`] to `out`, whose elements are 0.
+pub fn write_raw_matching(
     reference: (&Pyramid, &Camera),
     source: (&Pyramid, &Camera),
     disparities: &[f32],
-    share: f32,
     out: &mut [f32],
 ) {
     let (r, s) = (reference.0, source.0);
@@ -215,9 +214,9 @@ pub fn add_raw_matching(
     disparities.par_iter().zip(outs).for_each_init(Work::default, |work, (&disparity, outs)| {
         let (((fine, colour), coarse), valid) = outs;
         pair.half_resolution(disparity, work);
-        work.sums.score(share, fine, None);
-        pair.quarter_resolution(disparity, work, share, colour);
-        work.sums.score(share, coarse, Some(valid));
+        work.sums.score(fine, None);
+        pair.quarter_resolution(disparity, work, colour);
+        work.sums.score(coarse, Some(valid));
     });
 }
 
@@ -265,9 +264,9 @@ impl Pair<'_> {
         }
     }
 
-    /// Sums for windows of 5×5 quarter-resolution pixels; adds `share` times −mean |ΔRGB|
+    /// Sums for windows of 5×5 quarter-resolution pixels; adds −mean |ΔRGB|
     /// to `colour`, −0.25 (that of unrelated pixels) where there is no sample.
-    fn quarter_resolution(&self, disparity: f32, work: &mut Work, share: f32, colour: &mut [f32]) {
+    fn quarter_resolution(&self, disparity: f32, work: &mut Work, colour: &mut [f32]) {
         let (h, w) = (self.reference.height, self.reference.width);
         let n = h * w;
         work.sums.begin([h, w], 2, 1.0);
@@ -289,7 +288,7 @@ impl Pair<'_> {
                     for x in 0..w {
                         let samples = [red[x], green[x], blue[x]];
                         let sum = (0..3).fold(0.0, |sum, c| sum + (samples[c] - rgb[c][x]).abs());
-                        colour[x] -= share * if valid[x] > 0.0 { sum / 3.0 } else { 0.25 };
+                        colour[x] -= if valid[x] > 0.0 { sum / 3.0 } else { 0.25 };
                         red[x] = (samples[0] + samples[1] + samples[2]) / 3.0;
                     }
                     sums.add(y, [valid, grey, red], 1);
@@ -344,10 +343,10 @@ impl Sums {
         add_line(&mut self.blocks[to(5)], line, step, |_, a, b| a * b);
     }
 
-    /// Adds `share` times the zero-mean normalised cross-correlation in [−1, 1] to `out`
+    /// Adds the zero-mean normalised cross-correlation in [−1, 1] to `out`
     /// `[h, w]` (0 where less than half of the window is valid), and that of the valid
     /// share of the window to `valid`.
-    fn score(&mut self, share: f32, out: &mut [f32], valid: Option<&mut [f32]>) {
+    fn score(&mut self, out: &mut [f32], valid: Option<&mut [f32]>) {
         let ([h, w], r) = (self.size, self.radius);
         let wide = w + 2 * r;
         vectorize(
@@ -376,10 +375,10 @@ impl Sums {
                             sums.iter_mut().zip(row).for_each(|(sum, v)| *sum += v);
                         }
                     }
-                    score_line(&windows, self.full, share, out);
+                    score_line(&windows, self.full, out);
                     if let Some(valid) = &mut valid {
                         let counts = windows[..w].iter().zip(&mut valid[y * w..(y + 1) * w]);
-                        counts.for_each(|(count, to)| *to += share * (count / self.full));
+                        counts.for_each(|(count, to)| *to += count / self.full);
                     }
                 },
             );
@@ -409,7 +408,7 @@ fn add_line(
 
 /// Adds the scores of a line of windows, `[6, w]` sums.
 #[inline(always)]
-fn score_line(windows: &[f32], full: f32, share: f32, out: &mut [f32]) {
+fn score_line(windows: &[f32], full: f32, out: &mut [f32]) {
     let w = out.len();
     let plane = |p: usize| &windows[p * w..(p + 1) * w];
     let (count, a, b) = (plane(0), plane(1), plane(2));
@@ -420,7 +419,7 @@ fn score_line(windows: &[f32], full: f32, share: f32, out: &mut [f32]) {
         let var_a = (aa[x] * inverse - mean_a * mean_a).max(0.0) + VARIANCE_FLOOR;
         let var_b = (bb[x] * inverse - mean_b * mean_b).max(0.0) + VARIANCE_FLOOR;
         let score = (ab[x] * inverse - mean_a * mean_b) / (var_a * var_b).sqrt();
-        out[x] += if count[x] < 0.5 * full { 0.0 } else { share * score };
+        out[x] += if count[x] < 0.5 * full { 0.0 } else { score };
     }
 }
 

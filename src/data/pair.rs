@@ -6,7 +6,7 @@
 //!
 //! Lengths are world units, angles degrees.
 
-use crate::camera::Camera;
+use crate::camera::{Camera, NearFar};
 use crate::io::scene::{Scene, Units};
 use glam::{Mat3, Vec2, Vec3};
 use rayon::prelude::*;
@@ -160,6 +160,53 @@ fn score(g: &ViewGeometry, depth: f32, coverage: f32) -> Option<f32> {
     let turned = 0.01 * (g.rotation_deg - ROTATION_DEG).max(0.0);
     let too_near = 5.0 * (PARALLAX - parallax).max(0.0);
     Some(COVERAGE * coverage - (g.overlap - OVERLAP).abs() - turned - too_near)
+}
+
+/// Weight of the angle between the baselines of a view's sources: a second source on the other
+/// side shows what the first one does not.
+const OPPOSITE_SIDE: f32 = 0.1;
+
+/// Selects for each camera the `count` others with which its view is compared, the best first.
+///
+/// Each source has the best score of [`choose_pair`] without the coverage; later sources gain
+/// where their baseline points away from those of earlier ones. `near` and `far`: depth range of
+/// the scene, camera z. Cameras at one place come last. Returns fewer than `count` where there
+/// are fewer cameras.
+pub(crate) fn choose_sources(
+    cameras: &[Camera],
+    NearFar { near, far }: NearFar,
+    count: usize,
+) -> Vec<Vec<usize>> {
+    // Candidates are uniform in 1/z; this is the depth of the middle one.
+    let depth = 2.0 / (near.recip() + far.recip());
+    let (low, high) = (0.5 * depth, 2.0 * depth);
+    let of_view = |i: usize| -> Vec<usize> {
+        let mut rest: Vec<(usize, f32, Vec3)> = (0..cameras.len())
+            .filter(|&j| j != i)
+            .map(|j| {
+                let geometry = view_geometry(&cameras[i], &cameras[j], low, high);
+                let score = score(&geometry, depth, 0.0).unwrap_or(f32::NEG_INFINITY);
+                let across = cameras[j].position() - cameras[i].position();
+                (j, score, across.normalize_or_zero())
+            })
+            .collect();
+        let mut chosen: Vec<(usize, Vec3)> = Vec::new();
+        while chosen.len() < count && !rest.is_empty() {
+            let value = |(_, score, side): &(usize, f32, Vec3)| {
+                let same = chosen.iter().map(|(_, s)| s.dot(*side)).sum::<f32>();
+                score - OPPOSITE_SIDE * same
+            };
+            // The first of equal scores.
+            let best = (0..rest.len()).reduce(|a, b| match value(&rest[b]) > value(&rest[a]) {
+                true => b,
+                false => a,
+            });
+            let (j, _, side) = rest.remove(best.unwrap_or(0));
+            chosen.push((j, side));
+        }
+        chosen.into_iter().map(|(j, _)| j).collect()
+    };
+    (0..cameras.len()).into_par_iter().map(of_view).collect()
 }
 
 /// Estimates the depth of the scene and names the source of the estimate.

@@ -179,6 +179,45 @@ impl Benchmark {
         self.cases.iter_mut().for_each(|c| c.bounds = OnceLock::new());
     }
 
+    /// Replaces the cases by one for each scene: `count` frames spread over the sequence are its
+    /// inputs, and the frames in the middle between two of them its targets. A tenth of the
+    /// sequence at either end is left out. Scenes with fewer than 2·`count` − 1 frames in between
+    /// have no case; [`Benchmark::notes`] names them.
+    ///
+    /// # Errors
+    /// Chunks instead of scenes; fewer than two inputs; no scene with enough frames.
+    pub fn spread_contexts(&mut self, count: usize) -> Result<()> {
+        if self.chunks || count < 2 {
+            let expected = "at least 2 inputs, and scenes instead of chunks";
+            return Err(Error::argument("inputs of each case", expected, count.to_string()));
+        }
+        let (mut cases, mut short) = (Vec::new(), Vec::new());
+        for (i, scene) in self.scenes.iter().enumerate() {
+            let margin = scene.frames.len() / 10;
+            let between = scene.frames.len() - 2 * margin;
+            if between < 2 * count - 1 {
+                short.push(scene.name.clone());
+                continue;
+            }
+            let at = |n: usize| margin + n * (between - 1) / (count - 1);
+            let context: Vec<usize> = (0..count).map(at).collect();
+            let target = context.windows(2).map(|pair| (pair[0] + pair[1]) / 2).collect();
+            let resolution = self.cases.iter().find(|c| c.scene == scene.name);
+            let resolution = resolution.and_then(|c| c.resolution);
+            let views = Views { context, target };
+            cases.push(Case::new(&scene.name, views, resolution, Place::Scene(i)));
+        }
+        if cases.is_empty() {
+            let expected = format!("a scene with {} frames or more", 2 * count - 1);
+            return Err(Error::argument("scenes", expected, "none"));
+        }
+        if !short.is_empty() {
+            self.notes.push(format!("skipped, with too few frames: {}", short.join(", ")));
+        }
+        self.cases = cases;
+        Ok(())
+    }
+
     /// Keeps the cases of the first `scenes` scenes.
     pub fn limit(&mut self, scenes: usize) {
         let mut seen: Vec<String> = Vec::new();

@@ -17,7 +17,8 @@ use crate::model::subsplat::feature_channels;
 use crate::model::trunk::Trunk;
 use crate::model::weights::Weights;
 use crate::pipeline::{
-    DepthBounds, DepthRange, Error, Photo, Reconstructor, Result, add_detail, fit_to_inputs,
+    DepthBounds, DepthRange, Error, Photo, Reconstructor, Refine, Result, add_detail,
+    fit_to_inputs, refine_on_inputs,
 };
 use crate::render::{Renderer, render_with};
 use crate::splats::{SplatStatistics, Splats};
@@ -150,8 +151,8 @@ impl Evaluator {
         let mut pictures = PictureMaker::new(self, model, &crops)?;
         let mut result = self.empty(case, (&crops, &pictures.bounds), &names);
         for (m, method) in self.options.methods.iter().enumerate() {
-            pictures.select(method, &crops)?;
             for (t, target) in crops.targets.iter().enumerate() {
+                pictures.select(method, &crops, &target.target_camera)?;
                 let (w, h) = (target.target.width, target.target.height);
                 let rgb = match method {
                     Method::Other { folder, .. } => {
@@ -191,6 +192,7 @@ impl Evaluator {
         let (mut scores, mut coverage) = (Vec::new(), 0.0);
         for (i, input) in crops.inputs.iter().enumerate() {
             let place = format!("{place} input {i} {}", method.name());
+            pictures.select(method, crops, &input.target_camera)?;
             let rgb = pictures.picture(method, crops, input);
             scores.push(self.score(&rgb, &input.target, &place)?);
             coverage += pictures.coverage / crops.inputs.len() as f64;
@@ -315,16 +317,25 @@ enum Set {
     Children,
     Detailed,
     Fitted,
+    Refined,
+    /// The children of two inputs alone, with detail.
+    Pair([usize; 2]),
     Parents,
     Uniform,
 }
 
+/// Sets of which each is made of the one before it.
+const REFINED_IN_ORDER: [Set; 4] = [Set::Children, Set::Detailed, Set::Fitted, Set::Refined];
+
 impl Set {
-    fn of(method: &Method) -> Option<Self> {
+    /// The set of `method` for a picture seen by `camera`.
+    fn of(method: &Method, inputs: &[Cropped], camera: &Camera) -> Option<Self> {
         match method {
             Method::Subsplat => Some(Self::Children),
             Method::Detail => Some(Self::Detailed),
             Method::Fit => Some(Self::Fitted),
+            Method::Refine => Some(Self::Refined),
+            Method::Pair => nearest_two(inputs, camera).map(Self::Pair),
             Method::Backbone | Method::Lowpass | Method::Bilinear => Some(Self::Parents),
             Method::Uniform => Some(Self::Uniform),
             Method::Copy | Method::Mean | Method::Other { .. } => None,
@@ -359,38 +370,74 @@ impl<'a> PictureMaker<'a> {
         })
     }
 
-    /// Makes the Gaussians of `method`, unless they are in memory.
-    fn select(&mut self, method: &Method, crops: &Crops) -> Result<()> {
-        let (Some(set), Some(network)) = (Set::of(method), &self.network) else { return Ok(()) };
+    /// Makes the Gaussians of `method` for a picture seen by `camera`, unless they are in memory.
+    fn select(&mut self, method: &Method, crops: &Crops, camera: &Camera) -> Result<()> {
+        let set = Set::of(method, &crops.inputs, camera);
+        let (Some(set), Some(network)) = (set, &self.network) else { return Ok(()) };
         if self.current == Some(set) {
             return Ok(());
         }
-        let children = match (self.current, set, self.splats.take()) {
-            (Some(Set::Children), Set::Detailed | Set::Fitted, Some(splats)) => splats,
-            (Some(Set::Detailed), Set::Fitted, Some(splats)) => splats,
-            _ => network.splats(set, self.r)?,
+        let place = |set: Set| REFINED_IN_ORDER.iter().position(|s| *s == set);
+        let (from, to) = (self.current.and_then(place), place(set));
+        let splats = match (from, to, self.splats.take()) {
+            (Some(from), Some(to), Some(splats)) if from < to => {
+                self.refined(network, splats, crops, &REFINED_IN_ORDER[from + 1..=to])?
+            }
+            (_, Some(to), _) => {
+                let children = network.splats(Set::Children, self.r)?;
+                self.refined(network, children, crops, &REFINED_IN_ORDER[1..=to])?
+            }
+            (_, None, _) => match set {
+                Set::Pair(pair) => network.splats_of_pair(pair, crops)?,
+                _ => network.splats(set, self.r)?,
+            },
         };
-        let mut splats = children;
-        let detailed = self.current == Some(Set::Detailed);
-        if matches!(set, Set::Detailed | Set::Fitted) && !detailed {
-            add_detail(&mut splats, &crops.inputs, network.model.config().upscale)?;
-        }
-        if set == Set::Fitted {
-            let raster = self.raster_options(network, self.r, None);
-            let mut renderer = Renderer::default();
-            let mut go_on = |_: usize| ControlFlow::Continue(());
-            let options = FitOptions::default();
-            fit_to_inputs(
-                &mut splats,
-                &crops.inputs,
-                &raster,
-                &options,
-                &mut renderer,
-                &mut go_on,
-            )?;
-        }
         (self.current, self.splats) = (Some(set), Some(splats));
         Ok(())
+    }
+
+    /// Takes `splats` through the steps `sets` of [`REFINED_IN_ORDER`].
+    fn refined(
+        &self,
+        network: &Network<'_>,
+        mut splats: Splats,
+        crops: &Crops,
+        sets: &[Set],
+    ) -> Result<Splats> {
+        let (inputs, upscale) = (&crops.inputs, network.model.config().upscale);
+        let raster = self.raster_options(network, self.r, None);
+        let mut renderer = Renderer::default();
+        let mut go_on = |_: usize| ControlFlow::Continue(());
+        for set in sets {
+            match set {
+                Set::Detailed => {
+                    add_detail(&mut splats, inputs, upscale)?;
+                }
+                Set::Fitted => {
+                    let options = FitOptions::default();
+                    fit_to_inputs(
+                        &mut splats,
+                        inputs,
+                        &raster,
+                        &options,
+                        &mut renderer,
+                        &mut go_on,
+                    )?;
+                }
+                _ => {
+                    let options = Refine::Auto.options(inputs.len());
+                    refine_on_inputs(
+                        &mut splats,
+                        inputs,
+                        &raster,
+                        &options,
+                        &mut renderer,
+                        &mut go_on,
+                    )?;
+                }
+            }
+        }
+        Ok(splats)
     }
 
     fn picture(&mut self, method: &Method, crops: &Crops, target: &Cropped) -> Vec<f32> {
@@ -438,7 +485,6 @@ impl Network<'_> {
         let mut config = self.model.config().clone();
         let own;
         let trunk = match set {
-            Set::Children | Set::Detailed | Set::Fitted => self.model.model().trunk(),
             Set::Parents | Set::Uniform => {
                 config.upscale = r;
                 config.spgr.enabled = set == Set::Uniform;
@@ -449,10 +495,32 @@ impl Network<'_> {
                 own = Trunk::new(&config, &feature_channels(&config), start)?;
                 &own
             }
+            _ => self.model.model().trunk(),
         };
         let children = trunk.forward(&self.views, &self.output, &self.parents);
         Ok(children.and_then(|c| c.to_splats())?)
     }
+
+    /// The children of two inputs alone, with detail.
+    fn splats_of_pair(&self, pair: [usize; 2], crops: &Crops) -> Result<Splats> {
+        let inputs = pair.map(|i| crops.inputs[i].clone());
+        let (model, network) = (self.model, self.model.model());
+        let (views, _) = model.views(&inputs, crops.bounds.clone(), crops.depth_range)?;
+        let output = network.encode(&views)?;
+        let parents = network.primaries(&views, &output)?;
+        let mut splats = network.trunk().forward(&views, &output, &parents)?.to_splats()?;
+        add_detail(&mut splats, &inputs, model.config().upscale)?;
+        Ok(splats)
+    }
+}
+
+/// The two inputs whose cameras are nearest to `camera`, in ascending order.
+fn nearest_two(inputs: &[Cropped], camera: &Camera) -> Option<[usize; 2]> {
+    let distance = |i: usize| inputs[i].input_camera.position().distance(camera.position());
+    let mut order: Vec<usize> = (0..inputs.len()).collect();
+    order.sort_by(|a, b| distance(*a).total_cmp(&distance(*b)));
+    let [a, b] = order.get(..2)?.try_into().ok()?;
+    Some([a.min(b), a.max(b)])
 }
 
 #[cfg(test)]

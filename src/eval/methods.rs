@@ -14,9 +14,13 @@ pub enum Method {
     Subsplat,
     /// The model with detail from the photographs ([`crate::cpu::detail`]).
     Detail,
-    /// The model with detail, fitted to the photographs ([`crate::fit()`]): what `subsplat run`
-    /// gives.
+    /// The model with detail, fitted to the photographs ([`crate::fit()`]).
     Fit,
+    /// [`Method::Fit`], refined on the photographs ([`crate::refine()`]): what `subsplat run`
+    /// gives.
+    Refine,
+    /// The model with detail on the two inputs nearest to the target alone.
+    Pair,
     /// Its backbone's Gaussians, one a pixel, rendered at the target's size.
     Backbone,
     /// The same with the low-pass scaled to the input: r² times as many target px².
@@ -42,10 +46,12 @@ pub enum Method {
 }
 
 /// Names of the methods that need no files, in the order of the tables.
-pub(crate) const NAMED: [(&str, Method); 9] = [
+pub(crate) const NAMED: [(&str, Method); 11] = [
     ("subsplat", Method::Subsplat),
     ("detail", Method::Detail),
     ("fit", Method::Fit),
+    ("refine", Method::Refine),
+    ("pair", Method::Pair),
     ("backbone", Method::Backbone),
     ("lowpass", Method::Lowpass),
     ("bilinear", Method::Bilinear),

@@ -82,7 +82,8 @@ fn half_size(views: &Views, stride: usize) -> Result<Views> {
         Camera { intrinsics: k, ..half }
     };
     let cameras = views.cameras.iter().map(|all| all.iter().map(camera).collect()).collect();
-    Views::new(images.reshape((b, v, c, height, width))?, cameras, views.near_far.clone())
+    let images = images.reshape((b, v, c, height, width))?;
+    Views::new(images, cameras, views.near_far.clone())?.with_sources(views.sources().to_vec())
 }
 
 #[cfg(test)]

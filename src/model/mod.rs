@@ -44,6 +44,9 @@ pub struct Views {
     pub cameras: Vec<Vec<Camera>>,
     /// `[B][V]`: nearest and farthest depth candidate (camera z), world units.
     pub near_far: Vec<Vec<NearFar>>,
+    /// `[B][V][S]`: views with which each view is compared, ascending; S is the same for all.
+    /// [`Views::new`] takes all other views.
+    sources: Vec<Vec<Vec<usize>>>,
 }
 
 impl Views {
@@ -84,7 +87,48 @@ impl Views {
                 bail!("views: expected 0 < near < far, got near = {near}, far = {far}");
             }
         }
-        Ok(Self { images, cameras, near_far })
+        let all = |i: usize| (0..v).filter(|&j| j != i).collect();
+        let sources = vec![(0..v).map(all).collect(); b];
+        Ok(Self { images, cameras, near_far, sources })
+    }
+
+    /// Sets the views with which each view is compared, `[B][V][S]`. The network's time grows
+    /// with V·S.
+    ///
+    /// # Errors
+    /// Lists of different lengths, no source, or a source that is the view itself, twice in a
+    /// list or out of range.
+    pub fn with_sources(mut self, mut sources: Vec<Vec<Vec<usize>>>) -> Result<Self> {
+        let (b, v) = (self.scenes(), self.views());
+        let count = sources.first().and_then(|s| s.first()).map_or(0, Vec::len);
+        if sources.len() != b || sources.iter().any(|s| s.len() != v) {
+            let got: Vec<_> = sources.iter().map(Vec::len).collect();
+            bail!("views: expected lists of sources for {b} scenes of {v} views, got {got:?}");
+        }
+        for (i, list) in sources.iter_mut().flat_map(|s| s.iter_mut().enumerate()) {
+            list.sort_unstable();
+            let valid = list.iter().all(|&j| j < v && j != i);
+            let distinct = list.windows(2).all(|pair| pair[0] != pair[1]);
+            if list.len() != count || count == 0 || !valid || !distinct {
+                bail!(
+                    "views: expected {} different sources below {v} for view {i}, other than the \
+                     view itself, got {list:?}",
+                    count.max(1)
+                );
+            }
+        }
+        self.sources = sources;
+        Ok(self)
+    }
+
+    /// Returns the views with which each view is compared, `[B][V][S]`, ascending.
+    pub fn sources(&self) -> &[Vec<Vec<usize>>] {
+        &self.sources
+    }
+
+    /// Returns S, the number of views with which each view is compared.
+    pub fn sources_per_view(&self) -> usize {
+        self.sources.first().and_then(|s| s.first()).map_or(0, Vec::len)
     }
 
     /// Returns B, the number of scenes.
@@ -115,6 +159,7 @@ impl Views {
             images: self.images.narrow(0, b, 1)?,
             cameras: vec![self.cameras[b].clone()],
             near_far: vec![self.near_far[b].clone()],
+            sources: vec![self.sources[b].clone()],
         })
     }
 }

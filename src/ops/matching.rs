@@ -8,18 +8,20 @@ use rayon::prelude::*;
 
 pub use crate::cpu::matching::CHANNELS;
 
-/// `[B·V, 4, D, h, w]` at quarter resolution: the channels of
-/// [`crate::cpu::matching`] of each view against the others, averaged over them.
+/// `[R, 4, D, h, w]` at quarter resolution: the channels of [`crate::cpu::matching`], one row
+/// for each element of `rows`: a reference view and a source view of the same scene, as rows
+/// of `[B·V]`.
 ///
 /// `images` `[B, V, 3, H, W]` f32 in [0, 1], H and W multiples of 4; `cameras` and
 /// `disparities` (1 / camera z, one list per reference view) `[B][V]`.
 ///
 /// # Errors
-/// Another dtype, sides that are no multiples of 4, lists that do not fit.
+/// Another dtype, sides that are no multiples of 4, lists or rows that do not fit.
 pub fn raw_matching(
     images: &Tensor,
     cameras: &[Vec<Camera>],
     disparities: &[Vec<Vec<f32>>],
+    rows: &[[usize; 2]],
 ) -> Result<Tensor> {
     let (b, v, c, h, w) = images.dims5()?;
     if c != 3 || h % 4 != 0 || w % 4 != 0 {
@@ -39,20 +41,23 @@ pub fn raw_matching(
     if disparities.iter().flatten().any(|list| list.len() != d) {
         bail!("raw matching: expected {d} candidates for every view");
     }
+    if let Some(row) = rows.iter().find(|r| r.iter().any(|&i| i >= b * v) || r[0] / v != r[1] / v) {
+        bail!("raw matching: expected two views of one scene below {}, got {row:?}", b * v);
+    }
     let pixels = images.flatten_all()?.to_vec1::<f32>()?;
     let picture = 3 * h * w;
-    let pyramids: Vec<Pyramid> =
-        pixels.par_chunks_exact(picture).map(|p| Pyramid::new(p, h, w)).collect();
-    let share = 1.0 / (v - 1) as f32;
+    let used: Vec<bool> = (0..b * v).map(|i| rows.iter().any(|r| r.contains(&i))).collect();
+    let pyramids: Vec<Option<Pyramid>> = (pixels.par_chunks_exact(picture).zip(used))
+        .map(|(p, used)| used.then(|| Pyramid::new(p, h, w)))
+        .collect();
     let size = CHANNELS * d * (h / 4) * (w / 4);
-    let mut out = vec![0f32; b * v * size];
-    out.par_chunks_exact_mut(size.max(1)).enumerate().for_each(|(row, out)| {
-        let (scene, i) = (row / v, row % v);
-        for j in (0..v).filter(|&j| j != i) {
-            let reference = (&pyramids[row], &cameras[scene][i]);
-            let source = (&pyramids[scene * v + j], &cameras[scene][j]);
-            matching::add_raw_matching(reference, source, &disparities[scene][i], share, out);
+    let mut out = vec![0f32; rows.len() * size];
+    out.par_chunks_exact_mut(size.max(1)).zip(rows).for_each(|(out, &[i, j])| {
+        if let (Some(reference), Some(source)) = (&pyramids[i], &pyramids[j]) {
+            let reference = (reference, &cameras[i / v][i % v]);
+            let source = (source, &cameras[j / v][j % v]);
+            matching::write_raw_matching(reference, source, &disparities[i / v][i % v], out);
         }
     });
-    Tensor::from_vec(out, &[b * v, CHANNELS, d, h / 4, w / 4][..], images.device())
+    Tensor::from_vec(out, &[rows.len(), CHANNELS, d, h / 4, w / 4][..], images.device())
 }

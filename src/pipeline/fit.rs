@@ -1,4 +1,4 @@
-//! Fit of a reconstructed scene to its photographs.
+//! Fit and refinement of a reconstructed scene on its photographs.
 
 use super::{Error, Result};
 use crate::abi::RasterOptions;
@@ -6,6 +6,7 @@ use crate::camera::Camera;
 use crate::data::crop::Cropped;
 use crate::fit::{FitError, FitOptions, FitReport, FitView, fit};
 use crate::io::image::Rgb;
+use crate::refine::{RefineOptions, RefineReport, refine};
 use crate::render::Renderer;
 use crate::splats::Splats;
 use std::ops::ControlFlow;
@@ -32,17 +33,38 @@ pub(crate) fn fit_to_inputs(
     renderer: &mut Renderer,
     progress: &mut dyn FnMut(usize) -> ControlFlow<()>,
 ) -> Result<FitReport> {
-    let views: Vec<FitView<'_>> = inputs
-        .iter()
-        .map(|c| {
-            let (camera, image) = sharp_picture(c);
-            FitView { camera, image }
-        })
-        .collect();
-    fit(splats, &views, raster, options, renderer, progress).map_err(|e| match e {
+    fit(splats, &views_of(inputs), raster, options, renderer, progress).map_err(error)
+}
+
+/// Refines the Gaussians of `inputs` on their photographs. `progress` receives the number of steps
+/// done.
+///
+/// # Errors
+/// [`Error::Cancelled`]; a picture of another size than its camera.
+pub(crate) fn refine_on_inputs(
+    splats: &mut Splats,
+    inputs: &[Cropped],
+    raster: &RasterOptions,
+    options: &RefineOptions,
+    renderer: &mut Renderer,
+    progress: &mut dyn FnMut(usize) -> ControlFlow<()>,
+) -> Result<RefineReport> {
+    refine(splats, &views_of(inputs), raster, options, renderer, progress).map_err(error)
+}
+
+fn views_of(inputs: &[Cropped]) -> Vec<FitView<'_>> {
+    let view = |c| {
+        let (camera, image) = sharp_picture(c);
+        FitView { camera, image }
+    };
+    inputs.iter().map(view).collect()
+}
+
+fn error(e: FitError) -> Error {
+    match e {
         FitError::Cancelled => Error::Cancelled,
         FitError::Size { view, expected, got } => {
             Error::argument(format!("photograph {view}"), expected, got)
         }
-    })
+    }
 }

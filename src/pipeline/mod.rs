@@ -30,6 +30,7 @@
 //! 5. The network predicts one primary Gaussian per input pixel, then its children.
 //! 6. The photographs add detail to the children's colours ([`Detail`]).
 //! 7. Sizes, opacities and colours are fitted to the photographs ([`crate::fit()`]).
+//! 8. Means, shapes, opacities and colours are refined on the photographs ([`crate::refine()`]).
 //!
 //! [`Reconstructor::run`] executes all of them. [`Reconstructor::prepare`] executes steps 1 to 3;
 //! the caller can then free large photographs before the network runs.
@@ -55,7 +56,7 @@ pub use depth_range::{DepthBounds, DepthRange, DepthSource};
 pub use error::{Error, Result};
 pub use input_size::InputSize;
 pub use loose::{KnownLens, LensSource, LooseOptions, LooseScene, loose_scene};
-pub use options::{Check, Detail, Options};
+pub use options::{Check, Detail, Options, Refine};
 pub use photo::Photo;
 pub use poses::PoseError;
 pub use prepared::Prepared;
@@ -66,7 +67,7 @@ pub use warning::Warning;
 
 pub(crate) use depth_range::{initial_bounds, refined_bounds};
 pub(crate) use detail::add_detail;
-pub(crate) use fit::fit_to_inputs;
+pub(crate) use fit::{fit_to_inputs, refine_on_inputs};
 pub(crate) use poses::check_pairs;
 
 use crate::config::{Backbone, Config};

@@ -3,6 +3,7 @@
 use super::{DepthBounds, DepthRange, Error, InputSize, Result, initial_bounds};
 use crate::camera::Camera;
 use crate::fit::FitOptions;
+use crate::refine::RefineOptions;
 
 /// Options of [`Reconstructor::run`](super::Reconstructor::run). The defaults are those of the
 /// program `subsplat run`.
@@ -31,6 +32,9 @@ pub struct Options {
     pub detail: Detail,
     /// Fit of the Gaussians to the photographs ([`crate::fit()`]). Default: four steps.
     pub fit: FitOptions,
+    /// Refinement of the Gaussians on the photographs ([`crate::refine()`]). Default:
+    /// [`Refine::Auto`].
+    pub refine: Refine,
 }
 
 impl Options {
@@ -82,6 +86,13 @@ impl Options {
         self
     }
 
+    /// Sets [`Options::refine`].
+    #[must_use]
+    pub fn with_refine(mut self, refine: Refine) -> Self {
+        self.refine = refine;
+        self
+    }
+
     /// The depth range before any photograph is read: [`Options::depth_range`], then
     /// [`Options::depth_prior`], then a guess from the distances between the cameras. A program
     /// can reject wrong options early by this call.
@@ -94,6 +105,34 @@ impl Options {
             return Err(Error::argument("photographs", "at least 2", got));
         }
         initial_bounds(cameras, self.depth_range, self.depth_prior.as_ref())
+    }
+}
+
+/// Length of the refinement of Gaussians on their photographs ([`crate::refine()`]).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Refine {
+    /// Eight steps a photograph, 64 at most.
+    #[default]
+    Auto,
+    /// None.
+    Off,
+    /// At most this number of steps.
+    Steps(usize),
+}
+
+/// Weight of [`RefineOptions::across`] for two photographs.
+const ACROSS: f32 = 1.0;
+
+impl Refine {
+    /// Options of [`crate::refine()`] for a number of photographs.
+    pub(crate) fn options(self, photographs: usize) -> RefineOptions {
+        let steps = match self {
+            Self::Auto => (8 * photographs).min(64),
+            Self::Off => 0,
+            Self::Steps(steps) => steps,
+        };
+        RefineOptions::default().with_steps(steps).with_across(ACROSS)
     }
 }
 

@@ -3,7 +3,7 @@
 use super::progress::Tracker;
 use super::{
     DepthBounds, Detail, Options, Progress, Reconstruction, Reconstructor, Result, Stage, Warning,
-    add_detail, fit_to_inputs,
+    add_detail, fit_to_inputs, refine_on_inputs,
 };
 use crate::camera::Camera;
 use crate::check::PairReport;
@@ -97,22 +97,26 @@ impl Prepared<'_> {
         }
         let colour = Rgb::mean_colour(inputs.iter().map(|c| &c.input));
         let raster_options = config.raster_options(config.upscale as f32, bounds.near, colour);
-        let mut fit = None;
-        if options.fit.steps > 0 {
+        let (mut fit, mut refinement) = (None, None);
+        let (fit_options, refine_options) = (&options.fit, options.refine.options(inputs.len()));
+        let mut renderer = Renderer::new(model.backend());
+        if fit_options.steps > 0 {
             tracker.begin(Stage::Fit, progress)?;
-            let steps = options.fit.steps as f32;
-            let mut stepped = |step: usize| match tracker.advance(step as f32 / steps, progress) {
-                Ok(()) => ControlFlow::Continue(()),
-                Err(_) => ControlFlow::Break(()),
-            };
-            let mut renderer = Renderer::new(model.backend());
-            let (raster, how) = (&raster_options, &options.fit);
+            let mut stepped = tracker.steps(fit_options.steps, progress);
+            let (raster, how) = (&raster_options, fit_options);
             let done =
                 fit_to_inputs(&mut splats, &inputs, raster, how, &mut renderer, &mut stepped)?;
-            warnings
-                .extend(renderer.take_warning().map(|reason| Warning::CpuInsteadOfGpu { reason }));
             fit = Some(done);
         }
+        if refine_options.steps > 0 {
+            tracker.begin(Stage::Refine, progress)?;
+            let mut stepped = tracker.steps(refine_options.steps, progress);
+            let (raster, how) = (&raster_options, &refine_options);
+            let done =
+                refine_on_inputs(&mut splats, &inputs, raster, how, &mut renderer, &mut stepped)?;
+            refinement = Some(done);
+        }
+        warnings.extend(renderer.take_warning().map(|reason| Warning::CpuInsteadOfGpu { reason }));
         let depths = inputs.iter().zip(distances);
         let depths = depths.map(|(c, d)| camera_depth(&c.input_camera, d)).collect();
         warnings.extend(Warning::of_bounds(&bounds));
@@ -127,6 +131,7 @@ impl Prepared<'_> {
             raster_options,
             detail,
             fit,
+            refinement,
             reports,
             warnings,
             stage_times: tracker.finish(progress)?,

@@ -25,6 +25,8 @@ pub enum Stage {
     Detail,
     /// Sizes, opacities and colours are fitted to the photographs.
     Fit,
+    /// All parameters but the SH coefficients are refined on the photographs.
+    Refine,
 }
 
 impl Stage {
@@ -39,6 +41,7 @@ impl Stage {
             Self::Subsplat => "subsplat",
             Self::Detail => "detail",
             Self::Fit => "fit",
+            Self::Refine => "refine",
         }
     }
 }
@@ -111,6 +114,18 @@ impl Tracker {
         self.close();
         self.current = Some((stage, Instant::now()));
         self.advance(0.0, callback)
+    }
+
+    /// A callback for the current stage that receives the number of steps done of `steps`.
+    pub(super) fn steps<'a>(
+        &'a mut self,
+        steps: usize,
+        callback: &'a mut Callback<'_>,
+    ) -> impl FnMut(usize) -> ControlFlow<()> + 'a {
+        move |step| match self.advance(step as f32 / steps as f32, callback) {
+            Ok(()) => ControlFlow::Continue(()),
+            Err(_) => ControlFlow::Break(()),
+        }
     }
 
     /// Reports that `part` of the current stage is done, 0 to 1.

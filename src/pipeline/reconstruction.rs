@@ -8,6 +8,7 @@ use crate::data::crop::Cropped;
 use crate::fit::FitReport;
 use crate::io::image::Depth;
 use crate::io::{SaveOptions, SaveReport, save_splats};
+use crate::refine::RefineReport;
 use crate::render::{Picture, comment_of_options, render};
 use crate::splats::Splats;
 use std::path::Path;
@@ -25,6 +26,7 @@ pub struct Reconstruction {
     pub(super) raster_options: RasterOptions,
     pub(super) detail: Detail,
     pub(super) fit: Option<FitReport>,
+    pub(super) refinement: Option<RefineReport>,
     pub(super) reports: Vec<PairReport>,
     pub(super) warnings: Vec<Warning>,
     pub(super) stage_times: Vec<StageTime>,
@@ -103,6 +105,11 @@ impl Reconstruction {
     /// Losses before and after the fit to the photographs; `None` without one.
     pub fn fit(&self) -> Option<&FitReport> {
         self.fit.as_ref()
+    }
+
+    /// Errors of the held blocks before and after the refinement; `None` without one.
+    pub fn refinement(&self) -> Option<&RefineReport> {
+        self.refinement.as_ref()
     }
 
     /// Reports of the check, one for each pair of consecutive photographs; empty without one.

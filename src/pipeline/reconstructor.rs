@@ -9,6 +9,7 @@ use super::{
 use crate::camera::{Camera, NearFar};
 use crate::config::{Config, Preset};
 use crate::data::crop::{CropOptions, Cropped};
+use crate::data::pair::choose_sources;
 use crate::model::subsplat::SubSplat;
 use crate::model::weights::{SUBSPLAT_PREFIX, Weights};
 use crate::model::{Backend, Views};
@@ -262,10 +263,18 @@ impl Reconstructor {
             (Stage::Subsplat, if aggregates { 0.25 } else { 0.06 } * pixels),
             (Stage::Detail, if options.detail == Detail::Off { 0.0 } else { 0.01 * pixels }),
             (Stage::Fit, FIT_STEP * options.fit.steps as f32 * pixels * children),
+            // A step draws one photograph instead of all.
+            (
+                Stage::Refine,
+                FIT_STEP * options.refine.options(photos).steps as f32 / n * pixels * children,
+            ),
         ];
         costs.map(|(stage, cost)| StageCost { stage, cost }).to_vec()
     }
 }
+
+/// Number of other photographs with which each photograph is compared.
+const SOURCES: usize = 2;
 
 /// Duration of one step of the fit, in the unit of [`Reconstructor::stage_costs`].
 const FIT_STEP: f32 = 0.2;
@@ -299,6 +308,8 @@ fn views_of(inputs: &[Cropped], near_far: NearFar) -> Result<Views> {
     let (w, h) = inputs.first().map_or((0, 0), |c| (c.input.width, c.input.height));
     let pixels: Vec<f32> = inputs.iter().flat_map(|c| c.input.to_planes()).collect();
     let images = Tensor::from_vec(pixels, (1, inputs.len(), 3, h, w), &Device::Cpu)?;
-    let cameras = inputs.iter().map(|c| c.input_camera).collect();
-    Ok(Views::new(images, vec![cameras], vec![vec![near_far; inputs.len()]])?)
+    let cameras: Vec<Camera> = inputs.iter().map(|c| c.input_camera).collect();
+    let sources = choose_sources(&cameras, near_far, SOURCES);
+    let views = Views::new(images, vec![cameras], vec![vec![near_far; inputs.len()]])?;
+    Ok(views.with_sources(vec![sources])?)
 }

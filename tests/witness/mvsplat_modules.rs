@@ -65,8 +65,11 @@ fn transformer_plain_shifted_and_with_three_views() -> Result<()> {
         let weights = golden.weights();
         let net = Transformer::new(&narrow(), weights.builder().pp("backbone.transformer"))?;
         let x = golden.input("features").unsqueeze(0)?;
+        let views = x.dim(1)?;
+        let others = |i: usize| (0..views).filter(|&j| j != i).collect::<Vec<_>>();
+        let sources = vec![(0..views).map(others).collect::<Vec<_>>()];
         let seen = traced(|trace| {
-            golden.compare("out", &net.forward(&x, trace)?.squeeze(0)?);
+            golden.compare("out", &net.forward(&x, &sources, trace)?.squeeze(0)?);
             Ok(())
         })?;
         for i in 0..2 {

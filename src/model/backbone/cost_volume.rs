@@ -41,8 +41,15 @@ fn relative_pose(cameras: &[Camera], i: usize, j: usize) -> Mat4 {
     }
 }
 
+/// Returns the sources of view `i` in MVSplat's order: i + 1, i + 2, … modulo V.
+fn ordered_sources(views: &Views, scene: usize, i: usize) -> impl Iterator<Item = usize> {
+    let (v, sources) = (views.views(), &views.sources()[scene][i]);
+    (1..v).map(move |offset| (i + offset) % v).filter(|j| sources.contains(j))
+}
+
 /// Returns the plane sweep's geometry under MVSplat's conventions: reference view i against
-/// views i + 1, i + 2, … modulo V, at the features' resolution h × w.
+/// those of views i + 1, i + 2, … modulo V that are its sources, at the features' resolution
+/// h × w.
 ///
 /// # Errors
 /// A camera is not invertible.
@@ -52,8 +59,7 @@ pub fn sweep(views: &Views, disparities: &[Vec<f32>], features: &Tensor) -> Resu
     let mut pairs: Vec<Vec<Pair>> = Vec::with_capacity(v * b);
     for row in 0..v * b {
         let (i, scene) = (row / b, row % b);
-        let own = (1..v).map(|offset| {
-            let j = (i + offset) % v;
+        let own = ordered_sources(views, scene, i).map(|j| {
             let cameras = &views.cameras[scene];
             // Both sides take the reference's intrinsics, as in MVSplat's code.
             let k = cameras[i].intrinsics.resized(w, h);
@@ -104,17 +110,17 @@ fn trace_geometry(
     let dev = &Device::Cpu;
     let candidates: Vec<f32> = sweep.depths.iter().flatten().map(|z| 1.0 / z).collect();
     trace.put("cv.disp_candidates_vb", &Tensor::from_vec(candidates, (v * b, d), dev)?)?;
-    for offset in 1..v {
+    for at in 0..views.sources_per_view() {
         let (mut k, mut poses) = (Vec::new(), Vec::new());
         for row in 0..v * b {
             let (i, scene) = (row / b, row % b);
             let cameras = &views.cameras[scene];
             let own = cameras[i].intrinsics.resized(w, h).matrix().transpose();
             k.extend_from_slice(&own.to_cols_array());
-            let pose = relative_pose(cameras, i, (i + offset) % v).transpose();
-            poses.extend(pose.to_cols_array());
+            for j in ordered_sources(views, scene, i).skip(at).take(1) {
+                poses.extend(relative_pose(cameras, i, j).transpose().to_cols_array());
+            }
         }
-        let at = offset - 1;
         trace.put(&format!("cv.K_px.{at}"), &Tensor::from_vec(k, (v * b, 3, 3), dev)?)?;
         trace.put(&format!("cv.pose.{at}"), &Tensor::from_vec(poses, (v * b, 4, 4), dev)?)?;
         let some = [0, d / 2, d - 1];

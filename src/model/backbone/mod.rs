@@ -68,7 +68,7 @@ impl Mvsplat {
         let (_, c, h, w) = cnn.quarter.dims4()?;
         let cnn4 = cnn.quarter.reshape((b, v, c, h, w))?;
         trace.put("cnn.features", &cnn4)?;
-        let trans4 = self.transformer.forward(&cnn4, trace)?;
+        let trans4 = self.transformer.forward(&cnn4, views.sources(), trace)?;
         let input = depth::Input {
             views,
             images: vb_rows(&views.images)?,

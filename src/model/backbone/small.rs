@@ -44,6 +44,10 @@ const CONFIDENCE_SLOPE: f64 = 6.0;
 /// far plane, keep some opacity and cover gaps (on photographs 1 dB better than −1.5).
 const CONFIDENCE_SHIFT: f64 = 1.0;
 
+/// Half-width, in candidates, of the window around a source's mode whose mass is the source's
+/// visibility.
+const VISIBILITY_WINDOW: usize = 1;
+
 /// Candidates over which a pixel's mean disparity is taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DisparityMean {
@@ -223,7 +227,7 @@ impl SmallBackbone {
         for block in &self.blocks {
             feat4 = block.forward(&feat4)?;
         }
-        let stem = self.sweep(views, &feat4)?;
+        let stem = self.sweep(views, &feat4, mean)?;
         let deep = self.unet.forward(&join(&stem.input, &feat4, 1)?)?;
         let mut logits = self.logits.forward(&deep)?;
         if let Some(scores) = &stem.scores
@@ -244,43 +248,86 @@ impl SmallBackbone {
         Ok(Matched { rgb, feat2, feat4, deep, logits, index, confidence })
     }
 
-    /// Volume of matching scores after the stem.
-    fn sweep(&self, views: &Views, feat4: &Tensor) -> Result<Swept> {
+    /// Matching scores of every view, of its sources together.
+    fn sweep(&self, views: &Views, feat4: &Tensor, mean: DisparityMean) -> Result<Swept> {
         let unit = unit_channels(&self.matching.forward(feat4)?)?;
-        let (rows, channels, h, w) = unit.dims4()?;
-        let d = self.config.depth_candidates;
-        let disparities = candidates(views, d);
+        let disparities = candidates(views, self.config.depth_candidates);
+        let (count, sources) = (views.scenes() * views.views(), views.sources_per_view());
+        let rows = source_rows(views);
+        // The volumes are large: inference computes those of one view at a time, while a
+        // training graph keeps all of them anyway.
+        let step = match mean {
+            DisparityMean::AllCandidates => count,
+            DisparityMean::AroundMode => 1,
+        };
+        let mut parts = Vec::with_capacity(count.div_ceil(step));
+        for rows in rows.chunks(step * sources) {
+            let volume = self.volume(views, &unit, &disparities, rows)?;
+            parts.push(match &self.stem {
+                Some(stem) => self.visible_mean(&stem.forward(&volume)?, sources)?,
+                None => mean_of(&volume.flatten(1, 2)?, sources)?,
+            });
+        }
+        let input = whole(parts)?;
+        let scores = self.stem.is_some().then(|| input.clone());
+        Ok(Swept { input, scores })
+    }
+
+    /// Volume `[R, C, D, h, w]` of the correlation and the raw matching channels, for rows of
+    /// (view, source), rows of `unit` `[B·V, C, h, w]`.
+    fn volume(
+        &self,
+        views: &Views,
+        unit: &Tensor,
+        disparities: &[Vec<Vec<f32>>],
+        rows: &[[usize; 2]],
+    ) -> Result<Tensor> {
+        let (_, channels, h, w) = unit.dims4()?;
+        let (d, v) = (self.config.depth_candidates, views.views());
+        let depths = |&[i, _]: &[usize; 2]| {
+            disparities[i / v][i % v].iter().map(|d| 1.0 / d).collect::<Vec<f32>>()
+        };
         let sweep = Sweep {
-            pairs: pairs(views, h, w)?,
-            depths: disparities
-                .iter()
-                .flatten()
-                .map(|list| list.iter().map(|d| 1.0 / d).collect())
-                .collect(),
+            pairs: rows.iter().map(|row| sweep_pairs(views, *row, h, w)).collect::<Result<_>>()?,
+            depths: rows.iter().map(depths).collect(),
             centre: 0.5,
             min_z: 1e-3,
             scale: 1.0,
             channels,
             size: [h, w],
         };
-        // [B·V, 1, D·h, w]
-        let learned =
-            plane_sweep_on(&self.backend, &unit, &unit, sweep)?.reshape((rows, 1, d * h, w))?;
+        let references: Vec<u32> = rows.iter().map(|r| r[0] as u32).collect();
+        let reference = match references.iter().enumerate().all(|(i, r)| i == *r as usize) {
+            true => unit.narrow(0, 0, rows.len())?,
+            false => unit.index_select(&Tensor::new(references, unit.device())?, 0)?,
+        };
+        let learned = plane_sweep_on(&self.backend, &reference, unit, sweep)?;
+        // [R, 1, D·h, w]
+        let learned = learned.reshape((rows.len(), 1, d * h, w))?;
         let volume = match self.config.raw_matching {
             true => {
-                let raw = raw_matching(&views.images, &views.cameras, &disparities)?;
+                let raw = raw_matching(&views.images, &views.cameras, disparities, rows)?;
                 join(&learned, &raw.flatten(2, 3)?, 1)?
             }
             false => learned,
         };
-        let volume = volume.reshape((rows, (), d, h, w))?;
-        match &self.stem {
-            Some(stem) => {
-                let scores = stem.forward(&volume)?;
-                Ok(Swept { input: scores.clone(), scores: Some(scores) })
-            }
-            None => Ok(Swept { input: volume.flatten(1, 2)?, scores: None }),
+        volume.reshape((rows.len(), (), d, h, w))
+    }
+
+    /// Mean `[N, D, h, w]` of the stem's scores `[N·S, D, h, w]` over the S sources. A source that
+    /// does not show a pixel's surface has no clear match there. Therefore the weight of a source
+    /// is the square of its probability mass around the mode (after Zhang et al. 2020, *Visibility-aware
+    /// Multi-view Stereo Network*).
+    fn visible_mean(&self, scores: &Tensor, sources: usize) -> Result<Tensor> {
+        if sources == 1 {
+            return Ok(scores.clone());
         }
+        let (rows, d, h, w) = scores.dims4()?;
+        let logits = lift(&scores.zeros_like()?, scores, &self.stem_factor)?.detach();
+        let (_, mass) = expectation(&logits, VISIBILITY_WINDOW, false)?;
+        let weights = (mass.sqr()? + 1e-6)?.reshape((rows / sources, sources, 1, h, w))?;
+        let scores = scores.reshape((rows / sources, sources, d, h, w))?;
+        scores.broadcast_mul(&weights)?.sum(1)?.broadcast_div(&weights.sum(1)?)
     }
 
     /// Expected candidate index, and the probability within the window around the mode:
@@ -396,22 +443,28 @@ fn split_views(t: &Tensor, b: usize, v: usize) -> Result<Tensor> {
     t.reshape((b, v, c, h, w))
 }
 
-/// For each view all other views of its scene, at the features' resolution h × w.
-fn pairs(views: &Views, h: usize, w: usize) -> Result<Vec<Vec<Pair>>> {
+/// (view, source) for each view and each of its sources, as rows of `[B·V]`.
+fn source_rows(views: &Views) -> Vec<[usize; 2]> {
     let v = views.views();
-    let mut all = Vec::new();
-    for (b, scene) in views.cameras.iter().enumerate() {
-        let cameras: Vec<Camera> = scene.iter().map(|c| c.resized_unchecked(w, h)).collect();
-        for i in 0..v {
-            let others = (0..v).filter(|&j| j != i);
-            let row = |j: usize| {
-                let (r, s) = (&cameras[i], &cameras[j]);
-                pair(&r.intrinsics, &s.intrinsics, relative_pose(r, s), b * v + j)
-            };
-            all.push(others.map(row).collect::<Result<_>>()?);
-        }
+    let of_view = |(i, list): (usize, &Vec<usize>)| -> Vec<[usize; 2]> {
+        list.iter().map(|j| [i, i / v * v + j]).collect()
+    };
+    views.sources().iter().flatten().enumerate().flat_map(of_view).collect()
+}
+
+/// The plane sweep's map of one row of [`source_rows`], at the features' resolution h × w.
+fn sweep_pairs(views: &Views, [i, j]: [usize; 2], h: usize, w: usize) -> Result<Vec<Pair>> {
+    let v = views.views();
+    let [r, s] = [i, j].map(|k| views.cameras[k / v][k % v].resized_unchecked(w, h));
+    Ok(vec![pair(&r.intrinsics, &s.intrinsics, relative_pose(&r, &s), j)?])
+}
+
+/// Mean of `[N·S, …]` over the S sources.
+fn mean_of(volume: &Tensor, sources: usize) -> Result<Tensor> {
+    match volume.dims4()? {
+        _ if sources == 1 => Ok(volume.clone()),
+        (rows, c, h, w) => volume.reshape((rows / sources, sources, c, h, w))?.mean(1),
     }
-    Ok(all)
 }
 
 /// Disparity candidates (1 / camera z), `[B][V][D]`; index 0 is far.

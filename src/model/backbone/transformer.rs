@@ -52,11 +52,17 @@ impl Transformer {
         Ok(Self { layers: layers.collect::<Result<_>>()?, splits: s.window_splits })
     }
 
-    /// Maps `[B, V, C, h, w]` to the same shape.
+    /// Maps `[B, V, C, h, w]` to the same shape. `sources` `[B][V][S]`: the views that each view
+    /// attends to ([`crate::model::Views::sources`]).
     ///
     /// # Errors
     /// h or w is not a multiple of the window splits.
-    pub fn forward(&self, cnn: &Tensor, trace: &mut Trace<'_>) -> Result<Tensor> {
+    pub fn forward(
+        &self,
+        cnn: &Tensor,
+        sources: &[Vec<Vec<usize>>],
+        trace: &mut Trace<'_>,
+    ) -> Result<Tensor> {
         let (_, v, c, h, w) = cnn.dims5()?;
         let s = self.splits;
         if h % s != 0 || w % s != 0 {
@@ -76,7 +82,7 @@ impl Transformer {
             trace.put_with(&format!("transformer.layer{i}.self_attn_vb"), || {
                 updated.index_select(&back, 1)
             })?;
-            x = layer.cross(&updated, &input, v, &windows)?.index_select(&back, 1)?;
+            x = layer.cross(&updated, &input, sources, &windows)?.index_select(&back, 1)?;
             trace.put(&format!("transformer.layer{i}.out_vb"), &x)?;
         }
         let rows = x.dim(0)?;
@@ -87,15 +93,23 @@ impl Transformer {
 }
 
 impl Layer {
-    /// Cross-attention of every view to the layer's input (`input`) of all other views, all
-    /// views at once.
-    fn cross(&self, x: &Tensor, input: &Tensor, views: usize, w: &Windows) -> Result<Tensor> {
-        let scenes = input.dim(0)? / views;
-        let of_view = |v: usize| input.narrow(0, v * scenes, scenes);
-        // Targets in ascending order: target t of view v is view t, or t + 1 from v on.
-        let targets = (0..views - 1).map(|t| {
-            let rows = (0..views).map(|v| of_view(if t < v { t } else { t + 1 }));
-            Tensor::cat(&rows.collect::<Result<Vec<_>>>()?, 0)
+    /// Cross-attention of every view to the layer's input (`input`) of its sources, all views at
+    /// once. Rows are (v b).
+    fn cross(
+        &self,
+        x: &Tensor,
+        input: &Tensor,
+        sources: &[Vec<Vec<usize>>],
+        w: &Windows,
+    ) -> Result<Tensor> {
+        let scenes = sources.len();
+        let views = sources.first().map_or(0, Vec::len);
+        let count = sources.first().and_then(|s| s.first()).map_or(0, Vec::len);
+        // Target t of a view is its source t, in ascending order.
+        let targets = (0..count).map(|t| {
+            let row = |r: usize| sources[r % scenes][r / scenes][t] * scenes + r % scenes;
+            let rows: Vec<u32> = (0..views * scenes).map(|r| row(r) as u32).collect();
+            input.index_select(&Tensor::new(rows, input.device())?, 0)
         });
         let targets = targets.collect::<Result<Vec<_>>>()?;
         self.cross_attn.forward(x, &targets.iter().collect::<Vec<_>>(), w)

@@ -6,7 +6,7 @@ use super::args_view::{KEYS, ViewArgs};
 use super::values;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
-use subsplat::{FitOptions, InputSize};
+use subsplat::{FitOptions, InputSize, Refine};
 
 /// Exit codes, which scripts rely on.
 const EXIT_CODES: &str = "\
@@ -318,6 +318,10 @@ pub struct SourceArgs {
     /// changed so that they give the photographs back. 0: the network's Gaussians.
     #[arg(long, value_name = "STEPS", default_value_t = FitOptions::default().steps)]
     pub fit: usize,
+    /// Refinement of the Gaussians on the photographs, after the fit: means, shapes, opacities and
+    /// colours. `auto`: eight steps a photograph, 64 at most; `off`; or the largest number of steps.
+    #[arg(long, value_name = "auto | off | STEPS", default_value = "auto", value_parser = values::refine)]
+    pub refine: Refine,
     /// The model.
     #[command(flatten)]
     pub model: ModelArgs,

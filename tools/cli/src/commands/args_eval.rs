@@ -8,7 +8,7 @@ use subsplat::eval::{Disturbance, Method};
 
 const NOTES: &str = "\
 Methods: subsplat (the model), detail (the model with detail from the photographs), fit (the same, \
-fitted to the photographs: what `run` gives), backbone (its backbone's Gaussians alone, rendered \
+fitted to the photographs), refine (the same, refined on them: what `run` gives), pair (detail, on the two inputs nearest to the target alone), backbone (its backbone's Gaussians alone, rendered \
 at the target's size: spgr=off), lowpass (the same, low-pass scaled to the input), bilinear (the \
 same rendered at the input's size and enlarged), uniform (K equal Gaussians a pixel, untrained), \
 copy (the input nearest to the target), mean (of the inputs).
@@ -34,6 +34,10 @@ pub struct EvalArgs {
     /// protocol.json instead.
     #[arg(long, value_name = "FILE")]
     pub index: Option<PathBuf>,
+    /// Take N frames spread over each scene as inputs, and the frames in the middle between two of
+    /// them as targets, instead of the protocol's.
+    #[arg(long, value_name = "N", value_parser = values::at_least_one, conflicts_with = "index")]
+    pub contexts: Option<usize>,
     /// Folder for eval.json, targets.csv, means.csv, index.html and the pictures
     /// (pictures/METHOD/SCENE/INPUTS/FRAME.png). Default: no files are written.
     #[arg(short, long, value_name = "DIR")]

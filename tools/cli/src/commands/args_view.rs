@@ -4,8 +4,8 @@ use super::args::{ConventionArg, CropShapeArg, DetailArg, RenderingArgs, SourceA
 use super::values;
 use clap::Args;
 use std::path::PathBuf;
-use subsplat::FitOptions;
 use subsplat::gpu::DeviceChoice;
+use subsplat::{FitOptions, Refine};
 
 /// The window's keys, which `--help` and the H key show.
 pub const KEYS: &str = "\
@@ -100,6 +100,7 @@ impl ViewArgs {
             (source.crop != CropShapeArg::Whole, "--crop"),
             (source.detail != DetailArg::Photo, "--detail"),
             (source.fit != FitOptions::default().steps, "--fit"),
+            (source.refine != Refine::Auto, "--refine"),
             (source.model.backbone.is_some(), "--backbone"),
             (source.model.preset.is_some(), "--preset"),
             (source.model.config.is_some(), "--config"),

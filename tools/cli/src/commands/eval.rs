@@ -32,6 +32,9 @@ pub fn eval(args: &EvalArgs, answer: Answer) -> Result<()> {
     let mut data = progress.stage("data", |_| -> Result<_> {
         let mut data = Benchmark::open(&args.data, args.index.as_deref())?;
         data.set_depth_range(DepthRange::from_ends(args.near, args.far));
+        if let Some(count) = args.contexts {
+            data.spread_contexts(count)?;
+        }
         Ok(data)
     })?;
     data.notes().iter().for_each(|n| print_line(format!("note: {n}")));

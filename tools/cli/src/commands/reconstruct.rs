@@ -13,7 +13,7 @@ use subsplat::data::crop::Cropped;
 use subsplat::io::scene::Scene;
 use subsplat::{
     Check, DepthBounds, DepthRange, Detail, FitOptions, FitReport, InputSize, Options, Photo,
-    Prepared, Reconstruction, Reconstructor,
+    Prepared, Reconstruction, Reconstructor, RefineReport,
 };
 
 /// The library's options of the arguments, for photographs of frames `context`.
@@ -32,7 +32,8 @@ pub fn options(args: &SourceArgs, scene: &Scene, context: &[usize]) -> Result<Op
         .with_depth_prior(DepthBounds::of_scene(scene, context)?)
         .with_check(check)
         .with_detail(detail)
-        .with_fit(FitOptions::default().with_steps(args.fit));
+        .with_fit(FitOptions::default().with_steps(args.fit))
+        .with_refine(args.refine);
     let cameras: Vec<_> = context.iter().map(|&i| scene.frames[i].camera).collect();
     options.initial_depth_range(&cameras)?;
     Ok(options)
@@ -153,6 +154,13 @@ fn print_reconstruction(result: &Reconstruction, printed: usize) {
         print_line(format!(
             "the fit to the photographs changed their loss from {before:.5} to {after:.5} (--fit 0: \
              the network's Gaussians)"
+        ));
+    }
+    if let Some(refinement) = result.refinement() {
+        let RefineReport { steps, before, after, .. } = refinement;
+        print_line(format!(
+            "{steps} steps of refinement changed the error of the pixels that are held back from \
+             {before:.5} to {after:.5} (--refine off: none)"
         ));
     }
 }

@@ -316,6 +316,9 @@ impl Done {
             "untrained_tensors": self.model.untrained_tensors().len(),
             "detail": result.detail() == Detail::Photographs,
             "fit": result.fit().map(|f| json!({ "loss_before": f.before, "loss_after": f.after })),
+            "refine": result.refinement().map(
+                |r| json!({ "steps": r.steps, "held_mse_before": r.before, "held_mse_after": r.after })
+            ),
             "gaussians": result.splats().len(),
             "inputs": self.inputs.inputs,
             "distribution": self.inputs.gaussians,

@@ -1,6 +1,7 @@
 //! Parsers of argument values that need no file. clap reports their errors as wrong usage.
 
 use super::args::InputSizeArg;
+use subsplat::Refine;
 use subsplat::camera::Intrinsics;
 
 /// Largest number of views of a path.
@@ -32,6 +33,20 @@ pub fn threads(text: &str) -> Result<usize, String> {
 /// Parses r, the target's side over the input's.
 pub fn upscale(text: &str) -> Result<usize, String> {
     whole(text, 1, UPSCALE_MAX)
+}
+
+/// Largest number of steps of `--refine`.
+const REFINE_MAX: usize = 100_000;
+
+/// Parses the length of a refinement.
+pub fn refine(text: &str) -> Result<Refine, String> {
+    match text.trim() {
+        "auto" => Ok(Refine::Auto),
+        "off" => Ok(Refine::Off),
+        steps => whole(steps, 0, REFINE_MAX)
+            .map(Refine::Steps)
+            .map_err(|e| format!("expected auto, off or steps: {}", &e["expected ".len()..])),
+    }
 }
 
 /// Parses an SH degree.

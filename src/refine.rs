@@ -1,0 +1,552 @@
+//! Refines Gaussians on the photographs that they were made from: means, rotations, scales,
+//! opacities and colour offsets, by gradient steps through the rasterizer.
+//!
+//! [`crate::fit()`] changes sizes, opacities and colours alone and ends after four steps, because
+//! two photographs do not determine more. Three and more do: each photograph shows surfaces whose
+//! depth the others predict. The method is the optimisation of *3D Gaussian Splatting for
+//! Real-Time Radiance Field Rendering* (Kerbl et al. 2023), from the network's Gaussians instead
+//! of sparse points, hence some dozens of steps instead of 30,000. SH coefficients stay.
+//!
+//! Every sixteenth block of 8×8 pixels of each photograph is held back: no gradient comes from it.
+//! The refinement ends where the error of these blocks stops falling, and a set whose error there
+//! has not fallen stays unchanged.
+//!
+//! Two photographs hold back too little to tell a wrong depth that gives both of them back. There,
+//! each photograph is drawn a second time from the other's Gaussians alone ([`RefineOptions::across`]):
+//! geometry that is wrong shows as a displaced picture.
+//!
+//! One step draws one photograph. The order of photographs and the blocks depend on the number of
+//! photographs and their sizes only, so the same input gives the same bytes on any number of
+//! threads.
+
+use crate::abi::{
+    Geometry, Gradients, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, RasterOptions, SCALE_OFFSET,
+    SPLAT_STRIDE, SplatSlices, gain_with_offsets, sh_coefficients,
+};
+use crate::camera::Camera;
+use crate::fit::{FitError, FitView, Target};
+use crate::loss::Scored;
+use crate::render::Renderer;
+use crate::splats::Splats;
+use glam::Vec3;
+use rayon::prelude::*;
+use std::ops::{ControlFlow, Range};
+
+/// Options of a refinement. The rates were chosen on six scenes of `../shared/photos` at
+/// 128 → 256 with five photographs, targets between them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
+pub struct RefineOptions {
+    /// Most gradient steps; 0 leaves the Gaussians as they are. Default: 40.
+    pub steps: usize,
+    /// Step of the means, px of the photograph that shows the Gaussian at the largest scale. Default: 0.3.
+    pub mean_rate: f32,
+    /// Step of the unit quaternions' elements. Default: 0.03.
+    pub rotation_rate: f32,
+    /// Step of ln σ, each axis of its own. Default: 0.06.
+    pub scale_rate: f32,
+    /// Step of the opacities' logits. Default: 0.15.
+    pub opacity_rate: f32,
+    /// Step of the colour offsets δ, display values. Default: 0.012.
+    pub colour_rate: f32,
+    /// Weight of (1 − SSIM)/2 beside the mean squared difference. Default: 0.2.
+    pub dssim: f64,
+    /// Weight of the loss of each of two photographs, drawn from the other's Gaussians alone. It
+    /// changes geometry and opacity, not colours. The first half of the Gaussians must be those of
+    /// the first photograph, as [`Reconstruction::splats`](crate::Reconstruction::splats) has
+    /// them. No effect on other numbers of photographs. Default: 0.
+    pub across: f32,
+}
+
+impl Default for RefineOptions {
+    fn default() -> Self {
+        Self {
+            steps: 40,
+            mean_rate: 0.3,
+            rotation_rate: 0.03,
+            scale_rate: 0.06,
+            opacity_rate: 0.15,
+            colour_rate: 0.012,
+            dssim: 0.2,
+            across: 0.0,
+        }
+    }
+}
+
+impl RefineOptions {
+    /// Sets [`RefineOptions::steps`].
+    #[must_use]
+    pub fn with_steps(mut self, steps: usize) -> Self {
+        self.steps = steps;
+        self
+    }
+
+    /// Sets [`RefineOptions::across`].
+    #[must_use]
+    pub fn with_across(mut self, weight: f32) -> Self {
+        self.across = weight;
+        self
+    }
+}
+
+/// Result of a refinement: mean squared difference of the blocks that are held back, mean over
+/// the photographs, display values.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
+pub struct RefineReport {
+    /// Steps that were taken.
+    pub steps: usize,
+    /// Before the first step.
+    pub before: f64,
+    /// After the last step; equal to `before` where the Gaussians stayed as they were.
+    pub after: f64,
+}
+
+/// Side of the blocks that are held back, px.
+const BLOCK: usize = 8;
+/// One of so many blocks is held back.
+const BLOCKS_PER_HELD: u32 = 16;
+/// Least steps between two comparisons of the blocks that are held back.
+const ROUND_MIN: usize = 8;
+/// Comparisons in a row without a gain after which a refinement ends.
+const PATIENCE: usize = 2;
+/// The rates fall by a cosine from 1 + this to this.
+const RATE_FLOOR: f32 = 0.05;
+/// Decay rates of Adam's means of the gradient and of its square.
+const BETAS: [f32; 2] = [0.9, 0.99];
+/// Keeps the quotient of a Gaussian without gradient finite.
+const EPSILON: f32 = 1e-15;
+/// Coverage up to which a picture of the other photograph's Gaussians does not count; above it,
+/// the weight of a pixel grows linearly to 1.
+const COVERAGE_MIN: f32 = 0.7;
+/// Opacities are moved into [this, 1 − this], where the logit is finite.
+const OPACITY_MARGIN: f32 = 1e-3;
+/// Least and largest Δ ln σ.
+const LOG_SCALE_LIMITS: [f32; 2] = [-2.0, 1.0];
+/// Gaussians per parallel task.
+const CHUNK: usize = 4096;
+
+/// Parameters of one Gaussian, as differences from the predicted ones: logit of the opacity,
+/// ln σ (3), colour offset (3), mean in [`Refiner::units`] (3), quaternion (4).
+const PARAMETERS: usize = 14;
+const LOGIT: usize = 0;
+const LOG_SCALE: usize = 1;
+const COLOUR: usize = 4;
+const MEAN: usize = 7;
+const ROTATION: usize = 10;
+
+/// One Gaussian's parameters with Adam's state.
+#[derive(Clone, Copy, Default)]
+struct State {
+    value: [f32; PARAMETERS],
+    mean: [f32; PARAMETERS],
+    square: [f32; PARAMETERS],
+}
+
+/// A photograph with the pixels that are held back.
+struct HeldTarget<'a> {
+    target: Target<'a>,
+    /// Indices of the pixels.
+    held: Vec<usize>,
+}
+
+impl<'a> HeldTarget<'a> {
+    fn new(view: usize, v: &FitView<'a>, dssim: f64) -> Result<Self, FitError> {
+        let target = Target::new(view, v, dssim)?;
+        let (w, h) = (v.image.width, v.image.height);
+        let is_held = |i: &usize| is_held_back(view, i % w / BLOCK, i / w / BLOCK);
+        Ok(Self { target, held: (0..w * h).filter(is_held).collect() })
+    }
+
+    /// Mean squared difference of the held pixels of planes `[5, H, W]`.
+    fn held_error(&self, planes: &[f32]) -> f64 {
+        let truth = &self.target.truth;
+        let plane = truth.len() / 3;
+        let elements = self.held.iter().flat_map(|&i| [i, i + plane, i + 2 * plane]);
+        let sum: f64 = elements.map(|i| f64::from(planes[i] - truth[i]).powi(2)).sum();
+        sum / (3 * self.held.len()).max(1) as f64
+    }
+
+    /// Loss of the other pixels, with its gradient by R, G and B. A held pixel's truth is
+    /// replaced by its rendered colour.
+    fn loss(&self, planes: &[f32]) -> Scored {
+        let mut truth = self.target.truth.clone();
+        let plane = truth.len() / 3;
+        for i in self.held.iter().flat_map(|&i| [i, i + plane, i + 2 * plane]) {
+            truth[i] = planes[i];
+        }
+        self.target.loss_to(planes, &truth)
+    }
+
+    /// [`HeldTarget::loss`] where Gaussians cover the picture. `planes` `[5, H, W]`.
+    fn loss_where_covered(&self, planes: &[f32]) -> Scored {
+        let mut truth = self.target.truth.clone();
+        let plane = truth.len() / 3;
+        for (i, alpha) in planes[3 * plane..4 * plane].iter().enumerate() {
+            let weight = ((alpha - COVERAGE_MIN) / (1.0 - COVERAGE_MIN)).clamp(0.0, 1.0);
+            for j in [i, i + plane, i + 2 * plane] {
+                truth[j] = planes[j] + weight * (truth[j] - planes[j]);
+            }
+        }
+        for i in self.held.iter().flat_map(|&i| [i, i + plane, i + 2 * plane]) {
+            truth[i] = planes[i];
+        }
+        self.target.loss_to(planes, &truth)
+    }
+}
+
+/// Reports whether the block at (`x`, `y`) of photograph `view` is held back.
+fn is_held_back(view: usize, x: usize, y: usize) -> bool {
+    // A multiplicative hash (Knuth) of the three numbers, each of them small.
+    let key = (view as u32).wrapping_mul(73_856_093)
+        ^ (x as u32).wrapping_mul(19_349_663)
+        ^ (y as u32).wrapping_mul(83_492_791);
+    (key.wrapping_mul(2_654_435_761) >> 16).is_multiple_of(BLOCKS_PER_HELD)
+}
+
+/// A refinement that goes on step by step, for callers that show it. [`refine`] runs a whole one.
+pub struct Refiner<'a> {
+    predicted: &'a Splats,
+    targets: Vec<HeldTarget<'a>>,
+    raster: RasterOptions,
+    options: RefineOptions,
+    /// `[N]`: size of a pixel at the Gaussian, in the photograph where it is smallest, world units.
+    units: Vec<f32>,
+    states: Vec<State>,
+    rows: Vec<f32>,
+    /// `[N, 4]`.
+    gain: Vec<f32>,
+    gradients: Gradients,
+    /// Gradients by the Gaussians `other` of the photograph drawn from them alone.
+    across: Gradients,
+    /// The Gaussians of the photograph that the last step did not draw; empty without
+    /// [`RefineOptions::across`].
+    other: Range<usize>,
+    step: usize,
+}
+
+impl<'a> Refiner<'a> {
+    /// Prepares a refinement of `splats` on `views`, which are rendered by the rules `raster` in
+    /// the splats' own SH basis.
+    ///
+    /// # Errors
+    /// A picture of another size than its camera.
+    pub fn new(
+        splats: &'a Splats,
+        views: &[FitView<'a>],
+        raster: &RasterOptions,
+        options: &RefineOptions,
+    ) -> Result<Self, FitError> {
+        let held = |(i, v): (usize, &FitView<'a>)| HeldTarget::new(i, v, options.dssim);
+        let mut rows = splats.rows.clone();
+        for row in rows.chunks_exact_mut(SPLAT_STRIDE) {
+            row[OPACITY_OFFSET] = row[OPACITY_OFFSET].clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN);
+        }
+        Ok(Self {
+            predicted: splats,
+            targets: views.iter().enumerate().map(held).collect::<Result<_, _>>()?,
+            raster: RasterOptions { sh_basis: splats.sh_basis, ..*raster },
+            options: *options,
+            units: pixel_sizes(splats, views),
+            states: vec![State::default(); splats.len()],
+            rows,
+            gain: gain_with_offsets(&splats.gain, splats.len()),
+            gradients: Gradients::default(),
+            across: Gradients::default(),
+            other: 0..0,
+            step: 0,
+        })
+    }
+
+    /// Number of steps so far.
+    pub fn steps(&self) -> usize {
+        self.step
+    }
+
+    /// The Gaussians after the steps so far.
+    pub fn splats(&self) -> Splats {
+        Splats { rows: self.rows.clone(), gain: self.gain.clone(), ..self.predicted.clone() }
+    }
+
+    /// Takes one step, on one photograph. Returns the mean squared difference of its held blocks
+    /// before the step; `None` without photographs or Gaussians.
+    pub fn step(&mut self, renderer: &mut Renderer) -> Option<f64> {
+        if self.targets.is_empty() || self.predicted.is_empty() {
+            return None;
+        }
+        let view = view_of_step(self.step, self.targets.len());
+        let target = &self.targets[view];
+        let slices = slices_of(&self.rows, &self.gain, self.predicted);
+        let (camera, raster) = (target.target.camera, &self.raster);
+        let mut held = f64::NAN;
+        renderer.gradients_of(&slices, camera, raster, &mut self.gradients, &mut |planes| {
+            held = target.held_error(planes);
+            let mut gradient = target.loss(planes).gradient;
+            // Alpha and Σ w·z have no loss.
+            gradient.resize(planes.len(), 0.0);
+            gradient
+        });
+        self.other = other_half(self.predicted, self.targets.len(), view);
+        if self.options.across > 0.0 && !self.other.is_empty() {
+            let slices = part_of(slices, &self.other);
+            renderer.gradients_of(&slices, camera, raster, &mut self.across, &mut |planes| {
+                let mut gradient = target.loss_where_covered(planes).gradient;
+                gradient.resize(planes.len(), 0.0);
+                gradient
+            });
+        } else {
+            self.other = 0..0;
+        }
+        self.step += 1;
+        self.update();
+        Some(held)
+    }
+
+    /// Mean over the photographs of the mean squared difference of the blocks that are held back.
+    pub fn held_error(&self, renderer: &mut Renderer) -> f64 {
+        let slices = slices_of(&self.rows, &self.gain, self.predicted);
+        let error = |target: &HeldTarget<'_>| {
+            let planes = renderer.render_planes(&slices, target.target.camera, &self.raster);
+            target.held_error(&planes)
+        };
+        self.targets.iter().map(error).sum::<f64>() / self.targets.len().max(1) as f64
+    }
+
+    /// One step of Adam with the last gradients.
+    fn update(&mut self) {
+        let Self { predicted, options, units, states, rows, gain, gradients, step, .. } = self;
+        let (across, other) = (&self.across.rows, &self.other);
+        let n = i32::try_from(*step).unwrap_or(i32::MAX);
+        let correction = BETAS.map(|b| 1.0 - b.powi(n));
+        let rates = rates(options, *step);
+        let channels = predicted.gain_channels();
+        let rows = rows.par_chunks_exact_mut(SPLAT_STRIDE).zip(gain.par_chunks_exact_mut(4));
+        let by = gradients.rows.par_chunks_exact(SPLAT_STRIDE);
+        let by = by.zip(gradients.gain.par_chunks_exact(4));
+        let before = predicted.rows.par_chunks_exact(SPLAT_STRIDE).zip(&*units).enumerate();
+        states.par_iter_mut().zip(rows.zip(by).zip(before)).with_min_len(CHUNK).for_each(
+            |(state, (((row, gain), (by_row, by_gain)), (i, (before, unit))))| {
+                let mut gradient = by_parameters(row, by_row, by_gain, *unit);
+                if other.contains(&i) {
+                    let by_row = &across[(i - other.start) * SPLAT_STRIDE..][..SPLAT_STRIDE];
+                    let second = by_parameters(row, by_row, &[0.0; 4], *unit);
+                    let sums = gradient.iter_mut().zip(second);
+                    sums.for_each(|(sum, g)| *sum += options.across * g);
+                }
+                // Adam's state of a Gaussian that no pixel shows stays as it is.
+                if gradient.iter().all(|g| *g == 0.0) || gradient.iter().any(|g| !g.is_finite()) {
+                    return;
+                }
+                state.advance(&gradient, &rates, correction);
+                let offsets: [f32; 3] = match channels {
+                    4 => std::array::from_fn(|c| predicted.gain[4 * i + 1 + c]),
+                    _ => [0.0; 3],
+                };
+                state.write(before, offsets, *unit, row, gain);
+            },
+        );
+    }
+}
+
+/// Refines `splats` on `views` in place. `progress` receives the number of steps done;
+/// [`ControlFlow::Break`] cancels. The colour offsets are added to the δ of [`Splats::gain`], which
+/// has four numbers a Gaussian afterwards.
+///
+/// # Errors
+/// A picture of another size than its camera; a cancelled refinement. The Gaussians are then
+/// unchanged.
+pub fn refine(
+    splats: &mut Splats,
+    views: &[FitView<'_>],
+    raster: &RasterOptions,
+    options: &RefineOptions,
+    renderer: &mut Renderer,
+    progress: &mut dyn FnMut(usize) -> ControlFlow<()>,
+) -> Result<RefineReport, FitError> {
+    let mut refiner = Refiner::new(splats, views, raster, options)?;
+    if options.steps == 0 || views.is_empty() || refiner.predicted.is_empty() {
+        return Ok(RefineReport { steps: 0, before: 0.0, after: 0.0 });
+    }
+    let before = refiner.held_error(renderer);
+    // Every photograph equally often in a round.
+    let round = ROUND_MIN.div_ceil(views.len()) * views.len();
+    let (mut sum, mut best, mut without_gain) = (0.0, f64::INFINITY, 0);
+    while refiner.steps() < options.steps && without_gain < PATIENCE {
+        sum += refiner.step(renderer).unwrap_or(0.0);
+        let steps = refiner.steps();
+        if progress(steps).is_break() {
+            return Err(FitError::Cancelled);
+        }
+        if steps.is_multiple_of(round) {
+            // An error that is not a number is no gain.
+            without_gain = if sum < best { 0 } else { without_gain + 1 };
+            best = best.min(sum);
+            sum = 0.0;
+        }
+    }
+    let (steps, after) = (refiner.steps(), refiner.held_error(renderer));
+    if !(after < before) {
+        return Ok(RefineReport { steps, before, after: before });
+    }
+    let Refiner { rows, gain, .. } = refiner;
+    splats.rows = rows;
+    splats.gain = gain;
+    Ok(RefineReport { steps, before, after })
+}
+
+/// The photograph of a step, counted from 0: all of them once in each round.
+fn view_of_step(step: usize, views: usize) -> usize {
+    // Neighbours in the list are often neighbours in space; the stride separates them.
+    let stride = (views / 2 + 1..=views).find(|s| coprime(*s, views)).unwrap_or(1);
+    step * stride % views
+}
+
+fn coprime(a: usize, b: usize) -> bool {
+    if b == 0 { a == 1 } else { coprime(b, a % b) }
+}
+
+/// Size of a pixel at each Gaussian, in the photograph where it is smallest, world units.
+fn pixel_sizes(splats: &Splats, views: &[FitView<'_>]) -> Vec<f32> {
+    let size = |mean: Vec3, camera: &Camera| {
+        mean.distance(camera.position()) / camera.intrinsics.fx.max(camera.intrinsics.fy)
+    };
+    let rows = splats.rows.par_chunks_exact(SPLAT_STRIDE);
+    rows.map(|row| {
+        let mean = Vec3::from_slice(&row[MEAN_OFFSET..]);
+        views.iter().map(|v| size(mean, v.camera)).fold(f32::INFINITY, f32::min)
+    })
+    .collect()
+}
+
+fn slices_of<'s>(rows: &'s [f32], gain: &'s [f32], splats: &'s Splats) -> SplatSlices<'s> {
+    let sh_degree = splats.sh_degree;
+    SplatSlices { geometry: Geometry::Packed(rows), sh: &splats.sh, gain, sh_degree }
+}
+
+/// Of two photographs, the Gaussians of the one that is not `view`; none where a parent's children
+/// would be divided.
+fn other_half(splats: &Splats, views: usize, view: usize) -> Range<usize> {
+    let half = splats.parents() / 2 * splats.children_per_parent();
+    match views == 2 && splats.parents().is_multiple_of(2) {
+        true => (1 - view) * half..(2 - view) * half,
+        false => 0..0,
+    }
+}
+
+/// The Gaussians `range` of `slices`, whole families of packed rows.
+fn part_of<'s>(slices: SplatSlices<'s>, range: &Range<usize>) -> SplatSlices<'s> {
+    let Geometry::Packed(rows) = slices.geometry else { return slices };
+    let (children, set) = (slices.children_per_parent(), 3 * sh_coefficients(slices.sh_degree));
+    let parents = range.start / children..range.end / children;
+    SplatSlices {
+        geometry: Geometry::Packed(&rows[range.start * SPLAT_STRIDE..range.end * SPLAT_STRIDE]),
+        sh: &slices.sh[parents.start * set..parents.end * set],
+        gain: &slices.gain[4 * range.start..4 * range.end],
+        sh_degree: slices.sh_degree,
+    }
+}
+
+/// Step sizes of the parameters in step `step`, counted from 1.
+fn rates(options: &RefineOptions, step: usize) -> [f32; PARAMETERS] {
+    let part = step as f32 / options.steps.max(1) as f32;
+    let factor = RATE_FLOOR + 0.5 * (1.0 + (std::f32::consts::PI * part.min(1.0)).cos());
+    let mut rates = [0.0; PARAMETERS];
+    rates[LOGIT] = options.opacity_rate;
+    rates[LOG_SCALE..COLOUR].fill(options.scale_rate);
+    rates[COLOUR..MEAN].fill(options.colour_rate);
+    rates[MEAN..ROTATION].fill(options.mean_rate);
+    rates[ROTATION..].fill(options.rotation_rate);
+    rates.map(|rate| factor * rate)
+}
+
+/// Gradients by a Gaussian's parameters from those by its row and its gain.
+fn by_parameters(row: &[f32], by_row: &[f32], by_gain: &[f32], unit: f32) -> [f32; PARAMETERS] {
+    let alpha = row[OPACITY_OFFSET];
+    let mut out = [0.0; PARAMETERS];
+    out[LOGIT] = by_row[OPACITY_OFFSET] * alpha * (1.0 - alpha);
+    for k in 0..3 {
+        out[LOG_SCALE + k] = by_row[SCALE_OFFSET + k] * row[SCALE_OFFSET + k];
+        out[COLOUR + k] = by_gain[1 + k];
+        out[MEAN + k] = by_row[MEAN_OFFSET + k] * unit;
+    }
+    out[ROTATION..].copy_from_slice(&by_row[QUAT_OFFSET..QUAT_OFFSET + 4]);
+    out
+}
+
+impl State {
+    /// One step of Adam. `correction`: 1 − βⁿ of both means.
+    fn advance(
+        &mut self,
+        gradient: &[f32; PARAMETERS],
+        rates: &[f32; PARAMETERS],
+        correction: [f32; 2],
+    ) {
+        let [b1, b2] = BETAS;
+        for k in 0..PARAMETERS {
+            let g = gradient[k];
+            self.mean[k] = b1 * self.mean[k] + (1.0 - b1) * g;
+            self.square[k] = b2 * self.square[k] + (1.0 - b2) * g * g;
+            let root = (self.square[k] / correction[1]).sqrt() + EPSILON;
+            self.value[k] -= rates[k] * (self.mean[k] / correction[0]) / root;
+        }
+        let [low, high] = LOG_SCALE_LIMITS;
+        for v in &mut self.value[LOG_SCALE..COLOUR] {
+            *v = v.clamp(low, high);
+        }
+    }
+
+    /// Writes the Gaussian: the row `before` and its colour `offsets`, changed by the parameters.
+    fn write(
+        &self,
+        before: &[f32],
+        offsets: [f32; 3],
+        unit: f32,
+        row: &mut [f32],
+        gain: &mut [f32],
+    ) {
+        let value = &self.value;
+        let alpha = before[OPACITY_OFFSET].clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN);
+        let logit = (alpha / (1.0 - alpha)).ln() + value[LOGIT];
+        row[OPACITY_OFFSET] = 1.0 / (1.0 + (-logit).exp());
+        for k in 0..3 {
+            row[SCALE_OFFSET + k] = before[SCALE_OFFSET + k] * value[LOG_SCALE + k].exp();
+            row[MEAN_OFFSET + k] = before[MEAN_OFFSET + k] + unit * value[MEAN + k];
+            gain[1 + k] = offsets[k] + value[COLOUR + k];
+        }
+        let quat: [f32; 4] = std::array::from_fn(|k| before[QUAT_OFFSET + k] + value[ROTATION + k]);
+        let length = quat.iter().map(|q| q * q).sum::<f32>().sqrt();
+        // A quaternion of zero has no direction: the last one stays.
+        if length > 0.0 {
+            for (to, q) in row[QUAT_OFFSET..QUAT_OFFSET + 4].iter_mut().zip(quat) {
+                *to = q / length;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_round_shows_every_photograph_once() {
+        for views in 1..12 {
+            let mut seen: Vec<usize> = (0..views).map(|s| view_of_step(s, views)).collect();
+            seen.sort_unstable();
+            assert_eq!(seen, (0..views).collect::<Vec<_>>());
+        }
+    }
+
+    #[test]
+    fn a_sixteenth_of_the_blocks_is_held_back() {
+        for view in 0..3 {
+            let held = (0..64 * 64).filter(|i| is_held_back(view, i % 64, i / 64)).count();
+            assert!((200..320).contains(&held), "view {view}: {held} of 4096 blocks");
+            // No row or column of blocks lacks them.
+            for line in 0..64 {
+                assert!((0..64).any(|i| is_held_back(view, line, i)), "column {line}");
+                assert!((0..64).any(|i| is_held_back(view, i, line)), "row {line}");
+            }
+        }
+    }
+}
