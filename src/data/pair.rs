@@ -316,6 +316,24 @@ mod tests {
     }
 
     #[test]
+    fn sources_are_the_best_partners_on_both_sides() {
+        let depths = NearFar::new(1.0, 3.0);
+        // Five cameras in a row, 0.2 apart; depth 1.5.
+        let row: Vec<Camera> =
+            (0..5u8).map(|i| camera(0.0, Vec3::X * 0.2 * f32::from(i))).collect();
+        let sources = choose_sources(&row, depths, 2);
+        assert_eq!(sources[2].iter().copied().min(), Some(1));
+        assert_eq!(sources[2].iter().copied().max(), Some(3));
+        assert!(sources[0].contains(&1), "{sources:?}");
+        assert!(sources.iter().enumerate().all(|(i, s)| s.len() == 2 && !s.contains(&i)));
+        // A camera at the same place and one that looks away come last.
+        let others = vec![row[0], row[0], camera(3.1, Vec3::X * 0.2), row[1]];
+        assert_eq!(choose_sources(&others, depths, 1)[0], [3]);
+        // Fewer cameras than sources.
+        assert_eq!(choose_sources(&row[..2], depths, 2), [[1], [0]]);
+    }
+
+    #[test]
     fn known_geometry() {
         let a = camera(0.0, Vec3::ZERO);
         let same = view_geometry(&a, &a, 1.0, 10.0);

@@ -244,3 +244,45 @@ pub struct Primaries {
     /// Gaussians per view, H·W·G: the source view of Gaussian `i` is `i / per_view`.
     pub per_view: usize,
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::Intrinsics;
+    use candle_core::{DType, Device};
+    use glam::Mat4;
+
+    fn three() -> Views {
+        let k = Intrinsics { fx: 8.0, fy: 8.0, cx: 4.0, cy: 4.0, width: 8, height: 8 };
+        let camera = Camera::new(k, Mat4::IDENTITY).unwrap();
+        let images = Tensor::zeros((1, 3, 3, 8, 8), DType::F32, &Device::Cpu).unwrap();
+        Views::new(images, vec![vec![camera; 3]], vec![vec![NearFar::RE10K; 3]]).unwrap()
+    }
+
+    #[test]
+    fn all_other_views_are_sources_unless_they_are_named() {
+        let views = three();
+        assert_eq!(views.sources(), [[vec![1, 2], vec![0, 2], vec![0, 1]]]);
+        let views = views.with_sources(vec![vec![vec![2], vec![0], vec![1]]]).unwrap();
+        assert_eq!(views.sources_per_view(), 1);
+        assert_eq!(views.scene(0).unwrap().sources(), [[vec![2], vec![0], vec![1]]]);
+        let sorted = three().with_sources(vec![vec![vec![2, 1], vec![2, 0], vec![1, 0]]]).unwrap();
+        assert_eq!(sorted.sources(), three().sources());
+    }
+
+    #[test]
+    fn sources_that_no_view_can_have_are_refused() {
+        let bad: [Vec<Vec<usize>>; 6] = [
+            vec![vec![1], vec![0]],
+            vec![vec![1], vec![0], vec![0, 1]],
+            vec![vec![0], vec![0], vec![0]],
+            vec![vec![3], vec![0], vec![0]],
+            vec![vec![1, 1], vec![0, 2], vec![0, 1]],
+            vec![vec![], vec![], vec![]],
+        ];
+        for sources in bad {
+            let text = three().with_sources(vec![sources.clone()]).unwrap_err().to_string();
+            assert!(text.contains("expected"), "{sources:?}: {text}");
+        }
+    }
+}

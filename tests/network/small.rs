@@ -1,7 +1,7 @@
 //! The small backbone: results of its untrained start, and its switches.
 
 use candle_core::{Device, Tensor};
-use subsplat::camera::NearFar;
+use subsplat::camera::{Camera, NearFar};
 use subsplat::config::{Backbone, Config, Preset, Small};
 use subsplat::data::procedural::{Example, ExampleSpec};
 use subsplat::model::Views;
@@ -85,6 +85,39 @@ fn untrained_it_is_a_plane_sweep() {
     println!("within 15 %: {share:.3}; without the raw channels {without:.3}");
     assert!(share > 0.5, "{share}");
     assert!(without < share - 0.2, "the check does not see geometry: {without} and {share}");
+}
+
+/// Share of the pixels of the first view whose distance is within 15 % of the truth, compared with
+/// the second view and with a picture of something else at a third place.
+#[test]
+fn a_source_that_shows_something_else_costs_little() {
+    let (net, _) = build(&Small::standard());
+    let (mut hits, mut all) = ([0usize; 2], 0);
+    for seed in 0..4 {
+        let (e, other) = (example(seed), example(100 + seed));
+        let pair = views(std::slice::from_ref(&e));
+        let foreign = views(std::slice::from_ref(&other));
+        let foreign = foreign.images.narrow(1, 0, 1).unwrap();
+        let images = Tensor::cat(&[&pair.images, &foreign], 1).unwrap();
+        let [a, b] = [e.cameras[0], e.cameras[1]];
+        let third = glam::Mat4::from_translation(1.5 * (b.position() - a.position()));
+        let third = Camera::new(*a.intrinsics(), third * *a.world_from_camera()).unwrap();
+        let planes = vec![vec![pair.near_far[0][0]; 3]];
+        let three = Views::new(images, vec![vec![a, b, third]], planes).unwrap();
+        for (hits, views) in hits.iter_mut().zip([&pair, &three]) {
+            let (out, _) = net.forward(views, DisparityMean::AroundMode).unwrap();
+            let got = flat(&out.depths);
+            for (i, z) in e.views[0].depth.iter().enumerate() {
+                let px = glam::Vec2::new((i % SIDE) as f32 + 0.5, (i / SIDE) as f32 + 0.5);
+                let distance = z * a.intrinsics().unproject(px).length();
+                *hits += usize::from((got[i] - distance).abs() / distance < 0.15);
+            }
+        }
+        all += SIDE * SIDE;
+    }
+    let [alone, three] = hits.map(|h| h as f32 / all as f32);
+    println!("within 15 %: {alone:.3}; with a source of something else {three:.3}");
+    assert!(three > 0.8 * alone, "{three} of {alone}");
 }
 
 #[test]

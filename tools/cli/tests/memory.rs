@@ -81,8 +81,22 @@ fn large_photographs_are_freed_before_the_network() {
     let peaks = [(256, 256), (1080, 1920)].map(|(width, height)| {
         let folder = folder.path().join(width.to_string());
         scene(&folder, width, height);
-        // The fit of large photographs has larger pictures than the fit of small ones.
-        peak(&folder, &["--backbone", "re10k", "--crop", "square", "--detail", "off", "--fit", "0"])
+        // Fit and refinement of large photographs have larger pictures than those of small ones.
+        peak(
+            &folder,
+            &[
+                "--backbone",
+                "re10k",
+                "--crop",
+                "square",
+                "--detail",
+                "off",
+                "--fit",
+                "0",
+                "--refine",
+                "off",
+            ],
+        )
     });
     let [small, large] = peaks;
     assert!(large - small <= LARGE_PHOTOGRAPHS, "{large:.0} MiB instead of {small:.0}");

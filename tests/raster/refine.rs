@@ -1,0 +1,157 @@
+//! The refinement of Gaussians on pictures: it finds displaced geometry again, holds blocks of
+//! pixels back, and leaves a set alone where it cannot make it better.
+
+use std::ops::ControlFlow;
+use subsplat::abi::{QUAT_OFFSET, SPLAT_STRIDE};
+use subsplat::io::image::Rgb;
+use subsplat::{
+    FitError, FitView, RasterOptions, RefineOptions, RefineReport, Refiner, Renderer, Splats,
+    refine,
+};
+use subsplat_test_support::fit_scene::{SIDE, cameras, pictures, plane};
+
+fn refined(splats: &mut Splats, truth: &[Rgb], options: &RefineOptions) -> RefineReport {
+    let cameras = cameras();
+    let views: Vec<FitView<'_>> =
+        cameras.iter().zip(truth).map(|(camera, image)| FitView { camera, image }).collect();
+    let (raster, mut renderer) = (RasterOptions::default(), Renderer::default());
+    refine(splats, &views, &raster, options, &mut renderer, &mut |_| ControlFlow::Continue(()))
+        .unwrap()
+}
+
+/// The plane with its Gaussians displaced by up to `px` pixels, each in a direction of its own.
+fn displaced(px: f32) -> Splats {
+    let mut parts = plane(0.6, 0.9).into_parts();
+    let pixel = 2.0 / SIDE as f32;
+    for (i, row) in parts.rows.chunks_mut(SPLAT_STRIDE).enumerate() {
+        let angle = i as f32 * 2.4;
+        row[0] += px * pixel * angle.cos();
+        row[1] += px * pixel * angle.sin();
+    }
+    Splats::try_from(parts).unwrap()
+}
+
+fn distance(a: &Splats, b: &Splats) -> f32 {
+    let rows = a.rows().chunks(SPLAT_STRIDE).zip(b.rows().chunks(SPLAT_STRIDE));
+    let each = rows.map(|(a, b)| (0..2).map(|k| (a[k] - b[k]).powi(2)).sum::<f32>());
+    (each.sum::<f32>() / a.len() as f32).sqrt()
+}
+
+#[test]
+fn displaced_means_move_back() {
+    let sharp = plane(0.6, 0.9);
+    let truth = pictures(&sharp);
+    let start = displaced(0.4);
+    let mut splats = start.clone();
+    let options = RefineOptions::default().with_steps(60);
+    let report = refined(&mut splats, &truth, &options);
+    // The held blocks have no loss of their own; their Gaussians reach into other blocks.
+    assert!(report.after < 0.75 * report.before, "{report:?}");
+    let (before, after) = (distance(&start, &sharp), distance(&splats, &sharp));
+    assert!(after < 0.8 * before, "{after} of {before}");
+    for row in splats.rows().chunks(SPLAT_STRIDE) {
+        let quat = &row[QUAT_OFFSET..QUAT_OFFSET + 4];
+        let length = quat.iter().map(|q| q * q).sum::<f32>().sqrt();
+        assert!((length - 1.0).abs() < 1e-5, "{quat:?}");
+    }
+    assert_eq!((splats.sh(), splats.gain().len()), (start.sh(), 4 * start.len()));
+    // The result does not depend on the number of threads.
+    let mut again = start.clone();
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    assert_eq!(pool.install(|| refined(&mut again, &truth, &options)), report);
+    assert!(again == splats);
+}
+
+#[test]
+fn a_set_that_cannot_be_better_stays() {
+    let sharp = plane(0.6, 0.9);
+    let truth = pictures(&sharp);
+    let mut splats = sharp.clone();
+    // One step of Adam moves every parameter by its whole rate, away from the optimum.
+    let report = refined(&mut splats, &truth, &RefineOptions::default().with_steps(1));
+    assert!(splats == sharp && report.before == report.after, "{report:?}");
+    let report = refined(&mut splats, &truth, &RefineOptions::default().with_steps(0));
+    assert!(splats == sharp && report.steps == 0);
+    refined(&mut splats, &[], &RefineOptions::default());
+    assert!(splats == sharp);
+}
+
+#[test]
+fn a_refinement_without_gain_ends_early() {
+    let truth = pictures(&plane(0.6, 0.9));
+    let mut splats = plane(0.6, 0.9);
+    let report = refined(&mut splats, &truth, &RefineOptions::default().with_steps(10_000));
+    assert!(report.steps < 200, "{report:?}");
+}
+
+/// Two planes, one for each camera, the second at a wrong depth. Pictures of both together can be
+/// right only if the second moves; a picture of the second alone says where to.
+#[test]
+fn the_other_photographs_gaussians_are_drawn_alone() {
+    let (near, far) = (plane(0.6, 0.9).into_parts(), plane(0.6, 0.9).into_parts());
+    let mut both = near;
+    for row in far.rows.chunks(SPLAT_STRIDE) {
+        // Along the second camera's ray, a tenth behind the plane: its own picture stays.
+        let mut row = row.to_vec();
+        row[0] = 0.1 + 1.1 * (row[0] - 0.1);
+        row[1] *= 1.1;
+        row[2] *= 1.1;
+        both.rows.extend(row);
+    }
+    both.sh.extend(far.sh);
+    let start = Splats::try_from(both).unwrap();
+    let truth = pictures(&plane(0.6, 0.9));
+    let change = |across: f32| {
+        let mut splats = start.clone();
+        let options = RefineOptions::default().with_steps(40).with_across(across);
+        let mut options = options;
+        options.dssim = 0.0;
+        refined(&mut splats, &truth, &options);
+        let half = splats.len() / 2 * SPLAT_STRIDE;
+        let rows = splats.rows()[half..].chunks(SPLAT_STRIDE);
+        let before = start.rows()[half..].chunks(SPLAT_STRIDE);
+        let moved = rows.zip(before).map(|(a, b)| (a[0] - b[0]).abs() + (a[1] - b[1]).abs());
+        moved.sum::<f32>() / splats.len() as f32
+    };
+    let (without, with) = (change(0.0), change(1.0));
+    assert!(with > 1.5 * without && with > 0.0, "{with} and {without}");
+}
+
+#[test]
+fn a_cancelled_refinement_changes_nothing() {
+    let truth = pictures(&plane(0.6, 0.9));
+    let (mut splats, cameras) = (displaced(0.4), cameras());
+    let before = splats.clone();
+    let views = [FitView { camera: &cameras[0], image: &truth[0] }];
+    let (raster, options) = (RasterOptions::default(), RefineOptions::default());
+    let mut stop =
+        |step: usize| if step == 2 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) };
+    let result =
+        refine(&mut splats, &views, &raster, &options, &mut Renderer::default(), &mut stop);
+    assert!(matches!(result, Err(FitError::Cancelled)));
+    assert!(splats == before);
+}
+
+#[test]
+fn a_picture_of_another_size_is_refused() {
+    let (splats, cameras) = (plane(1.1, 0.3), cameras());
+    let image = Rgb { width: 2, height: 1, data: vec![0; 6] };
+    let views = [FitView { camera: &cameras[0], image: &image }];
+    let options = RefineOptions::default();
+    let error = Refiner::new(&splats, &views, &RasterOptions::default(), &options).err().unwrap();
+    assert_eq!(error.to_string(), "view 0: expected a picture of 48x48, got 2x1");
+}
+
+/// A pixel without Gaussians has no gradient, and numbers that are not finite change nothing.
+#[test]
+fn gaussians_that_no_picture_shows_stay() {
+    let truth = pictures(&plane(0.6, 0.9));
+    let mut parts = displaced(0.4).into_parts();
+    // Behind both cameras.
+    parts.rows[2] = -2.0;
+    let start = Splats::try_from(parts).unwrap();
+    let mut splats = start.clone();
+    refined(&mut splats, &truth, &RefineOptions::default().with_steps(20));
+    assert_ne!(splats.rows(), start.rows());
+    assert_eq!(splats.rows()[..10], start.rows()[..10]);
+}
