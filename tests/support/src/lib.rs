@@ -8,6 +8,7 @@ pub mod fit_scene;
 pub mod gpu;
 pub mod made_up;
 pub mod noise;
+pub mod npy;
 pub mod one_splat;
 pub mod oracle;
 pub mod pose_errors;
