@@ -5,6 +5,7 @@ pub mod chunk_files;
 pub mod colmap_files;
 pub mod cpu_against_gpu;
 pub mod fit_scene;
+pub mod gather;
 pub mod gpu;
 pub mod made_up;
 pub mod noise;
