@@ -10,6 +10,7 @@
 use super::Views;
 use super::backbone::SmallBackbone;
 use super::backbone::small::DisparityMean;
+use super::trace::Trace;
 use crate::camera::{Camera, NearFar};
 use candle_core::Result;
 
@@ -27,11 +28,12 @@ const MIN_HALF_SIDE: usize = 96;
 /// the number, px, of which the network's input sides are multiples.
 ///
 /// # Errors
-/// Those of the network.
+/// Those of the network and of the trace's checkpoint.
 pub(super) fn estimate_depth_range(
     network: &SmallBackbone,
     views: &Views,
     stride: usize,
+    trace: &Trace<'_>,
 ) -> Result<Views> {
     let mut estimated = views.clone();
     for b in 0..views.scenes() {
@@ -39,7 +41,7 @@ pub(super) fn estimate_depth_range(
         for range in wide.near_far.iter_mut().flatten() {
             *range = NearFar::new(range.near / SEARCH_FACTOR, range.far * SEARCH_FACTOR);
         }
-        let index = network.depth(&wide, DisparityMean::AroundMode)?.index;
+        let index = network.depth_with(&wide, DisparityMean::AroundMode, trace)?.index;
         let top = (network.candidates() - 1) as f32;
         let mut depths = Vec::with_capacity(index.elem_count());
         for (v, NearFar { near, far }) in wide.near_far[0].iter().enumerate() {

@@ -4,7 +4,7 @@ use super::backbone::small::{DepthMaps, DisparityMean};
 use super::backbone::{Mvsplat, SmallBackbone};
 use super::depth_range;
 use super::primaries::primaries;
-use super::trace::Trace;
+use super::trace::{Checkpoint, Trace};
 use super::trunk::{Children, Trunk};
 use super::{BackboneOutput, Primaries, Views};
 use crate::abi::RasterOptions;
@@ -84,15 +84,35 @@ impl SubSplat {
     /// # Errors
     /// A side is not a multiple of [`Config::stride`].
     pub fn encode(&self, views: &Views) -> Result<BackboneOutput> {
+        in_pool(|| self.encode_with(views, &|| Ok(())))
+    }
+
+    /// [`SubSplat::encode`] on this thread, with `checkpoint` after each of
+    /// [`SubSplat::encode_steps`].
+    ///
+    /// # Errors
+    /// Those of [`SubSplat::encode`] and of `checkpoint`.
+    pub fn encode_with(&self, views: &Views, checkpoint: Checkpoint<'_>) -> Result<BackboneOutput> {
         let (h, w) = views.size()?;
         let stride = self.config.stride();
         if h % stride != 0 || w % stride != 0 {
             bail!("input images: expected sides that are multiples of {stride}, got {w}x{h}");
         }
-        in_pool(|| match &self.encoder {
-            Encoder::Mvsplat(encoder) => encoder.forward(views, &mut Trace::off()),
-            Encoder::Small(encoder) => Ok(encoder.forward(views, DisparityMean::AroundMode)?.0),
-        })
+        let mut trace = Trace::with_checkpoint(checkpoint);
+        match &self.encoder {
+            Encoder::Mvsplat(encoder) => encoder.forward(views, &mut trace),
+            Encoder::Small(encoder) => {
+                Ok(encoder.forward_with(views, DisparityMean::AroundMode, &trace)?.0)
+            }
+        }
+    }
+
+    /// Returns the number of steps of [`SubSplat::encode_with`] for one scene of `views` views.
+    pub fn encode_steps(&self, views: usize) -> usize {
+        match &self.encoder {
+            Encoder::Mvsplat(encoder) => encoder.steps(views),
+            Encoder::Small(_) => SmallBackbone::steps(views),
+        }
     }
 
     /// Estimates near and far depth from half-size images.
@@ -105,9 +125,23 @@ impl SubSplat {
     /// # Errors
     /// A side is not a multiple of [`Config::stride`].
     pub fn estimate_depth_range(&self, views: &Views) -> Result<Views> {
+        in_pool(|| self.estimate_depth_range_with(views, &|| Ok(())))
+    }
+
+    /// [`SubSplat::estimate_depth_range`] on this thread, with `checkpoint` after each of four
+    /// steps.
+    ///
+    /// # Errors
+    /// Those of [`SubSplat::estimate_depth_range`] and of `checkpoint`.
+    pub fn estimate_depth_range_with(
+        &self,
+        views: &Views,
+        checkpoint: Checkpoint<'_>,
+    ) -> Result<Views> {
         match (&self.encoder, &self.config.backbone) {
             (Encoder::Small(network), Backbone::Small(c)) if c.estimate_depth_range => {
-                in_pool(|| depth_range::estimate_depth_range(network, views, self.config.stride()))
+                let trace = Trace::with_checkpoint(checkpoint);
+                depth_range::estimate_depth_range(network, views, self.config.stride(), &trace)
             }
             _ => Ok(views.clone()),
         }

@@ -14,6 +14,7 @@ use super::geometry::{Frames, ParentChunk};
 use super::mlp::Mode;
 use super::primaries::Packed;
 use super::spgr::{Heads, rules};
+use super::trace::Checkpoint;
 use super::{BackboneOutput, Primaries, Views};
 use crate::abi::{RasterOptions, SPLAT_STRIDE, ShBasis, sh_coefficients};
 use crate::camera::Camera;
@@ -132,6 +133,15 @@ struct Records {
     parents: Tensor,
 }
 
+/// Division of the parents into chunks, and the mode of their layers.
+struct Chunking<'a> {
+    /// Parents per chunk.
+    size: usize,
+    mode: Mode,
+    /// Runs after each chunk.
+    checkpoint: Checkpoint<'a>,
+}
+
 /// Output buffers of one chunk.
 struct Job<'a> {
     span: Span,
@@ -211,22 +221,50 @@ impl Trunk {
         backbone: &BackboneOutput,
         primaries: &Primaries,
     ) -> Result<Children> {
-        let Some(parts) = &self.parts else { return self.pass_through(views, primaries) };
-        let scene = self.scene(parts, views, backbone, primaries)?;
-        let sh = interleaved(&primaries.sh)?;
-        let chunk = if self.backend.is_cpu() { CHUNK } else { CHUNK_GPU };
-        self.children(parts, &scene, sh, primaries.sh_basis, chunk, Mode::Infer)
+        self.forward_with(views, backbone, primaries, &|| Ok(()))
     }
 
-    /// Children with coefficients `sh`, outside any graph, `chunk` parents at a time.
+    /// [`Trunk::forward`] with `checkpoint` after each of [`Trunk::steps`], on any thread.
+    ///
+    /// # Errors
+    /// Those of [`Trunk::forward`] and of `checkpoint`.
+    pub fn forward_with(
+        &self,
+        views: &Views,
+        backbone: &BackboneOutput,
+        primaries: &Primaries,
+        checkpoint: Checkpoint<'_>,
+    ) -> Result<Children> {
+        let Some(parts) = &self.parts else { return self.pass_through(views, primaries) };
+        let scene = self.scene(parts, views, backbone, primaries)?;
+        checkpoint()?;
+        let sh = interleaved(&primaries.sh)?;
+        let how = Chunking { size: self.chunk_size(), mode: Mode::Infer, checkpoint };
+        self.children(parts, &scene, sh, primaries.sh_basis, &how)
+    }
+
+    /// Returns the number of steps of [`Trunk::forward_with`].
+    pub fn steps(&self, primaries: &Primaries) -> usize {
+        let parents = primaries.opacities.elem_count();
+        match self.parts {
+            Some(_) => 1 + chunks(parents, primaries.per_view, self.chunk_size()).count(),
+            None => 0,
+        }
+    }
+
+    /// Parents per chunk at inference.
+    fn chunk_size(&self) -> usize {
+        if self.backend.is_cpu() { CHUNK } else { CHUNK_GPU }
+    }
+
+    /// Children with coefficients `sh`, outside any graph.
     fn children(
         &self,
         parts: &Parts,
         scene: &Scene,
         sh: Tensor,
         sh_basis: ShBasis,
-        chunk: usize,
-        mode: Mode,
+        how: &Chunking<'_>,
     ) -> Result<Children> {
         let (k, lanes) = (scene.rules.children(), scene.rules.gain_channels());
         let n = scene.means.dim(0)?;
@@ -237,7 +275,7 @@ impl Trunk {
         let mut gains = vec![0f32; n * k * lanes];
         let mut jobs = Vec::new();
         let (mut rows_left, mut gains_left) = (&mut rows[..], &mut gains[..]);
-        for span in chunks(n, scene.per_view, chunk.max(1)) {
+        for span in chunks(n, scene.per_view, how.size) {
             let (rows, rest) = rows_left.split_at_mut(span.len * k * SPLAT_STRIDE);
             rows_left = rest;
             let (gains, rest) = gains_left.split_at_mut(span.len * k * lanes);
@@ -245,8 +283,9 @@ impl Trunk {
             jobs.push(Job { span, rows, gains });
         }
         let run = |Job { span, rows, gains }: Job| {
-            let Records { head, parents } = self.records(parts, scene, span, mode)?;
-            spgr_into_on(&self.backend, &head, &parents, &scene.call(span), (rows, gains))
+            let Records { head, parents } = self.records(parts, scene, span, how.mode)?;
+            spgr_into_on(&self.backend, &head, &parents, &scene.call(span), (rows, gains))?;
+            (how.checkpoint)()
         };
         match self.backend.is_cpu() {
             true => jobs.into_par_iter().try_for_each(run)?,

@@ -9,8 +9,12 @@ use crate::camera::Camera;
 use crate::check::PairReport;
 use crate::data::crop::Cropped;
 use crate::io::image::{Depth, Rgb};
+use crate::model::Views;
 use crate::render::Renderer;
 use std::ops::ControlFlow;
+
+/// Steps of the estimate of the depth range.
+const RANGE_STEPS: usize = 4;
 
 /// Cropped photographs with a depth range, from [`Reconstructor::prepare`]. It holds nothing of
 /// the photographs' full size.
@@ -74,15 +78,24 @@ impl Prepared<'_> {
             tracker.begin(Stage::DepthRange, progress)?;
         }
         let initial_bounds = bounds.clone();
-        let (views, bounds) = model.views(&inputs, bounds, options.depth_range)?;
         let network = model.model();
+        let estimate = |views: &Views| {
+            tracker.run_steps(RANGE_STEPS, progress, |step| {
+                network.estimate_depth_range_with(views, step)
+            })
+        };
+        let (views, bounds) = model.views_with(&inputs, bounds, options.depth_range, estimate)?;
         tracker.begin(Stage::Backbone, progress)?;
-        let output = network.encode(&views)?;
+        let steps = network.encode_steps(inputs.len());
+        let output =
+            tracker.run_steps(steps, progress, |step| network.encode_with(&views, step))?;
         tracker.begin(Stage::Primaries, progress)?;
         let primaries = network.primaries(&views, &output)?;
         tracker.begin(Stage::Subsplat, progress)?;
-        // On a thread of the pool: parallel calls from there start without a wake-up.
-        let children = rayon::scope(|_| network.trunk().forward(&views, &output, &primaries))?;
+        let trunk = network.trunk();
+        let children = tracker.run_steps(trunk.steps(&primaries), progress, |step| {
+            trunk.forward_with(&views, &output, &primaries, step)
+        })?;
         let distances = output.depths.narrow(3, 0, 1)?.squeeze(3)?.squeeze(0)?.to_vec2()?;
         drop((views, output, primaries));
         let mut splats = children.to_splats()?;

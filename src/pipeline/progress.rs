@@ -1,8 +1,11 @@
 //! Progress of a reconstruction: stages, fractions, times, cancellation.
 
 use super::{Error, Result};
+use crate::model::trace::Checkpoint;
 use std::fmt;
 use std::ops::ControlFlow;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::mpsc;
 use std::time::Instant;
 
 /// A stage of a reconstruction, in the order of execution. [`fmt::Display`] gives its name.
@@ -76,6 +79,9 @@ pub struct StageTime {
 /// The caller's callback.
 pub(super) type Callback<'a> = dyn FnMut(Progress) -> ControlFlow<()> + 'a;
 
+/// Most reports of one stage of the network.
+const REPORTS_MAX: usize = 32;
+
 /// Share of one stage in the whole.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct StageCost {
@@ -142,6 +148,60 @@ impl Tracker {
             self.fraction = self.fraction.max(fraction);
         }
         report(Progress { stage, fraction: self.fraction }, callback)
+    }
+
+    /// Runs `work` on a thread of rayon's pool, where parallel calls start without a wake-up, and
+    /// reports its steps. `work` calls its checkpoint after each of about `steps` steps, on any
+    /// thread; the callback runs on this thread. On a thread of the pool `work` runs without
+    /// reports, because waiting for them would hold up the pool.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`]; those of `work`.
+    pub(super) fn run_steps<T: Send>(
+        &mut self,
+        steps: usize,
+        callback: &mut Callback<'_>,
+        work: impl FnOnce(Checkpoint<'_>) -> candle_core::Result<T> + Send,
+    ) -> Result<T> {
+        if rayon::current_thread_index().is_some() {
+            return Ok(work(&|| Ok(()))?);
+        }
+        let cancelled = AtomicBool::new(false);
+        let stride = steps.div_ceil(REPORTS_MAX).max(1);
+        let (sender, receiver) = mpsc::channel();
+        let mut outcome = None;
+        let (slot, stop) = (&mut outcome, &cancelled);
+        let reported = rayon::in_place_scope(|scope| {
+            scope.spawn(move |_| {
+                let count = AtomicUsize::new(0);
+                let checkpoint = || {
+                    let done = 1 + count.fetch_add(1, Ordering::Relaxed);
+                    if done.is_multiple_of(stride) {
+                        // The receiver is gone after a cancellation only.
+                        let _ = sender.send(done);
+                    }
+                    match stop.load(Ordering::Relaxed) {
+                        true => candle_core::bail!("cancelled"),
+                        false => Ok(()),
+                    }
+                };
+                *slot = Some(work(&checkpoint));
+            });
+            // Ends when `work` has dropped the sender.
+            for done in receiver {
+                let part = (done as f32 / steps.max(1) as f32).min(1.0);
+                if let Err(error) = self.advance(part, callback) {
+                    cancelled.store(true, Ordering::Relaxed);
+                    return Err(error);
+                }
+            }
+            Ok(())
+        });
+        reported?;
+        match outcome {
+            Some(result) => Ok(result?),
+            None => Err(Error::Cancelled),
+        }
     }
 
     /// Ends the last stage, reports fraction 1 and returns the times.

@@ -126,8 +126,10 @@ impl Reconstructor {
         self.run_with(photos, options, &mut |_| ControlFlow::Continue(()))
     }
 
-    /// [`Reconstructor::run`] with a callback for progress. The callback runs at the start of
-    /// each stage, and after each photograph and pair. [`ControlFlow::Break`] cancels.
+    /// [`Reconstructor::run`] with a callback for progress. The callback runs on the
+    /// calling thread: at the start of each stage, after each photograph and pair, within the
+    /// network and after each step of the fit. [`ControlFlow::Break`] cancels. On a thread of a
+    /// rayon pool the stages of the network give no reports of their own.
     ///
     /// # Errors
     /// Those of [`Reconstructor::run`]; [`Error::Cancelled`](super::Error::Cancelled).
@@ -212,11 +214,26 @@ impl Reconstructor {
         bounds: DepthBounds,
         range: DepthRange,
     ) -> Result<(Views, DepthBounds)> {
+        let estimate = |views: &Views| Ok(self.model.estimate_depth_range(views)?);
+        self.views_with(inputs, bounds, range, estimate)
+    }
+
+    /// [`Reconstructor::views`]; `estimate` estimates the range.
+    ///
+    /// # Errors
+    /// Those of [`Reconstructor::views`].
+    pub(super) fn views_with(
+        &self,
+        inputs: &[Cropped],
+        bounds: DepthBounds,
+        range: DepthRange,
+        estimate: impl FnOnce(&Views) -> Result<Views>,
+    ) -> Result<(Views, DepthBounds)> {
         let views = views_of(inputs, bounds.near_far())?;
         if range != DepthRange::Auto {
             return Ok((views, bounds));
         }
-        let views = self.model.estimate_depth_range(&views)?;
+        let views = estimate(&views)?;
         let estimate = views.near_far[0][0];
         if estimate == bounds.near_far() {
             return Ok((views, bounds));

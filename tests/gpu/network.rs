@@ -1,6 +1,7 @@
 //! Attention gather and plane sweep on the GPU against the CPU versions.
 
 use subsplat_test_support::cpu_against_gpu;
+use subsplat_test_support::gather::base;
 use subsplat_test_support::gpu as adapter;
 
 use adapter::gpu;
@@ -17,25 +18,6 @@ const GATHER: f32 = 4e-6;
 /// Tolerance of gradients: in addition, gradients of logits cancel and gradients of points are
 /// multiplied by 14.
 const GATHER_BWD: f32 = 1e-5;
-
-fn base() -> Gather {
-    Gather {
-        levels: vec![Level { height: 5, width: 7, first_cell: 0 }],
-        views: 2,
-        points: 1,
-        points_per_level: false,
-        dim: 8,
-        groups: 1,
-        stride: 16,
-        key: Some(0),
-        value: 8,
-        logit_scale: 0.4,
-        renormalise: true,
-        sample_convention: SampleConvention::HalfPixel,
-        drop: None,
-        point_gradient: true,
-    }
-}
 
 /// Every option of a gather, and one with the sizes of the paper.
 fn gathers() -> Vec<(&'static str, Gather)> {

@@ -2,11 +2,15 @@
 
 use subsplat_test_support::whole;
 
+use candle_core::{Device, Tensor};
 use std::ops::ControlFlow;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use subsplat::check::Verdict;
 use subsplat::config::{Config, Preset};
+use subsplat::model::Views;
 use subsplat::{
-    Check, DepthSource, Detail, Error, Options, Photo, Progress, Reconstructor, Stage, Warning,
+    Check, DepthSource, Detail, Error, NearFar, Options, Photo, Progress, Reconstructor, Stage,
+    Warning,
 };
 
 fn photos() -> Vec<Photo> {
@@ -63,6 +67,66 @@ fn progress_rises_through_all_stages_and_a_break_cancels() {
         let error = model.run_with(&photos, &quick(), &mut stop).unwrap_err();
         assert!(matches!(error, Error::Cancelled) && calls == 1, "{stage}: {error}");
     }
+}
+
+/// Runs `model` to the report that follows the first of `stage`, and cancels there.
+fn cancel_within(model: &Reconstructor, photos: &[Photo], stage: Stage) -> (usize, Error) {
+    let mut calls = 0;
+    let mut stop = |progress: Progress| {
+        assert!(progress.stage <= stage, "{progress:?} after {stage} was cancelled");
+        calls += usize::from(progress.stage == stage);
+        if calls < 2 { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+    };
+    let error = model.run_with(photos, &quick(), &mut stop).err().unwrap();
+    (calls, error)
+}
+
+#[test]
+fn a_break_within_a_stage_of_the_network_cancels_it() {
+    let (small, photos) = (untrained(), photos());
+    for stage in [Stage::DepthRange, Stage::Backbone, Stage::Subsplat] {
+        let (calls, error) = cancel_within(&small, &photos, stage);
+        assert!(matches!(error, Error::Cancelled) && calls == 2, "{stage}: {error}");
+    }
+    let mvsplat = Reconstructor::untrained(&Config::re10k(Preset::Tuned, 2), 7).unwrap();
+    let (calls, error) = cancel_within(&mvsplat, &photos, Stage::Backbone);
+    assert!(matches!(error, Error::Cancelled) && calls == 2, "{error}");
+}
+
+/// The fraction of a stage divides by the number of its steps, which the models state.
+#[test]
+fn the_networks_have_as_many_steps_as_they_state() {
+    let photos = photos();
+    for config in [Config::small(Preset::Tuned, 2), Config::re10k(Preset::Tuned, 2)] {
+        let model = Reconstructor::untrained(&config, 7).unwrap();
+        let (network, near_far) = (model.model(), NearFar::new(1.0, 20.0));
+        let inputs: Vec<_> =
+            photos.iter().map(|p| p.crop(&model.crop_options((64, 64))).unwrap()).collect();
+        let pixels: Vec<f32> = inputs.iter().flat_map(|c| c.input.to_planes()).collect();
+        let images = Tensor::from_vec(pixels, (1, 2, 3, 64, 64), &Device::Cpu).unwrap();
+        let cameras = inputs.iter().map(|c| c.input_camera).collect();
+        let views = Views::new(images, vec![cameras], vec![vec![near_far; 2]]).unwrap();
+        let count = AtomicUsize::new(0);
+        let step = || {
+            count.fetch_add(1, Ordering::Relaxed);
+            Ok(())
+        };
+        let output = network.encode_with(&views, &step).unwrap();
+        assert_eq!(count.swap(0, Ordering::Relaxed), network.encode_steps(2));
+        let primaries = network.primaries(&views, &output).unwrap();
+        let trunk = network.trunk();
+        trunk.forward_with(&views, &output, &primaries, &step).unwrap();
+        assert_eq!(count.swap(0, Ordering::Relaxed), trunk.steps(&primaries));
+    }
+}
+
+/// On a thread of a pool a report of a stage cannot wait for another thread of the pool.
+#[test]
+fn a_reconstruction_on_the_only_thread_of_a_pool_ends() {
+    let (model, photos) = (untrained(), photos());
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    let inside = pool.install(|| model.run(&photos, &quick()).unwrap());
+    assert_eq!(inside.splats(), model.run(&photos, &quick()).unwrap().splats());
 }
 
 #[test]

@@ -275,7 +275,7 @@ fn ref_render() {
     let splats = read_ply(&scene.join("5aca87f95a9412c6.globalsplat16k.ply"));
     let cameras = cameras(&scene.join("cameras.json"));
     let npy = std::fs::read(reference.join("5aca87f95a9412c6_view04_rgb_f32.npy")).unwrap();
-    let expected: Vec<f32> = npyz::NpyFile::new(&npy[..]).unwrap().into_vec().unwrap();
+    let expected = common::npy::floats(&npy);
     for (convention, least) in [(Convention::Mvsplat, 70.0), (Convention::Standard, 80.0)] {
         let options = RasterOptions::new(convention);
         let picture = subsplat::render(&splats, &cameras[4], &options);

@@ -174,7 +174,10 @@ impl DepthPredictor {
         trace: &mut Trace<'_>,
     ) -> Result<Tensor> {
         let name = "depth.refine_unet";
-        let projected = each_row(images, |r| self.proj_feature.forward(&up.row(r)?))?;
+        let projected = each_row(images, |r| {
+            trace.step()?;
+            self.proj_feature.forward(&up.row(r)?)
+        })?;
         trace.put("depth.proj_feature_vb", &projected)?;
         let x = Tensor::cat(&[images, &projected, &disparity.full, &disparity.pdf_max], 1)?;
         drop(projected);
@@ -196,6 +199,7 @@ impl DepthPredictor {
         trace: &mut Trace<'_>,
     ) -> Result<Tensor> {
         let raw = each_row(images, |r| {
+            trace.step()?;
             let row = |x: &Tensor| x.narrow(0, r, 1);
             let x = Tensor::cat(&[row(refined)?, row(images)?], 1)?;
             let x = join(&x, &up.row(r)?, 1)?;

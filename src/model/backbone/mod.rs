@@ -52,6 +52,18 @@ impl Mvsplat {
         self.depth.backend = backend.clone();
     }
 
+    /// Returns the number of steps, with a checkpoint after each, of a scene of `views` views.
+    pub fn steps(&self, views: usize) -> usize {
+        let Settings { transformer_layers, costvolume_levels, refine_levels, .. } = self.settings;
+        let cnn = 7;
+        let transformer = 2 + 2 * transformer_layers;
+        let cost_volume = 7 + unet::UNet::steps(costvolume_levels);
+        let coarse_depth = 7;
+        let refinement = 5 + views + unet::UNet::steps(refine_levels);
+        let heads = 2 + views;
+        cnn + transformer + cost_volume + coarse_depth + refinement + heads
+    }
+
     /// Runs the encoder on any number of scenes of two or more views. `trace` records the
     /// stages under the names of the reference outputs (`cnn.conv1`, …,
     /// `depth.to_disparity_vb`).

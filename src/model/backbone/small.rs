@@ -19,6 +19,7 @@ use crate::config::{FeatureLevel, Small};
 use crate::model::layers::{
     Activation, Conv2d, ConvShape, GroupNorm, LayerInit, gelu, resize_bilinear, sigmoid,
 };
+use crate::model::trace::Trace;
 use crate::model::{BackboneOutput, Views};
 use crate::ops::Backend;
 use crate::ops::join::join;
@@ -164,6 +165,12 @@ impl SmallBackbone {
         self.backend = backend.clone();
     }
 
+    /// Returns the number of steps of [`SmallBackbone::forward_with`] at inference, for a scene of
+    /// `views` views.
+    pub fn steps(views: usize) -> usize {
+        4 + views
+    }
+
     /// Runs the network.
     ///
     /// # Errors
@@ -173,10 +180,23 @@ impl SmallBackbone {
         views: &Views,
         mean: DisparityMean,
     ) -> Result<(BackboneOutput, DepthMaps)> {
+        self.forward_with(views, mean, &Trace::off())
+    }
+
+    /// [`SmallBackbone::forward`] with a checkpoint after each part. The trace records nothing.
+    ///
+    /// # Errors
+    /// Those of [`SmallBackbone::forward`] and of the checkpoint.
+    pub fn forward_with(
+        &self,
+        views: &Views,
+        mean: DisparityMean,
+        trace: &Trace<'_>,
+    ) -> Result<(BackboneOutput, DepthMaps)> {
         let (b, v, _, h, w) = views.images.dims5()?;
         let Matched { rgb, feat2, feat4, deep, logits, index, confidence } =
-            self.matched(views, mean)?;
-        let heads = self.heads(&rgb, &deep, [&index, &confidence], mean)?;
+            self.matched(views, mean, trace)?;
+        let heads = self.heads(&rgb, &deep, [&index, &confidence], mean, trace)?;
         let depths = self.ray_distance(views, &index)?;
         let pool = |s: usize| -> Result<Tensor> { split_views(&deep.avg_pool2d(s)?, b, v) };
         let features = vec![
@@ -210,12 +230,25 @@ impl SmallBackbone {
     /// # Errors
     /// Those of [`SmallBackbone::forward`].
     pub fn depth(&self, views: &Views, mean: DisparityMean) -> Result<DepthMaps> {
-        let Matched { logits, index, confidence, .. } = self.matched(views, mean)?;
+        self.depth_with(views, mean, &Trace::off())
+    }
+
+    /// [`SmallBackbone::depth`] with a checkpoint after each part.
+    ///
+    /// # Errors
+    /// Those of [`SmallBackbone::depth`] and of the checkpoint.
+    pub fn depth_with(
+        &self,
+        views: &Views,
+        mean: DisparityMean,
+        trace: &Trace<'_>,
+    ) -> Result<DepthMaps> {
+        let Matched { logits, index, confidence, .. } = self.matched(views, mean, trace)?;
         Ok(DepthMaps { logits, index, confidence: sigmoid(&confidence)? })
     }
 
     /// The network up to the heads.
-    fn matched(&self, views: &Views, mean: DisparityMean) -> Result<Matched> {
+    fn matched(&self, views: &Views, mean: DisparityMean, trace: &Trace<'_>) -> Result<Matched> {
         let (b, v, _, h, w) = views.images.dims5()?;
         let stride = 4 << (self.config.unet_channels.len() - 1);
         if h % stride != 0 || w % stride != 0 {
@@ -227,8 +260,11 @@ impl SmallBackbone {
         for block in &self.blocks {
             feat4 = block.forward(&feat4)?;
         }
+        trace.step()?;
         let stem = self.sweep(views, &feat4, mean)?;
+        trace.step()?;
         let deep = self.unet.forward(&join(&stem.input, &feat4, 1)?)?;
+        trace.step()?;
         let mut logits = self.logits.forward(&deep)?;
         if let Some(scores) = &stem.scores
             && self.config.stem_skip
@@ -245,6 +281,7 @@ impl SmallBackbone {
             Some(convex) => convex.apply(&deep, &rgb, [&index, &confidence])?,
             None => [resize_bilinear(&index, h, w)?, resize_bilinear(&confidence, h, w)?],
         };
+        trace.step()?;
         Ok(Matched { rgb, feat2, feat4, deep, logits, index, confidence })
     }
 
@@ -344,6 +381,7 @@ impl SmallBackbone {
         deep: &Tensor,
         sides: [&Tensor; 2],
         mean: DisparityMean,
+        trace: &Trace<'_>,
     ) -> Result<Heads> {
         let views = rgb.dim(0)?;
         let share = 1.0 / (self.config.depth_candidates - 1) as f32;
@@ -366,6 +404,7 @@ impl SmallBackbone {
             raws.push(raw);
             densities.push(density);
             hiddens.push(hidden);
+            trace.step()?;
         }
         Ok(Heads { raw: whole(raws)?, density: whole(densities)?, hidden: whole(hiddens)? })
     }

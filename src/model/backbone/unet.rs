@@ -83,6 +83,11 @@ impl UNet {
         })
     }
 
+    /// Returns the number of stages that a trace records.
+    pub(super) fn steps(levels: usize) -> usize {
+        4 * levels + 3
+    }
+
     /// Maps `[V·B, C, h, w]` to the same shape; `trace` records stages under `name`.
     ///
     /// # Errors

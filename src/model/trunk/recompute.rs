@@ -64,8 +64,8 @@ impl Trunk {
         let sh = interleaved(&primaries.sh)?;
         let outside = scene.leaves();
         let mode = Mode::Train { seed };
-        let children =
-            self.children(parts, &outside, sh, primaries.sh_basis, super::CHUNK, mode)?;
+        let how = super::Chunking { size: super::CHUNK, mode, checkpoint: &|| Ok(()) };
+        let children = self.children(parts, &outside, sh, primaries.sh_basis, &how)?;
         Ok(Recomputed { trunk: self, parts, scene, chunk: chunk.max(1), seed, children })
     }
 }
