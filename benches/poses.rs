@@ -1,11 +1,15 @@
 //! Cameras from photographs alone, on `../shared/photos`: errors against the given cameras, and
 //! seconds. `cargo bench --bench poses -- [NAME …] [--quick] [--threads N]`; the tables are `pairs
-//! known`, `pairs unknown`, `many known` and `many unknown`; `--quick` leaves out the last two.
+//! known`, `pairs unknown`, `scenes known`, `many known` and `many unknown`; `--quick` leaves out
+//! the last three.
 //!
 //! Columns of pairs: error of the rotation and of the direction (degrees), the estimate's own
 //! standard deviations of both, focal length over the true one, verdict. Columns of many
 //! photographs: number with a camera, largest error of a centre over the extent of all centres
-//! (percent) and of a rotation (degrees) after alignment.
+//! (percent) and of a rotation (degrees) after alignment. Columns of scenes: PSNR of the protocol's
+//! targets (dB), means of a pair, with the given cameras of the inputs, with estimated ones and
+//! their difference. Both see the targets from the given cameras; the estimated cameras are moved to
+//! the given ones by their mean rotation, the scale of the baseline and the middle between them.
 
 mod common;
 
@@ -14,9 +18,12 @@ use common::Bench;
 use serde_json::json;
 use std::time::Instant;
 use subsplat::camera::Camera;
-use subsplat::{Confidence, PoseOptions, PosePhoto, estimate_poses};
+use subsplat::{
+    Confidence, Options, Photo, PoseOptions, PosePhoto, PoseRefusal, Reconstructor, estimate_poses,
+    psnr,
+};
 use subsplat_test_support::pose_errors::{
-    aligned_errors, area_under_curve, median, relative_errors,
+    aligned_cameras, aligned_errors, area_under_curve, median, relative_errors,
 };
 use subsplat_test_support::posed_photos::{
     Intrinsics, MANY_FEATURES, PAIR_FEATURES, PosedPair, PosedPhoto, context_pairs, photo_scene,
@@ -42,6 +49,10 @@ fn main() -> Result<()> {
             bench.add_group(&name, rows);
         }
     }
+    if bench.selects("scenes known") && !bench.args.quick {
+        let rows = scenes(&bench)?;
+        bench.add_group("scenes known", rows);
+    }
     for (word, intrinsics) in lenses {
         let name = format!("many {word}");
         if bench.selects(&name) && !bench.args.quick {
@@ -57,7 +68,7 @@ fn pairs(bench: &Bench, name: &str, intrinsics: Intrinsics) -> Result<Vec<serde_
     println!("\n{name}: rotation, direction (deg) ± (deg), focal, verdict, seconds");
     let pairs = context_pairs().context("../shared/photos is absent")?;
     let (mut errors, mut rows) = (Vec::new(), Vec::new());
-    for PosedPair { name, photos } in &pairs {
+    for PosedPair { name, photos, .. } in &pairs {
         let begin = Instant::now();
         let estimate = bench.on_all(|| {
             let photos = photos.each_ref().map(|p| p.features(intrinsics, PAIR_FEATURES));
@@ -89,6 +100,63 @@ fn pairs(bench: &Bench, name: &str, intrinsics: Intrinsics) -> Result<Vec<serde_
     let areas = [5.0, 10.0, 20.0].map(|limit| area_under_curve(&errors, limit));
     println!("median {:.2}, area under the curve at 5, 10, 20: {areas:.3?}", median(&errors));
     Ok(rows)
+}
+
+/// The table of scenes from the context pairs, with given and with estimated cameras.
+fn scenes(bench: &Bench) -> Result<Vec<serde_json::Value>> {
+    println!(
+        "\nscenes known: PSNR of targets with given cameras, estimated cameras, difference (dB)"
+    );
+    let pairs = context_pairs().context("../shared/photos is absent")?;
+    let model = Reconstructor::shipped(2)?;
+    let (mut rows, mut differences) = (Vec::new(), Vec::new());
+    for pair in &pairs {
+        let photos = pair.photos.each_ref();
+        let truth = photos.map(|p| p.camera);
+        let estimate = bench.on_all(|| {
+            let features = photos.map(|p| p.features(Intrinsics::Known, PAIR_FEATURES));
+            let options = PoseOptions::default();
+            estimate_poses(&features, &options)
+                .map(|e| (e, ""))
+                .or_else(|_| Ok((estimate_poses(&features, &options.with_force(true))?, "refused")))
+        });
+        let (estimate, note) = match estimate {
+            Ok(found) => found,
+            Err::<_, PoseRefusal>(refusal) => {
+                println!("{:40} refused: {refusal}", pair.name);
+                continue;
+            }
+        };
+        let found: Vec<Camera> = estimate.cameras.iter().flatten().copied().collect();
+        let found = aligned_cameras(&found, &truth);
+        let score = |cameras: &[Camera]| bench.on_all(|| scene_psnr(&model, pair, cameras));
+        let [given, estimated] = [score(&truth)?, score(&found)?];
+        let difference = estimated - given;
+        println!("{:40} {given:6.2} {estimated:6.2} {difference:+6.2} {note}", pair.name);
+        rows.push(json!({ "pair": pair.name, "given": given, "estimated": estimated }));
+        if note.is_empty() {
+            differences.push(difference);
+        }
+    }
+    let mean = differences.iter().sum::<f64>() / differences.len().max(1) as f64;
+    println!("mean of the {} pairs that are not refused: {mean:+.2} dB", differences.len());
+    Ok(rows)
+}
+
+/// Mean PSNR of a pair's targets where its photographs have `cameras`.
+fn scene_psnr(model: &Reconstructor, pair: &PosedPair, cameras: &[Camera]) -> Result<f64> {
+    let photos: Vec<Photo> =
+        pair.photos.iter().zip(cameras).map(|(p, c)| p.with_camera(*c)).collect();
+    let scene = model.run(&photos, &Options::default())?;
+    let input = &scene.inputs()[0].input;
+    let crop = model.crop_options((input.width, input.height));
+    let mut sum = 0.0;
+    for target in &pair.targets {
+        let truth = target.with_camera(target.camera).crop(&crop)?;
+        let picture = scene.render(&truth.target_camera);
+        sum += psnr(&picture.rgb, &truth.target.to_unit(), picture.width, picture.height)?;
+    }
+    Ok(sum / pair.targets.len() as f64)
 }
 
 /// The table of scenes of many photographs, in a mixed order.

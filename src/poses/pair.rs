@@ -1,8 +1,8 @@
 //! The relative pose of two photographs.
 //!
 //! Matches without any geometry give candidates ([`ransac`]). Each distinct candidate finds its
-//! matches anew along its epipolar lines; the one with the largest support is refined on matches
-//! that are aligned below the pixel.
+//! matches anew along its epipolar lines and is refined on them, aligned below the pixel. The pose
+//! with the largest support on its own matches is chosen.
 
 use super::photo::{PosePhoto, aligned, detected, deviations};
 use super::ransac;
@@ -14,6 +14,9 @@ use crate::matches::pairs::{self, Pair};
 const LIMIT: f64 = 3.5;
 /// Number of distinct candidates that are completed and compared.
 const COMPARED: usize = 3;
+/// Support of a candidate over that of the best, on detected positions, below which it is not
+/// compared below the pixel.
+const COMPARED_SUPPORT: f64 = 0.5;
 /// Poses whose rotations and translations differ by more explain the matches differently, radians.
 const OTHER: f64 = 0.1;
 /// Smallest number of matches that a pose is refined on.
@@ -88,25 +91,21 @@ pub(super) fn estimate(
         })
         .collect();
     completed.sort_by(|x, y| y.0.total_cmp(&x.0));
-    let rival = rival(&completed, &exact(a, b, &found), prior);
-    let Some((_, coarse, more)) = completed.into_iter().next() else { return Err(first) };
-    let points = exact(a, b, &more);
-    let mut refined = refine(&coarse.relative, coarse.focal_scale, &points, prior, 30);
-    let mut inliers = within(&refined, &points);
-    for _ in 0..2 {
-        let chosen: Vec<Bearings> = inliers.iter().map(|&i| points[i]).collect();
-        if chosen.len() < MIN_REFINED {
-            break;
-        }
-        refined = refine(&refined.relative, refined.focal_scale, &chosen, prior, 30);
-        inliers = within(&refined, &points);
-    }
+    let most = completed.first().map_or(0.0, |c| c.0);
+    completed.retain(|c| c.0 >= COMPARED_SUPPORT * most);
+    let mut precise: Vec<Precise> = completed
+        .into_iter()
+        .map(|(_, coarse, more)| Precise::new(&coarse, exact(a, b, &more), more, prior))
+        .collect();
+    precise.sort_by(|x, y| y.support.total_cmp(&x.support));
+    let rival = rival(&precise);
+    let Some(Precise { refined, pairs, points, .. }) = precise.into_iter().next() else {
+        return Err(first);
+    };
     let consistent = within(&refined, &first).len();
-    let inlier_pairs = inliers.iter().map(|&i| more[i]).collect();
-    let points = inliers.iter().map(|&i| points[i]).collect();
     Ok(PairEstimate {
         refined,
-        inliers: inlier_pairs,
+        inliers: pairs,
         points,
         matches: found.len(),
         consistent,
@@ -115,19 +114,57 @@ pub(super) fn estimate(
     })
 }
 
-/// Support of the best pose that is another one than the first, over that of the first, on matches
-/// that no pose has chosen.
-fn rival(
-    completed: &[(f64, Refined, Vec<Pair>)],
-    points: &[Bearings],
-    prior: Option<FocalPrior>,
-) -> f64 {
-    let exact = |r: &Refined| refine(&r.relative, r.focal_scale, points, prior, 30);
-    let refined: Vec<Refined> = completed.iter().map(|c| exact(&c.1)).collect();
-    let Some(best) = refined.first() else { return 0.0 };
-    let others = refined.iter().filter(|r| r.relative.distance(&best.relative) > OTHER);
-    let most = others.map(|r| support(r, points, prior)).fold(0.0, f64::max);
-    most / support(best, points, prior).max(1e-9)
+/// A pose that was refined on its own matches below the pixel.
+struct Precise {
+    refined: Refined,
+    /// The matches that agree with it, as indices of features.
+    pairs: Vec<Pair>,
+    /// The same matches.
+    points: Vec<Bearings>,
+    /// Support on its own matches whose surroundings agree, below the pixel and in front of both
+    /// cameras. Of two poses that explain the detected positions equally well, as those of a plane
+    /// do, the true one has more of them. On 96 pairs of `../shared/photos` that the report does not
+    /// use, the area under the curve at 10° is 0.81; by detected positions alone it is 0.77.
+    support: f64,
+}
+
+impl Precise {
+    /// Refines `coarse` on `points`, the matches of `pairs`.
+    fn new(
+        coarse: &Refined,
+        points: Vec<Bearings>,
+        pairs: Vec<Pair>,
+        prior: Option<FocalPrior>,
+    ) -> Self {
+        let mut refined = refine(&coarse.relative, coarse.focal_scale, &points, prior, 30);
+        let mut inliers = within(&refined, &points);
+        for _ in 0..2 {
+            let chosen: Vec<Bearings> = inliers.iter().map(|&i| points[i]).collect();
+            if chosen.len() < MIN_REFINED {
+                break;
+            }
+            refined = refine(&refined.relative, refined.focal_scale, &chosen, prior, 30);
+            inliers = within(&refined, &points);
+        }
+        let inside: Vec<Bearings> = inliers.iter().map(|&i| points[i]).collect();
+        let support = support(&refined, &most_exact(&inside), prior);
+        let pairs = inliers.iter().map(|&i| pairs[i]).collect();
+        Self { refined, pairs, points: inside, support }
+    }
+}
+
+/// The matches with the smallest deviation: those that were aligned, or all where none was.
+fn most_exact(points: &[Bearings]) -> Vec<Bearings> {
+    let least = points.iter().fold(f64::INFINITY, |m, p| m.min(p.deviation));
+    points.iter().copied().filter(|p| p.deviation <= 1.01 * least).collect()
+}
+
+/// Support of the best pose that is another one than the first, over that of the first.
+fn rival(precise: &[Precise]) -> f64 {
+    let Some(best) = precise.first() else { return 0.0 };
+    let pose = |p: &Precise| p.refined.relative;
+    let others = precise.iter().filter(|p| pose(p).distance(&pose(best)) > OTHER);
+    others.map(|p| p.support).fold(0.0, f64::max) / best.support.max(1e-9)
 }
 
 /// Indices of the matches that agree with a pose.

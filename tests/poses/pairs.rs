@@ -51,13 +51,15 @@ fn assert_areas(errors: &[f64], least: [f64; 3]) {
 #[test]
 fn pairs_with_known_intrinsics_have_small_errors() {
     let Some(errors) = errors(Intrinsics::Known) else { return };
-    assert_areas(&errors, [0.70, 0.80, 0.88]);
-    // The given cameras of hololens and re10k_0c9b are themselves off by about a degree.
-    assert!(median(&errors) < 1.15, "{errors:.2?}");
+    // Measured: 0.743, 0.837, 0.901. The pose with the largest support on detected positions alone
+    // had 0.743, 0.823, 0.880.
+    assert_areas(&errors, [0.72, 0.825, 0.89]);
+    assert!(median(&errors) <= 0.8, "{errors:.2?}");
 }
 
 #[test]
 fn pairs_with_unknown_focal_lengths_are_estimated_or_doubted() {
     let Some(errors) = errors(Intrinsics::Unknown) else { return };
-    assert_areas(&errors, [0.40, 0.50, 0.65]);
+    // Measured: 0.612, 0.768, 0.853; by detected positions alone 0.540, 0.673, 0.743.
+    assert_areas(&errors, [0.55, 0.70, 0.80]);
 }

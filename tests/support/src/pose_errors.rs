@@ -1,6 +1,6 @@
 //! Errors of estimated cameras, after the alignment of both frames.
 
-use glam::{DMat3, DQuat, DVec3};
+use glam::{DMat3, DQuat, DVec3, Mat4};
 use subsplat::camera::Camera;
 
 /// Rotation and position of a camera in f64.
@@ -50,29 +50,68 @@ pub struct AlignedErrors {
     pub rotation_deg: f64,
 }
 
-/// Aligns `found` with `truth` by one similarity: the mean rotation between the cameras, then the
+/// The similarity that moves `found` onto `truth`: the mean rotation between the cameras, then the
 /// scale and translation that fit the centres best.
+struct Similarity {
+    turn: DMat3,
+    scale: f64,
+    from: DVec3,
+    to: DVec3,
+}
+
+impl Similarity {
+    fn new(found: &[Camera], truth: &[Camera]) -> Self {
+        let turns: Vec<DQuat> = found
+            .iter()
+            .zip(truth)
+            .map(|(f, t)| DQuat::from_mat3(&(pose(t).0 * pose(f).0.transpose())))
+            .collect();
+        // Mean of quaternions that are close to one another: their sum, each with the sign of the
+        // first.
+        let sum = turns.iter().fold(DQuat::from_xyzw(0.0, 0.0, 0.0, 0.0), |s, q| {
+            if q.dot(turns[0]) < 0.0 { s - *q } else { s + *q }
+        });
+        let turn = DMat3::from_quat(sum.normalize());
+        let (f, t) = (centres(found), centres(truth));
+        let mean = |v: &[DVec3]| v.iter().sum::<DVec3>() / v.len() as f64;
+        let (from, to) = (mean(&f), mean(&t));
+        let shared: f64 = f.iter().zip(&t).map(|(f, t)| (turn * (*f - from)).dot(*t - to)).sum();
+        let scale = shared / f.iter().map(|f| (*f - from).length_squared()).sum::<f64>();
+        Self { turn, scale, from, to }
+    }
+
+    fn point(&self, p: DVec3) -> DVec3 {
+        self.turn * (p - self.from) * self.scale + self.to
+    }
+}
+
+fn centres(cameras: &[Camera]) -> Vec<DVec3> {
+    cameras.iter().map(|c| pose(c).1).collect()
+}
+
+/// Moves `found` onto `truth` by the similarity of [`aligned_errors`]. Intrinsics stay.
+pub fn aligned_cameras(found: &[Camera], truth: &[Camera]) -> Vec<Camera> {
+    let similarity = Similarity::new(found, truth);
+    let moved = |c: &Camera| {
+        let (rotation, centre) = pose(c);
+        let rotation = (similarity.turn * rotation).as_mat3();
+        let position = similarity.point(centre).as_vec3();
+        let world_from_camera = Mat4::from_mat3_translation(rotation, position);
+        Camera::new(c.intrinsics(), world_from_camera).expect("a camera")
+    };
+    found.iter().map(moved).collect()
+}
+
+/// Errors after the alignment of `found` with `truth` by one similarity.
 pub fn aligned_errors(found: &[Camera], truth: &[Camera]) -> AlignedErrors {
-    let turns: Vec<DQuat> = found
+    let similarity = Similarity::new(found, truth);
+    let (f, t) = (centres(found), centres(truth));
+    let distances = f.iter().zip(&t).map(|(f, t)| similarity.point(*f).distance(*t));
+    let extent = t.iter().flat_map(|a| t.iter().map(|b| a.distance(*b))).fold(0.0, f64::max);
+    let rotations = found
         .iter()
         .zip(truth)
-        .map(|(f, t)| DQuat::from_mat3(&(pose(t).0 * pose(f).0.transpose())))
-        .collect();
-    // Mean of quaternions that are close to one another: their sum, each with the sign of the first.
-    let sum = turns.iter().fold(DQuat::from_xyzw(0.0, 0.0, 0.0, 0.0), |s, q| {
-        if q.dot(turns[0]) < 0.0 { s - *q } else { s + *q }
-    });
-    let turn = DMat3::from_quat(sum.normalize());
-    let centres = |cameras: &[Camera]| cameras.iter().map(|c| pose(c).1).collect::<Vec<_>>();
-    let (f, t) = (centres(found), centres(truth));
-    let mean = |v: &[DVec3]| v.iter().sum::<DVec3>() / v.len() as f64;
-    let (mf, mt) = (mean(&f), mean(&t));
-    let shared: f64 = f.iter().zip(&t).map(|(f, t)| (turn * (*f - mf)).dot(*t - mt)).sum();
-    let scale = shared / f.iter().map(|f| (*f - mf).length_squared()).sum::<f64>();
-    let distances = f.iter().zip(&t).map(|(f, t)| (turn * (*f - mf) * scale + mt).distance(*t));
-    let extent = t.iter().flat_map(|a| t.iter().map(|b| a.distance(*b))).fold(0.0, f64::max);
-    let rotations =
-        found.iter().zip(truth).map(|(f, t)| angle_deg(pose(t).0.transpose() * turn * pose(f).0));
+        .map(|(f, t)| angle_deg(pose(t).0.transpose() * similarity.turn * pose(f).0));
     AlignedErrors {
         centre: distances.fold(0.0, f64::max) / extent,
         rotation_deg: rotations.fold(0.0, f64::max),

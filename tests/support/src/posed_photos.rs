@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use subsplat::camera::Camera;
 use subsplat::io::protocol::load_protocol;
 use subsplat::io::scene::{Scene, load_scene};
-use subsplat::{Lens, PosePhoto};
+use subsplat::{Lens, Photo, PosePhoto, Rgb};
 
 /// Features of each photograph of a pair, as `loose_scene` takes them.
 pub const PAIR_FEATURES: usize = 4000;
@@ -32,6 +32,13 @@ impl PosedPhoto {
         Self { camera, rgb: rgb.data }
     }
 
+    /// Its pixels with a camera.
+    pub fn with_camera(&self, camera: Camera) -> Photo {
+        let k = self.camera.intrinsics();
+        let image = Rgb { width: k.width, height: k.height, data: self.rgb.clone() };
+        Photo::new(image, camera).expect("pixels of the camera's size")
+    }
+
     /// Its features, with as much of its lens as `intrinsics` says.
     pub fn features(&self, intrinsics: Intrinsics, count: usize) -> PosePhoto {
         let k = self.camera.intrinsics();
@@ -48,6 +55,8 @@ pub struct PosedPair {
     /// The scene's name and both indices: `fox 0,8`.
     pub name: String,
     pub photos: [PosedPhoto; 2],
+    /// The protocol's target views.
+    pub targets: Vec<PosedPhoto>,
 }
 
 /// A scene of `../shared/photos`.
@@ -73,7 +82,8 @@ fn pairs_of(folder: &Path) -> Vec<PosedPair> {
     let pairs = protocol.tests.iter().map(|views| {
         let [a, b] = views.context[..] else { panic!("{name}: two context views") };
         let photos = [a, b].map(|i| PosedPhoto::load(&scene, i));
-        PosedPair { name: format!("{name} {a},{b}"), photos }
+        let targets = views.target.iter().map(|&i| PosedPhoto::load(&scene, i)).collect();
+        PosedPair { name: format!("{name} {a},{b}"), photos, targets }
     });
     pairs.collect()
 }

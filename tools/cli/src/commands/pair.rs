@@ -145,7 +145,8 @@ pub fn print_estimate(loose: &LooseScene) {
             k.fov_x().to_degrees(),
             match estimate.focal.deviation {
                 0.0 => String::new(),
-                d => format!(", then estimated to ±{:.1} %", 100.0 * d),
+                // A lens's distortion and its principal point can change it by far more.
+                d => format!(", then estimated (matching noise alone: ±{:.1} %)", 100.0 * d),
             }
         ));
     }

@@ -11,8 +11,9 @@ use std::path::{Path, PathBuf};
 use subsplat::abi::{Convention, RasterOptions};
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::io::cameras_json::{is_cameras_json, load_cameras_json};
-use subsplat::io::image::{Depth, Rgb, save_depth_png, save_png};
+use subsplat::io::image::{Depth, Rgb, probe, save_depth_png, save_png};
 use subsplat::io::load_with_comments;
+use subsplat::io::photograph::list_photographs;
 use subsplat::io::scene::{is_scene, load_scene};
 use subsplat::navigation::Bounds;
 use subsplat::render::{Renderer, options_of_comments};
@@ -89,6 +90,12 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
 /// Finds the scene file of `path`: the path itself, or the file in a folder that `run` wrote.
 fn scene_file(path: &Path) -> Result<PathBuf> {
     if !path.is_dir() {
+        ensure!(
+            probe(path).is_err(),
+            "{}: expected a scene file, got a photograph: reconstruct two or more by `subsplat run \
+             PHOTOGRAPH…`, then render its output folder",
+            path.display()
+        );
         return Ok(path.to_owned());
     }
     let files = SceneFormatArg::value_variants().iter().map(|f| path.join(f.file_name()));
@@ -96,7 +103,7 @@ fn scene_file(path: &Path) -> Result<PathBuf> {
         return Ok(file);
     }
     let name = path.display();
-    let hint = match is_scene(path) {
+    let hint = match is_scene(path) || list_photographs(path).len() >= 2 {
         true => format!("; it holds photographs: reconstruct them by `subsplat run {name}`"),
         false => String::new(),
     };

@@ -31,13 +31,15 @@ fn refused(folder: &Path, rows: &[Row]) {
 fn bad_arguments() {
     let place = workplace();
     std::fs::write(place.path().join("file"), "text").unwrap();
-    let rows: [Row; 27] = [
+    let rows: [Row; 29] = [
         ("run nowhere", "nowhere"),
         ("check nowhere", "nowhere"),
         ("info nowhere", "nowhere"),
         ("render nowhere.ply", "nowhere.ply"),
         ("render scene", "scene.ply"),
         ("render scene", "subsplat run scene"),
+        ("render scene/images", "subsplat run scene/images"),
+        ("render scene/images/view0.png", "subsplat run PHOTOGRAPH"),
         ("compare --weights nowhere --reference file", "nowhere"),
         ("run scene --context 0,9", "`9`"),
         ("run scene --context 0,view7", "`view7`"),
