@@ -91,15 +91,20 @@ pub(super) fn estimate(
         })
         .collect();
     completed.sort_by(|x, y| y.0.total_cmp(&x.0));
+    // Without alignment the detected positions decide.
+    let rival_of_detected = (!precise).then(|| rival_of_detected(&completed, &first, prior));
+    if !precise {
+        completed.truncate(1);
+    }
     let most = completed.first().map_or(0.0, |c| c.0);
     completed.retain(|c| c.0 >= COMPARED_SUPPORT * most);
-    let mut precise: Vec<Precise> = completed
+    let mut poses: Vec<Precise> = completed
         .into_iter()
         .map(|(_, coarse, more)| Precise::new(&coarse, exact(a, b, &more), more, prior))
         .collect();
-    precise.sort_by(|x, y| y.support.total_cmp(&x.support));
-    let rival = rival(&precise);
-    let Some(Precise { refined, pairs, points, .. }) = precise.into_iter().next() else {
+    poses.sort_by(|x, y| y.support.total_cmp(&x.support));
+    let rival = rival_of_detected.unwrap_or_else(|| rival(&poses));
+    let Some(Precise { refined, pairs, points, .. }) = poses.into_iter().next() else {
         return Err(first);
     };
     let consistent = within(&refined, &first).len();
@@ -165,6 +170,20 @@ fn rival(precise: &[Precise]) -> f64 {
     let pose = |p: &Precise| p.refined.relative;
     let others = precise.iter().filter(|p| pose(p).distance(&pose(best)) > OTHER);
     others.map(|p| p.support).fold(0.0, f64::max) / best.support.max(1e-9)
+}
+
+/// The same on `points`, matches that no pose has chosen.
+fn rival_of_detected(
+    completed: &[(f64, Refined, Vec<Pair>)],
+    points: &[Bearings],
+    prior: Option<FocalPrior>,
+) -> f64 {
+    let refined = |r: &Refined| refine(&r.relative, r.focal_scale, points, prior, 30);
+    let all: Vec<Refined> = completed.iter().map(|c| refined(&c.1)).collect();
+    let Some(best) = all.first() else { return 0.0 };
+    let others = all.iter().filter(|r| r.relative.distance(&best.relative) > OTHER);
+    let most = others.map(|r| support(r, points, prior)).fold(0.0, f64::max);
+    most / support(best, points, prior).max(1e-9)
 }
 
 /// Indices of the matches that agree with a pose.
