@@ -286,7 +286,7 @@ impl<'a> Target<'a> {
     }
 
     /// The loss of rendered planes `[5, H, W]`, with its gradient by R, G and B.
-    fn loss(&self, planes: &[f32]) -> Scored {
+    pub(crate) fn loss(&self, planes: &[f32]) -> Scored {
         self.loss_to(planes, &self.truth)
     }
 

@@ -7,17 +7,14 @@
 //! Real-Time Radiance Field Rendering* (Kerbl et al. 2023), from the network's Gaussians instead
 //! of sparse points, hence some dozens of steps instead of 30,000. SH coefficients stay.
 //!
-//! Every sixteenth block of 8×8 pixels of each photograph is held back: no gradient comes from it.
-//! The refinement ends where the error of these blocks stops falling, and a set whose error there
-//! has not fallen stays unchanged.
+//! A photograph tells little about a scene that was optimised to give it back. The measure of a
+//! refinement is therefore each photograph drawn from the other photographs' Gaussians alone,
+//! where these cover it. A set whose error there has not fallen stays unchanged. Of two
+//! photographs, this picture is also part of the loss ([`RefineOptions::across`]), because two
+//! alone do not tell a wrong depth that gives both of them back.
 //!
-//! Two photographs hold back too little to tell a wrong depth that gives both of them back. There,
-//! each photograph is drawn a second time from the other's Gaussians alone ([`RefineOptions::across`]):
-//! geometry that is wrong shows as a displaced picture.
-//!
-//! One step draws one photograph. The order of photographs and the blocks depend on the number of
-//! photographs and their sizes only, so the same input gives the same bytes on any number of
-//! threads.
+//! One step draws one photograph, in an order that depends on their number only. The same input
+//! gives the same bytes on any number of threads.
 
 use crate::abi::{
     Geometry, Gradients, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, RasterOptions, SCALE_OFFSET,
@@ -25,7 +22,7 @@ use crate::abi::{
 };
 use crate::camera::Camera;
 use crate::fit::{FitError, FitView, Target};
-use crate::loss::Scored;
+use crate::loss::{Scored, mse};
 use crate::render::Renderer;
 use crate::splats::Splats;
 use glam::Vec3;
@@ -52,10 +49,13 @@ pub struct RefineOptions {
     /// Weight of (1 − SSIM)/2 beside the mean squared difference. Default: 0.2.
     pub dssim: f64,
     /// Weight of the loss of each of two photographs, drawn from the other's Gaussians alone. It
-    /// changes geometry and opacity, not colours. The first half of the Gaussians must be those of
-    /// the first photograph, as [`Reconstruction::splats`](crate::Reconstruction::splats) has
-    /// them. No effect on other numbers of photographs. Default: 0.
+    /// changes geometry and opacity, not colours. No effect on other numbers of photographs, or
+    /// without `grouped`. Default: 1.
     pub across: f32,
+    /// The Gaussians are in equal groups, one for each photograph in their order, as
+    /// [`Reconstruction::splats`](crate::Reconstruction::splats) has them. Without groups, the
+    /// measure is the pictures of all Gaussians. Default: false.
+    pub grouped: bool,
 }
 
 impl Default for RefineOptions {
@@ -68,7 +68,8 @@ impl Default for RefineOptions {
             opacity_rate: 0.15,
             colour_rate: 0.012,
             dssim: 0.2,
-            across: 0.0,
+            across: 1.0,
+            grouped: false,
         }
     }
 }
@@ -87,10 +88,17 @@ impl RefineOptions {
         self.across = weight;
         self
     }
+
+    /// Sets [`RefineOptions::grouped`].
+    #[must_use]
+    pub fn with_groups(mut self, grouped: bool) -> Self {
+        self.grouped = grouped;
+        self
+    }
 }
 
-/// Result of a refinement: mean squared difference of the blocks that are held back, mean over
-/// the photographs, display values.
+/// Result of a refinement: mean squared difference of the photographs, display values. With
+/// [`RefineOptions::grouped`], each is drawn from the other photographs' Gaussians alone.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[non_exhaustive]
 pub struct RefineReport {
@@ -102,14 +110,6 @@ pub struct RefineReport {
     pub after: f64,
 }
 
-/// Side of the blocks that are held back, px.
-const BLOCK: usize = 8;
-/// One of so many blocks is held back.
-const BLOCKS_PER_HELD: u32 = 16;
-/// Least steps between two comparisons of the blocks that are held back.
-const ROUND_MIN: usize = 8;
-/// Comparisons in a row without a gain after which a refinement ends.
-const PATIENCE: usize = 2;
 /// The rates fall by a cosine from 1 + this to this.
 const RATE_FLOOR: f32 = 0.05;
 /// Decay rates of Adam's means of the gradient and of its square.
@@ -143,71 +143,42 @@ struct State {
     square: [f32; PARAMETERS],
 }
 
-/// A photograph with the pixels that are held back.
-struct HeldTarget<'a> {
-    target: Target<'a>,
-    /// Indices of the pixels.
-    held: Vec<usize>,
+/// Weight of each pixel of planes `[5, H, W]` by its coverage, 0 to 1.
+fn coverage_weights(planes: &[f32], pixels: usize) -> impl Iterator<Item = f32> + '_ {
+    let weight = |alpha: &f32| ((alpha - COVERAGE_MIN) / (1.0 - COVERAGE_MIN)).clamp(0.0, 1.0);
+    planes[3 * pixels..4 * pixels].iter().map(weight)
 }
 
-impl<'a> HeldTarget<'a> {
-    fn new(view: usize, v: &FitView<'a>, dssim: f64) -> Result<Self, FitError> {
-        let target = Target::new(view, v, dssim)?;
-        let (w, h) = (v.image.width, v.image.height);
-        let is_held = |i: &usize| is_held_back(view, i % w / BLOCK, i / w / BLOCK);
-        Ok(Self { target, held: (0..w * h).filter(is_held).collect() })
-    }
-
-    /// Mean squared difference of the held pixels of planes `[5, H, W]`.
-    fn held_error(&self, planes: &[f32]) -> f64 {
-        let truth = &self.target.truth;
-        let plane = truth.len() / 3;
-        let elements = self.held.iter().flat_map(|&i| [i, i + plane, i + 2 * plane]);
-        let sum: f64 = elements.map(|i| f64::from(planes[i] - truth[i]).powi(2)).sum();
-        sum / (3 * self.held.len()).max(1) as f64
-    }
-
-    /// Loss of the other pixels, with its gradient by R, G and B. A held pixel's truth is
-    /// replaced by its rendered colour.
-    fn loss(&self, planes: &[f32]) -> Scored {
-        let mut truth = self.target.truth.clone();
-        let plane = truth.len() / 3;
-        for i in self.held.iter().flat_map(|&i| [i, i + plane, i + 2 * plane]) {
-            truth[i] = planes[i];
+/// Loss of planes `[5, H, W]` where Gaussians cover the picture, with its gradient by R, G and B.
+fn loss_where_covered(target: &Target<'_>, planes: &[f32]) -> Scored {
+    let mut truth = target.truth.clone();
+    let pixels = truth.len() / 3;
+    for (i, weight) in coverage_weights(planes, pixels).enumerate() {
+        for j in [i, i + pixels, i + 2 * pixels] {
+            truth[j] = planes[j] + weight * (truth[j] - planes[j]);
         }
-        self.target.loss_to(planes, &truth)
     }
-
-    /// [`HeldTarget::loss`] where Gaussians cover the picture. `planes` `[5, H, W]`.
-    fn loss_where_covered(&self, planes: &[f32]) -> Scored {
-        let mut truth = self.target.truth.clone();
-        let plane = truth.len() / 3;
-        for (i, alpha) in planes[3 * plane..4 * plane].iter().enumerate() {
-            let weight = ((alpha - COVERAGE_MIN) / (1.0 - COVERAGE_MIN)).clamp(0.0, 1.0);
-            for j in [i, i + plane, i + 2 * plane] {
-                truth[j] = planes[j] + weight * (truth[j] - planes[j]);
-            }
-        }
-        for i in self.held.iter().flat_map(|&i| [i, i + plane, i + 2 * plane]) {
-            truth[i] = planes[i];
-        }
-        self.target.loss_to(planes, &truth)
-    }
+    target.loss_to(planes, &truth)
 }
 
-/// Reports whether the block at (`x`, `y`) of photograph `view` is held back.
-fn is_held_back(view: usize, x: usize, y: usize) -> bool {
-    // A multiplicative hash (Knuth) of the three numbers, each of them small.
-    let key = (view as u32).wrapping_mul(73_856_093)
-        ^ (x as u32).wrapping_mul(19_349_663)
-        ^ (y as u32).wrapping_mul(83_492_791);
-    (key.wrapping_mul(2_654_435_761) >> 16).is_multiple_of(BLOCKS_PER_HELD)
+/// Mean squared difference of planes `[5, H, W]` where Gaussians cover the picture; 0 where they
+/// cover nothing.
+fn error_where_covered(target: &Target<'_>, planes: &[f32]) -> f64 {
+    let pixels = target.truth.len() / 3;
+    let (mut sum, mut weights) = (0.0, 0.0);
+    for (i, weight) in coverage_weights(planes, pixels).enumerate() {
+        let elements = [i, i + pixels, i + 2 * pixels];
+        let squares = elements.map(|j| f64::from(planes[j] - target.truth[j]).powi(2));
+        sum += f64::from(weight) * squares.iter().sum::<f64>();
+        weights += 3.0 * f64::from(weight);
+    }
+    if weights > 0.0 { sum / weights } else { 0.0 }
 }
 
 /// A refinement that goes on step by step, for callers that show it. [`refine`] runs a whole one.
 pub struct Refiner<'a> {
     predicted: &'a Splats,
-    targets: Vec<HeldTarget<'a>>,
+    targets: Vec<Target<'a>>,
     raster: RasterOptions,
     options: RefineOptions,
     /// `[N]`: size of a pixel at the Gaussian, in the photograph where it is smallest, world units.
@@ -237,14 +208,14 @@ impl<'a> Refiner<'a> {
         raster: &RasterOptions,
         options: &RefineOptions,
     ) -> Result<Self, FitError> {
-        let held = |(i, v): (usize, &FitView<'a>)| HeldTarget::new(i, v, options.dssim);
+        let target = |(i, v): (usize, &FitView<'a>)| Target::new(i, v, options.dssim);
         let mut rows = splats.rows.clone();
         for row in rows.chunks_exact_mut(SPLAT_STRIDE) {
             row[OPACITY_OFFSET] = row[OPACITY_OFFSET].clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN);
         }
         Ok(Self {
             predicted: splats,
-            targets: views.iter().enumerate().map(held).collect::<Result<_, _>>()?,
+            targets: views.iter().enumerate().map(target).collect::<Result<_, _>>()?,
             raster: RasterOptions { sh_basis: splats.sh_basis, ..*raster },
             options: *options,
             units: pixel_sizes(splats, views),
@@ -268,48 +239,64 @@ impl<'a> Refiner<'a> {
         Splats { rows: self.rows.clone(), gain: self.gain.clone(), ..self.predicted.clone() }
     }
 
-    /// Takes one step, on one photograph. Returns the mean squared difference of its held blocks
-    /// before the step; `None` without photographs or Gaussians.
-    pub fn step(&mut self, renderer: &mut Renderer) -> Option<f64> {
+    /// Takes one step, on one photograph. Does nothing without photographs or Gaussians.
+    pub fn step(&mut self, renderer: &mut Renderer) {
         if self.targets.is_empty() || self.predicted.is_empty() {
-            return None;
+            return;
         }
         let view = view_of_step(self.step, self.targets.len());
         let target = &self.targets[view];
         let slices = slices_of(&self.rows, &self.gain, self.predicted);
-        let (camera, raster) = (target.target.camera, &self.raster);
-        let mut held = f64::NAN;
-        renderer.gradients_of(&slices, camera, raster, &mut self.gradients, &mut |planes| {
-            held = target.held_error(planes);
-            let mut gradient = target.loss(planes).gradient;
-            // Alpha and Σ w·z have no loss.
+        let (camera, raster) = (target.camera, &self.raster);
+        // Alpha and Σ w·z have no loss.
+        let padded = |loss: Scored, planes: &[f32]| {
+            let mut gradient = loss.gradient;
             gradient.resize(planes.len(), 0.0);
             gradient
+        };
+        renderer.gradients_of(&slices, camera, raster, &mut self.gradients, &mut |planes| {
+            padded(target.loss(planes), planes)
         });
-        self.other = other_half(self.predicted, self.targets.len(), view);
-        if self.options.across > 0.0 && !self.other.is_empty() {
+        self.other = match self.options.across > 0.0 && self.targets.len() == 2 {
+            true => self.group(1 - view).unwrap_or(0..0),
+            false => 0..0,
+        };
+        if !self.other.is_empty() {
             let slices = part_of(slices, &self.other);
             renderer.gradients_of(&slices, camera, raster, &mut self.across, &mut |planes| {
-                let mut gradient = target.loss_where_covered(planes).gradient;
-                gradient.resize(planes.len(), 0.0);
-                gradient
+                padded(loss_where_covered(target, planes), planes)
             });
-        } else {
-            self.other = 0..0;
         }
         self.step += 1;
         self.update();
-        Some(held)
     }
 
-    /// Mean over the photographs of the mean squared difference of the blocks that are held back.
-    pub fn held_error(&self, renderer: &mut Renderer) -> f64 {
-        let slices = slices_of(&self.rows, &self.gain, self.predicted);
-        let error = |target: &HeldTarget<'_>| {
-            let planes = renderer.render_planes(&slices, target.target.camera, &self.raster);
-            target.held_error(&planes)
-        };
-        self.targets.iter().map(error).sum::<f64>() / self.targets.len().max(1) as f64
+    /// The Gaussians of photograph `view`; `None` without [`RefineOptions::grouped`], or where the
+    /// parents do not divide into equal groups.
+    fn group(&self, view: usize) -> Option<Range<usize>> {
+        let (parents, views) = (self.predicted.parents(), self.targets.len());
+        let grouped = self.options.grouped && parents.is_multiple_of(views);
+        let size = parents / views * self.predicted.children_per_parent();
+        grouped.then(|| view * size..(view + 1) * size)
+    }
+
+    /// The measure of the refinement ([`RefineReport`]): mean over the photographs.
+    pub fn error(&self, renderer: &mut Renderer) -> f64 {
+        let mut sum = 0.0;
+        for (view, target) in self.targets.iter().enumerate() {
+            let mut rows = self.rows.clone();
+            if let Some(group) = self.group(view) {
+                let own = &mut rows[group.start * SPLAT_STRIDE..group.end * SPLAT_STRIDE];
+                own.chunks_exact_mut(SPLAT_STRIDE).for_each(|row| row[OPACITY_OFFSET] = 0.0);
+            }
+            let slices = slices_of(&rows, &self.gain, self.predicted);
+            let planes = renderer.render_planes(&slices, target.camera, &self.raster);
+            sum += match self.group(view) {
+                Some(_) => error_where_covered(target, &planes),
+                None => mse(&planes[..target.truth.len()], &target.truth).value,
+            };
+        }
+        sum / self.targets.len().max(1) as f64
     }
 
     /// One step of Adam with the last gradients.
@@ -367,24 +354,15 @@ pub fn refine(
     if options.steps == 0 || views.is_empty() || refiner.predicted.is_empty() {
         return Ok(RefineReport { steps: 0, before: 0.0, after: 0.0 });
     }
-    let before = refiner.held_error(renderer);
-    // Every photograph equally often in a round.
-    let round = ROUND_MIN.div_ceil(views.len()) * views.len();
-    let (mut sum, mut best, mut without_gain) = (0.0, f64::INFINITY, 0);
-    while refiner.steps() < options.steps && without_gain < PATIENCE {
-        sum += refiner.step(renderer).unwrap_or(0.0);
-        let steps = refiner.steps();
-        if progress(steps).is_break() {
+    let before = refiner.error(renderer);
+    while refiner.steps() < options.steps {
+        refiner.step(renderer);
+        if progress(refiner.steps()).is_break() {
             return Err(FitError::Cancelled);
         }
-        if steps.is_multiple_of(round) {
-            // An error that is not a number is no gain.
-            without_gain = if sum < best { 0 } else { without_gain + 1 };
-            best = best.min(sum);
-            sum = 0.0;
-        }
     }
-    let (steps, after) = (refiner.steps(), refiner.held_error(renderer));
+    let (steps, after) = (refiner.steps(), refiner.error(renderer));
+    // An error that is not a number fails the comparison as well.
     if !(after < before) {
         return Ok(RefineReport { steps, before, after: before });
     }
@@ -421,16 +399,6 @@ fn pixel_sizes(splats: &Splats, views: &[FitView<'_>]) -> Vec<f32> {
 fn slices_of<'s>(rows: &'s [f32], gain: &'s [f32], splats: &'s Splats) -> SplatSlices<'s> {
     let sh_degree = splats.sh_degree;
     SplatSlices { geometry: Geometry::Packed(rows), sh: &splats.sh, gain, sh_degree }
-}
-
-/// Of two photographs, the Gaussians of the one that is not `view`; none where a parent's children
-/// would be divided.
-fn other_half(splats: &Splats, views: usize, view: usize) -> Range<usize> {
-    let half = splats.parents() / 2 * splats.children_per_parent();
-    match views == 2 && splats.parents().is_multiple_of(2) {
-        true => (1 - view) * half..(2 - view) * half,
-        false => 0..0,
-    }
 }
 
 /// The Gaussians `range` of `slices`, whole families of packed rows.
@@ -534,19 +502,6 @@ mod tests {
             let mut seen: Vec<usize> = (0..views).map(|s| view_of_step(s, views)).collect();
             seen.sort_unstable();
             assert_eq!(seen, (0..views).collect::<Vec<_>>());
-        }
-    }
-
-    #[test]
-    fn a_sixteenth_of_the_blocks_is_held_back() {
-        for view in 0..3 {
-            let held = (0..64 * 64).filter(|i| is_held_back(view, i % 64, i / 64)).count();
-            assert!((200..320).contains(&held), "view {view}: {held} of 4096 blocks");
-            // No row or column of blocks lacks them.
-            for line in 0..64 {
-                assert!((0..64).any(|i| is_held_back(view, line, i)), "column {line}");
-                assert!((0..64).any(|i| is_held_back(view, i, line)), "row {line}");
-            }
         }
     }
 }

@@ -121,9 +121,6 @@ pub enum Refine {
     Steps(usize),
 }
 
-/// Weight of [`RefineOptions::across`] for two photographs.
-const ACROSS: f32 = 1.0;
-
 impl Refine {
     /// Options of [`crate::refine()`] for a number of photographs.
     pub(crate) fn options(self, photographs: usize) -> RefineOptions {
@@ -132,7 +129,7 @@ impl Refine {
             Self::Off => 0,
             Self::Steps(steps) => steps,
         };
-        RefineOptions::default().with_steps(steps).with_across(ACROSS)
+        RefineOptions::default().with_steps(steps).with_groups(true)
     }
 }
 

@@ -107,7 +107,7 @@ impl Reconstruction {
         self.fit.as_ref()
     }
 
-    /// Errors of the held blocks before and after the refinement; `None` without one.
+    /// Errors before and after the refinement; `None` without one.
     pub fn refinement(&self) -> Option<&RefineReport> {
         self.refinement.as_ref()
     }

@@ -101,7 +101,7 @@ fn a_source_that_shows_something_else_costs_little() {
         let images = Tensor::cat(&[&pair.images, &foreign], 1).unwrap();
         let [a, b] = [e.cameras[0], e.cameras[1]];
         let third = glam::Mat4::from_translation(1.5 * (b.position() - a.position()));
-        let third = Camera::new(*a.intrinsics(), third * *a.world_from_camera()).unwrap();
+        let third = Camera::new(a.intrinsics(), third * a.world_from_camera()).unwrap();
         let planes = vec![vec![pair.near_far[0][0]; 3]];
         let three = Views::new(images, vec![vec![a, b, third]], planes).unwrap();
         for (hits, views) in hits.iter_mut().zip([&pair, &three]) {

@@ -1,5 +1,5 @@
-//! The refinement of Gaussians on pictures: it finds displaced geometry again, holds blocks of
-//! pixels back, and leaves a set alone where it cannot make it better.
+//! The refinement of Gaussians on pictures: it finds displaced geometry again, and leaves a
+//! set alone where it cannot make it better.
 
 use std::ops::ControlFlow;
 use subsplat::abi::{QUAT_OFFSET, SPLAT_STRIDE};
@@ -45,8 +45,7 @@ fn displaced_means_move_back() {
     let mut splats = start.clone();
     let options = RefineOptions::default().with_steps(60);
     let report = refined(&mut splats, &truth, &options);
-    // The held blocks have no loss of their own; their Gaussians reach into other blocks.
-    assert!(report.after < 0.75 * report.before, "{report:?}");
+    assert!(report.after < 0.5 * report.before, "{report:?}");
     let (before, after) = (distance(&start, &sharp), distance(&splats, &sharp));
     assert!(after < 0.8 * before, "{after} of {before}");
     for row in splats.rows().chunks(SPLAT_STRIDE) {
@@ -76,14 +75,6 @@ fn a_set_that_cannot_be_better_stays() {
     assert!(splats == sharp);
 }
 
-#[test]
-fn a_refinement_without_gain_ends_early() {
-    let truth = pictures(&plane(0.6, 0.9));
-    let mut splats = plane(0.6, 0.9);
-    let report = refined(&mut splats, &truth, &RefineOptions::default().with_steps(10_000));
-    assert!(report.steps < 200, "{report:?}");
-}
-
 /// Two planes, one for each camera, the second at a wrong depth. Pictures of both together can be
 /// right only if the second moves; a picture of the second alone says where to.
 #[test]
@@ -103,9 +94,7 @@ fn the_other_photographs_gaussians_are_drawn_alone() {
     let truth = pictures(&plane(0.6, 0.9));
     let change = |across: f32| {
         let mut splats = start.clone();
-        let options = RefineOptions::default().with_steps(40).with_across(across);
-        let mut options = options;
-        options.dssim = 0.0;
+        let options = RefineOptions::default().with_steps(40).with_across(across).with_groups(true);
         refined(&mut splats, &truth, &options);
         let half = splats.len() / 2 * SPLAT_STRIDE;
         let rows = splats.rows()[half..].chunks(SPLAT_STRIDE);

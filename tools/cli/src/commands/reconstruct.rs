@@ -159,8 +159,8 @@ fn print_reconstruction(result: &Reconstruction, printed: usize) {
     if let Some(refinement) = result.refinement() {
         let RefineReport { steps, before, after, .. } = refinement;
         print_line(format!(
-            "{steps} steps of refinement changed the error of the pixels that are held back from \
-             {before:.5} to {after:.5} (--refine off: none)"
+            "{steps} steps of refinement changed the error of photographs drawn from the others' \
+             Gaussians from {before:.5} to {after:.5} (--refine off: none)"
         ));
     }
 }

@@ -317,7 +317,7 @@ impl Done {
             "detail": result.detail() == Detail::Photographs,
             "fit": result.fit().map(|f| json!({ "loss_before": f.before, "loss_after": f.after })),
             "refine": result.refinement().map(
-                |r| json!({ "steps": r.steps, "held_mse_before": r.before, "held_mse_after": r.after })
+                |r| json!({ "steps": r.steps, "error_before": r.before, "error_after": r.after })
             ),
             "gaussians": result.splats().len(),
             "inputs": self.inputs.inputs,
