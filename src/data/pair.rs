@@ -322,9 +322,9 @@ mod tests {
         let row: Vec<Camera> =
             (0..5u8).map(|i| camera(0.0, Vec3::X * 0.2 * f32::from(i))).collect();
         let sources = choose_sources(&row, depths, 2);
-        assert_eq!(sources[2].iter().copied().min(), Some(1));
-        assert_eq!(sources[2].iter().copied().max(), Some(3));
-        assert!(sources[0].contains(&1), "{sources:?}");
+        assert!(sources[2].iter().any(|&j| j < 2) && sources[2].iter().any(|&j| j > 2));
+        // 0.4 of 1.5 overlaps by 87 %, 0.2 by 93 %; 0.6 has less.
+        assert_eq!(sources[0][0], 2, "{sources:?}");
         assert!(sources.iter().enumerate().all(|(i, s)| s.len() == 2 && !s.contains(&i)));
         // A camera at the same place and one that looks away come last.
         let others = vec![row[0], row[0], camera(3.1, Vec3::X * 0.2), row[1]];

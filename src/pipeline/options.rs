@@ -79,7 +79,8 @@ impl Options {
         self
     }
 
-    /// Sets [`Options::fit`]; [`FitOptions::off`] keeps the network's Gaussians.
+    /// Sets [`Options::fit`]; [`FitOptions::off`] keeps the network's Gaussians, unless
+    /// [`Options::refine`] names a number of steps.
     #[must_use]
     pub fn with_fit(mut self, fit: FitOptions) -> Self {
         self.fit = fit;
@@ -91,6 +92,14 @@ impl Options {
     pub fn with_refine(mut self, refine: Refine) -> Self {
         self.refine = refine;
         self
+    }
+
+    /// Options of the refinement for a number of photographs.
+    pub(super) fn refine_options(&self, photographs: usize) -> RefineOptions {
+        match (self.refine, self.fit.steps) {
+            (Refine::Auto, 0) => Refine::Off.options(photographs),
+            (refine, _) => refine.options(photographs),
+        }
     }
 
     /// The depth range before any photograph is read: [`Options::depth_range`], then
@@ -112,7 +121,7 @@ impl Options {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Refine {
-    /// Eight steps a photograph, 64 at most.
+    /// Eight steps a photograph, 64 at most; none where [`Options::fit`] is off.
     #[default]
     Auto,
     /// None.

@@ -283,7 +283,7 @@ impl Reconstructor {
             // A step draws one photograph instead of all.
             (
                 Stage::Refine,
-                FIT_STEP * options.refine.options(photos).steps as f32 / n * pixels * children,
+                FIT_STEP * options.refine_options(photos).steps as f32 / n * pixels * children,
             ),
         ];
         costs.map(|(stage, cost)| StageCost { stage, cost }).to_vec()

@@ -26,7 +26,7 @@ fn quick() -> Options {
     Options::default().with_input_size(96, 96)
 }
 
-const STAGES: [Stage; 8] = [
+const STAGES: [Stage; 9] = [
     Stage::Crop,
     Stage::Check,
     Stage::DepthRange,
@@ -35,6 +35,7 @@ const STAGES: [Stage; 8] = [
     Stage::Subsplat,
     Stage::Detail,
     Stage::Fit,
+    Stage::Refine,
 ];
 
 #[test]
