@@ -94,11 +94,12 @@ impl Options {
         self
     }
 
-    /// Options of the refinement for a number of photographs.
-    pub(super) fn refine_options(&self, photographs: usize) -> RefineOptions {
-        match (self.refine, self.fit.steps) {
-            (Refine::Auto, 0) => Refine::Off.options(photographs),
-            (refine, _) => refine.options(photographs),
+    /// Options of the refinement for a number of photographs and of Gaussians.
+    pub(super) fn refine_options(&self, photographs: usize, gaussians: usize) -> RefineOptions {
+        let none = self.fit.steps == 0 || gaussians > AUTO_GAUSSIANS_MAX;
+        match self.refine {
+            Refine::Auto if none => Refine::Off.options(photographs),
+            refine => refine.options(photographs),
         }
     }
 
@@ -121,7 +122,8 @@ impl Options {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Refine {
-    /// Eight steps a photograph, 64 at most; none where [`Options::fit`] is off.
+    /// Eight steps a photograph, 64 at most; none where [`Options::fit`] is off, and none of more
+    /// than 1.5 million Gaussians, for which a refinement takes more memory than the network.
     #[default]
     Auto,
     /// None.
@@ -129,6 +131,10 @@ pub enum Refine {
     /// At most this number of steps.
     Steps(usize),
 }
+
+/// Most Gaussians that [`Refine::Auto`] refines. The buffers of a refinement of two
+/// photographs take 322 bytes a Gaussian.
+const AUTO_GAUSSIANS_MAX: usize = 3 << 19;
 
 impl Refine {
     /// Options of [`crate::refine()`] for a number of photographs.

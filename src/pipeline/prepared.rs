@@ -111,7 +111,8 @@ impl Prepared<'_> {
         let colour = Rgb::mean_colour(inputs.iter().map(|c| &c.input));
         let raster_options = config.raster_options(config.upscale as f32, bounds.near, colour);
         let (mut fit, mut refinement) = (None, None);
-        let (fit_options, refine_options) = (&options.fit, options.refine_options(inputs.len()));
+        let (fit_options, refine_options) =
+            (&options.fit, options.refine_options(inputs.len(), splats.len()));
         let mut renderer = Renderer::new(model.backend());
         if fit_options.steps > 0 {
             tracker.begin(Stage::Fit, progress)?;

@@ -269,6 +269,7 @@ impl Reconstructor {
         let pixels = n * w as f32 * h as f32 / (2.0 * 256.0 * 256.0);
         let mvsplat = is_mvsplat(self.config());
         let estimates = self.estimates_depth_range(options);
+        let gaussians = photos * w * h * self.config().upscale.pow(2);
         let children = (self.config().upscale * self.config().upscale) as f32 / 4.0;
         let aggregates = self.config().agg.enabled;
         let costs = [
@@ -283,7 +284,9 @@ impl Reconstructor {
             // A step draws one photograph instead of all.
             (
                 Stage::Refine,
-                FIT_STEP * options.refine_options(photos).steps as f32 / n * pixels * children,
+                FIT_STEP * options.refine_options(photos, gaussians).steps as f32 / n
+                    * pixels
+                    * children,
             ),
         ];
         costs.map(|(stage, cost)| StageCost { stage, cost }).to_vec()
