@@ -117,7 +117,8 @@ fn a_source_that_shows_something_else_costs_little() {
     }
     let [alone, three] = hits.map(|h| h as f32 / all as f32);
     println!("within 15 %: {alone:.3}; with a source of something else {three:.3}");
-    assert!(three > 0.65 * alone, "{three} of {alone}");
+    // 0.72 with sources weighed by their match, 0.68 with equal weights.
+    assert!(three > 0.7 * alone, "{three} of {alone}");
 }
 
 #[test]
