@@ -1,9 +1,9 @@
 //! Refines Gaussians on the photographs that they were made from: means, rotations, scales,
 //! opacities and colour offsets, by gradient steps through the rasterizer.
 //!
-//! [`crate::fit()`] changes sizes, opacities and colours alone and ends after four steps, because
-//! two photographs do not determine more. Three and more do: each photograph shows surfaces whose
-//! depth the others predict. The method is the optimisation of *3D Gaussian Splatting for
+//! [`crate::fit()`] changes sizes, opacities and colours alone and ends after four steps. A
+//! refinement changes the geometry too: each photograph shows surfaces whose depth the others
+//! predict. The method is the optimisation of *3D Gaussian Splatting for
 //! Real-Time Radiance Field Rendering* (Kerbl et al. 2023), from the network's Gaussians instead
 //! of sparse points, hence some dozens of steps instead of 30,000. SH coefficients stay.
 //!
@@ -284,16 +284,18 @@ impl<'a> Refiner<'a> {
     pub fn error(&self, renderer: &mut Renderer) -> f64 {
         let mut sum = 0.0;
         for (view, target) in self.targets.iter().enumerate() {
-            let mut rows = self.rows.clone();
-            if let Some(group) = self.group(view) {
-                let own = &mut rows[group.start * SPLAT_STRIDE..group.end * SPLAT_STRIDE];
-                own.chunks_exact_mut(SPLAT_STRIDE).for_each(|row| row[OPACITY_OFFSET] = 0.0);
-            }
-            let slices = slices_of(&rows, &self.gain, self.predicted);
-            let planes = renderer.render_planes(&slices, target.camera, &self.raster);
+            let mut draw = |rows: &[f32]| {
+                let slices = slices_of(rows, &self.gain, self.predicted);
+                renderer.render_planes(&slices, target.camera, &self.raster)
+            };
             sum += match self.group(view) {
-                Some(_) => error_where_covered(target, &planes),
-                None => mse(&planes[..target.truth.len()], &target.truth).value,
+                Some(group) => {
+                    let mut rows = self.rows.clone();
+                    let own = &mut rows[group.start * SPLAT_STRIDE..group.end * SPLAT_STRIDE];
+                    own.chunks_exact_mut(SPLAT_STRIDE).for_each(|row| row[OPACITY_OFFSET] = 0.0);
+                    error_where_covered(target, &draw(&rows))
+                }
+                None => mse(&draw(&self.rows)[..target.truth.len()], &target.truth).value,
             };
         }
         sum / self.targets.len().max(1) as f64
