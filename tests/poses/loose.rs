@@ -21,8 +21,7 @@ fn photographs_in_memory_get_the_cameras_of_their_files() {
         .collect();
     let photographs: Vec<_> =
         files.iter().map(|file| load_photograph(file, &LoadOptions::default()).unwrap()).collect();
-    let mut options = LooseOptions::default();
-    options.lens = Some(KnownLens::FovX(1.1));
+    let options = LooseOptions { lens: Some(KnownLens::FovX(1.1)), ..LooseOptions::default() };
 
     let scene = loose_scene(folder.path(), &files, &options, &mut |_| Ok(())).unwrap();
     let memory = loose_photos(photographs.clone(), &options).unwrap();
