@@ -30,11 +30,14 @@
 //! use subsplat::{Bounds, RasterOptions, Rgb, load_splats, render, save_png};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
-//! # let file = |end| std::env::temp_dir().join(format!("subsplat-doc-{}.{end}", std::process::id()));
+//! # use subsplat::{SaveOptions, ShBasis, Splats, save_splats};
+//! # let folder = std::env::temp_dir();
+//! # let file = |end| folder.join(format!("subsplat-doc-{}.{end}", std::process::id()));
 //! # let (room_ply, view_png) = (&file("view.ply"), &file("view.png"));
-//! # let row = vec![0.1, 0.2, 3.0, 1.0, 0.0, 0.0, 0.0, 0.5, 0.5, 0.5, 0.9];
-//! # let one = subsplat::Splats::new(row, vec![0.5; 3], vec![], 0, subsplat::ShBasis::default())?;
-//! # subsplat::save_splats(room_ply, &one, &subsplat::SaveOptions::default())?;
+//! # let row = |x| [x, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.5, 0.5, 0.5, 0.9];
+//! # let rows = [-1.0, -0.5, 0.5, 1.0].map(row).concat();
+//! # let four = Splats::new(rows, vec![0.5; 12], vec![], 0, ShBasis::default())?;
+//! # save_splats(room_ply, &four, &SaveOptions::default())?;
 //! let splats = load_splats(room_ply)?;
 //! let bounds = Bounds::of(splats.means()).ok_or("the file holds no Gaussian")?;
 //! let camera = bounds.camera(60f32.to_radians(), 512)?; // 512x512 pixels, along the world's +z
