@@ -25,7 +25,7 @@
 //!    photograph is cropped to it and to the target size.
 //! 3. Points are matched between consecutive photographs. They check the poses ([`Check`]),
 //!    their depths replace a range that was only guessed, and their colours bring the
-//!    photographs to the exposure of the first.
+//!    photographs to the exposure of the one of middle brightness.
 //! 4. The small backbone estimates near and far at half size, unless the caller fixed one.
 //! 5. The network predicts one primary Gaussian per input pixel, then its children.
 //! 6. The photographs add detail to the children's colours ([`Detail`]).

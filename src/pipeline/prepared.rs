@@ -10,6 +10,7 @@ use crate::check::PairReport;
 use crate::data::crop::Cropped;
 use crate::io::image::{Depth, Rgb};
 use crate::model::Views;
+use crate::refine::Refiner;
 use crate::render::Renderer;
 use std::ops::ControlFlow;
 
@@ -116,18 +117,19 @@ impl Prepared<'_> {
         let mut renderer = Renderer::new(model.backend());
         if fit_options.steps > 0 {
             tracker.begin(Stage::Fit, progress)?;
-            let mut stepped = tracker.steps(fit_options.steps, progress);
+            let mut part = tracker.parts(progress);
+            let mut step = |step| part(step as f32 / fit_options.steps as f32);
             let (raster, how) = (&raster_options, fit_options);
-            let done =
-                fit_to_inputs(&mut splats, &inputs, raster, how, &mut renderer, &mut stepped)?;
+            let done = fit_to_inputs(&mut splats, &inputs, raster, how, &mut renderer, &mut step)?;
             fit = Some(done);
         }
         if refine_options.steps > 0 {
             tracker.begin(Stage::Refine, progress)?;
-            let mut stepped = tracker.steps(refine_options.steps, progress);
+            let mut part = tracker.parts(progress);
+            let mut step = |refiner: &Refiner<'_>| part(refiner.progress());
             let (raster, how) = (&raster_options, &refine_options);
             let done =
-                refine_on_inputs(&mut splats, &inputs, raster, how, &mut renderer, &mut stepped)?;
+                refine_on_inputs(&mut splats, &inputs, raster, how, &mut renderer, &mut step)?;
             refinement = Some(done);
         }
         warnings.extend(renderer.take_warning().map(|reason| Warning::CpuInsteadOfGpu { reason }));

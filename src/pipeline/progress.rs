@@ -122,13 +122,12 @@ impl Tracker {
         self.advance(0.0, callback)
     }
 
-    /// A callback for the current stage that receives the number of steps done of `steps`.
-    pub(super) fn steps<'a>(
+    /// A callback for the current stage that receives the part of it that is done, 0 to 1.
+    pub(super) fn parts<'a>(
         &'a mut self,
-        steps: usize,
         callback: &'a mut Callback<'_>,
-    ) -> impl FnMut(usize) -> ControlFlow<()> + 'a {
-        move |step| match self.advance(step as f32 / steps as f32, callback) {
+    ) -> impl FnMut(f32) -> ControlFlow<()> + 'a {
+        move |part| match self.advance(part, callback) {
             Ok(()) => ControlFlow::Continue(()),
             Err(_) => ControlFlow::Break(()),
         }

@@ -1,6 +1,6 @@
 //! A reconstructed scene.
 
-use super::{DepthBounds, Detail, Result, StageTime, Warning};
+use super::{DepthBounds, Detail, Refine, Result, StageTime, Warning, refine_on_inputs};
 use crate::abi::RasterOptions;
 use crate::camera::Camera;
 use crate::check::PairReport;
@@ -8,9 +8,10 @@ use crate::data::crop::Cropped;
 use crate::fit::FitReport;
 use crate::io::image::Depth;
 use crate::io::{SaveOptions, SaveReport, save_splats};
-use crate::refine::RefineReport;
-use crate::render::{Picture, comment_of_options, render};
+use crate::refine::{RefineReport, Refiner};
+use crate::render::{Picture, Renderer, comment_of_options, render};
 use crate::splats::Splats;
+use std::ops::ControlFlow;
 use std::path::Path;
 
 /// A reconstructed scene: Gaussians, the rules to render them, and a record of how they were
@@ -57,6 +58,26 @@ impl Reconstruction {
     #[cfg_attr(not(feature = "internals"), doc(hidden))]
     pub fn splats_mut(&mut self) -> &mut Splats {
         &mut self.splats
+    }
+
+    /// Refines the Gaussians on the photographs, as [`Options::refine`](super::Options::refine) does
+    /// within a run, for a caller that shows the scene first. `progress` receives the refinement
+    /// after each step; [`Refiner::splats`] returns the Gaussians so far.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](super::Error::Cancelled); the Gaussians are then unchanged.
+    pub fn refine(
+        &mut self,
+        refine: Refine,
+        renderer: &mut Renderer,
+        progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
+    ) -> Result<RefineReport> {
+        let Self { splats, inputs, raster_options, fit, .. } = self;
+        let options = refine.options_for(inputs.len(), splats.len(), fit.is_some());
+        let report =
+            refine_on_inputs(splats, inputs, raster_options, &options, renderer, progress)?;
+        self.refinement = Some(report);
+        Ok(report)
     }
 
     /// The Gaussians alone.

@@ -4,7 +4,8 @@ use super::progress::{Callback, StageCost, Tracker};
 use super::warning::Warning;
 use super::{
     Check, DepthBounds, DepthRange, DepthSource, Detail, Options, Photo, Prepared, Progress,
-    Reconstruction, Result, Stage, check_pairs, exposure, is_mvsplat, poses, refined_bounds,
+    Reconstruction, Refine, Result, Stage, check_pairs, exposure, is_mvsplat, poses,
+    refined_bounds,
 };
 use crate::camera::{Camera, NearFar};
 use crate::config::{Config, Preset};
@@ -272,6 +273,11 @@ impl Reconstructor {
         let gaussians = photos * w * h * self.config().upscale.pow(2);
         let children = (self.config().upscale * self.config().upscale) as f32 / 4.0;
         let aggregates = self.config().agg.enabled;
+        let refinement = match options.refine {
+            // The number of steps in a second is not known.
+            Refine::Seconds(seconds) => 10.0 * seconds as f32,
+            _ => options.refine_options(photos, gaussians).steps as f32,
+        };
         let costs = [
             (Stage::Crop, 0.015 * n),
             (Stage::Check, if options.check == Check::Off { 0.0 } else { 0.15 * (n - 1.0) }),
@@ -282,12 +288,7 @@ impl Reconstructor {
             (Stage::Detail, if options.detail == Detail::Off { 0.0 } else { 0.01 * pixels }),
             (Stage::Fit, FIT_STEP * options.fit.steps as f32 * pixels * children),
             // A step draws one photograph instead of all.
-            (
-                Stage::Refine,
-                FIT_STEP * options.refine_options(photos, gaussians).steps as f32 / n
-                    * pixels
-                    * children,
-            ),
+            (Stage::Refine, FIT_STEP * refinement / n * pixels * children),
         ];
         costs.map(|(stage, cost)| StageCost { stage, cost }).to_vec()
     }

@@ -319,8 +319,9 @@ pub struct SourceArgs {
     #[arg(long, value_name = "STEPS", default_value_t = FitOptions::default().steps)]
     pub fit: usize,
     /// Refinement of the Gaussians on the photographs, after the fit: means, shapes, opacities and
-    /// colours. `auto`: eight steps a photograph, 64 at most, none with `--fit 0` and of more than 1.5 million Gaussians; `off`; or the number of steps.
-    #[arg(long, value_name = "auto | off | STEPS", default_value = "auto", value_parser = values::refine)]
+    /// colours. `auto`: eight steps a photograph, 64 at most, none with `--fit 0` and of more than 1.5 million Gaussians; `off`; the number of
+    /// steps; or a time in seconds, such as `20s`. The steps end earlier where they no longer help.
+    #[arg(long, value_name = "auto | off | STEPS | SECONDSs", default_value = "auto", value_parser = values::refine)]
     pub refine: Refine,
     /// The model.
     #[command(flatten)]

@@ -157,10 +157,14 @@ fn print_reconstruction(result: &Reconstruction, printed: usize) {
         ));
     }
     if let Some(refinement) = result.refinement() {
-        let RefineReport { steps, before, after, .. } = refinement;
+        let RefineReport { steps, before, after, removed, .. } = refinement;
+        let removed = match removed {
+            0 => String::new(),
+            n => format!("; {n} Gaussians that the photographs hardly show were removed"),
+        };
         print_line(format!(
             "{steps} steps of refinement changed the error of photographs drawn from the others' \
-             Gaussians from {before:.5} to {after:.5} (--refine off: none)"
+             Gaussians from {before:.5} to {after:.5} (--refine off: none){removed}"
         ));
     }
 }

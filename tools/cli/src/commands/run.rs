@@ -317,7 +317,12 @@ impl Done {
             "detail": result.detail() == Detail::Photographs,
             "fit": result.fit().map(|f| json!({ "loss_before": f.before, "loss_after": f.after })),
             "refine": result.refinement().map(
-                |r| json!({ "steps": r.steps, "error_before": r.before, "error_after": r.after })
+                |r| json!({
+                    "steps": r.steps,
+                    "error_before": r.before,
+                    "error_after": r.after,
+                    "removed": r.removed,
+                })
             ),
             "gaussians": result.splats().len(),
             "inputs": self.inputs.inputs,

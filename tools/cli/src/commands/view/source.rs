@@ -8,12 +8,16 @@ use crate::report::{Progress, print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
 use std::ops::ControlFlow;
 use std::path::Path;
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
 use subsplat::abi::RasterOptions;
 use subsplat::io::{SplatFormat, load_with_comments};
 use subsplat::navigation::{Start, up_of};
 use subsplat::splats::Splats;
-use subsplat::{Check, Options, Photo, Reconstruction, Reconstructor};
+use subsplat::{Check, Options, Photo, Reconstruction, Reconstructor, Refine, Refiner, Renderer};
 
+/// Least time between two pictures of a refinement.
+const SHOWN_EVERY: Duration = Duration::from_millis(400);
 /// Highest SH degree of a finished scene.
 const SH_DEGREE: usize = 4;
 
@@ -42,6 +46,17 @@ pub struct Photographs {
     options: Options,
     /// Width and height of the network's input, px.
     input_size: (usize, usize),
+    /// The refinement that goes on while the window shows the scene.
+    refine: Refine,
+    /// The first reconstruction, until it is refined.
+    first: Mutex<Option<Unrefined>>,
+}
+
+/// A reconstruction with the rules to render it and its r.
+struct Unrefined {
+    result: Reconstruction,
+    options: RasterOptions,
+    upscale: usize,
 }
 
 /// Loads or reconstructs the scene of the arguments.
@@ -105,12 +120,16 @@ fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     let model = progress.stage("model", |_| load_model(args, args.source.upscale))?;
     let (size, sides) = reconstruct::input_size(&args.source, &model, &scene, &context)?;
     options.input_size = size;
+    // The window shows the scene while it is refined. A fixed number of frames shows the result.
+    let refine = match args.frames {
+        None => std::mem::replace(&mut options.refine, Refine::Off),
+        Some(_) => Refine::Off,
+    };
     let photos = run::photographs(&scene, &context, args.source.pair.force, progress)?;
     let result = reconstruct(&model, photos.as_slice(), &options, progress)?;
     // Later calls use the depth range of this check.
     let prior = result.initial_depth_range().clone();
     let options = options.with_depth_prior(prior).with_check(Check::Off);
-    let photographs = Photographs { args: args.clone(), photos, options, input_size: sides };
     let cameras: Vec<_> = scene.frames.iter().map(|f| f.camera).collect();
     let (Some(input), Some(depth)) = (result.inputs().first(), result.depths().first()) else {
         bail!("{}: expected photographs, got none", scene.name)
@@ -121,7 +140,19 @@ fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
         distance: run::median(&depth.data),
         radius: render::bounds(result.splats())?.radius(),
     };
-    let made = photographs.made(&model, result);
+    let photographs = Photographs {
+        args: args.clone(),
+        photos,
+        options,
+        input_size: sides,
+        refine,
+        first: Mutex::default(),
+    };
+    let first = photographs.unrefined(&model, result);
+    let made = first.made(first.result.splats().clone());
+    if refine != Refine::Off {
+        *photographs.first.lock().unwrap_or_else(PoisonError::into_inner) = Some(first);
+    }
     Ok(Source { name: scene.name, start, made, photographs: Some(photographs) })
 }
 
@@ -131,23 +162,76 @@ fn load_model(args: &ViewArgs, upscale: Option<usize>) -> Result<Reconstructor> 
 }
 
 impl Photographs {
-    /// Reconstructs the same scene with r×r children per pixel. `begin` receives the name of
-    /// each stage.
-    pub fn make(&self, upscale: usize, begin: &mut dyn FnMut(&'static str)) -> Result<Made> {
-        begin("model");
-        let model = load_model(&self.args, Some(upscale))?;
-        memory::check_run(model.config(), self.photos.len(), self.input_size)?;
-        let mut progress = |progress: subsplat::Progress| {
-            begin(progress.stage.name());
-            ControlFlow::Continue(())
-        };
-        let result = model.run_with(&self.photos, &self.options, &mut progress)?;
-        Ok(self.made(&model, result))
+    /// Returns whether the first reconstruction waits for its refinement.
+    pub fn is_unrefined(&self) -> bool {
+        self.first.lock().unwrap_or_else(PoisonError::into_inner).is_some()
     }
 
-    fn made(&self, model: &Reconstructor, result: Reconstruction) -> Made {
+    /// Reconstructs the same scene with r×r children per pixel, and refines it. The first
+    /// reconstruction is refined only. `begin` receives the name of each stage, and `show` the
+    /// splats, again and again until they are refined.
+    pub fn make(
+        &self,
+        upscale: usize,
+        begin: &mut dyn FnMut(&'static str),
+        show: &mut dyn FnMut(Made) -> Result<()>,
+    ) -> Result<()> {
+        let first = self.first.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let made = match first.filter(|f| f.upscale == upscale) {
+            Some(first) => first,
+            None => {
+                begin("model");
+                let model = load_model(&self.args, Some(upscale))?;
+                memory::check_run(model.config(), self.photos.len(), self.input_size)?;
+                let mut progress = |progress: subsplat::Progress| {
+                    begin(progress.stage.name());
+                    ControlFlow::Continue(())
+                };
+                let result = model.run_with(&self.photos, &self.options, &mut progress)?;
+                let made = self.unrefined(&model, result);
+                show(made.made(made.result.splats().clone()))?;
+                made
+            }
+        };
+        if self.refine == Refine::Off {
+            return Ok(());
+        }
+        begin("refine");
+        made.refine(self.refine, show)
+    }
+
+    fn unrefined(&self, model: &Reconstructor, result: Reconstruction) -> Unrefined {
         let config = model.config();
         let options = run::raster_options(&self.args.rendering(), config, &result);
-        Made { splats: result.into_splats(), options, upscale: Some(config.upscale) }
+        Unrefined { result, options, upscale: config.upscale }
+    }
+}
+
+impl Unrefined {
+    /// `splats` with the rules of this scene.
+    fn made(&self, splats: Splats) -> Made {
+        Made { splats, options: self.options, upscale: Some(self.upscale) }
+    }
+
+    fn refine(mut self, refine: Refine, show: &mut dyn FnMut(Made) -> Result<()>) -> Result<()> {
+        let (options, upscale) = (self.options, Some(self.upscale));
+        let (mut shown, mut failure) = (Instant::now(), None);
+        let mut progress = |refiner: &Refiner<'_>| {
+            if shown.elapsed() >= SHOWN_EVERY {
+                failure = show(Made { splats: refiner.splats(), options, upscale }).err();
+                shown = Instant::now();
+            }
+            match failure {
+                Some(_) => ControlFlow::Break(()),
+                None => ControlFlow::Continue(()),
+            }
+        };
+        let refined = self.result.refine(refine, &mut Renderer::default(), &mut progress);
+        if let Some(failure) = failure {
+            return Err(failure);
+        }
+        refined?;
+        let splats = self.result.splats().clone();
+        show(self.made(splats))
     }
 }
