@@ -192,12 +192,12 @@ pub use ops::{SplatTensors, rasterize_splats as rasterize};
 #[cfg(feature = "network")]
 pub use pipeline::{
     Check, DepthBounds, DepthRange, DepthSource, Detail, Error, InputSize, KnownLens, LensSource,
-    LooseOptions, LooseScene, Options, Photo, PoseError, Prepared, Progress, Reconstruction,
+    LooseOptions, LooseScene, Options, Photo, PoseError, Poses, Prepared, Progress, Reconstruction,
     Reconstructor, Refine, Result, Stage, StageTime, Warning, loose_scene,
 };
 pub use poses::{
-    Confidence, FocalEstimate, LeftOut, Lens, PoseEstimate, PoseOptions, PosePhoto, PosePhotoError,
-    PosePoint, PoseRefusal, PoseWarning, estimate_poses,
+    Confidence, FocalEstimate, LeftOut, Lens, PoseAdjustment, PoseEstimate, PoseOptions, PosePhoto,
+    PosePhotoError, PosePoint, PoseRefusal, PoseWarning, adjust_poses, estimate_poses,
 };
 pub use refine::{RefineOptions, RefineReport, Refiner, refine};
 pub use render::{Picture, Renderer, render};

@@ -19,6 +19,7 @@
 //!
 //! The stages ([`Stage`]), in order:
 //!
+//! 0. With [`Poses::Adjusted`], the cameras are adjusted by points matched between photographs.
 //! 1. The initial depth range comes from [`Options::depth_range`], then from
 //!    [`Options::depth_prior`], then from the distance between the cameras.
 //! 2. The size of the network's input follows from the photographs' shapes ([`InputSize`]). Each
@@ -56,7 +57,7 @@ pub use depth_range::{DepthBounds, DepthRange, DepthSource};
 pub use error::{Error, Result};
 pub use input_size::InputSize;
 pub use loose::{KnownLens, LensSource, LooseOptions, LooseScene, loose_scene};
-pub use options::{Check, Detail, Options, Refine};
+pub use options::{Check, Detail, Options, Poses, Refine};
 pub use photo::Photo;
 pub use poses::PoseError;
 pub use prepared::Prepared;

@@ -27,6 +27,8 @@ pub struct Options {
     /// Depth range that a file suggests, used for the ends that `depth_range` leaves open.
     /// Default: none.
     pub depth_prior: Option<DepthBounds>,
+    /// Cameras that the network receives. Default: [`Poses::Given`].
+    pub poses: Poses,
     /// Check of the poses by matched points. Default: [`Check::Warn`].
     pub check: Check,
     /// Source of colour detail. Default: [`Detail::Photographs`].
@@ -63,6 +65,13 @@ impl Options {
     #[must_use]
     pub fn with_depth_prior(mut self, prior: impl Into<Option<DepthBounds>>) -> Self {
         self.depth_prior = prior.into();
+        self
+    }
+
+    /// Sets [`Options::poses`].
+    #[must_use]
+    pub fn with_poses(mut self, poses: Poses) -> Self {
+        self.poses = poses;
         self
     }
 
@@ -160,6 +169,18 @@ impl Refine {
             Self::Seconds(seconds) => options.with_time(Duration::from_secs(seconds.into())),
         }
     }
+}
+
+/// Cameras that the network receives.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Poses {
+    /// Those of the photographs.
+    #[default]
+    Given,
+    /// Those of the photographs after [`crate::adjust_poses`], for cameras that are nearly right,
+    /// such as a headset's. Cameras that fit the photographs stay.
+    Adjusted,
 }
 
 /// Check of the poses by points matched between consecutive photographs ([`crate::check`]).

@@ -10,6 +10,7 @@ use crate::check::PairReport;
 use crate::data::crop::Cropped;
 use crate::io::image::{Depth, Rgb};
 use crate::model::Views;
+use crate::poses::PoseAdjustment;
 use crate::refine::Refiner;
 use crate::render::Renderer;
 use std::ops::ControlFlow;
@@ -23,6 +24,7 @@ pub struct Prepared<'a> {
     pub(super) model: &'a Reconstructor,
     pub(super) options: Options,
     pub(super) inputs: Vec<Cropped>,
+    pub(super) adjustment: Option<PoseAdjustment>,
     pub(super) cut_shares: Vec<f32>,
     pub(super) bounds: DepthBounds,
     pub(super) reports: Vec<PairReport>,
@@ -34,6 +36,12 @@ impl Prepared<'_> {
     /// The photographs at the sizes of the network's input and of the target.
     pub fn inputs(&self) -> &[Cropped] {
         &self.inputs
+    }
+
+    /// Change of the given cameras ([`Poses::Adjusted`](super::Poses::Adjusted)); `None` where they
+    /// stayed.
+    pub fn pose_adjustment(&self) -> Option<&PoseAdjustment> {
+        self.adjustment.as_ref()
     }
 
     /// Share of each photograph that its crop does not show, 0 to 1.
@@ -73,8 +81,8 @@ impl Prepared<'_> {
         self,
         progress: &mut dyn FnMut(Progress) -> ControlFlow<()>,
     ) -> Result<Reconstruction> {
-        let Self { model, options, inputs, cut_shares, bounds, reports, mut warnings, mut tracker } =
-            self;
+        let Self { model, options, inputs, adjustment, cut_shares, bounds, reports, .. } = self;
+        let (mut warnings, mut tracker) = (self.warnings, self.tracker);
         if model.estimates_depth_range(&options) {
             tracker.begin(Stage::DepthRange, progress)?;
         }
@@ -140,6 +148,7 @@ impl Prepared<'_> {
         Ok(Reconstruction {
             splats,
             inputs,
+            adjustment,
             cut_shares,
             depths,
             bounds,

@@ -12,6 +12,8 @@ use std::time::Instant;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[non_exhaustive]
 pub enum Stage {
+    /// Given cameras are adjusted by matched points.
+    Poses,
     /// Photographs are cropped and resized.
     Crop,
     /// Points are matched between photographs.
@@ -36,6 +38,7 @@ impl Stage {
     /// The name in reports: `crop`, `depth range`, ….
     pub fn name(self) -> &'static str {
         match self {
+            Self::Poses => "poses",
             Self::Crop => "crop",
             Self::Check => "check",
             Self::DepthRange => "depth range",

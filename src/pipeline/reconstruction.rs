@@ -8,6 +8,7 @@ use crate::data::crop::Cropped;
 use crate::fit::FitReport;
 use crate::io::image::Depth;
 use crate::io::{SaveOptions, SaveReport, save_splats};
+use crate::poses::PoseAdjustment;
 use crate::refine::{RefineReport, Refiner};
 use crate::render::{Picture, Renderer, comment_of_options, render};
 use crate::splats::Splats;
@@ -20,6 +21,7 @@ use std::path::Path;
 pub struct Reconstruction {
     pub(super) splats: Splats,
     pub(super) inputs: Vec<Cropped>,
+    pub(super) adjustment: Option<PoseAdjustment>,
     pub(super) cut_shares: Vec<f32>,
     pub(super) depths: Vec<Depth>,
     pub(super) bounds: DepthBounds,
@@ -88,6 +90,12 @@ impl Reconstruction {
     /// The photographs at the sizes of the network's input and of the target.
     pub fn inputs(&self) -> &[Cropped] {
         &self.inputs
+    }
+
+    /// Change of the given cameras ([`Poses::Adjusted`](super::Poses::Adjusted)); `None` where they
+    /// stayed. [`Reconstruction::inputs`] has the adjusted ones.
+    pub fn pose_adjustment(&self) -> Option<&PoseAdjustment> {
+        self.adjustment.as_ref()
     }
 
     /// Share of each photograph that its crop does not show, 0 to 1.

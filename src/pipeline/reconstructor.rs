@@ -3,7 +3,7 @@
 use super::progress::{Callback, StageCost, Tracker};
 use super::warning::Warning;
 use super::{
-    Check, DepthBounds, DepthRange, DepthSource, Detail, Options, Photo, Prepared, Progress,
+    Check, DepthBounds, DepthRange, DepthSource, Detail, Options, Photo, Poses, Prepared, Progress,
     Reconstruction, Refine, Result, Stage, check_pairs, exposure, is_mvsplat, poses,
     refined_bounds,
 };
@@ -163,11 +163,19 @@ impl Reconstructor {
         options: &Options,
         progress: &mut dyn FnMut(Progress) -> ControlFlow<()>,
     ) -> Result<Prepared<'_>> {
-        let cameras: Vec<Camera> = photos.iter().map(|p| *p.camera()).collect();
-        let guess = options.initial_depth_range(&cameras)?;
         let sizes: Vec<_> = photos.iter().map(|p| (p.image().width, p.image().height)).collect();
         let crop = self.crop_options(options.input_size.resolve(&sizes, self.config().stride()));
         let mut tracker = Tracker::new(self.stage_costs(photos.len(), crop.input_size, options));
+        let (mut adjusted, mut adjustment) = (Vec::new(), None);
+        if options.poses == Poses::Adjusted {
+            tracker.begin(Stage::Poses, progress)?;
+            if let Some((moved, found)) = poses::adjusted(photos)? {
+                (adjusted, adjustment) = (moved, Some(found));
+            }
+        }
+        let photos = if adjusted.is_empty() { photos } else { &adjusted };
+        let cameras: Vec<Camera> = photos.iter().map(|p| *p.camera()).collect();
+        let guess = options.initial_depth_range(&cameras)?;
         let mut inputs = crop_all(photos, &crop, &mut tracker, progress)?;
         let reports = match options.check {
             Check::Off => Vec::new(),
@@ -196,6 +204,7 @@ impl Reconstructor {
             model: self,
             options,
             inputs,
+            adjustment,
             cut_shares,
             bounds,
             reports,
@@ -279,6 +288,7 @@ impl Reconstructor {
             _ => options.refine_options(photos, gaussians).steps as f32,
         };
         let costs = [
+            (Stage::Poses, if options.poses == Poses::Adjusted { 0.3 * n } else { 0.0 }),
             (Stage::Crop, 0.015 * n),
             (Stage::Check, if options.check == Check::Off { 0.0 } else { 0.15 * (n - 1.0) }),
             (Stage::DepthRange, if estimates { 0.03 * pixels } else { 0.0 }),

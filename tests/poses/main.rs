@@ -1,5 +1,6 @@
 //! Tests of poses from photographs alone: pairs, many photographs, and what must be refused.
 
+mod adjusted;
 mod many;
 mod pairs;
 mod refused;

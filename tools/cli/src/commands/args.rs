@@ -311,6 +311,10 @@ pub struct SourceArgs {
     /// Do not match points between the context photographs (check of poses, depth range).
     #[arg(long)]
     pub no_check: bool,
+    /// Adjust the given cameras by points matched between the photographs, for poses that are nearly
+    /// right, such as a headset's.
+    #[arg(long)]
+    pub adjust_poses: bool,
     /// Colour detail from photographs that are larger than the network's input.
     #[arg(long, value_enum, default_value = "photo")]
     pub detail: DetailArg,
