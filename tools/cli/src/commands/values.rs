@@ -140,6 +140,17 @@ mod tests {
     use super::*;
 
     #[test]
+    fn lengths_of_a_refinement() {
+        assert_eq!(refine("auto"), Ok(Refine::Auto));
+        assert_eq!(refine(" off"), Ok(Refine::Off));
+        assert_eq!(refine("40"), Ok(Refine::Steps(40)));
+        assert_eq!(refine("20s"), Ok(Refine::Seconds(20)));
+        for bad in ["", "s", "0s", "-3", "1.5s", "100001", "86401s", "fast"] {
+            assert!(refine(bad).unwrap_err().starts_with("expected auto, off, steps or 20s"), "{bad}");
+        }
+    }
+
+    #[test]
     fn sizes() {
         assert_eq!(size("256"), Ok((256, 256)));
         assert_eq!(size("320x192"), Ok((320, 192)));

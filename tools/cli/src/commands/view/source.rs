@@ -235,3 +235,58 @@ impl Unrefined {
         show(self.made(splats))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+    use subsplat_test_support::repository;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        view: ViewArgs,
+    }
+
+    /// The scene as the window opens it and as the background thread shows it.
+    fn shown(flags: &[&str]) -> (Source, Vec<Splats>) {
+        let room = repository().join("examples/room");
+        let line = ["view", room.to_str().unwrap(), "--input-size", "64"];
+        let args = Line::parse_from(line.iter().chain(flags)).view;
+        let source = open(&args, &mut Progress::new()).unwrap();
+        let photographs = source.photographs.as_ref().unwrap();
+        let (mut all, mut stages) = (Vec::new(), Vec::new());
+        if photographs.is_unrefined() {
+            let mut show = |made: Made| {
+                all.push(made.splats);
+                Ok(())
+            };
+            photographs.make(2, &mut |stage| stages.push(stage), &mut show).unwrap();
+            assert_eq!(stages, ["refine"]);
+        }
+        (source, all)
+    }
+
+    #[test]
+    fn the_first_scene_is_refined_while_it_is_shown() {
+        let (source, shown_splats) = shown(&["--refine", "4"]);
+        let last = shown_splats.last().unwrap();
+        assert!(last.len() == source.made.splats.len() && *last != source.made.splats);
+        // A fixed number of frames begins with the refined scene.
+        let (fixed, none) = shown(&["--refine", "4", "--frames", "1"]);
+        assert!(none.is_empty() && fixed.made.splats == *last);
+        let (_, none) = shown(&["--refine", "off"]);
+        assert!(none.is_empty());
+    }
+
+    #[test]
+    fn a_window_that_cannot_show_ends_the_refinement() {
+        let room = repository().join("examples/room");
+        let line = ["view", room.to_str().unwrap(), "--input-size", "64", "--refine", "2"];
+        let source = open(&Line::parse_from(line).view, &mut Progress::new()).unwrap();
+        let mut show = |_: Made| bail!("no memory");
+        let photographs = source.photographs.unwrap();
+        let error = photographs.make(2, &mut |_| {}, &mut show).unwrap_err();
+        assert_eq!(error.to_string(), "no memory");
+    }
+}
