@@ -149,7 +149,7 @@ impl RefineReport {
 
 /// The rates fall by a cosine from 1 + this to this.
 const RATE_FLOOR: f32 = 0.05;
-/// Rounds of all photographs between two measurements of the error.
+/// Rounds of all photographs between two measurements of the error, in the second half.
 const ROUNDS_PER_CHECK: usize = 4;
 /// The steps end where the error has not fallen by this share since the last measurement.
 const LEAST_GAIN: f64 = 1e-3;
@@ -429,18 +429,20 @@ pub fn refine(
         None => Refiner::new(splats, views, raster, options)?,
     };
     let before = refiner.error(renderer);
-    let (mut last, round) = (before, views.len());
+    let (mut last, between) = (None, ROUNDS_PER_CHECK * views.len());
     while !refiner.is_done() {
         refiner.step(renderer);
         if progress(&refiner).is_break() {
             return Err(FitError::Cancelled);
         }
-        if refiner.steps().is_multiple_of(ROUNDS_PER_CHECK * round) && !refiner.is_done() {
+        // High rates at the beginning can raise the error for a while.
+        let settled = refiner.progress() >= 0.5 && refiner.steps() + between < options.steps;
+        if settled && refiner.steps().is_multiple_of(between) {
             let error = refiner.error(renderer);
-            if !(error < last * (1.0 - LEAST_GAIN)) {
+            if last.is_some_and(|last| !(error < last * (1.0 - LEAST_GAIN))) {
                 break;
             }
-            last = error;
+            last = Some(error);
         }
     }
     let (steps, after) = (refiner.steps(), refiner.error(renderer));
