@@ -56,7 +56,9 @@ pub use crate::model::Backend;
 pub use depth_range::{DepthBounds, DepthRange, DepthSource};
 pub use error::{Error, Result};
 pub use input_size::InputSize;
-pub use loose::{KnownLens, LensSource, LooseOptions, LooseScene, loose_scene};
+pub use loose::{
+    KnownLens, LensSource, LooseOptions, LoosePhotos, LooseScene, loose_photos, loose_scene,
+};
 pub use options::{Check, Detail, Options, Poses, Refine};
 pub use photo::Photo;
 pub use poses::PoseError;

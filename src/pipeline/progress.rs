@@ -230,6 +230,7 @@ fn report(progress: Progress, callback: &mut Callback<'_>) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::time::Duration;
 
     fn tracker() -> Tracker {
         let costs = [(Stage::Crop, 1.0), (Stage::Check, 2.0), (Stage::Backbone, 5.0)];
@@ -260,6 +261,25 @@ mod tests {
         assert_eq!(seen, expected);
         let stages: Vec<Stage> = times.iter().map(|t| t.stage).collect();
         assert_eq!(stages, [Stage::Crop, Stage::Check, Stage::Backbone]);
+    }
+
+    /// Without the flag that a break sets, the work would run to its end before the call returns.
+    #[test]
+    fn a_break_ends_the_work_at_its_next_checkpoint() {
+        let (mut tracker, ended_early) = (tracker(), AtomicBool::new(false));
+        tracker.begin(Stage::Backbone, &mut |_| ControlFlow::Continue(())).unwrap();
+        let mut stop = |_: Progress| ControlFlow::Break(());
+        let result = tracker.run_steps(4, &mut stop, |checkpoint| {
+            for _ in 0..5_000 {
+                let checked = checkpoint();
+                ended_early.fetch_or(checked.is_err(), Ordering::Relaxed);
+                checked?;
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            Ok(())
+        });
+        assert!(matches!(result, Err(Error::Cancelled)));
+        assert!(ended_early.into_inner());
     }
 
     #[test]

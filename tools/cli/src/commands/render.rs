@@ -244,7 +244,7 @@ pub fn median_depth(splats: &Splats, camera: &Camera) -> f32 {
 
 /// Bounds of a scene's splats without outliers.
 pub fn bounds(splats: &Splats) -> Result<Bounds> {
-    Bounds::of((0..splats.len()).map(|i| splats.mean(i))).context("the scene holds no Gaussian")
+    Bounds::of(splats.means()).context("the scene holds no Gaussian")
 }
 
 /// A camera along +z that shows the central 96 % of the means.

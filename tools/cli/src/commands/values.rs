@@ -146,7 +146,10 @@ mod tests {
         assert_eq!(refine("40"), Ok(Refine::Steps(40)));
         assert_eq!(refine("20s"), Ok(Refine::Seconds(20)));
         for bad in ["", "s", "0s", "-3", "1.5s", "100001", "86401s", "fast"] {
-            assert!(refine(bad).unwrap_err().starts_with("expected auto, off, steps or 20s"), "{bad}");
+            assert!(
+                refine(bad).unwrap_err().starts_with("expected auto, off, steps or 20s"),
+                "{bad}"
+            );
         }
     }
 
