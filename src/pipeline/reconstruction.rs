@@ -44,8 +44,14 @@ impl Reconstruction {
     /// # Errors
     /// Those of [`save_splats`].
     pub fn save(&self, path: &Path) -> Result<SaveReport> {
-        let comments = vec![comment_of_options(&self.raster_options)];
+        let comments = vec![self.comment()];
         Ok(save_splats(path, &self.splats, &SaveOptions { comments, ..SaveOptions::default() })?)
+    }
+
+    /// The rules to render the Gaussians as a line for a scene file
+    /// ([`SaveOptions::comments`](crate::SaveOptions)).
+    pub fn comment(&self) -> String {
+        comment_of_options(&self.raster_options)
     }
 
     /// The Gaussians.

@@ -42,6 +42,9 @@ pub enum Command {
     Run(Box<RunArgs>),
     /// Render a finished scene (.ply, .splat, .spz, .ksplat, .glb).
     Render(RenderArgs),
+    /// Write a finished scene in another format: one .html file that shows it, .ply, .glb, .spz,
+    /// .splat.
+    Export(ExportArgs),
     /// Show a scene in a window: a finished one, or photographs.
     #[cfg(feature = "view")]
     #[command(after_help = KEYS)]
@@ -220,6 +223,8 @@ pub enum SceneFormatArg {
     Splat,
     /// Niantic's compressed format, version 3.
     Spz,
+    /// One page that shows the scene in any browser, without a network.
+    Html,
 }
 
 impl SceneFormatArg {
@@ -230,6 +235,7 @@ impl SceneFormatArg {
             Self::Glb => "scene.glb",
             Self::Splat => "scene.splat",
             Self::Spz => "scene.spz",
+            Self::Html => "scene.html",
         }
     }
 }
@@ -482,6 +488,60 @@ pub struct RenderArgs {
     /// drawn; nearest depth itself under `standard`.
     #[arg(long, allow_negative_numbers = true, value_parser = values::positive)]
     pub near: Option<f32>,
+}
+
+/// The up direction of a written file.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub enum UpArg {
+    /// The scene's own axes: up is −y, as photogrammetry programs write it.
+    Keep,
+    /// Up is +y (OpenGL, game engines).
+    Y,
+    /// Up is +z (Blender, CAD).
+    Z,
+}
+
+impl From<UpArg> for subsplat::Up {
+    fn from(arg: UpArg) -> Self {
+        match arg {
+            UpArg::Keep => Self::Keep,
+            UpArg::Y => Self::Y,
+            UpArg::Z => Self::Z,
+        }
+    }
+}
+
+/// Arguments of `export`.
+#[derive(Debug, Args)]
+pub struct ExportArgs {
+    /// The scene: .ply, .compressed.ply, .splat, .spz, .ksplat or .glb; or a folder that `run`
+    /// wrote.
+    #[arg(value_name = "SPLATS | DIR")]
+    pub scene: PathBuf,
+    /// The file to write; its extension decides the format: .html, .ply, .glb, .spz or .splat.
+    #[arg(short, long, value_name = "FILE")]
+    pub out: PathBuf,
+    /// Places that the .html offers: any pose file or scene folder. Default: cameras.json beside
+    /// the scene, else a view of the whole.
+    #[arg(long, value_name = "SCENE")]
+    pub cameras: Option<PathBuf>,
+    /// Highest SH degree written (default: the scene's, at most 3). A .ply holds 0, 9, 24 or 45
+    /// `f_rest` values accordingly.
+    #[arg(long, value_name = "0…3", value_parser = values::file_sh_degree)]
+    pub sh: Option<usize>,
+    /// Leave Gaussians of less opacity out.
+    #[arg(
+        long,
+        default_value_t = 0.0,
+        value_name = "ALPHA",
+        allow_negative_numbers = true,
+        value_parser = values::opacity
+    )]
+    pub min_opacity: f32,
+    /// Up direction of a .ply or .splat (default: keep). A .glb and a .spz are y-up by their
+    /// formats, and a .html is upright.
+    #[arg(long, value_enum)]
+    pub up: Option<UpArg>,
 }
 
 /// Arguments of `check`.

@@ -13,7 +13,9 @@ mod check;
 mod compare;
 mod compare_raster;
 mod eval;
+mod export;
 mod frames;
+mod html;
 mod info;
 mod memory;
 mod model;
@@ -72,6 +74,7 @@ fn dispatch(cli: &Cli, answer: Answer) -> Result<bool> {
     }
     match &cli.command {
         Command::Run(args) => run::run(args, answer).map(|()| true),
+        Command::Export(args) => export::export(args, answer).map(|()| true),
         Command::Render(args) => render::render(args, answer).map(|()| true),
         #[cfg(feature = "view")]
         Command::View(args) => view::view(args, answer).map(|()| true),

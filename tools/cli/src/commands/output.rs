@@ -6,6 +6,7 @@
 
 use super::args::SceneFormatArg;
 use super::frames;
+use super::html::Page;
 use super::pair::folder_of;
 use crate::report::print_warning;
 use anyhow::{Context, Result, bail};
@@ -23,7 +24,6 @@ use subsplat::io::{SaveOptions, save_splats};
 use subsplat::metrics::{psnr, ssim};
 use subsplat::pipeline::{Photo, Reconstruction};
 use subsplat::render::Renderer;
-use subsplat::splats::Splats;
 
 /// Folders inside the output folder.
 const FOLDERS: [&str; 3] = ["images", "depth", "inputs"];
@@ -210,23 +210,29 @@ pub fn write_config(out: &Path, config: &Config) -> Result<()> {
 /// Writes the Gaussians in each of `formats`, and returns one report each.
 pub fn write_scene(
     out: &Path,
-    splats: &Splats,
+    page: &Page<'_>,
     formats: &[SceneFormatArg],
     options: &SaveOptions,
 ) -> Result<Vec<Value>> {
-    let mut names: Vec<&str> = Vec::new();
+    let mut distinct: Vec<SceneFormatArg> = Vec::new();
     for format in formats {
-        let name = format.file_name();
-        if !names.contains(&name) {
-            names.push(name);
+        if !distinct.contains(format) {
+            distinct.push(*format);
         }
     }
-    let one = |name: &&str| {
-        let path = out.join(name);
-        let saved = save_splats(&path, splats, options)?;
+    let one = |format: &SceneFormatArg| {
+        let path = out.join(format.file_name());
+        let html = *format == SceneFormatArg::Html;
+        let saved = match html {
+            true => page.write(&path, options)?,
+            false => save_splats(&path, page.splats, options)?,
+        };
         let mut value = serde_json::to_value(&saved)?;
+        if html {
+            value["format"] = json!("html");
+        }
         value["file"] = json!(path.display().to_string());
         Ok(value)
     };
-    names.iter().map(one).collect()
+    distinct.iter().map(one).collect()
 }

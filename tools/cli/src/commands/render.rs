@@ -88,7 +88,7 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
 }
 
 /// Finds the scene file of `path`: the path itself, or the file in a folder that `run` wrote.
-fn scene_file(path: &Path) -> Result<PathBuf> {
+pub fn scene_file(path: &Path) -> Result<PathBuf> {
     if !path.is_dir() {
         ensure!(
             probe(path).is_err(),
@@ -98,7 +98,8 @@ fn scene_file(path: &Path) -> Result<PathBuf> {
         );
         return Ok(path.to_owned());
     }
-    let files = SceneFormatArg::value_variants().iter().map(|f| path.join(f.file_name()));
+    let readable = SceneFormatArg::value_variants().iter().filter(|f| **f != SceneFormatArg::Html);
+    let files = readable.map(|f| path.join(f.file_name()));
     if let Some(file) = files.into_iter().find(|f| f.is_file()) {
         return Ok(file);
     }
@@ -187,23 +188,14 @@ fn cameras(args: &RenderArgs, file: &Path, splats: &Splats) -> Result<Vec<(Strin
 }
 
 fn named_cameras(args: &RenderArgs, file: &Path, splats: &Splats) -> Result<Vec<(String, Camera)>> {
-    let beside = file.parent().unwrap_or(Path::new("")).join("cameras.json");
-    let source = match &args.cameras {
-        Some(path) => path.clone(),
-        None if beside.is_file() => beside,
-        None => {
-            ensure!(
-                args.target.is_empty(),
-                "--target: expected --cameras or cameras.json beside the scene"
-            );
-            print_line(
-                "no cameras given and no cameras.json beside the scene: a view of the whole",
-            );
-            return Ok(vec![("view".to_owned(), whole(splats)?)]);
-        }
+    let Some(all) = cameras_beside(args.cameras.as_deref(), file)? else {
+        ensure!(
+            args.target.is_empty(),
+            "--target: expected --cameras or cameras.json beside the scene"
+        );
+        print_line("no cameras given and no cameras.json beside the scene: a view of the whole");
+        return Ok(vec![("view".to_owned(), whole(splats)?)]);
     };
-    let all = read_cameras(&source)?;
-    ensure!(!all.is_empty(), "{}: expected a camera, got none", source.display());
     let names: Vec<&str> = all.iter().map(|(n, _)| n.as_str()).collect();
     let chosen = match args.target.is_empty() {
         true => (0..all.len()).collect(),
@@ -212,6 +204,20 @@ fn named_cameras(args: &RenderArgs, file: &Path, splats: &Splats) -> Result<Vec<
     let (names, cameras): (Vec<String>, Vec<Camera>) =
         chosen.into_iter().map(|i| all[i].clone()).unzip();
     Ok(frames::file_stems(&names).into_iter().zip(cameras).collect())
+}
+
+/// Names and cameras of `given`, else of cameras.json beside the scene `file`; `None` without
+/// either.
+pub fn cameras_beside(given: Option<&Path>, file: &Path) -> Result<Option<Vec<(String, Camera)>>> {
+    let beside = file.parent().unwrap_or(Path::new("")).join("cameras.json");
+    let source = match given {
+        Some(path) => path,
+        None if beside.is_file() => &beside,
+        None => return Ok(None),
+    };
+    let all = read_cameras(source)?;
+    ensure!(!all.is_empty(), "{}: expected a camera, got none", source.display());
+    Ok(Some(all))
 }
 
 /// Names and cameras of a pose file or scene folder.

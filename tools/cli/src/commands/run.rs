@@ -1,6 +1,7 @@
 //! `subsplat run`: photographs to Gaussians, views and files.
 
 use super::args::{LowpassArg, PathArg, RenderingArgs, RunArgs};
+use super::html::Page;
 use super::output::{self, Scored, View, Views};
 use super::reconstruct::{self, reconstruct};
 use super::{frames, model, pair, render};
@@ -75,7 +76,14 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
             comments: vec![comment_of_options(&options)],
             ..SaveOptions::default()
         };
-        output::write_scene(&args.out, result.splats(), &args.save, &save)
+        let cameras: Vec<Camera> = result.inputs().iter().map(|c| c.target_camera).collect();
+        let page = Page {
+            splats: result.splats(),
+            cameras: &cameras,
+            options: &options,
+            title: &plan.scene.name,
+        };
+        output::write_scene(&args.out, &page, &args.save, &save)
     })?;
     let inputs = progress.stage("inputs", |_| input_report(&result, &options))?;
     Done { model, result, options, scored, inputs, files }.finish(args, &plan, progress, answer)

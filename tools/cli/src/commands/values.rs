@@ -54,6 +54,11 @@ pub fn sh_degree(text: &str) -> Result<usize, String> {
     whole(text, 0, 4)
 }
 
+/// Parses the SH degree of a file.
+pub fn file_sh_degree(text: &str) -> Result<usize, String> {
+    whole(text, 0, 3)
+}
+
 /// Parses a number above 0.
 pub fn at_least_one(text: &str) -> Result<usize, String> {
     whole(text, 1, usize::MAX)

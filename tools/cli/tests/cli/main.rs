@@ -7,6 +7,7 @@ mod compare_raster;
 mod convert;
 mod devices;
 mod eval_cli;
+mod export;
 mod loose_photographs;
 mod program;
 mod readme;
