@@ -121,10 +121,14 @@ impl Layout {
 
 fn read_vertices(header: &Header, element: &Element, source: &mut Source) -> Result<Incoming> {
     let layout = Layout::of(element, source.path)?;
-    let mut incoming =
-        Incoming::with_capacity(header.checked_count(element, source)?, layout.sh_degree);
+    let mut incoming = Incoming::with_capacity(header.checked_count(element, source)?, 0);
     let mut rest = vec![0.0f32; layout.rest.len()];
     header.rows(element, source, |_, v| {
+        for (r, &i) in rest.iter_mut().zip(&layout.rest) {
+            *r = v[i] as f32;
+        }
+        // Degrees that are zero in every row take no memory and no time.
+        incoming.raise_degree(used_degree(&rest));
         let sh = incoming.push(
             layout.mean.map(|i| v[i] as f32),
             layout.quat.map(|i| v[i] as f32),
@@ -137,13 +141,17 @@ fn read_vertices(header: &Header, element: &Element, source: &mut Source) -> Res
                 Some(range) => dc_from_colour(v[i] / range),
             };
         }
-        for (r, &i) in rest.iter_mut().zip(&layout.rest) {
-            *r = v[i] as f32;
-        }
         rest_to_set(&rest, sh);
         Ok(())
     })?;
     Ok(incoming)
+}
+
+/// Lowest SH degree that holds all of channel-major `f_rest` that is not zero.
+fn used_degree(rest: &[f32]) -> usize {
+    let per_channel = rest.len() / 3;
+    let last = (0..per_channel).rev().find(|j| (0..3).any(|c| rest[c * per_channel + j] != 0.0));
+    last.map_or(0, |j| (j + 1).isqrt())
 }
 
 /// Writes channel-major `f_rest[3, D − 1]` to a set `[D, 3]` after its constant term.
@@ -162,7 +170,9 @@ pub(super) fn write(
     out: &Outgoing,
     options: &SaveOptions,
 ) -> std::io::Result<()> {
-    let rests = REST_COUNTS[out.sh_degree];
+    // Readers assert the 45 values of degree 3, so a lower degree is padded with zeros unless the
+    // caller asks for it.
+    let rests = REST_COUNTS[out.sh_degree.max(options.sh_degree.unwrap_or(3).min(3))];
     file.write_all(header(out.count, rests, options).as_bytes())?;
     let mut block = Vec::with_capacity(BLOCK * 4 * (17 + rests));
     let mut visitor = out.visitor();

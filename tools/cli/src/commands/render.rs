@@ -1,8 +1,10 @@
 //! `subsplat render`: renders pictures of a finished scene.
 
-use super::args::{LowpassArg, PathArg, RenderArgs, RenderingArgs, SceneFormatArg};
-use super::frames;
+use super::args::{LowpassArg, PATH_FRAMES, PathArg, RenderArgs, RenderingArgs, SceneFormatArg};
+use super::depth_colour::colour_depth;
+use super::frames::{self, DepthSpread};
 use super::memory;
+use super::video;
 use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
 use clap::ValueEnum;
@@ -35,6 +37,7 @@ pub fn open(args: &RenderingArgs) -> Renderer {
 pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
     args.size.map_or(Ok(()), |size| memory::check_picture("--size", size))?;
+    args.motion.video.as_deref().map_or(Ok(()), video::check)?;
     let file = scene_file(&args.scene)?;
     let (splats, comments) = progress.stage("scene", |_| load_with_comments(&file))?;
     let cameras = cameras(args, &file, &splats)?;
@@ -43,20 +46,32 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
     let folder = if args.depth { args.out.join("depth") } else { args.out.clone() };
     std::fs::create_dir_all(&folder)
         .with_context(|| format!("output folder {}", folder.display()))?;
+    if args.depth {
+        let folder = args.out.join("depth_colour");
+        std::fs::create_dir_all(&folder)
+            .with_context(|| format!("output folder {}", folder.display()))?;
+    }
     let mut views = Vec::new();
     let mut renderer = open(&args.rendering);
+    let mut video = None;
     progress.steps("rendering", cameras.len(), |bar| {
         for (name, camera) in &cameras {
             let picture = renderer.render(&splats, camera, &options);
             renderer.take_warning().iter().for_each(print_warning);
             let (width, height) = (picture.width, picture.height);
             let file = args.out.join(format!("{name}.png"));
-            save_png(&file, &Rgb::from(&picture))?;
+            let rgb = Rgb::from(&picture);
+            save_png(&file, &rgb)?;
+            video::push(&mut video, &args.motion, &rgb)?;
             let file = file.display().to_string();
             let mut view = json!({ "file": file, "width": width, "height": height });
             if args.depth {
                 let file = args.out.join(format!("depth/{name}.png"));
-                let unit = save_depth_png(&file, &Depth { width, height, data: picture.depth })?;
+                let depth = Depth { width, height, data: picture.depth };
+                let unit = save_depth_png(&file, &depth)?;
+                let colours = args.out.join(format!("depth_colour/{name}.png"));
+                save_png(&colours, &colour_depth(&depth))?;
+                view["depth_colour_file"] = json!(colours.display().to_string());
                 view["depth_file"] = json!(file.display().to_string());
                 view["depth_unit"] = json!(unit);
             }
@@ -65,6 +80,7 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
         }
         anyhow::Ok(())
     })?;
+    let video = video::finish(video, &args.motion, answer)?;
     let seconds = progress.seconds();
     let peak = peak_memory_bytes();
     answer.line(format!(
@@ -82,6 +98,7 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
         "device": renderer.device(),
         "convention": if mvsplat_rules { "mvsplat" } else { "standard" },
         "views": views,
+        "video": video,
         "seconds": seconds,
         "peak_memory_bytes": peak,
     }))
@@ -177,12 +194,14 @@ fn cameras(args: &RenderArgs, file: &Path, splats: &Splats) -> Result<Vec<(Strin
         cameras.into_iter().enumerate().map(|(i, c)| Ok((name(i), sized(c)?))).collect()
     };
     let through: Vec<Camera> = named.iter().map(|(_, c)| *c).collect();
+    let count = args.motion.frames.unwrap_or(PATH_FRAMES);
     match args.path {
         PathArg::Targets => named.into_iter().map(|(n, c)| Ok((n, sized(c)?))).collect(),
-        PathArg::Interpolate => path(frames::interpolate(&through, args.frames)?),
-        PathArg::Orbit => {
-            let depth = median_depth(splats, &through[0]);
-            path(frames::orbit(&through, depth, args.frames)?)
+        PathArg::Interpolate => path(frames::interpolate(&through, count)?),
+        PathArg::Orbit | PathArg::Spiral | PathArg::Dolly => {
+            let shape = args.path.closed().unwrap_or(frames::Loop::Orbit);
+            let depths = depths(splats, &through[0]);
+            path(frames::closed_path(shape, &through, depths, count, args.motion.orbit_radius)?)
         }
     }
 }
@@ -238,14 +257,9 @@ pub fn read_cameras(source: &Path) -> Result<Vec<(String, Camera)>> {
     scene.frames.iter().map(|f| Ok((f.name.clone(), f.pinhole()?))).collect()
 }
 
-/// Median camera z of the splats in front of `camera`; 1 without any.
-pub fn median_depth(splats: &Splats, camera: &Camera) -> f32 {
-    let mut z: Vec<f32> = (0..splats.len())
-        .map(|i| camera.to_camera(splats.mean(i).into()).z)
-        .filter(|z| *z > 0.0)
-        .collect();
-    z.sort_by(f32::total_cmp);
-    z.get(z.len() / 2).copied().unwrap_or(1.0)
+/// Spread of the splats in front of `camera`.
+pub fn depths(splats: &Splats, camera: &Camera) -> DepthSpread {
+    DepthSpread::of((0..splats.len()).map(|i| camera.to_camera(splats.mean(i).into()).z))
 }
 
 /// Bounds of a scene's splats without outliers.

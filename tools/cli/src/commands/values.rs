@@ -49,6 +49,11 @@ pub fn refine(text: &str) -> Result<Refine, String> {
     }
 }
 
+/// Parses frames a second; a GIF counts hundredths of a second.
+pub fn rate(text: &str) -> Result<u32, String> {
+    whole(text, 1, 100).map(|n| n as u32)
+}
+
 /// Parses an SH degree.
 pub fn sh_degree(text: &str) -> Result<usize, String> {
     whole(text, 0, 4)

@@ -107,7 +107,7 @@ fn export_refuses_what_it_cannot_write() {
         ("export one.ply -o two.spz --up z", "y-up by definition"),
         ("export nothing.ply -o two.html", "nothing.ply"),
         ("export one.ply -o none/two.html", "none/two.html"),
-        ("export one.ply -o two.html --min-opacity 1", "at least one Gaussian to write"),
+        ("export one.ply -o two.html --min-opacity 0.95", "at least one Gaussian to write"),
     ] {
         let called = call_in(place.path(), arguments);
         assert_eq!(called.code, 1, "{arguments}");

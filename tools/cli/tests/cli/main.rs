@@ -9,6 +9,7 @@ mod devices;
 mod eval_cli;
 mod export;
 mod loose_photographs;
+mod motion;
 mod program;
 mod readme;
 mod readme_snippet;

@@ -2,6 +2,7 @@
 //! reconstructed again with another number of children.
 
 use crate::commands::args_view::ViewArgs;
+use crate::commands::frames::DepthSpread;
 use crate::commands::reconstruct::{self, reconstruct};
 use crate::commands::{info, memory, model, pair, render, run};
 use crate::report::{Progress, print_line, print_warning};
@@ -86,7 +87,7 @@ fn finished(args: &ViewArgs, path: &Path, progress: &mut Progress) -> Result<Sou
     let start = Start {
         home: *home,
         up: up_of(cameras.iter().map(|(_, c)| c)),
-        distance: render::median_depth(&splats, home),
+        distance: render::depths(&splats, home).middle,
         radius: render::bounds(&splats)?.radius(),
     };
     let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
@@ -118,7 +119,7 @@ fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     let start = Start {
         home: input.target_camera,
         up: up_of(cameras.iter()),
-        distance: run::median(&depth.data),
+        distance: DepthSpread::of(depth.data.iter().copied()).middle,
         radius: render::bounds(result.splats())?.radius(),
     };
     let made = photographs.made(&model, result);
