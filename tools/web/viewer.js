@@ -391,7 +391,7 @@ class GlPainter {
     const gl = canvas.getContext("webgl2", {
       alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true,
     });
-    if (!gl) throw new Error("no WebGL2");
+    if (!gl) throw new Error("This browser has no WebGL2.");
     this.gl = gl;
     this.canvas = canvas;
     this.half = Boolean(

@@ -1,6 +1,6 @@
 //! `subsplat export`: writes a finished scene in another format.
 
-use super::args::ExportArgs;
+use super::args::{ExportArgs, UpArg};
 use super::html::Page;
 use super::render;
 use crate::report::{Answer, Progress, print_warning};
@@ -9,7 +9,7 @@ use serde_json::json;
 use subsplat::abi::{Convention, RasterOptions};
 use subsplat::camera::Camera;
 use subsplat::io::{SaveOptions, load_with_comments, save_splats};
-use subsplat::render::options_of_comments;
+use subsplat::render::{camera_of_comments, comments_without_camera, options_of_comments};
 
 /// Runs the command.
 pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
@@ -21,11 +21,16 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
     }
     let (splats, comments) = progress.stage("scene", |_| load_with_comments(&file))?;
     let stored = options_of_comments(&comments);
+    // The camera of a comment holds in the axes that the file had.
+    let kept = match args.up {
+        None | Some(UpArg::Keep) => comments,
+        Some(UpArg::Y | UpArg::Z) => comments_without_camera(&comments),
+    };
     let save = SaveOptions {
         sh_degree: args.sh,
         min_opacity: args.min_opacity,
         up: args.up.map(Into::into).unwrap_or_default(),
-        comments,
+        comments: kept,
     };
     let report = progress.stage("writing", |_| {
         if !html {
@@ -42,7 +47,7 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
         }
         let cameras: Vec<Camera> = match render::cameras_beside(args.cameras.as_deref(), &file)? {
             Some(all) => all.into_iter().map(|(_, camera)| camera).collect(),
-            None => Vec::new(),
+            None => camera_of_comments(&save.comments).into_iter().collect(),
         };
         let title = file.file_stem().unwrap_or_default().to_string_lossy();
         let page = Page { splats: &splats, cameras: &cameras, options: &options, title: &title };

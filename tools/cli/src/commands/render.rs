@@ -18,7 +18,7 @@ use subsplat::io::load_with_comments;
 use subsplat::io::photograph::list_photographs;
 use subsplat::io::scene::{is_scene, load_scene};
 use subsplat::navigation::Bounds;
-use subsplat::render::{Renderer, options_of_comments};
+use subsplat::render::{Renderer, camera_of_comments, options_of_comments};
 use subsplat::splats::Splats;
 
 /// Side of a picture without a camera, px.
@@ -40,7 +40,7 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
     args.motion.video.as_deref().map_or(Ok(()), video::check)?;
     let file = scene_file(&args.scene)?;
     let (splats, comments) = progress.stage("scene", |_| load_with_comments(&file))?;
-    let cameras = cameras(args, &file, &splats)?;
+    let cameras = cameras(args, &file, &splats, &comments)?;
     check_sizes(&cameras)?;
     let options = options(&args.rendering, args.near, args.sh_degree, &comments)?;
     let folder = if args.depth { args.out.join("depth") } else { args.out.clone() };
@@ -172,8 +172,13 @@ pub fn options(
 }
 
 /// File stems and cameras.
-fn cameras(args: &RenderArgs, file: &Path, splats: &Splats) -> Result<Vec<(String, Camera)>> {
-    let named = named_cameras(args, file, splats)?;
+fn cameras(
+    args: &RenderArgs,
+    file: &Path,
+    splats: &Splats,
+    comments: &[String],
+) -> Result<Vec<(String, Camera)>> {
+    let named = named_cameras(args, file, splats, comments)?;
     let sized = |camera: Camera| -> Result<Camera> {
         let Some((w, h)) = args.size else { return Ok(camera) };
         let k = camera.intrinsics();
@@ -206,14 +211,25 @@ fn cameras(args: &RenderArgs, file: &Path, splats: &Splats) -> Result<Vec<(Strin
     }
 }
 
-fn named_cameras(args: &RenderArgs, file: &Path, splats: &Splats) -> Result<Vec<(String, Camera)>> {
+fn named_cameras(
+    args: &RenderArgs,
+    file: &Path,
+    splats: &Splats,
+    comments: &[String],
+) -> Result<Vec<(String, Camera)>> {
     let Some(all) = cameras_beside(args.cameras.as_deref(), file)? else {
         ensure!(
             args.target.is_empty(),
             "--target: expected --cameras or cameras.json beside the scene"
         );
-        print_line("no cameras given and no cameras.json beside the scene: a view of the whole");
-        return Ok(vec![("view".to_owned(), whole(splats)?)]);
+        let camera = camera_of_comments(comments);
+        print_line(match camera {
+            Some(_) => {
+                "no cameras given and no cameras.json beside the scene: the file's own camera"
+            }
+            None => "no cameras given and no cameras.json beside the scene: a view of the whole",
+        });
+        return Ok(vec![("view".to_owned(), camera.map_or_else(|| whole(splats), Ok)?)]);
     };
     let names: Vec<&str> = all.iter().map(|(n, _)| n.as_str()).collect();
     let chosen = match args.target.is_empty() {

@@ -20,7 +20,7 @@ use subsplat::io::image::{LoadOptions, Rgb, Truncated};
 use subsplat::io::scene::Scene;
 use subsplat::pipeline::Backend;
 use subsplat::pipeline::is_mvsplat;
-use subsplat::render::comment_of_options;
+use subsplat::render::{comment_of_camera, comment_of_options};
 use subsplat::splats::{SplatStatistics, Splats};
 use subsplat::{Detail, Options, Photo, Reconstruction, Reconstructor, Warning};
 
@@ -72,10 +72,12 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     // The scene comes first: it is what took the time, and a stop while views are drawn keeps it.
     let files = progress.stage("writing", |_| {
         output::write_config(&args.out, model.config())?;
+        let camera = result.inputs().first().map(|c| comment_of_camera(&c.target_camera));
+        let comments = std::iter::once(comment_of_options(&options)).chain(camera).collect();
         let save = SaveOptions {
             sh_degree: args.sh,
             min_opacity: args.min_opacity,
-            comments: vec![comment_of_options(&options)],
+            comments,
             ..SaveOptions::default()
         };
         let cameras: Vec<Camera> = result.inputs().iter().map(|c| c.target_camera).collect();

@@ -242,8 +242,11 @@ fn ffmpeg(kind: Kind, part: &Path, (w, h): (usize, usize), rate: Rate) -> Result
     Command::new("ffmpeg")
         .args(["-hide_banner", "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"])
         .args(["-s", &format!("{w}x{h}"), "-r", &rate.0.to_string(), "-i", "-"])
-        // Both codecs halve the colours' resolution, which needs even sides.
-        .args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"])
+        // Both codecs halve the colours' resolution, which needs even sides. The matrix is named,
+        // because players guess another one by the size.
+        .args(["-vf", "scale=out_color_matrix=bt709:out_range=tv,pad=ceil(iw/2)*2:ceil(ih/2)*2"])
+        .args(["-pix_fmt", "yuv420p", "-colorspace", "bt709", "-color_primaries", "bt709"])
+        .args(["-color_trc", "bt709"])
         .args(codec)
         .arg(part)
         .stdin(Stdio::piped())

@@ -2,7 +2,9 @@
 
 use crate::program::{call_in, call_with, workplace};
 use std::path::Path;
+use subsplat::io::image::load;
 use subsplat::io::{SplatFormat, load_splats, parse_splats};
+use subsplat::metrics::psnr;
 use subsplat::splats::Splats;
 use subsplat_test_support::one_splat::save_one_splat;
 
@@ -66,6 +68,28 @@ fn run_writes_a_page_with_its_scene_and_cameras() {
     assert_eq!(again.len(), splats.len());
     assert_eq!(settings["cameras"].as_array().unwrap().len(), 1);
     assert_eq!(settings["near"].as_f64().unwrap() as f32, 0.01);
+
+    // Alone, the file still knows the first photograph's camera; turned, it does not.
+    let alone = place.path().join("alone");
+    std::fs::create_dir(&alone).unwrap();
+    std::fs::copy(place.path().join("out/scene.ply"), alone.join("a.ply")).unwrap();
+    for (arguments, cameras) in
+        [("export alone/a.ply -o b.html", 1), ("export alone/turned.ply -o b.html", 0)]
+    {
+        let turn = "export alone/a.ply -o alone/turned.ply --up z";
+        assert_eq!(call_in(place.path(), turn).code, 0);
+        assert_eq!(call_in(place.path(), arguments).code, 0);
+        let (_, settings) = scene_of(&place.path().join("b.html"));
+        assert_eq!(settings["cameras"].as_array().unwrap().len(), cameras, "{arguments}");
+    }
+    let called = call_in(place.path(), "--json render alone/a.ply -o view");
+    assert!(called.code == 0 && called.stderr.contains("the file's own camera"));
+    let view = load(&place.path().join("view/view.png")).unwrap();
+    let photograph = load(&place.path().join("scene/images/view0.png")).unwrap();
+    let unit = |v: &[u8]| v.iter().map(|&v| f32::from(v) / 255.0).collect::<Vec<f32>>();
+    assert_eq!((view.width, view.height), (128, 128));
+    let likeness = psnr(&unit(&view.data), &unit(&photograph.data), 128, 128).unwrap();
+    assert!(likeness > 15.0, "the first photograph's view: {likeness:.1} dB");
 }
 
 #[test]

@@ -39,8 +39,8 @@ pub(crate) struct Session {
 struct Scene {
     splats: Splats,
     options: RasterOptions,
-    /// Line for the header of a .ply or .glb.
-    comment: Option<String>,
+    /// Lines for the header of a .ply or .glb.
+    comments: Vec<String>,
     cameras: Vec<Camera>,
     warnings: Vec<String>,
 }
@@ -120,7 +120,7 @@ impl Session {
         warnings.extend(result.warnings().iter().map(ToString::to_string));
         self.scene = Some(Scene {
             options: *result.raster_options(),
-            comment: Some(result.comment()),
+            comments: result.comments(),
             cameras: result.inputs().iter().map(|c| c.target_camera).collect(),
             splats: result.into_splats(),
             warnings,
@@ -134,11 +134,11 @@ impl Session {
         name_length: usize,
     ) -> Result<Vec<u8>, String> {
         let (name, file) = named(input, name_length)?;
-        let (splats, _) = parse_splats(file, name).map_err(|e| e.to_string())?;
+        let (splats, comments) = parse_splats(file, name).map_err(|e| e.to_string())?;
         self.scene = Some(Scene {
             splats,
             options: RasterOptions::default(),
-            comment: None,
+            comments,
             cameras: Vec::new(),
             warnings: Vec::new(),
         });
@@ -172,8 +172,7 @@ impl Session {
         let extension = String::from_utf8_lossy(extension);
         let format = SplatFormat::from_name(Path::new(&format!("scene.{extension}")))
             .ok_or_else(|| format!("expected ply, spz, glb or splat, got {extension:?}"))?;
-        let comments = scene.comment.iter().cloned().collect();
-        let options = SaveOptions { comments, ..SaveOptions::default() };
+        let options = SaveOptions { comments: scene.comments.clone(), ..SaveOptions::default() };
         encode_splats(format, &scene.splats, &options).map_err(|e| e.to_string())
     }
 

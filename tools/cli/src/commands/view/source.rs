@@ -12,6 +12,7 @@ use std::path::Path;
 use subsplat::abi::RasterOptions;
 use subsplat::io::{SplatFormat, load_with_comments};
 use subsplat::navigation::{Start, up_of};
+use subsplat::render::camera_of_comments;
 use subsplat::splats::Splats;
 use subsplat::{Check, Options, Photo, Reconstruction, Reconstructor};
 
@@ -78,7 +79,10 @@ fn finished(args: &ViewArgs, path: &Path, progress: &mut Progress) -> Result<Sou
     let cameras = match &args.cameras {
         Some(source) => render::read_cameras(source)?,
         None if beside.is_file() => render::read_cameras(&beside)?,
-        None => vec![(String::new(), render::whole(&splats)?)],
+        None => {
+            let own = camera_of_comments(&comments);
+            vec![(String::new(), own.map_or_else(|| render::whole(&splats), Ok)?)]
+        }
     };
     let Some((_, home)) = cameras.first() else {
         let source = args.cameras.as_ref().unwrap_or(&beside);
