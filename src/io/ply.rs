@@ -4,8 +4,8 @@
 //! `f_dc_0..2`, `f_rest_*` channel-major (all of R, then G, then B), `opacity` before
 //! the sigmoid, `scale_0..2` = ln σ, `rot_0..3` = wxyz. World frame throughout.
 //!
-//! SH degree: 3 by default, since viewers expect at most 45 `f_rest`; the network's degree 4
-//! is dropped. Gains and residuals of children are folded into their coefficients
+//! SH degree: 3 by default, since viewers expect 45 `f_rest`: lower degrees are padded with
+//! zeros, which the reader drops again, and the network's degree 4 is dropped. Gains and residuals of children are folded into their coefficients
 //! (`gaussians.rs`).
 //!
 //! The reader accepts ascii and both byte orders, any property order and number type, 0, 9,
@@ -70,7 +70,6 @@ struct Layout {
     /// Divisor to [0, 1] where `red green blue` stand in place of `f_dc`.
     colour_range: Option<f64>,
     rest: Vec<usize>,
-    sh_degree: usize,
 }
 
 impl Layout {
@@ -107,15 +106,11 @@ impl Layout {
         let named = element.properties.iter().filter(|p| is_rest(&p.name)).count();
         let rest: Vec<usize> =
             (0..named).map_while(|i| element.position(&format!("f_rest_{i}"))).collect();
-        match REST_COUNTS.iter().position(|&n| n == named && n == rest.len()) {
-            Some(sh_degree) => {
-                Ok(Self { mean, scale, quat, opacity, dc, colour_range, rest, sh_degree })
-            }
-            None => {
-                let got = format!("{named}, of which {} in sequence", rest.len());
-                Err(Error::format(path, "0, 9, 24, 45 or 72 properties f_rest_0, …", got))
-            }
+        if !REST_COUNTS.contains(&named) || named != rest.len() {
+            let got = format!("{named}, of which {} in sequence", rest.len());
+            return Err(Error::format(path, "0, 9, 24, 45 or 72 properties f_rest_0, …", got));
         }
+        Ok(Self { mean, scale, quat, opacity, dc, colour_range, rest })
     }
 }
 
