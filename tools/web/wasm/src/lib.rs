@@ -1,4 +1,4 @@
-//! The library for the page in `tools/web`: photographs in, Gaussians and pictures out.
+//! The library for the page in `tools/web`: photographs in, Gaussians out.
 //!
 //! A WebAssembly module with plain functions and numbers; no tool generates glue. JavaScript asks
 //! for memory with [`input`], writes bytes there and calls one of the functions below. Each returns
@@ -10,7 +10,7 @@
 
 mod session;
 
-use session::{Pose, Session};
+use session::Session;
 use std::cell::RefCell;
 
 thread_local! {
@@ -64,17 +64,10 @@ pub extern "C" fn add_photograph(name_length: usize) -> u32 {
 
 /// Finds the cameras of the photographs and reconstructs their scene at `upscale` times the
 /// network's input. `effort` 0: the network alone; 1: fitted to the photographs; 2: refined too.
-/// Answer: JSON as of [`open_scene`].
+/// Answer: JSON with `gaussians`, `background`, `cameras` and `warnings`.
 #[unsafe(no_mangle)]
 pub extern "C" fn reconstruct(upscale: usize, effort: u32) -> u32 {
     answer(|session, _| session.reconstruct(upscale, effort))
-}
-
-/// Opens a finished scene. Input: its name, `name_length` bytes, then the file. Answer: JSON with
-/// `gaussians`, `background`, `cameras` and `warnings`.
-#[unsafe(no_mangle)]
-pub extern "C" fn open_scene(name_length: usize) -> u32 {
-    answer(|session, input| session.open_scene(&input, name_length))
 }
 
 /// Writes the scene. Input: the format's extension (`ply`, `spz`, `glb` or `splat`). Answer: the
@@ -82,12 +75,4 @@ pub extern "C" fn open_scene(name_length: usize) -> u32 {
 #[unsafe(no_mangle)]
 pub extern "C" fn save() -> u32 {
     answer(|session, input| session.save(&input))
-}
-
-/// Renders a picture on the CPU: `width` × `height` px. Input: sixteen little-endian f32: fx, fy,
-/// cx, cy in px, then the first three rows of the camera-to-world matrix (OpenCV axes). Answer:
-/// RGBA, rows from the top.
-#[unsafe(no_mangle)]
-pub extern "C" fn render(width: usize, height: usize) -> u32 {
-    answer(|session, input| session.render(&Pose::parse(&input)?, width, height))
 }

@@ -3,17 +3,14 @@
 use serde_json::{Value, json};
 use std::ops::ControlFlow;
 use std::path::Path;
-use subsplat::glam::{Mat4, Vec4};
 use subsplat::{
-    Camera, FitOptions, Intrinsics, Lens, LoadOptions, Options, Photo, Photograph, PoseOptions,
-    PosePhoto, RasterOptions, Reconstructor, Refine, Rgb, SaveOptions, SplatFormat, Splats,
-    encode_splats, estimate_poses, parse_photograph, parse_splats, render,
+    Camera, FitOptions, Lens, LoadOptions, Options, Photo, Photograph, PoseOptions, PosePhoto,
+    RasterOptions, Reconstructor, Refine, SaveOptions, SplatFormat, Splats, encode_splats,
+    estimate_poses, parse_photograph,
 };
 
 /// Features of a photograph of a pair, and of one of many, as in the program.
 const FEATURES: [usize; 2] = [4000, 2500];
-/// Most pixels of a rendered picture.
-const PIXELS_MAX: usize = 1 << 24;
 
 #[cfg(all(target_family = "wasm", target_os = "unknown"))]
 #[link(wasm_import_module = "env")]
@@ -43,32 +40,6 @@ struct Scene {
     comments: Vec<String>,
     cameras: Vec<Camera>,
     warnings: Vec<String>,
-}
-
-/// A camera of the page.
-pub(crate) struct Pose {
-    intrinsics: [f32; 4],
-    world_from_camera: Mat4,
-}
-
-impl Pose {
-    /// Reads the input of [`crate::render`].
-    pub(crate) fn parse(bytes: &[u8]) -> Result<Self, String> {
-        let (numbers, rest) = bytes.as_chunks::<4>();
-        let numbers: Vec<f32> = numbers.iter().map(|b| f32::from_le_bytes(*b)).collect();
-        let (Some((intrinsics, rows)), []) = (numbers.split_first_chunk::<4>(), rest) else {
-            return Err(format!("camera: expected 64 bytes, got {}", bytes.len()));
-        };
-        let (rows, []) = rows.as_chunks::<4>() else {
-            return Err(format!("camera: expected 64 bytes, got {}", bytes.len()));
-        };
-        let &[x, y, z] = rows else {
-            return Err(format!("camera: expected 64 bytes, got {}", bytes.len()));
-        };
-        let [x, y, z] = [x, y, z].map(Vec4::from_array);
-        let world_from_camera = Mat4::from_cols(x, y, z, Vec4::W).transpose();
-        Ok(Self { intrinsics: *intrinsics, world_from_camera })
-    }
 }
 
 /// Splits the input into a name and a file.
@@ -128,23 +99,6 @@ impl Session {
         self.describe()
     }
 
-    pub(crate) fn open_scene(
-        &mut self,
-        input: &[u8],
-        name_length: usize,
-    ) -> Result<Vec<u8>, String> {
-        let (name, file) = named(input, name_length)?;
-        let (splats, comments) = parse_splats(file, name).map_err(|e| e.to_string())?;
-        self.scene = Some(Scene {
-            splats,
-            options: RasterOptions::default(),
-            comments,
-            cameras: Vec::new(),
-            warnings: Vec::new(),
-        });
-        self.describe()
-    }
-
     fn scene(&self) -> Result<&Scene, String> {
         self.scene.as_ref().ok_or_else(|| "there is no scene yet".to_owned())
     }
@@ -174,24 +128,6 @@ impl Session {
             .ok_or_else(|| format!("expected ply, spz, glb or splat, got {extension:?}"))?;
         let options = SaveOptions { comments: scene.comments.clone(), ..SaveOptions::default() };
         encode_splats(format, &scene.splats, &options).map_err(|e| e.to_string())
-    }
-
-    pub(crate) fn render(
-        &self,
-        pose: &Pose,
-        width: usize,
-        height: usize,
-    ) -> Result<Vec<u8>, String> {
-        let scene = self.scene()?;
-        if width.checked_mul(height).is_none_or(|n| n > PIXELS_MAX) {
-            return Err(format!("expected at most {PIXELS_MAX} pixels, got {width}x{height}"));
-        }
-        let [fx, fy, cx, cy] = pose.intrinsics;
-        let intrinsics = Intrinsics { fx, fy, cx, cy, width, height };
-        let camera = Camera::new(intrinsics, pose.world_from_camera).map_err(|e| e.to_string())?;
-        let picture = Rgb::from(&render(&scene.splats, &camera, &scene.options));
-        let (pixels, _) = picture.data.as_chunks::<3>();
-        Ok(pixels.iter().flat_map(|&[r, g, b]| [r, g, b, 255]).collect())
     }
 }
 
