@@ -155,5 +155,5 @@ fn a_second_run_leaves_no_picture_of_the_first() {
     assert!(!out.join("scene.splat").exists());
     let ply = std::fs::read(out.join("scene.ply")).unwrap();
     let head = String::from_utf8_lossy(&ply[..2000]).into_owned();
-    assert!(!head.contains("f_rest") && head.contains("f_dc_2"), "--sh 0");
+    assert!(!head.contains("float f_rest") && head.contains("f_dc_2"), "--sh 0");
 }
