@@ -84,6 +84,7 @@ pub mod backend;
 pub mod camera;
 #[cfg(feature = "internals")]
 pub mod check;
+mod clock;
 #[cfg(feature = "internals")]
 pub mod config;
 #[cfg(feature = "internals")]
@@ -206,7 +207,8 @@ pub use io::photograph::{
 };
 pub use io::scene::{Frame, LoadedFrame, Pixels, Scene, SceneFormat, Units, load_scene};
 pub use io::{
-    Error as FileError, SaveOptions, SaveReport, SplatFormat, Up, load_splats, save_splats,
+    Error as FileError, SaveOptions, SaveReport, SplatFormat, Up, encode_splats, load_splats,
+    parse_splats, save_splats,
 };
 pub use metrics::{MetricsError, psnr, ssim};
 pub use navigation::{Bounds, Mode, Navigator, Pace, Start};

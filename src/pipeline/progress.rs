@@ -1,12 +1,12 @@
 //! Progress of a reconstruction: stages, fractions, times, cancellation.
 
 use super::{Error, Result};
+use crate::clock::Instant;
 use crate::model::trace::Checkpoint;
 use std::fmt;
 use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc;
-use std::time::Instant;
 
 /// A stage of a reconstruction, in the order of execution. [`fmt::Display`] gives its name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -154,8 +154,8 @@ impl Tracker {
 
     /// Runs `work` on a thread of rayon's pool, where parallel calls start without a wake-up, and
     /// reports its steps. `work` calls its checkpoint after each of about `steps` steps, on any
-    /// thread; the callback runs on this thread. On a thread of the pool `work` runs without
-    /// reports, because waiting for them would hold up the pool.
+    /// thread; the callback runs on this thread. On a thread of the pool, and on WebAssembly, which
+    /// has one thread, `work` runs without reports, because waiting for them would hold up the pool.
     ///
     /// # Errors
     /// [`Error::Cancelled`]; those of `work`.
@@ -165,7 +165,7 @@ impl Tracker {
         callback: &mut Callback<'_>,
         work: impl FnOnce(Checkpoint<'_>) -> candle_core::Result<T> + Send,
     ) -> Result<T> {
-        if rayon::current_thread_index().is_some() {
+        if cfg!(target_family = "wasm") || rayon::current_thread_index().is_some() {
             return Ok(work(&|| Ok(()))?);
         }
         let cancelled = AtomicBool::new(false);

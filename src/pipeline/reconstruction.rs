@@ -10,7 +10,7 @@ use crate::io::image::Depth;
 use crate::io::{SaveOptions, SaveReport, save_splats};
 use crate::poses::PoseAdjustment;
 use crate::refine::{RefineReport, Refiner};
-use crate::render::{Picture, Renderer, comment_of_options, render};
+use crate::render::{Picture, Renderer, comment_of_camera, comment_of_options, render};
 use crate::splats::Splats;
 use std::ops::ControlFlow;
 use std::path::Path;
@@ -41,14 +41,21 @@ impl Reconstruction {
         render(&self.splats, camera, &self.raster_options)
     }
 
-    /// Writes the Gaussians to a .ply, .glb, .spz or .splat file. A comment in .ply and .glb
-    /// states the rules to render them.
+    /// Writes the Gaussians to a .ply, .glb, .spz or .splat file. Comments in .ply and .glb state
+    /// the rules to render them and a first camera.
     ///
     /// # Errors
     /// Those of [`save_splats`].
     pub fn save(&self, path: &Path) -> Result<SaveReport> {
-        let comments = vec![comment_of_options(&self.raster_options)];
+        let comments = self.comments();
         Ok(save_splats(path, &self.splats, &SaveOptions { comments, ..SaveOptions::default() })?)
+    }
+
+    /// The rules to render the Gaussians and the first photograph's camera, as lines for a scene
+    /// file ([`SaveOptions::comments`](crate::SaveOptions)).
+    pub fn comments(&self) -> Vec<String> {
+        let camera = self.inputs.first().map(|c| comment_of_camera(&c.target_camera));
+        std::iter::once(comment_of_options(&self.raster_options)).chain(camera).collect()
     }
 
     /// The Gaussians.

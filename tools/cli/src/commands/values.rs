@@ -55,9 +55,19 @@ pub fn refine(text: &str) -> Result<Refine, String> {
     length.map_err(|e| format!("expected auto, off, steps or 20s: {}", &e["expected ".len()..]))
 }
 
+/// Parses frames a second; a GIF counts hundredths of a second.
+pub fn rate(text: &str) -> Result<u32, String> {
+    whole(text, 1, 100).map(|n| n as u32)
+}
+
 /// Parses an SH degree.
 pub fn sh_degree(text: &str) -> Result<usize, String> {
     whole(text, 0, 4)
+}
+
+/// Parses the SH degree of a file.
+pub fn file_sh_degree(text: &str) -> Result<usize, String> {
+    whole(text, 0, 3)
 }
 
 /// Parses a number above 0.

@@ -2,6 +2,7 @@
 //! reconstructed again with another number of children.
 
 use crate::commands::args_view::ViewArgs;
+use crate::commands::frames::DepthSpread;
 use crate::commands::reconstruct::{self, reconstruct};
 use crate::commands::{info, memory, model, pair, render, run};
 use crate::report::{Progress, print_line, print_warning};
@@ -13,6 +14,7 @@ use std::time::{Duration, Instant};
 use subsplat::abi::RasterOptions;
 use subsplat::io::{SplatFormat, load_with_comments};
 use subsplat::navigation::{Start, up_of};
+use subsplat::render::camera_of_comments;
 use subsplat::splats::Splats;
 use subsplat::{Check, Options, Photo, Reconstruction, Reconstructor, Refine, Refiner, Renderer};
 
@@ -92,7 +94,10 @@ fn finished(args: &ViewArgs, path: &Path, progress: &mut Progress) -> Result<Sou
     let cameras = match &args.cameras {
         Some(source) => render::read_cameras(source)?,
         None if beside.is_file() => render::read_cameras(&beside)?,
-        None => vec![(String::new(), render::whole(&splats)?)],
+        None => {
+            let own = camera_of_comments(&comments);
+            vec![(String::new(), own.map_or_else(|| render::whole(&splats), Ok)?)]
+        }
     };
     let Some((_, home)) = cameras.first() else {
         let source = args.cameras.as_ref().unwrap_or(&beside);
@@ -101,7 +106,7 @@ fn finished(args: &ViewArgs, path: &Path, progress: &mut Progress) -> Result<Sou
     let start = Start {
         home: *home,
         up: up_of(cameras.iter().map(|(_, c)| c)),
-        distance: render::median_depth(&splats, home),
+        distance: render::depths(&splats, home).middle,
         radius: render::bounds(&splats)?.radius(),
     };
     let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
@@ -137,7 +142,7 @@ fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     let start = Start {
         home: input.target_camera,
         up: up_of(cameras.iter()),
-        distance: run::median(&depth.data),
+        distance: DepthSpread::of(depth.data.iter().copied()).middle,
         radius: render::bounds(result.splats())?.radius(),
     };
     let photographs = Photographs {
