@@ -87,6 +87,7 @@ pub mod backend;
 pub mod camera;
 #[cfg(feature = "internals")]
 pub mod check;
+mod clock;
 #[cfg(feature = "internals")]
 pub mod config;
 #[cfg(feature = "internals")]
@@ -209,7 +210,8 @@ pub use io::photograph::{
 };
 pub use io::scene::{Frame, LoadedFrame, Pixels, Scene, SceneFormat, Units, load_scene};
 pub use io::{
-    Error as FileError, SaveOptions, SaveReport, SplatFormat, Up, load_splats, save_splats,
+    Error as FileError, SaveOptions, SaveReport, SplatFormat, Up, encode_splats, load_splats,
+    parse_splats, save_splats,
 };
 pub use metrics::{MetricsError, psnr, ssim};
 pub use navigation::{Bounds, Mode, Navigator, Pace, Start};
@@ -218,13 +220,13 @@ pub use ops::{SplatTensors, rasterize_splats as rasterize};
 #[cfg(feature = "network")]
 pub use pipeline::{
     Check, DepthBounds, DepthRange, DepthSource, Detail, Error, InputSize, KnownLens, LensSource,
-    LooseOptions, LoosePhotos, LooseScene, Options, Photo, PoseError, Prepared, Progress,
+    LooseOptions, LoosePhotos, LooseScene, Options, Photo, PoseError, Poses, Prepared, Progress,
     Reconstruction, Reconstructor, Refine, Result, Stage, StageTime, Warning, loose_photos,
     loose_scene,
 };
 pub use poses::{
-    Confidence, FocalEstimate, LeftOut, Lens, PoseEstimate, PoseOptions, PosePhoto, PosePhotoError,
-    PosePoint, PoseRefusal, PoseWarning, estimate_poses,
+    Confidence, FocalEstimate, LeftOut, Lens, PoseAdjustment, PoseEstimate, PoseOptions, PosePhoto,
+    PosePhotoError, PosePoint, PoseRefusal, PoseWarning, adjust_poses, estimate_poses,
 };
 pub use refine::{RefineOptions, RefineReport, Refiner, refine};
 pub use render::{Picture, Renderer, render};

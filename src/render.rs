@@ -4,7 +4,10 @@ mod comment;
 mod device;
 mod image;
 
-pub use comment::{comment_of_options, options_of_comments};
+pub use comment::{
+    camera_of_comments, comment_of_camera, comment_of_options, comments_without_camera,
+    options_of_comments,
+};
 pub use device::{DeviceError, Renderer};
 
 use crate::abi::{RasterOptions, Rendered};

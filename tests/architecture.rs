@@ -9,13 +9,14 @@ use std::path::{Path, PathBuf};
 /// below compares this table with the one in ARCHITECTURE.md.
 const IMPORTS: &[(&str, &[&str])] = &[
     ("abi", &["camera"]),
+    ("clock", &[]),
     ("metrics", &[]),
     ("camera", &[]),
     ("sh", &["abi"]),
     ("config", &["abi"]),
     ("splats", &["abi", "camera", "sh"]),
     ("navigation", &["camera"]),
-    ("cpu", &["abi", "camera", "sh"]),
+    ("cpu", &["abi", "camera", "clock", "sh"]),
     ("device", &[]),
     ("gpu", &["abi", "camera", "device"]),
     ("backend", &["device", "gpu"]),
@@ -33,8 +34,8 @@ const IMPORTS: &[(&str, &[&str])] = &[
     (
         "pipeline",
         &[
-            "abi", "camera", "check", "config", "cpu", "data", "fit", "io", "metrics", "model",
-            "poses", "refine", "render", "sh", "splats",
+            "abi", "camera", "check", "clock", "config", "cpu", "data", "fit", "io", "metrics",
+            "model", "poses", "refine", "render", "sh", "splats",
         ],
     ),
     (
@@ -44,10 +45,17 @@ const IMPORTS: &[(&str, &[&str])] = &[
             "render", "splats",
         ],
     ),
-    ("train", &["abi", "camera", "config", "cpu", "data", "io", "loss", "metrics", "model", "ops"]),
+    (
+        "train",
+        &[
+            "abi", "camera", "clock", "config", "cpu", "data", "io", "loss", "metrics", "model",
+            "ops",
+        ],
+    ),
 ];
 
 const TOP_LEVEL: &[&str] = &[
+    ".cargo",
     ".ci",
     ".git",
     ".gitignore",

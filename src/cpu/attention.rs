@@ -151,7 +151,7 @@ pub fn backward(a: &Attention, s: &Saved<'_>) -> (Vec<f32>, Vec<f32>, Vec<f32>) 
     let mut dq = vec![0f32; s.q.len()];
     let mut dk = vec![0f32; s.k.len()];
     let mut dv = vec![0f32; s.v.len()];
-    if l * m * d * e == 0 {
+    if [l, m, d, e].contains(&0) {
         return (dq, dk, dv);
     }
     let grads = dq

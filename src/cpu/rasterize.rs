@@ -14,6 +14,7 @@ pub use crate::abi::Rendered;
 
 use crate::abi::{BLOCK, RasterOptions, TILE};
 use crate::camera::Camera;
+use crate::clock::Instant;
 use crate::cpu::blend::{BLOCKS, RenderTile, Rules, Tile, Workplace};
 use crate::cpu::ewa::{Footprint, View};
 use crate::cpu::project::{Projection, SplatSlices};
@@ -25,7 +26,7 @@ use crate::cpu::tiles::{Grid, TileLists};
 use rayon::prelude::*;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering::Relaxed};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 /// Counts and times of the last frame.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

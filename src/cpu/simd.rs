@@ -21,7 +21,10 @@
 //! slower.
 
 // Tests compare the vectors of every target with arrays.
-#[cfg(any(not(target_arch = "x86_64"), test))]
+#[cfg(any(
+    not(any(target_arch = "x86_64", all(target_arch = "wasm32", target_feature = "simd128"))),
+    test
+))]
 mod array;
 #[cfg(target_arch = "x86_64")]
 mod avx2;
@@ -32,6 +35,8 @@ mod lanes16;
 mod level;
 mod real;
 mod rows;
+#[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
+mod simd128;
 #[cfg(target_arch = "x86_64")]
 mod sse2;
 #[cfg(test)]

@@ -381,6 +381,21 @@ impl Incoming {
         self.sh.get_mut(i * set..(i + 1) * set)
     }
 
+    /// Raises the SH degree to `degree`, with zeros in the Gaussians so far.
+    pub fn raise_degree(&mut self, degree: usize) {
+        if degree <= self.sh_degree {
+            return;
+        }
+        let [before, after] = [self.sh_degree, degree].map(|d| 3 * sh_coefficients(d));
+        let count = self.rows.capacity() / SPLAT_STRIDE;
+        let mut raised = Vec::with_capacity(count * after);
+        for set in self.sh.chunks_exact(before) {
+            raised.extend_from_slice(set);
+            raised.resize(raised.len() + after - before, 0.0);
+        }
+        (self.sh, self.sh_degree) = (raised, degree);
+    }
+
     /// Makes a set of all Gaussians. Their numbers may be NaN or infinite.
     pub fn into_splats(self, path: &Path) -> Result<Splats> {
         let Self { rows, sh, sh_degree } = self;

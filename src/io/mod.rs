@@ -18,8 +18,8 @@ pub mod splats;
 pub mod spz;
 
 pub use splats::{
-    SaveOptions, SaveReport, SplatFormat, SplatInfo, Up, load_splats, load_with_comments,
-    save_splats, splat_info,
+    SaveOptions, SaveReport, SplatFormat, SplatInfo, Up, encode_splats, encode_splats_with,
+    load_splats, load_with_comments, parse_splats, save_splats, splat_info,
 };
 mod assemble;
 pub mod cameras_json;

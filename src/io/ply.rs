@@ -4,8 +4,8 @@
 //! `f_dc_0..2`, `f_rest_*` channel-major (all of R, then G, then B), `opacity` before
 //! the sigmoid, `scale_0..2` = ln σ, `rot_0..3` = wxyz. World frame throughout.
 //!
-//! SH degree: 3 by default, since viewers expect at most 45 `f_rest`; the network's degree 4
-//! is dropped. Gains and residuals of children are folded into their coefficients
+//! SH degree: 3 by default, since viewers expect 45 `f_rest`: lower degrees are padded with
+//! zeros, which the reader drops again, and the network's degree 4 is dropped. Gains and residuals of children are folded into their coefficients
 //! (`gaussians.rs`).
 //!
 //! The reader accepts ascii and both byte orders, any property order and number type, 0, 9,
@@ -70,7 +70,6 @@ struct Layout {
     /// Divisor to [0, 1] where `red green blue` stand in place of `f_dc`.
     colour_range: Option<f64>,
     rest: Vec<usize>,
-    sh_degree: usize,
 }
 
 impl Layout {
@@ -107,24 +106,24 @@ impl Layout {
         let named = element.properties.iter().filter(|p| is_rest(&p.name)).count();
         let rest: Vec<usize> =
             (0..named).map_while(|i| element.position(&format!("f_rest_{i}"))).collect();
-        match REST_COUNTS.iter().position(|&n| n == named && n == rest.len()) {
-            Some(sh_degree) => {
-                Ok(Self { mean, scale, quat, opacity, dc, colour_range, rest, sh_degree })
-            }
-            None => {
-                let got = format!("{named}, of which {} in sequence", rest.len());
-                Err(Error::format(path, "0, 9, 24, 45 or 72 properties f_rest_0, …", got))
-            }
+        if !REST_COUNTS.contains(&named) || named != rest.len() {
+            let got = format!("{named}, of which {} in sequence", rest.len());
+            return Err(Error::format(path, "0, 9, 24, 45 or 72 properties f_rest_0, …", got));
         }
+        Ok(Self { mean, scale, quat, opacity, dc, colour_range, rest })
     }
 }
 
 fn read_vertices(header: &Header, element: &Element, source: &mut Source) -> Result<Incoming> {
     let layout = Layout::of(element, source.path)?;
-    let mut incoming =
-        Incoming::with_capacity(header.checked_count(element, source)?, layout.sh_degree);
+    let mut incoming = Incoming::with_capacity(header.checked_count(element, source)?, 0);
     let mut rest = vec![0.0f32; layout.rest.len()];
     header.rows(element, source, |_, v| {
+        for (r, &i) in rest.iter_mut().zip(&layout.rest) {
+            *r = v[i] as f32;
+        }
+        // Degrees that are zero in every row take no memory and no time.
+        incoming.raise_degree(used_degree(&rest));
         let sh = incoming.push(
             layout.mean.map(|i| v[i] as f32),
             layout.quat.map(|i| v[i] as f32),
@@ -137,13 +136,17 @@ fn read_vertices(header: &Header, element: &Element, source: &mut Source) -> Res
                 Some(range) => dc_from_colour(v[i] / range),
             };
         }
-        for (r, &i) in rest.iter_mut().zip(&layout.rest) {
-            *r = v[i] as f32;
-        }
         rest_to_set(&rest, sh);
         Ok(())
     })?;
     Ok(incoming)
+}
+
+/// Lowest SH degree that holds all of channel-major `f_rest` that is not zero.
+fn used_degree(rest: &[f32]) -> usize {
+    let per_channel = rest.len() / 3;
+    let last = (0..per_channel).rev().find(|j| (0..3).any(|c| rest[c * per_channel + j] != 0.0));
+    last.map_or(0, |j| (j + 1).isqrt())
 }
 
 /// Writes channel-major `f_rest[3, D − 1]` to a set `[D, 3]` after its constant term.
@@ -162,7 +165,9 @@ pub(super) fn write(
     out: &Outgoing,
     options: &SaveOptions,
 ) -> std::io::Result<()> {
-    let rests = REST_COUNTS[out.sh_degree];
+    // Readers assert the 45 values of degree 3, so a lower degree is padded with zeros unless the
+    // caller asks for it.
+    let rests = REST_COUNTS[out.sh_degree.max(options.sh_degree.unwrap_or(3).min(3))];
     file.write_all(header(out.count, rests, options).as_bytes())?;
     let mut block = Vec::with_capacity(BLOCK * 4 * (17 + rests));
     let mut visitor = out.visitor();

@@ -20,7 +20,7 @@ use crate::splats::Splats;
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 use std::fs::File;
-use std::io::{BufReader, Read};
+use std::io::{BufReader, Cursor, Read, Seek, Write};
 use std::path::Path;
 use std::str::FromStr;
 
@@ -167,13 +167,7 @@ fn decode(path: &Path) -> Result<(SplatFormat, Decoded, u64)> {
     let metadata = file.metadata().map_err(io)?;
     let mut head = Vec::new();
     Read::take(&mut file, 4).read_to_end(&mut head).map_err(io)?;
-    if head.starts_with(b"PK\x03\x04") {
-        let got = "a zip archive (.sog?): `npx @playcanvas/splat-transform` converts it to .ply";
-        return Err(Error::format(path, KNOWN, got));
-    }
-    let format = SplatFormat::from_magic(&head)
-        .or_else(|| SplatFormat::from_name(path))
-        .ok_or_else(|| Error::format(path, KNOWN, format!("first bytes {head:02x?}")))?;
+    let format = format_of(&head, path)?;
     // The largest files are .ply: they are streamed, where the size is known.
     if format == SplatFormat::Ply && metadata.is_file() {
         let mut reader = BufReader::with_capacity(1 << 16, File::open(path).map_err(io)?);
@@ -186,14 +180,40 @@ fn decode(path: &Path) -> Result<(SplatFormat, Decoded, u64)> {
     } else {
         file.read_to_end(&mut bytes).map_err(io)?;
     }
-    let decoded = match format {
-        SplatFormat::Ply => ply::decode(&mut bytes.as_slice(), bytes.len() as u64, path),
-        SplatFormat::Glb => glb_read::decode(&bytes, path),
-        SplatFormat::Spz => spz::decode(&bytes, path),
-        SplatFormat::Splat => splat::decode(&bytes, path),
-        SplatFormat::Ksplat => ksplat::decode(&bytes, path),
-    }?;
-    Ok((format, decoded, bytes.len() as u64))
+    Ok((format, decode_bytes(format, &bytes, path)?, bytes.len() as u64))
+}
+
+/// Detects the format of a file by its first bytes, else by its name.
+fn format_of(head: &[u8], path: &Path) -> Result<SplatFormat> {
+    if head.starts_with(b"PK\x03\x04") {
+        let got = "a zip archive (.sog?): `npx @playcanvas/splat-transform` converts it to .ply";
+        return Err(Error::format(path, KNOWN, got));
+    }
+    let head = &head[..head.len().min(4)];
+    SplatFormat::from_magic(head)
+        .or_else(|| SplatFormat::from_name(path))
+        .ok_or_else(|| Error::format(path, KNOWN, format!("first bytes {head:02x?}")))
+}
+
+fn decode_bytes(format: SplatFormat, bytes: &[u8], path: &Path) -> Result<Decoded> {
+    match format {
+        SplatFormat::Ply => ply::decode(&mut { bytes }, bytes.len() as u64, path),
+        SplatFormat::Glb => glb_read::decode(bytes, path),
+        SplatFormat::Spz => spz::decode(bytes, path),
+        SplatFormat::Splat => splat::decode(bytes, path),
+        SplatFormat::Ksplat => ksplat::decode(bytes, path),
+    }
+}
+
+/// Reads a splat file in memory and its comments ([`SaveOptions::comments`]). `name` is for errors,
+/// and gives the format of a file without a magic number.
+///
+/// # Errors
+/// As [`load_splats`].
+pub fn parse_splats(bytes: &[u8], name: &Path) -> Result<(Splats, Vec<String>)> {
+    let decoded = decode_bytes(format_of(bytes, name)?, bytes, name)?;
+    check_finite(&decoded.splats, name)?;
+    Ok((decoded.splats, decoded.comments))
 }
 
 /// Writes a splat file in the format of its extension, atomically.
@@ -211,39 +231,105 @@ pub fn save_splats(path: &Path, splats: &Splats, options: &SaveOptions) -> Resul
         .ok_or_else(|| {
             Error::format(path, "a name that ends in .ply, .glb, .spz or .splat", name.clone())
         })?;
-    let survey = |rotation, limit| Outgoing::new(splats, options, rotation, limit, path);
-    let rotation = options.up.rotation();
-    let out = match format {
-        SplatFormat::Ply => survey(rotation, 4)?,
-        SplatFormat::Glb => survey(rotation, glb::SH_DEGREE_MAX)?,
-        SplatFormat::Splat => survey(rotation, 0)?,
-        SplatFormat::Spz | SplatFormat::Ksplat if options.up == Up::Z => {
-            return Err(Error::format(path, "up keep or y (.spz is y-up by definition)", "z"));
-        }
-        SplatFormat::Spz | SplatFormat::Ksplat => survey(Some(HALF_TURN_X), 3)?,
-    };
-    match format {
-        SplatFormat::Ply => write_atomic(path, |f| ply::write(f, &out, options))?,
-        SplatFormat::Glb => {
-            let plan = glb::Plan::new(&out, options.up, &options.comments, path)?;
-            write_atomic(path, |f| plan.write(f, &out))?;
-        }
-        SplatFormat::Splat => write_atomic(path, |f| splat::write(f, &out))?,
-        SplatFormat::Spz | SplatFormat::Ksplat => {
-            let bits = spz::fraction_bits(&out, path)?;
-            write_atomic(path, |f| spz::write(f, &out, bits))?;
+    let plan = Plan::new(format, splats, options, path)?;
+    write_atomic(path, |f| plan.write(f, options))?;
+    let bytes = std::fs::metadata(path).map_err(|e| Error::io(path, e))?.len();
+    Ok(plan.report(splats, bytes))
+}
+
+/// Writes a splat file into memory, as [`save_splats`] writes one of `format`.
+///
+/// # Errors
+/// Those of [`save_splats`]; a format that is read only.
+pub fn encode_splats(
+    format: SplatFormat,
+    splats: &Splats,
+    options: &SaveOptions,
+) -> Result<Vec<u8>> {
+    Ok(encode_splats_with(format, splats, options, Path::new("scene"))?.0)
+}
+
+/// [`encode_splats`] with the report of [`save_splats`]; `name` is for errors.
+///
+/// # Errors
+/// Those of [`encode_splats`].
+pub fn encode_splats_with(
+    format: SplatFormat,
+    splats: &Splats,
+    options: &SaveOptions,
+    name: &Path,
+) -> Result<(Vec<u8>, SaveReport)> {
+    if format == SplatFormat::Ksplat {
+        return Err(Error::format(name, "a format that is written", "ksplat"));
+    }
+    let mut bytes = Cursor::new(Vec::new());
+    let plan = Plan::new(format, splats, options, name)?;
+    plan.write(&mut bytes, options).map_err(|e| Error::io(name, e))?;
+    let bytes = bytes.into_inner();
+    let report = plan.report(splats, bytes.len() as u64);
+    Ok((bytes, report))
+}
+
+/// A file before its first byte is written.
+struct Plan<'a> {
+    format: SplatFormat,
+    out: Outgoing<'a>,
+    glb: Option<glb::Plan>,
+    /// Fractional bits of coordinates in .spz.
+    fraction_bits: u32,
+}
+
+impl<'a> Plan<'a> {
+    fn new(
+        format: SplatFormat,
+        splats: &'a Splats,
+        options: &SaveOptions,
+        path: &Path,
+    ) -> Result<Self> {
+        let survey = |rotation, limit| Outgoing::new(splats, options, rotation, limit, path);
+        let rotation = options.up.rotation();
+        let out = match format {
+            SplatFormat::Ply => survey(rotation, 4)?,
+            SplatFormat::Glb => survey(rotation, glb::SH_DEGREE_MAX)?,
+            SplatFormat::Splat => survey(rotation, 0)?,
+            SplatFormat::Spz | SplatFormat::Ksplat if options.up == Up::Z => {
+                return Err(Error::format(path, "up keep or y (.spz is y-up by definition)", "z"));
+            }
+            SplatFormat::Spz | SplatFormat::Ksplat => survey(Some(HALF_TURN_X), 3)?,
+        };
+        let glb = match format {
+            SplatFormat::Glb => Some(glb::Plan::new(&out, options.up, &options.comments, path)?),
+            _ => None,
+        };
+        let fraction_bits = match format {
+            SplatFormat::Spz => spz::fraction_bits(&out, path)?,
+            _ => 0,
+        };
+        Ok(Self { format, out, glb, fraction_bits })
+    }
+
+    fn write<F: Write + Seek>(&self, f: &mut F, options: &SaveOptions) -> std::io::Result<()> {
+        match (self.format, &self.glb) {
+            (_, Some(glb)) => glb.write(f, &self.out),
+            (SplatFormat::Ply | SplatFormat::Glb, None) => ply::write(f, &self.out, options),
+            (SplatFormat::Splat, None) => splat::write(f, &self.out),
+            (SplatFormat::Spz | SplatFormat::Ksplat, None) => {
+                spz::write(f, &self.out, self.fraction_bits)
+            }
         }
     }
-    let bytes = std::fs::metadata(path).map_err(|e| Error::io(path, e))?.len();
-    Ok(SaveReport {
-        format,
-        count: out.count,
-        pruned: out.pruned,
-        sh_degree: out.sh_degree,
-        stored_sh_degree: splats.sh_degree,
-        clamped_scales: out.clamped_scales,
-        bytes,
-    })
+
+    fn report(&self, splats: &Splats, bytes: u64) -> SaveReport {
+        SaveReport {
+            format: self.format,
+            count: self.out.count,
+            pruned: self.out.pruned,
+            sh_degree: self.out.sh_degree,
+            stored_sh_degree: splats.sh_degree,
+            clamped_scales: self.out.clamped_scales,
+            bytes,
+        }
+    }
 }
 
 /// Description of a splat file.

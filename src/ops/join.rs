@@ -16,7 +16,7 @@ const NAME: &str = "join";
 /// Shapes that do not fit; a dtype other than f32.
 pub fn join(fine: &Tensor, coarse: &Tensor, s: usize) -> Result<Tensor> {
     let ((b, c1, h, w), (cb, c2, ch, cw)) = (fine.dims4()?, coarse.dims4()?);
-    if cb != b || s == 0 || [s * ch, s * cw] != [h, w] || h * w * c1 * c2 == 0 {
+    if cb != b || s == 0 || [s * ch, s * cw] != [h, w] || [h, w, c1, c2].contains(&0) {
         bail!(
             "{NAME}: expected [B, C, {s}·h, {s}·w] and [B, C', h, w], got {:?} and {:?}",
             fine.dims(),

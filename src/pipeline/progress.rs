@@ -1,17 +1,19 @@
 //! Progress of a reconstruction: stages, fractions, times, cancellation.
 
 use super::{Error, Result};
+use crate::clock::Instant;
 use crate::model::trace::Checkpoint;
 use std::fmt;
 use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc;
-use std::time::Instant;
 
 /// A stage of a reconstruction, in the order of execution. [`fmt::Display`] gives its name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[non_exhaustive]
 pub enum Stage {
+    /// Given cameras are adjusted by matched points.
+    Poses,
     /// Photographs are cropped and resized.
     Crop,
     /// Points are matched between photographs.
@@ -36,6 +38,7 @@ impl Stage {
     /// The name in reports: `crop`, `depth range`, ….
     pub fn name(self) -> &'static str {
         match self {
+            Self::Poses => "poses",
             Self::Crop => "crop",
             Self::Check => "check",
             Self::DepthRange => "depth range",
@@ -122,13 +125,12 @@ impl Tracker {
         self.advance(0.0, callback)
     }
 
-    /// A callback for the current stage that receives the number of steps done of `steps`.
-    pub(super) fn steps<'a>(
+    /// A callback for the current stage that receives the part of it that is done, 0 to 1.
+    pub(super) fn parts<'a>(
         &'a mut self,
-        steps: usize,
         callback: &'a mut Callback<'_>,
-    ) -> impl FnMut(usize) -> ControlFlow<()> + 'a {
-        move |step| match self.advance(step as f32 / steps as f32, callback) {
+    ) -> impl FnMut(f32) -> ControlFlow<()> + 'a {
+        move |part| match self.advance(part, callback) {
             Ok(()) => ControlFlow::Continue(()),
             Err(_) => ControlFlow::Break(()),
         }
@@ -152,8 +154,8 @@ impl Tracker {
 
     /// Runs `work` on a thread of rayon's pool, where parallel calls start without a wake-up, and
     /// reports its steps. `work` calls its checkpoint after each of about `steps` steps, on any
-    /// thread; the callback runs on this thread. On a thread of the pool `work` runs without
-    /// reports, because waiting for them would hold up the pool.
+    /// thread; the callback runs on this thread. On a thread of the pool, and on WebAssembly, which
+    /// has one thread, `work` runs without reports, because waiting for them would hold up the pool.
     ///
     /// # Errors
     /// [`Error::Cancelled`]; those of `work`.
@@ -163,7 +165,7 @@ impl Tracker {
         callback: &mut Callback<'_>,
         work: impl FnOnce(Checkpoint<'_>) -> candle_core::Result<T> + Send,
     ) -> Result<T> {
-        if rayon::current_thread_index().is_some() {
+        if cfg!(target_family = "wasm") || rayon::current_thread_index().is_some() {
             return Ok(work(&|| Ok(()))?);
         }
         let cancelled = AtomicBool::new(false);

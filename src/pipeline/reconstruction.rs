@@ -1,6 +1,6 @@
 //! A reconstructed scene.
 
-use super::{DepthBounds, Detail, Result, StageTime, Warning};
+use super::{DepthBounds, Detail, Refine, Result, StageTime, Warning, refine_on_inputs};
 use crate::abi::RasterOptions;
 use crate::camera::Camera;
 use crate::check::PairReport;
@@ -8,9 +8,11 @@ use crate::data::crop::Cropped;
 use crate::fit::FitReport;
 use crate::io::image::Depth;
 use crate::io::{SaveOptions, SaveReport, save_splats};
-use crate::refine::RefineReport;
-use crate::render::{Picture, comment_of_options, render};
+use crate::poses::PoseAdjustment;
+use crate::refine::{RefineReport, Refiner};
+use crate::render::{Picture, Renderer, comment_of_camera, comment_of_options, render};
 use crate::splats::Splats;
+use std::ops::ControlFlow;
 use std::path::Path;
 
 /// A reconstructed scene: Gaussians, the rules to render them, and a record of how they were
@@ -19,6 +21,7 @@ use std::path::Path;
 pub struct Reconstruction {
     pub(super) splats: Splats,
     pub(super) inputs: Vec<Cropped>,
+    pub(super) adjustment: Option<PoseAdjustment>,
     pub(super) cut_shares: Vec<f32>,
     pub(super) depths: Vec<Depth>,
     pub(super) bounds: DepthBounds,
@@ -38,14 +41,21 @@ impl Reconstruction {
         render(&self.splats, camera, &self.raster_options)
     }
 
-    /// Writes the Gaussians to a .ply, .glb, .spz or .splat file. A comment in .ply and .glb
-    /// states the rules to render them.
+    /// Writes the Gaussians to a .ply, .glb, .spz or .splat file. Comments in .ply and .glb state
+    /// the rules to render them and a first camera.
     ///
     /// # Errors
     /// Those of [`save_splats`].
     pub fn save(&self, path: &Path) -> Result<SaveReport> {
-        let comments = vec![comment_of_options(&self.raster_options)];
+        let comments = self.comments();
         Ok(save_splats(path, &self.splats, &SaveOptions { comments, ..SaveOptions::default() })?)
+    }
+
+    /// The rules to render the Gaussians and the first photograph's camera, as lines for a scene
+    /// file ([`SaveOptions::comments`](crate::SaveOptions)).
+    pub fn comments(&self) -> Vec<String> {
+        let camera = self.inputs.first().map(|c| comment_of_camera(&c.target_camera));
+        std::iter::once(comment_of_options(&self.raster_options)).chain(camera).collect()
     }
 
     /// The Gaussians.
@@ -59,6 +69,26 @@ impl Reconstruction {
         &mut self.splats
     }
 
+    /// Refines the Gaussians on the photographs, as [`Options::refine`](super::Options::refine) does
+    /// within a run, for a caller that shows the scene first. `progress` receives the refinement
+    /// after each step; [`Refiner::splats`] returns the Gaussians so far.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](super::Error::Cancelled); the Gaussians are then unchanged.
+    pub fn refine(
+        &mut self,
+        refine: Refine,
+        renderer: &mut Renderer,
+        progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
+    ) -> Result<RefineReport> {
+        let Self { splats, inputs, raster_options, fit, .. } = self;
+        let options = refine.options_for(inputs.len(), splats.len(), fit.is_some());
+        let report =
+            refine_on_inputs(splats, inputs, raster_options, &options, renderer, progress)?;
+        self.refinement = Some(report);
+        Ok(report)
+    }
+
     /// The Gaussians alone.
     pub fn into_splats(self) -> Splats {
         self.splats
@@ -67,6 +97,12 @@ impl Reconstruction {
     /// The photographs at the sizes of the network's input and of the target.
     pub fn inputs(&self) -> &[Cropped] {
         &self.inputs
+    }
+
+    /// Change of the given cameras ([`Poses::Adjusted`](super::Poses::Adjusted)); `None` where they
+    /// stayed. [`Reconstruction::inputs`] has the adjusted ones.
+    pub fn pose_adjustment(&self) -> Option<&PoseAdjustment> {
+        self.adjustment.as_ref()
     }
 
     /// Share of each photograph that its crop does not show, 0 to 1.

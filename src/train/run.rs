@@ -9,6 +9,7 @@ use super::source::{Replay, Source};
 use super::step::{Learner, Seconds, StepScale, Terms};
 use super::validate::{self, Found, Split, Validator};
 use super::{Error, Result};
+use crate::clock::Instant;
 use crate::io;
 use crate::model::weights::{self, Weights};
 use candle_core::Tensor;
@@ -16,7 +17,6 @@ use std::fs::{File, TryLockError};
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Instant;
 
 /// Number of steps averaged in one line of the log.
 const LOG_EVERY: u64 = 10;

@@ -7,6 +7,7 @@ use super::source::{Example, InputTargets};
 use super::{Error, Result};
 use crate::abi::RasterOptions;
 use crate::camera::Camera;
+use crate::clock::Instant;
 use crate::config::{Backbone, Config};
 use crate::cpu::detail::{Photograph, SourceView, residuals, with_residuals};
 use crate::data::dataset::Posed;
@@ -23,7 +24,6 @@ use candle_core::backprop::GradStore;
 use candle_core::{Device, Tensor, Var};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
-use std::time::Instant;
 
 /// Parents per chunk of the trunk's backward pass. A `[2048, 128]` activation takes 1 MiB, a part
 /// of a core's L2 or L3 cache.

@@ -100,6 +100,50 @@ fn ply_and_glb_round_trips_are_exact() {
     }
 }
 
+/// Number of `f_rest` properties of a .ply.
+fn rests(path: &Path) -> usize {
+    let bytes = std::fs::read(path).unwrap();
+    bytes.windows(22).filter(|w| w.starts_with(b"property float f_rest_")).count()
+}
+
+#[test]
+fn plys_hold_45_rests_unless_a_degree_is_asked_for() {
+    let place = tempfile::tempdir().unwrap();
+    let path = place.path().join("a.ply");
+    for (degree, asked, expected) in [
+        (0, None, 45),
+        (1, None, 45),
+        (3, None, 45),
+        (4, None, 45),
+        (4, Some(4), 72),
+        (1, Some(3), 45),
+        (1, Some(4), 45),
+        (2, Some(1), 9),
+        (2, Some(0), 0),
+    ] {
+        let kind =
+            Kind { parents: 9, children: 1, degree, gain_channels: 0, basis: ShBasis::Standard };
+        let before = scene(degree as u64, kind);
+        let options = SaveOptions { sh_degree: asked, ..Default::default() };
+        save_splats(&path, &before, &options).unwrap();
+        assert_eq!(rests(&path), expected, "degree {degree}, asked {asked:?}");
+        // The padding is dropped again.
+        let after = load_splats(&path).unwrap();
+        assert_eq!(after.sh_degree(), degree.min(asked.unwrap_or(3)));
+    }
+    // A degree that the last Gaussian alone uses: the ones before get zeros.
+    let mut sh = vec![0.0; 3 * 48];
+    sh[2 * 48 + 3 * 5 + 1] = 0.25;
+    let rows = [[0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.5, 0.5, 0.5, 0.5]; 3].concat();
+    let late = Splats::new(rows, sh, Vec::new(), 3, ShBasis::Standard).unwrap();
+    save_splats(&path, &late, &SaveOptions::default()).unwrap();
+    let after = load_splats(&path).unwrap();
+    assert_eq!(after.sh_degree(), 2);
+    for i in 0..3 {
+        assert_eq!(after.sh_of(i), &late.sh_of(i)[..27]);
+    }
+}
+
 #[test]
 fn standard_coefficients_pass_a_ply_bit_by_bit() {
     let kind =

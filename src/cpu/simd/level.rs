@@ -1,20 +1,25 @@
 //! Instruction sets: detection, names, and the calls that enter them.
 
 use super::Simd;
-#[cfg(not(target_arch = "x86_64"))]
+#[cfg(not(any(
+    target_arch = "x86_64",
+    all(target_arch = "wasm32", target_feature = "simd128")
+)))]
 use super::array::Array;
+#[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
+use super::simd128;
 #[cfg(target_arch = "x86_64")]
 use super::{avx2, avx512, sse2};
 use std::sync::OnceLock;
 
 /// An instruction set that kernels are compiled for.
 ///
-/// A new one (wasm32 simd128 is planned) needs a variant here, an entry in
-/// [`SimdLevel::available`], an arm in `SimdLevel::run`, and a module beside `avx2` that
-/// implements `Simd`.
+/// A new one needs a variant here, an entry in [`SimdLevel::available`], an arm in
+/// `SimdLevel::run`, and a module beside `avx2` that implements `Simd`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SimdLevel {
-    /// The instructions that every processor of the target has. Products round separately.
+    /// The instructions that every processor of the target has: SSE2 on x86-64, simd128 on
+    /// WebAssembly built with it. Products round separately.
     Scalar,
     /// x86-64-v3: AVX2 and FMA. A vector is two registers.
     Avx2,
@@ -104,7 +109,12 @@ impl SimdLevel {
             SimdLevel::Neon => kernel.run(Array::<true>),
             #[cfg(target_arch = "x86_64")]
             _ => kernel.run(sse2::Token),
-            #[cfg(not(target_arch = "x86_64"))]
+            #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
+            _ => kernel.run(simd128::Token),
+            #[cfg(not(any(
+                target_arch = "x86_64",
+                all(target_arch = "wasm32", target_feature = "simd128")
+            )))]
             _ => kernel.run(Array::<false>),
         }
     }

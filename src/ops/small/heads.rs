@@ -34,7 +34,7 @@ pub fn head_input(
     expect(INPUT, "picture", rgb, &[b, 3, h, w])?;
     expect(INPUT, "index", index, &[b, 1, h, w])?;
     expect(INPUT, "confidence", confidence, &[b, 1, h, w])?;
-    if b * c * fh * fw * h * w == 0 {
+    if [b, c, fh, fw, h, w].contains(&0) {
         bail!("{INPUT}: expected sizes of at least 1, got {:?}, {:?}", features.dims(), rgb.dims());
     }
     let input = Input { channels: c, resize: Resize { from: [fh, fw], to: [h, w] }, share };

@@ -42,10 +42,16 @@ pub enum Command {
     Run(Box<RunArgs>),
     /// Render a finished scene (.ply, .splat, .spz, .ksplat, .glb).
     Render(RenderArgs),
+    /// Write a finished scene in another format: one .html file that shows it, .ply, .glb, .spz,
+    /// .splat.
+    Export(ExportArgs),
     /// Show a scene in a window: a finished one, or photographs.
     #[cfg(feature = "view")]
     #[command(after_help = KEYS)]
     View(Box<ViewArgs>),
+    /// Show a scene in a window: only in builds with the feature `view`.
+    #[cfg(not(feature = "view"))]
+    View(NoViewArgs),
     /// Estimate the cameras of photographs: poses, focal length, sparse points.
     Poses(PosesArgs),
     /// Check poses and intrinsics by points matched between the photographs.
@@ -70,14 +76,22 @@ impl Command {
                 let conflict = || Some("--target: only with --path targets".to_owned());
                 let source = &args.source;
                 values::depth_conflict(source.near, source.far)
+                    .or_else(|| radius_conflict(args.path, &args.motion))
                     .or_else(|| if targets { None } else { conflict() })
             }
             #[cfg(feature = "view")]
             Self::View(args) => args.conflict(),
+            Self::Render(args) => radius_conflict(args.path, &args.motion),
             Self::Eval(args) => values::depth_conflict(args.near, args.far),
             _ => None,
         }
     }
+}
+
+/// The conflict of `--orbit-radius` with a path without one.
+fn radius_conflict(path: PathArg, motion: &MotionArgs) -> Option<String> {
+    (motion.orbit_radius.is_some() && path.closed().is_none())
+        .then(|| "--orbit-radius: only with --path orbit, spiral or dolly".to_owned())
 }
 
 /// The rules of a rasterizer.
@@ -205,9 +219,48 @@ pub enum PathArg {
     Targets,
     /// From the first context camera to the last.
     Interpolate,
-    /// A small circle around the middle of the context cameras.
+    /// A circle around the middle of the context cameras (--orbit-radius).
     Orbit,
+    /// Two turns whose width and distance change.
+    Spiral,
+    /// Towards the scene and back.
+    Dolly,
 }
+
+impl PathArg {
+    /// The closed path around the cameras that this is, if it is one.
+    pub fn closed(self) -> Option<super::frames::Loop> {
+        use super::frames::Loop;
+        match self {
+            Self::Targets | Self::Interpolate => None,
+            Self::Orbit => Some(Loop::Orbit),
+            Self::Spiral => Some(Loop::Spiral),
+            Self::Dolly => Some(Loop::Dolly),
+        }
+    }
+}
+
+/// Length, radius and animation of a path.
+#[derive(Debug, Args)]
+pub struct MotionArgs {
+    /// Number of views of a path (default: 30; `run` without targets and without --path: 3).
+    #[arg(long, value_name = "N", value_parser = values::frames)]
+    pub frames: Option<usize>,
+    /// Radius of `--path orbit`, `spiral` and `dolly`, world units. Default: near points move
+    /// against far ones by 6 % of the picture's width, or half the distance between the cameras.
+    #[arg(long, value_name = "R", allow_negative_numbers = true, value_parser = values::positive)]
+    pub orbit_radius: Option<f32>,
+    /// The views as an animation too: .gif and .webp are written without another program, .mp4
+    /// and .webm by ffmpeg, which must be installed.
+    #[arg(long, value_name = "FILE")]
+    pub video: Option<PathBuf>,
+    /// Frames a second of --video.
+    #[arg(long, default_value_t = 25, value_name = "N", value_parser = values::rate)]
+    pub fps: u32,
+}
+
+/// Number of views of a path that is asked for.
+pub const PATH_FRAMES: usize = 30;
 
 /// Formats of the reconstructed scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -220,6 +273,8 @@ pub enum SceneFormatArg {
     Splat,
     /// Niantic's compressed format, version 3.
     Spz,
+    /// One page that shows the scene in any browser, without a network.
+    Html,
 }
 
 impl SceneFormatArg {
@@ -230,6 +285,7 @@ impl SceneFormatArg {
             Self::Glb => "scene.glb",
             Self::Splat => "scene.splat",
             Self::Spz => "scene.spz",
+            Self::Html => "scene.html",
         }
     }
 }
@@ -254,12 +310,16 @@ pub struct RunArgs {
     /// Rendered frames.
     #[arg(long, value_enum, default_value = "targets")]
     pub path: PathArg,
-    /// Number of views of `--path interpolate` and `orbit`.
-    #[arg(long, default_value_t = 30, value_name = "N", value_parser = values::frames)]
-    pub frames: usize,
+    /// Length, radius and animation of a path.
+    #[command(flatten)]
+    pub motion: MotionArgs,
     /// Formats of the scene, written as scene.ply and so on.
     #[arg(long, value_enum, value_delimiter = ',', default_value = "ply", value_name = "F,…")]
     pub save: Vec<SceneFormatArg>,
+    /// Highest SH degree of the scene files (default 3). A .ply holds 0, 9, 24 or 45 `f_rest` values
+    /// accordingly; readers expect 45.
+    #[arg(long, value_name = "0…3", value_parser = values::file_sh_degree)]
+    pub sh: Option<usize>,
     /// Leave Gaussians of less opacity out of the scene files.
     #[arg(
         long,
@@ -311,6 +371,10 @@ pub struct SourceArgs {
     /// Do not match points between the context photographs (check of poses, depth range).
     #[arg(long)]
     pub no_check: bool,
+    /// Adjust the given cameras by points matched between the photographs, for poses that are nearly
+    /// right, such as a headset's.
+    #[arg(long)]
+    pub adjust_poses: bool,
     /// Colour detail from photographs that are larger than the network's input.
     #[arg(long, value_enum, default_value = "photo")]
     pub detail: DetailArg,
@@ -319,8 +383,9 @@ pub struct SourceArgs {
     #[arg(long, value_name = "STEPS", default_value_t = FitOptions::default().steps)]
     pub fit: usize,
     /// Refinement of the Gaussians on the photographs, after the fit: means, shapes, opacities and
-    /// colours. `auto`: eight steps a photograph, 64 at most, none with `--fit 0` and of more than 1.5 million Gaussians; `off`; or the number of steps.
-    #[arg(long, value_name = "auto | off | STEPS", default_value = "auto", value_parser = values::refine)]
+    /// colours. `auto`: eight steps a photograph, 64 at most, none with `--fit 0` and of more than 1.5 million Gaussians; `off`; the number of
+    /// steps; or a time in seconds, such as `20s`. The steps end earlier where they no longer help.
+    #[arg(long, value_name = "auto | off | STEPS | SECONDSs", default_value = "auto", value_parser = values::refine)]
     pub refine: Refine,
     /// The model.
     #[command(flatten)]
@@ -463,16 +528,17 @@ pub struct RenderArgs {
     /// Rendered frames.
     #[arg(long, value_enum, default_value = "targets")]
     pub path: PathArg,
-    /// Number of views of `--path interpolate` and `orbit`.
-    #[arg(long, default_value_t = 30, value_name = "N", value_parser = values::frames)]
-    pub frames: usize,
+    /// Length, radius and animation of a path.
+    #[command(flatten)]
+    pub motion: MotionArgs,
     /// Picture size, px: N, or WxH (default: the cameras' own).
     #[arg(long, value_name = "N | WxH", value_parser = values::size)]
     pub size: Option<(usize, usize)>,
     /// Highest SH degree evaluated.
     #[arg(long, default_value_t = 4, value_name = "0…4", value_parser = values::sh_degree)]
     pub sh_degree: usize,
-    /// Write 16-bit depth pictures too, in depth/ of that folder.
+    /// Write depth pictures too: 16 bits in depth/, colours with a legend in depth_colour/ of that
+    /// folder.
     #[arg(long)]
     pub depth: bool,
     /// Options of the rendering.
@@ -482,6 +548,69 @@ pub struct RenderArgs {
     /// drawn; nearest depth itself under `standard`.
     #[arg(long, allow_negative_numbers = true, value_parser = values::positive)]
     pub near: Option<f32>,
+}
+
+/// Arguments of `view` in a build without it.
+#[cfg(not(feature = "view"))]
+#[derive(Debug, Args)]
+pub struct NoViewArgs {
+    /// Anything: the command says how to get a window.
+    #[arg(num_args = 0.., trailing_var_arg = true, allow_hyphen_values = true, hide = true)]
+    _ignored: Vec<String>,
+}
+
+/// The up direction of a written file.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub enum UpArg {
+    /// The scene's own axes: up is −y, as photogrammetry programs write it.
+    Keep,
+    /// Up is +y (OpenGL, game engines).
+    Y,
+    /// Up is +z (Blender, CAD).
+    Z,
+}
+
+impl From<UpArg> for subsplat::Up {
+    fn from(arg: UpArg) -> Self {
+        match arg {
+            UpArg::Keep => Self::Keep,
+            UpArg::Y => Self::Y,
+            UpArg::Z => Self::Z,
+        }
+    }
+}
+
+/// Arguments of `export`.
+#[derive(Debug, Args)]
+pub struct ExportArgs {
+    /// The scene: .ply, .compressed.ply, .splat, .spz, .ksplat or .glb; or a folder that `run`
+    /// wrote.
+    #[arg(value_name = "SPLATS | DIR")]
+    pub scene: PathBuf,
+    /// The file to write; its extension decides the format: .html, .ply, .glb, .spz or .splat.
+    #[arg(short, long, value_name = "FILE")]
+    pub out: PathBuf,
+    /// Places that the .html offers: any pose file or scene folder. Default: cameras.json beside
+    /// the scene, else a view of the whole.
+    #[arg(long, value_name = "SCENE")]
+    pub cameras: Option<PathBuf>,
+    /// Highest SH degree written (default 3). A .ply holds 0, 9, 24 or 45 `f_rest` values
+    /// accordingly; readers expect 45.
+    #[arg(long, value_name = "0…3", value_parser = values::file_sh_degree)]
+    pub sh: Option<usize>,
+    /// Leave Gaussians of less opacity out.
+    #[arg(
+        long,
+        default_value_t = 0.0,
+        value_name = "ALPHA",
+        allow_negative_numbers = true,
+        value_parser = values::opacity
+    )]
+    pub min_opacity: f32,
+    /// Up direction of a .ply or .splat (default: keep). A .glb and a .spz are y-up by their
+    /// formats, and a .html is upright.
+    #[arg(long, value_enum)]
+    pub up: Option<UpArg>,
 }
 
 /// Arguments of `check`.

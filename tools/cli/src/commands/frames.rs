@@ -121,24 +121,91 @@ fn catmull_rom(p: [Vec3; 4], t: f32) -> Vec3 {
     0.5 * (a + t * (b + t * (c + t * d)))
 }
 
-/// `frames` cameras on a small circle around the middle of `cameras`, looking at what
-/// lies `depth` in front of it. Radius: half the cameras' spread, or 5 % of `depth`.
-pub fn orbit(cameras: &[Camera], depth: f32, frames: usize) -> Result<Vec<Camera>> {
-    let Some(first) = cameras.first() else { bail!("an orbit needs at least 1 camera, got none") };
+/// Depths of a scene in front of its cameras, camera z: quantiles of 10, 50 and 90 %.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DepthSpread {
+    near: f32,
+    /// The median.
+    pub middle: f32,
+    far: f32,
+}
+
+impl DepthSpread {
+    /// The spread of the values above 0; all 1 without any.
+    pub fn of(values: impl Iterator<Item = f32>) -> Self {
+        let mut sorted: Vec<f32> = values.filter(|z| *z > 0.0 && z.is_finite()).collect();
+        sorted.sort_by(f32::total_cmp);
+        let at = |tenths: usize| sorted.get(sorted.len() * tenths / 10).copied().unwrap_or(1.0);
+        Self { near: at(1), middle: at(5), far: at(9) }
+    }
+
+    /// Radius at which near points shift against far ones by a fixed share of the picture's
+    /// width, world units. A flat scene has a limit.
+    fn radius(&self, camera: &Camera) -> f32 {
+        let k = camera.intrinsics();
+        let parallax = (1.0 / self.near - 1.0 / self.far) * k.fx / k.width as f32;
+        let radius = ORBIT_SHIFT / parallax.max(1e-9);
+        radius.clamp(ORBIT_RADIUS.0 * self.middle, ORBIT_RADIUS.1 * self.middle)
+    }
+}
+
+/// Shift of near against far points over the radius of a path, share of the picture's width.
+const ORBIT_SHIFT: f32 = 0.06;
+/// Limits of the radius, share of the median depth. Photographs show no more than what lies
+/// around their own places.
+const ORBIT_RADIUS: (f32, f32) = (0.02, 0.15);
+
+/// A closed path around the middle of the cameras.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Loop {
+    /// A circle across the line of sight.
+    Orbit,
+    /// Two turns whose width and distance change, as 3DGS and NeRF viewers have it.
+    Spiral,
+    /// Towards the scene and back.
+    Dolly,
+}
+
+impl Loop {
+    /// Offset from the middle at a share of the path, radii: right, down, forward.
+    fn offset(self, share: f32) -> Vec3 {
+        let angle = std::f32::consts::TAU * share;
+        match self {
+            Self::Orbit => Vec3::new(angle.cos(), angle.sin(), 0.0),
+            Self::Spiral => {
+                let width = 0.6 + 0.4 * angle.cos();
+                let (sin, cos) = (2.0 * angle).sin_cos();
+                Vec3::new(width * cos, width * sin, 0.8 * angle.sin())
+            }
+            Self::Dolly => Vec3::new(0.0, 0.0, 2.0 * angle.sin()),
+        }
+    }
+}
+
+/// `frames` cameras on a closed path around the middle of `cameras`, looking at what lies at the
+/// median depth in front of it. Default of `radius`, world units: by the scene's parallax
+/// ([`DepthSpread`]), or half the cameras' spread where that is larger.
+pub fn closed_path(
+    path: Loop,
+    cameras: &[Camera],
+    depths: DepthSpread,
+    frames: usize,
+    radius: Option<f32>,
+) -> Result<Vec<Camera>> {
+    let Some(first) = cameras.first() else { bail!("a path needs at least 1 camera, got none") };
     let count = cameras.len() as f32;
     let middle = cameras.iter().map(Camera::position).sum::<Vec3>() / count;
     let spread = cameras.iter().map(|c| c.position().distance(middle)).fold(0.0f32, f32::max);
-    let radius = if spread > 0.0 { 0.5 * spread } else { 0.05 * depth };
+    let radius = radius.unwrap_or_else(|| depths.radius(first).max(0.5 * spread));
     let turn = if cameras.len() == 1 {
         Quat::from_mat3(&first.rotation())
     } else {
         let last = cameras[cameras.len() - 1].rotation();
         Quat::from_mat3(&first.rotation()).slerp(Quat::from_mat3(&last), 0.5)
     };
-    let aim = middle + turn * (Vec3::Z * depth);
+    let aim = middle + turn * (Vec3::Z * depths.middle);
     let at = |i: usize| {
-        let angle = std::f32::consts::TAU * i as f32 / frames as f32;
-        let eye = middle + turn * (radius * Vec3::new(angle.cos(), angle.sin(), 0.0));
+        let eye = middle + turn * (radius * path.offset(i as f32 / frames as f32));
         let forward = (aim - eye).normalize_or(turn * Vec3::Z);
         let right = (turn * Vec3::Y).cross(forward).normalize_or(turn * Vec3::X);
         let down = forward.cross(right);
@@ -179,13 +246,51 @@ mod tests {
     }
 
     #[test]
-    fn an_orbit_looks_at_its_aim() {
+    fn closed_paths_look_at_their_aim_and_return() {
         let cameras = [camera(-1.0, 0.0), camera(1.0, 0.0)];
-        for c in orbit(&cameras, 4.0, 8).unwrap() {
-            let px = c.project(Vec3::new(0.0, 0.0, 4.0)).unwrap();
-            assert!((px.x - 32.0).abs() < 1e-3 && (px.y - 24.0).abs() < 1e-3, "{px}");
-            assert!(Camera::new(c.intrinsics(), c.world_from_camera()).is_ok());
+        let depths = DepthSpread::of([3.0, 4.0, 5.0].into_iter());
+        for path in [Loop::Orbit, Loop::Spiral, Loop::Dolly] {
+            let all = closed_path(path, &cameras, depths, 8, None).unwrap();
+            assert_eq!(all.len(), 8);
+            for c in &all {
+                let px = c.project(Vec3::new(0.0, 0.0, 4.0)).unwrap();
+                assert!((px.x - 32.0).abs() < 1e-3 && (px.y - 24.0).abs() < 1e-3, "{px}");
+                assert!(Camera::new(c.intrinsics(), c.world_from_camera()).is_ok());
+            }
+            // A frame after the last would be the first one.
+            assert!(path.offset(1.0).distance(path.offset(0.0)) < 1e-5);
         }
+        let dolly = closed_path(Loop::Dolly, &cameras, depths, 4, Some(0.5)).unwrap();
+        let z: Vec<f32> = dolly.iter().map(|c| c.position().z).collect();
+        assert!((z[1] - 1.0).abs() < 1e-5 && (z[3] + 1.0).abs() < 1e-5, "{z:?}");
+        assert!(closed_path(Loop::Orbit, &[], depths, 8, None).is_err());
+    }
+
+    #[test]
+    fn the_radius_follows_the_parallax() {
+        let one = [camera(0.0, 0.0)];
+        let radius = |depths: &[f32], radius| {
+            let depths = DepthSpread::of(depths.iter().copied());
+            let path = closed_path(Loop::Orbit, &one, depths, 4, radius).unwrap();
+            path[0].position().distance(path[2].position()) / 2.0
+        };
+        let deep: Vec<f32> = (0..100).map(|i| 2.0 + 0.08 * i as f32).collect();
+        let shift = |z: f32, r: f32| r * one[0].intrinsics().fx / z / 64.0;
+        let r = radius(&deep, None);
+        let moved = shift(deep[10], r) - shift(deep[90], r);
+        assert!((moved - 0.06).abs() < 1e-3, "{moved}");
+        // A flat scene has no parallax: the radius is limited.
+        assert!((radius(&[4.0; 10], None) - 0.6).abs() < 1e-4);
+        assert!((radius(&deep, Some(0.25)) - 0.25).abs() < 1e-6);
+        // Half the spread of cameras that stand wide apart.
+        let wide = [camera(-4.0, 0.0), camera(4.0, 0.0)];
+        let spread = DepthSpread::of(deep.iter().copied());
+        let path = closed_path(Loop::Orbit, &wide, spread, 4, None).unwrap();
+        assert!(path[0].position().distance(path[2].position()) / 2.0 > 2.0);
+        assert_eq!(
+            DepthSpread::of([0.0, f32::NAN].into_iter()),
+            DepthSpread::of([1.0].into_iter())
+        );
     }
 
     #[test]

@@ -12,8 +12,11 @@ mod args_view;
 mod check;
 mod compare;
 mod compare_raster;
+mod depth_colour;
 mod eval;
+mod export;
 mod frames;
+mod html;
 mod info;
 mod memory;
 mod model;
@@ -27,6 +30,7 @@ mod run;
 mod tensorboard;
 mod train;
 mod values;
+mod video;
 #[cfg(feature = "view")]
 mod view;
 
@@ -72,9 +76,15 @@ fn dispatch(cli: &Cli, answer: Answer) -> Result<bool> {
     }
     match &cli.command {
         Command::Run(args) => run::run(args, answer).map(|()| true),
+        Command::Export(args) => export::export(args, answer).map(|()| true),
         Command::Render(args) => render::render(args, answer).map(|()| true),
         #[cfg(feature = "view")]
         Command::View(args) => view::view(args, answer).map(|()| true),
+        #[cfg(not(feature = "view"))]
+        Command::View(_) => anyhow::bail!(
+            "view: this build has no window; `cargo install --path tools/cli --features view` builds \
+             one, and `subsplat export SCENE -o scene.html` writes a page for a browser"
+        ),
         Command::Poses(args) => poses::poses(args, answer).map(|()| true),
         Command::Check(args) => check::check(args, answer),
         Command::Info(args) => info::info(args, answer).map(|()| true),

@@ -1,13 +1,17 @@
 //! The output folder of `run`: pictures, depth, cameras, and the scene in any format.
 //!
-//! `images/` holds the rendered views and `depth/` their depth. `inputs/` holds the network's
+//! `images/` holds the rendered views, `depth/` their depth and `depth_colour/` the same to be
+//! looked at. `inputs/` holds the network's
 //! inputs with their depth, and `config.json` the model. `cameras.json` makes the folder a scene
 //! that every command reads.
 
-use super::args::SceneFormatArg;
+use super::args::{MotionArgs, RunArgs, SceneFormatArg};
+use super::depth_colour::colour_depth;
 use super::frames;
+use super::html::Page;
 use super::pair::folder_of;
-use crate::report::print_warning;
+use super::video::{self, Video};
+use crate::report::{print_line, print_warning};
 use anyhow::{Context, Result, bail};
 use indicatif::ProgressBar;
 use serde_json::{Value, json};
@@ -23,10 +27,9 @@ use subsplat::io::{SaveOptions, save_splats};
 use subsplat::metrics::{psnr, ssim};
 use subsplat::pipeline::{Photo, Reconstruction};
 use subsplat::render::Renderer;
-use subsplat::splats::Splats;
 
 /// Folders inside the output folder.
-const FOLDERS: [&str; 3] = ["images", "depth", "inputs"];
+const FOLDERS: [&str; 4] = ["images", "depth", "depth_colour", "inputs"];
 
 /// A view to render.
 pub enum View {
@@ -103,7 +106,33 @@ pub fn prepare(out: &Path, input: &Path, scene: &Scene) -> Result<()> {
             out.display()
         );
     }
+    remove_earlier(out);
     FOLDERS.iter().try_for_each(|f| make(&out.join(f)))
+}
+
+/// Removes the files that an earlier run into `out` lists in its metrics.json, so that none of them
+/// is taken for a result of this one. Files of other programs stay.
+fn remove_earlier(out: &Path) {
+    let Ok(text) = std::fs::read_to_string(out.join("metrics.json")) else { return };
+    let Ok(report) = serde_json::from_str::<Value>(&text) else { return };
+    let list = |key: &str| report[key].as_array().cloned().unwrap_or_default();
+    // A name, without the folder that it had then: the output folder may have moved.
+    let name =
+        |v: &Value| Path::new(v.as_str()?).file_name().map(|n| n.to_string_lossy().into_owned());
+    let mut files: Vec<String> = Vec::new();
+    for view in list("targets") {
+        for folder in ["images", "depth", "depth_colour"] {
+            files.extend(name(&view["image"]).map(|n| format!("{folder}/{n}")));
+        }
+    }
+    for i in 0..list("context").len() {
+        files.extend([format!("inputs/{i}.png"), format!("inputs/{i}_depth.png")]);
+    }
+    files.extend(list("files").iter().filter_map(|f| name(&f["file"])));
+    for file in files {
+        // One that is gone already, or that cannot be removed, does not stop the run.
+        let _ = std::fs::remove_file(out.join(file));
+    }
 }
 
 /// Renders, scores and writes views one by one.
@@ -116,12 +145,16 @@ pub struct Views<'a> {
     pub crop: CropOptions,
     /// Rules to render.
     pub options: RasterOptions,
+    /// Animation of the views.
+    pub motion: &'a MotionArgs,
+    /// The animation so far.
+    pub video: Option<Video>,
 }
 
 impl Views<'_> {
     /// Renders all of `views`, with one step of `bar` each.
     pub fn render(
-        &self,
+        &mut self,
         renderer: &mut Renderer,
         result: &Reconstruction,
         views: &[View],
@@ -146,7 +179,7 @@ impl Views<'_> {
     }
 
     fn render_one(
-        &self,
+        &mut self,
         renderer: &mut Renderer,
         result: &Reconstruction,
         view: &View,
@@ -164,9 +197,12 @@ impl Views<'_> {
         renderer.take_warning().iter().for_each(print_warning);
         let (width, height) = (picture.width, picture.height);
         let file = self.out.join(format!("images/{stem}.png"));
-        save_png(&file, &Rgb::from(&picture))?;
+        let rgb = Rgb::from(&picture);
+        save_png(&file, &rgb)?;
+        video::push(&mut self.video, self.motion, &rgb)?;
         let depth = Depth { width, height, data: picture.depth };
         let depth_unit = save_depth_png(&self.out.join(format!("depth/{stem}.png")), &depth)?;
+        save_png(&self.out.join(format!("depth_colour/{stem}.png")), &colour_depth(&depth))?;
         let mut scored = Scored {
             name,
             stem,
@@ -207,26 +243,114 @@ pub fn write_config(out: &Path, config: &Config) -> Result<()> {
     Ok(subsplat::io::write_atomic(&out.join("config.json"), write)?)
 }
 
+/// Most Gaussians of a .spz, and so of a .html: the limit of its readers.
+const SPZ_COUNT_MAX: u64 = 10_000_000;
+/// Largest .glb: its header counts bytes with 32 bits.
+const GLB_BYTES_MAX: u64 = u32::MAX as u64;
+/// Size of a scene file that is announced before the work, bytes.
+const ANNOUNCED: u64 = 200_000_000;
+
+/// Largest size of a scene file of `count` Gaussians with SH of `stored` degrees, of which `asked`
+/// are written, bytes; .spz and .html are compressed, .html contains base64.
+fn bytes_at_most(format: SceneFormatArg, count: u64, stored: usize, asked: Option<usize>) -> u64 {
+    let asked = asked.unwrap_or(3);
+    let rest = |degree: usize| 3 * (degree + 1).pow(2) as u64 - 3;
+    let kept = rest(stored.min(asked));
+    match format {
+        SceneFormatArg::Ply => count * 4 * (17 + rest(asked)),
+        // Position, rotation, scales, opacity, SH, and a colour of four 16-bit numbers.
+        SceneFormatArg::Glb => count * (4 * (11 + 3 + kept) + 8),
+        SceneFormatArg::Splat => count * 32,
+        SceneFormatArg::Spz => count * (20 + kept),
+        SceneFormatArg::Html => count * (20 + kept) * 4 / 3,
+    }
+}
+
+/// Refuses formats that cannot hold the scene of a run, before the work, and prints the size of
+/// large files. The scene has at most `count` Gaussians with SH of `degree`.
+pub fn check_formats(args: &RunArgs, count: u64, degree: usize) -> Result<()> {
+    for format in &args.save {
+        let bytes = bytes_at_most(*format, count, degree, args.sh);
+        check_format(*format, count, bytes, args.min_opacity)?;
+    }
+    Ok(())
+}
+
+/// [`check_formats`] of one file. A least opacity may leave fewer Gaussians, so that nothing is
+/// refused with one.
+fn check_format(format: SceneFormatArg, count: u64, bytes: u64, min_opacity: f32) -> Result<()> {
+    let name = format.file_name();
+    let limit = match format {
+        SceneFormatArg::Spz | SceneFormatArg::Html if count > SPZ_COUNT_MAX => {
+            Some(format!("at most {SPZ_COUNT_MAX} Gaussians"))
+        }
+        SceneFormatArg::Glb if bytes > GLB_BYTES_MAX => {
+            Some(format!("at most {:.1} GB", GLB_BYTES_MAX as f64 / 1e9))
+        }
+        _ => None,
+    };
+    if let Some(limit) = limit.filter(|_| min_opacity == 0.0) {
+        bail!(
+            "--save: {name} holds {limit}, and this run gives {count} Gaussians ({:.1} GB); choose \
+             another format, a smaller --upscale or --input-size, or --min-opacity",
+            bytes as f64 / 1e9
+        );
+    }
+    if bytes > ANNOUNCED {
+        let size = bytes as f64 / 1e6;
+        print_line(format!("{name}: at most {size:.0} MB for {count} Gaussians"));
+    }
+    Ok(())
+}
+
 /// Writes the Gaussians in each of `formats`, and returns one report each.
 pub fn write_scene(
     out: &Path,
-    splats: &Splats,
+    page: &Page<'_>,
     formats: &[SceneFormatArg],
     options: &SaveOptions,
 ) -> Result<Vec<Value>> {
-    let mut names: Vec<&str> = Vec::new();
+    let mut distinct: Vec<SceneFormatArg> = Vec::new();
     for format in formats {
-        let name = format.file_name();
-        if !names.contains(&name) {
-            names.push(name);
+        if !distinct.contains(format) {
+            distinct.push(*format);
         }
     }
-    let one = |name: &&str| {
-        let path = out.join(name);
-        let saved = save_splats(&path, splats, options)?;
+    let one = |format: &SceneFormatArg| {
+        let path = out.join(format.file_name());
+        let html = *format == SceneFormatArg::Html;
+        let saved = match html {
+            true => page.write(&path, options)?,
+            false => save_splats(&path, page.splats, options)?,
+        };
         let mut value = serde_json::to_value(&saved)?;
+        if html {
+            value["format"] = json!("html");
+        }
         value["file"] = json!(path.display().to_string());
         Ok(value)
     };
-    names.iter().map(one).collect()
+    distinct.iter().map(one).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn formats_are_refused_before_the_work() {
+        use SceneFormatArg::{Glb, Html, Ply, Spz};
+        let check = |format, count, opacity| {
+            check_format(format, count, bytes_at_most(format, count, 3, None), opacity)
+        };
+        let error = check(Spz, 10_000_001, 0.0).unwrap_err().to_string();
+        assert!(error.contains("scene.spz holds at most 10000000 Gaussians"), "{error}");
+        assert!(check(Html, 10_000_001, 0.0).is_err());
+        assert!(check(Spz, 10_000_001, 0.1).is_ok() && check(Spz, 10_000_000, 0.0).is_ok());
+        let error = check(Glb, 20_000_000, 0.0).unwrap_err().to_string();
+        assert!(error.contains("at most 4.3 GB"), "{error}");
+        assert!(check(Ply, 20_000_000, 0.0).is_ok());
+        assert_eq!(bytes_at_most(Ply, 2_097_152, 1, None), 520_093_696);
+        assert_eq!(bytes_at_most(Ply, 1000, 1, Some(0)), 68_000);
+    }
 }

@@ -1,8 +1,10 @@
 //! `subsplat render`: renders pictures of a finished scene.
 
-use super::args::{LowpassArg, PathArg, RenderArgs, RenderingArgs, SceneFormatArg};
-use super::frames;
+use super::args::{LowpassArg, PATH_FRAMES, PathArg, RenderArgs, RenderingArgs, SceneFormatArg};
+use super::depth_colour::colour_depth;
+use super::frames::{self, DepthSpread};
 use super::memory;
+use super::video;
 use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
 use clap::ValueEnum;
@@ -16,7 +18,7 @@ use subsplat::io::load_with_comments;
 use subsplat::io::photograph::list_photographs;
 use subsplat::io::scene::{is_scene, load_scene};
 use subsplat::navigation::Bounds;
-use subsplat::render::{Renderer, options_of_comments};
+use subsplat::render::{Renderer, camera_of_comments, options_of_comments};
 use subsplat::splats::Splats;
 
 /// Side of a picture without a camera, px.
@@ -35,28 +37,41 @@ pub fn open(args: &RenderingArgs) -> Renderer {
 pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
     args.size.map_or(Ok(()), |size| memory::check_picture("--size", size))?;
+    args.motion.video.as_deref().map_or(Ok(()), video::check)?;
     let file = scene_file(&args.scene)?;
     let (splats, comments) = progress.stage("scene", |_| load_with_comments(&file))?;
-    let cameras = cameras(args, &file, &splats)?;
+    let cameras = cameras(args, &file, &splats, &comments)?;
     check_sizes(&cameras)?;
     let options = options(&args.rendering, args.near, args.sh_degree, &comments)?;
     let folder = if args.depth { args.out.join("depth") } else { args.out.clone() };
     std::fs::create_dir_all(&folder)
         .with_context(|| format!("output folder {}", folder.display()))?;
+    if args.depth {
+        let folder = args.out.join("depth_colour");
+        std::fs::create_dir_all(&folder)
+            .with_context(|| format!("output folder {}", folder.display()))?;
+    }
     let mut views = Vec::new();
     let mut renderer = open(&args.rendering);
+    let mut video = None;
     progress.steps("rendering", cameras.len(), |bar| {
         for (name, camera) in &cameras {
             let picture = renderer.render(&splats, camera, &options);
             renderer.take_warning().iter().for_each(print_warning);
             let (width, height) = (picture.width, picture.height);
             let file = args.out.join(format!("{name}.png"));
-            save_png(&file, &Rgb::from(&picture))?;
+            let rgb = Rgb::from(&picture);
+            save_png(&file, &rgb)?;
+            video::push(&mut video, &args.motion, &rgb)?;
             let file = file.display().to_string();
             let mut view = json!({ "file": file, "width": width, "height": height });
             if args.depth {
                 let file = args.out.join(format!("depth/{name}.png"));
-                let unit = save_depth_png(&file, &Depth { width, height, data: picture.depth })?;
+                let depth = Depth { width, height, data: picture.depth };
+                let unit = save_depth_png(&file, &depth)?;
+                let colours = args.out.join(format!("depth_colour/{name}.png"));
+                save_png(&colours, &colour_depth(&depth))?;
+                view["depth_colour_file"] = json!(colours.display().to_string());
                 view["depth_file"] = json!(file.display().to_string());
                 view["depth_unit"] = json!(unit);
             }
@@ -65,6 +80,7 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
         }
         anyhow::Ok(())
     })?;
+    let video = video::finish(video, &args.motion, answer)?;
     let seconds = progress.seconds();
     let peak = peak_memory_bytes();
     answer.line(format!(
@@ -82,13 +98,14 @@ pub fn render(args: &RenderArgs, answer: Answer) -> Result<()> {
         "device": renderer.device(),
         "convention": if mvsplat_rules { "mvsplat" } else { "standard" },
         "views": views,
+        "video": video,
         "seconds": seconds,
         "peak_memory_bytes": peak,
     }))
 }
 
 /// Finds the scene file of `path`: the path itself, or the file in a folder that `run` wrote.
-fn scene_file(path: &Path) -> Result<PathBuf> {
+pub fn scene_file(path: &Path) -> Result<PathBuf> {
     if !path.is_dir() {
         ensure!(
             probe(path).is_err(),
@@ -98,7 +115,8 @@ fn scene_file(path: &Path) -> Result<PathBuf> {
         );
         return Ok(path.to_owned());
     }
-    let files = SceneFormatArg::value_variants().iter().map(|f| path.join(f.file_name()));
+    let readable = SceneFormatArg::value_variants().iter().filter(|f| **f != SceneFormatArg::Html);
+    let files = readable.map(|f| path.join(f.file_name()));
     if let Some(file) = files.into_iter().find(|f| f.is_file()) {
         return Ok(file);
     }
@@ -154,8 +172,13 @@ pub fn options(
 }
 
 /// File stems and cameras.
-fn cameras(args: &RenderArgs, file: &Path, splats: &Splats) -> Result<Vec<(String, Camera)>> {
-    let named = named_cameras(args, file, splats)?;
+fn cameras(
+    args: &RenderArgs,
+    file: &Path,
+    splats: &Splats,
+    comments: &[String],
+) -> Result<Vec<(String, Camera)>> {
+    let named = named_cameras(args, file, splats, comments)?;
     let sized = |camera: Camera| -> Result<Camera> {
         let Some((w, h)) = args.size else { return Ok(camera) };
         let k = camera.intrinsics();
@@ -176,34 +199,38 @@ fn cameras(args: &RenderArgs, file: &Path, splats: &Splats) -> Result<Vec<(Strin
         cameras.into_iter().enumerate().map(|(i, c)| Ok((name(i), sized(c)?))).collect()
     };
     let through: Vec<Camera> = named.iter().map(|(_, c)| *c).collect();
+    let count = args.motion.frames.unwrap_or(PATH_FRAMES);
     match args.path {
         PathArg::Targets => named.into_iter().map(|(n, c)| Ok((n, sized(c)?))).collect(),
-        PathArg::Interpolate => path(frames::interpolate(&through, args.frames)?),
-        PathArg::Orbit => {
-            let depth = median_depth(splats, &through[0]);
-            path(frames::orbit(&through, depth, args.frames)?)
+        PathArg::Interpolate => path(frames::interpolate(&through, count)?),
+        PathArg::Orbit | PathArg::Spiral | PathArg::Dolly => {
+            let shape = args.path.closed().unwrap_or(frames::Loop::Orbit);
+            let depths = depths(splats, &through[0]);
+            path(frames::closed_path(shape, &through, depths, count, args.motion.orbit_radius)?)
         }
     }
 }
 
-fn named_cameras(args: &RenderArgs, file: &Path, splats: &Splats) -> Result<Vec<(String, Camera)>> {
-    let beside = file.parent().unwrap_or(Path::new("")).join("cameras.json");
-    let source = match &args.cameras {
-        Some(path) => path.clone(),
-        None if beside.is_file() => beside,
-        None => {
-            ensure!(
-                args.target.is_empty(),
-                "--target: expected --cameras or cameras.json beside the scene"
-            );
-            print_line(
-                "no cameras given and no cameras.json beside the scene: a view of the whole",
-            );
-            return Ok(vec![("view".to_owned(), whole(splats)?)]);
-        }
+fn named_cameras(
+    args: &RenderArgs,
+    file: &Path,
+    splats: &Splats,
+    comments: &[String],
+) -> Result<Vec<(String, Camera)>> {
+    let Some(all) = cameras_beside(args.cameras.as_deref(), file)? else {
+        ensure!(
+            args.target.is_empty(),
+            "--target: expected --cameras or cameras.json beside the scene"
+        );
+        let camera = camera_of_comments(comments);
+        print_line(match camera {
+            Some(_) => {
+                "no cameras given and no cameras.json beside the scene: the file's own camera"
+            }
+            None => "no cameras given and no cameras.json beside the scene: a view of the whole",
+        });
+        return Ok(vec![("view".to_owned(), camera.map_or_else(|| whole(splats), Ok)?)]);
     };
-    let all = read_cameras(&source)?;
-    ensure!(!all.is_empty(), "{}: expected a camera, got none", source.display());
     let names: Vec<&str> = all.iter().map(|(n, _)| n.as_str()).collect();
     let chosen = match args.target.is_empty() {
         true => (0..all.len()).collect(),
@@ -212,6 +239,20 @@ fn named_cameras(args: &RenderArgs, file: &Path, splats: &Splats) -> Result<Vec<
     let (names, cameras): (Vec<String>, Vec<Camera>) =
         chosen.into_iter().map(|i| all[i].clone()).unzip();
     Ok(frames::file_stems(&names).into_iter().zip(cameras).collect())
+}
+
+/// Names and cameras of `given`, else of cameras.json beside the scene `file`; `None` without
+/// either.
+pub fn cameras_beside(given: Option<&Path>, file: &Path) -> Result<Option<Vec<(String, Camera)>>> {
+    let beside = file.parent().unwrap_or(Path::new("")).join("cameras.json");
+    let source = match given {
+        Some(path) => path,
+        None if beside.is_file() => &beside,
+        None => return Ok(None),
+    };
+    let all = read_cameras(source)?;
+    ensure!(!all.is_empty(), "{}: expected a camera, got none", source.display());
+    Ok(Some(all))
 }
 
 /// Names and cameras of a pose file or scene folder.
@@ -232,14 +273,9 @@ pub fn read_cameras(source: &Path) -> Result<Vec<(String, Camera)>> {
     scene.frames.iter().map(|f| Ok((f.name.clone(), f.pinhole()?))).collect()
 }
 
-/// Median camera z of the splats in front of `camera`; 1 without any.
-pub fn median_depth(splats: &Splats, camera: &Camera) -> f32 {
-    let mut z: Vec<f32> = (0..splats.len())
-        .map(|i| camera.to_camera(splats.mean(i).into()).z)
-        .filter(|z| *z > 0.0)
-        .collect();
-    z.sort_by(f32::total_cmp);
-    z.get(z.len() / 2).copied().unwrap_or(1.0)
+/// Spread of the splats in front of `camera`.
+pub fn depths(splats: &Splats, camera: &Camera) -> DepthSpread {
+    DepthSpread::of((0..splats.len()).map(|i| camera.to_camera(splats.mean(i).into()).z))
 }
 
 /// Bounds of a scene's splats without outliers.

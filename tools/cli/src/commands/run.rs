@@ -1,9 +1,11 @@
 //! `subsplat run`: photographs to Gaussians, views and files.
 
-use super::args::{LowpassArg, PathArg, RenderingArgs, RunArgs};
+use super::args::{LowpassArg, PATH_FRAMES, PathArg, RenderingArgs, RunArgs};
+use super::frames::{self, DepthSpread};
+use super::html::Page;
 use super::output::{self, Scored, View, Views};
 use super::reconstruct::{self, reconstruct};
-use super::{frames, model, pair, render};
+use super::{model, pair, render, video};
 use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, print_line, print_warning};
 use anyhow::{Result, bail, ensure};
 use serde_json::{Value, json};
@@ -18,12 +20,15 @@ use subsplat::io::image::{LoadOptions, Rgb, Truncated};
 use subsplat::io::scene::Scene;
 use subsplat::pipeline::Backend;
 use subsplat::pipeline::is_mvsplat;
-use subsplat::render::comment_of_options;
+use subsplat::render::{comment_of_camera, comment_of_options};
 use subsplat::splats::{SplatStatistics, Splats};
 use subsplat::{Detail, Options, Photo, Reconstruction, Reconstructor, Warning};
 
 /// Largest number of targets by default.
 const DEFAULT_TARGETS: usize = 30;
+
+/// Views of a scene without target frames, where no path was asked for.
+const UNASKED_FRAMES: usize = 3;
 
 /// Checked arguments.
 struct Plan {
@@ -35,6 +40,7 @@ struct Plan {
 /// Runs the command.
 pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
+    args.motion.video.as_deref().map_or(Ok(()), video::check)?;
     let mut plan = plan(args, &mut progress)?;
     let backend = backend(&args.rendering.device);
     let request = model::ModelRequest::from_source(&args.source);
@@ -43,13 +49,16 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     plan.options.input_size = size;
     let r = model.config().upscale;
     let targets = targets(args, &plan, (w * r, h * r))?;
+    let count = (plan.context.len() * w * h * r * r) as u64;
+    let degree = model.config().primaries().sh_degree;
+    output::check_formats(args, count, degree)?;
     output::prepare(&args.out, &args.input[0], &plan.scene)?;
     let photos = photographs(&plan.scene, &plan.context, args.source.pair.force, &mut progress)?;
     let result = reconstruct(&model, photos, &plan.options, &mut progress)?;
     check_opacity(result.splats(), args.min_opacity)?;
     let options = raster_options(&args.rendering, model.config(), &result);
     let views = views(args, &targets, &result)?;
-    let job = Views {
+    let mut job = Views {
         out: &args.out,
         scene: &plan.scene,
         // All inputs have one size.
@@ -57,28 +66,39 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
             result.inputs().first().map_or((w, h), |c| (c.input.width, c.input.height)),
         ),
         options,
+        motion: &args.motion,
+        video: None,
     };
+    // The scene comes first: it is what took the time, and a stop while views are drawn keeps it.
+    let files = progress.stage("writing", |_| {
+        output::write_config(&args.out, model.config())?;
+        let camera = result.inputs().first().map(|c| comment_of_camera(&c.target_camera));
+        let comments = std::iter::once(comment_of_options(&options)).chain(camera).collect();
+        let save = SaveOptions {
+            sh_degree: args.sh,
+            min_opacity: args.min_opacity,
+            comments,
+            ..SaveOptions::default()
+        };
+        let cameras: Vec<Camera> = result.inputs().iter().map(|c| c.target_camera).collect();
+        let page = Page {
+            splats: result.splats(),
+            cameras: &cameras,
+            options: &options,
+            title: &plan.scene.name,
+        };
+        output::write_scene(&args.out, &page, &args.save, &save)
+    })?;
     let mut renderer = render::open(&args.rendering);
     let scored = progress
         .steps("rendering", views.len(), |bar| job.render(&mut renderer, &result, &views, bar))?;
-    let files = progress.stage("writing", |_| {
-        let bounds = result.depth_range();
-        output::write_config(&args.out, model.config())?;
-        output::write_cameras(
-            &args.out,
-            &scored,
-            plan.scene.units,
-            NearFar::new(bounds.near, bounds.far),
-        )?;
-        let save = SaveOptions {
-            min_opacity: args.min_opacity,
-            comments: vec![comment_of_options(&options)],
-            ..SaveOptions::default()
-        };
-        output::write_scene(&args.out, result.splats(), &args.save, &save)
-    })?;
+    let bounds = result.depth_range();
+    let near_far = NearFar::new(bounds.near, bounds.far);
+    output::write_cameras(&args.out, &scored, plan.scene.units, near_far)?;
+    let video = video::finish(job.video.take(), &args.motion, answer)?;
     let inputs = progress.stage("inputs", |_| input_report(&result, &options))?;
-    Done { model, result, options, scored, inputs, files }.finish(args, &plan, progress, answer)
+    Done { model, result, options, scored, inputs, files, video }
+        .finish(args, &plan, progress, answer)
 }
 
 /// Scores the scene at its inputs' own cameras, and describes its Gaussians.
@@ -200,7 +220,7 @@ fn targets(args: &RunArgs, plan: &Plan, size: (usize, usize)) -> Result<Vec<usiz
     if chosen.is_empty() {
         print_line(format!(
             "no target frames: {} views from the first context to the last",
-            args.frames
+            path_frames(args)
         ));
     }
     Ok(chosen)
@@ -228,23 +248,30 @@ fn default_targets(input: &Path, plan: &Plan, size: (usize, usize)) -> Result<Ve
     Ok((0..count).map(|i| all[i * all.len() / count]).collect())
 }
 
+/// Views of a path: few where none was asked for.
+fn path_frames(args: &RunArgs) -> usize {
+    let default = match args.path {
+        PathArg::Targets if args.motion.video.is_none() => UNASKED_FRAMES,
+        _ => PATH_FRAMES,
+    };
+    args.motion.frames.unwrap_or(default)
+}
+
 fn views(args: &RunArgs, targets: &[usize], result: &Reconstruction) -> Result<Vec<View>> {
     let inputs: Vec<Camera> = result.inputs().iter().map(|c| c.target_camera).collect();
+    let frames = path_frames(args);
     let path = match args.path {
-        PathArg::Orbit => frames::orbit(&inputs, median(&result.depths()[0].data), args.frames)?,
+        PathArg::Orbit | PathArg::Spiral | PathArg::Dolly => {
+            let shape = args.path.closed().unwrap_or(frames::Loop::Orbit);
+            let depths = DepthSpread::of(result.depths()[0].data.iter().copied());
+            frames::closed_path(shape, &inputs, depths, frames, args.motion.orbit_radius)?
+        }
         PathArg::Targets if !targets.is_empty() => {
             return Ok(targets.iter().map(|&i| View::Frame(i)).collect());
         }
-        PathArg::Targets | PathArg::Interpolate => frames::interpolate(&inputs, args.frames)?,
+        PathArg::Targets | PathArg::Interpolate => frames::interpolate(&inputs, frames)?,
     };
     Ok(path.into_iter().map(View::Path).collect())
-}
-
-/// The median; 1 without any value.
-pub fn median(values: &[f32]) -> f32 {
-    let mut sorted = values.to_vec();
-    sorted.sort_by(f32::total_cmp);
-    sorted.get(sorted.len() / 2).copied().unwrap_or(1.0)
 }
 
 /// Rules to render a reconstruction of a model with `config`, with the arguments in place of the
@@ -279,6 +306,7 @@ struct Done {
     scored: Vec<Scored>,
     inputs: InputReport,
     files: Vec<Value>,
+    video: Value,
 }
 
 impl Done {
@@ -306,6 +334,12 @@ impl Done {
             "far": bounds.far,
             "near_far_from": bounds.source.to_string(),
             "check": reconstruct::report(result.reports()),
+            "pose_adjustment": result.pose_adjustment().map(|a| json!({
+                "points": a.points,
+                "error_before_px": a.before_px,
+                "error_after_px": a.after_px,
+                "turned_deg": a.turned_deg,
+            })),
             "cut_shares": result.cut_shares(),
             "input_intrinsics": result.inputs().iter().map(|c| camera(&c.input_camera)).collect::<Vec<_>>(),
             "backbone": if is_mvsplat(config) { "re10k" } else { "small" },
@@ -317,7 +351,12 @@ impl Done {
             "detail": result.detail() == Detail::Photographs,
             "fit": result.fit().map(|f| json!({ "loss_before": f.before, "loss_after": f.after })),
             "refine": result.refinement().map(
-                |r| json!({ "steps": r.steps, "error_before": r.before, "error_after": r.after })
+                |r| json!({
+                    "steps": r.steps,
+                    "error_before": r.before,
+                    "error_after": r.after,
+                    "removed": r.removed,
+                })
             ),
             "gaussians": result.splats().len(),
             "inputs": self.inputs.inputs,
@@ -327,6 +366,7 @@ impl Done {
             "ssim": self.mean(|s| s.ssim),
             "warnings": result.warnings().iter().map(Warning::to_string).collect::<Vec<_>>(),
             "files": self.files,
+            "video": self.video,
         })
     }
 

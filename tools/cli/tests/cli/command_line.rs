@@ -87,8 +87,8 @@ fn run_reports_and_writes_what_every_command_reads() {
 
     let out = place.path().join("out");
     let written: Vec<String> = files(&out).iter().map(|p| p.to_string_lossy().into()).collect();
-    let expected = "cameras.json config.json depth/view1.png images/view1.png inputs/0.png \
-         inputs/0_depth.png inputs/1.png inputs/1_depth.png metrics.json scene.glb scene.ply \
+    let expected = "cameras.json config.json depth/view1.png depth_colour/view1.png images/view1.png \
+         inputs/0.png inputs/0_depth.png inputs/1.png inputs/1_depth.png metrics.json scene.glb scene.ply \
          scene.splat scene.spz";
     assert_eq!(written, expected.split_whitespace().collect::<Vec<_>>());
     let metrics: Value =
@@ -469,9 +469,10 @@ fn depth_pictures_do_not_overwrite_colour() {
     save_cameras_json(&at("cameras.json"), &content).unwrap();
     let report = done(&call_in(place.path(), "--json render one.ply --depth -o out"));
     let views = report["views"].as_array().unwrap();
-    let written = views.iter().flat_map(|v| [&v["file"], &v["depth_file"]]);
+    let written =
+        views.iter().flat_map(|v| [&v["file"], &v["depth_file"], &v["depth_colour_file"]]);
     let written: BTreeSet<&str> = written.map(|f| f.as_str().unwrap()).collect();
-    assert_eq!((written.len(), files(&at("out")).len()), (6, 6), "{written:?}");
+    assert_eq!((written.len(), files(&at("out")).len()), (9, 9), "{written:?}");
     assert!(written.contains("out/a_depth.png") && written.contains("out/depth/a.png"));
 }
 

@@ -1,0 +1,71 @@
+//! `subsplat export`: writes a finished scene in another format.
+
+use super::args::{ExportArgs, UpArg};
+use super::html::Page;
+use super::render;
+use crate::report::{Answer, Progress, print_warning};
+use anyhow::{Result, bail};
+use serde_json::json;
+use subsplat::abi::{Convention, RasterOptions};
+use subsplat::camera::Camera;
+use subsplat::io::{SaveOptions, load_with_comments, save_splats};
+use subsplat::render::{camera_of_comments, comments_without_camera, options_of_comments};
+
+/// Runs the command.
+pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
+    let mut progress = Progress::new();
+    let file = render::scene_file(&args.scene)?;
+    let html = args.out.extension().is_some_and(|e| e.eq_ignore_ascii_case("html"));
+    if args.cameras.is_some() && !html {
+        bail!("--cameras: only .html files hold cameras, got {}", args.out.display());
+    }
+    let (splats, comments) = progress.stage("scene", |_| load_with_comments(&file))?;
+    let stored = options_of_comments(&comments);
+    // The camera of a comment holds in the axes that the file had.
+    let kept = match args.up {
+        None | Some(UpArg::Keep) => comments,
+        Some(UpArg::Y | UpArg::Z) => comments_without_camera(&comments),
+    };
+    let save = SaveOptions {
+        sh_degree: args.sh,
+        min_opacity: args.min_opacity,
+        up: args.up.map(Into::into).unwrap_or_default(),
+        comments: kept,
+    };
+    let report = progress.stage("writing", |_| {
+        if !html {
+            return Ok(save_splats(&args.out, &splats, &save)?);
+        }
+        if args.up.is_some() {
+            bail!("--up: a .html file shows the scene upright as it is; leave the flag out");
+        }
+        let options = stored.unwrap_or_else(|| RasterOptions::new(Convention::Standard));
+        if options.convention == Convention::Mvsplat {
+            print_warning(
+                "the viewer draws by the standard convention; mvsplat's differs a little",
+            );
+        }
+        let cameras: Vec<Camera> = match render::cameras_beside(args.cameras.as_deref(), &file)? {
+            Some(all) => all.into_iter().map(|(_, camera)| camera).collect(),
+            None => camera_of_comments(&save.comments).into_iter().collect(),
+        };
+        let title = file.file_stem().unwrap_or_default().to_string_lossy();
+        let page = Page { splats: &splats, cameras: &cameras, options: &options, title: &title };
+        page.write(&args.out, &save)
+    })?;
+    let kind =
+        if html { "html".to_owned() } else { serde_json::to_value(report.format)?.to_string() };
+    let kind = kind.trim_matches('"').to_owned();
+    answer.line(format!(
+        "{}: {} Gaussians, SH degree {}, {:.1} MB",
+        args.out.display(),
+        report.count,
+        report.sh_degree,
+        report.bytes as f64 / 1e6
+    ));
+    let mut value = serde_json::to_value(&report)?;
+    value["format"] = json!(kind);
+    value["file"] = json!(args.out.display().to_string());
+    value["seconds"] = serde_json::Value::Object(progress.seconds());
+    answer.finish(&value)
+}

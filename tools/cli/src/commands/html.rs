@@ -1,0 +1,145 @@
+//! A scene as one HTML file: the Gaussians as .spz in base64, and the viewer of `tools/web`.
+//!
+//! The file loads nothing else, so it opens from a disk, an attachment or any server.
+
+use anyhow::Result;
+use serde_json::json;
+use std::io::Write;
+use std::path::Path;
+use subsplat::abi::{ALPHA_MIN, Convention, NEAR_MVSPLAT, RasterOptions};
+use subsplat::camera::Camera;
+use subsplat::io::{SaveOptions, SaveReport, SplatFormat, encode_splats_with, write_atomic};
+use subsplat::splats::Splats;
+
+const TEMPLATE: &str = include_str!("../../../web/scene.html");
+const STYLE: &str = include_str!("../../../web/viewer.css");
+const VIEWER: &str = include_str!("../../../web/viewer.js");
+
+/// A scene to be written.
+pub struct Page<'a> {
+    /// The Gaussians.
+    pub splats: &'a Splats,
+    /// Places that the viewer offers, its first one first; without any it shows the whole scene.
+    pub cameras: &'a [Camera],
+    /// Near plane, low-pass and background of the viewer.
+    pub options: &'a RasterOptions,
+    /// Title of the page.
+    pub title: &'a str,
+}
+
+impl Page<'_> {
+    /// Writes the page. Gaussians that no pixel shows are left out.
+    ///
+    /// # Errors
+    /// Those of [`encode_splats_with`] for .spz; system errors.
+    pub fn write(&self, path: &Path, save: &SaveOptions) -> Result<SaveReport> {
+        let save = SaveOptions { min_opacity: save.min_opacity.max(ALPHA_MIN), ..save.clone() };
+        let (scene, report) = encode_splats_with(SplatFormat::Spz, self.splats, &save, path)?;
+        let parts = [
+            ("{{title}}", escaped(self.title)),
+            ("{{css}}", STYLE.to_owned()),
+            ("{{settings}}", self.settings()),
+            ("{{scene}}", base64(&scene)),
+            ("{{js}}", VIEWER.to_owned()),
+        ];
+        let bytes = write_atomic(path, |file| {
+            let mut rest = TEMPLATE;
+            for (mark, text) in &parts {
+                // A test compares the marks with the template.
+                let (before, after) = rest.split_once(mark).unwrap_or((rest, ""));
+                file.write_all(before.as_bytes())?;
+                file.write_all(text.as_bytes())?;
+                rest = after;
+            }
+            file.write_all(rest.as_bytes())
+        })
+        .and_then(|()| {
+            std::fs::metadata(path)
+                .map(|m| m.len())
+                .map_err(|source| subsplat::io::Error::Io { path: path.to_owned(), source })
+        })?;
+        Ok(SaveReport { bytes, ..report })
+    }
+
+    fn settings(&self) -> String {
+        let camera = |c: &Camera| {
+            let k = c.intrinsics();
+            json!({
+                "width": k.width, "height": k.height,
+                "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy,
+                "world_from_camera": c.world_from_camera().transpose().to_cols_array()[..12],
+            })
+        };
+        let near = match self.options.convention {
+            Convention::Standard => self.options.near,
+            Convention::Mvsplat => NEAR_MVSPLAT * self.options.near,
+        };
+        let settings = json!({
+            "background": self.options.background,
+            "near": near,
+            "lowpass": self.options.lowpass,
+            "cameras": self.cameras.iter().map(camera).collect::<Vec<_>>(),
+        });
+        // No text may end the script element.
+        settings.to_string().replace('<', "\\u003c")
+    }
+}
+
+/// Escapes text for HTML.
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
+}
+
+/// Encodes bytes as base64 (RFC 4648).
+fn base64(bytes: &[u8]) -> String {
+    const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let mut out = String::with_capacity(bytes.len().div_ceil(3) * 4);
+    for group in bytes.chunks(3) {
+        let mut code = 0u32;
+        for i in 0..3 {
+            code = code << 8 | u32::from(group.get(i).copied().unwrap_or(0));
+        }
+        for i in 0..4 {
+            let digit = DIGITS[(code >> (18 - 6 * i) & 63) as usize];
+            out.push(if i <= group.len() { char::from(digit) } else { '=' });
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn base64_of_the_standards_examples() {
+        for (text, expected) in [
+            ("", ""),
+            ("f", "Zg=="),
+            ("fo", "Zm8="),
+            ("foo", "Zm9v"),
+            ("foob", "Zm9vYg=="),
+            ("fooba", "Zm9vYmE="),
+            ("foobar", "Zm9vYmFy"),
+        ] {
+            assert_eq!(base64(text.as_bytes()), expected);
+        }
+        assert_eq!(base64(&[0xfb, 0xff, 0xfe]), "+//+");
+    }
+
+    #[test]
+    fn the_template_has_each_mark_once_and_the_viewer_ends_no_script() {
+        let mut rest = TEMPLATE;
+        for mark in ["{{title}}", "{{css}}", "{{settings}}", "{{scene}}", "{{js}}"] {
+            assert_eq!(TEMPLATE.matches(mark).count(), 1, "{mark}");
+            rest = rest.split_once(mark).unwrap().1;
+        }
+        assert!(!rest.contains("{{"));
+        assert!(!VIEWER.contains("</script") && !VIEWER.contains("<!--"));
+        assert!(!STYLE.contains("</style"));
+        // Nothing is fetched from elsewhere.
+        for text in [TEMPLATE, STYLE, VIEWER] {
+            assert!(!text.contains("http:") && !text.contains("https:") && !text.contains("src="));
+        }
+    }
+}

@@ -1,0 +1,145 @@
+//! `export`, and the HTML of `run`: every format from a folder, and what is refused.
+
+use crate::program::{call_in, call_with, workplace};
+use std::path::Path;
+use subsplat::io::image::load;
+use subsplat::io::{SplatFormat, load_splats, parse_splats};
+use subsplat::metrics::psnr;
+use subsplat::splats::Splats;
+use subsplat_test_support::one_splat::save_one_splat;
+
+/// The contents of the script element `id` of a page.
+fn script(page: &str, id: &str) -> String {
+    let start = page.find(&format!("<script id=\"{id}\"")).unwrap();
+    let body = &page[start..];
+    let body = &body[body.find('>').unwrap() + 1..];
+    body[..body.find("</script>").unwrap()].to_owned()
+}
+
+/// Decodes base64, character by character.
+fn from_base64(text: &str) -> Vec<u8> {
+    const DIGITS: &str = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let (mut bits, mut held, mut out) = (0u32, 0, Vec::new());
+    for c in text.chars().filter(|c| *c != '=') {
+        bits = bits << 6 | DIGITS.find(c).unwrap() as u32;
+        held += 6;
+        if held >= 8 {
+            held -= 8;
+            out.push((bits >> held) as u8);
+            bits &= (1 << held) - 1;
+        }
+    }
+    out
+}
+
+fn scene_of(page: &Path) -> (Splats, serde_json::Value) {
+    let page = std::fs::read_to_string(page).unwrap();
+    let bytes = from_base64(script(&page, "scene").trim());
+    assert_eq!(SplatFormat::from_magic(&bytes), Some(SplatFormat::Spz));
+    let (splats, _) = parse_splats(&bytes, Path::new("scene.spz")).unwrap();
+    (splats, serde_json::from_str(&script(&page, "settings")).unwrap())
+}
+
+#[test]
+fn run_writes_a_page_with_its_scene_and_cameras() {
+    let place = workplace();
+    let quick = "run scene --context 0,2 --input-size 64 --fit 0 --refine off -o out";
+    let called = call_in(place.path(), &format!("--json {quick} --save ply,html"));
+    assert_eq!(called.code, 0, "{}", called.stderr);
+    let report = called.json();
+    let file = &report["files"][1];
+    assert_eq!(file["format"], "html");
+    let path = place.path().join("out/scene.html");
+    assert_eq!(file["bytes"].as_u64(), Some(std::fs::metadata(&path).unwrap().len()));
+    let (splats, settings) = scene_of(&path);
+    let written = load_splats(&place.path().join("out/scene.ply")).unwrap();
+    assert_eq!(splats.len() as u64, file["count"].as_u64().unwrap());
+    assert_eq!(splats.len(), written.len() - file["pruned"].as_u64().unwrap() as usize);
+    // The two photographs' own cameras, at the target's size.
+    let cameras = settings["cameras"].as_array().unwrap();
+    assert_eq!(cameras.len(), 2);
+    assert_eq!(cameras[0]["width"], 128);
+    assert!(settings["background"][0].as_f64().unwrap() > 0.0);
+
+    // `export` finds scene.ply and cameras.json in the folder that `run` wrote.
+    let called = call_in(place.path(), "--json export out -o again.html");
+    assert_eq!(called.code, 0, "{}", called.stderr);
+    let (again, settings) = scene_of(&place.path().join("again.html"));
+    assert_eq!(again.len(), splats.len());
+    assert_eq!(settings["cameras"].as_array().unwrap().len(), 1);
+    assert_eq!(settings["near"].as_f64().unwrap() as f32, 0.01);
+
+    // Alone, the file still knows the first photograph's camera; turned, it does not.
+    let alone = place.path().join("alone");
+    std::fs::create_dir(&alone).unwrap();
+    std::fs::copy(place.path().join("out/scene.ply"), alone.join("a.ply")).unwrap();
+    for (arguments, cameras) in
+        [("export alone/a.ply -o b.html", 1), ("export alone/turned.ply -o b.html", 0)]
+    {
+        let turn = "export alone/a.ply -o alone/turned.ply --up z";
+        assert_eq!(call_in(place.path(), turn).code, 0);
+        assert_eq!(call_in(place.path(), arguments).code, 0);
+        let (_, settings) = scene_of(&place.path().join("b.html"));
+        assert_eq!(settings["cameras"].as_array().unwrap().len(), cameras, "{arguments}");
+    }
+    let called = call_in(place.path(), "--json render alone/a.ply -o view");
+    assert!(called.code == 0 && called.stderr.contains("the file's own camera"));
+    let view = load(&place.path().join("view/view.png")).unwrap();
+    let photograph = load(&place.path().join("scene/images/view0.png")).unwrap();
+    let unit = |v: &[u8]| v.iter().map(|&v| f32::from(v) / 255.0).collect::<Vec<f32>>();
+    assert_eq!((view.width, view.height), (128, 128));
+    let likeness = psnr(&unit(&view.data), &unit(&photograph.data), 128, 128).unwrap();
+    assert!(likeness > 15.0, "the first photograph's view: {likeness:.1} dB");
+}
+
+#[test]
+fn export_writes_every_format() {
+    let place = workplace();
+    save_one_splat(&place.path().join("one.ply"));
+    let first = load_splats(&place.path().join("one.ply")).unwrap();
+    for format in ["ply", "glb", "spz", "splat", "html"] {
+        let called = call_in(place.path(), &format!("--json export one.ply -o two.{format}"));
+        assert_eq!(called.code, 0, "{}", called.stderr);
+        let report = called.json();
+        assert_eq!((&report["count"], &report["format"]), (&1.into(), &format.into()));
+        let path = place.path().join(format!("two.{format}"));
+        let again = match format {
+            "html" => scene_of(&path).0,
+            _ => load_splats(&path).unwrap(),
+        };
+        for (a, b) in first.mean(0).iter().zip(again.mean(0)) {
+            assert!((a - b).abs() < 1e-4, "{format}");
+        }
+    }
+    // A view of the whole, where no cameras.json lies beside the scene.
+    assert_eq!(scene_of(&place.path().join("two.html")).1["cameras"].as_array().unwrap().len(), 0);
+
+    assert_eq!(call_in(place.path(), "export one.ply -o up.ply --up y").code, 0);
+    let up = load_splats(&place.path().join("up.ply")).unwrap();
+    let ([x, y, z], turned) = (first.mean(0), up.mean(0));
+    assert!((turned[0] - x).abs() + (turned[1] + y).abs() + (turned[2] + z).abs() < 1e-5);
+}
+
+#[test]
+fn export_refuses_what_it_cannot_write() {
+    let place = workplace();
+    save_one_splat(&place.path().join("one.ply"));
+    for (arguments, words) in [
+        ("export one.ply -o two.obj", "two.obj: expected a name that ends in .ply"),
+        ("export one.ply -o two.ply --cameras scene", "--cameras: only .html files"),
+        ("export one.ply -o two.html --up y", "--up: a .html file"),
+        ("export one.ply -o two.spz --up z", "y-up by definition"),
+        ("export nothing.ply -o two.html", "nothing.ply"),
+        ("export one.ply -o none/two.html", "none/two.html"),
+        ("export one.ply -o two.html --min-opacity 0.95", "at least one Gaussian to write"),
+    ] {
+        let called = call_in(place.path(), arguments);
+        assert_eq!(called.code, 1, "{arguments}");
+        assert!(called.error().contains(words), "{arguments}: {}", called.stderr);
+    }
+    assert!(!place.path().join("two.html").exists());
+    for arguments in [["--sh", "4"], ["--min-opacity", "2"]] {
+        let all = [&["export", "one.ply", "-o", "two.ply"][..], &arguments].concat();
+        assert_eq!(call_with(place.path(), &all, &[]).code, 2, "{arguments:?}");
+    }
+}
