@@ -42,7 +42,7 @@ const IMPORTS: &[(&str, &[&str])] = &[
         "eval",
         &[
             "abi", "camera", "config", "cpu", "data", "fit", "io", "metrics", "model", "pipeline",
-            "render", "splats",
+            "refine", "render", "splats",
         ],
     ),
     (
