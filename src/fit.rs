@@ -275,13 +275,19 @@ pub(crate) struct Target<'a> {
 }
 
 impl<'a> Target<'a> {
-    pub(crate) fn new(view: usize, v: &FitView<'a>, dssim: f64) -> Result<Self, FitError> {
+    /// Refuses a picture of another size than its camera.
+    pub(crate) fn check(view: usize, v: &FitView<'_>) -> Result<(), FitError> {
         let k = v.camera.intrinsics;
         if (k.width, k.height) != (v.image.width, v.image.height) {
             let expected = format!("{}x{}", k.width, k.height);
             let got = format!("{}x{}", v.image.width, v.image.height);
             return Err(FitError::Size { view, expected, got });
         }
+        Ok(())
+    }
+
+    pub(crate) fn new(view: usize, v: &FitView<'a>, dssim: f64) -> Result<Self, FitError> {
+        Self::check(view, v)?;
         Ok(Self { camera: v.camera, truth: v.image.to_planes(), dssim })
     }
 

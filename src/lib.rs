@@ -24,13 +24,36 @@
 //! # }
 //! ```
 //!
+//! A viewer needs no network. This loads a file and draws it from a camera that sees all of it:
+//!
+//! ```
+//! use subsplat::{Bounds, RasterOptions, Rgb, load_splats, render, save_png};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! # let file = |end| std::env::temp_dir().join(format!("subsplat-doc-{}.{end}", std::process::id()));
+//! # let (room_ply, view_png) = (&file("view.ply"), &file("view.png"));
+//! # let row = vec![0.1, 0.2, 3.0, 1.0, 0.0, 0.0, 0.0, 0.5, 0.5, 0.5, 0.9];
+//! # let one = subsplat::Splats::new(row, vec![0.5; 3], vec![], 0, subsplat::ShBasis::default())?;
+//! # subsplat::save_splats(room_ply, &one, &subsplat::SaveOptions::default())?;
+//! let splats = load_splats(room_ply)?;
+//! let bounds = Bounds::of(splats.means()).ok_or("the file holds no Gaussian")?;
+//! let camera = bounds.camera(60f32.to_radians(), 512)?; // 512x512 pixels, along the world's +z
+//! let picture = render(&splats, &camera, &RasterOptions::default());
+//! save_png(view_png, &Rgb::from(&picture))?;
+//! # assert!(picture.alpha[256 * 512 + 256] > 0.5);
+//! # std::fs::remove_file(room_ply)?;
+//! # std::fs::remove_file(view_png)?;
+//! # Ok(())
+//! # }
+//! ```
+//!
 //! * `Reconstructor` runs the network: photographs and cameras to a `Reconstruction`.
 //! * [`render()`] and [`Renderer`] draw any [`Splats`]; `rasterize` draws `SplatTensors` with
 //!   gradients.
 //! * [`load_scene`], [`load_splats`] and [`save_splats`] read and write files.
 //! * [`check_pair`] compares poses with matched points.
-//! * [`estimate_poses`] finds cameras of photographs in memory that have none; `loose_scene` makes
-//!   a [`Scene`] of their files.
+//! * `loose_photos` and `loose_scene` estimate the cameras of photographs that have none, in memory
+//!   and in files; [`estimate_poses`] is the step beneath.
 //! * [`Camera`] and [`Intrinsics`] define all geometric conventions: OpenCV axes, pixel centres
 //!   at +0.5, `world_from_camera`.
 //!
@@ -194,12 +217,13 @@ pub use ops::{SplatTensors, rasterize_splats as rasterize};
 #[cfg(feature = "network")]
 pub use pipeline::{
     Check, DepthBounds, DepthRange, DepthSource, Detail, Error, InputSize, KnownLens, LensSource,
-    LooseOptions, LooseScene, Options, Photo, PoseError, Prepared, Progress, Reconstruction,
-    Reconstructor, Refine, Result, Stage, StageTime, Warning, loose_scene,
+    LooseOptions, LoosePhotos, LooseScene, Options, Photo, PoseError, Poses, Prepared, Progress,
+    Reconstruction, Reconstructor, Refine, Result, Stage, StageTime, Warning, loose_photos,
+    loose_scene,
 };
 pub use poses::{
-    Confidence, FocalEstimate, LeftOut, Lens, PoseEstimate, PoseOptions, PosePhoto, PosePhotoError,
-    PosePoint, PoseRefusal, PoseWarning, estimate_poses,
+    Confidence, FocalEstimate, LeftOut, Lens, PoseAdjustment, PoseEstimate, PoseOptions, PosePhoto,
+    PosePhotoError, PosePoint, PoseRefusal, PoseWarning, adjust_poses, estimate_poses,
 };
 pub use refine::{RefineOptions, RefineReport, Refiner, refine};
 pub use render::{Picture, Renderer, render};

@@ -7,14 +7,17 @@
 //! Real-Time Radiance Field Rendering* (Kerbl et al. 2023), from the network's Gaussians instead
 //! of sparse points, hence some dozens of steps instead of 30,000. SH coefficients stay.
 //!
+//! Of three photographs or more, parents are removed first that show little of all of them
+//! ([`RefineOptions::least_share`]): they lie behind the surfaces of other photographs, or repeat them.
+//!
 //! A photograph tells little about a scene that was optimised to give it back. The measure of a
 //! refinement is therefore each photograph drawn from the other photographs' Gaussians alone,
-//! where these cover it. A set whose error there has not fallen stays unchanged. Of two
-//! photographs, this picture is also part of the loss ([`RefineOptions::across`]), because two
+//! where these cover it. Steps end where this error no longer falls, and a set whose error has not
+//! fallen at all stays unchanged. Of two photographs, this picture is also part of the loss ([`RefineOptions::across`]), because two
 //! alone do not tell a wrong depth that gives both of them back.
 //!
 //! One step draws one photograph, in an order that depends on their number only. The same input
-//! gives the same bytes on any number of threads.
+//! gives the same bytes on any number of threads, unless [`RefineOptions::time`] limits the steps.
 
 use crate::abi::{
     Geometry, Gradients, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, RasterOptions, SCALE_OFFSET,
@@ -28,6 +31,7 @@ use crate::splats::Splats;
 use glam::Vec3;
 use rayon::prelude::*;
 use std::ops::{ControlFlow, Range};
+use std::time::{Duration, Instant};
 
 /// Options of a refinement. The rates were chosen on six scenes of `../shared/photos` at
 /// 128 → 256 with five photographs, targets between them.
@@ -52,6 +56,14 @@ pub struct RefineOptions {
     /// changes geometry and opacity, not colours. No effect on other numbers of photographs, or
     /// without `grouped`. Default: 1.
     pub across: f32,
+    /// Least share of a parent in the photographs: the weight of its children in all pixels, over
+    /// that of an average parent. Parents below it are removed, where `grouped` is set and there are
+    /// three photographs or more. Two photographs show most places twice at most, so nothing is
+    /// removed. 0 keeps all. Default: 0.5.
+    pub least_share: f32,
+    /// Longest duration of the steps; the rates fall over it instead of over `steps`. The result
+    /// then depends on the machine. Default: none.
+    pub time: Option<Duration>,
     /// The Gaussians are in equal groups, one for each photograph in their order, as
     /// [`Reconstruction::splats`](crate::Reconstruction::splats) has them. Without groups, the
     /// measure is the pictures of all Gaussians. Default: false.
@@ -69,6 +81,8 @@ impl Default for RefineOptions {
             colour_rate: 0.012,
             dssim: 0.2,
             across: 1.0,
+            least_share: 0.5,
+            time: None,
             grouped: false,
         }
     }
@@ -86,6 +100,20 @@ impl RefineOptions {
     #[must_use]
     pub fn with_across(mut self, weight: f32) -> Self {
         self.across = weight;
+        self
+    }
+
+    /// Sets [`RefineOptions::least_share`].
+    #[must_use]
+    pub fn with_least_share(mut self, share: f32) -> Self {
+        self.least_share = share;
+        self
+    }
+
+    /// Sets [`RefineOptions::time`], and no limit of steps.
+    #[must_use]
+    pub fn with_time(mut self, time: Duration) -> Self {
+        (self.time, self.steps) = (Some(time), usize::MAX);
         self
     }
 
@@ -108,10 +136,25 @@ pub struct RefineReport {
     pub before: f64,
     /// After the last step; equal to `before` where the Gaussians stayed as they were.
     pub after: f64,
+    /// Gaussians that were removed ([`RefineOptions::least_share`]).
+    pub removed: usize,
+}
+
+impl RefineReport {
+    /// A report of Gaussians that stayed as they were, with the error `before`.
+    fn unchanged(steps: usize, before: f64) -> Self {
+        Self { steps, before, after: before, removed: 0 }
+    }
 }
 
 /// The rates fall by a cosine from 1 + this to this.
 const RATE_FLOOR: f32 = 0.05;
+/// Rounds of all photographs between two measurements of the error, in the second half.
+const ROUNDS_PER_CHECK: usize = 4;
+/// The steps end where the error has not fallen by this share since the last measurement.
+const LEAST_GAIN: f64 = 1e-3;
+/// Fewest photographs of which parents are removed.
+const PHOTOGRAPHS_TO_PRUNE: usize = 3;
 /// Decay rates of Adam's means of the gradient and of its square.
 const BETAS: [f32; 2] = [0.9, 0.99];
 /// Keeps the quotient of a Gaussian without gradient finite.
@@ -181,6 +224,10 @@ pub struct Refiner<'a> {
     targets: Vec<Target<'a>>,
     raster: RasterOptions,
     options: RefineOptions,
+    /// Gaussians of each photograph; empty without [`RefineOptions::grouped`].
+    groups: Vec<Range<usize>>,
+    /// Begin of the first step, with [`RefineOptions::time`].
+    begun: Option<Instant>,
     /// `[N]`: size of a pixel at the Gaussian, in the photograph where it is smallest, world units.
     units: Vec<f32>,
     states: Vec<State>,
@@ -215,6 +262,8 @@ impl<'a> Refiner<'a> {
         }
         Ok(Self {
             predicted: splats,
+            groups: equal_groups(splats, views.len(), options),
+            begun: None,
             targets: views.iter().enumerate().map(target).collect::<Result<_, _>>()?,
             raster: RasterOptions { sh_basis: splats.sh_basis, ..*raster },
             options: *options,
@@ -244,6 +293,9 @@ impl<'a> Refiner<'a> {
         if self.targets.is_empty() || self.predicted.is_empty() {
             return;
         }
+        if self.begun.is_none() && self.options.time.is_some() {
+            self.begun = Some(Instant::now());
+        }
         let view = view_of_step(self.step, self.targets.len());
         let target = &self.targets[view];
         let slices = slices_of(&self.rows, &self.gain, self.predicted);
@@ -271,13 +323,24 @@ impl<'a> Refiner<'a> {
         self.update();
     }
 
-    /// The Gaussians of photograph `view`; `None` without [`RefineOptions::grouped`], or where the
-    /// parents do not divide into equal groups.
+    /// The Gaussians of photograph `view`; `None` without [`RefineOptions::grouped`].
     fn group(&self, view: usize) -> Option<Range<usize>> {
-        let (parents, views) = (self.predicted.parents(), self.targets.len());
-        let grouped = self.options.grouped && parents.is_multiple_of(views);
-        let size = parents / views * self.predicted.children_per_parent();
-        grouped.then(|| view * size..(view + 1) * size)
+        self.groups.get(view).cloned()
+    }
+
+    /// Share of the refinement that is done, 0 to 1.
+    pub fn progress(&self) -> f32 {
+        let part = match (self.options.time, self.begun) {
+            (Some(time), Some(begun)) => begun.elapsed().as_secs_f32() / time.as_secs_f32(),
+            (Some(_), None) => 0.0,
+            (None, _) => self.step as f32 / self.options.steps.max(1) as f32,
+        };
+        part.clamp(0.0, 1.0)
+    }
+
+    /// Returns whether the limit of steps or of time is reached.
+    fn is_done(&self) -> bool {
+        self.step >= self.options.steps || self.progress() >= 1.0
     }
 
     /// The measure of the refinement ([`RefineReport`]): mean over the photographs.
@@ -303,11 +366,11 @@ impl<'a> Refiner<'a> {
 
     /// One step of Adam with the last gradients.
     fn update(&mut self) {
+        let rates = rates(&self.options, self.progress());
         let Self { predicted, options, units, states, rows, gain, gradients, step, .. } = self;
         let (across, other) = (&self.across.rows, &self.other);
         let n = i32::try_from(*step).unwrap_or(i32::MAX);
         let correction = BETAS.map(|b| 1.0 - b.powi(n));
-        let rates = rates(options, *step);
         let channels = predicted.gain_channels();
         let rows = rows.par_chunks_exact_mut(SPLAT_STRIDE).zip(gain.par_chunks_exact_mut(4));
         let by = gradients.rows.par_chunks_exact(SPLAT_STRIDE);
@@ -337,9 +400,9 @@ impl<'a> Refiner<'a> {
     }
 }
 
-/// Refines `splats` on `views` in place. `progress` receives the number of steps done;
-/// [`ControlFlow::Break`] cancels. The colour offsets are added to the δ of [`Splats::gain`], which
-/// has four numbers a Gaussian afterwards.
+/// Refines `splats` on `views` in place. `progress` receives the refinement after each step, whose
+/// [`Refiner::splats`] a caller can show; [`ControlFlow::Break`] cancels. The colour offsets are
+/// added to the δ of [`Splats::gain`], which has four numbers a Gaussian afterwards.
 ///
 /// # Errors
 /// A picture of another size than its camera; a cancelled refinement. The Gaussians are then
@@ -350,28 +413,136 @@ pub fn refine(
     raster: &RasterOptions,
     options: &RefineOptions,
     renderer: &mut Renderer,
-    progress: &mut dyn FnMut(usize) -> ControlFlow<()>,
+    progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
 ) -> Result<RefineReport, FitError> {
-    let mut refiner = Refiner::new(splats, views, raster, options)?;
-    if options.steps == 0 || views.is_empty() || refiner.predicted.is_empty() {
-        return Ok(RefineReport { steps: 0, before: 0.0, after: 0.0 });
+    if options.steps == 0 || views.is_empty() || splats.is_empty() {
+        return Ok(RefineReport::unchanged(0, 0.0));
     }
+    for (i, view) in views.iter().enumerate() {
+        Target::check(i, view)?;
+    }
+    let pruned = pruned(splats, views, raster, options, renderer);
+    let mut refiner = match &pruned {
+        Some((kept, groups)) => {
+            Refiner { groups: groups.clone(), ..Refiner::new(kept, views, raster, options)? }
+        }
+        None => Refiner::new(splats, views, raster, options)?,
+    };
     let before = refiner.error(renderer);
-    while refiner.steps() < options.steps {
+    let (mut last, between) = (None, ROUNDS_PER_CHECK * views.len());
+    while !refiner.is_done() {
         refiner.step(renderer);
-        if progress(refiner.steps()).is_break() {
+        if progress(&refiner).is_break() {
             return Err(FitError::Cancelled);
+        }
+        // High rates at the beginning can raise the error for a while.
+        let settled = refiner.progress() >= 0.5 && refiner.steps() + between < options.steps;
+        if settled && refiner.steps().is_multiple_of(between) {
+            let error = refiner.error(renderer);
+            if last.is_some_and(|last| !(error < last * (1.0 - LEAST_GAIN))) {
+                break;
+            }
+            last = Some(error);
         }
     }
     let (steps, after) = (refiner.steps(), refiner.error(renderer));
     // An error that is not a number fails the comparison as well.
     if !(after < before) {
-        return Ok(RefineReport { steps, before, after: before });
+        return Ok(RefineReport::unchanged(steps, before));
     }
     let Refiner { rows, gain, .. } = refiner;
+    let removed = splats.len() - rows.len() / SPLAT_STRIDE;
+    if let Some((kept, _)) = pruned {
+        *splats = kept;
+    }
     splats.rows = rows;
     splats.gain = gain;
-    Ok(RefineReport { steps, before, after })
+    Ok(RefineReport { steps, before, after, removed })
+}
+
+/// The Gaussians of each of `views` photographs: equal groups of whole families. Empty without
+/// [`RefineOptions::grouped`], or where the parents do not divide into equal groups.
+fn equal_groups(splats: &Splats, views: usize, options: &RefineOptions) -> Vec<Range<usize>> {
+    let parents = splats.parents();
+    if !options.grouped || views == 0 || !parents.is_multiple_of(views) {
+        return Vec::new();
+    }
+    let size = parents / views * splats.children_per_parent();
+    (0..views).map(|view| view * size..(view + 1) * size).collect()
+}
+
+/// A set of Gaussians with the group of each photograph.
+type Grouped = (Splats, Vec<Range<usize>>);
+
+/// The Gaussians without the parents below [`RefineOptions::least_share`]; `None` where all stay.
+fn pruned(
+    splats: &Splats,
+    views: &[FitView<'_>],
+    raster: &RasterOptions,
+    options: &RefineOptions,
+    renderer: &mut Renderer,
+) -> Option<Grouped> {
+    let groups = equal_groups(splats, views.len(), options);
+    if groups.len() < PHOTOGRAPHS_TO_PRUNE || !(options.least_share > 0.0) {
+        return None;
+    }
+    let shares = shares(splats, views, raster, renderer);
+    let keep: Vec<bool> = shares.iter().map(|share| *share >= options.least_share).collect();
+    let (children, mut end) = (splats.children_per_parent(), 0);
+    let groups: Vec<Range<usize>> = groups
+        .into_iter()
+        .map(|group| {
+            let families = &keep[group.start / children..group.end / children];
+            let begin = end;
+            end += children * families.iter().filter(|keep| **keep).count();
+            begin..end
+        })
+        .collect();
+    let some = end > 0 && keep.contains(&false);
+    some.then(|| (families(splats, &keep), groups))
+}
+
+/// Share of each parent in the photographs: the weights T·α of its children, summed over all
+/// pixels, over those of an average parent. The sums are gradients by the colour offsets of a
+/// loss that adds all pixels.
+fn shares(
+    splats: &Splats,
+    views: &[FitView<'_>],
+    raster: &RasterOptions,
+    renderer: &mut Renderer,
+) -> Vec<f32> {
+    let (parents, children) = (splats.parents(), splats.children_per_parent());
+    let raster = RasterOptions { sh_basis: splats.sh_basis, ..*raster };
+    let gain = gain_with_offsets(&splats.gain, splats.len());
+    let slices = slices_of(&splats.rows, &gain, splats);
+    let (mut shares, mut pixels) = (vec![0.0f32; parents], 0);
+    let mut gradients = Gradients::default();
+    for view in views {
+        let count = view.image.width * view.image.height;
+        pixels += count;
+        renderer.gradients_of(&slices, view.camera, &raster, &mut gradients, &mut |planes| {
+            let mut by_pixel = vec![0.0; planes.len()];
+            by_pixel[..3 * count].fill(1.0 / 3.0);
+            by_pixel
+        });
+        let families = gradients.gain.par_chunks_exact(4 * children);
+        shares.par_iter_mut().zip(families).with_min_len(CHUNK).for_each(|(share, family)| {
+            *share += family.chunks_exact(4).map(|g| g[1] + g[2] + g[3]).sum::<f32>();
+        });
+    }
+    let average = pixels as f32 / parents.max(1) as f32;
+    shares.iter().map(|weight| weight / average).collect()
+}
+
+/// The families of `splats` that `keep` marks.
+fn families(splats: &Splats, keep: &[bool]) -> Splats {
+    let part = |values: &[f32]| -> Vec<f32> {
+        let size = values.len() / keep.len().max(1);
+        let kept = values.chunks_exact(size.max(1)).zip(keep).filter(|(_, keep)| **keep);
+        kept.flat_map(|(family, _)| family).copied().collect()
+    };
+    let (rows, sh, gain) = (part(&splats.rows), part(&splats.sh), part(&splats.gain));
+    Splats { rows, sh, gain, sh_degree: splats.sh_degree, sh_basis: splats.sh_basis }
 }
 
 /// The photograph of a step, counted from 0: all of them once in each round.
@@ -416,10 +587,9 @@ fn part_of<'s>(slices: SplatSlices<'s>, range: &Range<usize>) -> SplatSlices<'s>
     }
 }
 
-/// Step sizes of the parameters in step `step`, counted from 1.
-fn rates(options: &RefineOptions, step: usize) -> [f32; PARAMETERS] {
-    let part = step as f32 / options.steps.max(1) as f32;
-    let factor = RATE_FLOOR + 0.5 * (1.0 + (std::f32::consts::PI * part.min(1.0)).cos());
+/// Step sizes of the parameters after the share `part` of the refinement.
+fn rates(options: &RefineOptions, part: f32) -> [f32; PARAMETERS] {
+    let factor = RATE_FLOOR + 0.5 * (1.0 + (std::f32::consts::PI * part).cos());
     let mut rates = [0.0; PARAMETERS];
     rates[LOGIT] = options.opacity_rate;
     rates[LOG_SCALE..COLOUR].fill(options.scale_rate);

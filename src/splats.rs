@@ -258,6 +258,11 @@ impl Splats {
         [r[MEAN_OFFSET], r[MEAN_OFFSET + 1], r[MEAN_OFFSET + 2]]
     }
 
+    /// Returns the means of all splats, world.
+    pub fn means(&self) -> impl Iterator<Item = [f32; 3]> + '_ {
+        (0..self.len()).map(|i| self.mean(i))
+    }
+
     /// Returns the quaternion of splat `i`, wxyz, as stored.
     pub fn quat_wxyz(&self, i: usize) -> [f32; 4] {
         let r = self.row(i);

@@ -18,6 +18,11 @@ struct Case {
     run: Run,
 }
 
+/// The factors and summands of a normalisation.
+fn affine(t: &HashMap<String, Tensor>) -> norm::Affine<'_> {
+    norm::Affine { weight: &t["w"], bias: &t["b"] }
+}
+
 /// Every operator of MVSplat except convolutions, at its largest and at its most frequent size.
 const CASES: [Case; 15] = [
     Case {
@@ -28,12 +33,12 @@ const CASES: [Case; 15] = [
     Case {
         name: "group_norm_silu 2x128x64x64",
         inputs: &[("x", &[2, 128, 64, 64]), ("w", &[128]), ("b", &[128])],
-        run: |t| norm::group_norm_then(&t["x"], 8, (&t["w"], &t["b"]), Some(Activation::Silu)),
+        run: |t| norm::group_norm_then(&t["x"], 8, affine(t), Some(Activation::Silu)),
     },
     Case {
         name: "group_norm_silu 2x32x256x256",
         inputs: &[("x", &[2, 32, 256, 256]), ("w", &[32]), ("b", &[32])],
-        run: |t| norm::group_norm_then(&t["x"], 8, (&t["w"], &t["b"]), Some(Activation::Silu)),
+        run: |t| norm::group_norm_then(&t["x"], 8, affine(t), Some(Activation::Silu)),
     },
     Case {
         name: "layer_norm 8192x128",

@@ -98,24 +98,23 @@ impl Directions {
 
     #[inline(always)]
     fn evaluate(&mut self, used: usize, basis: ShBasis) {
-        let mvsplat = basis == ShBasis::Mvsplat;
         match used {
-            1 => self.evaluate_first::<1>(mvsplat),
-            4 => self.evaluate_first::<4>(mvsplat),
-            9 => self.evaluate_first::<9>(mvsplat),
-            16 => self.evaluate_first::<16>(mvsplat),
-            _ => self.evaluate_first::<SH_COEFFICIENTS_MAX>(mvsplat),
+            1 => self.evaluate_first::<1>(basis),
+            4 => self.evaluate_first::<4>(basis),
+            9 => self.evaluate_first::<9>(basis),
+            16 => self.evaluate_first::<16>(basis),
+            _ => self.evaluate_first::<SH_COEFFICIENTS_MAX>(basis),
         }
     }
 
     #[inline(always)]
-    fn evaluate_first<const D: usize>(&mut self, mvsplat: bool) {
+    fn evaluate_first<const D: usize>(&mut self, basis: ShBasis) {
         for l in 0..GROUP {
             let v: [f32; 3] = get(&self.towards, l);
             let inverse = 1.0 / (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
             let d = [v[0] * inverse, v[1] * inverse, v[2] * inverse];
             let s: [f32; D] = std::array::from_fn(|k| self.s[k][l]);
-            let (y, g) = values_and_slope::<D>(mvsplat, d, &s);
+            let (y, g) = values_and_slope::<D>(basis, d, &s);
             let mut value = 0.0;
             for k in 0..D {
                 self.y[k][l] = y[k];

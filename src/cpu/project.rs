@@ -12,12 +12,12 @@ pub use crate::abi::{Geometry, SplatSlices};
 
 pub(crate) use crate::abi::floats_at;
 use crate::abi::{
-    MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE, ShBasis,
+    MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE,
     ShDirection, sh_coefficients,
 };
 use crate::cpu::covariance::Shape;
 use crate::cpu::ewa::{FIELDS, Footprint, View};
-use crate::cpu::sh::{direction_lanes, radiance_lanes};
+use crate::cpu::sh::{ShFunctions, direction_lanes, radiance_lanes};
 use crate::cpu::simd::{Kernel, LANES, Mask, Simd, SimdLevel, Vector};
 use crate::cpu::tiles::{ChunkCover, TileLists};
 use rayon::prelude::*;
@@ -65,7 +65,8 @@ impl Projection {
         options: &RasterOptions,
         lists: &mut TileLists,
     ) {
-        let basis = (options.sh_basis, options.sh_degree.min(splats.sh_degree));
+        let degree = options.sh_degree.min(splats.sh_degree);
+        let functions = ShFunctions { basis: options.sh_basis, degree };
         let shared = options.sh_direction == ShDirection::Parent;
         self.parents.clear();
         if shared {
@@ -73,7 +74,7 @@ impl Projection {
             let parents = splats.parents().max(splats.len().div_ceil(children));
             self.parents.resize(parents, [0.0; 3]);
             self.parents.par_chunks_mut(PARENTS).enumerate().for_each(|(c, out)| {
-                level.run(Parents { splats, view, basis, first: c * PARENTS, out });
+                level.run(Parents { splats, view, functions, first: c * PARENTS, out });
             });
         }
         self.footprints.resize(splats.len(), Footprint::default());
@@ -81,7 +82,15 @@ impl Projection {
         let chunk = lists.chunk();
         let chunks = self.footprints.par_chunks_mut(chunk).zip(lists.chunks(splats.len()));
         chunks.enumerate().for_each(|(c, (footprints, cover))| {
-            level.run(Chunk { splats, view, basis, parents, first: c * chunk, footprints, cover });
+            level.run(Chunk {
+                splats,
+                view,
+                functions,
+                parents,
+                first: c * chunk,
+                footprints,
+                cover,
+            });
         });
     }
 }
@@ -90,7 +99,7 @@ impl Projection {
 struct Parents<'a> {
     splats: &'a SplatSlices<'a>,
     view: &'a View,
-    basis: (ShBasis, usize),
+    functions: ShFunctions,
     /// First parent.
     first: usize,
     out: &'a mut [[f32; 3]],
@@ -125,7 +134,7 @@ impl Kernel for Parents<'_> {
             }
             let d = [s.load(&buffer[0]), s.load(&buffer[1]), s.load(&buffer[2])];
             let d = direction_lanes(s, d);
-            let rgb = radiance_lanes(s, self.basis, d, splats.sh, &at);
+            let rgb = radiance_lanes(s, self.functions, d, splats.sh, &at);
             for (lanes, v) in buffer.iter_mut().zip(rgb) {
                 s.store(v, lanes);
             }
@@ -143,7 +152,7 @@ const STRIP: usize = 256;
 struct Chunk<'a> {
     splats: &'a SplatSlices<'a>,
     view: &'a View,
-    basis: (ShBasis, usize),
+    functions: ShFunctions,
     parents: Option<&'a [[f32; 3]]>,
     /// First splat.
     first: usize,
@@ -317,7 +326,7 @@ impl Chunk<'_> {
                 [mean[0] - s.splat(eye[0]), mean[1] - s.splat(eye[1]), mean[2] - s.splat(eye[2])];
             let d = direction_lanes(s, away);
             let at = if children == 1 { index } else { index.map(|i| i / children) };
-            radiance_lanes(s, self.basis, d, splats.sh, &at.map(|p| p * set))
+            radiance_lanes(s, self.functions, d, splats.sh, &at.map(|p| p * set))
         };
         let (gain, residual) = self.gain(s, &index);
         let (half, infinity) = (s.splat(0.5), s.splat(f32::INFINITY));

@@ -97,16 +97,25 @@ pub fn radiance(kind: ShBasis, degree: usize, d: [f32; 3], sh: &[f32]) -> [f32; 
     rgb
 }
 
+/// The SH functions that a render evaluates.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct ShFunctions {
+    pub basis: ShBasis,
+    /// Highest degree.
+    pub degree: usize,
+}
+
 /// Computes [`radiance`] of sixteen sets along sixteen unit vectors. Set l starts at `at[l]`
 /// of `sh` and holds at least the coefficients of `degree`.
 #[inline(always)]
 pub(crate) fn radiance_lanes<S: Simd>(
     s: S,
-    (kind, degree): (ShBasis, usize),
+    functions: ShFunctions,
     d: [S::F; 3],
     sh: &[f32],
     at: &[usize; LANES],
 ) -> [S::F; 3] {
+    let ShFunctions { basis: kind, degree } = functions;
     let degree = degree.min(degree_max(kind));
     let used = sh_coefficients(degree);
     let b = basis(kind, degree, d);
@@ -210,7 +219,7 @@ mod tests {
         assert_ne!(three, radiance(ShBasis::Mvsplat, 2, d, &sh));
     }
 
-    struct Lanes<'a>(ShBasis, usize, &'a [[f32; 3]; LANES], &'a [f32], &'a [usize; LANES]);
+    struct Lanes<'a>(ShFunctions, &'a [[f32; 3]; LANES], &'a [f32], &'a [usize; LANES]);
 
     impl Kernel for Lanes<'_> {
         type Output = [[f32; LANES]; 3];
@@ -218,15 +227,13 @@ mod tests {
         #[inline(always)]
         fn run<S: Simd>(self, s: S) -> Self::Output {
             let mut columns = [[0.0; LANES]; 3];
-            for (l, v) in self.2.iter().enumerate() {
+            for (l, v) in self.1.iter().enumerate() {
                 for c in 0..3 {
                     columns[c][l] = v[c];
                 }
             }
             let d = direction_lanes(s, columns.map(|c| s.load(&c)));
-            for (to, v) in
-                columns.iter_mut().zip(radiance_lanes(s, (self.0, self.1), d, self.3, self.4))
-            {
+            for (to, v) in columns.iter_mut().zip(radiance_lanes(s, self.0, d, self.2, self.3)) {
                 s.store(v, to);
             }
             columns
@@ -248,8 +255,9 @@ mod tests {
             let at = std::array::from_fn(|l| (l * 5 % 9) * set);
             for degree in 0..=stored {
                 for kind in [ShBasis::Standard, ShBasis::Mvsplat] {
+                    let functions = ShFunctions { basis: kind, degree };
                     for &level in SimdLevel::available() {
-                        let got = level.run(Lanes(kind, degree, &vectors, &sh, &at));
+                        let got = level.run(Lanes(functions, &vectors, &sh, &at));
                         for l in 0..LANES {
                             let set = &sh[at[l]..at[l] + set];
                             let expected = radiance(kind, degree, direction(vectors[l]), set);

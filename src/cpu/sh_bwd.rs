@@ -16,11 +16,11 @@ pub(crate) fn used_coefficients(basis: ShBasis, degree: usize) -> usize {
 /// Y_k(d) of `basis`, k < D, and Σ_k s_k ∇Y_k(d).
 #[inline(always)]
 pub(crate) fn values_and_slope<const D: usize>(
-    mvsplat: bool,
+    basis: ShBasis,
     [x, y, z]: [f32; 3],
     s: &[f32; D],
 ) -> ([f32; D], [f32; 3]) {
-    if !mvsplat {
+    if basis == ShBasis::Standard {
         return standard(x, y, z, s);
     }
     let mut rest = *s;
@@ -134,15 +134,15 @@ mod tests {
 
     type Functions = fn(DVec3) -> Vec<f64>;
 
-    fn check<const D: usize>(mvsplat: bool, functions: Functions) {
+    fn check<const D: usize>(basis: ShBasis, functions: Functions) {
         for i in 0..40 {
             let z = 1.0 - 2.0 * (f64::from(i) + 0.5) / 40.0;
             let (sin, cos) = (2.399_963 * f64::from(i)).sin_cos();
             let d = DVec3::new((1.0 - z * z).sqrt() * cos, (1.0 - z * z).sqrt() * sin, z);
             let s: [f32; D] = std::array::from_fn(|k| ((k * 7 + i as usize) as f32).sin());
-            let (values, slope) = values_and_slope(mvsplat, d.to_array().map(|v| v as f32), &s);
+            let (values, slope) = values_and_slope(basis, d.to_array().map(|v| v as f32), &s);
             for (k, y) in functions(d).into_iter().take(D).enumerate() {
-                assert!((f64::from(values[k]) - y).abs() < 2e-6, "{mvsplat} {D} {k}");
+                assert!((f64::from(values[k]) - y).abs() < 2e-6, "{basis:?} {D} {k}");
             }
             let sum = |d: DVec3| -> f64 {
                 functions(d.normalize()).iter().zip(&s).map(|(y, s)| y * f64::from(*s)).sum()
@@ -153,7 +153,7 @@ mod tests {
                 let mut h = DVec3::ZERO;
                 h[axis] = 1e-5;
                 let expected = (sum(d + h) - sum(d - h)) / 2e-5;
-                assert!((along[axis] - expected).abs() < 2e-5, "{mvsplat} {D} {axis}");
+                assert!((along[axis] - expected).abs() < 2e-5, "{basis:?} {D} {axis}");
             }
         }
     }
@@ -162,12 +162,12 @@ mod tests {
     fn values_and_slopes_are_those_of_the_reference() {
         let standard: Functions = |d| crate::sh::standard(d).to_vec();
         let mvsplat: Functions = |d| crate::sh::mvsplat(d).to_vec();
-        check::<1>(false, standard);
-        check::<4>(false, standard);
-        check::<9>(false, standard);
-        check::<16>(false, standard);
-        check::<25>(false, standard);
-        check::<9>(true, mvsplat);
-        check::<16>(true, mvsplat);
+        check::<1>(ShBasis::Standard, standard);
+        check::<4>(ShBasis::Standard, standard);
+        check::<9>(ShBasis::Standard, standard);
+        check::<16>(ShBasis::Standard, standard);
+        check::<25>(ShBasis::Standard, standard);
+        check::<9>(ShBasis::Mvsplat, mvsplat);
+        check::<16>(ShBasis::Mvsplat, mvsplat);
     }
 }

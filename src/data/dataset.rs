@@ -319,7 +319,7 @@ impl Dataset {
         let expected = format!(
             "a scene of more than {} frames of at least {}x{} pixels, none wider than {FOV_MAX} \
              degrees, with a camera that moves or with near and far",
-            sampler.bounds(step).0,
+            sampler.bounds(step).low,
             w * r,
             h * r
         );

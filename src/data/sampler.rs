@@ -29,15 +29,24 @@ pub enum GapMode {
     Uniform,
 }
 
+/// Smallest and largest gap between the context frames, frames.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct GapBounds {
+    /// Smallest gap.
+    pub low: usize,
+    /// Largest gap.
+    pub high: usize,
+}
+
 /// Samples context and target frames of a video.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ViewSampler {
     /// Interpretation of the gap.
     pub mode: GapMode,
     /// Bounds of the gap at step 0, frames.
-    pub first: (usize, usize),
+    pub first: GapBounds,
     /// Bounds of the gap from step `steps` on, frames.
-    pub last: (usize, usize),
+    pub last: GapBounds,
     /// Steps over which the bounds grow linearly. With 0, `last` holds from the start.
     pub steps: usize,
     /// Number of targets of an example.
@@ -48,17 +57,23 @@ impl ViewSampler {
     /// Returns MVSplat's `re10k` configuration: 25–45 growing to 45–192 frames over 150,000 steps,
     /// 4 targets.
     pub fn re10k(mode: GapMode) -> Self {
-        Self { mode, first: (25, 45), last: (45, 192), steps: 150_000, targets: 4 }
+        Self {
+            mode,
+            first: GapBounds { low: 25, high: 45 },
+            last: GapBounds { low: 45, high: 192 },
+            steps: 150_000,
+            targets: 4,
+        }
     }
 
     /// Returns a sampler with gaps of `low` to `high` frames at every step.
     pub fn constant(low: usize, high: usize, targets: usize) -> Self {
-        let bounds = (low, high);
+        let bounds = GapBounds { low, high };
         Self { mode: GapMode::Uniform, first: bounds, last: bounds, steps: 0, targets }
     }
 
     /// Returns the bounds of the gap at `step`, without regard to the video's length and the mode.
-    pub fn bounds(&self, step: usize) -> (usize, usize) {
+    pub fn bounds(&self, step: usize) -> GapBounds {
         if self.steps == 0 {
             return self.last;
         }
@@ -69,14 +84,18 @@ impl ViewSampler {
             // The reference applies `min()`, which is correct for growing bounds only.
             if to >= from { moved.min(to as i64) } else { moved.max(to as i64) }.max(0) as usize
         };
-        (interpolated(self.first.0, self.last.0), interpolated(self.first.1, self.last.1))
+        let (first, last) = (self.first, self.last);
+        GapBounds {
+            low: interpolated(first.low, last.low),
+            high: interpolated(first.high, last.high),
+        }
     }
 
     /// Samples context and target frames of a video of `frames` frames at training step `step`.
     ///
     /// Returns `None` where the video is too short. Equal seeds give equal frames.
     pub fn sample(&self, frames: usize, step: usize, seed: u64) -> Option<SampledFrames> {
-        let (low, high) = self.bounds(step);
+        let GapBounds { low, high } = self.bounds(step);
         let low = low.max(1);
         let high = match self.mode {
             GapMode::Mvs => low,
@@ -112,17 +131,18 @@ mod tests {
     fn the_reference_samples_exactly_the_lower_bound() {
         let sampler = ViewSampler::re10k(GapMode::Mvs);
         for (step, gap) in [(0, 25), (7_499, 25), (7_500, 26), (75_000, 35), (149_999, 44)] {
-            assert_eq!(sampler.bounds(step).0, gap, "step {step}");
+            assert_eq!(sampler.bounds(step).low, gap, "step {step}");
             for seed in 0..50 {
                 let [left, right] = sampler.sample(200, step, seed).unwrap().context;
                 assert_eq!(right - left, gap, "step {step}");
             }
         }
         for step in [150_000, 400_000] {
-            assert_eq!(sampler.bounds(step), (45, 192));
+            assert_eq!(sampler.bounds(step), GapBounds { low: 45, high: 192 });
         }
-        let endless = ViewSampler { last: (45, 1 << 40), steps: 1, ..sampler };
-        assert_eq!(endless.bounds(1 << 40), (45, 1 << 40));
+        let last = GapBounds { low: 45, high: 1 << 40 };
+        let endless = ViewSampler { last, steps: 1, ..sampler };
+        assert_eq!(endless.bounds(1 << 40), last);
         // The largest gap of n frames is n − 1.
         assert_eq!(sampler.sample(26, 0, 1).unwrap().context, [0, 25]);
         assert_eq!(sampler.sample(25, 0, 1), None);

@@ -20,6 +20,7 @@ use crate::pipeline::{
     DepthBounds, DepthRange, Error, Photo, Reconstructor, Refine, Result, add_detail,
     fit_to_inputs, refine_on_inputs,
 };
+use crate::refine::Refiner;
 use crate::render::{Renderer, render_with};
 use crate::splats::{SplatStatistics, Splats};
 use std::ops::ControlFlow;
@@ -407,33 +408,21 @@ impl<'a> PictureMaker<'a> {
         let (inputs, upscale) = (&crops.inputs, network.model.config().upscale);
         let raster = self.raster_options(network, self.r, None);
         let mut renderer = Renderer::default();
-        let mut go_on = |_: usize| ControlFlow::Continue(());
         for set in sets {
+            let (splats, renderer) = (&mut splats, &mut renderer);
             match set {
                 Set::Detailed => {
-                    add_detail(&mut splats, inputs, upscale)?;
+                    add_detail(splats, inputs, upscale)?;
                 }
                 Set::Fitted => {
                     let options = FitOptions::default();
-                    fit_to_inputs(
-                        &mut splats,
-                        inputs,
-                        &raster,
-                        &options,
-                        &mut renderer,
-                        &mut go_on,
-                    )?;
+                    let mut progress = |_: usize| ControlFlow::Continue(());
+                    fit_to_inputs(splats, inputs, &raster, &options, renderer, &mut progress)?;
                 }
                 _ => {
                     let options = Refine::Auto.options(inputs.len());
-                    refine_on_inputs(
-                        &mut splats,
-                        inputs,
-                        &raster,
-                        &options,
-                        &mut renderer,
-                        &mut go_on,
-                    )?;
+                    let mut progress = |_: &Refiner<'_>| ControlFlow::Continue(());
+                    refine_on_inputs(splats, inputs, &raster, &options, renderer, &mut progress)?;
                 }
             }
         }

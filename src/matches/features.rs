@@ -107,8 +107,11 @@ pub(crate) struct Octave {
 /// add a second copy of a feature with several strong gradient directions.
 pub(crate) fn detect(image: &GrayImage, max_features: usize, orientation: Orientation) -> Features {
     let doubled = image.width().max(image.height()) < DOUBLE_BELOW;
-    let octaves = pyramid(image, doubled);
-    let unit = if doubled { 0.5 } else { 1.0 };
+    let (base, blur, unit) = match doubled {
+        true => (image.doubled(), 2.0 * SIGMA_CAMERA, 0.5),
+        false => (image.clone(), SIGMA_CAMERA, 1.0),
+    };
+    let octaves = pyramid(base, blur);
     let mut found: Vec<Feature> = octaves
         .iter()
         .enumerate()
@@ -127,11 +130,9 @@ pub(crate) fn detect(image: &GrayImage, max_features: usize, orientation: Orient
     Features { points, descriptors }
 }
 
-/// Builds the octaves; `doubled` starts with the picture at twice its size.
-fn pyramid(image: &GrayImage, doubled: bool) -> Vec<Octave> {
-    let (mut base, existing_blur) =
-        if doubled { (image.doubled(), 2.0 * SIGMA_CAMERA) } else { (image.clone(), SIGMA_CAMERA) };
-    base = base.blurred((SIGMA_BASE * SIGMA_BASE - existing_blur * existing_blur).sqrt());
+/// Builds the octaves, the first at the size of `base`, which has a blur of `existing_blur`.
+fn pyramid(base: GrayImage, existing_blur: f32) -> Vec<Octave> {
+    let mut base = base.blurred((SIGMA_BASE * SIGMA_BASE - existing_blur * existing_blur).sqrt());
     let step = 2f32.powf(1.0 / LEVELS as f32);
     let mut octaves = Vec::new();
     while base.width().min(base.height()) >= 4 * BORDER {

@@ -232,7 +232,8 @@ impl GroupNorm {
     /// # Errors
     /// As [`GroupNorm::forward`].
     pub fn forward_then(&self, x: &Tensor, activation: Activation) -> Result<Tensor> {
-        norm::group_norm_then(x, self.groups, (&self.weight, &self.bias), Some(activation))
+        let affine = norm::Affine { weight: &self.weight, bias: &self.bias };
+        norm::group_norm_then(x, self.groups, affine, Some(activation))
     }
 }
 

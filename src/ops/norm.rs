@@ -15,20 +15,29 @@ const EPS: f32 = 1e-5;
 /// # Errors
 /// Shapes that do not fit; a dtype other than f32.
 pub fn group_norm(x: &Tensor, groups: usize, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
-    group_norm_then(x, groups, (weight, bias), None)
+    group_norm_then(x, groups, Affine { weight, bias }, None)
 }
 
-/// [`group_norm`] with `affine` = (weight, bias), then `activation`, in one pass.
+/// Factor and summand of each channel, `[C]`.
+#[derive(Clone, Copy, Debug)]
+pub struct Affine<'a> {
+    /// Factors.
+    pub weight: &'a Tensor,
+    /// Summands.
+    pub bias: &'a Tensor,
+}
+
+/// [`group_norm`], then `activation`, in one pass.
 ///
 /// # Errors
 /// As [`group_norm`].
 pub fn group_norm_then(
     x: &Tensor,
     groups: usize,
-    affine: (&Tensor, &Tensor),
+    affine: Affine<'_>,
     activation: Option<Activation>,
 ) -> Result<Tensor> {
-    let (weight, bias) = affine;
+    let Affine { weight, bias } = affine;
     let dims = x.dims();
     let c = weight.elem_count();
     if dims.len() < 3 || dims[1] != c || groups == 0 || !c.is_multiple_of(groups) {

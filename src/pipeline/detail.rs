@@ -32,7 +32,7 @@ pub(crate) fn add_detail(splats: &mut Splats, inputs: &[Cropped], upscale: usize
         };
         sources.push(SourceView { photograph, camera: c.input_camera });
     }
-    let means: Vec<f32> = (0..splats.len()).flat_map(|i| splats.mean(i)).collect();
+    let means: Vec<f32> = splats.means().flatten().collect();
     let per_view = splats.parents() / inputs.len().max(1);
     let children = splats.children_per_parent();
     let delta = residuals(&sources, &means, per_view, children, upscale);

@@ -1,4 +1,4 @@
-//! Equal exposure and white balance of the photographs: each follows the first one.
+//! Equal exposure and white balance of the photographs: each follows the one of middle brightness.
 
 use super::{Photo, Warning};
 use crate::check::PairReport;
@@ -11,40 +11,85 @@ const MIN_LEVELS: f32 = 5.0;
 /// Largest median difference after the correction over that before it.
 const MAX_RESIDUAL: f32 = 0.7;
 
-/// Corrects the inputs after the first to its exposure. Each photograph is compared with the one
-/// before it at the matched points of their report; a pair without an estimate changes nothing.
+/// A line from levels of one photograph to those of another: gain and offset of R, G and B.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Tone {
+    gain: [f32; 3],
+    offset: [f32; 3],
+}
+
+impl Tone {
+    const IDENTITY: Self = Self { gain: [1.0; 3], offset: [0.0; 3] };
+
+    /// The levels of `inner`, then those of `self`.
+    fn after(&self, inner: &Self) -> Self {
+        let offset = |c: usize| self.gain[c] * inner.offset[c] + self.offset[c];
+        Self {
+            gain: std::array::from_fn(|c| self.gain[c] * inner.gain[c]),
+            offset: std::array::from_fn(offset),
+        }
+    }
+
+    /// The other direction. Gains are positive.
+    fn inverse(&self) -> Self {
+        Self {
+            gain: self.gain.map(|g| 1.0 / g),
+            offset: std::array::from_fn(|c| -self.offset[c] / self.gain[c]),
+        }
+    }
+
+    /// Level of a middle grey, mean over the channels.
+    fn of_grey(&self) -> f32 {
+        (0..3).map(|c| self.gain[c] * 128.0 + self.offset[c]).sum::<f32>() / 3.0
+    }
+}
+
+/// Corrects the inputs to the exposure of one of them. Each photograph is compared with the one
+/// before it at the matched points of their report; a pair without an estimate counts as equal.
+///
+/// The reference is the photograph of middle brightness. The first one would be an arbitrary
+/// choice, and the errors of a chain of estimates would grow with the distance from it.
 pub(super) fn equalise(
     photos: &[Photo],
     inputs: &mut [Cropped],
     reports: &[PairReport],
 ) -> Vec<Warning> {
-    let mut warnings = Vec::new();
-    let mut total = [[1.0f32, 0.0]; 3];
+    // Levels of each photograph to those of the first.
+    let mut to_first = vec![Tone::IDENTITY];
     for (i, report) in reports.iter().enumerate() {
-        let (Some([a, b]), Some(input)) = (photos.get(i..i + 2), inputs.get_mut(i + 1)) else {
-            break;
-        };
+        let Some([a, b]) = photos.get(i..i + 2) else { break };
         let matched = report.points.iter().filter(|p| p.consistent);
         let matched: Vec<PointPair> = matched.map(|p| PointPair { a: p.a, b: p.b }).collect();
-        if let Ok(exposure) = estimate_exposure(a.image(), b.image(), &matched)
-            && is_worth(&exposure)
-        {
-            for (c, [gain, offset]) in total.iter_mut().enumerate() {
-                *offset += *gain * exposure.offset[c];
-                *gain *= exposure.gain[c];
-            }
+        let step = match estimate_exposure(a.image(), b.image(), &matched) {
+            Ok(e) if is_worth(&e) => Tone { gain: e.gain, offset: e.offset },
+            _ => Tone::IDENTITY,
+        };
+        to_first.push(to_first[i].after(&step));
+    }
+    let reference = middle(&to_first);
+    let from_first = to_first[reference].inverse();
+    let mut warnings = Vec::new();
+    for (photo, (input, tone)) in inputs.iter_mut().zip(&to_first).enumerate() {
+        if *tone == to_first[reference] {
+            continue;
         }
-        if total != [[1.0, 0.0]; 3] {
-            let (gain, offset) = (total.map(|t| t[0]), total.map(|t| t[1]));
-            let zero = ([0.0; 3], [0.0; 3], [0; 3]);
-            let correction =
-                Exposure { gain, offset, before: zero.0, residual: zero.1, samples: zero.2 };
-            correction.apply(&mut input.input);
-            correction.apply(&mut input.target);
-            warnings.push(Warning::ExposureCorrected { photo: i + 1, gain, offset });
-        }
+        let Tone { gain, offset } = from_first.after(tone);
+        let (before, residual, samples) = ([0.0; 3], [0.0; 3], [0; 3]);
+        let correction = Exposure { gain, offset, before, residual, samples };
+        correction.apply(&mut input.input);
+        correction.apply(&mut input.target);
+        warnings.push(Warning::ExposureCorrected { photo, reference, gain, offset });
     }
     warnings
+}
+
+/// The photograph whose middle grey is the median; the earlier one of two.
+fn middle(to_first: &[Tone]) -> usize {
+    // A photograph whose levels map to bright ones is dark itself.
+    let mut order: Vec<usize> = (0..to_first.len()).collect();
+    order.sort_by(|a, b| to_first[*a].of_grey().total_cmp(&to_first[*b].of_grey()));
+    let [low, high] = [(order.len() - 1) / 2, order.len() / 2].map(|i| order[i]);
+    low.min(high)
 }
 
 /// Whether a correction is large, and removes most of the difference.
@@ -84,8 +129,8 @@ mod tests {
     }
 
     #[test]
-    fn darker_photographs_follow_the_first_and_equal_ones_stay() {
-        let photos = [photo(1.0), photo(0.7), photo(0.7)];
+    fn photographs_follow_the_middle_one_and_equal_ones_stay() {
+        let photos = [photo(1.0), photo(0.7), photo(0.85)];
         let options = CropOptions::square(64, 1, 16);
         let crops = |photos: &[Photo]| -> Vec<Cropped> {
             photos.iter().map(|p| crop(p.image(), p.camera(), &options).unwrap()).collect()
@@ -93,11 +138,17 @@ mod tests {
         let mut inputs = crops(&photos);
         let warnings = equalise(&photos, &mut inputs, &[report(), report()]);
         assert_eq!(warnings.len(), 2, "{warnings:?}");
-        for input in &inputs[1..] {
-            let pairs = input.target.data.iter().zip(&inputs[0].target.data);
+        assert_eq!(inputs[2], crops(&photos)[2]);
+        for input in &inputs[..2] {
+            let pairs = input.target.data.iter().zip(&inputs[2].target.data);
             let worst = pairs.map(|(a, b)| a.abs_diff(*b)).max().unwrap();
             assert!(worst <= 3, "{worst}");
         }
+        // Of two, the first stays.
+        let two = [photo(0.7), photo(1.0)];
+        let mut inputs = crops(&two);
+        assert_eq!(equalise(&two, &mut inputs, &[report()]).len(), 1);
+        assert_eq!(inputs[0], crops(&two)[0]);
         let same = [photo(1.0), photo(1.0)];
         let mut inputs = crops(&same);
         assert!(equalise(&same, &mut inputs, &[report()]).is_empty());

@@ -6,7 +6,7 @@ use crate::camera::Camera;
 use crate::data::crop::Cropped;
 use crate::fit::{FitError, FitOptions, FitReport, FitView, fit};
 use crate::io::image::Rgb;
-use crate::refine::{RefineOptions, RefineReport, refine};
+use crate::refine::{RefineOptions, RefineReport, Refiner, refine};
 use crate::render::Renderer;
 use crate::splats::Splats;
 use std::ops::ControlFlow;
@@ -36,8 +36,8 @@ pub(crate) fn fit_to_inputs(
     fit(splats, &views_of(inputs), raster, options, renderer, progress).map_err(error)
 }
 
-/// Refines the Gaussians of `inputs` on their photographs. `progress` receives the number of steps
-/// done.
+/// Refines the Gaussians of `inputs` on their photographs. `progress` receives the refinement after
+/// each step.
 ///
 /// # Errors
 /// [`Error::Cancelled`]; a picture of another size than its camera.
@@ -47,7 +47,7 @@ pub(crate) fn refine_on_inputs(
     raster: &RasterOptions,
     options: &RefineOptions,
     renderer: &mut Renderer,
-    progress: &mut dyn FnMut(usize) -> ControlFlow<()>,
+    progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
 ) -> Result<RefineReport> {
     refine(splats, &views_of(inputs), raster, options, renderer, progress).map_err(error)
 }

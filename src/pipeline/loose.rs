@@ -1,6 +1,6 @@
 //! Photographs without a pose file to a scene: their cameras are estimated.
 
-use super::{Error, Result};
+use super::{Error, Photo, Result};
 use crate::camera::{Camera, Intrinsics};
 use crate::io::exif::FocalSource;
 use crate::io::image::LoadOptions;
@@ -49,14 +49,14 @@ impl fmt::Display for LensSource {
     }
 }
 
-/// Options of [`loose_scene`].
+/// Options of [`loose_scene`] and [`loose_photos`].
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct LooseOptions {
     /// Intrinsics of all photographs. They win over EXIF.
     pub lens: Option<KnownLens>,
     /// Estimation of the poses.
     pub poses: PoseOptions,
-    /// Decoding.
+    /// Decoding by [`loose_scene`].
     pub load: LoadOptions,
 }
 
@@ -71,9 +71,51 @@ pub struct LooseScene {
     pub lenses: Vec<LensSource>,
 }
 
+/// Photographs in memory with estimated cameras.
+#[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
+pub struct LoosePhotos {
+    /// The photographs that have a camera, in their order.
+    pub photos: Vec<Photo>,
+    /// The estimate; its indices count all photographs.
+    pub estimate: PoseEstimate,
+    /// Origin of each photograph's focal length.
+    pub lenses: Vec<LensSource>,
+}
+
 /// Features of a photograph of a pair, and of one of many: the time of matching grows with their
 /// square and with the number of pairs.
 const FEATURES: [usize; 2] = [4000, 2500];
+
+/// Returns the number of features of each of `photographs` photographs.
+fn features_of(photographs: usize) -> usize {
+    FEATURES[usize::from(photographs > 2)]
+}
+
+/// Estimates the cameras of photographs in memory, for
+/// [`Reconstructor::run`](super::Reconstructor::run).
+/// [`parse_photograph`](crate::io::photograph::parse_photograph) decodes files in memory.
+///
+/// # Errors
+/// A lens that is no valid camera; [`Error::NoPoses`].
+pub fn loose_photos(photographs: Vec<Photograph>, options: &LooseOptions) -> Result<LoosePhotos> {
+    let features = features_of(photographs.len());
+    let (mut pose_photos, mut lenses) = (Vec::new(), Vec::new());
+    for photograph in &photographs {
+        let (lens, source) = lens(photograph, options.lens);
+        lenses.push(source);
+        pose_photos.push(PosePhoto::from_rgb8(&photograph.image.data, lens, features)?);
+    }
+    let estimate = estimate_poses(&pose_photos, &options.poses).map_err(|reason| {
+        Error::NoPoses { photographs: format!("{} photographs", photographs.len()), reason }
+    })?;
+    let photos = photographs
+        .into_iter()
+        .zip(&estimate.cameras)
+        .filter_map(|(photograph, camera)| Some(Photo::new(photograph.image, (*camera)?)))
+        .collect::<Result<_>>()?;
+    Ok(LoosePhotos { photos, estimate, lenses })
+}
 
 /// Estimates the cameras of photographs from their pixels. `name` names the scene in messages.
 /// `photograph` is called with the index of each photograph before it is decoded.
@@ -89,7 +131,7 @@ pub fn loose_scene(
     options: &LooseOptions,
     photograph: &mut dyn FnMut(usize) -> Result<()>,
 ) -> Result<LooseScene> {
-    let features = FEATURES[usize::from(photographs.len() > 2)];
+    let features = features_of(photographs.len());
     let mut warnings = Vec::new();
     let (mut photos, mut lenses) = (Vec::new(), Vec::new());
     for (i, path) in photographs.iter().enumerate() {

@@ -19,13 +19,14 @@
 //!
 //! The stages ([`Stage`]), in order:
 //!
+//! 0. With [`Poses::Adjusted`], the cameras are adjusted by points matched between photographs.
 //! 1. The initial depth range comes from [`Options::depth_range`], then from
 //!    [`Options::depth_prior`], then from the distance between the cameras.
 //! 2. The size of the network's input follows from the photographs' shapes ([`InputSize`]). Each
 //!    photograph is cropped to it and to the target size.
 //! 3. Points are matched between consecutive photographs. They check the poses ([`Check`]),
 //!    their depths replace a range that was only guessed, and their colours bring the
-//!    photographs to the exposure of the first.
+//!    photographs to the exposure of the one of middle brightness.
 //! 4. The small backbone estimates near and far at half size, unless the caller fixed one.
 //! 5. The network predicts one primary Gaussian per input pixel, then its children.
 //! 6. The photographs add detail to the children's colours ([`Detail`]).
@@ -55,8 +56,10 @@ pub use crate::model::Backend;
 pub use depth_range::{DepthBounds, DepthRange, DepthSource};
 pub use error::{Error, Result};
 pub use input_size::InputSize;
-pub use loose::{KnownLens, LensSource, LooseOptions, LooseScene, loose_scene};
-pub use options::{Check, Detail, Options, Refine};
+pub use loose::{
+    KnownLens, LensSource, LooseOptions, LoosePhotos, LooseScene, loose_photos, loose_scene,
+};
+pub use options::{Check, Detail, Options, Poses, Refine};
 pub use photo::Photo;
 pub use poses::PoseError;
 pub use prepared::Prepared;

@@ -4,6 +4,7 @@ use super::{DepthBounds, DepthRange, Error, InputSize, Result, initial_bounds};
 use crate::camera::Camera;
 use crate::fit::FitOptions;
 use crate::refine::RefineOptions;
+use std::time::Duration;
 
 /// Options of [`Reconstructor::run`](super::Reconstructor::run). The defaults are those of the
 /// program `subsplat run`.
@@ -26,6 +27,8 @@ pub struct Options {
     /// Depth range that a file suggests, used for the ends that `depth_range` leaves open.
     /// Default: none.
     pub depth_prior: Option<DepthBounds>,
+    /// Cameras that the network receives. Default: [`Poses::Given`].
+    pub poses: Poses,
     /// Check of the poses by matched points. Default: [`Check::Warn`].
     pub check: Check,
     /// Source of colour detail. Default: [`Detail::Photographs`].
@@ -65,6 +68,13 @@ impl Options {
         self
     }
 
+    /// Sets [`Options::poses`].
+    #[must_use]
+    pub fn with_poses(mut self, poses: Poses) -> Self {
+        self.poses = poses;
+        self
+    }
+
     /// Sets [`Options::check`].
     #[must_use]
     pub fn with_check(mut self, check: Check) -> Self {
@@ -96,11 +106,7 @@ impl Options {
 
     /// Options of the refinement for a number of photographs and of Gaussians.
     pub(super) fn refine_options(&self, photographs: usize, gaussians: usize) -> RefineOptions {
-        let none = self.fit.steps == 0 || gaussians > AUTO_GAUSSIANS_MAX;
-        match self.refine {
-            Refine::Auto if none => Refine::Off.options(photographs),
-            refine => refine.options(photographs),
-        }
+        self.refine.options_for(photographs, gaussians, self.fit.steps > 0)
     }
 
     /// The depth range before any photograph is read: [`Options::depth_range`], then
@@ -130,6 +136,8 @@ pub enum Refine {
     Off,
     /// At most this number of steps.
     Steps(usize),
+    /// Steps for about this number of seconds. The result then depends on the machine.
+    Seconds(u32),
 }
 
 /// Most Gaussians that [`Refine::Auto`] refines. The buffers of a refinement of two
@@ -137,15 +145,42 @@ pub enum Refine {
 const AUTO_GAUSSIANS_MAX: usize = 3 << 19;
 
 impl Refine {
+    /// Options for a number of photographs and of Gaussians, which are `fitted` or not.
+    pub(super) fn options_for(
+        self,
+        photographs: usize,
+        gaussians: usize,
+        fitted: bool,
+    ) -> RefineOptions {
+        match self {
+            Self::Auto if !fitted || gaussians > AUTO_GAUSSIANS_MAX => Self::Off,
+            refine => refine,
+        }
+        .options(photographs)
+    }
+
     /// Options of [`crate::refine()`] for a number of photographs.
     pub(crate) fn options(self, photographs: usize) -> RefineOptions {
-        let steps = match self {
-            Self::Auto => (8 * photographs).min(64),
-            Self::Off => 0,
-            Self::Steps(steps) => steps,
-        };
-        RefineOptions::default().with_steps(steps).with_groups(true)
+        let options = RefineOptions::default().with_groups(true);
+        match self {
+            Self::Auto => options.with_steps((8 * photographs).min(64)),
+            Self::Off => options.with_steps(0),
+            Self::Steps(steps) => options.with_steps(steps),
+            Self::Seconds(seconds) => options.with_time(Duration::from_secs(seconds.into())),
+        }
     }
+}
+
+/// Cameras that the network receives.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Poses {
+    /// Those of the photographs.
+    #[default]
+    Given,
+    /// Those of the photographs after [`crate::adjust_poses`], for cameras that are nearly right,
+    /// such as a headset's. Cameras that fit the photographs stay.
+    Adjusted,
 }
 
 /// Check of the poses by points matched between consecutive photographs ([`crate::check`]).

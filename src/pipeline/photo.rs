@@ -5,11 +5,12 @@ use crate::camera::Camera;
 use crate::data::crop::{CropOptions, Cropped, crop};
 use crate::io::image::{LoadOptions, Rgb};
 use crate::io::scene::{Frame, LoadedFrame};
+use std::sync::Arc;
 
-/// A photograph without lens distortion, and its pinhole camera.
+/// A photograph without lens distortion, and its pinhole camera. Clones share the pixels.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Photo {
-    image: Rgb,
+    image: Arc<Rgb>,
     camera: Camera,
 }
 
@@ -32,7 +33,7 @@ impl Photo {
             let got = format!("one of {}x{}", k.width, k.height);
             return Err(Error::argument("photograph", expected, got));
         }
-        Ok(Self { image, camera })
+        Ok(Self { image: Arc::new(image), camera })
     }
 
     /// Decodes a frame's picture and removes its lens distortion.
@@ -49,7 +50,13 @@ impl Photo {
     /// Those of [`Frame::load_with`].
     pub fn from_frame_with(frame: &Frame, options: &LoadOptions) -> Result<Self> {
         let LoadedFrame { picture, camera, .. } = frame.load_with(options)?;
-        Ok(Self { image: picture, camera })
+        Ok(Self { image: Arc::new(picture), camera })
+    }
+
+    /// The same pixels with the pose of another camera; the intrinsics stay.
+    pub(super) fn with_pose_of(&self, camera: &Camera) -> Result<Self> {
+        let camera = Camera::new(self.camera.intrinsics, camera.world_from_camera)?;
+        Ok(Self { image: Arc::clone(&self.image), camera })
     }
 
     /// The pixels.

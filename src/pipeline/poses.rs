@@ -1,8 +1,10 @@
-//! Check of the poses by points matched between photographs.
+//! Check and adjustment of the poses by points matched between photographs.
 
 use super::{Error, Photo, Result};
 use crate::check::{CheckOptions, Finding, GrayImage, PairReport, Verdict, check_pair};
 use crate::io::image::Rgb;
+use crate::poses::{Lens, PoseAdjustment, PosePhoto, adjust_poses};
+use rayon::prelude::*;
 use std::fmt;
 
 /// Cameras that [`Check::Refuse`](super::Check::Refuse) rejected.
@@ -51,6 +53,29 @@ pub(crate) fn check_pairs(
         checked(reports.len() as f32 / pairs as f32)?;
     }
     Ok(reports)
+}
+
+/// Features of each photograph for the adjustment.
+const FEATURES: usize = 4000;
+/// Seed of the random samples of the adjustment.
+const SEED: u64 = 1;
+
+/// Photographs with cameras that were adjusted by points matched between them. `None` where the
+/// cameras fit them already, or too few points are matched.
+///
+/// # Errors
+/// A photograph of which no features can be taken.
+pub(super) fn adjusted(photos: &[Photo]) -> Result<Option<(Vec<Photo>, PoseAdjustment)>> {
+    let features = |p: &Photo| {
+        let lens = Lens::known(p.camera().intrinsics);
+        PosePhoto::from_rgb8(&p.image().data, lens, FEATURES)
+    };
+    let features: Vec<PosePhoto> =
+        photos.par_iter().map(features).collect::<std::result::Result<_, _>>()?;
+    let cameras: Vec<_> = photos.iter().map(|p| *p.camera()).collect();
+    let Some(found) = adjust_poses(&features, &cameras, SEED) else { return Ok(None) };
+    let moved = photos.iter().zip(&found.cameras).map(|(p, camera)| p.with_pose_of(camera));
+    Ok(Some((moved.collect::<Result<_>>()?, found)))
 }
 
 fn grey(photo: &Photo) -> Result<GrayImage> {

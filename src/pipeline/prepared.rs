@@ -10,6 +10,8 @@ use crate::check::PairReport;
 use crate::data::crop::Cropped;
 use crate::io::image::{Depth, Rgb};
 use crate::model::Views;
+use crate::poses::PoseAdjustment;
+use crate::refine::Refiner;
 use crate::render::Renderer;
 use std::ops::ControlFlow;
 
@@ -22,6 +24,7 @@ pub struct Prepared<'a> {
     pub(super) model: &'a Reconstructor,
     pub(super) options: Options,
     pub(super) inputs: Vec<Cropped>,
+    pub(super) adjustment: Option<PoseAdjustment>,
     pub(super) cut_shares: Vec<f32>,
     pub(super) bounds: DepthBounds,
     pub(super) reports: Vec<PairReport>,
@@ -33,6 +36,12 @@ impl Prepared<'_> {
     /// The photographs at the sizes of the network's input and of the target.
     pub fn inputs(&self) -> &[Cropped] {
         &self.inputs
+    }
+
+    /// Change of the given cameras ([`Poses::Adjusted`](super::Poses::Adjusted)); `None` where they
+    /// stayed.
+    pub fn pose_adjustment(&self) -> Option<&PoseAdjustment> {
+        self.adjustment.as_ref()
     }
 
     /// Share of each photograph that its crop does not show, 0 to 1.
@@ -72,8 +81,8 @@ impl Prepared<'_> {
         self,
         progress: &mut dyn FnMut(Progress) -> ControlFlow<()>,
     ) -> Result<Reconstruction> {
-        let Self { model, options, inputs, cut_shares, bounds, reports, mut warnings, mut tracker } =
-            self;
+        let Self { model, options, inputs, adjustment, cut_shares, bounds, reports, .. } = self;
+        let (mut warnings, mut tracker) = (self.warnings, self.tracker);
         if model.estimates_depth_range(&options) {
             tracker.begin(Stage::DepthRange, progress)?;
         }
@@ -116,18 +125,19 @@ impl Prepared<'_> {
         let mut renderer = Renderer::new(model.backend());
         if fit_options.steps > 0 {
             tracker.begin(Stage::Fit, progress)?;
-            let mut stepped = tracker.steps(fit_options.steps, progress);
+            let mut part = tracker.parts(progress);
+            let mut step = |step| part(step as f32 / fit_options.steps as f32);
             let (raster, how) = (&raster_options, fit_options);
-            let done =
-                fit_to_inputs(&mut splats, &inputs, raster, how, &mut renderer, &mut stepped)?;
+            let done = fit_to_inputs(&mut splats, &inputs, raster, how, &mut renderer, &mut step)?;
             fit = Some(done);
         }
         if refine_options.steps > 0 {
             tracker.begin(Stage::Refine, progress)?;
-            let mut stepped = tracker.steps(refine_options.steps, progress);
+            let mut part = tracker.parts(progress);
+            let mut step = |refiner: &Refiner<'_>| part(refiner.progress());
             let (raster, how) = (&raster_options, &refine_options);
             let done =
-                refine_on_inputs(&mut splats, &inputs, raster, how, &mut renderer, &mut stepped)?;
+                refine_on_inputs(&mut splats, &inputs, raster, how, &mut renderer, &mut step)?;
             refinement = Some(done);
         }
         warnings.extend(renderer.take_warning().map(|reason| Warning::CpuInsteadOfGpu { reason }));
@@ -138,6 +148,7 @@ impl Prepared<'_> {
         Ok(Reconstruction {
             splats,
             inputs,
+            adjustment,
             cut_shares,
             depths,
             bounds,

@@ -12,6 +12,8 @@ use std::sync::mpsc;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[non_exhaustive]
 pub enum Stage {
+    /// Given cameras are adjusted by matched points.
+    Poses,
     /// Photographs are cropped and resized.
     Crop,
     /// Points are matched between photographs.
@@ -36,6 +38,7 @@ impl Stage {
     /// The name in reports: `crop`, `depth range`, ….
     pub fn name(self) -> &'static str {
         match self {
+            Self::Poses => "poses",
             Self::Crop => "crop",
             Self::Check => "check",
             Self::DepthRange => "depth range",
@@ -122,13 +125,12 @@ impl Tracker {
         self.advance(0.0, callback)
     }
 
-    /// A callback for the current stage that receives the number of steps done of `steps`.
-    pub(super) fn steps<'a>(
+    /// A callback for the current stage that receives the part of it that is done, 0 to 1.
+    pub(super) fn parts<'a>(
         &'a mut self,
-        steps: usize,
         callback: &'a mut Callback<'_>,
-    ) -> impl FnMut(usize) -> ControlFlow<()> + 'a {
-        move |step| match self.advance(step as f32 / steps as f32, callback) {
+    ) -> impl FnMut(f32) -> ControlFlow<()> + 'a {
+        move |part| match self.advance(part, callback) {
             Ok(()) => ControlFlow::Continue(()),
             Err(_) => ControlFlow::Break(()),
         }
@@ -228,6 +230,7 @@ fn report(progress: Progress, callback: &mut Callback<'_>) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::time::Duration;
 
     fn tracker() -> Tracker {
         let costs = [(Stage::Crop, 1.0), (Stage::Check, 2.0), (Stage::Backbone, 5.0)];
@@ -258,6 +261,25 @@ mod tests {
         assert_eq!(seen, expected);
         let stages: Vec<Stage> = times.iter().map(|t| t.stage).collect();
         assert_eq!(stages, [Stage::Crop, Stage::Check, Stage::Backbone]);
+    }
+
+    /// Without the flag that a break sets, the work would run to its end before the call returns.
+    #[test]
+    fn a_break_ends_the_work_at_its_next_checkpoint() {
+        let (mut tracker, ended_early) = (tracker(), AtomicBool::new(false));
+        tracker.begin(Stage::Backbone, &mut |_| ControlFlow::Continue(())).unwrap();
+        let mut stop = |_: Progress| ControlFlow::Break(());
+        let result = tracker.run_steps(4, &mut stop, |checkpoint| {
+            for _ in 0..5_000 {
+                let checked = checkpoint();
+                ended_early.fetch_or(checked.is_err(), Ordering::Relaxed);
+                checked?;
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            Ok(())
+        });
+        assert!(matches!(result, Err(Error::Cancelled)));
+        assert!(ended_early.into_inner());
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! A reconstructed scene.
 
-use super::{DepthBounds, Detail, Result, StageTime, Warning};
+use super::{DepthBounds, Detail, Refine, Result, StageTime, Warning, refine_on_inputs};
 use crate::abi::RasterOptions;
 use crate::camera::Camera;
 use crate::check::PairReport;
@@ -8,9 +8,11 @@ use crate::data::crop::Cropped;
 use crate::fit::FitReport;
 use crate::io::image::Depth;
 use crate::io::{SaveOptions, SaveReport, save_splats};
-use crate::refine::RefineReport;
-use crate::render::{Picture, comment_of_camera, comment_of_options, render};
+use crate::poses::PoseAdjustment;
+use crate::refine::{RefineReport, Refiner};
+use crate::render::{Picture, Renderer, comment_of_camera, comment_of_options, render};
 use crate::splats::Splats;
+use std::ops::ControlFlow;
 use std::path::Path;
 
 /// A reconstructed scene: Gaussians, the rules to render them, and a record of how they were
@@ -19,6 +21,7 @@ use std::path::Path;
 pub struct Reconstruction {
     pub(super) splats: Splats,
     pub(super) inputs: Vec<Cropped>,
+    pub(super) adjustment: Option<PoseAdjustment>,
     pub(super) cut_shares: Vec<f32>,
     pub(super) depths: Vec<Depth>,
     pub(super) bounds: DepthBounds,
@@ -66,6 +69,26 @@ impl Reconstruction {
         &mut self.splats
     }
 
+    /// Refines the Gaussians on the photographs, as [`Options::refine`](super::Options::refine) does
+    /// within a run, for a caller that shows the scene first. `progress` receives the refinement
+    /// after each step; [`Refiner::splats`] returns the Gaussians so far.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`](super::Error::Cancelled); the Gaussians are then unchanged.
+    pub fn refine(
+        &mut self,
+        refine: Refine,
+        renderer: &mut Renderer,
+        progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
+    ) -> Result<RefineReport> {
+        let Self { splats, inputs, raster_options, fit, .. } = self;
+        let options = refine.options_for(inputs.len(), splats.len(), fit.is_some());
+        let report =
+            refine_on_inputs(splats, inputs, raster_options, &options, renderer, progress)?;
+        self.refinement = Some(report);
+        Ok(report)
+    }
+
     /// The Gaussians alone.
     pub fn into_splats(self) -> Splats {
         self.splats
@@ -74,6 +97,12 @@ impl Reconstruction {
     /// The photographs at the sizes of the network's input and of the target.
     pub fn inputs(&self) -> &[Cropped] {
         &self.inputs
+    }
+
+    /// Change of the given cameras ([`Poses::Adjusted`](super::Poses::Adjusted)); `None` where they
+    /// stayed. [`Reconstruction::inputs`] has the adjusted ones.
+    pub fn pose_adjustment(&self) -> Option<&PoseAdjustment> {
+        self.adjustment.as_ref()
     }
 
     /// Share of each photograph that its crop does not show, 0 to 1.

@@ -3,8 +3,9 @@
 use super::progress::{Callback, StageCost, Tracker};
 use super::warning::Warning;
 use super::{
-    Check, DepthBounds, DepthRange, DepthSource, Detail, Options, Photo, Prepared, Progress,
-    Reconstruction, Result, Stage, check_pairs, exposure, is_mvsplat, poses, refined_bounds,
+    Check, DepthBounds, DepthRange, DepthSource, Detail, Options, Photo, Poses, Prepared, Progress,
+    Reconstruction, Refine, Result, Stage, check_pairs, exposure, is_mvsplat, poses,
+    refined_bounds,
 };
 use crate::camera::{Camera, NearFar};
 use crate::config::{Config, Preset};
@@ -162,11 +163,19 @@ impl Reconstructor {
         options: &Options,
         progress: &mut dyn FnMut(Progress) -> ControlFlow<()>,
     ) -> Result<Prepared<'_>> {
-        let cameras: Vec<Camera> = photos.iter().map(|p| *p.camera()).collect();
-        let guess = options.initial_depth_range(&cameras)?;
         let sizes: Vec<_> = photos.iter().map(|p| (p.image().width, p.image().height)).collect();
         let crop = self.crop_options(options.input_size.resolve(&sizes, self.config().stride()));
         let mut tracker = Tracker::new(self.stage_costs(photos.len(), crop.input_size, options));
+        let (mut adjusted, mut adjustment) = (Vec::new(), None);
+        if options.poses == Poses::Adjusted {
+            tracker.begin(Stage::Poses, progress)?;
+            if let Some((moved, found)) = poses::adjusted(photos)? {
+                (adjusted, adjustment) = (moved, Some(found));
+            }
+        }
+        let photos = if adjusted.is_empty() { photos } else { &adjusted };
+        let cameras: Vec<Camera> = photos.iter().map(|p| *p.camera()).collect();
+        let guess = options.initial_depth_range(&cameras)?;
         let mut inputs = crop_all(photos, &crop, &mut tracker, progress)?;
         let reports = match options.check {
             Check::Off => Vec::new(),
@@ -195,6 +204,7 @@ impl Reconstructor {
             model: self,
             options,
             inputs,
+            adjustment,
             cut_shares,
             bounds,
             reports,
@@ -272,7 +282,13 @@ impl Reconstructor {
         let gaussians = photos * w * h * self.config().upscale.pow(2);
         let children = (self.config().upscale * self.config().upscale) as f32 / 4.0;
         let aggregates = self.config().agg.enabled;
+        let refinement = match options.refine {
+            // The number of steps in a second is not known.
+            Refine::Seconds(seconds) => 10.0 * seconds as f32,
+            _ => options.refine_options(photos, gaussians).steps as f32,
+        };
         let costs = [
+            (Stage::Poses, if options.poses == Poses::Adjusted { 0.3 * n } else { 0.0 }),
             (Stage::Crop, 0.015 * n),
             (Stage::Check, if options.check == Check::Off { 0.0 } else { 0.15 * (n - 1.0) }),
             (Stage::DepthRange, if estimates { 0.03 * pixels } else { 0.0 }),
@@ -282,12 +298,7 @@ impl Reconstructor {
             (Stage::Detail, if options.detail == Detail::Off { 0.0 } else { 0.01 * pixels }),
             (Stage::Fit, FIT_STEP * options.fit.steps as f32 * pixels * children),
             // A step draws one photograph instead of all.
-            (
-                Stage::Refine,
-                FIT_STEP * options.refine_options(photos, gaussians).steps as f32 / n
-                    * pixels
-                    * children,
-            ),
+            (Stage::Refine, FIT_STEP * refinement / n * pixels * children),
         ];
         costs.map(|(stage, cost)| StageCost { stage, cost }).to_vec()
     }

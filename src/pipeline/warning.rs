@@ -54,11 +54,13 @@ pub enum Warning {
         /// The r that these weights have trained heads for; empty where unknown.
         trained: Vec<usize>,
     },
-    /// A photograph was brought to the exposure and white balance of the first one.
+    /// A photograph was brought to the exposure and white balance of another one.
     #[non_exhaustive]
     ExposureCorrected {
         /// Index of the photograph.
         photo: usize,
+        /// Index of the photograph of middle brightness, which stays.
+        reference: usize,
         /// Factor on each channel, red first.
         gain: [f32; 3],
         /// Offset of each channel, 8-bit levels.
@@ -112,11 +114,13 @@ impl fmt::Display for Warning {
                     ),
                 }
             }
-            Self::ExposureCorrected { photo, gain: [r, g, b], offset: [x, y, z] } => write!(
-                f,
-                "photograph {photo} (counted from 0) is brought to the first one's exposure: gain \
-                 {r:.2} {g:.2} {b:.2}, offset {x:+.0} {y:+.0} {z:+.0} of 255"
-            ),
+            Self::ExposureCorrected { photo, reference, gain: [r, g, b], offset: [x, y, z] } => {
+                write!(
+                    f,
+                    "photograph {photo} (counted from 0) is brought to the exposure of photograph \
+                 {reference}: gain {r:.2} {g:.2} {b:.2}, offset {x:+.0} {y:+.0} {z:+.0} of 255"
+                )
+            }
             Self::CpuInsteadOfGpu { reason } => f.write_str(reason),
         }
     }

@@ -4,12 +4,15 @@
 //! [`PoseEstimate`], or the reason why there is none ([`PoseRefusal`]). The module reads no files.
 //! Equal photographs give equal estimates.
 //!
+//! Cameras that are nearly right are adjusted by [`adjust_poses`] (`adjust.rs`).
+//!
 //! Two photographs: points are matched, an essential matrix is estimated and refined
 //! (`pair.rs`). Three and more: pairs are joined one by one (`reconstruct.rs`) and adjusted
 //! together (`bundle.rs`). The world's +y axis points down as far as the cameras' horizon says
 //! (`world.rs`); its unit is the median depth of the points.
 
 mod absolute;
+mod adjust;
 mod bundle;
 mod estimate;
 mod five_point;
@@ -22,6 +25,7 @@ mod tracks;
 mod two_view;
 mod world;
 
+pub use adjust::{PoseAdjustment, adjust_poses};
 pub use estimate::{
     Confidence, FocalEstimate, LeftOut, PoseEstimate, PoseOptions, PosePoint, PoseRefusal,
     PoseWarning, estimate_poses,

@@ -26,6 +26,9 @@ const MIN_SIGHTS: usize = 12;
 const MIN_SIGHT_SHARE: f64 = 0.25;
 /// Largest residual of a sight or an observation, standard deviations.
 const LIMIT: f64 = 5.0;
+/// The same for cameras that are given and not adjusted yet. Matches of verified pairs are hardly
+/// ever wrong, and 100 deviations of a feature are 40 working px: 4° or more.
+const GIVEN_LIMIT: f64 = 100.0;
 /// Smallest angle between two rays of a point, radians (1.5 degrees).
 const MIN_ANGLE: f64 = 0.026;
 /// Angle between rays at which a pair is wide enough to start with, radians (6 degrees).
@@ -157,6 +160,8 @@ struct Builder<'a> {
     prior: Option<FocalPrior>,
     /// Places of features after the alignment of their surroundings: (track, feature) in order.
     precise: Vec<Vec<Option<DVec2>>>,
+    /// Largest residual of an observation, standard deviations.
+    limit: f64,
 }
 
 /// Builds cameras and points of `photos` from verified pairs. `prior` is the knowledge of the
@@ -167,24 +172,7 @@ pub(super) fn build(
     prior: Option<FocalPrior>,
     seed: u64,
 ) -> Option<Model> {
-    let matches = edges.iter().flat_map(|e| {
-        let [a, b] = e.photos;
-        e.estimate.inliers.iter().map(move |p| {
-            [FeatureId { photo: a, feature: p.a }, FeatureId { photo: b, feature: p.b }]
-        })
-    });
-    let tracks = tracks(matches);
-    let count = tracks.len();
-    let mut builder = Builder {
-        photos,
-        precise: tracks.iter().map(|t| vec![None; t.len()]).collect(),
-        tracks,
-        cameras: vec![None; photos.len()],
-        positions: vec![None; count],
-        agreeing: vec![Vec::new(); count],
-        log_focal: 0.0,
-        prior,
-    };
+    let mut builder = Builder::new(photos, edges, prior);
     let start = start(edges)?;
     let [a, b] = start.photos;
     builder.cameras[a] = Some(Absolute::IDENTITY);
@@ -213,6 +201,55 @@ pub(super) fn build(
     Some(builder.finish())
 }
 
+/// Cameras that were adjusted from given ones.
+#[derive(Clone, Debug)]
+pub(super) struct Adjusted {
+    /// One pose for each photograph; `None` where too few points are seen.
+    pub cameras: Vec<Option<Absolute>>,
+    /// Median residual with the given cameras, working px.
+    pub before: f64,
+    /// The same with the adjusted ones.
+    pub after: f64,
+    /// Number of points.
+    pub points: usize,
+}
+
+/// Adjusts `given` cameras by the matches of pairs. `None` where fewer than two photographs see
+/// enough points.
+pub(super) fn adjust(photos: &[PosePhoto], edges: &[Edge], given: &[Absolute]) -> Option<Adjusted> {
+    let mut builder = Builder::new(photos, edges, None);
+    builder.cameras = given.iter().copied().map(Some).collect();
+    builder.limit = GIVEN_LIMIT;
+    builder.triangulate();
+    let mut seen = vec![0usize; photos.len()];
+    builder.agreeing.iter().flatten().for_each(|f| seen[f.photo] += 1);
+    for (camera, seen) in builder.cameras.iter_mut().zip(&seen) {
+        camera.take_if(|_| *seen < MIN_SIGHTS);
+    }
+    if builder.cameras.iter().flatten().count() < 2 {
+        return None;
+    }
+    let start = builder.cameras.clone();
+    builder.adjust(15);
+    builder.limit = LIMIT;
+    builder.triangulate();
+    builder.align();
+    for _ in 0..2 {
+        builder.triangulate();
+        builder.adjust(25);
+    }
+    let (cameras, points) = (builder.cameras.clone(), builder.positions.iter().flatten().count());
+    builder.limit = f64::INFINITY;
+    let mut error = |cameras: &[Option<Absolute>]| {
+        builder.cameras = cameras.to_vec();
+        builder.positions.fill(None);
+        builder.triangulate();
+        builder.median_residual()
+    };
+    let (before, after) = (error(&start)?, error(&cameras)?);
+    Some(Adjusted { cameras, before, after, points })
+}
+
 /// The pair to start with: many matches and a wide angle between their rays.
 fn start(edges: &[Edge]) -> Option<&Edge> {
     let score = |e: &Edge| {
@@ -224,7 +261,48 @@ fn start(edges: &[Edge]) -> Option<&Edge> {
     scored.reduce(|a, b| if b.0 > a.0 { b } else { a }).filter(|s| s.0 > 0.0).map(|s| s.1)
 }
 
-impl Builder<'_> {
+impl<'a> Builder<'a> {
+    /// The matches of `edges` as tracks, without cameras.
+    fn new(photos: &'a [PosePhoto], edges: &[Edge], prior: Option<FocalPrior>) -> Self {
+        let matches = edges.iter().flat_map(|e| {
+            let [a, b] = e.photos;
+            e.estimate.inliers.iter().map(move |p| {
+                [FeatureId { photo: a, feature: p.a }, FeatureId { photo: b, feature: p.b }]
+            })
+        });
+        let tracks = tracks(matches);
+        let count = tracks.len();
+        Self {
+            photos,
+            precise: tracks.iter().map(|t| vec![None; t.len()]).collect(),
+            tracks,
+            cameras: vec![None; photos.len()],
+            positions: vec![None; count],
+            agreeing: vec![Vec::new(); count],
+            log_focal: 0.0,
+            prior,
+            limit: LIMIT,
+        }
+    }
+
+    /// Median distance of the points' projections from their features, working px; `None` without
+    /// points.
+    fn median_residual(&self) -> Option<f64> {
+        let mut all: Vec<f64> = Vec::new();
+        for (track, position) in self.positions.iter().enumerate() {
+            let Some(position) = position else { continue };
+            for (at, f) in self.tracks[track].iter().enumerate() {
+                let Some(camera) = self.cameras[f.photo] else { continue };
+                let p = camera.to_camera(*position);
+                let (bearing, _) = self.sight(track, at);
+                let distance = (p.truncate() / p.z).distance(bearing);
+                all.push(distance * self.photos[f.photo].focal());
+            }
+        }
+        let middle = all.len() / 2;
+        (!all.is_empty()).then(|| *all.select_nth_unstable_by(middle, f64::total_cmp).1)
+    }
+
     /// Bearing of a track's feature, and its standard deviation, for the lens's own focal length.
     fn sight(&self, track: usize, at: usize) -> (DVec2, f64) {
         let id = self.tracks[track][at];
@@ -305,7 +383,7 @@ impl Builder<'_> {
                 }
                 let p = midpoint([rays[i].1.position(), rays[j].1.position()], [u, v]);
                 let count =
-                    rays.iter().filter(|(_, c, b, d)| residual(c, *b, *d, p) < LIMIT).count();
+                    rays.iter().filter(|(_, c, b, d)| residual(c, *b, *d, p) < self.limit).count();
                 if count > best.0 {
                     best = (count, Some(p));
                 }
@@ -317,14 +395,15 @@ impl Builder<'_> {
         let Some(mut p) = best.1 else { return (None, Vec::new()) };
         // A point that was adjusted before keeps its place where as many rays agree with it.
         if let Some(old) = self.positions[track] {
-            let count = rays.iter().filter(|(_, c, b, d)| residual(c, *b, *d, old) < LIMIT).count();
+            let count =
+                rays.iter().filter(|(_, c, b, d)| residual(c, *b, *d, old) < self.limit).count();
             if count >= best.0 {
                 p = old;
             }
         }
         let agreeing = rays
             .iter()
-            .filter(|(_, c, b, d)| residual(c, *b, *d, p) < LIMIT)
+            .filter(|(_, c, b, d)| residual(c, *b, *d, p) < self.limit)
             .map(|r| r.0)
             .collect();
         (Some(p), agreeing)

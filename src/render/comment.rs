@@ -142,7 +142,7 @@ mod tests {
         ] {
             let bad = good.replace(from, to);
             assert_ne!(bad, good);
-            assert_eq!(camera_of_comments(&[bad.clone()]), None, "{bad}");
+            assert_eq!(camera_of_comments(std::slice::from_ref(&bad)), None, "{bad}");
         }
     }
 }

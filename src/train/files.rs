@@ -6,7 +6,7 @@ use super::{Error, Result};
 use crate::camera::NearFar;
 use crate::data::crop::{CropOptions, CropRule};
 use crate::data::dataset::{Dataset, ExampleOptions};
-use crate::data::sampler::{GapMode, ViewSampler};
+use crate::data::sampler::{GapBounds, GapMode, ViewSampler};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -40,12 +40,12 @@ pub struct Files {
 }
 
 fn first() -> [usize; 2] {
-    let (low, high) = ViewSampler::re10k(GapMode::Mvs).first;
+    let GapBounds { low, high } = ViewSampler::re10k(GapMode::Mvs).first;
     [low, high]
 }
 
 fn last() -> [usize; 2] {
-    let (low, high) = ViewSampler::re10k(GapMode::Mvs).last;
+    let GapBounds { low, high } = ViewSampler::re10k(GapMode::Mvs).last;
     [low, high]
 }
 
@@ -97,11 +97,11 @@ impl Pictures {
     /// A missing data set; an index or a scene that cannot be parsed.
     pub fn open(files: &Files, config: &TrainConfig) -> Result<Self> {
         let model = config.model_config()?;
-        let pair = |[low, high]: [usize; 2]| (low, high);
+        let bounds = |[low, high]: [usize; 2]| GapBounds { low, high };
         let sampler = ViewSampler {
             mode: files.mode,
-            first: pair(files.first),
-            last: pair(files.last),
+            first: bounds(files.first),
+            last: bounds(files.last),
             steps: files.gap_steps,
             targets: config.data.targets,
         };

@@ -7,7 +7,7 @@ use std::path::Path;
 use subsplat::camera::NearFar;
 use subsplat::data::crop::CropOptions;
 use subsplat::data::dataset::{Dataset, ExampleOptions};
-use subsplat::data::sampler::ViewSampler;
+use subsplat::data::sampler::{GapBounds, ViewSampler};
 use subsplat::train::TrainConfig;
 use subsplat::train::files::Pictures;
 use subsplat::train::run::Training;
@@ -76,7 +76,7 @@ fn a_data_set_is_streamed_into_the_step() {
 
     // The stream of the data set itself, with the gap of the step that an index belongs to.
     let first = ViewSampler::constant(2, 3, 3);
-    let sampler = ViewSampler { last: (3, 5), steps: 10, ..first };
+    let sampler = ViewSampler { last: GapBounds { low: 3, high: 5 }, steps: 10, ..first };
     let crop = CropOptions::square(32, 2, config.model_config().unwrap().stride());
     let options = ExampleOptions { sampler, crop, flip: false, near_far: None };
     let data = Dataset::open(&folder_guard.path().join("videos"), options).unwrap();

@@ -1,6 +1,7 @@
 //! Ops on a GPU against the same ops on the CPU: values and gradients under every rule of SPGR,
 //! and calls that the GPU cannot execute.
 
+use subsplat_test_support::gather;
 use subsplat_test_support::gpu as adapter;
 use subsplat_test_support::scenes;
 use subsplat_test_support::spgr_calls;
@@ -8,9 +9,7 @@ use subsplat_test_support::spgr_calls;
 use adapter::{gpu, limited};
 use candle_core::{DType, Result, Tensor, Var};
 use scenes::Random;
-use subsplat::abi::{
-    Convention, Gather, Level, OpacityRule, RasterOptions, SampleConvention, ShDirection,
-};
+use subsplat::abi::{Convention, Gather, OpacityRule, RasterOptions, ShDirection};
 use subsplat::camera::Camera;
 use subsplat::gpu::{DeviceChoice, Gpu};
 use subsplat::ops::attention_gather::attention_gather_on;
@@ -113,22 +112,7 @@ fn redistribution() {
 }
 
 fn gather(points: usize) -> Gather {
-    Gather {
-        levels: vec![Level { height: 5, width: 7, first_cell: 0 }],
-        views: 2,
-        points,
-        points_per_level: false,
-        dim: 8,
-        groups: 2,
-        stride: 16,
-        key: Some(0),
-        value: 8,
-        logit_scale: 0.4,
-        renormalise: true,
-        sample_convention: SampleConvention::HalfPixel,
-        drop: None,
-        point_gradient: true,
-    }
+    Gather { points, groups: 2, ..gather::base() }
 }
 
 /// Maps, query and points of 90 parents.

@@ -11,26 +11,26 @@ use subsplat::{
 use subsplat_test_support::pose_errors::relative_errors;
 
 const FEATURES: usize = 4000;
-const W: usize = 640;
-const H: usize = 480;
+pub const W: usize = 640;
+pub const H: usize = 480;
 
 fn intrinsics() -> Intrinsics {
     Intrinsics::from_fov_x(1.1, W, H)
 }
 
 /// A camera at `eye` that looks at the middle of the room of `examples/room`, then turned by `yaw`.
-fn camera(eye: Vec3, yaw: f32) -> Camera {
+pub fn camera(eye: Vec3, yaw: f32) -> Camera {
     let z = (Vec3::new(0.95, -0.6, -1.15) - EYE).normalize();
     let x = Vec3::Y.cross(z).normalize();
     let turn = Mat3::from_cols(x, z.cross(x), z) * Mat3::from_rotation_y(yaw);
     Camera::new(intrinsics(), Mat4::from_translation(eye) * Mat4::from_mat3(turn)).unwrap()
 }
 
-const EYE: Vec3 = Vec3::new(-0.48, -1.66, 0.84);
-const STEP: Vec3 = Vec3::new(0.25, 0.0, 0.16);
+pub const EYE: Vec3 = Vec3::new(-0.48, -1.66, 0.84);
+pub const STEP: Vec3 = Vec3::new(0.25, 0.0, 0.16);
 
 /// Bytes of the picture of a room, with the noise of a sensor.
-fn picture(room: u64, camera: &Camera, noise_seed: u64) -> Vec<u8> {
+pub fn picture(room: u64, camera: &Camera, noise_seed: u64) -> Vec<u8> {
     let room = Room::with_bank(room, Arc::new(TextureBank::new(0, 512)));
     let grade = Grade { noise: 0.008, seed: noise_seed, ..Grade::default() };
     let view = room.render(camera, &Quality { grade, ..Quality::training(grade) });

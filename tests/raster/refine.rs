@@ -3,6 +3,7 @@
 
 use glam::Mat4;
 use std::ops::ControlFlow;
+use std::time::{Duration, Instant};
 use subsplat::abi::{QUAT_OFFSET, SPLAT_STRIDE};
 use subsplat::io::image::Rgb;
 use subsplat::{
@@ -117,8 +118,10 @@ fn a_cancelled_refinement_changes_nothing() {
     let before = splats.clone();
     let views = [FitView { camera: &cameras[0], image: &truth[0] }];
     let (raster, options) = (RasterOptions::default(), RefineOptions::default());
-    let mut stop =
-        |step: usize| if step == 2 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) };
+    let mut stop = |refiner: &Refiner<'_>| match refiner.steps() {
+        2 => ControlFlow::Break(()),
+        _ => ControlFlow::Continue(()),
+    };
     let result =
         refine(&mut splats, &views, &raster, &options, &mut Renderer::default(), &mut stop);
     assert!(matches!(result, Err(FitError::Cancelled)));
@@ -147,4 +150,74 @@ fn gaussians_that_no_picture_shows_stay() {
     refined(&mut splats, &truth, &RefineOptions::default().with_steps(60));
     assert!(splats.rows()[11..] != start.rows()[11..], "nothing changed");
     assert_eq!(splats.rows()[..10], start.rows()[..10]);
+}
+
+#[test]
+fn steps_end_where_the_error_no_longer_falls() {
+    let truth = pictures(&plane(0.6, 0.9));
+    let mut splats = displaced(0.4);
+    let report = refined(&mut splats, &truth, &RefineOptions::default().with_steps(4000));
+    assert!(report.steps < 4000 && report.steps.is_multiple_of(8), "{report:?}");
+    assert!(report.after < report.before, "{report:?}");
+}
+
+#[test]
+fn a_time_limit_ends_the_steps_and_their_rates() {
+    let truth = pictures(&plane(0.6, 0.9));
+    let mut splats = displaced(0.4);
+    let options = RefineOptions::default().with_time(Duration::from_millis(300));
+    let begun = Instant::now();
+    let report = refined(&mut splats, &truth, &options);
+    assert!(report.steps > 0 && report.after < report.before, "{report:?}");
+    // A hundred times the limit, whatever else the machine does.
+    assert!(begun.elapsed() < Duration::from_secs(30));
+}
+
+/// Three planes for three photographs, the third one behind the others. The third shows nothing,
+/// and of two photographs nothing is removed.
+#[test]
+fn parents_that_no_photograph_shows_are_removed() {
+    let (cameras, truth) = (cameras(), pictures(&plane(0.6, 0.95)));
+    let mut parts = displaced(0.4).into_parts();
+    let size = parts.rows.len();
+    for depth in [1.0, 1.5] {
+        let copy = displaced(0.4).into_parts();
+        parts.rows.extend(copy.rows.chunks(SPLAT_STRIDE).flat_map(|row| {
+            let mut row = row.to_vec();
+            row[2] *= depth;
+            row
+        }));
+        parts.sh.extend(copy.sh);
+        parts.gain.extend(copy.gain);
+    }
+    let start = Splats::try_from(parts).unwrap();
+    let order = [0, 1, 0];
+    let run = |views: usize, share: f32| {
+        let views: Vec<FitView<'_>> = order[..views]
+            .iter()
+            .map(|&i| FitView { camera: &cameras[i], image: &truth[i] })
+            .collect();
+        let options = RefineOptions::default().with_steps(24).with_groups(true);
+        let options = options.with_least_share(share);
+        let (mut splats, mut renderer) = (start.clone(), Renderer::default());
+        let mut go_on = |_: &Refiner<'_>| ControlFlow::Continue(());
+        let raster = RasterOptions::default();
+        let report =
+            refine(&mut splats, &views, &raster, &options, &mut renderer, &mut go_on).unwrap();
+        (report, splats)
+    };
+    let (report, splats) = run(3, 0.5);
+    assert!(report.after < report.before, "{report:?}");
+    assert_eq!(report.removed, start.len() - splats.len());
+    let behind = |s: &Splats| s.rows().chunks(SPLAT_STRIDE).filter(|r| r[2] > 1.25).count();
+    let behind = (behind(&start), behind(&splats));
+    assert!(behind.0 == size / SPLAT_STRIDE && behind.1 < behind.0 / 8, "{behind:?}");
+    let both = start.len() - behind.0;
+    assert!(splats.len() > both / 2, "{} of {both}", splats.len());
+    let buffers = (splats.rows().len(), splats.sh().len(), splats.gain().len());
+    let per_parent = start.sh().len() / start.parents();
+    let parents = splats.len() / start.children_per_parent();
+    assert_eq!(buffers, (SPLAT_STRIDE * splats.len(), per_parent * parents, 4 * splats.len()));
+    assert_eq!(run(3, 0.0).1.len(), start.len());
+    assert_eq!(run(2, 0.5).1.len(), start.len());
 }

@@ -9,7 +9,7 @@
 //!
 //! A job's sums are `[row][output channel]`, where row = channel · taps + tap.
 
-use super::algorithm::WeightGradArgs;
+use super::algorithm::{WeightGrad, WeightGradArgs};
 use super::buffers::Buffers;
 use super::packed_tile::{TileLayout, tile_starts};
 use super::plan::Plan;
@@ -118,8 +118,14 @@ impl Job<'_> {
     }
 }
 
+impl<A: TiledWeightGrad> WeightGrad for A {
+    fn weight_grad(&self, args: &WeightGradArgs<'_>, dw: &mut [f32]) {
+        sum_jobs(self, args, dw);
+    }
+}
+
 /// Computes ∂L/∂w by `algorithm`; overwrites `dw`.
-pub(super) fn run(algorithm: &dyn TiledWeightGrad, args: &WeightGradArgs<'_>, dw: &mut [f32]) {
+fn sum_jobs(algorithm: &dyn TiledWeightGrad, args: &WeightGradArgs<'_>, dw: &mut [f32]) {
     let &WeightGradArgs { level, plan, x, dy } = args;
     let (c, o, taps) = (plan.src_channels, plan.dst_channels, plan.kernel_taps);
     let in_pixels = plan.src_pixels();

@@ -3,7 +3,8 @@
 #![expect(clippy::needless_range_loop, reason = "counted loops over arrays become vectors")]
 
 use super::{
-    F32Vector, IntVector, LANES, Mask, Simd, Vector, all_inside, elementary, transpose4x4_index,
+    F32Vector, IntVector, Kernel, LANES, Mask, Simd, Vector, all_inside, elementary,
+    transpose4x4_index,
 };
 use std::mem::MaybeUninit;
 use std::ops::{Add, BitAnd, BitOr, BitXor, Div, Mul, Neg, Not, Sub};
@@ -297,6 +298,10 @@ impl<const FUSED: bool> Simd for Array<FUSED> {
     type M = M;
     type I = I;
 
+    #[inline(never)]
+    fn call<K: Kernel>(self, kernel: K) -> K::Output {
+        kernel.run(self)
+    }
     #[inline(always)]
     fn store_uninit(self, v: F<FUSED>, to: &mut [MaybeUninit<f32>; LANES]) {
         *to = v.0.map(MaybeUninit::new);

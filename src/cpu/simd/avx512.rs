@@ -279,6 +279,10 @@ impl Simd for Token {
     type I = I;
 
     #[inline(always)]
+    fn call<K: Kernel>(self, kernel: K) -> K::Output {
+        unsafe { run(kernel) }
+    }
+    #[inline(always)]
     fn store_uninit(self, v: F, to: &mut [MaybeUninit<f32>; LANES]) {
         unsafe { _mm512_storeu_ps(to.as_mut_ptr().cast(), v.0) }
     }

@@ -1,6 +1,6 @@
 //! Sixteen `f32` lanes: bits, shuffles, masked loads and prefetches.
 
-use super::{LANES, Mask, Vector};
+use super::{Kernel, LANES, Mask, Vector};
 use std::mem::MaybeUninit;
 use std::ops::{Add, BitAnd, BitOr, BitXor, Sub};
 
@@ -81,6 +81,11 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
 
     /// Vectors that the registers hold at once: the limit of a register tile.
     const REGISTERS: usize = <Self::F as Vector>::REGISTERS;
+
+    /// Runs `kernel` as a function of its own, compiled for this level. All callers share its
+    /// code; `kernel.run(self)` would compile a copy into each of them. It serves kernels that
+    /// take much longer than a call.
+    fn call<K: Kernel>(self, kernel: K) -> K::Output;
 
     /// Puts `v` into every lane.
     #[inline(always)]

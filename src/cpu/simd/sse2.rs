@@ -7,7 +7,8 @@
 #![expect(clippy::undocumented_unsafe_blocks, reason = "one reason for all, stated above")]
 
 use super::{
-    F32Vector, IntVector, LANES, Mask, RowLayout, Simd, Vector, all_inside, elementary, rows,
+    F32Vector, IntVector, Kernel, LANES, Mask, RowLayout, Simd, Vector, all_inside, elementary,
+    rows,
 };
 use std::arch::x86_64::*;
 use std::mem::MaybeUninit;
@@ -292,6 +293,10 @@ impl Simd for Token {
     type M = M;
     type I = I;
 
+    #[inline(never)]
+    fn call<K: Kernel>(self, kernel: K) -> K::Output {
+        kernel.run(self)
+    }
     #[inline(always)]
     fn store_uninit(self, v: F, to: &mut [MaybeUninit<f32>; LANES]) {
         for (i, v) in v.0.into_iter().enumerate() {

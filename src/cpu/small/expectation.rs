@@ -11,6 +11,15 @@ use rayon::prelude::*;
 /// Pixels per step of a loop.
 const LANES: usize = 16;
 
+/// Candidates over which a mean is taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum MeanOver {
+    /// All candidates.
+    All,
+    /// Those of the window alone.
+    Window,
+}
+
 /// Sizes and rules.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Expectation {
@@ -20,8 +29,8 @@ pub struct Expectation {
     pub pixels: usize,
     /// Half-width of the window around the mode, in candidates.
     pub window: usize,
-    /// True if the mean is over the window alone.
-    pub windowed: bool,
+    /// Candidates over which the mean is taken.
+    pub mean: MeanOver,
 }
 
 /// Results of the softmax of one pixel.
@@ -74,7 +83,10 @@ impl Expectation {
         }
         std::array::from_fn(|l| {
             let inverse = 1.0 / all[l];
-            let away = if self.windowed { first_near[l] / near[l] } else { first[l] * inverse };
+            let away = match self.mean {
+                MeanOver::Window => first_near[l] / near[l],
+                MeanOver::All => first[l] * inverse,
+            };
             let (mean, mass) = (mode[l] + away, near[l] * inverse);
             Pixel { max: max[l], inverse, mode: mode[l], mean, mass }
         })
@@ -127,8 +139,10 @@ pub fn backward(e: &Expectation, logits: &[f32], grad: &[f32], out: &mut [f32]) 
                 for (((out, x), p), (g, m)) in out.iter_mut().zip(x).zip(pixels).zip(grads) {
                     let inside = if (k - p.mode).abs() <= reach { 1.0 } else { 0.0 };
                     let share = exp(x - p.max) * p.inverse;
-                    let of_mean =
-                        if e.windowed { inside * (k - p.mean) / p.mass } else { k - p.mean };
+                    let of_mean = match e.mean {
+                        MeanOver::Window => inside * (k - p.mean) / p.mass,
+                        MeanOver::All => k - p.mean,
+                    };
                     *out = share * (of_mean * g + (inside - p.mass) * m);
                 }
             },

@@ -42,12 +42,17 @@ pub struct Target<'a> {
     pub sh_degree: usize,
 }
 
-/// Children, areas and opacities of one vector of parents.
-type Seat<'a, V> = (&'a mut [Seen<V>], &'a mut [V], &'a mut [V]);
+/// Numbers of the children of one vector of parents, one entry per child.
+struct Scratch<'a, V> {
+    projected: &'a mut [ProjectedChild<V>],
+    areas: &'a mut [V],
+    /// Logits, then opacities.
+    alphas: &'a mut [V],
+}
 
 /// A child in the target camera, before its opacity is known.
 #[derive(Clone, Copy)]
-struct Seen<V> {
+struct ProjectedChild<V> {
     /// Camera point.
     p: V3<V>,
     /// J·Σ·Jᵀ before the low-pass, px², and its determinant, px⁴.
@@ -60,7 +65,7 @@ struct Seen<V> {
     sum: V3<V>,
 }
 
-impl<V: Vector<Element = f32>> Seen<V> {
+impl<V: Vector<Element = f32>> ProjectedChild<V> {
     #[inline(always)]
     fn new(view: &View, d: V3<V>, child: &Child<V>) -> Self {
         let rows = [splat(&view.rows[0]), splat(&view.rows[1]), splat(&view.rows[2])];
@@ -188,7 +193,7 @@ impl VectorKernel<f32> for Project<'_> {
         let degree = options.sh_degree.min(self.target.sh_degree);
         let mut colour = Coefficients::new(options.sh_basis, degree);
         let zero = V::constant(0.0);
-        let empty = Seen {
+        let empty = ProjectedChild {
             p: [zero; 3],
             xx: zero,
             xy: zero,
@@ -197,16 +202,17 @@ impl VectorKernel<f32> for Project<'_> {
             gain: [zero; 2],
             sum: [zero; 3],
         };
-        let mut seen = vec![empty; children];
+        let mut projected = vec![empty; children];
         let (mut areas, mut alphas) = (vec![zero; children], vec![zero; children]);
         let mut bad = zero;
         for first in self.range.clone().step_by(V::LANES) {
             let span = (first, V::LANES.min(self.range.end - first));
             let set = 3 * sh_coefficients(self.target.sh_degree);
             colour.load::<V>(self.target.sh, (span.0, span.1, set));
-            let scratch = (&mut seen[..], &mut areas[..], &mut alphas[..]);
-            bad = bad + self.look(span, &colour, scratch);
-            self.write(span, &seen, &alphas);
+            let scratch =
+                Scratch { projected: &mut projected, areas: &mut areas, alphas: &mut alphas };
+            bad = bad + self.group(span, &colour, scratch);
+            self.write(span, &projected, &alphas);
         }
         let mut lanes = [0.0; LANES];
         bad.store(&mut lanes);
@@ -218,11 +224,11 @@ impl Project<'_> {
     /// Projects the children of one vector of parents; returns 0 in lanes where all numbers
     /// are finite, else NaN.
     #[inline(always)]
-    fn look<V: Vector<Element = f32>>(
+    fn group<V: Vector<Element = f32>>(
         &self,
         span: (usize, usize),
         colour: &Coefficients<f32>,
-        (seen, areas, alphas): Seat<V>,
+        Scratch { projected, areas, alphas }: Scratch<V>,
     ) -> V {
         let Args { rules, source, parents, .. } = self.args;
         let parent = Parent::load((rules, self.table, &source), parents, span);
@@ -230,25 +236,25 @@ impl Project<'_> {
         let eye = splat(&self.view.eye);
         let shared = self.target.options.sh_direction == ShDirection::Parent;
         let mut towards = [V::constant(0.0); 3];
-        for (k, seen) in seen.iter_mut().enumerate() {
+        for (k, projected) in projected.iter_mut().enumerate() {
             let head = records(&self.args, span, k);
             bad = not_finite(&head, bad);
             let child = Child::new(rules, &parent, k, &head);
             (areas[k], alphas[k]) = (child.area, head[HEAD_LOGIT_OFFSET]);
             bad = not_finite(&child.mean, not_finite(&child.scale, bad));
             let d = axpy(V::constant(-1.0), eye, child.mean);
-            *seen = Seen::new(self.view, d, &child);
+            *projected = ProjectedChild::new(self.view, d, &child);
             let [gamma, residual, ..] = gain(rules, head[HEAD_GAIN_OFFSET]);
-            seen.gain = [gamma, residual];
+            projected.gain = [gamma, residual];
             if shared {
                 towards = axpy(V::constant(1.0), d, towards);
             } else {
-                seen.sum = colour.radiance(d);
+                projected.sum = colour.radiance(d);
             }
         }
         if shared {
             let sum = colour.radiance(towards);
-            seen.iter_mut().for_each(|s| s.sum = sum);
+            projected.iter_mut().for_each(|child| child.sum = sum);
         }
         share(rules.opacity, areas, parent.alpha, parent.own, alphas);
         not_finite(alphas, bad)
@@ -258,13 +264,13 @@ impl Project<'_> {
     fn write<V: Vector<Element = f32>>(
         &mut self,
         (first, count): (usize, usize),
-        seen: &[Seen<V>],
+        projected: &[ProjectedChild<V>],
         alphas: &[V],
     ) {
-        let children = seen.len();
+        let children = projected.len();
         let at = (first - self.range.start) * children;
-        for (k, (seen, &alpha)) in seen.iter().zip(alphas).enumerate() {
-            let (numbers, keep) = seen.finish(self.view, alpha);
+        for (k, (child, &alpha)) in projected.iter().zip(alphas).enumerate() {
+            let (numbers, keep) = child.finish(self.view, alpha);
             let mut tile = [[0.0; LANES]; 16];
             for (i, (v, tile)) in numbers.into_iter().zip(&mut tile).enumerate() {
                 let v = if i < 12 { v } else { v + V::splat(MANTISSA) };

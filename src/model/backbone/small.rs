@@ -26,8 +26,8 @@ use crate::ops::join::join;
 use crate::ops::matching::raw_matching;
 use crate::ops::plane_sweep::{Pair, Sweep, pair, plane_sweep_on, relative_pose};
 use crate::ops::small::{
-    Candidates, Start, cross_check, expectation, head_input, head_output, lift, ray_distance,
-    unit_channels,
+    Candidates, MeanOver, Start, cross_check, expectation, head_input, head_output, lift,
+    ray_distance, unit_channels,
 };
 use crate::sh::C0;
 use candle_core::{Result, Tensor, bail};
@@ -361,7 +361,7 @@ impl SmallBackbone {
         }
         let (rows, d, h, w) = scores.dims4()?;
         let logits = lift(&scores.zeros_like()?, scores, &self.stem_factor)?.detach();
-        let (_, mass) = expectation(&logits, VISIBILITY_WINDOW, false)?;
+        let (_, mass) = expectation(&logits, VISIBILITY_WINDOW, MeanOver::All)?;
         let weights = (mass.sqr()? + 1e-6)?.reshape((rows / sources, sources, 1, h, w))?;
         let scores = scores.reshape((rows / sources, sources, d, h, w))?;
         scores.broadcast_mul(&weights)?.sum(1)?.broadcast_div(&weights.sum(1)?)
@@ -371,7 +371,11 @@ impl SmallBackbone {
     /// `[B·V, 1, h, w]` each.
     fn expected_index(&self, logits: &Tensor, mean: DisparityMean) -> Result<(Tensor, Tensor)> {
         let window = self.config.mode_window;
-        expectation(logits, window.max(1), mean == DisparityMean::AroundMode && window > 0)
+        let over = match mean {
+            DisparityMean::AroundMode if window > 0 => MeanOver::Window,
+            _ => MeanOver::All,
+        };
+        expectation(logits, window.max(1), over)
     }
 
     /// `sides`: candidate index and confidence (a logit), `[B·V, 1, H, W]`.

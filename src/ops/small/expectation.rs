@@ -1,4 +1,4 @@
-use crate::cpu::small::expectation::{self as cpu, Expectation};
+use crate::cpu::small::expectation::{self as cpu, Expectation, MeanOver};
 use crate::ops::{borrowed, output, slice, tensor_like};
 use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Tensor, bail};
 use rayon::prelude::*;
@@ -7,17 +7,17 @@ const NAME: &str = "expectation";
 const LIFT: &str = "lift";
 
 /// Of p = softmax over `logits` `[B, D, h, w]`: (mean of the candidate index, Σ p over
-/// |k − mode| ≤ `window`), both `[B, 1, h, w]`. `windowed` takes the mean over the
-/// window alone. The mode is a constant to gradients.
+/// |k − mode| ≤ `window`), both `[B, 1, h, w]`. `mean` says over which
+/// candidates the mean is taken. The mode is a constant to gradients.
 ///
 /// # Errors
 /// Another rank, no candidate, a dtype other than f32.
-pub fn expectation(logits: &Tensor, window: usize, windowed: bool) -> Result<(Tensor, Tensor)> {
+pub fn expectation(logits: &Tensor, window: usize, mean: MeanOver) -> Result<(Tensor, Tensor)> {
     let (b, d, h, w) = logits.dims4()?;
     if b * d * h * w == 0 {
         bail!("{NAME}: expected logits [B, D, h, w], none of them 0, got {:?}", logits.dims());
     }
-    let op = Op(Expectation { candidates: d, pixels: h * w, window, windowed });
+    let op = Op(Expectation { candidates: d, pixels: h * w, window, mean });
     let both = logits.contiguous()?.apply_op1(op)?;
     Ok((both.get(0)?, both.get(1)?))
 }

@@ -8,6 +8,7 @@ mod expectation;
 mod heads;
 mod unit;
 
+pub use crate::cpu::small::expectation::MeanOver;
 pub use crate::cpu::small::heads::Candidates;
 pub use convex::upsample_convex;
 pub use cross_check::cross_check;

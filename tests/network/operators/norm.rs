@@ -2,7 +2,7 @@
 
 use candle_core::{DType, Device, Result, Tensor};
 use subsplat::ops::activation::Activation;
-use subsplat::ops::norm::{group_norm, group_norm_then, instance_norm_then, layer_norm};
+use subsplat::ops::norm::{Affine, group_norm, group_norm_then, instance_norm_then, layer_norm};
 use subsplat_test_support::same::{noise, same};
 
 fn erf_gelu(x: &Tensor) -> Result<Tensor> {
@@ -28,14 +28,19 @@ fn silu_of_far_values() -> Result<()> {
     let (w, b) =
         (Tensor::new(&[400f32, -90.0], &Device::Cpu)?, Tensor::zeros(2, DType::F32, &Device::Cpu)?);
     let x = noise(&[1, 2, 5, 9], 7)?;
-    let got = group_norm_then(&x, 1, (&w, &b), Some(Activation::Silu))?;
+    let got = group_norm_then(&x, 1, Affine { weight: &w, bias: &b }, Some(Activation::Silu))?;
     let values = group_norm(&x, 1, &w, &b)?.flatten_all()?.to_vec1::<f32>()?;
     assert!(values.iter().any(|v| *v < -300.0) && values.iter().any(|v| *v > 300.0));
     for (got, v) in got.flatten_all()?.to_vec1::<f32>()?.into_iter().zip(values) {
         let want = f64::from(v) / (1.0 + (-f64::from(v)).exp());
         assert!((f64::from(got) - want).abs() <= 1e-6 * want.abs().max(1.0), "{v}: {got} {want}");
     }
-    let lost = group_norm_then(&(x * f64::NAN)?, 1, (&w, &b), Some(Activation::Silu))?;
+    let lost = group_norm_then(
+        &(x * f64::NAN)?,
+        1,
+        Affine { weight: &w, bias: &b },
+        Some(Activation::Silu),
+    )?;
     assert!(lost.flatten_all()?.to_vec1::<f32>()?.iter().all(|v| v.is_nan()));
     Ok(())
 }
@@ -50,7 +55,10 @@ fn norm_and_activation_agree_with_their_definitions() -> Result<()> {
     ] {
         same(
             &inputs,
-            |x| Ok(vec![group_norm_then(&x[0], 3, (&x[1], &x[2]), kind)?]),
+            |x| {
+                let affine = Affine { weight: &x[1], bias: &x[2] };
+                Ok(vec![group_norm_then(&x[0], 3, affine, kind)?])
+            },
             |x| Ok(vec![f(&plain(x, 3)?)?]),
         )?;
     }

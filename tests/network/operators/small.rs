@@ -3,8 +3,8 @@
 use candle_core::{D, Result, Tensor, Var};
 use subsplat::ops::join::join;
 use subsplat::ops::small::{
-    Candidates, Start, expectation, head_input, head_output, lift, ray_distance, unit_channels,
-    upsample_convex,
+    Candidates, MeanOver, Start, expectation, head_input, head_output, lift, ray_distance,
+    unit_channels, upsample_convex,
 };
 use subsplat_test_support::same::{far, gradient, noise, same};
 
@@ -33,7 +33,7 @@ fn joins_are_concatenations() -> Result<()> {
 fn expectations_agree_with_the_definition() -> Result<()> {
     // 5·7 pixels: whole vectors and a rest.
     let (d, window) = (11, 2);
-    let plain = |x: &Tensor, windowed: bool| -> Result<Vec<Tensor>> {
+    let plain = |x: &Tensor, over: MeanOver| -> Result<Vec<Tensor>> {
         let e = x.broadcast_sub(&x.detach().max_keepdim(1)?)?.exp()?;
         let p = e.broadcast_div(&e.sum_keepdim(1)?)?;
         let k = Tensor::arange(0f32, d as f32, x.device())?.reshape((1, d, 1, 1))?;
@@ -41,17 +41,17 @@ fn expectations_agree_with_the_definition() -> Result<()> {
         let near = k.broadcast_sub(&mode)?.abs()?.le(window as f64 + 0.5)?;
         let near = (&p * near.to_dtype(candle_core::DType::F32)?)?;
         let mass = near.sum_keepdim(1)?;
-        let mean = match windowed {
-            true => (near.broadcast_mul(&k)?.sum_keepdim(1)? / &mass)?,
-            false => p.broadcast_mul(&k)?.sum_keepdim(1)?,
+        let mean = match over {
+            MeanOver::Window => (near.broadcast_mul(&k)?.sum_keepdim(1)? / &mass)?,
+            MeanOver::All => p.broadcast_mul(&k)?.sum_keepdim(1)?,
         };
         Ok(vec![mean, mass])
     };
-    for windowed in [false, true] {
+    for over in [MeanOver::All, MeanOver::Window] {
         same(
             &[(noise(&[3, d, 5, 7], 3)? * 3.0)?],
-            |x| expectation(&x[0], window, windowed).map(|(a, b)| vec![a, b]),
-            |x| plain(&x[0], windowed),
+            |x| expectation(&x[0], window, over).map(|(a, b)| vec![a, b]),
+            |x| plain(&x[0], over),
         )?;
     }
     Ok(())

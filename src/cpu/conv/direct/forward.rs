@@ -175,10 +175,9 @@ impl Kernel for TileJob<'_> {
                         let x = &strip.x[r * layout.row_stride()..];
                         let strip = Strip { x, length: columns, ..strip };
                         let to = self.row_output(block.first, d, r);
-                        // SAFETY: `to` is the same part of a row of y in each channel of
-                        // the block. No other job writes it: jobs differ in image, tile or
-                        // channels.
-                        unsafe { strip.run_to(s, block.channels, to) };
+                        // `to` is the same part of a row of y in each channel of the block. No
+                        // other job writes it: jobs differ in image, tile or channels.
+                        s.call(StripJob { strip, channels: block.channels, to });
                     }
                     continue;
                 }
@@ -189,13 +188,33 @@ impl Kernel for TileJob<'_> {
                     from += n;
                     let floats = BLOCK_CHANNELS * length;
                     let sums = &mut self.sums[p * floats..][..floats];
-                    strip.run(s, block.channels, sums);
+                    let to = StripOutput { at: sums.as_mut_ptr(), stride: length };
+                    s.call(StripJob { strip, channels: block.channels, to });
                 }
                 for m in 0..block.channels {
                     self.copy_sums(s, block.first + m, m, d, length);
                 }
             }
         }
+    }
+}
+
+/// One strip: the part of the work that is a function of its own ([`Simd::call`]).
+struct StripJob<'a> {
+    strip: Strip<'a>,
+    channels: usize,
+    /// Has `strip.length` writable floats for each of the channels, which no other thread
+    /// accesses.
+    to: StripOutput,
+}
+
+impl Kernel for StripJob<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        // SAFETY: the contract of `to`.
+        unsafe { self.strip.run_to(s, self.channels, self.to) };
     }
 }
 

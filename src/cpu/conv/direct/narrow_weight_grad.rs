@@ -4,37 +4,25 @@
 //! sixteen neighbouring outputs of one channel; both x and ∂L/∂y are loaded as vectors, and
 //! the lanes are added at the end. Passes of at most eight output channels each.
 
+use super::weight_grad::TileProducts;
 use crate::cpu::conv::algorithm::MAX_NARROW_CHANNELS;
-use crate::cpu::conv::buffers::Buffer;
-use crate::cpu::conv::sizes::Axes;
-use crate::cpu::conv::weight_grad_jobs::Job;
 use crate::cpu::simd::{Kernel, LANES, Simd, Vector};
 
 /// Maximum floats of ∂L/∂y of a pass, which stay in a first-level cache, unless one row has
 /// more.
 const MAX_GRADIENT_FLOATS: usize = 8192;
 
-/// Adds the products of one tile to the sums of one job.
-pub(super) struct NarrowKernel<'a, 'b> {
-    pub job: &'a Job<'b>,
-    /// Packed tile.
-    pub x: &'a [f32],
-    pub dy: &'a [f32],
-    /// First output of the tile.
-    pub start: Axes,
-    /// Memory for the packed gradients.
-    pub scratch: &'a mut Buffer,
-    /// `[row][output channel]`.
-    pub sums: &'a mut [f32],
-}
+/// Adds the products of one tile with neighbouring outputs in the lanes.
+pub(super) struct NarrowKernel<'a, 'b>(pub TileProducts<'a, 'b>);
 
 impl Kernel for NarrowKernel<'_, '_> {
     type Output = ();
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let (job, layout) = (self.job, self.job.layout);
-        let [depth, height, width] = job.valid_outputs(self.start);
+        let TileProducts { job, x: tile, dy, start, scratch, sums } = self.0;
+        let layout = job.layout;
+        let [depth, height, width] = job.valid_outputs(start);
         let offsets = job.offsets();
         let (image_width, x_row_stride) = (job.plan.dst_size[2], layout.row_stride());
         let pass = MAX_NARROW_CHANNELS.min(job.row_stride);
@@ -51,9 +39,9 @@ impl Kernel for NarrowKernel<'_, '_> {
                 let line = (count - 1) * x_row_stride + width;
                 (1, line.next_multiple_of(LANES), x_row_stride)
             };
-            let x = &self.x[d * layout.depth_stride() + top * x_row_stride..];
+            let x = &tile[d * layout.depth_stride() + top * x_row_stride..];
             assert!(farthest + (lines - 1) * x_row_stride + line <= x.len());
-            let packed = self.scratch.floats(pass * lines * line);
+            let packed = scratch.floats(pass * lines * line);
             for first in (0..job.row_stride).step_by(MAX_NARROW_CHANNELS) {
                 let channels = job.output_channels.clone().skip(first);
                 if !whole || channels.len() < pass {
@@ -61,8 +49,8 @@ impl Kernel for NarrowKernel<'_, '_> {
                     packed.fill(0.0);
                 }
                 for (channel, plane) in channels.zip(packed.chunks_exact_mut(lines * line)) {
-                    let at = job.gradient_at(channel, self.start, d) + top * image_width;
-                    let from = &self.dy[at..];
+                    let at = job.gradient_at(channel, start, d) + top * image_width;
+                    let from = &dy[at..];
                     if whole && image_width == width {
                         plane.copy_from_slice(&from[..plane.len()]);
                         continue;
@@ -81,7 +69,7 @@ impl Kernel for NarrowKernel<'_, '_> {
                     rows: job.rows,
                     sums_stride: job.row_stride,
                 };
-                let sums = &mut self.sums[first..];
+                let sums = &mut sums[first..];
                 if S::REGISTERS >= 32 {
                     match pass {
                         8 => products.run::<S, 8, 3>(s, 0, sums),

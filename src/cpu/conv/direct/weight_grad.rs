@@ -6,11 +6,12 @@
 
 use super::narrow_weight_grad::NarrowKernel;
 use super::wide_weight_grad::WideKernel;
-use crate::cpu::conv::algorithm::{MAX_NARROW_CHANNELS, WeightGrad, WeightGradArgs};
-use crate::cpu::conv::buffers::Buffers;
+use crate::cpu::conv::algorithm::MAX_NARROW_CHANNELS;
+use crate::cpu::conv::buffers::{Buffer, Buffers};
 use crate::cpu::conv::packed_tile::{PackTile, tile_size, tile_starts};
 use crate::cpu::conv::plan::Plan;
-use crate::cpu::conv::weight_grad_jobs::{self, Job, Partition, TileOperands, TiledWeightGrad};
+use crate::cpu::conv::sizes::Axes;
+use crate::cpu::conv::weight_grad_jobs::{Job, Partition, TileOperands, TiledWeightGrad};
 use crate::cpu::conv::weight_grad_tile::{MAX_TILE_CHANNELS, TILE_ROWS};
 use crate::cpu::simd::{LANES, SimdLevel};
 
@@ -37,10 +38,18 @@ pub(in crate::cpu::conv) struct DirectWeightGrad {
     pub lanes: LaneAxis,
 }
 
-impl WeightGrad for DirectWeightGrad {
-    fn weight_grad(&self, args: &WeightGradArgs<'_>, dw: &mut [f32]) {
-        weight_grad_jobs::run(self, args, dw);
-    }
+/// The products of one packed tile, which a kernel adds to the sums of one job.
+pub(super) struct TileProducts<'a, 'b> {
+    pub job: &'a Job<'b>,
+    /// Packed tile.
+    pub x: &'a [f32],
+    pub dy: &'a [f32],
+    /// First output of the tile.
+    pub start: Axes,
+    /// Memory for gradients in the kernel's own order.
+    pub scratch: &'a mut Buffer,
+    /// `[row][output channel]`.
+    pub sums: &'a mut [f32],
 }
 
 impl TiledWeightGrad for DirectWeightGrad {
@@ -93,12 +102,10 @@ impl TiledWeightGrad for DirectWeightGrad {
             packed[floats..].fill(0.0);
             level.run(PackTile { plan, layout, x, start, out: packed });
             let (x, scratch) = (&*packed, &mut buffers.scratch);
-            let sums = &mut *sums;
+            let products = TileProducts { job, x, dy, start, scratch, sums: &mut *sums };
             match self.lanes {
-                LaneAxis::OutputChannels => {
-                    level.run(WideKernel { job, x, dy, start, scratch, sums });
-                }
-                LaneAxis::Outputs => level.run(NarrowKernel { job, x, dy, start, scratch, sums }),
+                LaneAxis::OutputChannels => level.run(WideKernel(products)),
+                LaneAxis::Outputs => level.run(NarrowKernel(products)),
             }
         }
     }

@@ -4,7 +4,7 @@
 //! first-level cache. Register tiles then multiply it with rows (channel × tap) of the packed
 //! tile, which are read as scalars where they lie.
 
-use crate::cpu::conv::buffers::Buffer;
+use super::weight_grad::TileProducts;
 use crate::cpu::conv::sizes::Axes;
 use crate::cpu::conv::weight_grad_jobs::Job;
 use crate::cpu::conv::weight_grad_tile::{OuterProducts, Store, TILE_ROWS};
@@ -13,38 +13,27 @@ use crate::cpu::simd::{Kernel, LANES, Simd};
 /// Maximum outputs whose gradients are transposed at once, unless one row has more.
 const MAX_TRANSPOSED_OUTPUTS: usize = 128;
 
-/// Adds the products of one tile to the sums of one job.
-pub(super) struct WideKernel<'a, 'b> {
-    pub job: &'a Job<'b>,
-    /// Packed tile.
-    pub x: &'a [f32],
-    pub dy: &'a [f32],
-    /// First output of the tile.
-    pub start: Axes,
-    /// Memory for the transposed gradients.
-    pub scratch: &'a mut Buffer,
-    /// `[row][output channel]`.
-    pub sums: &'a mut [f32],
-}
+/// Adds the products of one tile with output channels in the lanes.
+pub(super) struct WideKernel<'a, 'b>(pub TileProducts<'a, 'b>);
 
 impl Kernel for WideKernel<'_, '_> {
     type Output = ();
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let (job, layout) = (self.job, self.job.layout);
-        let [depth, height, width] = job.valid_outputs(self.start);
+        let TileProducts { job, x: tile, dy, start, scratch, sums } = self.0;
+        let layout = job.layout;
+        let [depth, height, width] = job.valid_outputs(start);
         let offsets = job.offsets();
         let stride = job.row_stride;
         let rows = (MAX_TRANSPOSED_OUTPUTS / width).clamp(1, height);
-        let transposed = self.scratch.floats(rows * width * stride);
+        let transposed = scratch.floats(rows * width * stride);
         for d in 0..depth {
             for first in (0..height).step_by(rows) {
                 let count = rows.min(height - first);
                 let transposed = &mut transposed[..count * width * stride];
-                let x = &self.x[d * layout.depth_stride() + first * layout.row_stride()..];
-                let start = self.start;
-                let from = OutputRows { job, dy: self.dy, start, d, first, rows: count, width };
+                let x = &tile[d * layout.depth_stride() + first * layout.row_stride()..];
+                let from = OutputRows { job, dy, start, d, first, rows: count, width };
                 from.transpose(s, transposed);
                 let products = OuterProducts {
                     x,
@@ -54,7 +43,7 @@ impl Kernel for WideKernel<'_, '_> {
                     height: count,
                     width,
                 };
-                let sums = self.sums.chunks_exact_mut(TILE_ROWS * stride);
+                let sums = sums.chunks_exact_mut(TILE_ROWS * stride);
                 for (i, (offsets, sums)) in offsets.as_chunks().0.iter().zip(sums).enumerate() {
                     if job.rows - i * TILE_ROWS > TILE_ROWS / 2 {
                         products.run::<S, TILE_ROWS>(s, offsets, Store::Add, sums);

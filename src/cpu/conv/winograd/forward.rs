@@ -5,7 +5,7 @@
 //! all destination channels in blocks of eight.
 
 use super::kind::{Kind, TransformTask};
-use super::load_tiles::{LoadScratch, TileBlock, TileLoader};
+use super::load_tiles::{LoadChannels, TileBlock, TileLoader};
 use super::product_layout::{GROUPS, ProductLayout};
 use super::products::{BlockProducts, OutputWriter};
 use super::transforms::{TILE, Transform};
@@ -135,16 +135,20 @@ where
         let tiles = tiles.floats(tiles_layout.floats);
         let pixels = plan.src_pixels();
         let channels = plan.src_channels;
-        let image = &x[self.image * channels * pixels..][..channels * pixels];
-        let rows = &mut [[s.splat(0.0); POINTS]; IN];
-        for (c, x) in image.chunks_exact(pixels).enumerate() {
-            let scratch = LoadScratch { packed: &mut *packed, rows: &mut *rows };
-            loader.load::<S, T, IN, POINTS, OUT>(s, x, scratch, tiles_layout, c, tiles);
-        }
+        s.call(LoadChannels {
+            loader: &loader,
+            x: &x[self.image * channels * pixels..][..channels * pixels],
+            pixels,
+            channels,
+            packed,
+            layout: tiles_layout,
+            tiles: &mut *tiles,
+            transform: self.transform,
+        });
         let output = OutputWriter::new::<OUT>(plan, y, block, self.image, self.start);
         let panels = self.weights.data.chunks_exact(GROUPS * group_stride(channels));
         for (block, panel) in self.weights.blocks.iter().zip(panels) {
-            let block_products = BlockProducts {
+            s.call(BlockProducts {
                 tiles,
                 tiles_layout,
                 products_layout,
@@ -152,8 +156,10 @@ where
                 block,
                 panel,
                 bias,
-            };
-            block_products.run::<S, T, IN, POINTS, OUT>(s, products, &output);
+                products: &mut *products,
+                output: &output,
+                transform: self.transform,
+            });
         }
     }
 }

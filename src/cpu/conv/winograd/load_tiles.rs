@@ -14,6 +14,7 @@ use crate::cpu::conv::plan::Plan;
 use crate::cpu::conv::sizes::Axes;
 use crate::cpu::simd::{Kernel, LANES, Mask, Simd, transpose4x4_index};
 use std::array::from_fn;
+use std::marker::PhantomData;
 
 /// A block of tiles: row by row, one image after the other.
 #[derive(Clone, Copy)]
@@ -243,20 +244,55 @@ impl Places<'_> {
     }
 }
 
-/// Memory that [`TileLoader::load`] works in.
-pub(super) struct LoadScratch<'a, V, const IN: usize, const POINTS: usize> {
-    /// A packed channel.
+/// Loads the tiles of some channels and writes Bᵀ·d·B to `tiles`. All directions call it as a
+/// function of its own ([`Simd::call`]).
+pub(super) struct LoadChannels<'a, T, const IN: usize, const POINTS: usize, const OUT: usize> {
+    pub loader: &'a TileLoader<'a>,
+    /// Source, from the first channel on.
+    pub x: &'a [f32],
+    /// Floats from channel to channel of `x`.
+    pub pixels: usize,
+    pub channels: usize,
+    /// Memory for a packed channel.
     pub packed: &'a mut Buffer,
+    /// Layout of `tiles`.
+    pub layout: &'a ProductLayout,
+    pub tiles: &'a mut [f32],
+    pub transform: PhantomData<T>,
+}
+
+impl<T, const IN: usize, const POINTS: usize, const OUT: usize> Kernel
+    for LoadChannels<'_, T, IN, POINTS, OUT>
+where
+    T: Transform<IN, POINTS, OUT>,
+{
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        let Self { loader, x, pixels, packed, layout, tiles, .. } = self;
+        let rows = &mut [[s.splat(0.0); POINTS]; IN];
+        for c in 0..self.channels {
+            let scratch = LoadScratch { packed: &mut *packed, rows: &mut *rows };
+            loader.load::<S, T, IN, POINTS, OUT>(s, &x[c * pixels..], scratch, layout, c, tiles);
+        }
+    }
+}
+
+/// Memory that [`TileLoader::load`] works in.
+struct LoadScratch<'a, V, const IN: usize, const POINTS: usize> {
+    /// A packed channel.
+    packed: &'a mut Buffer,
     /// Rows of sixteen tiles, transformed along themselves. Cleared once per job, not once
     /// per channel.
-    pub rows: &'a mut [[V; POINTS]; IN],
+    rows: &'a mut [[V; POINTS]; IN],
 }
 
 impl TileLoader<'_> {
     /// Loads the tiles of a channel, which begins at `x[0]`, and writes Bᵀ·d·B to channel
     /// `channel` of `tiles`.
     #[inline(always)]
-    pub fn load<S, T, const IN: usize, const POINTS: usize, const OUT: usize>(
+    fn load<S, T, const IN: usize, const POINTS: usize, const OUT: usize>(
         &self,
         s: S,
         x: &[f32],
@@ -289,7 +325,7 @@ impl TileLoader<'_> {
         let packed = packed.floats(images.len() * channel_stride + OVERREAD);
         for (x, out) in images.zip(packed.chunks_exact_mut(channel_stride)) {
             let (plan, layout, start) = (source.reader, &source.layout, source.start);
-            PackTile { plan, layout, x: &x[..pixels], start, out }.run(s);
+            s.call(PackTile { plan, layout, x: &x[..pixels], start, out });
         }
         for (v, starts) in source.tile_starts.iter().enumerate() {
             for r in 0..IN {

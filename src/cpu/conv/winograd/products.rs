@@ -1,5 +1,8 @@
 //! Products of transformed tiles and weights, their transform back and the store to y:
 //! Aᵀ·[Σ_c U ⊙ V]·A + bias.
+//!
+//! The kernels are functions of their own ([`Simd::call`]): the products serve all transforms,
+//! and the transform back serves images one by one and small images together.
 
 use super::load_tiles::TileBlock;
 use super::product_layout::ProductLayout;
@@ -10,12 +13,14 @@ use crate::cpu::conv::plan::Plan;
 use crate::cpu::conv::register_tile::{BLOCK_CHANNELS, ChannelBlock, Strip};
 use crate::cpu::conv::sizes::Axes;
 use crate::cpu::shared_slice::SharedSliceMut;
-use crate::cpu::simd::{LANES, Simd, transpose4x4_index};
+use crate::cpu::simd::{Kernel, LANES, Simd, transpose4x4_index};
 use std::array::from_fn;
+use std::marker::PhantomData;
 use std::mem::MaybeUninit;
 
-/// One block of destination channels of transformed tiles.
-pub(super) struct BlockProducts<'a> {
+/// Computes one block of destination channels from transformed tiles: multiplies into
+/// `products`, transforms back and writes to `output`.
+pub(super) struct BlockProducts<'a, T, const IN: usize, const POINTS: usize, const OUT: usize> {
     /// Transformed tiles.
     pub tiles: &'a [f32],
     /// Layout of `tiles`, or of each of its channels if `channel_stride` is set.
@@ -29,37 +34,33 @@ pub(super) struct BlockProducts<'a> {
     pub panel: &'a [f32],
     /// Bias of all destination channels, or empty.
     pub bias: &'a [f32],
+    pub products: &'a mut Buffer,
+    pub output: &'a OutputWriter<'a>,
+    pub transform: PhantomData<T>,
 }
 
-impl BlockProducts<'_> {
-    /// Multiplies into `products`, transforms back and writes to `output`.
+impl<T, const IN: usize, const POINTS: usize, const OUT: usize> Kernel
+    for BlockProducts<'_, T, IN, POINTS, OUT>
+where
+    T: Transform<IN, POINTS, OUT>,
+{
+    type Output = ();
+
     #[inline(always)]
-    pub fn run<S, T, const IN: usize, const POINTS: usize, const OUT: usize>(
-        &self,
-        s: S,
-        products: &mut Buffer,
-        output: &OutputWriter<'_>,
-    ) where
-        S: Simd,
-        T: Transform<IN, POINTS, OUT>,
-    {
-        let (block, channels) = (self.block, output.plan.src_channels);
-        let layout = self.products_layout;
-        let products = products.floats(layout.floats);
-        for (i, w) in self.panel.chunks_exact(group_stride(channels)).enumerate() {
-            let (from, to) = (self.tiles_layout.groups[i], layout.groups[i]);
-            let length = from.channel_stride;
-            let strip = Strip {
-                x: &self.tiles[from.start..],
-                channel_stride: self.channel_stride.unwrap_or(length),
-                channels,
-                offsets: &[0],
-                w,
-                bias: [0.0; BLOCK_CHANNELS],
-                length,
-            };
-            strip.run(s, block.channels, &mut products[to.start..][..BLOCK_CHANNELS * length]);
-        }
+    fn run<S: Simd>(self, s: S) {
+        let Self { tiles, tiles_layout, channel_stride, block, panel, output, .. } = self;
+        let (layout, channels) = (self.products_layout, output.plan.src_channels);
+        let products = self.products.floats(layout.floats);
+        s.call(GroupProducts {
+            tiles,
+            tiles_layout,
+            channel_stride,
+            channels,
+            panel,
+            block_channels: block.channels,
+            products: &mut *products,
+            products_layout: layout,
+        });
         let mut rows = [[s.splat(0.0); POINTS]; OUT];
         for m in 0..block.channels {
             let channel = block.first + m;
@@ -81,6 +82,45 @@ impl BlockProducts<'_> {
                     output.write_row(s, row, channel, places, r);
                 }
             }
+        }
+    }
+}
+
+/// The products of all groups, before they are transformed back.
+struct GroupProducts<'a> {
+    tiles: &'a [f32],
+    tiles_layout: &'a ProductLayout,
+    /// [`BlockProducts::channel_stride`].
+    channel_stride: Option<usize>,
+    /// Source channels.
+    channels: usize,
+    panel: &'a [f32],
+    /// Destination channels.
+    block_channels: usize,
+    products: &'a mut [f32],
+    products_layout: &'a ProductLayout,
+}
+
+impl Kernel for GroupProducts<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        let Self { channels, products, .. } = self;
+        for (i, w) in self.panel.chunks_exact(group_stride(channels)).enumerate() {
+            let (from, to) = (self.tiles_layout.groups[i], self.products_layout.groups[i]);
+            let length = from.channel_stride;
+            let strip = Strip {
+                x: &self.tiles[from.start..],
+                channel_stride: self.channel_stride.unwrap_or(length),
+                channels,
+                offsets: &[0],
+                w,
+                bias: [0.0; BLOCK_CHANNELS],
+                length,
+            };
+            let sums = &mut products[to.start..][..BLOCK_CHANNELS * length];
+            strip.run(s, self.block_channels, sums);
         }
     }
 }

@@ -7,7 +7,7 @@
 
 use super::forward::Call;
 use super::kind::{Kind, TransformTask};
-use super::load_tiles::{LoadScratch, TileBlock, TileLoader};
+use super::load_tiles::{LoadChannels, TileBlock, TileLoader};
 use super::product_layout::{GROUPS, ProductLayout};
 use super::products::{BlockProducts, OutputWriter};
 use super::transforms::{TILE, Transform};
@@ -65,10 +65,17 @@ impl TransformTask for AllImages<'_> {
         let all = transformed.floats(plan.src_channels * channel_stride);
         let channels = all.par_chunks_exact_mut(channel_stride).enumerate();
         channels.with_min_len(MIN_JOB_CHANNELS).for_each(|(channel, tiles)| {
-            let (x, transform) = (&x[channel * pixels..], PhantomData::<T>);
             Buffers::with(|buffers| {
-                let job = LoadJob { loader, tiles_layout, x, buffers, tiles, transform };
-                level.run::<LoadJob<'_, T, IN, POINTS, OUT>>(job);
+                level.run::<LoadChannels<'_, T, IN, POINTS, OUT>>(LoadChannels {
+                    loader,
+                    x: &x[channel * pixels..],
+                    pixels,
+                    channels: 1,
+                    packed: &mut buffers.packed,
+                    layout: tiles_layout,
+                    tiles,
+                    transform: PhantomData,
+                });
             });
         });
         let products_layout = &ProductLayout::new(POINTS, BLOCK_CHANNELS, tiles.lanes(), 0);
@@ -90,34 +97,6 @@ impl TransformTask for AllImages<'_> {
             });
         });
         Buffers::with(|buffers| buffers.tiles = transformed);
-    }
-}
-
-/// Transforms the tiles of one source channel of all images: `[product][tile]`.
-struct LoadJob<'a, T, const IN: usize, const POINTS: usize, const OUT: usize> {
-    loader: &'a TileLoader<'a>,
-    /// Layout of one channel.
-    tiles_layout: &'a ProductLayout,
-    /// From the channel's first image on.
-    x: &'a [f32],
-    buffers: &'a mut Buffers,
-    tiles: &'a mut [f32],
-    transform: PhantomData<T>,
-}
-
-impl<T, const IN: usize, const POINTS: usize, const OUT: usize> Kernel
-    for LoadJob<'_, T, IN, POINTS, OUT>
-where
-    T: Transform<IN, POINTS, OUT>,
-{
-    type Output = ();
-
-    #[inline(always)]
-    fn run<S: Simd>(self, s: S) {
-        let Self { loader, tiles_layout, x, buffers, tiles, .. } = self;
-        let rows = &mut [[s.splat(0.0); POINTS]; IN];
-        let scratch = LoadScratch { packed: &mut buffers.packed, rows };
-        loader.load::<S, T, IN, POINTS, OUT>(s, x, scratch, tiles_layout, 0, tiles);
     }
 }
 
@@ -151,8 +130,8 @@ where
         let (kind, block) = (self.kind, self.block);
         let Buffers { scratch: panel, products, .. } = self.buffers;
         let panel = panel.floats(GROUPS * group_stride(plan.src_channels));
-        TransformWeights { plan, kind, w, block, panel }.run(s);
-        let block_products = BlockProducts {
+        s.call(TransformWeights { plan, kind, w, block, panel: &mut *panel });
+        s.call(BlockProducts {
             tiles: self.tiles,
             tiles_layout: self.tiles_layout,
             products_layout: self.products_layout,
@@ -160,7 +139,9 @@ where
             block,
             panel,
             bias,
-        };
-        block_products.run::<S, T, IN, POINTS, OUT>(s, products, self.output);
+            products,
+            output: self.output,
+            transform: self.transform,
+        });
     }
 }

@@ -7,17 +7,17 @@
 //! transforms the sums once.
 
 use super::kind::{Kind, tiles_per_image};
-use super::load_tiles::{LoadScratch, TileBlock, TileLoader};
+use super::load_tiles::{LoadChannels, TileBlock, TileLoader};
 use super::product_layout::{GROUPS, ProductLayout};
 use super::transforms::{Adjoint, Stride1, Stride2, TILE, Transform, WEIGHTS, copy_vectors};
 use super::weights::TAPS;
-use crate::cpu::conv::algorithm::{WeightGrad, WeightGradArgs};
 use crate::cpu::conv::buffers::Buffers;
 use crate::cpu::conv::plan::Plan;
 use crate::cpu::conv::sizes::Axes;
-use crate::cpu::conv::weight_grad_jobs::{self, Job, Partition, TileOperands, TiledWeightGrad};
+use crate::cpu::conv::weight_grad_jobs::{Job, Partition, TileOperands, TiledWeightGrad};
 use crate::cpu::conv::weight_grad_tile::{MAX_TILE_CHANNELS, OuterProducts, Store, TILE_ROWS};
 use crate::cpu::simd::{Kernel, LANES, Simd, SimdLevel, first_lanes_bits};
+use std::marker::PhantomData;
 use std::ops::Range;
 
 /// Maximum input channels of a job.
@@ -36,12 +36,6 @@ const MAX_GROUPS: usize = 16;
 pub(in crate::cpu::conv) struct WinogradWeightGrad {
     /// [`Kind::Stride1`] or [`Kind::Stride2`].
     pub kind: Kind,
-}
-
-impl WeightGrad for WinogradWeightGrad {
-    fn weight_grad(&self, args: &WeightGradArgs<'_>, dw: &mut [f32]) {
-        weight_grad_jobs::run(self, args, dw);
-    }
 }
 
 impl TiledWeightGrad for WinogradWeightGrad {
@@ -164,12 +158,16 @@ impl SumProducts<'_, '_> {
         let tiles_layout = ProductLayout::new(POINTS, channels, lanes, LANES);
         let Buffers { packed, tiles, gradients, .. } = self.buffers;
         let tiles = tiles.floats(tiles_layout.floats);
-        let rows = &mut [[s.splat(0.0); POINTS]; IN];
-        for c in 0..channels {
-            let x = &x[c * x_pixels..];
-            let scratch = LoadScratch { packed: &mut *packed, rows: &mut *rows };
-            loader.load::<S, T, IN, POINTS, TILE>(s, x, scratch, &tiles_layout, c, tiles);
-        }
+        s.call(LoadChannels {
+            loader: &loader,
+            x,
+            pixels: x_pixels,
+            channels,
+            packed,
+            layout: &tiles_layout,
+            tiles: &mut *tiles,
+            transform: PhantomData::<T>,
+        });
         let zero = s.splat(0.0);
         let scratch =
             &mut GradientScratch { d: [[zero; LANES]; TILE], rows: [[zero; POINTS]; TILE] };
@@ -200,26 +198,67 @@ impl SumProducts<'_, '_> {
                     );
                 }
             }
-            for i in 0..GROUPS {
-                let (tile_group, gradient_group) =
-                    (tiles_layout.groups[i], gradients_layout.groups[i]);
-                let step = tile_group.channel_stride;
-                let outer = OuterProducts {
-                    x: &tiles[tile_group.start..][..channels * step],
-                    x_row_stride: lanes,
-                    dy: &gradients[gradient_group.start..][..gradient_group.channel_stride],
-                    stride: row_stride,
-                    height: step / lanes,
-                    width: used_lanes,
-                };
-                let sums = &mut own[i * rows * row_stride..][..rows * row_stride];
-                for (first, sums) in sums.chunks_exact_mut(TILE_ROWS * row_stride).enumerate() {
-                    let mut offsets = [0; TILE_ROWS];
-                    for m in 0..TILE_ROWS {
-                        offsets[m] = (first * TILE_ROWS + m).min(channels - 1) * step;
-                    }
-                    outer.run::<S, TILE_ROWS>(s, &offsets, self.store, sums);
+            s.call(SumGroups {
+                tiles: &*tiles,
+                tiles_layout: &tiles_layout,
+                gradients: &*gradients,
+                gradients_layout: &gradients_layout,
+                channels,
+                row_stride,
+                lanes,
+                used_lanes,
+                store: self.store,
+                sums: own,
+            });
+        }
+    }
+}
+
+/// Adds the products V ⊙ Z of all groups to `sums`. The transforms share this function
+/// ([`Simd::call`]).
+struct SumGroups<'a> {
+    tiles: &'a [f32],
+    tiles_layout: &'a ProductLayout,
+    gradients: &'a [f32],
+    gradients_layout: &'a ProductLayout,
+    /// Input channels.
+    channels: usize,
+    /// Floats of a row of sums.
+    row_stride: usize,
+    /// [`TileBlock::lanes`].
+    lanes: usize,
+    /// [`TileBlock::used_lanes`].
+    used_lanes: usize,
+    store: Store,
+    /// `[product][input channel][row_stride]`, input channels rounded up.
+    sums: &'a mut [f32],
+}
+
+impl Kernel for SumGroups<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        let Self { channels, row_stride, lanes, .. } = self;
+        let rows = channels.next_multiple_of(TILE_ROWS);
+        for i in 0..GROUPS {
+            let (tiles, gradients) = (self.tiles_layout.groups[i], self.gradients_layout.groups[i]);
+            let step = tiles.channel_stride;
+            let outer = OuterProducts {
+                x: &self.tiles[tiles.start..][..channels * step],
+                x_row_stride: lanes,
+                dy: &self.gradients[gradients.start..][..gradients.channel_stride],
+                stride: row_stride,
+                height: step / lanes,
+                width: self.used_lanes,
+            };
+            let sums = &mut self.sums[i * rows * row_stride..][..rows * row_stride];
+            for (first, sums) in sums.chunks_exact_mut(TILE_ROWS * row_stride).enumerate() {
+                let mut offsets = [0; TILE_ROWS];
+                for m in 0..TILE_ROWS {
+                    offsets[m] = (first * TILE_ROWS + m).min(channels - 1) * step;
                 }
+                outer.run::<S, TILE_ROWS>(s, &offsets, self.store, sums);
             }
         }
     }

@@ -371,6 +371,10 @@ pub struct SourceArgs {
     /// Do not match points between the context photographs (check of poses, depth range).
     #[arg(long)]
     pub no_check: bool,
+    /// Adjust the given cameras by points matched between the photographs, for poses that are nearly
+    /// right, such as a headset's.
+    #[arg(long)]
+    pub adjust_poses: bool,
     /// Colour detail from photographs that are larger than the network's input.
     #[arg(long, value_enum, default_value = "photo")]
     pub detail: DetailArg,
@@ -379,8 +383,9 @@ pub struct SourceArgs {
     #[arg(long, value_name = "STEPS", default_value_t = FitOptions::default().steps)]
     pub fit: usize,
     /// Refinement of the Gaussians on the photographs, after the fit: means, shapes, opacities and
-    /// colours. `auto`: eight steps a photograph, 64 at most, none with `--fit 0` and of more than 1.5 million Gaussians; `off`; or the number of steps.
-    #[arg(long, value_name = "auto | off | STEPS", default_value = "auto", value_parser = values::refine)]
+    /// colours. `auto`: eight steps a photograph, 64 at most, none with `--fit 0` and of more than 1.5 million Gaussians; `off`; the number of
+    /// steps; or a time in seconds, such as `20s`. The steps end earlier where they no longer help.
+    #[arg(long, value_name = "auto | off | STEPS | SECONDSs", default_value = "auto", value_parser = values::refine)]
     pub refine: Refine,
     /// The model.
     #[command(flatten)]

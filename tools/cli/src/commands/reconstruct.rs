@@ -13,7 +13,7 @@ use subsplat::data::crop::Cropped;
 use subsplat::io::scene::Scene;
 use subsplat::{
     Check, DepthBounds, DepthRange, Detail, FitOptions, FitReport, InputSize, Options, Photo,
-    Prepared, Reconstruction, Reconstructor, RefineReport,
+    Poses, Prepared, Reconstruction, Reconstructor, RefineReport,
 };
 
 /// The library's options of the arguments, for photographs of frames `context`.
@@ -23,6 +23,7 @@ use subsplat::{
 /// distance is necessary.
 pub fn options(args: &SourceArgs, scene: &Scene, context: &[usize]) -> Result<Options> {
     let check = if args.no_check { Check::Off } else { Check::Warn };
+    let poses = if args.adjust_poses { Poses::Adjusted } else { Poses::Given };
     let detail = match args.detail {
         DetailArg::Photo => Detail::Photographs,
         DetailArg::Off => Detail::Off,
@@ -33,6 +34,7 @@ pub fn options(args: &SourceArgs, scene: &Scene, context: &[usize]) -> Result<Op
         .with_check(check)
         .with_detail(detail)
         .with_fit(FitOptions::default().with_steps(args.fit))
+        .with_poses(poses)
         .with_refine(args.refine);
     let cameras: Vec<_> = context.iter().map(|&i| scene.frames[i].camera).collect();
     options.initial_depth_range(&cameras)?;
@@ -120,7 +122,7 @@ pub fn reconstruct(
         let prepared = model.prepare_with(photos.borrow(), options, &mut show)?;
         drop(photos);
         pages::trim_small_blocks();
-        bar.suspend(|| print_prepared(&prepared));
+        bar.suspend(|| print_prepared(&prepared, options.poses));
         let printed = prepared.warnings().len();
         let result = prepared.reconstruct_with(&mut show)?;
         bar.suspend(|| print_reconstruction(&result, printed));
@@ -130,8 +132,19 @@ pub fn reconstruct(
     Ok(result)
 }
 
-fn print_prepared(prepared: &Prepared<'_>) {
+fn print_prepared(prepared: &Prepared<'_>, poses: Poses) {
     print_line(crop_line(prepared.inputs(), prepared.cut_shares()));
+    match prepared.pose_adjustment() {
+        Some(a) => print_line(format!(
+            "the poses were adjusted by {} points, the largest change of a rotation is {:.2} degrees; \
+             the points' median error was {:.2} px and is {:.2} px",
+            a.points, a.turned_deg, a.before_px, a.after_px
+        )),
+        None if poses == Poses::Adjusted => {
+            print_line("the poses stay: they fit the photographs, or too few points are matched");
+        }
+        None => {}
+    }
     prepared.warnings().iter().for_each(print_warning);
     if prepared.reports().iter().any(|r| r.verdict == Verdict::Bad) {
         print_warning("these poses look wrong, and so will the result; `subsplat check` says more");
@@ -157,10 +170,14 @@ fn print_reconstruction(result: &Reconstruction, printed: usize) {
         ));
     }
     if let Some(refinement) = result.refinement() {
-        let RefineReport { steps, before, after, .. } = refinement;
+        let RefineReport { steps, before, after, removed, .. } = refinement;
+        let removed = match removed {
+            0 => String::new(),
+            n => format!("; {n} Gaussians that the photographs hardly show were removed"),
+        };
         print_line(format!(
             "{steps} steps of refinement changed the error of photographs drawn from the others' \
-             Gaussians from {before:.5} to {after:.5} (--refine off: none)"
+             Gaussians from {before:.5} to {after:.5} (--refine off: none){removed}"
         ));
     }
 }

@@ -280,7 +280,7 @@ pub fn depths(splats: &Splats, camera: &Camera) -> DepthSpread {
 
 /// Bounds of a scene's splats without outliers.
 pub fn bounds(splats: &Splats) -> Result<Bounds> {
-    Bounds::of((0..splats.len()).map(|i| splats.mean(i))).context("the scene holds no Gaussian")
+    Bounds::of(splats.means()).context("the scene holds no Gaussian")
 }
 
 /// A camera along +z that shows the central 96 % of the means.

@@ -334,6 +334,12 @@ impl Done {
             "far": bounds.far,
             "near_far_from": bounds.source.to_string(),
             "check": reconstruct::report(result.reports()),
+            "pose_adjustment": result.pose_adjustment().map(|a| json!({
+                "points": a.points,
+                "error_before_px": a.before_px,
+                "error_after_px": a.after_px,
+                "turned_deg": a.turned_deg,
+            })),
             "cut_shares": result.cut_shares(),
             "input_intrinsics": result.inputs().iter().map(|c| camera(&c.input_camera)).collect::<Vec<_>>(),
             "backbone": if is_mvsplat(config) { "re10k" } else { "small" },
@@ -345,7 +351,12 @@ impl Done {
             "detail": result.detail() == Detail::Photographs,
             "fit": result.fit().map(|f| json!({ "loss_before": f.before, "loss_after": f.after })),
             "refine": result.refinement().map(
-                |r| json!({ "steps": r.steps, "error_before": r.before, "error_after": r.after })
+                |r| json!({
+                    "steps": r.steps,
+                    "error_before": r.before,
+                    "error_after": r.after,
+                    "removed": r.removed,
+                })
             ),
             "gaussians": result.splats().len(),
             "inputs": self.inputs.inputs,

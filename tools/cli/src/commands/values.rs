@@ -38,15 +38,21 @@ pub fn upscale(text: &str) -> Result<usize, String> {
 /// Largest number of steps of `--refine`.
 const REFINE_MAX: usize = 100_000;
 
-/// Parses the length of a refinement.
+/// Largest number of seconds of `--refine`.
+const REFINE_SECONDS_MAX: usize = 86_400;
+
+/// Parses the length of a refinement: `auto`, `off`, steps, or seconds with an `s`.
 pub fn refine(text: &str) -> Result<Refine, String> {
-    match text.trim() {
-        "auto" => Ok(Refine::Auto),
-        "off" => Ok(Refine::Off),
-        steps => whole(steps, 0, REFINE_MAX)
-            .map(Refine::Steps)
-            .map_err(|e| format!("expected auto, off or steps: {}", &e["expected ".len()..])),
-    }
+    let text = text.trim();
+    let length = match (text, text.strip_suffix('s')) {
+        ("auto", _) => return Ok(Refine::Auto),
+        ("off", _) => return Ok(Refine::Off),
+        (_, Some(seconds)) => {
+            whole(seconds, 1, REFINE_SECONDS_MAX).map(|s| Refine::Seconds(s as u32))
+        }
+        (steps, None) => whole(steps, 0, REFINE_MAX).map(Refine::Steps),
+    };
+    length.map_err(|e| format!("expected auto, off, steps or 20s: {}", &e["expected ".len()..]))
 }
 
 /// Parses frames a second; a GIF counts hundredths of a second.
@@ -142,6 +148,20 @@ pub fn depth_conflict(near: Option<f32>, far: Option<f32>) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn lengths_of_a_refinement() {
+        assert_eq!(refine("auto"), Ok(Refine::Auto));
+        assert_eq!(refine(" off"), Ok(Refine::Off));
+        assert_eq!(refine("40"), Ok(Refine::Steps(40)));
+        assert_eq!(refine("20s"), Ok(Refine::Seconds(20)));
+        for bad in ["", "s", "0s", "-3", "1.5s", "100001", "86401s", "fast"] {
+            assert!(
+                refine(bad).unwrap_err().starts_with("expected auto, off, steps or 20s"),
+                "{bad}"
+            );
+        }
+    }
 
     #[test]
     fn sizes() {

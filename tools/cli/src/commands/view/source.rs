@@ -9,13 +9,17 @@ use crate::report::{Progress, print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
 use std::ops::ControlFlow;
 use std::path::Path;
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
 use subsplat::abi::RasterOptions;
 use subsplat::io::{SplatFormat, load_with_comments};
 use subsplat::navigation::{Start, up_of};
 use subsplat::render::camera_of_comments;
 use subsplat::splats::Splats;
-use subsplat::{Check, Options, Photo, Reconstruction, Reconstructor};
+use subsplat::{Check, Options, Photo, Reconstruction, Reconstructor, Refine, Refiner, Renderer};
 
+/// Least time between two pictures of a refinement.
+const SHOWN_EVERY: Duration = Duration::from_millis(400);
 /// Highest SH degree of a finished scene.
 const SH_DEGREE: usize = 4;
 
@@ -44,6 +48,17 @@ pub struct Photographs {
     options: Options,
     /// Width and height of the network's input, px.
     input_size: (usize, usize),
+    /// The refinement that goes on while the window shows the scene.
+    refine: Refine,
+    /// The first reconstruction, until it is refined.
+    first: Mutex<Option<Unrefined>>,
+}
+
+/// A reconstruction with the rules to render it and its r.
+struct Unrefined {
+    result: Reconstruction,
+    options: RasterOptions,
+    upscale: usize,
 }
 
 /// Loads or reconstructs the scene of the arguments.
@@ -110,12 +125,16 @@ fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     let model = progress.stage("model", |_| load_model(args, args.source.upscale))?;
     let (size, sides) = reconstruct::input_size(&args.source, &model, &scene, &context)?;
     options.input_size = size;
+    // The window shows the scene while it is refined. A fixed number of frames shows the result.
+    let refine = match args.frames {
+        None => std::mem::replace(&mut options.refine, Refine::Off),
+        Some(_) => Refine::Off,
+    };
     let photos = run::photographs(&scene, &context, args.source.pair.force, progress)?;
     let result = reconstruct(&model, photos.as_slice(), &options, progress)?;
     // Later calls use the depth range of this check.
     let prior = result.initial_depth_range().clone();
     let options = options.with_depth_prior(prior).with_check(Check::Off);
-    let photographs = Photographs { args: args.clone(), photos, options, input_size: sides };
     let cameras: Vec<_> = scene.frames.iter().map(|f| f.camera).collect();
     let (Some(input), Some(depth)) = (result.inputs().first(), result.depths().first()) else {
         bail!("{}: expected photographs, got none", scene.name)
@@ -126,7 +145,19 @@ fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
         distance: DepthSpread::of(depth.data.iter().copied()).middle,
         radius: render::bounds(result.splats())?.radius(),
     };
-    let made = photographs.made(&model, result);
+    let photographs = Photographs {
+        args: args.clone(),
+        photos,
+        options,
+        input_size: sides,
+        refine,
+        first: Mutex::default(),
+    };
+    let first = photographs.unrefined(&model, result);
+    let made = first.made(first.result.splats().clone());
+    if refine != Refine::Off {
+        *photographs.first.lock().unwrap_or_else(PoisonError::into_inner) = Some(first);
+    }
     Ok(Source { name: scene.name, start, made, photographs: Some(photographs) })
 }
 
@@ -136,23 +167,131 @@ fn load_model(args: &ViewArgs, upscale: Option<usize>) -> Result<Reconstructor> 
 }
 
 impl Photographs {
-    /// Reconstructs the same scene with r×r children per pixel. `begin` receives the name of
-    /// each stage.
-    pub fn make(&self, upscale: usize, begin: &mut dyn FnMut(&'static str)) -> Result<Made> {
-        begin("model");
-        let model = load_model(&self.args, Some(upscale))?;
-        memory::check_run(model.config(), self.photos.len(), self.input_size)?;
-        let mut progress = |progress: subsplat::Progress| {
-            begin(progress.stage.name());
-            ControlFlow::Continue(())
-        };
-        let result = model.run_with(&self.photos, &self.options, &mut progress)?;
-        Ok(self.made(&model, result))
+    /// Returns whether the first reconstruction waits for its refinement.
+    pub fn is_unrefined(&self) -> bool {
+        self.first.lock().unwrap_or_else(PoisonError::into_inner).is_some()
     }
 
-    fn made(&self, model: &Reconstructor, result: Reconstruction) -> Made {
+    /// Reconstructs the same scene with r×r children per pixel, and refines it. The first
+    /// reconstruction is refined only. `begin` receives the name of each stage, and `show` the
+    /// splats, again and again until they are refined.
+    pub fn make(
+        &self,
+        upscale: usize,
+        begin: &mut dyn FnMut(&'static str),
+        show: &mut dyn FnMut(Made) -> Result<()>,
+    ) -> Result<()> {
+        let first = self.first.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let made = match first.filter(|f| f.upscale == upscale) {
+            Some(first) => first,
+            None => {
+                begin("model");
+                let model = load_model(&self.args, Some(upscale))?;
+                memory::check_run(model.config(), self.photos.len(), self.input_size)?;
+                let mut progress = |progress: subsplat::Progress| {
+                    begin(progress.stage.name());
+                    ControlFlow::Continue(())
+                };
+                let result = model.run_with(&self.photos, &self.options, &mut progress)?;
+                let made = self.unrefined(&model, result);
+                show(made.made(made.result.splats().clone()))?;
+                made
+            }
+        };
+        if self.refine == Refine::Off {
+            return Ok(());
+        }
+        begin("refine");
+        made.refine(self.refine, show)
+    }
+
+    fn unrefined(&self, model: &Reconstructor, result: Reconstruction) -> Unrefined {
         let config = model.config();
         let options = run::raster_options(&self.args.rendering(), config, &result);
-        Made { splats: result.into_splats(), options, upscale: Some(config.upscale) }
+        Unrefined { result, options, upscale: config.upscale }
+    }
+}
+
+impl Unrefined {
+    /// `splats` with the rules of this scene.
+    fn made(&self, splats: Splats) -> Made {
+        Made { splats, options: self.options, upscale: Some(self.upscale) }
+    }
+
+    fn refine(mut self, refine: Refine, show: &mut dyn FnMut(Made) -> Result<()>) -> Result<()> {
+        let (options, upscale) = (self.options, Some(self.upscale));
+        let (mut shown, mut failure) = (Instant::now(), None);
+        let mut progress = |refiner: &Refiner<'_>| {
+            if shown.elapsed() >= SHOWN_EVERY {
+                failure = show(Made { splats: refiner.splats(), options, upscale }).err();
+                shown = Instant::now();
+            }
+            match failure {
+                Some(_) => ControlFlow::Break(()),
+                None => ControlFlow::Continue(()),
+            }
+        };
+        let refined = self.result.refine(refine, &mut Renderer::default(), &mut progress);
+        if let Some(failure) = failure {
+            return Err(failure);
+        }
+        refined?;
+        let splats = self.result.splats().clone();
+        show(self.made(splats))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+    use subsplat_test_support::repository;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        view: ViewArgs,
+    }
+
+    /// The scene as the window opens it and as the background thread shows it.
+    fn shown(flags: &[&str]) -> (Source, Vec<Splats>) {
+        let room = repository().join("examples/room");
+        let line = ["view", room.to_str().unwrap(), "--input-size", "64"];
+        let args = Line::parse_from(line.iter().chain(flags)).view;
+        let source = open(&args, &mut Progress::new()).unwrap();
+        let photographs = source.photographs.as_ref().unwrap();
+        let (mut all, mut stages) = (Vec::new(), Vec::new());
+        if photographs.is_unrefined() {
+            let mut show = |made: Made| {
+                all.push(made.splats);
+                Ok(())
+            };
+            photographs.make(2, &mut |stage| stages.push(stage), &mut show).unwrap();
+            assert_eq!(stages, ["refine"]);
+        }
+        (source, all)
+    }
+
+    #[test]
+    fn the_first_scene_is_refined_while_it_is_shown() {
+        let (source, shown_splats) = shown(&["--refine", "4"]);
+        let last = shown_splats.last().unwrap();
+        assert!(last.len() == source.made.splats.len() && *last != source.made.splats);
+        // A fixed number of frames begins with the refined scene.
+        let (fixed, none) = shown(&["--refine", "4", "--frames", "1"]);
+        assert!(none.is_empty() && fixed.made.splats == *last);
+        let (_, none) = shown(&["--refine", "off"]);
+        assert!(none.is_empty());
+    }
+
+    #[test]
+    fn a_window_that_cannot_show_ends_the_refinement() {
+        let room = repository().join("examples/room");
+        let line = ["view", room.to_str().unwrap(), "--input-size", "64", "--refine", "2"];
+        let source = open(&Line::parse_from(line).view, &mut Progress::new()).unwrap();
+        let mut show = |_: Made| bail!("no memory");
+        let photographs = source.photographs.unwrap();
+        let error = photographs.make(2, &mut |_| {}, &mut show).unwrap_err();
+        assert_eq!(error.to_string(), "no memory");
     }
 }

@@ -58,8 +58,10 @@ pub struct Done {
 pub enum Message {
     /// A stage begins.
     Stage(&'static str),
-    /// r×r children per pixel are ready, or failed.
-    Made(usize, Result<Ready, String>),
+    /// r×r children per pixel are ready. Further, refined ones may follow.
+    Made(usize, Ready),
+    /// The work on r×r children per pixel has ended, or failed.
+    Done(usize, Result<(), String>),
 }
 
 /// Splats in device memory.
@@ -196,6 +198,9 @@ impl Viewer {
         }
         self.canvas = Some(canvas);
         self.change();
+        if self.photographs.as_ref().is_some_and(|p| p.is_unrefined()) {
+            self.make_requested();
+        }
         Ok(())
     }
 
@@ -342,6 +347,11 @@ impl Viewer {
             }
             return;
         }
+        self.make_requested();
+    }
+
+    /// Starts the background thread for the requested splats, unless it runs already.
+    fn make_requested(&mut self) {
         let (None, Some(photographs), Some(canvas)) =
             (self.busy, self.photographs.clone(), &self.canvas)
         else {
@@ -352,8 +362,12 @@ impl Viewer {
         // A closed event loop needs no message.
         let work = move || {
             let mut stage = |name| drop(proxy.send_event(Message::Stage(name)));
-            let made = photographs.make(r, &mut stage).and_then(|made| upload(&gpu, &made));
-            drop(proxy.send_event(Message::Made(r, made.map_err(|e| format!("{e:#}")))));
+            let mut show = |made: Made| {
+                drop(proxy.send_event(Message::Made(r, upload(&gpu, &made)?)));
+                Ok(())
+            };
+            let done = photographs.make(r, &mut stage, &mut show);
+            drop(proxy.send_event(Message::Done(r, done.map_err(|e| format!("{e:#}")))));
         };
         if let Err(e) = std::thread::Builder::new().name(format!("x{r}")).spawn(work) {
             print_warning(format!("x{r}: no thread to make it: {e}"));
@@ -440,15 +454,19 @@ impl ApplicationHandler<Message> for Viewer {
     fn user_event(&mut self, _: &ActiveEventLoop, message: Message) {
         match message {
             Message::Stage(name) => self.busy = self.busy.map(|(r, _)| (r, name)),
-            Message::Made(r, made) => {
+            Message::Made(r, ready) => {
+                self.ready.insert(r, ready);
+                if r == self.requested {
+                    self.current = r;
+                }
+                self.change();
+            }
+            Message::Done(r, done) => {
                 self.busy = None;
-                match made {
-                    Ok(ready) => drop(self.ready.insert(r, ready)),
-                    Err(e) => {
-                        print_warning(format!("x{r}: {e}"));
-                        if self.requested == r {
-                            self.requested = self.current;
-                        }
+                if let Err(e) = done {
+                    print_warning(format!("x{r}: {e}"));
+                    if self.requested == r {
+                        self.requested = self.current;
                     }
                 }
                 self.show_requested();

@@ -1,0 +1,64 @@
+//! A refinement step ([`subsplat::refine`]) on one photograph beside the forward and backward pass
+//! of the rasterizer alone, on the rasterizer's scenes (`common/scene.rs`). A step adds the loss
+//! with its gradient and Adam's step of all Gaussians. The photograph is the scene's own picture
+//! with other colours.
+
+mod common;
+
+use anyhow::{Context, Result, ensure};
+use common::scene::{self, SCENES};
+use common::{Bench, Contender, Threads};
+use subsplat::abi::{Gradients, RasterOptions};
+use subsplat::cpu::Rasterizer;
+use subsplat::fit::FitView;
+use subsplat::io::image::Rgb;
+use subsplat::refine::{RefineOptions, Refiner};
+use subsplat::render::{Renderer, render, slices};
+
+/// Scenes of the report: 131,072 Gaussians at 256², and 524,288 at 512².
+const NAMES: [&str; 2] = ["131k-256", "524k-512"];
+
+fn main() -> Result<()> {
+    let mut bench = Bench::new("refine")?;
+    for spec in SCENES.iter().filter(|s| NAMES.contains(&s.name)) {
+        let name = format!("step {}", spec.name);
+        if !bench.selects(&name) || (bench.args.quick && spec.side > 256) {
+            continue;
+        }
+        let (splats, camera) = (scene::shared(spec), scene::camera(spec.side));
+        let raster = RasterOptions { background: [0.2, 0.1, 0.3], ..RasterOptions::default() };
+        let picture = bench.on_all(|| render(&splats, &camera, &raster));
+        let other: Vec<f32> = picture.rgb.iter().map(|v| 0.8 * v + 0.05).collect();
+        let image = Rgb::from_unit(&other, spec.side, spec.side).context("a picture")?;
+        let views = [FitView { camera: &camera, image: &image }];
+        let options = RefineOptions::default().with_steps(usize::MAX);
+        let refiner = || Refiner::new(&splats, &views, &raster, &options);
+        let (mut checked, mut renderer) = (refiner()?, Renderer::default());
+        bench.on_all(|| {
+            let before = checked.error(&mut renderer);
+            (0..8).for_each(|_| checked.step(&mut renderer));
+            let after = checked.error(&mut renderer);
+            ensure!(after < before, "eight steps raise the error from {before} to {after}");
+            Ok(())
+        })?;
+        let upstream = vec![1e-3; 5 * spec.side * spec.side];
+        let mut contenders = Vec::new();
+        for threads in [Threads::One, Threads::All] {
+            let (mut rasterizer, mut gradients) = (Rasterizer::new(), Gradients::default());
+            let (splats, camera, raster, upstream) = (&splats, &camera, &raster, &upstream);
+            contenders.push(Contender::new("rasterizer, both passes", threads, move || {
+                rasterizer.backward(&slices(splats), camera, raster, upstream, &mut gradients);
+                Ok(())
+            }));
+        }
+        for threads in [Threads::One, Threads::All] {
+            let (mut refiner, mut renderer) = (refiner()?, Renderer::default());
+            contenders.push(Contender::new("refinement step", threads, move || {
+                refiner.step(&mut renderer);
+                Ok(())
+            }));
+        }
+        bench.group(&name, contenders, "means, quaternions, scales, opacities, colour offsets")?;
+    }
+    bench.finish()
+}

@@ -1,0 +1,51 @@
+//! Cameras that are nearly right come back to where they belong.
+
+use glam::{Mat4, Quat, Vec3};
+use subsplat::camera::Camera;
+use subsplat::poses::{PosePhoto, adjust_poses};
+use subsplat_test_support::pose_errors::aligned_errors;
+use subsplat_test_support::posed_photos::{Intrinsics, PosedPhoto, photo_scene};
+
+/// A direction that depends on `i` only.
+fn direction(i: usize) -> Vec3 {
+    let (a, z) = (2.4 * i as f32, (1.7 * i as f32).sin());
+    let r = (1.0 - z * z).sqrt();
+    Vec3::new(r * a.cos(), r * a.sin(), z)
+}
+
+/// The camera turned by `degrees` and moved by `distance`, in directions of its own.
+fn disturbed(camera: &Camera, i: usize, degrees: f32, distance: f32) -> Camera {
+    let turn = Quat::from_axis_angle(direction(i), degrees.to_radians());
+    let rotation = turn * Quat::from_mat3(&camera.rotation());
+    let position = camera.position() + distance * direction(i + 7);
+    let matrix = Mat4::from_rotation_translation(rotation, position);
+    Camera::new(camera.intrinsics(), matrix).unwrap()
+}
+
+/// 0.5° and 1 % of the depth, which is that of the fox's wall, in five photographs.
+#[test]
+fn disturbed_cameras_come_back_to_within_a_third() {
+    let Some(scene) = photo_scene("fox") else { return };
+    let photos: Vec<PosedPhoto> =
+        [2, 5, 9, 13, 17].iter().map(|&i| PosedPhoto::load(&scene, i)).collect();
+    let features: Vec<PosePhoto> =
+        photos.iter().map(|p| p.features(Intrinsics::Known, 4000)).collect();
+    let truth: Vec<Camera> = photos.iter().map(|p| p.camera).collect();
+    let extent = truth.iter().map(|c| c.position().distance(truth[0].position()));
+    let distance = 0.01 * extent.fold(0.0, f32::max);
+    let given: Vec<Camera> =
+        truth.iter().enumerate().map(|(i, c)| disturbed(c, i, 0.5, distance)).collect();
+    let before = aligned_errors(&given, &truth);
+    let found = adjust_poses(&features, &given, 1).expect("an adjustment");
+    let after = aligned_errors(&found.cameras, &truth);
+    assert!(after.rotation_deg < before.rotation_deg / 3.0, "{before:?} {after:?}");
+    assert!(after.centre < before.centre / 3.0, "{before:?} {after:?}");
+    assert!(found.after_px < 0.8 * found.before_px && found.points > 100, "{found:?}");
+    assert!(found.turned_deg > 0.2 && found.turned_deg < 1.0, "{found:?}");
+    // The frame stays: the mean position and orientation are those of the given cameras.
+    let mean = |c: &[Camera]| c.iter().map(Camera::position).sum::<Vec3>() / c.len() as f32;
+    assert!(mean(&found.cameras).distance(mean(&given)) < 1e-4, "{found:?}");
+    // Cameras that fit stay.
+    assert!(adjust_poses(&features, &truth, 1).is_none_or(|a| a.turned_deg < 0.15));
+    assert!(adjust_poses(&features, &truth[..2], 1).is_none());
+}

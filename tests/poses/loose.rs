@@ -1,0 +1,43 @@
+//! Photographs without cameras, in memory and in files.
+
+use crate::refused::{EYE, H, STEP, W, camera, picture};
+use std::path::PathBuf;
+use subsplat::{
+    Error, KnownLens, LensSource, LoadOptions, LooseOptions, PoseRefusal, Rgb, load_photograph,
+    loose_photos, loose_scene, save_png,
+};
+
+#[test]
+fn photographs_in_memory_get_the_cameras_of_their_files() {
+    let folder = tempfile::tempdir().unwrap();
+    let cameras = [camera(EYE, 0.0), camera(EYE + STEP, -0.05)];
+    let files: Vec<PathBuf> = (0..2)
+        .map(|i| {
+            let file = folder.path().join(format!("{i}.png"));
+            let data = picture(7663, &cameras[i], i as u64);
+            save_png(&file, &Rgb { width: W, height: H, data }).unwrap();
+            file
+        })
+        .collect();
+    let photographs: Vec<_> =
+        files.iter().map(|file| load_photograph(file, &LoadOptions::default()).unwrap()).collect();
+    let options = LooseOptions { lens: Some(KnownLens::FovX(1.1)), ..LooseOptions::default() };
+
+    let scene = loose_scene(folder.path(), &files, &options, &mut |_| Ok(())).unwrap();
+    let memory = loose_photos(photographs.clone(), &options).unwrap();
+    assert_eq!(memory.estimate, scene.estimate);
+    assert_eq!(memory.lenses, [LensSource::Given, LensSource::Given]);
+    assert_eq!(memory.photos.len(), 2);
+    for ((photo, photograph), frame) in
+        memory.photos.iter().zip(&photographs).zip(&scene.scene.frames)
+    {
+        assert_eq!((photo.image(), *photo.camera()), (&photograph.image, frame.camera));
+    }
+
+    let twice = vec![photographs[0].clone(), photographs[0].clone()];
+    let refused = loose_photos(twice, &options);
+    assert!(
+        matches!(&refused, Err(Error::NoPoses { reason: PoseRefusal::SameView { .. }, .. })),
+        "{refused:?}"
+    );
+}
