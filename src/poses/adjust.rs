@@ -34,7 +34,8 @@ pub struct PoseAdjustment {
 }
 
 /// Adjusts `cameras`, one for each photograph, whose intrinsics are exact. `None` where too few
-/// points are matched, or where the cameras fit them already.
+/// points are matched, where the cameras fit them already, or where there is not one camera for
+/// each photograph. `seed` starts the random samples of the pairs' poses.
 pub fn adjust_poses(photos: &[PosePhoto], cameras: &[Camera], seed: u64) -> Option<PoseAdjustment> {
     if photos.len() != cameras.len() {
         return None;
