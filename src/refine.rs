@@ -24,6 +24,7 @@ use crate::abi::{
     SPLAT_STRIDE, SplatSlices, gain_with_offsets, sh_coefficients,
 };
 use crate::camera::Camera;
+use crate::cpu::simd::vectorize;
 use crate::fit::{FitError, FitView, Target};
 use crate::loss::{Scored, mse};
 use crate::render::Renderer;
@@ -59,7 +60,7 @@ pub struct RefineOptions {
     /// Least share of a parent in the photographs: the weight of its children in all pixels, over
     /// that of an average parent. Parents below it are removed, where `grouped` is set and there are
     /// three photographs or more. Two photographs show most places twice at most, so nothing is
-    /// removed. 0 keeps all. Default: 0.5.
+    /// removed. 0 keeps all. Default: 0.3.
     pub least_share: f32,
     /// Longest duration of the steps; the rates fall over it instead of over `steps`. The result
     /// then depends on the machine. Default: none.
@@ -81,7 +82,7 @@ impl Default for RefineOptions {
             colour_rate: 0.012,
             dssim: 0.2,
             across: 1.0,
-            least_share: 0.5,
+            least_share: 0.3,
             time: None,
             grouped: false,
         }
@@ -169,8 +170,8 @@ const LOG_SCALE_LIMITS: [f32; 2] = [-2.0, 1.0];
 /// Gaussians per parallel task.
 const CHUNK: usize = 4096;
 
-/// Parameters of one Gaussian, as differences from the predicted ones: logit of the opacity,
-/// ln σ (3), colour offset (3), mean in [`Refiner::units`] (3), quaternion (4).
+/// Parameters of one Gaussian: logit of the opacity; as differences from the predicted ones, ln σ
+/// (3), colour offset (3), mean in [`Refiner::units`] (3), quaternion (4).
 const PARAMETERS: usize = 14;
 const LOGIT: usize = 0;
 const LOG_SCALE: usize = 1;
@@ -257,8 +258,11 @@ impl<'a> Refiner<'a> {
     ) -> Result<Self, FitError> {
         let target = |(i, v): (usize, &FitView<'a>)| Target::new(i, v, options.dssim);
         let mut rows = splats.rows.clone();
-        for row in rows.chunks_exact_mut(SPLAT_STRIDE) {
-            row[OPACITY_OFFSET] = row[OPACITY_OFFSET].clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN);
+        let mut states = vec![State::default(); splats.len()];
+        for (row, state) in rows.chunks_exact_mut(SPLAT_STRIDE).zip(&mut states) {
+            let alpha = row[OPACITY_OFFSET].clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN);
+            row[OPACITY_OFFSET] = alpha;
+            state.value[LOGIT] = (alpha / (1.0 - alpha)).ln();
         }
         Ok(Self {
             predicted: splats,
@@ -268,7 +272,7 @@ impl<'a> Refiner<'a> {
             raster: RasterOptions { sh_basis: splats.sh_basis, ..*raster },
             options: *options,
             units: pixel_sizes(splats, views),
-            states: vec![State::default(); splats.len()],
+            states,
             rows,
             gain: gain_with_offsets(&splats.gain, splats.len()),
             gradients: Gradients::default(),
@@ -372,31 +376,43 @@ impl<'a> Refiner<'a> {
         let n = i32::try_from(*step).unwrap_or(i32::MAX);
         let correction = BETAS.map(|b| 1.0 - b.powi(n));
         let channels = predicted.gain_channels();
-        let rows = rows.par_chunks_exact_mut(SPLAT_STRIDE).zip(gain.par_chunks_exact_mut(4));
-        let by = gradients.rows.par_chunks_exact(SPLAT_STRIDE);
-        let by = by.zip(gradients.gain.par_chunks_exact(4));
-        let before = predicted.rows.par_chunks_exact(SPLAT_STRIDE).zip(&*units).enumerate();
-        states.par_iter_mut().zip(rows.zip(by).zip(before)).with_min_len(CHUNK).for_each(
-            |(state, (((row, gain), (by_row, by_gain)), (i, (before, unit))))| {
-                let mut gradient = by_parameters(row, by_row, by_gain, *unit);
-                if other.contains(&i) {
-                    let by_row = &across[(i - other.start) * SPLAT_STRIDE..][..SPLAT_STRIDE];
-                    let second = by_parameters(row, by_row, &[0.0; 4], *unit);
-                    let sums = gradient.iter_mut().zip(second);
-                    sums.for_each(|(sum, g)| *sum += options.across * g);
-                }
-                // Adam's state of a Gaussian that no pixel shows stays as it is.
-                if gradient.iter().all(|g| *g == 0.0) || gradient.iter().any(|g| !g.is_finite()) {
-                    return;
-                }
-                state.advance(&gradient, &rates, correction);
-                let offsets: [f32; 3] = match channels {
-                    4 => std::array::from_fn(|c| predicted.gain[4 * i + 1 + c]),
-                    _ => [0.0; 3],
-                };
-                state.write(before, offsets, *unit, row, gain);
-            },
-        );
+        let chunks = states.par_chunks_mut(CHUNK).enumerate();
+        let rows = rows.par_chunks_mut(CHUNK * SPLAT_STRIDE).zip(gain.par_chunks_mut(CHUNK * 4));
+        chunks.zip(rows).for_each(|((chunk, states), (rows, gain))| {
+            let first = chunk * CHUNK;
+            vectorize(
+                #[inline(always)]
+                || {
+                    let rows = rows.chunks_exact_mut(SPLAT_STRIDE).zip(gain.chunks_exact_mut(4));
+                    for (k, (state, (row, gain))) in states.iter_mut().zip(rows).enumerate() {
+                        let i = first + k;
+                        let by_row = &gradients.rows[i * SPLAT_STRIDE..(i + 1) * SPLAT_STRIDE];
+                        let by_gain = &gradients.gain[4 * i..4 * i + 4];
+                        let mut gradient = by_parameters(row, by_row, by_gain, units[i]);
+                        if other.contains(&i) {
+                            let by_row =
+                                &across[(i - other.start) * SPLAT_STRIDE..][..SPLAT_STRIDE];
+                            let second = by_parameters(row, by_row, &[0.0; 4], units[i]);
+                            let sums = gradient.iter_mut().zip(second);
+                            sums.for_each(|(sum, g)| *sum += options.across * g);
+                        }
+                        // Adam's state of a Gaussian that no pixel shows stays as it is.
+                        if gradient.iter().all(|g| *g == 0.0)
+                            || gradient.iter().any(|g| !g.is_finite())
+                        {
+                            continue;
+                        }
+                        state.advance(&gradient, &rates, correction);
+                        let offsets: [f32; 3] = match channels {
+                            4 => std::array::from_fn(|c| predicted.gain[4 * i + 1 + c]),
+                            _ => [0.0; 3],
+                        };
+                        let before = &predicted.rows[i * SPLAT_STRIDE..(i + 1) * SPLAT_STRIDE];
+                        state.write(before, offsets, units[i], row, gain);
+                    }
+                },
+            );
+        });
     }
 }
 
@@ -600,6 +616,7 @@ fn rates(options: &RefineOptions, part: f32) -> [f32; PARAMETERS] {
 }
 
 /// Gradients by a Gaussian's parameters from those by its row and its gain.
+#[inline(always)]
 fn by_parameters(row: &[f32], by_row: &[f32], by_gain: &[f32], unit: f32) -> [f32; PARAMETERS] {
     let alpha = row[OPACITY_OFFSET];
     let mut out = [0.0; PARAMETERS];
@@ -615,6 +632,7 @@ fn by_parameters(row: &[f32], by_row: &[f32], by_gain: &[f32], unit: f32) -> [f3
 
 impl State {
     /// One step of Adam. `correction`: 1 − βⁿ of both means.
+    #[inline(always)]
     fn advance(
         &mut self,
         gradient: &[f32; PARAMETERS],
@@ -636,6 +654,7 @@ impl State {
     }
 
     /// Writes the Gaussian: the row `before` and its colour `offsets`, changed by the parameters.
+    #[inline(always)]
     fn write(
         &self,
         before: &[f32],
@@ -645,9 +664,7 @@ impl State {
         gain: &mut [f32],
     ) {
         let value = &self.value;
-        let alpha = before[OPACITY_OFFSET].clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN);
-        let logit = (alpha / (1.0 - alpha)).ln() + value[LOGIT];
-        row[OPACITY_OFFSET] = 1.0 / (1.0 + (-logit).exp());
+        row[OPACITY_OFFSET] = 1.0 / (1.0 + (-value[LOGIT]).exp());
         for k in 0..3 {
             row[SCALE_OFFSET + k] = before[SCALE_OFFSET + k] * value[LOG_SCALE + k].exp();
             row[MEAN_OFFSET + k] = before[MEAN_OFFSET + k] + unit * value[MEAN + k];
