@@ -337,7 +337,8 @@ pub struct RunArgs {
 /// Options of a reconstruction: of `run` and `view`.
 #[derive(Clone, Debug, Args)]
 pub struct SourceArgs {
-    /// Context frames: indices into the scene's frames, or file names.
+    /// Context frames: indices into the scene's frames, or file names (default: up to five photographs
+    /// without poses all, else the protocol's or a pair).
     #[arg(long, value_delimiter = ',', value_name = "I,J")]
     pub context: Vec<String>,
     /// Size of the network's input, px. N: as many pixels as a square of side N, in the

@@ -17,7 +17,7 @@ use subsplat::data::pair::choose_pair;
 use subsplat::eval::{GaussianReport, InputReport, Score};
 use subsplat::io::SaveOptions;
 use subsplat::io::image::{LoadOptions, Rgb, Truncated};
-use subsplat::io::scene::Scene;
+use subsplat::io::scene::{Scene, SceneFormat};
 use subsplat::pipeline::Backend;
 use subsplat::pipeline::is_mvsplat;
 use subsplat::render::{comment_of_camera, comment_of_options};
@@ -171,6 +171,10 @@ pub fn photographs(
     })
 }
 
+/// Loose photographs of which all are context by default. Five score above their nearest pair on
+/// average (README), and their Gaussians are few enough for an automatic refinement.
+const CONTEXT_MAX: usize = 5;
+
 /// Chooses the context frames of the scene at `input`: those of `named`, or a default. Returns
 /// the reason for the choice too.
 pub fn context(named: &[String], input: &Path, scene: &Scene) -> Result<(Vec<usize>, String)> {
@@ -196,6 +200,12 @@ pub fn context(named: &[String], input: &Path, scene: &Scene) -> Result<(Vec<usi
     {
         let text = format!("{} from protocol.json", list(&test.context));
         return Ok((test.context, text));
+    }
+    let count = scene.frames.len();
+    if scene.source == SceneFormat::Photographs && count <= CONTEXT_MAX {
+        let all: Vec<usize> = (0..count).collect();
+        let text = format!("{}: all photographs", list(&all));
+        return Ok((all, text));
     }
     let Some(pair) = choose_pair(scene) else {
         bail!(
