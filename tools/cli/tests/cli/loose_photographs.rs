@@ -69,6 +69,20 @@ fn a_folder_of_photographs_becomes_a_scene() {
 }
 
 #[test]
+fn all_of_three_photographs_are_used() {
+    let place = folder();
+    fs::copy(room().join("images/heldout_0_512.jpg"), place.path().join("photos/third.jpg"))
+        .unwrap();
+    // The field of view of INTRINSICS, which the larger picture shares.
+    let arguments = "--json run photos --fov 68 --input-size 64 --frames 1 -o out";
+    let called = call_in(place.path(), arguments);
+    assert_eq!(called.code, 0, "{}", called.stderr);
+    let report = called.json();
+    assert_eq!(report["context"], serde_json::json!(["input_0", "input_1", "third"]));
+    assert!(report["refine"]["removed"].as_u64().unwrap() > 0, "{}", report["refine"]);
+}
+
+#[test]
 fn photographs_that_determine_no_cameras_are_refused_with_exit_code_3() {
     let place = folder();
     let same = "photos/input_0.png photos/input_0.png";
