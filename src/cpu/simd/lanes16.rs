@@ -132,12 +132,40 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     ///
     /// # Safety
     /// These floats must be readable.
-    unsafe fn load_masked(self, from: *const f32, bits: u16) -> Self::F;
+    #[inline(always)]
+    unsafe fn load_masked(self, from: *const f32, bits: u16) -> Self::F {
+        if bits == u16::MAX {
+            // SAFETY: the caller guarantees all sixteen.
+            return self.load(unsafe { &*from.cast() });
+        }
+        let mut out = [0.0; LANES];
+        for (i, out) in out.iter_mut().enumerate() {
+            if bits & (1 << i) != 0 {
+                // SAFETY: the caller guarantees this float.
+                *out = unsafe { *from.wrapping_add(i) };
+            }
+        }
+        self.load(&out)
+    }
     /// Stores the lanes whose bit i is set to `to[i]`.
     ///
     /// # Safety
     /// These places must be writable, and no other thread may use them.
-    unsafe fn store_masked(self, v: Self::F, to: *mut MaybeUninit<f32>, bits: u16);
+    #[inline(always)]
+    unsafe fn store_masked(self, v: Self::F, to: *mut MaybeUninit<f32>, bits: u16) {
+        if bits == u16::MAX {
+            // SAFETY: the caller guarantees all sixteen places, for this thread alone.
+            return self.store_uninit(v, unsafe { &mut *to.cast() });
+        }
+        let mut lanes = [0.0; LANES];
+        v.store(&mut lanes);
+        for (i, v) in lanes.into_iter().enumerate() {
+            if bits & (1 << i) != 0 {
+                // SAFETY: the caller guarantees this place, for this thread alone.
+                unsafe { to.wrapping_add(i).write(MaybeUninit::new(v)) };
+            }
+        }
+    }
 
     /// Rotates 16 elements in the order of [`transpose4x4_index`]: element i becomes
     /// element i + 1, the last one the first.

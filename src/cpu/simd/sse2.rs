@@ -342,32 +342,6 @@ impl Simd for Token {
         out
     }
     #[inline(always)]
-    unsafe fn load_masked(self, from: *const f32, bits: u16) -> F {
-        if bits == u16::MAX {
-            return self.load(unsafe { &*from.cast() });
-        }
-        let mut out = [0.0; LANES];
-        for (i, out) in out.iter_mut().enumerate() {
-            if bits & (1 << i) != 0 {
-                *out = unsafe { *from.wrapping_add(i) };
-            }
-        }
-        self.load(&out)
-    }
-    #[inline(always)]
-    unsafe fn store_masked(self, v: F, to: *mut MaybeUninit<f32>, bits: u16) {
-        if bits == u16::MAX {
-            return self.store_uninit(v, unsafe { &mut *to.cast() });
-        }
-        let mut lanes = [0.0; LANES];
-        v.store(&mut lanes);
-        for (i, v) in lanes.into_iter().enumerate() {
-            if bits & (1 << i) != 0 {
-                unsafe { to.wrapping_add(i).write(MaybeUninit::new(v)) };
-            }
-        }
-    }
-    #[inline(always)]
     fn rotate_left(self, v: F) -> F {
         let [a, b, c, d] = v.0;
         F([b, c, d, unsafe { _mm_shuffle_ps::<0x39>(a, a) }])
