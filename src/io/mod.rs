@@ -22,6 +22,7 @@ pub use splats::{
     load_splats, load_with_comments, parse_splats, save_splats, splat_info,
 };
 mod assemble;
+pub mod base64;
 pub mod cameras_json;
 pub mod colmap;
 mod decode;

@@ -8,6 +8,7 @@ use std::io::Write;
 use std::path::Path;
 use subsplat::abi::{ALPHA_MIN, Convention, NEAR_MVSPLAT, RasterOptions};
 use subsplat::camera::Camera;
+use subsplat::io::base64::base64;
 use subsplat::io::{SaveOptions, SaveReport, SplatFormat, encode_splats_with, write_atomic};
 use subsplat::splats::Splats;
 
@@ -90,42 +91,9 @@ fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
 }
 
-/// Encodes bytes as base64 (RFC 4648).
-fn base64(bytes: &[u8]) -> String {
-    const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-    let mut out = String::with_capacity(bytes.len().div_ceil(3) * 4);
-    for group in bytes.chunks(3) {
-        let mut code = 0u32;
-        for i in 0..3 {
-            code = code << 8 | u32::from(group.get(i).copied().unwrap_or(0));
-        }
-        for i in 0..4 {
-            let digit = DIGITS[(code >> (18 - 6 * i) & 63) as usize];
-            out.push(if i <= group.len() { char::from(digit) } else { '=' });
-        }
-    }
-    out
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn base64_of_the_standards_examples() {
-        for (text, expected) in [
-            ("", ""),
-            ("f", "Zg=="),
-            ("fo", "Zm8="),
-            ("foo", "Zm9v"),
-            ("foob", "Zm9vYg=="),
-            ("fooba", "Zm9vYmE="),
-            ("foobar", "Zm9vYmFy"),
-        ] {
-            assert_eq!(base64(text.as_bytes()), expected);
-        }
-        assert_eq!(base64(&[0xfb, 0xff, 0xfe]), "+//+");
-    }
 
     #[test]
     fn the_template_has_each_mark_once_and_the_viewer_ends_no_script() {
