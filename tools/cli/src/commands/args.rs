@@ -290,6 +290,24 @@ impl SceneFormatArg {
     }
 }
 
+/// Content of a scene file.
+#[derive(Clone, Copy, Debug, Args)]
+pub struct ContentArgs {
+    /// Highest SH degree of the scene files (default 3). A .ply holds 0, 9, 24 or 45 `f_rest` values
+    /// accordingly; readers expect 45.
+    #[arg(long, value_name = "0…3", value_parser = values::file_sh_degree)]
+    pub sh: Option<usize>,
+    /// Leave Gaussians of less opacity out of the scene files.
+    #[arg(
+        long,
+        default_value_t = 0.0,
+        value_name = "ALPHA",
+        allow_negative_numbers = true,
+        value_parser = values::opacity
+    )]
+    pub min_opacity: f32,
+}
+
 /// Arguments of `run`.
 #[derive(Debug, Args)]
 pub struct RunArgs {
@@ -316,19 +334,9 @@ pub struct RunArgs {
     /// Formats of the scene, written as scene.ply and so on.
     #[arg(long, value_enum, value_delimiter = ',', default_value = "ply", value_name = "F,…")]
     pub save: Vec<SceneFormatArg>,
-    /// Highest SH degree of the scene files (default 3). A .ply holds 0, 9, 24 or 45 `f_rest` values
-    /// accordingly; readers expect 45.
-    #[arg(long, value_name = "0…3", value_parser = values::file_sh_degree)]
-    pub sh: Option<usize>,
-    /// Leave Gaussians of less opacity out of the scene files.
-    #[arg(
-        long,
-        default_value_t = 0.0,
-        value_name = "ALPHA",
-        allow_negative_numbers = true,
-        value_parser = values::opacity
-    )]
-    pub min_opacity: f32,
+    /// Content of the scene files.
+    #[command(flatten)]
+    pub content: ContentArgs,
     /// Options of the rendering.
     #[command(flatten)]
     pub rendering: RenderingArgs,
@@ -595,19 +603,9 @@ pub struct ExportArgs {
     /// the scene, else a view of the whole.
     #[arg(long, value_name = "SCENE")]
     pub cameras: Option<PathBuf>,
-    /// Highest SH degree written (default 3). A .ply holds 0, 9, 24 or 45 `f_rest` values
-    /// accordingly; readers expect 45.
-    #[arg(long, value_name = "0…3", value_parser = values::file_sh_degree)]
-    pub sh: Option<usize>,
-    /// Leave Gaussians of less opacity out.
-    #[arg(
-        long,
-        default_value_t = 0.0,
-        value_name = "ALPHA",
-        allow_negative_numbers = true,
-        value_parser = values::opacity
-    )]
-    pub min_opacity: f32,
+    /// Content of the scene files.
+    #[command(flatten)]
+    pub content: ContentArgs,
     /// Up direction of a .ply or .splat (default: keep). A .glb and a .spz are y-up by their
     /// formats, and a .html is upright.
     #[arg(long, value_enum)]

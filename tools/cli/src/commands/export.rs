@@ -27,8 +27,8 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
         Some(UpArg::Y | UpArg::Z) => comments_without_camera(&comments),
     };
     let save = SaveOptions {
-        sh_degree: args.sh,
-        min_opacity: args.min_opacity,
+        sh_degree: args.content.sh,
+        min_opacity: args.content.min_opacity,
         up: args.up.map(Into::into).unwrap_or_default(),
         comments: kept,
     };

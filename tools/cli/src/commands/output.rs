@@ -270,8 +270,8 @@ fn bytes_at_most(format: SceneFormatArg, count: u64, stored: usize, asked: Optio
 /// large files. The scene has at most `count` Gaussians with SH of `degree`.
 pub fn check_formats(args: &RunArgs, count: u64, degree: usize) -> Result<()> {
     for format in &args.save {
-        let bytes = bytes_at_most(*format, count, degree, args.sh);
-        check_format(*format, count, bytes, args.min_opacity)?;
+        let bytes = bytes_at_most(*format, count, degree, args.content.sh);
+        check_format(*format, count, bytes, args.content.min_opacity)?;
     }
     Ok(())
 }

@@ -55,7 +55,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     output::prepare(&args.out, &args.input[0], &plan.scene)?;
     let photos = photographs(&plan.scene, &plan.context, args.source.pair.force, &mut progress)?;
     let result = reconstruct(&model, photos, &plan.options, &mut progress)?;
-    check_opacity(result.splats(), args.min_opacity)?;
+    check_opacity(result.splats(), args.content.min_opacity)?;
     let options = raster_options(&args.rendering, model.config(), &result);
     let views = views(args, &targets, &result)?;
     let mut job = Views {
@@ -75,8 +75,8 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
         let camera = result.inputs().first().map(|c| comment_of_camera(&c.target_camera));
         let comments = std::iter::once(comment_of_options(&options)).chain(camera).collect();
         let save = SaveOptions {
-            sh_degree: args.sh,
-            min_opacity: args.min_opacity,
+            sh_degree: args.content.sh,
+            min_opacity: args.content.min_opacity,
             comments,
             ..SaveOptions::default()
         };
