@@ -23,7 +23,7 @@ const IMPORTS: &[(&str, &[&str])] = &[
     ("render", &["abi", "backend", "camera", "cpu", "gpu", "io", "splats"]),
     ("loss", &["cpu", "metrics"]),
     ("fit", &["abi", "camera", "io", "loss", "render", "splats"]),
-    ("refine", &["abi", "camera", "cpu", "fit", "io", "loss", "render", "splats"]),
+    ("refine", &["abi", "camera", "fit", "io", "loss", "render", "splats"]),
     ("matches", &["cpu"]),
     ("check", &["camera", "matches", "metrics"]),
     ("poses", &["camera", "matches"]),
