@@ -9,6 +9,7 @@
 use super::absolute::Absolute;
 use super::photo::PosePhoto;
 use super::reconstruct::{self, Edge};
+use super::two_view::rotation_angle;
 use crate::camera::Camera;
 use glam::{DMat3, DQuat, DVec3, Mat4};
 
@@ -55,8 +56,7 @@ pub fn adjust_poses(photos: &[PosePhoto], cameras: &[Camera], seed: u64) -> Opti
     for (&photo, pose) in placed.iter().zip(&moved) {
         let (rotation, position) = back.pose(pose);
         let turn = rotation * given[photo].rotation;
-        turned_deg =
-            turned_deg.max(DQuat::from_mat3(&turn).normalize().to_axis_angle().1.to_degrees());
+        turned_deg = turned_deg.max(rotation_angle(&turn).to_degrees());
         let matrix = Mat4::from_mat3_translation(rotation.as_mat3(), position.as_vec3());
         out[photo] = Camera::new(cameras[photo].intrinsics, matrix).ok()?;
     }
@@ -73,7 +73,7 @@ fn absolute(camera: &Camera) -> Absolute {
 fn agrees(edge: &Edge, given: &[Absolute]) -> bool {
     let [a, b] = edge.photos.map(|i| given[i].rotation);
     let turn = edge.estimate.refined.relative.rotation.transpose() * (b * a.transpose());
-    DQuat::from_mat3(&turn).normalize().to_axis_angle().1.to_degrees() < MAX_TURN_DEG
+    rotation_angle(&turn).to_degrees() < MAX_TURN_DEG
 }
 
 /// The similarity that moves cameras onto others: the mean rotation between them, then the scale

@@ -9,7 +9,7 @@ use crate::report::{Progress, print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
 use std::ops::ControlFlow;
 use std::path::Path;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 use subsplat::abi::RasterOptions;
 use subsplat::io::{SplatFormat, load_with_comments};
@@ -156,7 +156,7 @@ fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     let first = photographs.unrefined(&model, result);
     let made = first.made(first.result.splats().clone());
     if refine != Refine::Off {
-        *photographs.first.lock().unwrap_or_else(PoisonError::into_inner) = Some(first);
+        *photographs.first() = Some(first);
     }
     Ok(Source { name: scene.name, start, made, photographs: Some(photographs) })
 }
@@ -169,7 +169,7 @@ fn load_model(args: &ViewArgs, upscale: Option<usize>) -> Result<Reconstructor> 
 impl Photographs {
     /// Returns whether the first reconstruction waits for its refinement.
     pub fn is_unrefined(&self) -> bool {
-        self.first.lock().unwrap_or_else(PoisonError::into_inner).is_some()
+        self.first().is_some()
     }
 
     /// Reconstructs the same scene with r×r children per pixel, and refines it. The first
@@ -181,7 +181,7 @@ impl Photographs {
         begin: &mut dyn FnMut(&'static str),
         show: &mut dyn FnMut(Made) -> Result<()>,
     ) -> Result<()> {
-        let first = self.first.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let first = self.first().take();
         let made = match first.filter(|f| f.upscale == upscale) {
             Some(first) => first,
             None => {
@@ -203,6 +203,11 @@ impl Photographs {
         }
         begin("refine");
         made.refine(self.refine, show)
+    }
+
+    /// The first reconstruction. A thread that panicked leaves it usable.
+    fn first(&self) -> MutexGuard<'_, Option<Unrefined>> {
+        self.first.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn unrefined(&self, model: &Reconstructor, result: Reconstruction) -> Unrefined {
