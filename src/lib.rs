@@ -221,8 +221,8 @@ pub use ops::{SplatTensors, rasterize_splats as rasterize};
 pub use pipeline::{
     Check, DepthBounds, DepthRange, DepthSource, Detail, Error, InputSize, KnownLens, LensSource,
     LooseOptions, LoosePhotos, LooseScene, Options, Photo, PoseError, Poses, Prepared, Progress,
-    Reconstruction, Reconstructor, Refine, Result, Stage, StageTime, Warning, loose_photos,
-    loose_scene,
+    Reconstruction, Reconstructor, Refine, Result, Stage, StageTime, TargetSize, Warning,
+    loose_photos, loose_scene,
 };
 pub use poses::{
     Confidence, FocalEstimate, LeftOut, Lens, PoseAdjustment, PoseEstimate, PoseOptions, PosePhoto,

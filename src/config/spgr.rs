@@ -75,6 +75,19 @@ pub enum SpgrHead {
     /// One output layer for all children, which differ by an embedding of their
     /// sub-pixel coordinate: any K at inference.
     Coord,
+    /// `mlp2` whose output layer is a polynomial of the child's position and of log K: any K at
+    /// inference, at the cost of `mlp2`. At K = 1 the only child is its parent.
+    Polynomial,
+}
+
+impl SpgrHead {
+    /// Returns whether one set of parameters serves every K.
+    pub fn serves_any_k(self) -> bool {
+        match self {
+            Self::Mlp2 | Self::Pg => false,
+            Self::Coord | Self::Polynomial => true,
+        }
+    }
 }
 
 /// λ_s: factor of the child's σ.

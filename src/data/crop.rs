@@ -41,13 +41,16 @@ pub enum LrFrom {
     Independent,
 }
 
+/// Largest side of a picture, px: beyond every use, and no product of sides overflows.
+const SIDE_MAX: usize = 1 << 15;
+
 /// How to crop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct CropOptions {
     /// Width and height of the network's input, px.
     pub input_size: (usize, usize),
-    /// r: target pixels per input pixel and axis.
-    pub upscale: usize,
+    /// Width and height of the target, px. Any size: r times the input's in the paper.
+    pub target_size: (usize, usize),
     /// The input's sides are cut to multiples of this.
     pub stride: usize,
     /// Principal point.
@@ -59,9 +62,16 @@ pub struct CropOptions {
 impl CropOptions {
     /// Square input of `side` pixels, exact intrinsics, input from the target's crop.
     pub fn square(side: usize, upscale: usize, stride: usize) -> Self {
+        Self::new((side, side), upscale, stride)
+    }
+
+    /// Input of `input_size` pixels, a target of `upscale` times its sides, exact intrinsics, input
+    /// from the target's crop.
+    pub fn new(input_size: (usize, usize), upscale: usize, stride: usize) -> Self {
+        let (w, h) = input_size;
         Self {
-            input_size: (side, side),
-            upscale,
+            input_size,
+            target_size: (w.saturating_mul(upscale), h.saturating_mul(upscale)),
             stride,
             rule: CropRule::default(),
             lr_from: LrFrom::default(),
@@ -92,12 +102,20 @@ pub struct Cropped {
     pub input: Rgb,
     /// Camera of `input`.
     pub input_camera: Camera,
-    /// r times the input's size: what the rendered picture is compared with.
+    /// The photograph at the size of the target: what the rendered picture is compared with.
     pub target: Rgb,
     /// Camera of `target`.
     pub target_camera: Camera,
     /// Where `target` lies in the photograph.
     pub window: PhotoWindow,
+}
+
+impl Cropped {
+    /// Returns target pixels per input pixel: the geometric mean of both axes.
+    pub fn ratio(&self) -> f32 {
+        let area = |p: &Rgb| (p.width * p.height).max(1) as f32;
+        (area(&self.target) / area(&self.input)).sqrt()
+    }
 }
 
 /// Resize and crop of one picture: the resampled size, the window's corner in it, and
@@ -168,29 +186,36 @@ impl Plan {
 /// Input and target of one pinhole photograph.
 ///
 /// # Errors
-/// A size below one stride or above what a picture may have; an upscale of 0; a camera
+/// A size below one stride or above what a picture may have; a target without pixels; a camera
 /// that is not the photograph's, or whose focal lengths leave the range of f32.
 pub fn crop(photo: &Rgb, camera: &Camera, options: &CropOptions) -> Result<Cropped> {
     let k = &camera.intrinsics;
     let bad = |expected: String, got: String| Err(Error::format("crop", expected, got));
-    let r = options.upscale;
     let stride = options.stride.max(1);
-    let (w, h) = options.input_size;
+    let ((w, h), (target_w, target_h)) = (options.input_size, options.target_size);
     if (k.width, k.height) != (photo.width, photo.height) || photo.data.is_empty() {
         let got = format!("one for {}x{}", k.width, k.height);
         return bad(format!("a camera for {}x{} pixels", photo.width, photo.height), got);
     }
-    // A target side of 2^15 is beyond every use, and no product below overflows.
-    let largest = (1usize << 15) / r.max(1);
-    if r == 0 || w < stride || h < stride || w > largest || h > largest {
-        let expected =
-            format!("an upscale above 0 and input sides of {stride} to {largest} pixels");
-        return bad(expected, format!("upscale {r}, {w}x{h}"));
+    let input_sides = stride..=SIDE_MAX;
+    let target_sides = 1..=SIDE_MAX;
+    if ![w, h].iter().all(|side| input_sides.contains(side)) {
+        let expected = format!("input sides of {stride} to {SIDE_MAX} pixels");
+        return bad(expected, format!("{w}x{h}"));
+    }
+    if ![target_w, target_h].iter().all(|side| target_sides.contains(side)) {
+        let expected = format!("target sides of 1 to {SIDE_MAX} pixels (the input is {w}x{h})");
+        return bad(expected, format!("{target_w}x{target_h}"));
     }
     let input_size = (w - w % stride, h - h % stride);
     let size = (photo.width, photo.height);
-    let times_r = |(w, h): (usize, usize)| (w * r, h * r);
-    let plan = Plan::new(size, times_r((w, h)), times_r(input_size), r);
+    // The target loses the same share as the input. At whole upscales the window lies in whole
+    // pixels of the input, as in MVSplat.
+    let cut = |target: usize, whole: usize, cut: usize| (target * cut + whole / 2) / whole;
+    let target_size = (cut(target_w, w, input_size.0), cut(target_h, h, input_size.1));
+    let r = target_w / w;
+    let unit = if (target_w, target_h) == (w * r, h * r) { r } else { 1 };
+    let plan = Plan::new(size, options.target_size, target_size, unit);
     let target = plan.picture(photo);
     let target_k = plan.intrinsics(k, options.rule);
     let (input, input_k) = match options.lr_from {
@@ -238,7 +263,7 @@ mod tests {
         for (w, h) in [(576, 320), (320, 576), (1920, 1080), (100, 90)] {
             let (picture, camera) = photo(w, h);
             for r in [1, 2, 4] {
-                let options = CropOptions { input_size: (64, 48), ..CropOptions::square(0, r, 16) };
+                let options = CropOptions::new((64, 48), r, 16);
                 let c = crop(&picture, &camera, &options).unwrap();
                 let p = Vec3::new(0.05, -0.07, 1.0);
                 let in_photo = camera.project(p).unwrap();
@@ -265,11 +290,32 @@ mod tests {
     #[test]
     fn sizes_are_cut_to_the_stride_around_the_same_middle() {
         let (picture, camera) = photo(640, 480);
-        let options = CropOptions { input_size: (100, 75), ..CropOptions::square(0, 2, 16) };
+        let options = CropOptions::new((100, 75), 2, 16);
         let c = crop(&picture, &camera, &options).unwrap();
         assert_eq!((c.input.width, c.input.height), (96, 64));
         let middle = c.window.to_photo(Vec2::new(96.0, 64.0));
         assert!((middle - Vec2::new(320.0, 240.0)).length() < 4.0, "{middle}");
+    }
+
+    #[test]
+    fn targets_have_any_size() {
+        let (picture, camera) = photo(640, 480);
+        let options = CropOptions { target_size: (150, 110), ..CropOptions::new((96, 64), 1, 32) };
+        let c = crop(&picture, &camera, &options).unwrap();
+        assert_eq!((c.input.width, c.input.height), (96, 64));
+        assert_eq!((c.target.width, c.target.height), (150, 110));
+        assert!((c.ratio() - (150.0f32 * 110.0 / (96.0 * 64.0)).sqrt()).abs() < 1e-6);
+        let p = Vec3::new(0.05, -0.07, 1.0);
+        let (in_input, in_target) =
+            (c.input_camera.project(p).unwrap(), c.target_camera.project(p).unwrap());
+        let scale = Vec2::new(150.0 / 96.0, 110.0 / 64.0);
+        assert!((in_input * scale - in_target).length() < 1e-3);
+        let in_photo = camera.project(p).unwrap();
+        assert!((c.window.to_photo(in_target) - in_photo).length() < 1e-2);
+        // A stride that cuts the input cuts the same share of the target.
+        let cut = CropOptions { input_size: (100, 64), stride: 32, ..options };
+        let c = crop(&picture, &camera, &cut).unwrap();
+        assert_eq!((c.input.width, c.target.width, c.target.height), (96, 144, 110));
     }
 
     #[test]
@@ -295,7 +341,7 @@ mod tests {
         let aligned = crop(&picture, &camera, &options).unwrap();
         options.lr_from = LrFrom::Independent;
         let shim = crop(&picture, &camera, &options).unwrap();
-        options.upscale = 1;
+        options.target_size = options.input_size;
         options.lr_from = LrFrom::HrCrop;
         let native = crop(&picture, &camera, &options).unwrap();
         assert_eq!(shim.input, native.input);
@@ -306,9 +352,15 @@ mod tests {
     #[test]
     fn bad_sizes_are_refused() {
         let (picture, camera) = photo(64, 64);
-        for (side, r) in [(0, 2), (8, 2), (1 << 20, 2), (256, 0), (256, usize::MAX)] {
+        for (side, r, named) in [
+            (0, 2, "input sides"),
+            (8, 2, "input sides"),
+            (1 << 20, 2, "input sides"),
+            (256, 0, "target sides"),
+            (256, usize::MAX, "target sides"),
+        ] {
             let e = crop(&picture, &camera, &CropOptions::square(side, r, 16)).unwrap_err();
-            assert!(e.to_string().contains("upscale"), "{e}");
+            assert!(e.to_string().contains(named), "{e}");
         }
         let other = camera.resized(32, 32).unwrap();
         assert!(crop(&picture, &other, &CropOptions::square(16, 1, 16)).is_err());

@@ -315,13 +315,13 @@ impl Dataset {
             }
         }
         let ExampleOptions { sampler, crop, .. } = &self.options;
-        let ((w, h), r) = (crop.input_size, crop.upscale);
+        let (w, h) = crop.target_size;
         let expected = format!(
             "a scene of more than {} frames of at least {}x{} pixels, none wider than {FOV_MAX} \
              degrees, with a camera that moves or with near and far",
             sampler.bounds(step).low,
-            w * r,
-            h * r
+            w,
+            h
         );
         let got = format!("none among {}", self.len());
         Err(Error::format(&self.root, expected, got))
@@ -391,8 +391,7 @@ impl Dataset {
         load: &dyn Fn(usize) -> Result<(Rgb, Camera)>,
     ) -> Result<Option<TrainingExample>> {
         let options = &self.options.crop;
-        let (w, h) = options.input_size;
-        let min_size = (w.saturating_mul(options.upscale), h.saturating_mul(options.upscale));
+        let min_size = options.target_size;
         let (mut context, mut targets) = (Vec::new(), Vec::new());
         for (i, &frame) in frames.context.iter().chain(&frames.targets).enumerate() {
             let (photo, camera) = load(frame)?;

@@ -249,7 +249,8 @@ impl Evaluator {
         let least = |side: fn(&Photo) -> usize| photos().map(side).min().unwrap_or(0);
         let least = (least(|p| p.image().width), least(|p| p.image().height));
         let input_size = fitting(nominal, upscale, stride, least);
-        let options = CropOptions { input_size, upscale, stride, rule, lr_from };
+        let options =
+            CropOptions { rule, lr_from, ..CropOptions::new(input_size, upscale, stride) };
         let cropped =
             |photos: &[Photo]| photos.iter().map(|p| p.crop(&options)).collect::<Result<Vec<_>>>();
         Ok(Crops {

@@ -6,6 +6,10 @@
 //! * `mlp2`: `norm`, `lin0`, GELU, `lin1` to K·9 or K·2.
 //! * `pg`: (Linear, ReLU, Linear, ReLU, LayerNorm) twice, Linear: `lin0` … `lin4`,
 //!   `ln0`, `ln1`.
+//! * `polynomial`: `mlp2` whose `lin1` holds one layer for each of 18 terms. The layer of child k is
+//!   Σ_b φ_b(g_k, K)·`lin1`_b. The terms are the products of {1, t, t² − 1} of t = 4·g_x, the same of
+//!   4·g_y, and {1, κ}, κ = log₂ √K − 1. At K = 4, t = ±1 and κ = 0, so four terms remain. They
+//!   determine the four children independently, as `mlp2` does.
 //! * `coord`: hid_k = GELU(lin0·norm(x) + c_k), o_k = lin1·hid_k, with
 //!   c_k = `pos1`·GELU(`pos0`·posenc(g_k)) of the sub-pixel's position g_k. The
 //!   parameters do not depend on K.
@@ -16,19 +20,41 @@ use crate::abi::{HEAD_GEOMETRY_LEN, HEAD_STRIDE};
 use crate::config::{AMin, Config, SpgrHead};
 use crate::ops::columns::columns;
 use crate::ops::spgr::Rules;
-use candle_core::{Result, Tensor};
+use candle_core::{Result, Tensor, bail};
 use candle_nn::{Init, Linear, VarBuilder};
 
 /// Octaves of the positional encoding of a sub-pixel.
 const OCTAVES: usize = 4;
 /// Width of the positional encoding: x, y, and their sines and cosines.
 const POSENC: usize = 2 + 4 * OCTAVES;
+/// Functions of one coordinate in `polynomial`: 1, t, t² − 1.
+const AXIS_TERMS: usize = 3;
+/// Terms of `polynomial`: products of the functions of x, of y, and of {1, κ}.
+const TERMS: usize = 2 * AXIS_TERMS * AXIS_TERMS;
 
 #[derive(Clone, Debug)]
 enum Form {
-    Mlp2 { norm: LayerNorm, lin0: Linear, lin1: Linear },
-    Pg { lin: Vec<Linear>, ln: Vec<LayerNorm> },
-    Coord { norm: LayerNorm, lin0: Linear, lin1: Linear, pos: [Linear; 2] },
+    Mlp2 {
+        norm: LayerNorm,
+        lin0: Linear,
+        lin1: Linear,
+    },
+    Pg {
+        lin: Vec<Linear>,
+        ln: Vec<LayerNorm>,
+    },
+    Coord {
+        norm: LayerNorm,
+        lin0: Linear,
+        lin1: Linear,
+        pos: [Linear; 2],
+    },
+    /// `lin1` maps to 18·`outputs` numbers, term by term.
+    Polynomial {
+        norm: LayerNorm,
+        lin0: Linear,
+        lin1: Linear,
+    },
 }
 
 /// One head: E channels to K × `outputs` numbers.
@@ -54,6 +80,11 @@ impl Head {
                 lin0: linear(e, h, kaiming, vb.pp("lin0"))?,
                 lin1: linear(h, all, last, vb.pp("lin1"))?,
             },
+            SpgrHead::Polynomial => Form::Polynomial {
+                norm: LayerNorm::new(e, vb.pp("norm"))?,
+                lin0: linear(e, h, kaiming, vb.pp("lin0"))?,
+                lin1: linear(h, TERMS * outputs, last, vb.pp("lin1"))?,
+            },
             SpgrHead::Pg => {
                 let widths = [(e, h), (h, h), (h, h), (h, h), (h, all)];
                 let layer = |(i, (a, b)): (usize, (usize, usize))| {
@@ -78,10 +109,27 @@ impl Head {
         Ok(Self { form, outputs })
     }
 
+    /// Returns the head for r = `side`: `polynomial` becomes `mlp2`, other forms stay.
+    fn for_side(&self, side: usize) -> Result<Self> {
+        let Form::Polynomial { norm, lin0, lin1 } = &self.form else { return Ok(self.clone()) };
+        let (weight, k) = (lin1.weight(), side * side);
+        let terms = terms(side, weight)?;
+        let hidden = weight.dim(1)?;
+        let of_children = |t: &Tensor, width: usize| terms.matmul(&t.reshape((TERMS, width))?);
+        let bias = match lin1.bias() {
+            Some(bias) => Some(of_children(bias, self.outputs)?.flatten_all()?),
+            None => None,
+        };
+        let weight = of_children(weight, self.outputs * hidden)?;
+        let lin1 = Linear::new(weight.reshape((k * self.outputs, hidden))?, bias);
+        let form = Form::Mlp2 { norm: norm.clone(), lin0: lin0.clone(), lin1 };
+        Ok(Self { form, outputs: self.outputs })
+    }
+
     /// Maps `x` `[n, E]` to `[n, r², outputs]`, r = `side`.
     ///
     /// # Errors
-    /// Shapes do not fit; r differs from the configured one (every form but `coord`).
+    /// Shapes do not fit; r differs from the one of the parameters (`mlp2` and `pg`).
     pub fn forward(&self, x: &Tensor, side: usize) -> Result<Tensor> {
         let (n, k) = (x.dim(0)?, side * side);
         let out = match &self.form {
@@ -108,7 +156,12 @@ impl Head {
                 };
                 Tensor::cat(&(0..k).map(child).collect::<Result<Vec<_>>>()?, 1)?
             }
+            Form::Polynomial { .. } => return self.for_side(side)?.forward(x, side),
         };
+        if out.elem_count() != n * k * self.outputs {
+            let expected = k * self.outputs;
+            bail!("head: expected {expected} outputs for {k} children, got {:?}", out.dims());
+        }
         out.reshape((n, k, self.outputs))
     }
 }
@@ -130,6 +183,23 @@ fn posenc(side: usize, like: &Tensor) -> Result<Tensor> {
     Tensor::from_vec(table, (side * side, POSENC), like.device())?.to_dtype(like.dtype())
 }
 
+/// Values of the terms of `polynomial` for each child: `[r², 18]`, dtype of `like`.
+fn terms(side: usize, like: &Tensor) -> Result<Tensor> {
+    let axis = |i: usize| {
+        let t = 4.0 * ((i as f32 + 0.5) / side as f32 - 0.5);
+        [1.0, t, t * t - 1.0]
+    };
+    let kappa = (side as f32).log2() - 1.0;
+    let mut table = Vec::with_capacity(side * side * TERMS);
+    for k in 0..side * side {
+        let (x, y) = (axis(k % side), axis(k / side));
+        for factor in [1.0, kappa] {
+            table.extend(y.iter().flat_map(|y| x.map(|x| factor * x * y)));
+        }
+    }
+    Tensor::from_vec(table, (side * side, TERMS), like.device())?.to_dtype(like.dtype())
+}
+
 /// Both heads.
 #[derive(Clone, Debug)]
 pub struct Heads {
@@ -148,6 +218,15 @@ impl Heads {
             geometry: Head::new(config, HEAD_GEOMETRY_LEN, vb.pp("geo"))?,
             appearance: Head::new(config, rest, vb.pp("app"))?,
         })
+    }
+
+    /// Returns the heads for r = `side`, which compute no polynomial per call.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn for_side(&self, side: usize) -> Result<Self> {
+        let Self { geometry, appearance } = self;
+        Ok(Self { geometry: geometry.for_side(side)?, appearance: appearance.for_side(side)? })
     }
 
     /// Maps the heads' inputs to records `[n, r², 11]`, r = `side`.

@@ -69,6 +69,16 @@ impl SubSplat {
         self
     }
 
+    /// Returns the model with r = `upscale` ([`Trunk::set_upscale`]).
+    ///
+    /// # Errors
+    /// Those of [`Trunk::set_upscale`].
+    pub fn with_upscale(mut self, upscale: usize) -> Result<Self> {
+        self.trunk.set_upscale(upscale)?;
+        self.config.upscale = upscale;
+        Ok(self)
+    }
+
     /// Returns the configuration of the model.
     pub fn config(&self) -> &Config {
         &self.config

@@ -32,6 +32,9 @@ use rayon::prelude::*;
 /// for elementwise operations; parallel chunks would contend for that pool's lock.
 pub const CHUNK: usize = 256;
 
+/// Largest r of [`Trunk::set_upscale`]: 64 children per parent.
+pub const UPSCALE_MAX: usize = 8;
+
 /// Parents per chunk if a GPU gathers: every chunk uploads the feature maps again, and the
 /// device takes one chunk at a time. 16384·E floats are 8 MiB at E = 128.
 const CHUNK_GPU: usize = 1 << 14;
@@ -115,6 +118,8 @@ struct Scene<'a> {
     sh_input: Tensor,
     per_view: usize,
     prepared: Option<Prepared>,
+    /// The heads for the r of `rules`.
+    heads: Heads,
     rules: Rules,
 }
 
@@ -188,22 +193,31 @@ impl Trunk {
         }
     }
 
-    /// Returns true if SPGR is off: children are then the primaries
-    /// ([`Children::whole`]).
+    /// Returns true if the children are the primaries ([`Children::whole`]): SPGR is off, or
+    /// r = 1 with heads whose only child is its parent.
     pub fn is_off(&self) -> bool {
-        self.parts.is_none()
+        self.parts().is_none()
     }
 
-    /// Sets r of the following calls. The `coord` head accepts any r up to 8, the others
-    /// only the configured one.
+    /// The parts, unless [`Trunk::is_off`].
+    fn parts(&self) -> Option<&Parts> {
+        let one = self.rules.side == 1 && self.config.spgr.head == SpgrHead::Polynomial;
+        self.parts.as_ref().filter(|_| !one)
+    }
+
+    /// Sets r of the following calls. Heads that serve any K ([`SpgrHead::serves_any_k`]) accept
+    /// r up to [`UPSCALE_MAX`], the others only the configured one.
     ///
     /// # Errors
     /// `side` differs from the configured r and the head has a fixed K; `side` is not in
     /// 1 to 8.
     pub fn set_upscale(&mut self, side: usize) -> Result<()> {
-        let fixed = self.config.spgr.head != SpgrHead::Coord && self.parts.is_some();
-        if !(1..=8).contains(&side) || (fixed && side != self.config.upscale) {
-            let expected = if fixed { self.config.upscale.to_string() } else { "1 to 8".into() };
+        let fixed = !self.config.spgr.head.serves_any_k() && self.parts.is_some();
+        if !(1..=UPSCALE_MAX).contains(&side) || (fixed && side != self.config.upscale) {
+            let expected = match fixed {
+                true => self.config.upscale.to_string(),
+                false => format!("1 to {UPSCALE_MAX}"),
+            };
             bail!("upscale: expected {expected} (head {:?}), got {side}", self.config.spgr.head);
         }
         self.rules = rules(&self.config, side);
@@ -235,7 +249,7 @@ impl Trunk {
         primaries: &Primaries,
         checkpoint: Checkpoint<'_>,
     ) -> Result<Children> {
-        let Some(parts) = &self.parts else { return self.pass_through(views, primaries) };
+        let Some(parts) = self.parts() else { return self.pass_through(views, primaries) };
         let scene = self.scene(parts, views, backbone, primaries)?;
         checkpoint()?;
         let sh = interleaved(&primaries.sh)?;
@@ -246,7 +260,7 @@ impl Trunk {
     /// Returns the number of steps of [`Trunk::forward_with`].
     pub fn steps(&self, primaries: &Primaries) -> usize {
         let parents = primaries.opacities.elem_count();
-        match self.parts {
+        match self.parts() {
             Some(_) => 1 + chunks(parents, primaries.per_view, self.chunk_size()).count(),
             None => 0,
         }
@@ -318,7 +332,7 @@ impl Trunk {
         options: &RasterOptions,
     ) -> Result<Tensor> {
         let options = &RasterOptions { sh_basis: primaries.sh_basis, ..*options };
-        let parts = match &self.parts {
+        let parts = match self.parts() {
             Some(parts) if self.backend.is_cpu() => parts,
             _ => {
                 let all = self.forward(views, backbone, primaries)?;
@@ -373,7 +387,7 @@ impl Trunk {
         primaries: &Primaries,
         TrainPass { chunk, seed }: TrainPass,
     ) -> Result<Children> {
-        let Some(parts) = &self.parts else { return self.pass_through(views, primaries) };
+        let Some(parts) = self.parts() else { return self.pass_through(views, primaries) };
         let scene = self.scene(parts, views, backbone, primaries)?;
         let (mut rows, mut gains) = (Vec::new(), Vec::new());
         for span in chunks(scene.means.dim(0)?, scene.per_view, chunk.max(1)) {
@@ -428,6 +442,7 @@ impl Trunk {
             sh_input: sh.reshape((n, 3 * d))?,
             per_view: primaries.per_view,
             prepared,
+            heads: parts.heads.for_side(self.rules.side)?,
             rules: self.rules,
         })
     }
@@ -453,11 +468,11 @@ impl Trunk {
             // f = 0 without aggregation, so that the heads read z.
             _ => z,
         };
-        let head = parts.heads.forward(&inputs, scene.rules.side)?;
+        let head = scene.heads.forward(&inputs, scene.rules.side)?;
         Ok(Records { head, parents: parents.rows()? })
     }
 
-    /// The primaries as their own children, K = 1 (SPGR off).
+    /// The primaries as their own children, K = 1.
     fn pass_through(&self, views: &Views, primaries: &Primaries) -> Result<Children> {
         check_single(views, primaries)?;
         let opacities = primaries.opacities.unsqueeze(2)?;

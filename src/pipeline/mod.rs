@@ -59,7 +59,7 @@ pub use input_size::InputSize;
 pub use loose::{
     KnownLens, LensSource, LooseOptions, LoosePhotos, LooseScene, loose_photos, loose_scene,
 };
-pub use options::{Check, Detail, Options, Poses, Refine};
+pub use options::{Check, Detail, Options, Poses, Refine, TargetSize};
 pub use photo::Photo;
 pub use poses::PoseError;
 pub use prepared::Prepared;

@@ -22,6 +22,9 @@ use std::time::Duration;
 pub struct Options {
     /// Size of the network's input. Default: the area of 256×256 in the photographs' shape.
     pub input_size: InputSize,
+    /// Size of the target pictures, which also is the size of the photographs that the fit and the
+    /// refinement read. Default: [`TargetSize::Upscaled`].
+    pub target_size: TargetSize,
     /// Ends of the depth range that the caller fixes. Default: [`DepthRange::Auto`].
     pub depth_range: DepthRange,
     /// Depth range that a file suggests, used for the ends that `depth_range` leaves open.
@@ -52,6 +55,12 @@ impl Options {
     #[must_use]
     pub fn with_input_area(self, pixels: usize) -> Self {
         Self { input_size: InputSize::Area(pixels), ..self }
+    }
+
+    /// Sets [`Options::target_size`].
+    #[must_use]
+    pub fn with_target_size(self, target_size: TargetSize) -> Self {
+        Self { target_size, ..self }
     }
 
     /// Sets [`Options::depth_range`].
@@ -104,6 +113,17 @@ impl Options {
         self
     }
 
+    /// Width and height of the network's input for `photos` (width and height, px) and a model of
+    /// `stride`, px.
+    pub fn input_size_for(&self, photos: &[(usize, usize)], stride: usize) -> (usize, usize) {
+        match self.target_size {
+            TargetSize::Exact { width, height } => {
+                self.input_size.resolve(&[(width, height)], stride)
+            }
+            _ => self.input_size.resolve(photos, stride),
+        }
+    }
+
     /// Options of the refinement for a number of photographs and of Gaussians.
     pub(super) fn refine_options(&self, photographs: usize, gaussians: usize) -> RefineOptions {
         self.refine.options_for(photographs, gaussians, self.fit.steps > 0)
@@ -121,6 +141,46 @@ impl Options {
             return Err(Error::argument("photographs", "at least 2", got));
         }
         initial_bounds(cameras, self.depth_range, self.depth_prior.as_ref())
+    }
+}
+
+/// Size of the target pictures.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[non_exhaustive]
+pub enum TargetSize {
+    /// The input's sides times the model's upscale r, of which each pixel has r² children.
+    #[default]
+    Upscaled,
+    /// The input's sides times this number, rounded.
+    Times(f32),
+    /// These sides, px. The input has their shape where [`Options::input_size`] leaves it open.
+    #[non_exhaustive]
+    Exact {
+        /// Width, px.
+        width: usize,
+        /// Height, px.
+        height: usize,
+    },
+}
+
+impl TargetSize {
+    /// Sides `width` and `height`, px.
+    pub fn exact(width: usize, height: usize) -> Self {
+        Self::Exact { width, height }
+    }
+
+    /// Width and height for an input of `input_size` px and a model of `upscale`. A factor that is
+    /// not finite gives 0, which [`Reconstructor::run`](super::Reconstructor::run) refuses.
+    pub fn resolve(self, input_size: (usize, usize), upscale: usize) -> (usize, usize) {
+        let (w, h) = input_size;
+        match self {
+            Self::Upscaled => (w.saturating_mul(upscale), h.saturating_mul(upscale)),
+            Self::Times(factor) => {
+                let side = |side: usize| (side as f32 * factor).round() as usize;
+                (side(w), side(h))
+            }
+            Self::Exact { width, height } => (width, height),
+        }
     }
 }
 

@@ -118,7 +118,8 @@ impl Prepared<'_> {
             }
         }
         let colour = Rgb::mean_colour(inputs.iter().map(|c| &c.input));
-        let raster_options = config.raster_options(config.upscale as f32, bounds.near, colour);
+        let ratio = inputs.first().map_or(1.0, Cropped::ratio);
+        let raster_options = config.raster_options(ratio, bounds.near, colour);
         let (mut fit, mut refinement) = (None, None);
         let (fit_options, refine_options) =
             (&options.fit, options.refine_options(inputs.len(), splats.len()));

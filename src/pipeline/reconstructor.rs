@@ -4,7 +4,7 @@ use super::progress::{Callback, StageCost, Tracker};
 use super::warning::Warning;
 use super::{
     Check, DepthBounds, DepthRange, DepthSource, Detail, Options, Photo, Poses, Prepared, Progress,
-    Reconstruction, Refine, Result, Stage, check_pairs, exposure, is_mvsplat, poses,
+    Reconstruction, Refine, Result, Stage, TargetSize, check_pairs, exposure, is_mvsplat, poses,
     refined_bounds,
 };
 use crate::camera::{Camera, NearFar};
@@ -112,10 +112,31 @@ impl Reconstructor {
         self.weights.unexpected()
     }
 
-    /// Crop of a photograph for inputs of `input_size` (width, height), px.
+    /// Returns the model with r = `upscale`: `upscale`² children per primary.
+    ///
+    /// # Errors
+    /// `upscale` is not in 1 to 8, or the weights hold heads for another number of children.
+    pub fn with_upscale(self, upscale: usize) -> Result<Self> {
+        Ok(Self { model: self.model.with_upscale(upscale)?, ..self })
+    }
+
+    /// Crop of a photograph for inputs of `input_size` (width, height), px, and targets of the
+    /// model's upscale.
     pub fn crop_options(&self, input_size: (usize, usize)) -> CropOptions {
+        self.crop_options_for(input_size, TargetSize::Upscaled)
+    }
+
+    /// [`Reconstructor::crop_options`] for targets of `target_size`.
+    pub fn crop_options_for(
+        &self,
+        input_size: (usize, usize),
+        target_size: TargetSize,
+    ) -> CropOptions {
         let config = self.config();
-        CropOptions { input_size, ..CropOptions::square(0, config.upscale, config.stride()) }
+        CropOptions {
+            target_size: target_size.resolve(input_size, config.upscale),
+            ..CropOptions::new(input_size, config.upscale, config.stride())
+        }
     }
 
     /// Reconstructs the scene of two or more photographs.
@@ -164,7 +185,8 @@ impl Reconstructor {
         progress: &mut dyn FnMut(Progress) -> ControlFlow<()>,
     ) -> Result<Prepared<'_>> {
         let sizes: Vec<_> = photos.iter().map(|p| (p.image().width, p.image().height)).collect();
-        let crop = self.crop_options(options.input_size.resolve(&sizes, self.config().stride()));
+        let input_size = options.input_size_for(&sizes, self.config().stride());
+        let crop = self.crop_options_for(input_size, options.target_size);
         let mut tracker = Tracker::new(self.stage_costs(photos.len(), crop.input_size, options));
         let (mut adjusted, mut adjustment) = (Vec::new(), None);
         if options.poses == Poses::Adjusted {

@@ -5,9 +5,11 @@ use super::augment::Augmentation;
 use super::files::Files;
 use super::optimizer::Settings;
 use super::schedule::Schedule;
+use super::source::ExampleSize;
 use super::{Error, Result};
 use crate::config::{Backbone, Config, Preset};
 use crate::io;
+use crate::model::trunk::UPSCALE_MAX;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -129,6 +131,9 @@ pub struct Data {
     pub scenes: u64,
     /// Width and height of the network's input, px.
     pub input: [usize; 2],
+    /// Sizes of the scenes, by turns, instead of `input` and `model.upscale`. Upscales that differ
+    /// need heads that serve any K, and inputs that differ need `together = 1`.
+    pub sizes: Vec<ExampleSize>,
     /// Views to predict per scene.
     pub targets: usize,
     /// Samples along each side of a pixel of the context views.
@@ -177,6 +182,7 @@ impl Default for Data {
             seed: 1,
             scenes: 0,
             input: [128, 128],
+            sizes: Vec::new(),
             targets: 1,
             samples: 2,
             target_samples: 1,
@@ -490,17 +496,42 @@ impl TrainConfig {
         }
     }
 
+    /// Validates the sizes of the scenes.
+    fn check_sizes(&self, config: &Config) -> Result<()> {
+        let sizes = &self.data.sizes;
+        let any = config.spgr.enabled && config.spgr.head.serves_any_k();
+        for size in sizes {
+            let (r, fits) = (size.upscale, any || size.upscale == config.upscale);
+            if !(1..=UPSCALE_MAX).contains(&r) || !fits {
+                let expected = match any {
+                    true => format!("an upscale of 1 to {UPSCALE_MAX}"),
+                    false => format!("the model's upscale, {}", config.upscale),
+                };
+                return Err(Error::value("data.sizes", expected, r));
+            }
+        }
+        let differ = sizes.iter().any(|s| s.input != sizes[0].input);
+        if differ && self.together > 1 {
+            let expected = "1, since the inputs of data.sizes differ";
+            return Err(Error::value("together", expected, self.together));
+        }
+        Ok(())
+    }
+
     /// Validates options that depend on one another.
     fn check_combinations(&self) -> Result<()> {
         let config = self.model_config()?;
         let small = matches!(config.backbone, Backbone::Small(_));
         let stride = config.stride();
-        let [w, h] = self.data.input;
         let side = |n: usize| (1..=INPUT_MAX).contains(&n) && n.is_multiple_of(stride);
-        if !(side(w) && side(h)) {
-            let expected = format!("multiples of {stride}, at most {INPUT_MAX}");
-            return Err(Error::value("data.input", expected, format!("{w}x{h}")));
+        let inputs = self.data.sizes.iter().map(|s| ("data.sizes", s.input));
+        for (key, [w, h]) in inputs.chain([("data.input", self.data.input)]) {
+            if !(side(w) && side(h)) {
+                let expected = format!("multiples of {stride}, at most {INPUT_MAX}");
+                return Err(Error::value(key, expected, format!("{w}x{h}")));
+            }
         }
+        self.check_sizes(&config)?;
         if let Start::Weights { opacity, .. } = &self.init
             && (!opacity.is_finite() || (!small && *opacity != 0.0))
         {

@@ -107,10 +107,10 @@ impl Pictures {
         };
         let [w, h] = config.data.input;
         let rule = if files.reference_crop { CropRule::Mvsplat } else { CropRule::Exact };
-        let square = CropOptions::square(w, model.upscale, model.stride());
+        let exact = CropOptions::new((w, h), model.upscale, model.stride());
         let options = ExampleOptions {
             sampler,
-            crop: CropOptions { input_size: (w, h), rule, ..square },
+            crop: CropOptions { rule, ..exact },
             // The loader mirrors the examples of every source.
             flip: false,
             near_far: files.near_far.map(|[near, far]| NearFar { near, far }),

@@ -8,6 +8,7 @@ use crate::data::pair::quantile;
 use crate::data::procedural::{self, ExampleSpec, TargetSpec};
 use crate::io::image::Rgb;
 use half::f16;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -25,6 +26,14 @@ pub struct Example {
     pub near_far: NearFar,
     /// Context views that are targets too. They are the last of `targets`, in order.
     pub input_targets: InputTargets,
+}
+
+impl Example {
+    /// Returns r: the side of the targets over the side of the context views, at least 1.
+    pub fn upscale(&self) -> usize {
+        let width = |views: &[Posed]| views.first().map_or(1, |p| p.image.width.max(1));
+        (width(&self.targets) / width(&self.context)).max(1)
+    }
 }
 
 /// Context views among the targets.
@@ -69,6 +78,16 @@ pub(super) fn uniform(seed: u64, key: u64) -> f64 {
     (hash(seed, key) >> 11) as f64 / (1u64 << 53) as f64
 }
 
+/// Size of an example.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ExampleSize {
+    /// Width and height of the network's input, px.
+    pub input: [usize; 2],
+    /// r: side of the targets over side of the input.
+    pub upscale: usize,
+}
+
 /// Procedural rooms ([`procedural`]). A training set is determined by one seed.
 #[derive(Clone, Debug)]
 pub struct Rooms {
@@ -80,6 +99,8 @@ pub struct Rooms {
     pub spec: ExampleSpec,
     /// Targets.
     pub targets: TargetSpec,
+    /// Sizes of the examples, by turns, instead of those of `spec` and `targets`; may be empty.
+    pub sizes: Vec<ExampleSize>,
     /// Share of the examples whose near and far are the visible depth range, slightly widened, as
     /// the depth estimate at inference gives it. The others keep the generator's near and far.
     pub seen_range: f32,
@@ -113,8 +134,13 @@ const FAR_FACTOR_MAX: f32 = 1.4;
 impl Source for Rooms {
     fn example(&self, index: u64) -> Result<Arc<Example>> {
         let scene = index.checked_rem(self.scenes).unwrap_or(index);
-        let made =
-            procedural::Example::with_targets(hash(self.seed, scene), &self.spec, &self.targets);
+        let (mut spec, mut targets) = (self.spec, self.targets);
+        if let Some(turn) = scene.checked_rem(self.sizes.len() as u64) {
+            let size = self.sizes[turn as usize];
+            [spec.cameras.width, spec.cameras.height] = size.input;
+            targets.ratio = size.upscale;
+        }
+        let made = procedural::Example::with_targets(hash(self.seed, scene), &spec, &targets);
         let mut pictures = Vec::with_capacity(made.views.len());
         let mut inverse_depth = Vec::new();
         for (i, (view, camera)) in made.views.iter().zip(&made.cameras).enumerate() {

@@ -396,7 +396,8 @@ impl Learner {
         let mut settings = self.model.config().primaries().clone();
         settings.opacity_exponent = self.opacity_exponent(step, settings.opacity_exponent);
         let parents = packed(output, views, &settings)?;
-        let trunk = self.model.trunk();
+        let mut trunk = self.model.trunk().clone();
+        trunk.set_upscale(example.upscale())?;
         if trunk.is_off() {
             let children = Children::whole(&parents)?;
             seconds.trunk += start.elapsed().as_secs_f64();
@@ -499,7 +500,7 @@ impl Learner {
         let means = children.rows.narrow(1, 0, 3)?.contiguous()?;
         let count = children.rows.dim(0)?;
         let per_view = count / (children.k * views.len()).max(1);
-        let upscale = self.model.config().upscale;
+        let upscale = example.upscale();
         let delta = residuals(&views, &flat(&means)?, per_view, children.k, upscale);
         let gain = with_residuals(&flat(&children.gain)?, &delta);
         Ok(Some(Tensor::from_vec(gain, (count, 4), &Device::Cpu)?))

@@ -79,7 +79,8 @@ pub fn rooms(config: &TrainConfig, split: Split) -> Result<Rooms> {
     };
     let seed = if held_out { hash(data.seed, HELD_OUT) } else { data.seed };
     let scenes = if held_out { 0 } else { data.scenes };
-    Ok(Rooms { seed, scenes, spec, targets, seen_range: data.seen_range, detail: data.detail })
+    let (sizes, seen_range, detail) = (data.sizes.clone(), data.seen_range, data.detail);
+    Ok(Rooms { seed, scenes, spec, targets, sizes, seen_range, detail })
 }
 
 impl Validator {
@@ -174,12 +175,16 @@ impl Validator {
         let mut found = Found::default();
         let distances = output.depths.narrow(3, 0, 1)?.flatten_all()?.to_vec1::<f32>()?;
         let depth = self.depth_scores(scene, &distances, &mut found);
+        let mut trunk = model.trunk().clone();
+        if scene.upscale() > 1 {
+            // Photographs have targets of the input's size, for which the model keeps its own r.
+            trunk.set_upscale(scene.upscale())?;
+        }
         let mut pictures: Vec<Rgb> = scene.context.iter().map(|p| p.image.clone()).collect();
         for target in &scene.targets {
             let k = target.camera.intrinsics;
             let options = raster_options(&self.model, scene, &target.camera);
-            let planes =
-                model.trunk().render(&views, &output, &parents, &target.camera, &options)?;
+            let planes = trunk.render(&views, &output, &parents, &target.camera, &options)?;
             let rgb = planes.narrow(0, 0, 3)?.flatten_all()?.to_vec1::<f32>()?;
             let rgb: Vec<f32> = rgb.iter().map(|v| v.clamp(0.0, 1.0)).collect();
             let Some(picture) = Rgb::from_planes(&rgb, k.width, k.height) else { continue };

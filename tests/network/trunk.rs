@@ -168,6 +168,7 @@ fn switches() -> Vec<(&'static str, Change)> {
         ("literal", |c| c.agg.ablations.strict_literal = true),
         ("head pg", |c| c.spgr.head = SpgrHead::Pg),
         ("head coord", |c| c.spgr.head = SpgrHead::Coord),
+        ("head polynomial", |c| c.spgr.head = SpgrHead::Polynomial),
         ("heads not zero", |c| c.spgr.zero_init = false),
         ("rgb gain", |c| c.spgr.ablations.gain_space = GainSpace::Rgb),
         ("low-pass of the input", |c| c.render.lowpass_ref = LowpassRef::Input),
@@ -531,23 +532,73 @@ fn pixel_unit_embeddings_transfer_to_another_resolution() {
 }
 
 #[test]
-fn coordinate_heads_serve_any_grid_and_others_refuse() {
+fn heads_for_any_k_serve_any_grid_and_others_refuse() {
     let scene = Scene::new(&cameras(2, SIZE, SIZE), 14);
     let mut c = config(Preset::Tuned, 2);
-    c.spgr.head = SpgrHead::Coord;
-    let (mut coord, _) = trunk(&c, 15);
-    let two = scene.infer(&coord);
-    for side in [1, 3, 4, 8] {
-        coord.set_upscale(side).unwrap();
-        let out = scene.infer(&coord);
-        assert_eq!((out.k, out.rows.dim(0).unwrap()), (side * side, 512 * side * side));
+    for head in [SpgrHead::Coord, SpgrHead::Polynomial] {
+        c.spgr.head = head;
+        let (mut any, _) = trunk(&c, 15);
+        let two = scene.infer(&any);
+        for side in [1, 3, 4, 8] {
+            any.set_upscale(side).unwrap();
+            let out = scene.infer(&any);
+            assert_eq!((out.k, out.rows.dim(0).unwrap()), (side * side, 512 * side * side));
+        }
+        any.set_upscale(2).unwrap();
+        assert_close(&scene.infer(&any).rows, &two.rows, 0.0);
+        assert!(any.set_upscale(9).is_err());
     }
-    coord.set_upscale(2).unwrap();
-    assert_close(&scene.infer(&coord).rows, &two.rows, 0.0);
-    assert!(coord.set_upscale(9).is_err());
     let (mut fixed, _) = trunk(&config(Preset::Tuned, 2), 15);
     fixed.set_upscale(2).unwrap();
     assert!(fixed.set_upscale(4).unwrap_err().to_string().contains("expected 2"));
+}
+
+/// Heads of the form `polynomial` whose terms 1, x, y and xy come from the heads `mlp2` of four
+/// children give the same children at ×2, and the parents at ×1.
+#[test]
+fn polynomial_heads_equal_fixed_ones_at_two_and_the_parents_at_one() {
+    let scene = Scene::new(&cameras(2, SIZE, SIZE), 18);
+    let mut c = config(Preset::Tuned, 2);
+    let (fixed, variables) = trunk(&c, 19);
+    let mut tensors: std::collections::BTreeMap<String, Tensor> = variables
+        .data()
+        .lock()
+        .unwrap()
+        .iter()
+        .map(|(name, var)| (name.clone(), var.as_tensor().clone()))
+        .collect();
+    let signs = [(0, [1.0, 1.0, 1.0, 1.0]), (1, [-1.0, 1.0, -1.0, 1.0])];
+    let signs = [signs[0], signs[1], (3, [-1.0, -1.0, 1.0, 1.0]), (4, [1.0, -1.0, -1.0, 1.0])];
+    for head in ["geo", "app"] {
+        for part in ["weight", "bias"] {
+            let name = format!("subsplat.{head}.lin1.{part}");
+            let of_children = tensors[&name].clone();
+            let dims = of_children.dims().to_vec();
+            let size = of_children.elem_count() / 4;
+            let flat = of_children.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+            let mut terms = vec![0f32; 18 * size];
+            for (term, signs) in signs {
+                for i in 0..size {
+                    let sum: f32 = (0..4).map(|k| signs[k] * flat[k * size + i]).sum();
+                    terms[term * size + i] = sum / 4.0;
+                }
+            }
+            let dims: Vec<usize> =
+                std::iter::once(dims[0] / 4 * 18).chain(dims[1..].to_vec()).collect();
+            tensors.insert(name, Tensor::from_vec(terms, dims, &Device::Cpu).unwrap());
+        }
+    }
+    c.spgr.head = SpgrHead::Polynomial;
+    let any = Weights::from_tensors(tensors);
+    let mut any = Trunk::new(&c, &channels(), any.builder()).unwrap();
+    let (got, want) = (scene.infer(&any), scene.infer(&fixed));
+    assert_close(&got.rows, &want.rows, 1e-5);
+    assert_close(&got.gain, &want.gain, 1e-5);
+    any.set_upscale(1).unwrap();
+    assert!(any.is_off());
+    c.spgr.enabled = false;
+    let parents = scene.infer(&Trunk::new(&c, &channels(), Weights::seeded(0).builder()).unwrap());
+    assert_close(&scene.infer(&any).rows, &parents.rows, 0.0);
 }
 
 #[test]

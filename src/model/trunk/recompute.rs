@@ -49,7 +49,7 @@ impl Trunk {
     /// coefficients `sh` are those of `primaries`, in their graph.
     ///
     /// # Errors
-    /// Those of [`Trunk::forward`]; SPGR is off.
+    /// Those of [`Trunk::forward`]; [`Trunk::is_off`].
     pub fn forward_recomputed<'a>(
         &'a self,
         views: &'a Views,
@@ -57,8 +57,8 @@ impl Trunk {
         primaries: &Primaries,
         TrainPass { chunk, seed }: TrainPass,
     ) -> Result<Recomputed<'a>> {
-        let Some(parts) = &self.parts else {
-            bail!("trunk: recomputation needs `spgr.enabled = true`, got false")
+        let Some(parts) = self.parts() else {
+            bail!("trunk: recomputation expected heads, got children that are their parents")
         };
         let scene = self.scene(parts, views, backbone, primaries)?;
         let sh = interleaved(&primaries.sh)?;
@@ -83,6 +83,7 @@ impl<'a> Scene<'a> {
             sh_input: self.sh_input.detach(),
             per_view: self.per_view,
             prepared: self.prepared.as_ref().map(|p| p.deferring()),
+            heads: self.heads.clone(),
             rules: self.rules,
         }
     }

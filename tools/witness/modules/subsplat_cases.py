@@ -108,6 +108,7 @@ CASES["sub_agg_three_views"] = agg_case(AGG["paper"] | ONE | {"op": "linear", "l
 CASES["sub_agg_faint"] = agg_case(AGG["tuned"] | ONE | {"residual": "none", "occlusion_gate": False}, 2, 0.005)
 CASES |= {f"sub_head_{form}": head_case(form, 2, 9) for form in ("mlp2", "pg", "coord")}
 CASES |= {"sub_head_coord_4": head_case("coord", 4, 2), "sub_head_mlp2_3": head_case("mlp2", 3, 2)}
+CASES |= {"sub_head_polynomial": head_case("polynomial", 2, 9), "sub_head_polynomial_3": head_case("polynomial", 3, 2)}
 CASES |= {f"sub_spgr_{name}": spgr_case(keys, 2) for name, keys in SPGRS.items()}
 CASES |= {f"sub_spgr_{name}_16": spgr_case(SPGRS[name], 4) for name in ALSO_16}
 CASES["sub_spgr_depth_lowpass"] = spgr_case(SPGR["tuned"], 2, [1.2, 0.3])

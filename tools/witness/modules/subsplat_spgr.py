@@ -19,6 +19,12 @@ def head(g, keys, x, name, side, channels):
             x = g.relu(g.linear(x, f"{name}.lin{2 * i}", hidden))
             x = g.layer_norm(g.relu(g.linear(x, f"{name}.lin{2 * i + 1}", hidden)), f"{name}.ln{i}")
         return g.linear(x, f"{name}.lin4", k * channels).reshape(n, k, channels)
+    if keys["head"] == "polynomial":
+        h = g.gelu(g.linear(g.layer_norm(x, f"{name}.norm"), f"{name}.lin0", hidden))
+        values = polynomial(side)
+        # One output per term, then the sum over terms with their values at each child.
+        terms = g.linear(h, f"{name}.lin1", values.shape[1] * channels).reshape(n, values.shape[1], channels)
+        return g.matmul(g.const(values), terms)
     # coord: hid_k = GELU(W x + c_k), o_k = W' hid_k, c_k = MLP(posenc(g_k)).
     x = g.linear(g.layer_norm(x, f"{name}.norm"), f"{name}.lin0", hidden)
     c = g.linear(g.gelu(g.linear(g.const(posenc(side)), f"{name}.pos0", hidden)), f"{name}.pos1", hidden)
@@ -28,6 +34,15 @@ def head(g, keys, x, name, side, channels):
 def subpixel_centres(side):
     """Returns [K, 2]: centres of the sub-pixels in input px from the pixel's centre, row-major."""
     return np.array([[(j + 0.5) / side - 0.5, (i + 0.5) / side - 0.5] for i in range(side) for j in range(side)])
+
+
+def polynomial(side):
+    """Returns [K, 18]: (1, kappa) x (1, v, v^2 - 1) x (1, u, u^2 - 1), the last factor fastest; (u, v) is four times
+    the position, kappa = log2(side / 2)."""
+    u, v = 4.0 * subpixel_centres(side).T
+    powers = lambda t: [np.ones_like(t), t, t**2 - 1.0]
+    kappa = np.log2(side / 2.0)
+    return np.stack([k * b * a for k in (1.0, kappa) for b in powers(v) for a in powers(u)], 1)
 
 
 def posenc(side):

@@ -140,6 +140,8 @@ const SUBSPLAT: &[Row] = &[
     ("sub_head_mlp2.record", 1e-6, HEAD),
     ("sub_head_mlp2_3.record", 1e-6, HEAD),
     ("sub_head_pg.record", 1e-6, HEAD),
+    ("sub_head_polynomial.record", 1e-6, HEAD),
+    ("sub_head_polynomial_3.record", 1e-6, HEAD),
     (
         "sub_sh.standard_0 standard_1 standard_2 standard_3 standard_4 mvsplat_0 mvsplat_1 mvsplat_2 mvsplat_3 mvsplat_4",
         1e-6,

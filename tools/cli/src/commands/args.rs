@@ -6,7 +6,7 @@ use super::args_view::{KEYS, ViewArgs};
 use super::values;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
-use subsplat::{FitOptions, InputSize, Refine};
+use subsplat::{FitOptions, InputSize, Refine, TargetSize};
 
 /// Exit codes, which scripts rely on.
 const EXIT_CODES: &str = "\
@@ -192,7 +192,30 @@ pub enum InputSizeArg {
     Sides(usize, usize),
 }
 
+impl RunArgs {
+    /// Size of the pictures: --size, else --upscale times the input.
+    pub fn target_size(&self) -> TargetSize {
+        match self.size {
+            Some((width, height)) => TargetSize::exact(width, height),
+            None => self.source.target_size(),
+        }
+    }
+}
+
 impl SourceArgs {
+    /// Side of the children's grid that --upscale names.
+    pub fn children_side(&self) -> Option<usize> {
+        self.upscale.map(|r| r.ceil() as usize)
+    }
+
+    /// Size of the target pictures that --upscale names.
+    pub fn target_size(&self) -> TargetSize {
+        match self.upscale {
+            Some(r) if r.fract() > 0.0 => TargetSize::Times(r),
+            _ => TargetSize::Upscaled,
+        }
+    }
+
     /// Size of the network's input that --input-size and --crop name.
     pub fn input_size(&self) -> InputSize {
         match (self.input_size, self.crop) {
@@ -331,6 +354,11 @@ pub struct RunArgs {
     /// Length, radius and animation of a path.
     #[command(flatten)]
     pub motion: MotionArgs,
+    /// Size of the pictures, px, for instance 1920x1080; N is NxN. The photographs are cropped to its
+    /// shape. Without --upscale, the children are as many as its pixels need (at most 64 per input
+    /// pixel).
+    #[arg(long, value_name = "N | WxH", value_parser = values::size)]
+    pub size: Option<(usize, usize)>,
     /// Formats of the scene, written as scene.ply and so on.
     #[arg(long, value_enum, value_delimiter = ',', default_value = "ply", value_name = "F,…")]
     pub save: Vec<SceneFormatArg>,
@@ -359,10 +387,10 @@ pub struct SourceArgs {
     /// Part of the photographs that is used, where --input-size is not WxH.
     #[arg(long, value_enum, default_value = "whole")]
     pub crop: CropShapeArg,
-    /// Target over input, side over side: 2 gives 4 children per pixel, 4 gives 16.
-    /// Default: the weights' own, else 2.
+    /// Target over input, side over side, 1 to 8: 2 gives 4 children per pixel, 4 gives 16. A
+    /// number between has the children of the next whole one. Default: the weights' own, else 2.
     #[arg(long, value_name = "R", value_parser = values::upscale)]
-    pub upscale: Option<usize>,
+    pub upscale: Option<f32>,
     /// Weights (.safetensors). Default: the shipped ones.
     #[arg(long, value_name = "FILE")]
     pub weights: Option<PathBuf>,

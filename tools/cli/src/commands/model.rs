@@ -5,7 +5,7 @@ use crate::report::print_warning;
 use anyhow::{Context, Result, bail, ensure};
 use std::path::Path;
 use subsplat::abi::HEAD_GEOMETRY_LEN;
-use subsplat::config::{Config, Preset, SpgrHead};
+use subsplat::config::{Config, Preset};
 use subsplat::model::weights::{SUBSPLAT_PREFIX, Weights};
 use subsplat::pipeline::{Reconstructor, is_mvsplat};
 
@@ -32,7 +32,7 @@ impl<'a> ModelRequest<'a> {
         Self {
             weights: source.weights.as_deref(),
             seed: source.seed,
-            upscale: source.upscale,
+            upscale: source.children_side(),
             ratio: None,
             model: &source.model,
         }
@@ -106,8 +106,9 @@ impl Contents {
         let names = weights.tensors();
         let plain = |n: &'_ String| n.strip_prefix("encoder.").unwrap_or(n).to_owned();
         let any = |prefix: &str| names.keys().any(|n| plain(n).starts_with(prefix));
-        // The geometry head's last layer has K times as many rows as a record. The `coord` head
-        // has one set of rows for any K, and a layer for positions besides.
+        // The geometry head's last layer has K times as many rows as a record, unless it serves
+        // any K. Files without a configuration are converted ones; of their heads, `coord` has a
+        // layer for positions besides.
         let rows = |layer: &str| {
             let name = format!("subsplat.geo.{layer}.weight");
             names
@@ -115,7 +116,8 @@ impl Contents {
                 .find(|(n, _)| plain(n) == name)
                 .and_then(|(_, t)| t.dims().first().copied())
         };
-        let fixed = !any("subsplat.geo.pos0.");
+        let any_k = weights.config().is_some_and(|c| c.spgr.head.serves_any_k());
+        let fixed = !any_k && !any("subsplat.geo.pos0.");
         let children = rows("lin4").or_else(|| rows("lin1")).map(|r| r / HEAD_GEOMETRY_LEN);
         Self {
             mvsplat: any("backbone.") || any("depth_predictor."),
@@ -141,7 +143,7 @@ impl Contents {
             );
         }
         let Some(children) = self.children.filter(|_| config.spgr.enabled) else { return Ok(()) };
-        let fixed = config.spgr.head != SpgrHead::Coord;
+        let fixed = !config.spgr.head.serves_any_k();
         ensure!(
             !fixed || children == config.children(),
             "{path}: expected weights for --upscale {} ({} children per pixel), got weights for \

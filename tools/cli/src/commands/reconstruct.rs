@@ -11,9 +11,10 @@ use subsplat::check::{PairReport, Verdict};
 use subsplat::config::Config;
 use subsplat::data::crop::Cropped;
 use subsplat::io::scene::Scene;
+use subsplat::model::trunk::UPSCALE_MAX;
 use subsplat::{
     Check, DepthBounds, DepthRange, Detail, FitOptions, FitReport, InputSize, Options, Photo,
-    Poses, Prepared, Reconstruction, Reconstructor, RefineReport,
+    Poses, Prepared, Reconstruction, Reconstructor, RefineReport, TargetSize,
 };
 
 /// The library's options of the arguments, for photographs of frames `context`.
@@ -41,13 +42,14 @@ pub fn options(args: &SourceArgs, scene: &Scene, context: &[usize]) -> Result<Op
     Ok(options)
 }
 
-/// Chooses the size of the network's input for frames `context`: `--quality`, else `--input-size`.
-/// Returns the width and height that it gives, px, too.
+/// Chooses the size of the network's input for frames `context` and pictures of size `target`:
+/// `--quality`, else `--input-size`. Returns the width and height that it gives, px, too.
 ///
 /// # Errors
 /// A size that is too small for the network or too large for the memory.
 pub fn input_size(
     args: &SourceArgs,
+    target: TargetSize,
     model: &Reconstructor,
     scene: &Scene,
     context: &[usize],
@@ -56,7 +58,10 @@ pub fn input_size(
         let k = scene.frames[i].camera.intrinsics();
         (k.width, k.height)
     };
-    let photos: Vec<_> = context.iter().map(size).collect();
+    let photos: Vec<_> = match target {
+        TargetSize::Exact { width, height, .. } => vec![(width, height)],
+        _ => context.iter().map(size).collect(),
+    };
     let config = model.config();
     let ample = |size: (usize, usize)| memory::is_ample(config, context.len(), size);
     let chosen = match args.quality {
@@ -76,8 +81,32 @@ pub fn input_size(
         asked.0,
         asked.1
     );
-    memory::check_run(config, context.len(), (w, h))?;
     Ok((chosen, (w, h)))
+}
+
+/// Returns the model with as many children as pictures of size `target` need, for an input of
+/// `input` px, and checks the memory of a run with `views` photographs. `--upscale`, and weights
+/// for one number of children, leave the model as it is.
+///
+/// # Errors
+/// More memory than there is.
+pub fn with_children(
+    args: &SourceArgs,
+    target: TargetSize,
+    model: Reconstructor,
+    views: usize,
+    input: (usize, usize),
+) -> Result<Reconstructor> {
+    let any = model.config().spgr.head.serves_any_k() && args.upscale.is_none();
+    let model = match target {
+        TargetSize::Exact { width, height, .. } if any => {
+            let ratio = width.div_ceil(input.0).max(height.div_ceil(input.1));
+            model.with_upscale(ratio.clamp(1, UPSCALE_MAX))?
+        }
+        _ => model,
+    };
+    memory::check_run(model.config(), views, input)?;
+    Ok(model)
 }
 
 /// The size of `quality` for `photos` (width and height, px). `High` is limited by the

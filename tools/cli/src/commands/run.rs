@@ -5,7 +5,7 @@ use super::frames::{self, DepthSpread};
 use super::html::Page;
 use super::output::{self, Scored, View, Views};
 use super::reconstruct::{self, reconstruct};
-use super::{model, pair, render, video};
+use super::{memory, model, pair, render, video};
 use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, print_line, print_warning};
 use anyhow::{Result, bail, ensure};
 use serde_json::{Value, json};
@@ -13,6 +13,7 @@ use std::path::Path;
 use subsplat::abi::{Convention, RasterOptions};
 use subsplat::camera::{Camera, NearFar};
 use subsplat::config::{Config, LowpassRef};
+use subsplat::data::crop::{CropOptions, Cropped};
 use subsplat::data::pair::choose_pair;
 use subsplat::eval::{GaussianReport, InputReport, Score};
 use subsplat::io::SaveOptions;
@@ -45,11 +46,14 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let backend = backend(&args.rendering.device);
     let request = model::ModelRequest::from_source(&args.source);
     let model = progress.stage("model", |_| model::load(&request))?.with_backend(&backend);
-    let (size, (w, h)) = reconstruct::input_size(&args.source, &model, &plan.scene, &plan.context)?;
-    plan.options.input_size = size;
-    let r = model.config().upscale;
-    let targets = targets(args, &plan, (w * r, h * r))?;
-    let count = (plan.context.len() * w * h * r * r) as u64;
+    let (source, target, context) = (&args.source, args.target_size(), &plan.context);
+    let (size, (w, h)) = reconstruct::input_size(source, target, &model, &plan.scene, context)?;
+    let model = reconstruct::with_children(source, target, model, context.len(), (w, h))?;
+    (plan.options.input_size, plan.options.target_size) = (size, target);
+    let target_size = target.resolve((w, h), model.config().upscale);
+    let targets = targets(args, &plan, target_size)?;
+    memory::check_picture("the picture size", target_size)?;
+    let count = (plan.context.len() * w * h * model.config().children()) as u64;
     let degree = model.config().primaries().sh_degree;
     output::check_formats(args, count, degree)?;
     output::prepare(&args.out, &args.input[0], &plan.scene)?;
@@ -61,10 +65,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let mut job = Views {
         out: &args.out,
         scene: &plan.scene,
-        // All inputs have one size.
-        crop: model.crop_options(
-            result.inputs().first().map_or((w, h), |c| (c.input.width, c.input.height)),
-        ),
+        crop: crop_of(&model, &result),
         options,
         motion: &args.motion,
         video: None,
@@ -99,6 +100,14 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let inputs = progress.stage("inputs", |_| input_report(&result, &options))?;
     Done { model, result, options, scored, inputs, files, video }
         .finish(args, &plan, progress, answer)
+}
+
+/// Crop of the targets' photographs: that of the inputs, which all have one size.
+fn crop_of(model: &Reconstructor, result: &Reconstruction) -> CropOptions {
+    let size = |p: &Rgb| (p.width, p.height);
+    let sizes = result.inputs().first().map(|c| (size(&c.input), size(&c.target)));
+    let (input, target_size) = sizes.unwrap_or_default();
+    CropOptions { target_size, ..model.crop_options(input) }
 }
 
 /// Scores the scene at its inputs' own cameras, and describes its Gaussians.
@@ -303,7 +312,8 @@ pub fn raster_options(
     }
     let colour = Rgb::mean_colour(result.inputs().iter().map(|c| &c.input));
     let near = result.depth_range().near;
-    let mut options = config.raster_options(config.upscale as f32, near, colour);
+    let ratio = result.inputs().first().map_or(1.0, Cropped::ratio);
+    let mut options = config.raster_options(ratio, near, colour);
     options.background = args.background.unwrap_or(options.background);
     options
 }
@@ -354,6 +364,7 @@ impl Done {
             "input_intrinsics": result.inputs().iter().map(|c| camera(&c.input_camera)).collect::<Vec<_>>(),
             "backbone": if is_mvsplat(config) { "re10k" } else { "small" },
             "upscale": config.upscale,
+            "target_size": result.inputs().first().map(|c| [c.target.width, c.target.height]),
             "convention": if mvsplat_rules { "mvsplat" } else { "standard" },
             "weights": args.source.weights.as_ref().map(|p| p.display().to_string()),
             "seed": args.source.seed,

@@ -9,7 +9,7 @@ const PATH_MAX: usize = 100_000;
 /// Largest number of threads; to start millions would hang the machine.
 const THREADS_MAX: usize = 1024;
 /// Largest r of `--upscale`, as of the configuration.
-const UPSCALE_MAX: usize = 8;
+const UPSCALE_MAX: f32 = 8.0;
 
 /// Parses a whole number from `least` to `most`.
 fn whole(text: &str, least: usize, most: usize) -> Result<usize, String> {
@@ -31,8 +31,10 @@ pub fn threads(text: &str) -> Result<usize, String> {
 }
 
 /// Parses r, the target's side over the input's.
-pub fn upscale(text: &str) -> Result<usize, String> {
-    whole(text, 1, UPSCALE_MAX)
+pub fn upscale(text: &str) -> Result<f32, String> {
+    let inside = |r: &f32| (1.0..=UPSCALE_MAX).contains(r);
+    let ratio = text.trim().parse().ok().filter(inside);
+    ratio.ok_or_else(|| format!("expected a number from 1 to {UPSCALE_MAX}"))
 }
 
 /// Largest number of steps of `--refine`.
@@ -176,8 +178,11 @@ mod tests {
 
     #[test]
     fn numbers_have_their_bounds() {
-        assert_eq!((upscale("1"), upscale("8"), sh_degree("0")), (Ok(1), Ok(8), Ok(0)));
-        assert!(upscale("0").is_err() && upscale("9").is_err() && sh_degree("5").is_err());
+        assert_eq!((upscale("1"), upscale("1.5"), sh_degree("0")), (Ok(1.0), Ok(1.5), Ok(0)));
+        for bad in ["0", "0.99", "8.1", "9", "NaN", "inf", "two"] {
+            assert_eq!(upscale(bad), Err("expected a number from 1 to 8".to_owned()), "{bad}");
+        }
+        assert!(upscale("8").is_ok() && sh_degree("5").is_err());
         assert!(frames("0").is_err() && frames("100000").is_ok() && frames("100001").is_err());
         assert!(at_least_one("0").is_err() && at_least_one("7").is_ok());
         assert_eq!((fov("179.9"), opacity("0")), (Ok(179.9), Ok(0.0)));

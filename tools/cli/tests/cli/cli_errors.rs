@@ -179,7 +179,7 @@ fn wrong_usage_is_exit_code_2() {
 fn impossible_values_are_wrong_usage() {
     let place = tempfile::tempdir().unwrap();
     let rows: [Row; 32] = [
-        ("run scene --upscale 0", "--upscale <R>': expected a whole number from 1 to 8"),
+        ("run scene --upscale 0", "--upscale <R>': expected a number from 1 to 8"),
         ("run scene --upscale 9", "from 1 to 8"),
         ("run scene --frames 0 --path orbit", "from 1 to 100000"),
         ("run scene --input-size 0", "--input-size"),

@@ -16,7 +16,9 @@ use subsplat::io::{SplatFormat, load_with_comments};
 use subsplat::navigation::{Start, up_of};
 use subsplat::render::camera_of_comments;
 use subsplat::splats::Splats;
-use subsplat::{Check, Options, Photo, Reconstruction, Reconstructor, Refine, Refiner, Renderer};
+use subsplat::{
+    Check, Options, Photo, Reconstruction, Reconstructor, Refine, Refiner, Renderer, TargetSize,
+};
 
 /// Least time between two pictures of a refinement.
 const SHOWN_EVERY: Duration = Duration::from_millis(400);
@@ -122,9 +124,11 @@ fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     let (context, reason) = run::context(&args.source.context, first, &scene)?;
     print_line(format!("{}: {} frames; context {reason}", scene.name, scene.frames.len()));
     let mut options = reconstruct::options(&args.source, &scene, &context)?;
-    let model = progress.stage("model", |_| load_model(args, args.source.upscale))?;
-    let (size, sides) = reconstruct::input_size(&args.source, &model, &scene, &context)?;
-    options.input_size = size;
+    let model = progress.stage("model", |_| load_model(args, args.source.children_side()))?;
+    let (source, target) = (&args.source, args.source.target_size());
+    let (size, sides) = reconstruct::input_size(source, target, &model, &scene, &context)?;
+    memory::check_run(model.config(), context.len(), sides)?;
+    (options.input_size, options.target_size) = (size, target);
     // The window shows the scene while it is refined. A fixed number of frames shows the result.
     let refine = match args.frames {
         None => std::mem::replace(&mut options.refine, Refine::Off),
@@ -192,7 +196,9 @@ impl Photographs {
                     begin(progress.stage.name());
                     ControlFlow::Continue(())
                 };
-                let result = model.run_with(&self.photos, &self.options, &mut progress)?;
+                // The sizes of --upscale are those of the first scene.
+                let options = self.options.clone().with_target_size(TargetSize::Upscaled);
+                let result = model.run_with(&self.photos, &options, &mut progress)?;
                 let made = self.unrefined(&model, result);
                 show(made.made(made.result.splats().clone()))?;
                 made
