@@ -227,7 +227,7 @@ impl Tracker {
     ) -> Result<T> {
         let stride = steps.div_ceil(REPORTS_MAX).max(1);
         // A checkpoint may be called on any thread, which the wrapper checks.
-        let state = SendWrapper::new(RefCell::new((0, self, callback)));
+        let state = SendWrapper::new(RefCell::new((0usize, self, callback)));
         let cancelled = AtomicBool::new(false);
         let checkpoint = || {
             let (done, tracker, callback) = &mut *state.borrow_mut();
