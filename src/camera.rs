@@ -13,6 +13,7 @@
 //! inputs only; [`Intrinsics::from_normalised`] and [`Intrinsics::normalised`] convert them.
 
 use glam::{Mat3, Mat4, Vec2, Vec3};
+use serde::ser::{Serialize, SerializeStruct, Serializer};
 use thiserror::Error;
 
 /// Reason for which a camera is refused.
@@ -206,6 +207,24 @@ pub struct Camera {
     pub(crate) world_from_camera: Mat4,
 }
 
+/// An object with width, height, fx, fy, cx and cy, px, and `world_from_camera`: the upper three
+/// rows of the matrix, row by row.
+impl Serialize for Camera {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let k = &self.intrinsics;
+        let mut object = serializer.serialize_struct("Camera", 7)?;
+        object.serialize_field("width", &k.width)?;
+        object.serialize_field("height", &k.height)?;
+        object.serialize_field("fx", &k.fx)?;
+        object.serialize_field("fy", &k.fy)?;
+        object.serialize_field("cx", &k.cx)?;
+        object.serialize_field("cy", &k.cy)?;
+        let rows = self.world_from_camera.transpose().to_cols_array();
+        object.serialize_field("world_from_camera", &rows[..12])?;
+        object.end()
+    }
+}
+
 impl Camera {
     /// Largest entry of |RᵀR − I| of a rotation. Pose files with six digits reach 1e-5;
     /// hand-edited ones more.
@@ -316,6 +335,20 @@ mod tests {
             Vec3::new(1.0, -2.0, 0.5),
         );
         Camera::new(k, pose).unwrap()
+    }
+
+    #[test]
+    fn json_has_intrinsics_and_the_rows_of_the_pose() {
+        let c = camera();
+        let json = serde_json::to_value(c).unwrap();
+        assert_eq!((&json["width"], &json["height"]), (&256.into(), &240.into()));
+        let number = |v: &serde_json::Value| v.as_f64().unwrap() as f32;
+        let k = ["fx", "fy", "cx", "cy"].map(|key| number(&json[key]));
+        assert_eq!(k, [300.0, 310.0, 130.0, 120.0]);
+        let rows: Vec<f32> =
+            json["world_from_camera"].as_array().unwrap().iter().map(number).collect();
+        assert_eq!((rows.len(), rows[3], rows[7], rows[11]), (12, 1.0, -2.0, 0.5));
+        assert_eq!(rows[1], c.world_from_camera.y_axis.x);
     }
 
     #[test]

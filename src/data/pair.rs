@@ -106,7 +106,7 @@ const FRAMES_MAX: usize = 128;
 /// Returns `None` if the scene has no two frames at different positions.
 pub fn choose_pair(scene: &Scene) -> Option<Pair> {
     let step = scene.frames.len().div_ceil(FRAMES_MAX).max(1);
-    let candidates: Vec<usize> = (0..scene.frames.len()).step_by(step).collect();
+    let candidates: Vec<usize> = scene.usable().into_iter().step_by(step).collect();
     let (depth, origin) = typical_depth(scene)?;
     let depths = [0.5 * depth, 2.0 * depth];
     let camera = |n: usize| &scene.frames[candidates[n]].camera;
@@ -295,6 +295,7 @@ mod tests {
 
     fn scene(cameras: Vec<Camera>) -> Scene {
         let frame = |camera| Frame {
+            other_shape: None,
             name: String::new(),
             image: "".into(),
             pixels: Pixels::Stored,

@@ -3,6 +3,7 @@
 use crate::camera::Camera;
 use crate::data::chunks::{Chunk, Example, load_index as chunk_index};
 use crate::data::dataset::{chunk_folder, scene_paths};
+use crate::data::pair::choose_pair;
 use crate::io::protocol::{Index, Views, load_index, load_protocol};
 use crate::io::scene::{Scene, load_scene};
 use crate::pipeline::{
@@ -10,6 +11,9 @@ use crate::pipeline::{
 };
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+
+/// Most targets of a case that is made up.
+const MADE_UP_TARGETS: usize = 8;
 
 /// Inputs and targets of one reconstruction.
 #[derive(Debug)]
@@ -69,13 +73,17 @@ pub struct Benchmark {
     /// The chunk that was opened last.
     open: Mutex<Option<(PathBuf, Arc<Chunk>)>>,
     notes: Vec<String>,
+    /// Notes on cases that are made up.
+    made_up: Vec<String>,
 }
 
 impl Benchmark {
     /// Opens pixelSplat's chunks, a scene, or a folder of scenes. Chunks have an `index.json` in
     /// `data` or `data/test`, and need an `index` (scene: context and target, or null). Scenes
-    /// need an `index` or a `protocol.json`. Scenes without tests are skipped, as are entries of
-    /// the index that the data lacks; [`Benchmark::notes`] counts them.
+    /// have an `index` or a `protocol.json`. Where no scene has one, each gets a case: the pair that
+    /// `subsplat run` chooses, and every k-th frame between the two as a target. Otherwise scenes
+    /// without tests are skipped, as are entries of the index that the data lacks;
+    /// [`Benchmark::notes`] lists them.
     ///
     /// # Errors
     /// Files that are missing or broken; a frame that a scene does not have; no case at all.
@@ -88,6 +96,7 @@ impl Benchmark {
             chunks: false,
             open: Mutex::default(),
             notes: Vec::new(),
+            made_up: Vec::new(),
         };
         match (chunk_folder(data, "test"), listed, index) {
             (Some(folder), Some(listed), _) => all.add_chunks(&folder, listed)?,
@@ -100,7 +109,9 @@ impl Benchmark {
         if all.cases.is_empty() {
             let expected = match index {
                 Some(index) => format!("scenes that {} names", index.display()),
-                None => "scenes with a protocol.json that has tests".to_owned(),
+                None => "scenes with a protocol.json that has tests, or of at least 3 frames at \
+                         different places"
+                    .to_owned(),
             };
             return Err(Error::argument(data.display().to_string(), expected, "none"));
         }
@@ -165,10 +176,31 @@ impl Benchmark {
             }
             self.scenes.push(scene);
         }
+        if self.cases.is_empty() && listed.is_none() {
+            self.make_up_cases();
+            without.retain(|name| !self.cases.iter().any(|c| c.scene == *name));
+        }
         if !without.is_empty() && !self.cases.is_empty() {
             self.notes.push(format!("skipped, without tests: {}", without.join(", ")));
         }
         Ok(())
+    }
+
+    /// Adds a case for each scene with enough frames.
+    fn make_up_cases(&mut self) {
+        for (i, scene) in self.scenes.iter().enumerate() {
+            let Some((views, step)) = made_up_views(scene) else { continue };
+            let [first, last] = [views.context[0], views.context[1]];
+            let inside = views.target.iter().all(|t| (first..last).contains(t));
+            let place = if inside { "between" } else { "beside" };
+            let targets = views.target.iter().map(usize::to_string).collect::<Vec<_>>().join(", ");
+            let name = &scene.name;
+            self.made_up.push(format!(
+                "{name} has no protocol.json: inputs are frames {first} and {last}, which `run` \
+                 chooses; targets are frames {targets}, one in {step} of those {place} them"
+            ));
+            self.cases.push(Case::new(name, views, None, Place::Scene(i)));
+        }
     }
 
     /// Fixes ends of the depth range of every scene. Open ends are 1 and 100 for chunks. For
@@ -193,15 +225,17 @@ impl Benchmark {
         }
         let (mut cases, mut short) = (Vec::new(), Vec::new());
         for (i, scene) in self.scenes.iter().enumerate() {
-            let margin = scene.frames.len() / 10;
-            let between = scene.frames.len() - 2 * margin;
+            let usable = scene.usable();
+            let margin = usable.len() / 10;
+            let between = usable.len() - 2 * margin;
             if between < 2 * count - 1 {
                 short.push(scene.name.clone());
                 continue;
             }
             let at = |n: usize| margin + n * (between - 1) / (count - 1);
             let context: Vec<usize> = (0..count).map(at).collect();
-            let target = context.windows(2).map(|pair| (pair[0] + pair[1]) / 2).collect();
+            let target = context.windows(2).map(|pair| usable[(pair[0] + pair[1]) / 2]).collect();
+            let context = context.into_iter().map(|n| usable[n]).collect();
             let resolution = self.cases.iter().find(|c| c.scene == scene.name);
             let resolution = resolution.and_then(|c| c.resolution);
             let views = Views { context, target };
@@ -215,6 +249,7 @@ impl Benchmark {
             self.notes.push(format!("skipped, with too few frames: {}", short.join(", ")));
         }
         self.cases = cases;
+        self.made_up.clear();
         Ok(())
     }
 
@@ -239,10 +274,10 @@ impl Benchmark {
         self.chunks
     }
 
-    /// Counts of skipped scenes and warnings of the readers, one line each.
+    /// Skipped scenes, cases that are made up, and warnings of the readers, one line each.
     pub fn notes(&self) -> Vec<String> {
-        let warnings = self.scenes.iter().flat_map(|s| s.warnings.clone());
-        self.notes.iter().cloned().chain(warnings).collect()
+        let warnings = self.scenes.iter().flat_map(|s| &s.warnings);
+        self.notes.iter().chain(&self.made_up).chain(warnings).cloned().collect()
     }
 
     /// Reads the photographs of a case.
@@ -326,6 +361,22 @@ impl Benchmark {
         *open = Some((file.to_owned(), Arc::clone(&chunk)));
         Ok(chunk)
     }
+}
+
+/// Makes up a scene's views, with the k of "every k-th frame": the pair that `subsplat run` chooses,
+/// and at most [`MADE_UP_TARGETS`] of the frames between the two; of the others where there are none.
+/// `None` for a scene of two frames, and without two frames at different places.
+fn made_up_views(scene: &Scene) -> Option<(Views, usize)> {
+    let pair = choose_pair(scene)?.frames;
+    let mut rest = scene.usable();
+    rest.retain(|i| !pair.contains(i));
+    let between: Vec<usize> =
+        rest.iter().copied().filter(|i| (pair[0]..pair[1]).contains(i)).collect();
+    let from = if between.is_empty() { rest } else { between };
+    let step = from.len().div_ceil(MADE_UP_TARGETS).max(1);
+    // The middle of each group of `step` frames, so that targets are not beside an input.
+    let target: Vec<usize> = from.iter().copied().skip((step - 1) / 2).step_by(step).collect();
+    (!target.is_empty()).then(|| (Views { context: pair.to_vec(), target }, step))
 }
 
 fn photo(chunk: &Chunk, video: &Example, frame: usize) -> Result<Photo> {

@@ -47,12 +47,14 @@ pub struct Options {
 }
 
 impl Options {
-    /// The model and every baseline that differs from the others at this `upscale`.
+    /// The model, its Gaussians after the fit and the refinement of
+    /// [`Reconstructor::run`](crate::pipeline::Reconstructor::run), and every baseline that differs
+    /// from the others at this `upscale`.
     pub fn new(upscale: usize) -> Self {
-        use Method::{Backbone, Bilinear, Copy, Fit, Lowpass, Mean, Subsplat, Uniform};
+        use Method::{Backbone, Bilinear, Copy, Fit, Lowpass, Mean, Refine, Subsplat, Uniform};
         let methods = match upscale {
-            1 => vec![Subsplat, Fit, Backbone, Copy, Mean],
-            _ => vec![Subsplat, Fit, Backbone, Lowpass, Bilinear, Uniform, Copy, Mean],
+            1 => vec![Subsplat, Fit, Refine, Backbone, Copy, Mean],
+            _ => vec![Subsplat, Fit, Refine, Backbone, Lowpass, Bilinear, Uniform, Copy, Mean],
         };
         Self {
             upscale,
@@ -421,7 +423,8 @@ impl<'a> PictureMaker<'a> {
                     fit_to_inputs(splats, inputs, &raster, &options, renderer, &mut progress)?;
                 }
                 _ => {
-                    let options = Refine::Auto.options(inputs.len());
+                    // As `run`: none of more Gaussians than `Auto` refines.
+                    let options = Refine::Auto.options_for(inputs.len(), splats.len(), true);
                     let mut progress = |_: &Refiner<'_>| ControlFlow::Continue(());
                     refine_on_inputs(splats, inputs, &raster, &options, renderer, &mut progress)?;
                 }

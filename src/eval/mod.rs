@@ -40,6 +40,6 @@ pub use cases::{Benchmark, Case, Loaded};
 pub use disturbance::Disturbance;
 pub use evaluator::{CaseResult, Evaluator, Options, TargetPictures};
 pub use methods::Method;
-pub use page::{Sheet, page};
+pub use page::{Sheet, escaped, page};
 pub use score::{CaseScores, GaussianReport, InputReport, Score, Scores, TargetScores};
 pub use tables::{means_csv, report, targets_csv};

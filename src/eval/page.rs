@@ -176,7 +176,8 @@ fn row(mean: Option<Score>) -> String {
     .concat()
 }
 
-fn escaped(text: &str) -> String {
+/// Escapes text for HTML, in elements and in attributes with double quotes.
+pub fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 

@@ -184,11 +184,19 @@ struct StoredIntrinsics {
     rescaled: bool,
 }
 
-/// Computes the intrinsics of the picture on disk; an error is the picture's size.
+/// A picture on disk of another shape than the pose file's.
+struct Misfit {
+    /// Intrinsics of the pose file's size.
+    intrinsics: Intrinsics,
+    /// The picture's size.
+    got: String,
+}
+
+/// Computes the intrinsics of the picture on disk.
 fn stored_intrinsics(
     draft: &Draft,
     stored: &Probe,
-) -> std::result::Result<StoredIntrinsics, String> {
+) -> std::result::Result<StoredIntrinsics, Misfit> {
     let (w, h) = (stored.width as f64, stored.height as f64);
     let (k, rescaled) = match draft.lens {
         Lens::Normalised(k) => ([k[0] * w, k[1] * h, k[2] * w, k[3] * h], false),
@@ -201,7 +209,10 @@ fn stored_intrinsics(
                     Some(o) => format!(" (EXIF orientation {o} is not applied)"),
                     None => String::new(),
                 };
-                return Err(format!("{}x{}{turned}", stored.width, stored.height));
+                let got = format!("{}x{}{turned}", stored.width, stored.height);
+                let [fx, fy, cx, cy] = k.map(|v| v as f32);
+                let intrinsics = Intrinsics { fx, fy, cx, cy, width: given_w, height: given_h };
+                return Err(Misfit { intrinsics, got });
             }
             ([k[0] * sx, k[1] * sy, k[2] * sx, k[3] * sy], (sx, sy) != (1.0, 1.0))
         }
@@ -225,7 +236,8 @@ pub(super) fn camera_error(path: &Path, place: &str, error: &CameraError) -> Err
 }
 
 /// Makes frames of drafts: reads the header of every picture and checks every camera. A
-/// missing picture gives a warning and no frame.
+/// missing picture gives a warning and no frame. A picture of another shape than its camera's gives
+/// a warning and a frame that cannot be loaded, so that the indices of the others stay.
 pub(super) fn assemble(path: &Path, source: SceneFormat, drafts: Vec<Draft>) -> Result<Scene> {
     if drafts.is_empty() {
         return Err(Error::format(path, "at least one frame", "none"));
@@ -234,7 +246,7 @@ pub(super) fn assemble(path: &Path, source: SceneFormat, drafts: Vec<Draft>) -> 
         drafts.par_iter().map(|d| d.image.as_deref().map(|image| size(image, d.pixels))).collect();
     let count = drafts.len();
     let mut notes = Notes::default();
-    let mut frames = Vec::with_capacity(count);
+    let mut frames: Vec<Frame> = Vec::with_capacity(count);
     for (draft, stored) in drafts.into_iter().zip(probes) {
         let (Some(image), Some(stored)) = (draft.image.clone(), stored) else {
             notes.missing.push(draft.file);
@@ -246,6 +258,13 @@ pub(super) fn assemble(path: &Path, source: SceneFormat, drafts: Vec<Draft>) -> 
         let first = notes.missing.first().cloned().unwrap_or_default();
         let got = format!("none of {count} (the first is `{first}`)");
         return Err(Error::format(path, "pictures on disk", got));
+    }
+    // A reconstruction needs two, and every camera of a command line is meant to be used.
+    let usable = frames.iter().filter(|f| f.other_shape.is_none()).count();
+    if (usable < 2 || !source.has_file())
+        && let Some(error) = notes.other_shape_error.take()
+    {
+        return Err(error);
     }
     Ok(Scene {
         name: scene_name(path),
@@ -280,11 +299,19 @@ fn frame(
     if stored.orientation.is_some() {
         notes.with_orientation.push(draft.file.clone());
     }
+    let mut other_shape = None;
     let StoredIntrinsics { intrinsics, rescaled } = match stored_intrinsics(&draft, stored) {
         Ok(k) => k,
-        Err(got) => {
-            let (w, h) = draft.size.unwrap_or_default();
-            return bad(format!("{} of {w}x{h}, or of the same shape", image.display()), got);
+        Err(misfit) => {
+            let Misfit { intrinsics, got } = misfit;
+            let Intrinsics { width: w, height: h, .. } = intrinsics;
+            let expected = format!("{} of {w}x{h}, or of the same shape", image.display());
+            notes.other_shape.push(draft.file.clone());
+            notes.other_shape_error.get_or_insert_with(|| {
+                Error::format(path, expected, got.clone()).at(draft.place.clone())
+            });
+            other_shape = Some(got);
+            StoredIntrinsics { intrinsics, rescaled: false }
         }
     };
     if rescaled {
@@ -309,6 +336,7 @@ fn frame(
         pixels: draft.pixels,
         camera,
         distortion: draft.distortion,
+        other_shape,
         timestamp: draft.timestamp,
         depth: draft.depth,
         visible: draft.visible,
@@ -319,6 +347,9 @@ fn frame(
 #[derive(Default)]
 struct Notes {
     missing: Vec<String>,
+    other_shape: Vec<String>,
+    /// Error of the first frame of `other_shape`.
+    other_shape_error: Option<Error>,
     with_orientation: Vec<String>,
     rescaled: Vec<String>,
     skewed: Vec<String>,
@@ -328,6 +359,10 @@ impl Notes {
     fn lines(&self, count: usize) -> Vec<String> {
         let kinds = [
             (&self.missing, "have no picture on disk and are left out"),
+            (
+                &self.other_shape,
+                "have pictures of another shape than the cameras' and cannot be used",
+            ),
             (
                 &self.with_orientation,
                 "have an EXIF orientation: ignored, pose files refer to the stored pixels",

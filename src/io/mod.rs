@@ -31,6 +31,7 @@ mod heic;
 mod icc;
 pub mod image;
 mod jpeg;
+pub mod lettering;
 pub mod matrices;
 pub mod photograph;
 pub mod protocol;

@@ -190,6 +190,14 @@ pub(super) fn write(
     file.write_all(&block)
 }
 
+/// Whether a comment is one of those that every written file begins with. They describe that file
+/// alone, and a copy of the scene gets its own.
+pub fn is_own_comment(comment: &str) -> bool {
+    let version = |text: &str| text.starts_with(|c: char| c.is_ascii_digit());
+    ["axes: ", "units: ", "rot = "].iter().any(|key| comment.starts_with(key))
+        || comment.strip_prefix("subsplat ").is_some_and(version)
+}
+
 fn header(count: usize, rests: usize, options: &SaveOptions) -> String {
     let axes = match options.up {
         Up::Keep => "+x right, +y down, +z forward (OpenCV); up is -y",

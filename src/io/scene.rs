@@ -92,6 +92,9 @@ pub struct Frame {
     pub camera: Camera,
     /// Lens distortion of the picture.
     pub distortion: Distortion,
+    /// Size of the stored picture where it has another shape than the camera's. Such a frame cannot
+    /// be loaded, and [`Scene::usable`] leaves it out.
+    pub other_shape: Option<String>,
     /// Time stamp of a video frame, microseconds (RealEstate10K).
     pub timestamp: Option<i64>,
     /// 16-bit depth map of the picture, if the pose file names one.
@@ -140,6 +143,11 @@ impl Frame {
     /// # Errors
     /// Errors of [`super::image::load_with`]; a size that is not the camera's.
     pub fn load_with(&self, options: &LoadOptions) -> Result<LoadedFrame> {
+        if let Some(got) = &self.other_shape {
+            let k = &self.camera.intrinsics;
+            let expected = format!("a picture of {}x{}, or of the same shape", k.width, k.height);
+            return Err(Error::format(&self.image, expected, got));
+        }
         let LoadedPicture { picture, warnings } = match self.pixels {
             Pixels::Stored => load_with(&self.image, options)?,
             Pixels::Upright => {
@@ -182,6 +190,11 @@ pub struct Scene {
 }
 
 impl Scene {
+    /// Indices of the frames that can be loaded, as far as the headers of their pictures say.
+    pub fn usable(&self) -> Vec<usize> {
+        (0..self.frames.len()).filter(|&i| self.frames[i].other_shape.is_none()).collect()
+    }
+
     /// Makes a scene of two loose photographs with known cameras. The cameras refer to the
     /// upright pixels ([`Pixels::Upright`]) and have the upright pictures' sizes.
     ///

@@ -206,7 +206,7 @@ const AUTO_GAUSSIANS_MAX: usize = 3 << 19;
 
 impl Refine {
     /// Options for a number of photographs and of Gaussians, which are `fitted` or not.
-    pub(super) fn options_for(
+    pub(crate) fn options_for(
         self,
         photographs: usize,
         gaussians: usize,
@@ -220,7 +220,7 @@ impl Refine {
     }
 
     /// Options of [`crate::refine()`] for a number of photographs.
-    pub(crate) fn options(self, photographs: usize) -> RefineOptions {
+    fn options(self, photographs: usize) -> RefineOptions {
         let options = RefineOptions::default().with_groups(true);
         match self {
             Self::Auto => options.with_steps((8 * photographs).min(64)),

@@ -3,9 +3,16 @@
 use super::{Error, Result};
 use crate::clock::Instant;
 use crate::model::trace::Checkpoint;
+#[cfg(target_family = "wasm")]
+use send_wrapper::SendWrapper;
+#[cfg(target_family = "wasm")]
+use std::cell::RefCell;
 use std::fmt;
 use std::ops::ControlFlow;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+#[cfg(not(target_family = "wasm"))]
+use std::sync::atomic::AtomicUsize;
+use std::sync::atomic::{AtomicBool, Ordering};
+#[cfg(not(target_family = "wasm"))]
 use std::sync::mpsc;
 
 /// A stage of a reconstruction, in the order of execution. [`fmt::Display`] gives its name.
@@ -154,18 +161,19 @@ impl Tracker {
 
     /// Runs `work` on a thread of rayon's pool, where parallel calls start without a wake-up, and
     /// reports its steps. `work` calls its checkpoint after each of about `steps` steps, on any
-    /// thread; the callback runs on this thread. On a thread of the pool, and on WebAssembly, which
-    /// has one thread, `work` runs without reports, because waiting for them would hold up the pool.
+    /// thread; the callback runs on this thread. On a thread of the pool `work` runs without
+    /// reports, because waiting for them would hold up the pool.
     ///
     /// # Errors
     /// [`Error::Cancelled`]; those of `work`.
+    #[cfg(not(target_family = "wasm"))]
     pub(super) fn run_steps<T: Send>(
         &mut self,
         steps: usize,
         callback: &mut Callback<'_>,
         work: impl FnOnce(Checkpoint<'_>) -> candle_core::Result<T> + Send,
     ) -> Result<T> {
-        if cfg!(target_family = "wasm") || rayon::current_thread_index().is_some() {
+        if rayon::current_thread_index().is_some() {
             return Ok(work(&|| Ok(()))?);
         }
         let cancelled = AtomicBool::new(false);
@@ -203,6 +211,38 @@ impl Tracker {
         match outcome {
             Some(result) => Ok(result?),
             None => Err(Error::Cancelled),
+        }
+    }
+
+    /// Runs `work`, and calls `callback` within its checkpoints: WebAssembly has one thread.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`]; those of `work`.
+    #[cfg(target_family = "wasm")]
+    pub(super) fn run_steps<T: Send>(
+        &mut self,
+        steps: usize,
+        callback: &mut Callback<'_>,
+        work: impl FnOnce(Checkpoint<'_>) -> candle_core::Result<T> + Send,
+    ) -> Result<T> {
+        let stride = steps.div_ceil(REPORTS_MAX).max(1);
+        // A checkpoint may be called on any thread, which the wrapper checks.
+        let state = SendWrapper::new(RefCell::new((0usize, self, callback)));
+        let cancelled = AtomicBool::new(false);
+        let checkpoint = || {
+            let (done, tracker, callback) = &mut *state.borrow_mut();
+            *done += 1;
+            let part = (*done as f32 / steps.max(1) as f32).min(1.0);
+            if done.is_multiple_of(stride) && tracker.advance(part, *callback).is_err() {
+                cancelled.store(true, Ordering::Relaxed);
+                candle_core::bail!("cancelled");
+            }
+            Ok(())
+        };
+        let result = work(&checkpoint);
+        match cancelled.load(Ordering::Relaxed) {
+            true => Err(Error::Cancelled),
+            false => Ok(result?),
         }
     }
 

@@ -17,6 +17,7 @@ use std::fs::{File, TryLockError};
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Number of steps averaged in one line of the log.
 const LOG_EVERY: u64 = 10;
@@ -74,11 +75,20 @@ pub struct StepReport {
 
 /// Limits of one call of [`Training::run`].
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Limits {
+pub struct Limits<'a> {
     /// Maximum duration, minutes.
     pub minutes: Option<f64>,
     /// Maximum number of steps.
     pub steps: Option<u64>,
+    /// True asks for an end after the current step. The checkpoint is then written, and the final
+    /// evaluation is left out.
+    pub stop: Option<&'a AtomicBool>,
+}
+
+impl Limits<'_> {
+    fn stopped(&self) -> bool {
+        self.stop.is_some_and(|stop| stop.load(Ordering::Relaxed))
+    }
 }
 
 /// A training at a certain step.
@@ -281,14 +291,14 @@ impl Training {
     }
 
     /// Takes steps until the last step of the configuration or a limit. It writes checkpoints,
-    /// `log.csv` and `validation.csv`, evaluates the scenes of `validator`, and calls `report_event` with
-    /// each event.
+    /// `log.csv` and `validation.csv`, evaluates the scenes of `validator`, and calls
+    /// `report_event` with each event.
     ///
     /// # Errors
     /// As [`Training::step`] and [`Training::save`].
     pub fn run(
         &mut self,
-        limits: Limits,
+        limits: Limits<'_>,
         validator: &Validator,
         report_event: &mut dyn FnMut(&Event),
     ) -> Result<()> {
@@ -307,6 +317,7 @@ impl Training {
         while self.progress.step < self.config.steps
             && limits.steps.is_none_or(|n| done < n)
             && limits.minutes.is_none_or(|m| minutes(begin) < m)
+            && !limits.stopped()
         {
             match self.step()? {
                 Some(report) => {
@@ -320,14 +331,16 @@ impl Training {
                 report_event(&Event::Saved(self.save()?));
                 saved = Instant::now();
             }
-            if minutes(validated) >= self.config.validate.minutes {
+            if minutes(validated) >= self.config.validate.minutes && !limits.stopped() {
                 self.validate(validator, &mut log, report_event)?;
                 validated = Instant::now();
             }
         }
         if done > 0 {
             report_event(&Event::Saved(self.save()?));
-            self.validate(validator, &mut log, report_event)?;
+            if !limits.stopped() {
+                self.validate(validator, &mut log, report_event)?;
+            }
         } else if self.resumed.is_some() {
             // The training may have stopped between its checkpoint and its weights.
             self.save_weights()?;

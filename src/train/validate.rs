@@ -9,6 +9,7 @@ use super::step::{raster_options, views_of};
 use crate::config::{Backbone, Config};
 use crate::data::dataset::Posed;
 use crate::io::image::{Rgb, save_png};
+use crate::io::lettering;
 use crate::metrics::{psnr, ssim};
 use crate::model::subsplat::SubSplat;
 use crate::model::weights::{SUBSPLAT_PREFIX, Weights};
@@ -105,8 +106,8 @@ impl Validator {
 
     /// Scores `weights` on procedural scenes and on photographs (`None` where there are none).
     ///
-    /// With a path, it also writes a contact sheet for each: inputs, prediction, target and depth,
-    /// at `path` with `-rooms.png` and `-photos.png`.
+    /// With a path, it also writes a contact sheet for each: inputs, prediction, target and depth
+    /// with their labels, at `path` with `-rooms.png` and `-photos.png`.
     ///
     /// # Errors
     /// Weights that do not fit or give values that are not finite; a sheet that cannot be written.
@@ -180,7 +181,8 @@ impl Validator {
             // Photographs have targets of the input's size, for which the model keeps its own r.
             trunk.set_upscale(scene.upscale())?;
         }
-        let mut pictures: Vec<Rgb> = scene.context.iter().map(|p| p.image.clone()).collect();
+        let input = |(i, p): (usize, &Posed)| Labelled::new(format!("input {}", i + 1), &p.image);
+        let mut pictures: Vec<Labelled> = scene.context.iter().enumerate().map(input).collect();
         for target in &scene.targets {
             let k = target.camera.intrinsics;
             let options = raster_options(&self.model, scene, &target.camera);
@@ -192,14 +194,16 @@ impl Validator {
             let truth = values(&target.image);
             let rendered = interleaved(&rgb);
             // Both pictures are finite and of one size.
-            found.psnr += share * psnr(&rendered, &truth, k.width, k.height).unwrap_or(f64::NAN);
+            let psnr_of_view = psnr(&rendered, &truth, k.width, k.height).unwrap_or(f64::NAN);
+            found.psnr += share * psnr_of_view;
             found.ssim += share * ssim(&rendered, &truth, k.width, k.height).unwrap_or(f64::NAN);
             let copy = enlarged(nearer(scene, target), k.width, k.height);
             found.copy_psnr +=
                 share * psnr(&values(&copy), &truth, k.width, k.height).unwrap_or(f64::NAN);
             if pictures.len() < scene.context.len() + 2 {
-                pictures.push(picture);
-                pictures.push(target.image.clone());
+                let label = format!("prediction {psnr_of_view:.1} dB");
+                pictures.push(Labelled::new(label, &picture));
+                pictures.push(Labelled::new("truth".to_owned(), &target.image));
             }
         }
         pictures.extend(depth);
@@ -207,7 +211,7 @@ impl Validator {
     }
 
     /// Compares depth with the generator's, and returns both as pictures.
-    fn depth_scores(&self, scene: &Example, distances: &[f32], found: &mut Found) -> Vec<Rgb> {
+    fn depth_scores(&self, scene: &Example, distances: &[f32], found: &mut Found) -> Vec<Labelled> {
         let Some(view) = scene.context.first() else { return Vec::new() };
         let (w, h) = (view.image.width, view.image.height);
         let mut pictures = Vec::new();
@@ -237,8 +241,12 @@ impl Validator {
                 let known = if truth.is_empty() { &predicted } else { &truth };
                 let top = block_median(known, w).into_iter().filter(|v| v.is_finite());
                 let top = top.fold(1.0, f32::max);
-                let both = [predicted, truth].into_iter().filter(|index| !index.is_empty());
-                pictures = both.map(|index| grey(&index, w, h, top)).collect();
+                let both = [("depth of input 1", predicted), ("true depth", truth)].into_iter();
+                let both = both.filter(|(_, index)| !index.is_empty());
+                let labelled = |(label, index): (&str, Vec<f32>)| {
+                    Labelled::new(label.to_owned(), &grey(&index, w, h, top))
+                };
+                pictures = both.map(labelled).collect();
             }
         }
         found.disparity = sum / count.max(1) as f64;
@@ -250,7 +258,19 @@ impl Validator {
 /// Scores of a scene and its row of the contact sheet.
 struct SceneResult {
     found: Found,
-    pictures: Vec<Rgb>,
+    pictures: Vec<Labelled>,
+}
+
+/// A picture of the contact sheet.
+struct Labelled {
+    label: String,
+    picture: Rgb,
+}
+
+impl Labelled {
+    fn new(label: String, picture: &Rgb) -> Self {
+        Self { label, picture: picture.clone() }
+    }
 }
 
 /// Returns the context view whose camera is nearer to the target's.
@@ -287,22 +307,69 @@ fn enlarged(picture: &Rgb, w: usize, h: usize) -> Rgb {
     Rgb { width: w, height: h, data }
 }
 
-/// Arranges pictures in rows and columns, all at the size of the largest.
-fn tiled(rows: &[Vec<Rgb>]) -> Rgb {
+/// Space above and below a label, dots.
+const LABEL_MARGIN: usize = 2;
+
+/// Arranges pictures in rows and columns, all at the size of the largest, each below its label.
+fn tiled(rows: &[Vec<Labelled>]) -> Rgb {
     let all = || rows.iter().flatten();
-    let (w, h) =
-        (all().map(|p| p.width).max().unwrap_or(1), all().map(|p| p.height).max().unwrap_or(1));
+    let side = |side: fn(&Rgb) -> usize| all().map(|l| side(&l.picture)).max().unwrap_or(1);
+    let (w, h) = (side(|p| p.width), side(|p| p.height));
+    let longest = all().map(|l| l.label.chars().count()).max().unwrap_or(1).max(1);
+    // Dots as large as the longest label allows, of at most 1/60 of the picture's height.
+    let scale = (w / (lettering::ADVANCE * longest)).min(h / 60).max(1);
+    let (margin, text) = (scale * LABEL_MARGIN, scale * lettering::HEIGHT);
+    let strip = text + 2 * margin;
     let columns = rows.iter().map(Vec::len).max().unwrap_or(1);
-    let mut sheet = Rgb::black(w * columns.max(1), h * rows.len().max(1));
+    let mut sheet = Rgb::black(w * columns.max(1), (strip + h) * rows.len().max(1));
     for (r, row) in rows.iter().enumerate() {
-        for (c, picture) in row.iter().enumerate() {
+        let top = r * (strip + h);
+        for (c, Labelled { label, picture }) in row.iter().enumerate() {
+            lettering::write(&mut sheet, (c * w + margin, top + margin), scale, [255; 3], label);
             let picture = enlarged(picture, w, h);
             for y in 0..h {
-                let at = 3 * ((r * h + y) * sheet.width + c * w);
+                let at = 3 * ((top + strip + y) * sheet.width + c * w);
                 sheet.data[at..at + 3 * w]
                     .copy_from_slice(&picture.data[3 * y * w..3 * (y + 1) * w]);
             }
         }
     }
     sheet
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sheet_has_each_picture_below_its_label() {
+        let grey = |w, h, v: u8| Rgb { width: w, height: h, data: vec![v; 3 * w * h] };
+        let row = |v| {
+            let small = Labelled::new("input 1".to_owned(), &grey(32, 20, v));
+            [small, Labelled::new("truth".to_owned(), &grey(64, 40, v + 1))].into()
+        };
+        let sheet = tiled(&[row(10), row(20)]);
+        let strip = lettering::HEIGHT + 2 * LABEL_MARGIN;
+        assert_eq!((sheet.width, sheet.height), (128, 2 * (strip + 40)));
+        let at = |x: usize, y: usize| sheet.data[3 * (y * 128 + x)];
+        // Corners of the pictures.
+        for (r, v) in [(0, 10), (1, 20)] {
+            let top = r * (strip + 40) + strip;
+            assert_eq!(
+                [at(0, top), at(63, top + 39), at(64, top), at(127, top + 39)],
+                [v, v, v + 1, v + 1]
+            );
+        }
+        // The I of "input" and the T of "truth".
+        let first = |left: usize| -> String {
+            let dot = |x| if at(left + LABEL_MARGIN + x, LABEL_MARGIN) == 255 { '#' } else { '.' };
+            (0..3).map(dot).collect()
+        };
+        assert_eq!([first(0), first(64)], ["###", "###"]);
+        let lit = |left: usize| {
+            let dots = (0..strip).flat_map(|y| (0..64).map(move |x| (left + x, y)));
+            dots.filter(|(x, y)| at(*x, *y) == 255).count()
+        };
+        assert_ne!(lit(0), lit(64));
+    }
 }

@@ -10,6 +10,7 @@ use noise::noise;
 use std::path::PathBuf;
 use subsplat::camera::{Camera, Intrinsics, NearFar};
 use subsplat::data::depth::depth_range;
+use subsplat::data::pair::choose_pair;
 use subsplat::io::cameras_json::{CameraFile, NamedCamera, load_cameras_json, save_cameras_json};
 use subsplat::io::image;
 use subsplat::io::matrices::{self, PoseConvention};
@@ -420,4 +421,31 @@ fn pairs_and_exif() {
     save(wrong);
     let e = load_scene(&pose_file).unwrap_err();
     assert!(e.to_string().contains("EXIF orientation 6"), "{e}");
+}
+
+/// A picture of another shape than its camera's gives a frame that cannot be loaded. It stops the
+/// scene only where fewer than two others are left.
+#[test]
+fn a_frame_of_another_shape_is_reported_and_avoided() {
+    let (folder, cameras) = made_up(4);
+    image::save_png(&folder.path().join("images/001.png"), &noise(48, 64)).unwrap();
+    let pose_file = folder.path().join("cameras.json");
+    let save = |cameras: &[NamedCamera]| {
+        let cameras = cameras.to_vec();
+        let content = CameraFile { cameras, units: Units::Unknown, near_far: None };
+        save_cameras_json(&pose_file, &content).unwrap();
+    };
+    save(&cameras);
+    let scene = load_scene(&pose_file).unwrap();
+    assert_eq!((scene.frames.len(), scene.usable()), (4, vec![0, 2, 3]));
+    assert!(scene.warnings[0].starts_with("1 of 4 frames have pictures of another shape"));
+    assert_eq!(scene.frames[1].camera, cameras[1].camera);
+    let e = scene.frames[1].load().unwrap_err().to_string();
+    assert!(e.contains("001.png") && e.contains("64x48") && e.contains("got 48x64"), "{e}");
+    assert!(scene.frames[2].load().is_ok());
+    let pair = choose_pair(&scene).unwrap();
+    assert!(!pair.frames.contains(&1), "{pair:?}");
+    save(&cameras[..2]);
+    let e = load_scene(&pose_file).unwrap_err().to_string();
+    assert!(e.contains("001.png of 64x48") && e.contains("got 48x64"), "{e}");
 }

@@ -2,20 +2,24 @@
 //! the pipeline, and errors for invalid requests.
 
 use subsplat_test_support as common;
-use subsplat_test_support::chunk_files;
 use subsplat_test_support::scene_folder as program;
+use subsplat_test_support::{chunk_files, made_up};
 
 use chunk_files::{frame, video, write};
+use glam::{Mat4, Vec3};
 use std::collections::BTreeMap;
 use std::path::Path;
 use subsplat::FitOptions;
+use subsplat::camera::{Camera, Intrinsics, NearFar};
 use subsplat::config::{Config, LowpassRef, Preset};
 use subsplat::data::crop::CropOptions;
+use subsplat::data::pair::choose_pair;
 use subsplat::eval::{
     Benchmark, CaseResult, Disturbance, Evaluator, InputReport, Method, Options, Scores,
 };
+use subsplat::io::cameras_json::{CameraFile, save_cameras_json};
 use subsplat::io::image::{Rgb, save_png};
-use subsplat::io::scene::load_scene;
+use subsplat::io::scene::{Units, load_scene};
 use subsplat::metrics::psnr;
 use subsplat::model::lpips::Lpips;
 use subsplat::model::weights::read_tensors;
@@ -393,9 +397,15 @@ fn what_cannot_be_evaluated_is_named() {
     let folder = chunks("{}");
     let e = Benchmark::open(folder.path(), None).unwrap_err().to_string();
     assert!(e.contains("an evaluation index") && e.contains("--index"), "{e}");
+    // Two frames leave no target.
     let place = program::workplace();
+    let cameras = place.path().join("scene/cameras.json");
+    let mut json: serde_json::Value =
+        serde_json::from_str(&std::fs::read_to_string(&cameras).unwrap()).unwrap();
+    json["frames"].as_array_mut().unwrap().pop();
+    std::fs::write(&cameras, json.to_string()).unwrap();
     let e = Benchmark::open(place.path(), None).unwrap_err().to_string();
-    assert!(e.contains("protocol.json"), "{e}");
+    assert!(e.contains("protocol.json") && e.contains("at least 3 frames"), "{e}");
     let place = room();
     let data = Benchmark::open(place.path(), None).unwrap();
     let e = Evaluator::new(Options::new(2)).run(None, &data).unwrap_err().to_string();
@@ -404,6 +414,51 @@ fn what_cannot_be_evaluated_is_named() {
     std::fs::write(place.path().join("scene/protocol.json"), protocol).unwrap();
     let e = Benchmark::open(place.path(), None).unwrap_err().to_string();
     assert!(e.contains("protocol.json") && e.contains("below 3"), "{e}");
+}
+
+/// Without a protocol: the pair that `run` chooses, and every k-th frame between the two.
+#[test]
+fn a_scene_without_a_protocol_gets_a_case() {
+    let place = program::workplace();
+    let scene = load_scene(&place.path().join("scene")).unwrap();
+    let pair = choose_pair(&scene).unwrap().frames;
+    let data = Benchmark::open(place.path(), None).unwrap();
+    let [case] = data.cases() else { panic!("{:?}", data.cases()) };
+    assert_eq!(case.views.context, pair);
+    let other = (0..3).find(|i| !pair.contains(i)).unwrap();
+    assert_eq!(case.views.target, [other]);
+    let notes = data.notes();
+    assert!(notes.len() == 1 && notes[0].contains("scene has no protocol.json"), "{notes:?}");
+    assert!(notes[0].contains(&format!("inputs are frames {} and {}", pair[0], pair[1])));
+    // A protocol of another scene: this one is skipped, as before.
+    let both = room();
+    let folder = both.path().join("other");
+    std::fs::rename(place.path().join("scene"), &folder).unwrap();
+    let data = Benchmark::open(both.path(), None).unwrap();
+    assert_eq!(data.cases().len(), 1);
+    assert_eq!(data.notes(), ["skipped, without tests: other"]);
+    // Twenty frames along a line: targets are 1 in 2 to 3 between the two inputs, none beside them.
+    let (folder, mut cameras) = made_up::made_up(20);
+    for (i, c) in cameras.iter_mut().enumerate() {
+        let pose = Mat4::from_translation(Vec3::new(0.02 * i as f32, 0.0, 0.0));
+        c.camera = Camera::new(cameras_intrinsics(), pose).unwrap();
+    }
+    let near_far = Some(NearFar::new(1.0, 4.0));
+    let content = CameraFile { cameras, units: Units::RealEstate10k, near_far };
+    save_cameras_json(&folder.path().join("cameras.json"), &content).unwrap();
+    let data = Benchmark::open(folder.path(), None).unwrap();
+    let views = &data.cases()[0].views;
+    let between = views.context[1] - views.context[0] - 1;
+    let step = between.div_ceil(8);
+    assert!(between > 8, "{views:?}");
+    let steps: Vec<usize> = views.target.windows(2).map(|t| t[1] - t[0]).collect();
+    assert!(steps.iter().all(|s| *s == step), "{views:?}");
+    assert!(views.target[0] > views.context[0] && *views.target.last().unwrap() < views.context[1]);
+    assert_eq!(views.target.len(), (between - (step - 1) / 2).div_ceil(step));
+}
+
+fn cameras_intrinsics() -> Intrinsics {
+    Intrinsics { fx: 70.0, fy: 70.0, cx: 32.0, cy: 24.0, width: 64, height: 48 }
 }
 
 /// The reference's own synthetic data set, through its own index.

@@ -237,11 +237,22 @@ async function testPage() {
 
     await page.selectOption("#upscale", "1");
     await page.selectOption("#effort", way === "webgl" ? "1" : "0");
+    await page.evaluate(() => {
+      window.fractions = {};
+      new MutationObserver(() => {
+        const stage = document.getElementById("stage").textContent;
+        (fractions[stage] ??= new Set()).add(document.getElementById("progress").value);
+      }).observe(document.getElementById("progress"), { attributes: true });
+    });
     const begin = Date.now();
     await chooseFiles(page, ROOM);
     await page.waitForSelector("#working:not([hidden])");
     await finished(page);
     assert.ok(await page.isHidden("#error"), await page.textContent("#error"));
+    const reports = await page.evaluate(
+      () => Object.entries(fractions).map(([stage, set]) => [stage, set.size]));
+    const [, within] = reports.find(([stage]) => stage.startsWith("estimating depth ")) ?? [];
+    assert.ok(within >= 3, `progress within the network: ${JSON.stringify(reports)}`);
     console.log(`page, ${way}: ${((Date.now() - begin) / 1000).toFixed(1)} s from choice to scene`);
     assert.match(await page.textContent(".splat-status"), way === "cpu" ? /the processor/ : /WebGL2/);
     const ply = await download(page, "[data-save=ply]");

@@ -1,12 +1,25 @@
 #!/usr/bin/env bash
 # Tests the page and an exported scene in headless Chromium (software WebGL2), from a release build
-# of the programs. `test.sh page` and `test.sh export` run one of the two.
+# of the programs. `test.sh page` and `test.sh export` run one of the two. Before them, the unit tests
+# of the SIMD level simd128 run under node.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 command -v node >/dev/null && command -v npm >/dev/null && command -v chromium >/dev/null ||
     { apt-get update && apt-get install -y --no-install-recommends chromium nodejs npm; }
 place=out/web-test
 mkdir -p "$place"
+
+# The modules of src/cpu/simd import nothing else of the crate, so they make a crate of their own.
+# wasm32-wasip1 has the same instructions as the page's target, and a standard output.
+rustup target add wasm32-wasip1
+simd=$place/simd
+rm -rf "$simd" && mkdir -p "$simd/cpu"
+cp -r src/cpu/simd.rs src/cpu/simd "$simd/cpu"
+echo '#![allow(dead_code, unused_imports)] pub mod cpu { pub mod simd; }' >"$simd/tests.rs"
+rustc --test --edition 2024 -O --target wasm32-wasip1 -C target-feature=+simd128 \
+    "$simd/tests.rs" -o "$simd/tests.wasm"
+node --no-warnings tools/web/wasi.mjs "$simd/tests.wasm"
+
 [[ -d $place/node_modules/playwright-core ]] ||
     npm install --prefix "$place" --no-audit --no-fund --silent playwright-core@1.65.1
 cp tools/web/test.mjs "$place/test.mjs"

@@ -88,6 +88,20 @@ impl Command {
     }
 }
 
+impl Command {
+    /// Whether the command may open a GPU.
+    pub fn uses_gpu(&self) -> bool {
+        let named = |device: &str| !device.eq_ignore_ascii_case("cpu");
+        match self {
+            Self::Run(args) => named(&args.rendering.device),
+            Self::Render(args) => named(&args.rendering.device),
+            Self::Compare(args) => named(&args.device),
+            Self::View(_) => cfg!(feature = "view"),
+            _ => false,
+        }
+    }
+}
+
 /// The conflict of `--orbit-radius` with a path without one.
 fn radius_conflict(path: PathArg, motion: &MotionArgs) -> Option<String> {
     (motion.orbit_radius.is_some() && path.closed().is_none())

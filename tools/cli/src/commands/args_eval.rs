@@ -8,10 +8,12 @@ use subsplat::eval::{Disturbance, Method};
 
 const NOTES: &str = "\
 Methods: subsplat (the model), detail (the model with detail from the photographs), fit (the same, \
-fitted to the photographs), refine (the same, refined on them: what `run` gives), pair (detail, on the two inputs nearest to the target alone), backbone (its backbone's Gaussians alone, rendered \
-at the target's size: spgr=off), lowpass (the same, low-pass scaled to the input), bilinear (the \
-same rendered at the input's size and enlarged), uniform (K equal Gaussians a pixel, untrained), \
-copy (the input nearest to the target), mean (of the inputs).
+fitted to the photographs), refine (the same, refined on them: what `run` gives, so that more than \
+1.5 million Gaussians are not refined), pair (detail, on the two inputs nearest to the target \
+alone), backbone (its backbone's Gaussians alone, rendered at the target's size: spgr=off), lowpass \
+(the same, low-pass scaled to the input), bilinear (the same rendered at the input's size and \
+enlarged), uniform (K equal Gaussians a pixel, untrained), copy (the input nearest to the target), \
+mean (of the inputs).
 
 Figures: PSNR (dB), SSIM, LPIPS (VGG16; needs --lpips), sharpness (mean absolute gradient over the \
 photograph's), GMSD (gradient magnitude similarity deviation; 0 is best). Means are over a case's \
@@ -27,11 +29,13 @@ are large enough.";
 #[command(after_long_help = NOTES)]
 pub struct EvalArgs {
     /// Chunks of pixelSplat's form (RealEstate10K, ACID; a folder with index.json or
-    /// test/index.json), a scene, or a folder of scenes with protocol.json.
+    /// test/index.json), a scene, or a folder of scenes. Without protocol.json and --index, the
+    /// inputs of a scene are the pair that `run` chooses, and every k-th frame between the two is a
+    /// target.
     #[arg(value_name = "DATA")]
     pub data: PathBuf,
-    /// Evaluation index of MVSplat's form, {scene: {context, target} or null}. Scenes have a
-    /// protocol.json instead.
+    /// Evaluation index of MVSplat's form, {scene: {context, target} or null}. Scenes may have
+    /// a protocol.json instead.
     #[arg(long, value_name = "FILE")]
     pub index: Option<PathBuf>,
     /// Take N frames spread over each scene as inputs, and the frames in the middle between two of
@@ -49,7 +53,7 @@ pub struct EvalArgs {
     #[arg(long, value_name = "N | WxH", value_parser = values::size)]
     pub input_size: Option<(usize, usize)>,
     /// Methods to compare, in this order (default: all that differ at this --upscale, without
-    /// detail).
+    /// detail and pair).
     #[arg(long, value_delimiter = ',', value_name = "M,…")]
     pub methods: Vec<Method>,
     /// Score also PNG pictures of another program: DIR/SCENE/INPUTS/NNNNNN.png, or

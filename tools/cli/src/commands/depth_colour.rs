@@ -4,6 +4,7 @@
 //! 2019), which keeps order in brightness at both ends and shows small steps.
 
 use subsplat::io::image::{Depth, Rgb};
+use subsplat::io::lettering::{HEIGHT, set_pixel, write};
 
 /// Ends of the scale: quantiles of the depths that exist.
 const ENDS: [f64; 2] = [0.02, 0.98];
@@ -17,12 +18,6 @@ const MARGIN: usize = 4;
 const NONE: [u8; 3] = [128, 128, 128];
 const PAPER: [u8; 3] = [255, 255, 255];
 const INK: [u8; 3] = [0, 0, 0];
-
-/// Rows of 3×5 dots of the digits and of the point, as octal digits of three bits.
-const DIGITS: [u16; 11] = [
-    0o75557, 0o26227, 0o71747, 0o71717, 0o55711, 0o74717, 0o74757, 0o71111, 0o75757, 0o75717,
-    0o00002,
-];
 
 /// Draws depth in colours, with a legend of `LABELS` values at the right.
 pub fn colour_depth(depth: &Depth) -> Rgb {
@@ -44,15 +39,15 @@ pub fn colour_depth(depth: &Depth) -> Rgb {
         for x in 0..depth.width {
             let d = depth.data[y * depth.width + x];
             let rgb = if exists(&d) { turbo((far - d) / (far - near)) } else { NONE };
-            put(&mut out, x, y, rgb);
+            set_pixel(&mut out, x, y, rgb);
         }
     }
-    let (margin, text) = (MARGIN * scale, 5 * scale);
+    let (margin, text) = (MARGIN * scale, HEIGHT * scale);
     let (top, rows) = (margin + text / 2, depth.height.saturating_sub(2 * margin + text).max(1));
     for y in 0..rows {
         let share = y as f32 / (rows.max(2) - 1) as f32;
         for x in 0..BAR * scale {
-            put(&mut out, depth.width + margin + x, top + y, turbo(1.0 - share));
+            set_pixel(&mut out, depth.width + margin + x, top + y, turbo(1.0 - share));
         }
     }
     for label in 0..LABELS {
@@ -63,6 +58,7 @@ pub fn colour_depth(depth: &Depth) -> Rgb {
             &mut out,
             (left, y.saturating_sub(text / 2)),
             scale,
+            INK,
             &number(near + share * (far - near)),
         );
     }
@@ -73,28 +69,6 @@ pub fn colour_depth(depth: &Depth) -> Rgb {
 fn number(v: f32) -> String {
     let digits = (2 - v.abs().max(1e-3).log10().floor() as i32).clamp(0, 5) as usize;
     format!("{v:.digits$}")
-}
-
-fn put(out: &mut Rgb, x: usize, y: usize, rgb: [u8; 3]) {
-    if x < out.width && y < out.height {
-        let at = 3 * (y * out.width + x);
-        out.data[at..at + 3].copy_from_slice(&rgb);
-    }
-}
-
-fn write(out: &mut Rgb, (left, top): (usize, usize), scale: usize, text: &str) {
-    for (i, c) in text.chars().enumerate() {
-        let glyph = match c.to_digit(10) {
-            Some(digit) => DIGITS[digit as usize],
-            None => DIGITS[10],
-        };
-        for dot in (0..15).filter(|dot| glyph >> (14 - dot) & 1 == 1) {
-            let (x, y) = (left + scale * (4 * i + dot % 3), top + scale * (dot / 3));
-            for (dx, dy) in (0..scale).flat_map(|dx| (0..scale).map(move |dy| (dx, dy))) {
-                put(out, x + dx, y + dy, INK);
-            }
-        }
-    }
 }
 
 /// The Turbo colour of a share from 0 (blue) to 1 (red).

@@ -8,6 +8,7 @@ use anyhow::{Result, bail};
 use serde_json::json;
 use subsplat::abi::{Convention, RasterOptions};
 use subsplat::camera::Camera;
+use subsplat::io::ply::is_own_comment;
 use subsplat::io::{SaveOptions, load_with_comments, save_splats};
 use subsplat::render::{camera_of_comments, comments_without_camera, options_of_comments};
 
@@ -19,7 +20,8 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
     if args.cameras.is_some() && !html {
         bail!("--cameras: only .html files hold cameras, got {}", args.out.display());
     }
-    let (splats, comments) = progress.stage("scene", |_| load_with_comments(&file))?;
+    let (splats, mut comments) = progress.stage("scene", |_| load_with_comments(&file))?;
+    comments.retain(|comment| !is_own_comment(comment));
     let stored = options_of_comments(&comments);
     // The camera of a comment holds in the axes that the file had.
     let kept = match args.up {

@@ -8,6 +8,7 @@ use std::io::Write;
 use std::path::Path;
 use subsplat::abi::{ALPHA_MIN, Convention, NEAR_MVSPLAT, RasterOptions};
 use subsplat::camera::Camera;
+use subsplat::eval::escaped;
 use subsplat::io::base64::base64;
 use subsplat::io::{SaveOptions, SaveReport, SplatFormat, encode_splats_with, write_atomic};
 use subsplat::splats::Splats;
@@ -63,14 +64,6 @@ impl Page<'_> {
     }
 
     fn settings(&self) -> String {
-        let camera = |c: &Camera| {
-            let k = c.intrinsics();
-            json!({
-                "width": k.width, "height": k.height,
-                "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy,
-                "world_from_camera": c.world_from_camera().transpose().to_cols_array()[..12],
-            })
-        };
         let near = match self.options.convention {
             Convention::Standard => self.options.near,
             Convention::Mvsplat => NEAR_MVSPLAT * self.options.near,
@@ -79,16 +72,11 @@ impl Page<'_> {
             "background": self.options.background,
             "near": near,
             "lowpass": self.options.lowpass,
-            "cameras": self.cameras.iter().map(camera).collect::<Vec<_>>(),
+            "cameras": self.cameras,
         });
         // No text may end the script element.
         settings.to_string().replace('<', "\\u003c")
     }
-}
-
-/// Escapes text for HTML.
-fn escaped(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
 }
 
 #[cfg(test)]

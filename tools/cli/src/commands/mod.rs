@@ -13,6 +13,7 @@ mod check;
 mod compare;
 mod compare_raster;
 mod depth_colour;
+mod environment;
 mod eval;
 mod export;
 mod frames;
@@ -33,6 +34,7 @@ mod values;
 mod video;
 #[cfg(feature = "view")]
 mod view;
+mod whole;
 
 use crate::failure;
 use crate::report::Answer;
@@ -54,6 +56,9 @@ pub fn main() -> ExitCode {
     if let Some(conflict) = cli.command.conflict() {
         let error = Cli::command().error(ErrorKind::ArgumentConflict, conflict);
         return failure::report_usage(&error);
+    }
+    if cli.command.uses_gpu() {
+        environment::restart_for_gpu();
     }
     let answer = Answer::new(cli.json);
     match dispatch(&cli, answer) {

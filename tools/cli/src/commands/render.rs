@@ -4,7 +4,7 @@ use super::args::{LowpassArg, PATH_FRAMES, PathArg, RenderArgs, RenderingArgs, S
 use super::depth_colour::colour_depth;
 use super::frames::{self, DepthSpread};
 use super::memory;
-use super::video;
+use super::{video, whole};
 use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
 use clap::ValueEnum;
@@ -17,14 +17,8 @@ use subsplat::io::image::{Depth, Rgb, probe, save_depth_png, save_png};
 use subsplat::io::load_with_comments;
 use subsplat::io::photograph::list_photographs;
 use subsplat::io::scene::{is_scene, load_scene};
-use subsplat::navigation::Bounds;
 use subsplat::render::{Renderer, camera_of_comments, options_of_comments};
 use subsplat::splats::Splats;
-
-/// Side of a picture without a camera, px.
-const DEFAULT_SIDE: usize = 512;
-/// Horizontal field of view of a picture without a camera.
-const DEFAULT_FOV_X: f32 = 0.9;
 
 /// Opens the renderer of `--device`; where that fails, prints a warning and uses the CPU.
 pub fn open(args: &RenderingArgs) -> Renderer {
@@ -227,9 +221,14 @@ fn named_cameras(
             Some(_) => {
                 "no cameras given and no cameras.json beside the scene: the file's own camera"
             }
-            None => "no cameras given and no cameras.json beside the scene: a view of the whole",
+            None => {
+                "no cameras given and no cameras.json beside the scene: a view of the whole from the side of its smaller Gaussians"
+            }
         });
-        return Ok(vec![("view".to_owned(), camera.map_or_else(|| whole(splats), Ok)?)]);
+        return Ok(vec![(
+            "view".to_owned(),
+            camera.map_or_else(|| whole::camera(splats, comments), Ok)?,
+        )]);
     };
     let names: Vec<&str> = all.iter().map(|(n, _)| n.as_str()).collect();
     let chosen = match args.target.is_empty() {
@@ -276,14 +275,4 @@ pub fn read_cameras(source: &Path) -> Result<Vec<(String, Camera)>> {
 /// Spread of the splats in front of `camera`.
 pub fn depths(splats: &Splats, camera: &Camera) -> DepthSpread {
     DepthSpread::of((0..splats.len()).map(|i| camera.to_camera(splats.mean(i).into()).z))
-}
-
-/// Bounds of a scene's splats without outliers.
-pub fn bounds(splats: &Splats) -> Result<Bounds> {
-    Bounds::of(splats.means()).context("the scene holds no Gaussian")
-}
-
-/// A camera along +z that shows the central 96 % of the means.
-pub fn whole(splats: &Splats) -> Result<Camera> {
-    Ok(bounds(splats)?.camera(DEFAULT_FOV_X, DEFAULT_SIDE)?)
 }

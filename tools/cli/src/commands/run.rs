@@ -262,7 +262,8 @@ fn default_targets(input: &Path, plan: &Plan, size: (usize, usize)) -> Result<Ve
     }
     let (first, last) = (context.iter().min(), context.iter().max());
     let (Some(&first), Some(&last)) = (first, last) else { return Ok(Vec::new()) };
-    let all: Vec<usize> = (first + 1..last).filter(|i| !context.contains(i)).collect();
+    let between = |i: &usize| (first + 1..last).contains(i) && !context.contains(i);
+    let all: Vec<usize> = scene.usable().into_iter().filter(between).collect();
     let count = all.len().min(DEFAULT_TARGETS);
     Ok((0..count).map(|i| all[i * all.len() / count]).collect())
 }

@@ -1,12 +1,17 @@
 //! `subsplat train`: trains a model by its configuration, with progress for the user.
 
 use super::args::TrainArgs;
+use super::environment;
 use super::tensorboard::Board;
 use crate::report::{Answer, mebibytes, print_line, print_warning};
-use anyhow::Result;
+use anyhow::{Context, Result};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
+use signal_hook::consts::SIGINT;
+use signal_hook::flag;
 use std::io::IsTerminal;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 use subsplat::train::TrainConfig;
 use subsplat::train::run::{Event, Limits, StepReport, Training};
@@ -19,34 +24,19 @@ const LINE_EVERY: Duration = Duration::from_secs(20);
 const PROFILE_EVERY: usize = 15;
 /// Weight of the newest step in the printed means.
 const NEW_WEIGHT: f64 = 0.05;
-
-/// Restarts the program with one thread for candle, unless the environment states a number.
-///
-/// Candle runs operations on large tensors in its own thread pool. Its idle threads spin, and
-/// take the cores from this crate's: 40 steps took 28.8 s with the pool and 20.7 s without.
-/// Candle reads the number from the environment, which a process cannot change without `unsafe`.
-#[cfg(unix)]
-fn restart_with_one_candle_thread() {
-    use std::os::unix::process::CommandExt;
-    const CANDLE_THREADS: &str = "CANDLE_NUM_THREADS";
-    if std::env::var_os(CANDLE_THREADS).is_some() {
-        return;
-    }
-    if let Ok(program) = std::env::current_exe() {
-        let mut again = std::process::Command::new(program);
-        // Returns only on failure; the training is then slower, with the same result.
-        let _ = again.args(std::env::args_os().skip(1)).env(CANDLE_THREADS, "1").exec();
-    }
-}
+/// Exit code of a program that SIGINT ended, as shells report it.
+const INTERRUPTED: i32 = 130;
 
 /// Runs the command.
 pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
-    #[cfg(unix)]
-    restart_with_one_candle_thread();
+    // Candle runs operations on large tensors in its own thread pool. Its idle threads spin, and
+    // take the cores from this crate's: 40 steps took 28.8 s with the pool and 20.7 s without.
+    environment::restart_with("CANDLE_NUM_THREADS", || "1".into());
     let config = TrainConfig::load(&args.config)?;
-    let limits = Limits { minutes: args.minutes, steps: args.steps };
+    let stop = stop_on_interrupt()?;
+    let limits = Limits { minutes: args.minutes, steps: args.steps, stop: Some(&stop) };
     let mut training = Training::open(&config, &args.out)?;
-    let mut watch = Watch::new(&config);
+    let mut watch = Watch::new(&config, limits);
     let mut board = Board::create(&args.out)?;
     let mut unwritten = None;
     let validator = Validator::new(&config, args.validate.as_deref())?;
@@ -66,7 +56,9 @@ pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
     let weights = Some(args.out.join("weights.safetensors")).filter(|file| file.is_file());
     let saved = weights.as_ref().map(|file| format!("; weights in {}", file.display()));
     let (done, steps) = (progress.step, config.steps);
-    print_line(format!("{done} of {steps} steps done{}", saved.unwrap_or_default()));
+    let stopped = stop.load(Ordering::Relaxed);
+    let how = if stopped { "stopped by Ctrl-C, " } else { "" };
+    print_line(format!("{how}{done} of {steps} steps done{}", saved.unwrap_or_default()));
     answer.finish(&json!({
         "step": progress.step,
         "steps": config.steps,
@@ -74,14 +66,28 @@ pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
         "seconds": progress.seconds,
         "loss": watch.loss,
         "weights": weights,
+        "stopped": stopped,
     }))
+}
+
+/// A flag that Ctrl-C sets. A second Ctrl-C ends the program.
+fn stop_on_interrupt() -> Result<Arc<AtomicBool>> {
+    let stop = Arc::new(AtomicBool::new(false));
+    // The actions run in this order: the first Ctrl-C does not find the flag set.
+    flag::register_conditional_shutdown(SIGINT, INTERRUPTED, Arc::clone(&stop))
+        .and_then(|_| flag::register(SIGINT, Arc::clone(&stop)))
+        .context("Ctrl-C")?;
+    Ok(stop)
 }
 
 /// Progress for the user: a bar on a terminal, else a line from time to time.
 struct Watch {
     bar: ProgressBar,
     terminal: bool,
+    /// Steps of the configuration.
     steps: u64,
+    /// Steps and minutes of this call.
+    limits: [Option<f64>; 2],
     started: Instant,
     first: u64,
     shown: Instant,
@@ -96,7 +102,7 @@ fn mean(old: f64, new: f64) -> f64 {
 }
 
 impl Watch {
-    fn new(config: &TrainConfig) -> Self {
+    fn new(config: &TrainConfig, limits: Limits<'_>) -> Self {
         let bar = ProgressBar::new(config.steps);
         let style = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len} [{elapsed}]");
         if let Ok(style) = style {
@@ -106,6 +112,7 @@ impl Watch {
             bar,
             terminal: std::io::stderr().is_terminal(),
             steps: config.steps,
+            limits: [limits.steps.map(|n| n as f64), limits.minutes],
             started: Instant::now(),
             first: 0,
             shown: Instant::now(),
@@ -178,8 +185,10 @@ impl Watch {
     /// Formats loss, PSNR, learning rate, speed, memory and remaining time.
     fn line(&self, report: &StepReport) -> String {
         let done = (report.step - self.first).max(1) as f64;
-        let each = self.started.elapsed().as_secs_f64() / done;
-        let left = each * self.steps.saturating_sub(report.step) as f64;
+        let passed = self.started.elapsed().as_secs_f64();
+        let each = passed / done;
+        let steps = self.steps.saturating_sub(report.step) as f64;
+        let left = seconds_left((steps, each), (done, passed), self.limits);
         let mut line = format!("loss {:.4}", self.loss);
         if self.psnr.is_finite() {
             line += &format!(" psnr {:.2}", self.psnr);
@@ -221,9 +230,26 @@ fn validation_line(step: u64, set: &str, found: &Found) -> String {
     line
 }
 
+/// Seconds until the last of `steps` steps of `each` seconds, or until a limit of this call, which
+/// has `done` steps in `passed` seconds. `limits`: steps and minutes.
+fn seconds_left(
+    (steps, each): (f64, f64),
+    (done, passed): (f64, f64),
+    [limit, minutes]: [Option<f64>; 2],
+) -> f64 {
+    let steps = limit.map_or(steps, |limit| steps.min(limit - done));
+    let left = each * steps;
+    minutes.map_or(left, |m| left.min(60.0 * m - passed)).max(0.0)
+}
+
+/// Formats a duration: `50 s`, `12 min`, `3 h 07 min`.
 fn duration(seconds: f64) -> String {
     let minutes = (seconds / 60.0).ceil() as u64;
-    format!("{}:{:02}", minutes / 60, minutes % 60)
+    match minutes {
+        0 | 1 => format!("{:.0} s", seconds.ceil()),
+        2..60 => format!("{minutes} min"),
+        _ => format!("{} h {:02} min", minutes / 60, minutes % 60),
+    }
 }
 
 /// Reads the resident memory of this process, bytes; `None` elsewhere than on Linux.
@@ -231,4 +257,34 @@ fn resident_bytes() -> Option<u64> {
     let text = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = text.lines().find(|l| l.starts_with("VmRSS:"))?;
     Some(line.split_whitespace().nth(1)?.parse::<u64>().ok()? * 1024)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_time_left_is_that_of_the_nearest_limit() {
+        let call = (10.0, 20.0);
+        assert_eq!(seconds_left((90.0, 2.0), call, [None, None]), 180.0);
+        assert_eq!(seconds_left((90.0, 2.0), call, [Some(15.0), None]), 10.0);
+        assert_eq!(seconds_left((90.0, 2.0), call, [Some(15.0), Some(0.4)]), 4.0);
+        assert_eq!(seconds_left((90.0, 2.0), call, [None, Some(2.0)]), 100.0);
+        // The last step ends after the limit.
+        assert_eq!(seconds_left((90.0, 2.0), call, [None, Some(0.3)]), 0.0);
+    }
+
+    #[test]
+    fn durations_have_their_unit() {
+        let cases = [
+            (0.0, "0 s"),
+            (59.2, "60 s"),
+            (60.5, "2 min"),
+            (3541.0, "1 h 00 min"),
+            (11_220.0, "3 h 07 min"),
+        ];
+        for (seconds, text) in cases {
+            assert_eq!(duration(seconds), text);
+        }
+    }
 }

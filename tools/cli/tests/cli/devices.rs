@@ -61,6 +61,28 @@ fn a_gpu_renders_what_the_cpu_does() {
     assert!(got.rgb.iter().zip(&expected.rgb).all(|(a, b)| (a - b).abs() < 0.02));
 }
 
+/// Mesa prints an error where no folder for sockets is named, though its driver works.
+#[cfg(feature = "gpu")]
+#[test]
+fn a_gpu_is_opened_without_a_message_of_its_driver() {
+    if adapter::gpu().is_none() {
+        return;
+    }
+    let place = workplace();
+    let quick = "run scene --context 0,1 --input-size 64 --fit 0 --refine off -o out";
+    assert_eq!(call_in(place.path(), quick).code, 0);
+    let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_subsplat"));
+    command.args("render out --size 64 --device gpu -o views".split_whitespace());
+    command.current_dir(place.path()).env_remove("XDG_RUNTIME_DIR");
+    let called = program::called(&mut command);
+    assert_eq!(called.code, 0, "{}", called.stderr);
+    assert!(
+        !called.stderr.contains("error") && !called.stderr.contains("XDG"),
+        "{}",
+        called.stderr
+    );
+}
+
 /// A picture that is larger than WebGPU's default 128 MiB of a binding comes in bands.
 #[cfg(feature = "gpu")]
 #[test]

@@ -29,8 +29,10 @@ fn eval_scores_writes_and_reads_its_own_pictures() {
     let place = room();
     let out = place.path().join("out");
     let report = done(&call_in(place.path(), "--json eval scene --detail photo -o out"));
-    let names =
-        ["subsplat", "detail", "fit", "backbone", "lowpass", "bilinear", "uniform", "copy", "mean"];
+    let names = [
+        "subsplat", "detail", "fit", "refine", "backbone", "lowpass", "bilinear", "uniform",
+        "copy", "mean",
+    ];
     let methods = report["methods"].as_object().unwrap();
     assert_eq!(methods.len(), names.len());
     for name in names {
@@ -54,22 +56,22 @@ fn eval_scores_writes_and_reads_its_own_pictures() {
     let mean = 0.5 * (psnr(&scene["cases"][0]) + psnr(case));
     assert!((psnr(scene) - mean).abs() < 1e-9 && (psnr(&report) - mean).abs() < 1e-9);
 
-    // 3 targets of 9 methods and the truth; four tables; nothing else.
+    // 3 targets of 10 methods and the truth; four tables; nothing else.
     let written = files(&out);
-    assert_eq!(written.len(), 3 * 10 + 4, "{written:?}");
+    assert_eq!(written.len(), 3 * 11 + 4, "{written:?}");
     let saved: Value = serde_json::from_str(&text(&out.join("eval.json"))).unwrap();
     assert_eq!((&saved["methods"], &saved["scenes"]), (&report["methods"], &report["scenes"]));
     let csv = text(&out.join("targets.csv"));
-    assert_eq!(csv.lines().count(), 1 + 3 * 9);
+    assert_eq!(csv.lines().count(), 1 + 3 * 10);
     assert!(csv.starts_with("scene,context,target,frame,method,psnr,ssim,lpips,sharpness,gmsd\n"));
     assert!(csv.lines().all(|l| l.matches(',').count() == 9), "{csv}");
     let means = text(&out.join("means.csv"));
-    assert_eq!(means.lines().count(), 1 + 2 * 9);
+    assert_eq!(means.lines().count(), 1 + 2 * 10);
     assert!(means.lines().all(|l| l.matches(',').count() == 17), "{means}");
     let page = text(&out.join("index.html"));
-    // Two inputs, the photograph and nine methods, twice; nothing from elsewhere.
-    assert_eq!(page.matches("<img ").count(), 24);
-    assert_eq!(page.matches("src=\"data:image/png;base64,").count(), 24);
+    // Two inputs, the photograph and ten methods, twice; nothing from elsewhere.
+    assert_eq!(page.matches("<img ").count(), 26);
+    assert_eq!(page.matches("src=\"data:image/png;base64,").count(), 26);
     assert!(!page.contains("http") && page.contains("the weights that ship"));
 
     // Its own pictures, read back as another program's: 8 bits apart.
@@ -81,6 +83,19 @@ fn eval_scores_writes_and_reads_its_own_pictures() {
     assert_eq!(again["methods"]["copy"]["psnr"], methods["copy"]["psnr"]);
     assert_eq!((of("same"), &again["methods"]["same"]["ssim"]), (None, &json!(1.0)));
     assert!(again["protocol"]["backbone"].is_null());
+}
+
+#[test]
+fn a_scene_without_a_protocol_is_scored_and_the_choice_is_printed() {
+    let place = workplace();
+    let called = call_in(place.path(), "--json eval scene --methods copy --input-size 64");
+    let report = done(&called);
+    assert_eq!((&report["cases"], &report["targets"]), (&json!(1), &json!(1)));
+    assert!(called.stderr.contains("note: scene has no protocol.json: inputs are frames"));
+    assert_eq!(report["notes"].as_array().unwrap().len(), 1);
+    // Other inputs need no such note.
+    let called = call_in(place.path(), "--json eval scene --methods copy --contexts 2");
+    assert!(done(&called)["notes"].as_array().unwrap().is_empty(), "{}", called.stderr);
 }
 
 #[test]

@@ -118,6 +118,10 @@ fn export_writes_every_format() {
     let up = load_splats(&place.path().join("up.ply")).unwrap();
     let ([x, y, z], turned) = (first.mean(0), up.mean(0));
     assert!((turned[0] - x).abs() + (turned[1] + y).abs() + (turned[2] + z).abs() < 1e-5);
+    // Its header describes its own axes alone.
+    let bytes = std::fs::read(place.path().join("up.ply")).unwrap();
+    let head = String::from_utf8_lossy(&bytes[..2000.min(bytes.len())]).into_owned();
+    assert_eq!((head.matches("up is ").count(), head.matches("up is +y").count()), (1, 1), "{head}");
 }
 
 #[test]

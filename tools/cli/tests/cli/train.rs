@@ -464,3 +464,43 @@ fn the_program_trains_and_goes_on() {
     let (code, _, stderr) = call(folder.path(), "train t.toml --out run --minutes 0");
     assert!(code == 2 && stderr.contains("--minutes"), "{stderr}");
 }
+
+/// SIGINT ends the program after a step, with a checkpoint and weights.
+#[cfg(unix)]
+#[test]
+fn ctrl_c_saves_a_checkpoint() {
+    use std::io::{BufRead, BufReader};
+    let folder = tempfile::tempdir().unwrap();
+    let endless = TINY.replace("PHASE", "depth").replace("steps = 40", "steps = 1000000");
+    std::fs::write(folder.path().join("t.toml"), endless).unwrap();
+    let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_subsplat"));
+    command.args("--json train t.toml --out run --minutes 5".split_whitespace());
+    command.current_dir(folder.path());
+    command.stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::piped());
+    let mut child = command.spawn().unwrap();
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    let step = lines.by_ref().map(Result::unwrap).find(|l| l.starts_with("step ")).unwrap();
+    // A million steps take longer than the five minutes of this call.
+    assert!(step.contains(" left 5 min") || step.contains(" left 4 min"), "{step}");
+    let interrupted = std::process::Command::new("kill")
+        .args(["-INT", &child.id().to_string()])
+        .status()
+        .unwrap();
+    assert!(interrupted.success());
+    let rest: Vec<String> = lines.map(Result::unwrap).collect();
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(0), "{rest:?}");
+    assert!(rest.iter().any(|l| l.starts_with("stopped by Ctrl-C, ")), "{rest:?}");
+    assert!(!rest.iter().any(|l| l.contains("held-out rooms")), "{rest:?}");
+    let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(report["stopped"], true);
+    let done = report["step"].as_u64().unwrap();
+    let run = folder.path().join("run");
+    assert_eq!(checkpoint::steps(&run), [done]);
+    assert!(run.join("weights.safetensors").is_file());
+    // It goes on from there.
+    let (code, stdout, stderr) = call(folder.path(), "--json train t.toml --out run --steps 1");
+    assert_eq!(code, 0, "{stderr}");
+    let report: serde_json::Value = serde_json::from_str(&stdout).unwrap();
+    assert_eq!((&report["step"], &report["stopped"]), (&(done + 1).into(), &false.into()));
+}

@@ -105,18 +105,10 @@ impl Session {
 
     fn describe(&self) -> Result<Vec<u8>, String> {
         let scene = self.scene()?;
-        let camera = |c: &Camera| {
-            let k = c.intrinsics();
-            json!({
-                "width": k.width, "height": k.height,
-                "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy,
-                "world_from_camera": c.world_from_camera().transpose().to_cols_array()[..12],
-            })
-        };
         Ok(bytes(&json!({
             "gaussians": scene.splats.len(),
             "background": scene.options.background,
-            "cameras": scene.cameras.iter().map(camera).collect::<Vec<_>>(),
+            "cameras": scene.cameras,
             "warnings": scene.warnings,
         })))
     }

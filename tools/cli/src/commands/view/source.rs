@@ -4,7 +4,7 @@
 use crate::commands::args_view::ViewArgs;
 use crate::commands::frames::DepthSpread;
 use crate::commands::reconstruct::{self, reconstruct};
-use crate::commands::{info, memory, model, pair, render, run};
+use crate::commands::{info, memory, model, pair, render, run, whole};
 use crate::report::{Progress, print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
 use std::ops::ControlFlow;
@@ -98,7 +98,7 @@ fn finished(args: &ViewArgs, path: &Path, progress: &mut Progress) -> Result<Sou
         None if beside.is_file() => render::read_cameras(&beside)?,
         None => {
             let own = camera_of_comments(&comments);
-            vec![(String::new(), own.map_or_else(|| render::whole(&splats), Ok)?)]
+            vec![(String::new(), own.map_or_else(|| whole::camera(&splats, &comments), Ok)?)]
         }
     };
     let Some((_, home)) = cameras.first() else {
@@ -109,7 +109,7 @@ fn finished(args: &ViewArgs, path: &Path, progress: &mut Progress) -> Result<Sou
         home: *home,
         up: up_of(cameras.iter().map(|(_, c)| c)),
         distance: render::depths(&splats, home).middle,
-        radius: render::bounds(&splats)?.radius(),
+        radius: whole::bounds(&splats)?.radius(),
     };
     let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let made = Made { splats, options, upscale: None };
@@ -147,7 +147,7 @@ fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
         home: input.target_camera,
         up: up_of(cameras.iter()),
         distance: DepthSpread::of(depth.data.iter().copied()).middle,
-        radius: render::bounds(result.splats())?.radius(),
+        radius: whole::bounds(result.splats())?.radius(),
     };
     let photographs = Photographs {
         args: args.clone(),
