@@ -219,9 +219,9 @@ pub use navigation::{Bounds, Mode, Navigator, Pace, Start};
 pub use ops::{SplatTensors, rasterize_splats as rasterize};
 #[cfg(feature = "network")]
 pub use pipeline::{
-    Check, DepthBounds, DepthRange, DepthSource, Detail, Error, InputSize, KnownLens, LensSource,
-    LooseOptions, LoosePhotos, LooseScene, Options, Photo, PoseError, Poses, Prepared, Progress,
-    Reconstruction, Reconstructor, Refine, Result, Stage, StageTime, TargetSize, Warning,
+    Check, Density, DepthBounds, DepthRange, DepthSource, Detail, Error, InputSize, KnownLens,
+    LensSource, LooseOptions, LoosePhotos, LooseScene, Options, Photo, PoseError, Poses, Prepared,
+    Progress, Reconstruction, Reconstructor, Refine, Result, Stage, StageTime, TargetSize, Warning,
     loose_photos, loose_scene,
 };
 pub use poses::{

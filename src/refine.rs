@@ -418,19 +418,38 @@ pub fn refine(
     renderer: &mut Renderer,
     progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
 ) -> Result<RefineReport, FitError> {
+    let mut groups = equal_groups(splats, views.len(), options);
+    refine_groups(splats, &mut groups, views, raster, options, renderer, progress)
+}
+
+/// [`refine`] with the Gaussians of each photograph in `groups`, which follow the removal; empty
+/// where they are not known.
+///
+/// # Errors
+/// Those of [`refine`].
+pub(crate) fn refine_groups(
+    splats: &mut Splats,
+    groups: &mut Vec<Range<usize>>,
+    views: &[FitView<'_>],
+    raster: &RasterOptions,
+    options: &RefineOptions,
+    renderer: &mut Renderer,
+    progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
+) -> Result<RefineReport, FitError> {
     if options.steps == 0 || views.is_empty() || splats.is_empty() {
         return Ok(RefineReport::unchanged(0, 0.0));
     }
     for (i, view) in views.iter().enumerate() {
         Target::check(i, view)?;
     }
-    let pruned = pruned(splats, views, raster, options, renderer);
-    let mut refiner = match &pruned {
-        Some((kept, groups)) => {
-            Refiner { groups: groups.clone(), ..Refiner::new(kept, views, raster, options)? }
-        }
-        None => Refiner::new(splats, views, raster, options)?,
+    let pruned = pruned(splats, groups, views, raster, options, renderer);
+    let (kept, kept_groups) = match &pruned {
+        Some((kept, groups)) => (kept, groups),
+        None => (&*splats, &*groups),
     };
+    let groups_of_kept = kept_groups.clone();
+    let mut refiner =
+        Refiner { groups: groups_of_kept, ..Refiner::new(kept, views, raster, options)? };
     let before = refiner.error(renderer);
     let (mut last, between) = (None, ROUNDS_PER_CHECK * views.len());
     while !refiner.is_done() {
@@ -455,8 +474,8 @@ pub fn refine(
     }
     let Refiner { rows, gain, .. } = refiner;
     let removed = splats.len() - rows.len() / SPLAT_STRIDE;
-    if let Some((kept, _)) = pruned {
-        *splats = kept;
+    if let Some((kept, kept_groups)) = pruned {
+        (*splats, *groups) = (kept, kept_groups);
     }
     splats.rows = rows;
     splats.gain = gain;
@@ -480,12 +499,12 @@ type Grouped = (Splats, Vec<Range<usize>>);
 /// The Gaussians without the parents below [`RefineOptions::least_share`]; `None` where all stay.
 fn pruned(
     splats: &Splats,
+    groups: &[Range<usize>],
     views: &[FitView<'_>],
     raster: &RasterOptions,
     options: &RefineOptions,
     renderer: &mut Renderer,
 ) -> Option<Grouped> {
-    let groups = equal_groups(splats, views.len(), options);
     if groups.len() < PHOTOGRAPHS_TO_PRUNE || !(options.least_share > 0.0) {
         return None;
     }
@@ -493,7 +512,7 @@ fn pruned(
     let keep: Vec<bool> = shares.iter().map(|share| *share >= options.least_share).collect();
     let (children, mut end) = (splats.children_per_parent(), 0);
     let groups: Vec<Range<usize>> = groups
-        .into_iter()
+        .iter()
         .map(|group| {
             let families = &keep[group.start / children..group.end / children];
             let begin = end;
@@ -508,7 +527,7 @@ fn pruned(
 /// Share of each parent in the photographs: the weights T·α of its children, summed over all
 /// pixels, over those of an average parent. The sums are gradients by the colour offsets of a
 /// loss that adds all pixels.
-fn shares(
+pub(crate) fn shares(
     splats: &Splats,
     views: &[FitView<'_>],
     raster: &RasterOptions,

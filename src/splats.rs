@@ -192,6 +192,18 @@ impl Splats {
         Ok(Self { rows, sh, gain, sh_degree, sh_basis })
     }
 
+    /// Returns the splats of `indices`, each with an SH set of its own.
+    pub(crate) fn selected(&self, indices: &[usize]) -> Self {
+        let channels = self.gain_channels();
+        let mut chosen = Self { rows: Vec::new(), sh: Vec::new(), gain: Vec::new(), ..*self };
+        for &i in indices {
+            chosen.rows.extend_from_slice(self.row(i));
+            chosen.sh.extend_from_slice(self.sh_of(i));
+            chosen.gain.extend_from_slice(&self.gain[i * channels..(i + 1) * channels]);
+        }
+        chosen
+    }
+
     /// Returns the packed rows `[N, 11]`: mean 3, quaternion wxyz 4, σ 3, opacity 1.
     pub fn rows(&self) -> &[f32] {
         &self.rows

@@ -186,6 +186,49 @@ pub fn residuals(
     out
 }
 
+/// δ `[N, 3]` of `means` `[N, 3]` whose parents have different numbers of children. `parents` `[N]`,
+/// in ascending order, are indices in the order of [`residuals`], `sides` their numbers of children a
+/// side, 0 to 255; `per_view` parents per view.
+pub fn mixed_residuals(
+    views: &[SourceView<'_>],
+    means: &[f32],
+    per_view: usize,
+    parents: &[u32],
+    sides: &[u8],
+) -> Vec<f32> {
+    debug_assert_eq!((means.len(), sides.len()), (3 * parents.len(), per_view * views.len()));
+    let mut out = vec![0.0f32; means.len()];
+    for (v, view) in views.iter().enumerate() {
+        let k = &view.camera.intrinsics;
+        let pixels = k.width * k.height;
+        let per_pixel = per_view / pixels.max(1);
+        if per_pixel == 0 {
+            continue;
+        }
+        let first = v * per_view;
+        let used =
+            |side: usize| sides[first..first + per_view].iter().any(|s| usize::from(*s) == side);
+        // The only child of a parent lies in its pixel's middle: no detail.
+        let most = sides.iter().copied().max().map_or(0, usize::from);
+        let prepared: Vec<Option<Prepared<'_>>> = (0..=most)
+            .map(|side| (side > 1 && used(side)).then(|| Prepared::new(view, side)))
+            .collect();
+        let end = |limit: usize| parents.partition_point(|p| (*p as usize) < limit);
+        let (begin, end) = (end(first), end(first + per_view));
+        let children = parents[begin..end].par_iter().zip(means[3 * begin..3 * end].par_chunks(3));
+        out[3 * begin..3 * end].par_chunks_mut(3).zip(children).with_min_len(1024).for_each(
+            |(out, (parent, mean))| {
+                let parent = *parent as usize;
+                let Some(prepared) = &prepared[usize::from(sides[parent])] else { return };
+                let pixel = ((parent - first) / per_pixel).min(pixels - 1);
+                let delta = prepared.residual(Vec3::from_slice(mean), pixel);
+                out.copy_from_slice(&delta.to_array());
+            },
+        );
+    }
+    out
+}
+
 /// `[N, 4]` of γ and δ as the renderer takes it: `gain` of 0 (γ = 1), N or 4·N floats
 /// with `delta` `[N, 3]` added to whatever residual is there.
 pub fn with_residuals(gain: &[f32], delta: &[f32]) -> Vec<f32> {
@@ -240,6 +283,33 @@ mod tests {
 
     fn view<'a>(turn: f32, pixels: &'a [f32], w: usize, h: usize) -> SourceView<'a> {
         SourceView { camera: camera(turn), photograph: Photograph::new(pixels, w, h) }
+    }
+
+    #[test]
+    fn mixed_children_have_the_residuals_of_their_grid() {
+        let photos = [noise(3 * W * H * 16, 1), noise(3 * W * H * 16, 2)];
+        let views = [view(0.0, &photos[0], W * 4, H * 4), view(0.7, &photos[1], W * 4, H * 4)];
+        let sides: Vec<u8> = (0..2 * W * H).map(|i| [4, 1, 2, 0][i % 4]).collect();
+        let of_side = |side: usize| -> (Vec<f32>, Vec<f32>) {
+            let mut means = children(&views[0].camera, side);
+            means.extend(children(&views[1].camera, side));
+            let delta = residuals(&views, &means, W * H, side * side, side);
+            (means, delta)
+        };
+        let all = [1, 2, 4].map(of_side);
+        let (mut means, mut want, mut parents) = (Vec::new(), Vec::new(), Vec::new());
+        for (i, side) in sides.iter().enumerate().filter(|(_, side)| **side > 0) {
+            let k = 3 * usize::from(*side).pow(2);
+            let (own, delta) = &all[usize::from(*side) / 2];
+            means.extend_from_slice(&own[i * k..(i + 1) * k]);
+            want.extend_from_slice(&delta[i * k..(i + 1) * k]);
+            parents.extend(std::iter::repeat_n(i as u32, k / 3));
+        }
+        let got = mixed_residuals(&views, &means, W * H, &parents, &sides);
+        assert!(want.iter().any(|d| d.abs() > 0.1));
+        for (g, w) in got.iter().zip(&want) {
+            assert!((g - w).abs() < 1e-5, "{g} {w}");
+        }
     }
 
     #[test]

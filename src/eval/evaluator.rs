@@ -17,8 +17,8 @@ use crate::model::subsplat::feature_channels;
 use crate::model::trunk::Trunk;
 use crate::model::weights::Weights;
 use crate::pipeline::{
-    DepthBounds, DepthRange, Error, Photo, Reconstructor, Refine, Result, add_detail,
-    fit_to_inputs, refine_on_inputs,
+    Density, DepthBounds, DepthRange, Encoded, Error, Photo, Reconstructor, Refine, Result,
+    SceneChildren, add_detail, fit_to_inputs, refine_on_inputs, sides_of,
 };
 use crate::refine::Refiner;
 use crate::render::{Renderer, render_with};
@@ -44,6 +44,8 @@ pub struct Options {
     pub lr_from: LrFrom,
     /// Disturbances of the inputs, in order.
     pub disturbances: Vec<Disturbance>,
+    /// Number of the model's Gaussians.
+    pub density: Density,
 }
 
 impl Options {
@@ -63,6 +65,7 @@ impl Options {
             rule: CropRule::Exact,
             lr_from: LrFrom::HrCrop,
             disturbances: Vec::new(),
+            density: Density::Full,
         }
     }
 }
@@ -201,7 +204,8 @@ impl Evaluator {
             coverage += pictures.coverage / crops.inputs.len() as f64;
         }
         let cameras: Vec<Camera> = crops.inputs.iter().map(|c| c.target_camera).collect();
-        let statistics = pictures.splats.as_ref().and_then(|s| SplatStatistics::new(s, &cameras));
+        let statistics = pictures.splats.as_ref();
+        let statistics = statistics.and_then(|c| SplatStatistics::new(&c.splats, &cameras));
         Ok(InputReport {
             inputs: Score::mean(&scores),
             gaussians: statistics.map(|s| GaussianReport::new(&s, coverage)),
@@ -299,9 +303,10 @@ struct PictureMaker<'a> {
     /// Mean colour of the inputs.
     colour: [f32; 3],
     network: Option<Network<'a>>,
+    density: Density,
     /// The set that `splats` holds.
     current: Option<Set>,
-    splats: Option<Splats>,
+    splats: Option<SceneChildren>,
     rasterizer: Rasterizer,
     /// Mean alpha of the last rendered picture.
     coverage: f64,
@@ -324,6 +329,8 @@ enum Set {
     Refined,
     /// The children of two inputs alone, with detail.
     Pair([usize; 2]),
+    Opaque,
+    Random,
     Parents,
     Uniform,
 }
@@ -340,6 +347,8 @@ impl Set {
             Method::Fit => Some(Self::Fitted),
             Method::Refine => Some(Self::Refined),
             Method::Pair => nearest_two(inputs, camera).map(Self::Pair),
+            Method::Opaque => Some(Self::Opaque),
+            Method::Random => Some(Self::Random),
             Method::Backbone | Method::Lowpass | Method::Bilinear => Some(Self::Parents),
             Method::Uniform => Some(Self::Uniform),
             Method::Copy | Method::Mean | Method::Other { .. } => None,
@@ -367,6 +376,7 @@ impl<'a> PictureMaker<'a> {
             bounds,
             colour: Rgb::mean_colour(crops.inputs.iter().map(|c| &c.input)),
             network,
+            density: evaluator.options.density,
             current: None,
             splats: None,
             rasterizer: Rasterizer::new(),
@@ -388,13 +398,15 @@ impl<'a> PictureMaker<'a> {
                 self.refined(network, splats, crops, &REFINED_IN_ORDER[from + 1..=to])?
             }
             (_, Some(to), _) => {
-                let children = network.splats(Set::Children, self.r)?;
+                let raster = self.raster_options(network, 1, None);
+                let children = network.children(&crops.inputs, self.density, &raster)?;
                 self.refined(network, children, crops, &REFINED_IN_ORDER[1..=to])?
             }
-            (_, None, _) => match set {
+            (_, None, _) => SceneChildren::of_splats(match set {
                 Set::Pair(pair) => network.splats_of_pair(pair, crops)?,
+                Set::Opaque | Set::Random => self.reduced(network, crops, set)?,
                 _ => network.splats(set, self.r)?,
-            },
+            }),
         };
         (self.current, self.splats) = (Some(set), Some(splats));
         Ok(())
@@ -404,33 +416,61 @@ impl<'a> PictureMaker<'a> {
     fn refined(
         &self,
         network: &Network<'_>,
-        mut splats: Splats,
+        mut children: SceneChildren,
         crops: &Crops,
         sets: &[Set],
-    ) -> Result<Splats> {
+    ) -> Result<SceneChildren> {
         let (inputs, upscale) = (&crops.inputs, network.model.config().upscale);
         let raster = self.raster_options(network, self.r, None);
         let mut renderer = Renderer::default();
         for set in sets {
-            let (splats, renderer) = (&mut splats, &mut renderer);
+            let renderer = &mut renderer;
             match set {
                 Set::Detailed => {
-                    add_detail(splats, inputs, upscale)?;
+                    children.add_detail(inputs, upscale)?;
                 }
                 Set::Fitted => {
                     let options = FitOptions::default();
                     let mut progress = |_: usize| ControlFlow::Continue(());
+                    let splats = &mut children.splats;
                     fit_to_inputs(splats, inputs, &raster, &options, renderer, &mut progress)?;
                 }
                 _ => {
                     // As `run`: none of more Gaussians than `Auto` refines.
-                    let options = Refine::Auto.options_for(inputs.len(), splats.len(), true);
+                    let regular = children.is_regular();
+                    let SceneChildren { splats, groups, .. } = &mut children;
+                    let mut options = Refine::Auto.options_for(inputs.len(), splats.len(), true);
+                    if !regular {
+                        options.least_share = 0.0;
+                    }
+                    let (raster, how) = (&raster, &options);
                     let mut progress = |_: &Refiner<'_>| ControlFlow::Continue(());
-                    refine_on_inputs(splats, inputs, &raster, &options, renderer, &mut progress)?;
+                    refine_on_inputs(splats, groups, inputs, raster, how, renderer, &mut progress)?;
                 }
             }
         }
-        Ok(splats)
+        Ok(children)
+    }
+
+    /// The Gaussians of [`Set::Detailed`] at full density, as many as the density allows: those of
+    /// the highest opacities ([`Set::Opaque`]), or random ones.
+    fn reduced(&self, network: &Network<'_>, crops: &Crops, set: Set) -> Result<Splats> {
+        let raster = self.raster_options(network, 1, None);
+        let mut children = network.children(&crops.inputs, Density::Full, &raster)?;
+        let upscale = network.model.config().upscale;
+        children.add_detail(&crops.inputs, upscale)?;
+        let splats = children.splats;
+        let limit = self.density.limit(splats.parents(), upscale);
+        let rank = |i: usize| match set {
+            Set::Opaque => f64::from(splats.opacity(i)),
+            // The fractional part of multiples of the golden ratio is spread evenly.
+            _ => (i as f64 * 0.618_033_988_749_895).fract(),
+        };
+        let mut order: Vec<usize> = (0..splats.len()).collect();
+        order.sort_by(|a, b| rank(*b).total_cmp(&rank(*a)));
+        order.truncate(limit);
+        order.sort_unstable();
+        Ok(splats.selected(&order))
     }
 
     fn picture(&mut self, method: &Method, crops: &Crops, target: &Cropped) -> Vec<f32> {
@@ -462,11 +502,11 @@ impl<'a> PictureMaker<'a> {
 
     /// Renders the current Gaussians from `camera`, whose pixels are 1/`ratio` input pixels.
     fn render(&mut self, camera: &Camera, ratio: usize, reference: Option<LowpassRef>) -> Vec<f32> {
-        let (Some(network), Some(splats)) = (&self.network, &self.splats) else {
+        let (Some(network), Some(children)) = (&self.network, &self.splats) else {
             return Vec::new();
         };
         let options = self.raster_options(network, ratio, reference);
-        let picture = render_with(&mut self.rasterizer, splats, camera, &options);
+        let picture = render_with(&mut self.rasterizer, &children.splats, camera, &options);
         let alpha: f64 = picture.alpha.iter().copied().map(f64::from).sum();
         self.coverage = alpha / picture.alpha.len().max(1) as f64;
         picture.rgb
@@ -474,6 +514,21 @@ impl<'a> PictureMaker<'a> {
 }
 
 impl Network<'_> {
+    /// The model's Gaussians, without detail. `raster` renders pictures of the input's size.
+    fn children(
+        &self,
+        inputs: &[Cropped],
+        density: Density,
+        raster: &RasterOptions,
+    ) -> Result<SceneChildren> {
+        let Self { views, output, parents: primaries, .. } = self;
+        let (network, encoded) = (self.model.model(), Encoded { views, output, primaries });
+        let mut renderer = Renderer::default();
+        let sides = sides_of(network, &encoded, inputs, density, raster, &mut renderer)?;
+        Ok(SceneChildren::new(network, &encoded, inputs.len(), sides, &|| Ok(()))?)
+    }
+
+    /// Gaussians of a baseline.
     fn splats(&self, set: Set, r: usize) -> Result<Splats> {
         let mut config = self.model.config().clone();
         let own;

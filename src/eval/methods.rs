@@ -21,6 +21,11 @@ pub enum Method {
     Refine,
     /// The model with detail on the two inputs nearest to the target alone.
     Pair,
+    /// The Gaussians of [`Method::Detail`] at full density, without those of the least opacities: as
+    /// many as [`super::Options::density`] allows.
+    Opaque,
+    /// The same without Gaussians chosen at random, the same ones in every run.
+    Random,
     /// Its backbone's Gaussians, one a pixel, rendered at the target's size.
     Backbone,
     /// The same with the low-pass scaled to the input: r² times as many target px².
@@ -46,12 +51,14 @@ pub enum Method {
 }
 
 /// Names of the methods that need no files, in the order of the tables.
-pub(crate) const NAMED: [(&str, Method); 11] = [
+pub(crate) const NAMED: [(&str, Method); 13] = [
     ("subsplat", Method::Subsplat),
     ("detail", Method::Detail),
     ("fit", Method::Fit),
     ("refine", Method::Refine),
     ("pair", Method::Pair),
+    ("opaque", Method::Opaque),
+    ("random", Method::Random),
     ("backbone", Method::Backbone),
     ("lowpass", Method::Lowpass),
     ("bilinear", Method::Bilinear),

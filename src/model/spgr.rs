@@ -6,10 +6,11 @@
 //! * `mlp2`: `norm`, `lin0`, GELU, `lin1` to K·9 or K·2.
 //! * `pg`: (Linear, ReLU, Linear, ReLU, LayerNorm) twice, Linear: `lin0` … `lin4`,
 //!   `ln0`, `ln1`.
-//! * `polynomial`: `mlp2` whose `lin1` holds one layer for each of 18 terms. The layer of child k is
-//!   Σ_b φ_b(g_k, K)·`lin1`_b. The terms are the products of {1, t, t² − 1} of t = 4·g_x, the same of
-//!   4·g_y, and {1, κ}, κ = log₂ √K − 1. At K = 4, t = ±1 and κ = 0, so four terms remain. They
-//!   determine the four children independently, as `mlp2` does.
+//! * `polynomial`: `mlp2` whose last layer depends on the child. With g_k the sub-pixel's position,
+//!   t = 4·g_x, u = 4·g_y and κ = log₂ √K − 1, it is the bilinear interpolation of the four layers
+//!   `lin1`, which lie at t, u = ±1, plus Σ_b φ_b(t, u, κ)·`lin2`_b. The 14 terms φ are the products of
+//!   one of {1, t, t² − 1}, one of {1, u, u² − 1} and one of {1, κ}, without the four bilinear ones. At
+//!   K = 4 all of them are 0, so `lin1` alone gives the four children, as in `mlp2`.
 //! * `coord`: hid_k = GELU(lin0·norm(x) + c_k), o_k = lin1·hid_k, with
 //!   c_k = `pos1`·GELU(`pos0`·posenc(g_k)) of the sub-pixel's position g_k. The
 //!   parameters do not depend on K.
@@ -27,10 +28,8 @@ use candle_nn::{Init, Linear, VarBuilder};
 const OCTAVES: usize = 4;
 /// Width of the positional encoding: x, y, and their sines and cosines.
 const POSENC: usize = 2 + 4 * OCTAVES;
-/// Functions of one coordinate in `polynomial`: 1, t, t² − 1.
-const AXIS_TERMS: usize = 3;
-/// Terms of `polynomial`: products of the functions of x, of y, and of {1, κ}.
-const TERMS: usize = 2 * AXIS_TERMS * AXIS_TERMS;
+/// Layers of `polynomial`: four of `lin1`, 14 of `lin2`.
+const LAYERS: [usize; 2] = [4, 14];
 
 #[derive(Clone, Debug)]
 enum Form {
@@ -49,11 +48,11 @@ enum Form {
         lin1: Linear,
         pos: [Linear; 2],
     },
-    /// `lin1` maps to 18·`outputs` numbers, term by term.
+    /// The last two map to 4·`outputs` and 14·`outputs` numbers, layer by layer.
     Polynomial {
         norm: LayerNorm,
         lin0: Linear,
-        lin1: Linear,
+        last: [Linear; 2],
     },
 }
 
@@ -83,7 +82,10 @@ impl Head {
             SpgrHead::Polynomial => Form::Polynomial {
                 norm: LayerNorm::new(e, vb.pp("norm"))?,
                 lin0: linear(e, h, kaiming, vb.pp("lin0"))?,
-                lin1: linear(h, TERMS * outputs, last, vb.pp("lin1"))?,
+                last: [
+                    linear(h, LAYERS[0] * outputs, last, vb.pp("lin1"))?,
+                    linear(h, LAYERS[1] * outputs, Init::Const(0.0), vb.pp("lin2"))?,
+                ],
             },
             SpgrHead::Pg => {
                 let widths = [(e, h), (h, h), (h, h), (h, h), (h, all)];
@@ -111,16 +113,25 @@ impl Head {
 
     /// Returns the head for r = `side`: `polynomial` becomes `mlp2`, other forms stay.
     fn for_side(&self, side: usize) -> Result<Self> {
-        let Form::Polynomial { norm, lin0, lin1 } = &self.form else { return Ok(self.clone()) };
-        let (weight, k) = (lin1.weight(), side * side);
-        let terms = terms(side, weight)?;
-        let hidden = weight.dim(1)?;
-        let of_children = |t: &Tensor, width: usize| terms.matmul(&t.reshape((TERMS, width))?);
-        let bias = match lin1.bias() {
-            Some(bias) => Some(of_children(bias, self.outputs)?.flatten_all()?),
+        let Form::Polynomial { norm, lin0, last } = &self.form else { return Ok(self.clone()) };
+        let k = side * side;
+        let hidden = last[0].weight().dim(1)?;
+        // Layers of the children: sums of the given ones.
+        let summed =
+            |part: fn(&Linear) -> Option<&Tensor>, width: usize| -> Result<Option<Tensor>> {
+                let [Some(four), Some(further)] = [part(&last[0]), part(&last[1])] else {
+                    return Ok(None);
+                };
+                let [bilinear, terms] = factors(side, four)?;
+                let four = bilinear.matmul(&four.reshape((LAYERS[0], width))?)?;
+                Ok(Some((four + terms.matmul(&further.reshape((LAYERS[1], width))?)?)?))
+            };
+        let weight = summed(|layer| Some(layer.weight()), self.outputs * hidden)?;
+        let Some(weight) = weight else { bail!("head: expected a weight, got none") };
+        let bias = match summed(Linear::bias, self.outputs)? {
+            Some(bias) => Some(bias.flatten_all()?),
             None => None,
         };
-        let weight = of_children(weight, self.outputs * hidden)?;
         let lin1 = Linear::new(weight.reshape((k * self.outputs, hidden))?, bias);
         let form = Form::Mlp2 { norm: norm.clone(), lin0: lin0.clone(), lin1 };
         Ok(Self { form, outputs: self.outputs })
@@ -183,21 +194,31 @@ fn posenc(side: usize, like: &Tensor) -> Result<Tensor> {
     Tensor::from_vec(table, (side * side, POSENC), like.device())?.to_dtype(like.dtype())
 }
 
-/// Values of the terms of `polynomial` for each child: `[r², 18]`, dtype of `like`.
-fn terms(side: usize, like: &Tensor) -> Result<Tensor> {
-    let axis = |i: usize| {
-        let t = 4.0 * ((i as f32 + 0.5) / side as f32 - 0.5);
-        [1.0, t, t * t - 1.0]
-    };
+/// Factors of the layers of `polynomial` for each child: `[r², 4]` and `[r², 14]`, dtype of `like`.
+fn factors(side: usize, like: &Tensor) -> Result<[Tensor; 2]> {
     let kappa = (side as f32).log2() - 1.0;
-    let mut table = Vec::with_capacity(side * side * TERMS);
+    let axis = |i: usize| 4.0 * ((i as f32 + 0.5) / side as f32 - 0.5);
+    let towards = |at: f32, second: bool| 0.5 * if second { 1.0 + at } else { 1.0 - at };
+    let (mut bilinear, mut terms) = (Vec::new(), Vec::new());
     for k in 0..side * side {
-        let (x, y) = (axis(k % side), axis(k / side));
-        for factor in [1.0, kappa] {
-            table.extend(y.iter().flat_map(|y| x.map(|x| factor * x * y)));
+        let (t, u) = (axis(k % side), axis(k / side));
+        let corners = (0..LAYERS[0]).map(|c| towards(t, c % 2 == 1) * towards(u, c / 2 == 1));
+        bilinear.extend(corners);
+        for (power, factor) in [1.0, kappa].into_iter().enumerate() {
+            for (j, by_u) in [1.0, u, u * u - 1.0].into_iter().enumerate() {
+                for (i, by_t) in [1.0, t, t * t - 1.0].into_iter().enumerate() {
+                    // The bilinear terms without κ belong to the four layers.
+                    if power == 1 || i == 2 || j == 2 {
+                        terms.push(factor * by_t * by_u);
+                    }
+                }
+            }
         }
     }
-    Tensor::from_vec(table, (side * side, TERMS), like.device())?.to_dtype(like.dtype())
+    let table = |values: Vec<f32>, width: usize| {
+        Tensor::from_vec(values, (side * side, width), like.device())?.to_dtype(like.dtype())
+    };
+    Ok([table(bilinear, LAYERS[0])?, table(terms, LAYERS[1])?])
 }
 
 /// Both heads.

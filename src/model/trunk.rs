@@ -4,8 +4,10 @@
 //!
 //! Parameters under `subsplat`: `embed`, `agg`, `geo`, `app`; none with SPGR off.
 
+mod mixed;
 mod recompute;
 
+pub use mixed::MixedChildren;
 pub use recompute::Recomputed;
 
 use super::aggregation::{Aggregation, Prepared, ring};
@@ -249,7 +251,7 @@ impl Trunk {
         primaries: &Primaries,
         checkpoint: Checkpoint<'_>,
     ) -> Result<Children> {
-        let Some(parts) = self.parts() else { return self.pass_through(views, primaries) };
+        let Some(parts) = self.parts() else { return self.parents(views, primaries) };
         let scene = self.scene(parts, views, backbone, primaries)?;
         checkpoint()?;
         let sh = interleaved(&primaries.sh)?;
@@ -387,7 +389,7 @@ impl Trunk {
         primaries: &Primaries,
         TrainPass { chunk, seed }: TrainPass,
     ) -> Result<Children> {
-        let Some(parts) = self.parts() else { return self.pass_through(views, primaries) };
+        let Some(parts) = self.parts() else { return self.parents(views, primaries) };
         let scene = self.scene(parts, views, backbone, primaries)?;
         let (mut rows, mut gains) = (Vec::new(), Vec::new());
         for span in chunks(scene.means.dim(0)?, scene.per_view, chunk.max(1)) {
@@ -472,8 +474,11 @@ impl Trunk {
         Ok(Records { head, parents: parents.rows()? })
     }
 
-    /// The primaries as their own children, K = 1.
-    fn pass_through(&self, views: &Views, primaries: &Primaries) -> Result<Children> {
+    /// Returns the primaries of the one scene in `views` as their own children, K = 1.
+    ///
+    /// # Errors
+    /// More than one scene; shapes that do not fit.
+    pub fn parents(&self, views: &Views, primaries: &Primaries) -> Result<Children> {
         check_single(views, primaries)?;
         let opacities = primaries.opacities.unsqueeze(2)?;
         let rows = [&primaries.means, &primaries.quats_wxyz, &primaries.scales, &opacities];

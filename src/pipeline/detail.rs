@@ -1,7 +1,7 @@
 //! Colour detail from photographs that are larger than the network's input.
 
 use super::{Error, Result};
-use crate::cpu::detail::{Photograph, SourceView, residuals, with_residuals};
+use crate::cpu::detail::{Photograph, SourceView, mixed_residuals, residuals, with_residuals};
 use crate::data::crop::Cropped;
 use crate::splats::Splats;
 
@@ -17,6 +17,32 @@ fn has_detail(c: &Cropped) -> bool {
 /// # Errors
 /// A photograph without pixels.
 pub(crate) fn add_detail(splats: &mut Splats, inputs: &[Cropped], upscale: usize) -> Result<bool> {
+    let per_view = splats.parents() / inputs.len().max(1);
+    let children = splats.children_per_parent();
+    add(splats, inputs, |sources, means| residuals(sources, means, per_view, children, upscale))
+}
+
+/// [`add_detail`] for Gaussians with the given `parents`, which have `sides`² children
+/// ([`mixed_residuals`]).
+///
+/// # Errors
+/// A photograph without pixels.
+pub(crate) fn add_mixed(
+    splats: &mut Splats,
+    inputs: &[Cropped],
+    parents: &[u32],
+    sides: &[u8],
+) -> Result<bool> {
+    let per_view = sides.len() / inputs.len().max(1);
+    add(splats, inputs, |sources, means| mixed_residuals(sources, means, per_view, parents, sides))
+}
+
+/// Adds the residuals that `of` returns for the sources and the means `[N, 3]`.
+fn add(
+    splats: &mut Splats,
+    inputs: &[Cropped],
+    of: impl FnOnce(&[SourceView<'_>], &[f32]) -> Vec<f32>,
+) -> Result<bool> {
     if !inputs.iter().any(has_detail) {
         return Ok(false);
     }
@@ -33,9 +59,7 @@ pub(crate) fn add_detail(splats: &mut Splats, inputs: &[Cropped], upscale: usize
         sources.push(SourceView { photograph, camera: c.input_camera });
     }
     let means: Vec<f32> = splats.means().flatten().collect();
-    let per_view = splats.parents() / inputs.len().max(1);
-    let children = splats.children_per_parent();
-    let delta = residuals(&sources, &means, per_view, children, upscale);
+    let delta = of(&sources, &means);
     splats.gain = with_residuals(&splats.gain, &delta);
     Ok(true)
 }

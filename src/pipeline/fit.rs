@@ -6,10 +6,10 @@ use crate::camera::Camera;
 use crate::data::crop::Cropped;
 use crate::fit::{FitError, FitOptions, FitReport, FitView, fit};
 use crate::io::image::Rgb;
-use crate::refine::{RefineOptions, RefineReport, Refiner, refine};
+use crate::refine::{RefineOptions, RefineReport, Refiner, refine_groups};
 use crate::render::Renderer;
 use crate::splats::Splats;
-use std::ops::ControlFlow;
+use std::ops::{ControlFlow, Range};
 
 /// The largest picture of `c` that is no enlargement of the photograph, with its camera: the
 /// target's size, else the input's.
@@ -36,20 +36,22 @@ pub(crate) fn fit_to_inputs(
     fit(splats, &views_of(inputs), raster, options, renderer, progress).map_err(error)
 }
 
-/// Refines the Gaussians of `inputs` on their photographs. `progress` receives the refinement after
-/// each step.
+/// Refines the Gaussians of `inputs`, those of each photograph in `groups`, on their photographs.
+/// `progress` receives the refinement after each step.
 ///
 /// # Errors
 /// [`Error::Cancelled`]; a picture of another size than its camera.
 pub(crate) fn refine_on_inputs(
     splats: &mut Splats,
+    groups: &mut Vec<Range<usize>>,
     inputs: &[Cropped],
     raster: &RasterOptions,
     options: &RefineOptions,
     renderer: &mut Renderer,
     progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
 ) -> Result<RefineReport> {
-    refine(splats, &views_of(inputs), raster, options, renderer, progress).map_err(error)
+    refine_groups(splats, groups, &views_of(inputs), raster, options, renderer, progress)
+        .map_err(error)
 }
 
 fn views_of(inputs: &[Cropped]) -> Vec<FitView<'_>> {

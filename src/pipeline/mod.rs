@@ -36,6 +36,8 @@
 //! [`Reconstructor::run`] executes all of them. [`Reconstructor::prepare`] executes steps 1 to 3;
 //! the caller can then free large photographs before the network runs.
 
+mod children;
+mod density;
 mod depth_range;
 mod detail;
 mod error;
@@ -53,6 +55,7 @@ mod reconstructor;
 mod warning;
 
 pub use crate::model::Backend;
+pub use density::Density;
 pub use depth_range::{DepthBounds, DepthRange, DepthSource};
 pub use error::{Error, Result};
 pub use input_size::InputSize;
@@ -68,6 +71,7 @@ pub use reconstruction::Reconstruction;
 pub use reconstructor::Reconstructor;
 pub use warning::Warning;
 
+pub(crate) use children::{Encoded, SceneChildren, sides_of};
 pub(crate) use depth_range::{initial_bounds, refined_bounds};
 pub(crate) use detail::add_detail;
 pub(crate) use fit::{fit_to_inputs, refine_on_inputs};

@@ -1,6 +1,6 @@
 //! Options of a reconstruction.
 
-use super::{DepthBounds, DepthRange, Error, InputSize, Result, initial_bounds};
+use super::{Density, DepthBounds, DepthRange, Error, InputSize, Result, initial_bounds};
 use crate::camera::Camera;
 use crate::fit::FitOptions;
 use crate::refine::RefineOptions;
@@ -25,6 +25,8 @@ pub struct Options {
     /// Size of the target pictures, which also is the size of the photographs that the fit and the
     /// refinement read. Default: [`TargetSize::Upscaled`].
     pub target_size: TargetSize,
+    /// Number of Gaussians. Default: [`Density::Full`].
+    pub density: Density,
     /// Ends of the depth range that the caller fixes. Default: [`DepthRange::Auto`].
     pub depth_range: DepthRange,
     /// Depth range that a file suggests, used for the ends that `depth_range` leaves open.
@@ -61,6 +63,12 @@ impl Options {
     #[must_use]
     pub fn with_target_size(self, target_size: TargetSize) -> Self {
         Self { target_size, ..self }
+    }
+
+    /// Sets [`Options::density`].
+    #[must_use]
+    pub fn with_density(self, density: Density) -> Self {
+        Self { density, ..self }
     }
 
     /// Sets [`Options::depth_range`].

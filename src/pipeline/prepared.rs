@@ -2,8 +2,8 @@
 
 use super::progress::Tracker;
 use super::{
-    DepthBounds, Detail, Options, Progress, Reconstruction, Reconstructor, Result, Stage, Warning,
-    add_detail, fit_to_inputs, refine_on_inputs,
+    DepthBounds, Detail, Encoded, Options, Progress, Reconstruction, Reconstructor, Result,
+    SceneChildren, Stage, Warning, fit_to_inputs, refine_on_inputs, sides_of,
 };
 use crate::camera::Camera;
 use crate::check::PairReport;
@@ -101,29 +101,36 @@ impl Prepared<'_> {
         tracker.begin(Stage::Primaries, progress)?;
         let primaries = network.primaries(&views, &output)?;
         tracker.begin(Stage::Subsplat, progress)?;
-        let trunk = network.trunk();
-        let children = tracker.run_steps(trunk.steps(&primaries), progress, |step| {
-            trunk.forward_with(&views, &output, &primaries, step)
+        let config = model.config();
+        let colour = Rgb::mean_colour(inputs.iter().map(|c| &c.input));
+        let raster_at = |ratio: f32| config.raster_options(ratio, bounds.near, colour);
+        let mut renderer = Renderer::new(model.backend());
+        let encoded = Encoded { views: &views, output: &output, primaries: &primaries };
+        let density = options.density;
+        let sides = sides_of(network, &encoded, &inputs, density, &raster_at(1.0), &mut renderer)?;
+        let steps = network.trunk().steps(&primaries);
+        let mut children = tracker.run_steps(steps, progress, |step| {
+            SceneChildren::new(network, &encoded, inputs.len(), sides, step)
         })?;
         let distances = output.depths.narrow(3, 0, 1)?.squeeze(3)?.squeeze(0)?.to_vec2()?;
         drop((views, output, primaries));
-        let mut splats = children.to_splats()?;
-        drop(children);
-        let config = model.config();
         let mut detail = Detail::Off;
         if options.detail == Detail::Photographs {
             tracker.begin(Stage::Detail, progress)?;
-            if add_detail(&mut splats, &inputs, config.upscale)? {
+            if children.add_detail(&inputs, config.upscale)? {
                 detail = Detail::Photographs;
             }
         }
-        let colour = Rgb::mean_colour(inputs.iter().map(|c| &c.input));
-        let ratio = inputs.first().map_or(1.0, Cropped::ratio);
-        let raster_options = config.raster_options(ratio, bounds.near, colour);
+        let regular = children.is_regular();
+        let SceneChildren { mut splats, mut groups, .. } = children;
+        let raster_options = raster_at(inputs.first().map_or(1.0, Cropped::ratio));
         let (mut fit, mut refinement) = (None, None);
-        let (fit_options, refine_options) =
+        let (fit_options, mut refine_options) =
             (&options.fit, options.refine_options(inputs.len(), splats.len()));
-        let mut renderer = Renderer::new(model.backend());
+        if !regular {
+            // Hidden parents were removed before.
+            refine_options.least_share = 0.0;
+        }
         if fit_options.steps > 0 {
             tracker.begin(Stage::Fit, progress)?;
             let mut part = tracker.parts(progress);
@@ -137,8 +144,9 @@ impl Prepared<'_> {
             let mut part = tracker.parts(progress);
             let mut step = |refiner: &Refiner<'_>| part(refiner.progress());
             let (raster, how) = (&raster_options, &refine_options);
+            let (splats, groups) = (&mut splats, &mut groups);
             let done =
-                refine_on_inputs(&mut splats, &inputs, raster, how, &mut renderer, &mut step)?;
+                refine_on_inputs(splats, groups, &inputs, raster, how, &mut renderer, &mut step)?;
             refinement = Some(done);
         }
         warnings.extend(renderer.take_warning().map(|reason| Warning::CpuInsteadOfGpu { reason }));
@@ -148,6 +156,8 @@ impl Prepared<'_> {
         warnings.extend(model.backend_warning());
         Ok(Reconstruction {
             splats,
+            groups,
+            regular,
             inputs,
             adjustment,
             cut_shares,

@@ -12,7 +12,7 @@ use crate::poses::PoseAdjustment;
 use crate::refine::{RefineReport, Refiner};
 use crate::render::{Picture, Renderer, comment_of_camera, comment_of_options, render};
 use crate::splats::Splats;
-use std::ops::ControlFlow;
+use std::ops::{ControlFlow, Range};
 use std::path::Path;
 
 /// A reconstructed scene: Gaussians, the rules to render them, and a record of how they were
@@ -20,6 +20,10 @@ use std::path::Path;
 #[derive(Clone, Debug)]
 pub struct Reconstruction {
     pub(super) splats: Splats,
+    /// Gaussians of each photograph.
+    pub(super) groups: Vec<Range<usize>>,
+    /// Every parent has the same number of children.
+    pub(super) regular: bool,
     pub(super) inputs: Vec<Cropped>,
     pub(super) adjustment: Option<PoseAdjustment>,
     pub(super) cut_shares: Vec<f32>,
@@ -81,10 +85,14 @@ impl Reconstruction {
         renderer: &mut Renderer,
         progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
     ) -> Result<RefineReport> {
-        let Self { splats, inputs, raster_options, fit, .. } = self;
-        let options = refine.options_for(inputs.len(), splats.len(), fit.is_some());
+        let Self { splats, groups, inputs, raster_options, fit, .. } = self;
+        let mut options = refine.options_for(inputs.len(), splats.len(), fit.is_some());
+        if !self.regular {
+            // The removal counts by parents, which have different numbers of children.
+            options.least_share = 0.0;
+        }
         let report =
-            refine_on_inputs(splats, inputs, raster_options, &options, renderer, progress)?;
+            refine_on_inputs(splats, groups, inputs, raster_options, &options, renderer, progress)?;
         self.refinement = Some(report);
         Ok(report)
     }

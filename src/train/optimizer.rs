@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 
 /// Options of the optimizer. Defaults: PyTorch's AdamW, clipping at 1, moving average 0.997.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
     /// Decay of the first and of the second moment.
@@ -29,6 +29,8 @@ pub struct Settings {
     pub backbone_rate: f64,
     /// Keeps the backbone constant. No gradient flows through it, and its depth losses are omitted.
     pub freeze_backbone: bool,
+    /// Ends of the names of the parameters that are trained; the others stay constant. Empty: all.
+    pub only: Vec<String>,
 }
 
 impl Default for Settings {
@@ -41,6 +43,7 @@ impl Default for Settings {
             average: 0.997,
             backbone_rate: 1.0,
             freeze_backbone: false,
+            only: Vec::new(),
         }
     }
 }
@@ -53,6 +56,7 @@ struct Slot {
     span: Range<usize>,
     decays: bool,
     backbone: bool,
+    frozen: bool,
 }
 
 /// All parameters of a model, in the order of their names, and the optimizer's state.
@@ -115,15 +119,24 @@ impl Optimizer {
     /// not start with `subsplat.`.
     ///
     /// # Errors
-    /// A variable that is not f32.
+    /// A variable that is not f32; an entry of [`Settings::only`] that names none.
     pub fn new(settings: Settings, variables: BTreeMap<String, Var>) -> Result<Self> {
+        let only = &settings.only;
+        if let Some(end) = only.iter().find(|end| !variables.keys().any(|n| n.ends_with(*end))) {
+            bail!(
+                "optimizer.only: expected ends of parameters' names, got `{end}`, which ends none"
+            );
+        }
         let (mut slots, mut values) = (Vec::new(), Vec::new());
         for (name, var) in variables {
             let start = values.len();
             values.extend(var.flatten_all()?.to_vec1::<f32>()?);
+            let backbone = !name.starts_with(crate::model::weights::SUBSPLAT_PREFIX);
+            let named = only.is_empty() || only.iter().any(|end| name.ends_with(end));
             slots.push(Slot {
                 decays: var.rank() >= 2,
-                backbone: !name.starts_with(crate::model::weights::SUBSPLAT_PREFIX),
+                backbone,
+                frozen: (backbone && settings.freeze_backbone) || !named,
                 span: start..values.len(),
                 name,
                 var,
@@ -157,7 +170,7 @@ impl Optimizer {
     /// A gradient that is not f32.
     pub fn collect(&self, store: &GradStore, gradients: &mut Gradients) -> Result<()> {
         for (i, slot) in self.slots.iter().enumerate() {
-            if slot.backbone && self.settings.freeze_backbone {
+            if slot.frozen {
                 continue;
             }
             let Some(gradient) = store.get(&slot.var) else { continue };
@@ -178,7 +191,7 @@ impl Optimizer {
     /// # Errors
     /// A tensor operation that fails.
     pub fn step(&mut self, gradients: &Gradients, norm: f64, rate: f64, step: u64) -> Result<()> {
-        let s = self.settings;
+        let s = &self.settings;
         let clip = if s.clip > 0.0 && norm > s.clip { s.clip / norm } else { 1.0 };
         let decay = s.average.min((1.0 + step as f64) / (10.0 + step as f64));
         let decay = if s.average > 0.0 { decay } else { 0.0 };

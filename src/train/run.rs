@@ -183,7 +183,7 @@ impl Training {
         };
         let learner = Learner::new(config, &weights)?;
         let untrained = weights.initialised().len();
-        let mut optimizer = Optimizer::new(config.optimizer, weights.variables())?;
+        let mut optimizer = Optimizer::new(config.optimizer.clone(), weights.variables())?;
         let mut progress = Progress::default();
         if let Some(path) = &newest {
             let old = checkpoint::load(path)?;

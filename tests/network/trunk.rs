@@ -553,52 +553,83 @@ fn heads_for_any_k_serve_any_grid_and_others_refuse() {
     assert!(fixed.set_upscale(4).unwrap_err().to_string().contains("expected 2"));
 }
 
-/// Heads of the form `polynomial` whose terms 1, x, y and xy come from the heads `mlp2` of four
-/// children give the same children at ×2, and the parents at ×1.
+/// Heads of the form `polynomial` give the children of `mlp2` at ×2, whatever the further layers are,
+/// and the parents at ×1.
 #[test]
 fn polynomial_heads_equal_fixed_ones_at_two_and_the_parents_at_one() {
     let scene = Scene::new(&cameras(2, SIZE, SIZE), 18);
     let mut c = config(Preset::Tuned, 2);
     let (fixed, variables) = trunk(&c, 19);
-    let mut tensors: std::collections::BTreeMap<String, Tensor> = variables
-        .data()
-        .lock()
-        .unwrap()
-        .iter()
-        .map(|(name, var)| (name.clone(), var.as_tensor().clone()))
-        .collect();
-    let signs = [(0, [1.0, 1.0, 1.0, 1.0]), (1, [-1.0, 1.0, -1.0, 1.0])];
-    let signs = [signs[0], signs[1], (3, [-1.0, -1.0, 1.0, 1.0]), (4, [1.0, -1.0, -1.0, 1.0])];
-    for head in ["geo", "app"] {
-        for part in ["weight", "bias"] {
-            let name = format!("subsplat.{head}.lin1.{part}");
-            let of_children = tensors[&name].clone();
-            let dims = of_children.dims().to_vec();
-            let size = of_children.elem_count() / 4;
-            let flat = of_children.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-            let mut terms = vec![0f32; 18 * size];
-            for (term, signs) in signs {
-                for i in 0..size {
-                    let sum: f32 = (0..4).map(|k| signs[k] * flat[k * size + i]).sum();
-                    terms[term * size + i] = sum / 4.0;
-                }
-            }
-            let dims: Vec<usize> =
-                std::iter::once(dims[0] / 4 * 18).chain(dims[1..].to_vec()).collect();
-            tensors.insert(name, Tensor::from_vec(terms, dims, &Device::Cpu).unwrap());
-        }
-    }
     c.spgr.head = SpgrHead::Polynomial;
-    let any = Weights::from_tensors(tensors);
-    let mut any = Trunk::new(&c, &channels(), any.builder()).unwrap();
+    let (_, further) = trunk(&c, 20);
+    let tensors = |variables: &VarMap| -> std::collections::BTreeMap<String, Tensor> {
+        let all = variables.data().lock().unwrap();
+        all.iter().map(|(name, var)| (name.clone(), var.as_tensor().clone())).collect()
+    };
+    let mut both = tensors(&further);
+    both.extend(tensors(&variables));
+    let weights = Weights::from_tensors(both);
+    let mut any = Trunk::new(&c, &channels(), weights.builder()).unwrap();
     let (got, want) = (scene.infer(&any), scene.infer(&fixed));
-    assert_close(&got.rows, &want.rows, 1e-5);
-    assert_close(&got.gain, &want.gain, 1e-5);
+    assert_close(&got.rows, &want.rows, 0.0);
+    assert_close(&got.gain, &want.gain, 0.0);
     any.set_upscale(1).unwrap();
     assert!(any.is_off());
     c.spgr.enabled = false;
     let parents = scene.infer(&Trunk::new(&c, &channels(), Weights::seeded(0).builder()).unwrap());
     assert_close(&scene.infer(&any).rows, &parents.rows, 0.0);
+}
+
+/// A parent with r² children has those of a run in which all parents have r² children.
+#[test]
+fn mixed_children_are_those_of_their_grid() {
+    let scene = Scene::new(&cameras(2, SIZE, SIZE), 21);
+    for preset in [Preset::Tuned, Preset::Paper] {
+        let mut c = config(preset, 2);
+        c.spgr.head = SpgrHead::Polynomial;
+        let (mut any, _) = trunk(&c, 22);
+        let mixed = |trunk: &Trunk, sides: &[u8]| {
+            let Scene { views, backbone, primaries } = &scene;
+            trunk.forward_mixed(views, backbone, primaries, sides, &|| Ok(()))
+        };
+        let sides: Vec<u8> = (0..512).map(|i| [2, 0, 1, 4, 1][i * i % 5]).collect();
+        let got = mixed(&any, &sides).unwrap();
+        let all: Vec<Option<Children>> = (0..5)
+            .map(|side| {
+                [1, 2, 4].contains(&side).then(|| {
+                    any.set_upscale(side).unwrap();
+                    scene.infer(&any)
+                })
+            })
+            .collect();
+        let all: Vec<_> = all.iter().map(|c| c.as_ref().map(|c| c.to_splats().unwrap())).collect();
+        let mut at = 0;
+        for (parent, side) in sides.iter().map(|s| usize::from(*s)).enumerate() {
+            let Some(of_side) = &all[side] else { continue };
+            for k in 0..side * side {
+                let i = parent * side * side + k;
+                assert_eq!(got.parents[at], parent as u32);
+                for (g, w) in got.splats.row(at).iter().zip(of_side.row(i)) {
+                    assert!(
+                        (g - w).abs() <= 1e-5 * w.abs().max(1.0),
+                        "{preset:?} {parent} {g} {w}"
+                    );
+                }
+                assert_eq!(got.splats.sh_of(at), of_side.sh_of(i));
+                let (gain, want) = (got.splats.gain_of(at).0, of_side.gain_of(i).0);
+                assert!((gain - want).abs() < 1e-5, "{preset:?} {parent}: gain {gain}, {want}");
+                at += 1;
+            }
+        }
+        assert_eq!(at, got.splats.len());
+        assert!(mixed(&any, &sides[1..]).unwrap_err().to_string().contains("each of 512 parents"));
+        assert!(mixed(&any, &[9; 512]).unwrap_err().to_string().contains("1 to 8"));
+        assert!(mixed(&any, &[0; 512]).unwrap().splats.is_empty());
+        // Heads for one K serve their own grid beside parents.
+        let (fixed, _) = trunk(&config(preset, 2), 23);
+        assert_eq!(mixed(&fixed, &[2; 512]).unwrap().splats.len(), 2048);
+        assert!(mixed(&fixed, &[4; 512]).unwrap_err().to_string().contains("expected 2"));
+    }
 }
 
 #[test]

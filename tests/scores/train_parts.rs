@@ -19,7 +19,7 @@ use subsplat::train::loading::{Loader, LoaderOptions};
 use subsplat::train::loss::{self, Scored, with_gradient};
 use subsplat::train::optimizer::{Optimizer, Settings};
 use subsplat::train::schedule::{NamedWarmup, Schedule, Warmup};
-use subsplat::train::source::{Example, InputTargets, Replay, Rooms, Source};
+use subsplat::train::source::{Example, ExampleSize, InputTargets, Replay, Rooms, Source};
 use subsplat::train::step::{Learner, Seconds, StepScale};
 
 /// Returns reproducible numbers in [0, 1).
@@ -240,7 +240,7 @@ fn the_optimizer_follows_adamw() {
 fn a_frozen_backbone_is_constant_and_the_state_is_restored() {
     let settings = Settings { freeze_backbone: true, ..Settings::default() };
     let vars = variables();
-    let mut optimizer = Optimizer::new(settings, vars.clone()).unwrap();
+    let mut optimizer = Optimizer::new(settings.clone(), vars.clone()).unwrap();
     let step = |optimizer: &mut Optimizer, vars: &BTreeMap<String, Var>, n: u64| {
         let store = quadratic(vars).backward().unwrap();
         let mut gradients = optimizer.gradients();
@@ -268,6 +268,25 @@ fn a_frozen_backbone_is_constant_and_the_state_is_restored() {
     assert!(other.restore(foreign).unwrap_err().to_string().contains("first/x"));
 }
 
+#[test]
+fn parameters_that_are_not_named_stay_constant() {
+    let flat = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    let settings = Settings { only: vec![".b".to_owned()], ..Settings::default() };
+    let vars = variables();
+    let before = flat(&vars["small.w"]);
+    let mut optimizer = Optimizer::new(settings, vars.clone()).unwrap();
+    let store = quadratic(&vars).backward().unwrap();
+    let mut gradients = optimizer.gradients();
+    optimizer.collect(&store, &mut gradients).unwrap();
+    let norm = gradients.norm();
+    optimizer.step(&gradients, norm, 0.1, 0).unwrap();
+    assert_eq!(flat(&vars["small.w"]), before);
+    assert_ne!(flat(&vars["subsplat.b"]), [0.0, 1.0]);
+    let unknown = Settings { only: vec![".c".to_owned()], ..Settings::default() };
+    let error = Optimizer::new(unknown, variables()).unwrap_err().to_string();
+    assert!(error.contains("optimizer.only") && error.contains(".c"), "{error}");
+}
+
 fn rooms() -> Rooms {
     let mut spec = ExampleSpec::new(32, 24, 1);
     spec.photographic = false;
@@ -276,6 +295,7 @@ fn rooms() -> Rooms {
         scenes: 0,
         spec,
         targets: TargetSpec { ratio: 2, samples: 1, clean: true, inputs: false },
+        sizes: Vec::new(),
         seen_range: 0.0,
         detail: 0.0,
     }
@@ -292,6 +312,50 @@ fn rooms_are_determined_by_their_seed() {
     assert_eq!(one.inverse_depth[1].len(), 32 * 24);
     let finite = Rooms { scenes: 3, ..rooms() };
     assert_eq!(finite.example(4).unwrap(), rooms().example(1).unwrap());
+}
+
+#[test]
+fn sizes_of_examples_take_turns() {
+    let size = |input: [usize; 2], upscale: usize| ExampleSize { input, upscale };
+    let all = Rooms { sizes: vec![size([32, 32], 3), size([64, 32], 1)], ..rooms() };
+    for (i, (input, upscale)) in [((32, 32), 3), ((64, 32), 1), ((32, 32), 3)].iter().enumerate() {
+        let made = all.example(i as u64).unwrap();
+        let sizes = |p: &Posed| (p.image.width, p.image.height);
+        assert_eq!((sizes(&made.context[1]), made.upscale()), (*input, *upscale));
+        assert_eq!(sizes(&made.targets[0]), (input.0 * upscale, input.1 * upscale));
+    }
+}
+
+/// A training on examples of several sizes: heads for every K take them, others refuse.
+#[test]
+fn a_step_trains_several_upscales() {
+    let text = |head: &str, more: &str| {
+        format!(
+            "batch = 2\ntogether = 1\n[model]\nset = {{ agg = {{ enabled = false }}, spgr = {{ head = \"{head}\", \
+             hidden = 16 }}, embed = {{ dim = 32 }}, backbone = {{ cnn_channels = [8, 8], unet_channels = [8, 8], \
+             head_channels = 8, stem_channels = 0, depth_candidates = 8 }} }}\n[data]\nsizes = [{{ input = [32, 32], \
+             upscale = 3 }}, {{ input = [64, 32], upscale = 2 }}]\n{more}"
+        )
+    };
+    let config = TrainConfig::from_toml(&text("polynomial", "")).unwrap();
+    let refused = |text: &str| TrainConfig::from_toml(text).unwrap_err().to_string();
+    assert!(refused(&text("mlp2", "")).contains("data.sizes: expected the model's upscale, 2"));
+    let together = text("polynomial", "").replace("together = 1", "together = 2");
+    assert!(refused(&together).contains("together: expected 1"));
+    let weights = Weights::seeded(5).trainable();
+    let learner = Learner::new(&config, &weights).unwrap();
+    let optimizer = Optimizer::new(Settings::default(), weights.variables()).unwrap();
+    let source =
+        subsplat::train::validate::rooms(&config, subsplat::train::validate::Split::Training)
+            .unwrap();
+    let examples: Vec<Example> =
+        (0..2).map(|i| Example::clone(&source.example(i).unwrap())).collect();
+    let mut gradients = optimizer.gradients();
+    let scale = StepScale { share: 0.5, step: 0 };
+    let mut seconds = Seconds::default();
+    let terms =
+        learner.accumulate(&examples, scale, &optimizer, &mut gradients, &mut seconds).unwrap();
+    assert!(terms.loss.is_finite() && gradients.norm() > 0.0);
 }
 
 #[test]

@@ -49,7 +49,7 @@ impl Trunk {
         sides: &[u8],
         checkpoint: Checkpoint<'_>,
     ) -> Result<MixedChildren> {
-        let parents = self.pass_through(views, primaries)?.to_splats()?;
+        let parents = self.parents(views, primaries)?.to_splats()?;
         if sides.len() != parents.len() {
             bail!("sides: expected one for each of {} parents, got {}", parents.len(), sides.len());
         }

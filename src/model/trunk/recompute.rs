@@ -72,7 +72,7 @@ impl Trunk {
 
 impl<'a> Scene<'a> {
     /// Returns the same tensors outside any graph, with the maps' gradients deferred.
-    fn leaves(&self) -> Scene<'a> {
+    pub(super) fn leaves(&self) -> Scene<'a> {
         Scene {
             views: self.views,
             frames: self.frames.clone(),

@@ -21,10 +21,9 @@ def head(g, keys, x, name, side, channels):
         return g.linear(x, f"{name}.lin4", k * channels).reshape(n, k, channels)
     if keys["head"] == "polynomial":
         h = g.gelu(g.linear(g.layer_norm(x, f"{name}.norm"), f"{name}.lin0", hidden))
-        values = polynomial(side)
-        # One output per term, then the sum over terms with their values at each child.
-        terms = g.linear(h, f"{name}.lin1", values.shape[1] * channels).reshape(n, values.shape[1], channels)
-        return g.matmul(g.const(values), terms)
+        # Outputs of all 18 layers, then their sums with the factors of each child.
+        layers = [g.linear(h, f"{name}.lin{i}", m * channels).reshape(n, m, channels) for i, m in ((1, 4), (2, 14))]
+        return g.matmul(g.const(polynomial(side)), g.concat(layers, 1))
     # coord: hid_k = GELU(W x + c_k), o_k = W' hid_k, c_k = MLP(posenc(g_k)).
     x = g.linear(g.layer_norm(x, f"{name}.norm"), f"{name}.lin0", hidden)
     c = g.linear(g.gelu(g.linear(g.const(posenc(side)), f"{name}.pos0", hidden)), f"{name}.pos1", hidden)
@@ -37,12 +36,15 @@ def subpixel_centres(side):
 
 
 def polynomial(side):
-    """Returns [K, 18]: (1, kappa) x (1, v, v^2 - 1) x (1, u, u^2 - 1), the last factor fastest; (u, v) is four times
-    the position, kappa = log2(side / 2)."""
+    """Returns [K, 18]: weights of bilinear interpolation from (u, v) = (-1, -1), (1, -1), (-1, 1), (1, 1); then
+    (1, kappa) x (1, v, v^2 - 1) x (1, u, u^2 - 1), the last factor fastest, without 1, u, v, uv. (u, v) is four times the
+    position, kappa = log2(side / 2)."""
     u, v = 4.0 * subpixel_centres(side).T
+    corners = [(1 + a * u) * (1 + b * v) / 4 for b in (-1, 1) for a in (-1, 1)]
     powers = lambda t: [np.ones_like(t), t, t**2 - 1.0]
     kappa = np.log2(side / 2.0)
-    return np.stack([k * b * a for k in (1.0, kappa) for b in powers(v) for a in powers(u)], 1)
+    products = [k * b * a for k in (1.0, kappa) for b in powers(v) for a in powers(u)]
+    return np.stack(corners + [p for i, p in enumerate(products) if i not in (0, 1, 3, 4)], 1)
 
 
 def posenc(side):

@@ -6,7 +6,7 @@ use super::args_view::{KEYS, ViewArgs};
 use super::values;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
-use subsplat::{FitOptions, InputSize, Refine, TargetSize};
+use subsplat::{Density, FitOptions, InputSize, Refine, TargetSize};
 
 /// Exit codes, which scripts rely on.
 const EXIT_CODES: &str = "\
@@ -405,6 +405,10 @@ pub struct SourceArgs {
     /// number between has the children of the next whole one. Default: the weights' own, else 2.
     #[arg(long, value_name = "R", value_parser = values::upscale)]
     pub upscale: Option<f32>,
+    /// Number of Gaussians, at most, or their share of all children of all pixels. Pixels of even
+    /// colour keep one, pixels with detail get all.
+    #[arg(long, value_name = "N | P%", value_parser = values::density, default_value = "100%")]
+    pub gaussians: Density,
     /// Weights (.safetensors). Default: the shipped ones.
     #[arg(long, value_name = "FILE")]
     pub weights: Option<PathBuf>,

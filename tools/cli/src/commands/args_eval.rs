@@ -4,6 +4,7 @@ use super::args::{DetailArg, ModelArgs};
 use super::values;
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
+use subsplat::Density;
 use subsplat::eval::{Disturbance, Method};
 
 const NOTES: &str = "\
@@ -56,6 +57,9 @@ pub struct EvalArgs {
     /// detail and pair).
     #[arg(long, value_delimiter = ',', value_name = "M,…")]
     pub methods: Vec<Method>,
+    /// Number of Gaussians, as in `run`; `opaque` and `random` remove others of all instead.
+    #[arg(long, value_name = "N | P%", value_parser = values::density, default_value = "100%")]
+    pub gaussians: Density,
     /// Score also PNG pictures of another program: DIR/SCENE/INPUTS/NNNNNN.png, or
     /// SCENE/color/NNNNNN.png, SCENE/NNNNNN.png, SCENE/FRAMENAME.png.
     #[arg(long, value_name = "NAME=DIR")]

@@ -56,6 +56,7 @@ pub fn eval(args: &EvalArgs, answer: Answer) -> Result<()> {
             LrFromArg::Independent => LrFrom::Independent,
         },
         disturbances: args.disturb.clone(),
+        density: args.gaussians,
         ..Options::new(upscale)
     };
     if let Some(model) = &model {

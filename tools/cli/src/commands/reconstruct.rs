@@ -36,6 +36,7 @@ pub fn options(args: &SourceArgs, scene: &Scene, context: &[usize]) -> Result<Op
         .with_detail(detail)
         .with_fit(FitOptions::default().with_steps(args.fit))
         .with_poses(poses)
+        .with_density(args.gaussians)
         .with_refine(args.refine);
     let cameras: Vec<_> = context.iter().map(|&i| scene.frames[i].camera).collect();
     options.initial_depth_range(&cameras)?;

@@ -53,7 +53,8 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let target_size = target.resolve((w, h), model.config().upscale);
     let targets = targets(args, &plan, target_size)?;
     memory::check_picture("the picture size", target_size)?;
-    let count = (plan.context.len() * w * h * model.config().children()) as u64;
+    let parents = plan.context.len() * w * h;
+    let count = plan.options.density.limit(parents, model.config().upscale) as u64;
     let degree = model.config().primaries().sh_degree;
     output::check_formats(args, count, degree)?;
     output::prepare(&args.out, &args.input[0], &plan.scene)?;

@@ -1,8 +1,8 @@
 //! Parsers of argument values that need no file. clap reports their errors as wrong usage.
 
 use super::args::InputSizeArg;
-use subsplat::Refine;
 use subsplat::camera::Intrinsics;
+use subsplat::{Density, Refine};
 
 /// Largest number of views of a path.
 const PATH_MAX: usize = 100_000;
@@ -35,6 +35,21 @@ pub fn upscale(text: &str) -> Result<f32, String> {
     let inside = |r: &f32| (1.0..=UPSCALE_MAX).contains(r);
     let ratio = text.trim().parse().ok().filter(inside);
     ratio.ok_or_else(|| format!("expected a number from 1 to {UPSCALE_MAX}"))
+}
+
+/// Parses a number of Gaussians: a whole number, or a share of all as `P%`.
+pub fn density(text: &str) -> Result<Density, String> {
+    let text = text.trim();
+    let Some(percent) = text.strip_suffix('%') else {
+        let count = whole(text, 1, usize::MAX);
+        let expected = |_| "expected a whole number of at least 1, or a share as 50%".to_owned();
+        return count.map(Density::Count).map_err(expected);
+    };
+    match percent.trim().parse::<f32>() {
+        Ok(100.0) => Ok(Density::Full),
+        Ok(p) if p > 0.0 && p < 100.0 => Ok(Density::Share(p / 100.0)),
+        _ => Err("expected a share above 0 % and of at most 100 %".to_owned()),
+    }
 }
 
 /// Largest number of steps of `--refine`.
@@ -150,6 +165,16 @@ pub fn depth_conflict(near: Option<f32>, far: Option<f32>) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn numbers_of_gaussians() {
+        assert_eq!(density("100%"), Ok(Density::Full));
+        assert_eq!(density(" 25 %"), Ok(Density::Share(0.25)));
+        assert_eq!(density("100000"), Ok(Density::Count(100_000)));
+        for bad in ["", "0", "-3", "1.5", "0%", "101%", "NaN%", "%", "many"] {
+            assert!(density(bad).unwrap_err().starts_with("expected a "), "{bad}");
+        }
+    }
 
     #[test]
     fn lengths_of_a_refinement() {

@@ -207,6 +207,31 @@ fn paths_sizes_and_detail() {
     assert_eq!((picture.width, picture.height), (40, 24));
 }
 
+/// Pictures of any size, and fewer Gaussians than children of all pixels.
+#[test]
+fn sizes_between_whole_upscales_and_fewer_gaussians() {
+    let place = workplace();
+    let run = |more: &str| {
+        let quick = "--json run scene --context view0,view2.png --no-check --input-size 32 --fit 0";
+        done(&call_in(place.path(), &format!("{quick} --target 0 -o a {more}")))
+    };
+    let picture = || load(&place.path().join("a/images/view0.png")).unwrap();
+    let report = run("--upscale 1.5");
+    assert_eq!((&report["upscale"], &report["gaussians"]), (&2.into(), &(2 * 1024 * 4).into()));
+    assert_eq!((picture().width, picture().height), (48, 48));
+    let report = run("--size 80x96");
+    let k = &report["input_intrinsics"][0];
+    assert_eq!((&k["width"], &k["height"]), (&32.into(), &32.into()));
+    assert_eq!(report["upscale"], 3);
+    assert_eq!(report["target_size"], serde_json::json!([80, 96]));
+    assert_eq!((picture().width, picture().height), (80, 96));
+    for (gaussians, least, most) in [("25%", 8000, 8192), ("3000", 2990, 3000), ("100", 100, 100)] {
+        let report = run(&format!("--upscale 4 --gaussians {gaussians} --fit 1 --refine 2"));
+        let count = report["gaussians"].as_u64().unwrap();
+        assert!((least..=most).contains(&count), "{gaussians}: {count}");
+    }
+}
+
 /// Photographs of any shape: the whole of them by default, their square on demand.
 #[test]
 fn the_shape_of_photographs_is_kept() {

@@ -1,0 +1,128 @@
+//! The Gaussians of a scene: the same number of children for each parent, or more where the
+//! photographs have detail.
+
+use super::density::{Density, sides};
+use super::{Result, add_detail, detail};
+use crate::abi::RasterOptions;
+use crate::data::crop::Cropped;
+use crate::fit::FitView;
+use crate::model::subsplat::SubSplat;
+use crate::model::trace::Checkpoint;
+use crate::model::{BackboneOutput, Primaries, Views};
+use crate::refine::shares;
+use crate::render::Renderer;
+use crate::splats::Splats;
+use std::ops::Range;
+
+/// The network's results for one scene.
+pub(crate) struct Encoded<'a> {
+    pub views: &'a Views,
+    pub output: &'a BackboneOutput,
+    pub primaries: &'a Primaries,
+}
+
+/// Gaussians of a scene.
+pub(crate) struct SceneChildren {
+    pub splats: Splats,
+    /// Gaussians of each photograph, in their order.
+    pub groups: Vec<Range<usize>>,
+    origins: Origins,
+}
+
+/// Parents of the Gaussians.
+enum Origins {
+    /// r² consecutive Gaussians have one parent.
+    Regular,
+    /// Parent of each Gaussian, and r of each parent.
+    Mixed { parents: Vec<u32>, sides: Vec<u8> },
+}
+
+/// Least share of a parent that is divided or kept, where three photographs or more show the scene
+/// ([`crate::refine::RefineOptions::least_share`]).
+const LEAST_SHARE: f32 = 0.3;
+/// Photographs from which on parents are removed.
+const PHOTOGRAPHS_TO_REMOVE: usize = 3;
+
+/// Sides of the parents' grids for `density`; `None` where all have r² children. `raster` renders
+/// pictures of the input's size, from which the parents' shares come.
+///
+/// # Errors
+/// Those of the network.
+pub(crate) fn sides_of(
+    network: &SubSplat,
+    Encoded { views, primaries, .. }: &Encoded<'_>,
+    inputs: &[Cropped],
+    density: Density,
+    raster: &RasterOptions,
+    renderer: &mut Renderer,
+) -> Result<Option<Vec<u8>>> {
+    if density == Density::Full {
+        return Ok(None);
+    }
+    let parents = network.trunk().parents(views, primaries)?.to_splats()?;
+    let upscale = network.config().upscale;
+    let photographs: Vec<FitView<'_>> =
+        inputs.iter().map(|c| FitView { camera: &c.input_camera, image: &c.input }).collect();
+    let mut shares = shares(&parents, &photographs, raster, renderer);
+    let mut limit = density.limit(parents.len(), upscale);
+    let mut hidden = Vec::new();
+    if inputs.len() >= PHOTOGRAPHS_TO_REMOVE {
+        hidden.extend((0..shares.len()).filter(|i| shares[*i] < LEAST_SHARE));
+        hidden.iter().for_each(|i| shares[*i] = 0.0);
+        limit = limit.saturating_add(hidden.len());
+    }
+    let mut sides = sides(inputs, &shares, upscale, limit);
+    hidden.into_iter().for_each(|i| sides[i] = 0);
+    Ok(Some(sides))
+}
+
+impl SceneChildren {
+    /// Children of the one scene that `encoded` holds, of `photographs` photographs, without detail;
+    /// `sides` are those of [`sides_of`].
+    ///
+    /// # Errors
+    /// Those of the network and of `checkpoint`.
+    pub(crate) fn new(
+        network: &SubSplat,
+        Encoded { views, output, primaries }: &Encoded<'_>,
+        photographs: usize,
+        sides: Option<Vec<u8>>,
+        checkpoint: Checkpoint<'_>,
+    ) -> candle_core::Result<Self> {
+        let (trunk, per_view) = (network.trunk(), primaries.per_view);
+        let Some(sides) = sides else {
+            let children = trunk.forward_with(views, output, primaries, checkpoint)?;
+            let size = per_view * children.k;
+            let groups = (0..photographs).map(|view| view * size..(view + 1) * size).collect();
+            return Ok(Self { splats: children.to_splats()?, groups, origins: Origins::Regular });
+        };
+        let mixed = trunk.forward_mixed(views, output, primaries, &sides, checkpoint)?;
+        let end = |view: usize| mixed.parents.partition_point(|p| (*p as usize) < view * per_view);
+        let groups = (0..photographs).map(|view| end(view)..end(view + 1)).collect();
+        let origins = Origins::Mixed { parents: mixed.parents, sides };
+        Ok(Self { splats: mixed.splats, groups, origins })
+    }
+
+    /// Adds the photographs' detail to the colours. Returns whether any photograph has detail.
+    ///
+    /// # Errors
+    /// A photograph without pixels.
+    pub(crate) fn add_detail(&mut self, inputs: &[Cropped], upscale: usize) -> Result<bool> {
+        match &self.origins {
+            Origins::Regular => add_detail(&mut self.splats, inputs, upscale),
+            Origins::Mixed { parents, sides } => {
+                detail::add_mixed(&mut self.splats, inputs, parents, sides)
+            }
+        }
+    }
+
+    /// Gaussians of which the photographs are not known.
+    pub(crate) fn of_splats(splats: Splats) -> Self {
+        Self { splats, groups: Vec::new(), origins: Origins::Regular }
+    }
+
+    /// Whether every parent has the same number of children.
+    pub(crate) fn is_regular(&self) -> bool {
+        matches!(self.origins, Origins::Regular)
+    }
+}
