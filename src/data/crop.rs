@@ -11,7 +11,7 @@
 //! the height: the rounding makes them differ slightly). [`CropRule`] says what becomes
 //! of the principal point.
 
-use crate::camera::{Camera, CameraError, Intrinsics};
+use crate::camera::{Camera, CameraError, Intrinsics, Size};
 use crate::io::image::Rgb;
 use crate::io::resize::{Filter, Window, resize, resize_window};
 use crate::io::{Error, Result};
@@ -44,8 +44,8 @@ pub enum LrFrom {
 /// How to crop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct CropOptions {
-    /// Width and height of the network's input, px.
-    pub input_size: (usize, usize),
+    /// Size of the network's input.
+    pub input_size: Size,
     /// r: target pixels per input pixel and axis.
     pub upscale: usize,
     /// The input's sides are cut to multiples of this.
@@ -60,7 +60,7 @@ impl CropOptions {
     /// Square input of `side` pixels, exact intrinsics, input from the target's crop.
     pub fn square(side: usize, upscale: usize, stride: usize) -> Self {
         Self {
-            input_size: (side, side),
+            input_size: Size::new(side, side),
             upscale,
             stride,
             rule: CropRule::default(),
@@ -175,7 +175,7 @@ pub fn crop(photo: &Rgb, camera: &Camera, options: &CropOptions) -> Result<Cropp
     let bad = |expected: String, got: String| Err(Error::format("crop", expected, got));
     let r = options.upscale;
     let stride = options.stride.max(1);
-    let (w, h) = options.input_size;
+    let Size { width: w, height: h } = options.input_size;
     if (k.width, k.height) != (photo.width, photo.height) || photo.data.is_empty() {
         let got = format!("one for {}x{}", k.width, k.height);
         return bad(format!("a camera for {}x{} pixels", photo.width, photo.height), got);
@@ -238,7 +238,8 @@ mod tests {
         for (w, h) in [(576, 320), (320, 576), (1920, 1080), (100, 90)] {
             let (picture, camera) = photo(w, h);
             for r in [1, 2, 4] {
-                let options = CropOptions { input_size: (64, 48), ..CropOptions::square(0, r, 16) };
+                let options =
+                    CropOptions { input_size: Size::new(64, 48), ..CropOptions::square(0, r, 16) };
                 let c = crop(&picture, &camera, &options).unwrap();
                 let p = Vec3::new(0.05, -0.07, 1.0);
                 let in_photo = camera.project(p).unwrap();
@@ -265,7 +266,8 @@ mod tests {
     #[test]
     fn sizes_are_cut_to_the_stride_around_the_same_middle() {
         let (picture, camera) = photo(640, 480);
-        let options = CropOptions { input_size: (100, 75), ..CropOptions::square(0, 2, 16) };
+        let options =
+            CropOptions { input_size: Size::new(100, 75), ..CropOptions::square(0, 2, 16) };
         let c = crop(&picture, &camera, &options).unwrap();
         assert_eq!((c.input.width, c.input.height), (96, 64));
         let middle = c.window.to_photo(Vec2::new(96.0, 64.0));

@@ -17,7 +17,7 @@ use super::crop::{CropOptions, crop};
 use super::depth::depth_range;
 use super::procedural::rng::Rng;
 use super::sampler::{SampledFrames, ViewSampler};
-use crate::camera::{Camera, Intrinsics, NearFar};
+use crate::camera::{Camera, Intrinsics, NearFar, Size};
 use crate::io::image::Rgb;
 use crate::io::scene::{Scene, is_scene, load_scene};
 use crate::io::{Error, Result};
@@ -315,7 +315,7 @@ impl Dataset {
             }
         }
         let ExampleOptions { sampler, crop, .. } = &self.options;
-        let ((w, h), r) = (crop.input_size, crop.upscale);
+        let (Size { width: w, height: h }, r) = (crop.input_size, crop.upscale);
         let expected = format!(
             "a scene of more than {} frames of at least {}x{} pixels, none wider than {FOV_MAX} \
              degrees, with a camera that moves or with near and far",
@@ -391,7 +391,7 @@ impl Dataset {
         load: &dyn Fn(usize) -> Result<(Rgb, Camera)>,
     ) -> Result<Option<TrainingExample>> {
         let options = &self.options.crop;
-        let (w, h) = options.input_size;
+        let Size { width: w, height: h } = options.input_size;
         let min_size = (w.saturating_mul(options.upscale), h.saturating_mul(options.upscale));
         let (mut context, mut targets) = (Vec::new(), Vec::new());
         for (i, &frame) in frames.context.iter().chain(&frames.targets).enumerate() {

@@ -3,7 +3,7 @@
 use super::config::TrainConfig;
 use super::source::{Example, InputTargets, Source};
 use super::{Error, Result};
-use crate::camera::NearFar;
+use crate::camera::{NearFar, Size};
 use crate::data::crop::{CropOptions, CropRule};
 use crate::data::dataset::{Dataset, ExampleOptions};
 use crate::data::sampler::{GapBounds, GapMode, ViewSampler};
@@ -110,7 +110,7 @@ impl Pictures {
         let square = CropOptions::square(w, model.upscale, model.stride());
         let options = ExampleOptions {
             sampler,
-            crop: CropOptions { input_size: (w, h), rule, ..square },
+            crop: CropOptions { input_size: Size::new(w, h), rule, ..square },
             // The loader mirrors the examples of every source.
             flip: false,
             near_far: files.near_far.map(|[near, far]| NearFar { near, far }),

@@ -7,6 +7,7 @@ use crate::report::{Progress, print_line, print_warning, show_fraction};
 use anyhow::{Result, ensure};
 use serde_json::{Value, json};
 use std::borrow::Borrow;
+use subsplat::camera::Size;
 use subsplat::check::{PairReport, Verdict};
 use subsplat::config::Config;
 use subsplat::data::crop::Cropped;
@@ -54,16 +55,16 @@ pub fn input_size(
 ) -> Result<(InputSize, (usize, usize))> {
     let size = |&i: &usize| {
         let k = scene.frames[i].camera.intrinsics();
-        (k.width, k.height)
+        Size::new(k.width, k.height)
     };
-    let photos: Vec<_> = context.iter().map(size).collect();
+    let photos: Vec<Size> = context.iter().map(size).collect();
     let config = model.config();
-    let ample = |size: (usize, usize)| memory::is_ample(config, context.len(), size);
+    let ample = |size: Size| memory::is_ample(config, context.len(), (size.width, size.height));
     let chosen = match args.quality {
         Some(quality) => quality_size(quality, args.crop, &photos, config, ample),
         None => args.input_size(),
     };
-    let (w, h) = chosen.resolve(&photos, config.stride());
+    let Size { width: w, height: h } = chosen.resolve(&photos, config.stride());
     let stride = config.stride();
     // An area below one cell of the stride gives one cell; the user asked for less.
     let asked = match chosen {
@@ -80,14 +81,14 @@ pub fn input_size(
     Ok((chosen, (w, h)))
 }
 
-/// The size of `quality` for `photos` (width and height, px). `High` is limited by the
+/// The size of `quality` for photographs of the sizes `photos`. `High` is limited by the
 /// photographs, whose pixels a target need not exceed, and by the memory.
 fn quality_size(
     quality: QualityArg,
     crop: CropShapeArg,
-    photos: &[(usize, usize)],
+    photos: &[Size],
     config: &Config,
-    ample: impl Fn((usize, usize)) -> bool,
+    ample: impl Fn(Size) -> bool,
 ) -> InputSize {
     let of_area = |area: usize| match crop {
         CropShapeArg::Whole => InputSize::Area(area),
@@ -97,9 +98,9 @@ fn quality_size(
     if quality != QualityArg::High {
         return of_area(quality.area());
     }
-    let pixels = |&(w, h): &(usize, usize)| match crop {
-        CropShapeArg::Whole => w * h,
-        CropShapeArg::Square => w.min(h) * w.min(h),
+    let pixels = |photo: &Size| match crop {
+        CropShapeArg::Whole => photo.width * photo.height,
+        CropShapeArg::Square => photo.width.min(photo.height).pow(2),
     };
     let photo = photos.iter().map(pixels).min().unwrap_or(0) / config.children();
     let mut area = quality.area().min(photo).max(normal);
@@ -229,9 +230,11 @@ mod tests {
     #[test]
     fn high_quality_is_limited_by_photographs_and_memory() {
         let config = Config::small(subsplat::config::Preset::Tuned, 2);
-        let size = |quality, crop, photo, ample: bool| {
-            let chosen = quality_size(quality, crop, &[photo, photo], &config, |_| ample);
-            chosen.resolve(&[photo, photo], 32)
+        let size = |quality, crop, (width, height): (usize, usize), ample: bool| {
+            let photos = [Size { width, height }; 2];
+            let chosen = quality_size(quality, crop, &photos, &config, |_| ample);
+            let size = chosen.resolve(&photos, 32);
+            (size.width, size.height)
         };
         use CropShapeArg::{Square, Whole};
         use QualityArg::{Fast, High, Normal};

@@ -11,7 +11,7 @@ use anyhow::{Result, bail, ensure};
 use serde_json::{Value, json};
 use std::path::Path;
 use subsplat::abi::{Convention, RasterOptions};
-use subsplat::camera::{Camera, NearFar};
+use subsplat::camera::{Camera, NearFar, Size};
 use subsplat::config::{Config, LowpassRef};
 use subsplat::data::pair::choose_pair;
 use subsplat::eval::{GaussianReport, InputReport, Score};
@@ -63,7 +63,10 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
         scene: &plan.scene,
         // All inputs have one size.
         crop: model.crop_options(
-            result.inputs().first().map_or((w, h), |c| (c.input.width, c.input.height)),
+            result
+                .inputs()
+                .first()
+                .map_or(Size::new(w, h), |c| Size::new(c.input.width, c.input.height)),
         ),
         options,
         motion: &args.motion,

@@ -121,7 +121,11 @@ fn export_writes_every_format() {
     // Its header describes its own axes alone.
     let bytes = std::fs::read(place.path().join("up.ply")).unwrap();
     let head = String::from_utf8_lossy(&bytes[..2000.min(bytes.len())]).into_owned();
-    assert_eq!((head.matches("up is ").count(), head.matches("up is +y").count()), (1, 1), "{head}");
+    assert_eq!(
+        (head.matches("up is ").count(), head.matches("up is +y").count()),
+        (1, 1),
+        "{head}"
+    );
 }
 
 #[test]
