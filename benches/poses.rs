@@ -17,7 +17,8 @@ use anyhow::{Context, Result};
 use common::Bench;
 use serde_json::json;
 use std::time::Instant;
-use subsplat::camera::Camera;
+use subsplat::camera::{Camera, Size};
+use subsplat::loose::Uncertain;
 use subsplat::{
     Confidence, Options, Photo, PoseOptions, PosePhoto, PoseRefusal, Reconstructor, estimate_poses,
     psnr,
@@ -116,9 +117,12 @@ fn scenes(bench: &Bench) -> Result<Vec<serde_json::Value>> {
         let estimate = bench.on_all(|| {
             let features = photos.map(|p| p.features(Intrinsics::Known, PAIR_FEATURES));
             let options = PoseOptions::default();
-            estimate_poses(&features, &options)
-                .map(|e| (e, ""))
-                .or_else(|_| Ok((estimate_poses(&features, &options.with_force(true))?, "refused")))
+            estimate_poses(&features, &options).map(|e| (e, "")).or_else(|_| {
+                Ok((
+                    estimate_poses(&features, &options.with_uncertain(Uncertain::Accept))?,
+                    "refused",
+                ))
+            })
         });
         let (estimate, note) = match estimate {
             Ok(found) => found,
@@ -149,7 +153,7 @@ fn scene_psnr(model: &Reconstructor, pair: &PosedPair, cameras: &[Camera]) -> Re
         pair.photos.iter().zip(cameras).map(|(p, c)| p.with_camera(*c)).collect();
     let scene = model.run(&photos, &Options::default())?;
     let input = &scene.inputs()[0].input;
-    let crop = model.crop_options((input.width, input.height));
+    let crop = model.crop_options(Size::new(input.width, input.height));
     let mut sum = 0.0;
     for target in &pair.targets {
         let truth = target.with_camera(target.camera).crop(&crop)?;

@@ -14,7 +14,30 @@
 
 use glam::{Mat3, Mat4, Vec2, Vec3};
 use serde::ser::{Serialize, SerializeStruct, Serializer};
+use std::fmt;
 use thiserror::Error;
+
+/// Width and height of a picture, px.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+pub struct Size {
+    /// Width, px.
+    pub width: usize,
+    /// Height, px.
+    pub height: usize,
+}
+
+impl Size {
+    /// A size of `width` and `height`, px.
+    pub fn new(width: usize, height: usize) -> Self {
+        Self { width, height }
+    }
+}
+
+impl fmt::Display for Size {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}x{}", self.width, self.height)
+    }
+}
 
 /// Reason for which a camera is refused.
 #[derive(Clone, Debug, Error, PartialEq)]

@@ -189,45 +189,92 @@ pub use image;
 
 pub use abi::{Convention, RasterOptions, ShBasis};
 pub use backend::{Backend, DeviceError};
-pub use camera::{Camera, CameraError, Intrinsics, NearFar};
-pub use check::{
-    CheckOptions, DepthReport, EpipolarReport, Finding, GrayImage, PairReport, Verdict, check_pair,
-};
+pub use camera::{Camera, CameraError, Intrinsics, NearFar, Size};
 #[cfg(feature = "network")]
 pub use config::{Config, ConfigError, Preset};
-#[cfg(feature = "network")]
-pub use data::crop::{CropOptions, Cropped};
-pub use data::exposure::{Exposure, ExposureError, PointPair, estimate_exposure};
 pub use device::DeviceChoice;
-pub use fit::{FitError, FitOptions, FitReport, FitView, fit};
-#[cfg(feature = "gpu")]
-pub use gpu::{Gpu, GpuError, Rasterizer as GpuRasterizer};
-pub use io::cameras_json::{CameraFile, NamedCamera, load_cameras_json, save_cameras_json};
-pub use io::exif::{ExifCamera, ExifReport, FocalLength, FocalSource, parse_exif};
-pub use io::image::{Depth, LoadOptions, Rgb, Truncated, save_depth_png, save_png};
-pub use io::photograph::{
-    Photograph, PhotographHeader, load_photograph, parse_photograph, probe_photograph,
-};
-pub use io::scene::{Frame, LoadedFrame, Pixels, Scene, SceneFormat, Units, load_scene};
+pub use fit::FitOptions;
+pub use io::image::{Depth, LoadOptions, Rgb, save_depth_png, save_png};
+pub use io::photograph::{Photograph, load_photograph, parse_photograph};
+pub use io::scene::{Frame, Scene, load_scene};
 pub use io::{
-    Error as FileError, SaveOptions, SaveReport, SplatFormat, Up, encode_splats, load_splats,
-    parse_splats, save_splats,
+    Error as FileError, SaveOptions, SplatFormat, Up, encode_splats, load_splats, parse_splats,
+    save_splats,
 };
-pub use metrics::{MetricsError, psnr, ssim};
-pub use navigation::{Bounds, Mode, Navigator, Pace, Start};
+pub use navigation::Bounds;
 #[cfg(feature = "network")]
 pub use ops::{SplatTensors, rasterize_splats as rasterize};
 #[cfg(feature = "network")]
 pub use pipeline::{
-    Check, Density, DepthBounds, DepthRange, DepthSource, Detail, Error, InputSize, KnownLens,
-    LensSource, LooseOptions, LoosePhotos, LooseScene, Options, Photo, PoseError, Poses, Prepared,
-    Progress, Reconstruction, Reconstructor, Refine, Result, Stage, StageTime, TargetSize, Warning,
+    Check, Density, DepthBounds, DepthRange, Detail, Error, InputSize, Options, Photo, Poses,
+    Prepared, Progress, Reconstruction, Reconstructor, Refine, Result, Stage, TargetSize, Warning,
     loose_photos, loose_scene,
 };
-pub use poses::{
-    Confidence, FocalEstimate, LeftOut, Lens, PoseAdjustment, PoseEstimate, PoseOptions, PosePhoto,
-    PosePhotoError, PosePoint, PoseRefusal, PoseWarning, adjust_poses, estimate_poses,
-};
-pub use refine::{RefineOptions, RefineReport, Refiner, refine};
 pub use render::{Picture, Renderer, render};
-pub use splats::{Quantiles, SplatParts, SplatStatistics, Splats, SplatsError};
+pub use splats::{Splats, SplatsError};
+
+// Names that programs, tests and benches of this repository use beside the modules.
+#[cfg(feature = "internals")]
+pub use check::{CheckOptions, GrayImage, check_pair};
+#[cfg(feature = "internals")]
+pub use data::exposure::{Exposure, ExposureError, PointPair, estimate_exposure};
+#[cfg(feature = "internals")]
+pub use details::*;
+#[cfg(feature = "internals")]
+pub use fit::fit;
+#[cfg(all(feature = "internals", feature = "gpu"))]
+pub use gpu::Rasterizer as GpuRasterizer;
+#[cfg(feature = "internals")]
+pub use io::cameras_json::{CameraFile, NamedCamera, load_cameras_json, save_cameras_json};
+#[cfg(feature = "internals")]
+pub use io::exif::{ExifReport, parse_exif};
+#[cfg(feature = "internals")]
+pub use io::photograph::{PhotographHeader, probe_photograph};
+#[cfg(all(feature = "internals", feature = "network"))]
+pub use loose::*;
+#[cfg(feature = "internals")]
+pub use metrics::{psnr, ssim};
+#[cfg(feature = "internals")]
+pub use navigation::{Mode, Navigator, Pace, Start};
+#[cfg(feature = "internals")]
+pub use poses::{Lens, PosePhoto, adjust_poses, estimate_poses};
+#[cfg(feature = "internals")]
+pub use refine::refine;
+#[cfg(feature = "internals")]
+pub use splats::{Quantiles, SplatStatistics};
+
+/// Types that an application reads or sets rarely: reports of a reconstruction, its inputs and its
+/// refinement, details of scenes and photographs, and the errors beneath [`FileError`] and `Error`.
+pub mod details {
+    pub use crate::check::{
+        DepthReport, EpipolarReport, Finding, MatchedPoint, PairReport, ReadingReport, Verdict,
+    };
+    #[cfg(feature = "network")]
+    pub use crate::data::crop::{CropOptions, CropRule, Cropped, LrFrom, PhotoWindow};
+    pub use crate::fit::{FitError, FitReport, FitView};
+    #[cfg(feature = "gpu")]
+    pub use crate::gpu::{Gpu, GpuError};
+    pub use crate::io::SaveReport;
+    pub use crate::io::exif::{ExifCamera, FocalLength, FocalSource};
+    pub use crate::io::image::Truncated;
+    pub use crate::io::scene::{LoadedFrame, Pixels, SceneFormat, Units};
+    pub use crate::io::undistort::Distortion;
+    pub use crate::metrics::MetricsError;
+    #[cfg(feature = "network")]
+    pub use crate::pipeline::{DepthSource, StageTime};
+    pub use crate::refine::{RefineOptions, RefineReport, Refiner};
+    pub use crate::splats::SplatParts;
+}
+
+/// Options and results of [`loose_photos`](crate::loose_photos) and
+/// [`loose_scene`](crate::loose_scene), which estimate the cameras of photographs.
+#[cfg(feature = "network")]
+pub mod loose {
+    pub use crate::pipeline::{
+        KnownLens, LensSource, LooseOptions, LoosePhotos, LooseScene, PoseError,
+    };
+    pub use crate::poses::{
+        Confidence, FocalEstimate, LeftOut, PoseAdjustment, PoseEstimate, PoseOptions,
+        PosePhotoError, PosePoint, PoseRefusal, PoseWarning, Uncertain,
+    };
+}

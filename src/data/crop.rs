@@ -11,7 +11,7 @@
 //! the height: the rounding makes them differ slightly). [`CropRule`] says what becomes
 //! of the principal point.
 
-use crate::camera::{Camera, CameraError, Intrinsics};
+use crate::camera::{Camera, CameraError, Intrinsics, Size};
 use crate::io::image::Rgb;
 use crate::io::resize::{Filter, Window, resize, resize_window};
 use crate::io::{Error, Result};
@@ -47,10 +47,10 @@ const SIDE_MAX: usize = 1 << 15;
 /// How to crop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct CropOptions {
-    /// Width and height of the network's input, px.
-    pub input_size: (usize, usize),
-    /// Width and height of the target, px. Any size: r times the input's in the paper.
-    pub target_size: (usize, usize),
+    /// Size of the network's input.
+    pub input_size: Size,
+    /// Size of the target. Any: r times the input's sides in the paper.
+    pub target_size: Size,
     /// The input's sides are cut to multiples of this.
     pub stride: usize,
     /// Principal point.
@@ -62,16 +62,16 @@ pub struct CropOptions {
 impl CropOptions {
     /// Square input of `side` pixels, exact intrinsics, input from the target's crop.
     pub fn square(side: usize, upscale: usize, stride: usize) -> Self {
-        Self::new((side, side), upscale, stride)
+        Self::new(Size::new(side, side), upscale, stride)
     }
 
     /// Input of `input_size` pixels, a target of `upscale` times its sides, exact intrinsics, input
     /// from the target's crop.
-    pub fn new(input_size: (usize, usize), upscale: usize, stride: usize) -> Self {
-        let (w, h) = input_size;
+    pub fn new(input_size: Size, upscale: usize, stride: usize) -> Self {
+        let Size { width: w, height: h } = input_size;
         Self {
             input_size,
-            target_size: (w.saturating_mul(upscale), h.saturating_mul(upscale)),
+            target_size: Size::new(w.saturating_mul(upscale), h.saturating_mul(upscale)),
             stride,
             rule: CropRule::default(),
             lr_from: LrFrom::default(),
@@ -192,7 +192,8 @@ pub fn crop(photo: &Rgb, camera: &Camera, options: &CropOptions) -> Result<Cropp
     let k = &camera.intrinsics;
     let bad = |expected: String, got: String| Err(Error::format("crop", expected, got));
     let stride = options.stride.max(1);
-    let ((w, h), (target_w, target_h)) = (options.input_size, options.target_size);
+    let Size { width: w, height: h } = options.input_size;
+    let Size { width: target_w, height: target_h } = options.target_size;
     if (k.width, k.height) != (photo.width, photo.height) || photo.data.is_empty() {
         let got = format!("one for {}x{}", k.width, k.height);
         return bad(format!("a camera for {}x{} pixels", photo.width, photo.height), got);
@@ -215,7 +216,7 @@ pub fn crop(photo: &Rgb, camera: &Camera, options: &CropOptions) -> Result<Cropp
     let target_size = (cut(target_w, w, input_size.0), cut(target_h, h, input_size.1));
     let r = target_w / w;
     let unit = if (target_w, target_h) == (w * r, h * r) { r } else { 1 };
-    let plan = Plan::new(size, options.target_size, target_size, unit);
+    let plan = Plan::new(size, (target_w, target_h), target_size, unit);
     let target = plan.picture(photo);
     let target_k = plan.intrinsics(k, options.rule);
     let (input, input_k) = match options.lr_from {
@@ -263,7 +264,7 @@ mod tests {
         for (w, h) in [(576, 320), (320, 576), (1920, 1080), (100, 90)] {
             let (picture, camera) = photo(w, h);
             for r in [1, 2, 4] {
-                let options = CropOptions::new((64, 48), r, 16);
+                let options = CropOptions::new(Size::new(64, 48), r, 16);
                 let c = crop(&picture, &camera, &options).unwrap();
                 let p = Vec3::new(0.05, -0.07, 1.0);
                 let in_photo = camera.project(p).unwrap();
@@ -290,7 +291,7 @@ mod tests {
     #[test]
     fn sizes_are_cut_to_the_stride_around_the_same_middle() {
         let (picture, camera) = photo(640, 480);
-        let options = CropOptions::new((100, 75), 2, 16);
+        let options = CropOptions::new(Size::new(100, 75), 2, 16);
         let c = crop(&picture, &camera, &options).unwrap();
         assert_eq!((c.input.width, c.input.height), (96, 64));
         let middle = c.window.to_photo(Vec2::new(96.0, 64.0));
@@ -300,7 +301,10 @@ mod tests {
     #[test]
     fn targets_have_any_size() {
         let (picture, camera) = photo(640, 480);
-        let options = CropOptions { target_size: (150, 110), ..CropOptions::new((96, 64), 1, 32) };
+        let options = CropOptions {
+            target_size: Size::new(150, 110),
+            ..CropOptions::new(Size::new(96, 64), 1, 32)
+        };
         let c = crop(&picture, &camera, &options).unwrap();
         assert_eq!((c.input.width, c.input.height), (96, 64));
         assert_eq!((c.target.width, c.target.height), (150, 110));
@@ -313,7 +317,7 @@ mod tests {
         let in_photo = camera.project(p).unwrap();
         assert!((c.window.to_photo(in_target) - in_photo).length() < 1e-2);
         // A stride that cuts the input cuts the same share of the target.
-        let cut = CropOptions { input_size: (100, 64), stride: 32, ..options };
+        let cut = CropOptions { input_size: Size::new(100, 64), ..options };
         let c = crop(&picture, &camera, &cut).unwrap();
         assert_eq!((c.input.width, c.target.width, c.target.height), (96, 144, 110));
     }

@@ -17,7 +17,7 @@ use super::crop::{CropOptions, crop};
 use super::depth::depth_range;
 use super::procedural::rng::Rng;
 use super::sampler::{SampledFrames, ViewSampler};
-use crate::camera::{Camera, Intrinsics, NearFar};
+use crate::camera::{Camera, Intrinsics, NearFar, Size};
 use crate::io::image::Rgb;
 use crate::io::scene::{Scene, is_scene, load_scene};
 use crate::io::{Error, Result};
@@ -315,7 +315,7 @@ impl Dataset {
             }
         }
         let ExampleOptions { sampler, crop, .. } = &self.options;
-        let (w, h) = crop.target_size;
+        let Size { width: w, height: h } = crop.target_size;
         let expected = format!(
             "a scene of more than {} frames of at least {}x{} pixels, none wider than {FOV_MAX} \
              degrees, with a camera that moves or with near and far",
@@ -391,7 +391,8 @@ impl Dataset {
         load: &dyn Fn(usize) -> Result<(Rgb, Camera)>,
     ) -> Result<Option<TrainingExample>> {
         let options = &self.options.crop;
-        let min_size = options.target_size;
+        let Size { width: w, height: h } = options.target_size;
+        let min_size = (w, h);
         let (mut context, mut targets) = (Vec::new(), Vec::new());
         for (i, &frame) in frames.context.iter().chain(&frames.targets).enumerate() {
             let (photo, camera) = load(frame)?;

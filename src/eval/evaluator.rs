@@ -6,7 +6,7 @@ use super::{
     Scores, TargetScores,
 };
 use crate::abi::RasterOptions;
-use crate::camera::Camera;
+use crate::camera::{Camera, Size};
 use crate::config::LowpassRef;
 use crate::cpu::Rasterizer;
 use crate::data::crop::{CropOptions, CropRule, Cropped, LrFrom};
@@ -254,7 +254,8 @@ impl Evaluator {
         let photos = || loaded.context.iter().chain(&loaded.targets);
         let least = |side: fn(&Photo) -> usize| photos().map(side).min().unwrap_or(0);
         let least = (least(|p| p.image().width), least(|p| p.image().height));
-        let input_size = fitting(nominal, upscale, stride, least);
+        let (width, height) = fitting(nominal, upscale, stride, least);
+        let input_size = Size { width, height };
         let options =
             CropOptions { rule, lr_from, ..CropOptions::new(input_size, upscale, stride) };
         let cropped =

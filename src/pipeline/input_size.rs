@@ -1,5 +1,7 @@
 //! Size of the network's input for photographs of any shape.
 
+use crate::camera::Size;
+
 /// Size of the network's input.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
@@ -37,19 +39,19 @@ impl InputSize {
         Self::Exact { width, height }
     }
 
-    /// Width and height for `photos` (width and height, px) and a model of `stride`, px. An exact
-    /// size is returned as it is. Without photographs the shape is square.
-    pub fn resolve(self, photos: &[(usize, usize)], stride: usize) -> (usize, usize) {
+    /// The size for photographs of the sizes `photos` and a model of `stride`, px. An exact size is
+    /// returned as it is. Without photographs the shape is square.
+    pub fn resolve(self, photos: &[Size], stride: usize) -> Size {
         let area = match self {
-            Self::Exact { width, height } => return (width, height),
+            Self::Exact { width, height } => return Size { width, height },
             Self::Area(area) => area.max(1) as f64,
         };
         let stride = stride.max(1);
         let cells = (AREA_RATIO.end() * area / (stride * stride) as f64) as usize;
-        let mut best = Candidate::new((stride, stride), area, photos);
+        let mut best = Candidate::new(Size::new(stride, stride), area, photos);
         for columns in 1..=cells {
             for rows in 1..=cells / columns {
-                let size = (columns * stride, rows * stride);
+                let size = Size::new(columns * stride, rows * stride);
                 let candidate = Candidate::new(size, area, photos);
                 if candidate.rank > best.rank {
                     best = candidate;
@@ -62,21 +64,21 @@ impl InputSize {
 
 /// A size with its rank; the higher the better.
 struct Candidate {
-    size: (usize, usize),
+    size: Size,
     /// Whether the area is in range, share kept of the photograph that loses most, mean share,
     /// closeness of the area. Shares are in ppm, so that rounding decides nothing.
     rank: (bool, i64, i64, i64),
 }
 
 impl Candidate {
-    fn new(size: (usize, usize), area: f64, photos: &[(usize, usize)]) -> Self {
+    fn new(size: Size, area: f64, photos: &[Size]) -> Self {
         let ppm = |v: f64| (v * 1e6).round() as i64;
-        let square = [(1, 1)];
+        let square = [Size::new(1, 1)];
         let photos = if photos.is_empty() { &square } else { photos };
         let shares = photos.iter().map(|photo| kept_share(*photo, size));
         let least = shares.clone().fold(f64::INFINITY, f64::min);
         let mean = shares.sum::<f64>() / photos.len() as f64;
-        let ratio = (size.0 * size.1) as f64 / area;
+        let ratio = (size.width * size.height) as f64 / area;
         let inside = AREA_RATIO.contains(&ratio);
         // Outside the range the nearest area counts alone: the input is smaller than a few cells.
         let (least, mean) = if inside { (ppm(least), ppm(mean)) } else { (0, 0) };
@@ -85,8 +87,8 @@ impl Candidate {
 }
 
 /// Share of a photograph of `photo` px that the largest window of the shape of `size` shows.
-fn kept_share(photo: (usize, usize), size: (usize, usize)) -> f64 {
-    let aspect = |(w, h): (usize, usize)| w.max(1) as f64 / h.max(1) as f64;
+fn kept_share(photo: Size, size: Size) -> f64 {
+    let aspect = |s: Size| s.width.max(1) as f64 / s.height.max(1) as f64;
     let ratio = aspect(photo) / aspect(size);
     ratio.min(1.0 / ratio)
 }
@@ -95,8 +97,18 @@ fn kept_share(photo: (usize, usize), size: (usize, usize)) -> f64 {
 mod tests {
     use super::*;
 
+    fn of((width, height): (usize, usize)) -> Size {
+        Size { width, height }
+    }
+
+    fn size_of(input: InputSize, photos: &[(usize, usize)], stride: usize) -> (usize, usize) {
+        let photos: Vec<Size> = photos.iter().copied().map(of).collect();
+        let size = input.resolve(&photos, stride);
+        (size.width, size.height)
+    }
+
     fn resolved(photos: &[(usize, usize)], stride: usize) -> (usize, usize) {
-        InputSize::default().resolve(photos, stride)
+        size_of(InputSize::default(), photos, stride)
     }
 
     #[test]
@@ -113,7 +125,7 @@ mod tests {
             let size = resolved(&[photo, photo], stride);
             assert_eq!(size, expected, "{photo:?}");
             assert!(AREA_RATIO.contains(&((size.0 * size.1) as f64 / 65536.0)), "{size:?}");
-            assert!(kept_share(photo, size) > 0.95, "{photo:?} {size:?}");
+            assert!(kept_share(of(photo), of(size)) > 0.95, "{photo:?} {size:?}");
         }
     }
 
@@ -122,17 +134,17 @@ mod tests {
         // 3:2 both ways: a square keeps two thirds of each; either shape keeps 4/9 of the other.
         assert_eq!(resolved(&[(600, 400), (400, 600)], 32), (256, 256));
         let size = resolved(&[(1600, 900), (1600, 900), (1200, 900)], 32);
-        let shares = [(1600, 900), (1200, 900)].map(|p| kept_share(p, size));
+        let shares = [(1600, 900), (1200, 900)].map(|p| kept_share(of(p), of(size)));
         assert!(shares.iter().all(|s| *s > 0.83), "{size:?} {shares:?}");
     }
 
     #[test]
     fn exact_and_tiny_sizes() {
-        assert_eq!(InputSize::exact(100, 75).resolve(&[(9, 5)], 32), (100, 75));
-        assert_eq!(InputSize::Area(1).resolve(&[(9, 5)], 32), (32, 32));
-        assert_eq!(InputSize::Area(0).resolve(&[], 32), (32, 32));
-        assert_eq!(InputSize::Area(96 * 96).resolve(&[], 32), (96, 96));
-        let (w, h) = InputSize::Area(1 << 20).resolve(&[(10_000, 100)], 32);
+        assert_eq!(size_of(InputSize::exact(100, 75), &[(9, 5)], 32), (100, 75));
+        assert_eq!(size_of(InputSize::Area(1), &[(9, 5)], 32), (32, 32));
+        assert_eq!(size_of(InputSize::Area(0), &[], 32), (32, 32));
+        assert_eq!(size_of(InputSize::Area(96 * 96), &[], 32), (96, 96));
+        let (w, h) = size_of(InputSize::Area(1 << 20), &[(10_000, 100)], 32);
         assert!(w > 40 * h && w * h < 1_300_000, "{w}x{h}");
     }
 }

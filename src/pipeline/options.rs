@@ -1,7 +1,7 @@
 //! Options of a reconstruction.
 
 use super::{Density, DepthBounds, DepthRange, Error, InputSize, Result, initial_bounds};
-use crate::camera::Camera;
+use crate::camera::{Camera, Size};
 use crate::fit::FitOptions;
 use crate::refine::RefineOptions;
 use std::time::Duration;
@@ -121,13 +121,10 @@ impl Options {
         self
     }
 
-    /// Width and height of the network's input for `photos` (width and height, px) and a model of
-    /// `stride`, px.
-    pub fn input_size_for(&self, photos: &[(usize, usize)], stride: usize) -> (usize, usize) {
+    /// Size of the network's input for photographs of the sizes `photos` and a model of `stride`, px.
+    pub fn input_size_for(&self, photos: &[Size], stride: usize) -> Size {
         match self.target_size {
-            TargetSize::Exact { width, height } => {
-                self.input_size.resolve(&[(width, height)], stride)
-            }
+            TargetSize::Exact(size) => self.input_size.resolve(&[size], stride),
             _ => self.input_size.resolve(photos, stride),
         }
     }
@@ -162,32 +159,24 @@ pub enum TargetSize {
     /// The input's sides times this number, rounded.
     Times(f32),
     /// These sides, px. The input has their shape where [`Options::input_size`] leaves it open.
-    #[non_exhaustive]
-    Exact {
-        /// Width, px.
-        width: usize,
-        /// Height, px.
-        height: usize,
-    },
+    Exact(Size),
 }
 
 impl TargetSize {
-    /// Sides `width` and `height`, px.
-    pub fn exact(width: usize, height: usize) -> Self {
-        Self::Exact { width, height }
-    }
-
-    /// Width and height for an input of `input_size` px and a model of `upscale`. A factor that is
-    /// not finite gives 0, which [`Reconstructor::run`](super::Reconstructor::run) refuses.
-    pub fn resolve(self, input_size: (usize, usize), upscale: usize) -> (usize, usize) {
-        let (w, h) = input_size;
+    /// The size for an input of `input_size` and a model of `upscale`. A factor that is not finite
+    /// gives 0 or a side that is too large, which
+    /// [`Reconstructor::run`](super::Reconstructor::run) refuses.
+    pub fn resolve(self, input_size: Size, upscale: usize) -> Size {
+        let Size { width, height } = input_size;
         match self {
-            Self::Upscaled => (w.saturating_mul(upscale), h.saturating_mul(upscale)),
+            Self::Upscaled => {
+                Size::new(width.saturating_mul(upscale), height.saturating_mul(upscale))
+            }
             Self::Times(factor) => {
                 let side = |side: usize| (side as f32 * factor).round() as usize;
-                (side(w), side(h))
+                Size::new(side(width), side(height))
             }
-            Self::Exact { width, height } => (width, height),
+            Self::Exact(size) => size,
         }
     }
 }

@@ -1,7 +1,7 @@
 //! A photograph with its camera.
 
 use super::{Error, Result};
-use crate::camera::Camera;
+use crate::camera::{Camera, Size};
 use crate::data::crop::{CropOptions, Cropped, crop};
 use crate::io::image::{LoadOptions, Rgb};
 use crate::io::scene::{Frame, LoadedFrame};
@@ -57,6 +57,11 @@ impl Photo {
     pub(super) fn with_pose_of(&self, camera: &Camera) -> Result<Self> {
         let camera = Camera::new(self.camera.intrinsics, camera.world_from_camera)?;
         Ok(Self { image: Arc::clone(&self.image), camera })
+    }
+
+    /// The size.
+    pub fn size(&self) -> Size {
+        Size::new(self.image.width, self.image.height)
     }
 
     /// The pixels.

@@ -7,7 +7,7 @@ use super::{
     Reconstruction, Refine, Result, Stage, TargetSize, check_pairs, exposure, is_mvsplat, poses,
     refined_bounds,
 };
-use crate::camera::{Camera, NearFar};
+use crate::camera::{Camera, NearFar, Size};
 use crate::config::{Config, Preset};
 use crate::data::crop::{CropOptions, Cropped};
 use crate::data::pair::choose_sources;
@@ -120,18 +120,13 @@ impl Reconstructor {
         Ok(Self { model: self.model.with_upscale(upscale)?, ..self })
     }
 
-    /// Crop of a photograph for inputs of `input_size` (width, height), px, and targets of the
-    /// model's upscale.
-    pub fn crop_options(&self, input_size: (usize, usize)) -> CropOptions {
+    /// Crop of a photograph for inputs of `input_size`, and targets of the model's upscale.
+    pub fn crop_options(&self, input_size: Size) -> CropOptions {
         self.crop_options_for(input_size, TargetSize::Upscaled)
     }
 
     /// [`Reconstructor::crop_options`] for targets of `target_size`.
-    pub fn crop_options_for(
-        &self,
-        input_size: (usize, usize),
-        target_size: TargetSize,
-    ) -> CropOptions {
+    pub fn crop_options_for(&self, input_size: Size, target_size: TargetSize) -> CropOptions {
         let config = self.config();
         CropOptions {
             target_size: target_size.resolve(input_size, config.upscale),
@@ -184,7 +179,7 @@ impl Reconstructor {
         options: &Options,
         progress: &mut dyn FnMut(Progress) -> ControlFlow<()>,
     ) -> Result<Prepared<'_>> {
-        let sizes: Vec<_> = photos.iter().map(|p| (p.image().width, p.image().height)).collect();
+        let sizes: Vec<Size> = photos.iter().map(Photo::size).collect();
         let input_size = options.input_size_for(&sizes, self.config().stride());
         let crop = self.crop_options_for(input_size, options.target_size);
         let mut tracker = Tracker::new(self.stage_costs(photos.len(), crop.input_size, options));
@@ -294,7 +289,7 @@ impl Reconstructor {
     fn stage_costs(
         &self,
         photos: usize,
-        (w, h): (usize, usize),
+        Size { width: w, height: h }: Size,
         options: &Options,
     ) -> Vec<StageCost> {
         let n = photos as f32;
@@ -348,12 +343,12 @@ fn crop_all(
 }
 
 /// Share of a photograph of `size` px that its crop does not show, 0 to 1.
-fn cut_share(crop: &Cropped, size: (usize, usize)) -> f32 {
+fn cut_share(crop: &Cropped, size: Size) -> f32 {
     let shown = crop.window.scale.x
         * crop.target.width as f32
         * crop.window.scale.y
         * crop.target.height as f32;
-    (1.0 - shown / (size.0 as f32 * size.1 as f32)).clamp(0.0, 1.0)
+    (1.0 - shown / (size.width as f32 * size.height as f32)).clamp(0.0, 1.0)
 }
 
 /// Cropped photographs of one scene as the network's input.

@@ -1,6 +1,7 @@
 //! Warnings of a reconstruction.
 
 use super::{DepthBounds, Photo};
+use crate::camera::Size;
 use crate::check::{Finding, PairReport};
 use crate::data::crop::{CropOptions, Cropped};
 use std::fmt;
@@ -29,20 +30,20 @@ pub enum Warning {
     /// The input size was cut to multiples of the model's stride.
     #[non_exhaustive]
     InputSizeCut {
-        /// Width and height that were requested, px.
-        requested: (usize, usize),
-        /// Width and height that are used, px.
-        used: (usize, usize),
+        /// The size that was requested.
+        requested: Size,
+        /// The size that is used.
+        used: Size,
         /// The model's stride, px.
         stride: usize,
     },
     /// A photograph is smaller than the target picture, and was enlarged.
     #[non_exhaustive]
     PhotographEnlarged {
-        /// Width and height of the photograph, px.
-        size: (usize, usize),
-        /// Width and height after resizing, px.
-        resized: (usize, usize),
+        /// Size of the photograph.
+        size: Size,
+        /// Size after resizing.
+        resized: Size,
     },
     /// The weights lack some or all of SubSplat's tensors, the heads that place children.
     #[non_exhaustive]
@@ -83,12 +84,12 @@ impl fmt::Display for Warning {
                 "near {near:.4} and far {far:.4} are guesses from the distance between the \
                  cameras; fix the depth range if you know it"
             ),
-            Self::InputSizeCut { requested: (w, h), used: (cut_w, cut_h), stride } => {
-                write!(f, "input size {w}x{h} is cut to {cut_w}x{cut_h}, multiples of {stride}")
+            Self::InputSizeCut { requested, used, stride } => {
+                write!(f, "input size {requested} is cut to {used}, multiples of {stride}")
             }
-            Self::PhotographEnlarged { size: (w, h), resized: (to_w, to_h) } => write!(
+            Self::PhotographEnlarged { size, resized } => write!(
                 f,
-                "the photograph of {w}x{h} is enlarged to {to_w}x{to_h}: the target shows no more \
+                "the photograph of {size} is enlarged to {resized}: the target shows no more \
                  detail than the photograph has"
             ),
             Self::UntrainedTensors { count, upscale, trained } => {
@@ -150,7 +151,7 @@ impl Warning {
         };
         let (requested, stride) = (options.input_size, options.stride);
         for c in inputs {
-            let used = (c.input.width, c.input.height);
+            let used = Size::new(c.input.width, c.input.height);
             if used != requested {
                 add(Self::InputSizeCut { requested, used, stride });
             }
@@ -158,9 +159,9 @@ impl Warning {
         for (photo, c) in photos.iter().zip(inputs) {
             let scale = c.window.scale;
             if scale.min_element() < 1.0 {
-                let size = (photo.image().width, photo.image().height);
+                let size = photo.size();
                 let side = |side: usize, scale: f32| (side as f32 / scale).round() as usize;
-                let resized = (side(size.0, scale.x), side(size.1, scale.y));
+                let resized = Size::new(side(size.width, scale.x), side(size.height, scale.y));
                 add(Self::PhotographEnlarged { size, resized });
             }
         }

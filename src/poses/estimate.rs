@@ -18,21 +18,31 @@ use rayon::prelude::*;
 pub struct PoseOptions {
     /// Seed of the random samples.
     pub seed: u64,
-    /// Returns the best estimate where it would be refused, as long as there is any.
-    pub force: bool,
+    /// Treatment of photographs that do not determine their cameras.
+    pub uncertain: Uncertain,
+}
+
+/// Treatment of photographs that do not determine their cameras.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Uncertain {
+    /// They are refused ([`PoseRefusal`]).
+    #[default]
+    Refuse,
+    /// The best estimate is returned, as long as there is any.
+    Accept,
 }
 
 impl Default for PoseOptions {
     fn default() -> Self {
-        Self { seed: 0x5EED, force: false }
+        Self { seed: 0x5EED, uncertain: Uncertain::Refuse }
     }
 }
 
 impl PoseOptions {
-    /// Sets [`PoseOptions::force`].
+    /// Sets [`PoseOptions::uncertain`].
     #[must_use]
-    pub fn with_force(mut self, force: bool) -> Self {
-        self.force = force;
+    pub fn with_uncertain(mut self, uncertain: Uncertain) -> Self {
+        self.uncertain = uncertain;
         self
     }
 }
@@ -267,7 +277,7 @@ fn two(a: &PosePhoto, b: &PosePhoto, options: &PoseOptions) -> Result<PoseEstima
         false => (upright, [a, b]),
     };
     // Symmetric things in a mirrored photograph agree with a camera upside down behind a plane.
-    if !options.force
+    if options.uncertain == Uncertain::Refuse
         && (supported(&best) < FEW_CONSISTENT || is_upside_down(&best))
         && let Some(refusal) = mirrored(a, b, supported(&best), options)
     {
@@ -297,7 +307,7 @@ fn judged(
 ) -> Result<PoseEstimate, PoseRefusal> {
     let estimate = estimate.map_err(|matches| unexplained(a, &matches))?;
     let refusal = refusal(a, &estimate);
-    if let (Some(refusal), false) = (&refusal, options.force) {
+    if let (Some(refusal), Uncertain::Refuse) = (&refusal, options.uncertain) {
         return Err(refusal.clone());
     }
     let relative = estimate.refined.relative;
@@ -449,7 +459,8 @@ fn many(photos: &[PosePhoto], options: &PoseOptions) -> Result<PoseEstimate, Pos
         if deviation > STATED { reconstruct::focal_scale(photos, options.seed) } else { 1.0 };
     let exact: Vec<PosePhoto> = photos.par_iter().map(|p| p.with_focal(first)).collect();
     let edges = reconstruct::edges(&exact, options.seed);
-    let sound = |e: &Edge| options.force || refusal(&exact[e.photos[0]], &e.estimate).is_none();
+    let accepted = options.uncertain == Uncertain::Accept;
+    let sound = |e: &Edge| accepted || refusal(&exact[e.photos[0]], &e.estimate).is_none();
     let usable: Vec<Edge> = edges.into_iter().filter(sound).collect();
     let prior = (deviation > 0.0).then_some(FocalPrior { mean: -first.ln(), deviation });
     let mut model =

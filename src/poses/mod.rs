@@ -28,6 +28,6 @@ mod world;
 pub use adjust::{PoseAdjustment, adjust_poses};
 pub use estimate::{
     Confidence, FocalEstimate, LeftOut, PoseEstimate, PoseOptions, PosePoint, PoseRefusal,
-    PoseWarning, estimate_poses,
+    PoseWarning, Uncertain, estimate_poses,
 };
 pub use photo::{Lens, PosePhoto, PosePhotoError};

@@ -3,7 +3,7 @@
 use super::config::TrainConfig;
 use super::source::{Example, InputTargets, Source};
 use super::{Error, Result};
-use crate::camera::NearFar;
+use crate::camera::{NearFar, Size};
 use crate::data::crop::{CropOptions, CropRule};
 use crate::data::dataset::{Dataset, ExampleOptions};
 use crate::data::sampler::{GapBounds, GapMode, ViewSampler};
@@ -107,7 +107,7 @@ impl Pictures {
         };
         let [w, h] = config.data.input;
         let rule = if files.reference_crop { CropRule::Mvsplat } else { CropRule::Exact };
-        let exact = CropOptions::new((w, h), model.upscale, model.stride());
+        let exact = CropOptions::new(Size::new(w, h), model.upscale, model.stride());
         let options = ExampleOptions {
             sampler,
             crop: CropOptions { rule, ..exact },

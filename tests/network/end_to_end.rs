@@ -8,7 +8,7 @@ use glam::Vec3;
 use subsplat::abi::{
     Convention, QUAT_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE, ShBasis, ShDirection,
 };
-use subsplat::camera::{Camera, Intrinsics, NearFar};
+use subsplat::camera::{Camera, Intrinsics, NearFar, Size};
 use subsplat::config::{Backbone, Config, Preset, ShFrame};
 use subsplat::io::image::Rgb;
 use subsplat::io::{SaveOptions, load_splats, save_splats};
@@ -342,7 +342,7 @@ fn shared_coefficients_render_as_separate_ones() {
 fn batch(model: &Reconstructor, shoots: &[Shoot], size: (usize, usize)) -> Views {
     let (mut images, mut cameras) = (Vec::new(), Vec::new());
     for shoot in shoots {
-        let options = model.crop_options(size);
+        let options = model.crop_options(Size::new(size.0, size.1));
         let inputs = shoot.photos.iter().map(|p| p.crop(&options).unwrap()).collect::<Vec<_>>();
         let planes: Vec<f32> = inputs.iter().flat_map(|c| c.input.to_planes()).collect();
         let shape = (1, inputs.len(), 3, size.1, size.0);

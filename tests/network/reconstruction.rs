@@ -5,6 +5,7 @@ use subsplat_test_support::whole;
 use candle_core::{Device, Tensor};
 use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use subsplat::camera::Size;
 use subsplat::check::Verdict;
 use subsplat::config::{Config, Preset};
 use subsplat::model::Views;
@@ -101,8 +102,10 @@ fn the_networks_have_as_many_steps_as_they_state() {
     for config in [Config::small(Preset::Tuned, 2), Config::re10k(Preset::Tuned, 2)] {
         let model = Reconstructor::untrained(&config, 7).unwrap();
         let (network, near_far) = (model.model(), NearFar::new(1.0, 20.0));
-        let inputs: Vec<_> =
-            photos.iter().map(|p| p.crop(&model.crop_options((64, 64))).unwrap()).collect();
+        let inputs: Vec<_> = photos
+            .iter()
+            .map(|p| p.crop(&model.crop_options(Size::new(64, 64))).unwrap())
+            .collect();
         let pixels: Vec<f32> = inputs.iter().flat_map(|c| c.input.to_planes()).collect();
         let images = Tensor::from_vec(pixels, (1, 2, 3, 64, 64), &Device::Cpu).unwrap();
         let cameras = inputs.iter().map(|c| c.input_camera).collect();

@@ -2,7 +2,7 @@
 //! the table.
 
 use rayon::prelude::*;
-use subsplat::{Confidence, PoseOptions, PoseRefusal, estimate_poses};
+use subsplat::{Confidence, PoseOptions, PoseRefusal, Uncertain, estimate_poses};
 use subsplat_test_support::pose_errors::{area_under_curve, median, relative_errors};
 use subsplat_test_support::posed_photos::{Intrinsics, PAIR_FEATURES, PosedPair, context_pairs};
 
@@ -19,7 +19,9 @@ fn outcome(pair: &PosedPair, intrinsics: Intrinsics) -> Outcome {
     let estimate = estimate_poses(&photos, &PoseOptions::default());
     let forced = match &estimate {
         Ok(estimate) => Ok(estimate.clone()),
-        Err(_) => estimate_poses(&photos, &PoseOptions::default().with_force(true)),
+        Err(_) => {
+            estimate_poses(&photos, &PoseOptions::default().with_uncertain(Uncertain::Accept))
+        }
     };
     let error = forced.map_or(f64::INFINITY, |e| {
         let found = [0, 1].map(|i| e.cameras[i].expect("a camera"));

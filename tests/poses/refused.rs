@@ -5,6 +5,7 @@ use glam::{Mat3, Mat4, Vec3};
 use std::sync::Arc;
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::data::procedural::{Grade, Quality, Room, TextureBank};
+use subsplat::loose::Uncertain;
 use subsplat::{
     Lens, PoseEstimate, PoseOptions, PosePhoto, PosePhotoError, PoseRefusal, estimate_poses,
 };
@@ -46,15 +47,15 @@ fn mirrored(rgb: &[u8]) -> Vec<u8> {
     rgb.chunks_exact(3 * W).flat_map(row).collect()
 }
 
-fn estimate(a: &[u8], b: &[u8], force: bool) -> Result<PoseEstimate, PoseRefusal> {
-    estimate_poses(&[photo(a), photo(b)], &PoseOptions::default().with_force(force))
+fn estimate(a: &[u8], b: &[u8], uncertain: Uncertain) -> Result<PoseEstimate, PoseRefusal> {
+    estimate_poses(&[photo(a), photo(b)], &PoseOptions::default().with_uncertain(uncertain))
 }
 
 #[test]
 fn a_step_aside_gives_the_cameras() {
     let cameras = [camera(EYE, 0.0), camera(EYE + STEP, -0.05)];
     let [a, b] = [0, 1].map(|i| picture(7663, &cameras[i], i as u64));
-    let estimate = estimate(&a, &b, false).unwrap();
+    let estimate = estimate(&a, &b, Uncertain::Refuse).unwrap();
     let found = [0, 1].map(|i| estimate.cameras[i].unwrap());
     let errors = relative_errors(found.each_ref(), cameras.each_ref());
     assert!(errors[0] < 0.2 && errors[1] < 1.0, "{errors:?}");
@@ -63,11 +64,11 @@ fn a_step_aside_gives_the_cameras() {
 #[test]
 fn the_same_photograph_twice_is_one_view() {
     let a = picture(7663, &camera(EYE, 0.0), 1);
-    let refusal = estimate(&a, &a, false).unwrap_err();
+    let refusal = estimate(&a, &a, Uncertain::Refuse).unwrap_err();
     assert_eq!(refusal, PoseRefusal::SameView { shift_px: 0.0 });
     // The same view with other noise, which no flag can turn into two places.
     let again = picture(7663, &camera(EYE, 0.0), 2);
-    let refusal = estimate(&a, &again, false).unwrap_err();
+    let refusal = estimate(&a, &again, Uncertain::Refuse).unwrap_err();
     assert!(matches!(refusal, PoseRefusal::SameView { .. }), "{refusal}");
 }
 
@@ -75,14 +76,14 @@ fn the_same_photograph_twice_is_one_view() {
 fn a_camera_that_only_turned_is_refused() {
     for yaw in [0.1, 0.25] {
         let [a, b] = [0.0, yaw].map(|yaw| picture(7663, &camera(EYE, yaw), yaw.to_bits().into()));
-        let refusal = estimate(&a, &b, false).unwrap_err();
+        let refusal = estimate(&a, &b, Uncertain::Refuse).unwrap_err();
         let PoseRefusal::PureRotation { degrees, parallax_px } = refusal else {
             panic!("{yaw}: {refusal}")
         };
         assert!((degrees - f64::from(yaw).to_degrees()).abs() < 0.5, "{degrees}");
         assert!(parallax_px < 1.0, "{parallax_px}");
         // Forced, the estimate is there and says what is wrong with it.
-        if let Ok(forced) = estimate(&a, &b, true) {
+        if let Ok(forced) = estimate(&a, &b, Uncertain::Accept) {
             assert!(forced.warnings.iter().any(|w| w.to_string().contains("did not move")));
         }
     }
@@ -93,7 +94,7 @@ fn a_mirrored_photograph_is_named() {
     let [a, b] =
         [(EYE, 0.0), (EYE + STEP, -0.05)].map(|(eye, yaw)| picture(7663, &camera(eye, yaw), 7));
     for other in [&a, &b] {
-        let refusal = estimate(&a, &mirrored(other), false).unwrap_err();
+        let refusal = estimate(&a, &mirrored(other), Uncertain::Refuse).unwrap_err();
         assert!(matches!(refusal, PoseRefusal::Mirrored { consistent } if consistent > 45));
     }
 }
@@ -102,7 +103,7 @@ fn a_mirrored_photograph_is_named() {
 fn photographs_of_different_rooms_are_refused() {
     for other in [1, 2, 3] {
         let [a, b] = [7663, other].map(|room| picture(room, &camera(EYE, 0.0), room));
-        let refusal = estimate(&a, &b, false).unwrap_err();
+        let refusal = estimate(&a, &b, Uncertain::Refuse).unwrap_err();
         assert!(matches!(refusal, PoseRefusal::FewMatches { .. }), "{other}: {refusal}");
     }
 }
@@ -110,7 +111,7 @@ fn photographs_of_different_rooms_are_refused() {
 #[test]
 fn photographs_without_texture_are_refused() {
     let grey = vec![128; 3 * W * H];
-    let refusal = estimate(&grey, &grey, true).unwrap_err();
+    let refusal = estimate(&grey, &grey, Uncertain::Accept).unwrap_err();
     assert!(matches!(refusal, PoseRefusal::FewMatches { consistent: 0, matches: 0, .. }));
     let one = [photo(&grey)];
     assert_eq!(

@@ -6,7 +6,7 @@ use super::args_view::{KEYS, ViewArgs};
 use super::values;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
-use subsplat::{Density, FitOptions, InputSize, Refine, TargetSize};
+use subsplat::{Density, FitOptions, InputSize, Refine, Size, TargetSize};
 
 /// Exit codes, which scripts rely on.
 const EXIT_CODES: &str = "\
@@ -210,7 +210,7 @@ impl RunArgs {
     /// Size of the pictures: --size, else --upscale times the input.
     pub fn target_size(&self) -> TargetSize {
         match self.size {
-            Some((width, height)) => TargetSize::exact(width, height),
+            Some((width, height)) => TargetSize::Exact(Size::new(width, height)),
             None => self.source.target_size(),
         }
     }

@@ -11,7 +11,9 @@ use subsplat::io::image::{LoadOptions, Truncated, probe};
 use subsplat::io::matrices::{self, PoseConvention, parse_intrinsics, parse_matrix};
 use subsplat::io::photograph::{PhotographHeader, list_photographs, probe_photograph};
 use subsplat::io::scene::{Scene, SceneFormat, is_scene, load_scene};
-use subsplat::{Confidence, KnownLens, LooseOptions, LooseScene, PoseOptions, loose_scene};
+use subsplat::{
+    Confidence, KnownLens, LooseOptions, LooseScene, PoseOptions, Uncertain, loose_scene,
+};
 
 /// Loads a scene; or makes one of photographs, with the cameras of `args` or estimated ones.
 pub fn load(input: &[PathBuf], args: &PairArgs, bar: &ProgressBar) -> Result<Scene> {
@@ -102,10 +104,13 @@ pub fn estimate(
         Some(text) => Some(KnownLens::Pixels(four(text)?)),
         None => request.fov.map(|fov| KnownLens::FovX(fov.to_radians())),
     };
-    let truncated = if request.force { Truncated::Accept } else { Truncated::Refuse };
+    let (truncated, uncertain) = match request.force {
+        true => (Truncated::Accept, Uncertain::Accept),
+        false => (Truncated::Refuse, Uncertain::Refuse),
+    };
     let options = LooseOptions {
         lens,
-        poses: PoseOptions::default().with_force(request.force),
+        poses: PoseOptions::default().with_uncertain(uncertain),
         load: LoadOptions { truncated },
     };
     let mut show = |i: usize| {

@@ -7,6 +7,7 @@ use crate::report::{Progress, print_line, print_warning, show_fraction};
 use anyhow::{Result, ensure};
 use serde_json::{Value, json};
 use std::borrow::Borrow;
+use subsplat::camera::Size;
 use subsplat::check::{PairReport, Verdict};
 use subsplat::config::Config;
 use subsplat::data::crop::Cropped;
@@ -57,19 +58,19 @@ pub fn input_size(
 ) -> Result<(InputSize, (usize, usize))> {
     let size = |&i: &usize| {
         let k = scene.frames[i].camera.intrinsics();
-        (k.width, k.height)
+        Size::new(k.width, k.height)
     };
-    let photos: Vec<_> = match target {
-        TargetSize::Exact { width, height, .. } => vec![(width, height)],
+    let photos: Vec<Size> = match target {
+        TargetSize::Exact(size) => vec![size],
         _ => context.iter().map(size).collect(),
     };
     let config = model.config();
-    let ample = |size: (usize, usize)| memory::is_ample(config, context.len(), size);
+    let ample = |size: Size| memory::is_ample(config, context.len(), (size.width, size.height));
     let chosen = match args.quality {
         Some(quality) => quality_size(quality, args.crop, &photos, config, ample),
         None => args.input_size(),
     };
-    let (w, h) = chosen.resolve(&photos, config.stride());
+    let Size { width: w, height: h } = chosen.resolve(&photos, config.stride());
     let stride = config.stride();
     // An area below one cell of the stride gives one cell; the user asked for less.
     let asked = match chosen {
@@ -100,8 +101,8 @@ pub fn with_children(
 ) -> Result<Reconstructor> {
     let any = model.config().spgr.head.serves_any_k() && args.upscale.is_none();
     let model = match target {
-        TargetSize::Exact { width, height, .. } if any => {
-            let ratio = width.div_ceil(input.0).max(height.div_ceil(input.1));
+        TargetSize::Exact(size) if any => {
+            let ratio = size.width.div_ceil(input.0).max(size.height.div_ceil(input.1));
             model.with_upscale(ratio.clamp(1, UPSCALE_MAX))?
         }
         _ => model,
@@ -110,14 +111,14 @@ pub fn with_children(
     Ok(model)
 }
 
-/// The size of `quality` for `photos` (width and height, px). `High` is limited by the
+/// The size of `quality` for photographs of the sizes `photos`. `High` is limited by the
 /// photographs, whose pixels a target need not exceed, and by the memory.
 fn quality_size(
     quality: QualityArg,
     crop: CropShapeArg,
-    photos: &[(usize, usize)],
+    photos: &[Size],
     config: &Config,
-    ample: impl Fn((usize, usize)) -> bool,
+    ample: impl Fn(Size) -> bool,
 ) -> InputSize {
     let of_area = |area: usize| match crop {
         CropShapeArg::Whole => InputSize::Area(area),
@@ -127,9 +128,9 @@ fn quality_size(
     if quality != QualityArg::High {
         return of_area(quality.area());
     }
-    let pixels = |&(w, h): &(usize, usize)| match crop {
-        CropShapeArg::Whole => w * h,
-        CropShapeArg::Square => w.min(h) * w.min(h),
+    let pixels = |photo: &Size| match crop {
+        CropShapeArg::Whole => photo.width * photo.height,
+        CropShapeArg::Square => photo.width.min(photo.height).pow(2),
     };
     let photo = photos.iter().map(pixels).min().unwrap_or(0) / config.children();
     let mut area = quality.area().min(photo).max(normal);
@@ -259,9 +260,11 @@ mod tests {
     #[test]
     fn high_quality_is_limited_by_photographs_and_memory() {
         let config = Config::small(subsplat::config::Preset::Tuned, 2);
-        let size = |quality, crop, photo, ample: bool| {
-            let chosen = quality_size(quality, crop, &[photo, photo], &config, |_| ample);
-            chosen.resolve(&[photo, photo], 32)
+        let size = |quality, crop, (width, height): (usize, usize), ample: bool| {
+            let photos = [Size { width, height }; 2];
+            let chosen = quality_size(quality, crop, &photos, &config, |_| ample);
+            let size = chosen.resolve(&photos, 32);
+            (size.width, size.height)
         };
         use CropShapeArg::{Square, Whole};
         use QualityArg::{Fast, High, Normal};

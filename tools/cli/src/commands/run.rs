@@ -11,7 +11,7 @@ use anyhow::{Result, bail, ensure};
 use serde_json::{Value, json};
 use std::path::Path;
 use subsplat::abi::{Convention, RasterOptions};
-use subsplat::camera::{Camera, NearFar};
+use subsplat::camera::{Camera, NearFar, Size};
 use subsplat::config::{Config, LowpassRef};
 use subsplat::data::crop::{CropOptions, Cropped};
 use subsplat::data::pair::choose_pair;
@@ -50,7 +50,8 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let (size, (w, h)) = reconstruct::input_size(source, target, &model, &plan.scene, context)?;
     let model = reconstruct::with_children(source, target, model, context.len(), (w, h))?;
     (plan.options.input_size, plan.options.target_size) = (size, target);
-    let target_size = target.resolve((w, h), model.config().upscale);
+    let Size { width, height } = target.resolve(Size::new(w, h), model.config().upscale);
+    let target_size = (width, height);
     let targets = targets(args, &plan, target_size)?;
     memory::check_picture("the picture size", target_size)?;
     let parents = plan.context.len() * w * h;
@@ -105,9 +106,9 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
 
 /// Crop of the targets' photographs: that of the inputs, which all have one size.
 fn crop_of(model: &Reconstructor, result: &Reconstruction) -> CropOptions {
-    let size = |p: &Rgb| (p.width, p.height);
+    let size = |p: &Rgb| Size::new(p.width, p.height);
     let sizes = result.inputs().first().map(|c| (size(&c.input), size(&c.target)));
-    let (input, target_size) = sizes.unwrap_or_default();
+    let (input, target_size) = sizes.unwrap_or((Size::new(0, 0), Size::new(0, 0)));
     CropOptions { target_size, ..model.crop_options(input) }
 }
 

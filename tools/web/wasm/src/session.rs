@@ -3,14 +3,11 @@
 use serde_json::{Value, json};
 use std::ops::ControlFlow;
 use std::path::Path;
+use subsplat::loose::LooseOptions;
 use subsplat::{
-    Camera, FitOptions, Lens, LoadOptions, Options, Photo, Photograph, PoseOptions, PosePhoto,
-    RasterOptions, Reconstructor, Refine, SaveOptions, SplatFormat, Splats, encode_splats,
-    estimate_poses, parse_photograph,
+    Camera, FitOptions, LoadOptions, Options, Photo, Photograph, RasterOptions, Reconstructor,
+    Refine, SaveOptions, SplatFormat, Splats, encode_splats, loose_photos, parse_photograph,
 };
-
-/// Features of a photograph of a pair, and of one of many, as in the program.
-const FEATURES: [usize; 2] = [4000, 2500];
 
 #[cfg(all(target_family = "wasm", target_os = "unknown"))]
 #[link(wasm_import_module = "env")]
@@ -73,8 +70,7 @@ impl Session {
     pub(crate) fn reconstruct(&mut self, upscale: usize, effort: u32) -> Result<Vec<u8>, String> {
         self.scene = None;
         let photographs = std::mem::take(&mut self.photographs);
-        let names: Vec<String> = photographs.iter().map(|(name, _)| name.clone()).collect();
-        let (photos, mut warnings) = with_cameras(photographs, &names)?;
+        let (photos, mut warnings) = with_cameras(photographs)?;
         let mut options = Options::default();
         match effort {
             0 => options = options.with_fit(FitOptions::off()).with_refine(Refine::Off),
@@ -126,33 +122,16 @@ impl Session {
 /// Estimates the cameras of photographs. Photographs without one are left out, with a warning.
 fn with_cameras(
     photographs: Vec<(String, Photograph)>,
-    names: &[String],
 ) -> Result<(Vec<Photo>, Vec<String>), String> {
-    let features = FEATURES[usize::from(photographs.len() > 2)];
-    let mut posed = Vec::new();
-    for (i, (_, photograph)) in photographs.iter().enumerate() {
-        report("cameras", i as f32 / photographs.len() as f32);
-        let (w, h) = (photograph.image.width, photograph.image.height);
-        let lens = match photograph.camera.focal {
-            Some(focal) => Lens::stated(focal.px as f32, w, h),
-            None => Lens::unknown(w, h),
-        };
-        let photo = PosePhoto::from_rgb8(&photograph.image.data, lens, features);
-        posed.push(photo.map_err(|e| e.to_string())?);
-    }
-    report("cameras", 0.9);
-    let estimate = estimate_poses(&posed, &PoseOptions::default()).map_err(|e| e.to_string())?;
-    let mut warnings: Vec<String> =
-        photographs.iter().flat_map(|(_, p)| p.warnings.clone()).collect();
+    let (names, photographs): (Vec<String>, Vec<Photograph>) = photographs.into_iter().unzip();
+    let mut warnings: Vec<String> = photographs.iter().flat_map(|p| p.warnings.clone()).collect();
+    report("cameras", 0.0);
+    let found =
+        loose_photos(photographs, &LooseOptions::default()).map_err(|error| error.to_string())?;
+    let estimate = &found.estimate;
     warnings.extend(
         estimate.left_out.iter().map(|l| format!("{} is left out: {}", names[l.photo], l.reason)),
     );
     warnings.extend(estimate.warnings.iter().map(|w| format!("estimated cameras: {w}")));
-    let mut photos = Vec::new();
-    for ((_, photograph), camera) in photographs.into_iter().zip(&estimate.cameras) {
-        if let Some(camera) = camera {
-            photos.push(Photo::new(photograph.image, *camera).map_err(|e| e.to_string())?);
-        }
-    }
-    Ok((photos, warnings))
+    Ok((found.photos, warnings))
 }
