@@ -65,7 +65,7 @@ impl Options {
             rule: CropRule::Exact,
             lr_from: LrFrom::HrCrop,
             disturbances: Vec::new(),
-            density: Density::Full,
+            density: Density::Auto,
         }
     }
 }
@@ -438,7 +438,7 @@ impl<'a> PictureMaker<'a> {
                 }
                 _ => {
                     // As `run`: none of more Gaussians than `Auto` refines.
-                    let regular = children.is_regular();
+                    let regular = children.sides().is_empty();
                     let SceneChildren { splats, groups, .. } = &mut children;
                     let mut options = Refine::Auto.options_for(inputs.len(), splats.len(), true);
                     if !regular {
@@ -461,7 +461,7 @@ impl<'a> PictureMaker<'a> {
         let upscale = network.model.config().upscale;
         children.add_detail(&crops.inputs, upscale)?;
         let splats = children.splats;
-        let limit = self.density.limit(splats.parents(), upscale);
+        let limit = self.density.limit(splats.parents(), crops.inputs.len(), upscale);
         let rank = |i: usize| match set {
             Set::Opaque => f64::from(splats.opacity(i)),
             // The fractional part of multiples of the golden ratio is spread evenly.

@@ -69,35 +69,19 @@ impl Weights {
         Self::parse(&io::read(path)?, path)
     }
 
-    /// The r for which SubSplat's heads ship.
-    pub const SHIPPED_UPSCALES: [usize; 2] = [2, 4];
-
-    /// Returns the weights that ship in the crate, for r = `upscale`: the small backbone,
-    /// and SubSplat's heads at ×2 and ×4. Another r has no trained heads; its children are
-    /// the even split of their parents. The training data are procedural rooms
-    /// (model card: `src/model/shipped/README.md`).
+    /// Returns the weights that ship in the crate, for r = `upscale`, 1 to 8: the small backbone,
+    /// and SubSplat's heads, of which one set serves every r. The training data are procedural
+    /// rooms (model card: `src/model/shipped/README.md`).
     ///
     /// # Errors
-    /// Those of [`Weights::load`]; none with the embedded files intact.
+    /// Those of [`Weights::load`]; none with the embedded file intact.
     pub fn shipped(upscale: usize) -> io::Result<Self> {
-        let at = |bytes: &[u8], name: &str| Self::parse(bytes, Path::new(name));
-        let whole = at(include_bytes!("shipped/small.safetensors"), "shipped weights")?;
-        if whole.config().is_some_and(|c| c.upscale == upscale) {
-            return Ok(whole);
-        }
-        let mut backbone = whole.without(SUBSPLAT_PREFIX);
-        if upscale == 4 {
-            let heads = at(include_bytes!("shipped/heads-x4.safetensors"), "shipped heads")?;
-            let both = backbone.tensors().iter().chain(heads.tensors());
-            let both = both.map(|(name, tensor)| (name.clone(), tensor.clone())).collect();
-            return Ok(Self { config: heads.config, ..Self::from_tensors(both) });
-        }
-        if let Some(config) = &mut backbone.config {
+        let bytes = include_bytes!("shipped/small.safetensors");
+        let mut weights = Self::parse(bytes, Path::new("shipped weights"))?;
+        if let Some(config) = &mut weights.config {
             config.upscale = upscale;
-            // Heads that start at zero do not use the features.
-            config.agg.enabled = false;
         }
-        Ok(backbone)
+        Ok(weights)
     }
 
     /// Does the same as [`Weights::load`] with bytes in memory; errors name `path`.

@@ -56,7 +56,7 @@ pub(crate) fn sides_of(
     raster: &RasterOptions,
     renderer: &mut Renderer,
 ) -> Result<Option<Vec<u8>>> {
-    if density == Density::Full {
+    if density.is_full(inputs.len()) {
         return Ok(None);
     }
     let parents = network.trunk().parents(views, primaries)?.to_splats()?;
@@ -64,7 +64,7 @@ pub(crate) fn sides_of(
     let photographs: Vec<FitView<'_>> =
         inputs.iter().map(|c| FitView { camera: &c.input_camera, image: &c.input }).collect();
     let mut shares = shares(&parents, &photographs, raster, renderer);
-    let mut limit = density.limit(parents.len(), upscale);
+    let mut limit = density.limit(parents.len(), inputs.len(), upscale);
     let mut hidden = Vec::new();
     if inputs.len() >= PHOTOGRAPHS_TO_REMOVE {
         hidden.extend((0..shares.len()).filter(|i| shares[*i] < LEAST_SHARE));
@@ -121,8 +121,11 @@ impl SceneChildren {
         Self { splats, groups: Vec::new(), origins: Origins::Regular }
     }
 
-    /// Whether every parent has the same number of children.
-    pub(crate) fn is_regular(&self) -> bool {
-        matches!(self.origins, Origins::Regular)
+    /// Returns r of each parent; empty where all have the same number of children.
+    pub(crate) fn sides(&self) -> &[u8] {
+        match &self.origins {
+            Origins::Regular => &[],
+            Origins::Mixed { sides, .. } => sides,
+        }
     }
 }

@@ -25,7 +25,7 @@ pub struct Options {
     /// Size of the target pictures, which also is the size of the photographs that the fit and the
     /// refinement read. Default: [`TargetSize::Upscaled`].
     pub target_size: TargetSize,
-    /// Number of Gaussians. Default: [`Density::Full`].
+    /// Number of Gaussians. Default: [`Density::Auto`].
     pub density: Density,
     /// Ends of the depth range that the caller fixes. Default: [`DepthRange::Auto`].
     pub depth_range: DepthRange,

@@ -121,13 +121,13 @@ impl Prepared<'_> {
                 detail = Detail::Photographs;
             }
         }
-        let regular = children.is_regular();
+        let parent_sides = children.sides().to_vec();
         let SceneChildren { mut splats, mut groups, .. } = children;
         let raster_options = raster_at(inputs.first().map_or(1.0, Cropped::ratio));
         let (mut fit, mut refinement) = (None, None);
         let (fit_options, mut refine_options) =
             (&options.fit, options.refine_options(inputs.len(), splats.len()));
-        if !regular {
+        if !parent_sides.is_empty() {
             // Hidden parents were removed before.
             refine_options.least_share = 0.0;
         }
@@ -157,7 +157,7 @@ impl Prepared<'_> {
         Ok(Reconstruction {
             splats,
             groups,
-            regular,
+            sides: parent_sides,
             inputs,
             adjustment,
             cut_shares,

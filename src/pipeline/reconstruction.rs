@@ -22,8 +22,8 @@ pub struct Reconstruction {
     pub(super) splats: Splats,
     /// Gaussians of each photograph.
     pub(super) groups: Vec<Range<usize>>,
-    /// Every parent has the same number of children.
-    pub(super) regular: bool,
+    /// r of each parent; empty where all have the same number of children.
+    pub(super) sides: Vec<u8>,
     pub(super) inputs: Vec<Cropped>,
     pub(super) adjustment: Option<PoseAdjustment>,
     pub(super) cut_shares: Vec<f32>,
@@ -85,9 +85,9 @@ impl Reconstruction {
         renderer: &mut Renderer,
         progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
     ) -> Result<RefineReport> {
-        let Self { splats, groups, inputs, raster_options, fit, .. } = self;
+        let Self { splats, groups, sides, inputs, raster_options, fit, .. } = self;
         let mut options = refine.options_for(inputs.len(), splats.len(), fit.is_some());
-        if !self.regular {
+        if !sides.is_empty() {
             // The removal counts by parents, which have different numbers of children.
             options.least_share = 0.0;
         }
@@ -95,6 +95,13 @@ impl Reconstruction {
             refine_on_inputs(splats, groups, inputs, raster_options, &options, renderer, progress)?;
         self.refinement = Some(report);
         Ok(report)
+    }
+
+    /// Number of children a side of each input pixel's Gaussian, photograph by photograph, rows from
+    /// the top: parent i has `children_sides()[i]`² of them. Empty where all pixels have the same number
+    /// ([`Options::density`](super::Options::density)).
+    pub fn children_sides(&self) -> &[u8] {
+        &self.sides
     }
 
     /// The Gaussians alone.

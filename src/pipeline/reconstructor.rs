@@ -25,8 +25,6 @@ pub struct Reconstructor {
     backend: Backend,
     /// SubSplat's tensors that the weight file lacks.
     missing: usize,
-    /// The r for which the weights have trained heads; empty where unknown.
-    trained: Vec<usize>,
 }
 
 impl Reconstructor {
@@ -39,15 +37,13 @@ impl Reconstructor {
         Self::build(config, Weights::seeded(seed))
     }
 
-    /// Builds the model that ships, [`Weights::shipped`], at ×`upscale`. SubSplat's heads are
-    /// trained at ×2 and ×4. At other upscales each pixel is split evenly, with a
-    /// [`Warning::UntrainedTensors`].
+    /// Builds the model that ships at ×`upscale`, 1 to 8: each input pixel has `upscale`²
+    /// Gaussians.
     ///
     /// # Errors
     /// An `upscale` out of range.
     pub fn shipped(upscale: usize) -> Result<Self> {
-        let built = Self::from_weights(Weights::shipped(upscale)?, None)?;
-        Ok(Self { trained: Weights::SHIPPED_UPSCALES.to_vec(), ..built })
+        Self::from_weights(Weights::shipped(upscale)?, None)
     }
 
     /// Builds a model from a weight file. `config` replaces the file's own configuration. A
@@ -80,7 +76,7 @@ impl Reconstructor {
 
     fn build(config: &Config, weights: Weights) -> Result<Self> {
         let model = SubSplat::new(config, weights.builder())?;
-        Ok(Self { model, weights, backend: Backend::Cpu, missing: 0, trained: Vec::new() })
+        Ok(Self { model, weights, backend: Backend::Cpu, missing: 0 })
     }
 
     /// The same model on another backend ([`SubSplat::with_backend`]). Where a GPU fails, the CPU
@@ -211,8 +207,7 @@ impl Reconstructor {
         warnings.extend(corrected);
         if self.missing > 0 {
             let upscale = self.config().upscale;
-            let (count, trained) = (self.missing, self.trained.clone());
-            warnings.push(Warning::UntrainedTensors { count, upscale, trained });
+            warnings.push(Warning::UntrainedTensors { count: self.missing, upscale });
         }
         let bounds = refined_bounds(guess, options.depth_range, &reports);
         let options = options.clone();
@@ -296,8 +291,10 @@ impl Reconstructor {
         let pixels = n * w as f32 * h as f32 / (2.0 * 256.0 * 256.0);
         let mvsplat = is_mvsplat(self.config());
         let estimates = self.estimates_depth_range(options);
-        let gaussians = photos * w * h * self.config().upscale.pow(2);
-        let children = (self.config().upscale * self.config().upscale) as f32 / 4.0;
+        let parents = photos * w * h;
+        let gaussians = options.density.limit(parents, photos, self.config().upscale);
+        // A quarter of a parent's mean number of children.
+        let children = gaussians as f32 / (4 * parents.max(1)) as f32;
         let aggregates = self.config().agg.enabled;
         let refinement = match options.refine {
             // The number of steps in a second is not known.

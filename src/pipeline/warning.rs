@@ -52,8 +52,6 @@ pub enum Warning {
         count: usize,
         /// r: side of the children's grid.
         upscale: usize,
-        /// The r that these weights have trained heads for; empty where unknown.
-        trained: Vec<usize>,
     },
     /// A photograph was brought to the exposure and white balance of another one.
     #[non_exhaustive]
@@ -92,20 +90,9 @@ impl fmt::Display for Warning {
                 "the photograph of {size} is enlarged to {resized}: the target shows no more \
                  detail than the photograph has"
             ),
-            Self::UntrainedTensors { count, upscale, trained } => {
+            Self::UntrainedTensors { count, upscale } => {
                 let children = upscale * upscale;
-                let known: Vec<String> = trained.iter().map(usize::to_string).collect();
-                match known.as_slice() {
-                    [] => write!(
-                        f,
-                        "the weights lack {count} tensors of the heads for upscale {upscale}"
-                    )?,
-                    _ => write!(
-                        f,
-                        "no trained heads exist for upscale {upscale}, only for {}",
-                        known.join(" and ")
-                    )?,
-                }
+                write!(f, "the weights lack {count} tensors of the heads for upscale {upscale}")?;
                 match children {
                     1 => f.write_str(": each pixel gives the backbone's one Gaussian"),
                     _ => write!(

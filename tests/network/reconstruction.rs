@@ -9,6 +9,7 @@ use subsplat::camera::Size;
 use subsplat::check::Verdict;
 use subsplat::config::{Config, Preset};
 use subsplat::model::Views;
+use subsplat::model::weights::Weights;
 use subsplat::{
     Check, DepthSource, Detail, Error, NearFar, Options, Photo, Progress, Reconstructor, Stage,
     Warning,
@@ -203,18 +204,21 @@ fn the_input_has_the_shape_of_the_photographs() {
 
 #[test]
 fn untrained_heads_are_a_warning() {
-    let rows = [
-        (1, Some("only for 2 and 4: each pixel gives the backbone's one Gaussian")),
-        (2, None),
-        (3, Some("only for 2 and 4: each pixel is split evenly into 9 Gaussians")),
-        (4, None),
-    ];
-    for (upscale, expected) in rows {
-        let model = Reconstructor::shipped(upscale).unwrap();
+    let told = |weights: Weights, upscale: usize| {
+        let config = Config { upscale, ..weights.config().unwrap().clone() };
+        let model = Reconstructor::from_weights(weights, Some(&config)).unwrap();
         let prepared = model.prepare(&photos(), &quick().with_check(Check::Off)).unwrap();
         let untrained = |w: &&Warning| matches!(w, Warning::UntrainedTensors { .. });
-        let told = prepared.warnings().iter().find(untrained).map(Warning::to_string);
-        assert_eq!(told.is_some(), expected.is_some(), "x{upscale}: {told:?}");
-        assert!(told.unwrap_or_default().contains(expected.unwrap_or("")), "x{upscale}");
+        prepared.warnings().iter().find(untrained).map(Warning::to_string)
+    };
+    for upscale in [1, 3] {
+        assert_eq!(told(Weights::shipped(upscale).unwrap(), upscale), None);
+        let backbone = Weights::shipped(upscale).unwrap().without("subsplat.");
+        let expected = match upscale {
+            1 => "each pixel gives the backbone's one Gaussian",
+            _ => "each pixel is split evenly into 9 Gaussians",
+        };
+        let told = told(backbone, upscale).unwrap();
+        assert!(told.contains(expected), "x{upscale}: {told}");
     }
 }

@@ -60,14 +60,13 @@ fn the_file_is_small_and_whole() {
     let finer = Reconstructor::shipped(4).unwrap();
     assert_eq!((finer.config().upscale, finer.config().children()), (4, 16));
     assert!(finer.unexpected_tensors().is_empty() && finer.untrained_tensors().is_empty());
-    let plain = Reconstructor::shipped(3).unwrap();
-    assert_eq!(plain.config().children(), 9);
-    let heads = plain.untrained_tensors();
-    assert!(!heads.is_empty() && heads.iter().all(|n| n.starts_with(SUBSPLAT_PREFIX)), "{heads:?}");
-    assert!(Reconstructor::shipped(9).is_err());
-    for other in [finer.config(), plain.config()] {
-        assert_eq!(model.config().backbone, other.backbone);
+    for upscale in 1..=8 {
+        let any = Reconstructor::shipped(upscale).unwrap();
+        assert_eq!(any.config().children(), upscale * upscale);
+        assert!(any.untrained_tensors().is_empty(), "{:?}", any.untrained_tensors());
+        assert_eq!(model.config().backbone, any.config().backbone);
     }
+    assert!(Reconstructor::shipped(9).is_err());
     assert_ne!(*model.config(), Config::small(Preset::Paper, 2));
 }
 
@@ -82,20 +81,22 @@ fn rooms_that_were_never_trained_on_are_reconstructed() {
     assert!(rooms.disparity < 0.5 * plain.disparity, "{rooms:?} {plain:?}");
 }
 
-/// Sixteen trained children render a room better than sixteen equal ones.
+/// The same heads render a room better than equal children, of sixteen as of sixty-four.
 #[test]
-fn heads_for_four_times_the_size_beat_the_plain_split() {
-    let backbone = || learnt(4).into_iter().filter(|(n, _)| !n.starts_with(SUBSPLAT_PREFIX));
-    let heads = Weights::seeded(0).trainable();
-    SubSplat::new(&shipped(4), heads.builder()).unwrap();
-    let heads = heads.variables().into_iter().map(|(name, v)| (name, v.as_tensor().clone()));
-    let heads = heads.filter(|(n, _)| n.starts_with(SUBSPLAT_PREFIX));
-    let [trained, _] = look(learnt(4), &shipped(4), None);
-    let [plain, _] = look(backbone().chain(heads).collect(), &shipped(4), None);
-    let (trained, plain) = (trained.unwrap(), plain.unwrap());
-    println!("trained {trained:?}\nplain split {plain:?}");
-    assert!(trained.psnr > plain.psnr + 0.4 && trained.ssim > plain.ssim + 0.005);
-    assert!(trained.psnr > trained.copy_psnr + 3.0, "{trained:?}");
+fn heads_beat_the_plain_split_at_other_upscales() {
+    for (upscale, least) in [(4, 0.4), (8, LEAST_AT_8)] {
+        let backbone = || learnt(2).into_iter().filter(|(n, _)| !n.starts_with(SUBSPLAT_PREFIX));
+        let heads = Weights::seeded(0).trainable();
+        SubSplat::new(&shipped(upscale), heads.builder()).unwrap();
+        let heads = heads.variables().into_iter().map(|(name, v)| (name, v.as_tensor().clone()));
+        let heads = heads.filter(|(n, _)| n.starts_with(SUBSPLAT_PREFIX));
+        let [trained, _] = look(learnt(2), &shipped(upscale), None);
+        let [plain, _] = look(backbone().chain(heads).collect(), &shipped(upscale), None);
+        let (trained, plain) = (trained.unwrap(), plain.unwrap());
+        println!("x{upscale}: trained {trained:?}\nplain split {plain:?}");
+        assert!(trained.psnr > plain.psnr + least && trained.ssim > plain.ssim, "x{upscale}");
+        assert!(trained.psnr > trained.copy_psnr + 2.0, "{trained:?}");
+    }
 }
 
 #[test]
@@ -107,6 +108,8 @@ fn photographs_are_reconstructed() {
     assert!(photos.psnr > photos.copy_psnr + 3.5 && photos.ssim > PHOTOS_SSIM, "{photos:?}");
 }
 
+/// Gain of PSNR at ×8 over equal children, dB.
+const LEAST_AT_8: f64 = 0.2;
 /// PSNR in dB and SSIM at ×2, a little below 28.92 and 0.909, which were measured.
 const ROOMS: (f64, f64) = (28.6, 0.9);
 /// As above, of 0.662.

@@ -406,8 +406,9 @@ pub struct SourceArgs {
     #[arg(long, value_name = "R", value_parser = values::upscale)]
     pub upscale: Option<f32>,
     /// Number of Gaussians, at most, or their share of all children of all pixels. Pixels of even
-    /// colour keep one, pixels with detail get all.
-    #[arg(long, value_name = "N | P%", value_parser = values::density, default_value = "100%")]
+    /// colour keep one, pixels with detail get all. auto: all of two photographs; more photographs
+    /// share the Gaussians of two and a half.
+    #[arg(long, value_name = "auto | N | P%", value_parser = values::density, default_value = "auto")]
     pub gaussians: Density,
     /// Weights (.safetensors). Default: the shipped ones.
     #[arg(long, value_name = "FILE")]

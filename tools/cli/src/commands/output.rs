@@ -19,7 +19,7 @@ use std::path::Path;
 use subsplat::abi::RasterOptions;
 use subsplat::camera::{Camera, NearFar};
 use subsplat::config::Config;
-use subsplat::data::crop::CropOptions;
+use subsplat::data::crop::{CropOptions, Cropped};
 use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
 use subsplat::io::image::{Depth, Rgb, save_depth_png, save_png};
 use subsplat::io::scene::{Scene, Units, is_scene};
@@ -126,13 +126,31 @@ fn remove_earlier(out: &Path) {
         }
     }
     for i in 0..list("context").len() {
-        files.extend([format!("inputs/{i}.png"), format!("inputs/{i}_depth.png")]);
+        let of_input = ["", "_depth", "_children"];
+        files.extend(of_input.map(|what| format!("inputs/{i}{what}.png")));
     }
     files.extend(list("files").iter().filter_map(|f| name(&f["file"])));
     for file in files {
         // One that is gone already, or that cannot be removed, does not stop the run.
         let _ = std::fs::remove_file(out.join(file));
     }
+}
+
+/// Pictures of the number of children of each input pixel, one for each photograph: black where there
+/// are none, white for the most. Empty where all pixels have the same number.
+fn children_maps(result: &Reconstruction) -> Vec<Rgb> {
+    let sides = result.children_sides();
+    let most = sides.iter().copied().max().unwrap_or(0).max(1);
+    let per_view = sides.len() / result.inputs().len().max(1);
+    let map = |(input, sides): (&Cropped, &[u8])| {
+        let (width, height) = (input.input.width, input.input.height);
+        // MVSplat may give a pixel several Gaussians; the first one counts.
+        let per_pixel = (sides.len() / (width * height).max(1)).max(1);
+        let grey = |side: &u8| (255.0 * f32::from(*side) / f32::from(most)).round() as u8;
+        let data = sides.iter().step_by(per_pixel).flat_map(|side| [grey(side); 3]).collect();
+        Rgb { width, height, data }
+    };
+    result.inputs().iter().zip(sides.chunks(per_view.max(1))).map(map).collect()
 }
 
 /// Renders, scores and writes views one by one.
@@ -163,6 +181,9 @@ impl Views<'_> {
         for (i, (input, depth)) in result.inputs().iter().zip(result.depths()).enumerate() {
             save_png(&self.out.join(format!("inputs/{i}.png")), &input.input)?;
             save_depth_png(&self.out.join(format!("inputs/{i}_depth.png")), depth)?;
+        }
+        for (i, map) in children_maps(result).iter().enumerate() {
+            save_png(&self.out.join(format!("inputs/{i}_children.png")), map)?;
         }
         let name = |(i, view): (usize, &View)| match view {
             View::Path(_) => format!("path_{i:04}"),

@@ -54,8 +54,8 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
     let target_size = (width, height);
     let targets = targets(args, &plan, target_size)?;
     memory::check_picture("the picture size", target_size)?;
-    let parents = plan.context.len() * w * h;
-    let count = plan.options.density.limit(parents, model.config().upscale) as u64;
+    let (inputs, upscale) = (plan.context.len(), model.config().upscale);
+    let count = plan.options.density.limit(inputs * w * h, inputs, upscale) as u64;
     let degree = model.config().primaries().sh_degree;
     output::check_formats(args, count, degree)?;
     output::prepare(&args.out, &args.input[0], &plan.scene)?;

@@ -37,12 +37,16 @@ pub fn upscale(text: &str) -> Result<f32, String> {
     ratio.ok_or_else(|| format!("expected a number from 1 to {UPSCALE_MAX}"))
 }
 
-/// Parses a number of Gaussians: a whole number, or a share of all as `P%`.
+/// Parses a number of Gaussians: `auto`, a whole number, or a share of all as `P%`.
 pub fn density(text: &str) -> Result<Density, String> {
     let text = text.trim();
+    if text == "auto" {
+        return Ok(Density::Auto);
+    }
     let Some(percent) = text.strip_suffix('%') else {
         let count = whole(text, 1, usize::MAX);
-        let expected = |_| "expected a whole number of at least 1, or a share as 50%".to_owned();
+        let expected =
+            |_| "expected auto, a whole number of at least 1, or a share as 50%".to_owned();
         return count.map(Density::Count).map_err(expected);
     };
     match percent.trim().parse::<f32>() {
@@ -168,11 +172,11 @@ mod tests {
 
     #[test]
     fn numbers_of_gaussians() {
-        assert_eq!(density("100%"), Ok(Density::Full));
+        assert_eq!((density("auto"), density("100%")), (Ok(Density::Auto), Ok(Density::Full)));
         assert_eq!(density(" 25 %"), Ok(Density::Share(0.25)));
         assert_eq!(density("100000"), Ok(Density::Count(100_000)));
         for bad in ["", "0", "-3", "1.5", "0%", "101%", "NaN%", "%", "many"] {
-            assert!(density(bad).unwrap_err().starts_with("expected a "), "{bad}");
+            assert!(density(bad).unwrap_err().starts_with("expected a"), "{bad}");
         }
     }
 

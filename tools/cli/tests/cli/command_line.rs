@@ -230,6 +230,12 @@ fn sizes_between_whole_upscales_and_fewer_gaussians() {
         let count = report["gaussians"].as_u64().unwrap();
         assert!((least..=most).contains(&count), "{gaussians}: {count}");
     }
+    // The last run kept 100 pixels of both photographs.
+    let map = |i: usize| load(&place.path().join(format!("a/inputs/{i}_children.png"))).unwrap();
+    let white = (0..2).flat_map(|i| map(i).data).filter(|v| *v == 255).count();
+    assert_eq!(white, 300);
+    run("--upscale 2");
+    assert!(!place.path().join("a/inputs/0_children.png").exists());
 }
 
 /// Photographs of any shape: the whole of them by default, their square on demand.
