@@ -54,9 +54,9 @@
 //! * [`render()`] and [`Renderer`] draw any [`Splats`]; `rasterize` draws `SplatTensors` with
 //!   gradients.
 //! * [`load_scene`], [`load_splats`] and [`save_splats`] read and write files.
-//! * [`check_pair`] compares poses with matched points.
 //! * `loose_photos` and `loose_scene` estimate the cameras of photographs that have none, in memory
-//!   and in files; [`estimate_poses`] is the step beneath.
+//!   and in files; the module `loose` holds their options and results.
+//! * [`details`] holds reports, and types that are seldom named.
 //! * [`Camera`] and [`Intrinsics`] define all geometric conventions: OpenCV axes, pixel centres
 //!   at +0.5, `world_from_camera`.
 //!
@@ -266,8 +266,8 @@ pub mod details {
     pub use crate::splats::SplatParts;
 }
 
-/// Options and results of [`loose_photos`](crate::loose_photos) and
-/// [`loose_scene`](crate::loose_scene), which estimate the cameras of photographs.
+/// Options and results of [`loose_photos`] and [`loose_scene`],
+/// which estimate the cameras of photographs.
 #[cfg(feature = "network")]
 pub mod loose {
     pub use crate::pipeline::{

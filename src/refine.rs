@@ -1,7 +1,7 @@
 //! Refines Gaussians on the photographs that they were made from: means, rotations, scales,
 //! opacities and colour offsets, by gradient steps through the rasterizer.
 //!
-//! [`crate::fit()`] changes sizes, opacities and colours alone and ends after four steps. A
+//! [`crate::fit::fit`] changes sizes, opacities and colours alone and ends after four steps. A
 //! refinement changes the geometry too: each photograph shows surfaces whose depth the others
 //! predict. The method is the optimisation of *3D Gaussian Splatting for
 //! Real-Time Radiance Field Rendering* (Kerbl et al. 2023), from the network's Gaussians instead

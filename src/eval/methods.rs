@@ -14,9 +14,9 @@ pub enum Method {
     Subsplat,
     /// The model with detail from the photographs ([`crate::cpu::detail`]).
     Detail,
-    /// The model with detail, fitted to the photographs ([`crate::fit()`]).
+    /// The model with detail, fitted to the photographs ([`crate::fit::fit`]).
     Fit,
-    /// [`Method::Fit`], refined on the photographs ([`crate::refine()`]): what `subsplat run`
+    /// [`Method::Fit`], refined on the photographs ([`crate::refine::refine`]): what `subsplat run`
     /// gives.
     Refine,
     /// The model with detail on the two inputs nearest to the target alone.

@@ -30,8 +30,8 @@
 //! 4. The small backbone estimates near and far at half size, unless the caller fixed one.
 //! 5. The network predicts one primary Gaussian per input pixel, then its children.
 //! 6. The photographs add detail to the children's colours ([`Detail`]).
-//! 7. Sizes, opacities and colours are fitted to the photographs ([`crate::fit()`]).
-//! 8. Means, shapes, opacities and colours are refined on the photographs ([`crate::refine()`]).
+//! 7. Sizes, opacities and colours are fitted to the photographs ([`crate::fit::fit`]).
+//! 8. Means, shapes, opacities and colours are refined on the photographs ([`crate::refine::refine`]).
 //!
 //! [`Reconstructor::run`] executes all of them. [`Reconstructor::prepare`] executes steps 1 to 3;
 //! the caller can then free large photographs before the network runs.

@@ -38,9 +38,9 @@ pub struct Options {
     pub check: Check,
     /// Source of colour detail. Default: [`Detail::Photographs`].
     pub detail: Detail,
-    /// Fit of the Gaussians to the photographs ([`crate::fit()`]). Default: four steps.
+    /// Fit of the Gaussians to the photographs ([`crate::fit::fit`]). Default: four steps.
     pub fit: FitOptions,
-    /// Refinement of the Gaussians on the photographs ([`crate::refine()`]). Default:
+    /// Refinement of the Gaussians on the photographs ([`crate::refine::refine`]). Default:
     /// [`Refine::Auto`].
     pub refine: Refine,
 }
@@ -181,7 +181,7 @@ impl TargetSize {
     }
 }
 
-/// Length of the refinement of Gaussians on their photographs ([`crate::refine()`]).
+/// Length of the refinement of Gaussians on their photographs ([`crate::refine::refine`]).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Refine {
@@ -216,7 +216,7 @@ impl Refine {
         .options(photographs)
     }
 
-    /// Options of [`crate::refine()`] for a number of photographs.
+    /// Options of [`crate::refine::refine`] for a number of photographs.
     fn options(self, photographs: usize) -> RefineOptions {
         let options = RefineOptions::default().with_groups(true);
         match self {
@@ -235,7 +235,7 @@ pub enum Poses {
     /// Those of the photographs.
     #[default]
     Given,
-    /// Those of the photographs after [`crate::adjust_poses`], for cameras that are nearly right,
+    /// Those of the photographs after [`crate::poses::adjust_poses`], for cameras that are nearly right,
     /// such as a headset's. Cameras that fit the photographs stay.
     Adjusted,
 }

@@ -124,7 +124,7 @@ pub enum PoseWarning {
         /// Standard deviation, degrees.
         degrees: f64,
     },
-    /// A refusal that [`PoseOptions::force`] overrode.
+    /// A refusal that [`Uncertain::Accept`] overrode.
     #[error("{0}")]
     Forced(PoseRefusal),
 }
