@@ -168,7 +168,8 @@ fn switches() -> Vec<(&'static str, Change)> {
         ("literal", |c| c.agg.ablations.strict_literal = true),
         ("head pg", |c| c.spgr.head = SpgrHead::Pg),
         ("head coord", |c| c.spgr.head = SpgrHead::Coord),
-        ("head polynomial", |c| c.spgr.head = SpgrHead::Polynomial),
+        // At ×2 its further layers have no effect.
+        ("head polynomial", |c| (c.spgr.head, c.upscale) = (SpgrHead::Polynomial, 3)),
         ("heads not zero", |c| c.spgr.zero_init = false),
         ("rgb gain", |c| c.spgr.ablations.gain_space = GainSpace::Rgb),
         ("low-pass of the input", |c| c.render.lowpass_ref = LowpassRef::Input),

@@ -12,7 +12,7 @@ use subsplat::metrics::psnr;
 use subsplat::model::subsplat::SubSplat;
 use subsplat::model::weights::{Weights, save};
 use subsplat::pipeline::{
-    Check, DepthRange, Detail, Options, Photo, Reconstruction, Reconstructor,
+    Check, Density, DepthRange, Detail, Options, Photo, Reconstruction, Reconstructor,
 };
 use subsplat::splats::Splats;
 use subsplat::{Picture, render};
@@ -113,6 +113,7 @@ pub fn options(
         .with_depth_range(DepthRange::Fixed { near, far })
         .with_check(Check::Off)
         .with_detail(if detail { Detail::Photographs } else { Detail::Off })
+        .with_density(Density::Full)
         .with_fit(FitOptions::off())
 }
 

@@ -212,8 +212,8 @@ fn paths_sizes_and_detail() {
 fn sizes_between_whole_upscales_and_fewer_gaussians() {
     let place = workplace();
     let run = |more: &str| {
-        let quick = "--json run scene --context view0,view2.png --no-check --input-size 32 --fit 0";
-        done(&call_in(place.path(), &format!("{quick} --target 0 -o a {more}")))
+        let quick = "--json run scene --context view0,view2.png --no-check --input-size 32 --fit 1";
+        done(&call_in(place.path(), &format!("{quick} --target 0 -o a --refine 2 {more}")))
     };
     let picture = || load(&place.path().join("a/images/view0.png")).unwrap();
     let report = run("--upscale 1.5");
@@ -226,7 +226,7 @@ fn sizes_between_whole_upscales_and_fewer_gaussians() {
     assert_eq!(report["target_size"], serde_json::json!([80, 96]));
     assert_eq!((picture().width, picture().height), (80, 96));
     for (gaussians, least, most) in [("25%", 8000, 8192), ("3000", 2990, 3000), ("100", 100, 100)] {
-        let report = run(&format!("--upscale 4 --gaussians {gaussians} --fit 1 --refine 2"));
+        let report = run(&format!("--upscale 4 --gaussians {gaussians}"));
         let count = report["gaussians"].as_u64().unwrap();
         assert!((least..=most).contains(&count), "{gaussians}: {count}");
     }

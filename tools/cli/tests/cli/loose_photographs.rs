@@ -79,7 +79,19 @@ fn all_of_three_photographs_are_used() {
     assert_eq!(called.code, 0, "{}", called.stderr);
     let report = called.json();
     assert_eq!(report["context"], serde_json::json!(["input_0", "input_1", "third"]));
-    assert!(report["refine"]["removed"].as_u64().unwrap() > 0, "{}", report["refine"]);
+    // They share the Gaussians of two and a half; hidden ones are left out.
+    let count = |report: &serde_json::Value| report["gaussians"].as_u64().unwrap();
+    let full = 3 * 64 * 64 * 4;
+    assert!(count(&report) <= full * 5 / 6 && report["refine"]["removed"] == 0, "{report}");
+    let maps =
+        || (0..3).filter(|i| place.path().join(format!("out/inputs/{i}_children.png")).exists());
+    assert_eq!(maps().count(), 3);
+    // Of all Gaussians, the refinement removes those of hidden parents.
+    let called = call_in(place.path(), &format!("{arguments} --gaussians 100%"));
+    let report = called.json();
+    let removed = report["refine"]["removed"].as_u64().unwrap();
+    assert!(removed > 0 && count(&report) + removed == full, "{report}");
+    assert_eq!(maps().count(), 0);
 }
 
 #[test]
