@@ -195,7 +195,7 @@ fn every_switch_runs_and_both_paths_agree() {
                 VarBuilder::from_varmap(&variables, DType::F32, &Device::Cpu),
             );
             let b = scene.train(&undropped.unwrap(), 100);
-            let k = if c.spgr.enabled { side * side } else { 1 };
+            let k = if c.spgr.enabled { c.children() } else { 1 };
             assert_eq!((a.k, b.k), (k, k));
             assert_eq!(a.rows.dims(), [512 * k, 11], "{name}");
             assert_eq!(a.sh.dims(), [512, 4, 3]);
