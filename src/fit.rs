@@ -259,9 +259,9 @@ pub fn fit(
 }
 
 /// Returns whether the start [`SHARPER`] is for these Gaussians: children of a primary (K > 1), of
-/// which the pictures have no fewer pixels. Gaussians with different numbers of siblings have an SH set
-/// each and start as predicted: new views gain 0.1 dB and lose .05 of sharpness. Where Gaussians are denser than pixels, their widths
-/// cannot be seen.
+/// which the pictures have no fewer pixels. Gaussians with different numbers of siblings have an SH
+/// set each and start as predicted: new views gain 0.1 dB and lose .05 of sharpness. Where Gaussians
+/// are denser than pixels, their widths cannot be seen.
 fn has_sharper_start(splats: &Splats, views: &[FitView<'_>]) -> bool {
     let pixels: usize = views.iter().map(|v| v.image.width * v.image.height).sum();
     splats.children_per_parent() > 1 && splats.len() <= pixels

@@ -19,6 +19,10 @@
 //! One step draws one photograph, in an order that depends on their number only. The same input
 //! gives the same bytes on any number of threads, unless [`RefineOptions::time`] limits the steps.
 
+mod removal;
+
+pub(crate) use removal::{Groups, LEAST_SHARE, PHOTOGRAPHS_TO_REMOVE, shares};
+
 use crate::abi::{
     Geometry, Gradients, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, RasterOptions, SCALE_OFFSET,
     SPLAT_STRIDE, SplatSlices, gain_with_offsets, sh_coefficients,
@@ -30,6 +34,7 @@ use crate::render::Renderer;
 use crate::splats::Splats;
 use glam::Vec3;
 use rayon::prelude::*;
+use removal::pruned;
 use std::ops::{ControlFlow, Range};
 use std::time::{Duration, Instant};
 
@@ -81,7 +86,7 @@ impl Default for RefineOptions {
             colour_rate: 0.012,
             dssim: 0.2,
             across: 1.0,
-            least_share: 0.3,
+            least_share: LEAST_SHARE,
             time: None,
             grouped: false,
         }
@@ -153,8 +158,6 @@ const RATE_FLOOR: f32 = 0.05;
 const ROUNDS_PER_CHECK: usize = 4;
 /// The steps end where the error has not fallen by this share since the last measurement.
 const LEAST_GAIN: f64 = 1e-3;
-/// Fewest photographs of which parents are removed.
-const PHOTOGRAPHS_TO_PRUNE: usize = 3;
 /// Decay rates of Adam's means of the gradient and of its square.
 const BETAS: [f32; 2] = [0.9, 0.99];
 /// Keeps the quotient of a Gaussian without gradient finite.
@@ -225,7 +228,7 @@ pub struct Refiner<'a> {
     raster: RasterOptions,
     options: RefineOptions,
     /// Gaussians of each photograph; empty without [`RefineOptions::grouped`].
-    groups: Vec<Range<usize>>,
+    groups: Groups,
     /// Begin of the first step, with [`RefineOptions::time`].
     begun: Option<Instant>,
     /// `[N]`: size of a pixel at the Gaussian, in the photograph where it is smallest, world units.
@@ -265,7 +268,7 @@ impl<'a> Refiner<'a> {
         }
         Ok(Self {
             predicted: splats,
-            groups: equal_groups(splats, views.len(), options),
+            groups: Groups::equal(splats, views.len(), options),
             begun: None,
             targets: views.iter().enumerate().map(target).collect::<Result<_, _>>()?,
             raster: RasterOptions { sh_basis: splats.sh_basis, ..*raster },
@@ -328,7 +331,7 @@ impl<'a> Refiner<'a> {
 
     /// The Gaussians of photograph `view`; `None` without [`RefineOptions::grouped`].
     fn group(&self, view: usize) -> Option<Range<usize>> {
-        self.groups.get(view).cloned()
+        self.groups.ranges.get(view).cloned()
     }
 
     /// Share of the refinement that is done, 0 to 1.
@@ -418,18 +421,17 @@ pub fn refine(
     renderer: &mut Renderer,
     progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
 ) -> Result<RefineReport, FitError> {
-    let mut groups = equal_groups(splats, views.len(), options);
+    let mut groups = Groups::equal(splats, views.len(), options);
     refine_groups(splats, &mut groups, views, raster, options, renderer, progress)
 }
 
-/// [`refine`] with the Gaussians of each photograph in `groups`, which follow the removal; empty
-/// where they are not known.
+/// [`refine`] with the Gaussians of each photograph in `groups`, which follow the removal.
 ///
 /// # Errors
 /// Those of [`refine`].
 pub(crate) fn refine_groups(
     splats: &mut Splats,
-    groups: &mut Vec<Range<usize>>,
+    groups: &mut Groups,
     views: &[FitView<'_>],
     raster: &RasterOptions,
     options: &RefineOptions,
@@ -480,91 +482,6 @@ pub(crate) fn refine_groups(
     splats.rows = rows;
     splats.gain = gain;
     Ok(RefineReport { steps, before, after, removed })
-}
-
-/// The Gaussians of each of `views` photographs: equal groups of whole families. Empty without
-/// [`RefineOptions::grouped`], or where the parents do not divide into equal groups.
-fn equal_groups(splats: &Splats, views: usize, options: &RefineOptions) -> Vec<Range<usize>> {
-    let parents = splats.parents();
-    if !options.grouped || views == 0 || !parents.is_multiple_of(views) {
-        return Vec::new();
-    }
-    let size = parents / views * splats.children_per_parent();
-    (0..views).map(|view| view * size..(view + 1) * size).collect()
-}
-
-/// A set of Gaussians with the group of each photograph.
-type Grouped = (Splats, Vec<Range<usize>>);
-
-/// The Gaussians without the parents below [`RefineOptions::least_share`]; `None` where all stay.
-fn pruned(
-    splats: &Splats,
-    groups: &[Range<usize>],
-    views: &[FitView<'_>],
-    raster: &RasterOptions,
-    options: &RefineOptions,
-    renderer: &mut Renderer,
-) -> Option<Grouped> {
-    if groups.len() < PHOTOGRAPHS_TO_PRUNE || !(options.least_share > 0.0) {
-        return None;
-    }
-    let shares = shares(splats, views, raster, renderer);
-    let keep: Vec<bool> = shares.iter().map(|share| *share >= options.least_share).collect();
-    let (children, mut end) = (splats.children_per_parent(), 0);
-    let groups: Vec<Range<usize>> = groups
-        .iter()
-        .map(|group| {
-            let families = &keep[group.start / children..group.end / children];
-            let begin = end;
-            end += children * families.iter().filter(|keep| **keep).count();
-            begin..end
-        })
-        .collect();
-    let some = end > 0 && keep.contains(&false);
-    some.then(|| (families(splats, &keep), groups))
-}
-
-/// Share of each parent in the photographs: the weights T·α of its children, summed over all
-/// pixels, over those of an average parent. The sums are gradients by the colour offsets of a
-/// loss that adds all pixels.
-pub(crate) fn shares(
-    splats: &Splats,
-    views: &[FitView<'_>],
-    raster: &RasterOptions,
-    renderer: &mut Renderer,
-) -> Vec<f32> {
-    let (parents, children) = (splats.parents(), splats.children_per_parent());
-    let raster = RasterOptions { sh_basis: splats.sh_basis, ..*raster };
-    let gain = gain_with_offsets(&splats.gain, splats.len());
-    let slices = slices_of(&splats.rows, &gain, splats);
-    let (mut shares, mut pixels) = (vec![0.0f32; parents], 0);
-    let mut gradients = Gradients::default();
-    for view in views {
-        let count = view.image.width * view.image.height;
-        pixels += count;
-        renderer.gradients_of(&slices, view.camera, &raster, &mut gradients, &mut |planes| {
-            let mut by_pixel = vec![0.0; planes.len()];
-            by_pixel[..3 * count].fill(1.0 / 3.0);
-            by_pixel
-        });
-        let families = gradients.gain.par_chunks_exact(4 * children);
-        shares.par_iter_mut().zip(families).with_min_len(CHUNK).for_each(|(share, family)| {
-            *share += family.chunks_exact(4).map(|g| g[1] + g[2] + g[3]).sum::<f32>();
-        });
-    }
-    let average = pixels as f32 / parents.max(1) as f32;
-    shares.iter().map(|weight| weight / average).collect()
-}
-
-/// The families of `splats` that `keep` marks.
-fn families(splats: &Splats, keep: &[bool]) -> Splats {
-    let part = |values: &[f32]| -> Vec<f32> {
-        let size = values.len() / keep.len().max(1);
-        let kept = values.chunks_exact(size.max(1)).zip(keep).filter(|(_, keep)| **keep);
-        kept.flat_map(|(family, _)| family).copied().collect()
-    };
-    let (rows, sh, gain) = (part(&splats.rows), part(&splats.sh), part(&splats.gain));
-    Splats { rows, sh, gain, sh_degree: splats.sh_degree, sh_basis: splats.sh_basis }
 }
 
 /// The photograph of a step, counted from 0: all of them once in each round.

@@ -438,12 +438,8 @@ impl<'a> PictureMaker<'a> {
                 }
                 _ => {
                     // As `run`: none of more Gaussians than `Auto` refines.
-                    let regular = children.sides().is_empty();
                     let SceneChildren { splats, groups, .. } = &mut children;
-                    let mut options = Refine::Auto.options_for(inputs.len(), splats.len(), true);
-                    if !regular {
-                        options.least_share = 0.0;
-                    }
+                    let options = Refine::Auto.options_for(inputs.len(), splats.len(), true);
                     let (raster, how) = (&raster, &options);
                     let mut progress = |_: &Refiner<'_>| ControlFlow::Continue(());
                     refine_on_inputs(splats, groups, inputs, raster, how, renderer, &mut progress)?;

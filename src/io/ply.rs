@@ -190,7 +190,7 @@ pub(super) fn write(
     file.write_all(&block)
 }
 
-/// Whether a comment is one of those that every written file begins with. They describe that file
+/// Returns whether a comment is one of those that every written file begins with. They describe that file
 /// alone, and a copy of the scene gets its own.
 pub fn is_own_comment(comment: &str) -> bool {
     let version = |text: &str| text.starts_with(|c: char| c.is_ascii_digit());

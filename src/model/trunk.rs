@@ -4,9 +4,11 @@
 //!
 //! Parameters under `subsplat`: `embed`, `agg`, `geo`, `app`; none with SPGR off.
 
+mod children;
 mod mixed;
 mod recompute;
 
+pub use children::Children;
 pub use mixed::MixedChildren;
 pub use recompute::Recomputed;
 
@@ -14,7 +16,6 @@ use super::aggregation::{Aggregation, Prepared, ring};
 use super::embed::{Descriptors, Embeddings};
 use super::geometry::{Frames, ParentChunk};
 use super::mlp::Mode;
-use super::primaries::Packed;
 use super::spgr::{Heads, rules};
 use super::trace::Checkpoint;
 use super::{BackboneOutput, Primaries, Views};
@@ -24,7 +25,6 @@ use crate::config::{Config, FeatureLevel, ShInput, SpgrHead};
 use crate::ops::direct::{Footprint, rasterize_footprints, spgr_footprints};
 use crate::ops::spgr::{Rules, Spgr, spgr_into_on, spgr_on};
 use crate::ops::{Backend, rasterize_on};
-use crate::splats::Splats;
 use candle_core::{DType, Result, Tensor, bail};
 use candle_nn::{VarBuilder, VarMap};
 use rayon::prelude::*;
@@ -40,47 +40,6 @@ pub const UPSCALE_MAX: usize = 8;
 /// Parents per chunk if a GPU gathers: every chunk uploads the feature maps again, and the
 /// device takes one chunk at a time. 16384·E floats are 8 MiB at E = 128.
 const CHUNK_GPU: usize = 1 << 14;
-
-/// Gaussians of one scene that share SH by parent.
-#[derive(Clone, Debug)]
-pub struct Children {
-    /// `[N·K, 11]`, columns as in [`crate::abi`]; child k of parent n is row n·K + k.
-    pub rows: Tensor,
-    /// `[N·K]`: gain γ; or `[N·K, 4]`: γ and the residual δ in RGB.
-    pub gain: Tensor,
-    /// `[N, D, 3]`: the parents' SH, world frame, RGB innermost.
-    pub sh: Tensor,
-    /// Basis of `sh`.
-    pub sh_basis: ShBasis,
-    /// K: children per parent.
-    pub k: usize,
-}
-
-impl Children {
-    /// Returns the primaries of one scene as their own children, K = 1: the result of a
-    /// trunk with SPGR off.
-    ///
-    /// # Errors
-    /// Those of candle.
-    pub fn whole(parents: &Packed) -> Result<Self> {
-        let rows = parents.rows().clone();
-        Ok(Self {
-            gain: Tensor::ones(rows.dim(0)?, rows.dtype(), rows.device())?,
-            rows,
-            sh: parents.sh()?,
-            sh_basis: parents.sh_basis,
-            k: 1,
-        })
-    }
-
-    /// Returns packed rows for the renderer and the file writers.
-    ///
-    /// # Errors
-    /// Tensors are not `f32`, do not fit one another, or hold a number that is not finite.
-    pub fn to_splats(&self) -> Result<Splats> {
-        Splats::from_tensors(&self.rows, &self.sh, &self.gain, self.sh_basis)
-    }
-}
 
 /// Chunk size and random seed of a training pass.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

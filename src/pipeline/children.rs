@@ -1,7 +1,7 @@
 //! The Gaussians of a scene: the same number of children for each parent, or more where the
 //! photographs have detail.
 
-use super::density::{Density, sides};
+use super::density::{Density, grids, sides};
 use super::{Result, add_detail, detail};
 use crate::abi::RasterOptions;
 use crate::data::crop::Cropped;
@@ -9,10 +9,9 @@ use crate::fit::FitView;
 use crate::model::subsplat::SubSplat;
 use crate::model::trace::Checkpoint;
 use crate::model::{BackboneOutput, Primaries, Views};
-use crate::refine::shares;
+use crate::refine::{Groups, LEAST_SHARE, PHOTOGRAPHS_TO_REMOVE, shares};
 use crate::render::Renderer;
 use crate::splats::Splats;
-use std::ops::Range;
 
 /// The network's results for one scene.
 pub(crate) struct Encoded<'a> {
@@ -24,8 +23,7 @@ pub(crate) struct Encoded<'a> {
 /// Gaussians of a scene.
 pub(crate) struct SceneChildren {
     pub splats: Splats,
-    /// Gaussians of each photograph, in their order.
-    pub groups: Vec<Range<usize>>,
+    pub groups: Groups,
     origins: Origins,
 }
 
@@ -37,11 +35,16 @@ enum Origins {
     Mixed { parents: Vec<u32>, sides: Vec<u8> },
 }
 
-/// Least share of a parent that is divided or kept, where three photographs or more show the scene
-/// ([`crate::refine::RefineOptions::least_share`]).
-const LEAST_SHARE: f32 = 0.3;
-/// Photographs from which on parents are removed.
-const PHOTOGRAPHS_TO_REMOVE: usize = 3;
+/// Sides of the grids that the network's children can have: r alone beside 1 for heads of one K, and
+/// 1 alone where the children are the primaries.
+fn grids_of(network: &SubSplat) -> Vec<usize> {
+    let config = network.config();
+    match config.spgr.head.serves_any_k() {
+        _ if network.trunk().is_off() || config.upscale == 1 => vec![1],
+        true => grids(config.upscale),
+        false => vec![1, config.upscale],
+    }
+}
 
 /// Sides of the parents' grids for `density`; `None` where all have r² children. `raster` renders
 /// pictures of the input's size, from which the parents' shares come.
@@ -60,10 +63,11 @@ pub(crate) fn sides_of(
         return Ok(None);
     }
     let parents = network.trunk().parents(views, primaries)?.to_splats()?;
-    let upscale = network.config().upscale;
+    let grids = grids_of(network);
     let photographs: Vec<FitView<'_>> =
         inputs.iter().map(|c| FitView { camera: &c.input_camera, image: &c.input }).collect();
     let mut shares = shares(&parents, &photographs, raster, renderer);
+    let upscale = grids.last().copied().unwrap_or(1);
     let mut limit = density.limit(parents.len(), inputs.len(), upscale);
     let mut hidden = Vec::new();
     if inputs.len() >= PHOTOGRAPHS_TO_REMOVE {
@@ -71,7 +75,7 @@ pub(crate) fn sides_of(
         hidden.iter().for_each(|i| shares[*i] = 0.0);
         limit = limit.saturating_add(hidden.len());
     }
-    let mut sides = sides(inputs, &shares, upscale, limit);
+    let mut sides = sides(inputs, &shares, &grids, limit);
     hidden.into_iter().for_each(|i| sides[i] = 0);
     Ok(Some(sides))
 }
@@ -93,12 +97,14 @@ impl SceneChildren {
         let Some(sides) = sides else {
             let children = trunk.forward_with(views, output, primaries, checkpoint)?;
             let size = per_view * children.k;
-            let groups = (0..photographs).map(|view| view * size..(view + 1) * size).collect();
+            let ranges = (0..photographs).map(|view| view * size..(view + 1) * size).collect();
+            let groups = Groups { ranges, equal_families: true };
             return Ok(Self { splats: children.to_splats()?, groups, origins: Origins::Regular });
         };
         let mixed = trunk.forward_mixed(views, output, primaries, &sides, checkpoint)?;
         let end = |view: usize| mixed.parents.partition_point(|p| (*p as usize) < view * per_view);
-        let groups = (0..photographs).map(|view| end(view)..end(view + 1)).collect();
+        let ranges = (0..photographs).map(|view| end(view)..end(view + 1)).collect();
+        let groups = Groups { ranges, equal_families: false };
         let origins = Origins::Mixed { parents: mixed.parents, sides };
         Ok(Self { splats: mixed.splats, groups, origins })
     }
@@ -118,7 +124,7 @@ impl SceneChildren {
 
     /// Gaussians of which the photographs are not known.
     pub(crate) fn of_splats(splats: Splats) -> Self {
-        Self { splats, groups: Vec::new(), origins: Origins::Regular }
+        Self { splats, groups: Groups::default(), origins: Origins::Regular }
     }
 
     /// Returns r of each parent; empty where all have the same number of children.

@@ -56,7 +56,7 @@ impl Density {
 const AUTO_PHOTOGRAPHS: f64 = 2.5;
 
 /// Grids of a pixel, by their sides: 1, the powers of two below r that divide r, and r.
-fn grids(r: usize) -> Vec<usize> {
+pub(crate) fn grids(r: usize) -> Vec<usize> {
     let powers = std::iter::successors(Some(1usize), |side| Some(2 * side));
     let mut grids: Vec<usize> =
         powers.take_while(|side| *side < r).filter(|side| r.is_multiple_of(*side)).collect();
@@ -75,23 +75,22 @@ struct Step {
 }
 
 /// Sides of the grids of all parents of `inputs`, whose `shares` are given, for at most `limit`
-/// children; r = `upscale`. Parents are in the order of their pixels, the same number for each.
-pub(crate) fn sides(inputs: &[Cropped], shares: &[f32], upscale: usize, limit: usize) -> Vec<u8> {
+/// children; `grids` are the sides that a parent's grid can have, in ascending order. Parents are in the order of their pixels, the same number for each.
+pub(crate) fn sides(inputs: &[Cropped], shares: &[f32], grids: &[usize], limit: usize) -> Vec<u8> {
     if limit < shares.len() {
         return largest(shares, limit);
     }
-    let grids = grids(upscale);
     let per_view = shares.len() / inputs.len().max(1);
     let mut steps: Vec<Step> = Vec::new();
     for (view, input) in inputs.iter().enumerate() {
-        let variances = variances(input, &grids);
+        let variances = variances(input, grids);
         let pixels = (input.input.width * input.input.height).max(1);
         let per_pixel = (per_view / pixels).max(1);
         let shares = &shares[view * per_view..][..per_view];
         let of_parent = |(i, share): (usize, &f32)| {
             let pixel = (i / per_pixel).min(pixels - 1);
             let gains = variances.iter().map(|level| share * level[pixel]);
-            steps_of((view * per_view + i) as u32, &grids, gains)
+            steps_of((view * per_view + i) as u32, grids, gains)
         };
         let made: Vec<Vec<Step>> =
             shares.par_iter().enumerate().with_min_len(1024).map(of_parent).collect();
@@ -202,14 +201,14 @@ mod tests {
         assert_eq!((grids(1), grids(3), grids(6)), (vec![1], vec![1, 3], vec![1, 2, 6]));
         let inputs = [input()];
         // Eight pixels have detail; stripes of one pixel show in the grid of four only.
-        let sides = sides(&inputs, &[1.0; 16], 4, 8 + 8 * 16);
+        let sides = sides(&inputs, &[1.0; 16], &grids(4), 8 + 8 * 16);
         for (i, side) in sides.iter().enumerate() {
             assert_eq!(*side, if i % 4 >= 2 { 4 } else { 1 }, "{i}");
         }
         // A parent that nothing shows gets none of them.
         let mut shares = [1.0; 16];
         shares[2] = 0.0;
-        let fewer = super::sides(&inputs, &shares, 4, 8 + 8 * 16);
+        let fewer = super::sides(&inputs, &shares, &grids(4), 8 + 8 * 16);
         assert_eq!((fewer[2], fewer[3]), (1, 4));
     }
 
@@ -218,11 +217,11 @@ mod tests {
         let inputs = [input()];
         let shares: Vec<f32> = (0..16).map(|i| i as f32).collect();
         for limit in [0, 5, 16, 17, 40, 100, 256, 1000] {
-            let sides = sides(&inputs, &shares, 4, limit);
+            let sides = sides(&inputs, &shares, &grids(4), limit);
             let count: usize = sides.iter().map(|s| usize::from(*s).pow(2)).sum();
             assert!(count <= limit && count + 15 >= limit.min(256), "{limit} {count}");
         }
-        let few = sides(&inputs, &shares, 4, 3);
+        let few = sides(&inputs, &shares, &grids(4), 3);
         assert!(few[13..] == [1, 1, 1] && few[..13] == [0; 13]);
         assert_eq!(Density::Full.limit(10, 5, 4), 160);
         assert_eq!(Density::Share(0.25).limit(10, 5, 4), 40);

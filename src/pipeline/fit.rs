@@ -6,10 +6,10 @@ use crate::camera::Camera;
 use crate::data::crop::Cropped;
 use crate::fit::{FitError, FitOptions, FitReport, FitView, fit};
 use crate::io::image::Rgb;
-use crate::refine::{RefineOptions, RefineReport, Refiner, refine_groups};
+use crate::refine::{Groups, RefineOptions, RefineReport, Refiner, refine_groups};
 use crate::render::Renderer;
 use crate::splats::Splats;
-use std::ops::{ControlFlow, Range};
+use std::ops::ControlFlow;
 
 /// The largest picture of `c` that is no enlargement of the photograph, with its camera: the
 /// target's size, else the input's.
@@ -43,7 +43,7 @@ pub(crate) fn fit_to_inputs(
 /// [`Error::Cancelled`]; a picture of another size than its camera.
 pub(crate) fn refine_on_inputs(
     splats: &mut Splats,
-    groups: &mut Vec<Range<usize>>,
+    groups: &mut Groups,
     inputs: &[Cropped],
     raster: &RasterOptions,
     options: &RefineOptions,

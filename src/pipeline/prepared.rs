@@ -125,12 +125,8 @@ impl Prepared<'_> {
         let SceneChildren { mut splats, mut groups, .. } = children;
         let raster_options = raster_at(inputs.first().map_or(1.0, Cropped::ratio));
         let (mut fit, mut refinement) = (None, None);
-        let (fit_options, mut refine_options) =
+        let (fit_options, refine_options) =
             (&options.fit, options.refine_options(inputs.len(), splats.len()));
-        if !parent_sides.is_empty() {
-            // Hidden parents were removed before.
-            refine_options.least_share = 0.0;
-        }
         if fit_options.steps > 0 {
             tracker.begin(Stage::Fit, progress)?;
             let mut part = tracker.parts(progress);

@@ -9,10 +9,10 @@ use crate::fit::FitReport;
 use crate::io::image::Depth;
 use crate::io::{SaveOptions, SaveReport, save_splats};
 use crate::poses::PoseAdjustment;
-use crate::refine::{RefineReport, Refiner};
+use crate::refine::{Groups, RefineReport, Refiner};
 use crate::render::{Picture, Renderer, comment_of_camera, comment_of_options, render};
 use crate::splats::Splats;
-use std::ops::{ControlFlow, Range};
+use std::ops::ControlFlow;
 use std::path::Path;
 
 /// A reconstructed scene: Gaussians, the rules to render them, and a record of how they were
@@ -21,7 +21,7 @@ use std::path::Path;
 pub struct Reconstruction {
     pub(super) splats: Splats,
     /// Gaussians of each photograph.
-    pub(super) groups: Vec<Range<usize>>,
+    pub(super) groups: Groups,
     /// r of each parent; empty where all have the same number of children.
     pub(super) sides: Vec<u8>,
     pub(super) inputs: Vec<Cropped>,
@@ -85,12 +85,8 @@ impl Reconstruction {
         renderer: &mut Renderer,
         progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
     ) -> Result<RefineReport> {
-        let Self { splats, groups, sides, inputs, raster_options, fit, .. } = self;
-        let mut options = refine.options_for(inputs.len(), splats.len(), fit.is_some());
-        if !sides.is_empty() {
-            // The removal counts by parents, which have different numbers of children.
-            options.least_share = 0.0;
-        }
+        let Self { splats, groups, inputs, raster_options, fit, .. } = self;
+        let options = refine.options_for(inputs.len(), splats.len(), fit.is_some());
         let report =
             refine_on_inputs(splats, groups, inputs, raster_options, &options, renderer, progress)?;
         self.refinement = Some(report);

@@ -4,7 +4,7 @@ use super::progress::{Callback, StageCost, Tracker};
 use super::warning::Warning;
 use super::{
     Check, DepthBounds, DepthRange, DepthSource, Detail, Options, Photo, Poses, Prepared, Progress,
-    Reconstruction, Refine, Result, Stage, TargetSize, check_pairs, exposure, is_mvsplat, poses,
+    Reconstruction, Refine, Result, Stage, check_pairs, exposure, is_mvsplat, poses,
     refined_bounds,
 };
 use crate::camera::{Camera, NearFar, Size};
@@ -118,16 +118,8 @@ impl Reconstructor {
 
     /// Crop of a photograph for inputs of `input_size`, and targets of the model's upscale.
     pub fn crop_options(&self, input_size: Size) -> CropOptions {
-        self.crop_options_for(input_size, TargetSize::Upscaled)
-    }
-
-    /// [`Reconstructor::crop_options`] for targets of `target_size`.
-    pub fn crop_options_for(&self, input_size: Size, target_size: TargetSize) -> CropOptions {
         let config = self.config();
-        CropOptions {
-            target_size: target_size.resolve(input_size, config.upscale),
-            ..CropOptions::new(input_size, config.upscale, config.stride())
-        }
+        CropOptions::new(input_size, config.upscale, config.stride())
     }
 
     /// Reconstructs the scene of two or more photographs.
@@ -177,7 +169,8 @@ impl Reconstructor {
     ) -> Result<Prepared<'_>> {
         let sizes: Vec<Size> = photos.iter().map(Photo::size).collect();
         let input_size = options.input_size_for(&sizes, self.config().stride());
-        let crop = self.crop_options_for(input_size, options.target_size);
+        let target_size = options.target_size.resolve(input_size, self.config().upscale);
+        let crop = CropOptions { target_size, ..self.crop_options(input_size) };
         let mut tracker = Tracker::new(self.stage_costs(photos.len(), crop.input_size, options));
         let (mut adjusted, mut adjustment) = (Vec::new(), None);
         if options.poses == Poses::Adjusted {

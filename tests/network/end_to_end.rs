@@ -9,12 +9,12 @@ use subsplat::abi::{
     Convention, QUAT_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE, ShBasis, ShDirection,
 };
 use subsplat::camera::{Camera, Intrinsics, NearFar, Size};
-use subsplat::config::{Backbone, Config, Preset, ShFrame};
+use subsplat::config::{Backbone, Config, Preset, ShFrame, SpgrHead};
 use subsplat::io::image::Rgb;
 use subsplat::io::{SaveOptions, load_splats, save_splats};
 use subsplat::metrics::psnr;
 use subsplat::model::Views;
-use subsplat::pipeline::{Photo, Reconstructor};
+use subsplat::pipeline::{Density, Photo, Reconstructor};
 use subsplat::render;
 use subsplat::splats::Splats;
 use whole::{options as options_of, *};
@@ -431,6 +431,35 @@ fn straight_to_the_picture_is_the_same_picture() {
                 assert!(worst < 0.02 && flips * 500 < plane, "{worst} {flips}");
             }
         }
+    }
+}
+
+/// Three photographs share the Gaussians of two and a half, whatever the heads are.
+#[test]
+fn heads_of_every_kind_share_their_gaussians() {
+    for (head, r, spgr) in [
+        (SpgrHead::Mlp2, 4, true),
+        (SpgrHead::Polynomial, 4, true),
+        (SpgrHead::Polynomial, 1, true),
+        (SpgrHead::Mlp2, 2, false),
+    ] {
+        let mut config = light(plain(false, Preset::Tuned, r));
+        (config.spgr.head, config.spgr.enabled) = (head, spgr);
+        let model = lively(&config);
+        let shoot = shoot(9, 3, 64, 64);
+        let options = options_of((64, 64), NEAR_FAR, false).with_density(Density::Auto);
+        let result = model.run(&shoot.photos, &options).unwrap();
+        let sides = result.children_sides();
+        let expected: &[u8] = match (head, r) {
+            (SpgrHead::Polynomial, 4) => &[0, 1, 2, 4],
+            (_, 4) => &[0, 1, 4],
+            _ => &[0, 1],
+        };
+        assert!(sides.iter().all(|s| expected.contains(s)), "{head:?} x{r} {spgr}");
+        let count: usize = sides.iter().map(|s| usize::from(*s).pow(2)).sum();
+        let full = 3 * 64 * 64 * usize::from(expected[expected.len() - 1]).pow(2);
+        assert_eq!((sides.len(), count), (3 * 64 * 64, result.splats().len()));
+        assert!(0 < count && count <= full * 5 / 6, "{head:?} x{r} {spgr}: {count} of {full}");
     }
 }
 

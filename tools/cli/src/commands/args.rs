@@ -89,7 +89,7 @@ impl Command {
 }
 
 impl Command {
-    /// Whether the command may open a GPU.
+    /// Returns whether the command may open a GPU.
     pub fn uses_gpu(&self) -> bool {
         let named = |device: &str| !device.eq_ignore_ascii_case("cpu");
         match self {

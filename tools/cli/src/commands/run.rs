@@ -108,7 +108,7 @@ pub fn run(args: &RunArgs, answer: Answer) -> Result<()> {
 fn crop_of(model: &Reconstructor, result: &Reconstruction) -> CropOptions {
     let size = |p: &Rgb| Size::new(p.width, p.height);
     let sizes = result.inputs().first().map(|c| (size(&c.input), size(&c.target)));
-    let (input, target_size) = sizes.unwrap_or((Size::new(0, 0), Size::new(0, 0)));
+    let (input, target_size) = sizes.unwrap_or_default();
     CropOptions { target_size, ..model.crop_options(input) }
 }
 

@@ -127,7 +127,7 @@ fn photographs(args: &ViewArgs, progress: &mut Progress) -> Result<Source> {
     let model = progress.stage("model", |_| load_model(args, args.source.children_side()))?;
     let (source, target) = (&args.source, args.source.target_size());
     let (size, sides) = reconstruct::input_size(source, target, &model, &scene, &context)?;
-    memory::check_run(model.config(), context.len(), sides)?;
+    let model = reconstruct::with_children(source, target, model, context.len(), sides)?;
     (options.input_size, options.target_size) = (size, target);
     // The window shows the scene while it is refined. A fixed number of frames shows the result.
     let refine = match args.frames {

@@ -1,0 +1,111 @@
+//! Gaussians by photograph, and the removal of those that the photographs hardly show.
+
+use super::{CHUNK, RefineOptions, slices_of};
+use crate::abi::{Gradients, RasterOptions, gain_with_offsets};
+use crate::fit::FitView;
+use crate::render::Renderer;
+use crate::splats::Splats;
+use rayon::prelude::*;
+use std::ops::Range;
+
+/// Least share of a parent that stays ([`RefineOptions::least_share`]).
+pub(crate) const LEAST_SHARE: f32 = 0.3;
+/// Fewest photographs of which parents are removed.
+pub(crate) const PHOTOGRAPHS_TO_REMOVE: usize = 3;
+
+/// Gaussians of each photograph.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Groups {
+    /// In the order of the photographs; empty where they are not known.
+    pub(crate) ranges: Vec<Range<usize>>,
+    /// Every parent has the same number of children. Parents with different numbers are not
+    /// removed here: their Gaussians have an SH set each, which hides the families.
+    pub(crate) equal_families: bool,
+}
+
+impl Groups {
+    /// Equal groups of whole families, one for each of `views` photographs. Not known without
+    /// [`RefineOptions::grouped`], or where the parents do not divide into equal groups.
+    pub(super) fn equal(splats: &Splats, views: usize, options: &RefineOptions) -> Self {
+        let parents = splats.parents();
+        if !options.grouped || views == 0 || !parents.is_multiple_of(views) {
+            return Self::default();
+        }
+        let size = parents / views * splats.children_per_parent();
+        let ranges = (0..views).map(|view| view * size..(view + 1) * size).collect();
+        Self { ranges, equal_families: true }
+    }
+}
+
+/// The Gaussians without the parents below [`RefineOptions::least_share`]; `None` where all stay.
+pub(super) fn pruned(
+    splats: &Splats,
+    groups: &Groups,
+    views: &[FitView<'_>],
+    raster: &RasterOptions,
+    options: &RefineOptions,
+    renderer: &mut Renderer,
+) -> Option<(Splats, Groups)> {
+    let enough = groups.ranges.len() >= PHOTOGRAPHS_TO_REMOVE && groups.equal_families;
+    if !enough || !(options.least_share > 0.0) {
+        return None;
+    }
+    let shares = shares(splats, views, raster, renderer);
+    let keep: Vec<bool> = shares.iter().map(|share| *share >= options.least_share).collect();
+    let (children, mut end) = (splats.children_per_parent(), 0);
+    let ranges: Vec<Range<usize>> = groups
+        .ranges
+        .iter()
+        .map(|group| {
+            let families = &keep[group.start / children..group.end / children];
+            let begin = end;
+            end += children * families.iter().filter(|keep| **keep).count();
+            begin..end
+        })
+        .collect();
+    let some = end > 0 && keep.contains(&false);
+    some.then(|| (families(splats, &keep), Groups { ranges, equal_families: true }))
+}
+
+/// Share of each parent in the photographs: the weights T·α of its children, summed over all
+/// pixels, over those of an average parent. The sums are gradients by the colour offsets of a
+/// loss that adds all pixels.
+pub(crate) fn shares(
+    splats: &Splats,
+    views: &[FitView<'_>],
+    raster: &RasterOptions,
+    renderer: &mut Renderer,
+) -> Vec<f32> {
+    let (parents, children) = (splats.parents(), splats.children_per_parent());
+    let raster = RasterOptions { sh_basis: splats.sh_basis, ..*raster };
+    let gain = gain_with_offsets(&splats.gain, splats.len());
+    let slices = slices_of(&splats.rows, &gain, splats);
+    let (mut shares, mut pixels) = (vec![0.0f32; parents], 0);
+    let mut gradients = Gradients::default();
+    for view in views {
+        let count = view.image.width * view.image.height;
+        pixels += count;
+        renderer.gradients_of(&slices, view.camera, &raster, &mut gradients, &mut |planes| {
+            let mut by_pixel = vec![0.0; planes.len()];
+            by_pixel[..3 * count].fill(1.0 / 3.0);
+            by_pixel
+        });
+        let families = gradients.gain.par_chunks_exact(4 * children);
+        shares.par_iter_mut().zip(families).with_min_len(CHUNK).for_each(|(share, family)| {
+            *share += family.chunks_exact(4).map(|g| g[1] + g[2] + g[3]).sum::<f32>();
+        });
+    }
+    let average = pixels as f32 / parents.max(1) as f32;
+    shares.iter().map(|weight| weight / average).collect()
+}
+
+/// The families of `splats` that `keep` marks.
+fn families(splats: &Splats, keep: &[bool]) -> Splats {
+    let part = |values: &[f32]| -> Vec<f32> {
+        let size = values.len() / keep.len().max(1);
+        let kept = values.chunks_exact(size.max(1)).zip(keep).filter(|(_, keep)| **keep);
+        kept.flat_map(|(family, _)| family).copied().collect()
+    };
+    let (rows, sh, gain) = (part(&splats.rows), part(&splats.sh), part(&splats.gain));
+    Splats { rows, sh, gain, sh_degree: splats.sh_degree, sh_basis: splats.sh_basis }
+}
