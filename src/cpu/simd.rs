@@ -22,7 +22,11 @@
 
 // Tests compare the vectors of every target with arrays.
 #[cfg(any(
-    not(any(target_arch = "x86_64", all(target_arch = "wasm32", target_feature = "simd128"))),
+    not(any(
+        target_arch = "x86_64",
+        target_arch = "aarch64",
+        all(target_arch = "wasm32", target_feature = "simd128")
+    )),
     test
 ))]
 mod array;
@@ -33,6 +37,8 @@ mod avx512;
 pub(crate) mod elementary;
 mod lanes16;
 mod level;
+#[cfg(target_arch = "aarch64")]
+mod neon;
 mod real;
 mod rows;
 #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]

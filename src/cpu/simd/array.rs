@@ -1,5 +1,5 @@
-//! Lanes as an array of 16 floats: the scalar level, which compilers map to the target's
-//! baseline vectors, and NEON, where they use its registers and fused products.
+//! Lanes as an array of 16 floats: the scalar level of targets without a module of their own,
+//! and, with fused products too, what tests compare every level with.
 #![expect(clippy::needless_range_loop, reason = "counted loops over arrays become vectors")]
 
 use super::{

@@ -3,9 +3,12 @@
 use super::Simd;
 #[cfg(not(any(
     target_arch = "x86_64",
+    target_arch = "aarch64",
     all(target_arch = "wasm32", target_feature = "simd128")
 )))]
 use super::array::Array;
+#[cfg(target_arch = "aarch64")]
+use super::neon;
 #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
 use super::simd128;
 #[cfg(target_arch = "x86_64")]
@@ -18,14 +21,14 @@ use std::sync::OnceLock;
 /// `SimdLevel::run`, and a module beside `avx2` that implements `Simd`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SimdLevel {
-    /// The instructions that every processor of the target has: SSE2 on x86-64, simd128 on
-    /// WebAssembly built with it. Products round separately.
+    /// The instructions that every processor of the target has: SSE2 on x86-64, NEON on
+    /// AArch64, simd128 on WebAssembly built with it. Products round separately.
     Scalar,
     /// x86-64-v3: AVX2 and FMA. A vector is two registers.
     Avx2,
     /// x86-64-v4: AVX-512 F, BW, CD, DQ, VL. A vector is one register.
     Avx512,
-    /// AArch64, where NEON and fused multiply-add always exist.
+    /// AArch64, where NEON and fused multiply-add always exist. A vector is four registers.
     Neon,
 }
 
@@ -106,13 +109,16 @@ impl SimdLevel {
                 unsafe { avx2::run(kernel) }
             }
             #[cfg(target_arch = "aarch64")]
-            SimdLevel::Neon => kernel.run(Array::<true>),
+            SimdLevel::Neon => kernel.run(neon::Token::<true>),
+            #[cfg(target_arch = "aarch64")]
+            _ => kernel.run(neon::Token::<false>),
             #[cfg(target_arch = "x86_64")]
             _ => kernel.run(sse2::Token),
             #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
             _ => kernel.run(simd128::Token),
             #[cfg(not(any(
                 target_arch = "x86_64",
+                target_arch = "aarch64",
                 all(target_arch = "wasm32", target_feature = "simd128")
             )))]
             _ => kernel.run(Array::<false>),
