@@ -4,6 +4,7 @@ use rayon::ThreadPool;
 use rayon::prelude::*;
 use std::hint::black_box;
 use std::time::Instant;
+use subsplat::cpu::SimdLevel;
 use subsplat::cpu::simd::{LANES, Real, Vector, VectorKernel};
 
 /// Floats of each buffer of the copy: 128 MiB, beyond most caches.
@@ -95,8 +96,9 @@ impl Machine {
             (0..turns).map(|_| once()).fold(0.0, f64::max)
         });
         println!(
-            "machine: copy {:.1} GB/s on 1 thread, {:.1} on {n} (into new pages {:.1}, {:.1}); \
-             multiply-adds {:.0} GFLOP/s on 1, {:.0} on {n} (f32)",
+            "SIMD level {}; machine: copy {:.1} GB/s on 1 thread, {:.1} on {n} (into new pages \
+             {:.1}, {:.1}); multiply-adds {:.0} GFLOP/s on 1, {:.0} on {n} (f32)",
+            SimdLevel::best().name(),
             copy[0],
             copy[1],
             copy_new[0],

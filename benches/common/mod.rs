@@ -2,9 +2,9 @@
 //! one process, so that other load on the machine affects all of them. The report has medians,
 //! minima, and ratios to the group's first contender. Where the minimum work is known, it also
 //! has the bandwidth relative to a plain copy and the arithmetic rate relative to a loop of
-//! multiply-adds, both measured in the same run.
+//! multiply-adds, both measured in the same run and at the same SIMD level.
 //!
-//! `cargo bench --bench raster -- [NAME …] [--quick] [--seconds S] [--threads N]
+//! `cargo bench --bench raster -- [NAME …] [--quick] [--seconds S] [--threads N] [--simd LEVEL]
 //! [--json FILE] [--write DIR] [--onnxruntime]`; a group runs where its name contains every NAME.
 
 #![allow(dead_code, reason = "each bench uses a part")]
@@ -19,7 +19,9 @@ use machine::Machine;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use serde_json::{Value, json};
 use std::path::PathBuf;
+use std::process::Command;
 use std::time::{Duration, Instant};
+use subsplat::cpu::SimdLevel;
 
 /// Minimum and maximum number of runs of a contender.
 const RUNS: (usize, usize) = (3, 200);
@@ -59,12 +61,33 @@ impl Args {
                 "--threads" => out.threads = Some(value()?.parse().context("--threads")?),
                 "--json" => out.json = Some(value()?.into()),
                 "--write" => out.write = Some(value()?.into()),
+                "--simd" => run_at(&value()?)?,
                 other if other.starts_with('-') => bail!("unknown option {other}"),
                 name => out.names.push(name.to_owned()),
             }
         }
         Ok(out)
     }
+}
+
+/// Returns where `name` is the SIMD level of this process. Else runs this program again with
+/// the same arguments at that level, and ends with its exit code: a process reads the variable
+/// `SUBSPLAT_SIMD` once.
+///
+/// # Errors
+/// A level that does not exist or that this processor lacks; a program that does not start.
+fn run_at(name: &str) -> Result<()> {
+    let level = SimdLevel::named(name).filter(|level| level.is_available());
+    let here: Vec<&str> = SimdLevel::available().iter().map(|level| level.name()).collect();
+    let level = level.with_context(|| {
+        format!("--simd: expected one that this processor runs ({}), got {name}", here.join(", "))
+    })?;
+    if level == SimdLevel::best() {
+        return Ok(());
+    }
+    let mut again = Command::new(std::env::current_exe()?);
+    let status = again.args(std::env::args_os().skip(1)).env("SUBSPLAT_SIMD", name).status()?;
+    std::process::exit(status.code().unwrap_or(1));
 }
 
 /// Number of threads of a contender.
@@ -315,6 +338,7 @@ impl Bench {
         let report = json!({
             "bench": self.name,
             "threads": self.all.current_num_threads(),
+            "simd": SimdLevel::best().name(),
             "machine": self.machine.map(|m| json!({ "copy_gb_s": m.copy, "fma_gflop_s": m.fma })),
             "groups": self.groups,
         });
