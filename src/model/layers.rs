@@ -3,9 +3,7 @@
 
 use crate::model::mlp::xavier;
 pub use crate::ops::activation::Activation;
-use crate::ops::activation::activation;
-use crate::ops::conv2d::conv2d;
-use crate::ops::{self, norm};
+use crate::ops::{Array, ConvSteps};
 use candle_core::{Result, Tensor, bail};
 use candle_nn::{Init, VarBuilder};
 
@@ -110,8 +108,11 @@ impl Conv2d {
     ///
     /// # Errors
     /// Another rank or number of channels.
-    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        conv2d(x, &self.weight, self.bias.as_ref(), self.shape.stride, self.shape.padding)
+    pub fn forward<A: Array>(&self, x: &A) -> Result<A> {
+        let bias = self.bias.as_ref().map(|bias| x.parameter(bias)).transpose()?;
+        let ConvShape { stride, padding, .. } = self.shape;
+        let steps = ConvSteps { stride, padding };
+        x.convolved(&x.parameter(&self.weight)?, bias.as_ref(), steps)
     }
 }
 
@@ -163,17 +164,15 @@ impl Linear {
     ///
     /// # Errors
     /// Another last dimension.
-    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+    pub fn forward<A: Array>(&self, x: &A) -> Result<A> {
         let (o, c) = self.weight.dims2()?;
         let mut dims = x.dims().to_vec();
         if dims.last() != Some(&c) {
             bail!("linear: expected x [.., {c}], got {:?}", x.dims());
         }
-        let x = x.contiguous()?.reshape(((), c))?;
-        let y = match &self.bias {
-            Some(bias) => ops::linear::linear(&x, &self.weight, bias)?,
-            None => ops::linear::linear_no_bias(&x, &self.weight)?,
-        };
+        let x = x.reshape(((), c))?;
+        let bias = self.bias.as_ref().map(|bias| x.parameter(bias)).transpose()?;
+        let y = x.projected(&x.parameter(&self.weight)?, bias.as_ref())?;
         if let Some(last) = dims.last_mut() {
             *last = o;
         }
@@ -223,17 +222,18 @@ impl GroupNorm {
     ///
     /// # Errors
     /// Another number of channels.
-    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        norm::group_norm(x, self.groups, &self.weight, &self.bias)
+    pub fn forward<A: Array>(&self, x: &A) -> Result<A> {
+        let affine = [&x.parameter(&self.weight)?, &x.parameter(&self.bias)?];
+        x.group_norm(self.groups, affine, None)
     }
 
     /// Applies [`GroupNorm::forward`] and `activation` in one pass.
     ///
     /// # Errors
     /// As [`GroupNorm::forward`].
-    pub fn forward_then(&self, x: &Tensor, activation: Activation) -> Result<Tensor> {
-        let affine = norm::Affine { weight: &self.weight, bias: &self.bias };
-        norm::group_norm_then(x, self.groups, affine, Some(activation))
+    pub fn forward_then<A: Array>(&self, x: &A, activation: Activation) -> Result<A> {
+        let affine = [&x.parameter(&self.weight)?, &x.parameter(&self.bias)?];
+        x.group_norm(self.groups, affine, Some(activation))
     }
 }
 
@@ -242,16 +242,16 @@ impl GroupNorm {
 ///
 /// # Errors
 /// Another rank.
-pub fn instance_norm(x: &Tensor) -> Result<Tensor> {
-    norm::instance_norm(x)
+pub fn instance_norm<A: Array>(x: &A) -> Result<A> {
+    x.instance_norm(None)
 }
 
 /// Computes max(0, [`instance_norm`]) in one pass.
 ///
 /// # Errors
 /// As [`instance_norm`].
-pub fn instance_norm_relu(x: &Tensor) -> Result<Tensor> {
-    norm::instance_norm_then(x, Some(Activation::Relu))
+pub fn instance_norm_relu<A: Array>(x: &A) -> Result<A> {
+    x.instance_norm(Some(Activation::Relu))
 }
 
 /// Normalises the last dimension, then scales and shifts: `weight`, `bias` `[C]`.
@@ -282,8 +282,8 @@ impl LayerNorm {
     ///
     /// # Errors
     /// Another last dimension.
-    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        norm::layer_norm(x, &self.weight, &self.bias)
+    pub fn forward<A: Array>(&self, x: &A) -> Result<A> {
+        x.layer_norm([&x.parameter(&self.weight)?, &x.parameter(&self.bias)?])
     }
 }
 
@@ -291,32 +291,32 @@ impl LayerNorm {
 ///
 /// # Errors
 /// `x` is not f32.
-pub fn relu(x: &Tensor) -> Result<Tensor> {
-    activation(x, Activation::Relu)
+pub fn relu<A: Array>(x: &A) -> Result<A> {
+    x.activated(Activation::Relu)
 }
 
 /// Computes x·sigmoid(x).
 ///
 /// # Errors
 /// `x` is not f32.
-pub fn silu(x: &Tensor) -> Result<Tensor> {
-    activation(x, Activation::Silu)
+pub fn silu<A: Array>(x: &A) -> Result<A> {
+    x.activated(Activation::Silu)
 }
 
 /// Computes x·Φ(x), the exact (erf) form.
 ///
 /// # Errors
 /// `x` is not f32.
-pub fn gelu(x: &Tensor) -> Result<Tensor> {
-    activation(x, Activation::Gelu)
+pub fn gelu<A: Array>(x: &A) -> Result<A> {
+    x.activated(Activation::Gelu)
 }
 
 /// Computes 1/(1 + e⁻ˣ).
 ///
 /// # Errors
 /// `x` is not f32.
-pub fn sigmoid(x: &Tensor) -> Result<Tensor> {
-    activation(x, Activation::Sigmoid)
+pub fn sigmoid<A: Array>(x: &A) -> Result<A> {
+    x.activated(Activation::Sigmoid)
 }
 
 pub use crate::ops::activation::softmax;

@@ -20,6 +20,7 @@ pub mod trace;
 pub mod trunk;
 pub mod weights;
 
+use crate::ops::Array;
 pub use crate::ops::Backend;
 
 use crate::camera::{Camera, NearFar};
@@ -166,25 +167,25 @@ impl Views {
 
 /// Output of a backbone. The H·W pixels are in row-major order, with G Gaussians each.
 #[derive(Clone, Debug)]
-pub struct BackboneOutput {
+pub struct BackboneOutput<A = Tensor> {
     /// `[B, V, H·W, 2 + 3 + 4 + 3·D]`, the raw head of MVSplat's adapter: sub-pixel offset
     /// and scale before the sigmoid; quaternion xyzw, camera frame, not unit; SH,
     /// colour-major, before the degree mask.
-    pub raw: Tensor,
+    pub raw: A,
     /// `[B, V, H·W, G]`: distance along the unit ray, world units.
-    pub depths: Tensor,
+    pub depths: A,
     /// `[B, V, H·W, G]`: opacity in (0, 1) before the opacity mapping and the
     /// division by G.
-    pub densities: Tensor,
+    pub densities: A,
     /// `[B, V, C_ℓ, h_ℓ, w_ℓ]` of every level.
-    pub features: Vec<(FeatureLevel, Tensor)>,
+    pub features: Vec<(FeatureLevel, A)>,
 }
 
-impl BackboneOutput {
-    /// Applies `f` to every tensor.
-    fn map(&self, f: impl Fn(&Tensor) -> Result<Tensor>) -> Result<Self> {
+impl<A: Array> BackboneOutput<A> {
+    /// Applies `f` to every array.
+    fn map<B>(&self, f: impl Fn(&A) -> Result<B>) -> Result<BackboneOutput<B>> {
         let features = self.features.iter().map(|(level, map)| Ok((*level, f(map)?)));
-        Ok(Self {
+        Ok(BackboneOutput {
             raw: f(&self.raw)?,
             depths: f(&self.depths)?,
             densities: f(&self.densities)?,
@@ -192,6 +193,16 @@ impl BackboneOutput {
         })
     }
 
+    /// Returns the same arrays in host memory.
+    ///
+    /// # Errors
+    /// Errors of the device.
+    pub fn to_host(&self) -> Result<BackboneOutput> {
+        self.map(A::to_host)
+    }
+}
+
+impl BackboneOutput {
     /// Returns the same tensors outside the backbone's graph.
     ///
     /// # Errors

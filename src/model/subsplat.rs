@@ -10,7 +10,7 @@ use super::{BackboneOutput, Primaries, Views};
 use crate::abi::RasterOptions;
 use crate::camera::Camera;
 use crate::config::{Backbone, Config, FeatureLevel};
-use crate::ops::Backend;
+use crate::ops::{Array, Backend};
 use candle_core::{Error, Result, Tensor, bail};
 use candle_nn::VarBuilder;
 
@@ -108,11 +108,20 @@ impl SubSplat {
         if h % stride != 0 || w % stride != 0 {
             bail!("input images: expected sides that are multiples of {stride}, got {w}x{h}");
         }
-        let mut trace = Trace::with_checkpoint(checkpoint);
+        self.encode_on(views, &views.images, &mut Trace::with_checkpoint(checkpoint))
+    }
+
+    /// Runs the backbone on the executor of `images`, the views' images.
+    fn encode_on<A: Array>(
+        &self,
+        views: &Views,
+        images: &A,
+        trace: &mut Trace<'_>,
+    ) -> Result<BackboneOutput<A>> {
         match &self.encoder {
-            Encoder::Mvsplat(encoder) => encoder.forward(views, &mut trace),
+            Encoder::Mvsplat(encoder) => encoder.forward_on(views, images, trace),
             Encoder::Small(encoder) => {
-                Ok(encoder.forward_with(views, DisparityMean::AroundMode, &trace)?.0)
+                Ok(encoder.forward_on(views, images, DisparityMean::AroundMode, trace)?.0)
             }
         }
     }

@@ -1,6 +1,7 @@
 //! Recording of intermediate tensors, for `subsplat compare` and tests, and checkpoints at which
 //! a caller can cancel. A trace without either costs nothing.
 
+use crate::ops::Array;
 use candle_core::{Result, Tensor};
 
 /// Receives name and tensor of each stage.
@@ -36,24 +37,28 @@ impl<'a> Trace<'a> {
         self.observer.is_some()
     }
 
-    /// Records `tensor`, which the computation needs anyway, and ends a step.
+    /// Records `array`, which the computation needs anyway, and ends a step.
     ///
     /// # Errors
     /// Those of the observer and of the checkpoint.
-    pub fn put(&mut self, name: &str, tensor: &Tensor) -> Result<()> {
+    pub fn put<A: Array>(&mut self, name: &str, array: &A) -> Result<()> {
         if let Some(observer) = &mut self.observer {
-            observer(name, tensor)?;
+            observer(name, &array.to_host()?)?;
         }
         self.step()
     }
 
-    /// Records the tensor of `make`, which runs only if stages are recorded, and ends a step.
+    /// Records the array of `make`, which runs only if stages are recorded, and ends a step.
     ///
     /// # Errors
     /// Those of the observer, of the checkpoint and of `make`.
-    pub fn put_with(&mut self, name: &str, make: impl FnOnce() -> Result<Tensor>) -> Result<()> {
+    pub fn put_with<A: Array>(
+        &mut self,
+        name: &str,
+        make: impl FnOnce() -> Result<A>,
+    ) -> Result<()> {
         if let Some(observer) = &mut self.observer {
-            observer(name, &make()?)?;
+            observer(name, &make()?.to_host()?)?;
         }
         self.step()
     }

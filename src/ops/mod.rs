@@ -4,6 +4,7 @@
 
 pub mod activation;
 pub mod adapter;
+pub mod array;
 pub mod attention;
 pub mod attention_gather;
 pub mod attributes;
@@ -28,6 +29,7 @@ pub mod small;
 pub mod spgr;
 mod splat_tensors;
 
+pub use array::{Array, ConvSteps};
 pub use backend::{Backend, NoDevice};
 pub use rasterize::{over_background, rasterize, rasterize_on, rasterize_splats};
 pub use splat_tensors::SplatTensors;

@@ -7,8 +7,8 @@ use crate::model::layers::{
     Conv2d, ConvShape, LayerInit, default_init, instance_norm, instance_norm_relu, relu,
 };
 use crate::model::trace::Trace;
-use crate::ops::moves::sum;
-use candle_core::{Result, Tensor};
+use crate::ops::Array;
+use candle_core::Result;
 use candle_nn::{Init, VarBuilder};
 
 /// Mean and standard deviation of ImageNet's colours, with which the CNN alone normalises
@@ -18,11 +18,11 @@ const STD: [f32; 3] = [0.229, 0.224, 0.225];
 
 /// Feature maps of the CNN.
 #[derive(Clone, Debug)]
-pub struct CnnOutput {
+pub struct CnnOutput<A> {
     /// `[N, C₁, H/2, W/2]`: output of the first stage.
-    pub half: Tensor,
+    pub half: A,
     /// `[N, C₃, H/4, W/4]`: output of the CNN.
-    pub quarter: Tensor,
+    pub quarter: A,
 }
 
 /// The network.
@@ -59,9 +59,9 @@ impl Cnn {
     ///
     /// # Errors
     /// Those of candle.
-    pub fn forward(&self, images: &Tensor, trace: &mut Trace<'_>) -> Result<CnnOutput> {
-        let row = |v: [f32; 3]| Tensor::new(&v, images.device())?.reshape((1, 3, 1, 1));
-        let x = images.broadcast_sub(&row(MEAN)?)?.broadcast_div(&row(STD)?)?;
+    pub fn forward<A: Array>(&self, images: &A, trace: &mut Trace<'_>) -> Result<CnnOutput<A>> {
+        let row = |v: [f32; 3]| images.constant(v.to_vec(), &[1, 3, 1, 1]);
+        let x = images.minus(&row(MEAN)?)?.over(&row(STD)?)?;
         trace.put("cnn.normalized_image", &x)?;
         let x = self.conv1.forward(&x)?;
         trace.put("cnn.conv1", &x)?;
@@ -105,13 +105,13 @@ impl Residual {
         })
     }
 
-    fn forward(&self, x: &Tensor) -> Result<Tensor> {
+    fn forward<A: Array>(&self, x: &A) -> Result<A> {
         let y = instance_norm_relu(&self.conv1.forward(x)?)?;
         let y = instance_norm_relu(&self.conv2.forward(&y)?)?;
         let skip = match &self.downsample {
             Some(conv) => instance_norm(&conv.forward(x)?)?,
             None => x.clone(),
         };
-        relu(&sum(&skip, &y)?)
+        relu(&skip.plus(&y)?)
     }
 }

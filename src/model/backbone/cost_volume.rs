@@ -7,9 +7,8 @@ use crate::config::Mvsplat as Settings;
 use crate::model::Views;
 use crate::model::layers::{Conv2d, ConvShape, GroupNorm, gelu};
 use crate::model::trace::Trace;
-use crate::ops::Backend;
-use crate::ops::join::join;
-use crate::ops::plane_sweep::{Pair, Sweep, pair, plane_sweep_on, warped};
+use crate::ops::plane_sweep::{Pair, Sweep, pair, warped};
+use crate::ops::{Array, Backend};
 use candle_core::{Device, Result, Tensor};
 use candle_nn::VarBuilder;
 use glam::Mat4;
@@ -53,8 +52,8 @@ fn ordered_sources(views: &Views, scene: usize, i: usize) -> impl Iterator<Item 
 ///
 /// # Errors
 /// A camera is not invertible.
-pub fn sweep(views: &Views, disparities: &[Vec<f32>], features: &Tensor) -> Result<Sweep> {
-    let (_, channels, h, w) = features.dims4()?;
+pub fn sweep<A: Array>(views: &Views, disparities: &[Vec<f32>], features: &A) -> Result<Sweep> {
+    let [_, channels, h, w] = features.sizes()?;
     let (b, v) = (views.scenes(), views.views());
     let mut pairs: Vec<Vec<Pair>> = Vec::with_capacity(v * b);
     for row in 0..v * b {
@@ -83,18 +82,18 @@ pub fn sweep(views: &Views, disparities: &[Vec<f32>], features: &Tensor) -> Resu
 ///
 /// # Errors
 /// A camera is not invertible.
-pub fn correlation(
+pub fn correlation<A: Array>(
     backend: &Backend,
     views: &Views,
     disparities: &[Vec<f32>],
-    features: &Tensor,
+    features: &A,
     trace: &mut Trace<'_>,
-) -> Result<Tensor> {
+) -> Result<A> {
     let sweep = sweep(views, disparities, features)?;
     if trace.is_on() {
-        trace_geometry(views, &sweep, features, trace)?;
+        trace_geometry(views, &sweep, &features.to_host()?, trace)?;
     }
-    let volume = plane_sweep_on(backend, features, features, sweep)?;
+    let volume = features.plane_sweep(features, sweep, backend)?;
     trace.put("cv.raw_correlation_vb", &volume)?;
     Ok(volume)
 }
@@ -165,15 +164,15 @@ impl Refinement {
     ///
     /// # Errors
     /// Those of candle.
-    pub fn forward(
+    pub fn forward<A: Array>(
         &self,
-        volume: &Tensor,
-        features: &Tensor,
+        volume: &A,
+        features: &A,
         views: usize,
         trace: &mut Trace<'_>,
-    ) -> Result<Tensor> {
+    ) -> Result<A> {
         let name = "cv.corr_refine_net";
-        let input = join(volume, features, 1)?;
+        let input = volume.beside(features, 1)?;
         let x = self.stem.0.forward(&input)?;
         trace.put(&format!("{name}.0"), &x)?;
         let x = self.stem.1.forward(&x)?;
@@ -185,7 +184,7 @@ impl Refinement {
         trace.put(&format!("{name}.out_vb"), &x)?;
         let residual = self.residual.forward(&input)?;
         trace.put("cv.regressor_residual_vb", &residual)?;
-        let x = (x + residual)?;
+        let x = x.plus(&residual)?;
         trace.put("cv.refined_correlation_vb", &x)?;
         Ok(x)
     }

@@ -11,51 +11,46 @@ use crate::abi::sh_coefficients;
 use crate::camera::NearFar;
 use crate::config::Mvsplat as Settings;
 use crate::model::Views;
-use crate::model::layers::{
-    Activation, Conv2d, ConvShape, GroupNorm, gelu, resize_bilinear, resize_bilinear_then, sigmoid,
-    softmax, upsample_nearest,
-};
+use crate::model::layers::{Activation, Conv2d, ConvShape, GroupNorm, gelu, sigmoid};
 use crate::model::trace::Trace;
-use crate::ops::Backend;
-use crate::ops::join::join;
-use crate::ops::moves::{channels_last, stacked};
-use candle_core::{Device, Result, Tensor};
+use crate::ops::{Array, Backend};
+use candle_core::Result;
 use candle_nn::VarBuilder;
 
 /// Factor between feature maps and images.
 const DOWNSCALE: usize = 4;
 
 /// Input of the predictor; all rows are (v b).
-pub struct Input<'a> {
+pub struct Input<'a, A> {
     /// Cameras and depth ranges.
     pub views: &'a Views,
     /// `[V·B, 3, H, W]`, RGB in [0, 1].
-    pub images: Tensor,
+    pub images: A,
     /// `[V·B, C, h, w]`, without position encoding.
-    pub cnn: Tensor,
+    pub cnn: A,
     /// `[V·B, C, h, w]`.
-    pub trans: Tensor,
+    pub trans: A,
 }
 
 /// Output of the predictor; all rows are (v b).
-pub struct Output {
+pub struct Output<A> {
     /// `[V·B, H·W, 2 + 7 + 3·D]`: raw head, as in
     /// [`BackboneOutput`](crate::model::BackboneOutput).
-    pub raw: Tensor,
+    pub raw: A,
     /// `[V·B, H·W, G]`: distance along the unit ray, world units.
-    pub depths: Tensor,
+    pub depths: A,
     /// `[V·B, H·W, G]`: opacity in (0, 1).
-    pub densities: Tensor,
+    pub densities: A,
     /// `[V·B, C_r, H, W]`: the refinement U-Net's output.
-    pub refined: Tensor,
+    pub refined: A,
 }
 
 /// Coarse and full-resolution disparity.
-struct Disparity {
+struct Disparity<A> {
     /// `[V·B, 1, H, W]`.
-    full: Tensor,
+    full: A,
     /// `[V·B, 1, H, W]`: largest probability among the candidates.
-    pdf_max: Tensor,
+    pdf_max: A,
 }
 
 /// Two convolutions with a GELU between.
@@ -70,7 +65,7 @@ impl Head {
         ))
     }
 
-    fn forward(&self, x: &Tensor) -> Result<Tensor> {
+    fn forward<A: Array>(&self, x: &A) -> Result<A> {
         self.1.forward(&gelu(&self.0.forward(x)?)?)
     }
 }
@@ -125,10 +120,14 @@ impl DepthPredictor {
     ///
     /// # Errors
     /// A camera is not invertible; those of candle.
-    pub fn forward(&self, input: Input<'_>, trace: &mut Trace<'_>) -> Result<Output> {
+    pub fn forward<A: Array>(
+        &self,
+        input: Input<'_, A>,
+        trace: &mut Trace<'_>,
+    ) -> Result<Output<A>> {
         let Input { views, images, cnn, trans } = input;
         let disparity = self.coarse(views, &trans, trace)?;
-        let joined = join(&trans, &cnn, 1)?;
+        let joined = trans.beside(&cnn, 1)?;
         drop((trans, cnn));
         let low = self.upsampler.forward(&joined)?;
         drop(joined);
@@ -140,46 +139,49 @@ impl DepthPredictor {
         Ok(Output { raw, depths, densities, refined })
     }
 
-    fn coarse(&self, views: &Views, trans: &Tensor, trace: &mut Trace<'_>) -> Result<Disparity> {
+    fn coarse<A: Array>(
+        &self,
+        views: &Views,
+        trans: &A,
+        trace: &mut Trace<'_>,
+    ) -> Result<Disparity<A>> {
         let candidates = disparities(views, self.candidates);
         let volume = correlation(&self.backend, views, &candidates, trans, trace)?;
         let volume = self.refinement.forward(&volume, trans, views.views(), trace)?;
         let logits = self.depth_head_lowres.forward(&volume)?;
         trace.put("depth.logits_vb", &logits)?;
-        let (rows, d, h, w) = logits.dims4()?;
+        let [rows, d, h, w] = logits.sizes()?;
         // Candidates are the last axis: a strided softmax or sum is many times slower.
-        let pdf = softmax(&channels_last(&logits)?)?;
-        trace.put_with("depth.pdf_vb", || {
-            pdf.transpose(1, 2)?.contiguous()?.reshape((rows, d, h, w))
-        })?;
-        let candidates = Tensor::new(candidates, &Device::Cpu)?.reshape((rows, d, 1))?;
-        let map = |x: Tensor| x.reshape((rows, 1, h, w));
-        let disparity = map(pdf.matmul(&candidates)?)?;
+        let pdf = logits.channels_last()?.softmax()?;
+        trace.put_with("depth.pdf_vb", || pdf.permuted(&[0, 2, 1])?.reshape((rows, d, h, w)))?;
+        let candidates = pdf.constant(candidates.concat(), &[rows, d])?;
+        let map = |x: A| x.reshape((rows, 1, h, w));
+        let disparity = map(pdf.weighted_sum(&candidates)?)?;
         trace.put("depth.coarse_disp_vb", &disparity)?;
-        let pdf_max = map(pdf.max_keepdim(2)?)?;
+        let pdf_max = map(pdf.largest()?)?;
         trace.put("depth.pdf_max_vb", &pdf_max)?;
-        let full = resize_bilinear(&disparity, DOWNSCALE * h, DOWNSCALE * w)?;
+        let full = disparity.resized([DOWNSCALE * h, DOWNSCALE * w], None)?;
         trace.put("depth.fullres_disp_vb", &full)?;
-        let pdf_max = upsample_nearest(&pdf_max, DOWNSCALE)?;
+        let pdf_max = pdf_max.repeated(DOWNSCALE)?;
         trace.put("depth.pdf_max_fullres_vb", &pdf_max)?;
         Ok(Disparity { full, pdf_max })
     }
 
-    fn refine(
+    fn refine<A: Array>(
         &self,
-        images: &Tensor,
-        up: &Upsampled,
-        disparity: &Disparity,
+        images: &A,
+        up: &Upsampled<A>,
+        disparity: &Disparity<A>,
         views: usize,
         trace: &mut Trace<'_>,
-    ) -> Result<Tensor> {
+    ) -> Result<A> {
         let name = "depth.refine_unet";
         let projected = each_row(images, |r| {
             trace.step()?;
             self.proj_feature.forward(&up.row(r)?)
         })?;
         trace.put("depth.proj_feature_vb", &projected)?;
-        let x = Tensor::cat(&[images, &projected, &disparity.full, &disparity.pdf_max], 1)?;
+        let x = A::joined(&[images, &projected, &disparity.full, &disparity.pdf_max], 1)?;
         drop(projected);
         trace.put(&format!("{name}.in_vb"), &x)?;
         let x = self.refine_stem.0.forward(&x)?;
@@ -191,59 +193,56 @@ impl DepthPredictor {
         self.refine_unet.forward(&x, views, trace, &format!("{name}.3"))
     }
 
-    fn gaussians(
+    fn gaussians<A: Array>(
         &self,
-        images: &Tensor,
-        up: &Upsampled,
-        refined: &Tensor,
+        images: &A,
+        up: &Upsampled<A>,
+        refined: &A,
         trace: &mut Trace<'_>,
-    ) -> Result<Tensor> {
+    ) -> Result<A> {
         let raw = each_row(images, |r| {
             trace.step()?;
-            let row = |x: &Tensor| x.narrow(0, r, 1);
-            let x = Tensor::cat(&[row(refined)?, row(images)?], 1)?;
-            let x = join(&x, &up.row(r)?, 1)?;
-            let y = self.to_gaussians.forward(&x)?;
-            channels_last(&y)
+            let row = |x: &A| x.narrow(0, r, 1);
+            let x = A::joined(&[&row(refined)?, &row(images)?], 1)?.beside(&up.row(r)?, 1)?;
+            self.to_gaussians.forward(&x)?.channels_last()
         })?;
         trace.put_with("depth.to_gaussians_vb", || {
-            let (rows, _, h, w) = images.dims4()?;
-            raw.transpose(1, 2)?.contiguous()?.reshape((rows, (), h, w))
+            let [rows, _, h, w] = images.sizes()?;
+            raw.permuted(&[0, 2, 1])?.reshape((rows, (), h, w))
         })?;
         Ok(raw)
     }
 
     /// Depths and densities, `[V·B, H·W, G]`.
-    fn disparity(
+    fn disparity<A: Array>(
         &self,
         views: &Views,
-        refined: &Tensor,
-        disparity: &Disparity,
+        refined: &A,
+        disparity: &Disparity<A>,
         trace: &mut Trace<'_>,
-    ) -> Result<(Tensor, Tensor)> {
+    ) -> Result<(A, A)> {
         let (b, g) = (views.scenes(), self.per_pixel);
         let out = self.to_disparity.forward(refined)?;
         trace.put("depth.to_disparity_vb", &out)?;
-        let last = |x: Tensor| channels_last(&x);
-        let full = last(disparity.full.broadcast_add(&out.narrow(1, 0, g)?)?)?;
+        let full = out.narrow(1, 0, g)?.plus(&disparity.full)?.channels_last()?;
         let depths = each_row(&full, |r| {
             let NearFar { near, far } = views.near_far[r % b][r / b];
-            full.narrow(0, r, 1)?.clamp(1.0 / far, 1.0 / near)?.recip()
+            full.narrow(0, r, 1)?.clamped(1.0 / far, 1.0 / near)?.reciprocal()
         })?;
-        Ok((depths, sigmoid(&last(out.narrow(1, g, g)?)?)?))
+        Ok((depths, sigmoid(&out.narrow(1, g, g)?.channels_last()?)?))
     }
 }
 
 /// GELU(bilinear ×4): 32 MiB per 256² view. Each use recomputes it, unless a gradient or the
 /// trace needs it.
-struct Upsampled {
-    low: Tensor,
-    kept: Option<Tensor>,
+struct Upsampled<A> {
+    low: A,
+    kept: Option<A>,
 }
 
-impl Upsampled {
-    fn new(low: Tensor, trace: &mut Trace<'_>) -> Result<Self> {
-        let kept = match low.track_op() || trace.is_on() {
+impl<A: Array> Upsampled<A> {
+    fn new(low: A, trace: &mut Trace<'_>) -> Result<Self> {
+        let kept = match low.is_tracked() || trace.is_on() {
             true => Some(Self::make(&low)?),
             false => None,
         };
@@ -253,13 +252,13 @@ impl Upsampled {
         Ok(Self { low, kept })
     }
 
-    fn make(low: &Tensor) -> Result<Tensor> {
-        let (_, _, h, w) = low.dims4()?;
-        resize_bilinear_then(low, DOWNSCALE * h, DOWNSCALE * w, Activation::Gelu)
+    fn make(low: &A) -> Result<A> {
+        let [_, _, h, w] = low.sizes()?;
+        low.resized([DOWNSCALE * h, DOWNSCALE * w], Some(Activation::Gelu))
     }
 
     /// Returns row `r`, `[1, C, H, W]`.
-    fn row(&self, r: usize) -> Result<Tensor> {
+    fn row(&self, r: usize) -> Result<A> {
         match &self.kept {
             Some(up) => up.narrow(0, r, 1),
             None => Self::make(&self.low.narrow(0, r, 1)?),
@@ -268,6 +267,7 @@ impl Upsampled {
 }
 
 /// Joins `f` of every row index of `like` along the first dimension.
-fn each_row(like: &Tensor, f: impl Fn(usize) -> Result<Tensor>) -> Result<Tensor> {
-    stacked(&(0..like.dim(0)?).map(f).collect::<Result<Vec<_>>>()?)
+fn each_row<A: Array>(like: &A, f: impl Fn(usize) -> Result<A>) -> Result<A> {
+    let rows = (0..like.dims()[0]).map(f).collect::<Result<Vec<_>>>()?;
+    A::joined(&rows.iter().collect::<Vec<_>>(), 0)
 }

@@ -19,8 +19,8 @@ pub(crate) use small_parts::apply_small_initial_value;
 use super::trace::Trace;
 use super::{BackboneOutput, Views};
 use crate::config::{Config, FeatureLevel, Mvsplat as Settings};
-use crate::ops::Backend;
-use candle_core::{Result, Tensor, bail};
+use crate::ops::{Array, Backend};
+use candle_core::{Result, bail};
 use candle_nn::VarBuilder;
 
 /// MVSplat's encoder.
@@ -71,28 +71,41 @@ impl Mvsplat {
     /// # Errors
     /// H or W is not a multiple of [`Config::stride`]; those of candle.
     pub fn forward(&self, views: &Views, trace: &mut Trace<'_>) -> Result<BackboneOutput> {
-        let (b, v, _, height, width) = views.images.dims5()?;
+        self.forward_on(views, &views.images, trace)
+    }
+
+    /// [`Mvsplat::forward`] on the executor of `images`, the views' images.
+    ///
+    /// # Errors
+    /// Those of [`Mvsplat::forward`].
+    pub fn forward_on<A: Array>(
+        &self,
+        views: &Views,
+        images: &A,
+        trace: &mut Trace<'_>,
+    ) -> Result<BackboneOutput<A>> {
+        let [b, v, _, height, width] = images.sizes()?;
         let stride = Config::stride_of(&self.settings);
         if height == 0 || width == 0 || height % stride != 0 || width % stride != 0 {
             bail!("backbone: expected sides that are multiples of {stride}, got {height}x{width}");
         }
-        let cnn = self.cnn.forward(&views.images.reshape((b * v, 3, height, width))?, trace)?;
-        let (_, c, h, w) = cnn.quarter.dims4()?;
+        let cnn = self.cnn.forward(&images.reshape((b * v, 3, height, width))?, trace)?;
+        let [_, c, h, w] = cnn.quarter.sizes()?;
         let cnn4 = cnn.quarter.reshape((b, v, c, h, w))?;
         trace.put("cnn.features", &cnn4)?;
         let trans4 = self.transformer.forward(&cnn4, views.sources(), trace)?;
         let input = depth::Input {
             views,
-            images: vb_rows(&views.images)?,
+            images: vb_rows(images)?,
             cnn: vb_rows(&cnn4)?,
             trans: vb_rows(&trans4)?,
         };
         let out = self.depth.forward(input, trace)?;
-        let pooled = |s: usize| -> Result<Tensor> {
-            let x = trans4.reshape((b * v, c, h, w))?.avg_pool2d(s)?;
+        let pooled = |s: usize| -> Result<A> {
+            let x = trans4.reshape((b * v, c, h, w))?.pooled(s)?;
             x.reshape((b, v, c, h / s, w / s))
         };
-        let (_, half, hh, hw) = cnn.half.dims4()?;
+        let [_, half, hh, hw] = cnn.half.sizes()?;
         let features = vec![
             (FeatureLevel::Trans8, pooled(2)?),
             (FeatureLevel::Trans16, pooled(4)?),
@@ -114,16 +127,30 @@ impl Mvsplat {
 ///
 /// # Errors
 /// Fewer than two dimensions.
-pub fn vb_rows(x: &Tensor) -> Result<Tensor> {
-    x.transpose(0, 1)?.contiguous()?.flatten(0, 1)
+pub fn vb_rows<A: Array>(x: &A) -> Result<A> {
+    let x = swapped(x)?;
+    let mut dims = x.dims().to_vec();
+    let views = dims.remove(0);
+    dims[0] *= views;
+    x.reshape(dims)
+}
+
+/// Exchanges the first two dimensions.
+fn swapped<A: Array>(x: &A) -> Result<A> {
+    let mut order: Vec<usize> = (0..x.dims().len()).collect();
+    match order.get_mut(..2) {
+        Some(first) => first.reverse(),
+        None => bail!("rows: expected two dimensions or more, got {:?}", x.dims()),
+    }
+    x.permuted(&order)
 }
 
 /// Maps `[V·B, …]` to `[B, V, …]`.
 ///
 /// # Errors
 /// The first dimension is not a multiple of `views`.
-pub fn bv_rows(x: &Tensor, views: usize) -> Result<Tensor> {
-    let mut dims = vec![views, x.dim(0)? / views.max(1)];
+pub fn bv_rows<A: Array>(x: &A, views: usize) -> Result<A> {
+    let mut dims = vec![views, x.dims()[0] / views.max(1)];
     dims.extend_from_slice(&x.dims()[1..]);
-    x.reshape(dims)?.transpose(0, 1)?.contiguous()
+    swapped(&x.reshape(dims)?)
 }

@@ -16,19 +16,12 @@ use super::small_parts::{ConvexUpsampling, Stem, Unet, conv_norm_gelu, local_mea
 use crate::abi::sh_coefficients;
 use crate::camera::{Camera, NearFar};
 use crate::config::{FeatureLevel, Small};
-use crate::model::layers::{
-    Activation, Conv2d, ConvShape, GroupNorm, LayerInit, gelu, resize_bilinear, sigmoid,
-};
+use crate::model::layers::{Activation, Conv2d, ConvShape, GroupNorm, LayerInit, gelu, sigmoid};
 use crate::model::trace::Trace;
 use crate::model::{BackboneOutput, Views};
-use crate::ops::Backend;
-use crate::ops::join::join;
-use crate::ops::matching::raw_matching;
-use crate::ops::plane_sweep::{Pair, Sweep, pair, plane_sweep_on, relative_pose};
-use crate::ops::small::{
-    Candidates, MeanOver, Start, cross_check, expectation, head_input, head_output, lift,
-    ray_distance, unit_channels,
-};
+use crate::ops::plane_sweep::{Pair, Sweep, pair, relative_pose};
+use crate::ops::small::{Candidates, MeanOver, Start};
+use crate::ops::{Array, Backend};
 use crate::sh::C0;
 use candle_core::{Result, Tensor, bail};
 use candle_nn::{Init, VarBuilder};
@@ -60,13 +53,13 @@ pub enum DisparityMean {
 
 /// Depth of the small backbone: logits at 1/4 resolution, the others at full resolution.
 #[derive(Clone, Debug)]
-pub struct DepthMaps {
+pub struct DepthMaps<A = Tensor> {
     /// `[B·V, D, h, w]`: logits over candidates, index 0 = far.
-    pub logits: Tensor,
+    pub logits: A,
     /// `[B·V, 1, H, W]`: disparity (1 / camera z) in candidate indices, 0 to D − 1.
-    pub index: Tensor,
+    pub index: A,
     /// `[B·V, 1, H, W]`: confidence in (0, 1).
-    pub confidence: Tensor,
+    pub confidence: A,
 }
 
 /// A residual block at 1/4 resolution: GELU(x + GN(conv(GELU(GN(conv x))))).
@@ -88,9 +81,9 @@ impl Residual {
         })
     }
 
-    fn forward(&self, x: &Tensor) -> Result<Tensor> {
+    fn forward<A: Array>(&self, x: &A) -> Result<A> {
         let y = self.norm1.forward_then(&self.conv1.forward(x)?, Activation::Gelu)?;
-        gelu(&(x + self.norm2.forward(&self.conv2.forward(&y)?)?)?)
+        gelu(&x.plus(&self.norm2.forward(&self.conv2.forward(&y)?)?)?)
     }
 }
 
@@ -165,7 +158,7 @@ impl SmallBackbone {
         self.backend = backend.clone();
     }
 
-    /// Returns the number of steps of [`SmallBackbone::forward_with`] at inference, for a scene of
+    /// Returns the number of steps of [`SmallBackbone::forward_on`] at inference, for a scene of
     /// `views` views.
     pub fn steps(views: usize) -> usize {
         4 + views
@@ -180,25 +173,27 @@ impl SmallBackbone {
         views: &Views,
         mean: DisparityMean,
     ) -> Result<(BackboneOutput, DepthMaps)> {
-        self.forward_with(views, mean, &Trace::off())
+        self.forward_on(views, &views.images, mean, &Trace::off())
     }
 
-    /// [`SmallBackbone::forward`] with a checkpoint after each part. The trace records nothing.
+    /// [`SmallBackbone::forward`] on the executor of `images`, the views' images, with a checkpoint
+    /// after each part. The trace records nothing.
     ///
     /// # Errors
     /// Those of [`SmallBackbone::forward`] and of the checkpoint.
-    pub fn forward_with(
+    pub fn forward_on<A: Array>(
         &self,
         views: &Views,
+        images: &A,
         mean: DisparityMean,
         trace: &Trace<'_>,
-    ) -> Result<(BackboneOutput, DepthMaps)> {
-        let (b, v, _, h, w) = views.images.dims5()?;
+    ) -> Result<(BackboneOutput<A>, DepthMaps<A>)> {
+        let [b, v, _, h, w] = images.sizes()?;
         let Matched { rgb, feat2, feat4, deep, logits, index, confidence } =
-            self.matched(views, mean, trace)?;
+            self.matched(views, images, mean, trace)?;
         let heads = self.heads(&rgb, &deep, [&index, &confidence], mean, trace)?;
         let depths = self.ray_distance(views, &index)?;
-        let pool = |s: usize| -> Result<Tensor> { split_views(&deep.avg_pool2d(s)?, b, v) };
+        let pool = |s: usize| -> Result<A> { split_views(&deep.pooled(s)?, b, v) };
         let features = vec![
             (FeatureLevel::Trans4, split_views(&deep, b, v)?),
             (FeatureLevel::Trans8, pool(2)?),
@@ -209,7 +204,7 @@ impl SmallBackbone {
         ];
         let mut densities = heads.density.reshape((b, v, h * w, 1))?;
         if self.config.cross_check {
-            densities = (densities * cross_check(&views.images, &views.cameras, &depths)?)?;
+            densities = densities.times(&images.cross_check(&views.cameras, &depths)?)?;
         }
         let output = BackboneOutput {
             raw: heads.raw.reshape((b, v, h * w, ()))?,
@@ -243,51 +238,64 @@ impl SmallBackbone {
         mean: DisparityMean,
         trace: &Trace<'_>,
     ) -> Result<DepthMaps> {
-        let Matched { logits, index, confidence, .. } = self.matched(views, mean, trace)?;
+        let Matched { logits, index, confidence, .. } =
+            self.matched(views, &views.images, mean, trace)?;
         Ok(DepthMaps { logits, index, confidence: sigmoid(&confidence)? })
     }
 
     /// The network up to the heads.
-    fn matched(&self, views: &Views, mean: DisparityMean, trace: &Trace<'_>) -> Result<Matched> {
-        let (b, v, _, h, w) = views.images.dims5()?;
+    fn matched<A: Array>(
+        &self,
+        views: &Views,
+        images: &A,
+        mean: DisparityMean,
+        trace: &Trace<'_>,
+    ) -> Result<Matched<A>> {
+        let [b, v, _, h, w] = images.sizes()?;
         let stride = 4 << (self.config.unet_channels.len() - 1);
         if h % stride != 0 || w % stride != 0 {
             bail!("small backbone: expected sides that are multiples of {stride}, got {h}x{w}");
         }
-        let rgb = views.images.reshape((b * v, 3, h, w))?;
-        let feat2 = conv_norm_gelu(&(&rgb - 0.5)?, &self.down2)?;
+        let rgb = images.reshape((b * v, 3, h, w))?;
+        let feat2 = conv_norm_gelu(&rgb.affine(1.0, -0.5)?, &self.down2)?;
         let mut feat4 = conv_norm_gelu(&feat2, &self.down4)?;
         for block in &self.blocks {
             feat4 = block.forward(&feat4)?;
         }
         trace.step()?;
-        let stem = self.sweep(views, &feat4, mean)?;
+        let stem = self.sweep(views, images, &feat4, mean)?;
         trace.step()?;
-        let deep = self.unet.forward(&join(&stem.input, &feat4, 1)?)?;
+        let deep = self.unet.forward(&stem.input.beside(&feat4, 1)?)?;
         trace.step()?;
         let mut logits = self.logits.forward(&deep)?;
         if let Some(scores) = &stem.scores
             && self.config.stem_skip
         {
-            logits = lift(&logits, scores, &self.stem_factor)?;
+            logits = logits.lifted(scores, &self.stem_factor)?;
         }
-        let (index, mass) = self.expected_index(&logits, mean)?;
-        let rough = (&index - local_mean(&index)?)?.abs()?;
-        let sides = Tensor::cat(&[&mass, &(rough / 4.0)?], 1)?;
-        let hidden = gelu(&self.confidence.0.forward(&join(&deep, &sides, 1)?)?)?;
-        let confidence = (self.confidence.1.forward(&hidden)?
-            + mass.affine(CONFIDENCE_SLOPE, CONFIDENCE_SHIFT)?)?;
+        let [index, mass] = self.expected_index(&logits, mean)?;
+        let rough = index.minus(&local_mean(&index)?)?.absolute()?;
+        let sides = A::joined(&[&mass, &rough.affine(0.25, 0.0)?], 1)?;
+        let hidden = gelu(&self.confidence.0.forward(&deep.beside(&sides, 1)?)?)?;
+        let start = mass.affine(CONFIDENCE_SLOPE, CONFIDENCE_SHIFT)?;
+        let confidence = self.confidence.1.forward(&hidden)?.plus(&start)?;
         let [index, confidence] = match &self.upsampling {
             Some(convex) => convex.apply(&deep, &rgb, [&index, &confidence])?,
-            None => [resize_bilinear(&index, h, w)?, resize_bilinear(&confidence, h, w)?],
+            None => [index.resized([h, w], None)?, confidence.resized([h, w], None)?],
         };
         trace.step()?;
         Ok(Matched { rgb, feat2, feat4, deep, logits, index, confidence })
     }
 
     /// Matching scores of every view, of its sources together.
-    fn sweep(&self, views: &Views, feat4: &Tensor, mean: DisparityMean) -> Result<Swept> {
-        let unit = unit_channels(&self.matching.forward(feat4)?)?;
+    fn sweep<A: Array>(
+        &self,
+        views: &Views,
+        images: &A,
+        feat4: &A,
+        mean: DisparityMean,
+    ) -> Result<Swept<A>> {
+        let unit = self.matching.forward(feat4)?.unit_channels()?;
         let disparities = candidates(views, self.config.depth_candidates);
         let (count, sources) = (views.scenes() * views.views(), views.sources_per_view());
         let rows = source_rows(views);
@@ -299,10 +307,13 @@ impl SmallBackbone {
         };
         let mut parts = Vec::with_capacity(count.div_ceil(step));
         for rows in rows.chunks(step * sources) {
-            let volume = self.volume(views, &unit, &disparities, rows)?;
+            let volume = self.volume(views, images, &unit, &disparities, rows)?;
             parts.push(match &self.stem {
                 Some(stem) => self.visible_mean(&stem.forward(&volume)?, sources)?,
-                None => mean_of(&volume.flatten(1, 2)?, sources)?,
+                None => {
+                    let [r, c, d, h, w] = volume.sizes()?;
+                    mean_of(&volume.reshape((r, c * d, h, w))?, sources)?
+                }
             });
         }
         let input = whole(parts)?;
@@ -312,14 +323,15 @@ impl SmallBackbone {
 
     /// Volume `[R, C, D, h, w]` of the correlation and the raw matching channels, for rows of
     /// (view, source), rows of `unit` `[B·V, C, h, w]`.
-    fn volume(
+    fn volume<A: Array>(
         &self,
         views: &Views,
-        unit: &Tensor,
+        images: &A,
+        unit: &A,
         disparities: &[Vec<Vec<f32>>],
         rows: &[[usize; 2]],
-    ) -> Result<Tensor> {
-        let (_, channels, h, w) = unit.dims4()?;
+    ) -> Result<A> {
+        let [_, channels, h, w] = unit.sizes()?;
         let (d, v) = (self.config.depth_candidates, views.views());
         let depths = |&[i, _]: &[usize; 2]| {
             disparities[i / v][i % v].iter().map(|d| 1.0 / d).collect::<Vec<f32>>()
@@ -336,15 +348,15 @@ impl SmallBackbone {
         let references: Vec<u32> = rows.iter().map(|r| r[0] as u32).collect();
         let reference = match references.iter().enumerate().all(|(i, r)| i == *r as usize) {
             true => unit.narrow(0, 0, rows.len())?,
-            false => unit.index_select(&Tensor::new(references, unit.device())?, 0)?,
+            false => unit.selected(0, &references)?,
         };
-        let learned = plane_sweep_on(&self.backend, &reference, unit, sweep)?;
+        let learned = reference.plane_sweep(unit, sweep, &self.backend)?;
         // [R, 1, D·h, w]
         let learned = learned.reshape((rows.len(), 1, d * h, w))?;
         let volume = match self.config.raw_matching {
             true => {
-                let raw = raw_matching(&views.images, &views.cameras, disparities, rows)?;
-                join(&learned, &raw.flatten(2, 3)?, 1)?
+                let raw = images.raw_matching(&views.cameras, disparities, rows)?;
+                learned.beside(&raw.reshape((rows.len(), (), d * h, w))?, 1)?
             }
             false => learned,
         };
@@ -355,39 +367,41 @@ impl SmallBackbone {
     /// does not show a pixel's surface has no clear match there. Therefore the weight of a source
     /// is the square of its probability mass around the mode (after Zhang et al. 2020, *Visibility-aware
     /// Multi-view Stereo Network*).
-    fn visible_mean(&self, scores: &Tensor, sources: usize) -> Result<Tensor> {
+    fn visible_mean<A: Array>(&self, scores: &A, sources: usize) -> Result<A> {
         if sources == 1 {
             return Ok(scores.clone());
         }
-        let (rows, d, h, w) = scores.dims4()?;
-        let logits = lift(&scores.zeros_like()?, scores, &self.stem_factor)?.detach();
-        let (_, mass) = expectation(&logits, VISIBILITY_WINDOW, MeanOver::All)?;
-        let weights = (mass.sqr()? + 1e-6)?.reshape((rows / sources, sources, 1, h, w))?;
+        let [rows, d, h, w] = scores.sizes()?;
+        let zeros = scores.affine(0.0, 0.0)?;
+        let logits = zeros.lifted(scores, &self.stem_factor)?.detached();
+        let [_, mass] = logits.expectation(VISIBILITY_WINDOW, MeanOver::All)?;
+        let weights = mass.squared()?.affine(1.0, 1e-6)?;
+        let weights = weights.reshape((rows / sources, sources, 1, h, w))?;
         let scores = scores.reshape((rows / sources, sources, d, h, w))?;
-        scores.broadcast_mul(&weights)?.sum(1)?.broadcast_div(&weights.sum(1)?)
+        scores.times(&weights)?.summed(1)?.over(&weights.summed(1)?)
     }
 
     /// Expected candidate index, and the probability within the window around the mode:
     /// `[B·V, 1, h, w]` each.
-    fn expected_index(&self, logits: &Tensor, mean: DisparityMean) -> Result<(Tensor, Tensor)> {
+    fn expected_index<A: Array>(&self, logits: &A, mean: DisparityMean) -> Result<[A; 2]> {
         let window = self.config.mode_window;
         let over = match mean {
             DisparityMean::AroundMode if window > 0 => MeanOver::Window,
             _ => MeanOver::All,
         };
-        expectation(logits, window.max(1), over)
+        logits.expectation(window.max(1), over)
     }
 
     /// `sides`: candidate index and confidence (a logit), `[B·V, 1, H, W]`.
-    fn heads(
+    fn heads<A: Array>(
         &self,
-        rgb: &Tensor,
-        deep: &Tensor,
-        sides: [&Tensor; 2],
+        rgb: &A,
+        deep: &A,
+        sides: [&A; 2],
         mean: DisparityMean,
         trace: &Trace<'_>,
-    ) -> Result<Heads> {
-        let views = rgb.dim(0)?;
+    ) -> Result<Heads<A>> {
+        let [views, ..] = rgb.sizes::<4>()?;
         let share = 1.0 / (self.config.depth_candidates - 1) as f32;
         let projected = self.project.forward(deep)?;
         // These are the network's largest tensors: inference computes one view at a time,
@@ -398,13 +412,13 @@ impl SmallBackbone {
         };
         let (mut raws, mut densities, mut hiddens) = (Vec::new(), Vec::new(), Vec::new());
         for i in (0..views).step_by(step) {
-            let part = |t: &Tensor| if step == views { Ok(t.clone()) } else { t.narrow(0, i, 1) };
+            let part = |t: &A| if step == views { Ok(t.clone()) } else { t.narrow(0, i, 1) };
             let (rgb, index, confidence) = (part(rgb)?, part(sides[0])?, part(sides[1])?);
-            let input = head_input(&part(&projected)?, &rgb, &index, &confidence, share)?;
+            let input = part(&projected)?.head_input(&rgb, [&index, &confidence], share)?;
             let hidden = gelu(&self.head1.forward(&input)?)?;
             drop(input);
             let out = self.head2.forward(&hidden)?;
-            let (raw, density) = head_output(&out, &confidence, &rgb, self.start())?;
+            let [raw, density] = out.head_output(&confidence, &rgb, self.start())?;
             raws.push(raw);
             densities.push(density);
             hiddens.push(hidden);
@@ -433,7 +447,7 @@ impl SmallBackbone {
     }
 
     /// Distance along the unit ray, `[B, V, H·W, 1]`, from candidate indices.
-    fn ray_distance(&self, views: &Views, index: &Tensor) -> Result<Tensor> {
+    fn ray_distance<A: Array>(&self, views: &Views, index: &A) -> Result<A> {
         let (b, v, _, h, w) = views.images.dims5()?;
         let steps = (self.config.depth_candidates - 1) as f32;
         let range = |&NearFar { near, far }: &NearFar| {
@@ -442,47 +456,47 @@ impl SmallBackbone {
         };
         let ranges = views.near_far.iter().flatten().map(range).collect();
         let lengths = views.cameras.iter().flatten().flat_map(ray_lengths).collect();
-        ray_distance(index, ranges, lengths)?.reshape((b, v, h * w, 1))
+        index.ray_distance(ranges, lengths)?.reshape((b, v, h * w, 1))
     }
 }
 
 /// Joins rows; a single part is not copied.
-fn whole(mut parts: Vec<Tensor>) -> Result<Tensor> {
+fn whole<A: Array>(mut parts: Vec<A>) -> Result<A> {
     match parts.len() {
         1 => Ok(parts.swap_remove(0)),
-        _ => Tensor::cat(&parts, 0),
+        _ => A::joined(&parts.iter().collect::<Vec<_>>(), 0),
     }
 }
 
 /// Features and depth before the heads. `confidence` is a logit; `index` and `confidence`
 /// are at full resolution.
-struct Matched {
-    rgb: Tensor,
-    feat2: Tensor,
-    feat4: Tensor,
-    deep: Tensor,
-    logits: Tensor,
-    index: Tensor,
-    confidence: Tensor,
+struct Matched<A> {
+    rgb: A,
+    feat2: A,
+    feat4: A,
+    deep: A,
+    logits: A,
+    index: A,
+    confidence: A,
 }
 
-struct Swept {
-    input: Tensor,
-    scores: Option<Tensor>,
+struct Swept<A> {
+    input: A,
+    scores: Option<A>,
 }
 
-struct Heads {
-    raw: Tensor,
-    density: Tensor,
-    hidden: Tensor,
+struct Heads<A> {
+    raw: A,
+    density: A,
+    hidden: A,
 }
 
 fn conv_norm(c: usize, o: usize, s: ConvShape, vb: VarBuilder) -> Result<(Conv2d, GroupNorm)> {
     Ok((Conv2d::new(c, o, s, vb.pp("conv"))?, GroupNorm::new(8, o, vb.pp("norm"))?))
 }
 
-fn split_views(t: &Tensor, b: usize, v: usize) -> Result<Tensor> {
-    let (_, c, h, w) = t.dims4()?;
+fn split_views<A: Array>(t: &A, b: usize, v: usize) -> Result<A> {
+    let [_, c, h, w] = t.sizes()?;
     t.reshape((b, v, c, h, w))
 }
 
@@ -503,10 +517,10 @@ fn sweep_pairs(views: &Views, [i, j]: [usize; 2], h: usize, w: usize) -> Result<
 }
 
 /// Mean of `[N·S, …]` over the S sources.
-fn mean_of(volume: &Tensor, sources: usize) -> Result<Tensor> {
-    match volume.dims4()? {
+fn mean_of<A: Array>(volume: &A, sources: usize) -> Result<A> {
+    match volume.sizes()? {
         _ if sources == 1 => Ok(volume.clone()),
-        (rows, c, h, w) => volume.reshape((rows / sources, sources, c, h, w))?.mean(1),
+        [rows, c, h, w] => volume.reshape((rows / sources, sources, c, h, w))?.averaged(1),
     }
 }
 

@@ -3,27 +3,19 @@
 use crate::model::layers::{
     Activation, Conv2d, ConvShape, GroupNorm, LayerInit, default_init, gelu,
 };
-use crate::ops::conv2d::conv2d;
-use crate::ops::conv3d::conv3d;
-use crate::ops::join::join;
-use crate::ops::small::upsample_convex;
+use crate::ops::{Array, ConvSteps};
 use candle_core::{Result, Tensor};
 use candle_nn::{Init, VarBuilder};
 
 /// GELU(GroupNorm(conv x)).
-pub(super) fn conv_norm_gelu(x: &Tensor, layer: &(Conv2d, GroupNorm)) -> Result<Tensor> {
+pub(super) fn conv_norm_gelu<A: Array>(x: &A, layer: &(Conv2d, GroupNorm)) -> Result<A> {
     layer.1.forward_then(&layer.0.forward(x)?, Activation::Gelu)
 }
 
-/// `[B, C, h, w]` with its edge pixels repeated once on every side.
-fn pad_edge(x: &Tensor) -> Result<Tensor> {
-    x.pad_with_same(2, 1, 1)?.pad_with_same(3, 1, 1)
-}
-
 /// Mean over 3×3 pixels of `[B, 1, h, w]`, edges repeated.
-pub(super) fn local_mean(x: &Tensor) -> Result<Tensor> {
-    let box3 = Tensor::full(1f32 / 9.0, (1, 1, 3, 3), x.device())?;
-    conv2d(&pad_edge(x)?, &box3, None, 1, 0)
+pub(super) fn local_mean<A: Array>(x: &A) -> Result<A> {
+    let box3 = x.constant(vec![1.0 / 9.0; 9], &[1, 1, 3, 3])?;
+    x.edges_repeated()?.convolved(&box3, None, ConvSteps { stride: 1, padding: 0 })
 }
 
 /// Two 3×3×3 convolutions over (disparity, y, x): `[B, C, D, h, w]` to scores
@@ -53,9 +45,14 @@ impl Stem {
         Ok(Self { weights: [w0, w1], biases: [b0, b1] })
     }
 
-    pub(super) fn forward(&self, volume: &Tensor) -> Result<Tensor> {
-        let hidden = gelu(&conv3d(volume, &self.weights[0], Some(&self.biases[0]), 1)?)?;
-        conv3d(&hidden, &self.weights[1], Some(&self.biases[1]), 1)?.squeeze(1)
+    pub(super) fn forward<A: Array>(&self, volume: &A) -> Result<A> {
+        let layer = |x: &A, i: usize| {
+            let (weight, bias) = (x.parameter(&self.weights[i])?, x.parameter(&self.biases[i])?);
+            x.convolved(&weight, Some(&bias), ConvSteps { stride: 1, padding: 1 })
+        };
+        let scores = layer(&gelu(&layer(volume, 0)?)?, 1)?;
+        let [b, _, d, h, w] = scores.sizes()?;
+        scores.reshape((b, d, h, w))
     }
 }
 
@@ -89,7 +86,7 @@ impl Block {
         Ok(Self([layer(0, c)?, layer(1, o)?]))
     }
 
-    fn forward(&self, x: &Tensor) -> Result<Tensor> {
+    fn forward<A: Array>(&self, x: &A) -> Result<A> {
         conv_norm_gelu(&conv_norm_gelu(x, &self.0[0])?, &self.0[1])
     }
 }
@@ -117,7 +114,7 @@ impl Unet {
     }
 
     /// Maps `[B, c_in, h, w]` to `[B, channels[0], h, w]`.
-    pub(super) fn forward(&self, x: &Tensor) -> Result<Tensor> {
+    pub(super) fn forward<A: Array>(&self, x: &A) -> Result<A> {
         let mut skips = Vec::new();
         let mut x = self.down[0].forward(x)?;
         for (shrink, block) in self.shrink.iter().zip(&self.down[1..]) {
@@ -125,7 +122,7 @@ impl Unet {
             skips.push(std::mem::replace(&mut x, next));
         }
         for (block, skip) in self.up.iter().zip(&skips).rev() {
-            x = block.forward(&join(skip, &x, 2)?)?;
+            x = block.forward(&skip.beside(&x, 2)?)?;
         }
         Ok(x)
     }
@@ -152,18 +149,13 @@ impl ConvexUpsampling {
 
     /// Upsamples `maps`, each `[B, 1, h, w]`, to `[B, 1, 4h, 4w]`. The mask comes from
     /// `deep` `[B, C, h, w]` and the image `rgb` `[B, 3, 4h, 4w]`.
-    pub(super) fn apply(
-        &self,
-        deep: &Tensor,
-        rgb: &Tensor,
-        maps: [&Tensor; 2],
-    ) -> Result<[Tensor; 2]> {
-        let (b, _, h, w) = deep.dims4()?;
+    pub(super) fn apply<A: Array>(&self, deep: &A, rgb: &A, maps: [&A; 2]) -> Result<[A; 2]> {
+        let [b, _, h, w] = deep.sizes()?;
         // The image's 4×4 blocks as channels.
-        let blocks = rgb.reshape(&[b, 3, h, 4, w, 4][..])?.permute([0, 1, 3, 5, 2, 4])?;
-        let blocks = (blocks.contiguous()?.reshape((b, 48, h, w))? - 0.5)?;
-        let hidden = gelu(&self.hidden.forward(&join(deep, &blocks, 1)?)?)?;
-        upsample_convex(&self.mask.forward(&hidden)?, maps, &bilinear_shares())
+        let blocks = rgb.reshape(vec![b, 3, h, 4, w, 4])?.permuted(&[0, 1, 3, 5, 2, 4])?;
+        let blocks = blocks.reshape((b, 48, h, w))?.affine(1.0, -0.5)?;
+        let hidden = gelu(&self.hidden.forward(&deep.beside(&blocks, 1)?)?)?;
+        self.mask.forward(&hidden)?.upsample_convex(maps, &bilinear_shares())
     }
 }
 

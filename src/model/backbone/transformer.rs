@@ -8,10 +8,9 @@ use super::{bv_rows, vb_rows};
 use crate::config::Mvsplat as Settings;
 use crate::model::layers::{LayerNorm, Linear, gelu};
 use crate::model::trace::Trace;
-use crate::ops;
-use crate::ops::attention::{Labels, attention};
-use crate::ops::moves::{channels_last, sum};
-use candle_core::{Result, Tensor, bail};
+use crate::ops::Array;
+use crate::ops::attention::Labels;
+use candle_core::{Result, bail};
 use candle_nn::VarBuilder;
 
 /// Tokens per block of the feed-forward block with gradients. Its hidden layer is 8 × as
@@ -57,36 +56,36 @@ impl Transformer {
     ///
     /// # Errors
     /// h or w is not a multiple of the window splits.
-    pub fn forward(
+    pub fn forward<A: Array>(
         &self,
-        cnn: &Tensor,
+        cnn: &A,
         sources: &[Vec<Vec<usize>>],
         trace: &mut Trace<'_>,
-    ) -> Result<Tensor> {
-        let (_, v, c, h, w) = cnn.dims5()?;
+    ) -> Result<A> {
+        let [_, v, c, h, w] = cnn.sizes()?;
         let s = self.splits;
         if h % s != 0 || w % s != 0 {
             bail!("transformer: expected a map that splits into {s}x{s} windows, got {h}x{w}");
         }
-        let x = cnn.broadcast_add(&position_encoding(c, [h, w], s, cnn)?)?;
+        let positions = position_encoding(c, [h, w], s);
+        let x = cnn.plus(&cnn.constant(positions, &[1, 1, c, h, w])?)?;
         trace.put("transformer.pos_added", &x)?;
-        let mut x = channels_last(&vb_rows(&x)?)?;
+        let mut x = vb_rows(&x)?.channels_last()?;
         for (i, layer) in self.layers.iter().enumerate() {
             // A single window has no seams to shift.
             let roll = if i % 2 == 1 && s > 1 { Roll::Half } else { Roll::None };
             let windows = Windows::new([h, w], s, roll);
-            let order = windows.order(x.device())?;
-            let input = x.index_select(&order, 1)?;
+            let input = x.selected(1, &windows.raster())?;
             let updated = layer.self_attn.forward(&input, &[&input], &windows)?;
-            let back = windows.inverse(x.device())?;
+            let back = windows.inverse();
             trace.put_with(&format!("transformer.layer{i}.self_attn_vb"), || {
-                updated.index_select(&back, 1)
+                updated.selected(1, &back)
             })?;
-            x = layer.cross(&updated, &input, sources, &windows)?.index_select(&back, 1)?;
+            x = layer.cross(&updated, &input, sources, &windows)?.selected(1, &back)?;
             trace.put(&format!("transformer.layer{i}.out_vb"), &x)?;
         }
-        let rows = x.dim(0)?;
-        let x = bv_rows(&channels_last(&x)?.reshape((rows, c, h, w))?, v)?;
+        let rows = x.dims()[0];
+        let x = bv_rows(&x.channels_last()?.reshape((rows, c, h, w))?, v)?;
         trace.put("transformer.features", &x)?;
         Ok(x)
     }
@@ -95,13 +94,13 @@ impl Transformer {
 impl Layer {
     /// Cross-attention of every view to the layer's input (`input`) of its sources, all views at
     /// once. Rows are (v b).
-    fn cross(
+    fn cross<A: Array>(
         &self,
-        x: &Tensor,
-        input: &Tensor,
+        x: &A,
+        input: &A,
         sources: &[Vec<Vec<usize>>],
         w: &Windows,
-    ) -> Result<Tensor> {
+    ) -> Result<A> {
         let scenes = sources.len();
         let views = sources.first().map_or(0, Vec::len);
         let count = sources.first().and_then(|s| s.first()).map_or(0, Vec::len);
@@ -109,7 +108,7 @@ impl Layer {
         let targets = (0..count).map(|t| {
             let row = |r: usize| sources[r % scenes][r / scenes][t] * scenes + r % scenes;
             let rows: Vec<u32> = (0..views * scenes).map(|r| row(r) as u32).collect();
-            input.index_select(&Tensor::new(rows, input.device())?, 0)
+            input.selected(0, &rows)
         });
         let targets = targets.collect::<Result<Vec<_>>>()?;
         self.cross_attn.forward(x, &targets.iter().collect::<Vec<_>>(), w)
@@ -150,24 +149,24 @@ impl SubLayer {
     }
 
     /// `x` and each of `targets` `[V·B, tokens, C]` in window order.
-    fn forward(&self, x: &Tensor, targets: &[&Tensor], windows: &Windows) -> Result<Tensor> {
-        let (rows, tokens, c) = x.dims3()?;
+    fn forward<A: Array>(&self, x: &A, targets: &[&A], windows: &Windows) -> Result<A> {
+        let [rows, tokens, c] = x.sizes()?;
         let (n, m) = (windows.count(), targets.len());
         let len = tokens / n;
         // Keys of a window: position-major, target-minor.
-        let gather = |proj: &Linear| -> Result<Tensor> {
-            let all = targets.iter().map(|t| proj.forward(t)?.reshape((rows * n, len, c)));
+        let gather = |proj: &Linear| -> Result<A> {
+            let all = targets.iter().map(|t| proj.forward(*t)?.reshape((rows * n, len, 1, c)));
             let all = all.collect::<Result<Vec<_>>>()?;
-            Tensor::stack(&all, 2)?.reshape((rows * n, len * m, c))
+            A::joined(&all.iter().collect::<Vec<_>>(), 2)?.reshape((rows * n, len * m, c))
         };
         let q = self.q_proj.forward(x)?.reshape((rows * n, len, c))?;
         let (k, v) = (gather(&self.k_proj)?, gather(&self.v_proj)?);
         let scale = 1.0 / (c as f32).sqrt();
-        let message = attention(&q, &k, &v, scale, windows.labels(m))?;
+        let message = q.attention(&k, &v, scale, windows.labels(m))?;
         let message = self.norm1.forward(&self.merge.forward(&message)?)?;
         let message = message.reshape((rows, tokens, c))?;
         match &self.ffn {
-            None => sum(x, &message),
+            None => x.plus(&message),
             Some(ffn) => {
                 let x = x.reshape((rows * tokens, c))?;
                 let message = message.reshape((rows * tokens, c))?;
@@ -178,25 +177,27 @@ impl SubLayer {
 }
 
 /// One fused pass, or single ops if a gradient is needed.
-fn feed_forward(
+fn feed_forward<A: Array>(
     (up, down, norm): &(Linear, Linear, LayerNorm),
-    x: &Tensor,
-    message: &Tensor,
-) -> Result<Tensor> {
-    let parameters = [up.weight(), down.weight()];
-    let tracked = |t: &Tensor| t.track_op();
-    let gradient = tracked(x) || tracked(message) || parameters.into_iter().any(tracked);
-    if !gradient && !norm.parameters().into_iter().any(tracked) {
-        return ops::feed_forward::feed_forward(x, message, parameters, norm.parameters());
+    x: &A,
+    message: &A,
+) -> Result<A> {
+    let on = |parameter| x.parameter(parameter);
+    let weights = [on(up.weight())?, on(down.weight())?];
+    let [scale, shift] = norm.parameters();
+    let affine = [on(scale)?, on(shift)?];
+    let mut all = [x, message].into_iter().chain(&weights).chain(&affine);
+    if !all.any(A::is_tracked) {
+        return x.feed_forward(message, weights.each_ref(), affine.each_ref());
     }
-    let rows = x.dim(0)?;
+    let rows = x.dims()[0];
     let blocks = (0..rows).step_by(FFN_ROWS).map(|start| {
         let n = FFN_ROWS.min(rows - start);
         let (x, message) = (x.narrow(0, start, n)?, message.narrow(0, start, n)?);
-        let hidden = gelu(&up.forward(&Tensor::cat(&[&x, &message], 1)?)?)?;
-        x + norm.forward(&down.forward(&hidden)?)?
+        let hidden = gelu(&up.forward(&A::joined(&[&x, &message], 1)?)?)?;
+        x.plus(&norm.forward(&down.forward(&hidden)?)?)
     });
-    Tensor::cat(&blocks.collect::<Result<Vec<_>>>()?, 0)
+    A::joined(&blocks.collect::<Result<Vec<_>>>()?.iter().collect::<Vec<_>>(), 0)
 }
 
 /// Offset of the windows, as in Swin transformers.
@@ -242,16 +243,13 @@ impl Windows {
         self.rolled().map(|[y, x]| ((y + sh) % h * w + (x + sw) % w) as u32).collect()
     }
 
-    fn order(&self, device: &candle_core::Device) -> Result<Tensor> {
-        Tensor::new(self.raster(), device)
-    }
-
-    fn inverse(&self, device: &candle_core::Device) -> Result<Tensor> {
+    /// Position in the window order of each token.
+    fn inverse(&self) -> Vec<u32> {
         let mut inverse = vec![0u32; self.size[0] * self.size[1]];
         for (position, &token) in self.raster().iter().enumerate() {
             inverse[token as usize] = position as u32;
         }
-        Tensor::new(inverse, device)
+        inverse
     }
 
     /// Labels that exclude attention between regions that were no neighbours before the
@@ -276,7 +274,7 @@ impl Windows {
 
 /// Sine and cosine of the position inside each window (1 to n, scaled to 2π), `[C, h, w]`:
 /// half of the channels from y, half from x.
-fn position_encoding(c: usize, size: [usize; 2], splits: usize, like: &Tensor) -> Result<Tensor> {
+fn position_encoding(c: usize, size: [usize; 2], splits: usize) -> Vec<f32> {
     let [h, w] = size;
     let half = c / 2;
     let value = |k: usize, i: usize, n: usize| -> f32 {
@@ -295,5 +293,5 @@ fn position_encoding(c: usize, size: [usize; 2], splits: usize, like: &Tensor) -
             }
         }
     }
-    Tensor::from_vec(out, (c, h, w), like.device())
+    out
 }

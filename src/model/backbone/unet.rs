@@ -2,14 +2,9 @@
 //! with the norm after each convolution, one residual block per level, and attention
 //! across the views of a scene at the lowest level. Rows are (v b).
 
-use crate::model::layers::{
-    Activation, Conv2d, ConvShape, GroupNorm, default_init, upsample_nearest,
-};
+use crate::model::layers::{Activation, Conv2d, ConvShape, GroupNorm, default_init};
 use crate::model::trace::Trace;
-use crate::ops::attention::attention;
-use crate::ops::conv2d::conv2d;
-use crate::ops::join::join;
-use crate::ops::moves::sum;
+use crate::ops::{Array, ConvSteps};
 use candle_core::{Result, Tensor};
 use candle_nn::VarBuilder;
 
@@ -92,13 +87,13 @@ impl UNet {
     ///
     /// # Errors
     /// h or w is not a multiple of 2^(levels − 1).
-    pub fn forward(
+    pub fn forward<A: Array>(
         &self,
-        x: &Tensor,
+        x: &A,
         views: usize,
         trace: &mut Trace<'_>,
         name: &str,
-    ) -> Result<Tensor> {
+    ) -> Result<A> {
         let mut x = self.stem.forward(x)?;
         trace.put(&format!("{name}.input_blocks.0"), &x)?;
         let mut skips = vec![x.clone()];
@@ -121,7 +116,7 @@ impl UNet {
         }
         for (i, up) in self.up.iter().enumerate() {
             let joined = match skips.pop() {
-                Some(skip) => join(&x, &skip, 1)?,
+                Some(skip) => x.beside(&skip, 1)?,
                 None => x,
             };
             x = up.block.forward(&joined)?;
@@ -129,7 +124,7 @@ impl UNet {
                 x = attention.forward(&x, views)?;
             }
             if let Some(grow) = &up.grow {
-                x = grow.forward(&upsample_nearest(&x, 2)?)?;
+                x = grow.forward(&x.repeated(2)?)?;
             }
             trace.put(&format!("{name}.output_blocks.{i}"), &x)?;
         }
@@ -165,12 +160,12 @@ impl ResBlock {
         })
     }
 
-    fn forward(&self, x: &Tensor) -> Result<Tensor> {
+    fn forward<A: Array>(&self, x: &A) -> Result<A> {
         let h = self.norm1.forward_then(&self.conv1.forward(x)?, Activation::Silu)?;
         let h = self.norm2.forward_then(&self.conv2.forward(&h)?, Activation::Silu)?;
         match &self.skip {
-            Some(skip) => sum(&skip.forward(x)?, &h),
-            None => sum(x, &h),
+            Some(skip) => skip.forward(x)?.plus(&h),
+            None => x.plus(&h),
         }
     }
 }
@@ -201,21 +196,23 @@ impl Attention {
         })
     }
 
-    fn forward(&self, x: &Tensor, views: usize) -> Result<Tensor> {
-        let (rows, c, h, w) = x.dims4()?;
+    fn forward<A: Array>(&self, x: &A, views: usize) -> Result<A> {
+        let [rows, c, h, w] = x.sizes()?;
         let (scenes, heads, n) = (rows / views, self.channels / HEAD, h * w);
-        let qkv = conv2d(x, &self.qkv.0, Some(&self.qkv.1), 1, 0)?;
-        let qkv = qkv.reshape(vec![views, scenes, heads, 3, HEAD, n])?;
-        let part = |i: usize| -> Result<Tensor> {
-            let x = qkv.narrow(3, i, 1)?.squeeze(3)?.permute((1, 2, 0, 4, 3))?;
-            x.contiguous()?.reshape((scenes * heads, views * n, HEAD))
+        let layer = |x: &A, (weight, bias): &(Tensor, Tensor)| {
+            let (weight, bias) = (x.parameter(weight)?, x.parameter(bias)?);
+            x.convolved(&weight, Some(&bias), ConvSteps { stride: 1, padding: 0 })
+        };
+        let qkv = layer(x, &self.qkv)?.reshape(vec![views, scenes, heads, 3, HEAD, n])?;
+        let part = |i: usize| -> Result<A> {
+            let x = qkv.narrow(3, i, 1)?.permuted(&[1, 2, 0, 5, 4, 3])?;
+            x.reshape((scenes * heads, views * n, HEAD))
         };
         // MVSplat's code scales q and k by HEAD^(−1/4) each.
         let scale = 1.0 / (HEAD as f32).sqrt();
-        let y = attention(&part(0)?, &part(1)?, &part(2)?, scale, None)?;
-        let y = y.reshape((scenes, heads, views, n, HEAD))?.permute((2, 0, 1, 4, 3))?;
-        let y = y.contiguous()?.reshape((rows, c, h, w))?;
-        let y = conv2d(&y, &self.proj_out.0, Some(&self.proj_out.1), 1, 0)?;
-        sum(x, &self.norm.forward(&y)?)
+        let y = part(0)?.attention(&part(1)?, &part(2)?, scale, None)?;
+        let y = y.reshape((scenes, heads, views, n, HEAD))?.permuted(&[2, 0, 1, 4, 3])?;
+        let y = layer(&y.reshape((rows, c, h, w))?, &self.proj_out)?;
+        x.plus(&self.norm.forward(&y)?)
     }
 }
