@@ -19,9 +19,9 @@ pub const CHANNELS: usize = 4;
 
 /// Added to each window's variance (grey levels in [0, 1]): a standard deviation of
 /// 0.01 is camera noise, and must not count as texture.
-const VARIANCE_FLOOR: f32 = 1e-4;
+pub const VARIANCE_FLOOR: f32 = 1e-4;
 /// A source point nearer than this, as a share of the reference depth, is behind.
-const Z_MIN: f32 = 1e-3;
+pub const Z_MIN: f32 = 1e-3;
 
 /// One photograph at the two resolutions that are compared.
 #[derive(Clone, Debug)]
@@ -92,6 +92,11 @@ impl PlaneWarp {
             from_px: k_s * Mat3::from_mat4(relative) * k_r.inverse(),
             shift: k_s * relative.w_axis.truncate(),
         }
+    }
+
+    /// Returns the three columns of the map of (u, v, 1) and the shift.
+    pub fn columns(&self) -> [Vec3; 4] {
+        [self.from_px.x_axis, self.from_px.y_axis, self.from_px.z_axis, self.shift]
     }
 }
 

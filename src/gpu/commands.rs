@@ -44,7 +44,7 @@ fn spread(groups: usize) -> [u32; 3] {
 }
 
 /// Encodes commands that read the bindings.
-type Draw = Box<dyn FnOnce(&mut wgpu::CommandEncoder, &[Binding])>;
+type Draw = Box<dyn FnOnce(&mut wgpu::CommandEncoder, &[Binding]) + Send + Sync>;
 
 enum Step {
     Stage(&'static str),
@@ -62,6 +62,17 @@ pub(crate) struct Commands<'g> {
     steps: Vec<Step>,
 }
 
+/// Calls that [`Gpu::resume`] continues.
+#[derive(Default)]
+pub(crate) struct Pending(Vec<Step>);
+
+impl Pending {
+    /// Returns the number of calls.
+    pub(crate) fn len(&self) -> usize {
+        self.0.len()
+    }
+}
+
 /// Maximum number of timed passes in one submit.
 const STAGES_MAX: u32 = 64;
 
@@ -72,9 +83,19 @@ impl Gpu {
         let timed = timed && self.has_timestamps();
         Commands { gpu: self, name, timed, steps: Vec::new() }
     }
+
+    /// Continues a list of calls.
+    pub(crate) fn resume(&self, name: &'static str, pending: Pending) -> Commands<'_> {
+        Commands { gpu: self, name, timed: false, steps: pending.0 }
+    }
 }
 
 impl Commands<'_> {
+    /// Returns the calls for a later [`Gpu::resume`].
+    pub(crate) fn suspend(self) -> Pending {
+        Pending(self.steps)
+    }
+
     /// Times the following calls under `name`.
     pub(crate) fn stage(&mut self, name: &'static str) {
         self.steps.push(Step::Stage(name));
@@ -138,7 +159,7 @@ impl Commands<'_> {
     pub(crate) fn draw(
         &mut self,
         bindings: Vec<Binding>,
-        f: impl FnOnce(&mut wgpu::CommandEncoder, &[Binding]) + 'static,
+        f: impl FnOnce(&mut wgpu::CommandEncoder, &[Binding]) + Send + Sync + 'static,
     ) {
         self.steps.push(Step::Draw(bindings, Box::new(f)));
     }

@@ -58,6 +58,7 @@
 //! 4 bytes per splat or one row of tiles exceed a binding; the CPU kernels can be used instead.
 
 mod adapter;
+mod array;
 mod attention_gather;
 mod attention_gather_bwd;
 mod buffers;
@@ -82,6 +83,10 @@ mod spgr_bwd;
 
 pub use crate::device::DeviceChoice;
 pub use adapter::{AdapterSummary, adapters, choose, find_for, instance};
+pub use array::{
+    AttentionCall, ConvolutionCall, CrossCheckCall, DeviceArray, Function, HeadOutputCall,
+    PointwiseFunction, RawMatchingCall, Recorder, Reduction,
+};
 pub use attention_gather::AttentionGatherArgs;
 pub use attention_gather_bwd::AttentionGatherGradients;
 pub use buffers::Buffer;
@@ -131,4 +136,21 @@ pub const KERNELS: &[&Kernel] = &[
     &plane_sweep_bwd::PLANE_SWEEP_TAPS,
     &plane_sweep_bwd::PLANE_SWEEP_REFERENCE_BWD,
     &plane_sweep_bwd::PLANE_SWEEP_SOURCE_BWD,
+    &array::ELEMENTWISE,
+    &array::CONVOLUTION,
+    &array::LINEAR,
+    &array::NORM_STATISTICS,
+    &array::NORM_APPLY,
+    &array::LAYER_NORM,
+    &array::SOFTMAX,
+    &array::REDUCE,
+    &array::SELECT_ROWS,
+    &array::RESIZE,
+    &array::ATTENTION,
+    &array::EXPECTATION,
+    &array::CONVEX,
+    &array::HEAD_OUTPUT,
+    &array::CROSS_CHECK,
+    &array::RAW_MATCHING_BLOCKS,
+    &array::RAW_MATCHING_SCORES,
 ];

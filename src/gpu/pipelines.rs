@@ -12,7 +12,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 /// Concatenates files under `kernels/`.
 macro_rules! wgsl {
     ($($file:literal),+ $(,)?) => {
-        concat!($(include_str!(concat!("../../kernels/", $file, ".wgsl"))),+)
+        concat!($(include_str!(concat!(env!("CARGO_MANIFEST_DIR"), "/kernels/", $file, ".wgsl"))),+)
     };
 }
 pub(crate) use wgsl;

@@ -4,6 +4,7 @@
 //! tests/gpu/network.rs.
 
 use crate::abi::{Pair, PlaneSweepUniform, SWEEP_PAIR_STRIDE, Sweep};
+use crate::gpu::array::DeviceArray;
 use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::device::Gpu;
@@ -149,5 +150,45 @@ impl Gpu {
             out.extend(reading.take(self)?);
         }
         Ok(out)
+    }
+}
+
+impl DeviceArray {
+    /// Computes the correlation `[R, D, h, w]` of this array `[R, C, h, w]` with `source`
+    /// `[S, C, h, w]`.
+    ///
+    /// # Errors
+    /// As [`Gpu::plane_sweep`].
+    pub fn plane_sweep(&self, source: &Self, sweep: &Sweep) -> Result<Self, GpuError> {
+        let args = PlaneSweepArgs { sweep, reference: &[], source: &[] };
+        let (rows, d, [h, w]) = (sweep.pairs.len(), sweep.candidates(), sweep.size);
+        let pictures = sweep.pairs.iter().flatten().map(|p| p.source + 1).max().unwrap_or(0);
+        let lengths = [
+            ("reference", self.count(), rows * args.features()),
+            ("source", source.count().min(pictures * args.features()), pictures * args.features()),
+            ("depths", sweep.depths.iter().map(Vec::len).sum(), rows * d),
+        ];
+        GpuError::check_lengths(PLANE_SWEEP.name, lengths)?;
+        let recorder = self.recorder();
+        let gpu = recorder.gpu();
+        let all = 0..rows;
+        let (pairs, starts) = args.tables(&all);
+        let sources = (source.count() / args.features().max(1)) as u32;
+        let uniform = gpu.uniform(&PlaneSweepUniform { sources, ..args.uniform(&all) })?;
+        let pairs = gpu.upload("pairs of views", &pairs)?;
+        let starts = gpu.upload("starts of pairs", &starts)?;
+        let depths = gpu.upload("candidate depths", &args.depths(&all))?;
+        let result = recorder.empty(&[rows, d, h, w])?;
+        let bindings = [
+            Binding::from(&uniform),
+            self.binding(),
+            source.binding(),
+            Binding::from(&pairs),
+            Binding::from(&starts),
+            Binding::from(&depths),
+            result.binding(),
+        ];
+        recorder.run(&PLANE_SWEEP, &[], &bindings, Groups::of(result.count(), THREADS))?;
+        Ok(result)
     }
 }

@@ -10,9 +10,13 @@ use super::{BackboneOutput, Primaries, Views};
 use crate::abi::RasterOptions;
 use crate::camera::Camera;
 use crate::config::{Backbone, Config, FeatureLevel};
+#[cfg(feature = "gpu")]
+use crate::ops::Executor;
 use crate::ops::{Array, Backend};
 use candle_core::{Error, Result, Tensor, bail};
 use candle_nn::VarBuilder;
+#[cfg(feature = "gpu")]
+use std::sync::Arc;
 
 enum Encoder {
     Mvsplat(Box<Mvsplat>),
@@ -28,6 +32,10 @@ pub struct SubSplat {
     config: Config,
     encoder: Encoder,
     trunk: Trunk,
+    backend: Backend,
+    /// The GPU of `backend`, if it is one.
+    #[cfg(feature = "gpu")]
+    executor: Option<Arc<Executor>>,
 }
 
 /// The result of [`SubSplat::forward`] for one scene.
@@ -55,12 +63,25 @@ impl SubSplat {
             Backbone::Small(c) => Encoder::Small(Box::new(SmallBackbone::new(c, vb.pp("small"))?)),
         };
         let trunk = Trunk::new(config, &feature_channels(config), vb)?;
-        Ok(Self { config: config.clone(), encoder, trunk })
+        Ok(Self {
+            config: config.clone(),
+            encoder,
+            trunk,
+            backend: Backend::Cpu,
+            #[cfg(feature = "gpu")]
+            executor: None,
+        })
     }
 
-    /// Returns the model with plane sweep, attention gather, SPGR and rasterizer on
-    /// `backend`. Everything else runs on the CPU.
+    /// Returns the model with the backbone's inference, attention gather, SPGR and rasterizer on
+    /// `backend`; in training, with the plane sweep instead of the whole backbone. Everything else
+    /// runs on the CPU.
     pub fn with_backend(mut self, backend: &Backend) -> Self {
+        self.backend = backend.clone();
+        #[cfg(feature = "gpu")]
+        {
+            self.executor = Executor::new(backend);
+        }
         match &mut self.encoder {
             Encoder::Mvsplat(encoder) => encoder.set_backend(backend),
             Encoder::Small(encoder) => encoder.set_backend(backend),
@@ -107,6 +128,18 @@ impl SubSplat {
         let stride = self.config.stride();
         if h % stride != 0 || w % stride != 0 {
             bail!("input images: expected sides that are multiples of {stride}, got {w}x{h}");
+        }
+        #[cfg(feature = "gpu")]
+        if let Some(executor) = &self.executor {
+            let pass = || {
+                let images = executor.upload(&views.images)?;
+                let mut trace = Trace::with_checkpoint(checkpoint);
+                self.encode_on(views, &images, &mut trace)?.to_host()
+            };
+            // After a failure of the device the CPU computes the backbone.
+            if let Some(result) = executor.attempt(&self.backend, pass) {
+                return result;
+            }
         }
         self.encode_on(views, &views.images, &mut Trace::with_checkpoint(checkpoint))
     }

@@ -2,11 +2,11 @@
 //! no learned parameter precedes them, so they have no gradient.
 
 use crate::camera::Camera;
-use crate::cpu::matching::{self, Pyramid};
+use crate::cpu::matching::{self, PlaneWarp, Pyramid};
 use candle_core::{DType, Result, Tensor, bail};
 use rayon::prelude::*;
 
-pub use crate::cpu::matching::CHANNELS;
+pub use crate::cpu::matching::{CHANNELS, VARIANCE_FLOOR, Z_MIN};
 
 /// `[R, 4, D, h, w]` at quarter resolution: the channels of [`crate::cpu::matching`], one row
 /// for each element of `rows`: a reference view and a source view of the same scene, as rows
@@ -60,4 +60,20 @@ pub fn raw_matching(
         }
     });
     Tensor::from_vec(out, &[rows.len(), CHANNELS, d, h / 4, w / 4][..], images.device())
+}
+
+/// Returns the warps of `rows` at half and at quarter resolution h × w as the GPU kernel reads
+/// them: 32 floats a row, four columns of four for each resolution.
+#[cfg(feature = "gpu")]
+pub(super) fn warp_floats(
+    cameras: &[Vec<Camera>],
+    rows: &[[usize; 2]],
+    [h, w]: [usize; 2],
+    v: usize,
+) -> Vec<f32> {
+    let of_row = |row: &[usize; 2]| {
+        let [reference, source] = row.map(|i| cameras[i / v][i % v]);
+        [2, 1].map(|scale| PlaneWarp::new(&reference, &source, scale * w, scale * h).columns())
+    };
+    rows.iter().flat_map(of_row).flatten().flat_map(|c| [c.x, c.y, c.z, 0.0]).collect()
 }

@@ -13,6 +13,8 @@ pub mod columns;
 mod conv;
 pub mod conv2d;
 pub mod conv3d;
+#[cfg(feature = "gpu")]
+pub mod device_array;
 pub mod direct;
 pub mod feed_forward;
 pub mod join;
@@ -31,6 +33,8 @@ mod splat_tensors;
 
 pub use array::{Array, ConvSteps};
 pub use backend::{Backend, NoDevice};
+#[cfg(feature = "gpu")]
+pub use device_array::{DeviceArray, Executor};
 pub use rasterize::{over_background, rasterize, rasterize_on, rasterize_splats};
 pub use splat_tensors::SplatTensors;
 

@@ -1,6 +1,7 @@
 //! The WGSL kernels against the CPU versions.
 #![cfg(feature = "gpu")]
 
+mod array;
 mod fit;
 mod layers;
 mod model;

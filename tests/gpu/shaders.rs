@@ -8,10 +8,7 @@ use naga::{AddressSpace, Expression, Handle, Literal, Module, StorageAccess, Typ
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::PathBuf;
-use subsplat::abi::{
-    self, AttentionGatherUniform, InvertUniform, OpacityRule, PlaneSweepUniform, RasterUniform,
-    RedistributeUniform, ShowUniform, SortUniform, SpgrGainsBwdUniform, SpgrUniform,
-};
+use subsplat::abi::{self, *};
 use subsplat::gpu::{Access, KERNELS, Kernel};
 
 /// WebGPU's default limits: storage buffers per stage, threads and bytes per workgroup.
@@ -42,6 +39,21 @@ const CPU_STEMS: &[(&str, &str)] = &[
     ("plane_sweep_taps", "plane_sweep"),
     ("plane_sweep_reference_bwd", "plane_sweep"),
     ("plane_sweep_source_bwd", "plane_sweep"),
+    ("convex", "small"),
+    ("convolution", "conv"),
+    ("cross_check", "small"),
+    // Copies and sums of tensors.
+    ("elementwise", "activation"),
+    ("expectation", "small"),
+    ("head_output", "small"),
+    ("layer_norm", "norm"),
+    ("linear", "gemm"),
+    ("norm_apply", "norm"),
+    ("norm_statistics", "norm"),
+    ("raw_matching_blocks", "matching"),
+    ("raw_matching_scores", "matching"),
+    ("reduce", "moves"),
+    ("select_rows", "moves"),
 ];
 
 /// Returns name and value of every constant of kernels/shared/abi.wgsl.
@@ -108,10 +120,24 @@ macro_rules! uniforms {
 
 const UNIFORMS: &[Uniform] = uniforms!(
     AttentionGatherUniform,
+    AttentionUniform,
+    ConvexUniform,
+    ConvolutionUniform,
+    CrossCheckUniform,
+    ElementwiseUniform,
+    ExpectationUniform,
+    HeadOutputUniform,
     InvertUniform,
+    LinearUniform,
+    NormUniform,
     PlaneSweepUniform,
     RasterUniform,
+    RawMatchingUniform,
     RedistributeUniform,
+    ReduceUniform,
+    ResizeUniform,
+    RowsUniform,
+    SelectUniform,
     ShowUniform,
     SortUniform,
     SpgrGainsBwdUniform,

@@ -17,10 +17,10 @@ use rayon::prelude::*;
 /// Factor of a pixel whose inconsistency is 1 in every view that shows its point.
 pub const MIN_FACTOR: f32 = 0.1;
 /// Σ|ΔRGB| of display values from which inconsistency is 1.
-const COLOUR: f32 = 1.0;
+pub const COLOUR: f32 = 1.0;
 /// A point is hidden where it lies behind the other view's surface by more than this
 /// share of that surface's z.
-const BEHIND: f32 = 0.05;
+pub const BEHIND: f32 = 0.05;
 
 /// A view with colours and depth.
 #[derive(Clone, Copy, Debug)]

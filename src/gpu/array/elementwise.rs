@@ -1,0 +1,326 @@
+//! Functions of one or two arrays, element by element, and copies in another order.
+//!
+//! WGSL: kernels/elementwise.wgsl.
+
+use super::{ALIGNMENT, DeviceArray, misfit};
+use crate::abi::ElementwiseUniform;
+use crate::gpu::buffers::Binding;
+use crate::gpu::commands::Groups;
+use crate::gpu::error::GpuError;
+use crate::gpu::pipelines::{Access, Kernel, wgsl};
+
+pub(crate) static ELEMENTWISE: Kernel = Kernel {
+    name: "elementwise",
+    entry: "main",
+    source: wgsl!("shared/grid", "shared/activation", "elementwise"),
+    bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Write],
+};
+
+const THREADS: usize = 64;
+/// Axes of the kernel.
+const AXES: usize = 7;
+
+/// An activation function, numbered as in kernels/shared/activation.wgsl.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PointwiseFunction {
+    /// x.
+    None = 0,
+    /// max(0, x).
+    Relu = 1,
+    /// x·σ(x).
+    Silu = 2,
+    /// x·Φ(x).
+    Gelu = 3,
+    /// σ(x).
+    Sigmoid = 4,
+}
+
+/// A function of kernels/elementwise.wgsl.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Function {
+    /// x.
+    Copy,
+    /// factor·x + offset.
+    Affine(f32, f32),
+    /// |x|.
+    Absolute,
+    /// x².
+    Square,
+    /// 1/x.
+    Reciprocal,
+    /// x within [low, high].
+    Clamp(f32, f32),
+    /// x + y.
+    Plus,
+    /// x − y.
+    Minus,
+    /// x·y.
+    Times,
+    /// x/y.
+    Over,
+    /// An activation function.
+    Activation(PointwiseFunction),
+    /// √x.
+    SquareRoot,
+}
+
+impl Function {
+    /// Returns the number in the kernel, and the two parameters.
+    fn parts(self) -> (u32, [f32; 2]) {
+        match self {
+            Self::Copy => (0, [0.0; 2]),
+            Self::Affine(factor, offset) => (1, [factor, offset]),
+            Self::Absolute => (2, [0.0; 2]),
+            Self::Square => (3, [0.0; 2]),
+            Self::Reciprocal => (4, [0.0; 2]),
+            Self::Clamp(low, high) => (5, [low, high]),
+            Self::Plus => (6, [0.0; 2]),
+            Self::Minus => (7, [0.0; 2]),
+            Self::Times => (8, [0.0; 2]),
+            Self::Over => (9, [0.0; 2]),
+            Self::Activation(_) => (10, [0.0; 2]),
+            Self::SquareRoot => (11, [0.0; 2]),
+        }
+    }
+}
+
+/// Strides of the axes, outermost first, and the first element.
+#[derive(Clone, Debug)]
+struct Walk {
+    strides: Vec<usize>,
+    first: usize,
+}
+
+impl Walk {
+    /// Returns the strides of a contiguous array.
+    fn contiguous(dims: &[usize]) -> Self {
+        let mut strides = vec![1; dims.len()];
+        for i in (1..dims.len()).rev() {
+            strides[i - 1] = strides[i] * dims[i];
+        }
+        Self { strides, first: 0 }
+    }
+
+    /// Returns the strides in which an array of sizes `own` repeats its sizes of 1.
+    fn repeating(own: &[usize]) -> Self {
+        let mut walk = Self::contiguous(own);
+        for (stride, size) in walk.strides.iter_mut().zip(own) {
+            *stride *= usize::from(*size != 1);
+        }
+        walk
+    }
+
+    fn words(&self) -> [[u32; 4]; 2] {
+        table(&self.strides, 0, self.first)
+    }
+}
+
+/// `values` for the last axes, `fill` for those before, then `last`.
+fn table(values: &[usize], fill: u32, last: usize) -> [[u32; 4]; 2] {
+    let mut out = [fill; 8];
+    for (to, value) in out[..AXES].iter_mut().rev().zip(values.iter().rev()) {
+        *to = *value as u32;
+    }
+    out[AXES] = last as u32;
+    let [a, b, c, d, e, f, g, h] = out;
+    [[a, b, c, d], [e, f, g, h]]
+}
+
+/// One call: result[…] = function(left[…], right[…]) over `sizes`.
+struct Call<'a> {
+    function: Function,
+    sizes: &'a [usize],
+    left: (&'a DeviceArray, Walk),
+    right: (&'a DeviceArray, Walk),
+    result: (&'a DeviceArray, Walk),
+}
+
+impl Call<'_> {
+    fn run(self) -> Result<(), GpuError> {
+        let count: usize = self.sizes.iter().product();
+        if self.sizes.len() > AXES {
+            return Err(misfit(ELEMENTWISE.name, format!("at most {AXES} axes"), self.sizes));
+        }
+        if count == 0 {
+            return Ok(());
+        }
+        let recorder = &self.result.0.recorder;
+        let (number, [first, second]) = self.function.parts();
+        let uniform = recorder.gpu.uniform(&ElementwiseUniform {
+            count: count as u32,
+            first,
+            second,
+            pad: 0,
+            sizes: table(self.sizes, 1, 0),
+            left: self.left.1.words(),
+            right: self.right.1.words(),
+            result: self.result.1.words(),
+        })?;
+        let kind = match self.function {
+            Function::Activation(kind) => f64::from(kind as u32),
+            _ => 0.0,
+        };
+        let constants = [("FUNCTION", f64::from(number)), ("ACTIVATION_KIND", kind)];
+        let arrays = [self.left.0, self.right.0, self.result.0].map(DeviceArray::binding);
+        let mut bindings = vec![Binding::from(&uniform)];
+        bindings.extend(arrays);
+        recorder.run(&ELEMENTWISE, &constants, &bindings, Groups::of(count, THREADS))
+    }
+}
+
+impl DeviceArray {
+    /// Computes `function` of every element.
+    ///
+    /// # Errors
+    /// Errors of the device.
+    pub fn map(&self, function: Function) -> Result<Self, GpuError> {
+        let result = self.recorder.empty(&self.dims)?;
+        let flat = [self.count()];
+        let walk = Walk::contiguous(&flat);
+        Call {
+            function,
+            sizes: &flat,
+            left: (self, walk.clone()),
+            right: (self, walk.clone()),
+            result: (&result, walk),
+        }
+        .run()?;
+        Ok(result)
+    }
+
+    pub(super) fn copied(&self) -> Result<Self, GpuError> {
+        self.map(Function::Copy)
+    }
+
+    /// Computes `function` of this array and `other`, whose sizes of 1 are repeated.
+    ///
+    /// # Errors
+    /// [`GpuError::Argument`] for sizes that do not fit; errors of the device.
+    pub fn with(&self, other: &Self, function: Function) -> Result<Self, GpuError> {
+        let fits = self.dims.len() == other.dims.len()
+            && self.dims.iter().zip(&other.dims).all(|(a, b)| a == b || *b == 1);
+        if !fits {
+            let expected = format!("{:?} or sizes of 1", self.dims);
+            return Err(misfit(ELEMENTWISE.name, expected, &other.dims));
+        }
+        let result = self.recorder.empty(&self.dims)?;
+        let walk = Walk::contiguous(&self.dims);
+        Call {
+            function,
+            sizes: &self.dims,
+            left: (self, walk.clone()),
+            right: (other, Walk::repeating(&other.dims)),
+            result: (&result, walk),
+        }
+        .run()?;
+        Ok(result)
+    }
+
+    /// Copies elements that `walk` visits over `dims`.
+    fn gathered(&self, dims: &[usize], walk: Walk) -> Result<Self, GpuError> {
+        let result = self.recorder.empty(dims)?;
+        Call {
+            function: Function::Copy,
+            sizes: dims,
+            left: (self, walk.clone()),
+            right: (self, walk),
+            result: (&result, Walk::contiguous(dims)),
+        }
+        .run()?;
+        Ok(result)
+    }
+
+    /// Returns `len` indices from `start` on of dimension `dim`.
+    ///
+    /// # Errors
+    /// [`GpuError::Argument`] for a range outside the dimension; errors of the device.
+    pub fn narrow(&self, dim: usize, start: usize, len: usize) -> Result<Self, GpuError> {
+        let [outer, length, inner] = self.around(dim)?;
+        if start + len > length {
+            let expected = format!("indices below {length}");
+            return Err(misfit("narrow", expected, &[start, len]));
+        }
+        let mut dims = self.dims.clone();
+        dims[dim] = len;
+        if outer == 1 && (self.offset + start * inner).is_multiple_of(ALIGNMENT) {
+            return Ok(Self { offset: self.offset + start * inner, dims, ..self.clone() });
+        }
+        let mut walk = Walk::contiguous(&self.dims);
+        walk.first = start * inner;
+        self.gathered(&dims, walk)
+    }
+
+    /// Reorders the dimensions: dimension i of the result is dimension `order[i]`.
+    ///
+    /// # Errors
+    /// [`GpuError::Argument`] where `order` is no permutation; errors of the device.
+    pub fn permuted(&self, order: &[usize]) -> Result<Self, GpuError> {
+        let mut sorted = order.to_vec();
+        sorted.sort_unstable();
+        if !sorted.iter().copied().eq(0..self.dims.len()) {
+            let expected = format!("a permutation of {} dimensions", self.dims.len());
+            return Err(misfit("permute", expected, order));
+        }
+        let own = Walk::contiguous(&self.dims);
+        let dims: Vec<usize> = order.iter().map(|&i| self.dims[i]).collect();
+        let strides = order.iter().map(|&i| own.strides[i]).collect();
+        self.gathered(&dims, Walk { strides, first: 0 })
+    }
+
+    /// Joins `parts` along dimension `dim`.
+    ///
+    /// # Errors
+    /// [`GpuError::Argument`] for no parts or other sizes; errors of the device.
+    pub fn joined(parts: &[&Self], dim: usize) -> Result<Self, GpuError> {
+        let Some(first) = parts.first() else {
+            return Err(misfit("join", "an array".to_owned(), &[]));
+        };
+        first.around(dim)?;
+        let mut dims = first.dims.clone();
+        dims[dim] = 0;
+        for part in parts {
+            let same = |(i, (a, b)): (usize, (&usize, &usize))| i == dim || a == b;
+            let fits = part.dims.len() == dims.len()
+                && part.dims.iter().zip(&first.dims).enumerate().all(same);
+            if !fits {
+                let expected = format!("{:?} except in dimension {dim}", first.dims);
+                return Err(misfit("join", expected, &part.dims));
+            }
+            dims[dim] += part.dims[dim];
+        }
+        let result = first.recorder.empty(&dims)?;
+        let whole = Walk::contiguous(&dims);
+        let mut start = 0;
+        for part in parts {
+            let walk = Walk::contiguous(&part.dims);
+            let to = Walk { first: start * whole.strides[dim], ..whole.clone() };
+            Call {
+                function: Function::Copy,
+                sizes: &part.dims,
+                left: (part, walk.clone()),
+                right: (part, walk),
+                result: (&result, to),
+            }
+            .run()?;
+            start += part.dims[dim];
+        }
+        Ok(result)
+    }
+
+    /// Repeats each pixel of `[B, C, h, w]` `s` × `s` times.
+    ///
+    /// # Errors
+    /// [`GpuError::Argument`] for another rank; errors of the device.
+    pub fn repeated(&self, s: usize) -> Result<Self, GpuError> {
+        let &[b, c, h, w] = self.dims.as_slice() else {
+            return Err(misfit("repeat", "[B, C, h, w]".to_owned(), &self.dims));
+        };
+        let strides = vec![c * h * w, h * w, w, 0, 1, 0];
+        self.gathered(&[b, c, h, s, w, s], Walk { strides, first: 0 })?.reshape(&[
+            b,
+            c,
+            s * h,
+            s * w,
+        ])
+    }
+}

@@ -1,0 +1,205 @@
+//! Arrays of the network in device memory, and its operations.
+//!
+//! An operation allocates its result and records the call of a kernel. [`Recorder`] submits calls
+//! in groups; a buffer returns to the pool after the submit of the last call that reads it, so
+//! that the memory in use is that of the arrays alive and of one group. Arrays are contiguous;
+//! [`DeviceArray::reshape`] and whole leading parts share memory.
+//!
+//! CPU versions: [`crate::cpu`], tensor operations of candle. Tests: tests/gpu/array.rs.
+
+mod attention;
+mod elementwise;
+mod norm;
+mod product;
+mod rows;
+mod small;
+
+pub(super) use attention::ATTENTION;
+pub use attention::AttentionCall;
+pub(super) use elementwise::ELEMENTWISE;
+pub use elementwise::{Function, PointwiseFunction};
+pub(super) use norm::{LAYER_NORM, NORM_APPLY, NORM_STATISTICS};
+pub use product::ConvolutionCall;
+pub(super) use product::{CONVOLUTION, LINEAR};
+pub use rows::Reduction;
+pub(super) use rows::{REDUCE, RESIZE, SELECT_ROWS, SOFTMAX};
+pub(super) use small::{
+    CONVEX, CROSS_CHECK, EXPECTATION, HEAD_OUTPUT, RAW_MATCHING_BLOCKS, RAW_MATCHING_SCORES,
+};
+pub use small::{CrossCheckCall, HeadOutputCall, RawMatchingCall};
+
+use crate::gpu::buffers::{Binding, Buffer};
+use crate::gpu::commands::{Groups, Pending};
+use crate::gpu::device::Gpu;
+use crate::gpu::error::GpuError;
+use crate::gpu::pipelines::{Constants, Kernel};
+use std::fmt;
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// Calls of one submit.
+const CALLS_MAX: usize = 48;
+/// Bytes of the results of one submit, which keeps their memory and that of their arguments.
+const BYTES_MAX: u64 = 32 << 20;
+/// Name of the calls in errors and traces.
+const NAME: &str = "network";
+
+/// Records calls for a GPU and submits them in groups, in order.
+pub struct Recorder {
+    gpu: Arc<Gpu>,
+    pending: Mutex<(Pending, u64)>,
+}
+
+impl fmt::Debug for Recorder {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.debug_struct("Recorder").field("gpu", &self.gpu).finish_non_exhaustive()
+    }
+}
+
+impl Recorder {
+    /// Creates a recorder without calls.
+    pub fn new(gpu: Arc<Gpu>) -> Arc<Self> {
+        Arc::new(Self { gpu, pending: Mutex::default() })
+    }
+
+    /// Returns the device.
+    pub fn gpu(&self) -> &Arc<Gpu> {
+        &self.gpu
+    }
+
+    /// Copies `values` to the device; `dims` are their dimensions.
+    ///
+    /// # Errors
+    /// [`GpuError::Argument`] for another number of values; errors of the device.
+    pub fn upload(
+        self: &Arc<Self>,
+        values: &[f32],
+        dims: &[usize],
+    ) -> Result<DeviceArray, GpuError> {
+        let lengths = [("values", values.len(), dims.iter().product())];
+        GpuError::check_lengths(NAME, lengths)?;
+        let buffer = self.gpu.upload(NAME, values)?;
+        Ok(DeviceArray { recorder: self.clone(), buffer, offset: 0, dims: dims.to_vec() })
+    }
+
+    /// Allocates an array whose elements the next call writes.
+    pub(super) fn empty(self: &Arc<Self>, dims: &[usize]) -> Result<DeviceArray, GpuError> {
+        let buffer = self.gpu.empty::<f32>(NAME, dims.iter().product())?;
+        Ok(DeviceArray { recorder: self.clone(), buffer, offset: 0, dims: dims.to_vec() })
+    }
+
+    /// Records a call. Submits all recorded calls if they are many or hold much memory.
+    pub(super) fn run(
+        &self,
+        kernel: &'static Kernel,
+        constants: Constants,
+        bindings: &[Binding],
+        groups: Groups,
+    ) -> Result<(), GpuError> {
+        let mut pending = self.pending.lock().unwrap_or_else(PoisonError::into_inner);
+        let (calls, mut bytes) = std::mem::take(&mut *pending);
+        let mut commands = self.gpu.resume(NAME, calls);
+        commands.run(kernel, constants, bindings, groups)?;
+        bytes += bindings.last().map_or(0, |result| result.bytes);
+        let calls = commands.suspend();
+        if calls.len() < CALLS_MAX && bytes < BYTES_MAX {
+            *pending = (calls, bytes);
+            return Ok(());
+        }
+        self.gpu.resume(NAME, calls).submit().map(|_| ())
+    }
+
+    /// Submits all recorded calls and returns the first `count` elements of `buffer`.
+    fn read(&self, buffer: &Buffer, count: usize) -> Result<Vec<f32>, GpuError> {
+        let mut pending = self.pending.lock().unwrap_or_else(PoisonError::into_inner);
+        let (calls, _) = std::mem::take(&mut *pending);
+        let mut commands = self.gpu.resume(NAME, calls);
+        let reading = commands.read::<f32>(buffer, count)?;
+        commands.submit()?;
+        reading.take(&self.gpu)
+    }
+}
+
+/// An f32 array in device memory, row-major. Clones share the memory; operations make new arrays.
+#[derive(Clone)]
+pub struct DeviceArray {
+    recorder: Arc<Recorder>,
+    buffer: Buffer,
+    /// First element; a multiple of [`ALIGNMENT`].
+    offset: usize,
+    dims: Vec<usize>,
+}
+
+impl fmt::Debug for DeviceArray {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.debug_struct("DeviceArray").field("dims", &self.dims).finish_non_exhaustive()
+    }
+}
+
+/// Alignment of a binding, floats (WebGPU: 256 bytes).
+const ALIGNMENT: usize = 64;
+
+impl DeviceArray {
+    /// Returns the dimensions.
+    pub fn dims(&self) -> &[usize] {
+        &self.dims
+    }
+
+    /// Returns the recorder of this array's operations.
+    pub fn recorder(&self) -> &Arc<Recorder> {
+        &self.recorder
+    }
+
+    /// Returns the number of elements.
+    pub fn count(&self) -> usize {
+        self.dims.iter().product()
+    }
+
+    /// Waits for all operations and returns the elements.
+    ///
+    /// # Errors
+    /// Errors of the device.
+    pub fn to_vec(&self) -> Result<Vec<f32>, GpuError> {
+        match self.offset {
+            0 => self.recorder.read(&self.buffer, self.count()),
+            _ => {
+                let whole = self.copied()?;
+                self.recorder.read(&whole.buffer, self.count())
+            }
+        }
+    }
+
+    /// Returns the same elements under other dimensions.
+    ///
+    /// # Errors
+    /// [`GpuError::Argument`] for another number of elements.
+    pub fn reshape(&self, dims: &[usize]) -> Result<Self, GpuError> {
+        GpuError::check_lengths("reshape", [("elements", self.count(), dims.iter().product())])?;
+        Ok(Self { dims: dims.to_vec(), ..self.clone() })
+    }
+
+    /// Returns the binding of the elements.
+    pub(super) fn binding(&self) -> Binding {
+        let at = 4 * self.offset as u64;
+        self.buffer.part(at..at + 4 * self.count() as u64)
+    }
+
+    /// Returns the product of the sizes before dimension `dim`, its size, and the product of the
+    /// sizes after it.
+    fn around(&self, dim: usize) -> Result<[usize; 3], GpuError> {
+        let Some(&length) = self.dims.get(dim) else {
+            return Err(GpuError::Argument {
+                kernel: NAME,
+                argument: "dimension",
+                expected: format!("below {}", self.dims.len()),
+                got: dim.to_string(),
+            });
+        };
+        let product = |dims: &[usize]| dims.iter().product();
+        Ok([product(&self.dims[..dim]), length, product(&self.dims[dim + 1..])])
+    }
+}
+
+/// The error of an argument of `kernel` whose dimensions do not fit.
+fn misfit(kernel: &'static str, expected: String, got: &[usize]) -> GpuError {
+    GpuError::Argument { kernel, argument: "dimensions", expected, got: format!("{got:?}") }
+}

@@ -1,0 +1,117 @@
+//! Normalisation over groups of channels and over the last axis.
+//!
+//! WGSL: kernels/norm_statistics.wgsl, kernels/norm_apply.wgsl, kernels/layer_norm.wgsl.
+
+use super::{DeviceArray, PointwiseFunction, misfit};
+use crate::abi::{NormUniform, RowsUniform};
+use crate::gpu::buffers::Binding;
+use crate::gpu::commands::Groups;
+use crate::gpu::error::GpuError;
+use crate::gpu::pipelines::{Access, Kernel, wgsl};
+
+pub(crate) static NORM_STATISTICS: Kernel = Kernel {
+    name: "norm_statistics",
+    entry: "main",
+    source: wgsl!("shared/grid", "shared/norm", "norm_statistics"),
+    bindings: &[Access::Uniform, Access::Read, Access::Write],
+};
+
+pub(crate) static NORM_APPLY: Kernel = Kernel {
+    name: "norm_apply",
+    entry: "main",
+    source: wgsl!("shared/grid", "shared/activation", "shared/norm", "norm_apply"),
+    bindings: &[
+        Access::Uniform,
+        Access::Read,
+        Access::Read,
+        Access::Read,
+        Access::Read,
+        Access::Write,
+    ],
+};
+
+pub(crate) static LAYER_NORM: Kernel = Kernel {
+    name: "layer_norm",
+    entry: "main",
+    source: wgsl!("shared/grid", "shared/rows", "layer_norm"),
+    bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Read, Access::Write],
+};
+
+/// ε of every normalisation (PyTorch's default).
+const EPSILON: f32 = 1e-5;
+/// Numbers of a part of a row (kernels/shared/norm.wgsl).
+const PART: usize = 8192;
+
+impl DeviceArray {
+    /// Normalises groups of channels of `[B, C, …]`, multiplies and adds `affine`, `[C]` each, and
+    /// applies `activation`.
+    ///
+    /// # Errors
+    /// [`GpuError::Argument`] for sizes that do not fit; errors of the device.
+    pub fn group_norm(
+        &self,
+        groups: usize,
+        affine: Option<[&Self; 2]>,
+        activation: PointwiseFunction,
+    ) -> Result<Self, GpuError> {
+        let (b, c) = match self.dims.as_slice() {
+            &[b, c, _, ..] if groups > 0 && c.is_multiple_of(groups) => (b, c),
+            _ => {
+                let expected = format!("[B, C, ..] with C a multiple of {groups}");
+                return Err(misfit(NORM_APPLY.name, expected, &self.dims));
+            }
+        };
+        if self.count() == 0 || affine.is_some_and(|a| a.iter().any(|a| a.count() != c)) {
+            let expected = format!("elements, and {c} factors and summands");
+            return Err(misfit(NORM_APPLY.name, expected, &self.dims));
+        }
+        let rows = b * groups;
+        let length = self.count() / rows;
+        let parts = length.div_ceil(PART);
+        let words = |n: usize| n as u32;
+        let uniform = self.recorder.gpu.uniform(&NormUniform {
+            rows: words(rows),
+            length: words(length),
+            run: words(self.count() / (b * c)),
+            groups: words(groups),
+            parts: words(parts),
+            has_affine: u32::from(affine.is_some()),
+            epsilon: EPSILON,
+            pad: 0,
+        })?;
+        let statistics = self.recorder.empty(&[rows * parts, 2])?;
+        let result = self.recorder.empty(&self.dims)?;
+        let uniform = Binding::from(&uniform);
+        let workgroups = || Groups::of(rows * parts, 1);
+        let bindings = [uniform.clone(), self.binding(), statistics.binding()];
+        self.recorder.run(&NORM_STATISTICS, &[], &bindings, workgroups())?;
+        let [factors, summands] = affine.unwrap_or([self, self]).map(DeviceArray::binding);
+        let bindings =
+            [uniform, self.binding(), statistics.binding(), factors, summands, result.binding()];
+        let constants = [("ACTIVATION_KIND", f64::from(activation as u32))];
+        self.recorder.run(&NORM_APPLY, &constants, &bindings, workgroups())?;
+        Ok(result)
+    }
+
+    /// Normalises the last dimension, multiplies and adds `affine`.
+    ///
+    /// # Errors
+    /// [`GpuError::Argument`] for sizes that do not fit; errors of the device.
+    pub fn layer_norm(&self, affine: [&Self; 2]) -> Result<Self, GpuError> {
+        let length = self.dims.last().copied().unwrap_or(0);
+        if length == 0 || affine.iter().any(|a| a.count() != length) {
+            let expected = format!("[.., {}]", affine[0].count());
+            return Err(misfit(LAYER_NORM.name, expected, &self.dims));
+        }
+        let rows = self.count() / length;
+        let result = self.recorder.empty(&self.dims)?;
+        let uniform =
+            RowsUniform { rows: rows as u32, length: length as u32, epsilon: EPSILON, pad: 0 };
+        let uniform = self.recorder.gpu.uniform(&uniform)?;
+        let [factors, summands] = affine.map(DeviceArray::binding);
+        let bindings =
+            [Binding::from(&uniform), self.binding(), factors, summands, result.binding()];
+        self.recorder.run(&LAYER_NORM, &[], &bindings, Groups::of(rows, 1))?;
+        Ok(result)
+    }
+}

@@ -1,0 +1,153 @@
+//! Reductions over an axis, softmax, and chosen indices.
+//!
+//! WGSL: kernels/reduce.wgsl, kernels/softmax.wgsl, kernels/select_rows.wgsl,
+//! kernels/resize.wgsl.
+
+use super::{DeviceArray, PointwiseFunction, misfit};
+use crate::abi::{ReduceUniform, ResizeUniform, RowsUniform, SelectUniform};
+use crate::gpu::buffers::Binding;
+use crate::gpu::commands::Groups;
+use crate::gpu::error::GpuError;
+use crate::gpu::pipelines::{Access, Kernel, wgsl};
+
+pub(crate) static REDUCE: Kernel = Kernel {
+    name: "reduce",
+    entry: "main",
+    source: wgsl!("shared/grid", "reduce"),
+    bindings: &[Access::Uniform, Access::Read, Access::Write],
+};
+
+pub(crate) static SOFTMAX: Kernel = Kernel {
+    name: "softmax",
+    entry: "main",
+    source: wgsl!("shared/grid", "shared/rows", "softmax"),
+    bindings: &[Access::Uniform, Access::Read, Access::Write],
+};
+
+pub(crate) static SELECT_ROWS: Kernel = Kernel {
+    name: "select_rows",
+    entry: "main",
+    source: wgsl!("shared/grid", "select_rows"),
+    bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Write],
+};
+
+pub(crate) static RESIZE: Kernel = Kernel {
+    name: "resize",
+    entry: "main",
+    source: wgsl!("shared/grid", "shared/activation", "resize"),
+    bindings: &[Access::Uniform, Access::Read, Access::Write],
+};
+
+const THREADS: usize = 64;
+
+/// A reduction over an axis.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reduction {
+    /// Sum.
+    Sum,
+    /// Mean.
+    Mean,
+    /// Maximum.
+    Maximum,
+}
+
+impl DeviceArray {
+    /// Reduces dimension `dim`, whose size becomes 1.
+    ///
+    /// # Errors
+    /// [`GpuError::Argument`] for an empty dimension; errors of the device.
+    pub fn reduced(&self, dim: usize, reduction: Reduction) -> Result<Self, GpuError> {
+        let [outer, length, inner] = self.around(dim)?;
+        if length == 0 {
+            return Err(misfit(REDUCE.name, "a size of at least 1".to_owned(), &self.dims));
+        }
+        let (number, factor) = match reduction {
+            Reduction::Sum => (0.0, 1.0),
+            Reduction::Mean => (0.0, 1.0 / length as f32),
+            Reduction::Maximum => (1.0, 1.0),
+        };
+        let mut dims = self.dims.clone();
+        dims[dim] = 1;
+        let result = self.recorder.empty(&dims)?;
+        let [outer_words, length, inner_words] = [outer, length, inner].map(|n| n as u32);
+        let uniform = self.recorder.gpu.uniform(&ReduceUniform {
+            outer: outer_words,
+            length,
+            inner: inner_words,
+            factor,
+        })?;
+        let bindings = [Binding::from(&uniform), self.binding(), result.binding()];
+        let groups = Groups::of(outer * inner, THREADS);
+        self.recorder.run(&REDUCE, &[("FUNCTION", number)], &bindings, groups)?;
+        Ok(result)
+    }
+
+    /// Computes the softmax over the last dimension.
+    ///
+    /// # Errors
+    /// [`GpuError::Argument`] for an empty dimension; errors of the device.
+    pub fn softmax(&self) -> Result<Self, GpuError> {
+        let length = self.dims.last().copied().unwrap_or(0);
+        if length == 0 {
+            return Err(misfit(SOFTMAX.name, "[.., n]".to_owned(), &self.dims));
+        }
+        let rows = self.count() / length;
+        let result = self.recorder.empty(&self.dims)?;
+        let uniform =
+            RowsUniform { rows: rows as u32, length: length as u32, ..RowsUniform::default() };
+        let uniform = self.recorder.gpu.uniform(&uniform)?;
+        let bindings = [Binding::from(&uniform), self.binding(), result.binding()];
+        self.recorder.run(&SOFTMAX, &[], &bindings, Groups::of(rows, 1))?;
+        Ok(result)
+    }
+
+    /// Returns the given indices of dimension `dim`.
+    ///
+    /// # Errors
+    /// [`GpuError::Argument`] for an index outside the dimension; errors of the device.
+    pub fn selected(&self, dim: usize, indices: &[u32]) -> Result<Self, GpuError> {
+        let [outer, length, inner] = self.around(dim)?;
+        if let Some(index) = indices.iter().find(|i| **i as usize >= length) {
+            let expected = format!("indices below {length}");
+            return Err(misfit(SELECT_ROWS.name, expected, &[*index as usize]));
+        }
+        let mut dims = self.dims.clone();
+        dims[dim] = indices.len();
+        let result = self.recorder.empty(&dims)?;
+        let [outer_words, length, inner, chosen] =
+            [outer, length, inner, indices.len()].map(|n| n as u32);
+        let gpu = &self.recorder.gpu;
+        let uniform = gpu.uniform(&SelectUniform { outer: outer_words, length, inner, chosen })?;
+        let indices = gpu.upload("indices", indices)?;
+        let bindings = [(&uniform).into(), self.binding(), (&indices).into(), result.binding()];
+        let groups = Groups::of(result.count(), THREADS);
+        self.recorder.run(&SELECT_ROWS, &[], &bindings, groups)?;
+        Ok(result)
+    }
+
+    /// Resizes planes `[…, h, w]` bilinearly, corners aligned, then applies `activation`.
+    ///
+    /// # Errors
+    /// [`GpuError::Argument`] for an empty size; errors of the device.
+    pub fn resized(&self, to: [usize; 2], activation: PointwiseFunction) -> Result<Self, GpuError> {
+        let rank = self.dims.len();
+        if rank < 2 || self.count() == 0 || to.contains(&0) {
+            return Err(misfit(RESIZE.name, "[.., h, w]".to_owned(), &self.dims));
+        }
+        let mut dims = self.dims.clone();
+        let from = [dims[rank - 2], dims[rank - 1]];
+        dims[rank - 2..].copy_from_slice(&to);
+        let result = self.recorder.empty(&dims)?;
+        let uniform = self.recorder.gpu.uniform(&ResizeUniform {
+            input_size: from.map(|n| n as u32),
+            output_size: to.map(|n| n as u32),
+            planes: (self.count() / (from[0] * from[1])) as u32,
+            pad: 0,
+        })?;
+        let bindings = [Binding::from(&uniform), self.binding(), result.binding()];
+        let constants = [("ACTIVATION_KIND", f64::from(activation as u32))];
+        let groups = Groups::of(result.count(), THREADS);
+        self.recorder.run(&RESIZE, &constants, &bindings, groups)?;
+        Ok(result)
+    }
+}
