@@ -3,7 +3,7 @@
 // src/cpu/activation.rs and tensor operations.
 
 // x, factor * x + offset, |x|, x^2, 1 / x, clamp(x), the four operations of two numbers, an
-// activation, the square root.
+// activation, the square root, x where y is above a number and else another.
 const COPY: u32 = 0u;
 const AFFINE: u32 = 1u;
 const ABSOLUTE: u32 = 2u;
@@ -16,13 +16,14 @@ const TIMES: u32 = 8u;
 const OVER: u32 = 9u;
 const ACTIVATION: u32 = 10u;
 const SQUARE_ROOT: u32 = 11u;
+const WHERE_ABOVE: u32 = 12u;
 
 override FUNCTION: u32 = 0u;
 override ACTIVATION_KIND: u32 = 0u;
 
 struct ElementwiseUniform {
     count: u32,
-    // Factor and offset of AFFINE, bounds of CLAMP.
+    // Factor and offset of AFFINE, bounds of CLAMP, bound and other number of WHERE_ABOVE.
     first: f32,
     second: f32,
     pad: u32,
@@ -54,6 +55,7 @@ fn value(i: u32, j: u32) -> f32 {
         case MINUS: { return x - right[j]; }
         case TIMES: { return x * right[j]; }
         case OVER: { return x / right[j]; }
+        case WHERE_ABOVE: { return select(call.second, x, right[j] > call.first); }
         case SQUARE_ROOT: { return sqrt(x); }
         case ACTIVATION: { return activation(ACTIVATION_KIND, x); }
         default: { return x; }

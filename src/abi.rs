@@ -21,11 +21,11 @@ pub use spgr::{
 };
 pub use sweep::{Pair, SWEEP_PAIR_STRIDE, Sweep};
 pub use uniforms::{
-    AttentionGatherUniform, AttentionUniform, ConvexUniform, ConvolutionUniform, CrossCheckUniform,
-    ElementwiseUniform, ExpectationUniform, HeadOutputUniform, InvertUniform, LinearUniform,
-    NormUniform, PlaneSweepUniform, RasterUniform, RawMatchingUniform, RedistributeUniform,
-    ReduceUniform, ResizeUniform, RowsUniform, SelectUniform, ShowUniform, SortUniform,
-    SpgrGainsBwdUniform, SpgrUniform,
+    AttentionGatherUniform, AttentionUniform, AttributesUniform, ConvexUniform, ConvolutionUniform,
+    CrossCheckUniform, ElementwiseUniform, ExpectationUniform, HeadOutputUniform, InvertUniform,
+    LinearUniform, NormUniform, OcclusionUniform, PlaneSweepUniform, RasterUniform,
+    RawMatchingUniform, RedistributeUniform, ReduceUniform, ResizeUniform, RowsUniform,
+    SelectUniform, ShowUniform, SortUniform, SpgrGainsBwdUniform, SpgrUniform,
 };
 pub use view::View;
 

@@ -574,3 +574,61 @@ uniform! {
         pad1: f32,
     }
 }
+
+uniform! {
+    /// Parameters of kernels/attributes.wgsl.
+    AttributesUniform {
+        /// Rows of R, world from camera, of the frame; its position.
+        frame: [[f32; 4]; 3],
+        /// Rows of the matrix that turns quaternions into the frame.
+        turn: [[f32; 4]; 4],
+        /// Rows of R of the source view; its position.
+        source: [[f32; 4]; 3],
+        /// Parents.
+        parents: u32,
+        /// 1: attributes are those of the frame.
+        framed: u32,
+        /// 1: positions are slopes and ln z.
+        ray: u32,
+        /// 1: scales are logarithms of pixels.
+        log_px: u32,
+        /// 1: opacities are logits.
+        logit: u32,
+        /// ln of the focal length, px.
+        log_focal: f32,
+        /// Smallest opacity of a logit.
+        logit_low: f32,
+        /// Smallest z, world units.
+        z_min: f32,
+        /// Bound of slopes.
+        slope_max: f32,
+        /// Smallest σ, world units.
+        scale_min: f32,
+        /// Unused.
+        pad0: u32,
+        /// Unused.
+        pad1: u32,
+    }
+}
+
+uniform! {
+    /// Parameters of kernels/occlusion.wgsl.
+    OcclusionUniform {
+        /// Points.
+        points: u32,
+        /// Views.
+        views: u32,
+        /// Height of the surfaces, px.
+        height: u32,
+        /// Width of the surfaces, px.
+        width: u32,
+        /// Tolerance and softness, shares of z.
+        tolerance: f32,
+        /// Unused.
+        pad0: u32,
+        /// Unused.
+        pad1: u32,
+        /// Unused.
+        pad2: u32,
+    }
+}

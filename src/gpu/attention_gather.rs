@@ -54,8 +54,16 @@ impl<'a> AttentionGatherArgs<'a> {
 
     /// Checks the arguments and returns N.
     pub(super) fn check(&self) -> Result<usize, GpuError> {
+        self.check_lengths([self.maps.len(), self.query.len(), self.points.len()])
+    }
+
+    /// Checks the options and the lengths of maps, query and points; returns N.
+    pub(super) fn check_lengths(
+        &self,
+        [maps, query, points]: [usize; 3],
+    ) -> Result<usize, GpuError> {
         let g = self.gather;
-        let n = self.query.len() / g.query_width().max(1);
+        let n = query / g.query_width().max(1);
         let divides = g.groups > 0 && g.dim.is_multiple_of(g.groups);
         let channels = g.dim + g.value.max(g.key.unwrap_or(0));
         let end = |l: &crate::abi::Level| l.first_cell + g.views * l.height * l.width;
@@ -79,9 +87,9 @@ impl<'a> AttentionGatherArgs<'a> {
             );
         }
         let lengths = [
-            ("query", self.query.len(), n * g.query_width()),
-            ("points", self.points.len(), n * self.points_row()),
-            ("maps", self.maps.len().min(cells * g.stride), cells * g.stride),
+            ("query", query, n * g.query_width()),
+            ("points", points, n * self.points_row()),
+            ("maps", maps.min(cells * g.stride), cells * g.stride),
         ];
         GpuError::check_lengths(ATTENTION_GATHER.name, lengths).map(|()| n)
     }

@@ -85,7 +85,7 @@ pub use crate::device::DeviceChoice;
 pub use adapter::{AdapterSummary, adapters, choose, find_for, instance};
 pub use array::{
     AttentionCall, ConvolutionCall, CrossCheckCall, DeviceArray, Function, HeadOutputCall,
-    PointwiseFunction, RawMatchingCall, Recorder, Reduction,
+    PointwiseFunction, RawMatchingCall, Recorder, Reduction, Work,
 };
 pub use attention_gather::AttentionGatherArgs;
 pub use attention_gather_bwd::AttentionGatherGradients;
@@ -153,4 +153,6 @@ pub const KERNELS: &[&Kernel] = &[
     &array::CROSS_CHECK,
     &array::RAW_MATCHING_BLOCKS,
     &array::RAW_MATCHING_SCORES,
+    &array::ATTRIBUTES,
+    &array::OCCLUSION,
 ];

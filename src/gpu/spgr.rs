@@ -60,15 +60,20 @@ pub struct SpgrArgs<'a> {
 impl<'a> SpgrArgs<'a> {
     /// Checks the arguments and returns N.
     pub(super) fn check(&self) -> Result<usize, GpuError> {
-        let n = self.parents.len() / SPLAT_STRIDE;
+        self.check_lengths([self.head.len(), self.parents.len()])
+    }
+
+    /// Checks the arguments and the lengths of head records and parents; returns N.
+    pub(super) fn check_lengths(&self, [head, parents]: [usize; 2]) -> Result<usize, GpuError> {
+        let n = parents / SPLAT_STRIDE;
         let k = self.rules.children();
         let lengths = [
             ("children per parent", k, k.clamp(1, CHILDREN_MAX)),
             ("cameras", self.cameras.len(), self.cameras.len().max(1)),
             ("near planes", self.near.len(), self.cameras.len()),
             ("parents per view", self.per_view, self.per_view.max(1)),
-            ("parents", self.parents.len(), n * SPLAT_STRIDE),
-            ("head records", self.head.len(), n * k * HEAD_STRIDE),
+            ("parents", parents, n * SPLAT_STRIDE),
+            ("head records", head, n * k * HEAD_STRIDE),
         ];
         GpuError::check_lengths(SPGR.name, lengths).map(|()| n)
     }

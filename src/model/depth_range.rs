@@ -8,11 +8,8 @@
 //! time.
 
 use super::Views;
-use super::backbone::SmallBackbone;
-use super::backbone::small::DisparityMean;
-use super::trace::Trace;
 use crate::camera::{Camera, NearFar};
-use candle_core::Result;
+use candle_core::{Result, Tensor};
 
 /// Factor by which the searched range extends the given one on both sides: content nearer
 /// than RealEstate10K's near of 1 is common.
@@ -24,16 +21,17 @@ const MARGIN: f32 = 0.1;
 /// Smallest side, px, of a half-size image. Smaller images stay at full size.
 const MIN_HALF_SIDE: usize = 96;
 
-/// Returns `views` with near and far of every scene as `network` estimates them. `stride`:
-/// the number, px, of which the network's input sides are multiples.
+/// Returns `views` with near and far of every scene as a network estimates them. `indices`:
+/// the network's candidate indices `[V, 1, H, W]` of a scene, of `candidates`; `stride`: the
+/// number, px, of which the network's input sides are multiples.
 ///
 /// # Errors
-/// Those of the network and of the trace's checkpoint.
+/// Those of `indices`.
 pub(super) fn estimate_depth_range(
-    network: &SmallBackbone,
     views: &Views,
+    candidates: usize,
     stride: usize,
-    trace: &Trace<'_>,
+    indices: impl Fn(&Views) -> Result<Tensor>,
 ) -> Result<Views> {
     let mut estimated = views.clone();
     for b in 0..views.scenes() {
@@ -41,8 +39,8 @@ pub(super) fn estimate_depth_range(
         for range in wide.near_far.iter_mut().flatten() {
             *range = NearFar::new(range.near / SEARCH_FACTOR, range.far * SEARCH_FACTOR);
         }
-        let index = network.depth_with(&wide, DisparityMean::AroundMode, trace)?.index;
-        let top = (network.candidates() - 1) as f32;
+        let index = indices(&wide)?;
+        let top = (candidates - 1) as f32;
         let mut depths = Vec::with_capacity(index.elem_count());
         for (v, NearFar { near, far }) in wide.near_far[0].iter().enumerate() {
             let (low, high) = (far.recip(), near.recip());

@@ -9,8 +9,8 @@
 use super::geometry::{Frames, ParentChunk};
 use super::mlp::{Block2, LayerNorm, affine, gelu, linear, xavier};
 use crate::config::{AlphaInput, AnchorFrame, Embed, EmbedMlp, ScaleInput};
-use crate::ops::attributes::{Attributes, attributes};
-use crate::ops::moves;
+use crate::ops::Array;
+use crate::ops::attributes::Attributes;
 use candle_core::{Result, Tensor};
 use candle_nn::{Linear, VarBuilder};
 
@@ -49,11 +49,11 @@ enum Mlps {
 /// One geometry and one appearance descriptor of each parent of a chunk: the embeddings
 /// z^g and z^a, or the aggregated features f^g and f^a.
 #[derive(Clone, Debug)]
-pub struct Descriptors {
+pub struct Descriptors<A = Tensor> {
     /// `[n, E]`.
-    pub geometry: Tensor,
+    pub geometry: A,
     /// `[n, E]`.
-    pub appearance: Tensor,
+    pub appearance: A,
 }
 
 /// The embeddings' parameters.
@@ -103,7 +103,7 @@ impl Embeddings {
     ///
     /// # Errors
     /// Those of candle.
-    pub fn attributes(&self, parents: &ParentChunk, frames: &Frames) -> Result<Tensor> {
+    pub fn attributes<A: Array>(&self, parents: &ParentChunk<A>, frames: &Frames) -> Result<A> {
         let (c, source) = (&self.config, &frames.0[parents.source]);
         let rules = Attributes {
             frame: match c.anchor_frame {
@@ -120,14 +120,18 @@ impl Embeddings {
             slope_max: SLOPE_MAX,
             scale_min: SCALE_MIN,
         };
-        attributes(&parents.rows()?, rules)
+        parents.rows()?.attributes(rules)
     }
 
     /// Returns z^g and z^a, `[n, E]`.
     ///
     /// # Errors
     /// Shapes do not fit.
-    pub fn forward(&self, parents: &ParentChunk, frames: &Frames) -> Result<Descriptors> {
+    pub fn forward<A: Array>(
+        &self,
+        parents: &ParentChunk<A>,
+        frames: &Frames,
+    ) -> Result<Descriptors<A>> {
         let all = self.attributes(parents, frames)?;
         match &self.mlps {
             Mlps::Pg { geometry, w_g, colour } => {
@@ -135,7 +139,7 @@ impl Embeddings {
                 let mut first = WIDTHS[0].1;
                 for (block, (_, width)) in geometry.iter().zip(WIDTHS).skip(1) {
                     let next = block.forward(&all.narrow(1, first, width)?)?;
-                    sum = moves::sum(&sum, &next)?;
+                    sum = sum.plus(&next)?;
                     first += width;
                 }
                 Ok(Descriptors {

@@ -7,10 +7,8 @@
 use crate::abi::VISIBLE_Z_MIN;
 use crate::camera::Camera;
 use crate::config::MaskMode;
-use crate::ops::attributes;
-use crate::ops::columns::columns;
-use crate::ops::linear::linear;
-use candle_core::{D, DType, Device, Result, Tensor, bail};
+use crate::ops::{Array, attributes};
+use candle_core::{DType, Device, Result, Tensor, bail};
 
 /// Image position of points behind a camera: farther outside than any learned offset
 /// reaches.
@@ -20,31 +18,31 @@ const CLAMP_MAX: f64 = 0.9999;
 
 /// Consecutive parents of one source view.
 #[derive(Clone, Debug)]
-pub struct ParentChunk {
+pub struct ParentChunk<A = Tensor> {
     /// Index of the first parent in the scene.
     pub first: usize,
     /// Index of the source view.
     pub source: usize,
     /// `[n, 3]`, world.
-    pub means: Tensor,
+    pub means: A,
     /// `[n, 4]` wxyz, world.
-    pub quats_wxyz: Tensor,
+    pub quats_wxyz: A,
     /// `[n, 3]`: σ, world units.
-    pub scales: Tensor,
+    pub scales: A,
     /// `[n, 1]`.
-    pub opacities: Tensor,
+    pub opacities: A,
     /// `[n, 3·D]`, colour-major, in the frame of [`crate::config::Embed::sh`].
-    pub sh: Tensor,
+    pub sh: A,
 }
 
-impl ParentChunk {
+impl<A: Array> ParentChunk<A> {
     /// Returns the packed rows `[n, 11]`; columns as in [`crate::abi`].
     ///
     /// # Errors
     /// Shapes do not fit one another.
-    pub fn rows(&self) -> Result<Tensor> {
-        let all_but_opacity = columns(&self.means, &self.quats_wxyz, Some(&self.scales))?;
-        columns(&all_but_opacity, &self.opacities, None)
+    pub fn rows(&self) -> Result<A> {
+        let all_but_opacity = self.means.columns(&self.quats_wxyz, Some(&self.scales))?;
+        all_but_opacity.columns(&self.opacities, None)
     }
 }
 
@@ -61,13 +59,9 @@ pub struct Frame {
     pub quat_from_world: Tensor,
 }
 
-/// x·m of `x` `[n, k]` and `m` `[k, k]`. f32 does not use candle's product, which queries
-/// the operating system for the number of processors on every call.
-fn times(x: &Tensor, m: &Tensor) -> Result<Tensor> {
-    if x.dtype() != DType::F32 {
-        return x.matmul(m);
-    }
-    linear(x, &m.t()?, &Tensor::zeros(m.dim(1)?, DType::F32, m.device())?)
+/// x·m of `x` `[n, k]` and `m` `[k, k]`.
+fn times<A: Array>(x: &A, m: &Tensor) -> Result<A> {
+    x.projected(&x.like(&m.t()?.contiguous()?)?, None)
 }
 
 impl Frame {
@@ -107,8 +101,8 @@ impl Frame {
     ///
     /// # Errors
     /// Another shape.
-    pub fn to_camera(&self, means: &Tensor) -> Result<Tensor> {
-        times(&means.broadcast_sub(&self.position)?, &self.rotation)
+    pub fn to_camera<A: Array>(&self, means: &A) -> Result<A> {
+        times(&means.minus(&means.like(&self.position)?)?, &self.rotation)
     }
 
     /// Maps world quaternions `[n, 4]` wxyz to this camera's frame.
@@ -144,30 +138,28 @@ impl Frames {
     ///
     /// # Errors
     /// Another shape.
-    pub fn project(&self, points: &Tensor, mask: MaskMode) -> Result<(Tensor, Tensor)> {
-        let (n, m, _) = points.dims3()?;
+    pub fn project<A: Array>(&self, points: &A, mask: MaskMode) -> Result<(A, A)> {
+        let [n, m, _] = points.sizes()?;
         let flat = points.reshape((n * m, 3))?;
         let mut positions = Vec::with_capacity(self.0.len());
         let mut depths = Vec::with_capacity(self.0.len());
         for frame in &self.0 {
             let p = frame.to_camera(&flat)?;
             let z = p.narrow(1, 2, 1)?;
-            let safe = z.maximum(VISIBLE_Z_MIN)?;
+            let safe = z.clamped(VISIBLE_Z_MIN, f64::INFINITY)?;
             let [fx, fy, cx, cy] = frame.camera.intrinsics.normalised().map(f64::from);
-            let u = (p.narrow(1, 0, 1)?.div(&safe)?.affine(fx, cx))?;
-            let v = (p.narrow(1, 1, 1)?.div(&safe)?.affine(fy, cy))?;
-            let uv = Tensor::cat(&[&u, &v], 1)?;
+            let u = p.narrow(1, 0, 1)?.over(&safe)?.affine(fx, cx)?;
+            let v = p.narrow(1, 1, 1)?.over(&safe)?.affine(fy, cy)?;
+            let uv = A::joined(&[&u, &v], 1)?;
             let uv = match mask {
-                MaskMode::Renorm => {
-                    let front = z.gt(VISIBLE_Z_MIN)?.broadcast_as(uv.shape())?;
-                    front.where_cond(&uv, &uv.zeros_like()?.affine(1.0, BEHIND)?)?
-                }
-                MaskMode::PgClamp => uv.clamp(0.0, CLAMP_MAX)?,
+                MaskMode::Renorm => uv.where_above(&z, VISIBLE_Z_MIN, BEHIND)?,
+                MaskMode::PgClamp => uv.clamped(0.0, CLAMP_MAX)?,
             };
-            positions.push(uv.reshape((n, m, 2))?);
-            depths.push(z.reshape((n, m))?);
+            positions.push(uv.reshape((n, 1, m, 2))?);
+            depths.push(z.reshape((n, 1, m))?);
         }
-        Ok((Tensor::stack(&positions, 1)?, Tensor::stack(&depths, 1)?))
+        let joined = |parts: &[A]| A::joined(&parts.iter().collect::<Vec<_>>(), 1);
+        Ok((joined(&positions)?, joined(&depths)?))
     }
 
     /// Returns depth maps `[V, H, W]`: at each pixel the smallest camera z of its G
@@ -175,8 +167,9 @@ impl Frames {
     ///
     /// # Errors
     /// The number of parents per view is not a multiple of H·W.
-    pub fn depth_maps(&self, means: &Tensor, (height, width): (usize, usize)) -> Result<Tensor> {
-        let per_view = means.dim(0)? / self.0.len().max(1);
+    pub fn depth_maps<A: Array>(&self, means: &A, (height, width): (usize, usize)) -> Result<A> {
+        let [all, _] = means.sizes()?;
+        let per_view = all / self.0.len().max(1);
         if height * width == 0 || !per_view.is_multiple_of(height * width) {
             bail!(
                 "depth maps: expected a multiple of {height}x{width} parents per view, got {per_view}"
@@ -184,9 +177,11 @@ impl Frames {
         }
         let maps = self.0.iter().enumerate().map(|(v, frame)| {
             let z = frame.to_camera(&means.narrow(0, v * per_view, per_view)?)?.narrow(1, 2, 1)?;
-            z.reshape((height, width, per_view / (height * width)))?.min(D::Minus1)
+            // The minimum.
+            let z = z.reshape((height, width, per_view / (height * width)))?.affine(-1.0, 0.0)?;
+            z.largest()?.affine(-1.0, 0.0)?.reshape((1, height, width))
         });
-        Tensor::stack(&maps.collect::<Result<Vec<_>>>()?, 0)
+        A::joined(&maps.collect::<Result<Vec<_>>>()?.iter().collect::<Vec<_>>(), 0)
     }
 }
 

@@ -1,10 +1,10 @@
 //! Linear layers with chosen initial values, and a LayerNorm: fused ops for f32, tensor
 //! operations for f64, which the tests' references use.
 
-use crate::ops;
-use crate::ops::activation::{Activation, activation};
-use candle_core::{D, DType, Result, Tensor};
-use candle_nn::{Init, Linear, Module, VarBuilder};
+use crate::ops::Array;
+use crate::ops::activation::Activation;
+use candle_core::{Result, Tensor};
+use candle_nn::{Init, Linear, VarBuilder};
 
 /// Purpose of a forward pass.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,23 +38,15 @@ pub(crate) fn linear(
 
 /// x·Wᵀ + b of `x` `[n, inputs]`. f32 runs on the caller's thread ([`ops::linear`]),
 /// because chunks of parents or scenes are the parallel tasks.
-pub(crate) fn affine(layer: &Linear, x: &Tensor) -> Result<Tensor> {
-    match layer.bias() {
-        Some(bias) if x.dtype() == DType::F32 => ops::linear::linear(x, layer.weight(), bias),
-        _ => layer.forward(x),
-    }
+pub(crate) fn affine<A: Array>(layer: &Linear, x: &A) -> Result<A> {
+    let bias = layer.bias().map(|bias| x.parameter(bias)).transpose()?;
+    x.projected(&x.parameter(layer.weight())?, bias.as_ref())
 }
 
 /// x·Φ(x), exact form.
-pub(crate) fn gelu(x: &Tensor) -> Result<Tensor> {
-    match x.dtype() {
-        DType::F32 => activation(x, Activation::Gelu),
-        _ => x.gelu_erf(),
-    }
+pub(crate) fn gelu<A: Array>(x: &A) -> Result<A> {
+    x.activated(Activation::Gelu)
 }
-
-/// ε of every LayerNorm (PyTorch's default).
-const NORM_EPS: f64 = 1e-5;
 
 /// (x − mean)/√(variance + ε)·weight + bias over the last axis.
 #[derive(Clone, Debug)]
@@ -75,20 +67,12 @@ impl LayerNorm {
         })
     }
 
-    /// Normalises `x` `[.., dim]`. f64 uses tensor operations: the fused kernel has f32
-    /// only.
+    /// Normalises `x` `[.., dim]`.
     ///
     /// # Errors
     /// Another last dimension.
-    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        if x.dtype() == DType::F32 {
-            return ops::norm::layer_norm(x, &self.weight, &self.bias);
-        }
-        let x = x.broadcast_sub(&x.mean_keepdim(D::Minus1)?)?;
-        let variance = x.sqr()?.mean_keepdim(D::Minus1)?;
-        x.broadcast_div(&(variance + NORM_EPS)?.sqrt()?)?
-            .broadcast_mul(&self.weight)?
-            .broadcast_add(&self.bias)
+    pub fn forward<A: Array>(&self, x: &A) -> Result<A> {
+        x.layer_norm([&x.parameter(&self.weight)?, &x.parameter(&self.bias)?])
     }
 }
 
@@ -112,10 +96,10 @@ impl Block2 {
         })
     }
 
-    pub(crate) fn forward(&self, x: &Tensor) -> Result<Tensor> {
+    pub(crate) fn forward<A: Array>(&self, x: &A) -> Result<A> {
         let mut x = x.clone();
         for (lin, ln) in self.lin.iter().zip(&self.ln) {
-            x = ln.forward(&affine(lin, &x)?.relu()?)?;
+            x = ln.forward(&affine(lin, &x)?.activated(Activation::Relu)?)?;
         }
         Ok(x)
     }

@@ -193,6 +193,20 @@ impl<A: Array> BackboneOutput<A> {
         })
     }
 
+    /// Returns the feature map of `level`.
+    ///
+    /// # Errors
+    /// The backbone does not have `level`.
+    pub fn feature(&self, level: FeatureLevel) -> Result<&A> {
+        match self.features.iter().find(|(l, _)| *l == level) {
+            Some((_, map)) => Ok(map),
+            None => {
+                let have: Vec<_> = self.features.iter().map(|(l, _)| *l).collect();
+                bail!("feature level {level:?}: expected one of {have:?}")
+            }
+        }
+    }
+
     /// Returns the same arrays in host memory.
     ///
     /// # Errors
@@ -217,20 +231,6 @@ impl BackboneOutput {
     /// `b` is out of range.
     pub fn scene(&self, b: usize) -> Result<Self> {
         self.map(|t| t.narrow(0, b, 1))
-    }
-
-    /// Returns the feature map of `level`.
-    ///
-    /// # Errors
-    /// The backbone does not have `level`.
-    pub fn feature(&self, level: FeatureLevel) -> Result<&Tensor> {
-        match self.features.iter().find(|(l, _)| *l == level) {
-            Some((_, map)) => Ok(map),
-            None => {
-                let have: Vec<_> = self.features.iter().map(|(l, _)| *l).collect();
-                bail!("feature level {level:?}: expected one of {have:?}")
-            }
-        }
     }
 }
 

@@ -19,7 +19,8 @@ use super::embed::Descriptors;
 use super::mlp::{LayerNorm, affine, gelu, linear};
 use crate::abi::{HEAD_GEOMETRY_LEN, HEAD_STRIDE};
 use crate::config::{AMin, Config, SpgrHead};
-use crate::ops::columns::columns;
+use crate::ops::Array;
+use crate::ops::activation::Activation;
 use crate::ops::spgr::Rules;
 use candle_core::{Result, Tensor, bail};
 use candle_nn::{Init, Linear, VarBuilder};
@@ -141,8 +142,9 @@ impl Head {
     ///
     /// # Errors
     /// Shapes do not fit; r differs from the one of the parameters (`mlp2` and `pg`).
-    pub fn forward(&self, x: &Tensor, side: usize) -> Result<Tensor> {
-        let (n, k) = (x.dim(0)?, side * side);
+    pub fn forward<A: Array>(&self, x: &A, side: usize) -> Result<A> {
+        let [n, _] = x.sizes()?;
+        let k = side * side;
         let out = match &self.form {
             Form::Mlp2 { norm, lin0, lin1 } => {
                 let hidden = affine(lin0, &norm.forward(x)?)?;
@@ -151,25 +153,28 @@ impl Head {
             Form::Pg { lin, ln } => {
                 let mut x = x.clone();
                 for (i, ln) in ln.iter().enumerate() {
-                    x = affine(&lin[2 * i], &x)?.relu()?;
-                    x = ln.forward(&affine(&lin[2 * i + 1], &x)?.relu()?)?;
+                    x = affine(&lin[2 * i], &x)?.activated(Activation::Relu)?;
+                    x = affine(&lin[2 * i + 1], &x)?.activated(Activation::Relu)?;
+                    x = ln.forward(&x)?;
                 }
                 affine(&lin[4], &x)?
             }
             Form::Coord { norm, lin0, lin1, pos } => {
                 let x = affine(lin0, &norm.forward(x)?)?;
-                let positions = gelu(&affine(&pos[0], &posenc(side, &x)?)?)?;
+                let positions = x.constant(posenc(side), &[k, POSENC])?;
+                let positions = gelu(&affine(&pos[0], &positions)?)?;
                 let positions = affine(&pos[1], &positions)?;
                 // One child at a time, so that no tensor [n, K, hidden] exists.
                 let child = |i: usize| {
-                    let hidden = x.broadcast_add(&positions.narrow(0, i, 1)?)?;
+                    let hidden = x.plus(&positions.narrow(0, i, 1)?)?;
                     affine(lin1, &gelu(&hidden)?)
                 };
-                Tensor::cat(&(0..k).map(child).collect::<Result<Vec<_>>>()?, 1)?
+                let children = (0..k).map(child).collect::<Result<Vec<_>>>()?;
+                A::joined(&children.iter().collect::<Vec<_>>(), 1)?
             }
             Form::Polynomial { .. } => return self.for_side(side)?.forward(x, side),
         };
-        if out.elem_count() != n * k * self.outputs {
+        if out.count() != n * k * self.outputs {
             let expected = k * self.outputs;
             bail!("head: expected {expected} outputs for {k} children, got {:?}", out.dims());
         }
@@ -178,8 +183,8 @@ impl Head {
 }
 
 /// Positions of the r² sub-pixels in input px, (−½, ½)², with their sines and cosines:
-/// `[r², 18]`, dtype of `like`.
-fn posenc(side: usize, like: &Tensor) -> Result<Tensor> {
+/// `[r², 18]`.
+fn posenc(side: usize) -> Vec<f32> {
     let mut table = Vec::with_capacity(side * side * POSENC);
     for k in 0..side * side {
         let position = [k % side, k / side].map(|i| (i as f32 + 0.5) / side as f32 - 0.5);
@@ -191,7 +196,7 @@ fn posenc(side: usize, like: &Tensor) -> Result<Tensor> {
             }
         }
     }
-    Tensor::from_vec(table, (side * side, POSENC), like.device())?.to_dtype(like.dtype())
+    table
 }
 
 /// Factors of the layers of `polynomial` for each child: `[r², 4]` and `[r², 14]`, dtype of `like`.
@@ -254,11 +259,13 @@ impl Heads {
     ///
     /// # Errors
     /// Those of [`Head::forward`].
-    pub fn forward(&self, inputs: &Descriptors, side: usize) -> Result<Tensor> {
+    pub fn forward<A: Array>(&self, inputs: &Descriptors<A>, side: usize) -> Result<A> {
         let geometry = self.geometry.forward(&inputs.geometry, side)?;
         let appearance = self.appearance.forward(&inputs.appearance, side)?;
-        let flat = columns(&geometry.flatten(0, 1)?, &appearance.flatten(0, 1)?, None)?;
-        flat.reshape((geometry.dim(0)?, side * side, HEAD_STRIDE))
+        let [n, k, outputs] = geometry.sizes()?;
+        let rest = appearance.reshape((n * k, ()))?;
+        let flat = geometry.reshape((n * k, outputs))?.columns(&rest, None)?;
+        flat.reshape((n, k, HEAD_STRIDE))
     }
 }
 

@@ -10,13 +10,9 @@ use super::{BackboneOutput, Primaries, Views};
 use crate::abi::RasterOptions;
 use crate::camera::Camera;
 use crate::config::{Backbone, Config, FeatureLevel};
-#[cfg(feature = "gpu")]
-use crate::ops::Executor;
 use crate::ops::{Array, Backend};
 use candle_core::{Error, Result, Tensor, bail};
 use candle_nn::VarBuilder;
-#[cfg(feature = "gpu")]
-use std::sync::Arc;
 
 enum Encoder {
     Mvsplat(Box<Mvsplat>),
@@ -32,10 +28,6 @@ pub struct SubSplat {
     config: Config,
     encoder: Encoder,
     trunk: Trunk,
-    backend: Backend,
-    /// The GPU of `backend`, if it is one.
-    #[cfg(feature = "gpu")]
-    executor: Option<Arc<Executor>>,
 }
 
 /// The result of [`SubSplat::forward`] for one scene.
@@ -63,25 +55,12 @@ impl SubSplat {
             Backbone::Small(c) => Encoder::Small(Box::new(SmallBackbone::new(c, vb.pp("small"))?)),
         };
         let trunk = Trunk::new(config, &feature_channels(config), vb)?;
-        Ok(Self {
-            config: config.clone(),
-            encoder,
-            trunk,
-            backend: Backend::Cpu,
-            #[cfg(feature = "gpu")]
-            executor: None,
-        })
+        Ok(Self { config: config.clone(), encoder, trunk })
     }
 
-    /// Returns the model with the backbone's inference, attention gather, SPGR and rasterizer on
-    /// `backend`; in training, with the plane sweep instead of the whole backbone. Everything else
-    /// runs on the CPU.
+    /// Returns the model on `backend`: at inference the network and the rasterizer, in training
+    /// plane sweep, attention gather, SPGR and rasterizer. Everything else runs on the CPU.
     pub fn with_backend(mut self, backend: &Backend) -> Self {
-        self.backend = backend.clone();
-        #[cfg(feature = "gpu")]
-        {
-            self.executor = Executor::new(backend);
-        }
         match &mut self.encoder {
             Encoder::Mvsplat(encoder) => encoder.set_backend(backend),
             Encoder::Small(encoder) => encoder.set_backend(backend),
@@ -130,16 +109,12 @@ impl SubSplat {
             bail!("input images: expected sides that are multiples of {stride}, got {w}x{h}");
         }
         #[cfg(feature = "gpu")]
-        if let Some(executor) = &self.executor {
-            let pass = || {
-                let images = executor.upload(&views.images)?;
-                let mut trace = Trace::with_checkpoint(checkpoint);
-                self.encode_on(views, &images, &mut trace)?.to_host()
-            };
-            // After a failure of the device the CPU computes the backbone.
-            if let Some(result) = executor.attempt(&self.backend, pass) {
-                return result;
-            }
+        if let Some(result) = self.trunk.on_device(|executor| {
+            let images = executor.upload(&views.images)?;
+            let mut trace = Trace::with_checkpoint(checkpoint);
+            self.encode_on(views, &images, &mut trace)?.to_host()
+        }) {
+            return result;
         }
         self.encode_on(views, &views.images, &mut Trace::with_checkpoint(checkpoint))
     }
@@ -192,11 +167,31 @@ impl SubSplat {
     ) -> Result<Views> {
         match (&self.encoder, &self.config.backbone) {
             (Encoder::Small(network), Backbone::Small(c)) if c.estimate_depth_range => {
-                let trace = Trace::with_checkpoint(checkpoint);
-                depth_range::estimate_depth_range(network, views, self.config.stride(), &trace)
+                let (d, stride) = (network.candidates(), self.config.stride());
+                depth_range::estimate_depth_range(views, d, stride, |views| {
+                    self.depth_indices(network, views, &Trace::with_checkpoint(checkpoint))
+                })
             }
             _ => Ok(views.clone()),
         }
+    }
+
+    /// Candidate indices `[B·V, 1, H, W]` of the small backbone's depth.
+    fn depth_indices(
+        &self,
+        network: &SmallBackbone,
+        views: &Views,
+        trace: &Trace<'_>,
+    ) -> Result<Tensor> {
+        let mean = DisparityMean::AroundMode;
+        #[cfg(feature = "gpu")]
+        if let Some(result) = self.trunk.on_device(|executor| {
+            let images = executor.upload(&views.images)?;
+            network.depth_on(views, &images, mean, trace)?.index.to_host()
+        }) {
+            return result;
+        }
+        Ok(network.depth_on(views, &views.images, mean, trace)?.index)
     }
 
     /// Runs the backbone for training: with every gradient, and with its depth maps if it

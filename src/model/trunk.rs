@@ -22,12 +22,16 @@ use super::{BackboneOutput, Primaries, Views};
 use crate::abi::{RasterOptions, SPLAT_STRIDE, ShBasis, sh_coefficients};
 use crate::camera::Camera;
 use crate::config::{Config, FeatureLevel, ShInput, SpgrHead};
+#[cfg(feature = "gpu")]
+use crate::ops::Executor;
 use crate::ops::direct::{Footprint, rasterize_footprints, spgr_footprints};
-use crate::ops::spgr::{Rules, Spgr, spgr_into_on, spgr_on};
-use crate::ops::{Backend, rasterize_on};
+use crate::ops::spgr::{Rules, Spgr, spgr_on};
+use crate::ops::{Array, Backend, rasterize_on};
 use candle_core::{DType, Result, Tensor, bail};
 use candle_nn::{VarBuilder, VarMap};
 use rayon::prelude::*;
+#[cfg(feature = "gpu")]
+use std::sync::Arc;
 
 /// Parents per chunk at inference. A `[256, 128]` activation fits into a core's L2 cache.
 /// It also stays below 65,536 elements, from which on candle uses a thread pool of its own
@@ -66,19 +70,23 @@ pub struct Trunk {
     /// `None` if SPGR is off.
     parts: Option<Parts>,
     backend: Backend,
+    /// The GPU of `backend`, if it is one.
+    #[cfg(feature = "gpu")]
+    executor: Option<Arc<Executor>>,
 }
 
-/// Tensors that all chunks of one scene share.
-struct Scene<'a> {
+/// Arrays that all chunks of one scene share.
+#[derive(Clone)]
+struct Scene<'a, A = Tensor> {
     views: &'a Views,
     frames: Frames,
-    means: Tensor,
-    quats_wxyz: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    sh_input: Tensor,
+    means: A,
+    quats_wxyz: A,
+    scales: A,
+    opacities: A,
+    sh_input: A,
     per_view: usize,
-    prepared: Option<Prepared>,
+    prepared: Option<Prepared<A>>,
     /// The heads for the r of `rules`.
     heads: Heads,
     rules: Rules,
@@ -92,11 +100,11 @@ struct Span {
 }
 
 /// Input of SPGR for one chunk.
-struct Records {
+struct Records<A = Tensor> {
     /// `[n, K, 11]`: head records.
-    head: Tensor,
+    head: A,
     /// `[n, 11]`: packed parents.
-    parents: Tensor,
+    parents: A,
 }
 
 /// Division of the parents into chunks, and the mode of their layers.
@@ -143,12 +151,24 @@ impl Trunk {
             None
         };
         let rules = rules(config, config.upscale);
-        Ok(Self { config: config.clone(), rules, parts, backend: Backend::Cpu })
+        Ok(Self {
+            config: config.clone(),
+            rules,
+            parts,
+            backend: Backend::Cpu,
+            #[cfg(feature = "gpu")]
+            executor: None,
+        })
     }
 
-    /// Sets the backend of the following gathers, SPGR calls and renders.
+    /// Sets the backend of the following calls: at inference of all operations, in training of
+    /// gathers and SPGR.
     pub fn set_backend(&mut self, backend: &Backend) {
         self.backend = backend.clone();
+        #[cfg(feature = "gpu")]
+        {
+            self.executor = Executor::new(backend);
+        }
         if let Some(agg) = self.parts.as_mut().and_then(|p| p.aggregation.as_mut()) {
             agg.set_backend(backend);
         }
@@ -211,11 +231,36 @@ impl Trunk {
         checkpoint: Checkpoint<'_>,
     ) -> Result<Children> {
         let Some(parts) = self.parts() else { return self.parents(views, primaries) };
+        let how = Chunking { size: self.chunk_size(), mode: Mode::Infer, checkpoint };
+        let sh = || -> Result<_> { Ok((interleaved(&primaries.sh)?, primaries.sh_basis)) };
+        #[cfg(feature = "gpu")]
+        if let Some(result) = self.on_device(|executor| {
+            let like = |t: &Tensor| executor.upload(t);
+            let scene = self.scene_on(parts, views, backbone, primaries, like)?;
+            checkpoint()?;
+            self.children(parts, &scene, sh()?, &how)
+        }) {
+            return result;
+        }
         let scene = self.scene(parts, views, backbone, primaries)?;
         checkpoint()?;
-        let sh = interleaved(&primaries.sh)?;
-        let how = Chunking { size: self.chunk_size(), mode: Mode::Infer, checkpoint };
-        self.children(parts, &scene, sh, primaries.sh_basis, &how)
+        self.children(parts, &scene, sh()?, &how)
+    }
+
+    /// Returns the GPU of the trunk's backend, if it is one.
+    #[cfg(feature = "gpu")]
+    pub fn executor(&self) -> Option<&Arc<Executor>> {
+        self.executor.as_ref()
+    }
+
+    /// Runs `f` on the GPU; `None` where there is none or it failed, and the CPU takes over.
+    #[cfg(feature = "gpu")]
+    pub(super) fn on_device<R>(
+        &self,
+        f: impl FnOnce(&Arc<Executor>) -> Result<R>,
+    ) -> Option<Result<R>> {
+        let executor = self.executor.as_ref()?;
+        executor.attempt(&self.backend, || f(executor))
     }
 
     /// Returns the number of steps of [`Trunk::forward_with`].
@@ -233,18 +278,17 @@ impl Trunk {
     }
 
     /// Children with coefficients `sh`, outside any graph.
-    fn children(
+    fn children<A: Array + Sync>(
         &self,
         parts: &Parts,
-        scene: &Scene,
-        sh: Tensor,
-        sh_basis: ShBasis,
+        scene: &Scene<'_, A>,
+        (sh, sh_basis): (Tensor, ShBasis),
         how: &Chunking<'_>,
     ) -> Result<Children> {
         let (k, lanes) = (scene.rules.children(), scene.rules.gain_channels());
-        let n = scene.means.dim(0)?;
-        if scene.means.dtype() != DType::F32 {
-            bail!("primaries: expected f32, got {:?}", scene.means.dtype());
+        let [n, _] = scene.means.sizes()?;
+        if sh.dtype() != DType::F32 {
+            bail!("primaries: expected f32, got {:?}", sh.dtype());
         }
         let mut rows = vec![0f32; n * k * SPLAT_STRIDE];
         let mut gains = vec![0f32; n * k * lanes];
@@ -259,14 +303,14 @@ impl Trunk {
         }
         let run = |Job { span, rows, gains }: Job| {
             let Records { head, parents } = self.records(parts, scene, span, how.mode)?;
-            spgr_into_on(&self.backend, &head, &parents, &scene.call(span), (rows, gains))?;
+            head.write_children(&parents, &scene.call(span), &self.backend, rows, gains)?;
             (how.checkpoint)()
         };
         match self.backend.is_cpu() {
             true => jobs.into_par_iter().try_for_each(run)?,
             false => jobs.into_iter().try_for_each(run)?,
         }
-        let device = scene.means.device();
+        let device = sh.device();
         let gain = Tensor::from_vec(gains, n * k * lanes, device)?;
         Ok(Children {
             rows: Tensor::from_vec(rows, (n * k, SPLAT_STRIDE), device)?,
@@ -374,12 +418,25 @@ impl Trunk {
         backbone: &BackboneOutput,
         primaries: &Primaries,
     ) -> Result<Scene<'a>> {
+        self.scene_on(parts, views, backbone, primaries, |t| Ok(t.clone()))
+    }
+
+    /// [`Trunk::scene`] on the executor to which `like` copies tensors.
+    fn scene_on<'a, A: Array>(
+        &self,
+        parts: &Parts,
+        views: &'a Views,
+        backbone: &BackboneOutput,
+        primaries: &Primaries,
+        like: impl Fn(&Tensor) -> Result<A>,
+    ) -> Result<Scene<'a, A>> {
         check_single(views, primaries)?;
         // Contiguous once, so that no chunk copies its rows out of wider ones.
-        let own = |t: &Tensor| t.squeeze(0)?.contiguous();
+        let own = |t: &Tensor| like(&t.squeeze(0)?.contiguous()?);
+        let (_, n, _) = primaries.means.dims3()?;
         let means = own(&primaries.means)?;
-        let n = means.dim(0)?;
-        let frames = Frames::new(&views.cameras[0], means.dtype(), means.device())?;
+        let (dtype, device) = (primaries.means.dtype(), primaries.means.device());
+        let frames = Frames::new(&views.cameras[0], dtype, device)?;
         let sh = match self.config.embed.sh {
             ShInput::World => &primaries.sh,
             ShInput::Camera => &primaries.sh_camera,
@@ -390,7 +447,10 @@ impl Trunk {
             bail!("primaries SH: expected [1, {n}, 3, {expected}], got {:?}", sh.dims());
         }
         let prepared = match &parts.aggregation {
-            Some(agg) => Some(agg.prepare(views, &frames, backbone, primaries)?),
+            Some(agg) => {
+                let feature = |level| like(backbone.feature(level)?);
+                Some(agg.prepare(views, &frames, feature, &means)?)
+            }
             None => None,
         };
         Ok(Scene {
@@ -399,8 +459,8 @@ impl Trunk {
             means,
             quats_wxyz: own(&primaries.quats_wxyz)?,
             scales: own(&primaries.scales)?,
-            opacities: own(&primaries.opacities)?.unsqueeze(1)?,
-            sh_input: sh.reshape((n, 3 * d))?,
+            opacities: own(&primaries.opacities)?.reshape((n, 1))?,
+            sh_input: like(&sh.reshape((n, 3 * d))?)?,
             per_view: primaries.per_view,
             prepared,
             heads: parts.heads.for_side(self.rules.side)?,
@@ -409,18 +469,24 @@ impl Trunk {
     }
 
     /// Records of the parents in `span`.
-    fn records(&self, parts: &Parts, scene: &Scene, span: Span, mode: Mode) -> Result<Records> {
+    fn records<A: Array>(
+        &self,
+        parts: &Parts,
+        scene: &Scene<'_, A>,
+        span: Span,
+        mode: Mode,
+    ) -> Result<Records<A>> {
         self.records_of(parts, scene, scene.chunk(span)?, mode)
     }
 
-    fn records_of(
+    fn records_of<A: Array>(
         &self,
         parts: &Parts,
-        scene: &Scene,
-        parents: ParentChunk,
+        scene: &Scene<'_, A>,
+        parents: ParentChunk<A>,
         mode: Mode,
-    ) -> Result<Records> {
-        let z: Descriptors = parts.embeddings.forward(&parents, &scene.frames)?;
+    ) -> Result<Records<A>> {
+        let z: Descriptors<A> = parts.embeddings.forward(&parents, &scene.frames)?;
         let inputs = match (&parts.aggregation, &scene.prepared) {
             (Some(agg), Some(prepared)) => {
                 let f = agg.forward(prepared, &parents, &scene.frames, &z, mode)?;
@@ -452,8 +518,8 @@ impl Trunk {
     }
 }
 
-impl Scene<'_> {
-    fn chunk(&self, Span { first, len }: Span) -> Result<ParentChunk> {
+impl<A: Array> Scene<'_, A> {
+    fn chunk(&self, Span { first, len }: Span) -> Result<ParentChunk<A>> {
         Ok(ParentChunk {
             first,
             source: first / self.per_view,

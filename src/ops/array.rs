@@ -6,13 +6,16 @@
 
 use super::activation::{self as pointwise, Activation};
 use super::attention::{Labels, attention};
+use super::attention_gather::{Deferred, Gather, attention_gather_deferred, occlusion_gate};
+use super::attributes::{Attributes, attributes};
 use super::feed_forward::feed_forward;
 use super::plane_sweep::Sweep;
 use super::small::{self, Candidates, MeanOver, Start};
+use super::spgr::{Spgr, spgr_into_on};
 use super::{Backend, columns, conv2d, conv3d, join, linear, matching, moves, norm, resize};
 use crate::camera::Camera;
 use candle_core::shape::ShapeWithOneHole;
-use candle_core::{DType, Result, Tensor, bail};
+use candle_core::{D, DType, Result, Tensor, bail};
 
 /// Sizes of a convolution: stride and zero padding of every axis, px.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -41,6 +44,12 @@ pub trait Array: Clone + std::fmt::Debug {
     /// # Errors
     /// A length that differs from the shape; errors of the device.
     fn constant(&self, values: Vec<f32>, dims: &[usize]) -> Result<Self>;
+
+    /// Returns a tensor on this array's executor.
+    ///
+    /// # Errors
+    /// Errors of the device.
+    fn like(&self, tensor: &Tensor) -> Result<Self>;
 
     /// Returns the elements in host memory.
     ///
@@ -104,7 +113,14 @@ pub trait Array: Clone + std::fmt::Debug {
     fn reciprocal(&self) -> Result<Self>;
 
     /// Clamps to [low, high].
-    fn clamped(&self, low: f32, high: f32) -> Result<Self>;
+    fn clamped(&self, low: f64, high: f64) -> Result<Self>;
+
+    /// Returns x where the element of `other` is above `least`, else `fill`; sizes of 1 of `other`
+    /// are repeated.
+    fn where_above(&self, other: &Self, least: f64, fill: f64) -> Result<Self>;
+
+    /// Repeats sizes of 1 until the dimensions are `dims`.
+    fn expanded(&self, dims: &[usize]) -> Result<Self>;
 
     /// Computes a + b; sizes of 1 of `other` are repeated.
     fn plus(&self, other: &Self) -> Result<Self>;
@@ -216,6 +232,34 @@ pub trait Array: Clone + std::fmt::Debug {
     /// Computes opacity factors from images `self` and distances.
     fn cross_check(&self, cameras: &[Vec<Camera>], distances: &Self) -> Result<Self>;
 
+    /// Computes the attributes of packed rows `[N, 11]`.
+    fn attributes(&self, rules: Attributes) -> Result<Self>;
+
+    /// Computes the attention gather from maps `self`; `backend` executes it for host tensors.
+    fn attention_gather(
+        &self,
+        query: &Self,
+        points: &Self,
+        gather: Gather,
+        deferred: Option<&Deferred>,
+        backend: &Backend,
+    ) -> Result<Self>;
+
+    /// Computes the visibility `[N, V]` of points `self` `[N, V, 2]` with camera z `[N, V]` before
+    /// the surfaces `depths` `[V, H, W]`, without a gradient.
+    fn occlusion(&self, z: &Self, depths: &Self) -> Result<Self>;
+
+    /// Writes the children of head records `self` and `parents` to `rows` and `gains`; `backend`
+    /// computes them for host tensors.
+    fn write_children(
+        &self,
+        parents: &Self,
+        call: &Spgr,
+        backend: &Backend,
+        rows: &mut [f32],
+        gains: &mut [f32],
+    ) -> Result<()>;
+
     /// Returns the number of elements.
     fn count(&self) -> usize {
         self.dims().iter().product()
@@ -244,6 +288,10 @@ impl Array for Tensor {
 
     fn constant(&self, values: Vec<f32>, dims: &[usize]) -> Result<Self> {
         Tensor::from_vec(values, dims, self.device())?.to_dtype(self.dtype())
+    }
+
+    fn like(&self, tensor: &Tensor) -> Result<Self> {
+        tensor.to_dtype(self.dtype())
     }
 
     fn to_host(&self) -> Result<Tensor> {
@@ -307,8 +355,20 @@ impl Array for Tensor {
         self.recip()
     }
 
-    fn clamped(&self, low: f32, high: f32) -> Result<Self> {
-        self.clamp(low, high)
+    fn clamped(&self, low: f64, high: f64) -> Result<Self> {
+        match high == f64::INFINITY {
+            true => self.maximum(low),
+            false => self.clamp(low, high),
+        }
+    }
+
+    fn where_above(&self, other: &Self, least: f64, fill: f64) -> Result<Self> {
+        let above = other.gt(least)?.broadcast_as(self.shape())?;
+        above.where_cond(self, &self.zeros_like()?.affine(1.0, fill)?)
+    }
+
+    fn expanded(&self, dims: &[usize]) -> Result<Self> {
+        self.broadcast_as(dims)
     }
 
     fn plus(&self, other: &Self) -> Result<Self> {
@@ -339,7 +399,7 @@ impl Array for Tensor {
     }
 
     fn largest(&self) -> Result<Self> {
-        self.max_keepdim(candle_core::D::Minus1)
+        self.max_keepdim(D::Minus1)
     }
 
     fn weighted_sum(&self, weights: &Self) -> Result<Self> {
@@ -382,7 +442,15 @@ impl Array for Tensor {
     }
 
     fn layer_norm(&self, [weight, bias]: [&Self; 2]) -> Result<Self> {
-        norm::layer_norm(self, weight, bias)
+        if self.dtype() == DType::F32 {
+            return norm::layer_norm(self, weight, bias);
+        }
+        // The fused kernel has f32 only.
+        let x = self.broadcast_sub(&self.mean_keepdim(D::Minus1)?)?;
+        let variance = x.sqr()?.mean_keepdim(D::Minus1)?;
+        x.broadcast_div(&(variance + norm::EPS)?.sqrt()?)?
+            .broadcast_mul(weight)?
+            .broadcast_add(bias)
     }
 
     fn resized(&self, [h, w]: [usize; 2], activation: Option<Activation>) -> Result<Self> {
@@ -405,7 +473,10 @@ impl Array for Tensor {
     }
 
     fn channels_last(&self) -> Result<Self> {
-        moves::channels_last(self)
+        match self.dtype() {
+            DType::F32 => moves::channels_last(self),
+            _ => self.flatten_from(2)?.transpose(1, 2)?.contiguous(),
+        }
     }
 
     fn columns(&self, second: &Self, third: Option<&Self>) -> Result<Self> {
@@ -469,5 +540,35 @@ impl Array for Tensor {
 
     fn cross_check(&self, cameras: &[Vec<Camera>], distances: &Self) -> Result<Self> {
         small::cross_check(self, cameras, distances)
+    }
+
+    fn attributes(&self, rules: Attributes) -> Result<Self> {
+        attributes(self, rules)
+    }
+
+    fn attention_gather(
+        &self,
+        query: &Self,
+        points: &Self,
+        gather: Gather,
+        deferred: Option<&Deferred>,
+        backend: &Backend,
+    ) -> Result<Self> {
+        attention_gather_deferred(backend, self, query, points, gather, deferred)
+    }
+
+    fn occlusion(&self, z: &Self, depths: &Self) -> Result<Self> {
+        occlusion_gate(self, z, depths)
+    }
+
+    fn write_children(
+        &self,
+        parents: &Self,
+        call: &Spgr,
+        backend: &Backend,
+        rows: &mut [f32],
+        gains: &mut [f32],
+    ) -> Result<()> {
+        spgr_into_on(backend, self, parents, call, (rows, gains))
     }
 }

@@ -5,10 +5,15 @@
 use super::activation::Activation;
 use super::array::{Array, ConvSteps};
 use super::attention::{Labels, PENALTY};
+use super::attention_gather::{Deferred, Gather};
+use super::attributes::{Attributes, Frame};
 use super::plane_sweep::Sweep;
 use super::small::{Candidates, MeanOver, Start};
+use super::spgr::{Spgr, finite};
 use super::{Backend, matching};
+use crate::abi::{AttributesUniform, MuInput, SPLAT_STRIDE};
 use crate::camera::Camera;
+use crate::cpu::attention_gather::OCCLUSION_TOLERANCE;
 use crate::cpu::small::cross_check;
 use crate::gpu::{
     self, AttentionCall, ConvolutionCall, CrossCheckCall, Function, GpuError, HeadOutputCall,
@@ -75,6 +80,11 @@ impl Executor {
             }
             _ => Some(result),
         }
+    }
+
+    /// Returns the recorder of all operations, which counts them.
+    pub fn recorder(&self) -> &Arc<Recorder> {
+        &self.recorder
     }
 
     /// Copies `tensor`, f32, to the device.
@@ -176,6 +186,10 @@ impl Array for DeviceArray {
         self.of(self.executor.recorder.upload(&values, dims))
     }
 
+    fn like(&self, tensor: &Tensor) -> Result<Self> {
+        self.executor.upload(tensor)
+    }
+
     fn to_host(&self) -> Result<Tensor> {
         let values = self.executor.checked(self.array.to_vec())?;
         Tensor::from_vec(values, self.dims(), &candle_core::Device::Cpu)
@@ -235,8 +249,16 @@ impl Array for DeviceArray {
         self.map(Function::Reciprocal)
     }
 
-    fn clamped(&self, low: f32, high: f32) -> Result<Self> {
-        self.map(Function::Clamp(low, high))
+    fn clamped(&self, low: f64, high: f64) -> Result<Self> {
+        self.map(Function::Clamp(low as f32, high.min(f64::from(f32::MAX)) as f32))
+    }
+
+    fn where_above(&self, other: &Self, least: f64, fill: f64) -> Result<Self> {
+        self.with(other, Function::WhereAbove(least as f32, fill as f32))
+    }
+
+    fn expanded(&self, dims: &[usize]) -> Result<Self> {
+        self.of(self.array.expanded(dims))
     }
 
     fn plus(&self, other: &Self) -> Result<Self> {
@@ -445,5 +467,77 @@ impl Array for DeviceArray {
             behind: cross_check::BEHIND,
         };
         self.of(self.array.cross_check(&distances.array, call))
+    }
+
+    fn attributes(&self, rules: Attributes) -> Result<Self> {
+        self.of(self.array.attributes(attributes_uniform(&rules)))
+    }
+
+    fn attention_gather(
+        &self,
+        query: &Self,
+        points: &Self,
+        gather: Gather,
+        _deferred: Option<&Deferred>,
+        _backend: &Backend,
+    ) -> Result<Self> {
+        self.of(self.array.gather(&query.array, &points.array, &gather))
+    }
+
+    fn occlusion(&self, z: &Self, depths: &Self) -> Result<Self> {
+        self.of(self.array.occlusion(&z.array, &depths.array, OCCLUSION_TOLERANCE))
+    }
+
+    fn write_children(
+        &self,
+        parents: &Self,
+        call: &Spgr,
+        _backend: &Backend,
+        rows: &mut [f32],
+        gains: &mut [f32],
+    ) -> Result<()> {
+        let k = call.rules.children();
+        let n = parents.count() / SPLAT_STRIDE;
+        let expected = [n * k * SPLAT_STRIDE, n * k * call.rules.gain_channels()];
+        if [rows.len(), gains.len()] != expected {
+            let got = [rows.len(), gains.len()];
+            bail!("spgr: expected buffers of {expected:?} floats, got {got:?}");
+        }
+        let made = self.array.spgr(&parents.array, &call.on_gpu(&[], &[]));
+        let host = |array: &gpu::DeviceArray| self.executor.checked(array.to_vec());
+        for (to, from) in [&mut *rows, &mut *gains].into_iter().zip(self.executor.checked(made)?) {
+            to.copy_from_slice(&host(&from)?);
+        }
+        if rows.iter().chain(&*gains).any(|v| !v.is_finite()) {
+            finite(call, &host(&self.array)?, &host(&parents.array)?, rows, gains)?;
+        }
+        Ok(())
+    }
+}
+
+/// `rules` as the kernel reads them.
+fn attributes_uniform(rules: &Attributes) -> AttributesUniform {
+    let rows = |frame: &Frame| -> [[f32; 4]; 3] {
+        std::array::from_fn(|i| {
+            let [x, y, z] = frame.rotation[i];
+            [x, y, z, frame.position[i]].map(|v| v as f32)
+        })
+    };
+    let frame = rules.frame.unwrap_or(rules.source);
+    AttributesUniform {
+        frame: rows(&frame),
+        turn: frame.turn.map(|row| row.map(|v| v as f32)),
+        source: rows(&rules.source),
+        parents: 0,
+        framed: u32::from(rules.frame.is_some()),
+        ray: u32::from(rules.position == MuInput::RayLogz),
+        log_px: u32::from(rules.log_px.is_some()),
+        logit: u32::from(rules.logit.is_some()),
+        log_focal: rules.log_px.map_or(0.0, |focal| focal.ln() as f32),
+        logit_low: rules.logit.map_or(0.0, |most| (1.0 / (1.0 + most.exp())) as f32),
+        z_min: rules.z_min as f32,
+        slope_max: rules.slope_max as f32,
+        scale_min: rules.scale_min as f32,
+        ..AttributesUniform::default()
     }
 }

@@ -2,7 +2,9 @@
 //! no learned parameter precedes them, so they have no gradient.
 
 use crate::camera::Camera;
-use crate::cpu::matching::{self, PlaneWarp, Pyramid};
+#[cfg(feature = "gpu")]
+use crate::cpu::matching::PlaneWarp;
+use crate::cpu::matching::{self, Pyramid};
 use candle_core::{DType, Result, Tensor, bail};
 use rayon::prelude::*;
 

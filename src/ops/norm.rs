@@ -7,7 +7,7 @@ use crate::cpu::norm::{self as cpu, Rows, Saved};
 use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Tensor, bail};
 
 /// ε of every normalisation (PyTorch's default).
-const EPS: f32 = 1e-5;
+pub(super) const EPS: f64 = 1e-5;
 
 /// Over the channels of each of `groups` groups and all pixels: `x` `[B, C, …]`,
 /// `weight` and `bias` `[C]`.
@@ -46,7 +46,7 @@ pub fn group_norm_then(
         );
     }
     let run = dims[2..].iter().product();
-    let rows = Rows { len: c / groups * run, run, groups, eps: EPS, activation };
+    let rows = Rows { len: c / groups * run, run, groups, eps: EPS as f32, activation };
     normalise(x, rows, Some((weight, bias)))
 }
 
@@ -64,7 +64,7 @@ pub fn instance_norm(x: &Tensor) -> Result<Tensor> {
 /// As [`instance_norm`].
 pub fn instance_norm_then(x: &Tensor, activation: Option<Activation>) -> Result<Tensor> {
     let (_, _, h, w) = x.dims4()?;
-    normalise(x, Rows { len: h * w, run: h * w, groups: 1, eps: EPS, activation }, None)
+    normalise(x, Rows { len: h * w, run: h * w, groups: 1, eps: EPS as f32, activation }, None)
 }
 
 /// Over the last dimension: `x` `[…, C]`, `weight` and `bias` `[C]`.
@@ -76,7 +76,7 @@ pub fn layer_norm(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> 
     if x.dims().last() != Some(&c) {
         bail!("layer norm: expected x [.., {c}], got {:?}", x.dims());
     }
-    let rows = Rows { len: c, run: 1, groups: 1, eps: EPS, activation: None };
+    let rows = Rows { len: c, run: 1, groups: 1, eps: EPS as f32, activation: None };
     normalise(x, rows, Some((weight, bias)))
 }
 

@@ -168,7 +168,7 @@ fn run<T: Number>(
 
 /// Refuses numbers that are not finite, on the way in (an infinite opacity would be
 /// capped, an infinite gain squashed: wrong results without an error) and on the way out.
-fn finite<T: Number>(
+pub(super) fn finite<T: Number>(
     call: &Spgr,
     head: &[T],
     parents: &[T],
@@ -281,7 +281,11 @@ fn backward<T: Number>(
 
 #[cfg(feature = "gpu")]
 impl Spgr {
-    fn on_gpu<'a>(&'a self, head: &'a [f32], parents: &'a [f32]) -> crate::gpu::SpgrArgs<'a> {
+    pub(super) fn on_gpu<'a>(
+        &'a self,
+        head: &'a [f32],
+        parents: &'a [f32],
+    ) -> crate::gpu::SpgrArgs<'a> {
         let Self { rules, cameras, near, per_view, first } = self;
         let (per_view, first) = (*per_view, *first);
         crate::gpu::SpgrArgs { rules, cameras, near, per_view, first, head, parents }

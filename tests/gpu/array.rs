@@ -1,15 +1,20 @@
 //! Operations of the network in device memory against those of candle tensors.
 
 use subsplat_test_support::cpu_against_gpu::{Random, assert_matches_cpu};
+use subsplat_test_support::gather::base;
 use subsplat_test_support::gpu::gpu;
 
-use candle_core::{Device, Result, Tensor};
+use candle_core::{DType, Device, Result, Tensor};
 use glam::{Mat4, Quat, Vec3};
 use std::sync::Arc;
+use subsplat::abi::MuInput;
 use subsplat::camera::{Camera, Intrinsics};
+use subsplat::config::MaskMode;
 use subsplat::model::Backend;
+use subsplat::model::geometry::Frames;
 use subsplat::ops::activation::Activation;
 use subsplat::ops::attention::Labels;
+use subsplat::ops::attributes::Attributes;
 use subsplat::ops::plane_sweep::{Sweep, pair, relative_pose};
 use subsplat::ops::small::{Candidates, MeanOver, Start};
 use subsplat::ops::{Array, ConvSteps, Executor};
@@ -301,6 +306,64 @@ fn parts_of_the_small_backbone() {
     agree!(gpu, "ray distance", TOLERANCE, |fine| {
         fine.absolute()?.ray_distance(ranges.clone(), lengths.clone())
     });
+}
+
+#[test]
+fn parts_of_the_trunk() {
+    let Some(gpu) = executor() else { return };
+    let r = &mut Random(13);
+    let n = 70;
+    // Two views of 35 parents; some points lie behind a camera, some opacities are 0 and 1.
+    let mut rows = r.many(n * 11, -1.0, 1.0);
+    for (i, row) in rows.chunks_exact_mut(11).enumerate() {
+        row[2] = if i % 9 == 0 { -0.5 } else { 2.0 + row[2] };
+        row[7..10].iter_mut().for_each(|s| *s = 1e-3 + s.abs());
+        row[10] = [0.0, 1.0, 0.5 + 0.4 * row[10]][i % 3];
+    }
+    let rows = Tensor::from_vec(rows, (n, 11), &Device::Cpu).unwrap();
+    let all = cameras([24, 32], 2);
+    let frames = Frames::new(&all, DType::F32, &Device::Cpu).unwrap();
+    let [first, second] = [frames.0[0].numbers(), frames.0[1].numbers()];
+    let rules = Attributes {
+        frame: Some(second),
+        source: first,
+        log_px: Some(32.0),
+        position: MuInput::RayLogz,
+        logit: Some(6.0),
+        z_min: 1e-3,
+        slope_max: 100.0,
+        scale_min: 1e-12,
+    };
+    let plain =
+        Attributes { frame: None, log_px: None, position: MuInput::Raw, logit: None, ..rules };
+    for rules in [rules, plain] {
+        agree!(gpu, "attributes", TOLERANCE, |rows| rows.attributes(rules));
+    }
+    for mask in [MaskMode::Renorm, MaskMode::PgClamp] {
+        for i in 0..2 {
+            agree!(gpu, "projected points", 1e-5, |rows| {
+                let (at, z) = frames.project(&rows.narrow(1, 0, 3)?.reshape((n, 1, 3))?, mask)?;
+                if i == 0 { at.reshape((n, 2, 2)) } else { z.reshape((n, 2, 1)) }
+            });
+        }
+    }
+    let places = Tensor::from_vec(r.many(4 * n, -0.2, 1.2), (n, 2, 2), &Device::Cpu).unwrap();
+    let z = Tensor::from_vec(r.many(2 * n, -0.2, 3.0), (n, 2), &Device::Cpu).unwrap();
+    let maps = Tensor::from_vec(r.many(2 * 6 * 8, 0.5, 3.0), (2, 6, 8), &Device::Cpu).unwrap();
+    agree!(gpu, "occlusion", 2e-5, |places, z, maps| places.occlusion(z, maps));
+    let row = noise(r, &[1, 5]);
+    agree!(gpu, "expanded", COPIED, |row| row.expanded(&[7, 5]));
+    let gather = base();
+    let maps = noise(r, &[70, gather.stride]);
+    let query = noise(r, &[n, gather.query_width()]);
+    let points = Tensor::from_vec(r.many(4 * n, -0.2, 1.2), (n, 2, 1, 2), &Device::Cpu).unwrap();
+    agree!(gpu, "gather", 1e-5, |maps, query, points| {
+        maps.attention_gather(query, points, gather.clone(), None, &Backend::Cpu)
+    });
+    let text = gpu.upload(&noise(r, &[3, 11])).unwrap();
+    let text =
+        text.attention_gather(&text, &text, gather, None, &Backend::Cpu).unwrap_err().to_string();
+    assert!(text.contains("attention_gather"), "{text}");
 }
 
 /// More calls than one submit holds, with memory that returns to the pool between them.

@@ -6,7 +6,10 @@ use subsplat_test_support::whole;
 use adapter::gpu;
 use subsplat::config::Preset;
 use subsplat::model::Backend;
-use whole::{compare, light, lively, plain, run, shoot};
+use subsplat::model::compare::compare;
+use subsplat::model::weights::Weights;
+use subsplat_test_support::shared;
+use whole::{light, lively, plain, run, shoot};
 
 /// Fraction of rows that may differ: a depth whose window around the mode begins one candidate
 /// farther moves its pixel's children.
@@ -41,7 +44,7 @@ fn check(mvsplat: bool) {
         rows.filter(|(g, e)| (0..11).any(|k| !((g[k] - e[k]).abs() <= TOLERANCE * largest[k])));
     let share = off.count() as f64 / expected.len() as f64;
     let camera = shoot.photos[0].camera();
-    let decibels = compare(&expected, &got, camera, &options);
+    let decibels = whole::compare(&expected, &got, camera, &options);
     eprintln!("mvsplat {mvsplat}: {share:.4} of the rows moved, {decibels:.1} dB");
     assert!(share < MOVED_MAX, "{share} of the rows moved");
     assert!(decibels > 45.0, "{decibels} dB");
@@ -55,4 +58,18 @@ fn small() {
 #[test]
 fn mvsplat() {
     check(true);
+}
+
+/// The encoder with MVSplat's weights, stage by stage, against the outputs of the public MVSplat.
+#[test]
+fn every_stage_of_mvsplat_agrees_with_the_reference() {
+    let Some(gpu) = gpu() else { return };
+    let Some(weights) = shared("golden/mvsplat_weights.safetensors") else { return };
+    let Some(reference) = shared("golden/mvsplat_64x64_b1v2.safetensors") else { return };
+    let backend = Backend::from(gpu);
+    let report = compare(&Weights::load(&weights).unwrap(), &reference, &backend).unwrap();
+    let bad: Vec<_> = report.rows.iter().filter(|row| !row.ok).collect();
+    assert!(report.ok(), "{bad:#?}");
+    assert_eq!(report.not_produced, [""; 0]);
+    assert_eq!(report.rows.len(), 99);
 }

@@ -54,6 +54,7 @@ const CPU_STEMS: &[(&str, &str)] = &[
     ("raw_matching_scores", "matching"),
     ("reduce", "moves"),
     ("select_rows", "moves"),
+    ("occlusion", "attention_gather"),
 ];
 
 /// Returns name and value of every constant of kernels/shared/abi.wgsl.
@@ -121,6 +122,7 @@ macro_rules! uniforms {
 const UNIFORMS: &[Uniform] = uniforms!(
     AttentionGatherUniform,
     AttentionUniform,
+    AttributesUniform,
     ConvexUniform,
     ConvolutionUniform,
     CrossCheckUniform,
@@ -129,6 +131,7 @@ const UNIFORMS: &[Uniform] = uniforms!(
     HeadOutputUniform,
     InvertUniform,
     LinearUniform,
+    OcclusionUniform,
     NormUniform,
     PlaneSweepUniform,
     RasterUniform,

@@ -71,9 +71,20 @@ fn build(keys: &subsplat::config::Aggregation, seed: u64) -> (Aggregation, VarMa
     (agg, variables)
 }
 
+/// The feature maps of a backbone, by their levels.
+fn maps_of(backbone: &BackboneOutput) -> impl Fn(FeatureLevel) -> candle_core::Result<Tensor> {
+    |level| backbone.feature(level).cloned()
+}
+
+/// `[N, 3]`.
+fn means_of(primaries: &Primaries) -> Tensor {
+    primaries.means.squeeze(0).unwrap()
+}
+
 fn run(agg: &Aggregation, x: &Fixture, mode: Mode) -> [Tensor; 2] {
     let views = views(&x.cameras);
-    let prepared = agg.prepare(&views, &x.frames, &x.backbone, &x.primaries).unwrap();
+    let prepared =
+        agg.prepare(&views, &x.frames, maps_of(&x.backbone), &means_of(&x.primaries)).unwrap();
     let z = Descriptors { geometry: x.z[0].clone(), appearance: x.z[1].clone() };
     let f = agg.forward(&prepared, &x.parents, &x.frames, &z, mode).unwrap();
     [f.geometry, f.appearance]
@@ -378,7 +389,7 @@ fn learned_gates_have_a_limit_of_views() {
         let mut keys = paper();
         (keys.gate_views, keys.ablations.gate, keys.ablations.op) = (2, gate, op);
         let (agg, _) = build(&keys, 14);
-        let got = agg.prepare(&views(&three), &frames, &backbone, &primaries);
+        let got = agg.prepare(&views(&three), &frames, maps_of(&backbone), &means_of(&primaries));
         match got {
             Ok(_) => assert!(fits, "{gate:?} {op:?}"),
             Err(e) => assert!(!fits && e.to_string().contains("agg.gate_views"), "{e}"),

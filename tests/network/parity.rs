@@ -9,12 +9,12 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use subsplat::camera::NearFar;
 use subsplat::config::Mvsplat as Settings;
-use subsplat::model::Views;
 use subsplat::model::backbone::Mvsplat;
 use subsplat::model::compare::{Report, compare, compare_encoder, views};
 use subsplat::model::primaries::primaries;
 use subsplat::model::trace::Trace;
 use subsplat::model::weights::{Weights, read_tensors};
+use subsplat::model::{Backend, Views};
 
 fn golden() -> Option<(PathBuf, PathBuf)> {
     Some((
@@ -31,7 +31,7 @@ fn show(report: &Report) -> String {
 #[test]
 fn every_stage_agrees_with_the_reference() {
     let Some((weights, reference)) = golden() else { return };
-    let report = compare(&Weights::load(&weights).unwrap(), &reference).unwrap();
+    let report = compare(&Weights::load(&weights).unwrap(), &reference, &Backend::Cpu).unwrap();
     assert!(report.ok(), "{}", show(&report));
     assert_eq!(report.not_produced, [""; 0]);
     assert_eq!(report.unexpected_weights, [""; 0]);
@@ -63,7 +63,8 @@ fn a_wrong_weight_turns_the_comparison_red() {
         changed.insert(key.clone(), (&good[&key] * 1.001).unwrap());
         let encoder =
             Mvsplat::new(&Settings::re10k(), Weights::from_tensors(changed).builder()).unwrap();
-        let report = compare_encoder(&encoder, &Settings::re10k(), &tensors).unwrap();
+        let report =
+            compare_encoder(&encoder, &Settings::re10k(), &tensors, &Backend::Cpu).unwrap();
         let first = report.rows.iter().find(|r| !r.ok).map(|r| r.tensor.as_str());
         // A convolution before an InstanceNorm may be scaled freely: nothing to notice.
         assert_eq!(first, stage, "{name}");
@@ -79,12 +80,14 @@ fn missing_and_misshapen_inputs_are_named() {
     // Another shape in the file is a failed row, not a crash.
     tensors.insert("out.means".into(), Tensor::zeros((1, 5, 3), DType::F32, &Device::Cpu).unwrap());
     tensors.insert("made.up".into(), Tensor::zeros(1, DType::F32, &Device::Cpu).unwrap());
-    let report = compare_encoder(&encoder, &Settings::re10k(), &tensors).unwrap();
+    let report = compare_encoder(&encoder, &Settings::re10k(), &tensors, &Backend::Cpu).unwrap();
     let row = report.rows.iter().find(|r| r.tensor == "out.means").unwrap();
     assert!(!row.ok && row.note.as_ref().unwrap().contains("[1, 5, 3]"));
     assert_eq!(report.not_produced, ["made.up"]);
     tensors.remove("in.near");
-    let e = compare_encoder(&encoder, &Settings::re10k(), &tensors).unwrap_err().to_string();
+    let e = compare_encoder(&encoder, &Settings::re10k(), &tensors, &Backend::Cpu)
+        .unwrap_err()
+        .to_string();
     assert!(e.contains("in.near"), "{e}");
 }
 

@@ -176,7 +176,12 @@ fn attention() -> Result<()> {
         let agg = Aggregation::new(&keys, z[0].dim(1)?, &channels, vb)?;
         let sh = Tensor::zeros((z[0].dim(0)?, 3), DType::F32, &Device::Cpu)?;
         let primaries = scene.primaries(&sh, config::ShInput::World)?;
-        let prepared = agg.prepare(&scene.views()?, &scene.frames, &backbone, &primaries)?;
+        let prepared = agg.prepare(
+            &scene.views()?,
+            &scene.frames,
+            |level| backbone.feature(level).cloned(),
+            &primaries.means.squeeze(0)?,
+        )?;
         for mode in MODES {
             let [f_g, f_a] = joined(&scene, |v| {
                 let part = |t: &Tensor| t.narrow(0, v * scene.per_view, scene.per_view);

@@ -309,7 +309,7 @@ pub struct DepthMap<'a> {
 }
 
 /// Tolerance and softness of [`occlusion`], fractions of z.
-const OCCLUSION_TOLERANCE: f32 = 0.02;
+pub const OCCLUSION_TOLERANCE: f32 = 0.02;
 
 /// exp(−max(0, z − D(R) − τ)/τ′), τ = τ′ = 2 % of z: near 0 where the view's own
 /// surface D hides a point of camera z `z` at picture position `at` in [0, 1]²; 1

@@ -85,6 +85,7 @@ impl DeviceArray {
             result.binding(),
         ];
         let groups = Groups::of(r * l.div_ceil(SIDE), 1);
+        self.recorder.count_flops(&ATTENTION, 2 * r * l * m * (d + e));
         self.recorder.run(&ATTENTION, &[], &bindings, groups)?;
         Ok(result)
     }

@@ -62,6 +62,8 @@ pub enum Function {
     Activation(PointwiseFunction),
     /// √x.
     SquareRoot,
+    /// x where y is above the first number, else the second.
+    WhereAbove(f32, f32),
 }
 
 impl Function {
@@ -80,6 +82,7 @@ impl Function {
             Self::Over => (9, [0.0; 2]),
             Self::Activation(_) => (10, [0.0; 2]),
             Self::SquareRoot => (11, [0.0; 2]),
+            Self::WhereAbove(least, fill) => (12, [least, fill]),
         }
     }
 }
@@ -265,6 +268,19 @@ impl DeviceArray {
         let dims: Vec<usize> = order.iter().map(|&i| self.dims[i]).collect();
         let strides = order.iter().map(|&i| own.strides[i]).collect();
         self.gathered(&dims, Walk { strides, first: 0 })
+    }
+
+    /// Repeats sizes of 1 until the dimensions are `dims`.
+    ///
+    /// # Errors
+    /// [`GpuError::Argument`] for sizes that do not fit; errors of the device.
+    pub fn expanded(&self, dims: &[usize]) -> Result<Self, GpuError> {
+        let fits = self.dims.len() == dims.len()
+            && self.dims.iter().zip(dims).all(|(own, size)| own == size || *own == 1);
+        match fits {
+            true => self.gathered(dims, Walk::repeating(&self.dims)),
+            false => Err(misfit("expand", format!("{dims:?} or sizes of 1"), &self.dims)),
+        }
     }
 
     /// Joins `parts` along dimension `dim`.

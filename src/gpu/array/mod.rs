@@ -13,6 +13,7 @@ mod norm;
 mod product;
 mod rows;
 mod small;
+mod trunk;
 
 pub(super) use attention::ATTENTION;
 pub use attention::AttentionCall;
@@ -27,12 +28,14 @@ pub(super) use small::{
     CONVEX, CROSS_CHECK, EXPECTATION, HEAD_OUTPUT, RAW_MATCHING_BLOCKS, RAW_MATCHING_SCORES,
 };
 pub use small::{CrossCheckCall, HeadOutputCall, RawMatchingCall};
+pub(super) use trunk::{ATTRIBUTES, OCCLUSION};
 
 use crate::gpu::buffers::{Binding, Buffer};
 use crate::gpu::commands::{Groups, Pending};
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
 use crate::gpu::pipelines::{Constants, Kernel};
+use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -47,6 +50,20 @@ const NAME: &str = "network";
 pub struct Recorder {
     gpu: Arc<Gpu>,
     pending: Mutex<(Pending, u64)>,
+    work: Mutex<BTreeMap<&'static str, Work>>,
+}
+
+/// Work of all calls of one kernel, counted from their sizes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Work {
+    /// Calls.
+    pub calls: u64,
+    /// Workgroups.
+    pub workgroups: u64,
+    /// Additions and multiplications of convolutions, linear layers and attention; 0 for others.
+    pub flops: u64,
+    /// Bytes of the arguments, each counted once a call.
+    pub bytes: u64,
 }
 
 impl fmt::Debug for Recorder {
@@ -58,7 +75,7 @@ impl fmt::Debug for Recorder {
 impl Recorder {
     /// Creates a recorder without calls.
     pub fn new(gpu: Arc<Gpu>) -> Arc<Self> {
-        Arc::new(Self { gpu, pending: Mutex::default() })
+        Arc::new(Self { gpu, pending: Mutex::default(), work: Mutex::default() })
     }
 
     /// Returns the device.
@@ -87,6 +104,28 @@ impl Recorder {
         Ok(DeviceArray { recorder: self.clone(), buffer, offset: 0, dims: dims.to_vec() })
     }
 
+    /// Returns the work of each kernel since the recorder was created.
+    pub fn work(&self) -> BTreeMap<&'static str, Work> {
+        self.work.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Counts the additions and multiplications of a call of `kernel`.
+    fn count_flops(&self, kernel: &'static Kernel, flops: usize) {
+        let mut work = self.work.lock().unwrap_or_else(PoisonError::into_inner);
+        work.entry(kernel.name).or_default().flops += flops as u64;
+    }
+
+    /// Counts a call.
+    fn count(&self, kernel: &'static Kernel, bindings: &[Binding], groups: &Groups) {
+        let mut work = self.work.lock().unwrap_or_else(PoisonError::into_inner);
+        let own = work.entry(kernel.name).or_default();
+        own.calls += 1;
+        own.bytes += bindings.iter().map(|b| b.bytes).sum::<u64>();
+        if let Groups::Of(sizes) = groups {
+            own.workgroups += sizes.iter().map(|n| u64::from(*n)).product::<u64>();
+        }
+    }
+
     /// Records a call. Submits all recorded calls if they are many or hold much memory.
     pub(super) fn run(
         &self,
@@ -95,6 +134,7 @@ impl Recorder {
         bindings: &[Binding],
         groups: Groups,
     ) -> Result<(), GpuError> {
+        self.count(kernel, bindings, &groups);
         let mut pending = self.pending.lock().unwrap_or_else(PoisonError::into_inner);
         let (calls, mut bytes) = std::mem::take(&mut *pending);
         let mut commands = self.gpu.resume(NAME, calls);

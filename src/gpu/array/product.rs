@@ -110,6 +110,7 @@ impl DeviceArray {
             result.binding(),
         ];
         let groups = [pixels.div_ceil(SIDE), o.div_ceil(SIDE), b].map(|n| n as u32);
+        self.recorder.count_flops(&CONVOLUTION, 2 * result.count() * weight.count() / o);
         self.recorder.run(&CONVOLUTION, &[], &bindings, Groups::Of(groups))?;
         Ok(result)
     }
@@ -141,6 +142,7 @@ impl DeviceArray {
             result.binding(),
         ];
         let groups = Groups::of(rows.div_ceil(SIDE) * o.div_ceil(SIDE), 1);
+        self.recorder.count_flops(&LINEAR, 2 * rows * o * c);
         self.recorder.run(&LINEAR, &[], &bindings, groups)?;
         Ok(result)
     }

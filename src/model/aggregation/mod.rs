@@ -21,16 +21,15 @@ mod ablated;
 mod points;
 mod preset;
 
+use super::Views;
 use super::embed::Descriptors;
 use super::geometry::{Frames, ParentChunk};
 use super::mlp::Mode;
-use super::{BackboneOutput, Primaries, Views};
 use crate::config::{Aggregation as Keys, AggregationAblations, FeatureLevel, HeadInput, MaskMode};
-use crate::ops::Backend;
-use crate::ops::attention_gather::{Deferred, Level, occlusion_gate};
-use crate::ops::moves::{channels_last, sum};
+use crate::ops::attention_gather::{Deferred, Level};
+use crate::ops::{Array, Backend};
 use ablated::Ablated;
-use candle_core::{DType, Result, Tensor, bail};
+use candle_core::{Result, Tensor, bail};
 use candle_nn::VarBuilder;
 pub use points::ring;
 
@@ -63,17 +62,17 @@ struct Stages<S> {
 
 /// Input of one attention stage.
 #[derive(Clone, Copy)]
-struct StageInput<'a> {
+struct StageInput<'a, A = Tensor> {
     /// Index over all stages, geometry first.
     index: usize,
     /// Projected maps, `[cells, stride]`.
-    maps: &'a Tensor,
+    maps: &'a A,
     /// Receiver of the maps' gradient; `None` leaves it to candle's graph.
     deferred: Option<&'a Deferred>,
     /// `[n, E]`: output of the stage before.
-    f: &'a Tensor,
+    f: &'a A,
     /// `[n, E]`: embedding.
-    z: &'a Tensor,
+    z: &'a A,
 }
 
 impl<S> Stages<S> {
@@ -90,14 +89,14 @@ impl<S> Stages<S> {
     }
 
     /// Runs all stages: f^g and f^a, `[n, E]`.
-    fn run(
+    fn run<A: Array>(
         &self,
-        prepared: &Prepared,
-        z: &Descriptors,
-        step: impl Fn(&S, StageInput) -> Result<Tensor>,
-    ) -> Result<Descriptors> {
+        prepared: &Prepared<A>,
+        z: &Descriptors<A>,
+        step: impl Fn(&S, StageInput<'_, A>) -> Result<A>,
+    ) -> Result<Descriptors<A>> {
         let deferred = |index: usize| prepared.deferred.get(index);
-        let mut geometry = z.geometry.zeros_like()?;
+        let mut geometry = z.geometry.detached().affine(0.0, 0.0)?;
         for (index, (stage, maps)) in self.geometry.iter().zip(&prepared.geometry).enumerate() {
             let (f, z, deferred) = (&geometry, &z.geometry, deferred(index));
             geometry = step(stage, StageInput { index, maps, deferred, f, z })?;
@@ -114,16 +113,30 @@ impl<S> Stages<S> {
 
 /// Projected feature maps and depth maps of one scene, computed once per scene.
 #[derive(Clone, Debug)]
-pub struct Prepared {
+pub struct Prepared<A = Tensor> {
     /// Projected maps of each geometry stage, `[cells, stride]`.
-    geometry: Vec<Tensor>,
+    geometry: Vec<A>,
     /// Projected maps of each appearance stage, `[cells, stride]`.
-    appearance: Vec<Tensor>,
+    appearance: Vec<A>,
     levels: Vec<Level>,
     /// `[V, H, W]`: camera z, if the occlusion gate is on.
-    depths: Option<Tensor>,
+    depths: Option<A>,
     /// Receivers of the maps' gradients, one a stage; empty: candle's graph has them.
     deferred: Vec<Deferred>,
+}
+
+impl<A: Array> Prepared<A> {
+    /// Returns the same maps in host memory, in their graph.
+    fn to_host(&self) -> Result<Prepared> {
+        let all = |maps: &[A]| maps.iter().map(A::to_host).collect::<Result<Vec<_>>>();
+        Ok(Prepared {
+            geometry: all(&self.geometry)?,
+            appearance: all(&self.appearance)?,
+            levels: self.levels.clone(),
+            depths: self.depths.as_ref().map(A::to_host).transpose()?,
+            deferred: self.deferred.clone(),
+        })
+    }
 }
 
 impl Prepared {
@@ -153,13 +166,13 @@ impl Prepared {
 }
 
 /// Values that all stages share for one chunk of parents.
-struct Call<'a> {
-    parents: &'a ParentChunk,
+struct Call<'a, A = Tensor> {
+    parents: &'a ParentChunk<A>,
     frames: &'a Frames,
     /// `[n, V, 1, 2]`: projected centres, in units of each image's size.
-    centres: Tensor,
+    centres: A,
     /// `[n, V]` in [0, 1], if the occlusion gate is on.
-    visibility: Option<Tensor>,
+    visibility: Option<A>,
     levels: &'a [Level],
     mode: Mode,
     backend: &'a Backend,
@@ -202,19 +215,19 @@ impl Aggregation {
         self.backend = backend.clone();
     }
 
-    /// Projects the feature maps of the one scene in `backbone`, and makes its depth maps
-    /// if the occlusion gate is on.
+    /// Projects the feature maps `[1, V, C, h, w]` of one scene, and makes its depth maps from
+    /// the parents' `means` `[N, 3]` if the occlusion gate is on.
     ///
     /// # Errors
     /// Levels, views or sizes do not fit; the scene has more views than the learned
     /// per-view parameters serve.
-    pub fn prepare(
+    pub fn prepare<A: Array>(
         &self,
         views: &Views,
         frames: &Frames,
-        backbone: &BackboneOutput,
-        primaries: &Primaries,
-    ) -> Result<Prepared> {
+        feature: impl Fn(FeatureLevel) -> Result<A>,
+        means: &A,
+    ) -> Result<Prepared<A>> {
         let v = frames.0.len();
         if let Some(limit) = self.view_limit.filter(|limit| v > *limit) {
             bail!(
@@ -222,18 +235,25 @@ impl Aggregation {
                  got {v} views; gate `query` or `off` with op `dot` takes any number"
             );
         }
-        let (levels, maps) = self.map_rows(backbone, v)?;
+        let (levels, maps) = self.map_rows(feature, v)?;
         let (geometry, appearance) = match &self.plan {
             Plan::Preset(stages) => {
-                let project = |all: &[preset::Stage]| -> Result<Vec<Tensor>> {
+                let project = |all: &[preset::Stage]| -> Result<Vec<A>> {
                     all.iter().map(|stage| stage.project(&maps)).collect()
                 };
                 (project(&stages.geometry)?, project(&stages.appearance)?)
             }
-            Plan::Ablated(ablated) => ablated.project(maps)?,
+            Plan::Ablated(ablated) => {
+                let maps = maps.iter().map(A::to_host).collect::<Result<_>>()?;
+                let (geometry, appearance) = ablated.project(maps)?;
+                let back = |all: Vec<Tensor>| -> Result<Vec<A>> {
+                    all.iter().map(|map| means.like(map)).collect()
+                };
+                (back(geometry)?, back(appearance)?)
+            }
         };
         let depths = match self.occlusion_gate {
-            true => Some(frames.depth_maps(&primaries.means.squeeze(0)?.detach(), views.size()?)?),
+            true => Some(frames.depth_maps(&means.detached(), views.size()?)?),
             false => None,
         };
         Ok(Prepared { geometry, appearance, levels, depths, deferred: Vec::new() })
@@ -241,21 +261,21 @@ impl Aggregation {
 
     /// Returns the place of each level in the joined maps, and each level's map as rows
     /// `[V·h·w, C]`.
-    fn map_rows(&self, backbone: &BackboneOutput, v: usize) -> Result<(Vec<Level>, Vec<Tensor>)> {
+    fn map_rows<A: Array>(
+        &self,
+        feature: impl Fn(FeatureLevel) -> Result<A>,
+        v: usize,
+    ) -> Result<(Vec<Level>, Vec<A>)> {
         let mut levels = Vec::with_capacity(self.levels.len());
         let mut maps = Vec::with_capacity(self.levels.len());
         let mut first_cell = 0;
         for level in &self.levels {
-            let map = backbone.feature(*level)?;
-            let (b, got, c, height, width) = map.dims5()?;
+            let map = feature(*level)?;
+            let [b, got, c, height, width] = map.sizes()?;
             if b != 1 || got != v {
                 bail!("feature map {level:?}: expected 1 scene of {v} views, got {b} of {got}");
             }
-            let map = map.squeeze(0)?;
-            let map = match map.dtype() {
-                DType::F32 => channels_last(&map)?,
-                _ => map.permute((0, 2, 3, 1))?.contiguous()?,
-            };
+            let map = map.reshape((v, c, height, width))?.channels_last()?;
             maps.push(map.reshape((v * height * width, c))?);
             levels.push(Level { height, width, first_cell });
             first_cell += v * height * width;
@@ -267,25 +287,46 @@ impl Aggregation {
     ///
     /// # Errors
     /// Shapes do not fit.
-    pub fn forward(
+    pub fn forward<A: Array>(
         &self,
-        prepared: &Prepared,
-        parents: &ParentChunk,
+        prepared: &Prepared<A>,
+        parents: &ParentChunk<A>,
         frames: &Frames,
-        z: &Descriptors,
+        z: &Descriptors<A>,
         mode: Mode,
-    ) -> Result<Descriptors> {
+    ) -> Result<Descriptors<A>> {
         let backend = &self.backend;
         match &self.plan {
             Plan::Preset(stages) => {
-                let means = parents.means.unsqueeze(1)?;
+                let means = parents.means.reshape(((), 1, 3))?;
                 let (centres, depth) = frames.project(&means, MaskMode::Renorm)?;
                 let visibility = visibility(prepared, &centres, &depth)?;
                 let levels = &prepared.levels;
                 let call = Call { parents, frames, centres, visibility, levels, mode, backend };
                 stages.run(prepared, z, |stage, input| stage.forward(&call, input))
             }
-            Plan::Ablated(ablated) => ablated.forward(prepared, parents, frames, z, mode, backend),
+            Plan::Ablated(ablated) => {
+                // The general form has host tensors alone.
+                let own = ParentChunk {
+                    first: parents.first,
+                    source: parents.source,
+                    means: parents.means.to_host()?,
+                    quats_wxyz: parents.quats_wxyz.to_host()?,
+                    scales: parents.scales.to_host()?,
+                    opacities: parents.opacities.to_host()?,
+                    sh: parents.sh.to_host()?,
+                };
+                let host = Descriptors {
+                    geometry: z.geometry.to_host()?,
+                    appearance: z.appearance.to_host()?,
+                };
+                let prepared = prepared.to_host()?;
+                let f = ablated.forward(&prepared, &own, frames, &host, mode, backend)?;
+                Ok(Descriptors {
+                    geometry: z.geometry.like(&f.geometry)?,
+                    appearance: z.geometry.like(&f.appearance)?,
+                })
+            }
         }
     }
 
@@ -293,12 +334,16 @@ impl Aggregation {
     ///
     /// # Errors
     /// Shapes differ.
-    pub fn head_inputs(&self, f: Descriptors, z: &Descriptors) -> Result<Descriptors> {
+    pub fn head_inputs<A: Array>(
+        &self,
+        f: Descriptors<A>,
+        z: &Descriptors<A>,
+    ) -> Result<Descriptors<A>> {
         match &self.plan {
             Plan::Ablated(ablated) if ablated.head_input() == HeadInput::F => Ok(f),
             _ => Ok(Descriptors {
-                geometry: sum(&f.geometry, &z.geometry)?,
-                appearance: sum(&f.appearance, &z.appearance)?,
+                geometry: f.geometry.plus(&z.geometry)?,
+                appearance: f.appearance.plus(&z.appearance)?,
             }),
         }
     }
@@ -315,9 +360,9 @@ fn widths(levels: &[FeatureLevel], channels: &[(FeatureLevel, usize)]) -> Result
 
 /// Visibility `[n, V]` of parents at `centres` `[n, V, 1, 2]` with camera z `depth`
 /// `[n, V, 1]`, if the occlusion gate is on.
-fn visibility(prepared: &Prepared, centres: &Tensor, depth: &Tensor) -> Result<Option<Tensor>> {
-    match &prepared.depths {
-        Some(maps) => Ok(Some(occlusion_gate(&centres.squeeze(2)?, &depth.squeeze(2)?, maps)?)),
-        None => Ok(None),
-    }
+fn visibility<A: Array>(prepared: &Prepared<A>, centres: &A, depth: &A) -> Result<Option<A>> {
+    let Some(maps) = &prepared.depths else { return Ok(None) };
+    let [n, v, _] = depth.sizes()?;
+    let (centres, depth) = (centres.reshape((n, v, 2))?, depth.reshape((n, v))?);
+    centres.occlusion(&depth, maps).map(Some)
 }

@@ -5,9 +5,8 @@ use super::{Call, StageInput};
 use crate::abi::SampleConvention;
 use crate::config::{Aggregation as Keys, StageNorm};
 use crate::model::mlp::{LayerNorm, affine, linear, xavier};
-use crate::ops::attention_gather::{Gather, attention_gather_deferred};
-use crate::ops::columns::columns;
-use crate::ops::moves;
+use crate::ops::Array;
+use crate::ops::attention_gather::Gather;
 use candle_core::{Result, Tensor};
 use candle_nn::{Init, Linear, VarBuilder};
 
@@ -46,43 +45,47 @@ impl Stage {
 
     /// Projects `maps`, `[cells of the level, C]` each, to rows `[cells, 2E]` of keys and
     /// values of all levels.
-    pub(super) fn project(&self, maps: &[Tensor]) -> Result<Tensor> {
+    pub(super) fn project<A: Array>(&self, maps: &[A]) -> Result<A> {
         let layers = self.wk.iter().zip(&self.wv);
         let rows = maps.iter().zip(layers).map(|(map, (wk, wv))| affine(&joined(wk, wv)?, map));
-        moves::stacked(&rows.collect::<Result<Vec<_>>>()?)
+        A::joined(&rows.collect::<Result<Vec<_>>>()?.iter().collect::<Vec<_>>(), 0)
     }
 
     /// Returns the next f, `[n, E]`.
-    pub(super) fn forward(&self, call: &Call, input: StageInput) -> Result<Tensor> {
+    pub(super) fn forward<A: Array>(
+        &self,
+        call: &Call<'_, A>,
+        input: StageInput<'_, A>,
+    ) -> Result<A> {
         let StageInput { maps, deferred, f, z, .. } = input;
-        let mut q = moves::sum(f, z)?;
+        let mut q = f.plus(z)?;
         if let Some(norm) = &self.norm {
             q = norm.forward(&q)?;
         }
-        let gather = gather(call, q.dim(1)?);
+        let [_, dim] = q.sizes()?;
         let query = self.query(call, &q)?;
-        let o =
-            attention_gather_deferred(call.backend, maps, &query, &call.centres, gather, deferred)?;
-        moves::sum(f, &o)
+        let gather = gather(call, dim);
+        f.plus(&maps.attention_gather(&query, &call.centres, gather, deferred, call.backend)?)
     }
 
     /// Rows of (q `[E]`, bias `[V·L]`, gate `[V]`).
-    fn query(&self, call: &Call, q: &Tensor) -> Result<Tensor> {
-        let (n, v, l) = (q.dim(0)?, call.frames.0.len(), call.levels.len());
+    fn query<A: Array>(&self, call: &Call<'_, A>, q: &A) -> Result<A> {
+        let [n, _] = q.sizes()?;
+        let (v, l) = (call.frames.0.len(), call.levels.len());
         let bias = match &self.level_bias {
             Some(bias) => {
-                let bias = bias.reshape((1, 1, l))?;
-                bias.broadcast_as((n, v, l))?.reshape((n, v * l))?
+                let bias = q.like(&bias.reshape((1, 1, l))?)?;
+                bias.expanded(&[n, v, l])?.reshape((n, v * l))?
             }
-            None => Tensor::zeros((n, v * l), q.dtype(), q.device())?,
+            None => q.constant(vec![0.0], &[1, 1])?.expanded(&[n, v * l])?,
         };
         let gates = view_shares(&self.gate, v)?.affine(v as f64, 0.0)?;
-        let gates = visible(gates.unsqueeze(0)?.broadcast_as((n, v))?, call)?;
-        columns(q, &bias, Some(&gates))
+        let gates = visible(q.like(&gates.unsqueeze(0)?)?.expanded(&[n, v])?, call)?;
+        q.columns(&bias, Some(&gates))
     }
 }
 
-fn gather(call: &Call, dim: usize) -> Gather {
+fn gather<A>(call: &Call<'_, A>, dim: usize) -> Gather {
     Gather {
         levels: call.levels.to_vec(),
         views: call.frames.0.len(),
@@ -124,9 +127,9 @@ pub(super) fn view_shares(beta: &Tensor, views: usize) -> Result<Tensor> {
 }
 
 /// `gates` `[n, V]` times the visibility, if the occlusion gate is on.
-pub(super) fn visible(gates: Tensor, call: &Call) -> Result<Tensor> {
+pub(super) fn visible<A: Array>(gates: A, call: &Call<'_, A>) -> Result<A> {
     match &call.visibility {
-        Some(visibility) => gates.mul(visibility),
+        Some(visibility) => gates.times(visibility),
         None => Ok(gates),
     }
 }

@@ -227,7 +227,7 @@ impl DepthPredictor {
         let full = out.narrow(1, 0, g)?.plus(&disparity.full)?.channels_last()?;
         let depths = each_row(&full, |r| {
             let NearFar { near, far } = views.near_far[r % b][r / b];
-            full.narrow(0, r, 1)?.clamped(1.0 / far, 1.0 / near)?.reciprocal()
+            full.narrow(0, r, 1)?.clamped(f64::from(1.0 / far), f64::from(1.0 / near))?.reciprocal()
         })?;
         Ok((depths, sigmoid(&out.narrow(1, g, g)?.channels_last()?)?))
     }

@@ -225,21 +225,22 @@ impl SmallBackbone {
     /// # Errors
     /// Those of [`SmallBackbone::forward`].
     pub fn depth(&self, views: &Views, mean: DisparityMean) -> Result<DepthMaps> {
-        self.depth_with(views, mean, &Trace::off())
+        self.depth_on(views, &views.images, mean, &Trace::off())
     }
 
-    /// [`SmallBackbone::depth`] with a checkpoint after each part.
+    /// [`SmallBackbone::depth`] on the executor of `images`, the views' images, with a checkpoint
+    /// after each part.
     ///
     /// # Errors
     /// Those of [`SmallBackbone::depth`] and of the checkpoint.
-    pub fn depth_with(
+    pub fn depth_on<A: Array>(
         &self,
         views: &Views,
+        images: &A,
         mean: DisparityMean,
         trace: &Trace<'_>,
-    ) -> Result<DepthMaps> {
-        let Matched { logits, index, confidence, .. } =
-            self.matched(views, &views.images, mean, trace)?;
+    ) -> Result<DepthMaps<A>> {
+        let Matched { logits, index, confidence, .. } = self.matched(views, images, mean, trace)?;
         Ok(DepthMaps { logits, index, confidence: sigmoid(&confidence)? })
     }
 

@@ -11,9 +11,11 @@ use crate::model::mlp::Mode;
 use crate::model::spgr::rules;
 use crate::model::trace::Checkpoint;
 use crate::model::{BackboneOutput, Primaries, Views};
-use crate::ops::spgr::spgr_into_on;
+use crate::ops::Array;
 use crate::splats::Splats;
-use candle_core::{DType, Result, Tensor, bail};
+#[cfg(feature = "gpu")]
+use candle_core::Tensor;
+use candle_core::{DType, Result, bail};
 use rayon::prelude::*;
 
 /// Gaussians of one scene with different numbers of children per parent.
@@ -73,10 +75,29 @@ impl Trunk {
         let Some(parts) = &self.parts else {
             bail!("sides: expected 0 or 1 where SPGR is off, got more")
         };
-        let scene = self.scene(parts, views, backbone, primaries)?;
-        if scene.means.dtype() != DType::F32 {
-            bail!("primaries: expected f32, got {:?}", scene.means.dtype());
+        if primaries.means.dtype() != DType::F32 {
+            bail!("primaries: expected f32, got {:?}", primaries.means.dtype());
         }
+        #[cfg(feature = "gpu")]
+        if let Some(result) = self.on_device(|executor| {
+            let like = |t: &Tensor| executor.upload(t);
+            let scene = self.scene_on(parts, views, backbone, primaries, like)?;
+            self.made_of(parts, &scene, groups, checkpoint)
+        }) {
+            return result;
+        }
+        let scene = self.scene(parts, views, backbone, primaries)?;
+        self.made_of(parts, &scene, groups, checkpoint)
+    }
+
+    /// [`Trunk::made`] of one scene.
+    fn made_of<A: Array + Sync>(
+        &self,
+        parts: &Parts,
+        scene: &Scene<'_, A>,
+        groups: &[Group],
+        checkpoint: Checkpoint<'_>,
+    ) -> Result<Vec<Made>> {
         checkpoint()?;
         let mut made: Vec<Made> = groups.iter().map(|_| Made::default()).collect();
         let mut sides: Vec<usize> = groups.iter().map(|g| g.side).filter(|s| *s > 1).collect();
@@ -100,11 +121,15 @@ impl Trunk {
     }
 
     /// Children of one group; the trunk and the scene have its side.
-    fn children_of(&self, parts: &Parts, scene: &Scene, group: &Group) -> Result<Made> {
+    fn children_of<A: Array>(
+        &self,
+        parts: &Parts,
+        scene: &Scene<'_, A>,
+        group: &Group,
+    ) -> Result<Made> {
         let first = group.indices.first().map_or(0, |i| *i as usize);
         let view = first / scene.per_view.max(1);
-        let indices = Tensor::new(group.indices.as_slice(), scene.means.device())?;
-        let chosen = |t: &Tensor| t.index_select(&indices, 0);
+        let chosen = |t: &A| t.selected(0, &group.indices);
         let own = ParentChunk {
             first,
             source: view,
@@ -120,19 +145,19 @@ impl Trunk {
         let mut gains = vec![0f32; count * scene.rules.gain_channels()];
         // SPGR reads a parent's view from its index, so any index of the view will do.
         let call = scene.call(Span { first: view * scene.per_view, len: group.indices.len() });
-        spgr_into_on(&self.backend, &head, &parents, &call, (&mut rows, &mut gains))?;
+        head.write_children(&parents, &call, &self.backend, &mut rows, &mut gains)?;
         Ok((rows, gains))
     }
 }
 
-impl<'a> Scene<'a> {
+impl<'a, A: Array> Scene<'a, A> {
     /// The same scene for the r of `trunk`.
-    fn for_side(&self, trunk: &Trunk, parts: &Parts) -> Result<Scene<'a>> {
+    fn for_side(&self, trunk: &Trunk, parts: &Parts) -> Result<Scene<'a, A>> {
         let side = trunk.rules.side;
         Ok(Scene {
             heads: parts.heads.for_side(side)?,
             rules: rules(&trunk.config, side),
-            ..self.leaves()
+            ..self.clone()
         })
     }
 }

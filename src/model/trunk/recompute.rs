@@ -65,7 +65,7 @@ impl Trunk {
         let outside = scene.leaves();
         let mode = Mode::Train { seed };
         let how = super::Chunking { size: super::CHUNK, mode, checkpoint: &|| Ok(()) };
-        let children = self.children(parts, &outside, sh, primaries.sh_basis, &how)?;
+        let children = self.children(parts, &outside, (sh, primaries.sh_basis), &how)?;
         Ok(Recomputed { trunk: self, parts, scene, chunk: chunk.max(1), seed, children })
     }
 }

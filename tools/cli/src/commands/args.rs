@@ -723,14 +723,9 @@ pub struct CompareArgs {
     /// Instruction set of the rasterizer (default: SUBSPLAT_SIMD, else the widest here).
     #[arg(long, value_enum, conflicts_with = "weights")]
     pub simd: Option<SimdArg>,
-    /// Device for the picture and its gradients: as of `render --device`, but an error where it
-    /// fails.
-    #[arg(
-        long,
-        default_value = "cpu",
-        value_name = "auto|cpu|gpu|NAME",
-        conflicts_with_all = ["weights", "simd"]
-    )]
+    /// Device of the encoder, or of the picture and its gradients: as of `render --device`, but an
+    /// error where it fails.
+    #[arg(long, default_value = "cpu", value_name = "auto|cpu|gpu|NAME", conflicts_with = "simd")]
     pub device: String,
 }
 

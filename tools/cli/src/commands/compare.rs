@@ -8,6 +8,7 @@ use anyhow::{Context, Result, bail, ensure};
 use serde_json::{Value, json};
 use std::path::Path;
 use subsplat::cpu::SimdLevel;
+use subsplat::model::Backend;
 use subsplat::model::compare::{self, Row};
 use subsplat::model::weights::Weights;
 use subsplat::render::Renderer;
@@ -15,7 +16,7 @@ use subsplat::render::Renderer;
 /// Runs the command; `false` where a tensor is out of tolerance.
 pub fn compare(args: &CompareArgs, answer: Answer) -> Result<bool> {
     match &args.weights {
-        Some(weights) => encoder(weights, &args.reference, answer),
+        Some(weights) => encoder(weights, &args.reference, &args.device, answer),
         None if args.device.eq_ignore_ascii_case("cpu") => {
             let level = level(args.simd)?;
             let compare = |case: &Case| compare_raster::compare(case, level);
@@ -35,11 +36,13 @@ pub fn compare(args: &CompareArgs, answer: Answer) -> Result<bool> {
     }
 }
 
-fn encoder(weights: &Path, reference: &Path, answer: Answer) -> Result<bool> {
+fn encoder(weights: &Path, reference: &Path, device: &str, answer: Answer) -> Result<bool> {
+    let backend = Backend::open(device)?;
     let mut progress = Progress::new();
     let report = progress.stage("encoder", |_| -> Result<_> {
         let weights = Weights::load(weights)?;
-        compare::compare(&weights, reference).with_context(|| reference.display().to_string())
+        compare::compare(&weights, reference, &backend)
+            .with_context(|| reference.display().to_string())
     })?;
     table(&report.rows, answer);
     for name in &report.not_produced {

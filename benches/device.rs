@@ -1,0 +1,139 @@
+//! Work and time of the network on a GPU: calls, workgroups, operations, bytes and device memory of
+//! two pictures, counted, and the time that adapters of four classes would need for them.
+//!
+//! `cargo bench --bench device -- [small|mvsplat …] [--side PX] [--device NAME]`. Work depends on the
+//! sizes only; the measured time is that of the adapter at hand.
+
+use anyhow::{Context, Result, bail, ensure};
+use candle_core::{Device, Tensor};
+use glam::{Mat4, Vec3};
+use std::collections::BTreeMap;
+use std::time::Instant;
+use subsplat::camera::{Camera, Intrinsics, NearFar};
+use subsplat::config::{Config, Preset};
+use subsplat::gpu::Work;
+use subsplat::model::primaries::primaries;
+use subsplat::model::subsplat::SubSplat;
+use subsplat::model::trace::Trace;
+use subsplat::model::weights::Weights;
+use subsplat::model::{Backend, Views};
+
+/// Class of adapters, its f32 rate in flop/s, and its memory's rate in bytes/s (data sheets).
+const CLASSES: [(&str, f64, f64); 4] = [
+    ("integrated", 2e12, 60e9),
+    ("laptop", 10e12, 250e9),
+    ("desktop", 30e12, 700e9),
+    ("H200", 60e12, 4.8e12),
+];
+/// Shares of both rates that are expected of tiled products and of streams; duration of a call, s.
+const FLOPS_SHARE: f64 = 0.3;
+const BYTES_SHARE: f64 = 0.7;
+const CALL_S: f64 = 5e-6;
+
+struct Args {
+    names: Vec<String>,
+    side: usize,
+    device: String,
+}
+
+fn parse() -> Result<Args> {
+    let mut args = Args { names: Vec::new(), side: 256, device: "gpu".to_owned() };
+    let mut words = std::env::args().skip(1);
+    while let Some(word) = words.next() {
+        let mut value = || words.next().with_context(|| format!("{word}: expected a value"));
+        match word.as_str() {
+            "--bench" => {}
+            "--side" => args.side = value()?.parse().context("--side")?,
+            "--device" => args.device = value()?,
+            other if other.starts_with('-') => bail!("unknown option {other}"),
+            name => args.names.push(name.to_owned()),
+        }
+    }
+    Ok(args)
+}
+
+/// Two pictures of noise, 0.2 apart.
+fn views(side: usize) -> Result<Views> {
+    let s = side as f32;
+    let k = Intrinsics { fx: s, fy: s, cx: 0.5 * s, cy: 0.5 * s, width: side, height: side };
+    let camera = |x: f32| Camera::new(k, Mat4::from_translation(Vec3::new(x, 0.0, 0.0)));
+    let number = |i: usize| ((i as f32 * 12.9898).sin() * 43_758.547).fract().abs();
+    let pixels = (0..6 * side * side).map(number).collect();
+    let images = Tensor::from_vec(pixels, (1, 2, 3, side, side), &Device::Cpu)?;
+    let near_far = vec![vec![NearFar::new(1.0, 100.0); 2]];
+    Ok(Views::new(images, vec![vec![camera(0.0)?, camera(0.2)?]], near_far)?)
+}
+
+/// Seconds of one pass and the work of each kernel in it.
+fn pass(network: &SubSplat, views: &Views) -> Result<(f64, BTreeMap<&'static str, Work>)> {
+    let executor = network.trunk().executor().context("expected a GPU, got the CPU")?;
+    let before = executor.recorder().work();
+    let start = Instant::now();
+    let output = network.encode(views)?;
+    let settings = network.config().primaries();
+    let parents = primaries(&output, views, settings, &mut Trace::off())?;
+    network.trunk().forward(views, &output, &parents)?;
+    let seconds = start.elapsed().as_secs_f64();
+    let mut work = executor.recorder().work();
+    for (name, own) in &mut work {
+        let was = before.get(name).copied().unwrap_or_default();
+        own.calls -= was.calls;
+        own.workgroups -= was.workgroups;
+        own.flops -= was.flops;
+        own.bytes -= was.bytes;
+    }
+    Ok((seconds, work))
+}
+
+fn report(name: &str, config: &Config, args: &Args) -> Result<()> {
+    let backend = Backend::open(&args.device)?;
+    let gpu = backend.gpu().context("--device: expected a GPU, got the CPU")?.clone();
+    let weights = Weights::seeded(7);
+    let network = SubSplat::new(config, weights.builder())?.with_backend(&backend);
+    let views = views(args.side)?;
+    pass(&network, &views)?;
+    let (seconds, work) = pass(&network, &views)?;
+    ensure!(backend.warning().is_none(), "{name}: {}", backend.warning().unwrap_or_default());
+    println!("{name}, two pictures of {0}x{0}, on {1}", args.side, gpu.adapter());
+    println!("{:22} {:>6} {:>11} {:>9} {:>9}", "kernel", "calls", "workgroups", "GFLOP", "MB");
+    let line = |name: &str, w: &Work| {
+        let (flops, bytes) = (w.flops as f64 / 1e9, w.bytes as f64 / 1e6);
+        println!("{name:22} {:>6} {:>11} {flops:>9.2} {bytes:>9.1}", w.calls, w.workgroups);
+    };
+    let mut sum = Work::default();
+    for (name, own) in &work {
+        line(name, own);
+        sum.calls += own.calls;
+        sum.workgroups += own.workgroups;
+        sum.flops += own.flops;
+        sum.bytes += own.bytes;
+    }
+    line("sum", &sum);
+    println!(
+        "{:.0} MiB of device memory, {seconds:.3} s here",
+        gpu.allocated_bytes() as f64 / 1048576.0
+    );
+    for (class, flops, bytes) in CLASSES {
+        let of = |w: &Work| {
+            let products = w.flops as f64 / (FLOPS_SHARE * flops);
+            products.max(w.bytes as f64 / (BYTES_SHARE * bytes)) + CALL_S * w.calls as f64
+        };
+        println!("{class:12} {:.1} ms expected", 1e3 * work.values().map(of).sum::<f64>());
+    }
+    println!();
+    Ok(())
+}
+
+fn main() -> Result<()> {
+    let args = parse()?;
+    let all = [
+        ("small", Weights::shipped(2)?.config().context("the weights' configuration")?.clone()),
+        ("mvsplat", Config::re10k(Preset::Tuned, 2)),
+    ];
+    for (name, config) in all {
+        if args.names.is_empty() || args.names.iter().any(|n| n == name) {
+            report(name, &config, &args)?;
+        }
+    }
+    Ok(())
+}
