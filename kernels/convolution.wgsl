@@ -31,9 +31,9 @@ struct ConvolutionUniform {
 const SIDE: u32 = 64u;
 const STEP: u32 = 16u;
 
-// [STEP, SIDE]: terms of the outputs, and of the pixels.
-var<workgroup> rows: array<f32, 1024>;
-var<workgroup> columns: array<f32, 1024>;
+// [STEP, SIDE / 4]: terms of four outputs, and of four pixels.
+var<workgroup> rows: array<vec4<f32>, 256>;
+var<workgroup> columns: array<vec4<f32>, 256>;
 
 // Returns the first sample of a pixel: its place times the stride, minus the padding.
 fn corner(pixel: u32) -> vec3<i32> {
@@ -57,10 +57,9 @@ fn main(
     let volume = call.kernel.x * call.kernel.y * call.kernel.z;
     let area = call.kernel.y * call.kernel.z;
     let size = vec3<i32>(call.input_size.xyz);
-    // Loads: four terms of one output; one term of four pixels.
-    let own_output = first_output + thread / 4u;
-    let own_term = thread % 4u * 4u;
-    let term_row = thread / 16u;
+    // A thread loads one term of four outputs and of four pixels.
+    let own_term = thread / 16u;
+    let own_output = first_output + thread % 16u * 4u;
     let own_pixel = thread % 16u * 4u;
     var corners: array<vec3<i32>, 4>;
     for (var j = 0u; j < 4u; j++) {
@@ -68,13 +67,14 @@ fn main(
     }
     var sums: array<vec4<f32>, 4>;
     for (var first = 0u; first < call.terms; first += STEP) {
+        let term = first + own_term;
+        var terms: vec4<f32>;
         for (var j = 0u; j < 4u; j++) {
-            let term = first + own_term + j;
-            let inside = own_output < call.outputs && term < call.terms;
-            let at = select(0u, own_output * call.terms + term, inside);
-            rows[(own_term + j) * SIDE + thread / 4u] = select(0.0, weight[at], inside);
+            let inside = own_output + j < call.outputs && term < call.terms;
+            let at = select(0u, (own_output + j) * call.terms + term, inside);
+            terms[j] = select(0.0, weight[at], inside);
         }
-        let term = first + term_row;
+        rows[thread] = terms;
         let channel = term / volume;
         let tap = vec3<i32>(vec3<u32>(
             term % volume / area,
@@ -82,22 +82,23 @@ fn main(
             term % call.kernel.z,
         ));
         let base = input + channel * plane;
+        var samples: vec4<f32>;
         for (var j = 0u; j < 4u; j++) {
             let at = corners[j] + tap;
             let inside = term < call.terms && all(at >= vec3<i32>()) && all(at < size);
             let offset = u32((at.x * size.y + at.y) * size.z + at.z);
             let sample = picture[select(0u, base + offset, inside)];
-            columns[term_row * SIDE + own_pixel + j] = select(0.0, sample, inside);
+            samples[j] = select(0.0, sample, inside);
         }
+        columns[thread] = samples;
         workgroupBarrier();
         for (var k = 0u; k < STEP; k++) {
-            let r = k * SIDE + thread / 16u * 4u;
-            let c = k * SIDE + own_pixel;
-            let samples =
-                vec4<f32>(columns[c], columns[c + 1u], columns[c + 2u], columns[c + 3u]);
-            for (var i = 0u; i < 4u; i++) {
-                sums[i] += rows[r + i] * samples;
-            }
+            let row = rows[k * SIDE / 4u + thread / 16u];
+            let column = columns[k * SIDE / 4u + thread % 16u];
+            sums[0] += row.x * column;
+            sums[1] += row.y * column;
+            sums[2] += row.z * column;
+            sums[3] += row.w * column;
         }
         workgroupBarrier();
     }

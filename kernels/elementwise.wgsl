@@ -26,7 +26,8 @@ struct ElementwiseUniform {
     // Factor and offset of AFFINE, bounds of CLAMP, bound and other number of WHERE_ABOVE.
     first: f32,
     second: f32,
-    pad: u32,
+    // Axes in use, the last ones.
+    axes: u32,
     // Sizes of seven axes, outermost first.
     sizes: array<vec4<u32>, 2>,
     // Strides of the axes of each array; the last number is the offset of its first element.
@@ -74,7 +75,7 @@ fn main(
     }
     var rest = i;
     var at = vec3<u32>(call.left[1].w, call.right[1].w, call.result[1].w);
-    for (var axis = 7u; axis > 0u; axis--) {
+    for (var axis = 7u; axis > 7u - call.axes; axis--) {
         let block = (axis - 1u) / 4u;
         let lane = (axis - 1u) % 4u;
         let size = call.sizes[block][lane];

@@ -22,9 +22,9 @@ struct LinearUniform {
 const SIDE: u32 = 64u;
 const STEP: u32 = 16u;
 
-// [STEP, SIDE]: terms of the rows, and of the outputs.
-var<workgroup> rows: array<f32, 1024>;
-var<workgroup> columns: array<f32, 1024>;
+// [STEP, SIDE / 4]: terms of four rows, and of four outputs.
+var<workgroup> rows: array<vec4<f32>, 256>;
+var<workgroup> columns: array<vec4<f32>, 256>;
 
 @compute @workgroup_size(256)
 fn main(
@@ -39,30 +39,35 @@ fn main(
     if first_row >= call.rows {
         return;
     }
-    let line = thread / 4u;
-    let own_term = thread % 4u * 4u;
+    // A thread loads one term of four rows and of four outputs. The terms of a row lie side by
+    // side, so that neighbouring threads read one row.
+    let own_term = thread % 16u;
+    let line = thread / 16u * 4u;
     let own_output = thread % 16u * 4u;
     var sums: array<vec4<f32>, 4>;
     for (var first = 0u; first < call.terms; first += STEP) {
+        let term = first + own_term;
+        var row_terms: vec4<f32>;
+        var column_terms: vec4<f32>;
         for (var j = 0u; j < 4u; j++) {
-            let term = first + own_term + j;
-            let in_row = first_row + line < call.rows && term < call.terms;
-            let in_column = first_output + line < call.outputs && term < call.terms;
-            let row = x[select(0u, (first_row + line) * call.terms + term, in_row)];
+            let in_row = first_row + line + j < call.rows && term < call.terms;
+            let in_column = first_output + line + j < call.outputs && term < call.terms;
+            let row = x[select(0u, (first_row + line + j) * call.terms + term, in_row)];
             let column =
-                weight[select(0u, (first_output + line) * call.terms + term, in_column)];
-            rows[(own_term + j) * SIDE + line] = select(0.0, row, in_row);
-            columns[(own_term + j) * SIDE + line] = select(0.0, column, in_column);
+                weight[select(0u, (first_output + line + j) * call.terms + term, in_column)];
+            row_terms[j] = select(0.0, row, in_row);
+            column_terms[j] = select(0.0, column, in_column);
         }
+        rows[own_term * SIDE / 4u + line / 4u] = row_terms;
+        columns[own_term * SIDE / 4u + line / 4u] = column_terms;
         workgroupBarrier();
         for (var k = 0u; k < STEP; k++) {
-            let r = k * SIDE + thread / 16u * 4u;
-            let c = k * SIDE + own_output;
-            let factors =
-                vec4<f32>(columns[c], columns[c + 1u], columns[c + 2u], columns[c + 3u]);
-            for (var i = 0u; i < 4u; i++) {
-                sums[i] += rows[r + i] * factors;
-            }
+            let row = rows[k * SIDE / 4u + thread / 16u];
+            let column = columns[k * SIDE / 4u + thread % 16u];
+            sums[0] += row.x * column;
+            sums[1] += row.y * column;
+            sums[2] += row.z * column;
+            sums[3] += row.w * column;
         }
         workgroupBarrier();
     }

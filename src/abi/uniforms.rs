@@ -320,8 +320,8 @@ uniform! {
         first: f32,
         /// Summand, or upper bound.
         second: f32,
-        /// Unused.
-        pad: u32,
+        /// Axes in use.
+        axes: u32,
         /// Sizes of seven axes, outermost first; unused.
         sizes: [[u32; 4]; 2],
         /// Strides of the first array; offset of its first element.

@@ -41,15 +41,23 @@ fn values(t: &Tensor) -> Vec<f32> {
     t.flatten_all().unwrap().to_vec1().unwrap()
 }
 
+/// Returns the tensor of `f`.
+fn made(f: impl FnOnce() -> Result<Tensor>) -> Tensor {
+    f().unwrap()
+}
+
 /// Compares `$body` of tensors with `$body` of the same arrays in device memory.
 macro_rules! agree {
     ($gpu:expr, $name:expr, $tolerance:expr, |$($x:ident),+| $body:expr) => {{
-        let expected: Tensor = (|| -> Result<Tensor> { $(let $x = &$x;)+ $body })().unwrap();
-        let got = (|| -> Result<Tensor> {
+        let expected = made(|| {
+            $(let $x = &$x;)+
+            $body
+        });
+        let got = made(|| {
             $(let $x = &$gpu.upload(&$x)?;)+
             let result: Result<_> = $body;
             result?.to_host()
-        })().unwrap();
+        });
         assert_eq!(got.dims(), expected.dims(), "{}", $name);
         assert_matches_cpu($name, &values(&got), &values(&expected), $tolerance);
     }};

@@ -3,11 +3,14 @@
 use subsplat_test_support::gpu as adapter;
 use subsplat_test_support::whole;
 
-use adapter::gpu;
+use adapter::{gpu, limited};
+use std::ops::ControlFlow;
+use subsplat::camera::NearFar;
 use subsplat::config::Preset;
 use subsplat::model::Backend;
 use subsplat::model::compare::compare;
 use subsplat::model::weights::Weights;
+use subsplat::{Error, Progress, Stage};
 use subsplat_test_support::shared;
 use whole::{light, lively, plain, run, shoot};
 
@@ -72,4 +75,30 @@ fn every_stage_of_mvsplat_agrees_with_the_reference() {
     assert!(report.ok(), "{bad:#?}");
     assert_eq!(report.not_produced, [""; 0]);
     assert_eq!(report.rows.len(), 99);
+}
+
+/// After a device is lost, the CPU computes the network; after cancellation it does not.
+#[test]
+fn the_cpu_takes_over_from_a_lost_device() {
+    let Some(own) = limited(128 << 20) else { return };
+    let config = light(plain(false, Preset::Tuned, 2));
+    let shoot = shoot(5, 2, 96, 96);
+    let model = lively(&config);
+    let expected = run(&model, &shoot.photos, (64, 64), false).into_splats();
+    let backend = Backend::from(own.clone());
+    let model = model.with_backend(&backend);
+    let mut calls = 0;
+    let mut cancel = |p: Progress| {
+        calls += usize::from(p.stage == Stage::Subsplat);
+        if calls > 1 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    };
+    let options = whole::options((64, 64), NearFar::RE10K, false);
+    let cancelled = model.run_with(&shoot.photos, &options, &mut cancel);
+    assert!(matches!(cancelled, Err(Error::Cancelled)), "{cancelled:?}");
+    assert_eq!(backend.warning(), None);
+    own.device().destroy();
+    own.device().poll(subsplat::gpu::wgpu::PollType::Poll).ok();
+    let got = run(&model, &shoot.photos, (64, 64), false).into_splats();
+    assert_eq!(got.rows(), expected.rows());
+    assert!(backend.warning().is_some_and(|w| w.contains("GPU lost")), "{:?}", backend.warning());
 }

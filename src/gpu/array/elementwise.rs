@@ -129,6 +129,35 @@ fn table(values: &[usize], fill: u32, last: usize) -> [[u32; 4]; 2] {
     [[a, b, c, d], [e, f, g, h]]
 }
 
+/// Joins neighbouring axes that all `walks` visit as one axis, and drops axes of one index. An
+/// index of the kernel costs a division for each axis.
+fn merged(sizes: &[usize], walks: [&Walk; 3]) -> (Vec<usize>, [Walk; 3]) {
+    let mut out = walks.map(|walk| Walk { strides: Vec::new(), first: walk.first });
+    let mut kept: Vec<usize> = Vec::new();
+    for (axis, &size) in sizes.iter().enumerate().filter(|(_, size)| **size != 1) {
+        let strides = walks.map(|walk| walk.strides[axis]);
+        let continues = |(walk, stride): (&Walk, usize)| {
+            walk.strides.last().is_some_and(|outer| *outer == stride * size)
+        };
+        let joins = out.iter().zip(strides).all(continues);
+        match kept.last_mut().filter(|_| joins) {
+            Some(last) => *last *= size,
+            None => kept.push(size),
+        }
+        for (walk, stride) in out.iter_mut().zip(strides) {
+            match walk.strides.last_mut().filter(|_| joins) {
+                Some(last) => *last = stride,
+                None => walk.strides.push(stride),
+            }
+        }
+    }
+    if kept.is_empty() {
+        kept.push(1);
+        out.iter_mut().for_each(|walk| walk.strides.push(0));
+    }
+    (kept, out)
+}
+
 /// One call: result[…] = function(left[…], right[…]) over `sizes`.
 struct Call<'a> {
     function: Function,
@@ -141,7 +170,9 @@ struct Call<'a> {
 impl Call<'_> {
     fn run(self) -> Result<(), GpuError> {
         let count: usize = self.sizes.iter().product();
-        if self.sizes.len() > AXES {
+        let walks = [&self.left.1, &self.right.1, &self.result.1];
+        let (sizes, [left, right, result]) = merged(self.sizes, walks);
+        if sizes.len() > AXES {
             return Err(misfit(ELEMENTWISE.name, format!("at most {AXES} axes"), self.sizes));
         }
         if count == 0 {
@@ -153,11 +184,11 @@ impl Call<'_> {
             count: count as u32,
             first,
             second,
-            pad: 0,
-            sizes: table(self.sizes, 1, 0),
-            left: self.left.1.words(),
-            right: self.right.1.words(),
-            result: self.result.1.words(),
+            axes: sizes.len() as u32,
+            sizes: table(&sizes, 1, 0),
+            left: left.words(),
+            right: right.words(),
+            result: result.words(),
         })?;
         let kind = match self.function {
             Function::Activation(kind) => f64::from(kind as u32),
@@ -338,5 +369,29 @@ impl DeviceArray {
             s * h,
             s * w,
         ])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn axes_are_merged_where_all_arrays_continue() {
+        let walk = |strides: &[usize]| Walk { strides: strides.to_vec(), first: 3 };
+        let whole = walk(&[60, 20, 5, 1]);
+        let (sizes, walks) = merged(&[2, 3, 4, 5], [&whole, &whole, &whole]);
+        assert_eq!((sizes, walks[0].strides.clone(), walks[0].first), (vec![120], vec![1], 3));
+        // A row of three channels is repeated over the pixels.
+        let row = walk(&[0, 1, 0, 0]);
+        let (sizes, walks) = merged(&[2, 3, 4, 5], [&whole, &row, &whole]);
+        assert_eq!(sizes, [2, 3, 20]);
+        assert_eq!(walks.map(|w| w.strides), [vec![60, 20, 1], vec![0, 1, 0], vec![60, 20, 1]]);
+        // Axes in another order; an axis of one index.
+        let turned = walk(&[1, 7, 24, 6]);
+        let (sizes, walks) = merged(&[6, 1, 2, 4], [&turned, &turned, &walk(&[8, 8, 4, 1])]);
+        assert_eq!((sizes, walks[0].strides.clone()), (vec![6, 8], vec![1, 6]));
+        let one = walk(&[1, 1]);
+        assert_eq!(merged(&[1, 1], [&one, &one, &one]).0, [1]);
     }
 }

@@ -42,7 +42,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 /// Calls of one submit.
 const CALLS_MAX: usize = 48;
 /// Bytes of the results of one submit, which keeps their memory and that of their arguments.
-const BYTES_MAX: u64 = 32 << 20;
+const BYTES_MAX: u64 = 4 << 20;
 /// Name of the calls in errors and traces.
 const NAME: &str = "network";
 
