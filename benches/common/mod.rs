@@ -66,6 +66,7 @@ impl Args {
                 name => out.names.push(name.to_owned()),
             }
         }
+        SimdLevel::requested()?;
         Ok(out)
     }
 }

@@ -113,19 +113,23 @@ unsafe fn tile<S: Simd, const R: usize, const V: usize>(s: S, part: PanelProduct
     // SAFETY: the contract of this function.
     unsafe {
         let mut sums = [[s.splat(0.0); V]; R];
-        let (mut a, mut b) = (part.a, part.b);
-        for _ in 0..part.depth {
+        let mut b = part.b;
+        // A pointer to each row: with one pointer, the loop computes the addresses anew.
+        let mut a = [part.a; R];
+        for r in 0..R {
+            a[r] = part.a.wrapping_add(r * part.a_stride);
+        }
+        for i in 0..part.depth {
             let mut columns = [s.splat(0.0); V];
             for v in 0..V {
                 columns[v] = load(s, b.add(v * LANES));
             }
             for r in 0..R {
-                let x = s.splat(*a.add(r * part.a_stride));
+                let x = s.splat(*a[r].wrapping_add(i));
                 for v in 0..V {
                     sums[r][v] = x.fma(columns[v], sums[r][v]);
                 }
             }
-            a = a.add(1);
             b = b.wrapping_add(width);
         }
         epilogue(s, part, sums);
