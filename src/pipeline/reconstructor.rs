@@ -3,8 +3,8 @@
 use super::progress::{Callback, StageCost, Tracker};
 use super::warning::Warning;
 use super::{
-    Check, DepthBounds, DepthRange, DepthSource, Detail, Options, Photo, Poses, Prepared, Progress,
-    Reconstruction, Refine, Result, Stage, check_pairs, exposure, is_mvsplat, poses,
+    Check, DepthBounds, DepthRange, DepthSource, Detail, Error, Options, Photo, Poses, Prepared,
+    Progress, Reconstruction, Refine, Result, Stage, check_pairs, exposure, is_mvsplat, poses,
     refined_bounds,
 };
 use crate::camera::{Camera, NearFar, Size};
