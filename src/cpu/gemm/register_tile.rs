@@ -51,15 +51,19 @@ pub(super) unsafe fn multiply_panel<S: Simd>(s: S, part: PanelProduct, m: usize,
                 _ => tiles::<S, 1>(s, part, m, width),
             }
         } else {
-            for j in (0..width).step_by(LANES) {
-                let own = PanelProduct {
-                    b: part.b.add(j),
-                    dst: part.dst.add(j),
-                    cols: (part.cols - j).min(LANES),
-                    base: part.base.map(|b| b.add(j)),
-                    ..part
-                };
-                tiles::<S, 1>(s, own, m, width);
+            // A tile's rows stay in the first-level cache for all columns of the panel.
+            for i in (0..m).step_by(TILE_ROWS) {
+                for j in (0..width).step_by(LANES) {
+                    let own = PanelProduct {
+                        a: part.a.wrapping_add(i * part.a_stride),
+                        b: part.b.add(j),
+                        dst: part.dst.add(i * part.dst_stride + j),
+                        cols: (part.cols - j).min(LANES),
+                        base: part.base.map(|b| b.add(j)),
+                        ..part
+                    };
+                    tiles::<S, 1>(s, own, (m - i).min(TILE_ROWS), width);
+                }
             }
         }
     }
