@@ -1,5 +1,5 @@
 //! The whole network: a training step of the small backbone; photographs to a picture with either
-//! backbone; the time of MVSplat's stages (`-- stages`); the serial fraction (`-- serial`). With
+//! backbone; stages with their rates (`-- stages`); the serial fraction (`-- serial`). With
 //! `--onnxruntime` also the same backbone and operators in onnxruntime, in the same run:
 //!
 //! ```text
@@ -14,22 +14,27 @@ mod common;
 mod ops;
 #[path = "network/rival.rs"]
 mod rival;
+#[path = "network/stages.rs"]
+mod stages;
 
 use anyhow::{Context, Result, bail};
 use candle_core::Tensor;
 use common::{Bench, Contender, Threads, inputs, scene};
 use rival::{Rival, median, timed};
-use std::collections::BTreeMap;
-use std::time::Instant;
+use stages::Stages;
+use std::ops::ControlFlow;
 use subsplat::FitOptions;
 use subsplat::camera::NearFar;
 use subsplat::config::{Config, Mvsplat as Settings, Preset, Small};
+use subsplat::cpu::SimdLevel;
 use subsplat::io::image::Rgb;
 use subsplat::model::Views;
 use subsplat::model::backbone::{DisparityMean, Mvsplat, SmallBackbone};
 use subsplat::model::trace::Trace;
 use subsplat::model::weights::Weights;
-use subsplat::pipeline::{Check, DepthBounds, Detail, Options, Photo, Reconstructor};
+use subsplat::pipeline::{
+    Check, DepthBounds, Detail, Options, Photo, Progress, Reconstructor, Stage,
+};
 
 /// The allocator of the programs.
 #[path = "../tools/cli/src/pages.rs"]
@@ -59,7 +64,7 @@ fn main() -> Result<()> {
     }
     let tables = ["stages", "serial"].map(|name| bench.selects(name));
     if tables[0] {
-        bench.on_all(stages)?;
+        stages(&mut bench)?;
     }
     if tables[1] {
         serial(&bench)?;
@@ -160,6 +165,17 @@ fn whole(case: &str) -> Result<Run> {
             Ok(f64::from(out.depths.mean_all()?.to_scalar::<f32>()?))
         }));
     }
+    let (model, photos, options) = self::case(case)?;
+    let camera = scene::camera(photos[0].size().width);
+    Ok(Box::new(move || {
+        let picture = model.run(&photos, &options)?.render(&camera);
+        Ok(f64::from(picture.rgb.iter().sum::<f32>()))
+    }))
+}
+
+/// Returns the model, the photographs and the options of one of [`CASES`] with photographs.
+fn case(case: &str) -> Result<(Reconstructor, [Photo; 2], Options)> {
+    let words: Vec<&str> = case.split(' ').collect();
     let [kind, from, "to", to] = words[..] else { bail!("no case {case:?}") };
     let (from, to): (usize, usize) = (from.parse()?, to.parse()?);
     let mut config = match kind {
@@ -169,18 +185,13 @@ fn whole(case: &str) -> Result<Run> {
     // MVSplat alone: one Gaussian per pixel.
     config.spgr.enabled = to > from;
     let model = Reconstructor::untrained(&config, 3)?;
-    let photos = [photo(to, 0)?, photo(to, 1)?];
     let options = Options::default()
         .with_input_size(from, from)
         .with_depth_prior(DepthBounds::re10k())
         .with_check(Check::Off)
         .with_detail(Detail::Off)
         .with_fit(FitOptions::off());
-    let camera = scene::camera(to);
-    Ok(Box::new(move || {
-        let picture = model.run(&photos, &options)?.render(&camera);
-        Ok(f64::from(picture.rgb.iter().sum::<f32>()))
-    }))
+    Ok((model, [photo(to, 0)?, photo(to, 1)?], options))
 }
 
 /// MVSplat of the released size, with seeded weights.
@@ -188,28 +199,40 @@ fn backbone() -> Result<Mvsplat> {
     Ok(Mvsplat::new(&Settings::re10k(), Weights::seeded(3).builder())?)
 }
 
-/// Prints the seconds between the stages that MVSplat's backbone reports, summed by the first two
-/// parts of their names; second of two runs.
-fn stages() -> Result<()> {
+/// Prints the stages of MVSplat's backbone, summed by the first two parts of their names, and of
+/// photographs to a scene with the small backbone; second of two runs.
+fn stages(bench: &mut Bench) -> Result<()> {
     let (net, v) = (backbone()?, views(1, 256)?);
-    let mut table = BTreeMap::<String, f64>::new();
-    for _ in 0..2 {
-        table.clear();
-        let mut last = Instant::now();
+    let observed = || {
+        let mut stages = Stages::start();
         let mut observe = |name: &str, _: &Tensor| {
             let parts: Vec<&str> = name.split('.').take(2).collect();
-            *table.entry(parts.join(".")).or_default() += last.elapsed().as_secs_f64();
-            last = Instant::now();
+            stages.end(&parts.join("."));
             Ok(())
         };
         net.forward(&v, &mut Trace::to(&mut observe))?;
-    }
-    let total: f64 = table.values().sum();
-    println!("\nstages of MVSplat's backbone, 256² (observed, so a little slower than alone)");
-    for (name, seconds) in &table {
-        println!("  {name:<40} {:>9.1} ms {:>5.1}%", 1e3 * seconds, 100.0 * seconds / total);
-    }
-    println!("  {:<40} {:>9.1} ms", "all", 1e3 * total);
+        anyhow::Ok(stages)
+    };
+    let small = || {
+        let mut stages = Stages::start();
+        let mut current = None;
+        let mut progress = |progress: Progress| {
+            stages.end(current.map_or("start", Stage::name));
+            current = Some(progress.stage);
+            ControlFlow::Continue(())
+        };
+        let (model, photos, options) = case("small 256 to 512")?;
+        model.run_with(&photos, &options, &mut progress)?;
+        stages.end(current.map_or("start", Stage::name));
+        anyhow::Ok(stages)
+    };
+    let mvsplat = bench.on_all(|| observed().and_then(|_| observed()))?;
+    let small = bench.on_all(|| small().and_then(|_| small()))?;
+    let level = SimdLevel::best().name();
+    let title = "MVSplat's backbone, 256² (observed, so a little slower than alone)";
+    mvsplat.print(&format!("stages of {title}, {level}"), bench.machine());
+    let title = "photographs to a scene, small 256 to 512";
+    small.print(&format!("stages of {title}, {level}"), bench.machine());
     Ok(())
 }
 

@@ -40,6 +40,7 @@ var<workgroup> state: array<vec2<f32>, 256>;
 var<workgroup> ends: array<u32, 256>;
 var<workgroup> last: atomic<u32>;
 var<workgroup> last_read: u32;
+// Per splat: mean and half sizes, which decide the rows; the rest of the footprint; colour and z.
 var<workgroup> batch: array<vec4<f32>, 3u * SPLATS>;
 var<workgroup> thread_sums: array<f32, THREADS * SUMS_STRIDE>;
 // Double buffers: indices of pairs, and masks of the threads that have sums.
@@ -92,14 +93,14 @@ fn store_pixel(slot: u32, x: u32, y: u32) {
 }
 
 // Returns the rows of 0..ROWS from `top` on that a splat can intersect in column `x`.
-fn intersected_rows(a: vec4<f32>, half: vec2<f32>, x: f32, top: f32) -> vec2<u32> {
+fn intersected_rows(mean: vec2<f32>, half: vec2<f32>, x: f32, top: f32) -> vec2<u32> {
     let reach = half + SPAN_SLACK_PX;
-    if abs(x - a.x) > reach.x {
+    if abs(x - mean.x) > reach.x {
         return vec2<u32>(0u);
     }
     let row_count = f32(ROWS);
-    let low = clamp(ceil(a.y - reach.y - top), 0.0, row_count);
-    let high = clamp(floor(a.y + reach.y - top) + 1.0, low, row_count);
+    let low = clamp(ceil(mean.y - reach.y - top), 0.0, row_count);
+    let high = clamp(floor(mean.y + reach.y - top) + 1.0, low, row_count);
     return vec2<u32>(u32(low), u32(high));
 }
 
@@ -161,19 +162,24 @@ fn main(
             let place = pairs[end - 1u - thread];
             let i = owners[place];
             places[buffer + thread] = place;
-            batch[3u * thread] = footprints[3u * i];
-            batch[3u * thread + 1u] = footprints[3u * i + 1u];
-            batch[3u * thread + 2u] = footprints[3u * i + 2u];
+            let a = footprints[3u * i];
+            let b = footprints[3u * i + 1u];
+            let c = footprints[3u * i + 2u];
+            batch[3u * thread] = vec4<f32>(a.xy, b.w, c.w);
+            batch[3u * thread + 1u] = vec4<f32>(a.zw, b.xy);
+            batch[3u * thread + 2u] = vec4<f32>(c.xyz, b.z);
         }
         workgroupBarrier();
         for (var s = 0u; s < count; s++) {
-            let a = batch[3u * s];
-            let b = batch[3u * s + 1u];
-            let c = batch[3u * s + 2u];
-            let rows = intersected_rows(a, vec2<f32>(b.w, c.w), f32(x), f32(top));
+            let place_size = batch[3u * s];
+            let rows = intersected_rows(place_size.xy, place_size.zw, f32(x), f32(top));
             if rows.x >= rows.y {
                 continue;
             }
+            let shape = batch[3u * s + 1u];
+            let a = vec4<f32>(place_size.xy, shape.xy);
+            let b = vec4<f32>(shape.zw, 0.0, 0.0);
+            let colour_z = batch[3u * s + 2u];
             let place = end - 1u - s;
             var v_low = vec3<f32>(0.0);
             var v_high = vec3<f32>(0.0);
@@ -190,7 +196,7 @@ fn main(
                 let left = state[slot];
                 let t = left.x / (1.0 - alpha);
                 let w = alpha * t;
-                let difference = dot(g, vec4<f32>(c.xyz, b.z)) - left.y;
+                let difference = dot(g, colour_z) - left.y;
                 state[slot] = vec2<f32>(t, left.y + alpha * difference);
                 // A capped alpha is constant.
                 let v = select(0.0, w * difference, alpha < call.alpha_max);

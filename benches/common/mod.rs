@@ -4,7 +4,7 @@
 //! has the bandwidth relative to a plain copy and the arithmetic rate relative to a loop of
 //! multiply-adds, both measured in the same run and at the same SIMD level.
 //!
-//! `cargo bench --bench raster -- [NAME …] [--quick] [--seconds S] [--threads N] [--simd LEVEL]
+//! `cargo bench --bench raster -- [NAME …] [--quick] [--seconds S] [--threads N] [--simd LEVEL|all]
 //! [--json FILE] [--write DIR] [--onnxruntime]`; a group runs where its name contains every NAME.
 
 #![allow(dead_code, reason = "each bench uses a part")]
@@ -15,7 +15,7 @@ mod machine;
 pub mod scene;
 
 use anyhow::{Context, Result, bail, ensure};
-use machine::Machine;
+pub use machine::Machine;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -66,28 +66,37 @@ impl Args {
                 name => out.names.push(name.to_owned()),
             }
         }
+        SimdLevel::requested()?;
         Ok(out)
     }
 }
 
 /// Returns where `name` is the SIMD level of this process. Else runs this program again with
-/// the same arguments at that level, and ends with its exit code: a process reads the variable
-/// `SUBSPLAT_SIMD` once.
+/// the same arguments at that level, or at each level one after the other where `name` is `all`,
+/// and ends with its exit code: a process reads the variable `SUBSPLAT_SIMD` once.
 ///
 /// # Errors
 /// A level that does not exist or that this processor lacks; a program that does not start.
 fn run_at(name: &str) -> Result<()> {
-    let level = SimdLevel::named(name).filter(|level| level.is_available());
     let here: Vec<&str> = SimdLevel::available().iter().map(|level| level.name()).collect();
-    let level = level.with_context(|| {
-        format!("--simd: expected one that this processor runs ({}), got {name}", here.join(", "))
-    })?;
-    if level == SimdLevel::best() {
+    ensure!(
+        name == "all" || here.contains(&name),
+        "--simd: expected all, or one that this processor runs ({}), got {name}",
+        here.join(", ")
+    );
+    if name == SimdLevel::best().name() {
         return Ok(());
     }
-    let mut again = Command::new(std::env::current_exe()?);
-    let status = again.args(std::env::args_os().skip(1)).env("SUBSPLAT_SIMD", name).status()?;
-    std::process::exit(status.code().unwrap_or(1));
+    for level in here.into_iter().filter(|level| name == "all" || *level == name) {
+        let mut again = Command::new(std::env::current_exe()?);
+        let words = std::env::args_os().skip(1);
+        let words = words.map(|word| if word == "all" { level.into() } else { word });
+        let status = again.args(words).env("SUBSPLAT_SIMD", level).status()?;
+        if name != "all" || !status.success() {
+            std::process::exit(status.code().unwrap_or(1));
+        }
+    }
+    std::process::exit(0)
 }
 
 /// Number of threads of a contender.
@@ -220,14 +229,18 @@ impl Bench {
         }
     }
 
+    /// Returns the machine's rates at this SIMD level, measured at the first call.
+    pub fn machine(&mut self) -> &Machine {
+        let (one, all, quick) = (&self.one, &self.all, self.args.quick);
+        self.machine.get_or_insert_with(|| Machine::measure(one, all, quick))
+    }
+
     /// Times `contenders` alternately and prints a table; ratios are relative to the first one.
     ///
     /// # Errors
     /// Errors of the contenders.
     pub fn group(&mut self, name: &str, mut contenders: Vec<Contender>, note: &str) -> Result<()> {
-        if self.machine.is_none() {
-            self.machine = Some(Machine::measure(&self.one, &self.all, self.args.quick));
-        }
+        self.machine();
         let seconds = self.args.seconds.unwrap_or(if self.args.quick { 2.0 } else { 10.0 });
         let share = seconds / contenders.len() as f64;
         let mut times: Vec<Times> = contenders.iter().map(|_| Times::default()).collect();

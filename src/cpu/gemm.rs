@@ -23,6 +23,7 @@ mod tests;
 
 use super::simd::{Kernel, LANES, Simd, SimdLevel};
 use super::uninit::UninitBuffer;
+use super::work;
 pub(super) use packing::copy;
 pub use packing::{Mat, Packed};
 use rayon::prelude::*;
@@ -109,6 +110,7 @@ pub(crate) unsafe fn product_at(
     if let Base::Row(row) = base {
         assert_eq!(row.len(), n, "gemm: row");
     }
+    work::add(m * k * n, m * k + k * n + m * n);
     level.run(Product { dst, lhs, rhs, scale, base });
 }
 

@@ -46,6 +46,7 @@ pub mod spgr;
 pub mod sums;
 mod tiles;
 mod uninit;
+pub mod work;
 
 pub use project::{Geometry, SplatSlices};
 pub use project_bwd::Gradients;

@@ -98,7 +98,9 @@ pub(super) fn share<V: Vector>(rule: OpacityRule, areas: &[V], alpha: V, own: V,
     }
     if rule == OpacityRule::Linear {
         let factor = alpha / per_area(areas, alphas);
-        alphas.iter_mut().for_each(|o| *o = *o * factor);
+        for o in alphas {
+            *o = *o * factor;
+        }
         return;
     }
     let one = V::constant(1.0);
@@ -107,7 +109,9 @@ pub(super) fn share<V: Vector>(rule: OpacityRule, areas: &[V], alpha: V, own: V,
     let whole = if rule == OpacityRule::Area { alpha } else { optical_depth(alpha) };
     let factor = whole * inverse;
     if rule == OpacityRule::Transmittance {
-        alphas.iter_mut().for_each(|o| *o = opacity_of(rule, factor * *o));
+        for o in alphas {
+            *o = opacity_of(rule, factor * *o);
+        }
         return;
     }
     let (mut areas, mut pairs) = (areas.chunks_exact(2), alphas.chunks_exact_mut(2));

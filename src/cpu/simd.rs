@@ -53,7 +53,7 @@ pub(crate) use lanes16::{
     APPROX_SQRT_ERROR, F32Vector, IntVector, Simd, all_inside, first_lanes_bits, transpose4x4_index,
 };
 pub(crate) use level::Kernel;
-pub use level::{SimdLevel, vectorize};
+pub use level::{SimdLevel, UnknownLevel, vectorize};
 pub use real::{Real, VectorKernel};
 pub use rows::RowLayout;
 pub use vector::{Mask, Vector};

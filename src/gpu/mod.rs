@@ -24,7 +24,7 @@
 //! | intersect | 1 | 64 | 0 | 16, 32 | 68 N + 8 P |
 //! | sort by tile | 3 per 4 bits of T | 256 | 9,216 | 3, 8 | 20 P per 4 bits |
 //! | ranges | 1 | 256 | 0 | 4, 8 | 12 P + 8 T |
-//! | rasterize | 1 | 256 | 12,296 | 2, 8 | 56 P + 28 px |
+//! | rasterize | 1 | 64 | 6,152 | 5, 16 | 56 P + 28 px |
 //! | rasterize backward | 1 | 32 | 15,368 | 2, 6 | 96 P + 28 px |
 //! | sum pairs | 1 | 64 | 0 | 16, 32 | 40 P + 68 N |
 //! | project backward | 2 a part | 64 | 0 | 16, 32 | 236 N |

@@ -3,12 +3,13 @@
 use super::progress::{Callback, StageCost, Tracker};
 use super::warning::Warning;
 use super::{
-    Check, DepthBounds, DepthRange, DepthSource, Detail, Options, Photo, Poses, Prepared, Progress,
-    Reconstruction, Refine, Result, Stage, check_pairs, exposure, is_mvsplat, poses,
+    Check, DepthBounds, DepthRange, DepthSource, Detail, Error, Options, Photo, Poses, Prepared,
+    Progress, Reconstruction, Refine, Result, Stage, check_pairs, exposure, is_mvsplat, poses,
     refined_bounds,
 };
 use crate::camera::{Camera, NearFar, Size};
 use crate::config::{Config, Preset};
+use crate::cpu::SimdLevel;
 use crate::data::crop::{CropOptions, Cropped};
 use crate::data::pair::choose_sources;
 use crate::model::subsplat::SubSplat;
@@ -32,7 +33,8 @@ impl Reconstructor {
     /// sweep and gives a usable scene; MVSplat's gives noise.
     ///
     /// # Errors
-    /// A configuration out of range.
+    /// A configuration out of range; an environment variable `SUBSPLAT_SIMD` that names no level
+    /// of this processor.
     pub fn untrained(config: &Config, seed: u64) -> Result<Self> {
         Self::build(config, Weights::seeded(seed))
     }
@@ -41,7 +43,7 @@ impl Reconstructor {
     /// Gaussians.
     ///
     /// # Errors
-    /// An `upscale` out of range.
+    /// An `upscale` out of range; `SUBSPLAT_SIMD` as in [`Reconstructor::untrained`].
     pub fn shipped(upscale: usize) -> Result<Self> {
         Self::from_weights(Weights::shipped(upscale)?, None)
     }
@@ -53,7 +55,8 @@ impl Reconstructor {
     ///
     /// # Errors
     /// A file that holds no weights; a tensor that is missing or has another shape, named with
-    /// both shapes; a configuration out of range.
+    /// both shapes; a configuration out of range; `SUBSPLAT_SIMD` as in
+    /// [`Reconstructor::untrained`].
     pub fn load(path: &Path, config: Option<&Config>) -> Result<Self> {
         Self::from_weights(Weights::load(path)?, config)
     }
@@ -75,6 +78,8 @@ impl Reconstructor {
     }
 
     fn build(config: &Config, weights: Weights) -> Result<Self> {
+        SimdLevel::requested()
+            .map_err(|level| Error::argument(level.variable(), level.expected(), level.found()))?;
         let model = SubSplat::new(config, weights.builder())?;
         Ok(Self { model, weights, backend: Backend::Cpu, missing: 0 })
     }

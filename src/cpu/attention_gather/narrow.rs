@@ -16,9 +16,11 @@ use rayon::prelude::*;
 /// Most samples of a parent, and four times as many taps.
 const SAMPLES: usize = 32;
 const TAPS: usize = 4 * SAMPLES;
-/// Taps whose dot products are summed at once, vectors of the result at once: as many
-/// chains as hide a product's latency.
+/// Taps whose dot products are summed at once, vectors of the result at once: as many chains as
+/// hide a product's latency, where a vector is one register.
 const WIDE: usize = 8;
+/// The same where a vector is more than one register, of which there are fewer.
+const NARROW: usize = 4;
 
 /// Returns whether [`forward`] supports `g`.
 pub(super) fn suits(g: &Gather) -> bool {
@@ -149,53 +151,53 @@ unsafe fn lanes<S: Simd>(s: S, p: *const f32) -> S::F {
     s.load(unsafe { &*p.cast::<[f32; LANES]>() })
 }
 
-/// q·k of the taps, eight at once.
+/// q·k of the taps, `N` at once; `N` divides [`TAPS`].
 ///
 /// # Safety
 /// Rows of `dim` keys at every one of `taps`, `dim` floats in `q`; `dim` in whole vectors.
 #[inline(always)]
-unsafe fn products<S: Simd>(
+unsafe fn products<S: Simd, const N: usize>(
     s: S,
     q: &[f32],
     keys: *const f32,
     taps: &Taps,
     dots: &mut [f32; TAPS],
 ) {
-    for first in (0..taps.count).step_by(WIDE) {
-        let mut rows = [keys; WIDE];
+    for first in (0..taps.count).step_by(N) {
+        let mut rows = [keys; N];
         for (row, at) in rows.iter_mut().zip(&taps.at[first..taps.count]) {
             *row = keys.wrapping_add(*at);
         }
-        let mut sums = [s.splat(0.0); WIDE];
+        let mut sums = [s.splat(0.0); N];
         for c in (0..q.len()).step_by(LANES) {
             // SAFETY: as the caller's; rows past the last tap are the first of the maps.
             unsafe {
                 let q = lanes(s, q.as_ptr().add(c));
-                for t in 0..WIDE {
+                for t in 0..N {
                     sums[t] = q.fma(lanes(s, rows[t].add(c)), sums[t]);
                 }
             }
         }
-        dots[first..first + WIDE].copy_from_slice(&s.sums(sums));
+        dots[first..first + N].copy_from_slice(&s.sums(sums));
     }
 }
 
-/// Σ weight · value row into `out`.
+/// Σ weight · value row into `out`, `N` vectors at once.
 ///
 /// # Safety
 /// As [`products`], of values and `out`.
 #[inline(always)]
-unsafe fn blend<S: Simd>(s: S, values: *const f32, taps: &Taps, out: &mut [f32]) {
-    for c in (0..out.len()).step_by(WIDE * LANES) {
-        let mut sums = [s.splat(0.0); WIDE];
+unsafe fn blend<S: Simd, const N: usize>(s: S, values: *const f32, taps: &Taps, out: &mut [f32]) {
+    for c in (0..out.len()).step_by(N * LANES) {
+        let mut sums = [s.splat(0.0); N];
         for (at, weight) in taps.at[..taps.count].iter().zip(&taps.weight) {
             let (row, weight) = (values.wrapping_add(at + c), s.splat(*weight));
-            for i in 0..WIDE {
+            for i in 0..N {
                 // SAFETY: the caller's.
                 sums[i] = weight.fma(unsafe { lanes(s, row.add(i * LANES)) }, sums[i]);
             }
         }
-        for i in 0..WIDE {
+        for i in 0..N {
             // SAFETY: the caller's.
             let to = unsafe { &mut *out.as_mut_ptr().add(c + i * LANES).cast::<[f32; LANES]>() };
             s.store(sums[i], to);
@@ -208,6 +210,13 @@ impl Kernel for Block<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
+        if S::REGISTERS >= 32 { self.gather::<S, WIDE>(s) } else { self.gather::<S, NARROW>(s) }
+    }
+}
+
+impl Block<'_> {
+    #[inline(always)]
+    fn gather<S: Simd, const N: usize>(self, s: S) {
         let Self { g, key, maps, query, points, out } = self;
         let mut taps = Taps {
             at: [0; TAPS],
@@ -226,13 +235,13 @@ impl Kernel for Block<'_> {
             assert!(last + g.stride <= maps.len(), "attention gather: a tap past the maps");
             // SAFETY: rows of `stride` floats lie inside the maps, as checked above; keys and
             // values inside a row ([`forward`]); `dim` is in whole vectors ([`suits`]).
-            unsafe { products(s, q, maps.as_ptr().add(key), &taps, &mut dots) };
+            unsafe { products::<S, N>(s, q, maps.as_ptr().add(key), &taps, &mut dots) };
             if !taps.attend(g, &dots, &rest[..samples], &rest[samples..]) {
                 out.fill(0.0);
                 continue;
             }
             // SAFETY: as above.
-            unsafe { blend(s, maps.as_ptr().add(g.value), &taps, out) };
+            unsafe { blend::<S, N>(s, maps.as_ptr().add(g.value), &taps, out) };
         }
     }
 }

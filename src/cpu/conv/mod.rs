@@ -87,9 +87,10 @@ mod winograd;
 
 use super::simd::SimdLevel;
 use super::uninit::{UninitBuffer, UninitSlice};
+use super::work;
 use algorithm::{
-    Convolve, ConvolveArgs, WeightGrad, WeightGradArgs, choose_algorithm,
-    choose_weight_grad_algorithm,
+    Algorithm, Convolve, ConvolveArgs, WeightGrad, WeightGradAlgorithm, WeightGradArgs,
+    choose_algorithm, choose_weight_grad_algorithm,
 };
 use plan::Plan;
 
@@ -120,7 +121,11 @@ pub fn weight_grad(level: SimdLevel, s: &Sizes, x: &[f32], dy: &[f32], dw: &mut 
         return;
     }
     let args = WeightGradArgs { level, plan: &Plan::forward(s), x, dy };
-    choose_weight_grad_algorithm(args.plan, args.images()).weight_grad(&args, dw);
+    let algorithm = choose_weight_grad_algorithm(args.plan, args.images());
+    if algorithm != WeightGradAlgorithm::Pointwise {
+        work::add(args.plan.products(args.images()), x.len() + dy.len() + dw.len());
+    }
+    algorithm.weight_grad(&args, dw);
 }
 
 /// Convolves into new memory.
@@ -134,7 +139,15 @@ fn convolve(args: &ConvolveArgs<'_>, images: usize) -> Vec<f32> {
 
 /// Convolves into `y`, by the algorithm that [`choose_algorithm`] returns.
 fn convolve_into(args: &ConvolveArgs<'_>, y: &mut UninitSlice<f32>) {
-    if !y.is_empty() {
-        choose_algorithm(args.plan).convolve(args, y);
+    if y.is_empty() {
+        return;
     }
+    let ConvolveArgs { plan, x, w, .. } = *args;
+    let algorithm = choose_algorithm(plan);
+    // The matrix product counts its own work.
+    if algorithm != Algorithm::Pointwise {
+        let images = y.len() / (plan.dst_channels * plan.dst_pixels());
+        work::add(plan.products(images), x.len() + w.len() + y.len());
+    }
+    algorithm.convolve(args, y);
 }

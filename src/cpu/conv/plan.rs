@@ -213,6 +213,15 @@ impl Plan {
         self.dst_size.iter().product()
     }
 
+    /// Returns the products of the definition, for `images` images.
+    pub fn products(&self, images: usize) -> usize {
+        let outputs = match self.direction {
+            Direction::Forward => self.dst_pixels(),
+            Direction::InputGrad => self.src_pixels(),
+        };
+        images * self.src_channels * self.dst_channels * outputs * self.kernel_taps
+    }
+
     /// Returns the index in the weights `[O·C, taps]` of the kernel that maps source channel
     /// `src` to destination channel `dst`.
     #[inline(always)]

@@ -86,6 +86,15 @@ impl Strip<'_> {
             }
         } else {
             match channels {
+                // AVX2 has 16 registers, two a vector: twelve sums, then eight, are in flight.
+                8 if S::REGISTERS >= 8 => {
+                    self.tiles::<S, 8, 6, 1, 1>(s, 0, to);
+                    self.tiles::<S, 8, 2, 2, 1>(s, 6, to);
+                }
+                7 if S::REGISTERS >= 8 => {
+                    self.tiles::<S, 7, 5, 1, 1>(s, 0, to);
+                    self.tiles::<S, 7, 2, 2, 1>(s, 5, to);
+                }
                 8 => {
                     self.tiles::<S, 8, 4, 1, 1>(s, 0, to);
                     self.tiles::<S, 8, 4, 1, 1>(s, 4, to);

@@ -58,6 +58,18 @@ impl OuterProducts<'_> {
                 2 => self.tile::<S, M, 2>(s, offsets, 0, 0, store, sums),
                 _ => self.tile::<S, M, 1>(s, offsets, 0, 0, store, sums),
             }
+        } else if S::REGISTERS >= 8 && M > 4 {
+            // As in the forward direction: twelve sums in flight, then eight.
+            for channel in (0..self.stride).step_by(LANES) {
+                self.tile::<S, 6, 1>(s, offsets, 0, channel, store, sums);
+            }
+            let pairs = self.stride / (2 * LANES) * 2 * LANES;
+            for channel in (0..pairs).step_by(2 * LANES) {
+                self.tile::<S, 2, 2>(s, offsets, 6, channel, store, sums);
+            }
+            if pairs < self.stride {
+                self.tile::<S, 2, 1>(s, offsets, 6, pairs, store, sums);
+            }
         } else {
             for channel in (0..self.stride).step_by(LANES) {
                 self.tile::<S, 4, 1>(s, offsets, 0, channel, store, sums);

@@ -51,15 +51,19 @@ pub(super) unsafe fn multiply_panel<S: Simd>(s: S, part: PanelProduct, m: usize,
                 _ => tiles::<S, 1>(s, part, m, width),
             }
         } else {
-            for j in (0..width).step_by(LANES) {
-                let own = PanelProduct {
-                    b: part.b.add(j),
-                    dst: part.dst.add(j),
-                    cols: (part.cols - j).min(LANES),
-                    base: part.base.map(|b| b.add(j)),
-                    ..part
-                };
-                tiles::<S, 1>(s, own, m, width);
+            // A tile's rows stay in the first-level cache for all columns of the panel.
+            for i in (0..m).step_by(TILE_ROWS) {
+                for j in (0..width).step_by(LANES) {
+                    let own = PanelProduct {
+                        a: part.a.wrapping_add(i * part.a_stride),
+                        b: part.b.add(j),
+                        dst: part.dst.add(i * part.dst_stride + j),
+                        cols: (part.cols - j).min(LANES),
+                        base: part.base.map(|b| b.add(j)),
+                        ..part
+                    };
+                    tiles::<S, 1>(s, own, (m - i).min(TILE_ROWS), width);
+                }
             }
         }
     }
@@ -113,19 +117,23 @@ unsafe fn tile<S: Simd, const R: usize, const V: usize>(s: S, part: PanelProduct
     // SAFETY: the contract of this function.
     unsafe {
         let mut sums = [[s.splat(0.0); V]; R];
-        let (mut a, mut b) = (part.a, part.b);
-        for _ in 0..part.depth {
+        let mut b = part.b;
+        // A pointer to each row: with one pointer, the loop computes the addresses anew.
+        let mut a = [part.a; R];
+        for r in 0..R {
+            a[r] = part.a.wrapping_add(r * part.a_stride);
+        }
+        for i in 0..part.depth {
             let mut columns = [s.splat(0.0); V];
             for v in 0..V {
                 columns[v] = load(s, b.add(v * LANES));
             }
             for r in 0..R {
-                let x = s.splat(*a.add(r * part.a_stride));
+                let x = s.splat(*a[r].wrapping_add(i));
                 for v in 0..V {
                     sums[r][v] = x.fma(columns[v], sums[r][v]);
                 }
             }
-            a = a.add(1);
             b = b.wrapping_add(width);
         }
         epilogue(s, part, sums);

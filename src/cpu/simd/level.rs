@@ -13,7 +13,41 @@ use super::neon;
 use super::simd128;
 #[cfg(target_arch = "x86_64")]
 use super::{avx2, avx512, sse2};
+use std::fmt;
 use std::sync::OnceLock;
+
+/// The environment variable that names a level.
+const VARIABLE: &str = "SUBSPLAT_SIMD";
+
+/// A value of `SUBSPLAT_SIMD` that names no level of this processor.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct UnknownLevel(String);
+
+impl UnknownLevel {
+    /// Returns the name of the variable.
+    pub fn variable(&self) -> &'static str {
+        VARIABLE
+    }
+
+    /// Lists the values that are accepted.
+    pub fn expected(&self) -> String {
+        let names: Vec<&str> = SimdLevel::available().iter().map(|level| level.name()).collect();
+        format!("a level of this processor ({})", names.join(", "))
+    }
+
+    /// Returns the value that was found.
+    pub fn found(&self) -> &str {
+        &self.0
+    }
+}
+
+impl fmt::Display for UnknownLevel {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        write!(f, "{}: expected {}, got {}", self.variable(), self.expected(), self.found())
+    }
+}
+
+impl std::error::Error for UnknownLevel {}
 
 /// An instruction set that kernels are compiled for.
 ///
@@ -59,15 +93,32 @@ impl SimdLevel {
     }
 
     /// Returns the fastest level here, or the one that the environment variable
-    /// `SUBSPLAT_SIMD` names (`scalar`, `avx2`, `avx512`, `neon`). The variable is read
-    /// once; a level that the processor lacks is ignored.
+    /// `SUBSPLAT_SIMD` names ([`SimdLevel::requested`]), which is read once.
     pub fn best() -> SimdLevel {
         static BEST: OnceLock<SimdLevel> = OnceLock::new();
         *BEST.get_or_init(|| {
-            let named = std::env::var("SUBSPLAT_SIMD").ok();
-            let named = named.and_then(|name| Self::named(&name)).filter(|l| l.is_available());
-            named.or(Self::available().last().copied()).unwrap_or(SimdLevel::Scalar)
+            let requested = Self::requested().ok().flatten();
+            requested.or(Self::available().last().copied()).unwrap_or(SimdLevel::Scalar)
         })
+    }
+
+    /// Returns the level that the environment variable `SUBSPLAT_SIMD` names (`scalar`, `avx2`,
+    /// `avx512`, `neon`), or `None` where the variable is absent or empty.
+    ///
+    /// # Errors
+    /// The variable names no level that this processor supports. [`SimdLevel::best`] is then the
+    /// fastest level.
+    pub fn requested() -> Result<Option<SimdLevel>, UnknownLevel> {
+        match std::env::var_os(VARIABLE) {
+            Some(value) if !value.is_empty() => Self::here(&value.to_string_lossy()).map(Some),
+            _ => Ok(None),
+        }
+    }
+
+    /// Finds a level that this processor supports.
+    fn here(name: &str) -> Result<SimdLevel, UnknownLevel> {
+        let level = Self::named(name).filter(|level| level.is_available());
+        level.ok_or_else(|| UnknownLevel(name.to_owned()))
     }
 
     /// Finds the level that `SUBSPLAT_SIMD` calls `name`.
@@ -154,4 +205,25 @@ pub fn vectorize<R>(f: impl FnOnce() -> R) -> R {
         }
     }
     SimdLevel::best().run(Closure(f))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_levels_that_do_not_exist_here_are_errors() {
+        for &level in SimdLevel::available() {
+            assert_eq!(SimdLevel::here(level.name()), Ok(level));
+        }
+        let elsewhere = SimdLevel::ALL.into_iter().find(|level| !level.is_available());
+        for name in
+            [Some("axv2"), Some("AVX2"), elsewhere.map(SimdLevel::name)].into_iter().flatten()
+        {
+            let error = SimdLevel::here(name).unwrap_err().to_string();
+            assert!(error.starts_with("SUBSPLAT_SIMD: expected"), "{error}");
+            assert!(error.contains("(scalar"), "{error}");
+            assert!(error.ends_with(&format!("got {name}")), "{error}");
+        }
+    }
 }

@@ -103,7 +103,7 @@ impl Vector for F {
     type Mask = M;
     const LANES: usize = LANES;
     // Engines map four of these registers to each vector, on machines with 16.
-    const REGISTERS: usize = 8;
+    const REGISTERS: usize = 4;
 
     #[inline(always)]
     fn splat(v: f32) -> F {

@@ -119,7 +119,7 @@ impl Vector for F {
     type Element = f32;
     type Mask = M;
     const LANES: usize = LANES;
-    const REGISTERS: usize = 8;
+    const REGISTERS: usize = 4;
 
     #[inline(always)]
     fn splat(v: f32) -> F {

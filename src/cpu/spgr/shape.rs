@@ -11,14 +11,25 @@ const SERIES_BELOW: f64 = 1.0;
 /// Hamilton product, wxyz.
 #[inline(always)]
 pub(super) fn multiply<V: Vector>(a: [V; 4], b: [V; 4]) -> [V; 4] {
-    let vector =
-        |i: usize, j: usize, k: usize| (a[0] * b[i] + a[i] * b[0]) + (a[j] * b[k] - a[k] * b[j]);
     [
         (a[0] * b[0] - a[1] * b[1]) - (a[2] * b[2] + a[3] * b[3]),
-        vector(1, 2, 3),
-        vector(2, 3, 1),
-        vector(3, 1, 2),
+        imaginary(a, b, [1, 2, 3]),
+        imaginary(a, b, [2, 3, 1]),
+        imaginary(a, b, [3, 1, 2]),
     ]
+}
+
+/// Returns the value of the axis with the shortest length, the first of several.
+#[inline(always)]
+fn of_shortest<V: Vector>([l0, l1, l2]: V3<V>, [a, b, c]: V3<V>) -> V {
+    let not_first = l2.lt(l1).select(c, b);
+    l1.min(l2).lt(l0).select(not_first, a)
+}
+
+/// Component i of the product of two quaternions; i, j, k follow one another cyclically.
+#[inline(always)]
+fn imaginary<V: Vector>(a: [V; 4], b: [V; 4], [i, j, k]: [usize; 3]) -> V {
+    (a[0] * b[i] + a[i] * b[0]) + (a[j] * b[k] - a[k] * b[j])
 }
 
 #[inline(always)]
@@ -152,14 +163,20 @@ impl<V: Vector> Footprint<V> {
         Self { turned, m, normal, area }
     }
 
+    /// Returns the squared length of each column of M.
+    #[inline(always)]
+    fn squared_lengths(&self) -> V3<V> {
+        let [a, b] = &self.m;
+        [a[0].fma(a[0], b[0] * b[0]), a[1].fma(a[1], b[1] * b[1]), a[2].fma(a[2], b[2] * b[2])]
+    }
+
     /// √det(M Mᵀ + low-pass·I) for M's columns times `growth` and the area with it.
     #[inline(always)]
     pub(super) fn blurred(&self, growth: V3<V>, area: V, lowpass: f64) -> V {
-        let column = |i: usize| {
-            let g = growth[i] * growth[i];
-            g * self.m[0][i].fma(self.m[0][i], self.m[1][i] * self.m[1][i])
-        };
-        let trace = column(0) + column(1) + column(2);
+        let l = self.squared_lengths();
+        let trace = growth[0] * growth[0] * l[0]
+            + growth[1] * growth[1] * l[1]
+            + growth[2] * growth[2] * l[2];
         let lowpass = V::constant(lowpass);
         area.fma(area, lowpass.fma(trace, lowpass * lowpass)).sqrt()
     }
@@ -215,22 +232,20 @@ impl<V: Vector> Footprint<V> {
             let c = small.select((a_min / area).sqrt().min(most), one);
             return [c; 3];
         }
-        let length = |i: usize| self.m[0][i].fma(self.m[0][i], self.m[1][i] * self.m[1][i]);
-        let (l0, l1, l2) = (length(0), length(1), length(2));
-        // The axis that stays is the first of the shortest columns.
-        let pick = |a: V, b: V, c: V| {
-            let not_first = l2.lt(l1).select(c, b);
-            l1.min(l2).lt(l0).select(not_first, a)
-        };
+        let lengths = self.squared_lengths();
         let n = self.normal;
         let s = [n[0] * n[0], n[1] * n[1], n[2] * n[2]];
         // c⁴·p + c²·q = A_min², the root without cancellation.
-        let p = pick(s[0], s[1], s[2]);
-        let q = pick(s[1] + s[2], s[0] + s[2], s[0] + s[1]);
+        let p = of_shortest(lengths, [s[0], s[1], s[2]]);
+        let q = of_shortest(lengths, [s[1] + s[2], s[0] + s[2], s[0] + s[1]]);
         let target = a_min * a_min;
         let root = q.fma(q, V::constant(4.0) * p * target).sqrt();
         let c2 = V::constant(2.0) * target / (q + root);
         let c = small.select(c2.sqrt().min(most), one);
-        [pick(one, c, c), pick(c, one, c), pick(c, c, one)]
+        [
+            of_shortest(lengths, [one, c, c]),
+            of_shortest(lengths, [c, one, c]),
+            of_shortest(lengths, [c, c, one]),
+        ]
     }
 }

@@ -43,6 +43,7 @@ use args::{Cli, Command};
 use clap::error::ErrorKind;
 use clap::{CommandFactory, Parser};
 use std::process::ExitCode;
+use subsplat::cpu::SimdLevel;
 
 /// Exit code of a negative answer.
 const ANSWER_NO: u8 = 3;
@@ -76,6 +77,7 @@ pub fn main() -> ExitCode {
 }
 
 fn dispatch(cli: &Cli, answer: Answer) -> Result<bool> {
+    SimdLevel::requested()?;
     if let Some(threads) = cli.threads {
         rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().context("--threads")?;
     }

@@ -242,3 +242,18 @@ fn backtraces_stay_out_of_errors() {
     // It ends with the shape that is missing.
     assert!(error.ends_with("got no such tensor"), "{error}");
 }
+
+#[test]
+fn an_unknown_simd_level() {
+    let place = workplace();
+    for arguments in [&["--json", "run", "scene"][..], &["--json", "info", "scene"]] {
+        let called = call_with(place.path(), arguments, &[("SUBSPLAT_SIMD", "axv2")]);
+        assert_eq!(called.code, 1, "{}", called.stderr);
+        let error = called.error();
+        assert!(error.starts_with("error: SUBSPLAT_SIMD: expected "), "{error}");
+        assert!(error.contains("scalar") && error.ends_with("got axv2"), "{error}");
+        assert_eq!(format!("error: {}", called.json()["error"].as_str().unwrap()), error);
+    }
+    let called = call_with(place.path(), &["info", "scene"], &[("SUBSPLAT_SIMD", "scalar")]);
+    assert_eq!(called.code, 0, "{}", called.stderr);
+}
