@@ -41,8 +41,8 @@ const IMPORTS: &[(&str, &[&str])] = &[
     (
         "eval",
         &[
-            "abi", "camera", "config", "cpu", "data", "fit", "io", "metrics", "model", "pipeline",
-            "refine", "render", "splats",
+            "abi", "camera", "clock", "config", "cpu", "data", "fit", "io", "metrics", "model",
+            "pipeline", "refine", "render", "splats",
         ],
     ),
     (

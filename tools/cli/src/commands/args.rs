@@ -1,6 +1,7 @@
 //! Command-line arguments. Their documentation is the program's manual.
 
 use super::args_eval::EvalArgs;
+use super::args_paper::PaperArgs;
 #[cfg(feature = "view")]
 use super::args_view::{KEYS, ViewArgs};
 use super::values;
@@ -60,6 +61,8 @@ pub enum Command {
     Info(InfoArgs),
     /// Score a model and baselines on photographs that it was not trained on.
     Eval(Box<EvalArgs>),
+    /// Make the paper's tables and figures, with the paper's numbers beside.
+    Paper(PaperArgs),
     /// Run the encoder, or the rasterizer, on the inputs of a reference file, and compare every
     /// tensor in the file.
     Compare(CompareArgs),

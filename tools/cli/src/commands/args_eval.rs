@@ -47,9 +47,9 @@ pub struct EvalArgs {
     /// (pictures/METHOD/SCENE/INPUTS/FRAME.png). Default: no files are written.
     #[arg(short, long, value_name = "DIR")]
     pub out: Option<PathBuf>,
-    /// Target over input, side over side. Default: the weights' own, else 2.
-    #[arg(long, value_name = "R", value_parser = ["1", "2", "4"])]
-    pub upscale: Option<String>,
+    /// Target over input, side over side, 1 to 8, as in `run`. Default: the weights' own, else 2.
+    #[arg(long, value_name = "R", value_parser = values::upscale)]
+    pub upscale: Option<f32>,
     /// Side of the network's input, px: N, or WxH (default: protocol.json's, else 256).
     #[arg(long, value_name = "N | WxH", value_parser = values::size)]
     pub input_size: Option<(usize, usize)>,

@@ -1,0 +1,123 @@
+//! The data sets of the tables, or generated rooms in their place.
+
+use super::tables::{INPUT, Setting};
+use crate::report::Progress;
+use anyhow::{Context, Result};
+use std::path::{Path, PathBuf};
+use subsplat::eval::Benchmark;
+use subsplat::train::TrainConfig;
+use subsplat::train::folders::write_scene;
+use subsplat::train::source::Source;
+use subsplat::train::validate::{Split, rooms};
+
+/// Side of the network's input for generated rooms, px. Rooms for 256 px take four times as long.
+const GENERATED_INPUT: usize = 128;
+/// Seed of the generated rooms, which no training uses.
+const SEED: u64 = 77;
+/// Targets of a generated room.
+const TARGETS: usize = 2;
+/// Samples along each side of a pixel.
+const SAMPLES: usize = 2;
+/// Folders of `--data`.
+const FOLDERS: [&str; 6] = ["re10k", "re10k-720", "re10k-1080", "acid", "acid-720", "acid-1080"];
+
+/// The data of the arguments.
+pub struct Sets<'a> {
+    /// `--data`.
+    pub root: Option<&'a Path>,
+    /// `--input-size`.
+    pub input: Option<usize>,
+    /// `--limit`.
+    pub scenes: usize,
+    /// Folder for generated rooms.
+    pub generated: PathBuf,
+}
+
+/// Data of a setting.
+pub struct Opened {
+    /// The cases.
+    pub benchmark: Benchmark,
+    /// Name of the data in the tables.
+    pub name: String,
+    /// True for generated rooms.
+    pub generated: bool,
+    /// Side of the network's input, px.
+    pub input: usize,
+}
+
+impl Sets<'_> {
+    /// Opens the data of a setting. Where its folder is absent, rooms are generated.
+    ///
+    /// # Errors
+    /// Data that cannot be read; a room that cannot be written.
+    pub fn open(&self, setting: &Setting, progress: &mut Progress) -> Result<Opened> {
+        let mut opened = match self.folder(setting) {
+            Some(folder) => {
+                let index = folder.with_extension("json");
+                let index = Some(index.as_path()).filter(|file| file.is_file());
+                let name = folder.file_name().unwrap_or(folder.as_os_str()).to_string_lossy();
+                Opened {
+                    benchmark: Benchmark::open(&folder, index)?,
+                    name: name.into_owned(),
+                    generated: false,
+                    input: self.input.unwrap_or(INPUT),
+                }
+            }
+            None => {
+                let input = self.generated_input();
+                let folder = self.rooms(input * setting.upscale, progress)?;
+                Opened {
+                    benchmark: Benchmark::open(&folder, None)?,
+                    name: "generated rooms".to_owned(),
+                    generated: true,
+                    input,
+                }
+            }
+        };
+        opened.benchmark.limit(self.scenes);
+        Ok(opened)
+    }
+
+    /// Side of the network's input where rooms are generated, px.
+    pub fn generated_input(&self) -> usize {
+        self.input.unwrap_or(GENERATED_INPUT)
+    }
+
+    /// The folder of a setting's data: that of the data set in `root`; `root` itself if it holds no
+    /// data set by name.
+    fn folder(&self, setting: &Setting) -> Option<PathBuf> {
+        let root = self.root?;
+        if !FOLDERS.iter().any(|name| root.join(name).is_dir()) {
+            return Some(root.to_owned());
+        }
+        setting.folders().iter().map(|name| root.join(name)).find(|folder| folder.is_dir())
+    }
+
+    /// Generates rooms with pictures of `side` px, unless their folder has them. Returns the folder.
+    ///
+    /// # Errors
+    /// A file that cannot be written.
+    pub fn rooms(&self, side: usize, progress: &mut Progress) -> Result<PathBuf> {
+        let folder = self.generated.join(format!("{side}px"));
+        let mut config = TrainConfig::default();
+        config.model.upscale = 1;
+        config.data.input = [side, side];
+        config.data.targets = TARGETS;
+        config.data.target_samples = SAMPLES;
+        config.data.seed = SEED;
+        let source = rooms(&config, Split::HeldOut)?;
+        let place = |i: usize| folder.join(format!("room_{i:03}"));
+        let missing = |i: &usize| !place(*i).join("protocol.json").is_file();
+        let new: Vec<usize> = (0..self.scenes).filter(missing).collect();
+        progress.steps("rooms", new.len(), |bar| {
+            for i in &new {
+                let place = place(*i);
+                let write = || write_scene(&*source.example(*i as u64)?, &place);
+                write().with_context(|| place.display().to_string())?;
+                bar.inc(1);
+            }
+            Ok::<_, anyhow::Error>(())
+        })?;
+        Ok(folder)
+    }
+}
