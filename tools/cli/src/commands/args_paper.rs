@@ -14,8 +14,8 @@ specification of a Table 6 exists.
 
 --data ROOT holds re10k-720 or re10k, re10k-1080, acid-720 or acid, and acid-1080: each what `eval` \
 reads, with the evaluation index of chunks beside it (ROOT/re10k.json). A ROOT without these folders is \
-itself the data of every column. Where a data set is absent, generated rooms stand in for it, at half \
-of the paper's sizes, and the output says so.
+itself the data of every column. Where a data set is absent, generated rooms, and shapes in place of \
+ACID, stand in for it at half of the paper's sizes, and the output says so.
 
 --ckpts DIR holds NAME-xR.safetensors or NAME.safetensors: mvsplat, subsplat, and the ablations full, \
 no-aggregation, stages-1, stages-2, beta-z-50, beta-z-75, beta-z-100, lambda-s-50, -55, -65, -70, \
@@ -34,7 +34,7 @@ pub struct PaperArgs {
     /// Output folder.
     #[arg(short, long, default_value = "out/paper", value_name = "DIR")]
     pub out: PathBuf,
-    /// Folder of data sets. Default: generated rooms.
+    /// Folder of data sets. Default: generated scenes.
     #[arg(long, value_name = "ROOT")]
     pub data: Option<PathBuf>,
     /// Folder of weights. Default: the weights that ship, and trainings.
@@ -56,7 +56,7 @@ pub struct PaperArgs {
     /// Trainings of each row, with different initial weights and rooms.
     #[arg(long, default_value_t = 2, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub seeds: u64,
-    /// Side of the network's input, px (default: 256; 128 on generated rooms).
+    /// Side of the network's input, px (default: 256; 128 on generated scenes).
     #[arg(long, value_name = "N", value_parser = values::at_least_one)]
     pub input_size: Option<usize>,
     /// Frames of the video of fB.

@@ -1,6 +1,6 @@
-//! The data sets of the tables, or generated rooms in their place.
+//! The data sets of the tables, or generated scenes in their place.
 
-use super::tables::{INPUT, Setting};
+use super::tables::{Data, INPUT, Setting};
 use crate::report::Progress;
 use anyhow::{Context, Result};
 use std::path::{Path, PathBuf};
@@ -10,11 +10,11 @@ use subsplat::train::folders::write_scene;
 use subsplat::train::source::Source;
 use subsplat::train::validate::{Split, rooms};
 
-/// Side of the network's input for generated rooms, px. Rooms for 256 px take four times as long.
+/// Side of the network's input for generated scenes, px. Scenes for 256 px take four times as long.
 const GENERATED_INPUT: usize = 128;
-/// Seed of the generated rooms, which no training uses.
+/// Seed of the generated scenes, which no training uses.
 const SEED: u64 = 77;
-/// Targets of a generated room.
+/// Targets of a generated scene.
 const TARGETS: usize = 2;
 /// Samples along each side of a pixel.
 const SAMPLES: usize = 2;
@@ -29,7 +29,7 @@ pub struct Sets<'a> {
     pub input: Option<usize>,
     /// `--limit`.
     pub scenes: usize,
-    /// Folder for generated rooms.
+    /// Folder for generated scenes.
     pub generated: PathBuf,
 }
 
@@ -39,17 +39,17 @@ pub struct Opened {
     pub benchmark: Benchmark,
     /// Name of the data in the tables.
     pub name: String,
-    /// True for generated rooms.
+    /// True for generated scenes.
     pub generated: bool,
     /// Side of the network's input, px.
     pub input: usize,
 }
 
 impl Sets<'_> {
-    /// Opens the data of a setting. Where its folder is absent, rooms are generated.
+    /// Opens the data of a setting. Where its folder is absent, scenes are generated.
     ///
     /// # Errors
-    /// Data that cannot be read; a room that cannot be written.
+    /// Data that cannot be read; a scene that cannot be written.
     pub fn open(&self, setting: &Setting, progress: &mut Progress) -> Result<Opened> {
         let mut opened = match self.folder(setting) {
             Some(folder) => {
@@ -64,11 +64,15 @@ impl Sets<'_> {
                 }
             }
             None => {
-                let input = self.generated_input();
-                let folder = self.rooms(input * setting.upscale, progress)?;
+                let input = self.input.unwrap_or(GENERATED_INPUT);
+                let folder = self.scenes(setting.data, input * setting.upscale, progress)?;
+                let name = match setting.data {
+                    Data::Re10k => "generated rooms",
+                    Data::Acid => "generated shapes",
+                };
                 Opened {
                     benchmark: Benchmark::open(&folder, None)?,
-                    name: "generated rooms".to_owned(),
+                    name: name.to_owned(),
                     generated: true,
                     input,
                 }
@@ -76,11 +80,6 @@ impl Sets<'_> {
         };
         opened.benchmark.limit(self.scenes);
         Ok(opened)
-    }
-
-    /// Side of the network's input where rooms are generated, px.
-    pub fn generated_input(&self) -> usize {
-        self.input.unwrap_or(GENERATED_INPUT)
     }
 
     /// The folder of a setting's data: that of the data set in `root`; `root` itself if it holds no
@@ -93,23 +92,29 @@ impl Sets<'_> {
         setting.folders().iter().map(|name| root.join(name)).find(|folder| folder.is_dir())
     }
 
-    /// Generates rooms with pictures of `side` px, unless their folder has them. Returns the folder.
+    /// Generates scenes with pictures of `side` px, unless their folder has them: furnished rooms, or,
+    /// in place of ACID, shapes at random places, indoors and outdoors. Returns the folder.
     ///
     /// # Errors
     /// A file that cannot be written.
-    pub fn rooms(&self, side: usize, progress: &mut Progress) -> Result<PathBuf> {
-        let folder = self.generated.join(format!("{side}px"));
+    pub fn scenes(&self, data: Data, side: usize, progress: &mut Progress) -> Result<PathBuf> {
+        let (kind, shapes) = match data {
+            Data::Re10k => ("rooms", 0.0),
+            Data::Acid => ("shapes", 1.0),
+        };
+        let folder = self.generated.join(format!("{kind}-{side}px"));
         let mut config = TrainConfig::default();
         config.model.upscale = 1;
         config.data.input = [side, side];
         config.data.targets = TARGETS;
         config.data.target_samples = SAMPLES;
         config.data.seed = SEED;
+        (config.data.scattered, config.data.wide) = (shapes, shapes);
         let source = rooms(&config, Split::HeldOut)?;
-        let place = |i: usize| folder.join(format!("room_{i:03}"));
+        let place = |i: usize| folder.join(format!("scene_{i:03}"));
         let missing = |i: &usize| !place(*i).join("protocol.json").is_file();
         let new: Vec<usize> = (0..self.scenes).filter(missing).collect();
-        progress.steps("rooms", new.len(), |bar| {
+        progress.steps("generated scenes", new.len(), |bar| {
             for i in &new {
                 let place = place(*i);
                 let write = || write_scene(&*source.example(*i as u64)?, &place);

@@ -28,9 +28,11 @@ use subsplat::io::image::save_png;
 use subsplat::io::write_atomic;
 use subsplat::pipeline::Reconstructor;
 pub use tables::TABLES;
-use tables::{Kind, Row, Setting, Source, Table, slug};
+use tables::{Data, Kind, Row, Setting, Source, Table, slug};
 use write::{Measured, Part};
 
+/// Side of the targets of a training, px; the inputs have a half or a quarter of it.
+const TRAINING_TARGET: usize = 128;
 /// Scenes of which a figure shows pictures.
 const SHEETS: usize = 4;
 
@@ -108,8 +110,7 @@ impl<'a> Maker<'a> {
             folder: args.ckpts.as_deref(),
             trained: args.out.join("models"),
             steps: args.steps,
-            // Trainings use generated rooms, whatever the data are.
-            target: 2 * Sets { root: None, ..sets_of(args) }.generated_input(),
+            target: args.input_size.unwrap_or(TRAINING_TARGET),
         };
         Ok(Self { args, table, book, sets, models, out })
     }
@@ -147,7 +148,7 @@ impl<'a> Maker<'a> {
         let mut notes = Vec::new();
         if generated {
             notes.push(
-                "GENERATED ROOMS stand in for data sets that --data does not have: our numbers are \
+                "GENERATED SCENES stand in for data sets that --data does not have: our numbers are \
                  not comparable with the paper's."
                     .to_owned(),
             );
@@ -402,8 +403,8 @@ impl<'a> Maker<'a> {
         measured: &mut [Measured],
         progress: &mut Progress,
     ) -> Result<()> {
-        let rooms = self.sets.rooms(input * setting.upscale, progress)?;
-        let room = rooms.join("room_000");
+        let scenes = self.sets.scenes(Data::Re10k, input * setting.upscale, progress)?;
+        let scene = scenes.join("scene_000");
         for (row, ours) in self.table.rows.iter().zip(measured) {
             let (weights, method, upscale) = match row.source {
                 Source::Method(weights, method) => (weights, method, setting.upscale),
@@ -415,7 +416,7 @@ impl<'a> Maker<'a> {
             let side = input * setting.upscale / upscale;
             let mut child = Command::new(std::env::current_exe().context("this program's file")?);
             child.args(["--json", "--threads", &rayon::current_num_threads().to_string(), "eval"]);
-            child.arg(&room).args(["--methods", method, "--upscale", &upscale.to_string()]);
+            child.arg(&scene).args(["--methods", method, "--upscale", &upscale.to_string()]);
             child.args(["--input-size", &side.to_string()]);
             if let Some(file) = chosen.as_ref().and_then(Chosen::file) {
                 child.arg("--weights").arg(file);
@@ -437,10 +438,6 @@ impl Job {
     fn upscale(&self, setting: &Setting) -> usize {
         if self.at_target_size { 1 } else { setting.upscale }
     }
-}
-
-fn sets_of(args: &PaperArgs) -> Sets<'_> {
-    Sets { root: None, input: args.input_size, scenes: 0, generated: Default::default() }
 }
 
 /// Number of scenes of the data.
