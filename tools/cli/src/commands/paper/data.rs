@@ -11,7 +11,7 @@ use subsplat::train::source::Source;
 use subsplat::train::validate::{Split, rooms};
 
 /// Side of the network's input for generated scenes, px. Scenes for 256 px take four times as long.
-const GENERATED_INPUT: usize = 128;
+pub const GENERATED_INPUT: usize = 128;
 /// Seed of the generated scenes, which no training uses.
 const SEED: u64 = 77;
 /// Targets of a generated scene.
@@ -46,11 +46,17 @@ pub struct Opened {
 }
 
 impl Sets<'_> {
-    /// Opens the data of a setting. Where its folder is absent, scenes are generated.
+    /// Opens the data of a setting. Where its folder is absent, scenes are generated for inputs of
+    /// `generated_input` px.
     ///
     /// # Errors
     /// Data that cannot be read; a scene that cannot be written.
-    pub fn open(&self, setting: &Setting, progress: &mut Progress) -> Result<Opened> {
+    pub fn open(
+        &self,
+        setting: &Setting,
+        generated_input: usize,
+        progress: &mut Progress,
+    ) -> Result<Opened> {
         let mut opened = match self.folder(setting) {
             Some(folder) => {
                 let index = folder.with_extension("json");
@@ -64,7 +70,7 @@ impl Sets<'_> {
                 }
             }
             None => {
-                let input = self.input.unwrap_or(GENERATED_INPUT);
+                let input = self.input.unwrap_or(generated_input);
                 let folder = self.scenes(setting.data, input * setting.upscale, progress)?;
                 let name = match setting.data {
                     Data::Re10k => "generated rooms",

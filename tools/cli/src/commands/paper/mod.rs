@@ -15,7 +15,8 @@ use super::args_paper::PaperArgs;
 use super::environment;
 use crate::report::{Answer, Progress, print_line};
 use anyhow::{Context, Result, bail, ensure};
-use data::{Opened, Sets};
+use data::{GENERATED_INPUT, Opened, Sets};
+use indicatif::ProgressBar;
 use models::{Chosen, Models};
 use published::Book;
 use serde_json::{Value, json};
@@ -23,12 +24,12 @@ use sheet::Scene;
 use std::io::Write;
 use std::path::Path;
 use std::process::Command;
-use subsplat::eval::{Evaluator, Method, Options, Score};
+use subsplat::eval::{CaseResult, Evaluator, Method, Options, Score};
 use subsplat::io::image::save_png;
 use subsplat::io::write_atomic;
 use subsplat::pipeline::Reconstructor;
 pub use tables::TABLES;
-use tables::{Data, Kind, Row, Setting, Source, Table, slug};
+use tables::{Data, INPUT, Kind, Row, Setting, Source, Table, slug};
 use write::{Measured, Part};
 
 /// Side of the targets of a training, px; the inputs have a half or a quarter of it.
@@ -86,6 +87,16 @@ struct Job {
     at_target_size: bool,
 }
 
+/// Numbers and pictures of a setting, which the jobs fill.
+struct Results {
+    /// Name of each row.
+    names: Vec<String>,
+    /// Numbers of each row.
+    measured: Vec<Measured>,
+    /// Pictures of the first cases.
+    scenes: Vec<Scene>,
+}
+
 impl<'a> Maker<'a> {
     fn new(
         args: &'a PaperArgs,
@@ -115,16 +126,22 @@ impl<'a> Maker<'a> {
         Ok(Self { args, table, book, sets, models, out })
     }
 
+    /// Opens the data of a setting. Costs are measured at the paper's sizes.
+    fn open(&self, setting: &Setting, progress: &mut Progress) -> Result<Opened> {
+        let generated = if self.table.kind.has_memory() { INPUT } else { GENERATED_INPUT };
+        self.sets.open(setting, generated, progress)
+    }
+
     /// Evaluates all settings, writes the files, and prints the table.
     fn table(&mut self, progress: &mut Progress, answer: Answer) -> Result<Value> {
         let (mut parts, mut sheets, mut generated) = (Vec::new(), 0, false);
         for setting in self.table.settings {
-            let opened = self.sets.open(setting, progress)?;
+            let opened = self.open(setting, progress)?;
             generated |= opened.generated;
             opened.benchmark.notes().iter().for_each(|n| print_line(format!("note: {n}")));
             let (part, scenes) = self.part(setting, &opened, progress)?;
-            for scene in &scenes {
-                let name = format!("{}-{}.png", setting.slug(), slug(&scene.name));
+            for (i, scene) in scenes.iter().enumerate() {
+                let name = format!("{}-{i}-{}.png", setting.slug(), slug(&scene.name));
                 save_png(&self.out.join(name), &scene.sheet())?;
                 sheets += 1;
             }
@@ -133,8 +150,10 @@ impl<'a> Maker<'a> {
         let notes = self.notes(&parts, generated);
         let id = self.table.id;
         let text = write::markdown(self.table, &parts, &notes);
-        let files =
-            [(format!("{id}.csv"), write::csv(self.table, &parts)), (format!("{id}.md"), text.clone())];
+        let files = [
+            (format!("{id}.csv"), write::csv(self.table, &parts)),
+            (format!("{id}.md"), text.clone()),
+        ];
         for (name, content) in &files {
             write_atomic(&self.out.join(name), |f| f.write_all(content.as_bytes()))?;
         }
@@ -164,12 +183,11 @@ impl<'a> Maker<'a> {
                 if self.args.seeds == 1 { "" } else { "s" },
             ));
         }
+        let upscales = || self.table.settings.iter().map(|s| s.upscale);
         let shipped = |row: &Row| match row.source {
-            Source::Method(w, _) | Source::MethodAtTargetSize(w, _) => {
-                self.models.choose(&row.source, 2, 0).is_ok_and(|c| c == Some(Chosen::Shipped))
-                    && !w.name().is_empty()
-            }
-            _ => false,
+            Source::Method(w, _) => upscales().any(|r| !self.models.has(w.name(), r)),
+            Source::MethodAtTargetSize(w, _) => !self.models.has(w.name(), 1),
+            Source::Imported | Source::Trained(_) => false,
         };
         if self.table.rows.iter().any(shipped) {
             notes.push(
@@ -199,14 +217,17 @@ impl<'a> Maker<'a> {
             ours.psnr.is_empty() && ours.seconds.is_none() && published::Published::is_some(paper)
         };
         if parts.iter().any(|p| p.rows.iter().any(unmeasured)) {
-            notes.push("Rows without our numbers: pictures by --pred NAME=DIR.".to_owned());
+            notes.push(match self.table.kind {
+                Kind::Cost => "Time and memory of other systems are not measured here.".to_owned(),
+                _ => "Rows without our numbers: pictures by --pred NAME=DIR.".to_owned(),
+            });
         }
         notes.extend((!self.table.note.is_empty()).then(|| self.table.note.to_owned()));
         notes.extend(write::order(parts));
         notes
     }
 
-    /// Evaluates all rows in one setting. Returns the pictures of the first scenes for figures.
+    /// Evaluates all rows in one setting. Returns the pictures of the first scenes too.
     fn part(
         &self,
         setting: &'static Setting,
@@ -216,26 +237,29 @@ impl<'a> Maker<'a> {
         let mut names: Vec<String> = self.table.rows.iter().map(|r| r.name.to_owned()).collect();
         let known = names.len();
         names.extend(self.further_preds().map(|m| m.name().to_owned()));
-        let mut measured = vec![Measured::default(); names.len()];
-        let mut scenes: Vec<Scene> = Vec::new();
+        let measured = vec![Measured::default(); names.len()];
+        let mut results = Results { names, measured, scenes: Vec::new() };
         for job in self.jobs(setting, known)? {
             let model = job.chosen.as_ref().map(|c| c.load(job.upscale(setting))).transpose()?;
             let label = format!("{} {}", self.table.id, setting.label);
             progress.steps(&label, opened.benchmark.cases().len(), |bar| {
-                self.evaluate(&job, model.as_ref(), (setting, opened), &names, &mut measured, &mut scenes, bar)
+                self.evaluate(&job, model.as_ref(), (setting, opened), &mut results, bar)
             })?;
         }
         if self.table.kind.has_memory() {
-            self.measure_memory(setting, opened.input, &mut measured, progress)?;
+            self.measure_memory(setting, opened.input, &mut results.measured, progress)?;
         }
+        let Results { names, measured, scenes } = results;
         let rows = names.into_iter().zip(measured).map(|(name, ours)| {
             let paper = self.book.find(self.table.id, &name, setting.label);
             (name, ours, paper)
         });
-        let rows = rows.collect();
-        let scenes_count = scene_count(opened);
-        let part =
-            Part { label: setting.label, data: opened.name.clone(), scenes: scenes_count, rows };
+        let part = Part {
+            label: setting.label,
+            data: opened.name.clone(),
+            scenes: scene_count(opened),
+            rows: rows.collect(),
+        };
         Ok((part, scenes))
     }
 
@@ -252,7 +276,9 @@ impl<'a> Maker<'a> {
             let at_target_size = matches!(row.source, Source::MethodAtTargetSize(..));
             let upscale = if at_target_size { 1 } else { setting.upscale };
             let seeds = match row.source {
-                Source::Trained(variant) if !self.models.has(variant, upscale) => self.args.seeds,
+                Source::Trained(variant) if !self.models.has(variant.name, upscale) => {
+                    self.args.seeds
+                }
                 _ => 1,
             };
             for seed in 0..seeds {
@@ -277,9 +303,10 @@ impl<'a> Maker<'a> {
                 }
             }
         }
-        let further = self.further_preds().enumerate().filter_map(|(i, method)| {
-            self.pred(method.name(), setting).map(|m| (known + i, m))
-        });
+        let further = self
+            .further_preds()
+            .enumerate()
+            .filter_map(|(i, method)| self.pred(method.name(), setting).map(|m| (known + i, m)));
         let rows: Vec<_> = further.collect();
         if !rows.is_empty() {
             jobs.push(Job { rows, chosen: None, at_target_size: false });
@@ -303,17 +330,14 @@ impl<'a> Maker<'a> {
         Some(Method::Other { name: name.clone(), folder })
     }
 
-    /// Scores the rows of a job, and keeps pictures of the first scenes.
-    #[expect(clippy::too_many_arguments, reason = "buffers that several jobs fill")]
+    /// Scores the rows of a job.
     fn evaluate(
         &self,
         job: &Job,
         model: Option<&Reconstructor>,
         (setting, opened): (&Setting, &Opened),
-        names: &[String],
-        measured: &mut [Measured],
-        scenes: &mut Vec<Scene>,
-        bar: &indicatif::ProgressBar,
+        results: &mut Results,
+        bar: &ProgressBar,
     ) -> Result<()> {
         let upscale = job.upscale(setting);
         let side = opened.input * setting.upscale / upscale;
@@ -341,11 +365,13 @@ impl<'a> Maker<'a> {
                 scores[i].extend(result.scores.mean(i));
                 seconds[i].push(result.seconds[i]);
             }
-            self.keep_pictures(n, job, result, names, measured, scenes);
+            if n < SHEETS {
+                results.keep_pictures(n, job, result);
+            }
             bar.inc(1);
         }
         for (i, (row, method)) in job.rows.iter().enumerate() {
-            let ours = &mut measured[*row];
+            let ours = &mut results.measured[*row];
             ours.sides = sides;
             if let Some(mean) = Score::mean(&scores[i]) {
                 ours.psnr.push(mean.psnr);
@@ -358,41 +384,6 @@ impl<'a> Maker<'a> {
             }
         }
         Ok(())
-    }
-
-    /// Adds a case's pictures of the middle target to its scene. Of several seeds, those of the first.
-    fn keep_pictures(
-        &self,
-        case: usize,
-        job: &Job,
-        result: subsplat::eval::CaseResult,
-        names: &[String],
-        measured: &[Measured],
-        scenes: &mut Vec<Scene>,
-    ) {
-        let middle = result.pictures.len() / 2;
-        let Some(pictures) = result.pictures.into_iter().nth(middle).filter(|_| case < SHEETS)
-        else {
-            return;
-        };
-        if scenes.len() == case {
-            let input = result.inputs.into_iter().next();
-            scenes.push(Scene {
-                name: result.scores.scene.clone(),
-                input: input.unwrap_or_else(|| pictures.truth.clone()),
-                truth: pictures.truth,
-                methods: Vec::new(),
-            });
-        }
-        let scores = result.scores.targets.get(middle).map(|t| t.scores.as_slice());
-        for (((row, _), picture), score) in
-            job.rows.iter().zip(pictures.methods).zip(scores.unwrap_or_default())
-        {
-            if measured[*row].psnr.is_empty() {
-                let label = format!("{} {:.2}", names[*row], score.psnr);
-                scenes[case].methods.push((*row, label, picture));
-            }
-        }
     }
 
     /// Measures the peak memory of each row with a model, by `subsplat eval` in a process of its own.
@@ -431,6 +422,31 @@ impl<'a> Maker<'a> {
             ours.bytes = report["peak_memory_bytes"].as_u64();
         }
         Ok(())
+    }
+}
+
+impl Results {
+    /// Adds a case's pictures of the middle target to its scene. Of several seeds, those of the first.
+    fn keep_pictures(&mut self, case: usize, job: &Job, result: CaseResult) {
+        let middle = result.pictures.len() / 2;
+        let Some(pictures) = result.pictures.into_iter().nth(middle) else { return };
+        if self.scenes.len() == case {
+            let input = result.inputs.into_iter().next();
+            self.scenes.push(Scene {
+                name: result.scores.scene.clone(),
+                input: input.unwrap_or_else(|| pictures.truth.clone()),
+                truth: pictures.truth,
+                methods: Vec::new(),
+            });
+        }
+        let scores = result.scores.targets.get(middle).map(|t| t.scores.as_slice());
+        let rows = job.rows.iter().zip(pictures.methods).zip(scores.unwrap_or_default());
+        for (((row, _), picture), score) in rows {
+            if self.measured[*row].psnr.is_empty() {
+                let label = format!("{} {:.2}", self.names[*row], score.psnr);
+                self.scenes[case].methods.push((*row, label, picture));
+            }
+        }
     }
 }
 

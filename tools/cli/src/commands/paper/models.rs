@@ -1,8 +1,8 @@
 //! Weights of the rows: files, the shipped ones, or heads that are trained here.
 
+use super::tables::{Source, Variant};
 use crate::commands::args::ModelArgs;
 use crate::commands::model::{self, ModelRequest};
-use super::tables::{Source, Variant};
 use crate::report::print_line;
 use anyhow::{Context, Result};
 use std::path::{Path, PathBuf};
@@ -51,16 +51,18 @@ impl Models<'_> {
             Source::Method(weights, _) | Source::MethodAtTargetSize(weights, _) => {
                 Some(self.file(weights.name(), upscale).map_or(Chosen::Shipped, Chosen::File))
             }
-            Source::Trained(variant) => Some(Chosen::File(match self.file(variant.name, upscale) {
-                Some(file) => file,
-                None => self.train(variant, upscale, seed)?,
-            })),
+            Source::Trained(variant) => {
+                Some(Chosen::File(match self.file(variant.name, upscale) {
+                    Some(file) => file,
+                    None => self.train(variant, upscale, seed)?,
+                }))
+            }
         })
     }
 
-    /// Returns whether `--ckpts` has the weights of a variant, so that all seeds have the same.
-    pub fn has(&self, variant: &Variant, upscale: usize) -> bool {
-        self.file(variant.name, upscale).is_some()
+    /// Returns whether `--ckpts` has the weights `name`.
+    pub fn has(&self, name: &str, upscale: usize) -> bool {
+        self.file(name, upscale).is_some()
     }
 
     /// The first of `NAME-xR.safetensors` and `NAME.safetensors` in the folder of `--ckpts`.
@@ -72,10 +74,8 @@ impl Models<'_> {
 
     /// Trains a variant, unless its folder holds the trained weights. Returns their file.
     fn train(&self, variant: &Variant, upscale: usize, seed: u64) -> Result<PathBuf> {
-        let name = format!(
-            "{}-x{upscale}-{}px-{}steps-seed{seed}",
-            variant.name, self.target, self.steps
-        );
+        let name =
+            format!("{}-x{upscale}-{}px-{}steps-seed{seed}", variant.name, self.target, self.steps);
         let folder = self.trained.join(&name);
         let file = folder.join("weights.safetensors");
         let config = self.config(variant, upscale, seed)?;
@@ -84,9 +84,7 @@ impl Models<'_> {
             print_line(format!("training {name}"));
         }
         let validator = Validator::new(&config, None)?;
-        training
-            .run(Limits::default(), &validator, &mut |_| ())
-            .with_context(|| name.clone())?;
+        training.run(Limits::default(), &validator, &mut |_| ()).with_context(|| name.clone())?;
         Ok(file)
     }
 

@@ -34,7 +34,10 @@ impl Book {
     /// A line that is not three names and five numbers.
     pub fn open() -> Result<Self> {
         let lines = include_str!("published.csv").lines().skip(1);
-        lines.map(|l| line(l).with_context(|| format!("published.csv: `{l}`"))).collect::<Result<_>>().map(Self)
+        lines
+            .map(|l| line(l).with_context(|| format!("published.csv: `{l}`")))
+            .collect::<Result<_>>()
+            .map(Self)
     }
 
     /// The paper's numbers of a row, all absent where it has none.
@@ -87,7 +90,11 @@ mod tests {
         }
         // Tables of the paper have numbers; its figures have none.
         for Table { id, .. } in TABLES {
-            assert_eq!(book.0.iter().any(|(names, _)| names[0] == *id), id.starts_with('t'), "{id}");
+            assert_eq!(
+                book.0.iter().any(|(names, _)| names[0] == *id),
+                id.starts_with('t'),
+                "{id}"
+            );
         }
         assert_eq!(book.find("t2", "SubSplat", "RE10K 512").seconds, Some(0.042));
         assert!(!book.find("t2", "SubSplat", "ACID 512").is_some());

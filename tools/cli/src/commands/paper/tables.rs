@@ -214,8 +214,10 @@ const MODULES: &[Row] = &[
     trained("+ feature aggregation (SubSplat)", &FULL),
 ];
 
-const OWN_ROWS: &str = "The rows \"low-pass of the input\" and \"fitted and refined\" are not in the paper.";
-const OVERRIDES: &str = "Each row is trained with its own value; the paper does not say whether its rows were.";
+const OWN_ROWS: &str =
+    "The rows \"low-pass of the input\" and \"fitted and refined\" are not in the paper.";
+const OVERRIDES: &str =
+    "Each row is trained with its own value; the paper does not say whether its rows were.";
 
 /// The tables and figures that the specification describes. Figures 1 and 2 are drawings; a Table 6
 /// is not described.

@@ -27,7 +27,7 @@ impl Maker<'_> {
     pub(super) fn video(&mut self, progress: &mut Progress, answer: Answer) -> Result<Value> {
         let id = self.table.id;
         let [setting] = self.table.settings else { bail!("{id}: expected one setting") };
-        let opened = self.sets.open(setting, progress)?;
+        let opened = self.open(setting, progress)?;
         let case = opened.benchmark.cases().first().context("the data hold no case")?;
         let loaded = opened.benchmark.load(case)?;
         let mut scenes = Vec::new();

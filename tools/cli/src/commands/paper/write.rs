@@ -122,9 +122,8 @@ pub fn markdown(table: &Table, parts: &[Part], notes: &[String]) -> String {
             let mut line = vec![name.clone()];
             let (ours, paper) = (ours.numbers(), paper.numbers());
             for (i, (_, digits)) in columns.iter().enumerate() {
-                let cell = |v: Option<f64>| {
-                    v.map_or_else(|| "-".to_owned(), |v| format!("{v:.digits$}"))
-                };
+                let cell =
+                    |v: Option<f64>| v.map_or_else(|| "-".to_owned(), |v| format!("{v:.digits$}"));
                 line.push(cell(ours[i + offset(table.kind)]));
                 line.extend(published.then(|| cell(paper[i + offset(table.kind)])));
             }
@@ -243,8 +242,11 @@ mod tests {
         let same = part(&[(&[1.0], Some(10.0)), (&[2.0, 3.0], Some(20.0)), (&[9.0], None)]);
         let line = order(&[same]).remove(0);
         assert!(line.contains(" confirmed: 1 of 1, 1 of 1 pair of"), "{line}");
-        let other =
-            part(&[(&[1.0, 5.0], Some(10.0)), (&[2.0, 3.0], Some(20.0)), (&[4.0, 6.0], Some(30.0))]);
+        let other = part(&[
+            (&[1.0, 5.0], Some(10.0)),
+            (&[2.0, 3.0], Some(20.0)),
+            (&[4.0, 6.0], Some(30.0)),
+        ]);
         let line = order(&[other]).remove(0);
         assert!(line.contains("not confirmed: 3 of 3, 2 of 3 pairs"), "{line}");
         assert!(order(&[part(&[(&[1.0], Some(1.0)), (&[], Some(2.0))])]).is_empty());
@@ -256,7 +258,10 @@ mod tests {
         let parts = [part(&[(&[1.0, 2.0], Some(10.5)), (&[], None)])];
         let text = csv(table, &parts);
         let lines: Vec<&str> = text.lines().collect();
-        assert_eq!(lines[1], "t1,\"row, 0\",RE10K 512,rooms,1,,,2,1.500000,,,,,1.000000 2.000000,10.5,,,,");
+        assert_eq!(
+            lines[1],
+            "t1,\"row, 0\",RE10K 512,rooms,1,,,2,1.500000,,,,,1.000000 2.000000,10.5,,,,"
+        );
         assert_eq!(lines[2], "t1,\"row, 1\",RE10K 512,rooms,1,,,0,,,,,,,,,,,");
         let text = markdown(table, &parts, &["a note".to_owned()]);
         assert!(text.contains("| row, 0 | 1.50 | 10.50 |"), "{text}");
