@@ -51,7 +51,7 @@ pub struct PaperArgs {
     #[arg(long, default_value_t = 4, value_name = "N", value_parser = values::at_least_one)]
     pub limit: usize,
     /// Steps of each training.
-    #[arg(long, default_value_t = 60, value_name = "N")]
+    #[arg(long, default_value_t = 40, value_name = "N")]
     pub steps: u64,
     /// Trainings of each row, with different initial weights and rooms.
     #[arg(long, default_value_t = 2, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]

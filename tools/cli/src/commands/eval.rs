@@ -41,6 +41,9 @@ pub fn eval(args: &EvalArgs, answer: Answer) -> Result<()> {
     if let Some(limit) = args.limit {
         data.limit(limit);
     }
+    if let Some((part, parts)) = args.shard {
+        data.keep_part(part, parts).context("--shard")?;
+    }
     let needed = methods(args, ratio.unwrap_or(UPSCALE))?.iter().any(Method::needs_model);
     let model = match needed {
         true => Some(progress.stage("model", |_| load(args, ratio))?),
@@ -310,6 +313,7 @@ fn protocol(args: &EvalArgs, options: &Options, model: Option<&Reconstructor>) -
         "disturbances": args.disturb.iter().map(|d| d.name()).collect::<Vec<_>>(),
         "weights": args.weights.as_ref().map(|p| p.display().to_string()),
         "seed": args.seed,
+        "shard": args.shard.map(|(part, parts)| format!("{part}/{parts}")),
         "untrained_tensors": model.map(|m| m.untrained_tensors().len()),
         "backbone": config.map(|c| if is_mvsplat(c) { "re10k" } else { "small" }),
         "children": config.map(|c| if c.spgr.enabled { c.children() } else { 1 }),

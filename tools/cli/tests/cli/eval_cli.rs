@@ -167,6 +167,45 @@ fn any_number_of_threads_gives_the_same_figures() {
     }
 }
 
+/// The recipe of tools/train/README.md, "Several processes".
+#[test]
+fn two_processes_share_an_evaluation() {
+    let place = room();
+    let eval = |more: &str| {
+        let called =
+            call_in(place.path(), &format!("eval scene --methods subsplat,fit,mean {more}"));
+        assert_eq!(called.code, 0, "{}", called.stderr);
+    };
+    eval("-o whole");
+    std::thread::scope(|scope| {
+        for part in ["0", "1"] {
+            scope.spawn(move || eval(&format!("--shard {part}/2 -o part{part}")));
+        }
+    });
+    let csv = |out: &str| text(&place.path().join(out).join("targets.csv"));
+    let (first, second) = (csv("part0"), csv("part1"));
+    let head = second.lines().next().unwrap();
+    let joined = first.clone() + &second[head.len() + 1..];
+    assert!(first.lines().count() > 1 && second.lines().count() > 1);
+    assert_eq!(joined, csv("whole"));
+    // Both folders together hold the pictures of one process.
+    let pictures = |out: &str| files(&place.path().join(out).join("pictures"));
+    let mut both = [pictures("part0"), pictures("part1")].concat();
+    both.sort();
+    assert_eq!(both, pictures("whole"));
+    for file in both {
+        let read =
+            |out: &str| std::fs::read(place.path().join(out).join("pictures").join(&file)).ok();
+        assert_eq!(read("part0").or(read("part1")), read("whole"), "{}", file.display());
+    }
+    for (shard, code, words) in
+        [("2/2", 2, "expected I/N"), ("x", 2, "expected I/N"), ("1/9", 1, "part of the cases")]
+    {
+        let called = call_in(place.path(), &format!("eval scene --methods copy --shard {shard}"));
+        assert!(called.code == code && called.stderr.contains(words), "{shard}: {}", called.stderr);
+    }
+}
+
 #[test]
 fn refusals_are_one_line_and_leave_no_tables() {
     let place = room();
