@@ -37,13 +37,10 @@ fn wall(z: f32, colour: impl Fn(usize, usize) -> [f32; 3]) -> Splats {
     Splats::new(rows, sh, Vec::new(), 0, ShBasis::Standard).unwrap()
 }
 
-/// Half plain, half a fine pattern.
+/// Half plain, half of a colour for each pixel.
 fn pattern(x: usize, y: usize) -> [f32; 3] {
-    match x < GRID / 2 {
-        true => [0.2, 0.5, 0.7],
-        false if (x / 3 + y / 3) % 2 == 0 => [0.9, 0.8, 0.1],
-        false => [0.1, 0.1, 0.3],
-    }
+    let spread = |k: usize| ((x * 7919 + y * 104_729 + k * 1_299_709) % 97) as f32 / 97.0;
+    if x < GRID / 2 { [0.2, 0.5, 0.7] } else { [0, 1, 2].map(spread) }
 }
 
 fn picture(splats: &Splats) -> Vec<f32> {
@@ -52,6 +49,16 @@ fn picture(splats: &Splats) -> Vec<f32> {
 
 fn likeness(splats: &Splats, whole: &[f32]) -> f64 {
     psnr(&picture(splats), whole, SIDE, SIDE).unwrap()
+}
+
+/// About `count` Gaussians, spread evenly.
+fn evenly(splats: &Splats, count: usize) -> Splats {
+    let share = count as f64 / splats.len() as f64;
+    let kept = |i: &usize| (*i as f64 * 0.618_033_988_749_895).fract() < share;
+    let chosen: Vec<usize> = (0..splats.len()).filter(kept).collect();
+    let rows = chosen.iter().flat_map(|i| splats.row(*i)).copied().collect();
+    let sh = chosen.iter().flat_map(|i| splats.sh_of(*i)).copied().collect();
+    Splats::new(rows, sh, Vec::new(), 0, ShBasis::Standard).unwrap()
 }
 
 fn joined(a: &Splats, b: &Splats) -> Splats {
@@ -111,19 +118,24 @@ fn a_merge_keeps_moments_colour_and_optical_depth() {
 }
 
 #[test]
-fn half_of_a_wall_gives_its_picture_and_random_halves_do_not() {
+fn plain_parts_are_merged_and_patterns_stay() {
     let all = wall(2.0, pattern);
     let whole = picture(&all);
-    let (count, mut renderer) = (all.len() / 2, Renderer::default());
+    let (count, mut renderer) = (5 * all.len() / 8, Renderer::default());
     let merged = reduce(&all, &[camera()], &raster(), count, &mut renderer);
     assert_eq!(merged.len(), count);
-    assert!(likeness(&merged, &whole) > 33.0, "{:.1} dB", likeness(&merged, &whole));
+    // A wall of one layer over black is the hardest case: any gap shows. As many Gaussians, chosen
+    // evenly, give 14 dB.
+    let removed = likeness(&evenly(&all, count), &whole);
+    let psnr = likeness(&merged, &whole);
+    assert!(psnr > 27.0 && psnr > removed + 8.0, "{psnr:.1} dB, removed {removed:.1} dB");
     // The plain half is merged, not the pattern.
     let plain = |s: &Splats| s.means().filter(|m| m[0] < 0.0).count();
-    assert!(4 * plain(&merged) < plain(&all), "{} of {}", plain(&merged), plain(&all));
+    assert!(3 * plain(&merged) < plain(&all), "{} of {}", plain(&merged), plain(&all));
     // Without cameras too.
     let alone = reduce(&all, &[], &raster(), count, &mut renderer);
-    assert!(likeness(&alone, &whole) > 33.0, "{:.1} dB", likeness(&alone, &whole));
+    let psnr = likeness(&alone, &whole);
+    assert!(psnr > 27.0 && psnr > removed + 8.0, "{psnr:.1} dB, removed {removed:.1} dB");
     let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     let again = one_thread
         .install(|| reduce(&all, &[camera()], &raster(), count, &mut Renderer::default()));
@@ -143,11 +155,11 @@ fn gaussians_behind_a_wall_go_first_and_those_outside_the_picture_stay() {
     let scene = joined(&front, &hidden);
     let whole = picture(&scene);
     let mut renderer = Renderer::default();
-    let reduced = reduce(&scene, &[camera()], &raster(), 3 * front.len() / 2, &mut renderer);
+    let reduced = reduce(&scene, &[camera()], &raster(), 11 * front.len() / 10, &mut renderer);
     let behind = |s: &Splats| s.means().filter(|m| m[2] > 3.0).count();
-    // The wall's edge is half transparent and shows a little of them.
-    assert!(behind(&reduced) < hidden.len() / 5, "{} stay", behind(&reduced));
-    assert!(likeness(&reduced, &whole) > 50.0, "{:.1} dB", likeness(&reduced, &whole));
+    // The wall is not quite opaque and shows a little of them.
+    assert!(behind(&reduced) < hidden.len() / 8, "{} stay", behind(&reduced));
+    assert!(likeness(&reduced, &whole) > 40.0, "{:.1} dB", likeness(&reduced, &whole));
     let scene = joined(&front, &beside);
     let reduced = reduce(&scene, &[camera()], &raster(), front.len(), &mut renderer);
     let outside = reduced.means().filter(|m| m[0] > 3.0).count();
