@@ -11,12 +11,9 @@
 //! but from another seed; `eval` halves the context pictures to get its ×2 input.
 
 use anyhow::{Context, Result};
-use serde_json::json;
 use std::path::PathBuf;
-use subsplat::data::dataset::Posed;
-use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
-use subsplat::io::image::save_png;
 use subsplat::train::TrainConfig;
+use subsplat::train::folders::write_scene;
 use subsplat::train::source::Source;
 use subsplat::train::validate::{Split, rooms};
 
@@ -43,25 +40,7 @@ fn main() -> Result<()> {
     (config.data.scattered, config.data.wide) = (scattered, scattered);
     let source = rooms(&config, Split::HeldOut)?;
     for i in 0..count {
-        let example = source.example(i)?;
-        let place = folder.join(format!("room_{i:03}"));
-        std::fs::create_dir_all(place.join("images"))?;
-        let save = |(v, view): (usize, &Posed)| -> Result<NamedCamera> {
-            let file = format!("images/{v}.png");
-            save_png(&place.join(&file), &view.image)?;
-            Ok(NamedCamera::new(file, view.camera))
-        };
-        let views = example.context.iter().chain(&example.targets).enumerate();
-        let cameras = views.map(save).collect::<Result<Vec<_>>>()?;
-        let contexts = example.context.len();
-        let target: Vec<usize> = (contexts..cameras.len()).collect();
-        let near_far = Some(example.near_far);
-        let file = CameraFile { cameras, units: Default::default(), near_far };
-        save_cameras_json(&place.join("cameras.json"), &file)?;
-        let context: Vec<usize> = (0..contexts).collect();
-        let tests = json!([{ "context": context, "target": target }]);
-        let protocol = json!({ "resolution": [SIDE, SIDE], "tests": tests });
-        std::fs::write(place.join("protocol.json"), format!("{protocol:#}\n"))?;
+        write_scene(&*source.example(i)?, &folder.join(format!("room_{i:03}")))?;
     }
     println!("{count} rooms in {}", folder.display());
     Ok(())

@@ -121,6 +121,8 @@ pub mod pipeline;
 #[cfg(feature = "internals")]
 pub mod poses;
 #[cfg(feature = "internals")]
+pub mod reduce;
+#[cfg(feature = "internals")]
 pub mod refine;
 #[cfg(feature = "internals")]
 pub mod render;
@@ -171,6 +173,8 @@ mod ops;
 mod pipeline;
 #[cfg(not(feature = "internals"))]
 mod poses;
+#[cfg(not(feature = "internals"))]
+mod reduce;
 #[cfg(not(feature = "internals"))]
 mod refine;
 #[cfg(not(feature = "internals"))]

@@ -24,6 +24,7 @@ const IMPORTS: &[(&str, &[&str])] = &[
     ("loss", &["cpu", "metrics"]),
     ("fit", &["abi", "camera", "io", "loss", "render", "splats"]),
     ("refine", &["abi", "camera", "fit", "io", "loss", "render", "splats"]),
+    ("reduce", &["abi", "camera", "fit", "io", "refine", "render", "sh", "splats"]),
     ("matches", &["cpu"]),
     ("check", &["camera", "matches", "metrics"]),
     ("poses", &["camera", "matches"]),
@@ -41,8 +42,8 @@ const IMPORTS: &[(&str, &[&str])] = &[
     (
         "eval",
         &[
-            "abi", "camera", "config", "cpu", "data", "fit", "io", "metrics", "model", "pipeline",
-            "refine", "render", "splats",
+            "abi", "camera", "clock", "config", "cpu", "data", "fit", "io", "metrics", "model",
+            "pipeline", "refine", "render", "splats",
         ],
     ),
     (

@@ -264,6 +264,29 @@ impl Benchmark {
         });
     }
 
+    /// Keeps the cases of part `part` of `parts` equal parts, in order: processes that evaluate one part
+    /// each evaluate every case once.
+    ///
+    /// # Errors
+    /// No part of that number; a part without a case.
+    pub fn keep_part(&mut self, part: usize, parts: usize) -> Result<()> {
+        let at = |i: usize| self.cases.len() * i / parts.max(1);
+        if part >= parts || at(part) == at(part + 1) {
+            let expected =
+                format!("one of {} cases in each part, counted from 0", self.cases.len());
+            return Err(Error::argument("part of the cases", expected, format!("{part}/{parts}")));
+        }
+        let kept = at(part)..at(part + 1);
+        self.cases = self
+            .cases
+            .drain(..)
+            .enumerate()
+            .filter(|(i, _)| kept.contains(i))
+            .map(|(_, c)| c)
+            .collect();
+        Ok(())
+    }
+
     /// The cases, in the order of the scenes.
     pub fn cases(&self) -> &[Case] {
         &self.cases

@@ -7,6 +7,7 @@ use super::{
 };
 use crate::abi::RasterOptions;
 use crate::camera::{Camera, Size};
+use crate::clock::Instant;
 use crate::config::LowpassRef;
 use crate::cpu::Rasterizer;
 use crate::data::crop::{CropOptions, CropRule, Cropped, LrFrom};
@@ -18,7 +19,7 @@ use crate::model::trunk::Trunk;
 use crate::model::weights::Weights;
 use crate::pipeline::{
     Density, DepthBounds, DepthRange, Encoded, Error, Photo, Reconstructor, Refine, Result,
-    SceneChildren, add_detail, fit_to_inputs, refine_on_inputs, sides_of,
+    SceneChildren, TargetSize, add_detail, fit_to_inputs, refine_on_inputs, sides_of,
 };
 use crate::refine::Refiner;
 use crate::render::{Renderer, render_with};
@@ -32,8 +33,9 @@ const SIDE: usize = 256;
 /// Options of an evaluation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Options {
-    /// r: target side over input side.
-    pub upscale: usize,
+    /// Target side over input side, 1 to 8. The model's children fill the grid of the next whole
+    /// number.
+    pub upscale: f32,
     /// Width and height of the inputs, px. Default: the protocol's, else 256×256.
     pub input_size: Option<(usize, usize)>,
     /// Methods, in the order of the tables.
@@ -52,11 +54,11 @@ impl Options {
     /// The model, its Gaussians after the fit and the refinement of
     /// [`Reconstructor::run`](crate::pipeline::Reconstructor::run), and every baseline that differs
     /// from the others at this `upscale`.
-    pub fn new(upscale: usize) -> Self {
+    pub fn new(upscale: f32) -> Self {
         use Method::{Backbone, Bilinear, Copy, Fit, Lowpass, Mean, Refine, Subsplat, Uniform};
-        let methods = match upscale {
-            1 => vec![Subsplat, Fit, Refine, Backbone, Copy, Mean],
-            _ => vec![Subsplat, Fit, Refine, Backbone, Lowpass, Bilinear, Uniform, Copy, Mean],
+        let methods = match upscale > 1.0 {
+            false => vec![Subsplat, Fit, Refine, Backbone, Copy, Mean],
+            true => vec![Subsplat, Fit, Refine, Backbone, Lowpass, Bilinear, Uniform, Copy, Mean],
         };
         Self {
             upscale,
@@ -88,6 +90,9 @@ pub struct CaseResult {
     pub inputs: Vec<Rgb>,
     /// One set of pictures for each target.
     pub pictures: Vec<TargetPictures>,
+    /// Seconds of each method from the cropped inputs to one picture: network, Gaussians, one view.
+    /// 0 for pictures of other programs, and where the platform has no clock.
+    pub seconds: Vec<f64>,
 }
 
 /// Scores methods on cases.
@@ -157,9 +162,11 @@ impl Evaluator {
         let mut pictures = PictureMaker::new(self, model, &crops)?;
         let mut result = self.empty(case, (&crops, &pictures.bounds), &names);
         for (m, method) in self.options.methods.iter().enumerate() {
+            let mut drawing = 0.0;
             for (t, target) in crops.targets.iter().enumerate() {
                 pictures.select(method, &crops, &target.target_camera)?;
                 let (w, h) = (target.target.width, target.target.height);
+                let begin = Instant::now();
                 let rgb = match method {
                     Method::Other { folder, .. } => {
                         let pair = case.pair();
@@ -169,6 +176,7 @@ impl Evaluator {
                     }
                     _ => pictures.picture(method, &crops, target),
                 };
+                drawing += begin.elapsed().as_secs_f64() / crops.targets.len() as f64;
                 let place = format!("{place} target {} {}", names[t], method.name());
                 let score = self.score(&rgb, &target.target, &place)?;
                 result.scores.targets[t].scores.push(score);
@@ -179,6 +187,11 @@ impl Evaluator {
                 debug_assert_eq!(result.pictures[t].methods.len(), m);
                 result.pictures[t].methods.push(picture);
             }
+            result.seconds.push(match method {
+                Method::Other { .. } => 0.0,
+                _ if method.needs_model() => pictures.seconds() + drawing,
+                _ => drawing,
+            });
             result.scores.inputs.push(self.input_report(&mut pictures, method, &crops, &place)?);
         }
         Ok(result)
@@ -243,6 +256,7 @@ impl Evaluator {
             },
             inputs: inputs.iter().map(|c| c.input.clone()).collect(),
             pictures: pictures.collect(),
+            seconds: Vec::new(),
         }
     }
 
@@ -256,8 +270,9 @@ impl Evaluator {
         let least = (least(|p| p.image().width), least(|p| p.image().height));
         let (width, height) = fitting(nominal, upscale, stride, least);
         let input_size = Size { width, height };
+        let target_size = TargetSize::Times(upscale).resolve(input_size, 1);
         let options =
-            CropOptions { rule, lr_from, ..CropOptions::new(input_size, upscale, stride) };
+            CropOptions { rule, lr_from, target_size, ..CropOptions::new(input_size, 1, stride) };
         let cropped =
             |photos: &[Photo]| photos.iter().map(|p| p.crop(&options)).collect::<Result<Vec<_>>>();
         Ok(Crops {
@@ -283,22 +298,25 @@ impl Evaluator {
 /// not cover the target, and the target stays no smaller than `nominal`.
 fn fitting(
     nominal: (usize, usize),
-    upscale: usize,
+    upscale: f32,
     stride: usize,
     least: (usize, usize),
 ) -> (usize, usize) {
     let (mut size, mut ratio) = (nominal, upscale);
-    let covers = |s: (usize, usize)| s.0 * upscale <= least.0 && s.1 * upscale <= least.1;
-    while ratio > 1 && !covers(size) && size.0 / 2 >= stride && size.1 / 2 >= stride {
+    let covers = |s: (usize, usize)| {
+        s.0 as f32 * upscale <= least.0 as f32 && s.1 as f32 * upscale <= least.1 as f32
+    };
+    while ratio >= 2.0 && !covers(size) && size.0 / 2 >= stride && size.1 / 2 >= stride {
         size = (size.0 / 2, size.1 / 2);
-        ratio /= 2;
+        ratio /= 2.0;
     }
     size
 }
 
 /// Makes the pictures of one case. One set of Gaussians is in memory at a time.
 struct PictureMaker<'a> {
-    r: usize,
+    /// Target side over input side.
+    upscale: f32,
     /// Depth range of the network's candidates.
     bounds: DepthBounds,
     /// Mean colour of the inputs.
@@ -311,6 +329,10 @@ struct PictureMaker<'a> {
     rasterizer: Rasterizer,
     /// Mean alpha of the last rendered picture.
     coverage: f64,
+    /// Seconds of depth range, backbone and primaries.
+    network_seconds: f64,
+    /// Seconds of the current set, made of the primaries.
+    set_seconds: f64,
 }
 
 /// The backbone's outputs of one case, and the model.
@@ -359,6 +381,7 @@ impl Set {
 
 impl<'a> PictureMaker<'a> {
     fn new(evaluator: &Evaluator, model: Option<&'a Reconstructor>, crops: &Crops) -> Result<Self> {
+        let begin = Instant::now();
         let needed = evaluator.options.methods.iter().find(|m| m.needs_model());
         let mut bounds = crops.bounds.clone();
         let network = match (needed, model) {
@@ -373,7 +396,7 @@ impl<'a> PictureMaker<'a> {
             }
         };
         Ok(Self {
-            r: evaluator.options.upscale,
+            upscale: evaluator.options.upscale,
             bounds,
             colour: Rgb::mean_colour(crops.inputs.iter().map(|c| &c.input)),
             network,
@@ -382,7 +405,14 @@ impl<'a> PictureMaker<'a> {
             splats: None,
             rasterizer: Rasterizer::new(),
             coverage: 0.0,
+            network_seconds: begin.elapsed().as_secs_f64(),
+            set_seconds: 0.0,
         })
+    }
+
+    /// Seconds from the inputs to the current Gaussians.
+    fn seconds(&self) -> f64 {
+        self.network_seconds + self.set_seconds
     }
 
     /// Makes the Gaussians of `method` for a picture seen by `camera`, unless they are in memory.
@@ -392,23 +422,27 @@ impl<'a> PictureMaker<'a> {
         if self.current == Some(set) {
             return Ok(());
         }
+        let begin = Instant::now();
         let place = |set: Set| REFINED_IN_ORDER.iter().position(|s| *s == set);
+        let mut before = 0.0;
         let (from, to) = (self.current.and_then(place), place(set));
         let splats = match (from, to, self.splats.take()) {
             (Some(from), Some(to), Some(splats)) if from < to => {
+                before = self.set_seconds;
                 self.refined(network, splats, crops, &REFINED_IN_ORDER[from + 1..=to])?
             }
             (_, Some(to), _) => {
-                let raster = self.raster_options(network, 1, None);
+                let raster = self.raster_options(network, 1.0, None);
                 let children = network.children(&crops.inputs, self.density, &raster)?;
                 self.refined(network, children, crops, &REFINED_IN_ORDER[1..=to])?
             }
             (_, None, _) => SceneChildren::of_splats(match set {
                 Set::Pair(pair) => network.splats_of_pair(pair, crops)?,
                 Set::Opaque | Set::Random => self.reduced(network, crops, set)?,
-                _ => network.splats(set, self.r)?,
+                _ => network.splats(set, self.upscale.ceil() as usize)?,
             }),
         };
+        self.set_seconds = before + begin.elapsed().as_secs_f64();
         (self.current, self.splats) = (Some(set), Some(splats));
         Ok(())
     }
@@ -422,7 +456,7 @@ impl<'a> PictureMaker<'a> {
         sets: &[Set],
     ) -> Result<SceneChildren> {
         let (inputs, upscale) = (&crops.inputs, network.model.config().upscale);
-        let raster = self.raster_options(network, self.r, None);
+        let raster = self.raster_options(network, self.upscale, None);
         let mut renderer = Renderer::default();
         for set in sets {
             let renderer = &mut renderer;
@@ -452,7 +486,7 @@ impl<'a> PictureMaker<'a> {
     /// The Gaussians of [`Set::Detailed`] at full density, as many as the density allows: those of
     /// the highest opacities ([`Set::Opaque`]), or random ones.
     fn reduced(&self, network: &Network<'_>, crops: &Crops, set: Set) -> Result<Splats> {
-        let raster = self.raster_options(network, 1, None);
+        let raster = self.raster_options(network, 1.0, None);
         let mut children = network.children(&crops.inputs, Density::Full, &raster)?;
         let upscale = network.model.config().upscale;
         children.add_detail(&crops.inputs, upscale)?;
@@ -471,15 +505,16 @@ impl<'a> PictureMaker<'a> {
     }
 
     fn picture(&mut self, method: &Method, crops: &Crops, target: &Cropped) -> Vec<f32> {
-        let (r, camera) = (self.r, &target.target_camera);
+        let (r, camera) = (self.upscale, &target.target_camera);
+        let size = (target.target.width, target.target.height);
         match method {
-            Method::Copy => nearest(&crops.inputs, camera, r),
-            Method::Mean => mean(&crops.inputs, r),
+            Method::Copy => nearest(&crops.inputs, camera, size),
+            Method::Mean => mean(&crops.inputs, size),
             Method::Lowpass => self.render(camera, r, Some(LowpassRef::Input)),
             Method::Backbone => self.render(camera, r, Some(LowpassRef::Target)),
             Method::Bilinear => {
-                let small = self.render(&target.input_camera, 1, None);
-                enlarged(&small, (target.input.width, target.input.height), r)
+                let small = self.render(&target.input_camera, 1.0, None);
+                enlarged(&small, (target.input.width, target.input.height), size)
             }
             _ => self.render(camera, r, None),
         }
@@ -489,16 +524,16 @@ impl<'a> PictureMaker<'a> {
     fn raster_options(
         &self,
         network: &Network<'_>,
-        ratio: usize,
+        ratio: f32,
         reference: Option<LowpassRef>,
     ) -> RasterOptions {
         let mut config = network.model.config().clone();
         config.render.lowpass_ref = reference.unwrap_or(config.render.lowpass_ref);
-        config.raster_options(ratio as f32, self.bounds.near, self.colour)
+        config.raster_options(ratio, self.bounds.near, self.colour)
     }
 
     /// Renders the current Gaussians from `camera`, whose pixels are 1/`ratio` input pixels.
-    fn render(&mut self, camera: &Camera, ratio: usize, reference: Option<LowpassRef>) -> Vec<f32> {
+    fn render(&mut self, camera: &Camera, ratio: f32, reference: Option<LowpassRef>) -> Vec<f32> {
         let (Some(network), Some(children)) = (&self.network, &self.splats) else {
             return Vec::new();
         };
@@ -574,16 +609,17 @@ mod tests {
 
     #[test]
     fn inputs_are_halved_where_photographs_are_small() {
-        let side = |upscale, least| fitting((256, 256), upscale, 32, least).0;
-        assert_eq!(side(1, (256, 300)), 256);
-        assert_eq!(side(2, (512, 600)), 256);
-        assert_eq!(side(2, (540, 360)), 128);
+        let side = |upscale: f32, least| fitting((256, 256), upscale, 32, least).0;
+        assert_eq!(side(1.0, (256, 300)), 256);
+        assert_eq!(side(2.0, (512, 600)), 256);
+        assert_eq!(side(2.0, (540, 360)), 128);
         // The target is never smaller than the nominal input.
-        assert_eq!(side(2, (200, 200)), 128);
-        assert_eq!(side(1, (200, 200)), 256);
-        assert_eq!(side(4, (1920, 1080)), 256);
-        assert_eq!(side(4, (800, 600)), 128);
-        assert_eq!(side(4, (400, 300)), 64);
-        assert_eq!(fitting((64, 48), 4, 32, (100, 100)), (64, 48));
+        assert_eq!(side(2.0, (200, 200)), 128);
+        assert_eq!(side(1.0, (200, 200)), 256);
+        assert_eq!(side(4.0, (1920, 1080)), 256);
+        assert_eq!(side(4.0, (800, 600)), 128);
+        assert_eq!(side(4.0, (400, 300)), 64);
+        assert_eq!((side(3.0, (600, 600)), side(1.5, (300, 300))), (128, 256));
+        assert_eq!(fitting((64, 48), 4.0, 32, (100, 100)), (64, 48));
     }
 }

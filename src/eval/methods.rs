@@ -147,41 +147,46 @@ impl Method {
     }
 }
 
-/// Enlarges the input whose camera is nearest to `target` to r times its size.
-pub(crate) fn nearest(inputs: &[Cropped], target: &Camera, r: usize) -> Vec<f32> {
+/// Enlarges the input whose camera is nearest to `target` to `size`.
+pub(crate) fn nearest(inputs: &[Cropped], target: &Camera, size: (usize, usize)) -> Vec<f32> {
     let distance = |c: &&Cropped| c.input_camera.position().distance(target.position());
     let nearest = inputs.iter().min_by(|a, b| distance(a).total_cmp(&distance(b)));
-    nearest
-        .map_or_else(Vec::new, |c| enlarged(&c.input.to_unit(), (c.input.width, c.input.height), r))
+    nearest.map_or_else(Vec::new, |c| {
+        enlarged(&c.input.to_unit(), (c.input.width, c.input.height), size)
+    })
 }
 
-/// Averages the inputs, and enlarges the mean to r times their size.
-pub(crate) fn mean(inputs: &[Cropped], r: usize) -> Vec<f32> {
+/// Averages the inputs, and enlarges the mean to `size`.
+pub(crate) fn mean(inputs: &[Cropped], size: (usize, usize)) -> Vec<f32> {
     let Some(first) = inputs.first() else { return Vec::new() };
     let mut sum = vec![0.0f32; first.input.data.len()];
     for c in inputs {
         sum.iter_mut().zip(&c.input.data).for_each(|(s, v)| *s += f32::from(*v) / 255.0);
     }
     sum.iter_mut().for_each(|s| *s /= inputs.len() as f32);
-    enlarged(&sum, (first.input.width, first.input.height), r)
+    enlarged(&sum, (first.input.width, first.input.height), size)
 }
 
-/// Enlarges `[h, w, 3]` to `[r·h, r·w, 3]` bilinearly: pixel centres at +0.5, borders repeated
-/// (PyTorch's `interpolate` with `align_corners=False`).
-pub(crate) fn enlarged(picture: &[f32], (w, h): (usize, usize), r: usize) -> Vec<f32> {
-    let taps = |side: usize| -> Vec<(usize, usize, f32)> {
+/// Enlarges `[h, w, 3]` to a picture of `to` (width, height) bilinearly: pixel centres at +0.5,
+/// borders repeated (PyTorch's `interpolate` with `align_corners=False`).
+pub(crate) fn enlarged(
+    picture: &[f32],
+    (w, h): (usize, usize),
+    (to_w, to_h): (usize, usize),
+) -> Vec<f32> {
+    let taps = |side: usize, to: usize| -> Vec<(usize, usize, f32)> {
         let tap = |i: usize| {
-            let at = ((i as f32 + 0.5) / r as f32 - 0.5).max(0.0);
+            let at = ((i as f32 + 0.5) * side as f32 / to as f32 - 0.5).max(0.0);
             let low = (at as usize).min(side - 1);
             (low, (low + 1).min(side - 1), at - low as f32)
         };
-        (0..r * side).map(tap).collect()
+        (0..to).map(tap).collect()
     };
     if w == 0 || h == 0 || picture.len() != 3 * w * h {
         return Vec::new();
     }
-    let (columns, rows) = (taps(w), taps(h));
-    let mut out = Vec::with_capacity(picture.len() * r * r);
+    let (columns, rows) = (taps(w, to_w), taps(h, to_h));
+    let mut out = Vec::with_capacity(3 * to_w * to_h);
     for &(top, bottom, fy) in &rows {
         for &(left, right, fx) in &columns {
             for c in 0..3 {
@@ -220,11 +225,11 @@ mod tests {
     #[test]
     fn enlarging_is_pytorchs() {
         let pair = [[0.0f32; 3], [1.0; 3]].concat();
-        let wide = enlarged(&pair, (2, 1), 2);
+        let wide = enlarged(&pair, (2, 1), (4, 2));
         let row: Vec<f32> = wide.iter().step_by(3).copied().collect();
         assert_eq!(row, [0.0, 0.25, 0.75, 1.0, 0.0, 0.25, 0.75, 1.0]);
-        assert_eq!(enlarged(&pair, (2, 1), 1), pair);
-        let tall = enlarged(&pair, (1, 2), 4);
+        assert_eq!(enlarged(&pair, (2, 1), (2, 1)), pair);
+        let tall = enlarged(&pair, (1, 2), (4, 8));
         let column: Vec<f32> = tall.iter().step_by(12).copied().collect();
         assert_eq!(column, [0.0, 0.0, 0.125, 0.375, 0.625, 0.875, 1.0, 1.0]);
     }

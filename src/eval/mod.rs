@@ -9,7 +9,7 @@
 //! # fn main() -> subsplat::Result<()> {
 //! let model = Reconstructor::untrained(&Config::small(Preset::Tuned, 2), 0)?;
 //! let photos = Benchmark::open("photos".as_ref(), None)?;
-//! let options = Options { methods: vec![Method::Subsplat, Method::Copy], ..Options::new(2) };
+//! let options = Options { methods: vec![Method::Subsplat, Method::Copy], ..Options::new(2.0) };
 //! let scores = Evaluator::new(options).run(Some(&model), &photos)?;
 //! println!("{:?} dB", scores.mean("subsplat").map(|s| s.psnr));
 //! # Ok(())
@@ -25,8 +25,8 @@
 //!
 //! Inputs have `input_size` pixels and targets r times as many a side, cropped from the
 //! photograph as [`crate::data::crop`] describes. Some photographs are too small for such a
-//! target. Their case's input is then halved until the target fits, or until the target has the
-//! nominal input size. No score is therefore taken against enlarged pixels.
+//! target. Their case's input is then halved until the target fits, or until half of the target would
+//! be smaller than the nominal input. No score is therefore taken against enlarged pixels.
 
 mod cases;
 mod disturbance;
@@ -40,6 +40,6 @@ pub use cases::{Benchmark, Case, Loaded};
 pub use disturbance::Disturbance;
 pub use evaluator::{CaseResult, Evaluator, Options, TargetPictures};
 pub use methods::Method;
-pub use page::{Sheet, escaped, page};
+pub use page::{Sheet, busiest, escaped, page};
 pub use score::{CaseScores, GaussianReport, InputReport, Score, Scores, TargetScores};
 pub use tables::{means_csv, report, targets_csv};

@@ -63,8 +63,9 @@ impl Sheet {
     }
 }
 
-/// Finds the window (left, top, width, height) with the largest mean gradient.
-fn busiest(truth: &Rgb) -> (usize, usize, usize, usize) {
+/// Finds the window (left, top, width, height) of at most 128 px a side with the largest mean
+/// gradient.
+pub fn busiest(truth: &Rgb) -> (usize, usize, usize, usize) {
     let (w, h) = (WINDOW.min(truth.width), WINDOW.min(truth.height));
     let mut best = (-1.0, (0, 0, w, h));
     for i in 0..CANDIDATES * CANDIDATES {

@@ -394,6 +394,11 @@ impl TrainConfig {
         Ok(Config::from_json(&json.to_string())?)
     }
 
+    /// Changes keys of the model's configuration, nested as in its JSON.
+    pub fn change_model(&mut self, change: &Value) {
+        merge(&mut self.model.set, change);
+    }
+
     /// Returns the number of examples of one step.
     pub fn examples_per_step(&self) -> u64 {
         (self.batch * self.accumulate) as u64

@@ -9,6 +9,7 @@ pub mod augment;
 pub mod checkpoint;
 pub mod config;
 pub mod files;
+pub mod folders;
 pub mod loading;
 pub mod loss;
 pub mod optimizer;

@@ -8,4 +8,5 @@ mod raster_bwd;
 mod raster_bwd_oracle;
 mod raster_op;
 mod raster_oracle;
+mod reduce;
 mod refine;

@@ -31,7 +31,7 @@ fn untrained(upscale: usize) -> Reconstructor {
 }
 
 fn options(upscale: usize, methods: &[Method]) -> Options {
-    Options { methods: methods.to_vec(), input_size: None, ..Options::new(upscale) }
+    Options { methods: methods.to_vec(), input_size: None, ..Options::new(upscale as f32) }
 }
 
 /// Mean colour of a reconstruction's inputs.
@@ -408,7 +408,7 @@ fn what_cannot_be_evaluated_is_named() {
     assert!(e.contains("protocol.json") && e.contains("at least 3 frames"), "{e}");
     let place = room();
     let data = Benchmark::open(place.path(), None).unwrap();
-    let e = Evaluator::new(Options::new(2)).run(None, &data).unwrap_err().to_string();
+    let e = Evaluator::new(Options::new(2.0)).run(None, &data).unwrap_err().to_string();
     assert!(e.contains("subsplat: expected a model"), "{e}");
     let protocol = r#"{"tests": [{"context": [0, 2], "target": [3]}]}"#;
     std::fs::write(place.path().join("scene/protocol.json"), protocol).unwrap();

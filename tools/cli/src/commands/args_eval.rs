@@ -47,9 +47,9 @@ pub struct EvalArgs {
     /// (pictures/METHOD/SCENE/INPUTS/FRAME.png). Default: no files are written.
     #[arg(short, long, value_name = "DIR")]
     pub out: Option<PathBuf>,
-    /// Target over input, side over side. Default: the weights' own, else 2.
-    #[arg(long, value_name = "R", value_parser = ["1", "2", "4"])]
-    pub upscale: Option<String>,
+    /// Target over input, side over side, 1 to 8, as in `run`. Default: the weights' own, else 2.
+    #[arg(long, value_name = "R", value_parser = values::upscale)]
+    pub upscale: Option<f32>,
     /// Side of the network's input, px: N, or WxH (default: protocol.json's, else 256).
     #[arg(long, value_name = "N | WxH", value_parser = values::size)]
     pub input_size: Option<(usize, usize)>,
@@ -91,6 +91,10 @@ pub struct EvalArgs {
     /// Only the first N scenes.
     #[arg(long, value_name = "N", value_parser = values::at_least_one)]
     pub limit: Option<usize>,
+    /// Only part I of N equal parts of the cases, I from 0: N processes share an evaluation. The lines
+    /// of their targets.csv, one after the other, are those of one process.
+    #[arg(long, value_name = "I/N", value_parser = part)]
+    pub shard: Option<(usize, usize)>,
     /// Principal point after a crop (default: mvsplat for chunks with the re10k backbone, else
     /// exact).
     #[arg(long, value_enum)]
@@ -119,6 +123,13 @@ pub enum LrFromArg {
     HrCrop,
     /// The photograph, resized and cropped independently, as in MVSplat.
     Independent,
+}
+
+/// Parses a part of several: `0/4`.
+fn part(text: &str) -> Result<(usize, usize), String> {
+    let numbers = text.split_once('/').and_then(|(i, n)| Some((i.parse().ok()?, n.parse().ok()?)));
+    let inside = |(i, n): &(usize, usize)| i < n;
+    numbers.filter(inside).ok_or_else(|| format!("expected I/N with I from 0 to N-1, got `{text}`"))
 }
 
 /// Parses the name of a disturbance.

@@ -19,7 +19,7 @@ use subsplat::io::write_atomic;
 use subsplat::pipeline::{DepthRange, Reconstructor, is_mvsplat};
 
 /// r without arguments or weights that state one.
-const UPSCALE: usize = 2;
+const UPSCALE: f32 = 2.0;
 /// Largest number of cases on the page; each takes some hundred kilobytes.
 const SHEETS: usize = 60;
 /// Reason for an empty LPIPS column.
@@ -28,7 +28,7 @@ const NO_LPIPS: &str = "not measured: VGG16's weights were not given (--lpips FI
 /// Runs the command.
 pub fn eval(args: &EvalArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
-    let ratio = args.upscale.as_deref().map(str::parse).transpose()?;
+    let ratio = args.upscale;
     let mut data = progress.stage("data", |_| -> Result<_> {
         let mut data = Benchmark::open(&args.data, args.index.as_deref())?;
         data.set_depth_range(DepthRange::from_ends(args.near, args.far));
@@ -41,12 +41,16 @@ pub fn eval(args: &EvalArgs, answer: Answer) -> Result<()> {
     if let Some(limit) = args.limit {
         data.limit(limit);
     }
+    if let Some((part, parts)) = args.shard {
+        data.keep_part(part, parts).context("--shard")?;
+    }
     let needed = methods(args, ratio.unwrap_or(UPSCALE))?.iter().any(Method::needs_model);
     let model = match needed {
         true => Some(progress.stage("model", |_| load(args, ratio))?),
         false => None,
     };
-    let upscale = ratio.or(model.as_ref().map(|m| m.config().upscale)).unwrap_or(UPSCALE);
+    let own = model.as_ref().map(|m| m.config().upscale as f32);
+    let upscale = ratio.or(own).unwrap_or(UPSCALE);
     let options = Options {
         input_size: args.input_size,
         methods: methods(args, upscale)?,
@@ -91,18 +95,18 @@ pub fn eval(args: &EvalArgs, answer: Answer) -> Result<()> {
     answer.finish(&all)
 }
 
-fn load(args: &EvalArgs, ratio: Option<usize>) -> Result<Reconstructor> {
+fn load(args: &EvalArgs, ratio: Option<f32>) -> Result<Reconstructor> {
     model::load(&model::ModelRequest {
         weights: args.weights.as_deref(),
         seed: args.seed,
         upscale: None,
-        ratio,
+        ratio: ratio.map(|r| r.ceil() as usize),
         model: &args.model,
     })
 }
 
 /// The methods of the arguments at `upscale`, checked: no name twice.
-fn methods(args: &EvalArgs, upscale: usize) -> Result<Vec<Method>> {
+fn methods(args: &EvalArgs, upscale: f32) -> Result<Vec<Method>> {
     let mut all = match args.methods.is_empty() {
         true => Options::new(upscale).methods,
         false => args.methods.clone(),
@@ -144,7 +148,7 @@ fn rule(args: &EvalArgs, data: &Benchmark, model: Option<&Reconstructor>) -> Cro
 /// Rejects sizes that exceed the memory, before any work.
 fn check_memory(model: &Reconstructor, data: &Benchmark, options: &Options) -> Result<()> {
     let mut config = model.config().clone();
-    config.upscale = config.upscale.max(options.upscale);
+    config.upscale = config.upscale.max(options.upscale.ceil() as usize);
     for case in data.cases() {
         let nominal = case.resolution.map(|[w, h]| (w, h)).unwrap_or((256, 256));
         let size = options.input_size.unwrap_or(nominal);
@@ -209,7 +213,7 @@ fn pictures(out: &Path, pair: &str, methods: &[String], result: &CaseResult) -> 
     Ok(())
 }
 
-fn print_scores(scores: &Scores, upscale: usize, answer: Answer) {
+fn print_scores(scores: &Scores, upscale: f32, answer: Answer) {
     let line = |name: &str, mean: Option<Score>| {
         let cell = |v: Option<f64>, digits: usize| {
             v.map_or_else(|| format!("{:>7}", "-"), |v| format!("{v:7.digits$}"))
@@ -289,17 +293,27 @@ fn sizes(scores: &Scores) -> String {
     counts.iter().map(one).collect::<Vec<_>>().join(", ")
 }
 
+/// A ratio as JSON: a whole number where it is one.
+fn json_ratio(ratio: f32) -> Value {
+    match ratio.fract() == 0.0 {
+        true => json!(ratio as usize),
+        // The shortest digits of the f32, not those of its value as f64.
+        false => ratio.to_string().parse::<f64>().map_or(Value::Null, |r| json!(r)),
+    }
+}
+
 fn protocol(args: &EvalArgs, options: &Options, model: Option<&Reconstructor>) -> Value {
     let config = model.map(Reconstructor::config);
     json!({
         "data": args.data.display().to_string(),
         "index": args.index.as_ref().map(|p| p.display().to_string()),
-        "upscale": options.upscale,
+        "upscale": json_ratio(options.upscale),
         "crop": if options.rule == CropRule::Mvsplat { "mvsplat" } else { "exact" },
         "lr_from": if options.lr_from == LrFrom::HrCrop { "hr_crop" } else { "independent" },
         "disturbances": args.disturb.iter().map(|d| d.name()).collect::<Vec<_>>(),
         "weights": args.weights.as_ref().map(|p| p.display().to_string()),
         "seed": args.seed,
+        "shard": args.shard.map(|(part, parts)| format!("{part}/{parts}")),
         "untrained_tensors": model.map(|m| m.untrained_tensors().len()),
         "backbone": config.map(|c| if is_mvsplat(c) { "re10k" } else { "small" }),
         "children": config.map(|c| if c.spgr.enabled { c.children() } else { 1 }),

@@ -10,19 +10,49 @@ use subsplat::abi::{Convention, RasterOptions};
 use subsplat::camera::Camera;
 use subsplat::io::ply::is_own_comment;
 use subsplat::io::{SaveOptions, load_with_comments, save_splats};
-use subsplat::render::{camera_of_comments, comments_without_camera, options_of_comments};
+use subsplat::reduce::reduce;
+use subsplat::render::{
+    Renderer, camera_of_comments, comments_without_camera, options_of_comments,
+};
 
 /// Runs the command.
 pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
     let file = render::scene_file(&args.scene)?;
+    let mut cameras: Vec<Camera> = Vec::new();
     let html = args.out.extension().is_some_and(|e| e.eq_ignore_ascii_case("html"));
-    if args.cameras.is_some() && !html {
-        bail!("--cameras: only .html files hold cameras, got {}", args.out.display());
+    if args.cameras.is_some() && !html && args.gaussians.is_none() {
+        bail!(
+            "--cameras: only .html files hold cameras, got {}; --gaussians uses them too",
+            args.out.display()
+        );
     }
-    let (splats, mut comments) = progress.stage("scene", |_| load_with_comments(&file))?;
+    let (mut splats, mut comments) = progress.stage("scene", |_| load_with_comments(&file))?;
     comments.retain(|comment| !is_own_comment(comment));
     let stored = options_of_comments(&comments);
+    let all = splats.len();
+    if html || args.gaussians.is_some() {
+        cameras = match render::cameras_beside(args.cameras.as_deref(), &file)? {
+            Some(all) => all.into_iter().map(|(_, camera)| camera).collect(),
+            None => camera_of_comments(&comments).into_iter().collect(),
+        };
+    }
+    if let Some(density) = args.gaussians {
+        let options = stored.unwrap_or_else(|| RasterOptions::new(Convention::Standard));
+        let count = density.limit(all, 1, 1).max(1);
+        splats = progress.stage("merging", |_| {
+            // cameras.json of `run` holds the views, the comment the first photograph.
+            let mut from = cameras.clone();
+            from.extend(camera_of_comments(&comments));
+            Ok::<_, anyhow::Error>(reduce(
+                &splats,
+                &from,
+                &options,
+                count,
+                &mut Renderer::default(),
+            ))
+        })?;
+    }
     // The camera of a comment holds in the axes that the file had.
     let kept = match args.up {
         None | Some(UpArg::Keep) => comments,
@@ -47,10 +77,6 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
                 "the viewer draws by the standard convention; mvsplat's differs a little",
             );
         }
-        let cameras: Vec<Camera> = match render::cameras_beside(args.cameras.as_deref(), &file)? {
-            Some(all) => all.into_iter().map(|(_, camera)| camera).collect(),
-            None => camera_of_comments(&save.comments).into_iter().collect(),
-        };
         let title = file.file_stem().unwrap_or_default().to_string_lossy();
         let page = Page { splats: &splats, cameras: &cameras, options: &options, title: &title };
         page.write(&args.out, &save)
@@ -58,8 +84,9 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
     let kind =
         if html { "html".to_owned() } else { serde_json::to_value(report.format)?.to_string() };
     let kind = kind.trim_matches('"').to_owned();
+    let of = if args.gaussians.is_some() { format!(" of {all}") } else { String::new() };
     answer.line(format!(
-        "{}: {} Gaussians, SH degree {}, {:.1} MB",
+        "{}: {}{of} Gaussians, SH degree {}, {:.1} MB",
         args.out.display(),
         report.count,
         report.sh_degree,
@@ -67,6 +94,7 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
     ));
     let mut value = serde_json::to_value(&report)?;
     value["format"] = json!(kind);
+    value["all"] = json!(all);
     value["file"] = json!(args.out.display().to_string());
     value["seconds"] = serde_json::Value::Object(progress.seconds());
     answer.finish(&value)

@@ -7,6 +7,7 @@
 
 pub mod args;
 mod args_eval;
+mod args_paper;
 #[cfg(feature = "view")]
 mod args_view;
 mod check;
@@ -23,6 +24,7 @@ mod memory;
 mod model;
 mod output;
 mod pair;
+mod paper;
 mod poses;
 mod raster_case;
 mod reconstruct;
@@ -96,6 +98,7 @@ fn dispatch(cli: &Cli, answer: Answer) -> Result<bool> {
         Command::Check(args) => check::check(args, answer),
         Command::Info(args) => info::info(args, answer).map(|()| true),
         Command::Eval(args) => eval::eval(args, answer).map(|()| true),
+        Command::Paper(args) => paper::paper(args, answer).map(|()| true),
         Command::Compare(args) => compare::compare(args, answer),
         Command::Train(args) => train::train(args, answer).map(|()| true),
     }

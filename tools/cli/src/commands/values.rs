@@ -56,6 +56,16 @@ pub fn density(text: &str) -> Result<Density, String> {
     }
 }
 
+/// Parses a number of Gaussians of a finished scene: a whole number, or a share of all as `P%`.
+pub fn reduced(text: &str) -> Result<Density, String> {
+    match density(text) {
+        Ok(Density::Auto) => {
+            Err("expected a whole number of at least 1, or a share as 50%".to_owned())
+        }
+        other => other,
+    }
+}
+
 /// Largest number of steps of `--refine`.
 const REFINE_MAX: usize = 100_000;
 

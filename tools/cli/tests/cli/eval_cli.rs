@@ -122,6 +122,33 @@ fn a_folder_of_scenes_and_an_index_choose_the_cases() {
 }
 
 #[test]
+fn any_upscale_of_run_is_scored_at_its_size() {
+    let place = room();
+    for (upscale, side, gaussians) in [("1.5", 96, 4), ("3", 96, 9)] {
+        // 32 px at x3: the photographs have 128.
+        let input = if upscale == "3" { 32 } else { 64 };
+        let methods = "subsplat,backbone,bilinear,uniform,copy,mean";
+        let arguments = format!(
+            "--json eval scene --upscale {upscale} --input-size {input} --methods {methods}"
+        );
+        let report = done(&call_in(place.path(), &arguments));
+        let case = &report["scenes"]["scene"]["cases"][0];
+        assert_eq!(case["input"], json!([input, input]));
+        assert_eq!(case["target"], json!([side, side]), "{upscale}");
+        assert_eq!(report["protocol"]["upscale"].to_string(), upscale);
+        for method in methods.split(',') {
+            let psnr = report["methods"][method]["psnr"].as_f64().unwrap();
+            assert!((6.0..60.0).contains(&psnr), "{upscale} {method}: {psnr}");
+        }
+        // The children fill the grid of the next whole upscale.
+        for method in ["subsplat", "uniform"] {
+            let count = report["inputs"][method]["gaussians"]["count"].as_f64();
+            assert_eq!(count, Some(f64::from(2 * input * input * gaussians)), "{upscale} {method}");
+        }
+    }
+}
+
+#[test]
 fn any_number_of_threads_gives_the_same_figures() {
     let place = room();
     for (threads, out) in [(1, "one"), (2, "two")] {
@@ -137,6 +164,45 @@ fn any_number_of_threads_gives_the_same_figures() {
     for file in files(&place.path().join("one")) {
         let [one, two] = ["one", "two"].map(|o| read(&place.path().join(o).join(&file)));
         assert!(one == two, "{}", file.display());
+    }
+}
+
+/// The recipe of tools/train/README.md, "Several processes".
+#[test]
+fn two_processes_share_an_evaluation() {
+    let place = room();
+    let eval = |more: &str| {
+        let called =
+            call_in(place.path(), &format!("eval scene --methods subsplat,fit,mean {more}"));
+        assert_eq!(called.code, 0, "{}", called.stderr);
+    };
+    eval("-o whole");
+    std::thread::scope(|scope| {
+        for part in ["0", "1"] {
+            scope.spawn(move || eval(&format!("--shard {part}/2 -o part{part}")));
+        }
+    });
+    let csv = |out: &str| text(&place.path().join(out).join("targets.csv"));
+    let (first, second) = (csv("part0"), csv("part1"));
+    let head = second.lines().next().unwrap();
+    let joined = first.clone() + &second[head.len() + 1..];
+    assert!(first.lines().count() > 1 && second.lines().count() > 1);
+    assert_eq!(joined, csv("whole"));
+    // Both folders together hold the pictures of one process.
+    let pictures = |out: &str| files(&place.path().join(out).join("pictures"));
+    let mut both = [pictures("part0"), pictures("part1")].concat();
+    both.sort();
+    assert_eq!(both, pictures("whole"));
+    for file in both {
+        let read =
+            |out: &str| std::fs::read(place.path().join(out).join("pictures").join(&file)).ok();
+        assert_eq!(read("part0").or(read("part1")), read("whole"), "{}", file.display());
+    }
+    for (shard, code, words) in
+        [("2/2", 2, "expected I/N"), ("x", 2, "expected I/N"), ("1/9", 1, "part of the cases")]
+    {
+        let called = call_in(place.path(), &format!("eval scene --methods copy --shard {shard}"));
+        assert!(called.code == code && called.stderr.contains(words), "{shard}: {}", called.stderr);
     }
 }
 
@@ -166,7 +232,7 @@ fn refusals_are_one_line_and_leave_no_tables() {
     }
     for (arguments, words) in [
         ("eval scene --methods best", "expected one of subsplat, detail"),
-        ("eval scene --upscale 3", "--upscale"),
+        ("eval scene --upscale 9", "expected a number from 1 to 8"),
         ("eval scene --near 9 --far 2 --methods copy", "--near 9"),
         ("eval scene --limit 0", "--limit"),
         ("eval", "DATA"),

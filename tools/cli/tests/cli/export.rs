@@ -129,12 +129,50 @@ fn export_writes_every_format() {
 }
 
 #[test]
+fn export_merges_gaussians_to_half_and_a_quarter() {
+    let place = workplace();
+    let run = "run scene --context 0,2 --target 1 --input-size 64 --refine off -o out";
+    assert_eq!(call_in(place.path(), run).code, 0);
+    let all = load_splats(&place.path().join("out/scene.ply")).unwrap().len();
+    let size = |name: &str| std::fs::metadata(place.path().join(name)).unwrap().len() as f64;
+    let view = |name: &str| {
+        let render = format!("render {name} --cameras scene -o view-{}", name.replace('/', "-"));
+        assert_eq!(call_in(place.path(), &render).code, 0);
+        let folder = place.path().join(format!("view-{}", name.replace('/', "-")));
+        // The frame between the inputs, and the inputs.
+        ["view1.png", "view0.png", "view2.png"].map(|f| load(&folder.join(f)).unwrap().to_unit())
+    };
+    let whole = view("out/scene.ply");
+    for (wanted, share, likeness) in [("50%", 0.5, 38.0), ("2048", 2048.0 / all as f64, 33.0)] {
+        let export = format!("--json export out -o less.ply --gaussians {wanted}");
+        let called = call_in(place.path(), &export);
+        assert_eq!(called.code, 0, "{}", called.stderr);
+        let report = called.json();
+        assert_eq!(report["all"], all);
+        assert_eq!(report["count"], (share * all as f64).round() as usize);
+        assert!((size("less.ply") / size("out/scene.ply") - share).abs() < 0.02);
+        for (got, expected) in view("less.ply").iter().zip(&whole) {
+            let psnr = psnr(got, expected, 128, 128).unwrap();
+            assert!(psnr > likeness, "{wanted}: {psnr:.1} dB");
+        }
+        let again = call_in(place.path(), "--threads 1 export out -o again.ply --gaussians 50%");
+        assert_eq!(again.code, 0);
+        let read = |name: &str| std::fs::read(place.path().join(name)).unwrap();
+        assert!(wanted != "50%" || read("less.ply") == read("again.ply"), "bytes by threads");
+    }
+    // More than there are: nothing is merged.
+    let called = call_in(place.path(), "--json export out -o all.splat --gaussians 99999999");
+    assert_eq!(called.json()["count"], all);
+}
+
+#[test]
 fn export_refuses_what_it_cannot_write() {
     let place = workplace();
     save_one_splat(&place.path().join("one.ply"));
     for (arguments, words) in [
         ("export one.ply -o two.obj", "two.obj: expected a name that ends in .ply"),
         ("export one.ply -o two.ply --cameras scene", "--cameras: only .html files"),
+        ("export one.ply -o two.ply --cameras none --gaussians 50%", "none"),
         ("export one.ply -o two.html --up y", "--up: a .html file"),
         ("export one.ply -o two.spz --up z", "y-up by definition"),
         ("export nothing.ply -o two.html", "nothing.ply"),
@@ -146,8 +184,9 @@ fn export_refuses_what_it_cannot_write() {
         assert!(called.error().contains(words), "{arguments}: {}", called.stderr);
     }
     assert!(!place.path().join("two.html").exists());
-    for arguments in [["--sh", "4"], ["--min-opacity", "2"]] {
-        let all = [&["export", "one.ply", "-o", "two.ply"][..], &arguments].concat();
+    let numbers = [["--gaussians", "auto"], ["--gaussians", "0"], ["--gaussians", "0%"]];
+    for arguments in [["--sh", "4"], ["--min-opacity", "2"]].iter().chain(&numbers) {
+        let all = [&["export", "one.ply", "-o", "two.ply"][..], arguments].concat();
         assert_eq!(call_with(place.path(), &all, &[]).code, 2, "{arguments:?}");
     }
 }

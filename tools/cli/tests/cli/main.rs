@@ -10,6 +10,7 @@ mod eval_cli;
 mod export;
 mod loose_photographs;
 mod motion;
+mod paper;
 mod program;
 mod readme;
 mod readme_snippet;
