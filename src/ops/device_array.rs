@@ -75,6 +75,8 @@ impl Executor {
         let failure = self.failure.lock().unwrap_or_else(PoisonError::into_inner).take();
         match (&result, failure) {
             (Err(_), Some(error)) => {
+                // A lost device first refuses a command; the loss is the reason.
+                let error = self.recorder.gpu().check().err().unwrap_or(error);
                 backend.offload(|_| Err::<(), _>(error));
                 None
             }

@@ -6,6 +6,13 @@
 //! [`DeviceArray::reshape`] and whole leading parts share memory.
 //!
 //! CPU versions: [`crate::cpu`], tensor operations of candle. Tests: tests/gpu/array.rs.
+//!
+//! Work of the small network for two pictures of 256×256 with four children (`cargo bench --bench
+//! device -- small`), counted: 432 calls, 15.2 Gflop of convolutions and 17.1 of linear layers, 3.2 GB
+//! of arguments. 1.5 GB of them belong to `elementwise`: copies that a fused kernel would save. From
+//! data sheets, with 30 % of the f32 rate, 70 % of the memory's rate and 5 µs a call, an integrated
+//! adapter (2 Tflop/s, 60 GB/s) needs 110 ms, one of a laptop (10, 250) 26 ms, one of a desktop (30,
+//! 700) 10 ms, an H200 (60, 4800) 5 ms. These times are estimates; no GPU was at hand.
 
 mod attention;
 mod elementwise;
