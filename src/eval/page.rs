@@ -194,9 +194,9 @@ mod tests {
                 picture.data[3 * (300 * y + x)] = if (x + y) % 2 == 0 { 255 } else { 0 };
             }
         }
-        let (left, top, w, h) = busiest(&picture);
+        let (left, top, w, h) = busiest(&picture, WINDOW);
         assert_eq!((w, h), (128, 128));
         assert!((left, top) == (143, 60) || (left, top) == (172, 60), "{left} {top}");
-        assert_eq!(busiest(&Rgb::black(20, 10)), (0, 0, 20, 10));
+        assert_eq!(busiest(&Rgb::black(20, 10), WINDOW), (0, 0, 20, 10));
     }
 }
