@@ -40,7 +40,7 @@ impl Sheet {
         for (frame, input) in scores.context.iter().zip(&result.inputs) {
             cells.push((format!("input {frame}, whole"), png(input)?));
         }
-        let window = busiest(&pictures.truth);
+        let window = busiest(&pictures.truth, WINDOW);
         let cut =
             |p: &Rgb| p.window(window.0, window.1, window.2, window.3).unwrap_or_else(|| p.clone());
         cells.push(("photograph".to_owned(), png(&cut(&pictures.truth))?));
@@ -63,10 +63,10 @@ impl Sheet {
     }
 }
 
-/// Finds the window (left, top, width, height) of at most 128 px a side with the largest mean
+/// Finds the window (left, top, width, height) of at most `side` px a side with the largest mean
 /// gradient.
-pub fn busiest(truth: &Rgb) -> (usize, usize, usize, usize) {
-    let (w, h) = (WINDOW.min(truth.width), WINDOW.min(truth.height));
+pub fn busiest(truth: &Rgb, side: usize) -> (usize, usize, usize, usize) {
+    let (w, h) = (side.min(truth.width), side.min(truth.height));
     let mut best = (-1.0, (0, 0, w, h));
     for i in 0..CANDIDATES * CANDIDATES {
         let at = |space: usize, k: usize| space * k / (CANDIDATES - 1);
@@ -194,9 +194,9 @@ mod tests {
                 picture.data[3 * (300 * y + x)] = if (x + y) % 2 == 0 { 255 } else { 0 };
             }
         }
-        let (left, top, w, h) = busiest(&picture);
+        let (left, top, w, h) = busiest(&picture, WINDOW);
         assert_eq!((w, h), (128, 128));
         assert!((left, top) == (143, 60) || (left, top) == (172, 60), "{left} {top}");
-        assert_eq!(busiest(&Rgb::black(20, 10)), (0, 0, 20, 10));
+        assert_eq!(busiest(&Rgb::black(20, 10), WINDOW), (0, 0, 20, 10));
     }
 }

@@ -38,7 +38,7 @@ impl Scene {
     /// Joins the pictures: above the whole pictures with their labels, below a window of each.
     pub fn sheet(&self) -> Rgb {
         let side = self.truth.width.min(self.truth.height);
-        let (left, top, size) = window(&self.truth, (side / WINDOW_SHARE).max(1));
+        let (left, top, size, _) = busiest(&self.truth, (side / WINDOW_SHARE).max(1));
         let mut columns = vec![("input".to_owned(), &self.input, None)];
         let target = Some((left, top, size));
         let mut methods: Vec<_> = self.methods.iter().collect();
@@ -64,13 +64,6 @@ impl Scene {
         }
         sheet
     }
-}
-
-/// Left, top and side of the busiest square window of at most `side` px.
-fn window(truth: &Rgb, side: usize) -> (usize, usize, usize) {
-    let (left, top, width, height) = busiest(truth);
-    let side = side.min(width).min(height);
-    (left + (width - side) / 2, top + (height - side) / 2, side)
 }
 
 /// Splits a label into lines that fit a cell.

@@ -102,8 +102,7 @@ pub fn markdown(table: &Table, parts: &[Part], notes: &[String]) -> String {
     let mut text = format!("# {}: {}\n", table.id, table.title);
     let columns = columns(table.kind);
     for part in parts {
-        let sides = part.rows.iter().find_map(|(_, ours, _)| ours.sides);
-        let sides = sides.map_or_else(String::new, |[a, b]| format!(", {a} to {b} px"));
+        let sides = sides(part).map_or_else(String::new, |sides| format!(", {sides}"));
         let _ = writeln!(
             text,
             "\n## {}: measured on {}, {} scene{}{sides}\n",
@@ -136,6 +135,16 @@ pub fn markdown(table: &Table, parts: &[Part], notes: &[String]) -> String {
         let _ = writeln!(text, "* {note}");
     }
     text
+}
+
+/// Sides of the inputs and of the pictures: `256 and 512 to 512 px`.
+fn sides(part: &Part) -> Option<String> {
+    let mut all: Vec<[usize; 2]> = part.rows.iter().filter_map(|(_, ours, _)| ours.sides).collect();
+    all.sort_unstable();
+    all.dedup();
+    let target = all.first()?[1];
+    let inputs: Vec<String> = all.iter().map(|[input, _]| input.to_string()).collect();
+    Some(format!("{} to {target} px", inputs.join(" and ")))
 }
 
 /// Index of the first number that a kind of table shows.
@@ -255,7 +264,7 @@ mod tests {
     #[test]
     fn cells_with_commas_are_quoted_and_means_printed() {
         let table = super::super::tables::TABLES.first().unwrap();
-        let parts = [part(&[(&[1.0, 2.0], Some(10.5)), (&[], None)])];
+        let mut parts = [part(&[(&[1.0, 2.0], Some(10.5)), (&[], None)])];
         let text = csv(table, &parts);
         let lines: Vec<&str> = text.lines().collect();
         assert_eq!(
@@ -263,7 +272,10 @@ mod tests {
             "t1,\"row, 0\",RE10K 512,rooms,1,,,2,1.500000,,,,,1.000000 2.000000,10.5,,,,"
         );
         assert_eq!(lines[2], "t1,\"row, 1\",RE10K 512,rooms,1,,,0,,,,,,,,,,,");
+        parts[0].rows[0].1.sides = Some([64, 64]);
+        parts[0].rows[1].1.sides = Some([32, 64]);
         let text = markdown(table, &parts, &["a note".to_owned()]);
+        assert!(text.contains("measured on rooms, 1 scene, 32 and 64 to 64 px"), "{text}");
         assert!(text.contains("| row, 0 | 1.50 | 10.50 |"), "{text}");
         assert!(text.contains("| row, 1 |    - |     - |"), "{text}");
         assert!(text.ends_with("\n* a note\n"), "{text}");
