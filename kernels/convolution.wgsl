@@ -28,13 +28,6 @@ struct ConvolutionUniform {
 // [B, outputs, output_size].
 @group(0) @binding(4) var<storage, read_write> result: array<f32>;
 
-const SIDE: u32 = 64u;
-const STEP: u32 = 16u;
-
-// [STEP, SIDE / 4]: terms of four outputs, and of four pixels.
-var<workgroup> rows: array<vec4<f32>, 256>;
-var<workgroup> columns: array<vec4<f32>, 256>;
-
 // Returns the first sample of a pixel: its place times the stride, minus the padding.
 fn corner(pixel: u32) -> vec3<i32> {
     let place = vec3<u32>(
@@ -91,16 +84,7 @@ fn main(
             samples[j] = select(0.0, sample, inside);
         }
         columns[thread] = samples;
-        workgroupBarrier();
-        for (var k = 0u; k < STEP; k++) {
-            let row = rows[k * SIDE / 4u + thread / 16u];
-            let column = columns[k * SIDE / 4u + thread % 16u];
-            sums[0] += row.x * column;
-            sums[1] += row.y * column;
-            sums[2] += row.z * column;
-            sums[3] += row.w * column;
-        }
-        workgroupBarrier();
+        add_step(&sums, thread);
     }
     for (var i = 0u; i < 4u; i++) {
         let output = first_output + thread / 16u * 4u + i;

@@ -4,7 +4,7 @@
 @group(0) @binding(3) var<storage, read> summands: array<f32>;
 @group(0) @binding(4) var<storage, read_write> y: array<f32>;
 
-@compute @workgroup_size(64)
+@compute @workgroup_size(THREADS)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
@@ -13,12 +13,12 @@ fn main(
     let row = workgroup_number(workgroup, workgroups);
     let base = min(row, call.rows - 1u) * call.length;
     var own = 0.0;
-    for (var i = thread; i < call.length; i += 64u) {
+    for (var i = thread; i < call.length; i += THREADS) {
         own += x[base + i];
     }
     let mean = total(own, thread) / f32(call.length);
     own = 0.0;
-    for (var i = thread; i < call.length; i += 64u) {
+    for (var i = thread; i < call.length; i += THREADS) {
         let away = x[base + i] - mean;
         own += away * away;
     }
@@ -26,7 +26,7 @@ fn main(
     if row >= call.rows {
         return;
     }
-    for (var i = thread; i < call.length; i += 64u) {
+    for (var i = thread; i < call.length; i += THREADS) {
         y[base + i] = (x[base + i] - mean) * scale * factors[i] + summands[i];
     }
 }

@@ -19,13 +19,6 @@ struct LinearUniform {
 // [rows, outputs].
 @group(0) @binding(4) var<storage, read_write> y: array<f32>;
 
-const SIDE: u32 = 64u;
-const STEP: u32 = 16u;
-
-// [STEP, SIDE / 4]: terms of four rows, and of four outputs.
-var<workgroup> rows: array<vec4<f32>, 256>;
-var<workgroup> columns: array<vec4<f32>, 256>;
-
 @compute @workgroup_size(256)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -60,16 +53,7 @@ fn main(
         }
         rows[own_term * SIDE / 4u + line / 4u] = row_terms;
         columns[own_term * SIDE / 4u + line / 4u] = column_terms;
-        workgroupBarrier();
-        for (var k = 0u; k < STEP; k++) {
-            let row = rows[k * SIDE / 4u + thread / 16u];
-            let column = columns[k * SIDE / 4u + thread % 16u];
-            sums[0] += row.x * column;
-            sums[1] += row.y * column;
-            sums[2] += row.z * column;
-            sums[3] += row.w * column;
-        }
-        workgroupBarrier();
+        add_step(&sums, thread);
     }
     for (var j = 0u; j < 4u; j++) {
         let output = first_output + own_output + j;

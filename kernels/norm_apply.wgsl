@@ -9,7 +9,7 @@
 
 override ACTIVATION_KIND: u32 = 0u;
 
-@compute @workgroup_size(256)
+@compute @workgroup_size(THREADS)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
@@ -35,7 +35,7 @@ fn main(
     let first = number % call.parts * PART;
     let count = min(call.length - first, PART);
     let channels = call.length / call.run;
-    for (var i = thread; i < count; i += 256u) {
+    for (var i = thread; i < count; i += THREADS) {
         let at = first + i;
         var v = (x[row * call.length + at] - mean) * scale;
         if call.has_affine == 1u {

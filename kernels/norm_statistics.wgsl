@@ -3,24 +3,7 @@
 // [rows, parts].
 @group(0) @binding(2) var<storage, read_write> statistics: array<vec2<f32>>;
 
-var<workgroup> partial: array<f32, 256>;
-
-// Returns the sum of `own` over the workgroup.
-fn total(own: f32, thread: u32) -> f32 {
-    partial[thread] = own;
-    workgroupBarrier();
-    for (var half = 128u; half > 0u; half /= 2u) {
-        if thread < half {
-            partial[thread] += partial[thread + half];
-        }
-        workgroupBarrier();
-    }
-    let sum = partial[0];
-    workgroupBarrier();
-    return sum;
-}
-
-@compute @workgroup_size(256)
+@compute @workgroup_size(THREADS)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
@@ -32,12 +15,12 @@ fn main(
     let count = min(call.length - first, PART);
     let base = row * call.length + first;
     var own = 0.0;
-    for (var i = thread; i < count; i += 256u) {
+    for (var i = thread; i < count; i += THREADS) {
         own += x[base + i];
     }
     let mean = total(own, thread) / f32(count);
     own = 0.0;
-    for (var i = thread; i < count; i += 256u) {
+    for (var i = thread; i < count; i += THREADS) {
         let away = x[base + i] - mean;
         own += away * away;
     }

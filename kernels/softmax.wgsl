@@ -2,7 +2,7 @@
 
 @group(0) @binding(2) var<storage, read_write> y: array<f32>;
 
-@compute @workgroup_size(64)
+@compute @workgroup_size(THREADS)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
@@ -11,19 +11,19 @@ fn main(
     let row = workgroup_number(workgroup, workgroups);
     let base = min(row, call.rows - 1u) * call.length;
     var own = x[base];
-    for (var i = thread; i < call.length; i += 64u) {
+    for (var i = thread; i < call.length; i += THREADS) {
         own = max(own, x[base + i]);
     }
     let most = largest(own, thread);
     own = 0.0;
-    for (var i = thread; i < call.length; i += 64u) {
+    for (var i = thread; i < call.length; i += THREADS) {
         own += exp(x[base + i] - most);
     }
     let sum = total(own, thread);
     if row >= call.rows {
         return;
     }
-    for (var i = thread; i < call.length; i += 64u) {
+    for (var i = thread; i < call.length; i += THREADS) {
         y[base + i] = exp(x[base + i] - most) / sum;
     }
 }

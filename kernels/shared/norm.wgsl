@@ -21,3 +21,4 @@ struct NormUniform {
 
 // Numbers of a part.
 const PART: u32 = 8192u;
+const THREADS: u32 = 256u;

@@ -1,4 +1,4 @@
-// Rows that one workgroup of 64 threads takes together.
+// Rows that one workgroup processes together.
 
 struct RowsUniform {
     rows: u32,
@@ -11,28 +11,13 @@ struct RowsUniform {
 // [rows, length].
 @group(0) @binding(1) var<storage, read> x: array<f32>;
 
-var<workgroup> partial: array<f32, 64>;
-
-// Returns the sum of `own` over the workgroup.
-fn total(own: f32, thread: u32) -> f32 {
-    partial[thread] = own;
-    workgroupBarrier();
-    for (var half = 32u; half > 0u; half /= 2u) {
-        if thread < half {
-            partial[thread] += partial[thread + half];
-        }
-        workgroupBarrier();
-    }
-    let sum = partial[0];
-    workgroupBarrier();
-    return sum;
-}
+const THREADS: u32 = 64u;
 
 // Returns the maximum of `own` over the workgroup.
 fn largest(own: f32, thread: u32) -> f32 {
     partial[thread] = own;
     workgroupBarrier();
-    for (var half = 32u; half > 0u; half /= 2u) {
+    for (var half = THREADS / 2u; half > 0u; half /= 2u) {
         if thread < half {
             partial[thread] = max(partial[thread], partial[thread + half]);
         }

@@ -276,14 +276,9 @@ impl Benchmark {
                 format!("one of {} cases in each part, counted from 0", self.cases.len());
             return Err(Error::argument("part of the cases", expected, format!("{part}/{parts}")));
         }
-        let kept = at(part)..at(part + 1);
-        self.cases = self
-            .cases
-            .drain(..)
-            .enumerate()
-            .filter(|(i, _)| kept.contains(i))
-            .map(|(_, c)| c)
-            .collect();
+        let (first, end) = (at(part), at(part + 1));
+        self.cases.truncate(end);
+        self.cases.drain(..first);
         Ok(())
     }
 

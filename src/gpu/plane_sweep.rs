@@ -174,13 +174,12 @@ impl DeviceArray {
         let all = 0..rows;
         let (pairs, starts) = args.tables(&all);
         let sources = (source.count() / args.features().max(1)) as u32;
-        let uniform = gpu.uniform(&PlaneSweepUniform { sources, ..args.uniform(&all) })?;
+        let uniform = PlaneSweepUniform { sources, ..args.uniform(&all) };
         let pairs = gpu.upload("pairs of views", &pairs)?;
         let starts = gpu.upload("starts of pairs", &starts)?;
         let depths = gpu.upload("candidate depths", &args.depths(&all))?;
         let result = recorder.empty(&[rows, d, h, w])?;
         let bindings = [
-            Binding::from(&uniform),
             self.binding(),
             source.binding(),
             Binding::from(&pairs),
@@ -188,7 +187,13 @@ impl DeviceArray {
             Binding::from(&depths),
             result.binding(),
         ];
-        recorder.run(&PLANE_SWEEP, &[], &bindings, Groups::of(result.count(), THREADS))?;
+        recorder.call(
+            &PLANE_SWEEP,
+            &[],
+            &uniform,
+            &bindings,
+            Groups::of(result.count(), THREADS),
+        )?;
         Ok(result)
     }
 }

@@ -120,27 +120,18 @@ pub fn compare_encoder(
 }
 
 /// Runs the encoder on `backend`. Errors of a GPU are errors here.
-#[cfg(feature = "gpu")]
 fn encode(
     encoder: &Mvsplat,
     views: &Views,
     backend: &Backend,
     trace: &mut Trace<'_>,
 ) -> Result<BackboneOutput> {
-    match Executor::new(backend) {
-        Some(gpu) => encoder.forward_on(views, &gpu.upload(&views.images)?, trace)?.to_host(),
-        None => encoder.forward(views, trace),
+    #[cfg(feature = "gpu")]
+    if let Some(gpu) = Executor::new(backend) {
+        return encoder.forward_on(views, &gpu.upload(&views.images)?, trace)?.to_host();
     }
-}
-
-/// Runs the encoder on the CPU.
-#[cfg(not(feature = "gpu"))]
-fn encode(
-    encoder: &Mvsplat,
-    views: &Views,
-    _backend: &Backend,
-    trace: &mut Trace<'_>,
-) -> Result<BackboneOutput> {
+    #[cfg(not(feature = "gpu"))]
+    let Backend::Cpu = backend;
     encoder.forward(views, trace)
 }
 

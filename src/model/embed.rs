@@ -7,7 +7,8 @@
 //!   each.
 
 use super::geometry::{Frames, ParentChunk};
-use super::mlp::{Block2, LayerNorm, affine, gelu, linear, xavier};
+use super::layers::{LayerNorm, gelu, xavier};
+use super::mlp::{Block2, affine, linear};
 use crate::config::{AlphaInput, AnchorFrame, Embed, EmbedMlp, ScaleInput};
 use crate::ops::Array;
 use crate::ops::attributes::Attributes;

@@ -1,7 +1,6 @@
 //! Layers of both backbones, with PyTorch's parameter names and initialisation. All have
 //! gradients.
 
-use crate::model::mlp::xavier;
 pub use crate::ops::activation::Activation;
 use crate::ops::{Array, ConvSteps};
 use candle_core::{Result, Tensor, bail};
@@ -10,6 +9,12 @@ use candle_nn::{Init, VarBuilder};
 /// Returns PyTorch's default for weights and biases of Linear and Conv: U(±1/√fan_in).
 pub fn default_init(fan_in: usize) -> Init {
     let bound = 1.0 / (fan_in.max(1) as f64).sqrt();
+    Init::Uniform { lo: -bound, up: bound }
+}
+
+/// Uniform in ±√(6/(in + out)) (Xavier, Glorot).
+pub(crate) fn xavier(inputs: usize, outputs: usize) -> Init {
+    let bound = (6.0 / (inputs + outputs) as f64).sqrt();
     Init::Uniform { lo: -bound, up: bound }
 }
 

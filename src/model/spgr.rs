@@ -16,11 +16,11 @@
 //!   parameters do not depend on K.
 
 use super::embed::Descriptors;
-use super::mlp::{LayerNorm, affine, gelu, linear};
+use super::layers::{LayerNorm, gelu, relu};
+use super::mlp::{affine, linear};
 use crate::abi::{HEAD_GEOMETRY_LEN, HEAD_STRIDE};
 use crate::config::{AMin, Config, SpgrHead};
 use crate::ops::Array;
-use crate::ops::activation::Activation;
 use crate::ops::spgr::Rules;
 use candle_core::{Result, Tensor, bail};
 use candle_nn::{Init, Linear, VarBuilder};
@@ -153,9 +153,8 @@ impl Head {
             Form::Pg { lin, ln } => {
                 let mut x = x.clone();
                 for (i, ln) in ln.iter().enumerate() {
-                    x = affine(&lin[2 * i], &x)?.activated(Activation::Relu)?;
-                    x = affine(&lin[2 * i + 1], &x)?.activated(Activation::Relu)?;
-                    x = ln.forward(&x)?;
+                    x = relu(&affine(&lin[2 * i], &x)?)?;
+                    x = ln.forward(&relu(&affine(&lin[2 * i + 1], &x)?)?)?;
                 }
                 affine(&lin[4], &x)?
             }

@@ -50,18 +50,11 @@ pub fn group_norm_then(
     normalise(x, rows, Some((weight, bias)))
 }
 
-/// Over the pixels of each channel of each picture, no parameters: `[B, C, H, W]`.
+/// Over the pixels of each channel of each picture, no parameters, then `activation`, in one pass:
+/// `[B, C, H, W]`.
 ///
 /// # Errors
 /// Another rank; a dtype other than f32.
-pub fn instance_norm(x: &Tensor) -> Result<Tensor> {
-    instance_norm_then(x, None)
-}
-
-/// [`instance_norm`], then `activation`, in one pass.
-///
-/// # Errors
-/// As [`instance_norm`].
 pub fn instance_norm_then(x: &Tensor, activation: Option<Activation>) -> Result<Tensor> {
     let (_, _, h, w) = x.dims4()?;
     normalise(x, Rows { len: h * w, run: h * w, groups: 1, eps: EPS as f32, activation }, None)

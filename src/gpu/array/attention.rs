@@ -64,7 +64,7 @@ impl DeviceArray {
         let gpu = &self.recorder.gpu;
         let words = |n: usize| n as u32;
         let (windows, queries, keys) = call.labels.unwrap_or((0, &[], &[]));
-        let uniform = gpu.uniform(&AttentionUniform {
+        let uniform = AttentionUniform {
             rows: words(r),
             queries: words(l),
             keys: words(m),
@@ -73,20 +73,14 @@ impl DeviceArray {
             windows: words(windows),
             scale: call.scale,
             penalty: call.penalty,
-        })?;
+        };
         let labels: Vec<u32> = queries.iter().chain(keys).map(|label| u32::from(*label)).collect();
         let labels = gpu.upload("labels", &labels)?;
-        let bindings = [
-            Binding::from(&uniform),
-            self.binding(),
-            k.binding(),
-            v.binding(),
-            Binding::from(&labels),
-            result.binding(),
-        ];
+        let bindings =
+            [self.binding(), k.binding(), v.binding(), Binding::from(&labels), result.binding()];
         let groups = Groups::of(r * l.div_ceil(SIDE), 1);
         self.recorder.count_flops(&ATTENTION, 2 * r * l * m * (d + e));
-        self.recorder.run(&ATTENTION, &[], &bindings, groups)?;
+        self.recorder.call(&ATTENTION, &[], &uniform, &bindings, groups)?;
         Ok(result)
     }
 }

@@ -4,7 +4,6 @@
 
 use super::{ALIGNMENT, DeviceArray, misfit};
 use crate::abi::ElementwiseUniform;
-use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::error::GpuError;
 use crate::gpu::pipelines::{Access, Kernel, wgsl};
@@ -180,7 +179,7 @@ impl Call<'_> {
         }
         let recorder = &self.result.0.recorder;
         let (number, [first, second]) = self.function.parts();
-        let uniform = recorder.gpu.uniform(&ElementwiseUniform {
+        let uniform = ElementwiseUniform {
             count: count as u32,
             first,
             second,
@@ -189,16 +188,14 @@ impl Call<'_> {
             left: left.words(),
             right: right.words(),
             result: result.words(),
-        })?;
+        };
         let kind = match self.function {
             Function::Activation(kind) => f64::from(kind as u32),
             _ => 0.0,
         };
         let constants = [("FUNCTION", f64::from(number)), ("ACTIVATION_KIND", kind)];
-        let arrays = [self.left.0, self.right.0, self.result.0].map(DeviceArray::binding);
-        let mut bindings = vec![Binding::from(&uniform)];
-        bindings.extend(arrays);
-        recorder.run(&ELEMENTWISE, &constants, &bindings, Groups::of(count, THREADS))
+        let bindings = [self.left.0, self.right.0, self.result.0].map(DeviceArray::binding);
+        recorder.call(&ELEMENTWISE, &constants, &uniform, &bindings, Groups::of(count, THREADS))
     }
 }
 

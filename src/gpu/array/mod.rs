@@ -42,6 +42,7 @@ use crate::gpu::commands::{Groups, Pending};
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
 use crate::gpu::pipelines::{Constants, Kernel};
+use bytemuck::Pod;
 use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -133,19 +134,23 @@ impl Recorder {
         }
     }
 
-    /// Records a call. Submits all recorded calls if they are many or hold much memory.
-    pub(super) fn run(
+    /// Uploads `uniform` and records a call with it and `arguments`. Submits all recorded calls if
+    /// they are many or hold much memory.
+    pub(super) fn call<T: Pod>(
         &self,
         kernel: &'static Kernel,
         constants: Constants,
-        bindings: &[Binding],
+        uniform: &T,
+        arguments: &[Binding],
         groups: Groups,
     ) -> Result<(), GpuError> {
-        self.count(kernel, bindings, &groups);
+        let mut bindings = vec![Binding::from(&self.gpu.uniform(uniform)?)];
+        bindings.extend_from_slice(arguments);
+        self.count(kernel, &bindings, &groups);
         let mut pending = self.pending.lock().unwrap_or_else(PoisonError::into_inner);
         let (calls, mut bytes) = std::mem::take(&mut *pending);
         let mut commands = self.gpu.resume(NAME, calls);
-        commands.run(kernel, constants, bindings, groups)?;
+        commands.run(kernel, constants, &bindings, groups)?;
         bytes += bindings.last().map_or(0, |result| result.bytes);
         let calls = commands.suspend();
         if calls.len() < CALLS_MAX && bytes < BYTES_MAX {

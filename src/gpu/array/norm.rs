@@ -4,7 +4,6 @@
 
 use super::{DeviceArray, PointwiseFunction, misfit};
 use crate::abi::{NormUniform, RowsUniform};
-use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::error::GpuError;
 use crate::gpu::pipelines::{Access, Kernel, wgsl};
@@ -12,7 +11,7 @@ use crate::gpu::pipelines::{Access, Kernel, wgsl};
 pub(crate) static NORM_STATISTICS: Kernel = Kernel {
     name: "norm_statistics",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/norm", "norm_statistics"),
+    source: wgsl!("shared/grid", "shared/norm", "shared/sum", "norm_statistics"),
     bindings: &[Access::Uniform, Access::Read, Access::Write],
 };
 
@@ -33,7 +32,7 @@ pub(crate) static NORM_APPLY: Kernel = Kernel {
 pub(crate) static LAYER_NORM: Kernel = Kernel {
     name: "layer_norm",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/rows", "layer_norm"),
+    source: wgsl!("shared/grid", "shared/rows", "shared/sum", "layer_norm"),
     bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Read, Access::Write],
 };
 
@@ -69,7 +68,7 @@ impl DeviceArray {
         let length = self.count() / rows;
         let parts = length.div_ceil(PART);
         let words = |n: usize| n as u32;
-        let uniform = self.recorder.gpu.uniform(&NormUniform {
+        let uniform = NormUniform {
             rows: words(rows),
             length: words(length),
             run: words(self.count() / (b * c)),
@@ -78,18 +77,16 @@ impl DeviceArray {
             has_affine: u32::from(affine.is_some()),
             epsilon: EPSILON,
             pad: 0,
-        })?;
+        };
         let statistics = self.recorder.empty(&[rows * parts, 2])?;
         let result = self.recorder.empty(&self.dims)?;
-        let uniform = Binding::from(&uniform);
         let workgroups = || Groups::of(rows * parts, 1);
-        let bindings = [uniform.clone(), self.binding(), statistics.binding()];
-        self.recorder.run(&NORM_STATISTICS, &[], &bindings, workgroups())?;
+        let bindings = [self.binding(), statistics.binding()];
+        self.recorder.call(&NORM_STATISTICS, &[], &uniform, &bindings, workgroups())?;
         let [factors, summands] = affine.unwrap_or([self, self]).map(DeviceArray::binding);
-        let bindings =
-            [uniform, self.binding(), statistics.binding(), factors, summands, result.binding()];
+        let bindings = [self.binding(), statistics.binding(), factors, summands, result.binding()];
         let constants = [("ACTIVATION_KIND", f64::from(activation as u32))];
-        self.recorder.run(&NORM_APPLY, &constants, &bindings, workgroups())?;
+        self.recorder.call(&NORM_APPLY, &constants, &uniform, &bindings, workgroups())?;
         Ok(result)
     }
 
@@ -107,11 +104,9 @@ impl DeviceArray {
         let result = self.recorder.empty(&self.dims)?;
         let uniform =
             RowsUniform { rows: rows as u32, length: length as u32, epsilon: EPSILON, pad: 0 };
-        let uniform = self.recorder.gpu.uniform(&uniform)?;
         let [factors, summands] = affine.map(DeviceArray::binding);
-        let bindings =
-            [Binding::from(&uniform), self.binding(), factors, summands, result.binding()];
-        self.recorder.run(&LAYER_NORM, &[], &bindings, Groups::of(rows, 1))?;
+        let bindings = [self.binding(), factors, summands, result.binding()];
+        self.recorder.call(&LAYER_NORM, &[], &uniform, &bindings, Groups::of(rows, 1))?;
         Ok(result)
     }
 }

@@ -4,7 +4,6 @@
 
 use super::{DeviceArray, misfit};
 use crate::abi::{ConvolutionUniform, LinearUniform};
-use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::error::GpuError;
 use crate::gpu::pipelines::{Access, Kernel, wgsl};
@@ -12,14 +11,14 @@ use crate::gpu::pipelines::{Access, Kernel, wgsl};
 pub(crate) static CONVOLUTION: Kernel = Kernel {
     name: "convolution",
     entry: "main",
-    source: wgsl!("convolution"),
+    source: wgsl!("shared/product", "convolution"),
     bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Read, Access::Write],
 };
 
 pub(crate) static LINEAR: Kernel = Kernel {
     name: "linear",
     entry: "main",
-    source: wgsl!("shared/grid", "linear"),
+    source: wgsl!("shared/grid", "shared/product", "linear"),
     bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Read, Access::Write],
 };
 
@@ -91,7 +90,7 @@ impl DeviceArray {
         dims.extend_from_slice(&to[usize::from(flat)..]);
         let result = self.recorder.empty(&dims)?;
         let pixels: usize = to.iter().product();
-        let uniform = self.recorder.gpu.uniform(&ConvolutionUniform {
+        let uniform = ConvolutionUniform {
             channels: c as u32,
             outputs: o as u32,
             terms: (c * taps.iter().product::<usize>()) as u32,
@@ -101,17 +100,12 @@ impl DeviceArray {
             kernel: words(taps, 0),
             stride: words(stride, 0),
             padding: words(padding, usize::from(bias.is_some())),
-        })?;
-        let bindings = [
-            Binding::from(&uniform),
-            self.binding(),
-            weight.binding(),
-            bias.unwrap_or(weight).binding(),
-            result.binding(),
-        ];
+        };
+        let bindings =
+            [self.binding(), weight.binding(), bias.unwrap_or(weight).binding(), result.binding()];
         let groups = [pixels.div_ceil(SIDE), o.div_ceil(SIDE), b].map(|n| n as u32);
         self.recorder.count_flops(&CONVOLUTION, 2 * result.count() * weight.count() / o);
-        self.recorder.run(&CONVOLUTION, &[], &bindings, Groups::Of(groups))?;
+        self.recorder.call(&CONVOLUTION, &[], &uniform, &bindings, Groups::Of(groups))?;
         Ok(result)
     }
 
@@ -128,22 +122,17 @@ impl DeviceArray {
             return Err(misfit(LINEAR.name, expected, &weight.dims));
         }
         let result = self.recorder.empty(&[rows, o])?;
-        let uniform = self.recorder.gpu.uniform(&LinearUniform {
+        let uniform = LinearUniform {
             rows: rows as u32,
             outputs: o as u32,
             terms: c as u32,
             has_bias: u32::from(bias.is_some()),
-        })?;
-        let bindings = [
-            Binding::from(&uniform),
-            self.binding(),
-            weight.binding(),
-            bias.unwrap_or(weight).binding(),
-            result.binding(),
-        ];
+        };
+        let bindings =
+            [self.binding(), weight.binding(), bias.unwrap_or(weight).binding(), result.binding()];
         let groups = Groups::of(rows.div_ceil(SIDE) * o.div_ceil(SIDE), 1);
         self.recorder.count_flops(&LINEAR, 2 * rows * o * c);
-        self.recorder.run(&LINEAR, &[], &bindings, groups)?;
+        self.recorder.call(&LINEAR, &[], &uniform, &bindings, groups)?;
         Ok(result)
     }
 }

@@ -5,7 +5,6 @@
 
 use super::{DeviceArray, PointwiseFunction, misfit};
 use crate::abi::{ReduceUniform, ResizeUniform, RowsUniform, SelectUniform};
-use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
 use crate::gpu::error::GpuError;
 use crate::gpu::pipelines::{Access, Kernel, wgsl};
@@ -20,7 +19,7 @@ pub(crate) static REDUCE: Kernel = Kernel {
 pub(crate) static SOFTMAX: Kernel = Kernel {
     name: "softmax",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/rows", "softmax"),
+    source: wgsl!("shared/grid", "shared/rows", "shared/sum", "softmax"),
     bindings: &[Access::Uniform, Access::Read, Access::Write],
 };
 
@@ -70,15 +69,10 @@ impl DeviceArray {
         dims[dim] = 1;
         let result = self.recorder.empty(&dims)?;
         let [outer_words, length, inner_words] = [outer, length, inner].map(|n| n as u32);
-        let uniform = self.recorder.gpu.uniform(&ReduceUniform {
-            outer: outer_words,
-            length,
-            inner: inner_words,
-            factor,
-        })?;
-        let bindings = [Binding::from(&uniform), self.binding(), result.binding()];
+        let uniform = ReduceUniform { outer: outer_words, length, inner: inner_words, factor };
+        let bindings = [self.binding(), result.binding()];
         let groups = Groups::of(outer * inner, THREADS);
-        self.recorder.run(&REDUCE, &[("FUNCTION", number)], &bindings, groups)?;
+        self.recorder.call(&REDUCE, &[("FUNCTION", number)], &uniform, &bindings, groups)?;
         Ok(result)
     }
 
@@ -95,9 +89,8 @@ impl DeviceArray {
         let result = self.recorder.empty(&self.dims)?;
         let uniform =
             RowsUniform { rows: rows as u32, length: length as u32, ..RowsUniform::default() };
-        let uniform = self.recorder.gpu.uniform(&uniform)?;
-        let bindings = [Binding::from(&uniform), self.binding(), result.binding()];
-        self.recorder.run(&SOFTMAX, &[], &bindings, Groups::of(rows, 1))?;
+        let bindings = [self.binding(), result.binding()];
+        self.recorder.call(&SOFTMAX, &[], &uniform, &bindings, Groups::of(rows, 1))?;
         Ok(result)
     }
 
@@ -117,11 +110,11 @@ impl DeviceArray {
         let [outer_words, length, inner, chosen] =
             [outer, length, inner, indices.len()].map(|n| n as u32);
         let gpu = &self.recorder.gpu;
-        let uniform = gpu.uniform(&SelectUniform { outer: outer_words, length, inner, chosen })?;
+        let uniform = SelectUniform { outer: outer_words, length, inner, chosen };
         let indices = gpu.upload("indices", indices)?;
-        let bindings = [(&uniform).into(), self.binding(), (&indices).into(), result.binding()];
+        let bindings = [self.binding(), (&indices).into(), result.binding()];
         let groups = Groups::of(result.count(), THREADS);
-        self.recorder.run(&SELECT_ROWS, &[], &bindings, groups)?;
+        self.recorder.call(&SELECT_ROWS, &[], &uniform, &bindings, groups)?;
         Ok(result)
     }
 
@@ -138,16 +131,37 @@ impl DeviceArray {
         let from = [dims[rank - 2], dims[rank - 1]];
         dims[rank - 2..].copy_from_slice(&to);
         let result = self.recorder.empty(&dims)?;
-        let uniform = self.recorder.gpu.uniform(&ResizeUniform {
+        let uniform = ResizeUniform {
             input_size: from.map(|n| n as u32),
             output_size: to.map(|n| n as u32),
             planes: (self.count() / (from[0] * from[1])) as u32,
             pad: 0,
-        })?;
-        let bindings = [Binding::from(&uniform), self.binding(), result.binding()];
+        };
+        let bindings = [self.binding(), result.binding()];
         let constants = [("ACTIVATION_KIND", f64::from(activation as u32))];
         let groups = Groups::of(result.count(), THREADS);
-        self.recorder.run(&RESIZE, &constants, &bindings, groups)?;
+        self.recorder.call(&RESIZE, &constants, &uniform, &bindings, groups)?;
         Ok(result)
+    }
+
+    /// Computes the mean of blocks of `s` × `s` pixels of `[…, h, w]`; a remainder at the right
+    /// and the lower edge is left out.
+    ///
+    /// # Errors
+    /// [`GpuError::Argument`] for sides below `s`; errors of the device.
+    pub fn pooled(&self, s: usize) -> Result<Self, GpuError> {
+        let rank = self.dims.len();
+        let (h, w) = match self.dims.as_slice() {
+            &[.., h, w] if s > 0 && h >= s && w >= s => (h / s, w / s),
+            _ => return Err(misfit("pool", format!("sides of at least {s}"), &self.dims)),
+        };
+        let cut = self.narrow(rank - 1, 0, w * s)?.narrow(rank - 2, 0, h * s)?;
+        let planes = cut.count() / (h * s * w * s);
+        let mut dims = self.dims.clone();
+        dims[rank - 2..].copy_from_slice(&[h, w]);
+        cut.reshape(&[planes * h, s, w, s])?
+            .reduced(3, Reduction::Mean)?
+            .reduced(1, Reduction::Mean)?
+            .reshape(&dims)
     }
 }

@@ -137,16 +137,22 @@ impl DeviceArray {
             return Err(misfit(EXPECTATION.name, "[B, D, h, w]".to_owned(), &self.dims));
         };
         let result = self.recorder.empty(&[2, b, 1, h, w])?;
-        let uniform = self.recorder.gpu.uniform(&ExpectationUniform {
+        let uniform = ExpectationUniform {
             pictures: b as u32,
             candidates: d as u32,
             pixels: (h * w) as u32,
             window: window as u32,
             window_alone: u32::from(window_alone),
             ..ExpectationUniform::default()
-        })?;
-        let bindings = [Binding::from(&uniform), self.binding(), result.binding()];
-        self.recorder.run(&EXPECTATION, &[], &bindings, Groups::of(b * h * w, THREADS))?;
+        };
+        let bindings = [self.binding(), result.binding()];
+        self.recorder.call(
+            &EXPECTATION,
+            &[],
+            &uniform,
+            &bindings,
+            Groups::of(b * h * w, THREADS),
+        )?;
         result.halves(&[b, 1, h, w])
     }
 
@@ -170,17 +176,22 @@ impl DeviceArray {
         let result = self.recorder.empty(&[2, b, 1, 4 * h, 4 * w])?;
         let gpu = &self.recorder.gpu;
         let [pictures, height, width] = [b, h, w].map(|n| n as u32);
-        let uniform = gpu.uniform(&ConvexUniform { pictures, height, width, pad: 0 })?;
+        let uniform = ConvexUniform { pictures, height, width, pad: 0 };
         let start = gpu.upload("start", start)?;
         let bindings = [
-            Binding::from(&uniform),
             self.binding(),
             maps[0].binding(),
             maps[1].binding(),
             Binding::from(&start),
             result.binding(),
         ];
-        self.recorder.run(&CONVEX, &[], &bindings, Groups::of(result.count() / 2, THREADS))?;
+        self.recorder.call(
+            &CONVEX,
+            &[],
+            &uniform,
+            &bindings,
+            Groups::of(result.count() / 2, THREADS),
+        )?;
         result.halves(&dims)
     }
 
@@ -212,7 +223,7 @@ impl DeviceArray {
         let gpu = &self.recorder.gpu;
         let (places, factor, offset) = call.colour.unwrap_or_default();
         let [red, green, blue] = places.map(|p| p as u32);
-        let uniform = gpu.uniform(&HeadOutputUniform {
+        let uniform = HeadOutputUniform {
             pictures: b as u32,
             pixels: (h * w) as u32,
             raw: r as u32,
@@ -222,10 +233,9 @@ impl DeviceArray {
             offset,
             confident: u32::from(call.confident),
             pad: 0,
-        })?;
+        };
         let start = gpu.upload("start", call.start)?;
         let bindings = [
-            Binding::from(&uniform),
             self.binding(),
             confidence.binding(),
             rgb.binding(),
@@ -233,7 +243,13 @@ impl DeviceArray {
             rows.binding(),
             opacity.binding(),
         ];
-        self.recorder.run(&HEAD_OUTPUT, &[], &bindings, Groups::of(b * h * w, THREADS))?;
+        self.recorder.call(
+            &HEAD_OUTPUT,
+            &[],
+            &uniform,
+            &bindings,
+            Groups::of(b * h * w, THREADS),
+        )?;
         Ok([rows, opacity])
     }
 
@@ -256,25 +272,18 @@ impl DeviceArray {
         let gpu = &self.recorder.gpu;
         let [scenes, views, height, width] = [b, v, h, w].map(|n| n as u32);
         let CrossCheckCall { least, colour, behind, .. } = call;
-        let uniform = gpu.uniform(&CrossCheckUniform {
-            scenes,
-            views,
-            height,
-            width,
-            least,
-            colour,
-            behind,
-            pad: 0.0,
-        })?;
+        let uniform =
+            CrossCheckUniform { scenes, views, height, width, least, colour, behind, pad: 0.0 };
         let cameras = gpu.upload("cameras", call.cameras)?;
-        let bindings = [
-            Binding::from(&uniform),
-            self.binding(),
-            distances.binding(),
-            Binding::from(&cameras),
-            result.binding(),
-        ];
-        self.recorder.run(&CROSS_CHECK, &[], &bindings, Groups::of(result.count(), THREADS))?;
+        let bindings =
+            [self.binding(), distances.binding(), Binding::from(&cameras), result.binding()];
+        self.recorder.call(
+            &CROSS_CHECK,
+            &[],
+            &uniform,
+            &bindings,
+            Groups::of(result.count(), THREADS),
+        )?;
         Ok(result)
     }
 
@@ -305,7 +314,7 @@ impl DeviceArray {
         let grey = rgb.reduced(1, Reduction::Mean)?.pooled(2)?;
         let rgb = rgb.pooled(4)?;
         let gpu = &self.recorder.gpu;
-        let uniform = gpu.uniform(&RawMatchingUniform {
+        let uniform = RawMatchingUniform {
             rows: rows as u32,
             candidates: d as u32,
             height: h as u32,
@@ -314,16 +323,14 @@ impl DeviceArray {
             variance_floor: call.variance_floor,
             pad0: 0.0,
             pad1: 0.0,
-        })?;
+        };
         let pictures = gpu.upload("pairs of pictures", call.rows)?;
         let warps = gpu.upload("warps", call.warps)?;
         let disparities = gpu.upload("disparities", call.disparities)?;
         let sums = self.recorder.empty(&[rows, d, PLANES, h, w])?;
         let result = self.recorder.empty(&[rows, CHANNELS, d, h, w])?;
         let groups = || Groups::of(rows * d * h * w, THREADS);
-        let uniform = Binding::from(&uniform);
         let bindings = [
-            uniform.clone(),
             grey.binding(),
             rgb.binding(),
             Binding::from(&pictures),
@@ -331,30 +338,9 @@ impl DeviceArray {
             Binding::from(&disparities),
             sums.binding(),
         ];
-        self.recorder.run(&RAW_MATCHING_BLOCKS, &[], &bindings, groups())?;
-        let bindings = [uniform, sums.binding(), result.binding()];
-        self.recorder.run(&RAW_MATCHING_SCORES, &[], &bindings, groups())?;
+        self.recorder.call(&RAW_MATCHING_BLOCKS, &[], &uniform, &bindings, groups())?;
+        let bindings = [sums.binding(), result.binding()];
+        self.recorder.call(&RAW_MATCHING_SCORES, &[], &uniform, &bindings, groups())?;
         Ok(result)
-    }
-
-    /// Computes the mean of blocks of `s` × `s` pixels of `[…, h, w]`; a remainder at the right
-    /// and the lower edge is left out.
-    ///
-    /// # Errors
-    /// [`GpuError::Argument`] for sides below `s`; errors of the device.
-    pub fn pooled(&self, s: usize) -> Result<Self, GpuError> {
-        let rank = self.dims.len();
-        let (h, w) = match self.dims.as_slice() {
-            &[.., h, w] if s > 0 && h >= s && w >= s => (h / s, w / s),
-            _ => return Err(misfit("pool", format!("sides of at least {s}"), &self.dims)),
-        };
-        let cut = self.narrow(rank - 1, 0, w * s)?.narrow(rank - 2, 0, h * s)?;
-        let planes = cut.count() / (h * s * w * s);
-        let mut dims = self.dims.clone();
-        dims[rank - 2..].copy_from_slice(&[h, w]);
-        cut.reshape(&[planes * h, s, w, s])?
-            .reduced(3, Reduction::Mean)?
-            .reduced(1, Reduction::Mean)?
-            .reshape(&dims)
     }
 }

@@ -39,9 +39,8 @@ impl DeviceArray {
         };
         let result = self.recorder.empty(&[n, SPLAT_STRIDE])?;
         let uniform = AttributesUniform { parents: n as u32, ..call };
-        let uniform = self.recorder.gpu.uniform(&uniform)?;
-        let bindings = [Binding::from(&uniform), self.binding(), result.binding()];
-        self.recorder.run(&ATTRIBUTES, &[], &bindings, Groups::of(n, THREADS))?;
+        let bindings = [self.binding(), result.binding()];
+        self.recorder.call(&ATTRIBUTES, &[], &uniform, &bindings, Groups::of(n, THREADS))?;
         Ok(result)
     }
 
@@ -68,15 +67,8 @@ impl DeviceArray {
             tolerance,
             ..OcclusionUniform::default()
         };
-        let uniform = self.recorder.gpu.uniform(&uniform)?;
-        let bindings = [
-            Binding::from(&uniform),
-            self.binding(),
-            z.binding(),
-            surfaces.binding(),
-            result.binding(),
-        ];
-        self.recorder.run(&OCCLUSION, &[], &bindings, Groups::of(n * v, THREADS))?;
+        let bindings = [self.binding(), z.binding(), surfaces.binding(), result.binding()];
+        self.recorder.call(&OCCLUSION, &[], &uniform, &bindings, Groups::of(n * v, THREADS))?;
         Ok(result)
     }
 
@@ -92,18 +84,16 @@ impl DeviceArray {
         let gpu = &self.recorder.gpu;
         let mut uniform = args.uniform(&(0..n));
         uniform.cells = (self.count() / gather.stride.max(1)) as u32;
-        let uniform = gpu.uniform(&uniform)?;
         let levels = gpu.upload("feature levels", &args.levels())?;
         let result = self.recorder.empty(&[n, gather.dim])?;
         let bindings = [
-            Binding::from(&uniform),
             self.binding(),
             query.binding(),
             points.binding(),
             Binding::from(&levels),
             result.binding(),
         ];
-        self.recorder.run(&ATTENTION_GATHER, &[], &bindings, Groups::of(n, 1))?;
+        self.recorder.call(&ATTENTION_GATHER, &[], &uniform, &bindings, Groups::of(n, 1))?;
         Ok(result)
     }
 
@@ -116,19 +106,18 @@ impl DeviceArray {
         let n = args.check_lengths([self.count(), parents.count()])?;
         let (k, gain_stride) = (args.rules.children(), args.rules.gain_channels());
         let gpu = &self.recorder.gpu;
-        let uniform = gpu.uniform(&args.uniform(&(0..n)))?;
+        let uniform = args.uniform(&(0..n));
         let cameras = gpu.upload("context cameras", &args.cameras())?;
         let rows = self.recorder.empty(&[n * k, SPLAT_STRIDE])?;
         let gains = self.recorder.empty(&[n * k, gain_stride])?;
         let bindings = [
-            Binding::from(&uniform),
             self.binding(),
             parents.binding(),
             Binding::from(&cameras),
             rows.binding(),
             gains.binding(),
         ];
-        self.recorder.run(&SPGR, &[], &bindings, Groups::of(n, THREADS))?;
+        self.recorder.call(&SPGR, &[], &uniform, &bindings, Groups::of(n, THREADS))?;
         Ok([rows, gains])
     }
 }

@@ -14,7 +14,8 @@ use crate::config::{
 };
 use crate::model::embed::Descriptors;
 use crate::model::geometry::{Frames, ParentChunk};
-use crate::model::mlp::{LayerNorm, Mode, affine, linear, xavier};
+use crate::model::layers::{LayerNorm, xavier};
+use crate::model::mlp::{Mode, affine, linear};
 use crate::ops::Backend;
 use crate::ops::attention_gather::{Drop, Gather, attention_gather_deferred};
 use crate::ops::columns::columns;

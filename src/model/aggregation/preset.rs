@@ -4,7 +4,8 @@
 use super::{Call, StageInput};
 use crate::abi::SampleConvention;
 use crate::config::{Aggregation as Keys, StageNorm};
-use crate::model::mlp::{LayerNorm, affine, linear, xavier};
+use crate::model::layers::{LayerNorm, xavier};
+use crate::model::mlp::{affine, linear};
 use crate::ops::Array;
 use crate::ops::attention_gather::Gather;
 use candle_core::{Result, Tensor};

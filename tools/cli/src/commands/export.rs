@@ -19,7 +19,6 @@ use subsplat::render::{
 pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
     let mut progress = Progress::new();
     let file = render::scene_file(&args.scene)?;
-    let mut cameras: Vec<Camera> = Vec::new();
     let html = args.out.extension().is_some_and(|e| e.eq_ignore_ascii_case("html"));
     if args.cameras.is_some() && !html && args.gaussians.is_none() {
         bail!(
@@ -31,26 +30,21 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
     comments.retain(|comment| !is_own_comment(comment));
     let stored = options_of_comments(&comments);
     let all = splats.len();
-    if html || args.gaussians.is_some() {
-        cameras = match render::cameras_beside(args.cameras.as_deref(), &file)? {
-            Some(all) => all.into_iter().map(|(_, camera)| camera).collect(),
-            None => camera_of_comments(&comments).into_iter().collect(),
-        };
-    }
+    // cameras.json of `run` holds the views, the comment the first photograph.
+    let own = camera_of_comments(&comments);
+    let beside = match html || args.gaussians.is_some() {
+        true => render::cameras_beside(args.cameras.as_deref(), &file)?,
+        false => None,
+    };
+    let beside: Option<Vec<Camera>> =
+        beside.map(|all| all.into_iter().map(|(_, camera)| camera).collect());
     if let Some(density) = args.gaussians {
         let options = stored.unwrap_or_else(|| RasterOptions::new(Convention::Standard));
         let count = density.limit(all, 1, 1).max(1);
+        let cameras: Vec<Camera> = beside.iter().flatten().copied().chain(own).collect();
         splats = progress.stage("merging", |_| {
-            // cameras.json of `run` holds the views, the comment the first photograph.
-            let mut from = cameras.clone();
-            from.extend(camera_of_comments(&comments));
-            Ok::<_, anyhow::Error>(reduce(
-                &splats,
-                &from,
-                &options,
-                count,
-                &mut Renderer::default(),
-            ))
+            let renderer = &mut Renderer::default();
+            Ok::<_, anyhow::Error>(reduce(&splats, &cameras, &options, count, renderer))
         })?;
     }
     // The camera of a comment holds in the axes that the file had.
@@ -78,6 +72,7 @@ pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {
             );
         }
         let title = file.file_stem().unwrap_or_default().to_string_lossy();
+        let cameras = beside.unwrap_or_else(|| own.into_iter().collect());
         let page = Page { splats: &splats, cameras: &cameras, options: &options, title: &title };
         page.write(&args.out, &save)
     })?;

@@ -1,0 +1,323 @@
+//! Uniforms of the kernels of the network ([`crate::gpu`], arrays in device memory).
+
+uniform! {
+    /// Parameters of kernels/elementwise.wgsl.
+    ElementwiseUniform {
+        /// Elements of the result.
+        count: u32,
+        /// Factor, or lower bound.
+        first: f32,
+        /// Summand, or upper bound.
+        second: f32,
+        /// Axes in use.
+        axes: u32,
+        /// Sizes of seven axes, outermost first; unused.
+        sizes: [[u32; 4]; 2],
+        /// Strides of the first array; offset of its first element.
+        left: [[u32; 4]; 2],
+        /// Those of the second array.
+        right: [[u32; 4]; 2],
+        /// Those of the result.
+        result: [[u32; 4]; 2],
+    }
+}
+
+uniform! {
+    /// Parameters of kernels/convolution.wgsl. Sizes are z, y, x.
+    ConvolutionUniform {
+        /// Input channels.
+        channels: u32,
+        /// Output channels.
+        outputs: u32,
+        /// Terms of a sum: channels times the volume of the kernel.
+        terms: u32,
+        /// Pixels of a result.
+        pixels: u32,
+        /// Size of the input; unused.
+        input_size: [u32; 4],
+        /// Size of the result; unused.
+        output_size: [u32; 4],
+        /// Size of the kernel; unused.
+        kernel: [u32; 4],
+        /// Strides; unused.
+        stride: [u32; 4],
+        /// Zeros on either side; 1 if there is a bias.
+        padding: [u32; 4],
+    }
+}
+
+uniform! {
+    /// Parameters of kernels/linear.wgsl.
+    LinearUniform {
+        /// Rows of x.
+        rows: u32,
+        /// Columns of y.
+        outputs: u32,
+        /// Columns of x.
+        terms: u32,
+        /// 1 if there is a bias.
+        has_bias: u32,
+    }
+}
+
+uniform! {
+    /// Parameters of kernels/norm_statistics.wgsl and norm_apply.wgsl.
+    NormUniform {
+        /// Rows.
+        rows: u32,
+        /// Numbers of a row.
+        length: u32,
+        /// Consecutive numbers of one channel.
+        run: u32,
+        /// Rows of one picture.
+        groups: u32,
+        /// Parts of a row.
+        parts: u32,
+        /// 1 if channels have factors and summands.
+        has_affine: u32,
+        /// ε.
+        epsilon: f32,
+        /// Unused.
+        pad: u32,
+    }
+}
+
+uniform! {
+    /// Parameters of kernels/layer_norm.wgsl and softmax.wgsl.
+    RowsUniform {
+        /// Rows.
+        rows: u32,
+        /// Numbers of a row.
+        length: u32,
+        /// ε.
+        epsilon: f32,
+        /// Unused.
+        pad: u32,
+    }
+}
+
+uniform! {
+    /// Parameters of kernels/resize.wgsl. Sizes are height, width.
+    ResizeUniform {
+        /// Size of the input.
+        input_size: [u32; 2],
+        /// Size of the result.
+        output_size: [u32; 2],
+        /// Planes.
+        planes: u32,
+        /// Unused.
+        pad: u32,
+    }
+}
+
+uniform! {
+    /// Parameters of kernels/reduce.wgsl.
+    ReduceUniform {
+        /// Product of the sizes before the axis.
+        outer: u32,
+        /// Size of the axis.
+        length: u32,
+        /// Product of the sizes after it.
+        inner: u32,
+        /// Factor of the result.
+        factor: f32,
+    }
+}
+
+uniform! {
+    /// Parameters of kernels/select_rows.wgsl.
+    SelectUniform {
+        /// Product of the sizes before the axis.
+        outer: u32,
+        /// Size of the axis.
+        length: u32,
+        /// Product of the sizes after it.
+        inner: u32,
+        /// Number of indices.
+        chosen: u32,
+    }
+}
+
+uniform! {
+    /// Parameters of kernels/attention.wgsl.
+    AttentionUniform {
+        /// Rows: windows or heads.
+        rows: u32,
+        /// Queries of a row.
+        queries: u32,
+        /// Keys of a row.
+        keys: u32,
+        /// Width of queries and keys.
+        width: u32,
+        /// Width of values.
+        value_width: u32,
+        /// Windows with labels; 0: no labels.
+        windows: u32,
+        /// Factor of the dot product.
+        scale: f32,
+        /// Term of pairs with different labels.
+        penalty: f32,
+    }
+}
+
+uniform! {
+    /// Parameters of kernels/expectation.wgsl.
+    ExpectationUniform {
+        /// Pictures.
+        pictures: u32,
+        /// Candidates.
+        candidates: u32,
+        /// Pixels of a picture.
+        pixels: u32,
+        /// Half-width of the window, candidates.
+        window: u32,
+        /// 1: the mean is that of the window.
+        window_alone: u32,
+        /// Unused.
+        pad0: u32,
+        /// Unused.
+        pad1: u32,
+        /// Unused.
+        pad2: u32,
+    }
+}
+
+uniform! {
+    /// Parameters of kernels/convex.wgsl.
+    ConvexUniform {
+        /// Pictures.
+        pictures: u32,
+        /// Height of the coarse map.
+        height: u32,
+        /// Width of the coarse map.
+        width: u32,
+        /// Unused.
+        pad: u32,
+    }
+}
+
+uniform! {
+    /// Parameters of kernels/head_output.wgsl.
+    HeadOutputUniform {
+        /// Pictures.
+        pictures: u32,
+        /// Pixels of a picture.
+        pixels: u32,
+        /// Numbers of a raw row.
+        raw: u32,
+        /// 1: rows contain the colour of their pixel.
+        coloured: u32,
+        /// Places of red, green and blue in a row; unused.
+        places: [u32; 4],
+        /// Factor of the colour.
+        factor: f32,
+        /// Summand of the colour.
+        offset: f32,
+        /// 1: opacity depends on the confidence.
+        confident: u32,
+        /// Unused.
+        pad: u32,
+    }
+}
+
+uniform! {
+    /// Parameters of kernels/cross_check.wgsl.
+    CrossCheckUniform {
+        /// Scenes.
+        scenes: u32,
+        /// Views of a scene.
+        views: u32,
+        /// Height, px.
+        height: u32,
+        /// Width, px.
+        width: u32,
+        /// Factor of a pixel that is inconsistent everywhere.
+        least: f32,
+        /// Difference of colour from which inconsistency is 1.
+        colour: f32,
+        /// Share of z by which a hidden point lies behind a surface.
+        behind: f32,
+        /// Unused.
+        pad: f32,
+    }
+}
+
+uniform! {
+    /// Parameters of kernels/raw_matching_blocks.wgsl and raw_matching_scores.wgsl.
+    RawMatchingUniform {
+        /// Pairs of reference and source.
+        rows: u32,
+        /// Candidates.
+        candidates: u32,
+        /// Height at quarter resolution, px.
+        height: u32,
+        /// Width at quarter resolution, px.
+        width: u32,
+        /// Smallest z of a source point, as a share of the reference depth.
+        z_min: f32,
+        /// Term of the variances.
+        variance_floor: f32,
+        /// Unused.
+        pad0: f32,
+        /// Unused.
+        pad1: f32,
+    }
+}
+
+uniform! {
+    /// Parameters of kernels/attributes.wgsl.
+    AttributesUniform {
+        /// Rows of R, world from camera, of the frame; its position.
+        frame: [[f32; 4]; 3],
+        /// Rows of the matrix that turns quaternions into the frame.
+        turn: [[f32; 4]; 4],
+        /// Rows of R of the source view; its position.
+        source: [[f32; 4]; 3],
+        /// Parents.
+        parents: u32,
+        /// 1: attributes are those of the frame.
+        framed: u32,
+        /// 1: positions are slopes and ln z.
+        ray: u32,
+        /// 1: scales are logarithms of pixels.
+        log_px: u32,
+        /// 1: opacities are logits.
+        logit: u32,
+        /// ln of the focal length, px.
+        log_focal: f32,
+        /// Smallest opacity of a logit.
+        logit_low: f32,
+        /// Smallest z, world units.
+        z_min: f32,
+        /// Bound of slopes.
+        slope_max: f32,
+        /// Smallest σ, world units.
+        scale_min: f32,
+        /// Unused.
+        pad0: u32,
+        /// Unused.
+        pad1: u32,
+    }
+}
+
+uniform! {
+    /// Parameters of kernels/occlusion.wgsl.
+    OcclusionUniform {
+        /// Points.
+        points: u32,
+        /// Views.
+        views: u32,
+        /// Height of the surfaces, px.
+        height: u32,
+        /// Width of the surfaces, px.
+        width: u32,
+        /// Tolerance and softness, shares of z.
+        tolerance: f32,
+        /// Unused.
+        pad0: u32,
+        /// Unused.
+        pad1: u32,
+        /// Unused.
+        pad2: u32,
+    }
+}
