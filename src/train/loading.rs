@@ -1,6 +1,7 @@
 //! Threads that make examples ahead of the training step.
 
 use super::augment::Augmentation;
+use super::ranks::Division;
 use super::source::{Example, Source};
 use super::{Error, Result};
 use std::collections::BTreeMap;
@@ -23,6 +24,8 @@ pub struct LoaderOptions {
     pub workers: usize,
     /// Number of examples made ahead.
     pub ahead: usize,
+    /// The examples that this process makes; it passes over the others.
+    pub(super) division: Division,
 }
 
 /// A queue of examples in the order of their indices, filled by separate threads.
@@ -48,7 +51,7 @@ struct Queue {
     /// First index that the training step has not taken.
     next_to_take: u64,
     /// Finished examples by index.
-    done: BTreeMap<u64, Result<Example>>,
+    done: BTreeMap<u64, Result<Option<Example>>>,
 }
 
 impl Shared {
@@ -66,7 +69,8 @@ impl Shared {
     fn work(&self) {
         loop {
             let mut queue = self.lock();
-            while queue.next_to_start >= queue.next_to_take + self.options.ahead.max(1) as u64
+            let ahead = self.options.ahead.max(1) * self.options.division.count();
+            while queue.next_to_start >= queue.next_to_take + ahead as u64
                 && !self.stop.load(Ordering::Relaxed)
             {
                 queue = self.wait(queue);
@@ -77,8 +81,9 @@ impl Shared {
             let index = queue.next_to_start;
             queue.next_to_start += 1;
             drop(queue);
-            let LoaderOptions { augmentation, seed, .. } = &self.options;
-            let made = self.source.example(index).map(|e| augmentation.apply(&e, *seed, index));
+            let LoaderOptions { augmentation, seed, division, .. } = &self.options;
+            let make = || self.source.example(index).map(|e| augmentation.apply(&e, *seed, index));
+            let made = division.has(index).then(make).transpose();
             self.lock().done.insert(index, made);
             self.changed.notify_all();
         }
@@ -121,11 +126,11 @@ impl Loader {
         self.next
     }
 
-    /// Waits for the next example and returns it.
+    /// Waits for the next example and returns it; `None` for an example of another process.
     ///
     /// # Errors
     /// An error of the source; loading threads that have ended.
-    pub fn take(&mut self) -> Result<Example> {
+    pub fn take(&mut self) -> Result<Option<Example>> {
         let mut queue = self.shared.lock();
         loop {
             if let Some(example) = queue.done.remove(&self.next) {

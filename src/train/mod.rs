@@ -4,6 +4,7 @@
 //! examples and their order derive from seeds, and every kernel gives the same bytes for any number
 //! of threads. A checkpoint therefore holds the parameters, the optimizer's state and the step. A
 //! resumed training takes the same steps as an uninterrupted one (`tools/cli/tests/cli/train.rs`).
+//! Several processes that share a training take these steps too ([`ranks`]).
 
 pub mod augment;
 pub mod checkpoint;
@@ -14,6 +15,7 @@ pub mod loading;
 pub mod loss;
 pub mod optimizer;
 pub mod photos;
+pub mod ranks;
 pub mod run;
 pub mod schedule;
 pub mod source;

@@ -8,6 +8,7 @@ use candle_core::{Device, Result, Tensor, Var, bail};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use std::hash::Hasher;
 use std::ops::Range;
 
 /// Options of the optimizer. Defaults: PyTorch's AdamW, clipping at 1, moving average 0.997.
@@ -99,6 +100,22 @@ impl Gradients {
         self.touched.iter_mut().zip(&other.touched).for_each(|(a, b)| *a |= b);
     }
 
+    /// Returns the summed gradients of all parameters, and which parameters received one.
+    pub(super) fn parts(&self) -> (&[f32], &[bool]) {
+        (&self.sum, &self.touched)
+    }
+
+    /// The gradients with these [`Gradients::parts`]; `None` where their lengths are not those of
+    /// `optimizer`.
+    pub(super) fn from_parts(
+        sum: Vec<f32>,
+        touched: Vec<bool>,
+        optimizer: &Optimizer,
+    ) -> Option<Self> {
+        let fits = sum.len() == optimizer.values.len() && touched.len() == optimizer.slots.len();
+        fits.then_some(Self { sum, touched })
+    }
+
     /// Sets all gradients to zero.
     pub fn clear(&mut self) {
         self.sum.fill(0.0);
@@ -157,6 +174,11 @@ impl Optimizer {
     /// Returns the number of parameters.
     pub fn parameters(&self) -> usize {
         self.values.len()
+    }
+
+    /// Adds the bits of all parameters to a hash.
+    pub(super) fn hash_values(&self, hasher: &mut impl Hasher) {
+        self.values.iter().for_each(|v| hasher.write_u32(v.to_bits()));
     }
 
     /// Returns zero gradients.

@@ -5,7 +5,8 @@ use super::config::{Start, TrainConfig};
 use super::files::Pictures;
 use super::loading::{Loader, LoaderOptions};
 use super::optimizer::Optimizer;
-use super::source::{Replay, Source};
+use super::ranks::{Division, Exchange, Ranks};
+use super::source::{Example, Replay, Source};
 use super::step::{Learner, Seconds, StepScale, Terms};
 use super::validate::{self, Found, Split, Validator};
 use super::{Error, Result};
@@ -102,6 +103,11 @@ pub struct Training {
     resumed: Option<PathBuf>,
     untrained: usize,
     warnings: Vec<String>,
+    /// The other processes of the training; `None` for one process alone.
+    exchange: Option<Exchange>,
+    /// Wish of this process to end after the step.
+    end: bool,
+    rank: usize,
     /// Lock of the folder against other trainings.
     _lock: File,
 }
@@ -115,9 +121,12 @@ fn source(config: &TrainConfig) -> Result<Arc<dyn Source>> {
     })
 }
 
-/// Locks the folder while the returned file is open.
-fn lock_folder(folder: &Path) -> Result<File> {
-    let path = folder.join("lock");
+/// Locks the folder for one rank while the returned file is open.
+fn lock_folder(folder: &Path, rank: usize) -> Result<File> {
+    let path = match rank {
+        0 => folder.join("lock"),
+        _ => folder.join(format!("lock-{rank}")),
+    };
     let file = File::options().create(true).append(true).open(&path);
     let file = file.map_err(|e| io::Error::io(&path, e))?;
     match file.try_lock() {
@@ -159,7 +168,16 @@ impl Training {
     /// An invalid configuration; weights or a checkpoint that do not fit; a folder that cannot be
     /// created or is in use.
     pub fn open(config: &TrainConfig, folder: &Path) -> Result<Self> {
-        Self::with_source(config, folder, source(config)?)
+        Self::open_rank(config, folder, Ranks::single())
+    }
+
+    /// [`Training::open`] as one of several processes that share the training. All of them receive
+    /// the same configuration and the same folder, and begin with the same checkpoint.
+    ///
+    /// # Errors
+    /// As [`Training::open`]; a rank out of range; more ranks than groups of scenes in a step.
+    pub fn open_rank(config: &TrainConfig, folder: &Path, ranks: Ranks) -> Result<Self> {
+        Self::with(config, folder, source(config)?, ranks)
     }
 
     /// Starts or continues a training with the examples of `source`.
@@ -171,9 +189,19 @@ impl Training {
         folder: &Path,
         source: Arc<dyn Source>,
     ) -> Result<Self> {
+        Self::with(config, folder, source, Ranks::single())
+    }
+
+    fn with(
+        config: &TrainConfig,
+        folder: &Path,
+        source: Arc<dyn Source>,
+        ranks: Ranks,
+    ) -> Result<Self> {
         config.check()?;
+        ranks.check(config)?;
         std::fs::create_dir_all(folder).map_err(|e| io::Error::io(folder, e))?;
-        let lock = lock_folder(folder)?;
+        let lock = lock_folder(folder, ranks.rank)?;
         let warnings = source.warnings();
         let newest = checkpoint::steps(folder).last().map(|s| checkpoint::path(folder, *s));
         let weights = match newest {
@@ -199,6 +227,11 @@ impl Training {
             seed: config.seed,
             workers: data.workers,
             ahead: data.ahead,
+            division: Division::of(config, ranks),
+        };
+        let exchange = match ranks.count {
+            1 => None,
+            _ => Some(Exchange::open(folder, config, ranks)?),
         };
         let loader = Loader::start(source, options, progress.examples)?;
         Ok(Self {
@@ -211,6 +244,9 @@ impl Training {
             resumed: newest,
             untrained,
             warnings,
+            exchange,
+            end: false,
+            rank: ranks.rank,
             _lock: lock,
         })
     }
@@ -230,7 +266,7 @@ impl Training {
     /// Returns `None` if loss or gradient were not finite; the weights are then unchanged.
     ///
     /// # Errors
-    /// An error of the source or the network; too many consecutive steps that were not finite.
+    /// An error of the source or the network; another rank whose gradients are missing; too many consecutive steps that were not finite.
     pub fn step(&mut self) -> Result<Option<StepReport>> {
         let begin = Instant::now();
         let config = &self.config;
@@ -238,20 +274,48 @@ impl Training {
         let mut seconds = Seconds::default();
         let mut gradients = self.optimizer.gradients();
         let mut terms = Terms::default();
-        let share = 1.0 / config.examples_per_step() as f64;
-        for _ in 0..config.accumulate {
+        let scale = StepScale { share: 1.0 / config.examples_per_step() as f64, step };
+        if let Some(exchange) = &mut self.exchange {
+            exchange.begin(step, &self.optimizer);
+        }
+        for round in 0..config.accumulate {
             let start = Instant::now();
             let examples =
                 (0..config.batch).map(|_| self.loader.take()).collect::<Result<Vec<_>>>()?;
             seconds.data += start.elapsed().as_secs_f64();
-            let found = self.learner.accumulate(
-                &examples,
-                StepScale { share, step },
-                &self.optimizer,
-                &mut gradients,
-                &mut seconds,
-            )?;
-            terms.add(&found, 1.0 / config.accumulate as f64);
+            // A group has one rank, so the examples of a group are all here or all elsewhere.
+            let groups: Vec<Vec<&Example>> = examples
+                .chunks(config.together.max(1))
+                .map(|g| g.iter().flatten().collect())
+                .collect();
+            let own: Vec<Vec<&Example>> =
+                groups.iter().filter(|group| !group.is_empty()).cloned().collect();
+            let sums = self.learner.group_sums(&own, scale, &self.optimizer)?;
+            let number = |group: usize| round * groups.len() + group;
+            if let Some(exchange) = &mut self.exchange {
+                let here = (0..groups.len()).filter(|group| !groups[*group].is_empty());
+                for (group, sum) in here.zip(&sums) {
+                    exchange.publish(number(group), sum, self.end)?;
+                }
+            }
+            let (mut sums, mut of_round) = (sums.into_iter(), Terms::default());
+            // In the order of the groups: the sums do not depend on their processes.
+            for (group, chunk) in examples.chunks(config.together.max(1)).enumerate() {
+                let own = if groups[group].is_empty() { None } else { sums.next() };
+                let sum = match (own, &mut self.exchange) {
+                    (Some(sum), _) => sum,
+                    (None, Some(exchange)) => {
+                        let all = config.accumulate * groups.len();
+                        exchange.receive(number(group), all, &self.optimizer)?
+                    }
+                    (None, None) => {
+                        return Err(Error::value("step", "a result of every scene", "none"));
+                    }
+                };
+                let share = chunk.len() as f64 / examples.len() as f64;
+                sum.add_to(&mut gradients, &mut of_round, &mut seconds, share);
+            }
+            terms.add(&of_round, 1.0 / config.accumulate as f64);
         }
         let start = Instant::now();
         let norm = gradients.norm();
@@ -309,41 +373,67 @@ impl Training {
             untrained: self.untrained,
             warnings: self.warnings.clone(),
         });
-        let mut log = Log::open(&self.folder, self.progress.step)?;
+        let mut log = match self.rank {
+            0 => Some(Log::open(&self.folder, self.progress.step)?),
+            _ => None,
+        };
         let begin = Instant::now();
         let minutes = |since: Instant| since.elapsed().as_secs_f64() / 60.0;
         let (mut saved, mut validated) = (Instant::now(), Instant::now());
         let mut done = 0;
-        while self.progress.step < self.config.steps
-            && limits.steps.is_none_or(|n| done < n)
-            && limits.minutes.is_none_or(|m| minutes(begin) < m)
-            && !limits.stopped()
-        {
-            match self.step()? {
+        let reached = |done: u64| {
+            limits.steps.is_some_and(|n| done >= n)
+                || limits.minutes.is_some_and(|m| minutes(begin) >= m)
+                || limits.stopped()
+        };
+        loop {
+            // The ranks end together: each knows after a step whether one of them wished it.
+            let ends = match &self.exchange {
+                Some(exchange) => exchange.ends() || limits.steps == Some(0),
+                None => reached(done),
+            };
+            if ends || self.progress.step >= self.config.steps {
+                break;
+            }
+            self.end = reached(done + 1);
+            let taken = self.step();
+            if taken.is_err() && self.exchange.is_some() && log.is_some() && done > 0 {
+                // Another rank is missing; the steps so far are complete.
+                report_event(&Event::Saved(self.save()?));
+            }
+            match taken? {
                 Some(report) => {
-                    log.step(&report, self.progress.seconds)?;
+                    if let Some(log) = &mut log {
+                        log.step(&report, self.progress.seconds)?;
+                    }
                     report_event(&Event::Step(report));
                 }
                 None => report_event(&Event::Skipped { step: self.progress.step }),
             }
             done += 1;
+            let Some(log) = &mut log else { continue };
             if minutes(saved) >= self.config.checkpoint.minutes {
                 report_event(&Event::Saved(self.save()?));
                 saved = Instant::now();
             }
             if minutes(validated) >= self.config.validate.minutes && !limits.stopped() {
-                self.validate(validator, &mut log, report_event)?;
+                self.validate(validator, log, report_event)?;
                 validated = Instant::now();
             }
         }
-        if done > 0 {
-            report_event(&Event::Saved(self.save()?));
-            if !limits.stopped() {
-                self.validate(validator, &mut log, report_event)?;
+        if let Some(log) = &mut log {
+            if done > 0 {
+                report_event(&Event::Saved(self.save()?));
+                if !limits.stopped() {
+                    self.validate(validator, log, report_event)?;
+                }
+            } else if self.resumed.is_some() {
+                // The training may have stopped between its checkpoint and its weights.
+                self.save_weights()?;
             }
-        } else if self.resumed.is_some() {
-            // The training may have stopped between its checkpoint and its weights.
-            self.save_weights()?;
+        }
+        if let Some(exchange) = &mut self.exchange {
+            exchange.close();
         }
         Ok(())
     }

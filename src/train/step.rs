@@ -54,6 +54,21 @@ impl Terms {
         -10.0 * self.mse.log10()
     }
 
+    /// Number of the terms.
+    pub(super) const COUNT: usize = 7;
+
+    /// Returns the terms in the order of the fields.
+    pub(super) fn to_array(self) -> [f64; Self::COUNT] {
+        let Self { loss, mse, dssim, lpips, cross_entropy, disparity, confidence } = self;
+        [loss, mse, dssim, lpips, cross_entropy, disparity, confidence]
+    }
+
+    /// Inverse of [`Terms::to_array`].
+    pub(super) fn from_array(values: [f64; Self::COUNT]) -> Self {
+        let [loss, mse, dssim, lpips, cross_entropy, disparity, confidence] = values;
+        Self { loss, mse, dssim, lpips, cross_entropy, disparity, confidence }
+    }
+
     /// Adds `share` times the terms of `other`.
     pub fn add(&mut self, other: &Self, share: f64) {
         self.loss += share * other.loss;
@@ -143,8 +158,32 @@ struct EncodedScene<'a> {
     example: &'a Example,
 }
 
-/// Results of one group of scenes.
-type GroupResult = Result<(Gradients, Terms, Seconds)>;
+/// Results of one group of scenes that pass through the backbone together.
+pub(super) struct GroupSum {
+    /// Gradients of the group's share of the loss.
+    pub gradients: Gradients,
+    /// Means over the group's scenes.
+    pub terms: Terms,
+    /// Seconds of this process.
+    pub seconds: Seconds,
+}
+
+impl GroupSum {
+    /// Adds the group to the sums of a step. `share` is its share of the batch's scenes.
+    pub(super) fn add_to(
+        &self,
+        gradients: &mut Gradients,
+        terms: &mut Terms,
+        seconds: &mut Seconds,
+        share: f64,
+    ) {
+        let start = Instant::now();
+        gradients.add(&self.gradients);
+        seconds.add(&self.seconds);
+        seconds.optimizer += start.elapsed().as_secs_f64();
+        terms.add(&self.terms, share);
+    }
+}
 
 /// Stacks the context views of `examples` as the network's input.
 ///
@@ -226,8 +265,27 @@ impl Learner {
     ) -> Result<Terms> {
         let groups: Vec<Vec<&Example>> =
             examples.chunks(self.config.together.max(1)).map(|g| g.iter().collect()).collect();
+        let mut terms = Terms::default();
+        // In the order of the groups: the sums do not depend on the number of groups in parallel.
+        for (group, sum) in groups.iter().zip(self.group_sums(&groups, scale, optimizer)?) {
+            let share = group.len() as f64 / examples.len() as f64;
+            sum.add_to(gradients, &mut terms, seconds, share);
+        }
+        Ok(terms)
+    }
+
+    /// Results of `groups` of scenes, in their order.
+    ///
+    /// # Errors
+    /// Those of [`Learner::accumulate`].
+    pub(super) fn group_sums(
+        &self,
+        groups: &[Vec<&Example>],
+        scale: StepScale,
+        optimizer: &Optimizer,
+    ) -> Result<Vec<GroupSum>> {
         let next = AtomicUsize::new(0);
-        let found: Vec<Mutex<Option<GroupResult>>> =
+        let found: Vec<Mutex<Option<Result<GroupSum>>>> =
             groups.iter().map(|_| Mutex::new(None)).collect();
         let work = || {
             while let Some(i) =
@@ -242,23 +300,20 @@ impl Learner {
                 scope.spawn(|| pool.install(work));
             }
         });
-        // In the order of the groups: the sums do not depend on the number of groups in parallel.
-        let mut terms = Terms::default();
-        for (group, one) in groups.iter().zip(found) {
+        let sum = |one: Mutex<Option<Result<GroupSum>>>| {
             let one = one.into_inner().unwrap_or_else(PoisonError::into_inner);
-            let missing = || Error::value("step", "a result of every scene", "none");
-            let (found, group_terms, group_seconds) = one.ok_or_else(missing)??;
-            let start = Instant::now();
-            gradients.add(&found);
-            seconds.add(&group_seconds);
-            seconds.optimizer += start.elapsed().as_secs_f64();
-            terms.add(&group_terms, group.len() as f64 / examples.len() as f64);
-        }
-        Ok(terms)
+            one.ok_or_else(|| Error::value("step", "a result of every scene", "none"))?
+        };
+        found.into_iter().map(sum).collect()
     }
 
     /// Computes gradients and terms of scenes that pass through the backbone together.
-    fn group(&self, group: &[&Example], scale: StepScale, optimizer: &Optimizer) -> GroupResult {
+    fn group(
+        &self,
+        group: &[&Example],
+        scale: StepScale,
+        optimizer: &Optimizer,
+    ) -> Result<GroupSum> {
         let mut seconds = Seconds::default();
         let mut gradients = optimizer.gradients();
         let views = views_of(group)?;
@@ -275,7 +330,7 @@ impl Learner {
         let start = Instant::now();
         optimizer.collect(&store, &mut gradients)?;
         seconds.optimizer += start.elapsed().as_secs_f64();
-        Ok((gradients, terms, seconds))
+        Ok(GroupSum { gradients, terms, seconds })
     }
 
     /// Computes the loss of the depth phase.

@@ -93,7 +93,7 @@ pub struct EvalArgs {
     pub limit: Option<usize>,
     /// Only part I of N equal parts of the cases, I from 0: N processes share an evaluation. The lines
     /// of their targets.csv, one after the other, are those of one process.
-    #[arg(long, value_name = "I/N", value_parser = part)]
+    #[arg(long, value_name = "I/N", value_parser = values::part)]
     pub shard: Option<(usize, usize)>,
     /// Principal point after a crop (default: mvsplat for chunks with the re10k backbone, else
     /// exact).
@@ -123,13 +123,6 @@ pub enum LrFromArg {
     HrCrop,
     /// The photograph, resized and cropped independently, as in MVSplat.
     Independent,
-}
-
-/// Parses a part of several: `0/4`.
-fn part(text: &str) -> Result<(usize, usize), String> {
-    let numbers = text.split_once('/').and_then(|(i, n)| Some((i.parse().ok()?, n.parse().ok()?)));
-    let inside = |(i, n): &(usize, usize)| i < n;
-    numbers.filter(inside).ok_or_else(|| format!("expected I/N with I from 0 to N-1, got `{text}`"))
 }
 
 /// Parses the name of a disturbance.

@@ -14,6 +14,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 use subsplat::train::TrainConfig;
+use subsplat::train::ranks::Ranks;
 use subsplat::train::run::{Event, Limits, StepReport, Training};
 use subsplat::train::step::Seconds;
 use subsplat::train::validate::{Found, Validator};
@@ -35,14 +36,17 @@ pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
     let config = TrainConfig::load(&args.config)?;
     let stop = stop_on_interrupt()?;
     let limits = Limits { minutes: args.minutes, steps: args.steps, stop: Some(&stop) };
-    let mut training = Training::open(&config, &args.out)?;
+    let ranks = args.rank.map_or(Ranks::single(), |(rank, count)| Ranks::new(rank, count));
+    let mut training = Training::open_rank(&config, &args.out, ranks)?;
     let mut watch = Watch::new(&config, limits);
-    let mut board = Board::create(&args.out)?;
+    // Rank 0 keeps the records of a shared training.
+    let first = ranks.rank == 0;
+    let mut board = if first { Some(Board::create(&args.out)?) } else { None };
     let mut unwritten = None;
     let validator = Validator::new(&config, args.validate.as_deref())?;
     let outcome = training.run(limits, &validator, &mut |event| {
         watch.handle(event);
-        if unwritten.is_none() {
+        if let (None, Some(board)) = (&unwritten, &mut board) {
             unwritten = board.record(event).err();
         }
     });
@@ -53,7 +57,7 @@ pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
     }
     let progress = training.progress();
     // The file is absent before the first checkpoint.
-    let weights = Some(args.out.join("weights.safetensors")).filter(|file| file.is_file());
+    let weights = Some(args.out.join("weights.safetensors")).filter(|file| first && file.is_file());
     let saved = weights.as_ref().map(|file| format!("; weights in {}", file.display()));
     let (done, steps) = (progress.step, config.steps);
     let stopped = stop.load(Ordering::Relaxed);

@@ -176,6 +176,13 @@ pub fn depth_conflict(near: Option<f32>, far: Option<f32>) -> Option<String> {
     (near >= far).then(|| format!("--near {near}: expected less than --far {far}"))
 }
 
+/// Parses a part of several: `0/4`.
+pub fn part(text: &str) -> Result<(usize, usize), String> {
+    let numbers = text.split_once('/').and_then(|(i, n)| Some((i.parse().ok()?, n.parse().ok()?)));
+    let inside = |(i, n): &(usize, usize)| i < n;
+    numbers.filter(inside).ok_or_else(|| format!("expected I/N with I from 0 to N-1, got `{text}`"))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
