@@ -3,6 +3,7 @@
 
 use crate::device::DeviceChoice;
 use crate::gpu::error::GpuError;
+use crate::gpu::wait;
 use std::fmt;
 use wgpu::DeviceType;
 
@@ -11,7 +12,7 @@ use wgpu::DeviceType;
 pub struct AdapterSummary {
     /// Name that the driver reports.
     pub name: String,
-    /// Graphics API: Vulkan, Metal or Dx12.
+    /// Graphics API: Vulkan, Metal, Dx12 or BrowserWebGpu.
     pub backend: String,
     /// Driver name and version.
     pub driver: String,
@@ -56,7 +57,8 @@ pub fn instance() -> wgpu::Instance {
 }
 
 fn enumerate(instance: &wgpu::Instance) -> Vec<wgpu::Adapter> {
-    let mut all = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::PRIMARY));
+    let found = wait::block_on(instance.enumerate_adapters(wgpu::Backends::PRIMARY));
+    let mut all = found.unwrap_or_default();
     all.sort_by_key(|a| rank(a.get_info().device_type));
     all
 }
@@ -86,7 +88,7 @@ pub fn choose(choice: &DeviceChoice, found: &[AdapterSummary]) -> Result<Option<
         }
     };
     let listed = || match found {
-        [] => "no adapter (is a Vulkan, Metal or DX12 driver installed?)".to_owned(),
+        [] => "no adapter (expected a driver for Vulkan, Metal or DX12, or WebGPU)".to_owned(),
         _ => found.iter().map(AdapterSummary::to_string).collect::<Vec<_>>().join("; "),
     };
     match index {

@@ -9,6 +9,7 @@ use crate::gpu::adapter::{AdapterSummary, find};
 use crate::gpu::buffers::Pool;
 use crate::gpu::error::GpuError;
 use crate::gpu::pipelines::Pipelines;
+use crate::gpu::wait::{self, Scopes};
 use std::fmt;
 use std::sync::atomic::AtomicUsize;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
@@ -84,10 +85,9 @@ impl Gpu {
             required_limits: limits_of(adapter),
             ..wgpu::DeviceDescriptor::default()
         };
-        let (device, queue) =
-            pollster::block_on(adapter.request_device(&descriptor)).map_err(|e| {
-                GpuError::Device { adapter: summary.to_string(), reason: e.to_string() }
-            })?;
+        let refused = |reason| GpuError::Device { adapter: summary.to_string(), reason };
+        let opened = wait::block_on(adapter.request_device(&descriptor)).map_err(refused)?;
+        let (device, queue) = opened.map_err(|e| refused(e.to_string()))?;
         let health = Arc::new(Health::default());
         let stray = health.clone();
         // wgpu's own handler panics.
@@ -195,32 +195,8 @@ impl Gpu {
 }
 
 /// Joins the lines of wgpu's message and its causes.
-fn single_line(error: &wgpu::Error) -> String {
+pub(super) fn single_line(error: &wgpu::Error) -> String {
     let text = error.to_string();
     let lines = text.lines().map(str::trim).filter(|l| !l.is_empty() && *l != "Caused by:");
     lines.collect::<Vec<_>>().join(": ")
-}
-
-/// Error scopes around calls to a device.
-pub(crate) struct Scopes([wgpu::ErrorScopeGuard; 3]);
-
-impl Scopes {
-    pub(crate) fn open(device: &wgpu::Device) -> Self {
-        use wgpu::ErrorFilter::{Internal, OutOfMemory, Validation};
-        Self([Internal, Validation, OutOfMemory].map(|filter| device.push_error_scope(filter)))
-    }
-
-    pub(crate) fn close(self, operation: &str) -> Result<(), GpuError> {
-        let operation = operation.to_owned();
-        let [internal, validation, memory] = self.0;
-        // Scopes form a stack: the last one opened is popped first.
-        let memory = pollster::block_on(memory.pop());
-        let validation = pollster::block_on(validation.pop());
-        let internal = pollster::block_on(internal.pop());
-        match (memory, validation.or(internal)) {
-            (Some(_), _) => Err(GpuError::OutOfMemory { allocation: operation }),
-            (None, Some(e)) => Err(GpuError::Refused { operation, reason: single_line(&e) }),
-            (None, None) => Ok(()),
-        }
-    }
 }
