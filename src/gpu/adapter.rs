@@ -23,7 +23,8 @@ pub struct AdapterSummary {
 impl AdapterSummary {
     pub(crate) fn of(info: &wgpu::AdapterInfo) -> Self {
         Self {
-            name: info.name.clone(),
+            // Browsers may conceal the name.
+            name: if info.name.is_empty() { "adapter".to_owned() } else { info.name.clone() },
             backend: format!("{:?}", info.backend),
             driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
             software: info.device_type == DeviceType::Cpu,
@@ -33,8 +34,11 @@ impl AdapterSummary {
 
 impl fmt::Display for AdapterSummary {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        write!(f, "{} ({}, {})", self.name, self.backend, self.driver)?;
-        if self.software { f.write_str(", software") } else { Ok(()) }
+        write!(f, "{} ({}", self.name, self.backend)?;
+        if !self.driver.is_empty() {
+            write!(f, ", {}", self.driver)?;
+        }
+        f.write_str(if self.software { "), software" } else { ")" })
     }
 }
 

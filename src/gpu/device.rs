@@ -49,7 +49,7 @@ pub struct Gpu {
 #[derive(Debug, Default)]
 struct Health {
     lost: OnceLock<String>,
-    /// The last error outside every error scope.
+    /// The first error outside every error scope; later ones follow from it.
     stray: Mutex<Option<String>>,
 }
 
@@ -87,12 +87,13 @@ impl Gpu {
         };
         let refused = |reason| GpuError::Device { adapter: summary.to_string(), reason };
         let opened = wait::block_on(adapter.request_device(&descriptor)).map_err(refused)?;
-        let (device, queue) = opened.map_err(|e| refused(e.to_string()))?;
+        let (device, queue) = opened.map_err(|e| refused(single_line(&e)))?;
         let health = Arc::new(Health::default());
         let stray = health.clone();
         // wgpu's own handler panics.
         device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| {
-            stray.stray.lock().unwrap_or_else(PoisonError::into_inner).replace(single_line(&e));
+            let mut first = stray.stray.lock().unwrap_or_else(PoisonError::into_inner);
+            first.get_or_insert_with(|| single_line(&e));
         }));
         Ok(Self::assemble(device, queue, summary, health))
     }
@@ -113,7 +114,7 @@ impl Gpu {
         let lost = health.clone();
         device.set_device_lost_callback(move |reason, message| {
             let text = if message.is_empty() { format!("{reason:?}") } else { message };
-            lost.lost.get_or_init(|| text);
+            lost.lost.get_or_init(|| text.trim_end_matches('.').to_owned());
         });
         let limits = device.limits();
         let timestamps = device.features().contains(wgpu::Features::TIMESTAMP_QUERY);
@@ -195,7 +196,7 @@ impl Gpu {
 }
 
 /// Joins the lines of wgpu's message and its causes.
-pub(super) fn single_line(error: &wgpu::Error) -> String {
+pub(super) fn single_line(error: &impl fmt::Display) -> String {
     let text = error.to_string();
     let lines = text.lines().map(str::trim).filter(|l| !l.is_empty() && *l != "Caused by:");
     lines.collect::<Vec<_>>().join(": ")

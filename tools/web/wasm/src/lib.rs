@@ -66,13 +66,14 @@ pub extern "C" fn add_photograph(name_length: usize) -> u32 {
     answer(|session, input| session.add_photograph(&input, name_length))
 }
 
-/// Finds the cameras of the photographs and reconstructs their scene at `upscale` times the
-/// network's input. `effort` 0: the network alone; 1: fitted to the photographs; 2: refined too.
-/// Input: the device (`auto`, `cpu` or `gpu`); where it cannot be opened, the CPU does the work.
-/// Answer: JSON with `gaussians`, `background`, `cameras`, `warnings` and `network`.
+/// Finds the cameras of the photographs and reconstructs their scene. Input: JSON with the texts
+/// `upscale` (1 to 8), `effort` (0: the network alone; 1: fitted to the photographs; 2: refined too),
+/// `size` (side of a square with as many pixels as the network's input) and `network` (the device:
+/// `auto`, `cpu` or `gpu`). Where the device cannot be opened, the CPU does the work. Answer: JSON
+/// with `gaussians`, `background`, `cameras`, `warnings` and `network`.
 #[unsafe(no_mangle)]
-pub extern "C" fn reconstruct(upscale: usize, effort: u32) -> u32 {
-    answer(|session, device| session.reconstruct(upscale, effort, &device))
+pub extern "C" fn reconstruct() -> u32 {
+    answer(|session, request| session.reconstruct(&request))
 }
 
 /// Writes the scene. Input: the format's extension (`ply`, `spz`, `glb` or `splat`). Answer: the

@@ -2,7 +2,7 @@
 
 use crate::host;
 use serde_json::{Value, json};
-use std::ops::ControlFlow;
+use std::ops::{ControlFlow, RangeInclusive};
 use std::path::Path;
 use subsplat::loose::LooseOptions;
 use subsplat::{
@@ -31,6 +31,37 @@ struct Scene {
     cameras: Vec<Camera>,
     warnings: Vec<String>,
     network: Network,
+}
+
+/// Options of a reconstruction.
+struct Request {
+    /// r: side of the grid of Gaussians of an input pixel.
+    upscale: usize,
+    /// 0: the network alone; 1: a fit to the photographs; 2: a refinement too.
+    effort: usize,
+    /// Side of a square with as many pixels as the network's input.
+    size: usize,
+    /// The network's device.
+    network: String,
+}
+
+impl Request {
+    /// Reads a JSON object of strings.
+    fn parse(input: &[u8]) -> Result<Self, String> {
+        let json: Value = serde_json::from_slice(input).map_err(|e| format!("options: {e}"))?;
+        let text = |name: &str| json[name].as_str().unwrap_or_default().to_owned();
+        let number = |name: &str, range: RangeInclusive<usize>| {
+            let (text, [low, high]) = (text(name), [range.start(), range.end()]);
+            let found = text.parse().ok().filter(|n| range.contains(n));
+            found.ok_or_else(|| format!("{name}: expected {low} to {high}, got {text:?}"))
+        };
+        Ok(Self {
+            upscale: number("upscale", 1..=8)?,
+            effort: number("effort", 0..=2)?,
+            size: number("size", 32..=1024)?,
+            network: text("network"),
+        })
+    }
 }
 
 /// Processor that ran the network.
@@ -69,23 +100,19 @@ impl Session {
         Ok(bytes(&answer))
     }
 
-    pub(crate) fn reconstruct(
-        &mut self,
-        upscale: usize,
-        effort: u32,
-        device: &[u8],
-    ) -> Result<Vec<u8>, String> {
+    pub(crate) fn reconstruct(&mut self, request: &[u8]) -> Result<Vec<u8>, String> {
         self.scene = None;
         let photographs = std::mem::take(&mut self.photographs);
+        let request = Request::parse(request)?;
         let (photos, mut warnings) = with_cameras(photographs)?;
-        let mut options = Options::default();
-        match effort {
+        let mut options = Options::default().with_input_area(request.size * request.size);
+        match request.effort {
             0 => options = options.with_fit(FitOptions::off()).with_refine(Refine::Off),
             1 => options = options.with_refine(Refine::Off),
             _ => {}
         }
-        let (backend, mut reason) = open(device);
-        let model = Reconstructor::shipped(upscale).map_err(|e| e.to_string())?;
+        let (backend, mut reason) = open(&request.network);
+        let model = Reconstructor::shipped(request.upscale).map_err(|e| e.to_string())?;
         let model = model.with_backend(&backend);
         let result = model
             .run_with(&photos, &options, &mut |p| {
@@ -140,9 +167,9 @@ impl Session {
 }
 
 /// Opens `device` (`auto`, `cpu` or `gpu`). Returns the CPU and the reason where that fails.
-fn open(device: &[u8]) -> (Backend, Option<String>) {
+fn open(device: &str) -> (Backend, Option<String>) {
     host::allow_waiting();
-    let choice: DeviceChoice = String::from_utf8_lossy(device).parse().unwrap_or_default();
+    let choice: DeviceChoice = device.parse().unwrap_or_default();
     match Backend::new(&choice) {
         Ok(backend) => (backend, None),
         Err(error) => (Backend::Cpu, Some(error.to_string())),
