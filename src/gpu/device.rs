@@ -198,6 +198,6 @@ impl Gpu {
 /// Joins the lines of wgpu's message and its causes.
 pub(super) fn single_line(error: &impl fmt::Display) -> String {
     let text = error.to_string();
-    let lines = text.lines().map(str::trim).filter(|l| !l.is_empty() && *l != "Caused by:");
-    lines.collect::<Vec<_>>().join(": ")
+    let lines = text.lines().map(|l| l.trim().trim_end_matches('.'));
+    lines.filter(|l| !l.is_empty() && *l != "Caused by:").collect::<Vec<_>>().join(": ")
 }
