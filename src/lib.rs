@@ -257,10 +257,10 @@ pub mod details {
     #[cfg(feature = "network")]
     pub use crate::data::crop::{CropOptions, CropRule, Cropped, LrFrom, PhotoWindow};
     pub use crate::fit::{FitError, FitReport, FitView};
-    #[cfg(feature = "gpu")]
-    pub use crate::gpu::{Gpu, GpuError};
     #[cfg(all(feature = "gpu", target_family = "wasm", target_os = "unknown"))]
     pub use crate::gpu::set_gpu_wait;
+    #[cfg(feature = "gpu")]
+    pub use crate::gpu::{Gpu, GpuError};
     pub use crate::io::SaveReport;
     pub use crate::io::exif::{ExifCamera, FocalLength, FocalSource};
     pub use crate::io::image::Truncated;

@@ -32,15 +32,15 @@ pub(super) fn map(device: &wgpu::Device, slice: &wgpu::BufferSlice) -> Result<()
 }
 
 /// Error scopes around calls to a device.
-pub(crate) struct Scopes([wgpu::ErrorScopeGuard; 3]);
+pub(super) struct Scopes([wgpu::ErrorScopeGuard; 3]);
 
 impl Scopes {
-    pub(crate) fn open(device: &wgpu::Device) -> Self {
+    pub(super) fn open(device: &wgpu::Device) -> Self {
         use wgpu::ErrorFilter::{Internal, OutOfMemory, Validation};
         Self([Internal, Validation, OutOfMemory].map(|filter| device.push_error_scope(filter)))
     }
 
-    pub(crate) fn close(self, operation: &str) -> Result<(), GpuError> {
+    pub(super) fn close(self, operation: &str) -> Result<(), GpuError> {
         let operation = operation.to_owned();
         let [internal, validation, memory] = self.0;
         // Scopes form a stack: the last one opened is popped first.

@@ -78,14 +78,14 @@ pub(super) fn map(_: &wgpu::Device, slice: &wgpu::BufferSlice) -> Result<(), Str
 }
 
 /// Stands in for the error scopes of other platforms.
-pub(crate) struct Scopes;
+pub(super) struct Scopes;
 
 impl Scopes {
-    pub(crate) fn open(_: &wgpu::Device) -> Self {
+    pub(super) fn open(_: &wgpu::Device) -> Self {
         Self
     }
 
-    pub(crate) fn close(self, _: &str) -> Result<(), GpuError> {
+    pub(super) fn close(self, _: &str) -> Result<(), GpuError> {
         Ok(())
     }
 }
