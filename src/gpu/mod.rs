@@ -1,5 +1,5 @@
 //! The kernels as WGSL compute shaders, on every adapter that wgpu supports (Vulkan, Metal,
-//! DX12).
+//! DX12, and WebGPU of a browser: `wait_web.rs`).
 //!
 //! Files have the stems and arguments of [`crate::cpu`]; results agree within the tolerances of
 //! tests/gpu. [`Gpu::open`] opens an adapter. After an error the caller can use the CPU kernels.

@@ -330,6 +330,11 @@ async function testPage() {
  * worker's. */
 const NETWORKS = [
   { name: "WebGPU", network: "gpu", says: /Done in .*The network ran on WebGPU\.$/ },
+  {
+    name: "WebGPU unasked, of an adapter that calls itself hardware", network: "auto",
+    before: `Object.defineProperty(GPUAdapterInfo.prototype, "isFallbackAdapter", { get: () => false });`,
+    says: /Done in .*The network ran on WebGPU\.$/,
+  },
   { name: "CPU", network: "cpu", says: /Done in .*The network ran on the processor\.$/ },
   {
     name: "no adapter", network: "gpu",
