@@ -64,7 +64,8 @@
 //!
 //! * `network` (default): the network, its training and its scores, on candle. Without it the
 //!   crate has cameras, splats, their files and the rasterizer.
-//! * `gpu` (default): the kernels as WGSL compute, through wgpu.
+//! * `gpu` (default): the kernels as WGSL compute, through wgpu. In a browser (WebGPU) a program
+//!   supplies the wait for the device: `details::set_gpu_wait`.
 //! * `heic`: reads HEIC pictures, the default format of iPhones, in pure Rust.
 //! * `internals`: makes the modules with kernels, ops and network parts public. No version
 //!   promises anything about them.
@@ -256,6 +257,8 @@ pub mod details {
     #[cfg(feature = "network")]
     pub use crate::data::crop::{CropOptions, CropRule, Cropped, LrFrom, PhotoWindow};
     pub use crate::fit::{FitError, FitReport, FitView};
+    #[cfg(all(feature = "gpu", target_family = "wasm", target_os = "unknown"))]
+    pub use crate::gpu::set_gpu_wait;
     #[cfg(feature = "gpu")]
     pub use crate::gpu::{Gpu, GpuError};
     pub use crate::io::SaveReport;

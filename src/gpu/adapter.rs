@@ -3,6 +3,7 @@
 
 use crate::device::DeviceChoice;
 use crate::gpu::error::GpuError;
+use crate::gpu::wait;
 use std::fmt;
 use wgpu::DeviceType;
 
@@ -11,7 +12,7 @@ use wgpu::DeviceType;
 pub struct AdapterSummary {
     /// Name that the driver reports.
     pub name: String,
-    /// Graphics API: Vulkan, Metal or Dx12.
+    /// Graphics API: Vulkan, Metal, Dx12 or BrowserWebGpu.
     pub backend: String,
     /// Driver name and version.
     pub driver: String,
@@ -22,7 +23,8 @@ pub struct AdapterSummary {
 impl AdapterSummary {
     pub(crate) fn of(info: &wgpu::AdapterInfo) -> Self {
         Self {
-            name: info.name.clone(),
+            // Browsers may conceal the name.
+            name: if info.name.is_empty() { "adapter".to_owned() } else { info.name.clone() },
             backend: format!("{:?}", info.backend),
             driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
             software: info.device_type == DeviceType::Cpu,
@@ -32,8 +34,11 @@ impl AdapterSummary {
 
 impl fmt::Display for AdapterSummary {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        write!(f, "{} ({}, {})", self.name, self.backend, self.driver)?;
-        if self.software { f.write_str(", software") } else { Ok(()) }
+        write!(f, "{} ({}", self.name, self.backend)?;
+        if !self.driver.is_empty() {
+            write!(f, ", {}", self.driver)?;
+        }
+        f.write_str(if self.software { "), software" } else { ")" })
     }
 }
 
@@ -56,7 +61,8 @@ pub fn instance() -> wgpu::Instance {
 }
 
 fn enumerate(instance: &wgpu::Instance) -> Vec<wgpu::Adapter> {
-    let mut all = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::PRIMARY));
+    let found = wait::block_on(instance.enumerate_adapters(wgpu::Backends::PRIMARY));
+    let mut all = found.unwrap_or_default();
     all.sort_by_key(|a| rank(a.get_info().device_type));
     all
 }
@@ -86,7 +92,7 @@ pub fn choose(choice: &DeviceChoice, found: &[AdapterSummary]) -> Result<Option<
         }
     };
     let listed = || match found {
-        [] => "no adapter (is a Vulkan, Metal or DX12 driver installed?)".to_owned(),
+        [] => "no adapter (expected a driver for Vulkan, Metal or DX12, or WebGPU)".to_owned(),
         _ => found.iter().map(AdapterSummary::to_string).collect::<Vec<_>>().join("; "),
     };
     match index {

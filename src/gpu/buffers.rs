@@ -6,13 +6,12 @@
 
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
+use crate::gpu::wait;
 use bytemuck::Pod;
 use std::marker::PhantomData;
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
-use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
 use wgpu::BufferUsages;
 
 /// Purpose of a buffer of the pool.
@@ -43,9 +42,6 @@ impl Use {
 const SIZE_GRANULARITY: u64 = 256;
 /// Minimum size of a kernel's argument, bytes: an array of one vec4.
 const BINDING_BYTES_MIN: u64 = 16;
-/// Maximum wait for the result of a mapping. Another thread's poll may have completed the mapping
-/// and still be delivering its result.
-const MAPPING_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Free buffers, and the amount of memory allocated.
 #[derive(Debug)]
@@ -281,19 +277,7 @@ impl<T: Pod> Reading<T> {
             |reason: String| GpuError::Refused { operation: "the read-back".to_owned(), reason };
         let read = gpu.checked("the read-back", || {
             let slice = self.staging.raw().slice(..self.staging.bytes());
-            let (sender, receiver) = channel();
-            slice.map_async(wgpu::MapMode::Read, move |done| {
-                // Sending fails only after this read-back was abandoned.
-                sender.send(done).ok();
-            });
-            let polled = gpu.device.poll(wgpu::PollType::wait_indefinitely());
-            polled.map_err(|e| refused(e.to_string()))?;
-            match receiver.recv_timeout(MAPPING_TIMEOUT) {
-                Ok(done) => done.map_err(|e| refused(e.to_string()))?,
-                Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => {
-                    return Err(refused("the device did not complete the mapping".to_owned()));
-                }
-            }
+            wait::map(&gpu.device, &slice).map_err(refused)?;
             let view = slice.get_mapped_range().map_err(|e| refused(e.to_string()))?;
             let to: &mut [u8] = bytemuck::cast_slice_mut(out);
             for (to, from) in to.iter_mut().zip(view.iter()) {

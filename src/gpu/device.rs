@@ -9,6 +9,7 @@ use crate::gpu::adapter::{AdapterSummary, find};
 use crate::gpu::buffers::Pool;
 use crate::gpu::error::GpuError;
 use crate::gpu::pipelines::Pipelines;
+use crate::gpu::wait::{self, Scopes};
 use std::fmt;
 use std::sync::atomic::AtomicUsize;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
@@ -48,7 +49,7 @@ pub struct Gpu {
 #[derive(Debug, Default)]
 struct Health {
     lost: OnceLock<String>,
-    /// The last error outside every error scope.
+    /// The first error outside every error scope; later ones follow from it.
     stray: Mutex<Option<String>>,
 }
 
@@ -84,21 +85,21 @@ impl Gpu {
             required_limits: limits_of(adapter),
             ..wgpu::DeviceDescriptor::default()
         };
-        let (device, queue) =
-            pollster::block_on(adapter.request_device(&descriptor)).map_err(|e| {
-                GpuError::Device { adapter: summary.to_string(), reason: e.to_string() }
-            })?;
+        let refused = |reason| GpuError::Device { adapter: summary.to_string(), reason };
+        let opened = wait::block_on(adapter.request_device(&descriptor)).map_err(refused)?;
+        let (device, queue) = opened.map_err(|e| refused(single_line(&e)))?;
         let health = Arc::new(Health::default());
         let stray = health.clone();
         // wgpu's own handler panics.
         device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| {
-            stray.stray.lock().unwrap_or_else(PoisonError::into_inner).replace(single_line(&e));
+            let mut first = stray.stray.lock().unwrap_or_else(PoisonError::into_inner);
+            first.get_or_insert_with(|| single_line(&e));
         }));
         Ok(Self::assemble(device, queue, summary, health))
     }
 
     /// Wraps a device of the application, which keeps its own error handler. Frames can be drawn
-    /// to textures of that device.
+    /// to textures of that device. In a browser the device's errors reach that handler alone.
     pub fn from_device(device: wgpu::Device, queue: wgpu::Queue) -> Arc<Self> {
         let summary = AdapterSummary::of(&device.adapter_info());
         Arc::new(Self::assemble(device, queue, summary, Arc::default()))
@@ -113,7 +114,7 @@ impl Gpu {
         let lost = health.clone();
         device.set_device_lost_callback(move |reason, message| {
             let text = if message.is_empty() { format!("{reason:?}") } else { message };
-            lost.lost.get_or_init(|| text);
+            lost.lost.get_or_init(|| text.trim_end_matches('.').to_owned());
         });
         let limits = device.limits();
         let timestamps = device.features().contains(wgpu::Features::TIMESTAMP_QUERY);
@@ -195,32 +196,8 @@ impl Gpu {
 }
 
 /// Joins the lines of wgpu's message and its causes.
-fn single_line(error: &wgpu::Error) -> String {
+pub(super) fn single_line(error: &impl fmt::Display) -> String {
     let text = error.to_string();
-    let lines = text.lines().map(str::trim).filter(|l| !l.is_empty() && *l != "Caused by:");
-    lines.collect::<Vec<_>>().join(": ")
-}
-
-/// Error scopes around calls to a device.
-pub(crate) struct Scopes([wgpu::ErrorScopeGuard; 3]);
-
-impl Scopes {
-    pub(crate) fn open(device: &wgpu::Device) -> Self {
-        use wgpu::ErrorFilter::{Internal, OutOfMemory, Validation};
-        Self([Internal, Validation, OutOfMemory].map(|filter| device.push_error_scope(filter)))
-    }
-
-    pub(crate) fn close(self, operation: &str) -> Result<(), GpuError> {
-        let operation = operation.to_owned();
-        let [internal, validation, memory] = self.0;
-        // Scopes form a stack: the last one opened is popped first.
-        let memory = pollster::block_on(memory.pop());
-        let validation = pollster::block_on(validation.pop());
-        let internal = pollster::block_on(internal.pop());
-        match (memory, validation.or(internal)) {
-            (Some(_), _) => Err(GpuError::OutOfMemory { allocation: operation }),
-            (None, Some(e)) => Err(GpuError::Refused { operation, reason: single_line(&e) }),
-            (None, None) => Ok(()),
-        }
-    }
+    let lines = text.lines().map(|l| l.trim().trim_end_matches('.'));
+    lines.filter(|l| !l.is_empty() && *l != "Caused by:").collect::<Vec<_>>().join(": ")
 }

@@ -1,5 +1,5 @@
 //! The kernels as WGSL compute shaders, on every adapter that wgpu supports (Vulkan, Metal,
-//! DX12).
+//! DX12, and WebGPU of a browser: `wait_web.rs`).
 //!
 //! Files have the stems and arguments of [`crate::cpu`]; results agree within the tolerances of
 //! tests/gpu. [`Gpu::open`] opens an adapter. After an error the caller can use the CPU kernels.
@@ -80,6 +80,8 @@ mod show;
 mod sort;
 mod spgr;
 mod spgr_bwd;
+#[cfg_attr(all(target_family = "wasm", target_os = "unknown"), path = "wait_web.rs")]
+mod wait;
 
 pub use crate::device::DeviceChoice;
 pub use adapter::{AdapterSummary, adapters, choose, find_for, instance};
@@ -99,6 +101,8 @@ pub use rasterize::Rasterizer;
 pub use redistribute::{RedistributeArgs, RedistributeGradients};
 pub use scene::Scene;
 pub use spgr::SpgrArgs;
+#[cfg(all(target_family = "wasm", target_os = "unknown"))]
+pub use wait::set_gpu_wait;
 /// The version of wgpu whose devices and textures [`Gpu`] uses.
 pub use wgpu;
 

@@ -11,14 +11,35 @@ const STAGES = {
   fit: "fitting to the photographs", refine: "refining",
 };
 
+/** `?network=cpu` and `?network=gpu` choose the processor of the network, `?draw=cpu` and
+ * `?draw=webgl` that of the pictures. `?size=N` sets the network's input to about N×N pixels. */
+const ADDRESS = new URLSearchParams(location.search);
+
+/** The program: loaded while the photographs are chosen, compiled once. */
+const compiled = (async () => {
+  const answer = await fetch("subsplat.wasm.gz");
+  if (!answer.ok) throw new Error(`The program could not be loaded (${answer.status}).`);
+  const plain = answer.body.pipeThrough(new DecompressionStream("gzip"));
+  return WebAssembly.compile(await new Response(plain).arrayBuffer());
+})();
+compiled.catch(() => {});
+
 let worker = null;
+/** Ends the reconstruction that runs. */
+let running = null;
 let task = 0;
 const waiting = new Map();
 let viewer = null;
 let photographs = [];
 
-function startWorker() {
+function stopWorker(reason) {
   worker?.terminate();
+  for (const { reject } of waiting.values()) reject(new Error(reason));
+  waiting.clear();
+}
+
+function startWorker() {
+  stopWorker("Another reconstruction began.");
   worker = new Worker("worker.js");
   worker.onmessage = ({ data: { id, stage, fraction, answer, error } }) => {
     const promise = waiting.get(id);
@@ -31,10 +52,7 @@ function startWorker() {
     waiting.delete(id);
     error === undefined ? promise.resolve(answer) : promise.reject(new Error(error));
   };
-  worker.onerror = (event) => {
-    for (const { reject } of waiting.values()) reject(new Error(event.message ?? "no worker"));
-    waiting.clear();
-  };
+  worker.onerror = (event) => stopWorker(event.message ?? "no worker");
 }
 
 function ask(message, transfer = []) {
@@ -48,6 +66,14 @@ function ask(message, transfer = []) {
 function showError(text) {
   find("error").hidden = !text;
   find("error").textContent = text ?? "";
+}
+
+/** Names the processor of the network, and the reason where it is not the first choice. */
+function networkText({ processor, reason }) {
+  if (processor === "gpu") {
+    return reason ? `The network began on WebGPU. ${reason}.` : "The network ran on WebGPU.";
+  }
+  return `The network ran on the processor${reason ? `: ${reason}` : ""}.`;
 }
 
 function choose(list) {
@@ -80,6 +106,22 @@ function busy(state) {
   find("files").disabled = state;
 }
 
+/** Reads the photographs and returns the worker's answer. */
+async function send(signal) {
+  const module = await compiled;
+  const files = await Promise.all(
+    photographs.map(async (file) => ({ name: file.name, bytes: await file.arrayBuffer() })));
+  signal.throwIfAborted();
+  startWorker();
+  return ask({
+    task: "reconstruct", module, files,
+    options: {
+      upscale: find("upscale").value, effort: find("effort").value,
+      size: ADDRESS.get("size") ?? "256", network: ADDRESS.get("network") ?? "auto",
+    },
+  }, files.map((f) => f.bytes));
+}
+
 async function reconstruct() {
   showError(null);
   busy(true);
@@ -87,17 +129,16 @@ async function reconstruct() {
   find("result").hidden = true;
   const begin = performance.now();
   try {
-    const files = await Promise.all(
-      photographs.map(async (file) => ({ name: file.name, bytes: await file.arrayBuffer() })));
-    const { scene, spz } = await ask({
-      task: "reconstruct", files,
-      upscale: Number(find("upscale").value), effort: Number(find("effort").value),
-    }, files.map((f) => f.bytes));
-    find("result").hidden = false;
-    // `?draw=cpu` and `?draw=webgl` choose how the scene is drawn.
-    viewer ??= new SplatViewer(find("viewer"), {
-      draw: new URLSearchParams(location.search).get("draw") ?? "auto",
+    find("stage").textContent = "loading the program …";
+    find("progress").value = 0;
+    running = new AbortController();
+    const { signal } = running;
+    const cancelled = new Promise((_, reject) => {
+      signal.addEventListener("abort", () => reject(signal.reason));
     });
+    const { scene, spz } = await Promise.race([cancelled, send(signal)]);
+    find("result").hidden = false;
+    viewer ??= new SplatViewer(find("viewer"), { draw: ADDRESS.get("draw") ?? "auto" });
     await viewer.load(spz, scene);
     const notes = scene.warnings.map((text) => {
       const row = document.createElement("li");
@@ -107,7 +148,7 @@ async function reconstruct() {
     find("notes").hidden = notes.length === 0;
     find("notes").querySelector("ul").replaceChildren(...notes);
     const seconds = ((performance.now() - begin) / 1000).toFixed(1);
-    find("news").textContent = `Done in ${seconds} seconds.`;
+    find("news").textContent = `Done in ${seconds} seconds. ${networkText(scene.network)}`;
     viewer.canvas.focus({ preventScroll: false });
   } catch (error) {
     showError(error.message);
@@ -126,9 +167,8 @@ find("files").addEventListener("change", () => {
   find("files").value = "";
 });
 find("cancel").addEventListener("click", () => {
-  for (const { reject } of waiting.values()) reject(new Error("Cancelled."));
-  waiting.clear();
-  startWorker();
+  running.abort(new Error("Cancelled."));
+  stopWorker("Cancelled.");
 });
 for (const button of document.querySelectorAll("[data-save]")) {
   button.addEventListener("click", async () => {
@@ -154,5 +194,3 @@ document.addEventListener("drop", (event) => {
   drop.classList.remove("over");
   if (!find("files").disabled) choose(event.dataTransfer.files);
 });
-// The program is loaded while the photographs are chosen.
-startWorker();

@@ -18,6 +18,7 @@ const FLAGS = [
   "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
   "--disable-background-networking", "--disable-component-update", "--disable-sync",
   "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+  "--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader",
 ];
 const MINUTES = 60_000;
 
@@ -183,7 +184,8 @@ async function testExport() {
   }
 }
 
-/** Serves the page's folder; counts the bytes. */
+/** Serves the page's folder. `before` is JavaScript in front of the worker's own; `sizes` has the bytes
+ * of each file that was asked for. */
 function serve() {
   const kinds = { html: "text/html", js: "text/javascript", css: "text/css" };
   const server = http.createServer((request, answer) => {
@@ -191,11 +193,12 @@ function serve() {
     const file = path.join(SITE, path.basename(name));
     if (!fs.existsSync(file)) return answer.writeHead(404).end();
     const body = fs.readFileSync(file);
-    server.bytes += body.length;
+    server.sizes.set(name, body.length);
     answer.writeHead(200, { "content-type": kinds[name.split(".").pop()] ?? "application/octet-stream" });
-    answer.end(body);
+    answer.end(name === "worker.js" ? server.before + body : body);
   });
-  server.bytes = 0;
+  server.sizes = new Map();
+  server.before = "";
   return new Promise((done) => server.listen(0, "127.0.0.1", () => done(server)));
 }
 
@@ -204,6 +207,32 @@ async function chooseFiles(page, files) {
   const chooser = page.waitForEvent("filechooser");
   await page.click("text=Choose photographs");
   await (await chooser).setFiles(files);
+}
+
+/** Drops files onto the page. */
+async function dropFiles(page, files) {
+  const list = files.map((file) => ({
+    name: path.basename(file), text: fs.readFileSync(file).toString("base64"),
+  }));
+  const dataTransfer = await page.evaluateHandle((list) => {
+    const data = new DataTransfer();
+    for (const { name, text } of list) {
+      data.items.add(new File([Uint8Array.from(atob(text), (c) => c.charCodeAt(0))], name));
+    }
+    return data;
+  }, list);
+  await page.dispatchEvent("#drop", "drop", { dataTransfer });
+}
+
+/** The program's picture of a scene file from the first camera of the page's viewer. */
+async function nativeFromPage(page, scene, name) {
+  const camera = await page.evaluate(() => ({ ...viewer.cameras[0] }));
+  // The viewer's world is y-up: back to the program's.
+  camera.world_from_camera = [0, 1, 2].flatMap((r) => {
+    const sign = r === 0 ? 1 : -1;
+    return [...camera.rotation.slice(3 * r, 3 * r + 3), camera.eye[r]].map((v) => sign * v);
+  });
+  return native(scene, name, { cameras: [camera] });
 }
 
 const finished = (page) => page.waitForFunction(
@@ -255,15 +284,10 @@ async function testPage() {
     assert.ok(within >= 3, `progress within the network: ${JSON.stringify(reports)}`);
     console.log(`page, ${way}: ${((Date.now() - begin) / 1000).toFixed(1)} s from choice to scene`);
     assert.match(await page.textContent(".splat-status"), way === "cpu" ? /the processor/ : /WebGL2/);
+    // The one adapter here is a software one, which is not chosen unasked.
+    assert.match(await page.textContent("#news"), /The network ran on the processor\.$/);
     const ply = await download(page, "[data-save=ply]");
-    const settings = await page.evaluate(() => ({ cameras: [{ ...viewer.cameras[0] }] }));
-    // The viewer's world is y-up: back to the program's.
-    const [c] = settings.cameras;
-    c.world_from_camera = [0, 1, 2].flatMap((r) => {
-      const sign = r === 0 ? 1 : -1;
-      return [...c.rotation.slice(3 * r, 3 * r + 3), c.eye[r]].map((v) => sign * v);
-    });
-    const expected = await native(ply, `page-${way}`, settings);
+    const expected = await nativeFromPage(page, ply, `page-${way}`);
     const likeness = psnr(await capture(page), expected);
     console.log(`page, ${way}: ${likeness.toFixed(1)} dB against the program's picture of its .ply`);
     assert.ok(likeness >= LIKENESS);
@@ -291,8 +315,9 @@ async function testPage() {
       const wide = await page.evaluate(() => document.documentElement.scrollWidth);
       assert.ok(wide <= 360, `a page ${wide} px wide on a phone`);
       await page.screenshot({ path: `${PLACE}/page-phone.png` });
-      console.log(`page: ${server.bytes} bytes over the wire`);
-      assert.ok(server.bytes <= 6e6);
+      const bytes = [...server.sizes.values()].reduce((a, b) => a + b, 0);
+      console.log(`page: ${bytes} bytes over the wire`);
+      assert.ok(bytes <= 6e6);
     }
     assert.ok(asked.every((url) => /^(blob|data):/.test(url) || url.startsWith(address)), asked.join());
     assert.equal(errors.length, 0, errors.join());
@@ -301,10 +326,93 @@ async function testPage() {
   server.close();
 }
 
+/** What the page says of the network's processor, by address and by JavaScript that precedes the
+ * worker's. */
+const NETWORKS = [
+  { name: "WebGPU", network: "gpu", says: /Done in .*The network ran on WebGPU\.$/ },
+  {
+    name: "WebGPU unasked, of an adapter that calls itself hardware", network: "auto",
+    before: `Object.defineProperty(GPUAdapterInfo.prototype, "isFallbackAdapter", { get: () => false });`,
+    says: /Done in .*The network ran on WebGPU\.$/,
+  },
+  { name: "CPU", network: "cpu", says: /Done in .*The network ran on the processor\.$/ },
+  {
+    name: "no adapter", network: "gpu",
+    before: "GPU.prototype.requestAdapter = async () => null;",
+    says: /The network ran on the processor: no GPU: .*no adapter/,
+  },
+  {
+    name: "no device", network: "gpu",
+    before: "GPUAdapter.prototype.requestDevice = async () => { throw new Error('none left'); };",
+    says: /The network ran on the processor: GPU .*: no device: .*none left/,
+  },
+  {
+    name: "no Suspending", network: "auto", before: "delete WebAssembly.Suspending;",
+    says: /The network ran on the processor: .*WebAssembly\.Suspending/,
+  },
+  {
+    name: "a kernel refused", network: "gpu",
+    before: `const make = GPUDevice.prototype.createShaderModule;
+      GPUDevice.prototype.createShaderModule = function (of) {
+        return make.call(this, { ...of, code: of.code + " nonsense" });
+      };`,
+    says: /The network began on WebGPU\. GPU refused .*nonsense.*; the CPU does this instead\.$/,
+  },
+  {
+    name: "a device lost", network: "gpu",
+    before: `let device = null, submits = 0;
+      const { requestDevice } = GPUAdapter.prototype, { submit } = GPUQueue.prototype;
+      GPUAdapter.prototype.requestDevice = async function (...of) {
+        return (device = await requestDevice.apply(this, of));
+      };
+      GPUQueue.prototype.submit = function (...of) {
+        if (++submits === 3) device.destroy();
+        return submit.apply(this, of);
+      };`,
+    says: /The network began on WebGPU\. GPU lost: .*; the CPU does this instead\.$/,
+  },
+];
+
+/** The network on every processor, against the program's own scene of the same photographs. */
+async function testNetwork() {
+  const size = 64, out = `${PLACE}/network`;
+  subsplat("run", ...ROOM, "--input-size", `${size}`, "--upscale", "2", "--fit", "0", "--refine", "off",
+    "--device", "cpu", "--save", "ply", "-o", out);
+  const server = await serve();
+  for (const { name, network, before, says } of NETWORKS) {
+    server.before = `{ ${before ?? ""} }\n`;
+    const address = `http://127.0.0.1:${server.address().port}/?network=${network}&size=${size}`;
+    const { page, errors } = await open(address);
+    await page.selectOption("#upscale", "2");
+    await page.selectOption("#effort", "0");
+    const begin = Date.now();
+    await dropFiles(page, ROOM);
+    await finished(page);
+    const seconds = ((Date.now() - begin) / 1000).toFixed(1);
+    assert.ok(await page.isHidden("#error"), await page.textContent("#error"));
+    assert.match(await page.textContent("#news"), says);
+    const got = await capture(page);
+    const expected = await nativeFromPage(page, `${out}/scene.ply`, `network-${network}`);
+    const likeness = psnr(got, expected);
+    console.log(`network, ${name}: ${likeness.toFixed(1)} dB against the program's scene, ${seconds} s`);
+    assert.ok(likeness >= LIKENESS);
+    assert.equal(errors.length, 0, errors.join());
+    await page.close();
+  }
+  // A size out of range is refused.
+  const { page } = await open(`http://127.0.0.1:${server.address().port}/?size=9`);
+  await dropFiles(page, ROOM);
+  await finished(page);
+  assert.match(await page.textContent("#error"), /size: expected 32 to 1024, got "9"/);
+  await page.close();
+  server.close();
+}
+
 const chosen = process.argv.slice(2);
 try {
   if (chosen.length === 0 || chosen.includes("export")) await testExport();
   if (chosen.length === 0 || chosen.includes("page")) await testPage();
+  if (chosen.length === 0 || chosen.includes("network")) await testNetwork();
 } finally {
   await browser.close();
 }

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Tests the page and an exported scene in headless Chromium (software WebGL2), from a release build
-# of the programs. `test.sh page` and `test.sh export` run one of the two. Before them, the unit tests
-# of the SIMD level simd128 run under node.
+# Tests the page and an exported scene in headless Chromium (software WebGL2 and WebGPU), from a release
+# build of the programs. `test.sh page`, `test.sh export` and `test.sh network` run one of the three.
+# Before them, the unit tests of the SIMD level simd128 run under node.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 command -v node >/dev/null && command -v npm >/dev/null && command -v chromium >/dev/null ||

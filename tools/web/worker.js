@@ -1,41 +1,60 @@
-// Runs the library (subsplat.wasm) off the page's thread.
+// Runs the library (subsplat.wasm) off the page's thread, for one reconstruction: WebAssembly
+// returns no memory, so the page starts a new worker for the next one.
 //
-// Messages in: { id, task: "reconstruct", files: [{ name, bytes }], upscale, effort } and
+// Messages in: { id, task: "reconstruct", module, files: [{ name, bytes }], options } and
 // { id, task: "save", format }. Messages out: { id, stage, fraction }, then { id, answer } or
-// { id, error }.
+// { id, error }. `options` is the input of the library's function `reconstruct`.
 "use strict";
 
-/** Compiled once; each reconstruction gets a new instance, since WebAssembly returns no memory. */
-const compiled = (async () => {
-  const answer = await fetch("subsplat.wasm.gz");
-  if (!answer.ok) throw new Error(`The program could not be loaded (${answer.status}).`);
-  const plain = answer.body.pipeThrough(new DecompressionStream("gzip"));
-  return WebAssembly.compile(await new Response(plain).arrayBuffer());
-})();
-compiled.catch(() => {});
+/** Whether the library can wait for a GPU (JavaScript Promise Integration). */
+const CAN_WAIT = typeof WebAssembly.Suspending === "function";
 
 let library = null;
 let current = 0;
 
-async function open() {
+/** The import `suspend`, which returns after a call of `resume`. */
+const wait = {
+  resumed: false,
+  end: null,
+  suspend() {
+    return new Promise((end) => {
+      this.end = end;
+      if (this.resumed) this.resume();
+    });
+  },
+  resume() {
+    this.resumed = this.end === null;
+    this.end?.();
+    this.end = null;
+  },
+};
+
+async function open(module) {
   const text = new TextDecoder();
-  const progress = (stage, length, fraction) => {
-    const name = text.decode(new Uint8Array(library.memory.buffer, stage, length));
-    postMessage({ id: current, stage: name, fraction });
+  const env = {
+    progress(stage, length, fraction) {
+      const name = text.decode(new Uint8Array(library.memory.buffer, stage, length));
+      postMessage({ id: current, stage: name, fraction });
+    },
+    suspend: CAN_WAIT ? new WebAssembly.Suspending(() => wait.suspend()) : () => {},
+    resume: () => wait.resume(),
   };
-  library = null;
-  library = (await WebAssembly.instantiate(await compiled, { env: { progress } })).exports;
+  const bindings = await import("./subsplat_bg.js");
+  const imports = { env, "./subsplat_bg.js": bindings };
+  library = (await WebAssembly.instantiate(module, imports)).exports;
+  bindings.__wbg_set_wasm(library);
+  library.__wbindgen_start();
 }
 
-/** Calls a function of the library with `input`, and returns a copy of its answer. */
-function call(name, input, ...numbers) {
+/** Calls `work`, a function of the library, with `input`, and returns a copy of its answer. */
+async function call(work, input, ...numbers) {
   if (input) {
     const at = library.input(input.length);
     new Uint8Array(library.memory.buffer, at, input.length).set(input);
   }
   let success;
   try {
-    success = library[name](...numbers);
+    success = await work(...numbers);
   } catch (error) {
     // A trap: the library is in no usable state.
     library = null;
@@ -48,33 +67,49 @@ function call(name, input, ...numbers) {
   return answer;
 }
 
-async function reconstruct({ files, upscale, effort }) {
-  postMessage({ id: current, stage: "loading the program", fraction: 0 });
-  await open();
+/** The device for the library, and the reason where it is not the one that the page asks for. */
+function device(network) {
+  if (network === "cpu" || CAN_WAIT) return [network, null];
+  const reason = "this browser has no WebAssembly.Suspending, which the wait for WebGPU needs";
+  return ["cpu", navigator.gpu || network === "gpu" ? reason : null];
+}
+
+async function reconstruct({ module, files, options }) {
+  await open(module);
+  const bytesOf = (text) => new TextEncoder().encode(text);
   for (const [i, { name, bytes }] of files.entries()) {
     postMessage({ id: current, stage: `reading ${name}`, fraction: i / files.length });
-    const title = new TextEncoder().encode(name);
+    const title = bytesOf(name);
     const input = new Uint8Array(title.length + bytes.byteLength);
     input.set(title);
     input.set(new Uint8Array(bytes), title.length);
-    call("add_photograph", input, title.length);
+    await call(library.add_photograph, input, title.length);
   }
-  const scene = JSON.parse(new TextDecoder().decode(call("reconstruct", null, upscale, effort)));
+  const [network, reason] = device(options.network);
+  const work = CAN_WAIT ? WebAssembly.promising(library.reconstruct) : library.reconstruct;
+  const answer = await call(work, bytesOf(JSON.stringify({ ...options, network })));
+  const scene = JSON.parse(new TextDecoder().decode(answer));
+  scene.network.reason ??= reason;
   postMessage({ id: current, stage: "packing", fraction: 1 });
-  return { scene, spz: save({ format: "spz" }) };
+  return { scene, spz: await save({ format: "spz" }) };
 }
 
-function save({ format }) {
+async function save({ format }) {
   if (!library) throw new Error("There is no scene to save.");
-  return call("save", new TextEncoder().encode(format));
+  return call(library.save, new TextEncoder().encode(format));
 }
 
-onmessage = async ({ data }) => {
-  current = data.id;
+async function run({ id, task, ...message }) {
+  current = id;
   try {
-    const answer = await { reconstruct, save }[data.task](data);
-    postMessage({ id: data.id, answer });
+    postMessage({ id, answer: await { reconstruct, save }[task](message) });
   } catch (error) {
-    postMessage({ id: data.id, error: error.message });
+    postMessage({ id, error: error.message });
   }
+}
+
+// One task at a time: the library takes no other call while it is suspended.
+let tasks = Promise.resolve();
+onmessage = ({ data }) => {
+  tasks = tasks.then(() => run(data));
 };

@@ -1,13 +1,17 @@
 //! The library for the page in `tools/web`: photographs in, Gaussians out.
 //!
-//! A WebAssembly module with plain functions and numbers; no tool generates glue. JavaScript asks
-//! for memory with [`input`], writes bytes there and calls one of the functions below. Each returns
-//! 1 on success. The answer, or the message of an error, then lies at [`output`], [`output_length`]
-//! bytes long, until the next call. One import, `env.progress`, receives the name of the stage
-//! (UTF-8 in memory) and the share of the work that is done.
+//! A WebAssembly module with plain functions and numbers. JavaScript asks for memory with [`input`],
+//! writes bytes there and calls one of the functions below. Each returns 1 on success. The answer, or
+//! the message of an error, then lies at [`output`], [`output_length`] bytes long, until the next
+//! call. The imports `env.progress`, `env.suspend` and `env.resume` are those of `host.rs`. The other
+//! imports belong to wgpu, and wasm-bindgen generates them (`tools/web/bindgen`).
+//!
+//! With a GPU, [`reconstruct`] suspends while the device works: JavaScript calls it through
+//! `WebAssembly.promising`, and calls no other function until it returns.
 //!
 //! The module has one thread and belongs into a Web Worker: a reconstruction blocks for seconds.
 
+mod host;
 mod session;
 
 use session::Session;
@@ -62,12 +66,14 @@ pub extern "C" fn add_photograph(name_length: usize) -> u32 {
     answer(|session, input| session.add_photograph(&input, name_length))
 }
 
-/// Finds the cameras of the photographs and reconstructs their scene at `upscale` times the
-/// network's input. `effort` 0: the network alone; 1: fitted to the photographs; 2: refined too.
-/// Answer: JSON with `gaussians`, `background`, `cameras` and `warnings`.
+/// Finds the cameras of the photographs and reconstructs their scene. Input: JSON with the texts
+/// `upscale` (1 to 8), `effort` (0: the network alone; 1: fitted to the photographs; 2: refined too),
+/// `size` (side of a square with as many pixels as the network's input) and `network` (the device:
+/// `auto`, `cpu` or `gpu`). Where the device cannot be opened, the CPU does the work. Answer: JSON
+/// with `gaussians`, `background`, `cameras`, `warnings` and `network`.
 #[unsafe(no_mangle)]
-pub extern "C" fn reconstruct(upscale: usize, effort: u32) -> u32 {
-    answer(|session, _| session.reconstruct(upscale, effort))
+pub extern "C" fn reconstruct() -> u32 {
+    answer(|session, request| session.reconstruct(&request))
 }
 
 /// Writes the scene. Input: the format's extension (`ply`, `spz`, `glb` or `splat`). Answer: the

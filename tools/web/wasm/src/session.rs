@@ -1,26 +1,19 @@
 //! The photographs and the scene of one page.
 
+use crate::host;
 use serde_json::{Value, json};
-use std::ops::ControlFlow;
+use std::ops::{ControlFlow, RangeInclusive};
 use std::path::Path;
 use subsplat::loose::LooseOptions;
 use subsplat::{
-    Camera, FitOptions, LoadOptions, Options, Photo, Photograph, RasterOptions, Reconstructor,
-    Refine, SaveOptions, SplatFormat, Splats, encode_splats, loose_photos, parse_photograph,
+    Backend, Camera, DeviceChoice, FitOptions, LoadOptions, Options, Photo, Photograph,
+    RasterOptions, Reconstructor, Refine, SaveOptions, SplatFormat, Splats, Warning, encode_splats,
+    loose_photos, parse_photograph,
 };
-
-#[cfg(all(target_family = "wasm", target_os = "unknown"))]
-#[link(wasm_import_module = "env")]
-unsafe extern "C" {
-    safe fn progress(stage: *const u8, length: usize, fraction: f32);
-}
-
-#[cfg(not(all(target_family = "wasm", target_os = "unknown")))]
-fn progress(_: *const u8, _: usize, _: f32) {}
 
 /// Reports a stage to the page.
 fn report(stage: &str, fraction: f32) {
-    progress(stage.as_ptr(), stage.len(), fraction);
+    host::progress(stage.as_ptr(), stage.len(), fraction);
 }
 
 /// State between calls.
@@ -37,6 +30,46 @@ struct Scene {
     comments: Vec<String>,
     cameras: Vec<Camera>,
     warnings: Vec<String>,
+    network: Network,
+}
+
+/// Options of a reconstruction.
+struct Request {
+    /// r: side of the grid of Gaussians of an input pixel.
+    upscale: usize,
+    /// 0: the network alone; 1: a fit to the photographs; 2: a refinement too.
+    effort: usize,
+    /// Side of a square with as many pixels as the network's input.
+    size: usize,
+    /// The network's device.
+    network: String,
+}
+
+impl Request {
+    /// Reads a JSON object of strings.
+    fn parse(input: &[u8]) -> Result<Self, String> {
+        let json: Value = serde_json::from_slice(input).map_err(|e| format!("options: {e}"))?;
+        let text = |name: &str| json[name].as_str().unwrap_or_default().to_owned();
+        let number = |name: &str, range: RangeInclusive<usize>| {
+            let (text, [low, high]) = (text(name), [range.start(), range.end()]);
+            let found = text.parse().ok().filter(|n| range.contains(n));
+            found.ok_or_else(|| format!("{name}: expected {low} to {high}, got {text:?}"))
+        };
+        Ok(Self {
+            upscale: number("upscale", 1..=8)?,
+            effort: number("effort", 0..=2)?,
+            size: number("size", 32..=1024)?,
+            network: text("network"),
+        })
+    }
+}
+
+/// Processor that ran the network.
+struct Network {
+    /// `gpu`, or `cpu`.
+    processor: &'static str,
+    /// Why the CPU did all or some of a GPU's work.
+    reason: Option<String>,
 }
 
 /// Splits the input into a name and a file.
@@ -67,30 +100,40 @@ impl Session {
         Ok(bytes(&answer))
     }
 
-    pub(crate) fn reconstruct(&mut self, upscale: usize, effort: u32) -> Result<Vec<u8>, String> {
+    pub(crate) fn reconstruct(&mut self, request: &[u8]) -> Result<Vec<u8>, String> {
         self.scene = None;
         let photographs = std::mem::take(&mut self.photographs);
+        let request = Request::parse(request)?;
         let (photos, mut warnings) = with_cameras(photographs)?;
-        let mut options = Options::default();
-        match effort {
+        let mut options = Options::default().with_input_area(request.size * request.size);
+        match request.effort {
             0 => options = options.with_fit(FitOptions::off()).with_refine(Refine::Off),
             1 => options = options.with_refine(Refine::Off),
             _ => {}
         }
-        let model = Reconstructor::shipped(upscale).map_err(|e| e.to_string())?;
+        let (backend, mut reason) = open(&request.network);
+        let model = Reconstructor::shipped(request.upscale).map_err(|e| e.to_string())?;
+        let model = model.with_backend(&backend);
         let result = model
             .run_with(&photos, &options, &mut |p| {
                 report(p.stage.name(), p.fraction);
                 ControlFlow::Continue(())
             })
             .map_err(|e| e.to_string())?;
-        warnings.extend(result.warnings().iter().map(ToString::to_string));
+        for warning in result.warnings() {
+            match warning {
+                Warning::CpuInsteadOfGpu { reason: text, .. } => reason = Some(text.clone()),
+                _ => warnings.push(warning.to_string()),
+            }
+        }
+        let processor = if backend.is_cpu() { "cpu" } else { "gpu" };
         self.scene = Some(Scene {
             options: *result.raster_options(),
             comments: result.comments(),
             cameras: result.inputs().iter().map(|c| c.target_camera).collect(),
             splats: result.into_splats(),
             warnings,
+            network: Network { processor, reason },
         });
         self.describe()
     }
@@ -106,6 +149,10 @@ impl Session {
             "background": scene.options.background,
             "cameras": scene.cameras,
             "warnings": scene.warnings,
+            "network": {
+                "processor": scene.network.processor,
+                "reason": scene.network.reason,
+            },
         })))
     }
 
@@ -116,6 +163,16 @@ impl Session {
             .ok_or_else(|| format!("expected ply, spz, glb or splat, got {extension:?}"))?;
         let options = SaveOptions { comments: scene.comments.clone(), ..SaveOptions::default() };
         encode_splats(format, &scene.splats, &options).map_err(|e| e.to_string())
+    }
+}
+
+/// Opens `device` (`auto`, `cpu` or `gpu`). Returns the CPU and the reason where that fails.
+fn open(device: &str) -> (Backend, Option<String>) {
+    host::allow_waiting();
+    let choice: DeviceChoice = device.parse().unwrap_or_default();
+    match Backend::new(&choice) {
+        Ok(backend) => (backend, None),
+        Err(error) => (Backend::Cpu, Some(error.to_string())),
     }
 }
 
