@@ -17,7 +17,7 @@ use std::path::Path;
 use subsplat::data::procedural::{CameraSpec, Example, ExampleSpec, View};
 use subsplat::{
     Camera, DepthBounds, DepthSource, FitOptions, Options, Photo, Picture, Reconstruction,
-    Reconstructor, Refine, Rgb,
+    Reconstructor, Refine, Rgb, save_png,
 };
 
 /// Views of a room: the two ends of a path, and cameras between them.
