@@ -2,7 +2,8 @@
 
 use super::args::DetailArg;
 use super::args_eval::{CropArg, EvalArgs, LrFromArg};
-use super::{memory, model};
+use super::memory::{self, Planned};
+use super::model;
 use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, print_line, print_warning};
 use anyhow::{Context, Result, ensure};
 use serde_json::{Value, json};
@@ -151,8 +152,12 @@ fn check_memory(model: &Reconstructor, data: &Benchmark, options: &Options) -> R
     config.upscale = config.upscale.max(options.upscale.ceil() as usize);
     for case in data.cases() {
         let nominal = case.resolution.map(|[w, h]| (w, h)).unwrap_or((256, 256));
-        let size = options.input_size.unwrap_or(nominal);
-        memory::check_run(&config, case.views.context.len(), size)?;
+        memory::check_run(&Planned {
+            config: &config,
+            views: case.views.context.len(),
+            input: options.input_size.unwrap_or(nominal),
+            density: options.density,
+        })?;
     }
     Ok(())
 }

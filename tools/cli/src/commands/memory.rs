@@ -1,38 +1,62 @@
 //! Early rejection of runs that exceed the machine's memory.
 
 use anyhow::{Result, ensure};
+use subsplat::Density;
 use subsplat::config::Config;
 
-/// Lower bound of a run's memory per input pixel and view, bytes. Measured with both backbones
-/// between 256² and 512² (two views, K = 4): 2.9 KB.
+/// Lower bound of a run's memory per input pixel of the first two views, bytes. Measured with both
+/// backbones between 256² and 512² (K = 4): 2.9 KB.
 const PER_PIXEL: u64 = 2000;
+/// The same of further views, which the network encodes one at a time. Twenty views of 256² take
+/// 1337 MiB, refined, with 675,838 children.
+const PER_FURTHER_PIXEL: u64 = 600;
 /// Lower bound of the memory per child: row, gain and the trunk's buffers, bytes. Measured
 /// between K = 4 and K = 16: 78 B.
 const PER_CHILD: u64 = 70;
 /// Bytes per pixel of a rendered picture: colour, alpha, depth, 8 and 16 bit copies.
 const PER_RENDERED: u64 = 30;
 
-/// Lower bound of a reconstruction's memory, bytes.
-fn run_bytes(config: &Config, views: usize, (w, h): (usize, usize)) -> u64 {
-    let pixels = (w as u64).saturating_mul(h as u64);
-    let each = PER_PIXEL + PER_CHILD * config.children() as u64;
-    let r = config.upscale as u64;
-    let network = pixels.saturating_mul(views as u64).saturating_mul(each);
-    let rendered = pixels.saturating_mul(r * r * PER_RENDERED);
-    network.saturating_add(rendered)
+/// A reconstruction whose memory is estimated.
+#[derive(Clone, Copy, Debug)]
+pub struct Planned<'a> {
+    /// The model's configuration.
+    pub config: &'a Config,
+    /// Number of photographs.
+    pub views: usize,
+    /// Width and height of the network's input, px.
+    pub input: (usize, usize),
+    /// Number of Gaussians.
+    pub density: Density,
+}
+
+impl Planned<'_> {
+    /// Lower bound of the memory, bytes.
+    fn bytes(&self) -> u64 {
+        let (w, h) = self.input;
+        let pixels = (w as u64).saturating_mul(h as u64);
+        let first = self.views.min(2) as u64;
+        let each = PER_PIXEL * first + PER_FURTHER_PIXEL * (self.views as u64 - first);
+        let r = self.config.upscale;
+        let parents = w.saturating_mul(h).saturating_mul(self.views);
+        let children = self.density.limit(parents, self.views, r) as u64;
+        let network = pixels.saturating_mul(each);
+        let rendered = pixels.saturating_mul((r * r) as u64 * PER_RENDERED);
+        network.saturating_add(children.saturating_mul(PER_CHILD)).saturating_add(rendered)
+    }
 }
 
 /// Rejects a reconstruction that exceeds the memory.
-pub fn check_run(config: &Config, views: usize, (w, h): (usize, usize)) -> Result<()> {
+pub fn check_run(planned: &Planned<'_>) -> Result<()> {
+    let Planned { config, views, input: (w, h), .. } = planned;
     let r = config.upscale;
     let source = format!("--input-size {w}x{h} with {views} views at --upscale {r}");
-    fits(&source, run_bytes(config, views, (w, h)), available())
+    fits(&source, planned.bytes(), available())
 }
 
 /// Whether the memory is ample for a reconstruction: half as much again as the lower bound, which
 /// leaves room for the fit to the photographs (measured: 1.3 times the bound).
-pub fn is_ample(config: &Config, views: usize, size: (usize, usize)) -> bool {
-    let needed = run_bytes(config, views, size).saturating_mul(3) / 2;
+pub fn is_ample(planned: &Planned<'_>) -> bool {
+    let needed = planned.bytes().saturating_mul(3) / 2;
     available().is_none_or(|a| needed <= a)
 }
 
@@ -75,9 +99,29 @@ mod tests {
         assert_eq!(error, "--size 9x9: needs at least 3.0 GiB of memory, 1.0 GiB are available");
         let config = Config::x4();
         // Far beyond any machine; the products do not overflow.
-        assert!(available().is_none() || check_run(&config, 2, (1 << 20, 1 << 20)).is_err());
-        assert!(available().is_none() || !is_ample(&config, 2, (1 << 20, 1 << 20)));
-        assert!(is_ample(&config, 2, (64, 64)));
+        let of = |views, side| Planned {
+            config: &config,
+            views,
+            input: (side, side),
+            density: Density::Auto,
+        };
+        let huge = of(2, 1 << 20);
+        assert!(available().is_none() || check_run(&huge).is_err());
+        assert!(available().is_none() || !is_ample(&huge));
+        assert!(is_ample(&of(2, 64)));
+        assert!(of(2, usize::MAX).bytes() == u64::MAX);
         assert!(available().is_none() || check_picture("", (usize::MAX, usize::MAX)).is_err());
+    }
+
+    /// The bound is below what a run of twenty photographs took, and not far below.
+    #[test]
+    fn many_photographs_are_not_refused() {
+        let config = Config { upscale: 2, ..Config::x4() };
+        let planned =
+            Planned { config: &config, views: 20, input: (256, 256), density: Density::Auto };
+        let mebibytes = planned.bytes() >> 20;
+        assert!((900..1337).contains(&mebibytes), "{mebibytes}");
+        let all = Planned { density: Density::Full, ..planned };
+        assert!(all.bytes() > planned.bytes());
     }
 }

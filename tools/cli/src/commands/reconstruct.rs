@@ -1,7 +1,7 @@
 //! The library's call with a progress bar and lines for the user: for `run` and `view`.
 
 use super::args::{CropShapeArg, DetailArg, QualityArg, SourceArgs};
-use super::memory;
+use super::memory::{self, Planned};
 use crate::pages;
 use crate::report::{Progress, print_line, print_warning, show_fraction};
 use anyhow::{Result, ensure};
@@ -65,7 +65,10 @@ pub fn input_size(
         _ => context.iter().map(size).collect(),
     };
     let config = model.config();
-    let ample = |size: Size| memory::is_ample(config, context.len(), (size.width, size.height));
+    let (views, density) = (context.len(), args.gaussians);
+    let ample = |size: Size| {
+        memory::is_ample(&Planned { config, views, input: (size.width, size.height), density })
+    };
     let chosen = match args.quality {
         Some(quality) => quality_size(quality, args.crop, &photos, config, ample),
         None => args.input_size(),
@@ -107,7 +110,8 @@ pub fn with_children(
         }
         _ => model,
     };
-    memory::check_run(model.config(), views, input)?;
+    let (config, density) = (model.config(), args.gaussians);
+    memory::check_run(&Planned { config, views, input, density })?;
     Ok(model)
 }
 

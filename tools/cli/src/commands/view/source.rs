@@ -3,8 +3,9 @@
 
 use crate::commands::args_view::ViewArgs;
 use crate::commands::frames::DepthSpread;
+use crate::commands::memory::{self, Planned};
 use crate::commands::reconstruct::{self, reconstruct};
-use crate::commands::{info, memory, model, pair, render, run, whole};
+use crate::commands::{info, model, pair, render, run, whole};
 use crate::report::{Progress, print_line, print_warning};
 use anyhow::{Context, Result, bail, ensure};
 use std::ops::ControlFlow;
@@ -191,7 +192,12 @@ impl Photographs {
             None => {
                 begin("model");
                 let model = load_model(&self.args, Some(upscale))?;
-                memory::check_run(model.config(), self.photos.len(), self.input_size)?;
+                memory::check_run(&Planned {
+                    config: model.config(),
+                    views: self.photos.len(),
+                    input: self.input_size,
+                    density: self.options.density,
+                })?;
                 let mut progress = |progress: subsplat::Progress| {
                     begin(progress.stage.name());
                     ControlFlow::Continue(())
