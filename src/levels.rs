@@ -386,7 +386,6 @@ fn merged(first: &Entry, rest: &[&Entry], lowpass: f64, sh: &mut [f32], set: usi
             sh[first.set * set + c] += part * (value - sh[first.set * set + c]);
         }
     }
-    moments.write(lowpass, &mut new.row);
-    new.blob = Blob::of(&new.row);
+    new.blob = moments.write(lowpass, &mut new.row);
     new
 }

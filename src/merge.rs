@@ -19,6 +19,9 @@ use glam::{DMat3, DQuat, DVec3};
 pub const CURVE_BITS: u32 = 21;
 /// Largest opacity of a merged Gaussian.
 const OPACITY_MAX: f64 = 0.9999;
+/// Opacity for each unit of a large optical depth: a stack of Gaussians of the opacities of a scene then
+/// has the same silhouette.
+const DENSE_OPACITY: f64 = 0.35;
 
 /// Mean, covariance and optical depth of a Gaussian.
 #[derive(Clone, Copy)]
@@ -89,9 +92,12 @@ impl Moments {
         Self { mean, covariance, weight: self.weight + other.weight }
     }
 
-    /// Writes the Gaussian of these moments to a packed row. Its optical depth, integrated under the
-    /// low-pass, is the weight.
-    pub fn write(&self, lowpass: f64, row: &mut [f32]) {
+    /// Writes the Gaussian of these moments to a packed row, and returns it. Its optical depth,
+    /// integrated under the low-pass, is the weight.
+    ///
+    /// Many opaque Gaussians below the size of a pixel hide more than one Gaussian can. Under a low-pass
+    /// the opacity therefore exceeds 1 for a large optical depth: the rasterizer limits alpha.
+    pub fn write(&self, lowpass: f64, row: &mut [f32]) -> Blob {
         let matrix = nalgebra::Matrix3::from_column_slice(&self.covariance.to_cols_array());
         let eigen = nalgebra::SymmetricEigen::new(matrix);
         let scales = [0, 1, 2].map(|i| eigen.eigenvalues[i].max(0.0).sqrt());
@@ -106,11 +112,16 @@ impl Moments {
         sorted.sort_by(f64::total_cmp);
         let area = footprint([sorted[1], sorted[2]], lowpass);
         let depth = self.weight / area.max(f64::MIN_POSITIVE);
-        let opacity = (-(-depth).exp_m1()).min(OPACITY_MAX);
+        let opacity = match lowpass > 0.0 {
+            true => (-(-depth).exp_m1()).max(DENSE_OPACITY * depth),
+            false => (-(-depth).exp_m1()).min(OPACITY_MAX),
+        };
         row[MEAN_OFFSET..MEAN_OFFSET + 3].copy_from_slice(&self.mean.to_array().map(|v| v as f32));
         row[QUAT_OFFSET..QUAT_OFFSET + 4].copy_from_slice(&[q.w, q.x, q.y, q.z].map(|v| v as f32));
         row[SCALE_OFFSET..SCALE_OFFSET + 3].copy_from_slice(&scales.map(|v| v as f32));
         row[OPACITY_OFFSET] = opacity as f32;
+        let (mean, covariance) = (self.mean, self.covariance);
+        Blob { mean, covariance, sigmas: [sorted[1], sorted[2]], depth }
     }
 }
 

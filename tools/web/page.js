@@ -94,9 +94,10 @@ async function reconstruct() {
       upscale: Number(find("upscale").value), effort: Number(find("effort").value),
     }, files.map((f) => f.bytes));
     find("result").hidden = false;
-    // `?draw=cpu` and `?draw=webgl` choose how the scene is drawn.
+    // `?draw=cpu` and `?draw=webgl` choose how the scene is drawn, `?levels=off` draws all of it.
+    const query = new URLSearchParams(location.search);
     viewer ??= new SplatViewer(find("viewer"), {
-      draw: new URLSearchParams(location.search).get("draw") ?? "auto",
+      draw: query.get("draw") ?? "auto", levels: query.get("levels") !== "off",
     });
     await viewer.load(spz, scene);
     const notes = scene.warnings.map((text) => {
