@@ -35,7 +35,7 @@ fn wall() -> Splats {
         for (dx, dy) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
             let [u, v] = [x + dx, y + dy].map(|i| (i as f32 + 0.5) / GRID as f32 - 0.5);
             let i = rows.len() / SPLAT_STRIDE;
-            let layer = if i % 3 == 0 { 0.02 } else { 0.0 };
+            let layer = if i.is_multiple_of(3) { 0.02 } else { 0.0 };
             rows.extend([u, v, 1.0 + 0.4 * u + layer, 1.0, 0.2 * unit(i), 0.1, -0.1]);
             let sigma = (0.7 + 0.5 * unit(i + 7)) / GRID as f32;
             rows.extend([sigma, 0.7 * sigma, 0.1 * sigma, 0.5 + 0.45 * unit(i + 3)]);
