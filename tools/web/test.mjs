@@ -114,8 +114,8 @@ async function levelOfDetail(page, way) {
   const all = await page.evaluate(() => viewer.scene.count);
   await capture(page);
   const near = await page.evaluate(() => viewer.drawn);
-  // Eight times the distance.
-  await page.evaluate(() => viewer.wheel(Math.log(8) / Math.log(0.9)));
+  // 16 times the distance.
+  await page.evaluate(() => viewer.wheel(Math.log(16) / Math.log(0.9)));
   const fewer = await capture(page);
   const far = await page.evaluate(() => viewer.drawn);
   await page.waitForFunction(
@@ -126,14 +126,14 @@ async function levelOfDetail(page, way) {
   assert.equal(await page.evaluate(() => viewer.drawn), all, "L draws all Gaussians");
   await page.locator("canvas").press("l");
   const likeness = psnr(fewer, whole);
-  console.log(`export, ${way}: ${near} of ${all} Gaussians at the first camera, ${far} at 8 times the`
+  console.log(`export, ${way}: ${near} of ${all} Gaussians at the first camera, ${far} at 16 times the`
     + ` distance, ${likeness.toFixed(1)} dB against all`);
   assert.ok(far < near && 2 * far < all, "a far camera draws fewer Gaussians");
   assert.ok(likeness >= LIKENESS && likeness < 90, "the picture of fewer Gaussians");
   // Without levels the far camera draws all.
   const off = await open(`${page.url().split("#")[0]}?levels=off#${way}`);
   await off.page.waitForFunction(() => viewer?.levels);
-  await off.page.evaluate(() => viewer.wheel(Math.log(8) / Math.log(0.9)));
+  await off.page.evaluate(() => viewer.wheel(Math.log(16) / Math.log(0.9)));
   await capture(off.page);
   assert.equal(await off.page.evaluate(() => viewer.drawn), all, "levels=off");
   await off.page.close();
