@@ -336,6 +336,9 @@ fn coarse(mut entries: Vec<Entry>, mut sh: Vec<f32>, set: usize, grid: &Grid) ->
     let mut made = Coarse::default();
     // Each bit halves the cells along one axis.
     for bits in 1..=3 * CURVE_BITS {
+        if entries.len() < 2 {
+            break;
+        }
         let side = grid.side * (f64::from(bits) / 3.0).exp2();
         let cell = |e: &Entry| e.code >> bits;
         let merges = |e: &Entry| e.blob.sigmas[1] <= SIGMA_MAX * side;
