@@ -12,6 +12,7 @@ use common::conventional::project::{Gradients as PlainGradients, Options, Splats
 use common::conventional::raster::Rasterizer as Conventional;
 use common::scene::{self, SCENES, Spec};
 use common::{Bench, Contender, Threads, Work, agree};
+use glam::{Mat4, Vec3};
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
 use std::collections::HashMap;
@@ -24,6 +25,8 @@ use subsplat::gpu::{DeviceChoice, Gpu, Rasterizer as GpuRasterizer};
 use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
 use subsplat::io::scene::Units;
 use subsplat::io::{save_splats, write_atomic};
+use subsplat::levels::{CELL_PX, Levels};
+use subsplat::metrics::psnr;
 use subsplat::render::slices;
 use subsplat::splats::Splats;
 use subsplat_test_support::oracle;
@@ -43,6 +46,8 @@ const FLOPS_PER_SPLAT: f64 = 150.0;
 const PICTURE: [f32; 3] = [5e-5, 0.2, 3e-3];
 /// Tolerance of gradients: their f32 sums over many pixels cancel.
 const GRADIENT: [f32; 3] = [2e-4, 0.2, 1e-3];
+/// Distances of the camera in the group of the levels, relative to the scene's camera.
+const DISTANCES: [f32; 4] = [1.0, 2.0, 4.0, 8.0];
 /// Side of a picture that the naive oracle renders in seconds, px.
 const NAIVE_SIDE: usize = 128;
 
@@ -75,7 +80,65 @@ fn main() -> Result<()> {
             }
         }
     }
+    let spec = if bench.args.quick { "131k-512" } else { "524k-512" };
+    for spec in SCENES.iter().filter(|s| s.name == spec) {
+        levels(&mut bench, spec)?;
+    }
     bench.finish()
+}
+
+/// Times frames with and without level of detail, the camera at several times the distance of the middle
+/// Gaussian. Moving Gaussians to the selection is apart: a viewer does it once for many frames.
+fn levels(bench: &mut Bench, spec: &Spec) -> Result<()> {
+    let name = |far: f32| format!("levels x{far} {}", spec.name);
+    if !DISTANCES.iter().any(|far| bench.selects(&name(*far))) {
+        return Ok(());
+    }
+    let case = Case::new(spec, scene::shared(spec));
+    let start = std::time::Instant::now();
+    let levels = bench.on_all(|| Levels::new(&case.splats));
+    let made = format!("{} merged, made in {:.2?}", levels.coarse_len(), start.elapsed());
+    let forward = case.camera.rotation().z_axis;
+    let eye = case.camera.position();
+    let mut depths: Vec<f32> =
+        case.splats.means().map(|m| (Vec3::from_array(m) - eye).dot(forward)).collect();
+    let middle = *depths.select_nth_unstable_by(case.splats.len() / 2, f32::total_cmp).1;
+    for far in DISTANCES {
+        if !bench.selects(&name(far)) {
+            continue;
+        }
+        let back = Mat4::from_translation(-forward * (middle * (far - 1.0)));
+        let pose = back * case.camera.world_from_camera();
+        let camera = Camera::new(case.camera.intrinsics(), pose)?;
+        let gather = || levels.gather(&case.splats, &levels.select(&camera, CELL_PX));
+        let chosen = gather()?;
+        let [whole, fewer] = [&case.splats, &chosen]
+            .map(|s| Rasterizer::new().render(&slices(s), &camera, &case.options));
+        let psnr = psnr(&fewer.rgb, &whole.rgb, spec.side, spec.side)?;
+        let draw = |splats: &'_ Splats, out: &mut (Rasterizer, Rendered)| {
+            out.0.render_into(&slices(splats), &camera, &case.options, &mut out.1);
+        };
+        let mut outs = [(); 2].map(|()| (Rasterizer::new(), Rendered::default()));
+        let [all, few] = &mut outs;
+        let contenders = vec![
+            Contender::new("all Gaussians", Threads::All, || {
+                draw(&case.splats, all);
+                Ok(())
+            }),
+            Contender::new("those of the levels", Threads::All, || {
+                draw(&chosen, few);
+                Ok(())
+            }),
+            Contender::new("selecting and copying those", Threads::All, || {
+                std::hint::black_box(gather()?);
+                Ok(())
+            }),
+        ];
+        let share = 100.0 * chosen.len() as f64 / case.splats.len() as f64;
+        let note = format!("{share:.1} % of {}, {psnr:.1} dB; {made}", case.splats.len());
+        bench.group(&name(far), contenders, &note)?;
+    }
+    Ok(())
 }
 
 /// A scene with its camera.

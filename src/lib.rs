@@ -106,9 +106,13 @@ pub mod gpu;
 #[cfg(feature = "internals")]
 pub mod io;
 #[cfg(feature = "internals")]
+pub mod levels;
+#[cfg(feature = "internals")]
 pub mod loss;
 #[cfg(feature = "internals")]
 pub mod matches;
+#[cfg(feature = "internals")]
+pub mod merge;
 #[cfg(feature = "internals")]
 pub mod metrics;
 #[cfg(all(feature = "internals", feature = "network"))]
@@ -159,9 +163,13 @@ mod gpu;
 #[cfg(not(feature = "internals"))]
 mod io;
 #[cfg(not(feature = "internals"))]
+mod levels;
+#[cfg(not(feature = "internals"))]
 mod loss;
 #[cfg(not(feature = "internals"))]
 mod matches;
+#[cfg(not(feature = "internals"))]
+mod merge;
 #[cfg(not(feature = "internals"))]
 mod metrics;
 #[cfg(all(not(feature = "internals"), feature = "network"))]

@@ -3,6 +3,7 @@
 mod baseline;
 mod coverage;
 mod fit;
+mod levels;
 mod raster;
 mod raster_bwd;
 mod raster_bwd_oracle;

@@ -138,7 +138,9 @@ async function reconstruct() {
     });
     const { scene, spz } = await Promise.race([cancelled, send(signal)]);
     find("result").hidden = false;
-    viewer ??= new SplatViewer(find("viewer"), { draw: ADDRESS.get("draw") ?? "auto" });
+    viewer ??= new SplatViewer(find("viewer"), {
+      draw: ADDRESS.get("draw") ?? "auto", levels: ADDRESS.get("levels") !== "off",
+    });
     await viewer.load(spz, scene);
     const notes = scene.warnings.map((text) => {
       const row = document.createElement("li");

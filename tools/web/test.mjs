@@ -109,6 +109,39 @@ async function moves(page, action, what) {
   assert.ok(psnr(before, after) < 45, `${what} did not change the picture`);
 }
 
+/** A far camera draws fewer Gaussians, and nearly the picture of all of them. */
+async function levelOfDetail(page, way) {
+  await page.waitForFunction(() => viewer.levels);
+  const all = await page.evaluate(() => viewer.scene.count);
+  await capture(page);
+  const near = await page.evaluate(() => viewer.drawn);
+  // 16 times the distance.
+  await page.evaluate(() => viewer.wheel(Math.log(16) / Math.log(0.9)));
+  const fewer = await capture(page);
+  const far = await page.evaluate(() => viewer.drawn);
+  await page.waitForFunction(
+    (far) => document.querySelector(".splat-status").textContent.startsWith(far.toLocaleString("en")
+      + " of "), far);
+  await page.locator("canvas").press("l");
+  const whole = await capture(page);
+  assert.equal(await page.evaluate(() => viewer.drawn), all, "L draws all Gaussians");
+  await page.locator("canvas").press("l");
+  const likeness = psnr(fewer, whole);
+  console.log(`export, ${way}: ${near} of ${all} Gaussians at the first camera, ${far} at 16 times the`
+    + ` distance, ${likeness.toFixed(1)} dB against all`);
+  assert.ok(far < near && 2 * far < all, "a far camera draws fewer Gaussians");
+  assert.ok(likeness >= LIKENESS && likeness < 90, "the picture of fewer Gaussians");
+  // Without levels the far camera draws all.
+  const off = await open(`${page.url().split("#")[0]}?levels=off#${way}`);
+  await off.page.waitForFunction(() => viewer?.levels);
+  await off.page.evaluate(() => viewer.wheel(Math.log(16) / Math.log(0.9)));
+  await capture(off.page);
+  assert.equal(await off.page.evaluate(() => viewer.drawn), all, "levels=off");
+  await off.page.close();
+  await page.evaluate(() => viewer.reset());
+  await idle(page);
+}
+
 async function testExport() {
   const out = `${PLACE}/export`;
   subsplat("run", "examples/room", "--input-size", "64", "--fit", "0", "--refine", "off",
@@ -145,6 +178,9 @@ async function testExport() {
     assert.ok(psnr(swapped, expected) < LIKENESS && psnr(
       { ...got, rgba: Buffer.from(new Uint32Array(new Uint8Array(got.rgba).buffer).reverse().buffer) },
       expected) < LIKENESS);
+
+    await levelOfDetail(page, way);
+    assert.ok(psnr(await capture(page), expected) >= LIKENESS, "levels leave the first picture");
 
     const { x, y, width, height } = await box(page);
     const middle = [x + width / 2, y + height / 2];

@@ -11,6 +11,13 @@
 const ALPHA_MIN = 1 / 255;
 const ALPHA_MAX = 0.999;
 const SH_C0 = 0.28209479177387814;
+/** The rules of src/levels.rs and src/merge.rs. */
+const BLOCK = 1024, CELL_PX = 1, SIGMA_MAX = 1, SHARE_MAX = 0.5, PIXEL_SIDES = 1.4, LOWPASS = 0.3;
+const MERGED_OPACITY_MAX = 0.9999, DENSE_OPACITY = 0.35;
+/** Bits of a coordinate on the curve: a code is a whole number below 2 to the power of 53. */
+const CURVE_BITS = 17;
+/** Longest time without a pause while levels are made, ms. */
+const SLICE = 8;
 /** Coefficients of degree 1 to 3, in the order of `basis`. */
 const SH = [
   -0.4886025119029199, 0.4886025119029199, -0.4886025119029199,
@@ -225,6 +232,220 @@ function projection(camera, rules) {
   return { ...camera, limit, near: rules.near, lowpass: rules.lowpass };
 }
 
+/** The two largest eigenvalues of a covariance (xx, xy, xz, yy, yz, zz). */
+function variances([a, xy, xz, b, yz, c]) {
+  const mean = (a + b + c) / 3;
+  const d = a - mean, e = b - mean, f = c - mean;
+  const p = Math.sqrt((d * d + e * e + f * f + 2 * (xy * xy + xz * xz + yz * yz)) / 6);
+  if (!(p > 1e-9 * mean)) return [mean, mean];
+  const det = d * (e * f - yz * yz) - xy * (xy * f - yz * xz) + xz * (xy * yz - e * xz);
+  const angle = Math.acos(Math.min(Math.max(det / (2 * p ** 3), -1), 1)) / 3;
+  const first = mean + 2 * p * Math.cos(angle);
+  const last = mean + 2 * p * Math.cos(angle + 2 * Math.PI / 3);
+  return [first, Math.max(3 * mean - first - last, 0)];
+}
+
+/** A function that pauses where a slice of time is over, and returns whether to go on. */
+function slices(goesOn) {
+  let begin = performance.now();
+  return async () => {
+    if (performance.now() - begin > SLICE) {
+      await new Promise((done) => setTimeout(done));
+      begin = performance.now();
+    }
+    return goesOn();
+  };
+}
+
+/**
+ * Level of detail, as src/levels.rs describes it. Merged Gaussians follow those of the file in `scene`.
+ * A block has a bounding sphere, its Gaussians `own`, and levels `coarse` of `count` merged Gaussians.
+ */
+class Levels {
+  /** Makes the levels of `file`; null where `pause` ends the work. */
+  static async make(file, pause) {
+    const levels = new Levels(file);
+    const codes = new Float64Array(file.count);
+    for (let i = 0; i < file.count; i++) {
+      if (i % 4096 === 0 && !await pause()) return null;
+      codes[i] = levels.code(i);
+    }
+    let order = Uint32Array.from(codes, (_, i) => i), spare = new Uint32Array(file.count);
+    const starts = new Uint32Array(8192);
+    for (let unit = 1; unit < 2 ** (3 * CURVE_BITS); unit *= 8192) {
+      if (!await pause()) return null;
+      const digit = (i) => Math.floor(codes[i] / unit) % 8192;
+      starts.fill(0);
+      for (const i of order) starts[digit(i)]++;
+      for (let d = 0, sum = 0; d < 8192; d++) [starts[d], sum] = [sum, sum + starts[d]];
+      for (const i of order) spare[starts[digit(i)]++] = i;
+      [order, spare] = [spare, order];
+    }
+    for (let first = 0; first < file.count; first += BLOCK) {
+      if (!await pause()) return null;
+      levels.add(order.subarray(first, first + BLOCK), codes);
+    }
+    levels.close();
+    return levels;
+  }
+
+  constructor(file) {
+    this.file = file;
+    this.low = [Infinity, Infinity, Infinity];
+    const high = [-Infinity, -Infinity, -Infinity];
+    for (let at = 0; at < 3 * file.count; at++) {
+      this.low[at % 3] = Math.min(this.low[at % 3], file.means[at]);
+      high[at % 3] = Math.max(high[at % 3], file.means[at]);
+    }
+    this.side = Math.max(...add(high, this.low, -1), 1e-30) / (2 ** CURVE_BITS - 1);
+    this.blocks = [];
+    /** Rows of merged Gaussians: mean, opacity, covariance; colour and further coefficients, bytes. */
+    this.parts = [];
+    this.count = file.count;
+    this.chosen = new Uint32Array(file.count);
+  }
+
+  /** The place of Gaussian `i` on a Morton curve. */
+  code(i) {
+    const [x, y, z] = [0, 1, 2].map((c) => (this.file.means[3 * i + c] - this.low[c]) / this.side);
+    let code = 0;
+    for (let bit = CURVE_BITS - 1; bit >= 0; bit--) {
+      code = 8 * code + (x >> bit & 1 | (y >> bit & 1) << 1 | (z >> bit & 1) << 2);
+    }
+    return code;
+  }
+
+  entry(i, code) {
+    const { means, covariances, opacities, colours, rest, restStride, degree } = this.file;
+    const covariance = covariances.subarray(6 * i, 6 * i + 6);
+    const used = restStride * i + 3 * ((degree + 1) ** 2 - 1);
+    return {
+      code, covariance, opacity: opacities[i], mean: means.subarray(3 * i, 3 * i + 3), variances: variances(covariance),
+      depth: -Math.log1p(-Math.min(opacities[i], MERGED_OPACITY_MAX)),
+      colour: [...colours.subarray(3 * i, 3 * i + 3), ...rest.subarray(restStride * i, used)],
+    };
+  }
+
+  /** Adds the block of the Gaussians `own` along the curve. */
+  add(own, codes) {
+    let entries = [];
+    for (const i of own) {
+      if (this.file.opacities[i] >= ALPHA_MIN) entries.push(this.entry(i, codes[i]));
+    }
+    const ends = [Math.min, Math.max].map((end) => [0, 1, 2].map(
+      (c) => entries.reduce((v, e) => end(v, e.mean[c]), entries[0]?.mean[c] ?? 0)));
+    const centre = add(...ends).map((v) => 0.5 * v);
+    const radius = entries.reduce((r, e) => Math.max(r, Math.hypot(...add(e.mean, centre, -1))), 0);
+    const coarse = [];
+    for (let bits = 1; bits <= 3 * CURVE_BITS && entries.length > 1; bits++) {
+      const side = this.side * 2 ** (bits / 3), cells = 2 ** bits;
+      const merges = (e) => e.variances[0] <= (SIGMA_MAX * side) ** 2;
+      const cell = (e) => Math.floor(e.code / cells);
+      let count = 0, last = -1;
+      for (const e of entries) {
+        if (!merges(e) || cell(e) !== last) count++;
+        if (merges(e)) last = cell(e);
+      }
+      if (count > SHARE_MAX * entries.length) continue;
+      const lowpass = LOWPASS * (PIXEL_SIDES / CELL_PX * side) ** 2;
+      const next = [];
+      let group = [];
+      const flush = () => {
+        if (group.length) next.push(merged(group, lowpass));
+        group = [];
+      };
+      for (const e of entries) {
+        if (group.length && cell(e) !== cell(group[0])) flush();
+        if (merges(e)) group.push(e);
+        else next.push(e);
+      }
+      flush();
+      // A Gaussian between two of another cell may precede the cell's merge.
+      entries = next.sort((a, b) => a.code - b.code);
+      coarse.push({ side, first: this.count, count });
+      this.count += count;
+      const geometry = new Float32Array(10 * count);
+      entries.forEach((e, k) => geometry.set(
+        [...e.mean, e.opacity, ...e.covariance], 10 * k));
+      this.parts.push([geometry, Uint8Array.from(entries.flatMap((e) => e.colour.map(Math.round)))]);
+    }
+    this.blocks.push({ centre, radius, own, coarse });
+  }
+
+  /** Appends the merged Gaussians to those of the file. */
+  close() {
+    const { file, count } = this;
+    const longer = (from, stride) => {
+      const out = new from.constructor(stride * count);
+      out.set(from);
+      return out;
+    };
+    const scene = this.scene = {
+      ...file, count, means: longer(file.means, 3), opacities: longer(file.opacities, 1),
+      covariances: longer(file.covariances, 6), colours: longer(file.colours, 3),
+      rest: longer(file.rest, file.restStride),
+    };
+    const set = 3 * (file.degree + 1) ** 2;
+    let at = file.count;
+    for (const [geometry, colours] of this.parts) {
+      for (let k = 0; 10 * k < geometry.length; k++, at++) {
+        scene.means.set(geometry.subarray(10 * k, 10 * k + 3), 3 * at);
+        scene.opacities[at] = geometry[10 * k + 3];
+        scene.covariances.set(geometry.subarray(10 * k + 4, 10 * k + 10), 6 * at);
+        scene.colours.set(colours.subarray(set * k, set * k + 3), 3 * at);
+        scene.rest.set(colours.subarray(set * k + 3, set * (k + 1)), file.restStride * at);
+      }
+    }
+    this.parts = [];
+  }
+
+  /** The Gaussians to draw for a view; null for those of the file. */
+  select({ eye, fx, fy }) {
+    const { chosen } = this;
+    let n = 0, whole = true;
+    for (const { centre, radius, own, coarse } of this.blocks) {
+      const distance = Math.hypot(...add(centre, eye, -1)) - radius;
+      let level = null;
+      for (const next of coarse) {
+        if (next.side * Math.max(fx, fy) > CELL_PX * distance) break;
+        level = next;
+      }
+      if (level) {
+        whole = false;
+        for (let k = 0; k < level.count; k++) chosen[n++] = level.first + k;
+      } else {
+        chosen.set(own, n);
+        n += own.length;
+      }
+    }
+    return whole ? null : chosen.subarray(0, n);
+  }
+}
+
+/** Merges entries by their moments; a single one stays as it is. */
+function merged(group, lowpass) {
+  if (group.length === 1) return group[0];
+  const footprint = ([a, b]) => Math.sqrt((a + lowpass) * (b + lowpass));
+  let weight = 0;
+  const mean = [0, 0, 0], covariance = [0, 0, 0, 0, 0, 0], colour = group[0].colour.map(() => 0);
+  for (const e of group) {
+    const own = e.depth * footprint(e.variances);
+    weight += own;
+    const part = own / weight;
+    const d = add(e.mean, mean, -1);
+    const spread = [d[0] * d[0], d[0] * d[1], d[0] * d[2], d[1] * d[1], d[1] * d[2], d[2] * d[2]];
+    for (let c = 0; c < 6; c++) {
+      covariance[c] += part * (e.covariance[c] - covariance[c] + (1 - part) * spread[c]);
+    }
+    for (let c = 0; c < 3; c++) mean[c] += part * d[c];
+    for (let c = 0; c < colour.length; c++) colour[c] += part * (e.colour[c] - colour[c]);
+  }
+  const sizes = variances(covariance);
+  const depth = weight / footprint(sizes);
+  const opacity = Math.max(-Math.expm1(-depth), DENSE_OPACITY * depth);
+  return { code: group[0].code, mean, covariance, colour, variances: sizes, depth, opacity };
+}
+
 /** Sorts the splats in front of the near plane by camera z, nearest first; a radix sort. */
 class Sorter {
   constructor(count) {
@@ -236,12 +457,15 @@ class Sorter {
     this.starts = new Uint32Array(65536);
   }
 
-  sort({ means, count }, view) {
+  /** Sorts all Gaussians of a scene, or those of `chosen`. */
+  sort({ means, count }, view, chosen) {
     const [fx, fy, fz] = column(view.rotation, 2);
     const offset = fx * view.eye[0] + fy * view.eye[1] + fz * view.eye[2];
     const { keys, bits, spareKeys, spare, order, starts } = this;
     let n = 0;
-    for (let i = 0, at = 0; i < count; i++, at += 3) {
+    const most = chosen ? chosen.length : Math.min(count, keys.length);
+    for (let k = 0; k < most; k++) {
+      const i = chosen ? chosen[k] : k, at = 3 * i;
       const z = fx * means[at] + fy * means[at + 1] + fz * means[at + 2] - offset;
       if (z > view.near) {
         keys[n] = z;
@@ -431,48 +655,84 @@ class GlPainter {
     return program;
   }
 
-  texture(unitIndex, internal, format, type, texels, data) {
-    const { gl } = this;
-    const width = Math.min(4096, gl.getParameter(gl.MAX_TEXTURE_SIZE));
-    const height = Math.max(1, Math.ceil(texels / width));
+  /** A texture of `rows` rows for each `width` Gaussians of a scene. */
+  texture(unitIndex, internal, rows, count) {
+    const { gl, width } = this;
+    const height = Math.max(1, rows * Math.ceil(count / width));
     if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
       throw new Error("this graphics card holds no scene of this size");
     }
     const texture = gl.createTexture();
     gl.activeTexture(gl.TEXTURE0 + unitIndex);
     gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, internal, width, height);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
-    const padded = new data.constructor(4 * width * height);
-    padded.set(data);
-    gl.texImage2D(gl.TEXTURE_2D, 0, internal, width, height, 0, format, type, padded);
     return texture;
   }
 
-  load(scene) {
+  /** Textures for a scene, without texels. */
+  open(scene) {
     const { gl } = this;
-    const geometry = new Float32Array(12 * scene.count);
-    for (let i = 0; i < scene.count; i++) {
-      geometry.set(scene.means.subarray(3 * i, 3 * i + 3), 12 * i);
-      geometry[12 * i + 3] = scene.opacities[i];
-      geometry.set(scene.covariances.subarray(6 * i, 6 * i + 6), 12 * i + 4);
-    }
-    const used = 3 * (scene.degree + 1) ** 2;
-    this.texels = Math.ceil(used / 16);
-    const stride = 16 * this.texels;
-    const bytes = new Uint8Array(stride * scene.count);
-    for (let i = 0; i < scene.count; i++) {
-      bytes.set(scene.colours.subarray(3 * i, 3 * i + 3), stride * i);
+    this.width = Math.min(4096, gl.getParameter(gl.MAX_TEXTURE_SIZE));
+    this.texels = Math.ceil(3 * (scene.degree + 1) ** 2 / 16);
+    return [
+      this.texture(0, gl.RGBA32F, 3, scene.count),
+      this.texture(1, gl.RGBA32UI, this.texels, scene.count),
+    ];
+  }
+
+  /** Fills the rows of the textures that begin with Gaussian `first`. */
+  fill([geometry, colours], scene, first) {
+    const { gl, width, texels } = this;
+    const count = Math.min(width, scene.count - first);
+    const numbers = new Float32Array(12 * width);
+    const used = 3 * (scene.degree + 1) ** 2, stride = 16 * texels;
+    const bytes = new Uint8Array(stride * width);
+    for (let k = 0, i = first; k < count; k++, i++) {
+      numbers.set(scene.means.subarray(3 * i, 3 * i + 3), 12 * k);
+      numbers[12 * k + 3] = scene.opacities[i];
+      numbers.set(scene.covariances.subarray(6 * i, 6 * i + 6), 12 * k + 4);
+      bytes.set(scene.colours.subarray(3 * i, 3 * i + 3), stride * k);
       const from = scene.restStride * i;
-      bytes.set(scene.rest.subarray(from, from + used - 3), stride * i + 3);
+      bytes.set(scene.rest.subarray(from, from + used - 3), stride * k + 3);
     }
-    [this.geometry, this.colours].forEach((t) => t && gl.deleteTexture(t));
-    this.geometry = this.texture(0, gl.RGBA32F, gl.RGBA, gl.FLOAT, 3 * scene.count, geometry);
-    this.colours = this.texture(1, gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT,
-      this.texels * scene.count, new Uint32Array(bytes.buffer));
+    const row = first / width;
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, geometry);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 3 * row, width, 3, gl.RGBA, gl.FLOAT, numbers);
+    gl.activeTexture(gl.TEXTURE1);
+    gl.bindTexture(gl.TEXTURE_2D, colours);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, texels * row, width, texels, gl.RGBA_INTEGER,
+      gl.UNSIGNED_INT, new Uint32Array(bytes.buffer));
+  }
+
+  close(textures, scene) {
+    [this.geometry, this.colours].forEach((t) => t && this.gl.deleteTexture(t));
+    [this.geometry, this.colours] = textures;
     this.degree = scene.degree;
-    this.sorter = new Sorter(scene.count);
     this.scene = scene;
+  }
+
+  load(scene) {
+    const textures = this.open(scene);
+    for (let i = 0; i < scene.count; i += this.width) this.fill(textures, scene, i);
+    this.close(textures, scene);
+    this.sorter = new Sorter(scene.count);
+  }
+
+  /** Replaces the scene by a longer one with the same beginning; false where `pause` ends the work. */
+  async extend(scene, pause) {
+    const textures = this.open(scene);
+    for (let i = 0; i < scene.count; i += this.width) {
+      if (!await pause()) {
+        textures.forEach((t) => this.gl.deleteTexture(t));
+        return false;
+      }
+      this.fill(textures, scene, i);
+    }
+    this.close(textures, scene);
+    return true;
   }
 
   target(width, height) {
@@ -499,9 +759,9 @@ class GlPainter {
     return this.half ? this.frame : null;
   }
 
-  draw(view, background) {
+  draw(view, background, chosen) {
     const { gl, splats } = this;
-    const n = this.sorter.sort(this.scene, view);
+    const n = this.sorter.sort(this.scene, view, chosen);
     const order = this.sorter.order.subarray(0, n).reverse();
     gl.bindBuffer(gl.ARRAY_BUFFER, this.indices);
     gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
@@ -574,6 +834,11 @@ class CpuPainter {
     this.sorter = new Sorter(scene.count);
   }
 
+  async extend(scene) {
+    this.scene = scene;
+    return true;
+  }
+
   colour(i, d, out) {
     const { colours, rest, restStride, degree } = this.scene;
     const [x, y, z] = d, xx = x * x, yy = y * y, zz = z * z;
@@ -593,10 +858,10 @@ class CpuPainter {
     }
   }
 
-  draw(view, background) {
+  draw(view, background, chosen) {
     const { means, covariances, opacities } = this.scene;
     const { width, height, rotation: r, eye, fx, fy, limit, lowpass } = view;
-    const n = this.sorter.sort(this.scene, view);
+    const n = this.sorter.sort(this.scene, view, chosen);
     const sums = new Float32Array(3 * width * height);
     const through = new Float32Array(width * height).fill(1);
     const rgb = [0, 0, 0];
@@ -679,14 +944,16 @@ const KEYS = [
   ["F", "orbit or fly"],
   ["V", "next photograph’s place"],
   ["R", "back to the start"],
+  ["L", "all Gaussians, or fewer where they are far"],
   ["P", "save the picture"],
 ];
 
 /** A viewer inside the element `root`. */
 class SplatViewer {
-  /** `draw`: "auto", "webgl" or "cpu". */
-  constructor(root, { draw = "auto" } = {}) {
+  /** `draw`: "auto", "webgl" or "cpu"; `levels`: whether far parts are drawn with fewer Gaussians. */
+  constructor(root, { draw = "auto", levels = true } = {}) {
     this.root = root;
+    this.useLevels = levels;
     root.classList.add("splat-viewer");
     root.innerHTML = `
       <canvas tabindex="0" role="application" aria-roledescription="3D view"
@@ -753,8 +1020,28 @@ class SplatViewer {
     this.fly = false;
     this.root.querySelector("[data-do=fly]").setAttribute("aria-pressed", "false");
     this.root.querySelector("[data-do=view]").hidden = this.cameras.length < 2;
+    this.levels = null;
     this.reset();
-    this.say(`${scene.count.toLocaleString("en")} Gaussians, drawn by ${this.painter.name}`);
+    this.drawn = scene.count;
+    this.sayCount();
+    // The levels are made after the first picture.
+    setTimeout(() => this.makeLevels(scene).catch(() => { this.levels = null; }), 100);
+  }
+
+  /** Says the number of Gaussians drawn. */
+  sayCount() {
+    const [drawn, all] = [this.drawn, this.scene.count].map((n) => n.toLocaleString("en"));
+    this.countText = `${drawn === all ? all : `${drawn} of ${all}`} Gaussians, drawn by ${this.painter.name}`;
+    this.say(this.countText);
+  }
+
+  /** Makes the levels of a scene in the background, until another one is loaded. */
+  async makeLevels(scene) {
+    const pause = slices(() => this.scene === scene);
+    const levels = await Levels.make(scene, pause);
+    if (!levels || !await this.painter.extend(levels.scene, pause)) return;
+    this.levels = levels;
+    this.redraw();
   }
 
   /** Goes to the place of a photograph. */
@@ -825,6 +1112,11 @@ class SplatViewer {
     requestAnimationFrame(() => {
       this.pending = false;
       this.paint();
+      // The number is said at rest, and replaces no other message.
+      clearTimeout(this.counting);
+      this.counting = setTimeout(() => {
+        if (this.status.textContent === this.countText) this.sayCount();
+      }, 300);
     });
   }
 
@@ -840,7 +1132,10 @@ class SplatViewer {
     if (this.canvas.width !== width) this.canvas.width = width;
     if (this.canvas.height !== height) this.canvas.height = height;
     const camera = { ...intrinsics, rotation: this.rotation, eye: this.eye };
-    this.painter.draw(projection(camera, this.rules), this.background);
+    const view = projection(camera, this.rules);
+    const chosen = this.useLevels && this.levels ? this.levels.select(view) : null;
+    this.painter.draw(view, this.background, chosen);
+    this.drawn = chosen ? chosen.length : this.scene.count;
   }
 
   /** The current view at the size of the photographs, as ImageData. */
@@ -876,6 +1171,11 @@ class SplatViewer {
         this.say(`The place of photograph ${this.view + 1} of ${this.cameras.length}.`);
         break;
       case "reset": this.reset(); break;
+      case "levels":
+        this.useLevels = !this.useLevels;
+        this.paint();
+        this.sayCount();
+        break;
       case "picture": this.savePicture(); break;
       case "help":
         this.keys.hidden = !this.keys.hidden;
@@ -933,7 +1233,7 @@ class SplatViewer {
       ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step], ArrowDown: [0, step],
     };
     const actions = {
-      KeyF: "fly", KeyV: "view", KeyR: "reset", Home: "reset", KeyP: "picture", KeyH: "help",
+      KeyF: "fly", KeyV: "view", KeyR: "reset", Home: "reset", KeyP: "picture", KeyL: "levels", KeyH: "help",
     };
     if (arrows[event.code]) {
       event.shiftKey ? this.pan(...arrows[event.code]) : this.rotate(...arrows[event.code], 512);

@@ -2,7 +2,7 @@
 
 use super::args::{ConventionArg, CropShapeArg, DetailArg, RenderingArgs, SourceArgs};
 use super::values;
-use clap::Args;
+use clap::{Args, ValueEnum};
 use std::path::PathBuf;
 use subsplat::gpu::DeviceChoice;
 use subsplat::{FitOptions, Refine};
@@ -17,9 +17,19 @@ In the window:
   F                        orbit or fly
   R                        back to the first camera
   1 2 4                    children a side of a pixel: x1, x2, x4 (of photographs)
+  L                        all Gaussians, or fewer where they are far
   P                        save the picture
   H                        this list
   Esc                      quit";
+
+/// Gaussians that the window draws.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum LevelsArg {
+    /// Gaussians far below a pixel are replaced by fewer, merged ones.
+    Auto,
+    /// All Gaussians.
+    Off,
+}
 
 /// Arguments of `view`.
 #[derive(Clone, Debug, Args)]
@@ -49,6 +59,9 @@ pub struct ViewArgs {
     /// view. Default: cameras.json beside the scene, else a view of the whole.
     #[arg(long, value_name = "SCENE")]
     pub cameras: Option<PathBuf>,
+    /// Level of detail by the distance; L switches it in the window.
+    #[arg(long, value_enum, default_value_t = LevelsArg::Auto)]
+    pub levels: LevelsArg,
     /// Options of the reconstruction.
     #[command(flatten)]
     pub source: SourceArgs,

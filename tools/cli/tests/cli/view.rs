@@ -30,6 +30,7 @@ fn wrong_arguments_are_told_before_a_window_is_looked_for() {
         ("a.ply --near -1", 2, "expected a finite number above 0"),
         ("a.ply --background 2,0,0", 2, "--background"),
         ("a.ply --save b.png", 2, "--frames"),
+        ("a.ply --levels 3", 2, "[possible values: auto, off]"),
         ("", 2, "SPLATS | SCENE | IMG… | DIR"),
     ] {
         let got = view(folder.path(), arguments, None);
@@ -87,6 +88,7 @@ fn the_manual_names_every_key() {
         "1 2 4",
         "  F ",
         "  R ",
+        "  L ",
         "  P ",
         "  H ",
         "Esc",

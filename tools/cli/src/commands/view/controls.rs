@@ -18,6 +18,8 @@ pub enum KeyAction {
     Reset,
     /// Sets r of r×r children per pixel.
     Upscale(usize),
+    /// Toggles the level of detail.
+    Levels,
     /// Saves a picture of the window.
     Save,
     /// Prints the list of keys.
@@ -78,6 +80,7 @@ fn key_action(key: KeyCode) -> Option<KeyAction> {
         KeyCode::Digit1 | KeyCode::Numpad1 => KeyAction::Upscale(1),
         KeyCode::Digit2 | KeyCode::Numpad2 => KeyAction::Upscale(2),
         KeyCode::Digit4 | KeyCode::Numpad4 => KeyAction::Upscale(4),
+        KeyCode::KeyL => KeyAction::Levels,
         KeyCode::KeyP => KeyAction::Save,
         KeyCode::KeyH => KeyAction::Help,
         KeyCode::Escape => KeyAction::Quit,
@@ -220,6 +223,7 @@ mod tests {
         assert_eq!(c.key(KeyCode::Digit4, Pressed, true), None);
         assert_eq!(c.key(KeyCode::Digit4, Released, false), None);
         assert_eq!(c.key(KeyCode::Escape, Pressed, false), Some(KeyAction::Quit));
+        assert_eq!(c.key(KeyCode::KeyL, Pressed, false), Some(KeyAction::Levels));
         assert_eq!(c.key(KeyCode::KeyS, Pressed, false), None);
         assert_eq!(c.key(KeyCode::F12, Pressed, false), None);
     }

@@ -4,15 +4,17 @@
 //!
 //! A change draws two frames: the first measures the number of pairs, and the second has buffers
 //! for them. A background thread makes and uploads the children for another r. The device has the
-//! adapter's binding limits, not WebGPU's defaults.
+//! adapter's binding limits, not WebGPU's defaults. `detail` replaces far parts of a scene by fewer
+//! Gaussians.
 
 mod canvas;
 mod controls;
+mod detail;
 mod pictures;
 mod source;
 mod window;
 
-use super::args_view::ViewArgs;
+use super::args_view::{LevelsArg, ViewArgs};
 use super::memory;
 use crate::report::{Answer, Progress, print_line};
 use anyhow::{Context, Result, bail};
@@ -33,6 +35,8 @@ pub struct Plan {
     save: Option<PathBuf>,
     /// Folder for pictures.
     out: PathBuf,
+    /// True if far parts are drawn with fewer Gaussians.
+    levels: bool,
 }
 
 /// Runs the command.
@@ -59,6 +63,7 @@ pub fn view(args: &ViewArgs, answer: Answer) -> Result<()> {
     answer.finish(&json!({
         "scene": done.name,
         "gaussians": done.gaussians,
+        "drawn": done.drawn,
         "upscale": done.upscale,
         "device": done.adapter,
         "frames": done.frames,
@@ -80,7 +85,8 @@ fn plan(args: &ViewArgs) -> Result<Plan> {
         bail!("--device: expected auto, gpu or an adapter's name, got cpu");
     }
     let (frames, save, out) = (args.frames, args.save.clone(), args.out.clone());
-    Ok(Plan { size, device, frames, save, out })
+    let levels = args.levels == LevelsArg::Auto;
+    Ok(Plan { size, device, frames, save, out, levels })
 }
 
 /// Rejects a choice without an adapter.

@@ -4,6 +4,7 @@
 use super::Plan;
 use super::canvas::{Canvas, Frame};
 use super::controls::{Controls, Drag, KeyAction};
+use super::detail::{Detail, Fit, Outcome};
 use super::pictures::save_next;
 use super::source::{Made, Photographs, Source};
 use crate::commands::args_view::KEYS;
@@ -13,6 +14,7 @@ use glam::Vec2;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 use subsplat::abi::RasterOptions;
 use subsplat::gpu::{Gpu, Scene};
@@ -46,6 +48,8 @@ const NEW_WEIGHT: f32 = 0.1;
 pub struct Done {
     pub name: String,
     pub gaussians: usize,
+    /// Gaussians of the last frame.
+    pub drawn: usize,
     pub upscale: Option<usize>,
     pub adapter: String,
     pub frames: usize,
@@ -62,12 +66,17 @@ pub enum Message {
     Made(usize, Ready),
     /// The work on r×r children per pixel has ended, or failed.
     Done(usize, Result<(), String>),
+    /// A task for the level of detail of the scene of this number has ended.
+    Detail(usize, Outcome),
 }
 
 /// Splats in device memory.
 pub struct Ready {
     scene: Scene,
     options: RasterOptions,
+    detail: Detail,
+    /// Unlike that of any other scene.
+    number: usize,
 }
 
 /// Opens a window and shows `source` until the user or the plan ends it.
@@ -80,6 +89,7 @@ pub fn run(events: EventLoop<Message>, plan: Plan, source: Source) -> Result<Don
     let shown = viewer.ready.get(&viewer.current);
     Ok(Done {
         gaussians: shown.map_or(0, |r| r.scene.len()),
+        drawn: viewer.splats,
         upscale: (viewer.current > 0).then_some(viewer.current),
         adapter: canvas.gpu().adapter().to_string(),
         frames: viewer.drawn,
@@ -145,6 +155,10 @@ struct Viewer {
     /// True if the next frame is to be saved.
     picture: bool,
     drawn: usize,
+    /// True if far parts are drawn with fewer Gaussians.
+    levels: bool,
+    /// Gaussians of the last frame.
+    splats: usize,
     rate: Rate,
     title: (String, Option<Instant>),
     saved: Vec<PathBuf>,
@@ -155,6 +169,8 @@ impl Viewer {
     fn new(plan: Plan, source: Source, proxy: EventLoopProxy<Message>) -> Self {
         let current = source.made.upscale.unwrap_or(0);
         Self {
+            levels: plan.levels,
+            splats: 0,
             plan,
             name: source.name,
             photographs: source.photographs.map(Arc::new),
@@ -194,7 +210,7 @@ impl Viewer {
         let canvas = Canvas::open(Arc::new(window), &self.plan.device)?;
         print_line(format!("drawing on {}", canvas.gpu().adapter()));
         if let Some(made) = self.first.take() {
-            self.ready.insert(self.current, upload(canvas.gpu(), &made)?);
+            self.ready.insert(self.current, upload(canvas.gpu(), made)?);
         }
         self.canvas = Some(canvas);
         self.change();
@@ -223,7 +239,7 @@ impl Viewer {
 
     fn frame(&mut self, events: &ActiveEventLoop) -> Result<()> {
         let Some(canvas) = &mut self.canvas else { return Ok(()) };
-        let Some(ready) = self.ready.get(&self.current) else { return Ok(()) };
+        let Some(ready) = self.ready.get_mut(&self.current) else { return Ok(()) };
         let seconds = self.rate.begin(Instant::now(), self.running);
         if self.controls.moving() {
             let (along, fast) = self.controls.motion();
@@ -233,11 +249,21 @@ impl Viewer {
         let last = self.plan.frames.is_some_and(|n| self.drawn + 1 >= n);
         let capture = self.picture || (last && self.plan.save.is_some());
         let navigator = &mut self.navigator;
-        let camera = |width, height| {
+        let mut camera = |width, height| {
             navigator.resize(width, height);
             navigator.camera()
         };
-        let frame = match canvas.draw(&ready.scene, &ready.options, camera, capture) {
+        let (width, height) = canvas.size();
+        let now = camera(width, height);
+        // A picture that is saved depends on the camera only.
+        let exact = self.levels && (self.picture || self.plan.frames.is_some());
+        if exact && let Err(e) = ready.detail.complete(&now, canvas.gpu()) {
+            print_warning(format!("level of detail: {e:#}; all Gaussians are drawn"));
+        }
+        let coarser = self.levels.then(|| ready.detail.scene(&now)).flatten();
+        let scene = coarser.unwrap_or(&ready.scene);
+        self.splats = scene.len();
+        let frame = match canvas.draw(scene, &ready.options, camera, capture) {
             Ok(frame) => frame,
             Err(e) if self.before != self.current && !canvas.is_lost() => {
                 print_warning(format!("x{}: {e:#}; back to x{}", self.current, self.before));
@@ -265,8 +291,32 @@ impl Viewer {
         if self.running {
             self.redraw();
         }
+        self.continue_detail();
         self.update_title();
         Ok(())
+    }
+
+    /// Starts the next task for the level of detail, unless the scene is about to change.
+    fn continue_detail(&mut self) {
+        let (true, None, Some(canvas)) = (self.levels, self.busy, &self.canvas) else { return };
+        let Some(ready) = self.ready.get_mut(&self.current) else { return };
+        let camera = self.navigator.camera();
+        let Some(task) = ready.detail.missing(&camera, Fit::Fine) else { return };
+        let (number, gpu, proxy) = (ready.number, canvas.gpu().clone(), self.proxy.clone());
+        // A closed event loop needs no message.
+        let work = move || drop(proxy.send_event(Message::Detail(number, task.run(&gpu))));
+        if let Err(e) = std::thread::Builder::new().name("levels".to_owned()).spawn(work) {
+            self.finish_detail(number, Outcome::Failed(e.into()));
+        }
+    }
+
+    /// Takes the result of a task for the level of detail. A scene that was replaced needs none.
+    fn finish_detail(&mut self, number: usize, outcome: Outcome) {
+        let Some(ready) = self.ready.values_mut().find(|r| r.number == number) else { return };
+        match ready.detail.finish(outcome) {
+            Ok(()) => self.change(),
+            Err(e) => print_warning(format!("level of detail: {e:#}; all Gaussians are drawn")),
+        }
     }
 
     /// Saves a frame where it was requested.
@@ -291,7 +341,11 @@ impl Viewer {
     /// Updates the title, at most once per [`TITLE_EVERY`] during an animation.
     fn update_title(&mut self) {
         let Some(canvas) = &self.canvas else { return };
-        let splats = self.ready.get(&self.current).map_or(0, |r| r.scene.len());
+        let all = self.ready.get(&self.current).map_or(0, |r| r.scene.len());
+        let splats = match self.splats {
+            drawn if drawn == all || drawn == 0 => all.to_string(),
+            drawn => format!("{drawn} of {all}"),
+        };
         let fps = self.rate.fps().map_or(String::new(), |fps| {
             let digits = usize::from(fps < 10.0);
             format!(", {fps:.digits$} fps")
@@ -328,6 +382,10 @@ impl Viewer {
                 self.requested = r;
                 self.show_requested();
             }
+            KeyAction::Levels => {
+                self.levels = !self.levels;
+                self.change();
+            }
             KeyAction::Save => {
                 self.picture = true;
                 self.redraw();
@@ -363,7 +421,7 @@ impl Viewer {
         let work = move || {
             let mut stage = |name| drop(proxy.send_event(Message::Stage(name)));
             let mut show = |made: Made| {
-                drop(proxy.send_event(Message::Made(r, upload(&gpu, &made)?)));
+                drop(proxy.send_event(Message::Made(r, upload(&gpu, made)?)));
                 Ok(())
             };
             let done = photographs.make(r, &mut stage, &mut show);
@@ -425,10 +483,12 @@ impl Viewer {
     }
 }
 
-fn upload(gpu: &Gpu, made: &Made) -> Result<Ready> {
+fn upload(gpu: &Gpu, made: Made) -> Result<Ready> {
+    static NUMBER: AtomicUsize = AtomicUsize::new(0);
     let scene = gpu.upload_splats(&slices(&made.splats))?;
     let options = RasterOptions { sh_basis: made.splats.sh_basis(), ..made.options };
-    Ok(Ready { scene, options })
+    let number = NUMBER.fetch_add(1, Ordering::Relaxed);
+    Ok(Ready { scene, options, detail: Detail::new(made.splats), number })
 }
 
 impl ApplicationHandler<Message> for Viewer {
@@ -470,7 +530,10 @@ impl ApplicationHandler<Message> for Viewer {
                     }
                 }
                 self.show_requested();
+                // The level of detail waited for the work.
+                self.redraw();
             }
+            Message::Detail(number, outcome) => self.finish_detail(number, outcome),
         }
         self.update_title();
     }
