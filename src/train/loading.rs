@@ -25,7 +25,7 @@ pub struct LoaderOptions {
     /// Number of examples made ahead.
     pub ahead: usize,
     /// The examples that this process makes; it passes over the others.
-    pub(super) division: Division,
+    pub division: Division,
 }
 
 /// A queue of examples in the order of their indices, filled by separate threads.

@@ -81,16 +81,17 @@ impl Ranks {
     }
 }
 
-/// The ranks of all examples.
+/// Division of the examples among the ranks.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Division {
+pub struct Division {
     batch: usize,
     together: usize,
     ranks: Ranks,
 }
 
 impl Division {
-    pub(super) fn of(config: &TrainConfig, ranks: Ranks) -> Self {
+    /// The division for rank `ranks.rank` of a training.
+    pub fn of(config: &TrainConfig, ranks: Ranks) -> Self {
         Self { batch: config.batch.max(1), together: config.together.max(1), ranks }
     }
 
