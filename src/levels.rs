@@ -23,6 +23,8 @@
 //! | the same in the pixels that the scene covers | ∞ | ∞ | 49.9 | 44.3 | 38.0 | 35.8 |
 //! | the same with cells of 1.5 pixels | ∞ | 48.2 | 42.0 | 37.5 | 33.5 | 31.2 |
 //!
+//! `cargo bench --bench raster -- levels` times frames; README.md, "Viewer", has numbers.
+//!
 //! The picture of all Gaussians is itself no reference far away: the nearest of many Gaussians in a pixel
 //! decide its colour, while a merge has the mean of all.
 
@@ -334,7 +336,7 @@ fn block(splats: &Splats, grid: &Grid, first: usize, codes: &[(u64, u32)]) -> (B
 /// Makes the levels above 0 of the `entries` of a block, whose SH sets of `set` numbers are `sh`.
 fn coarse(mut entries: Vec<Entry>, mut sh: Vec<f32>, set: usize, grid: &Grid) -> Coarse {
     let mut made = Coarse::default();
-    // Each bit halves the cells along one axis.
+    // Each bit doubles the cells along one axis.
     for bits in 1..=3 * CURVE_BITS {
         if entries.len() < 2 {
             break;
