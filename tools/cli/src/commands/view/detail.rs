@@ -80,10 +80,12 @@ impl Detail {
         (!wanted.is_whole()).then_some(wanted)
     }
 
-    /// Returns the Gaussians to draw instead of all.
-    pub fn scene(&self, camera: &Camera) -> Option<&Scene> {
-        self.wanted(camera)?;
-        self.drawn.as_ref().map(|(_, scene)| scene)
+    /// Returns the Gaussians to draw instead of all. [`Fit::Fine`] includes those of an older
+    /// selection.
+    pub fn scene(&self, camera: &Camera, fit: Fit) -> Option<&Scene> {
+        let wanted = self.wanted(camera)?;
+        let (drawn, scene) = self.drawn.as_ref()?;
+        (fit == Fit::Fine || *drawn == wanted).then_some(scene)
     }
 
     /// Returns the work that is missing for a camera; `None` while other work goes on.
@@ -182,14 +184,16 @@ mod tests {
         let (splats, far, near) = (wall(), camera(8.0), camera(0.5));
         let mut detail = Detail::new(splats.clone());
         // The first task makes the levels; no second one begins before it is finished.
-        assert!(detail.scene(&far).is_none());
+        assert!(detail.scene(&far, Fit::Exact).is_none());
         let task = detail.missing(&far, Fit::Fine).unwrap();
         assert!(matches!(task, Task::Levels(_)) && detail.missing(&far, Fit::Fine).is_none());
         detail.finish(task.run(&gpu)).unwrap();
         // The camera near the wall shows all of it.
-        assert!(detail.missing(&near, Fit::Fine).is_none() && detail.scene(&near).is_none());
+        assert!(
+            detail.missing(&near, Fit::Fine).is_none() && detail.scene(&near, Fit::Fine).is_none()
+        );
         detail.complete(&far, &gpu).unwrap();
-        let scene = detail.scene(&far).unwrap();
+        let scene = detail.scene(&far, Fit::Exact).unwrap();
         let count = scene.len();
         assert!(2 * count < splats.len(), "{count}");
         let mut rasterizer = Rasterizer::new(gpu.clone());
@@ -202,14 +206,17 @@ mod tests {
         // A camera that approaches needs finer Gaussians; the older ones are drawn meanwhile.
         let nearer = camera(4.0);
         let task = detail.missing(&nearer, Fit::Fine).unwrap();
-        assert_eq!(detail.scene(&nearer).unwrap().len(), count);
+        assert_eq!(detail.scene(&nearer, Fit::Fine).unwrap().len(), count);
+        assert!(detail.scene(&nearer, Fit::Exact).is_none());
         detail.finish(task.run(&gpu)).unwrap();
-        assert!(detail.scene(&nearer).unwrap().len() > count);
+        assert!(detail.scene(&nearer, Fit::Fine).unwrap().len() > count);
         assert!(detail.missing(&nearer, Fit::Fine).is_none());
         // A failure ends the tasks, and all Gaussians are drawn.
         let task = detail.missing(&far, Fit::Exact).unwrap();
         drop(task);
         assert!(detail.finish(Outcome::Failed(Error::msg("no memory"))).is_err());
-        assert!(detail.scene(&far).is_none() && detail.missing(&far, Fit::Exact).is_none());
+        assert!(
+            detail.scene(&far, Fit::Exact).is_none() && detail.missing(&far, Fit::Exact).is_none()
+        );
     }
 }

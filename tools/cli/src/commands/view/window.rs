@@ -260,7 +260,8 @@ impl Viewer {
         if exact && let Err(e) = ready.detail.complete(&now, canvas.gpu()) {
             print_warning(format!("level of detail: {e:#}; all Gaussians are drawn"));
         }
-        let coarser = self.levels.then(|| ready.detail.scene(&now)).flatten();
+        let fit = if exact { Fit::Exact } else { Fit::Fine };
+        let coarser = self.levels.then(|| ready.detail.scene(&now, fit)).flatten();
         let scene = coarser.unwrap_or(&ready.scene);
         self.splats = scene.len();
         let frame = match canvas.draw(scene, &ready.options, camera, capture) {
