@@ -187,7 +187,8 @@ fn a_missing_rank_is_named() {
     assert!(twice.contains("without another training"), "{twice}");
     drop(alone);
 
-    let other = TrainConfig { seed: 4, ..tiny("depth") };
+    // The weights are the same.
+    let other = TrainConfig { steps: 41, ..tiny("depth") };
     let found = std::thread::scope(|scope| {
         let rank = |config, rank| {
             let ranks = Ranks { wait: Duration::from_secs(3), ..Ranks::new(rank, 2) };
