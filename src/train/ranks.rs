@@ -1,10 +1,11 @@
 //! One training over several processes: data-parallel ranks that exchange their gradients.
 //!
-//! The scenes of a step are in groups ([`TrainConfig::together`]), and group g of a step belongs to the
-//! rank g mod N. A rank computes the gradients of its groups and writes each to a file in the folder
-//! `exchange` of the training. Then it reads the files of all other groups, adds them in the order of
-//! the groups, and takes the optimizer's step on its own copy of the weights. One process adds the
-//! same groups in the same order, so the weights of N ranks equal those of one process bit for bit.
+//! The scenes of a step are in groups ([`TrainConfig::together`]), and group g, counted over all
+//! steps, belongs to the rank g mod N. A rank computes the gradients of its groups and writes each to
+//! a file in the folder `exchange` of the training. Then it reads the files of all other groups, adds
+//! them in the order of the groups, and takes the optimizer's step on its own copy of the weights. One
+//! process adds the same groups in the same order, so the weights of N ranks equal those of one
+//! process bit for bit.
 //!
 //! The ranks need a folder that all of them see, and nothing else: no server, no order of start, no
 //! network library. A rank reads and writes the gradients of all groups once a step, four bytes a
@@ -63,6 +64,11 @@ impl Ranks {
         Self::new(0, 1)
     }
 
+    /// Returns the rank of a group, counted over all steps.
+    fn owner(&self, group: u64) -> usize {
+        (group % self.count as u64) as usize
+    }
+
     /// Checks that every rank has a group in every step of `config`.
     ///
     /// # Errors
@@ -105,7 +111,7 @@ impl Division {
         let batch = self.batch as u64;
         let group = (index % batch) / self.together as u64;
         let all = (index / batch) * self.groups() as u64 + group;
-        all % self.ranks.count as u64 == self.ranks.rank as u64
+        self.ranks.owner(all) == self.ranks.rank
     }
 
     /// Number of ranks.
@@ -177,7 +183,7 @@ impl Exchange {
 
     /// Rank of a group of this step, of `groups` groups a step.
     fn owner(&self, group: usize, groups: usize) -> usize {
-        ((self.step * groups as u64 + group as u64) % self.ranks.count as u64) as usize
+        self.ranks.owner(self.step * groups as u64 + group as u64)
     }
 
     fn path(&self, group: usize, owner: usize) -> PathBuf {

@@ -266,7 +266,8 @@ impl Training {
     /// Returns `None` if loss or gradient were not finite; the weights are then unchanged.
     ///
     /// # Errors
-    /// An error of the source or the network; another rank whose gradients are missing; too many consecutive steps that were not finite.
+    /// An error of the source or the network; another rank whose gradients are missing; too many
+    /// consecutive steps that were not finite.
     pub fn step(&mut self) -> Result<Option<StepReport>> {
         let begin = Instant::now();
         let config = &self.config;

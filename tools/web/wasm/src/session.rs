@@ -68,7 +68,7 @@ impl Request {
 struct Network {
     /// `gpu`, or `cpu`.
     processor: &'static str,
-    /// Why the CPU did all or some of a GPU's work.
+    /// Reason for which the CPU did all or some of a GPU's work.
     reason: Option<String>,
 }
 
