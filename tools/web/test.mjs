@@ -118,6 +118,8 @@ async function levelOfDetail(page, way) {
   // 16 times the distance.
   await page.evaluate(() => viewer.wheel(Math.log(16) / Math.log(0.9)));
   const fewer = await capture(page);
+  // The page's canvas has another size than the captured picture, so its number is another one.
+  await idle(page);
   const far = await page.evaluate(() => viewer.drawn);
   await page.waitForFunction(
     (far) => document.querySelector(".splat-status").textContent.startsWith(far.toLocaleString("en")
