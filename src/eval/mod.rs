@@ -33,6 +33,8 @@ mod disturbance;
 mod evaluator;
 mod methods;
 mod page;
+mod pictures;
+mod preparation;
 mod score;
 mod tables;
 
@@ -41,5 +43,6 @@ pub use disturbance::Disturbance;
 pub use evaluator::{CaseResult, Evaluator, Options, TargetPictures};
 pub use methods::Method;
 pub use page::{Sheet, busiest, escaped, page};
+pub use preparation::Preparation;
 pub use score::{CaseScores, GaussianReport, InputReport, Score, Scores, TargetScores};
 pub use tables::{means_csv, report, targets_csv};

@@ -49,7 +49,7 @@ impl Tone {
 ///
 /// The reference is the photograph of middle brightness. The first one would be an arbitrary
 /// choice, and the errors of a chain of estimates would grow with the distance from it.
-pub(super) fn equalise(
+pub(crate) fn equalise(
     photos: &[Photo],
     inputs: &mut [Cropped],
     reports: &[PairReport],

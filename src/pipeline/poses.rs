@@ -65,7 +65,7 @@ const SEED: u64 = 1;
 ///
 /// # Errors
 /// A photograph of which no features can be taken.
-pub(super) fn adjusted(photos: &[Photo]) -> Result<Option<(Vec<Photo>, PoseAdjustment)>> {
+pub(crate) fn adjusted(photos: &[Photo]) -> Result<Option<(Vec<Photo>, PoseAdjustment)>> {
     let features = |p: &Photo| {
         let lens = Lens::known(p.camera().intrinsics);
         PosePhoto::from_rgb8(&p.image().data, lens, FEATURES)

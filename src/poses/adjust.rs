@@ -54,14 +54,26 @@ pub fn adjust_poses(photos: &[PosePhoto], cameras: &[Camera], seed: u64) -> Opti
     let back = Similarity::new(&moved, &kept);
     let (mut out, mut turned_deg) = (cameras.to_vec(), 0.0f64);
     for (&photo, pose) in placed.iter().zip(&moved) {
-        let (rotation, position) = back.pose(pose);
+        let (rotation, _) = back.pose(pose);
         let turn = rotation * given[photo].rotation;
         turned_deg = turned_deg.max(rotation_angle(&turn).to_degrees());
-        let matrix = Mat4::from_mat3_translation(rotation.as_mat3(), position.as_vec3());
-        out[photo] = Camera::new(cameras[photo].intrinsics, matrix).ok()?;
+        out[photo] = back.camera(pose, &cameras[photo])?;
     }
     let (before_px, after_px, points) = (adjusted.before, adjusted.after, adjusted.points);
     Some(PoseAdjustment { cameras: out, before_px, after_px, turned_deg, points })
+}
+
+/// Moves `others` by the similarity that moves the cameras `from` onto `to`: the mean rotation between
+/// them, then the scale and translation that fit their centres best. Thereby views of a scene follow
+/// cameras that were adjusted. `None` without a camera, where there is not one in `to` for each one in
+/// `from`, or where a camera is not finite.
+pub fn move_along(from: &[Camera], to: &[Camera], others: &[Camera]) -> Option<Vec<Camera>> {
+    if from.is_empty() || from.len() != to.len() {
+        return None;
+    }
+    let [from, to] = [from, to].map(|all| all.iter().map(absolute).collect::<Vec<_>>());
+    let similarity = Similarity::new(&from, &to);
+    others.iter().map(|c| similarity.camera(&absolute(c), c)).collect()
 }
 
 fn absolute(camera: &Camera) -> Absolute {
@@ -105,6 +117,13 @@ impl Similarity {
         }
         let scale = if shared > 0.0 && square > 0.0 { shared / square } else { 1.0 };
         Self { turn, scale, from: origin, to: target }
+    }
+
+    /// A camera that was moved, with the intrinsics of `like`.
+    fn camera(&self, camera: &Absolute, like: &Camera) -> Option<Camera> {
+        let (rotation, position) = self.pose(camera);
+        let matrix = Mat4::from_mat3_translation(rotation.as_mat3(), position.as_vec3());
+        Camera::new(like.intrinsics, matrix).ok()
     }
 
     /// Axes and position of a camera in the world.

@@ -25,7 +25,7 @@ mod tracks;
 mod two_view;
 mod world;
 
-pub use adjust::{PoseAdjustment, adjust_poses};
+pub use adjust::{PoseAdjustment, adjust_poses, move_along};
 pub use estimate::{
     Confidence, FocalEstimate, LeftOut, PoseEstimate, PoseOptions, PosePoint, PoseRefusal,
     PoseWarning, Uncertain, estimate_poses,

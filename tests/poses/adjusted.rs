@@ -2,7 +2,7 @@
 
 use glam::{Mat4, Quat, Vec3};
 use subsplat::camera::Camera;
-use subsplat::poses::{PosePhoto, adjust_poses};
+use subsplat::poses::{PosePhoto, adjust_poses, move_along};
 use subsplat_test_support::pose_errors::aligned_errors;
 use subsplat_test_support::posed_photos::{Intrinsics, PosedPhoto, photo_scene};
 
@@ -45,6 +45,15 @@ fn disturbed_cameras_come_back_to_within_a_third() {
     // The frame stays: the mean position and orientation are those of the given cameras.
     let mean = |c: &[Camera]| c.iter().map(Camera::position).sum::<Vec3>() / c.len() as f32;
     assert!(mean(&found.cameras).distance(mean(&given)) < 1e-4, "{found:?}");
+    // Another camera of the scene follows: relative to the first one it stands where it stood.
+    let other = disturbed(&truth[1], 3, 5.0, distance);
+    let moved = move_along(&truth, &found.cameras, &[other]).unwrap()[0];
+    let seen =
+        |from: &Camera, c: &Camera| from.world_from_camera().inverse() * c.world_from_camera();
+    let (want, got) = (seen(&truth[1], &other), seen(&found.cameras[1], &moved));
+    assert!(want.abs_diff_eq(got, 0.01), "{want} {got}");
+    assert!(move_along(&truth, &found.cameras[1..], &[other]).is_none());
+    assert!(move_along(&[], &[], &[other]).is_none());
     // Cameras that fit stay.
     assert!(adjust_poses(&features, &truth, 1).is_none_or(|a| a.turned_deg < 0.15));
     assert!(adjust_poses(&features, &truth[..2], 1).is_none());

@@ -15,7 +15,8 @@ use subsplat::config::{Config, LowpassRef, Preset};
 use subsplat::data::crop::CropOptions;
 use subsplat::data::pair::choose_pair;
 use subsplat::eval::{
-    Benchmark, CaseResult, Disturbance, Evaluator, InputReport, Method, Options, Scores,
+    Benchmark, CaseResult, Disturbance, Evaluator, InputReport, Method, Options, Preparation,
+    Scores,
 };
 use subsplat::io::cameras_json::{CameraFile, save_cameras_json};
 use subsplat::io::image::{Rgb, save_png};
@@ -23,7 +24,9 @@ use subsplat::io::scene::{Units, load_scene};
 use subsplat::metrics::psnr;
 use subsplat::model::lpips::Lpips;
 use subsplat::model::weights::read_tensors;
-use subsplat::pipeline::{self, Check, DepthBounds, DepthRange, Detail, Photo, Reconstructor};
+use subsplat::pipeline::{
+    self, Check, DepthBounds, DepthRange, Detail, Photo, Poses, Reconstructor,
+};
 use subsplat::render;
 
 fn untrained(upscale: usize) -> Reconstructor {
@@ -121,6 +124,36 @@ fn disturbed_inputs_differ_by_name() {
     let ratio = mean(&dark.inputs[1]) / mean(&plain.inputs[1]);
     // Half the light at exponent 2.2.
     assert!((ratio - 0.7297).abs() < 0.01, "{ratio}");
+}
+
+/// Inputs that are prepared as `run` prepares them come back from a wrong pose and a dark photograph.
+#[test]
+fn prepared_inputs_come_back_from_disturbances() {
+    let data = Benchmark::open("examples/room".as_ref(), None).unwrap();
+    let model = untrained(1);
+    let case = &data.cases()[0];
+    let run = |disturbance: Option<Disturbance>, preparation: Preparation| {
+        let disturbances = disturbance.into_iter().collect();
+        let input_size = Some((256, 256));
+        let options =
+            Options { disturbances, preparation, input_size, ..options(1, &[Method::Backbone]) };
+        Evaluator::new(options).case(Some(&model), case, data.load(case).unwrap()).unwrap()
+    };
+    let psnr = |r: &CaseResult| r.scores.targets[0].scores[0].psnr;
+    let grey = |p: &Rgb| p.data.iter().map(|v| f64::from(*v)).sum::<f64>() / p.data.len() as f64;
+    let given = Preparation::default();
+    let adjusted = Preparation { poses: Poses::Adjusted, ..given };
+    let equal = Preparation { equal_exposure: true, ..given };
+    let plain = run(None, given);
+    let loss = |disturbance: Disturbance, preparation: Preparation| {
+        let found = run(Some(disturbance), preparation);
+        (psnr(&plain) - psnr(&found), (grey(&plain.inputs[1]) - grey(&found.inputs[1])).abs())
+    };
+    let (wrong, back) = (loss(Disturbance::Rotation, given), loss(Disturbance::Rotation, adjusted));
+    assert!(wrong.0 > 0.3 && back.0 < 0.6 * wrong.0, "rotation: {wrong:?} dB, {back:?}");
+    let (wrong, back) = (loss(Disturbance::Dark, given), loss(Disturbance::Dark, equal));
+    assert!(wrong.0 > 0.5 && back.0 < 0.2 * wrong.0, "dark: {wrong:?} dB, {back:?}");
+    assert!(wrong.1 > 20.0 && back.1 < 2.0, "dark: {wrong:?}, {back:?} levels");
 }
 
 /// Every method that renders, against the pipeline's own functions by hand.

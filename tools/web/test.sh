@@ -4,8 +4,12 @@
 # Before them, the unit tests of the SIMD level simd128 run under node.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
-command -v node >/dev/null && command -v npm >/dev/null && command -v chromium >/dev/null ||
-    { apt-get update && apt-get install -y --no-install-recommends chromium nodejs npm; }
+# Only missing packages: Debian's npm conflicts with other builds of nodejs.
+missing=()
+command -v chromium >/dev/null || missing+=(chromium)
+command -v npm >/dev/null || missing+=(nodejs npm)
+[[ ${#missing[@]} -eq 0 ]] ||
+    { apt-get update && apt-get install -y --no-install-recommends "${missing[@]}"; }
 place=out/web-test
 mkdir -p "$place"
 

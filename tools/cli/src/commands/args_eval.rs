@@ -73,6 +73,14 @@ pub struct EvalArgs {
     /// disturbed inputs.
     #[arg(long, value_delimiter = ',', value_name = "D,…", value_parser = disturbance)]
     pub disturb: Vec<Disturbance>,
+    /// Adjust the inputs' cameras by points matched between them, as in `run`. The targets' cameras
+    /// follow by one similarity.
+    #[arg(long)]
+    pub adjust_poses: bool,
+    /// Give the inputs the exposure and white balance of one of them, as `run` does. Of two inputs it
+    /// is the first.
+    #[arg(long)]
+    pub equal_exposure: bool,
     /// VGG16 and LPIPS weights (.safetensors, made by subsplat-convert).
     #[arg(long, value_name = "FILE")]
     pub lpips: Option<PathBuf>,

@@ -12,12 +12,12 @@ use std::io::Write;
 use std::path::Path;
 use subsplat::data::crop::{CropRule, LrFrom};
 use subsplat::eval::{
-    Benchmark, CaseResult, Evaluator, Method, Options, Score, Scores, Sheet, means_csv, page,
-    report, targets_csv,
+    Benchmark, CaseResult, Evaluator, Method, Options, Preparation, Score, Scores, Sheet,
+    means_csv, page, report, targets_csv,
 };
 use subsplat::io::image::save_png;
 use subsplat::io::write_atomic;
-use subsplat::pipeline::{DepthRange, Reconstructor, is_mvsplat};
+use subsplat::pipeline::{DepthRange, Poses, Reconstructor, is_mvsplat};
 
 /// r without arguments or weights that state one.
 const UPSCALE: f32 = 2.0;
@@ -61,6 +61,10 @@ pub fn eval(args: &EvalArgs, answer: Answer) -> Result<()> {
             LrFromArg::Independent => LrFrom::Independent,
         },
         disturbances: args.disturb.clone(),
+        preparation: Preparation {
+            poses: if args.adjust_poses { Poses::Adjusted } else { Poses::Given },
+            equal_exposure: args.equal_exposure,
+        },
         density: args.gaussians,
         ..Options::new(upscale)
     };
@@ -316,6 +320,8 @@ fn protocol(args: &EvalArgs, options: &Options, model: Option<&Reconstructor>) -
         "crop": if options.rule == CropRule::Mvsplat { "mvsplat" } else { "exact" },
         "lr_from": if options.lr_from == LrFrom::HrCrop { "hr_crop" } else { "independent" },
         "disturbances": args.disturb.iter().map(|d| d.name()).collect::<Vec<_>>(),
+        "poses": if args.adjust_poses { "adjusted" } else { "given" },
+        "equal_exposure": args.equal_exposure,
         "weights": args.weights.as_ref().map(|p| p.display().to_string()),
         "seed": args.seed,
         "shard": args.shard.map(|(part, parts)| format!("{part}/{parts}")),

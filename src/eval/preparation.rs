@@ -1,0 +1,60 @@
+//! Preparation of the inputs before the network, as [`crate::pipeline`] does it for `run`.
+
+use crate::camera::Camera;
+use crate::data::crop::Cropped;
+use crate::pipeline::{Photo, Poses, Result, adjusted, check_pairs, equalise};
+use crate::poses::move_along;
+
+/// Steps before the network. They receive the pictures of the target's size and the cameras after all
+/// disturbances.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Preparation {
+    /// Whether cameras are adjusted by points matched between the inputs. The targets' cameras then
+    /// follow by one similarity, because nothing tells which camera of a pair was wrong.
+    pub poses: Poses,
+    /// Whether the inputs receive the exposure and white balance of one of them: of two inputs, the
+    /// first one's.
+    pub equal_exposure: bool,
+}
+
+impl Preparation {
+    /// Prepares the inputs of a case. `given`: their cameras before any disturbance.
+    ///
+    /// # Errors
+    /// Pictures of which no features can be taken.
+    pub(super) fn apply(
+        self,
+        given: &[Camera],
+        inputs: &mut [Cropped],
+        targets: &mut [Cropped],
+    ) -> Result<()> {
+        if self == Self::default() {
+            return Ok(());
+        }
+        let photo = |c: &Cropped| Photo::new(c.target.clone(), c.target_camera);
+        let mut photos = inputs.iter().map(photo).collect::<Result<Vec<_>>>()?;
+        if self.poses == Poses::Adjusted {
+            if let Some((moved, _)) = adjusted(&photos)? {
+                photos = moved;
+            }
+            let cameras: Vec<Camera> = photos.iter().map(|p| *p.camera()).collect();
+            inputs.iter_mut().zip(&cameras).for_each(|(c, camera)| place(c, camera));
+            // Position, orientation and size of the whole scene are no error of a reconstruction.
+            let seen: Vec<Camera> = targets.iter().map(|c| c.target_camera).collect();
+            if let Some(moved) = move_along(given, &cameras, &seen) {
+                targets.iter_mut().zip(&moved).for_each(|(c, camera)| place(c, camera));
+            }
+        }
+        if self.equal_exposure {
+            let reports = check_pairs(&photos, |_| Ok(()))?;
+            equalise(&photos, inputs, &reports);
+        }
+        Ok(())
+    }
+}
+
+/// Moves both cameras of a crop to the pose of `camera`.
+fn place(crop: &mut Cropped, camera: &Camera) {
+    crop.input_camera.world_from_camera = camera.world_from_camera;
+    crop.target_camera.world_from_camera = camera.world_from_camera;
+}
