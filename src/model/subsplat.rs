@@ -5,6 +5,9 @@ use super::backbone::{Mvsplat, SmallBackbone};
 use super::depth_range;
 use super::primaries::primaries;
 use super::trace::{Checkpoint, Trace};
+#[cfg(feature = "gpu")]
+use super::traced::Tape;
+use super::traced::Traced;
 use super::trunk::{Children, Trunk};
 use super::{BackboneOutput, Primaries, Views};
 use crate::abi::RasterOptions;
@@ -14,6 +17,7 @@ use crate::ops::{Array, Backend};
 use candle_core::{Error, Result, Tensor, bail};
 use candle_nn::VarBuilder;
 
+#[derive(Clone)]
 enum Encoder {
     Mvsplat(Box<Mvsplat>),
     Small(Box<SmallBackbone>),
@@ -24,6 +28,7 @@ enum Encoder {
 /// Parameter names: MVSplat's own at the root (a converted checkpoint loads with or
 /// without its `encoder.` prefix), the small backbone's under `small.`, SubSplat's under
 /// `subsplat.`.
+#[derive(Clone)]
 pub struct SubSplat {
     config: Config,
     encoder: Encoder,
@@ -59,7 +64,8 @@ impl SubSplat {
     }
 
     /// Returns the model on `backend`: at inference the network and the rasterizer, in training
-    /// plane sweep, attention gather, SPGR and rasterizer. Everything else runs on the CPU.
+    /// the small backbone and a trunk without aggregation. Of other networks' training a GPU
+    /// computes plane sweep, attention gather and SPGR.
     pub fn with_backend(mut self, backend: &Backend) -> Self {
         match &mut self.encoder {
             Encoder::Mvsplat(encoder) => encoder.set_backend(backend),
@@ -195,7 +201,8 @@ impl SubSplat {
     }
 
     /// Runs the backbone for training: with every gradient, and with its depth maps if it
-    /// is the small one.
+    /// is the small one. A GPU computes the small one; its output then has the feature maps only
+    /// where the trunk reads them.
     ///
     /// # Errors
     /// A side is not a multiple of [`Config::stride`].
@@ -203,25 +210,50 @@ impl SubSplat {
         &self,
         views: &Views,
         mean: DisparityMean,
-    ) -> Result<(BackboneOutput, Option<DepthMaps>)> {
-        match &self.encoder {
-            Encoder::Mvsplat(encoder) => Ok((encoder.forward(views, &mut Trace::off())?, None)),
-            Encoder::Small(encoder) => {
-                let (output, maps) = encoder.forward(views, mean)?;
-                Ok((output, Some(maps)))
+    ) -> Result<Traced<(BackboneOutput, Option<DepthMaps>)>> {
+        let encoder = match &self.encoder {
+            Encoder::Mvsplat(encoder) => {
+                return Ok(Traced::on_host((encoder.forward(views, &mut Trace::off())?, None)));
             }
+            Encoder::Small(encoder) => encoder,
+        };
+        #[cfg(feature = "gpu")]
+        if let Some(result) = self.trunk.on_device(|executor| {
+            let images = executor.upload(&views.images)?;
+            let (mut output, maps) = encoder.forward_on(views, &images, mean, &Trace::off())?;
+            if !self.trunk.reads_features() {
+                output.features.clear();
+            }
+            let mut tape = Tape::new(executor);
+            let output = output.copied(&mut tape)?;
+            let maps = maps.copied(&mut tape)?;
+            Ok(Traced::on_device((output, Some(maps)), tape))
+        }) {
+            return result;
         }
+        let (output, maps) = encoder.forward(views, mean)?;
+        Ok(Traced::on_host((output, Some(maps))))
     }
 
-    /// Computes the small backbone's depth alone.
+    /// Computes the small backbone's depth alone, with every gradient.
     ///
     /// # Errors
     /// The backbone is MVSplat's; a side is not a multiple of [`Config::stride`].
-    pub fn depth_maps(&self, views: &Views, mean: DisparityMean) -> Result<DepthMaps> {
-        match &self.encoder {
-            Encoder::Mvsplat(_) => bail!("depth maps: expected the small backbone, got MVSplat's"),
-            Encoder::Small(encoder) => encoder.depth(views, mean),
+    pub fn depth_maps(&self, views: &Views, mean: DisparityMean) -> Result<Traced<DepthMaps>> {
+        let Encoder::Small(encoder) = &self.encoder else {
+            bail!("depth maps: expected the small backbone, got MVSplat's")
+        };
+        #[cfg(feature = "gpu")]
+        if let Some(result) = self.trunk.on_device(|executor| {
+            let images = executor.upload(&views.images)?;
+            let maps = encoder.depth_on(views, &images, mean, &Trace::off())?;
+            let mut tape = Tape::new(executor);
+            let maps = maps.copied(&mut tape)?;
+            Ok(Traced::on_device(maps, tape))
+        }) {
+            return result;
         }
+        Ok(Traced::on_host(encoder.depth(views, mean)?))
     }
 
     /// Returns the world-frame primaries of the backbone's `output`.

@@ -3,6 +3,9 @@
 //! backward pass recomputes each chunk of parents with a graph of its own. The tensors of a
 //! chunk fit into a core's cache.
 //!
+//! A GPU computes both passes of a trunk without aggregation. The gradients of its parameters and
+//! inputs then return as scalars of candle's graph.
+//!
 //! The maps' gradient is kept as factors ([`Deferred`]) and added where parents sampled the maps;
 //! a dense gradient of a chunk would be mostly zeros.
 
@@ -14,9 +17,16 @@ use crate::model::{BackboneOutput, Primaries, Views};
 use crate::ops::attention_gather::Deferred;
 use crate::ops::precomputed_gradient::precomputed_gradient;
 use crate::ops::spgr::spgr_on;
+#[cfg(feature = "gpu")]
+use crate::ops::{Array, DeviceArray};
 use candle_core::backprop::GradStore;
 use candle_core::{Result, Tensor, Var, bail};
 use rayon::prelude::*;
+
+/// Parents per chunk on a GPU. The tape of a chunk holds about 30 activations `[8192, 128]`, 4 MiB
+/// each.
+#[cfg(feature = "gpu")]
+const CHUNK_GPU: usize = 1 << 13;
 
 /// State of [`Trunk::forward_recomputed`] for the backward pass.
 pub struct Recomputed<'a> {
@@ -27,6 +37,9 @@ pub struct Recomputed<'a> {
     chunk: usize,
     seed: u64,
     children: Children,
+    /// The same parents on the GPU that computed the children.
+    #[cfg(feature = "gpu")]
+    device: Option<Scene<'a, DeviceArray>>,
 }
 
 /// Gradients of one chunk.
@@ -62,11 +75,35 @@ impl Trunk {
         };
         let scene = self.scene(parts, views, backbone, primaries)?;
         let sh = interleaved(&primaries.sh)?;
-        let outside = scene.leaves();
         let mode = Mode::Train { seed };
+        #[cfg(feature = "gpu")]
+        if parts.aggregation.is_none()
+            && let Some(result) = self.on_device(|executor| {
+                let like = |t: &Tensor| executor.upload(&t.detach());
+                let device = self.scene_on(parts, views, backbone, primaries, like)?;
+                let how = super::Chunking { size: CHUNK_GPU, mode, checkpoint: &|| Ok(()) };
+                let sh = (sh.clone(), primaries.sh_basis);
+                let children = self.children(parts, &device, sh, &how)?;
+                Ok((children, device))
+            })
+        {
+            let (children, device) = result?;
+            let (trunk, device) = (self, Some(device));
+            return Ok(Recomputed { trunk, parts, scene, chunk, seed, children, device });
+        }
+        let outside = scene.leaves();
         let how = super::Chunking { size: super::CHUNK, mode, checkpoint: &|| Ok(()) };
         let children = self.children(parts, &outside, (sh, primaries.sh_basis), &how)?;
-        Ok(Recomputed { trunk: self, parts, scene, chunk: chunk.max(1), seed, children })
+        Ok(Recomputed {
+            trunk: self,
+            parts,
+            scene,
+            chunk: chunk.max(1),
+            seed,
+            children,
+            #[cfg(feature = "gpu")]
+            device: None,
+        })
     }
 }
 
@@ -99,8 +136,8 @@ impl Recomputed<'_> {
     /// `[N·K, 11]` and `gain` of `[N·K]` or `[N·K, 4]`.
     ///
     /// `each` receives the parameters' gradients of every chunk, in order. The returned
-    /// scalars carry the gradients of the backbone and of the maps' projections: the caller
-    /// applies candle's `backward` to their sum. The order of summation does not depend on
+    /// scalars carry the gradients of the backbone and of the maps' projections, on a GPU also
+    /// those of the parameters: the caller applies candle's `backward` to their sum. The order of summation does not depend on
     /// the number of threads.
     ///
     /// # Errors
@@ -121,6 +158,10 @@ impl Recomputed<'_> {
             return Err(candle_core::Error::Msg(text).into());
         }
         let wanted = inputs(&self.scene).iter().any(|t| t.track_op());
+        #[cfg(feature = "gpu")]
+        if let Some(scene) = &self.device {
+            return Ok(self.backward_on(scene, [rows, gain], wanted)?);
+        }
         let zeros = |t: &Tensor| vec![0f32; t.elem_count()];
         let mut inputs_sum: Vec<Vec<f32>> = match wanted {
             true => inputs(&self.scene).into_iter().map(zeros).collect(),
@@ -158,6 +199,58 @@ impl Recomputed<'_> {
             }
         }
         Ok(rest)
+    }
+
+    /// [`Recomputed::backward`] on the GPU of `scene`. The scalars carry the parameters'
+    /// gradients too.
+    #[cfg(feature = "gpu")]
+    fn backward_on(
+        &self,
+        scene: &Scene<'_, DeviceArray>,
+        [rows, gain]: [&[f32]; 2],
+        wanted: bool,
+    ) -> Result<Vec<Tensor>> {
+        let [n, _] = scene.means.sizes()?;
+        let tensors = inputs(&self.scene);
+        let mut sums: Vec<Vec<f32>> =
+            tensors.iter().map(|t| vec![0.0; if wanted { t.elem_count() } else { 0 }]).collect();
+        let mut scalars = Vec::new();
+        for span in chunks(n, scene.per_view, CHUNK_GPU) {
+            let own = scene.chunk(span)?;
+            let leaf = |array: &DeviceArray| if wanted { array.leaf() } else { array.clone() };
+            let own = ParentChunk {
+                means: leaf(&own.means),
+                quats_wxyz: leaf(&own.quats_wxyz),
+                scales: leaf(&own.scales),
+                opacities: leaf(&own.opacities),
+                sh: leaf(&own.sh),
+                ..own
+            };
+            let leaves = [&own.means, &own.quats_wxyz, &own.scales, &own.opacities, &own.sh]
+                .map(DeviceArray::clone);
+            let mode = Mode::Train { seed: self.seed };
+            let Records { head, parents } = self.trunk.records_of(self.parts, scene, own, mode)?;
+            let part = |all: &[f32]| {
+                let width = all.len() / n;
+                all[span.first * width..(span.first + span.len) * width].to_vec()
+            };
+            let children = [part(rows), part(gain)];
+            let gradients = head.children_backward(&parents, &scene.call(span), children)?;
+            scalars.extend(gradients.scalars()?);
+            for (sum, leaf) in sums.iter_mut().zip(&leaves).filter(|_| wanted) {
+                let width = sum.len() / n;
+                if let Some(gradient) = gradients.of(leaf) {
+                    let own = gradient.to_host()?.flatten_all()?.to_vec1::<f32>()?;
+                    sum[span.first * width..][..own.len()].copy_from_slice(&own);
+                }
+            }
+        }
+        for (tensor, gradient) in tensors.into_iter().zip(sums) {
+            if tensor.track_op() {
+                scalars.push(precomputed_gradient(tensor, 0.0, gradient)?);
+            }
+        }
+        Ok(scalars)
     }
 
     /// Forward and backward pass of one chunk.
