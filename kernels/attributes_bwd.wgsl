@@ -17,10 +17,10 @@ fn main(
         return;
     }
     let row = i * SPLAT_STRIDE;
-    let from = i * 11u;
+    let first = i * 11u;
     let m = row + MEAN_OFFSET;
     let mean = vec3<f32>(rows[m], rows[m + 1u], rows[m + 2u]);
-    var d_position = vec3<f32>(dy[from], dy[from + 1u], dy[from + 2u]);
+    var d_position = vec3<f32>(dy[first], dy[first + 1u], dy[first + 2u]);
     let q = row + QUAT_OFFSET;
     var quat_w = rows[q];
     var position = mean;
@@ -46,7 +46,7 @@ fn main(
             dot(call.frame[2].xyz, d_position),
         );
     }
-    var d_scale = vec3<f32>(dy[from + 3u], dy[from + 4u], dy[from + 5u]);
+    var d_scale = vec3<f32>(dy[first + 3u], dy[first + 4u], dy[first + 5u]);
     if call.log_px == 1u {
         let away = mean - vec3<f32>(call.source[0].w, call.source[1].w, call.source[2].w);
         let axis = vec3<f32>(call.source[0].z, call.source[1].z, call.source[2].z);
@@ -58,7 +58,7 @@ fn main(
         let least = vec3<f32>(call.scale_min);
         d_scale = select(vec3<f32>(), d_scale / max(scale, least), scale > least);
     }
-    var d_quat = vec4<f32>(dy[from + 6u], dy[from + 7u], dy[from + 8u], dy[from + 9u]);
+    var d_quat = vec4<f32>(dy[first + 6u], dy[first + 7u], dy[first + 8u], dy[first + 9u]);
     if quat_w < 0.0 {
         d_quat = -d_quat;
     }
@@ -66,7 +66,7 @@ fn main(
         d_quat = call.turn[0] * d_quat.x + call.turn[1] * d_quat.y + call.turn[2] * d_quat.z
             + call.turn[3] * d_quat.w;
     }
-    var d_opacity = dy[from + 10u];
+    var d_opacity = dy[first + 10u];
     if call.logit == 1u {
         let opacity = rows[row + OPACITY_OFFSET];
         let low = call.logit_low;

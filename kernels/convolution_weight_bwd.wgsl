@@ -72,8 +72,8 @@ fn main(
         for (var j = 0u; j < 4u; j++) {
             let output = first_output + line + j;
             let has_output = pixel < end && output < call.outputs;
-            let from = (b * call.outputs + output) * call.pixels + pixel;
-            outputs[j] = select(0.0, dy[select(0u, from, has_output)], has_output);
+            let place_of_dy = (b * call.outputs + output) * call.pixels + pixel;
+            outputs[j] = select(0.0, dy[select(0u, place_of_dy, has_output)], has_output);
             let at = corner + taps[j];
             let inside = pixel < end && first_term + line + j < call.terms
                 && all(at >= vec3<i32>()) && all(at < size);

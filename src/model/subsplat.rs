@@ -64,8 +64,7 @@ impl SubSplat {
     }
 
     /// Returns the model on `backend`: at inference the network and the rasterizer, in training
-    /// the small backbone and a trunk without aggregation. Of other networks' training a GPU
-    /// computes plane sweep, attention gather and SPGR.
+    /// the backbone and a trunk without aggregation.
     pub fn with_backend(mut self, backend: &Backend) -> Self {
         match &mut self.encoder {
             Encoder::Mvsplat(encoder) => encoder.set_backend(backend),
@@ -201,8 +200,7 @@ impl SubSplat {
     }
 
     /// Runs the backbone for training: with every gradient, and with its depth maps if it
-    /// is the small one. A GPU computes the small one; its output then has the feature maps only
-    /// where the trunk reads them.
+    /// is the small one. The output of a GPU has feature maps only where the trunk reads them.
     ///
     /// # Errors
     /// A side is not a multiple of [`Config::stride`].
@@ -211,28 +209,39 @@ impl SubSplat {
         views: &Views,
         mean: DisparityMean,
     ) -> Result<Traced<(BackboneOutput, Option<DepthMaps>)>> {
-        let encoder = match &self.encoder {
-            Encoder::Mvsplat(encoder) => {
-                return Ok(Traced::on_host((encoder.forward(views, &mut Trace::off())?, None)));
-            }
-            Encoder::Small(encoder) => encoder,
-        };
         #[cfg(feature = "gpu")]
         if let Some(result) = self.trunk.on_device(|executor| {
             let images = executor.upload(&views.images)?;
-            let (mut output, maps) = encoder.forward_on(views, &images, mean, &Trace::off())?;
+            let (mut output, maps) = self.train_on(views, &images, mean)?;
             if !self.trunk.reads_features() {
                 output.features.clear();
             }
             let mut tape = Tape::new(executor);
             let output = output.copied(&mut tape)?;
-            let maps = maps.copied(&mut tape)?;
-            Ok(Traced::on_device((output, Some(maps)), tape))
+            let maps = maps.map(|maps| maps.copied(&mut tape)).transpose()?;
+            Ok(Traced::on_device((output, maps), tape))
         }) {
             return result;
         }
-        let (output, maps) = encoder.forward(views, mean)?;
-        Ok(Traced::on_host((output, Some(maps))))
+        Ok(Traced::on_host(self.train_on(views, &views.images, mean)?))
+    }
+
+    /// Runs the backbone for training on the executor of `images`, the views' images.
+    fn train_on<A: Array>(
+        &self,
+        views: &Views,
+        images: &A,
+        mean: DisparityMean,
+    ) -> Result<(BackboneOutput<A>, Option<DepthMaps<A>>)> {
+        match &self.encoder {
+            Encoder::Mvsplat(encoder) => {
+                Ok((encoder.forward_on(views, images, &mut Trace::off())?, None))
+            }
+            Encoder::Small(encoder) => {
+                let (output, maps) = encoder.forward_on(views, images, mean, &Trace::off())?;
+                Ok((output, Some(maps)))
+            }
+        }
     }
 
     /// Computes the small backbone's depth alone, with every gradient.

@@ -163,8 +163,8 @@ impl Trunk {
         })
     }
 
-    /// Sets the backend of the following calls: at inference of all operations, in training
-    /// likewise without aggregation, else of gathers and SPGR.
+    /// Sets the backend of the following calls: of all operations, in training only where
+    /// [`Trunk::trains_on_device`], else of gathers and SPGR.
     pub fn set_backend(&mut self, backend: &Backend) {
         self.backend = backend.clone();
         #[cfg(feature = "gpu")]

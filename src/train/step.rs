@@ -496,7 +496,7 @@ impl Learner {
         let parents = packed(output, views, &settings)?;
         let mut trunk = model.trunk().clone();
         trunk.set_upscale(example.upscale())?;
-        if trunk.reads_features() {
+        if trunk.reads_features() && !trunk.trains_on_device() {
             // Each chunk of a gather on a GPU would upload the feature maps.
             trunk.set_backend(&Backend::Cpu);
         }

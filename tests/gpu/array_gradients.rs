@@ -11,6 +11,7 @@ use subsplat::config::MaskMode;
 use subsplat::model::Backend;
 use subsplat::model::geometry::Frames;
 use subsplat::ops::activation::Activation;
+use subsplat::ops::attention::Labels;
 use subsplat::ops::attributes::Attributes;
 use subsplat::ops::plane_sweep::{Sweep, pair, relative_pose};
 use subsplat::ops::precomputed_gradient::precomputed_gradient;
@@ -228,6 +229,27 @@ fn norms() {
             bias | { x.layer_norm([weight, bias]) }
         );
     }
+}
+
+#[test]
+fn attention() {
+    let Some(gpu) = executor() else { return };
+    let r = &mut Random(9);
+    for (rows, l, m, d, e) in [(4, 37, 70, 24, 24), (2, 64, 64, 128, 128), (3, 1, 5, 3, 40)] {
+        let (q, k, v) = (noise(r, &[rows, l, d]), noise(r, &[rows, m, d]), noise(r, &[rows, m, e]));
+        same_gradients!(gpu, "attention", DIFFERENCES, [] | q, k, v | q.attention(k, v, 0.2, None));
+    }
+    let (q, k, v) = (noise(r, &[4, 33, 16]), noise(r, &[4, 66, 16]), noise(r, &[4, 66, 16]));
+    let label = |n: usize, step: usize| (0..n).map(|i| (i / step % 3) as u8).collect::<Vec<_>>();
+    let labels = Labels { windows: 2, queries: label(66, 7), keys: label(132, 5) };
+    same_gradients!(
+        gpu,
+        "labels",
+        DIFFERENCES,
+        [] | q,
+        k,
+        v | { q.attention(k, v, 0.4, Some(labels.clone())) }
+    );
 }
 
 #[test]

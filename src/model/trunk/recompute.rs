@@ -3,14 +3,16 @@
 //! backward pass recomputes each chunk of parents with a graph of its own. The tensors of a
 //! chunk fit into a core's cache.
 //!
-//! A GPU computes both passes of a trunk without aggregation. The gradients of its parameters and
-//! inputs then return as scalars of candle's graph.
+//! A GPU computes both passes ([`Trunk::trains_on_device`]). The gradients of parameters and inputs
+//! then return as scalars of candle's graph.
 //!
 //! The maps' gradient is kept as factors ([`Deferred`]) and added where parents sampled the maps;
 //! a dense gradient of a chunk would be mostly zeros.
 
 use super::{Children, Parts, Records, Scene, Span, TrainPass, Trunk, chunks, interleaved};
 use crate::abi::SPLAT_STRIDE;
+#[cfg(feature = "gpu")]
+use crate::model::aggregation::Prepared;
 use crate::model::geometry::ParentChunk;
 use crate::model::mlp::Mode;
 use crate::model::{BackboneOutput, Primaries, Views};
@@ -57,6 +59,18 @@ fn inputs<'s>(scene: &'s Scene) -> [&'s Tensor; 5] {
 }
 
 impl Trunk {
+    /// Returns whether the trunk's GPU computes its training pass. The CPU computes that of an
+    /// aggregation that neither preset uses.
+    pub fn trains_on_device(&self) -> bool {
+        #[cfg(feature = "gpu")]
+        if self.executor.is_some() {
+            let aggregation = self.parts().and_then(|parts| parts.aggregation.as_ref());
+            return aggregation
+                .is_none_or(crate::model::aggregation::Aggregation::trains_on_device);
+        }
+        false
+    }
+
     /// Computes the children of the one scene in `views`, f32. Their rows and gains are
     /// outside any graph: [`Recomputed::backward`] propagates their gradient. The
     /// coefficients `sh` are those of `primaries`, in their graph.
@@ -77,10 +91,12 @@ impl Trunk {
         let sh = interleaved(&primaries.sh)?;
         let mode = Mode::Train { seed };
         #[cfg(feature = "gpu")]
-        if parts.aggregation.is_none()
+        if self.trains_on_device()
             && let Some(result) = self.on_device(|executor| {
-                let like = |t: &Tensor| executor.upload(&t.detach());
-                let device = self.scene_on(parts, views, backbone, primaries, like)?;
+                // Feature maps are leaves of the tape; the parents' gradients are requested by chunk.
+                let device = self
+                    .scene_on(parts, views, backbone, primaries, |t: &Tensor| executor.upload(t))?;
+                let device = device.without_parents_tape();
                 let how = super::Chunking { size: CHUNK_GPU, mode, checkpoint: &|| Ok(()) };
                 let sh = (sh.clone(), primaries.sh_basis);
                 let children = self.children(parts, &device, sh, &how)?;
@@ -122,6 +138,21 @@ impl<'a> Scene<'a> {
             prepared: self.prepared.as_ref().map(|p| p.deferring()),
             heads: self.heads.clone(),
             rules: self.rules,
+        }
+    }
+}
+
+#[cfg(feature = "gpu")]
+impl Scene<'_, DeviceArray> {
+    /// Returns the same arrays, of which only the maps belong to a tape.
+    fn without_parents_tape(self) -> Self {
+        Self {
+            means: self.means.detached(),
+            quats_wxyz: self.quats_wxyz.detached(),
+            scales: self.scales.detached(),
+            opacities: self.opacities.detached(),
+            sh_input: self.sh_input.detached(),
+            ..self
         }
     }
 }
@@ -201,7 +232,7 @@ impl Recomputed<'_> {
         Ok(rest)
     }
 
-    /// [`Recomputed::backward`] on the GPU of `scene`. The scalars carry the parameters'
+    /// Computes [`Recomputed::backward`] on the GPU of `scene`. The scalars carry the parameters'
     /// gradients too.
     #[cfg(feature = "gpu")]
     fn backward_on(
@@ -215,6 +246,12 @@ impl Recomputed<'_> {
         let mut sums: Vec<Vec<f32>> =
             tensors.iter().map(|t| vec![0.0; if wanted { t.elem_count() } else { 0 }]).collect();
         let mut scalars = Vec::new();
+        // The maps' own tape is passed once, after all chunks.
+        let prepared = scene.prepared.as_ref().map(Prepared::leaves);
+        let mut of_maps: Vec<Option<DeviceArray>> =
+            prepared.iter().flat_map(|p| p.maps()).map(|_| None).collect();
+        let whole = scene;
+        let scene = &Scene { prepared, ..whole.clone() };
         for span in chunks(n, scene.per_view, CHUNK_GPU) {
             let own = scene.chunk(span)?;
             let leaf = |array: &DeviceArray| if wanted { array.leaf() } else { array.clone() };
@@ -237,6 +274,12 @@ impl Recomputed<'_> {
             let children = [part(rows), part(gain)];
             let gradients = head.children_backward(&parents, &scene.call(span), children)?;
             scalars.extend(gradients.scalars()?);
+            for (sum, map) in of_maps.iter_mut().zip(scene.prepared.iter().flat_map(|p| p.maps())) {
+                *sum = match (sum.take(), gradients.of(map)) {
+                    (Some(sum), Some(own)) => Some(sum.plus(&own)?),
+                    (sum, own) => sum.or(own),
+                };
+            }
             for (sum, leaf) in sums.iter_mut().zip(&leaves).filter(|_| wanted) {
                 let width = sum.len() / n;
                 if let Some(gradient) = gradients.of(leaf) {
@@ -244,6 +287,11 @@ impl Recomputed<'_> {
                     sum[span.first * width..][..own.len()].copy_from_slice(&own);
                 }
             }
+        }
+        let maps = whole.prepared.iter().flat_map(|p| p.maps()).zip(&of_maps);
+        let maps: Vec<_> = maps.filter_map(|(map, sum)| Some((map, sum.as_ref()?))).collect();
+        if let Some((map, _)) = maps.first() {
+            scalars.extend(map.executor().backward(&maps)?.scalars()?);
         }
         for (tensor, gradient) in tensors.into_iter().zip(sums) {
             if tensor.track_op() {

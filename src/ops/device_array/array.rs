@@ -1,20 +1,20 @@
 //! [`Array`] for arrays in device memory: each operation, and the rule of its gradient.
 
 use super::DeviceArray;
-use super::rules::{ProductRules, scaled, wanted};
-use crate::abi::{AttributesUniform, MuInput, SPLAT_STRIDE};
+use super::rules::{ProductRules, attention_call, attributes_uniform, pointwise, scaled, wanted};
+use crate::abi::SPLAT_STRIDE;
 use crate::camera::Camera;
 use crate::cpu::attention_gather::OCCLUSION_TOLERANCE;
 use crate::cpu::small::cross_check;
 use crate::gpu::{
-    self, AttentionCall, ConvolutionCall, CrossCheckCall, Function, HeadOutputCall,
-    PointwiseFunction, RawMatchingCall, Reduction,
+    self, ConvolutionCall, CrossCheckCall, Function, HeadOutputCall, PointwiseFunction,
+    RawMatchingCall, Reduction,
 };
 use crate::ops::activation::Activation;
 use crate::ops::array::{Array, ConvSteps};
-use crate::ops::attention::{Labels, PENALTY};
+use crate::ops::attention::Labels;
 use crate::ops::attention_gather::{Deferred, Gather};
-use crate::ops::attributes::{Attributes, Frame};
+use crate::ops::attributes::Attributes;
 use crate::ops::plane_sweep::Sweep;
 use crate::ops::small::{Candidates, MeanOver, Start};
 use crate::ops::spgr::{Spgr, finite};
@@ -24,16 +24,6 @@ use candle_core::{DType, Result, Tensor, bail};
 
 /// Factor of scores in [`Array::lifted`], as in [`crate::ops::small::lift`].
 const LIFT_GAIN: f64 = 4.0;
-
-fn pointwise(activation: Option<Activation>) -> PointwiseFunction {
-    match activation {
-        None => PointwiseFunction::None,
-        Some(Activation::Relu) => PointwiseFunction::Relu,
-        Some(Activation::Silu) => PointwiseFunction::Silu,
-        Some(Activation::Gelu) => PointwiseFunction::Gelu,
-        Some(Activation::Sigmoid) => PointwiseFunction::Sigmoid,
-    }
-}
 
 impl Array for DeviceArray {
     fn dims(&self) -> &[usize] {
@@ -365,10 +355,16 @@ impl Array for DeviceArray {
     }
 
     fn attention(&self, k: &Self, v: &Self, scale: f32, labels: Option<Labels>) -> Result<Self> {
-        let labels = labels.as_ref().map(|l| (l.windows, &*l.queries, &*l.keys));
-        let call = AttentionCall { scale, penalty: PENALTY, labels };
-        let result = self.array.attention(&k.array, &v.array, call);
-        self.without_rule("attention", result, &[self, k, v])
+        let result = self.array.attention(&k.array, &v.array, attention_call(scale, &labels));
+        self.recorded("attention", result, [self, k, v], |want, _| {
+            let [q, k, v] = [self, k, v].map(|x| x.array.clone());
+            move |dy| {
+                let call = attention_call(scale, &labels);
+                let [of_q, of_k, of_v] = q.attention_backward(&k, &v, call, dy)?;
+                let all = [(want[0], of_q), (want[1], of_k), (want[2], of_v)];
+                Ok(all.map(|(want, gradient)| want.then_some(gradient)))
+            }
+        })
     }
 
     fn feed_forward(
@@ -541,7 +537,15 @@ impl Array for DeviceArray {
         _backend: &Backend,
     ) -> Result<Self> {
         let result = self.array.gather(&query.array, &points.array, &gather);
-        self.without_rule("attention gather", result, &[self, query, points])
+        self.recorded("attention gather", result, [self, query, points], |want, _| {
+            let [maps, query, points] = [self, query, points].map(|x| x.array.clone());
+            move |dy| {
+                let [of_maps, of_query, of_points] =
+                    maps.gather_backward(&query, &points, &gather, dy)?;
+                let all = [(want[0], of_maps), (want[1], of_query), (want[2], of_points)];
+                Ok(all.map(|(want, gradient)| want.then_some(gradient)))
+            }
+        })
     }
 
     fn occlusion(&self, z: &Self, depths: &Self) -> Result<Self> {
@@ -572,32 +576,5 @@ impl Array for DeviceArray {
             finite(call, &host(&self.array)?, &host(&parents.array)?, rows, gains)?;
         }
         Ok(())
-    }
-}
-
-/// `rules` as the kernel reads them.
-fn attributes_uniform(rules: &Attributes) -> AttributesUniform {
-    let rows = |frame: &Frame| -> [[f32; 4]; 3] {
-        std::array::from_fn(|i| {
-            let [x, y, z] = frame.rotation[i];
-            [x, y, z, frame.position[i]].map(|v| v as f32)
-        })
-    };
-    let frame = rules.frame.unwrap_or(rules.source);
-    AttributesUniform {
-        frame: rows(&frame),
-        turn: frame.turn.map(|row| row.map(|v| v as f32)),
-        source: rows(&rules.source),
-        parents: 0,
-        framed: u32::from(rules.frame.is_some()),
-        ray: u32::from(rules.position == MuInput::RayLogz),
-        log_px: u32::from(rules.log_px.is_some()),
-        logit: u32::from(rules.logit.is_some()),
-        log_focal: rules.log_px.map_or(0.0, |focal| focal.ln() as f32),
-        logit_low: rules.logit.map_or(0.0, |most| (1.0 / (1.0 + most.exp())) as f32),
-        z_min: rules.z_min as f32,
-        slope_max: rules.slope_max as f32,
-        scale_min: rules.scale_min as f32,
-        ..AttributesUniform::default()
     }
 }

@@ -1,8 +1,13 @@
-//! Rules of gradients that several operations share, and the gradient of the children.
+//! Rules of gradients that several operations share, arguments of kernels, and the gradient of the
+//! children.
 
 use super::{DeviceArray, DeviceGradients, OnDevice};
-use crate::gpu::{self, Function, Reduction};
+use crate::abi::{AttributesUniform, MuInput};
+use crate::gpu::{self, AttentionCall, Function, PointwiseFunction, Reduction};
 use crate::ops::Array;
+use crate::ops::activation::Activation;
+use crate::ops::attention::{Labels, PENALTY};
+use crate::ops::attributes::{Attributes, Frame};
 use crate::ops::spgr::Spgr;
 use candle_core::{Result, bail};
 
@@ -127,4 +132,46 @@ pub(super) struct ProductRules {
     pub(super) weight: ProductRule,
     /// Dimension of the outputs in the result.
     pub(super) channel: usize,
+}
+
+pub(super) fn pointwise(activation: Option<Activation>) -> PointwiseFunction {
+    match activation {
+        None => PointwiseFunction::None,
+        Some(Activation::Relu) => PointwiseFunction::Relu,
+        Some(Activation::Silu) => PointwiseFunction::Silu,
+        Some(Activation::Gelu) => PointwiseFunction::Gelu,
+        Some(Activation::Sigmoid) => PointwiseFunction::Sigmoid,
+    }
+}
+
+pub(super) fn attention_call(scale: f32, labels: &Option<Labels>) -> AttentionCall<'_> {
+    let labels = labels.as_ref().map(|l| (l.windows, &*l.queries, &*l.keys));
+    AttentionCall { scale, penalty: PENALTY, labels }
+}
+
+/// `rules` as the kernel reads them.
+pub(super) fn attributes_uniform(rules: &Attributes) -> AttributesUniform {
+    let rows = |frame: &Frame| -> [[f32; 4]; 3] {
+        std::array::from_fn(|i| {
+            let [x, y, z] = frame.rotation[i];
+            [x, y, z, frame.position[i]].map(|v| v as f32)
+        })
+    };
+    let frame = rules.frame.unwrap_or(rules.source);
+    AttributesUniform {
+        frame: rows(&frame),
+        turn: frame.turn.map(|row| row.map(|v| v as f32)),
+        source: rows(&rules.source),
+        parents: 0,
+        framed: u32::from(rules.frame.is_some()),
+        ray: u32::from(rules.position == MuInput::RayLogz),
+        log_px: u32::from(rules.log_px.is_some()),
+        logit: u32::from(rules.logit.is_some()),
+        log_focal: rules.log_px.map_or(0.0, |focal| focal.ln() as f32),
+        logit_low: rules.logit.map_or(0.0, |most| (1.0 / (1.0 + most.exp())) as f32),
+        z_min: rules.z_min as f32,
+        slope_max: rules.slope_max as f32,
+        scale_min: rules.scale_min as f32,
+        ..AttributesUniform::default()
+    }
 }

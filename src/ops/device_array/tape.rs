@@ -124,6 +124,11 @@ impl Executor {
 }
 
 impl DeviceArray {
+    /// Returns the executor of the array.
+    pub fn executor(&self) -> &Arc<Executor> {
+        &self.executor
+    }
+
     /// Returns the same elements as a leaf of a tape, whose gradient [`DeviceGradients::of`]
     /// returns.
     #[must_use]
