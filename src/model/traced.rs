@@ -61,7 +61,7 @@ impl<T> Traced<T> {
     /// `store` has them.
     ///
     /// # Errors
-    /// An operation without a gradient on a GPU; errors of the device.
+    /// Errors of the device.
     pub fn backward(self, store: &GradStore) -> Result<Vec<Tensor>> {
         #[cfg(feature = "gpu")]
         if let Some(tape) = self.tape {

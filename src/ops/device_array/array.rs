@@ -211,7 +211,15 @@ impl Array for DeviceArray {
 
     fn largest(&self) -> Result<Self> {
         let last = self.dims().len().saturating_sub(1);
-        self.without_rule("largest", self.array.reduced(last, Reduction::Maximum), &[self])
+        let result = self.array.reduced(last, Reduction::Maximum);
+        self.recorded_alone("largest", result, |x, y| {
+            let (x, y) = (x.clone(), y.clone());
+            move |dy| {
+                // The elements that equal the largest.
+                let below = x.with(&y, Function::Minus)?;
+                dy.expanded(x.dims())?.with(&below, Function::WhereAbove(-f32::MIN_POSITIVE, 0.0))
+            }
+        })
     }
 
     fn weighted_sum(&self, weights: &Self) -> Result<Self> {

@@ -34,8 +34,6 @@ enum Origin {
         inputs: Vec<Option<Arc<Node>>>,
         rule: Mutex<Option<Rule>>,
     },
-    /// An operation without a gradient on a GPU.
-    Missing(&'static str),
 }
 
 impl fmt::Debug for Node {
@@ -61,8 +59,8 @@ impl Executor {
     /// gradient. Each operation is passed once, and then forgotten.
     ///
     /// # Errors
-    /// An operation without a gradient, named; a second pass over an operation; gradients of other
-    /// sizes; errors of the device.
+    /// A second pass over an operation; a rule without a gradient of an input, named; gradients of
+    /// other sizes; errors of the device.
     pub fn backward(
         self: &Arc<Self>,
         results: &[(&DeviceArray, &DeviceArray)],
@@ -98,9 +96,6 @@ impl Executor {
                         };
                         self.add(&mut open, input, gradient.clone())?;
                     }
-                }
-                Origin::Missing(name) => {
-                    bail!("`{name}` has no gradient on a GPU; train with device = \"cpu\"")
                 }
             }
         }
@@ -209,22 +204,6 @@ impl DeviceArray {
                 });
                 self.executor.node(Origin::Operation { name, inputs, rule: Mutex::new(Some(rule)) })
             }
-            false => None,
-        };
-        Ok(Self { array, executor: self.executor.clone(), node })
-    }
-
-    /// Returns `result` of an operation of `inputs` whose gradient does not exist on a GPU. The
-    /// backward pass refuses it.
-    pub(super) fn without_rule(
-        &self,
-        name: &'static str,
-        result: OnDevice<gpu::DeviceArray>,
-        inputs: &[&Self],
-    ) -> Result<Self> {
-        let array = self.executor.checked(result)?;
-        let node = match inputs.iter().any(|input| input.node.is_some()) {
-            true => self.executor.node(Origin::Missing(name)),
             false => None,
         };
         Ok(Self { array, executor: self.executor.clone(), node })
