@@ -64,7 +64,7 @@ impl SubSplat {
     }
 
     /// Returns the model on `backend`: at inference the network and the rasterizer, in training
-    /// the backbone and a trunk without aggregation.
+    /// the backbone, and the trunk where [`Trunk::trains_on_device`].
     pub fn with_backend(mut self, backend: &Backend) -> Self {
         match &mut self.encoder {
             Encoder::Mvsplat(encoder) => encoder.set_backend(backend),

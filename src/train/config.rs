@@ -36,9 +36,9 @@ pub struct TrainConfig {
     /// GPU takes one group at a time.
     #[serde(rename = "lanes")]
     pub parallel_groups: usize,
-    /// Device of network and rasterizer: `cpu`, `auto`, `gpu`, or a part of an adapter's name. The
-    /// small backbone, and a trunk without aggregation, run on a GPU. Losses, summation of
-    /// gradients and optimizer run on the CPU. A training can go on with another device.
+    /// Device of network and rasterizer: `cpu`, `auto`, `gpu`, or a part of an adapter's name.
+    /// Losses, placement of the primaries, summation of gradients and optimizer run on the CPU. A
+    /// training can go on with another device.
     pub device: String,
     /// Configuration of the network.
     pub model: Model,

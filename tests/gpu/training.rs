@@ -152,7 +152,7 @@ fn every_parameter_of_the_aggregation_has_the_gradient_of_the_cpu() {
 
 #[test]
 fn every_parameter_of_mvsplat_has_the_gradient_of_the_cpu() {
-    check(&config(true, false), 106);
+    check(&config(true, false), 437);
 }
 
 /// A network of some thousand numbers, pictures of 32², targets of 64².

@@ -5,7 +5,10 @@
 //! that the memory in use is that of the arrays alive and of one group. Arrays are contiguous;
 //! [`DeviceArray::reshape`] and whole leading parts share memory.
 //!
-//! CPU versions: [`crate::cpu`], tensor operations of candle. Tests: tests/gpu/array.rs.
+//! Gradients (`*_backward`) are operations too; `crate::ops::DeviceArray` has the tape that calls them.
+//!
+//! CPU versions: [`crate::cpu`], tensor operations of candle. Tests: tests/gpu/array.rs,
+//! tests/gpu/array_gradients.rs.
 //!
 //! Work of the small network for two pictures of 256×256 with four children (`cargo bench --bench
 //! device -- small`), counted: 432 calls, 15.2 Gflop of convolutions and 17.1 of linear layers, 3.2 GB
