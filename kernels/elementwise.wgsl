@@ -3,7 +3,9 @@
 // src/cpu/activation.rs and tensor operations.
 
 // x, factor * x + offset, |x|, x^2, 1 / x, clamp(x), the four operations of two numbers, an
-// activation, the square root, x where y is above a number and else another.
+// activation, the square root, x where y is above a number and else another. Gradients: x times the
+// slope of an activation at y, x with its sign changed where y < 0, x where y lies between two numbers
+// and else 0.
 const COPY: u32 = 0u;
 const AFFINE: u32 = 1u;
 const ABSOLUTE: u32 = 2u;
@@ -17,13 +19,17 @@ const OVER: u32 = 9u;
 const ACTIVATION: u32 = 10u;
 const SQUARE_ROOT: u32 = 11u;
 const WHERE_ABOVE: u32 = 12u;
+const SLOPE: u32 = 13u;
+const SIGNED: u32 = 14u;
+const WITHIN: u32 = 15u;
 
 override FUNCTION: u32 = 0u;
 override ACTIVATION_KIND: u32 = 0u;
 
 struct ElementwiseUniform {
     count: u32,
-    // Factor and offset of AFFINE, bounds of CLAMP, bound and other number of WHERE_ABOVE.
+    // Factor and offset of AFFINE, bounds of CLAMP and WITHIN, bound and other number of
+    // WHERE_ABOVE.
     first: f32,
     second: f32,
     // Axes in use, the last ones.
@@ -57,6 +63,11 @@ fn value(i: u32, j: u32) -> f32 {
         case TIMES: { return x * right[j]; }
         case OVER: { return x / right[j]; }
         case WHERE_ABOVE: { return select(call.second, x, right[j] > call.first); }
+        case SLOPE: { return x * activation_slope(ACTIVATION_KIND, right[j]); }
+        case SIGNED: { return select(x, -x, right[j] < 0.0); }
+        case WITHIN: {
+            return select(0.0, x, right[j] >= call.first && right[j] <= call.second);
+        }
         case SQUARE_ROOT: { return sqrt(x); }
         case ACTIVATION: { return activation(ACTIVATION_KIND, x); }
         default: { return x; }

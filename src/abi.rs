@@ -23,9 +23,10 @@ pub use sweep::{Pair, SWEEP_PAIR_STRIDE, Sweep};
 pub use uniforms::{
     AttentionGatherUniform, AttentionUniform, AttributesUniform, ConvexUniform, ConvolutionUniform,
     CrossCheckUniform, ElementwiseUniform, ExpectationUniform, HeadOutputUniform, InvertUniform,
-    LinearUniform, NormUniform, OcclusionUniform, PlaneSweepUniform, RasterUniform,
-    RawMatchingUniform, RedistributeUniform, ReduceUniform, ResizeUniform, RowsUniform,
-    SelectUniform, ShowUniform, SortUniform, SpgrGainsBwdUniform, SpgrUniform,
+    LinearUniform, LinearWeightBwdUniform, NormUniform, OcclusionUniform, PlaneSweepUniform,
+    RasterUniform, RawMatchingUniform, RedistributeUniform, ReduceUniform, ResizeUniform,
+    RowsUniform, SelectUniform, ShowUniform, SortUniform, SpgrGainsBwdUniform, SpgrUniform,
+    SumPartsUniform,
 };
 pub use view::View;
 

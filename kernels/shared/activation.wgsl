@@ -40,3 +40,24 @@ fn activation(kind: u32, x: f32) -> f32 {
         default: { return x; }
     }
 }
+
+// Returns the derivative of the activation `kind` at x.
+fn activation_slope(kind: u32, x: f32) -> f32 {
+    switch kind {
+        case ACTIVATION_RELU: { return select(0.0, 1.0, x > 0.0); }
+        case ACTIVATION_SILU: {
+            let s = sigmoid(x);
+            return s * (1.0 + x * (1.0 - s));
+        }
+        case ACTIVATION_GELU: {
+            // The density of the normal distribution.
+            let density = 0.3989422804014327 * exp(-0.5 * x * x);
+            return 0.5 * (1.0 + erf(x * 0.7071067811865476)) + x * density;
+        }
+        case ACTIVATION_SIGMOID: {
+            let s = sigmoid(x);
+            return s * (1.0 - s);
+        }
+        default: { return 1.0; }
+    }
+}

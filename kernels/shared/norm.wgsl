@@ -13,7 +13,8 @@ struct NormUniform {
     // 1 if there are factors and summands of the channels.
     has_affine: u32,
     epsilon: f32,
-    pad: u32,
+    // Parts of a channel's numbers in the backward pass, else 0.
+    channel_parts: u32,
 }
 
 @group(0) @binding(0) var<uniform> call: NormUniform;

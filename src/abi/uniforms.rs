@@ -25,8 +25,9 @@ mod network;
 
 pub use network::{
     AttentionUniform, AttributesUniform, ConvexUniform, ConvolutionUniform, CrossCheckUniform,
-    ElementwiseUniform, ExpectationUniform, HeadOutputUniform, LinearUniform, NormUniform,
-    OcclusionUniform, RawMatchingUniform, ReduceUniform, ResizeUniform, RowsUniform, SelectUniform,
+    ElementwiseUniform, ExpectationUniform, HeadOutputUniform, LinearUniform,
+    LinearWeightBwdUniform, NormUniform, OcclusionUniform, RawMatchingUniform, ReduceUniform,
+    ResizeUniform, RowsUniform, SelectUniform, SumPartsUniform,
 };
 
 uniform! {

@@ -3,6 +3,8 @@
 //! CPU version: [`crate::cpu::attention_gather`]. WGSL: kernels/attention_gather_bwd.wgsl,
 //! kernels/invert.wgsl and kernels/attention_gather_scatter.wgsl. Tests: tests/gpu/network.rs.
 
+use crate::abi::Gather;
+use crate::gpu::array::DeviceArray;
 use crate::gpu::attention_gather::AttentionGatherArgs;
 use crate::gpu::buffers::{Binding, Buffer};
 use crate::gpu::commands::Groups;
@@ -131,5 +133,64 @@ impl Gpu {
         let d_rows = commands.read::<f32>(&d_rows, floats)?;
         commands.submit()?;
         Ok((d_maps.take(self)?, d_rows.take(self)?))
+    }
+}
+
+impl DeviceArray {
+    /// Computes the gradients of maps, this array, `query` and `points` from the gradient `dy`
+    /// `[N, E]` of [`DeviceArray::gather`].
+    ///
+    /// # Errors
+    /// As [`Gpu::attention_gather_backward`].
+    pub fn gather_backward(
+        &self,
+        query: &Self,
+        points: &Self,
+        gather: &Gather,
+        dy: &Self,
+    ) -> Result<[Self; 3], GpuError> {
+        let args = AttentionGatherArgs { gather, maps: &[], query: &[], points: &[] };
+        let n = args.check_lengths([self.count(), query.count(), points.count()])?;
+        let lengths = [("gradient of the output", dy.count(), n * gather.dim)];
+        GpuError::check_lengths(ATTENTION_GATHER_BWD.name, lengths)?;
+        let recorder = self.recorder();
+        let gpu = recorder.gpu();
+        let cells = self.count() / gather.stride.max(1);
+        let samples = n * gather.samples();
+        let (width, row) = (gather.query_width(), gather.query_width() + args.points_row());
+        let mut uniform = args.uniform(&(0..n));
+        uniform.cells = cells as u32;
+        let uniform = gpu.uniform(&uniform)?;
+        let levels = gpu.upload("feature levels", &args.levels())?;
+        let cells_of = gpu.empty::<u32>("cells of samples", 4 * samples)?;
+        let factors = gpu.empty::<f32>("factors", samples * (4 + 2 * gather.groups))?;
+        let rows = recorder.empty(&[n, row])?;
+        let of_maps = recorder.empty(self.dims())?;
+        recorder.record(cells_of.bytes() + factors.bytes(), |commands| {
+            let [maps, query, points, dy, rows, of_maps] =
+                [self, query, points, dy, &rows, &of_maps].map(Self::binding);
+            let [uniform, levels, cells_binding, factors] =
+                [&uniform, &levels, &cells_of, &factors].map(Binding::from);
+            let bindings = [
+                uniform.clone(),
+                maps,
+                query.clone(),
+                points,
+                levels,
+                dy.clone(),
+                rows,
+                cells_binding,
+                factors.clone(),
+            ];
+            commands.run(&ATTENTION_GATHER_BWD, &[], &bindings, Groups::of(n, 1))?;
+            let lists = gpu.invert(commands, &cells_of, 4 * samples, cells)?;
+            let [starts, list] = [&lists.starts, &lists.list].map(Binding::from);
+            let bindings = [uniform, query, dy, factors, starts, list, of_maps];
+            let groups = Groups::of(self.count(), THREADS);
+            commands.run(&ATTENTION_GATHER_SCATTER, &[], &bindings, groups)
+        })?;
+        let of_query = rows.narrow(1, 0, width)?.reshape(query.dims())?;
+        let of_points = rows.narrow(1, width, row - width)?.reshape(points.dims())?;
+        Ok([of_maps, of_query, of_points])
     }
 }

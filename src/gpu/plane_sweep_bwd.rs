@@ -4,6 +4,8 @@
 //! kernels/plane_sweep_reference_bwd.wgsl, kernels/invert.wgsl and
 //! kernels/plane_sweep_source_bwd.wgsl. Tests: tests/gpu/network.rs.
 
+use crate::abi::{PlaneSweepUniform, Sweep};
+use crate::gpu::array::DeviceArray;
 use crate::gpu::buffers::{Binding, Buffer};
 use crate::gpu::commands::Groups;
 use crate::gpu::device::Gpu;
@@ -143,5 +145,70 @@ impl Gpu {
         let d_source = commands.read::<f32>(&d_source, args.source.len())?;
         commands.submit()?;
         Ok((d_reference.take(self)?, d_source.take(self)?))
+    }
+}
+
+impl DeviceArray {
+    /// Computes the gradients of [`DeviceArray::plane_sweep`] with respect to this array and to
+    /// `source` for `grad` `[R, D, h, w]`, the gradient of the correlation.
+    ///
+    /// # Errors
+    /// As [`Gpu::plane_sweep_backward`].
+    pub fn plane_sweep_backward(
+        &self,
+        source: &Self,
+        sweep: &Sweep,
+        grad: &Self,
+    ) -> Result<[Self; 2], GpuError> {
+        let args = PlaneSweepArgs { sweep, reference: &[], source: &[] };
+        let (rows, features) = (sweep.pairs.len(), args.features());
+        let pictures = sweep.pairs.iter().flatten().map(|p| p.source + 1).max().unwrap_or(0);
+        let lengths = [
+            ("reference", self.count(), rows * features),
+            ("source", source.count().min(pictures * features), pictures * features),
+            ("gradient", grad.count(), rows * sweep.candidates() * args.plane()),
+        ];
+        GpuError::check_lengths(PLANE_SWEEP_TAPS.name, lengths)?;
+        let (recorder, all) = (self.recorder(), 0..rows);
+        let gpu = recorder.gpu();
+        let (pairs, starts) = args.tables(&all);
+        let sources = source.count() / features.max(1);
+        let call = PlaneSweepUniform { sources: sources as u32, ..args.uniform(&all) };
+        let taps = call.pairs as usize * sweep.candidates() * args.plane();
+        let uniform = gpu.uniform(&call)?;
+        let pairs = gpu.upload("pairs of views", &pairs)?;
+        let starts = gpu.upload("starts of pairs", &starts)?;
+        let depths = gpu.upload("candidate depths", &args.depths(&all))?;
+        let cells_of = gpu.empty::<u32>("cells of taps", 4 * taps)?;
+        let factors = gpu.empty::<f32>("coefficients", 4 * taps)?;
+        let d_reference = recorder.empty(self.dims())?;
+        let d_source = recorder.empty(source.dims())?;
+        recorder.record(cells_of.bytes() + factors.bytes(), |commands| {
+            let [own, other, of_own, of_other] =
+                [self, source, &d_reference, &d_source].map(DeviceArray::binding);
+            let [uniform, pairs, starts, depths, cells, factors] =
+                [&uniform, &pairs, &starts, &depths, &cells_of, &factors].map(Binding::from);
+            let bindings = [
+                uniform.clone(),
+                own.clone(),
+                other.clone(),
+                pairs,
+                starts.clone(),
+                depths,
+                grad.binding(),
+                cells.clone(),
+                factors.clone(),
+            ];
+            commands.run(&PLANE_SWEEP_TAPS, &[], &bindings, Groups::of(taps, THREADS))?;
+            let bindings = [uniform.clone(), other, starts.clone(), cells, factors.clone(), of_own];
+            let groups = Groups::of(self.count(), THREADS);
+            commands.run(&PLANE_SWEEP_REFERENCE_BWD, &[], &bindings, groups)?;
+            let lists = gpu.invert(commands, &cells_of, 4 * taps, sources * args.plane())?;
+            let [list_starts, list] = [&lists.starts, &lists.list].map(Binding::from);
+            let bindings = [uniform, own, starts, factors, list_starts, list, of_other];
+            let groups = Groups::of(source.count(), THREADS);
+            commands.run(&PLANE_SWEEP_SOURCE_BWD, &[], &bindings, groups)
+        })?;
+        Ok([d_reference, d_source])
     }
 }

@@ -17,6 +17,7 @@ pub mod primaries;
 pub mod spgr;
 pub mod subsplat;
 pub mod trace;
+pub mod traced;
 pub mod trunk;
 pub mod weights;
 

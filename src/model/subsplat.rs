@@ -5,6 +5,9 @@ use super::backbone::{Mvsplat, SmallBackbone};
 use super::depth_range;
 use super::primaries::primaries;
 use super::trace::{Checkpoint, Trace};
+#[cfg(feature = "gpu")]
+use super::traced::Tape;
+use super::traced::Traced;
 use super::trunk::{Children, Trunk};
 use super::{BackboneOutput, Primaries, Views};
 use crate::abi::RasterOptions;
@@ -14,6 +17,7 @@ use crate::ops::{Array, Backend};
 use candle_core::{Error, Result, Tensor, bail};
 use candle_nn::VarBuilder;
 
+#[derive(Clone)]
 enum Encoder {
     Mvsplat(Box<Mvsplat>),
     Small(Box<SmallBackbone>),
@@ -24,6 +28,7 @@ enum Encoder {
 /// Parameter names: MVSplat's own at the root (a converted checkpoint loads with or
 /// without its `encoder.` prefix), the small backbone's under `small.`, SubSplat's under
 /// `subsplat.`.
+#[derive(Clone)]
 pub struct SubSplat {
     config: Config,
     encoder: Encoder,
@@ -59,7 +64,7 @@ impl SubSplat {
     }
 
     /// Returns the model on `backend`: at inference the network and the rasterizer, in training
-    /// plane sweep, attention gather, SPGR and rasterizer. Everything else runs on the CPU.
+    /// the backbone, and the trunk where [`Trunk::trains_on_device`].
     pub fn with_backend(mut self, backend: &Backend) -> Self {
         match &mut self.encoder {
             Encoder::Mvsplat(encoder) => encoder.set_backend(backend),
@@ -195,7 +200,7 @@ impl SubSplat {
     }
 
     /// Runs the backbone for training: with every gradient, and with its depth maps if it
-    /// is the small one.
+    /// is the small one. The output of a GPU has feature maps only where the trunk reads them.
     ///
     /// # Errors
     /// A side is not a multiple of [`Config::stride`].
@@ -203,25 +208,61 @@ impl SubSplat {
         &self,
         views: &Views,
         mean: DisparityMean,
-    ) -> Result<(BackboneOutput, Option<DepthMaps>)> {
+    ) -> Result<Traced<(BackboneOutput, Option<DepthMaps>)>> {
+        #[cfg(feature = "gpu")]
+        if let Some(result) = self.trunk.on_device(|executor| {
+            let images = executor.upload(&views.images)?;
+            let (mut output, maps) = self.train_on(views, &images, mean)?;
+            if !self.trunk.reads_features() {
+                output.features.clear();
+            }
+            let mut tape = Tape::new(executor);
+            let output = output.copied(&mut tape)?;
+            let maps = maps.map(|maps| maps.copied(&mut tape)).transpose()?;
+            Ok(Traced::on_device((output, maps), tape))
+        }) {
+            return result;
+        }
+        Ok(Traced::on_host(self.train_on(views, &views.images, mean)?))
+    }
+
+    /// Runs the backbone for training on the executor of `images`, the views' images.
+    fn train_on<A: Array>(
+        &self,
+        views: &Views,
+        images: &A,
+        mean: DisparityMean,
+    ) -> Result<(BackboneOutput<A>, Option<DepthMaps<A>>)> {
         match &self.encoder {
-            Encoder::Mvsplat(encoder) => Ok((encoder.forward(views, &mut Trace::off())?, None)),
+            Encoder::Mvsplat(encoder) => {
+                Ok((encoder.forward_on(views, images, &mut Trace::off())?, None))
+            }
             Encoder::Small(encoder) => {
-                let (output, maps) = encoder.forward(views, mean)?;
+                let (output, maps) = encoder.forward_on(views, images, mean, &Trace::off())?;
                 Ok((output, Some(maps)))
             }
         }
     }
 
-    /// Computes the small backbone's depth alone.
+    /// Computes the small backbone's depth alone, with every gradient.
     ///
     /// # Errors
     /// The backbone is MVSplat's; a side is not a multiple of [`Config::stride`].
-    pub fn depth_maps(&self, views: &Views, mean: DisparityMean) -> Result<DepthMaps> {
-        match &self.encoder {
-            Encoder::Mvsplat(_) => bail!("depth maps: expected the small backbone, got MVSplat's"),
-            Encoder::Small(encoder) => encoder.depth(views, mean),
+    pub fn depth_maps(&self, views: &Views, mean: DisparityMean) -> Result<Traced<DepthMaps>> {
+        let Encoder::Small(encoder) = &self.encoder else {
+            bail!("depth maps: expected the small backbone, got MVSplat's")
+        };
+        #[cfg(feature = "gpu")]
+        if let Some(result) = self.trunk.on_device(|executor| {
+            let images = executor.upload(&views.images)?;
+            let maps = encoder.depth_on(views, &images, mean, &Trace::off())?;
+            let mut tape = Tape::new(executor);
+            let maps = maps.copied(&mut tape)?;
+            Ok(Traced::on_device(maps, tape))
+        }) {
+            return result;
         }
+        Ok(Traced::on_host(encoder.depth(views, mean)?))
     }
 
     /// Returns the world-frame primaries of the backbone's `output`.

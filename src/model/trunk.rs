@@ -163,8 +163,8 @@ impl Trunk {
         })
     }
 
-    /// Sets the backend of the following calls: at inference of all operations, in training of
-    /// gathers and SPGR.
+    /// Sets the backend of the following calls: of all operations, in training only where
+    /// [`Trunk::trains_on_device`], else of gathers and SPGR.
     pub fn set_backend(&mut self, backend: &Backend) {
         self.backend = backend.clone();
         #[cfg(feature = "gpu")]
@@ -180,6 +180,11 @@ impl Trunk {
     /// r = 1 with heads whose only child is its parent.
     pub fn is_off(&self) -> bool {
         self.parts().is_none()
+    }
+
+    /// Returns whether the trunk reads the backbone's feature maps.
+    pub fn reads_features(&self) -> bool {
+        self.parts().is_some_and(|parts| parts.aggregation.is_some())
     }
 
     /// The parts, unless [`Trunk::is_off`].

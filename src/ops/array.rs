@@ -2,7 +2,7 @@
 //!
 //! The modules of [`crate::model`] are written once, over [`Array`]. `candle_core::Tensor`
 //! implements it with the CPU kernels and their gradients; `DeviceArray` implements it with WGSL
-//! kernels over buffers that stay on a GPU, without gradients.
+//! kernels over buffers that stay on a GPU, and a tape of its own.
 
 use super::activation::{self as pointwise, Activation};
 use super::attention::{Labels, attention};

@@ -34,7 +34,7 @@ mod splat_tensors;
 pub use array::{Array, ConvSteps};
 pub use backend::{Backend, NoDevice};
 #[cfg(feature = "gpu")]
-pub use device_array::{DeviceArray, Executor};
+pub use device_array::{DeviceArray, DeviceGradients, Executor};
 pub use rasterize::{over_background, rasterize, rasterize_on, rasterize_splats};
 pub use splat_tensors::SplatTensors;
 

@@ -32,9 +32,14 @@ pub struct TrainConfig {
     /// memory; the rendering phase holds the graphs of that many backbones.
     pub together: usize,
     /// Groups of `together` scenes that are processed in parallel, each with its share of the
-    /// threads and a separate graph; 0: one group per thread. The result does not depend on it.
+    /// threads and a separate graph; 0: one group per thread. The result does not depend on it. A
+    /// GPU takes one group at a time.
     #[serde(rename = "lanes")]
     pub parallel_groups: usize,
+    /// Device of network and rasterizer: `cpu`, `auto`, `gpu`, or a part of an adapter's name.
+    /// Losses, placement of the primaries, summation of gradients and optimizer run on the CPU. A
+    /// training can go on with another device.
+    pub device: String,
     /// Configuration of the network.
     pub model: Model,
     /// Initial weights.
@@ -292,6 +297,7 @@ impl Default for TrainConfig {
             accumulate: 1,
             together: 1,
             parallel_groups: 0,
+            device: "cpu".to_owned(),
             model: Model::default(),
             init: Start::Scratch,
             data: Data::default(),

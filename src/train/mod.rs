@@ -35,6 +35,9 @@ pub enum Error {
     /// The network failed: shapes or weights.
     #[error(transparent)]
     Model(#[from] candle_core::Error),
+    /// The configured device cannot be opened.
+    #[error(transparent)]
+    Device(#[from] crate::ops::NoDevice),
     /// The model's configuration is invalid.
     #[error(transparent)]
     Config(#[from] crate::config::ConfigError),

@@ -256,6 +256,11 @@ impl Training {
         &self.progress
     }
 
+    /// Returns why the CPU took over work of the configured GPU; `None` where it did not.
+    pub fn warning(&self) -> Option<String> {
+        self.learner.warning()
+    }
+
     /// Returns the optimizer, which holds all weights.
     pub fn optimizer(&self) -> &Optimizer {
         &self.optimizer

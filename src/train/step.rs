@@ -1,27 +1,28 @@
 //! Computes the gradients of one step: network, losses and the backward pass.
 
+mod pictures;
+
 use super::config::{Phase, TrainConfig};
-use super::loss::{self, Scored, with_gradient};
+use super::loss::{self, with_gradient};
 use super::optimizer::{Gradients, Optimizer};
-use super::source::{Example, InputTargets};
+use super::source::Example;
 use super::{Error, Result};
 use crate::abi::RasterOptions;
 use crate::camera::Camera;
 use crate::clock::Instant;
 use crate::config::{Backbone, Config};
-use crate::cpu::detail::{Photograph, SourceView, residuals, with_residuals};
-use crate::data::dataset::Posed;
 use crate::io::image::Rgb;
 use crate::model::backbone::small::{DepthMaps, DisparityMean};
 use crate::model::lpips::Lpips;
 use crate::model::primaries::packed;
 use crate::model::subsplat::SubSplat;
+use crate::model::traced::Traced;
 use crate::model::trunk::{Children, TrainPass};
 use crate::model::weights::Weights;
 use crate::model::{BackboneOutput, Views};
-use crate::ops::rasterize;
+use crate::ops::Backend;
 use candle_core::backprop::GradStore;
-use candle_core::{Device, Tensor, Var};
+use candle_core::{Device, Tensor};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
@@ -129,6 +130,9 @@ impl Seconds {
 /// The model and the data that its loss needs.
 pub struct Learner {
     model: SubSplat,
+    /// The same model on the CPU, for groups that the device could not compute.
+    on_cpu: SubSplat,
+    backend: Backend,
     config: TrainConfig,
     lpips: Option<Lpips>,
     /// One thread pool per parallel group. Groups run in parallel, each in its share of the
@@ -211,11 +215,6 @@ pub fn raster_options(config: &Config, example: &Example, camera: &Camera) -> Ra
     config.raster_options(ratio, example.near_far.near, inputs)
 }
 
-/// Returns a detached copy that collects its own gradient.
-fn leaf(t: &Tensor) -> Result<Var> {
-    Ok(Var::from_tensor(&t.detach())?)
-}
-
 /// Returns the elements of a tensor.
 fn flat(t: &Tensor) -> Result<Vec<f32>> {
     Ok(t.flatten_all()?.to_vec1::<f32>()?)
@@ -225,9 +224,12 @@ impl Learner {
     /// Builds the model from `weights`, which must be trainable.
     ///
     /// # Errors
-    /// Weights that do not fit; a weight file of LPIPS that cannot be read.
+    /// Weights that do not fit; a weight file of LPIPS that cannot be read; a device that cannot be
+    /// opened.
     pub fn new(config: &TrainConfig, weights: &Weights) -> Result<Self> {
-        let model = SubSplat::new(&config.model_config()?, weights.builder())?;
+        let on_cpu = SubSplat::new(&config.model_config()?, weights.builder())?;
+        let backend = Backend::open(&config.device)?;
+        let model = on_cpu.clone().with_backend(&backend);
         let lpips = match &config.loss.lpips_weights {
             Some(path) if config.loss.lpips > 0.0 => {
                 Some(Lpips::new(Weights::load(path)?.builder())?)
@@ -235,19 +237,28 @@ impl Learner {
             _ => None,
         };
         let threads = rayon::current_num_threads();
-        let count = if config.parallel_groups == 0 { threads } else { config.parallel_groups };
+        let count = match (config.parallel_groups, backend.is_cpu()) {
+            (_, false) => 1,
+            (0, true) => threads,
+            (count, true) => count,
+        };
         let pool = |i: usize| {
             let share = (threads + count - 1 - i) / count;
             let built = rayon::ThreadPoolBuilder::new().num_threads(share.max(1)).build();
             built.map_err(|e| Error::value("threads", "a thread pool", e))
         };
         let pools = (0..count).map(pool).collect::<Result<_>>()?;
-        Ok(Self { model, config: config.clone(), lpips, pools })
+        Ok(Self { model, on_cpu, backend, config: config.clone(), lpips, pools })
     }
 
     /// Returns the model.
     pub fn model(&self) -> &SubSplat {
         &self.model
+    }
+
+    /// Returns why the CPU took over work of the configured GPU; `None` where it did not.
+    pub fn warning(&self) -> Option<String> {
+        self.backend.warning()
     }
 
     /// Adds the gradients of the loss of `examples` and returns the mean terms. Each example counts
@@ -307,9 +318,28 @@ impl Learner {
         found.into_iter().map(sum).collect()
     }
 
-    /// Computes gradients and terms of scenes that pass through the backbone together.
+    /// Computes gradients and terms of scenes that pass through the backbone together. The CPU
+    /// repeats a group whose device failed.
     fn group(
         &self,
+        group: &[&Example],
+        scale: StepScale,
+        optimizer: &Optimizer,
+    ) -> Result<GroupSum> {
+        #[cfg(feature = "gpu")]
+        if let Some(executor) = self.model.trunk().executor()
+            && let Some(result) = executor
+                .attempt(&self.backend, || self.group_with(&self.model, group, scale, optimizer))
+        {
+            return result;
+        }
+        self.group_with(&self.on_cpu, group, scale, optimizer)
+    }
+
+    /// [`Learner::group`] with `model`.
+    fn group_with(
+        &self,
+        model: &SubSplat,
         group: &[&Example],
         scale: StepScale,
         optimizer: &Optimizer,
@@ -317,41 +347,49 @@ impl Learner {
         let mut seconds = Seconds::default();
         let mut gradients = optimizer.gradients();
         let views = views_of(group)?;
-        let (total, terms) = match self.config.phase {
-            Phase::Depth => self.depth_group(group, &views, scale.share, &mut seconds)?,
+        let (loss, terms) = match self.config.phase {
+            Phase::Depth => self.depth_group(model, group, &views, scale.share, &mut seconds)?,
             Phase::Render => {
                 let sink = GradientSink { optimizer, gradients: &mut gradients };
-                self.render_group(group, &views, scale, sink, &mut seconds)?
+                self.render_group(model, group, &views, scale, sink, &mut seconds)?
             }
         };
         let start = Instant::now();
-        let store = total.backward()?;
+        let store = loss.value.backward()?;
         seconds.backward += start.elapsed().as_secs_f64();
         let start = Instant::now();
         optimizer.collect(&store, &mut gradients)?;
         seconds.optimizer += start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let rest = loss.backward(&store)?;
+        if !rest.is_empty() {
+            optimizer.collect(&sum(rest)?.backward()?, &mut gradients)?;
+        }
+        seconds.backward += start.elapsed().as_secs_f64();
         Ok(GroupSum { gradients, terms, seconds })
     }
 
     /// Computes the loss of the depth phase.
     fn depth_group(
         &self,
+        model: &SubSplat,
         group: &[&Example],
         views: &Views,
         share: f64,
         seconds: &mut Seconds,
-    ) -> Result<(Tensor, Terms)> {
+    ) -> Result<(Traced<Tensor>, Terms)> {
         let start = Instant::now();
-        let maps = self.model.depth_maps(views, self.disparity_mean())?;
+        let maps = model.depth_maps(views, self.disparity_mean())?;
         seconds.backbone += start.elapsed().as_secs_f64();
         let start = Instant::now();
         let unmeasured =
             Terms { mse: f64::NAN, dssim: f64::NAN, lpips: f64::NAN, ..Terms::default() };
         let (mut parts, mut terms) = (Vec::new(), unmeasured);
         let weight = share * group.len() as f64;
-        self.depth_losses(group, &maps, weight, &mut parts, &mut terms)?;
+        self.depth_losses(group, &maps.value, weight, &mut parts, &mut terms)?;
         seconds.loss += start.elapsed().as_secs_f64();
-        Ok((sum(parts)?, terms))
+        let total = sum(parts)?;
+        Ok((maps.map(|_| total), terms))
     }
 
     /// Adds to `parts` scalars whose sum is `weight` times the mean depth loss of `group`.
@@ -403,19 +441,21 @@ impl Learner {
     /// Computes the loss of the rendering phase. The trunk's gradients go to `sink`.
     fn render_group(
         &self,
+        model: &SubSplat,
         group: &[&Example],
         views: &Views,
         scale: StepScale,
         mut sink: GradientSink<'_>,
         seconds: &mut Seconds,
-    ) -> Result<(Tensor, Terms)> {
+    ) -> Result<(Traced<Tensor>, Terms)> {
         let start = Instant::now();
-        let (output, maps) = self.model.encode_for_training(views, self.disparity_mean())?;
+        let encoded = model.encode_for_training(views, self.disparity_mean())?;
+        let (output, maps) = &encoded.value;
         let frozen = self.config.optimizer.freeze_backbone;
-        let output = if frozen { output.detach()? } else { output };
+        let output = if frozen { output.detach()? } else { output.clone() };
         seconds.backbone += start.elapsed().as_secs_f64();
         let (mut parts, mut terms) = (Vec::new(), Terms::default());
-        match &maps {
+        match maps {
             Some(maps) if !frozen => {
                 let start = Instant::now();
                 let weight = scale.share * group.len() as f64;
@@ -429,16 +469,19 @@ impl Learner {
         }
         for (b, example) in group.iter().enumerate() {
             let scene = EncodedScene { views: views.scene(b)?, output: output.scene(b)?, example };
-            let scene_terms = self.render_scene(&scene, scale, &mut sink, &mut parts, seconds)?;
+            let scene_terms =
+                self.render_scene(model, &scene, scale, &mut sink, &mut parts, seconds)?;
             terms.add(&scene_terms, 1.0 / group.len() as f64);
         }
-        Ok((sum(parts)?, terms))
+        let total = sum(parts)?;
+        Ok((encoded.map(|_| total), terms))
     }
 
     /// Renders one scene and propagates its loss back to the backbone's output. The trunk's
     /// gradients go to `sink`; scalars for the remaining backward pass go to `parts`.
     fn render_scene(
         &self,
+        model: &SubSplat,
         scene: &EncodedScene<'_>,
         scale: StepScale,
         sink: &mut GradientSink<'_>,
@@ -448,11 +491,15 @@ impl Learner {
         let EncodedScene { views, output, example } = scene;
         let StepScale { share, step } = scale;
         let start = Instant::now();
-        let mut settings = self.model.config().primaries().clone();
+        let mut settings = model.config().primaries().clone();
         settings.opacity_exponent = self.opacity_exponent(step, settings.opacity_exponent);
         let parents = packed(output, views, &settings)?;
-        let mut trunk = self.model.trunk().clone();
+        let mut trunk = model.trunk().clone();
         trunk.set_upscale(example.upscale())?;
+        if trunk.reads_features() && !trunk.trains_on_device() {
+            // Each chunk of a gather on a GPU would upload the feature maps.
+            trunk.set_backend(&Backend::Cpu);
+        }
         if trunk.is_off() {
             let children = Children::whole(&parents)?;
             seconds.trunk += start.elapsed().as_secs_f64();
@@ -501,103 +548,6 @@ impl Learner {
         let share = (step as f64 / l.opacity_steps as f64).min(1.0);
         l.opacity_start + share * (last - l.opacity_start)
     }
-
-    /// Renders every target of `example` and propagates the loss back to the children immediately,
-    /// so that one picture's graph exists at a time.
-    fn pictures(&self, children: &Children, example: &Example) -> Result<RenderedLoss> {
-        let gain = self.detailed_gain(children, example)?;
-        let gain = gain.as_ref().unwrap_or(&children.gain);
-        let leaves = [leaf(&children.rows)?, leaf(&children.sh)?, leaf(gain)?];
-        let mut gradients =
-            [&children.rows, &children.sh, gain].map(|t| Scored::zero(t.elem_count()));
-        let mut terms = Terms::default();
-        let share = 1.0 / example.targets.len().max(1) as f64;
-        for target in &example.targets {
-            let mut options = raster_options(self.model.config(), example, &target.camera);
-            options.sh_basis = children.sh_basis;
-            let planes = rasterize(&leaves[0], &leaves[1], &leaves[2], &target.camera, &options)?;
-            let rgb = planes.narrow(0, 0, 3)?.contiguous()?;
-            let (loss, found) = self.picture_loss(&rgb, target)?;
-            terms.add(&found, share);
-            let store = loss.backward()?;
-            for (leaf, sum) in leaves.iter().zip(&mut gradients) {
-                if let Some(g) = store.get(leaf) {
-                    let gradient = flat(g)?;
-                    sum.add(&Scored { value: 0.0, gradient }, share);
-                }
-            }
-        }
-        gradients[0].value = terms.loss;
-        let channels = children.gain.elem_count() / children.rows.dim(0)?.max(1);
-        if channels == 1 && gain.rank() == 2 {
-            // δ is data: only the column of γ has a parameter.
-            let of_gain = &mut gradients[2].gradient;
-            *of_gain = of_gain.iter().step_by(4).copied().collect();
-        }
-        Ok(RenderedLoss { gradients, terms })
-    }
-
-    /// Returns γ and δ `[N·K, 4]` with the detail of the example's photographs, or `None` where it
-    /// takes none.
-    fn detailed_gain(&self, children: &Children, example: &Example) -> Result<Option<Tensor>> {
-        if example.input_targets != InputTargets::WithDetail {
-            return Ok(None);
-        }
-        let context = &example.context;
-        let first = example.targets.len().saturating_sub(context.len());
-        let photographs = &example.targets[first..];
-        let pixels: Vec<Vec<f32>> = photographs.iter().map(|t| t.image.to_unit()).collect();
-        let views = context.iter().zip(photographs).zip(&pixels).map(|((view, photo), pixels)| {
-            let (w, h) = (photo.image.width, photo.image.height);
-            SourceView { photograph: Photograph::new(pixels, w, h), camera: view.camera }
-        });
-        let views: Vec<SourceView<'_>> = views.collect();
-        let means = children.rows.narrow(1, 0, 3)?.contiguous()?;
-        let count = children.rows.dim(0)?;
-        let per_view = count / (children.k * views.len()).max(1);
-        let upscale = example.upscale();
-        let delta = residuals(&views, &flat(&means)?, per_view, children.k, upscale);
-        let gain = with_residuals(&flat(&children.gain)?, &delta);
-        Ok(Some(Tensor::from_vec(gain, (count, 4), &Device::Cpu)?))
-    }
-
-    /// Returns the loss of one picture as a scalar of candle's graph, and its terms.
-    fn picture_loss(&self, rgb: &Tensor, target: &Posed) -> Result<(Tensor, Terms)> {
-        let w = &self.config.loss;
-        let (_, height, width) = rgb.dims3()?;
-        let (x, truth) = (flat(rgb)?, target.image.to_planes());
-        let mut all = loss::mse(&x, &truth).scaled(w.mse);
-        let mut terms = Terms {
-            mse: all.value / w.mse.max(1e-30),
-            dssim: f64::NAN,
-            lpips: f64::NAN,
-            ..Terms::default()
-        };
-        if w.mse == 0.0 {
-            terms.mse = loss::mse(&x, &truth).value;
-        }
-        if w.dssim > 0.0 {
-            let found = loss::dssim(&x, &truth, width, height);
-            terms.dssim = found.value;
-            all.add(&found, w.dssim);
-        }
-        terms.loss = all.value;
-        let mut total = with_gradient(rgb, all)?;
-        if let Some(lpips) = &self.lpips {
-            let truth = Tensor::from_vec(truth, (1, 3, height, width), &Device::Cpu)?;
-            let found = lpips.forward(&rgb.unsqueeze(0)?, &truth)?.mean_all()?;
-            terms.lpips = f64::from(found.to_scalar::<f32>()?);
-            terms.loss += w.lpips * terms.lpips;
-            total = (total + (found * w.lpips)?)?;
-        }
-        Ok((total, terms))
-    }
-}
-
-/// Loss of a scene's pictures: gradients of rows, SH and gain, and the terms.
-struct RenderedLoss {
-    gradients: [Scored; 3],
-    terms: Terms,
 }
 
 /// Adds scalars.

@@ -32,12 +32,12 @@ fn executor() -> Option<Arc<Executor>> {
 }
 
 /// Tensor of numbers in ±2.
-fn noise(r: &mut Random, dims: &[usize]) -> Tensor {
+pub(super) fn noise(r: &mut Random, dims: &[usize]) -> Tensor {
     let values = r.many(dims.iter().product(), -2.0, 2.0);
     Tensor::from_vec(values, dims, &Device::Cpu).unwrap()
 }
 
-fn values(t: &Tensor) -> Vec<f32> {
+pub(super) fn values(t: &Tensor) -> Vec<f32> {
     t.flatten_all().unwrap().to_vec1().unwrap()
 }
 
@@ -217,7 +217,7 @@ fn attention() {
     });
 }
 
-fn cameras(size: [usize; 2], count: usize) -> Vec<Camera> {
+pub(super) fn cameras(size: [usize; 2], count: usize) -> Vec<Camera> {
     let [h, w] = size;
     let focal = w as f32;
     let k = Intrinsics {

@@ -2,6 +2,7 @@
 #![cfg(feature = "gpu")]
 
 mod array;
+mod array_gradients;
 mod fit;
 mod layers;
 mod model;
@@ -13,3 +14,4 @@ mod redistribute;
 mod scenes;
 mod shaders;
 mod spgr;
+mod training;

@@ -55,6 +55,18 @@ const CPU_STEMS: &[(&str, &str)] = &[
     ("reduce", "moves"),
     ("select_rows", "moves"),
     ("occlusion", "attention_gather"),
+    ("attributes_bwd", "attributes"),
+    ("convex_bwd", "small"),
+    ("convex_maps_bwd", "small"),
+    ("convolution_weight_bwd", "conv"),
+    ("expectation_bwd", "small"),
+    ("layer_norm_bwd", "norm"),
+    ("linear_weight_bwd", "gemm"),
+    ("norm_bwd", "norm"),
+    ("norm_sums_bwd", "norm"),
+    ("resize_bwd", "resize"),
+    ("select_rows_bwd", "moves"),
+    ("sum_parts", "sums"),
 ];
 
 /// Returns name and value of every constant of kernels/shared/abi.wgsl.
@@ -131,6 +143,7 @@ const UNIFORMS: &[Uniform] = uniforms!(
     HeadOutputUniform,
     InvertUniform,
     LinearUniform,
+    LinearWeightBwdUniform,
     OcclusionUniform,
     NormUniform,
     PlaneSweepUniform,
@@ -144,7 +157,8 @@ const UNIFORMS: &[Uniform] = uniforms!(
     ShowUniform,
     SortUniform,
     SpgrGainsBwdUniform,
-    SpgrUniform
+    SpgrUniform,
+    SumPartsUniform
 );
 
 fn root() -> PathBuf {

@@ -61,7 +61,8 @@ uniform! {
 }
 
 uniform! {
-    /// Parameters of kernels/norm_statistics.wgsl and norm_apply.wgsl.
+    /// Parameters of kernels/norm_statistics.wgsl, norm_apply.wgsl, norm_sums_bwd.wgsl and
+    /// norm_bwd.wgsl.
     NormUniform {
         /// Rows.
         rows: u32,
@@ -77,13 +78,13 @@ uniform! {
         has_affine: u32,
         /// ε.
         epsilon: f32,
-        /// Unused.
-        pad: u32,
+        /// Parts of a channel's numbers in the backward pass, else 0.
+        channel_parts: u32,
     }
 }
 
 uniform! {
-    /// Parameters of kernels/layer_norm.wgsl and softmax.wgsl.
+    /// Parameters of kernels/layer_norm.wgsl, layer_norm_bwd.wgsl and softmax.wgsl.
     RowsUniform {
         /// Rows.
         rows: u32,
@@ -125,7 +126,35 @@ uniform! {
 }
 
 uniform! {
-    /// Parameters of kernels/select_rows.wgsl.
+    /// Parameters of kernels/sum_parts.wgsl.
+    SumPartsUniform {
+        /// Product of the sizes before the axis.
+        outer: u32,
+        /// Size of the axis.
+        length: u32,
+        /// Product of the sizes after it.
+        inner: u32,
+        /// Sums of the axis.
+        parts: u32,
+    }
+}
+
+uniform! {
+    /// Parameters of kernels/linear_weight_bwd.wgsl.
+    LinearWeightBwdUniform {
+        /// Rows.
+        rows: u32,
+        /// Outputs.
+        outputs: u32,
+        /// Terms.
+        terms: u32,
+        /// Rows of a part.
+        part: u32,
+    }
+}
+
+uniform! {
+    /// Parameters of kernels/select_rows.wgsl and select_rows_bwd.wgsl.
     SelectUniform {
         /// Product of the sizes before the axis.
         outer: u32,

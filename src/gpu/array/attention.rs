@@ -2,7 +2,7 @@
 //!
 //! WGSL: kernels/attention.wgsl.
 
-use super::{DeviceArray, misfit};
+use super::{DeviceArray, Function, misfit};
 use crate::abi::AttentionUniform;
 use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
@@ -37,6 +37,20 @@ pub struct AttentionCall<'a> {
     pub penalty: f32,
     /// Windows, labels of queries `[windows, L]` and of keys `[windows, M]`.
     pub labels: Option<(usize, &'a [u8], &'a [u8])>,
+}
+
+impl AttentionCall<'_> {
+    /// Returns the terms of the logits `[L, M]` of each window; `None` where all of them are 0.
+    fn masks(&self, [l, m]: [usize; 2]) -> impl Iterator<Item = Option<Vec<f32>>> {
+        let (windows, queries, keys) = self.labels.unwrap_or((0, &[], &[]));
+        let penalty = self.penalty;
+        (0..windows).map(move |window| {
+            let (queries, keys) = (&queries[window * l..][..l], &keys[window * m..][..m]);
+            let term = move |a: u8| keys.iter().map(move |b| if a == *b { 0.0 } else { penalty });
+            let all: Vec<f32> = queries.iter().copied().flat_map(term).collect();
+            all.iter().any(|term| *term != 0.0).then_some(all)
+        })
+    }
 }
 
 impl DeviceArray {
@@ -82,5 +96,54 @@ impl DeviceArray {
         self.recorder.count_flops(&ATTENTION, 2 * r * l * m * (d + e));
         self.recorder.call(&ATTENTION, &[], &uniform, &bindings, groups)?;
         Ok(result)
+    }
+
+    /// Computes the gradients of queries, this array, keys and values from the gradient `dy`
+    /// `[R, L, e]` of [`DeviceArray::attention`], row by row: one matrix `[L, M]` of weights exists
+    /// at a time.
+    ///
+    /// # Errors
+    /// As [`DeviceArray::attention`].
+    pub fn attention_backward(
+        &self,
+        k: &Self,
+        v: &Self,
+        call: AttentionCall,
+        dy: &Self,
+    ) -> Result<[Self; 3], GpuError> {
+        let (&[r, l, d], &[_, m, _], &[.., e]) =
+            (self.dims.as_slice(), k.dims.as_slice(), v.dims.as_slice())
+        else {
+            return Err(misfit(ATTENTION.name, "[R, L, d]".to_owned(), &self.dims));
+        };
+        if dy.dims != [r, l, e] {
+            return Err(misfit(ATTENTION.name, format!("a gradient [{r}, {l}, {e}]"), &dy.dims));
+        }
+        let masks = call.masks([l, m]).map(|mask| match mask {
+            Some(mask) => self.recorder.upload(&mask, &[l, m]).map(Some),
+            None => Ok(None),
+        });
+        let masks = masks.collect::<Result<Vec<_>, _>>()?;
+        let (mut of_q, mut of_k, mut of_v) = (Vec::new(), Vec::new(), Vec::new());
+        for row in 0..r {
+            let part = |of: &Self, dims: [usize; 2]| of.narrow(0, row, 1)?.reshape(&dims);
+            let (q, k, v) = (part(self, [l, d])?, part(k, [m, d])?, part(v, [m, e])?);
+            let dy = part(dy, [l, e])?;
+            let logits = q.projected(&k, None)?.map(Function::Affine(call.scale, 0.0))?;
+            let logits = match masks.get(row % masks.len().max(1)) {
+                Some(Some(mask)) => logits.with(mask, Function::Plus)?,
+                _ => logits,
+            };
+            let weights = logits.softmax()?;
+            let of_logits = weights.softmax_backward(&dy.projected(&v, None)?)?;
+            let of_products = of_logits.map(Function::Affine(call.scale, 0.0))?;
+            of_q.push(of_products.projected(&k.permuted(&[1, 0])?, None)?);
+            of_k.push(q.projected_weight_backward(&of_products)?);
+            of_v.push(dy.projected_weight_backward(&weights)?);
+        }
+        let joined = |rows: &[Self], dims: &[usize]| {
+            Self::joined(&rows.iter().collect::<Vec<_>>(), 0)?.reshape(dims)
+        };
+        Ok([joined(&of_q, &self.dims)?, joined(&of_k, &k.dims)?, joined(&of_v, &v.dims)?])
     }
 }

@@ -63,6 +63,12 @@ pub enum Function {
     SquareRoot,
     /// x where y is above the first number, else the second.
     WhereAbove(f32, f32),
+    /// x times the slope of an activation function at y.
+    Slope(PointwiseFunction),
+    /// x, with its sign changed where y is negative.
+    Signed,
+    /// x where y lies in [low, high], else 0.
+    Within(f32, f32),
 }
 
 impl Function {
@@ -82,6 +88,9 @@ impl Function {
             Self::Activation(_) => (10, [0.0; 2]),
             Self::SquareRoot => (11, [0.0; 2]),
             Self::WhereAbove(least, fill) => (12, [least, fill]),
+            Self::Slope(_) => (13, [0.0; 2]),
+            Self::Signed => (14, [0.0; 2]),
+            Self::Within(low, high) => (15, [low, high]),
         }
     }
 }
@@ -190,7 +199,7 @@ impl Call<'_> {
             result: result.words(),
         };
         let kind = match self.function {
-            Function::Activation(kind) => f64::from(kind as u32),
+            Function::Activation(kind) | Function::Slope(kind) => f64::from(kind as u32),
             _ => 0.0,
         };
         let constants = [("FUNCTION", f64::from(number)), ("ACTIVATION_KIND", kind)];
@@ -348,6 +357,43 @@ impl DeviceArray {
             .run()?;
             start += part.dims[dim];
         }
+        Ok(result)
+    }
+
+    /// Returns an array of zeros of sizes `dims` with this array's elements at every `stride`-th
+    /// place of each dimension, from index `first` on.
+    ///
+    /// # Errors
+    /// [`GpuError::Argument`] for sizes that do not fit; errors of the device.
+    pub(super) fn spread(
+        &self,
+        dims: &[usize],
+        strides: &[usize],
+        first: &[usize],
+    ) -> Result<Self, GpuError> {
+        let fits = dims.len() == self.dims.len()
+            && (0..dims.len()).all(|i| {
+                let last = self.dims[i].saturating_sub(1) * strides[i] + first[i];
+                last < dims[i]
+            });
+        if !fits {
+            return Err(misfit("spread", format!("sizes within {dims:?}"), &self.dims));
+        }
+        let result = self.recorder.zeros(dims)?;
+        let whole = Walk::contiguous(dims);
+        let walk = Walk::contiguous(&self.dims);
+        let to = Walk {
+            strides: whole.strides.iter().zip(strides).map(|(own, step)| own * step).collect(),
+            first: whole.strides.iter().zip(first).map(|(own, at)| own * at).sum(),
+        };
+        Call {
+            function: Function::Copy,
+            sizes: &self.dims,
+            left: (self, walk.clone()),
+            right: (self, walk),
+            result: (&result, to),
+        }
+        .run()?;
         Ok(result)
     }
 

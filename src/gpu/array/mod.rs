@@ -5,7 +5,10 @@
 //! that the memory in use is that of the arrays alive and of one group. Arrays are contiguous;
 //! [`DeviceArray::reshape`] and whole leading parts share memory.
 //!
-//! CPU versions: [`crate::cpu`], tensor operations of candle. Tests: tests/gpu/array.rs.
+//! Gradients (`*_backward`) are operations too; `crate::ops::DeviceArray` has the tape that calls them.
+//!
+//! CPU versions: [`crate::cpu`], tensor operations of candle. Tests: tests/gpu/array.rs,
+//! tests/gpu/array_gradients.rs.
 //!
 //! Work of the small network for two pictures of 256×256 with four children (`cargo bench --bench
 //! device -- small`), counted: 432 calls, 15.2 Gflop of convolutions and 17.1 of linear layers, 3.2 GB
@@ -17,28 +20,38 @@
 mod attention;
 mod elementwise;
 mod norm;
+mod norm_bwd;
 mod product;
+mod product_bwd;
 mod rows;
+mod rows_bwd;
 mod small;
+mod small_bwd;
 mod trunk;
+mod trunk_bwd;
 
 pub(super) use attention::ATTENTION;
 pub use attention::AttentionCall;
 pub(super) use elementwise::ELEMENTWISE;
 pub use elementwise::{Function, PointwiseFunction};
 pub(super) use norm::{LAYER_NORM, NORM_APPLY, NORM_STATISTICS};
+pub(super) use norm_bwd::{LAYER_NORM_BWD, NORM_BWD, NORM_SUMS_BWD};
 pub use product::ConvolutionCall;
 pub(super) use product::{CONVOLUTION, LINEAR};
+pub(super) use product_bwd::{CONVOLUTION_WEIGHT_BWD, LINEAR_WEIGHT_BWD};
 pub use rows::Reduction;
 pub(super) use rows::{REDUCE, RESIZE, SELECT_ROWS, SOFTMAX};
+pub(super) use rows_bwd::{RESIZE_BWD, SELECT_ROWS_BWD, SUM_PARTS};
 pub(super) use small::{
     CONVEX, CROSS_CHECK, EXPECTATION, HEAD_OUTPUT, RAW_MATCHING_BLOCKS, RAW_MATCHING_SCORES,
 };
 pub use small::{CrossCheckCall, HeadOutputCall, RawMatchingCall};
+pub(super) use small_bwd::{CONVEX_BWD, CONVEX_MAPS_BWD, EXPECTATION_BWD};
 pub(super) use trunk::{ATTRIBUTES, OCCLUSION};
+pub(super) use trunk_bwd::ATTRIBUTES_BWD;
 
 use crate::gpu::buffers::{Binding, Buffer};
-use crate::gpu::commands::{Groups, Pending};
+use crate::gpu::commands::{Commands, Groups, Pending};
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
 use crate::gpu::pipelines::{Constants, Kernel};
@@ -112,6 +125,16 @@ impl Recorder {
         Ok(DeviceArray { recorder: self.clone(), buffer, offset: 0, dims: dims.to_vec() })
     }
 
+    /// Allocates an array of zeros.
+    pub(super) fn zeros(self: &Arc<Self>, dims: &[usize]) -> Result<DeviceArray, GpuError> {
+        let array = self.empty(dims)?;
+        self.record(array.buffer.bytes(), |commands| {
+            commands.clear(&array.buffer);
+            Ok(())
+        })?;
+        Ok(array)
+    }
+
     /// Returns the work of each kernel since the recorder was created.
     pub fn work(&self) -> BTreeMap<&'static str, Work> {
         self.work.lock().unwrap_or_else(PoisonError::into_inner).clone()
@@ -147,17 +170,28 @@ impl Recorder {
         let mut bindings = vec![Binding::from(&self.gpu.uniform(uniform)?)];
         bindings.extend_from_slice(arguments);
         self.count(kernel, &bindings, &groups);
+        let bytes = bindings.last().map_or(0, |result| result.bytes);
+        self.record(bytes, |commands| commands.run(kernel, constants, &bindings, groups))
+    }
+
+    /// Records the commands of `f`, whose results have `bytes` bytes. Submits all recorded commands
+    /// if they are many or hold much memory.
+    pub(super) fn record<R>(
+        &self,
+        bytes: u64,
+        f: impl FnOnce(&mut Commands<'_>) -> Result<R, GpuError>,
+    ) -> Result<R, GpuError> {
         let mut pending = self.pending.lock().unwrap_or_else(PoisonError::into_inner);
-        let (calls, mut bytes) = std::mem::take(&mut *pending);
+        let (calls, before) = std::mem::take(&mut *pending);
         let mut commands = self.gpu.resume(NAME, calls);
-        commands.run(kernel, constants, &bindings, groups)?;
-        bytes += bindings.last().map_or(0, |result| result.bytes);
-        let calls = commands.suspend();
+        let result = f(&mut commands)?;
+        let (calls, bytes) = (commands.suspend(), before + bytes);
         if calls.len() < CALLS_MAX && bytes < BYTES_MAX {
             *pending = (calls, bytes);
-            return Ok(());
+            return Ok(result);
         }
-        self.gpu.resume(NAME, calls).submit().map(|_| ())
+        self.gpu.resume(NAME, calls).submit()?;
+        Ok(result)
     }
 
     /// Submits all recorded calls and returns the first `count` elements of `buffer`.

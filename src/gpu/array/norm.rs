@@ -18,7 +18,13 @@ pub(crate) static NORM_STATISTICS: Kernel = Kernel {
 pub(crate) static NORM_APPLY: Kernel = Kernel {
     name: "norm_apply",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/activation", "shared/norm", "norm_apply"),
+    source: wgsl!(
+        "shared/grid",
+        "shared/activation",
+        "shared/norm",
+        "shared/norm_read",
+        "norm_apply"
+    ),
     bindings: &[
         Access::Uniform,
         Access::Read,
@@ -37,9 +43,9 @@ pub(crate) static LAYER_NORM: Kernel = Kernel {
 };
 
 /// ε of every normalisation (PyTorch's default).
-const EPSILON: f32 = 1e-5;
+pub(super) const EPSILON: f32 = 1e-5;
 /// Numbers of a part of a row (kernels/shared/norm.wgsl).
-const PART: usize = 8192;
+pub(super) const PART: usize = 8192;
 
 impl DeviceArray {
     /// Normalises groups of channels of `[B, C, …]`, multiplies and adds `affine`, `[C]` each, and
@@ -76,7 +82,7 @@ impl DeviceArray {
             parts: words(parts),
             has_affine: u32::from(affine.is_some()),
             epsilon: EPSILON,
-            pad: 0,
+            channel_parts: 0,
         };
         let statistics = self.recorder.empty(&[rows * parts, 2])?;
         let result = self.recorder.empty(&self.dims)?;

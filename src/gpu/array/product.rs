@@ -23,7 +23,7 @@ pub(crate) static LINEAR: Kernel = Kernel {
 };
 
 /// Rows and columns of the result that a workgroup computes.
-const SIDE: usize = 64;
+pub(super) const SIDE: usize = 64;
 
 /// Strides and padding of a convolution, the same on every axis, px.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -35,7 +35,7 @@ pub struct ConvolutionCall {
 }
 
 /// Three sizes of two or three axes.
-fn volume(dims: &[usize]) -> Option<[usize; 3]> {
+pub(super) fn volume(dims: &[usize]) -> Option<[usize; 3]> {
     match *dims {
         [h, w] => Some([1, h, w]),
         [d, h, w] => Some([d, h, w]),
@@ -44,7 +44,7 @@ fn volume(dims: &[usize]) -> Option<[usize; 3]> {
 }
 
 /// `sizes` as words, then `last`.
-fn words([a, b, c]: [usize; 3], last: usize) -> [u32; 4] {
+pub(super) fn words([a, b, c]: [usize; 3], last: usize) -> [u32; 4] {
     [a, b, c, last].map(|n| n as u32)
 }
 

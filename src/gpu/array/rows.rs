@@ -33,7 +33,7 @@ pub(crate) static SELECT_ROWS: Kernel = Kernel {
 pub(crate) static RESIZE: Kernel = Kernel {
     name: "resize",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/activation", "resize"),
+    source: wgsl!("shared/grid", "shared/activation", "shared/resize", "resize"),
     bindings: &[Access::Uniform, Access::Read, Access::Write],
 };
 

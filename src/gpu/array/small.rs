@@ -15,7 +15,7 @@ use crate::gpu::pipelines::{Access, Kernel, wgsl};
 pub(crate) static EXPECTATION: Kernel = Kernel {
     name: "expectation",
     entry: "main",
-    source: wgsl!("shared/grid", "expectation"),
+    source: wgsl!("shared/grid", "shared/expectation", "expectation"),
     bindings: &[Access::Uniform, Access::Read, Access::Write],
 };
 
@@ -127,12 +127,12 @@ pub struct RawMatchingCall<'a> {
 }
 
 impl DeviceArray {
-    /// Computes expected candidate and mass within `window` of the mode of logits `[B, D, h, w]`:
-    /// `[B, 1, h, w]` each. `window_alone`: the mean is taken over the window.
+    /// Computes expected candidate, then mass within `window` of the mode, of logits `[B, D, h, w]`:
+    /// `[2, B, 1, h, w]`. `window_alone`: the mean is taken over the window.
     ///
     /// # Errors
     /// [`GpuError::Argument`] for another rank; errors of the device.
-    pub fn expectation(&self, window: usize, window_alone: bool) -> Result<[Self; 2], GpuError> {
+    pub fn expectation(&self, window: usize, window_alone: bool) -> Result<Self, GpuError> {
         let &[b, d, h, w] = self.dims.as_slice() else {
             return Err(misfit(EXPECTATION.name, "[B, D, h, w]".to_owned(), &self.dims));
         };
@@ -153,26 +153,25 @@ impl DeviceArray {
             &bindings,
             Groups::of(b * h * w, THREADS),
         )?;
-        result.halves(&[b, 1, h, w])
+        Ok(result)
     }
 
     /// Returns the two halves of the first dimension under `dims`.
-    fn halves(&self, dims: &[usize]) -> Result<[Self; 2], GpuError> {
+    pub(super) fn halves(&self, dims: &[usize]) -> Result<[Self; 2], GpuError> {
         Ok([self.narrow(0, 0, 1)?.reshape(dims)?, self.narrow(0, 1, 1)?.reshape(dims)?])
     }
 
-    /// Upsamples two maps `[B, 1, h, w]` by 4 with masks `[B, 144, h, w]`; `start` `[16, 9]` is
-    /// added to the masks' logits.
+    /// Upsamples two maps `[B, 1, h, w]` by 4 with masks `[B, 144, h, w]`: `[2, B, 1, 4h, 4w]`;
+    /// `start` `[16, 9]` is added to the masks' logits.
     ///
     /// # Errors
     /// [`GpuError::Argument`] for sizes that do not fit; errors of the device.
-    pub fn upsample_convex(&self, maps: [&Self; 2], start: &[f32]) -> Result<[Self; 2], GpuError> {
+    pub fn upsample_convex(&self, maps: [&Self; 2], start: &[f32]) -> Result<Self, GpuError> {
         let (b, h, w) = match self.dims.as_slice() {
             &[b, 144, h, w] if maps.iter().all(|m| m.dims == [b, 1, h, w]) => (b, h, w),
             _ => return Err(misfit(CONVEX.name, "masks [B, 144, h, w]".to_owned(), &self.dims)),
         };
         GpuError::check_lengths(CONVEX.name, [("start", start.len(), 144)])?;
-        let dims = [b, 1, 4 * h, 4 * w];
         let result = self.recorder.empty(&[2, b, 1, 4 * h, 4 * w])?;
         let gpu = &self.recorder.gpu;
         let [pictures, height, width] = [b, h, w].map(|n| n as u32);
@@ -192,7 +191,7 @@ impl DeviceArray {
             &bindings,
             Groups::of(result.count() / 2, THREADS),
         )?;
-        result.halves(&dims)
+        Ok(result)
     }
 
     /// Computes raw rows `[B, H·W, R]` and opacities `[B, 1, H, W]` of `[B, R + 1, H, W]`,

@@ -15,7 +15,7 @@ use crate::gpu::spgr::{SPGR, SpgrArgs};
 pub(crate) static ATTRIBUTES: Kernel = Kernel {
     name: "attributes",
     entry: "main",
-    source: wgsl!("shared/abi", "shared/grid", "attributes"),
+    source: wgsl!("shared/abi", "shared/grid", "shared/attributes", "attributes"),
     bindings: &[Access::Uniform, Access::Read, Access::Write],
 };
 

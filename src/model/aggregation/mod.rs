@@ -26,6 +26,8 @@ use super::embed::Descriptors;
 use super::geometry::{Frames, ParentChunk};
 use super::mlp::Mode;
 use crate::config::{Aggregation as Keys, AggregationAblations, FeatureLevel, HeadInput, MaskMode};
+#[cfg(feature = "gpu")]
+use crate::ops::DeviceArray;
 use crate::ops::attention_gather::{Deferred, Level};
 use crate::ops::{Array, Backend};
 use ablated::Ablated;
@@ -126,6 +128,11 @@ pub struct Prepared<A = Tensor> {
 }
 
 impl<A: Array> Prepared<A> {
+    /// Returns the projected maps `[cells, stride]` of every stage, geometry first.
+    pub fn maps(&self) -> impl Iterator<Item = &A> {
+        self.geometry.iter().chain(&self.appearance)
+    }
+
     /// Returns the same maps in host memory, in their graph.
     fn to_host(&self) -> Result<Prepared> {
         let all = |maps: &[A]| maps.iter().map(A::to_host).collect::<Result<Vec<_>>>();
@@ -136,6 +143,16 @@ impl<A: Array> Prepared<A> {
             depths: self.depths.as_ref().map(A::to_host).transpose()?,
             deferred: self.deferred.clone(),
         })
+    }
+}
+
+#[cfg(feature = "gpu")]
+impl Prepared<DeviceArray> {
+    /// Returns the same maps as leaves of tapes.
+    pub fn leaves(&self) -> Self {
+        let leaves = |maps: &[DeviceArray]| maps.iter().map(DeviceArray::leaf).collect();
+        let (geometry, appearance) = (leaves(&self.geometry), leaves(&self.appearance));
+        Self { geometry, appearance, ..self.clone() }
     }
 }
 
@@ -151,11 +168,6 @@ impl Prepared {
             depths: self.depths.clone(),
             deferred: self.maps().map(|_| Deferred::default()).collect(),
         }
-    }
-
-    /// Returns the projected maps `[cells, stride]` of every stage, geometry first.
-    pub fn maps(&self) -> impl Iterator<Item = &Tensor> {
-        self.geometry.iter().chain(&self.appearance)
     }
 
     /// Returns the deferred gradients of every stage; empty unless made by
@@ -208,6 +220,12 @@ impl Aggregation {
             view_limit,
             backend: Backend::Cpu,
         })
+    }
+
+    /// Returns whether a GPU computes the gradients too: the form of the presets.
+    #[cfg(feature = "gpu")]
+    pub(super) fn trains_on_device(&self) -> bool {
+        matches!(self.plan, Plan::Preset(_))
     }
 
     /// Sets the backend of the following gathers.

@@ -55,6 +55,9 @@ pub fn train(args: &TrainArgs, answer: Answer) -> Result<()> {
     if let Some(e) = unwritten {
         print_warning(format!("{e:#}: TensorBoard's file ends here"));
     }
+    if let Some(warning) = training.warning() {
+        print_warning(warning);
+    }
     let progress = training.progress();
     // The file is absent before the first checkpoint.
     let weights = Some(args.out.join("weights.safetensors")).filter(|file| first && file.is_file());
