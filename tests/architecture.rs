@@ -45,7 +45,7 @@ const IMPORTS: &[(&str, &[&str])] = &[
         "eval",
         &[
             "abi", "camera", "clock", "config", "cpu", "data", "fit", "io", "metrics", "model",
-            "pipeline", "refine", "render", "splats",
+            "pipeline", "poses", "refine", "render", "splats",
         ],
     ),
     (
