@@ -9,11 +9,10 @@ use crate::poses::move_along;
 /// disturbances.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Preparation {
-    /// Whether cameras are adjusted by points matched between the inputs. The targets' cameras then
-    /// follow by one similarity, because nothing tells which camera of a pair was wrong.
+    /// Cameras of the inputs. Those of the targets follow adjusted ones by one similarity, because nothing
+    /// tells which camera of a pair was wrong.
     pub poses: Poses,
-    /// Whether the inputs receive the exposure and white balance of one of them: of two inputs, the
-    /// first one's.
+    /// Gives all inputs the exposure and white balance of one of them; of two inputs it is the first.
     pub equal_exposure: bool,
 }
 

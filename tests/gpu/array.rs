@@ -124,19 +124,22 @@ fn parts_and_orders() {
     agree!(gpu, "largest", COPIED, |x| x.largest());
 }
 
+/// (channels, outputs, height, width, kernel, stride, padding): parts of tiles on every side, strides
+/// that leave pixels out, several parts of the pixels.
+pub const CONVOLUTIONS: [(usize, usize, usize, usize, usize, usize, usize); 6] = [
+    (3, 70, 37, 41, 3, 1, 1),
+    (5, 9, 36, 20, 5, 2, 2),
+    (4, 6, 9, 12, 3, 2, 1),
+    (17, 130, 9, 16, 1, 1, 0),
+    (3, 16, 32, 32, 7, 2, 3),
+    (1, 1, 8, 9, 3, 1, 0),
+];
+
 #[test]
 fn products() {
     let Some(gpu) = executor() else { return };
     let r = &mut Random(5);
-    // (channels, outputs, height, width, kernel, stride, padding): parts of tiles on every side.
-    let shapes = [
-        (3, 70, 37, 41, 3, 1, 1),
-        (5, 9, 36, 20, 5, 2, 2),
-        (17, 130, 9, 16, 1, 1, 0),
-        (3, 16, 32, 32, 7, 2, 3),
-        (1, 1, 8, 9, 3, 1, 0),
-    ];
-    for (c, o, h, w, k, stride, padding) in shapes {
+    for (c, o, h, w, k, stride, padding) in CONVOLUTIONS {
         let (x, weight, bias) = (noise(r, &[2, c, h, w]), noise(r, &[o, c, k, k]), noise(r, &[o]));
         let steps = ConvSteps { stride, padding };
         let name = format!("convolution {c} {o} {k}");

@@ -19,7 +19,7 @@ use subsplat::ops::precomputed_gradient::precomputed_gradient;
 use subsplat::ops::small::{Candidates, MeanOver, Start};
 use subsplat::ops::{Array, ConvSteps, DeviceArray, Executor};
 
-use super::array::{cameras, noise, values};
+use super::array::{CONVOLUTIONS, cameras, noise, values};
 
 /// Tolerance: sums of at most 10,000 products in another order, and elementary functions of the
 /// device, which are exact to 3 units in the last place.
@@ -143,17 +143,7 @@ fn parts_orders_and_sums() {
 fn products() {
     let Some(gpu) = executor() else { return };
     let r = &mut Random(5);
-    // (channels, outputs, height, width, kernel, stride, padding): parts of tiles on every side,
-    // strides that leave pixels out, several parts of the pixels.
-    let shapes = [
-        (3, 70, 37, 41, 3, 1, 1),
-        (5, 9, 36, 20, 5, 2, 2),
-        (4, 6, 9, 12, 3, 2, 1),
-        (17, 130, 9, 16, 1, 1, 0),
-        (3, 16, 32, 32, 7, 2, 3),
-        (1, 1, 8, 9, 3, 1, 0),
-    ];
-    for (c, o, h, w, k, stride, padding) in shapes {
+    for (c, o, h, w, k, stride, padding) in CONVOLUTIONS {
         let (x, weight, bias) = (noise(r, &[2, c, h, w]), noise(r, &[o, c, k, k]), noise(r, &[o]));
         let steps = ConvSteps { stride, padding };
         let name = format!("convolution {c} {o} {k}");

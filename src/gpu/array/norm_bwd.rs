@@ -18,6 +18,7 @@ pub(crate) static NORM_SUMS_BWD: Kernel = Kernel {
         "shared/activation",
         "shared/norm",
         "shared/norm_read",
+        "shared/norm_channel",
         "shared/sum",
         "norm_sums_bwd"
     ),
@@ -40,6 +41,7 @@ pub(crate) static NORM_BWD: Kernel = Kernel {
         "shared/activation",
         "shared/norm",
         "shared/norm_read",
+        "shared/norm_channel",
         "norm_bwd"
     ),
     bindings: &[
