@@ -48,7 +48,7 @@ fn main(
     if n >= call.parents {
         return;
     }
-    let count = call.side * call.side;
+    let count = children_count();
     let first = n * count;
     let p = load_parent(n);
     for (var k = 0u; k < count; k++) {

@@ -148,7 +148,7 @@ fn step_bwd(
     let per = flat / p.view.focal;
     d_offset += per * p.z;
     (*g).z += dot(per, t.offset);
-    d_offset /= f32(call.side);
+    d_offset /= call.zoom;
     if call.bounded != 0u {
         d_offset *= call.offset_bound * (1.0 - t.bounded * t.bounded);
     }
@@ -208,7 +208,7 @@ fn child_bwd(p: Parent, k: u32, i: u32, d_of_area: f32, g: ptr<function, ParentG
 fn own_bwd(p: Parent, g: ptr<function, ParentGradient>) {
     let o = own_of(p);
     let f = o.footprint;
-    let each = (*g).own * f32(call.side * call.side);
+    let each = (*g).own * f32(children_count());
     var d_area = each;
     var da = vec3<f32>();
     var db = vec3<f32>();
@@ -345,7 +345,7 @@ fn main(
     if n >= call.parents {
         return;
     }
-    let count = call.side * call.side;
+    let count = children_count();
     let first = n * count;
     let p = load_parent(n);
     for (var k = 0u; k < count; k++) {

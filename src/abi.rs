@@ -7,6 +7,7 @@
 
 mod frame;
 mod gather;
+mod positions;
 mod spgr;
 mod sweep;
 mod uniforms;
@@ -15,6 +16,7 @@ mod view;
 pub(crate) use frame::floats_at;
 pub use frame::{BlendRules, Geometry, Gradients, Rendered, SplatSlices};
 pub use gather::{Drop, GATHER_SAMPLES_MAX, GATHER_WEIGHTS_MAX, Gather, Level, SampleConvention};
+pub use positions::Positions;
 pub use spgr::{
     AMinMode, AreaAt, CHILDREN_MAX, DISC_AREA_SQ_MIN, DepthDir, DepthUnit, GainSpace, PrimaryView,
     Rules, SPGR_CAMERA_STRIDE, Slide,

@@ -5,7 +5,6 @@
 
 struct SpgrUniform {
     parents: u32,
-    side: u32,
     per_view: u32,
     first: u32,
     views: u32,
@@ -18,8 +17,12 @@ struct SpgrUniform {
     area_at_parent: u32,
     two_axis: u32,
     rgb_gain: u32,
-    pad0: u32,
-    pad1: u32,
+    // Positions of the children: src/abi/positions.rs.
+    columns: u32,
+    rows: u32,
+    step: u32,
+    // √K.
+    zoom: f32,
     offset_bound: f32,
     beta_z: f32,
     lambda_s: f32,
@@ -300,7 +303,7 @@ fn load_parent(n: u32) -> Parent {
         p.disc = disc_of(p);
     }
     if call.area_at_parent != 0u {
-        p.jacobian = jacobian(p.view, p.in_camera, f32(call.side));
+        p.jacobian = jacobian(p.view, p.in_camera, call.zoom);
     }
     return p;
 }
@@ -329,7 +332,7 @@ fn own_of(p: Parent) -> Own {
             o.lowpassed_area =
                 lowpassed_area(o.footprint, vec3<f32>(1.0), o.footprint.area, call.lowpass_input);
         }
-        o.value = f32(call.side * call.side) * o.lowpassed_area;
+        o.value = f32(children_count()) * o.lowpassed_area;
     }
     return o;
 }
@@ -351,10 +354,18 @@ struct Step {
     free_depth: bool,
 }
 
+fn children_count() -> u32 {
+    return call.columns * select(1u, call.rows, call.step == 0u);
+}
+
 fn step_of(p: Parent, k: u32, record: u32) -> Step {
     var t: Step;
-    let per_side = 1.0 / f32(call.side);
-    let cell = vec2<f32>(f32(k % call.side), f32(k / call.side));
+    let per_side = 1.0 / call.zoom;
+    var cell = vec2<u32>(k % call.columns, k / call.columns);
+    if call.step != 0u {
+        cell.y = call.step * k % call.rows;
+    }
+    let per_cell = 1.0 / vec2<f32>(f32(call.columns), f32(call.rows));
     let learned = vec2<f32>(head[record + HEAD_UV_OFFSET], head[record + HEAD_UV_OFFSET + 1u]);
     t.bounded = learned;
     var per_px = per_side;
@@ -362,7 +373,7 @@ fn step_of(p: Parent, k: u32, record: u32) -> Step {
         t.bounded = vec2<f32>(tanh_of(learned.x), tanh_of(learned.y));
         per_px = call.offset_bound * per_side;
     }
-    t.offset = t.bounded * per_px + ((cell + 0.5) * per_side - 0.5);
+    t.offset = t.bounded * per_px + ((vec2<f32>(cell) + 0.5) * per_cell - 0.5);
     var s = vec3<f32>(p.z * t.offset / p.view.focal, 0.0);
     if call.disc != 0u {
         let d = t.offset.x * p.disc.u + t.offset.y * p.disc.v;
@@ -431,7 +442,7 @@ fn child_of(p: Parent, k: u32, record: u32) -> Child {
     if call.area_at_parent != 0u {
         c.jacobian = p.jacobian;
     } else {
-        c.jacobian = jacobian(p.view, p.in_camera + c.step.out, f32(call.side));
+        c.jacobian = jacobian(p.view, p.in_camera + c.step.out, call.zoom);
     }
     c.footprint = footprint(c.jacobian, c.rotation, c.small);
     c.growth = growth_of(c.footprint);

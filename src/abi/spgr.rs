@@ -1,6 +1,6 @@
 //! Options of an SPGR call ([`crate::cpu::spgr`]).
 
-use super::OpacityRule;
+use super::{OpacityRule, Positions};
 use serde::{Deserialize, Serialize};
 
 /// Largest number of children per parent; they are kept on the stack.
@@ -80,8 +80,9 @@ pub enum GainSpace {
 /// Options of SPGR as the kernels read them. `config::Spgr` documents each.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rules {
-    /// r: K = r² children; the target picture is r times the input.
-    pub side: usize,
+    /// K, and the positions of the children. The target picture is √K times the input, side over
+    /// side.
+    pub positions: Positions,
     /// Choice of v*.
     pub primary_view: PrimaryView,
     /// ρ, sub-pixels.
@@ -119,7 +120,12 @@ pub struct Rules {
 impl Rules {
     /// Returns K.
     pub fn children(&self) -> usize {
-        self.side * self.side
+        self.positions.children()
+    }
+
+    /// Returns √K: target px per input px, side over side. It is r for a grid of r² children.
+    pub fn zoom(&self) -> f64 {
+        (self.children() as f64).sqrt()
     }
 
     /// Returns the floats of gain per child, 1 or 4.

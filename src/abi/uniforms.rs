@@ -243,8 +243,6 @@ uniform! {
     SpgrUniform {
         /// N.
         parents: u32,
-        /// r.
-        side: u32,
         /// Parents per view.
         per_view: u32,
         /// Index in the scene of the call's first parent.
@@ -269,10 +267,14 @@ uniform! {
         two_axis: u32,
         /// 1: gains have four floats.
         rgb_gain: u32,
-        /// Unused.
-        pad0: u32,
-        /// Unused.
-        pad1: u32,
+        /// Columns of [`super::Positions`].
+        columns: u32,
+        /// Its rows.
+        rows: u32,
+        /// Its step.
+        step: u32,
+        /// √K.
+        zoom: f32,
         /// ρ, sub-pixels.
         offset_bound: f32,
         /// β_z.

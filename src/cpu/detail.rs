@@ -187,16 +187,16 @@ pub fn residuals(
 }
 
 /// δ `[N, 3]` of `means` `[N, 3]` whose parents have different numbers of children. `parents` `[N]`,
-/// in ascending order, are indices in the order of [`residuals`], `sides` their numbers of children a
-/// side, 0 to 255; `per_view` parents per view.
+/// in ascending order, are indices in the order of [`residuals`], `counts` their numbers of children;
+/// `per_view` parents per view.
 pub fn mixed_residuals(
     views: &[SourceView<'_>],
     means: &[f32],
     per_view: usize,
     parents: &[u32],
-    sides: &[u8],
+    counts: &[u8],
 ) -> Vec<f32> {
-    debug_assert_eq!((means.len(), sides.len()), (3 * parents.len(), per_view * views.len()));
+    debug_assert_eq!((means.len(), counts.len()), (3 * parents.len(), per_view * views.len()));
     let mut out = vec![0.0f32; means.len()];
     for (v, view) in views.iter().enumerate() {
         let k = &view.camera.intrinsics;
@@ -206,12 +206,13 @@ pub fn mixed_residuals(
             continue;
         }
         let first = v * per_view;
-        let used =
-            |side: usize| sides[first..first + per_view].iter().any(|s| usize::from(*s) == side);
+        // The photograph has the children's pixels, or smaller ones if K is not a square.
+        let side = |children: &u8| f64::from(*children).sqrt().ceil() as usize;
+        let sides: Vec<usize> = counts[first..first + per_view].iter().map(side).collect();
         // The only child of a parent lies in its pixel's middle: no detail.
-        let most = sides.iter().copied().max().map_or(0, usize::from);
+        let most = sides.iter().copied().max().unwrap_or(0);
         let prepared: Vec<Option<Prepared<'_>>> = (0..=most)
-            .map(|side| (side > 1 && used(side)).then(|| Prepared::new(view, side)))
+            .map(|side| (side > 1 && sides.contains(&side)).then(|| Prepared::new(view, side)))
             .collect();
         let end = |limit: usize| parents.partition_point(|p| (*p as usize) < limit);
         let (begin, end) = (end(first), end(first + per_view));
@@ -219,7 +220,7 @@ pub fn mixed_residuals(
         out[3 * begin..3 * end].par_chunks_mut(3).zip(children).with_min_len(1024).for_each(
             |(out, (parent, mean))| {
                 let parent = *parent as usize;
-                let Some(prepared) = &prepared[usize::from(sides[parent])] else { return };
+                let Some(prepared) = &prepared[sides[parent - first]] else { return };
                 let pixel = ((parent - first) / per_pixel).min(pixels - 1);
                 let delta = prepared.residual(Vec3::from_slice(mean), pixel);
                 out.copy_from_slice(&delta.to_array());
@@ -305,7 +306,8 @@ mod tests {
             want.extend_from_slice(&delta[i * k..(i + 1) * k]);
             parents.extend(std::iter::repeat_n(i as u32, k / 3));
         }
-        let got = mixed_residuals(&views, &means, W * H, &parents, &sides);
+        let counts: Vec<u8> = sides.iter().map(|side| side * side).collect();
+        let got = mixed_residuals(&views, &means, W * H, &parents, &counts);
         assert!(want.iter().any(|d| d.abs() > 0.1));
         for (g, w) in got.iter().zip(&want) {
             assert!((g - w).abs() < 1e-5, "{g} {w}");

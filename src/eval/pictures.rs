@@ -16,7 +16,7 @@ use crate::model::trunk::Trunk;
 use crate::model::weights::Weights;
 use crate::pipeline::{
     Density, DepthBounds, Encoded, Error, Reconstructor, Refine, Result, SceneChildren, add_detail,
-    fit_to_inputs, refine_on_inputs, sides_of,
+    counts_of, fit_to_inputs, refine_on_inputs,
 };
 use crate::refine::Refiner;
 use crate::render::{Renderer, render_with};
@@ -290,8 +290,8 @@ impl Network<'_> {
         let Self { views, output, parents: primaries, .. } = self;
         let (network, encoded) = (self.model.model(), Encoded { views, output, primaries });
         let mut renderer = Renderer::default();
-        let sides = sides_of(network, &encoded, inputs, density, raster, &mut renderer)?;
-        Ok(SceneChildren::new(network, &encoded, inputs.len(), sides, &|| Ok(()))?)
+        let counts = counts_of(network, &encoded, inputs, density, raster, &mut renderer)?;
+        Ok(SceneChildren::new(network, &encoded, inputs.len(), counts, &|| Ok(()))?)
     }
 
     /// Gaussians of a baseline.

@@ -83,7 +83,10 @@ impl<'a> SpgrArgs<'a> {
         let r = self.rules;
         SpgrUniform {
             parents: parents.len() as u32,
-            side: r.side as u32,
+            columns: r.positions.columns,
+            rows: r.positions.rows,
+            step: r.positions.step,
+            zoom: r.zoom() as f32,
             per_view: self.per_view as u32,
             first: (self.first + parents.start) as u32,
             views: self.cameras.len() as u32,
@@ -96,8 +99,6 @@ impl<'a> SpgrArgs<'a> {
             area_at_parent: u32::from(r.area_at == AreaAt::Parent),
             two_axis: u32::from(r.a_min_mode == AMinMode::TwoAxis),
             rgb_gain: u32::from(r.gain_space == GainSpace::Rgb),
-            pad0: 0,
-            pad1: 0,
             offset_bound: r.offset_bound.unwrap_or(0.0) as f32,
             beta_z: r.beta_z as f32,
             lambda_s: r.lambda_s as f32,

@@ -18,7 +18,7 @@
 use super::embed::Descriptors;
 use super::layers::{LayerNorm, gelu, relu};
 use super::mlp::{affine, linear};
-use crate::abi::{HEAD_GEOMETRY_LEN, HEAD_STRIDE};
+use crate::abi::{HEAD_GEOMETRY_LEN, HEAD_STRIDE, Positions};
 use crate::config::{AMin, Config, SpgrHead};
 use crate::ops::Array;
 use crate::ops::spgr::Rules;
@@ -112,10 +112,9 @@ impl Head {
         Ok(Self { form, outputs })
     }
 
-    /// Returns the head for r = `side`: `polynomial` becomes `mlp2`, other forms stay.
-    fn for_side(&self, side: usize) -> Result<Self> {
+    /// Returns the head for K = `children`: `polynomial` becomes `mlp2`, other forms stay.
+    fn for_children(&self, children: usize) -> Result<Self> {
         let Form::Polynomial { norm, lin0, last } = &self.form else { return Ok(self.clone()) };
-        let k = side * side;
         let hidden = last[0].weight().dim(1)?;
         // Layers of the children: sums of the given ones.
         let summed =
@@ -123,7 +122,7 @@ impl Head {
                 let [Some(four), Some(further)] = [part(&last[0]), part(&last[1])] else {
                     return Ok(None);
                 };
-                let [bilinear, terms] = factors(side, four)?;
+                let [bilinear, terms] = factors(children, four)?;
                 let four = bilinear.matmul(&four.reshape((LAYERS[0], width))?)?;
                 Ok(Some((four + terms.matmul(&further.reshape((LAYERS[1], width))?)?)?))
             };
@@ -133,18 +132,17 @@ impl Head {
             Some(bias) => Some(bias.flatten_all()?),
             None => None,
         };
-        let lin1 = Linear::new(weight.reshape((k * self.outputs, hidden))?, bias);
+        let lin1 = Linear::new(weight.reshape((children * self.outputs, hidden))?, bias);
         let form = Form::Mlp2 { norm: norm.clone(), lin0: lin0.clone(), lin1 };
         Ok(Self { form, outputs: self.outputs })
     }
 
-    /// Maps `x` `[n, E]` to `[n, r², outputs]`, r = `side`.
+    /// Maps `x` `[n, E]` to `[n, K, outputs]`.
     ///
     /// # Errors
-    /// Shapes do not fit; r differs from the one of the parameters (`mlp2` and `pg`).
-    pub fn forward<A: Array>(&self, x: &A, side: usize) -> Result<A> {
+    /// Shapes do not fit; K differs from the one of the parameters (`mlp2` and `pg`).
+    pub fn forward<A: Array>(&self, x: &A, k: usize) -> Result<A> {
         let [n, _] = x.sizes()?;
-        let k = side * side;
         let out = match &self.form {
             Form::Mlp2 { norm, lin0, lin1 } => {
                 let hidden = affine(lin0, &norm.forward(x)?)?;
@@ -160,7 +158,7 @@ impl Head {
             }
             Form::Coord { norm, lin0, lin1, pos } => {
                 let x = affine(lin0, &norm.forward(x)?)?;
-                let positions = x.constant(posenc(side), &[k, POSENC])?;
+                let positions = x.constant(posenc(k), &[k, POSENC])?;
                 let positions = gelu(&affine(&pos[0], &positions)?)?;
                 let positions = affine(&pos[1], &positions)?;
                 // One child at a time, so that no tensor [n, K, hidden] exists.
@@ -171,7 +169,7 @@ impl Head {
                 let children = (0..k).map(child).collect::<Result<Vec<_>>>()?;
                 A::joined(&children.iter().collect::<Vec<_>>(), 1)?
             }
-            Form::Polynomial { .. } => return self.for_side(side)?.forward(x, side),
+            Form::Polynomial { .. } => return self.for_children(k)?.forward(x, k),
         };
         if out.count() != n * k * self.outputs {
             let expected = k * self.outputs;
@@ -181,12 +179,12 @@ impl Head {
     }
 }
 
-/// Positions of the r² sub-pixels in input px, (−½, ½)², with their sines and cosines:
-/// `[r², 18]`.
-fn posenc(side: usize) -> Vec<f32> {
-    let mut table = Vec::with_capacity(side * side * POSENC);
-    for k in 0..side * side {
-        let position = [k % side, k / side].map(|i| (i as f32 + 0.5) / side as f32 - 0.5);
+/// Positions of the K children in input px, (−½, ½)², with their sines and cosines: `[K, 18]`.
+fn posenc(children: usize) -> Vec<f32> {
+    let positions = Positions::new(children);
+    let mut table = Vec::with_capacity(children * POSENC);
+    for k in 0..children {
+        let position = positions.of(k).map(|x| x as f32);
         table.extend(position);
         for octave in 0..OCTAVES {
             for g in position {
@@ -198,14 +196,14 @@ fn posenc(side: usize) -> Vec<f32> {
     table
 }
 
-/// Factors of the layers of `polynomial` for each child: `[r², 4]` and `[r², 14]`, dtype of `like`.
-fn factors(side: usize, like: &Tensor) -> Result<[Tensor; 2]> {
-    let kappa = (side as f32).log2() - 1.0;
-    let axis = |i: usize| 4.0 * ((i as f32 + 0.5) / side as f32 - 0.5);
+/// Factors of the layers of `polynomial` for each child: `[K, 4]` and `[K, 14]`, dtype of `like`.
+fn factors(children: usize, like: &Tensor) -> Result<[Tensor; 2]> {
+    let positions = Positions::new(children);
+    let kappa = (children as f32).sqrt().log2() - 1.0;
     let towards = |at: f32, second: bool| 0.5 * if second { 1.0 + at } else { 1.0 - at };
     let (mut bilinear, mut terms) = (Vec::new(), Vec::new());
-    for k in 0..side * side {
-        let (t, u) = (axis(k % side), axis(k / side));
+    for k in 0..children {
+        let [t, u] = positions.of(k).map(|x| 4.0 * x as f32);
         let corners = (0..LAYERS[0]).map(|c| towards(t, c % 2 == 1) * towards(u, c / 2 == 1));
         bilinear.extend(corners);
         for (power, factor) in [1.0, kappa].into_iter().enumerate() {
@@ -220,7 +218,7 @@ fn factors(side: usize, like: &Tensor) -> Result<[Tensor; 2]> {
         }
     }
     let table = |values: Vec<f32>, width: usize| {
-        Tensor::from_vec(values, (side * side, width), like.device())?.to_dtype(like.dtype())
+        Tensor::from_vec(values, (children, width), like.device())?.to_dtype(like.dtype())
     };
     Ok([table(bilinear, LAYERS[0])?, table(terms, LAYERS[1])?])
 }
@@ -245,22 +243,25 @@ impl Heads {
         })
     }
 
-    /// Returns the heads for r = `side`, which compute no polynomial per call.
+    /// Returns the heads for K = `children`, which compute no polynomial per call.
     ///
     /// # Errors
     /// Those of candle.
-    pub fn for_side(&self, side: usize) -> Result<Self> {
+    pub fn for_children(&self, children: usize) -> Result<Self> {
         let Self { geometry, appearance } = self;
-        Ok(Self { geometry: geometry.for_side(side)?, appearance: appearance.for_side(side)? })
+        Ok(Self {
+            geometry: geometry.for_children(children)?,
+            appearance: appearance.for_children(children)?,
+        })
     }
 
-    /// Maps the heads' inputs to records `[n, r², 11]`, r = `side`.
+    /// Maps the heads' inputs to records `[n, K, 11]`.
     ///
     /// # Errors
     /// Those of [`Head::forward`].
-    pub fn forward<A: Array>(&self, inputs: &Descriptors<A>, side: usize) -> Result<A> {
-        let geometry = self.geometry.forward(&inputs.geometry, side)?;
-        let appearance = self.appearance.forward(&inputs.appearance, side)?;
+    pub fn forward<A: Array>(&self, inputs: &Descriptors<A>, children: usize) -> Result<A> {
+        let geometry = self.geometry.forward(&inputs.geometry, children)?;
+        let appearance = self.appearance.forward(&inputs.appearance, children)?;
         let [n, k, outputs] = geometry.sizes()?;
         let rest = appearance.reshape((n * k, ()))?;
         let flat = geometry.reshape((n * k, outputs))?.columns(&rest, None)?;
@@ -268,10 +269,10 @@ impl Heads {
     }
 }
 
-/// Returns the constants of the fused op for `config` and r = `side`.
-pub fn rules(config: &Config, side: usize) -> Rules {
+/// Returns the constants of the fused op for `config` and K = `k`.
+pub fn rules(config: &Config, k: usize) -> Rules {
     let (s, ablations) = (&config.spgr, &config.spgr.ablations);
-    let k = side * side;
+    let positions = Positions::new(k);
     let a_min = match ablations.a_min {
         AMin::OverK if k == 1 => 0.0,
         AMin::OverK => 1.0 / k as f64,
@@ -280,7 +281,7 @@ pub fn rules(config: &Config, side: usize) -> Rules {
         AMin::Off => 0.0,
     };
     Rules {
-        side,
+        positions,
         primary_view: s.primary_view,
         offset_bound: s.offset_bound,
         beta_z: s.beta_z,
@@ -293,7 +294,7 @@ pub fn rules(config: &Config, side: usize) -> Rules {
         a_min,
         a_min_mode: ablations.a_min_mode,
         opacity: s.opacity,
-        lowpass_target: f64::from(config.render.lowpass_px2(side as f32)),
+        lowpass_target: f64::from(config.render.lowpass_px2((k as f32).sqrt())),
         lowpass_input: f64::from(config.render.lowpass),
         delta: s.delta,
         gain_space: ablations.gain_space,

@@ -152,7 +152,7 @@ impl Trunk {
         } else {
             None
         };
-        let rules = rules(config, config.upscale);
+        let rules = rules(config, config.children());
         Ok(Self {
             config: config.clone(),
             rules,
@@ -189,7 +189,7 @@ impl Trunk {
 
     /// The parts, unless [`Trunk::is_off`].
     fn parts(&self) -> Option<&Parts> {
-        let one = self.rules.side == 1 && self.config.spgr.head == SpgrHead::Polynomial;
+        let one = self.rules.children() == 1 && self.config.spgr.head == SpgrHead::Polynomial;
         self.parts.as_ref().filter(|_| !one)
     }
 
@@ -208,7 +208,26 @@ impl Trunk {
             };
             bail!("upscale: expected {expected} (head {:?}), got {side}", self.config.spgr.head);
         }
-        self.rules = rules(&self.config, side);
+        self.rules = rules(&self.config, side * side);
+        Ok(())
+    }
+
+    /// Sets K of the following calls, which need not be a square ([`Positions`](crate::abi::Positions)).
+    ///
+    /// # Errors
+    /// K differs from the configured one and the head has a fixed K; K is not in 1 to 64.
+    pub fn set_children(&mut self, children: usize) -> Result<()> {
+        let fixed = !self.config.spgr.head.serves_any_k() && self.parts.is_some();
+        let most = UPSCALE_MAX * UPSCALE_MAX;
+        if !(1..=most).contains(&children) || (fixed && children != self.config.children()) {
+            let expected = match fixed {
+                true => self.config.children().to_string(),
+                false => format!("1 to {most}"),
+            };
+            let head = self.config.spgr.head;
+            bail!("children per parent: expected {expected} (head {head:?}), got {children}");
+        }
+        self.rules = rules(&self.config, children);
         Ok(())
     }
 
@@ -470,7 +489,7 @@ impl Trunk {
             sh_input: like(&sh.reshape((n, 3 * d))?)?,
             per_view: primaries.per_view,
             prepared,
-            heads: parts.heads.for_side(self.rules.side)?,
+            heads: parts.heads.for_children(self.rules.children())?,
             rules: self.rules,
         })
     }
@@ -502,7 +521,7 @@ impl Trunk {
             // f = 0 without aggregation, so that the heads read z.
             _ => z,
         };
-        let head = scene.heads.forward(&inputs, scene.rules.side)?;
+        let head = scene.heads.forward(&inputs, scene.rules.children())?;
         Ok(Records { head, parents: parents.rows()? })
     }
 

@@ -1,9 +1,9 @@
 //! The Gaussians of a scene: the same number of children for each parent, or more where the
 //! photographs have detail.
 
-use super::density::{Density, grids, sides};
+use super::density::{Density, counts, grids};
 use super::{Result, add_detail, detail};
-use crate::abi::RasterOptions;
+use crate::abi::{CHILDREN_MAX, RasterOptions};
 use crate::data::crop::Cropped;
 use crate::fit::FitView;
 use crate::model::subsplat::SubSplat;
@@ -31,8 +31,8 @@ pub(crate) struct SceneChildren {
 enum Origins {
     /// r² consecutive Gaussians have one parent.
     Regular,
-    /// Parent of each Gaussian, and r of each parent.
-    Mixed { parents: Vec<u32>, sides: Vec<u8> },
+    /// Parent of each Gaussian, and K of each parent.
+    Mixed { parents: Vec<u32>, counts: Vec<u8> },
 }
 
 /// Sides of the grids that the network's children can have: r alone beside 1 for heads of one K, and
@@ -51,7 +51,7 @@ fn grids_of(network: &SubSplat) -> Vec<usize> {
 ///
 /// # Errors
 /// Those of the network.
-pub(crate) fn sides_of(
+pub(crate) fn counts_of(
     network: &SubSplat,
     Encoded { views, primaries, .. }: &Encoded<'_>,
     inputs: &[Cropped],
@@ -75,14 +75,17 @@ pub(crate) fn sides_of(
         hidden.iter().for_each(|i| shares[*i] = 0.0);
         limit = limit.saturating_add(hidden.len());
     }
-    let mut sides = sides(inputs, &shares, &grids, limit);
-    hidden.into_iter().for_each(|i| sides[i] = 0);
-    Ok(Some(sides))
+    let mut counts = match density {
+        Density::Each(children) => vec![children.clamp(1, CHILDREN_MAX) as u8; shares.len()],
+        _ => counts(inputs, &shares, &grids, limit),
+    };
+    hidden.into_iter().for_each(|i| counts[i] = 0);
+    Ok(Some(counts))
 }
 
 impl SceneChildren {
     /// Children of the one scene that `encoded` holds, of `photographs` photographs, without detail;
-    /// `sides` are those of [`sides_of`].
+    /// `counts` are those of [`counts_of`].
     ///
     /// # Errors
     /// Those of the network and of `checkpoint`.
@@ -90,22 +93,22 @@ impl SceneChildren {
         network: &SubSplat,
         Encoded { views, output, primaries }: &Encoded<'_>,
         photographs: usize,
-        sides: Option<Vec<u8>>,
+        counts: Option<Vec<u8>>,
         checkpoint: Checkpoint<'_>,
     ) -> candle_core::Result<Self> {
         let (trunk, per_view) = (network.trunk(), primaries.per_view);
-        let Some(sides) = sides else {
+        let Some(counts) = counts else {
             let children = trunk.forward_with(views, output, primaries, checkpoint)?;
             let size = per_view * children.k;
             let ranges = (0..photographs).map(|view| view * size..(view + 1) * size).collect();
             let groups = Groups { ranges, equal_families: true };
             return Ok(Self { splats: children.to_splats()?, groups, origins: Origins::Regular });
         };
-        let mixed = trunk.forward_mixed(views, output, primaries, &sides, checkpoint)?;
+        let mixed = trunk.forward_mixed(views, output, primaries, &counts, checkpoint)?;
         let end = |view: usize| mixed.parents.partition_point(|p| (*p as usize) < view * per_view);
         let ranges = (0..photographs).map(|view| end(view)..end(view + 1)).collect();
         let groups = Groups { ranges, equal_families: false };
-        let origins = Origins::Mixed { parents: mixed.parents, sides };
+        let origins = Origins::Mixed { parents: mixed.parents, counts };
         Ok(Self { splats: mixed.splats, groups, origins })
     }
 
@@ -116,8 +119,8 @@ impl SceneChildren {
     pub(crate) fn add_detail(&mut self, inputs: &[Cropped], upscale: usize) -> Result<bool> {
         match &self.origins {
             Origins::Regular => add_detail(&mut self.splats, inputs, upscale),
-            Origins::Mixed { parents, sides } => {
-                detail::add_mixed(&mut self.splats, inputs, parents, sides)
+            Origins::Mixed { parents, counts } => {
+                detail::add_mixed(&mut self.splats, inputs, parents, counts)
             }
         }
     }
@@ -127,11 +130,11 @@ impl SceneChildren {
         Self { splats, groups: Groups::default(), origins: Origins::Regular }
     }
 
-    /// Returns r of each parent; empty where all have the same number of children.
-    pub(crate) fn sides(&self) -> &[u8] {
+    /// Returns K of each parent; empty where all have the same.
+    pub(crate) fn counts(&self) -> &[u8] {
         match &self.origins {
             Origins::Regular => &[],
-            Origins::Mixed { sides, .. } => sides,
+            Origins::Mixed { counts, .. } => counts,
         }
     }
 }

@@ -25,6 +25,8 @@ pub enum Density {
     Share(f32),
     /// At most this number: more where the photographs have detail.
     Count(usize),
+    /// This number for each pixel of the network's input, 1 to 64, a square or not.
+    Each(usize),
 }
 
 impl Density {
@@ -33,7 +35,7 @@ impl Density {
         match self {
             Self::Auto => photographs <= 2,
             Self::Full => true,
-            Self::Share(_) | Self::Count(_) => false,
+            Self::Share(_) | Self::Count(_) | Self::Each(_) => false,
         }
     }
 
@@ -47,6 +49,7 @@ impl Density {
             Self::Full => full,
             Self::Share(share) => (f64::from(share.clamp(0.0, 1.0)) * full as f64).round() as usize,
             Self::Count(count) => count.min(full),
+            Self::Each(children) => parents.saturating_mul(children),
         }
     }
 }
@@ -67,16 +70,17 @@ pub(crate) fn grids(r: usize) -> Vec<usize> {
 /// A finer grid for one parent.
 struct Step {
     parent: u32,
-    side: u8,
+    children: u8,
     /// Further children.
     cost: usize,
     /// Gain over cost.
     slope: f32,
 }
 
-/// Sides of the grids of all parents of `inputs`, whose `shares` are given, for at most `limit`
-/// children; `grids` are the sides that a parent's grid can have, in ascending order. Parents are in the order of their pixels, the same number for each.
-pub(crate) fn sides(inputs: &[Cropped], shares: &[f32], grids: &[usize], limit: usize) -> Vec<u8> {
+/// Numbers of children of all parents of `inputs`, whose `shares` are given, for at most `limit`
+/// children. `grids` are the sides that a parent's grid can have, in ascending order. Parents are in
+/// the order of their pixels, the same number for each.
+pub(crate) fn counts(inputs: &[Cropped], shares: &[f32], grids: &[usize], limit: usize) -> Vec<u8> {
     if limit < shares.len() {
         return largest(shares, limit);
     }
@@ -98,26 +102,26 @@ pub(crate) fn sides(inputs: &[Cropped], shares: &[f32], grids: &[usize], limit: 
     }
     // Stable: of equal slopes, a parent's coarser grid comes first.
     steps.par_sort_by(|a, b| b.slope.total_cmp(&a.slope));
-    let mut sides = vec![1u8; shares.len()];
+    let mut counts = vec![1u8; shares.len()];
     let mut left = limit - shares.len();
     for step in &steps {
         // A parent's next grid costs more, so it does not fit either.
         if step.cost > left {
             continue;
         }
-        sides[step.parent as usize] = step.side;
+        counts[step.parent as usize] = step.children;
         left -= step.cost;
     }
-    sides
+    counts
 }
 
 /// 1 for the `limit` parents with the largest shares, 0 for the others.
 fn largest(shares: &[f32], limit: usize) -> Vec<u8> {
     let mut order: Vec<usize> = (0..shares.len()).collect();
     order.sort_by(|a, b| shares[*b].total_cmp(&shares[*a]));
-    let mut sides = vec![0u8; shares.len()];
-    order.iter().take(limit).for_each(|i| sides[*i] = 1);
-    sides
+    let mut counts = vec![0u8; shares.len()];
+    order.iter().take(limit).for_each(|i| counts[*i] = 1);
+    counts
 }
 
 /// Finer grids of one parent in order, with falling slopes: a grid that gains less than the next one
@@ -132,7 +136,7 @@ fn steps_of(parent: u32, grids: &[usize], gains: impl Iterator<Item = f32>) -> V
             }
         }
         let slope = gain / cost as f32;
-        steps.push((Step { parent, side: pair[1] as u8, cost, slope }, gain));
+        steps.push((Step { parent, children: (pair[1] * pair[1]) as u8, cost, slope }, gain));
     }
     steps.into_iter().map(|(step, _)| step).collect()
 }
@@ -201,15 +205,15 @@ mod tests {
         assert_eq!((grids(1), grids(3), grids(6)), (vec![1], vec![1, 3], vec![1, 2, 6]));
         let inputs = [input()];
         // Eight pixels have detail; stripes of one pixel show in the grid of four only.
-        let sides = sides(&inputs, &[1.0; 16], &grids(4), 8 + 8 * 16);
-        for (i, side) in sides.iter().enumerate() {
-            assert_eq!(*side, if i % 4 >= 2 { 4 } else { 1 }, "{i}");
+        let counts = counts(&inputs, &[1.0; 16], &grids(4), 8 + 8 * 16);
+        for (i, k) in counts.iter().enumerate() {
+            assert_eq!(*k, if i % 4 >= 2 { 16 } else { 1 }, "{i}");
         }
         // A parent that nothing shows gets none of them.
         let mut shares = [1.0; 16];
         shares[2] = 0.0;
-        let fewer = super::sides(&inputs, &shares, &grids(4), 8 + 8 * 16);
-        assert_eq!((fewer[2], fewer[3]), (1, 4));
+        let fewer = super::counts(&inputs, &shares, &grids(4), 8 + 8 * 16);
+        assert_eq!((fewer[2], fewer[3]), (1, 16));
     }
 
     #[test]
@@ -217,15 +221,16 @@ mod tests {
         let inputs = [input()];
         let shares: Vec<f32> = (0..16).map(|i| i as f32).collect();
         for limit in [0, 5, 16, 17, 40, 100, 256, 1000] {
-            let sides = sides(&inputs, &shares, &grids(4), limit);
-            let count: usize = sides.iter().map(|s| usize::from(*s).pow(2)).sum();
+            let counts = counts(&inputs, &shares, &grids(4), limit);
+            let count: usize = counts.iter().map(|k| usize::from(*k)).sum();
             assert!(count <= limit && count + 15 >= limit.min(256), "{limit} {count}");
         }
-        let few = sides(&inputs, &shares, &grids(4), 3);
+        let few = counts(&inputs, &shares, &grids(4), 3);
         assert!(few[13..] == [1, 1, 1] && few[..13] == [0; 13]);
         assert_eq!(Density::Full.limit(10, 5, 4), 160);
         assert_eq!(Density::Share(0.25).limit(10, 5, 4), 40);
         assert_eq!(Density::Count(7).limit(10, 5, 4), 7);
+        assert_eq!(Density::Each(3).limit(10, 2, 4), 30);
         assert_eq!((Density::Auto.limit(10, 2, 4), Density::Auto.limit(10, 5, 4)), (160, 80));
         assert!(Density::Auto.is_full(2) && !Density::Auto.is_full(3));
     }

@@ -22,7 +22,7 @@ pub(crate) fn add_detail(splats: &mut Splats, inputs: &[Cropped], upscale: usize
     add(splats, inputs, |sources, means| residuals(sources, means, per_view, children, upscale))
 }
 
-/// [`add_detail`] for Gaussians with the given `parents`, which have `sides`² children
+/// [`add_detail`] for Gaussians with the given `parents`, which have `counts` children each
 /// ([`mixed_residuals`]).
 ///
 /// # Errors
@@ -31,10 +31,10 @@ pub(crate) fn add_mixed(
     splats: &mut Splats,
     inputs: &[Cropped],
     parents: &[u32],
-    sides: &[u8],
+    counts: &[u8],
 ) -> Result<bool> {
-    let per_view = sides.len() / inputs.len().max(1);
-    add(splats, inputs, |sources, means| mixed_residuals(sources, means, per_view, parents, sides))
+    let per_view = counts.len() / inputs.len().max(1);
+    add(splats, inputs, |sources, means| mixed_residuals(sources, means, per_view, parents, counts))
 }
 
 /// Adds the residuals that `of` returns for the sources and the means `[N, 3]`.

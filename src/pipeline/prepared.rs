@@ -3,7 +3,7 @@
 use super::progress::Tracker;
 use super::{
     DepthBounds, Detail, Encoded, Options, Progress, Reconstruction, Reconstructor, Result,
-    SceneChildren, Stage, Warning, fit_to_inputs, refine_on_inputs, sides_of,
+    SceneChildren, Stage, Warning, counts_of, fit_to_inputs, refine_on_inputs,
 };
 use crate::camera::Camera;
 use crate::check::PairReport;
@@ -107,10 +107,11 @@ impl Prepared<'_> {
         let mut renderer = Renderer::new(model.backend());
         let encoded = Encoded { views: &views, output: &output, primaries: &primaries };
         let density = options.density;
-        let sides = sides_of(network, &encoded, &inputs, density, &raster_at(1.0), &mut renderer)?;
+        let counts =
+            counts_of(network, &encoded, &inputs, density, &raster_at(1.0), &mut renderer)?;
         let steps = network.trunk().steps(&primaries);
         let mut children = tracker.run_steps(steps, progress, |step| {
-            SceneChildren::new(network, &encoded, inputs.len(), sides, step)
+            SceneChildren::new(network, &encoded, inputs.len(), counts, step)
         })?;
         let distances = output.depths.narrow(3, 0, 1)?.squeeze(3)?.squeeze(0)?.to_vec2()?;
         drop((views, output, primaries));
@@ -121,7 +122,7 @@ impl Prepared<'_> {
                 detail = Detail::Photographs;
             }
         }
-        let parent_sides = children.sides().to_vec();
+        let parent_counts = children.counts().to_vec();
         let SceneChildren { mut splats, mut groups, .. } = children;
         let raster_options = raster_at(inputs.first().map_or(1.0, Cropped::ratio));
         let (mut fit, mut refinement) = (None, None);
@@ -153,7 +154,7 @@ impl Prepared<'_> {
         Ok(Reconstruction {
             splats,
             groups,
-            sides: parent_sides,
+            counts: parent_counts,
             inputs,
             adjustment,
             cut_shares,

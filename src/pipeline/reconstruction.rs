@@ -23,7 +23,7 @@ pub struct Reconstruction {
     /// Gaussians of each photograph.
     pub(super) groups: Groups,
     /// r of each parent; empty where all have the same number of children.
-    pub(super) sides: Vec<u8>,
+    pub(super) counts: Vec<u8>,
     pub(super) inputs: Vec<Cropped>,
     pub(super) adjustment: Option<PoseAdjustment>,
     pub(super) cut_shares: Vec<f32>,
@@ -93,11 +93,11 @@ impl Reconstruction {
         Ok(report)
     }
 
-    /// Number of children a side of each input pixel's Gaussian, photograph by photograph, rows from
-    /// the top: parent i has `children_sides()[i]`² of them. Empty where all pixels have the same number
+    /// Number of children (K) of each input pixel's Gaussian, photograph by photograph, rows from the
+    /// top. Empty where all pixels have the same number
     /// ([`Options::density`](super::Options::density)).
-    pub fn children_sides(&self) -> &[u8] {
-        &self.sides
+    pub fn children_counts(&self) -> &[u8] {
+        &self.counts
     }
 
     /// The Gaussians alone.

@@ -75,11 +75,11 @@ fn spgr_under_every_rule() {
     let Some(gpu) = gpu() else { return };
     let backend = Backend::from(gpu);
     let mut r = Random(21);
-    for side in [2, 3] {
-        for (name, config) in spgr_calls::variants(side) {
-            let call = spgr_calls::call(&config, 8);
+    for k in [4, 5, 6] {
+        for (name, config) in spgr_calls::variants(2) {
+            let call = spgr_calls::call_of(&config, 8, k);
             let parents = spgr_calls::parents(&call.cameras, &mut r);
-            let head = spgr_calls::head(128, side * side, 1.0, DType::F32, &mut r);
+            let head = spgr_calls::head(128, k, 1.0, DType::F32, &mut r);
             agrees(&name, &backend, &[&head, &parents], |backend, x| {
                 let (rows, gains) = spgr_on(backend, &x[0], &x[1], &call)?;
                 Ok(vec![rows, gains])

@@ -8,7 +8,7 @@ use cpu_against_gpu::{Random, assert_matches_cpu};
 use glam::{EulerRot, Mat4, Quat, Vec3};
 use subsplat::abi::{
     AMinMode, AreaAt, DepthDir, DepthUnit, GainSpace, HEAD_STRIDE, MEAN_OFFSET, OPACITY_OFFSET,
-    OpacityRule, PrimaryView, QUAT_OFFSET, Rules, SCALE_OFFSET, SPLAT_STRIDE, Slide,
+    OpacityRule, Positions, PrimaryView, QUAT_OFFSET, Rules, SCALE_OFFSET, SPLAT_STRIDE, Slide,
 };
 use subsplat::camera::{Camera, Intrinsics};
 use subsplat::cpu::spgr as cpu;
@@ -59,11 +59,11 @@ fn parents(cameras: &[Camera], r: &mut Random) -> Vec<f32> {
     rows
 }
 
-/// The rules of the presets at K = r².
-fn base(tuned: bool, side: usize) -> Rules {
-    let k = (side * side) as f64;
+/// The rules of the presets at K = `children`.
+fn base(tuned: bool, children: usize) -> Rules {
+    let k = children as f64;
     Rules {
-        side,
+        positions: Positions::new(children),
         primary_view: if tuned { PrimaryView::Source } else { PrimaryView::NearestVisible },
         offset_bound: tuned.then_some(0.5),
         beta_z: if tuned { 0.1 } else { 0.25 },
@@ -73,7 +73,7 @@ fn base(tuned: bool, side: usize) -> Rules {
         lambda_s: if tuned { 1.0 / k.sqrt() } else { 0.6 },
         dlog_clamp: 2.0,
         area_at: AreaAt::Child,
-        a_min: if side == 1 { 0.0 } else { 1.0 / k },
+        a_min: if children == 1 { 0.0 } else { 1.0 / k },
         a_min_mode: AMinMode::Iso,
         opacity: if tuned { OpacityRule::OpticalDepth } else { OpacityRule::Linear },
         lowpass_target: 0.3,
@@ -84,7 +84,7 @@ fn base(tuned: bool, side: usize) -> Rules {
 }
 
 /// Every rule, applied one at a time to each preset.
-fn variants(side: usize) -> Vec<(String, Rules)> {
+fn variants(children: usize) -> Vec<(String, Rules)> {
     type Change = (&'static str, fn(&mut Rules));
     let changes: [Change; 22] = [
         ("as is", |_| {}),
@@ -97,10 +97,10 @@ fn variants(side: usize) -> Vec<(String, Rules)> {
         ("world", |s| (s.depth_unit, s.beta_z) = (DepthUnit::World, 9.0)),
         ("relative", |s| (s.depth_unit, s.beta_z) = (DepthUnit::Relative, 1.0)),
         ("disc", |s| s.slide = Slide::Disc),
-        ("lambda", |s| s.lambda_s = 1.2 / s.side as f64),
+        ("lambda", |s| s.lambda_s = 1.2 / s.zoom()),
         ("at parent", |s| s.area_at = AreaAt::Parent),
         ("a_min px", |s| s.a_min = 2.0),
-        ("a_min in", |s| s.a_min = 0.5 * (s.side * s.side) as f64),
+        ("a_min in", |s| s.a_min = 0.5 * s.children() as f64),
         ("a_min off", |s| s.a_min = 0.0),
         ("two axis", |s| (s.a_min, s.a_min_mode) = (2.0, AMinMode::TwoAxis)),
         ("linear", |s| s.opacity = OpacityRule::Linear),
@@ -113,9 +113,12 @@ fn variants(side: usize) -> Vec<(String, Rules)> {
     let mut all = Vec::new();
     for tuned in [false, true] {
         for (name, change) in changes {
-            let mut rules = base(tuned, side);
+            let mut rules = base(tuned, children);
             change(&mut rules);
-            all.push((format!("{} {name} r={side}", if tuned { "tuned" } else { "paper" }), rules));
+            all.push((
+                format!("{} {name} K={children}", if tuned { "tuned" } else { "paper" }),
+                rules,
+            ));
         }
     }
     all
@@ -130,11 +133,11 @@ struct Inputs {
 }
 
 impl Inputs {
-    fn new(side: usize, r: &mut Random) -> Self {
+    fn new(children: usize, r: &mut Random) -> Self {
         let cameras = cameras(12);
         let parents = parents(&cameras, r);
         let n = parents.len() / SPLAT_STRIDE;
-        let head = r.many(n * side * side * HEAD_STRIDE, -1.5, 1.5);
+        let head = r.many(n * children * HEAD_STRIDE, -1.5, 1.5);
         Self { cameras, near: vec![1.0; 2], parents, head }
     }
 
@@ -170,9 +173,9 @@ const PARTS: [(&str, usize, usize); 4] = [
 fn children() {
     let Some(gpu) = gpu() else { return };
     let mut r = Random(11);
-    for side in [1, 2, 3] {
-        let inputs = Inputs::new(side, &mut r);
-        for (name, rules) in variants(side) {
+    for k in [1, 4, 5, 6] {
+        let inputs = Inputs::new(k, &mut r);
+        for (name, rules) in variants(k) {
             let expected = on_cpu(&inputs, &rules);
             let got = gpu.spgr(&inputs.gpu(&rules)).unwrap();
             for (part, first, count) in PARTS {
@@ -211,9 +214,9 @@ fn gradients<T: subsplat::cpu::simd::Real>(
 fn gradients_of_children() {
     let Some(gpu) = gpu() else { return };
     let mut r = Random(12);
-    for side in [1, 2, 3] {
-        let inputs = Inputs::new(side, &mut r);
-        for (name, rules) in variants(side) {
+    for k in [1, 4, 5, 6] {
+        let inputs = Inputs::new(k, &mut r);
+        for (name, rules) in variants(k) {
             let count = inputs.parents.len() / SPLAT_STRIDE * rules.children();
             let grad = r.many(count * SPLAT_STRIDE, -1.0, 1.0);
             let by_gain = r.many(count * rules.gain_channels(), -1.0, 1.0);

@@ -545,13 +545,18 @@ fn heads_for_any_k_serve_any_grid_and_others_refuse() {
             let out = scene.infer(&any);
             assert_eq!((out.k, out.rows.dim(0).unwrap()), (side * side, 512 * side * side));
         }
+        for children in [2, 3, 6] {
+            any.set_children(children).unwrap();
+            assert_eq!(scene.infer(&any).rows.dim(0).unwrap(), 512 * children);
+        }
         any.set_upscale(2).unwrap();
         assert_close(&scene.infer(&any).rows, &two.rows, 0.0);
-        assert!(any.set_upscale(9).is_err());
+        assert!(any.set_upscale(9).is_err() && any.set_children(65).is_err());
     }
     let (mut fixed, _) = trunk(&config(Preset::Tuned, 2), 15);
     fixed.set_upscale(2).unwrap();
     assert!(fixed.set_upscale(4).unwrap_err().to_string().contains("expected 2"));
+    assert!(fixed.set_children(3).unwrap_err().to_string().contains("expected 4"));
 }
 
 /// Heads of the form `polynomial` give the children of `mlp2` at ×2, whatever the further layers are,
@@ -581,55 +586,55 @@ fn polynomial_heads_equal_fixed_ones_at_two_and_the_parents_at_one() {
     assert_close(&scene.infer(&any).rows, &parents.rows, 0.0);
 }
 
-/// A parent with r² children has those of a run in which all parents have r² children.
+/// A parent with K children has those of a run in which all parents have K children.
 #[test]
-fn mixed_children_are_those_of_their_grid() {
+fn mixed_children_are_those_of_their_number() {
     let scene = Scene::new(&cameras(2, SIZE, SIZE), 21);
     for preset in [Preset::Tuned, Preset::Paper] {
         let mut c = config(preset, 2);
         c.spgr.head = SpgrHead::Polynomial;
         let (mut any, _) = trunk(&c, 22);
-        let mixed = |trunk: &Trunk, sides: &[u8]| {
+        let mixed = |trunk: &Trunk, counts: &[u8]| {
             let Scene { views, backbone, primaries } = &scene;
-            trunk.forward_mixed(views, backbone, primaries, sides, &|| Ok(()))
+            trunk.forward_mixed(views, backbone, primaries, counts, &|| Ok(()))
         };
-        let sides: Vec<u8> = (0..512).map(|i| [2, 0, 1, 4, 1][i * i % 5]).collect();
-        let got = mixed(&any, &sides).unwrap();
-        let all: Vec<Option<Children>> = (0..5)
-            .map(|side| {
-                [1, 2, 4].contains(&side).then(|| {
-                    any.set_upscale(side).unwrap();
+        let counts: Vec<u8> = (0..512).map(|i| [4, 0, 1, 16, 3][i * i % 5]).collect();
+        let got = mixed(&any, &counts).unwrap();
+        let all: Vec<Option<Children>> = (0..17)
+            .map(|k| {
+                [1, 3, 4, 16].contains(&k).then(|| {
+                    any.set_children(k).unwrap();
                     scene.infer(&any)
                 })
             })
             .collect();
         let all: Vec<_> = all.iter().map(|c| c.as_ref().map(|c| c.to_splats().unwrap())).collect();
         let mut at = 0;
-        for (parent, side) in sides.iter().map(|s| usize::from(*s)).enumerate() {
-            let Some(of_side) = &all[side] else { continue };
-            for k in 0..side * side {
-                let i = parent * side * side + k;
+        for (parent, children) in counts.iter().map(|k| usize::from(*k)).enumerate() {
+            let Some(of_count) = &all[children] else { continue };
+            for k in 0..children {
+                let i = parent * children + k;
                 assert_eq!(got.parents[at], parent as u32);
-                for (g, w) in got.splats.row(at).iter().zip(of_side.row(i)) {
+                for (g, w) in got.splats.row(at).iter().zip(of_count.row(i)) {
                     assert!(
                         (g - w).abs() <= 1e-5 * w.abs().max(1.0),
                         "{preset:?} {parent} {g} {w}"
                     );
                 }
-                assert_eq!(got.splats.sh_of(at), of_side.sh_of(i));
-                let (gain, want) = (got.splats.gain_of(at).0, of_side.gain_of(i).0);
+                assert_eq!(got.splats.sh_of(at), of_count.sh_of(i));
+                let (gain, want) = (got.splats.gain_of(at).0, of_count.gain_of(i).0);
                 assert!((gain - want).abs() < 1e-5, "{preset:?} {parent}: gain {gain}, {want}");
                 at += 1;
             }
         }
         assert_eq!(at, got.splats.len());
-        assert!(mixed(&any, &sides[1..]).unwrap_err().to_string().contains("each of 512 parents"));
-        assert!(mixed(&any, &[9; 512]).unwrap_err().to_string().contains("1 to 8"));
+        assert!(mixed(&any, &counts[1..]).unwrap_err().to_string().contains("each of 512 parents"));
+        assert!(mixed(&any, &[65; 512]).unwrap_err().to_string().contains("1 to 64"));
         assert!(mixed(&any, &[0; 512]).unwrap().splats.is_empty());
         // Heads for one K serve their own grid beside parents.
         let (fixed, _) = trunk(&config(preset, 2), 23);
-        assert_eq!(mixed(&fixed, &[2; 512]).unwrap().splats.len(), 2048);
-        assert!(mixed(&fixed, &[4; 512]).unwrap_err().to_string().contains("expected 2"));
+        assert_eq!(mixed(&fixed, &[4; 512]).unwrap().splats.len(), 2048);
+        assert!(mixed(&fixed, &[16; 512]).unwrap_err().to_string().contains("expected 4"));
     }
 }
 

@@ -9,7 +9,7 @@ use candle_core::{DType, Device, Tensor, Var};
 use glam::{DMat3, DVec3, Quat, Vec2, Vec3};
 use scenes::*;
 use spgr_calls::*;
-use subsplat::abi::HEAD_STRIDE;
+use subsplat::abi::{HEAD_STRIDE, Positions};
 use subsplat::camera::Camera;
 use subsplat::config::*;
 use subsplat::ops::spgr::{Rules, Spgr, spgr, spgr_into};
@@ -525,7 +525,7 @@ fn misfits_are_refused_by_name() {
     let h = Tensor::zeros((128, 9, HEAD_STRIDE), DType::F32, &Device::Cpu).unwrap();
     let error = spgr(&h, &p, &call).unwrap_err().to_string();
     assert!(error.contains("[N, 4, 11]"), "{error}");
-    let big = Spgr { rules: Rules { side: 9, ..call.rules }, ..call.clone() };
+    let big = Spgr { rules: Rules { positions: Positions::new(81), ..call.rules }, ..call.clone() };
     let h = Tensor::zeros((128, 81, HEAD_STRIDE), DType::F32, &Device::Cpu).unwrap();
     assert!(spgr(&h, &p, &big).unwrap_err().to_string().contains("64"));
     let h = Tensor::zeros((128, 4, HEAD_STRIDE), DType::F32, &Device::Cpu).unwrap();

@@ -228,7 +228,7 @@ fn reparameterization() -> Result<()> {
             config.render.lowpass_ref = LowpassRef::Input;
         }
         let call = Spgr {
-            rules: rules(&config, side),
+            rules: rules(&config, side * side),
             cameras: scene.cameras.clone(),
             near: scene.near.clone(),
             per_view: scene.per_view,

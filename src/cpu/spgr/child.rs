@@ -32,14 +32,14 @@ impl<V: Vector> Step<V> {
     #[inline(always)]
     fn new(rules: &Rules, parent: &Parent<V>, k: usize, head: &[V; HEAD_STRIDE]) -> Self {
         let z = parent.z;
-        let per_side = 1.0 / rules.side as f64;
-        let cell = [k % rules.side, k / rules.side];
+        let per_side = 1.0 / rules.zoom();
+        let position = rules.positions.of(k);
         let learned = [head[HEAD_UV_OFFSET], head[HEAD_UV_OFFSET + 1]];
         let (bounded, per_px) = match rules.offset_bound {
             Some(bound) => ([learned[0].tanh(), learned[1].tanh()], bound * per_side),
             None => (learned, per_side),
         };
-        let grid = |i: usize| V::constant((cell[i] as f64 + 0.5) * per_side - 0.5);
+        let grid = |i: usize| V::constant(position[i]);
         let offset = [
             bounded[0].fma(V::constant(per_px), grid(0)),
             bounded[1].fma(V::constant(per_px), grid(1)),
@@ -127,7 +127,7 @@ impl<V: Vector> Step<V> {
                 d_flat[i] = d_s[i] - d_slid[i];
             }
         }
-        let per_side = 1.0 / rules.side as f64;
+        let per_side = 1.0 / rules.zoom();
         for i in 0..2 {
             let per = d_flat[i] / parent.view.focal[i];
             d_offset[i] = per.fma(z, d_offset[i]);
@@ -201,7 +201,7 @@ impl<V: Vector> Child<V> {
             Some(shared) => shared.jw,
             None => {
                 let at = add(parent.in_camera, step.out);
-                let own = Jacobian::new(&parent.view, at, V::constant(rules.side as f64));
+                let own = Jacobian::new(&parent.view, at, V::constant(rules.zoom()));
                 let jw = own.jw;
                 jacobian = Some(own);
                 jw

@@ -111,7 +111,7 @@ impl<V: Vector> Parent<V> {
             parent.disc = Some(Disc::new(&parent));
         }
         if rules.area_at == AreaAt::Parent {
-            let zoom = V::constant(rules.side as f64);
+            let zoom = V::constant(rules.zoom());
             parent.jacobian = Some(Jacobian::new(&view, in_camera, zoom));
         }
         if rules.opacity.areas_are_relative() {

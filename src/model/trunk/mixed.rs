@@ -1,8 +1,8 @@
 //! Children of parents with different numbers of them (ours, not the paper's).
 //!
-//! In: r of each parent, 0 to [`UPSCALE_MAX`](super::UPSCALE_MAX). A parent has r² children; at r = 1 it is its own child,
-//! at r = 0 it has none. Out: packed rows in the order of the parents, each with the index of its
-//! parent. Optical depth ([`crate::config::OpacityRule`]) makes neighbours of different r agree.
+//! In: K of each parent, 0 to 64. At K = 1 a parent is its own child, at K = 0 it has none. Out:
+//! packed rows in the order of the parents, each with the index of its parent. Optical depth
+//! ([`crate::config::OpacityRule`]) makes neighbours of different K agree.
 
 use super::{Parts, Records, Scene, Span, Trunk};
 use crate::abi::SPLAT_STRIDE;
@@ -27,9 +27,9 @@ pub struct MixedChildren {
     pub parents: Vec<u32>,
 }
 
-/// Parents of one view with the same r.
+/// Parents of one view with the same K.
 struct Group {
-    side: usize,
+    children: usize,
     indices: Vec<u32>,
 }
 
@@ -37,33 +37,34 @@ struct Group {
 type Made = (Vec<f32>, Vec<f32>);
 
 impl Trunk {
-    /// Computes the children of the one scene in `views`; parent i has `sides[i]`² of them.
+    /// Computes the children of the one scene in `views`; parent i has `counts[i]` of them.
     /// `checkpoint` runs after each chunk of parents, on any thread.
     ///
     /// # Errors
-    /// Those of [`Trunk::forward`] and of `checkpoint`; another number of `sides` than of parents;
-    /// a side above [`UPSCALE_MAX`](super::UPSCALE_MAX), or one that the heads do not serve.
+    /// Those of [`Trunk::forward`] and of `checkpoint`; another number of `counts` than of parents;
+    /// a count above 64, or one that the heads do not serve.
     pub fn forward_mixed(
         &self,
         views: &Views,
         backbone: &BackboneOutput,
         primaries: &Primaries,
-        sides: &[u8],
+        counts: &[u8],
         checkpoint: Checkpoint<'_>,
     ) -> Result<MixedChildren> {
         let parents = self.parents(views, primaries)?.to_splats()?;
-        if sides.len() != parents.len() {
-            bail!("sides: expected one for each of {} parents, got {}", parents.len(), sides.len());
+        if counts.len() != parents.len() {
+            let (expected, got) = (parents.len(), counts.len());
+            bail!("numbers of children: expected one for each of {expected} parents, got {got}");
         }
-        let groups = groups(sides, primaries.per_view, self.chunk_size());
-        let made = match groups.iter().any(|group| group.side > 1) {
+        let groups = groups(counts, primaries.per_view, self.chunk_size());
+        let made = match groups.iter().any(|group| group.children > 1) {
             true => self.made(views, backbone, primaries, &groups, checkpoint)?,
             false => groups.iter().map(|_| Made::default()).collect(),
         };
-        Ok(assembled(&parents, sides, &groups, &made))
+        Ok(assembled(&parents, counts, &groups, &made))
     }
 
-    /// Children of every group with a side above 1.
+    /// Children of every group with more than one.
     fn made(
         &self,
         views: &Views,
@@ -73,7 +74,7 @@ impl Trunk {
         checkpoint: Checkpoint<'_>,
     ) -> Result<Vec<Made>> {
         let Some(parts) = &self.parts else {
-            bail!("sides: expected 0 or 1 where SPGR is off, got more")
+            bail!("children per parent: expected 0 or 1 where SPGR is off, got more")
         };
         if primaries.means.dtype() != DType::F32 {
             bail!("primaries: expected f32, got {:?}", primaries.means.dtype());
@@ -100,27 +101,27 @@ impl Trunk {
     ) -> Result<Vec<Made>> {
         checkpoint()?;
         let mut made: Vec<Made> = groups.iter().map(|_| Made::default()).collect();
-        let mut sides: Vec<usize> = groups.iter().map(|g| g.side).filter(|s| *s > 1).collect();
-        sides.sort_unstable();
-        sides.dedup();
-        for side in sides {
+        let mut counts: Vec<usize> = groups.iter().map(|g| g.children).filter(|k| *k > 1).collect();
+        counts.sort_unstable();
+        counts.dedup();
+        for children in counts {
             let mut trunk = self.clone();
-            trunk.set_upscale(side)?;
-            let scene = scene.for_side(&trunk, parts)?;
+            trunk.set_children(children)?;
+            let scene = scene.for_rules_of(&trunk, parts)?;
             let run = |(group, made): (&Group, &mut Made)| {
                 *made = trunk.children_of(parts, &scene, group)?;
                 checkpoint()
             };
-            let of_side = |(group, _): &(&Group, &mut Made)| group.side == side;
+            let of_count = |(group, _): &(&Group, &mut Made)| group.children == children;
             match self.backend.is_cpu() {
-                true => groups.par_iter().zip(&mut made).filter(of_side).try_for_each(run)?,
-                false => groups.iter().zip(&mut made).filter(of_side).try_for_each(run)?,
+                true => groups.par_iter().zip(&mut made).filter(of_count).try_for_each(run)?,
+                false => groups.iter().zip(&mut made).filter(of_count).try_for_each(run)?,
             }
         }
         Ok(made)
     }
 
-    /// Children of one group; the trunk and the scene have its side.
+    /// Children of one group; the trunk and the scene have its K.
     fn children_of<A: Array>(
         &self,
         parts: &Parts,
@@ -140,7 +141,7 @@ impl Trunk {
             sh: chosen(&scene.sh_input)?,
         };
         let Records { head, parents } = self.records_of(parts, scene, own, Mode::Infer)?;
-        let count = group.indices.len() * group.side * group.side;
+        let count = group.indices.len() * group.children;
         let mut rows = vec![0f32; count * SPLAT_STRIDE];
         let mut gains = vec![0f32; count * scene.rules.gain_channels()];
         // SPGR reads a parent's view from its index, so any index of the view will do.
@@ -151,44 +152,43 @@ impl Trunk {
 }
 
 impl<'a, A: Array> Scene<'a, A> {
-    /// The same scene for the r of `trunk`.
-    fn for_side(&self, trunk: &Trunk, parts: &Parts) -> Result<Scene<'a, A>> {
-        let side = trunk.rules.side;
+    /// The same scene for the K of `trunk`.
+    fn for_rules_of(&self, trunk: &Trunk, parts: &Parts) -> Result<Scene<'a, A>> {
+        let children = trunk.rules.children();
         Ok(Scene {
-            heads: parts.heads.for_side(side)?,
-            rules: rules(&trunk.config, side),
+            heads: parts.heads.for_children(children)?,
+            rules: rules(&trunk.config, children),
             ..self.clone()
         })
     }
 }
 
-/// Parents with children in groups of one view and one side, of at most `size` parents.
-fn groups(sides: &[u8], per_view: usize, size: usize) -> Vec<Group> {
+/// Parents with children in groups of one view and one K, of at most `size` parents.
+fn groups(counts: &[u8], per_view: usize, size: usize) -> Vec<Group> {
     let mut groups = Vec::new();
-    for (view, sides) in sides.chunks(per_view.max(1)).enumerate() {
-        let mut by_side: Vec<Vec<u32>> = Vec::new();
-        for (i, side) in sides.iter().enumerate().filter(|(_, side)| **side > 0) {
-            let side = usize::from(*side);
-            by_side.resize_with(by_side.len().max(side + 1), Vec::new);
-            by_side[side].push((view * per_view + i) as u32);
+    for (view, counts) in counts.chunks(per_view.max(1)).enumerate() {
+        let mut by_count: Vec<Vec<u32>> = Vec::new();
+        for (i, children) in counts.iter().enumerate().filter(|(_, children)| **children > 0) {
+            let children = usize::from(*children);
+            by_count.resize_with(by_count.len().max(children + 1), Vec::new);
+            by_count[children].push((view * per_view + i) as u32);
         }
-        for (side, indices) in by_side.into_iter().enumerate() {
+        for (children, indices) in by_count.into_iter().enumerate() {
             let parts = indices.chunks(size.max(1));
-            groups.extend(parts.map(|part| Group { side, indices: part.to_vec() }));
+            groups.extend(parts.map(|part| Group { children, indices: part.to_vec() }));
         }
     }
     groups
 }
 
 /// Rows, SH sets and gains in the order of the parents.
-fn assembled(parents: &Splats, sides: &[u8], groups: &[Group], made: &[Made]) -> MixedChildren {
-    let square = |side: &u8| usize::from(*side).pow(2);
-    let count: usize = sides.iter().map(square).sum();
-    let mut starts = Vec::with_capacity(sides.len());
+fn assembled(parents: &Splats, counts: &[u8], groups: &[Group], made: &[Made]) -> MixedChildren {
+    let count: usize = counts.iter().map(|k| usize::from(*k)).sum();
+    let mut starts = Vec::with_capacity(counts.len());
     let mut of_children = Vec::with_capacity(count);
-    for (parent, side) in sides.iter().enumerate() {
+    for (parent, children) in counts.iter().enumerate() {
         starts.push(of_children.len());
-        of_children.extend(std::iter::repeat_n(parent as u32, square(side)));
+        of_children.extend(std::iter::repeat_n(parent as u32, usize::from(*children)));
     }
     let set = 3 * parents.sh_coefficients();
     let mut sh = Vec::with_capacity(count * set);
@@ -196,7 +196,7 @@ fn assembled(parents: &Splats, sides: &[u8], groups: &[Group], made: &[Made]) ->
         sh.extend_from_slice(parents.sh_of(*parent as usize));
     }
     let children = |(group, (_, gains)): (&Group, &Made)| {
-        gains.len() / (group.indices.len() * group.side * group.side).max(1)
+        gains.len() / (group.indices.len() * group.children).max(1)
     };
     // γ, or γ and δ.
     let channels = groups.iter().zip(made).map(children).max().unwrap_or(0).max(1);
@@ -204,11 +204,11 @@ fn assembled(parents: &Splats, sides: &[u8], groups: &[Group], made: &[Made]) ->
     let mut gain = vec![0f32; count * channels];
     gain.iter_mut().step_by(channels).for_each(|gamma| *gamma = 1.0);
     for (group, (made_rows, made_gains)) in groups.iter().zip(made) {
-        let k = group.side * group.side;
+        let k = group.children;
         for (i, parent) in group.indices.iter().map(|p| *p as usize).enumerate() {
             let (begin, end) = (starts[parent], starts[parent] + k);
             let own = &mut rows[begin * SPLAT_STRIDE..end * SPLAT_STRIDE];
-            if group.side == 1 {
+            if k == 1 {
                 own.copy_from_slice(parents.row(parent));
                 continue;
             }

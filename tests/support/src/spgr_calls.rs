@@ -9,10 +9,15 @@ use subsplat::config::{self, *};
 use subsplat::model::spgr::rules;
 use subsplat::ops::spgr::Spgr;
 
+/// [`call`] for K = `children`, which need not be that of `config`.
+pub fn call_of(config: &Config, size: usize, children: usize) -> Spgr {
+    Spgr { rules: rules(config, children), ..call(config, size) }
+}
+
 /// A call for parents of two views of `size` px, one parent per pixel.
 pub fn call(config: &Config, size: usize) -> Spgr {
     Spgr {
-        rules: rules(config, config.upscale),
+        rules: rules(config, config.children()),
         cameras: cameras(2, size, size),
         near: vec![1.0; 2],
         per_view: size * size,

@@ -12,7 +12,7 @@ use subsplat::abi::{
     AMinMode, AREA_SQ_EPS, AreaAt, DEPTH_FRACTION_MIN, DepthDir, DepthUnit, FRUSTUM_MARGIN,
     GROWTH_MAX, GainSpace, HEAD_DEPTH_OFFSET, HEAD_GAIN_OFFSET, HEAD_LOG_SCALE_OFFSET,
     HEAD_LOGIT_OFFSET, HEAD_ROTATION_OFFSET, HEAD_UV_OFFSET, MEAN_OFFSET, OPACITY_OFFSET,
-    PrimaryView, QUAT_OFFSET, SCALE_OFFSET, Slide, VISIBLE_Z_MIN,
+    Positions, PrimaryView, QUAT_OFFSET, SCALE_OFFSET, Slide, VISIBLE_Z_MIN,
 };
 use subsplat::ops::redistribute::{OpacityRule, redistribute};
 use subsplat::ops::spgr::{Rules, Spgr};
@@ -316,7 +316,6 @@ impl Parents {
 
     /// Camera-frame step of all children, `[n, K]` each.
     fn step(&self, rules: &Rules, lane: &dyn Fn(usize) -> Result<Tensor>) -> Result<V3> {
-        let side = rules.side as f64;
         let offset = |i: usize| -> Result<Tensor> {
             let learned = lane(HEAD_UV_OFFSET + i)?;
             let learned = match rules.offset_bound {
@@ -324,12 +323,21 @@ impl Parents {
                 None => learned,
             };
             let place = |k: usize| {
-                let cell = if i == 0 { k % rules.side } else { k / rules.side };
-                (cell as f64 + 0.5) / side - 0.5
+                let Positions { columns, rows, step } = rules.positions;
+                let (columns, rows) = (columns as usize, rows as usize);
+                let cell = match (i, step) {
+                    (0, _) => k % columns,
+                    (_, 0) => k / columns,
+                    (_, step) => k * step as usize % rows,
+                };
+                (cell as f64 + 0.5) / [columns, rows][i] as f64 - 0.5
             };
             let grid: Vec<f64> = (0..rules.children()).map(place).collect();
             let grid = Tensor::from_vec(grid, (1, rules.children()), learned.device())?;
-            add(&scaled(&learned, 1.0 / side)?, &grid.to_dtype(learned.dtype())?)
+            add(
+                &scaled(&learned, 1.0 / (rules.children() as f64).sqrt())?,
+                &grid.to_dtype(learned.dtype())?,
+            )
         };
         let mut s = self.lateral(rules, &[offset(0)?, offset(1)?])?;
         let mut dz = scaled(&lane(HEAD_DEPTH_OFFSET)?.tanh()?, rules.beta_z)?;
@@ -411,7 +419,7 @@ pub fn spgr(head: &Tensor, parents: &Tensor, call: &Spgr) -> Result<(Tensor, Ten
         AreaAt::Parent => Ok(p.in_camera[i].clone()),
         AreaAt::Child => add(&p.in_camera[i], &step[i]),
     };
-    let j = p.view.jacobian(&[at(0)?, at(1)?, at(2)?], rules.side as f64)?;
+    let j = p.view.jacobian(&[at(0)?, at(1)?, at(2)?], (rules.children() as f64).sqrt())?;
     let m = Footprint::new(&j, &p.view.ellipsoid(&quat, &scale)?)?;
     let area = m.area()?;
     let growth = m.growth(&area, rules)?;

@@ -410,8 +410,8 @@ pub struct SourceArgs {
     pub upscale: Option<f32>,
     /// Number of Gaussians, at most, or their share of all children of all pixels. Pixels of even
     /// colour keep one, pixels with detail get all. auto: all of two photographs; more photographs
-    /// share the Gaussians of two and a half.
-    #[arg(long, value_name = "auto | N | P%", value_parser = values::density, default_value = "auto")]
+    /// share the Gaussians of two and a half. K/px: K for every pixel, a square number or not.
+    #[arg(long, value_name = "auto | N | P% | K/px", value_parser = values::density, default_value = "auto")]
     pub gaussians: Density,
     /// Weights (.safetensors). Default: the shipped ones.
     #[arg(long, value_name = "FILE")]

@@ -58,7 +58,7 @@ pub struct EvalArgs {
     #[arg(long, value_delimiter = ',', value_name = "M,…")]
     pub methods: Vec<Method>,
     /// Number of Gaussians, as in `run`; `opaque` and `random` remove others of all instead.
-    #[arg(long, value_name = "auto | N | P%", value_parser = values::density, default_value = "auto")]
+    #[arg(long, value_name = "auto | N | P% | K/px", value_parser = values::density, default_value = "auto")]
     pub gaussians: Density,
     /// Score also PNG pictures of another program: DIR/SCENE/INPUTS/NNNNNN.png, or
     /// SCENE/color/NNNNNN.png, SCENE/NNNNNN.png, SCENE/FRAMENAME.png.

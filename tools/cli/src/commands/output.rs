@@ -139,18 +139,18 @@ fn remove_earlier(out: &Path) {
 /// Pictures of the number of children of each input pixel, one for each photograph: black where there
 /// are none, white for the most. Empty where all pixels have the same number.
 fn children_maps(result: &Reconstruction) -> Vec<Rgb> {
-    let sides = result.children_sides();
-    let most = sides.iter().copied().max().unwrap_or(0).max(1);
-    let per_view = sides.len() / result.inputs().len().max(1);
-    let map = |(input, sides): (&Cropped, &[u8])| {
+    let counts = result.children_counts();
+    let most = counts.iter().copied().max().unwrap_or(0).max(1);
+    let per_view = counts.len() / result.inputs().len().max(1);
+    let map = |(input, counts): (&Cropped, &[u8])| {
         let (width, height) = (input.input.width, input.input.height);
         // MVSplat may give a pixel several Gaussians; the first one counts.
-        let per_pixel = (sides.len() / (width * height).max(1)).max(1);
-        let grey = |side: &u8| (255.0 * f32::from(*side) / f32::from(most)).round() as u8;
-        let data = sides.iter().step_by(per_pixel).flat_map(|side| [grey(side); 3]).collect();
+        let per_pixel = (counts.len() / (width * height).max(1)).max(1);
+        let grey = |k: &u8| (255.0 * (f32::from(*k) / f32::from(most)).sqrt()).round() as u8;
+        let data = counts.iter().step_by(per_pixel).flat_map(|k| [grey(k); 3]).collect();
         Rgb { width, height, data }
     };
-    result.inputs().iter().zip(sides.chunks(per_view.max(1))).map(map).collect()
+    result.inputs().iter().zip(counts.chunks(per_view.max(1))).map(map).collect()
 }
 
 /// Renders, scores and writes views one by one.

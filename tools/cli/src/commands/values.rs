@@ -1,6 +1,7 @@
 //! Parsers of argument values that need no file. clap reports their errors as wrong usage.
 
 use super::args::InputSizeArg;
+use subsplat::abi::CHILDREN_MAX;
 use subsplat::camera::Intrinsics;
 use subsplat::{Density, Refine};
 
@@ -37,16 +38,22 @@ pub fn upscale(text: &str) -> Result<f32, String> {
     ratio.ok_or_else(|| format!("expected a number from 1 to {UPSCALE_MAX}"))
 }
 
-/// Parses a number of Gaussians: `auto`, a whole number, or a share of all as `P%`.
+/// Parses a number of Gaussians: `auto`, a whole number, a share of all as `P%`, or the number for each
+/// pixel of the network's input as `K/px`.
 pub fn density(text: &str) -> Result<Density, String> {
     let text = text.trim();
     if text == "auto" {
         return Ok(Density::Auto);
     }
+    if let Some(each) = text.strip_suffix("/px") {
+        let each = whole(each, 1, CHILDREN_MAX).map(Density::Each);
+        return each
+            .map_err(|_| format!("expected a whole number of 1 to {CHILDREN_MAX} before /px"));
+    }
     let Some(percent) = text.strip_suffix('%') else {
         let count = whole(text, 1, usize::MAX);
         let expected =
-            |_| "expected auto, a whole number of at least 1, or a share as 50%".to_owned();
+            |_| "expected auto, a whole number of at least 1, a share as 50%, or 3/px".to_owned();
         return count.map(Density::Count).map_err(expected);
     };
     match percent.trim().parse::<f32>() {
@@ -59,7 +66,7 @@ pub fn density(text: &str) -> Result<Density, String> {
 /// Parses a number of Gaussians of a finished scene: a whole number, or a share of all as `P%`.
 pub fn reduced(text: &str) -> Result<Density, String> {
     match density(text) {
-        Ok(Density::Auto) => {
+        Ok(Density::Auto | Density::Each(_)) => {
             Err("expected a whole number of at least 1, or a share as 50%".to_owned())
         }
         other => other,
@@ -191,6 +198,12 @@ mod tests {
     fn numbers_of_gaussians() {
         assert_eq!((density("auto"), density("100%")), (Ok(Density::Auto), Ok(Density::Full)));
         assert_eq!(density(" 25 %"), Ok(Density::Share(0.25)));
+        assert_eq!(
+            (density("3/px"), density("1 /px")),
+            (Ok(Density::Each(3)), Ok(Density::Each(1)))
+        );
+        assert!(density("0/px").is_err() && density("65/px").unwrap_err().contains("64"));
+        assert!(reduced("3/px").is_err());
         assert_eq!(density("100000"), Ok(Density::Count(100_000)));
         for bad in ["", "0", "-3", "1.5", "0%", "101%", "NaN%", "%", "many"] {
             assert!(density(bad).unwrap_err().starts_with("expected a"), "{bad}");
