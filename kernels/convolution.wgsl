@@ -3,6 +3,9 @@
 //
 // A workgroup computes 64 outputs of 64 pixels in steps of 16 terms; a thread 4 x 4 of them.
 
+// An activation function of the results.
+override ACTIVATION_KIND: u32 = 0u;
+
 struct ConvolutionUniform {
     channels: u32,
     outputs: u32,
@@ -99,7 +102,7 @@ fn main(
             let pixel = first_pixel + own_pixel + j;
             if pixel < call.pixels {
                 result[(workgroup.z * call.outputs + output) * call.pixels + pixel] =
-                    sums[i][j] + start;
+                    activation(ACTIVATION_KIND, sums[i][j] + start);
             }
         }
     }

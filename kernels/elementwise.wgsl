@@ -25,6 +25,8 @@ const WITHIN: u32 = 15u;
 
 override FUNCTION: u32 = 0u;
 override ACTIVATION_KIND: u32 = 0u;
+// An activation function of the results.
+override AFTER_KIND: u32 = 0u;
 
 struct ElementwiseUniform {
     count: u32,
@@ -98,5 +100,5 @@ fn main(
             call.result[block][lane],
         );
     }
-    result[at.z] = value(at.x, at.y);
+    result[at.z] = activation(AFTER_KIND, value(at.x, at.y));
 }

@@ -2,6 +2,9 @@
 //
 // A workgroup computes 64 rows of 64 outputs in steps of 16 terms; a thread 4 x 4 of them.
 
+// An activation function of the results.
+override ACTIVATION_KIND: u32 = 0u;
+
 struct LinearUniform {
     rows: u32,
     outputs: u32,
@@ -67,7 +70,8 @@ fn main(
         for (var i = 0u; i < 4u; i++) {
             let row = first_row + thread / 16u * 4u + i;
             if row < call.rows {
-                y[row * call.outputs + output] = sums[i][j] + start;
+                y[row * call.outputs + output] =
+                    activation(ACTIVATION_KIND, sums[i][j] + start);
             }
         }
     }

@@ -7,8 +7,8 @@
 //!   each.
 
 use super::geometry::{Frames, ParentChunk};
-use super::layers::{LayerNorm, gelu, xavier};
-use super::mlp::{Block2, affine, linear};
+use super::layers::{Activation, LayerNorm, xavier};
+use super::mlp::{Block2, affine, affine_then, linear};
 use crate::config::{AlphaInput, AnchorFrame, Embed, EmbedMlp, ScaleInput};
 use crate::ops::Array;
 use crate::ops::attributes::Attributes;
@@ -149,9 +149,9 @@ impl Embeddings {
                 })
             }
             Mlps::Lite { geometry, w_g, ln_g, colour, ln_c } => {
-                let hidden = affine(&side_by_side(geometry)?, &all)?;
-                let geometry = ln_g.forward(&affine(w_g, &gelu(&hidden)?)?)?;
-                let hidden = gelu(&affine(&colour[0], &parents.sh)?)?;
+                let hidden = affine_then(&side_by_side(geometry)?, &all, Activation::Gelu)?;
+                let geometry = ln_g.forward(&affine(w_g, &hidden)?)?;
+                let hidden = affine_then(&colour[0], &parents.sh, Activation::Gelu)?;
                 let appearance = ln_c.forward(&affine(&colour[1], &hidden)?)?;
                 Ok(Descriptors { geometry, appearance })
             }

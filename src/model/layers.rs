@@ -119,6 +119,17 @@ impl Conv2d {
         let steps = ConvSteps { stride, padding };
         x.convolved(&x.parameter(&self.weight)?, bias.as_ref(), steps)
     }
+
+    /// Applies [`Conv2d::forward`], then `activation`.
+    ///
+    /// # Errors
+    /// As [`Conv2d::forward`].
+    pub fn forward_then<A: Array>(&self, x: &A, activation: Activation) -> Result<A> {
+        let bias = self.bias.as_ref().map(|bias| x.parameter(bias)).transpose()?;
+        let ConvShape { stride, padding, .. } = self.shape;
+        let steps = ConvSteps { stride, padding };
+        x.convolved_then(&x.parameter(&self.weight)?, bias.as_ref(), steps, activation)
+    }
 }
 
 /// Linear layer: `weight` `[O, C]`, `bias` `[O]`; `[…, C]` to `[…, O]`.

@@ -1,6 +1,6 @@
 //! Linear layers with chosen initial values, and an MLP of them.
 
-use super::layers::{LayerNorm, relu};
+use super::layers::{Activation, LayerNorm};
 use crate::ops::Array;
 use candle_core::Result;
 use candle_nn::{Init, Linear, VarBuilder};
@@ -36,6 +36,12 @@ pub(crate) fn affine<A: Array>(layer: &Linear, x: &A) -> Result<A> {
     x.projected(&x.parameter(layer.weight())?, bias.as_ref())
 }
 
+/// [`affine`], then an activation function.
+pub(crate) fn affine_then<A: Array>(layer: &Linear, x: &A, activation: Activation) -> Result<A> {
+    let bias = layer.bias().map(|bias| x.parameter(bias)).transpose()?;
+    x.projected_then(&x.parameter(layer.weight())?, bias.as_ref(), activation)
+}
+
 /// (Linear, ReLU, LayerNorm) twice: an attribute MLP of PixelGaussian and
 /// GaussianFormer. Parameters `lin0`, `ln0`, `lin1`, `ln1`.
 #[derive(Clone, Debug)]
@@ -59,7 +65,7 @@ impl Block2 {
     pub(crate) fn forward<A: Array>(&self, x: &A) -> Result<A> {
         let mut x = x.clone();
         for (lin, ln) in self.lin.iter().zip(&self.ln) {
-            x = ln.forward(&relu(&affine(lin, &x)?)?)?;
+            x = ln.forward(&affine_then(lin, &x, Activation::Relu)?)?;
         }
         Ok(x)
     }

@@ -16,8 +16,8 @@
 //!   parameters do not depend on K.
 
 use super::embed::Descriptors;
-use super::layers::{LayerNorm, gelu, relu};
-use super::mlp::{affine, linear};
+use super::layers::{Activation, LayerNorm};
+use super::mlp::{affine, affine_then, linear};
 use crate::abi::{HEAD_GEOMETRY_LEN, HEAD_STRIDE, Positions};
 use crate::config::{AMin, Config, SpgrHead};
 use crate::ops::Array;
@@ -145,26 +145,26 @@ impl Head {
         let [n, _] = x.sizes()?;
         let out = match &self.form {
             Form::Mlp2 { norm, lin0, lin1 } => {
-                let hidden = affine(lin0, &norm.forward(x)?)?;
-                affine(lin1, &gelu(&hidden)?)?
+                let hidden = affine_then(lin0, &norm.forward(x)?, Activation::Gelu)?;
+                affine(lin1, &hidden)?
             }
             Form::Pg { lin, ln } => {
                 let mut x = x.clone();
                 for (i, ln) in ln.iter().enumerate() {
-                    x = relu(&affine(&lin[2 * i], &x)?)?;
-                    x = ln.forward(&relu(&affine(&lin[2 * i + 1], &x)?)?)?;
+                    x = affine_then(&lin[2 * i], &x, Activation::Relu)?;
+                    x = ln.forward(&affine_then(&lin[2 * i + 1], &x, Activation::Relu)?)?;
                 }
                 affine(&lin[4], &x)?
             }
             Form::Coord { norm, lin0, lin1, pos } => {
                 let x = affine(lin0, &norm.forward(x)?)?;
                 let positions = x.constant(posenc(k), &[k, POSENC])?;
-                let positions = gelu(&affine(&pos[0], &positions)?)?;
+                let positions = affine_then(&pos[0], &positions, Activation::Gelu)?;
                 let positions = affine(&pos[1], &positions)?;
                 // One child at a time, so that no tensor [n, K, hidden] exists.
                 let child = |i: usize| {
-                    let hidden = x.plus(&positions.narrow(0, i, 1)?)?;
-                    affine(lin1, &gelu(&hidden)?)
+                    let hidden = x.plus_then(&positions.narrow(0, i, 1)?, Activation::Gelu)?;
+                    affine(lin1, &hidden)
                 };
                 let children = (0..k).map(child).collect::<Result<Vec<_>>>()?;
                 A::joined(&children.iter().collect::<Vec<_>>(), 1)?

@@ -125,6 +125,11 @@ pub trait Array: Clone + std::fmt::Debug {
     /// Computes a + b; sizes of 1 of `other` are repeated.
     fn plus(&self, other: &Self) -> Result<Self>;
 
+    /// Computes [`Array::plus`], then an activation function.
+    fn plus_then(&self, other: &Self, activation: Activation) -> Result<Self> {
+        self.plus(other)?.activated(activation)
+    }
+
     /// Computes a − b; sizes of 1 of `other` are repeated.
     fn minus(&self, other: &Self) -> Result<Self>;
 
@@ -152,8 +157,29 @@ pub trait Array: Clone + std::fmt::Debug {
     /// Computes a convolution over two or three axes.
     fn convolved(&self, weight: &Self, bias: Option<&Self>, steps: ConvSteps) -> Result<Self>;
 
+    /// Computes [`Array::convolved`], then an activation function.
+    fn convolved_then(
+        &self,
+        weight: &Self,
+        bias: Option<&Self>,
+        steps: ConvSteps,
+        activation: Activation,
+    ) -> Result<Self> {
+        self.convolved(weight, bias, steps)?.activated(activation)
+    }
+
     /// Computes x·Wᵀ + b of `[N, C]`.
     fn projected(&self, weight: &Self, bias: Option<&Self>) -> Result<Self>;
+
+    /// Computes [`Array::projected`], then an activation function.
+    fn projected_then(
+        &self,
+        weight: &Self,
+        bias: Option<&Self>,
+        activation: Activation,
+    ) -> Result<Self> {
+        self.projected(weight, bias)?.activated(activation)
+    }
 
     /// Normalises groups of channels of `[B, C, …]`, then applies `activation`.
     fn group_norm(

@@ -13,6 +13,7 @@ use super::{Error, Result};
 use crate::clock::Instant;
 use crate::io;
 use crate::model::weights::{self, Weights};
+use crate::ops::Backend;
 use candle_core::Tensor;
 use std::fs::{File, TryLockError};
 use std::io::{ErrorKind, Write};
@@ -254,6 +255,11 @@ impl Training {
     /// Returns the progress.
     pub fn progress(&self) -> &Progress {
         &self.progress
+    }
+
+    /// Returns the kernels of the configured device.
+    pub fn backend(&self) -> &Backend {
+        self.learner.backend()
     }
 
     /// Returns why the CPU took over work of the configured GPU; `None` where it did not.

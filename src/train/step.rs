@@ -256,6 +256,11 @@ impl Learner {
         &self.model
     }
 
+    /// Returns the kernels that the model uses.
+    pub fn backend(&self) -> &Backend {
+        &self.backend
+    }
+
     /// Returns why the CPU took over work of the configured GPU; `None` where it did not.
     pub fn warning(&self) -> Option<String> {
         self.backend.warning()

@@ -5,12 +5,14 @@ use subsplat_test_support::whole;
 
 use adapter::{gpu, limited};
 use std::ops::ControlFlow;
+use std::path::Path;
 use subsplat::camera::NearFar;
 use subsplat::config::Preset;
 use subsplat::model::Backend;
 use subsplat::model::compare::compare;
 use subsplat::model::weights::Weights;
-use subsplat::{Error, Progress, Stage};
+use subsplat::pipeline::{Photo, Reconstructor};
+use subsplat::{Error, Progress, Stage, load_scene};
 use subsplat_test_support::shared;
 use whole::{light, lively, plain, run, shoot};
 
@@ -61,6 +63,28 @@ fn small() {
 #[test]
 fn mvsplat() {
     check(true);
+}
+
+/// The weights that ship on the room that ships, at the default size of the input.
+#[test]
+fn shipped_weights_on_the_shipped_room() {
+    let Some(gpu) = gpu() else { return };
+    let room = Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/room");
+    let scene = load_scene(&room).unwrap();
+    let photos: Vec<Photo> =
+        scene.frames[..2].iter().map(|f| Photo::from_frame(f).unwrap()).collect();
+    let options = whole::options((256, 256), NearFar::new(1.0, 12.0), true);
+    let model = Reconstructor::shipped(2).unwrap();
+    let expected = model.run(&photos, &options).unwrap();
+    let backend = Backend::from(gpu);
+    let got = model.with_backend(&backend).run(&photos, &options).unwrap();
+    assert_eq!(backend.warning(), None);
+    let raster = *expected.raster_options();
+    let camera = *photos[0].camera();
+    let decibels = whole::compare(expected.splats(), got.splats(), &camera, &raster);
+    eprintln!("shipped room: {decibels:.1} dB");
+    assert!(decibels >= 50.0, "{decibels} dB");
+    assert!(got.splats().rows() != expected.splats().rows(), "the results have equal bytes");
 }
 
 /// The encoder with MVSplat's weights, stage by stage, against the outputs of the public MVSplat.

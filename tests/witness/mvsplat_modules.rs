@@ -2,6 +2,7 @@
 //! written from the specification in `tools/witness`, run by onnxruntime. No Python is
 //! needed here; `tools/witness/verify.py` holds the goldens against onnxruntime.
 
+use subsplat_test_support::gpu::gpu;
 use subsplat_test_support::witness as witness_common;
 
 use candle_core::{DType, Device, Result, Tensor};
@@ -18,7 +19,7 @@ use subsplat::model::primaries::primaries;
 use subsplat::model::subsplat::{SceneOutput, SubSplat};
 use subsplat::model::trace::Trace;
 use subsplat::model::weights::Weights;
-use subsplat::model::{BackboneOutput, Primaries, Views};
+use subsplat::model::{BackboneOutput, Backend, Primaries, Views};
 use witness_common::{Golden, folder, skip, tolerances};
 
 #[test]
@@ -230,8 +231,10 @@ fn whole(
     golden: &Golden,
     preset: Preset,
     weights: &Weights,
+    backend: &Backend,
 ) -> Result<BTreeMap<&'static str, Tensor>> {
     let model = SubSplat::new(&configured(golden, preset), weights.builder())?;
+    let model = model.with_backend(backend);
     let views = golden.views();
     let parents = model.primaries(&views, &model.encode(&views)?)?.means.squeeze(0)?;
     let mut scenes = model.forward(&views, &mut |_| ())?;
@@ -258,7 +261,7 @@ fn whole_network() -> Result<()> {
     for (name, preset) in WHOLE {
         let golden = Golden::load(name);
         let weights = golden.weights();
-        for (output, got) in whole(&golden, preset, &weights)? {
+        for (output, got) in whole(&golden, preset, &weights, &Backend::Cpu)? {
             golden.compare(output, &got);
         }
         golden.done(&weights);
@@ -269,8 +272,7 @@ fn whole_network() -> Result<()> {
 /// `tools/witness/verify.py --fresh DIR` draws pictures, cameras and weights anew;
 /// SUBSPLAT_WITNESS names DIR. One element in 500 may be off: a parent on the edge of
 /// another view's picture, or equally near to two views, may fall on either side.
-#[test]
-fn fresh_inputs() -> Result<()> {
+fn check_fresh(backend: &Backend, factor: f64) -> Result<()> {
     let Some(folder) = std::env::var_os("SUBSPLAT_WITNESS") else {
         skip("SUBSPLAT_WITNESS is not set; nothing drawn anew was checked");
         return Ok(());
@@ -279,9 +281,9 @@ fn fresh_inputs() -> Result<()> {
     for (name, preset) in WHOLE {
         let golden = Golden::load_from(&folder, name);
         let weights = golden.weights();
-        for (output, got) in whole(&golden, preset, &weights)? {
+        for (output, got) in whole(&golden, preset, &weights, backend)? {
             let far = golden.distances(output, &got);
-            let tolerance = tolerances::of(name, output);
+            let tolerance = factor * tolerances::of(name, output);
             let off = far.iter().filter(|&&d| d > tolerance).count();
             let worst = far.iter().copied().fold(0.0, f64::max);
             let what = format!(
@@ -294,6 +296,21 @@ fn fresh_inputs() -> Result<()> {
         }
         golden.done(&weights);
     }
+    Ok(())
+}
+
+#[test]
+fn fresh_inputs() -> Result<()> {
+    check_fresh(&Backend::Cpu, 1.0)
+}
+
+/// The tolerances are twenty times those of the CPU, whose elementary functions are more exact.
+#[test]
+fn fresh_inputs_on_a_gpu() -> Result<()> {
+    let Some(gpu) = gpu() else { return Ok(()) };
+    let backend = Backend::from(gpu);
+    check_fresh(&backend, 20.0)?;
+    assert_eq!(backend.warning(), None);
     Ok(())
 }
 

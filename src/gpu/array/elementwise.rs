@@ -95,6 +95,40 @@ impl Function {
     }
 }
 
+impl Function {
+    /// Returns the name under which calls are counted.
+    fn name(self) -> &'static str {
+        match self {
+            Self::Copy => "elementwise copy",
+            Self::Activation(_) => "elementwise activation",
+            Self::Plus => "elementwise sum",
+            _ => "elementwise other",
+        }
+    }
+
+    /// Returns whether there is a second operand.
+    fn has_right(self) -> bool {
+        match self {
+            Self::Plus
+            | Self::Minus
+            | Self::Times
+            | Self::Over
+            | Self::WhereAbove(..)
+            | Self::Slope(_)
+            | Self::Signed
+            | Self::Within(..) => true,
+            Self::Copy
+            | Self::Affine(..)
+            | Self::Absolute
+            | Self::Square
+            | Self::Reciprocal
+            | Self::Clamp(..)
+            | Self::Activation(_)
+            | Self::SquareRoot => false,
+        }
+    }
+}
+
 /// Strides of the axes, outermost first, and the first element.
 #[derive(Clone, Debug)]
 struct Walk {
@@ -166,9 +200,10 @@ fn merged(sizes: &[usize], walks: [&Walk; 3]) -> (Vec<usize>, [Walk; 3]) {
     (kept, out)
 }
 
-/// One call: result[…] = function(left[…], right[…]) over `sizes`.
+/// One call: result[…] = after(function(left[…], right[…])) over `sizes`.
 struct Call<'a> {
     function: Function,
+    after: PointwiseFunction,
     sizes: &'a [usize],
     left: (&'a DeviceArray, Walk),
     right: (&'a DeviceArray, Walk),
@@ -202,9 +237,18 @@ impl Call<'_> {
             Function::Activation(kind) | Function::Slope(kind) => f64::from(kind as u32),
             _ => 0.0,
         };
-        let constants = [("FUNCTION", f64::from(number)), ("ACTIVATION_KIND", kind)];
-        let bindings = [self.left.0, self.right.0, self.result.0].map(DeviceArray::binding);
-        recorder.call(&ELEMENTWISE, &constants, &uniform, &bindings, Groups::of(count, THREADS))
+        let constants = [
+            ("FUNCTION", f64::from(number)),
+            ("ACTIVATION_KIND", kind),
+            ("AFTER_KIND", f64::from(self.after as u32)),
+        ];
+        let [left, right, result] =
+            [self.left.0, self.right.0, self.result.0].map(DeviceArray::binding);
+        // A second operand that is not read is no traffic.
+        let right = if self.function.has_right() { right } else { self.right.0.first_binding() };
+        let call = (self.function.name(), &ELEMENTWISE);
+        let groups = Groups::of(count, THREADS);
+        recorder.call_named(call, &constants, &uniform, &[left, right, result], groups)
     }
 }
 
@@ -219,6 +263,7 @@ impl DeviceArray {
         let walk = Walk::contiguous(&flat);
         Call {
             function,
+            after: PointwiseFunction::None,
             sizes: &flat,
             left: (self, walk.clone()),
             right: (self, walk.clone()),
@@ -237,6 +282,19 @@ impl DeviceArray {
     /// # Errors
     /// [`GpuError::Argument`] for sizes that do not fit; errors of the device.
     pub fn with(&self, other: &Self, function: Function) -> Result<Self, GpuError> {
+        self.with_then(other, function, PointwiseFunction::None)
+    }
+
+    /// [`DeviceArray::with`], then an activation function, in one call.
+    ///
+    /// # Errors
+    /// As [`DeviceArray::with`].
+    pub fn with_then(
+        &self,
+        other: &Self,
+        function: Function,
+        after: PointwiseFunction,
+    ) -> Result<Self, GpuError> {
         let fits = self.dims.len() == other.dims.len()
             && self.dims.iter().zip(&other.dims).all(|(a, b)| a == b || *b == 1);
         if !fits {
@@ -247,6 +305,7 @@ impl DeviceArray {
         let walk = Walk::contiguous(&self.dims);
         Call {
             function,
+            after,
             sizes: &self.dims,
             left: (self, walk.clone()),
             right: (other, Walk::repeating(&other.dims)),
@@ -261,6 +320,7 @@ impl DeviceArray {
         let result = self.recorder.empty(dims)?;
         Call {
             function: Function::Copy,
+            after: PointwiseFunction::None,
             sizes: dims,
             left: (self, walk.clone()),
             right: (self, walk),
@@ -349,6 +409,7 @@ impl DeviceArray {
             let to = Walk { first: start * whole.strides[dim], ..whole.clone() };
             Call {
                 function: Function::Copy,
+                after: PointwiseFunction::None,
                 sizes: &part.dims,
                 left: (part, walk.clone()),
                 right: (part, walk),
@@ -388,6 +449,7 @@ impl DeviceArray {
         };
         Call {
             function: Function::Copy,
+            after: PointwiseFunction::None,
             sizes: &self.dims,
             left: (self, walk.clone()),
             right: (self, walk),

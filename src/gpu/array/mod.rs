@@ -147,9 +147,9 @@ impl Recorder {
     }
 
     /// Counts a call.
-    fn count(&self, kernel: &'static Kernel, bindings: &[Binding], groups: &Groups) {
+    fn count(&self, name: &'static str, bindings: &[Binding], groups: &Groups) {
         let mut work = self.work.lock().unwrap_or_else(PoisonError::into_inner);
-        let own = work.entry(kernel.name).or_default();
+        let own = work.entry(name).or_default();
         own.calls += 1;
         own.bytes += bindings.iter().map(|b| b.bytes).sum::<u64>();
         if let Groups::Of(sizes) = groups {
@@ -167,9 +167,21 @@ impl Recorder {
         arguments: &[Binding],
         groups: Groups,
     ) -> Result<(), GpuError> {
+        self.call_named((kernel.name, kernel), constants, uniform, arguments, groups)
+    }
+
+    /// [`Recorder::call`], counted under another name.
+    pub(super) fn call_named<T: Pod>(
+        &self,
+        (name, kernel): (&'static str, &'static Kernel),
+        constants: Constants,
+        uniform: &T,
+        arguments: &[Binding],
+        groups: Groups,
+    ) -> Result<(), GpuError> {
         let mut bindings = vec![Binding::from(&self.gpu.uniform(uniform)?)];
         bindings.extend_from_slice(arguments);
-        self.count(kernel, &bindings, &groups);
+        self.count(name, &bindings, &groups);
         let bytes = bindings.last().map_or(0, |result| result.bytes);
         self.record(bytes, |commands| commands.run(kernel, constants, &bindings, groups))
     }
@@ -267,6 +279,12 @@ impl DeviceArray {
     pub(super) fn binding(&self) -> Binding {
         let at = 4 * self.offset as u64;
         self.buffer.part(at..at + 4 * self.count() as u64)
+    }
+
+    /// Returns a binding of the first elements, for an argument that the kernel does not read.
+    pub(super) fn first_binding(&self) -> Binding {
+        let at = 4 * self.offset as u64;
+        self.buffer.part(at..at + 4 * self.count().min(4) as u64)
     }
 
     /// Returns the product of the sizes before dimension `dim`, its size, and the product of the

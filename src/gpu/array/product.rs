@@ -2,7 +2,7 @@
 //!
 //! WGSL: kernels/convolution.wgsl, kernels/linear.wgsl.
 
-use super::{DeviceArray, misfit};
+use super::{DeviceArray, PointwiseFunction, misfit};
 use crate::abi::{ConvolutionUniform, LinearUniform};
 use crate::gpu::commands::Groups;
 use crate::gpu::error::GpuError;
@@ -11,14 +11,14 @@ use crate::gpu::pipelines::{Access, Kernel, wgsl};
 pub(crate) static CONVOLUTION: Kernel = Kernel {
     name: "convolution",
     entry: "main",
-    source: wgsl!("shared/product", "convolution"),
+    source: wgsl!("shared/activation", "shared/product", "convolution"),
     bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Read, Access::Write],
 };
 
 pub(crate) static LINEAR: Kernel = Kernel {
     name: "linear",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/product", "linear"),
+    source: wgsl!("shared/activation", "shared/grid", "shared/product", "linear"),
     bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Read, Access::Write],
 };
 
@@ -58,6 +58,20 @@ impl DeviceArray {
         weight: &Self,
         bias: Option<&Self>,
         call: ConvolutionCall,
+    ) -> Result<Self, GpuError> {
+        self.convolved_then(weight, bias, call, PointwiseFunction::None)
+    }
+
+    /// [`DeviceArray::convolved`], then an activation function, in one call.
+    ///
+    /// # Errors
+    /// As [`DeviceArray::convolved`].
+    pub fn convolved_then(
+        &self,
+        weight: &Self,
+        bias: Option<&Self>,
+        call: ConvolutionCall,
+        activation: PointwiseFunction,
     ) -> Result<Self, GpuError> {
         let expected = || format!("weight [O, C, ..] and bias [O] for {:?}", self.dims);
         let refused = || misfit(CONVOLUTION.name, expected(), &weight.dims);
@@ -105,7 +119,8 @@ impl DeviceArray {
             [self.binding(), weight.binding(), bias.unwrap_or(weight).binding(), result.binding()];
         let groups = [pixels.div_ceil(SIDE), o.div_ceil(SIDE), b].map(|n| n as u32);
         self.recorder.count_flops(&CONVOLUTION, 2 * result.count() * weight.count() / o);
-        self.recorder.call(&CONVOLUTION, &[], &uniform, &bindings, Groups::Of(groups))?;
+        let constants = [("ACTIVATION_KIND", f64::from(activation as u32))];
+        self.recorder.call(&CONVOLUTION, &constants, &uniform, &bindings, Groups::Of(groups))?;
         Ok(result)
     }
 
@@ -114,6 +129,19 @@ impl DeviceArray {
     /// # Errors
     /// [`GpuError::Argument`] for sizes that do not fit; errors of the device.
     pub fn projected(&self, weight: &Self, bias: Option<&Self>) -> Result<Self, GpuError> {
+        self.projected_then(weight, bias, PointwiseFunction::None)
+    }
+
+    /// [`DeviceArray::projected`], then an activation function, in one call.
+    ///
+    /// # Errors
+    /// As [`DeviceArray::projected`].
+    pub fn projected_then(
+        &self,
+        weight: &Self,
+        bias: Option<&Self>,
+        activation: PointwiseFunction,
+    ) -> Result<Self, GpuError> {
         let (&[rows, c], &[o, wc]) = (self.dims.as_slice(), weight.dims.as_slice()) else {
             return Err(misfit(LINEAR.name, "matrices".to_owned(), &self.dims));
         };
@@ -132,7 +160,8 @@ impl DeviceArray {
             [self.binding(), weight.binding(), bias.unwrap_or(weight).binding(), result.binding()];
         let groups = Groups::of(rows.div_ceil(SIDE) * o.div_ceil(SIDE), 1);
         self.recorder.count_flops(&LINEAR, 2 * rows * o * c);
-        self.recorder.call(&LINEAR, &[], &uniform, &bindings, groups)?;
+        let constants = [("ACTIVATION_KIND", f64::from(activation as u32))];
+        self.recorder.call(&LINEAR, &constants, &uniform, &bindings, groups)?;
         Ok(result)
     }
 }

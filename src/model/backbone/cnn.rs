@@ -4,7 +4,7 @@
 //! In: `[N, 3, H, W]` RGB in [0, 1], rows in any order. Out: [`CnnOutput`].
 
 use crate::model::layers::{
-    Conv2d, ConvShape, LayerInit, default_init, instance_norm, instance_norm_relu, relu,
+    Activation, Conv2d, ConvShape, LayerInit, default_init, instance_norm, instance_norm_relu,
 };
 use crate::model::trace::Trace;
 use crate::ops::Array;
@@ -112,6 +112,6 @@ impl Residual {
             Some(conv) => instance_norm(&conv.forward(x)?)?,
             None => x.clone(),
         };
-        relu(&skip.plus(&y)?)
+        skip.plus_then(&y, Activation::Relu)
     }
 }

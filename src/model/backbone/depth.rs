@@ -66,7 +66,7 @@ impl Head {
     }
 
     fn forward<A: Array>(&self, x: &A) -> Result<A> {
-        self.1.forward(&gelu(&self.0.forward(x)?)?)
+        self.1.forward(&self.0.forward_then(x, Activation::Gelu)?)
     }
 }
 

@@ -16,7 +16,7 @@ use super::small_parts::{ConvexUpsampling, Stem, Unet, conv_norm_gelu, local_mea
 use crate::abi::sh_coefficients;
 use crate::camera::{Camera, NearFar};
 use crate::config::{FeatureLevel, Small};
-use crate::model::layers::{Activation, Conv2d, ConvShape, GroupNorm, LayerInit, gelu, sigmoid};
+use crate::model::layers::{Activation, Conv2d, ConvShape, GroupNorm, LayerInit, sigmoid};
 use crate::model::trace::Trace;
 use crate::model::{BackboneOutput, Views};
 use crate::ops::plane_sweep::{Pair, Sweep, pair, relative_pose};
@@ -83,7 +83,7 @@ impl Residual {
 
     fn forward<A: Array>(&self, x: &A) -> Result<A> {
         let y = self.norm1.forward_then(&self.conv1.forward(x)?, Activation::Gelu)?;
-        gelu(&x.plus(&self.norm2.forward(&self.conv2.forward(&y)?)?)?)
+        x.plus_then(&self.norm2.forward(&self.conv2.forward(&y)?)?, Activation::Gelu)
     }
 }
 
@@ -277,7 +277,8 @@ impl SmallBackbone {
         let [index, mass] = self.expected_index(&logits, mean)?;
         let rough = index.minus(&local_mean(&index)?)?.absolute()?;
         let sides = A::joined(&[&mass, &rough.affine(0.25, 0.0)?], 1)?;
-        let hidden = gelu(&self.confidence.0.forward(&deep.beside(&sides, 1)?)?)?;
+        let hidden = deep.beside(&sides, 1)?;
+        let hidden = self.confidence.0.forward_then(&hidden, Activation::Gelu)?;
         let start = mass.affine(CONFIDENCE_SLOPE, CONFIDENCE_SHIFT)?;
         let confidence = self.confidence.1.forward(&hidden)?.plus(&start)?;
         let [index, confidence] = match &self.upsampling {
@@ -416,7 +417,7 @@ impl SmallBackbone {
             let part = |t: &A| if step == views { Ok(t.clone()) } else { t.narrow(0, i, 1) };
             let (rgb, index, confidence) = (part(rgb)?, part(sides[0])?, part(sides[1])?);
             let input = part(&projected)?.head_input(&rgb, [&index, &confidence], share)?;
-            let hidden = gelu(&self.head1.forward(&input)?)?;
+            let hidden = self.head1.forward_then(&input, Activation::Gelu)?;
             drop(input);
             let out = self.head2.forward(&hidden)?;
             let [raw, density] = out.head_output(&confidence, &rgb, self.start())?;

@@ -1,8 +1,6 @@
 //! Parts of the small backbone: 3-D stem, U-Net, convex upsampling.
 
-use crate::model::layers::{
-    Activation, Conv2d, ConvShape, GroupNorm, LayerInit, default_init, gelu,
-};
+use crate::model::layers::{Activation, Conv2d, ConvShape, GroupNorm, LayerInit, default_init};
 use crate::ops::{Array, ConvSteps};
 use candle_core::{Result, Tensor};
 use candle_nn::{Init, VarBuilder};
@@ -46,11 +44,13 @@ impl Stem {
     }
 
     pub(super) fn forward<A: Array>(&self, volume: &A) -> Result<A> {
-        let layer = |x: &A, i: usize| {
-            let (weight, bias) = (x.parameter(&self.weights[i])?, x.parameter(&self.biases[i])?);
-            x.convolved(&weight, Some(&bias), ConvSteps { stride: 1, padding: 1 })
+        let on = |i: usize| -> Result<[A; 2]> {
+            Ok([volume.parameter(&self.weights[i])?, volume.parameter(&self.biases[i])?])
         };
-        let scores = layer(&gelu(&layer(volume, 0)?)?, 1)?;
+        let steps = ConvSteps { stride: 1, padding: 1 };
+        let ([first, b0], [second, b1]) = (on(0)?, on(1)?);
+        let hidden = volume.convolved_then(&first, Some(&b0), steps, Activation::Gelu)?;
+        let scores = hidden.convolved(&second, Some(&b1), steps)?;
         let [b, _, d, h, w] = scores.sizes()?;
         scores.reshape((b, d, h, w))
     }
@@ -154,7 +154,7 @@ impl ConvexUpsampling {
         // The image's 4×4 blocks as channels.
         let blocks = rgb.reshape(vec![b, 3, h, 4, w, 4])?.permuted(&[0, 1, 3, 5, 2, 4])?;
         let blocks = blocks.reshape((b, 48, h, w))?.affine(1.0, -0.5)?;
-        let hidden = gelu(&self.hidden.forward(&deep.beside(&blocks, 1)?)?)?;
+        let hidden = self.hidden.forward_then(&deep.beside(&blocks, 1)?, Activation::Gelu)?;
         self.mask.forward(&hidden)?.upsample_convex(maps, &bilinear_shares())
     }
 }

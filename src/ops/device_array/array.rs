@@ -261,6 +261,43 @@ impl Array for DeviceArray {
         self.product("linear layer", result, [weight, bias.unwrap_or(&none)], rules)
     }
 
+    fn convolved_then(
+        &self,
+        weight: &Self,
+        bias: Option<&Self>,
+        steps: ConvSteps,
+        activation: Activation,
+    ) -> Result<Self> {
+        if [Some(self), Some(weight), bias].into_iter().flatten().any(Self::is_tracked) {
+            return self.convolved(weight, bias, steps)?.activated(activation);
+        }
+        let ConvSteps { stride, padding } = steps;
+        let (call, kind) = (ConvolutionCall { stride, padding }, pointwise(Some(activation)));
+        let bias = bias.map(|bias| &bias.array);
+        self.of(self.array.convolved_then(&weight.array, bias, call, kind))
+    }
+
+    fn projected_then(
+        &self,
+        weight: &Self,
+        bias: Option<&Self>,
+        activation: Activation,
+    ) -> Result<Self> {
+        if [Some(self), Some(weight), bias].into_iter().flatten().any(Self::is_tracked) {
+            return self.projected(weight, bias)?.activated(activation);
+        }
+        let bias = bias.map(|bias| &bias.array);
+        self.of(self.array.projected_then(&weight.array, bias, pointwise(Some(activation))))
+    }
+
+    fn plus_then(&self, other: &Self, activation: Activation) -> Result<Self> {
+        if self.is_tracked() || other.is_tracked() {
+            return self.plus(other)?.activated(activation);
+        }
+        let kind = pointwise(Some(activation));
+        self.of(self.array.with_then(&other.array, Function::Plus, kind))
+    }
+
     fn group_norm(
         &self,
         groups: usize,
@@ -382,7 +419,7 @@ impl Array for DeviceArray {
         norm: [&Self; 2],
     ) -> Result<Self> {
         let both = Self::joined(&[self, message], 1)?;
-        let hidden = both.projected(up, None)?.activated(Activation::Gelu)?;
+        let hidden = both.projected_then(up, None, Activation::Gelu)?;
         self.plus(&hidden.projected(down, None)?.layer_norm(norm)?)
     }
 
