@@ -3,6 +3,7 @@
 use crate::data::crop::Cropped;
 use crate::data::photographic::{blurred, compress, expose};
 use crate::io::image::Rgb;
+use crate::pipeline::{DepthBounds, Photo, Result, check_pairs};
 use glam::{Mat4, Quat, Vec3};
 
 /// A disturbance of the inputs of every case. Targets stay.
@@ -12,6 +13,9 @@ pub enum Disturbance {
     /// The poses of all inputs but the first are rotated by 0.5°, about an axis that depends on the
     /// input.
     Rotation,
+    /// The positions of all inputs but the first are moved by 1 % of the depth across their viewing
+    /// direction, in a direction that depends on the input.
+    Position,
     /// The focal lengths of all inputs are 3 % too large.
     Focal,
     /// All inputs but the first are darker by one stop.
@@ -24,6 +28,8 @@ pub enum Disturbance {
 
 /// Rotation of a disturbed pose, degrees.
 const ROTATION: f32 = 0.5;
+/// Shift of a disturbed position over the depth.
+const SHIFT: f32 = 0.01;
 /// Factor on a disturbed focal length.
 const FOCAL: f32 = 1.03;
 /// Change of exposure, stops.
@@ -35,8 +41,9 @@ const QUALITY: u8 = 30;
 
 impl Disturbance {
     /// All disturbances with their names.
-    pub const NAMED: [(&str, Self); 5] = [
+    pub const NAMED: [(&str, Self); 6] = [
         ("rotation", Self::Rotation),
+        ("position", Self::Position),
         ("focal", Self::Focal),
         ("dark", Self::Dark),
         ("blur", Self::Blur),
@@ -48,12 +55,21 @@ impl Disturbance {
         Self::NAMED.iter().find(|(_, d)| *d == self).map_or("", |(name, _)| name)
     }
 
-    /// Disturbs the inputs of a case.
-    pub(super) fn apply(self, inputs: &mut [Cropped]) {
+    /// Disturbs the inputs of a case. Without matched points, the depth of the scene is the geometric
+    /// mean of `bounds`.
+    ///
+    /// # Errors
+    /// Pictures of which no features can be taken.
+    pub(super) fn apply(self, inputs: &mut [Cropped], bounds: &DepthBounds) -> Result<()> {
+        let shift = match self {
+            Self::Position => SHIFT * depth(inputs, bounds)?,
+            _ => 0.0,
+        };
         for (i, c) in inputs.iter_mut().enumerate() {
             let first = i == 0;
             match self {
-                Self::Rotation if !first => rotate(c, i),
+                Self::Rotation if !first => move_by(c, turn(i)),
+                Self::Position if !first => move_by(c, step(i, shift)),
                 Self::Focal => {
                     for camera in [&mut c.input_camera, &mut c.target_camera] {
                         camera.intrinsics.fx *= FOCAL;
@@ -68,20 +84,48 @@ impl Disturbance {
                     compress(&mut c.input, QUALITY);
                     compress(&mut c.target, QUALITY);
                 }
-                Self::Rotation | Self::Dark | Self::Blur => {}
+                Self::Rotation | Self::Position | Self::Dark | Self::Blur => {}
             }
         }
+        Ok(())
     }
 }
 
-/// Rotates the cameras of input `i`.
-fn rotate(c: &mut Cropped, i: usize) {
-    // Multiples of the golden angle spread the axes over the circle of pitch and yaw.
+/// Multiples of the golden angle, rad, spread directions over the circle.
+fn direction(i: usize) -> (f32, f32) {
     let angle = 2.4 * i as f32;
-    let axis = Vec3::new(angle.cos(), angle.sin(), 0.3).normalize_or(Vec3::X);
-    let rotation = Mat4::from_quat(Quat::from_axis_angle(axis, ROTATION.to_radians()));
-    c.input_camera.world_from_camera *= rotation;
-    c.target_camera.world_from_camera *= rotation;
+    (angle.cos(), angle.sin())
+}
+
+/// The rotation of input `i` in its camera's frame.
+fn turn(i: usize) -> Mat4 {
+    let (pitch, yaw) = direction(i);
+    let axis = Vec3::new(pitch, yaw, 0.3).normalize_or(Vec3::X);
+    Mat4::from_quat(Quat::from_axis_angle(axis, ROTATION.to_radians()))
+}
+
+/// The shift of input `i` by `length` world units in its camera's frame.
+fn step(i: usize, length: f32) -> Mat4 {
+    let (right, down) = direction(i);
+    Mat4::from_translation(length * Vec3::new(right, down, 0.0))
+}
+
+/// Moves the cameras of an input.
+fn move_by(c: &mut Cropped, motion: Mat4) {
+    c.input_camera.world_from_camera *= motion;
+    c.target_camera.world_from_camera *= motion;
+}
+
+/// Median depth of the points that are matched between neighbouring inputs, world units.
+fn depth(inputs: &[Cropped], bounds: &DepthBounds) -> Result<f32> {
+    let photo = |c: &Cropped| Photo::new(c.target.clone(), c.target_camera);
+    let photos = inputs.iter().map(photo).collect::<Result<Vec<_>>>()?;
+    let reports = check_pairs(&photos, |_| Ok(()))?;
+    let [_, _, median, ..] = reports
+        .iter()
+        .find_map(|r| r.depth)
+        .map_or_else(|| [(bounds.near * bounds.far).sqrt(); 5], |depth| depth.quantiles);
+    Ok(median)
 }
 
 /// Changes both pictures of an input. `of` receives display values, the width, and the picture's

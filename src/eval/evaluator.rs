@@ -150,7 +150,9 @@ impl Evaluator {
         let names = loaded.names.clone();
         let mut crops = self.crop(model, case, loaded)?;
         let given: Vec<Camera> = crops.inputs.iter().map(|c| c.target_camera).collect();
-        self.options.disturbances.iter().for_each(|d| d.apply(&mut crops.inputs));
+        for disturbance in &self.options.disturbances {
+            disturbance.apply(&mut crops.inputs, &crops.bounds)?;
+        }
         self.options.preparation.apply(&given, &mut crops.inputs, &mut crops.targets)?;
         let place = format!("{} ({})", case.scene, case.pair());
         let mut pictures = PictureMaker::new(&self.options, model, &crops)?;

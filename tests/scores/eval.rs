@@ -112,7 +112,7 @@ fn disturbed_inputs_differ_by_name() {
         assert!((psnr(&found, 0) - psnr(&plain, 0)).abs() > 1e-3, "{name}: the Gaussians");
         let changed = [0, 1].map(|i| found.inputs[i] != plain.inputs[i]);
         let expected = match disturbance {
-            Disturbance::Rotation | Disturbance::Focal => [false, false],
+            Disturbance::Rotation | Disturbance::Position | Disturbance::Focal => [false, false],
             Disturbance::Jpeg => [true, true],
             _ => [false, true],
         };
@@ -151,6 +151,9 @@ fn prepared_inputs_come_back_from_disturbances() {
     };
     let (wrong, back) = (loss(Disturbance::Rotation, given), loss(Disturbance::Rotation, adjusted));
     assert!(wrong.0 > 0.3 && back.0 < 0.6 * wrong.0, "rotation: {wrong:?} dB, {back:?}");
+    let (wrong, back) = (loss(Disturbance::Position, given), loss(Disturbance::Position, adjusted));
+    eprintln!("position: {wrong:?} dB, {back:?}");
+    assert!(wrong.0 > 0.02 && back.0 < 0.6 * wrong.0, "position: {wrong:?} dB, {back:?}");
     let (wrong, back) = (loss(Disturbance::Dark, given), loss(Disturbance::Dark, equal));
     assert!(wrong.0 > 0.5 && back.0 < 0.2 * wrong.0, "dark: {wrong:?} dB, {back:?}");
     assert!(wrong.1 > 20.0 && back.1 < 2.0, "dark: {wrong:?}, {back:?} levels");
