@@ -207,7 +207,7 @@ fn heads() -> Result<()> {
         config.embed.dim = golden.note("dim");
         let vb = weights.builder().pp("subsplat").pp("geo");
         let head = Head::new(&config, golden.note("lanes"), vb)?;
-        golden.compare("record", &head.forward(&golden.input("x"), side)?);
+        golden.compare("record", &head.forward(&golden.input("x"), side * side)?);
         golden.done(&weights);
     }
     Ok(())
