@@ -154,7 +154,7 @@ fn every_parameter_of_mvsplat_has_the_gradient_of_the_cpu() {
     if let Backbone::Mvsplat(own) = &mut config.backbone {
         own.transformer_layers = 6;
     }
-    check(&config, 437);
+    check(&config, 501);
 }
 
 /// A network of some thousand numbers, pictures of 32², targets of 64².
