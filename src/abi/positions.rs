@@ -73,7 +73,7 @@ impl Positions {
     }
 }
 
-/// Whether 1 is the only common divisor.
+/// Returns whether 1 is the only common divisor.
 fn coprime(a: u32, b: u32) -> bool {
     match b {
         0 => a == 1,

@@ -1,9 +1,10 @@
 //! Disturbed inputs: errors of poses and focal lengths, and photographs that differ in quality.
 
+use super::preparation::photos;
 use crate::data::crop::Cropped;
 use crate::data::photographic::{blurred, compress, expose};
 use crate::io::image::Rgb;
-use crate::pipeline::{DepthBounds, Photo, Result, check_pairs};
+use crate::pipeline::{DepthBounds, Result, check_pairs};
 use glam::{Mat4, Quat, Vec3};
 
 /// A disturbance of the inputs of every case. Targets stay.
@@ -118,9 +119,7 @@ fn move_by(c: &mut Cropped, motion: Mat4) {
 
 /// Median depth of the points that are matched between neighbouring inputs, world units.
 fn depth(inputs: &[Cropped], bounds: &DepthBounds) -> Result<f32> {
-    let photo = |c: &Cropped| Photo::new(c.target.clone(), c.target_camera);
-    let photos = inputs.iter().map(photo).collect::<Result<Vec<_>>>()?;
-    let reports = check_pairs(&photos, |_| Ok(()))?;
+    let reports = check_pairs(&photos(inputs)?, |_| Ok(()))?;
     let [_, _, median, ..] = reports
         .iter()
         .find_map(|r| r.depth)

@@ -30,8 +30,7 @@ impl Preparation {
         if self == Self::default() {
             return Ok(());
         }
-        let photo = |c: &Cropped| Photo::new(c.target.clone(), c.target_camera);
-        let mut photos = inputs.iter().map(photo).collect::<Result<Vec<_>>>()?;
+        let mut photos = photos(inputs)?;
         if self.poses == Poses::Adjusted {
             if let Some((moved, _)) = adjusted(&photos)? {
                 photos = moved;
@@ -50,6 +49,11 @@ impl Preparation {
         }
         Ok(())
     }
+}
+
+/// Photographs of the target's size with their cameras.
+pub(super) fn photos(inputs: &[Cropped]) -> Result<Vec<Photo>> {
+    inputs.iter().map(|c| Photo::new(c.target.clone(), c.target_camera)).collect()
 }
 
 /// Moves both cameras of a crop to the pose of `camera`.

@@ -61,7 +61,7 @@ pub struct Frame {
 
 /// x·m of `x` `[n, k]` and `m` `[k, k]`.
 fn times<A: Array>(x: &A, m: &Tensor) -> Result<A> {
-    x.projected(&x.like(&m.t()?.contiguous()?)?, None)
+    x.projected(&x.like(&m.t()?.contiguous()?)?, None, None)
 }
 
 impl Frame {

@@ -114,10 +114,7 @@ impl Conv2d {
     /// # Errors
     /// Another rank or number of channels.
     pub fn forward<A: Array>(&self, x: &A) -> Result<A> {
-        let bias = self.bias.as_ref().map(|bias| x.parameter(bias)).transpose()?;
-        let ConvShape { stride, padding, .. } = self.shape;
-        let steps = ConvSteps { stride, padding };
-        x.convolved(&x.parameter(&self.weight)?, bias.as_ref(), steps)
+        self.apply(x, None)
     }
 
     /// Applies [`Conv2d::forward`], then `activation`.
@@ -125,10 +122,14 @@ impl Conv2d {
     /// # Errors
     /// As [`Conv2d::forward`].
     pub fn forward_then<A: Array>(&self, x: &A, activation: Activation) -> Result<A> {
+        self.apply(x, Some(activation))
+    }
+
+    fn apply<A: Array>(&self, x: &A, activation: Option<Activation>) -> Result<A> {
         let bias = self.bias.as_ref().map(|bias| x.parameter(bias)).transpose()?;
         let ConvShape { stride, padding, .. } = self.shape;
         let steps = ConvSteps { stride, padding };
-        x.convolved_then(&x.parameter(&self.weight)?, bias.as_ref(), steps, activation)
+        x.convolved(&x.parameter(&self.weight)?, bias.as_ref(), steps, activation)
     }
 }
 
@@ -188,7 +189,7 @@ impl Linear {
         }
         let x = x.reshape(((), c))?;
         let bias = self.bias.as_ref().map(|bias| x.parameter(bias)).transpose()?;
-        let y = x.projected(&x.parameter(&self.weight)?, bias.as_ref())?;
+        let y = x.projected(&x.parameter(&self.weight)?, bias.as_ref(), None)?;
         if let Some(last) = dims.last_mut() {
             *last = o;
         }

@@ -32,14 +32,17 @@ pub(crate) fn linear(
 /// x·Wᵀ + b of `x` `[n, inputs]`. f32 runs on the caller's thread ([`ops::linear`]),
 /// because chunks of parents or scenes are the parallel tasks.
 pub(crate) fn affine<A: Array>(layer: &Linear, x: &A) -> Result<A> {
-    let bias = layer.bias().map(|bias| x.parameter(bias)).transpose()?;
-    x.projected(&x.parameter(layer.weight())?, bias.as_ref())
+    projected(layer, x, None)
 }
 
 /// [`affine`], then an activation function.
 pub(crate) fn affine_then<A: Array>(layer: &Linear, x: &A, activation: Activation) -> Result<A> {
+    projected(layer, x, Some(activation))
+}
+
+fn projected<A: Array>(layer: &Linear, x: &A, activation: Option<Activation>) -> Result<A> {
     let bias = layer.bias().map(|bias| x.parameter(bias)).transpose()?;
-    x.projected_then(&x.parameter(layer.weight())?, bias.as_ref(), activation)
+    x.projected(&x.parameter(layer.weight())?, bias.as_ref(), activation)
 }
 
 /// (Linear, ReLU, LayerNorm) twice: an attribute MLP of PixelGaussian and

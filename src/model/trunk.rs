@@ -21,7 +21,7 @@ use super::mlp::Mode;
 use super::spgr::{Heads, rules};
 use super::trace::Checkpoint;
 use super::{BackboneOutput, Primaries, Views};
-use crate::abi::{RasterOptions, SPLAT_STRIDE, ShBasis, sh_coefficients};
+use crate::abi::{CHILDREN_MAX, RasterOptions, SPLAT_STRIDE, ShBasis, sh_coefficients};
 use crate::camera::Camera;
 use crate::config::{Config, FeatureLevel, ShInput, SpgrHead};
 #[cfg(feature = "gpu")]
@@ -200,14 +200,7 @@ impl Trunk {
     /// `side` differs from the configured r and the head has a fixed K; `side` is not in
     /// 1 to 8.
     pub fn set_upscale(&mut self, side: usize) -> Result<()> {
-        let fixed = !self.config.spgr.head.serves_any_k() && self.parts.is_some();
-        if !(1..=UPSCALE_MAX).contains(&side) || (fixed && side != self.config.upscale) {
-            let expected = match fixed {
-                true => self.config.upscale.to_string(),
-                false => format!("1 to {UPSCALE_MAX}"),
-            };
-            bail!("upscale: expected {expected} (head {:?}), got {side}", self.config.spgr.head);
-        }
+        self.check_served("upscale", side, self.config.upscale, UPSCALE_MAX)?;
         self.rules = rules(&self.config, side * side);
         Ok(())
     }
@@ -217,18 +210,26 @@ impl Trunk {
     /// # Errors
     /// K differs from the configured one and the head has a fixed K; K is not in 1 to 64.
     pub fn set_children(&mut self, children: usize) -> Result<()> {
-        let fixed = !self.config.spgr.head.serves_any_k() && self.parts.is_some();
-        let most = UPSCALE_MAX * UPSCALE_MAX;
-        if !(1..=most).contains(&children) || (fixed && children != self.config.children()) {
-            let expected = match fixed {
-                true => self.config.children().to_string(),
-                false => format!("1 to {most}"),
-            };
-            let head = self.config.spgr.head;
-            bail!("children per parent: expected {expected} (head {head:?}), got {children}");
-        }
+        let own = self.config.children();
+        self.check_served("children per parent", children, own, CHILDREN_MAX)?;
         self.rules = rules(&self.config, children);
         Ok(())
+    }
+
+    /// Refuses a number that the heads do not serve: above `most`, or, if they are for one K, another than
+    /// the `configured` one.
+    fn check_served(&self, what: &str, got: usize, configured: usize, most: usize) -> Result<()> {
+        let head = self.config.spgr.head;
+        let served = match self.parts.is_some() && !head.serves_any_k() {
+            true => configured..=configured,
+            false => 1..=most,
+        };
+        if served.contains(&got) {
+            return Ok(());
+        }
+        let (least, most) = served.into_inner();
+        let expected = if least == most { least.to_string() } else { format!("{least} to {most}") };
+        bail!("{what}: expected {expected} (head {head:?}), got {got}")
     }
 
     /// Computes the children of the one scene in `views`, without gradient. Chunks run in

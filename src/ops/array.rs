@@ -154,32 +154,22 @@ pub trait Array: Clone + std::fmt::Debug {
     /// Computes the softmax over the last dimension.
     fn softmax(&self) -> Result<Self>;
 
-    /// Computes a convolution over two or three axes.
-    fn convolved(&self, weight: &Self, bias: Option<&Self>, steps: ConvSteps) -> Result<Self>;
-
-    /// Computes [`Array::convolved`], then an activation function.
-    fn convolved_then(
+    /// Computes a convolution over two or three axes, then applies `activation`.
+    fn convolved(
         &self,
         weight: &Self,
         bias: Option<&Self>,
         steps: ConvSteps,
-        activation: Activation,
-    ) -> Result<Self> {
-        self.convolved(weight, bias, steps)?.activated(activation)
-    }
+        activation: Option<Activation>,
+    ) -> Result<Self>;
 
-    /// Computes x·Wᵀ + b of `[N, C]`.
-    fn projected(&self, weight: &Self, bias: Option<&Self>) -> Result<Self>;
-
-    /// Computes [`Array::projected`], then an activation function.
-    fn projected_then(
+    /// Computes x·Wᵀ + b of `[N, C]`, then applies `activation`.
+    fn projected(
         &self,
         weight: &Self,
         bias: Option<&Self>,
-        activation: Activation,
-    ) -> Result<Self> {
-        self.projected(weight, bias)?.activated(activation)
-    }
+        activation: Option<Activation>,
+    ) -> Result<Self>;
 
     /// Normalises groups of channels of `[B, C, …]`, then applies `activation`.
     fn group_norm(
@@ -436,21 +426,40 @@ impl Array for Tensor {
         pointwise::softmax(self)
     }
 
-    fn convolved(&self, weight: &Self, bias: Option<&Self>, steps: ConvSteps) -> Result<Self> {
+    fn convolved(
+        &self,
+        weight: &Self,
+        bias: Option<&Self>,
+        steps: ConvSteps,
+        activation: Option<Activation>,
+    ) -> Result<Self> {
         let ConvSteps { stride, padding } = steps;
-        match (weight.rank(), stride) {
-            (5, 1) => conv3d::conv3d(self, weight, bias, padding),
+        let y = match (weight.rank(), stride) {
+            (5, 1) => conv3d::conv3d(self, weight, bias, padding)?,
             (5, _) => bail!("conv3d: expected stride 1, got {stride}"),
-            _ => conv2d::conv2d(self, weight, bias, stride, padding),
+            _ => conv2d::conv2d(self, weight, bias, stride, padding)?,
+        };
+        match activation {
+            Some(kind) => y.activated(kind),
+            None => Ok(y),
         }
     }
 
-    fn projected(&self, weight: &Self, bias: Option<&Self>) -> Result<Self> {
-        match (bias, self.dtype()) {
-            (Some(bias), DType::F32) => linear::linear(self, weight, bias),
-            (None, DType::F32) => linear::linear_no_bias(self, weight),
-            (Some(bias), _) => self.matmul(&weight.t()?)?.broadcast_add(bias),
-            (None, _) => self.matmul(&weight.t()?),
+    fn projected(
+        &self,
+        weight: &Self,
+        bias: Option<&Self>,
+        activation: Option<Activation>,
+    ) -> Result<Self> {
+        let y = match (bias, self.dtype()) {
+            (Some(bias), DType::F32) => linear::linear(self, weight, bias)?,
+            (None, DType::F32) => linear::linear_no_bias(self, weight)?,
+            (Some(bias), _) => self.matmul(&weight.t()?)?.broadcast_add(bias)?,
+            (None, _) => self.matmul(&weight.t()?)?,
+        };
+        match activation {
+            Some(kind) => y.activated(kind),
+            None => Ok(y),
         }
     }
 

@@ -2,7 +2,7 @@
 //! photographs have detail.
 
 use super::density::{Density, counts, grids};
-use super::{Result, add_detail, detail};
+use super::{Error, Result, add_detail, detail};
 use crate::abi::{CHILDREN_MAX, RasterOptions};
 use crate::data::crop::Cropped;
 use crate::fit::FitView;
@@ -50,7 +50,7 @@ fn grids_of(network: &SubSplat) -> Vec<usize> {
 /// pictures of the input's size, from which the parents' shares come.
 ///
 /// # Errors
-/// Those of the network.
+/// Those of the network; a number of [`Density::Each`] that is not in 1 to 64.
 pub(crate) fn counts_of(
     network: &SubSplat,
     Encoded { views, primaries, .. }: &Encoded<'_>,
@@ -76,11 +76,22 @@ pub(crate) fn counts_of(
         limit = limit.saturating_add(hidden.len());
     }
     let mut counts = match density {
-        Density::Each(children) => vec![children.clamp(1, CHILDREN_MAX) as u8; shares.len()],
+        Density::Each(children) => vec![each(children)?; shares.len()],
         _ => counts(inputs, &shares, &grids, limit),
     };
     hidden.into_iter().for_each(|i| counts[i] = 0);
     Ok(Some(counts))
+}
+
+/// K of [`Density::Each`].
+fn each(children: usize) -> Result<u8> {
+    match u8::try_from(children) {
+        Ok(k) if (1..=CHILDREN_MAX).contains(&children) => Ok(k),
+        _ => {
+            let expected = format!("1 to {CHILDREN_MAX} for each pixel");
+            Err(Error::argument("density", expected, children.to_string()))
+        }
+    }
 }
 
 impl SceneChildren {

@@ -22,7 +22,7 @@ pub struct Reconstruction {
     pub(super) splats: Splats,
     /// Gaussians of each photograph.
     pub(super) groups: Groups,
-    /// r of each parent; empty where all have the same number of children.
+    /// K of each parent; empty where all have the same.
     pub(super) counts: Vec<u8>,
     pub(super) inputs: Vec<Cropped>,
     pub(super) adjustment: Option<PoseAdjustment>,

@@ -76,6 +76,7 @@ fn elementwise_functions() {
     agree!(gpu, "clamped", TOLERANCE, |x| x.clamped(-0.5, 1.25));
     agree!(gpu, "plus", TOLERANCE, |x, y| x.plus(y));
     agree!(gpu, "plus row", TOLERANCE, |x, row| x.plus(row));
+    agree!(gpu, "plus, relu", TOLERANCE, |x, row| x.plus_then(row, Activation::Relu));
     agree!(gpu, "minus map", TOLERANCE, |x, map| x.minus(map));
     agree!(gpu, "times row", TOLERANCE, |x, row| x.times(row));
     agree!(gpu, "over", TOLERANCE, |x, y| x.over(y));
@@ -143,23 +144,32 @@ fn products() {
         let (x, weight, bias) = (noise(r, &[2, c, h, w]), noise(r, &[o, c, k, k]), noise(r, &[o]));
         let steps = ConvSteps { stride, padding };
         let name = format!("convolution {c} {o} {k}");
-        agree!(gpu, &name, TOLERANCE, |x, weight, bias| x.convolved(weight, Some(bias), steps));
-        agree!(gpu, &name, TOLERANCE, |x, weight| x.convolved(weight, None, steps));
+        agree!(gpu, &name, TOLERANCE, |x, weight, bias| x.convolved(
+            weight,
+            Some(bias),
+            steps,
+            None
+        ));
+        agree!(gpu, &name, TOLERANCE, |x, weight| x.convolved(weight, None, steps, None));
+        let gelu = Some(Activation::Gelu);
+        agree!(gpu, &name, TOLERANCE, |x, weight| x.convolved(weight, None, steps, gelu));
     }
     let (x, weight, bias) =
         (noise(r, &[2, 4, 6, 9, 10]), noise(r, &[3, 4, 3, 3, 3]), noise(r, &[3]));
     let steps = ConvSteps { stride: 1, padding: 1 };
-    agree!(gpu, "3-D", TOLERANCE, |x, weight, bias| x.convolved(weight, Some(bias), steps));
+    agree!(gpu, "3-D", TOLERANCE, |x, weight, bias| x.convolved(weight, Some(bias), steps, None));
     for (n, c, o) in [(1, 1, 1), (130, 67, 70), (64, 128, 64), (300, 11, 5)] {
         let (x, weight, bias) = (noise(r, &[n, c]), noise(r, &[o, c]), noise(r, &[o]));
-        agree!(gpu, "linear", TOLERANCE, |x, weight, bias| x.projected(weight, Some(bias)));
-        agree!(gpu, "linear", TOLERANCE, |x, weight| x.projected(weight, None));
+        agree!(gpu, "linear", TOLERANCE, |x, weight, bias| x.projected(weight, Some(bias), None));
+        agree!(gpu, "linear", TOLERANCE, |x, weight| x.projected(weight, None, None));
+        let silu = Some(Activation::Silu);
+        agree!(gpu, "linear", TOLERANCE, |x, weight| x.projected(weight, None, silu));
     }
     let (x, weights) = (noise(r, &[2, 30, 13]), noise(r, &[2, 13]));
     agree!(gpu, "weighted sum", TOLERANCE, |x, weights| x.weighted_sum(weights));
     let wrong = gpu.upload(&noise(r, &[4, 5, 3, 3])).unwrap();
     let x = gpu.upload(&noise(r, &[1, 4, 8, 8])).unwrap();
-    let text = x.convolved(&wrong, None, steps).unwrap_err().to_string();
+    let text = x.convolved(&wrong, None, steps, None).unwrap_err().to_string();
     assert!(text.contains("convolution") && text.contains("[4, 5, 3, 3]"), "{text}");
 }
 

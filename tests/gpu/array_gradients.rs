@@ -148,7 +148,7 @@ fn products() {
         let steps = ConvSteps { stride, padding };
         let name = format!("convolution {c} {o} {k}");
         same_gradients!(gpu, &name, TOLERANCE, |x, weight, bias| {
-            x.convolved(weight, Some(bias), steps)
+            x.convolved(weight, Some(bias), steps, None)
         });
     }
     let (x, weight, bias) =
@@ -157,16 +157,20 @@ fn products() {
     same_gradients!(gpu, "3-D", TOLERANCE, |x, weight, bias| x.convolved(
         weight,
         Some(bias),
-        steps
+        steps,
+        None
     ));
     same_gradients!(gpu, "constant weight", TOLERANCE, [weight], |x| x
-        .convolved(weight, None, steps));
+        .convolved(weight, None, steps, None));
     for (n, c, o) in [(1, 1, 1), (2200, 67, 70), (64, 128, 64), (300, 11, 5)] {
         let (x, weight, bias) = (noise(r, &[n, c]), noise(r, &[o, c]), noise(r, &[o]));
         same_gradients!(gpu, "linear", TOLERANCE, |x, weight, bias| {
-            x.projected(weight, Some(bias))
+            x.projected(weight, Some(bias), None)
         });
-        same_gradients!(gpu, "linear", TOLERANCE, |x, weight| x.projected(weight, None));
+        same_gradients!(gpu, "linear", TOLERANCE, |x, weight| x.projected(weight, None, None));
+        same_gradients!(gpu, "linear, gelu", TOLERANCE, |x, weight| {
+            x.projected(weight, None, Some(Activation::Gelu))
+        });
     }
 }
 
@@ -379,7 +383,7 @@ fn gradients_are_reproducible() {
     let (x, weight) = (noise(r, &[2, 9, 40, 41]), noise(r, &[20, 9, 3, 3]));
     let pass = || -> Result<Vec<u32>> {
         let (x, weight) = (gpu.upload(&x)?.leaf(), gpu.upload(&weight)?.leaf());
-        let y = x.convolved(&weight, None, ConvSteps { stride: 1, padding: 1 })?;
+        let y = x.convolved(&weight, None, ConvSteps { stride: 1, padding: 1 }, None)?;
         let y = y.instance_norm(Some(Activation::Gelu))?;
         let gradients = gpu.backward(&[(&y, &gpu.upload(&upstream(y.dims()))?)])?;
         let of = |leaf: &DeviceArray| Ok(values(&gradients.of(leaf).unwrap().to_host()?));

@@ -75,7 +75,7 @@ fn spgr_under_every_rule() {
     let Some(gpu) = gpu() else { return };
     let backend = Backend::from(gpu);
     let mut r = Random(21);
-    for k in [4, 5, 6] {
+    for k in [4, 9, 5, 6] {
         for (name, config) in spgr_calls::variants(2) {
             let call = spgr_calls::call_of(&config, 8, k);
             let parents = spgr_calls::parents(&call.cameras, &mut r);

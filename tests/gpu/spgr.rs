@@ -173,7 +173,7 @@ const PARTS: [(&str, usize, usize); 4] = [
 fn children() {
     let Some(gpu) = gpu() else { return };
     let mut r = Random(11);
-    for k in [1, 4, 5, 6] {
+    for k in [1, 4, 9, 5, 6] {
         let inputs = Inputs::new(k, &mut r);
         for (name, rules) in variants(k) {
             let expected = on_cpu(&inputs, &rules);
@@ -214,7 +214,7 @@ fn gradients<T: subsplat::cpu::simd::Real>(
 fn gradients_of_children() {
     let Some(gpu) = gpu() else { return };
     let mut r = Random(12);
-    for k in [1, 4, 5, 6] {
+    for k in [1, 4, 9, 5, 6] {
         let inputs = Inputs::new(k, &mut r);
         for (name, rules) in variants(k) {
             let count = inputs.parents.len() / SPLAT_STRIDE * rules.children();

@@ -463,6 +463,26 @@ fn heads_of_every_kind_share_their_gaussians() {
     }
 }
 
+/// Every pixel has the number of Gaussians that is asked for, or the error names the number.
+#[test]
+fn a_number_for_each_pixel_is_kept() {
+    let mut config = light(plain(false, Preset::Tuned, 2));
+    config.spgr.head = SpgrHead::Polynomial;
+    let model = lively(&config);
+    let shoot = shoot(9, 2, 64, 64);
+    let run = |children: usize| {
+        let options = options_of((64, 64), NEAR_FAR, false);
+        model.run(&shoot.photos, &options.with_density(Density::Each(children)))
+    };
+    let three = run(3).unwrap();
+    assert_eq!(three.children_counts(), vec![3; 2 * 64 * 64]);
+    assert_eq!(three.splats().len(), 3 * 2 * 64 * 64);
+    for wrong in [0, 65, 300] {
+        let error = run(wrong).unwrap_err().to_string();
+        assert!(error.contains("1 to 64") && error.contains(&wrong.to_string()), "{error}");
+    }
+}
+
 #[test]
 fn any_number_of_views_any_shape_any_depth_range() {
     for mvsplat in [true, false] {

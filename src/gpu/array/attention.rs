@@ -2,7 +2,7 @@
 //!
 //! WGSL: kernels/attention.wgsl.
 
-use super::{DeviceArray, Function, misfit};
+use super::{DeviceArray, Function, PointwiseFunction, misfit};
 use crate::abi::AttentionUniform;
 use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
@@ -129,15 +129,16 @@ impl DeviceArray {
             let part = |of: &Self, dims: [usize; 2]| of.narrow(0, row, 1)?.reshape(&dims);
             let (q, k, v) = (part(self, [l, d])?, part(k, [m, d])?, part(v, [m, e])?);
             let dy = part(dy, [l, e])?;
-            let logits = q.projected(&k, None)?.map(Function::Affine(call.scale, 0.0))?;
+            let none = PointwiseFunction::None;
+            let logits = q.projected(&k, None, none)?.map(Function::Affine(call.scale, 0.0))?;
             let logits = match masks.get(row % masks.len().max(1)) {
                 Some(Some(mask)) => logits.with(mask, Function::Plus)?,
                 _ => logits,
             };
             let weights = logits.softmax()?;
-            let of_logits = weights.softmax_backward(&dy.projected(&v, None)?)?;
+            let of_logits = weights.softmax_backward(&dy.projected(&v, None, none)?)?;
             let of_products = of_logits.map(Function::Affine(call.scale, 0.0))?;
-            of_q.push(of_products.projected(&k.permuted(&[1, 0])?, None)?);
+            of_q.push(of_products.projected(&k.permuted(&[1, 0])?, None, none)?);
             of_k.push(q.projected_weight_backward(&of_products)?);
             of_v.push(dy.projected_weight_backward(&weights)?);
         }

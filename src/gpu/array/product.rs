@@ -49,24 +49,12 @@ pub(super) fn words([a, b, c]: [usize; 3], last: usize) -> [u32; 4] {
 }
 
 impl DeviceArray {
-    /// Convolves `[B, C, (D,) H, W]` with `weight` `[O, C, (kd,) kh, kw]`; `bias` `[O]`.
+    /// Convolves `[B, C, (D,) H, W]` with `weight` `[O, C, (kd,) kh, kw]`, then applies `activation`; `bias`
+    /// `[O]`.
     ///
     /// # Errors
     /// [`GpuError::Argument`] for sizes that do not fit; errors of the device.
     pub fn convolved(
-        &self,
-        weight: &Self,
-        bias: Option<&Self>,
-        call: ConvolutionCall,
-    ) -> Result<Self, GpuError> {
-        self.convolved_then(weight, bias, call, PointwiseFunction::None)
-    }
-
-    /// [`DeviceArray::convolved`], then an activation function, in one call.
-    ///
-    /// # Errors
-    /// As [`DeviceArray::convolved`].
-    pub fn convolved_then(
         &self,
         weight: &Self,
         bias: Option<&Self>,
@@ -124,19 +112,11 @@ impl DeviceArray {
         Ok(result)
     }
 
-    /// Computes x·Wᵀ + b of `[N, C]`, `weight` `[O, C]`, `bias` `[O]`.
+    /// Computes x·Wᵀ + b of `[N, C]`, then applies `activation`; `weight` `[O, C]`, `bias` `[O]`.
     ///
     /// # Errors
     /// [`GpuError::Argument`] for sizes that do not fit; errors of the device.
-    pub fn projected(&self, weight: &Self, bias: Option<&Self>) -> Result<Self, GpuError> {
-        self.projected_then(weight, bias, PointwiseFunction::None)
-    }
-
-    /// [`DeviceArray::projected`], then an activation function, in one call.
-    ///
-    /// # Errors
-    /// As [`DeviceArray::projected`].
-    pub fn projected_then(
+    pub fn projected(
         &self,
         weight: &Self,
         bias: Option<&Self>,

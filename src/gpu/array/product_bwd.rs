@@ -7,7 +7,7 @@
 //! tests/gpu/array_gradients.rs.
 
 use super::product::{SIDE, volume, words};
-use super::{ConvolutionCall, DeviceArray, misfit};
+use super::{ConvolutionCall, DeviceArray, PointwiseFunction, misfit};
 use crate::abi::{ConvolutionUniform, LinearWeightBwdUniform};
 use crate::gpu::commands::Groups;
 use crate::gpu::error::GpuError;
@@ -83,7 +83,7 @@ impl DeviceArray {
         };
         let turned = turned.reshape(&[&[c, o], kernel].concat())?;
         let call = ConvolutionCall { stride: 1, padding: side - 1 - padding };
-        whole.convolved(&turned, None, call)
+        whole.convolved(&turned, None, call, PointwiseFunction::None)
     }
 
     /// Computes the gradient of the weight of [`DeviceArray::convolved`], whose dimensions are

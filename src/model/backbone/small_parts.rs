@@ -13,7 +13,7 @@ pub(super) fn conv_norm_gelu<A: Array>(x: &A, layer: &(Conv2d, GroupNorm)) -> Re
 /// Mean over 3×3 pixels of `[B, 1, h, w]`, edges repeated.
 pub(super) fn local_mean<A: Array>(x: &A) -> Result<A> {
     let box3 = x.constant(vec![1.0 / 9.0; 9], &[1, 1, 3, 3])?;
-    x.edges_repeated()?.convolved(&box3, None, ConvSteps { stride: 1, padding: 0 })
+    x.edges_repeated()?.convolved(&box3, None, ConvSteps { stride: 1, padding: 0 }, None)
 }
 
 /// Two 3×3×3 convolutions over (disparity, y, x): `[B, C, D, h, w]` to scores
@@ -49,8 +49,8 @@ impl Stem {
         };
         let steps = ConvSteps { stride: 1, padding: 1 };
         let ([first, b0], [second, b1]) = (on(0)?, on(1)?);
-        let hidden = volume.convolved_then(&first, Some(&b0), steps, Activation::Gelu)?;
-        let scores = hidden.convolved(&second, Some(&b1), steps)?;
+        let hidden = volume.convolved(&first, Some(&b0), steps, Some(Activation::Gelu))?;
+        let scores = hidden.convolved(&second, Some(&b1), steps, None)?;
         let [b, _, d, h, w] = scores.sizes()?;
         scores.reshape((b, d, h, w))
     }

@@ -201,7 +201,7 @@ impl Attention {
         let (scenes, heads, n) = (rows / views, self.channels / HEAD, h * w);
         let layer = |x: &A, (weight, bias): &(Tensor, Tensor)| {
             let (weight, bias) = (x.parameter(weight)?, x.parameter(bias)?);
-            x.convolved(&weight, Some(&bias), ConvSteps { stride: 1, padding: 0 })
+            x.convolved(&weight, Some(&bias), ConvSteps { stride: 1, padding: 0 }, None)
         };
         let qkv = layer(x, &self.qkv)?.reshape(vec![views, scenes, heads, 3, HEAD, n])?;
         let part = |i: usize| -> Result<A> {

@@ -236,58 +236,41 @@ impl Array for DeviceArray {
         })
     }
 
-    fn convolved(&self, weight: &Self, bias: Option<&Self>, steps: ConvSteps) -> Result<Self> {
+    fn convolved(
+        &self,
+        weight: &Self,
+        bias: Option<&Self>,
+        steps: ConvSteps,
+        activation: Option<Activation>,
+    ) -> Result<Self> {
         let ConvSteps { stride, padding } = steps;
         let call = ConvolutionCall { stride, padding };
-        let result = self.array.convolved(&weight.array, bias.map(|bias| &bias.array), call);
         let rules = ProductRules {
             input: Box::new(move |dy, x, w| dy.convolved_input_backward(w, x.dims(), call)),
             weight: Box::new(move |dy, x, w| x.convolved_weight_backward(dy, w.dims(), call)),
             channel: 1,
         };
-        // Without a bias, an array without a node takes its place.
-        let none = weight.detached();
-        self.product("convolution", result, [weight, bias.unwrap_or(&none)], rules)
+        self.product("convolution", (weight, bias), rules, activation, |kind| {
+            self.array.convolved(&weight.array, bias.map(|bias| &bias.array), call, kind)
+        })
     }
 
-    fn projected(&self, weight: &Self, bias: Option<&Self>) -> Result<Self> {
-        let result = self.array.projected(&weight.array, bias.map(|bias| &bias.array));
+    fn projected(
+        &self,
+        weight: &Self,
+        bias: Option<&Self>,
+        activation: Option<Activation>,
+    ) -> Result<Self> {
         let rules = ProductRules {
-            input: Box::new(|dy, _, w| dy.projected(&w.permuted(&[1, 0])?, None)),
+            input: Box::new(|dy, _, w| {
+                dy.projected(&w.permuted(&[1, 0])?, None, PointwiseFunction::None)
+            }),
             weight: Box::new(|dy, x, _| x.projected_weight_backward(dy)),
             channel: 1,
         };
-        let none = weight.detached();
-        self.product("linear layer", result, [weight, bias.unwrap_or(&none)], rules)
-    }
-
-    fn convolved_then(
-        &self,
-        weight: &Self,
-        bias: Option<&Self>,
-        steps: ConvSteps,
-        activation: Activation,
-    ) -> Result<Self> {
-        if [Some(self), Some(weight), bias].into_iter().flatten().any(Self::is_tracked) {
-            return self.convolved(weight, bias, steps)?.activated(activation);
-        }
-        let ConvSteps { stride, padding } = steps;
-        let (call, kind) = (ConvolutionCall { stride, padding }, pointwise(Some(activation)));
-        let bias = bias.map(|bias| &bias.array);
-        self.of(self.array.convolved_then(&weight.array, bias, call, kind))
-    }
-
-    fn projected_then(
-        &self,
-        weight: &Self,
-        bias: Option<&Self>,
-        activation: Activation,
-    ) -> Result<Self> {
-        if [Some(self), Some(weight), bias].into_iter().flatten().any(Self::is_tracked) {
-            return self.projected(weight, bias)?.activated(activation);
-        }
-        let bias = bias.map(|bias| &bias.array);
-        self.of(self.array.projected_then(&weight.array, bias, pointwise(Some(activation))))
+        self.product("linear layer", (weight, bias), rules, activation, |kind| {
+            self.array.projected(&weight.array, bias.map(|bias| &bias.array), kind)
+        })
     }
 
     fn plus_then(&self, other: &Self, activation: Activation) -> Result<Self> {
@@ -419,8 +402,8 @@ impl Array for DeviceArray {
         norm: [&Self; 2],
     ) -> Result<Self> {
         let both = Self::joined(&[self, message], 1)?;
-        let hidden = both.projected_then(up, None, Activation::Gelu)?;
-        self.plus(&hidden.projected(down, None)?.layer_norm(norm)?)
+        let hidden = both.projected(up, None, Some(Activation::Gelu))?;
+        self.plus(&hidden.projected(down, None, None)?.layer_norm(norm)?)
     }
 
     fn plane_sweep(&self, source: &Self, sweep: Sweep, _backend: &Backend) -> Result<Self> {

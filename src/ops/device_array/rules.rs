@@ -29,16 +29,25 @@ impl DeviceArray {
         self.executor.array(result)
     }
 
-    /// Records a convolution or a linear layer with the gradients of input, weight and bias.
+    /// Records a convolution or a linear layer, which `compute` returns with an activation function, with
+    /// the gradients of input, weight and bias. A gradient needs the value before the activation, which is
+    /// then an operation of its own.
     pub(super) fn product(
         &self,
         name: &'static str,
-        result: OnDevice<gpu::DeviceArray>,
-        [weight, bias]: [&Self; 2],
+        (weight, bias): (&Self, Option<&Self>),
         rules: ProductRules,
+        activation: Option<Activation>,
+        compute: impl FnOnce(PointwiseFunction) -> OnDevice<gpu::DeviceArray>,
     ) -> Result<Self> {
+        // Without a bias, an array without a node takes its place.
+        let none = weight.detached();
+        let bias = bias.unwrap_or(&none);
+        let tracked = [self, weight, bias].into_iter().any(Self::is_tracked);
+        let (within, after) = if tracked { (None, activation) } else { (activation, None) };
+        let result = compute(pointwise(within));
         let ProductRules { input, weight: of_weight, channel } = rules;
-        self.recorded(name, result, [self, weight, bias], |want, _| {
+        let product = self.recorded(name, result, [self, weight, bias], |want, _| {
             let (x, w) = (self.array.clone(), weight.array.clone());
             let bias_dims = bias.array.dims().to_vec();
             move |dy| {
@@ -53,7 +62,11 @@ impl DeviceArray {
                     wanted(want[2], of_bias)?,
                 ])
             }
-        })
+        })?;
+        match after {
+            Some(kind) => product.activated(kind),
+            None => Ok(product),
+        }
     }
 
     /// Sums or averages over dimension `dim`, which disappears.

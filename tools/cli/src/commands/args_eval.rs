@@ -68,9 +68,9 @@ pub struct EvalArgs {
     #[arg(long, value_enum, default_value = "off")]
     pub detail: DetailArg,
     /// Disturb the inputs before the model receives them: rotation (0.5 degrees, all but the
-    /// first), position (1 % of the depth, all but the first), focal (3 % too large), dark (one stop, all but the first), blur (1.5 target px, all
-    /// but the first), jpeg (quality 30). Scores at the inputs' cameras are then those of the
-    /// disturbed inputs.
+    /// first), position (1 % of the depth, all but the first), focal (3 % too large), dark (one
+    /// stop, all but the first), blur (1.5 target px, all but the first), jpeg (quality 30). Scores
+    /// at the inputs' cameras are then those of the disturbed inputs.
     #[arg(long, value_delimiter = ',', value_name = "D,…", value_parser = disturbance)]
     pub disturb: Vec<Disturbance>,
     /// Adjust the inputs' cameras by points matched between them, as in `run`. The targets' cameras
