@@ -251,7 +251,8 @@ fn a_training_goes_on_with_the_other_device() {
     }
 }
 
-/// The CPU repeats the scenes of the step in which the device is lost, and computes all that follow.
+/// A device that is lost between two steps: the CPU computes all that follow. A loss within a step is not
+/// tested.
 #[test]
 fn a_training_survives_the_loss_of_its_device() {
     if gpu().is_none() {
