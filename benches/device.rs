@@ -1,8 +1,9 @@
 //! Work and time of the network on a GPU: calls, workgroups, operations, bytes and device memory of
 //! two pictures, counted, and the time that adapters of four classes would need for them.
 //!
-//! `cargo bench --bench device -- [small|mvsplat …] [--side PX] [--device NAME]`. Work depends on the
-//! sizes only; the measured time is that of the adapter at hand.
+//! `cargo bench --bench device -- [small|mvsplat …] [--side PX] [--device NAME] [--count]`. Work and
+//! memory depend on the sizes only; the measured time is that of the adapter at hand. `--count` allocates
+//! the memory and counts the calls, but executes none.
 
 use anyhow::{Context, Result, bail, ensure};
 use candle_core::{Device, Tensor};
@@ -12,9 +13,7 @@ use std::time::Instant;
 use subsplat::camera::{Camera, Intrinsics, NearFar};
 use subsplat::config::{Config, Preset};
 use subsplat::gpu::Work;
-use subsplat::model::primaries::primaries;
 use subsplat::model::subsplat::SubSplat;
-use subsplat::model::trace::Trace;
 use subsplat::model::weights::Weights;
 use subsplat::model::{Backend, Views};
 
@@ -34,15 +33,17 @@ struct Args {
     names: Vec<String>,
     side: usize,
     device: String,
+    count: bool,
 }
 
 fn parse() -> Result<Args> {
-    let mut args = Args { names: Vec::new(), side: 256, device: "gpu".to_owned() };
+    let mut args = Args { names: Vec::new(), side: 256, device: "gpu".to_owned(), count: false };
     let mut words = std::env::args().skip(1);
     while let Some(word) = words.next() {
         let mut value = || words.next().with_context(|| format!("{word}: expected a value"));
         match word.as_str() {
             "--bench" => {}
+            "--count" => args.count = true,
             "--side" => args.side = value()?.parse().context("--side")?,
             "--device" => args.device = value()?,
             other if other.starts_with('-') => bail!("unknown option {other}"),
@@ -69,10 +70,7 @@ fn pass(network: &SubSplat, views: &Views) -> Result<(f64, BTreeMap<&'static str
     let executor = network.trunk().executor().context("expected a GPU, got the CPU")?;
     let before = executor.recorder().work();
     let start = Instant::now();
-    let output = network.encode(views)?;
-    let settings = network.config().primaries();
-    let parents = primaries(&output, views, settings, &mut Trace::off())?;
-    network.trunk().forward(views, &output, &parents)?;
+    network.forward(views, &mut |_| {})?;
     let seconds = start.elapsed().as_secs_f64();
     let mut work = executor.recorder().work();
     for (name, own) in &mut work {
@@ -91,6 +89,8 @@ fn report(name: &str, config: &Config, args: &Args) -> Result<()> {
     let weights = Weights::seeded(7);
     let network = SubSplat::new(config, weights.builder())?.with_backend(&backend);
     let views = views(args.side)?;
+    let executor = network.trunk().executor().context("expected a GPU, got the CPU")?;
+    executor.recorder().set_counts_only(args.count);
     pass(&network, &views)?;
     let (seconds, work) = pass(&network, &views)?;
     ensure!(backend.warning().is_none(), "{name}: {}", backend.warning().unwrap_or_default());
@@ -109,10 +109,11 @@ fn report(name: &str, config: &Config, args: &Args) -> Result<()> {
         sum.bytes += own.bytes;
     }
     line("sum", &sum);
-    println!(
-        "{:.0} MiB of device memory, {seconds:.3} s here",
-        gpu.allocated_bytes() as f64 / 1048576.0
-    );
+    let memory = gpu.allocated_bytes() as f64 / 1048576.0;
+    match args.count {
+        true => println!("{memory:.0} MiB of device memory; nothing was executed"),
+        false => println!("{memory:.0} MiB of device memory, {seconds:.3} s here"),
+    }
     for (class, flops, bytes) in CLASSES {
         let of = |w: &Work| {
             let products = w.flops as f64 / (FLOPS_SHARE * flops);

@@ -24,10 +24,10 @@ macro_rules! uniform {
 mod network;
 
 pub use network::{
-    AttentionUniform, AttributesUniform, ConvexUniform, ConvolutionUniform, CrossCheckUniform,
-    ElementwiseUniform, ExpectationUniform, HeadOutputUniform, LinearUniform,
-    LinearWeightBwdUniform, NormUniform, OcclusionUniform, RawMatchingUniform, ReduceUniform,
-    ResizeUniform, RowsUniform, SelectUniform, SumPartsUniform,
+    AdamUniform, AdapterUniform, AttentionUniform, AttributesUniform, ConvexUniform,
+    ConvolutionUniform, CrossCheckUniform, ElementwiseUniform, ExpectationUniform,
+    HeadOutputUniform, LinearUniform, LinearWeightBwdUniform, NormUniform, OcclusionUniform,
+    RawMatchingUniform, ReduceUniform, ResizeUniform, RowsUniform, SelectUniform, SumPartsUniform,
 };
 
 uniform! {

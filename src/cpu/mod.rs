@@ -8,6 +8,7 @@
 //! tile), `rasterize` (the frame).
 
 pub mod activation;
+pub mod adam;
 pub mod adapter;
 pub mod attention;
 pub mod attention_gather;

@@ -11,11 +11,12 @@ use crate::cpu::Rasterizer;
 use crate::data::crop::Cropped;
 use crate::fit::FitOptions;
 use crate::io::image::Rgb;
+use crate::model::encoding::SceneEncoding;
 use crate::model::subsplat::feature_channels;
 use crate::model::trunk::Trunk;
 use crate::model::weights::Weights;
 use crate::pipeline::{
-    Density, DepthBounds, Encoded, Error, Reconstructor, Refine, Result, SceneChildren, add_detail,
+    Density, DepthBounds, Error, Reconstructor, Refine, Result, SceneChildren, add_detail,
     counts_of, fit_to_inputs, refine_on_inputs,
 };
 use crate::refine::Refiner;
@@ -287,11 +288,12 @@ impl Network<'_> {
         density: Density,
         raster: &RasterOptions,
     ) -> Result<SceneChildren> {
-        let Self { views, output, parents: primaries, .. } = self;
-        let (network, encoded) = (self.model.model(), Encoded { views, output, primaries });
+        let Self { views, output, parents, .. } = self;
+        let network = self.model.model();
+        let encoding = SceneEncoding::new(views.clone(), output.clone(), parents.clone());
         let mut renderer = Renderer::default();
-        let counts = counts_of(network, &encoded, inputs, density, raster, &mut renderer)?;
-        Ok(SceneChildren::new(network, &encoded, inputs.len(), counts, &|| Ok(()))?)
+        let counts = counts_of(network, &encoding, inputs, density, raster, &mut renderer)?;
+        Ok(SceneChildren::new(network, &encoding, inputs.len(), counts, &|| Ok(()))?)
     }
 
     /// Gaussians of a baseline.

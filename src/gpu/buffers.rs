@@ -43,11 +43,22 @@ const SIZE_GRANULARITY: u64 = 256;
 /// Minimum size of a kernel's argument, bytes: an array of one vec4.
 const BINDING_BYTES_MIN: u64 = 16;
 
+/// Buffers that the CPU has read, and their sizes together.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ReadBacks {
+    /// Buffers.
+    pub count: u64,
+    /// Bytes.
+    pub bytes: u64,
+}
+
 /// Free buffers, and the amount of memory allocated.
 #[derive(Debug)]
 pub(crate) struct Pool {
     free: Mutex<Vec<(Use, wgpu::Buffer)>>,
     allocated: AtomicU64,
+    /// Count and bytes of [`ReadBacks`].
+    read: [AtomicU64; 2],
     buffer_max: u64,
     binding_max: u64,
 }
@@ -57,6 +68,7 @@ impl Pool {
         Arc::new(Self {
             free: Mutex::default(),
             allocated: AtomicU64::new(0),
+            read: Default::default(),
             buffer_max: limits.max_buffer_size,
             binding_max: limits.max_storage_buffer_binding_size,
         })
@@ -232,6 +244,23 @@ impl Gpu {
         self.pool.allocated.load(Relaxed)
     }
 
+    /// Returns the read-backs since the device was opened.
+    pub fn read_backs(&self) -> ReadBacks {
+        let [count, bytes] = self.pool.read.each_ref().map(|n| n.load(Relaxed));
+        ReadBacks { count, bytes }
+    }
+
+    /// Waits until the device has executed all submitted work.
+    ///
+    /// # Errors
+    /// [`GpuError::Lost`]; [`GpuError::Refused`] where the driver reports an error.
+    pub(crate) fn finish(&self) -> Result<(), GpuError> {
+        self.checked("a wait", || {
+            let refused = |reason| GpuError::Refused { operation: "a wait".to_owned(), reason };
+            wait::idle(&self.device).map_err(refused)
+        })
+    }
+
     /// Returns the free buffers to the driver.
     pub fn trim(&self) {
         let mut free = self.pool.free.lock().unwrap_or_else(PoisonError::into_inner);
@@ -273,6 +302,8 @@ impl<T: Pod> Reading<T> {
         if self.count == 0 {
             return Ok(());
         }
+        gpu.pool.read[0].fetch_add(1, Relaxed);
+        gpu.pool.read[1].fetch_add(size_of_val(out) as u64, Relaxed);
         let refused =
             |reason: String| GpuError::Refused { operation: "the read-back".to_owned(), reason };
         let read = gpu.checked("the read-back", || {

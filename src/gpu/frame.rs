@@ -117,16 +117,9 @@ pub(crate) fn project(
         (call.first, call.count) = (part.first as u32, part.count as u32);
         call.own = (part.first - store.first) as u32;
         let own = gpu.uniform(&call)?;
-        let bindings = bind([
-            &own,
-            &part.rows,
-            &part.sh,
-            &part.gain,
-            &store.footprints,
-            &store.rectangles,
-            &depth.keys[0],
-            &counts,
-        ]);
+        let results = bind([&store.footprints, &store.rectangles, &depth.keys[0], &counts]);
+        let splats = [&part.rows, &part.sh, &part.gain].map(Clone::clone);
+        let bindings = [vec![Binding::from(&own)], splats.into(), results.into()].concat();
         commands.run(&PROJECT, &[], &bindings, Groups::of(part.count, THREADS))?;
     }
     commands.stage("sort by depth");

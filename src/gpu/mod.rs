@@ -86,12 +86,13 @@ mod wait;
 pub use crate::device::DeviceChoice;
 pub use adapter::{AdapterSummary, adapters, choose, find_for, instance};
 pub use array::{
-    AttentionCall, ConvolutionCall, CrossCheckCall, DeviceArray, Function, HeadOutputCall,
-    PointwiseFunction, RawMatchingCall, Recorder, Reduction, Work,
+    ADAM_BLOCK, AdamCall, AdapterCall, AdapterView, AttentionCall, ConvolutionCall, CrossCheckCall,
+    DeviceArray, Function, HeadOutputCall, PointwiseFunction, RawMatchingCall, Recorder, Reduction,
+    Work,
 };
 pub use attention_gather::AttentionGatherArgs;
 pub use attention_gather_bwd::AttentionGatherGradients;
-pub use buffers::Buffer;
+pub use buffers::{Buffer, ReadBacks};
 pub use device::{Gpu, limits_of};
 pub use error::GpuError;
 pub use pipelines::{Access, Kernel};
@@ -99,7 +100,7 @@ pub use plane_sweep::PlaneSweepArgs;
 pub use raster_bwd::Frame;
 pub use rasterize::Rasterizer;
 pub use redistribute::{RedistributeArgs, RedistributeGradients};
-pub use scene::Scene;
+pub use scene::{Scene, SceneArrays};
 pub use spgr::SpgrArgs;
 #[cfg(all(target_family = "wasm", target_os = "unknown"))]
 pub use wait::set_gpu_wait;
@@ -140,6 +141,9 @@ pub const KERNELS: &[&Kernel] = &[
     &plane_sweep_bwd::PLANE_SWEEP_TAPS,
     &plane_sweep_bwd::PLANE_SWEEP_REFERENCE_BWD,
     &plane_sweep_bwd::PLANE_SWEEP_SOURCE_BWD,
+    &array::ADAM,
+    &array::ADAPTER,
+    &array::ADAPTER_COLOURS,
     &array::ELEMENTWISE,
     &array::CONVOLUTION,
     &array::LINEAR,

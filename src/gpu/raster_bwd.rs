@@ -22,7 +22,7 @@
 
 use crate::abi::{Gradients, PAIR_SUMS, RasterOptions, RasterUniform, SplatSlices, TILE_GPU};
 use crate::camera::Camera;
-use crate::gpu::buffers::{Buffer, Reading};
+use crate::gpu::buffers::{Binding, Buffer, Reading};
 use crate::gpu::commands::{Commands, Groups};
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
@@ -307,9 +307,12 @@ impl Frame {
         ];
         let [rows, sh, gain] = lengths.map(|n| gpu.empty::<f32>("gradients of splats", n));
         let (rows, sh, gain) = (rows?, sh?, gain?);
-        let bindings = bind([&own, &part.rows, footprints, sums, &rows]);
+        let of = |buffer: &Buffer| Binding::from(buffer);
+        let bindings = [of(&own), part.rows.clone(), of(footprints), of(sums), of(&rows)];
         commands.run(&PROJECT_BWD, &[], &bindings, Groups::of(part.count, THREADS))?;
-        let bindings = bind([&own, &part.rows, &part.sh, &part.gain, sums, &rows, &sh, &gain]);
+        let splats = [&part.rows, &part.sh, &part.gain].map(Clone::clone);
+        let results = bind([sums, &rows, &sh, &gain]);
+        let bindings = [vec![of(&own)], splats.into(), results.into()].concat();
         commands.run(&COLOUR_BWD, &[], &bindings, Groups::of(parents, THREADS))?;
         let [n, d, g] = lengths;
         Ok(PartReading {

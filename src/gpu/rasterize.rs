@@ -146,6 +146,19 @@ impl Rasterizer {
         self.pixels(&scene, camera, options, Channels::Planes)
     }
 
+    /// Renders splats of device memory into planes, as [`Rasterizer::render_planes`] does.
+    ///
+    /// # Errors
+    /// As [`Rasterizer::render`].
+    pub fn render_scene_planes(
+        &mut self,
+        scene: &Scene,
+        camera: &Camera,
+        options: &RasterOptions,
+    ) -> Result<Vec<f32>, GpuError> {
+        self.pixels(scene, camera, options, Channels::Planes)
+    }
+
     fn pixels(
         &mut self,
         scene: &Scene,

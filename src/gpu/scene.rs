@@ -1,7 +1,10 @@
 //! Splats in device memory, divided into parts where one binding is too small.
 
-use crate::abi::{FOOTPRINT_STRIDE, Geometry, SPLAT_STRIDE, SplatSlices, sh_coefficients};
-use crate::gpu::buffers::Buffer;
+use crate::abi::{
+    FOOTPRINT_STRIDE, Geometry, SH_DEGREE_MAX, SPLAT_STRIDE, SplatSlices, sh_coefficients,
+};
+use crate::gpu::array::DeviceArray;
+use crate::gpu::buffers::Binding;
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
 
@@ -26,12 +29,77 @@ pub struct Scene {
 pub(crate) struct Part {
     pub(crate) first: usize,
     pub(crate) count: usize,
-    pub(crate) rows: Buffer,
-    pub(crate) sh: Buffer,
-    pub(crate) gain: Buffer,
+    pub(crate) rows: Binding,
+    pub(crate) sh: Binding,
+    pub(crate) gain: Binding,
+}
+
+/// Consecutive splats that an operation left in device memory, and their parents' SH.
+#[derive(Clone, Copy, Debug)]
+pub struct SceneArrays<'a> {
+    /// `[n·K, 11]`.
+    pub rows: &'a DeviceArray,
+    /// `[n, D, 3]`.
+    pub sh: &'a DeviceArray,
+    /// `[n·K]` or `[n·K, 4]`; `None` for gains of 1.
+    pub gain: Option<&'a DeviceArray>,
+}
+
+impl SceneArrays<'_> {
+    /// Floats of a gain, and D.
+    fn layout(&self) -> (usize, usize) {
+        let count = self.rows.dims().first().copied().unwrap_or(0).max(1);
+        let gain = self.gain.map_or(0, |gain| gain.count() / count);
+        (gain, self.sh.dims().get(1).copied().unwrap_or(0))
+    }
 }
 
 impl Scene {
+    /// Returns the scene of arrays in device memory, part by part, without a copy; `children` is K.
+    /// The recorder of the arrays must be flushed before a frame is drawn.
+    ///
+    /// # Errors
+    /// [`GpuError::Argument`] for dimensions that do not fit; [`GpuError::TooSmall`] for a part with
+    /// more footprints than a binding holds.
+    pub fn from_arrays(parts: &[SceneArrays], children: usize) -> Result<Self, GpuError> {
+        let misfit = |argument, expected: String, got: String| {
+            Err(GpuError::Argument { kernel: "project", argument, expected, got })
+        };
+        let of = |part: Option<&SceneArrays>| part.map_or((0, 0), |part| part.layout());
+        let (gain_stride, d) = of(parts.first());
+        let Some(sh_degree) = (0..=SH_DEGREE_MAX).find(|l| sh_coefficients(*l) == d) else {
+            return misfit("sh", "1, 4, 9, 16 or 25 functions".to_owned(), d.to_string());
+        };
+        let (mut first, mut own) = (0, Vec::with_capacity(parts.len()));
+        for part in parts {
+            let (rows, sh) = (part.rows.dims(), part.sh.dims());
+            let count = rows.first().copied().unwrap_or(0);
+            let fits = rows == [count, SPLAT_STRIDE]
+                && sh == [count / children.max(1), d, 3]
+                && count.is_multiple_of(children.max(1))
+                && part.gain.is_none_or(|gain| gain.count() == count * gain_stride)
+                && part.layout() == (gain_stride, d);
+            if !fits {
+                let expected = format!("rows [n·{children}, 11], sh [n, {d}, 3] and gains");
+                return misfit("splats", expected, format!("{rows:?}, {sh:?}"));
+            }
+            let limit = part.rows.recorder().gpu().rows_per_binding(FOOTPRINT_STRIDE);
+            if count > limit {
+                let (needed, limit) = (count as u64, limit as u64);
+                let resource = "splats of a part";
+                return Err(GpuError::TooSmall { resource, needed, limit });
+            }
+            let (rows, sh) = (part.rows.binding(), part.sh.binding());
+            // Without gains the kernel reads none.
+            let gain = part.gain.unwrap_or(part.rows);
+            let gain = if gain_stride == 0 { gain.first_binding() } else { gain.binding() };
+            own.push(Part { first, count, rows, sh, gain });
+            first += count;
+        }
+        let stride = SPLAT_STRIDE;
+        Ok(Self { parts: own, len: first, children, stride, sh_degree, gain_stride })
+    }
+
     /// Returns the number of splats N.
     pub fn len(&self) -> usize {
         self.len
@@ -81,7 +149,8 @@ impl Gpu {
             .min()
             .unwrap_or(1);
         let part = |of: &[f32], from: usize, past: usize, stride: usize| {
-            self.upload("splats", of.get(from * stride..past * stride).unwrap_or(&[]))
+            let own = of.get(from * stride..past * stride).unwrap_or(&[]);
+            Ok::<_, GpuError>(Binding::from(&self.upload("splats", own)?))
         };
         let parts = Self::chunks(n.div_ceil(children), max_parents).map(|parents| {
             let (first, past) = (parents.start * children, (parents.end * children).min(n));

@@ -31,6 +31,11 @@ pub(super) fn map(device: &wgpu::Device, slice: &wgpu::BufferSlice) -> Result<()
     }
 }
 
+/// Waits for all submitted work. Returns the reason of a failure.
+pub(super) fn idle(device: &wgpu::Device) -> Result<(), String> {
+    device.poll(wgpu::PollType::wait_indefinitely()).map(drop).map_err(|e| e.to_string())
+}
+
 /// Error scopes around calls to a device.
 pub(super) struct Scopes([wgpu::ErrorScopeGuard; 3]);
 

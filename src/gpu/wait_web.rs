@@ -77,6 +77,11 @@ pub(super) fn map(_: &wgpu::Device, slice: &wgpu::BufferSlice) -> Result<(), Str
     result.map_err(|e| e.to_string())
 }
 
+/// Returns at once: a browser waits at the next read-back.
+pub(super) fn idle(_: &wgpu::Device) -> Result<(), String> {
+    Ok(())
+}
+
 /// Stands in for the error scopes of other platforms.
 pub(super) struct Scopes;
 

@@ -8,6 +8,7 @@ pub mod backbone;
 pub mod compare;
 mod depth_range;
 pub mod embed;
+pub mod encoding;
 pub mod geometry;
 pub mod layers;
 pub mod lpips;

@@ -12,6 +12,7 @@ use crate::abi::{
 };
 use crate::camera::Camera;
 use crate::config::{Primaries as Settings, ShFrame};
+use crate::ops::Array;
 use crate::ops::adapter::{Adapter, Placed, Turn, View, place};
 use crate::sh::{Rotation, RotationBasis, standard_from_mvsplat};
 use candle_core::{Device, Result, Tensor, bail};
@@ -103,10 +104,37 @@ pub fn primaries(
 /// # Errors
 /// Those of [`primaries`].
 pub fn packed(out: &BackboneOutput, views: &Views, settings: &Settings) -> Result<Packed> {
+    let adapter = adapter_of(out, views, settings)?;
+    let ([h, w], g) = (adapter.size, adapter.per_pixel);
+    Ok(Packed {
+        placed: place(&out.raw, &out.depths, &out.densities, adapter)?,
+        scenes: views.scenes(),
+        sh_basis: basis_of(settings),
+        per_view: h * w * g,
+    })
+}
+
+/// Returns the basis of the SH that the adapter computes.
+pub(super) fn basis_of(settings: &Settings) -> ShBasis {
+    match settings.sh_frame {
+        ShFrame::Mvsplat => ShBasis::Mvsplat,
+        ShFrame::MvsplatExact | ShFrame::Standard => ShBasis::Standard,
+    }
+}
+
+/// Returns the constants of the adapter for `out`, on any executor.
+///
+/// # Errors
+/// Those of [`primaries`].
+pub fn adapter_of<A: Array>(
+    out: &BackboneOutput<A>,
+    views: &Views,
+    settings: &Settings,
+) -> Result<Adapter> {
     let (b, v, _, h, w) = views.images.dims5()?;
     let d = sh_coefficients(settings.sh_degree);
-    let (rb, rv, pixels, channels) = out.raw.dims4()?;
-    let g = out.depths.dim(3)?;
+    let [rb, rv, pixels, channels] = out.raw.sizes()?;
+    let [_, _, _, g] = out.depths.sizes()?;
     if [rb, rv, pixels, channels] != [b, v, h * w, 9 + 3 * d] {
         let expected = [b, v, h * w, 9 + 3 * d];
         bail!("primaries raw: expected {expected:?}, got {:?}", out.raw.dims());
@@ -117,22 +145,13 @@ pub fn packed(out: &BackboneOutput, views: &Views, settings: &Settings) -> Resul
             "primaries depths, densities: expected [{b}, {v}, {pixels}, G], got {depths:?}, {densities:?}"
         );
     }
-    let adapter = Adapter {
+    Ok(Adapter {
         views: views.cameras.iter().flatten().map(|camera| view(camera, settings)).collect(),
         size: [h, w],
         per_pixel: g,
         functions: d,
         exponent: settings.opacity_exponent,
         camera: Turn::new(&masked(settings), d),
-    };
-    Ok(Packed {
-        placed: place(&out.raw, &out.depths, &out.densities, adapter)?,
-        scenes: b,
-        sh_basis: match settings.sh_frame {
-            ShFrame::Mvsplat => ShBasis::Mvsplat,
-            ShFrame::MvsplatExact | ShFrame::Standard => ShBasis::Standard,
-        },
-        per_view: pixels * g,
     })
 }
 

@@ -108,11 +108,7 @@ impl SubSplat {
     /// # Errors
     /// Those of [`SubSplat::encode`] and of `checkpoint`.
     pub fn encode_with(&self, views: &Views, checkpoint: Checkpoint<'_>) -> Result<BackboneOutput> {
-        let (h, w) = views.size()?;
-        let stride = self.config.stride();
-        if h % stride != 0 || w % stride != 0 {
-            bail!("input images: expected sides that are multiples of {stride}, got {w}x{h}");
-        }
+        self.check_input(views)?;
         #[cfg(feature = "gpu")]
         if let Some(result) = self.trunk.on_device(|executor| {
             let images = executor.upload(&views.images)?;
@@ -124,8 +120,18 @@ impl SubSplat {
         self.encode_on(views, &views.images, &mut Trace::with_checkpoint(checkpoint))
     }
 
+    /// Refuses images whose sides are no multiples of [`Config::stride`].
+    pub(super) fn check_input(&self, views: &Views) -> Result<()> {
+        let (h, w) = views.size()?;
+        let stride = self.config.stride();
+        if h % stride != 0 || w % stride != 0 {
+            bail!("input images: expected sides that are multiples of {stride}, got {w}x{h}");
+        }
+        Ok(())
+    }
+
     /// Runs the backbone on the executor of `images`, the views' images.
-    fn encode_on<A: Array>(
+    pub(super) fn encode_on<A: Array>(
         &self,
         views: &Views,
         images: &A,
@@ -288,19 +294,18 @@ impl SubSplat {
             // Scenes are independent; one at a time bounds the memory.
             let views = views.scene(b)?;
             stage(STAGES[0]);
-            let output = self.encode(&views)?;
+            let features = in_pool(|| self.encode_scene(&views, &|| Ok(())))?;
             stage(STAGES[1]);
-            let parents = self.primaries(&views, &output)?;
+            let encoding = self.place(features)?;
             stage(STAGES[2]);
-            let children = in_pool(|| self.trunk.forward(&views, &output, &parents))?;
-            let depths = output.depths.narrow(3, 0, 1)?.squeeze(3)?.squeeze(0)?.to_vec2()?;
-            scenes.push(SceneOutput { children, depths });
+            scenes.push(in_pool(|| encoding.children(self, &|| Ok(())))?);
         }
         Ok(scenes)
     }
 
     /// Renders every scene from `camera` without storing its children ([`Trunk::render`]):
-    /// `[5, H, W]` a scene (R, G, B, alpha, Σ w·z).
+    /// `[5, H, W]` a scene (R, G, B, alpha, Σ w·z). On a GPU nothing but the picture and its number of
+    /// (splat, tile) pairs returns to the host.
     ///
     /// # Errors
     /// Those of [`SubSplat::forward`] and of the rasterizer.
@@ -312,9 +317,8 @@ impl SubSplat {
     ) -> Result<Vec<Tensor>> {
         let one = |b: usize| {
             let views = views.scene(b)?;
-            let output = self.encode(&views)?;
-            let parents = self.primaries(&views, &output)?;
-            in_pool(|| self.trunk.render(&views, &output, &parents, camera, options))
+            let features = in_pool(|| self.features(&views, &|| Ok(()), false))?;
+            self.place(features)?.render(self, camera, options)
         };
         (0..views.scenes()).map(one).collect()
     }
@@ -322,7 +326,7 @@ impl SubSplat {
 
 /// Runs `work` on a thread of the current pool. Hundreds of parallel calls of the network
 /// then start without waking another thread first.
-fn in_pool<R: Send>(work: impl FnOnce() -> R + Send) -> R {
+pub(super) fn in_pool<R: Send>(work: impl FnOnce() -> R + Send) -> R {
     rayon::scope(|_| work())
 }
 

@@ -7,11 +7,15 @@
 mod children;
 mod initial;
 mod mixed;
+#[cfg(feature = "gpu")]
+mod on_device;
 mod recompute;
 
 pub use children::Children;
 pub use initial::{initial_value, set_initial_values};
 pub use mixed::MixedChildren;
+#[cfg(feature = "gpu")]
+pub(super) use on_device::DeviceParents;
 pub use recompute::Recomputed;
 
 use super::aggregation::{Aggregation, Prepared};
@@ -29,7 +33,7 @@ use crate::ops::Executor;
 use crate::ops::direct::{Footprint, rasterize_footprints, spgr_footprints};
 use crate::ops::spgr::{Rules, Spgr, spgr_on};
 use crate::ops::{Array, Backend, rasterize_on};
-use candle_core::{DType, Result, Tensor, bail};
+use candle_core::{DType, Device, Result, Tensor, bail};
 use candle_nn::VarBuilder;
 use rayon::prelude::*;
 #[cfg(feature = "gpu")]
@@ -92,6 +96,21 @@ struct Scene<'a, A = Tensor> {
     /// The heads for the r of `rules`.
     heads: Heads,
     rules: Rules,
+}
+
+/// Arrays of one scene's N parents on one executor.
+struct ParentArrays<A> {
+    /// `[N, 3]`.
+    means: A,
+    /// `[N, 4]`.
+    quats_wxyz: A,
+    /// `[N, 3]`.
+    scales: A,
+    /// `[N, 1]`.
+    opacities: A,
+    /// `[N, 3·D]`.
+    sh_input: A,
+    per_view: usize,
 }
 
 /// Consecutive parents of one view.
@@ -292,9 +311,13 @@ impl Trunk {
 
     /// Returns the number of steps of [`Trunk::forward_with`].
     pub fn steps(&self, primaries: &Primaries) -> usize {
-        let parents = primaries.opacities.elem_count();
+        self.steps_of(primaries.opacities.elem_count(), primaries.per_view)
+    }
+
+    /// [`Trunk::steps`] of `parents` parents, `per_view` of each view.
+    pub(super) fn steps_of(&self, parents: usize, per_view: usize) -> usize {
         match self.parts() {
-            Some(_) => 1 + chunks(parents, primaries.per_view, self.chunk_size()).count(),
+            Some(_) => 1 + chunks(parents, per_view, self.chunk_size()).count(),
             None => 0,
         }
     }
@@ -461,9 +484,6 @@ impl Trunk {
         // Contiguous once, so that no chunk copies its rows out of wider ones.
         let own = |t: &Tensor| like(&t.squeeze(0)?.contiguous()?);
         let (_, n, _) = primaries.means.dims3()?;
-        let means = own(&primaries.means)?;
-        let (dtype, device) = (primaries.means.dtype(), primaries.means.device());
-        let frames = Frames::new(&views.cameras[0], dtype, device)?;
         let sh = match self.config.embed.sh {
             ShInput::World => &primaries.sh,
             ShInput::Camera => &primaries.sh_camera,
@@ -473,22 +493,44 @@ impl Trunk {
         if (channels, d) != (3, expected) {
             bail!("primaries SH: expected [1, {n}, 3, {expected}], got {:?}", sh.dims());
         }
+        let arrays = ParentArrays {
+            means: own(&primaries.means)?,
+            quats_wxyz: own(&primaries.quats_wxyz)?,
+            scales: own(&primaries.scales)?,
+            opacities: own(&primaries.opacities)?.reshape((n, 1))?,
+            sh_input: like(&sh.reshape((n, 3 * d))?)?,
+            per_view: primaries.per_view,
+        };
+        let kind = (primaries.means.dtype(), primaries.means.device());
+        let feature = |level| like(backbone.feature(level)?);
+        self.scene_from(parts, views, arrays, kind, feature)
+    }
+
+    /// The scene of `parents`; `feature` returns a level of the backbone's feature maps, and the cameras
+    /// become tensors of `dtype` on `device`.
+    fn scene_from<'a, A: Array>(
+        &self,
+        parts: &Parts,
+        views: &'a Views,
+        parents: ParentArrays<A>,
+        (dtype, device): (DType, &Device),
+        feature: impl Fn(FeatureLevel) -> Result<A>,
+    ) -> Result<Scene<'a, A>> {
+        let frames = Frames::new(&views.cameras[0], dtype, device)?;
+        let ParentArrays { means, quats_wxyz, scales, opacities, sh_input, per_view } = parents;
         let prepared = match &parts.aggregation {
-            Some(agg) => {
-                let feature = |level| like(backbone.feature(level)?);
-                Some(agg.prepare(views, &frames, feature, &means)?)
-            }
+            Some(agg) => Some(agg.prepare(views, &frames, feature, &means)?),
             None => None,
         };
         Ok(Scene {
             views,
             frames,
             means,
-            quats_wxyz: own(&primaries.quats_wxyz)?,
-            scales: own(&primaries.scales)?,
-            opacities: own(&primaries.opacities)?.reshape((n, 1))?,
-            sh_input: like(&sh.reshape((n, 3 * d))?)?,
-            per_view: primaries.per_view,
+            quats_wxyz,
+            scales,
+            opacities,
+            sh_input,
+            per_view,
             prepared,
             heads: parts.heads.for_children(self.rules.children())?,
             rules: self.rules,
@@ -585,13 +627,7 @@ fn check_single(views: &Views, primaries: &Primaries) -> Result<()> {
     if views.scenes() != 1 || b != 1 {
         bail!("trunk: expected one scene, got {} of views and {b} of primaries", views.scenes());
     }
-    if primaries.per_view == 0 || n != primaries.per_view * views.views() {
-        bail!(
-            "primaries: expected {} views of {} parents, got {n} parents",
-            views.views(),
-            primaries.per_view
-        );
-    }
+    check_views(views, n, primaries.per_view)?;
     let fits = primaries.quats_wxyz.dims() == [1, n, 4]
         && primaries.scales.dims() == [1, n, 3]
         && primaries.opacities.dims() == [1, n];
@@ -602,6 +638,14 @@ fn check_single(views: &Views, primaries: &Primaries) -> Result<()> {
             primaries.scales.dims(),
             primaries.opacities.dims()
         );
+    }
+    Ok(())
+}
+
+/// Refuses `n` parents that are not `per_view` of each view.
+fn check_views(views: &Views, n: usize, per_view: usize) -> Result<()> {
+    if per_view == 0 || n != per_view * views.views() {
+        bail!("primaries: expected {} views of {per_view} parents, got {n} parents", views.views());
     }
     Ok(())
 }

@@ -34,7 +34,12 @@ mod splat_tensors;
 pub use array::{Array, ConvSteps};
 pub use backend::{Backend, NoDevice};
 #[cfg(feature = "gpu")]
-pub use device_array::{DeviceArray, DeviceGradients, Executor};
+pub use device_array::{
+    ColourLayout, DeviceAdam, DeviceArray, DeviceGradients, DeviceSplats, Executor, ParameterStep,
+    SharedStep,
+};
+#[cfg(feature = "gpu")]
+pub(crate) use rasterize::check_options as check_raster_options;
 pub use rasterize::{over_background, rasterize, rasterize_on, rasterize_splats};
 pub use splat_tensors::SplatTensors;
 

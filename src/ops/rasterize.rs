@@ -159,7 +159,7 @@ fn check_shapes(splats: &Tensor, sh: &Tensor, gain: &Tensor) -> Result<()> {
     Ok(())
 }
 
-pub(super) fn check_options(options: &RasterOptions) -> Result<()> {
+pub(crate) fn check_options(options: &RasterOptions) -> Result<()> {
     if options.sh_degree > SH_DEGREE_MAX {
         bail!("rasterize: expected sh_degree 0 to {SH_DEGREE_MAX}, got {}", options.sh_degree);
     }

@@ -6,25 +6,29 @@ use super::{Error, Result, add_detail, detail};
 use crate::abi::{CHILDREN_MAX, RasterOptions};
 use crate::data::crop::Cropped;
 use crate::fit::FitView;
-use crate::model::subsplat::SubSplat;
+use crate::model::encoding::SceneEncoding;
+use crate::model::subsplat::{SceneOutput, SubSplat};
 use crate::model::trace::Checkpoint;
-use crate::model::{BackboneOutput, Primaries, Views};
 use crate::refine::{Groups, LEAST_SHARE, PHOTOGRAPHS_TO_REMOVE, shares};
 use crate::render::Renderer;
 use crate::splats::Splats;
-
-/// The network's results for one scene.
-pub(crate) struct Encoded<'a> {
-    pub views: &'a Views,
-    pub output: &'a BackboneOutput,
-    pub primaries: &'a Primaries,
-}
 
 /// Gaussians of a scene.
 pub(crate) struct SceneChildren {
     pub splats: Splats,
     pub groups: Groups,
+    /// `[V][H·W]`: distance of each input pixel's first Gaussian along the unit ray, world units; empty
+    /// where it is not known.
+    pub distances: Vec<Vec<f32>>,
     origins: Origins,
+}
+
+/// Numbers of children that parents have.
+pub(crate) struct Counts {
+    /// K of each parent.
+    counts: Vec<u8>,
+    /// The parents.
+    parents: Splats,
 }
 
 /// Parents of the Gaussians.
@@ -46,23 +50,23 @@ fn grids_of(network: &SubSplat) -> Vec<usize> {
     }
 }
 
-/// Sides of the parents' grids for `density`; `None` where all have r² children. `raster` renders
+/// Numbers of children of the parents for `density`; `None` where all have r² children. `raster` renders
 /// pictures of the input's size, from which the parents' shares come.
 ///
 /// # Errors
 /// Those of the network; a number of [`Density::Each`] that is not in 1 to 64.
 pub(crate) fn counts_of(
     network: &SubSplat,
-    Encoded { views, primaries, .. }: &Encoded<'_>,
+    encoding: &SceneEncoding,
     inputs: &[Cropped],
     density: Density,
     raster: &RasterOptions,
     renderer: &mut Renderer,
-) -> Result<Option<Vec<u8>>> {
+) -> Result<Option<Counts>> {
     if density.is_full(inputs.len()) {
         return Ok(None);
     }
-    let parents = network.trunk().parents(views, primaries)?.to_splats()?;
+    let parents = encoding.parents(network)?;
     let grids = grids_of(network);
     let photographs: Vec<FitView<'_>> =
         inputs.iter().map(|c| FitView { camera: &c.input_camera, image: &c.input }).collect();
@@ -80,7 +84,7 @@ pub(crate) fn counts_of(
         _ => counts(inputs, &shares, &grids, limit),
     };
     hidden.into_iter().for_each(|i| counts[i] = 0);
-    Ok(Some(counts))
+    Ok(Some(Counts { counts, parents }))
 }
 
 /// K of [`Density::Each`].
@@ -95,32 +99,33 @@ fn each(children: usize) -> Result<u8> {
 }
 
 impl SceneChildren {
-    /// Children of the one scene that `encoded` holds, of `photographs` photographs, without detail;
+    /// Children of the one scene that `encoding` holds, of `photographs` photographs, without detail;
     /// `counts` are those of [`counts_of`].
     ///
     /// # Errors
     /// Those of the network and of `checkpoint`.
     pub(crate) fn new(
         network: &SubSplat,
-        Encoded { views, output, primaries }: &Encoded<'_>,
+        encoding: &SceneEncoding,
         photographs: usize,
-        counts: Option<Vec<u8>>,
+        counts: Option<Counts>,
         checkpoint: Checkpoint<'_>,
     ) -> candle_core::Result<Self> {
-        let (trunk, per_view) = (network.trunk(), primaries.per_view);
-        let Some(counts) = counts else {
-            let children = trunk.forward_with(views, output, primaries, checkpoint)?;
+        let per_view = encoding.per_view();
+        let Some(Counts { counts, parents }) = counts else {
+            let SceneOutput { children, depths } = encoding.children(network, checkpoint)?;
             let size = per_view * children.k;
             let ranges = (0..photographs).map(|view| view * size..(view + 1) * size).collect();
             let groups = Groups { ranges, equal_families: true };
-            return Ok(Self { splats: children.to_splats()?, groups, origins: Origins::Regular });
+            let (splats, origins) = (children.to_splats()?, Origins::Regular);
+            return Ok(Self { splats, groups, distances: depths, origins });
         };
-        let mixed = trunk.forward_mixed(views, output, primaries, &counts, checkpoint)?;
+        let (mixed, distances) = encoding.mixed(network, &parents, &counts, checkpoint)?;
         let end = |view: usize| mixed.parents.partition_point(|p| (*p as usize) < view * per_view);
         let ranges = (0..photographs).map(|view| end(view)..end(view + 1)).collect();
         let groups = Groups { ranges, equal_families: false };
         let origins = Origins::Mixed { parents: mixed.parents, counts };
-        Ok(Self { splats: mixed.splats, groups, origins })
+        Ok(Self { splats: mixed.splats, groups, distances, origins })
     }
 
     /// Adds the photographs' detail to the colours. Returns whether any photograph has detail.
@@ -138,7 +143,8 @@ impl SceneChildren {
 
     /// Gaussians of which the photographs are not known.
     pub(crate) fn of_splats(splats: Splats) -> Self {
-        Self { splats, groups: Groups::default(), origins: Origins::Regular }
+        let (groups, distances) = Default::default();
+        Self { splats, groups, distances, origins: Origins::Regular }
     }
 
     /// Returns K of each parent; empty where all have the same.

@@ -71,7 +71,7 @@ pub use reconstruction::Reconstruction;
 pub use reconstructor::Reconstructor;
 pub use warning::Warning;
 
-pub(crate) use children::{Encoded, SceneChildren, counts_of};
+pub(crate) use children::{SceneChildren, counts_of};
 pub(crate) use depth_range::{initial_bounds, refined_bounds};
 pub(crate) use detail::add_detail;
 pub(crate) use exposure::equalise;

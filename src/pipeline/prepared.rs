@@ -2,8 +2,8 @@
 
 use super::progress::Tracker;
 use super::{
-    DepthBounds, Detail, Encoded, Options, Progress, Reconstruction, Reconstructor, Result,
-    SceneChildren, Stage, Warning, counts_of, fit_to_inputs, refine_on_inputs,
+    DepthBounds, Detail, Options, Progress, Reconstruction, Reconstructor, Result, SceneChildren,
+    Stage, Warning, counts_of, fit_to_inputs, refine_on_inputs,
 };
 use crate::camera::Camera;
 use crate::check::PairReport;
@@ -96,25 +96,23 @@ impl Prepared<'_> {
         let (views, bounds) = model.views_with(&inputs, bounds, options.depth_range, estimate)?;
         tracker.begin(Stage::Backbone, progress)?;
         let steps = network.encode_steps(inputs.len());
-        let output =
-            tracker.run_steps(steps, progress, |step| network.encode_with(&views, step))?;
+        let features =
+            tracker.run_steps(steps, progress, |step| network.encode_scene(&views, step))?;
         tracker.begin(Stage::Primaries, progress)?;
-        let primaries = network.primaries(&views, &output)?;
+        let encoding = network.place(features)?;
         tracker.begin(Stage::Subsplat, progress)?;
         let config = model.config();
         let colour = Rgb::mean_colour(inputs.iter().map(|c| &c.input));
         let raster_at = |ratio: f32| config.raster_options(ratio, bounds.near, colour);
         let mut renderer = Renderer::new(model.backend());
-        let encoded = Encoded { views: &views, output: &output, primaries: &primaries };
         let density = options.density;
         let counts =
-            counts_of(network, &encoded, &inputs, density, &raster_at(1.0), &mut renderer)?;
-        let steps = network.trunk().steps(&primaries);
+            counts_of(network, &encoding, &inputs, density, &raster_at(1.0), &mut renderer)?;
+        let steps = encoding.steps(network.trunk());
         let mut children = tracker.run_steps(steps, progress, |step| {
-            SceneChildren::new(network, &encoded, inputs.len(), counts, step)
+            SceneChildren::new(network, &encoding, inputs.len(), counts, step)
         })?;
-        let distances = output.depths.narrow(3, 0, 1)?.squeeze(3)?.squeeze(0)?.to_vec2()?;
-        drop((views, output, primaries));
+        drop((views, encoding));
         let mut detail = Detail::Off;
         if options.detail == Detail::Photographs {
             tracker.begin(Stage::Detail, progress)?;
@@ -123,7 +121,7 @@ impl Prepared<'_> {
             }
         }
         let parent_counts = children.counts().to_vec();
-        let SceneChildren { mut splats, mut groups, .. } = children;
+        let SceneChildren { mut splats, mut groups, distances, .. } = children;
         let raster_options = raster_at(inputs.first().map_or(1.0, Cropped::ratio));
         let (mut fit, mut refinement) = (None, None);
         let (fit_options, refine_options) =

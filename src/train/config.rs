@@ -37,7 +37,7 @@ pub struct TrainConfig {
     #[serde(rename = "lanes")]
     pub parallel_groups: usize,
     /// Device of network and rasterizer: `cpu`, `auto`, `gpu`, or a part of an adapter's name.
-    /// Losses, placement of the primaries, summation of gradients and optimizer run on the CPU. A
+    /// Losses, placement of the primaries and summation of gradients run on the CPU. A
     /// training can go on with another device.
     pub device: String,
     /// Configuration of the network.

@@ -1,8 +1,13 @@
 //! Adam and AdamW over all parameters in one contiguous array: one pass per step for clipping,
 //! moments, weights and their moving average.
 //!
-//! Sources: Kingma and Ba 2015, algorithm 1; Loshchilov and Hutter 2019.
+//! Sources: Kingma and Ba 2015, algorithm 1; Loshchilov and Hutter 2019. On a GPU
+//! ([`Optimizer::set_device`]) the same step runs over arrays in device memory. Host memory has copies of
+//! them after each step, so that a checkpoint, a moving average and a lost device need no others.
 
+use crate::cpu::adam::AdamStep;
+#[cfg(feature = "gpu")]
+use crate::ops::{Backend, DeviceAdam, Executor, ParameterStep, SharedStep};
 use candle_core::backprop::GradStore;
 use candle_core::{Device, Result, Tensor, Var, bail};
 use rayon::prelude::*;
@@ -10,6 +15,8 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::hash::Hasher;
 use std::ops::Range;
+#[cfg(feature = "gpu")]
+use std::sync::Arc;
 
 /// Options of the optimizer. Defaults: PyTorch's AdamW, clipping at 1, moving average 0.997.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -61,7 +68,7 @@ struct Slot {
 }
 
 /// All parameters of a model, in the order of their names, and the optimizer's state.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub struct Optimizer {
     settings: Settings,
     slots: Vec<Slot>,
@@ -72,6 +79,18 @@ pub struct Optimizer {
     /// Number of updates of each parameter, for its bias correction. A parameter without a gradient
     /// is not updated.
     updates: Vec<u64>,
+    /// The same state in device memory.
+    #[cfg(feature = "gpu")]
+    device: Option<OnDevice>,
+}
+
+/// The state on a GPU.
+#[cfg(feature = "gpu")]
+#[derive(Debug)]
+struct OnDevice {
+    executor: Arc<Executor>,
+    backend: Backend,
+    adam: DeviceAdam,
 }
 
 /// Sum of the gradients of several backward passes.
@@ -168,7 +187,70 @@ impl Optimizer {
             second: vec![0.0; n],
             average: values.clone(),
             values,
+            #[cfg(feature = "gpu")]
+            device: None,
         })
+    }
+
+    /// Computes norms and steps on the GPU of `executor`, which reads the parameters from there;
+    /// `backend` learns of its failure, after which the CPU goes on.
+    ///
+    /// # Errors
+    /// Those of the parameters' tensors.
+    #[cfg(feature = "gpu")]
+    pub fn set_device(&mut self, executor: &Arc<Executor>, backend: &Backend) -> Result<()> {
+        self.device = None;
+        let moved: Option<Result<DeviceAdam>> = executor.attempt(backend, || {
+            let spans = self.slots.iter().map(|slot| slot.span.clone()).collect();
+            let state = [&self.values, &self.first, &self.second, &self.average];
+            let adam = DeviceAdam::new(executor, spans, state.map(Vec::as_slice))?;
+            let part = |(i, slot): (usize, &Slot)| -> Result<_> {
+                Ok((slot.var.as_tensor().clone(), adam.value(i, slot.var.dims())?))
+            };
+            let parts = self.slots.iter().enumerate().map(part).collect::<Result<Vec<_>>>()?;
+            executor.keep_trained(&parts)?;
+            Ok(adam)
+        });
+        if let Some(adam) = moved {
+            let (executor, backend) = (executor.clone(), backend.clone());
+            self.device = Some(OnDevice { executor, backend, adam: adam? });
+        }
+        Ok(())
+    }
+
+    /// Runs `f` on the GPU; `None` where there is none or it failed, and the CPU goes on for good.
+    #[cfg(feature = "gpu")]
+    fn on_device<R>(&mut self, f: impl FnOnce(&DeviceAdam) -> Result<R>) -> Result<Option<R>> {
+        let Some(OnDevice { executor, backend, adam }) = &self.device else { return Ok(None) };
+        match executor.attempt(backend, || f(adam)) {
+            Some(result) => result.map(Some),
+            None => {
+                // The values on the device may be those of no step.
+                executor.keep_trained(&[])?;
+                self.device = None;
+                Ok(None)
+            }
+        }
+    }
+
+    /// Returns whether a GPU has the state.
+    pub fn is_on_device(&self) -> bool {
+        #[cfg(feature = "gpu")]
+        return self.device.is_some();
+        #[cfg(not(feature = "gpu"))]
+        return false;
+    }
+
+    /// Returns the norm of all gradients together, computed where the state is.
+    ///
+    /// # Errors
+    /// Gradients of other parameters.
+    pub fn norm(&mut self, gradients: &Gradients) -> Result<f64> {
+        #[cfg(feature = "gpu")]
+        if let Some(norm) = self.on_device(|adam| adam.norm(&gradients.sum))? {
+            return Ok(norm);
+        }
+        Ok(gradients.norm())
     }
 
     /// Returns the number of parameters.
@@ -213,34 +295,25 @@ impl Optimizer {
     /// # Errors
     /// A tensor operation that fails.
     pub fn step(&mut self, gradients: &Gradients, norm: f64, rate: f64, step: u64) -> Result<()> {
-        let s = &self.settings;
-        let clip = if s.clip > 0.0 && norm > s.clip { s.clip / norm } else { 1.0 };
-        let decay = s.average.min((1.0 + step as f64) / (10.0 + step as f64));
-        let decay = if s.average > 0.0 { decay } else { 0.0 };
-        for (i, slot) in self.slots.iter().enumerate() {
-            if !gradients.touched[i] {
-                continue;
+        for (updates, touched) in self.updates.iter_mut().zip(&gradients.touched) {
+            *updates += u64::from(*touched);
+        }
+        let steps: Vec<Option<AdamStep>> = (0..self.slots.len())
+            .map(|i| gradients.touched[i].then(|| self.constants(i, norm, rate, step)))
+            .collect();
+        if !self.step_on_device(gradients, &steps)? {
+            for (slot, update) in self.slots.iter().zip(&steps) {
+                let (Some(update), span) = (update, slot.span.clone()) else { continue };
+                update.run(
+                    &gradients.sum[span.clone()],
+                    &mut self.values[span.clone()],
+                    [&mut self.first[span.clone()], &mut self.second[span.clone()]],
+                    &mut self.average[span],
+                );
             }
-            self.updates[i] += 1;
-            let t = self.updates[i] as i32;
-            let rate = if slot.backbone { rate * s.backbone_rate } else { rate };
-            let update = Update {
-                clip: clip as f32,
-                betas: s.betas.map(|b| b as f32),
-                // Both bias corrections are folded into the rate and the scale of ε.
-                rate: (rate / (1.0 - s.betas[0].powi(t))) as f32,
-                root: (1.0 / (1.0 - s.betas[1].powi(t)).sqrt()) as f32,
-                epsilon: s.epsilon as f32,
-                keep: if slot.decays { (1.0 - rate * s.weight_decay) as f32 } else { 1.0 },
-                average: decay as f32,
-            };
+        }
+        for (slot, _) in self.slots.iter().zip(&steps).filter(|(_, update)| update.is_some()) {
             let span = slot.span.clone();
-            update.run(
-                &gradients.sum[span.clone()],
-                &mut self.values[span.clone()],
-                [&mut self.first[span.clone()], &mut self.second[span.clone()]],
-                &mut self.average[span.clone()],
-            );
             slot.var.set(&Tensor::from_slice(
                 &self.values[span],
                 slot.var.shape(),
@@ -248,6 +321,54 @@ impl Optimizer {
             )?)?;
         }
         Ok(())
+    }
+
+    /// Constants of step number `step` for parameter `i`.
+    fn constants(&self, i: usize, norm: f64, rate: f64, step: u64) -> AdamStep {
+        let (s, slot) = (&self.settings, &self.slots[i]);
+        let clip = if s.clip > 0.0 && norm > s.clip { s.clip / norm } else { 1.0 };
+        let decay = s.average.min((1.0 + step as f64) / (10.0 + step as f64));
+        let decay = if s.average > 0.0 { decay } else { 0.0 };
+        let t = self.updates[i] as i32;
+        let rate = if slot.backbone { rate * s.backbone_rate } else { rate };
+        AdamStep {
+            clip: clip as f32,
+            betas: s.betas.map(|b| b as f32),
+            // Both bias corrections are folded into the rate and the scale of ε.
+            rate: (rate / (1.0 - s.betas[0].powi(t))) as f32,
+            root: (1.0 / (1.0 - s.betas[1].powi(t)).sqrt()) as f32,
+            epsilon: s.epsilon as f32,
+            keep: if slot.decays { (1.0 - rate * s.weight_decay) as f32 } else { 1.0 },
+            average: decay as f32,
+        }
+    }
+
+    /// Takes a step on the GPU and copies its results; false where the CPU must take it.
+    #[cfg(feature = "gpu")]
+    fn step_on_device(
+        &mut self,
+        gradients: &Gradients,
+        steps: &[Option<AdamStep>],
+    ) -> Result<bool> {
+        let Some(shared) = steps.iter().flatten().next() else { return Ok(true) };
+        let AdamStep { clip, betas, epsilon, average, .. } = *shared;
+        let shared = SharedStep { clip, betas, epsilon, average };
+        let own = |step: &AdamStep| {
+            let AdamStep { rate, root, keep, .. } = *step;
+            ParameterStep { rate, root, keep }
+        };
+        let own: Vec<_> = steps.iter().map(|step| step.as_ref().map(own)).collect();
+        let Some(state) = self.on_device(|adam| adam.step(&gradients.sum, shared, &own))? else {
+            return Ok(false);
+        };
+        [self.values, self.first, self.second, self.average] = state;
+        Ok(true)
+    }
+
+    #[cfg(not(feature = "gpu"))]
+    #[expect(clippy::unnecessary_wraps, reason = "the signature of the GPU's version")]
+    fn step_on_device(&mut self, _: &Gradients, _: &[Option<AdamStep>]) -> Result<bool> {
+        Ok(false)
     }
 
     /// Returns the moving average of the weights, by the model's names.
@@ -300,6 +421,10 @@ impl Optimizer {
         }
         let updates = take_tensor(&mut state, UPDATES, &[self.slots.len()])?.to_vec1::<f32>()?;
         self.updates = updates.into_iter().map(|u| u as u64).collect();
+        #[cfg(feature = "gpu")]
+        if let Some(OnDevice { executor, backend, .. }) = self.device.take() {
+            self.set_device(&executor, &backend)?;
+        }
         match state.keys().next() {
             Some(name) => bail!("checkpoint: tensor `{name}` does not belong to this model"),
             None => Ok(()),
@@ -313,38 +438,5 @@ fn take_tensor(state: &mut State, name: &str, dims: &[usize]) -> Result<Tensor> 
         Some(t) if t.dims() == dims => Ok(t),
         Some(t) => bail!("checkpoint tensor `{name}`: expected {dims:?}, got {:?}", t.dims()),
         None => bail!("checkpoint: expected a tensor `{name}`, got none"),
-    }
-}
-
-/// Constants of one parameter's step.
-struct Update {
-    clip: f32,
-    betas: [f32; 2],
-    rate: f32,
-    root: f32,
-    epsilon: f32,
-    keep: f32,
-    average: f32,
-}
-
-impl Update {
-    /// Updates values, moments and average in place.
-    fn run(&self, g: &[f32], value: &mut [f32], [m, v]: [&mut [f32]; 2], average: &mut [f32]) {
-        /// Elements of one parallel task.
-        const TASK: usize = 1 << 14;
-        g.par_chunks(TASK)
-            .zip(value.par_chunks_mut(TASK).zip(average.par_chunks_mut(TASK)))
-            .zip(m.par_chunks_mut(TASK).zip(v.par_chunks_mut(TASK)))
-            .for_each(|((g, (value, average)), (m, v))| {
-                let [b1, b2] = self.betas;
-                for i in 0..g.len() {
-                    let g = g[i] * self.clip;
-                    m[i] = b1 * m[i] + (1.0 - b1) * g;
-                    v[i] = b2 * v[i] + (1.0 - b2) * g * g;
-                    let step = self.rate * m[i] / (v[i].sqrt() * self.root + self.epsilon);
-                    value[i] = self.keep * value[i] - step;
-                    average[i] += (1.0 - self.average) * (value[i] - average[i]);
-                }
-            });
     }
 }

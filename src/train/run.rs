@@ -222,6 +222,10 @@ impl Training {
             optimizer.restore(old.state)?;
             progress = old.progress;
         }
+        #[cfg(feature = "gpu")]
+        if let Some(executor) = learner.executor() {
+            optimizer.set_device(executor, learner.backend())?;
+        }
         let data = &config.data;
         let options = LoaderOptions {
             augmentation: data.augment,
@@ -330,7 +334,7 @@ impl Training {
             terms.add(&of_round, 1.0 / config.accumulate as f64);
         }
         let start = Instant::now();
-        let norm = gradients.norm();
+        let norm = self.optimizer.norm(&gradients)?;
         let rate = config.schedule.rate(step, config.steps);
         let finite = terms.loss.is_finite() && norm.is_finite();
         if finite {

@@ -21,8 +21,12 @@ use crate::model::trunk::{Children, TrainPass};
 use crate::model::weights::Weights;
 use crate::model::{BackboneOutput, Views};
 use crate::ops::Backend;
+#[cfg(feature = "gpu")]
+use crate::ops::Executor;
 use candle_core::backprop::GradStore;
 use candle_core::{Device, Tensor};
+#[cfg(feature = "gpu")]
+use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
@@ -259,6 +263,12 @@ impl Learner {
     /// Returns the kernels that the model uses.
     pub fn backend(&self) -> &Backend {
         &self.backend
+    }
+
+    /// Returns the GPU of the configured device, if it is one.
+    #[cfg(feature = "gpu")]
+    pub(super) fn executor(&self) -> Option<&Arc<Executor>> {
+        self.model.trunk().executor()
     }
 
     /// Returns why the CPU took over work of the configured GPU; `None` where it did not.

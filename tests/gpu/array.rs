@@ -27,7 +27,7 @@ const TOLERANCE: f32 = 4e-6;
 /// resolves.
 const COPIED: f32 = 3e-7;
 
-fn executor() -> Option<Arc<Executor>> {
+pub(super) fn executor() -> Option<Arc<Executor>> {
     Executor::new(&Backend::from(gpu()?))
 }
 

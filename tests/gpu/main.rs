@@ -8,6 +8,8 @@ mod layers;
 mod model;
 mod network;
 mod ops;
+mod optimizer;
+mod primaries;
 mod raster;
 mod raster_bwd;
 mod redistribute;

@@ -4,17 +4,19 @@ use subsplat_test_support::gpu as adapter;
 use subsplat_test_support::whole;
 
 use adapter::{gpu, limited};
+use candle_core::{Device, Tensor};
 use std::ops::ControlFlow;
 use std::path::Path;
+use subsplat::abi::PLAN_WORDS;
 use subsplat::camera::NearFar;
 use subsplat::config::Preset;
-use subsplat::model::Backend;
 use subsplat::model::compare::compare;
 use subsplat::model::weights::Weights;
+use subsplat::model::{Backend, Views};
 use subsplat::pipeline::{Photo, Reconstructor};
 use subsplat::{Error, Progress, Stage, load_scene};
 use subsplat_test_support::shared;
-use whole::{light, lively, plain, run, shoot};
+use whole::{Shoot, light, lively, plain, run, shoot};
 
 /// Fraction of rows that may differ: a depth whose window around the mode begins one candidate
 /// farther moves its pixel's children.
@@ -100,6 +102,117 @@ fn every_stage_of_mvsplat_agrees_with_the_reference() {
     assert!(report.ok(), "{bad:#?}");
     assert_eq!(report.not_produced, [""; 0]);
     assert_eq!(report.rows.len(), 99);
+}
+
+/// The network's input of photographs.
+fn views(shoot: &Shoot) -> Views {
+    let cameras: Vec<_> = shoot.photos.iter().map(|p| *p.camera()).collect();
+    let pixels: Vec<f32> = shoot.photos.iter().flat_map(|p| p.image().to_planes()).collect();
+    let k = cameras[0].intrinsics();
+    let sizes = (1, cameras.len(), 3, k.height, k.width);
+    let images = Tensor::from_vec(pixels, sizes, &Device::Cpu).unwrap();
+    let near_far = vec![vec![whole::NEAR_FAR; cameras.len()]];
+    Views::new(images, vec![cameras], near_far).unwrap()
+}
+
+/// From photographs to a picture, the host reads the picture alone, and the number of pairs that the
+/// frame needs; from photographs to Gaussians, it reads these with one wait.
+#[test]
+fn the_host_reads_the_picture_alone() {
+    for mvsplat in [false, true] {
+        // Read-backs are counted for a device; other tests use the shared one.
+        let Some(own) = limited(128 << 20) else { return };
+        let config = light(plain(mvsplat, Preset::Tuned, 2));
+        let shoot = shoot(5, 2, 64, 64);
+        let views = views(&shoot);
+        let camera = shoot.targets[0].resized(128, 128).unwrap();
+        let options = config.raster_options(2.0, whole::NEAR_FAR.near, [0.3; 3]);
+        let model = lively(&config);
+        let expected = model.model().render(&views, &camera, &options).unwrap().remove(0);
+        let backend = Backend::from(own.clone());
+        let model = model.with_backend(&backend);
+        let start = own.read_backs();
+        let got = model.model().render(&views, &camera, &options).unwrap().remove(0);
+        let read = own.read_backs();
+        assert_eq!(backend.warning(), None);
+        assert_eq!(got.dims(), [5, 128, 128]);
+        let numbers = 5 * 128 * 128 + PLAN_WORDS as u64;
+        assert_eq!((read.count - start.count, read.bytes - start.bytes), (2, 4 * numbers));
+        let [got, expected] =
+            [&got, &expected].map(|t| t.flatten_all().unwrap().to_vec1().unwrap());
+        let rgb = 3 * 128 * 128;
+        let decibels = decibels(&got[..rgb], &expected[..rgb]);
+        eprintln!("mvsplat {mvsplat}: {decibels:.1} dB");
+        assert!(decibels > 45.0, "{decibels} dB");
+        assert!(got != expected, "the pictures have equal bytes");
+        let scene = model.model().forward(&views, &mut |_| {}).unwrap().remove(0);
+        let children = &scene.children;
+        let arrays = [&children.rows, &children.gain, &children.sh];
+        let floats: usize = arrays.iter().map(|t| t.elem_count()).sum();
+        let floats = floats + scene.depths.iter().map(Vec::len).sum::<usize>();
+        let end = own.read_backs();
+        // A chunk of each view, with rows and gains; SH and depths of all.
+        assert_eq!((end.count - read.count, end.bytes - read.bytes), (6, 4 * floats as u64));
+    }
+}
+
+/// Calls that are only counted are those that run, and need the same memory.
+#[test]
+fn counted_calls_are_those_that_run() {
+    let shoot = shoot(5, 2, 64, 64);
+    let mut model = lively(&light(plain(false, Preset::Tuned, 2)));
+    let mut found = Vec::new();
+    for counts_only in [false, true] {
+        let Some(own) = limited(128 << 20) else { return };
+        let backend = Backend::from(own.clone());
+        model = model.with_backend(&backend);
+        let network = model.model();
+        let recorder = network.trunk().executor().unwrap().recorder().clone();
+        recorder.set_counts_only(counts_only);
+        let scene = network.forward(&views(&shoot), &mut |_| {}).unwrap().remove(0);
+        assert_eq!(backend.warning(), None);
+        let rows = scene.children.rows.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        assert_eq!(rows.iter().all(|v| *v == 0.0), counts_only, "what runs has results");
+        found.push((recorder.work(), own.allocated_bytes()));
+    }
+    assert!(found[0].0.values().map(|work| work.flops).sum::<u64>() > 1_000_000_000);
+    assert_eq!(found[0], found[1]);
+}
+
+fn decibels(got: &[f32], expected: &[f32]) -> f64 {
+    let squares = got.iter().zip(expected).map(|(a, b)| f64::from(a - b).powi(2));
+    -10.0 * (squares.sum::<f64>() / got.len() as f64).log10()
+}
+
+/// A device that is lost between backbone and trunk: the CPU repeats the scene, both for Gaussians and
+/// for a picture.
+#[test]
+fn a_device_lost_within_a_scene_repeats_it_on_the_cpu() {
+    let config = light(plain(false, Preset::Tuned, 2));
+    let shoot = shoot(5, 2, 64, 64);
+    let views = views(&shoot);
+    let camera = shoot.targets[0].resized(128, 128).unwrap();
+    let options = config.raster_options(2.0, whole::NEAR_FAR.near, [0.3; 3]);
+    let model = lively(&config);
+    let expected = model.model().forward(&views, &mut |_| {}).unwrap().remove(0);
+    let picture = model.model().render(&views, &camera, &options).unwrap().remove(0);
+    let Some(own) = limited(128 << 20) else { return };
+    let backend = Backend::from(own.clone());
+    let model = model.with_backend(&backend);
+    let network = model.model();
+    let place = || network.place(network.encode_scene(&views, &|| Ok(())).unwrap()).unwrap();
+    let [first, second] = [place(), place()];
+    assert_eq!(backend.warning(), None);
+    own.device().destroy();
+    own.device().poll(subsplat::gpu::wgpu::PollType::wait_indefinitely()).ok();
+    let got = first.children(network, &|| Ok(())).unwrap();
+    assert!(backend.warning().is_some_and(|w| w.contains("GPU lost")), "{:?}", backend.warning());
+    let values = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    assert_eq!(values(&got.children.rows), values(&expected.children.rows));
+    assert_eq!(got.depths, expected.depths);
+    let drawn = second.render(network, &camera, &options).unwrap();
+    let off = decibels(&values(&drawn), &values(&picture));
+    assert!(off > 90.0, "{off} dB");
 }
 
 /// After a device is lost, the CPU computes the network; after cancellation it does not.

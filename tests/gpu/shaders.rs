@@ -18,6 +18,7 @@ const WORKGROUP_BYTES_MAX: u32 = 16 << 10;
 
 /// Kernels whose CPU version has another stem.
 const CPU_STEMS: &[(&str, &str)] = &[
+    ("adapter_colours", "adapter"),
     ("sort_count", "sort"),
     ("sort_scatter", "sort"),
     ("scan_reduce", "tiles"),
@@ -132,6 +133,8 @@ macro_rules! uniforms {
 }
 
 const UNIFORMS: &[Uniform] = uniforms!(
+    AdamUniform,
+    AdapterUniform,
     AttentionGatherUniform,
     AttentionUniform,
     AttributesUniform,

@@ -350,3 +350,47 @@ uniform! {
         pad2: u32,
     }
 }
+
+uniform! {
+    /// Parameters of kernels/adapter.wgsl and adapter_colours.wgsl.
+    AdapterUniform {
+        /// Gaussians of all views.
+        gaussians: u32,
+        /// Pixels of a view.
+        pixels: u32,
+        /// Width of a view, px.
+        width: u32,
+        /// Gaussians of a pixel.
+        per_pixel: u32,
+        /// Numbers of a raw row.
+        lanes: u32,
+        /// SH functions of a colour.
+        functions: u32,
+        /// 1: SH have RGB innermost.
+        interleaved: u32,
+        /// Exponent of the opacity mapping.
+        exponent: f32,
+    }
+}
+
+uniform! {
+    /// Parameters of kernels/adam.wgsl.
+    AdamUniform {
+        /// Elements of the arrays, a multiple of 64.
+        count: u32,
+        /// Factor of the gradients.
+        clip: f32,
+        /// Decay of the first moment.
+        first_decay: f32,
+        /// Decay of the second moment.
+        second_decay: f32,
+        /// Term added to the root of the second moment.
+        epsilon: f32,
+        /// Decay of the moving average.
+        average: f32,
+        /// Unused.
+        pad0: u32,
+        /// Unused.
+        pad1: u32,
+    }
+}

@@ -16,6 +16,16 @@ pub struct Turn {
 }
 
 impl Turn {
+    /// Returns the row-major matrix `[D, D]`.
+    pub fn dense(&self) -> Vec<f64> {
+        let d = self.rows.len();
+        let mut matrix = vec![0.0; d * d];
+        for (i, row) in self.rows.iter().enumerate() {
+            row.iter().for_each(|&(j, v)| matrix[i * d + j] = v);
+        }
+        matrix
+    }
+
     /// Lists the elements of the row-major `[D, D]` matrix `m`, D ≤ 25.
     pub fn new(m: &[f64], d: usize) -> Self {
         let line = |at: &dyn Fn(usize) -> f64| -> Vec<(usize, f64)> {

@@ -17,6 +17,8 @@
 //! adapter (2 Tflop/s, 60 GB/s) needs 110 ms, one of a laptop (10, 250) 26 ms, one of a desktop (30,
 //! 700) 10 ms, an H200 (60, 4800) 5 ms. These times are estimates; no GPU was at hand.
 
+mod adam;
+mod adapter;
 mod attention;
 mod elementwise;
 mod norm;
@@ -30,6 +32,10 @@ mod small_bwd;
 mod trunk;
 mod trunk_bwd;
 
+pub(super) use adam::ADAM;
+pub use adam::{ADAM_BLOCK, AdamCall};
+pub(super) use adapter::{ADAPTER, ADAPTER_COLOURS};
+pub use adapter::{AdapterCall, AdapterView};
 pub(super) use attention::ATTENTION;
 pub use attention::AttentionCall;
 pub(super) use elementwise::ELEMENTWISE;
@@ -58,6 +64,7 @@ use crate::gpu::pipelines::{Constants, Kernel};
 use bytemuck::Pod;
 use std::collections::BTreeMap;
 use std::fmt;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// Calls of one submit.
@@ -72,6 +79,8 @@ pub struct Recorder {
     gpu: Arc<Gpu>,
     pending: Mutex<(Pending, u64)>,
     work: Mutex<BTreeMap<&'static str, Work>>,
+    /// Calls are counted and dropped.
+    counts_only: AtomicBool,
 }
 
 /// Work of all calls of one kernel, counted from their sizes.
@@ -96,7 +105,14 @@ impl fmt::Debug for Recorder {
 impl Recorder {
     /// Creates a recorder without calls.
     pub fn new(gpu: Arc<Gpu>) -> Arc<Self> {
-        Arc::new(Self { gpu, pending: Mutex::default(), work: Mutex::default() })
+        let (pending, work, counts_only) = Default::default();
+        Arc::new(Self { gpu, pending, work, counts_only })
+    }
+
+    /// Sets whether calls are only counted. Memory is then allocated and returned as at execution, no
+    /// call runs, and read-backs return zeros.
+    pub fn set_counts_only(&self, counts_only: bool) {
+        self.counts_only.store(counts_only, Relaxed);
     }
 
     /// Returns the device.
@@ -202,18 +218,63 @@ impl Recorder {
             *pending = (calls, bytes);
             return Ok(result);
         }
-        self.gpu.resume(NAME, calls).submit()?;
+        self.submit(self.gpu.resume(NAME, calls))?;
         Ok(result)
     }
 
-    /// Submits all recorded calls and returns the first `count` elements of `buffer`.
-    fn read(&self, buffer: &Buffer, count: usize) -> Result<Vec<f32>, GpuError> {
+    /// Submits `commands`, or drops them if they are only counted.
+    fn submit(&self, commands: Commands<'_>) -> Result<(), GpuError> {
+        if !self.counts_only.load(Relaxed) {
+            return commands.submit().map(drop);
+        }
+        drop(commands);
+        // An empty submit ends the uploads so far, whose memory would grow.
+        self.gpu.commands(NAME, false).submit().map(drop)
+    }
+
+    /// Submits all recorded calls, so that calls of others find their results.
+    ///
+    /// # Errors
+    /// Errors of the device.
+    pub fn flush(&self) -> Result<(), GpuError> {
+        let mut pending = self.pending.lock().unwrap_or_else(PoisonError::into_inner);
+        let (calls, _) = std::mem::take(&mut *pending);
+        match calls.len() {
+            0 => Ok(()),
+            _ => self.submit(self.gpu.resume(NAME, calls)),
+        }
+    }
+
+    /// Submits all recorded calls and waits until the device has executed them. A browser waits at
+    /// the next read-back instead.
+    ///
+    /// # Errors
+    /// Errors of the device.
+    pub fn finish(&self) -> Result<(), GpuError> {
+        self.flush()?;
+        self.gpu.finish()
+    }
+
+    /// Waits for all operations and returns the elements of `arrays`, with one wait for all.
+    ///
+    /// # Errors
+    /// Errors of the device.
+    pub fn read(&self, arrays: &[&DeviceArray]) -> Result<Vec<Vec<f32>>, GpuError> {
+        let aligned = |array: &&DeviceArray| match array.offset {
+            0 => Ok((*array).clone()),
+            _ => array.copied(),
+        };
+        let arrays = arrays.iter().map(aligned).collect::<Result<Vec<_>, _>>()?;
         let mut pending = self.pending.lock().unwrap_or_else(PoisonError::into_inner);
         let (calls, _) = std::mem::take(&mut *pending);
         let mut commands = self.gpu.resume(NAME, calls);
-        let reading = commands.read::<f32>(buffer, count)?;
-        commands.submit()?;
-        reading.take(&self.gpu)
+        let readings = arrays.iter().map(|a| commands.read::<f32>(&a.buffer, a.count()));
+        let readings = readings.collect::<Result<Vec<_>, _>>()?;
+        self.submit(commands)?;
+        if self.counts_only.load(Relaxed) {
+            return Ok(arrays.iter().map(|array| vec![0.0; array.count()]).collect());
+        }
+        readings.into_iter().map(|reading| reading.take(&self.gpu)).collect()
     }
 }
 
@@ -257,13 +318,7 @@ impl DeviceArray {
     /// # Errors
     /// Errors of the device.
     pub fn to_vec(&self) -> Result<Vec<f32>, GpuError> {
-        match self.offset {
-            0 => self.recorder.read(&self.buffer, self.count()),
-            _ => {
-                let whole = self.copied()?;
-                self.recorder.read(&whole.buffer, self.count())
-            }
-        }
+        Ok(self.recorder.read(&[self])?.pop().unwrap_or_default())
     }
 
     /// Returns the same elements under other dimensions.

@@ -4,6 +4,8 @@
 //! packed rows in the order of the parents, each with the index of its parent. Optical depth
 //! ([`crate::config::OpacityRule`]) makes neighbours of different K agree.
 
+#[cfg(feature = "gpu")]
+use super::DeviceParents;
 use super::{Parts, Records, Scene, Span, Trunk};
 use crate::abi::SPLAT_STRIDE;
 use crate::model::geometry::ParentChunk;
@@ -12,6 +14,8 @@ use crate::model::spgr::rules;
 use crate::model::trace::Checkpoint;
 use crate::model::{BackboneOutput, Primaries, Views};
 use crate::ops::Array;
+#[cfg(feature = "gpu")]
+use crate::ops::DeviceArray;
 use crate::splats::Splats;
 #[cfg(feature = "gpu")]
 use candle_core::Tensor;
@@ -52,16 +56,57 @@ impl Trunk {
         checkpoint: Checkpoint<'_>,
     ) -> Result<MixedChildren> {
         let parents = self.parents(views, primaries)?.to_splats()?;
+        self.mixed(&parents, primaries.per_view, counts, |groups| {
+            self.made(views, backbone, primaries, groups, checkpoint)
+        })
+    }
+
+    /// [`Trunk::forward_mixed`] of primaries in device memory; `host` has copies of them.
+    ///
+    /// # Errors
+    /// Those of [`Trunk::forward_mixed`].
+    #[cfg(feature = "gpu")]
+    pub(in crate::model) fn device_mixed(
+        &self,
+        views: &Views,
+        output: &BackboneOutput<DeviceArray>,
+        (parents, host): (&DeviceParents, &Splats),
+        counts: &[u8],
+        checkpoint: Checkpoint<'_>,
+    ) -> Result<MixedChildren> {
+        self.mixed(host, parents.per_view, counts, |groups| {
+            let parts = self.parts_of_groups()?;
+            let scene = self.device_scene(parts, views, output, parents)?;
+            self.made_of(parts, &scene, groups, checkpoint)
+        })
+    }
+
+    /// Children of `parents`, of which `made` computes those of the groups.
+    fn mixed(
+        &self,
+        parents: &Splats,
+        per_view: usize,
+        counts: &[u8],
+        made: impl FnOnce(&[Group]) -> Result<Vec<Made>>,
+    ) -> Result<MixedChildren> {
         if counts.len() != parents.len() {
             let (expected, got) = (parents.len(), counts.len());
             bail!("numbers of children: expected one for each of {expected} parents, got {got}");
         }
-        let groups = groups(counts, primaries.per_view, self.chunk_size());
+        let groups = groups(counts, per_view, self.chunk_size());
         let made = match groups.iter().any(|group| group.children > 1) {
-            true => self.made(views, backbone, primaries, &groups, checkpoint)?,
+            true => made(&groups)?,
             false => groups.iter().map(|_| Made::default()).collect(),
         };
-        Ok(assembled(&parents, counts, &groups, &made))
+        Ok(assembled(parents, counts, &groups, &made))
+    }
+
+    /// The parts, which groups of several children need.
+    fn parts_of_groups(&self) -> Result<&Parts> {
+        match &self.parts {
+            Some(parts) => Ok(parts),
+            None => bail!("children per parent: expected 0 or 1 where SPGR is off, got more"),
+        }
     }
 
     /// Children of every group with more than one.
@@ -73,9 +118,7 @@ impl Trunk {
         groups: &[Group],
         checkpoint: Checkpoint<'_>,
     ) -> Result<Vec<Made>> {
-        let Some(parts) = &self.parts else {
-            bail!("children per parent: expected 0 or 1 where SPGR is off, got more")
-        };
+        let parts = self.parts_of_groups()?;
         if primaries.means.dtype() != DType::F32 {
             bail!("primaries: expected f32, got {:?}", primaries.means.dtype());
         }

@@ -597,8 +597,10 @@ impl Array for DeviceArray {
         }
         let made = self.array.spgr(&parents.array, &call.on_gpu(&[], &[]));
         let host = |array: &gpu::DeviceArray| self.executor.checked(array.to_vec());
-        for (to, from) in [&mut *rows, &mut *gains].into_iter().zip(self.executor.checked(made)?) {
-            to.copy_from_slice(&host(&from)?);
+        let [own_rows, own_gains] = self.executor.checked(made)?;
+        let read = self.executor.recorder.read(&[&own_rows, &own_gains]);
+        for (to, from) in [&mut *rows, &mut *gains].into_iter().zip(self.executor.checked(read)?) {
+            to.copy_from_slice(&from);
         }
         if rows.iter().chain(&*gains).any(|v| !v.is_finite()) {
             finite(call, &host(&self.array)?, &host(&parents.array)?, rows, gains)?;

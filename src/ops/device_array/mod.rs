@@ -5,10 +5,14 @@
 //! gradients; other arrays hold none. The gradients are those of the CPU ops
 //! (tests/gpu/array_gradients.rs).
 
+mod adam;
 mod array;
 mod rules;
+mod scene;
 mod tape;
 
+pub use adam::{DeviceAdam, ParameterStep, SharedStep};
+pub use scene::{ColourLayout, DeviceSplats};
 pub use tape::DeviceGradients;
 
 use super::Backend;
@@ -30,6 +34,8 @@ const PASSES_KEPT: u64 = 8;
 pub struct Executor {
     recorder: Arc<Recorder>,
     parameters: Mutex<Parameters>,
+    /// Parameters in training, by the tensors of which they are copies.
+    trained: Mutex<HashMap<TensorId, gpu::DeviceArray>>,
     /// The first error of the device since [`Executor::attempt`] began.
     failure: Mutex<Option<GpuError>>,
     /// Number of nodes of tapes so far.
@@ -47,8 +53,8 @@ impl Executor {
     /// Returns an executor on the GPU of `backend`, if it is one.
     pub fn new(backend: &Backend) -> Option<Arc<Self>> {
         let recorder = Recorder::new(backend.gpu()?.clone());
-        let (parameters, failure, nodes) = Default::default();
-        Some(Arc::new(Self { recorder, parameters, failure, nodes }))
+        let (parameters, trained, failure, nodes) = Default::default();
+        Some(Arc::new(Self { recorder, parameters, trained, failure, nodes }))
     }
 
     /// Runs `f`, one pass of the network. `None`: the device failed, and `backend` knows the
@@ -112,10 +118,21 @@ impl Executor {
         })
     }
 
-    /// Returns `parameter` on the device, where it is kept unless its values can change.
+    /// Returns `parameter` on the device, where it is kept unless its values can change outside
+    /// [`Executor::keep_trained`].
     fn parameter(self: &Arc<Self>, parameter: &Tensor) -> Result<DeviceArray> {
         if parameter.track_op() {
-            return self.upload(parameter);
+            let trained = self.trained.lock().unwrap_or_else(PoisonError::into_inner);
+            return match trained.get(&parameter.id()) {
+                Some(array) => {
+                    let own = self.array(Ok(array.clone()))?;
+                    Ok(own.with_leaf(Some(parameter.clone())))
+                }
+                None => {
+                    drop(trained);
+                    self.upload(parameter)
+                }
+            };
         }
         let mut kept = self.parameters.lock().unwrap_or_else(PoisonError::into_inner);
         let now = kept.pass;
