@@ -1,7 +1,8 @@
 //! Device memory: a pool of buffers, uploads, read-back, and division of arrays that exceed a
 //! binding.
 //!
-//! A dropped [`Buffer`] returns to its pool with its bytes unchanged. A kernel that needs zeros
+//! A dropped [`Buffer`] returns to its pool with its bytes unchanged. Free buffers of other sizes than those
+//! requested return to the driver, so that the memory stays within a quarter of that in use. A kernel that needs zeros
 //! clears the buffer first ([`super::Commands::clear`]).
 
 use crate::gpu::device::Gpu;
@@ -40,6 +41,11 @@ impl Use {
 
 /// Granularity of allocations, bytes: no binding and no copy is empty or unaligned.
 const SIZE_GRANULARITY: u64 = 256;
+/// A free buffer serves a request that is smaller by at most the request over this; free buffers may take
+/// the largest memory in use over this.
+const SURPLUS: u64 = 4;
+/// Size from which free buffers return to the driver, bytes. Smaller ones are many and cost little.
+const LARGE: u64 = 1 << 20;
 /// Minimum size of a kernel's argument, bytes: an array of one vec4.
 const BINDING_BYTES_MIN: u64 = 16;
 
@@ -57,6 +63,11 @@ pub struct ReadBacks {
 pub(crate) struct Pool {
     free: Mutex<Vec<(Use, wgpu::Buffer)>>,
     allocated: AtomicU64,
+    /// The largest value of `allocated` so far.
+    allocated_most: AtomicU64,
+    /// Bytes of the buffers in use, and their largest value so far.
+    used: AtomicU64,
+    used_most: AtomicU64,
     /// Count and bytes of [`ReadBacks`].
     read: [AtomicU64; 2],
     buffer_max: u64,
@@ -68,6 +79,9 @@ impl Pool {
         Arc::new(Self {
             free: Mutex::default(),
             allocated: AtomicU64::new(0),
+            allocated_most: AtomicU64::new(0),
+            used: AtomicU64::new(0),
+            used_most: AtomicU64::new(0),
             read: Default::default(),
             buffer_max: limits.max_buffer_size,
             binding_max: limits.max_storage_buffer_binding_size,
@@ -84,8 +98,36 @@ impl Pool {
 
     fn take(&self, purpose: Use, size: u64) -> Option<wgpu::Buffer> {
         let mut free = self.free.lock().unwrap_or_else(PoisonError::into_inner);
-        let index = free.iter().position(|(u, b)| *u == purpose && b.size() == size)?;
-        Some(free.swap_remove(index).1)
+        let fits = |(u, b): &(Use, wgpu::Buffer)| {
+            *u == purpose && (size..=size + size / SURPLUS).contains(&b.size())
+        };
+        let fitting = free.iter().enumerate().filter(|(_, entry)| fits(entry));
+        let (index, _) = fitting.min_by_key(|(_, (_, b))| b.size())?;
+        Some(free.remove(index).1)
+    }
+
+    /// Returns free buffers to the driver, those that are free longest first, where a new buffer of
+    /// `size` bytes would raise the allocated memory above the most that was in use, and a part of it.
+    fn make_room(&self, size: u64) {
+        let most = self.used_most.load(Relaxed).max(self.used.load(Relaxed) + size);
+        let mut excess =
+            (self.allocated.load(Relaxed) + size).saturating_sub(most + most / SURPLUS);
+        let mut free = self.free.lock().unwrap_or_else(PoisonError::into_inner);
+        free.retain(|(purpose, buffer)| {
+            if excess == 0 || *purpose != Use::Work || buffer.size() < LARGE {
+                return true;
+            }
+            excess = excess.saturating_sub(buffer.size());
+            self.allocated.fetch_sub(buffer.size(), Relaxed);
+            buffer.destroy();
+            false
+        });
+    }
+
+    /// Counts a buffer of `size` bytes that comes into use.
+    fn begin_use(&self, size: u64) {
+        let used = self.used.fetch_add(size, Relaxed) + size;
+        self.used_most.fetch_max(used, Relaxed);
     }
 }
 
@@ -101,6 +143,7 @@ struct Inner {
 
 impl Drop for Inner {
     fn drop(&mut self) {
+        self.pool.used.fetch_sub(self.raw.size(), Relaxed);
         if self.mapping_failed.load(Relaxed) {
             self.pool.allocated.fetch_sub(self.raw.size(), Relaxed);
             self.raw.destroy();
@@ -190,11 +233,14 @@ impl Gpu {
                     usage,
                     mapped_at_creation: false,
                 };
+                self.pool.make_room(size);
                 let raw = self.checked(label, || Ok(self.device.create_buffer(&new)))?;
-                self.pool.allocated.fetch_add(size, Relaxed);
+                let allocated = self.pool.allocated.fetch_add(size, Relaxed) + size;
+                self.pool.allocated_most.fetch_max(allocated, Relaxed);
                 raw
             }
         };
+        self.pool.begin_use(raw.size());
         let bytes = bytes.max(BINDING_BYTES_MIN).next_multiple_of(4);
         let (pool, mapping_failed) = (self.pool.clone(), AtomicBool::new(false));
         Ok(Buffer(Arc::new(Inner { raw, purpose, bytes, pool, mapping_failed })))
@@ -242,6 +288,11 @@ impl Gpu {
     /// Returns the allocated device memory, bytes, free buffers included.
     pub fn allocated_bytes(&self) -> u64 {
         self.pool.allocated.load(Relaxed)
+    }
+
+    /// Returns the largest value of [`Gpu::allocated_bytes`] so far.
+    pub fn peak_allocated_bytes(&self) -> u64 {
+        self.pool.allocated_most.load(Relaxed)
     }
 
     /// Returns the read-backs since the device was opened.

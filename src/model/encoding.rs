@@ -39,7 +39,7 @@ enum Output {
 enum Place {
     Host(BackboneOutput, Primaries),
     #[cfg(feature = "gpu")]
-    Device(BackboneOutput<DeviceArray>, DeviceParents),
+    Device(Box<DeviceParents>),
 }
 
 impl SubSplat {
@@ -67,8 +67,9 @@ impl SubSplat {
         if let Some(result) = self.trunk().on_device(|executor| {
             let images = executor.upload(&views.images)?;
             let output = self.encode_on(views, &images, &mut Trace::with_checkpoint(checkpoint))?;
-            // Inference needs no tape.
-            let output = output.map(|array| Ok(array.detached()))?;
+            // Inference needs no tape, and the trunk not all maps.
+            let mut output = output.map(|array| Ok(array.detached()))?;
+            output.features.retain(|(level, _)| self.trunk().reads(*level));
             if waits {
                 executor.finish()?;
             }
@@ -100,10 +101,10 @@ impl SubSplat {
                 let sh_input = self.config().embed.sh;
                 let placed = self
                     .trunk()
-                    .on_device(|_| DeviceParents::new(&output, &views, settings, sh_input));
+                    .on_device(|_| DeviceParents::new(output, &views, settings, sh_input));
                 return match placed {
                     Some(parents) => {
-                        Ok(SceneEncoding { views, place: Place::Device(output, parents?) })
+                        Ok(SceneEncoding { views, place: Place::Device(Box::new(parents?)) })
                     }
                     None => self.encoding_on_host(&views),
                 };
@@ -133,7 +134,7 @@ impl SceneEncoding {
         match &self.place {
             Place::Host(_, primaries) => primaries.per_view,
             #[cfg(feature = "gpu")]
-            Place::Device(_, parents) => parents.per_view,
+            Place::Device(parents) => parents.per_view,
         }
     }
 
@@ -152,7 +153,7 @@ impl SceneEncoding {
                 network.trunk().parents(&self.views, primaries)?.to_splats()
             }
             #[cfg(feature = "gpu")]
-            Place::Device(_, parents) => {
+            Place::Device(parents) => {
                 match network.trunk().on_device(|executor| parents.to_host(executor)) {
                     Some(parents) => parents,
                     None => network.encoding_on_host(&self.views)?.parents(network),
@@ -170,17 +171,17 @@ impl SceneEncoding {
         let (output, primaries) = match &self.place {
             Place::Host(output, primaries) => (output, primaries),
             #[cfg(feature = "gpu")]
-            Place::Device(output, parents) => {
+            Place::Device(parents) => {
                 let made = network.trunk().on_device(|executor| {
                     let (trunk, steps) = (network.trunk(), (checkpoint, true));
-                    let children = trunk.device_children(&self.views, output, parents, steps)?;
-                    let (children, depths) = children.to_host(executor, &[&output.depths])?;
+                    let children = trunk.device_children(&self.views, parents, steps)?;
+                    let (children, depths) = children.to_host(executor, &[&parents.depths])?;
                     let finite = |t: &Tensor| -> Result<bool> {
                         Ok(t.flatten_all()?.to_vec1::<f32>()?.iter().all(|v| v.is_finite()))
                     };
                     if !finite(&children.rows)? || !finite(&children.gain)? {
                         // The checked form names the parent.
-                        trunk.check_device_children(&self.views, output, parents)?;
+                        trunk.check_device_children(&self.views, parents)?;
                     }
                     let depths = distances(depths.first())?;
                     Ok(SceneOutput { children, depths })
@@ -212,11 +213,11 @@ impl SceneEncoding {
         let (output, primaries) = match &self.place {
             Place::Host(output, primaries) => (output, primaries),
             #[cfg(feature = "gpu")]
-            Place::Device(output, device) => {
+            Place::Device(device) => {
                 let made = trunk.on_device(|executor| {
-                    let own = (device, parents);
-                    let mixed = trunk.device_mixed(&self.views, output, own, counts, checkpoint)?;
-                    let depths = executor.read(&[&output.depths])?;
+                    let own = (&**device, parents);
+                    let mixed = trunk.device_mixed(&self.views, own, counts, checkpoint)?;
+                    let depths = executor.read(&[&device.depths])?;
                     Ok((mixed, distances(depths.first())?))
                 });
                 return match made {
@@ -248,10 +249,10 @@ impl SceneEncoding {
                 in_pool(|| trunk.render(&self.views, output, primaries, camera, options))
             }
             #[cfg(feature = "gpu")]
-            Place::Device(output, parents) => {
+            Place::Device(parents) => {
                 let made = trunk.on_device(|executor| {
                     let steps: (Checkpoint<'_>, bool) = (&|| Ok(()), false);
-                    let children = trunk.device_children(&self.views, output, parents, steps)?;
+                    let children = trunk.device_children(&self.views, parents, steps)?;
                     children.render(executor, camera, options)
                 });
                 match made {

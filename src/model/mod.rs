@@ -200,13 +200,7 @@ impl<A: Array> BackboneOutput<A> {
     /// # Errors
     /// The backbone does not have `level`.
     pub fn feature(&self, level: FeatureLevel) -> Result<&A> {
-        match self.features.iter().find(|(l, _)| *l == level) {
-            Some((_, map)) => Ok(map),
-            None => {
-                let have: Vec<_> = self.features.iter().map(|(l, _)| *l).collect();
-                bail!("feature level {level:?}: expected one of {have:?}")
-            }
-        }
+        feature_of(&self.features, level)
     }
 
     /// Returns the same arrays in host memory.
@@ -215,6 +209,20 @@ impl<A: Array> BackboneOutput<A> {
     /// Errors of the device.
     pub fn to_host(&self) -> Result<BackboneOutput> {
         self.map(A::to_host)
+    }
+}
+
+/// Returns the feature map of `level`.
+///
+/// # Errors
+/// `features` do not have `level`.
+fn feature_of<A>(features: &[(FeatureLevel, A)], level: FeatureLevel) -> Result<&A> {
+    match features.iter().find(|(l, _)| *l == level) {
+        Some((_, map)) => Ok(map),
+        None => {
+            let have: Vec<_> = features.iter().map(|(l, _)| *l).collect();
+            bail!("feature level {level:?}: expected one of {have:?}")
+        }
     }
 }
 

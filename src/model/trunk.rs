@@ -206,6 +206,14 @@ impl Trunk {
         self.parts().is_some_and(|parts| parts.aggregation.is_some())
     }
 
+    /// Returns whether the trunk reads the backbone's feature map of `level`.
+    #[cfg(feature = "gpu")]
+    pub(super) fn reads(&self, level: FeatureLevel) -> bool {
+        // Mixed numbers of children need the parts even where r is 1.
+        let aggregation = self.parts.as_ref().and_then(|parts| parts.aggregation.as_ref());
+        aggregation.is_some_and(|aggregation| aggregation.levels().contains(&level))
+    }
+
     /// The parts, unless [`Trunk::is_off`].
     fn parts(&self) -> Option<&Parts> {
         let one = self.rules.children() == 1 && self.config.spgr.head == SpgrHead::Polynomial;

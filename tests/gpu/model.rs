@@ -9,8 +9,10 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use subsplat::abi::PLAN_WORDS;
 use subsplat::camera::NearFar;
-use subsplat::config::Preset;
+use subsplat::config::{Config, Preset};
+use subsplat::gpu::{DeviceChoice, Gpu};
 use subsplat::model::compare::compare;
+use subsplat::model::subsplat::SubSplat;
 use subsplat::model::weights::Weights;
 use subsplat::model::{Backend, Views};
 use subsplat::pipeline::{Photo, Reconstructor};
@@ -173,10 +175,44 @@ fn counted_calls_are_those_that_run() {
         assert_eq!(backend.warning(), None);
         let rows = scene.children.rows.flatten_all().unwrap().to_vec1::<f32>().unwrap();
         assert_eq!(rows.iter().all(|v| *v == 0.0), counts_only, "what runs has results");
-        found.push((recorder.work(), own.allocated_bytes()));
+        found.push((recorder.work(), own.peak_allocated_bytes()));
     }
     assert!(found[0].0.values().map(|work| work.flops).sum::<u64>() > 1_000_000_000);
     assert_eq!(found[0], found[1]);
+}
+
+/// Memory of two pictures of 256×256, of which no call runs: both networks stay below their limits, MiB.
+#[test]
+fn peak_memory_at_256_by_256() {
+    let shoot = shoot(5, 2, 256, 256);
+    for (mvsplat, most) in [(false, 0.2 * 1024.0), (true, 0.6 * 1024.0)] {
+        if gpu().is_none() {
+            return;
+        }
+        // The adapter's own sizes of bindings, and a pool of its own.
+        let own = Gpu::open(&DeviceChoice::Gpu).unwrap().unwrap();
+        let backend = Backend::from(own.clone());
+        let config = match mvsplat {
+            true => Config::re10k(Preset::Tuned, 2),
+            false => Weights::shipped(2).unwrap().config().unwrap().clone(),
+        };
+        let network = SubSplat::new(&config, Weights::seeded(7).builder()).unwrap();
+        let network = network.with_backend(&backend);
+        let recorder = network.trunk().executor().unwrap().recorder().clone();
+        recorder.set_counts_only(true);
+        // The second pass has the parameters and the free buffers of the first.
+        for _ in 0..2 {
+            network.forward(&views(&shoot), &mut |_| {}).unwrap();
+        }
+        assert_eq!(backend.warning(), None);
+        let peak = own.peak_allocated_bytes() as f64 / 1048576.0;
+        eprintln!("mvsplat {mvsplat}: {peak:.0} MiB");
+        assert!(peak <= most, "mvsplat {mvsplat}: {peak:.0} MiB, limit {most:.0}");
+        assert!(
+            peak > 0.25 * most,
+            "mvsplat {mvsplat}: {peak:.0} MiB cannot hold the network's arrays"
+        );
+    }
 }
 
 fn decibels(got: &[f32], expected: &[f32]) -> f64 {

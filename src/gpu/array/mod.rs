@@ -10,12 +10,17 @@
 //! CPU versions: [`crate::cpu`], tensor operations of candle. Tests: tests/gpu/array.rs,
 //! tests/gpu/array_gradients.rs.
 //!
-//! Work of the small network for two pictures of 256×256 with four children (`cargo bench --bench
-//! device -- small`), counted: 432 calls, 15.2 Gflop of convolutions and 17.1 of linear layers, 3.2 GB
-//! of arguments. 1.5 GB of them belong to `elementwise`: copies that a fused kernel would save. From
-//! data sheets, with 30 % of the f32 rate, 70 % of the memory's rate and 5 µs a call, an integrated
-//! adapter (2 Tflop/s, 60 GB/s) needs 110 ms, one of a laptop (10, 250) 26 ms, one of a desktop (30,
-//! 700) 10 ms, an H200 (60, 4800) 5 ms. These times are estimates; no GPU was at hand.
+//! Work of the networks for two pictures of 256×256 with four children, from photographs to children in
+//! host memory, counted by `cargo bench --bench device -- --count`:
+//!
+//! | network | calls | Gflop | arguments | device memory | integrated, laptop, desktop, H200 |
+//! |---|---|---|---|---|---|
+//! | small | 399 | 32 | 2.36 GB | 130 MiB | 89, 21, 8.4, 4.2 ms |
+//! | MVSplat | 1,485 | 363 | 14.8 GB | 515 MiB | 878, 192, 71, 31 ms |
+//!
+//! Times are estimates from data sheets, with 30 % of the f32 rate, 70 % of the memory's rate and 5 µs a
+//! call: 2 Tflop/s and 60 GB/s, 10 and 250, 30 and 700, 60 and 4800. No GPU was at hand. Memory is the most
+//! that was allocated, parameters and buffers of the read-back included.
 
 mod adam;
 mod adapter;

@@ -222,6 +222,12 @@ impl Aggregation {
         })
     }
 
+    /// Returns the feature maps that the aggregation reads.
+    #[cfg(feature = "gpu")]
+    pub fn levels(&self) -> &[FeatureLevel] {
+        &self.levels
+    }
+
     /// Returns whether a GPU computes the gradients too: the form of the presets.
     #[cfg(feature = "gpu")]
     pub(super) fn trains_on_device(&self) -> bool {

@@ -14,8 +14,6 @@ use crate::model::spgr::rules;
 use crate::model::trace::Checkpoint;
 use crate::model::{BackboneOutput, Primaries, Views};
 use crate::ops::Array;
-#[cfg(feature = "gpu")]
-use crate::ops::DeviceArray;
 use crate::splats::Splats;
 #[cfg(feature = "gpu")]
 use candle_core::Tensor;
@@ -69,14 +67,13 @@ impl Trunk {
     pub(in crate::model) fn device_mixed(
         &self,
         views: &Views,
-        output: &BackboneOutput<DeviceArray>,
         (parents, host): (&DeviceParents, &Splats),
         counts: &[u8],
         checkpoint: Checkpoint<'_>,
     ) -> Result<MixedChildren> {
         self.mixed(host, parents.per_view, counts, |groups| {
             let parts = self.parts_of_groups()?;
-            let scene = self.device_scene(parts, views, output, parents)?;
+            let scene = self.device_scene(parts, views, parents)?;
             self.made_of(parts, &scene, groups, checkpoint)
         })
     }

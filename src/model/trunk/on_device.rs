@@ -7,10 +7,10 @@ use super::{
 };
 use crate::abi::{MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, RasterOptions, SCALE_OFFSET, ShBasis};
 use crate::camera::Camera;
-use crate::config::{Primaries as Settings, ShInput};
+use crate::config::{FeatureLevel, Primaries as Settings, ShInput};
 use crate::model::primaries::{adapter_of, basis_of};
 use crate::model::trace::Checkpoint;
-use crate::model::{BackboneOutput, Views};
+use crate::model::{BackboneOutput, Views, feature_of};
 use crate::ops::{Array, ColourLayout, DeviceArray, DeviceSplats, Executor};
 use crate::splats::Splats;
 use candle_core::{DType, Device, Result, Tensor, bail};
@@ -26,6 +26,10 @@ pub struct DeviceParents {
     /// `[N, 3·D]`, colour-major, in the frame of [`crate::config::Embed::sh`].
     sh_input: DeviceArray,
     sh_basis: ShBasis,
+    /// `[1, V, H·W, G]`: distance along the unit ray, world units.
+    pub(in crate::model) depths: DeviceArray,
+    /// The backbone's feature maps.
+    features: Vec<(FeatureLevel, DeviceArray)>,
     /// Primaries of a view.
     pub(in crate::model) per_view: usize,
 }
@@ -49,12 +53,12 @@ impl DeviceParents {
     /// # Errors
     /// Shapes that do not fit; errors of the device.
     pub(in crate::model) fn new(
-        output: &BackboneOutput<DeviceArray>,
+        output: BackboneOutput<DeviceArray>,
         views: &Views,
         settings: &Settings,
         sh_input: ShInput,
     ) -> Result<Self> {
-        let adapter = adapter_of(output, views, settings)?;
+        let adapter = adapter_of(&output, views, settings)?;
         let rows = output.raw.placed(&output.depths, &output.densities, &adapter)?;
         let layout = match sh_input {
             ShInput::World => ColourLayout::WorldByColour,
@@ -67,6 +71,8 @@ impl DeviceParents {
             sh_input: input.reshape((n, 3 * adapter.functions))?,
             sh_basis: basis_of(settings),
             per_view: n / views.views().max(1),
+            depths: output.depths,
+            features: output.features,
             rows,
         })
     }
@@ -139,12 +145,11 @@ impl Trunk {
     pub(in crate::model) fn device_children(
         &self,
         views: &Views,
-        output: &BackboneOutput<DeviceArray>,
         parents: &DeviceParents,
         (checkpoint, waits): (Checkpoint<'_>, bool),
     ) -> Result<DeviceChildren> {
         let Some(parts) = self.parts() else { return Ok(parents.whole()) };
-        let scene = self.device_scene(parts, views, output, parents)?;
+        let scene = self.device_scene(parts, views, parents)?;
         checkpoint()?;
         let step = || {
             if let Some(executor) = self.executor.as_ref().filter(|_| waits) {
@@ -173,11 +178,10 @@ impl Trunk {
     pub(in crate::model) fn check_device_children(
         &self,
         views: &Views,
-        output: &BackboneOutput<DeviceArray>,
         parents: &DeviceParents,
     ) -> Result<()> {
         let Some(parts) = self.parts() else { return Ok(()) };
-        let scene = self.device_scene(parts, views, output, parents)?;
+        let scene = self.device_scene(parts, views, parents)?;
         let how = Chunking { size: CHUNK_GPU, mode: Mode::Infer, checkpoint: &|| Ok(()) };
         let sh = Tensor::zeros((0, 0, 3), DType::F32, &Device::Cpu)?;
         self.children(parts, &scene, (sh, parents.sh_basis), &how).map(drop)
@@ -188,7 +192,6 @@ impl Trunk {
         &self,
         parts: &Parts,
         views: &'a Views,
-        output: &BackboneOutput<DeviceArray>,
         parents: &DeviceParents,
     ) -> Result<Scene<'a, DeviceArray>> {
         let [n, _] = parents.rows.sizes()?;
@@ -202,7 +205,7 @@ impl Trunk {
             sh_input: parents.sh_input.clone(),
             per_view: parents.per_view,
         };
-        let feature = |level| output.feature(level).cloned();
+        let feature = |level| feature_of(&parents.features, level).cloned();
         self.scene_from(parts, views, own, (DType::F32, &Device::Cpu), feature)
     }
 }
