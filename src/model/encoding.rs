@@ -77,6 +77,8 @@ impl SubSplat {
         }) {
             return result;
         }
+        // The CPU has nothing to wait for.
+        let _ = waits;
         self.host_features(views, checkpoint)
     }
 
@@ -228,7 +230,8 @@ impl SceneEncoding {
                 };
             }
         };
-        let mixed = trunk.forward_mixed(&self.views, output, primaries, counts, checkpoint)?;
+        let own = (primaries, parents);
+        let mixed = trunk.host_mixed(&self.views, output, own, counts, checkpoint)?;
         Ok((mixed, distances(Some(&output.depths))?))
     }
 

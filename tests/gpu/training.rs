@@ -281,7 +281,8 @@ fn an_unknown_device_is_refused() {
     assert!(error.contains("no such adapter"), "{error}");
 }
 
-/// Losses of 100 steps of both devices, for the notes: `cargo test … -- --ignored --nocapture`.
+/// Losses of 100 steps of both devices, for the notes: `cargo test … -- --ignored --nocapture`. On lavapipe
+/// both phases took 140 s; the largest relative difference was 1.1e-2 in `depth` and 1.3e-3 in `render`.
 #[test]
 #[ignore = "takes minutes on a software adapter"]
 fn losses_of_100_steps() {

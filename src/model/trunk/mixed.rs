@@ -54,7 +54,22 @@ impl Trunk {
         checkpoint: Checkpoint<'_>,
     ) -> Result<MixedChildren> {
         let parents = self.parents(views, primaries)?.to_splats()?;
-        self.mixed(&parents, primaries.per_view, counts, |groups| {
+        self.host_mixed(views, backbone, (primaries, &parents), counts, checkpoint)
+    }
+
+    /// [`Trunk::forward_mixed`] of primaries that `parents` has as Gaussians.
+    ///
+    /// # Errors
+    /// Those of [`Trunk::forward_mixed`].
+    pub(in crate::model) fn host_mixed(
+        &self,
+        views: &Views,
+        backbone: &BackboneOutput,
+        (primaries, parents): (&Primaries, &Splats),
+        counts: &[u8],
+        checkpoint: Checkpoint<'_>,
+    ) -> Result<MixedChildren> {
+        self.mixed(parents, primaries.per_view, counts, |groups| {
             self.made(views, backbone, primaries, groups, checkpoint)
         })
     }
