@@ -24,22 +24,18 @@ struct CrossCheckUniform {
 @group(0) @binding(3) var<storage, read> cameras: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read_write> factors: array<f32>;
 
-// Returns K^-1 (u, v, 1) of a pixel's centre.
-fn ray(view: u32, x: u32, y: u32) -> vec3<f32> {
-    let k = cameras[view * 4u + 3u];
-    return vec3<f32>((vec2<f32>(f32(x), f32(y)) + 0.5 - k.zw) / k.xy, 1.0);
-}
-
-// Returns the camera z of a pixel's surface.
-fn surface_z(view: u32, x: u32, y: u32) -> f32 {
-    let at = view * call.height * call.width + y * call.width + x;
-    return distances[at] / length(ray(view, x, y));
-}
-
-fn colour(view: u32, x: u32, y: u32) -> vec3<f32> {
-    let plane = call.height * call.width;
-    let at = view * 3u * plane + y * call.width + x;
-    return vec3<f32>(rgb[at], rgb[at + plane], rgb[at + 2u * plane]);
+// Returns the largest camera z of the 3x3 pixels around a position inside the picture.
+fn farthest(view: u32, at: vec2<f32>) -> f32 {
+    let middle = vec2<u32>(at);
+    let low = max(middle, vec2<u32>(1u)) - 1u;
+    let high = min(middle + 1u, vec2<u32>(call.width, call.height) - 1u);
+    var most = 0.0;
+    for (var row = low.y; row <= high.y; row++) {
+        for (var column = low.x; column <= high.x; column++) {
+            most = max(most, surface_z(view, vec2<u32>(column, row)));
+        }
+    }
+    return most;
 }
 
 @compute @workgroup_size(64)
@@ -54,16 +50,9 @@ fn main(
         return;
     }
     let view = i / plane;
-    let x = i % call.width;
-    let y = i % plane / call.width;
-    let own = colour(view, x, y);
-    let in_camera = vec4<f32>(ray(view, x, y) * surface_z(view, x, y), 1.0);
-    let c = view * 4u;
-    let point = vec3<f32>(
-        dot(cameras[c], in_camera),
-        dot(cameras[c + 1u], in_camera),
-        dot(cameras[c + 2u], in_camera),
-    );
+    let pixel = vec2<u32>(i % call.width, i % plane / call.width);
+    let own = colour(view, pixel);
+    let point = world_point(view, centre(pixel), surface_z(view, pixel));
     var sum = 0.0;
     var count = 0u;
     let first = view / call.views * call.views;
@@ -71,31 +60,12 @@ fn main(
         if other == view {
             continue;
         }
-        let o = other * 4u;
-        let away = point - vec3<f32>(cameras[o].w, cameras[o + 1u].w, cameras[o + 2u].w);
-        let p = cameras[o].xyz * away.x + cameras[o + 1u].xyz * away.y
-            + cameras[o + 2u].xyz * away.z;
-        let k = cameras[o + 3u];
-        let at = k.xy * p.xy / p.z + k.zw;
-        let size = vec2<f32>(f32(call.width), f32(call.height));
-        if !(all(at >= vec2<f32>()) && all(at < size) && p.z > 0.0) {
+        let seen = projected(other, point);
+        if !(seen.z > 0.0) {
             continue;
         }
-        let centre = vec2<i32>(at);
-        let last = vec2<i32>(i32(call.width), i32(call.height)) - 1;
-        let low = max(centre - 1, vec2<i32>());
-        let high = min(centre + 1, last);
-        var surface = 0.0;
-        var apart = call.colour;
-        for (var row = low.y; row <= high.y; row++) {
-            for (var column = low.x; column <= high.x; column++) {
-                surface = max(surface, surface_z(other, u32(column), u32(row)));
-                let difference = abs(colour(other, u32(column), u32(row)) - own);
-                apart = min(apart, difference.x + difference.y + difference.z);
-            }
-        }
-        if p.z <= surface * (1.0 + call.behind) {
-            sum += apart / call.colour;
+        if seen.z <= farthest(other, seen.xy) * (1.0 + call.behind) {
+            sum += min(colour_difference(other, seen.xy, own), call.colour) / call.colour;
             count++;
         }
     }

@@ -24,11 +24,11 @@ pub use spgr::{
 pub use sweep::{Pair, SWEEP_PAIR_STRIDE, Sweep};
 pub use uniforms::{
     AdamUniform, AdapterUniform, AttentionGatherUniform, AttentionUniform, AttributesUniform,
-    ConvexUniform, ConvolutionUniform, CrossCheckUniform, ElementwiseUniform, ExpectationUniform,
-    HeadOutputUniform, InvertUniform, LinearUniform, LinearWeightBwdUniform, NormUniform,
-    OcclusionUniform, PlaneSweepUniform, RasterUniform, RawMatchingUniform, RedistributeUniform,
-    ReduceUniform, ResizeUniform, RowsUniform, SelectUniform, ShowUniform, SortUniform,
-    SpgrGainsBwdUniform, SpgrUniform, SumPartsUniform,
+    ConvexUniform, ConvolutionUniform, CrossCheckUniform, DepthConsensusUniform,
+    ElementwiseUniform, ExpectationUniform, HeadOutputUniform, InvertUniform, LinearUniform,
+    LinearWeightBwdUniform, NormUniform, OcclusionUniform, PlaneSweepUniform, RasterUniform,
+    RawMatchingUniform, RedistributeUniform, ReduceUniform, ResizeUniform, RowsUniform,
+    SelectUniform, ShowUniform, SortUniform, SpgrGainsBwdUniform, SpgrUniform, SumPartsUniform,
 };
 pub use view::View;
 

@@ -25,9 +25,10 @@ mod network;
 
 pub use network::{
     AdamUniform, AdapterUniform, AttentionUniform, AttributesUniform, ConvexUniform,
-    ConvolutionUniform, CrossCheckUniform, ElementwiseUniform, ExpectationUniform,
-    HeadOutputUniform, LinearUniform, LinearWeightBwdUniform, NormUniform, OcclusionUniform,
-    RawMatchingUniform, ReduceUniform, ResizeUniform, RowsUniform, SelectUniform, SumPartsUniform,
+    ConvolutionUniform, CrossCheckUniform, DepthConsensusUniform, ElementwiseUniform,
+    ExpectationUniform, HeadOutputUniform, LinearUniform, LinearWeightBwdUniform, NormUniform,
+    OcclusionUniform, RawMatchingUniform, ReduceUniform, ResizeUniform, RowsUniform, SelectUniform,
+    SumPartsUniform,
 };
 
 uniform! {

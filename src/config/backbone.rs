@@ -82,6 +82,10 @@ pub struct Small {
     /// ([`crate::cpu::small::cross_check`]). Files without the key mean true.
     #[serde(default = "yes")]
     pub cross_check: bool,
+    /// From three views on, each pixel takes the depth that most views support
+    /// ([`crate::cpu::small::depth_consensus`]). Files without the key mean true.
+    #[serde(default = "yes")]
+    pub depth_consensus: bool,
     /// Estimates near and far depth from half-size images
     /// ([`crate::model::subsplat::SubSplat::estimate_depth_range`]). Serialised as
     /// `first_look`; files without the key mean true.
@@ -189,6 +193,7 @@ impl Small {
             pixel_colour: true,
             head_channels: 32,
             cross_check: true,
+            depth_consensus: true,
             estimate_depth_range: true,
             primaries: Primaries::with(ShFrame::Standard),
         }

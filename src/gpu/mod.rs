@@ -87,8 +87,8 @@ pub use crate::device::DeviceChoice;
 pub use adapter::{AdapterSummary, adapters, choose, find_for, instance};
 pub use array::{
     ADAM_BLOCK, AdamCall, AdapterCall, AdapterView, AttentionCall, ConvolutionCall, CrossCheckCall,
-    DeviceArray, Function, HeadOutputCall, PointwiseFunction, RawMatchingCall, Recorder, Reduction,
-    Work,
+    DepthConsensusCall, DeviceArray, Function, HeadOutputCall, PointwiseFunction, RawMatchingCall,
+    Recorder, Reduction, Work,
 };
 pub use attention_gather::AttentionGatherArgs;
 pub use attention_gather_bwd::AttentionGatherGradients;
@@ -159,6 +159,7 @@ pub const KERNELS: &[&Kernel] = &[
     &array::CONVEX,
     &array::HEAD_OUTPUT,
     &array::CROSS_CHECK,
+    &array::DEPTH_CONSENSUS,
     &array::RAW_MATCHING_BLOCKS,
     &array::RAW_MATCHING_SCORES,
     &array::ATTRIBUTES,

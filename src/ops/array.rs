@@ -13,7 +13,7 @@ use super::plane_sweep::Sweep;
 use super::small::{self, Candidates, MeanOver, Start};
 use super::spgr::{Spgr, spgr_into_on};
 use super::{Backend, columns, conv2d, conv3d, join, linear, matching, moves, norm, resize};
-use crate::camera::Camera;
+use crate::camera::{Camera, NearFar};
 use candle_core::shape::ShapeWithOneHole;
 use candle_core::{D, DType, Result, Tensor, bail};
 
@@ -247,6 +247,15 @@ pub trait Array: Clone + std::fmt::Debug {
 
     /// Computes opacity factors from images `self` and distances.
     fn cross_check(&self, cameras: &[Vec<Camera>], distances: &Self) -> Result<Self>;
+
+    /// Computes the distances that most views support, from images `self`, then distances and
+    /// confidences.
+    fn depth_consensus(
+        &self,
+        cameras: &[Vec<Camera>],
+        ranges: &[Vec<NearFar>],
+        depths: [&Self; 2],
+    ) -> Result<Self>;
 
     /// Computes the attributes of packed rows `[N, 11]`.
     fn attributes(&self, rules: Attributes) -> Result<Self>;
@@ -575,6 +584,15 @@ impl Array for Tensor {
 
     fn cross_check(&self, cameras: &[Vec<Camera>], distances: &Self) -> Result<Self> {
         small::cross_check(self, cameras, distances)
+    }
+
+    fn depth_consensus(
+        &self,
+        cameras: &[Vec<Camera>],
+        ranges: &[Vec<NearFar>],
+        depths: [&Self; 2],
+    ) -> Result<Self> {
+        small::depth_consensus(self, cameras, ranges, depths)
     }
 
     fn attributes(&self, rules: Attributes) -> Result<Self> {

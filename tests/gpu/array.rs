@@ -8,7 +8,7 @@ use candle_core::{DType, Device, Result, Tensor};
 use glam::{Mat4, Quat, Vec3};
 use std::sync::Arc;
 use subsplat::abi::MuInput;
-use subsplat::camera::{Camera, Intrinsics};
+use subsplat::camera::{Camera, Intrinsics, NearFar};
 use subsplat::config::MaskMode;
 use subsplat::model::Backend;
 use subsplat::model::geometry::Frames;
@@ -263,6 +263,12 @@ fn views_are_compared() {
     let distances =
         Tensor::from_vec(r.many(3 * h * w, 1.5, 4.0), (1, 3, h * w, 1), &Device::Cpu).unwrap();
     agree!(gpu, "cross-check", 1e-4, |images, distances| images.cross_check(&all, distances));
+    let confidences =
+        Tensor::from_vec(r.many(3 * h * w, 0.0, 1.0), (1, 3, h * w, 1), &Device::Cpu).unwrap();
+    let ranges = vec![vec![NearFar { near: 1.0, far: 4.0 }; 3]];
+    agree!(gpu, "depth consensus", 1e-4, |images, distances, confidences| {
+        images.depth_consensus(&all, &ranges, [distances, confidences])
+    });
     let features = noise(r, &[3, 8, h / 4, w / 4]);
     let small = cameras([h / 4, w / 4], 3);
     let line = |[i, j]: [usize; 2]| {

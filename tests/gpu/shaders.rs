@@ -43,6 +43,7 @@ const CPU_STEMS: &[(&str, &str)] = &[
     ("convex", "small"),
     ("convolution", "conv"),
     ("cross_check", "small"),
+    ("depth_consensus", "small"),
     // Copies and sums of tensors.
     ("elementwise", "activation"),
     ("expectation", "small"),
@@ -141,6 +142,7 @@ const UNIFORMS: &[Uniform] = uniforms!(
     ConvexUniform,
     ConvolutionUniform,
     CrossCheckUniform,
+    DepthConsensusUniform,
     ElementwiseUniform,
     ExpectationUniform,
     HeadOutputUniform,

@@ -12,23 +12,33 @@ use subsplat::model::weights::Weights;
 const SIDE: usize = 128;
 
 fn example(seed: u64) -> Example {
-    let mut spec = ExampleSpec::new(SIDE, SIDE, 0);
+    example_of(seed, 0)
+}
+
+/// An example of two views and `targets` more.
+fn example_of(seed: u64, targets: usize) -> Example {
+    let mut spec = ExampleSpec::new(SIDE, SIDE, targets);
     spec.photographic = false;
     spec.cameras.crop = 0.0;
     Example::new(seed, &spec)
 }
 
 fn views(examples: &[Example]) -> Views {
+    first_views(examples, 2)
+}
+
+/// The first `v` views of each example.
+fn first_views(examples: &[Example], v: usize) -> Views {
     let mut pixels = Vec::new();
-    for view in examples.iter().flat_map(|e| &e.views[..2]) {
+    for view in examples.iter().flat_map(|e| &e.views[..v]) {
         for c in 0..3 {
             pixels.extend(view.rgb.iter().skip(c).step_by(3).map(|v| v.clamp(0.0, 1.0)));
         }
     }
-    let shape = (examples.len(), 2, 3, SIDE, SIDE);
+    let shape = (examples.len(), v, 3, SIDE, SIDE);
     let images = Tensor::from_vec(pixels, shape, &Device::Cpu).unwrap();
-    let cameras = examples.iter().map(|e| e.cameras[..2].to_vec()).collect();
-    let planes = examples.iter().map(|e| vec![NearFar::new(e.near, e.far); 2]).collect();
+    let cameras = examples.iter().map(|e| e.cameras[..v].to_vec()).collect();
+    let planes = examples.iter().map(|e| vec![NearFar::new(e.near, e.far); v]).collect();
     Views::new(images, cameras, planes).unwrap()
 }
 
@@ -119,6 +129,41 @@ fn a_source_that_shows_something_else_costs_little() {
     println!("within 15 %: {alone:.3}; with a source of something else {three:.3}");
     // 0.72 with sources weighed by their match, 0.68 with equal weights.
     assert!(three > 0.7 * alone, "{three} of {alone}");
+}
+
+/// Mean error of disparity of the first `v` views of four rooms, as a share of the range, with the
+/// shipped weights.
+fn disparity_error(depth_consensus: bool, v: usize) -> f32 {
+    let weights = Weights::shipped(2).unwrap();
+    let Backbone::Small(config) = &weights.config().unwrap().backbone else {
+        panic!("the shipped backbone is the small one")
+    };
+    let config = Small { depth_consensus, ..config.clone() };
+    let net = SmallBackbone::new(&config, weights.builder().pp("small")).unwrap();
+    let (mut sum, mut all) = (0.0, 0);
+    for seed in 0..4 {
+        let e = example_of(seed, 1);
+        let views = first_views(std::slice::from_ref(&e), v);
+        let (out, _) = net.forward(&views, DisparityMean::AroundMode).unwrap();
+        let mut got = flat(&out.depths).into_iter();
+        for (view, camera) in e.views[..v].iter().zip(&e.cameras) {
+            for (i, z) in view.depth.iter().enumerate() {
+                let px = glam::Vec2::new((i % SIDE) as f32 + 0.5, (i / SIDE) as f32 + 0.5);
+                let found = got.next().unwrap() / camera.intrinsics().unproject(px).length();
+                sum += (1.0 / found - 1.0 / z).abs() / (1.0 / e.near - 1.0 / e.far);
+                all += 1;
+            }
+        }
+    }
+    sum / all as f32
+}
+
+#[test]
+fn three_views_take_the_depths_that_most_support() {
+    assert_eq!(disparity_error(true, 2), disparity_error(false, 2));
+    let [with, without] = [true, false].map(|on| disparity_error(on, 3));
+    println!("error of disparity: {with:.4}; of each view by itself {without:.4}");
+    assert!(with < without, "{with} and {without}");
 }
 
 #[test]

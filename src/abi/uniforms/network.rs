@@ -272,6 +272,36 @@ uniform! {
 }
 
 uniform! {
+    /// Parameters of kernels/depth_consensus.wgsl.
+    DepthConsensusUniform {
+        /// Scenes.
+        scenes: u32,
+        /// Views of a scene.
+        views: u32,
+        /// Height, px.
+        height: u32,
+        /// Width, px.
+        width: u32,
+        /// Weight of a pixel's own depth.
+        own_weight: f32,
+        /// Difference of colour at which support falls to 1/e.
+        colour: f32,
+        /// Number of σ from which a surface gives no support.
+        reach: f32,
+        /// Term of the weights.
+        least_weight: f32,
+        /// Distance from a ray up to which a surface point is on it, px per axis.
+        on_ray: f32,
+        /// Steps of the search for the intersection of a ray and a surface.
+        steps: u32,
+        /// Unused.
+        pad_a: u32,
+        /// Unused.
+        pad_b: u32,
+    }
+}
+
+uniform! {
     /// Parameters of kernels/raw_matching_blocks.wgsl and raw_matching_scores.wgsl.
     RawMatchingUniform {
         /// Pairs of reference and source.

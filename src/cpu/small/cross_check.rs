@@ -11,7 +11,7 @@
 //! colour, or hidden in all views). No gradient: pictures are inputs, and the step of a point
 //! across a silhouette has no derivative. Oracle: the same in f64 by matrices (the tests).
 
-use crate::camera::Camera;
+use super::rgbd::{RgbdView, Surface};
 use rayon::prelude::*;
 
 /// Factor of a pixel whose inconsistency is 1 in every view that shows its point.
@@ -22,62 +22,15 @@ pub const COLOUR: f32 = 1.0;
 /// share of that surface's z.
 pub const BEHIND: f32 = 0.05;
 
-/// A view with colours and depth.
-#[derive(Clone, Copy, Debug)]
-pub struct RgbdView<'a> {
-    /// Camera of H × W pixels.
-    pub camera: &'a Camera,
-    /// `[3, H, W]`, display values.
-    pub rgb: &'a [f32],
-    /// `[H·W]`: distance along the unit ray, world units.
-    pub distances: &'a [f32],
-}
-
-/// Position and colour of a view's surface.
-struct Surface<'a> {
-    view: RgbdView<'a>,
-    /// `[H·W]`: camera z.
-    z: Vec<f32>,
-}
-
-impl<'a> Surface<'a> {
-    fn new(view: RgbdView<'a>) -> Self {
-        let z = (0..view.distances.len()).into_par_iter();
-        let z = z.map(|i| view.distances[i] / ray(view.camera, i).length()).collect();
-        Self { view, z }
-    }
-
-    fn colour(&self, i: usize) -> [f32; 3] {
-        let plane = self.z.len();
-        [0, 1, 2].map(|c| self.view.rgb[c * plane + i])
-    }
-
+impl Surface<'_> {
     /// Returns the inconsistency of a `point` (world) of `colour` with this view, 0 to 1; none
     /// where the view does not show the point.
     fn inconsistency(&self, point: glam::Vec3, colour: [f32; 3]) -> Option<f32> {
-        let k = self.view.camera.intrinsics;
-        let p = self.view.camera.to_camera(point);
-        let at = k.project(p);
-        let inside = at.x >= 0.0 && at.y >= 0.0 && at.x < k.width as f32 && at.y < k.height as f32;
-        if !(inside && p.z > 0.0) {
-            return None;
-        }
-        let (x, y) = (at.x as usize, at.y as usize);
-        let (mut surface, mut apart) = (0.0f32, COLOUR);
-        for row in y.saturating_sub(1)..(y + 2).min(k.height) {
-            for i in row * k.width + x.saturating_sub(1)..row * k.width + (x + 2).min(k.width) {
-                surface = surface.max(self.z[i]);
-                let own = self.colour(i);
-                apart = apart.min((0..3).map(|c| (own[c] - colour[c]).abs()).sum());
-            }
-        }
-        (p.z <= surface * (1.0 + BEHIND)).then_some(apart / COLOUR)
+        let (at, z) = self.project(point)?;
+        let surface = self.around(at).map(|i| self.z[i]).fold(0.0, f32::max);
+        let apart = self.difference(at, colour).min(COLOUR);
+        (z <= surface * (1.0 + BEHIND)).then_some(apart / COLOUR)
     }
-}
-
-fn ray(camera: &Camera, i: usize) -> glam::Vec3 {
-    let k = camera.intrinsics;
-    k.unproject(glam::Vec2::new((i % k.width) as f32 + 0.5, (i / k.width) as f32 + 0.5))
 }
 
 /// The factors of all views' pixels, `[V, H·W]`: 1 minus the mean inconsistency of
@@ -86,10 +39,8 @@ pub fn cross_check(views: &[RgbdView<'_>]) -> Vec<f32> {
     let surfaces: Vec<Surface> = views.iter().map(|v| Surface::new(*v)).collect();
     let mut out: Vec<f32> = Vec::with_capacity(views.iter().map(|v| v.distances.len()).sum());
     for (v, own) in surfaces.iter().enumerate() {
-        let camera = own.view.camera;
         let factor = |i: usize| {
-            let in_camera = ray(camera, i) * own.z[i];
-            let point = camera.rotation() * in_camera + camera.position();
+            let point = own.point(own.centre(i), own.z[i]);
             let others = surfaces.iter().enumerate().filter(|(u, _)| *u != v);
             let inconsistencies = others.filter_map(|(_, u)| u.inconsistency(point, own.colour(i)));
             let (sum, count) = inconsistencies.fold((0.0, 0u32), |(s, n), d| (s + d, n + 1));
@@ -103,38 +54,16 @@ pub fn cross_check(views: &[RgbdView<'_>]) -> Vec<f32> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::rgbd::examples::{
+        SIDE, Seen, around, centre, colour, difference, place, project, turned, wall, z_of,
+    };
     use super::*;
-    use crate::camera::Intrinsics;
-    use glam::{DVec3, Mat4, Vec3};
-
-    const SIDE: usize = 32;
-
-    fn camera(x: f32) -> Camera {
-        let k = Intrinsics { fx: 32.0, fy: 32.0, cx: 16.0, cy: 16.0, width: SIDE, height: SIDE };
-        Camera::new(k, Mat4::from_translation(Vec3::new(x, 0.0, 0.0))).unwrap()
-    }
-
-    /// A wall at z = 2 whose left half is dark, seen from x: `[3, H, W]` and distances.
-    fn wall(camera: &Camera) -> (Vec<f32>, Vec<f32>) {
-        let (mut grey, mut distances) = (Vec::new(), Vec::new());
-        for i in 0..SIDE * SIDE {
-            let ray = ray(camera, i);
-            let x = camera.position().x + 2.0 * ray.x;
-            grey.push(if x < 0.0 { 0.1 } else { 0.9 });
-            distances.push(2.0 * ray.length());
-        }
-        (grey.repeat(3), distances)
-    }
+    use glam::DVec3;
 
     fn factors(change: impl Fn(&mut [f32])) -> Vec<f32> {
-        let cameras = [camera(0.0), camera(0.5)];
-        let [a, b] = [wall(&cameras[0]), wall(&cameras[1])];
-        let mut distances = a.1;
-        change(&mut distances);
-        cross_check(&[
-            RgbdView { camera: &cameras[0], rgb: &a.0, distances: &distances },
-            RgbdView { camera: &cameras[1], rgb: &b.0, distances: &b.1 },
-        ])
+        let [mut a, b] = [wall(0.0), wall(0.5)];
+        change(&mut a.distances);
+        cross_check(&[a.view(), b.view()])
     }
 
     #[test]
@@ -170,7 +99,7 @@ mod tests {
         let mut out = Vec::new();
         for (v, own) in views.iter().enumerate() {
             for i in 0..own.distances.len() {
-                let point = place(own, i);
+                let point = place(own, centre(own, i), z_of(own, i));
                 let inconsistencies: Vec<f64> = (0..views.len())
                     .filter(|u| *u != v)
                     .filter_map(|u| inconsistency(&views[u], point, colour(own, i)))
@@ -183,75 +112,19 @@ mod tests {
         out
     }
 
-    fn colour(view: &RgbdView<'_>, i: usize) -> [f64; 3] {
-        [0, 1, 2].map(|c| f64::from(view.rgb[c * view.distances.len() + i]))
-    }
-
-    /// World point of a pixel.
-    fn place(view: &RgbdView<'_>, i: usize) -> DVec3 {
-        let k = view.camera.intrinsics;
-        let x = ((i % k.width) as f64 + 0.5 - f64::from(k.cx)) / f64::from(k.fx);
-        let y = ((i / k.width) as f64 + 0.5 - f64::from(k.cy)) / f64::from(k.fy);
-        let ray = DVec3::new(x, y, 1.0);
-        let in_camera = ray * (f64::from(view.distances[i]) / ray.length());
-        view.camera.world_from_camera.as_dmat4().transform_point3(in_camera)
-    }
-
     fn inconsistency(view: &RgbdView<'_>, point: DVec3, wanted: [f64; 3]) -> Option<f64> {
-        let (k, world) = (view.camera.intrinsics, view.camera.world_from_camera.as_dmat4());
-        let p = world.inverse().transform_point3(point);
-        let x = f64::from(k.fx) * p.x / p.z + f64::from(k.cx);
-        let y = f64::from(k.fy) * p.y / p.z + f64::from(k.cy);
-        if p.z <= 0.0 || x < 0.0 || y < 0.0 || x >= k.width as f64 || y >= k.height as f64 {
-            return None;
-        }
-        let (mut surface, mut apart) = (0.0f64, f64::from(COLOUR));
-        for row in 0..k.height {
-            for column in 0..k.width {
-                let near = |a: usize, b: f64| (a as f64 - b.floor()).abs() <= 1.0;
-                if near(row, y) && near(column, x) {
-                    let i = row * k.width + column;
-                    let seen = world.inverse().transform_point3(place(view, i));
-                    surface = surface.max(seen.z);
-                    let own = colour(view, i);
-                    apart = apart.min((0..3).map(|c| (own[c] - wanted[c]).abs()).sum());
-                }
-            }
-        }
-        let hidden = p.z > surface * (1.0 + f64::from(BEHIND));
+        let (at, z) = project(view, point)?;
+        let pixels = around(view, at);
+        let surface = pixels.iter().map(|i| z_of(view, *i)).fold(0.0, f64::max);
+        let apart = difference(view, &pixels, wanted).min(f64::from(COLOUR));
+        let hidden = z > surface * (1.0 + f64::from(BEHIND));
         (!hidden).then_some(apart / f64::from(COLOUR))
     }
 
     #[test]
     fn three_turned_views_agree_with_the_oracle() {
-        let noise = |n: usize, seed: f32| -> Vec<f32> {
-            (0..n).map(|i| 0.5 + 0.5 * ((i as f32 + seed) * 12.9898).sin()).collect()
-        };
-        let cameras: Vec<Camera> = (0..3u8)
-            .map(|v| {
-                let turn = Mat4::from_rotation_y(0.1 * f32::from(v) - 0.1)
-                    * Mat4::from_rotation_z(0.05 * f32::from(v));
-                let at = Mat4::from_translation(Vec3::new(0.2 * f32::from(v), 0.1, 0.0));
-                let side = 24;
-                let k = Intrinsics {
-                    fx: 26.0,
-                    fy: 25.0,
-                    cx: 11.7,
-                    cy: 12.4,
-                    width: side,
-                    height: side,
-                };
-                Camera::new(k, at * turn).unwrap()
-            })
-            .collect();
-        let n = 24 * 24;
-        let pictures: Vec<Vec<f32>> = (0..3u8).map(|v| noise(3 * n, 7.0 * f32::from(v))).collect();
-        let depths: Vec<Vec<f32>> = (0..3u8)
-            .map(|v| noise(n, 100.0 + f32::from(v)).iter().map(|d| 1.5 + 0.5 * d).collect())
-            .collect();
-        let views: Vec<RgbdView> = (0..3)
-            .map(|v| RgbdView { camera: &cameras[v], rgb: &pictures[v], distances: &depths[v] })
-            .collect();
+        let seen = turned();
+        let views: Vec<RgbdView> = seen.iter().map(Seen::view).collect();
         let (got, want) = (cross_check(&views), oracle(&views));
         assert_eq!(got.len(), want.len());
         // Pixels that round, or surfaces that hide, the other way.

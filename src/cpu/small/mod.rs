@@ -4,6 +4,8 @@
 
 pub mod convex;
 pub mod cross_check;
+pub mod depth_consensus;
 pub mod expectation;
 pub mod heads;
+pub mod rgbd;
 pub mod unit;

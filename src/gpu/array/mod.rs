@@ -54,9 +54,10 @@ pub use rows::Reduction;
 pub(super) use rows::{REDUCE, RESIZE, SELECT_ROWS, SOFTMAX};
 pub(super) use rows_bwd::{RESIZE_BWD, SELECT_ROWS_BWD, SUM_PARTS};
 pub(super) use small::{
-    CONVEX, CROSS_CHECK, EXPECTATION, HEAD_OUTPUT, RAW_MATCHING_BLOCKS, RAW_MATCHING_SCORES,
+    CONVEX, CROSS_CHECK, DEPTH_CONSENSUS, EXPECTATION, HEAD_OUTPUT, RAW_MATCHING_BLOCKS,
+    RAW_MATCHING_SCORES,
 };
-pub use small::{CrossCheckCall, HeadOutputCall, RawMatchingCall};
+pub use small::{CrossCheckCall, DepthConsensusCall, HeadOutputCall, RawMatchingCall};
 pub(super) use small_bwd::{CONVEX_BWD, CONVEX_MAPS_BWD, EXPECTATION_BWD};
 pub(super) use trunk::{ATTRIBUTES, OCCLUSION};
 pub(super) use trunk_bwd::ATTRIBUTES_BWD;

@@ -1,11 +1,12 @@
 //! The small backbone's own parts.
 //!
-//! WGSL: kernels/expectation.wgsl, convex.wgsl, head_output.wgsl, cross_check.wgsl,
+//! WGSL: kernels/expectation.wgsl, convex.wgsl, head_output.wgsl, cross_check.wgsl, depth_consensus.wgsl,
 //! raw_matching_blocks.wgsl, raw_matching_scores.wgsl.
 
 use super::{DeviceArray, Reduction, misfit};
 use crate::abi::{
-    ConvexUniform, CrossCheckUniform, ExpectationUniform, HeadOutputUniform, RawMatchingUniform,
+    ConvexUniform, CrossCheckUniform, DepthConsensusUniform, ExpectationUniform, HeadOutputUniform,
+    RawMatchingUniform,
 };
 use crate::gpu::buffers::Binding;
 use crate::gpu::commands::Groups;
@@ -51,8 +52,23 @@ pub(crate) static HEAD_OUTPUT: Kernel = Kernel {
 pub(crate) static CROSS_CHECK: Kernel = Kernel {
     name: "cross_check",
     entry: "main",
-    source: wgsl!("shared/grid", "cross_check"),
+    source: wgsl!("shared/grid", "shared/rgbd", "cross_check"),
     bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Read, Access::Write],
+};
+
+pub(crate) static DEPTH_CONSENSUS: Kernel = Kernel {
+    name: "depth_consensus",
+    entry: "main",
+    source: wgsl!("shared/grid", "shared/rgbd", "depth_consensus"),
+    bindings: &[
+        Access::Uniform,
+        Access::Read,
+        Access::Read,
+        Access::Read,
+        Access::Read,
+        Access::Read,
+        Access::Write,
+    ],
 };
 
 pub(crate) static RAW_MATCHING_BLOCKS: Kernel = Kernel {
@@ -108,6 +124,29 @@ pub struct CrossCheckCall<'a> {
     pub colour: f32,
     /// Share of z by which a hidden point lies behind a surface.
     pub behind: f32,
+}
+
+/// Constants of [`DeviceArray::depth_consensus`].
+#[derive(Clone, Copy, Debug)]
+pub struct DepthConsensusCall<'a> {
+    /// Views of a scene.
+    pub views: usize,
+    /// Per view 16 floats, as in [`CrossCheckCall::cameras`].
+    pub cameras: &'a [f32],
+    /// Per view: σ of the agreement of two disparities, 1 / world units.
+    pub tolerances: &'a [f32],
+    /// Weight of a pixel's own depth.
+    pub own_weight: f32,
+    /// Σ|difference of colour| at which support falls to 1/e.
+    pub colour: f32,
+    /// Number of σ from which a surface gives no support.
+    pub reach: f32,
+    /// Term of the weights.
+    pub least_weight: f32,
+    /// Distance from a ray up to which a surface point is on it, px per axis.
+    pub on_ray: f32,
+    /// Steps of the search for the intersection of a ray and a surface.
+    pub steps: u32,
 }
 
 /// Constants of [`DeviceArray::raw_matching`].
@@ -278,6 +317,64 @@ impl DeviceArray {
             [self.binding(), distances.binding(), Binding::from(&cameras), result.binding()];
         self.recorder.call(
             &CROSS_CHECK,
+            &[],
+            &uniform,
+            &bindings,
+            Groups::of(result.count(), THREADS),
+        )?;
+        Ok(result)
+    }
+
+    /// Computes the distances `[B, V, H·W, 1]` that most views support, of images
+    /// `[B, V, 3, H, W]`, `distances` along the unit rays and `confidences`.
+    ///
+    /// # Errors
+    /// [`GpuError::Argument`] for sizes that do not fit; errors of the device.
+    pub fn depth_consensus(
+        &self,
+        [distances, confidences]: [&Self; 2],
+        call: DepthConsensusCall,
+    ) -> Result<Self, GpuError> {
+        let &[b, v, 3, h, w] = self.dims.as_slice() else {
+            return Err(misfit(DEPTH_CONSENSUS.name, "[B, V, 3, H, W]".to_owned(), &self.dims));
+        };
+        let lengths = [
+            ("distances", distances.count(), b * v * h * w),
+            ("confidences", confidences.count(), b * v * h * w),
+            ("cameras", call.cameras.len(), 16 * b * v),
+            ("tolerances", call.tolerances.len(), b * v),
+            ("views", call.views, v),
+        ];
+        GpuError::check_lengths(DEPTH_CONSENSUS.name, lengths)?;
+        let result = self.recorder.empty(&[b, v, h * w, 1])?;
+        let gpu = &self.recorder.gpu;
+        let [scenes, views, height, width] = [b, v, h, w].map(|n| n as u32);
+        let uniform = DepthConsensusUniform {
+            scenes,
+            views,
+            height,
+            width,
+            own_weight: call.own_weight,
+            colour: call.colour,
+            reach: call.reach,
+            least_weight: call.least_weight,
+            on_ray: call.on_ray,
+            steps: call.steps,
+            pad_a: 0,
+            pad_b: 0,
+        };
+        let cameras = gpu.upload("cameras", call.cameras)?;
+        let tolerances = gpu.upload("tolerances", call.tolerances)?;
+        let bindings = [
+            self.binding(),
+            distances.binding(),
+            confidences.binding(),
+            Binding::from(&cameras),
+            Binding::from(&tolerances),
+            result.binding(),
+        ];
+        self.recorder.call(
+            &DEPTH_CONSENSUS,
             &[],
             &uniform,
             &bindings,

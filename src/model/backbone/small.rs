@@ -42,6 +42,9 @@ const CONFIDENCE_SHIFT: f64 = 1.0;
 /// visibility.
 const VISIBILITY_WINDOW: usize = 1;
 
+/// Views from which they correct one another's depths. Of two views, neither can be outvoted.
+const CONSENSUS_VIEWS: usize = 3;
+
 /// Candidates over which a pixel's mean disparity is taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DisparityMean {
@@ -192,7 +195,13 @@ impl SmallBackbone {
         let Matched { rgb, feat2, feat4, deep, logits, index, confidence } =
             self.matched(views, images, mean, trace)?;
         let heads = self.heads(&rgb, &deep, [&index, &confidence], mean, trace)?;
-        let depths = self.ray_distance(views, &index)?;
+        let mut depths = self.ray_distance(views, &index)?;
+        let mut densities = heads.density.reshape((b, v, h * w, 1))?;
+        let enough = v >= CONSENSUS_VIEWS && mean == DisparityMean::AroundMode;
+        if self.config.depth_consensus && enough {
+            let maps = [&depths, &densities];
+            depths = images.depth_consensus(&views.cameras, &views.near_far, maps)?;
+        }
         let pool = |s: usize| -> Result<A> { split_views(&deep.pooled(s)?, b, v) };
         let features = vec![
             (FeatureLevel::Trans4, split_views(&deep, b, v)?),
@@ -202,7 +211,6 @@ impl SmallBackbone {
             (FeatureLevel::Cnn2, split_views(&feat2, b, v)?),
             (FeatureLevel::Refine1, split_views(&heads.hidden, b, v)?),
         ];
-        let mut densities = heads.density.reshape((b, v, h * w, 1))?;
         if self.config.cross_check {
             densities = densities.times(&images.cross_check(&views.cameras, &depths)?)?;
         }

@@ -1,14 +1,16 @@
 //! [`Array`] for arrays in device memory: each operation, and the rule of its gradient.
 
 use super::DeviceArray;
-use super::rules::{ProductRules, attention_call, attributes_uniform, pointwise, scaled, wanted};
+use super::rules::{
+    ProductRules, attention_call, attributes_uniform, camera_floats, pointwise, scaled, wanted,
+};
 use crate::abi::SPLAT_STRIDE;
-use crate::camera::Camera;
+use crate::camera::{Camera, NearFar};
 use crate::cpu::attention_gather::OCCLUSION_TOLERANCE;
-use crate::cpu::small::cross_check;
+use crate::cpu::small::{cross_check, depth_consensus};
 use crate::gpu::{
-    self, ConvolutionCall, CrossCheckCall, Function, HeadOutputCall, PointwiseFunction,
-    RawMatchingCall, Reduction,
+    self, ConvolutionCall, CrossCheckCall, DepthConsensusCall, Function, HeadOutputCall,
+    PointwiseFunction, RawMatchingCall, Reduction,
 };
 use crate::ops::activation::Activation;
 use crate::ops::array::{Array, ConvSteps};
@@ -16,7 +18,7 @@ use crate::ops::attention::Labels;
 use crate::ops::attention_gather::{Deferred, Gather};
 use crate::ops::attributes::Attributes;
 use crate::ops::plane_sweep::Sweep;
-use crate::ops::small::{Candidates, MeanOver, Start};
+use crate::ops::small::{Candidates, MeanOver, Start, consensus_tolerances};
 use crate::ops::spgr::{Spgr, finite};
 use crate::ops::{Backend, matching};
 use candle_core::shape::ShapeWithOneHole;
@@ -533,19 +535,34 @@ impl Array for DeviceArray {
     }
 
     fn cross_check(&self, cameras: &[Vec<Camera>], distances: &Self) -> Result<Self> {
-        let floats = |camera: &Camera| -> Vec<f32> {
-            let (r, p, k) = (camera.rotation(), camera.position(), camera.intrinsics);
-            let row = |i: usize| [r.row(i).x, r.row(i).y, r.row(i).z, p[i]];
-            [row(0), row(1), row(2), [k.fx, k.fy, k.cx, k.cy]].concat()
-        };
         let call = CrossCheckCall {
             views: cameras.first().map_or(0, Vec::len),
-            cameras: &cameras.iter().flatten().flat_map(floats).collect::<Vec<_>>(),
+            cameras: &camera_floats(cameras),
             least: cross_check::MIN_FACTOR,
             colour: cross_check::COLOUR,
             behind: cross_check::BEHIND,
         };
         self.of(self.array.cross_check(&distances.array, call))
+    }
+
+    fn depth_consensus(
+        &self,
+        cameras: &[Vec<Camera>],
+        ranges: &[Vec<NearFar>],
+        depths: [&Self; 2],
+    ) -> Result<Self> {
+        let call = DepthConsensusCall {
+            views: cameras.first().map_or(0, Vec::len),
+            cameras: &camera_floats(cameras),
+            tolerances: &consensus_tolerances(cameras, ranges)?,
+            own_weight: depth_consensus::OWN_WEIGHT,
+            colour: depth_consensus::COLOUR,
+            reach: depth_consensus::REACH,
+            least_weight: depth_consensus::LEAST_WEIGHT,
+            on_ray: depth_consensus::ON_RAY,
+            steps: depth_consensus::STEPS,
+        };
+        self.of(self.array.depth_consensus(depths.map(|d| &d.array), call))
     }
 
     fn attributes(&self, rules: Attributes) -> Result<Self> {

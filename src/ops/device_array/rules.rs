@@ -3,6 +3,7 @@
 
 use super::{DeviceArray, DeviceGradients, OnDevice};
 use crate::abi::{AttributesUniform, MuInput};
+use crate::camera::Camera;
 use crate::gpu::{self, AttentionCall, Function, PointwiseFunction, Reduction};
 use crate::ops::Array;
 use crate::ops::activation::Activation;
@@ -22,6 +23,16 @@ pub(super) fn wanted(
 /// Returns factor·x.
 pub(super) fn scaled(x: &gpu::DeviceArray, factor: f32) -> OnDevice<gpu::DeviceArray> {
     x.map(Function::Affine(factor, 0.0))
+}
+
+/// Returns 16 floats for each camera ([`gpu::CrossCheckCall::cameras`]).
+pub(super) fn camera_floats(cameras: &[Vec<Camera>]) -> Vec<f32> {
+    let floats = |camera: &Camera| -> Vec<f32> {
+        let (r, p, k) = (camera.rotation(), camera.position(), camera.intrinsics);
+        let row = |i: usize| [r.row(i).x, r.row(i).y, r.row(i).z, p[i]];
+        [row(0), row(1), row(2), [k.fx, k.fy, k.cx, k.cy]].concat()
+    };
+    cameras.iter().flatten().flat_map(floats).collect()
 }
 
 impl DeviceArray {

@@ -4,14 +4,18 @@
 
 mod convex;
 mod cross_check;
+mod depth_consensus;
 mod expectation;
 mod heads;
+mod rgbd;
 mod unit;
 
 pub use crate::cpu::small::expectation::MeanOver;
 pub use crate::cpu::small::heads::Candidates;
 pub use convex::upsample_convex;
 pub use cross_check::cross_check;
+pub use depth_consensus::depth_consensus;
+pub(in crate::ops) use depth_consensus::tolerances as consensus_tolerances;
 pub use expectation::{expectation, lift};
 pub use heads::{Start, head_input, head_output, ray_distance};
 pub use unit::unit_channels;
