@@ -28,6 +28,7 @@ use crate::abi::{
     SPLAT_STRIDE, SplatSlices, gain_with_offsets, sh_coefficients,
 };
 use crate::camera::Camera;
+use crate::cpu::simd::vectorize;
 use crate::fit::{FitError, FitView, Target};
 use crate::loss::{Scored, mse};
 use crate::render::Renderer;
@@ -378,31 +379,42 @@ impl<'a> Refiner<'a> {
         let n = i32::try_from(*step).unwrap_or(i32::MAX);
         let correction = BETAS.map(|b| 1.0 - b.powi(n));
         let channels = predicted.gain_channels();
-        let rows = rows.par_chunks_exact_mut(SPLAT_STRIDE).zip(gain.par_chunks_exact_mut(4));
-        let by = gradients.rows.par_chunks_exact(SPLAT_STRIDE);
-        let by = by.zip(gradients.gain.par_chunks_exact(4));
-        let before = predicted.rows.par_chunks_exact(SPLAT_STRIDE).zip(&*units).enumerate();
-        states.par_iter_mut().zip(rows.zip(by).zip(before)).with_min_len(CHUNK).for_each(
-            |(state, (((row, gain), (by_row, by_gain)), (i, (before, unit))))| {
-                let mut gradient = by_parameters(row, by_row, by_gain, *unit);
-                if other.contains(&i) {
-                    let by_row = &across[(i - other.start) * SPLAT_STRIDE..][..SPLAT_STRIDE];
-                    let second = by_parameters(row, by_row, &[0.0; 4], *unit);
-                    let sums = gradient.iter_mut().zip(second);
-                    sums.for_each(|(sum, g)| *sum += options.across * g);
-                }
-                // Adam's state of a Gaussian that no pixel shows stays as it is.
-                if gradient.iter().all(|g| *g == 0.0) || gradient.iter().any(|g| !g.is_finite()) {
-                    return;
-                }
-                state.advance(&gradient, &rates, correction);
-                let offsets: [f32; 3] = match channels {
-                    4 => std::array::from_fn(|c| predicted.gain[4 * i + 1 + c]),
-                    _ => [0.0; 3],
-                };
-                state.write(before, offsets, *unit, row, gain);
-            },
-        );
+        let rows = rows.par_chunks_mut(CHUNK * SPLAT_STRIDE).zip(gain.par_chunks_mut(CHUNK * 4));
+        let parts = states.par_chunks_mut(CHUNK).zip(rows).enumerate();
+        parts.for_each(|(part, (states, (rows, gain)))| {
+            vectorize(
+                #[inline(always)]
+                || {
+                    let rows = rows.chunks_exact_mut(SPLAT_STRIDE).zip(gain.chunks_exact_mut(4));
+                    for (i, (state, (row, gain))) in states.iter_mut().zip(rows).enumerate() {
+                        let i = part * CHUNK + i;
+                        let (at, unit) = (i * SPLAT_STRIDE..(i + 1) * SPLAT_STRIDE, units[i]);
+                        let by_row = &gradients.rows[at.clone()];
+                        let by_gain = &gradients.gain[4 * i..4 * i + 4];
+                        let mut gradient = by_parameters(row, by_row, by_gain, unit);
+                        if other.contains(&i) {
+                            let at = (i - other.start) * SPLAT_STRIDE;
+                            let by_row = &across[at..at + SPLAT_STRIDE];
+                            let second = by_parameters(row, by_row, &[0.0; 4], unit);
+                            for (sum, g) in gradient.iter_mut().zip(second) {
+                                *sum += options.across * g;
+                            }
+                        }
+                        // Adam's state of a Gaussian that no pixel shows stays as it is.
+                        let zero = gradient.iter().all(|g| *g == 0.0);
+                        if zero || gradient.iter().any(|g| !g.is_finite()) {
+                            continue;
+                        }
+                        state.advance(&gradient, &rates, correction);
+                        let offsets: [f32; 3] = match channels {
+                            4 => std::array::from_fn(|c| predicted.gain[4 * i + 1 + c]),
+                            _ => [0.0; 3],
+                        };
+                        state.write(&predicted.rows[at], offsets, unit, row, gain);
+                    }
+                },
+            );
+        });
     }
 }
 
@@ -539,6 +551,7 @@ fn rates(options: &RefineOptions, part: f32) -> [f32; PARAMETERS] {
 }
 
 /// Gradients by a Gaussian's parameters from those by its row and its gain.
+#[inline(always)]
 fn by_parameters(row: &[f32], by_row: &[f32], by_gain: &[f32], unit: f32) -> [f32; PARAMETERS] {
     let alpha = row[OPACITY_OFFSET];
     let mut out = [0.0; PARAMETERS];
@@ -554,6 +567,7 @@ fn by_parameters(row: &[f32], by_row: &[f32], by_gain: &[f32], unit: f32) -> [f3
 
 impl State {
     /// One step of Adam. `correction`: 1 − βⁿ of both means.
+    #[inline(always)]
     fn advance(
         &mut self,
         gradient: &[f32; PARAMETERS],
@@ -575,6 +589,7 @@ impl State {
     }
 
     /// Writes the Gaussian: the row `before` and its colour `offsets`, changed by the parameters.
+    #[inline(always)]
     fn write(
         &self,
         before: &[f32],

@@ -23,7 +23,7 @@ const IMPORTS: &[(&str, &[&str])] = &[
     ("render", &["abi", "backend", "camera", "cpu", "gpu", "io", "splats"]),
     ("loss", &["cpu", "metrics"]),
     ("fit", &["abi", "camera", "io", "loss", "render", "splats"]),
-    ("refine", &["abi", "camera", "fit", "io", "loss", "render", "splats"]),
+    ("refine", &["abi", "camera", "cpu", "fit", "io", "loss", "render", "splats"]),
     ("merge", &["abi", "sh", "splats"]),
     ("levels", &["abi", "camera", "merge", "splats"]),
     ("reduce", &["abi", "camera", "fit", "io", "merge", "refine", "render", "sh", "splats"]),

@@ -7,7 +7,7 @@
 
 use crate::cpu::activation::sigmoid;
 use crate::cpu::resize::{Bilinear, Resize};
-use crate::cpu::simd::vectorize;
+use crate::cpu::simd::{Kernel, LANES, RowLayout, Simd, SimdLevel, Vector, vectorize};
 use rayon::prelude::*;
 
 /// Channels of [`Input`] beside the features.
@@ -125,12 +125,8 @@ impl Output {
             let (b, y) = (i / h, i % h);
             for (j, rows) in rows.chunks_mut(PIXELS * r).enumerate() {
                 let (at, count) = (y * w + j * PIXELS, rows.len() / r);
-                for (c, start) in self.start.iter().enumerate() {
-                    let x = &x[(b * (r + 1) + c) * n + at..][..count];
-                    for (x, v) in x.iter().zip(rows.iter_mut().skip(c).step_by(r)) {
-                        *v = x + start;
-                    }
-                }
+                let planes = &x[b * (r + 1) * n + at..];
+                SimdLevel::best().run(ToRows { planes, n, start: &self.start, rows });
                 let Some((places, factor, offset)) = self.colour else { continue };
                 for (k, place) in places.into_iter().enumerate() {
                     let colours = &rgb[(b * 3 + k) * n + at..][..count];
@@ -190,7 +186,8 @@ impl Output {
                 let count = (planes.len() / n).min(r - first.min(r));
                 if let Some(d_raw) = d_raw {
                     let rows = &d_raw[b * n * r..(b + 1) * n * r];
-                    transpose(rows, r, first, &mut planes[..count * n], n);
+                    let planes = &mut planes[..count * n];
+                    SimdLevel::best().run(ToPlanes { rows, r, first, planes, n });
                 }
                 if let Some(last) = planes.chunks_exact_mut(n).nth(r.saturating_sub(first))
                     && first <= r
@@ -204,14 +201,73 @@ impl Output {
     }
 }
 
+/// Planes of `n` elements, of which each begins at the same pixel, plus `start`, as `rows` of as
+/// many numbers as `start` has.
+struct ToRows<'a> {
+    planes: &'a [f32],
+    n: usize,
+    start: &'a [f32],
+    rows: &'a mut [f32],
+}
+
+impl Kernel for ToRows<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        let Self { planes, n, start, rows } = self;
+        let r = start.len();
+        let layout = RowLayout { stride: r, count: LANES };
+        for (i, rows) in rows.chunks_mut(LANES * r).enumerate() {
+            let at = i * LANES;
+            if rows.len() < LANES * r || r < LANES {
+                for (c, start) in start.iter().enumerate() {
+                    for (j, row) in rows.chunks_exact_mut(r).enumerate() {
+                        row[c] = planes[c * n + at + j] + start;
+                    }
+                }
+                continue;
+            }
+            for c in (0..r).step_by(LANES) {
+                // The last vectors cover some channels again.
+                let c = c.min(r - LANES);
+                let mut vectors = [s.splat(0.0); LANES];
+                for (j, v) in vectors.iter_mut().enumerate() {
+                    let plane = &planes[(c + j) * n + at..][..LANES];
+                    *v = S::F::load(plane.try_into().expect("16 floats")) + s.splat(start[c + j]);
+                }
+                S::F::store_rows(&vectors, layout, &mut rows[c..]);
+            }
+        }
+    }
+}
+
 /// Columns from `first` of `rows` `[n, r]` as planes of `n`.
-fn transpose(rows: &[f32], r: usize, first: usize, planes: &mut [f32], n: usize) {
-    for at in (0..n).step_by(PIXELS) {
-        let count = PIXELS.min(n - at);
+struct ToPlanes<'a> {
+    rows: &'a [f32],
+    r: usize,
+    first: usize,
+    planes: &'a mut [f32],
+    n: usize,
+}
+
+impl Kernel for ToPlanes<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, _s: S) {
+        let Self { rows, r, first, planes, n } = self;
+        let layout = RowLayout { stride: r, count: LANES };
+        let whole = if planes.len() == CHANNELS * n { n / LANES * LANES } else { 0 };
+        for at in (0..whole).step_by(LANES) {
+            let vectors = S::F::load_rows::<CHANNELS>(&rows[at * r + first..], layout);
+            for (v, plane) in vectors.iter().zip(planes.chunks_exact_mut(n)) {
+                v.store((&mut plane[at..at + LANES]).try_into().expect("16 floats"));
+            }
+        }
         for (c, plane) in planes.chunks_exact_mut(n).enumerate() {
-            let column = rows[at * r + first + c..].iter().step_by(r);
-            for (to, from) in plane[at..at + count].iter_mut().zip(column) {
-                *to = *from;
+            for (i, to) in plane.iter_mut().enumerate().skip(whole) {
+                *to = rows[i * r + first + c];
             }
         }
     }
