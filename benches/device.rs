@@ -4,15 +4,18 @@
 //! `cargo bench --bench device -- [small|mvsplat …] [--side PX] [--device NAME] [--count]`. Work and
 //! memory depend on the sizes only; the measured time is that of the adapter at hand. `--count` allocates
 //! the memory and counts the calls, but executes none.
+//!
+//! `--subgroups` times the kernels with two sources instead, with and without subgroup operations.
 
 use anyhow::{Context, Result, bail, ensure};
 use candle_core::{Device, Tensor};
 use glam::{Mat4, Vec3};
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::Instant;
 use subsplat::camera::{Camera, Intrinsics, NearFar};
 use subsplat::config::{Config, Preset};
-use subsplat::gpu::Work;
+use subsplat::gpu::{DeviceArray, FULL_GRID, Gpu, GpuError, PointwiseFunction, Recorder, Work};
 use subsplat::model::subsplat::SubSplat;
 use subsplat::model::weights::Weights;
 use subsplat::model::{Backend, Views};
@@ -28,22 +31,33 @@ const CLASSES: [(&str, f64, f64); 4] = [
 const FLOPS_SHARE: f64 = 0.3;
 const BYTES_SHARE: f64 = 0.7;
 const CALL_S: f64 = 5e-6;
+/// Calls without arithmetic of their own, which a fusion with the call before could replace. All others are
+/// the minimum that the bytes are compared with.
+const FUSIBLE: [&str; 3] = ["elementwise copy", "elementwise sum", "elementwise activation"];
 
 struct Args {
     names: Vec<String>,
     side: usize,
     device: String,
     count: bool,
+    subgroups: bool,
 }
 
 fn parse() -> Result<Args> {
-    let mut args = Args { names: Vec::new(), side: 256, device: "gpu".to_owned(), count: false };
+    let mut args = Args {
+        names: Vec::new(),
+        side: 256,
+        device: "gpu".to_owned(),
+        count: false,
+        subgroups: false,
+    };
     let mut words = std::env::args().skip(1);
     while let Some(word) = words.next() {
         let mut value = || words.next().with_context(|| format!("{word}: expected a value"));
         match word.as_str() {
             "--bench" => {}
             "--count" => args.count = true,
+            "--subgroups" => args.subgroups = true,
             "--side" => args.side = value()?.parse().context("--side")?,
             "--device" => args.device = value()?,
             other if other.starts_with('-') => bail!("unknown option {other}"),
@@ -76,6 +90,7 @@ fn pass(network: &SubSplat, views: &Views) -> Result<(f64, BTreeMap<&'static str
     for (name, own) in &mut work {
         let was = before.get(name).copied().unwrap_or_default();
         own.calls -= was.calls;
+        own.full_calls -= was.full_calls;
         own.workgroups -= was.workgroups;
         own.flops -= was.flops;
         own.bytes -= was.bytes;
@@ -95,20 +110,32 @@ fn report(name: &str, config: &Config, args: &Args) -> Result<()> {
     let (seconds, work) = pass(&network, &views)?;
     ensure!(backend.warning().is_none(), "{name}: {}", backend.warning().unwrap_or_default());
     println!("{name}, two pictures of {0}x{0}, on {1}", args.side, gpu.adapter());
-    println!("{:22} {:>6} {:>11} {:>9} {:>9}", "kernel", "calls", "workgroups", "GFLOP", "MB");
+    let heads = ["calls", "full", "workgroups", "GFLOP", "MB"];
+    let [calls, full, workgroups, flops, bytes] = heads;
+    println!("{:22} {calls:>6} {full:>6} {workgroups:>11} {flops:>9} {bytes:>9}", "kernel");
     let line = |name: &str, w: &Work| {
         let (flops, bytes) = (w.flops as f64 / 1e9, w.bytes as f64 / 1e6);
-        println!("{name:22} {:>6} {:>11} {flops:>9.2} {bytes:>9.1}", w.calls, w.workgroups);
+        let Work { calls, full_calls, workgroups, .. } = w;
+        println!("{name:22} {calls:>6} {full_calls:>6} {workgroups:>11} {flops:>9.2} {bytes:>9.1}");
     };
     let mut sum = Work::default();
     for (name, own) in &work {
         line(name, own);
         sum.calls += own.calls;
+        sum.full_calls += own.full_calls;
         sum.workgroups += own.workgroups;
         sum.flops += own.flops;
         sum.bytes += own.bytes;
     }
     line("sum", &sum);
+    let full = 100.0 * sum.full_calls as f64 / sum.calls as f64;
+    println!("{full:.0} % of the calls have at least {FULL_GRID} workgroups, which fill an H200");
+    let minimum: u64 =
+        work.iter().filter(|(n, _)| !FUSIBLE.contains(n)).map(|(_, w)| w.bytes).sum();
+    println!(
+        "{:.2} times the bytes without copies, sums and activations",
+        sum.bytes as f64 / minimum as f64
+    );
     let memory = gpu.peak_allocated_bytes() as f64 / 1048576.0;
     match args.count {
         true => println!("{memory:.0} MiB of device memory at most; nothing was executed"),
@@ -125,8 +152,76 @@ fn report(name: &str, config: &Config, args: &Args) -> Result<()> {
     Ok(())
 }
 
+/// Calls of one measurement, and measurements of each device, of which the fastest counts.
+const CALLS: usize = 10;
+const REPEATS: usize = 7;
+
+/// A kernel on arrays of its device: gradients have the last one as the upstream gradient.
+type Call = fn(&[DeviceArray; 4]) -> Result<(), GpuError>;
+
+const REDUCTIONS: [(&str, [usize; 4], Call); 6] = [
+    ("group norm", [2, 64, 128, 128], |[x, f, s, _]| {
+        x.group_norm(8, Some([f, s]), PointwiseFunction::Silu).map(drop)
+    }),
+    ("group norm backward", [2, 64, 64, 64], |[x, f, s, dy]| {
+        x.group_norm_backward(8, Some([f, s]), PointwiseFunction::Silu, dy).map(drop)
+    }),
+    ("layer norm", [1, 128, 64, 128], |[x, f, s, _]| {
+        x.reshape(&[64 * 128, 128])?.layer_norm([f, s]).map(drop)
+    }),
+    ("layer norm backward", [1, 128, 64, 128], |[x, f, _, dy]| {
+        let rows = |a: &DeviceArray| a.reshape(&[64 * 128, 128]);
+        rows(x)?.layer_norm_backward(f, &rows(dy)?).map(drop)
+    }),
+    ("softmax of 32", [64, 64, 16, 32], |[x, ..]| x.softmax().map(drop)),
+    ("softmax of 1024", [1, 64, 32, 1024], |[x, ..]| x.softmax().map(drop)),
+];
+
+/// Prints the times of kernels with two sources on the adapter, with and without subgroup operations.
+fn report_subgroups() -> Result<()> {
+    let with = subsplat_test_support::gpu::gpu().context("expected a GPU")?;
+    let without = subsplat_test_support::gpu::without_subgroups().context("expected a GPU")?;
+    ensure!(with.has_subgroups(), "{}: expected subgroup operations", with.adapter());
+    println!(
+        "{:22} {:>12} {:>12}   ms a call, {}",
+        "kernel",
+        "subgroups",
+        "without",
+        with.adapter()
+    );
+    for (name, dims, call) in REDUCTIONS {
+        let arrays = |gpu: &Arc<Gpu>| -> Result<_> {
+            let recorder = Recorder::new(gpu.clone());
+            let numbers = |n: usize| (0..n).map(|i| (i as f32 * 0.37).sin()).collect::<Vec<_>>();
+            let upload = |dims: &[usize]| recorder.upload(&numbers(dims.iter().product()), dims);
+            let channels = [dims[1]];
+            Ok([upload(&dims)?, upload(&channels)?, upload(&channels)?, upload(&dims)?])
+        };
+        let devices = [arrays(&with)?, arrays(&without)?];
+        let mut best = [f64::INFINITY; 2];
+        for _ in 0..=REPEATS {
+            for (arrays, best) in devices.iter().zip(&mut best) {
+                let recorder = arrays[0].recorder();
+                recorder.finish()?;
+                let start = Instant::now();
+                for _ in 0..CALLS {
+                    call(arrays)?;
+                }
+                recorder.finish()?;
+                *best = best.min(start.elapsed().as_secs_f64());
+            }
+        }
+        let [own, other] = best.map(|s| 1e3 * s / CALLS as f64);
+        println!("{name:22} {own:>12.3} {other:>12.3}");
+    }
+    Ok(())
+}
+
 fn main() -> Result<()> {
     let args = parse()?;
+    if args.subgroups {
+        return report_subgroups();
+    }
     let all = [
         ("small", Weights::shipped(2)?.config().context("the weights' configuration")?.clone()),
         ("mvsplat", Config::re10k(Preset::Tuned, 2)),

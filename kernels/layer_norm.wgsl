@@ -8,21 +8,22 @@
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) thread: u32,
+    place: Place,
 ) {
+    let thread = thread_of(place);
     let row = workgroup_number(workgroup, workgroups);
     let base = min(row, call.rows - 1u) * call.length;
     var own = 0.0;
     for (var i = thread; i < call.length; i += THREADS) {
         own += x[base + i];
     }
-    let mean = total(own, thread) / f32(call.length);
+    let mean = total(own, place) / f32(call.length);
     own = 0.0;
     for (var i = thread; i < call.length; i += THREADS) {
         let away = x[base + i] - mean;
         own += away * away;
     }
-    let scale = 1.0 / sqrt(total(own, thread) / f32(call.length) + call.epsilon);
+    let scale = 1.0 / sqrt(total(own, place) / f32(call.length) + call.epsilon);
     if row >= call.rows {
         return;
     }

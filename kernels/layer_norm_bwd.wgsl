@@ -11,8 +11,9 @@
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) thread: u32,
+    place: Place,
 ) {
+    let thread = thread_of(place);
     let row = workgroup_number(workgroup, workgroups);
     let base = min(row, call.rows - 1u) * call.length;
     let length = f32(call.length);
@@ -20,20 +21,20 @@ fn main(
     for (var i = thread; i < call.length; i += THREADS) {
         own += x[base + i];
     }
-    let mean = total(own, thread) / length;
+    let mean = total(own, place) / length;
     own = 0.0;
     for (var i = thread; i < call.length; i += THREADS) {
         let away = x[base + i] - mean;
         own += away * away;
     }
-    let scale = 1.0 / sqrt(total(own, thread) / length + call.epsilon);
+    let scale = 1.0 / sqrt(total(own, place) / length + call.epsilon);
     var sums = vec2<f32>();
     for (var i = thread; i < call.length; i += THREADS) {
         let d = dy[base + i] * factors[i];
         sums += vec2<f32>(d, d * (x[base + i] - mean) * scale);
     }
-    let of_mean = total(sums.x, thread) / length;
-    let of_scale = total(sums.y, thread) / length;
+    let of_mean = total(sums.x, place) / length;
+    let of_scale = total(sums.y, place) / length;
     if row >= call.rows {
         return;
     }

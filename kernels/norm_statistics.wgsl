@@ -7,8 +7,9 @@
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) thread: u32,
+    place: Place,
 ) {
+    let thread = thread_of(place);
     let number = workgroup_number(workgroup, workgroups);
     let row = min(number / call.parts, call.rows - 1u);
     let first = number % call.parts * PART;
@@ -18,13 +19,13 @@ fn main(
     for (var i = thread; i < count; i += THREADS) {
         own += x[base + i];
     }
-    let mean = total(own, thread) / f32(count);
+    let mean = total(own, place) / f32(count);
     own = 0.0;
     for (var i = thread; i < count; i += THREADS) {
         let away = x[base + i] - mean;
         own += away * away;
     }
-    let squares = total(own, thread);
+    let squares = total(own, place);
     if thread == 0u && number < call.rows * call.parts {
         statistics[number] = vec2<f32>(mean, squares);
     }

@@ -8,8 +8,9 @@
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) thread: u32,
+    place: Place,
 ) {
+    let thread = thread_of(place);
     let number = workgroup_number(workgroup, workgroups);
     let part = channel_part(number);
     var sum = vec2<f32>();
@@ -17,8 +18,8 @@ fn main(
         let own = normalised(part, part.base + i);
         sum += vec2<f32>(own.y, own.y * own.x);
     }
-    let of_summand = total(sum.x, thread);
-    let of_factor = total(sum.y, thread);
+    let of_summand = total(sum.x, place);
+    let of_factor = total(sum.y, place);
     if thread == 0u && number < all_channels() * call.channel_parts {
         sums[number] = vec2<f32>(of_summand, of_factor);
     }

@@ -6,20 +6,21 @@
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) thread: u32,
+    place: Place,
 ) {
+    let thread = thread_of(place);
     let row = workgroup_number(workgroup, workgroups);
     let base = min(row, call.rows - 1u) * call.length;
     var own = x[base];
     for (var i = thread; i < call.length; i += THREADS) {
         own = max(own, x[base + i]);
     }
-    let most = largest(own, thread);
+    let most = largest(own, place);
     own = 0.0;
     for (var i = thread; i < call.length; i += THREADS) {
         own += exp(x[base + i] - most);
     }
-    let sum = total(own, thread);
+    let sum = total(own, place);
     if row >= call.rows {
         return;
     }

@@ -1,7 +1,8 @@
 //! One opened GPU: device, queue, limits, and the errors that its driver reports.
 //!
 //! [`Gpu::open`] requests WebGPU's default limits, so that the kernels also run in a browser.
-//! Only the sizes of bindings, buffers and textures are those of the adapter ([`limits_of`]).
+//! Only the sizes of bindings, buffers and textures are those of the adapter ([`limits_of`]). Timestamps
+//! and subgroup operations are used where the adapter has them ([`features_of`]).
 //! [`Gpu::from_device`] takes an application's own device.
 
 use crate::device::DeviceChoice;
@@ -31,6 +32,38 @@ pub fn limits_of(adapter: &wgpu::Adapter) -> wgpu::Limits {
     }
 }
 
+/// The environment variable that turns subgroup operations off.
+const SUBGROUPS_VARIABLE: &str = "SUBSPLAT_SUBGROUPS";
+/// Kernels use subgroup operations. naga 30 reads no `enable subgroups;`, without which a browser refuses
+/// them, so there they are never used.
+const USES_SUBGROUPS: bool = !cfg!(all(target_family = "wasm", target_os = "unknown"));
+
+/// Returns the features that [`Gpu::open`] requests: timestamps and subgroup operations where the adapter
+/// has them. The environment variable `SUBSPLAT_SUBGROUPS=off` leaves out the second.
+///
+/// # Errors
+/// [`GpuError::Argument`] for another value of `SUBSPLAT_SUBGROUPS`.
+pub fn features_of(adapter: &wgpu::Adapter) -> Result<wgpu::Features, GpuError> {
+    let mut wanted = wgpu::Features::TIMESTAMP_QUERY;
+    let value = std::env::var_os(SUBGROUPS_VARIABLE).unwrap_or_default();
+    wanted.set(wgpu::Features::SUBGROUP, subgroups_allowed(&value.to_string_lossy())?);
+    Ok(adapter.features() & wanted)
+}
+
+/// Returns whether a value of `SUBSPLAT_SUBGROUPS` allows subgroup operations.
+fn subgroups_allowed(value: &str) -> Result<bool, GpuError> {
+    match value {
+        "" => Ok(USES_SUBGROUPS),
+        "off" => Ok(false),
+        _ => Err(GpuError::Argument {
+            kernel: "device",
+            argument: SUBGROUPS_VARIABLE,
+            expected: "off, or no value".to_owned(),
+            got: value.to_owned(),
+        }),
+    }
+}
+
 /// An opened GPU with its buffers and compiled kernels. Threads share it in an [`Arc`].
 pub struct Gpu {
     pub(crate) device: wgpu::Device,
@@ -42,6 +75,7 @@ pub struct Gpu {
     pub(crate) pairs: AtomicUsize,
     summary: AdapterSummary,
     timestamps: bool,
+    subgroups: bool,
     health: Arc<Health>,
 }
 
@@ -58,6 +92,7 @@ impl fmt::Debug for Gpu {
         f.debug_struct("Gpu")
             .field("adapter", &self.summary)
             .field("timestamps", &self.timestamps)
+            .field("subgroups", &self.subgroups)
             .field("lost", &self.health.lost.get())
             .finish_non_exhaustive()
     }
@@ -68,7 +103,7 @@ impl Gpu {
     ///
     /// # Errors
     /// [`GpuError::NoAdapter`] where `choice` requires a GPU and no adapter matches;
-    /// [`GpuError::Device`] where the driver opens no device.
+    /// [`GpuError::Device`] where the driver opens no device; [`features_of`].
     pub fn open(choice: &DeviceChoice) -> Result<Option<Arc<Self>>, GpuError> {
         match find(choice)? {
             Some(adapter) => Self::from_adapter(&adapter).map(|gpu| Some(Arc::new(gpu))),
@@ -78,10 +113,9 @@ impl Gpu {
 
     fn from_adapter(adapter: &wgpu::Adapter) -> Result<Self, GpuError> {
         let summary = AdapterSummary::of(&adapter.get_info());
-        let timestamps = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("subsplat"),
-            required_features: timestamps,
+            required_features: features_of(adapter)?,
             required_limits: limits_of(adapter),
             ..wgpu::DeviceDescriptor::default()
         };
@@ -99,7 +133,7 @@ impl Gpu {
     }
 
     /// Wraps a device of the application, which keeps its own error handler. Frames can be drawn
-    /// to textures of that device. In a browser the device's errors reach that handler alone.
+    /// to textures of that device. Kernels use the features that it was opened with. In a browser the device's errors reach that handler alone.
     pub fn from_device(device: wgpu::Device, queue: wgpu::Queue) -> Arc<Self> {
         let summary = AdapterSummary::of(&device.adapter_info());
         Arc::new(Self::assemble(device, queue, summary, Arc::default()))
@@ -118,6 +152,7 @@ impl Gpu {
         });
         let limits = device.limits();
         let timestamps = device.features().contains(wgpu::Features::TIMESTAMP_QUERY);
+        let subgroups = USES_SUBGROUPS && device.features().contains(wgpu::Features::SUBGROUP);
         let pool = Pool::new(&limits);
         Self {
             device,
@@ -128,6 +163,7 @@ impl Gpu {
             pairs: AtomicUsize::new(0),
             summary,
             timestamps,
+            subgroups,
             health,
         }
     }
@@ -156,6 +192,11 @@ impl Gpu {
     /// Returns whether the device supports timestamps.
     pub fn has_timestamps(&self) -> bool {
         self.timestamps
+    }
+
+    /// Returns whether kernels use subgroup operations.
+    pub fn has_subgroups(&self) -> bool {
+        self.subgroups
     }
 
     /// Checks that the device is usable.
@@ -200,4 +241,20 @@ pub(super) fn single_line(error: &impl fmt::Display) -> String {
     let text = error.to_string();
     let lines = text.lines().map(|l| l.trim().trim_end_matches('.'));
     lines.filter(|l| !l.is_empty() && *l != "Caused by:").collect::<Vec<_>>().join(": ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_variable_turns_subgroups_off() {
+        assert_eq!(subgroups_allowed("off"), Ok(false));
+        assert_eq!(subgroups_allowed(""), Ok(USES_SUBGROUPS));
+        let error = subgroups_allowed("no").unwrap_err().to_string();
+        assert!(
+            error.contains("SUBSPLAT_SUBGROUPS: expected off") && error.ends_with("got no"),
+            "{error}"
+        );
+    }
 }

@@ -87,15 +87,15 @@ pub use crate::device::DeviceChoice;
 pub use adapter::{AdapterSummary, adapters, choose, find_for, instance};
 pub use array::{
     ADAM_BLOCK, AdamCall, AdapterCall, AdapterView, AttentionCall, ConvolutionCall, CrossCheckCall,
-    DepthConsensusCall, DeviceArray, Function, HeadOutputCall, PointwiseFunction, RawMatchingCall,
-    Recorder, Reduction, Work,
+    DepthConsensusCall, DeviceArray, FULL_GRID, Function, HeadOutputCall, PointwiseFunction,
+    RawMatchingCall, Recorder, Reduction, Work,
 };
 pub use attention_gather::AttentionGatherArgs;
 pub use attention_gather_bwd::AttentionGatherGradients;
 pub use buffers::{Buffer, ReadBacks};
-pub use device::{Gpu, limits_of};
+pub use device::{Gpu, features_of, limits_of};
 pub use error::GpuError;
-pub use pipelines::{Access, Kernel};
+pub use pipelines::{Access, Kernel, Source};
 pub use plane_sweep::PlaneSweepArgs;
 pub use raster_bwd::Frame;
 pub use rasterize::Rasterizer;

@@ -3,19 +3,47 @@
 //! The source of a kernel is the concatenation of files under `kernels/`: shared files
 //! (`kernels/shared`) first, then its own file. There is no preprocessor. Binding i of group 0 is
 //! argument i.
+//!
+//! A kernel that reduces over a workgroup has two sources, which differ in one shared file: with subgroup
+//! operations for devices that have them, and without for all others ([`Source`]).
 
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Concatenates files under `kernels/`.
+/// Concatenates files under `kernels/` to a [`Source`]. `[a | b]` is file a without subgroups, b with them.
 macro_rules! wgsl {
     ($($file:literal),+ $(,)?) => {
+        $crate::gpu::pipelines::Source { plain: wgsl!(@joined $($file),+), subgroups: None }
+    };
+    ($($file:literal),+ , [$plain:literal | $subgroups:literal], $($last:literal),+ $(,)?) => {
+        $crate::gpu::pipelines::Source {
+            plain: wgsl!(@joined $($file,)+ $plain, $($last),+),
+            subgroups: Some(wgsl!(@joined $($file,)+ $subgroups, $($last),+)),
+        }
+    };
+    (@joined $($file:literal),+) => {
         concat!($(include_str!(concat!(env!("CARGO_MANIFEST_DIR"), "/kernels/", $file, ".wgsl"))),+)
     };
 }
 pub(crate) use wgsl;
+
+/// WGSL source of a kernel, shared files included.
+#[derive(Clone, Copy, Debug)]
+pub struct Source {
+    /// Source without subgroup operations.
+    pub plain: &'static str,
+    /// Source with subgroup operations, for kernels that use them.
+    pub subgroups: Option<&'static str>,
+}
+
+impl Source {
+    /// Returns the source for devices with or without subgroup operations.
+    pub fn of(&self, subgroups: bool) -> &'static str {
+        self.subgroups.filter(|_| subgroups).unwrap_or(self.plain)
+    }
+}
 
 /// Access of a kernel to an argument.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -35,8 +63,8 @@ pub struct Kernel {
     pub name: &'static str,
     /// Entry point.
     pub entry: &'static str,
-    /// WGSL source, shared files included.
-    pub source: &'static str,
+    /// WGSL source.
+    pub source: Source,
     /// Arguments in the order of their bindings. At most 8 are storage buffers (WebGPU's default
     /// limit).
     pub bindings: &'static [Access],
@@ -94,7 +122,8 @@ impl Gpu {
     }
 
     /// Returns the compiled module of a kernel's file. Errors go to the open error scope.
-    pub(crate) fn module(&self, name: &'static str, source: &'static str) -> wgpu::ShaderModule {
+    pub(crate) fn module(&self, kernel: &'static Kernel) -> wgpu::ShaderModule {
+        let (name, source) = (kernel.name, kernel.source.of(self.has_subgroups()));
         let mut modules = self.pipelines.modules.lock().unwrap_or_else(PoisonError::into_inner);
         let compile = || {
             self.device.create_shader_module(wgpu::ShaderModuleDescriptor {
@@ -107,7 +136,7 @@ impl Gpu {
 
     fn build(&self, kernel: &'static Kernel, constants: Constants) -> Pipeline {
         let label = kernel.label();
-        let module = self.module(kernel.name, kernel.source);
+        let module = self.module(kernel);
         let layout = layout(&self.device, kernel, wgpu::ShaderStages::COMPUTE);
         let whole = self.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
             label: Some(&label),

@@ -7,7 +7,7 @@ use crate::gpu::commands::Commands;
 use crate::gpu::device::Gpu;
 use crate::gpu::error::GpuError;
 use crate::gpu::frame::{Channels, pixels, uniform};
-use crate::gpu::pipelines::{Access, Kernel, layout};
+use crate::gpu::pipelines::{Access, Kernel, layout, wgsl};
 use crate::gpu::rasterize::Rasterizer;
 use crate::gpu::scene::Scene;
 use std::sync::PoisonError;
@@ -15,7 +15,7 @@ use std::sync::PoisonError;
 pub(crate) static SHOW: Kernel = Kernel {
     name: "show",
     entry: "fragment",
-    source: include_str!("../../kernels/show.wgsl"),
+    source: wgsl!("show"),
     bindings: &[Access::Uniform, Access::Read],
 };
 
@@ -151,7 +151,7 @@ impl Gpu {
     }
 
     fn build_show(&self, format: wgpu::TextureFormat) -> wgpu::RenderPipeline {
-        let module = self.module(SHOW.name, SHOW.source);
+        let module = self.module(&SHOW);
         let group = layout(&self.device, &SHOW, wgpu::ShaderStages::FRAGMENT);
         let whole = self.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
             label: Some(SHOW.name),

@@ -16,4 +16,5 @@ mod redistribute;
 mod scenes;
 mod shaders;
 mod spgr;
+mod subgroups;
 mod training;

@@ -174,9 +174,16 @@ fn parse(source: &str) -> Result<Module, String> {
     naga::front::wgsl::parse_str(source).map_err(|e| e.emit_to_string(source))
 }
 
-fn validate(source: &str) -> Result<Module, String> {
+/// Returns the sources of a kernel, and what each needs of a device.
+fn sources(kernel: &Kernel) -> impl Iterator<Item = (&'static str, Capabilities)> {
+    let plain = (kernel.source.plain, Capabilities::empty());
+    let subgroups = kernel.source.subgroups.map(|source| (source, Capabilities::SUBGROUP));
+    std::iter::once(plain).chain(subgroups)
+}
+
+fn validate(source: &str, capabilities: Capabilities) -> Result<Module, String> {
     let module = parse(source)?;
-    let mut validator = Validator::new(ValidationFlags::all(), Capabilities::empty());
+    let mut validator = Validator::new(ValidationFlags::all(), capabilities);
     validator.validate(&module).map_err(|e| e.emit_to_string(source))?;
     Ok(module)
 }
@@ -255,7 +262,7 @@ fn uniform_differences(module: &Module) -> (Vec<String>, BTreeSet<String>) {
 fn uniforms_match_abi() {
     let mut seen = BTreeSet::new();
     for kernel in KERNELS {
-        let (wrong, names) = uniform_differences(&parse(kernel.source).unwrap());
+        let (wrong, names) = uniform_differences(&parse(kernel.source.plain).unwrap());
         assert_eq!(wrong, Vec::<String>::new(), "{}", kernel.name);
         seen.extend(names);
     }
@@ -264,8 +271,9 @@ fn uniforms_match_abi() {
     let redistribute = KERNELS.iter().find(|k| k.name == "redistribute").unwrap();
     let swapped = redistribute
         .source
+        .plain
         .replace("parents: u32,\n    children: u32,", "children: u32, parents: u32,");
-    assert_ne!(swapped, redistribute.source);
+    assert_ne!(swapped, redistribute.source.plain);
     assert_eq!(uniform_differences(&parse(&swapped).unwrap()).0.len(), 1, "swapped fields pass");
 }
 
@@ -302,14 +310,16 @@ fn workgroup(kernel: &Kernel, module: &Module) -> (u32, u32) {
 
 fn check_kernel(kernel: &Kernel) {
     let name = kernel.name;
-    let module = validate(kernel.source).unwrap_or_else(|e| panic!("{name}: {e}"));
-    let ours: BTreeMap<u32, Access> = (0..).zip(kernel.bindings.iter().copied()).collect();
-    assert_eq!(arguments(&module), ours, "{name}: arguments");
-    let storage = kernel.bindings.iter().filter(|a| **a != Access::Uniform).count();
-    assert!(storage <= STORAGE_MAX, "{name}: {storage} storage buffers");
-    let (threads, bytes) = workgroup(kernel, &module);
-    assert!(threads <= THREADS_MAX, "{name}: {threads} threads");
-    assert!(bytes <= WORKGROUP_BYTES_MAX, "{name}: {bytes} bytes of workgroup memory");
+    for (source, capabilities) in sources(kernel) {
+        let module = validate(source, capabilities).unwrap_or_else(|e| panic!("{name}: {e}"));
+        let ours: BTreeMap<u32, Access> = (0..).zip(kernel.bindings.iter().copied()).collect();
+        assert_eq!(arguments(&module), ours, "{name}: arguments");
+        let storage = kernel.bindings.iter().filter(|a| **a != Access::Uniform).count();
+        assert!(storage <= STORAGE_MAX, "{name}: {storage} storage buffers");
+        let (threads, bytes) = workgroup(kernel, &module);
+        assert!(threads <= THREADS_MAX, "{name}: {threads} threads");
+        assert!(bytes <= WORKGROUP_BYTES_MAX, "{name}: {bytes} bytes of workgroup memory");
+    }
 }
 
 /// Stages of the table in src/gpu/mod.rs, and their largest kernel.
@@ -333,7 +343,7 @@ fn stage_differences(docs: &str) -> Vec<&'static str> {
     let rows: Vec<_> = docs.lines().map(cells).filter(|c| c.len() == 8).collect();
     let wrong = |(stage, name): &(&str, &str)| {
         let kernel = KERNELS.iter().find(|k| k.name == *name).unwrap();
-        let (threads, bytes) = workgroup(kernel, &parse(kernel.source).unwrap());
+        let (threads, bytes) = workgroup(kernel, &parse(kernel.source.plain).unwrap());
         let concurrent = |most: u32, memory: u32| (most / threads).min(memory / bytes.max(1));
         let expected = [
             threads.to_string(),
@@ -365,7 +375,22 @@ fn every_kernel_is_valid_and_within_the_default_limits() {
     for kernel in KERNELS {
         check_kernel(kernel);
     }
-    assert!(validate("fn f() -> f32 { return 1u; }").is_err(), "naga accepts invalid WGSL");
+    let none = Capabilities::empty();
+    assert!(validate("fn f() -> f32 { return 1u; }", none).is_err(), "naga accepts invalid WGSL");
+}
+
+/// No device without subgroup operations compiles a kernel that needs them, and the other source of such a
+/// kernel uses them.
+#[test]
+fn subgroup_operations_are_in_their_own_source() {
+    let both: Vec<_> = KERNELS.iter().filter(|k| k.source.subgroups.is_some()).collect();
+    assert!(!both.is_empty());
+    for kernel in both {
+        for (source, needs) in sources(kernel) {
+            let without = validate(source, Capabilities::empty());
+            assert_eq!(without.is_err(), needs == Capabilities::SUBGROUP, "{}", kernel.name);
+        }
+    }
 }
 
 /// Returns the stems of the files of a folder with this extension.
@@ -410,6 +435,9 @@ fn every_kernel_has_a_cpu_version() {
 fn shared_files_are_used() {
     for stem in stems("kernels/shared", "wgsl") {
         let text = fs::read_to_string(root().join(format!("kernels/shared/{stem}.wgsl"))).unwrap();
-        assert!(KERNELS.iter().any(|k| k.source.contains(&text)), "shared/{stem}.wgsl");
+        assert!(
+            KERNELS.iter().any(|k| sources(k).any(|(source, _)| source.contains(&text))),
+            "shared/{stem}.wgsl"
+        );
     }
 }

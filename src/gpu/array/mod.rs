@@ -89,11 +89,16 @@ pub struct Recorder {
     counts_only: AtomicBool,
 }
 
+/// Workgroups that occupy every core of the largest adapter of the table above at once (an H200: 132 cores).
+pub const FULL_GRID: u64 = 132;
+
 /// Work of all calls of one kernel, counted from their sizes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Work {
     /// Calls.
     pub calls: u64,
+    /// Calls of at least [`FULL_GRID`] workgroups.
+    pub full_calls: u64,
     /// Workgroups.
     pub workgroups: u64,
     /// Additions and multiplications of convolutions, linear layers and attention; 0 for others.
@@ -175,7 +180,9 @@ impl Recorder {
         own.calls += 1;
         own.bytes += bindings.iter().map(|b| b.bytes).sum::<u64>();
         if let Groups::Of(sizes) = groups {
-            own.workgroups += sizes.iter().map(|n| u64::from(*n)).product::<u64>();
+            let workgroups = sizes.iter().map(|n| u64::from(*n)).product::<u64>();
+            own.workgroups += workgroups;
+            own.full_calls += u64::from(workgroups >= FULL_GRID);
         }
     }
 

@@ -11,7 +11,13 @@ use crate::gpu::pipelines::{Access, Kernel, wgsl};
 pub(crate) static NORM_STATISTICS: Kernel = Kernel {
     name: "norm_statistics",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/norm", "shared/sum", "norm_statistics"),
+    source: wgsl!(
+        "shared/grid",
+        "shared/norm",
+        "shared/sum",
+        ["shared/place" | "shared/place_subgroups"],
+        "norm_statistics"
+    ),
     bindings: &[Access::Uniform, Access::Read, Access::Write],
 };
 
@@ -38,7 +44,13 @@ pub(crate) static NORM_APPLY: Kernel = Kernel {
 pub(crate) static LAYER_NORM: Kernel = Kernel {
     name: "layer_norm",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/rows", "shared/sum", "layer_norm"),
+    source: wgsl!(
+        "shared/grid",
+        "shared/rows",
+        "shared/sum",
+        ["shared/place" | "shared/place_subgroups"],
+        "layer_norm"
+    ),
     bindings: &[Access::Uniform, Access::Read, Access::Read, Access::Read, Access::Write],
 };
 

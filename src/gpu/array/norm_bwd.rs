@@ -20,6 +20,7 @@ pub(crate) static NORM_SUMS_BWD: Kernel = Kernel {
         "shared/norm_read",
         "shared/norm_channel",
         "shared/sum",
+        ["shared/place" | "shared/place_subgroups"],
         "norm_sums_bwd"
     ),
     bindings: &[
@@ -59,7 +60,13 @@ pub(crate) static NORM_BWD: Kernel = Kernel {
 pub(crate) static LAYER_NORM_BWD: Kernel = Kernel {
     name: "layer_norm_bwd",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/rows", "shared/sum", "layer_norm_bwd"),
+    source: wgsl!(
+        "shared/grid",
+        "shared/rows",
+        "shared/sum",
+        ["shared/place" | "shared/place_subgroups"],
+        "layer_norm_bwd"
+    ),
     bindings: &[
         Access::Uniform,
         Access::Read,

@@ -19,7 +19,13 @@ pub(crate) static REDUCE: Kernel = Kernel {
 pub(crate) static SOFTMAX: Kernel = Kernel {
     name: "softmax",
     entry: "main",
-    source: wgsl!("shared/grid", "shared/rows", "shared/sum", "softmax"),
+    source: wgsl!(
+        "shared/grid",
+        "shared/rows",
+        "shared/sum",
+        ["shared/place" | "shared/place_subgroups"],
+        "softmax"
+    ),
     bindings: &[Access::Uniform, Access::Read, Access::Write],
 };
 

@@ -1,7 +1,7 @@
 //! The GPU that tests run on: any adapter, a software one too.
 
 use std::sync::{Arc, OnceLock};
-use subsplat::gpu::{DeviceChoice, Gpu};
+use subsplat::gpu::{DeviceChoice, Gpu, GpuError, features_of, find_for, instance, wgpu};
 
 /// The adapter, opened once, or `None`, loudly, where there is none.
 /// `SUBSPLAT_GPU=require` (CI) turns absence into failure.
@@ -26,15 +26,28 @@ pub fn gpu() -> Option<Arc<Gpu>> {
 
 /// The same adapter with a device of whose buffers at most `binding` bytes are bound.
 pub fn limited(binding: u64) -> Option<Arc<Gpu>> {
-    use subsplat::gpu::{find_for, instance, wgpu};
+    let limits =
+        wgpu::Limits { max_storage_buffer_binding_size: binding, ..wgpu::Limits::default() };
+    opened(limits, features_of)
+}
+
+/// The same adapter with a device without subgroup operations.
+pub fn without_subgroups() -> Option<Arc<Gpu>> {
+    opened(wgpu::Limits::default(), |adapter| {
+        Ok(features_of(adapter)?.difference(wgpu::Features::SUBGROUP))
+    })
+}
+
+fn opened(
+    required_limits: wgpu::Limits,
+    features: impl FnOnce(&wgpu::Adapter) -> Result<wgpu::Features, GpuError>,
+) -> Option<Arc<Gpu>> {
     gpu()?;
     let adapter = find_for(&instance(), &DeviceChoice::Gpu, None).unwrap().unwrap();
+    let required_features = features(&adapter).unwrap();
     let descriptor = wgpu::DeviceDescriptor {
-        required_features: adapter.features() & wgpu::Features::TIMESTAMP_QUERY,
-        required_limits: wgpu::Limits {
-            max_storage_buffer_binding_size: binding,
-            ..wgpu::Limits::default()
-        },
+        required_features,
+        required_limits,
         ..wgpu::DeviceDescriptor::default()
     };
     let (device, queue) = pollster::block_on(adapter.request_device(&descriptor)).unwrap();

@@ -4,7 +4,9 @@ use anyhow::{Context, Result, anyhow, ensure};
 use std::sync::{Arc, Mutex, PoisonError};
 use subsplat::abi::RasterOptions;
 use subsplat::camera::Camera;
-use subsplat::gpu::{DeviceChoice, Gpu, Rasterizer, Scene, find_for, instance, limits_of, wgpu};
+use subsplat::gpu::{
+    DeviceChoice, Gpu, Rasterizer, Scene, features_of, find_for, instance, limits_of, wgpu,
+};
 use subsplat::io::image::Rgb;
 use wgpu::CurrentSurfaceTexture as Current;
 use winit::window::Window;
@@ -78,10 +80,11 @@ fn configuration(
     })
 }
 
-/// Opens a device of `adapter` with the adapter's own limits, and a place for its errors.
+/// Opens a device of `adapter` with the adapter's own limits and features, and a place for its errors.
 fn device_of(adapter: &wgpu::Adapter) -> Result<(Arc<Gpu>, Fault)> {
     let descriptor = wgpu::DeviceDescriptor {
         label: Some("subsplat view"),
+        required_features: features_of(adapter)?,
         required_limits: limits_of(adapter),
         ..wgpu::DeviceDescriptor::default()
     };
