@@ -233,8 +233,8 @@ impl Kernel for ToRows<'_> {
                 let c = c.min(r - LANES);
                 let mut vectors = [s.splat(0.0); LANES];
                 for (j, v) in vectors.iter_mut().enumerate() {
-                    let plane = &planes[(c + j) * n + at..][..LANES];
-                    *v = S::F::load(plane.try_into().expect("16 floats")) + s.splat(start[c + j]);
+                    let pixels = &planes[(c + j) * n + at..].as_chunks().0[0];
+                    *v = s.load(pixels) + s.splat(start[c + j]);
                 }
                 S::F::store_rows(&vectors, layout, &mut rows[c..]);
             }
@@ -262,7 +262,7 @@ impl Kernel for ToPlanes<'_> {
         for at in (0..whole).step_by(LANES) {
             let vectors = S::F::load_rows::<CHANNELS>(&rows[at * r + first..], layout);
             for (v, plane) in vectors.iter().zip(planes.chunks_exact_mut(n)) {
-                v.store((&mut plane[at..at + LANES]).try_into().expect("16 floats"));
+                v.store(&mut plane[at..].as_chunks_mut().0[0]);
             }
         }
         for (c, plane) in planes.chunks_exact_mut(n).enumerate() {
