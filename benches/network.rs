@@ -44,17 +44,14 @@ mod pages;
 #[global_allocator]
 static PAGES: pages::Pages = pages::Pages;
 
-/// Candle's variable for the size of its own thread pool. `train` sets it to 1, since the pool's
-/// idle threads spin and take the cores from this crate's; so does the bench.
-const CANDLE_THREADS: &str = "CANDLE_NUM_THREADS";
+/// Restarts of the programs.
+#[path = "../tools/cli/src/commands/environment.rs"]
+#[allow(dead_code, reason = "the bench opens no GPU")]
+mod environment;
 
 fn main() -> Result<()> {
-    if std::env::var_os(CANDLE_THREADS).is_none() {
-        // Candle reads the variable once.
-        let mut again = std::process::Command::new(std::env::current_exe()?);
-        let status = again.args(std::env::args_os().skip(1)).env(CANDLE_THREADS, "1").status()?;
-        std::process::exit(status.code().unwrap_or(1));
-    }
+    // As `train` does: idle threads of candle's own pool spin, and take the cores from this crate's.
+    environment::restart_with("CANDLE_NUM_THREADS", || "1".into());
     let words: Vec<String> = std::env::args().collect();
     if let Some(at) = words.iter().position(|w| w == "--peak") {
         return peak_of(words.get(at + 1).map_or("", String::as_str));

@@ -26,12 +26,10 @@ struct CrossCheckUniform {
 
 // Returns the largest camera z of the 3x3 pixels around a position inside the picture.
 fn farthest(view: u32, at: vec2<f32>) -> f32 {
-    let middle = vec2<u32>(at);
-    let low = max(middle, vec2<u32>(1u)) - 1u;
-    let high = min(middle + 1u, vec2<u32>(call.width, call.height) - 1u);
+    let window = around(at);
     var most = 0.0;
-    for (var row = low.y; row <= high.y; row++) {
-        for (var column = low.x; column <= high.x; column++) {
+    for (var row = window.y; row <= window.w; row++) {
+        for (var column = window.x; column <= window.z; column++) {
             most = max(most, surface_z(view, vec2<u32>(column, row)));
         }
     }

@@ -19,20 +19,21 @@
 //! One step draws one photograph, in an order that depends on their number only. The same input
 //! gives the same bytes on any number of threads, unless [`RefineOptions::time`] limits the steps.
 
+mod adam;
 mod removal;
 
 pub(crate) use removal::{Groups, LEAST_SHARE, PHOTOGRAPHS_TO_REMOVE, shares};
 
 use crate::abi::{
-    Geometry, Gradients, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, RasterOptions, SCALE_OFFSET,
-    SPLAT_STRIDE, SplatSlices, gain_with_offsets, sh_coefficients,
+    Geometry, Gradients, MEAN_OFFSET, OPACITY_OFFSET, RasterOptions, SPLAT_STRIDE, SplatSlices,
+    gain_with_offsets, sh_coefficients,
 };
 use crate::camera::Camera;
-use crate::cpu::simd::vectorize;
 use crate::fit::{FitError, FitView, Target};
 use crate::loss::{Scored, mse};
 use crate::render::Renderer;
 use crate::splats::Splats;
+use adam::{BETAS, State, Step, rates};
 use glam::Vec3;
 use rayon::prelude::*;
 use removal::pruned;
@@ -153,42 +154,15 @@ impl RefineReport {
     }
 }
 
-/// The rates fall by a cosine from 1 + this to this.
-const RATE_FLOOR: f32 = 0.05;
 /// Rounds of all photographs between two measurements of the error, in the second half.
 const ROUNDS_PER_CHECK: usize = 4;
 /// The steps end where the error has not fallen by this share since the last measurement.
 const LEAST_GAIN: f64 = 1e-3;
-/// Decay rates of Adam's means of the gradient and of its square.
-const BETAS: [f32; 2] = [0.9, 0.99];
-/// Keeps the quotient of a Gaussian without gradient finite.
-const EPSILON: f32 = 1e-15;
 /// Coverage up to which a picture of the other photograph's Gaussians does not count; above it,
 /// the weight of a pixel grows linearly to 1.
 const COVERAGE_MIN: f32 = 0.7;
-/// Opacities are moved into [this, 1 − this], where the logit is finite.
-const OPACITY_MARGIN: f32 = 1e-3;
-/// Least and largest Δ ln σ.
-const LOG_SCALE_LIMITS: [f32; 2] = [-2.0, 1.0];
 /// Gaussians per parallel task.
 const CHUNK: usize = 4096;
-
-/// Parameters of one Gaussian: logit of the opacity; as differences from the predicted ones, ln σ
-/// (3), colour offset (3), mean in [`Refiner::units`] (3), quaternion (4).
-const PARAMETERS: usize = 14;
-const LOGIT: usize = 0;
-const LOG_SCALE: usize = 1;
-const COLOUR: usize = 4;
-const MEAN: usize = 7;
-const ROTATION: usize = 10;
-
-/// One Gaussian's parameters with Adam's state.
-#[derive(Clone, Copy, Default)]
-struct State {
-    value: [f32; PARAMETERS],
-    mean: [f32; PARAMETERS],
-    square: [f32; PARAMETERS],
-}
 
 /// Weight of each pixel of planes `[5, H, W]` by its coverage, 0 to 1.
 fn coverage_weights(planes: &[f32], pixels: usize) -> impl Iterator<Item = f32> + '_ {
@@ -261,12 +235,7 @@ impl<'a> Refiner<'a> {
     ) -> Result<Self, FitError> {
         let target = |(i, v): (usize, &FitView<'a>)| Target::new(i, v, options.dssim);
         let mut rows = splats.rows.clone();
-        let mut states = vec![State::default(); splats.len()];
-        for (row, state) in rows.chunks_exact_mut(SPLAT_STRIDE).zip(&mut states) {
-            let alpha = row[OPACITY_OFFSET].clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN);
-            row[OPACITY_OFFSET] = alpha;
-            state.value[LOGIT] = (alpha / (1.0 - alpha)).ln();
-        }
+        let states = rows.chunks_exact_mut(SPLAT_STRIDE).map(State::of).collect();
         Ok(Self {
             predicted: splats,
             groups: Groups::equal(splats, views.len(), options),
@@ -373,48 +342,16 @@ impl<'a> Refiner<'a> {
 
     /// One step of Adam with the last gradients.
     fn update(&mut self) {
-        let rates = rates(&self.options, self.progress());
-        let Self { predicted, options, units, states, rows, gain, gradients, step, .. } = self;
-        let (across, other) = (&self.across.rows, &self.other);
-        let n = i32::try_from(*step).unwrap_or(i32::MAX);
-        let correction = BETAS.map(|b| 1.0 - b.powi(n));
-        let channels = predicted.gain_channels();
-        let rows = rows.par_chunks_mut(CHUNK * SPLAT_STRIDE).zip(gain.par_chunks_mut(CHUNK * 4));
-        let parts = states.par_chunks_mut(CHUNK).zip(rows).enumerate();
-        parts.for_each(|(part, (states, (rows, gain)))| {
-            vectorize(
-                #[inline(always)]
-                || {
-                    let rows = rows.chunks_exact_mut(SPLAT_STRIDE).zip(gain.chunks_exact_mut(4));
-                    for (i, (state, (row, gain))) in states.iter_mut().zip(rows).enumerate() {
-                        let i = part * CHUNK + i;
-                        let (at, unit) = (i * SPLAT_STRIDE..(i + 1) * SPLAT_STRIDE, units[i]);
-                        let by_row = &gradients.rows[at.clone()];
-                        let by_gain = &gradients.gain[4 * i..4 * i + 4];
-                        let mut gradient = by_parameters(row, by_row, by_gain, unit);
-                        if other.contains(&i) {
-                            let at = (i - other.start) * SPLAT_STRIDE;
-                            let by_row = &across[at..at + SPLAT_STRIDE];
-                            let second = by_parameters(row, by_row, &[0.0; 4], unit);
-                            for (sum, g) in gradient.iter_mut().zip(second) {
-                                *sum += options.across * g;
-                            }
-                        }
-                        // Adam's state of a Gaussian that no pixel shows stays as it is.
-                        let zero = gradient.iter().all(|g| *g == 0.0);
-                        if zero || gradient.iter().any(|g| !g.is_finite()) {
-                            continue;
-                        }
-                        state.advance(&gradient, &rates, correction);
-                        let offsets: [f32; 3] = match channels {
-                            4 => std::array::from_fn(|c| predicted.gain[4 * i + 1 + c]),
-                            _ => [0.0; 3],
-                        };
-                        state.write(&predicted.rows[at], offsets, unit, row, gain);
-                    }
-                },
-            );
-        });
+        let n = i32::try_from(self.step).unwrap_or(i32::MAX);
+        let step = Step {
+            predicted: self.predicted,
+            units: &self.units,
+            gradients: &self.gradients,
+            across: (&self.across.rows, self.other.clone(), self.options.across),
+            rates: rates(&self.options, self.progress()),
+            correction: BETAS.map(|b| 1.0 - b.powi(n)),
+        };
+        step.take(&mut self.states, &mut self.rows, &mut self.gain);
     }
 }
 
@@ -535,84 +472,6 @@ fn part_of<'s>(slices: SplatSlices<'s>, range: &Range<usize>) -> SplatSlices<'s>
         sh: &slices.sh[parents.start * set..parents.end * set],
         gain: &slices.gain[4 * range.start..4 * range.end],
         sh_degree: slices.sh_degree,
-    }
-}
-
-/// Step sizes of the parameters after the share `part` of the refinement.
-fn rates(options: &RefineOptions, part: f32) -> [f32; PARAMETERS] {
-    let factor = RATE_FLOOR + 0.5 * (1.0 + (std::f32::consts::PI * part).cos());
-    let mut rates = [0.0; PARAMETERS];
-    rates[LOGIT] = options.opacity_rate;
-    rates[LOG_SCALE..COLOUR].fill(options.scale_rate);
-    rates[COLOUR..MEAN].fill(options.colour_rate);
-    rates[MEAN..ROTATION].fill(options.mean_rate);
-    rates[ROTATION..].fill(options.rotation_rate);
-    rates.map(|rate| factor * rate)
-}
-
-/// Gradients by a Gaussian's parameters from those by its row and its gain.
-#[inline(always)]
-fn by_parameters(row: &[f32], by_row: &[f32], by_gain: &[f32], unit: f32) -> [f32; PARAMETERS] {
-    let alpha = row[OPACITY_OFFSET];
-    let mut out = [0.0; PARAMETERS];
-    out[LOGIT] = by_row[OPACITY_OFFSET] * alpha * (1.0 - alpha);
-    for k in 0..3 {
-        out[LOG_SCALE + k] = by_row[SCALE_OFFSET + k] * row[SCALE_OFFSET + k];
-        out[COLOUR + k] = by_gain[1 + k];
-        out[MEAN + k] = by_row[MEAN_OFFSET + k] * unit;
-    }
-    out[ROTATION..].copy_from_slice(&by_row[QUAT_OFFSET..QUAT_OFFSET + 4]);
-    out
-}
-
-impl State {
-    /// One step of Adam. `correction`: 1 − βⁿ of both means.
-    #[inline(always)]
-    fn advance(
-        &mut self,
-        gradient: &[f32; PARAMETERS],
-        rates: &[f32; PARAMETERS],
-        correction: [f32; 2],
-    ) {
-        let [b1, b2] = BETAS;
-        for k in 0..PARAMETERS {
-            let g = gradient[k];
-            self.mean[k] = b1 * self.mean[k] + (1.0 - b1) * g;
-            self.square[k] = b2 * self.square[k] + (1.0 - b2) * g * g;
-            let root = (self.square[k] / correction[1]).sqrt() + EPSILON;
-            self.value[k] -= rates[k] * (self.mean[k] / correction[0]) / root;
-        }
-        let [low, high] = LOG_SCALE_LIMITS;
-        for v in &mut self.value[LOG_SCALE..COLOUR] {
-            *v = v.clamp(low, high);
-        }
-    }
-
-    /// Writes the Gaussian: the row `before` and its colour `offsets`, changed by the parameters.
-    #[inline(always)]
-    fn write(
-        &self,
-        before: &[f32],
-        offsets: [f32; 3],
-        unit: f32,
-        row: &mut [f32],
-        gain: &mut [f32],
-    ) {
-        let value = &self.value;
-        row[OPACITY_OFFSET] = 1.0 / (1.0 + (-value[LOGIT]).exp());
-        for k in 0..3 {
-            row[SCALE_OFFSET + k] = before[SCALE_OFFSET + k] * value[LOG_SCALE + k].exp();
-            row[MEAN_OFFSET + k] = before[MEAN_OFFSET + k] + unit * value[MEAN + k];
-            gain[1 + k] = offsets[k] + value[COLOUR + k];
-        }
-        let quat: [f32; 4] = std::array::from_fn(|k| before[QUAT_OFFSET + k] + value[ROTATION + k]);
-        let length = quat.iter().map(|q| q * q).sum::<f32>().sqrt();
-        // A quaternion of zero has no direction: the last one stays.
-        if length > 0.0 {
-            for (to, q) in row[QUAT_OFFSET..QUAT_OFFSET + 4].iter_mut().zip(quat) {
-                *to = q / length;
-            }
-        }
     }
 }
 

@@ -53,15 +53,20 @@ fn projected(view: u32, point: vec3<f32>) -> vec3<f32> {
     return select(vec3<f32>(), vec3<f32>(at, p.z), inside);
 }
 
+// Returns the first and the last of the 3x3 pixels around a position inside the picture.
+fn around(at: vec2<f32>) -> vec4<u32> {
+    let middle = vec2<u32>(at);
+    let last = vec2<u32>(call.width, call.height) - 1u;
+    return vec4<u32>(max(middle, vec2<u32>(1u)) - 1u, min(middle + 1u, last));
+}
+
 // Returns the sum of |difference of RGB| between `wanted` and the nearest colour of the 3x3 pixels
 // around a position inside the picture.
 fn colour_difference(view: u32, at: vec2<f32>, wanted: vec3<f32>) -> f32 {
-    let middle = vec2<u32>(at);
-    let low = max(middle, vec2<u32>(1u)) - 1u;
-    let high = min(middle + 1u, vec2<u32>(call.width, call.height) - 1u);
+    let window = around(at);
     var least = 3.4e38;
-    for (var row = low.y; row <= high.y; row++) {
-        for (var column = low.x; column <= high.x; column++) {
+    for (var row = window.y; row <= window.w; row++) {
+        for (var column = window.x; column <= window.z; column++) {
             let difference = abs(colour(view, vec2<u32>(column, row)) - wanted);
             least = min(least, difference.x + difference.y + difference.z);
         }

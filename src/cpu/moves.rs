@@ -73,9 +73,10 @@ pub fn transposed(x: &[f32], rows: usize, cols: usize) -> Vec<f32> {
     unsafe { buffer.assume_init() }
 }
 
-struct Turn<'a> {
-    from: Mat<'a>,
-    to: &'a mut [f32],
+/// Copies a matrix of any strides to a row-major one.
+pub(super) struct Turn<'a> {
+    pub from: Mat<'a>,
+    pub to: &'a mut [f32],
 }
 
 impl Kernel for Turn<'_> {

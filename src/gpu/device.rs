@@ -133,7 +133,8 @@ impl Gpu {
     }
 
     /// Wraps a device of the application, which keeps its own error handler. Frames can be drawn
-    /// to textures of that device. Kernels use the features that it was opened with. In a browser the device's errors reach that handler alone.
+    /// to textures of that device. Kernels use the features that it was opened with. In a browser the
+    /// device's errors reach that handler alone.
     pub fn from_device(device: wgpu::Device, queue: wgpu::Queue) -> Arc<Self> {
         let summary = AdapterSummary::of(&device.adapter_info());
         Arc::new(Self::assemble(device, queue, summary, Arc::default()))

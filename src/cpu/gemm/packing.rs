@@ -168,11 +168,14 @@ pub(in crate::cpu) fn copy<S: Simd>(s: S, from: Mat<'_>, row_len: usize, to: &mu
         }
         return;
     }
-    let (whole_rows, whole_cols) = (rows / LANES * LANES, cols / LANES * LANES);
-    if row_stride == 1 {
-        // The contiguous direction of the source is down its columns: transpose squares.
-        for j in (0..whole_cols).step_by(LANES) {
-            for i in (0..whole_rows).step_by(LANES) {
+    let squares = row_stride == 1 && rows.min(cols) >= LANES;
+    if squares {
+        // The contiguous direction of the source is down its columns: transpose squares, of which
+        // the last ones overlap those before.
+        for j in (0..cols).step_by(LANES) {
+            let j = j.min(cols - LANES);
+            for i in (0..rows).step_by(LANES) {
+                let i = i.min(rows - LANES);
                 let mut square = [s.splat(0.0); LANES];
                 for (c, v) in square.iter_mut().enumerate() {
                     *v = s.load(lanes(&data[(j + c) * col_stride + i..]));
@@ -183,9 +186,8 @@ pub(in crate::cpu) fn copy<S: Simd>(s: S, from: Mat<'_>, row_len: usize, to: &mu
             }
         }
     }
-    let done = if row_stride == 1 { [whole_rows, whole_cols] } else { [0, 0] };
+    let first = if squares { cols } else { 0 };
     for (i, to) in to.chunks_exact_mut(row_len).enumerate() {
-        let first = if i < done[0] { done[1] } else { 0 };
         for (j, to) in to[..cols].iter_mut().enumerate().skip(first) {
             *to = data[i * row_stride + j * col_stride];
         }

@@ -28,8 +28,8 @@ impl Surface<'_> {
     fn inconsistency(&self, point: glam::Vec3, colour: [f32; 3]) -> Option<f32> {
         let (at, z) = self.project(point)?;
         let surface = self.around(at).map(|i| self.z[i]).fold(0.0, f32::max);
-        let apart = self.difference(at, colour).min(COLOUR);
-        (z <= surface * (1.0 + BEHIND)).then_some(apart / COLOUR)
+        let apart = || self.difference(at, colour).min(COLOUR) / COLOUR;
+        (z <= surface * (1.0 + BEHIND)).then(apart)
     }
 }
 

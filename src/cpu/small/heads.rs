@@ -6,8 +6,10 @@
 //! opacity `[B, H·W]`.
 
 use crate::cpu::activation::sigmoid;
+use crate::cpu::gemm::Mat;
+use crate::cpu::moves::Turn;
 use crate::cpu::resize::{Bilinear, Resize};
-use crate::cpu::simd::{Kernel, LANES, RowLayout, Simd, SimdLevel, Vector, vectorize};
+use crate::cpu::simd::{SimdLevel, vectorize};
 use rayon::prelude::*;
 
 /// Channels of [`Input`] beside the features.
@@ -125,8 +127,12 @@ impl Output {
             let (b, y) = (i / h, i % h);
             for (j, rows) in rows.chunks_mut(PIXELS * r).enumerate() {
                 let (at, count) = (y * w + j * PIXELS, rows.len() / r);
-                let planes = &x[b * (r + 1) * n + at..];
-                SimdLevel::best().run(ToRows { planes, n, start: &self.start, rows });
+                let data = &x[b * (r + 1) * n + at..];
+                let from = Mat { data, rows: count, cols: r, row_stride: 1, col_stride: n };
+                SimdLevel::best().run(Turn { from, to: rows });
+                for row in rows.chunks_exact_mut(r) {
+                    row.iter_mut().zip(&self.start).for_each(|(v, start)| *v += start);
+                }
                 let Some((places, factor, offset)) = self.colour else { continue };
                 for (k, place) in places.into_iter().enumerate() {
                     let colours = &rgb[(b * 3 + k) * n + at..][..count];
@@ -186,8 +192,7 @@ impl Output {
                 let count = (planes.len() / n).min(r - first.min(r));
                 if let Some(d_raw) = d_raw {
                     let rows = &d_raw[b * n * r..(b + 1) * n * r];
-                    let planes = &mut planes[..count * n];
-                    SimdLevel::best().run(ToPlanes { rows, r, first, planes, n });
+                    transpose(rows, r, first, &mut planes[..count * n], n);
                 }
                 if let Some(last) = planes.chunks_exact_mut(n).nth(r.saturating_sub(first))
                     && first <= r
@@ -201,73 +206,20 @@ impl Output {
     }
 }
 
-/// Planes of `n` elements, of which each begins at the same pixel, plus `start`, as `rows` of as
-/// many numbers as `start` has.
-struct ToRows<'a> {
-    planes: &'a [f32],
-    n: usize,
-    start: &'a [f32],
-    rows: &'a mut [f32],
-}
-
-impl Kernel for ToRows<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn run<S: Simd>(self, s: S) {
-        let Self { planes, n, start, rows } = self;
-        let r = start.len();
-        let layout = RowLayout { stride: r, count: LANES };
-        for (i, rows) in rows.chunks_mut(LANES * r).enumerate() {
-            let at = i * LANES;
-            if rows.len() < LANES * r || r < LANES {
-                for (c, start) in start.iter().enumerate() {
-                    for (j, row) in rows.chunks_exact_mut(r).enumerate() {
-                        row[c] = planes[c * n + at + j] + start;
-                    }
-                }
-                continue;
-            }
-            for c in (0..r).step_by(LANES) {
-                // The last vectors cover some channels again.
-                let c = c.min(r - LANES);
-                let mut vectors = [s.splat(0.0); LANES];
-                for (j, v) in vectors.iter_mut().enumerate() {
-                    let pixels = &planes[(c + j) * n + at..].as_chunks().0[0];
-                    *v = s.load(pixels) + s.splat(start[c + j]);
-                }
-                S::F::store_rows(&vectors, layout, &mut rows[c..]);
-            }
-        }
-    }
-}
-
 /// Columns from `first` of `rows` `[n, r]` as planes of `n`.
-struct ToPlanes<'a> {
-    rows: &'a [f32],
-    r: usize,
-    first: usize,
-    planes: &'a mut [f32],
-    n: usize,
-}
-
-impl Kernel for ToPlanes<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn run<S: Simd>(self, _s: S) {
-        let Self { rows, r, first, planes, n } = self;
-        let layout = RowLayout { stride: r, count: LANES };
-        let whole = if planes.len() == CHANNELS * n { n / LANES * LANES } else { 0 };
-        for at in (0..whole).step_by(LANES) {
-            let vectors = S::F::load_rows::<CHANNELS>(&rows[at * r + first..], layout);
-            for (v, plane) in vectors.iter().zip(planes.chunks_exact_mut(n)) {
-                v.store(&mut plane[at..].as_chunks_mut().0[0]);
-            }
-        }
+fn transpose(rows: &[f32], r: usize, first: usize, planes: &mut [f32], n: usize) {
+    let count = planes.len() / n;
+    if count == CHANNELS {
+        let data = &rows[first..];
+        let from = Mat { data, rows: count, cols: n, row_stride: 1, col_stride: r };
+        return SimdLevel::best().run(Turn { from, to: planes });
+    }
+    for at in (0..n).step_by(PIXELS) {
+        let count = PIXELS.min(n - at);
         for (c, plane) in planes.chunks_exact_mut(n).enumerate() {
-            for (i, to) in plane.iter_mut().enumerate().skip(whole) {
-                *to = rows[i * r + first + c];
+            let column = rows[at * r + first + c..].iter().step_by(r);
+            for (to, from) in plane[at..at + count].iter_mut().zip(column) {
+                *to = *from;
             }
         }
     }
