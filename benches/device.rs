@@ -15,7 +15,9 @@ use std::sync::Arc;
 use std::time::Instant;
 use subsplat::camera::{Camera, Intrinsics, NearFar};
 use subsplat::config::{Config, Preset};
-use subsplat::gpu::{DeviceArray, FULL_GRID, Gpu, GpuError, PointwiseFunction, Recorder, Work};
+use subsplat::gpu::{
+    DeviceArray, FULL_GRID, Gpu, GpuError, NormSum, PointwiseFunction, Recorder, Work,
+};
 use subsplat::model::subsplat::SubSplat;
 use subsplat::model::weights::Weights;
 use subsplat::model::{Backend, Views};
@@ -161,13 +163,13 @@ type Call = fn(&[DeviceArray; 4]) -> Result<(), GpuError>;
 
 const REDUCTIONS: [(&str, [usize; 4], Call); 6] = [
     ("group norm", [2, 64, 128, 128], |[x, f, s, _]| {
-        x.group_norm(8, Some([f, s]), PointwiseFunction::Silu).map(drop)
+        x.group_norm(8, Some([f, s]), PointwiseFunction::Silu, None).map(drop)
     }),
     ("group norm backward", [2, 64, 64, 64], |[x, f, s, dy]| {
         x.group_norm_backward(8, Some([f, s]), PointwiseFunction::Silu, dy).map(drop)
     }),
     ("layer norm", [1, 128, 64, 128], |[x, f, s, _]| {
-        x.reshape(&[64 * 128, 128])?.layer_norm([f, s]).map(drop)
+        x.reshape(&[64 * 128, 128])?.layer_norm([f, s], NormSum::None).map(drop)
     }),
     ("layer norm backward", [1, 128, 64, 128], |[x, f, _, dy]| {
         let rows = |a: &DeviceArray| a.reshape(&[64 * 128, 128]);

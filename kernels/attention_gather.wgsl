@@ -2,10 +2,14 @@
 // A.2). CPU version: src/cpu/attention_gather. Arguments except the last:
 // kernels/shared/gather_samples.wgsl.
 //
-// Output: [N, E]. One workgroup per parent; its threads process the samples, then the weights,
+// Output: [N, E], plus a residual of the same sizes. One workgroup per parent; its threads process the samples, then the weights,
 // then the channels. Only the output leaves workgroup memory.
 
-@group(0) @binding(5) var<storage, read_write> attended: array<f32>;
+@group(0) @binding(5) var<storage, read> residual: array<f32>;
+@group(0) @binding(6) var<storage, read_write> attended: array<f32>;
+
+// 1 if there is a residual.
+override HAS_RESIDUAL: u32 = 0u;
 
 @compute @workgroup_size(64)
 fn main(
@@ -33,6 +37,9 @@ fn main(
                 let u = vec4<f32>(maps[row.x], maps[row.y], maps[row.z], maps[row.w]);
                 sum += weights[j * call.groups + c / group_dim] * dot(corners[j], u);
             }
+        }
+        if HAS_RESIDUAL == 1u {
+            sum += residual[n * call.dim + c];
         }
         attended[n * call.dim + c] = sum;
     }

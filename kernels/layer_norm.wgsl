@@ -1,8 +1,22 @@
-// LayerNorm over the last axis. CPU version: src/cpu/norm.rs.
+// LayerNorm over the last axis, of a sum or before a sum with an array of the same sizes. CPU version:
+// src/cpu/norm.rs and a sum.
 
 @group(0) @binding(2) var<storage, read> factors: array<f32>;
 @group(0) @binding(3) var<storage, read> summands: array<f32>;
-@group(0) @binding(4) var<storage, read_write> y: array<f32>;
+@group(0) @binding(4) var<storage, read> other: array<f32>;
+@group(0) @binding(5) var<storage, read_write> y: array<f32>;
+
+// Place of the sum with the other array; 0: none.
+const SUM_BEFORE: u32 = 1u;
+const SUM_AFTER: u32 = 2u;
+override SUM: u32 = 0u;
+
+fn value(at: u32) -> f32 {
+    if SUM == SUM_BEFORE {
+        return x[at] + other[at];
+    }
+    return x[at];
+}
 
 @compute @workgroup_size(THREADS)
 fn main(
@@ -15,12 +29,12 @@ fn main(
     let base = min(row, call.rows - 1u) * call.length;
     var own = 0.0;
     for (var i = thread; i < call.length; i += THREADS) {
-        own += x[base + i];
+        own += value(base + i);
     }
     let mean = total(own, place) / f32(call.length);
     own = 0.0;
     for (var i = thread; i < call.length; i += THREADS) {
-        let away = x[base + i] - mean;
+        let away = value(base + i) - mean;
         own += away * away;
     }
     let scale = 1.0 / sqrt(total(own, place) / f32(call.length) + call.epsilon);
@@ -28,6 +42,10 @@ fn main(
         return;
     }
     for (var i = thread; i < call.length; i += THREADS) {
-        y[base + i] = (x[base + i] - mean) * scale * factors[i] + summands[i];
+        var v = (value(base + i) - mean) * scale * factors[i] + summands[i];
+        if SUM == SUM_AFTER {
+            v += other[base + i];
+        }
+        y[base + i] = v;
     }
 }

@@ -1,11 +1,14 @@
-// (x - mean) / sqrt(variance + epsilon), times factor, plus summand, then an activation. CPU
-// version: src/cpu/norm.rs.
+// (x - mean) / sqrt(variance + epsilon), times factor, plus summand, then an activation, then plus a
+// residual of the same sizes. CPU version: src/cpu/norm.rs and a sum.
 
 @group(0) @binding(3) var<storage, read> factors: array<f32>;
 @group(0) @binding(4) var<storage, read> summands: array<f32>;
-@group(0) @binding(5) var<storage, read_write> y: array<f32>;
+@group(0) @binding(5) var<storage, read> residual: array<f32>;
+@group(0) @binding(6) var<storage, read_write> y: array<f32>;
 
 override ACTIVATION_KIND: u32 = 0u;
+// 1 if there is a residual.
+override HAS_RESIDUAL: u32 = 0u;
 
 @compute @workgroup_size(THREADS)
 fn main(
@@ -29,6 +32,10 @@ fn main(
             let channel = row % call.groups * channels + at / call.run;
             v = v * factors[channel] + summands[channel];
         }
-        y[row * call.length + at] = activation(ACTIVATION_KIND, v);
+        v = activation(ACTIVATION_KIND, v);
+        if HAS_RESIDUAL == 1u {
+            v += residual[row * call.length + at];
+        }
+        y[row * call.length + at] = v;
     }
 }

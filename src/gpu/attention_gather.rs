@@ -28,6 +28,7 @@ pub(crate) static ATTENTION_GATHER: Kernel = Kernel {
         Access::Read,
         Access::Read,
         Access::Read,
+        Access::Read,
         Access::Write,
     ],
 };
@@ -169,7 +170,8 @@ impl Gpu {
             let query = self.upload("queries", query)?;
             let points = self.upload("sample points", points)?;
             let attended = self.empty::<f32>("attention output", parents.len() * dim)?;
-            let bindings = [&uniform, &maps, &query, &points, &levels, &attended];
+            // The query takes the place of the residual, which is not read.
+            let bindings = [&uniform, &maps, &query, &points, &levels, &query, &attended];
             let mut commands = self.commands("attention_gather", false);
             let groups = Groups::of(parents.len(), 1);
             commands.run(&ATTENTION_GATHER, &[], &bindings.map(Binding::from), groups)?;

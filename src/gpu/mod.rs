@@ -87,8 +87,8 @@ pub use crate::device::DeviceChoice;
 pub use adapter::{AdapterSummary, adapters, choose, find_for, instance};
 pub use array::{
     ADAM_BLOCK, AdamCall, AdapterCall, AdapterView, AttentionCall, ConvolutionCall, CrossCheckCall,
-    DepthConsensusCall, DeviceArray, FULL_GRID, Function, HeadOutputCall, PointwiseFunction,
-    RawMatchingCall, Recorder, Reduction, Work,
+    DepthConsensusCall, DeviceArray, FULL_GRID, Function, HeadOutputCall, NormSum,
+    PointwiseFunction, RawMatchingCall, Recorder, Reduction, Work,
 };
 pub use attention_gather::AttentionGatherArgs;
 pub use attention_gather_bwd::AttentionGatherGradients;

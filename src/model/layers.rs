@@ -241,7 +241,7 @@ impl GroupNorm {
     /// Another number of channels.
     pub fn forward<A: Array>(&self, x: &A) -> Result<A> {
         let affine = [&x.parameter(&self.weight)?, &x.parameter(&self.bias)?];
-        x.group_norm(self.groups, affine, None)
+        x.group_norm(self.groups, affine, None, None)
     }
 
     /// Applies [`GroupNorm::forward`] and `activation` in one pass.
@@ -250,7 +250,22 @@ impl GroupNorm {
     /// As [`GroupNorm::forward`].
     pub fn forward_then<A: Array>(&self, x: &A, activation: Activation) -> Result<A> {
         let affine = [&x.parameter(&self.weight)?, &x.parameter(&self.bias)?];
-        x.group_norm(self.groups, affine, Some(activation))
+        x.group_norm(self.groups, affine, Some(activation), None)
+    }
+
+    /// Applies [`GroupNorm::forward`] and `activation`, then adds `residual`: the end of a residual
+    /// block in one call.
+    ///
+    /// # Errors
+    /// As [`GroupNorm::forward`]; a residual of another shape.
+    pub fn forward_onto<A: Array>(
+        &self,
+        residual: &A,
+        x: &A,
+        activation: Option<Activation>,
+    ) -> Result<A> {
+        let affine = [&x.parameter(&self.weight)?, &x.parameter(&self.bias)?];
+        x.group_norm(self.groups, affine, activation, Some(residual))
     }
 }
 
@@ -300,7 +315,23 @@ impl LayerNorm {
     /// # Errors
     /// Another last dimension.
     pub fn forward<A: Array>(&self, x: &A) -> Result<A> {
-        x.layer_norm([&x.parameter(&self.weight)?, &x.parameter(&self.bias)?])
+        x.layer_norm([&x.parameter(&self.weight)?, &x.parameter(&self.bias)?], None)
+    }
+
+    /// Applies [`LayerNorm::forward`] to x + other, in one call.
+    ///
+    /// # Errors
+    /// As [`LayerNorm::forward`]; arrays of different shapes.
+    pub fn forward_of_sum<A: Array>(&self, x: &A, other: &A) -> Result<A> {
+        x.layer_norm_of_sum(other, [&x.parameter(&self.weight)?, &x.parameter(&self.bias)?])
+    }
+
+    /// Applies [`LayerNorm::forward`], then adds `residual`, in one call.
+    ///
+    /// # Errors
+    /// As [`LayerNorm::forward`]; a residual of another shape.
+    pub fn forward_onto<A: Array>(&self, residual: &A, x: &A) -> Result<A> {
+        x.layer_norm([&x.parameter(&self.weight)?, &x.parameter(&self.bias)?], Some(residual))
     }
 }
 

@@ -171,19 +171,25 @@ pub trait Array: Clone + std::fmt::Debug {
         activation: Option<Activation>,
     ) -> Result<Self>;
 
-    /// Normalises groups of channels of `[B, C, …]`, then applies `activation`.
+    /// Normalises groups of channels of `[B, C, …]`, applies `activation`, then adds `residual`.
     fn group_norm(
         &self,
         groups: usize,
         affine: [&Self; 2],
         activation: Option<Activation>,
+        residual: Option<&Self>,
     ) -> Result<Self>;
 
     /// Normalises each channel of `[B, C, H, W]`, then applies `activation`.
     fn instance_norm(&self, activation: Option<Activation>) -> Result<Self>;
 
-    /// Normalises the last dimension.
-    fn layer_norm(&self, affine: [&Self; 2]) -> Result<Self>;
+    /// Normalises the last dimension, then adds `residual`.
+    fn layer_norm(&self, affine: [&Self; 2], residual: Option<&Self>) -> Result<Self>;
+
+    /// Normalises the last dimension of self + other.
+    fn layer_norm_of_sum(&self, other: &Self, affine: [&Self; 2]) -> Result<Self> {
+        self.plus(other)?.layer_norm(affine, None)
+    }
 
     /// Resizes `[B, C, h, w]`, corners aligned, then applies `activation`.
     fn resized(&self, size: [usize; 2], activation: Option<Activation>) -> Result<Self>;
@@ -260,13 +266,15 @@ pub trait Array: Clone + std::fmt::Debug {
     /// Computes the attributes of packed rows `[N, 11]`.
     fn attributes(&self, rules: Attributes) -> Result<Self>;
 
-    /// Computes the attention gather from maps `self`; `backend` executes it for host tensors.
+    /// Computes the attention gather from maps `self`, then adds `residual`; `backend` executes it
+    /// for host tensors.
     fn attention_gather(
         &self,
         query: &Self,
         points: &Self,
         gather: Gather,
         deferred: Option<&Deferred>,
+        residual: Option<&Self>,
         backend: &Backend,
     ) -> Result<Self>;
 
@@ -299,6 +307,14 @@ pub trait Array: Clone + std::fmt::Debug {
             Ok(sizes) => Ok(sizes),
             Err(_) => bail!("expected {N} dimensions, got {:?}", self.dims()),
         }
+    }
+}
+
+/// Returns residual + x.
+fn onto(residual: Option<&Tensor>, x: Tensor) -> Result<Tensor> {
+    match residual {
+        Some(residual) => Array::plus(residual, &x),
+        None => Ok(x),
     }
 }
 
@@ -477,24 +493,27 @@ impl Array for Tensor {
         groups: usize,
         [weight, bias]: [&Self; 2],
         activation: Option<Activation>,
+        residual: Option<&Self>,
     ) -> Result<Self> {
-        norm::group_norm_then(self, groups, norm::Affine { weight, bias }, activation)
+        onto(
+            residual,
+            norm::group_norm_then(self, groups, norm::Affine { weight, bias }, activation)?,
+        )
     }
 
     fn instance_norm(&self, activation: Option<Activation>) -> Result<Self> {
         norm::instance_norm_then(self, activation)
     }
 
-    fn layer_norm(&self, [weight, bias]: [&Self; 2]) -> Result<Self> {
+    fn layer_norm(&self, [weight, bias]: [&Self; 2], residual: Option<&Self>) -> Result<Self> {
         if self.dtype() == DType::F32 {
-            return norm::layer_norm(self, weight, bias);
+            return onto(residual, norm::layer_norm(self, weight, bias)?);
         }
         // The fused kernel has f32 only.
         let x = self.broadcast_sub(&self.mean_keepdim(D::Minus1)?)?;
         let variance = x.sqr()?.mean_keepdim(D::Minus1)?;
-        x.broadcast_div(&(variance + norm::EPS)?.sqrt()?)?
-            .broadcast_mul(weight)?
-            .broadcast_add(bias)
+        let scaled = x.broadcast_div(&(variance + norm::EPS)?.sqrt()?)?.broadcast_mul(weight)?;
+        onto(residual, scaled.broadcast_add(bias)?)
     }
 
     fn resized(&self, [h, w]: [usize; 2], activation: Option<Activation>) -> Result<Self> {
@@ -605,9 +624,11 @@ impl Array for Tensor {
         points: &Self,
         gather: Gather,
         deferred: Option<&Deferred>,
+        residual: Option<&Self>,
         backend: &Backend,
     ) -> Result<Self> {
-        attention_gather_deferred(backend, self, query, points, gather, deferred)
+        let y = attention_gather_deferred(backend, self, query, points, gather, deferred)?;
+        onto(residual, y)
     }
 
     fn occlusion(&self, z: &Self, depths: &Self) -> Result<Self> {

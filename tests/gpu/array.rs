@@ -181,17 +181,32 @@ fn norms_and_softmax() {
     for (c, h, w) in [(8, 96, 100), (16, 5, 7), (24, 16, 16)] {
         let x = noise(r, &[2, c, h, w]).affine(1.0, 7.0).unwrap();
         let (weight, bias) = (noise(r, &[c]), noise(r, &[c]));
+        let residual = noise(r, &[2, c, h, w]);
         for activation in [None, Some(Activation::Silu), Some(Activation::Gelu)] {
             agree!(gpu, "group norm", 1e-5, |x, weight, bias| {
-                x.group_norm(4, [weight, bias], activation)
+                x.group_norm(4, [weight, bias], activation, None)
+            });
+            agree!(gpu, "group norm and residual", 1e-5, |x, weight, bias, residual| {
+                x.group_norm(4, [weight, bias], activation, Some(residual))
             });
         }
         agree!(gpu, "instance norm", 1e-5, |x| x.instance_norm(Some(Activation::Relu)));
         agree!(gpu, "instance norm", 1e-5, |x| x.instance_norm(None));
     }
+    let x = gpu.upload(&noise(r, &[2, 8, 3, 4])).unwrap();
+    let [ones, other] = [&[8][..], &[2, 8, 4, 3]].map(|dims| gpu.upload(&noise(r, dims)).unwrap());
+    let text = x.group_norm(4, [&ones, &ones], None, Some(&other)).unwrap_err().to_string();
+    assert!(text.contains("residual") && text.contains("[2, 8, 4, 3]"), "{text}");
     for c in [7, 64, 192] {
         let (x, weight, bias) = (noise(r, &[130, c]), noise(r, &[c]), noise(r, &[c]));
-        agree!(gpu, "layer norm", 1e-5, |x, weight, bias| x.layer_norm([weight, bias]));
+        let residual = noise(r, &[130, c]);
+        agree!(gpu, "layer norm", 1e-5, |x, weight, bias| x.layer_norm([weight, bias], None));
+        agree!(gpu, "layer norm and residual", 1e-5, |x, weight, bias, residual| {
+            x.layer_norm([weight, bias], Some(residual))
+        });
+        agree!(gpu, "layer norm of a sum", 1e-5, |x, weight, bias, residual| {
+            x.layer_norm_of_sum(residual, [weight, bias])
+        });
         agree!(gpu, "softmax", TOLERANCE, |x| x.affine(10.0, 0.0)?.softmax());
     }
 }
@@ -385,11 +400,18 @@ fn parts_of_the_trunk() {
     let query = noise(r, &[n, gather.query_width()]);
     let points = Tensor::from_vec(r.many(4 * n, -0.2, 1.2), (n, 2, 1, 2), &Device::Cpu).unwrap();
     agree!(gpu, "gather", 1e-5, |maps, query, points| {
-        maps.attention_gather(query, points, gather.clone(), None, &Backend::Cpu)
+        maps.attention_gather(query, points, gather.clone(), None, None, &Backend::Cpu)
+    });
+    let residual = noise(r, &[n, gather.dim]);
+    agree!(gpu, "gather and residual", 1e-5, |maps, query, points, residual| {
+        let (gather, residual) = (gather.clone(), Some(residual));
+        maps.attention_gather(query, points, gather, None, residual, &Backend::Cpu)
     });
     let text = gpu.upload(&noise(r, &[3, 11])).unwrap();
-    let text =
-        text.attention_gather(&text, &text, gather, None, &Backend::Cpu).unwrap_err().to_string();
+    let text = text
+        .attention_gather(&text, &text, gather, None, None, &Backend::Cpu)
+        .unwrap_err()
+        .to_string();
     assert!(text.contains("attention_gather"), "{text}");
 }
 

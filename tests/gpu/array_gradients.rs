@@ -182,10 +182,19 @@ fn norms() {
     for (c, h, w) in [(8, 96, 100), (16, 5, 7), (24, 16, 16)] {
         let x = noise(r, &[2, c, h, w]).affine(1.0, 7.0).unwrap();
         let (weight, bias) = (noise(r, &[c]), noise(r, &[c]));
+        let residual = noise(r, &[2, c, h, w]);
         for activation in [None, Some(Activation::Silu), Some(Activation::Gelu)] {
             same_gradients!(gpu, "group norm", DIFFERENCES, |x, weight, bias| {
-                x.group_norm(4, [weight, bias], activation)
+                x.group_norm(4, [weight, bias], activation, None)
             });
+            same_gradients!(
+                gpu,
+                "group norm and residual",
+                DIFFERENCES,
+                |x, weight, bias, residual| {
+                    x.group_norm(4, [weight, bias], activation, Some(residual))
+                }
+            );
         }
         same_gradients!(gpu, "instance norm", DIFFERENCES, |x| {
             x.instance_norm(Some(Activation::Gelu))
@@ -194,8 +203,15 @@ fn norms() {
     }
     for c in [7, 64, 192] {
         let (x, weight, bias) = (noise(r, &[130, c]), noise(r, &[c]), noise(r, &[c]));
+        let residual = noise(r, &[130, c]);
         same_gradients!(gpu, "layer norm", DIFFERENCES, |x, weight, bias| {
-            x.layer_norm([weight, bias])
+            x.layer_norm([weight, bias], None)
+        });
+        same_gradients!(gpu, "norm and residual", DIFFERENCES, |x, weight, bias, residual| {
+            x.layer_norm([weight, bias], Some(residual))
+        });
+        same_gradients!(gpu, "norm of a sum", DIFFERENCES, |x, weight, bias, residual| {
+            x.layer_norm_of_sum(residual, [weight, bias])
         });
     }
 }
@@ -209,7 +225,12 @@ fn attention_gather() {
     let query = noise(r, &[n, gather.query_width()]);
     let points = Tensor::from_vec(r.many(4 * n, -0.2, 1.2), (n, 2, 1, 2), &Device::Cpu).unwrap();
     same_gradients!(gpu, "gather", DIFFERENCES, |maps, query, points| {
-        maps.attention_gather(query, points, gather.clone(), None, &Backend::Cpu)
+        maps.attention_gather(query, points, gather.clone(), None, None, &Backend::Cpu)
+    });
+    let residual = noise(r, &[n, gather.dim]);
+    same_gradients!(gpu, "gather and residual", DIFFERENCES, |maps, query, points, residual| {
+        let (gather, residual) = (gather.clone(), Some(residual));
+        maps.attention_gather(query, points, gather, None, residual, &Backend::Cpu)
     });
 }
 

@@ -7,7 +7,7 @@ use subsplat_test_support::gpu::{gpu, without_subgroups};
 
 use candle_core::Tensor;
 use std::sync::Arc;
-use subsplat::gpu::{DeviceArray, Gpu, PointwiseFunction, Recorder};
+use subsplat::gpu::{DeviceArray, Gpu, NormSum, PointwiseFunction, Recorder};
 
 /// Opens the adapter with and without subgroup operations; `None`, loudly, where it has none.
 fn both() -> Option<[Arc<Gpu>; 2]> {
@@ -54,7 +54,7 @@ fn rows_have_the_bytes_of_the_path_without() {
         let name = |kernel: &str| format!("{kernel} of {rows} x {length}");
         assert_same_bits(&name("softmax"), &devices, &[&x], |a| vec![a[0].softmax().unwrap()]);
         assert_same_bits(&name("layer norm"), &devices, &[&x, factors, summands], |a| {
-            vec![a[0].layer_norm([&a[1], &a[2]]).unwrap()]
+            vec![a[0].layer_norm([&a[1], &a[2]], NormSum::None).unwrap()]
         });
         assert_same_bits(&name("gradient of layer norm"), &devices, &[&x, factors, &dy], |a| {
             a[0].layer_norm_backward(&a[1], &a[2]).unwrap().to_vec()
@@ -74,7 +74,7 @@ fn groups_have_the_bytes_of_the_path_without() {
         let tensors = [&x, &affine[0], &affine[1], &dy];
         let silu = PointwiseFunction::Silu;
         assert_same_bits(&format!("group norm of {dims:?}"), &devices, &tensors, |a| {
-            let of_result = a[0].group_norm(2, Some([&a[1], &a[2]]), silu).unwrap();
+            let of_result = a[0].group_norm(2, Some([&a[1], &a[2]]), silu, None).unwrap();
             let gradients = a[0].group_norm_backward(2, Some([&a[1], &a[2]]), silu, &a[3]);
             [vec![of_result], gradients.unwrap().to_vec()].concat()
         });

@@ -45,6 +45,7 @@ pub(super) use attention::ATTENTION;
 pub use attention::AttentionCall;
 pub(super) use elementwise::ELEMENTWISE;
 pub use elementwise::{Function, PointwiseFunction};
+pub use norm::NormSum;
 pub(super) use norm::{LAYER_NORM, NORM_APPLY, NORM_STATISTICS};
 pub(super) use norm_bwd::{LAYER_NORM_BWD, NORM_BWD, NORM_SUMS_BWD};
 pub use product::ConvolutionCall;
@@ -355,6 +356,12 @@ impl DeviceArray {
         self.buffer.part(at..at + 4 * self.count().min(4) as u64)
     }
 
+    /// Returns a kernel's constant and argument of a residual, an array that is added to its result.
+    fn residual_argument(&self, residual: Option<&Self>) -> ((&'static str, f64), Binding) {
+        let binding = residual.map_or_else(|| self.first_binding(), Self::binding);
+        (("HAS_RESIDUAL", f64::from(u32::from(residual.is_some()))), binding)
+    }
+
     /// Returns the product of the sizes before dimension `dim`, its size, and the product of the
     /// sizes after it.
     fn around(&self, dim: usize) -> Result<[usize; 3], GpuError> {
@@ -368,6 +375,18 @@ impl DeviceArray {
         };
         let product = |dims: &[usize]| dims.iter().product();
         Ok([product(&self.dims[..dim]), length, product(&self.dims[dim + 1..])])
+    }
+}
+
+/// Refuses a residual of other dimensions than `dims`.
+fn check_residual(
+    kernel: &'static str,
+    dims: &[usize],
+    residual: Option<&DeviceArray>,
+) -> Result<(), GpuError> {
+    match residual.filter(|residual| residual.dims != dims) {
+        Some(other) => Err(misfit(kernel, format!("a residual of {dims:?}"), &other.dims)),
+        None => Ok(()),
     }
 }
 

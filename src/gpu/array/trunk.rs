@@ -3,7 +3,7 @@
 //! WGSL: kernels/attributes.wgsl, kernels/occlusion.wgsl; attention gather and SPGR are those of
 //! [`crate::gpu::attention_gather`] and [`crate::gpu::spgr`].
 
-use super::{DeviceArray, misfit};
+use super::{DeviceArray, check_residual, misfit};
 use crate::abi::{AttributesUniform, Gather, OcclusionUniform, SPLAT_STRIDE};
 use crate::gpu::attention_gather::{ATTENTION_GATHER, AttentionGatherArgs};
 use crate::gpu::buffers::Binding;
@@ -73,27 +73,37 @@ impl DeviceArray {
     }
 
     /// Computes the attention output `[N, E]` from maps `[cells, stride]`, `query` `[N, Q]` and
-    /// `points`.
+    /// `points`, and adds `residual` `[N, E]`.
     ///
     /// # Errors
-    /// As [`crate::gpu::Gpu::attention_gather`].
-    pub fn gather(&self, query: &Self, points: &Self, gather: &Gather) -> Result<Self, GpuError> {
+    /// As [`crate::gpu::Gpu::attention_gather`]; a residual of other sizes.
+    pub fn gather(
+        &self,
+        query: &Self,
+        points: &Self,
+        gather: &Gather,
+        residual: Option<&Self>,
+    ) -> Result<Self, GpuError> {
         let args = AttentionGatherArgs { gather, maps: &[], query: &[], points: &[] };
         args.check_lengths([self.count(), query.count(), points.count()])?;
         let n = query.count() / gather.query_width().max(1);
+        check_residual(ATTENTION_GATHER.name, &[n, gather.dim], residual)?;
         let gpu = &self.recorder.gpu;
         let mut uniform = args.uniform(&(0..n));
         uniform.cells = (self.count() / gather.stride.max(1)) as u32;
         let levels = gpu.upload("feature levels", &args.levels())?;
         let result = self.recorder.empty(&[n, gather.dim])?;
+        let (has_residual, residual) = self.residual_argument(residual);
         let bindings = [
             self.binding(),
             query.binding(),
             points.binding(),
             Binding::from(&levels),
+            residual,
             result.binding(),
         ];
-        self.recorder.call(&ATTENTION_GATHER, &[], &uniform, &bindings, Groups::of(n, 1))?;
+        let constants = [has_residual];
+        self.recorder.call(&ATTENTION_GATHER, &constants, &uniform, &bindings, Groups::of(n, 1))?;
         Ok(result)
     }
 

@@ -59,14 +59,15 @@ impl Stage {
         input: StageInput<'_, A>,
     ) -> Result<A> {
         let StageInput { maps, deferred, f, z, .. } = input;
-        let mut q = f.plus(z)?;
-        if let Some(norm) = &self.norm {
-            q = norm.forward(&q)?;
-        }
+        let q = match &self.norm {
+            Some(norm) => norm.forward_of_sum(f, z)?,
+            None => f.plus(z)?,
+        };
         let [_, dim] = q.sizes()?;
         let query = self.query(call, &q)?;
         let gather = gather(call, dim);
-        f.plus(&maps.attention_gather(&query, &call.centres, gather, deferred, call.backend)?)
+        let (centres, backend) = (&call.centres, call.backend);
+        maps.attention_gather(&query, centres, gather, deferred, Some(f), backend)
     }
 
     /// Rows of (q `[E]`, bias `[V·L]`, gate `[V]`).

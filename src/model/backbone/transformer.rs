@@ -163,13 +163,12 @@ impl SubLayer {
         let (k, v) = (gather(&self.k_proj)?, gather(&self.v_proj)?);
         let scale = 1.0 / (c as f32).sqrt();
         let message = q.attention(&k, &v, scale, windows.labels(m))?;
-        let message = self.norm1.forward(&self.merge.forward(&message)?)?;
-        let message = message.reshape((rows, tokens, c))?;
+        let message = self.merge.forward(&message)?.reshape((rows, tokens, c))?;
         match &self.ffn {
-            None => x.plus(&message),
+            None => self.norm1.forward_onto(x, &message),
             Some(ffn) => {
                 let x = x.reshape((rows * tokens, c))?;
-                let message = message.reshape((rows * tokens, c))?;
+                let message = self.norm1.forward(&message)?.reshape((rows * tokens, c))?;
                 feed_forward(ffn, &x, &message)?.reshape((rows, tokens, c))
             }
         }
@@ -195,7 +194,7 @@ fn feed_forward<A: Array>(
         let n = FFN_ROWS.min(rows - start);
         let (x, message) = (x.narrow(0, start, n)?, message.narrow(0, start, n)?);
         let hidden = gelu(&up.forward(&A::joined(&[&x, &message], 1)?)?)?;
-        x.plus(&norm.forward(&down.forward(&hidden)?)?)
+        norm.forward_onto(&x, &down.forward(&hidden)?)
     });
     A::joined(&blocks.collect::<Result<Vec<_>>>()?.iter().collect::<Vec<_>>(), 0)
 }

@@ -162,11 +162,12 @@ impl ResBlock {
 
     fn forward<A: Array>(&self, x: &A) -> Result<A> {
         let h = self.norm1.forward_then(&self.conv1.forward(x)?, Activation::Silu)?;
-        let h = self.norm2.forward_then(&self.conv2.forward(&h)?, Activation::Silu)?;
-        match &self.skip {
-            Some(skip) => skip.forward(x)?.plus(&h),
-            None => x.plus(&h),
-        }
+        let h = self.conv2.forward(&h)?;
+        let skip = match &self.skip {
+            Some(skip) => &skip.forward(x)?,
+            None => x,
+        };
+        self.norm2.forward_onto(skip, &h, Some(Activation::Silu))
     }
 }
 
@@ -213,6 +214,6 @@ impl Attention {
         let y = part(0)?.attention(&part(1)?, &part(2)?, scale, None)?;
         let y = y.reshape((scenes, heads, views, n, HEAD))?.permuted(&[2, 0, 1, 4, 3])?;
         let y = layer(&y.reshape((rows, c, h, w))?, &self.proj_out)?;
-        x.plus(&self.norm.forward(&y)?)
+        self.norm.forward_onto(x, &y, None)
     }
 }

@@ -9,7 +9,7 @@ use crate::camera::{Camera, NearFar};
 use crate::cpu::attention_gather::OCCLUSION_TOLERANCE;
 use crate::cpu::small::{cross_check, depth_consensus};
 use crate::gpu::{
-    self, ConvolutionCall, CrossCheckCall, DepthConsensusCall, Function, HeadOutputCall,
+    self, ConvolutionCall, CrossCheckCall, DepthConsensusCall, Function, HeadOutputCall, NormSum,
     PointwiseFunction, RawMatchingCall, Reduction,
 };
 use crate::ops::activation::Activation;
@@ -288,22 +288,23 @@ impl Array for DeviceArray {
         groups: usize,
         affine: [&Self; 2],
         activation: Option<Activation>,
+        residual: Option<&Self>,
     ) -> Result<Self> {
         let (arrays, activation) = (affine.map(|a| &a.array), pointwise(activation));
-        let result = self.array.group_norm(groups, Some(arrays), activation);
-        self.recorded("group norm", result, [self, affine[0], affine[1]], |want, _| {
+        let result = self.array.group_norm(
+            groups,
+            Some(arrays),
+            activation,
+            residual.map(|residual| &residual.array),
+        );
+        self.normalised("group norm", result, affine, residual, || {
             let (x, [factors, summands]) = (self.array.clone(), arrays.map(Clone::clone));
             move |dy| {
                 let affine = Some([&factors, &summands]);
                 let [dx, of_factors, of_summands] =
                     x.group_norm_backward(groups, affine, activation, dy)?;
                 let of_factors = of_factors.reshape(factors.dims())?;
-                let of_summands = of_summands.reshape(summands.dims())?;
-                Ok([
-                    want[0].then_some(dx),
-                    want[1].then_some(of_factors),
-                    want[2].then_some(of_summands),
-                ])
+                Ok([dx, of_factors, of_summands.reshape(summands.dims())?])
             }
         })
     }
@@ -311,7 +312,7 @@ impl Array for DeviceArray {
     fn instance_norm(&self, activation: Option<Activation>) -> Result<Self> {
         let [_, channels, ..] = self.sizes::<4>()?;
         let activation = pointwise(activation);
-        let result = self.array.group_norm(channels, None, activation);
+        let result = self.array.group_norm(channels, None, activation, None);
         self.recorded_alone("instance norm", result, |x, _| {
             let x = x.clone();
             move |dy| {
@@ -321,19 +322,22 @@ impl Array for DeviceArray {
         })
     }
 
-    fn layer_norm(&self, affine: [&Self; 2]) -> Result<Self> {
-        let result = self.array.layer_norm(affine.map(|a| &a.array));
-        self.recorded("layer norm", result, [self, affine[0], affine[1]], |want, _| {
+    fn layer_norm(&self, affine: [&Self; 2], residual: Option<&Self>) -> Result<Self> {
+        let arrays = affine.map(|a| &a.array);
+        let sum = residual.map_or(NormSum::None, |residual| NormSum::After(&residual.array));
+        let result = self.array.layer_norm(arrays, sum);
+        self.normalised("layer norm", result, affine, residual, || {
             let (x, factors) = (self.array.clone(), affine[0].array.clone());
-            move |dy| {
-                let [dx, of_factors, of_summands] = x.layer_norm_backward(&factors, dy)?;
-                Ok([
-                    want[0].then_some(dx),
-                    want[1].then_some(of_factors),
-                    want[2].then_some(of_summands),
-                ])
-            }
+            move |dy| x.layer_norm_backward(&factors, dy)
         })
+    }
+
+    fn layer_norm_of_sum(&self, other: &Self, affine: [&Self; 2]) -> Result<Self> {
+        // A gradient needs the sum, which is then an operation of its own.
+        if [self, other, affine[0], affine[1]].into_iter().any(Self::is_tracked) {
+            return self.plus(other)?.layer_norm(affine, None);
+        }
+        self.of(self.array.layer_norm(affine.map(|a| &a.array), NormSum::Before(&other.array)))
     }
 
     fn resized(&self, size: [usize; 2], activation: Option<Activation>) -> Result<Self> {
@@ -405,7 +409,7 @@ impl Array for DeviceArray {
     ) -> Result<Self> {
         let both = Self::joined(&[self, message], 1)?;
         let hidden = both.projected(up, None, Some(Activation::Gelu))?;
-        self.plus(&hidden.projected(down, None, None)?.layer_norm(norm)?)
+        hidden.projected(down, None, None)?.layer_norm(norm, Some(self))
     }
 
     fn plane_sweep(&self, source: &Self, sweep: Sweep, _backend: &Backend) -> Result<Self> {
@@ -579,16 +583,19 @@ impl Array for DeviceArray {
         points: &Self,
         gather: Gather,
         _deferred: Option<&Deferred>,
+        residual: Option<&Self>,
         _backend: &Backend,
     ) -> Result<Self> {
-        let result = self.array.gather(&query.array, &points.array, &gather);
-        self.recorded("attention gather", result, [self, query, points], |want, _| {
+        let (none, added) = (self.detached(), residual.map(|residual| &residual.array));
+        let result = self.array.gather(&query.array, &points.array, &gather, added);
+        let inputs = [self, query, points, residual.unwrap_or(&none)];
+        self.recorded("attention gather", result, inputs, |want, _| {
             let [maps, query, points] = [self, query, points].map(|x| x.array.clone());
             move |dy| {
                 let [of_maps, of_query, of_points] =
                     maps.gather_backward(&query, &points, &gather, dy)?;
-                let all = [(want[0], of_maps), (want[1], of_query), (want[2], of_points)];
-                Ok(all.map(|(want, gradient)| want.then_some(gradient)))
+                let all = [of_maps, of_query, of_points, dy.clone()].map(Some);
+                Ok(std::array::from_fn(|i| all[i].clone().filter(|_| want[i])))
             }
         })
     }

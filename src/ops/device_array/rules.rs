@@ -80,6 +80,39 @@ impl DeviceArray {
         }
     }
 
+    /// Records a norm with factors and summands, to which a residual is added. `rule` makes the rule of the
+    /// gradients of input, factors and summands; that of the residual is the result's.
+    pub(super) fn normalised<R>(
+        &self,
+        name: &'static str,
+        result: OnDevice<gpu::DeviceArray>,
+        [factors, summands]: [&Self; 2],
+        residual: Option<&Self>,
+        rule: impl FnOnce() -> R,
+    ) -> Result<Self>
+    where
+        R: FnOnce(&gpu::DeviceArray) -> OnDevice<[gpu::DeviceArray; 3]> + Send + Sync + 'static,
+    {
+        // Without a residual, an array without a node takes its place.
+        let none = self.detached();
+        let inputs = [self, factors, summands, residual.unwrap_or(&none)];
+        self.recorded(name, result, inputs, |want, _| {
+            let rule = rule();
+            move |dy| {
+                let [dx, of_factors, of_summands] = match want[..3].contains(&true) {
+                    true => rule(dy)?.map(Some),
+                    false => [None, None, None],
+                };
+                Ok([
+                    dx.filter(|_| want[0]),
+                    of_factors.filter(|_| want[1]),
+                    of_summands.filter(|_| want[2]),
+                    want[3].then(|| dy.clone()),
+                ])
+            }
+        })
+    }
+
     /// Sums or averages over dimension `dim`, which disappears.
     pub(super) fn reduced(&self, dim: usize, reduction: Reduction) -> Result<Self> {
         let mut dims = self.dims().to_vec();
