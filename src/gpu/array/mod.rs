@@ -16,7 +16,7 @@
 //! | network | calls | Gflop | arguments | device memory | integrated, laptop, desktop, H200 |
 //! |---|---|---|---|---|---|
 //! | small | 399 | 32 | 2.36 GB | 130 MiB | 89, 21, 8.4, 4.2 ms |
-//! | MVSplat | 1,485 | 363 | 14.8 GB | 515 MiB | 878, 192, 71, 31 ms |
+//! | MVSplat | 1,375 | 363 | 13.5 GB | 508 MiB | 845, 184, 67, 30 ms |
 //!
 //! Times are estimates from data sheets, with 30 % of the f32 rate, 70 % of the memory's rate and 5 µs a
 //! call: 2 Tflop/s and 60 GB/s, 10 and 250, 30 and 700, 60 and 4800. No GPU was at hand. Memory is the most
