@@ -9,6 +9,7 @@
 )]
 
 use crate::cpu::simd::{LANES, Simd, Vector};
+use std::hint::black_box;
 
 /// Rows of a register tile.
 const TILE_ROWS: usize = 6;
@@ -118,11 +119,13 @@ unsafe fn tile<S: Simd, const R: usize, const V: usize>(s: S, part: PanelProduct
     unsafe {
         let mut sums = [[s.splat(0.0); V]; R];
         let mut b = part.b;
-        // A pointer to each row: with one pointer, the loop computes the addresses anew.
+        // A pointer to each row, whose origin the compiler does not see: it would compute the
+        // addresses anew in the loop, 29 instructions instead of 24 for 12 of AVX2's multiply-adds.
         let mut a = [part.a; R];
         for r in 0..R {
             a[r] = part.a.wrapping_add(r * part.a_stride);
         }
+        let a = black_box(a);
         for i in 0..part.depth {
             let mut columns = [s.splat(0.0); V];
             for v in 0..V {
