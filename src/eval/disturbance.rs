@@ -56,6 +56,14 @@ impl Disturbance {
         Self::NAMED.iter().find(|(_, d)| *d == self).map_or("", |(name, _)| name)
     }
 
+    /// Whether the pictures change, not the cameras.
+    pub(super) fn changes_pictures(self) -> bool {
+        match self {
+            Self::Dark | Self::Blur | Self::Jpeg => true,
+            Self::Rotation | Self::Position | Self::Focal => false,
+        }
+    }
+
     /// Disturbs the inputs of a case. Without matched points, the depth of the scene is the geometric
     /// mean of `bounds`.
     ///

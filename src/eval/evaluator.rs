@@ -1,6 +1,7 @@
 //! Scores the pictures of every method on the targets of a case.
 
 use super::pictures::PictureMaker;
+use super::preparation::{photos, whole_photos};
 use super::{
     Benchmark, Case, CaseScores, Disturbance, GaussianReport, InputReport, Loaded, Method,
     Preparation, Score, Scores, TargetScores,
@@ -147,13 +148,19 @@ impl Evaluator {
         case: &Case,
         loaded: Loaded,
     ) -> Result<CaseResult> {
-        let names = loaded.names.clone();
+        let (names, whole) = (loaded.names.clone(), loaded.context.clone());
         let mut crops = self.crop(model, case, loaded)?;
         let given: Vec<Camera> = crops.inputs.iter().map(|c| c.target_camera).collect();
         for disturbance in &self.options.disturbances {
             disturbance.apply(&mut crops.inputs, &crops.bounds)?;
         }
-        self.options.preparation.apply(&given, &mut crops.inputs, &mut crops.targets)?;
+        // `run` matches points in the whole photographs. Those of disturbed pictures are as given.
+        let photos = match self.options.disturbances.iter().any(|d| d.changes_pictures()) {
+            true => photos(&crops.inputs)?,
+            false => whole_photos(&whole, &given, &crops.inputs)?,
+        };
+        let Crops { inputs, targets, .. } = &mut crops;
+        self.options.preparation.apply(&given, photos, inputs, targets)?;
         let place = format!("{} ({})", case.scene, case.pair());
         let mut pictures = PictureMaker::new(&self.options, model, &crops)?;
         let mut result = self.empty(case, (&crops, pictures.bounds()), &names);

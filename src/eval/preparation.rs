@@ -5,7 +5,7 @@ use crate::data::crop::Cropped;
 use crate::pipeline::{Photo, Poses, Result, adjusted, check_pairs, equalise};
 use crate::poses::move_along;
 
-/// Steps before the network. They receive the pictures of the target's size and the cameras after all
+/// Steps before the network. They receive the inputs' photographs and the cameras after all
 /// disturbances.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Preparation {
@@ -17,20 +17,21 @@ pub struct Preparation {
 }
 
 impl Preparation {
-    /// Prepares the inputs of a case. `given`: their cameras before any disturbance.
+    /// Prepares the inputs of a case, by points matched between `photos`: the inputs' photographs
+    /// with their cameras after all disturbances. `given`: the cameras before any disturbance.
     ///
     /// # Errors
     /// Pictures of which no features can be taken.
     pub(super) fn apply(
         self,
         given: &[Camera],
+        mut photos: Vec<Photo>,
         inputs: &mut [Cropped],
         targets: &mut [Cropped],
     ) -> Result<()> {
         if self == Self::default() {
             return Ok(());
         }
-        let mut photos = photos(inputs)?;
         if self.poses == Poses::Adjusted {
             if let Some((moved, _)) = adjusted(&photos)? {
                 photos = moved;
@@ -49,6 +50,27 @@ impl Preparation {
         }
         Ok(())
     }
+}
+
+/// The whole photographs `whole` of `inputs`, with the cameras that the inputs have after disturbances.
+/// `given`: the inputs' cameras before.
+///
+/// # Errors
+/// A disturbed camera that is none, such as a focal length that is not finite.
+pub(super) fn whole_photos(
+    whole: &[Photo],
+    given: &[Camera],
+    inputs: &[Cropped],
+) -> Result<Vec<Photo>> {
+    let of = |((photo, given), input): ((&Photo, &Camera), &Cropped)| {
+        let (from, to) = (given.intrinsics, input.target_camera.intrinsics);
+        let mut camera = *photo.camera();
+        camera.intrinsics.fx *= to.fx / from.fx;
+        camera.intrinsics.fy *= to.fy / from.fy;
+        camera.world_from_camera = input.target_camera.world_from_camera;
+        photo.with_camera(camera)
+    };
+    whole.iter().zip(given).zip(inputs).map(of).collect()
 }
 
 /// Photographs of the target's size with their cameras.

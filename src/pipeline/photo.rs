@@ -55,7 +55,12 @@ impl Photo {
 
     /// The same pixels with the pose of another camera; the intrinsics stay.
     pub(super) fn with_pose_of(&self, camera: &Camera) -> Result<Self> {
-        let camera = Camera::new(self.camera.intrinsics, camera.world_from_camera)?;
+        self.with_camera(Camera { intrinsics: self.camera.intrinsics, ..*camera })
+    }
+
+    /// The same pixels with another camera of their size.
+    pub(crate) fn with_camera(&self, camera: Camera) -> Result<Self> {
+        let camera = Camera::new(camera.intrinsics, camera.world_from_camera)?;
         Ok(Self { image: Arc::clone(&self.image), camera })
     }
 
