@@ -148,7 +148,8 @@ impl Evaluator {
         case: &Case,
         loaded: Loaded,
     ) -> Result<CaseResult> {
-        let (names, whole) = (loaded.names.clone(), loaded.context.clone());
+        let names = loaded.names.clone();
+        let (whole, truth) = (loaded.context.clone(), loaded.targets.clone());
         let mut crops = self.crop(model, case, loaded)?;
         let given: Vec<Camera> = crops.inputs.iter().map(|c| c.target_camera).collect();
         for disturbance in &self.options.disturbances {
@@ -160,7 +161,7 @@ impl Evaluator {
             false => whole_photos(&whole, &given, &crops.inputs)?,
         };
         let Crops { inputs, targets, .. } = &mut crops;
-        self.options.preparation.apply(&given, photos, inputs, targets)?;
+        self.options.preparation.apply(&given, photos, inputs, &truth, targets)?;
         let place = format!("{} ({})", case.scene, case.pair());
         let mut pictures = PictureMaker::new(&self.options, model, &crops)?;
         let mut result = self.empty(case, (&crops, pictures.bounds()), &names);

@@ -2,15 +2,16 @@
 
 use crate::camera::Camera;
 use crate::data::crop::Cropped;
-use crate::pipeline::{Photo, Poses, Result, adjusted, check_pairs, equalise};
+use crate::pipeline::{Photo, Poses, Result, adjusted, check_pairs, equalise, located};
 use crate::poses::move_along;
 
 /// Steps before the network. They receive the inputs' photographs and the cameras after all
 /// disturbances.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Preparation {
-    /// Cameras of the inputs. Those of the targets follow adjusted ones by one similarity, because nothing
-    /// tells which camera of a pair was wrong.
+    /// Cameras of the inputs. With adjusted ones, the targets are located by points matched with the
+    /// inputs, because a target's own camera is in the frame of the cameras before. Targets with too few
+    /// matches follow the inputs by one similarity.
     pub poses: Poses,
     /// Gives all inputs the exposure and white balance of one of them; of two inputs it is the first.
     pub equal_exposure: bool,
@@ -18,7 +19,8 @@ pub struct Preparation {
 
 impl Preparation {
     /// Prepares the inputs of a case, by points matched between `photos`: the inputs' photographs
-    /// with their cameras after all disturbances. `given`: the cameras before any disturbance.
+    /// with their cameras after all disturbances. `given`: the cameras before any disturbance;
+    /// `truth`: the targets' photographs.
     ///
     /// # Errors
     /// Pictures of which no features can be taken.
@@ -27,6 +29,7 @@ impl Preparation {
         given: &[Camera],
         mut photos: Vec<Photo>,
         inputs: &mut [Cropped],
+        truth: &[Photo],
         targets: &mut [Cropped],
     ) -> Result<()> {
         if self == Self::default() {
@@ -38,10 +41,12 @@ impl Preparation {
             }
             let cameras: Vec<Camera> = photos.iter().map(|p| *p.camera()).collect();
             inputs.iter_mut().zip(&cameras).for_each(|(c, camera)| place(c, camera));
-            // Position, orientation and size of the whole scene are no error of a reconstruction.
-            let seen: Vec<Camera> = targets.iter().map(|c| c.target_camera).collect();
-            if let Some(moved) = move_along(given, &cameras, &seen) {
-                targets.iter_mut().zip(&moved).for_each(|(c, camera)| place(c, camera));
+            let seen: Vec<Camera> = truth.iter().map(|p| *p.camera()).collect();
+            let seen = move_along(given, &cameras, &seen).unwrap_or(seen);
+            let truth = truth.iter().zip(&seen).map(|(p, c)| p.with_camera(*c));
+            let found = located(&photos, &truth.collect::<Result<Vec<_>>>()?)?;
+            for ((target, found), moved) in targets.iter_mut().zip(&found).zip(&seen) {
+                place(target, found.as_ref().unwrap_or(moved));
             }
         }
         if self.equal_exposure {

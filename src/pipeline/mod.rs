@@ -76,7 +76,7 @@ pub(crate) use depth_range::{initial_bounds, refined_bounds};
 pub(crate) use detail::add_detail;
 pub(crate) use exposure::equalise;
 pub(crate) use fit::{fit_to_inputs, refine_on_inputs};
-pub(crate) use poses::{adjusted, check_pairs};
+pub(crate) use poses::{adjusted, check_pairs, located};
 
 use crate::config::{Backbone, Config};
 

@@ -1,9 +1,10 @@
 //! Check and adjustment of the poses by points matched between photographs.
 
 use super::{Error, Photo, Result};
+use crate::camera::Camera;
 use crate::check::{CheckOptions, Finding, GrayImage, PairReport, Verdict, check_pair};
 use crate::io::image::Rgb;
-use crate::poses::{Lens, PoseAdjustment, PosePhoto, adjust_poses};
+use crate::poses::{Lens, PoseAdjustment, PosePhoto, adjust_poses, locate_photos};
 use rayon::prelude::*;
 use std::fmt;
 
@@ -66,16 +67,32 @@ const SEED: u64 = 1;
 /// # Errors
 /// A photograph of which no features can be taken.
 pub(crate) fn adjusted(photos: &[Photo]) -> Result<Option<(Vec<Photo>, PoseAdjustment)>> {
-    let features = |p: &Photo| {
+    let Some(found) = adjust_poses(&features(photos)?, &cameras(photos), SEED) else {
+        return Ok(None);
+    };
+    let moved = photos.iter().zip(&found.cameras).map(|(p, camera)| p.with_pose_of(camera));
+    Ok(Some((moved.collect::<Result<_>>()?, found)))
+}
+
+/// The cameras of `others`, located by points matched with `photos`. `None` where too few are matched.
+///
+/// # Errors
+/// A photograph of which no features can be taken.
+pub(crate) fn located(photos: &[Photo], others: &[Photo]) -> Result<Vec<Option<Camera>>> {
+    let all = [features(photos)?, features(others)?].concat();
+    Ok(locate_photos(&all, &cameras(photos), &cameras(others), SEED))
+}
+
+fn features(photos: &[Photo]) -> Result<Vec<PosePhoto>> {
+    let of = |p: &Photo| {
         let lens = Lens::known(p.camera().intrinsics);
         PosePhoto::from_rgb8(&p.image().data, lens, FEATURES)
     };
-    let features: Vec<PosePhoto> =
-        photos.par_iter().map(features).collect::<std::result::Result<_, _>>()?;
-    let cameras: Vec<_> = photos.iter().map(|p| *p.camera()).collect();
-    let Some(found) = adjust_poses(&features, &cameras, SEED) else { return Ok(None) };
-    let moved = photos.iter().zip(&found.cameras).map(|(p, camera)| p.with_pose_of(camera));
-    Ok(Some((moved.collect::<Result<_>>()?, found)))
+    Ok(photos.par_iter().map(of).collect::<std::result::Result<_, _>>()?)
+}
+
+fn cameras(photos: &[Photo]) -> Vec<Camera> {
+    photos.iter().map(|p| *p.camera()).collect()
 }
 
 fn grey(photo: &Photo) -> Result<GrayImage> {

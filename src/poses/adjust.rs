@@ -76,6 +76,30 @@ pub fn move_along(from: &[Camera], to: &[Camera], others: &[Camera]) -> Option<V
     others.iter().map(|c| similarity.camera(&absolute(c), c)).collect()
 }
 
+/// Locates photographs among the points that others with the cameras `known` show, from matches alone.
+/// `photos`: first those with `known` cameras, then one for each of `others`, whose intrinsics are
+/// exact. `None` for a photograph that shows too few points, whose match turns its camera in `others`
+/// by more than [`MAX_TURN_DEG`], or where there is not one camera for each photograph.
+pub(crate) fn locate_photos(
+    photos: &[PosePhoto],
+    known: &[Camera],
+    others: &[Camera],
+    seed: u64,
+) -> Vec<Option<Camera>> {
+    if photos.len() != known.len() + others.len() {
+        return vec![None; others.len()];
+    }
+    let known: Vec<Absolute> = known.iter().map(absolute).collect();
+    let found = reconstruct::locate_others(photos, &known, seed);
+    let camera = |(pose, like): (Option<Absolute>, &Camera)| {
+        let pose = pose?;
+        let turn = pose.rotation * absolute(like).rotation.transpose();
+        let near = rotation_angle(&turn).to_degrees() < MAX_TURN_DEG;
+        near.then(|| pose.camera(like))?
+    };
+    found.into_iter().zip(others).map(camera).collect()
+}
+
 fn absolute(camera: &Camera) -> Absolute {
     let rotation = camera.rotation().as_dmat3().transpose();
     Absolute { rotation, translation: -(rotation * camera.position().as_dvec3()) }
@@ -95,6 +119,15 @@ struct Similarity {
     scale: f64,
     from: DVec3,
     to: DVec3,
+}
+
+impl Absolute {
+    /// This pose with the intrinsics of `like`; `None` where it is not finite.
+    fn camera(&self, like: &Camera) -> Option<Camera> {
+        let axes = self.rotation.transpose().as_mat3();
+        let matrix = Mat4::from_mat3_translation(axes, self.position().as_vec3());
+        Camera::new(like.intrinsics, matrix).ok()
+    }
 }
 
 impl Similarity {

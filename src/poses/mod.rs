@@ -25,6 +25,7 @@ mod tracks;
 mod two_view;
 mod world;
 
+pub(crate) use adjust::locate_photos;
 pub use adjust::{PoseAdjustment, adjust_poses, move_along};
 pub use estimate::{
     Confidence, FocalEstimate, LeftOut, PoseEstimate, PoseOptions, PosePoint, PoseRefusal,

@@ -98,7 +98,12 @@ fn compared(photos: &[PosePhoto]) -> Vec<[usize; 2]> {
 
 /// Estimates the relative poses of all comparable pairs.
 pub(super) fn edges(photos: &[PosePhoto], seed: u64) -> Vec<Edge> {
-    compared(photos)
+    edges_of(photos, compared(photos), seed)
+}
+
+/// Estimates the relative poses of `pairs`.
+fn edges_of(photos: &[PosePhoto], pairs: Vec<[usize; 2]>, seed: u64) -> Vec<Edge> {
+    pairs
         .into_par_iter()
         .filter_map(|[i, j]| {
             let estimate = pair::estimate(&photos[i], &photos[j], false, seed).ok()?;
@@ -248,6 +253,23 @@ pub(super) fn adjust(photos: &[PosePhoto], edges: &[Edge], given: &[Absolute]) -
     };
     let (before, after) = (error(&start)?, error(&cameras)?);
     Some(Adjusted { cameras, before, after, points })
+}
+
+/// Locates the photographs after the first `known.len()` among the points that those show with the
+/// cameras `known`. `None` for a photograph that shows too few of them.
+pub(super) fn locate_others(
+    photos: &[PosePhoto],
+    known: &[Absolute],
+    seed: u64,
+) -> Vec<Option<Absolute>> {
+    let all = (0..photos.len()).flat_map(|j| (0..j.min(known.len())).map(move |i| [i, j]));
+    let edges = edges_of(photos, all.collect(), seed);
+    let mut builder = Builder::new(photos, &edges, None);
+    builder.cameras[..known.len()].iter_mut().zip(known).for_each(|(c, k)| *c = Some(*k));
+    builder.triangulate();
+    builder.align();
+    builder.triangulate();
+    (known.len()..photos.len()).into_par_iter().map(|i| builder.register(i, seed)).collect()
 }
 
 /// The pair to start with: many matches and a wide angle between their rays.
