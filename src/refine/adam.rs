@@ -54,6 +54,8 @@ pub(super) struct Step<'a> {
     pub predicted: &'a Splats,
     /// `[N]`: unit of a mean's parameters, world units.
     pub units: &'a [f32],
+    /// `[N]` or empty: Gaussians of which only the colours change.
+    pub beyond: &'a [bool],
     /// Gradients by all Gaussians.
     pub gradients: &'a Gradients,
     /// More gradients by rows, the Gaussians that they belong to, and their weight.
@@ -96,6 +98,10 @@ impl Step<'_> {
             for (sum, g) in gradient.iter_mut().zip(second) {
                 *sum += weight * g;
             }
+        }
+        if self.beyond.get(i) == Some(&true) {
+            gradient[..COLOUR].fill(0.0);
+            gradient[MEAN..].fill(0.0);
         }
         // Adam's state of a Gaussian that no pixel shows stays as it is.
         if gradient.iter().all(|g| *g == 0.0) || gradient.iter().any(|g| !g.is_finite()) {
