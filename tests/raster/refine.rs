@@ -152,6 +152,67 @@ fn gaussians_that_no_picture_shows_stay() {
     assert_eq!(splats.rows()[..10], start.rows()[..10]);
 }
 
+/// Gaussians whose 3σ reach beyond both photographs get other colours only: a photograph that shows a
+/// part of one would shrink it, and leave a black strip at the edge of new views.
+#[test]
+fn gaussians_at_the_edge_of_both_photographs_keep_their_geometry() {
+    let (truth, start) = (pictures(&plane(0.6, 0.9)), displaced(0.4));
+    let mut splats = start.clone();
+    refined(&mut splats, &truth, &RefineOptions::default().with_steps(60));
+    let rows =
+        |s: &Splats| s.rows().chunks(SPLAT_STRIDE).map(<[f32]>::to_vec).collect::<Vec<Vec<f32>>>();
+    let (before, after) = (rows(&start), rows(&splats));
+    // The first camera's picture begins 2.4 px left of the plane, more than 3 · 0.6 px, and at its top.
+    let (left, top) = (24 * SIDE, 24);
+    assert_ne!(after[left], before[left]);
+    assert_eq!(after[top][..10], before[top][..10]);
+    assert_ne!(splats.gain()[4 * top..][..4], [1.0, 0.0, 0.0, 0.0]);
+    // Of three photographs they are refined as all others.
+    let (cameras, truth) = (cameras(), [&truth[0], &truth[1], &truth[0]]);
+    let order = [cameras[0], cameras[1], cameras[0]];
+    let views: Vec<FitView<'_>> =
+        order.iter().zip(truth).map(|(camera, image)| FitView { camera, image }).collect();
+    let (raster, options) = (RasterOptions::default(), RefineOptions::default().with_steps(60));
+    let mut go_on = |_: &Refiner<'_>| ControlFlow::Continue(());
+    let mut splats = start.clone();
+    let mut renderer = Renderer::default();
+    refine(&mut splats, &views, &raster, &options, &mut renderer, &mut go_on).unwrap();
+    assert_ne!(rows(&splats)[top][..10], before[top][..10]);
+}
+
+/// Two photographs whose Gaussians hardly show in each other's stay as they are.
+#[test]
+fn two_photographs_with_little_in_common_are_not_refined() {
+    let truth = pictures(&plane(0.6, 0.9));
+    let copy = displaced(0.4).into_parts();
+    // The rows of the plane that each photograph has made.
+    let start = |rows: usize| {
+        let mut parts = displaced(0.4).into_parts();
+        let second = parts.rows.len();
+        parts.rows.extend_from_slice(&copy.rows);
+        parts.sh.extend_from_slice(&copy.sh);
+        for (i, row) in parts.rows.chunks_mut(SPLAT_STRIDE).enumerate() {
+            let kept = match i * SPLAT_STRIDE < second {
+                true => i / SIDE < rows,
+                false => i / SIDE - SIDE >= SIDE - rows,
+            };
+            if !kept {
+                row[OPACITY_OFFSET] = 1e-3;
+            }
+        }
+        Splats::try_from(parts).unwrap()
+    };
+    let run = |rows: usize| {
+        let (start, options) = (start(rows), RefineOptions::default().with_groups(true));
+        let mut splats = start.clone();
+        (refined(&mut splats, &truth, &options), splats == start)
+    };
+    let (report, same) = run(SIDE / 6);
+    assert!(same && report.steps == 0 && report.after == report.before, "{report:?}");
+    let (report, same) = run(SIDE / 2);
+    assert!(!same && report.after < report.before, "{report:?}");
+}
+
 #[test]
 fn steps_end_where_the_error_no_longer_falls() {
     let truth = pictures(&plane(0.6, 0.9));
