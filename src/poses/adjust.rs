@@ -86,8 +86,9 @@ pub fn move_along(from: &[Camera], to: &[Camera], others: &[Camera]) -> Option<V
 /// Locates photographs among the points that others with the cameras `known` show, from matches alone.
 /// `photos`: first those with `known` cameras, then one for each of `others`, whose intrinsics are
 /// exact. `None` for a photograph that shows too few points, whose match turns its camera in `others`
-/// by more than [`MAX_TURN_DEG`], or where there is not one camera for each photograph.
-pub(crate) fn locate_photos(
+/// by more than 4° ([`MAX_TURN_DEG`]), or where there is not one camera for each photograph.
+#[must_use]
+pub fn locate_photos(
     photos: &[PosePhoto],
     known: &[Camera],
     others: &[Camera],

@@ -25,8 +25,7 @@ mod tracks;
 mod two_view;
 mod world;
 
-pub(crate) use adjust::locate_photos;
-pub use adjust::{PoseAdjustment, adjust_poses, move_along};
+pub use adjust::{PoseAdjustment, adjust_poses, locate_photos, move_along};
 pub use estimate::{
     Confidence, FocalEstimate, LeftOut, PoseEstimate, PoseOptions, PosePoint, PoseRefusal,
     PoseWarning, Uncertain, estimate_poses,

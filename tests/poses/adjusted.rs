@@ -2,7 +2,7 @@
 
 use glam::{Mat4, Quat, Vec3};
 use subsplat::camera::Camera;
-use subsplat::poses::{PosePhoto, adjust_poses, move_along};
+use subsplat::poses::{PosePhoto, adjust_poses, locate_photos, move_along};
 use subsplat_test_support::pose_errors::aligned_errors;
 use subsplat_test_support::posed_photos::{Intrinsics, PosedPhoto, photo_scene};
 
@@ -57,4 +57,34 @@ fn disturbed_cameras_come_back_to_within_a_third() {
     // Cameras that fit stay.
     assert!(adjust_poses(&features, &truth, 1).is_none_or(|a| a.turned_deg < 0.15));
     assert!(adjust_poses(&features, &truth[..2], 1).is_none());
+}
+
+/// Two photographs whose cameras are off by 1° and 3 % of the extent, among three whose cameras are known.
+#[test]
+fn photographs_are_located_among_others() {
+    let Some(scene) = photo_scene("fox") else { return };
+    let photos: Vec<PosedPhoto> =
+        [2, 5, 9, 4, 7].iter().map(|&i| PosedPhoto::load(&scene, i)).collect();
+    let features: Vec<PosePhoto> =
+        photos.iter().map(|p| p.features(Intrinsics::Known, 4000)).collect();
+    let truth: Vec<Camera> = photos.iter().map(|p| p.camera).collect();
+    let extent = truth[0].position().distance(truth[2].position());
+    let (known, others) = truth.split_at(3);
+    let off = |degrees: f32| -> Vec<Camera> {
+        let moved = |(i, c)| disturbed(c, i, degrees, 0.03 * extent);
+        others.iter().enumerate().map(moved).collect()
+    };
+    let found = locate_photos(&features, known, &off(1.0), 1);
+    for (found, truth) in found.iter().zip(others) {
+        let found = found.expect("a camera");
+        let turn = Quat::from_mat3(&(found.rotation().transpose() * truth.rotation()));
+        let degrees = 2.0 * turn.xyz().length().asin().to_degrees();
+        assert!(degrees < 0.2, "{degrees}");
+        let distance = found.position().distance(truth.position());
+        assert!(distance < 0.01 * extent, "{distance} of {extent}");
+        assert_eq!(found.intrinsics(), truth.intrinsics());
+    }
+    // A camera that looks elsewhere is no better than the match says.
+    assert_eq!(locate_photos(&features, known, &off(6.0), 1), [None, None]);
+    assert_eq!(locate_photos(&features[1..], known, &off(1.0), 1), [None, None]);
 }
