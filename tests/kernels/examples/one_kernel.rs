@@ -27,7 +27,8 @@ const SOFTMAX: [usize; 2] = [512, 256];
 fn main() -> Result<(), Box<dyn Error>> {
     let mut arguments = std::env::args().skip(1);
     let kernel = arguments.next().ok_or("expected KERNEL REPEATS, got no kernel")?;
-    let repeats: usize = arguments.next().ok_or("expected KERNEL REPEATS, got no repeats")?.parse()?;
+    let repeats: usize =
+        arguments.next().ok_or("expected KERNEL REPEATS, got no repeats")?.parse()?;
     SimdLevel::requested()?;
     rayon::ThreadPoolBuilder::new().num_threads(1).build_global()?;
     let units = match kernel.as_str() {
