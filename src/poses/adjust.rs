@@ -86,7 +86,7 @@ pub fn move_along(from: &[Camera], to: &[Camera], others: &[Camera]) -> Option<V
 /// Locates photographs among the points that others with the cameras `known` show, from matches alone.
 /// `photos`: first those with `known` cameras, then one for each of `others`, whose intrinsics are
 /// exact. `None` for a photograph that shows too few points, whose match turns its camera in `others`
-/// by more than 4° ([`MAX_TURN_DEG`]), or where there is not one camera for each photograph.
+/// by more than 4°, or where there is not one camera for each photograph.
 #[must_use]
 pub fn locate_photos(
     photos: &[PosePhoto],
