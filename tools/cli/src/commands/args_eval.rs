@@ -73,8 +73,8 @@ pub struct EvalArgs {
     /// at the inputs' cameras are then those of the disturbed inputs.
     #[arg(long, value_delimiter = ',', value_name = "D,…", value_parser = disturbance)]
     pub disturb: Vec<Disturbance>,
-    /// Adjust the inputs' cameras by points matched between them, as in `run`. The targets' cameras
-    /// follow by one similarity.
+    /// Adjust the inputs' cameras by points matched between them, as in `run`. Targets are located by
+    /// points that they share with the inputs; without enough, they follow by one similarity.
     #[arg(long)]
     pub adjust_poses: bool,
     /// Give the inputs the exposure and white balance of one of them, as `run` does. Of two inputs it
