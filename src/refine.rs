@@ -476,7 +476,7 @@ fn pixel_sizes(splats: &Splats, views: &[FitView<'_>]) -> Vec<f32> {
     .collect()
 }
 
-/// Whether each Gaussian reaches beyond the photographs: none of them shows all of its 3σ. The part
+/// Marks the Gaussians that reach beyond the photographs: none of them shows all of 3σ. The part
 /// that a photograph shows would shrink and move it, and leave a black strip at the edge of new views.
 /// Of five photographs this costs 0.04 dB, because the others show such Gaussians from elsewhere.
 fn beyond(splats: &Splats, views: &[FitView<'_>]) -> Vec<bool> {

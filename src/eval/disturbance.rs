@@ -56,7 +56,7 @@ impl Disturbance {
         Self::NAMED.iter().find(|(_, d)| *d == self).map_or("", |(name, _)| name)
     }
 
-    /// Whether the pictures change, not the cameras.
+    /// Returns true if the pictures change, not the cameras.
     pub(super) fn changes_pictures(self) -> bool {
         match self {
             Self::Dark | Self::Blur | Self::Jpeg => true,

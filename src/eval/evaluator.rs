@@ -156,9 +156,10 @@ impl Evaluator {
             disturbance.apply(&mut crops.inputs, &crops.bounds)?;
         }
         // `run` matches points in the whole photographs. Those of disturbed pictures are as given.
-        let photos = match self.options.disturbances.iter().any(|d| d.changes_pictures()) {
-            true => photos(&crops.inputs)?,
-            false => whole_photos(&whole, &given, &crops.inputs)?,
+        let changed = self.options.disturbances.iter().any(|d| d.changes_pictures());
+        let photos = |inputs: &[Cropped]| match changed {
+            true => photos(inputs),
+            false => whole_photos(&whole, &given, inputs),
         };
         let Crops { inputs, targets, .. } = &mut crops;
         self.options.preparation.apply(&given, photos, inputs, &truth, targets)?;

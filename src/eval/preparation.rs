@@ -18,8 +18,8 @@ pub struct Preparation {
 }
 
 impl Preparation {
-    /// Prepares the inputs of a case, by points matched between `photos`: the inputs' photographs
-    /// with their cameras after all disturbances. `given`: the cameras before any disturbance;
+    /// Prepares the inputs of a case, by points matched between the inputs' photographs with their
+    /// cameras after all disturbances. `photos` makes these of the inputs where a step needs them. `given`: the cameras before any disturbance;
     /// `truth`: the targets' photographs.
     ///
     /// # Errors
@@ -27,7 +27,7 @@ impl Preparation {
     pub(super) fn apply(
         self,
         given: &[Camera],
-        mut photos: Vec<Photo>,
+        photos: impl FnOnce(&[Cropped]) -> Result<Vec<Photo>>,
         inputs: &mut [Cropped],
         truth: &[Photo],
         targets: &mut [Cropped],
@@ -35,6 +35,7 @@ impl Preparation {
         if self == Self::default() {
             return Ok(());
         }
+        let mut photos = photos(inputs)?;
         if self.poses == Poses::Adjusted {
             if let Some((moved, _)) = adjusted(&photos)? {
                 photos = moved;

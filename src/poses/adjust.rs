@@ -103,9 +103,16 @@ pub fn locate_photos(
         let pose = pose?;
         let turn = pose.rotation * absolute(like).rotation.transpose();
         let near = rotation_angle(&turn).to_degrees() < MAX_TURN_DEG;
-        near.then(|| pose.camera(like))?
+        near.then(|| camera_at(pose.rotation.transpose(), pose.position(), like))?
     };
     found.into_iter().zip(others).map(camera).collect()
+}
+
+/// A camera with these axes and this position in the world and the intrinsics of `like`; `None` where
+/// it is not finite.
+fn camera_at(axes: DMat3, position: DVec3, like: &Camera) -> Option<Camera> {
+    let matrix = Mat4::from_mat3_translation(axes.as_mat3(), position.as_vec3());
+    Camera::new(like.intrinsics, matrix).ok()
 }
 
 fn absolute(camera: &Camera) -> Absolute {
@@ -127,15 +134,6 @@ struct Similarity {
     scale: f64,
     from: DVec3,
     to: DVec3,
-}
-
-impl Absolute {
-    /// This pose with the intrinsics of `like`; `None` where it is not finite.
-    fn camera(&self, like: &Camera) -> Option<Camera> {
-        let axes = self.rotation.transpose().as_mat3();
-        let matrix = Mat4::from_mat3_translation(axes, self.position().as_vec3());
-        Camera::new(like.intrinsics, matrix).ok()
-    }
 }
 
 impl Similarity {
@@ -162,9 +160,8 @@ impl Similarity {
 
     /// A camera that was moved, with the intrinsics of `like`.
     fn camera(&self, camera: &Absolute, like: &Camera) -> Option<Camera> {
-        let (rotation, position) = self.pose(camera);
-        let matrix = Mat4::from_mat3_translation(rotation.as_mat3(), position.as_vec3());
-        Camera::new(like.intrinsics, matrix).ok()
+        let (axes, position) = self.pose(camera);
+        camera_at(axes, position, like)
     }
 
     /// Axes and position of a camera in the world.

@@ -22,15 +22,18 @@ fn disturbed(camera: &Camera, i: usize, degrees: f32, distance: f32) -> Camera {
     Camera::new(camera.intrinsics(), matrix).unwrap()
 }
 
+/// Features and cameras of five photographs of the fox; `None` where the folder is absent.
+fn fox(frames: [usize; 5]) -> Option<(Vec<PosePhoto>, Vec<Camera>)> {
+    let scene = photo_scene("fox")?;
+    let photos = frames.map(|i| PosedPhoto::load(&scene, i));
+    let features = photos.iter().map(|p| p.features(Intrinsics::Known, 4000)).collect();
+    Some((features, photos.iter().map(|p| p.camera).collect()))
+}
+
 /// 0.5° and 1 % of the depth, which is that of the fox's wall, in five photographs.
 #[test]
 fn disturbed_cameras_come_back_to_within_a_third() {
-    let Some(scene) = photo_scene("fox") else { return };
-    let photos: Vec<PosedPhoto> =
-        [2, 5, 9, 13, 17].iter().map(|&i| PosedPhoto::load(&scene, i)).collect();
-    let features: Vec<PosePhoto> =
-        photos.iter().map(|p| p.features(Intrinsics::Known, 4000)).collect();
-    let truth: Vec<Camera> = photos.iter().map(|p| p.camera).collect();
+    let Some((features, truth)) = fox([2, 5, 9, 13, 17]) else { return };
     let extent = truth.iter().map(|c| c.position().distance(truth[0].position()));
     let distance = 0.01 * extent.fold(0.0, f32::max);
     let given: Vec<Camera> =
@@ -62,12 +65,7 @@ fn disturbed_cameras_come_back_to_within_a_third() {
 /// Two photographs whose cameras are off by 1° and 3 % of the extent, among three whose cameras are known.
 #[test]
 fn photographs_are_located_among_others() {
-    let Some(scene) = photo_scene("fox") else { return };
-    let photos: Vec<PosedPhoto> =
-        [2, 5, 9, 4, 7].iter().map(|&i| PosedPhoto::load(&scene, i)).collect();
-    let features: Vec<PosePhoto> =
-        photos.iter().map(|p| p.features(Intrinsics::Known, 4000)).collect();
-    let truth: Vec<Camera> = photos.iter().map(|p| p.camera).collect();
+    let Some((features, truth)) = fox([2, 5, 9, 4, 7]) else { return };
     let extent = truth[0].position().distance(truth[2].position());
     let (known, others) = truth.split_at(3);
     let off = |degrees: f32| -> Vec<Camera> {
