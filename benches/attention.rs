@@ -8,7 +8,7 @@ use candle_core::{Tensor, Var};
 use common::conventional::attention::{Size, gather as plain};
 use common::inputs::Attention;
 use common::{Bench, Contender, Threads, Work, agree};
-use subsplat::ops::attention_gather::attention_gather;
+use subsplat::network::ops::attention_gather::attention_gather;
 
 /// The paper's E.
 const DIM: usize = 128;

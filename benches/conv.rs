@@ -16,10 +16,10 @@ use serde_json::{Value, json};
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
-use subsplat::cpu::SimdLevel;
-use subsplat::cpu::conv::{Sizes, bias_grad, forward, input_grad, weight_grad};
-use subsplat::ops::conv2d::conv2d;
-use subsplat::ops::conv3d::conv3d;
+use subsplat::network::ops::conv2d::conv2d;
+use subsplat::network::ops::conv3d::conv3d;
+use subsplat_kernels::cpu::SimdLevel;
+use subsplat_kernels::cpu::conv::{Sizes, bias_grad, forward, input_grad, weight_grad};
 
 /// The allocator of the programs.
 #[path = "../tools/cli/src/pages.rs"]

@@ -13,14 +13,14 @@ use glam::{Mat4, Vec3};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
-use subsplat::camera::{Camera, Intrinsics, NearFar};
-use subsplat::config::{Config, Preset};
-use subsplat::gpu::{
+use subsplat::network::config::{Config, Preset};
+use subsplat::network::model::subsplat::SubSplat;
+use subsplat::network::model::weights::Weights;
+use subsplat::network::model::{Backend, Views};
+use subsplat_kernels::camera::{Camera, Intrinsics, NearFar};
+use subsplat_kernels::gpu::{
     DeviceArray, FULL_GRID, Gpu, GpuError, NormSum, PointwiseFunction, Recorder, Work,
 };
-use subsplat::model::subsplat::SubSplat;
-use subsplat::model::weights::Weights;
-use subsplat::model::{Backend, Views};
 
 /// Class of adapters, its f32 rate in flop/s, and its memory's rate in bytes/s (data sheets).
 const CLASSES: [(&str, f64, f64); 4] = [

@@ -24,17 +24,17 @@ use rival::{Rival, median, timed};
 use stages::Stages;
 use std::ops::ControlFlow;
 use subsplat::FitOptions;
-use subsplat::camera::NearFar;
-use subsplat::config::{Config, Mvsplat as Settings, Preset, Small};
-use subsplat::cpu::SimdLevel;
-use subsplat::io::image::Rgb;
-use subsplat::model::Views;
-use subsplat::model::backbone::{DisparityMean, Mvsplat, SmallBackbone};
-use subsplat::model::trace::Trace;
-use subsplat::model::weights::Weights;
-use subsplat::pipeline::{
+use subsplat::files::image::Rgb;
+use subsplat::network::config::{Config, Mvsplat as Settings, Preset, Small};
+use subsplat::network::model::Views;
+use subsplat::network::model::backbone::{DisparityMean, Mvsplat, SmallBackbone};
+use subsplat::network::model::trace::Trace;
+use subsplat::network::model::weights::Weights;
+use subsplat::reconstruct::{
     Check, DepthBounds, Detail, Options, Photo, Progress, Reconstructor, Stage,
 };
+use subsplat_kernels::camera::NearFar;
+use subsplat_kernels::cpu::SimdLevel;
 
 /// The allocator of the programs.
 #[path = "../tools/cli/src/pages.rs"]
@@ -153,7 +153,8 @@ const CASES: [&str; 6] = [
 
 fn photo(side: usize, view: usize) -> Result<Photo> {
     let planes = inputs::tensor(&[3, side / 4, side / 4], 0.25, 40 + view as u64)?;
-    let planes = subsplat::ops::resize::resize_bilinear(&planes.unsqueeze(0)?, side, side)?;
+    let planes =
+        subsplat::network::ops::resize::resize_bilinear(&planes.unsqueeze(0)?, side, side)?;
     let rows = planes.squeeze(0)?.permute((1, 2, 0))?.flatten_all()?.to_vec1::<f32>()?;
     let data = rows.iter().map(|v| (255.0 * (v + 0.5).clamp(0.0, 1.0)) as u8).collect();
     let camera = scene::views(side)[view];

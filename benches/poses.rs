@@ -17,12 +17,13 @@ use anyhow::{Context, Result};
 use common::Bench;
 use serde_json::json;
 use std::time::Instant;
-use subsplat::camera::{Camera, Size};
-use subsplat::loose::Uncertain;
-use subsplat::{
-    Confidence, Options, Photo, PoseOptions, PosePhoto, PoseRefusal, Reconstructor, estimate_poses,
-    psnr,
+use subsplat::cameras::estimation::Uncertain;
+use subsplat::cameras::estimation::{
+    Confidence, PoseOptions, PosePhoto, PoseRefusal, estimate_poses,
 };
+use subsplat::scene::metrics::psnr;
+use subsplat::{Options, Photo, Reconstructor};
+use subsplat_kernels::camera::{Camera, Size};
 use subsplat_test_support::pose_errors::{
     aligned_cameras, aligned_errors, area_under_curve, median, relative_errors,
 };

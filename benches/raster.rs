@@ -17,18 +17,18 @@ use safetensors::Dtype;
 use safetensors::tensor::TensorView;
 use std::collections::HashMap;
 use std::path::Path;
-use subsplat::abi::RasterOptions;
-use subsplat::camera::Camera;
-use subsplat::cpu::{Gradients, Rasterizer, Rendered, SimdLevel, Stats};
+use subsplat::files::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
+use subsplat::files::scene::Units;
+use subsplat::files::{save_splats, write_atomic};
+use subsplat::scene::levels::{CELL_PX, Levels};
+use subsplat::scene::metrics::psnr;
+use subsplat::scene::render::slices;
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::camera::Camera;
+use subsplat_kernels::cpu::{Gradients, Rasterizer, Rendered, SimdLevel, Stats};
 #[cfg(feature = "gpu")]
-use subsplat::gpu::{DeviceChoice, Gpu, Rasterizer as GpuRasterizer};
-use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
-use subsplat::io::scene::Units;
-use subsplat::io::{save_splats, write_atomic};
-use subsplat::levels::{CELL_PX, Levels};
-use subsplat::metrics::psnr;
-use subsplat::render::slices;
-use subsplat::splats::Splats;
+use subsplat_kernels::gpu::{DeviceChoice, Gpu, Rasterizer as GpuRasterizer};
+use subsplat_kernels::layout::RasterOptions;
 use subsplat_test_support::oracle;
 
 /// Half side of a splat's box in σ, for timing the baseline: the value of most programs.

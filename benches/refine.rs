@@ -1,4 +1,4 @@
-//! A refinement step ([`subsplat::refine`]) on one photograph beside the forward and backward pass
+//! A refinement step ([`subsplat::refine::refine`]) on one photograph beside the forward and backward pass
 //! of the rasterizer alone, on the rasterizer's scenes (`common/scene.rs`). A step adds the loss
 //! with its gradient and Adam's step of all Gaussians. The photograph is the scene's own picture
 //! with other colours.
@@ -8,12 +8,12 @@ mod common;
 use anyhow::{Context, Result, ensure};
 use common::scene::{self, SCENES};
 use common::{Bench, Contender, Threads};
-use subsplat::abi::{Gradients, RasterOptions};
-use subsplat::cpu::Rasterizer;
+use subsplat::files::image::Rgb;
 use subsplat::fit::FitView;
-use subsplat::io::image::Rgb;
 use subsplat::refine::{RefineOptions, Refiner};
-use subsplat::render::{Renderer, render, slices};
+use subsplat::scene::render::{Renderer, render, slices};
+use subsplat_kernels::cpu::Rasterizer;
+use subsplat_kernels::layout::{Gradients, RasterOptions};
 
 /// Scenes of the report: 131,072 Gaussians at 256², and 524,288 at 512².
 const NAMES: [&str; 2] = ["131k-256", "524k-512"];

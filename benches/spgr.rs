@@ -10,12 +10,12 @@ use common::conventional::redistribute as plain;
 use common::scene::{self, Spec};
 use common::{Bench, Contender, Threads, Work, agree, inputs};
 use rayon::prelude::*;
-use subsplat::abi::{HEAD_STRIDE, SPLAT_STRIDE};
-use subsplat::config::{Config, Preset};
-use subsplat::cpu::{redistribute as shares, spgr as kernel, sums};
-use subsplat::model::spgr::rules;
-use subsplat::ops::redistribute::{OpacityRule, redistribute};
-use subsplat::ops::spgr::{Spgr, spgr, spgr_into};
+use subsplat::network::config::{Config, Preset};
+use subsplat::network::model::spgr::rules;
+use subsplat::network::ops::redistribute::{OpacityRule, redistribute};
+use subsplat::network::ops::spgr::{Spgr, spgr, spgr_into};
+use subsplat_kernels::cpu::{redistribute as shares, spgr as kernel, sums};
+use subsplat_kernels::layout::{HEAD_STRIDE, SPLAT_STRIDE};
 
 /// The allocator of the programs.
 #[path = "../tools/cli/src/pages.rs"]

@@ -7,7 +7,7 @@ use anyhow::{Result, anyhow};
 use candle_core::{Tensor, Var};
 use common::conventional::sweep as plain;
 use common::{Bench, Contender, Threads, Work, agree, inputs, scene};
-use subsplat::ops::plane_sweep::{Sweep, plane_sweep};
+use subsplat::network::ops::plane_sweep::{Sweep, plane_sweep};
 
 /// Two 256² pictures with features at a quarter of the resolution: (side, channels, candidates).
 const SIZE: (usize, usize, usize) = (64, 128, 128);

@@ -6,7 +6,9 @@
 
 use anyhow::{Context, Result, bail};
 use std::path::Path;
-use subsplat::{RasterOptions, Rgb, load_cameras_json, load_splats, render, save_png};
+use subsplat::files::cameras_json::load_cameras_json;
+use subsplat::scene::render;
+use subsplat::{RasterOptions, Rgb, load_splats, save_png};
 
 fn main() -> Result<()> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();

@@ -10,21 +10,22 @@
 //!
 //! A [`FitView`] is a picture with its camera. [`fit`] changes [`Splats`] in place.
 
-use crate::abi::{
+use crate::files::image::Rgb;
+use crate::loss;
+use crate::loss::Scored;
+use crate::scene::render::Renderer;
+use crate::scene::splats::Splats;
+use rayon::prelude::*;
+use std::ops::ControlFlow;
+use subsplat_kernels::camera::Camera;
+use subsplat_kernels::layout::{
     Geometry, Gradients, OPACITY_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE, SplatSlices,
     gain_with_offsets,
 };
-use crate::camera::Camera;
-use crate::io::image::Rgb;
-use crate::loss::{self, Scored};
-use crate::render::Renderer;
-use crate::splats::Splats;
-use rayon::prelude::*;
-use std::ops::ControlFlow;
 use thiserror::Error;
 
 /// Options of [`fit`]. The defaults were chosen on nine of the sixteen pairs of photographs that
-/// `src/model/shipped/README.md` reports (scenes fox, hololens_table, re10k_0bf and re10k_0f68).
+/// `src/network/shipped/README.md` reports (scenes fox, hololens_table, re10k_0bf and re10k_0f68).
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[non_exhaustive]
 pub struct FitOptions {
@@ -278,7 +279,7 @@ pub(crate) struct Target<'a> {
 impl<'a> Target<'a> {
     /// Refuses a picture of another size than its camera.
     pub(crate) fn check(view: usize, v: &FitView<'_>) -> Result<(), FitError> {
-        let k = v.camera.intrinsics;
+        let k = v.camera.intrinsics();
         if (k.width, k.height) != (v.image.width, v.image.height) {
             let expected = format!("{}x{}", k.width, k.height);
             let got = format!("{}x{}", v.image.width, v.image.height);
@@ -299,7 +300,7 @@ impl<'a> Target<'a> {
 
     /// [`Target::loss`] with another `truth`.
     pub(crate) fn loss_to(&self, planes: &[f32], truth: &[f32]) -> Scored {
-        let k = self.camera.intrinsics;
+        let k = self.camera.intrinsics();
         let rgb = &planes[..truth.len()];
         let mut loss = loss::mse(rgb, truth);
         if self.dssim > 0.0 {

@@ -27,7 +27,8 @@
 //! A viewer needs no network. This loads a file and draws it from a camera that sees all of it:
 //!
 //! ```
-//! use subsplat::{Bounds, RasterOptions, Rgb, load_splats, render, save_png};
+//! use subsplat::{Bounds, RasterOptions, Rgb, load_splats, save_png};
+//! use subsplat::scene::render;
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! # use subsplat::{SaveOptions, ShBasis, Splats, save_splats};
@@ -67,229 +68,87 @@
 //! * `gpu` (default): the kernels as WGSL compute, through wgpu. In a browser (WebGPU) a program
 //!   supplies the wait for the device: `details::set_gpu_wait`.
 //! * `heic`: reads HEIC pictures, the default format of iPhones, in pure Rust.
-//! * `internals`: makes the modules with kernels, ops and network parts public. No version
-//!   promises anything about them.
 
-#![cfg_attr(
-    not(feature = "internals"),
-    allow(
-        dead_code,
-        unused_imports,
-        rustdoc::private_intra_doc_links,
-        reason = "programs, tests and benches use more of the crate than its public items do"
-    )
-)]
+#![forbid(unsafe_code)]
 
-#[cfg(feature = "internals")]
-pub mod abi;
-#[cfg(feature = "internals")]
-pub mod backend;
-#[cfg(feature = "internals")]
-pub mod camera;
-#[cfg(feature = "internals")]
-pub mod check;
-mod clock;
-#[cfg(feature = "internals")]
-pub mod config;
-#[cfg(feature = "internals")]
-pub mod cpu;
-#[cfg(feature = "internals")]
-pub mod data;
-#[cfg(feature = "internals")]
-pub mod device;
-#[cfg(all(feature = "internals", feature = "network"))]
-pub mod eval;
-#[cfg(feature = "internals")]
+pub mod cameras;
+pub mod files;
 pub mod fit;
-#[cfg(all(feature = "internals", feature = "gpu"))]
-pub mod gpu;
-#[cfg(feature = "internals")]
-pub mod io;
-#[cfg(feature = "internals")]
-pub mod levels;
-#[cfg(feature = "internals")]
 pub mod loss;
-#[cfg(feature = "internals")]
-pub mod matches;
-#[cfg(feature = "internals")]
 pub mod merge;
-#[cfg(feature = "internals")]
-pub mod metrics;
-#[cfg(all(feature = "internals", feature = "network"))]
-pub mod model;
-#[cfg(feature = "internals")]
-pub mod navigation;
-#[cfg(all(feature = "internals", feature = "network"))]
-pub mod ops;
-#[cfg(all(feature = "internals", feature = "network"))]
-pub mod pipeline;
-#[cfg(feature = "internals")]
-pub mod poses;
-#[cfg(feature = "internals")]
-pub mod reduce;
-#[cfg(feature = "internals")]
-pub mod refine;
-#[cfg(feature = "internals")]
-pub mod render;
-#[cfg(feature = "internals")]
-pub mod sh;
-#[cfg(feature = "internals")]
-pub mod splats;
-#[cfg(all(feature = "internals", feature = "network"))]
-pub mod train;
-
-#[cfg(not(feature = "internals"))]
-mod abi;
-#[cfg(not(feature = "internals"))]
-mod backend;
-#[cfg(not(feature = "internals"))]
-mod camera;
-#[cfg(not(feature = "internals"))]
-mod check;
-#[cfg(not(feature = "internals"))]
-mod config;
-#[cfg(not(feature = "internals"))]
-mod cpu;
-#[cfg(not(feature = "internals"))]
-mod data;
-#[cfg(not(feature = "internals"))]
-mod device;
-#[cfg(all(not(feature = "internals"), feature = "network"))]
-mod eval;
-#[cfg(not(feature = "internals"))]
-mod fit;
-#[cfg(all(not(feature = "internals"), feature = "gpu"))]
-mod gpu;
-#[cfg(not(feature = "internals"))]
-mod io;
-#[cfg(not(feature = "internals"))]
-mod levels;
-#[cfg(not(feature = "internals"))]
-mod loss;
-#[cfg(not(feature = "internals"))]
-mod matches;
-#[cfg(not(feature = "internals"))]
-mod merge;
-#[cfg(not(feature = "internals"))]
-mod metrics;
-#[cfg(all(not(feature = "internals"), feature = "network"))]
-mod model;
-#[cfg(not(feature = "internals"))]
-mod navigation;
-#[cfg(all(not(feature = "internals"), feature = "network"))]
-mod ops;
-#[cfg(all(not(feature = "internals"), feature = "network"))]
-mod pipeline;
-#[cfg(not(feature = "internals"))]
-mod poses;
-#[cfg(not(feature = "internals"))]
-mod reduce;
-#[cfg(not(feature = "internals"))]
-mod refine;
-#[cfg(not(feature = "internals"))]
-mod render;
-#[cfg(not(feature = "internals"))]
-mod sh;
-#[cfg(not(feature = "internals"))]
-mod splats;
-#[cfg(all(not(feature = "internals"), feature = "network"))]
-mod train;
-
 #[cfg(feature = "network")]
-pub use candle_core;
+pub mod network;
+#[cfg(feature = "network")]
+pub mod reconstruct;
+pub mod reduce;
+pub mod refine;
+pub mod scene;
+
 pub use glam;
 pub use image;
 
-pub use abi::{Convention, RasterOptions, ShBasis};
-pub use backend::{Backend, DeviceError};
-pub use camera::{Camera, CameraError, Intrinsics, NearFar, Size};
 #[cfg(feature = "network")]
-pub use config::{Config, ConfigError, Preset};
-pub use device::DeviceChoice;
-pub use fit::FitOptions;
-pub use io::image::{Depth, LoadOptions, Rgb, save_depth_png, save_png};
-pub use io::photograph::{Photograph, load_photograph, parse_photograph};
-pub use io::scene::{Frame, Scene, load_scene};
-pub use io::{
-    Error as FileError, SaveOptions, SplatFormat, Up, encode_splats, load_splats, parse_splats,
-    save_splats,
-};
-pub use navigation::Bounds;
+pub use crate::network::config::{Config, ConfigError, Preset};
 #[cfg(feature = "network")]
-pub use ops::{SplatTensors, rasterize_splats as rasterize};
+pub use crate::network::ops::{SplatTensors, rasterize_splats as rasterize};
 #[cfg(feature = "network")]
-pub use pipeline::{
+pub use crate::reconstruct::{
     Check, Density, DepthBounds, DepthRange, Detail, Error, InputSize, Options, Photo, Poses,
     Prepared, Progress, Reconstruction, Reconstructor, Refine, Result, Stage, TargetSize, Warning,
     loose_photos, loose_scene,
 };
-pub use render::{Picture, Renderer, render};
-pub use splats::{Splats, SplatsError};
-
-// Names that programs, tests and benches of this repository use beside the modules.
-#[cfg(feature = "internals")]
-pub use check::{CheckOptions, GrayImage, check_pair};
-#[cfg(feature = "internals")]
-pub use data::exposure::{Exposure, ExposureError, PointPair, estimate_exposure};
-#[cfg(feature = "internals")]
-pub use details::*;
-#[cfg(feature = "internals")]
-pub use fit::fit;
-#[cfg(all(feature = "internals", feature = "gpu"))]
-pub use gpu::Rasterizer as GpuRasterizer;
-#[cfg(feature = "internals")]
-pub use io::cameras_json::{CameraFile, NamedCamera, load_cameras_json, save_cameras_json};
-#[cfg(feature = "internals")]
-pub use io::exif::{ExifReport, parse_exif};
-#[cfg(feature = "internals")]
-pub use io::photograph::{PhotographHeader, probe_photograph};
-#[cfg(all(feature = "internals", feature = "network"))]
-pub use loose::*;
-#[cfg(feature = "internals")]
-pub use metrics::{psnr, ssim};
-#[cfg(feature = "internals")]
-pub use navigation::{Mode, Navigator, Pace, Start};
-#[cfg(feature = "internals")]
-pub use poses::{Lens, PosePhoto, adjust_poses, estimate_poses};
-#[cfg(feature = "internals")]
-pub use refine::refine;
-#[cfg(feature = "internals")]
-pub use splats::{Quantiles, SplatStatistics};
+pub use files::image::{Depth, LoadOptions, Rgb, save_depth_png, save_png};
+pub use files::photograph::{Photograph, load_photograph, parse_photograph};
+pub use files::scene::{Frame, Scene, load_scene};
+pub use files::{
+    Error as FileError, SaveOptions, SplatFormat, Up, encode_splats, load_splats, parse_splats,
+    save_splats,
+};
+pub use fit::FitOptions;
+pub use scene::navigation::Bounds;
+pub use scene::render::{Picture, Renderer, render};
+pub use scene::splats::{Splats, SplatsError};
+pub use subsplat_kernels::backend::{Backend, DeviceError};
+pub use subsplat_kernels::camera::{Camera, CameraError, Intrinsics, NearFar, Size};
+pub use subsplat_kernels::device::DeviceChoice;
+pub use subsplat_kernels::layout::{Convention, RasterOptions, ShBasis};
 
 /// Types that an application reads or sets rarely: reports of a reconstruction, its inputs and its
 /// refinement, details of scenes and photographs, and the errors beneath [`FileError`] and `Error`.
 pub mod details {
-    pub use crate::check::{
+    pub use crate::cameras::check::{
         DepthReport, EpipolarReport, Finding, MatchedPoint, PairReport, ReadingReport, Verdict,
     };
-    #[cfg(feature = "network")]
-    pub use crate::data::crop::{CropOptions, CropRule, Cropped, LrFrom, PhotoWindow};
+    pub use crate::files::SaveReport;
+    pub use crate::files::exif::{ExifCamera, FocalLength, FocalSource};
+    pub use crate::files::image::Truncated;
+    pub use crate::files::scene::{LoadedFrame, Pixels, SceneFormat, Units};
+    pub use crate::files::undistort::Distortion;
     pub use crate::fit::{FitError, FitReport, FitView};
-    #[cfg(all(feature = "gpu", target_family = "wasm", target_os = "unknown"))]
-    pub use crate::gpu::set_gpu_wait;
-    #[cfg(feature = "gpu")]
-    pub use crate::gpu::{Gpu, GpuError};
-    pub use crate::io::SaveReport;
-    pub use crate::io::exif::{ExifCamera, FocalLength, FocalSource};
-    pub use crate::io::image::Truncated;
-    pub use crate::io::scene::{LoadedFrame, Pixels, SceneFormat, Units};
-    pub use crate::io::undistort::Distortion;
-    pub use crate::metrics::MetricsError;
     #[cfg(feature = "network")]
-    pub use crate::pipeline::{DepthSource, StageTime};
+    pub use crate::reconstruct::inputs::crop::{
+        CropOptions, CropRule, Cropped, LrFrom, PhotoWindow,
+    };
+    #[cfg(feature = "network")]
+    pub use crate::reconstruct::{DepthSource, StageTime};
     pub use crate::refine::{RefineOptions, RefineReport, Refiner};
-    pub use crate::splats::SplatParts;
+    pub use crate::scene::metrics::MetricsError;
+    pub use crate::scene::splats::SplatParts;
+    #[cfg(all(feature = "gpu", target_family = "wasm", target_os = "unknown"))]
+    pub use subsplat_kernels::gpu::set_gpu_wait;
+    #[cfg(feature = "gpu")]
+    pub use subsplat_kernels::gpu::{Gpu, GpuError};
 }
 
 /// Options and results of [`loose_photos`] and [`loose_scene`],
 /// which estimate the cameras of photographs.
 #[cfg(feature = "network")]
 pub mod loose {
-    pub use crate::pipeline::{
-        KnownLens, LensSource, LooseOptions, LoosePhotos, LooseScene, PoseError,
-    };
-    pub use crate::poses::{
+    pub use crate::cameras::estimation::{
         Confidence, FocalEstimate, LeftOut, PoseAdjustment, PoseEstimate, PoseOptions,
         PosePhotoError, PosePoint, PoseRefusal, PoseWarning, Uncertain,
+    };
+    pub use crate::reconstruct::{
+        KnownLens, LensSource, LooseOptions, LoosePhotos, LooseScene, PoseError,
     };
 }

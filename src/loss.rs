@@ -1,9 +1,9 @@
 //! Losses of pictures as functions of slices: a value, and its analytic gradient. Training and
 //! the fit of a scene to its photographs use them.
 
-use crate::cpu::dssim::{Window, plane};
-use crate::metrics::{SSIM_C1, SSIM_C2, SSIM_COVARIANCE, SSIM_WINDOW, window};
+use crate::scene::metrics::{SSIM_C1, SSIM_C2, SSIM_COVARIANCE, SSIM_WINDOW, window};
 use rayon::prelude::*;
+use subsplat_kernels::cpu::dssim::{Window, plane};
 
 /// A loss and its gradient with respect to one of its arguments.
 #[derive(Clone, Debug, PartialEq)]
@@ -56,7 +56,7 @@ const CHUNK: usize = 4096;
 /// Returns the structural dissimilarity (1 − SSIM)/2 of planes `[C, height, width]` in [0, 1], with
 /// its gradient by `x`.
 ///
-/// SSIM is that of [`crate::metrics::ssim`]: 11×11 Gaussian windows of σ = 1.5 inside the picture,
+/// SSIM is that of [`crate::scene::metrics::ssim`]: 11×11 Gaussian windows of σ = 1.5 inside the picture,
 /// sample covariance.
 pub fn dssim(x: &[f32], target: &[f32], width: usize, height: usize) -> Scored {
     if width < SSIM_WINDOW || height < SSIM_WINDOW {

@@ -10,10 +10,10 @@
 //! A is `√((σ₁² + l)(σ₂² + l))`, σ₁ and σ₂ the two largest. The variance l, world units squared, is
 //! that of a low-pass of the rasterizer; it is 0 where the size of a pixel is unknown.
 
-use crate::abi::{MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET};
-use crate::sh::C0;
-use crate::splats::Splats;
+use crate::scene::splats::Splats;
 use glam::{DMat3, DQuat, DVec3};
+use subsplat_kernels::layout::{MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET};
+use subsplat_kernels::sh::C0;
 
 /// Bits of a coordinate on the curve.
 pub const CURVE_BITS: u32 = 21;

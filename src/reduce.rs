@@ -12,17 +12,17 @@
 //!
 //! The same input gives the same bytes on any number of threads.
 
-use crate::abi::{RasterOptions, SPLAT_STRIDE};
-use crate::camera::Camera;
+use crate::files::image::Rgb;
 use crate::fit::FitView;
-use crate::io::image::Rgb;
 use crate::merge::{Blob, CURVE_BITS, curve_code, folded};
 use crate::refine::shares;
-use crate::render::Renderer;
-use crate::sh::C0;
-use crate::splats::Splats;
+use crate::scene::render::Renderer;
+use crate::scene::splats::Splats;
 use glam::{DMat3, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
+use subsplat_kernels::camera::Camera;
+use subsplat_kernels::layout::{RasterOptions, SPLAT_STRIDE};
+use subsplat_kernels::sh::C0;
 
 /// κ: cost of a distance of one standard deviation, squared display values.
 const DISTANCE_COST: f64 = 0.001;

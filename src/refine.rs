@@ -22,23 +22,24 @@
 mod adam;
 mod removal;
 
-pub(crate) use removal::{Groups, LEAST_SHARE, PHOTOGRAPHS_TO_REMOVE, shares};
+pub use removal::Groups;
+pub(crate) use removal::{LEAST_SHARE, PHOTOGRAPHS_TO_REMOVE, shares};
 
-use crate::abi::{
-    Geometry, Gradients, MEAN_OFFSET, OPACITY_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE,
-    SplatSlices, gain_with_offsets, sh_coefficients,
-};
-use crate::camera::Camera;
 use crate::fit::{FitError, FitView, Target};
 use crate::loss::{Scored, mse};
-use crate::render::Renderer;
-use crate::splats::Splats;
+use crate::scene::render::Renderer;
+use crate::scene::splats::Splats;
 use adam::{BETAS, State, Step, rates};
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 use removal::pruned;
 use std::ops::{ControlFlow, Range};
 use std::time::{Duration, Instant};
+use subsplat_kernels::camera::Camera;
+use subsplat_kernels::layout::{
+    Geometry, Gradients, MEAN_OFFSET, OPACITY_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE,
+    SplatSlices, gain_with_offsets, sh_coefficients,
+};
 
 /// Options of a refinement. The rates were chosen on six scenes of `../shared/photos` at
 /// 128 → 256 with five photographs, targets between them.
@@ -466,7 +467,7 @@ fn coprime(a: usize, b: usize) -> bool {
 /// Size of a pixel at each Gaussian, in the photograph where it is smallest, world units.
 fn pixel_sizes(splats: &Splats, views: &[FitView<'_>]) -> Vec<f32> {
     let size = |mean: Vec3, camera: &Camera| {
-        mean.distance(camera.position()) / camera.intrinsics.fx.max(camera.intrinsics.fy)
+        mean.distance(camera.position()) / camera.intrinsics().fx.max(camera.intrinsics().fy)
     };
     let rows = splats.rows.par_chunks_exact(SPLAT_STRIDE);
     rows.map(|row| {
@@ -483,7 +484,7 @@ fn beyond(splats: &Splats, views: &[FitView<'_>]) -> Vec<bool> {
     let shown = |row: &[f32], camera: &Camera| {
         let mean = Vec3::from_slice(&row[MEAN_OFFSET..]);
         let Some(p) = camera.project(mean) else { return false };
-        let k = camera.intrinsics;
+        let k = camera.intrinsics();
         let sigma = row[SCALE_OFFSET..SCALE_OFFSET + 3].iter().fold(0.0f32, |m, s| m.max(*s));
         let reach = 3.0 * sigma * k.fx.max(k.fy) / camera.to_camera(mean).z;
         let size = Vec2::new(k.width as f32, k.height as f32);

@@ -1,5 +1,5 @@
 """Makes tests/goldens/metrics.txt: PSNR and SSIM of made-up pictures by scikit-image, as
-MVSplat computes them. Checked by tests/scores/metrics.rs.
+MVSplat computes them. Checked by tests/scenes/metrics.rs.
 
     pip install scikit-image==0.26.0 && python tools/make_metrics_golden.py
 """
@@ -26,7 +26,7 @@ def pair(width, height, weight):
     y, x, c = np.meshgrid(np.arange(height), np.arange(width), np.arange(3), indexing="ij")
     ramp = (3 * x + 5 * y + 40 * c) % 256
     mixed = (ramp * (256 - weight) + noise(width, height).astype(int) * weight) // 256
-    # float32 divided by 255, as tests/scores/metrics.rs does; the sums are in float64.
+    # float32 divided by 255, as tests/scenes/metrics.rs does; the sums are in float64.
     return [(p.astype(np.float32) / np.float32(255)).astype(np.float64) for p in (ramp, mixed)]
 
 

@@ -2,10 +2,10 @@
 
 use super::scene::{normal, unit};
 use candle_core::{Device, Result, Tensor};
-use subsplat::abi::SampleConvention;
-use subsplat::camera::Camera;
-use subsplat::ops::attention_gather::{Gather, Level};
-use subsplat::ops::plane_sweep::{Sweep, pair, relative_pose};
+use subsplat::network::ops::attention_gather::{Gather, Level};
+use subsplat::network::ops::plane_sweep::{Sweep, pair, relative_pose};
+use subsplat_kernels::camera::Camera;
+use subsplat_kernels::layout::SampleConvention;
 
 /// Returns normally distributed numbers of a given shape.
 pub fn tensor(shape: &[usize], scale: f32, stream: u64) -> Result<Tensor> {

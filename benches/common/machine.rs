@@ -4,8 +4,8 @@ use rayon::ThreadPool;
 use rayon::prelude::*;
 use std::hint::black_box;
 use std::time::Instant;
-use subsplat::cpu::SimdLevel;
-use subsplat::cpu::simd::{LANES, Real, Vector, VectorKernel};
+use subsplat_kernels::cpu::SimdLevel;
+use subsplat_kernels::cpu::simd::{LANES, Real, Vector, VectorKernel};
 
 /// Floats of each buffer of the copy: 128 MiB, beyond most caches.
 const COPY: usize = 32 << 20;

@@ -21,7 +21,7 @@ use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::process::Command;
 use std::time::{Duration, Instant};
-use subsplat::cpu::SimdLevel;
+use subsplat_kernels::cpu::SimdLevel;
 
 /// Minimum and maximum number of runs of a contender.
 const RUNS: (usize, usize) = (3, 200);
@@ -356,7 +356,7 @@ impl Bench {
             "groups": self.groups,
         });
         let text = serde_json::to_vec_pretty(&report)?;
-        subsplat::io::write_atomic(path, |f| std::io::Write::write_all(f, &text))?;
+        subsplat::files::write_atomic(path, |f| std::io::Write::write_all(f, &text))?;
         Ok(())
     }
 }

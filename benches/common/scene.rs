@@ -9,9 +9,9 @@
 //! SH set, each child with a gain.
 
 use glam::{Mat4, Quat, Vec3};
-use subsplat::abi::ShBasis;
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::splats::Splats;
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::camera::{Camera, Intrinsics};
+use subsplat_kernels::layout::ShBasis;
 
 /// SH degree of all scenes.
 pub const DEGREE: usize = 3;

@@ -5,8 +5,12 @@ use crate::common::{Bench, agree, inputs};
 use anyhow::{Context, Result};
 use candle_core::{Device, Tensor};
 use std::collections::HashMap;
-use subsplat::model::layers::{self, Activation};
-use subsplat::ops::{attention::attention, join::join, linear::linear_no_bias, norm};
+use subsplat::network::model::layers;
+use subsplat::network::model::layers::Activation;
+use subsplat::network::ops::attention::attention;
+use subsplat::network::ops::join::join;
+use subsplat::network::ops::linear::linear_no_bias;
+use subsplat::network::ops::norm;
 
 type Run = fn(&HashMap<String, Tensor>) -> candle_core::Result<Tensor>;
 

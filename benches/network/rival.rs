@@ -10,12 +10,12 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Instant;
-use subsplat::camera::{Camera, Intrinsics, NearFar};
-use subsplat::config::Mvsplat as Settings;
-use subsplat::model::Views;
-use subsplat::model::backbone::Mvsplat;
-use subsplat::model::trace::Trace;
-use subsplat::model::weights::Weights;
+use subsplat::network::config::Mvsplat as Settings;
+use subsplat::network::model::Views;
+use subsplat::network::model::backbone::Mvsplat;
+use subsplat::network::model::trace::Trace;
+use subsplat::network::model::weights::Weights;
+use subsplat_kernels::camera::{Camera, Intrinsics, NearFar};
 
 /// Tolerance: f32 noise of a deep network. Single pixels differ by more where a clamp or an
 /// epipolar border flips.

@@ -5,7 +5,7 @@
 use crate::common::Machine;
 use std::collections::BTreeMap;
 use std::time::Instant;
-use subsplat::cpu::work::{Counts, counts};
+use subsplat_kernels::cpu::work::{Counts, counts};
 
 /// Time and work of one stage.
 #[derive(Clone, Copy, Default)]

@@ -2,11 +2,13 @@
 //! algorithm 1). Tests: tests/raster/refine.rs.
 
 use super::{CHUNK, RefineOptions};
-use crate::abi::{Gradients, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE};
-use crate::cpu::simd::vectorize;
-use crate::splats::Splats;
+use crate::scene::splats::Splats;
 use rayon::prelude::*;
 use std::ops::Range;
+use subsplat_kernels::cpu::simd::vectorize;
+use subsplat_kernels::layout::{
+    Gradients, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE,
+};
 
 /// The rates fall by a cosine from 1 + this to this.
 const RATE_FLOOR: f32 = 0.05;

@@ -1,12 +1,12 @@
 //! Gaussians by photograph, and the removal of those that the photographs hardly show.
 
 use super::{CHUNK, RefineOptions, slices_of};
-use crate::abi::{Gradients, RasterOptions, gain_with_offsets};
 use crate::fit::FitView;
-use crate::render::Renderer;
-use crate::splats::Splats;
+use crate::scene::render::Renderer;
+use crate::scene::splats::Splats;
 use rayon::prelude::*;
 use std::ops::Range;
+use subsplat_kernels::layout::{Gradients, RasterOptions, gain_with_offsets};
 
 /// Least share of a parent that stays ([`RefineOptions::least_share`]).
 pub(crate) const LEAST_SHARE: f32 = 0.3;
@@ -15,12 +15,12 @@ pub(crate) const PHOTOGRAPHS_TO_REMOVE: usize = 3;
 
 /// Gaussians of each photograph.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Groups {
+pub struct Groups {
     /// In the order of the photographs; empty where they are not known.
-    pub(crate) ranges: Vec<Range<usize>>,
+    pub ranges: Vec<Range<usize>>,
     /// Every parent has the same number of children. Parents with different numbers are not
     /// removed here: their Gaussians have an SH set each, which hides the families.
-    pub(crate) equal_families: bool,
+    pub equal_families: bool,
 }
 
 impl Groups {

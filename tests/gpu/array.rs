@@ -7,17 +7,17 @@ use subsplat_test_support::gpu::gpu;
 use candle_core::{DType, Device, Result, Tensor};
 use glam::{Mat4, Quat, Vec3};
 use std::sync::Arc;
-use subsplat::abi::MuInput;
-use subsplat::camera::{Camera, Intrinsics, NearFar};
-use subsplat::config::MaskMode;
-use subsplat::model::Backend;
-use subsplat::model::geometry::Frames;
-use subsplat::ops::activation::Activation;
-use subsplat::ops::attention::Labels;
-use subsplat::ops::attributes::Attributes;
-use subsplat::ops::plane_sweep::{Sweep, pair, relative_pose};
-use subsplat::ops::small::{Candidates, MeanOver, Start};
-use subsplat::ops::{Array, ConvSteps, Executor};
+use subsplat::network::config::MaskMode;
+use subsplat::network::model::Backend;
+use subsplat::network::model::geometry::Frames;
+use subsplat::network::ops::activation::Activation;
+use subsplat::network::ops::attention::Labels;
+use subsplat::network::ops::attributes::Attributes;
+use subsplat::network::ops::plane_sweep::{Sweep, pair, relative_pose};
+use subsplat::network::ops::small::{Candidates, MeanOver, Start};
+use subsplat::network::ops::{Array, ConvSteps, Executor};
+use subsplat_kernels::camera::{Camera, Intrinsics, NearFar};
+use subsplat_kernels::layout::MuInput;
 
 /// Tolerance: sums of at most 2,000 products in another order, and elementary functions of the
 /// device, which are exact to 3 units in the last place.

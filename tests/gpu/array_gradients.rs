@@ -7,17 +7,17 @@ use subsplat_test_support::gpu::gpu;
 
 use candle_core::{DType, Device, Result, Tensor, Var};
 use std::sync::Arc;
-use subsplat::abi::MuInput;
-use subsplat::config::MaskMode;
-use subsplat::model::Backend;
-use subsplat::model::geometry::Frames;
-use subsplat::ops::activation::Activation;
-use subsplat::ops::attention::Labels;
-use subsplat::ops::attributes::Attributes;
-use subsplat::ops::plane_sweep::{Sweep, pair, relative_pose};
-use subsplat::ops::precomputed_gradient::precomputed_gradient;
-use subsplat::ops::small::{Candidates, MeanOver, Start};
-use subsplat::ops::{Array, ConvSteps, DeviceArray, Executor};
+use subsplat::network::config::MaskMode;
+use subsplat::network::model::Backend;
+use subsplat::network::model::geometry::Frames;
+use subsplat::network::ops::activation::Activation;
+use subsplat::network::ops::attention::Labels;
+use subsplat::network::ops::attributes::Attributes;
+use subsplat::network::ops::plane_sweep::{Sweep, pair, relative_pose};
+use subsplat::network::ops::precomputed_gradient::precomputed_gradient;
+use subsplat::network::ops::small::{Candidates, MeanOver, Start};
+use subsplat::network::ops::{Array, ConvSteps, DeviceArray, Executor};
+use subsplat_kernels::layout::MuInput;
 
 use super::array::{CONVOLUTIONS, cameras, noise, values};
 

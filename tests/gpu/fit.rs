@@ -1,7 +1,8 @@
 //! The fit on the GPU against the fit on the CPU.
 
 use std::ops::ControlFlow;
-use subsplat::{FitOptions, FitReport, FitView, RasterOptions, Renderer, Splats, fit};
+use subsplat::fit::{FitReport, FitView, fit};
+use subsplat::{FitOptions, RasterOptions, Renderer, Splats};
 use subsplat_test_support::fit_scene::{cameras, pictures, plane};
 use subsplat_test_support::gpu::gpu;
 

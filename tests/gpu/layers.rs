@@ -7,11 +7,11 @@ use subsplat_test_support::raster_scene;
 use adapter::{gpu, limited};
 use raster_scene::{Kind, Random, Scene};
 use std::sync::Arc;
-use subsplat::abi::{
+use subsplat_kernels::camera::Camera;
+use subsplat_kernels::gpu::{Gpu, GpuError, Rasterizer};
+use subsplat_kernels::layout::{
     Convention, FOOTPRINT_STRIDE, PAIR_SUMS, RasterOptions, ShDirection, SplatSlices,
 };
-use subsplat::camera::Camera;
-use subsplat::gpu::{Gpu, GpuError, Rasterizer};
 
 /// Size of a binding, bytes: 1,365 footprints, 16,384 pairs forward and 1,638 backward, and one
 /// row of tiles of [`WIDTH`] pixels.
@@ -129,7 +129,8 @@ fn errors_name_the_exceeded_limit() {
 /// Sizes are those of the adapter; all other limits are WebGPU's defaults.
 #[test]
 fn devices_have_the_sizes_of_their_adapter() {
-    use subsplat::gpu::{DeviceChoice, find_for, instance, wgpu::Limits};
+    use subsplat_kernels::gpu::wgpu::Limits;
+    use subsplat_kernels::gpu::{DeviceChoice, find_for, instance};
     let Some(gpu) = gpu() else { return };
     let adapter = find_for(&instance(), &DeviceChoice::Gpu, None).unwrap().unwrap();
     let (own, usual) = (adapter.limits(), Limits::default());

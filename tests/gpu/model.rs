@@ -7,16 +7,16 @@ use adapter::{gpu, limited};
 use candle_core::{Device, Tensor};
 use std::ops::ControlFlow;
 use std::path::Path;
-use subsplat::abi::PLAN_WORDS;
-use subsplat::camera::NearFar;
-use subsplat::config::{Config, Preset};
-use subsplat::gpu::{DeviceChoice, Gpu};
-use subsplat::model::compare::compare;
-use subsplat::model::subsplat::SubSplat;
-use subsplat::model::weights::Weights;
-use subsplat::model::{Backend, Views};
-use subsplat::pipeline::{Photo, Reconstructor};
+use subsplat::network::config::{Config, Preset};
+use subsplat::network::model::subsplat::SubSplat;
+use subsplat::network::model::weights::Weights;
+use subsplat::network::model::{Backend, Views};
+use subsplat::reconstruct::{Photo, Reconstructor};
 use subsplat::{Error, Progress, Stage, load_scene};
+use subsplat_kernels::camera::NearFar;
+use subsplat_kernels::gpu::{DeviceChoice, Gpu};
+use subsplat_kernels::layout::PLAN_WORDS;
+use subsplat_lab::compare::compare;
 use subsplat_test_support::shared;
 use whole::{Shoot, light, lively, plain, run, shoot};
 
@@ -240,7 +240,7 @@ fn a_device_lost_within_a_scene_repeats_it_on_the_cpu() {
     let [first, second] = [place(), place()];
     assert_eq!(backend.warning(), None);
     own.device().destroy();
-    own.device().poll(subsplat::gpu::wgpu::PollType::wait_indefinitely()).ok();
+    own.device().poll(subsplat_kernels::gpu::wgpu::PollType::wait_indefinitely()).ok();
     let got = first.children(network, &|| Ok(())).unwrap();
     assert!(backend.warning().is_some_and(|w| w.contains("GPU lost")), "{:?}", backend.warning());
     let values = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
@@ -272,7 +272,7 @@ fn the_cpu_takes_over_from_a_lost_device() {
     assert_eq!(backend.warning(), None);
     own.device().destroy();
     // The loss is reported after the work in flight.
-    own.device().poll(subsplat::gpu::wgpu::PollType::wait_indefinitely()).ok();
+    own.device().poll(subsplat_kernels::gpu::wgpu::PollType::wait_indefinitely()).ok();
     let got = run(&model, &shoot.photos, (64, 64), false).into_splats();
     assert_eq!(got.rows(), expected.rows());
     assert!(backend.warning().is_some_and(|w| w.contains("GPU lost")), "{:?}", backend.warning());

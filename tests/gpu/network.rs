@@ -6,9 +6,9 @@ use subsplat_test_support::gpu as adapter;
 
 use adapter::gpu;
 use cpu_against_gpu::{Random, assert_matches_cpu};
-use subsplat::abi::{Drop, Gather, Level, Pair, SampleConvention, Sweep};
-use subsplat::cpu::{attention_gather as cpu, plane_sweep};
-use subsplat::gpu::{AttentionGatherArgs, GpuError, PlaneSweepArgs};
+use subsplat_kernels::cpu::{attention_gather as cpu, plane_sweep};
+use subsplat_kernels::gpu::{AttentionGatherArgs, GpuError, PlaneSweepArgs};
+use subsplat_kernels::layout::{Drop, Gather, Level, Pair, SampleConvention, Sweep};
 
 /// Tolerance: sums of at most 64 products in another order; sample positions within the f32
 /// rounding of 14 columns (1e-6 px); softmax weights whose exponential has an error of 3 + 2|x|

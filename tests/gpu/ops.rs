@@ -9,14 +9,14 @@ use subsplat_test_support::spgr_calls;
 use adapter::{gpu, limited};
 use candle_core::{DType, Result, Tensor, Var};
 use scenes::Random;
-use subsplat::abi::{Convention, Gather, OpacityRule, RasterOptions, ShDirection};
-use subsplat::camera::Camera;
-use subsplat::gpu::{DeviceChoice, Gpu};
-use subsplat::ops::attention_gather::attention_gather_on;
-use subsplat::ops::plane_sweep::{Sweep, pair, plane_sweep_on};
-use subsplat::ops::redistribute::redistribute_on;
-use subsplat::ops::spgr::spgr_on;
-use subsplat::ops::{Backend, rasterize_on};
+use subsplat::network::ops::attention_gather::attention_gather_on;
+use subsplat::network::ops::plane_sweep::{Sweep, pair, plane_sweep_on};
+use subsplat::network::ops::redistribute::redistribute_on;
+use subsplat::network::ops::spgr::spgr_on;
+use subsplat::network::ops::{Backend, rasterize_on};
+use subsplat_kernels::camera::Camera;
+use subsplat_kernels::gpu::{DeviceChoice, Gpu};
+use subsplat_kernels::layout::{Convention, Gather, OpacityRule, RasterOptions, ShDirection};
 
 /// Tolerance, relative to the largest number. Kernels agree to 4e-5 (tests/gpu/spgr.rs,
 /// tests/gpu/network.rs); random parents contain needles, whose f32 gradients on the CPU have
@@ -140,7 +140,7 @@ fn sweep() {
     let cameras = scenes::cameras(2, 12, 9);
     let k = cameras[0].intrinsics();
     let to = |a: usize, b: usize| {
-        let pose = subsplat::ops::plane_sweep::relative_pose(&cameras[a], &cameras[b]);
+        let pose = subsplat::network::ops::plane_sweep::relative_pose(&cameras[a], &cameras[b]);
         pair(&k, &k, pose, b).unwrap()
     };
     let s = Sweep {
@@ -224,7 +224,7 @@ fn the_cpu_takes_over_from_a_failed_rasterizer() {
         let planes = rasterize_on(backend, &x[0], &x[1], &x[2], &camera, &options)?;
         assert_eq!(backend.warning(), None);
         own.device().destroy();
-        own.device().poll(subsplat::gpu::wgpu::PollType::Poll).ok();
+        own.device().poll(subsplat_kernels::gpu::wgpu::PollType::Poll).ok();
         Ok(vec![planes])
     });
     let expected = of(&Backend::Cpu, &camera);

@@ -7,10 +7,10 @@ use super::array::values;
 use candle_core::{Device, Tensor, Var};
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use subsplat::gpu::Gpu;
-use subsplat::model::Backend;
-use subsplat::ops::Executor;
-use subsplat::train::optimizer::{Gradients, Optimizer, Settings};
+use subsplat::network::model::Backend;
+use subsplat::network::ops::Executor;
+use subsplat_kernels::gpu::Gpu;
+use subsplat_lab::train::optimizer::{Gradients, Optimizer, Settings};
 
 /// Tolerance of state after [`STEPS`] steps: a dozen roundings a step, and roots and quotients of the
 /// device, which are exact to 3 units in the last place.
@@ -175,7 +175,7 @@ fn a_lost_device_loses_no_step() {
         if n == 2 {
             assert_eq!(backend.warning(), None);
             gpu.device().destroy();
-            gpu.device().poll(subsplat::gpu::wgpu::PollType::wait_indefinitely()).ok();
+            gpu.device().poll(subsplat_kernels::gpu::wgpu::PollType::wait_indefinitely()).ok();
         }
         step(&mut cpu, &cpu_vars, n);
         step(&mut own, &vars, n);

@@ -6,13 +6,13 @@ use subsplat_test_support::primaries_reference;
 use super::array::{executor, values};
 use candle_core::{DType, Device, Tensor};
 use glam::{EulerRot, Mat4, Quat, Vec3};
-use subsplat::abi::sh_coefficients;
-use subsplat::camera::{Camera, Intrinsics, NearFar};
-use subsplat::config::{Mvsplat, Primaries as Settings, ShFrame};
-use subsplat::model::primaries::{adapter_of, primaries};
-use subsplat::model::trace::Trace;
-use subsplat::model::{BackboneOutput, Views};
-use subsplat::ops::{Array, ColourLayout};
+use subsplat::network::config::{Mvsplat, Primaries as Settings, ShFrame};
+use subsplat::network::model::primaries::{adapter_of, primaries};
+use subsplat::network::model::trace::Trace;
+use subsplat::network::model::{BackboneOutput, Views};
+use subsplat::network::ops::{Array, ColourLayout};
+use subsplat_kernels::camera::{Camera, Intrinsics, NearFar};
+use subsplat_kernels::layout::sh_coefficients;
 
 /// Height and width, px; neither is a multiple of a workgroup.
 const SIZE: (usize, usize) = (7, 11);

@@ -11,9 +11,10 @@ use adapter::gpu;
 use common::shared;
 use raster_case::File;
 use raster_scene::{KINDS, Kind, Random, Scene};
-use subsplat::abi::{Convention, RasterOptions, Rendered};
-use subsplat::cpu::{self, Geometry, SplatSlices};
-use subsplat::gpu::{GpuError, Rasterizer};
+use subsplat_kernels::cpu;
+use subsplat_kernels::cpu::{Geometry, SplatSlices};
+use subsplat_kernels::gpu::{GpuError, Rasterizer};
+use subsplat_kernels::layout::{Convention, RasterOptions, Rendered};
 
 /// Largest |difference| of colours and alphas between GPU and CPU outside the boundary: ten times
 /// the f32 error of 2e-6, because WGSL allows larger errors in exp2 and log2.
@@ -218,7 +219,7 @@ fn a_texture_is_drawn_in_bands() {
 }
 
 fn draw_to_texture(binding: u64) {
-    use subsplat::gpu::{Gpu, wgpu};
+    use subsplat_kernels::gpu::{Gpu, wgpu};
     let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
     let adapter =
         pollster::block_on(instance.request_adapter(&wgpu::RequestAdapterOptions::default()))
@@ -290,7 +291,7 @@ fn draw_to_texture(binding: u64) {
 /// uploads, and in the backward pass of an earlier frame.
 #[test]
 fn a_lost_device_is_an_error() {
-    use subsplat::gpu::{DeviceChoice, Gpu, wgpu};
+    use subsplat_kernels::gpu::{DeviceChoice, Gpu, wgpu};
     if gpu().is_none() {
         return;
     }

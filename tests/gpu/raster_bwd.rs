@@ -12,9 +12,9 @@ use common::shared;
 use raster_case::File;
 use raster_gradients::{check, named, planes, worst_row};
 use raster_scene::{KINDS, Kind, Random, Scene};
-use subsplat::abi::{Gradients, RasterOptions, ShDirection};
-use subsplat::cpu::{Geometry, SplatSlices};
-use subsplat::gpu::{GpuError, Rasterizer};
+use subsplat_kernels::cpu::{Geometry, SplatSlices};
+use subsplat_kernels::gpu::{GpuError, Rasterizer};
+use subsplat_kernels::layout::{Gradients, RasterOptions, ShDirection};
 
 /// Largest error of a row, in the measure of the README of the conformance cases.
 const GRADIENT: f32 = 5e-4;

@@ -5,9 +5,9 @@ use subsplat_test_support::cpu_against_gpu::Random;
 use subsplat_test_support::gpu as adapter;
 
 use adapter::gpu;
-use subsplat::abi::OpacityRule;
-use subsplat::cpu::redistribute as cpu;
-use subsplat::gpu::{GpuError, RedistributeArgs};
+use subsplat_kernels::cpu::redistribute as cpu;
+use subsplat_kernels::gpu::{GpuError, RedistributeArgs};
+use subsplat_kernels::layout::OpacityRule;
 
 /// Relative tolerance. WGSL allows errors of 3 + 2|x| units in the last place in exp and log,
 /// with |x| up to 20 here: 3e-6 of the result, in numerator and sum.

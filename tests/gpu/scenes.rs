@@ -7,17 +7,17 @@ use subsplat_test_support::gpu as adapter;
 use adapter::gpu;
 use std::path::{Path, PathBuf};
 use subsplat::FitOptions;
-use subsplat::abi::{Convention, Gradients, RasterOptions};
-use subsplat::camera::{Camera, NearFar};
-use subsplat::cpu;
-use subsplat::gpu::Rasterizer;
-use subsplat::io::load_splats;
-use subsplat::io::scene::{Scene, load_scene};
-use subsplat::metrics::psnr;
-use subsplat::model::Backend;
-use subsplat::pipeline::{Check, DepthRange, Options, Photo, Reconstructor};
-use subsplat::render::slices;
-use subsplat::splats::Splats;
+use subsplat::files::load_splats;
+use subsplat::files::scene::{Scene, load_scene};
+use subsplat::network::model::Backend;
+use subsplat::reconstruct::{Check, DepthRange, Options, Photo, Reconstructor};
+use subsplat::scene::metrics::psnr;
+use subsplat::scene::render::slices;
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::camera::{Camera, NearFar};
+use subsplat_kernels::cpu;
+use subsplat_kernels::gpu::Rasterizer;
+use subsplat_kernels::layout::{Convention, Gradients, RasterOptions};
 
 /// Fraction of the numbers of a picture whose error may exceed that of tests/gpu/raster.rs: where
 /// an alpha falls on the other side of 1/255.

@@ -8,8 +8,9 @@ use naga::{AddressSpace, Expression, Handle, Literal, Module, StorageAccess, Typ
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::PathBuf;
-use subsplat::abi::{self, *};
-use subsplat::gpu::{Access, KERNELS, Kernel};
+use subsplat_kernels::gpu::{Access, KERNELS, Kernel};
+use subsplat_kernels::layout as abi;
+use subsplat_kernels::layout::*;
 
 /// WebGPU's default limits: storage buffers per stage, threads and bytes per workgroup.
 const STORAGE_MAX: usize = 8;
@@ -322,7 +323,7 @@ fn check_kernel(kernel: &Kernel) {
     }
 }
 
-/// Stages of the table in src/gpu/mod.rs, and their largest kernel.
+/// Stages of the table in kernels/src/gpu/mod.rs, and their largest kernel.
 const STAGES: &[(&str, &str)] = &[
     ("project", "project"),
     ("sort by depth", "sort_scatter"),
@@ -360,7 +361,7 @@ fn stage_differences(docs: &str) -> Vec<&'static str> {
 
 #[test]
 fn the_table_of_stages_matches_the_kernels() {
-    let docs = fs::read_to_string(root().join("src/gpu/mod.rs")).unwrap();
+    let docs = fs::read_to_string(root().join("kernels/src/gpu/mod.rs")).unwrap();
     assert_eq!(stage_differences(&docs), Vec::<&str>::new());
     assert_eq!(stage_differences(&docs.replace("15,368", "15,372")), ["rasterize backward"]);
     assert_eq!(

@@ -6,13 +6,13 @@ use subsplat_test_support::gpu as adapter;
 use adapter::gpu;
 use cpu_against_gpu::{Random, assert_matches_cpu};
 use glam::{EulerRot, Mat4, Quat, Vec3};
-use subsplat::abi::{
+use subsplat_kernels::camera::{Camera, Intrinsics};
+use subsplat_kernels::cpu::spgr as cpu;
+use subsplat_kernels::gpu::{GpuError, SpgrArgs};
+use subsplat_kernels::layout::{
     AMinMode, AreaAt, DepthDir, DepthUnit, GainSpace, HEAD_STRIDE, MEAN_OFFSET, OPACITY_OFFSET,
     OpacityRule, Positions, PrimaryView, QUAT_OFFSET, Rules, SCALE_OFFSET, SPLAT_STRIDE, Slide,
 };
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::cpu::spgr as cpu;
-use subsplat::gpu::{GpuError, SpgrArgs};
 
 /// Tolerance: a few hundred roundings of 6e-8, including WGSL's larger errors (division 2.5 units
 /// in the last place, exponential 3 + 2|x|). The growth along two axes divides by a cross
@@ -190,7 +190,7 @@ fn children() {
 
 /// Returns the gradients on the CPU: of the head records, of the parents, and of the head records
 /// by the gains.
-fn gradients<T: subsplat::cpu::simd::Real>(
+fn gradients<T: subsplat_kernels::cpu::simd::Real>(
     inputs: &Inputs,
     rules: &Rules,
     grad: &[f32],

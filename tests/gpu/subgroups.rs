@@ -7,7 +7,7 @@ use subsplat_test_support::gpu::{gpu, without_subgroups};
 
 use candle_core::Tensor;
 use std::sync::Arc;
-use subsplat::gpu::{DeviceArray, Gpu, NormSum, PointwiseFunction, Recorder};
+use subsplat_kernels::gpu::{DeviceArray, Gpu, NormSum, PointwiseFunction, Recorder};
 
 /// Opens the adapter with and without subgroup operations; `None`, loudly, where it has none.
 fn both() -> Option<[Arc<Gpu>; 2]> {

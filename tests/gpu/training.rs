@@ -8,17 +8,17 @@ use super::array::{noise, values};
 use candle_core::backprop::GradStore;
 use candle_core::{Device, Result, Tensor};
 use std::collections::BTreeMap;
-use subsplat::config::{Backbone, Config, Preset};
-use subsplat::model::Views;
-use subsplat::model::backbone::small::DisparityMean;
-use subsplat::model::primaries::packed;
-use subsplat::model::subsplat::SubSplat;
-use subsplat::model::trunk::TrainPass;
-use subsplat::model::weights::Weights;
-use subsplat::model::{BackboneOutput, Backend};
-use subsplat::ops::precomputed_gradient::precomputed_gradient;
-use subsplat::train::TrainConfig;
-use subsplat::train::run::Training;
+use subsplat::network::config::{Backbone, Config, Preset};
+use subsplat::network::model::Views;
+use subsplat::network::model::backbone::small::DisparityMean;
+use subsplat::network::model::primaries::packed;
+use subsplat::network::model::subsplat::SubSplat;
+use subsplat::network::model::trunk::TrainPass;
+use subsplat::network::model::weights::Weights;
+use subsplat::network::model::{BackboneOutput, Backend};
+use subsplat::network::ops::precomputed_gradient::precomputed_gradient;
+use subsplat_lab::train::TrainConfig;
+use subsplat_lab::train::run::Training;
 use subsplat_test_support::cpu_against_gpu::Random;
 
 /// Norm of a difference over the norm of a parameter's gradient. The modes of a few pixels differ
@@ -266,7 +266,7 @@ fn a_training_survives_the_loss_of_its_device() {
     let own = training.backend().gpu().unwrap().clone();
     own.device().destroy();
     // The loss is reported after the work in flight.
-    own.device().poll(subsplat::gpu::wgpu::PollType::wait_indefinitely()).ok();
+    own.device().poll(subsplat_kernels::gpu::wgpu::PollType::wait_indefinitely()).ok();
     got.extend(losses(&mut training, 2));
     assert_close(&got, &expected, "lost");
     assert!(training.warning().is_some_and(|w| w.contains("GPU lost")), "{:?}", training.warning());

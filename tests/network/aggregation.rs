@@ -7,19 +7,19 @@ use candle_core::{DType, Device, Tensor};
 use candle_nn::{VarBuilder, VarMap};
 use glam::{Quat, Vec3};
 use scenes::*;
-use subsplat::config::*;
-use subsplat::model::aggregation::Aggregation;
-use subsplat::model::embed::Descriptors;
-use subsplat::model::geometry::{Frames, ParentChunk};
-use subsplat::model::mlp::Mode;
-use subsplat::model::trunk::set_initial_values;
-use subsplat::model::weights::Weights;
-use subsplat::model::{BackboneOutput, Primaries};
-use subsplat::ops::attention_gather::{Gather, Level};
+use subsplat::network::config::*;
+use subsplat::network::model::aggregation::Aggregation;
+use subsplat::network::model::embed::Descriptors;
+use subsplat::network::model::geometry::{Frames, ParentChunk};
+use subsplat::network::model::mlp::Mode;
+use subsplat::network::model::trunk::set_initial_values;
+use subsplat::network::model::weights::Weights;
+use subsplat::network::model::{BackboneOutput, Primaries};
+use subsplat::network::ops::attention_gather::{Gather, Level};
 
 /// Everything a stage needs for one 16 × 16 scene of two views.
 struct Fixture {
-    cameras: Vec<subsplat::camera::Camera>,
+    cameras: Vec<subsplat_kernels::camera::Camera>,
     backbone: BackboneOutput,
     primaries: Primaries,
     frames: Frames,
@@ -51,12 +51,12 @@ fn fixture(first: usize, len: usize, seed: u64) -> Fixture {
     }
 }
 
-fn paper() -> subsplat::config::Aggregation {
+fn paper() -> subsplat::network::config::Aggregation {
     Config::re10k(Preset::Paper, 2).agg
 }
 
 /// The aggregation with random parameters, and those parameters.
-fn build(keys: &subsplat::config::Aggregation, seed: u64) -> (Aggregation, VarMap) {
+fn build(keys: &subsplat::network::config::Aggregation, seed: u64) -> (Aggregation, VarMap) {
     let variables = VarMap::new();
     let vb = VarBuilder::from_varmap(&variables, DType::F32, &Device::Cpu);
     let agg = Aggregation::new(keys, 32, &channels(), vb.pp("subsplat").pp("agg")).unwrap();
@@ -237,7 +237,7 @@ fn coordinate_maps(x: &mut Fixture) {
 }
 
 /// One stage that averages its samples: linear weights at zero, no projection.
-fn averaging() -> subsplat::config::Aggregation {
+fn averaging() -> subsplat::network::config::Aggregation {
     let ablations = AggregationAblations {
         op: AttentionOp::Linear,
         kv_proj: false,
@@ -245,7 +245,7 @@ fn averaging() -> subsplat::config::Aggregation {
         residual: Residual::None,
         ..AggregationAblations::default()
     };
-    subsplat::config::Aggregation { stages_geo: 1, stages_app: 0, ablations, ..paper() }
+    subsplat::network::config::Aggregation { stages_geo: 1, stages_app: 0, ablations, ..paper() }
 }
 
 #[test]

@@ -5,8 +5,10 @@ use subsplat_test_support::scenes;
 
 use candle_core::{DType, Device, Tensor};
 use scenes::*;
-use subsplat::abi::SampleConvention;
-use subsplat::ops::attention_gather::{Drop, Gather, Level, attention_gather, occlusion_gate};
+use subsplat::network::ops::attention_gather::{
+    Drop, Gather, Level, attention_gather, occlusion_gate,
+};
+use subsplat_kernels::layout::SampleConvention;
 
 /// The definition, sample by sample, nothing merged; without dropping.
 fn naive(g: &Gather, maps: &Tensor, query: &Tensor, points: &Tensor) -> Tensor {

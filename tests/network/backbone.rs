@@ -5,14 +5,14 @@
 use candle_core::{Device, Result, Tensor};
 use glam::{Mat4, Quat, Vec3};
 use std::collections::BTreeMap;
-use subsplat::camera::{Camera, Intrinsics, NearFar};
-use subsplat::config::Mvsplat as Settings;
-use subsplat::model::Views;
-use subsplat::model::backbone::Mvsplat;
-use subsplat::model::backbone::unet::UNet;
-use subsplat::model::primaries::primaries;
-use subsplat::model::trace::Trace;
-use subsplat::model::weights::Weights;
+use subsplat::network::config::Mvsplat as Settings;
+use subsplat::network::model::Views;
+use subsplat::network::model::backbone::Mvsplat;
+use subsplat::network::model::backbone::unet::UNet;
+use subsplat::network::model::primaries::primaries;
+use subsplat::network::model::trace::Trace;
+use subsplat::network::model::weights::Weights;
+use subsplat_kernels::camera::{Camera, Intrinsics, NearFar};
 
 /// MVSplat with narrow layers: the same code at a hundredth of the work.
 fn narrow() -> Settings {
@@ -474,7 +474,9 @@ fn several_gaussians_per_pixel_share_all_but_depth_and_opacity() -> Result<()> {
 /// `camera.rs` projects: a source map that holds its own coordinates gives them back.
 #[test]
 fn the_sweep_samples_where_cameras_project() -> Result<()> {
-    use subsplat::ops::plane_sweep::{Sweep, pair, plane_sweep, relative_pose, validity, warped};
+    use subsplat::network::ops::plane_sweep::{
+        Sweep, pair, plane_sweep, relative_pose, validity, warped,
+    };
     let (h, w) = (8, 12);
     let views = posed(2, 32, 48);
     let cameras: Vec<Camera> = views.cameras[0].iter().map(|c| c.resized(w, h).unwrap()).collect();

@@ -5,12 +5,12 @@ use subsplat_test_support as common;
 use candle_core::{DType, Device, Result, Tensor};
 use common::shared;
 use std::collections::BTreeMap;
-use subsplat::config::Mvsplat as Settings;
-use subsplat::model::backbone::Mvsplat;
-use subsplat::model::compare::views;
-use subsplat::model::primaries::primaries;
-use subsplat::model::trace::Trace;
-use subsplat::model::weights::{Weights, read_tensors};
+use subsplat::network::config::Mvsplat as Settings;
+use subsplat::network::model::backbone::Mvsplat;
+use subsplat::network::model::primaries::primaries;
+use subsplat::network::model::trace::Trace;
+use subsplat::network::model::weights::{Weights, read_tensors};
+use subsplat_lab::compare::views;
 
 /// Norm of a difference over the norm; the worst seen is 4e-3 (a convolution of the CNN):
 /// depth turns the last digits of features into its third, and a gradient of the CNN has

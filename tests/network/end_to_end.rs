@@ -5,18 +5,18 @@ use subsplat_test_support::whole;
 
 use candle_core::{Device, Tensor};
 use glam::Vec3;
-use subsplat::abi::{
+use subsplat::files::image::Rgb;
+use subsplat::files::{SaveOptions, load_splats, save_splats};
+use subsplat::network::config::{Backbone, Config, Preset, ShFrame, SpgrHead};
+use subsplat::network::model::Views;
+use subsplat::reconstruct::{Density, Photo, Reconstructor};
+use subsplat::scene::metrics::psnr;
+use subsplat::scene::render;
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::camera::{Camera, Intrinsics, NearFar, Size};
+use subsplat_kernels::layout::{
     Convention, QUAT_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE, ShBasis, ShDirection,
 };
-use subsplat::camera::{Camera, Intrinsics, NearFar, Size};
-use subsplat::config::{Backbone, Config, Preset, ShFrame, SpgrHead};
-use subsplat::io::image::Rgb;
-use subsplat::io::{SaveOptions, load_splats, save_splats};
-use subsplat::metrics::psnr;
-use subsplat::model::Views;
-use subsplat::pipeline::{Density, Photo, Reconstructor};
-use subsplat::render;
-use subsplat::splats::Splats;
 use whole::{options as options_of, *};
 
 /// Sides of inputs, px: the smallest that both networks take and windows split.
@@ -33,7 +33,7 @@ fn rules(model: &Reconstructor, near: f32) -> RasterOptions {
     config.raster_options(config.upscale as f32, near, [0.0; 3])
 }
 
-fn cameras(result: &subsplat::pipeline::Reconstruction) -> Vec<Camera> {
+fn cameras(result: &subsplat::reconstruct::Reconstruction) -> Vec<Camera> {
     result.inputs().iter().map(|c| c.target_camera).collect()
 }
 
@@ -268,7 +268,7 @@ fn materialised(splats: &Splats) -> Splats {
         let start = sh.len();
         sh.extend(splats.sh_of(i).iter().map(|h| gamma * h));
         for (v, d) in sh[start..start + 3].iter_mut().zip(delta) {
-            *v += d / subsplat::sh::C0 as f32;
+            *v += d / subsplat_kernels::sh::C0 as f32;
         }
     }
     Splats::new(splats.rows().to_vec(), sh, Vec::new(), splats.sh_degree(), splats.sh_basis())

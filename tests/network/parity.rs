@@ -7,14 +7,14 @@ use candle_core::{DType, Device, Tensor};
 use common::shared;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use subsplat::camera::NearFar;
-use subsplat::config::Mvsplat as Settings;
-use subsplat::model::backbone::Mvsplat;
-use subsplat::model::compare::{Report, compare, compare_encoder, views};
-use subsplat::model::primaries::primaries;
-use subsplat::model::trace::Trace;
-use subsplat::model::weights::{Weights, read_tensors};
-use subsplat::model::{Backend, Views};
+use subsplat::network::config::Mvsplat as Settings;
+use subsplat::network::model::backbone::Mvsplat;
+use subsplat::network::model::primaries::primaries;
+use subsplat::network::model::trace::Trace;
+use subsplat::network::model::weights::{Weights, read_tensors};
+use subsplat::network::model::{Backend, Views};
+use subsplat_kernels::camera::NearFar;
+use subsplat_lab::compare::{Report, compare, compare_encoder, views};
 
 fn golden() -> Option<(PathBuf, PathBuf)> {
     Some((
@@ -151,8 +151,8 @@ fn sizes_that_do_not_fit_are_refused() {
     let settings = Settings::re10k();
     let encoder = Mvsplat::new(&settings, Weights::seeded(1).builder()).unwrap();
     let image = Tensor::zeros((1, 2, 3, 64, 72), DType::F32, &Device::Cpu).unwrap();
-    let k = subsplat::camera::Intrinsics::from_fov_x(1.0, 72, 64);
-    let camera = subsplat::camera::Camera::new(k, glam::Mat4::IDENTITY).unwrap();
+    let k = subsplat_kernels::camera::Intrinsics::from_fov_x(1.0, 72, 64);
+    let camera = subsplat_kernels::camera::Camera::new(k, glam::Mat4::IDENTITY).unwrap();
     let views =
         Views::new(image, vec![vec![camera; 2]], vec![vec![NearFar::new(1.0, 10.0); 2]]).unwrap();
     let e = encoder.forward(&views, &mut Trace::off()).unwrap_err().to_string();

@@ -3,8 +3,8 @@
 
 use candle_core::{Device, Result, Tensor, Var};
 use glam::{Mat4, Quat, Vec3};
-use subsplat::camera::Intrinsics;
-use subsplat::ops::plane_sweep::{Pair, Sweep, pair, plane_sweep};
+use subsplat::network::ops::plane_sweep::{Pair, Sweep, pair, plane_sweep};
+use subsplat_kernels::camera::Intrinsics;
 
 const SIZE: [usize; 2] = [7, 9];
 const CHANNELS: usize = 5;

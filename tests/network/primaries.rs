@@ -5,14 +5,14 @@ use subsplat_test_support::primaries_reference;
 
 use candle_core::{DType, Device, Result, Tensor, Var};
 use glam::{DMat3, DQuat, DVec3, Mat4, Quat, Vec3};
-use subsplat::abi::ShBasis;
-use subsplat::camera::{Camera, Intrinsics, NearFar};
-use subsplat::config::{Mvsplat, Primaries as Settings, ShFrame};
-use subsplat::model::primaries::{primaries, sh_mask};
-use subsplat::model::trace::Trace;
-use subsplat::model::{BackboneOutput, Primaries, Views};
-use subsplat::ops::adapter::{Adapter, Turn, View, place};
-use subsplat::sh;
+use subsplat::network::config::{Mvsplat, Primaries as Settings, ShFrame};
+use subsplat::network::model::primaries::{primaries, sh_mask};
+use subsplat::network::model::trace::Trace;
+use subsplat::network::model::{BackboneOutput, Primaries, Views};
+use subsplat::network::ops::adapter::{Adapter, Turn, View, place};
+use subsplat_kernels::camera::{Camera, Intrinsics, NearFar};
+use subsplat_kernels::layout::ShBasis;
+use subsplat_kernels::sh;
 
 const SIZE: (usize, usize) = (4, 6);
 

@@ -5,15 +5,15 @@ use subsplat_test_support::whole;
 use candle_core::{Device, Tensor};
 use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use subsplat::camera::Size;
-use subsplat::check::Verdict;
-use subsplat::config::{Config, Preset};
-use subsplat::model::Views;
-use subsplat::model::weights::Weights;
+use subsplat::cameras::check::Verdict;
+use subsplat::network::config::{Config, Preset};
+use subsplat::network::model::Views;
+use subsplat::network::model::weights::Weights;
+use subsplat::reconstruct::DepthSource;
 use subsplat::{
-    Check, DepthSource, Detail, Error, NearFar, Options, Photo, Progress, Reconstructor, Stage,
-    Warning,
+    Check, Detail, Error, NearFar, Options, Photo, Progress, Reconstructor, Stage, Warning,
 };
+use subsplat_kernels::camera::Size;
 
 fn photos() -> Vec<Photo> {
     whole::shoot(3, 2, 160, 144).photos

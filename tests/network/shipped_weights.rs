@@ -6,13 +6,13 @@ use subsplat_test_support as common;
 use candle_core::Tensor;
 use std::collections::BTreeMap;
 use std::path::Path;
-use subsplat::config::{Config, Preset};
-use subsplat::model::subsplat::SubSplat;
-use subsplat::model::weights::{SUBSPLAT_PREFIX, Weights};
-use subsplat::pipeline::Reconstructor;
-use subsplat::train::TrainConfig;
-use subsplat::train::config::Model;
-use subsplat::train::validate::{Found, Validator};
+use subsplat::network::config::{Config, Preset};
+use subsplat::network::model::subsplat::SubSplat;
+use subsplat::network::model::weights::{SUBSPLAT_PREFIX, Weights};
+use subsplat::reconstruct::Reconstructor;
+use subsplat_lab::train::TrainConfig;
+use subsplat_lab::train::config::Model;
+use subsplat_lab::train::validate::{Found, Validator};
 
 /// The shipped model's configuration.
 fn shipped(upscale: usize) -> Config {
@@ -49,7 +49,7 @@ fn learnt(upscale: usize) -> BTreeMap<String, Tensor> {
 
 #[test]
 fn the_file_is_small_and_whole() {
-    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("src/model/shipped/small.safetensors");
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("src/network/shipped/small.safetensors");
     let bytes = std::fs::metadata(&file).unwrap().len();
     assert!((500_000..6 << 20).contains(&bytes), "{bytes}");
     let model = Reconstructor::shipped(2).unwrap();

@@ -1,13 +1,13 @@
 //! The small backbone: results of its untrained start, and its switches.
 
 use candle_core::{Device, Tensor};
-use subsplat::camera::{Camera, NearFar};
-use subsplat::config::{Backbone, Config, Preset, Small};
-use subsplat::data::procedural::{Example, ExampleSpec};
-use subsplat::model::Views;
-use subsplat::model::backbone::{DisparityMean, SmallBackbone};
-use subsplat::model::subsplat::SubSplat;
-use subsplat::model::weights::Weights;
+use subsplat::network::config::{Backbone, Config, Preset, Small};
+use subsplat::network::model::Views;
+use subsplat::network::model::backbone::{DisparityMean, SmallBackbone};
+use subsplat::network::model::subsplat::SubSplat;
+use subsplat::network::model::weights::Weights;
+use subsplat_kernels::camera::{Camera, NearFar};
+use subsplat_lab::data::procedural::{Example, ExampleSpec};
 
 const SIDE: usize = 128;
 

@@ -6,13 +6,13 @@ use subsplat_test_support::scenes;
 use candle_core::{DType, Device, Tensor};
 use candle_nn::{VarBuilder, VarMap};
 use scenes::*;
-use subsplat::camera::Camera;
-use subsplat::config::*;
-use subsplat::model::embed::Embeddings;
-use subsplat::model::geometry::{Frames, ParentChunk};
-use subsplat::model::trunk::{Children, TrainPass, Trunk, set_initial_values};
-use subsplat::model::weights::Weights;
-use subsplat::model::{BackboneOutput, Primaries, Views};
+use subsplat::network::config::*;
+use subsplat::network::model::embed::Embeddings;
+use subsplat::network::model::geometry::{Frames, ParentChunk};
+use subsplat::network::model::trunk::{Children, TrainPass, Trunk, set_initial_values};
+use subsplat::network::model::weights::Weights;
+use subsplat::network::model::{BackboneOutput, Primaries, Views};
+use subsplat_kernels::camera::Camera;
 
 const SIZE: usize = 16;
 

@@ -3,14 +3,16 @@
 
 use candle_core::{DType, Device, Result, Tensor, Var};
 use glam::{Mat4, Quat, Vec3};
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::config::{AlphaInput, AnchorFrame, Config, Embed, MuInput, Preset, ScaleInput};
-use subsplat::model::embed::Embeddings;
-use subsplat::model::geometry::{Frames, ParentChunk};
-use subsplat::model::weights::Weights;
-use subsplat::ops::columns::columns;
-use subsplat::ops::linear::linear;
-use subsplat::ops::norm::layer_norm;
+use subsplat::network::config::{
+    AlphaInput, AnchorFrame, Config, Embed, MuInput, Preset, ScaleInput,
+};
+use subsplat::network::model::embed::Embeddings;
+use subsplat::network::model::geometry::{Frames, ParentChunk};
+use subsplat::network::model::weights::Weights;
+use subsplat::network::ops::columns::columns;
+use subsplat::network::ops::linear::linear;
+use subsplat::network::ops::norm::layer_norm;
+use subsplat_kernels::camera::{Camera, Intrinsics};
 
 /// Parents in front of, behind and beside the cameras, with scales and opacities
 /// inside and outside every bound.

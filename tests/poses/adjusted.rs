@@ -1,8 +1,8 @@
 //! Cameras that are nearly right come back to where they belong.
 
 use glam::{Mat4, Quat, Vec3};
-use subsplat::camera::Camera;
-use subsplat::poses::{PosePhoto, adjust_poses, locate_photos, move_along};
+use subsplat::cameras::estimation::{PosePhoto, adjust_poses, locate_photos, move_along};
+use subsplat_kernels::camera::Camera;
 use subsplat_test_support::pose_errors::aligned_errors;
 use subsplat_test_support::posed_photos::{Intrinsics, PosedPhoto, photo_scene};
 

@@ -2,10 +2,9 @@
 
 use crate::refused::{EYE, H, STEP, W, camera, picture};
 use std::path::PathBuf;
-use subsplat::{
-    Error, KnownLens, LensSource, LoadOptions, LooseOptions, PoseRefusal, Rgb, load_photograph,
-    loose_photos, loose_scene, save_png,
-};
+use subsplat::cameras::estimation::PoseRefusal;
+use subsplat::reconstruct::{KnownLens, LensSource, LooseOptions};
+use subsplat::{Error, LoadOptions, Rgb, load_photograph, loose_photos, loose_scene, save_png};
 
 #[test]
 fn photographs_in_memory_get_the_cameras_of_their_files() {

@@ -1,7 +1,7 @@
 //! Twenty photographs in any order, and one among them that does not belong.
 
-use subsplat::camera::Camera;
-use subsplat::{Confidence, PoseOptions, PosePhoto, estimate_poses};
+use subsplat::cameras::estimation::{Confidence, PoseOptions, PosePhoto, estimate_poses};
+use subsplat_kernels::camera::Camera;
 use subsplat_test_support::pose_errors::aligned_errors;
 use subsplat_test_support::posed_photos::{Intrinsics, MANY_FEATURES, PosedPhoto, photo_scene};
 

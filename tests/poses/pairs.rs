@@ -2,7 +2,9 @@
 //! the table.
 
 use rayon::prelude::*;
-use subsplat::{Confidence, PoseOptions, PoseRefusal, Uncertain, estimate_poses};
+use subsplat::cameras::estimation::{
+    Confidence, PoseOptions, PoseRefusal, Uncertain, estimate_poses,
+};
 use subsplat_test_support::pose_errors::{area_under_curve, median, relative_errors};
 use subsplat_test_support::posed_photos::{Intrinsics, PAIR_FEATURES, PosedPair, context_pairs};
 

@@ -3,12 +3,12 @@
 
 use glam::{Mat3, Mat4, Vec3};
 use std::sync::Arc;
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::data::procedural::{Grade, Quality, Room, TextureBank};
-use subsplat::loose::Uncertain;
-use subsplat::{
+use subsplat::cameras::estimation::Uncertain;
+use subsplat::cameras::estimation::{
     Lens, PoseEstimate, PoseOptions, PosePhoto, PosePhotoError, PoseRefusal, estimate_poses,
 };
+use subsplat_kernels::camera::{Camera, Intrinsics};
+use subsplat_lab::data::procedural::{Grade, Quality, Room, TextureBank};
 use subsplat_test_support::pose_errors::relative_errors;
 
 const FEATURES: usize = 4000;

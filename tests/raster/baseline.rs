@@ -20,10 +20,10 @@ use conventional::{attention, redistribute, sweep};
 use glam::Mat4;
 use safetensors::SafeTensors;
 use std::collections::HashMap;
-use subsplat::abi::{ALPHA_MIN, RasterOptions};
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::ops;
-use subsplat::ops::redistribute::OpacityRule;
+use subsplat::network::ops;
+use subsplat::network::ops::redistribute::OpacityRule;
+use subsplat_kernels::camera::{Camera, Intrinsics};
+use subsplat_kernels::layout::{ALPHA_MIN, RasterOptions};
 
 /// No pixel of alpha ≥ 1/255 lies outside such a box.
 const EXACT_BOX: f32 = 3.34;
@@ -250,8 +250,10 @@ fn scenes_are_what_they_say() {
     let own = scene::unshared(&splats);
     assert_eq!((own.len(), own.parents()), (8192, 8192));
     let options = RasterOptions::default();
-    let (a, b) =
-        (subsplat::render(&splats, &camera, &options), subsplat::render(&own, &camera, &options));
+    let (a, b) = (
+        subsplat::scene::render(&splats, &camera, &options),
+        subsplat::scene::render(&own, &camera, &options),
+    );
     assert_close(&a.rgb, &b.rgb, 1e-4);
     // Covered, and with steps in depth.
     let covered = a.alpha.iter().filter(|&&v| v > 0.9).count();
@@ -259,8 +261,8 @@ fn scenes_are_what_they_say() {
     let steps = a.depth.chunks(spec.side).flat_map(|r| r.windows(2));
     let steps = steps.filter(|w| (w[0] - w[1]).abs() > 0.5).count();
     assert!(steps > spec.side, "{steps}");
-    let mut rasterizer = subsplat::cpu::Rasterizer::new();
-    rasterizer.render(&subsplat::render::slices(&splats), &camera, &options);
+    let mut rasterizer = subsplat_kernels::cpu::Rasterizer::new();
+    rasterizer.render(&subsplat::scene::render::slices(&splats), &camera, &options);
     // σ of the footprint without its low-pass, from the determinant of its conic.
     let sigma: Vec<f32> = rasterizer
         .footprints()

@@ -4,9 +4,9 @@
 //! SubSplat's physical remark, first three columns.
 
 use glam::{Mat4, Vec2, Vec3};
-use subsplat::abi::{Convention, LOWPASS, RasterOptions, ShBasis};
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::splats::Splats;
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::camera::{Camera, Intrinsics};
+use subsplat_kernels::layout::{Convention, LOWPASS, RasterOptions, ShBasis};
 
 /// Input picture side, px: large enough for a middle without borders.
 const SIDE: usize = 64;
@@ -36,7 +36,7 @@ fn plane(sigma_px: f32, eyes: [[f32; 2]; 2]) -> Splats {
         }
     }
     // White: ½ + C₀·h = 1.
-    let sh = vec![0.5 / subsplat::sh::C0 as f32; rows.len() / 11 * 3];
+    let sh = vec![0.5 / subsplat_kernels::sh::C0 as f32; rows.len() / 11 * 3];
     Splats::new(rows, sh, Vec::new(), 0, ShBasis::Standard).unwrap()
 }
 
@@ -44,7 +44,7 @@ fn plane(sigma_px: f32, eyes: [[f32; 2]; 2]) -> Splats {
 fn coverage(splats: &Splats, scale: usize, lowpass: f32, convention: Convention) -> f32 {
     let options = RasterOptions { lowpass, ..RasterOptions::new(convention) };
     let side = SIDE * scale;
-    let picture = subsplat::render(splats, &camera([0.0; 2], side), &options);
+    let picture = subsplat::scene::render(splats, &camera([0.0; 2], side), &options);
     let middle = side / 4..3 * side / 4;
     let (mut sum, mut n) = (0.0, 0.0);
     for p in middle.clone().flat_map(|y| middle.clone().map(move |x| y * side + x)) {

@@ -2,9 +2,10 @@
 //! leaves a set alone where it cannot make it better.
 
 use std::ops::ControlFlow;
-use subsplat::abi::{OPACITY_OFFSET, SCALE_OFFSET, SPLAT_STRIDE};
-use subsplat::io::image::Rgb;
-use subsplat::{FitError, FitOptions, FitReport, FitView, RasterOptions, Renderer, Splats, fit};
+use subsplat::files::image::Rgb;
+use subsplat::fit::{FitError, FitReport, FitView, fit};
+use subsplat::{FitOptions, RasterOptions, Renderer, Splats};
+use subsplat_kernels::layout::{OPACITY_OFFSET, SCALE_OFFSET, SPLAT_STRIDE};
 use subsplat_test_support::fit_scene::{SIDE, cameras, pictures, plane};
 
 fn fitted(splats: &mut Splats, truth: &[Rgb], steps: usize) -> FitReport {

@@ -1,14 +1,14 @@
 //! Level of detail: moments of a merge, the selection by distance, and pictures of selections.
 
 use glam::{DMat3, DQuat, DVec3, Mat4, Vec3};
-use subsplat::abi::{LOWPASS, RasterOptions, SPLAT_STRIDE, ShBasis};
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::levels::{BLOCK, CELL_PX, Levels};
 use subsplat::merge::Blob;
-use subsplat::metrics::psnr;
-use subsplat::render::render;
-use subsplat::sh::C0;
-use subsplat::splats::Splats;
+use subsplat::scene::levels::{BLOCK, CELL_PX, Levels};
+use subsplat::scene::metrics::psnr;
+use subsplat::scene::render::render;
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::camera::{Camera, Intrinsics};
+use subsplat_kernels::layout::{LOWPASS, RasterOptions, SPLAT_STRIDE, ShBasis};
+use subsplat_kernels::sh::C0;
 
 /// Side of the pictures, px.
 const SIDE: usize = 128;

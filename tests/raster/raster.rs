@@ -10,10 +10,10 @@ use common::{committed, raster_cases, shared};
 use glam::{Mat4, Vec3};
 use raster_case::{File, rows};
 use std::path::Path;
-use subsplat::abi::{Convention, RasterOptions, ShBasis};
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::cpu::{Geometry, Rasterizer, SimdLevel, SplatSlices};
-use subsplat::splats::Splats;
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::camera::{Camera, Intrinsics};
+use subsplat_kernels::cpu::{Geometry, Rasterizer, SimdLevel, SplatSlices};
+use subsplat_kernels::layout::{Convention, RasterOptions, ShBasis};
 
 /// Largest |got − expected| over pixels that are no boundary; `lanes` per pixel.
 /// With `relative`, over max(|expected|, the number given).
@@ -209,7 +209,7 @@ fn brush_tiny() {
     }
 }
 
-/// INRIA .ply as splats, for this test only (the reader proper is `subsplat::io`).
+/// INRIA .ply as splats, for this test only (the reader proper is `subsplat::files`).
 fn read_ply(path: &Path) -> Splats {
     let bytes = std::fs::read(path).unwrap();
     let end = b"end_header\n";
@@ -278,7 +278,7 @@ fn ref_render() {
     let expected = common::npy::floats(&npy);
     for (convention, least) in [(Convention::Mvsplat, 70.0), (Convention::Standard, 80.0)] {
         let options = RasterOptions::new(convention);
-        let picture = subsplat::render(&splats, &cameras[4], &options);
+        let picture = subsplat::scene::render(&splats, &cameras[4], &options);
         let clipped = picture.rgb.iter().map(|v| v.clamp(0.0, 1.0));
         let db = psnr(clipped, expected.iter().map(|v| v.clamp(0.0, 1.0)));
         eprintln!("ref_render {convention:?}: {db:.2} dB");
@@ -290,7 +290,7 @@ fn ref_render() {
     for (i, camera) in cameras.iter().enumerate() {
         let photo = image::open(scene.join(format!("images/{i:03}.png"))).unwrap().to_rgb8();
         let options = RasterOptions::new(Convention::Mvsplat);
-        let picture = subsplat::render(&splats, camera, &options);
+        let picture = subsplat::scene::render(&splats, camera, &options);
         let db = psnr(
             picture.rgb.iter().map(|v| v.clamp(0.0, 1.0)),
             photo.as_raw().iter().map(|&v| f32::from(v) / 255.0),

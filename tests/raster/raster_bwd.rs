@@ -9,9 +9,9 @@ use common::{raster_cases, shared};
 use glam::{DVec3, Mat4, Vec3};
 use raster_case::{File, rows};
 use raster_gradients::{check, part, planes, worst_row};
-use subsplat::abi::{RasterOptions, SPLAT_STRIDE};
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::cpu::{Geometry, Gradients, Rasterizer, SplatSlices};
+use subsplat_kernels::camera::{Camera, Intrinsics};
+use subsplat_kernels::cpu::{Geometry, Gradients, Rasterizer, SplatSlices};
+use subsplat_kernels::layout::{RasterOptions, SPLAT_STRIDE};
 
 fn check_case(name: &str) {
     let Some(path) = shared(&format!("fixtures/raster/{name}.safetensors")) else { return };
@@ -70,7 +70,7 @@ fn brush_tiny() {
         let colour: [f64; 3] = std::array::from_fn(|c| f64::from(got.sh[48 * i + c]) / 0.282_094_8);
         let at = DVec3::from_array(splat_mean(&packed, i)) - eye.as_dvec3();
         let loss = |at: DVec3| -> f64 {
-            let y = subsplat::sh::standard(at.normalize());
+            let y = subsplat_kernels::sh::standard(at.normalize());
             (0..16)
                 .map(|k| {
                     (0..3).map(|c| colour[c] * f64::from(sh[48 * i + 3 * k + c])).sum::<f64>()

@@ -7,12 +7,12 @@ use subsplat_test_support::raster_scene;
 
 use glam::Vec3;
 use raster_scene::{KINDS, Kind, Random, SIZE, Scene};
-use subsplat::abi::{
+use subsplat_kernels::camera::{Camera, Intrinsics};
+use subsplat_kernels::cpu::{Gradients, Rasterizer, SimdLevel};
+use subsplat_kernels::layout::{
     Convention, OPACITY_OFFSET, QUAT_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE, ShBasis,
     ShDirection, sh_coefficients,
 };
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::cpu::{Gradients, Rasterizer, SimdLevel};
 
 /// Central difference of the loss in one number, which `of` finds. Steps are such that
 /// no alpha moves by more than the oracle's boundary is wide, and count as `f32` took

@@ -3,12 +3,12 @@
 
 use candle_core::{DType, Device, Tensor, Var};
 use glam::{Mat4, Vec3};
-use subsplat::abi::{Convention, RasterOptions, ShBasis};
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::cpu::{Gradients, Rasterizer};
-use subsplat::ops::SplatTensors;
-use subsplat::ops::{over_background, rasterize};
-use subsplat::splats::Splats;
+use subsplat::network::ops::SplatTensors;
+use subsplat::network::ops::{over_background, rasterize};
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::camera::{Camera, Intrinsics};
+use subsplat_kernels::cpu::{Gradients, Rasterizer};
+use subsplat_kernels::layout::{Convention, RasterOptions, ShBasis};
 
 fn camera() -> Camera {
     let k = Intrinsics { fx: 30.0, fy: 32.0, cx: 14.0, cy: 10.0, width: 29, height: 21 };
@@ -37,7 +37,7 @@ fn forward_is_the_kernels() {
     let out = rasterize(&rows, &sh, &gain, &camera, &o).unwrap();
     assert_eq!(out.dims(), [5, 21, 29]);
     let out = out.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-    let picture = subsplat::render(&s, &camera, &o);
+    let picture = subsplat::scene::render(&s, &camera, &o);
     let n = 21 * 29;
     assert!(picture.alpha.iter().filter(|&&a| a > 0.5).count() > 50);
     for p in 0..n {
@@ -58,7 +58,7 @@ fn forward_is_the_kernels() {
     *single.gain_mut() = one.to_vec1().unwrap();
     let got = rasterize(&rows, &sh, &one, &camera, &o).unwrap();
     let got = got.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-    let expected = subsplat::render(&single, &camera, &o);
+    let expected = subsplat::scene::render(&single, &camera, &o);
     assert!((0..n).all(|p| got[p] == expected.rgb[3 * p]));
     assert_ne!(got, out);
 }
@@ -143,7 +143,7 @@ fn gradients_are_the_kernels_and_those_of_the_loss() {
     let again = loss.backward().unwrap();
     let mut kernel = Gradients::default();
     let v: Vec<f32> = weights().flatten_all().unwrap().to_vec1().unwrap();
-    let slices = subsplat::render::slices(&s);
+    let slices = subsplat::scene::render::slices(&s);
     Rasterizer::new().backward(&slices, &camera, &o, &v, &mut kernel);
     for (variable, expected) in variables.iter().zip([&kernel.rows, &kernel.sh, &kernel.gain]) {
         for store in [&store, &again] {
@@ -196,7 +196,7 @@ fn splat_tensors_pass_gradients_to_their_parts() {
     let planes = subsplat::rasterize(&tensors, &camera, &o).unwrap();
     let mut plain = s.clone();
     *plain.gain_mut() = Vec::new();
-    let picture = subsplat::render(&plain, &camera, &o);
+    let picture = subsplat::scene::render(&plain, &camera, &o);
     let got: Vec<f32> = planes.get(3).unwrap().flatten_all().unwrap().to_vec1().unwrap();
     assert!(got == picture.alpha);
     let store = (&planes * weights()).unwrap().sum_all().unwrap().backward().unwrap();
@@ -209,7 +209,7 @@ fn splat_tensors_pass_gradients_to_their_parts() {
     tensors.sh = tensors.sh.transpose(0, 1).unwrap().contiguous().unwrap().transpose(0, 1).unwrap();
     let planes = subsplat::rasterize(&tensors, &camera, &o).unwrap();
     let got: Vec<f32> = planes.get(0).unwrap().flatten_all().unwrap().to_vec1().unwrap();
-    let picture = subsplat::render(&s, &camera, &o);
+    let picture = subsplat::scene::render(&s, &camera, &o);
     assert!(got.iter().zip(picture.rgb.chunks_exact(3)).all(|(g, p)| *g == p[0]));
 }
 
@@ -230,7 +230,7 @@ fn a_background_tensor_is_the_option_and_has_a_gradient() {
     let got: Vec<f32> = store.get(&variable).unwrap().to_vec1().unwrap();
     let mut kernel = Gradients::default();
     let v: Vec<f32> = weights().flatten_all().unwrap().to_vec1().unwrap();
-    let slices = subsplat::render::slices(&s);
+    let slices = subsplat::scene::render::slices(&s);
     Rasterizer::new().backward(&slices, &camera, &fixed, &v, &mut kernel);
     for (g, e) in got.iter().zip(kernel.background) {
         assert!((g - e).abs() < 1e-4 * e.abs().max(1.0), "{g} {e}");

@@ -6,12 +6,12 @@ use subsplat_test_support::oracle;
 
 use glam::{EulerRot, Mat4, Quat, Vec3};
 use oracle::{Shape, Splat};
-use subsplat::abi::{
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::camera::{Camera, Intrinsics};
+use subsplat_kernels::cpu::{Geometry, Rasterizer, Rendered, SimdLevel, SplatSlices};
+use subsplat_kernels::layout::{
     ALPHA_MIN, Convention, OPACITY_OFFSET, RasterOptions, SPLAT_STRIDE, ShBasis, ShDirection,
 };
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::cpu::{Geometry, Rasterizer, Rendered, SimdLevel, SplatSlices};
-use subsplat::splats::Splats;
 
 /// xorshift64*.
 struct Random(u64);
@@ -146,7 +146,7 @@ fn for_oracle(splats: &Splats) -> Vec<Splat> {
 }
 
 fn slices(splats: &Splats) -> SplatSlices<'_> {
-    subsplat::render::slices(splats)
+    subsplat::scene::render::slices(splats)
 }
 
 /// Compares off the boundary; returns the largest difference and the boundary's size.
@@ -538,7 +538,7 @@ fn an_empty_scene_is_background() {
     let empty = Splats::new(vec![], vec![], vec![], 3, ShBasis::Standard).unwrap();
     for convention in [Convention::Standard, Convention::Mvsplat] {
         let o = options(convention);
-        let picture = subsplat::render(&empty, &camera, &o);
+        let picture = subsplat::scene::render(&empty, &camera, &o);
         assert_eq!((picture.width, picture.height), (45, 33));
         assert_eq!(picture.rgb.len(), 3 * 45 * 33);
         assert!(picture.rgb.chunks_exact(3).all(|c| c == o.background));
@@ -580,7 +580,7 @@ fn render_uses_the_splats_own_basis() {
     let mut splats = scene.splats;
     splats.set_sh_basis(ShBasis::Mvsplat);
     let o = RasterOptions::default();
-    let picture = subsplat::render(&splats, &scene.camera, &o);
+    let picture = subsplat::scene::render(&splats, &scene.camera, &o);
     let mvsplat = RasterOptions { sh_basis: ShBasis::Mvsplat, ..o };
     let direct = Rasterizer::new().render(&slices(&splats), &scene.camera, &mvsplat);
     assert!(picture.rgb == direct.rgb);

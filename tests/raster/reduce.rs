@@ -1,13 +1,13 @@
 //! Fewer Gaussians: moments and optical depth of a merge, and pictures of reduced scenes.
 
 use glam::{DMat3, DQuat, DVec3, Mat4};
-use subsplat::abi::{Convention, RasterOptions, ShBasis};
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::metrics::psnr;
 use subsplat::reduce::reduce;
-use subsplat::render::Renderer;
-use subsplat::sh::C0;
-use subsplat::splats::Splats;
+use subsplat::scene::metrics::psnr;
+use subsplat::scene::render::Renderer;
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::camera::{Camera, Intrinsics};
+use subsplat_kernels::layout::{Convention, RasterOptions, ShBasis};
+use subsplat_kernels::sh::C0;
 
 /// Side of the pictures, px.
 const SIDE: usize = 96;

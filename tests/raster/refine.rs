@@ -4,12 +4,12 @@
 use glam::Mat4;
 use std::ops::ControlFlow;
 use std::time::{Duration, Instant};
-use subsplat::abi::{OPACITY_OFFSET, QUAT_OFFSET, SPLAT_STRIDE};
-use subsplat::io::image::Rgb;
-use subsplat::{
-    Camera, FitError, FitView, RasterOptions, RefineOptions, RefineReport, Refiner, Renderer,
-    Splats, refine, render,
-};
+use subsplat::files::image::Rgb;
+use subsplat::fit::{FitError, FitView};
+use subsplat::refine::{RefineOptions, RefineReport, Refiner, refine};
+use subsplat::scene::render;
+use subsplat::{Camera, RasterOptions, Renderer, Splats};
+use subsplat_kernels::layout::{OPACITY_OFFSET, QUAT_OFFSET, SPLAT_STRIDE};
 use subsplat_test_support::fit_scene::{SIDE, cameras, pictures, plane};
 
 fn refined(splats: &mut Splats, truth: &[Rgb], options: &RefineOptions) -> RefineReport {

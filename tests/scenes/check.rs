@@ -4,10 +4,10 @@ use subsplat_test_support as common;
 
 use glam::{Mat3, Mat4, Vec3};
 use std::path::Path;
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::check::{
+use subsplat::cameras::check::{
     CheckOptions, GrayImage, PairReport, RgbPicture, Verdict, check_pair, epipolar_picture,
 };
+use subsplat_kernels::camera::{Camera, Intrinsics};
 
 /// Scenes, context pairs of their protocols, and their justified findings: a very small baseline
 /// and focal lengths divided by the wrong side (pair_bananas), automatic exposure, and video poses

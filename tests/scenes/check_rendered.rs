@@ -1,8 +1,8 @@
 //! Tests of `check_pair` on ray-traced scenes of exactly known geometry.
 
 use glam::{Mat4, Quat, Vec3};
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::check::{CheckOptions, GrayImage, PairReport, Verdict, check_pair};
+use subsplat::cameras::check::{CheckOptions, GrayImage, PairReport, Verdict, check_pair};
+use subsplat_kernels::camera::{Camera, Intrinsics};
 
 const W: usize = 480;
 const H: usize = 360;

@@ -8,17 +8,17 @@ use subsplat_test_support::noise;
 use made_up::made_up;
 use serde_json::{Value, json};
 use std::path::Path;
-use subsplat::io::cameras_json::{CameraFile, save_cameras_json};
-use subsplat::io::colmap::{
+use subsplat::files::cameras_json::{CameraFile, save_cameras_json};
+use subsplat::files::colmap::{
     parse_cameras_bin, parse_cameras_txt, parse_images_bin, parse_images_txt, parse_points_bin,
     parse_points_txt,
 };
-use subsplat::io::protocol::{load_index, load_protocol};
-use subsplat::io::scene::{Units, load_scene};
-use subsplat::io::{image, re10k};
+use subsplat::files::protocol::{load_index, load_protocol};
+use subsplat::files::scene::{Units, load_scene};
+use subsplat::files::{image, re10k};
 
 /// Asserts an error of one line that contains all of `words`.
-fn check(case: &str, result: Result<(), subsplat::io::Error>, words: &[&str]) {
+fn check(case: &str, result: Result<(), subsplat::files::Error>, words: &[&str]) {
     let error = match result {
         Ok(()) => panic!("{case}: was accepted"),
         Err(e) => e.to_string(),
@@ -32,7 +32,7 @@ fn check(case: &str, result: Result<(), subsplat::io::Error>, words: &[&str]) {
 }
 
 /// Loads a valid scene with `file` replaced by `bytes`.
-fn with(file: &str, bytes: &[u8]) -> Result<(), subsplat::io::Error> {
+fn with(file: &str, bytes: &[u8]) -> Result<(), subsplat::files::Error> {
     let (folder, _) = made_up(3);
     let path = folder.path().join(file);
     std::fs::create_dir_all(path.parent().unwrap()).unwrap();
@@ -417,7 +417,7 @@ fn bad_protocols() {
     test.check(&path, 10).unwrap();
 }
 
-type Parser = fn(&[u8]) -> Result<(), subsplat::io::Error>;
+type Parser = fn(&[u8]) -> Result<(), subsplat::files::Error>;
 
 const BINARY: [(&str, Parser); 3] = [
     ("cameras", |b| parse_cameras_bin(Path::new("cameras.bin"), b).map(|_| ())),
@@ -453,7 +453,7 @@ fn colmap_binary_with_hostile_fields() {
     };
     let trillion = 1_000_000_000_000u64.to_le_bytes();
     let nan = f64::NAN.to_le_bytes();
-    // Offsets follow the layouts in src/io/colmap/binary.rs. The name of a picture has seven
+    // Offsets follow the layouts in src/files/colmap/binary.rs. The name of a picture has seven
     // letters and a terminator here.
     let observations = 8 + 4 + 56 + 4 + 8;
     let cases: Vec<(&str, usize, Vec<u8>, &[&str])> = vec![
@@ -504,7 +504,7 @@ fn bad_colmap_text() {
     let cameras = |t: &str| parse_cameras_txt(path, t.as_bytes()).map(|_| ());
     let images = |t: &str| parse_images_txt(path, t.as_bytes(), &mut Vec::new()).map(|_| ());
     let points = |t: &str| parse_points_txt(path, t.as_bytes()).map(|_| ());
-    let cases: Vec<(&str, Result<(), subsplat::io::Error>, &[&str])> = vec![
+    let cases: Vec<(&str, Result<(), subsplat::files::Error>, &[&str])> = vec![
         ("no cameras", cameras("# none\n"), &["x.txt", "at least one camera"]),
         ("id", cameras("\n\na PINHOLE 1 1 1 1 1 1"), &["x.txt:3", "camera id", "`a`"]),
         ("model", cameras("1 FOV 6 4 1 1 1 1 1"), &["x.txt:1", "got FOV"]),
@@ -616,7 +616,7 @@ fn mutated_scenes_are_accepted_or_refused() {
                     for f in &scene.frames {
                         let k = f.camera.intrinsics();
                         assert_eq!(
-                            subsplat::camera::Camera::new(k, f.camera.world_from_camera()),
+                            subsplat_kernels::camera::Camera::new(k, f.camera.world_from_camera()),
                             Ok(f.camera)
                         );
                         let _ = f.pinhole();

@@ -3,6 +3,7 @@
 mod check;
 mod check_rendered;
 mod hostile_scenes;
+mod metrics;
 mod navigation;
 mod photographs;
 mod resize;

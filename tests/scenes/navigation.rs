@@ -3,8 +3,8 @@
 
 use glam::{Mat4, Quat, Vec2, Vec3};
 use std::f32::consts::PI;
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::navigation::{Bounds, Mode, Navigator, Pace, Start, fitted, up_of};
+use subsplat::scene::navigation::{Bounds, Mode, Navigator, Pace, Start, fitted, up_of};
+use subsplat_kernels::camera::{Camera, Intrinsics};
 
 const UP: Vec3 = Vec3::NEG_Y;
 

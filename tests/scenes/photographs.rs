@@ -7,14 +7,22 @@ use glam::{DMat3, DVec3, Mat4};
 use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
 use moxcms::{ColorProfile, ToneReprCurve};
 use std::path::{Path, PathBuf};
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::image::codecs::{png::PngEncoder, tiff::TiffEncoder, webp::WebPEncoder};
-use subsplat::image::{self as image_crate, ExtendedColorType, ImageEncoder};
-use subsplat::io::cameras_json::{CameraFile, NamedCamera, load_cameras_json, save_cameras_json};
-use subsplat::io::exif::{FocalSource, parse_exif};
-use subsplat::io::image::{self, LoadOptions, Rgb, Truncated};
-use subsplat::io::photograph::{Photograph, load_photograph, parse_photograph, probe_photograph};
-use subsplat::io::scene::{Pixels, Scene, Units, load_scene};
+use subsplat::files::cameras_json::{
+    CameraFile, NamedCamera, load_cameras_json, save_cameras_json,
+};
+use subsplat::files::exif::{FocalSource, parse_exif};
+use subsplat::files::image;
+use subsplat::files::image::{LoadOptions, Rgb, Truncated};
+use subsplat::files::photograph::{
+    Photograph, load_photograph, parse_photograph, probe_photograph,
+};
+use subsplat::files::scene::{Pixels, Scene, Units, load_scene};
+use subsplat::image as image_crate;
+use subsplat::image::codecs::png::PngEncoder;
+use subsplat::image::codecs::tiff::TiffEncoder;
+use subsplat::image::codecs::webp::WebPEncoder;
+use subsplat::image::{ExtendedColorType, ImageEncoder};
+use subsplat_kernels::camera::{Camera, Intrinsics};
 
 /// Makes an EXIF block.
 fn block(fields: &[(Tag, Value)], little_endian: bool) -> Vec<u8> {

@@ -8,14 +8,17 @@ use glam::{Mat4, Vec3};
 use made_up::made_up;
 use noise::noise;
 use std::path::PathBuf;
-use subsplat::camera::{Camera, Intrinsics, NearFar};
-use subsplat::data::depth::depth_range;
-use subsplat::data::pair::choose_pair;
-use subsplat::io::cameras_json::{CameraFile, NamedCamera, load_cameras_json, save_cameras_json};
-use subsplat::io::image;
-use subsplat::io::matrices::{self, PoseConvention};
-use subsplat::io::scene::{Scene, SceneFormat, Units, load_scene};
-use subsplat::io::undistort::Distortion;
+use subsplat::files::cameras_json::{
+    CameraFile, NamedCamera, load_cameras_json, save_cameras_json,
+};
+use subsplat::files::image;
+use subsplat::files::matrices;
+use subsplat::files::matrices::PoseConvention;
+use subsplat::files::scene::{Scene, SceneFormat, Units, load_scene};
+use subsplat::files::undistort::Distortion;
+use subsplat::reconstruct::inputs::depth::depth_range;
+use subsplat::reconstruct::inputs::pair::choose_pair;
+use subsplat_kernels::camera::{Camera, Intrinsics, NearFar};
 
 #[test]
 fn cameras_json_round_trips() {
@@ -375,7 +378,7 @@ fn names_are_sorted_by_their_numbers() {
     for name in ["images/0.png", "images/7.png"] {
         image::save_png(&at(name), &noise(12, 8)).unwrap();
     }
-    let x = |f: &subsplat::io::scene::Frame| -f.camera.position().x;
+    let x = |f: &subsplat::files::scene::Frame| -f.camera.position().x;
     let scene = load_scene(&at("a.txt")).unwrap();
     assert_eq!(scene.frames.iter().map(x).collect::<Vec<_>>(), [0.0, 7.0]);
 }

@@ -6,14 +6,15 @@ use subsplat_test_support as common;
 use common::shared;
 use glam::{DMat4, Vec2};
 use std::path::Path;
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::data::crop::{CropOptions, CropRule, crop};
-use subsplat::data::depth::depth_range;
-use subsplat::data::pair::{choose_pair, view_geometry};
-use subsplat::io::image::{self, Rgb};
-use subsplat::io::protocol::{load_index, load_protocol};
-use subsplat::io::scene::{Scene, SceneFormat, Units, load_scene};
-use subsplat::io::undistort::{Distortion, undistort};
+use subsplat::files::image;
+use subsplat::files::image::Rgb;
+use subsplat::files::protocol::{load_index, load_protocol};
+use subsplat::files::scene::{Scene, SceneFormat, Units, load_scene};
+use subsplat::files::undistort::{Distortion, undistort};
+use subsplat::reconstruct::inputs::crop::{CropOptions, CropRule, crop};
+use subsplat::reconstruct::inputs::depth::depth_range;
+use subsplat::reconstruct::inputs::pair::{choose_pair, view_geometry};
+use subsplat_kernels::camera::{Camera, Intrinsics};
 
 const SCENES: [&str; 9] = [
     "fox",

@@ -4,7 +4,7 @@ use subsplat_test_support::scenes;
 
 use candle_core::{DType, Device, Tensor, Var};
 use scenes::*;
-use subsplat::ops::redistribute::{OpacityRule, redistribute};
+use subsplat::network::ops::redistribute::{OpacityRule, redistribute};
 
 fn cpu(v: Vec<f64>, shape: &[usize]) -> Tensor {
     Tensor::from_vec(v, shape, &Device::Cpu).unwrap()

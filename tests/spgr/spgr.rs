@@ -9,10 +9,10 @@ use candle_core::{DType, Device, Tensor, Var};
 use glam::{DMat3, DVec3, Quat, Vec2, Vec3};
 use scenes::*;
 use spgr_calls::*;
-use subsplat::abi::{HEAD_STRIDE, Positions};
-use subsplat::camera::Camera;
-use subsplat::config::*;
-use subsplat::ops::spgr::{Rules, Spgr, spgr, spgr_into};
+use subsplat::network::config::*;
+use subsplat::network::ops::spgr::{Rules, Spgr, spgr, spgr_into};
+use subsplat_kernels::camera::Camera;
+use subsplat_kernels::layout::{HEAD_STRIDE, Positions};
 
 fn cpu(v: Vec<f64>, shape: &[usize]) -> Tensor {
     Tensor::from_vec(v, shape, &Device::Cpu).unwrap()

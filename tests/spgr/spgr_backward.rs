@@ -8,10 +8,11 @@ use subsplat_test_support::spgr_reference;
 use candle_core::{DType, Device, Result, Tensor, Var};
 use scenes::*;
 use spgr_calls::*;
-use subsplat::abi::{HEAD_GAIN_OFFSET, HEAD_STRIDE, SPLAT_STRIDE};
-use subsplat::config::*;
-use subsplat::cpu::spgr::{self as kernel, Args};
-use subsplat::ops::spgr::{Spgr, spgr};
+use subsplat::network::config::*;
+use subsplat::network::ops::spgr::{Spgr, spgr};
+use subsplat_kernels::cpu::spgr as kernel;
+use subsplat_kernels::cpu::spgr::Args;
+use subsplat_kernels::layout::{HEAD_GAIN_OFFSET, HEAD_STRIDE, SPLAT_STRIDE};
 
 fn host(t: &Tensor) -> Vec<f64> {
     t.to_dtype(DType::F64).unwrap().flatten_all().unwrap().to_vec1().unwrap()

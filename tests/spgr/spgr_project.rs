@@ -8,15 +8,16 @@ use candle_core::DType;
 use glam::{Mat4, Quat, Vec3};
 use scenes::*;
 use spgr_calls::*;
-use subsplat::abi::{
+use subsplat::network::config::*;
+use subsplat::network::ops::spgr::Spgr;
+use subsplat_kernels::camera::Camera;
+use subsplat_kernels::cpu::raster::ewa::Footprint;
+use subsplat_kernels::cpu::spgr as kernel;
+use subsplat_kernels::cpu::spgr::{Args, Target};
+use subsplat_kernels::cpu::{Geometry, Rasterizer, SplatSlices};
+use subsplat_kernels::layout::{
     Convention, RasterOptions, SPLAT_STRIDE, ShBasis, ShDirection, sh_coefficients,
 };
-use subsplat::camera::Camera;
-use subsplat::config::*;
-use subsplat::cpu::ewa::Footprint;
-use subsplat::cpu::spgr::{self as kernel, Args, Target};
-use subsplat::cpu::{Geometry, Rasterizer, SplatSlices};
-use subsplat::ops::spgr::Spgr;
 
 struct Scene {
     call: Spgr,

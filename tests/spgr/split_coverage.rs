@@ -7,14 +7,14 @@ use subsplat_test_support::scenes;
 use candle_core::{Device, Tensor};
 use glam::{Mat4, Quat, Vec2, Vec3};
 use scenes::{Random, backbone, channels};
-use subsplat::abi::{RasterOptions, ShBasis};
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::config::{Config, LambdaS, OpacityRule, Preset};
-use subsplat::model::trunk::Trunk;
-use subsplat::model::weights::Weights;
-use subsplat::model::{Primaries, Views};
-use subsplat::render;
-use subsplat::splats::Splats;
+use subsplat::network::config::{Config, LambdaS, OpacityRule, Preset};
+use subsplat::network::model::trunk::Trunk;
+use subsplat::network::model::weights::Weights;
+use subsplat::network::model::{Primaries, Views};
+use subsplat::scene::render;
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::camera::{Camera, Intrinsics};
+use subsplat_kernels::layout::{RasterOptions, ShBasis};
 
 const DEPTH: f32 = 2.0;
 
@@ -58,7 +58,7 @@ impl Parents {
                 let (row, colour) = parent(camera, px);
                 rows.extend(row);
                 for c in colour {
-                    sh.push((c - 0.5) / subsplat::sh::C0 as f32);
+                    sh.push((c - 0.5) / subsplat_kernels::sh::C0 as f32);
                     // The small network's SH are of degree 4.
                     sh.extend([0.0; 24]);
                 }

@@ -7,14 +7,14 @@ use splat_scene::*;
 use std::io::Write;
 use std::path::Path;
 use std::time::{Duration, Instant};
-use subsplat::abi::ShBasis;
-use subsplat::io::glb::parse_glb;
-use subsplat::io::ksplat::parse_ksplat;
-use subsplat::io::ply::parse_ply;
-use subsplat::io::splat::parse_splat;
-use subsplat::io::spz::parse_spz;
-use subsplat::io::{Result, SaveOptions, load_splats, save_splats, splat_info};
-use subsplat::splats::Splats;
+use subsplat::files::glb::parse_glb;
+use subsplat::files::ksplat::parse_ksplat;
+use subsplat::files::ply::parse_ply;
+use subsplat::files::splat::parse_splat;
+use subsplat::files::spz::parse_spz;
+use subsplat::files::{Result, SaveOptions, load_splats, save_splats, splat_info};
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::layout::ShBasis;
 
 type Parse = fn(&[u8], &Path) -> Result<Splats>;
 

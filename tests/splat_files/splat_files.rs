@@ -5,9 +5,9 @@ use subsplat_test_support::splat_scene;
 use glam::{DMat3, DVec3};
 use splat_scene::*;
 use std::path::{Path, PathBuf};
-use subsplat::abi::{SPLAT_STRIDE, ShBasis};
-use subsplat::io::{SaveOptions, SplatFormat, Up, load_splats, save_splats, splat_info};
-use subsplat::splats::{SplatParts, Splats};
+use subsplat::files::{SaveOptions, SplatFormat, Up, load_splats, save_splats, splat_info};
+use subsplat::scene::splats::{SplatParts, Splats};
+use subsplat_kernels::layout::{SPLAT_STRIDE, ShBasis};
 
 fn save(name: &str, splats: &Splats, options: &SaveOptions) -> (tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();

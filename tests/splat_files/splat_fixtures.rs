@@ -8,10 +8,10 @@ use glam::{DMat3, DVec3};
 use splat_scene::*;
 use std::io::Read;
 use std::path::Path;
-use subsplat::abi::ShBasis;
-use subsplat::io::ply::parse_ply;
-use subsplat::io::{SaveOptions, load_splats, save_splats, splat_info};
-use subsplat::splats::Splats;
+use subsplat::files::ply::parse_ply;
+use subsplat::files::{SaveOptions, load_splats, save_splats, splat_info};
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::layout::ShBasis;
 
 const C0: f64 = 0.282_094_791_773_878_14;
 
@@ -419,7 +419,7 @@ fn spz_rotations_and_positions_of_old_versions() {
         b
     };
     for version in [1, 2] {
-        let s = subsplat::io::spz::parse_spz(&body(version), Path::new("old.spz")).unwrap();
+        let s = subsplat::files::spz::parse_spz(&body(version), Path::new("old.spz")).unwrap();
         // Ours are turned by half a turn about x.
         assert_eq!(s.mean(0), [1.5, 2.25, -0.5]);
         let [sx, sy, sz] = s.scale(0).map(|v| f64::from(v).ln());
@@ -477,7 +477,7 @@ fn ksplat_buckets_and_harmonics() {
                 }
             }
         }
-        let s = subsplat::io::ksplat::parse_ksplat(&b, Path::new("a.ksplat")).unwrap();
+        let s = subsplat::files::ksplat::parse_ksplat(&b, Path::new("a.ksplat")).unwrap();
         assert_eq!((s.len(), s.sh_degree()), (3, 1));
         for (i, centre) in
             [[10.0, 20.0, 30.0], [10.0, 20.0, 30.0], [-10.0, -20.0, -30.0]].into_iter().enumerate()

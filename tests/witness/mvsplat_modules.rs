@@ -8,18 +8,19 @@ use subsplat_test_support::witness as witness_common;
 use candle_core::{DType, Device, Result, Tensor};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
-use subsplat::config::{self, Backbone, Config, FeatureLevel, Mvsplat as Settings, Preset};
-use subsplat::model::backbone::Mvsplat;
-use subsplat::model::backbone::cnn::Cnn;
-use subsplat::model::backbone::cost_volume::{correlation, disparities};
-use subsplat::model::backbone::depth::{DepthPredictor, Input};
-use subsplat::model::backbone::transformer::Transformer;
-use subsplat::model::backbone::unet::UNet;
-use subsplat::model::primaries::primaries;
-use subsplat::model::subsplat::{SceneOutput, SubSplat};
-use subsplat::model::trace::Trace;
-use subsplat::model::weights::Weights;
-use subsplat::model::{BackboneOutput, Backend, Primaries, Views};
+use subsplat::network::config;
+use subsplat::network::config::{Backbone, Config, FeatureLevel, Mvsplat as Settings, Preset};
+use subsplat::network::model::backbone::Mvsplat;
+use subsplat::network::model::backbone::cnn::Cnn;
+use subsplat::network::model::backbone::cost_volume::{correlation, disparities};
+use subsplat::network::model::backbone::depth::{DepthPredictor, Input};
+use subsplat::network::model::backbone::transformer::Transformer;
+use subsplat::network::model::backbone::unet::UNet;
+use subsplat::network::model::primaries::primaries;
+use subsplat::network::model::subsplat::{SceneOutput, SubSplat};
+use subsplat::network::model::trace::Trace;
+use subsplat::network::model::weights::Weights;
+use subsplat::network::model::{BackboneOutput, Backend, Primaries, Views};
 use witness_common::{Golden, folder, skip, tolerances};
 
 #[test]
@@ -94,7 +95,7 @@ fn plane_sweep() -> Result<()> {
         let views = Views::new(blank, vec![cameras], vec![near_far])?;
         let candidates = disparities(&views, 24);
         let volume = correlation(
-            &subsplat::ops::Backend::Cpu,
+            &subsplat::network::ops::Backend::Cpu,
             &views,
             &candidates,
             &features,

@@ -8,20 +8,22 @@ use subsplat_test_support::witness as witness_common;
 use candle_core::{DType, Device, Result, Tensor};
 use glam::{DMat3, DQuat, DVec3};
 use std::collections::BTreeMap;
-use subsplat::abi::{
+use subsplat::network::config;
+use subsplat::network::config::{Config, FeatureLevel, LowpassRef, Preset};
+use subsplat::network::model::aggregation::Aggregation;
+use subsplat::network::model::embed::{Descriptors, Embeddings};
+use subsplat::network::model::geometry::{Frames, ParentChunk};
+use subsplat::network::model::mlp::Mode;
+use subsplat::network::model::spgr::{Head, rules};
+use subsplat::network::model::trunk::{Children, TrainPass, Trunk};
+use subsplat::network::model::{BackboneOutput, Primaries, Views};
+use subsplat::network::ops::spgr::{Spgr, spgr};
+use subsplat_kernels::camera::{Camera, NearFar};
+use subsplat_kernels::cpu::raster::sh;
+use subsplat_kernels::cpu::{Geometry, Rasterizer, SplatSlices};
+use subsplat_kernels::layout::{
     Convention, MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, RasterOptions, SCALE_OFFSET, ShBasis,
 };
-use subsplat::camera::{Camera, NearFar};
-use subsplat::config::{self, Config, FeatureLevel, LowpassRef, Preset};
-use subsplat::cpu::{Geometry, Rasterizer, SplatSlices, sh};
-use subsplat::model::aggregation::Aggregation;
-use subsplat::model::embed::{Descriptors, Embeddings};
-use subsplat::model::geometry::{Frames, ParentChunk};
-use subsplat::model::mlp::Mode;
-use subsplat::model::spgr::{Head, rules};
-use subsplat::model::trunk::{Children, TrainPass, Trunk};
-use subsplat::model::{BackboneOutput, Primaries, Views};
-use subsplat::ops::spgr::{Spgr, spgr};
 use witness_common::{Golden, names};
 
 /// Goldens are double precision rounded to `f32`: kernels in `f64` lie this close.

@@ -13,12 +13,12 @@ command -v npm >/dev/null || missing+=(nodejs npm)
 place=out/web-test
 mkdir -p "$place"
 
-# The modules of src/cpu/simd import nothing else of the crate, so they make a crate of their own.
+# The modules of kernels/src/cpu/simd import nothing else of the crate, so they make a crate of their own.
 # wasm32-wasip1 has the same instructions as the page's target, and a standard output.
 rustup target add wasm32-wasip1
 simd=$place/simd
 rm -rf "$simd" && mkdir -p "$simd/cpu"
-cp -r src/cpu/simd.rs src/cpu/simd "$simd/cpu"
+cp -r kernels/src/cpu/simd.rs kernels/src/cpu/simd "$simd/cpu"
 echo '#![allow(dead_code, unused_imports)] pub mod cpu { pub mod simd; }' >"$simd/tests.rs"
 rustc --test --edition 2024 -O --target wasm32-wasip1 -C target-feature=+simd128 \
     "$simd/tests.rs" -o "$simd/tests.wasm"

@@ -5,7 +5,7 @@
 //
 // World axes here are those of .spz: x right, y up, z backward. Camera axes are OpenCV's: x right,
 // y down, z forward. Projection, low-pass and blending are the crate's `standard` convention
-// (src/cpu/ewa.rs, src/abi.rs); the movements are those of src/navigation.rs.
+// (kernels/src/cpu/raster/ewa.rs, kernels/src/layout/mod.rs); the movements are those of src/navigation.rs.
 "use strict";
 
 const ALPHA_MIN = 1 / 255;
@@ -223,7 +223,7 @@ function fitted(home, width, height) {
   };
 }
 
-/** Parameters of projection of a camera: those of src/abi/view.rs, `standard` convention. */
+/** Parameters of projection of a camera: those of kernels/src/layout/view.rs, `standard` convention. */
 function projection(camera, rules) {
   const margin = 0.3;
   const limit = [[camera.cx, camera.width, camera.fx], [camera.cy, camera.height, camera.fy]].map(

@@ -5,7 +5,7 @@
 //! stride for both axes.
 
 use rayon::prelude::*;
-use subsplat::cpu::gemm::{Mat, gemm};
+use subsplat_kernels::cpu::gemm::{Mat, gemm};
 
 /// Pixels of one output tile.
 const TILE: usize = 512;

@@ -4,7 +4,7 @@
 #![expect(clippy::needless_range_loop, reason = "plain loops, as such programs have them")]
 
 use super::sh;
-use subsplat::camera::Camera;
+use subsplat_kernels::camera::Camera;
 
 type V3 = [f32; 3];
 

@@ -7,7 +7,7 @@
 #![expect(clippy::needless_range_loop, reason = "plain loops, as such programs have them")]
 
 use super::project::{Gradients, Options, Projected, ProjectedGrad, Splats, View};
-use subsplat::camera::Camera;
+use subsplat_kernels::camera::Camera;
 
 const TILE: usize = 16;
 const ALPHA_MIN: f32 = 1.0 / 255.0;

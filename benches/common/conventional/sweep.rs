@@ -3,7 +3,7 @@
 //! pair, as from `grid_sample`; planes are distributed over rayon's current pool.
 
 use rayon::prelude::*;
-use subsplat::ops::plane_sweep::{Pair, Sweep};
+use subsplat::network::ops::plane_sweep::{Pair, Sweep};
 
 /// Correlation `[R, D, h, w]`; `reference` `[R, C, h, w]`, `source` `[S, C, h, w]`.
 pub fn correlation(s: &Sweep, reference: &[f32], source: &[f32]) -> Vec<f32> {

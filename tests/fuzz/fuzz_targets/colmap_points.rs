@@ -6,5 +6,5 @@ use libfuzzer_sys::fuzz_target;
 use std::path::Path;
 
 fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::io::colmap::parse_points_bin(Path::new("fuzz"), bytes);
+    let _ = subsplat::files::colmap::parse_points_bin(Path::new("fuzz"), bytes);
 });

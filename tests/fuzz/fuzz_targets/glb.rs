@@ -1,6 +1,6 @@
-//! `subsplat::io::glb::parse_glb` on arbitrary bytes: an answer, never a panic.
+//! `subsplat::files::glb::parse_glb` on arbitrary bytes: an answer, never a panic.
 #![no_main]
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::io::glb::parse_glb(bytes, std::path::Path::new("fuzz.glb"));
+    let _ = subsplat::files::glb::parse_glb(bytes, std::path::Path::new("fuzz.glb"));
 });

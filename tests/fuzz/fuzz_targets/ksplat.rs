@@ -1,6 +1,6 @@
-//! `subsplat::io::ksplat::parse_ksplat` on arbitrary bytes: an answer, never a panic.
+//! `subsplat::files::ksplat::parse_ksplat` on arbitrary bytes: an answer, never a panic.
 #![no_main]
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::io::ksplat::parse_ksplat(bytes, std::path::Path::new("fuzz.ksplat"));
+    let _ = subsplat::files::ksplat::parse_ksplat(bytes, std::path::Path::new("fuzz.ksplat"));
 });

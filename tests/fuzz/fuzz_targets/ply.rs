@@ -1,6 +1,6 @@
-//! `subsplat::io::ply::parse_ply` on arbitrary bytes: an answer, never a panic.
+//! `subsplat::files::ply::parse_ply` on arbitrary bytes: an answer, never a panic.
 #![no_main]
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::io::ply::parse_ply(bytes, std::path::Path::new("fuzz.ply"));
+    let _ = subsplat::files::ply::parse_ply(bytes, std::path::Path::new("fuzz.ply"));
 });

@@ -1,6 +1,6 @@
-//! `subsplat::io::splat::parse_splat` on arbitrary bytes: an answer, never a panic.
+//! `subsplat::files::splat::parse_splat` on arbitrary bytes: an answer, never a panic.
 #![no_main]
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::io::splat::parse_splat(bytes, std::path::Path::new("fuzz.splat"));
+    let _ = subsplat::files::splat::parse_splat(bytes, std::path::Path::new("fuzz.splat"));
 });

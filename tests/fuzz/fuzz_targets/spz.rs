@@ -1,6 +1,6 @@
-//! `subsplat::io::spz::parse_spz` on arbitrary bytes: an answer, never a panic.
+//! `subsplat::files::spz::parse_spz` on arbitrary bytes: an answer, never a panic.
 #![no_main]
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::io::spz::parse_spz(bytes, std::path::Path::new("fuzz.spz"));
+    let _ = subsplat::files::spz::parse_spz(bytes, std::path::Path::new("fuzz.spz"));
 });

@@ -1,7 +1,7 @@
-//! `subsplat::io::torch` on arbitrary bytes, every tensor read: an answer, never a panic.
+//! `subsplat::files::torch` on arbitrary bytes, every tensor read: an answer, never a panic.
 #![no_main]
 
-use subsplat::io::torch::TorchFile;
+use subsplat::files::torch::TorchFile;
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     let Ok(file) = TorchFile::parse(bytes, std::path::Path::new("fuzz.pt")) else { return };

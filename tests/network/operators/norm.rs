@@ -1,8 +1,10 @@
 //! Normalisations with activations, against tensor operations.
 
 use candle_core::{DType, Device, Result, Tensor};
-use subsplat::ops::activation::Activation;
-use subsplat::ops::norm::{Affine, group_norm, group_norm_then, instance_norm_then, layer_norm};
+use subsplat::network::ops::activation::Activation;
+use subsplat::network::ops::norm::{
+    Affine, group_norm, group_norm_then, instance_norm_then, layer_norm,
+};
 use subsplat_test_support::same::{noise, same};
 
 fn erf_gelu(x: &Tensor) -> Result<Tensor> {

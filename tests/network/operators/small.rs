@@ -1,8 +1,8 @@
 //! Ops of the small backbone, against tensor operations.
 
 use candle_core::{D, Result, Tensor, Var};
-use subsplat::ops::join::join;
-use subsplat::ops::small::{
+use subsplat::network::ops::join::join;
+use subsplat::network::ops::small::{
     Candidates, MeanOver, Start, expectation, head_input, head_output, lift, ray_distance,
     unit_channels, upsample_convex,
 };
@@ -105,7 +105,7 @@ fn head_inputs_agree_with_the_definition() -> Result<()> {
         &inputs,
         |x| Ok(vec![head_input(&x[0], &rgb, &x[1], &x[2], 0.25)?]),
         |x| {
-            let up = subsplat::ops::resize::resize_bilinear(&x[0], 12, 20)?;
+            let up = subsplat::network::ops::resize::resize_bilinear(&x[0], 12, 20)?;
             Ok(vec![Tensor::cat(&[&up, &rgb, &(&x[1] * 0.25)?, &sigma(&x[2])?], 1)?])
         },
     )

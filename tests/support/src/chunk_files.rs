@@ -3,7 +3,7 @@
 use super::noise::noise;
 use super::torch_writer::{Checkpoint, Py, dict, text};
 use std::path::Path;
-use subsplat::io::image::{Rgb, png_bytes};
+use subsplat::files::image::{Rgb, png_bytes};
 
 /// A video of a chunk.
 pub struct Video {

@@ -2,8 +2,8 @@
 
 use glam::DQuat;
 use std::path::Path;
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::io::cameras_json::NamedCamera;
+use subsplat::files::cameras_json::NamedCamera;
+use subsplat_kernels::camera::{Camera, Intrinsics};
 
 /// Model number, name, and parameters of a camera of 64×48 pixels.
 pub type Model = (i32, &'static str, Vec<f64>);

@@ -1,8 +1,9 @@
 //! A textured plane before two cameras, for fits of Gaussians to pictures.
 
 use glam::{Mat4, Vec3};
-use subsplat::io::image::Rgb;
-use subsplat::{Camera, Intrinsics, RasterOptions, ShBasis, Splats, render};
+use subsplat::files::image::Rgb;
+use subsplat::scene::render;
+use subsplat::{Camera, Intrinsics, RasterOptions, ShBasis, Splats};
 
 /// Width and height of the pictures, px.
 pub const SIDE: usize = 48;

@@ -1,7 +1,7 @@
 //! Attention gathers that tests of the CPU, the GPU and the aggregation share.
 
 use candle_core::{DType, Tensor};
-use subsplat::abi::{Gather, Level, SampleConvention};
+use subsplat_kernels::layout::{Gather, Level, SampleConvention};
 
 /// The elements of a tensor in f64.
 pub fn host(t: &Tensor) -> Vec<f64> {

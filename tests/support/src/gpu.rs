@@ -1,7 +1,7 @@
 //! The GPU that tests run on: any adapter, a software one too.
 
 use std::sync::{Arc, OnceLock};
-use subsplat::gpu::{DeviceChoice, Gpu, GpuError, features_of, find_for, instance, wgpu};
+use subsplat_kernels::gpu::{DeviceChoice, Gpu, GpuError, features_of, find_for, instance, wgpu};
 
 /// The adapter, opened once, or `None`, loudly, where there is none.
 /// `SUBSPLAT_GPU=require` (CI) turns absence into failure.

@@ -2,9 +2,9 @@
 
 use super::noise::noise;
 use glam::{Mat4, Quat, Vec3};
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::io::cameras_json::NamedCamera;
-use subsplat::io::image;
+use subsplat::files::cameras_json::NamedCamera;
+use subsplat::files::image;
+use subsplat_kernels::camera::{Camera, Intrinsics};
 
 /// A folder with `n` pictures of 64×48 and cameras that nothing is special about.
 pub fn made_up(n: usize) -> (tempfile::TempDir, Vec<NamedCamera>) {

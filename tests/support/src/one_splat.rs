@@ -1,9 +1,9 @@
 //! The smallest finished scene.
 
 use std::path::Path;
-use subsplat::abi::ShBasis;
-use subsplat::io::{SaveOptions, save_splats};
-use subsplat::splats::Splats;
+use subsplat::files::{SaveOptions, save_splats};
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::layout::ShBasis;
 
 /// A finished scene of one grey Gaussian before a camera at the origin.
 pub fn save_one_splat(path: &Path) {

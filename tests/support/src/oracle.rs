@@ -2,8 +2,8 @@
 //! tiles, no bounds. Written from the conventions' text alone; shares no code with
 //! the kernels. Never to be deleted: it is the bottom of the ladder of oracles.
 
-use subsplat::abi::{Convention, RasterOptions, ShBasis, ShDirection};
-use subsplat::camera::Camera;
+use subsplat_kernels::camera::Camera;
+use subsplat_kernels::layout::{Convention, RasterOptions, ShBasis, ShDirection};
 
 /// How near, relatively, a decision may be before its pixel counts as boundary.
 const BAND: f64 = 1e-3;

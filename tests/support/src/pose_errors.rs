@@ -1,7 +1,7 @@
 //! Errors of estimated cameras, after the alignment of both frames.
 
 use glam::{DMat3, DQuat, DVec3, Mat4};
-use subsplat::camera::Camera;
+use subsplat_kernels::camera::Camera;
 
 /// Rotation and position of a camera in f64.
 fn pose(camera: &Camera) -> (DMat3, DVec3) {

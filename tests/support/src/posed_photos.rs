@@ -2,10 +2,11 @@
 
 use crate::shared;
 use std::path::{Path, PathBuf};
-use subsplat::camera::Camera;
-use subsplat::io::protocol::load_protocol;
-use subsplat::io::scene::{Scene, load_scene};
-use subsplat::{Lens, Photo, PosePhoto, Rgb};
+use subsplat::cameras::estimation::{Lens, PosePhoto};
+use subsplat::files::protocol::load_protocol;
+use subsplat::files::scene::{Scene, load_scene};
+use subsplat::{Photo, Rgb};
+use subsplat_kernels::camera::Camera;
 
 /// Features of each photograph of a pair, as `loose_scene` takes them.
 pub const PAIR_FEATURES: usize = 4000;

@@ -1,15 +1,15 @@
 //! MVSplat's Gaussian adapter in tensor operations: the reference for the fused op
-//! `subsplat::ops::adapter`, with candle's gradients.
+//! `subsplat::network::ops::adapter`, with candle's gradients.
 
 use candle_core::{DType, Device, Result, Tensor, bail};
 use glam::{DMat3, DQuat};
-use subsplat::abi::{ShBasis, sh_coefficients};
-use subsplat::camera::Camera;
-use subsplat::config::{Primaries as Settings, ShFrame};
-use subsplat::model::layers::sigmoid;
-use subsplat::model::primaries::sh_mask;
-use subsplat::model::{BackboneOutput, Primaries, Views};
-use subsplat::sh::{Rotation, RotationBasis, standard_from_mvsplat};
+use subsplat::network::config::{Primaries as Settings, ShFrame};
+use subsplat::network::model::layers::sigmoid;
+use subsplat::network::model::primaries::sh_mask;
+use subsplat::network::model::{BackboneOutput, Primaries, Views};
+use subsplat_kernels::camera::Camera;
+use subsplat_kernels::layout::{ShBasis, sh_coefficients};
+use subsplat_kernels::sh::{Rotation, RotationBasis, standard_from_mvsplat};
 
 /// Scales are in tenths of a pixel's extent at the Gaussian's depth, summed over both
 /// axes: a fifth of a square pixel (MVSplat).

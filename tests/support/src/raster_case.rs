@@ -4,10 +4,10 @@ use glam::Mat4;
 use safetensors::SafeTensors;
 use std::collections::HashMap;
 use std::path::Path;
-use subsplat::abi::{
+use subsplat_kernels::camera::{Camera, Intrinsics};
+use subsplat_kernels::layout::{
     Convention, Geometry, RasterOptions, SH_DEGREE_MAX, ShBasis, SplatSlices, sh_coefficients,
 };
-use subsplat::camera::{Camera, Intrinsics};
 
 /// A fixture file, decoded.
 pub struct File {

@@ -2,8 +2,10 @@
 //! them.
 
 use crate::raster_case::File;
-use subsplat::abi::{MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE};
-use subsplat::cpu::Gradients;
+use subsplat_kernels::cpu::Gradients;
+use subsplat_kernels::layout::{
+    MEAN_OFFSET, OPACITY_OFFSET, QUAT_OFFSET, SCALE_OFFSET, SPLAT_STRIDE,
+};
 
 /// `[5, H, W]` from the gradients of rgb `[H, W, 3]` and alpha `[H, W]`; depth gets none.
 pub fn planes(v_rgb: &[f32], v_alpha: &[f32]) -> Vec<f32> {

@@ -3,12 +3,12 @@
 
 use crate::oracle::{self, Shape, Splat};
 use glam::{EulerRot, Mat4, Quat, Vec3};
-use subsplat::abi::{
+use subsplat_kernels::camera::{Camera, Intrinsics};
+use subsplat_kernels::cpu::{Geometry, Gradients, Rasterizer, SplatSlices};
+use subsplat_kernels::layout::{
     Convention, OPACITY_OFFSET, QUAT_OFFSET, RasterOptions, SCALE_OFFSET, SPLAT_STRIDE, ShBasis,
     ShDirection, sh_coefficients,
 };
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::cpu::{Geometry, Gradients, Rasterizer, SplatSlices};
 
 /// xorshift64*.
 pub struct Random(pub u64);

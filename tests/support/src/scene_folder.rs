@@ -2,12 +2,12 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
-use subsplat::camera::{Camera, NearFar};
-use subsplat::data::procedural::CameraSpec;
-use subsplat::data::procedural::{Example, ExampleSpec};
-use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
-use subsplat::io::image::{Rgb, save_png};
-use subsplat::io::scene::Units;
+use subsplat::files::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
+use subsplat::files::image::{Rgb, save_png};
+use subsplat::files::scene::Units;
+use subsplat_kernels::camera::{Camera, NearFar};
+use subsplat_lab::data::procedural::CameraSpec;
+use subsplat_lab::data::procedural::{Example, ExampleSpec};
 
 /// Side of the scene's pictures, px.
 pub const SIDE: usize = 128;

@@ -2,10 +2,10 @@
 
 use candle_core::{DType, Device, Result, Tensor};
 use glam::{EulerRot, Mat4, Quat, Vec3};
-use subsplat::abi::ShBasis;
-use subsplat::camera::{Camera, Intrinsics, NearFar};
-use subsplat::config::FeatureLevel;
-use subsplat::model::{BackboneOutput, Primaries, Views};
+use subsplat::network::config::FeatureLevel;
+use subsplat::network::model::{BackboneOutput, Primaries, Views};
+use subsplat_kernels::camera::{Camera, Intrinsics, NearFar};
+use subsplat_kernels::layout::ShBasis;
 
 /// SplitMix64.
 pub struct Random(pub u64);

@@ -3,11 +3,12 @@
 
 use crate::scenes::{LocalPrimaries, Random, cameras};
 use candle_core::{DType, Tensor};
-use subsplat::abi::HEAD_STRIDE;
-use subsplat::camera::Camera;
-use subsplat::config::{self, *};
-use subsplat::model::spgr::rules;
-use subsplat::ops::spgr::Spgr;
+use subsplat::network::config;
+use subsplat::network::config::*;
+use subsplat::network::model::spgr::rules;
+use subsplat::network::ops::spgr::Spgr;
+use subsplat_kernels::camera::Camera;
+use subsplat_kernels::layout::HEAD_STRIDE;
 
 /// [`call`] for K = `children`, which need not be that of `config`.
 pub fn call_of(config: &Config, size: usize, children: usize) -> Spgr {

@@ -1,5 +1,5 @@
 //! Sub-pixel Gaussian reparameterization in tensor operations (SubSplat 3.2, A.3): the
-//! reference for the fused op `subsplat::ops::spgr`, with candle's gradients to head
+//! reference for the fused op `subsplat::network::ops::spgr`, with candle's gradients to head
 //! records and parents.
 //!
 //! The choice of the primary view, the growth factor c of the minimum footprint (it
@@ -8,14 +8,14 @@
 
 use candle_core::{Result, Tensor};
 use glam::Vec3;
-use subsplat::abi::{
+use subsplat::network::ops::redistribute::{OpacityRule, redistribute};
+use subsplat::network::ops::spgr::{Rules, Spgr};
+use subsplat_kernels::layout::{
     AMinMode, AREA_SQ_EPS, AreaAt, DEPTH_FRACTION_MIN, DepthDir, DepthUnit, FRUSTUM_MARGIN,
     GROWTH_MAX, GainSpace, HEAD_DEPTH_OFFSET, HEAD_GAIN_OFFSET, HEAD_LOG_SCALE_OFFSET,
     HEAD_LOGIT_OFFSET, HEAD_ROTATION_OFFSET, HEAD_UV_OFFSET, MEAN_OFFSET, OPACITY_OFFSET,
     Positions, PrimaryView, QUAT_OFFSET, SCALE_OFFSET, Slide, VISIBLE_Z_MIN,
 };
-use subsplat::ops::redistribute::{OpacityRule, redistribute};
-use subsplat::ops::spgr::{Rules, Spgr};
 
 type V3 = [Tensor; 3];
 
@@ -392,7 +392,7 @@ fn primary_views(parents: &Tensor, call: &Spgr) -> Result<Vec<u32>> {
 }
 
 /// Children `[n·K, 11]` and gains `[n·K]` or `[n·K, 4]`, as
-/// `subsplat::ops::spgr::spgr`, differentiable in `head` `[n, K, 11]` and `parents`
+/// `subsplat::network::ops::spgr::spgr`, differentiable in `head` `[n, K, 11]` and `parents`
 /// `[n, 11]`.
 ///
 /// # Errors

@@ -1,9 +1,9 @@
 //! Random Gaussians, and what two sets of them must have in common.
 
 use glam::{DMat3, DQuat, DVec3};
-use subsplat::abi::{SPLAT_STRIDE, ShBasis};
-use subsplat::sh;
-use subsplat::splats::Splats;
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::layout::{SPLAT_STRIDE, ShBasis};
+use subsplat_kernels::sh;
 
 /// SplitMix64: the same numbers everywhere.
 pub struct Random(pub u64);

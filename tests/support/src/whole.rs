@@ -3,19 +3,20 @@
 use candle_core::{Device, Tensor};
 use glam::{EulerRot, Mat4, Quat, Vec3};
 use subsplat::FitOptions;
-use subsplat::abi::RasterOptions;
-use subsplat::camera::{Camera, NearFar};
-use subsplat::config::{Backbone, Config, Preset};
-use subsplat::data::procedural::{CameraSpec, Quality, Room, sample_cameras};
-use subsplat::io::image::Rgb;
-use subsplat::metrics::psnr;
-use subsplat::model::subsplat::SubSplat;
-use subsplat::model::weights::{Weights, save};
-use subsplat::pipeline::{
+use subsplat::Picture;
+use subsplat::files::image::Rgb;
+use subsplat::network::config::{Backbone, Config, Preset};
+use subsplat::network::model::subsplat::SubSplat;
+use subsplat::network::model::weights::{Weights, save};
+use subsplat::reconstruct::{
     Check, Density, DepthRange, Detail, Options, Photo, Reconstruction, Reconstructor,
 };
-use subsplat::splats::Splats;
-use subsplat::{Picture, render};
+use subsplat::scene::metrics::psnr;
+use subsplat::scene::render;
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::camera::{Camera, NearFar};
+use subsplat_kernels::layout::RasterOptions;
+use subsplat_lab::data::procedural::{CameraSpec, Quality, Room, sample_cameras};
 
 /// The depth range that the rooms are reconstructed with, metres.
 pub const NEAR_FAR: NearFar = NearFar::new(0.4, 12.0);

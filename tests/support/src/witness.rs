@@ -11,9 +11,9 @@ use serde::Deserialize;
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
-use subsplat::camera::{Camera, Intrinsics, NearFar};
-use subsplat::model::Views;
-use subsplat::model::weights::Weights;
+use subsplat::network::model::Views;
+use subsplat::network::model::weights::Weights;
+use subsplat_kernels::camera::{Camera, Intrinsics, NearFar};
 
 /// Metadata `witness` of a golden.
 #[derive(Debug, Deserialize)]

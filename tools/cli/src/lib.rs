@@ -5,6 +5,7 @@
 
 pub mod commands;
 pub mod convert;
-mod failure;
+pub mod failure;
+pub mod lettering;
 pub mod pages;
-mod report;
+pub mod report;

@@ -6,7 +6,7 @@ use serde::Serialize;
 use std::io::Write;
 use std::ops::ControlFlow;
 use std::time::{Duration, Instant};
-use subsplat::pipeline::StageTime;
+use subsplat::reconstruct::StageTime;
 
 /// Steps of a bar that shows a fraction.
 const FRACTION_STEPS: u64 = 1000;
@@ -171,4 +171,9 @@ impl Answer {
 /// Formats bytes as MiB.
 pub fn mebibytes(bytes: u64) -> String {
     format!("{:.0} MiB", bytes as f64 / f64::from(1 << 20))
+}
+
+/// Escapes text for HTML, in elements and in attributes with double quotes.
+pub fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }

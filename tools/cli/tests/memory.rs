@@ -4,8 +4,8 @@ use subsplat_test_support::whole;
 
 use std::path::Path;
 use std::process::Command;
-use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
-use subsplat::io::image::save_png;
+use subsplat::files::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
+use subsplat::files::image::save_png;
 
 /// Largest difference between the peaks of runs with small and with large photographs, MiB.
 const LARGE_PHOTOGRAPHS: f64 = 8.0;
@@ -14,7 +14,7 @@ const LARGE_PHOTOGRAPHS: f64 = 8.0;
 fn scene(folder: &Path, width: usize, height: usize) {
     let shoot = whole::shoot(3, 2, width, height);
     std::fs::create_dir_all(folder.join("images")).unwrap();
-    let frame = |(i, photo): (usize, &subsplat::pipeline::Photo)| {
+    let frame = |(i, photo): (usize, &subsplat::reconstruct::Photo)| {
         let file = format!("images/{i}.png");
         save_png(&folder.join(&file), photo.image()).unwrap();
         NamedCamera::new(file, *photo.camera())

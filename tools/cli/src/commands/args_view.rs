@@ -4,8 +4,8 @@ use super::args::{ConventionArg, CropShapeArg, DetailArg, RenderingArgs, SourceA
 use super::values;
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
-use subsplat::gpu::DeviceChoice;
 use subsplat::{FitOptions, Refine};
+use subsplat_kernels::gpu::DeviceChoice;
 
 /// The window's keys, which `--help` and the H key show.
 pub const KEYS: &str = "\

@@ -5,12 +5,12 @@ use super::{frames, pair};
 use crate::report::{Answer, Progress, peak_memory_bytes, print_line, print_warning};
 use anyhow::{Context, Result, ensure};
 use serde_json::json;
-use subsplat::check::{
+use subsplat::cameras::check::{
     CheckOptions, GrayImage, PairReport, RgbPicture, Verdict, check_pair, epipolar_picture,
 };
-use subsplat::data::pair::choose_pair;
-use subsplat::io::image::{Rgb, save_png};
-use subsplat::io::scene::Scene;
+use subsplat::files::image::{Rgb, save_png};
+use subsplat::files::scene::Scene;
+use subsplat::reconstruct::inputs::pair::choose_pair;
 
 /// Runs the command; returns `false` where the poses are judged bad.
 pub fn check(args: &CheckArgs, answer: Answer) -> Result<bool> {

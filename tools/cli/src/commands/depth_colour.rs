@@ -3,8 +3,8 @@
 //! The 16-bit picture beside it holds the numbers. Colours are Google's Turbo (polynomial of Mikhailov,
 //! 2019), which keeps order in brightness at both ends and shows small steps.
 
-use subsplat::io::image::{Depth, Rgb};
-use subsplat::io::lettering::{HEIGHT, set_pixel, write};
+use crate::lettering::{HEIGHT, set_pixel, write};
+use subsplat::files::image::{Depth, Rgb};
 
 /// Ends of the scale: quantiles of the depths that exist.
 const ENDS: [f64; 2] = [0.02, 0.98];

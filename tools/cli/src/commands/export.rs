@@ -6,14 +6,14 @@ use super::render;
 use crate::report::{Answer, Progress, print_warning};
 use anyhow::{Result, bail};
 use serde_json::json;
-use subsplat::abi::{Convention, RasterOptions};
-use subsplat::camera::Camera;
-use subsplat::io::ply::is_own_comment;
-use subsplat::io::{SaveOptions, load_with_comments, save_splats};
+use subsplat::files::ply::is_own_comment;
+use subsplat::files::{SaveOptions, load_with_comments, save_splats};
 use subsplat::reduce::reduce;
-use subsplat::render::{
+use subsplat::scene::render::{
     Renderer, camera_of_comments, comments_without_camera, options_of_comments,
 };
+use subsplat_kernels::camera::Camera;
+use subsplat_kernels::layout::{Convention, RasterOptions};
 
 /// Runs the command.
 pub fn export(args: &ExportArgs, answer: Answer) -> Result<()> {

@@ -4,9 +4,9 @@ use super::pair::folder_of;
 use anyhow::{Context, Result, bail, ensure};
 use glam::{Mat4, Quat, Vec3};
 use std::path::Path;
-use subsplat::camera::Camera;
-use subsplat::io::protocol::{Views, load_protocol};
-use subsplat::io::scene::Scene;
+use subsplat::files::protocol::{Views, load_protocol};
+use subsplat::files::scene::Scene;
+use subsplat_kernels::camera::Camera;
 
 fn stem(file: &str) -> String {
     Path::new(file).file_stem().unwrap_or_default().to_string_lossy().into_owned()
@@ -223,7 +223,7 @@ pub fn closed_path(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use subsplat::camera::Intrinsics;
+    use subsplat_kernels::camera::Intrinsics;
 
     fn camera(x: f32, turn: f32) -> Camera {
         let k = Intrinsics::from_fov_x(1.0, 64, 48);

@@ -2,16 +2,16 @@
 //!
 //! The file loads nothing else, so it opens from a disk, an attachment or any server.
 
+use crate::report::escaped;
 use anyhow::Result;
 use serde_json::json;
 use std::io::Write;
 use std::path::Path;
-use subsplat::abi::{ALPHA_MIN, Convention, NEAR_MVSPLAT, RasterOptions};
-use subsplat::camera::Camera;
-use subsplat::eval::escaped;
-use subsplat::io::base64::base64;
-use subsplat::io::{SaveOptions, SaveReport, SplatFormat, encode_splats_with, write_atomic};
-use subsplat::splats::Splats;
+use subsplat::files::base64::base64;
+use subsplat::files::{SaveOptions, SaveReport, SplatFormat, encode_splats_with, write_atomic};
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::camera::Camera;
+use subsplat_kernels::layout::{ALPHA_MIN, Convention, NEAR_MVSPLAT, RasterOptions};
 
 const TEMPLATE: &str = include_str!("../../../web/scene.html");
 const STYLE: &str = include_str!("../../../web/viewer.css");
@@ -58,7 +58,7 @@ impl Page<'_> {
         .and_then(|()| {
             std::fs::metadata(path)
                 .map(|m| m.len())
-                .map_err(|source| subsplat::io::Error::Io { path: path.to_owned(), source })
+                .map_err(|source| subsplat::files::Error::Io { path: path.to_owned(), source })
         })?;
         Ok(SaveReport { bytes, ..report })
     }

@@ -2,7 +2,7 @@
 
 use anyhow::{Result, ensure};
 use subsplat::Density;
-use subsplat::config::Config;
+use subsplat::network::config::Config;
 
 /// Lower bound of a run's memory per input pixel of the first two views, bytes. Measured with both
 /// backbones between 256² and 512² (K = 4): 2.9 KB.

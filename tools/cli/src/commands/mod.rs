@@ -1,39 +1,29 @@
 //! The commands, one file each.
 //!
 //! Exit codes: 0 success; 1 an error, reported on stderr; 2 wrong usage; 3 a negative answer
-//! (`check`: bad poses; `compare`: a tensor out of tolerance; photographs that do not determine
-//! their cameras). With `--json` stdout always holds
+//! (`check`: bad poses; photographs that do not determine their cameras). With `--json` stdout always holds
 //! one object: the report, or `{"error": …}`.
 
 pub mod args;
-mod args_eval;
-mod args_paper;
 #[cfg(feature = "view")]
 mod args_view;
 mod check;
-mod compare;
-mod compare_raster;
-mod depth_colour;
-mod environment;
-mod eval;
+pub mod depth_colour;
+pub mod environment;
 mod export;
-mod frames;
+pub mod frames;
 mod html;
 mod info;
-mod memory;
-mod model;
+pub mod memory;
+pub mod model;
 mod output;
 mod pair;
-mod paper;
 mod poses;
-mod raster_case;
 mod reconstruct;
 mod render;
 mod run;
-mod tensorboard;
-mod train;
-mod values;
-mod video;
+pub mod values;
+pub mod video;
 #[cfg(feature = "view")]
 mod view;
 mod whole;
@@ -45,7 +35,7 @@ use args::{Cli, Command};
 use clap::error::ErrorKind;
 use clap::{CommandFactory, Parser};
 use std::process::ExitCode;
-use subsplat::cpu::SimdLevel;
+use subsplat_kernels::cpu::SimdLevel;
 
 /// Exit code of a negative answer.
 const ANSWER_NO: u8 = 3;
@@ -97,10 +87,6 @@ fn dispatch(cli: &Cli, answer: Answer) -> Result<bool> {
         Command::Poses(args) => poses::poses(args, answer).map(|()| true),
         Command::Check(args) => check::check(args, answer),
         Command::Info(args) => info::info(args, answer).map(|()| true),
-        Command::Eval(args) => eval::eval(args, answer).map(|()| true),
-        Command::Paper(args) => paper::paper(args, answer).map(|()| true),
-        Command::Compare(args) => compare::compare(args, answer),
-        Command::Train(args) => train::train(args, answer).map(|()| true),
     }
 }
 

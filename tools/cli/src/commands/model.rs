@@ -4,10 +4,10 @@ use super::args::{BackboneArg, ModelArgs, SourceArgs};
 use crate::report::print_warning;
 use anyhow::{Context, Result, bail, ensure};
 use std::path::Path;
-use subsplat::abi::HEAD_GEOMETRY_LEN;
-use subsplat::config::{Config, Preset};
-use subsplat::model::weights::{SUBSPLAT_PREFIX, Weights};
-use subsplat::pipeline::{Reconstructor, is_mvsplat};
+use subsplat::network::config::{Config, Preset};
+use subsplat::network::model::weights::{SUBSPLAT_PREFIX, Weights};
+use subsplat::reconstruct::{Reconstructor, is_mvsplat};
+use subsplat_kernels::layout::HEAD_GEOMETRY_LEN;
 
 /// Default ratio of target to input.
 const UPSCALE: usize = 2;

@@ -16,17 +16,17 @@ use anyhow::{Context, Result, bail};
 use indicatif::ProgressBar;
 use serde_json::{Value, json};
 use std::path::Path;
-use subsplat::abi::RasterOptions;
-use subsplat::camera::{Camera, NearFar};
-use subsplat::config::Config;
-use subsplat::data::crop::{CropOptions, Cropped};
-use subsplat::io::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
-use subsplat::io::image::{Depth, Rgb, save_depth_png, save_png};
-use subsplat::io::scene::{Scene, Units, is_scene};
-use subsplat::io::{SaveOptions, save_splats};
-use subsplat::metrics::{psnr, ssim};
-use subsplat::pipeline::{Photo, Reconstruction};
-use subsplat::render::Renderer;
+use subsplat::files::cameras_json::{CameraFile, NamedCamera, save_cameras_json};
+use subsplat::files::image::{Depth, Rgb, save_depth_png, save_png};
+use subsplat::files::scene::{Scene, Units, is_scene};
+use subsplat::files::{SaveOptions, save_splats};
+use subsplat::network::config::Config;
+use subsplat::reconstruct::inputs::crop::{CropOptions, Cropped};
+use subsplat::reconstruct::{Photo, Reconstruction};
+use subsplat::scene::metrics::{psnr, ssim};
+use subsplat::scene::render::Renderer;
+use subsplat_kernels::camera::{Camera, NearFar};
+use subsplat_kernels::layout::RasterOptions;
 
 /// Folders inside the output folder.
 const FOLDERS: [&str; 4] = ["images", "depth", "depth_colour", "inputs"];
@@ -261,7 +261,7 @@ pub fn write_config(out: &Path, config: &Config) -> Result<()> {
     let text = serde_json::to_string_pretty(config)?;
     let write =
         |f: &mut std::io::BufWriter<std::fs::File>| std::io::Write::write_all(f, text.as_bytes());
-    Ok(subsplat::io::write_atomic(&out.join("config.json"), write)?)
+    Ok(subsplat::files::write_atomic(&out.join("config.json"), write)?)
 }
 
 /// Most Gaussians of a .spz, and so of a .html: the limit of its readers.

@@ -6,14 +6,15 @@ use anyhow::{Context, Result, bail, ensure};
 use glam::{EulerRot, Mat4, Quat, Vec3};
 use indicatif::ProgressBar;
 use std::path::{Path, PathBuf};
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::io::image::{LoadOptions, Truncated, probe};
-use subsplat::io::matrices::{self, PoseConvention, parse_intrinsics, parse_matrix};
-use subsplat::io::photograph::{PhotographHeader, list_photographs, probe_photograph};
-use subsplat::io::scene::{Scene, SceneFormat, is_scene, load_scene};
-use subsplat::{
-    Confidence, KnownLens, LooseOptions, LooseScene, PoseOptions, Uncertain, loose_scene,
-};
+use subsplat::cameras::estimation::{Confidence, PoseOptions, Uncertain};
+use subsplat::files::image::{LoadOptions, Truncated, probe};
+use subsplat::files::matrices;
+use subsplat::files::matrices::{PoseConvention, parse_intrinsics, parse_matrix};
+use subsplat::files::photograph::{PhotographHeader, list_photographs, probe_photograph};
+use subsplat::files::scene::{Scene, SceneFormat, is_scene, load_scene};
+use subsplat::loose_scene;
+use subsplat::reconstruct::{KnownLens, LooseOptions, LooseScene};
+use subsplat_kernels::camera::{Camera, Intrinsics};
 
 /// Loads a scene; or makes one of photographs, with the cameras of `args` or estimated ones.
 pub fn load(input: &[PathBuf], args: &PairArgs, bar: &ProgressBar) -> Result<Scene> {
@@ -276,7 +277,8 @@ fn four(text: &str) -> Result<[f32; 4]> {
 mod tests {
     use super::*;
     use clap::Parser;
-    use subsplat::image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
+    use subsplat::image::codecs::png::PngEncoder;
+    use subsplat::image::{ExtendedColorType, ImageEncoder};
 
     #[derive(Parser)]
     struct Flags {

@@ -6,10 +6,13 @@ use crate::report::{Answer, Progress, peak_memory_bytes, print_warning};
 use anyhow::{Context, Result};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
-use subsplat::camera::Camera;
-use subsplat::io::cameras_json::save_cameras_and_points;
-use subsplat::io::colmap::{SparsePoint, save_colmap};
-use subsplat::{CameraFile, Confidence, LooseScene, NamedCamera, Units};
+use subsplat::cameras::estimation::Confidence;
+use subsplat::files::cameras_json::save_cameras_and_points;
+use subsplat::files::cameras_json::{CameraFile, NamedCamera};
+use subsplat::files::colmap::{SparsePoint, save_colmap};
+use subsplat::files::scene::Units;
+use subsplat::reconstruct::LooseScene;
+use subsplat_kernels::camera::Camera;
 
 /// Runs the command.
 pub fn poses(args: &PosesArgs, answer: Answer) -> Result<()> {

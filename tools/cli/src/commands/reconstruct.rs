@@ -7,16 +7,18 @@ use crate::report::{Progress, print_line, print_warning, show_fraction};
 use anyhow::{Result, ensure};
 use serde_json::{Value, json};
 use std::borrow::Borrow;
-use subsplat::camera::Size;
-use subsplat::check::{PairReport, Verdict};
-use subsplat::config::Config;
-use subsplat::data::crop::Cropped;
-use subsplat::io::scene::Scene;
-use subsplat::model::trunk::UPSCALE_MAX;
+use subsplat::cameras::check::{PairReport, Verdict};
+use subsplat::files::scene::Scene;
+use subsplat::fit::FitReport;
+use subsplat::network::config::Config;
+use subsplat::network::model::trunk::UPSCALE_MAX;
+use subsplat::reconstruct::inputs::crop::Cropped;
+use subsplat::refine::RefineReport;
 use subsplat::{
-    Check, DepthBounds, DepthRange, Detail, FitOptions, FitReport, InputSize, Options, Photo,
-    Poses, Prepared, Reconstruction, Reconstructor, RefineReport, TargetSize,
+    Check, DepthBounds, DepthRange, Detail, FitOptions, InputSize, Options, Photo, Poses, Prepared,
+    Reconstruction, Reconstructor, TargetSize,
 };
+use subsplat_kernels::camera::Size;
 
 /// The library's options of the arguments, for photographs of frames `context`.
 ///
@@ -257,13 +259,13 @@ pub fn report(reports: &[PairReport]) -> Vec<Value> {
 mod tests {
     use super::*;
     use glam::Mat4;
-    use subsplat::camera::{Camera, Intrinsics};
-    use subsplat::data::crop::{CropOptions, crop};
-    use subsplat::io::image::Rgb;
+    use subsplat::files::image::Rgb;
+    use subsplat::reconstruct::inputs::crop::{CropOptions, crop};
+    use subsplat_kernels::camera::{Camera, Intrinsics};
 
     #[test]
     fn high_quality_is_limited_by_photographs_and_memory() {
-        let config = Config::small(subsplat::config::Preset::Tuned, 2);
+        let config = Config::small(subsplat::network::config::Preset::Tuned, 2);
         let size = |quality, crop, (width, height): (usize, usize), ample: bool| {
             let photos = [Size { width, height }; 2];
             let chosen = quality_size(quality, crop, &photos, &config, |_| ample);

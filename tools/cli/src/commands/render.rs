@@ -10,15 +10,15 @@ use anyhow::{Context, Result, bail, ensure};
 use clap::ValueEnum;
 use serde_json::json;
 use std::path::{Path, PathBuf};
-use subsplat::abi::{Convention, RasterOptions};
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::io::cameras_json::{is_cameras_json, load_cameras_json};
-use subsplat::io::image::{Depth, Rgb, probe, save_depth_png, save_png};
-use subsplat::io::load_with_comments;
-use subsplat::io::photograph::list_photographs;
-use subsplat::io::scene::{is_scene, load_scene};
-use subsplat::render::{Renderer, camera_of_comments, options_of_comments};
-use subsplat::splats::Splats;
+use subsplat::files::cameras_json::{is_cameras_json, load_cameras_json};
+use subsplat::files::image::{Depth, Rgb, probe, save_depth_png, save_png};
+use subsplat::files::load_with_comments;
+use subsplat::files::photograph::list_photographs;
+use subsplat::files::scene::{is_scene, load_scene};
+use subsplat::scene::render::{Renderer, camera_of_comments, options_of_comments};
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::camera::{Camera, Intrinsics};
+use subsplat_kernels::layout::{Convention, RasterOptions};
 
 /// Opens the renderer of `--device`; where that fails, prints a warning and uses the CPU.
 pub fn open(args: &RenderingArgs) -> Renderer {

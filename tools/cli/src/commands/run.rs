@@ -10,20 +10,20 @@ use crate::report::{Answer, Progress, mebibytes, peak_memory_bytes, print_line, 
 use anyhow::{Result, bail, ensure};
 use serde_json::{Value, json};
 use std::path::Path;
-use subsplat::abi::{Convention, RasterOptions};
-use subsplat::camera::{Camera, NearFar, Size};
-use subsplat::config::{Config, LowpassRef};
-use subsplat::data::crop::{CropOptions, Cropped};
-use subsplat::data::pair::choose_pair;
-use subsplat::eval::{GaussianReport, InputReport, Score};
-use subsplat::io::SaveOptions;
-use subsplat::io::image::{LoadOptions, Rgb, Truncated};
-use subsplat::io::scene::{Scene, SceneFormat};
-use subsplat::pipeline::Backend;
-use subsplat::pipeline::is_mvsplat;
-use subsplat::render::{comment_of_camera, comment_of_options};
-use subsplat::splats::{SplatStatistics, Splats};
+use subsplat::files::SaveOptions;
+use subsplat::files::image::{LoadOptions, Rgb, Truncated};
+use subsplat::files::scene::{Scene, SceneFormat};
+use subsplat::network::config::{Config, LowpassRef};
+use subsplat::reconstruct::Backend;
+use subsplat::reconstruct::inputs::crop::{CropOptions, Cropped};
+use subsplat::reconstruct::inputs::pair::choose_pair;
+use subsplat::reconstruct::is_mvsplat;
+use subsplat::scene::render::{comment_of_camera, comment_of_options};
+use subsplat::scene::score::{GaussianReport, InputReport, Score};
+use subsplat::scene::splats::{SplatStatistics, Splats};
 use subsplat::{Detail, Options, Photo, Reconstruction, Reconstructor, Warning};
+use subsplat_kernels::camera::{Camera, NearFar, Size};
+use subsplat_kernels::layout::{Convention, RasterOptions};
 
 /// Largest number of targets by default.
 const DEFAULT_TARGETS: usize = 30;
@@ -116,7 +116,7 @@ fn crop_of(model: &Reconstructor, result: &Reconstruction) -> CropOptions {
 fn input_report(result: &Reconstruction, options: &RasterOptions) -> Result<InputReport> {
     let (mut scores, mut coverage) = (Vec::new(), 0.0);
     for input in result.inputs() {
-        let picture = subsplat::render(result.splats(), &input.target_camera, options);
+        let picture = subsplat::scene::render(result.splats(), &input.target_camera, options);
         scores.push(Score::of(&picture.rgb, &input.target)?);
         let alpha: f64 = picture.alpha.iter().copied().map(f64::from).sum();
         coverage += alpha / (picture.alpha.len() * result.inputs().len()) as f64;
@@ -403,7 +403,7 @@ impl Done {
         report["peak_memory_bytes"] = json!(peak);
         let path = args.out.join("metrics.json");
         let text = serde_json::to_string_pretty(&report)?;
-        subsplat::io::write_atomic(&path, |f| std::io::Write::write_all(f, text.as_bytes()))?;
+        subsplat::files::write_atomic(&path, |f| std::io::Write::write_all(f, text.as_bytes()))?;
         self.print_scores(answer);
         answer.line(format!(
             "{} Gaussians, {} views in {}; {total:.1} s{}",

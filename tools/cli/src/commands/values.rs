@@ -1,9 +1,9 @@
 //! Parsers of argument values that need no file. clap reports their errors as wrong usage.
 
 use super::args::InputSizeArg;
-use subsplat::abi::CHILDREN_MAX;
-use subsplat::camera::Intrinsics;
 use subsplat::{Density, Refine};
+use subsplat_kernels::camera::Intrinsics;
+use subsplat_kernels::layout::CHILDREN_MAX;
 
 /// Largest number of views of a path.
 const PATH_MAX: usize = 100_000;

@@ -2,9 +2,9 @@
 
 use anyhow::{Context, Result};
 use glam::{DMat3, DVec3, Mat3, Mat4, Vec3};
-use subsplat::camera::Camera;
-use subsplat::navigation::Bounds;
-use subsplat::splats::Splats;
+use subsplat::scene::navigation::Bounds;
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::camera::Camera;
 
 /// Side of the picture, px.
 const SIDE: usize = 512;
@@ -86,7 +86,7 @@ fn growth(splats: &Splats, bounds: &Bounds) -> Option<Vec3> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use subsplat::abi::ShBasis;
+    use subsplat_kernels::layout::ShBasis;
 
     /// Points on a wall 4 units before a camera at the origin that looks along `forward`, and on a
     /// box 2 units before it; σ is a hundredth of the distance.

@@ -3,8 +3,8 @@
 use crate::convert::numbers::Float;
 use clap::{Parser, ValueEnum};
 use std::path::PathBuf;
-use subsplat::config::Preset;
-use subsplat::model::architecture::Kind;
+use subsplat::network::config::Preset;
+use subsplat::network::model::architecture::Kind;
 
 /// Exit codes, which scripts rely on.
 const EXIT_CODES: &str = "\

@@ -18,9 +18,9 @@ use source::{Content, Source};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::ExitCode;
-use subsplat::config::Config;
-use subsplat::io;
-use subsplat::io::tensors::{TensorSpec, write_tensors};
+use subsplat::files as io;
+use subsplat::files::tensors::{TensorSpec, write_tensors};
+use subsplat::network::config::Config;
 
 /// Names that are printed of each list; `--json` has all of them.
 const NAMES_PRINTED: usize = 3;

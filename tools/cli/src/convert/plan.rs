@@ -6,8 +6,8 @@ use crate::convert::args::Args;
 use crate::convert::source::{Content, Entry, Source};
 use anyhow::{Context, Result, bail, ensure};
 use std::collections::BTreeMap;
-use subsplat::config::{Config, Preset};
-use subsplat::model::architecture::{Kind, Shapes, expected, guess_config};
+use subsplat::network::config::{Config, Preset};
+use subsplat::network::model::architecture::{Kind, Shapes, expected, guess_config};
 
 /// Result of the comparison of names and shapes with the architecture.
 pub struct Plan {

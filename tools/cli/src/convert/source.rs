@@ -9,10 +9,10 @@ use std::collections::BTreeSet;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use subsplat::config::Config;
-use subsplat::io;
-use subsplat::io::tensors::{TensorFile, TensorSpec};
-use subsplat::io::torch::{Form, TensorRef, TorchDtype, TorchFile, Value};
+use subsplat::files as io;
+use subsplat::files::tensors::{TensorFile, TensorSpec};
+use subsplat::files::torch::{Form, TensorRef, TorchDtype, TorchFile, Value};
+use subsplat::network::config::Config;
 
 /// Keys of the state dict inside a checkpoint: Lightning's and UniMatch's.
 const WRAPPERS: [&str; 2] = ["state_dict", "model"];

@@ -231,8 +231,9 @@ fn backtraces_stay_out_of_errors() {
         (place.path().join("w.safetensors"), "run scene --context 0,2 --weights");
     let one = candle_core::Tensor::ones(1, candle_core::DType::F32, &candle_core::Device::Cpu);
     let tensors = [("small.x".to_owned(), one.unwrap())].into_iter().collect();
-    let config = subsplat::config::Config::small(subsplat::config::Preset::Tuned, 2);
-    subsplat::model::weights::save(&weights, &tensors, &config).unwrap();
+    let config =
+        subsplat::network::config::Config::small(subsplat::network::config::Preset::Tuned, 2);
+    subsplat::network::model::weights::save(&weights, &tensors, &config).unwrap();
     let mut arguments: Vec<&str> = words.split(' ').collect();
     arguments.push("w.safetensors");
     let called = call_with(place.path(), &arguments, &[("RUST_BACKTRACE", "1")]);

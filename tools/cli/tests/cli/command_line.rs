@@ -10,14 +10,14 @@ use program::{Called, SIDE, call_in, call_with, files, named, workplace};
 use serde_json::Value;
 use std::collections::BTreeSet;
 use std::path::Path;
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::config::{Config, Preset, SpgrHead};
-use subsplat::io::cameras_json::{CameraFile, save_cameras_json};
-use subsplat::io::image::{Rgb, load, save_png};
-use subsplat::io::scene::{Frame, Units, load_scene};
-use subsplat::metrics::psnr;
-use subsplat::model::subsplat::SubSplat;
-use subsplat::model::weights::{Weights, save};
+use subsplat::files::cameras_json::{CameraFile, save_cameras_json};
+use subsplat::files::image::{Rgb, load, save_png};
+use subsplat::files::scene::{Frame, Units, load_scene};
+use subsplat::network::config::{Config, Preset, SpgrHead};
+use subsplat::network::model::subsplat::SubSplat;
+use subsplat::network::model::weights::{Weights, save};
+use subsplat::scene::metrics::psnr;
+use subsplat_kernels::camera::{Camera, Intrinsics};
 
 /// A quick reconstruction: 64 px input, 128 px target, all frames named.
 const QUICK: &str = "--json run scene --context 0,2 --input-size 64";
@@ -530,7 +530,7 @@ fn compare_says_yes_and_no() {
     assert_eq!(code, 0);
     assert!(tensors > 20, "{tensors}");
     // The inputs and one tensor that is a hundredth of its range off.
-    let (mut all, _) = subsplat::model::weights::read_tensors(&reference).unwrap();
+    let (mut all, _) = subsplat::network::model::weights::read_tensors(&reference).unwrap();
     all.retain(|name, _| name.starts_with("in.") || name == "out.means");
     let off = all["out.means"].affine(1.0, 1.0).unwrap();
     all.insert("out.means".to_owned(), off);

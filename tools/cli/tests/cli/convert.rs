@@ -13,11 +13,11 @@ use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::Command;
-use subsplat::config::{Backbone, Config, Preset, SpgrHead};
-use subsplat::io::tensors::{TensorFile, TensorSpec, write_tensors};
-use subsplat::model::lpips::Lpips;
-use subsplat::model::subsplat::SubSplat;
-use subsplat::model::weights::{Weights, read_tensors, save};
+use subsplat::files::tensors::{TensorFile, TensorSpec, write_tensors};
+use subsplat::network::config::{Backbone, Config, Preset, SpgrHead};
+use subsplat::network::model::subsplat::SubSplat;
+use subsplat::network::model::weights::{Weights, read_tensors, save};
+use subsplat_lab::lpips::Lpips;
 
 /// Name to shape and elements.
 type Content = BTreeMap<String, (Vec<usize>, Vec<u8>)>;

@@ -7,10 +7,10 @@ use crate::program;
 
 use glam::Mat4;
 use program::{call_in, workplace};
-use subsplat::abi::{RasterOptions, SPLAT_STRIDE, ShBasis};
-use subsplat::camera::{Camera, Intrinsics};
-use subsplat::render::{Renderer, render};
-use subsplat::splats::Splats;
+use subsplat::scene::render::{Renderer, render};
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::camera::{Camera, Intrinsics};
+use subsplat_kernels::layout::{RasterOptions, SPLAT_STRIDE, ShBasis};
 
 fn scene() -> (Splats, Camera) {
     let mut rows = Vec::new();

@@ -2,10 +2,10 @@
 
 use crate::program::{call_in, call_with, workplace};
 use std::path::Path;
-use subsplat::io::image::load;
-use subsplat::io::{SplatFormat, load_splats, parse_splats};
-use subsplat::metrics::psnr;
-use subsplat::splats::Splats;
+use subsplat::files::image::load;
+use subsplat::files::{SplatFormat, load_splats, parse_splats};
+use subsplat::scene::metrics::psnr;
+use subsplat::scene::splats::Splats;
 use subsplat_test_support::one_splat::save_one_splat;
 
 /// The contents of the script element `id` of a page.

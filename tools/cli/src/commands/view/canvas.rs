@@ -2,12 +2,12 @@
 
 use anyhow::{Context, Result, anyhow, ensure};
 use std::sync::{Arc, Mutex, PoisonError};
-use subsplat::abi::RasterOptions;
-use subsplat::camera::Camera;
-use subsplat::gpu::{
+use subsplat::files::image::Rgb;
+use subsplat_kernels::camera::Camera;
+use subsplat_kernels::gpu::{
     DeviceChoice, Gpu, Rasterizer, Scene, features_of, find_for, instance, limits_of, wgpu,
 };
-use subsplat::io::image::Rgb;
+use subsplat_kernels::layout::RasterOptions;
 use wgpu::CurrentSurfaceTexture as Current;
 use winit::window::Window;
 

@@ -1,16 +1,16 @@
 //! Level of detail of the Gaussians in the window: far parts of a scene are drawn with fewer, merged
-//! Gaussians ([`subsplat::levels`]).
+//! Gaussians ([`subsplat::scene::levels`]).
 //!
 //! A background thread makes the levels after the first picture, then the Gaussians of a selection for
 //! the camera. Meanwhile the window draws those of the selection before, or all.
 
 use anyhow::{Error, Result};
 use std::sync::Arc;
-use subsplat::camera::Camera;
-use subsplat::gpu::{Gpu, Scene};
-use subsplat::levels::{CELL_PX, Levels, Selection};
-use subsplat::render::slices;
-use subsplat::splats::Splats;
+use subsplat::scene::levels::{CELL_PX, Levels, Selection};
+use subsplat::scene::render::slices;
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::camera::Camera;
+use subsplat_kernels::gpu::{Gpu, Scene};
 
 /// Factor of the cells' largest width for a selection made in advance: a camera that approaches keeps it
 /// for a while.
@@ -152,9 +152,9 @@ impl Detail {
 mod tests {
     use super::*;
     use glam::{Mat4, Vec3};
-    use subsplat::abi::{RasterOptions, ShBasis};
-    use subsplat::camera::Intrinsics;
-    use subsplat::gpu::{DeviceChoice, Rasterizer};
+    use subsplat_kernels::camera::Intrinsics;
+    use subsplat_kernels::gpu::{DeviceChoice, Rasterizer};
+    use subsplat_kernels::layout::{RasterOptions, ShBasis};
 
     const SIDE: usize = 64;
 
@@ -200,7 +200,7 @@ mod tests {
         let options = RasterOptions { sh_basis: ShBasis::Standard, ..RasterOptions::default() };
         let fewer = rasterizer.render_scene(scene, &far, &options).unwrap();
         let all = rasterizer.render(&slices(&splats), &far, &options).unwrap();
-        let likeness = subsplat::metrics::psnr(&fewer.rgb, &all.rgb, SIDE, SIDE).unwrap();
+        let likeness = subsplat::scene::metrics::psnr(&fewer.rgb, &all.rgb, SIDE, SIDE).unwrap();
         assert!(likeness >= 35.0, "{likeness:.1} dB");
         assert!(detail.missing(&far, Fit::Fine).is_none());
         // A camera that approaches needs finer Gaussians; the older ones are drawn meanwhile.

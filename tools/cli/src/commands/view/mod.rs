@@ -1,6 +1,6 @@
 //! `subsplat view`: a window that shows a scene. `source` provides the splats, `canvas` draws
 //! them, `controls` interprets keys and mouse, and `window` joins the three. The camera moves by
-//! [`subsplat::navigation`].
+//! [`subsplat::scene::navigation`].
 //!
 //! A change draws two frames: the first measures the number of pairs, and the second has buffers
 //! for them. A background thread makes and uploads the children for another r. The device has the
@@ -21,7 +21,8 @@ use anyhow::{Context, Result, bail};
 use serde_json::json;
 use std::convert::Infallible;
 use std::path::PathBuf;
-use subsplat::gpu::{self, DeviceChoice};
+use subsplat_kernels::gpu;
+use subsplat_kernels::gpu::DeviceChoice;
 use winit::event_loop::EventLoop;
 
 /// The arguments of the window, checked.

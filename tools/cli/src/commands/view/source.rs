@@ -12,14 +12,15 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
-use subsplat::abi::RasterOptions;
-use subsplat::io::{SplatFormat, load_with_comments};
-use subsplat::navigation::{Start, up_of};
-use subsplat::render::camera_of_comments;
-use subsplat::splats::Splats;
+use subsplat::files::{SplatFormat, load_with_comments};
+use subsplat::refine::Refiner;
+use subsplat::scene::navigation::{Start, up_of};
+use subsplat::scene::render::camera_of_comments;
+use subsplat::scene::splats::Splats;
 use subsplat::{
-    Check, Options, Photo, Reconstruction, Reconstructor, Refine, Refiner, Renderer, TargetSize,
+    Check, Options, Photo, Reconstruction, Reconstructor, Refine, Renderer, TargetSize,
 };
+use subsplat_kernels::layout::RasterOptions;
 
 /// Least time between two pictures of a refinement.
 const SHOWN_EVERY: Duration = Duration::from_millis(400);

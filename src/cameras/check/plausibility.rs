@@ -1,0 +1,107 @@
+//! Tests that need no matches: picture sizes, intrinsics, a repeated camera, a repeated photograph.
+//!
+//! Input: grey photographs and cameras. Output: findings in the [`PairReport`].
+
+use super::mistakes::NORMALISED_FOCAL;
+use super::report::{PairReport, Verdict};
+use crate::cameras::matches::GrayImage;
+use subsplat_kernels::camera::{Camera, Intrinsics};
+
+/// Largest mean difference of two copies of one photograph, 0 to 1: below the error of
+/// recompression.
+const MAX_SAME_DIFFERENCE: f32 = 0.004;
+/// Fields of view of hand-held pinhole cameras, degrees.
+const PLAUSIBLE_FOV: std::ops::RangeInclusive<f32> = 8.0..=140.0;
+/// Principal point over the picture's size. Lenses deviate by a few percent, crops by more,
+/// intrinsics of half the size by a quarter.
+const PLAUSIBLE_MIDDLE: std::ops::RangeInclusive<f32> = 0.28..=0.72;
+/// Ratios fx / fy of the pixels of video. Other ratios arise from a division by the wrong side.
+const PLAUSIBLE_PIXELS: std::ops::RangeInclusive<f32> = 0.7..=1.43;
+/// Largest relative difference of aspect between a photograph and its intrinsics.
+const ASPECT: f32 = 0.02;
+
+/// Compares the cameras with the photographs' sizes and with each other.
+pub(super) fn cameras(report: &mut PairReport, views: [(&GrayImage, &Camera); 2]) {
+    for (name, (image, camera)) in ["first", "second"].into_iter().zip(views) {
+        size(report, name, image, &camera.intrinsics());
+        intrinsics(report, name, &camera.intrinsics());
+    }
+    let [a, b] = views.map(|v| v.1.world_from_camera());
+    if a.abs_diff_eq(b, 1e-6) {
+        let sentence = "both photographs have the same camera: depth needs a baseline between them";
+        report.add(Verdict::Bad, "same_camera", sentence);
+    }
+}
+
+/// Reports a photograph whose size differs from its intrinsics.
+fn size(report: &mut PairReport, name: &str, image: &GrayImage, k: &Intrinsics) {
+    let (w, h) = (image.width(), image.height());
+    if (k.width, k.height) == (w, h) {
+        return;
+    }
+    let aspect = (w * k.height) as f32 / (h * k.width).max(1) as f32;
+    let (severity, note) = if (k.width, k.height) == (h, w) {
+        (Verdict::Bad, "the photograph is rotated (EXIF orientation?)")
+    } else if (aspect - 1.0).abs() > ASPECT {
+        (
+            Verdict::Bad,
+            "the aspect differs, because the photograph was cropped or the intrinsics belong to another camera",
+        )
+    } else {
+        (Verdict::Warning, "the intrinsics are scaled to fit")
+    };
+    let sentence = format!(
+        "the {name} photograph has {w}x{h} pixels, but its intrinsics are for {}x{}: {note}",
+        k.width, k.height
+    );
+    report.add(severity, "size_differs", sentence);
+}
+
+/// Reports implausible focal lengths and principal points.
+fn intrinsics(report: &mut PairReport, name: &str, k: &Intrinsics) {
+    let fov = [k.fov_x().to_degrees(), k.fov_y().to_degrees()];
+    let middle = [k.cx / k.width as f32, k.cy / k.height as f32];
+    if k.fx < NORMALISED_FOCAL && k.fy < NORMALISED_FOCAL {
+        let sentence = format!(
+            "the {name} camera has fx = {:.3} and fy = {:.3}: pixels are expected, but these \
+             values are divided by the picture's size",
+            k.fx, k.fy
+        );
+        report.add(Verdict::Bad, "intrinsics_normalised", sentence);
+    } else if fov.iter().any(|v| !PLAUSIBLE_FOV.contains(v)) {
+        let sentence = format!(
+            "the {name} camera's field of view is {:.0}° x {:.0}°: are its intrinsics in pixels \
+             of this photograph?",
+            fov[0], fov[1]
+        );
+        report.add(Verdict::Bad, "field_of_view", sentence);
+    } else if middle.iter().any(|v| !PLAUSIBLE_MIDDLE.contains(v)) {
+        let sentence = format!(
+            "the {name} camera's principal point ({:.0}, {:.0}) is far from the middle of its \
+             {}x{} px: do its intrinsics belong to another picture size?",
+            k.cx, k.cy, k.width, k.height
+        );
+        report.add(Verdict::Warning, "principal_point", sentence);
+    } else if !PLAUSIBLE_PIXELS.contains(&(k.fx / k.fy)) {
+        let sentence = format!(
+            "the {name} camera has fx = {:.0} px and fy = {:.0} px: pixels are rarely that far \
+             from square; was a focal length divided by the wrong side?",
+            k.fx, k.fy
+        );
+        report.add(Verdict::Warning, "pixels_not_square", sentence);
+    }
+}
+
+/// Tests whether both photographs are the same picture, and reports it.
+pub(super) fn same_photograph(report: &mut PairReport, a: &GrayImage, b: &GrayImage) -> bool {
+    if (a.width(), a.height()) != (b.width(), b.height()) {
+        return false;
+    }
+    let sum: f64 = a.pixels().iter().zip(b.pixels()).map(|(x, y)| f64::from((x - y).abs())).sum();
+    let same = sum / (a.pixels().len() as f64) < f64::from(MAX_SAME_DIFFERENCE);
+    if same {
+        let sentence = "both photographs are the same picture: depth needs parallax between them";
+        report.add(Verdict::Bad, "same_photograph", sentence);
+    }
+    same
+}

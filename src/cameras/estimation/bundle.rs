@@ -1,0 +1,416 @@
+//! Bundle adjustment: all cameras, all points and a shared focal length together.
+//!
+//! Levenberg-Marquardt steps on the robust sum of squared distances between the points' pictures
+//! and their projections. The points are eliminated (Schur complement), so that a step solves one
+//! dense system of 6 unknowns a camera and one for the focal length. The first camera is kept.
+//!
+//! Source: B. Triggs et al., "Bundle adjustment - a modern synthesis", 2000.
+
+use super::absolute::{Absolute, projection_slope, slope_in_camera};
+use super::refine::FocalPrior;
+use glam::{DVec2, DVec3};
+use nalgebra::{DMatrix, DVector, SMatrix, SVector};
+
+/// A point's picture in a camera.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Observation {
+    /// Index into [`Bundle::cameras`].
+    pub camera: usize,
+    /// Index into [`Bundle::points`].
+    pub point: usize,
+    /// The picture on the plane z = 1 of the lens's own focal length.
+    pub bearing: DVec2,
+    /// Standard deviation of the bearing, units of the plane.
+    pub deviation: f64,
+}
+
+/// Cameras, points and observations.
+#[derive(Clone, Debug)]
+pub(super) struct Bundle {
+    /// Cameras; the first one is kept.
+    pub cameras: Vec<Absolute>,
+    /// Positions of the points.
+    pub points: Vec<DVec3>,
+    /// Observations, sorted by point.
+    pub observations: Vec<Observation>,
+    /// Logarithm of the focal length over that of the lenses.
+    pub log_focal: f64,
+    /// Knowledge of the focal length; `None` keeps it.
+    pub prior: Option<FocalPrior>,
+}
+
+/// Residual at which Cauchy's loss begins to grow slowly, standard deviations.
+const LOSS_SCALE: f64 = 2.0;
+/// Unknowns of a camera.
+const POSE: usize = 6;
+
+type Slope = SMatrix<f64, 2, 6>;
+type PointSlope = SMatrix<f64, 2, 3>;
+
+impl Observation {
+    /// Residual, standard deviations; `None` behind the camera.
+    pub(super) fn residual(
+        &self,
+        camera: &Absolute,
+        point: DVec3,
+        log_focal: f64,
+    ) -> Option<DVec2> {
+        let p = camera.to_camera(point);
+        let projected = p.truncate() / p.z * log_focal.exp();
+        (p.z > 1e-9).then(|| (projected - self.bearing) / self.deviation)
+    }
+}
+
+/// Normal equations of the cameras and the focal length after the elimination of the points.
+struct Reduced {
+    matrix: DMatrix<f64>,
+    gradient: DVector<f64>,
+    /// Inverse of each point's own block, and its gradient.
+    points: Vec<(SMatrix<f64, 3, 3>, SVector<f64, 3>)>,
+    /// For each observation the product of the slopes of camera and point.
+    mixed: Vec<SMatrix<f64, 6, 3>>,
+    /// For each point the product of the slopes of focal length and point.
+    focal: Vec<SVector<f64, 3>>,
+}
+
+impl Bundle {
+    fn unknowns(&self) -> usize {
+        POSE * (self.cameras.len() - 1) + 1
+    }
+
+    /// Sum of Cauchy's losses, and of the prior.
+    fn cost(&self) -> f64 {
+        let c2 = LOSS_SCALE * LOSS_SCALE;
+        let one = |o: &Observation| {
+            let residual =
+                o.residual(&self.cameras[o.camera], self.points[o.point], self.log_focal);
+            // A point behind the camera costs as much as a large residual.
+            let squared = residual.map_or(1e8, |r| r.length_squared());
+            0.5 * c2 * (squared / c2).ln_1p()
+        };
+        let data: f64 = self.observations.iter().map(one).sum();
+        data + self.prior.map_or(0.0, |p| 0.5 * p.distance(self.log_focal).powi(2))
+    }
+
+    /// Improves all unknowns in at most `steps` steps.
+    pub(super) fn adjust(&mut self, steps: usize) {
+        let mut damping = 1e-4;
+        let mut cost = self.cost();
+        for _ in 0..steps {
+            let reduced = self.reduce(damping);
+            let next = reduced.solve().map(|step| self.moved(&reduced, &step));
+            let next_cost = next.as_ref().map_or(f64::INFINITY, Self::cost);
+            match next {
+                Some(next) if next_cost < cost => {
+                    let gain = cost - next_cost;
+                    *self = next;
+                    cost = next_cost;
+                    damping = (damping * 0.2).max(1e-8);
+                    if gain < 1e-6 * cost {
+                        break;
+                    }
+                }
+                _ => {
+                    damping *= 10.0;
+                    if damping > 1e6 {
+                        break;
+                    }
+                }
+            }
+        }
+    }
+
+    /// Builds the normal equations; `damping` is added to the diagonal in proportion.
+    fn reduce(&self, damping: f64) -> Reduced {
+        let n = self.unknowns();
+        let last = n - 1;
+        let scale = self.log_focal.exp();
+        let mut matrix = DMatrix::<f64>::zeros(n, n);
+        let mut gradient = DVector::<f64>::zeros(n);
+        let mut own = vec![SMatrix::<f64, 3, 3>::zeros(); self.points.len()];
+        let mut own_gradient = vec![SVector::<f64, 3>::zeros(); self.points.len()];
+        let mut focal = vec![SVector::<f64, 3>::zeros(); self.points.len()];
+        let mut mixed = vec![SMatrix::<f64, 6, 3>::zeros(); self.observations.len()];
+        for (o, mixed) in self.observations.iter().zip(&mut mixed) {
+            let (camera, point) = (&self.cameras[o.camera], self.points[o.point]);
+            let Some(r) = o.residual(camera, point, self.log_focal) else { continue };
+            let weight = 1.0 / (1.0 + r.length_squared() / (LOSS_SCALE * LOSS_SCALE));
+            let p = camera.to_camera(point);
+            let unit = scale / o.deviation;
+            let rotation =
+                SMatrix::<f64, 3, 3>::from_column_slice(&camera.rotation.to_cols_array());
+            let by_camera: Slope = projection_slope(camera, point) * unit;
+            let by_point: PointSlope = slope_in_camera(p) * rotation * unit;
+            let by_focal = SVector::<f64, 2>::new(p.x / p.z, p.y / p.z) * unit;
+            let r = SVector::<f64, 2>::new(r.x, r.y);
+            own[o.point] += by_point.transpose() * by_point * weight;
+            own_gradient[o.point] += by_point.transpose() * r * weight;
+            if self.prior.is_some() {
+                focal[o.point] += by_point.transpose() * by_focal * weight;
+                matrix[(last, last)] += weight * by_focal.norm_squared();
+                gradient[last] += weight * by_focal.dot(&r);
+            }
+            if let Some(at) = o.camera.checked_sub(1).map(|c| c * POSE) {
+                *mixed = by_camera.transpose() * by_point * weight;
+                let mut block = matrix.fixed_view_mut::<6, 6>(at, at);
+                block += by_camera.transpose() * by_camera * weight;
+                let mut part = gradient.fixed_rows_mut::<6>(at);
+                part += by_camera.transpose() * r * weight;
+                if self.prior.is_some() {
+                    let cross = by_camera.transpose() * by_focal * weight;
+                    let mut column = matrix.fixed_view_mut::<6, 1>(at, last);
+                    column += cross;
+                    let mut row = matrix.fixed_view_mut::<1, 6>(last, at);
+                    row += cross.transpose();
+                }
+            }
+        }
+        match self.prior {
+            None => matrix[(last, last)] = 1.0,
+            Some(p) => {
+                matrix[(last, last)] += p.deviation.powi(-2);
+                gradient[last] += p.distance(self.log_focal) / p.deviation;
+            }
+        }
+        (0..n).for_each(|i| matrix[(i, i)] *= 1.0 + damping);
+        let points: Vec<_> = own
+            .into_iter()
+            .zip(own_gradient)
+            .map(|(mut m, g)| {
+                (0..3).for_each(|i| m[(i, i)] = m[(i, i)] * (1.0 + damping) + 1e-12);
+                (m.try_inverse().unwrap_or_else(SMatrix::zeros), g)
+            })
+            .collect();
+        let mut reduced = Reduced { matrix, gradient, points, mixed, focal };
+        self.eliminate(&mut reduced);
+        reduced
+    }
+
+    /// Subtracts what the points take up: S = U − W V⁻¹ Wᵀ.
+    fn eliminate(&self, reduced: &mut Reduced) {
+        let last = self.unknowns() - 1;
+        let Reduced { matrix, gradient, points, mixed, focal } = reduced;
+        let all = self.observations.iter().zip(mixed.iter()).collect::<Vec<_>>();
+        for run in all.chunk_by(|a, b| a.0.point == b.0.point) {
+            let index = run[0].0.point;
+            let (inverse, own) = &points[index];
+            let f = focal[index];
+            let through = inverse * f;
+            matrix[(last, last)] -= f.dot(&through);
+            gradient[last] -= through.dot(own);
+            for (o, w) in run {
+                let Some(at) = o.camera.checked_sub(1).map(|c| c * POSE) else { continue };
+                let left = *w * inverse;
+                let mut part = gradient.fixed_rows_mut::<6>(at);
+                part -= left * own;
+                let cross = *w * through;
+                let mut column = matrix.fixed_view_mut::<6, 1>(at, last);
+                column -= cross;
+                let mut row = matrix.fixed_view_mut::<1, 6>(last, at);
+                row -= cross.transpose();
+                for (other, v) in run {
+                    let Some(to) = other.camera.checked_sub(1).map(|c| c * POSE) else { continue };
+                    let mut block = matrix.fixed_view_mut::<6, 6>(at, to);
+                    block -= left * v.transpose();
+                }
+            }
+        }
+    }
+
+    /// The bundle after a step of cameras and focal length; the points follow.
+    fn moved(&self, reduced: &Reduced, step: &DVector<f64>) -> Self {
+        let mut next = self.clone();
+        let last = self.unknowns() - 1;
+        for (i, camera) in next.cameras.iter_mut().enumerate().skip(1) {
+            let at = (i - 1) * POSE;
+            *camera = camera.moved(&step.as_slice()[at..at + POSE]);
+        }
+        if self.prior.is_some() {
+            next.log_focal += step[last];
+        }
+        let mut gradients: Vec<SVector<f64, 3>> = reduced.points.iter().map(|p| p.1).collect();
+        for (o, w) in self.observations.iter().zip(&reduced.mixed) {
+            if let Some(at) = o.camera.checked_sub(1).map(|c| c * POSE) {
+                gradients[o.point] += w.transpose() * step.fixed_rows::<6>(at);
+            }
+        }
+        for (i, point) in next.points.iter_mut().enumerate() {
+            let g = gradients[i] + reduced.focal[i] * step[last];
+            let move_by = -(reduced.points[i].0 * g);
+            *point += DVec3::new(move_by[0], move_by[1], move_by[2]);
+        }
+        next
+    }
+
+    /// Standard deviations at the solution: of each camera's position in units of the scene (the
+    /// scale is that of the given points), of each rotation, radians, and of the logarithm of the
+    /// focal length. The first camera has none. `None` where the system is singular.
+    pub(super) fn deviations(&self) -> Option<Deviations> {
+        let mut reduced = self.reduce(0.0);
+        let n = self.unknowns();
+        // The scale is free: its direction, translations in proportion to themselves, gets weight.
+        let mut scale = DVector::<f64>::zeros(n);
+        let origin = self.cameras[0].translation;
+        for (i, camera) in self.cameras.iter().enumerate().skip(1) {
+            let shift = camera.translation
+                - camera.rotation * self.cameras[0].rotation.transpose() * origin;
+            scale.fixed_rows_mut::<3>((i - 1) * POSE + 3).copy_from_slice(&shift.to_array());
+        }
+        let length = scale.norm().max(1e-12);
+        scale /= length;
+        let weight = reduced.matrix.diagonal().max();
+        reduced.matrix.ger(weight, &scale, &scale, 1.0);
+        let covariance = reduced.matrix.cholesky()?.inverse();
+        let at = |i: usize, from: usize| {
+            (0..3).map(|k| covariance[((i - 1) * POSE + from + k, (i - 1) * POSE + from + k)]).sum()
+        };
+        let all = |from: usize| -> Vec<f64> {
+            (0..self.cameras.len())
+                .map(|i| if i == 0 { 0.0 } else { f64::sqrt(at(i, from)) })
+                .collect()
+        };
+        let focal = if self.prior.is_some() { covariance[(n - 1, n - 1)].sqrt() } else { 0.0 };
+        Some(Deviations { rotations: all(0), translations: all(3), focal })
+    }
+}
+
+/// See [`Bundle::deviations`].
+#[derive(Clone, Debug)]
+pub(super) struct Deviations {
+    /// Of the rotations, radians.
+    pub rotations: Vec<f64>,
+    /// Of the translations, units of the scene.
+    pub translations: Vec<f64>,
+    /// Of the logarithm of the focal length.
+    pub focal: f64,
+}
+
+impl Reduced {
+    fn solve(&self) -> Option<DVector<f64>> {
+        let factor = self.matrix.clone().cholesky()?;
+        let step = -factor.solve(&self.gradient);
+        step.iter().all(|v| v.is_finite()).then_some(step)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::two_view::rotation;
+    use super::*;
+    use crate::cameras::matches::random::SplitMix;
+
+    /// Five cameras on an arc, 120 points; pictures for lenses with 1 / `focal` of the true focal
+    /// length and normal noise of one standard deviation.
+    fn scene(focal: f64, noise: f64) -> Bundle {
+        let mut random = SplitMix(3);
+        let cameras: Vec<Absolute> = (0..5)
+            .map(|i| {
+                let angle = 0.15 * f64::from(i);
+                let r = rotation(DVec3::new(0.02 * f64::from(i), angle, 0.0));
+                let centre = DVec3::new(0.0, 0.0, 4.0);
+                let eye = centre
+                    + rotation(DVec3::Y * -angle) * DVec3::new(0.0, 0.1 * f64::from(i), -4.0);
+                Absolute { rotation: r, translation: -(r * eye) }
+            })
+            .collect();
+        let points: Vec<DVec3> = (0..120)
+            .map(|_| {
+                DVec3::from_array(std::array::from_fn(|_| 2.0 * random.uniform() - 1.0))
+                    + DVec3::Z * 4.0
+            })
+            .collect();
+        let deviation = 1e-3;
+        let mut observations = Vec::new();
+        for (point, p) in points.iter().enumerate() {
+            for (camera, c) in cameras.iter().enumerate() {
+                let q = c.to_camera(*p);
+                let jitter = DVec2::new(random.normal(), random.normal()) * noise * deviation;
+                let bearing = q.truncate() / q.z * focal + jitter;
+                observations.push(Observation { camera, point, bearing, deviation });
+            }
+        }
+        Bundle { cameras, points, observations, log_focal: 0.0, prior: None }
+    }
+
+    fn disturb(bundle: &mut Bundle) {
+        let mut random = SplitMix(8);
+        for c in bundle.cameras.iter_mut().skip(1) {
+            let step: [f64; 6] = std::array::from_fn(|_| 0.02 * random.normal());
+            *c = c.moved(&step);
+        }
+        for p in &mut bundle.points {
+            *p += DVec3::from_array(std::array::from_fn(|_| 0.05 * random.normal()));
+        }
+    }
+
+    /// Largest angle between the directions of positions, seen from the first camera.
+    fn off(a: &Bundle, b: &Bundle) -> f64 {
+        let pairs = a.cameras.iter().zip(&b.cameras).skip(1);
+        pairs.map(|(a, b)| a.position().angle_between(b.position())).fold(0.0, f64::max)
+    }
+
+    #[test]
+    fn disturbed_cameras_and_points_return() {
+        let truth = scene(1.0, 0.0);
+        let mut bundle = truth.clone();
+        disturb(&mut bundle);
+        assert!(off(&bundle, &truth) > 5e-3);
+        bundle.adjust(60);
+        assert!(off(&bundle, &truth) < 1e-4, "{}", off(&bundle, &truth));
+    }
+
+    #[test]
+    fn a_wrong_focal_length_and_wrong_pictures_are_survived() {
+        let truth = scene(1.15, 0.5);
+        let mut bundle = truth.clone();
+        for o in bundle.observations.iter_mut().step_by(23) {
+            o.bearing.x += 0.1;
+        }
+        bundle.prior = Some(FocalPrior { mean: 0.0, deviation: 0.5 });
+        disturb(&mut bundle);
+        bundle.adjust(100);
+        assert!((bundle.log_focal.exp() / 1.15 - 1.0).abs() < 0.02, "{}", bundle.log_focal.exp());
+        assert!(off(&bundle, &truth) < 0.01, "{}", off(&bundle, &truth));
+        let deviations = bundle.deviations().unwrap();
+        assert!(deviations.focal > 1e-4 && deviations.focal < 0.05, "{deviations:?}");
+        assert!(deviations.rotations[1] > 1e-5 && deviations.rotations[1] < 0.01);
+    }
+
+    #[test]
+    fn the_gradient_is_that_of_finite_differences() {
+        let mut bundle = scene(1.1, 0.5);
+        bundle.prior = Some(FocalPrior { mean: 0.1, deviation: 0.3 });
+        disturb(&mut bundle);
+        bundle.observations.truncate(200);
+        let n = bundle.unknowns();
+        // Points that do not move: the cameras' gradient before the elimination is that of the cost.
+        let kept = bundle.clone();
+        let mut plain = bundle.reduce(0.0);
+        for (o, w) in kept.observations.iter().zip(plain.mixed.clone()) {
+            if let Some(at) = o.camera.checked_sub(1).map(|c| c * POSE) {
+                let (inverse, own) = &plain.points[o.point];
+                let mut part = plain.gradient.fixed_rows_mut::<6>(at);
+                part += w * inverse * own;
+            }
+        }
+        for (i, (inverse, own)) in plain.points.iter().enumerate() {
+            plain.gradient[n - 1] += plain.focal[i].dot(&(inverse * own));
+        }
+        for i in 0..n {
+            let at = |h: f64| {
+                let mut moved = kept.clone();
+                if i == n - 1 {
+                    moved.log_focal += h;
+                } else {
+                    let mut step = [0.0; POSE];
+                    step[i % POSE] = h;
+                    moved.cameras[1 + i / POSE] = moved.cameras[1 + i / POSE].moved(&step);
+                }
+                moved.cost()
+            };
+            let numeric = (at(1e-6) - at(-1e-6)) / 2e-6;
+            let got = plain.gradient[i];
+            assert!((numeric - got).abs() < 1e-3 * (1.0 + got.abs()), "{i}: {numeric} {got}");
+        }
+    }
+}

@@ -1,0 +1,538 @@
+//! Cameras and points of three or more photographs, one photograph after the other.
+//!
+//! Pairs are matched and verified ([`Edge`]); their matches join to tracks. The best pair starts;
+//! then the photograph that sees most points is located among them, its tracks give new points,
+//! and all cameras and points are adjusted together.
+//!
+//! Source: N. Snavely, S. Seitz and R. Szeliski, "Photo tourism", 2006; J. Schönberger and
+//! J.-M. Frahm, "Structure-from-motion revisited", 2016.
+
+use super::absolute::{Absolute, Sight, locate};
+use super::bundle::{Bundle, Observation};
+use super::pair::{self, PairEstimate};
+use super::photo::{PosePhoto, aligned_position, deviations};
+use super::refine::FocalPrior;
+use super::tracks::{FeatureId, tracks};
+use glam::{DVec2, DVec3};
+use rayon::prelude::*;
+
+/// Smallest number of matches of a verified pair.
+const MIN_PAIR_INLIERS: usize = 20;
+/// Smallest number of its matches that were found without a geometry.
+const MIN_PAIR_CONSISTENT: usize = 16;
+/// Smallest number of points by which a photograph is located.
+const MIN_SIGHTS: usize = 12;
+/// Smallest share of the points that agree with a located photograph.
+const MIN_SIGHT_SHARE: f64 = 0.25;
+/// Largest residual of a sight or an observation, standard deviations.
+const LIMIT: f64 = 5.0;
+/// The same for cameras that are given and not adjusted yet. Matches of verified pairs are hardly
+/// ever wrong, and 100 deviations of a feature are 40 working px: 4° or more.
+const GIVEN_LIMIT: f64 = 100.0;
+/// Smallest angle between two rays of a point, radians (1.5 degrees).
+const MIN_ANGLE: f64 = 0.026;
+/// Angle between rays at which a pair is wide enough to start with, radians (6 degrees).
+const START_ANGLE: f64 = 0.105;
+/// Photographs that are compared with all others; of more, each is compared with this many
+/// neighbours in their order and with the photographs most alike.
+const PARTNERS: usize = 10;
+/// Features by which likeness is judged.
+const SKETCH: usize = 700;
+
+/// Two photographs with a verified relative pose.
+#[derive(Clone, Debug)]
+pub(super) struct Edge {
+    /// Indices of the photographs, the smaller first.
+    pub photos: [usize; 2],
+    /// Their relative pose.
+    pub estimate: PairEstimate,
+}
+
+/// A point with its features.
+#[derive(Clone, Debug)]
+pub(super) struct Point {
+    /// Position, units of the model.
+    pub position: DVec3,
+    /// The features that agree with it.
+    pub features: Vec<FeatureId>,
+}
+
+/// Cameras and points in an arbitrary frame and scale.
+#[derive(Clone, Debug)]
+pub(super) struct Model {
+    /// One pose for each photograph; `None` where it does not fit.
+    pub cameras: Vec<Option<Absolute>>,
+    /// The points.
+    pub points: Vec<Point>,
+    /// Focal length over that of the lenses.
+    pub focal_scale: f64,
+    /// Standard deviation of the logarithm of the focal length.
+    pub focal_deviation: f64,
+    /// Largest standard deviation of a camera's rotation, radians.
+    pub rotation_deviation: f64,
+    /// Largest standard deviation of a camera's position over the extent of all.
+    pub position_deviation: f64,
+}
+
+/// Returns the pairs of photographs that are compared in full: all of a few photographs, else those
+/// that are most alike by their strongest features.
+fn compared(photos: &[PosePhoto]) -> Vec<[usize; 2]> {
+    let n = photos.len();
+    let all: Vec<[usize; 2]> = (0..n).flat_map(|i| (i + 1..n).map(move |j| [i, j])).collect();
+    if n <= PARTNERS {
+        return all;
+    }
+    let sketches: Vec<_> = photos.par_iter().map(|p| p.features.strongest(SKETCH)).collect();
+    let alike: Vec<usize> = all
+        .par_iter()
+        .map(|&[i, j]| crate::cameras::matches::pairs::pairs(&sketches[i], &sketches[j]).len())
+        .collect();
+    let mut chosen = vec![false; all.len()];
+    for photo in 0..n {
+        let mut own: Vec<usize> = (0..all.len()).filter(|&k| all[k].contains(&photo)).collect();
+        own.sort_by_key(|&k| std::cmp::Reverse(alike[k]));
+        own.iter().take(PARTNERS).for_each(|&k| chosen[k] = true);
+    }
+    all.into_iter().zip(chosen).filter_map(|(pair, c)| c.then_some(pair)).collect()
+}
+
+/// Estimates the relative poses of all comparable pairs.
+pub(super) fn edges(photos: &[PosePhoto], seed: u64) -> Vec<Edge> {
+    edges_of(photos, compared(photos), seed)
+}
+
+/// Estimates the relative poses of `pairs`.
+fn edges_of(photos: &[PosePhoto], pairs: Vec<[usize; 2]>, seed: u64) -> Vec<Edge> {
+    pairs
+        .into_par_iter()
+        .filter_map(|[i, j]| {
+            let estimate = pair::estimate(&photos[i], &photos[j], false, seed).ok()?;
+            let enough = estimate.consistent >= MIN_PAIR_CONSISTENT
+                && estimate.inliers.len() >= MIN_PAIR_INLIERS;
+            enough.then_some(Edge { photos: [i, j], estimate })
+        })
+        .collect()
+}
+
+/// Estimates the shared focal length of photographs whose lenses are not exact, over that of the
+/// lenses: the weighted median of the estimates of the pairs with most matches.
+pub(super) fn focal_scale(photos: &[PosePhoto], seed: u64) -> f64 {
+    /// Number of pairs that vote.
+    const VOTES: usize = 8;
+    let sketches: Vec<_> = photos.par_iter().map(|p| p.features.strongest(SKETCH)).collect();
+    let mut alike: Vec<(usize, [usize; 2])> = compared(photos)
+        .into_par_iter()
+        .map(|[i, j]| {
+            (crate::cameras::matches::pairs::pairs(&sketches[i], &sketches[j]).len(), [i, j])
+        })
+        .collect();
+    alike.sort_by_key(|(n, pair)| (std::cmp::Reverse(*n), *pair));
+    // Neighbours of a video have many matches and little parallax: every second pair counts.
+    let step = (alike.len() / (2 * VOTES)).clamp(1, 3);
+    let mut votes: Vec<(f64, f64)> = alike
+        .iter()
+        .step_by(step)
+        .take(VOTES)
+        .collect::<Vec<_>>()
+        .into_par_iter()
+        .filter_map(|(_, [i, j])| {
+            let e = pair::estimate(&photos[*i], &photos[*j], false, seed).ok()?;
+            let weight =
+                e.refined.information.try_inverse().map_or(0.0, |c| 1.0 / c[(5, 5)].max(1e-6));
+            (e.consistent >= MIN_PAIR_INLIERS).then_some((e.refined.focal_scale, weight.sqrt()))
+        })
+        .collect();
+    votes.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let total: f64 = votes.iter().map(|v| v.1).sum();
+    let mut sum = 0.0;
+    votes
+        .iter()
+        .find(|v| {
+            sum += v.1;
+            sum >= 0.5 * total
+        })
+        .map_or(1.0, |v| v.0)
+}
+
+/// The growing model.
+struct Builder<'a> {
+    photos: &'a [PosePhoto],
+    tracks: Vec<Vec<FeatureId>>,
+    cameras: Vec<Option<Absolute>>,
+    /// Position of each track; `None` where it is not a point yet.
+    positions: Vec<Option<DVec3>>,
+    /// Features of each point that agree with it.
+    agreeing: Vec<Vec<FeatureId>>,
+    log_focal: f64,
+    prior: Option<FocalPrior>,
+    /// Places of features after the alignment of their surroundings: (track, feature) in order.
+    precise: Vec<Vec<Option<DVec2>>>,
+    /// Largest residual of an observation, standard deviations.
+    limit: f64,
+}
+
+/// Builds cameras and points of `photos` from verified pairs. `prior` is the knowledge of the
+/// focal length over that of the lenses. `None` where no pair is wide enough to start with.
+pub(super) fn build(
+    photos: &[PosePhoto],
+    edges: &[Edge],
+    prior: Option<FocalPrior>,
+    seed: u64,
+) -> Option<Model> {
+    let mut builder = Builder::new(photos, edges, prior);
+    let start = start(edges)?;
+    let [a, b] = start.photos;
+    builder.cameras[a] = Some(Absolute::IDENTITY);
+    builder.cameras[b] =
+        Some(Absolute::IDENTITY.followed_by(&start.estimate.refined.relative, 1.0));
+    builder.triangulate();
+    builder.adjust(10);
+    let mut refused = vec![false; photos.len()];
+    while let Some(next) = builder.most_sights(&refused) {
+        match builder.register(next, seed) {
+            Some(pose) => {
+                builder.cameras[next] = Some(pose);
+                builder.triangulate();
+                builder.adjust(6);
+                // A photograph that was refused before may fit the larger model.
+                refused.fill(false);
+            }
+            None => refused[next] = true,
+        }
+    }
+    builder.align();
+    for _ in 0..2 {
+        builder.triangulate();
+        builder.adjust(25);
+    }
+    Some(builder.finish())
+}
+
+/// Cameras that were adjusted from given ones.
+#[derive(Clone, Debug)]
+pub(super) struct Adjusted {
+    /// One pose for each photograph; `None` where too few points are seen.
+    pub cameras: Vec<Option<Absolute>>,
+    /// Median residual with the given cameras, working px.
+    pub before: f64,
+    /// The same with the adjusted ones.
+    pub after: f64,
+    /// Number of points.
+    pub points: usize,
+}
+
+/// Adjusts `given` cameras by the matches of pairs. `None` where fewer than two photographs see
+/// enough points.
+pub(super) fn adjust(photos: &[PosePhoto], edges: &[Edge], given: &[Absolute]) -> Option<Adjusted> {
+    let mut builder = Builder::new(photos, edges, None);
+    builder.cameras = given.iter().copied().map(Some).collect();
+    builder.limit = GIVEN_LIMIT;
+    builder.triangulate();
+    let mut seen = vec![0usize; photos.len()];
+    builder.agreeing.iter().flatten().for_each(|f| seen[f.photo] += 1);
+    for (camera, seen) in builder.cameras.iter_mut().zip(&seen) {
+        camera.take_if(|_| *seen < MIN_SIGHTS);
+    }
+    if builder.cameras.iter().flatten().count() < 2 {
+        return None;
+    }
+    let start = builder.cameras.clone();
+    builder.adjust(15);
+    builder.limit = LIMIT;
+    builder.triangulate();
+    builder.align();
+    for _ in 0..2 {
+        builder.triangulate();
+        builder.adjust(25);
+    }
+    let (cameras, points) = (builder.cameras.clone(), builder.positions.iter().flatten().count());
+    builder.limit = f64::INFINITY;
+    let mut error = |cameras: &[Option<Absolute>]| {
+        builder.cameras = cameras.to_vec();
+        builder.positions.fill(None);
+        builder.triangulate();
+        builder.median_residual()
+    };
+    let (before, after) = (error(&start)?, error(&cameras)?);
+    Some(Adjusted { cameras, before, after, points })
+}
+
+/// Locates the photographs after the first `known.len()` among the points that those show with the
+/// cameras `known`. `None` for a photograph that shows too few of them.
+pub(super) fn locate_others(
+    photos: &[PosePhoto],
+    known: &[Absolute],
+    seed: u64,
+) -> Vec<Option<Absolute>> {
+    let all = (0..photos.len()).flat_map(|j| (0..j.min(known.len())).map(move |i| [i, j]));
+    let edges = edges_of(photos, all.collect(), seed);
+    let mut builder = Builder::new(photos, &edges, None);
+    builder.cameras[..known.len()].iter_mut().zip(known).for_each(|(c, k)| *c = Some(*k));
+    builder.triangulate();
+    builder.align();
+    builder.triangulate();
+    (known.len()..photos.len()).into_par_iter().map(|i| builder.register(i, seed)).collect()
+}
+
+/// The pair to start with: many matches and a wide angle between their rays.
+fn start(edges: &[Edge]) -> Option<&Edge> {
+    let score = |e: &Edge| {
+        let angle = e.estimate.median_angle();
+        let certain = 1.0 - e.estimate.rival.min(1.0);
+        e.estimate.inliers.len() as f64 * (angle / START_ANGLE).min(1.0).powi(2) * certain.sqrt()
+    };
+    let scored = edges.iter().map(|e| (score(e), e));
+    scored.reduce(|a, b| if b.0 > a.0 { b } else { a }).filter(|s| s.0 > 0.0).map(|s| s.1)
+}
+
+impl<'a> Builder<'a> {
+    /// The matches of `edges` as tracks, without cameras.
+    fn new(photos: &'a [PosePhoto], edges: &[Edge], prior: Option<FocalPrior>) -> Self {
+        let matches = edges.iter().flat_map(|e| {
+            let [a, b] = e.photos;
+            e.estimate.inliers.iter().map(move |p| {
+                [FeatureId { photo: a, feature: p.a }, FeatureId { photo: b, feature: p.b }]
+            })
+        });
+        let tracks = tracks(matches);
+        let count = tracks.len();
+        Self {
+            photos,
+            precise: tracks.iter().map(|t| vec![None; t.len()]).collect(),
+            tracks,
+            cameras: vec![None; photos.len()],
+            positions: vec![None; count],
+            agreeing: vec![Vec::new(); count],
+            log_focal: 0.0,
+            prior,
+            limit: LIMIT,
+        }
+    }
+
+    /// Median distance of the points' projections from their features, working px; `None` without
+    /// points.
+    fn median_residual(&self) -> Option<f64> {
+        let mut all: Vec<f64> = Vec::new();
+        for (track, position) in self.positions.iter().enumerate() {
+            let Some(position) = position else { continue };
+            for (at, f) in self.tracks[track].iter().enumerate() {
+                let Some(camera) = self.cameras[f.photo] else { continue };
+                let p = camera.to_camera(*position);
+                let (bearing, _) = self.sight(track, at);
+                let distance = (p.truncate() / p.z).distance(bearing);
+                all.push(distance * self.photos[f.photo].focal());
+            }
+        }
+        let middle = all.len() / 2;
+        (!all.is_empty()).then(|| *all.select_nth_unstable_by(middle, f64::total_cmp).1)
+    }
+
+    /// Bearing of a track's feature, and its standard deviation, for the lens's own focal length.
+    fn sight(&self, track: usize, at: usize) -> (DVec2, f64) {
+        let id = self.tracks[track][at];
+        let photo = &self.photos[id.photo];
+        let [detected, aligned] = deviations(photo);
+        match self.precise[track][at] {
+            Some(px) => (photo.bearing(px), aligned),
+            None => (photo.bearings[id.feature], detected),
+        }
+    }
+
+    /// The tracks' known points as photograph `photo` sees them, with their tracks.
+    fn sights(&self, photo: usize) -> Vec<(usize, Sight)> {
+        let scale = self.log_focal.exp();
+        let mut out = Vec::new();
+        for (track, position) in self.positions.iter().enumerate() {
+            let Some(point) = *position else { continue };
+            if let Some(at) = self.tracks[track].iter().position(|f| f.photo == photo) {
+                let (bearing, deviation) = self.sight(track, at);
+                let sight = Sight { point, bearing: bearing / scale, deviation: deviation / scale };
+                out.push((track, sight));
+            }
+        }
+        out
+    }
+
+    /// The photograph without a pose that sees most points.
+    fn most_sights(&self, refused: &[bool]) -> Option<usize> {
+        let mut counts = vec![0usize; self.photos.len()];
+        for (track, position) in self.tracks.iter().zip(&self.positions) {
+            if position.is_some() {
+                track.iter().for_each(|f| counts[f.photo] += 1);
+            }
+        }
+        (0..self.photos.len())
+            .filter(|&i| self.cameras[i].is_none() && !refused[i] && counts[i] >= MIN_SIGHTS)
+            .max_by_key(|&i| (counts[i], std::cmp::Reverse(i)))
+    }
+
+    fn register(&self, photo: usize, seed: u64) -> Option<Absolute> {
+        let sights: Vec<Sight> = self.sights(photo).into_iter().map(|s| s.1).collect();
+        let (pose, inside) = locate(&sights, 2.0 * LIMIT, seed)?;
+        let enough = inside.len() >= MIN_SIGHTS
+            && inside.len() as f64 >= MIN_SIGHT_SHARE * sights.len() as f64;
+        enough.then_some(pose)
+    }
+
+    /// Gives every track that two or more cameras see a position, where its rays agree.
+    fn triangulate(&mut self) {
+        let this = &*self;
+        let found: Vec<(Option<DVec3>, Vec<FeatureId>)> =
+            (0..this.tracks.len()).into_par_iter().map(|track| this.triangulated(track)).collect();
+        (self.positions, self.agreeing) = found.into_iter().unzip();
+    }
+
+    fn triangulated(&self, track: usize) -> (Option<DVec3>, Vec<FeatureId>) {
+        let scale = self.log_focal.exp();
+        let mut rays = Vec::new();
+        for (at, f) in self.tracks[track].iter().enumerate() {
+            if let Some(camera) = self.cameras[f.photo] {
+                let (bearing, deviation) = self.sight(track, at);
+                rays.push((*f, camera, bearing / scale, deviation / scale));
+            }
+        }
+        let direction =
+            |c: &Absolute, b: &DVec2| (c.rotation.transpose() * b.extend(1.0)).normalize();
+        let residual = |c: &Absolute, b: DVec2, dev: f64, p: DVec3| {
+            let q = c.to_camera(p);
+            if q.z > 1e-9 { (q.truncate() / q.z).distance(b) / dev } else { f64::INFINITY }
+        };
+        // Of the points of all pairs of rays the one with which most rays agree.
+        let mut best: (usize, Option<DVec3>) = (1, None);
+        for i in 0..rays.len() {
+            for j in i + 1..rays.len() {
+                let (u, v) = (direction(&rays[i].1, &rays[i].2), direction(&rays[j].1, &rays[j].2));
+                if u.angle_between(v) < MIN_ANGLE {
+                    continue;
+                }
+                let p = midpoint([rays[i].1.position(), rays[j].1.position()], [u, v]);
+                let count =
+                    rays.iter().filter(|(_, c, b, d)| residual(c, *b, *d, p) < self.limit).count();
+                if count > best.0 {
+                    best = (count, Some(p));
+                }
+            }
+            if best.0 == rays.len() {
+                break;
+            }
+        }
+        let Some(mut p) = best.1 else { return (None, Vec::new()) };
+        // A point that was adjusted before keeps its place where as many rays agree with it.
+        if let Some(old) = self.positions[track] {
+            let count =
+                rays.iter().filter(|(_, c, b, d)| residual(c, *b, *d, old) < self.limit).count();
+            if count >= best.0 {
+                p = old;
+            }
+        }
+        let agreeing = rays
+            .iter()
+            .filter(|(_, c, b, d)| residual(c, *b, *d, p) < self.limit)
+            .map(|r| r.0)
+            .collect();
+        (Some(p), agreeing)
+    }
+
+    /// Adjusts all cameras, points and the focal length.
+    fn adjust(&mut self, steps: usize) {
+        let (mut bundle, photos, points) = self.bundle();
+        if bundle.cameras.len() < 2 || bundle.points.len() < MIN_SIGHTS {
+            return;
+        }
+        bundle.adjust(steps);
+        self.log_focal = bundle.log_focal;
+        photos.iter().zip(&bundle.cameras).for_each(|(&i, c)| self.cameras[i] = Some(*c));
+        points.iter().zip(&bundle.points).for_each(|(&i, p)| self.positions[i] = Some(*p));
+    }
+
+    /// The bundle of all cameras and points, with their photographs and tracks.
+    fn bundle(&self) -> (Bundle, Vec<usize>, Vec<usize>) {
+        let photos: Vec<usize> =
+            (0..self.photos.len()).filter(|&i| self.cameras[i].is_some()).collect();
+        let index = |photo: usize| photos.binary_search(&photo).ok();
+        let (mut points, mut kept, mut observations) = (Vec::new(), Vec::new(), Vec::new());
+        for (track, position) in self.positions.iter().enumerate() {
+            let Some(position) = position else { continue };
+            for (at, f) in self.tracks[track].iter().enumerate() {
+                let Some(camera) = index(f.photo) else { continue };
+                if self.agreeing[track].contains(f) {
+                    let (bearing, deviation) = self.sight(track, at);
+                    let point = points.len();
+                    observations.push(Observation { camera, point, bearing, deviation });
+                }
+            }
+            points.push(*position);
+            kept.push(track);
+        }
+        let cameras = photos.iter().filter_map(|&i| self.cameras[i]).collect();
+        let bundle =
+            Bundle { cameras, points, observations, log_focal: self.log_focal, prior: self.prior };
+        (bundle, photos, kept)
+    }
+
+    /// Moves the features of each point to where their surroundings agree with those of the feature
+    /// that shows it largest.
+    fn align(&mut self) {
+        let (photos, tracks) = (self.photos, &self.tracks);
+        let agreeing = &self.agreeing;
+        self.precise.par_iter_mut().zip(tracks.par_iter().zip(agreeing)).for_each(
+            |(places, (track, agreeing))| {
+                let size = |f: &FeatureId| photos[f.photo].features.points[f.feature].size;
+                let reference = agreeing
+                    .iter()
+                    .max_by(|a, b| size(a).total_cmp(&size(b)).then(b.cmp(a)))
+                    .copied();
+                let Some(reference) = reference else { return };
+                for (place, f) in places.iter_mut().zip(track) {
+                    let own = || photos[f.photo].position(f.feature);
+                    *place = if *f == reference {
+                        Some(own())
+                    } else {
+                        let from = (&photos[reference.photo], reference.feature);
+                        aligned_position(from, (&photos[f.photo], f.feature))
+                    };
+                }
+            },
+        );
+    }
+
+    fn finish(self) -> Model {
+        let (bundle, photos, _) = self.bundle();
+        let deviations = bundle.deviations();
+        let eyes: Vec<DVec3> = bundle.cameras.iter().map(Absolute::position).collect();
+        let extent = eyes.iter().fold(0.0f64, |m, e| m.max(e.distance(eyes[0])));
+        let most = |v: &[f64]| v.iter().fold(0.0f64, |m, x| m.max(*x));
+        let (rotation, position, focal) = deviations
+            .map_or((f64::INFINITY, f64::INFINITY, 1.0), |d| {
+                (most(&d.rotations), most(&d.translations) / extent.max(1e-12), d.focal)
+            });
+        let mut cameras = vec![None; self.photos.len()];
+        photos.iter().zip(&bundle.cameras).for_each(|(&i, c)| cameras[i] = Some(*c));
+        let points = self
+            .positions
+            .into_iter()
+            .zip(self.agreeing)
+            .filter_map(|(position, features)| Some(Point { position: position?, features }))
+            .filter(|p| p.features.len() > 1)
+            .collect();
+        Model {
+            cameras,
+            points,
+            focal_scale: self.log_focal.exp(),
+            focal_deviation: focal,
+            rotation_deviation: rotation,
+            position_deviation: position,
+        }
+    }
+}
+
+/// The point closest to two rays.
+pub(super) fn midpoint(origins: [DVec3; 2], directions: [DVec3; 2]) -> DVec3 {
+    let [u, v] = directions;
+    let between = origins[1] - origins[0];
+    let c = u.dot(v);
+    let n = (1.0 - c * c).max(1e-15);
+    let s = (between.dot(u) - c * between.dot(v)) / n;
+    let t = (c * between.dot(u) - between.dot(v)) / n;
+    0.5 * (origins[0] + s * u + origins[1] + t * v)
+}

@@ -1,0 +1,160 @@
+//! Readers and writers of every file format. Readers convert to the conventions of
+//! `camera.rs`; writers convert from them.
+//!
+//! Writers write a temporary file and rename it at the end ([`write_atomic`]), so that no
+//! reader sees a partial file. Readers compare every declared size with the bytes that
+//! exist before they allocate. They check the checksums of a container and refuse bytes
+//! after its end.
+
+pub mod compressed_ply;
+mod gaussians;
+pub mod glb;
+mod glb_read;
+pub mod ksplat;
+pub mod ply;
+mod ply_container;
+pub mod splat;
+pub mod splats;
+pub mod spz;
+
+pub use splats::{
+    SaveOptions, SaveReport, SplatFormat, SplatInfo, Up, encode_splats, encode_splats_with,
+    load_splats, load_with_comments, parse_splats, save_splats, splat_info,
+};
+mod assemble;
+pub mod base64;
+pub mod cameras_json;
+pub mod colmap;
+mod decode;
+pub mod exif;
+mod heic;
+mod icc;
+pub mod image;
+mod jpeg;
+pub mod matrices;
+pub mod photograph;
+pub mod protocol;
+pub mod re10k;
+pub mod resize;
+mod rgb_image;
+pub mod scene;
+pub mod tensors;
+pub mod torch;
+pub mod transforms;
+pub mod undistort;
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+use thiserror::Error;
+
+/// Reason for which a file is refused or cannot be written.
+#[derive(Debug, Error)]
+pub enum Error {
+    /// The operating system reports an error: missing file, no permission, full disk.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// The system's error.
+        source: std::io::Error,
+    },
+    /// The content is malformed.
+    #[error("{}{at}: expected {expected}, got {got}", path.display())]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// Place in the file: `:12` (a line), ` at byte 96`, ` frame 3`, or empty.
+        at: String,
+        /// The accepted content.
+        expected: String,
+        /// The content found.
+        got: String,
+    },
+}
+
+/// Result of the functions of this module.
+pub type Result<T> = std::result::Result<T, Error>;
+
+impl Error {
+    /// Makes an [`Error::Io`] for `path`.
+    pub fn io(path: impl Into<PathBuf>, source: std::io::Error) -> Self {
+        Self::Io { path: path.into(), source }
+    }
+
+    /// Makes an [`Error::Format`] for the whole of `path`.
+    pub fn format(
+        path: impl Into<PathBuf>,
+        expected: impl Into<String>,
+        got: impl Into<String>,
+    ) -> Self {
+        let (expected, got) = (expected.into(), got.into());
+        Self::Format { path: path.into(), at: String::new(), expected, got }
+    }
+
+    /// Returns the same error at a place in the file: `:12`, ` at byte 96`, ` frame 3`.
+    #[must_use]
+    pub fn at(mut self, place: impl Into<String>) -> Self {
+        if let Self::Format { at, .. } = &mut self {
+            *at = place.into();
+        }
+        self
+    }
+}
+
+/// Reads a whole file.
+///
+/// # Errors
+/// [`Error::Io`]: missing, unreadable, a directory.
+pub fn read(path: &Path) -> Result<Vec<u8>> {
+    std::fs::read(path).map_err(|e| Error::io(path, e))
+}
+
+/// Writes `path` through `body`: to a temporary file in the same folder, which is flushed to
+/// the disk and renamed. An error removes the temporary file and leaves the old file as it
+/// was.
+///
+/// # Errors
+/// No such folder, no permission, full disk; the error of `body`.
+pub fn write_atomic(
+    path: &Path,
+    body: impl FnOnce(&mut BufWriter<File>) -> std::io::Result<()>,
+) -> Result<()> {
+    let name = path.file_name().ok_or_else(|| Error::format(path, "a file name", "a folder"))?;
+    let mut temporary = name.to_owned();
+    temporary.push(format!(".{}.part", std::process::id()));
+    let temporary = path.with_file_name(temporary);
+    let attempt = || -> std::io::Result<()> {
+        let mut file = BufWriter::new(File::create(&temporary)?);
+        body(&mut file)?;
+        file.flush()?;
+        file.get_ref().sync_all()?;
+        drop(file);
+        std::fs::rename(&temporary, path)
+    };
+    attempt().map_err(|e| {
+        // The first error is reported; this one is not.
+
+        let _ = std::fs::remove_file(&temporary);
+        Error::io(path, e)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_failed_write_leaves_the_old_file_and_no_other() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.bin");
+        write_atomic(&path, |f| f.write_all(b"old")).unwrap();
+        let failed = write_atomic(&path, |f| {
+            f.write_all(b"half")?;
+            Err(std::io::Error::other("disk full"))
+        });
+        assert!(failed.unwrap_err().to_string().contains("disk full"));
+        assert_eq!(read(&path).unwrap(), b"old");
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+}

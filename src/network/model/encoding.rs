@@ -1,0 +1,276 @@
+//! One scene after the backbone, on the executor that computed it.
+//!
+//! On a GPU the backbone's outputs, the primaries and the children stay in device memory until the
+//! host needs them: [`SceneEncoding::render`] reads one picture, [`SceneEncoding::children`] the
+//! Gaussians. A failure of the device repeats the scene on the CPU.
+
+use super::primaries::primaries;
+use super::subsplat::{SceneOutput, SubSplat, in_pool};
+use super::trace::{Checkpoint, Trace};
+#[cfg(feature = "gpu")]
+use super::trunk::DeviceParents;
+use super::trunk::{MixedChildren, Trunk};
+use super::{BackboneOutput, Primaries, Views};
+#[cfg(feature = "gpu")]
+use crate::network::ops::{Array, DeviceArray};
+use crate::scene::splats::Splats;
+use candle_core::{Result, Tensor, bail};
+use subsplat_kernels::camera::Camera;
+use subsplat_kernels::layout::RasterOptions;
+
+/// Outputs of the backbone for one scene.
+pub struct SceneFeatures {
+    views: Views,
+    output: Output,
+}
+
+/// Outputs of the backbone for one scene, and its primaries.
+pub struct SceneEncoding {
+    views: Views,
+    place: Place,
+}
+
+enum Output {
+    Host(BackboneOutput),
+    #[cfg(feature = "gpu")]
+    Device(BackboneOutput<DeviceArray>),
+}
+
+enum Place {
+    Host(BackboneOutput, Primaries),
+    #[cfg(feature = "gpu")]
+    Device(Box<DeviceParents>),
+}
+
+impl SubSplat {
+    /// Runs the backbone on the one scene in `views`, with `checkpoint` after each of
+    /// [`SubSplat::encode_steps`]. A GPU has executed all work at the return, and keeps the results.
+    ///
+    /// # Errors
+    /// More than one scene; those of [`SubSplat::encode_with`].
+    pub fn encode_scene(&self, views: &Views, checkpoint: Checkpoint<'_>) -> Result<SceneFeatures> {
+        self.features(views, checkpoint, true)
+    }
+
+    /// [`SubSplat::encode_scene`]; without `waits` a GPU may still work.
+    pub(super) fn features(
+        &self,
+        views: &Views,
+        checkpoint: Checkpoint<'_>,
+        waits: bool,
+    ) -> Result<SceneFeatures> {
+        self.check_input(views)?;
+        if views.scenes() != 1 {
+            bail!("encoding: expected one scene, got {}", views.scenes());
+        }
+        #[cfg(feature = "gpu")]
+        if let Some(result) = self.trunk().on_device(|executor| {
+            let images = executor.upload(&views.images)?;
+            let output = self.encode_on(views, &images, &mut Trace::with_checkpoint(checkpoint))?;
+            // Inference needs no tape, and the trunk not all maps.
+            let mut output = output.map(|array| Ok(array.detached()))?;
+            output.features.retain(|(level, _)| self.trunk().reads(*level));
+            if waits {
+                executor.finish()?;
+            }
+            Ok(SceneFeatures { views: views.clone(), output: Output::Device(output) })
+        }) {
+            return result;
+        }
+        // The CPU has nothing to wait for.
+        let _ = waits;
+        self.host_features(views, checkpoint)
+    }
+
+    /// Runs the backbone on the CPU.
+    fn host_features(&self, views: &Views, checkpoint: Checkpoint<'_>) -> Result<SceneFeatures> {
+        let mut trace = Trace::with_checkpoint(checkpoint);
+        let output = self.encode_on(views, &views.images, &mut trace)?;
+        Ok(SceneFeatures { views: views.clone(), output: Output::Host(output) })
+    }
+
+    /// Places the primaries in world frame.
+    ///
+    /// # Errors
+    /// Shapes of the outputs that do not fit the views.
+    pub fn place(&self, features: SceneFeatures) -> Result<SceneEncoding> {
+        let SceneFeatures { views, output } = features;
+        let settings = self.config().primaries();
+        #[cfg(feature = "gpu")]
+        let output = match output {
+            Output::Host(output) => output,
+            Output::Device(output) => {
+                let sh_input = self.config().embed.sh;
+                let placed = self
+                    .trunk()
+                    .on_device(|_| DeviceParents::new(output, &views, settings, sh_input));
+                return match placed {
+                    Some(parents) => {
+                        Ok(SceneEncoding { views, place: Place::Device(Box::new(parents?)) })
+                    }
+                    None => self.encoding_on_host(&views),
+                };
+            }
+        };
+        #[cfg(not(feature = "gpu"))]
+        let Output::Host(output) = output;
+        let parents = primaries(&output, &views, settings, &mut Trace::off())?;
+        Ok(SceneEncoding::new(views, output, parents))
+    }
+
+    /// Computes backbone and primaries on the CPU, after a failure of the device.
+    #[cfg(feature = "gpu")]
+    fn encoding_on_host(&self, views: &Views) -> Result<SceneEncoding> {
+        self.place(in_pool(|| self.host_features(views, &|| Ok(())))?)
+    }
+}
+
+impl SceneEncoding {
+    /// Returns results in host memory.
+    pub fn new(views: Views, output: BackboneOutput, primaries: Primaries) -> Self {
+        Self { views, place: Place::Host(output, primaries) }
+    }
+
+    /// Returns the number of primaries of a view.
+    pub fn per_view(&self) -> usize {
+        match &self.place {
+            Place::Host(_, primaries) => primaries.per_view,
+            #[cfg(feature = "gpu")]
+            Place::Device(parents) => parents.per_view,
+        }
+    }
+
+    /// Returns the number of steps of [`SceneEncoding::children`] with `trunk`.
+    pub fn steps(&self, trunk: &Trunk) -> usize {
+        trunk.steps_of(self.per_view() * self.views.views(), self.per_view())
+    }
+
+    /// Returns the primaries as Gaussians in host memory.
+    ///
+    /// # Errors
+    /// A number that is not finite.
+    pub fn parents(&self, network: &SubSplat) -> Result<Splats> {
+        match &self.place {
+            Place::Host(_, primaries) => {
+                network.trunk().parents(&self.views, primaries)?.to_splats()
+            }
+            #[cfg(feature = "gpu")]
+            Place::Device(parents) => {
+                match network.trunk().on_device(|executor| parents.to_host(executor)) {
+                    Some(parents) => parents,
+                    None => network.encoding_on_host(&self.views)?.parents(network),
+                }
+            }
+        }
+    }
+
+    /// Computes the children, with `checkpoint` after each of [`SceneEncoding::steps`], on any thread. A
+    /// GPU has executed a step at its checkpoint.
+    ///
+    /// # Errors
+    /// Those of [`Trunk::forward_with`].
+    pub fn children(&self, network: &SubSplat, checkpoint: Checkpoint<'_>) -> Result<SceneOutput> {
+        let (output, primaries) = match &self.place {
+            Place::Host(output, primaries) => (output, primaries),
+            #[cfg(feature = "gpu")]
+            Place::Device(parents) => {
+                let made = network.trunk().on_device(|executor| {
+                    let (trunk, steps) = (network.trunk(), (checkpoint, true));
+                    let children = trunk.device_children(&self.views, parents, steps)?;
+                    let (children, depths) = children.to_host(executor, &[&parents.depths])?;
+                    let finite = |t: &Tensor| -> Result<bool> {
+                        Ok(t.flatten_all()?.to_vec1::<f32>()?.iter().all(|v| v.is_finite()))
+                    };
+                    if !finite(&children.rows)? || !finite(&children.gain)? {
+                        // The checked form names the parent.
+                        trunk.check_device_children(&self.views, parents)?;
+                    }
+                    let depths = distances(depths.first())?;
+                    Ok(SceneOutput { children, depths })
+                });
+                return match made {
+                    Some(made) => made,
+                    None => network.encoding_on_host(&self.views)?.children(network, checkpoint),
+                };
+            }
+        };
+        let trunk = network.trunk();
+        let children = trunk.forward_with(&self.views, output, primaries, checkpoint)?;
+        Ok(SceneOutput { children, depths: distances(Some(&output.depths))? })
+    }
+
+    /// Computes children of which parent i, one of `parents`, has `counts[i]`, and the distances of
+    /// [`SceneOutput::depths`].
+    ///
+    /// # Errors
+    /// Those of [`Trunk::forward_mixed`].
+    pub fn mixed(
+        &self,
+        network: &SubSplat,
+        parents: &Splats,
+        counts: &[u8],
+        checkpoint: Checkpoint<'_>,
+    ) -> Result<(MixedChildren, Vec<Vec<f32>>)> {
+        let trunk = network.trunk();
+        let (output, primaries) = match &self.place {
+            Place::Host(output, primaries) => (output, primaries),
+            #[cfg(feature = "gpu")]
+            Place::Device(device) => {
+                let made = trunk.on_device(|executor| {
+                    let own = (&**device, parents);
+                    let mixed = trunk.device_mixed(&self.views, own, counts, checkpoint)?;
+                    let depths = executor.read(&[&device.depths])?;
+                    Ok((mixed, distances(depths.first())?))
+                });
+                return match made {
+                    Some(made) => made,
+                    None => network
+                        .encoding_on_host(&self.views)?
+                        .mixed(network, parents, counts, checkpoint),
+                };
+            }
+        };
+        let own = (primaries, parents);
+        let mixed = trunk.host_mixed(&self.views, output, own, counts, checkpoint)?;
+        Ok((mixed, distances(Some(&output.depths))?))
+    }
+
+    /// Renders the children from `camera`: `[5, H, W]` ([`Trunk::render`]). A GPU reads nothing back but
+    /// the picture and its number of (splat, tile) pairs, and does not draw Gaussians that are not finite.
+    ///
+    /// # Errors
+    /// Those of [`Trunk::render`]; on a GPU no error names a Gaussian that is not finite.
+    pub fn render(
+        &self,
+        network: &SubSplat,
+        camera: &Camera,
+        options: &RasterOptions,
+    ) -> Result<Tensor> {
+        let trunk = network.trunk();
+        match &self.place {
+            Place::Host(output, primaries) => {
+                in_pool(|| trunk.render(&self.views, output, primaries, camera, options))
+            }
+            #[cfg(feature = "gpu")]
+            Place::Device(parents) => {
+                let made = trunk.on_device(|executor| {
+                    let steps: (Checkpoint<'_>, bool) = (&|| Ok(()), false);
+                    let children = trunk.device_children(&self.views, parents, steps)?;
+                    children.render(executor, camera, options)
+                });
+                match made {
+                    Some(picture) => picture,
+                    None => network.encoding_on_host(&self.views)?.render(network, camera, options),
+                }
+            }
+        }
+    }
+}
+
+/// Distance of each pixel's first Gaussian, `[V][H·W]`, of `[1, V, H·W, G]`.
+fn distances(depths: Option<&Tensor>) -> Result<Vec<Vec<f32>>> {
+    match depths {
+        Some(depths) => depths.narrow(3, 0, 1)?.squeeze(3)?.squeeze(0)?.to_vec2(),
+        None => bail!("depths: expected a tensor, got none"),
+    }
+}

@@ -1,0 +1,127 @@
+//! Results of the backbone for training, on either executor.
+//!
+//! On a GPU the results are copies in host memory, and leaves of candle's graph. candle's backward
+//! pass ends at them; [`Traced::backward`] continues it on the device.
+
+#[cfg(feature = "gpu")]
+use super::BackboneOutput;
+#[cfg(feature = "gpu")]
+use super::backbone::small::DepthMaps;
+#[cfg(feature = "gpu")]
+use crate::network::ops::{Array, DeviceArray, Executor};
+#[cfg(feature = "gpu")]
+use candle_core::Var;
+use candle_core::backprop::GradStore;
+use candle_core::{Result, Tensor};
+#[cfg(feature = "gpu")]
+use std::sync::Arc;
+
+/// Tensors of a forward pass, and its tape where a GPU computed them.
+pub struct Traced<T> {
+    /// The tensors.
+    pub value: T,
+    #[cfg(feature = "gpu")]
+    tape: Option<Tape>,
+}
+
+/// Copies of results in host memory, and the results.
+#[cfg(feature = "gpu")]
+pub(super) struct Tape {
+    executor: Arc<Executor>,
+    results: Vec<(Var, DeviceArray)>,
+}
+
+impl<T> Traced<T> {
+    /// Returns tensors whose graph is candle's.
+    pub(super) fn on_host(value: T) -> Self {
+        Self {
+            value,
+            #[cfg(feature = "gpu")]
+            tape: None,
+        }
+    }
+
+    /// Returns the tensors of [`Tape::copy`].
+    #[cfg(feature = "gpu")]
+    pub(super) fn on_device(value: T, tape: Tape) -> Self {
+        Self { value, tape: Some(tape) }
+    }
+
+    /// Replaces the tensors, with which the tape stays.
+    pub fn map<U>(self, f: impl FnOnce(T) -> U) -> Traced<U> {
+        Traced {
+            value: f(self.value),
+            #[cfg(feature = "gpu")]
+            tape: self.tape,
+        }
+    }
+
+    /// Continues the backward pass whose gradients are in `store`. Returns scalars, to whose sum
+    /// the caller applies candle's `backward` for the gradients of the parameters; none where
+    /// `store` has them.
+    ///
+    /// # Errors
+    /// Errors of the device.
+    pub fn backward(self, store: &GradStore) -> Result<Vec<Tensor>> {
+        #[cfg(feature = "gpu")]
+        if let Some(tape) = self.tape {
+            return tape.backward(store);
+        }
+        let _ = store;
+        Ok(Vec::new())
+    }
+}
+
+#[cfg(feature = "gpu")]
+impl Tape {
+    pub(super) fn new(executor: &Arc<Executor>) -> Self {
+        Self { executor: executor.clone(), results: Vec::new() }
+    }
+
+    /// Copies a result to host memory.
+    pub(super) fn copy(&mut self, result: &DeviceArray) -> Result<Tensor> {
+        let leaf = Var::from_tensor(&result.to_host()?)?;
+        let tensor = leaf.as_tensor().clone();
+        if result.is_tracked() {
+            self.results.push((leaf, result.clone()));
+        }
+        Ok(tensor)
+    }
+
+    fn backward(self, store: &GradStore) -> Result<Vec<Tensor>> {
+        let mut pairs = Vec::new();
+        for (leaf, result) in self.results {
+            if let Some(gradient) = store.get(&leaf) {
+                pairs.push((result, self.executor.upload(&gradient.detach())?));
+            }
+        }
+        let pairs: Vec<_> = pairs.iter().map(|(result, gradient)| (result, gradient)).collect();
+        self.executor.backward(&pairs)?.scalars()
+    }
+}
+
+#[cfg(feature = "gpu")]
+impl BackboneOutput<DeviceArray> {
+    /// Returns copies in host memory that `tape` knows.
+    pub(super) fn copied(&self, tape: &mut Tape) -> Result<BackboneOutput> {
+        let features = self.features.iter().map(|(level, map)| Ok((*level, tape.copy(map)?)));
+        Ok(BackboneOutput {
+            features: features.collect::<Result<_>>()?,
+            raw: tape.copy(&self.raw)?,
+            depths: tape.copy(&self.depths)?,
+            densities: tape.copy(&self.densities)?,
+        })
+    }
+}
+
+#[cfg(feature = "gpu")]
+impl DepthMaps<DeviceArray> {
+    /// Returns copies in host memory that `tape` knows.
+    pub(super) fn copied(&self, tape: &mut Tape) -> Result<DepthMaps> {
+        Ok(DepthMaps {
+            logits: tape.copy(&self.logits)?,
+            index: tape.copy(&self.index)?,
+            confidence: tape.copy(&self.confidence)?,
+        })
+    }
+}

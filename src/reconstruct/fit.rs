@@ -1,0 +1,72 @@
+//! Fit and refinement of a reconstructed scene on its photographs.
+
+use super::{Error, Result};
+use crate::files::image::Rgb;
+use crate::fit::{FitError, FitOptions, FitReport, FitView, fit};
+use crate::reconstruct::inputs::crop::Cropped;
+use crate::refine::{Groups, RefineOptions, RefineReport, Refiner, refine_groups};
+use crate::scene::render::Renderer;
+use crate::scene::splats::Splats;
+use std::ops::ControlFlow;
+use subsplat_kernels::camera::Camera;
+use subsplat_kernels::layout::RasterOptions;
+
+/// The largest picture of `c` that is no enlargement of the photograph, with its camera: the
+/// target's size, else the input's.
+fn sharp_picture(c: &Cropped) -> (&Camera, &Rgb) {
+    match c.window.scale.min_element() < 1.0 {
+        true => (&c.input_camera, &c.input),
+        false => (&c.target_camera, &c.target),
+    }
+}
+
+/// Fits the Gaussians of `inputs` to their photographs. `progress` receives the number of steps
+/// done.
+///
+/// # Errors
+/// [`Error::Cancelled`]; a picture of another size than its camera.
+pub fn fit_to_inputs(
+    splats: &mut Splats,
+    inputs: &[Cropped],
+    raster: &RasterOptions,
+    options: &FitOptions,
+    renderer: &mut Renderer,
+    progress: &mut dyn FnMut(usize) -> ControlFlow<()>,
+) -> Result<FitReport> {
+    fit(splats, &views_of(inputs), raster, options, renderer, progress).map_err(error)
+}
+
+/// Refines the Gaussians of `inputs`, those of each photograph in `groups`, on their photographs.
+/// `progress` receives the refinement after each step.
+///
+/// # Errors
+/// [`Error::Cancelled`]; a picture of another size than its camera.
+pub fn refine_on_inputs(
+    splats: &mut Splats,
+    groups: &mut Groups,
+    inputs: &[Cropped],
+    raster: &RasterOptions,
+    options: &RefineOptions,
+    renderer: &mut Renderer,
+    progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
+) -> Result<RefineReport> {
+    refine_groups(splats, groups, &views_of(inputs), raster, options, renderer, progress)
+        .map_err(error)
+}
+
+fn views_of(inputs: &[Cropped]) -> Vec<FitView<'_>> {
+    let view = |c| {
+        let (camera, image) = sharp_picture(c);
+        FitView { camera, image }
+    };
+    inputs.iter().map(view).collect()
+}
+
+fn error(e: FitError) -> Error {
+    match e {
+        FitError::Cancelled => Error::Cancelled,
+        FitError::Size { view, expected, got } => {
+            Error::argument(format!("photograph {view}"), expected, got)
+        }
+    }
+}

@@ -1,0 +1,96 @@
+//! From photographs to a rendered scene in one call. Applications and programs use this module.
+//!
+//! ```no_run
+//! use std::ops::ControlFlow;
+//! use subsplat::reconstruct::{DepthBounds, Options, Photo, Reconstructor};
+//! # fn main() -> subsplat::Result<()> {
+//! let scene = subsplat::files::scene::load_scene("scene".as_ref())?;
+//! let photos = [Photo::from_frame(&scene.frames[0])?, Photo::from_frame(&scene.frames[1])?];
+//! let options = Options::default().with_depth_prior(DepthBounds::of_scene(&scene, &[0, 1])?);
+//! let model = Reconstructor::load("weights.safetensors".as_ref(), None)?;
+//! let result = model.run_with(&photos, &options, &mut |progress| {
+//!     println!("{:3.0} % {}", 100.0 * progress.fraction, progress.stage);
+//!     ControlFlow::Continue(())
+//! })?;
+//! result.save("scene.ply".as_ref())?;
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! The stages ([`Stage`]), in order:
+//!
+//! 0. With [`Poses::Adjusted`], the cameras are adjusted by points matched between photographs.
+//! 1. The initial depth range comes from [`Options::depth_range`], then from
+//!    [`Options::depth_prior`], then from the distance between the cameras.
+//! 2. The size of the network's input follows from the photographs' shapes ([`InputSize`]). Each
+//!    photograph is cropped to it and to the target size.
+//! 3. Points are matched between consecutive photographs. They check the poses ([`Check`]),
+//!    their depths replace a range that was only guessed, and their colours bring the
+//!    photographs to the exposure of the one of middle brightness.
+//! 4. The small backbone estimates near and far at half size, unless the caller fixed one.
+//! 5. The network predicts one primary Gaussian per input pixel, then its children.
+//! 6. The photographs add detail to the children's colours ([`Detail`]).
+//! 7. Sizes, opacities and colours are fitted to the photographs ([`crate::fit::fit`]).
+//! 8. Means, shapes, opacities and colours are refined on the photographs ([`crate::refine::refine`]).
+//!
+//! [`Reconstructor::run`] executes all of them. [`Reconstructor::prepare`] executes steps 1 to 3;
+//! the caller can then free large photographs before the network runs.
+
+mod children;
+mod density;
+mod depth_range;
+mod detail;
+mod error;
+mod exposure;
+mod fit;
+mod input_size;
+pub mod inputs;
+mod loose;
+mod options;
+mod photo;
+mod poses;
+mod prepared;
+mod progress;
+mod reconstruction;
+mod reconstructor;
+mod warning;
+
+pub use crate::network::model::Backend;
+pub use density::Density;
+pub use depth_range::{DepthBounds, DepthRange, DepthSource};
+pub use error::{Error, Result};
+pub use input_size::InputSize;
+pub use loose::{
+    KnownLens, LensSource, LooseOptions, LoosePhotos, LooseScene, loose_photos, loose_scene,
+};
+pub use options::{Check, Detail, Options, Poses, Refine, TargetSize};
+pub use photo::Photo;
+pub use poses::PoseError;
+pub use prepared::Prepared;
+pub use progress::{Progress, Stage, StageTime};
+pub use reconstruction::Reconstruction;
+pub use reconstructor::Reconstructor;
+pub use warning::Warning;
+
+pub(crate) use children::{SceneChildren, counts_of};
+pub(crate) use depth_range::{initial_bounds, refined_bounds};
+pub(crate) use fit::{fit_to_inputs, refine_on_inputs};
+pub(crate) use poses::check_pairs;
+
+/// The stages of a run, one by one, for evaluation. No version promises anything about them.
+pub mod stages {
+    pub use super::children::{Counts, SceneChildren, counts_of};
+    pub use super::depth_range::{initial_bounds, refined_bounds};
+    pub use super::detail::add_detail;
+    pub use super::exposure::equalise;
+    pub use super::fit::{fit_to_inputs, refine_on_inputs};
+    pub use super::poses::{adjusted, check_pairs, located};
+    pub use crate::refine::Groups;
+}
+
+use crate::network::config::{Backbone, Config};
+
+/// Returns whether a configuration's backbone is MVSplat.
+pub fn is_mvsplat(config: &Config) -> bool {
+    matches!(config.backbone, Backbone::Mvsplat(_))
+}

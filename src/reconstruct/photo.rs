@@ -1,0 +1,118 @@
+//! A photograph with its camera.
+
+use super::{Error, Result};
+use crate::files::image::{LoadOptions, Rgb};
+use crate::files::scene::{Frame, LoadedFrame};
+use crate::reconstruct::inputs::crop::{CropOptions, Cropped, crop};
+use std::sync::Arc;
+use subsplat_kernels::camera::{Camera, Size};
+
+/// A photograph without lens distortion, and its pinhole camera. Clones share the pixels.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Photo {
+    image: Arc<Rgb>,
+    camera: Camera,
+}
+
+impl Photo {
+    /// Combines pixels (an [`Rgb`] or an `image::RgbImage`) with their camera.
+    ///
+    /// # Errors
+    /// The buffer does not hold 3·W·H bytes; the camera has another picture size.
+    pub fn new(image: impl Into<Rgb>, camera: Camera) -> Result<Self> {
+        let image = image.into();
+        let Rgb { width, height, data } = &image;
+        let bytes = width.checked_mul(*height).and_then(|n| n.checked_mul(3));
+        if bytes != Some(data.len()) {
+            let expected = format!("3 bytes for each of {width}x{height} pixels");
+            return Err(Error::argument("photograph", expected, format!("{} bytes", data.len())));
+        }
+        let k = camera.intrinsics();
+        if (k.width, k.height) != (*width, *height) {
+            let expected = format!("a camera of {width}x{height} pixels");
+            let got = format!("one of {}x{}", k.width, k.height);
+            return Err(Error::argument("photograph", expected, got));
+        }
+        Ok(Self { image: Arc::new(image), camera })
+    }
+
+    /// Decodes a frame's picture and removes its lens distortion.
+    ///
+    /// # Errors
+    /// Those of [`Frame::load`].
+    pub fn from_frame(frame: &Frame) -> Result<Self> {
+        Self::from_frame_with(frame, &LoadOptions::default())
+    }
+
+    /// [`Photo::from_frame`] with options of the decoding.
+    ///
+    /// # Errors
+    /// Those of [`Frame::load_with`].
+    pub fn from_frame_with(frame: &Frame, options: &LoadOptions) -> Result<Self> {
+        let LoadedFrame { picture, camera, .. } = frame.load_with(options)?;
+        Ok(Self { image: Arc::new(picture), camera })
+    }
+
+    /// The same pixels with the pose of another camera; the intrinsics stay.
+    pub(super) fn with_pose_of(&self, camera: &Camera) -> Result<Self> {
+        self.with_camera(Camera::new_unchecked(
+            self.camera.intrinsics(),
+            camera.world_from_camera(),
+        ))
+    }
+
+    /// The same pixels with another camera of their size.
+    pub fn with_camera(&self, camera: Camera) -> Result<Self> {
+        let camera = Camera::new(camera.intrinsics(), camera.world_from_camera())?;
+        Ok(Self { image: Arc::clone(&self.image), camera })
+    }
+
+    /// The size.
+    pub fn size(&self) -> Size {
+        Size::new(self.image.width, self.image.height)
+    }
+
+    /// The pixels.
+    pub fn image(&self) -> &Rgb {
+        &self.image
+    }
+
+    /// Pinhole camera of these pixels.
+    pub fn camera(&self) -> &Camera {
+        &self.camera
+    }
+
+    /// Crops and resizes the photograph to the network's input and to the target picture.
+    ///
+    /// # Errors
+    /// Those of [`crop`].
+    pub fn crop(&self, options: &CropOptions) -> Result<Cropped> {
+        Ok(crop(&self.image, &self.camera, options)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Mat4;
+    use subsplat_kernels::camera::Intrinsics;
+
+    #[test]
+    fn pixels_and_camera_must_fit() {
+        let camera =
+            Camera::new(Intrinsics::from_fov_x(1.0, 4, 3), Mat4::IDENTITY).expect("a valid camera");
+        assert!(Photo::new(Rgb::black(4, 3), camera).is_ok());
+        assert!(Photo::new(image::RgbImage::new(4, 3), camera).is_ok());
+        let cut = Rgb { data: vec![0; 35], ..Rgb::black(4, 3) };
+        for (photo, words) in [
+            (
+                Photo::new(Rgb::black(3, 4), camera),
+                "expected a camera of 3x4 pixels, got one of 4x3",
+            ),
+            (Photo::new(cut, camera), "4x3 pixels, got 35 bytes"),
+        ] {
+            let error = photo.unwrap_err().to_string();
+            assert!(error.contains(words), "{error}");
+        }
+    }
+}

@@ -1,0 +1,123 @@
+//! Check and adjustment of the poses by points matched between photographs.
+
+use super::{Error, Photo, Result};
+use crate::cameras::check::{CheckOptions, Finding, GrayImage, PairReport, Verdict, check_pair};
+use crate::cameras::estimation::{Lens, PoseAdjustment, PosePhoto, adjust_poses, locate_photos};
+use crate::files::image::Rgb;
+use rayon::prelude::*;
+use std::fmt;
+use subsplat_kernels::camera::Camera;
+
+/// Cameras that [`Check::Refuse`](super::Check::Refuse) rejected.
+#[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
+pub struct PoseError {
+    /// Index of the first photograph of the pair; the second one follows it.
+    pub first: usize,
+    /// The findings of that pair, worst first.
+    pub findings: Vec<Finding>,
+}
+
+impl fmt::Display for PoseError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (i, j) = (self.first, self.first + 1);
+        let finding = self.findings.first().map_or("they do not fit", |f| f.sentence.as_str());
+        write!(f, "poses of photographs {i} and {j} (counted from 0): {finding}")
+    }
+}
+
+impl std::error::Error for PoseError {}
+
+/// Returns an error for the first pair whose poses are judged bad.
+pub(super) fn refuse_bad(reports: &[PairReport]) -> Result<()> {
+    match reports.iter().position(|r| r.verdict == Verdict::Bad) {
+        Some(first) => Err(PoseError { first, findings: reports[first].findings.clone() }.into()),
+        None => Ok(()),
+    }
+}
+
+/// Matches each photograph with the next one. `checked` receives the share of pairs that are
+/// done. Grey images exist for one pair at a time.
+///
+/// # Errors
+/// A photograph without pixels; the error of `checked`.
+pub fn check_pairs(
+    photos: &[Photo],
+    mut checked: impl FnMut(f32) -> Result<()>,
+) -> Result<Vec<PairReport>> {
+    let pairs = photos.len().saturating_sub(1);
+    let mut reports = Vec::with_capacity(pairs);
+    for pair in photos.windows(2) {
+        let [a, b] = [grey(&pair[0])?, grey(&pair[1])?];
+        let options = CheckOptions::default();
+        reports.push(check_pair(&a, pair[0].camera(), &b, pair[1].camera(), &options));
+        checked(reports.len() as f32 / pairs as f32)?;
+    }
+    Ok(reports)
+}
+
+/// Features of each photograph for the adjustment.
+const FEATURES: usize = 4000;
+/// Seed of the random samples of the adjustment.
+const SEED: u64 = 1;
+
+/// Photographs with cameras that were adjusted by points matched between them. `None` where the
+/// cameras fit them already, or too few points are matched.
+///
+/// # Errors
+/// A photograph of which no features can be taken.
+pub fn adjusted(photos: &[Photo]) -> Result<Option<(Vec<Photo>, PoseAdjustment)>> {
+    let Some(found) = adjust_poses(&features(photos)?, &cameras(photos), SEED) else {
+        return Ok(None);
+    };
+    let moved = photos.iter().zip(&found.cameras).map(|(p, camera)| p.with_pose_of(camera));
+    Ok(Some((moved.collect::<Result<_>>()?, found)))
+}
+
+/// The cameras of `others`, located by points matched with `photos`. `None` where too few are matched.
+///
+/// # Errors
+/// A photograph of which no features can be taken.
+pub fn located(photos: &[Photo], others: &[Photo]) -> Result<Vec<Option<Camera>>> {
+    let all = [features(photos)?, features(others)?].concat();
+    Ok(locate_photos(&all, &cameras(photos), &cameras(others), SEED))
+}
+
+fn features(photos: &[Photo]) -> Result<Vec<PosePhoto>> {
+    let of = |p: &Photo| {
+        let lens = Lens::known(p.camera().intrinsics());
+        PosePhoto::from_rgb8(&p.image().data, lens, FEATURES)
+    };
+    Ok(photos.par_iter().map(of).collect::<std::result::Result<_, _>>()?)
+}
+
+fn cameras(photos: &[Photo]) -> Vec<Camera> {
+    photos.iter().map(|p| *p.camera()).collect()
+}
+
+fn grey(photo: &Photo) -> Result<GrayImage> {
+    let Rgb { width, height, data } = photo.image();
+    GrayImage::from_rgb8(*width, *height, data).ok_or_else(|| {
+        let expected = format!("{width}x{height} pixels");
+        Error::argument("photograph", expected, data.len().to_string())
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bad_pair_is_named_with_its_finding() {
+        let sentence = "the poses fit if they are read as OpenGL's".to_owned();
+        let code = "poses_wrong".to_owned();
+        let finding = Finding { severity: Verdict::Bad, code, sentence };
+        let bad =
+            PairReport { verdict: Verdict::Bad, findings: vec![finding], ..PairReport::default() };
+        let error = refuse_bad(&[PairReport::default(), bad]).unwrap_err();
+        let text = "poses of photographs 1 and 2 (counted from 0): the poses fit if they are read as \
+                    OpenGL's";
+        assert_eq!(error.to_string(), text);
+        assert!(refuse_bad(&[PairReport::default()]).is_ok());
+    }
+}

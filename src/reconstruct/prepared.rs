@@ -1,0 +1,182 @@
+//! Photographs that are cropped and checked, and the network's run on them.
+
+use super::progress::Tracker;
+use super::{
+    DepthBounds, Detail, Options, Progress, Reconstruction, Reconstructor, Result, SceneChildren,
+    Stage, Warning, counts_of, fit_to_inputs, refine_on_inputs,
+};
+use crate::cameras::check::PairReport;
+use crate::cameras::estimation::PoseAdjustment;
+use crate::files::image::{Depth, Rgb};
+use crate::network::model::Views;
+use crate::reconstruct::inputs::crop::Cropped;
+use crate::refine::Refiner;
+use crate::scene::render::Renderer;
+use std::ops::ControlFlow;
+use subsplat_kernels::camera::Camera;
+
+/// Steps of the estimate of the depth range.
+const RANGE_STEPS: usize = 4;
+
+/// Cropped photographs with a depth range, from [`Reconstructor::prepare`]. It holds nothing of
+/// the photographs' full size.
+pub struct Prepared<'a> {
+    pub(super) model: &'a Reconstructor,
+    pub(super) options: Options,
+    pub(super) inputs: Vec<Cropped>,
+    pub(super) adjustment: Option<PoseAdjustment>,
+    pub(super) cut_shares: Vec<f32>,
+    pub(super) bounds: DepthBounds,
+    pub(super) reports: Vec<PairReport>,
+    pub(super) warnings: Vec<Warning>,
+    pub(super) tracker: Tracker,
+}
+
+impl Prepared<'_> {
+    /// The photographs at the sizes of the network's input and of the target.
+    pub fn inputs(&self) -> &[Cropped] {
+        &self.inputs
+    }
+
+    /// Change of the given cameras ([`Poses::Adjusted`](super::Poses::Adjusted)); `None` where they
+    /// stayed.
+    pub fn pose_adjustment(&self) -> Option<&PoseAdjustment> {
+        self.adjustment.as_ref()
+    }
+
+    /// Share of each photograph that its crop does not show, 0 to 1.
+    pub fn cut_shares(&self) -> &[f32] {
+        &self.cut_shares
+    }
+
+    /// The depth range before the network estimates its own.
+    pub fn depth_range(&self) -> &DepthBounds {
+        &self.bounds
+    }
+
+    /// Reports of the check, one for each pair of consecutive photographs; empty without one.
+    pub fn reports(&self) -> &[PairReport] {
+        &self.reports
+    }
+
+    /// Warnings so far.
+    pub fn warnings(&self) -> &[Warning] {
+        &self.warnings
+    }
+
+    /// Runs the network.
+    ///
+    /// # Errors
+    /// An error of the network.
+    pub fn reconstruct(self) -> Result<Reconstruction> {
+        self.reconstruct_with(&mut |_| ControlFlow::Continue(()))
+    }
+
+    /// [`Prepared::reconstruct`] with a callback for progress, whose fractions continue those of
+    /// [`Reconstructor::prepare_with`].
+    ///
+    /// # Errors
+    /// Those of [`Prepared::reconstruct`]; [`Error::Cancelled`](super::Error::Cancelled).
+    pub fn reconstruct_with(
+        self,
+        progress: &mut dyn FnMut(Progress) -> ControlFlow<()>,
+    ) -> Result<Reconstruction> {
+        let Self { model, options, inputs, adjustment, cut_shares, bounds, reports, .. } = self;
+        let (mut warnings, mut tracker) = (self.warnings, self.tracker);
+        if model.estimates_depth_range(&options) {
+            tracker.begin(Stage::DepthRange, progress)?;
+        }
+        let initial_bounds = bounds.clone();
+        let network = model.model();
+        let estimate = |views: &Views| {
+            tracker.run_steps(RANGE_STEPS, progress, |step| {
+                network.estimate_depth_range_with(views, step)
+            })
+        };
+        let (views, bounds) = model.views_with(&inputs, bounds, options.depth_range, estimate)?;
+        tracker.begin(Stage::Backbone, progress)?;
+        let steps = network.encode_steps(inputs.len());
+        let features =
+            tracker.run_steps(steps, progress, |step| network.encode_scene(&views, step))?;
+        tracker.begin(Stage::Primaries, progress)?;
+        let encoding = network.place(features)?;
+        tracker.begin(Stage::Subsplat, progress)?;
+        let config = model.config();
+        let colour = Rgb::mean_colour(inputs.iter().map(|c| &c.input));
+        let raster_at = |ratio: f32| config.raster_options(ratio, bounds.near, colour);
+        let mut renderer = Renderer::new(model.backend());
+        let density = options.density;
+        let counts =
+            counts_of(network, &encoding, &inputs, density, &raster_at(1.0), &mut renderer)?;
+        let steps = encoding.steps(network.trunk());
+        let mut children = tracker.run_steps(steps, progress, |step| {
+            SceneChildren::new(network, &encoding, inputs.len(), counts, step)
+        })?;
+        drop((views, encoding));
+        let mut detail = Detail::Off;
+        if options.detail == Detail::Photographs {
+            tracker.begin(Stage::Detail, progress)?;
+            if children.add_detail(&inputs, config.upscale)? {
+                detail = Detail::Photographs;
+            }
+        }
+        let parent_counts = children.counts().to_vec();
+        let SceneChildren { mut splats, mut groups, distances, .. } = children;
+        let raster_options = raster_at(inputs.first().map_or(1.0, Cropped::ratio));
+        let (mut fit, mut refinement) = (None, None);
+        let (fit_options, refine_options) =
+            (&options.fit, options.refine_options(inputs.len(), splats.len()));
+        if fit_options.steps > 0 {
+            tracker.begin(Stage::Fit, progress)?;
+            let mut part = tracker.parts(progress);
+            let mut step = |step| part(step as f32 / fit_options.steps as f32);
+            let (raster, how) = (&raster_options, fit_options);
+            let done = fit_to_inputs(&mut splats, &inputs, raster, how, &mut renderer, &mut step)?;
+            fit = Some(done);
+        }
+        if refine_options.steps > 0 {
+            tracker.begin(Stage::Refine, progress)?;
+            let mut part = tracker.parts(progress);
+            let mut step = |refiner: &Refiner<'_>| part(refiner.progress());
+            let (raster, how) = (&raster_options, &refine_options);
+            let (splats, groups) = (&mut splats, &mut groups);
+            let done =
+                refine_on_inputs(splats, groups, &inputs, raster, how, &mut renderer, &mut step)?;
+            refinement = Some(done);
+        }
+        warnings.extend(renderer.take_warning().map(|reason| Warning::CpuInsteadOfGpu { reason }));
+        let depths = inputs.iter().zip(distances);
+        let depths = depths.map(|(c, d)| camera_depth(&c.input_camera, d)).collect();
+        warnings.extend(Warning::of_bounds(&bounds));
+        warnings.extend(model.backend_warning());
+        Ok(Reconstruction {
+            splats,
+            groups,
+            counts: parent_counts,
+            inputs,
+            adjustment,
+            cut_shares,
+            depths,
+            bounds,
+            initial_bounds,
+            raster_options,
+            detail,
+            fit,
+            refinement,
+            reports,
+            warnings,
+            stage_times: tracker.finish(progress)?,
+        })
+    }
+}
+
+/// Converts distances along the unit ray to camera z.
+fn camera_depth(camera: &Camera, distances: Vec<f32>) -> Depth {
+    let k = camera.intrinsics();
+    let mut data = distances;
+    for (i, d) in data.iter_mut().enumerate() {
+        let px = glam::Vec2::new((i % k.width) as f32 + 0.5, (i / k.width) as f32 + 0.5);
+        *d /= k.unproject(px).length();
+    }
+    Depth { width: k.width, height: k.height, data }
+}

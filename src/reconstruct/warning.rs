@@ -1,0 +1,163 @@
+//! Warnings of a reconstruction.
+
+use super::{DepthBounds, Photo};
+use crate::cameras::check::{Finding, PairReport};
+use crate::reconstruct::inputs::crop::{CropOptions, Cropped};
+use std::fmt;
+use subsplat_kernels::camera::Size;
+
+/// A circumstance that may spoil the result. [`fmt::Display`] gives one sentence without a final
+/// full stop.
+#[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
+pub enum Warning {
+    /// The check of the poses found something.
+    #[non_exhaustive]
+    Poses {
+        /// Index of the first photograph of the pair; the second one follows it.
+        first: usize,
+        /// The finding.
+        finding: Finding,
+    },
+    /// Nothing but the distance between the cameras determined near or far.
+    #[non_exhaustive]
+    DepthRangeGuessed {
+        /// Nearest depth candidate, world units.
+        near: f32,
+        /// Farthest depth candidate, world units.
+        far: f32,
+    },
+    /// The input size was cut to multiples of the model's stride.
+    #[non_exhaustive]
+    InputSizeCut {
+        /// The size that was requested.
+        requested: Size,
+        /// The size that is used.
+        used: Size,
+        /// The model's stride, px.
+        stride: usize,
+    },
+    /// A photograph is smaller than the target picture, and was enlarged.
+    #[non_exhaustive]
+    PhotographEnlarged {
+        /// Size of the photograph.
+        size: Size,
+        /// Size after resizing.
+        resized: Size,
+    },
+    /// The weights lack some or all of SubSplat's tensors, the heads that place children.
+    #[non_exhaustive]
+    UntrainedTensors {
+        /// Number of missing tensors.
+        count: usize,
+        /// r: side of the children's grid.
+        upscale: usize,
+    },
+    /// A photograph was brought to the exposure and white balance of another one.
+    #[non_exhaustive]
+    ExposureCorrected {
+        /// Index of the photograph.
+        photo: usize,
+        /// Index of the photograph of middle brightness, which stays.
+        reference: usize,
+        /// Factor on each channel, red first.
+        gain: [f32; 3],
+        /// Offset of each channel, 8-bit levels.
+        offset: [f32; 3],
+    },
+    /// The GPU failed or refused a call, and the CPU did the work.
+    #[non_exhaustive]
+    CpuInsteadOfGpu {
+        /// The GPU's error.
+        reason: String,
+    },
+}
+
+impl fmt::Display for Warning {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Poses { finding, .. } => f.write_str(&finding.sentence),
+            Self::DepthRangeGuessed { near, far } => write!(
+                f,
+                "near {near:.4} and far {far:.4} are guesses from the distance between the \
+                 cameras; fix the depth range if you know it"
+            ),
+            Self::InputSizeCut { requested, used, stride } => {
+                write!(f, "input size {requested} is cut to {used}, multiples of {stride}")
+            }
+            Self::PhotographEnlarged { size, resized } => write!(
+                f,
+                "the photograph of {size} is enlarged to {resized}: the target shows no more \
+                 detail than the photograph has"
+            ),
+            Self::UntrainedTensors { count, upscale } => {
+                let children = upscale * upscale;
+                write!(f, "the weights lack {count} tensors of the heads for upscale {upscale}")?;
+                match children {
+                    1 => f.write_str(": each pixel gives the backbone's one Gaussian"),
+                    _ => write!(
+                        f,
+                        ": each pixel is split evenly into {children} Gaussians, which adds no \
+                         learned detail"
+                    ),
+                }
+            }
+            Self::ExposureCorrected { photo, reference, gain: [r, g, b], offset: [x, y, z] } => {
+                write!(
+                    f,
+                    "photograph {photo} (counted from 0) is brought to the exposure of photograph \
+                 {reference}: gain {r:.2} {g:.2} {b:.2}, offset {x:+.0} {y:+.0} {z:+.0} of 255"
+                )
+            }
+            Self::CpuInsteadOfGpu { reason } => f.write_str(reason),
+        }
+    }
+}
+
+impl Warning {
+    /// All findings of the checked pairs.
+    pub(super) fn of_reports(reports: &[PairReport]) -> Vec<Self> {
+        let pair = |(first, report): (usize, &PairReport)| {
+            let warning = move |finding: &Finding| Self::Poses { first, finding: finding.clone() };
+            report.findings.iter().map(warning).collect::<Vec<_>>()
+        };
+        reports.iter().enumerate().flat_map(pair).collect()
+    }
+
+    /// Sizes that were cut, and photographs that were enlarged; each warning once.
+    pub(super) fn of_crops(
+        photos: &[Photo],
+        inputs: &[Cropped],
+        options: &CropOptions,
+    ) -> Vec<Self> {
+        let mut warnings = Vec::new();
+        let mut add = |warning: Self| {
+            if !warnings.contains(&warning) {
+                warnings.push(warning);
+            }
+        };
+        let (requested, stride) = (options.input_size, options.stride);
+        for c in inputs {
+            let used = Size::new(c.input.width, c.input.height);
+            if used != requested {
+                add(Self::InputSizeCut { requested, used, stride });
+            }
+        }
+        for (photo, c) in photos.iter().zip(inputs) {
+            let scale = c.window.scale;
+            if scale.min_element() < 1.0 {
+                let size = photo.size();
+                let side = |side: usize, scale: f32| (side as f32 / scale).round() as usize;
+                let resized = Size::new(side(size.width, scale.x), side(size.height, scale.y));
+                add(Self::PhotographEnlarged { size, resized });
+            }
+        }
+        warnings
+    }
+
+    /// A warning where nothing but the baseline determined an end of `bounds`.
+    pub(super) fn of_bounds(bounds: &DepthBounds) -> Option<Self> {
+        let DepthBounds { near, far, source } = bounds;
+        source.is_guess().then_some(Self::DepthRangeGuessed { near: *near, far: *far })
+    }
+}

@@ -1,0 +1,10 @@
+//! Scenes of Gaussians, their pictures and their measures.
+
+pub mod levels;
+pub mod metrics;
+pub mod navigation;
+pub mod render;
+pub mod score;
+pub mod splats;
+
+pub use render::render;

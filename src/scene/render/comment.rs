@@ -1,0 +1,148 @@
+//! Rasterizer options and a first camera as comments of a scene file.
+//!
+//! A .ply or .glb file does not state which rules its Gaussians were made for, nor from where they
+//! are to be seen. Convention, near plane, low-pass and background therefore travel as one comment
+//! line, the camera of the first photograph as another.
+
+use glam::Mat4;
+use subsplat_kernels::camera::{Camera, Intrinsics};
+use subsplat_kernels::layout::{Convention, RasterOptions};
+
+/// First words of the comment.
+const PREFIX: &str = "subsplat render:";
+
+/// Formats `options` as a comment for a scene file; [`options_of_comments`] reads it.
+pub fn comment_of_options(options: &RasterOptions) -> String {
+    let convention = match options.convention {
+        Convention::Standard => "standard",
+        Convention::Mvsplat => "mvsplat",
+    };
+    let [r, g, b] = options.background;
+    format!(
+        "{PREFIX} convention={convention} near={} lowpass={} background={r},{g},{b}",
+        options.near, options.lowpass
+    )
+}
+
+/// First words of the comment of a camera.
+const CAMERA_PREFIX: &str = "subsplat camera:";
+
+/// Formats `camera` as a comment for a scene file; [`camera_of_comments`] reads it.
+pub fn comment_of_camera(camera: &Camera) -> String {
+    let k = camera.intrinsics();
+    let pose = camera.world_from_camera().transpose().to_cols_array();
+    let pose: Vec<String> = pose[..12].iter().map(f32::to_string).collect();
+    format!(
+        "{CAMERA_PREFIX} size={},{} focal={},{} centre={},{} c2w={}",
+        k.width,
+        k.height,
+        k.fx,
+        k.fy,
+        k.cx,
+        k.cy,
+        pose.join(",")
+    )
+}
+
+/// Reads the camera of a file's comments; `None` where no comment holds a valid one.
+pub fn camera_of_comments(comments: &[String]) -> Option<Camera> {
+    let text = comments.iter().find_map(|c| c.trim().strip_prefix(CAMERA_PREFIX))?;
+    let value = |key: &str| text.split_whitespace().find_map(|w| w.strip_prefix(key));
+    let numbers = |key: &str| {
+        let all = value(key)?.split(',').map(str::parse::<f32>).collect::<Result<Vec<_>, _>>();
+        all.ok().filter(|all| all.iter().all(|v| v.is_finite()))
+    };
+    let mut size = value("size=")?.split(',').map(|side| side.parse::<usize>().ok());
+    let (width, height) = (size.next()??, size.next()??);
+    let [fx, fy] = <[f32; 2]>::try_from(numbers("focal=")?).ok()?;
+    let [cx, cy] = <[f32; 2]>::try_from(numbers("centre=")?).ok()?;
+    let rows = <[f32; 12]>::try_from(numbers("c2w=")?).ok()?;
+    let mut pose = [0.0; 16];
+    pose[..12].copy_from_slice(&rows);
+    pose[15] = 1.0;
+    let pose = Mat4::from_cols_array(&pose).transpose();
+    Camera::new(Intrinsics { fx, fy, cx, cy, width, height }, pose).ok()
+}
+
+/// Leaves out comments that hold in a file's own axes only.
+pub fn comments_without_camera(comments: &[String]) -> Vec<String> {
+    comments.iter().filter(|c| !c.trim().starts_with(CAMERA_PREFIX)).cloned().collect()
+}
+
+/// Reads convention, near plane, low-pass and background from a file's comments; `None` where
+/// no comment holds valid ones.
+pub fn options_of_comments(comments: &[String]) -> Option<RasterOptions> {
+    let text = comments.iter().find_map(|c| c.trim().strip_prefix(PREFIX))?;
+    let value = |key: &str| text.split_whitespace().find_map(|w| w.strip_prefix(key));
+    let number = |key: &str| value(key)?.parse::<f32>().ok().filter(|v| v.is_finite());
+    let convention = match value("convention=")? {
+        "standard" => Convention::Standard,
+        "mvsplat" => Convention::Mvsplat,
+        _ => return None,
+    };
+    let near = number("near=").filter(|v| *v > 0.0)?;
+    let lowpass = number("lowpass=").filter(|v| *v >= 0.0)?;
+    let mut options = RasterOptions { near, lowpass, ..RasterOptions::new(convention) };
+    // Files of earlier versions have no background.
+    let channels = value("background=").map(|v| v.split(',').map(str::parse::<f32>));
+    if let Some(Ok(rgb)) = channels.map(|all| all.collect::<Result<Vec<_>, _>>())
+        && let Ok(rgb) = <[f32; 3]>::try_from(rgb)
+        && rgb.iter().all(|v| (0.0..=1.0).contains(v))
+    {
+        options.background = rgb;
+    }
+    Some(options)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_comment_restores_the_options() {
+        for (convention, near, lowpass) in
+            [(Convention::Standard, 0.01f32, 0.3f32), (Convention::Mvsplat, 1.25, 1.2)]
+        {
+            let background = [near.min(1.0), 0.25, 0.0];
+            let plain = RasterOptions::new(convention);
+            let options = RasterOptions { near, lowpass, background, ..plain };
+            let comments = ["up is -y".to_owned(), comment_of_options(&options)];
+            assert_eq!(options_of_comments(&comments), Some(options));
+        }
+        for bad in [
+            "",
+            "convention=gsplat near=1 lowpass=0.3",
+            "convention=standard near=-1 lowpass=0.3",
+            "convention=standard near=1 lowpass=nan",
+            "near=1 lowpass=0.3",
+        ] {
+            assert_eq!(options_of_comments(&[format!("{PREFIX} {bad}")]), None, "{bad}");
+        }
+    }
+
+    #[test]
+    fn a_comment_restores_a_camera() {
+        let k = Intrinsics { fx: 300.1, fy: 299.7, cx: 127.3, cy: 90.2, width: 256, height: 192 };
+        let pose = Mat4::from_rotation_translation(
+            glam::Quat::from_euler(glam::EulerRot::XYZ, 0.3, -1.7, 0.05),
+            glam::Vec3::new(0.1, -2.7, 1e-3),
+        );
+        let camera = Camera::new(k, pose).unwrap();
+        let comments = ["up is -y".to_owned(), comment_of_camera(&camera)];
+        assert_eq!(camera_of_comments(&comments), Some(camera));
+        assert_eq!(comments_without_camera(&comments), ["up is -y"]);
+        let good = comment_of_camera(&camera);
+        for (from, to) in [
+            ("size=256,192", "size=256"),
+            ("size=256,192", "size=0,192"),
+            ("focal=300.1", "focal=nan"),
+            ("centre=", "center="),
+            ("c2w=", "c2w=1,"),
+            ("c2w=", "c2w=5"),
+        ] {
+            let bad = good.replace(from, to);
+            assert_ne!(bad, good);
+            assert_eq!(camera_of_comments(std::slice::from_ref(&bad)), None, "{bad}");
+        }
+    }
+}

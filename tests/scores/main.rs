@@ -1,7 +1,0 @@
-//! Metrics, evaluation and the parts of training.
-
-mod eval;
-mod lpips;
-mod metrics;
-mod train_mvsplat;
-mod train_parts;

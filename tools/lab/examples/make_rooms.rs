@@ -1,0 +1,47 @@
+//! Makes a test set of procedural rooms for `subsplat eval`, one scene folder each:
+//!
+//! ```text
+//! cargo run --release --example make_rooms -- out/rooms 24 77   # folder, rooms, seed (and
+//!     # the share of rooms with things close before the cameras: 0; the share of scenes of
+//!     # shapes at random places, with cameras of a wide range: 0)
+//! subsplat eval out/rooms --upscale 2
+//! ```
+//!
+//! Two context pictures and two targets of 256², drawn as training draws its examples
+//! but from another seed; `eval` halves the context pictures to get its ×2 input.
+
+use anyhow::{Context, Result};
+use std::path::PathBuf;
+use subsplat_lab::train::TrainConfig;
+use subsplat_lab::train::folders::write_scene;
+use subsplat_lab::train::source::Source;
+use subsplat_lab::train::validate::{Split, rooms};
+
+/// Side of every picture, px.
+const SIDE: usize = 256;
+const TARGETS: usize = 2;
+
+fn main() -> Result<()> {
+    let mut arguments = std::env::args().skip(1);
+    let folder = PathBuf::from(arguments.next().unwrap_or_else(|| "out/rooms".to_owned()));
+    let mut number = |default: u64| -> Result<u64> {
+        arguments.next().map_or(Ok(default), |text| text.parse().context("a number"))
+    };
+    let (count, seed) = (number(24)?, number(77)?);
+    let mut share = || arguments.next().map_or(Ok(0.0), |text| text.parse().context("a share"));
+    let (foreground, scattered) = (share()?, share()?);
+    let mut config = TrainConfig::default();
+    config.model.upscale = 1;
+    config.data.input = [SIDE, SIDE];
+    config.data.targets = TARGETS;
+    config.data.target_samples = 2;
+    config.data.seed = seed;
+    config.data.foreground = foreground;
+    (config.data.scattered, config.data.wide) = (scattered, scattered);
+    let source = rooms(&config, Split::HeldOut)?;
+    for i in 0..count {
+        write_scene(&*source.example(i)?, &folder.join(format!("room_{i:03}")))?;
+    }
+    println!("{count} rooms in {}", folder.display());
+    Ok(())
+}

@@ -1,0 +1,340 @@
+//! The pictures of a case by every method: one set of Gaussians after the other.
+
+use super::Method;
+use super::evaluator::{Crops, Options};
+use super::methods::{enlarged, mean, nearest};
+use std::ops::ControlFlow;
+use subsplat::files::image::Rgb;
+use subsplat::fit::FitOptions;
+use subsplat::network::config::LowpassRef;
+use subsplat::network::model::encoding::SceneEncoding;
+use subsplat::network::model::subsplat::feature_channels;
+use subsplat::network::model::trunk::Trunk;
+use subsplat::network::model::weights::Weights;
+use subsplat::reconstruct::inputs::crop::Cropped;
+use subsplat::reconstruct::stages::{
+    SceneChildren, add_detail, counts_of, fit_to_inputs, refine_on_inputs,
+};
+use subsplat::reconstruct::{Density, DepthBounds, Error, Reconstructor, Refine, Result};
+use subsplat::refine::Refiner;
+use subsplat::scene::render::{Renderer, render_with};
+use subsplat::scene::splats::Splats;
+use subsplat_kernels::camera::Camera;
+use subsplat_kernels::clock::Instant;
+use subsplat_kernels::cpu::Rasterizer;
+use subsplat_kernels::layout::RasterOptions;
+
+/// Makes the pictures of one case. One set of Gaussians is in memory at a time.
+pub(super) struct PictureMaker<'a> {
+    /// Target side over input side.
+    upscale: f32,
+    /// Depth range of the network's candidates.
+    bounds: DepthBounds,
+    /// Mean colour of the inputs.
+    colour: [f32; 3],
+    network: Option<Network<'a>>,
+    density: Density,
+    /// The set that `splats` holds.
+    current: Option<Set>,
+    splats: Option<SceneChildren>,
+    rasterizer: Rasterizer,
+    /// Mean alpha of the last rendered picture.
+    coverage: f64,
+    /// Seconds of depth range, backbone and primaries.
+    network_seconds: f64,
+    /// Seconds of the current set, made of the primaries.
+    set_seconds: f64,
+}
+
+/// The backbone's outputs of one case, and the model.
+struct Network<'a> {
+    model: &'a Reconstructor,
+    views: subsplat::network::model::Views,
+    output: subsplat::network::model::BackboneOutput,
+    parents: subsplat::network::model::Primaries,
+}
+
+/// A set of Gaussians that methods share.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Set {
+    Children,
+    Detailed,
+    Fitted,
+    Refined,
+    /// The children of two inputs alone, with detail.
+    Pair([usize; 2]),
+    Opaque,
+    Random,
+    Parents,
+    Uniform,
+}
+
+/// Sets of which each is made of the one before it.
+const REFINED_IN_ORDER: [Set; 4] = [Set::Children, Set::Detailed, Set::Fitted, Set::Refined];
+
+impl Set {
+    /// The set of `method` for a picture seen by `camera`.
+    fn of(method: &Method, inputs: &[Cropped], camera: &Camera) -> Option<Self> {
+        match method {
+            Method::Subsplat => Some(Self::Children),
+            Method::Detail => Some(Self::Detailed),
+            Method::Fit => Some(Self::Fitted),
+            Method::Refine => Some(Self::Refined),
+            Method::Pair => nearest_two(inputs, camera).map(Self::Pair),
+            Method::Opaque => Some(Self::Opaque),
+            Method::Random => Some(Self::Random),
+            Method::Backbone | Method::Lowpass | Method::Bilinear => Some(Self::Parents),
+            Method::Uniform => Some(Self::Uniform),
+            Method::Copy | Method::Mean | Method::Other { .. } => None,
+        }
+    }
+}
+
+impl<'a> PictureMaker<'a> {
+    /// Runs the network where a method needs it.
+    ///
+    /// # Errors
+    /// No model for a method that needs one; an error of the network.
+    pub(super) fn new(
+        options: &Options,
+        model: Option<&'a Reconstructor>,
+        crops: &Crops,
+    ) -> Result<Self> {
+        let begin = Instant::now();
+        let needed = options.methods.iter().find(|m| m.needs_model());
+        let mut bounds = crops.bounds.clone();
+        let network = match (needed, model) {
+            (None, _) => None,
+            (Some(method), None) => return Err(Error::argument(method.name(), "a model", "none")),
+            (Some(_), Some(model)) => {
+                let (views, found) = model.views(&crops.inputs, bounds, crops.depth_range)?;
+                bounds = found;
+                let output = model.model().encode(&views)?;
+                let parents = model.model().primaries(&views, &output)?;
+                Some(Network { model, views, output, parents })
+            }
+        };
+        Ok(Self {
+            upscale: options.upscale,
+            bounds,
+            colour: Rgb::mean_colour(crops.inputs.iter().map(|c| &c.input)),
+            network,
+            density: options.density,
+            current: None,
+            splats: None,
+            rasterizer: Rasterizer::new(),
+            coverage: 0.0,
+            network_seconds: begin.elapsed().as_secs_f64(),
+            set_seconds: 0.0,
+        })
+    }
+
+    /// Depth range of the network's candidates.
+    pub(super) fn bounds(&self) -> &DepthBounds {
+        &self.bounds
+    }
+
+    /// The current Gaussians.
+    pub(super) fn splats(&self) -> Option<&Splats> {
+        self.splats.as_ref().map(|c| &c.splats)
+    }
+
+    /// Mean alpha of the last rendered picture.
+    pub(super) fn coverage(&self) -> f64 {
+        self.coverage
+    }
+
+    /// Seconds from the inputs to the current Gaussians.
+    pub(super) fn seconds(&self) -> f64 {
+        self.network_seconds + self.set_seconds
+    }
+
+    /// Makes the Gaussians of `method` for a picture seen by `camera`, unless they are in memory.
+    pub(super) fn select(&mut self, method: &Method, crops: &Crops, camera: &Camera) -> Result<()> {
+        let set = Set::of(method, &crops.inputs, camera);
+        let (Some(set), Some(network)) = (set, &self.network) else { return Ok(()) };
+        if self.current == Some(set) {
+            return Ok(());
+        }
+        let begin = Instant::now();
+        let place = |set: Set| REFINED_IN_ORDER.iter().position(|s| *s == set);
+        let mut before = 0.0;
+        let (from, to) = (self.current.and_then(place), place(set));
+        let splats = match (from, to, self.splats.take()) {
+            (Some(from), Some(to), Some(splats)) if from < to => {
+                before = self.set_seconds;
+                self.refined(network, splats, crops, &REFINED_IN_ORDER[from + 1..=to])?
+            }
+            (_, Some(to), _) => {
+                let raster = self.raster_options(network, 1.0, None);
+                let children = network.children(&crops.inputs, self.density, &raster)?;
+                self.refined(network, children, crops, &REFINED_IN_ORDER[1..=to])?
+            }
+            (_, None, _) => SceneChildren::of_splats(match set {
+                Set::Pair(pair) => network.splats_of_pair(pair, crops)?,
+                Set::Opaque | Set::Random => self.reduced(network, crops, set)?,
+                _ => network.splats(set, self.upscale.ceil() as usize)?,
+            }),
+        };
+        self.set_seconds = before + begin.elapsed().as_secs_f64();
+        (self.current, self.splats) = (Some(set), Some(splats));
+        Ok(())
+    }
+
+    /// Takes `splats` through the steps `sets` of [`REFINED_IN_ORDER`].
+    fn refined(
+        &self,
+        network: &Network<'_>,
+        mut children: SceneChildren,
+        crops: &Crops,
+        sets: &[Set],
+    ) -> Result<SceneChildren> {
+        let (inputs, upscale) = (&crops.inputs, network.model.config().upscale);
+        let raster = self.raster_options(network, self.upscale, None);
+        let mut renderer = Renderer::default();
+        for set in sets {
+            let renderer = &mut renderer;
+            match set {
+                Set::Detailed => {
+                    children.add_detail(inputs, upscale)?;
+                }
+                Set::Fitted => {
+                    let options = FitOptions::default();
+                    let mut progress = |_: usize| ControlFlow::Continue(());
+                    let splats = &mut children.splats;
+                    fit_to_inputs(splats, inputs, &raster, &options, renderer, &mut progress)?;
+                }
+                _ => {
+                    // As `run`: none of more Gaussians than `Auto` refines.
+                    let SceneChildren { splats, groups, .. } = &mut children;
+                    let options = Refine::Auto.options_for(inputs.len(), splats.len(), true);
+                    let (raster, how) = (&raster, &options);
+                    let mut progress = |_: &Refiner<'_>| ControlFlow::Continue(());
+                    refine_on_inputs(splats, groups, inputs, raster, how, renderer, &mut progress)?;
+                }
+            }
+        }
+        Ok(children)
+    }
+
+    /// The Gaussians of [`Set::Detailed`] at full density, as many as the density allows: those of
+    /// the highest opacities ([`Set::Opaque`]), or random ones.
+    fn reduced(&self, network: &Network<'_>, crops: &Crops, set: Set) -> Result<Splats> {
+        let raster = self.raster_options(network, 1.0, None);
+        let mut children = network.children(&crops.inputs, Density::Full, &raster)?;
+        let upscale = network.model.config().upscale;
+        children.add_detail(&crops.inputs, upscale)?;
+        let splats = children.splats;
+        let limit = self.density.limit(splats.parents(), crops.inputs.len(), upscale);
+        let rank = |i: usize| match set {
+            Set::Opaque => f64::from(splats.opacity(i)),
+            // The fractional part of multiples of the golden ratio is spread evenly.
+            _ => (i as f64 * 0.618_033_988_749_895).fract(),
+        };
+        let mut order: Vec<usize> = (0..splats.len()).collect();
+        order.sort_by(|a, b| rank(*b).total_cmp(&rank(*a)));
+        order.truncate(limit);
+        order.sort_unstable();
+        Ok(splats.selected(&order))
+    }
+
+    /// The picture of `method` at a target, of the current Gaussians: RGB, display values.
+    pub(super) fn picture(&mut self, method: &Method, crops: &Crops, target: &Cropped) -> Vec<f32> {
+        let (r, camera) = (self.upscale, &target.target_camera);
+        let size = (target.target.width, target.target.height);
+        match method {
+            Method::Copy => nearest(&crops.inputs, camera, size),
+            Method::Mean => mean(&crops.inputs, size),
+            Method::Lowpass => self.render(camera, r, Some(LowpassRef::Input)),
+            Method::Backbone => self.render(camera, r, Some(LowpassRef::Target)),
+            Method::Bilinear => {
+                let small = self.render(&target.input_camera, 1.0, None);
+                enlarged(&small, (target.input.width, target.input.height), size)
+            }
+            _ => self.render(camera, r, None),
+        }
+    }
+
+    /// The model's rules of rendering pictures whose pixels are 1/`ratio` input pixels.
+    fn raster_options(
+        &self,
+        network: &Network<'_>,
+        ratio: f32,
+        reference: Option<LowpassRef>,
+    ) -> RasterOptions {
+        let mut config = network.model.config().clone();
+        config.render.lowpass_ref = reference.unwrap_or(config.render.lowpass_ref);
+        config.raster_options(ratio, self.bounds.near, self.colour)
+    }
+
+    /// Renders the current Gaussians from `camera`, whose pixels are 1/`ratio` input pixels.
+    fn render(&mut self, camera: &Camera, ratio: f32, reference: Option<LowpassRef>) -> Vec<f32> {
+        let (Some(network), Some(children)) = (&self.network, &self.splats) else {
+            return Vec::new();
+        };
+        let options = self.raster_options(network, ratio, reference);
+        let picture = render_with(&mut self.rasterizer, &children.splats, camera, &options);
+        let alpha: f64 = picture.alpha.iter().copied().map(f64::from).sum();
+        self.coverage = alpha / picture.alpha.len().max(1) as f64;
+        picture.rgb
+    }
+}
+
+impl Network<'_> {
+    /// The model's Gaussians, without detail. `raster` renders pictures of the input's size.
+    fn children(
+        &self,
+        inputs: &[Cropped],
+        density: Density,
+        raster: &RasterOptions,
+    ) -> Result<SceneChildren> {
+        let Self { views, output, parents, .. } = self;
+        let network = self.model.model();
+        let encoding = SceneEncoding::new(views.clone(), output.clone(), parents.clone());
+        let mut renderer = Renderer::default();
+        let counts = counts_of(network, &encoding, inputs, density, raster, &mut renderer)?;
+        Ok(SceneChildren::new(network, &encoding, inputs.len(), counts, &|| Ok(()))?)
+    }
+
+    /// Gaussians of a baseline.
+    fn splats(&self, set: Set, r: usize) -> Result<Splats> {
+        let mut config = self.model.config().clone();
+        let own;
+        let trunk = match set {
+            Set::Parents | Set::Uniform => {
+                config.upscale = r;
+                config.spgr.enabled = set == Set::Uniform;
+                // Heads whose last layers are zero do not depend on their inputs.
+                config.spgr.zero_init = true;
+                config.agg.enabled = false;
+                let start = Weights::seeded(0).builder();
+                own = Trunk::new(&config, &feature_channels(&config), start)?;
+                &own
+            }
+            _ => self.model.model().trunk(),
+        };
+        let children = trunk.forward(&self.views, &self.output, &self.parents);
+        Ok(children.and_then(|c| c.to_splats())?)
+    }
+
+    /// The children of two inputs alone, with detail.
+    fn splats_of_pair(&self, pair: [usize; 2], crops: &Crops) -> Result<Splats> {
+        let inputs = pair.map(|i| crops.inputs[i].clone());
+        let (model, network) = (self.model, self.model.model());
+        let (views, _) = model.views(&inputs, crops.bounds.clone(), crops.depth_range)?;
+        let output = network.encode(&views)?;
+        let parents = network.primaries(&views, &output)?;
+        let mut splats = network.trunk().forward(&views, &output, &parents)?.to_splats()?;
+        add_detail(&mut splats, &inputs, model.config().upscale)?;
+        Ok(splats)
+    }
+}
+
+/// The two inputs whose cameras are nearest to `camera`, in ascending order.
+fn nearest_two(inputs: &[Cropped], camera: &Camera) -> Option<[usize; 2]> {
+    let distance = |i: usize| inputs[i].input_camera.position().distance(camera.position());
+    let mut order: Vec<usize> = (0..inputs.len()).collect();
+    order.sort_by(|a, b| distance(*a).total_cmp(&distance(*b)));
+    let [a, b] = order.get(..2)?.try_into().ok()?;
+    Some([a.min(b), a.max(b)])
+}

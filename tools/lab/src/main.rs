@@ -1,0 +1,10 @@
+//! The `subsplat-lab` program.
+
+use std::process::ExitCode;
+
+#[global_allocator]
+static PAGES: subsplat_cli::pages::Pages = subsplat_cli::pages::Pages;
+
+fn main() -> ExitCode {
+    subsplat_lab::commands::main()
+}
