@@ -256,7 +256,7 @@ mod tests {
         }
         let (w, h) = (width as f32, height as f32);
         let k = Intrinsics { fx: 0.9 * w, fy: 0.8 * w, cx: 0.53 * w, cy: 0.47 * h, width, height };
-        (photo, Camera { intrinsics: k, world_from_camera: Mat4::IDENTITY })
+        (photo, Camera::new(k, Mat4::IDENTITY).unwrap())
     }
 
     #[test]
