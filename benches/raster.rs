@@ -415,12 +415,12 @@ fn write(folder: &Path, bench: &Bench) -> Result<()> {
     for spec in SCENES.iter().filter(|s| bench.selects(s.name)) {
         let at = |ending: &str| folder.join(format!("{}.{ending}", spec.name));
         let (splats, camera) = (scene::shared(spec), scene::camera(spec.side));
-        save_splats(&at("ply"), &splats, &Default::default())?;
+        save_splats(at("ply"), &splats, &Default::default())?;
         let file = format!("{}.png", spec.name);
         let camera_only = NamedCamera::new(file, camera);
         let cameras =
             CameraFile { cameras: vec![camera_only], units: Units::Unknown, near_far: None };
-        save_cameras_json(&at("cameras.json"), &cameras)?;
+        save_cameras_json(at("cameras.json"), &cameras)?;
         write_tensors(&at("shared.safetensors"), &splats, &camera)?;
         write_tensors(&at("safetensors"), &scene::unshared(&splats), &camera)?;
         written.push(spec.name);

@@ -5,7 +5,6 @@
 //! ```
 
 use anyhow::{Context, Result, bail};
-use std::path::Path;
 use subsplat::files::cameras_json::load_cameras_json;
 use subsplat::scene::render;
 use subsplat::{RasterOptions, Rgb, load_splats, save_png};
@@ -15,10 +14,10 @@ fn main() -> Result<()> {
     let [scene, cameras, out] = arguments.as_slice() else {
         bail!("expected SCENE CAMERAS.JSON OUT.PNG, got {arguments:?}")
     };
-    let splats = load_splats(Path::new(scene))?;
-    let cameras = load_cameras_json(Path::new(cameras))?;
+    let splats = load_splats(scene)?;
+    let cameras = load_cameras_json(cameras)?;
     let camera = cameras.cameras.first().context("a camera")?.camera;
     let picture = render(&splats, &camera, &RasterOptions::default());
-    save_png(Path::new(out), &Rgb::from(&picture))?;
+    save_png(out, &Rgb::from(&picture))?;
     Ok(())
 }

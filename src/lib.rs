@@ -9,7 +9,7 @@
 //! use subsplat::{DepthBounds, Options, Photo, Reconstructor, load_scene};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
-//! let scene = load_scene("examples/room".as_ref())?;
+//! let scene = load_scene("examples/room")?;
 //! let photos = [Photo::from_frame(&scene.frames[0])?, Photo::from_frame(&scene.frames[1])?];
 //! let options = Options::default().with_depth_prior(DepthBounds::of_scene(&scene, &[0, 1])?);
 //! let model = Reconstructor::shipped(2)?; // or ::load(weights)
@@ -55,8 +55,8 @@
 //! * [`render()`] and [`Renderer`] draw any [`Splats`]; `rasterize` draws `SplatTensors` with
 //!   gradients.
 //! * [`load_scene`], [`load_splats`] and [`save_splats`] read and write files.
-//! * `loose_photos` and `loose_scene` estimate the cameras of photographs that have none, in memory
-//!   and in files; the module `loose` holds their options and results.
+//! * `estimate_cameras` and `estimate_cameras_of_files` estimate the cameras of photographs that
+//!   have none, in memory and in files; the module `estimate` holds their options and results.
 //! * [`details`] holds reports, and types that are seldom named.
 //! * [`Camera`] and [`Intrinsics`] define all geometric conventions: OpenCV axes, pixel centres
 //!   at +0.5, `world_from_camera`.
@@ -95,7 +95,8 @@ pub use crate::network::ops::{SplatTensors, rasterize_splats as rasterize};
 pub use crate::reconstruct::{
     Check, Density, DepthBounds, DepthRange, Detail, Error, InputSize, Options, Photo, Poses,
     Prepared, Progress, Reconstruction, Reconstructor, Refine, Result, Stage, TargetSize, Warning,
-    loose_photos, loose_scene,
+    estimate_cameras,
+    estimate_cameras_of_files,
 };
 pub use files::image::{Depth, LoadOptions, Rgb, save_depth_png, save_png};
 pub use files::photograph::{Photograph, load_photograph, parse_photograph};
@@ -140,15 +141,15 @@ pub mod details {
     pub use subsplat_kernels::gpu::{Gpu, GpuError};
 }
 
-/// Options and results of [`loose_photos`] and [`loose_scene`],
+/// Options and results of [`estimate_cameras`] and [`estimate_cameras_of_files`],
 /// which estimate the cameras of photographs.
 #[cfg(feature = "network")]
-pub mod loose {
+pub mod estimate {
     pub use crate::cameras::estimation::{
         Confidence, FocalEstimate, LeftOut, PoseAdjustment, PoseEstimate, PoseOptions,
         PosePhotoError, PosePoint, PoseRefusal, PoseWarning, Uncertain,
     };
     pub use crate::reconstruct::{
-        KnownLens, LensSource, LooseOptions, LoosePhotos, LooseScene, PoseError,
+        EstimateOptions, EstimatedPhotos, EstimatedScene, KnownLens, LensSource, PoseError,
     };
 }

@@ -12,11 +12,10 @@ use glam::{Mat4, Quat, Vec3};
 use subsplat::scene::splats::Splats;
 use subsplat_kernels::camera::{Camera, Intrinsics};
 use subsplat_kernels::layout::ShBasis;
+use subsplat_kernels::layout::random::{GOLDEN, mix};
 
 /// SH degree of all scenes.
 pub const DEGREE: usize = 3;
-/// SplitMix64's increment.
-const GOLDEN: u64 = 0x9E37_79B9_7F4A_7C15;
 /// Focal length relative to the picture's side: a field of view of 58°.
 const FOCAL: f32 = 0.9;
 
@@ -48,10 +47,8 @@ pub const SCENES: [Spec; 7] = [
 
 /// Returns a number in [0, 1) that depends on (stream, index) only.
 pub fn unit(stream: u64, index: u64) -> f32 {
-    let mut z = (stream << 40 ^ index).wrapping_add(1).wrapping_mul(GOLDEN);
-    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-    ((z ^ (z >> 31)) >> 40) as f32 / (1u64 << 24) as f32
+    let bits = mix((stream << 40 ^ index).wrapping_add(1).wrapping_mul(GOLDEN));
+    (bits >> 40) as f32 / (1u64 << 24) as f32
 }
 
 /// Returns an approximately normal number: mean 0, variance 1 (a sum of four uniform numbers).

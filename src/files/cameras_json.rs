@@ -172,7 +172,11 @@ pub(super) fn matrix(rows: &[Vec<f64>]) -> std::result::Result<DMat4, String> {
 ///
 /// # Errors
 /// A file of another name that is not JSON.
-pub fn is_cameras_json(path: &Path) -> Result<bool> {
+pub fn is_cameras_json(path: impl AsRef<Path>) -> Result<bool> {
+    has_this_layout(path.as_ref())
+}
+
+fn has_this_layout(path: &Path) -> Result<bool> {
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
     if ["cameras.json", "transforms.json"].contains(&&*name) || !name.ends_with(".json") {
         return Ok(name == "cameras.json");
@@ -280,7 +284,11 @@ pub(super) fn load(path: &Path) -> Result<Scene> {
 ///
 /// # Errors
 /// Another layout; an invalid camera (the error names its frame).
-pub fn load_cameras_json(path: &Path) -> Result<CameraFile> {
+pub fn load_cameras_json(path: impl AsRef<Path>) -> Result<CameraFile> {
+    read_cameras(path.as_ref())
+}
+
+fn read_cameras(path: &Path) -> Result<CameraFile> {
     let (drafts, info) = drafts(path)?;
     let mut cameras = Vec::with_capacity(drafts.len());
     for d in drafts {
@@ -305,7 +313,7 @@ pub fn load_cameras_json(path: &Path) -> Result<CameraFile> {
 ///
 /// # Errors
 /// Errors of [`write_atomic`].
-pub fn save_cameras_json(path: &Path, content: &CameraFile) -> Result<()> {
+pub fn save_cameras_json(path: impl AsRef<Path>, content: &CameraFile) -> Result<()> {
     save_cameras_and_points(path, content, &[])
 }
 
@@ -314,7 +322,15 @@ pub fn save_cameras_json(path: &Path, content: &CameraFile) -> Result<()> {
 ///
 /// # Errors
 /// Errors of [`write_atomic`].
-pub fn save_cameras_and_points(path: &Path, content: &CameraFile, points: &[Vec3]) -> Result<()> {
+pub fn save_cameras_and_points(
+    path: impl AsRef<Path>,
+    content: &CameraFile,
+    points: &[Vec3],
+) -> Result<()> {
+    write_cameras_and_points(path.as_ref(), content, points)
+}
+
+fn write_cameras_and_points(path: &Path, content: &CameraFile, points: &[Vec3]) -> Result<()> {
     let frame = |c: &'_ NamedCamera| {
         let Intrinsics { fx, fy, cx, cy, width, height } = c.camera.intrinsics();
         let c2w = c.camera.world_from_camera().transpose().to_cols_array_2d();

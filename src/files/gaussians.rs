@@ -6,7 +6,7 @@
 //! Readers give K = 1, no gain, the standard basis and unit quaternions.
 
 use super::{Error, Result, SaveOptions};
-use crate::scene::splats::Splats;
+use crate::scene::splats::{SplatParts, Splats};
 use glam::{DMat3, DQuat, DVec3};
 use std::path::Path;
 use subsplat_kernels::layout::{
@@ -399,7 +399,8 @@ impl Incoming {
     /// Makes a set of all Gaussians. Their numbers may be NaN or infinite.
     pub fn into_splats(self, path: &Path) -> Result<Splats> {
         let Self { rows, sh, sh_degree } = self;
-        Splats::new_with_unchecked_numbers(rows, sh, Vec::new(), sh_degree, ShBasis::Standard)
+        let (gain, sh_basis) = (Vec::new(), ShBasis::Standard);
+        Splats::with_unchecked_numbers(SplatParts { rows, sh, gain, sh_degree, sh_basis })
             .map_err(|e| Error::format(path, "Gaussians of one shape", e.to_string()))
     }
 }

@@ -30,7 +30,8 @@ const JSON_MAX: usize = 16 << 20;
 /// Not glTF 2 binary, chunk lengths that do not fill the file, no splats, an accessor beyond
 /// its buffer, a compressed or sparse one, a mirrored or sheared node, numbers that are not
 /// finite.
-pub fn parse_glb(bytes: &[u8], name: &Path) -> Result<Splats> {
+pub fn parse_glb(bytes: &[u8], name: impl AsRef<Path>) -> Result<Splats> {
+    let name = name.as_ref();
     let decoded = decode(bytes, name)?;
     check_finite(&decoded.splats, name)?;
     Ok(decoded.splats)

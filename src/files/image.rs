@@ -162,8 +162,8 @@ pub struct LoadedPicture {
 ///
 /// # Errors
 /// Missing, not a picture, more than [`MAX_PIXELS`].
-pub fn probe(path: &Path) -> Result<Probe> {
-    Ok(decode::header(path)?.probe)
+pub fn probe(path: impl AsRef<Path>) -> Result<Probe> {
+    Ok(decode::header(path.as_ref())?.probe)
 }
 
 /// Decodes a picture. Grey becomes three equal channels, 16 bits are rounded to 8, and
@@ -174,7 +174,7 @@ pub fn probe(path: &Path) -> Result<Probe> {
 /// # Errors
 /// Missing, truncated, not a picture, more than [`MAX_PIXELS`]; CMYK without Adobe's marker;
 /// HEIC without feature `heic`.
-pub fn load(path: &Path) -> Result<Rgb> {
+pub fn load(path: impl AsRef<Path>) -> Result<Rgb> {
     Ok(load_with(path, &LoadOptions::default())?.picture)
 }
 
@@ -182,7 +182,8 @@ pub fn load(path: &Path) -> Result<Rgb> {
 ///
 /// # Errors
 /// As [`load`]; with [`Truncated::Accept`] only a truncated JPEG without any decodable pixel.
-pub fn load_with(path: &Path, options: &LoadOptions) -> Result<LoadedPicture> {
+pub fn load_with(path: impl AsRef<Path>, options: &LoadOptions) -> Result<LoadedPicture> {
+    let path = path.as_ref();
     let bytes = read(path)?;
     let decoded = decode(&bytes, options, path)?;
     Ok(LoadedPicture { picture: decoded.picture, warnings: decoded.warnings })
@@ -192,8 +193,8 @@ pub fn load_with(path: &Path, options: &LoadOptions) -> Result<LoadedPicture> {
 ///
 /// # Errors
 /// As [`load`].
-pub fn parse_picture(bytes: &[u8], path: &Path) -> Result<Rgb> {
-    Ok(decode(bytes, &LoadOptions::default(), path)?.picture)
+pub fn parse_picture(bytes: &[u8], path: impl AsRef<Path>) -> Result<Rgb> {
+    Ok(decode(bytes, &LoadOptions::default(), path.as_ref())?.picture)
 }
 
 fn encode(
@@ -218,7 +219,8 @@ fn encode(
 ///
 /// # Errors
 /// A buffer whose length does not match the size; errors of [`write_atomic`].
-pub fn save_png(path: &Path, picture: &Rgb) -> Result<()> {
+pub fn save_png(path: impl AsRef<Path>, picture: &Rgb) -> Result<()> {
+    let path = path.as_ref();
     let bytes = png_bytes(picture, path)?;
     write_atomic(path, |f| f.write_all(&bytes))
 }
@@ -227,7 +229,11 @@ pub fn save_png(path: &Path, picture: &Rgb) -> Result<()> {
 ///
 /// # Errors
 /// A buffer whose length does not match the size.
-pub fn png_bytes(picture: &Rgb, path: &Path) -> Result<Vec<u8>> {
+pub fn png_bytes(picture: &Rgb, path: impl AsRef<Path>) -> Result<Vec<u8>> {
+    encode_rgb(picture, path.as_ref())
+}
+
+fn encode_rgb(picture: &Rgb, path: &Path) -> Result<Vec<u8>> {
     let expected = 3 * picture.width * picture.height;
     if picture.data.len() != expected || expected == 0 {
         let got = format!("{} for {}x{}", picture.data.len(), picture.width, picture.height);
@@ -259,7 +265,11 @@ const DEPTH_UNIT_KEY: &[u8] = b"depth_unit";
 ///
 /// # Errors
 /// A buffer whose length does not match the size; errors of [`write_atomic`].
-pub fn save_depth_png(path: &Path, depth: &Depth) -> Result<f32> {
+pub fn save_depth_png(path: impl AsRef<Path>, depth: &Depth) -> Result<f32> {
+    write_depth_png(path.as_ref(), depth)
+}
+
+fn write_depth_png(path: &Path, depth: &Depth) -> Result<f32> {
     let area = depth.width * depth.height;
     if depth.data.len() != area || area == 0 {
         let got = format!("{} for {}x{}", depth.data.len(), depth.width, depth.height);
@@ -319,7 +329,8 @@ fn depth_unit(png: &[u8]) -> Option<f32> {
 ///
 /// # Errors
 /// Missing, truncated, not 16-bit grey, a unit that is not above zero.
-pub fn load_depth_png(path: &Path, unit: f32) -> Result<Depth> {
+pub fn load_depth_png(path: impl AsRef<Path>, unit: f32) -> Result<Depth> {
+    let path = path.as_ref();
     parse_depth_png(&read(path)?, unit, path)
 }
 
@@ -327,7 +338,11 @@ pub fn load_depth_png(path: &Path, unit: f32) -> Result<Depth> {
 ///
 /// # Errors
 /// As [`load_depth_png`].
-pub fn parse_depth_png(bytes: &[u8], unit: f32, path: &Path) -> Result<Depth> {
+pub fn parse_depth_png(bytes: &[u8], unit: f32, path: impl AsRef<Path>) -> Result<Depth> {
+    decode_depth_png(bytes, unit, path.as_ref())
+}
+
+fn decode_depth_png(bytes: &[u8], unit: f32, path: &Path) -> Result<Depth> {
     let decoder = decoder(std::io::Cursor::new(bytes), path)?.decoder;
     let decoded =
         image::DynamicImage::from_decoder(decoder).map_err(|e| decode::refused(path, e))?;

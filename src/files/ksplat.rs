@@ -28,7 +28,8 @@ const STEPS: u32 = 32767;
 /// # Errors
 /// Another version or compression level, sections that do not fill the bytes, numbers
 /// that are not finite.
-pub fn parse_ksplat(bytes: &[u8], name: &Path) -> Result<Splats> {
+pub fn parse_ksplat(bytes: &[u8], name: impl AsRef<Path>) -> Result<Splats> {
+    let name = name.as_ref();
     let decoded = decode(bytes, name)?;
     check_finite(&decoded.splats, name)?;
     Ok(decoded.splats)

@@ -89,7 +89,11 @@ fn text(path: &Path) -> Result<String> {
 /// # Errors
 /// A file that is missing or malformed (the error names the line); a number of pictures that
 /// is not the number of poses.
-pub fn load(folder: &Path, convention: PoseConvention) -> Result<Scene> {
+pub fn load(folder: impl AsRef<Path>, convention: PoseConvention) -> Result<Scene> {
+    load_folder(folder.as_ref(), convention)
+}
+
+fn load_folder(folder: &Path, convention: PoseConvention) -> Result<Scene> {
     let (poses_path, k_path) = (folder.join("poses.txt"), folder.join("K.txt"));
     let k = parse_intrinsics(&text(&k_path)?)
         .map_err(|got| Error::format(&k_path, "a 3x3 intrinsic matrix, or fx fy cx cy", got))?;

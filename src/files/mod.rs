@@ -22,7 +22,6 @@ pub use splats::{
     load_splats, load_with_comments, parse_splats, save_splats, splat_info,
 };
 mod assemble;
-pub mod base64;
 pub mod cameras_json;
 pub mod colmap;
 mod decode;
@@ -106,7 +105,8 @@ impl Error {
 ///
 /// # Errors
 /// [`Error::Io`]: missing, unreadable, a directory.
-pub fn read(path: &Path) -> Result<Vec<u8>> {
+pub fn read(path: impl AsRef<Path>) -> Result<Vec<u8>> {
+    let path = path.as_ref();
     std::fs::read(path).map_err(|e| Error::io(path, e))
 }
 
@@ -117,9 +117,10 @@ pub fn read(path: &Path) -> Result<Vec<u8>> {
 /// # Errors
 /// No such folder, no permission, full disk; the error of `body`.
 pub fn write_atomic(
-    path: &Path,
+    path: impl AsRef<Path>,
     body: impl FnOnce(&mut BufWriter<File>) -> std::io::Result<()>,
 ) -> Result<()> {
+    let path = path.as_ref();
     let name = path.file_name().ok_or_else(|| Error::format(path, "a file name", "a folder"))?;
     let mut temporary = name.to_owned();
     temporary.push(format!(".{}.part", std::process::id()));

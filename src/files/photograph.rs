@@ -1,4 +1,4 @@
-//! Loose photographs: pictures without a pose file, from a phone or a camera.
+//! Photographs without a pose file, from a phone or a camera.
 //!
 //! A [`Photograph`] is upright: its EXIF orientation is applied. `image.rs` keeps the stored
 //! pixels instead, to which pose files refer. The EXIF block also gives the focal length
@@ -66,7 +66,8 @@ impl PhotographHeader {
 
 /// Lists the photographs of a folder, by name with numbers in numeric order; without any, those of
 /// its folder `images`.
-pub fn list_photographs(folder: &Path) -> Vec<PathBuf> {
+pub fn list_photographs(folder: impl AsRef<Path>) -> Vec<PathBuf> {
+    let folder = folder.as_ref();
     let own = list_images(folder);
     if own.is_empty() { list_images(&folder.join("images")) } else { own }
 }
@@ -75,7 +76,8 @@ pub fn list_photographs(folder: &Path) -> Vec<PathBuf> {
 ///
 /// # Errors
 /// Those of [`super::image::probe`]; a DNG raw file.
-pub fn probe_photograph(path: &Path) -> Result<PhotographHeader> {
+pub fn probe_photograph(path: impl AsRef<Path>) -> Result<PhotographHeader> {
+    let path = path.as_ref();
     let Header { probe, exif } = decode::header(path)?;
     let orientation = probe.orientation;
     let Probe { width, height, .. } = probe.upright();
@@ -87,7 +89,8 @@ pub fn probe_photograph(path: &Path) -> Result<PhotographHeader> {
 ///
 /// # Errors
 /// Those of [`super::image::load_with`]; a DNG raw file.
-pub fn load_photograph(path: &Path, options: &LoadOptions) -> Result<Photograph> {
+pub fn load_photograph(path: impl AsRef<Path>, options: &LoadOptions) -> Result<Photograph> {
+    let path = path.as_ref();
     parse_photograph(&read(path)?, options, path)
 }
 
@@ -95,7 +98,15 @@ pub fn load_photograph(path: &Path, options: &LoadOptions) -> Result<Photograph>
 ///
 /// # Errors
 /// As [`load_photograph`].
-pub fn parse_photograph(bytes: &[u8], options: &LoadOptions, path: &Path) -> Result<Photograph> {
+pub fn parse_photograph(
+    bytes: &[u8],
+    options: &LoadOptions,
+    path: impl AsRef<Path>,
+) -> Result<Photograph> {
+    decode_upright(bytes, options, path.as_ref())
+}
+
+fn decode_upright(bytes: &[u8], options: &LoadOptions, path: &Path) -> Result<Photograph> {
     let decoded = decode(bytes, options, path)?;
     let Rgb { width, height, .. } = decoded.picture;
     let report = report(decoded.exif.as_deref(), width, height, path)?;

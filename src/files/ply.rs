@@ -31,7 +31,8 @@ const BLOCK: usize = 1024;
 /// # Errors
 /// Not a PLY, not a splat file, a truncated file, a count that the bytes do not bear out,
 /// bytes after the last element, numbers that are not finite.
-pub fn parse_ply(bytes: &[u8], name: &Path) -> Result<Splats> {
+pub fn parse_ply(bytes: &[u8], name: impl AsRef<Path>) -> Result<Splats> {
+    let name = name.as_ref();
     let mut reader = bytes;
     let decoded = decode(&mut reader, bytes.len() as u64, name)?;
     check_finite(&decoded.splats, name)?;

@@ -27,11 +27,12 @@ impl Views {
     ///
     /// # Errors
     /// An index out of range; `path` is the file in the error.
-    pub fn check(&self, path: &Path, frames: usize) -> Result<()> {
+    pub fn check(&self, path: impl AsRef<Path>, frames: usize) -> Result<()> {
         match self.context.iter().chain(&self.target).find(|i| **i >= frames) {
             None => Ok(()),
             Some(i) => {
-                Err(Error::format(path, format!("frame indices below {frames}"), i.to_string()))
+                let expected = format!("frame indices below {frames}");
+                Err(Error::format(path.as_ref(), expected, i.to_string()))
             }
         }
     }
@@ -71,7 +72,11 @@ pub type Index = BTreeMap<String, Option<Views>>;
 ///
 /// # Errors
 /// JSON of another form; a test without context.
-pub fn load_protocol(path: &Path) -> Result<Protocol> {
+pub fn load_protocol(path: impl AsRef<Path>) -> Result<Protocol> {
+    read_protocol(path.as_ref())
+}
+
+fn read_protocol(path: &Path) -> Result<Protocol> {
     let protocol: Protocol = serde_json::from_slice(&read(path)?)
         .map_err(|e| json_error(path, "protocol.json (tests with context and target)", &e))?;
     for (i, test) in protocol.tests.iter().enumerate() {
@@ -87,7 +92,11 @@ pub fn load_protocol(path: &Path) -> Result<Protocol> {
 ///
 /// # Errors
 /// JSON of another form; a scene without context.
-pub fn load_index(path: &Path) -> Result<Index> {
+pub fn load_index(path: impl AsRef<Path>) -> Result<Index> {
+    read_index(path.as_ref())
+}
+
+fn read_index(path: &Path) -> Result<Index> {
     let index: Index = serde_json::from_slice(&read(path)?).map_err(|e| {
         json_error(path, "an evaluation index (scene: context and target, or null)", &e)
     })?;

@@ -40,7 +40,15 @@ pub struct Re10kCamera {
 ///
 /// # Errors
 /// Not UTF-8, a line that has not 19 numbers, no camera at all.
-pub fn parse(path: &Path, bytes: &[u8], warnings: &mut Vec<String>) -> Result<Vec<Re10kCamera>> {
+pub fn parse(
+    path: impl AsRef<Path>,
+    bytes: &[u8],
+    warnings: &mut Vec<String>,
+) -> Result<Vec<Re10kCamera>> {
+    cameras(path.as_ref(), bytes, warnings)
+}
+
+fn cameras(path: &Path, bytes: &[u8], warnings: &mut Vec<String>) -> Result<Vec<Re10kCamera>> {
     let text = std::str::from_utf8(bytes).map_err(|e| {
         Error::format(path, "UTF-8 text", "other bytes").at(format!(" at byte {}", e.valid_up_to()))
     })?;

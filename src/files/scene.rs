@@ -6,8 +6,8 @@
 //! `poses.txt` with `K.txt`. The path of a pose file selects that file.
 //!
 //! Pose files refer to the stored pixels ([`Pixels::Stored`]): EXIF orientation is not applied,
-//! and a picture with one gives a warning. Cameras of loose photographs refer to the upright
-//! pixels ([`Pixels::Upright`]).
+//! and a picture with one gives a warning. Cameras of photographs without a pose file refer to
+//! the upright pixels ([`Pixels::Upright`]).
 
 use super::assemble::{Draft, Lens, assemble};
 use super::image::{LoadOptions, LoadedPicture, Rgb, load_with};
@@ -195,41 +195,49 @@ impl Scene {
         (0..self.frames.len()).filter(|&i| self.frames[i].other_shape.is_none()).collect()
     }
 
-    /// Makes a scene of two loose photographs with known cameras. The cameras refer to the
+    /// Makes a scene of two photographs and their cameras. The cameras refer to the
     /// upright pixels ([`Pixels::Upright`]) and have the upright pictures' sizes.
     ///
     /// # Errors
     /// A picture that is missing, malformed or of another size.
-    pub fn from_pair(a: &Path, b: &Path, camera_a: Camera, camera_b: Camera) -> Result<Self> {
+    pub fn from_pair(
+        a: impl AsRef<Path>,
+        b: impl AsRef<Path>,
+        camera_a: Camera,
+        camera_b: Camera,
+    ) -> Result<Self> {
+        let (a, b) = (a.as_ref(), b.as_ref());
         let photographs = [(a.to_owned(), camera_a), (b.to_owned(), camera_b)];
         Self::from_photographs(SceneFormat::Pair, a, &photographs)
     }
 
-    /// Makes a scene of loose photographs with cameras of their upright pixels. `path` names the
+    /// Makes a scene of photographs and the cameras of their upright pixels. `path` names the
     /// scene in messages.
     ///
     /// # Errors
     /// As [`Scene::from_pair`].
     pub fn from_photographs(
         source: SceneFormat,
-        path: &Path,
+        path: impl AsRef<Path>,
         photographs: &[(PathBuf, Camera)],
     ) -> Result<Self> {
-        let draft = |(path, camera): &(PathBuf, Camera)| {
-            let k = camera.intrinsics();
-            Draft {
-                size: Some((k.width, k.height)),
-                pixels: Pixels::Upright,
-                image: Some(path.clone()),
-                ..Draft::new(
-                    String::new(),
-                    path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
-                    Lens::Pixels([k.fx, k.fy, k.cx, k.cy].map(f64::from)),
-                    camera.world_from_camera().as_dmat4(),
-                )
-            }
-        };
-        assemble(path, source, photographs.iter().map(draft).collect())
+        assemble(path.as_ref(), source, photographs.iter().map(upright_draft).collect())
+    }
+}
+
+/// Returns a frame of a photograph and the camera of its upright pixels.
+fn upright_draft((path, camera): &(PathBuf, Camera)) -> Draft {
+    let k = camera.intrinsics;
+    Draft {
+        size: Some((k.width, k.height)),
+        pixels: Pixels::Upright,
+        image: Some(path.clone()),
+        ..Draft::new(
+            String::new(),
+            path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+            Lens::Pixels([k.fx, k.fy, k.cx, k.cy].map(f64::from)),
+            camera.world_from_camera.as_dmat4(),
+        )
     }
 }
 
@@ -241,7 +249,11 @@ const MODEL_FOLDERS: [&str; 4] = ["sparse/0", "sparse", "colmap/sparse/0", ""];
 /// # Errors
 /// No pose file; a malformed pose file (the error names file and line or byte); no picture;
 /// a picture whose size does not match its camera.
-pub fn load_scene(path: &Path) -> Result<Scene> {
+pub fn load_scene(path: impl AsRef<Path>) -> Result<Scene> {
+    load_at(path.as_ref())
+}
+
+fn load_at(path: &Path) -> Result<Scene> {
     let metadata = std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
     if metadata.is_file() {
         return load_file(path);
@@ -273,7 +285,8 @@ pub fn load_scene(path: &Path) -> Result<Scene> {
 }
 
 /// Reports whether `path` is a folder with a pose file that [`load_scene`] reads.
-pub fn is_scene(path: &Path) -> bool {
+pub fn is_scene(path: impl AsRef<Path>) -> bool {
+    let path = path.as_ref();
     let file = |name: &str| path.join(name).is_file();
     ["cameras.json", "transforms.json", "poses.txt"].into_iter().any(file)
         || MODEL_FOLDERS.iter().any(|f| colmap::is_model(&path.join(f)))

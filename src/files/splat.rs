@@ -23,7 +23,8 @@ const BLOCK: usize = 4096;
 /// # Errors
 /// Not a positive multiple of 32 bytes; a mean or scale that is not finite; a negative
 /// scale, which gives most files of another format away.
-pub fn parse_splat(bytes: &[u8], name: &Path) -> Result<Splats> {
+pub fn parse_splat(bytes: &[u8], name: impl AsRef<Path>) -> Result<Splats> {
+    let name = name.as_ref();
     let decoded = decode(bytes, name)?;
     check_finite(&decoded.splats, name)?;
     Ok(decoded.splats)

@@ -45,8 +45,8 @@ const KNOWN: &str = "a .ply, .glb, .spz, .splat or .ksplat file";
 
 impl SplatFormat {
     /// Detects the format by the file name's extension, in upper or lower case.
-    pub fn from_name(path: &Path) -> Option<Self> {
-        let extension = path.extension()?.to_string_lossy().to_ascii_lowercase();
+    pub fn from_name(path: impl AsRef<Path>) -> Option<Self> {
+        let extension = path.as_ref().extension()?.to_string_lossy().to_ascii_lowercase();
         Some(match extension.as_str() {
             "ply" => Self::Ply,
             "glb" => Self::Glb,
@@ -147,7 +147,7 @@ pub struct SaveReport {
 ///
 /// # Errors
 /// An unknown format; the errors of the format's reader.
-pub fn load_splats(path: &Path) -> Result<Splats> {
+pub fn load_splats(path: impl AsRef<Path>) -> Result<Splats> {
     Ok(load_with_comments(path)?.0)
 }
 
@@ -155,7 +155,8 @@ pub fn load_splats(path: &Path) -> Result<Splats> {
 ///
 /// # Errors
 /// As [`load_splats`].
-pub fn load_with_comments(path: &Path) -> Result<(Splats, Vec<String>)> {
+pub fn load_with_comments(path: impl AsRef<Path>) -> Result<(Splats, Vec<String>)> {
+    let path = path.as_ref();
     let decoded = decode(path)?.1;
     check_finite(&decoded.splats, path)?;
     Ok((decoded.splats, decoded.comments))
@@ -210,7 +211,8 @@ fn decode_bytes(format: SplatFormat, bytes: &[u8], path: &Path) -> Result<Decode
 ///
 /// # Errors
 /// As [`load_splats`].
-pub fn parse_splats(bytes: &[u8], name: &Path) -> Result<(Splats, Vec<String>)> {
+pub fn parse_splats(bytes: &[u8], name: impl AsRef<Path>) -> Result<(Splats, Vec<String>)> {
+    let name = name.as_ref();
     let decoded = decode_bytes(format_of(bytes, name)?, bytes, name)?;
     check_finite(&decoded.splats, name)?;
     Ok((decoded.splats, decoded.comments))
@@ -224,7 +226,15 @@ pub fn parse_splats(bytes: &[u8], name: &Path) -> Result<(Splats, Vec<String>)> 
 /// # Errors
 /// An extension of no writable format, numbers that are not finite (the first Gaussian is
 /// named), an opacity out of [0, 1], no Gaussian left to write, system errors.
-pub fn save_splats(path: &Path, splats: &Splats, options: &SaveOptions) -> Result<SaveReport> {
+pub fn save_splats(
+    path: impl AsRef<Path>,
+    splats: &Splats,
+    options: &SaveOptions,
+) -> Result<SaveReport> {
+    write_splats(path.as_ref(), splats, options)
+}
+
+fn write_splats(path: &Path, splats: &Splats, options: &SaveOptions) -> Result<SaveReport> {
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
     let format = SplatFormat::from_name(path)
         .filter(|f| *f != SplatFormat::Ksplat && !name.ends_with(".compressed.ply"))
@@ -246,7 +256,7 @@ pub fn encode_splats(
     splats: &Splats,
     options: &SaveOptions,
 ) -> Result<Vec<u8>> {
-    Ok(encode_splats_with(format, splats, options, Path::new("scene"))?.0)
+    Ok(encode_splats_with(format, splats, options, "scene")?.0)
 }
 
 /// [`encode_splats`] with the report of [`save_splats`]; `name` is for errors.
@@ -254,6 +264,15 @@ pub fn encode_splats(
 /// # Errors
 /// Those of [`encode_splats`].
 pub fn encode_splats_with(
+    format: SplatFormat,
+    splats: &Splats,
+    options: &SaveOptions,
+    name: impl AsRef<Path>,
+) -> Result<(Vec<u8>, SaveReport)> {
+    encode(format, splats, options, name.as_ref())
+}
+
+fn encode(
     format: SplatFormat,
     splats: &Splats,
     options: &SaveOptions,
@@ -407,7 +426,7 @@ fn quantiles(mut values: Vec<f32>) -> Vec<f32> {
 ///
 /// # Errors
 /// As [`load_splats`], except for numbers that are not finite.
-pub fn splat_info(path: &Path) -> Result<SplatInfo> {
-    let (format, decoded, bytes) = decode(path)?;
+pub fn splat_info(path: impl AsRef<Path>) -> Result<SplatInfo> {
+    let (format, decoded, bytes) = decode(path.as_ref())?;
     Ok(SplatInfo::of(format, decoded, bytes))
 }

@@ -56,7 +56,8 @@ const FRACTION_MAX: i32 = 20;
 /// # Errors
 /// Another magic or version, a truncated file, a wrong checksum, streams that do not inflate
 /// to the size that the count gives, bytes after the end, a decompression bomb.
-pub fn parse_spz(bytes: &[u8], name: &Path) -> Result<Splats> {
+pub fn parse_spz(bytes: &[u8], name: impl AsRef<Path>) -> Result<Splats> {
+    let name = name.as_ref();
     let decoded = decode(bytes, name)?;
     check_finite(&decoded.splats, name)?;
     Ok(decoded.splats)

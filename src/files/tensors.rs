@@ -56,7 +56,11 @@ impl TensorFile {
     ///
     /// # Errors
     /// Missing, not a safetensors file, shorter or longer than the header declares.
-    pub fn open(path: &Path) -> Result<Self> {
+    pub fn open(path: impl AsRef<Path>) -> Result<Self> {
+        Self::open_at(path.as_ref())
+    }
+
+    fn open_at(path: &Path) -> Result<Self> {
         let bad = |got: String| Error::format(path, "a safetensors file", got);
         let io = |e| Error::io(path, e);
         let mut file = File::open(path).map_err(io)?;
@@ -122,11 +126,12 @@ impl TensorFile {
 /// Two tensors of one name, data whose length does not match the shape, errors of `data`
 /// and of [`write_atomic`].
 pub fn write_tensors(
-    path: &Path,
+    path: impl AsRef<Path>,
     specs: &[TensorSpec],
     metadata: &BTreeMap<String, String>,
     mut data: impl FnMut(usize) -> Result<Vec<u8>>,
 ) -> Result<()> {
+    let path = path.as_ref();
     let header = header(path, specs, metadata)?;
     let mut refused = None;
     let written = write_atomic(path, |out| {
@@ -232,7 +237,7 @@ mod tests {
     #[test]
     fn tensors_come_back_one_by_one() {
         let folder = tempfile::tempdir().unwrap();
-        let file = TensorFile::open(&written(folder.path())).unwrap();
+        let file = TensorFile::open(written(folder.path())).unwrap();
         let (specs, data) = three();
         assert_eq!(file.specs(), specs);
         for (spec, data) in specs.iter().zip(data) {

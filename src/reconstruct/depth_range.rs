@@ -1,15 +1,22 @@
-//! The depth range: the nearest and farthest depth candidate of a reconstruction.
+//! The depth range of a reconstruction: its near and far depth, decided in this module alone.
 //!
-//! Candidates are uniform in 1/depth between the two. The ends come, in this order, from the
-//! caller ([`DepthRange`]), from a file ([`DepthBounds::of_scene`]), or from the distance
-//! between the cameras. Points matched between the photographs replace the last kind. The
-//! small backbone then estimates both ends, unless the caller fixed one
+//! Depth candidates are uniform in 1/depth between the two. A far end that is too far costs
+//! little; a near end that is too near costs resolution everywhere. Each end comes from the first
+//! of these sources that knows it:
+//!
+//! 1. the caller ([`DepthRange`]);
+//! 2. the scene's files ([`DepthBounds::of_scene`]): the pose file's own near and far; 1 and 100
+//!    for RealEstate10K, as pixelSplat and MVSplat use them; quantiles of the sparse points;
+//! 3. points matched between the photographs ([`DepthBounds::refined`]);
+//! 4. the largest distance between two cameras, a guess ([`DepthBounds::initial`]).
+//!
+//! With both ends free, the network may then narrow the range: it runs once at half size
 //! ([`SubSplat::estimate_depth_range`](crate::network::model::subsplat::SubSplat::estimate_depth_range)).
 
 use super::{Error, Result};
 use crate::cameras::check::{PairReport, Verdict};
 use crate::files::scene::{Scene, Units};
-use crate::reconstruct::inputs::depth::depth_range;
+use crate::reconstruct::inputs::pair::{points_in_view, quantile};
 use std::fmt;
 use subsplat_kernels::camera::{Camera, NearFar};
 
@@ -17,6 +24,14 @@ use subsplat_kernels::camera::{Camera, NearFar};
 const NEAR_BASELINES: f32 = 0.5;
 /// Farthest depth of a guess, in the same unit.
 const FAR_BASELINES: f32 = 30.0;
+/// Fewest depths of sparse points that determine a range.
+const SPARSE_DEPTHS_MIN: usize = 20;
+/// Quantiles of the depths of sparse points. Stray points lie outside the two.
+const SPARSE_QUANTILES: [f32; 2] = [0.02, 0.98];
+/// The nearest depth is the low quantile divided by this: surfaces without texture have no points.
+const SPARSE_NEAR_MARGIN: f32 = 1.5;
+/// The farthest depth is the high quantile times this, for the same reason.
+const SPARSE_FAR_MARGIN: f32 = 2.0;
 
 /// Ends of the depth range that the caller fixes, world units of camera z.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -96,8 +111,11 @@ pub enum DepthSource {
     PoseFile,
     /// The scene is RealEstate10K's, where near 1 and far 100 are customary.
     RealEstate10k,
-    /// Quantiles of the scene's sparse points.
-    SparsePoints,
+    /// Quantiles of the depths of the scene's sparse points.
+    SparsePoints {
+        /// Number of depths. A point counts once in each photograph that shows it.
+        depths: usize,
+    },
     /// Points matched between the photographs.
     MatchedPoints {
         /// Number of points.
@@ -133,15 +151,20 @@ impl fmt::Display for DepthSource {
             Self::FixedNear { far } => write!(f, "near as given, far {far}"),
             Self::FixedFar { near } => write!(f, "far as given, near {near}"),
             Self::PoseFile => f.write_str("from the pose file"),
-            Self::RealEstate10k => f.write_str("RealEstate10K's usual range"),
-            Self::SparsePoints => f.write_str("from sparse points"),
-            Self::MatchedPoints { points } => write!(f, "from {points} matched points"),
+            Self::RealEstate10k => f.write_str("the usual range of RealEstate10K"),
+            Self::SparsePoints { depths } => {
+                write!(f, "from {depths} depths of the scene's sparse points")
+            }
+            Self::MatchedPoints { points } => {
+                write!(f, "from {points} points matched between the photographs")
+            }
             Self::Baseline { distance } => write!(
                 f,
-                "{NEAR_BASELINES} and {FAR_BASELINES} times the baseline of {distance:.4}"
+                "guessed as {NEAR_BASELINES} and {FAR_BASELINES} times the distance between the \
+                 cameras ({distance:.4})"
             ),
             Self::Estimated { from } => {
-                write!(f, "estimated by the network at half size (initial range: {from})")
+                write!(f, "estimated by the network at half size; initial range: {from}")
             }
         }
     }
@@ -159,27 +182,83 @@ impl DepthBounds {
         Self { near, far, source: DepthSource::RealEstate10k }
     }
 
-    /// The range that a scene's files suggest for the photographs of frames `context`: the pose
-    /// file's own, RealEstate10K's, or quantiles of sparse points. `None` where they suggest
-    /// none.
+    /// The range that a scene's files give for the photographs of frames `context`: the pose
+    /// file's own, RealEstate10K's, or quantiles of sparse points. `None` where they give none.
     ///
     /// # Errors
     /// A frame that the scene does not have.
     pub fn of_scene(scene: &Scene, context: &[usize]) -> Result<Option<Self>> {
-        if let Some(i) = context.iter().find(|i| **i >= scene.frames.len()) {
-            let expected = format!("frames below {}", scene.frames.len());
-            return Err(Error::argument(&scene.name, expected, i.to_string()));
-        }
+        let cameras = context_cameras(scene, context)?;
         if let Some(NearFar { near, far }) = scene.near_far {
             return Ok(Some(Self { near, far, source: DepthSource::PoseFile }));
         }
         if scene.units == Units::RealEstate10k {
             return Ok(Some(Self::re10k()));
         }
-        // An error means cameras at one place: `initial_bounds` reports it where it matters.
-        let points = depth_range(scene, context, None, None).ok().filter(|r| !r.guessed);
-        let source = DepthSource::SparsePoints;
-        Ok(points.map(|range| Self { near: range.near, far: range.far, source }))
+        let points = scene.points.as_deref().unwrap_or_default();
+        let mut depths: Vec<f32> = cameras.iter().flat_map(|c| points_in_view(c, points)).collect();
+        if depths.len() < SPARSE_DEPTHS_MIN {
+            return Ok(None);
+        }
+        let [low, high] = SPARSE_QUANTILES.map(|q| quantile(&mut depths, q));
+        let source = DepthSource::SparsePoints { depths: depths.len() };
+        let (near, far) = (low / SPARSE_NEAR_MARGIN, high * SPARSE_FAR_MARGIN);
+        Ok(Some(Self { near, far, source }))
+    }
+
+    /// The range for the photographs of frames `context`, without a look at their pixels:
+    /// [`DepthBounds::of_scene`], else a guess from the cameras.
+    ///
+    /// # Errors
+    /// Those of [`DepthBounds::of_scene`] and of [`DepthBounds::initial`].
+    pub fn of_frames(scene: &Scene, context: &[usize], range: DepthRange) -> Result<Self> {
+        let prior = Self::of_scene(scene, context)?;
+        Self::initial(&context_cameras(scene, context)?, range, prior.as_ref()).map_err(|error| {
+            match error {
+                Error::Argument { expected, got, .. } => {
+                    Error::argument(format!("depth range of {}", scene.name), expected, got)
+                }
+                error => error,
+            }
+        })
+    }
+
+    /// The range before any photograph is read: `range`, then `prior`, then a guess from the
+    /// distances between `cameras`.
+    ///
+    /// # Errors
+    /// Not 0 < near < far; cameras at one place and no other source.
+    pub fn initial(cameras: &[Camera], range: DepthRange, prior: Option<&Self>) -> Result<Self> {
+        let bounds = match (range, prior) {
+            (DepthRange::Fixed { near, far }, _) => Self { near, far, source: DepthSource::Fixed },
+            (_, Some(prior)) => range.applied_to(prior.clone()),
+            (_, None) => range.applied_to(guess_from_cameras(cameras)?),
+        };
+        if !bounds.is_valid() {
+            let Self { near, far, source } = bounds;
+            let got = format!("near {near}, far {far} ({source})");
+            return Err(Error::argument("depth range", "0 < near < far", got));
+        }
+        Ok(bounds)
+    }
+
+    /// Replaces guessed ends by the depths of the points that `reports` matched. Ends that
+    /// `range` fixes stay, and so do ends that are no guess.
+    pub fn refined(self, range: DepthRange, reports: &[PairReport]) -> Self {
+        let usable = reports.iter().filter(|r| r.verdict != Verdict::Bad);
+        let depths: Vec<_> = usable.filter_map(|r| r.depth).collect();
+        if !self.source.is_guess() || depths.is_empty() {
+            return self;
+        }
+        let matched = Self {
+            near: depths.iter().map(|d| d.near).fold(f32::INFINITY, f32::min),
+            far: depths.iter().map(|d| d.far).fold(0.0, f32::max),
+            source: DepthSource::MatchedPoints {
+                points: reports.iter().map(|r| r.consistent_matches).sum(),
+            },
+        };
+        let refined = range.applied_to(matched);
+        if refined.is_valid() { refined } else { self }
     }
 
     /// Returns the two ends.
@@ -193,32 +272,20 @@ impl DepthBounds {
     }
 }
 
-/// The range before any photograph is read: `range`, then `prior`, then a guess from the
-/// distances between `cameras`.
-///
-/// # Errors
-/// Not 0 < near < far; cameras at one place and no other source.
-pub fn initial_bounds(
-    cameras: &[Camera],
-    range: DepthRange,
-    prior: Option<&DepthBounds>,
-) -> Result<DepthBounds> {
-    let bounds = match (range, prior) {
-        (DepthRange::Fixed { near, far }, _) => {
-            DepthBounds { near, far, source: DepthSource::Fixed }
+/// Returns the cameras of frames `context`.
+fn context_cameras(scene: &Scene, context: &[usize]) -> Result<Vec<Camera>> {
+    let camera = |&i: &usize| match scene.frames.get(i) {
+        Some(frame) => Ok(frame.camera),
+        None => {
+            let expected = format!("frames below {}", scene.frames.len());
+            Err(Error::argument(&scene.name, expected, i.to_string()))
         }
-        (_, Some(prior)) => range.applied_to(prior.clone()),
-        (_, None) => range.applied_to(guess_from_baseline(cameras)?),
     };
-    if !bounds.is_valid() {
-        let DepthBounds { near, far, source } = bounds;
-        let got = format!("near {near}, far {far} ({source})");
-        return Err(Error::argument("depth range", "0 < near < far", got));
-    }
-    Ok(bounds)
+    context.iter().map(camera).collect()
 }
 
-fn guess_from_baseline(cameras: &[Camera]) -> Result<DepthBounds> {
+/// Guesses both ends from the largest distance between two cameras.
+fn guess_from_cameras(cameras: &[Camera]) -> Result<DepthBounds> {
     let mut distance = 0.0f32;
     for (i, a) in cameras.iter().enumerate() {
         for b in &cameras[i + 1..] {
@@ -227,36 +294,14 @@ fn guess_from_baseline(cameras: &[Camera]) -> Result<DepthBounds> {
     }
     if !(distance > 0.0 && distance.is_finite()) {
         let expected = "cameras at different places, or near and far";
-        return Err(Error::argument("depth range", expected, format!("a baseline of {distance}")));
+        let got = format!("a distance of {distance} between the cameras");
+        return Err(Error::argument("depth range", expected, got));
     }
     Ok(DepthBounds {
         near: NEAR_BASELINES * distance,
         far: FAR_BASELINES * distance,
         source: DepthSource::Baseline { distance },
     })
-}
-
-/// `bounds` with guessed ends replaced by the depths of the points that `reports` matched. Ends
-/// that `range` fixes stay.
-pub fn refined_bounds(
-    bounds: DepthBounds,
-    range: DepthRange,
-    reports: &[PairReport],
-) -> DepthBounds {
-    let usable = reports.iter().filter(|r| r.verdict != Verdict::Bad);
-    let depths: Vec<_> = usable.filter_map(|r| r.depth).collect();
-    if !bounds.source.is_guess() || depths.is_empty() {
-        return bounds;
-    }
-    let matched = DepthBounds {
-        near: depths.iter().map(|d| d.near).fold(f32::INFINITY, f32::min),
-        far: depths.iter().map(|d| d.far).fold(0.0, f32::max),
-        source: DepthSource::MatchedPoints {
-            points: reports.iter().map(|r| r.consistent_matches).sum(),
-        },
-    };
-    let refined = range.applied_to(matched);
-    if refined.is_valid() { refined } else { bounds }
 }
 
 #[cfg(test)]
@@ -291,21 +336,24 @@ mod tests {
     fn matched_points_replace_only_a_guess() {
         let reports = [matched(0.6, 9.0), matched(0.7, 12.0)];
         let refined = |range: DepthRange, reports: &[PairReport]| {
-            let guess = initial_bounds(&cameras(0.125), range, None).unwrap();
-            refined_bounds(guess, range, reports)
+            let guess = DepthBounds::initial(&cameras(0.125), range, None).unwrap();
+            guess.refined(range, reports)
         };
         let auto = refined(DepthRange::Auto, &reports);
         assert_eq!(ends(&auto), (0.6, 12.0));
-        assert_eq!(auto.source.to_string(), "from 80 matched points");
+        assert_eq!(auto.source.to_string(), "from 80 points matched between the photographs");
         let near = refined(DepthRange::Near(1.0), &reports);
         assert_eq!(ends(&near), (1.0, 12.0));
-        assert_eq!(near.source.to_string(), "near as given, far from 80 matched points");
+        assert_eq!(
+            near.source.to_string(),
+            "near as given, far from 80 points matched between the photographs"
+        );
         assert_eq!(ends(&refined(DepthRange::Far(20.0), &reports)), (0.6, 20.0));
         // Points beyond the fixed far end leave the guess.
         assert_eq!(ends(&refined(DepthRange::Far(0.5), &reports)), (0.0625, 0.5));
         let prior = DepthBounds::new(0.01, 0.5, DepthSource::PoseFile);
-        let known = initial_bounds(&cameras(1.0), DepthRange::Auto, Some(&prior)).unwrap();
-        assert_eq!(refined_bounds(known.clone(), DepthRange::Auto, &reports), known);
+        let known = DepthBounds::initial(&cameras(1.0), DepthRange::Auto, Some(&prior)).unwrap();
+        assert_eq!(known.clone().refined(DepthRange::Auto, &reports), known);
         let bad = PairReport { verdict: Verdict::Bad, ..matched(0.6, 9.0) };
         for reports in [&[][..], &[bad]] {
             let guess = refined(DepthRange::Auto, reports);
@@ -318,23 +366,24 @@ mod tests {
     fn fixed_ends_come_before_the_prior_and_the_prior_before_the_baseline() {
         let prior = DepthBounds::re10k();
         let initial = |range, prior: Option<&DepthBounds>| {
-            initial_bounds(&cameras(2.0), range, prior).map(|b| (ends(&b), b.source.to_string()))
+            DepthBounds::initial(&cameras(2.0), range, prior)
+                .map(|b| (ends(&b), b.source.to_string()))
         };
         let (both, text) =
             initial(DepthRange::Fixed { near: 3.0, far: 4.0 }, Some(&prior)).unwrap();
         assert_eq!((both, text.as_str()), ((3.0, 4.0), "as given"));
         let (near, text) = initial(DepthRange::Near(3.0), Some(&prior)).unwrap();
         assert_eq!(near, (3.0, 100.0));
-        assert_eq!(text, "near as given, far RealEstate10K's usual range");
+        assert_eq!(text, "near as given, far the usual range of RealEstate10K");
         assert_eq!(initial(DepthRange::Auto, Some(&prior)).unwrap().0, (1.0, 100.0));
         let (guess, text) = initial(DepthRange::Far(9.0), None).unwrap();
         assert_eq!(guess, (1.0, 9.0));
-        assert!(text.ends_with("times the baseline of 2.0000"), "{text}");
+        assert!(text.ends_with("(2.0000)"), "{text}");
         for (near, far) in [(5.0, 1.0), (-1.0, 2.0), (f32::NAN, 2.0), (1.0, f32::INFINITY)] {
             let error = initial(DepthRange::Fixed { near, far }, None).unwrap_err().to_string();
             assert!(error.contains(&format!("near {near}, far {far}")), "{error}");
         }
-        let error = initial_bounds(&cameras(0.0), DepthRange::Auto, None).unwrap_err();
-        assert!(error.to_string().contains("baseline"), "{error}");
+        let error = DepthBounds::initial(&cameras(0.0), DepthRange::Auto, None).unwrap_err();
+        assert!(error.to_string().contains("a distance of 0 between"), "{error}");
     }
 }

@@ -4,15 +4,15 @@
 //! use std::ops::ControlFlow;
 //! use subsplat::reconstruct::{DepthBounds, Options, Photo, Reconstructor};
 //! # fn main() -> subsplat::Result<()> {
-//! let scene = subsplat::files::scene::load_scene("scene".as_ref())?;
+//! let scene = subsplat::files::scene::load_scene("scene")?;
 //! let photos = [Photo::from_frame(&scene.frames[0])?, Photo::from_frame(&scene.frames[1])?];
 //! let options = Options::default().with_depth_prior(DepthBounds::of_scene(&scene, &[0, 1])?);
-//! let model = Reconstructor::load("weights.safetensors".as_ref(), None)?;
+//! let model = Reconstructor::load("weights.safetensors", None)?;
 //! let result = model.run_with(&photos, &options, &mut |progress| {
 //!     println!("{:3.0} % {}", 100.0 * progress.fraction, progress.stage);
 //!     ControlFlow::Continue(())
 //! })?;
-//! result.save("scene.ply".as_ref())?;
+//! result.save("scene.ply")?;
 //! # Ok(())
 //! # }
 //! ```
@@ -41,11 +41,11 @@ mod density;
 mod depth_range;
 mod detail;
 mod error;
+mod estimate_cameras;
 mod exposure;
 mod fit;
 mod input_size;
 pub mod inputs;
-mod loose;
 mod options;
 mod photo;
 mod poses;
@@ -59,10 +59,11 @@ pub use crate::network::model::Backend;
 pub use density::Density;
 pub use depth_range::{DepthBounds, DepthRange, DepthSource};
 pub use error::{Error, Result};
-pub use input_size::InputSize;
-pub use loose::{
-    KnownLens, LensSource, LooseOptions, LoosePhotos, LooseScene, loose_photos, loose_scene,
+pub use estimate_cameras::{
+    EstimateOptions, EstimatedPhotos, EstimatedScene, KnownLens, LensSource, estimate_cameras,
+    estimate_cameras_of_files,
 };
+pub use input_size::InputSize;
 pub use options::{Check, Detail, Options, Poses, Refine, TargetSize};
 pub use photo::Photo;
 pub use poses::PoseError;
@@ -73,14 +74,12 @@ pub use reconstructor::Reconstructor;
 pub use warning::Warning;
 
 pub(crate) use children::{SceneChildren, counts_of};
-pub(crate) use depth_range::{initial_bounds, refined_bounds};
 pub(crate) use fit::{fit_to_inputs, refine_on_inputs};
 pub(crate) use poses::check_pairs;
 
 /// The stages of a run, one by one, for evaluation. No version promises anything about them.
 pub mod stages {
     pub use super::children::{Counts, SceneChildren, counts_of};
-    pub use super::depth_range::{initial_bounds, refined_bounds};
     pub use super::detail::add_detail;
     pub use super::exposure::equalise;
     pub use super::fit::{fit_to_inputs, refine_on_inputs};

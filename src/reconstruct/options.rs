@@ -1,6 +1,6 @@
 //! Options of a reconstruction.
 
-use super::{Density, DepthBounds, DepthRange, Error, InputSize, Result, initial_bounds};
+use super::{Density, DepthBounds, DepthRange, Error, InputSize, Result};
 use crate::fit::FitOptions;
 use crate::refine::RefineOptions;
 use std::time::Duration;
@@ -145,7 +145,7 @@ impl Options {
             let got = cameras.len().to_string();
             return Err(Error::argument("photographs", "at least 2", got));
         }
-        initial_bounds(cameras, self.depth_range, self.depth_prior.as_ref())
+        DepthBounds::initial(cameras, self.depth_range, self.depth_prior.as_ref())
     }
 }
 

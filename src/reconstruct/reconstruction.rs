@@ -50,7 +50,7 @@ impl Reconstruction {
     ///
     /// # Errors
     /// Those of [`save_splats`].
-    pub fn save(&self, path: &Path) -> Result<SaveReport> {
+    pub fn save(&self, path: impl AsRef<Path>) -> Result<SaveReport> {
         let comments = self.comments();
         Ok(save_splats(path, &self.splats, &SaveOptions { comments, ..SaveOptions::default() })?)
     }

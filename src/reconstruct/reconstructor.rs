@@ -5,7 +5,6 @@ use super::warning::Warning;
 use super::{
     Check, DepthBounds, DepthRange, DepthSource, Detail, Error, Options, Photo, Poses, Prepared,
     Progress, Reconstruction, Refine, Result, Stage, check_pairs, exposure, is_mvsplat, poses,
-    refined_bounds,
 };
 use crate::network::config::{Config, Preset};
 use crate::network::model::subsplat::SubSplat;
@@ -57,8 +56,8 @@ impl Reconstructor {
     /// A file that holds no weights; a tensor that is missing or has another shape, named with
     /// both shapes; a configuration out of range; `SUBSPLAT_SIMD` as in
     /// [`Reconstructor::untrained`].
-    pub fn load(path: &Path, config: Option<&Config>) -> Result<Self> {
-        Self::from_weights(Weights::load(path)?, config)
+    pub fn load(path: impl AsRef<Path>, config: Option<&Config>) -> Result<Self> {
+        Self::from_weights(Weights::load(path.as_ref())?, config)
     }
 
     /// [`Reconstructor::load`] from weights in memory.
@@ -205,7 +204,7 @@ impl Reconstructor {
             let upscale = self.config().upscale;
             warnings.push(Warning::UntrainedTensors { count: self.missing, upscale });
         }
-        let bounds = refined_bounds(guess, options.depth_range, &reports);
+        let bounds = guess.refined(options.depth_range, &reports);
         let options = options.clone();
         let cut_shares = inputs.iter().zip(sizes).map(|(c, size)| cut_share(c, size)).collect();
         Ok(Prepared {

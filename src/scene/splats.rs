@@ -93,33 +93,20 @@ impl TryFrom<SplatParts> for Splats {
     type Error = SplatsError;
 
     fn try_from(parts: SplatParts) -> Result<Self, SplatsError> {
-        let SplatParts { rows, sh, gain, sh_degree, sh_basis } = parts;
-        Self::new(rows, sh, gain, sh_degree, sh_basis)
+        let new = Self::with_unchecked_numbers(parts)?;
+        let check = |what, values: &[f32], floats_per_set: usize, splats_per_set: usize| {
+            let Some(at) = first_not_finite(values) else { return Ok(()) };
+            let splat = at / floats_per_set * splats_per_set;
+            Err(SplatsError::NotFinite { what, splat, got: values[at].to_string() })
+        };
+        check("rows", &new.rows, SPLAT_STRIDE, 1)?;
+        check("SH coefficients", &new.sh, 3 * new.sh_coefficients(), new.children_per_parent())?;
+        check("gain", &new.gain, new.gain_channels().max(1), 1)?;
+        Ok(new)
     }
 }
 
 impl Splats {
-    /// Returns the rows, to be edited in place. Their number and their values are not checked;
-    /// [`Splats::into_parts`] and [`Splats::try_from`] check.
-    pub fn rows_mut(&mut self) -> &mut Vec<f32> {
-        &mut self.rows
-    }
-
-    /// Returns the SH coefficients, to be edited in place without a check.
-    pub fn sh_mut(&mut self) -> &mut Vec<f32> {
-        &mut self.sh
-    }
-
-    /// Returns the gains, to be edited in place without a check.
-    pub fn gain_mut(&mut self) -> &mut Vec<f32> {
-        &mut self.gain
-    }
-
-    /// Changes the SH basis without converting the coefficients.
-    pub fn set_sh_basis(&mut self, basis: ShBasis) {
-        self.sh_basis = basis;
-    }
-
     /// Returns the buffers, to change them; [`Splats::try_from`] checks them again.
     pub fn into_parts(self) -> SplatParts {
         let Self { rows, sh, gain, sh_degree, sh_basis } = self;
@@ -142,30 +129,17 @@ impl Splats {
         sh_degree: usize,
         sh_basis: ShBasis,
     ) -> Result<Self, SplatsError> {
-        let new = Self::new_with_unchecked_numbers(rows, sh, gain, sh_degree, sh_basis)?;
-        let check = |what, values: &[f32], floats_per_set: usize, splats_per_set: usize| {
-            let Some(at) = first_not_finite(values) else { return Ok(()) };
-            let splat = at / floats_per_set * splats_per_set;
-            Err(SplatsError::NotFinite { what, splat, got: values[at].to_string() })
-        };
-        check("rows", &new.rows, SPLAT_STRIDE, 1)?;
-        check("SH coefficients", &new.sh, 3 * new.sh_coefficients(), new.children_per_parent())?;
-        check("gain", &new.gain, new.gain_channels().max(1), 1)?;
-        Ok(new)
+        Self::try_from(SplatParts { rows, sh, gain, sh_degree, sh_basis })
     }
 
-    /// Checks the lengths of the buffers only. The file readers check the numbers themselves,
-    /// because their errors name the file.
+    /// Checks the lengths of the buffers only, for numbers that are checked elsewhere: the errors
+    /// of the file readers name the file. The rasterizer drops Gaussians whose numbers are not
+    /// finite.
     ///
     /// # Errors
     /// [`SplatsError::Shape`] names the buffer.
-    pub(crate) fn new_with_unchecked_numbers(
-        rows: Vec<f32>,
-        sh: Vec<f32>,
-        gain: Vec<f32>,
-        sh_degree: usize,
-        sh_basis: ShBasis,
-    ) -> Result<Self, SplatsError> {
+    pub fn with_unchecked_numbers(parts: SplatParts) -> Result<Self, SplatsError> {
+        let SplatParts { rows, sh, gain, sh_degree, sh_basis } = parts;
         let shape = |what, expected: String, got: usize| {
             Err(SplatsError::Shape { what, expected, got: got.to_string() })
         };

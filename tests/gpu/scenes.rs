@@ -2,10 +2,11 @@
 //! shipped weights, and a .ply of 16,384 Gaussians.
 
 use subsplat_test_support as common;
+use subsplat_test_support::edit::Edit;
 use subsplat_test_support::gpu as adapter;
 
 use adapter::gpu;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use subsplat::FitOptions;
 use subsplat::files::load_splats;
 use subsplat::files::scene::{Scene, load_scene};
@@ -75,7 +76,7 @@ fn check(name: &str, splats: &Splats, camera: &Camera, options: &RasterOptions) 
     assert!(off < FLIPPED && alphas_off < FLIPPED && worst < FLIP, "{name}: {off} {worst}");
     // The check fails for one changed splat in a thousand.
     let mut moved = splats.clone();
-    moved.rows_mut().chunks_mut(11 * 1000).for_each(|rows| rows[10] *= 0.5);
+    moved.edit(|p| p.rows.chunks_mut(11 * 1000).for_each(|rows| rows[10] *= 0.5));
     let (off, worst) =
         differences(&on_gpu.render(&slices(&moved), camera, &options).unwrap().rgb, &expected.rgb);
     assert!(off > FLIPPED || worst > FLIP, "{name}: halved opacities pass: {off} {worst}");
@@ -104,7 +105,7 @@ fn a_real_ply() {
         return;
     }
     let Some(folder) = common::shared("photos/re10k_5aca87f95a9412c6") else { return };
-    let splats = load_splats(&folder.join("5aca87f95a9412c6.globalsplat16k.ply")).unwrap();
+    let splats = load_splats(folder.join("5aca87f95a9412c6.globalsplat16k.ply")).unwrap();
     assert_eq!((splats.len(), splats.sh_degree()), (16_384, 3));
     let camera = load_scene(&folder).unwrap().frames[4].pinhole().unwrap();
     for convention in [Convention::Standard, Convention::Mvsplat] {
@@ -116,7 +117,7 @@ fn a_real_ply() {
 /// fit amplifies differences of rounding: tests/gpu/fit.rs compares its loss.
 fn room() -> (Scene, Vec<Photo>, Options) {
     let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("examples/room");
-    let scene = load_scene(Path::new(&folder)).unwrap();
+    let scene = load_scene(&folder).unwrap();
     let photos = scene.frames[..2].iter().map(|f| Photo::from_frame(f).unwrap()).collect();
     let NearFar { near, far } = scene.near_far.unwrap();
     let options = Options::default().with_depth_range(DepthRange::Fixed { near, far });
@@ -158,7 +159,7 @@ fn the_example_room_with_the_shipped_weights() {
     eprintln!("{} Gaussians, {share:.1e} of them moved", got.len());
     assert!(share < MOVED, "{share} of the rows moved");
     let mut other = got.clone();
-    other.rows_mut().chunks_mut(11 * 40).for_each(|rows| rows[0] += 0.1);
+    other.edit(|p| p.rows.chunks_mut(11 * 40).for_each(|rows| rows[0] += 0.1));
     assert!(moved(&other, &expected) > MOVED, "moved rows pass");
 
     let target = &scene.frames[2];

@@ -1,6 +1,7 @@
 //! The whole path in numbers: photographs of procedural rooms through seeded networks
 //! to splats, pictures and files, and back from files.
 
+use subsplat_test_support::edit::Edit;
 use subsplat_test_support::whole;
 
 use candle_core::{Device, Tensor};
@@ -100,7 +101,7 @@ fn files_render_as_the_splats_they_were_made_from() {
 fn forgetful(splats: &Splats) -> Vec<(&'static str, Splats)> {
     let gain = |f: &dyn Fn(&mut [f32])| {
         let mut wrong = splats.clone();
-        wrong.gain_mut().chunks_exact_mut(4).for_each(f);
+        wrong.edit(|p| p.gain.chunks_exact_mut(4).for_each(f));
         wrong
     };
     let basis = match splats.sh_basis() {
@@ -110,7 +111,7 @@ fn forgetful(splats: &Splats) -> Vec<(&'static str, Splats)> {
     let mut flat = splats.clone();
     amplify_view_dependence(&mut flat, 0.0);
     let mut rebased = splats.clone();
-    rebased.set_sh_basis(basis);
+    rebased.edit(|p| p.sh_basis = basis);
     vec![
         ("no gain", gain(&|g| g[0] = 1.0)),
         ("no residual", gain(&|g| g[1..].fill(0.0))),

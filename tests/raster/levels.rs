@@ -9,6 +9,7 @@ use subsplat::scene::splats::Splats;
 use subsplat_kernels::camera::{Camera, Intrinsics};
 use subsplat_kernels::layout::{LOWPASS, RasterOptions, SPLAT_STRIDE, ShBasis};
 use subsplat_kernels::sh::C0;
+use subsplat_test_support::edit::Edit;
 
 /// Side of the pictures, px.
 const SIDE: usize = 128;
@@ -253,11 +254,10 @@ fn numbers_that_are_not_finite_have_no_part_in_a_merge() {
         (10, 0.001),
     ] {
         let mut poisoned = all.clone();
-        poisoned
-            .rows_mut()
-            .chunks_exact_mut(SPLAT_STRIDE)
-            .step_by(50)
-            .for_each(|r| r[column] = value);
+        poisoned.edit(|p| {
+            let rows = p.rows.chunks_exact_mut(SPLAT_STRIDE).step_by(50);
+            rows.for_each(|r| r[column] = value);
+        });
         let levels = Levels::new(&poisoned);
         let selection = levels.select(&camera, CELL_PX);
         let chosen = levels.gather(&poisoned, &selection).unwrap();
@@ -268,14 +268,16 @@ fn numbers_that_are_not_finite_have_no_part_in_a_merge() {
         assert!(likeness >= 35.0, "{column}: {likeness:.1} dB");
     }
     let mut poisoned = all.clone();
-    poisoned.sh_mut()[7] = f32::NAN;
-    poisoned.gain_mut()[400] = f32::INFINITY;
+    poisoned.edit(|p| {
+        p.sh[7] = f32::NAN;
+        p.gain[400] = f32::INFINITY;
+    });
     let levels = Levels::new(&poisoned);
     let chosen = levels.gather(&poisoned, &levels.select(&camera, CELL_PX)).unwrap();
     assert!(chosen.sh().iter().all(|v| v.is_finite()));
     let nothing = {
         let mut nothing = all.clone();
-        nothing.rows_mut().fill(f32::NAN);
+        nothing.edit(|p| p.rows.fill(f32::NAN));
         nothing
     };
     assert!(Levels::new(&nothing).select(&camera, CELL_PX).is_whole());

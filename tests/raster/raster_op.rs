@@ -9,6 +9,7 @@ use subsplat::scene::splats::Splats;
 use subsplat_kernels::camera::{Camera, Intrinsics};
 use subsplat_kernels::cpu::{Gradients, Rasterizer};
 use subsplat_kernels::layout::{Convention, RasterOptions, ShBasis};
+use subsplat_test_support::edit::Edit;
 
 fn camera() -> Camera {
     let k = Intrinsics { fx: 30.0, fy: 32.0, cx: 14.0, cy: 10.0, width: 29, height: 21 };
@@ -55,7 +56,7 @@ fn forward_is_the_kernels() {
     // Gain of one channel.
     let one = gain.narrow(1, 0, 1).unwrap().flatten_all().unwrap().contiguous().unwrap();
     let mut single = s.clone();
-    *single.gain_mut() = one.to_vec1().unwrap();
+    single.edit(|p| p.gain = one.to_vec1().unwrap());
     let got = rasterize(&rows, &sh, &one, &camera, &o).unwrap();
     let got = got.flatten_all().unwrap().to_vec1::<f32>().unwrap();
     let expected = subsplat::scene::render(&single, &camera, &o);
@@ -129,10 +130,12 @@ fn gradients_are_the_kernels_and_those_of_the_loss() {
     let (mut s, camera, o) = (splats(), camera(), RasterOptions::default());
     // So wide and faint that no support ends inside the picture and no pixel stops: a
     // finite step then meets no jump.
-    for row in s.rows_mut().chunks_exact_mut(11) {
-        row[7..10].iter_mut().for_each(|scale| *scale *= 20.0);
-        row[10] = 0.35;
-    }
+    s.edit(|p| {
+        for row in p.rows.chunks_exact_mut(11) {
+            row[7..10].iter_mut().for_each(|scale| *scale *= 20.0);
+            row[10] = 0.35;
+        }
+    });
     let (rows, sh, gain) = s.to_tensors(&Device::Cpu).unwrap();
     let variables = [&rows, &sh, &gain].map(|t| Var::from_tensor(t).unwrap());
     let [a, b, c] = variables.each_ref().map(|v| v.as_tensor().clone());
@@ -195,7 +198,7 @@ fn splat_tensors_pass_gradients_to_their_parts() {
         SplatTensors::from_parts(&means, &quats, &scales, &opacities, &sh, s.sh_basis()).unwrap();
     let planes = subsplat::rasterize(&tensors, &camera, &o).unwrap();
     let mut plain = s.clone();
-    *plain.gain_mut() = Vec::new();
+    plain.edit(|p| p.gain.clear());
     let picture = subsplat::scene::render(&plain, &camera, &o);
     let got: Vec<f32> = planes.get(3).unwrap().flatten_all().unwrap().to_vec1().unwrap();
     assert!(got == picture.alpha);

@@ -2,6 +2,7 @@
 //! hold for any scene: the same bytes for any number of threads and any memory
 //! limit, no poison from bad numbers, background where nothing is.
 
+use subsplat_test_support::edit::Edit;
 use subsplat_test_support::oracle;
 
 use glam::{EulerRot, Mat4, Quat, Vec3};
@@ -265,11 +266,13 @@ fn mvsplat_lengths_are_in_units_of_near() {
     let base = Rasterizer::new().render(&slices(&scene.splats), &scene.camera, &o);
     // A power of two scales f32 exactly.
     let mut scaled = scene.splats.clone();
-    for row in scaled.rows_mut().chunks_exact_mut(SPLAT_STRIDE) {
-        for lane in [0, 1, 2, 7, 8, 9] {
-            row[lane] *= 4.0;
+    scaled.edit(|p| {
+        for row in p.rows.chunks_exact_mut(SPLAT_STRIDE) {
+            for lane in [0, 1, 2, 7, 8, 9] {
+                row[lane] *= 4.0;
+            }
         }
-    }
+    });
     let mut pose = scene.camera.world_from_camera();
     pose.w_axis *= glam::Vec4::new(4.0, 4.0, 4.0, 1.0);
     let camera = Camera::new(scene.camera.intrinsics(), pose).unwrap();
@@ -311,13 +314,15 @@ fn any_number_of_threads_and_any_memory_gives_the_same_bytes() {
         }
         let more = scene(kind, seed as u64, (150, 97), 4);
         let move_back = camera.world_from_camera() * more.camera.camera_from_world();
-        for row in more.splats.rows().chunks_exact(SPLAT_STRIDE) {
-            let at = move_back.transform_point3(Vec3::from_slice(&row[..3]));
-            all.splats.rows_mut().extend(at.to_array());
-            all.splats.rows_mut().extend_from_slice(&row[3..]);
-        }
-        all.splats.sh_mut().extend_from_slice(more.splats.sh());
-        all.splats.gain_mut().extend_from_slice(more.splats.gain());
+        all.splats.edit(|p| {
+            for row in more.splats.rows().chunks_exact(SPLAT_STRIDE) {
+                let at = move_back.transform_point3(Vec3::from_slice(&row[..3]));
+                p.rows.extend(at.to_array());
+                p.rows.extend_from_slice(&row[3..]);
+            }
+            p.sh.extend_from_slice(more.splats.sh());
+            p.gain.extend_from_slice(more.splats.gain());
+        });
     }
     assert!(all.splats.len() > 10_000);
     let levels = SimdLevel::available().iter().map(|&level| (Convention::Standard, level));
@@ -480,9 +485,9 @@ fn bad_numbers_drop_their_splat_and_nothing_else() {
         // The oracle of dropping a splat is not having it: opacity 0.
         let without = |dropped: &[usize]| {
             let mut s = good.splats.clone();
-            for &i in dropped {
-                s.rows_mut()[i * SPLAT_STRIDE + OPACITY_OFFSET] = 0.0;
-            }
+            s.edit(|p| {
+                dropped.iter().for_each(|i| p.rows[i * SPLAT_STRIDE + OPACITY_OFFSET] = 0.0);
+            });
             rasterize(&s, &o)
         };
         assert!(without(&[]) != without(&(0..n).collect::<Vec<_>>()));
@@ -493,31 +498,32 @@ fn bad_numbers_drop_their_splat_and_nothing_else() {
                 }
                 let mut s = good.splats.clone();
                 let hit: Vec<usize> = (lane..n).step_by(9).collect();
-                for &i in &hit {
-                    s.rows_mut()[i * SPLAT_STRIDE + lane] = bad;
-                }
+                s.edit(|p| hit.iter().for_each(|i| p.rows[i * SPLAT_STRIDE + lane] = bad));
                 let got = rasterize(&s, &o);
                 assert!(got == without(&hit), "lane {lane} = {bad} {convention:?}");
             }
         }
         let mut s = good.splats.clone();
         let zero: Vec<usize> = (0..n).step_by(5).collect();
-        for &i in &zero {
-            s.rows_mut()[i * SPLAT_STRIDE + 3..i * SPLAT_STRIDE + 7].fill(0.0);
-        }
+        s.edit(|p| {
+            let quaternion = |i: &usize| i * SPLAT_STRIDE + 3..i * SPLAT_STRIDE + 7;
+            zero.iter().for_each(|i| p.rows[quaternion(i)].fill(0.0));
+        });
         assert!(rasterize(&s, &o) == without(&zero), "zero quaternions {convention:?}");
         let mut s = good.splats.clone();
-        s.gain_mut()[4 * 11 + 2] = f32::NAN;
-        s.gain_mut()[4 * 12] = f32::INFINITY;
+        s.edit(|p| {
+            p.gain[4 * 11 + 2] = f32::NAN;
+            p.gain[4 * 12] = f32::INFINITY;
+        });
         assert!(rasterize(&s, &o) == without(&[11, 12]), "gain {convention:?}");
         let mut s = good.splats.clone();
-        s.sh_mut()[75 * 3 + 5] = f32::NAN;
+        s.edit(|p| p.sh[75 * 3 + 5] = f32::NAN);
         let family: Vec<usize> = (3 * k..4 * k).collect();
         assert!(rasterize(&s, &o) == without(&family), "SH {convention:?}");
         // A lost child does not blind its siblings under the parent's direction.
         let shared = RasterOptions { sh_direction: ShDirection::Parent, ..o };
         let mut s = good.splats.clone();
-        s.rows_mut()[8 * SPLAT_STRIDE] = f32::NAN;
+        s.edit(|p| p.rows[8 * SPLAT_STRIDE] = f32::NAN);
         let got = rasterize(&s, &shared);
         assert!(got.rgb.iter().all(|v| v.is_finite()));
         let all_gone = rasterize(&poisoned(&good.splats), &o);
@@ -527,7 +533,7 @@ fn bad_numbers_drop_their_splat_and_nothing_else() {
 
 fn poisoned(splats: &Splats) -> Splats {
     let mut s = splats.clone();
-    s.rows_mut().fill(f32::NAN);
+    s.edit(|p| p.rows.fill(f32::NAN));
     s
 }
 
@@ -566,9 +572,7 @@ fn opaque_layers_end_the_work() {
     let k = Intrinsics { cx: 0.5, cy: 0.5, width: 1, height: 1, ..k };
     let camera = Camera::new(k, Mat4::IDENTITY).unwrap();
     let mut points = splats.clone();
-    for row in points.rows_mut().chunks_exact_mut(SPLAT_STRIDE) {
-        row[7..10].fill(0.0);
-    }
+    points.edit(|p| p.rows.chunks_exact_mut(SPLAT_STRIDE).for_each(|row| row[7..10].fill(0.0)));
     rasterizer.render(&slices(&points), &camera, &RasterOptions::default());
     assert_eq!(rasterizer.stats().items, 2);
 }
@@ -578,7 +582,7 @@ fn opaque_layers_end_the_work() {
 fn render_uses_the_splats_own_basis() {
     let scene = scene(Kind::Plain, 9, (64, 48), 0);
     let mut splats = scene.splats;
-    splats.set_sh_basis(ShBasis::Mvsplat);
+    splats.edit(|p| p.sh_basis = ShBasis::Mvsplat);
     let o = RasterOptions::default();
     let picture = subsplat::scene::render(&splats, &scene.camera, &o);
     let mvsplat = RasterOptions { sh_basis: ShBasis::Mvsplat, ..o };

@@ -8,6 +8,7 @@ use subsplat::scene::splats::Splats;
 use subsplat_kernels::camera::{Camera, Intrinsics};
 use subsplat_kernels::layout::{Convention, RasterOptions, ShBasis};
 use subsplat_kernels::sh::C0;
+use subsplat_test_support::edit::Edit;
 
 /// Side of the pictures, px.
 const SIDE: usize = 96;
@@ -149,9 +150,7 @@ fn gaussians_behind_a_wall_go_first_and_those_outside_the_picture_stay() {
     let front = wall(2.0, pattern);
     let hidden = wall(4.0, |_, y| [y as f32 / GRID as f32, 1.0, 0.0]);
     let mut beside = wall(2.0, |x, y| [x as f32 / GRID as f32, y as f32 / GRID as f32, 1.0]);
-    for row in beside.rows_mut().chunks_exact_mut(11) {
-        row[0] += 5.0;
-    }
+    beside.edit(|p| p.rows.chunks_exact_mut(11).for_each(|row| row[0] += 5.0));
     let scene = joined(&front, &hidden);
     let whole = picture(&scene);
     let mut renderer = Renderer::default();

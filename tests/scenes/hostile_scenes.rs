@@ -16,6 +16,7 @@ use subsplat::files::colmap::{
 use subsplat::files::protocol::{load_index, load_protocol};
 use subsplat::files::scene::{Units, load_scene};
 use subsplat::files::{image, re10k};
+use subsplat_kernels::layout::random;
 
 /// Asserts an error of one line that contains all of `words`.
 fn check(case: &str, result: Result<(), subsplat::files::Error>, words: &[&str]) {
@@ -371,7 +372,7 @@ fn bad_pictures() {
     check("a folder", load_scene(folder.path()).map(|_| ()), &["001.png", "directory"]);
     check(
         "8-bit depth",
-        image::load_depth_png(&folder.path().join("images/000.png"), 0.001).map(|_| ()),
+        image::load_depth_png(folder.path().join("images/000.png"), 0.001).map(|_| ()),
         &["16-bit grey"],
     );
 }
@@ -385,11 +386,11 @@ fn bad_paths() {
         load_scene(folder.path()).map(|_| ()),
         &["cameras.json", "sparse/0", "none of them"],
     );
-    check("nothing", load_scene(&at("nowhere")).map(|_| ()), &["nowhere", "No such file"]);
+    check("nothing", load_scene(at("nowhere")).map(|_| ()), &["nowhere", "No such file"]);
     std::fs::write(at("a.ply"), "ply").unwrap();
-    check("a .ply", load_scene(&at("a.ply")).map(|_| ()), &["a.ply", "pose file", "`ply`"]);
+    check("a .ply", load_scene(at("a.ply")).map(|_| ()), &["a.ply", "pose file", "`ply`"]);
     std::fs::write(at("a.bin"), "").unwrap();
-    check("lone .bin", load_scene(&at("a.bin")).map(|_| ()), &["cameras", "No such file"]);
+    check("lone .bin", load_scene(at("a.bin")).map(|_| ()), &["cameras", "No such file"]);
 }
 
 #[test]
@@ -420,9 +421,9 @@ fn bad_protocols() {
 type Parser = fn(&[u8]) -> Result<(), subsplat::files::Error>;
 
 const BINARY: [(&str, Parser); 3] = [
-    ("cameras", |b| parse_cameras_bin(Path::new("cameras.bin"), b).map(|_| ())),
-    ("images", |b| parse_images_bin(Path::new("images.bin"), b).map(|_| ())),
-    ("points", |b| parse_points_bin(Path::new("points3D.bin"), b).map(|_| ())),
+    ("cameras", |b| parse_cameras_bin("cameras.bin", b).map(|_| ())),
+    ("images", |b| parse_images_bin("images.bin", b).map(|_| ())),
+    ("points", |b| parse_points_bin("points3D.bin", b).map(|_| ())),
 ];
 
 #[test]
@@ -535,11 +536,7 @@ struct Random(u64);
 
 impl Random {
     fn below(&mut self, n: usize) -> usize {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) % n as u64) as usize
+        (random::next(&mut self.0) % n as u64) as usize
     }
 
     /// Applies one to four changes: a flipped bit, another byte, a run of ones, a removed piece, a

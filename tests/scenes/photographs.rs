@@ -1,4 +1,4 @@
-//! Loose photographs: EXIF orientation and camera, truncated files, ICC profiles, pixel formats,
+//! Photographs without a pose file: EXIF orientation and camera, truncated files, ICC profiles, pixel formats,
 //! HEIC.
 
 use exif::experimental::Writer;
@@ -98,14 +98,14 @@ fn file(name: &str) -> PathBuf {
 }
 
 fn parse(bytes: &[u8]) -> Photograph {
-    parse_photograph(bytes, &LoadOptions::default(), &file("photo")).unwrap()
+    parse_photograph(bytes, &LoadOptions::default(), file("photo")).unwrap()
 }
 
 fn error(bytes: &[u8]) -> String {
-    let loose = parse_photograph(bytes, &LoadOptions::default(), &file("photo")).unwrap_err();
-    let posed = image::parse_picture(bytes, &file("photo")).unwrap_err();
-    assert_eq!(loose.to_string(), posed.to_string());
-    loose.to_string()
+    let upright = parse_photograph(bytes, &LoadOptions::default(), file("photo")).unwrap_err();
+    let posed = image::parse_picture(bytes, file("photo")).unwrap_err();
+    assert_eq!(upright.to_string(), posed.to_string());
+    upright.to_string()
 }
 
 /// A smooth picture whose four corners differ.
@@ -181,7 +181,7 @@ fn photographs_are_upright_in_all_orientations() {
     let e = parse_photograph(
         &tiff_with_tag(&stored, 0xc612, 1),
         &LoadOptions::default(),
-        &file("a.dng"),
+        file("a.dng"),
     );
     let e = e.unwrap_err().to_string();
     assert!(e.contains("a.dng") && e.contains("DNG"), "{e}");
@@ -347,7 +347,7 @@ fn damaged_exif_never_panics() {
             damaged[at] = value;
             let _ = parse_exif(&damaged, 8, 6);
             let bytes = rgb_png(&picture, Some(&damaged));
-            let _ = parse_photograph(&bytes, &LoadOptions::default(), &file("photo"));
+            let _ = parse_photograph(&bytes, &LoadOptions::default(), file("photo"));
         }
     }
 }
@@ -362,12 +362,12 @@ fn pairs_are_upright_and_pose_files_are_not() {
         std::fs::write(path(name), rgb_png(&stored, Some(&exif))).unwrap();
     }
     let portrait = camera(6, 8);
-    let scene = Scene::from_pair(&path("a.png"), &path("b.png"), portrait, portrait).unwrap();
+    let scene = Scene::from_pair(path("a.png"), path("b.png"), portrait, portrait).unwrap();
     assert!(scene.warnings.is_empty(), "{:?}", scene.warnings);
     let (picture, found) = scene.frames[0].load().unwrap();
     assert_eq!((picture.width, picture.height, found), (6, 8, portrait));
     assert_eq!(picture.data[..3], stored.data[3 * 8 * 5..][..3]);
-    let sideways = Scene::from_pair(&path("a.png"), &path("b.png"), camera(8, 6), portrait);
+    let sideways = Scene::from_pair(path("a.png"), path("b.png"), camera(8, 6), portrait);
     let e = sideways.unwrap_err().to_string();
     assert!(e.contains("8x6") && e.contains("6x8"), "{e}");
 
@@ -436,7 +436,7 @@ fn truncated_jpegs_are_refused() {
         let padded = [&bytes[..half], &[0; 300]].concat();
         assert!(error(&padded).contains("inside its pixels"), "{case}");
         let accept = LoadOptions { truncated: Truncated::Accept };
-        let loaded = parse_photograph(&bytes[..half], &accept, &file("photo")).unwrap();
+        let loaded = parse_photograph(&bytes[..half], &accept, file("photo")).unwrap();
         assert_eq!((loaded.image.width, loaded.image.height), (64, 48));
         assert!(loaded.warnings[0].contains("truncated"), "{:?}", loaded.warnings);
     }
@@ -478,7 +478,7 @@ fn truncated_files_of_other_formats_are_refused() {
         parse(&bytes);
         for i in 1..8 {
             let cut = bytes.len() * i / 8;
-            let found = parse_photograph(&bytes[..cut], &LoadOptions::default(), &file("photo"));
+            let found = parse_photograph(&bytes[..cut], &LoadOptions::default(), file("photo"));
             assert!(found.is_err(), "{case} cut at {cut} of {}", bytes.len());
         }
     }
@@ -534,7 +534,7 @@ fn icc_profiles_are_converted_to_srgb() {
             };
             let rgb8 = png(&colour, [1, 1], ExtendedColorType::Rgb8, None, Some(icc.clone()));
             close(&parse(&rgb8).image.data, 1.0, "PNG");
-            assert_eq!(image::parse_picture(&rgb8, &file("a")).unwrap(), parse(&rgb8).image);
+            assert_eq!(image::parse_picture(&rgb8, file("a")).unwrap(), parse(&rgb8).image);
             assert!(parse(&rgb8).warnings.is_empty());
             let [r, g, b] = colour;
             let kind = ExtendedColorType::Rgba8;
@@ -665,7 +665,7 @@ fn every_pixel_format_is_right_or_refused() {
         let found = parse(&bytes);
         assert_eq!(found.image.data[..3], expected, "{case}");
         assert!(found.warnings.is_empty(), "{case} {:?}", found.warnings);
-        assert_eq!(image::parse_picture(&bytes, &file("a")).unwrap(), found.image, "{case}");
+        assert_eq!(image::parse_picture(&bytes, file("a")).unwrap(), found.image, "{case}");
     }
 }
 
@@ -701,9 +701,9 @@ fn heic(name: &str) -> PathBuf {
 
 #[test]
 fn avif_is_refused_by_name() {
-    let e = load_photograph(&heic("colour.avif"), &LoadOptions::default()).unwrap_err();
+    let e = load_photograph(heic("colour.avif"), &LoadOptions::default()).unwrap_err();
     assert!(e.to_string().contains("got an AVIF picture"), "{e}");
-    assert!(image::probe(&heic("colour.avif")).unwrap_err().to_string().contains("AVIF"));
+    assert!(image::probe(heic("colour.avif")).unwrap_err().to_string().contains("AVIF"));
 }
 
 #[cfg(not(feature = "heic"))]
@@ -741,21 +741,21 @@ fn heic_equals_the_encoded_pictures() {
         ("rotated.heic", &rotated),
         ("mirrored.heic", &mirrored),
     ] {
-        let photograph = load_photograph(&heic(name), &LoadOptions::default()).unwrap();
+        let photograph = load_photograph(heic(name), &LoadOptions::default()).unwrap();
         let psnr = psnr(&photograph.image, expected);
         assert!(psnr > 35.0, "{name}: {psnr} dB");
         assert_eq!(photograph.orientation, None, "{name}");
-        assert_eq!(image::load(&heic(name)).unwrap(), photograph.image, "{name}");
-        let header = probe_photograph(&heic(name)).unwrap();
+        assert_eq!(image::load(heic(name)).unwrap(), photograph.image, "{name}");
+        let header = probe_photograph(heic(name)).unwrap();
         assert_eq!((header.width, header.height), (expected.width, expected.height), "{name}");
         assert_eq!(header.camera, photograph.camera);
         assert!(photograph.warnings.is_empty(), "{name} {:?}", photograph.warnings);
     }
-    let camera = load_photograph(&heic("rotated.heic"), &LoadOptions::default()).unwrap().camera;
+    let camera = load_photograph(heic("rotated.heic"), &LoadOptions::default()).unwrap().camera;
     assert_eq!((camera.make.as_deref(), camera.model.as_deref()), (Some("Maker"), Some("Model 1")));
     assert!((camera.focal.unwrap().px - 26.0 * 80.0 / 43.2666).abs() < 1e-3, "{camera:?}");
     // A file with EXIF orientation and no rotation of its own: the standard does not apply it.
-    let turned = load_photograph(&heic("exif_turned.heic"), &LoadOptions::default()).unwrap();
+    let turned = load_photograph(heic("exif_turned.heic"), &LoadOptions::default()).unwrap();
     assert_eq!((turned.image.width, turned.image.height), (64, 48));
     assert!(turned.warnings[0].contains("EXIF orientation 6"), "{:?}", turned.warnings);
 }
@@ -774,7 +774,7 @@ fn damaged_heic_never_panics() {
     // EXIF is last, after the pixels.
     let pixels = whole.len() - 104;
     for cut in 0..whole.len() {
-        let found = parse_photograph(&whole[..cut], &LoadOptions::default(), &file("photo"));
+        let found = parse_photograph(&whole[..cut], &LoadOptions::default(), file("photo"));
         match found {
             Err(_) => assert!(cut < pixels, "cut at {cut}"),
             Ok(found) => {
@@ -786,6 +786,6 @@ fn damaged_heic_never_panics() {
     for at in 0..whole.len() {
         let mut damaged = whole.clone();
         damaged[at] ^= 0x55;
-        let _ = parse_photograph(&damaged, &LoadOptions::default(), &file("photo"));
+        let _ = parse_photograph(&damaged, &LoadOptions::default(), file("photo"));
     }
 }

@@ -16,8 +16,8 @@ use subsplat::files::matrices;
 use subsplat::files::matrices::PoseConvention;
 use subsplat::files::scene::{Scene, SceneFormat, Units, load_scene};
 use subsplat::files::undistort::Distortion;
-use subsplat::reconstruct::inputs::depth::depth_range;
 use subsplat::reconstruct::inputs::pair::choose_pair;
+use subsplat::reconstruct::{DepthBounds, DepthRange};
 use subsplat_kernels::camera::{Camera, Intrinsics, NearFar};
 
 #[test]
@@ -119,7 +119,7 @@ fn colmap_binary_and_text_agree_in_every_folder() {
         std::fs::write(model.join("frames.bin"), [1, 2]).unwrap();
         check_colmap(&load_scene(folder.path()).unwrap(), &cameras);
         let name = folder.path().file_name().unwrap().to_string_lossy().into_owned();
-        assert_eq!(load_scene(&model.join("images.bin")).unwrap().name, name);
+        assert_eq!(load_scene(model.join("images.bin")).unwrap().name, name);
 
         let (folder, cameras) = made_up(4);
         let model = folder.path().join(subfolder);
@@ -129,7 +129,7 @@ fn colmap_binary_and_text_agree_in_every_folder() {
         let scene = load_scene(folder.path()).unwrap();
         check_colmap(&scene, &cameras);
         assert!(scene.warnings.is_empty(), "{:?}", scene.warnings);
-        check_colmap(&load_scene(&model.join("cameras.txt")).unwrap(), &cameras);
+        check_colmap(&load_scene(model.join("cameras.txt")).unwrap(), &cameras);
     }
 }
 
@@ -166,16 +166,21 @@ fn colmap_points_give_the_depth_range() {
     let camera = &mut scene.frames[0].camera;
     *camera = Camera::new(camera.intrinsics(), Mat4::IDENTITY).unwrap();
     scene.points = Some((0..101).map(|i| Vec3::new(0.0, 0.0, 2.0 + 0.02 * i as f32)).collect());
-    let range = depth_range(&scene, &[0], None, None).unwrap();
+    let of_frames = |scene: &Scene, frame, range| DepthBounds::of_frames(scene, &[frame], range);
+    let range = of_frames(&scene, 0, DepthRange::Auto).unwrap();
     assert!((range.near - 2.04 / 1.5).abs() < 1e-4 && (range.far - 2.0 * 3.96).abs() < 1e-4);
-    assert!(range.reason.contains("101"), "{}", range.reason);
-    let fixed_near = depth_range(&scene, &[0], Some(0.5), None).unwrap();
+    assert!(range.source.to_string().contains("101"), "{}", range.source);
+    let fixed_near = of_frames(&scene, 0, DepthRange::Near(0.5)).unwrap();
     assert_eq!((fixed_near.near, fixed_near.far), (0.5, range.far));
-    assert!(depth_range(&scene, &[0], Some(50.0), None).is_err());
-    assert!(depth_range(&scene, &[0], Some(f32::NAN), Some(2.0)).is_err());
-    assert!(depth_range(&scene, &[7], None, None).is_err());
-    scene.points = None;
-    assert!(depth_range(&scene, &[0], None, None).unwrap_err().to_string().contains("baseline"));
+    assert!(of_frames(&scene, 0, DepthRange::Near(50.0)).is_err());
+    let not_a_number = DepthRange::Fixed { near: f32::NAN, far: 2.0 };
+    assert!(of_frames(&scene, 0, not_a_number).is_err());
+    assert!(of_frames(&scene, 7, DepthRange::Auto).is_err());
+    // 19 depths say too little.
+    scene.points.as_mut().unwrap().truncate(19);
+    assert_eq!(DepthBounds::of_scene(&scene, &[0]).unwrap(), None);
+    let error = of_frames(&scene, 0, DepthRange::Auto).unwrap_err().to_string();
+    assert!(error.contains(&scene.name) && error.contains("distance of 0"), "{error}");
 }
 
 #[test]
@@ -270,7 +275,7 @@ fn precedence_of_pose_files() {
     std::fs::write(at("transforms.json"), json).unwrap();
     assert_eq!(source(), SceneFormat::Transforms);
     save_cameras_json(
-        &at("cameras.json"),
+        at("cameras.json"),
         &CameraFile { cameras: cameras.clone(), units: Units::Unknown, near_far: None },
     )
     .unwrap();
@@ -283,7 +288,7 @@ fn precedence_of_pose_files() {
         ("abc.txt", SceneFormat::RealEstate10k),
         ("poses.txt", SceneFormat::Matrices),
     ] {
-        let scene = load_scene(&at(file)).unwrap();
+        let scene = load_scene(at(file)).unwrap();
         assert_eq!(scene.source, format);
         for (a, b) in scene.frames.iter().zip(&reference.frames) {
             assert_eq!((&a.name, &a.image), (&b.name, &b.image));
@@ -291,7 +296,7 @@ fn precedence_of_pose_files() {
             assert!(e.to_cols_array().iter().all(|v| v.abs() < 1e-5), "{file} {e}");
         }
     }
-    assert_eq!(load_scene(&at("sparse/0")).unwrap().source, SceneFormat::Colmap);
+    assert_eq!(load_scene(at("sparse/0")).unwrap().source, SceneFormat::Colmap);
     // Other matrix conventions, from the same numbers.
     for (convention, want) in [
         (PoseConvention::WorldFromCameraOpenGl, cameras[0].camera.world_from_camera() * gl),
@@ -317,7 +322,7 @@ fn re10k_frames_are_matched_by_time_order_or_number() {
         std::fs::remove_dir_all(&images).unwrap();
         std::fs::create_dir(&images).unwrap();
         let path = |n: &&str| images.join(n);
-        names.iter().for_each(|n| image::save_png(&path(n), &noise(12, 8)).unwrap());
+        names.iter().for_each(|n| image::save_png(path(n), &noise(12, 8)).unwrap());
         names.iter().map(path).collect()
     };
     let x = |scene: &Scene| -> Vec<f32> {
@@ -359,10 +364,10 @@ fn names_are_sorted_by_their_numbers() {
         let _ = std::fs::remove_dir_all(at("images"));
         std::fs::create_dir(at("images")).unwrap();
         for i in 0..12 {
-            image::save_png(&at("images").join(name(i) + ".png"), &noise(12, 8)).unwrap();
+            image::save_png(at("images").join(name(i) + ".png"), &noise(12, 8)).unwrap();
         }
         for file in ["a.txt", "poses.txt"] {
-            let scene = load_scene(&at(file)).unwrap();
+            let scene = load_scene(at(file)).unwrap();
             assert_eq!(scene.frames.len(), 12);
             for (i, frame) in scene.frames.iter().enumerate() {
                 let x = -frame.camera.position().x;
@@ -376,10 +381,10 @@ fn names_are_sorted_by_their_numbers() {
     std::fs::remove_dir_all(at("images")).unwrap();
     std::fs::create_dir(at("images")).unwrap();
     for name in ["images/0.png", "images/7.png"] {
-        image::save_png(&at(name), &noise(12, 8)).unwrap();
+        image::save_png(at(name), &noise(12, 8)).unwrap();
     }
     let x = |f: &subsplat::files::scene::Frame| -f.camera.position().x;
-    let scene = load_scene(&at("a.txt")).unwrap();
+    let scene = load_scene(at("a.txt")).unwrap();
     assert_eq!(scene.frames.iter().map(x).collect::<Vec<_>>(), [0.0, 7.0]);
 }
 
@@ -387,13 +392,13 @@ fn names_are_sorted_by_their_numbers() {
 fn pairs_and_exif() {
     let (folder, cameras) = made_up(2);
     let path = |i: usize| folder.path().join(&cameras[i].file);
-    let scene = Scene::from_pair(&path(0), &path(1), cameras[0].camera, cameras[1].camera).unwrap();
+    let scene = Scene::from_pair(path(0), path(1), cameras[0].camera, cameras[1].camera).unwrap();
     assert_eq!(scene.frames[1].camera, cameras[1].camera);
     assert!(scene.warnings.is_empty());
     let camera = cameras[0].camera;
     let wrong = Intrinsics { width: 48, height: 64, ..camera.intrinsics() };
     let wrong = camera.with_intrinsics(wrong).unwrap();
-    let e = Scene::from_pair(&path(0), &path(1), wrong, cameras[1].camera).unwrap_err();
+    let e = Scene::from_pair(path(0), path(1), wrong, cameras[1].camera).unwrap_err();
     assert!(e.to_string().contains("48x64"), "{e}");
 
     // A PNG eXIf chunk with orientation 6, big-endian TIFF.
@@ -408,9 +413,9 @@ fn pairs_and_exif() {
     let mut png = std::fs::read(path(0)).unwrap();
     png.splice(33..33, chunk);
     std::fs::write(path(0), png).unwrap();
-    assert_eq!(image::probe(&path(0)).unwrap().orientation, Some(6));
-    let before = image::load(&path(1)).unwrap();
-    assert_eq!(image::load(&path(0)).unwrap(), before, "the orientation is not applied");
+    assert_eq!(image::probe(path(0)).unwrap().orientation, Some(6));
+    let before = image::load(path(1)).unwrap();
+    assert_eq!(image::load(path(0)).unwrap(), before, "the orientation is not applied");
     // A pose file's cameras describe the stored pixels.
     let pose_file = folder.path().join("cameras.json");
     let save = |camera| {
@@ -431,7 +436,7 @@ fn pairs_and_exif() {
 #[test]
 fn a_frame_of_another_shape_is_reported_and_avoided() {
     let (folder, cameras) = made_up(4);
-    image::save_png(&folder.path().join("images/001.png"), &noise(48, 64)).unwrap();
+    image::save_png(folder.path().join("images/001.png"), &noise(48, 64)).unwrap();
     let pose_file = folder.path().join("cameras.json");
     let save = |cameras: &[NamedCamera]| {
         let cameras = cameras.to_vec();

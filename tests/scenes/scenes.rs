@@ -12,8 +12,8 @@ use subsplat::files::protocol::{load_index, load_protocol};
 use subsplat::files::scene::{Scene, SceneFormat, Units, load_scene};
 use subsplat::files::undistort::{Distortion, undistort};
 use subsplat::reconstruct::inputs::crop::{CropOptions, CropRule, crop};
-use subsplat::reconstruct::inputs::depth::depth_range;
 use subsplat::reconstruct::inputs::pair::{choose_pair, view_geometry};
+use subsplat::reconstruct::{DepthBounds, DepthRange};
 use subsplat_kernels::camera::{Camera, Intrinsics};
 
 const SCENES: [&str; 9] = [
@@ -50,7 +50,7 @@ fn difference(a: &Scene, b: &Scene) -> (f32, f32) {
 fn every_scene_loads() {
     let Some(photos) = shared("photos") else { return };
     for name in SCENES {
-        let scene = load_scene(&photos.join(name)).unwrap();
+        let scene = load_scene(photos.join(name)).unwrap();
         assert_eq!(scene.name, name);
         assert_eq!(scene.source, SceneFormat::CamerasJson);
         assert!(scene.warnings.is_empty(), "{:?}", scene.warnings);
@@ -91,7 +91,7 @@ fn formats_of_one_folder_agree() {
     for (name, file, format, px, pose) in cases {
         let folder = photos.join(name);
         let reference = load_scene(&folder).unwrap();
-        let other = load_scene(&folder.join(file)).unwrap();
+        let other = load_scene(folder.join(file)).unwrap();
         assert_eq!(other.source, format);
         let worst = difference(&reference, &other);
         assert!(worst.0 < px && worst.1 < pose, "{name} {file}: {worst:?}");
@@ -109,7 +109,7 @@ fn protocol_intrinsics_follow_the_exact_rule() {
     let Some(photos) = shared("photos") else { return };
     for name in SCENES {
         let folder = photos.join(name);
-        let protocol = load_protocol(&folder.join("protocol.json")).unwrap();
+        let protocol = load_protocol(folder.join("protocol.json")).unwrap();
         let scene = load_scene(&folder).unwrap();
         for test in &protocol.tests {
             test.check(&folder, scene.frames.len()).unwrap();
@@ -142,7 +142,7 @@ fn protocol_geometry_is_reproduced() {
     for name in SCENES {
         let text = std::fs::read(photos.join(name).join("protocol.json")).unwrap();
         let file: File = serde_json::from_slice(&text).unwrap();
-        let scene = load_scene(&photos.join(name)).unwrap();
+        let scene = load_scene(photos.join(name)).unwrap();
         for t in file.tests {
             let [a, b] = t.context.map(|i| scene.frames[i].camera);
             let g = view_geometry(&a, &b, 1.0, 100.0);
@@ -152,7 +152,7 @@ fn protocol_geometry_is_reproduced() {
         }
         let pair = choose_pair(&scene).unwrap();
         eprintln!("{name}: {}", pair.reason);
-        let range = depth_range(&scene, &pair.frames, None, None).unwrap();
+        let range = DepthBounds::of_frames(&scene, &pair.frames, DepthRange::Auto).unwrap();
         assert_eq!(name.starts_with("re10k"), range.near == 1.0 && range.far == 100.0, "{range:?}");
     }
     assert!(compared >= 13, "{compared}");
@@ -181,12 +181,12 @@ fn evaluation_indexes_have_the_published_counts() {
         ("mvsplat_evaluation_index_re10k.json", 7194, 6474),
         ("mvsplat_evaluation_index_acid.json", 1848, 1595),
     ] {
-        let index = load_index(&folder.join(file)).unwrap();
+        let index = load_index(folder.join(file)).unwrap();
         assert_eq!(index.len(), all);
         assert_eq!(index.values().flatten().count(), usable);
         assert!(index.values().flatten().all(|v| v.context.len() == 2 && v.target.len() == 3));
     }
-    load_index(&folder.join("globalsplat_demo_index.json")).unwrap();
+    load_index(folder.join("globalsplat_demo_index.json")).unwrap();
 }
 
 #[test]
@@ -194,7 +194,7 @@ fn the_distortion_of_the_fox_is_removed() {
     let Some(fox) = shared("photos/fox") else { return };
     // This file lists all 67 frames of the source, 20 of which are stored, with the lens of the
     // unprocessed photographs.
-    let distorted = load_scene(&fox.join("transforms_original_distorted_1080x1920.json")).unwrap();
+    let distorted = load_scene(fox.join("transforms_original_distorted_1080x1920.json")).unwrap();
     let undistorted = load_scene(&fox).unwrap();
     assert_eq!(distorted.frames.len(), undistorted.frames.len());
     assert!(distorted.warnings.iter().any(|w| w.contains("of 67 frames have no picture")));
@@ -278,7 +278,7 @@ fn psnr_inside(a: &Rgb, b: &Rgb, border: usize) -> f64 {
 #[test]
 fn mvsplat_rule_on_real_estate_gives_its_published_crop() {
     let Some(photos) = shared("photos") else { return };
-    let scene = load_scene(&photos.join("re10k_0bf152ef84195293")).unwrap();
+    let scene = load_scene(photos.join("re10k_0bf152ef84195293")).unwrap();
     let (picture, camera) = scene.frames[0].load().unwrap();
     let options = CropOptions { rule: CropRule::Mvsplat, ..CropOptions::square(256, 1, 16) };
     let c = crop(&picture, &camera, &options).unwrap();

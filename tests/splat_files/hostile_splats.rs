@@ -5,7 +5,7 @@ use subsplat_test_support::splat_scene;
 
 use splat_scene::*;
 use std::io::Write;
-use std::path::Path;
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 use subsplat::files::glb::parse_glb;
 use subsplat::files::ksplat::parse_ksplat;
@@ -16,7 +16,7 @@ use subsplat::files::{Result, SaveOptions, load_splats, save_splats, splat_info}
 use subsplat::scene::splats::Splats;
 use subsplat_kernels::layout::ShBasis;
 
-type Parse = fn(&[u8], &Path) -> Result<Splats>;
+type Parse = fn(&[u8], PathBuf) -> Result<Splats>;
 
 const READERS: [(&str, Parse); 5] = [
     ("ply", parse_ply),
@@ -30,7 +30,7 @@ const READERS: [(&str, Parse); 5] = [
 fn answer(ending: &str, parse: Parse, bytes: &[u8]) -> std::result::Result<Splats, String> {
     let name = format!("hostile.{ending}");
     let start = Instant::now();
-    let result = parse(bytes, Path::new(&name));
+    let result = parse(bytes, PathBuf::from(&name));
     assert!(start.elapsed() < Duration::from_secs(5), "{name} took {:?}", start.elapsed());
     match result {
         Ok(s) => {

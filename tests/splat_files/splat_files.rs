@@ -1,5 +1,6 @@
 //! Splat files written by us and by others: every round trip, every fixture.
 
+use subsplat_test_support::edit::Edit;
 use subsplat_test_support::splat_scene;
 
 use glam::{DMat3, DVec3};
@@ -275,7 +276,7 @@ fn spz_round_trips_within_its_steps() {
         kind.degree = kind.degree.min(3);
         let mut before = scene(200 + seed as u64, kind);
         // Gains and the change of basis may carry ±0.4 beyond ±1, which .spz clamps.
-        before.sh_mut().iter_mut().for_each(|h| *h *= 0.6);
+        before.edit(|p| p.sh.iter_mut().for_each(|h| *h *= 0.6));
         for up in [Up::Keep, Up::Y] {
             let options = SaveOptions { up, ..Default::default() };
             let after = reload("a.spz", &before, &options);
@@ -291,7 +292,7 @@ fn spz_round_trips_within_its_steps() {
         }
         let z = SaveOptions { up: Up::Z, ..Default::default() };
         let folder = tempfile::tempdir().unwrap();
-        let refused = save_splats(&folder.path().join("a.spz"), &before, &z).unwrap_err();
+        let refused = save_splats(folder.path().join("a.spz"), &before, &z).unwrap_err();
         assert!(refused.to_string().contains("y-up by definition"), "{refused}");
     }
 }
@@ -327,12 +328,13 @@ fn splat_quaternion_bytes_reach_their_ends() {
     let kind =
         Kind { parents: 4, children: 1, degree: 0, gain_channels: 0, basis: ShBasis::Standard };
     let mut s = scene(16, kind);
-    for i in 0..4 {
-        let row = &mut s.rows_mut()[i * SPLAT_STRIDE..(i + 1) * SPLAT_STRIDE];
-        row[3..7].fill(0.0);
-        row[3 + i] = if i % 2 == 0 { 3.0 } else { -0.5 };
-        row[7..].fill(1.0 / (1.0 + i as f32));
-    }
+    s.edit(|p| {
+        for (i, row) in p.rows.chunks_exact_mut(SPLAT_STRIDE).enumerate() {
+            row[3..7].fill(0.0);
+            row[3 + i] = if i % 2 == 0 { 3.0 } else { -0.5 };
+            row[7..].fill(1.0 / (1.0 + i as f32));
+        }
+    });
     let (_folder, path) = save("a.splat", &s, &SaveOptions::default());
     for (i, record) in std::fs::read(path).unwrap().chunks_exact(32).enumerate() {
         let mut expected = [128; 4];
@@ -391,7 +393,7 @@ fn pruning_counts_and_an_empty_result_is_refused() {
     }
     for bad in [f32::NAN, -0.1, 1.5] {
         let options = SaveOptions { min_opacity: bad, ..Default::default() };
-        assert!(save_splats(&folder.path().join("b.ply"), &s, &options).is_err());
+        assert!(save_splats(folder.path().join("b.ply"), &s, &options).is_err());
     }
 }
 
@@ -411,21 +413,21 @@ fn numbers_that_are_not_finite_are_refused_by_index() {
         for (lane, what) in [(1, "mean"), (5, "quaternion"), (8, "scale"), (10, "opacity")] {
             for value in [f32::NAN, f32::INFINITY] {
                 let mut s = good.clone();
-                s.rows_mut()[7 * SPLAT_STRIDE + lane] = value;
+                s.edit(|p| p.rows[7 * SPLAT_STRIDE + lane] = value);
                 refused(&s, "splat 7", what);
             }
         }
         let mut s = good.clone();
-        s.sh_mut()[12 * 3 + 4] = f32::NAN; // the fourth parent's, whose first child is 6
+        s.edit(|p| p.sh[12 * 3 + 4] = f32::NAN); // the fourth parent's, whose first child is 6
         refused(&s, "splat 6", "SH");
         let mut s = good.clone();
-        s.gain_mut()[4 * 9 + 2] = f32::INFINITY;
+        s.edit(|p| p.gain[4 * 9 + 2] = f32::INFINITY);
         refused(&s, "splat 9", "gain");
         let mut s = good.clone();
-        s.rows_mut()[3 * SPLAT_STRIDE + 10] = 1.5;
+        s.edit(|p| p.rows[3 * SPLAT_STRIDE + 10] = 1.5);
         refused(&s, "splat 3", "opacity in [0, 1]");
         let mut s = good.clone();
-        (s.gain_mut()[4 * 4], s.sh_mut()[2 * 12]) = (3e38, 3e38);
+        s.edit(|p| (p.gain[4 * 4], p.sh[2 * 12]) = (3e38, 3e38));
         refused(&s, "splat 4", "overflow");
     }
 }
@@ -454,11 +456,11 @@ fn names_and_magics_choose_the_format() {
         }
     }
     for name in ["a.ksplat", "a.compressed.ply", "a.sog", "a"] {
-        let e = save_splats(&folder.path().join(name), &s, &SaveOptions::default()).unwrap_err();
+        let e = save_splats(folder.path().join(name), &s, &SaveOptions::default()).unwrap_err();
         assert!(e.to_string().contains(".ply, .glb, .spz or .splat"), "{e}");
     }
     std::fs::write(folder.path().join("a.sog"), b"PK\x03\x04rest").unwrap();
-    let e = load_splats(&folder.path().join("a.sog")).unwrap_err().to_string();
+    let e = load_splats(folder.path().join("a.sog")).unwrap_err().to_string();
     assert!(e.contains("splat-transform"), "{e}");
 }
 
@@ -467,9 +469,9 @@ fn info_describes_what_is_there() {
     let kind =
         Kind { parents: 101, children: 1, degree: 2, gain_channels: 0, basis: ShBasis::Standard };
     let mut s = scene(11, kind);
-    for i in 0..101 {
-        s.rows_mut()[i * SPLAT_STRIDE + 10] = i as f32 / 100.0;
-    }
+    s.edit(|p| {
+        (0..101).for_each(|i| p.rows[i * SPLAT_STRIDE + 10] = i as f32 / 100.0);
+    });
     let (folder, path) = save("a.ply", &s, &SaveOptions::default());
     let info = splat_info(&path).unwrap();
     assert_eq!((info.count, info.sh_degree, info.non_finite, info.invisible), (101, 2, 0, 1));
@@ -515,8 +517,11 @@ fn glb_structure_is_what_gltf_asks_for() {
     };
     let mut s = scene(12, kind);
     // Mid-grey, fully opaque, at the identity.
-    s.rows_mut()[..SPLAT_STRIDE].copy_from_slice(&[9., 8., 7., 2., 0., 0., 0., 0.1, 0.2, 0.3, 1.0]);
-    s.sh_mut()[..3].fill(0.0);
+    s.edit(|p| {
+        let row = [9., 8., 7., 2., 0., 0., 0., 0.1, 0.2, 0.3, 1.0];
+        p.rows[..SPLAT_STRIDE].copy_from_slice(&row);
+        p.sh[..3].fill(0.0);
+    });
     let (_folder, path) = save("a.glb", &s, &SaveOptions::default());
     let bytes = std::fs::read(path).unwrap();
     let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()) as usize;
@@ -608,16 +613,17 @@ fn glb_nodes_move_turn_and_scale_splats() {
     // In ours: x to −y, y to x.
     let turn = DMat3::from_cols(DVec3::NEG_Y, DVec3::X, DVec3::Z);
     let mut expected = s.clone();
-    for i in 0..s.len() {
-        let m = s.mean(i);
-        // glTF (x, −y, −z), doubled, turned to (−y, x, z), shifted, and back to ours.
-        let g = [2.0 * m[0], -2.0 * m[1], -2.0 * m[2]];
-        let g = [1.0 - g[1], 2.0 + g[0], 3.0 + g[2]];
-        let row = &mut expected.rows_mut()[i * SPLAT_STRIDE..];
-        // `assert_same` turns the mean: give it the one before the turn.
-        row[..3].copy_from_slice(&[g[1], g[0], -g[2]]);
-        row[7..10].iter_mut().for_each(|v| *v *= 2.0);
-    }
+    expected.edit(|p| {
+        for (i, row) in p.rows.chunks_exact_mut(SPLAT_STRIDE).enumerate() {
+            let m = s.mean(i);
+            // glTF (x, −y, −z), doubled, turned to (−y, x, z), shifted, and back to ours.
+            let g = [2.0 * m[0], -2.0 * m[1], -2.0 * m[2]];
+            let g = [1.0 - g[1], 2.0 + g[0], 3.0 + g[2]];
+            // `assert_same` turns the mean: give it the one before the turn.
+            row[..3].copy_from_slice(&[g[1], g[0], -g[2]]);
+            row[7..10].iter_mut().for_each(|v| *v *= 2.0);
+        }
+    });
     let allowed = Tolerance { mean: 4e-6, ..EXACT };
     assert_same(&expected, &after, &in_order(&s), turn, 3, allowed);
     for (node, what) in [

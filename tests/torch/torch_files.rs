@@ -15,7 +15,7 @@ fn goldens() -> PathBuf {
 }
 
 fn golden(name: &str) -> TorchFile {
-    TorchFile::open(&goldens().join(name)).unwrap()
+    TorchFile::open(goldens().join(name)).unwrap()
 }
 
 fn hex(bytes: &[u8]) -> String {

@@ -303,8 +303,8 @@ impl Pair<'_> {
     }
 }
 
-/// Planes of [`Sums`]: Σ 1, r, s, r², s², r·s over valid samples s of reference r.
-const PLANES: usize = 6;
+/// Number of sums in [`Sums`]: Σ 1, r, s, r², s², r·s over valid samples s of reference r.
+const WINDOW_SUMS: usize = 6;
 
 /// Sums over blocks, then over windows of (2·radius + 1)² blocks.
 #[derive(Default)]
@@ -326,9 +326,9 @@ impl Sums {
         let side = (2 * radius + 1) as f32;
         (self.size, self.radius, self.full) = (size, radius, side * side * samples);
         self.blocks.clear();
-        self.blocks.resize(PLANES * h * (w + 2 * radius), 0.0);
+        self.blocks.resize(WINDOW_SUMS * h * (w + 2 * radius), 0.0);
         self.columns.clear();
-        self.columns.resize(PLANES * h * w, 0.0);
+        self.columns.resize(WINDOW_SUMS * h * w, 0.0);
     }
 
     /// Adds a line (validity, reference, samples) to the blocks of row `y`; blocks are
@@ -367,7 +367,7 @@ impl Sums {
                 }
             },
         );
-        let mut windows = vec![0f32; PLANES * w];
+        let mut windows = vec![0f32; WINDOW_SUMS * w];
         let mut valid = valid;
         for (y, out) in out.chunks_exact_mut(w).enumerate() {
             windows.fill(0.0);

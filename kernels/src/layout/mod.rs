@@ -8,6 +8,7 @@
 mod frame;
 mod gather;
 mod positions;
+pub mod random;
 mod spgr;
 mod sweep;
 mod uniforms;

@@ -99,6 +99,13 @@ impl TwoViews {
         }
     }
 
+    /// Returns whether a match lies in front of both cameras. Rays that are parallel within the
+    /// `noise` of a point, px, count as in front, because their intersection is not defined.
+    pub(super) fn in_front(&self, m: &Match, noise: f64) -> bool {
+        let t = self.triangulate(m);
+        (t.z_a > 0.0 && t.z_b > 0.0) || t.angle < noise * self.radians_per_px()
+    }
+
     /// Returns the point of depth `z` at pixel `a` of the first picture, in the axes of the second
     /// camera.
     pub(super) fn in_second(&self, a: DVec2, z: f64) -> DVec3 {

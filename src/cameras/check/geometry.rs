@@ -1,12 +1,12 @@
-//! Measures that follow from the cameras and from triangulated depths: baseline, angle, fields of
-//! view, parallax, depth range, overlap and coverage.
+//! Geometry of matched points before two cameras: depths, parallax, overlap and coverage.
 //!
-//! Lengths are world units, angles degrees, positions px of the working size.
+//! Lengths are world units, positions px of the working size. `measures.rs` alone calls
+//! these functions.
 
 use super::epipolar::{Match, TwoViews, quantile};
-use super::report::{DepthReport, PairReport};
+use super::report::DepthReport;
 use glam::{DMat3, DQuat, DVec2, DVec3};
-use subsplat_kernels::camera::{Camera, Intrinsics};
+use subsplat_kernels::camera::Intrinsics;
 
 /// Points along each side of the grid on which overlap is measured.
 const OVERLAP_GRID: usize = 24;
@@ -32,15 +32,6 @@ const BEYOND_ROTATION: f64 = 0.75;
 const ROTATION_STEPS: usize = 20;
 /// Side of the network's input, px, at which parallax is reported.
 const INPUT_SIDE: f64 = 256.0;
-
-/// Writes baseline, angle and fields of view into the report.
-pub(super) fn describe(report: &mut PairReport, cameras: &[Camera; 2]) {
-    let views = TwoViews::new(&cameras[0], &cameras[1]);
-    report.baseline = views.translation.length() as f32;
-    report.rotation_deg = views.rotation_angle().to_degrees() as f32;
-    report.fov_deg =
-        cameras.map(|c| [c.intrinsics().fov_x().to_degrees(), c.intrinsics().fov_y().to_degrees()]);
-}
 
 /// Returns the depths of `matches` in the first camera. All `matches` are assumed right. Returns
 /// `None` where fewer than half have a parallax above the `noise` of a point, px.

@@ -7,41 +7,8 @@
 //! that leave the relative pose unchanged, such as a wrong scale or OpenGL axes under a sideways
 //! motion without rotation. Those mistakes do not harm a reconstruction from the pair.
 
-use super::epipolar::{Match, TwoViews, distance, median};
 use glam::{Mat3, Mat4, Vec3};
 use subsplat_kernels::camera::{Camera, Intrinsics};
-
-/// Agreement of two cameras with matches.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Fit {
-    /// Median epipolar distance, px. A point behind a camera counts as infinitely distant.
-    pub error: f64,
-    /// Median epipolar distance alone, px.
-    pub distance: f64,
-    /// Share of matches that triangulate in front of both cameras.
-    pub in_front: f64,
-}
-
-/// Measures the fit of `views` to `matches`; `noise` is the accuracy of a point, px.
-pub(super) fn fit(views: &TwoViews, matches: &[Match], noise: f64) -> Fit {
-    let f = views.fundamental();
-    let distances: Vec<f64> = matches.iter().map(|m| distance(&f, m)).collect();
-    let front: Vec<bool> = matches.iter().map(|m| in_front(views, m, noise)).collect();
-    let counted = distances.iter().zip(&front);
-    let errors = counted.map(|(&d, &ok)| if ok { d } else { f64::INFINITY }).collect();
-    Fit {
-        error: median(errors).unwrap_or(f64::INFINITY),
-        distance: median(distances).unwrap_or(f64::INFINITY),
-        in_front: front.iter().filter(|&&ok| ok).count() as f64 / front.len().max(1) as f64,
-    }
-}
-
-/// Tests whether a match lies in front of both cameras. Rays that are parallel within the noise
-/// count as in front, because their intersection is not defined.
-pub(super) fn in_front(views: &TwoViews, m: &Match, noise: f64) -> bool {
-    let t = views.triangulate(m);
-    (t.z_a > 0.0 && t.z_b > 0.0) || t.angle < noise * views.radians_per_px()
-}
 
 /// An alternative interpretation of the two cameras.
 #[derive(Clone, Debug)]

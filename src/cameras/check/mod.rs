@@ -6,15 +6,31 @@
 //!
 //! Input: grey photographs and cameras. Output: [`PairReport`]. The module reads no files and
 //! prints nothing. Equal inputs give equal reports.
+//!
+//! Data flows one way:
+//!
+//! ```text
+//! photographs, cameras ─> working ─> matched ─> measures ─> findings ─┐
+//!          └────────────> plausibility ──────────────────────────────┴─> PairReport
+//! ```
+//!
+//! `working` reduces the photographs, `matched` finds the matches that agree with one another,
+//! `measures` computes every number (with `agreement` and `mistakes` for the poses, `geometry` for
+//! depths), and `findings` judges the numbers in sentences. `plausibility` judges what needs no
+//! matches. `epipolar` and `estimate` hold the mathematics.
 
+mod agreement;
 mod epipolar;
 mod estimate;
+mod findings;
 mod geometry;
+mod matched;
+mod measures;
 mod mistakes;
 mod picture;
 mod plausibility;
 mod report;
-mod verdict;
+mod working;
 
 pub use crate::cameras::matches::GrayImage;
 pub use picture::{RgbPicture, epipolar_picture};
@@ -22,13 +38,10 @@ pub use report::{
     DepthReport, EpipolarReport, Finding, MatchedPoint, PairReport, ReadingReport, Verdict,
 };
 
-use crate::cameras::matches::features;
-use crate::cameras::matches::features::Orientation;
-use crate::cameras::matches::pairs;
-use epipolar::Match;
-use glam::DVec2;
+use matched::Matched;
+use measures::{CameraMeasures, Measures};
 use subsplat_kernels::camera::Camera;
-use verdict::Evidence;
+use working::WorkingPair;
 
 /// Options of [`check_pair`].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -49,9 +62,6 @@ impl Default for CheckOptions {
     }
 }
 
-/// Longer side of the photographs at which errors are reported, px.
-const REPORT_SIDE: f64 = 640.0;
-
 /// Checks photographs `a` and `b` against their cameras.
 pub fn check_pair(
     a: &GrayImage,
@@ -60,85 +70,46 @@ pub fn check_pair(
     camera_b: &Camera,
     options: &CheckOptions,
 ) -> PairReport {
-    let mut report = PairReport::default();
-    plausibility::cameras(&mut report, [(a, camera_a), (b, camera_b)]);
-    let cameras = [fitted(camera_a, a), fitted(camera_b, b)];
-    geometry::describe(&mut report, &cameras);
-    if plausibility::same_photograph(&mut report, a, b) {
-        return report;
-    }
-    let work = WorkingPair::new([a, b], cameras, options);
-    let upright = Matched::new(&work, options, Orientation::Upright);
-    // Photographs that roll against each other need descriptors oriented along their gradients.
-    let found = if upright.evidence.is_insufficient(upright.matches.len()) {
-        let oriented = Matched::new(&work, options, Orientation::Gradient);
-        if oriented.evidence.count() > upright.evidence.count() { oriented } else { upright }
-    } else {
-        upright
+    let fitted = [fitted(camera_a, a), fitted(camera_b, b)];
+    let cameras = CameraMeasures::new(&fitted);
+    let mut findings = plausibility::of_cameras([(a, camera_a), (b, camera_b)], &cameras);
+    let report = PairReport {
+        baseline: cameras.baseline,
+        rotation_deg: cameras.rotation_deg,
+        fov_deg: cameras.fov_deg,
+        ..PairReport::default()
     };
-    report.features = found.features;
-    report.matches = found.matches.len();
-    verdict::matches(&mut report, &work, &found.matches, &found.evidence);
-    report
-}
-
-/// Points matched between the photographs.
-struct Matched {
-    features: [usize; 2],
-    matches: Vec<Match>,
-    evidence: Evidence,
-}
-
-impl Matched {
-    /// Detects and matches features, then finds the consistent matches.
-    fn new(work: &WorkingPair, options: &CheckOptions, orientation: Orientation) -> Self {
-        let [a, b] = [&work.images[0], &work.images[1]]
-            .map(|image| features::detect(image, options.features, orientation));
-        let position = |f: &features::Feature| DVec2::new(f64::from(f.x), f64::from(f.y));
-        let matches: Vec<Match> = pairs::pairs(&a, &b)
-            .iter()
-            .map(|p| Match { a: position(&a.points[p.a]), b: position(&b.points[p.b]) })
-            .collect();
-        let evidence = Evidence::gather(work, &matches, options.seed);
-        Self { features: [a.points.len(), b.points.len()], matches, evidence }
+    if let Some(same) = plausibility::same_photograph(a, b) {
+        findings.push(same);
+        return report.with_findings(findings);
     }
+    let work = WorkingPair::new([a, b], fitted, options);
+    let matched = Matched::new(&work, options);
+    let measures = Measures::new(&work, &matched, &cameras);
+    findings.extend(findings::of_measures(&measures, &cameras));
+    let readings = measures.agreement.map_or_else(Vec::new, |a| a.better);
+    let reading = |(error_px, reading): (f64, mistakes::Reading)| ReadingReport {
+        name: reading.name,
+        clause: reading.clause,
+        error_px: error_px as f32,
+    };
+    PairReport {
+        features: matched.features,
+        matches: measures.matches,
+        consistent_matches: measures.consistent,
+        epipolar: measures.epipolar,
+        readings: readings.into_iter().map(reading).collect(),
+        depth: measures.depths.and_then(|d| d.report),
+        overlap: measures.overlap,
+        coverage: measures.coverage,
+        brightness_difference: measures.brightness_difference,
+        points: measures.points,
+        ..report
+    }
+    .with_findings(findings)
 }
 
 /// Rescales the camera to the size of the photograph.
 fn fitted(camera: &Camera, image: &GrayImage) -> Camera {
     camera.resized_unchecked(image.width(), image.height())
-}
-
-/// The photographs at the working size.
-struct WorkingPair {
-    /// Photographs reduced to the working size.
-    images: [GrayImage; 2],
-    /// Cameras of the reduced photographs.
-    cameras: [Camera; 2],
-    /// Working px per px of the photograph, (x, y).
-    scale: [DVec2; 2],
-    /// Working px per px of the reported scale ([`REPORT_SIDE`]).
-    px_per_report_px: f64,
-}
-
-impl WorkingPair {
-    /// Reduces photographs and cameras to the working size.
-    fn new(images: [&GrayImage; 2], cameras: [Camera; 2], options: &CheckOptions) -> Self {
-        let target = options.longest_side.max(16);
-        let reduced = images.map(|image| {
-            let (w, h) = (image.width(), image.height());
-            let factor = (target as f64 / w.max(h) as f64).min(1.0);
-            let side = |v: usize| ((v as f64 * factor).round() as usize).clamp(1, v);
-            if factor < 1.0 { image.reduced(side(w), side(h)) } else { image.clone() }
-        });
-        let size = |i: usize| (reduced[i].width(), reduced[i].height());
-        let scale = [0, 1].map(|i| {
-            let (w, h) = size(i);
-            DVec2::new(w as f64 / images[i].width() as f64, h as f64 / images[i].height() as f64)
-        });
-        let cameras = [0, 1].map(|i| cameras[i].resized_unchecked(size(i).0, size(i).1));
-        let side = |i: usize| size(i).0.max(size(i).1) as f64;
-        let px_per_report_px = 0.5 * (side(0) + side(1)) / REPORT_SIDE;
-        Self { images: reduced, cameras, scale, px_per_report_px }
-    }
 }

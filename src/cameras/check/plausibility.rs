@@ -1,9 +1,11 @@
-//! Tests that need no matches: picture sizes, intrinsics, a repeated camera, a repeated photograph.
+//! Judges what needs no matches: picture sizes, intrinsics, a repeated camera, a repeated
+//! photograph.
 //!
-//! Input: grey photographs and cameras. Output: findings in the [`PairReport`].
+//! Input: grey photographs and cameras. Output: [`Finding`]s.
 
+use super::measures::CameraMeasures;
 use super::mistakes::NORMALISED_FOCAL;
-use super::report::{PairReport, Verdict};
+use super::report::{Finding, Verdict};
 use crate::cameras::matches::GrayImage;
 use subsplat_kernels::camera::{Camera, Intrinsics};
 
@@ -20,32 +22,38 @@ const PLAUSIBLE_PIXELS: std::ops::RangeInclusive<f32> = 0.7..=1.43;
 /// Largest relative difference of aspect between a photograph and its intrinsics.
 const ASPECT: f32 = 0.02;
 
-/// Compares the cameras with the photographs' sizes and with each other.
-pub(super) fn cameras(report: &mut PairReport, views: [(&GrayImage, &Camera); 2]) {
+/// Judges the cameras by the photographs' sizes and by each other.
+pub(super) fn of_cameras(
+    views: [(&GrayImage, &Camera); 2],
+    cameras: &CameraMeasures,
+) -> Vec<Finding> {
+    let mut findings = Vec::new();
     for (name, (image, camera)) in ["first", "second"].into_iter().zip(views) {
-        size(report, name, image, &camera.intrinsics());
-        intrinsics(report, name, &camera.intrinsics());
+        findings.extend(size(name, image, &camera.intrinsics));
+        findings.extend(intrinsics(name, &camera.intrinsics));
     }
-    let [a, b] = views.map(|v| v.1.world_from_camera());
-    if a.abs_diff_eq(b, 1e-6) {
-        let sentence = "both photographs have the same camera: depth needs a baseline between them";
-        report.add(Verdict::Bad, "same_camera", sentence);
+    if cameras.is_same_camera {
+        let sentence = "both photographs have the same camera position: depth can be seen only \
+                        from two places";
+        findings.push(Finding::new(Verdict::Bad, "same_camera", sentence));
     }
+    findings
 }
 
 /// Reports a photograph whose size differs from its intrinsics.
-fn size(report: &mut PairReport, name: &str, image: &GrayImage, k: &Intrinsics) {
+fn size(name: &str, image: &GrayImage, k: &Intrinsics) -> Option<Finding> {
     let (w, h) = (image.width(), image.height());
     if (k.width, k.height) == (w, h) {
-        return;
+        return None;
     }
     let aspect = (w * k.height) as f32 / (h * k.width).max(1) as f32;
     let (severity, note) = if (k.width, k.height) == (h, w) {
-        (Verdict::Bad, "the photograph is rotated (EXIF orientation?)")
+        (Verdict::Bad, "the photograph was rotated (EXIF orientation?)")
     } else if (aspect - 1.0).abs() > ASPECT {
         (
             Verdict::Bad,
-            "the aspect differs, because the photograph was cropped or the intrinsics belong to another camera",
+            "the shapes differ, because the photograph was cropped or the intrinsics belong to \
+             another camera",
         )
     } else {
         (Verdict::Warning, "the intrinsics are scaled to fit")
@@ -54,11 +62,11 @@ fn size(report: &mut PairReport, name: &str, image: &GrayImage, k: &Intrinsics) 
         "the {name} photograph has {w}x{h} pixels, but its intrinsics are for {}x{}: {note}",
         k.width, k.height
     );
-    report.add(severity, "size_differs", sentence);
+    Some(Finding::new(severity, "size_differs", sentence))
 }
 
 /// Reports implausible focal lengths and principal points.
-fn intrinsics(report: &mut PairReport, name: &str, k: &Intrinsics) {
+fn intrinsics(name: &str, k: &Intrinsics) -> Option<Finding> {
     let fov = [k.fov_x().to_degrees(), k.fov_y().to_degrees()];
     let middle = [k.cx / k.width as f32, k.cy / k.height as f32];
     if k.fx < NORMALISED_FOCAL && k.fy < NORMALISED_FOCAL {
@@ -67,41 +75,44 @@ fn intrinsics(report: &mut PairReport, name: &str, k: &Intrinsics) {
              values are divided by the picture's size",
             k.fx, k.fy
         );
-        report.add(Verdict::Bad, "intrinsics_normalised", sentence);
-    } else if fov.iter().any(|v| !PLAUSIBLE_FOV.contains(v)) {
+        return Some(Finding::new(Verdict::Bad, "intrinsics_normalised", sentence));
+    }
+    if fov.iter().any(|v| !PLAUSIBLE_FOV.contains(v)) {
         let sentence = format!(
             "the {name} camera's field of view is {:.0}° x {:.0}°: are its intrinsics in pixels \
              of this photograph?",
             fov[0], fov[1]
         );
-        report.add(Verdict::Bad, "field_of_view", sentence);
-    } else if middle.iter().any(|v| !PLAUSIBLE_MIDDLE.contains(v)) {
+        return Some(Finding::new(Verdict::Bad, "field_of_view", sentence));
+    }
+    if middle.iter().any(|v| !PLAUSIBLE_MIDDLE.contains(v)) {
         let sentence = format!(
             "the {name} camera's principal point ({:.0}, {:.0}) is far from the middle of its \
              {}x{} px: do its intrinsics belong to another picture size?",
             k.cx, k.cy, k.width, k.height
         );
-        report.add(Verdict::Warning, "principal_point", sentence);
-    } else if !PLAUSIBLE_PIXELS.contains(&(k.fx / k.fy)) {
+        return Some(Finding::new(Verdict::Warning, "principal_point", sentence));
+    }
+    (!PLAUSIBLE_PIXELS.contains(&(k.fx / k.fy))).then(|| {
         let sentence = format!(
             "the {name} camera has fx = {:.0} px and fy = {:.0} px: pixels are rarely that far \
              from square; was a focal length divided by the wrong side?",
             k.fx, k.fy
         );
-        report.add(Verdict::Warning, "pixels_not_square", sentence);
-    }
+        Finding::new(Verdict::Warning, "pixels_not_square", sentence)
+    })
 }
 
-/// Tests whether both photographs are the same picture, and reports it.
-pub(super) fn same_photograph(report: &mut PairReport, a: &GrayImage, b: &GrayImage) -> bool {
+/// Reports two photographs that are the same picture.
+pub(super) fn same_photograph(a: &GrayImage, b: &GrayImage) -> Option<Finding> {
     if (a.width(), a.height()) != (b.width(), b.height()) {
-        return false;
+        return None;
     }
     let sum: f64 = a.pixels().iter().zip(b.pixels()).map(|(x, y)| f64::from((x - y).abs())).sum();
-    let same = sum / (a.pixels().len() as f64) < f64::from(MAX_SAME_DIFFERENCE);
-    if same {
-        let sentence = "both photographs are the same picture: depth needs parallax between them";
-        report.add(Verdict::Bad, "same_photograph", sentence);
-    }
-    same
+    let is_same = sum / (a.pixels().len() as f64) < f64::from(MAX_SAME_DIFFERENCE);
+    is_same.then(|| {
+        let sentence = "both photographs are the same picture: depth can be seen only from two \
+                        places";
+        Finding::new(Verdict::Bad, "same_photograph", sentence)
+    })
 }

@@ -124,12 +124,20 @@ pub struct PairReport {
     pub points: Vec<MatchedPoint>,
 }
 
+impl Finding {
+    /// Makes a finding.
+    pub(super) fn new(severity: Verdict, code: &str, sentence: impl Into<String>) -> Self {
+        Self { severity, code: code.into(), sentence: sentence.into() }
+    }
+}
+
 impl PairReport {
-    /// Adds a finding and updates the verdict.
-    pub(super) fn add(&mut self, severity: Verdict, code: &str, sentence: impl Into<String>) {
-        self.verdict = self.verdict.max(severity);
-        self.findings.push(Finding { severity, code: code.into(), sentence: sentence.into() });
-        self.findings.sort_by_key(|f| std::cmp::Reverse(f.severity));
+    /// Returns the report with `findings`, the most severe first, and their verdict.
+    pub(super) fn with_findings(mut self, mut findings: Vec<Finding>) -> Self {
+        findings.sort_by_key(|f| std::cmp::Reverse(f.severity));
+        self.verdict = findings.first().map_or(Verdict::Ok, |f| f.severity);
+        self.findings = findings;
+        self
     }
 
     /// Returns true if the report holds a finding with this code.

@@ -1,17 +1,15 @@
 //! Seeded random numbers, so that equal matches give equal estimates.
 
-/// SplitMix64 (Steele, Lea and Flood 2014): a state of 64 bits, equal on every machine.
+use subsplat_kernels::layout::random;
+
+/// SplitMix64: a state of 64 bits, equal on every machine.
 #[derive(Clone, Debug)]
 pub(crate) struct SplitMix(pub(crate) u64);
 
 impl SplitMix {
     /// Returns 64 random bits.
     pub(crate) fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        z ^ (z >> 31)
+        random::next(&mut self.0)
     }
 
     /// Draws N different indices below `count`, which is N or more.

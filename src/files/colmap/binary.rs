@@ -109,7 +109,11 @@ impl<'a> Cursor<'a> {
 ///
 /// # Errors
 /// Truncated, a camera model that is not read, parameters that are not finite.
-pub fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Cameras> {
+pub fn parse_cameras(path: impl AsRef<Path>, bytes: &[u8]) -> Result<Cameras> {
+    cameras(path.as_ref(), bytes)
+}
+
+fn cameras(path: &Path, bytes: &[u8]) -> Result<Cameras> {
     let mut c = Cursor { path, bytes, at: 0 };
     // A record has 24 bytes and at least three parameters.
     let n = c.count(48, "cameras")?;
@@ -139,7 +143,11 @@ pub fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Cameras> {
 ///
 /// # Errors
 /// Truncated, a pose that is not finite, a name that is not UTF-8.
-pub fn parse_images(path: &Path, bytes: &[u8]) -> Result<Vec<ColmapImage>> {
+pub fn parse_images(path: impl AsRef<Path>, bytes: &[u8]) -> Result<Vec<ColmapImage>> {
+    images(path.as_ref(), bytes)
+}
+
+fn images(path: &Path, bytes: &[u8]) -> Result<Vec<ColmapImage>> {
     let mut c = Cursor { path, bytes, at: 0 };
     // A record has 64 bytes, a name of at least two bytes, and a count.
     let n = c.count(74, "images")?;
@@ -174,7 +182,11 @@ pub fn parse_images(path: &Path, bytes: &[u8]) -> Result<Vec<ColmapImage>> {
 ///
 /// # Errors
 /// Truncated, a position that is not finite.
-pub fn parse_points(path: &Path, bytes: &[u8]) -> Result<Points> {
+pub fn parse_points(path: impl AsRef<Path>, bytes: &[u8]) -> Result<Points> {
+    points(path.as_ref(), bytes)
+}
+
+fn points(path: &Path, bytes: &[u8]) -> Result<Points> {
     let mut c = Cursor { path, bytes, at: 0 };
     let n = c.count(51, "points")?;
     let mut points = Points::with_capacity(n);

@@ -66,7 +66,11 @@ fn records<'a>(path: &'a Path, bytes: &'a [u8]) -> Result<impl Iterator<Item = L
 ///
 /// # Errors
 /// A line that does not parse, a camera model that is not read.
-pub fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Cameras> {
+pub fn parse_cameras(path: impl AsRef<Path>, bytes: &[u8]) -> Result<Cameras> {
+    cameras(path.as_ref(), bytes)
+}
+
+fn cameras(path: &Path, bytes: &[u8]) -> Result<Cameras> {
     let mut cameras = Cameras::new();
     for line in records(path, bytes)? {
         let mut words = line.text.split_ascii_whitespace();
@@ -118,10 +122,14 @@ fn observations(text: &str) -> Option<Vec<u64>> {
 /// # Errors
 /// A line that does not parse, a pose that is not finite.
 pub fn parse_images(
-    path: &Path,
+    path: impl AsRef<Path>,
     bytes: &[u8],
     warnings: &mut Vec<String>,
 ) -> Result<Vec<ColmapImage>> {
+    images(path.as_ref(), bytes, warnings)
+}
+
+fn images(path: &Path, bytes: &[u8], warnings: &mut Vec<String>) -> Result<Vec<ColmapImage>> {
     let lines = lines(path, bytes)?;
     let mut images = Vec::new();
     let mut without = 0;
@@ -185,7 +193,11 @@ fn image(line: Line<'_>) -> Result<ColmapImage> {
 ///
 /// # Errors
 /// A line that does not parse, a position that is not finite.
-pub fn parse_points(path: &Path, bytes: &[u8]) -> Result<Points> {
+pub fn parse_points(path: impl AsRef<Path>, bytes: &[u8]) -> Result<Points> {
+    points(path.as_ref(), bytes)
+}
+
+fn points(path: &Path, bytes: &[u8]) -> Result<Points> {
     let mut points = Points::new();
     for line in records(path, bytes)? {
         let mut words = line.text.split_ascii_whitespace();

@@ -28,10 +28,14 @@ pub struct SparsePoint {
 /// A name with white space at its ends or a line break; a point of an image that does not exist;
 /// errors of [`write_atomic`]; the folder cannot be created.
 pub fn save_colmap(
-    folder: &Path,
+    folder: impl AsRef<Path>,
     images: &[(String, Camera)],
     points: &[SparsePoint],
 ) -> Result<()> {
+    write_model(folder.as_ref(), images, points)
+}
+
+fn write_model(folder: &Path, images: &[(String, Camera)], points: &[SparsePoint]) -> Result<()> {
     std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
     let mut cameras = String::from("# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY\n");
     let mut poses = String::from(
@@ -78,7 +82,7 @@ pub fn save_colmap(
     }
     for (name, text) in [("cameras.txt", cameras), ("images.txt", poses), ("points3D.txt", sparse)]
     {
-        write_atomic(&folder.join(name), |f| f.write_all(text.as_bytes()))?;
+        write_atomic(folder.join(name), |f| f.write_all(text.as_bytes()))?;
     }
     Ok(())
 }
@@ -108,8 +112,7 @@ mod tests {
             error_px: 0.25,
             track: vec![(0, [17.0, 14.0]), (1, [7.5, 9.0])],
         };
-        save_colmap(&folder.path().join("sparse/0"), &images, std::slice::from_ref(&point))
-            .unwrap();
+        save_colmap(folder.path().join("sparse/0"), &images, std::slice::from_ref(&point)).unwrap();
         let scene = crate::files::scene::load_scene(folder.path()).unwrap();
         assert_eq!(scene.points.as_deref(), Some(&[point.position][..]));
         for (frame, camera) in scene.frames.iter().zip(&cameras) {

@@ -66,7 +66,8 @@ impl TorchFile {
     /// Missing, not a file of `torch.save` (the message names the format found), truncated,
     /// a wrong checksum, bytes outside of every entry, a tensor that does not lie in its
     /// storage, more values than the limits.
-    pub fn open(path: &Path) -> Result<Self> {
+    pub fn open(path: impl AsRef<Path>) -> Result<Self> {
+        let path = path.as_ref();
         Self::from_source(Source::open(path)?, path)
     }
 
@@ -74,8 +75,8 @@ impl TorchFile {
     ///
     /// # Errors
     /// As [`TorchFile::open`].
-    pub fn parse(bytes: impl Into<Arc<[u8]>>, name: &Path) -> Result<Self> {
-        Self::from_source(Source::Memory(bytes.into()), name)
+    pub fn parse(bytes: impl Into<Arc<[u8]>>, name: impl AsRef<Path>) -> Result<Self> {
+        Self::from_source(Source::Memory(bytes.into()), name.as_ref())
     }
 
     fn from_source(source: Source, path: &Path) -> Result<Self> {

@@ -5,10 +5,10 @@
 pub mod aggregation;
 pub mod architecture;
 pub mod backbone;
-mod depth_range;
 pub mod embed;
 pub mod encoding;
 pub mod geometry;
+mod half_size_pass;
 pub mod layers;
 pub mod mlp;
 pub mod primaries;

@@ -2,7 +2,7 @@
 
 use super::backbone::small::{DepthMaps, DisparityMean};
 use super::backbone::{Mvsplat, SmallBackbone};
-use super::depth_range;
+use super::half_size_pass;
 use super::primaries::primaries;
 use super::trace::{Checkpoint, Trace};
 #[cfg(feature = "gpu")]
@@ -179,7 +179,7 @@ impl SubSplat {
         match (&self.encoder, &self.config.backbone) {
             (Encoder::Small(network), Backbone::Small(c)) if c.estimate_depth_range => {
                 let (d, stride) = (network.candidates(), self.config.stride());
-                depth_range::estimate_depth_range(views, d, stride, |views| {
+                half_size_pass::estimate_depth_range(views, d, stride, |views| {
                     self.depth_indices(network, views, &Trace::with_checkpoint(checkpoint))
                 })
             }

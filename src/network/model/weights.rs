@@ -21,6 +21,7 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use subsplat_kernels::layout::random::{GOLDEN, mix};
 
 /// Lightning's name of the encoder inside the whole module.
 const LIGHTNING_PREFIX: &str = "encoder.";
@@ -333,20 +334,13 @@ pub fn save(path: &Path, tensors: &BTreeMap<String, Tensor>, config: &Config) ->
     io::write_atomic(path, |out| std::io::Write::write_all(out, &file))
 }
 
-/// Finaliser of SplitMix64 (Steele, Lea, Flood 2014).
-fn mix(mut z: u64) -> u64 {
-    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-    z ^ (z >> 31)
-}
-
 /// The elements of tensor `name` for `seed`, by the formula of the module's doc.
 fn seeded_values(seed: u64, name: &str, shape: &Shape, init: Init) -> Vec<f32> {
     let hash = name
         .bytes()
         .fold(0xCBF2_9CE4_8422_2325u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01B3));
     let key = hash ^ mix(seed);
-    let word = |i: u64| mix(key.wrapping_add((i + 1).wrapping_mul(0x9E37_79B9_7F4A_7C15)));
+    let word = |i: u64| mix(key.wrapping_add((i + 1).wrapping_mul(GOLDEN)));
     let uniform = |i: usize| ((word(i as u64) >> 40) as f64 + 0.5) / (1u64 << 24) as f64;
     let normal = |i: usize| {
         let field = (1u64 << 21) - 1;

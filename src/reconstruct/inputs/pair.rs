@@ -260,7 +260,7 @@ fn convergence_depth(cameras: &[&Camera]) -> Option<f32> {
 }
 
 /// Returns the camera z of the points that project into the picture.
-pub(super) fn points_in_view(camera: &Camera, points: &[Vec3]) -> Vec<f32> {
+pub(crate) fn points_in_view(camera: &Camera, points: &[Vec3]) -> Vec<f32> {
     let k = &camera.intrinsics();
     let depth = |p: &Vec3| {
         let p = camera.to_camera(*p);

@@ -2,5 +2,5 @@
 #![no_main]
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::files::glb::parse_glb(bytes, std::path::Path::new("fuzz.glb"));
+    let _ = subsplat::files::glb::parse_glb(bytes, "fuzz.glb");
 });

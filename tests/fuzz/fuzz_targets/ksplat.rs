@@ -2,5 +2,5 @@
 #![no_main]
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::files::ksplat::parse_ksplat(bytes, std::path::Path::new("fuzz.ksplat"));
+    let _ = subsplat::files::ksplat::parse_ksplat(bytes, "fuzz.ksplat");
 });

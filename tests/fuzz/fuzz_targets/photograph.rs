@@ -5,6 +5,6 @@ use subsplat::files::image::{LoadOptions, Truncated};
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     let options = LoadOptions { truncated: Truncated::Accept };
-    let path = std::path::Path::new("fuzz.jpg");
+    let path = "fuzz.jpg";
     let _ = subsplat::files::photograph::parse_photograph(bytes, &options, path);
 });

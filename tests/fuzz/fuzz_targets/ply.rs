@@ -2,5 +2,5 @@
 #![no_main]
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::files::ply::parse_ply(bytes, std::path::Path::new("fuzz.ply"));
+    let _ = subsplat::files::ply::parse_ply(bytes, "fuzz.ply");
 });

@@ -2,5 +2,5 @@
 #![no_main]
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::files::splat::parse_splat(bytes, std::path::Path::new("fuzz.splat"));
+    let _ = subsplat::files::splat::parse_splat(bytes, "fuzz.splat");
 });

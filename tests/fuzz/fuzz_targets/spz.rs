@@ -2,5 +2,5 @@
 #![no_main]
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let _ = subsplat::files::spz::parse_spz(bytes, std::path::Path::new("fuzz.spz"));
+    let _ = subsplat::files::spz::parse_spz(bytes, "fuzz.spz");
 });

@@ -4,7 +4,7 @@
 use subsplat::files::torch::TorchFile;
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let Ok(file) = TorchFile::parse(bytes, std::path::Path::new("fuzz.pt")) else { return };
+    let Ok(file) = TorchFile::parse(bytes, "fuzz.pt") else { return };
     let mut left = vec![file.root()];
     while let Some(value) = left.pop() {
         if let Some(tensor) = value.as_tensor() {

@@ -4,6 +4,7 @@ pub mod checkpoints;
 pub mod chunk_files;
 pub mod colmap_files;
 pub mod cpu_against_gpu;
+pub mod edit;
 pub mod fit_scene;
 pub mod gather;
 pub mod gpu;

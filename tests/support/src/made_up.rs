@@ -12,7 +12,7 @@ pub fn made_up(n: usize) -> (tempfile::TempDir, Vec<NamedCamera>) {
     std::fs::create_dir(folder.path().join("images")).unwrap();
     let cameras = (0..n).map(|i| {
         let file = format!("images/{i:03}.png");
-        image::save_png(&folder.path().join(&file), &noise(64, 48)).unwrap();
+        image::save_png(folder.path().join(&file), &noise(64, 48)).unwrap();
         let t = i as f32;
         let k = Intrinsics {
             fx: 70.1 + t,

@@ -8,9 +8,9 @@ use subsplat::files::scene::{Scene, load_scene};
 use subsplat::{Photo, Rgb};
 use subsplat_kernels::camera::Camera;
 
-/// Features of each photograph of a pair, as `loose_scene` takes them.
+/// Features of each photograph of a pair, as `estimate_cameras_of_files` takes them.
 pub const PAIR_FEATURES: usize = 4000;
-/// Features of each of many photographs, as `loose_scene` takes them.
+/// Features of each of many photographs, as `estimate_cameras_of_files` takes them.
 pub const MANY_FEATURES: usize = 2500;
 
 /// What an estimate may know of the lens.
@@ -77,7 +77,7 @@ pub fn context_pairs() -> Option<Vec<PosedPair>> {
 }
 
 fn pairs_of(folder: &Path) -> Vec<PosedPair> {
-    let protocol = load_protocol(&folder.join("protocol.json")).expect("a protocol");
+    let protocol = load_protocol(folder.join("protocol.json")).expect("a protocol");
     let scene = load_scene(folder).expect("a scene");
     let name = folder.file_name().expect("a name").to_string_lossy();
     let pairs = protocol.tests.iter().map(|views| {

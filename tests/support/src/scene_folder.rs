@@ -26,12 +26,12 @@ pub fn workplace() -> tempfile::TempDir {
         let byte = |v: &f32| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
         let picture = Rgb { width: SIDE, height: SIDE, data: view.rgb.iter().map(byte).collect() };
         let file = format!("images/view{i}.png");
-        save_png(&scene.join(&file), &picture).unwrap();
+        save_png(scene.join(&file), &picture).unwrap();
         cameras.push(named(file, example.cameras[from]));
     }
     let near_far = Some(NearFar::new(example.near, example.far));
     let content = CameraFile { cameras, units: Units::Unknown, near_far };
-    save_cameras_json(&scene.join("cameras.json"), &content).unwrap();
+    save_cameras_json(scene.join("cameras.json"), &content).unwrap();
     folder
 }
 

@@ -5,18 +5,14 @@ use glam::{EulerRot, Mat4, Quat, Vec3};
 use subsplat::network::config::FeatureLevel;
 use subsplat::network::model::{BackboneOutput, Primaries, Views};
 use subsplat_kernels::camera::{Camera, Intrinsics, NearFar};
-use subsplat_kernels::layout::ShBasis;
+use subsplat_kernels::layout::{ShBasis, random};
 
 /// SplitMix64.
 pub struct Random(pub u64);
 
 impl Random {
     pub fn bits(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        z ^ (z >> 31)
+        random::next(&mut self.0)
     }
 
     /// Uniform in [low, high).

@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DQuat, DVec3};
 use subsplat::scene::splats::Splats;
-use subsplat_kernels::layout::{SPLAT_STRIDE, ShBasis};
+use subsplat_kernels::layout::{SPLAT_STRIDE, ShBasis, random};
 use subsplat_kernels::sh;
 
 /// SplitMix64: the same numbers everywhere.
@@ -10,11 +10,7 @@ pub struct Random(pub u64);
 
 impl Random {
     pub fn word(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        z ^ (z >> 31)
+        random::next(&mut self.0)
     }
 
     /// Uniform in [a, b).

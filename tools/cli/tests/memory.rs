@@ -16,12 +16,12 @@ fn scene(folder: &Path, width: usize, height: usize) {
     std::fs::create_dir_all(folder.join("images")).unwrap();
     let frame = |(i, photo): (usize, &subsplat::reconstruct::Photo)| {
         let file = format!("images/{i}.png");
-        save_png(&folder.join(&file), photo.image()).unwrap();
+        save_png(folder.join(&file), photo.image()).unwrap();
         NamedCamera::new(file, *photo.camera())
     };
     let cameras = shoot.photos.iter().enumerate().map(frame).collect();
     save_cameras_json(
-        &folder.join("cameras.json"),
+        folder.join("cameras.json"),
         &CameraFile { cameras, units: Default::default(), near_far: None },
     )
     .unwrap();

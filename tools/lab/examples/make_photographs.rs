@@ -19,6 +19,7 @@ use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use subsplat_kernels::camera::{Camera, Intrinsics};
+use subsplat_kernels::layout::random::{GOLDEN, mix};
 use subsplat_lab::data::procedural::{Grade, Quality, Room, TextureBank, View};
 
 /// Room of `examples/room`, with finer textures.
@@ -115,10 +116,7 @@ fn sample(view: &View, at: Vec2) -> Vec3 {
 
 /// Normal number of a counter (Irwin-Hall with four uniform numbers of SplitMix64).
 fn normal(counter: u64, seed: u64) -> f32 {
-    let mut z = (counter ^ (seed << 48)).wrapping_mul(0x9E37_79B9_7F4A_7C15);
-    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-    z ^= z >> 31;
+    let z = mix((counter ^ (seed << 48)).wrapping_mul(GOLDEN));
     let sum: f32 = (0..4).map(|k| ((z >> (16 * k)) & 0xFFFF) as f32 / 65536.0).sum();
     (sum - 2.0) * 3.0f32.sqrt()
 }

@@ -25,6 +25,7 @@ pub use backward::{Gradients, Scatter, backward, factors, scatter_into};
 
 use super::simd::Real;
 use super::simd::vectorize;
+use crate::layout::random;
 use rayon::prelude::*;
 
 impl Gather {
@@ -33,17 +34,14 @@ impl Gather {
     fn kept<T: Real>(&self, n: usize, j: usize, g: usize) -> T {
         let Some(drop) = self.drop else { return T::constant(1.0) };
         let index = ((drop.first_parent + n) * self.samples() + j) * self.groups + g;
-        let u = (mix(drop.seed ^ mix(index as u64)) >> 11) as f64 / (1u64 << 53) as f64;
+        let u = (bits(drop.seed ^ bits(index as u64)) >> 11) as f64 / (1u64 << 53) as f64;
         T::constant(if u < drop.probability { 0.0 } else { 1.0 / (1.0 - drop.probability) })
     }
 }
 
-/// SplitMix64's finaliser.
-fn mix(seed: u64) -> u64 {
-    let mut z = seed.wrapping_add(0x9E37_79B9_7F4A_7C15);
-    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-    z ^ (z >> 31)
+/// Returns SplitMix64's first number of a seed.
+fn bits(mut seed: u64) -> u64 {
+    random::next(&mut seed)
 }
 
 /// Role of a sample in the softmax.

@@ -94,7 +94,7 @@ pub(crate) static RAW_MATCHING_SCORES: Kernel = Kernel {
 };
 
 const THREADS: usize = 64;
-/// Sums of a pixel and candidate (kernels/shared/raw_matching.wgsl).
+/// Sums of a pixel and candidate, as in kernels/shared/raw_matching.wgsl.
 const PLANES: usize = 13;
 /// Channels of the result of a raw matching.
 const CHANNELS: usize = 4;
@@ -438,5 +438,18 @@ impl DeviceArray {
         let bindings = [sums.binding(), result.binding()];
         self.recorder.call(&RAW_MATCHING_SCORES, &[], &uniform, &bindings, groups())?;
         Ok(result)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_kernels_of_a_raw_matching_have_as_many_planes() {
+        let declared = format!("const PLANES: u32 = {PLANES}u;");
+        for kernel in [&RAW_MATCHING_BLOCKS, &RAW_MATCHING_SCORES] {
+            assert!(kernel.source.plain.contains(&declared), "{}: {declared}", kernel.name);
+        }
     }
 }

@@ -10,7 +10,7 @@ use crate::network::ops::attention::Labels;
 use crate::network::ops::attention_gather::{Deferred, Gather};
 use crate::network::ops::attributes::Attributes;
 use crate::network::ops::plane_sweep::Sweep;
-use crate::network::ops::small::{Candidates, MeanOver, Start, consensus_tolerances};
+use crate::network::ops::small::{Candidates, LIFT_GAIN, MeanOver, Start, consensus_tolerances};
 use crate::network::ops::spgr::{Spgr, finite};
 use crate::network::ops::{Backend, matching};
 use candle_core::shape::ShapeWithOneHole;
@@ -24,9 +24,6 @@ use subsplat_kernels::gpu::{
     PointwiseFunction, RawMatchingCall, Reduction,
 };
 use subsplat_kernels::layout::SPLAT_STRIDE;
-
-/// Factor of scores in [`Array::lifted`], as in [`crate::network::ops::small::lift`].
-const LIFT_GAIN: f64 = 4.0;
 
 impl Array for DeviceArray {
     fn dims(&self) -> &[usize] {
@@ -454,10 +451,10 @@ impl Array for DeviceArray {
         if factor.track_op() {
             let dims = vec![1; scores.dims().len()];
             let factor = self.executor.parameter(factor)?.reshape(dims)?;
-            return self.plus(&scores.affine(LIFT_GAIN, 0.0)?.times(&factor)?);
+            return self.plus(&scores.affine(f64::from(LIFT_GAIN), 0.0)?.times(&factor)?);
         }
         let factor = f64::from(factor.sum_all()?.to_dtype(DType::F32)?.to_scalar::<f32>()?);
-        self.plus(&scores.affine(LIFT_GAIN * factor, 0.0)?)
+        self.plus(&scores.affine(f64::from(LIFT_GAIN) * factor, 0.0)?)
     }
 
     fn expectation(&self, window: usize, mean: MeanOver) -> Result<[Self; 2]> {

@@ -64,8 +64,8 @@ pub fn lift(logits: &Tensor, scores: &Tensor, factor: &Tensor) -> Result<Tensor>
     logits.contiguous()?.apply_op3(&scores.contiguous()?, factor, Lift)
 }
 
-/// Scores count fourfold (`learning.md`'s network).
-const LIFT_GAIN: f32 = 4.0;
+/// Factor of the scores in [`lift`]: they count fourfold (`learning.md`'s network).
+pub(in crate::network::ops) const LIFT_GAIN: f32 = 4.0;
 /// Elements per task.
 const CHUNK: usize = 16_384;
 

@@ -14,6 +14,7 @@ pub use convex::upsample_convex;
 pub use cross_check::cross_check;
 pub use depth_consensus::depth_consensus;
 pub(in crate::network::ops) use depth_consensus::tolerances as consensus_tolerances;
+pub(in crate::network::ops) use expectation::LIFT_GAIN;
 pub use expectation::{expectation, lift};
 pub use heads::{Start, head_input, head_output, ray_distance};
 pub use subsplat_kernels::cpu::small::expectation::MeanOver;

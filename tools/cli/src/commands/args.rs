@@ -667,7 +667,7 @@ pub struct CheckArgs {
     /// Folder for the epipolar pictures.
     #[arg(short, long, default_value = "out", value_name = "DIR")]
     pub out: PathBuf,
-    /// Cameras of two loose photographs.
+    /// Cameras of two photographs that come without a scene.
     #[command(flatten)]
     pub pair: PairArgs,
 }

@@ -64,7 +64,7 @@ pub fn file_stems(names: &[String]) -> Vec<String> {
     names.iter().enumerate().map(unique).collect()
 }
 
-/// Reads the tests of the scene's protocol.json, if it has one. A protocol.json beside two loose
+/// Reads the tests of the scene's protocol.json, if it has one. A protocol.json beside two single
 /// photographs belongs to another scene.
 pub fn protocol(path: &Path, scene: &Scene) -> Result<Vec<Views>> {
     let file = folder_of(path).join("protocol.json");

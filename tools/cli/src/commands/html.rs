@@ -7,7 +7,6 @@ use anyhow::Result;
 use serde_json::json;
 use std::io::Write;
 use std::path::Path;
-use subsplat::files::base64::base64;
 use subsplat::files::{SaveOptions, SaveReport, SplatFormat, encode_splats_with, write_atomic};
 use subsplat::scene::splats::Splats;
 use subsplat_kernels::camera::Camera;
@@ -41,7 +40,7 @@ impl Page<'_> {
             ("{{title}}", escaped(self.title)),
             ("{{css}}", STYLE.to_owned()),
             ("{{settings}}", self.settings()),
-            ("{{scene}}", base64(&scene)),
+            ("{{scene}}", base64::encode(&scene)),
             ("{{js}}", VIEWER.to_owned()),
         ];
         let bytes = write_atomic(path, |file| {

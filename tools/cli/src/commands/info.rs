@@ -98,7 +98,7 @@ fn picture(path: &Path, answer: Answer) -> Result<Value> {
     let header = probe_photograph(path)?;
     if let Some(orientation) = header.orientation {
         answer.line(format!(
-            "  EXIF orientation {orientation}: a loose photograph is turned upright, {}x{}; a \
+            "  EXIF orientation {orientation}: a photograph without a pose file is turned upright, {}x{}; a \
              pose file describes the stored pixels",
             header.width, header.height
         ));

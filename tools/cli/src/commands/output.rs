@@ -179,11 +179,11 @@ impl Views<'_> {
         bar: &ProgressBar,
     ) -> Result<Vec<Scored>> {
         for (i, (input, depth)) in result.inputs().iter().zip(result.depths()).enumerate() {
-            save_png(&self.out.join(format!("inputs/{i}.png")), &input.input)?;
-            save_depth_png(&self.out.join(format!("inputs/{i}_depth.png")), depth)?;
+            save_png(self.out.join(format!("inputs/{i}.png")), &input.input)?;
+            save_depth_png(self.out.join(format!("inputs/{i}_depth.png")), depth)?;
         }
         for (i, map) in children_maps(result).iter().enumerate() {
-            save_png(&self.out.join(format!("inputs/{i}_children.png")), map)?;
+            save_png(self.out.join(format!("inputs/{i}_children.png")), map)?;
         }
         let name = |(i, view): (usize, &View)| match view {
             View::Path(_) => format!("path_{i:04}"),
@@ -222,8 +222,8 @@ impl Views<'_> {
         save_png(&file, &rgb)?;
         video::push(&mut self.video, self.motion, &rgb)?;
         let depth = Depth { width, height, data: picture.depth };
-        let depth_unit = save_depth_png(&self.out.join(format!("depth/{stem}.png")), &depth)?;
-        save_png(&self.out.join(format!("depth_colour/{stem}.png")), &colour_depth(&depth))?;
+        let depth_unit = save_depth_png(self.out.join(format!("depth/{stem}.png")), &depth)?;
+        save_png(self.out.join(format!("depth_colour/{stem}.png")), &colour_depth(&depth))?;
         let mut scored = Scored {
             name,
             stem,
@@ -253,7 +253,7 @@ pub fn write_cameras(out: &Path, views: &[Scored], units: Units, near_far: NearF
     };
     let cameras = views.iter().map(camera).collect();
     let content = CameraFile { cameras, units, near_far: Some(near_far) };
-    Ok(save_cameras_json(&out.join("cameras.json"), &content)?)
+    Ok(save_cameras_json(out.join("cameras.json"), &content)?)
 }
 
 /// Writes `config.json`, which `--config` reads.
@@ -261,7 +261,7 @@ pub fn write_config(out: &Path, config: &Config) -> Result<()> {
     let text = serde_json::to_string_pretty(config)?;
     let write =
         |f: &mut std::io::BufWriter<std::fs::File>| std::io::Write::write_all(f, text.as_bytes());
-    Ok(subsplat::files::write_atomic(&out.join("config.json"), write)?)
+    Ok(subsplat::files::write_atomic(out.join("config.json"), write)?)
 }
 
 /// Most Gaussians of a .spz, and so of a .html: the limit of its readers.

@@ -12,8 +12,8 @@ use subsplat::files::matrices;
 use subsplat::files::matrices::{PoseConvention, parse_intrinsics, parse_matrix};
 use subsplat::files::photograph::{PhotographHeader, list_photographs, probe_photograph};
 use subsplat::files::scene::{Scene, SceneFormat, is_scene, load_scene};
-use subsplat::loose_scene;
-use subsplat::reconstruct::{KnownLens, LooseOptions, LooseScene};
+use subsplat::reconstruct::KnownLens;
+use subsplat::{EstimateOptions, EstimatedScene, estimate_cameras_of_files};
 use subsplat_kernels::camera::{Camera, Intrinsics};
 
 /// Loads a scene; or makes one of photographs, with the cameras of `args` or estimated ones.
@@ -25,14 +25,14 @@ pub fn load(input: &[PathBuf], args: &PairArgs, bar: &ProgressBar) -> Result<Sce
         if let Some(flag) = args.first_pose_flag() {
             bail!("{flag}: expected two photographs with --move or --pose-b, got neither flag");
         }
-        let options = LooseRequest {
+        let options = EstimateRequest {
             fov: args.fov,
             intrinsics: args.intrinsics.as_deref(),
             force: args.force,
         };
-        let loose = estimate(&input[0], &photographs, &options, bar)?;
-        bar.suspend(|| print_estimate(&loose));
-        return Ok(loose.scene);
+        let estimated = estimate(&input[0], &photographs, &options, bar)?;
+        bar.suspend(|| print_estimate(&estimated));
+        return Ok(estimated.scene);
     }
     let [one] = input else {
         bail!("expected photographs or one scene, got {} paths", input.len())
@@ -85,7 +85,7 @@ pub fn photographs(input: &[PathBuf]) -> Result<Option<Vec<PathBuf>>> {
 }
 
 /// Arguments of an estimation of cameras.
-pub struct LooseRequest<'a> {
+pub struct EstimateRequest<'a> {
     /// Horizontal field of view, degrees.
     pub fov: Option<f32>,
     /// Text of `--intrinsics`.
@@ -98,9 +98,9 @@ pub struct LooseRequest<'a> {
 pub fn estimate(
     name: &Path,
     photographs: &[PathBuf],
-    request: &LooseRequest<'_>,
+    request: &EstimateRequest<'_>,
     bar: &ProgressBar,
-) -> Result<LooseScene> {
+) -> Result<EstimatedScene> {
     let lens = match request.intrinsics {
         Some(text) => Some(KnownLens::Pixels(four(text)?)),
         None => request.fov.map(|fov| KnownLens::FovX(fov.to_radians())),
@@ -109,7 +109,7 @@ pub fn estimate(
         true => (Truncated::Accept, Uncertain::Accept),
         false => (Truncated::Refuse, Uncertain::Refuse),
     };
-    let options = LooseOptions {
+    let options = EstimateOptions {
         lens,
         poses: PoseOptions::default().with_uncertain(uncertain),
         load: LoadOptions { truncated },
@@ -118,14 +118,14 @@ pub fn estimate(
         bar.set_message(format!("photograph {} of {}", i + 1, photographs.len()));
         Ok(())
     };
-    let loose = loose_scene(name, photographs, &options, &mut show)?;
+    let estimated = estimate_cameras_of_files(name, photographs, &options, &mut show)?;
     bar.set_message("");
-    Ok(loose)
+    Ok(estimated)
 }
 
 /// Prints what was estimated.
-pub fn print_estimate(loose: &LooseScene) {
-    let estimate = &loose.estimate;
+pub fn print_estimate(estimated: &EstimatedScene) {
+    let estimate = &estimated.estimate;
     let placed = estimate.cameras.iter().flatten().count();
     let certain = match estimate.confidence {
         Confidence::High => "high confidence",
@@ -140,7 +140,7 @@ pub fn print_estimate(loose: &LooseScene) {
         estimate.direction_error_deg,
     ));
     if let Some((camera, source)) =
-        estimate.cameras.iter().zip(&loose.lenses).find_map(|(c, s)| Some(((*c)?, s)))
+        estimate.cameras.iter().zip(&estimated.lenses).find_map(|(c, s)| Some(((*c)?, s)))
     {
         let k = camera.intrinsics();
         print_line(format!(
@@ -225,7 +225,7 @@ fn of_photographs(a: &Path, b: &Path, args: &PairArgs) -> Result<Scene> {
         }
     };
     let camera = |path: &Path, pose: Mat4| -> Result<Camera> {
-        // The size of the upright picture: loose photographs are turned upright.
+        // The size of the upright picture: photographs without a pose file are turned upright.
         let header = probe_photograph(path)?;
         let k = intrinsics(args, path, &header)?;
         Camera::new(k, pose).with_context(|| format!("camera of {}", path.display()))

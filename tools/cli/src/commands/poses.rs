@@ -1,17 +1,17 @@
 //! `subsplat poses`: cameras of photographs that come without any.
 
 use super::args::PosesArgs;
-use super::pair::{self, LooseRequest};
+use super::pair::{self, EstimateRequest};
 use crate::report::{Answer, Progress, peak_memory_bytes, print_warning};
 use anyhow::{Context, Result};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
+use subsplat::EstimatedScene;
 use subsplat::cameras::estimation::Confidence;
 use subsplat::files::cameras_json::save_cameras_and_points;
 use subsplat::files::cameras_json::{CameraFile, NamedCamera};
 use subsplat::files::colmap::{SparsePoint, save_colmap};
 use subsplat::files::scene::Units;
-use subsplat::reconstruct::LooseScene;
 use subsplat_kernels::camera::Camera;
 
 /// Runs the command.
@@ -20,36 +20,39 @@ pub fn poses(args: &PosesArgs, answer: Answer) -> Result<()> {
     let photographs = pair::photographs(&args.input)?.with_context(|| {
         format!("{}: expected photographs, got a scene with cameras", args.input[0].display())
     })?;
-    let request =
-        LooseRequest { fov: args.fov, intrinsics: args.intrinsics.as_deref(), force: args.force };
-    let loose = progress
+    let request = EstimateRequest {
+        fov: args.fov,
+        intrinsics: args.intrinsics.as_deref(),
+        force: args.force,
+    };
+    let estimated = progress
         .stage("cameras", |bar| pair::estimate(&args.input[0], &photographs, &request, bar))?;
-    loose.scene.warnings.iter().for_each(print_warning);
-    pair::print_estimate(&loose);
-    let files = progress.stage("writing", |_| write(&args.out, &loose))?;
+    estimated.scene.warnings.iter().for_each(print_warning);
+    pair::print_estimate(&estimated);
+    let files = progress.stage("writing", |_| write(&args.out, &estimated))?;
     files.iter().for_each(|f| answer.line(f.display()));
-    answer.finish(&report(&photographs, &loose, &files, &progress))
+    answer.finish(&report(&photographs, &estimated, &files, &progress))
 }
 
 /// Writes the cameras; returns the files.
-fn write(out: &Path, loose: &LooseScene) -> Result<Vec<PathBuf>> {
+fn write(out: &Path, estimated: &EstimatedScene) -> Result<Vec<PathBuf>> {
     let is_file = out.extension().is_some_and(|e| e.eq_ignore_ascii_case("json"));
     let file = if is_file { out.to_owned() } else { out.join("cameras.json") };
     let folder = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     std::fs::create_dir_all(folder)
         .with_context(|| format!("output folder {}", folder.display()))?;
-    let frames = &loose.scene.frames;
+    let frames = &estimated.scene.frames;
     let cameras = frames
         .iter()
         .map(|f| Ok(NamedCamera::of_frame(f, path_from(folder, &f.image)?)))
         .collect::<Result<Vec<_>>>()?;
     let content = CameraFile { cameras, units: Units::Unknown, near_far: None };
-    let points = loose.scene.points.as_deref().unwrap_or_default();
+    let points = estimated.scene.points.as_deref().unwrap_or_default();
     save_cameras_and_points(&file, &content, points)?;
     let model = folder.join("sparse/0");
     let mut files = vec![file];
     if !is_file {
-        let (images, points) = colmap(loose);
+        let (images, points) = colmap(estimated);
         save_colmap(&model, &images, &points)?;
         files.push(model);
     }
@@ -66,13 +69,13 @@ fn path_from(folder: &Path, picture: &Path) -> Result<String> {
 
 /// Images and points of COLMAP's model. Names are file names: COLMAP's programs get the folder of
 /// the photographs as their image path.
-fn colmap(loose: &LooseScene) -> (Vec<(String, Camera)>, Vec<SparsePoint>) {
+fn colmap(estimated: &EstimatedScene) -> (Vec<(String, Camera)>, Vec<SparsePoint>) {
     let name = |p: &Path| p.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let images = loose.scene.frames.iter().map(|f| (name(&f.image), f.camera)).collect();
-    let placed: Vec<usize> = (0..loose.estimate.cameras.len())
-        .filter(|&i| loose.estimate.cameras[i].is_some())
+    let images = estimated.scene.frames.iter().map(|f| (name(&f.image), f.camera)).collect();
+    let placed: Vec<usize> = (0..estimated.estimate.cameras.len())
+        .filter(|&i| estimated.estimate.cameras[i].is_some())
         .collect();
-    let points = loose.estimate.points.iter().map(|p| SparsePoint {
+    let points = estimated.estimate.points.iter().map(|p| SparsePoint {
         position: p.position,
         colour: p.colour,
         error_px: p.error_px,
@@ -87,12 +90,12 @@ fn colmap(loose: &LooseScene) -> (Vec<(String, Camera)>, Vec<SparsePoint>) {
 
 fn report(
     photographs: &[PathBuf],
-    loose: &LooseScene,
+    estimated: &EstimatedScene,
     files: &[PathBuf],
     progress: &Progress,
 ) -> Value {
-    let estimate = &loose.estimate;
-    let cameras = photographs.iter().zip(&estimate.cameras).zip(&loose.lenses);
+    let estimate = &estimated.estimate;
+    let cameras = photographs.iter().zip(&estimate.cameras).zip(&estimated.lenses);
     let photographs: Vec<Value> = cameras
         .map(|((path, camera), source)| {
             json!({
@@ -113,7 +116,7 @@ fn report(
         "rotation_deviation_deg": estimate.rotation_error_deg,
         "direction_deviation_deg": estimate.direction_error_deg,
         "focal_deviation": estimate.focal.deviation,
-        "warnings": loose.scene.warnings,
+        "warnings": estimated.scene.warnings,
         "files": files.iter().map(|f| f.display().to_string()).collect::<Vec<_>>(),
         "seconds": progress.seconds(),
         "peak_memory_bytes": peak_memory_bytes(),

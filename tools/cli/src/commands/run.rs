@@ -182,7 +182,7 @@ pub fn photographs(
     })
 }
 
-/// Loose photographs of which all are context by default. Five score above their nearest pair on
+/// Photographs without a pose file of which all are context by default. Five score above their nearest pair on
 /// average (README), and their Gaussians are few enough for an automatic refinement.
 const CONTEXT_MAX: usize = 5;
 

@@ -81,7 +81,7 @@ fn matched_points_find_the_depth_that_the_baseline_misses() {
     let (near, far) = (report["near"].as_f64().unwrap(), report["far"].as_f64().unwrap());
     assert!((0.3..3.0).contains(&near) && (3.0..20.0).contains(&far), "{near} {far}");
     let from = report["near_far_from"].as_str().unwrap();
-    assert!(from.contains("estimated by the network") && from.contains("matched points"), "{from}");
+    assert!(from.contains("estimated by the network") && from.contains("points matched"), "{from}");
     assert!(!report["check"][0]["findings"].as_array().unwrap().is_empty());
     let report = call(place.path(), &format!("{run} --near 0.5 --far 30"), &bananas);
     assert_eq!((report["near"].as_f64(), report["far"].as_f64()), (Some(0.5), Some(30.0)));

@@ -183,7 +183,7 @@ fn paths_sizes_and_detail() {
         .collect();
     assert_eq!(names, ["path_0000", "path_0001", "path_0002"]);
     assert!(report["targets"][0]["psnr"].is_null() && report["psnr"].is_null());
-    let picture = load(&place.path().join("a/images/path_0002.png")).unwrap();
+    let picture = load(place.path().join("a/images/path_0002.png")).unwrap();
     assert_eq!((picture.width, picture.height), (128, 64));
 
     // The photograph is four times the input, so that it has detail to give. (Whether it
@@ -203,7 +203,7 @@ fn paths_sizes_and_detail() {
     let command = "--json render a/scene.ply --path orbit --frames 2 --size 40x24 -o b";
     let report = done(&call_in(place.path(), command));
     assert_eq!(report["views"].as_array().unwrap().len(), 2);
-    let picture = load(&place.path().join("b/path_0001.png")).unwrap();
+    let picture = load(place.path().join("b/path_0001.png")).unwrap();
     assert_eq!((picture.width, picture.height), (40, 24));
 }
 
@@ -215,7 +215,7 @@ fn sizes_between_whole_upscales_and_fewer_gaussians() {
         let quick = "--json run scene --context view0,view2.png --no-check --input-size 32 --fit 1";
         done(&call_in(place.path(), &format!("{quick} --target 0 -o a --refine 2 {more}")))
     };
-    let picture = || load(&place.path().join("a/images/view0.png")).unwrap();
+    let picture = || load(place.path().join("a/images/view0.png")).unwrap();
     let report = run("--upscale 1.5");
     assert_eq!((&report["upscale"], &report["gaussians"]), (&2.into(), &(2 * 1024 * 4).into()));
     assert_eq!((picture().width, picture().height), (48, 48));
@@ -231,7 +231,7 @@ fn sizes_between_whole_upscales_and_fewer_gaussians() {
         assert!((least..=most).contains(&count), "{gaussians}: {count}");
     }
     // The last run kept 100 pixels of both photographs.
-    let map = |i: usize| load(&place.path().join(format!("a/inputs/{i}_children.png"))).unwrap();
+    let map = |i: usize| load(place.path().join(format!("a/inputs/{i}_children.png"))).unwrap();
     let white = (0..2).flat_map(|i| map(i).data).filter(|v| *v == 255).count();
     assert_eq!(white, 300);
     run("--upscale 2");
@@ -244,7 +244,7 @@ fn the_shape_of_photographs_is_kept() {
     let place = tempfile::tempdir().unwrap();
     let picture = |name: &str, width: usize, height: usize| {
         let data = (0..3 * width * height).map(|i| (i * i / 7 % 251) as u8).collect();
-        save_png(&place.path().join(name), &Rgb { width, height, data }).unwrap();
+        save_png(place.path().join(name), &Rgb { width, height, data }).unwrap();
     };
     picture("wide.png", 320, 192);
     picture("wide2.png", 320, 192);
@@ -275,7 +275,7 @@ fn the_shape_of_photographs_is_kept() {
 
 /// The same two cameras three ways: matrices in two conventions, and a move.
 #[test]
-fn two_loose_photographs() {
+fn two_photographs_without_a_scene() {
     let place = workplace();
     let run = |out: &str, cameras: &[&str]| {
         let mut arguments =
@@ -342,7 +342,7 @@ fn check_says_no_with_exit_code_3() {
     let report = called.json();
     assert_eq!(called.code == 0, report["ok"].as_bool().unwrap());
     let picture = report["pairs"][0]["epipolar_picture"].as_str().unwrap();
-    assert!(load(&place.path().join(picture)).is_ok());
+    assert!(load(place.path().join(picture)).is_ok());
 }
 
 /// Weights as training will write them: configuration and all tensors in one file.
@@ -400,7 +400,7 @@ fn output_never_overwrites_what_is_read() {
     assert_eq!(called.code, 1);
     assert!(called.error().contains("choose another"), "{}", called.error());
     assert_eq!(std::fs::read(place.path().join("scene/cameras.json")).unwrap(), before);
-    assert_eq!(load(&place.path().join("scene/images/view0.png")).unwrap().width, SIDE);
+    assert_eq!(load(place.path().join("scene/images/view0.png")).unwrap().width, SIDE);
 
     // The pictures are safe in another folder, but the poses would not be.
     let at = |name: &str| place.path().join(name);
@@ -462,7 +462,7 @@ fn nothing_is_rendered_of_a_scene_that_cannot_be_saved() {
 #[test]
 fn plain_matrices_take_a_convention() {
     let place = workplace();
-    let scene = load_scene(&place.path().join("scene")).unwrap();
+    let scene = load_scene(place.path().join("scene")).unwrap();
     let at = |name: &str| place.path().join("scene").join(name);
     let pose = |f: &Frame| {
         let m = f.camera.camera_from_world().transpose().to_cols_array();
@@ -497,7 +497,7 @@ fn depth_pictures_do_not_overwrite_colour() {
     let camera = Camera::new(k, glam::Mat4::IDENTITY).unwrap();
     let cameras = ["a.png", "a_depth.png", "depth/a.png"].map(|n| named(n.to_owned(), camera));
     let content = CameraFile { cameras: cameras.to_vec(), units: Units::Unknown, near_far: None };
-    save_cameras_json(&at("cameras.json"), &content).unwrap();
+    save_cameras_json(at("cameras.json"), &content).unwrap();
     let report = done(&call_in(place.path(), "--json render one.ply --depth -o out"));
     let views = report["views"].as_array().unwrap();
     let written =

@@ -504,7 +504,7 @@ fn the_file_says_where_it_comes_from() {
     write_tensors(&source, &specs, &BTreeMap::new(), data).unwrap();
     let report = converted(place, "deep/in.safetensors w.safetensors --allow-missing");
     assert_eq!(report["dtypes_in"], serde_json::json!({ "f64": 5 }));
-    let out = TensorFile::open(&place.join("w.safetensors")).unwrap();
+    let out = TensorFile::open(place.join("w.safetensors")).unwrap();
     assert_eq!(out.read("lin0.model.1.weight").unwrap(), (1.0f32 / 3.0).to_le_bytes().repeat(64));
     assert_eq!(out.metadata("subsplat.kind"), Some("lpips"));
     assert_eq!(out.metadata("subsplat.source"), Some("in.safetensors"));

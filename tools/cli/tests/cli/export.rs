@@ -36,7 +36,7 @@ fn scene_of(page: &Path) -> (Splats, serde_json::Value) {
     let page = std::fs::read_to_string(page).unwrap();
     let bytes = from_base64(script(&page, "scene").trim());
     assert_eq!(SplatFormat::from_magic(&bytes), Some(SplatFormat::Spz));
-    let (splats, _) = parse_splats(&bytes, Path::new("scene.spz")).unwrap();
+    let (splats, _) = parse_splats(&bytes, "scene.spz").unwrap();
     (splats, serde_json::from_str(&script(&page, "settings")).unwrap())
 }
 
@@ -52,7 +52,7 @@ fn run_writes_a_page_with_its_scene_and_cameras() {
     let path = place.path().join("out/scene.html");
     assert_eq!(file["bytes"].as_u64(), Some(std::fs::metadata(&path).unwrap().len()));
     let (splats, settings) = scene_of(&path);
-    let written = load_splats(&place.path().join("out/scene.ply")).unwrap();
+    let written = load_splats(place.path().join("out/scene.ply")).unwrap();
     assert_eq!(splats.len() as u64, file["count"].as_u64().unwrap());
     assert_eq!(splats.len(), written.len() - file["pruned"].as_u64().unwrap() as usize);
     // The two photographs' own cameras, at the target's size.
@@ -84,8 +84,8 @@ fn run_writes_a_page_with_its_scene_and_cameras() {
     }
     let called = call_in(place.path(), "--json render alone/a.ply -o view");
     assert!(called.code == 0 && called.stderr.contains("the file's own camera"));
-    let view = load(&place.path().join("view/view.png")).unwrap();
-    let photograph = load(&place.path().join("scene/images/view0.png")).unwrap();
+    let view = load(place.path().join("view/view.png")).unwrap();
+    let photograph = load(place.path().join("scene/images/view0.png")).unwrap();
     let unit = |v: &[u8]| v.iter().map(|&v| f32::from(v) / 255.0).collect::<Vec<f32>>();
     assert_eq!((view.width, view.height), (128, 128));
     let likeness = psnr(&unit(&view.data), &unit(&photograph.data), 128, 128).unwrap();
@@ -96,7 +96,7 @@ fn run_writes_a_page_with_its_scene_and_cameras() {
 fn export_writes_every_format() {
     let place = workplace();
     save_one_splat(&place.path().join("one.ply"));
-    let first = load_splats(&place.path().join("one.ply")).unwrap();
+    let first = load_splats(place.path().join("one.ply")).unwrap();
     for format in ["ply", "glb", "spz", "splat", "html"] {
         let called = call_in(place.path(), &format!("--json export one.ply -o two.{format}"));
         assert_eq!(called.code, 0, "{}", called.stderr);
@@ -115,7 +115,7 @@ fn export_writes_every_format() {
     assert_eq!(scene_of(&place.path().join("two.html")).1["cameras"].as_array().unwrap().len(), 0);
 
     assert_eq!(call_in(place.path(), "export one.ply -o up.ply --up y").code, 0);
-    let up = load_splats(&place.path().join("up.ply")).unwrap();
+    let up = load_splats(place.path().join("up.ply")).unwrap();
     let ([x, y, z], turned) = (first.mean(0), up.mean(0));
     assert!((turned[0] - x).abs() + (turned[1] + y).abs() + (turned[2] + z).abs() < 1e-5);
     // Its header describes its own axes alone.
@@ -133,14 +133,14 @@ fn export_merges_gaussians_to_half_and_a_quarter() {
     let place = workplace();
     let run = "run scene --context 0,2 --target 1 --input-size 64 --refine off -o out";
     assert_eq!(call_in(place.path(), run).code, 0);
-    let all = load_splats(&place.path().join("out/scene.ply")).unwrap().len();
+    let all = load_splats(place.path().join("out/scene.ply")).unwrap().len();
     let size = |name: &str| std::fs::metadata(place.path().join(name)).unwrap().len() as f64;
     let view = |name: &str| {
         let render = format!("render {name} --cameras scene -o view-{}", name.replace('/', "-"));
         assert_eq!(call_in(place.path(), &render).code, 0);
         let folder = place.path().join(format!("view-{}", name.replace('/', "-")));
         // The frame between the inputs, and the inputs.
-        ["view1.png", "view0.png", "view2.png"].map(|f| load(&folder.join(f)).unwrap().to_unit())
+        ["view1.png", "view0.png", "view2.png"].map(|f| load(folder.join(f)).unwrap().to_unit())
     };
     let whole = view("out/scene.ply");
     for (wanted, share, likeness) in [("50%", 0.5, 38.0), ("2048", 2048.0 / all as f64, 33.0)] {

@@ -17,8 +17,8 @@ fn run_without_targets_draws_three_views_and_a_path_draws_what_is_asked() {
     let report = called.json();
     assert_eq!(report["targets"].as_array().unwrap().len(), 3);
     assert!(report["video"].is_null());
-    let depth = load(&place.path().join("out/depth_colour/path_0001.png")).unwrap();
-    let view = load(&place.path().join("out/images/path_0001.png")).unwrap();
+    let depth = load(place.path().join("out/depth_colour/path_0001.png")).unwrap();
+    let view = load(place.path().join("out/images/path_0001.png")).unwrap();
     assert!(depth.width > view.width && depth.height == view.height);
 
     let moving = "--path dolly --frames 4 --orbit-radius 0.1 --fps 10 --video out/dolly.webp";
@@ -33,13 +33,13 @@ fn run_without_targets_draws_three_views_and_a_path_draws_what_is_asked() {
     assert_eq!(frames.len(), 4);
     // The animation shows the pictures.
     for (i, frame) in frames.iter().enumerate() {
-        let still = load(&place.path().join(format!("out/images/path_{i:04}.png"))).unwrap();
+        let still = load(place.path().join(format!("out/images/path_{i:04}.png"))).unwrap();
         let rgb: Vec<u8> = frame.buffer().pixels().flat_map(|p| [p[0], p[1], p[2]]).collect();
         assert!(rgb == still.data, "frame {i}");
         assert_eq!(frame.delay().numer_denom_ms(), (100, 1));
     }
     // Towards the scene by twice the radius.
-    let cameras = load_cameras_json(&place.path().join("out/cameras.json")).unwrap().cameras;
+    let cameras = load_cameras_json(place.path().join("out/cameras.json")).unwrap().cameras;
     let step = cameras[1].camera.position().distance(cameras[0].camera.position());
     assert!((step - 0.2).abs() < 1e-4, "{step}");
 }
@@ -55,7 +55,7 @@ fn render_writes_a_gif_of_a_path() {
         let report = called.json();
         assert_eq!(report["views"].as_array().unwrap().len(), 3);
         let depth = report["views"][2]["depth_colour_file"].as_str().unwrap();
-        assert!(load(&place.path().join(depth)).unwrap().width > 48);
+        assert!(load(place.path().join(depth)).unwrap().width > 48);
         let gif = std::fs::read(place.path().join(format!("{path}.gif"))).unwrap();
         assert_eq!(
             (&gif[..6], gif.len() as u64),
@@ -113,7 +113,7 @@ fn ffmpeg_gets_every_frame() {
     assert_eq!(called.code, 0, "{}", called.stderr);
     let written = std::fs::read(place.path().join("a.mp4")).unwrap();
     assert_eq!(written.len(), 3 * 20 * 10 * 3);
-    let still = load(&place.path().join("out/path_0002.png")).unwrap();
+    let still = load(place.path().join("out/path_0002.png")).unwrap();
     assert!(written.ends_with(&still.data));
     let arguments = std::fs::read_to_string(place.path().join("arguments")).unwrap();
     for expected in ["-pix_fmt rgb24 -s 20x10 -r 25 -i -", "libx264", "-f mp4"] {

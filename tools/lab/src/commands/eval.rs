@@ -216,9 +216,9 @@ fn pictures(out: &Path, pair: &str, methods: &[String], result: &CaseResult) -> 
     methods.iter().try_for_each(|m| make(m))?;
     for (target, pictures) in result.scores.targets.iter().zip(&result.pictures) {
         let file = format!("{:06}.png", target.frame);
-        save_png(&folder("truth").join(&file), &pictures.truth)?;
+        save_png(folder("truth").join(&file), &pictures.truth)?;
         for (method, picture) in methods.iter().zip(&pictures.methods) {
-            save_png(&folder(method).join(&file), picture)?;
+            save_png(folder(method).join(&file), picture)?;
         }
     }
     Ok(())
@@ -382,7 +382,7 @@ fn write(
         ("index.html", page(&title, &notes, scores, sheets)),
     ];
     for (name, content) in files {
-        write_atomic(&out.join(name), |f| f.write_all(content.as_bytes()))?;
+        write_atomic(out.join(name), |f| f.write_all(content.as_bytes()))?;
     }
     Ok(())
 }

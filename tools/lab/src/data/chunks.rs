@@ -96,7 +96,7 @@ impl Chunk {
     /// # Errors
     /// Files that [`TorchFile::open`] refuses; an example without one of its parts; parts of
     /// different numbers of frames; an invalid camera.
-    pub fn open(path: &Path) -> Result<Self> {
+    pub fn open(path: impl AsRef<Path>) -> Result<Self> {
         Self::from_file(TorchFile::open(path)?)
     }
 
@@ -104,7 +104,7 @@ impl Chunk {
     ///
     /// # Errors
     /// As [`Chunk::open`].
-    pub fn parse(bytes: impl Into<Arc<[u8]>>, name: &Path) -> Result<Self> {
+    pub fn parse(bytes: impl Into<Arc<[u8]>>, name: impl AsRef<Path>) -> Result<Self> {
         Self::from_file(TorchFile::parse(bytes, name)?)
     }
 
@@ -233,7 +233,11 @@ fn pictures(value: &Value) -> std::result::Result<Vec<Arc<TensorRef>>, String> {
 ///
 /// # Errors
 /// A missing file; content other than an object of strings; a file name outside the folder.
-pub fn load_index(folder: &Path) -> Result<BTreeMap<String, PathBuf>> {
+pub fn load_index(folder: impl AsRef<Path>) -> Result<BTreeMap<String, PathBuf>> {
+    read_index(folder.as_ref())
+}
+
+fn read_index(folder: &Path) -> Result<BTreeMap<String, PathBuf>> {
     let path = folder.join("index.json");
     let names: BTreeMap<String, String> = serde_json::from_slice(&read(&path)?).map_err(|e| {
         Error::format(&path, "an object from keys to names of chunks", e.to_string())

@@ -23,7 +23,7 @@ use subsplat::files::image::Rgb;
 use subsplat::files::scene::{Scene, is_scene, load_scene};
 use subsplat::files::{Error, Result};
 use subsplat::reconstruct::inputs::crop::{CropOptions, crop};
-use subsplat::reconstruct::inputs::depth::depth_range;
+use subsplat::reconstruct::{DepthBounds, DepthRange};
 use subsplat_kernels::camera::{Camera, Intrinsics, NearFar, Size};
 
 /// Widest field of view of an example, degrees (pixelSplat's `max_fov`).
@@ -111,7 +111,7 @@ pub struct ExampleOptions {
     /// Mirrors half of the examples.
     pub flip: bool,
     /// Nearest and farthest depth candidate. The default is 1 and 100 for chunks and
-    /// [`depth_range`] for scenes.
+    /// [`DepthBounds::of_frames`] for scenes.
     pub near_far: Option<NearFar>,
 }
 
@@ -162,7 +162,8 @@ pub struct Dataset {
 
 /// Returns the folder of chunks at `path` or at `path/split` (`train`, `test`). Returns `None`
 /// where neither has an `index.json`.
-pub fn chunk_folder(path: &Path, split: &str) -> Option<PathBuf> {
+pub fn chunk_folder(path: impl AsRef<Path>, split: &str) -> Option<PathBuf> {
+    let path = path.as_ref();
     let folders = [path.to_owned(), path.join(split)];
     folders.into_iter().find(|f| f.join("index.json").is_file())
 }
@@ -172,7 +173,11 @@ pub fn chunk_folder(path: &Path, split: &str) -> Option<PathBuf> {
 ///
 /// # Errors
 /// A folder without any scene; a folder that cannot be listed.
-pub fn scene_paths(path: &Path) -> Result<Vec<PathBuf>> {
+pub fn scene_paths(path: impl AsRef<Path>) -> Result<Vec<PathBuf>> {
+    list_scenes(path.as_ref())
+}
+
+fn list_scenes(path: &Path) -> Result<Vec<PathBuf>> {
     if path.is_file() || is_scene(path) {
         return Ok(vec![path.to_owned()]);
     }
@@ -192,7 +197,11 @@ impl Dataset {
     ///
     /// # Errors
     /// None of these; an index or a scene that cannot be parsed.
-    pub fn open(path: &Path, options: ExampleOptions) -> Result<Self> {
+    pub fn open(path: impl AsRef<Path>, options: ExampleOptions) -> Result<Self> {
+        Self::open_at(path.as_ref(), options)
+    }
+
+    fn open_at(path: &Path, options: ExampleOptions) -> Result<Self> {
         let source = match chunk_folder(path, "train") {
             Some(folder) => {
                 let mut files: BTreeMap<PathBuf, Vec<String>> = BTreeMap::new();
@@ -370,8 +379,8 @@ impl Dataset {
         let near_far = match self.options.near_far {
             Some(range) => range,
             // Frames and near_far are already validated: the error means a zero baseline.
-            None => match depth_range(scene, &frames.context, None, None) {
-                Ok(range) => NearFar::new(range.near, range.far),
+            None => match DepthBounds::of_frames(scene, &frames.context, DepthRange::Auto) {
+                Ok(bounds) => bounds.near_far(),
                 Err(_) => return Ok(None),
             },
         };

@@ -1,4 +1,4 @@
-//! Prepares network inputs from scenes: crops, depth ranges, context pairs, chunks of pixelSplat's
+//! Prepares network inputs from scenes: crops, context pairs, chunks of pixelSplat's
 //! data sets, training examples, and procedural rooms.
 
 pub mod chunks;

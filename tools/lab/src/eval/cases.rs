@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use subsplat::files::protocol::{Index, Views, load_index, load_protocol};
 use subsplat::files::scene::{Scene, load_scene};
 use subsplat::reconstruct::inputs::pair::choose_pair;
-use subsplat::reconstruct::stages::{check_pairs, initial_bounds, refined_bounds};
+use subsplat::reconstruct::stages::check_pairs;
 use subsplat::reconstruct::{DepthBounds, DepthRange, Error, Photo, Result};
 use subsplat_kernels::camera::Camera;
 
@@ -329,7 +329,7 @@ impl Benchmark {
             frames.iter().map(|&f| photo(&chunk, video, f)).collect()
         };
         let names = case.views.target.iter().map(|f| format!("{f:06}")).collect();
-        let bounds = initial_bounds(&[], self.depth_range, Some(&DepthBounds::re10k()))?;
+        let bounds = DepthBounds::initial(&[], self.depth_range, Some(&DepthBounds::re10k()))?;
         let (context, targets) = (photos(&case.views.context)?, photos(&case.views.target)?);
         Ok(Loaded { context, targets, names, bounds, depth_range: self.depth_range })
     }
@@ -359,12 +359,12 @@ impl Benchmark {
     fn bounds_of_scene(&self, case: &Case, scene: &Scene, photos: &[Photo]) -> Result<DepthBounds> {
         let prior = DepthBounds::of_scene(scene, &case.views.context)?;
         let cameras: Vec<Camera> = photos.iter().map(|p| *p.camera()).collect();
-        let guess = initial_bounds(&cameras, self.depth_range, prior.as_ref())?;
+        let guess = DepthBounds::initial(&cameras, self.depth_range, prior.as_ref())?;
         if !guess.source.is_guess() {
             return Ok(guess);
         }
         let reports = check_pairs(photos, |_| Ok(()))?;
-        Ok(refined_bounds(guess, self.depth_range, &reports))
+        Ok(guess.refined(self.depth_range, &reports))
     }
 
     fn chunk(&self, file: &Path) -> Result<Arc<Chunk>> {

@@ -5,7 +5,6 @@ use super::{CaseResult, InputReport, Score, Scores};
 use std::fmt::Write;
 use std::path::Path;
 use subsplat::files::Result;
-use subsplat::files::base64::base64;
 use subsplat::files::image::{Rgb, png_bytes};
 use subsplat::scene::metrics::mean_gradient;
 use subsplat_cli::report::escaped;
@@ -129,7 +128,7 @@ pub fn page(title: &str, notes: &[String], scores: &Scores, sheets: &[Sheet]) ->
                 html,
                 "<figure><img alt=\"{caption}\" src=\"data:image/png;base64,{}\"><figcaption>\
                  {caption}</figcaption></figure>",
-                base64(png)
+                base64::encode(png)
             );
         }
         html.push_str("</div>\n");

@@ -20,7 +20,7 @@ pub fn write_scene(example: &Example, place: &Path) -> Result<()> {
     std::fs::create_dir_all(&images).map_err(|e| io::Error::io(&images, e))?;
     let save = |(v, view): (usize, &Posed)| -> Result<NamedCamera> {
         let file = format!("images/{v}.png");
-        save_png(&place.join(&file), &view.image)?;
+        save_png(place.join(&file), &view.image)?;
         Ok(NamedCamera::new(file, view.camera))
     };
     let views = example.context.iter().chain(&example.targets).enumerate();
@@ -30,11 +30,11 @@ pub fn write_scene(example: &Example, place: &Path) -> Result<()> {
     let target: Vec<usize> = (contexts..cameras.len()).collect();
     let near_far = Some(example.near_far);
     let file = CameraFile { cameras, units: Default::default(), near_far };
-    save_cameras_json(&place.join("cameras.json"), &file)?;
+    save_cameras_json(place.join("cameras.json"), &file)?;
     let size = example.context.first().map_or((0, 0), |v| (v.image.width, v.image.height));
     let tests = json!([{ "context": context, "target": target }]);
     let protocol = json!({ "resolution": [size.0, size.1], "tests": tests });
     let text = format!("{protocol:#}\n");
     let write = |out: &mut std::io::BufWriter<_>| out.write_all(text.as_bytes());
-    Ok(io::write_atomic(&place.join("protocol.json"), write)?)
+    Ok(io::write_atomic(place.join("protocol.json"), write)?)
 }

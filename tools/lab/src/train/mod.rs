@@ -35,6 +35,9 @@ pub enum Error {
     /// The network failed: shapes or weights.
     #[error(transparent)]
     Model(#[from] candle_core::Error),
+    /// A scene has no depth range.
+    #[error(transparent)]
+    DepthRange(#[from] subsplat::reconstruct::Error),
     /// The configured device cannot be opened.
     #[error(transparent)]
     Device(#[from] subsplat::network::ops::NoDevice),

@@ -9,8 +9,7 @@ use std::sync::Arc;
 use subsplat::files::protocol::{Views, load_protocol};
 use subsplat::files::scene::{Scene, load_scene};
 use subsplat::reconstruct::inputs::crop::{CropOptions, crop};
-use subsplat::reconstruct::inputs::depth::depth_range;
-use subsplat_kernels::camera::NearFar;
+use subsplat::reconstruct::{DepthBounds, DepthRange};
 
 /// Side of input and target, px, as in the protocol.
 const SIDE: usize = 256;
@@ -55,12 +54,12 @@ fn pair(scene: &Scene, test: &Views, stride: usize) -> Result<Example> {
         let cropped = crop(&photo, &camera, &options)?;
         Ok(Posed { image: cropped.input, camera: cropped.input_camera })
     };
-    let range = depth_range(scene, &test.context, None, None)?;
+    let bounds = DepthBounds::of_frames(scene, &test.context, DepthRange::Auto)?;
     Ok(Example {
         context: test.context.iter().map(load).collect::<Result<_>>()?,
         targets: test.target.iter().map(load).collect::<Result<_>>()?,
         inverse_depth: Vec::new(),
-        near_far: NearFar::new(range.near, range.far),
+        near_far: bounds.near_far(),
         input_targets: InputTargets::Absent,
     })
 }

@@ -182,18 +182,6 @@ impl Training {
         Self::with(config, folder, source(config)?, ranks)
     }
 
-    /// Starts or continues a training with the examples of `source`.
-    ///
-    /// # Errors
-    /// As [`Training::open`].
-    pub fn with_source(
-        config: &TrainConfig,
-        folder: &Path,
-        source: Arc<dyn Source>,
-    ) -> Result<Self> {
-        Self::with(config, folder, source, Ranks::single())
-    }
-
     fn with(
         config: &TrainConfig,
         folder: &Path,

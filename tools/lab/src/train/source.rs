@@ -12,6 +12,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use subsplat::files::image::Rgb;
 use subsplat::reconstruct::inputs::pair::quantile;
 use subsplat_kernels::camera::NearFar;
+use subsplat_kernels::layout::random::{GOLDEN, mix};
 
 /// One scene as training data.
 #[derive(Clone, Debug, PartialEq)]
@@ -63,15 +64,9 @@ pub trait Source: Send + Sync {
     }
 }
 
-/// Returns 64 pseudo-random bits for a seed and a key (SplitMix64's finaliser).
+/// Returns 64 pseudo-random bits for a seed and a key (SplitMix64's finaliser, twice).
 pub(super) fn hash(seed: u64, key: u64) -> u64 {
-    let mut z = seed ^ key.wrapping_add(1).wrapping_mul(0x9E37_79B9_7F4A_7C15);
-    for _ in 0..2 {
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        z ^= z >> 31;
-    }
-    z
+    mix(mix(seed ^ key.wrapping_add(1).wrapping_mul(GOLDEN)))
 }
 
 /// Returns a pseudo-random number in [0, 1).

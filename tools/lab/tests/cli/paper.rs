@@ -102,7 +102,7 @@ fn every_table_and_figure_has_its_rows_numbers_and_pictures() {
             files(&folder).into_iter().filter(|f| f.extension().unwrap() == "png").collect();
         assert_eq!(sheets.len(), settings, "{id}: {sheets:?}");
         assert_eq!(report["tables"][id]["pictures"], json!(settings));
-        let sheet = load(&folder.join(&sheets[0])).unwrap();
+        let sheet = load(folder.join(&sheets[0])).unwrap();
         assert_eq!(sheet.width, (measured / settings + 2) * 262, "{id}");
     }
     // Trained once, and shared by the tables.

@@ -346,7 +346,7 @@ fn photographs_without_targets_are_refused() {
     let (made, cameras) = made_up::made_up(3);
     let content =
         CameraFile { cameras, units: Units::Unknown, near_far: Some(NearFar::new(1.0, 9.0)) };
-    save_cameras_json(&made.path().join("cameras.json"), &content).unwrap();
+    save_cameras_json(made.path().join("cameras.json"), &content).unwrap();
     let refused = |tests: &str| {
         let file = made.path().join("protocol.json");
         std::fs::write(file, format!(r#"{{"tests": [{tests}]}}"#)).unwrap();

@@ -166,7 +166,7 @@ fn broken_data_sets_are_refused_with_a_reason() {
     std::fs::write(folder.path().join("000000.torch"), chunk_files::chunk(&[video("a", 5)]))
         .unwrap();
     refused(&["000000.torch", "`z`", "index.json says"]);
-    let missing = Dataset::open(&folder.path().join("none"), options(false));
+    let missing = Dataset::open(folder.path().join("none"), options(false));
     assert!(missing.err().unwrap().to_string().contains("none"));
 }
 
@@ -174,7 +174,7 @@ fn scene_folder(folder: &Path, frames: usize, units: Units, near_far: Option<Nea
     std::fs::create_dir_all(folder).unwrap();
     let (made, cameras) = made_up::made_up(frames);
     std::fs::rename(made.path().join("images"), folder.join("images")).unwrap();
-    save_cameras_json(&folder.join("cameras.json"), &CameraFile { cameras, units, near_far })
+    save_cameras_json(folder.join("cameras.json"), &CameraFile { cameras, units, near_far })
         .unwrap();
 }
 
@@ -185,7 +185,7 @@ fn folders_of_scenes_are_data_sets() {
     scene_folder(&folder.path().join("two"), 5, Units::Unknown, Some(NearFar::new(0.5, 7.0)));
     scene_folder(&folder.path().join("three"), 5, Units::Unknown, None);
     std::fs::create_dir(folder.path().join("notes")).unwrap();
-    assert!(is_scene(&folder.path().join("one")) && !is_scene(&folder.path().join("notes")));
+    assert!(is_scene(folder.path().join("one")) && !is_scene(folder.path().join("notes")));
     let data = open(folder.path(), options(false));
     let mut stream = data.stream(2, 0);
     let mut names = BTreeSet::new();

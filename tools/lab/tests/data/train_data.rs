@@ -79,7 +79,7 @@ fn a_data_set_is_streamed_into_the_step() {
     let sampler = ViewSampler { last: GapBounds { low: 3, high: 5 }, steps: 10, ..first };
     let crop = CropOptions::square(32, 2, config.model_config().unwrap().stride());
     let options = ExampleOptions { sampler, crop, flip: false, near_far: None };
-    let data = Dataset::open(&folder_guard.path().join("videos"), options).unwrap();
+    let data = Dataset::open(folder_guard.path().join("videos"), options).unwrap();
     for index in [0u64, 1, 7, 30] {
         let want = data.example_from(5, index, index as usize / 2).unwrap().1;
         let got = source.example(index).unwrap();

@@ -180,7 +180,7 @@ fn methods_are_what_they_say() {
     let got: Vec<f64> = result.scores.targets[0].scores.iter().map(|s| s.psnr).collect();
     println!("{got:?}");
 
-    let scene = load_scene(&place.path().join("scene")).unwrap();
+    let scene = load_scene(place.path().join("scene")).unwrap();
     let photo = |i: usize| Photo::from_frame(&scene.frames[i]).unwrap();
     let crop = CropOptions::square(64, 2, 32);
     let truth = photo(1).crop(&crop).unwrap();
@@ -410,7 +410,7 @@ fn pictures_of_other_programs_are_found_in_their_layouts() {
         found.push(copying(folder.path(), &[method()]).unwrap().mean("x").unwrap().psnr);
     }
     assert!(found[0] != found[1] && found[1] != found[2], "{found:?}");
-    save_png(&other.join("c/0_3/000001.png"), &Rgb::black(31, 32)).unwrap();
+    save_png(other.join("c/0_3/000001.png"), &Rgb::black(31, 32)).unwrap();
     let e = copying(folder.path(), &[method()]).unwrap_err();
     assert!(e.contains("expected 32x32, got 31x32"), "{e}");
 }
@@ -455,7 +455,7 @@ fn what_cannot_be_evaluated_is_named() {
 #[test]
 fn a_scene_without_a_protocol_gets_a_case() {
     let place = program::workplace();
-    let scene = load_scene(&place.path().join("scene")).unwrap();
+    let scene = load_scene(place.path().join("scene")).unwrap();
     let pair = choose_pair(&scene).unwrap().frames;
     let data = Benchmark::open(place.path(), None).unwrap();
     let [case] = data.cases() else { panic!("{:?}", data.cases()) };
@@ -480,7 +480,7 @@ fn a_scene_without_a_protocol_gets_a_case() {
     }
     let near_far = Some(NearFar::new(1.0, 4.0));
     let content = CameraFile { cameras, units: Units::RealEstate10k, near_far };
-    save_cameras_json(&folder.path().join("cameras.json"), &content).unwrap();
+    save_cameras_json(folder.path().join("cameras.json"), &content).unwrap();
     let data = Benchmark::open(folder.path(), None).unwrap();
     let views = &data.cases()[0].views;
     let between = views.context[1] - views.context[0] - 1;

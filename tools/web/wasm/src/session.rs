@@ -4,11 +4,11 @@ use crate::host;
 use serde_json::{Value, json};
 use std::ops::{ControlFlow, RangeInclusive};
 use std::path::Path;
-use subsplat::reconstruct::LooseOptions;
+use subsplat::estimate::EstimateOptions;
 use subsplat::{
     Backend, Camera, DeviceChoice, FitOptions, LoadOptions, Options, Photo, Photograph,
     RasterOptions, Reconstructor, Refine, SaveOptions, SplatFormat, Splats, Warning, encode_splats,
-    loose_photos, parse_photograph,
+    estimate_cameras, parse_photograph,
 };
 
 /// Reports a stage to the page.
@@ -183,8 +183,8 @@ fn with_cameras(
     let (names, photographs): (Vec<String>, Vec<Photograph>) = photographs.into_iter().unzip();
     let mut warnings: Vec<String> = photographs.iter().flat_map(|p| p.warnings.clone()).collect();
     report("cameras", 0.0);
-    let found =
-        loose_photos(photographs, &LooseOptions::default()).map_err(|error| error.to_string())?;
+    let found = estimate_cameras(photographs, &EstimateOptions::default())
+        .map_err(|error| error.to_string())?;
     let estimate = &found.estimate;
     warnings.extend(
         estimate.left_out.iter().map(|l| format!("{} is left out: {}", names[l.photo], l.reason)),

@@ -49,7 +49,7 @@ mod tests {
         assert_eq!(name(save_next(&deep, "s", &picture).unwrap()), "s-0003.png");
         assert_eq!(name(save_next(&deep, "x/y", &picture).unwrap()), "x_y-0001.png");
         assert_eq!(std::fs::read(deep.join("s-0002.png")).unwrap(), b"mine");
-        let whole = subsplat::files::image::load(&deep.join("s-0003.png")).unwrap();
+        let whole = subsplat::files::image::load(deep.join("s-0003.png")).unwrap();
         assert_eq!((whole.width, whole.height), (2, 1));
         // A picture that cannot be written leaves no file.
         let none = Rgb { width: 2, height: 1, data: Vec::new() };

@@ -142,7 +142,7 @@ impl<'a> Maker<'a> {
             let (part, scenes) = self.part(setting, &opened, progress)?;
             for (i, scene) in scenes.iter().enumerate() {
                 let name = format!("{}-{i}-{}.png", setting.slug(), slug(&scene.name));
-                save_png(&self.out.join(name), &scene.sheet())?;
+                save_png(self.out.join(name), &scene.sheet())?;
                 sheets += 1;
             }
             parts.push(part);
@@ -155,7 +155,7 @@ impl<'a> Maker<'a> {
             (format!("{id}.md"), text.clone()),
         ];
         for (name, content) in &files {
-            write_atomic(&self.out.join(name), |f| f.write_all(content.as_bytes()))?;
+            write_atomic(self.out.join(name), |f| f.write_all(content.as_bytes()))?;
         }
         answer.line(text.trim_end());
         answer.line(format!("{id}.csv, {id}.md, {sheets} pictures in {}\n", self.out.display()));

@@ -74,7 +74,7 @@ impl Maker<'_> {
                 writer.push(&view)?;
                 let still = (i % STILL_EVERY == 0).then(|| format!("still-{i:03}.png"));
                 if let Some(name) = &still {
-                    save_png(&self.out.join(name), &view)?;
+                    save_png(self.out.join(name), &view)?;
                     stills += 1;
                 }
                 let p = camera.position();
@@ -86,12 +86,12 @@ impl Maker<'_> {
             Ok::<_, anyhow::Error>(())
         })?;
         let bytes = video.context("no frame")?.finish()?;
-        write_atomic(&self.out.join(format!("{id}.csv")), |f| f.write_all(table.as_bytes()))?;
+        write_atomic(self.out.join(format!("{id}.csv")), |f| f.write_all(table.as_bytes()))?;
         let notes = self.notes(&[], opened.generated);
         let place = format!("{} of {}", case.scene, opened.name);
         let mut text = format!("# {id}: {}\n\n{frames} frames of {place}.\n\n", self.table.title);
         notes.iter().for_each(|note| text += &format!("* {note}\n"));
-        write_atomic(&self.out.join(format!("{id}.md")), |f| f.write_all(text.as_bytes()))?;
+        write_atomic(self.out.join(format!("{id}.md")), |f| f.write_all(text.as_bytes()))?;
         answer.line(text.trim_end());
         answer.line(format!(
             "video.webp ({:.1} MB), {stills} stills, {id}.csv, {id}.md in {}\n",

@@ -3,18 +3,8 @@
 //!
 //! A stream is a 64-bit state. [`Rng::fork`] opens an independent stream, so that an additional
 //! number in one stream leaves all others unchanged.
-//!
-//! Source: Steele, Lea and Flood, OOPSLA 2014.
 
-/// Weyl increment of SplitMix64: 2⁶⁴ over the golden ratio, odd.
-const GOLDEN: u64 = 0x9E37_79B9_7F4A_7C15;
-
-/// Applies SplitMix64's finaliser: every input bit affects every output bit.
-fn mix(mut z: u64) -> u64 {
-    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-    z ^ (z >> 31)
-}
+use subsplat_kernels::layout::random::{GOLDEN, mix, next};
 
 /// Returns 64 random bits for a position. Jitter and noise use them, because those must not depend
 /// on the order of evaluation.
@@ -61,8 +51,7 @@ impl Rng {
 
     /// Returns 64 random bits.
     pub(in crate::data) fn bits(&mut self) -> u64 {
-        self.state = self.state.wrapping_add(GOLDEN);
-        mix(self.state)
+        next(&mut self.state)
     }
 
     /// Returns a number in [0, 1).

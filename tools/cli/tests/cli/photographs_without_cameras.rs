@@ -42,10 +42,10 @@ fn poses_of_two_photographs_are_those_of_the_scene() {
     let report = called.json();
     assert_eq!(report["confidence"], "high", "{report}");
     assert!(report["points"].as_u64().unwrap() > 50, "{report}");
-    let truth = load_scene(&room()).unwrap();
+    let truth = load_scene(room()).unwrap();
     let truth = [truth.frames[0].camera, truth.frames[1].camera];
     for file in ["photos", "photos/cameras.json", "photos/sparse/0"] {
-        let found = load_scene(&place.path().join(file)).unwrap();
+        let found = load_scene(place.path().join(file)).unwrap();
         assert!(found.points.is_some_and(|p| p.len() > 50), "{file}");
         let found = [found.frames[0].camera, found.frames[1].camera];
         let [turn, direction] = errors(found, truth);

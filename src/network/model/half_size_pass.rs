@@ -1,4 +1,7 @@
-//! Estimation of near and far depth from half-size images.
+//! First pass of the depth network, at half size, which narrows near and far.
+//!
+//! The module narrows a range that is given. `src/reconstruct/depth_range.rs` decides that range from
+//! files, cameras and matched points, without the network.
 //!
 //! Depth candidates are uniform in 1/depth between near and far, so a range wider than the
 //! scene costs accuracy. The depth network runs once on images of half the size, with a

@@ -1,4 +1,5 @@
-//! Photographs without a pose file to a scene: their cameras are estimated.
+//! Estimates the cameras of photographs without a pose file: decodes them, takes what is known of
+//! their lenses, estimates the poses ([`crate::cameras::estimation`]), and returns photographs or a scene.
 
 use super::{Error, Photo, Result};
 use crate::cameras::estimation::{Lens, PoseEstimate, PoseOptions, PosePhoto, estimate_poses};
@@ -49,20 +50,20 @@ impl fmt::Display for LensSource {
     }
 }
 
-/// Options of [`loose_scene`] and [`loose_photos`].
+/// Options of [`estimate_cameras`] and [`estimate_cameras_of_files`].
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct LooseOptions {
+pub struct EstimateOptions {
     /// Intrinsics of all photographs. They win over EXIF.
     pub lens: Option<KnownLens>,
     /// Estimation of the poses.
     pub poses: PoseOptions,
-    /// Decoding by [`loose_scene`].
+    /// Decoding by [`estimate_cameras_of_files`].
     pub load: LoadOptions,
 }
 
-/// A scene with estimated cameras.
+/// Result of [`estimate_cameras_of_files`]: a scene with estimated cameras.
 #[derive(Clone, Debug, PartialEq)]
-pub struct LooseScene {
+pub struct EstimatedScene {
     /// The photographs that have a camera, and the sparse points.
     pub scene: Scene,
     /// The estimate; its indices count all photographs.
@@ -71,10 +72,10 @@ pub struct LooseScene {
     pub lenses: Vec<LensSource>,
 }
 
-/// Photographs in memory with estimated cameras.
+/// Result of [`estimate_cameras`]: photographs in memory with estimated cameras.
 #[derive(Clone, Debug, PartialEq)]
 #[non_exhaustive]
-pub struct LoosePhotos {
+pub struct EstimatedPhotos {
     /// The photographs that have a camera, in their order.
     pub photos: Vec<Photo>,
     /// The estimate; its indices count all photographs.
@@ -98,7 +99,10 @@ fn features_of(photographs: usize) -> usize {
 ///
 /// # Errors
 /// A lens that is no valid camera; [`Error::NoPoses`].
-pub fn loose_photos(photographs: Vec<Photograph>, options: &LooseOptions) -> Result<LoosePhotos> {
+pub fn estimate_cameras(
+    photographs: Vec<Photograph>,
+    options: &EstimateOptions,
+) -> Result<EstimatedPhotos> {
     let features = features_of(photographs.len());
     let (mut pose_photos, mut lenses) = (Vec::new(), Vec::new());
     for photograph in &photographs {
@@ -114,10 +118,10 @@ pub fn loose_photos(photographs: Vec<Photograph>, options: &LooseOptions) -> Res
         .zip(&estimate.cameras)
         .filter_map(|(photograph, camera)| Some(Photo::new(photograph.image, (*camera)?)))
         .collect::<Result<_>>()?;
-    Ok(LoosePhotos { photos, estimate, lenses })
+    Ok(EstimatedPhotos { photos, estimate, lenses })
 }
 
-/// Estimates the cameras of photographs from their pixels. `name` names the scene in messages.
+/// Estimates the cameras of photographs in files. `name` names the scene in messages.
 /// `photograph` is called with the index of each photograph before it is decoded.
 ///
 /// One photograph is decoded at a time, so that memory holds one at its full size.
@@ -125,12 +129,22 @@ pub fn loose_photos(photographs: Vec<Photograph>, options: &LooseOptions) -> Res
 /// # Errors
 /// Those of [`load_photograph`]; a lens that is no valid camera; [`Error::NoPoses`]; the error of
 /// `photograph`.
-pub fn loose_scene(
-    name: &Path,
-    photographs: &[PathBuf],
-    options: &LooseOptions,
+pub fn estimate_cameras_of_files(
+    name: impl AsRef<Path>,
+    photographs: &[impl AsRef<Path>],
+    options: &EstimateOptions,
     photograph: &mut dyn FnMut(usize) -> Result<()>,
-) -> Result<LooseScene> {
+) -> Result<EstimatedScene> {
+    let photographs: Vec<&Path> = photographs.iter().map(AsRef::as_ref).collect();
+    estimate_scene(name.as_ref(), &photographs, options, photograph)
+}
+
+fn estimate_scene(
+    name: &Path,
+    photographs: &[&Path],
+    options: &EstimateOptions,
+    photograph: &mut dyn FnMut(usize) -> Result<()>,
+) -> Result<EstimatedScene> {
     let features = features_of(photographs.len());
     let mut warnings = Vec::new();
     let (mut photos, mut lenses) = (Vec::new(), Vec::new());
@@ -150,7 +164,7 @@ pub fn loose_scene(
     let placed: Vec<(PathBuf, Camera)> = photographs
         .iter()
         .zip(&estimate.cameras)
-        .filter_map(|(path, camera)| Some((path.clone(), (*camera)?)))
+        .filter_map(|(path, camera)| Some((path.to_path_buf(), (*camera)?)))
         .collect();
     let mut scene = Scene::from_photographs(SceneFormat::Photographs, name, &placed)?;
     scene.points = Some(estimate.points.iter().map(|p| p.position).collect());
@@ -168,7 +182,7 @@ pub fn loose_scene(
         scene.warnings.push(format!("{path} is left out: {}", left.reason));
     }
     scene.warnings.extend(estimate.warnings.iter().map(|w| format!("estimated cameras: {w}")));
-    Ok(LooseScene { scene, estimate, lenses })
+    Ok(EstimatedScene { scene, estimate, lenses })
 }
 
 /// What is known of a photograph's lens.
@@ -184,7 +198,7 @@ fn lens(photograph: &Photograph, known: Option<KnownLens>) -> (Lens, LensSource)
 }
 
 /// Names photographs in a message.
-fn photographs_of(name: &Path, photographs: &[PathBuf]) -> String {
+fn photographs_of(name: &Path, photographs: &[&Path]) -> String {
     match photographs {
         [a, b] => format!("{} and {}", a.display(), b.display()),
         _ => format!("{} ({} photographs)", name.display(), photographs.len()),

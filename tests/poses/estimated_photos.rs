@@ -3,8 +3,11 @@
 use crate::refused::{EYE, H, STEP, W, camera, picture};
 use std::path::PathBuf;
 use subsplat::cameras::estimation::PoseRefusal;
-use subsplat::reconstruct::{KnownLens, LensSource, LooseOptions};
-use subsplat::{Error, LoadOptions, Rgb, load_photograph, loose_photos, loose_scene, save_png};
+use subsplat::reconstruct::{KnownLens, LensSource};
+use subsplat::{
+    Error, EstimateOptions, LoadOptions, Rgb, estimate_cameras, estimate_cameras_of_files,
+    load_photograph, save_png,
+};
 
 #[test]
 fn photographs_in_memory_get_the_cameras_of_their_files() {
@@ -20,10 +23,12 @@ fn photographs_in_memory_get_the_cameras_of_their_files() {
         .collect();
     let photographs: Vec<_> =
         files.iter().map(|file| load_photograph(file, &LoadOptions::default()).unwrap()).collect();
-    let options = LooseOptions { lens: Some(KnownLens::FovX(1.1)), ..LooseOptions::default() };
+    let options =
+        EstimateOptions { lens: Some(KnownLens::FovX(1.1)), ..EstimateOptions::default() };
 
-    let scene = loose_scene(folder.path(), &files, &options, &mut |_| Ok(())).unwrap();
-    let memory = loose_photos(photographs.clone(), &options).unwrap();
+    let scene =
+        estimate_cameras_of_files(folder.path(), &files, &options, &mut |_| Ok(())).unwrap();
+    let memory = estimate_cameras(photographs.clone(), &options).unwrap();
     assert_eq!(memory.estimate, scene.estimate);
     assert_eq!(memory.lenses, [LensSource::Given, LensSource::Given]);
     assert_eq!(memory.photos.len(), 2);
@@ -34,7 +39,7 @@ fn photographs_in_memory_get_the_cameras_of_their_files() {
     }
 
     let twice = vec![photographs[0].clone(), photographs[0].clone()];
-    let refused = loose_photos(twice, &options);
+    let refused = estimate_cameras(twice, &options);
     assert!(
         matches!(&refused, Err(Error::NoPoses { reason: PoseRefusal::SameView { .. }, .. })),
         "{refused:?}"
