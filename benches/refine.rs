@@ -1,4 +1,4 @@
-//! A refinement step ([`subsplat::refine::refine`]) on one photograph beside the forward and backward pass
+//! A refinement step ([`subsplat::finish::refine()`]) on one photograph beside the forward and backward pass
 //! of the rasterizer alone, on the rasterizer's scenes (`common/scene.rs`). A step adds the loss
 //! with its gradient and Adam's step of all Gaussians. The photograph is the scene's own picture
 //! with other colours.
@@ -9,8 +9,7 @@ use anyhow::{Context, Result, ensure};
 use common::scene::{self, SCENES};
 use common::{Bench, Contender, Threads};
 use subsplat::files::image::Rgb;
-use subsplat::fit::FitView;
-use subsplat::refine::{RefineOptions, Refiner};
+use subsplat::finish::{RefineOptions, Refiner, TargetView};
 use subsplat::scene::render::{Renderer, render, slices};
 use subsplat_kernels::cpu::Rasterizer;
 use subsplat_kernels::layout::{Gradients, RasterOptions};
@@ -30,7 +29,7 @@ fn main() -> Result<()> {
         let picture = bench.on_all(|| render(&splats, &camera, &raster));
         let other: Vec<f32> = picture.rgb.iter().map(|v| 0.8 * v + 0.05).collect();
         let image = Rgb::from_unit(&other, spec.side, spec.side).context("a picture")?;
-        let views = [FitView { camera: &camera, image: &image }];
+        let views = [TargetView { camera: &camera, image: &image }];
         let options = RefineOptions::default().with_steps(usize::MAX);
         let mut checked = Refiner::new(&splats, &views, &raster, &options)?;
         let mut renderer = Renderer::default();

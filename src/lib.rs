@@ -73,15 +73,11 @@
 
 pub mod cameras;
 pub mod files;
-pub mod fit;
-pub mod loss;
-pub mod merge;
+pub mod finish;
 #[cfg(feature = "network")]
 pub mod network;
 #[cfg(feature = "network")]
 pub mod reconstruct;
-pub mod reduce;
-pub mod refine;
 pub mod scene;
 
 pub use glam;
@@ -105,7 +101,7 @@ pub use files::{
     Error as FileError, SaveOptions, SplatFormat, Up, encode_splats, load_splats, parse_splats,
     save_splats,
 };
-pub use fit::FitOptions;
+pub use finish::FitOptions;
 pub use scene::navigation::Bounds;
 pub use scene::render::{Picture, Renderer, render};
 pub use scene::splats::{Splats, SplatsError};
@@ -125,14 +121,15 @@ pub mod details {
     pub use crate::files::image::Truncated;
     pub use crate::files::scene::{LoadedFrame, Pixels, SceneFormat, Units};
     pub use crate::files::undistort::Distortion;
-    pub use crate::fit::{FitError, FitReport, FitView};
+    pub use crate::finish::{
+        FinishError, FitReport, RefineOptions, RefineReport, Refiner, TargetView,
+    };
     #[cfg(feature = "network")]
     pub use crate::reconstruct::inputs::crop::{
         CropOptions, CropRule, Cropped, LrFrom, PhotoWindow,
     };
     #[cfg(feature = "network")]
     pub use crate::reconstruct::{DepthSource, StageTime};
-    pub use crate::refine::{RefineOptions, RefineReport, Refiner};
     pub use crate::scene::metrics::MetricsError;
     pub use crate::scene::splats::SplatParts;
     #[cfg(all(feature = "gpu", target_family = "wasm", target_os = "unknown"))]

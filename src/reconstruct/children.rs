@@ -4,12 +4,11 @@
 use super::density::{Density, counts, grids};
 use super::detail::{self, add_detail};
 use super::{Error, Result};
-use crate::fit::FitView;
+use crate::finish::{Groups, LEAST_SHARE, TargetView, hidden, shares};
 use crate::network::model::encoding::SceneEncoding;
 use crate::network::model::subsplat::{SceneOutput, SubSplat};
 use crate::network::model::trace::Checkpoint;
 use crate::reconstruct::inputs::crop::Cropped;
-use crate::refine::{Groups, LEAST_SHARE, PHOTOGRAPHS_TO_REMOVE, shares};
 use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
 use subsplat_kernels::layout::{CHILDREN_MAX, RasterOptions};
@@ -71,22 +70,23 @@ pub fn counts_of(
     }
     let parents = encoding.parents(network)?;
     let grids = grids_of(network);
-    let photographs: Vec<FitView<'_>> =
-        inputs.iter().map(|c| FitView { camera: &c.input_camera, image: &c.input }).collect();
+    let photographs: Vec<TargetView<'_>> =
+        inputs.iter().map(|c| TargetView { camera: &c.input_camera, image: &c.input }).collect();
     let mut shares = shares(&parents, &photographs, raster, renderer);
     let upscale = grids.last().copied().unwrap_or(1);
     let mut limit = density.limit(parents.len(), inputs.len(), upscale);
-    let mut hidden = Vec::new();
-    if inputs.len() >= PHOTOGRAPHS_TO_REMOVE {
-        hidden.extend((0..shares.len()).filter(|i| shares[*i] < LEAST_SHARE));
-        hidden.iter().for_each(|i| shares[*i] = 0.0);
-        limit = limit.saturating_add(hidden.len());
+    let hidden = hidden(&shares, inputs.len(), LEAST_SHARE);
+    for (share, _) in shares.iter_mut().zip(&hidden).filter(|(_, hidden)| **hidden) {
+        *share = 0.0;
+        limit = limit.saturating_add(1);
     }
     let mut counts = match density {
         Density::Each(children) => vec![each(children)?; shares.len()],
         _ => counts(inputs, &shares, &grids, limit),
     };
-    hidden.into_iter().for_each(|i| counts[i] = 0);
+    for (count, _) in counts.iter_mut().zip(&hidden).filter(|(_, hidden)| **hidden) {
+        *count = 0;
+    }
     Ok(Some(Counts { counts, parents }))
 }
 

@@ -1,14 +1,17 @@
 //! Fit and refinement of a reconstructed scene on its photographs.
 
-use super::{Error, Result};
+use super::{Error, Refine, Result};
 use crate::files::image::Rgb;
-use crate::fit::{FitError, FitOptions, FitReport, FitView, fit};
+use crate::finish::{
+    FinishError, FitOptions, FitReport, Groups, RefineOptions, RefineReport, Refiner, TargetView,
+    check_time, fit, refine_groups,
+};
 use crate::reconstruct::inputs::crop::Cropped;
-use crate::refine::{Groups, RefineOptions, RefineReport, Refiner, refine_groups};
 use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
 use std::ops::ControlFlow;
 use subsplat_kernels::camera::Camera;
+use subsplat_kernels::clock::HAS_CLOCK;
 use subsplat_kernels::layout::RasterOptions;
 
 /// The largest picture of `c` that is no enlargement of the photograph, with its camera: the
@@ -54,18 +57,31 @@ pub fn refine_on_inputs(
         .map_err(error)
 }
 
-fn views_of(inputs: &[Cropped]) -> Vec<FitView<'_>> {
+/// Refuses a refinement that this platform cannot end.
+///
+/// # Errors
+/// [`Refine::Seconds`] where there is no clock.
+pub(crate) fn check_refine(refine: Refine) -> Result<()> {
+    check_time(refine.time(), HAS_CLOCK).map_err(error)
+}
+
+fn views_of(inputs: &[Cropped]) -> Vec<TargetView<'_>> {
     let view = |c| {
         let (camera, image) = sharp_picture(c);
-        FitView { camera, image }
+        TargetView { camera, image }
     };
     inputs.iter().map(view).collect()
 }
 
-fn error(e: FitError) -> Error {
+fn error(e: FinishError) -> Error {
     match e {
-        FitError::Cancelled => Error::Cancelled,
-        FitError::Size { view, expected, got } => {
+        FinishError::Cancelled => Error::Cancelled,
+        FinishError::NoClock => Error::argument(
+            "refinement",
+            "a number of steps, because WebAssembly without an operating system has no clock",
+            "a time",
+        ),
+        FinishError::Size { view, expected, got } => {
             Error::argument(format!("photograph {view}"), expected, got)
         }
     }

@@ -30,8 +30,8 @@
 //! 4. The small backbone estimates near and far at half size, unless the caller fixed one.
 //! 5. The network predicts one primary Gaussian per input pixel, then its children.
 //! 6. The photographs add detail to the children's colours ([`Detail`]).
-//! 7. Sizes, opacities and colours are fitted to the photographs ([`crate::fit::fit`]).
-//! 8. Means, shapes, opacities and colours are refined on the photographs ([`crate::refine::refine`]).
+//! 7. Sizes, opacities and colours are fitted to the photographs ([`crate::finish::fit()`]).
+//! 8. Means, shapes, opacities and colours are refined on the photographs ([`crate::finish::refine()`]).
 //!
 //! [`Reconstructor::run`] executes all of them. [`Reconstructor::prepare`] executes steps 1 to 3;
 //! the caller can then free large photographs before the network runs.
@@ -74,7 +74,7 @@ pub use reconstructor::Reconstructor;
 pub use warning::Warning;
 
 pub(crate) use children::{SceneChildren, counts_of};
-pub(crate) use fit::{fit_to_inputs, refine_on_inputs};
+pub(crate) use fit::{check_refine, fit_to_inputs, refine_on_inputs};
 pub(crate) use poses::check_pairs;
 
 /// The stages of a run, one by one, for evaluation. No version promises anything about them.
@@ -84,7 +84,7 @@ pub mod stages {
     pub use super::exposure::equalise;
     pub use super::fit::{fit_to_inputs, refine_on_inputs};
     pub use super::poses::{adjusted, check_pairs, located};
-    pub use crate::refine::Groups;
+    pub use crate::finish::Groups;
 }
 
 use crate::network::config::{Backbone, Config};

@@ -1,8 +1,7 @@
 //! Options of a reconstruction.
 
 use super::{Density, DepthBounds, DepthRange, Error, InputSize, Result};
-use crate::fit::FitOptions;
-use crate::refine::RefineOptions;
+use crate::finish::{FitOptions, RefineOptions};
 use std::time::Duration;
 use subsplat_kernels::camera::{Camera, Size};
 
@@ -38,9 +37,9 @@ pub struct Options {
     pub check: Check,
     /// Source of colour detail. Default: [`Detail::Photographs`].
     pub detail: Detail,
-    /// Fit of the Gaussians to the photographs ([`crate::fit::fit`]). Default: four steps.
+    /// Fit of the Gaussians to the photographs ([`crate::finish::fit()`]). Default: four steps.
     pub fit: FitOptions,
-    /// Refinement of the Gaussians on the photographs ([`crate::refine::refine`]). Default:
+    /// Refinement of the Gaussians on the photographs ([`crate::finish::refine()`]). Default:
     /// [`Refine::Auto`].
     pub refine: Refine,
 }
@@ -181,7 +180,7 @@ impl TargetSize {
     }
 }
 
-/// Length of the refinement of Gaussians on their photographs ([`crate::refine::refine`]).
+/// Length of the refinement of Gaussians on their photographs ([`crate::finish::refine()`]).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Refine {
@@ -193,7 +192,8 @@ pub enum Refine {
     Off,
     /// At most this number of steps.
     Steps(usize),
-    /// Steps for about this number of seconds. The result then depends on the machine.
+    /// Steps for about this number of seconds. The result then depends on the machine. Refused where
+    /// there is no clock (WebAssembly without an operating system).
     Seconds(u32),
 }
 
@@ -211,14 +211,24 @@ impl Refine {
         .options(photographs)
     }
 
-    /// Options of [`crate::refine::refine`] for a number of photographs.
+    /// The limit of time, if there is one.
+    pub(crate) fn time(self) -> Option<Duration> {
+        match self {
+            Self::Seconds(seconds) => Some(Duration::from_secs(seconds.into())),
+            Self::Auto | Self::Off | Self::Steps(_) => None,
+        }
+    }
+
+    /// Options of [`crate::finish::refine()`] for a number of photographs.
     fn options(self, photographs: usize) -> RefineOptions {
         let options = RefineOptions::default().with_groups(true);
         match self {
             Self::Auto => options.with_steps((8 * photographs).min(64)),
             Self::Off => options.with_steps(0),
             Self::Steps(steps) => options.with_steps(steps),
-            Self::Seconds(seconds) => options.with_time(Duration::from_secs(seconds.into())),
+            Self::Seconds(_) => {
+                RefineOptions { time: self.time(), ..options.with_steps(usize::MAX) }
+            }
         }
     }
 }

@@ -8,9 +8,9 @@ use super::{
 use crate::cameras::check::PairReport;
 use crate::cameras::estimation::PoseAdjustment;
 use crate::files::image::{Depth, Rgb};
+use crate::finish::Refiner;
 use crate::network::model::Views;
 use crate::reconstruct::inputs::crop::Cropped;
-use crate::refine::Refiner;
 use crate::scene::render::Renderer;
 use std::ops::ControlFlow;
 use subsplat_kernels::camera::Camera;

@@ -4,7 +4,8 @@ use super::progress::{Callback, StageCost, Tracker};
 use super::warning::Warning;
 use super::{
     Check, DepthBounds, DepthRange, DepthSource, Detail, Error, Options, Photo, Poses, Prepared,
-    Progress, Reconstruction, Refine, Result, Stage, check_pairs, exposure, is_mvsplat, poses,
+    Progress, Reconstruction, Refine, Result, Stage, check_pairs, check_refine, exposure,
+    is_mvsplat, poses,
 };
 use crate::network::config::{Config, Preset};
 use crate::network::model::subsplat::SubSplat;
@@ -169,6 +170,7 @@ impl Reconstructor {
         options: &Options,
         progress: &mut dyn FnMut(Progress) -> ControlFlow<()>,
     ) -> Result<Prepared<'_>> {
+        check_refine(options.refine)?;
         let sizes: Vec<Size> = photos.iter().map(Photo::size).collect();
         let input_size = options.input_size_for(&sizes, self.config().stride());
         let target_size = options.target_size.resolve(input_size, self.config().upscale);

@@ -2,7 +2,7 @@
 //!
 //! The Gaussians are sorted along a Morton curve and cut into blocks of [`BLOCK`]. Level 0 of a block is
 //! its Gaussians. At a coarser level the Gaussians of the level before in one cell of a grid are merged
-//! to one of the same moments ([`crate::merge`]). The cells are boxes: each bit of the curve doubles them
+//! to one of the same moments ([`crate::finish::merge`]). The cells are boxes: each bit of the curve doubles them
 //! along one axis. A level has at most half of the Gaussians of the level before. A Gaussian with a σ
 //! above the cells' side stays as it is.
 //!
@@ -28,7 +28,7 @@
 //! The picture of all Gaussians is itself no reference far away: the nearest of many Gaussians in a pixel
 //! decide its colour, while a merge has the mean of all.
 
-use crate::merge::{Blob, CURVE_BITS, curve_code, folded};
+use crate::finish::merge::{Blob, CURVE_BITS, curve_code, folded};
 use crate::scene::splats::Splats;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;

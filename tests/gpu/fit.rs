@@ -1,8 +1,8 @@
 //! The fit on the GPU against the fit on the CPU.
 
 use std::ops::ControlFlow;
-use subsplat::fit::{FitReport, FitView, fit};
-use subsplat::{FitOptions, RasterOptions, Renderer, Splats};
+use subsplat::finish::{FitReport, fit};
+use subsplat::{FitOptions, RasterOptions, Renderer, Splats, TargetView};
 use subsplat_test_support::fit_scene::{cameras, pictures, plane};
 use subsplat_test_support::gpu::gpu;
 
@@ -12,8 +12,8 @@ const LOSS: f64 = 2e-2;
 
 fn fitted(splats: &mut Splats, renderer: &mut Renderer) -> FitReport {
     let (cameras, truth) = (cameras(), pictures(&plane(0.5, 0.9)));
-    let views: Vec<FitView<'_>> =
-        cameras.iter().zip(&truth).map(|(camera, image)| FitView { camera, image }).collect();
+    let views: Vec<TargetView<'_>> =
+        cameras.iter().zip(&truth).map(|(camera, image)| TargetView { camera, image }).collect();
     let (raster, options) = (RasterOptions::default(), FitOptions::default());
     fit(splats, &views, &raster, &options, renderer, &mut |_| ControlFlow::Continue(())).unwrap()
 }

@@ -3,15 +3,15 @@
 
 use std::ops::ControlFlow;
 use subsplat::files::image::Rgb;
-use subsplat::fit::{FitError, FitReport, FitView, fit};
-use subsplat::{FitOptions, RasterOptions, Renderer, Splats};
+use subsplat::finish::{FitReport, fit};
+use subsplat::{FinishError, FitOptions, RasterOptions, Renderer, Splats, TargetView};
 use subsplat_kernels::layout::{OPACITY_OFFSET, SCALE_OFFSET, SPLAT_STRIDE};
 use subsplat_test_support::fit_scene::{SIDE, cameras, pictures, plane};
 
 fn fitted(splats: &mut Splats, truth: &[Rgb], steps: usize) -> FitReport {
     let cameras = cameras();
-    let views: Vec<FitView<'_>> =
-        cameras.iter().zip(truth).map(|(camera, image)| FitView { camera, image }).collect();
+    let views: Vec<TargetView<'_>> =
+        cameras.iter().zip(truth).map(|(camera, image)| TargetView { camera, image }).collect();
     let options = FitOptions::default().with_steps(steps);
     let (raster, mut renderer) = (RasterOptions::default(), Renderer::default());
     fit(splats, &views, &raster, &options, &mut renderer, &mut |_| ControlFlow::Continue(()))
@@ -101,7 +101,7 @@ fn a_cancelled_fit_changes_nothing() {
     let truth = pictures(&plane(0.5, 0.9));
     let (mut splats, cameras) = (plane(1.1, 0.3), cameras());
     let before = splats.clone();
-    let views = [FitView { camera: &cameras[0], image: &truth[0] }];
+    let views = [TargetView { camera: &cameras[0], image: &truth[0] }];
     let (raster, options) = (RasterOptions::default(), FitOptions::default());
     let mut steps = Vec::new();
     let mut stop = |step: usize| {
@@ -109,7 +109,7 @@ fn a_cancelled_fit_changes_nothing() {
         if step == 2 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     };
     let result = fit(&mut splats, &views, &raster, &options, &mut Renderer::default(), &mut stop);
-    assert!(matches!(result, Err(FitError::Cancelled)));
+    assert!(matches!(result, Err(FinishError::Cancelled)));
     assert_eq!(steps, [1, 2]);
     assert!(splats == before);
 }
@@ -118,7 +118,7 @@ fn a_cancelled_fit_changes_nothing() {
 fn a_picture_of_another_size_is_refused() {
     let (mut splats, cameras) = (plane(1.1, 0.3), cameras());
     let image = Rgb { width: 2, height: 1, data: vec![0; 6] };
-    let views = [FitView { camera: &cameras[0], image: &image }];
+    let views = [TargetView { camera: &cameras[0], image: &image }];
     let (raster, options) = (RasterOptions::default(), FitOptions::default());
     let mut go_on = |_: usize| ControlFlow::Continue(());
     let error = fit(&mut splats, &views, &raster, &options, &mut Renderer::default(), &mut go_on);

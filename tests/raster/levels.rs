@@ -1,7 +1,7 @@
 //! Level of detail: moments of a merge, the selection by distance, and pictures of selections.
 
 use glam::{DMat3, DQuat, DVec3, Mat4, Vec3};
-use subsplat::merge::Blob;
+use subsplat::finish::merge::Blob;
 use subsplat::scene::levels::{BLOCK, CELL_PX, Levels};
 use subsplat::scene::metrics::psnr;
 use subsplat::scene::render::render;

@@ -1,7 +1,7 @@
 //! Fewer Gaussians: moments and optical depth of a merge, and pictures of reduced scenes.
 
 use glam::{DMat3, DQuat, DVec3, Mat4};
-use subsplat::reduce::reduce;
+use subsplat::finish::reduce;
 use subsplat::scene::metrics::psnr;
 use subsplat::scene::render::Renderer;
 use subsplat::scene::splats::Splats;

@@ -5,17 +5,16 @@ use glam::Mat4;
 use std::ops::ControlFlow;
 use std::time::{Duration, Instant};
 use subsplat::files::image::Rgb;
-use subsplat::fit::{FitError, FitView};
-use subsplat::refine::{RefineOptions, RefineReport, Refiner, refine};
+use subsplat::finish::{RefineOptions, RefineReport, Refiner, refine};
 use subsplat::scene::render;
-use subsplat::{Camera, RasterOptions, Renderer, Splats};
+use subsplat::{Camera, FinishError, RasterOptions, Renderer, Splats, TargetView};
 use subsplat_kernels::layout::{OPACITY_OFFSET, QUAT_OFFSET, SPLAT_STRIDE};
 use subsplat_test_support::fit_scene::{SIDE, cameras, pictures, plane};
 
 fn refined(splats: &mut Splats, truth: &[Rgb], options: &RefineOptions) -> RefineReport {
     let cameras = cameras();
-    let views: Vec<FitView<'_>> =
-        cameras.iter().zip(truth).map(|(camera, image)| FitView { camera, image }).collect();
+    let views: Vec<TargetView<'_>> =
+        cameras.iter().zip(truth).map(|(camera, image)| TargetView { camera, image }).collect();
     let (raster, mut renderer) = (RasterOptions::default(), Renderer::default());
     refine(splats, &views, &raster, options, &mut renderer, &mut |_| ControlFlow::Continue(()))
         .unwrap()
@@ -116,7 +115,7 @@ fn a_cancelled_refinement_changes_nothing() {
     let truth = pictures(&plane(0.6, 0.9));
     let (mut splats, cameras) = (displaced(0.4), cameras());
     let before = splats.clone();
-    let views = [FitView { camera: &cameras[0], image: &truth[0] }];
+    let views = [TargetView { camera: &cameras[0], image: &truth[0] }];
     let (raster, options) = (RasterOptions::default(), RefineOptions::default());
     let mut stop = |refiner: &Refiner<'_>| match refiner.steps() {
         2 => ControlFlow::Break(()),
@@ -124,7 +123,7 @@ fn a_cancelled_refinement_changes_nothing() {
     };
     let result =
         refine(&mut splats, &views, &raster, &options, &mut Renderer::default(), &mut stop);
-    assert!(matches!(result, Err(FitError::Cancelled)));
+    assert!(matches!(result, Err(FinishError::Cancelled)));
     assert!(splats == before);
 }
 
@@ -132,7 +131,7 @@ fn a_cancelled_refinement_changes_nothing() {
 fn a_picture_of_another_size_is_refused() {
     let (splats, cameras) = (plane(1.1, 0.3), cameras());
     let image = Rgb { width: 2, height: 1, data: vec![0; 6] };
-    let views = [FitView { camera: &cameras[0], image: &image }];
+    let views = [TargetView { camera: &cameras[0], image: &image }];
     let options = RefineOptions::default();
     let error = Refiner::new(&splats, &views, &RasterOptions::default(), &options).err().unwrap();
     assert_eq!(error.to_string(), "view 0: expected a picture of 48x48, got 2x1");
@@ -170,8 +169,8 @@ fn gaussians_at_the_edge_of_both_photographs_keep_their_geometry() {
     // Of three photographs they are refined as all others.
     let (cameras, truth) = (cameras(), [&truth[0], &truth[1], &truth[0]]);
     let order = [cameras[0], cameras[1], cameras[0]];
-    let views: Vec<FitView<'_>> =
-        order.iter().zip(truth).map(|(camera, image)| FitView { camera, image }).collect();
+    let views: Vec<TargetView<'_>> =
+        order.iter().zip(truth).map(|(camera, image)| TargetView { camera, image }).collect();
     let (raster, options) = (RasterOptions::default(), RefineOptions::default().with_steps(60));
     let mut go_on = |_: &Refiner<'_>| ControlFlow::Continue(());
     let mut splats = start.clone();
@@ -258,9 +257,9 @@ fn parents_that_no_photograph_shows_are_removed() {
     let start = Splats::try_from(parts).unwrap();
     let order = [0, 1, 0];
     let run = |views: usize, share: f32| {
-        let views: Vec<FitView<'_>> = order[..views]
+        let views: Vec<TargetView<'_>> = order[..views]
             .iter()
-            .map(|&i| FitView { camera: &cameras[i], image: &truth[i] })
+            .map(|&i| TargetView { camera: &cameras[i], image: &truth[i] })
             .collect();
         let options = RefineOptions::default().with_steps(90).with_groups(true);
         let options = options.with_least_share(share);

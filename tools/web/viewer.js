@@ -11,7 +11,7 @@
 const ALPHA_MIN = 1 / 255;
 const ALPHA_MAX = 0.999;
 const SH_C0 = 0.28209479177387814;
-/** The rules of src/levels.rs and src/merge.rs. */
+/** The rules of src/levels.rs and src/finish/merge.rs. */
 const BLOCK = 1024, CELL_PX = 1, SIGMA_MAX = 1, SHARE_MAX = 0.5, PIXEL_SIDES = 1.4, LOWPASS = 0.3;
 const MERGED_OPACITY_MAX = 0.9999, DENSE_OPACITY = 0.35;
 /** Bits of a coordinate on the curve: a code is a whole number below 2 to the power of 53. */

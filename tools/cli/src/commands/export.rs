@@ -8,7 +8,7 @@ use anyhow::{Result, bail};
 use serde_json::json;
 use subsplat::files::ply::is_own_comment;
 use subsplat::files::{SaveOptions, load_with_comments, save_splats};
-use subsplat::reduce::reduce;
+use subsplat::finish::reduce;
 use subsplat::scene::render::{
     Renderer, camera_of_comments, comments_without_camera, options_of_comments,
 };

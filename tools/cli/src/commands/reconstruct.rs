@@ -9,11 +9,11 @@ use serde_json::{Value, json};
 use std::borrow::Borrow;
 use subsplat::cameras::check::{PairReport, Verdict};
 use subsplat::files::scene::Scene;
-use subsplat::fit::FitReport;
+use subsplat::finish::FitReport;
 use subsplat::network::config::Config;
 use subsplat::network::model::trunk::UPSCALE_MAX;
 use subsplat::reconstruct::inputs::crop::Cropped;
-use subsplat::refine::RefineReport;
+use subsplat::finish::RefineReport;
 use subsplat::{
     Check, DepthBounds, DepthRange, Detail, FitOptions, InputSize, Options, Photo, Poses, Prepared,
     Reconstruction, Reconstructor, TargetSize,

@@ -14,9 +14,9 @@ pub enum Method {
     Subsplat,
     /// The model with detail from the photographs ([`subsplat_kernels::cpu::detail`]).
     Detail,
-    /// The model with detail, fitted to the photographs ([`subsplat::fit::fit`]).
+    /// The model with detail, fitted to the photographs ([`subsplat::finish::fit()`]).
     Fit,
-    /// [`Method::Fit`], refined on the photographs ([`subsplat::refine::refine`]): what `subsplat run`
+    /// [`Method::Fit`], refined on the photographs ([`subsplat::finish::refine()`]): what `subsplat run`
     /// gives.
     Refine,
     /// The model with detail on the two inputs nearest to the target alone.

@@ -5,7 +5,7 @@ use super::evaluator::{Crops, Options};
 use super::methods::{enlarged, mean, nearest};
 use std::ops::ControlFlow;
 use subsplat::files::image::Rgb;
-use subsplat::fit::FitOptions;
+use subsplat::finish::{FitOptions, Refiner};
 use subsplat::network::config::LowpassRef;
 use subsplat::network::model::encoding::SceneEncoding;
 use subsplat::network::model::subsplat::feature_channels;
@@ -16,7 +16,6 @@ use subsplat::reconstruct::stages::{
     SceneChildren, add_detail, counts_of, fit_to_inputs, refine_on_inputs,
 };
 use subsplat::reconstruct::{Density, DepthBounds, Error, Reconstructor, Refine, Result};
-use subsplat::refine::Refiner;
 use subsplat::scene::render::{Renderer, render_with};
 use subsplat::scene::splats::Splats;
 use subsplat_kernels::camera::Camera;

@@ -1,5 +1,5 @@
 //! Losses of the network's outputs as functions of slices: a value, and its analytic gradient.
-//! Those of pictures are in [`subsplat::loss`].
+//! Those of pictures are in [`subsplat::finish::loss`].
 //!
 //! [`with_gradient`] inserts a loss into candle's graph as one scalar. No graph of small tensor
 //! operations exists between a prediction and its loss, so that a loss costs about one pass over
@@ -7,7 +7,7 @@
 
 use candle_core::{Result, Tensor};
 use rayon::prelude::*;
-pub use subsplat::loss::{Scored, dssim, mse};
+pub use subsplat::finish::loss::{Scored, dssim, mse};
 use subsplat::network::ops::precomputed_gradient::precomputed_gradient;
 use subsplat_kernels::camera::NearFar;
 

@@ -13,7 +13,7 @@ use std::path::Path;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 use subsplat::files::{SplatFormat, load_with_comments};
-use subsplat::refine::Refiner;
+use subsplat::finish::Refiner;
 use subsplat::scene::navigation::{Start, up_of};
 use subsplat::scene::render::camera_of_comments;
 use subsplat::scene::splats::Splats;

@@ -1,17 +1,19 @@
 //! Gaussians by photograph, and the removal of those that the photographs hardly show.
 
-use super::{CHUNK, RefineOptions, slices_of};
-use crate::fit::FitView;
+use super::TargetView;
+use crate::scene::render;
 use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
 use rayon::prelude::*;
 use std::ops::Range;
-use subsplat_kernels::layout::{Gradients, RasterOptions, gain_with_offsets};
+use subsplat_kernels::layout::{Gradients, RasterOptions, SplatSlices, gain_with_offsets};
 
-/// Least share of a parent that stays ([`RefineOptions::least_share`]).
+/// Fewest parents of a parallel task.
+const TASK: usize = 4096;
+/// Least share of a parent that stays ([`RefineOptions::least_share`](super::RefineOptions::least_share)).
 pub(crate) const LEAST_SHARE: f32 = 0.3;
 /// Fewest photographs of which parents are removed.
-pub(crate) const PHOTOGRAPHS_TO_REMOVE: usize = 3;
+const PHOTOGRAPHS_TO_REMOVE: usize = 3;
 
 /// Gaussians of each photograph.
 #[derive(Clone, Debug, Default)]
@@ -24,11 +26,11 @@ pub struct Groups {
 }
 
 impl Groups {
-    /// Equal groups of whole families, one for each of `views` photographs. Not known without
-    /// [`RefineOptions::grouped`], or where the parents do not divide into equal groups.
-    pub(super) fn equal(splats: &Splats, views: usize, options: &RefineOptions) -> Self {
+    /// Equal groups of whole families, one for each of `views` photographs. Not known where the
+    /// Gaussians are not `grouped`, or where the parents do not divide into equal groups.
+    pub(super) fn equal(splats: &Splats, views: usize, grouped: bool) -> Self {
         let parents = splats.parents();
-        if !options.grouped || views == 0 || !parents.is_multiple_of(views) {
+        if !grouped || views == 0 || !parents.is_multiple_of(views) {
             return Self::default();
         }
         let size = parents / views * splats.children_per_parent();
@@ -37,21 +39,31 @@ impl Groups {
     }
 }
 
-/// The Gaussians without the parents below [`RefineOptions::least_share`]; `None` where all stay.
+/// Parents of which the photographs show less than `least_share`, marked by true: they lie behind the
+/// surfaces of other photographs, or repeat them. Fewer than [`PHOTOGRAPHS_TO_REMOVE`] photographs show
+/// most places twice at most, so none is marked.
+pub(crate) fn hidden(shares: &[f32], photographs: usize, least_share: f32) -> Vec<bool> {
+    let enough = photographs >= PHOTOGRAPHS_TO_REMOVE;
+    shares.iter().map(|share| enough && *share < least_share).collect()
+}
+
+/// The Gaussians without the parents that are [`hidden`]; `None` where all stay.
 pub(super) fn pruned(
     splats: &Splats,
     groups: &Groups,
-    views: &[FitView<'_>],
+    views: &[TargetView<'_>],
     raster: &RasterOptions,
-    options: &RefineOptions,
+    least_share: f32,
     renderer: &mut Renderer,
 ) -> Option<(Splats, Groups)> {
-    let enough = groups.ranges.len() >= PHOTOGRAPHS_TO_REMOVE && groups.equal_families;
-    if !enough || !(options.least_share > 0.0) {
+    let photographs = groups.ranges.len();
+    let may_remove = photographs >= PHOTOGRAPHS_TO_REMOVE && groups.equal_families;
+    if !may_remove || !(least_share > 0.0) {
         return None;
     }
     let shares = shares(splats, views, raster, renderer);
-    let keep: Vec<bool> = shares.iter().map(|share| *share >= options.least_share).collect();
+    let hidden = hidden(&shares, photographs, least_share);
+    let keep: Vec<bool> = hidden.into_iter().map(|hidden| !hidden).collect();
     let (children, mut end) = (splats.children_per_parent(), 0);
     let ranges: Vec<Range<usize>> = groups
         .ranges
@@ -72,14 +84,14 @@ pub(super) fn pruned(
 /// loss that adds all pixels.
 pub(crate) fn shares(
     splats: &Splats,
-    views: &[FitView<'_>],
+    views: &[TargetView<'_>],
     raster: &RasterOptions,
     renderer: &mut Renderer,
 ) -> Vec<f32> {
     let (parents, children) = (splats.parents(), splats.children_per_parent());
     let raster = RasterOptions { sh_basis: splats.sh_basis, ..*raster };
     let gain = gain_with_offsets(&splats.gain, splats.len());
-    let slices = slices_of(&splats.rows, &gain, splats);
+    let slices = SplatSlices { gain: &gain, ..render::slices(splats) };
     let (mut shares, mut pixels) = (vec![0.0f32; parents], 0);
     let mut gradients = Gradients::default();
     for view in views {
@@ -91,7 +103,7 @@ pub(crate) fn shares(
             by_pixel
         });
         let families = gradients.gain.par_chunks_exact(4 * children);
-        shares.par_iter_mut().zip(families).with_min_len(CHUNK).for_each(|(share, family)| {
+        shares.par_iter_mut().zip(families).with_min_len(TASK).for_each(|(share, family)| {
             *share += family.chunks_exact(4).map(|g| g[1] + g[2] + g[3]).sum::<f32>();
         });
     }

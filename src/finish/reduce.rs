@@ -1,7 +1,7 @@
 //! Reduces the number of Gaussians of a finished scene: those that the cameras hardly show are
 //! removed, then neighbours are merged.
 //!
-//! A merge ([`crate::merge`]) keeps the moments of a pair and its integrated optical depth.
+//! A merge ([`super::merge`]) keeps the moments of a pair and its integrated optical depth.
 //! Pairs are neighbours along two curves through space (Morton order). The cost of a pair is Ward's:
 //! `s₁s₂/(s₁ + s₂) · (|Δc|² + κ·Δμᵀ(Σ₁ + Σ₂)⁻¹Δμ)`, s the Gaussians' shares of the pictures and c
 //! their mean colour. Rounds of disjoint pairs, the cheapest first, lead to the wanted number.
@@ -12,10 +12,10 @@
 //!
 //! The same input gives the same bytes on any number of threads.
 
+use super::TargetView;
+use super::merge::{Blob, CURVE_BITS, curve_code, folded};
+use super::removal::shares;
 use crate::files::image::Rgb;
-use crate::fit::FitView;
-use crate::merge::{Blob, CURVE_BITS, curve_code, folded};
-use crate::refine::shares;
 use crate::scene::render::Renderer;
 use crate::scene::splats::Splats;
 use glam::{DMat3, DVec3, Vec2, Vec3};
@@ -67,8 +67,8 @@ fn picture_shares(
     // Only the sizes of the pictures count.
     let blank = |c: &Camera| Rgb::black(c.intrinsics().width, c.intrinsics().height);
     let pictures: Vec<Rgb> = cameras.iter().map(blank).collect();
-    let views: Vec<FitView<'_>> =
-        cameras.iter().zip(&pictures).map(|(camera, image)| FitView { camera, image }).collect();
+    let views: Vec<TargetView<'_>> =
+        cameras.iter().zip(&pictures).map(|(camera, image)| TargetView { camera, image }).collect();
     let mut found = match views.is_empty() {
         true => vec![1.0; splats.len()],
         false => shares(splats, &views, raster, renderer),

@@ -1,0 +1,176 @@
+//! Refines Gaussians on the photographs that they were made from: means, rotations, scales,
+//! opacities and colour offsets, by gradient steps through the rasterizer.
+//!
+//! [`fit`](super::fit()) changes sizes, opacities and colours alone and ends after four steps. A
+//! refinement changes the geometry too: each photograph shows surfaces whose depth the others
+//! predict. The method is the optimisation of *3D Gaussian Splatting for
+//! Real-Time Radiance Field Rendering* (Kerbl et al. 2023), from the network's Gaussians instead
+//! of sparse points, hence some dozens of steps instead of 30,000. SH coefficients stay.
+//!
+//! Of three photographs or more, parents are removed first that show little of all of them
+//! ([`RefineOptions::least_share`]): they lie behind the surfaces of other photographs, or repeat them.
+//!
+//! A photograph tells little about a scene that was optimised to give it back. The measure of a
+//! refinement is therefore each photograph drawn from the other photographs' Gaussians alone,
+//! where these cover it. Steps end where this error no longer falls, and a set whose error has not
+//! fallen at all stays unchanged. Of two photographs, this picture is also part of the loss ([`RefineOptions::across`]), because two
+//! alone do not tell a wrong depth that gives both of them back.
+//!
+//! One step draws one photograph, in an order that depends on their number only. The same input
+//! gives the same bytes on any number of threads, unless [`RefineOptions::time`] limits the steps.
+
+use super::phase::Phase;
+use super::refiner::{Outcome, Refiner, run};
+use super::removal::{Groups, LEAST_SHARE};
+use super::{FinishError, TargetView};
+use crate::scene::render::Renderer;
+use crate::scene::splats::Splats;
+use std::ops::ControlFlow;
+use std::time::Duration;
+use subsplat_kernels::layout::RasterOptions;
+
+/// Options of a refinement. The rates were chosen on six scenes of `../shared/photos` at
+/// 128 → 256 with five photographs, targets between them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
+pub struct RefineOptions {
+    /// Most gradient steps; 0 leaves the Gaussians as they are. Default: 40.
+    pub steps: usize,
+    /// Step of the means, px of the photograph that shows the Gaussian at the largest scale. Default: 0.3.
+    pub mean_rate: f32,
+    /// Step of the unit quaternions' elements. Default: 0.03.
+    pub rotation_rate: f32,
+    /// Step of ln σ, each axis of its own. Default: 0.06.
+    pub scale_rate: f32,
+    /// Step of the opacities' logits. Default: 0.15.
+    pub opacity_rate: f32,
+    /// Step of the colour offsets δ, display values. Default: 0.012.
+    pub colour_rate: f32,
+    /// Weight of (1 − SSIM)/2 beside the mean squared difference. Default: 0.2.
+    pub dssim: f64,
+    /// Weight of the loss of each of two photographs, drawn from the other's Gaussians alone. It
+    /// changes geometry and opacity, not colours. No effect on other numbers of photographs, or
+    /// without `grouped`. Default: 1.
+    pub across: f32,
+    /// Least share of a parent in the photographs: the weight of its children in all pixels, over
+    /// that of an average parent. Parents below it are removed, where `grouped` is set and there are
+    /// three photographs or more. Two photographs show most places twice at most, so nothing is
+    /// removed. 0 keeps all. Default: 0.3.
+    pub least_share: f32,
+    /// Longest duration of the steps; the rates fall over it instead of over `steps`. The result
+    /// then depends on the machine. Refused where there is no clock (WebAssembly without an operating
+    /// system). Default: none.
+    pub time: Option<Duration>,
+    /// The Gaussians are in equal groups, one for each photograph in their order, as
+    /// [`Reconstruction::splats`](crate::Reconstruction::splats) has them. Without groups, the
+    /// measure is the pictures of all Gaussians. Default: false.
+    pub grouped: bool,
+}
+
+impl Default for RefineOptions {
+    fn default() -> Self {
+        Self {
+            steps: 40,
+            mean_rate: 0.3,
+            rotation_rate: 0.03,
+            scale_rate: 0.06,
+            opacity_rate: 0.15,
+            colour_rate: 0.012,
+            dssim: 0.2,
+            across: 1.0,
+            least_share: LEAST_SHARE,
+            time: None,
+            grouped: false,
+        }
+    }
+}
+
+impl RefineOptions {
+    /// Sets [`RefineOptions::steps`].
+    #[must_use]
+    pub fn with_steps(mut self, steps: usize) -> Self {
+        self.steps = steps;
+        self
+    }
+
+    /// Sets [`RefineOptions::across`].
+    #[must_use]
+    pub fn with_across(mut self, weight: f32) -> Self {
+        self.across = weight;
+        self
+    }
+
+    /// Sets [`RefineOptions::least_share`].
+    #[must_use]
+    pub fn with_least_share(mut self, share: f32) -> Self {
+        self.least_share = share;
+        self
+    }
+
+    /// Sets [`RefineOptions::time`], and no limit of steps.
+    #[must_use]
+    pub fn with_time(mut self, time: Duration) -> Self {
+        (self.time, self.steps) = (Some(time), usize::MAX);
+        self
+    }
+
+    /// Sets [`RefineOptions::grouped`].
+    #[must_use]
+    pub fn with_groups(mut self, grouped: bool) -> Self {
+        self.grouped = grouped;
+        self
+    }
+}
+
+/// Result of a refinement: mean squared difference of the photographs, display values. With
+/// [`RefineOptions::grouped`], each is drawn from the other photographs' Gaussians alone.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
+pub struct RefineReport {
+    /// Steps that were taken.
+    pub steps: usize,
+    /// Before the first step.
+    pub before: f64,
+    /// After the last step; equal to `before` where the Gaussians stayed as they were.
+    pub after: f64,
+    /// Gaussians that were removed ([`RefineOptions::least_share`]).
+    pub removed: usize,
+}
+
+/// Refines `splats` on `views` in place. `progress` receives the refinement after each step, whose
+/// [`Refiner::splats`] a caller can show; [`ControlFlow::Break`] cancels. The colour offsets are
+/// added to the δ of [`Splats::gain`], which has four numbers a Gaussian afterwards.
+///
+/// # Errors
+/// A picture of another size than its camera; [`RefineOptions::time`] where there is no clock; a
+/// cancelled refinement. The Gaussians are then unchanged.
+pub fn refine(
+    splats: &mut Splats,
+    views: &[TargetView<'_>],
+    raster: &RasterOptions,
+    options: &RefineOptions,
+    renderer: &mut Renderer,
+    progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
+) -> Result<RefineReport, FinishError> {
+    let mut groups = Groups::equal(splats, views.len(), options.grouped);
+    refine_groups(splats, &mut groups, views, raster, options, renderer, progress)
+}
+
+/// [`refine`] with the Gaussians of each photograph in `groups`, which follow the removal.
+///
+/// # Errors
+/// Those of [`refine`].
+pub(crate) fn refine_groups(
+    splats: &mut Splats,
+    groups: &mut Groups,
+    views: &[TargetView<'_>],
+    raster: &RasterOptions,
+    options: &RefineOptions,
+    renderer: &mut Renderer,
+    progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
+) -> Result<RefineReport, FinishError> {
+    let phase = Phase::refine(options);
+    let Outcome { steps, before, after, removed } =
+        run(splats, groups, views, raster, &phase, renderer, progress)?;
+    Ok(RefineReport { steps, before, after, removed })
+}

@@ -1,0 +1,364 @@
+//! One phase of the optimisation of a scene, on its photographs: steps, measure, and the result that
+//! is kept.
+
+use super::FinishError;
+use super::optimiser::{Across, Optimiser, PhotographGradients};
+use super::parameters::MEAN;
+use super::phase::{Measure, Phase, Photographs};
+use super::refine::RefineOptions;
+use super::removal::{Groups, pruned};
+use super::targets::{Target, TargetView, beyond, by_planes, pixel_sizes};
+use crate::scene::render::Renderer;
+use crate::scene::splats::Splats;
+use std::ops::{ControlFlow, Range};
+use std::time::Duration;
+use subsplat_kernels::clock::{HAS_CLOCK, Instant};
+use subsplat_kernels::layout::{
+    Geometry, Gradients, OPACITY_OFFSET, RasterOptions, SPLAT_STRIDE, SplatSlices, sh_coefficients,
+};
+
+/// A phase that goes on step by step, for callers that show it. [`fit`](super::fit()) and
+/// [`refine`](super::refine()) run whole ones.
+pub struct Refiner<'a> {
+    phase: Phase,
+    targets: Vec<Target<'a>>,
+    raster: RasterOptions,
+    /// Gaussians of each photograph; empty where they are not known.
+    groups: Groups,
+    /// Begin of the first step, where time limits the steps.
+    begun: Option<Instant>,
+    optimiser: Optimiser<'a>,
+    gradients: Gradients,
+    /// Gradients by the Gaussians of a photograph that the step does not draw, drawn alone.
+    across: Gradients,
+    step: usize,
+}
+
+/// What a phase did.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Outcome {
+    /// Steps that were taken.
+    pub steps: usize,
+    /// The measure before the first step.
+    pub before: f64,
+    /// After the last step; equal to `before` where the Gaussians stayed as they were.
+    pub after: f64,
+    /// Gaussians that were removed.
+    pub removed: usize,
+}
+
+impl Outcome {
+    /// Gaussians that stayed as they were, with the measure `before`.
+    fn unchanged(steps: usize, before: f64) -> Self {
+        Self { steps, before, after: before, removed: 0 }
+    }
+}
+
+impl<'a> Refiner<'a> {
+    /// Prepares a refinement of `splats` on `views`, which are rendered by the rules `raster` in
+    /// the splats' own SH basis.
+    ///
+    /// # Errors
+    /// A picture of another size than its camera; a limit of time where there is no clock.
+    pub fn new(
+        splats: &'a Splats,
+        views: &[TargetView<'a>],
+        raster: &RasterOptions,
+        options: &RefineOptions,
+    ) -> Result<Self, FinishError> {
+        let groups = Groups::equal(splats, views.len(), options.grouped);
+        Self::of_phase(splats, groups, views, raster, &Phase::refine(options))
+    }
+
+    /// Prepares a phase of `splats`, whose Gaussians of each photograph are in `groups`.
+    fn of_phase(
+        splats: &'a Splats,
+        groups: Groups,
+        views: &[TargetView<'a>],
+        raster: &RasterOptions,
+        phase: &Phase,
+    ) -> Result<Self, FinishError> {
+        check_time(phase.time, HAS_CLOCK)?;
+        let target = |(i, view): (usize, &TargetView<'a>)| Target::new(i, view, phase.loss.dssim);
+        let targets = views.iter().enumerate().map(target).collect::<Result<_, _>>()?;
+        let pixels = if phase.moves(MEAN) { pixel_sizes(splats, views) } else { Vec::new() };
+        let spares = phase.spares_edges && views.len() == 2;
+        let spared = if spares { beyond(splats, views) } else { Vec::new() };
+        let photographs = match phase.photographs {
+            Photographs::All => views.len(),
+            Photographs::InTurn => 1,
+        };
+        Ok(Self {
+            phase: phase.clone(),
+            targets,
+            raster: RasterOptions { sh_basis: splats.sh_basis, ..*raster },
+            groups,
+            begun: None,
+            optimiser: Optimiser::new(splats, phase, photographs, pixels, spared),
+            gradients: Gradients::default(),
+            across: Gradients::default(),
+            step: 0,
+        })
+    }
+
+    /// Number of steps so far.
+    pub fn steps(&self) -> usize {
+        self.step
+    }
+
+    /// The Gaussians after the steps so far.
+    pub fn splats(&self) -> Splats {
+        self.optimiser.splats()
+    }
+
+    /// Takes one step. Does nothing without photographs or Gaussians.
+    pub fn step(&mut self, renderer: &mut Renderer) {
+        let views = self.targets.len();
+        if views == 0 || self.optimiser.rows().is_empty() {
+            return;
+        }
+        if self.begun.is_none() && self.phase.time.is_some() {
+            self.begun = Some(Instant::now());
+        }
+        let photographs = match self.phase.photographs {
+            Photographs::All => 0..views,
+            Photographs::InTurn => {
+                let view = view_of_step(self.step, views);
+                view..view + 1
+            }
+        };
+        let last = photographs.end - 1;
+        for view in photographs.start..last {
+            let other = self.add_gradients(view, renderer);
+            let gradients = gradients_of(&self.gradients, &self.across, other, &self.phase);
+            self.optimiser.add(&gradients);
+        }
+        let other = self.add_gradients(last, renderer);
+        self.step += 1;
+        let factor = self.phase.schedule.factor(self.progress());
+        let gradients = gradients_of(&self.gradients, &self.across, other, &self.phase);
+        self.optimiser.step(&gradients, factor);
+    }
+
+    /// Computes the gradients of the loss of photograph `view`. Returns the Gaussians of the other one of
+    /// two photographs, where these are drawn alone as well.
+    fn add_gradients(&mut self, view: usize, renderer: &mut Renderer) -> Range<usize> {
+        let target = &self.targets[view];
+        let slices = self.optimiser.slices();
+        let (camera, raster) = (target.camera, &self.raster);
+        renderer.gradients_of(&slices, camera, raster, &mut self.gradients, &mut |planes| {
+            by_planes(target.loss(planes), planes)
+        });
+        if !(self.phase.loss.across > 0.0) || self.targets.len() != 2 {
+            return 0..0;
+        }
+        let other = self.group(1 - view).unwrap_or(0..0);
+        if !other.is_empty() {
+            let slices = part_of(slices, &other);
+            renderer.gradients_of(&slices, camera, raster, &mut self.across, &mut |planes| {
+                by_planes(target.loss_where_covered(planes), planes)
+            });
+        }
+        other
+    }
+
+    /// The Gaussians of photograph `view`; `None` where they are not known.
+    fn group(&self, view: usize) -> Option<Range<usize>> {
+        self.groups.ranges.get(view).cloned()
+    }
+
+    /// Share of the phase that is done, 0 to 1.
+    pub fn progress(&self) -> f32 {
+        let part = match (self.phase.time, self.begun) {
+            (Some(time), Some(begun)) => begun.elapsed().as_secs_f32() / time.as_secs_f32(),
+            (Some(_), None) => 0.0,
+            (None, _) => self.step as f32 / self.phase.steps.max(1) as f32,
+        };
+        part.clamp(0.0, 1.0)
+    }
+
+    /// Returns whether the limit of steps or of time is reached.
+    fn is_done(&self) -> bool {
+        self.step >= self.phase.steps || self.progress() >= 1.0
+    }
+
+    /// The measure of the phase ([`RefineReport`](super::RefineReport)): mean over the photographs.
+    pub fn error(&self, renderer: &mut Renderer) -> f64 {
+        let [error, _] = self.measure(renderer);
+        error
+    }
+
+    /// [`Refiner::error`], and the mean share of the photographs on which it was measured.
+    fn measure(&self, renderer: &mut Renderer) -> [f64; 2] {
+        let mut sum = [0.0; 2];
+        for (view, target) in self.targets.iter().enumerate() {
+            let mut draw = |rows: &[f32]| {
+                let slices = self.optimiser.slices_of(rows);
+                renderer.render_planes(&slices, target.camera, &self.raster)
+            };
+            let rows = self.optimiser.rows();
+            let [error, covered] = match (self.phase.measure, self.group(view)) {
+                (Measure::Loss, _) => [target.loss(&draw(rows)).value, 1.0],
+                (Measure::Others, Some(group)) => {
+                    let mut rows = rows.to_vec();
+                    let own = &mut rows[group.start * SPLAT_STRIDE..group.end * SPLAT_STRIDE];
+                    own.chunks_exact_mut(SPLAT_STRIDE).for_each(|row| row[OPACITY_OFFSET] = 0.0);
+                    target.error_where_covered(&draw(&rows))
+                }
+                (Measure::Others, None) => [target.error(&draw(rows)), 1.0],
+            };
+            sum = [sum[0] + error, sum[1] + covered];
+        }
+        sum.map(|s| s / self.targets.len().max(1) as f64)
+    }
+
+    /// Takes the start of the phase with the smallest measure. The first one has the measure `first`.
+    fn choose_start(&mut self, first: f64, renderer: &mut Renderer) {
+        let (mut best, starts) = (first, self.phase.starts);
+        let mut chosen = starts.first();
+        for start in starts.iter().skip(1) {
+            self.optimiser.begin(Some(*start));
+            let error = self.error(renderer);
+            if error < best {
+                (best, chosen) = (error, Some(start));
+            }
+        }
+        if chosen != starts.last() {
+            self.optimiser.begin(chosen.copied());
+        }
+    }
+}
+
+/// The gradients of a photograph, and those by the Gaussians `other`, drawn alone.
+fn gradients_of<'g>(
+    all: &'g Gradients,
+    across: &'g Gradients,
+    other: Range<usize>,
+    phase: &Phase,
+) -> PhotographGradients<'g> {
+    let weight = phase.loss.across;
+    let across = Across { gradients: across, weight, gaussians: other };
+    let across = if across.gaussians.is_empty() { None } else { Some(across) };
+    PhotographGradients { all, across }
+}
+
+/// Runs `phase` on `splats` in place; `groups` are the Gaussians of each photograph, which follow the
+/// removal. `progress` receives the phase after each step.
+///
+/// # Errors
+/// A picture of another size than its camera; a limit of time where there is no clock; a phase that was
+/// cancelled. The Gaussians are then unchanged.
+pub(super) fn run(
+    splats: &mut Splats,
+    groups: &mut Groups,
+    views: &[TargetView<'_>],
+    raster: &RasterOptions,
+    phase: &Phase,
+    renderer: &mut Renderer,
+    progress: &mut dyn FnMut(&Refiner<'_>) -> ControlFlow<()>,
+) -> Result<Outcome, FinishError> {
+    check_time(phase.time, HAS_CLOCK)?;
+    for (i, view) in views.iter().enumerate() {
+        Target::check(i, view)?;
+    }
+    if phase.steps == 0 || views.is_empty() || splats.is_empty() {
+        return Ok(Outcome::unchanged(0, 0.0));
+    }
+    let pruned = pruned(splats, groups, views, raster, phase.least_share, renderer);
+    let (kept, kept_groups) = match &pruned {
+        Some((kept, groups)) => (kept, groups),
+        None => (&*splats, &*groups),
+    };
+    let mut refiner = Refiner::of_phase(kept, kept_groups.clone(), views, raster, phase)?;
+    let [before, covered] = refiner.measure(renderer);
+    if views.len() == 2 && covered < phase.least_covered {
+        return Ok(Outcome::unchanged(0, before));
+    }
+    refiner.choose_start(before, renderer);
+    let mut last = None;
+    while !refiner.is_done() {
+        refiner.step(renderer);
+        if progress(&refiner).is_break() {
+            return Err(FinishError::Cancelled);
+        }
+        let Some(patience) = phase.patience else { continue };
+        let between = patience.rounds * views.len();
+        // High rates at the beginning can raise the error for a while.
+        let settled = refiner.progress() >= 0.5 && refiner.steps() + between < phase.steps;
+        if settled && refiner.steps().is_multiple_of(between) {
+            let error = refiner.error(renderer);
+            if last.is_some_and(|last| !(error < last * (1.0 - patience.least_gain))) {
+                break;
+            }
+            last = Some(error);
+        }
+    }
+    let (steps, after) = (refiner.steps(), refiner.error(renderer));
+    // An error that is not a number fails the comparison as well.
+    if !(after < before) {
+        return Ok(Outcome::unchanged(steps, before));
+    }
+    let (rows, gain) = refiner.optimiser.into_parts();
+    let removed = splats.len() - rows.len() / SPLAT_STRIDE;
+    if let Some((kept, kept_groups)) = pruned {
+        (*splats, *groups) = (kept, kept_groups);
+    }
+    splats.rows = rows;
+    splats.gain = gain;
+    Ok(Outcome { steps, before, after, removed })
+}
+
+/// Refuses a limit of time where there is no clock.
+pub(crate) fn check_time(time: Option<Duration>, has_clock: bool) -> Result<(), FinishError> {
+    if time.is_some() && !has_clock {
+        return Err(FinishError::NoClock);
+    }
+    Ok(())
+}
+
+/// The photograph of a step, counted from 0: all of them once in each round.
+fn view_of_step(step: usize, views: usize) -> usize {
+    // Neighbours in the list are often neighbours in space; the stride separates them.
+    let stride = (views / 2 + 1..=views).find(|s| coprime(*s, views)).unwrap_or(1);
+    step * stride % views
+}
+
+fn coprime(a: usize, b: usize) -> bool {
+    if b == 0 { a == 1 } else { coprime(b, a % b) }
+}
+
+/// The Gaussians `range` of `slices`, whole families of packed rows.
+fn part_of<'s>(slices: SplatSlices<'s>, range: &Range<usize>) -> SplatSlices<'s> {
+    let Geometry::Packed(rows) = slices.geometry else { return slices };
+    let (children, set) = (slices.children_per_parent(), 3 * sh_coefficients(slices.sh_degree));
+    let parents = range.start / children..range.end / children;
+    SplatSlices {
+        geometry: Geometry::Packed(&rows[range.start * SPLAT_STRIDE..range.end * SPLAT_STRIDE]),
+        sh: &slices.sh[parents.start * set..parents.end * set],
+        gain: &slices.gain[4 * range.start..4 * range.end],
+        sh_degree: slices.sh_degree,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_round_shows_every_photograph_once() {
+        for views in 1..12 {
+            let mut seen: Vec<usize> = (0..views).map(|s| view_of_step(s, views)).collect();
+            seen.sort_unstable();
+            assert_eq!(seen, (0..views).collect::<Vec<_>>());
+        }
+    }
+
+    #[test]
+    fn a_limit_of_time_needs_a_clock() {
+        let second = Some(Duration::from_secs(1));
+        assert!(check_time(second, true).is_ok() && check_time(None, false).is_ok());
+        let error = check_time(second, false).unwrap_err();
+        assert!(matches!(error, FinishError::NoClock));
+        assert!(error.to_string().contains("number of steps"), "{error}");
+    }
+}
